@@ -1,0 +1,194 @@
+//! The arena: parameters, gradients and optimizer state of a whole pipeline, under their names.
+
+use crate::error::{Error, Result};
+use std::collections::BTreeMap;
+use std::ops::Range;
+
+/// A named block of the arena.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct Block {
+    /// Full name: `encoder.…`, `normalizers.0.…`, `field.…`.
+    pub name: String,
+    /// Shape, row-major.
+    pub shape: Vec<usize>,
+    /// Place in the arena.
+    pub range: Range<usize>,
+}
+
+/// Names and places of every parameter.
+#[derive(Debug, Clone, Default, PartialEq, Eq)]
+pub struct Layout {
+    /// In the order of the arena, without gaps.
+    pub blocks: Vec<Block>,
+}
+
+impl Layout {
+    /// Number of parameters.
+    pub fn len(&self) -> usize {
+        self.blocks.last().map_or(0, |b| b.range.end)
+    }
+
+    /// Whether there are none.
+    pub fn is_empty(&self) -> bool {
+        self.len() == 0
+    }
+
+    /// The block called `name`.
+    pub fn find(&self, name: &str) -> Option<&Block> {
+        self.blocks.iter().find(|b| b.name == name)
+    }
+}
+
+/// Everything that training changes.
+#[derive(Debug, Clone, Default, PartialEq)]
+pub struct Arena {
+    /// Parameters.
+    pub params: Vec<f32>,
+    /// Gradients of the current step.
+    pub grads: Vec<f32>,
+    /// Adam's first moments.
+    pub first: Vec<f32>,
+    /// Adam's second moments.
+    pub second: Vec<f32>,
+}
+
+impl Arena {
+    /// An arena of `n` zeros.
+    pub fn new(n: usize) -> Self {
+        Self { params: vec![0.0; n], grads: vec![0.0; n], first: vec![0.0; n], second: vec![0.0; n] }
+    }
+
+    /// Keeps only `ranges` of every part, in that order.
+    pub fn retain(&mut self, ranges: &[Range<usize>]) {
+        for part in [&mut self.params, &mut self.grads, &mut self.first, &mut self.second] {
+            let kept: Vec<f32> = ranges.iter().flat_map(|r| part[r.clone()].iter().copied()).collect();
+            *part = kept;
+        }
+    }
+
+    /// Bytes held.
+    pub fn bytes(&self) -> usize {
+        4 * (self.params.len() + self.grads.len() + self.first.len() + self.second.len())
+    }
+}
+
+/// Named tensors with the notes of the file that they came from.
+#[derive(Debug, Clone, Default, PartialEq)]
+pub struct Weights {
+    /// Shape and values by name.
+    pub tensors: BTreeMap<String, (Vec<usize>, Vec<f32>)>,
+    /// Free notes: the spec that made them, the program's version.
+    pub notes: BTreeMap<String, String>,
+}
+
+/// What an initializer did, tensor by tensor.
+#[derive(Debug, Clone, Default, PartialEq, serde::Serialize)]
+pub struct InitReport {
+    /// Loaded, by name.
+    pub loaded: Vec<String>,
+    /// In the pipeline but left as the stage's own scheme made it, with the reason.
+    pub fresh: Vec<(String, String)>,
+    /// In the file but not used, with the reason.
+    pub unused: Vec<(String, String)>,
+}
+
+impl Weights {
+    /// The blocks of `layout` for which `take` holds.
+    pub fn from_arena(layout: &Layout, params: &[f32], take: impl Fn(&str) -> bool) -> Self {
+        let tensors = layout
+            .blocks
+            .iter()
+            .filter(|b| take(&b.name))
+            .map(|b| (b.name.clone(), (b.shape.clone(), params[b.range.clone()].to_vec())))
+            .collect();
+        Self { tensors, notes: BTreeMap::new() }
+    }
+
+    /// Copies every block for which `take` holds into `params`. Refuses, before anything is written, a block that
+    /// is missing here, has another shape, or holds a number that is not finite.
+    pub fn load(
+        &self,
+        place: &str,
+        layout: &Layout,
+        params: &mut [f32],
+        take: impl Fn(&str) -> bool,
+    ) -> Result<InitReport> {
+        let mut report = InitReport::default();
+        for b in &layout.blocks {
+            if !take(&b.name) {
+                report.fresh.push((b.name.clone(), "not asked for".into()));
+                continue;
+            }
+            let Some((shape, data)) = self.tensors.get(&b.name) else {
+                return Err(Error::invalid(place, &b.name, "nothing", format!("a tensor of shape {:?}", b.shape)));
+            };
+            if *shape != b.shape {
+                return Err(Error::invalid(
+                    place,
+                    &b.name,
+                    format!("shape {shape:?}"),
+                    format!("shape {:?} as this pipeline has it", b.shape),
+                ));
+            }
+            if let Some(x) = data.iter().find(|x| !x.is_finite()) {
+                return Err(Error::invalid(place, &b.name, x, "finite weights"));
+            }
+            report.loaded.push(b.name.clone());
+        }
+        for name in self.tensors.keys().filter(|n| !report.loaded.contains(n)) {
+            let why = if layout.find(name).is_some() { "not asked for" } else { "not in this pipeline" };
+            report.unused.push((name.clone(), why.into()));
+        }
+        for b in layout.blocks.iter().filter(|b| take(&b.name)) {
+            params[b.range.clone()].copy_from_slice(&self.tensors[&b.name].1);
+        }
+        Ok(report)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn layout() -> Layout {
+        Layout {
+            blocks: vec![
+                Block { name: "encoder.a".into(), shape: vec![2], range: 0..2 },
+                Block { name: "field.w".into(), shape: vec![2, 2], range: 2..6 },
+            ],
+        }
+    }
+
+    #[test]
+    fn weights_load_what_is_asked_for_and_say_what_is_not() {
+        let w = Weights::from_arena(&layout(), &[1.0, 2.0, 3.0, 4.0, 5.0, 6.0], |_| true);
+        let mut params = [0.0; 6];
+        let report = w.load("w", &layout(), &mut params, |n| n.starts_with("field")).unwrap();
+        assert_eq!(params, [0.0, 0.0, 3.0, 4.0, 5.0, 6.0]);
+        assert_eq!(report.loaded, ["field.w"]);
+        assert_eq!(report.unused[0].0, "encoder.a");
+    }
+
+    #[test]
+    fn another_shape_is_refused_before_anything_is_written() {
+        let mut w = Weights::from_arena(&layout(), &[1.0; 6], |_| true);
+        w.tensors.get_mut("field.w").unwrap().0 = vec![4];
+        let mut params = [0.0; 6];
+        let e = w.load("w.safetensors", &layout(), &mut params, |_| true).unwrap_err().to_string();
+        assert!(e.contains("field.w") && e.contains("[4]") && e.contains("[2, 2]"), "{e}");
+        assert_eq!(params, [0.0; 6]);
+    }
+
+    #[test]
+    fn retain_moves_every_part_alike() {
+        let mut a = Arena {
+            params: vec![0., 1., 2., 3.],
+            grads: vec![4., 5., 6., 7.],
+            first: vec![0.; 4],
+            second: vec![9., 8., 7., 6.],
+        };
+        a.retain(&[3..4, 0..2]);
+        assert_eq!(a.params, [3., 0., 1.]);
+        assert_eq!(a.second, [6., 9., 8.]);
+    }
+}

@@ -1,0 +1,136 @@
+//! A backend compiles a pipeline and does its work: training steps, evaluation at points, rendering of rays.
+
+use crate::error::Result;
+use crate::pipeline::{Model, Pipeline};
+use crate::stage::UnitRay;
+use serde::Serialize;
+
+/// A ray with its measured value, both scaled to what stages see.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct TrainRay {
+    /// The ray.
+    pub ray: UnitRay,
+    /// Measured line integral.
+    pub target: f32,
+}
+
+/// Penalty of the difference between predicted and measured.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub enum Loss {
+    /// `|d|`
+    L1,
+    /// `d²/2`
+    L2,
+    /// `d²/2` up to `delta`, then `delta·(|d| − delta/2)`.
+    Huber {
+        /// Where it becomes linear.
+        delta: f64,
+    },
+}
+
+impl Loss {
+    /// Value and derivative at `d`.
+    pub fn at(&self, d: f64) -> (f64, f64) {
+        match *self {
+            Loss::L1 => (d.abs(), if d == 0.0 { 0.0 } else { d.signum() }),
+            Loss::L2 => (0.5 * d * d, d),
+            Loss::Huber { delta } if d.abs() <= delta => (0.5 * d * d, d),
+            Loss::Huber { delta } => (delta * (d.abs() - 0.5 * delta), delta * d.signum()),
+        }
+    }
+}
+
+/// Isotropic total variation of the field over small blocks of neighbouring points.
+#[derive(Debug, Clone, Default, PartialEq)]
+pub struct TvBlocks {
+    /// Lowest corner of each block in the unit cube.
+    pub corners: Vec<[f32; 3]>,
+    /// Distance of neighbouring points along each axis, in cube sides.
+    pub spacing: [f32; 3],
+    /// Points along a block's edge, at least 2.
+    pub edge: usize,
+    /// Weight of the mean over points in the loss.
+    pub weight: f64,
+    /// The variation below which the penalty is quadratic, so that it has a derivative at 0.
+    pub smoothing: f64,
+}
+
+/// What a step learns from. Each part's loss is a mean over its entries; parts add.
+#[derive(Debug, Clone)]
+pub struct Work<'a> {
+    /// Which step this is; decides random sample positions together with `seed`.
+    pub step: u64,
+    /// Seed of the run.
+    pub seed: u64,
+    /// Penalty for rays and points.
+    pub loss: Loss,
+    /// Rays with measured line integrals.
+    pub rays: &'a [TrainRay],
+    /// Points of the unit cube with known attenuation.
+    pub points: &'a [([f32; 3], f32)],
+    /// Blocks for the total-variation prior.
+    pub tv: Option<&'a TvBlocks>,
+}
+
+/// What a step found.
+#[derive(Debug, Clone, Copy, Default, PartialEq, Serialize)]
+pub struct StepStats {
+    /// Mean penalty of rays and of points.
+    pub loss: f64,
+    /// Weighted total variation.
+    pub prior: f64,
+    /// Samples evaluated.
+    pub samples: u64,
+    /// Seconds in forward and in the backward passes of dense stages.
+    pub dense_s: f64,
+    /// Seconds in gradients of scattered parameters.
+    pub scatter_s: f64,
+}
+
+/// Adam's settings for one step.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Adam {
+    /// Learning rate of this step.
+    pub lr: f64,
+    /// Decay of the first moment.
+    pub beta1: f64,
+    /// Decay of the second moment.
+    pub beta2: f64,
+    /// Added to the root of the second moment.
+    pub eps: f64,
+    /// Steps taken, this one included.
+    pub step: u64,
+}
+
+/// What a backend made of a pipeline, for people.
+#[derive(Debug, Clone, Default, PartialEq, Serialize)]
+pub struct Explain {
+    /// Name of the backend, with the instruction set or device.
+    pub backend: String,
+    /// One line a decision.
+    pub notes: Vec<String>,
+    /// Bytes beyond model and scan.
+    pub scratch_bytes: usize,
+}
+
+/// Makes a pipeline ready to run.
+pub trait Backend: Send + Sync {
+    /// Its name on the command line.
+    fn name(&self) -> &'static str;
+    /// Checks that every stage can run here and says how; never falls back silently.
+    fn compile(&self, pipeline: &Pipeline) -> Result<(Box<dyn Executable>, Explain)>;
+}
+
+/// A compiled pipeline. After a mask changed the pipeline, compile again.
+pub trait Executable: Send {
+    /// Gradients of `work`'s loss, written over the arena's gradients.
+    fn step(&mut self, model: &mut Model, work: &Work<'_>) -> Result<StepStats>;
+    /// One Adam step with the arena's gradients.
+    fn update(&mut self, model: &mut Model, adam: &Adam) -> Result<()>;
+    /// The field at `points` of the unit cube.
+    fn evaluate(&mut self, model: &Model, points: &[[f32; 3]], out: &mut [f32]) -> Result<()>;
+    /// The encoder's features at `points`, channel-major.
+    fn encode(&mut self, model: &Model, points: &[[f32; 3]]) -> Result<Vec<f32>>;
+    /// Line integrals of `rays`.
+    fn render(&mut self, model: &Model, rays: &[UnitRay], out: &mut [f32]) -> Result<()>;
+}

@@ -1,0 +1,83 @@
+//! The error that every crate of conefield returns.
+//!
+//! A message names the place (a file, a spec, a stage), the field, what was found and what was expected.
+
+use std::path::{Path, PathBuf};
+
+/// Everything that can go wrong, said in words that a user can act on.
+#[derive(Debug, thiserror::Error)]
+pub enum Error {
+    /// A value that cannot be used: where it stands, what it is, what would do.
+    #[error("{place}: {field}: found {found}, expected {expected}")]
+    Invalid {
+        /// File, spec or stage that holds the value.
+        place: String,
+        /// Name of the field, or path to it.
+        field: String,
+        /// What stands there.
+        found: String,
+        /// What would be accepted.
+        expected: String,
+    },
+    /// The operating system refused.
+    #[error("{}: {source}", path.display())]
+    Io {
+        /// The file or folder.
+        path: PathBuf,
+        /// The system's reason.
+        #[source]
+        source: std::io::Error,
+    },
+    /// Something was asked for that this build or this pipeline cannot do.
+    #[error("{what}: {why}")]
+    Unsupported {
+        /// What was asked for.
+        what: String,
+        /// Why not, and what to do instead.
+        why: String,
+    },
+    /// The run was interrupted by the user.
+    #[error("interrupted at step {step}")]
+    Interrupted {
+        /// The last finished step.
+        step: u64,
+    },
+    /// Training left the finite numbers.
+    #[error("training diverged at step {step}: {what}")]
+    Diverged {
+        /// The step at which it was seen.
+        step: u64,
+        /// What was not finite.
+        what: String,
+    },
+}
+
+/// Result with conefield's [`Error`].
+pub type Result<T, E = Error> = std::result::Result<T, E>;
+
+impl Error {
+    /// A value that cannot be used; see [`Error::Invalid`].
+    pub fn invalid(
+        place: impl Into<String>,
+        field: impl Into<String>,
+        found: impl ToString,
+        expected: impl Into<String>,
+    ) -> Self {
+        Self::Invalid { place: place.into(), field: field.into(), found: found.to_string(), expected: expected.into() }
+    }
+
+    /// A system error at `path`.
+    pub fn io(path: impl AsRef<Path>, source: std::io::Error) -> Self {
+        Self::Io { path: path.as_ref().to_path_buf(), source }
+    }
+
+    /// A thing that cannot be done, with the reason.
+    pub fn unsupported(what: impl Into<String>, why: impl Into<String>) -> Self {
+        Self::Unsupported { what: what.into(), why: why.into() }
+    }
+}
+
+/// Returns [`Error::Invalid`] unless `ok`.
+pub fn ensure(ok: bool, place: &str, field: &str, found: impl ToString, expected: impl Into<String>) -> Result<()> {
+    if ok { Ok(()) } else { Err(Error::invalid(place, field, found, expected)) }
+}

@@ -1,0 +1,348 @@
+//! Scan geometry: where source, detector and volume stand, in millimetres.
+//!
+//! World: right-handed, rotation axis z. On a circular orbit the source at angle `a` stands at
+//! `DSO·(cos a, sin a, 0)`, detector columns (u) run along `(-sin a, cos a, 0)` and detector rows (v) run
+//! towards −z. A view is stored as vectors, so that irregular orbits need nothing special.
+
+use crate::error::{Error, Result, ensure};
+use serde::{Deserialize, Serialize};
+
+/// A point or vector in the world, in millimetres.
+pub type Vec3 = [f64; 3];
+
+/// A length in millimetres.
+#[derive(Debug, Clone, Copy, PartialEq, PartialOrd, Serialize, Deserialize)]
+#[serde(transparent)]
+pub struct Millimetres(pub f64);
+
+/// An angle in radians.
+#[derive(Debug, Clone, Copy, PartialEq, PartialOrd, Serialize, Deserialize)]
+#[serde(transparent)]
+pub struct Radians(pub f64);
+
+/// One position of source and detector.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct View {
+    /// The X-ray source.
+    pub source: Vec3,
+    /// The centre of the detector (between the middle pixels where their number is even).
+    pub detector: Vec3,
+    /// From one pixel's centre to the next column's.
+    pub u: Vec3,
+    /// From one pixel's centre to the next row's.
+    pub v: Vec3,
+}
+
+impl View {
+    /// A view of a circular orbit: source at `dso·(cos a, sin a, 0)`, detector plane at distance `dsd` from the
+    /// source, pixels of `pixel = [rows, columns]`, detector shifted by `offset = [along v, along u]`.
+    pub fn circular(
+        angle: Radians,
+        dso: Millimetres,
+        dsd: Millimetres,
+        pixel: [Millimetres; 2],
+        offset: [Millimetres; 2],
+    ) -> Self {
+        let (s, c) = angle.0.sin_cos();
+        let u_dir = [-s, c, 0.0];
+        let v_dir = [0.0, 0.0, -1.0];
+        let back = dso.0 - dsd.0;
+        Self {
+            source: [dso.0 * c, dso.0 * s, 0.0],
+            detector: std::array::from_fn(|k| back * [c, s, 0.0][k] + offset[0].0 * v_dir[k] + offset[1].0 * u_dir[k]),
+            u: u_dir.map(|x| x * pixel[1].0),
+            v: v_dir.map(|x| x * pixel[0].0),
+        }
+    }
+
+    /// The point on the detector at the (possibly fractional) pixel `row`, `column` of a detector of `shape`
+    /// rows × columns; whole numbers are pixel centres.
+    pub fn pixel(&self, shape: [usize; 2], row: f64, column: f64) -> Vec3 {
+        let dv = row - (shape[0] as f64 - 1.0) / 2.0;
+        let du = column - (shape[1] as f64 - 1.0) / 2.0;
+        std::array::from_fn(|k| self.detector[k] + dv * self.v[k] + du * self.u[k])
+    }
+
+    /// The unit normal of the detector, pointing from the source towards it, and the distance between them.
+    pub fn normal(&self) -> (Vec3, f64) {
+        let n = cross(self.u, self.v);
+        let len = norm(n);
+        let n = n.map(|x| x / len);
+        let d = dot(n, sub(self.detector, self.source));
+        if d < 0.0 { (n.map(|x| -x), -d) } else { (n, d) }
+    }
+}
+
+/// The grid of voxels that is to be reconstructed.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct VoxelGrid {
+    /// Voxels along x, y, z.
+    pub shape: [usize; 3],
+    /// Voxel size in mm along x, y, z.
+    pub spacing: Vec3,
+    /// Centre of the grid in mm.
+    #[serde(default)]
+    pub center: Vec3,
+}
+
+impl VoxelGrid {
+    /// Side lengths in mm.
+    pub fn size(&self) -> Vec3 {
+        std::array::from_fn(|k| self.shape[k] as f64 * self.spacing[k])
+    }
+
+    /// Lower and upper corner of the box that the voxels fill.
+    pub fn bounds(&self) -> [Vec3; 2] {
+        let size = self.size();
+        [
+            std::array::from_fn(|k| self.center[k] - size[k] / 2.0),
+            std::array::from_fn(|k| self.center[k] + size[k] / 2.0),
+        ]
+    }
+
+    /// Centre of voxel `index`.
+    pub fn voxel(&self, index: [usize; 3]) -> Vec3 {
+        let lo = self.bounds()[0];
+        std::array::from_fn(|k| lo[k] + (index[k] as f64 + 0.5) * self.spacing[k])
+    }
+
+    /// Number of voxels, or `None` past what a `usize` holds.
+    pub fn len(&self) -> Option<usize> {
+        self.shape.iter().try_fold(1usize, |n, &s| n.checked_mul(s))
+    }
+
+    /// Whether there is no voxel.
+    pub fn is_empty(&self) -> bool {
+        self.shape.contains(&0)
+    }
+
+    /// Refuses empty grids, sizes past memory and spacings that are not positive and finite.
+    pub fn validate(&self, place: &str) -> Result<()> {
+        ensure(!self.is_empty(), place, "volume.shape", format!("{:?}", self.shape), "at least one voxel an axis")?;
+        ensure(
+            self.len().is_some_and(|n| n.checked_mul(8).is_some_and(|b| b <= isize::MAX as usize)),
+            place,
+            "volume.shape",
+            format!("{:?}", self.shape),
+            "a number of voxels that can be addressed",
+        )?;
+        ensure(
+            self.spacing.iter().all(|s| s.is_finite() && *s > 0.0),
+            place,
+            "volume.spacing",
+            format!("{:?}", self.spacing),
+            "positive finite millimetres",
+        )?;
+        ensure(
+            self.center.iter().all(|s| s.is_finite()),
+            place,
+            "volume.center",
+            format!("{:?}", self.center),
+            "finite millimetres",
+        )
+    }
+}
+
+/// Everything that relates a detector pixel to a ray through the volume.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub struct Geometry {
+    /// Detector rows (v) × columns (u).
+    pub detector: [usize; 2],
+    /// One entry a view, in the order of the projections.
+    pub views: Vec<View>,
+    /// The voxels to reconstruct.
+    pub volume: VoxelGrid,
+}
+
+/// A straight line from the source through the world: `origin + t·direction`, `t` in mm.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Ray {
+    /// The source.
+    pub origin: Vec3,
+    /// Unit vector towards the pixel.
+    pub direction: Vec3,
+}
+
+impl Ray {
+    /// Where the ray is inside the box `[lower, upper]`: `t` in mm, entry and exit, or `None` if it misses.
+    pub fn clip(&self, bounds: [Vec3; 2]) -> Option<[f64; 2]> {
+        let (mut near, mut far) = (0.0f64, f64::INFINITY);
+        for k in 0..3 {
+            let (o, d) = (self.origin[k], self.direction[k]);
+            if d == 0.0 {
+                if o < bounds[0][k] || o > bounds[1][k] {
+                    return None;
+                }
+                continue;
+            }
+            let (a, b) = ((bounds[0][k] - o) / d, (bounds[1][k] - o) / d);
+            near = near.max(a.min(b));
+            far = far.min(a.max(b));
+        }
+        (far > near).then_some([near, far])
+    }
+
+    /// The point at `t` mm from the origin.
+    pub fn at(&self, t: f64) -> Vec3 {
+        std::array::from_fn(|k| self.origin[k] + t * self.direction[k])
+    }
+}
+
+impl Geometry {
+    /// The ray from the source of `view` to the centre of pixel `row`, `column`.
+    pub fn ray(&self, view: usize, row: usize, column: usize) -> Ray {
+        let v = &self.views[view];
+        let d = sub(v.pixel(self.detector, row as f64, column as f64), v.source);
+        let len = norm(d);
+        Ray { origin: v.source, direction: d.map(|x| x / len) }
+    }
+
+    /// Number of measured values, or `None` past what a `usize` holds.
+    pub fn measurements(&self) -> Option<usize> {
+        self.views.len().checked_mul(self.detector[0])?.checked_mul(self.detector[1])
+    }
+
+    /// Every length times `factor`.
+    pub fn scaled(&self, factor: f64) -> Self {
+        let s = |v: Vec3| v.map(|x| x * factor);
+        Self {
+            detector: self.detector,
+            views: self
+                .views
+                .iter()
+                .map(|w| View { source: s(w.source), detector: s(w.detector), u: s(w.u), v: s(w.v) })
+                .collect(),
+            volume: VoxelGrid {
+                shape: self.volume.shape,
+                spacing: s(self.volume.spacing),
+                center: s(self.volume.center),
+            },
+        }
+    }
+
+    /// Refuses what no reconstruction can use: no views, no pixels, numbers that are not finite, a degenerate
+    /// detector, a source inside the volume.
+    pub fn validate(&self, place: &str) -> Result<()> {
+        self.volume.validate(place)?;
+        ensure(!self.views.is_empty(), place, "views", 0, "at least one view")?;
+        ensure(
+            self.detector[0] > 0 && self.detector[1] > 0,
+            place,
+            "detector",
+            format!("{:?}", self.detector),
+            "at least one row and one column",
+        )?;
+        ensure(
+            self.measurements().is_some_and(|n| n.checked_mul(8).is_some_and(|b| b <= isize::MAX as usize)),
+            place,
+            "detector",
+            format!("{} views of {:?}", self.views.len(), self.detector),
+            "a number of pixels that can be addressed",
+        )?;
+        let [lo, hi] = self.volume.bounds();
+        for (i, v) in self.views.iter().enumerate() {
+            let field = format!("views[{i}]");
+            let all = [v.source, v.detector, v.u, v.v];
+            ensure(
+                all.iter().flatten().all(|x| x.is_finite()),
+                place,
+                &field,
+                "a number that is not finite",
+                "finite millimetres",
+            )?;
+            ensure(
+                norm(cross(v.u, v.v)) > 0.0,
+                place,
+                &field,
+                "parallel or zero pixel axes",
+                "two independent detector axes",
+            )?;
+            ensure(
+                v.normal().1 > 0.0,
+                place,
+                &field,
+                "a source in the plane of the detector",
+                "a source before the detector",
+            )?;
+            if (0..3).all(|k| v.source[k] > lo[k] && v.source[k] < hi[k]) {
+                return Err(Error::invalid(
+                    place,
+                    field,
+                    format!("a source at {:?} mm inside the volume", v.source),
+                    "a source outside the volume (check units and distances)",
+                ));
+            }
+        }
+        Ok(())
+    }
+}
+
+/// Scalar product.
+pub fn dot(a: Vec3, b: Vec3) -> f64 {
+    a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
+}
+
+/// Vector product.
+pub fn cross(a: Vec3, b: Vec3) -> Vec3 {
+    [a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]]
+}
+
+/// Difference `a − b`.
+pub fn sub(a: Vec3, b: Vec3) -> Vec3 {
+    std::array::from_fn(|k| a[k] - b[k])
+}
+
+/// Euclidean length.
+pub fn norm(a: Vec3) -> f64 {
+    dot(a, a).sqrt()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn mm(x: f64) -> Millimetres {
+        Millimetres(x)
+    }
+
+    fn geometry() -> Geometry {
+        Geometry {
+            detector: [4, 6],
+            views: vec![View::circular(Radians(0.0), mm(100.0), mm(150.0), [mm(2.0), mm(1.0)], [mm(0.0); 2])],
+            volume: VoxelGrid { shape: [8, 8, 8], spacing: [1.0; 3], center: [0.0; 3] },
+        }
+    }
+
+    #[test]
+    fn circular_view_follows_the_world_convention() {
+        let v = &geometry().views[0];
+        assert_eq!(v.source, [100.0, 0.0, 0.0]);
+        assert_eq!(v.detector, [-50.0, 0.0, 0.0]);
+        assert_eq!(v.u, [0.0, 1.0, 0.0]);
+        assert_eq!(v.v, [0.0, 0.0, -2.0]);
+        let (n, d) = v.normal();
+        assert_eq!((n, d), ([-1.0, 0.0, 0.0], 150.0));
+        // First pixel: half of 6 columns to the left, half of 4 rows up.
+        assert_eq!(v.pixel([4, 6], 0.0, 0.0), [-50.0, -2.5, 3.0]);
+    }
+
+    #[test]
+    fn a_clipped_ray_starts_and_ends_on_the_box() {
+        let g = geometry();
+        let r = Ray { origin: [100.0, 0.0, 0.0], direction: [-1.0, 0.0, 0.0] };
+        assert_eq!(r.clip(g.volume.bounds()), Some([96.0, 104.0]));
+        let miss = Ray { origin: [100.0, 10.0, 0.0], direction: [-1.0, 0.0, 0.0] };
+        assert_eq!(miss.clip(g.volume.bounds()), None);
+    }
+
+    #[test]
+    fn a_source_inside_the_volume_is_refused() {
+        let mut g = geometry();
+        assert!(g.validate("test").is_ok());
+        g.views[0].source = [1.0, 0.0, 0.0];
+        let e = g.validate("scan.toml").unwrap_err().to_string();
+        assert!(e.contains("scan.toml") && e.contains("views[0]") && e.contains("inside the volume"), "{e}");
+    }
+}

@@ -1,0 +1,24 @@
+//! The contracts that conefield's stages, backends and solvers meet at.
+//!
+//! - [`geometry`], [`scan`]: what was measured, in millimetres.
+//! - [`simd`], [`dense`], [`stage`]: what a stage computes and how.
+//! - [`arena`]: parameters, gradients and optimizer state under their names.
+//! - [`spec`], [`registry`]: what a user writes, and the stage types that it may name.
+//! - [`pipeline`], [`backend`], [`solver`]: from a spec to a volume.
+
+pub mod arena;
+pub mod backend;
+pub mod dense;
+pub mod error;
+pub mod geometry;
+pub mod pipeline;
+pub mod random;
+pub mod registry;
+pub mod scan;
+pub mod scene;
+pub mod simd;
+pub mod solver;
+pub mod spec;
+pub mod stage;
+
+pub use error::{Error, Result};

@@ -1,0 +1,189 @@
+//! A pipeline: encoder, normalizers and field, built and checked, with the layout of their parameters.
+
+use crate::arena::{Arena, Block, Layout};
+use crate::error::{Result, ensure};
+use crate::spec::Spec;
+use crate::stage::{Encoder, Field, Info, Mask, Normalizer, Probe, Projector, Scope, Stage};
+use std::ops::Range;
+
+/// The built stages of a spec, in order, with the arena's layout.
+pub struct Pipeline {
+    /// Points to features.
+    pub encoder: Box<dyn Encoder>,
+    /// Features to features.
+    pub normalizers: Vec<Box<dyn Normalizer>>,
+    /// Features to attenuation.
+    pub field: Box<dyn Field>,
+    /// Rays to samples.
+    pub projector: Box<dyn Projector>,
+    layout: Layout,
+    ranges: Vec<Range<usize>>,
+}
+
+/// A pipeline with its parameters.
+pub struct Model {
+    /// The stages.
+    pub pipeline: Pipeline,
+    /// Their parameters and what training needs beside them.
+    pub arena: Arena,
+}
+
+impl Pipeline {
+    /// Builds every stage of `spec` and refuses combinations that do not fit, before any parameter is allocated.
+    pub fn build(spec: &Spec) -> Result<Self> {
+        let need = |what: &str| crate::Error::invalid("spec", what, "nothing", format!("a table [{what}] with a type"));
+        let encoder = spec.encoder.as_ref().ok_or_else(|| need("encoder"))?.build()?;
+        let mut width = check("encoder", encoder.as_ref(), 3)?;
+        let mut normalizers = vec![];
+        for (i, n) in spec.normalizers.iter().enumerate() {
+            let n = n.build(width)?;
+            width = check(&format!("normalizers[{i}]"), n.as_ref(), width)?;
+            normalizers.push(n);
+        }
+        let field = spec.field.as_ref().ok_or_else(|| need("field"))?.build(width)?;
+        let out = check("field", field.as_ref(), width)?;
+        ensure(out == 1, "spec", "field", format!("{out} channels out"), "1, the attenuation")?;
+        let projector = spec.projector.as_ref().ok_or_else(|| need("projector"))?.build()?;
+        Ok(Self::assemble(encoder, normalizers, field, projector))
+    }
+
+    /// Puts built stages together; their widths must fit.
+    pub fn assemble(
+        encoder: Box<dyn Encoder>,
+        normalizers: Vec<Box<dyn Normalizer>>,
+        field: Box<dyn Field>,
+        projector: Box<dyn Projector>,
+    ) -> Self {
+        let mut p = Self { encoder, normalizers, field, projector, layout: Layout::default(), ranges: vec![] };
+        p.lay_out();
+        p
+    }
+
+    fn lay_out(&mut self) {
+        let mut blocks = vec![];
+        let mut ranges = vec![];
+        let mut start = 0;
+        for (name, stage) in self.stages() {
+            let end = start + stage.info().params;
+            for p in stage.parameters() {
+                let r = p.range();
+                blocks.push(Block {
+                    name: format!("{name}.{}", p.name),
+                    shape: p.shape,
+                    range: start + r.start..start + r.end,
+                });
+            }
+            ranges.push(start..end);
+            start = end;
+        }
+        self.layout = Layout { blocks };
+        self.ranges = ranges;
+    }
+
+    /// Encoder, normalizers and field with the names under which their parameters stand in the arena. A
+    /// normalizer is named by its place among those that have parameters, so that a mask beside it does not
+    /// change the names in a weights file.
+    pub fn stages(&self) -> Vec<(String, &dyn Stage)> {
+        let mut all: Vec<(String, &dyn Stage)> = vec![("encoder".into(), self.encoder.as_ref())];
+        let mut index = 0;
+        for n in &self.normalizers {
+            all.push((format!("normalizers.{index}"), n.as_ref()));
+            index += usize::from(n.info().params > 0);
+        }
+        all.push(("field".into(), self.field.as_ref()));
+        all
+    }
+
+    /// Names and places of every parameter.
+    pub fn layout(&self) -> &Layout {
+        &self.layout
+    }
+
+    /// Where each of [`Pipeline::stages`] has its parameters.
+    pub fn ranges(&self) -> &[Range<usize>] {
+        &self.ranges
+    }
+
+    /// The furthest that any stage looks.
+    pub fn scope(&self) -> Scope {
+        let ray = self.stages().iter().any(|(_, s)| s.info().scope == Scope::Ray);
+        if ray { Scope::Ray } else { Scope::Row }
+    }
+
+    /// Multiply-adds a sample, forward.
+    pub fn macs(&self) -> usize {
+        self.stages().iter().map(|(_, s)| s.info().macs).sum()
+    }
+
+    /// Removes the channels that normalizer `at` masked: stages before it compute only what is still read, stages
+    /// after it become narrower, and parameters that nothing reads leave the arena.
+    fn apply_mask(&mut self, at: usize, mask: &Mask, arena: &mut Arena) -> Result<()> {
+        let old = self.ranges.clone();
+        let mut kept: Vec<Vec<Range<usize>>> = vec![vec![]; old.len()];
+        let mut keep = mask.keep.clone();
+        for i in at..self.normalizers.len() {
+            let r = self.normalizers[i].keep_inputs(&keep)?;
+            self.normalizers[i] = r.stage;
+            kept[1 + i] = r.params;
+            keep = r.channels;
+        }
+        let r = self.field.keep_inputs(&keep)?;
+        self.field = r.stage;
+        kept[1 + self.normalizers.len()] = r.params;
+        let mut needed = mask.keep.clone();
+        for i in (0..at).rev() {
+            let r = self.normalizers[i].keep_outputs(&needed)?;
+            self.normalizers[i] = r.stage;
+            kept[1 + i] = r.params;
+            needed = r.channels;
+        }
+        let r = self.encoder.keep_outputs(&needed)?;
+        self.encoder = r.stage;
+        kept[0] = r.params;
+        let ranges: Vec<_> =
+            kept.iter().zip(&old).flat_map(|(k, o)| k.iter().map(|r| o.start + r.start..o.start + r.end)).collect();
+        arena.retain(&ranges);
+        self.lay_out();
+        debug_assert_eq!(arena.params.len(), self.layout.len());
+        Ok(())
+    }
+}
+
+impl Model {
+    /// A model with every parameter as its stage's own scheme makes it.
+    pub fn random(pipeline: Pipeline, seed: u64) -> Self {
+        let mut arena = Arena::new(pipeline.layout.len());
+        for ((i, (_, stage)), range) in pipeline.stages().into_iter().enumerate().zip(&pipeline.ranges) {
+            stage.init(
+                seed.wrapping_mul(0x9E37_79B9_7F4A_7C15).wrapping_add(i as u64),
+                &mut arena.params[range.clone()],
+            );
+        }
+        Self { pipeline, arena }
+    }
+
+    /// Lets every normalizer look at the encoder. Returns what was masked, for the log.
+    pub fn refresh(&mut self, probe: impl Fn(&Self) -> Box<dyn Probe + '_>) -> Result<Vec<String>> {
+        let mut reports = vec![];
+        for i in 0..self.pipeline.normalizers.len() {
+            let mask = {
+                let mut probe = probe(self);
+                self.pipeline.normalizers[i].refresh(probe.as_mut())?
+            };
+            if let Some(mask) = mask {
+                if mask.keep.len() < self.pipeline.normalizers[i].info().input {
+                    self.pipeline.apply_mask(i, &mask, &mut self.arena)?;
+                }
+                reports.push(mask.report);
+            }
+        }
+        Ok(reports)
+    }
+}
+
+fn check(name: &str, stage: &dyn Stage, width: usize) -> Result<usize> {
+    let Info { input, output, .. } = stage.info();
+    ensure(input == width, "spec", name, format!("{width} channels from the stage before"), format!("{input}"))?;
+    ensure(output > 0, "spec", name, "no channels out", "at least one")?;
+    Ok(output)
+}

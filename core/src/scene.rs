@@ -1,0 +1,131 @@
+//! The scene: between the world in millimetres and the unit cube that stages see.
+
+use crate::error::{Result, ensure};
+use crate::geometry::{Geometry, Ray, Vec3, VoxelGrid, dot, norm, sub};
+use crate::scan::Scan;
+use crate::spec;
+use crate::stage::UnitRay;
+
+/// Maps lengths to cube sides and attenuation to order one, by the scan alone.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Scene {
+    /// World position of the cube's lowest corner, mm.
+    pub origin: Vec3,
+    /// Side of the cube, mm.
+    pub side: f64,
+    /// The box to reconstruct, mm.
+    pub bounds: [Vec3; 2],
+    /// The voxels to export.
+    pub grid: VoxelGrid,
+    /// The attenuation that stages see as 1, in 1/mm.
+    pub attenuation: f64,
+    /// Half the diagonal of the volume in the plane of the orbit plus a small tolerance: the published sampling
+    /// range reaches this far before and behind the axis.
+    published_reach: f64,
+}
+
+impl Scene {
+    /// The scene of `scan` under the spec's settings.
+    pub fn new(scan: &Scan, settings: &spec::Scene) -> Result<Self> {
+        let grid = scan.geometry.volume;
+        let longest = grid.size().into_iter().fold(0.0, f64::max);
+        let attenuation = match settings.attenuation {
+            spec::AttenuationScale::Fixed(x) => {
+                ensure(x.is_finite() && x > 0.0, "spec", "scene.attenuation", x, "a positive finite number")?;
+                x / scan.unit.mm
+            }
+            spec::AttenuationScale::Scan => {
+                let top = top_projection(scan);
+                ensure(
+                    top > 0.0,
+                    "scan",
+                    "projections",
+                    "no positive line integral",
+                    "line integrals of an object, positive where it absorbs",
+                )?;
+                4.0 * top / longest
+            }
+        };
+        Self::with_attenuation(grid, settings, attenuation)
+    }
+
+    /// The scene around `grid` in which `attenuation` (1/mm) counts as 1.
+    pub fn with_attenuation(grid: VoxelGrid, settings: &spec::Scene, attenuation: f64) -> Result<Self> {
+        let fill = settings.fill;
+        ensure(fill > 0.0 && fill <= 1.0, "spec", "scene.fill", fill, "a number above 0 and at most 1")?;
+        let size = grid.size();
+        let longest = size.into_iter().fold(0.0, f64::max);
+        let side = longest / fill;
+        let bounds = grid.bounds();
+        Ok(Self {
+            origin: std::array::from_fn(|k| grid.center[k] - side / 2.0),
+            side,
+            bounds,
+            grid,
+            attenuation,
+            published_reach: size[0].hypot(size[1]) / 2.0 + 0.0125 * longest,
+        })
+    }
+
+    /// A world position in the unit cube.
+    pub fn to_unit(&self, p: Vec3) -> [f32; 3] {
+        std::array::from_fn(|k| ((p[k] - self.origin[k]) / self.side) as f32)
+    }
+
+    /// A ray in the unit cube, or `None` where it misses the reconstruction box. `axis` is the unit vector from
+    /// the source to the detector along which the published codes measure depth.
+    pub fn ray(&self, ray: &Ray, axis: Vec3) -> Option<UnitRay> {
+        let inside = ray.clip(self.bounds)?;
+        let depth = dot(ray.direction, axis);
+        let to_axis = dot(sub(self.grid.center, ray.origin), axis);
+        let s = self.side;
+        let near = ((to_axis - self.published_reach) / depth).max(0.0);
+        let far = (to_axis + self.published_reach) / depth;
+        Some(UnitRay {
+            origin: self.to_unit(ray.origin),
+            direction: ray.direction.map(|x| x as f32),
+            inside: inside.map(|t| (t / s) as f32),
+            published: [(near / s) as f32, (far / s) as f32],
+            per_mm: (1.0 / s) as f32,
+        })
+    }
+
+    /// The ray of a pixel of `geometry`.
+    pub fn pixel_ray(&self, geometry: &Geometry, view: usize, row: usize, column: usize) -> Option<UnitRay> {
+        self.ray(&geometry.ray(view, row, column), geometry.views[view].normal().0)
+    }
+
+    /// A line integral as stages see it: attenuations of order one over cube sides.
+    pub fn line_to_unit(&self, a: f32) -> f32 {
+        (f64::from(a) / (self.attenuation * self.side)) as f32
+    }
+
+    /// The line integral that stages see as 1.
+    pub fn line_scale(&self) -> f64 {
+        self.attenuation * self.side
+    }
+
+    /// Spacing of the voxels to export, in cube sides.
+    pub fn unit_spacing(&self) -> [f32; 3] {
+        std::array::from_fn(|k| (self.grid.spacing[k] / self.side) as f32)
+    }
+
+    /// Unit-cube position of a voxel's centre.
+    pub fn voxel(&self, index: [usize; 3]) -> [f32; 3] {
+        self.to_unit(self.grid.voxel(index))
+    }
+
+    /// Distance of the cube's centre from a view's source, mm.
+    pub fn distance(&self, source: Vec3) -> f64 {
+        norm(sub(self.grid.center, source))
+    }
+}
+
+/// The 99.5th percentile of the projections: the scan's own scale, hardly moved by single hot pixels.
+fn top_projection(scan: &Scan) -> f64 {
+    let mut all: Vec<f32> =
+        scan.projections.iter().copied().step_by((scan.projections.len() / 1_000_000).max(1)).collect();
+    let k = ((all.len() as f64 * 0.995) as usize).min(all.len() - 1);
+    let (_, x, _) = all.select_nth_unstable_by(k, f32::total_cmp);
+    f64::from(*x)
+}

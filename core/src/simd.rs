@@ -1,0 +1,264 @@
+//! One source for every precision and instruction set.
+//!
+//! A kernel is written once over a number type [`Real`] (`f32` for work, `f64` for checking gradients) and a SIMD
+//! token `S`; [`run`] picks the best instruction set of the machine at run time.
+
+use fearless_simd::Bytes;
+pub use fearless_simd::{Level, Select, Simd, SimdBase, SimdFloat, SimdFloatElement};
+use std::fmt::{Debug, Display};
+use std::iter::Sum;
+use std::ops::{Add, AddAssign, Div, Mul, MulAssign, Sub, SubAssign};
+use std::sync::OnceLock;
+
+/// A native vector of `R` under the token `S`.
+pub type V<S, R> = <R as SimdFloatElement>::Native<S>;
+
+/// The numbers that stages compute with.
+pub trait Real:
+    SimdFloatElement
+    + Copy
+    + Default
+    + Debug
+    + Display
+    + PartialOrd
+    + Send
+    + Sync
+    + Add<Output = Self>
+    + Sub<Output = Self>
+    + Mul<Output = Self>
+    + Div<Output = Self>
+    + AddAssign
+    + SubAssign
+    + MulAssign
+    + Sum
+    + 'static
+{
+    /// 0.
+    const ZERO: Self;
+    /// 1.
+    const ONE: Self;
+    /// The nearest number to `x`.
+    fn of(x: f64) -> Self;
+    /// As `f64`, exactly.
+    fn f64(self) -> f64;
+    /// Largest whole number not above.
+    fn floor(self) -> Self;
+    /// As a signed whole number, towards zero, saturating.
+    fn int(self) -> i64;
+    /// Whether neither infinite nor NaN.
+    fn finite(self) -> bool;
+    /// Exponential of every lane.
+    fn exp_lanes<S: Simd>(s: S, x: V<S, Self>) -> V<S, Self>;
+    /// Distribution function and density of the standard normal, `(Φ(x), φ(x))`, of every lane.
+    /// `f32`: |error| < 2e-7, by Abramowitz & Stegun 7.1.26, which shares its exponential with φ.
+    fn normal_lanes<S: Simd>(s: S, x: V<S, Self>) -> (V<S, Self>, V<S, Self>);
+    /// Sine and cosine.
+    fn sin_cos(self) -> (Self, Self);
+    /// Natural logarithm of `1 + exp(x)` without overflow.
+    fn softplus(self) -> Self;
+}
+
+impl Real for f32 {
+    const ZERO: Self = 0.0;
+    const ONE: Self = 1.0;
+    #[inline(always)]
+    fn of(x: f64) -> Self {
+        x as f32
+    }
+    #[inline(always)]
+    fn f64(self) -> f64 {
+        f64::from(self)
+    }
+    #[inline(always)]
+    fn floor(self) -> Self {
+        f32::floor(self)
+    }
+    #[inline(always)]
+    fn int(self) -> i64 {
+        self as i64
+    }
+    #[inline(always)]
+    fn finite(self) -> bool {
+        self.is_finite()
+    }
+    #[inline(always)]
+    fn exp_lanes<S: Simd>(s: S, x: V<S, Self>) -> V<S, Self> {
+        // Range reduction to |r| ≤ ln2/2, then a degree-6 polynomial (relative error 2e-7), then the exponent's bits.
+        let x = x.max(S::f32s::splat(s, -87.0)).min(S::f32s::splat(s, 88.0));
+        let n = (x * std::f32::consts::LOG2_E).round_ties_even();
+        let r = n.mul_add(S::f32s::splat(s, -0.693_359_4), x);
+        let r = n.mul_add(S::f32s::splat(s, 2.121_944_4e-4), r);
+        let mut p = S::f32s::splat(s, 1.388_889e-3);
+        for c in [8.333_334e-3, 4.166_666_8e-2, 1.666_666_7e-1, 0.5, 1.0, 1.0] {
+            p = p.mul_add(r, S::f32s::splat(s, c));
+        }
+        let bits: S::i32s = n.to_int();
+        let scale: S::f32s = ((bits + 127) << 23).bitcast();
+        p * scale
+    }
+    #[inline(always)]
+    fn normal_lanes<S: Simd>(s: S, x: V<S, Self>) -> (V<S, Self>, V<S, Self>) {
+        let one = S::f32s::splat(s, 1.0);
+        let z = x.abs() * std::f32::consts::FRAC_1_SQRT_2;
+        let e = Self::exp_lanes(s, z * z * -1.0);
+        let d = z.mul_add(S::f32s::splat(s, 0.327_591_1), one);
+        let t = d.approximate_recip();
+        let t = t * (S::f32s::splat(s, 2.0) - d * t);
+        let mut p = S::f32s::splat(s, 1.061_405_4);
+        for c in [-1.453_152, 1.421_413_8, -0.284_496_74, 0.254_829_6] {
+            p = p.mul_add(t, S::f32s::splat(s, c));
+        }
+        let tail = p * t * e * 0.5;
+        let cdf = x.simd_ge(S::f32s::splat(s, 0.0)).select(one - tail, tail);
+        (cdf, e * 0.398_942_3)
+    }
+    #[inline(always)]
+    fn sin_cos(self) -> (Self, Self) {
+        f32::sin_cos(self)
+    }
+    #[inline(always)]
+    fn softplus(self) -> Self {
+        self.max(0.0) + (-self.abs()).exp().ln_1p()
+    }
+}
+
+impl Real for f64 {
+    const ZERO: Self = 0.0;
+    const ONE: Self = 1.0;
+    #[inline(always)]
+    fn of(x: f64) -> Self {
+        x
+    }
+    #[inline(always)]
+    fn f64(self) -> f64 {
+        self
+    }
+    #[inline(always)]
+    fn floor(self) -> Self {
+        f64::floor(self)
+    }
+    #[inline(always)]
+    fn int(self) -> i64 {
+        self as i64
+    }
+    #[inline(always)]
+    fn finite(self) -> bool {
+        self.is_finite()
+    }
+    #[inline(always)]
+    fn exp_lanes<S: Simd>(_: S, mut x: V<S, Self>) -> V<S, Self> {
+        x.as_mut_slice().iter_mut().for_each(|v| *v = v.exp());
+        x
+    }
+    #[inline(always)]
+    fn normal_lanes<S: Simd>(_: S, x: V<S, Self>) -> (V<S, Self>, V<S, Self>) {
+        let (mut cdf, mut pdf) = (x, x);
+        for (c, p) in cdf.as_mut_slice().iter_mut().zip(pdf.as_mut_slice()) {
+            let x = *c;
+            *c = 0.5 * libm::erfc(-x * std::f64::consts::FRAC_1_SQRT_2);
+            *p = (-0.5 * x * x).exp() * 0.398_942_280_401_432_7;
+        }
+        (cdf, pdf)
+    }
+    #[inline(always)]
+    fn sin_cos(self) -> (Self, Self) {
+        f64::sin_cos(self)
+    }
+    #[inline(always)]
+    fn softplus(self) -> Self {
+        self.max(0.0) + (-self.abs()).exp().ln_1p()
+    }
+}
+
+/// A piece of work that is compiled for every instruction set. `call` must be `#[inline(always)]`.
+pub trait Op {
+    /// What the work returns.
+    type Out;
+    /// Does the work with the instructions that `s` stands for.
+    fn call<S: Simd>(self, s: S) -> Self::Out;
+}
+
+/// Runs `op` with the best instruction set of this machine, or the one that `CONEFIELD_SIMD` names
+/// (`avx512`, `avx2`, `sse4.2`, `baseline`) where the machine has it.
+#[inline]
+pub fn run<O: Op>(op: O) -> O::Out {
+    fearless_simd::dispatch!(level(), s => op.call(s))
+}
+
+/// The instruction set that [`run`] uses.
+pub fn level() -> Level {
+    static LEVEL: OnceLock<Level> = OnceLock::new();
+    *LEVEL.get_or_init(|| {
+        let best = Level::new();
+        #[cfg(target_arch = "x86_64")]
+        {
+            let wanted = match std::env::var("CONEFIELD_SIMD").as_deref() {
+                Ok("avx2") => best.as_avx2().map(Level::Avx2),
+                Ok("sse4.2") => best.as_sse4_2().map(Level::Sse4_2),
+                Ok("baseline") => best.as_sse2().map(Level::Sse2),
+                _ => None,
+            };
+            wanted.unwrap_or(best)
+        }
+        #[cfg(not(target_arch = "x86_64"))]
+        best
+    })
+}
+
+/// Up to a vector's worth of `x` from `at`; lanes past the end are 0.
+#[inline(always)]
+pub fn load<S: Simd, R: Real>(s: S, x: &[R], at: usize) -> V<S, R> {
+    let len = V::<S, R>::LEN;
+    if at + len <= x.len() {
+        V::<S, R>::from_slice(s, &x[at..at + len])
+    } else {
+        V::<S, R>::from_fn(s, |i| x.get(at + i).copied().unwrap_or(R::ZERO))
+    }
+}
+
+/// Stores the lanes of `v` that fit into `y` from `at`.
+#[inline(always)]
+pub fn store<S: Simd, R: Real>(v: V<S, R>, y: &mut [R], at: usize) {
+    let len = V::<S, R>::LEN;
+    if at + len <= y.len() {
+        v.store_slice(&mut y[at..at + len]);
+    } else {
+        let n = y.len() - at;
+        y[at..].copy_from_slice(&v.as_slice()[..n]);
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    struct Normal<'a, R>(&'a [R]);
+    impl<R: Real> Op for Normal<'_, R> {
+        type Out = Vec<[f64; 3]>;
+        #[inline(always)]
+        fn call<S: Simd>(self, s: S) -> Self::Out {
+            let mut out = vec![];
+            for i in (0..self.0.len()).step_by(V::<S, R>::LEN) {
+                let x = load(s, self.0, i);
+                let (c, p) = R::normal_lanes(s, x);
+                let e = R::exp_lanes(s, x);
+                for k in 0..V::<S, R>::LEN.min(self.0.len() - i) {
+                    out.push([c.as_slice()[k].f64(), p.as_slice()[k].f64(), e.as_slice()[k].f64()]);
+                }
+            }
+            out
+        }
+    }
+
+    #[test]
+    fn f32_normal_and_exp_agree_with_f64() {
+        let x: Vec<f64> = (-400..=400).map(|i| f64::from(i) * 0.025).collect();
+        let x32: Vec<f32> = x.iter().map(|&v| v as f32).collect();
+        let x64: Vec<f64> = x32.iter().map(|&v| f64::from(v)).collect();
+        for (i, (a, b)) in run(Normal(&x32)).iter().zip(run(Normal(&x64))).enumerate() {
+            assert!((a[0] - b[0]).abs() < 3e-7, "Φ({}) = {} not {}", x[i], a[0], b[0]);
+            assert!((a[1] - b[1]).abs() < 2e-7, "φ({}) = {} not {}", x[i], a[1], b[1]);
+            assert!((a[2] / b[2] - 1.0).abs() < 5e-7, "exp({}) = {} not {}", x[i], a[2], b[2]);
+        }
+    }
+}

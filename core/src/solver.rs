@@ -1,0 +1,132 @@
+//! A solver: scan in, volume out.
+
+use crate::backend::Backend;
+use crate::error::Result;
+use crate::pipeline::Model;
+use crate::scan::{Scan, Volume};
+use crate::spec::Spec;
+use serde::Serialize;
+
+/// What a solver works on.
+pub struct Job<'a> {
+    /// Views to learn from.
+    pub scan: &'a Scan,
+    /// Views kept aside, whose error is reported.
+    pub held_out: Option<&'a Scan>,
+    /// The volume sought, if known; it is only looked at, never learned from.
+    pub reference: Option<&'a Volume>,
+    /// The whole spec.
+    pub spec: &'a Spec,
+    /// Does the work.
+    pub backend: &'a dyn Backend,
+    /// Seed of everything random.
+    pub seed: u64,
+    /// Limits that the command line adds to the spec's.
+    pub limits: Limits,
+    /// Reads a weights file that the spec names.
+    pub weights: &'a dyn Fn(&str) -> Result<crate::arena::Weights>,
+}
+
+/// When to stop, whichever comes first.
+#[derive(Debug, Clone, Copy, Default, PartialEq)]
+pub struct Limits {
+    /// Steps (iterations).
+    pub steps: Option<u64>,
+    /// Seconds of training.
+    pub seconds: Option<f64>,
+}
+
+/// One line of `metrics.jsonl`.
+#[derive(Debug, Clone, Default, PartialEq, Serialize)]
+pub struct Record {
+    /// Finished steps.
+    pub step: u64,
+    /// Seconds of training so far (evaluation and export left out).
+    pub seconds: f64,
+    /// Mean loss since the last record.
+    pub loss: f64,
+    /// Mean weighted prior since the last record.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub prior: Option<f64>,
+    /// Learning rate.
+    pub lr: f64,
+    /// Training samples a second since the last record.
+    pub samples_per_s: f64,
+    /// Root mean square error of the held-out views' line integrals, over their largest value.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub held_out: Option<f64>,
+    /// PSNR against the reference over every 4th voxel an axis, dB.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub psnr: Option<f64>,
+    /// What else happened since the last record, e.g. channels masked.
+    #[serde(skip_serializing_if = "Vec::is_empty")]
+    pub events: Vec<String>,
+}
+
+/// Hears of a run's progress and may stop it.
+pub trait Observer {
+    /// After every step: finished share in [0, 1] and the seconds left by the solver's own estimate.
+    fn progress(&mut self, step: u64, share: f64, seconds_left: f64);
+    /// A record is due.
+    fn record(&mut self, record: &Record);
+    /// A sentence for the log.
+    fn note(&mut self, text: &str);
+    /// Whether to stop after this step.
+    fn cancelled(&self) -> bool {
+        false
+    }
+}
+
+/// Hears nothing.
+pub struct Silent;
+
+impl Observer for Silent {
+    fn progress(&mut self, _: u64, _: f64, _: f64) {}
+    fn record(&mut self, _: &Record) {}
+    fn note(&mut self, _: &str) {}
+}
+
+/// What a solver made.
+pub struct Solution {
+    /// The volume, in 1/unit of the scan.
+    pub volume: Volume,
+    /// The trained model, of solvers that have one.
+    pub model: Option<Model>,
+    /// Steps done.
+    pub steps: u64,
+    /// Seconds of training.
+    pub train_s: f64,
+    /// Seconds of export.
+    pub export_s: f64,
+    /// Training samples.
+    pub samples: u64,
+}
+
+/// Scan in, volume out.
+pub trait Solver: Send + Sync {
+    /// Does the whole job.
+    fn solve(&self, job: &Job<'_>, observer: &mut dyn Observer) -> Result<Solution>;
+
+    /// Trains the spec's field on a known volume, voxel by voxel, for weights that other scans reuse.
+    fn pretrain(&self, job: &PretrainJob<'_>, observer: &mut dyn Observer) -> Result<Model> {
+        let _ = (job, observer);
+        Err(crate::Error::unsupported(self.describe(), "this solver has nothing to pre-train"))
+    }
+
+    /// A line for `explain`.
+    fn describe(&self) -> String;
+}
+
+/// What pre-training works on.
+pub struct PretrainJob<'a> {
+    /// The known volumes, in any unit of attenuation.
+    pub volumes: &'a [Volume],
+    /// The whole spec.
+    pub spec: &'a Spec,
+    /// Does the work.
+    pub backend: &'a dyn Backend,
+    /// Seed of everything random.
+    pub seed: u64,
+    /// Limits that the command line adds to the spec's.
+    pub limits: Limits,
+}

@@ -1,0 +1,119 @@
+//! What a user writes: a pipeline spec. TOML or JSON, the same types.
+//!
+//! Every stage is a table with a `type`; its other keys are that type's settings. [`crate::registry`] lists the
+//! types; [`load`] reads files and says where a mistake stands.
+
+pub mod load;
+
+use crate::arena::{Arena, InitReport, Layout, Weights};
+use crate::error::Result;
+use crate::solver::Solver;
+use crate::stage::{Encoder, Field, Normalizer, Projector};
+use schemars::JsonSchema;
+use serde::{Deserialize, Serialize};
+
+/// A whole pipeline.
+#[derive(Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct Spec {
+    /// Short name, shown in tables.
+    #[serde(default)]
+    pub name: String,
+    /// What it is for, in a sentence.
+    #[serde(default)]
+    pub description: String,
+    /// How the scan is mapped to what stages see.
+    #[serde(default)]
+    pub scene: Scene,
+    /// Points to features.
+    pub encoder: Option<Box<dyn EncoderSpec>>,
+    /// Features to features, in order.
+    #[serde(default)]
+    pub normalizers: Vec<Box<dyn NormalizerSpec>>,
+    /// Features to attenuation.
+    pub field: Option<Box<dyn FieldSpec>>,
+    /// Rays to samples.
+    pub projector: Option<Box<dyn ProjectorSpec>>,
+    /// Where weights come from.
+    pub initializer: Option<Box<dyn InitializerSpec>>,
+    /// Scan to volume.
+    pub solver: Box<dyn SolverSpec>,
+}
+
+/// How the scan is mapped to the unit cube and to attenuations of order one.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
+#[serde(deny_unknown_fields, default)]
+pub struct Scene {
+    /// Share of the unit cube's side that the longest side of the volume fills, in (0, 1]. Published codes leave
+    /// most of the cube empty; 1 spends every cell on the volume.
+    pub fill: f64,
+    /// The attenuation that stages see as 1.
+    pub attenuation: AttenuationScale,
+}
+
+impl Default for Scene {
+    fn default() -> Self {
+        Self { fill: 1.0, attenuation: AttenuationScale::Scan }
+    }
+}
+
+/// The attenuation that stages see as 1.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize, JsonSchema)]
+#[serde(rename_all = "kebab-case")]
+pub enum AttenuationScale {
+    /// Four times the mean attenuation of the most absorbing rays over the volume's longest side: from the scan
+    /// alone, so that the result does not depend on units.
+    Scan,
+    /// A value in the scan's own unit (1/unit).
+    Fixed(f64),
+}
+
+/// Settings of an encoder.
+#[typetag::serde(tag = "type")]
+pub trait EncoderSpec: Send + Sync {
+    /// The stage, or why the settings make none.
+    fn build(&self) -> Result<Box<dyn Encoder>>;
+}
+
+/// Settings of a normalizer.
+#[typetag::serde(tag = "type")]
+pub trait NormalizerSpec: Send + Sync {
+    /// The stage for features of `width` channels.
+    fn build(&self, width: usize) -> Result<Box<dyn Normalizer>>;
+}
+
+/// Settings of a field.
+#[typetag::serde(tag = "type")]
+pub trait FieldSpec: Send + Sync {
+    /// The stage for features of `width` channels.
+    fn build(&self, width: usize) -> Result<Box<dyn Field>>;
+}
+
+/// Settings of a projector.
+#[typetag::serde(tag = "type")]
+pub trait ProjectorSpec: Send + Sync {
+    /// The stage.
+    fn build(&self) -> Result<Box<dyn Projector>>;
+}
+
+/// Settings of an initializer.
+#[typetag::serde(tag = "type")]
+pub trait InitializerSpec: Send + Sync {
+    /// The stage. `weights` reads a weights file that the settings name.
+    fn build(&self, weights: &dyn Fn(&str) -> Result<Weights>) -> Result<Box<dyn Initializer>>;
+}
+
+/// Settings of a solver.
+#[typetag::serde(tag = "type")]
+pub trait SolverSpec: Send + Sync {
+    /// The solver.
+    fn build(&self) -> Result<Box<dyn Solver>>;
+}
+
+/// Brings named weights into the arena.
+pub trait Initializer: Send + Sync {
+    /// Fills what it fills (the stages' own random scheme has run before) and reports it.
+    fn apply(&self, layout: &Layout, arena: &mut Arena) -> Result<InitReport>;
+    /// A line for `explain`.
+    fn describe(&self) -> String;
+}

@@ -1,0 +1,1 @@
+//! Reading specs: layers, `--set`, and errors that say where.

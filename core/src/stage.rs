@@ -1,0 +1,344 @@
+//! What a stage is: a validated, immutable set of settings with a forward and a hand-written backward pass over
+//! tiles of rows.
+//!
+//! A tile is channel-major: channel `c` of row `i` stands at `c·rows + i`. Rows are samples, in ray-major order.
+
+use crate::error::{Error, Result};
+use crate::simd::Real;
+use std::ops::Range;
+
+/// Rows that the host puts into a tile at most. A stage must accept any number from 1 up.
+pub const TILE_ROWS: usize = 256;
+
+/// Channels of some rows, read-only.
+#[derive(Debug, Clone, Copy)]
+pub struct Tile<'a, R> {
+    /// `[width][rows]`.
+    pub data: &'a [R],
+    /// Rows, at least 1.
+    pub rows: usize,
+}
+
+impl<'a, R> Tile<'a, R> {
+    /// A tile over `data`, whose length is a multiple of `rows`.
+    pub fn new(data: &'a [R], rows: usize) -> Self {
+        debug_assert!(rows > 0 && data.len() % rows == 0);
+        Self { data, rows }
+    }
+
+    /// Channels.
+    pub fn width(&self) -> usize {
+        self.data.len() / self.rows
+    }
+
+    /// One channel.
+    #[inline(always)]
+    pub fn channel(&self, c: usize) -> &'a [R] {
+        &self.data[c * self.rows..(c + 1) * self.rows]
+    }
+
+    /// Some neighbouring channels.
+    #[inline(always)]
+    pub fn channels(&self, c: Range<usize>) -> &'a [R] {
+        &self.data[c.start * self.rows..c.end * self.rows]
+    }
+}
+
+/// Channels of some rows, to be written.
+#[derive(Debug)]
+pub struct TileMut<'a, R> {
+    /// `[width][rows]`.
+    pub data: &'a mut [R],
+    /// Rows, at least 1.
+    pub rows: usize,
+}
+
+impl<'a, R> TileMut<'a, R> {
+    /// A tile over `data`, whose length is a multiple of `rows`.
+    pub fn new(data: &'a mut [R], rows: usize) -> Self {
+        debug_assert!(rows > 0 && data.len() % rows == 0);
+        Self { data, rows }
+    }
+
+    /// Channels.
+    pub fn width(&self) -> usize {
+        self.data.len() / self.rows
+    }
+
+    /// One channel.
+    #[inline(always)]
+    pub fn channel(&mut self, c: usize) -> &mut [R] {
+        &mut self.data[c * self.rows..(c + 1) * self.rows]
+    }
+}
+
+/// The part of a stage's gradient that a call of [`Kernel::backward`] adds to.
+#[derive(Debug)]
+pub struct Grads<'a, R> {
+    /// Gradients of the parameters `range`, which starts at parameter `range.start` of the stage.
+    pub values: &'a mut [R],
+    /// Which parameters of the stage these are. A kernel leaves the others alone.
+    pub range: Range<usize>,
+}
+
+impl<'a, R> Grads<'a, R> {
+    /// Gradients of every parameter of a stage.
+    pub fn all(values: &'a mut [R]) -> Self {
+        let range = 0..values.len();
+        Self { values, range }
+    }
+}
+
+/// How far the result of a row may look.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, serde::Serialize)]
+#[serde(rename_all = "kebab-case")]
+pub enum Scope {
+    /// Its own row only.
+    Row,
+    /// The rows of its ray.
+    Ray,
+}
+
+/// How a stage's parameters receive gradients.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, serde::Serialize)]
+#[serde(rename_all = "kebab-case")]
+pub enum GradKind {
+    /// It has no parameters.
+    None,
+    /// Few parameters, every one touched by every row: each worker sums its own copy, copies are merged in order.
+    Dense,
+    /// Many parameters, few touched by a row: workers own disjoint ranges ([`Stage::partition`]) and go through
+    /// the rows in order, so that no copy and no atomic is needed and sums have one order.
+    Scatter,
+}
+
+/// All that a planner needs to know of a stage.
+#[derive(Debug, Clone, PartialEq, serde::Serialize)]
+pub struct Info {
+    /// Channels in.
+    pub input: usize,
+    /// Channels out.
+    pub output: usize,
+    /// Parameters.
+    pub params: usize,
+    /// Numbers a row that forward leaves for backward.
+    pub tape: usize,
+    /// How far a row looks.
+    pub scope: Scope,
+    /// How gradients arrive.
+    pub grads: GradKind,
+    /// Multiply-adds a row, forward.
+    pub macs: usize,
+    /// Output equals input: hosts leave the stage out.
+    pub identity: bool,
+}
+
+/// One named block of a stage's parameters.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct Parameter {
+    /// Name within the stage, e.g. `0.weight`.
+    pub name: String,
+    /// Shape, row-major.
+    pub shape: Vec<usize>,
+    /// First parameter of the block within the stage.
+    pub start: usize,
+}
+
+impl Parameter {
+    /// Its place within the stage's parameters.
+    pub fn range(&self) -> Range<usize> {
+        self.start..self.start + self.shape.iter().product::<usize>()
+    }
+}
+
+/// The arithmetic of a stage in one precision.
+pub trait Kernel<R: Real>: Send + Sync {
+    /// `y = f(x; params)`. Fills `tape` (`[info.tape][rows]`) with what [`Kernel::backward`] needs.
+    fn forward(&self, params: &[R], x: Tile<'_, R>, y: TileMut<'_, R>, tape: TileMut<'_, R>);
+
+    /// Given `dy = ∂L/∂y`: *adds* `∂L/∂params` to `grads` and, where `dx` is given, overwrites it with `∂L/∂x`.
+    /// The order in which a parameter's gradient is summed must not depend on `grads.range`.
+    fn backward(
+        &self,
+        params: &[R],
+        x: Tile<'_, R>,
+        tape: Tile<'_, R>,
+        dy: Tile<'_, R>,
+        grads: Grads<'_, R>,
+        dx: Option<TileMut<'_, R>>,
+    );
+}
+
+/// Names for a stage's WGSL functions, unique in the composed kernel.
+#[derive(Debug, Clone)]
+pub struct Namer {
+    /// Prefix of every function that the fragment defines.
+    pub prefix: String,
+}
+
+/// A stage's WGSL: functions `{prefix}_fwd` and `{prefix}_bwd` that call accessors which the host generates.
+#[derive(Debug, Clone)]
+pub struct Fragment {
+    /// The functions.
+    pub source: String,
+    /// Workgroup memory that they need, in bytes.
+    pub workgroup_bytes: u32,
+}
+
+/// A map from rows of `info.input` channels to rows of `info.output` channels.
+pub trait Stage: Send + Sync {
+    /// Widths, counts and cost.
+    fn info(&self) -> Info;
+
+    /// Names and shapes of the parameters, in order, without gaps.
+    fn parameters(&self) -> Vec<Parameter>;
+
+    /// Fills `params` by the stage's own scheme, repeatable by `seed`.
+    fn init(&self, seed: u64, params: &mut [f32]);
+
+    /// The arithmetic that trains.
+    fn kernel(&self) -> &dyn Kernel<f32>;
+
+    /// The same formula in double precision, by which gradients are checked.
+    fn reference(&self) -> Option<&dyn Kernel<f64>> {
+        None
+    }
+
+    /// Disjoint ranges that cover the parameters of a [`GradKind::Scatter`] stage; each may be summed by a worker
+    /// of its own.
+    fn partition(&self) -> Vec<Range<usize>> {
+        vec![0..self.info().params]
+    }
+
+    /// The same formula for a GPU, or `None` where there is only the CPU.
+    fn wgsl(&self, _namer: &Namer) -> Option<Fragment> {
+        None
+    }
+
+    /// A line for `explain`, e.g. `10 levels x 2, 16 to 8192, tables of 2^19`.
+    fn describe(&self) -> String;
+}
+
+/// A stage without some of its channels, and what became of the rest.
+pub struct Reduced<S: ?Sized> {
+    /// The smaller stage.
+    pub stage: Box<S>,
+    /// Which of the old parameters it keeps, in its order.
+    pub params: Vec<Range<usize>>,
+    /// Which channels remain on the other side of the stage.
+    pub channels: Vec<usize>,
+}
+
+/// Points `[n, 3]` in the unit cube to features `[n, F]`.
+pub trait Encoder: Stage {
+    /// The encoder that computes only the outputs `keep` (ascending).
+    fn keep_outputs(&self, keep: &[usize]) -> Result<Reduced<dyn Encoder>> {
+        let _ = keep;
+        Err(Error::unsupported(self.describe(), "this encoder cannot leave out channels"))
+    }
+
+    /// Channels ordered from coarse to fine, which masks that drop "all finer" channels rely on.
+    fn coarse_to_fine(&self) -> bool {
+        false
+    }
+}
+
+/// A look at the encoder between steps.
+pub trait Probe {
+    /// The encoder's features at `points` (unit cube), channel-major `[F][n]`, for the channels still computed.
+    fn encode(&mut self, points: &[[f32; 3]]) -> Result<Vec<f32>>;
+    /// Voxels along x, y, z of the volume to be exported.
+    fn shape(&self) -> [usize; 3];
+    /// The unit-cube position of a voxel's centre.
+    fn voxel(&self, index: [usize; 3]) -> [f32; 3];
+    /// Finished passes over all views.
+    fn epoch(&self) -> f64;
+    /// Whether channels stand in order from coarse to fine.
+    fn coarse_to_fine(&self) -> bool;
+}
+
+/// What a normalizer found between steps.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Mask {
+    /// Channels that stay (of those still computed), ascending.
+    pub keep: Vec<usize>,
+    /// What was measured for each channel, for the log.
+    pub report: String,
+}
+
+/// Features `[n, F]` to features `[n, F]`.
+pub trait Normalizer: Stage {
+    /// Called before every step; `Some` removes channels for good.
+    fn refresh(&self, probe: &mut dyn Probe) -> Result<Option<Mask>> {
+        let _ = probe;
+        Ok(None)
+    }
+
+    /// The normalizer without the inputs that are not in `keep`: they are gone from its sums too.
+    fn keep_inputs(&self, keep: &[usize]) -> Result<Reduced<dyn Normalizer>>;
+
+    /// The normalizer that computes only the outputs `keep`; it may still need every input.
+    fn keep_outputs(&self, keep: &[usize]) -> Result<Reduced<dyn Normalizer>>;
+}
+
+/// Features `[n, F]` to attenuation `[n, 1]`.
+pub trait Field: Stage {
+    /// The field without the inputs that are not in `keep`.
+    fn keep_inputs(&self, keep: &[usize]) -> Result<Reduced<dyn Field>> {
+        let _ = keep;
+        Err(Error::unsupported(self.describe(), "this field cannot do without some of its inputs"))
+    }
+}
+
+/// A ray in the unit cube: `origin + t·direction`, where `t` counts cube sides.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct UnitRay {
+    /// Start.
+    pub origin: [f32; 3],
+    /// Unit vector.
+    pub direction: [f32; 3],
+    /// Entry into and exit from the reconstruction box, in cube sides.
+    pub inside: [f32; 2],
+    /// Beginning and end of the published sampling range (`near`, `far`), in cube sides.
+    pub published: [f32; 2],
+    /// Cube sides a millimetre.
+    pub per_mm: f32,
+}
+
+/// Samples of rays: positions and the lengths that they stand for.
+#[derive(Debug, Default, Clone)]
+pub struct Samples {
+    /// Positions in the unit cube.
+    pub points: Vec<[f32; 3]>,
+    /// `δ` of each sample in cube sides.
+    pub weights: Vec<f32>,
+}
+
+/// Rays to samples with weights.
+pub trait Projector: Send + Sync {
+    /// Samples that [`Projector::sample`] adds at most for `ray`.
+    fn max_samples(&self, ray: &UnitRay) -> usize;
+
+    /// Appends the samples of `ray`. `seed` decides random positions; `None` (rendering) means none are random.
+    fn sample(&self, ray: &UnitRay, seed: Option<u64>, out: &mut Samples);
+
+    /// Beer-Lambert: the line integral `Σ μᵢ δᵢ` of one ray.
+    fn integrate(&self, weights: &[f32], mu: &[f32]) -> f64 {
+        weights.iter().zip(mu).map(|(&w, &m)| f64::from(w) * f64::from(m)).sum()
+    }
+
+    /// The exact adjoint of [`Projector::integrate`]: `∂L/∂μᵢ = δᵢ·∂L/∂A`.
+    fn adjoint(&self, weights: &[f32], dline: f64, dmu: &mut [f32]) {
+        for (d, &w) in dmu.iter_mut().zip(weights) {
+            *d = (f64::from(w) * dline) as f32;
+        }
+    }
+
+    /// A line for `explain`.
+    fn describe(&self) -> String;
+
+    /// The same formula for a GPU.
+    fn wgsl(&self, _namer: &Namer) -> Option<Fragment> {
+        None
+    }
+}

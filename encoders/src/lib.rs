@@ -1,0 +1,1 @@
+//! Position encoders: hash grid, dense grid, frequency, concat

@@ -1,0 +1,1 @@
+//! Attenuation fields: MLP, voxel grid

@@ -1,0 +1,1 @@
+//! Initializers: random, mapping-consistency (MCI), checkpoint

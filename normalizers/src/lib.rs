@@ -1,0 +1,1 @@
+//! Normalizers between encoder and field: LayerNorm, FFT channel mask

@@ -1,0 +1,1 @@
+//! Solvers: gradient training and voxel-supervised pre-training
