@@ -17,6 +17,17 @@ pub struct Weights<'a, R> {
     pub column: usize,
 }
 
+/// What a product does with the numbers that stand in its output.
+#[derive(Clone, Copy, PartialEq, Eq)]
+pub enum Output {
+    /// Replaces them.
+    Set,
+    /// Adds to them.
+    Add,
+    /// Multiplies them: the chain rule through an activation whose derivative stands there.
+    Multiply,
+}
+
 /// `y = W[:, column..column + k]·x + bias`, or `y += …` without a bias.
 #[inline(always)]
 pub fn affine<S: Simd, R: Real>(s: S, w: Weights<'_, R>, bias: Option<&[R]>, x: &[R], y: &mut [R], n: usize) {
@@ -108,9 +119,9 @@ fn affine_block<S: Simd, R: Real, const M: usize, const C: usize>(
     }
 }
 
-/// `dx = W[:, column..column + k]ᵀ·dy`, or `dx += …` with `add`.
+/// `dx = W[:, column..column + k]ᵀ·dy`, set, added or multiplied into `dx`.
 #[inline(always)]
-pub fn affine_input<S: Simd, R: Real>(s: S, w: Weights<'_, R>, dy: &[R], dx: &mut [R], add: bool, n: usize) {
+pub fn affine_input<S: Simd, R: Real>(s: S, w: Weights<'_, R>, dy: &[R], dx: &mut [R], out: Output, n: usize) {
     let k = dx.len() / n;
     let len = V::<S, R>::LEN;
     let mut i = 0;
@@ -127,11 +138,11 @@ pub fn affine_input<S: Simd, R: Real>(s: S, w: Weights<'_, R>, dy: &[R], dx: &mu
             };
             let (w, dx) = (Weights { column: w.column + c, ..w }, &mut dx[c * n..(c + width) * n]);
             match (width, wide) {
-                (8, _) => input_block::<S, R, 8, 2>(s, w, dy, dx, add, n, i),
-                (4, true) => input_block::<S, R, 4, 2>(s, w, dy, dx, add, n, i),
-                (4, false) => input_block::<S, R, 4, 1>(s, w, dy, dx, add, n, i),
-                (_, true) => input_block::<S, R, 1, 2>(s, w, dy, dx, add, n, i),
-                (_, false) => input_block::<S, R, 1, 1>(s, w, dy, dx, add, n, i),
+                (8, _) => input_block::<S, R, 8, 2>(s, w, dy, dx, out, n, i),
+                (4, true) => input_block::<S, R, 4, 2>(s, w, dy, dx, out, n, i),
+                (4, false) => input_block::<S, R, 4, 1>(s, w, dy, dx, out, n, i),
+                (_, true) => input_block::<S, R, 1, 2>(s, w, dy, dx, out, n, i),
+                (_, false) => input_block::<S, R, 1, 1>(s, w, dy, dx, out, n, i),
             }
             c += width;
         }
@@ -145,14 +156,18 @@ fn input_block<S: Simd, R: Real, const K: usize, const C: usize>(
     w: Weights<'_, R>,
     dy: &[R],
     dx: &mut [R],
-    add: bool,
+    out: Output,
     n: usize,
     i: usize,
 ) {
     let len = V::<S, R>::LEN;
     let mut acc: [[V<S, R>; C]; K] = std::array::from_fn(|j| {
         std::array::from_fn(|c| {
-            if add { load(s, &dx[j * n..(j + 1) * n], i + c * len) } else { V::<S, R>::splat(s, R::ZERO) }
+            if out == Output::Add {
+                load(s, &dx[j * n..(j + 1) * n], i + c * len)
+            } else {
+                V::<S, R>::splat(s, R::ZERO)
+            }
         })
     });
     for (o, dy) in dy.chunks_exact(n).enumerate() {
@@ -167,7 +182,9 @@ fn input_block<S: Simd, R: Real, const K: usize, const C: usize>(
     }
     for j in 0..K {
         for c in 0..C {
-            store::<S, R>(acc[j][c], &mut dx[j * n..(j + 1) * n], i + c * len);
+            let dx = &mut dx[j * n..(j + 1) * n];
+            let v = if out == Output::Multiply { acc[j][c] * load(s, dx, i + c * len) } else { acc[j][c] };
+            store::<S, R>(v, dx, i + c * len);
         }
     }
 }
@@ -309,7 +326,7 @@ mod tests {
             let (mut dw, mut db) = (vec![R::ONE; w.len()], vec![R::ZERO; m]);
             let weights = Weights { data: w, ld, column };
             affine(s, weights, Some(&bias), x, &mut y, n);
-            affine_input(s, weights, dy, &mut dx, true, n);
+            affine_input(s, weights, dy, &mut dx, Output::Add, n);
             affine_weights(s, dy, x, &mut dw, ld, column, Some(&mut db), n);
             [y, dx, dw, db]
         }

@@ -156,13 +156,13 @@ pub trait Kernel<R: Real>: Send + Sync {
     /// `y = f(x; params)`. Fills `tape` (`[info.tape][rows]`) with what [`Kernel::backward`] needs.
     fn forward(&self, params: &[R], x: Tile<'_, R>, y: TileMut<'_, R>, tape: TileMut<'_, R>);
 
-    /// Given `dy = ∂L/∂y`: *adds* `∂L/∂params` to `grads` and, where `dx` is given, overwrites it with `∂L/∂x`.
+    /// `tape` holds what forward left and may be used as scratch. Given `dy = ∂L/∂y`: *adds* `∂L/∂params` to `grads` and, where `dx` is given, overwrites it with `∂L/∂x`.
     /// The order in which a parameter's gradient is summed must not depend on `grads.range`.
     fn backward(
         &self,
         params: &[R],
         x: Tile<'_, R>,
-        tape: Tile<'_, R>,
+        tape: TileMut<'_, R>,
         dy: Tile<'_, R>,
         grads: Grads<'_, R>,
         dx: Option<TileMut<'_, R>>,

@@ -1,1 +1,2 @@
 //! Position encoders: hash grid, dense grid, frequency, concat
+pub mod hash_grid;

@@ -1,0 +1,351 @@
+//! A spec as written: values that know where they stand.
+
+use crate::error::{Error, Result};
+use serde_json::{Number, Value};
+use std::fmt;
+use std::sync::Arc;
+use toml::de::{DeTable, DeValue};
+
+/// A place in a source: a file with line and column, or a `--set`.
+#[derive(Debug, Clone, PartialEq)]
+pub(super) struct At {
+    source: Arc<str>,
+    /// Line and column, from 1.
+    line: Option<(usize, usize)>,
+}
+
+impl At {
+    /// A source without lines.
+    pub(super) fn whole(source: impl Into<Arc<str>>) -> Self {
+        Self { source: source.into(), line: None }
+    }
+
+    /// The byte `offset` of `text`.
+    fn byte(source: &Arc<str>, text: &str, offset: usize) -> Self {
+        let before = &text.as_bytes()[..offset.min(text.len())];
+        let line = before.iter().filter(|b| **b == b'\n').count() + 1;
+        let column = String::from_utf8_lossy(before.rsplit(|b| *b == b'\n').next().unwrap_or_default()).chars().count();
+        Self { source: source.clone(), line: Some((line, column + 1)) }
+    }
+}
+
+impl fmt::Display for At {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.write_str(&self.source)?;
+        if let Some((line, column)) = self.line {
+            write!(f, ":{line}:{column}")?;
+        }
+        Ok(())
+    }
+}
+
+/// A value and its place.
+#[derive(Debug, Clone, PartialEq)]
+pub(super) struct Node {
+    pub(super) at: At,
+    pub(super) kind: Kind,
+}
+
+/// What a value is.
+#[derive(Debug, Clone, PartialEq)]
+pub(super) enum Kind {
+    Null,
+    Bool(bool),
+    Number(Number),
+    String(String),
+    Array(Vec<Node>),
+    Table(Vec<Entry>),
+}
+
+/// A key of a table with its value.
+#[derive(Debug, Clone, PartialEq)]
+pub(super) struct Entry {
+    pub(super) key: String,
+    /// Where the key stands.
+    pub(super) at: At,
+    pub(super) value: Node,
+}
+
+impl Node {
+    /// A table without entries.
+    pub(super) fn empty_table(at: At) -> Self {
+        Self { at, kind: Kind::Table(vec![]) }
+    }
+
+    /// The value of `key`, if this is a table that has it.
+    pub(super) fn get(&self, key: &str) -> Option<&Node> {
+        self.entries().iter().find(|e| e.key == key).map(|e| &e.value)
+    }
+
+    /// The entries of a table; none of anything else.
+    pub(super) fn entries(&self) -> &[Entry] {
+        match &self.kind {
+            Kind::Table(entries) => entries,
+            _ => &[],
+        }
+    }
+
+    /// Takes `key` out of a table.
+    pub(super) fn take(&mut self, key: &str) -> Option<Entry> {
+        match &mut self.kind {
+            Kind::Table(entries) => entries.iter().position(|e| e.key == key).map(|i| entries.remove(i)),
+            _ => None,
+        }
+    }
+
+    /// The text of a string.
+    pub(super) fn text(&self) -> Option<&str> {
+        match &self.kind {
+            Kind::String(s) => Some(s),
+            _ => None,
+        }
+    }
+
+    /// The deepest node on `path` that exists.
+    pub(super) fn nearest(&self, path: &[&str]) -> &Node {
+        let mut node = self;
+        for step in path {
+            let next = match &node.kind {
+                Kind::Array(items) => step.parse::<usize>().ok().and_then(|i| items.get(i)),
+                _ => node.get(step),
+            };
+            match next {
+                Some(n) => node = n,
+                None => break,
+            }
+        }
+        node
+    }
+
+    /// Lays `over` on top: tables merge, everything else is replaced. A table of another `type` replaces too, as
+    /// the keys of one type mean nothing to another.
+    pub(super) fn merge(&mut self, over: Node) {
+        let retyped = match (self.get("type"), over.get("type")) {
+            (Some(a), Some(b)) => a.text() != b.text(),
+            _ => false,
+        };
+        match (&mut self.kind, over.kind) {
+            (Kind::Table(base), Kind::Table(over_entries)) if !retyped => {
+                for e in over_entries {
+                    match base.iter_mut().find(|b| b.key == e.key) {
+                        Some(b) => {
+                            b.value.merge(e.value);
+                            b.at = e.at;
+                        }
+                        None => base.push(e),
+                    }
+                }
+                self.at = over.at;
+            }
+            (_, kind) => *self = Node { at: over.at, kind },
+        }
+    }
+
+    /// As a JSON value.
+    pub(super) fn to_json(&self) -> Value {
+        match &self.kind {
+            Kind::Null => Value::Null,
+            Kind::Bool(b) => Value::Bool(*b),
+            Kind::Number(n) => Value::Number(n.clone()),
+            Kind::String(s) => Value::String(s.clone()),
+            Kind::Array(items) => Value::Array(items.iter().map(Node::to_json).collect()),
+            Kind::Table(entries) => {
+                Value::Object(entries.iter().map(|e| (e.key.clone(), e.value.to_json())).collect())
+            }
+        }
+    }
+
+    /// For an error message: the value, or what it is where it is long.
+    pub(super) fn shown(&self) -> String {
+        match &self.kind {
+            Kind::Array(items) => format!("a list of {}", items.len()),
+            Kind::Table(_) => "a table".into(),
+            Kind::String(s) => format!("the text {s:?}"),
+            _ => self.to_json().to_string(),
+        }
+    }
+}
+
+/// Reads TOML.
+pub(super) fn parse_toml(source: &str, text: &str) -> Result<Node> {
+    let source: Arc<str> = source.into();
+    let root = DeTable::parse(text).map_err(|e| {
+        let at = At::byte(&source, text, e.span().map_or(0, |s| s.start));
+        Error::invalid(at.to_string(), "syntax", e.message().replace('\n', ", "), "TOML")
+    })?;
+    toml_table(&source, text, root.get_ref(), At::byte(&source, text, 0))
+}
+
+fn toml_table(source: &Arc<str>, text: &str, table: &DeTable<'_>, at: At) -> Result<Node> {
+    let mut entries = Vec::with_capacity(table.len());
+    for (key, value) in table {
+        entries.push(Entry {
+            key: key.get_ref().to_string(),
+            at: At::byte(source, text, key.span().start),
+            value: toml_value(source, text, value.get_ref(), At::byte(source, text, value.span().start))?,
+        });
+    }
+    Ok(Node { at, kind: Kind::Table(entries) })
+}
+
+fn toml_value(source: &Arc<str>, text: &str, value: &DeValue<'_>, at: At) -> Result<Node> {
+    let refuse = |found: &dyn fmt::Display, expected: &str| Error::invalid(at.to_string(), "value", found, expected);
+    let kind = match value {
+        DeValue::String(s) => Kind::String(s.to_string()),
+        DeValue::Boolean(b) => Kind::Bool(*b),
+        DeValue::Integer(i) => {
+            let n = i64::from_str_radix(i.as_str(), i.radix()).map(Number::from);
+            let n = n.or_else(|_| u64::from_str_radix(i.as_str(), i.radix()).map(Number::from));
+            Kind::Number(n.map_err(|_| refuse(i, "a whole number of at most 64 bits"))?)
+        }
+        DeValue::Float(f) => {
+            let n = f.as_str().parse().ok().and_then(Number::from_f64);
+            Kind::Number(n.ok_or_else(|| refuse(f, "a finite number"))?)
+        }
+        DeValue::Datetime(d) => return Err(refuse(d, "a number, a text, a list or a table; no setting is a date")),
+        DeValue::Array(items) => Kind::Array(
+            items
+                .iter()
+                .map(|v| toml_value(source, text, v.get_ref(), At::byte(source, text, v.span().start)))
+                .collect::<Result<_>>()?,
+        ),
+        DeValue::Table(t) => return toml_table(source, text, t, at),
+    };
+    Ok(Node { at, kind })
+}
+
+/// Reads JSON.
+pub(super) fn parse_json(source: &str, text: &str) -> Result<Node> {
+    let source: Arc<str> = source.into();
+    // serde_json checks syntax and depth; what follows only has to find its way through valid text.
+    serde_json::from_str::<Value>(text).map_err(|e| {
+        let at = At { source: source.clone(), line: Some((e.line(), e.column())) };
+        let why = e.to_string();
+        let why = why.split(" at line ").next().unwrap_or_default();
+        Error::invalid(at.to_string(), "syntax", why, "JSON")
+    })?;
+    let mut reader = Json { source, text, at: 0 };
+    reader.value()
+}
+
+/// Reads text that is known to be valid JSON.
+struct Json<'a> {
+    source: Arc<str>,
+    text: &'a str,
+    at: usize,
+}
+
+impl Json<'_> {
+    fn place(&self) -> At {
+        At::byte(&self.source, self.text, self.at)
+    }
+
+    fn peek(&mut self) -> u8 {
+        let rest = &self.text.as_bytes()[self.at..];
+        self.at += rest.iter().take_while(|b| b.is_ascii_whitespace()).count();
+        self.text.as_bytes().get(self.at).copied().unwrap_or(0)
+    }
+
+    /// Steps over `byte` if it is next.
+    fn eat(&mut self, byte: u8) -> bool {
+        let found = self.peek() == byte;
+        self.at += usize::from(found);
+        found
+    }
+
+    fn scalar<T: serde::de::DeserializeOwned>(&mut self, len: usize) -> Result<T> {
+        let at = self.place();
+        let piece = self.text.get(self.at..self.at + len).unwrap_or_default();
+        self.at += len;
+        serde_json::from_str(piece).map_err(|_| Error::invalid(at.to_string(), "value", piece, "a JSON value"))
+    }
+
+    fn string(&mut self) -> Result<String> {
+        self.peek();
+        let mut escaped = false;
+        let end = self.text.as_bytes()[self.at..].iter().skip(1).position(|&b| {
+            let ends = b == b'"' && !escaped;
+            escaped = b == b'\\' && !escaped;
+            ends
+        });
+        self.scalar(end.map_or(0, |n| n + 2))
+    }
+
+    fn value(&mut self) -> Result<Node> {
+        let next = self.peek();
+        let at = self.place();
+        let kind = match next {
+            b'{' => {
+                self.at += 1;
+                let mut entries: Vec<Entry> = vec![];
+                while !self.eat(b'}') {
+                    self.eat(b',');
+                    self.peek();
+                    let at = self.place();
+                    let key = self.string()?;
+                    if entries.iter().any(|e| e.key == key) {
+                        return Err(Error::invalid(at.to_string(), key, "the key a second time", "each key once"));
+                    }
+                    self.eat(b':');
+                    entries.push(Entry { key, at, value: self.value()? });
+                }
+                Kind::Table(entries)
+            }
+            b'[' => {
+                self.at += 1;
+                let mut items = vec![];
+                while !self.eat(b']') {
+                    self.eat(b',');
+                    items.push(self.value()?);
+                }
+                Kind::Array(items)
+            }
+            b'"' => Kind::String(self.string()?),
+            _ => {
+                let rest = &self.text.as_bytes()[self.at..];
+                let len = rest.iter().take_while(|b| !b",]}".contains(b) && !b.is_ascii_whitespace()).count();
+                match self.scalar(len)? {
+                    Value::Bool(b) => Kind::Bool(b),
+                    Value::Number(n) => Kind::Number(n),
+                    _ => Kind::Null,
+                }
+            }
+        };
+        Ok(Node { at, kind })
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn toml_and_json_read_alike_and_know_their_lines() {
+        let t = parse_toml("a.toml", "x = 1\n[b]\n  y = [2.5, \"é\"]\n").unwrap();
+        let j = parse_json("a.json", "{ \"x\": 1,\n \"b\": {\n\n \"y\": [2.5, \"\\u00e9\"] } }").unwrap();
+        assert_eq!(t.to_json(), j.to_json());
+        assert_eq!(t.nearest(&["b", "y", "1"]).at.to_string(), "a.toml:3:13");
+        assert_eq!(j.nearest(&["b", "y", "1"]).at.to_string(), "a.json:4:13");
+        assert_eq!(j.nearest(&["b", "z"]).at.to_string(), "a.json:2:7");
+    }
+
+    #[test]
+    fn syntax_errors_name_the_line() {
+        let e = parse_toml("a.toml", "x = 1\ny = = 2\n").unwrap_err().to_string();
+        assert!(e.starts_with("a.toml:2:"), "{e}");
+        let e = parse_json("a.json", "{\n \"x\": }").unwrap_err().to_string();
+        assert!(e.starts_with("a.json:2:"), "{e}");
+        let e = parse_json("a.json", "{ \"x\": 1,\n \"x\": 2}").unwrap_err().to_string();
+        assert!(e.starts_with("a.json:2:2: x: found the key a second time"), "{e}");
+        let e = parse_toml("a.toml", "x = nan").unwrap_err().to_string();
+        assert!(e.contains("a finite number"), "{e}");
+    }
+
+    #[test]
+    fn a_changed_type_drops_the_keys_of_the_old_one() {
+        let mut base = parse_toml("base", "[a]\ntype = 'one'\nk = 1\n[b]\ntype = 'one'\nk = 1\n").unwrap();
+        base.merge(parse_toml("over", "[a]\ntype = 'two'\n[b]\nl = 2\n").unwrap());
+        let want = serde_json::json!({"a": {"type": "two"}, "b": {"type": "one", "k": 1, "l": 2}});
+        assert_eq!(base.to_json(), want);
+    }
+}

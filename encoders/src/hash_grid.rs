@@ -1,0 +1,550 @@
+//! Multi-resolution hash grid (Müller et al. 2022, Instant Neural Graphics Primitives, section 3).
+//!
+//! Points `[n, 3]` in the unit cube to `[n, levels·features]`: on each level the features of the 8 corners of the
+//! point's cell, trilinearly interpolated. A level whose vertices fit the table is indexed directly, a finer one by
+//! `h(c) = (c_x·π₁ ⊕ c_y·π₂ ⊕ c_z·π₃) mod T` with products modulo 2³² by definition.
+
+use conefield_core::error::{Result, ensure};
+use conefield_core::random::{mix, unit};
+use conefield_core::simd::{Op, Real, Simd, run};
+use conefield_core::spec::EncoderSpec;
+use conefield_core::stage::{Encoder, GradKind, Grads, Info, Kernel, Parameter, Reduced, Scope, Stage, Tile, TileMut};
+use schemars::JsonSchema;
+use serde::{Deserialize, Serialize};
+use std::ops::Range;
+
+/// Which published hash a grid uses.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
+#[serde(rename_all = "kebab-case")]
+pub enum Convention {
+    /// torch-ngp's, which NAF, SAX-NeRF and NI-NeRF use: primes 1, 19349663, 83492791.
+    Naf,
+    /// The paper's (its equation 4): primes 1, 2654435761, 805459861.
+    InstantNgp,
+}
+
+impl Convention {
+    fn primes(self) -> [u32; 3] {
+        match self {
+            Self::Naf => [1, 19_349_663, 83_492_791],
+            Self::InstantNgp => [1, 2_654_435_761, 805_459_861],
+        }
+    }
+}
+
+/// Settings of `hash-grid`.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
+#[serde(deny_unknown_fields, default)]
+pub struct HashGrid {
+    /// Which published hash.
+    pub convention: Convention,
+    /// Levels, coarse to fine.
+    pub levels: usize,
+    /// Features a level: 1, 2, 4 or 8.
+    pub features: usize,
+    /// Cells along the cube's side on the coarsest level.
+    pub base_resolution: u32,
+    /// Resolution of a level over that of the level before.
+    pub growth: f64,
+    /// Largest table, as a power of two.
+    pub log2_table_size: u32,
+    /// Features start uniform in ± this.
+    pub init_range: f64,
+}
+
+impl Default for HashGrid {
+    fn default() -> Self {
+        Self {
+            convention: Convention::Naf,
+            levels: 10,
+            features: 2,
+            base_resolution: 16,
+            growth: 2.0,
+            log2_table_size: 19,
+            init_range: 1e-4,
+        }
+    }
+}
+
+conefield_core::stage_type!(Encoder, "hash-grid", HashGrid, "multi-resolution hash grid");
+
+#[typetag::serde(name = "hash-grid")]
+impl EncoderSpec for HashGrid {
+    fn build(&self) -> Result<Box<dyn Encoder>> {
+        Ok(Box::new(HashGridStage::new(self)?))
+    }
+}
+
+/// Positions are `f32`: a finer grid than this has no fraction of a cell left to interpolate by.
+const FINEST: f64 = 8_388_608.0;
+
+#[derive(Debug, Clone, PartialEq)]
+struct Level {
+    /// `pos = x·scale + 0.5`.
+    scale: f64,
+    /// Vertices along a side.
+    side: u32,
+    /// Entries of the table.
+    entries: u32,
+    /// Indexed directly.
+    dense: bool,
+    /// First entry among all levels.
+    start: usize,
+    /// Number of the level in the settings, which names its parameters.
+    number: usize,
+    /// Output channel of each feature, where it is read.
+    outputs: Vec<Option<usize>>,
+}
+
+/// The stage that [`HashGrid`] builds.
+#[derive(Debug, Clone)]
+pub struct HashGridStage {
+    settings: HashGrid,
+    primes: [u32; 3],
+    levels: Vec<Level>,
+    entries: usize,
+    outputs: usize,
+}
+
+impl HashGridStage {
+    /// The stage, or which setting is out of range.
+    pub fn new(settings: &HashGrid) -> Result<Self> {
+        let s = settings;
+        let bad = |field: &str, found: String, expected: &str| {
+            ensure(false, "spec", &format!("encoder.{field}"), found, expected)
+        };
+        if !(1..=32).contains(&s.levels) {
+            bad("levels", s.levels.to_string(), "1 to 32")?;
+        }
+        if ![1, 2, 4, 8].contains(&s.features) {
+            bad("features", s.features.to_string(), "1, 2, 4 or 8")?;
+        }
+        if !(2..=1 << 20).contains(&s.base_resolution) {
+            bad("base_resolution", s.base_resolution.to_string(), "2 to 2^20")?;
+        }
+        if !(s.growth >= 1.0 && s.growth <= 16.0) {
+            bad("growth", s.growth.to_string(), "1 to 16")?;
+        }
+        if !(4..=28).contains(&s.log2_table_size) {
+            bad("log2_table_size", s.log2_table_size.to_string(), "4 to 28")?;
+        }
+        if !(s.init_range.is_finite() && s.init_range >= 0.0) {
+            bad("init_range", s.init_range.to_string(), "a finite number, 0 or more")?;
+        }
+        let table = 1u64 << s.log2_table_size;
+        let mut levels = Vec::with_capacity(s.levels);
+        let mut start = 0usize;
+        for l in 0..s.levels {
+            let resolution = f64::from(s.base_resolution) * s.growth.powi(l as i32);
+            if resolution > FINEST {
+                bad(
+                    "levels",
+                    format!("level {l} with {resolution:.0} cells a side"),
+                    "at most 2^23 cells a side (positions are single precision): fewer levels or less growth",
+                )?;
+            }
+            let scale = resolution - 1.0;
+            // Cells reach from floor(0.5) to floor(scale + 0.5), and each has a corner one further.
+            let side = (scale + 0.5).floor() as u64 + 2;
+            let vertices = u128::from(side).pow(3);
+            let dense = vertices <= u128::from(table);
+            let entries = if dense { vertices as u64 } else { table };
+            levels.push(Level {
+                scale,
+                side: side as u32,
+                entries: entries as u32,
+                dense,
+                start,
+                number: l,
+                outputs: (0..s.features).map(|f| Some(l * s.features + f)).collect(),
+            });
+            start += entries as usize;
+        }
+        Ok(Self {
+            primes: s.convention.primes(),
+            outputs: s.levels * s.features,
+            entries: start,
+            levels,
+            settings: s.clone(),
+        })
+    }
+
+    fn params_of(&self, level: &Level) -> Range<usize> {
+        let f = self.settings.features;
+        level.start * f..(level.start + level.entries as usize) * f
+    }
+}
+
+/// Rows that are located together: their 8 indices and weights stay in the L1 cache.
+const BLOCK: usize = 64;
+
+/// Where the rows of a block fall on one level.
+struct Located<R> {
+    index: [[u32; BLOCK]; 8],
+    weight: [[R; BLOCK]; 8],
+    /// Position within the cell, for the gradient with respect to the point.
+    fraction: [[R; BLOCK]; 3],
+}
+
+impl<R: Real> Located<R> {
+    fn new() -> Self {
+        Self { index: [[0; BLOCK]; 8], weight: [[R::ZERO; BLOCK]; 8], fraction: [[R::ZERO; BLOCK]; 3] }
+    }
+
+    /// Locates rows `at..at + n` of `x`. Points outside the cube count as on its rim.
+    #[inline(always)]
+    fn locate(&mut self, level: &Level, primes: [u32; 3], x: Tile<'_, R>, at: usize, n: usize) {
+        let scale = R::of(level.scale);
+        let top = R::of(level.scale + 0.5);
+        let half = R::of(0.5);
+        let mut cell = [[0u32; BLOCK]; 3];
+        for d in 0..3 {
+            let x = &x.channel(d)[at..at + n];
+            for i in 0..n {
+                let p = x[i] * scale + half;
+                let p = if p > R::ZERO { p } else { R::ZERO };
+                let p = if p < top { p } else { top };
+                let c = p.floor();
+                self.fraction[d][i] = p - c;
+                cell[d][i] = c.int() as u32;
+            }
+        }
+        let [cx, cy, cz] = &cell;
+        if level.dense {
+            let (sy, sz) = (level.side, level.side * level.side);
+            for i in 0..n {
+                let base = cx[i] + cy[i] * sy + cz[i] * sz;
+                for c in 0..8u32 {
+                    self.index[c as usize][i] = base + (c & 1) + (c >> 1 & 1) * sy + (c >> 2) * sz;
+                }
+            }
+        } else {
+            let mask = level.entries - 1;
+            for i in 0..n {
+                let (y0, z0) = (cy[i].wrapping_mul(primes[1]), cz[i].wrapping_mul(primes[2]));
+                let (y1, z1) = (y0.wrapping_add(primes[1]), z0.wrapping_add(primes[2]));
+                let (x0, x1) = (cx[i].wrapping_mul(primes[0]), (cx[i] + 1).wrapping_mul(primes[0]));
+                for c in 0..8u32 {
+                    let x = if c & 1 == 0 { x0 } else { x1 };
+                    let y = if c & 2 == 0 { y0 } else { y1 };
+                    let z = if c & 4 == 0 { z0 } else { z1 };
+                    self.index[c as usize][i] = (x ^ y ^ z) & mask;
+                }
+            }
+        }
+        let [fx, fy, fz] = &self.fraction;
+        for c in 0..8usize {
+            for i in 0..n {
+                let x = if c & 1 == 0 { R::ONE - fx[i] } else { fx[i] };
+                let y = if c & 2 == 0 { R::ONE - fy[i] } else { fy[i] };
+                let z = if c & 4 == 0 { R::ONE - fz[i] } else { fz[i] };
+                self.weight[c][i] = x * y * z;
+            }
+        }
+    }
+}
+
+struct Forward<'a, R> {
+    stage: &'a HashGridStage,
+    params: &'a [R],
+    x: Tile<'a, R>,
+    y: TileMut<'a, R>,
+}
+
+impl<R: Real> Forward<'_, R> {
+    #[inline(always)]
+    fn features<const F: usize>(mut self) {
+        let mut located = Located::new();
+        let mut out = [[R::ZERO; BLOCK]; F];
+        for level in &self.stage.levels {
+            let (table, _) = self.params[self.stage.params_of(level)].as_chunks::<F>();
+            for at in (0..self.x.rows).step_by(BLOCK) {
+                let n = BLOCK.min(self.x.rows - at);
+                located.locate(level, self.stage.primes, self.x, at, n);
+                for i in 0..n {
+                    let mut sum = [R::ZERO; F];
+                    for c in 0..8 {
+                        let (entry, w) = (&table[located.index[c][i] as usize], located.weight[c][i]);
+                        for f in 0..F {
+                            sum[f] += w * entry[f];
+                        }
+                    }
+                    for f in 0..F {
+                        out[f][i] = sum[f];
+                    }
+                }
+                for (out, channel) in out.iter().zip(&level.outputs) {
+                    if let Some(c) = *channel {
+                        self.y.channel(c)[at..at + n].copy_from_slice(&out[..n]);
+                    }
+                }
+            }
+        }
+    }
+}
+
+impl<R: Real> Op for Forward<'_, R> {
+    type Out = ();
+    #[inline(always)]
+    fn call<S: Simd>(self, _: S) {
+        match self.stage.settings.features {
+            1 => self.features::<1>(),
+            2 => self.features::<2>(),
+            4 => self.features::<4>(),
+            _ => self.features::<8>(),
+        }
+    }
+}
+
+struct Backward<'a, R> {
+    stage: &'a HashGridStage,
+    params: &'a [R],
+    x: Tile<'a, R>,
+    dy: Tile<'a, R>,
+    grads: Grads<'a, R>,
+    dx: Option<TileMut<'a, R>>,
+}
+
+impl<R: Real> Backward<'_, R> {
+    #[inline(always)]
+    fn features<const F: usize>(mut self) {
+        let mut located = Located::new();
+        let mut dy = [[R::ZERO; F]; BLOCK];
+        if let Some(dx) = &mut self.dx {
+            dx.data.fill(R::ZERO);
+        }
+        for level in &self.stage.levels {
+            let params = self.stage.params_of(level);
+            let range = self.grads.range.clone();
+            let (from, to) = (params.start.max(range.start), params.end.min(range.end));
+            if from >= to && self.dx.is_none() {
+                continue;
+            }
+            let whole = from == params.start && to == params.end;
+            for at in (0..self.x.rows).step_by(BLOCK) {
+                let n = BLOCK.min(self.x.rows - at);
+                for (f, channel) in level.outputs.iter().enumerate() {
+                    for i in 0..n {
+                        dy[i][f] = channel.map_or(R::ZERO, |c| self.dy.channel(c)[at + i]);
+                    }
+                }
+                located.locate(level, self.stage.primes, self.x, at, n);
+                if whole {
+                    let (grads, _) = self.grads.values[from - range.start..to - range.start].as_chunks_mut::<F>();
+                    for i in 0..n {
+                        for c in 0..8 {
+                            let (g, w) = (&mut grads[located.index[c][i] as usize], located.weight[c][i]);
+                            for f in 0..F {
+                                g[f] += w * dy[i][f];
+                            }
+                        }
+                    }
+                } else if from < to {
+                    for i in 0..n {
+                        for c in 0..8 {
+                            let (entry, w) = (located.index[c][i] as usize, located.weight[c][i]);
+                            for f in 0..F {
+                                let p = params.start + entry * F + f;
+                                if (from..to).contains(&p) {
+                                    self.grads.values[p - range.start] += w * dy[i][f];
+                                }
+                            }
+                        }
+                    }
+                }
+                if let Some(dx) = &mut self.dx {
+                    let (table, _) = self.params[params.clone()].as_chunks::<F>();
+                    for i in 0..n {
+                        let v: [R; 8] = std::array::from_fn(|c| {
+                            let entry = &table[located.index[c][i] as usize];
+                            (0..F).map(|f| entry[f] * dy[i][f]).sum()
+                        });
+                        for d in 0..3 {
+                            let mut slope = R::ZERO;
+                            for c in 0..8 {
+                                let mut w = if c >> d & 1 == 1 { R::of(level.scale) } else { R::of(-level.scale) };
+                                for e in (0..3).filter(|&e| e != d) {
+                                    let fraction = located.fraction[e][i];
+                                    w *= if c >> e & 1 == 1 { fraction } else { R::ONE - fraction };
+                                }
+                                slope += w * v[c];
+                            }
+                            dx.channel(d)[at + i] += slope;
+                        }
+                    }
+                }
+            }
+        }
+    }
+}
+
+impl<R: Real> Op for Backward<'_, R> {
+    type Out = ();
+    #[inline(always)]
+    fn call<S: Simd>(self, _: S) {
+        match self.stage.settings.features {
+            1 => self.features::<1>(),
+            2 => self.features::<2>(),
+            4 => self.features::<4>(),
+            _ => self.features::<8>(),
+        }
+    }
+}
+
+impl<R: Real> Kernel<R> for HashGridStage {
+    fn forward(&self, params: &[R], x: Tile<'_, R>, y: TileMut<'_, R>, _: TileMut<'_, R>) {
+        run(Forward { stage: self, params, x, y });
+    }
+
+    fn backward(
+        &self,
+        params: &[R],
+        x: Tile<'_, R>,
+        _: TileMut<'_, R>,
+        dy: Tile<'_, R>,
+        grads: Grads<'_, R>,
+        dx: Option<TileMut<'_, R>>,
+    ) {
+        run(Backward { stage: self, params, x, dy, grads, dx });
+    }
+}
+
+impl Stage for HashGridStage {
+    fn info(&self) -> Info {
+        let f = self.settings.features;
+        Info {
+            input: 3,
+            output: self.outputs,
+            params: self.entries * f,
+            tape: 0,
+            scope: Scope::Row,
+            grads: GradKind::Scatter,
+            macs: self.levels.len() * (8 * f + 16),
+            identity: false,
+        }
+    }
+
+    fn parameters(&self) -> Vec<Parameter> {
+        let f = self.settings.features;
+        self.levels
+            .iter()
+            .map(|l| Parameter {
+                name: format!("{}.table", l.number),
+                shape: vec![l.entries as usize, f],
+                start: l.start * f,
+            })
+            .collect()
+    }
+
+    fn init(&self, seed: u64, params: &mut [f32]) {
+        let range = self.settings.init_range as f32;
+        for (i, p) in params.iter_mut().enumerate() {
+            *p = (2.0 * unit(mix(seed, i as u64)) - 1.0) * range;
+        }
+    }
+
+    fn kernel(&self) -> &dyn Kernel<f32> {
+        self
+    }
+
+    fn reference(&self) -> Option<&dyn Kernel<f64>> {
+        Some(self)
+    }
+
+    fn partition(&self) -> Vec<Range<usize>> {
+        self.levels.iter().map(|l| self.params_of(l)).collect()
+    }
+
+    fn describe(&self) -> String {
+        let side = |l: Option<&Level>| l.map_or(0.0, |l| l.scale + 1.0);
+        format!(
+            "hash-grid: {} levels x {}, {:.0} to {:.0} cells a side, tables up to 2^{}, {} of them direct",
+            self.levels.len(),
+            self.settings.features,
+            side(self.levels.first()),
+            side(self.levels.last()),
+            self.settings.log2_table_size,
+            self.levels.iter().filter(|l| l.dense).count()
+        )
+    }
+}
+
+impl Encoder for HashGridStage {
+    fn keep_outputs(&self, keep: &[usize]) -> Result<Reduced<dyn Encoder>> {
+        let mut stage = Self { levels: vec![], entries: 0, outputs: keep.len(), ..self.clone() };
+        let mut params = vec![];
+        for level in &self.levels {
+            let outputs: Vec<_> =
+                level.outputs.iter().map(|c| c.and_then(|c| keep.iter().position(|&k| k == c))).collect();
+            if outputs.iter().all(Option::is_none) {
+                continue;
+            }
+            params.push(self.params_of(level));
+            stage.levels.push(Level { outputs, start: stage.entries, ..level.clone() });
+            stage.entries += level.entries as usize;
+        }
+        Ok(Reduced { stage: Box::new(stage), params, channels: (0..3).collect() })
+    }
+
+    fn coarse_to_fine(&self) -> bool {
+        true
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// The published index, in exact arithmetic.
+    fn index(level: &Level, primes: [u64; 3], c: [u64; 3]) -> u64 {
+        if level.dense {
+            let s = u64::from(level.side);
+            c[0] + s * (c[1] + s * c[2])
+        } else {
+            let h = (0..3).fold(0u64, |h, d| h ^ (c[d] * primes[d] % (1 << 32)));
+            h % u64::from(level.entries)
+        }
+    }
+
+    #[test]
+    fn corners_match_the_published_hash_on_every_level() {
+        let settings = HashGrid { levels: 16, log2_table_size: 14, ..HashGrid::default() };
+        let stage = HashGridStage::new(&settings).unwrap();
+        let primes = settings.convention.primes().map(u64::from);
+        for level in &stage.levels {
+            for p in [[0.0, 0.0, 0.0], [1.0, 1.0, 1.0], [0.3, 0.71, 0.999], [0.5, 0.25, 0.125f64]] {
+                let mut located = Located::<f64>::new();
+                let data: Vec<f64> = p.to_vec();
+                located.locate(level, stage.primes, Tile::new(&data, 1), 0, 1);
+                let cell = p.map(|x| (x * level.scale + 0.5).floor() as u64);
+                let mut total = 0.0;
+                for c in 0..8u64 {
+                    let corner = [cell[0] + (c & 1), cell[1] + (c >> 1 & 1), cell[2] + (c >> 2)];
+                    assert!(corner.iter().all(|&v| v < u64::from(level.side)));
+                    assert_eq!(u64::from(located.index[c as usize][0]), index(level, primes, corner));
+                    total += located.weight[c as usize][0];
+                }
+                assert!((total - 1.0).abs() < 1e-12);
+            }
+        }
+        // NAF's first three levels (17³, 33³, … vertices) and which of them are direct with 2^19 entries.
+        let naf = HashGridStage::new(&HashGrid::default()).unwrap();
+        let entries: Vec<_> = naf.levels.iter().take(4).map(|l| (l.entries, l.dense)).collect();
+        assert_eq!(entries, [(4913, true), (35937, true), (274_625, true), (524_288, false)]);
+    }
+
+    #[test]
+    fn a_level_past_single_precision_is_refused() {
+        let e = HashGridStage::new(&HashGrid { levels: 32, ..HashGrid::default() }).unwrap_err().to_string();
+        assert!(e.contains("encoder.levels") && e.contains("2^23"), "{e}");
+    }
+
+    #[test]
+    fn levels_of_which_nothing_is_read_leave_the_stage() {
+        let stage = HashGridStage::new(&HashGrid { levels: 3, ..HashGrid::default() }).unwrap();
+        let r = stage.keep_outputs(&[0, 5]).unwrap();
+        assert_eq!(r.params, [0..9826, 81_700..630_950]);
+        assert_eq!(r.stage.info().output, 2);
+        assert_eq!(r.stage.parameters()[1].name, "2.table");
+    }
+}
