@@ -1,1 +1,2 @@
 //! Attenuation fields: MLP, voxel grid
+pub mod mlp;

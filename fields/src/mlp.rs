@@ -1,0 +1,515 @@
+//! Multi-layer perceptron with skip connections: features `[n, F]` to attenuation `[n, 1]`.
+//!
+//! Layers count linear maps: `depth = 4, width = 32, skips = [2]` is F→32→32→(F+32)→32→1, the shape of NAF
+//! (Zha et al. 2022) and NI-NeRF (Xu et al. 2025). A skip layer reads the features first, then the layer before.
+
+use conefield_core::dense::{Output as Into, Weights, affine, affine_input, affine_weights};
+use conefield_core::error::{Result, ensure};
+use conefield_core::random::{mix, unit};
+use conefield_core::simd::{Op, Real, Select, Simd, SimdBase, SimdFloat, V, load, run, store};
+use conefield_core::spec::FieldSpec;
+use conefield_core::stage::{Field, GradKind, Grads, Info, Kernel, Parameter, Reduced, Scope, Stage, Tile, TileMut};
+use schemars::JsonSchema;
+use serde::{Deserialize, Serialize};
+use std::ops::Range;
+
+/// SquarePlus's `b` as NI-NeRF has it.
+pub const SQUAREPLUS_B: f64 = 1.523_821_03;
+
+/// What follows a linear map.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
+#[serde(rename_all = "kebab-case")]
+pub enum Activation {
+    /// `x`
+    None,
+    /// `max(x, 0)`
+    Relu,
+    /// `x` above 0, `0.01·x` below
+    LeakyRelu,
+    /// `x·Φ(x)` (Hendrycks & Gimpel 2016), not its tanh approximation
+    Gelu,
+    /// `(x + √(x² + b))/2` with b = 1.52382103 (Barron 2021)
+    Squareplus,
+    /// `ln(1 + eˣ)`
+    Softplus,
+    /// `1/(1 + e⁻ˣ)`
+    Sigmoid,
+}
+
+impl Activation {
+    /// Value and derivative.
+    #[inline(always)]
+    fn at<S: Simd, R: Real>(self, s: S, x: V<S, R>) -> (V<S, R>, V<S, R>) {
+        let number = |v: f64| V::<S, R>::splat(s, R::of(v));
+        let (zero, one) = (number(0.0), number(1.0));
+        match self {
+            Self::None => (x, one),
+            Self::Relu => {
+                let on = x.simd_gt(zero);
+                (x.max(zero), on.select(one, zero))
+            }
+            Self::LeakyRelu => {
+                let slope = x.simd_gt(zero).select(one, number(0.01));
+                (x * slope, slope)
+            }
+            Self::Gelu => {
+                let (cdf, pdf) = R::normal_lanes(s, x);
+                (x * cdf, x.mul_add(pdf, cdf))
+            }
+            Self::Squareplus => {
+                // Past 1e18 the square would overflow, and the root is |x| to the last bit.
+                let small = x.abs().min(number(1e18));
+                let root = small.mul_add(small, number(SQUAREPLUS_B)).sqrt().max(x.abs());
+                ((x + root) * number(0.5), (x / root + one) * number(0.5))
+            }
+            Self::Softplus => {
+                let mut y = x;
+                y.as_mut_slice().iter_mut().for_each(|v| *v = v.softplus());
+                (y, sigmoid::<S, R>(s, x))
+            }
+            Self::Sigmoid => {
+                let y = sigmoid::<S, R>(s, x);
+                (y, y * (one - y))
+            }
+        }
+    }
+}
+
+#[inline(always)]
+fn sigmoid<S: Simd, R: Real>(s: S, x: V<S, R>) -> V<S, R> {
+    let one = V::<S, R>::splat(s, R::ONE);
+    one / (one + R::exp_lanes(s, V::<S, R>::splat(s, R::ZERO) - x))
+}
+
+/// How weights start. Biases start as the scheme says.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
+#[serde(rename_all = "kebab-case")]
+pub enum Scheme {
+    /// Weights and biases uniform in ±1/√inputs: PyTorch's default for linear layers.
+    Torch,
+    /// Weights uniform in ±√(6/inputs) (He et al. 2015), biases 0.
+    He,
+    /// Weights uniform in ±√(6/(inputs + outputs)) (Glorot & Bengio 2010), biases 0.
+    Glorot,
+}
+
+/// Settings of `mlp`.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
+#[serde(deny_unknown_fields, default)]
+pub struct Mlp {
+    /// Channels of hidden layers.
+    pub width: usize,
+    /// Linear layers, the last included.
+    pub depth: usize,
+    /// Layers (counted from 0) that read the features again beside the layer before.
+    pub skips: Vec<usize>,
+    /// After every layer but the last.
+    pub activation: Activation,
+    /// After the last.
+    pub output: Activation,
+    /// How weights start.
+    pub init: Scheme,
+}
+
+impl Default for Mlp {
+    fn default() -> Self {
+        Self {
+            width: 32,
+            depth: 4,
+            skips: vec![2],
+            activation: Activation::Gelu,
+            output: Activation::Squareplus,
+            init: Scheme::Torch,
+        }
+    }
+}
+
+conefield_core::stage_type!(Field, "mlp", Mlp, "multi-layer perceptron with skip connections");
+
+#[typetag::serde(name = "mlp")]
+impl FieldSpec for Mlp {
+    fn build(&self, width: usize) -> Result<Box<dyn Field>> {
+        Ok(Box::new(MlpStage::new(self, width)?))
+    }
+}
+
+#[derive(Debug, Clone, PartialEq)]
+struct Layer {
+    /// Channels that come from the features.
+    skip: usize,
+    /// Channels that come from the layer before (or from the features, on layer 0).
+    input: usize,
+    output: usize,
+    /// First parameter: `[output][skip + input]` weights, then biases.
+    start: usize,
+}
+
+impl Layer {
+    fn ld(&self) -> usize {
+        self.skip + self.input
+    }
+    fn weights(&self) -> Range<usize> {
+        self.start..self.start + self.output * self.ld()
+    }
+    fn bias(&self) -> Range<usize> {
+        let w = self.weights().end;
+        w..w + self.output
+    }
+}
+
+/// The stage that [`Mlp`] builds.
+#[derive(Debug, Clone)]
+pub struct MlpStage {
+    settings: Mlp,
+    input: usize,
+    layers: Vec<Layer>,
+}
+
+impl MlpStage {
+    /// The stage for `input` features, or which setting is out of range.
+    pub fn new(settings: &Mlp, input: usize) -> Result<Self> {
+        let s = settings;
+        let depth = s.depth;
+        ensure((1..=64).contains(&depth), "spec", "field.depth", depth, "1 to 64 linear layers")?;
+        ensure((1..=1024).contains(&s.width), "spec", "field.width", s.width, "1 to 1024 channels")?;
+        for &k in &s.skips {
+            ensure(k > 0 && k < depth, "spec", "field.skips", k, format!("layers 1 to {}", depth - 1))?;
+        }
+        let mut layers = vec![];
+        let mut start = 0;
+        for i in 0..depth {
+            let layer = Layer {
+                skip: if s.skips.contains(&i) { input } else { 0 },
+                input: if i == 0 { input } else { s.width },
+                output: if i + 1 == depth { 1 } else { s.width },
+                start,
+            };
+            start = layer.bias().end;
+            layers.push(layer);
+        }
+        Ok(Self { settings: s.clone(), input, layers })
+    }
+
+    /// Tape channels: of each hidden layer its output and the activation's derivative, then the derivative of the
+    /// output.
+    fn hidden(&self, layer: usize) -> Range<usize> {
+        2 * layer * self.settings.width..(2 * layer + 1) * self.settings.width
+    }
+    fn slope(&self, layer: usize) -> Range<usize> {
+        let w = self.settings.width;
+        let start = (2 * layer + 1) * w;
+        if layer + 1 == self.layers.len() { 2 * layer * w..2 * layer * w + 1 } else { start..start + w }
+    }
+}
+
+struct Forward<'a, R> {
+    stage: &'a MlpStage,
+    params: &'a [R],
+    x: Tile<'a, R>,
+    y: TileMut<'a, R>,
+    tape: TileMut<'a, R>,
+}
+
+/// Splits `data` into `[..at]` and the channels `range` behind it.
+fn split<R>(data: &mut [R], range: Range<usize>, rows: usize) -> (&[R], &mut [R]) {
+    let (before, rest) = data.split_at_mut(range.start * rows);
+    (before, &mut rest[..range.len() * rows])
+}
+
+impl<R: Real> Op for Forward<'_, R> {
+    type Out = ();
+    #[inline(always)]
+    fn call<S: Simd>(self, s: S) {
+        let Self { stage, params, x, y, tape } = self;
+        let n = x.rows;
+        for (i, layer) in stage.layers.iter().enumerate() {
+            let last = i + 1 == stage.layers.len();
+            let act = if last { stage.settings.output } else { stage.settings.activation };
+            // The linear map goes where its derivative will stand; the activation then reads it in place.
+            let from = if last { stage.slope(i).start } else { stage.hidden(i).start };
+            let until = stage.slope(i).end;
+            let (before, both) = split(tape.data, from..until, n);
+            let (h, z) = if last { (&mut y.data[..], both) } else { both.split_at_mut(layer.output * n) };
+            let weights = |column| Weights { data: &params[layer.weights()], ld: layer.ld(), column };
+            let input =
+                if i == 0 { x.data } else { &before[stage.hidden(i - 1).start * n..stage.hidden(i - 1).end * n] };
+            affine(s, weights(layer.skip), Some(&params[layer.bias()]), input, z, n);
+            if layer.skip > 0 {
+                affine(s, weights(0), None, x.data, z, n);
+            }
+            activate(s, act, z, h);
+        }
+    }
+}
+
+/// `h = f(z)`, `z = f'(z)`.
+#[inline(always)]
+fn activate<S: Simd, R: Real>(s: S, act: Activation, z: &mut [R], h: &mut [R]) {
+    // One loop an activation, so that none of them branches inside.
+    macro_rules! each {
+        ($($a:ident),*) => {
+            match act {
+                $(Activation::$a => {
+                    let mut i = 0;
+                    while i < z.len() {
+                        let (v, d) = Activation::$a.at::<S, R>(s, load(s, z, i));
+                        store::<S, R>(v, h, i);
+                        store::<S, R>(d, z, i);
+                        i += V::<S, R>::LEN;
+                    }
+                })*
+            }
+        };
+    }
+    each!(None, Relu, LeakyRelu, Gelu, Squareplus, Softplus, Sigmoid);
+}
+
+struct Backward<'a, R> {
+    stage: &'a MlpStage,
+    params: &'a [R],
+    x: Tile<'a, R>,
+    tape: TileMut<'a, R>,
+    dy: Tile<'a, R>,
+    grads: Grads<'a, R>,
+    dx: Option<TileMut<'a, R>>,
+}
+
+impl<R: Real> Op for Backward<'_, R> {
+    type Out = ();
+    #[inline(always)]
+    fn call<S: Simd>(self, s: S) {
+        let Self { stage, params, x, tape, dy, grads, mut dx } = self;
+        let n = x.rows;
+        let last = stage.layers.len() - 1;
+        debug_assert_eq!(grads.range, 0..params.len());
+        // The tape's derivatives become ∂L/∂z, layer by layer.
+        for (d, &g) in tape.data[stage.slope(last).start * n..].iter_mut().zip(dy.data) {
+            *d *= g;
+        }
+        let mut fresh = true;
+        for (i, layer) in stage.layers.iter().enumerate().rev() {
+            let weights = |column| Weights { data: &params[layer.weights()], ld: layer.ld(), column };
+            let (before, dz) = tape.data.split_at_mut(stage.slope(i).start * n);
+            let dz = &dz[..layer.output * n];
+            let input =
+                if i == 0 { x.data } else { &before[stage.hidden(i - 1).start * n..stage.hidden(i - 1).end * n] };
+            let (dw, db) = grads.values[layer.start..layer.bias().end].split_at_mut(layer.weights().len());
+            affine_weights(s, dz, input, dw, layer.ld(), layer.skip, Some(db), n);
+            if layer.skip > 0 {
+                affine_weights(s, dz, x.data, dw, layer.ld(), 0, None, n);
+            }
+            if let Some(dx) = &mut dx {
+                if layer.skip > 0 || i == 0 {
+                    let out = if fresh { Into::Set } else { Into::Add };
+                    affine_input(s, weights(0), dz, dx.data, out, n);
+                    fresh = false;
+                }
+            }
+            if i > 0 {
+                let slope = stage.slope(i - 1);
+                affine_input(
+                    s,
+                    weights(layer.skip),
+                    dz,
+                    &mut before[slope.start * n..slope.end * n],
+                    Into::Multiply,
+                    n,
+                );
+            }
+        }
+    }
+}
+
+impl<R: Real> Kernel<R> for MlpStage {
+    fn forward(&self, params: &[R], x: Tile<'_, R>, y: TileMut<'_, R>, tape: TileMut<'_, R>) {
+        run(Forward { stage: self, params, x, y, tape });
+    }
+
+    fn backward(
+        &self,
+        params: &[R],
+        x: Tile<'_, R>,
+        tape: TileMut<'_, R>,
+        dy: Tile<'_, R>,
+        grads: Grads<'_, R>,
+        dx: Option<TileMut<'_, R>>,
+    ) {
+        run(Backward { stage: self, params, x, tape, dy, grads, dx });
+    }
+}
+
+impl Stage for MlpStage {
+    fn info(&self) -> Info {
+        Info {
+            input: self.input,
+            output: 1,
+            params: self.layers.last().map_or(0, |l| l.bias().end),
+            tape: self.slope(self.layers.len() - 1).end,
+            scope: Scope::Row,
+            grads: GradKind::Dense,
+            macs: self.layers.iter().map(|l| l.weights().len()).sum(),
+            identity: false,
+        }
+    }
+
+    fn parameters(&self) -> Vec<Parameter> {
+        let mut all = vec![];
+        for (i, l) in self.layers.iter().enumerate() {
+            all.push(Parameter { name: format!("{i}.weight"), shape: vec![l.output, l.ld()], start: l.start });
+            all.push(Parameter { name: format!("{i}.bias"), shape: vec![l.output], start: l.bias().start });
+        }
+        all
+    }
+
+    fn init(&self, seed: u64, params: &mut [f32]) {
+        for l in &self.layers {
+            let (fan_in, fan_out) = (l.ld() as f64, l.output as f64);
+            let (w, b) = match self.settings.init {
+                Scheme::Torch => (1.0 / fan_in.sqrt(), 1.0 / fan_in.sqrt()),
+                Scheme::He => ((6.0 / fan_in).sqrt(), 0.0),
+                Scheme::Glorot => ((6.0 / (fan_in + fan_out)).sqrt(), 0.0),
+            };
+            for (range, bound) in [(l.weights(), w), (l.bias(), b)] {
+                for i in range {
+                    params[i] = ((2.0 * f64::from(unit(mix(seed, i as u64))) - 1.0) * bound) as f32;
+                }
+            }
+        }
+    }
+
+    fn kernel(&self) -> &dyn Kernel<f32> {
+        self
+    }
+
+    fn reference(&self) -> Option<&dyn Kernel<f64>> {
+        Some(self)
+    }
+
+    fn describe(&self) -> String {
+        let mut shape = self.input.to_string();
+        for (i, l) in self.layers.iter().enumerate() {
+            if l.skip > 0 && i > 0 {
+                shape += &format!("→(+{})", l.skip);
+            }
+            shape += &format!("→{}", l.output);
+        }
+        format!("mlp: {shape}, {:?} and {:?}", self.settings.activation, self.settings.output).to_lowercase()
+    }
+}
+
+impl Field for MlpStage {
+    fn keep_inputs(&self, keep: &[usize]) -> Result<Reduced<dyn Field>> {
+        let stage = Self::new(&self.settings, keep.len())?;
+        let mut params: Vec<Range<usize>> = vec![];
+        for (i, l) in self.layers.iter().enumerate() {
+            for o in 0..l.output {
+                let row = l.start + o * l.ld();
+                if i == 0 {
+                    params.extend(keep.iter().map(|&c| row + c..row + c + 1));
+                    continue;
+                }
+                if l.skip > 0 {
+                    params.extend(keep.iter().map(|&c| row + c..row + c + 1));
+                }
+                params.push(row + l.skip..row + l.ld());
+            }
+            params.push(l.bias());
+        }
+        Ok(Reduced { stage: Box::new(stage), params, channels: vec![0] })
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn the_published_shapes_have_their_parameter_counts() {
+        let count = |mlp: &Mlp, input| MlpStage::new(mlp, input).unwrap().info().params;
+        assert_eq!(count(&Mlp::default(), 20), 21 * 32 + 33 * 32 + 53 * 32 + 33);
+        let naf = Mlp { activation: Activation::LeakyRelu, output: Activation::Sigmoid, ..Mlp::default() };
+        assert_eq!(count(&naf, 32), 33 * 32 + 33 * 32 + 65 * 32 + 33);
+        let m = MlpStage::new(&Mlp::default(), 20).unwrap();
+        assert_eq!(m.describe(), "mlp: 20→32→32→(+20)→32→1, gelu and squareplus");
+    }
+
+    #[test]
+    fn a_field_without_inputs_equals_one_that_sees_zeros_there() {
+        let m = MlpStage::new(&Mlp { width: 9, ..Mlp::default() }, 6).unwrap();
+        let mut params = vec![0.0; m.info().params];
+        m.init(3, &mut params);
+        let keep = [0, 3, 4];
+        let r = m.keep_inputs(&keep).unwrap();
+        let small: Vec<f32> = r.params.iter().flat_map(|r| params[r.clone()].iter().copied()).collect();
+        let n = 5;
+        let x: Vec<f32> = (0..3 * n).map(|i| (i as f32 * 0.7).sin()).collect();
+        let mut wide = vec![0.0; 6 * n];
+        for (c, &k) in keep.iter().enumerate() {
+            wide[k * n..(k + 1) * n].copy_from_slice(&x[c * n..(c + 1) * n]);
+        }
+        let eval = |s: &dyn Stage, p: &[f32], x: &[f32]| {
+            let (mut y, mut tape) = (vec![0.0; n], vec![0.0; s.info().tape * n]);
+            s.kernel().forward(p, Tile::new(x, n), TileMut::new(&mut y, n), TileMut::new(&mut tape, n));
+            y
+        };
+        let (a, b) = (eval(&m, &params, &wide), eval(r.stage.as_ref(), &small, &x));
+        for (a, b) in a.iter().zip(&b) {
+            assert!((a - b).abs() < 1e-6, "{a} {b}");
+        }
+    }
+
+    /// Output and gradients against central differences of the f64 kernel, for every activation.
+    #[test]
+    fn gradients_match_finite_differences() {
+        use Activation::*;
+        for act in [None, Gelu, Squareplus, Softplus, Sigmoid, LeakyRelu] {
+            let m = MlpStage::new(
+                &Mlp { width: 5, depth: 4, skips: vec![1, 2], activation: act, output: act, init: Scheme::He },
+                3,
+            )
+            .unwrap();
+            let info = m.info();
+            let mut p32 = vec![0.0; info.params];
+            m.init(11, &mut p32);
+            let mut p: Vec<f64> = p32.iter().map(|&v| f64::from(v)).collect();
+            let n = 4;
+            let mut x: Vec<f64> = (0..3 * n).map(|i| (i as f64 * 1.3).cos()).collect();
+            let dy: Vec<f64> = (0..n).map(|i| 1.0 + i as f64).collect();
+            let k = m.reference().unwrap();
+            let loss = |p: &[f64], x: &[f64]| {
+                let (mut y, mut tape) = (vec![0.0; n], vec![0.0; info.tape * n]);
+                k.forward(p, Tile::new(x, n), TileMut::new(&mut y, n), TileMut::new(&mut tape, n));
+                (y.iter().zip(&dy).map(|(a, b)| a * b).sum::<f64>(), tape)
+            };
+            let (_, mut tape) = loss(&p, &x);
+            let (mut g, mut dx) = (vec![0.0; info.params], vec![0.0; 3 * n]);
+            k.backward(
+                &p,
+                Tile::new(&x, n),
+                TileMut::new(&mut tape, n),
+                Tile::new(&dy, n),
+                Grads::all(&mut g),
+                Some(TileMut::new(&mut dx, n)),
+            );
+            let h = 1e-6;
+            for i in 0..info.params {
+                let keep = p[i];
+                p[i] = keep + h;
+                let up = loss(&p, &x).0;
+                p[i] = keep - h;
+                let want = (up - loss(&p, &x).0) / (2.0 * h);
+                p[i] = keep;
+                assert!((g[i] - want).abs() < 1e-6 * (1.0 + want.abs()), "{act:?} param {i}: {} {want}", g[i]);
+            }
+            for i in 0..3 * n {
+                let keep = x[i];
+                x[i] = keep + h;
+                let up = loss(&p, &x).0;
+                x[i] = keep - h;
+                let want = (up - loss(&p, &x).0) / (2.0 * h);
+                x[i] = keep;
+                assert!((dx[i] - want).abs() < 1e-6 * (1.0 + want.abs()), "{act:?} input {i}: {} {want}", dx[i]);
+            }
+        }
+    }
+}
