@@ -3,7 +3,10 @@
 //! Every stage is a table with a `type`; its other keys are that type's settings. [`crate::registry`] lists the
 //! types; [`load`] reads files and says where a mistake stands.
 
+mod check;
 pub mod load;
+pub mod schema;
+mod tree;
 
 use crate::arena::{Arena, InitReport, Layout, Weights};
 use crate::error::Result;

@@ -95,7 +95,7 @@ impl<'a, R> Grads<'a, R> {
 pub enum Scope {
     /// Its own row only.
     Row,
-    /// The rows of its ray.
+    /// The rows of its ray: the host hands it tiles of one whole ray, and of a single row for points off any ray.
     Ray,
 }
 
@@ -108,7 +108,8 @@ pub enum GradKind {
     /// Few parameters, every one touched by every row: each worker sums its own copy, copies are merged in order.
     Dense,
     /// Many parameters, few touched by a row: workers own disjoint ranges ([`Stage::partition`]) and go through
-    /// the rows in order, so that no copy and no atomic is needed and sums have one order.
+    /// the rows in order, so that no copy and no atomic is needed and sums have one order. Such a stage keeps no
+    /// tape.
     Scatter,
 }
 
@@ -323,14 +324,14 @@ pub trait Projector: Send + Sync {
     fn sample(&self, ray: &UnitRay, seed: Option<u64>, out: &mut Samples);
 
     /// Beer-Lambert: the line integral `Σ μᵢ δᵢ` of one ray.
-    fn integrate(&self, weights: &[f32], mu: &[f32]) -> f64 {
-        weights.iter().zip(mu).map(|(&w, &m)| f64::from(w) * f64::from(m)).sum()
+    fn integrate(&self, weights: &[f32], mu: &[f64]) -> f64 {
+        weights.iter().zip(mu).map(|(&w, &m)| f64::from(w) * m).sum()
     }
 
     /// The exact adjoint of [`Projector::integrate`]: `∂L/∂μᵢ = δᵢ·∂L/∂A`.
-    fn adjoint(&self, weights: &[f32], dline: f64, dmu: &mut [f32]) {
+    fn adjoint(&self, weights: &[f32], dline: f64, dmu: &mut [f64]) {
         for (d, &w) in dmu.iter_mut().zip(weights) {
-            *d = (f64::from(w) * dline) as f32;
+            *d = f64::from(w) * dline;
         }
     }
 

@@ -1,1 +1,154 @@
-//! CPU backend: tiles in cache, SIMD with run-time dispatch, the same bits on any number of threads
+//! The CPU backend.
+//!
+//! A step goes wave by wave (some ten thousand rows). In a wave, workers take groups of rows: sample, encode,
+//! normalise, evaluate the field, integrate, take the loss and go backward, tile by tile, while a tile is in the
+//! cache ([`rows`]). Dense stages sum their gradients in copies of their own, one a slot, merged in order. Stages
+//! with scattered parameters get the rows of the wave a second time, each worker with a range of parameters of its
+//! own ([`step`]). The number of slots and the order of every sum depend on the plan alone: the same bits come out
+//! on any number of threads.
+
+pub mod adam;
+pub mod rows;
+pub mod step;
+
+use conefield_core::backend::{Adam, Backend, Executable, Explain, StepStats, Work};
+use conefield_core::error::{Error, Result};
+use conefield_core::pipeline::{Model, Pipeline};
+use conefield_core::simd;
+use conefield_core::stage::{GradKind, Samples, TILE_ROWS, UnitRay};
+use rayon::prelude::*;
+use rows::{Kernels, Scratch};
+use step::Slots;
+
+/// The CPU backend: rayon threads, SIMD chosen at run time.
+#[derive(Debug, Clone, Copy, Default)]
+pub struct Cpu;
+
+impl Cpu {
+    /// The backend. It uses rayon's current pool.
+    pub fn new() -> Self {
+        Self
+    }
+}
+
+impl Backend for Cpu {
+    fn name(&self) -> &'static str {
+        "cpu"
+    }
+
+    fn compile(&self, pipeline: &Pipeline) -> Result<(Box<dyn Executable>, Explain)> {
+        let mut notes = vec![];
+        for (name, stage) in pipeline.stages() {
+            let info = stage.info();
+            if info.grads == GradKind::Scatter && info.tape > 0 {
+                return Err(Error::unsupported(
+                    format!("{name} on the CPU backend"),
+                    "a stage with scattered parameters must not keep a tape",
+                ));
+            }
+            notes.push(match (info.identity, info.grads) {
+                (true, _) => format!("{name}: identity, left out"),
+                (_, GradKind::None) => format!("{name}: fused"),
+                (_, GradKind::Dense) => format!("{name}: fused, gradients in one copy a slot"),
+                (_, GradKind::Scatter) => {
+                    format!(
+                        "{name}: fused; gradients in a second pass over {} disjoint ranges",
+                        stage.partition().len()
+                    )
+                }
+            });
+        }
+        let kernels = Kernels::new(pipeline, |s| Some(s.kernel()))
+            .ok_or_else(|| Error::unsupported("cpu backend", "a stage offers no kernel"))?;
+        let slots = Slots::<f32>::new(&kernels);
+        let explain = Explain {
+            backend: format!("cpu, {:?}, {} threads", simd::level(), rayon::current_num_threads()),
+            notes,
+            scratch_bytes: slots.bytes(),
+        };
+        Ok((Box::new(CpuExecutable { slots, clean: false }), explain))
+    }
+}
+
+struct CpuExecutable {
+    slots: Slots<f32>,
+    /// The arena's gradients are known to be zero.
+    clean: bool,
+}
+
+fn kernels(pipeline: &Pipeline) -> Result<Kernels<'_, f32>> {
+    Kernels::new(pipeline, |s| Some(s.kernel())).ok_or_else(|| Error::unsupported("cpu backend", "no kernel"))
+}
+
+impl Executable for CpuExecutable {
+    fn step(&mut self, model: &mut Model, work: &Work<'_>) -> Result<StepStats> {
+        let kernels = kernels(&model.pipeline)?;
+        if !self.clean {
+            model.arena.grads.fill(0.0);
+        }
+        self.clean = false;
+        Ok(self.slots.step(
+            &kernels,
+            model.pipeline.projector.as_ref(),
+            &model.arena.params,
+            &mut model.arena.grads,
+            work,
+        ))
+    }
+
+    fn update(&mut self, model: &mut Model, adam: &Adam) -> Result<()> {
+        adam::update(&mut model.arena, adam);
+        self.clean = true;
+        Ok(())
+    }
+
+    fn evaluate(&mut self, model: &Model, points: &[[f32; 3]], out: &mut [f32]) -> Result<()> {
+        let kernels = kernels(&model.pipeline)?;
+        let rows = kernels.rows_at_points();
+        out.par_chunks_mut(rows * 8).zip(points.par_chunks(rows * 8)).for_each_init(
+            Scratch::default,
+            |scratch, (out, points)| {
+                for (out, points) in out.chunks_mut(rows).zip(points.chunks(rows)) {
+                    scratch.load(points);
+                    scratch.forward(&kernels, &model.arena.params, &[points.len()]);
+                    out.copy_from_slice(scratch.outputs());
+                }
+            },
+        );
+        Ok(())
+    }
+
+    fn encode(&mut self, model: &Model, points: &[[f32; 3]]) -> Result<Vec<f32>> {
+        let kernels = kernels(&model.pipeline)?;
+        let n = points.len();
+        let mut out = vec![0.0; n * kernels.encoder_width()];
+        let mut scratch = Scratch::default();
+        for (i, points) in points.chunks(TILE_ROWS).enumerate() {
+            scratch.load(points);
+            let features = scratch.encode(&kernels, &model.arena.params, points.len());
+            for (c, f) in features.chunks(points.len()).enumerate() {
+                out[c * n + i * TILE_ROWS..][..f.len()].copy_from_slice(f);
+            }
+        }
+        Ok(out)
+    }
+
+    fn render(&mut self, model: &Model, rays: &[UnitRay], out: &mut [f32]) -> Result<()> {
+        let kernels = kernels(&model.pipeline)?;
+        let projector = model.pipeline.projector.as_ref();
+        out.par_iter_mut().zip(rays).for_each_init(
+            || (Scratch::default(), Samples::default(), vec![]),
+            |(scratch, samples, mu), (out, ray)| {
+                samples.points.clear();
+                samples.weights.clear();
+                projector.sample(ray, None, samples);
+                scratch.load(&samples.points);
+                scratch.forward(&kernels, &model.arena.params, &kernels.ray_tiles(samples.points.len()));
+                mu.clear();
+                mu.extend(scratch.outputs().iter().map(|&m| f64::from(m)));
+                *out = projector.integrate(&samples.weights, mu) as f32;
+            },
+        );
+        Ok(())
+    }
+}

@@ -1,1 +1,483 @@
 //! Reading specs: layers, `--set`, and errors that say where.
+//!
+//! A spec is read into a tree whose values know their line. `extends` lays it over the spec that it names, `--set`
+//! lays single values over that; the result is checked against the settings of the registered stage types and only
+//! then becomes a [`Spec`].
+
+use super::tree::{At, Entry, Kind, Node, parse_json, parse_toml};
+use super::{Spec, check};
+use crate::error::{Error, Result};
+use serde_json::Value;
+use std::path::{Path, PathBuf};
+
+/// A spec that comes with the program.
+#[derive(Debug, Clone, Copy)]
+pub struct Shipped {
+    /// The name that users write.
+    pub name: &'static str,
+    /// The file's text, TOML.
+    pub text: &'static str,
+}
+
+/// A spec, checked, with where it came from.
+pub struct Loaded {
+    /// The spec.
+    pub spec: Spec,
+    /// The same with every default written.
+    pub tree: Value,
+    /// The file or shipped name.
+    pub source: String,
+    written: Node,
+}
+
+/// Reads the spec `what`: the name of a shipped one or a TOML or JSON file. `sets` are `path=value` and lie on top.
+pub fn load(what: &str, sets: &[String], shipped: &[Shipped]) -> Result<Loaded> {
+    let layer = Layer::find(what, None, shipped)
+        .map_err(|why| Error::invalid("spec", what, why, format!("a file or {}", names(what, shipped))))?;
+    let source = layer.label();
+    finish(layer.resolve(shipped, &mut vec![])?, source, sets)
+}
+
+/// Reads a spec from `text`, called `source` in errors; TOML unless it begins like JSON.
+pub fn parse(text: &str, source: &str, sets: &[String], shipped: &[Shipped]) -> Result<Loaded> {
+    let layer = Layer { origin: Origin::Text(source.into()), text: text.into() };
+    finish(layer.resolve(shipped, &mut vec![])?, source.into(), sets)
+}
+
+/// The spec as TOML with every default written.
+pub fn to_toml(spec: &Spec) -> Result<String> {
+    toml::to_string_pretty(spec).map_err(|e| Error::unsupported("writing the spec as TOML", e.to_string()))
+}
+
+fn finish(mut written: Node, source: String, sets: &[String]) -> Result<Loaded> {
+    let mut sets = sets.iter().map(|s| Set::parse(s)).collect::<Result<Vec<_>>>()?;
+    // A type clears the keys of the old one, so it goes before the keys beside it, whatever the order on the line.
+    sets.sort_by_key(|s| (s.path.len(), s.path.last().is_some_and(|k| k != "type")));
+    for set in sets {
+        set.apply(&mut written)?;
+    }
+    check::spec(&written)?;
+    let spec: Spec = serde_path_to_error::deserialize(written.to_json()).map_err(|e| {
+        let path: Vec<String> = steps(&e.path().to_string());
+        let at = &written.nearest(&path.iter().map(String::as_str).collect::<Vec<_>>()).at;
+        Error::invalid(at.to_string(), path.join("."), e.inner(), "a value that the setting can hold")
+    })?;
+    let tree = serde_json::to_value(&spec).map_err(|e| Error::unsupported("writing the spec", e.to_string()))?;
+    Ok(Loaded { spec, tree, source, written })
+}
+
+impl Loaded {
+    /// The same error, with the line of the spec that it is about.
+    pub fn locate(&self, error: Error) -> Error {
+        let Error::Invalid { place, field, found, expected } = error else { return error };
+        let path = match place.as_str() {
+            "spec" => steps(&field),
+            _ => return Error::Invalid { place, field, found, expected },
+        };
+        let at = &self.written.nearest(&path.iter().map(String::as_str).collect::<Vec<_>>()).at;
+        Error::Invalid { place: at.to_string(), field: path.join("."), found, expected }
+    }
+}
+
+/// `normalizers[0].epoch` and `normalizers.0.epoch` alike.
+fn steps(path: &str) -> Vec<String> {
+    path.replace('[', ".").replace(']', "").split('.').filter(|s| !s.is_empty()).map(str::to_owned).collect()
+}
+
+/// `one of a, b` of the shipped names, the nearest first where one is near.
+fn names(what: &str, shipped: &[Shipped]) -> String {
+    let known: Vec<&str> = shipped.iter().map(|s| s.name).collect();
+    format!("the name of a shipped spec: {}", check::suggest(what, &known))
+}
+
+/// Where a layer comes from.
+#[derive(Debug, Clone, PartialEq)]
+enum Origin {
+    Shipped(&'static str),
+    File(PathBuf),
+    Text(String),
+}
+
+/// One spec file before layering.
+struct Layer {
+    origin: Origin,
+    text: String,
+}
+
+impl Layer {
+    /// What `what` means, written in a file of `folder`; or why it means nothing.
+    fn find(what: &str, folder: Option<&Path>, shipped: &[Shipped]) -> Result<Self, String> {
+        if let Some(s) = shipped.iter().find(|s| s.name == what) {
+            return Ok(Self { origin: Origin::Shipped(s.name), text: s.text.into() });
+        }
+        let path = folder.map_or_else(|| PathBuf::from(what), |f| f.join(what));
+        match std::fs::read_to_string(&path) {
+            Ok(text) => Ok(Self { origin: Origin::File(path), text }),
+            Err(e) if e.kind() == std::io::ErrorKind::NotFound => Err("neither a shipped spec nor a file".into()),
+            Err(e) => Err(e.to_string()),
+        }
+    }
+
+    fn label(&self) -> String {
+        match &self.origin {
+            Origin::Shipped(name) => format!("{name} (shipped)"),
+            Origin::File(path) => path.display().to_string(),
+            Origin::Text(name) => name.clone(),
+        }
+    }
+
+    /// The tree of this layer over those that it extends. `above` are the layers that led here.
+    fn resolve(self, shipped: &[Shipped], above: &mut Vec<Origin>) -> Result<Node> {
+        let label = self.label();
+        let is_json = match &self.origin {
+            Origin::File(p) if p.extension().is_some_and(|e| e.eq_ignore_ascii_case("json")) => true,
+            Origin::File(p) if p.extension().is_some_and(|e| e.eq_ignore_ascii_case("toml")) => false,
+            _ => self.text.trim_start().starts_with('{'),
+        };
+        let mut node = if is_json { parse_json(&label, &self.text)? } else { parse_toml(&label, &self.text)? };
+        node.take("$schema");
+        let Some(extends) = node.take("extends") else { return Ok(node) };
+        let at = extends.value.at.to_string();
+        let Some(what) = extends.value.text() else {
+            let found = extends.value.shown();
+            return Err(Error::invalid(at, "extends", found, "the name of a shipped spec or a file"));
+        };
+        let folder = match &self.origin {
+            Origin::File(p) => p.parent(),
+            _ => None,
+        };
+        let base = Self::find(what, folder, shipped).map_err(|why| {
+            Error::invalid(&at, "extends", format!("{what:?}, {why}"), format!("a file or {}", names(what, shipped)))
+        })?;
+        above.push(self.origin.clone());
+        if above.iter().any(|o| same(o, &base.origin)) {
+            return Err(Error::invalid(at, "extends", format!("{what:?}, which extends this one"), "no circle"));
+        }
+        let mut tree = base.resolve(shipped, above)?;
+        tree.merge(node);
+        Ok(tree)
+    }
+}
+
+/// Whether two layers are one file.
+fn same(a: &Origin, b: &Origin) -> bool {
+    match (a, b) {
+        (Origin::File(a), Origin::File(b)) => {
+            let real = |p: &Path| p.canonicalize().unwrap_or_else(|_| p.to_path_buf());
+            real(a) == real(b)
+        }
+        _ => a == b,
+    }
+}
+
+/// A `--set path=value`.
+struct Set {
+    path: Vec<String>,
+    value: Node,
+    at: At,
+}
+
+impl Set {
+    fn parse(text: &str) -> Result<Self> {
+        let label = format!("--set {text}");
+        let (path, value) = text.split_once('=').map(|(p, v)| (p.trim(), v.trim())).unwrap_or((text, ""));
+        if path.is_empty() || !text.contains('=') || path.split('.').any(str::is_empty) {
+            return Err(Error::invalid(label, "path", format!("{text:?}"), "path=value, such as encoder.levels=8"));
+        }
+        let at = At::whole(label);
+        // A TOML value, or else a text that needs no quotes.
+        let parsed = parse_toml("", &format!("value = {value}")).ok().filter(|n| n.entries().len() == 1);
+        let kind = match parsed.and_then(|mut n| n.take("value")) {
+            Some(e) => e.value.kind,
+            None => Kind::String(value.to_owned()),
+        };
+        let value = at_everywhere(Node { at: at.clone(), kind }, &at);
+        Ok(Self { path: path.split('.').map(str::to_owned).collect(), value, at })
+    }
+
+    /// Lays the value over `tree`.
+    fn apply(self, tree: &mut Node) -> Result<()> {
+        let Self { path, value, at } = self;
+        let mut node = tree;
+        for (i, step) in path.iter().enumerate() {
+            let so_far = path[..=i].join(".");
+            let shown = node.shown();
+            match &mut node.kind {
+                Kind::Array(items) => {
+                    let n = items.len();
+                    let index = step.parse::<usize>().ok().filter(|k| *k <= n).ok_or_else(|| {
+                        let range =
+                            if n == 0 { "0, to add one".into() } else { format!("0 to {}, or {n} to add one", n - 1) };
+                        Error::invalid(at.to_string(), &so_far, format!("{step:?}"), range)
+                    })?;
+                    if index == n {
+                        items.push(Node::empty_table(at.clone()));
+                    }
+                    node = &mut items[index];
+                }
+                Kind::Table(entries) => {
+                    // A type that changes leaves nothing of the old settings.
+                    let retyped = |e: &Entry| e.key == "type" && e.value.text() != value.text();
+                    if i + 1 == path.len() && step == "type" && entries.iter().any(retyped) {
+                        entries.clear();
+                    }
+                    let found = entries.iter().position(|e| e.key == *step);
+                    let index = found.unwrap_or_else(|| {
+                        let fresh = Node::empty_table(at.clone());
+                        entries.push(Entry { key: step.clone(), at: at.clone(), value: fresh });
+                        entries.len() - 1
+                    });
+                    let entry = &mut entries[index];
+                    entry.at = at.clone();
+                    node = &mut entry.value;
+                }
+                _ => {
+                    let above = path[..i].join(".");
+                    return Err(Error::invalid(
+                        at.to_string(),
+                        so_far,
+                        format!("a key below {above}, which is {shown}"),
+                        format!("{above}=value"),
+                    ));
+                }
+            }
+        }
+        match value.kind {
+            Kind::Table(_) => node.merge(value),
+            _ => *node = value,
+        }
+        Ok(())
+    }
+}
+
+/// The node with every place in it `at`.
+fn at_everywhere(mut node: Node, at: &At) -> Node {
+    node.at = at.clone();
+    match &mut node.kind {
+        Kind::Array(items) => {
+            for item in items {
+                *item = at_everywhere(std::mem::replace(item, Node::empty_table(at.clone())), at);
+            }
+        }
+        Kind::Table(entries) => {
+            for e in entries {
+                e.at = at.clone();
+                e.value = at_everywhere(std::mem::replace(&mut e.value, Node::empty_table(at.clone())), at);
+            }
+        }
+        _ => {}
+    }
+    node
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::spec::{EncoderSpec, SolverSpec};
+    use schemars::JsonSchema;
+    use serde::{Deserialize, Serialize};
+
+    #[derive(Serialize, Deserialize, JsonSchema, Clone, Copy)]
+    #[serde(rename_all = "kebab-case")]
+    enum Way {
+        Straight,
+        Round,
+    }
+
+    #[derive(Serialize, Deserialize, JsonSchema)]
+    #[serde(deny_unknown_fields, default)]
+    struct TestGrid {
+        levels: usize,
+        growth: f64,
+        way: Way,
+        range: [f64; 2],
+        top: Option<u32>,
+    }
+
+    impl Default for TestGrid {
+        fn default() -> Self {
+            Self { levels: 4, growth: 2.0, way: Way::Straight, range: [0.0, 1.0], top: None }
+        }
+    }
+
+    crate::stage_type!(Encoder, "test-grid", TestGrid, "for tests");
+    #[typetag::serde(name = "test-grid")]
+    impl EncoderSpec for TestGrid {
+        fn build(&self) -> Result<Box<dyn crate::stage::Encoder>> {
+            Err(Error::invalid("spec", "encoder.levels", self.levels, "another number"))
+        }
+    }
+
+    #[derive(Serialize, Deserialize, JsonSchema)]
+    #[serde(deny_unknown_fields)]
+    struct TestStack {
+        #[schemars(extend("x-stage" = "encoder"))]
+        below: serde_json::Value,
+    }
+
+    crate::stage_type!(Encoder, "test-stack", TestStack, "for tests");
+    #[typetag::serde(name = "test-stack")]
+    impl EncoderSpec for TestStack {
+        fn build(&self) -> Result<Box<dyn crate::stage::Encoder>> {
+            Err(Error::unsupported("test-stack", "for tests"))
+        }
+    }
+
+    #[derive(Serialize, Deserialize, JsonSchema)]
+    #[serde(deny_unknown_fields, default)]
+    struct TestSolver {
+        steps: u64,
+    }
+
+    impl Default for TestSolver {
+        fn default() -> Self {
+            Self { steps: 10 }
+        }
+    }
+
+    crate::stage_type!(Solver, "test-solver", TestSolver, "for tests");
+    #[typetag::serde(name = "test-solver")]
+    impl SolverSpec for TestSolver {
+        fn build(&self) -> Result<Box<dyn crate::solver::Solver>> {
+            Err(Error::unsupported("test-solver", "for tests"))
+        }
+    }
+
+    const SHIPPED: &[Shipped] = &[
+        Shipped {
+            name: "plain",
+            text: "name = 'plain'\n[encoder]\ntype = 'test-grid'\nlevels = 3\n[solver]\ntype = 'test-solver'\n",
+        },
+        Shipped { name: "curved", text: "extends = 'plain'\nname = 'curved'\n[encoder]\nway = 'round'\n" },
+    ];
+
+    fn read(text: &str, sets: &[&str]) -> Result<Loaded> {
+        parse(text, "a.toml", &sets.iter().map(|s| s.to_string()).collect::<Vec<_>>(), SHIPPED)
+    }
+
+    fn refusal(text: &str, sets: &[&str]) -> String {
+        read(text, sets).err().expect("refused").to_string()
+    }
+
+    #[test]
+    fn layers_and_sets_lie_over_each_other() {
+        let l = read("extends = 'curved'\nencoder.growth = 3\n", &["encoder.levels=8", "name=mine"]).unwrap();
+        let e = &l.tree["encoder"];
+        assert_eq!(e["levels"], 8);
+        assert_eq!(e["growth"], 3.0);
+        assert_eq!(e["way"], "round");
+        assert_eq!(l.tree["name"], "mine");
+        assert_eq!(l.tree["solver"]["steps"], 10, "defaults are written");
+    }
+
+    #[test]
+    fn what_is_written_out_reads_back_the_same() {
+        let l = read("extends = 'curved'\nencoder.top = 7\n", &[]).unwrap();
+        let text = to_toml(&l.spec).unwrap();
+        assert_eq!(read(&text, &[]).unwrap().tree, l.tree, "{text}");
+        let json = serde_json::to_string(&l.tree).unwrap();
+        assert_eq!(read(&json, &[]).unwrap().tree, l.tree);
+    }
+
+    #[test]
+    fn mistakes_are_told_with_line_path_and_nearest_name() {
+        let base = "extends = 'plain'\n[encoder]\n";
+        for (line, want) in [
+            ("level = 3", "a.toml:3:1: encoder.level: found an unknown key, expected \"levels\""),
+            (
+                "levels = 'x'",
+                "a.toml:3:10: encoder.levels: found the text \"x\", expected a whole number of at least 0",
+            ),
+            ("levels = -1", "a.toml:3:10: encoder.levels: found -1, expected a whole number of at least 0"),
+            ("levels = 2.5", "encoder.levels: found 2.5, expected a whole number"),
+            ("way = 'rund'", "a.toml:3:7: encoder.way: found \"rund\", expected \"round\""),
+            ("way = 3", "a.toml:3:7: encoder.way: found 3, expected straight or round"),
+            ("range = [1]", "a.toml:3:9: encoder.range: found a list of 1, expected a list of 2"),
+            ("range = [1, 'a']", "a.toml:3:13: encoder.range.1: found the text \"a\", expected a number"),
+            ("top = 'a'", "a.toml:3:7: encoder.top: found the text \"a\", expected a whole number"),
+            (
+                "type = 'tets-grid'",
+                "a.toml:3:8: encoder.type: found no encoder type \"tets-grid\", expected \"test-grid\"",
+            ),
+            (
+                "type = 'test-stack'",
+                "a.toml:2:1: encoder.below: found nothing, expected a table with an encoder type: one of",
+            ),
+            ("type = 'test-stack'\nbelow = { type = 'test-grid', level = 2 }", "a.toml:4:31: encoder.below.level"),
+        ] {
+            let e = refusal(&format!("{base}{line}\n"), &[]);
+            assert!(e.contains(want), "{line}\n{e}\n{want}");
+        }
+        let e = refusal("extends = 'plain'\n\nencodr = 3\n", &[]);
+        assert!(e.starts_with("a.toml:3:1: encodr: found an unknown key, expected \"encoder\""), "{e}");
+        let e = refusal("name = 'x'\n", &[]);
+        assert!(e.contains("solver: found nothing") && e.contains("test-solver"), "{e}");
+        let e = refusal("extends = 'plian'\n", &[]);
+        assert!(
+            e.starts_with("a.toml:1:11: extends")
+                && e.contains("expected a file or the name")
+                && e.contains("\"plain\""),
+            "{e}"
+        );
+        let e = refusal("{\n\"solver\": {\"type\": \"test-solver\",\n \"step\": 3}}", &[]);
+        assert!(e.starts_with("a.toml:3:2: solver.step: found an unknown key, expected \"steps\""), "{e}");
+    }
+
+    #[test]
+    fn sets_are_checked_like_files() {
+        for (set, want) in [
+            ("encoder.level=8", "--set encoder.level=8: encoder.level: found an unknown key"),
+            ("encoder.levels=8x", "found the text \"8x\", expected a whole number"),
+            ("encoder.levels", "--set encoder.levels: path: found"),
+            ("=3", "expected path=value"),
+            ("encoder..levels=3", "expected path=value"),
+            ("encoder.levels.deep=3", "a key below encoder.levels, which is 3"),
+            ("normalizers.0.type=nothing", "no normalizer type"),
+            ("name=1\nsolver=2", "name"),
+        ] {
+            let text = if set.starts_with("normalizers") {
+                "extends = 'plain'\nnormalizers = []"
+            } else {
+                "extends = 'plain'"
+            };
+            match read(text, &[set]) {
+                Ok(l) => assert_eq!(l.tree["name"], "1\nsolver=2", "{set}"),
+                Err(e) => assert!(e.to_string().contains(want), "{set}: {e}"),
+            }
+        }
+        let e = refusal("extends = 'plain'\nnormalizers = []", &["normalizers.2.type=x"]);
+        assert!(e.contains("expected 0, to add one"), "{e}");
+    }
+
+    #[test]
+    fn a_type_set_clears_the_keys_of_the_old_type_in_any_order() {
+        let sets = ["encoder.below={type='test-grid'}", "encoder.type=test-stack"];
+        let l = read("extends = 'plain'", &sets).unwrap();
+        assert_eq!(l.tree["encoder"]["type"], "test-stack");
+        assert!(l.tree["encoder"].get("levels").is_none());
+    }
+
+    #[test]
+    fn errors_of_a_stage_get_their_line() {
+        let l = read("extends = 'plain'\n[encoder]\ngrowth = 2\nlevels = 9\n", &[]).unwrap();
+        let e = l.locate(l.spec.encoder.as_ref().unwrap().build().err().unwrap()).to_string();
+        assert_eq!(e, "a.toml:4:10: encoder.levels: found 9, expected another number");
+    }
+
+    #[test]
+    fn circles_are_refused() {
+        let dir = std::env::temp_dir().join(format!("conefield-circle-{}", std::process::id()));
+        std::fs::create_dir_all(&dir).unwrap();
+        std::fs::write(dir.join("a.toml"), "extends = 'b.toml'\n").unwrap();
+        std::fs::write(dir.join("b.toml"), "extends = './a.toml'\n").unwrap();
+        let e = load(&dir.join("a.toml").display().to_string(), &[], SHIPPED).err().unwrap().to_string();
+        std::fs::remove_dir_all(&dir).unwrap();
+        assert!(e.contains("b.toml:1:11: extends") && e.contains("expected no circle"), "{e}");
+    }
+
+    #[test]
+    fn an_unknown_name_lists_what_there_is() {
+        let e = load("plan", &[], SHIPPED).err().unwrap().to_string();
+        assert!(e.contains("neither a shipped spec nor a file") && e.contains("\"plain\" (of plain, curved)"), "{e}");
+    }
+}

@@ -1,0 +1,287 @@
+//! Forward and backward of a group of rows, tile by tile.
+
+use conefield_core::pipeline::Pipeline;
+use conefield_core::simd::Real;
+use conefield_core::stage::{GradKind, Grads, Info, Kernel, Scope, Stage, TILE_ROWS, Tile, TileMut};
+use std::ops::Range;
+
+/// A stage ready to run: its arithmetic, its widths and its place in the arena.
+pub struct Step<'a, R: Real> {
+    /// The arithmetic.
+    pub kernel: &'a dyn Kernel<R>,
+    /// Widths and counts.
+    pub info: Info,
+    /// Its parameters in the arena.
+    pub params: Range<usize>,
+    /// Ranges of its parameters (within the stage) that workers may own, for scattered ones.
+    pub partition: Vec<Range<usize>>,
+    /// Whether a stage before it learns, so that it must hand a gradient on.
+    pub hands_on: bool,
+    /// Channels of a tile that it reads and writes; its tape follows its output.
+    input: Range<usize>,
+    output: Range<usize>,
+}
+
+/// Every stage that does something, in order.
+pub struct Kernels<'a, R: Real> {
+    /// Encoder first, field last.
+    pub steps: Vec<Step<'a, R>>,
+    scope: Scope,
+}
+
+impl<'a, R: Real> Kernels<'a, R> {
+    /// The kernels of `pipeline` in the precision that `pick` chooses; `None` where a stage lacks it.
+    pub fn new(pipeline: &'a Pipeline, pick: impl Fn(&'a dyn Stage) -> Option<&'a dyn Kernel<R>>) -> Option<Self> {
+        let mut steps = vec![];
+        let mut learns = false;
+        let (mut input, mut end) = (0..3, 3);
+        for ((_, stage), range) in pipeline.stages().into_iter().zip(pipeline.ranges()) {
+            let info = stage.info();
+            let hands_on = learns;
+            learns |= info.params > 0;
+            if info.identity && !steps.is_empty() {
+                continue;
+            }
+            let partition = if info.grads == GradKind::Scatter { stage.partition() } else { vec![] };
+            let output = end..end + info.output;
+            end = output.end + info.tape;
+            let read = std::mem::replace(&mut input, output.clone());
+            let (kernel, params) = (pick(stage)?, range.clone());
+            steps.push(Step { kernel, info, params, partition, hands_on, input: read, output });
+        }
+        Some(Self { steps, scope: pipeline.scope() })
+    }
+
+    /// Channels that the encoder computes.
+    pub fn encoder_width(&self) -> usize {
+        self.steps[0].info.output
+    }
+
+    /// Rows of a tile of points that belong to no ray.
+    pub fn rows_at_points(&self) -> usize {
+        if self.scope == Scope::Ray { 1 } else { TILE_ROWS }
+    }
+
+    /// Tiles for one ray of `n` samples.
+    pub fn ray_tiles(&self, n: usize) -> Vec<usize> {
+        if self.scope == Scope::Ray { vec![n] } else { even_tiles(n) }
+    }
+
+    /// Whether rows of several rays may share a tile.
+    pub fn mixes_rays(&self) -> bool {
+        self.scope == Scope::Row
+    }
+
+    /// Numbers a row that a tile holds: points, every stage's output, tape and gradient.
+    pub fn row_numbers(&self) -> usize {
+        3 + self.steps.iter().map(|s| s.info.output + s.info.tape).sum::<usize>()
+    }
+
+    fn widest(&self) -> usize {
+        self.steps.iter().map(|s| s.info.output).max().unwrap_or(1).max(3)
+    }
+}
+
+/// `n` rows in as few tiles of nearly the same size as [`TILE_ROWS`] allows, whole vectors each but the last.
+pub fn even_tiles(n: usize) -> Vec<usize> {
+    let tiles = n.div_ceil(TILE_ROWS).max(1);
+    let each = n.div_ceil(tiles).next_multiple_of(32).min(TILE_ROWS);
+    (0..n).step_by(each).map(|at| each.min(n - at)).collect()
+}
+
+/// One tile of a scattered stage's input and output gradient, kept until the second pass.
+#[derive(Debug, Default, Clone)]
+pub struct Log<R> {
+    /// Tile by tile: input channels, then output-gradient channels.
+    pub data: Vec<R>,
+    /// Rows of each tile.
+    pub rows: Vec<usize>,
+}
+
+/// Working memory of a worker; it grows to what the largest group needs and is used again.
+#[derive(Debug, Default)]
+pub struct Scratch<R> {
+    points: Vec<[f32; 3]>,
+    /// Tile by tile: points, then of each stage output and tape.
+    data: Vec<R>,
+    tiles: Vec<usize>,
+    outputs: Vec<R>,
+    /// Gradients on the way back: of a stage's output and of its input.
+    back: [Vec<R>; 2],
+}
+
+impl<R: Real> Scratch<R> {
+    /// Takes the rows to work on.
+    pub fn load(&mut self, points: &[[f32; 3]]) {
+        self.points.clear();
+        self.points.extend_from_slice(points);
+    }
+
+    /// The field at every row of the last [`Scratch::forward`].
+    pub fn outputs(&self) -> &[R] {
+        &self.outputs
+    }
+
+    /// Bytes held.
+    pub fn bytes(&self) -> usize {
+        (self.data.capacity() + self.outputs.capacity() + self.back[0].capacity() + self.back[1].capacity())
+            * size_of::<R>()
+            + self.points.capacity() * 12
+    }
+
+    /// Runs every stage over tiles of `tiles` rows.
+    pub fn forward(&mut self, kernels: &Kernels<'_, R>, params: &[R], tiles: &[usize]) {
+        self.run(kernels, params, tiles, kernels.steps.len());
+    }
+
+    /// The encoder's features of the first `n` rows, channel-major.
+    pub fn encode(&mut self, kernels: &Kernels<'_, R>, params: &[R], n: usize) -> &[R] {
+        self.run(kernels, params, &[n], 1);
+        &self.outputs
+    }
+
+    fn run(&mut self, kernels: &Kernels<'_, R>, params: &[R], tiles: &[usize], steps: usize) {
+        let rows: usize = tiles.iter().sum();
+        debug_assert_eq!(rows, self.points.len());
+        if self.data.len() < rows * kernels.row_numbers() {
+            self.data.resize(rows * kernels.row_numbers(), R::ZERO);
+        }
+        self.tiles.clear();
+        self.tiles.extend_from_slice(tiles);
+        self.outputs.clear();
+        let mut tile = &mut self.data[..];
+        let mut points = &self.points[..];
+        for &n in tiles {
+            let (own, rest) = std::mem::take(&mut tile).split_at_mut(n * kernels.row_numbers());
+            tile = rest;
+            for k in 0..3 {
+                for (x, p) in own[k * n..(k + 1) * n].iter_mut().zip(points) {
+                    *x = R::of(f64::from(p[k]));
+                }
+            }
+            points = &points[n..];
+            for s in &kernels.steps[..steps] {
+                let (before, after) = own.split_at_mut(s.output.start * n);
+                let (y, tape) = after[..(s.info.output + s.info.tape) * n].split_at_mut(s.info.output * n);
+                s.kernel.forward(
+                    &params[s.params.clone()],
+                    Tile::new(&before[s.input.start * n..s.input.end * n], n),
+                    TileMut::new(y, n),
+                    TileMut::new(tape, n),
+                );
+            }
+            let y = &kernels.steps[steps - 1].output;
+            self.outputs.extend_from_slice(&own[y.start * n..y.end * n]);
+        }
+    }
+
+    /// Given the gradient of every row's output, adds the gradients of dense stages to `dense` (as long as the
+    /// arena; only their ranges are touched) and appends what scattered stages need to `logs`, one a stage.
+    pub fn backward(
+        &mut self,
+        kernels: &Kernels<'_, R>,
+        params: &[R],
+        dmu: &[R],
+        dense: &mut DenseGrads<R>,
+        logs: &mut [Log<R>],
+    ) {
+        let widest = kernels.widest();
+        let mut tile = &mut self.data[..];
+        let mut dmu = dmu;
+        for &n in &self.tiles {
+            let (own, rest) = std::mem::take(&mut tile).split_at_mut(n * kernels.row_numbers());
+            tile = rest;
+            let [dy, dx] = &mut self.back;
+            dy.resize((widest * n).max(dy.len()), R::ZERO);
+            dx.resize((widest * n).max(dx.len()), R::ZERO);
+            dy[..n].copy_from_slice(&dmu[..n]);
+            dmu = &dmu[n..];
+            for (k, s) in kernels.steps.iter().enumerate().rev() {
+                if s.info.params == 0 && !s.hands_on {
+                    break;
+                }
+                let (before, after) = own.split_at_mut(s.output.start * n);
+                let x = &before[s.input.start * n..s.input.end * n];
+                let g = &dy[..s.info.output * n];
+                let scattered = s.info.grads == GradKind::Scatter;
+                if scattered {
+                    let log = &mut logs[k];
+                    log.data.extend_from_slice(x);
+                    log.data.extend_from_slice(g);
+                    log.rows.push(n);
+                }
+                if scattered && !s.hands_on {
+                    break;
+                }
+                let grads = if scattered || s.info.params == 0 {
+                    Grads { values: &mut [], range: 0..0 }
+                } else {
+                    Grads::all(dense.of(k))
+                };
+                s.kernel.backward(
+                    &params[s.params.clone()],
+                    Tile::new(x, n),
+                    TileMut::new(&mut after[s.info.output * n..(s.info.output + s.info.tape) * n], n),
+                    Tile::new(g, n),
+                    grads,
+                    s.hands_on.then(|| TileMut::new(&mut dx[..s.info.input * n], n)),
+                );
+                if !s.hands_on {
+                    break;
+                }
+                std::mem::swap(dy, dx);
+            }
+        }
+    }
+}
+
+/// Gradients of the dense stages, one buffer.
+#[derive(Debug, Default, Clone)]
+pub struct DenseGrads<R> {
+    values: Vec<R>,
+    /// Of each step: its place in `values`, empty for those that are not dense.
+    places: Vec<Range<usize>>,
+}
+
+impl<R: Real> DenseGrads<R> {
+    /// Zeros for every dense step of `kernels`.
+    pub fn new(kernels: &Kernels<'_, R>) -> Self {
+        let mut places = vec![];
+        let mut end = 0;
+        for s in &kernels.steps {
+            let n = if s.info.grads == GradKind::Dense { s.info.params } else { 0 };
+            places.push(end..end + n);
+            end += n;
+        }
+        Self { values: vec![R::ZERO; end], places }
+    }
+
+    /// The gradients of step `k`.
+    pub fn of(&mut self, k: usize) -> &mut [R] {
+        &mut self.values[self.places[k].clone()]
+    }
+
+    /// Numbers held.
+    pub fn len(&self) -> usize {
+        self.values.len()
+    }
+
+    /// Whether no stage is dense.
+    pub fn is_empty(&self) -> bool {
+        self.values.is_empty()
+    }
+
+    /// Back to zero.
+    pub fn clear(&mut self) {
+        self.values.fill(R::ZERO);
+    }
+
+    /// Adds everything to the arena's gradients.
+    pub fn merge(&self, kernels: &Kernels<'_, R>, grads: &mut [R]) {
+        for (s, place) in kernels.steps.iter().zip(&self.places) {
+            for (g, &v) in grads[s.params.clone()].iter_mut().zip(&self.values[place.clone()]) {
+                *g += v;
+            }
+        }
+    }
+}

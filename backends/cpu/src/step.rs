@@ -1,0 +1,311 @@
+//! One training step: losses and their gradients over rays, points and blocks.
+
+use crate::rows::{DenseGrads, Kernels, Log, Scratch, even_tiles};
+use conefield_core::backend::{StepStats, TvBlocks, Work};
+use conefield_core::random::mix;
+use conefield_core::simd::Real;
+use conefield_core::stage::{Grads, Projector, Samples, Tile, TileMut};
+use rayon::prelude::*;
+use std::ops::Range;
+use std::time::Instant;
+
+/// Rows of a wave: its logs stay in the last-level cache, its work keeps many workers busy.
+const WAVE_ROWS: usize = 65_536;
+/// Rows of a group: what a worker carries through forward and backward at once.
+const GROUP_ROWS: usize = 512;
+/// Groups of a wave are dealt to this many slots at most, each with its own sums.
+const SLOTS: usize = 16;
+/// Bytes that all slots' copies of dense gradients may take together.
+const DENSE_BYTES: usize = 128 << 20;
+
+/// A group of rows that goes forward and backward together.
+#[derive(Debug, Clone)]
+enum Group {
+    Rays(Range<usize>),
+    Points(Range<usize>),
+    Tv(Range<usize>),
+}
+
+/// What belongs to one slot.
+#[derive(Debug, Default)]
+struct Slot<R> {
+    scratch: Scratch<R>,
+    samples: Samples,
+    /// Rows of each ray of the group.
+    counts: Vec<usize>,
+    mu: Vec<f64>,
+    dmu: Vec<f64>,
+    back: Vec<R>,
+    dense: DenseGrads<R>,
+    logs: Vec<Log<R>>,
+    loss: f64,
+    prior: f64,
+    rows: u64,
+}
+
+/// The working memory of steps.
+#[derive(Debug)]
+pub struct Slots<R> {
+    slots: Vec<Slot<R>>,
+}
+
+impl<R: Real> Slots<R> {
+    /// Slots for `kernels`. Their number depends on the plan alone, since it decides the order of sums.
+    pub fn new(kernels: &Kernels<'_, R>) -> Self {
+        let dense = DenseGrads::new(kernels);
+        let count = (DENSE_BYTES / (dense.len() * size_of::<R>()).max(1)).clamp(1, SLOTS);
+        let slot = || Slot { dense: dense.clone(), logs: vec![Log::default(); kernels.steps.len()], ..Slot::default() };
+        Self { slots: std::iter::repeat_with(slot).take(count).collect() }
+    }
+
+    /// Bytes held now.
+    pub fn bytes(&self) -> usize {
+        let logs = |s: &Slot<R>| s.logs.iter().map(|l| l.data.capacity() * size_of::<R>()).sum::<usize>();
+        self.slots.iter().map(|s| s.scratch.bytes() + logs(s) + s.dense.len() * size_of::<R>()).sum()
+    }
+
+    /// Adds the gradients of `work`'s loss to `grads`.
+    pub fn step(
+        &mut self,
+        kernels: &Kernels<'_, R>,
+        projector: &dyn Projector,
+        params: &[R],
+        grads: &mut [R],
+        work: &Work<'_>,
+    ) -> StepStats {
+        let mut stats = StepStats::default();
+        for slot in &mut self.slots {
+            slot.dense.clear();
+            (slot.loss, slot.prior, slot.rows) = (0.0, 0.0, 0);
+        }
+        for wave in waves(kernels, projector, work) {
+            let start = Instant::now();
+            let share = wave.len().div_ceil(self.slots.len()).max(1);
+            self.slots.par_iter_mut().enumerate().for_each(|(i, slot)| {
+                let from = (i * share).min(wave.len());
+                for group in &wave[from..(from + share).min(wave.len())] {
+                    slot.run(kernels, projector, params, work, group);
+                }
+            });
+            let dense_done = Instant::now();
+            self.scatter(kernels, params, grads);
+            stats.dense_s += (dense_done - start).as_secs_f64();
+            stats.scatter_s += dense_done.elapsed().as_secs_f64();
+        }
+        for slot in &self.slots {
+            slot.dense.merge(kernels, grads);
+            stats.loss += slot.loss;
+            stats.prior += slot.prior;
+            stats.samples += slot.rows;
+        }
+        stats
+    }
+
+    /// The second pass: each worker owns a range of scattered parameters and goes through the logs in order.
+    fn scatter(&mut self, kernels: &Kernels<'_, R>, params: &[R], grads: &mut [R]) {
+        let slots = &self.slots;
+        let mut rest = grads;
+        let mut taken = 0;
+        let mut tasks = vec![];
+        for (k, s) in kernels.steps.iter().enumerate() {
+            for range in &s.partition {
+                let (from, to) = (s.params.start + range.start, s.params.start + range.end);
+                let (own, after) = std::mem::take(&mut rest)[from - taken..].split_at_mut(to - from);
+                (rest, taken) = (after, to);
+                tasks.push((k, range.clone(), own));
+            }
+        }
+        // The last ranges are the largest (finest levels): start with them, so that workers end together.
+        tasks.into_par_iter().rev().with_max_len(1).for_each(|(k, range, values)| {
+            let s = &kernels.steps[k];
+            for log in slots.iter().map(|slot| &slot.logs[k]) {
+                let mut data = &log.data[..];
+                for &n in &log.rows {
+                    let (x, after) = data.split_at(s.info.input * n);
+                    let (dy, after) = after.split_at(s.info.output * n);
+                    data = after;
+                    let grads = Grads { values: &mut values[..], range: range.clone() };
+                    s.kernel.backward(
+                        &params[s.params.clone()],
+                        Tile::new(x, n),
+                        TileMut::new(&mut [], n),
+                        Tile::new(dy, n),
+                        grads,
+                        None,
+                    );
+                }
+            }
+        });
+        for log in self.slots.iter_mut().flat_map(|s| &mut s.logs) {
+            log.data.clear();
+            log.rows.clear();
+        }
+    }
+}
+
+/// Cuts the work into groups, and these into waves.
+fn waves<R: Real>(kernels: &Kernels<'_, R>, projector: &dyn Projector, work: &Work<'_>) -> Vec<Vec<Group>> {
+    let mut groups: Vec<(Group, usize)> = vec![];
+    let (mut start, mut rows) = (0, 0);
+    for (i, ray) in work.rays.iter().enumerate() {
+        let n = projector.max_samples(&ray.ray);
+        if i > start && (rows + n > GROUP_ROWS || !kernels.mixes_rays()) {
+            groups.push((Group::Rays(start..i), rows));
+            (start, rows) = (i, 0);
+        }
+        rows += n;
+    }
+    if start < work.rays.len() {
+        groups.push((Group::Rays(start..work.rays.len()), rows));
+    }
+    for start in (0..work.points.len()).step_by(GROUP_ROWS) {
+        let end = (start + GROUP_ROWS).min(work.points.len());
+        groups.push((Group::Points(start..end), end - start));
+    }
+    if let Some(tv) = work.tv {
+        let block = tv.edge.pow(3);
+        let each = (GROUP_ROWS / block).max(1);
+        for start in (0..tv.corners.len()).step_by(each) {
+            let end = (start + each).min(tv.corners.len());
+            groups.push((Group::Tv(start..end), (end - start) * block));
+        }
+    }
+    let mut waves = vec![vec![]];
+    let mut rows = 0;
+    for (group, n) in groups {
+        if rows > 0 && rows + n > WAVE_ROWS {
+            waves.push(vec![]);
+            rows = 0;
+        }
+        rows += n;
+        if let Some(wave) = waves.last_mut() {
+            wave.push(group);
+        }
+    }
+    waves
+}
+
+impl<R: Real> Slot<R> {
+    fn run(
+        &mut self,
+        kernels: &Kernels<'_, R>,
+        projector: &dyn Projector,
+        params: &[R],
+        work: &Work<'_>,
+        group: &Group,
+    ) {
+        self.samples.points.clear();
+        self.samples.weights.clear();
+        self.counts.clear();
+        match group {
+            Group::Rays(range) => {
+                for i in range.clone() {
+                    let before = self.samples.points.len();
+                    let seed = mix(mix(work.seed, work.step), i as u64);
+                    projector.sample(&work.rays[i].ray, Some(seed), &mut self.samples);
+                    self.counts.push(self.samples.points.len() - before);
+                }
+            }
+            Group::Points(range) => self.samples.points.extend(work.points[range.clone()].iter().map(|p| p.0)),
+            Group::Tv(range) => {
+                for corner in work.tv.iter().flat_map(|tv| &tv.corners[range.clone()]) {
+                    block_points(work.tv, *corner, &mut self.samples.points);
+                }
+            }
+        }
+        let rows = self.samples.points.len();
+        if rows == 0 {
+            return;
+        }
+        self.rows += rows as u64;
+        let on_rays = matches!(group, Group::Rays(_));
+        let tiles = match (on_rays, kernels.mixes_rays()) {
+            (_, true) => {
+                // Whole vectors: the last row is repeated with no weight.
+                let padded = rows.next_multiple_of(16);
+                let last = self.samples.points[rows - 1];
+                self.samples.points.resize(padded, last);
+                even_tiles(padded)
+            }
+            (true, false) => self.counts.clone(),
+            (false, false) => vec![1; rows],
+        };
+        self.scratch.load(&self.samples.points);
+        self.scratch.forward(kernels, params, &tiles);
+        self.mu.clear();
+        self.mu.extend(self.scratch.outputs().iter().map(|m| m.f64()));
+        self.dmu.clear();
+        self.dmu.resize(self.mu.len(), 0.0);
+        match group {
+            Group::Rays(range) => self.ray_loss(projector, work, range.clone()),
+            Group::Points(range) => {
+                let scale = 1.0 / work.points.len() as f64;
+                for (i, (_, target)) in work.points[range.clone()].iter().enumerate() {
+                    let (loss, slope) = work.loss.at(self.mu[i] - f64::from(*target));
+                    self.loss += loss * scale;
+                    self.dmu[i] = slope * scale;
+                }
+            }
+            Group::Tv(range) => {
+                for (tv, i) in work.tv.iter().flat_map(|tv| (0..range.len()).map(move |i| (tv, i))) {
+                    let at = i * tv.edge.pow(3)..(i + 1) * tv.edge.pow(3);
+                    self.prior += total_variation(tv, &self.mu[at.clone()], &mut self.dmu[at]);
+                }
+            }
+        }
+        self.back.clear();
+        self.back.extend(self.dmu.iter().map(|&d| R::of(d)));
+        self.scratch.backward(kernels, params, &self.back, &mut self.dense, &mut self.logs);
+    }
+
+    fn ray_loss(&mut self, projector: &dyn Projector, work: &Work<'_>, rays: Range<usize>) {
+        let scale = 1.0 / work.rays.len() as f64;
+        let mut at = 0;
+        for (i, &n) in rays.zip(&self.counts) {
+            let rows = at..at + n;
+            let weights = &self.samples.weights[rows.clone()];
+            let line = projector.integrate(weights, &self.mu[rows.clone()]);
+            let (loss, slope) = work.loss.at(line - f64::from(work.rays[i].target));
+            self.loss += loss * scale;
+            projector.adjoint(weights, slope * scale, &mut self.dmu[rows]);
+            at += n;
+        }
+    }
+}
+
+fn block_points(tv: Option<&TvBlocks>, corner: [f32; 3], out: &mut Vec<[f32; 3]>) {
+    let Some(tv) = tv else { return };
+    for x in 0..tv.edge {
+        for y in 0..tv.edge {
+            for z in 0..tv.edge {
+                let i = [x, y, z];
+                out.push(std::array::from_fn(|k| corner[k] + i[k] as f32 * tv.spacing[k]));
+            }
+        }
+    }
+}
+
+/// Weighted isotropic total variation of one block by forward differences, its mean over points and blocks; adds
+/// its gradient to `dmu`.
+fn total_variation(tv: &TvBlocks, mu: &[f64], dmu: &mut [f64]) -> f64 {
+    let e = tv.edge;
+    let strides = [e * e, e, 1];
+    let scale = tv.weight / (tv.corners.len() * mu.len()) as f64;
+    let mut sum = 0.0;
+    for i in 0..mu.len() {
+        let index = [i / (e * e), i / e % e, i % e];
+        let d: [f64; 3] = std::array::from_fn(|k| if index[k] + 1 < e { mu[i + strides[k]] - mu[i] } else { 0.0 });
+        let size = (d[0] * d[0] + d[1] * d[1] + d[2] * d[2] + tv.smoothing * tv.smoothing).sqrt();
+        sum += size - tv.smoothing;
+        if size > 0.0 {
+            for k in 0..3 {
+                if index[k] + 1 < e {
+                    let g = scale * d[k] / size;
+                    dmu[i + strides[k]] += g;
+                    dmu[i] -= g;
+                }
+            }
+        }
+    }
+    sum * scale
+}

@@ -1,0 +1,306 @@
+//! Checks a spec as written against what the registered stage types know, so that a mistake is told with its line,
+//! its path and the nearest valid name.
+
+use super::schema::{NESTED, STAGES, kind_name, kind_named, of_scene, of_type};
+use super::tree::{At, Kind as Is, Node};
+use crate::error::{Error, Result};
+use crate::registry::{Kind, names, stage_types};
+use serde_json::Value;
+
+/// Keys of a spec beside its stages.
+const TEXTS: [&str; 2] = ["name", "description"];
+
+/// Refuses unknown keys, unknown types and values of another type than their setting has.
+pub(super) fn spec(root: &Node) -> Result<()> {
+    table(root, "spec")?;
+    for e in root.entries() {
+        let key = e.key.as_str();
+        if TEXTS.contains(&key) {
+            setting(&e.value, &serde_json::json!({ "type": "string" }), &Context::new(&Value::Null, None), key)?;
+        } else if key == "scene" {
+            let schema = of_scene();
+            setting(&e.value, &schema, &Context::new(&schema, None), key)?;
+        } else if key == "normalizers" {
+            let Is::Array(items) = &e.value.kind else {
+                return Err(invalid(&e.value.at, key, e.value.shown(), "a list of tables, [[normalizers]]".into()));
+            };
+            for (i, n) in items.iter().enumerate() {
+                stage(n, Kind::Normalizer, &format!("{key}.{i}"))?;
+            }
+        } else if let Some((_, kind)) = STAGES.iter().find(|s| s.0 == key) {
+            stage(&e.value, *kind, key)?;
+        } else {
+            let known: Vec<&str> = TEXTS.into_iter().chain(["scene"]).chain(STAGES.iter().map(|s| s.0)).collect();
+            return Err(unknown(&e.at, key, key, &known));
+        }
+    }
+    if root.get("solver").is_none() {
+        let want = format!("a table [solver] with a type: {}", listed(&names(Kind::Solver)));
+        return Err(invalid(&root.at, "solver", "nothing".into(), want));
+    }
+    Ok(())
+}
+
+/// Checks a stage: its type, then its settings.
+fn stage(node: &Node, kind: Kind, path: &str) -> Result<()> {
+    if node.kind == Is::Null {
+        return Ok(());
+    }
+    table(node, path)?;
+    let known = names(kind);
+    let types = || format!("a type: {}", listed(&known));
+    let Some(name) = node.get("type") else {
+        return Err(invalid(&node.at, &join(path, "type"), "nothing".into(), types()));
+    };
+    let Some(text) = name.text() else {
+        return Err(invalid(&name.at, &join(path, "type"), name.shown(), types()));
+    };
+    let Some(found) = stage_types().into_iter().find(|t| t.kind == kind && t.name == text) else {
+        let found = format!("no {} type {text:?}", kind_name(kind));
+        return Err(invalid(&name.at, &join(path, "type"), found, suggest(text, &known)));
+    };
+    let schema = of_type(found);
+    object(node, &schema, &Context::new(&schema, Some(kind)), path)
+}
+
+/// Where references of a schema lead, and what kind of stage it belongs to.
+struct Context<'a> {
+    root: &'a Value,
+    kind: Option<Kind>,
+}
+
+impl<'a> Context<'a> {
+    fn new(root: &'a Value, kind: Option<Kind>) -> Self {
+        Self { root, kind }
+    }
+
+    /// The schema that `schema` refers to, or itself.
+    fn resolve<'b>(&'b self, schema: &'b Value) -> &'b Value {
+        let target = schema["$ref"].as_str().and_then(|r| self.root.pointer(r.trim_start_matches('#')));
+        target.unwrap_or(schema)
+    }
+}
+
+/// Checks a value against the schema of its setting.
+fn setting(node: &Node, schema: &Value, cx: &Context<'_>, path: &str) -> Result<()> {
+    let schema = cx.resolve(schema);
+    if let Some(kind) = schema[NESTED].as_str().and_then(kind_named) {
+        return stage(node, kind, path);
+    }
+    if let (Some(kind), true, true) = (cx.kind, is_open(schema), node.get("type").is_some()) {
+        return stage(node, kind, path);
+    }
+    let wrong = || invalid(&node.at, path, node.shown(), wanted(schema, cx));
+    let choices: Vec<&Value> =
+        ["anyOf", "oneOf"].iter().filter_map(|k| schema[*k].as_array()).flatten().map(|s| cx.resolve(s)).collect();
+    if !choices.is_empty() {
+        if choices.iter().any(|s| setting(node, s, cx, path).is_ok()) {
+            return Ok(());
+        }
+        // Where only one choice is of this value's shape, its own message says more.
+        let mut alike = choices.iter().filter(|s| shape_fits(node, s) && s["const"].is_null() && s["enum"].is_null());
+        return match (alike.next(), alike.next()) {
+            (Some(one), None) => setting(node, one, cx, path),
+            _ => Err(misnamed(node, path, &constants(schema, cx)).unwrap_or_else(wrong)),
+        };
+    }
+    if !schema["const"].is_null() || !schema["enum"].is_null() {
+        let all = constants(schema, cx);
+        return if all.contains(&node.to_json()) {
+            Ok(())
+        } else {
+            Err(misnamed(node, path, &all).unwrap_or_else(wrong))
+        };
+    }
+    if !shape_fits(node, schema) {
+        return Err(wrong());
+    }
+    match &node.kind {
+        Is::Number(n) => {
+            let x = n.as_f64().unwrap_or(f64::NAN);
+            let low = schema["minimum"].as_f64().is_none_or(|m| x >= m);
+            let high = schema["maximum"].as_f64().is_none_or(|m| x <= m);
+            if low && high { Ok(()) } else { Err(wrong()) }
+        }
+        Is::Array(items) => {
+            let n = items.len() as u64;
+            if schema["minItems"].as_u64().is_some_and(|m| n < m) || schema["maxItems"].as_u64().is_some_and(|m| n > m)
+            {
+                return Err(wrong());
+            }
+            for (i, item) in items.iter().enumerate() {
+                let of = if schema["prefixItems"][i].is_null() { &schema["items"] } else { &schema["prefixItems"][i] };
+                setting(item, of, cx, &format!("{path}.{i}"))?;
+            }
+            Ok(())
+        }
+        Is::Table(_) => object(node, schema, cx, path),
+        _ => Ok(()),
+    }
+}
+
+/// Checks the keys of a table.
+fn object(node: &Node, schema: &Value, cx: &Context<'_>, path: &str) -> Result<()> {
+    let empty = serde_json::Map::new();
+    let properties = schema["properties"].as_object().unwrap_or(&empty);
+    for e in node.entries() {
+        let at = join(path, &e.key);
+        match properties.get(&e.key) {
+            Some(s) => setting(&e.value, s, cx, &at)?,
+            None if schema["additionalProperties"] == Value::Bool(false) => {
+                let known: Vec<&str> = properties.keys().map(String::as_str).filter(|k| *k != "type").collect();
+                return Err(unknown(&e.at, &at, &e.key, &known));
+            }
+            None => {}
+        }
+    }
+    for key in schema["required"].as_array().into_iter().flatten().filter_map(Value::as_str) {
+        if node.get(key).is_none() {
+            let want = properties.get(key).map_or("a value".into(), |s| wanted(cx.resolve(s), cx));
+            return Err(invalid(&node.at, &join(path, key), "nothing".into(), want));
+        }
+    }
+    Ok(())
+}
+
+/// Whether a schema says nothing about a value's type.
+fn is_open(schema: &Value) -> bool {
+    schema
+        .as_object()
+        .is_none_or(|s| ["type", "properties", "anyOf", "oneOf", "const", "enum"].iter().all(|k| !s.contains_key(*k)))
+}
+
+/// Whether the value is of the type that the schema names.
+fn shape_fits(node: &Node, schema: &Value) -> bool {
+    let one = |name: &str| match (&node.kind, name) {
+        (Is::Null, "null")
+        | (Is::Bool(_), "boolean")
+        | (Is::Number(_), "number")
+        | (Is::String(_), "string")
+        | (Is::Array(_), "array")
+        | (Is::Table(_), "object") => true,
+        (Is::Number(n), "integer") => n.is_i64() || n.is_u64(),
+        _ => false,
+    };
+    match &schema["type"] {
+        Value::String(name) => one(name),
+        Value::Array(any) => any.iter().filter_map(Value::as_str).any(one),
+        _ => true,
+    }
+}
+
+/// The fixed values that a schema allows.
+fn constants(schema: &Value, cx: &Context<'_>) -> Vec<Value> {
+    let schema = cx.resolve(schema);
+    let mut all: Vec<Value> = schema["enum"].as_array().cloned().unwrap_or_default();
+    if !schema["const"].is_null() {
+        all.push(schema["const"].clone());
+    }
+    for key in ["anyOf", "oneOf"] {
+        all.extend(schema[key].as_array().into_iter().flatten().flat_map(|s| constants(s, cx)));
+    }
+    all
+}
+
+/// In words, what a schema allows.
+fn wanted(schema: &Value, cx: &Context<'_>) -> String {
+    let schema = cx.resolve(schema);
+    if let Some(kind) = schema[NESTED].as_str().and_then(kind_named) {
+        let article = if kind == Kind::Encoder || kind == Kind::Initializer { "an" } else { "a" };
+        return format!("a table with {article} {} type: {}", kind_name(kind), listed(&names(kind)));
+    }
+    let fixed = constants(schema, cx);
+    let mut words: Vec<String> = fixed.iter().map(plain).collect();
+    for key in ["anyOf", "oneOf"] {
+        let open = schema[key].as_array().into_iter().flatten().map(|s| cx.resolve(s));
+        words.extend(open.filter(|s| constants(s, cx).is_empty() && s["type"] != "null").map(|s| wanted(s, cx)));
+    }
+    if words.is_empty() {
+        let types: Vec<&str> = match &schema["type"] {
+            Value::Array(any) => any.iter().filter_map(Value::as_str).filter(|t| *t != "null").collect(),
+            one => one.as_str().into_iter().collect(),
+        };
+        for t in types {
+            words.push(match t {
+                "integer" => format!("a whole number{}", limits(schema)),
+                "number" => format!("a number{}", limits(schema)),
+                "string" => "a text".into(),
+                "boolean" => "true or false".into(),
+                "array" => list(schema, cx),
+                _ => {
+                    let keys = schema["properties"].as_object().into_iter().flat_map(|p| p.keys());
+                    format!("a table of {}", keys.map(String::as_str).collect::<Vec<_>>().join(", "))
+                }
+            });
+        }
+    }
+    if words.is_empty() { "another value".into() } else { words.join(" or ") }
+}
+
+fn list(schema: &Value, cx: &Context<'_>) -> String {
+    let n = schema["minItems"].as_u64().filter(|n| schema["maxItems"].as_u64() == Some(*n));
+    let item = if schema["items"].is_object() { format!(", each {}", wanted(&schema["items"], cx)) } else { "".into() };
+    n.map_or(format!("a list{item}"), |n| format!("a list of {n}{item}"))
+}
+
+fn limits(schema: &Value) -> String {
+    match (schema["minimum"].as_f64(), schema["maximum"].as_f64()) {
+        (Some(a), Some(b)) => format!(" from {a} to {b}"),
+        (Some(a), None) => format!(" of at least {a}"),
+        (None, Some(b)) => format!(" of at most {b}"),
+        (None, None) => String::new(),
+    }
+}
+
+fn plain(value: &Value) -> String {
+    value.as_str().map_or_else(|| value.to_string(), str::to_owned)
+}
+
+/// A text that is none of the texts allowed.
+fn misnamed(node: &Node, path: &str, allowed: &[Value]) -> Option<Error> {
+    let names: Vec<&str> = allowed.iter().filter_map(Value::as_str).collect();
+    let text = node.text().filter(|_| !names.is_empty())?;
+    Some(invalid(&node.at, path, format!("{text:?}"), suggest(text, &names)))
+}
+
+fn table(node: &Node, path: &str) -> Result<()> {
+    match node.kind {
+        Is::Table(_) => Ok(()),
+        _ => Err(invalid(&node.at, path, node.shown(), "a table".into())),
+    }
+}
+
+fn join(path: &str, key: &str) -> String {
+    format!("{path}.{key}")
+}
+
+fn invalid(at: &At, path: &str, found: String, expected: String) -> Error {
+    Error::invalid(at.to_string(), path, found, expected)
+}
+
+fn unknown(at: &At, path: &str, key: &str, known: &[&str]) -> Error {
+    invalid(at, path, "an unknown key".into(), suggest(key, known))
+}
+
+/// The nearest of `known` if one is near, and all of them.
+pub(super) fn suggest(name: &str, known: &[&str]) -> String {
+    let distance = |k: &str| strsim::osa_distance(&name.to_lowercase(), k);
+    let near = known
+        .iter()
+        .min_by_key(|k| distance(k))
+        .filter(|k| distance(k) <= (k.len() / 3).max(2) || k.starts_with(name) || name.starts_with(**k));
+    match (near, known) {
+        (_, []) => "none; there are none".into(),
+        (Some(near), [_]) => format!("{near:?}"),
+        (Some(near), _) => format!("{near:?} (of {})", known.join(", ")),
+        (None, _) => listed(known),
+    }
+}
+
+fn listed(known: &[&str]) -> String {
+    match known {
+        [] => "none is known here".into(),
+        [one] => (*one).into(),
+        _ => format!("one of {}", known.join(", ")),
+    }
+}
