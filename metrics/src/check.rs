@@ -1,0 +1,45 @@
+//! What no metric can be computed on is refused here, before any work.
+
+use conefield_core::error::{Error, Result, ensure};
+use ndarray::{ArrayView3, Zip};
+use rayon::prelude::*;
+
+const PLACE: &str = "metrics";
+
+/// Refuses pairs of different shape, empty ones, values that are not finite and a peak that is no data range.
+pub(crate) fn pair(result: ArrayView3<f32>, reference: ArrayView3<f32>, peak: f64) -> Result<()> {
+    ensure(
+        result.shape() == reference.shape(),
+        PLACE,
+        "shape of the result",
+        format!("{:?}", result.shape()),
+        format!("{:?}, the shape of the reference", reference.shape()),
+    )?;
+    ensure(!result.is_empty(), PLACE, "shape", format!("{:?}", result.shape()), "at least one voxel an axis")?;
+    ensure(peak.is_finite() && peak > 0.0, PLACE, "peak", peak, "a positive finite data range")?;
+    finite(result, "result")?;
+    finite(reference, "reference")
+}
+
+fn finite(volume: ArrayView3<f32>, name: &str) -> Result<()> {
+    // The usual case is decided in one parallel pass; the index is looked for only once it is known to exist.
+    let ok = volume.axis_iter(ndarray::Axis(0)).into_par_iter().all(|plane| Zip::from(&plane).all(|x| x.is_finite()));
+    if ok {
+        return Ok(());
+    }
+    match volume.indexed_iter().find(|(_, x)| !x.is_finite()) {
+        Some(((i, j, k), x)) => Err(Error::invalid(PLACE, format!("{name}[{i}, {j}, {k}]"), x, "a finite value")),
+        None => Ok(()),
+    }
+}
+
+/// Refuses, in the name of `metric`, volumes with an axis shorter than its window.
+pub(crate) fn window(metric: &str, shape: &[usize], window: usize) -> Result<()> {
+    ensure(
+        shape.iter().all(|&n| n >= window),
+        metric,
+        "shape",
+        format!("{shape:?}"),
+        format!("at least {window} voxels an axis, the size of the window"),
+    )
+}

@@ -1,0 +1,17 @@
+//! How far a reconstructed volume is from its reference: PSNR, RMSE and the three SSIMs in use.
+//!
+//! Three definitions of SSIM are published under the one name and differ by several hundredths. Each has its own
+//! function here ([`ssim_2d`], [`ssim_3d`], [`ssim_skimage`]) and [`evaluate`] reports all of them, so that a number
+//! is always named. Every sum is kept in `f64`; results do not depend on the number of threads.
+//!
+//! Volumes are `[x, y, z]`. `peak` is the data range: 1 for volumes in `[0, 1]`, and what all published figures use.
+
+mod check;
+mod error;
+mod score;
+mod ssim;
+mod window;
+
+pub use error::{Axis, WorstSlice, psnr, rmse, worst_slices};
+pub use score::{Scores, evaluate};
+pub use ssim::{ssim_2d, ssim_3d, ssim_skimage};
