@@ -1,1 +1,5 @@
-fn main() {}
+//! The `conefield` command.
+
+fn main() -> std::process::ExitCode {
+    conefield::main()
+}

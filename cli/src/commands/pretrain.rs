@@ -1,0 +1,88 @@
+//! `conefield pretrain`
+
+use super::{BackendChoice, Ends, reconstruct::notes};
+use crate::parse::{self, Values};
+use crate::progress::Progress;
+use crate::{out, specs};
+use clap::Args;
+use conefield_core::Result;
+use conefield_core::arena::Weights;
+use conefield_core::scan::Volume;
+use conefield_core::solver::PretrainJob;
+use serde_json::json;
+use std::path::PathBuf;
+
+/// Train a field on known volumes, for weights that other scans start from (MCI).
+///
+/// The weights file holds normalizers and field; the encoder stays with the volume that it was trained on.
+#[derive(Args)]
+pub struct Pretrain {
+    /// The known volumes.
+    #[arg(required = true, value_name = "VOLUME")]
+    volumes: Vec<PathBuf>,
+    /// A shipped spec (naf, ni-naf, nerf, dense, fast) or a file.
+    #[arg(long)]
+    spec: String,
+    /// The weights file to write (.safetensors).
+    #[arg(short, long = "output", value_name = "WEIGHTS")]
+    output: PathBuf,
+    /// Change a setting, such as encoder.levels=8.
+    #[arg(long = "set", value_name = "KEY=VALUE")]
+    sets: Vec<String>,
+    /// What voxel values mean: as-is, hu:MU_WATER or clip:LO,HI.
+    #[arg(long, default_value = "as-is", value_parser = parse::values)]
+    values: Values,
+    #[command(flatten)]
+    ends: Ends,
+    /// Which backend.
+    #[arg(long, default_value = "auto")]
+    backend: BackendChoice,
+    /// Seed of everything random.
+    #[arg(long, default_value_t = 0)]
+    seed: u64,
+    /// Print one JSON object.
+    #[arg(long)]
+    json: bool,
+}
+
+impl Pretrain {
+    pub fn run(self) -> Result<()> {
+        let loaded = specs::read(&self.spec, &self.sets)?;
+        let solver = loaded.spec.solver.build().map_err(|e| loaded.locate(e))?;
+        specs::build(&loaded)?;
+        let read = |p: &PathBuf| self.values.apply(conefield_io::read_volume(p)?);
+        let volumes: Vec<Volume> = self.volumes.iter().map(read).collect::<Result<_>>()?;
+        let backend = self.backend.open();
+        let job = PretrainJob {
+            volumes: &volumes,
+            spec: &loaded.spec,
+            backend: backend.as_ref(),
+            seed: self.seed,
+            limits: self.ends.limits(),
+        };
+        let mut progress = Progress::new("pretrain", None);
+        let model = solver.pretrain(&job, &mut progress).map_err(|e| loaded.locate(e))?;
+        let last = progress.records().last().cloned().unwrap_or_default();
+        drop(progress);
+        let keep = |name: &str| !name.starts_with("encoder.");
+        let mut weights = Weights::from_arena(model.pipeline.layout(), &model.arena.params, keep);
+        weights.notes = notes(&loaded, self.seed)?;
+        conefield_io::write_weights(&self.output, &weights)?;
+        let numbers: usize = weights.tensors.values().map(|t| t.1.len()).sum();
+        if self.json {
+            return out::json(&json!({
+                "weights": self.output, "tensors": weights.tensors.keys().collect::<Vec<_>>(), "parameters": numbers,
+                "steps": last.step, "train_s": last.seconds, "loss": last.loss,
+            }));
+        }
+        out::say(&format!(
+            "{}: {} tensors, {} parameters, after {} steps in {}, loss {:.3e}",
+            self.output.display(),
+            weights.tensors.len(),
+            out::number(numbers as u64),
+            last.step,
+            out::duration(last.seconds),
+            last.loss,
+        ))
+    }
+}

@@ -1,0 +1,174 @@
+//! `conefield simulate`
+
+use super::convert::refuse_existing;
+use crate::parse::{self, Angles as AnglesArg, Values};
+use crate::out;
+use clap::Args;
+use conefield_core::scan::Volume;
+use conefield_core::{Error, Result};
+use conefield_projectors::simulate::{Angles, HuMapping, Noise, PhantomKind, Protocol, downsample, phantom, simulate};
+use serde_json::json;
+use std::path::{Path, PathBuf};
+
+/// Make a scan of a known volume.
+///
+/// Projections are line integrals of the volume's trilinear interpolation along a circular orbit. The scan keeps the
+/// volume as its truth.
+#[derive(Args)]
+pub struct Simulate {
+    /// The volume: a file, or phantom:NAME or phantom:NAME:SIZE for one that the program makes, such as
+    /// phantom:head:128.
+    volume: String,
+    /// The folder for the scan.
+    #[arg(short, long = "output", value_name = "SCAN")]
+    output: PathBuf,
+    /// Where source and detector stand: r2, the published synthetic set-up, or a TOML or JSON file.
+    #[arg(long, default_value = "r2", value_name = "r2|FILE")]
+    protocol: String,
+    /// Number of views [default: the protocol's; r2: 50].
+    #[arg(long, value_name = "N", value_parser = clap::value_parser!(u32).range(1..))]
+    views: Option<u32>,
+    /// Rows and columns of the detector, whose size stays [default: the protocol's; r2: 512x512].
+    #[arg(long, value_name = "ROWSxCOLS", value_parser = parse::detector)]
+    detector: Option<[usize; 2]>,
+    /// Shift of the detector along its rows' and its columns' direction, in mm.
+    #[arg(long, value_name = "V,U", value_parser = parse::offset, allow_hyphen_values = true)]
+    offset: Option<[f64; 2]>,
+    /// Angles in degrees: evenly from START over RANGE, or a file with one a line.
+    #[arg(long, value_name = "START:RANGE|FILE", value_parser = parse::angles, allow_hyphen_values = true)]
+    angles: Option<AnglesArg>,
+    /// Noise: none, tigre:I0,SIGMA such as tigre:1e4,10 (the published one), or poisson:I0 [default: the protocol's;
+    /// r2: none].
+    #[arg(long, value_parser = parse::noise)]
+    noise: Option<Noise>,
+    /// Average blocks of N x N x N voxels first.
+    #[arg(long, value_name = "N", default_value_t = 1, value_parser = clap::value_parser!(u16).range(1..))]
+    downsample: u16,
+    /// What voxel values mean: as-is (attenuation a unit of the protocol), hu:MU_WATER (HU, with the attenuation of
+    /// water in 1/mm) or clip:LO,HI (LO to HI becomes 0 to 1).
+    #[arg(long, default_value = "as-is", value_parser = parse::values)]
+    values: Values,
+    /// Seed of the noise.
+    #[arg(long, default_value_t = 0)]
+    seed: u64,
+    /// Replace SCAN.
+    #[arg(long)]
+    force: bool,
+    /// Print one JSON object.
+    #[arg(long)]
+    json: bool,
+}
+
+impl Simulate {
+    pub fn run(self) -> Result<()> {
+        refuse_existing(&self.output, self.force)?;
+        let mut volume = self.values.apply(source(&self.volume)?)?;
+        volume.affine = None;
+        // A scan's volume stands on the rotation axis.
+        volume.grid.center = [0.0; 3];
+        if self.downsample > 1 {
+            volume = downsample(&volume, self.downsample.into())?;
+            volume.grid.center = [0.0; 3];
+        }
+        let protocol = self.protocol(&volume)?;
+        if let Values::Hu(HuMapping::Mu { .. }) = self.values {
+            // From 1/mm to the protocol's unit.
+            let per_unit = protocol.unit.mm as f32;
+            volume = volume.mapped(|x| x * per_unit);
+        }
+        let mut scan = simulate(&volume, &protocol)?;
+        if let Some(p) = scan.provenance.as_object_mut() {
+            p.insert("source".into(), json!(self.volume));
+        }
+        conefield_io::write_scan(&self.output, &scan, Some(&volume))?;
+        let g = &scan.geometry;
+        if self.json {
+            return out::json(&json!({
+                "scan": self.output, "views": g.views.len(), "detector": g.detector, "volume": g.volume.shape,
+                "noise": protocol.noise, "seed": self.seed,
+            }));
+        }
+        let ([rows, columns], [x, y, z]) = (g.detector, g.volume.shape);
+        out::say(&format!(
+            "{}: {} views of {rows} x {columns}, of {x} x {y} x {z} voxels, noise {}",
+            self.output.display(),
+            g.views.len(),
+            protocol.noise,
+        ))
+    }
+
+    fn protocol(&self, volume: &Volume) -> Result<Protocol> {
+        let mut p = match self.protocol.as_str() {
+            "r2" => Protocol::r2(&volume.grid),
+            path => read_protocol(Path::new(path))?,
+        };
+        if let Some(d) = self.detector {
+            p = p.with_detector(d);
+        }
+        if let Some(n) = self.noise {
+            p.noise = n;
+        }
+        p.seed = self.seed;
+        if let Some(mm) = self.offset {
+            p.offset = mm.map(|x| x / p.unit.mm);
+        }
+        match &self.angles {
+            Some(AnglesArg::File(path)) => {
+                if self.views.is_some() {
+                    let expected = "--views or --angles FILE, which says how many there are";
+                    return Err(Error::invalid("command line", "--views", "both", expected));
+                }
+                p.angles = Angles::ListDeg(read_angles(path)?);
+            }
+            Some(AnglesArg::Even { start, range }) => {
+                let views = self.views.map_or(p.angles.radians().len(), |n| n as usize);
+                p.angles = Angles::Even { views, start_deg: *start, arc_deg: *range };
+            }
+            None => {
+                if let Some(n) = self.views {
+                    let views = n as usize;
+                    p.angles = match p.angles {
+                        Angles::Even { start_deg, arc_deg, .. } => Angles::Even { views, start_deg, arc_deg },
+                        Angles::ListDeg(_) => Angles::Even { views, start_deg: 0.0, arc_deg: 360.0 },
+                    };
+                }
+            }
+        }
+        Ok(p)
+    }
+}
+
+/// The volume that `name` means: a phantom or a file.
+pub fn source(name: &str) -> Result<Volume> {
+    let Some(rest) = name.strip_prefix("phantom:") else { return conefield_io::read_volume(name) };
+    let (kind, size) = rest.split_once(':').unwrap_or((rest, "128"));
+    let kind: PhantomKind = kind.parse()?;
+    match size.parse() {
+        Ok(size @ 8..=1024) => phantom(kind, size),
+        _ => Err(Error::invalid("phantom", "size", size, "a number of voxels from 8 to 1024")),
+    }
+}
+
+fn read_protocol(path: &Path) -> Result<Protocol> {
+    let text = std::fs::read_to_string(path).map_err(|e| Error::io(path, e))?;
+    let place = path.display();
+    if text.trim_start().starts_with('{') {
+        return serde_json::from_str(&text)
+            .map_err(|e| Error::invalid(format!("{place}:{}:{}", e.line(), e.column()), "protocol", e, "a protocol"));
+    }
+    toml::from_str(&text).map_err(|e| {
+        let before = e.span().and_then(|s| text.get(..s.start)).unwrap_or_default();
+        let line = before.matches('\n').count() + 1;
+        Error::invalid(format!("{place}:{line}"), "protocol", e.message(), "a protocol")
+    })
+}
+
+fn read_angles(path: &Path) -> Result<Vec<f64>> {
+    let text = std::fs::read_to_string(path).map_err(|e| Error::io(path, e))?;
+    let lines = text.lines().map(|l| l.split('#').next().unwrap_or_default().trim()).enumerate();
+    let angles = lines.filter(|(_, l)| !l.is_empty()).map(|(i, l)| match l.parse::<f64>() {
+        Ok(a) if a.is_finite() => Ok(a),
+        _ => Err(Error::invalid(format!("{}:{}", path.display(), i + 1), "angle", l, "a number of degrees")),
+    });
+    angles.collect()
+}

@@ -1,0 +1,179 @@
+//! Values on the command line. What does not parse is wrong use, told before any work.
+
+use conefield_core::scan::Volume;
+use conefield_projectors::simulate::{HuMapping, Noise};
+use std::fmt::Display;
+use std::path::PathBuf;
+use std::str::FromStr;
+
+/// `600`, `600s`, `10m` or `1.5h` in seconds.
+pub fn seconds(text: &str) -> Result<f64, String> {
+    let (number, unit) = match text.trim_end_matches(|c: char| c.is_ascii_alphabetic()) {
+        digits if digits.len() < text.len() => text.split_at(digits.len()),
+        _ => (text, "s"),
+    };
+    let factor = match unit {
+        "s" => 1.0,
+        "m" | "min" => 60.0,
+        "h" => 3600.0,
+        _ => return Err("expected seconds (600s), minutes (10m) or hours (1h)".into()),
+    };
+    match number.parse::<f64>() {
+        Ok(x) if x > 0.0 && x.is_finite() => Ok(x * factor),
+        _ => Err("expected a positive time such as 600s, 10m or 1h".into()),
+    }
+}
+
+/// Two numbers with `separator` between them.
+fn pair<T: FromStr>(text: &str, separator: char, form: &str) -> Result<[T; 2], String> {
+    let parsed = text.split_once(separator).and_then(|(a, b)| Some([a.trim().parse().ok()?, b.trim().parse().ok()?]));
+    parsed.ok_or_else(|| format!("expected {form}"))
+}
+
+/// `ROWSxCOLS`.
+pub fn detector(text: &str) -> Result<[usize; 2], String> {
+    let form = "ROWSxCOLS, such as 256x256";
+    match pair(text, 'x', form)? {
+        d if d.contains(&0) => Err(format!("expected {form}, both above 0")),
+        d => Ok(d),
+    }
+}
+
+/// `V,U` in mm.
+pub fn offset(text: &str) -> Result<[f64; 2], String> {
+    finite(pair(text, ',', "V,U in mm, such as 0,12.5")?)
+}
+
+fn finite(numbers: [f64; 2]) -> Result<[f64; 2], String> {
+    if numbers.iter().all(|x| x.is_finite()) { Ok(numbers) } else { Err("expected finite numbers".into()) }
+}
+
+fn positive(text: &str, what: impl Display) -> Result<f64, String> {
+    match text.parse::<f64>() {
+        Ok(x) if x > 0.0 && x.is_finite() => Ok(x),
+        _ => Err(format!("expected {what}")),
+    }
+}
+
+/// `none`, `tigre:I0,SIGMA` or `poisson:I0`.
+pub fn noise(text: &str) -> Result<Noise, String> {
+    text.parse().map_err(|e: conefield_core::Error| e.to_string())
+}
+
+/// Which views to keep aside.
+#[derive(Debug, Clone, PartialEq)]
+pub enum HoldOut {
+    Views(Vec<usize>),
+    Every(usize),
+}
+
+impl HoldOut {
+    /// Indices among `n` views.
+    pub fn views(&self, n: usize) -> Vec<usize> {
+        match self {
+            Self::Views(v) => v.clone(),
+            Self::Every(k) => (0..n).skip(k / 2).step_by(*k).collect(),
+        }
+    }
+}
+
+/// `3,17` or `every:10`.
+pub fn hold_out(text: &str) -> Result<HoldOut, String> {
+    let form = || "expected view numbers from 0, such as 3,17, or every:10".to_owned();
+    match text.split_once(':') {
+        Some(("every", k)) => k.parse().ok().filter(|k| *k > 1).map(HoldOut::Every).ok_or_else(form),
+        Some(_) => Err(form()),
+        None => {
+            let views: Option<Vec<usize>> = text.split(',').map(|v| v.trim().parse().ok()).collect();
+            views.map(HoldOut::Views).ok_or_else(form)
+        }
+    }
+}
+
+/// Where the source stands.
+#[derive(Debug, Clone, PartialEq)]
+pub enum Angles {
+    /// Evenly from `start` over `range` degrees, the end left out.
+    Even { start: f64, range: f64 },
+    /// Degrees, one a line.
+    File(PathBuf),
+}
+
+/// `START:RANGE` in degrees or a file.
+pub fn angles(text: &str) -> Result<Angles, String> {
+    match pair::<f64>(text, ':', "") {
+        Ok([start, range]) if start.is_finite() && range.is_finite() && range != 0.0 => {
+            Ok(Angles::Even { start, range })
+        }
+        Ok(_) => Err("expected START:RANGE in degrees, such as 0:360, with a range other than 0".into()),
+        Err(_) => Ok(Angles::File(text.into())),
+    }
+}
+
+/// What voxel values mean.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub enum Values {
+    /// Attenuation already, in whatever unit the scan has.
+    AsIs,
+    /// Hounsfield units, to attenuation in 1/mm or to [0, 1].
+    Hu(HuMapping),
+}
+
+impl Values {
+    /// The volume in attenuation.
+    pub fn apply(self, volume: Volume) -> conefield_core::Result<Volume> {
+        match self {
+            Self::AsIs => Ok(volume),
+            Self::Hu(mapping) => mapping.apply(volume),
+        }
+    }
+}
+
+/// `as-is`, `hu:MU_WATER` or `clip:LO,HI`.
+pub fn values(text: &str) -> Result<Values, String> {
+    let form = "as-is, hu:MU_WATER (in 1/mm) such as hu:0.02, or clip:LO,HI such as clip:-1000,2000";
+    match text.split_once(':') {
+        None if text == "as-is" => Ok(Values::AsIs),
+        Some(("hu", water)) => Ok(Values::Hu(HuMapping::Mu { mu_water: positive(water, form)? })),
+        Some(("clip", both)) => match finite(pair(both, ',', form)?)? {
+            [low, high] if low < high => Ok(Values::Hu(HuMapping::Clip { low, high })),
+            _ => Err("expected clip:LO,HI with LO below HI".into()),
+        },
+        _ => Err(format!("expected {form}")),
+    }
+}
+
+/// A positive finite number.
+pub fn above_zero(text: &str) -> Result<f64, String> {
+    positive(text, "a number above 0")
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn values_parse_and_refuse() {
+        assert_eq!(seconds("600s"), Ok(600.0));
+        assert_eq!(seconds("10m"), Ok(600.0));
+        assert_eq!(seconds("1.5h"), Ok(5400.0));
+        assert_eq!(seconds("90"), Ok(90.0));
+        for bad in ["", "s", "-3s", "3x", "nan", "inf", "0", "1e999s"] {
+            assert!(seconds(bad).is_err(), "{bad}");
+        }
+        assert_eq!(detector("64x96"), Ok([64, 96]));
+        assert!(detector("64").is_err() && detector("0x4").is_err() && detector("4x-1").is_err());
+        assert_eq!(noise("tigre:1e4,10"), Ok(Noise::Tigre { i0: 1e4, sigma: 10.0 }));
+        assert_eq!(noise("poisson:1e5"), Ok(Noise::Poisson { i0: 1e5 }));
+        assert!(noise("poisson:0").is_err() && noise("tigre:1e4").is_err() && noise("salt").is_err());
+        assert_eq!(hold_out("3,17"), Ok(HoldOut::Views(vec![3, 17])));
+        assert_eq!(hold_out("every:10").unwrap().views(25), [5, 15]);
+        assert!(hold_out("every:1").is_err() && hold_out("a").is_err());
+        assert_eq!(angles("0:360"), Ok(Angles::Even { start: 0.0, range: 360.0 }));
+        assert_eq!(angles("a.txt"), Ok(Angles::File("a.txt".into())));
+        assert!(angles("0:0").is_err());
+        assert_eq!(values("hu:0.02"), Ok(Values::Hu(HuMapping::Mu { mu_water: 0.02 })));
+        assert_eq!(values("clip:-1000,2000"), Ok(Values::Hu(HuMapping::Clip { low: -1000.0, high: 2000.0 })));
+        assert!(values("clip:3,1").is_err() && values("hu:-1").is_err());
+    }
+}

@@ -1,0 +1,139 @@
+//! Progress and log, both on standard error.
+
+use conefield_core::solver::{Observer, Record};
+use indicatif::{MultiProgress, ProgressBar, ProgressDrawTarget, ProgressStyle};
+use std::fs::File;
+use std::io::{self, IsTerminal, Write};
+use std::path::PathBuf;
+use std::sync::LazyLock;
+use std::time::{Duration, Instant};
+use tracing::{info, warn};
+use tracing_subscriber::EnvFilter;
+
+/// The bars on the terminal; the log is written between two drawings of them.
+static BARS: LazyLock<MultiProgress> = LazyLock::new(|| MultiProgress::with_draw_target(ProgressDrawTarget::hidden()));
+
+/// Without a terminal, how often progress is told.
+const EVERY: Duration = Duration::from_secs(5);
+
+/// Starts the log: warnings and news, more with `verbose`, errors only when `quiet`.
+pub fn start_log(verbose: u8, quiet: bool) {
+    if !quiet && io::stderr().is_terminal() {
+        BARS.set_draw_target(ProgressDrawTarget::stderr());
+    }
+    let level = match (quiet, verbose) {
+        (true, _) => "error",
+        (_, 0) => "info",
+        (_, 1) => "debug",
+        _ => "trace",
+    };
+    let _ = tracing_subscriber::fmt()
+        .with_env_filter(EnvFilter::new(level))
+        .with_writer(|| BetweenBars)
+        .with_ansi(io::stderr().is_terminal())
+        .with_target(false)
+        .without_time()
+        .try_init();
+}
+
+/// Standard error, written while no bar is drawn.
+struct BetweenBars;
+
+impl Write for BetweenBars {
+    fn write(&mut self, text: &[u8]) -> io::Result<usize> {
+        BARS.suspend(|| io::stderr().write(text))
+    }
+
+    fn flush(&mut self) -> io::Result<()> {
+        io::stderr().flush()
+    }
+}
+
+/// Shows a solver's progress and writes its records.
+pub struct Progress {
+    bar: ProgressBar,
+    told: Instant,
+    what: String,
+    latest: Record,
+    records: Vec<Record>,
+    log: Option<(PathBuf, File)>,
+}
+
+impl Progress {
+    /// Progress of `what`. Records go to `log` (JSON, one a line) as they come.
+    pub fn new(what: &str, log: Option<(PathBuf, File)>) -> Self {
+        let bar = BARS.add(ProgressBar::new(1000));
+        if let Ok(style) = ProgressStyle::with_template("{prefix} [{bar:30}] {percent:>3} %  {msg}") {
+            bar.set_style(style.progress_chars("=> "));
+        }
+        bar.set_prefix(what.to_owned());
+        Self { bar, told: Instant::now(), what: what.into(), latest: Record::default(), records: vec![], log }
+    }
+
+    /// The records so far.
+    pub fn records(&self) -> &[Record] {
+        &self.records
+    }
+
+    /// How things stand, in a line.
+    fn line(&self, step: u64, seconds_left: f64) -> String {
+        let r = &self.latest;
+        let mut line = format!("step {step}");
+        if r.step > 0 {
+            line += &format!(", loss {:.3e}, {:.2} M samples/s", r.loss, r.samples_per_s / 1e6);
+        }
+        if let Some(h) = r.held_out {
+            line += &format!(", held out {h:.4}");
+        }
+        if let Some(p) = r.psnr {
+            line += &format!(", {p:.2} dB");
+        }
+        if seconds_left.is_finite() {
+            line += &format!(", {} left", crate::out::duration(seconds_left));
+        }
+        line
+    }
+}
+
+impl Observer for Progress {
+    fn progress(&mut self, step: u64, share: f64, seconds_left: f64) {
+        let wait = if self.bar.is_hidden() { EVERY } else { Duration::from_millis(100) };
+        if self.told.elapsed() < wait {
+            return;
+        }
+        self.told = Instant::now();
+        let line = self.line(step, seconds_left);
+        if self.bar.is_hidden() {
+            info!("{} {:.0} %: {line}", self.what, 100.0 * share);
+        } else {
+            self.bar.set_position((1000.0 * share.clamp(0.0, 1.0)) as u64);
+            self.bar.set_message(line);
+        }
+    }
+
+    fn record(&mut self, record: &Record) {
+        self.latest = record.clone();
+        self.records.push(record.clone());
+        if let Some((path, file)) = &mut self.log {
+            let line = serde_json::to_string(record).map_err(io::Error::other).and_then(|mut line| {
+                line.push('\n');
+                file.write_all(line.as_bytes())
+            });
+            if let Err(e) = line {
+                warn!("{}: {e}; no more records are written", path.display());
+                self.log = None;
+            }
+        }
+    }
+
+    fn note(&mut self, text: &str) {
+        info!("{text}");
+    }
+}
+
+impl Drop for Progress {
+    fn drop(&mut self) {
+        self.bar.finish_and_clear();
+        BARS.remove(&self.bar);
+    }
+}

@@ -1,0 +1,59 @@
+//! The specs that come with the program, and the weights that the demonstration uses.
+
+use conefield_core::spec::load::{Loaded, Shipped, load};
+use conefield_core::{Error, Result};
+
+/// The files in `specs/`.
+pub const SHIPPED: &[Shipped] = &[
+    Shipped { name: "naf", text: include_str!("../../specs/naf.toml") },
+    Shipped { name: "ni-naf", text: include_str!("../../specs/ni-naf.toml") },
+    Shipped { name: "nerf", text: include_str!("../../specs/nerf.toml") },
+    Shipped { name: "dense", text: include_str!("../../specs/dense.toml") },
+    Shipped { name: "fast", text: include_str!("../../specs/fast.toml") },
+];
+
+/// Reads a spec by its shipped name or from a file, with `sets` on top.
+pub fn read(what: &str, sets: &[String]) -> Result<Loaded> {
+    load(what, sets, SHIPPED)
+}
+
+/// The MCI weights for the spec `fast`, as a safetensors file.
+pub fn fast_weights() -> Option<&'static [u8]> {
+    #[cfg(fast_weights)]
+    return Some(include_bytes!("../../specs/weights/fast.safetensors"));
+    #[cfg(not(fast_weights))]
+    None
+}
+
+/// Builds the pipeline of `loaded`; refusals name the line of the spec.
+pub fn build(loaded: &Loaded) -> Result<conefield_core::pipeline::Pipeline> {
+    conefield_core::pipeline::Pipeline::build(&loaded.spec).map_err(|e: Error| loaded.locate(e))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn every_shipped_spec_builds() {
+        for s in SHIPPED {
+            let loaded = read(s.name, &[]).unwrap();
+            assert_eq!(loaded.spec.name, s.name);
+            assert!(!loaded.spec.description.is_empty());
+            build(&loaded).unwrap();
+        }
+    }
+
+    #[test]
+    fn every_file_is_shipped() {
+        let folder = concat!(env!("CARGO_MANIFEST_DIR"), "/../specs");
+        let mut files: Vec<String> = std::fs::read_dir(folder)
+            .unwrap()
+            .filter_map(|e| e.unwrap().file_name().into_string().unwrap().strip_suffix(".toml").map(str::to_owned))
+            .collect();
+        let mut names: Vec<&str> = SHIPPED.iter().map(|s| s.name).collect();
+        files.sort();
+        names.sort();
+        assert_eq!(files, names);
+    }
+}
