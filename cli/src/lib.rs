@@ -1,6 +1,7 @@
 //! The `conefield` command, one module a subcommand, and the specs that come with it.
 
 mod commands;
+mod files;
 mod memory;
 mod out;
 mod parse;

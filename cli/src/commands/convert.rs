@@ -1,7 +1,7 @@
 //! `conefield convert`
 
-use crate::out;
 use crate::parse::{self, Values};
+use crate::{files, out};
 use clap::{Args, ValueEnum};
 use conefield_core::{Error, Result};
 use std::path::PathBuf;
@@ -45,11 +45,11 @@ impl Convert {
             let volume = self.values.apply(conefield_io::read_volume(&self.input)?)?;
             conefield_io::write_volume(&self.output, &volume)?;
         } else {
-            let scan = super::reconstruct::read_scan(&self.input)?;
+            let scan = files::scan(&self.input)?;
             let truth = conefield_io::read_truth(&self.input)?;
             match self.to {
                 ScanFormat::Conefield => conefield_io::write_scan(&self.output, &scan, truth.as_ref())?,
-                ScanFormat::R2 => conefield_io::write_r2(&self.output, &scan, truth.as_ref())?,
+                ScanFormat::R2 => conefield_io::write_r2(&self.output, &scan, None, truth.as_ref())?,
             }
         }
         out::say(&self.output.display().to_string())

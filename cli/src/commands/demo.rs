@@ -2,17 +2,18 @@
 
 use super::convert::refuse_existing;
 use super::evaluate::score;
+use super::reconstruct::mci;
 use crate::progress::Progress;
-use crate::{out, parse, specs};
+use crate::{files, out, parse, specs};
 use clap::Args;
 use conefield_backend_cpu::Cpu;
-use conefield_core::arena::Weights;
 use conefield_core::scan::{Scan, Volume};
 use conefield_core::solver::{Job, Limits};
 use conefield_core::{Error, Result};
 use conefield_metrics::Scores;
-use conefield_projectors::simulate::{PhantomKind, Protocol, phantom, simulate};
+use conefield_projectors::simulate::{Noise, Protocol, phantom, simulate};
 use serde::Serialize;
+use serde_json::json;
 use std::path::PathBuf;
 use tracing::info;
 
@@ -59,39 +60,43 @@ struct Entry {
 
 impl Demo {
     pub fn run(self) -> Result<()> {
-        refuse_existing(&self.output, self.force)?;
+        let folder = &self.output;
+        refuse_existing(folder, self.force)?;
+        std::fs::create_dir_all(folder).map_err(|e| Error::io(folder, e))?;
         let size = usize::from(self.size);
-        let truth = phantom(PhantomKind::Head, size)?;
-        let noise = parse::noise("tigre:1e4,10").map_err(|e| Error::unsupported("noise", e))?;
+        let truth = phantom(size);
+        let noise = Noise::Tigre { i0: 1e4, sigma: 10.0 };
         let protocol = Protocol::r2(&truth.grid)
             .with_detector([size; 2])
             .with_views(self.views.into())
             .with_noise(noise, self.seed);
         let scan = simulate(&truth, &protocol)?;
+        conefield_io::write_scan(folder.join("scan"), &scan, Some(&truth))?;
         info!("simulated {} views of {size} x {size} pixels", self.views);
-        let weights = specs::fast_weights().map(conefield_io::weights_from_bytes).transpose()?;
+
         let mut with = vec![];
-        let name = if weights.is_some() {
-            with.push("initializer={ type = \"mci\", weights = \"fast\" }".to_owned());
-            "fast (LN, MCI)"
-        } else {
-            info!("no pre-trained weights in this build: MCI is left out");
-            "fast (LN)"
-        };
-        let without = vec!["normalizers=[]".to_owned(), "initializer={ type = \"random\" }".to_owned()];
-        let entries = [
-            self.compete(name, &with, &scan, &truth, weights.as_ref())?,
-            self.compete("same field without", &without, &scan, &truth, None)?,
-        ];
-        conefield_io::write_folder_atomic(&self.output, |folder| {
-            conefield_io::write_scan(folder.join("scan"), &scan, Some(&truth))?;
-            conefield_io::write_volume(folder.join("fast.nii.gz"), &entries[0].volume)?;
-            conefield_io::write_volume(folder.join("without.nii.gz"), &entries[1].volume)?;
-            conefield_io::compare_png(folder.join("fast.png"), &truth, &entries[0].volume)?;
-            conefield_io::compare_png(folder.join("without.png"), &truth, &entries[1].volume)
-        })?;
+        let mut name = "fast (LN)";
+        match specs::fast_weights() {
+            Some(raw) => {
+                let path = folder.join("fast.safetensors");
+                conefield_io::write_atomic(&path, |w| w.write_all(raw).map_err(|e| Error::io(&path, e)))?;
+                with.push(mci(&path));
+                name = "fast (LN, MCI)";
+            }
+            None => info!("this build comes without pre-trained weights: MCI is left out"),
+        }
+        let without = vec!["normalizers=[]".to_owned(), "initializer.type=random".to_owned()];
+        let entries =
+            [self.compete(name, &with, &scan, &truth)?, self.compete("without LN, MCI", &without, &scan, &truth)?];
+        for (entry, file) in entries.iter().zip(["fast.nii.gz", "without.nii.gz"]) {
+            conefield_io::write_volume(folder.join(file), &entry.volume)?;
+        }
+        let captions = entries.each_ref().map(|e| format!("{} {:.2} dB", e.name, e.scores.psnr));
+        let results = [(&captions[0][..], &entries[0].volume), (&captions[1][..], &entries[1].volume)];
+        let picture = folder.join("compare.png");
+        conefield_io::compare_png(&picture, ("phantom", &truth), &results, files::window(&truth))?;
         if self.json {
-            return out::json(&serde_json::json!({ "folder": self.output, "results": entries }));
+            return out::json(&json!({ "folder": folder, "picture": picture, "results": entries }));
         }
         let ssim = |s: Option<f64>| s.map_or("-".into(), |x| format!("{x:.4}"));
         let mut rows = vec![["", "PSNR dB", "ssim_2d", "ssim_3d", "steps", "training"].map(str::to_owned).to_vec()];
@@ -106,31 +111,21 @@ impl Demo {
             ]);
         }
         out::say(&out::table(&rows, &[1, 2, 3, 4, 5]))?;
-        out::say(&format!("scan, volumes and pictures in {}", self.output.display()))
+        out::say(&format!("\npicture: {}\nscan and volumes beside it", picture.display()))
     }
 
-    fn compete(
-        &self,
-        name: &'static str,
-        sets: &[String],
-        scan: &Scan,
-        truth: &Volume,
-        weights: Option<&Weights>,
-    ) -> Result<Entry> {
+    fn compete(&self, name: &'static str, sets: &[String], scan: &Scan, truth: &Volume) -> Result<Entry> {
         let loaded = specs::read("fast", sets)?;
         let solver = loaded.spec.solver.build()?;
         let job = Job {
             scan,
             held_out: None,
-            reference: Some(truth),
+            reference: None,
             spec: &loaded.spec,
             backend: &Cpu::new(),
             seed: self.seed,
             limits: Limits { steps: None, seconds: Some(self.budget) },
-            weights: &|path| match weights {
-                Some(w) if path == "fast" => Ok(w.clone()),
-                _ => conefield_io::read_weights(path),
-            },
+            weights: &|path| files::read_weights(path),
         };
         let solution = solver.solve(&job, &mut Progress::new(name, None))?;
         let scores = score(name, &solution.volume, truth, 1.0)?;

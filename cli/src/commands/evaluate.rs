@@ -1,6 +1,6 @@
 //! `conefield evaluate`
 
-use crate::{out, parse};
+use crate::{files, out, parse};
 use clap::Args;
 use conefield_core::scan::Volume;
 use conefield_core::{Error, Result};
@@ -35,7 +35,7 @@ impl Evaluate {
         let place = self.volume.display().to_string();
         let scores = score(&place, &volume, &reference, self.peak)?;
         if let Some(png) = &self.png {
-            conefield_io::compare_png(png, &reference, &volume)?;
+            files::picture(png, Some(&reference), &volume)?;
         }
         if self.json { out::json(&scores) } else { out::say(&lines(&scores)) }
     }

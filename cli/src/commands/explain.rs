@@ -2,7 +2,7 @@
 
 use super::BackendChoice;
 use crate::memory::Memory;
-use crate::{out, specs};
+use crate::{files, out, specs};
 use clap::Args;
 use conefield_core::backend::Explain as Compiled;
 use conefield_core::pipeline::Pipeline;
@@ -115,7 +115,7 @@ impl Explain {
         let pipeline = specs::build(&loaded)?;
         let (_, compiled) = self.backend.open().compile(&pipeline)?;
         let scan = match &self.scan {
-            Some(path) => Some(for_scan(&loaded, &pipeline, &conefield_io::read_scan(path)?, &compiled)?),
+            Some(path) => Some(for_scan(&loaded, &pipeline, &files::scan(path)?, &compiled)?),
             None => None,
         };
         let report = report(&loaded, &pipeline, compiled, scan)?;
@@ -207,8 +207,9 @@ fn text(r: &Report) -> String {
         rest.push(vec!["initializer".into(), i.kind.clone(), i.what.clone()]);
     }
     rest.push(vec!["solver".into(), r.solver.kind.clone(), r.solver.what.clone()]);
-    rest.push(vec!["backend".into(), r.backend.backend.clone(), r.backend.notes.join("; ")]);
     lines.push(out::table(&rest, &[]));
+    lines.push(format!("\nbackend: {}", r.backend.backend));
+    lines.extend(r.backend.notes.iter().map(|n| format!("  {n}")));
     lines.push(String::new());
     lines.push(format!(
         "memory for the model: {} (parameters {p}, gradients {p}, moments {})",

@@ -1,6 +1,6 @@
 //! `conefield info`
 
-use crate::out;
+use crate::{files, out};
 use clap::Args;
 use conefield_core::geometry::norm;
 use conefield_core::{Error, Result};
@@ -54,7 +54,7 @@ fn volume(path: &Path) -> Result<Value> {
 }
 
 fn scan(path: &Path) -> Result<Value> {
-    let s = super::reconstruct::read_scan(path)?;
+    let s = files::scan(path)?;
     let g = &s.geometry;
     let first = &g.views[0];
     let truth = conefield_io::read_truth(path)?;
@@ -74,7 +74,7 @@ fn scan(path: &Path) -> Result<Value> {
 }
 
 fn weights(path: &Path) -> Result<Value> {
-    let w = conefield_io::read_weights(path)?;
+    let w = files::read_weights(path)?;
     let tensors: serde_json::Map<String, Value> =
         w.tensors.iter().map(|(name, (shape, _))| (name.clone(), json!(shape))).collect();
     let parameters: usize = w.tensors.values().map(|t| t.1.len()).sum();

@@ -3,7 +3,7 @@
 use super::{BackendChoice, Ends, reconstruct::notes};
 use crate::parse::{self, Values};
 use crate::progress::Progress;
-use crate::{out, specs};
+use crate::{files, out, specs};
 use clap::Args;
 use conefield_core::Result;
 use conefield_core::arena::Weights;
@@ -17,9 +17,9 @@ use std::path::PathBuf;
 /// The weights file holds normalizers and field; the encoder stays with the volume that it was trained on.
 #[derive(Args)]
 pub struct Pretrain {
-    /// The known volumes.
+    /// The known volumes: files, or phantoms such as phantom:head:128.
     #[arg(required = true, value_name = "VOLUME")]
-    volumes: Vec<PathBuf>,
+    volumes: Vec<String>,
     /// A shipped spec (naf, ni-naf, nerf, dense, fast) or a file.
     #[arg(long)]
     spec: String,
@@ -50,7 +50,7 @@ impl Pretrain {
         let loaded = specs::read(&self.spec, &self.sets)?;
         let solver = loaded.spec.solver.build().map_err(|e| loaded.locate(e))?;
         specs::build(&loaded)?;
-        let read = |p: &PathBuf| self.values.apply(conefield_io::read_volume(p)?);
+        let read = |name: &String| self.values.apply(files::volume(name)?);
         let volumes: Vec<Volume> = self.volumes.iter().map(read).collect::<Result<_>>()?;
         let backend = self.backend.open();
         let job = PretrainJob {
@@ -67,7 +67,7 @@ impl Pretrain {
         let keep = |name: &str| !name.starts_with("encoder.");
         let mut weights = Weights::from_arena(model.pipeline.layout(), &model.arena.params, keep);
         weights.notes = notes(&loaded, self.seed)?;
-        conefield_io::write_weights(&self.output, &weights)?;
+        files::write_weights(&self.output, &weights)?;
         let numbers: usize = weights.tensors.values().map(|t| t.1.len()).sum();
         if self.json {
             return out::json(&json!({

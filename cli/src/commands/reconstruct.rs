@@ -5,7 +5,7 @@ use crate::memory::Memory;
 use crate::parse::{self, HoldOut};
 use crate::progress::Progress;
 use crate::run::RunFolder;
-use crate::{out, specs};
+use crate::{files, out, specs};
 use clap::Args;
 use conefield_core::arena::Weights;
 use conefield_core::backend::Explain;
@@ -107,7 +107,7 @@ impl Reconstruct {
         let backend = self.backend.open();
         let pipeline = loaded.spec.encoder.as_ref().map(|_| specs::build(&loaded)).transpose()?;
         let compiled = pipeline.as_ref().map(|p| backend.compile(p)).transpose()?.map(|c| c.1).unwrap_or_default();
-        let whole = read_scan(&self.scan)?;
+        let whole = files::scan(&self.scan)?;
         let reference = self.reference.as_ref().map(|path| read_reference(path, &self.scan, &whole)).transpose()?;
         let held = self.hold_out.as_ref().map(|h| h.views(whole.geometry.views.len())).unwrap_or_default();
         let memory = pipeline.as_ref().map(|p| Memory::of(p, &whole, &compiled, reference.is_some()));
@@ -126,7 +126,7 @@ impl Reconstruct {
             backend: backend.as_ref(),
             seed: self.seed,
             limits: self.ends.limits(),
-            weights: &|path| conefield_io::read_weights(path),
+            weights: &|path| files::read_weights(path),
         };
         let solution = solver.solve(&job, &mut progress).map_err(|e| loaded.locate(e))?;
         let last = progress.records().last().cloned();
@@ -137,18 +137,11 @@ impl Reconstruct {
         if let Some(model) = &solution.model {
             let mut weights = Weights::from_arena(model.pipeline.layout(), &model.arena.params, |_| true);
             weights.notes = notes(&loaded, self.seed)?;
-            conefield_io::write_weights(folder.file("weights.safetensors"), &weights)?;
+            files::write_weights(folder.file("weights.safetensors"), &weights)?;
         }
-        let scores = match &reference {
-            Some(r) => {
-                conefield_io::compare_png(folder.file("slices.png"), r, &solution.volume)?;
-                Some(evaluate::score(&place.display().to_string(), &solution.volume, r, self.peak)?)
-            }
-            None => {
-                conefield_io::slices_png(folder.file("slices.png"), &solution.volume)?;
-                None
-            }
-        };
+        files::picture(folder.file("slices.png"), reference.as_ref(), &solution.volume)?;
+        let score = |r| evaluate::score(&place.display().to_string(), &solution.volume, r, self.peak);
+        let scores = reference.as_ref().map(score).transpose()?;
         let record = Record {
             version: env!("CARGO_PKG_VERSION"),
             spec: loaded.spec.name.clone(),
@@ -186,18 +179,10 @@ impl Reconstruct {
     fn all_sets(&self) -> Vec<String> {
         let mut sets = self.sets.clone();
         if let Some(path) = &self.init {
-            let path = toml::Value::String(path.display().to_string());
-            sets.push(format!("initializer={{ type = \"mci\", weights = {path} }}"));
+            sets.push(mci(path));
         }
         sets
     }
-}
-
-/// Reads a scan and checks it.
-pub fn read_scan(path: &Path) -> Result<Scan> {
-    let scan = conefield_io::read_scan(path)?;
-    scan.validate(&path.display().to_string())?;
-    Ok(scan)
 }
 
 fn read_reference(path: &Path, scan_path: &Path, scan: &Scan) -> Result<Volume> {
@@ -220,6 +205,12 @@ fn read_reference(path: &Path, scan_path: &Path, scan: &Scan) -> Result<Volume> 
 fn split(scan: &Scan, held: &[usize]) -> Result<(Scan, Option<Scan>)> {
     let (train, held) = scan.split(held)?;
     Ok((train, Some(held)))
+}
+
+/// The setting that starts from the weights in `path`.
+pub fn mci(path: &Path) -> String {
+    let path = toml::Value::String(path.display().to_string());
+    format!("initializer={{ type = \"mci\", weights = {path} }}")
 }
 
 /// What weights say of where they come from.

@@ -2,11 +2,11 @@
 
 use super::convert::refuse_existing;
 use crate::parse::{self, Angles as AnglesArg, Values};
-use crate::out;
+use crate::{files, out};
 use clap::Args;
 use conefield_core::scan::Volume;
 use conefield_core::{Error, Result};
-use conefield_projectors::simulate::{Angles, HuMapping, Noise, PhantomKind, Protocol, downsample, phantom, simulate};
+use conefield_projectors::simulate::{Angles, HuMapping, Noise, Protocol, downsample, simulate};
 use serde_json::json;
 use std::path::{Path, PathBuf};
 
@@ -62,7 +62,7 @@ pub struct Simulate {
 impl Simulate {
     pub fn run(self) -> Result<()> {
         refuse_existing(&self.output, self.force)?;
-        let mut volume = self.values.apply(source(&self.volume)?)?;
+        let mut volume = self.values.apply(files::volume(&self.volume)?)?;
         volume.affine = None;
         // A scan's volume stands on the rotation axis.
         volume.grid.center = [0.0; 3];
@@ -135,17 +135,6 @@ impl Simulate {
             }
         }
         Ok(p)
-    }
-}
-
-/// The volume that `name` means: a phantom or a file.
-pub fn source(name: &str) -> Result<Volume> {
-    let Some(rest) = name.strip_prefix("phantom:") else { return conefield_io::read_volume(name) };
-    let (kind, size) = rest.split_once(':').unwrap_or((rest, "128"));
-    let kind: PhantomKind = kind.parse()?;
-    match size.parse() {
-        Ok(size @ 8..=1024) => phantom(kind, size),
-        _ => Err(Error::invalid("phantom", "size", size, "a number of voxels from 8 to 1024")),
     }
 }
 

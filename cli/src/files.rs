@@ -1,0 +1,79 @@
+//! Between the files of `conefield-io` and what the subcommands work with.
+
+use conefield_core::arena::Weights;
+use conefield_core::scan::{Scan, Volume};
+use conefield_core::{Error, Result};
+use conefield_projectors::simulate::{PhantomKind, phantom_of};
+use std::path::Path;
+
+/// The volume that `name` means: `phantom:KIND[:SIZE]` or a file.
+pub fn volume(name: &str) -> Result<Volume> {
+    let Some(rest) = name.strip_prefix("phantom:") else { return conefield_io::read_volume(name) };
+    let (kind, size) = match (rest.parse::<PhantomKind>(), rest.rsplit_once(':')) {
+        (Ok(kind), _) => (kind, "128"),
+        (_, Some((kind, size))) => (kind.parse()?, size),
+        (Err(e), None) => return Err(e),
+    };
+    match size.parse() {
+        Ok(size @ 8..=1024) => Ok(phantom_of(kind, size)),
+        _ => Err(Error::invalid(name, "size", size, "a number of voxels from 8 to 1024")),
+    }
+}
+
+/// Reads a scan and checks it.
+pub fn scan(path: &Path) -> Result<Scan> {
+    let scan = conefield_io::read_scan(path)?;
+    scan.validate(&path.display().to_string())?;
+    Ok(scan)
+}
+
+/// Reads weights.
+pub fn read_weights(path: impl AsRef<Path>) -> Result<Weights> {
+    let file = conefield_io::read_weights(path)?;
+    Ok(Weights { tensors: file.tensors, notes: file.metadata })
+}
+
+/// Writes weights with their notes.
+pub fn write_weights(path: impl AsRef<Path>, weights: &Weights) -> Result<()> {
+    let tensors: Vec<_> = weights.tensors.iter().map(|(name, (shape, values))| (name, shape, &values[..])).collect();
+    conefield_io::write_weights(path, &tensors, &weights.notes)
+}
+
+/// Draws the middle slices of `volume`, with those of `reference` and their difference where there is one.
+pub fn picture(path: impl AsRef<Path>, reference: Option<&Volume>, volume: &Volume) -> Result<()> {
+    match reference {
+        Some(r) => conefield_io::slices_png(path, &[("reference", r), ("result", volume)], window(r), Some(0)),
+        None => conefield_io::slices_png(path, &[("result", volume)], window(volume), None),
+    }
+}
+
+/// From black to white: the values but for the outermost thousandth on either side.
+pub fn window(volume: &Volume) -> [f32; 2] {
+    let step = (volume.data.len() / 1_000_000).max(1);
+    let mut all: Vec<f32> = volume.data.iter().copied().step_by(step).filter(|x| x.is_finite()).collect();
+    all.sort_unstable_by(f32::total_cmp);
+    let at = |share: f64| all.get((all.len() as f64 * share) as usize).or(all.last()).copied().unwrap_or(0.0);
+    let (low, high) = (at(0.001), at(0.999));
+    if low < high { [low, high] } else { [low, low + low.abs().max(1.0)] }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn phantoms_have_kind_and_size() {
+        assert_eq!(volume("phantom:head:16").unwrap().grid.shape, [16; 3]);
+        assert_eq!(volume("phantom:random:3:16").unwrap().grid.shape, [16; 3]);
+        for (name, want) in [("phantom:hand", "`hand`"), ("phantom:head:x", "voxels"), ("phantom:head:0", "from 8")] {
+            let e = volume(name).unwrap_err().to_string();
+            assert!(e.contains(want), "{name}: {e}");
+        }
+    }
+
+    #[test]
+    fn a_window_is_never_empty() {
+        let flat = Volume::centered(ndarray::Array3::zeros([2; 3]), [1.0; 3]);
+        assert_eq!(window(&flat), [0.0, 1.0]);
+    }
+}

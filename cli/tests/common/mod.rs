@@ -1,0 +1,41 @@
+//! What the whole-program tests share.
+
+use assert_cmd::Command;
+use serde_json::Value;
+use std::path::Path;
+
+/// The command with `args`, quiet.
+pub fn conefield(args: &[&str]) -> Command {
+    let mut c = Command::cargo_bin("conefield").expect("the command is built with its tests");
+    c.arg("--quiet").args(args);
+    c
+}
+
+/// Runs to success; what it printed.
+#[allow(dead_code)]
+pub fn done(args: &[&str]) -> String {
+    let out = conefield(args).assert().success().get_output().stdout.clone();
+    String::from_utf8(out).expect("UTF-8")
+}
+
+/// Runs to success; the one JSON object that it printed.
+#[allow(dead_code)]
+pub fn json(args: &[&str]) -> Value {
+    serde_json::from_str(&done(args)).expect("one JSON object on standard output")
+}
+
+/// Runs to the exit status `code`; what it said. Nothing stands on standard output.
+#[allow(dead_code)]
+pub fn refused(code: i32, args: &[&str]) -> String {
+    let output = conefield(args).assert().code(code).get_output().clone();
+    assert!(output.stdout.is_empty(), "{args:?}");
+    let text = String::from_utf8(output.stderr).expect("UTF-8");
+    assert!(text.starts_with("error: "), "{args:?}: {text}");
+    text
+}
+
+/// The path as text.
+#[allow(dead_code)]
+pub fn text(path: &Path) -> String {
+    path.display().to_string()
+}

@@ -1,0 +1,52 @@
+//! Help, and exit status 2 for wrong use.
+
+mod common;
+use common::{conefield, done, refused};
+
+const COMMANDS: [&str; 10] =
+    ["simulate", "reconstruct", "pretrain", "evaluate", "explain", "info", "convert", "backends", "schema", "demo"];
+
+#[test]
+fn every_subcommand_has_help() {
+    let all = done(&["--help"]);
+    for c in COMMANDS {
+        assert!(all.contains(&format!("\n  {c} ")), "{c} is listed");
+        let help = done(&[c, "--help"]);
+        assert!(help.contains(&format!("Usage: conefield {c}")), "{help}");
+        assert!(!help.contains("[OPTIONS]") || help.contains("--help"));
+    }
+    // One line for every subcommand and for `help` itself: nothing is listed that is not tested here.
+    let listed = all.lines().skip_while(|l| *l != "Commands:").skip(1).take_while(|l| !l.is_empty()).count();
+    assert_eq!(listed, COMMANDS.len() + 1);
+}
+
+#[test]
+fn version_is_told() {
+    assert_eq!(done(&["--version"]).trim(), concat!("conefield ", env!("CARGO_PKG_VERSION")));
+}
+
+#[test]
+fn wrong_use_exits_with_2() {
+    for (args, want) in [
+        (&["reconstruct"][..], "--spec <SPEC>"),
+        (&["recontruct"], "reconstruct"),
+        (&["simulate", "v", "-o", "s", "--noise", "salt"], "poisson"),
+        (&["simulate", "v", "-o", "s", "--detector", "12"], "ROWSxCOLS"),
+        (&["simulate", "v", "-o", "s", "--views", "0"], "--views"),
+        (&["simulate", "v", "-o", "s", "--values", "hu:x"], "hu:MU_WATER"),
+        (&["simulate", "v", "-o", "s", "--downsample", "0"], "--downsample"),
+        (&["reconstruct", "s", "--spec", "naf", "-o", "r", "--budget", "-1s"], "--budget"),
+        (&["reconstruct", "s", "--spec", "naf", "-o", "r", "--budget", "soon"], "600s"),
+        (&["reconstruct", "s", "--spec", "naf", "-o", "r", "--steps", "0"], "--steps"),
+        (&["reconstruct", "s", "--spec", "naf", "-o", "r", "--hold-out", "x"], "every:10"),
+        (&["reconstruct", "s", "--spec", "naf", "-o", "r", "--backend", "abacus"], "cpu"),
+        (&["evaluate", "a", "b", "--peak", "0"], "above 0"),
+        (&["--threads", "0", "backends"], "--threads"),
+        (&["pretrain", "--spec", "naf", "-o", "w"], "<VOLUME>"),
+    ] {
+        let said = refused(2, args);
+        assert!(said.contains(want), "{args:?}: {said}");
+    }
+    // Without a subcommand there is help instead.
+    conefield(&[]).assert().code(2);
+}

@@ -1,0 +1,37 @@
+//! The schema for editors is what the program knows now.
+
+mod common;
+use common::done;
+use serde_json::Value;
+
+#[test]
+fn the_file_in_specs_is_current() {
+    let path = concat!(env!("CARGO_MANIFEST_DIR"), "/../specs/schema/pipeline.schema.json");
+    let file = std::fs::read_to_string(path).unwrap_or_default();
+    assert!(
+        file == done(&["schema"]),
+        "write it anew: cargo run --release -p conefield -- schema > specs/schema/pipeline.schema.json"
+    );
+}
+
+#[test]
+fn every_reference_leads_somewhere() {
+    fn walk(value: &Value, root: &Value, count: &mut usize) {
+        match value {
+            Value::Object(map) => {
+                if let Some(Value::String(r)) = map.get("$ref") {
+                    assert!(root.pointer(r.trim_start_matches('#')).is_some(), "{r}");
+                    *count += 1;
+                }
+                assert!(!map.contains_key("x-stage"), "a nested stage refers to its kind");
+                map.values().for_each(|v| walk(v, root, count));
+            }
+            Value::Array(items) => items.iter().for_each(|v| walk(v, root, count)),
+            _ => {}
+        }
+    }
+    let schema: Value = serde_json::from_str(&done(&["schema"])).unwrap();
+    let mut count = 0;
+    walk(&schema, &schema, &mut count);
+    assert!(count > 10);
+}
