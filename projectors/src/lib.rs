@@ -1,0 +1,3 @@
+//! Ray sampling and Beer-Lambert integration; projection of voxel volumes
+pub mod ray_march;
+pub mod simulate;

@@ -1,0 +1,193 @@
+//! The settings of a scan that is to be simulated.
+
+use super::noise::Noise;
+use conefield_core::error::{Result, ensure};
+use conefield_core::geometry::{Geometry, Millimetres, Radians, View, VoxelGrid};
+use conefield_core::scan::Unit;
+use serde::{Deserialize, Serialize};
+
+/// A circular orbit with a flat detector. Lengths count in the protocol's own [`Protocol::unit`].
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct Protocol {
+    /// The unit of every length below, and of the volume's values (per unit).
+    #[serde(default)]
+    pub unit: Unit,
+    /// From the source to the rotation axis.
+    pub dso: f64,
+    /// From the source to the detector's plane.
+    pub dsd: f64,
+    /// Detector rows and columns.
+    pub detector: [usize; 2],
+    /// How large the detector is.
+    pub extent: Extent,
+    /// Shift of the detector along its rows' direction v and its columns' direction u.
+    #[serde(default)]
+    pub offset: [f64; 2],
+    /// Where the views are taken.
+    pub angles: Angles,
+    /// What the detector adds.
+    #[serde(default)]
+    pub noise: Noise,
+    /// Seed of the noise.
+    #[serde(default)]
+    pub seed: u64,
+    /// Samples along a ray, per smallest voxel side; at least 2.
+    #[serde(default = "two")]
+    pub samples_per_voxel: f64,
+}
+
+fn two() -> f64 {
+    2.0
+}
+
+/// Size of the detector, along v (rows) and u (columns).
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum Extent {
+    /// Of one pixel.
+    Pixel([f64; 2]),
+    /// Of the whole detector.
+    Side([f64; 2]),
+}
+
+/// Angles of the views.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case", deny_unknown_fields)]
+pub enum Angles {
+    /// View `i` of `views` at `start_deg + arc_deg·i/views`: the end of the arc, which closes a full circle, is not
+    /// taken.
+    Even {
+        /// How many.
+        views: usize,
+        /// The first angle in degrees.
+        #[serde(default)]
+        start_deg: f64,
+        /// The arc in degrees.
+        #[serde(default = "full_circle")]
+        arc_deg: f64,
+    },
+    /// These angles, in degrees.
+    ListDeg(Vec<f64>),
+}
+
+fn full_circle() -> f64 {
+    360.0
+}
+
+impl Angles {
+    /// The angle of every view.
+    pub fn radians(&self) -> Vec<Radians> {
+        match self {
+            Self::Even { views, start_deg, arc_deg } => {
+                (0..*views).map(|i| Radians((start_deg + arc_deg * i as f64 / *views as f64).to_radians())).collect()
+            }
+            Self::ListDeg(list) => list.iter().map(|a| Radians(a.to_radians())).collect(),
+        }
+    }
+}
+
+impl Protocol {
+    /// The published synthetic set-up, scaled to `grid`: the volume's largest side is the cube of side 2; DSO 5,
+    /// DSD 7, detector 512×512 of side 4, 50 views evenly over the circle from angle 0, no noise.
+    pub fn r2(grid: &VoxelGrid) -> Self {
+        let side = grid.size().into_iter().fold(0.0, f64::max);
+        Self {
+            unit: Unit { name: "cube half side".into(), mm: side / 2.0 },
+            dso: 5.0,
+            dsd: 7.0,
+            detector: [512, 512],
+            extent: Extent::Side([4.0, 4.0]),
+            offset: [0.0; 2],
+            angles: Angles::Even { views: 50, start_deg: 0.0, arc_deg: 360.0 },
+            noise: Noise::None,
+            seed: 0,
+            samples_per_voxel: two(),
+        }
+    }
+
+    /// The same with `rows × columns` pixels on a detector of the same size.
+    pub fn with_detector(mut self, detector: [usize; 2]) -> Self {
+        self.extent = Extent::Side(self.side());
+        self.detector = detector;
+        self
+    }
+
+    /// The same with `views` views evenly over the circle from angle 0.
+    pub fn with_views(mut self, views: usize) -> Self {
+        self.angles = Angles::Even { views, start_deg: 0.0, arc_deg: 360.0 };
+        self
+    }
+
+    /// The same with noise.
+    pub fn with_noise(mut self, noise: Noise, seed: u64) -> Self {
+        (self.noise, self.seed) = (noise, seed);
+        self
+    }
+
+    /// Size of the whole detector along v and u, in units.
+    pub fn side(&self) -> [f64; 2] {
+        match self.extent {
+            Extent::Pixel(p) => std::array::from_fn(|k| p[k] * self.detector[k] as f64),
+            Extent::Side(s) => s,
+        }
+    }
+
+    /// Source, detector and `grid` in mm. Refuses what cannot be scanned.
+    pub fn geometry(&self, grid: &VoxelGrid) -> Result<Geometry> {
+        self.validate()?;
+        let mm = |x: f64| Millimetres(x * self.unit.mm);
+        let side = self.side();
+        let pixel = std::array::from_fn(|k| mm(side[k] / self.detector[k] as f64));
+        let views = self
+            .angles
+            .radians()
+            .into_iter()
+            .map(|a| View::circular(a, mm(self.dso), mm(self.dsd), pixel, self.offset.map(mm)))
+            .collect();
+        let geometry = Geometry { detector: self.detector, views, volume: *grid };
+        geometry.validate("protocol")?;
+        Ok(geometry)
+    }
+
+    fn validate(&self) -> Result<()> {
+        let positive =
+            |field: &str, x: f64| ensure(x.is_finite() && x > 0.0, "protocol", field, x, "a positive finite number");
+        positive("unit.mm", self.unit.mm)?;
+        positive("dso", self.dso)?;
+        ensure(
+            self.dsd.is_finite() && self.dsd > self.dso,
+            "protocol",
+            "dsd",
+            self.dsd,
+            format!("a detector beyond the axis (more than dso = {})", self.dso),
+        )?;
+        ensure(
+            self.detector.iter().all(|&n| n > 0),
+            "protocol",
+            "detector",
+            format!("{:?}", self.detector),
+            "at least one row and one column",
+        )?;
+        for side in self.side() {
+            positive("extent", side)?;
+        }
+        let finite_offset = self.offset.iter().all(|x| x.is_finite());
+        ensure(finite_offset, "protocol", "offset", format!("{:?}", self.offset), "finite numbers")?;
+        // An even orbit's angles are not made before their number is known to be one that can be stored.
+        if let Angles::Even { views, .. } = self.angles {
+            let pixels = self.detector[0].checked_mul(self.detector[1]).and_then(|n| n.checked_mul(views));
+            ensure(
+                pixels.is_some_and(|n| n.checked_mul(8).is_some_and(|b| b <= isize::MAX as usize)),
+                "protocol",
+                "angles.even.views",
+                views,
+                "a number of pixels that can be addressed",
+            )?;
+        }
+        let angles = self.angles.radians();
+        ensure(!angles.is_empty(), "protocol", "angles", "no view", "at least one view")?;
+        ensure(angles.iter().all(|a| a.0.is_finite()), "protocol", "angles", "an angle that is not finite", "degrees")?;
+        self.noise.validate("protocol")
+    }
+}
