@@ -1,6 +1,7 @@
 //! The arena: parameters, gradients and optimizer state of a whole pipeline, under their names.
 
 use crate::error::{Error, Result};
+use crate::pages::Pages;
 use std::collections::BTreeMap;
 use std::ops::Range;
 
@@ -43,25 +44,26 @@ impl Layout {
 #[derive(Debug, Clone, Default, PartialEq)]
 pub struct Arena {
     /// Parameters.
-    pub params: Vec<f32>,
+    pub params: Pages,
     /// Gradients of the current step.
-    pub grads: Vec<f32>,
+    pub grads: Pages,
     /// Adam's first moments.
-    pub first: Vec<f32>,
+    pub first: Pages,
     /// Adam's second moments.
-    pub second: Vec<f32>,
+    pub second: Pages,
 }
 
 impl Arena {
     /// An arena of `n` zeros.
     pub fn new(n: usize) -> Self {
-        Self { params: vec![0.0; n], grads: vec![0.0; n], first: vec![0.0; n], second: vec![0.0; n] }
+        let zeros = || Pages::zeros(n);
+        Self { params: zeros(), grads: zeros(), first: zeros(), second: zeros() }
     }
 
     /// Keeps only `ranges` of every part, in that order.
     pub fn retain(&mut self, ranges: &[Range<usize>]) {
         for part in [&mut self.params, &mut self.grads, &mut self.first, &mut self.second] {
-            let kept: Vec<f32> = ranges.iter().flat_map(|r| part[r.clone()].iter().copied()).collect();
+            let kept: Pages = ranges.iter().flat_map(|r| part[r.clone()].iter().copied()).collect();
             *part = kept;
         }
     }
@@ -181,14 +183,12 @@ mod tests {
 
     #[test]
     fn retain_moves_every_part_alike() {
-        let mut a = Arena {
-            params: vec![0., 1., 2., 3.],
-            grads: vec![4., 5., 6., 7.],
-            first: vec![0.; 4],
-            second: vec![9., 8., 7., 6.],
-        };
+        let mut a = Arena::new(4);
+        for i in 0..4 {
+            (a.params[i], a.second[i]) = (i as f32, 9.0 - i as f32);
+        }
         a.retain(&[3..4, 0..2]);
-        assert_eq!(a.params, [3., 0., 1.]);
-        assert_eq!(a.second, [6., 9., 8.]);
+        assert_eq!(*a.params, [3., 0., 1.]);
+        assert_eq!(*a.second, [6., 9., 8.]);
     }
 }

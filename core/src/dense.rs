@@ -33,145 +33,155 @@ pub enum Output {
 pub fn affine<S: Simd, R: Real>(s: S, w: Weights<'_, R>, bias: Option<&[R]>, x: &[R], y: &mut [R], n: usize) {
     let (k, m) = (x.len() / n, y.len() / n);
     let len = V::<S, R>::LEN;
-    let row = |o: usize| &w.data[o * w.ld + w.column..][..k];
-    let mut i = 0;
-    while i < n {
-        let wide = i + 2 * len <= n;
-        let mut o = 0;
-        while o < m {
-            if o + 8 <= m && wide {
-                affine_block::<S, R, 8, 2>(
-                    s,
-                    std::array::from_fn(|j| row(o + j)),
-                    bias.map(|b| &b[o..]),
-                    x,
-                    &mut y[o * n..],
-                    n,
-                    i,
-                );
-                o += 8;
-            } else if o + 4 <= m {
-                if wide {
-                    affine_block::<S, R, 4, 2>(
-                        s,
-                        std::array::from_fn(|j| row(o + j)),
-                        bias.map(|b| &b[o..]),
-                        x,
-                        &mut y[o * n..],
-                        n,
-                        i,
-                    );
-                } else {
-                    affine_block::<S, R, 4, 1>(
-                        s,
-                        std::array::from_fn(|j| row(o + j)),
-                        bias.map(|b| &b[o..]),
-                        x,
-                        &mut y[o * n..],
-                        n,
-                        i,
-                    );
-                }
-                o += 4;
-            } else {
-                if wide {
-                    affine_block::<S, R, 1, 2>(s, [row(o)], bias.map(|b| &b[o..]), x, &mut y[o * n..], n, i);
-                } else {
-                    affine_block::<S, R, 1, 1>(s, [row(o)], bias.map(|b| &b[o..]), x, &mut y[o * n..], n, i);
-                }
-                o += 1;
+    let mut o = 0;
+    while o < m {
+        let (high, rows) = (m - o, &w.data[o * w.ld..]);
+        let w = Weights { data: rows, ..w };
+        let (bias, y) = (bias.map(|b| &b[o..]), &mut y[o * n..]);
+        let mut i = 0;
+        o += if high >= 8 {
+            8
+        } else if high >= 4 {
+            4
+        } else {
+            1
+        };
+        while i < n {
+            let wide = i + 2 * len <= n;
+            let full = i + len <= n;
+            match (high, wide, full) {
+                (8.., true, _) => affine_block::<S, R, 8, 2, true>(s, w, bias, x, y, k, n, i),
+                (8.., _, true) => affine_block::<S, R, 8, 1, true>(s, w, bias, x, y, k, n, i),
+                (8.., ..) => affine_block::<S, R, 8, 1, false>(s, w, bias, x, y, k, n, i),
+                (4.., true, _) => affine_block::<S, R, 4, 2, true>(s, w, bias, x, y, k, n, i),
+                (4.., ..) => affine_block::<S, R, 4, 1, false>(s, w, bias, x, y, k, n, i),
+                (_, true, _) => affine_block::<S, R, 1, 2, true>(s, w, bias, x, y, k, n, i),
+                _ => affine_block::<S, R, 1, 1, false>(s, w, bias, x, y, k, n, i),
             }
+            i += if wide { 2 * len } else { len };
         }
-        i += if wide { 2 * len } else { len };
     }
 }
 
+/// `M` output channels × `C` vectors of rows in registers. `FULL` blocks reach no further than the tile.
 #[inline(always)]
-fn affine_block<S: Simd, R: Real, const M: usize, const C: usize>(
+fn affine_block<S: Simd, R: Real, const M: usize, const C: usize, const FULL: bool>(
     s: S,
-    w: [&[R]; M],
+    w: Weights<'_, R>,
     bias: Option<&[R]>,
     x: &[R],
     y: &mut [R],
+    k: usize,
     n: usize,
     i: usize,
 ) {
-    let len = V::<S, R>::LEN;
-    let mut acc: [[V<S, R>; C]; M] = std::array::from_fn(|j| {
-        std::array::from_fn(|c| match bias {
-            Some(b) => V::<S, R>::splat(s, b[j]),
-            None => load(s, &y[j * n..(j + 1) * n], i + c * len),
-        })
-    });
-    for (k, x) in x.chunks_exact(n).enumerate() {
-        let x: [V<S, R>; C] = std::array::from_fn(|c| load(s, x, i + c * len));
+    // Plain loops, not closures: a closure is compiled without the instructions that `s` stands for.
+    let zero = V::<S, R>::splat(s, R::ZERO);
+    let mut acc = [[zero; C]; M];
+    let mut rows: [&[R]; M] = [&[]; M];
+    for j in 0..M {
+        rows[j] = &w.data[j * w.ld + w.column..][..k];
+        for c in 0..C {
+            acc[j][c] = match bias {
+                Some(b) => V::<S, R>::splat(s, b[j]),
+                None => read::<S, R, FULL>(s, &y[j * n..(j + 1) * n], i, c),
+            };
+        }
+    }
+    for k in 0..k {
+        let x = &x[k * n..(k + 1) * n];
+        let mut v = [zero; C];
+        for c in 0..C {
+            v[c] = read::<S, R, FULL>(s, x, i, c);
+        }
         for j in 0..M {
-            let w = V::<S, R>::splat(s, w[j][k]);
+            let w = V::<S, R>::splat(s, rows[j][k]);
             for c in 0..C {
-                acc[j][c] = w.mul_add(x[c], acc[j][c]);
+                acc[j][c] = w.mul_add(v[c], acc[j][c]);
             }
         }
     }
     for j in 0..M {
         for c in 0..C {
-            store::<S, R>(acc[j][c], &mut y[j * n..(j + 1) * n], i + c * len);
+            write::<S, R, FULL>(acc[j][c], &mut y[j * n..(j + 1) * n], i, c);
         }
     }
+}
+
+/// Vector `c` of the rows from `i`.
+#[inline(always)]
+fn read<S: Simd, R: Real, const FULL: bool>(s: S, x: &[R], i: usize, c: usize) -> V<S, R> {
+    let (at, len) = (i + c * V::<S, R>::LEN, V::<S, R>::LEN);
+    if FULL { V::<S, R>::from_slice(s, &x[at..at + len]) } else { load(s, x, at) }
+}
+
+#[inline(always)]
+fn write<S: Simd, R: Real, const FULL: bool>(v: V<S, R>, y: &mut [R], i: usize, c: usize) {
+    let (at, len) = (i + c * V::<S, R>::LEN, V::<S, R>::LEN);
+    if FULL { v.store_slice(&mut y[at..at + len]) } else { store::<S, R>(v, y, at) }
 }
 
 /// `dx = W[:, column..column + k]ᵀ·dy`, set, added or multiplied into `dx`.
 #[inline(always)]
 pub fn affine_input<S: Simd, R: Real>(s: S, w: Weights<'_, R>, dy: &[R], dx: &mut [R], out: Output, n: usize) {
-    let k = dx.len() / n;
+    let (k, m) = (dx.len() / n, dy.len() / n);
     let len = V::<S, R>::LEN;
-    let mut i = 0;
-    while i < n {
-        let wide = i + 2 * len <= n;
-        let mut c = 0;
-        while c < k {
-            let width = if c + 8 <= k && wide {
-                8
-            } else if c + 4 <= k {
-                4
-            } else {
-                1
-            };
-            let (w, dx) = (Weights { column: w.column + c, ..w }, &mut dx[c * n..(c + width) * n]);
-            match (width, wide) {
-                (8, _) => input_block::<S, R, 8, 2>(s, w, dy, dx, out, n, i),
-                (4, true) => input_block::<S, R, 4, 2>(s, w, dy, dx, out, n, i),
-                (4, false) => input_block::<S, R, 4, 1>(s, w, dy, dx, out, n, i),
-                (_, true) => input_block::<S, R, 1, 2>(s, w, dy, dx, out, n, i),
-                (_, false) => input_block::<S, R, 1, 1>(s, w, dy, dx, out, n, i),
+    let mut c = 0;
+    while c < k {
+        let broad = k - c;
+        let w = Weights { column: w.column + c, ..w };
+        let dx = &mut dx[c * n..];
+        let mut i = 0;
+        c += if broad >= 8 {
+            8
+        } else if broad >= 4 {
+            4
+        } else {
+            1
+        };
+        while i < n {
+            let wide = i + 2 * len <= n;
+            let full = i + len <= n;
+            match (broad, wide, full) {
+                (8.., true, _) => input_block::<S, R, 8, 2, true>(s, w, dy, dx, out, m, n, i),
+                (8.., _, true) => input_block::<S, R, 8, 1, true>(s, w, dy, dx, out, m, n, i),
+                (8.., ..) => input_block::<S, R, 8, 1, false>(s, w, dy, dx, out, m, n, i),
+                (4.., true, _) => input_block::<S, R, 4, 2, true>(s, w, dy, dx, out, m, n, i),
+                (4.., ..) => input_block::<S, R, 4, 1, false>(s, w, dy, dx, out, m, n, i),
+                (_, true, _) => input_block::<S, R, 1, 2, true>(s, w, dy, dx, out, m, n, i),
+                _ => input_block::<S, R, 1, 1, false>(s, w, dy, dx, out, m, n, i),
             }
-            c += width;
+            i += if wide { 2 * len } else { len };
         }
-        i += if wide { 2 * len } else { len };
     }
 }
 
 #[inline(always)]
-fn input_block<S: Simd, R: Real, const K: usize, const C: usize>(
+fn input_block<S: Simd, R: Real, const K: usize, const C: usize, const FULL: bool>(
     s: S,
     w: Weights<'_, R>,
     dy: &[R],
     dx: &mut [R],
     out: Output,
+    m: usize,
     n: usize,
     i: usize,
 ) {
-    let len = V::<S, R>::LEN;
-    let mut acc: [[V<S, R>; C]; K] = std::array::from_fn(|j| {
-        std::array::from_fn(|c| {
-            if out == Output::Add {
-                load(s, &dx[j * n..(j + 1) * n], i + c * len)
-            } else {
-                V::<S, R>::splat(s, R::ZERO)
+    let zero = V::<S, R>::splat(s, R::ZERO);
+    let mut acc = [[zero; C]; K];
+    if out == Output::Add {
+        for j in 0..K {
+            for c in 0..C {
+                acc[j][c] = read::<S, R, FULL>(s, &dx[j * n..(j + 1) * n], i, c);
             }
-        })
-    });
-    for (o, dy) in dy.chunks_exact(n).enumerate() {
-        let d: [V<S, R>; C] = std::array::from_fn(|c| load(s, dy, i + c * len));
+        }
+    }
+    for o in 0..m {
+        let dy = &dy[o * n..(o + 1) * n];
+        let mut d = [zero; C];
+        for c in 0..C {
+            d[c] = read::<S, R, FULL>(s, dy, i, c);
+        }
         let w = &w.data[o * w.ld + w.column..][..K];
         for j in 0..K {
             let w = V::<S, R>::splat(s, w[j]);
@@ -183,8 +193,8 @@ fn input_block<S: Simd, R: Real, const K: usize, const C: usize>(
     for j in 0..K {
         for c in 0..C {
             let dx = &mut dx[j * n..(j + 1) * n];
-            let v = if out == Output::Multiply { acc[j][c] * load(s, dx, i + c * len) } else { acc[j][c] };
-            store::<S, R>(v, dx, i + c * len);
+            let v = if out == Output::Multiply { acc[j][c] * read::<S, R, FULL>(s, dx, i, c) } else { acc[j][c] };
+            write::<S, R, FULL>(v, dx, i, c);
         }
     }
 }
@@ -240,18 +250,33 @@ fn weights_block<S: Simd, R: Real, const M: usize, const K: usize>(
     let len = V::<S, R>::LEN;
     let zero = V::<S, R>::splat(s, R::ZERO);
     let mut acc = [zero; 16];
-    let dy: [&[R]; M] = std::array::from_fn(|j| &dy[j * n..(j + 1) * n]);
-    let x: [&[R]; K] = std::array::from_fn(|j| &x[j * n..(j + 1) * n]);
-    let mut i = 0;
-    while i < n {
-        let x: [V<S, R>; K] = std::array::from_fn(|j| load(s, x[j], i));
+    let (mut rows, mut columns): ([&[R]; M], [&[R]; K]) = ([&[]; M], [&[]; K]);
+    for j in 0..M {
+        rows[j] = &dy[j * n..(j + 1) * n];
+    }
+    for k in 0..K {
+        columns[k] = &x[k * n..(k + 1) * n];
+    }
+    let (dy, x) = (rows, columns);
+    let whole = n / len * len;
+    for i in (0..whole).step_by(len) {
+        let mut v = [zero; K];
+        for k in 0..K {
+            v[k] = V::<S, R>::from_slice(s, &x[k][i..i + len]);
+        }
         for j in 0..M {
-            let d = load(s, dy[j], i);
+            let d = V::<S, R>::from_slice(s, &dy[j][i..i + len]);
             for k in 0..K {
-                acc[j * K + k] = d.mul_add(x[k], acc[j * K + k]);
+                acc[j * K + k] = d.mul_add(v[k], acc[j * K + k]);
             }
         }
-        i += len;
+    }
+    if whole < n {
+        for j in 0..M {
+            for k in 0..K {
+                acc[j * K + k] = load(s, dy[j], whole).mul_add(load(s, x[k], whole), acc[j * K + k]);
+            }
+        }
     }
     let sums = lane_sums::<S, R>(acc);
     for j in 0..M {

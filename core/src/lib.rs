@@ -11,6 +11,7 @@ pub mod backend;
 pub mod dense;
 pub mod error;
 pub mod geometry;
+pub mod pages;
 pub mod pipeline;
 pub mod random;
 pub mod registry;

@@ -2,6 +2,7 @@
 
 use crate::arena::{Arena, Block, Layout};
 use crate::error::{Result, ensure};
+use crate::scene::Scene;
 use crate::spec::Spec;
 use crate::stage::{Encoder, Field, Info, Mask, Normalizer, Probe, Projector, Scope, Stage};
 use std::ops::Range;
@@ -162,22 +163,49 @@ impl Model {
         Self { pipeline, arena }
     }
 
-    /// Lets every normalizer look at the encoder. Returns what was masked, for the log.
-    pub fn refresh(&mut self, probe: impl Fn(&Self) -> Box<dyn Probe + '_>) -> Result<Vec<String>> {
+    /// Lets every normalizer look at the encoder, through `encode`, after `epoch` passes over the views. Returns
+    /// what was masked, for the log; compile again if anything was.
+    pub fn refresh(&mut self, scene: &Scene, epoch: f64, encode: &mut Encode<'_>) -> Result<Vec<String>> {
         let mut reports = vec![];
         for i in 0..self.pipeline.normalizers.len() {
             let mask = {
-                let mut probe = probe(self);
-                self.pipeline.normalizers[i].refresh(probe.as_mut())?
+                let mut look = Look { model: self, scene, epoch, encode: &mut *encode };
+                self.pipeline.normalizers[i].refresh(&mut look)?
             };
             if let Some(mask) = mask {
-                if mask.keep.len() < self.pipeline.normalizers[i].info().input {
-                    self.pipeline.apply_mask(i, &mask, &mut self.arena)?;
-                }
+                self.pipeline.apply_mask(i, &mask, &mut self.arena)?;
                 reports.push(mask.report);
             }
         }
         Ok(reports)
+    }
+}
+
+/// Evaluates a model's encoder at points of the unit cube, channel-major.
+pub type Encode<'a> = dyn FnMut(&Model, &[[f32; 3]]) -> Result<Vec<f32>> + 'a;
+
+struct Look<'a, 'b> {
+    model: &'a Model,
+    scene: &'a Scene,
+    epoch: f64,
+    encode: &'a mut Encode<'b>,
+}
+
+impl Probe for Look<'_, '_> {
+    fn encode(&mut self, points: &[[f32; 3]]) -> Result<Vec<f32>> {
+        (self.encode)(self.model, points)
+    }
+    fn shape(&self) -> [usize; 3] {
+        self.scene.grid.shape
+    }
+    fn voxel(&self, index: [usize; 3]) -> [f32; 3] {
+        self.scene.voxel(index)
+    }
+    fn epoch(&self) -> f64 {
+        self.epoch
+    }
+    fn coarse_to_fine(&self) -> bool {
+        self.model.pipeline.encoder.coarse_to_fine()
     }
 }
 

@@ -45,6 +45,8 @@ pub trait Real:
     fn floor(self) -> Self;
     /// As a signed whole number, towards zero, saturating.
     fn int(self) -> i64;
+    /// The whole part of every lane, which is at least 0 and below 2³¹, into `out`; as many as fit.
+    fn cells<S: Simd>(s: S, x: V<S, Self>, out: &mut [u32]);
     /// Whether neither infinite nor NaN.
     fn finite(self) -> bool;
     /// Exponential of every lane.
@@ -76,6 +78,16 @@ impl Real for f32 {
     #[inline(always)]
     fn int(self) -> i64 {
         self as i64
+    }
+    #[inline(always)]
+    fn cells<S: Simd>(_: S, x: V<S, Self>, out: &mut [u32]) {
+        let cells: S::u32s = x.to_int();
+        let n = out.len().min(S::u32s::LEN);
+        if n == S::u32s::LEN {
+            cells.store_slice(&mut out[..n]);
+        } else {
+            out.copy_from_slice(&cells.as_slice()[..n]);
+        }
     }
     #[inline(always)]
     fn finite(self) -> bool {
@@ -140,6 +152,12 @@ impl Real for f64 {
     #[inline(always)]
     fn int(self) -> i64 {
         self as i64
+    }
+    #[inline(always)]
+    fn cells<S: Simd>(_: S, x: V<S, Self>, out: &mut [u32]) {
+        for (o, x) in out.iter_mut().zip(x.as_slice()) {
+            *o = *x as u32;
+        }
     }
     #[inline(always)]
     fn finite(self) -> bool {

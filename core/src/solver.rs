@@ -15,6 +15,8 @@ pub struct Job<'a> {
     pub held_out: Option<&'a Scan>,
     /// The volume sought, if known; it is only looked at, never learned from.
     pub reference: Option<&'a Volume>,
+    /// The value that PSNR takes for the reference's full range.
+    pub peak: f64,
     /// The whole spec.
     pub spec: &'a Spec,
     /// Does the work.

@@ -223,7 +223,10 @@ impl Set {
                     }
                     let found = entries.iter().position(|e| e.key == *step);
                     let index = found.unwrap_or_else(|| {
-                        let fresh = Node::empty_table(at.clone());
+                        // A number after the key makes it a list.
+                        let list = path.get(i + 1).is_some_and(|next| next.parse::<usize>().is_ok());
+                        let kind = if list { Kind::Array(vec![]) } else { Kind::Table(vec![]) };
+                        let fresh = Node { at: at.clone(), kind };
                         entries.push(Entry { key: step.clone(), at: at.clone(), value: fresh });
                         entries.len() - 1
                     });
@@ -433,19 +436,15 @@ mod tests {
             ("encoder..levels=3", "expected path=value"),
             ("encoder.levels.deep=3", "a key below encoder.levels, which is 3"),
             ("normalizers.0.type=nothing", "no normalizer type"),
+            ("normalizers.0=3", "normalizers.0: found 3, expected a table"),
             ("name=1\nsolver=2", "name"),
         ] {
-            let text = if set.starts_with("normalizers") {
-                "extends = 'plain'\nnormalizers = []"
-            } else {
-                "extends = 'plain'"
-            };
-            match read(text, &[set]) {
+            match read("extends = 'plain'", &[set]) {
                 Ok(l) => assert_eq!(l.tree["name"], "1\nsolver=2", "{set}"),
                 Err(e) => assert!(e.to_string().contains(want), "{set}: {e}"),
             }
         }
-        let e = refusal("extends = 'plain'\nnormalizers = []", &["normalizers.2.type=x"]);
+        let e = refusal("extends = 'plain'", &["normalizers.2.type=x"]);
         assert!(e.contains("expected 0, to add one"), "{e}");
     }
 

@@ -1,0 +1,424 @@
+//! Gradient training: an attenuation field whose Beer-Lambert line integrals match the measured ones.
+//!
+//! Every step draws rays, compares their integrals with the measurement (L1 in the published codes), optionally adds
+//! a total-variation prior on small random blocks of neighbouring points, and takes an Adam step.
+
+use crate::rays::{Pixels, RaySource, Views};
+use crate::schedule::{Clock, Decay};
+use conefield_core::backend::{Adam, Executable, Loss, TrainRay, TvBlocks, Work};
+use conefield_core::error::{Error, Result, ensure};
+use conefield_core::pipeline::{Model, Pipeline};
+use conefield_core::random::stream;
+use conefield_core::scan::{Scan, Volume};
+use conefield_core::scene::Scene;
+use conefield_core::solver::{Job, Limits, Observer, PretrainJob, Record, Solution, Solver};
+use conefield_core::spec::SolverSpec;
+use conefield_core::stage::UnitRay;
+use ndarray::Array3;
+use rand::RngExt;
+use schemars::JsonSchema;
+use serde::{Deserialize, Serialize};
+use std::time::Instant;
+
+/// Penalty of the difference between predicted and measured, in the scan's own scale.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize, JsonSchema)]
+#[serde(rename_all = "kebab-case")]
+pub enum Penalty {
+    /// Absolute difference (published by NI-NeRF).
+    L1,
+    /// Half the square (published by NAF, up to the factor).
+    L2,
+    /// Half the square up to this difference, linear beyond it.
+    Huber(f64),
+}
+
+impl From<Penalty> for Loss {
+    fn from(p: Penalty) -> Self {
+        match p {
+            Penalty::L1 => Loss::L1,
+            Penalty::L2 => Loss::L2,
+            Penalty::Huber(delta) => Loss::Huber { delta },
+        }
+    }
+}
+
+/// Total variation of the field over small random blocks of neighbouring points.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
+#[serde(deny_unknown_fields, default)]
+pub struct TvPrior {
+    /// Weight against the mean penalty of a ray.
+    pub weight: f64,
+    /// Blocks a step.
+    pub blocks: usize,
+    /// Points along a block's edge.
+    pub edge: usize,
+    /// Distance of the points in voxels.
+    pub spacing: f64,
+    /// Differences below this (in the scale that stages see) count quadratically.
+    pub smoothing: f64,
+}
+
+impl Default for TvPrior {
+    fn default() -> Self {
+        Self { weight: 1e-3, blocks: 64, edge: 8, spacing: 1.0, smoothing: 1e-4 }
+    }
+}
+
+/// Settings of `gradient`.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
+#[serde(deny_unknown_fields, default)]
+pub struct Gradient {
+    /// Ends after this many passes over the views.
+    pub epochs: Option<f64>,
+    /// Ends after this many steps.
+    pub steps: Option<u64>,
+    /// Ends after this many seconds of training. Which limit comes first ends the run.
+    pub seconds: Option<f64>,
+    /// Rays a step.
+    pub rays: usize,
+    /// Where a step takes its rays from.
+    pub views: Views,
+    /// Which pixels count.
+    pub pixels: Pixels,
+    /// Pixels by which the support is widened.
+    pub margin: usize,
+    /// Penalty of the difference between predicted and measured.
+    pub loss: Penalty,
+    /// Learning rate.
+    pub lr: f64,
+    /// How it goes down.
+    pub decay: Decay,
+    /// Adam's decay rates of the moments.
+    pub betas: [f64; 2],
+    /// Adam's ε.
+    pub eps: f64,
+    /// Total-variation prior, if any.
+    pub tv: Option<TvPrior>,
+    /// Steps between two records of the metrics.
+    pub report_every: u64,
+    /// Points a step of pre-training.
+    pub pretrain_points: usize,
+    /// Steps of pre-training.
+    pub pretrain_steps: u64,
+}
+
+impl Default for Gradient {
+    fn default() -> Self {
+        Self {
+            epochs: None,
+            steps: Some(1500),
+            seconds: None,
+            rays: 1024,
+            views: Views::All,
+            pixels: Pixels::Support,
+            margin: 8,
+            loss: Penalty::L1,
+            lr: 1e-3,
+            decay: Decay::Exponential(0.1),
+            betas: [0.9, 0.999],
+            eps: 1e-8,
+            tv: None,
+            report_every: 50,
+            pretrain_points: 65_536,
+            pretrain_steps: 1000,
+        }
+    }
+}
+
+conefield_core::stage_type!(Solver, "gradient", Gradient, "stochastic gradient training of an attenuation field");
+
+#[typetag::serde(name = "gradient")]
+impl SolverSpec for Gradient {
+    fn build(&self) -> Result<Box<dyn Solver>> {
+        let place = "spec";
+        let positive = |x: f64| x.is_finite() && x > 0.0;
+        ensure((1..=1 << 20).contains(&self.rays), place, "solver.rays", self.rays, "1 to 2^20")?;
+        ensure(positive(self.lr), place, "solver.lr", self.lr, "a positive finite number")?;
+        ensure(positive(self.eps), place, "solver.eps", self.eps, "a positive finite number")?;
+        let betas = self.betas.iter().all(|b| (0.0..1.0).contains(b));
+        ensure(betas, place, "solver.betas", format!("{:?}", self.betas), "two numbers from 0 to below 1")?;
+        ensure(self.report_every > 0, place, "solver.report_every", 0, "at least 1")?;
+        ensure(
+            self.epochs.is_some() || self.steps.is_some() || self.seconds.is_some(),
+            place,
+            "solver",
+            "no end",
+            "one of epochs, steps or seconds",
+        )?;
+        if let Penalty::Huber(delta) = self.loss {
+            ensure(positive(delta), place, "solver.loss", delta, "a positive finite number")?;
+        }
+        if let Some(tv) = &self.tv {
+            ensure((2..=32).contains(&tv.edge), place, "solver.tv.edge", tv.edge, "2 to 32")?;
+            ensure(tv.weight.is_finite() && tv.weight >= 0.0, place, "solver.tv.weight", tv.weight, "0 or more")?;
+            ensure(positive(tv.spacing), place, "solver.tv.spacing", tv.spacing, "a positive finite number")?;
+            ensure(positive(tv.smoothing), place, "solver.tv.smoothing", tv.smoothing, "a positive finite number")?;
+            ensure((1..=1 << 16).contains(&tv.blocks), place, "solver.tv.blocks", tv.blocks, "1 to 65536")?;
+        }
+        ensure(self.pretrain_points > 0, place, "solver.pretrain_points", 0, "at least 1")?;
+        self.decay.validate()?;
+        Ok(Box::new(self.clone()))
+    }
+}
+
+/// Voxels between the points at which PSNR is watched during training.
+const WATCH: usize = 4;
+/// Rays of held-out views that are rendered for a record, at most.
+const HELD_OUT_RAYS: usize = 8192;
+/// Points that are exported at once.
+const SLAB_POINTS: usize = 1 << 20;
+
+impl Solver for Gradient {
+    fn solve(&self, job: &Job<'_>, observer: &mut dyn Observer) -> Result<Solution> {
+        job.scan.validate("scan")?;
+        let scene = Scene::new(job.scan, &job.spec.scene)?;
+        let pipeline = Pipeline::build(job.spec)?;
+        let initializer = job.spec.initializer.as_ref().map(|i| i.build(job.weights)).transpose()?;
+        let source = RaySource::new(job.scan, &scene, self.views, self.pixels, self.margin)?;
+        observer.note(&format!("{:.0}% of the pixels are trained on", 100.0 * source.share()));
+        let mut model = Model::random(pipeline, job.seed);
+        if let Some(i) = initializer {
+            let report = i.apply(model.pipeline.layout(), &mut model.arena)?;
+            if !report.loaded.is_empty() {
+                observer.note(&format!(
+                    "loaded {} of {} tensors",
+                    report.loaded.len(),
+                    report.loaded.len() + report.fresh.len()
+                ));
+            }
+        }
+        let (mut exe, explain) = job.backend.compile(&model.pipeline)?;
+        observer.note(&explain.backend);
+        let watch = Watch::new(job, &scene);
+        let steps_an_epoch = source.steps_an_epoch() as f64;
+        let by_epochs = self.epochs.map(|e| (e * steps_an_epoch).ceil() as u64);
+        let steps = [self.steps, by_epochs].into_iter().flatten().min();
+        let mut clock = Clock::new(Limits { steps, seconds: self.seconds }, job.limits);
+        let mut window = Window::default();
+        let mut rays = Vec::with_capacity(self.rays);
+        let mut tv = TvBlocks::default();
+        let (mut step, mut samples) = (0u64, 0u64);
+        clock.resume();
+        loop {
+            let share = clock.share(step);
+            let done = share >= 1.0 || observer.cancelled();
+            if step > 0 && (step % self.report_every == 0 || done) && window.steps > 0 {
+                clock.pause();
+                let record =
+                    window.record(step, clock.seconds(), self.lr * self.decay.at(step as f64 / steps_an_epoch, share));
+                let record = watch.fill(record, &model, exe.as_mut())?;
+                observer.record(&record);
+                window = Window::default();
+                clock.resume();
+            }
+            if done {
+                break;
+            }
+            let epoch = step as f64 / steps_an_epoch;
+            let reports = model.refresh(&scene, epoch, &mut |m, points| exe.encode(m, points))?;
+            if !reports.is_empty() {
+                exe = job.backend.compile(&model.pipeline)?.0;
+                window.events.extend(reports);
+            }
+            source.draw(job.seed, step, self.rays, &mut rays);
+            let tv = self.tv.as_ref().map(|prior| {
+                blocks(prior, &scene, job.seed, step, &mut tv);
+                &tv
+            });
+            let work = Work { step, seed: job.seed, loss: self.loss.into(), rays: &rays, points: &[], tv };
+            let start = Instant::now();
+            let stats = exe.step(&mut model, &work)?;
+            if !(stats.loss.is_finite() && stats.prior.is_finite()) {
+                return Err(Error::Diverged {
+                    step,
+                    what: format!("the loss is {}; try a smaller solver.lr", stats.loss),
+                });
+            }
+            step += 1;
+            samples += stats.samples;
+            exe.update(&mut model, &self.adam(step, epoch, share))?;
+            window.add(stats.loss, stats.prior, stats.samples, start.elapsed().as_secs_f64());
+            let share = clock.share(step);
+            observer.progress(step, share, clock.seconds() * (1.0 - share).max(0.0) / share.max(1e-9));
+        }
+        clock.pause();
+        let start = Instant::now();
+        let volume = export(&scene, &model, exe.as_mut(), job.scan)?;
+        Ok(Solution {
+            volume,
+            model: Some(model),
+            steps: step,
+            train_s: clock.seconds(),
+            export_s: start.elapsed().as_secs_f64(),
+            samples,
+        })
+    }
+
+    fn pretrain(&self, job: &PretrainJob<'_>, observer: &mut dyn Observer) -> Result<Model> {
+        crate::pretrain::pretrain(self, job, observer)
+    }
+
+    fn describe(&self) -> String {
+        let tv = self.tv.as_ref().map_or(String::new(), |t| format!(", total variation {}", t.weight));
+        format!("gradient: {} rays a step, {:?}, Adam {}{tv}", self.rays, self.loss, self.lr).to_lowercase()
+    }
+}
+
+impl Gradient {
+    /// Adam's settings for step `step` (from 1).
+    pub fn adam(&self, step: u64, epoch: f64, share: f64) -> Adam {
+        Adam {
+            lr: self.lr * self.decay.at(epoch, share),
+            beta1: self.betas[0],
+            beta2: self.betas[1],
+            eps: self.eps,
+            step,
+        }
+    }
+}
+
+/// Random blocks of neighbouring points inside the volume.
+fn blocks(prior: &TvPrior, scene: &Scene, seed: u64, step: u64, out: &mut TvBlocks) {
+    let mut rng = stream(seed ^ 0x7e57_b10c, step);
+    let voxel = scene.unit_spacing();
+    let spacing = voxel.map(|s| s * prior.spacing as f32);
+    let (lo, hi) = (scene.to_unit(scene.bounds[0]), scene.to_unit(scene.bounds[1]));
+    out.corners.clear();
+    for _ in 0..prior.blocks {
+        out.corners.push(std::array::from_fn(|k| {
+            let room = (hi[k] - lo[k] - spacing[k] * (prior.edge - 1) as f32).max(0.0);
+            lo[k] + room * rng.random::<f32>()
+        }));
+    }
+    out.spacing = spacing;
+    out.edge = prior.edge;
+    out.weight = prior.weight;
+    out.smoothing = prior.smoothing;
+}
+
+/// Sums since the last record.
+#[derive(Default)]
+struct Window {
+    steps: u64,
+    loss: f64,
+    prior: f64,
+    samples: u64,
+    seconds: f64,
+    events: Vec<String>,
+}
+
+impl Window {
+    fn add(&mut self, loss: f64, prior: f64, samples: u64, seconds: f64) {
+        self.steps += 1;
+        self.loss += loss;
+        self.prior += prior;
+        self.samples += samples;
+        self.seconds += seconds;
+    }
+
+    fn record(&mut self, step: u64, seconds: f64, lr: f64) -> Record {
+        let n = self.steps as f64;
+        Record {
+            step,
+            seconds,
+            loss: self.loss / n,
+            prior: (self.prior > 0.0).then_some(self.prior / n),
+            lr,
+            samples_per_s: self.samples as f64 / self.seconds.max(1e-12),
+            held_out: None,
+            psnr: None,
+            events: std::mem::take(&mut self.events),
+        }
+    }
+}
+
+/// What is looked at for every record: some voxels of the reference, some rays of the held-out views.
+struct Watch {
+    points: Vec<[f32; 3]>,
+    reference: Vec<f32>,
+    /// From what stages see to the reference's unit.
+    scale: f32,
+    peak: f64,
+    rays: Vec<TrainRay>,
+    top: f64,
+}
+
+impl Watch {
+    fn new(job: &Job<'_>, scene: &Scene) -> Self {
+        let (mut points, mut reference) = (vec![], vec![]);
+        let shape = scene.grid.shape;
+        if let Some(r) = job.reference.filter(|r| r.data.shape() == shape) {
+            for x in (0..shape[0]).step_by(WATCH) {
+                for y in (0..shape[1]).step_by(WATCH) {
+                    for z in (0..shape[2]).step_by(WATCH) {
+                        points.push(scene.voxel([x, y, z]));
+                        reference.push(r.data[[x, y, z]]);
+                    }
+                }
+            }
+        }
+        let (mut rays, mut top) = (vec![], 0.0f64);
+        if let Some(scan) = job.held_out {
+            let [rows, columns] = scan.geometry.detector;
+            let every = (scan.projections.len() / HELD_OUT_RAYS).max(1) | 1;
+            for i in (0..scan.projections.len()).step_by(every) {
+                let at = [i / (rows * columns), i / columns % rows, i % columns];
+                let target = scene.line_to_unit(scan.projections[at]);
+                top = top.max(f64::from(target));
+                if let Some(ray) = scene.pixel_ray(&scan.geometry, at[0], at[1], at[2]) {
+                    rays.push(TrainRay { ray, target });
+                }
+            }
+        }
+        Self { points, reference, scale: unit_scale(scene, job.scan), peak: job.peak, rays, top }
+    }
+
+    fn fill(&self, mut record: Record, model: &Model, exe: &mut dyn Executable) -> Result<Record> {
+        if !self.points.is_empty() {
+            let mut mu = vec![0.0; self.points.len()];
+            exe.evaluate(model, &self.points, &mut mu)?;
+            let square = |(m, r): (&f32, &f32)| (f64::from(m * self.scale) - f64::from(*r)).powi(2);
+            let mse = mu.iter().zip(&self.reference).map(square).sum::<f64>() / mu.len() as f64;
+            record.psnr = Some(10.0 * (self.peak * self.peak / mse.max(1e-300)).log10());
+        }
+        if !self.rays.is_empty() {
+            let rays: Vec<UnitRay> = self.rays.iter().map(|r| r.ray).collect();
+            let mut lines = vec![0.0; rays.len()];
+            exe.render(model, &rays, &mut lines)?;
+            let square = |(a, r): (&f32, &TrainRay)| (f64::from(*a) - f64::from(r.target)).powi(2);
+            let mse = lines.iter().zip(&self.rays).map(square).sum::<f64>() / rays.len() as f64;
+            record.held_out = Some(mse.sqrt() / self.top.max(1e-300));
+        }
+        Ok(record)
+    }
+}
+
+fn unit_scale(scene: &Scene, scan: &Scan) -> f32 {
+    (scene.attenuation * scan.unit.mm) as f32
+}
+
+/// The field at every voxel, in the scan's unit, slab by slab.
+fn export(scene: &Scene, model: &Model, exe: &mut dyn Executable, scan: &Scan) -> Result<Volume> {
+    let shape = scene.grid.shape;
+    let scale = unit_scale(scene, scan);
+    let mut data = Array3::zeros(shape);
+    let slab = (SLAB_POINTS / (shape[1] * shape[2])).max(1);
+    let mut points = vec![];
+    for from in (0..shape[0]).step_by(slab) {
+        let to = (from + slab).min(shape[0]);
+        points.clear();
+        for x in from..to {
+            for y in 0..shape[1] {
+                points.extend((0..shape[2]).map(|z| scene.voxel([x, y, z])));
+            }
+        }
+        let mut part = data.slice_mut(ndarray::s![from..to, .., ..]);
+        let Some(out) = part.as_slice_mut() else { unreachable!("a slab of a new array is contiguous") };
+        exe.evaluate(model, &points, out)?;
+        out.iter_mut().for_each(|m| *m *= scale);
+        if let Some(i) = out.iter().position(|m| !m.is_finite()) {
+            return Err(Error::Diverged { step: 0, what: format!("voxel {i} of the export is not finite") });
+        }
+    }
+    Ok(Volume { data, grid: scene.grid, affine: None })
+}

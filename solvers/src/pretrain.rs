@@ -1,0 +1,111 @@
+//! Pre-training on a known volume, voxel by voxel: `L = |μ(x) − voxel|`, NI-NeRF's mapping-consistency
+//! initialization. What the LayerNorm and the field learn there is reused for every other scan.
+
+use crate::gradient::Gradient;
+use crate::schedule::Clock;
+use conefield_core::arena::Arena;
+use conefield_core::backend::{Loss, Work};
+use conefield_core::error::{Error, Result};
+use conefield_core::pipeline::{Model, Pipeline};
+use conefield_core::random::stream;
+use conefield_core::scan::Volume;
+use conefield_core::scene::Scene;
+use conefield_core::solver::{Limits, Observer, PretrainJob, Record};
+use conefield_core::spec::AttenuationScale;
+use ndarray::Axis;
+use rand::RngExt;
+
+/// Steps on one volume before the next has its turn.
+const TURN: u64 = 25;
+
+/// Trains the field of `job.spec` on its volumes, in turn. Each volume has an encoder of its own; everything behind
+/// the encoder is shared.
+pub fn pretrain(settings: &Gradient, job: &PretrainJob<'_>, observer: &mut dyn Observer) -> Result<Model> {
+    let scenes: Vec<Scene> = job.volumes.iter().map(|v| scene(v, job)).collect::<Result<_>>()?;
+    if scenes.is_empty() {
+        return Err(Error::invalid("pretrain", "volumes", 0, "at least one volume"));
+    }
+    let mut model = Model::random(Pipeline::build(job.spec)?, job.seed);
+    let shared_from = model.pipeline.ranges()[0].end;
+    let (mut exe, explain) = job.backend.compile(&model.pipeline)?;
+    observer.note(&explain.backend);
+    let mut waiting: Vec<Arena> = vec![model.arena.clone(); scenes.len() - 1];
+    let limits = Limits { steps: Some(settings.pretrain_steps), seconds: None };
+    let mut clock = Clock::new(limits, job.limits);
+    let mut points = Vec::with_capacity(settings.pretrain_points);
+    let (mut step, mut loss, mut since) = (0u64, 0.0, 0u64);
+    let mut at = 0;
+    clock.resume();
+    while clock.share(step) < 1.0 && !observer.cancelled() {
+        if step > 0 && step.is_multiple_of(TURN) && !waiting.is_empty() {
+            let mut next = waiting.remove(0);
+            let Arena { params, first, second, .. } = &model.arena;
+            next.params[shared_from..].copy_from_slice(&params[shared_from..]);
+            next.first[shared_from..].copy_from_slice(&first[shared_from..]);
+            next.second[shared_from..].copy_from_slice(&second[shared_from..]);
+            waiting.push(std::mem::replace(&mut model.arena, next));
+            at = (at + 1) % scenes.len();
+        }
+        draw(&job.volumes[at], &scenes[at], job.seed, step, settings.pretrain_points, &mut points);
+        let work = Work { step, seed: job.seed, loss: Loss::L1, rays: &[], points: &points, tv: None };
+        let stats = exe.step(&mut model, &work)?;
+        if !stats.loss.is_finite() {
+            return Err(Error::Diverged { step, what: format!("the loss is {}", stats.loss) });
+        }
+        step += 1;
+        let share = clock.share(step);
+        let adam = settings.adam(step, 0.0, share);
+        exe.update(&mut model, &adam)?;
+        (loss, since) = (loss + stats.loss, since + 1);
+        observer.progress(step, share, clock.seconds() * (1.0 - share).max(0.0) / share.max(1e-9));
+        if step.is_multiple_of(settings.report_every) || share >= 1.0 {
+            let samples_per_s = (step * settings.pretrain_points as u64) as f64 / clock.seconds();
+            let record = Record {
+                step,
+                seconds: clock.seconds(),
+                loss: loss / since as f64,
+                lr: adam.lr,
+                samples_per_s,
+                ..Record::default()
+            };
+            observer.record(&record);
+            (loss, since) = (0.0, 0);
+        }
+    }
+    Ok(model)
+}
+
+/// The scene that a scan of `volume` would have: its attenuation scale comes from the sums along x and y, which are
+/// what rays of a scan would measure.
+fn scene(volume: &Volume, job: &PretrainJob<'_>) -> Result<Scene> {
+    volume.grid.validate("volume")?;
+    let attenuation = match job.spec.scene.attenuation {
+        AttenuationScale::Fixed(x) => x,
+        AttenuationScale::Scan => {
+            let mut sums: Vec<f64> = vec![];
+            for axis in 0..2 {
+                let spacing = volume.grid.spacing[axis];
+                sums.extend(volume.data.sum_axis(Axis(axis)).iter().map(|&s| f64::from(s) * spacing));
+            }
+            let k = ((sums.len() as f64 * 0.995) as usize).min(sums.len() - 1);
+            let (_, top, _) = sums.select_nth_unstable_by(k, f64::total_cmp);
+            let longest = volume.grid.size().into_iter().fold(0.0, f64::max);
+            4.0 * *top / longest
+        }
+    };
+    if !(attenuation.is_finite() && attenuation > 0.0) {
+        return Err(Error::invalid("volume", "values", "no attenuation", "a volume of an object that absorbs"));
+    }
+    Scene::with_attenuation(volume.grid, &job.spec.scene, attenuation)
+}
+
+/// Random voxel centres with their values.
+fn draw(volume: &Volume, scene: &Scene, seed: u64, step: u64, count: usize, out: &mut Vec<([f32; 3], f32)>) {
+    let mut rng = stream(seed ^ 0x70_7265, step);
+    let shape = volume.grid.shape;
+    out.clear();
+    for _ in 0..count {
+        let index: [usize; 3] = std::array::from_fn(|k| rng.random_range(0..shape[k]));
+        out.push((scene.voxel(index), (f64::from(volume.data[index]) / scene.attenuation) as f32));
+    }
+}

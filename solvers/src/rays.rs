@@ -1,0 +1,183 @@
+//! Which rays a step trains on.
+
+use conefield_core::backend::TrainRay;
+use conefield_core::error::{Error, Result};
+use conefield_core::random::stream;
+use conefield_core::scan::Scan;
+use conefield_core::scene::Scene;
+use ndarray::{Array2, ArrayView2};
+use rand::RngExt;
+use rand::seq::SliceRandom;
+use rayon::prelude::*;
+use schemars::JsonSchema;
+use serde::{Deserialize, Serialize};
+
+/// Where a step takes its rays from.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
+#[serde(rename_all = "kebab-case")]
+pub enum Views {
+    /// One view a step, every view once an epoch in random order (published).
+    One,
+    /// All views at once.
+    All,
+}
+
+/// Which pixels count.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
+#[serde(rename_all = "kebab-case")]
+pub enum Pixels {
+    /// Those whose own measured value is positive (published). Under noise it keeps the positive half of the empty
+    /// background and so biases it.
+    Positive,
+    /// Those that the object's shadow covers, with a margin: decided from smoothed neighbourhoods, so that the
+    /// noise of a pixel does not decide about itself.
+    Support,
+    /// Every pixel whose ray meets the reconstruction box.
+    All,
+}
+
+/// The rays of a scan that may be trained on.
+pub struct RaySource<'a> {
+    scan: &'a Scan,
+    scene: &'a Scene,
+    /// Of each view, its usable pixels (row-major index).
+    pixels: Vec<Vec<u32>>,
+    views: Views,
+    /// Views that have a usable pixel.
+    usable: Vec<usize>,
+}
+
+impl<'a> RaySource<'a> {
+    /// Finds the usable pixels. `margin` widens the support by that many pixels.
+    pub fn new(scan: &'a Scan, scene: &'a Scene, views: Views, which: Pixels, margin: usize) -> Result<Self> {
+        let level = (which == Pixels::Support).then(|| air_level(scan));
+        let pixels: Vec<Vec<u32>> = (0..scan.geometry.views.len())
+            .into_par_iter()
+            .map(|v| {
+                let view = scan.view(v);
+                let support = level.map(|level| shadow(view, level, margin));
+                let columns = scan.geometry.detector[1];
+                (0..view.len() as u32)
+                    .filter(|&p| {
+                        let (row, column) = (p as usize / columns, p as usize % columns);
+                        let counts = match (which, &support) {
+                            (Pixels::Positive, _) => view[[row, column]] > 0.0,
+                            (_, Some(s)) => s[[row, column]],
+                            _ => true,
+                        };
+                        counts && scene.pixel_ray(&scan.geometry, v, row, column).is_some()
+                    })
+                    .collect()
+            })
+            .collect();
+        let usable: Vec<usize> = (0..pixels.len()).filter(|&v| !pixels[v].is_empty()).collect();
+        if usable.is_empty() {
+            return Err(Error::invalid(
+                "scan",
+                "projections",
+                "no ray that meets the volume and the object",
+                "rays to train on (check the geometry and the unit of lengths)",
+            ));
+        }
+        Ok(Self { scan, scene, pixels, views, usable })
+    }
+
+    /// Share of all pixels that may be trained on.
+    pub fn share(&self) -> f64 {
+        let all = self.scan.projections.len().max(1);
+        self.pixels.iter().map(Vec::len).sum::<usize>() as f64 / all as f64
+    }
+
+    /// Steps that make an epoch.
+    pub fn steps_an_epoch(&self) -> u64 {
+        self.usable.len() as u64
+    }
+
+    /// The rays of step `step` (from 0): the same for the same seed.
+    pub fn draw(&self, seed: u64, step: u64, count: usize, out: &mut Vec<TrainRay>) {
+        out.clear();
+        let steps = self.steps_an_epoch();
+        let mut rng = stream(seed, 2 * step);
+        let one = (self.views == Views::One).then(|| {
+            let mut order = self.usable.clone();
+            order.shuffle(&mut stream(seed, 2 * (step / steps) + 1));
+            order[(step % steps) as usize]
+        });
+        while out.len() < count {
+            let view = one.unwrap_or_else(|| self.usable[rng.random_range(0..self.usable.len())]);
+            let pixels = &self.pixels[view];
+            let p = pixels[rng.random_range(0..pixels.len())] as usize;
+            let columns = self.scan.geometry.detector[1];
+            let (row, column) = (p / columns, p % columns);
+            if let Some(ray) = self.scene.pixel_ray(&self.scan.geometry, view, row, column) {
+                let target = self.scene.line_to_unit(self.scan.projections[[view, row, column]]);
+                out.push(TrainRay { ray, target });
+            }
+        }
+    }
+}
+
+/// The value that a smoothed pixel of air stays below: the noise's standard deviation, estimated from differences of
+/// neighbouring pixels, or 1/500 of the largest values, whichever is more.
+fn air_level(scan: &Scan) -> f32 {
+    let top = scan.projections.iter().copied().fold(0.0f32, f32::max);
+    let mut differences: Vec<f32> = scan
+        .projections
+        .outer_iter()
+        .flat_map(|view| {
+            let low = move |x: f32| x < 0.1 * top;
+            view.rows()
+                .into_iter()
+                .flat_map(|row| row.windows(2).into_iter().map(|w| (w[0], w[1])).collect::<Vec<_>>())
+                .filter(|&(a, b)| low(a) && low(b))
+                .map(|(a, b)| (a - b).abs())
+                .step_by(7)
+                .collect::<Vec<_>>()
+        })
+        .collect();
+    let sigma = if differences.len() < 100 {
+        0.0
+    } else {
+        // |a − b| of two equal normals is above 1.05 σ·√2·0.6745… in half of the cases; pixels clipped at zero make
+        // ties at 0, so the 75th percentile is used: 1.150 σ √2.
+        let k = differences.len() * 3 / 4;
+        let (_, q, _) = differences.select_nth_unstable_by(k, f32::total_cmp);
+        *q / (1.150 * std::f32::consts::SQRT_2)
+    };
+    sigma.max(top / 500.0)
+}
+
+/// Pixels whose 7 × 7 neighbourhood is above `level` in the mean, widened by `margin` pixels.
+fn shadow(view: ArrayView2<'_, f32>, level: f32, margin: usize) -> Array2<bool> {
+    let smooth = box_filter(view.to_owned(), 3, |window| window.iter().sum::<f32>() / window.len() as f32);
+    let hit = smooth.mapv(|x| f32::from(u8::from(x > level)));
+    box_filter(hit, margin, |window| window.iter().copied().fold(0.0, f32::max)).mapv(|x| x > 0.0)
+}
+
+/// Applies `f` to windows of ± `reach` along rows, then along columns; windows are cut at the border.
+fn box_filter(mut image: Array2<f32>, reach: usize, f: impl Fn(&[f32]) -> f32) -> Array2<f32> {
+    for axis in [1, 0] {
+        for mut lane in image.lanes_mut(ndarray::Axis(axis)) {
+            let line = lane.to_vec();
+            for (i, x) in lane.iter_mut().enumerate() {
+                *x = f(&line[i.saturating_sub(reach)..(i + reach + 1).min(line.len())]);
+            }
+        }
+    }
+    image
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_shadow_covers_the_object_and_its_margin_but_not_noise() {
+        let view = Array2::from_shape_fn((40, 40), |(r, c)| {
+            let noise = 0.01 * (((r * 31 + c * 17) % 13) as f32 / 6.0 - 1.0);
+            if (15..25).contains(&r) && (15..25).contains(&c) { 1.0 } else { noise.max(0.0) }
+        });
+        let s = shadow(view.view(), 0.02, 4);
+        assert!(s[[20, 20]] && s[[12, 20]] && !s[[2, 2]] && !s[[35, 35]]);
+    }
+}

@@ -1,0 +1,111 @@
+//! How the learning rate goes down, and when a run ends.
+
+use conefield_core::error::{Result, ensure};
+use conefield_core::solver::Limits;
+use schemars::JsonSchema;
+use serde::{Deserialize, Serialize};
+use std::time::{Duration, Instant};
+
+/// The learning rate over a run.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize, JsonSchema)]
+#[serde(rename_all = "kebab-case", deny_unknown_fields)]
+pub enum Decay {
+    /// Never.
+    None,
+    /// Times `factor` after every `epochs` passes over the views (published).
+    Step {
+        /// Passes over the views between two steps.
+        epochs: f64,
+        /// Multiplier.
+        factor: f64,
+    },
+    /// Geometrically from 1 at the start to this at the end of the run, whatever ends it.
+    Exponential(f64),
+}
+
+impl Decay {
+    /// The rate's multiplier after `epoch` passes, at `share` of the run.
+    pub fn at(&self, epoch: f64, share: f64) -> f64 {
+        match *self {
+            Decay::None => 1.0,
+            Decay::Step { epochs, factor } => factor.powf((epoch / epochs).floor()),
+            Decay::Exponential(last) => last.powf(share.clamp(0.0, 1.0)),
+        }
+    }
+
+    /// Refuses factors and lengths that are not positive and finite.
+    pub fn validate(&self) -> Result<()> {
+        let all = match *self {
+            Decay::None => [1.0, 1.0],
+            Decay::Step { epochs, factor } => [epochs, factor],
+            Decay::Exponential(last) => [last, 1.0],
+        };
+        let good = all.iter().all(|x| x.is_finite() && *x > 0.0);
+        ensure(good, "spec", "solver.decay", format!("{self:?}"), "positive finite numbers")
+    }
+}
+
+/// Counts steps and training time against their limits.
+#[derive(Debug)]
+pub struct Clock {
+    limits: Limits,
+    spent: Duration,
+    running: Option<Instant>,
+}
+
+impl Clock {
+    /// A stopped clock. A limit on the command line replaces the spec's limit of the same kind; where it names
+    /// only time, the spec's number of steps does not end the run.
+    pub fn new(spec: Limits, cli: Limits) -> Self {
+        let limits = Limits {
+            steps: cli.steps.or(if cli.seconds.is_some() { None } else { spec.steps }),
+            seconds: cli.seconds.or(if cli.steps.is_some() { None } else { spec.seconds }),
+        };
+        Self { limits, spent: Duration::ZERO, running: None }
+    }
+
+    /// Training goes on.
+    pub fn resume(&mut self) {
+        self.running.get_or_insert_with(Instant::now);
+    }
+
+    /// Training pauses: what follows is not counted.
+    pub fn pause(&mut self) {
+        if let Some(since) = self.running.take() {
+            self.spent += since.elapsed();
+        }
+    }
+
+    /// Seconds of training.
+    pub fn seconds(&self) -> f64 {
+        (self.spent + self.running.map_or(Duration::ZERO, |s| s.elapsed())).as_secs_f64()
+    }
+
+    /// Share of the run that is over after `steps` steps: 1 or more means the end.
+    pub fn share(&self, steps: u64) -> f64 {
+        let by_steps = self.limits.steps.map_or(0.0, |n| if n == 0 { 1.0 } else { steps as f64 / n as f64 });
+        let by_time = self.limits.seconds.map_or(0.0, |t| if t <= 0.0 { 1.0 } else { self.seconds() / t });
+        by_steps.max(by_time)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn decays_are_what_their_names_say() {
+        assert_eq!(Decay::Step { epochs: 10.0, factor: 0.1 }.at(25.0, 0.0), 0.1f64.powi(2));
+        assert!((Decay::Exponential(0.01).at(0.0, 0.5) - 0.1).abs() < 1e-12);
+        assert!(Decay::Exponential(0.0).validate().is_err());
+    }
+
+    #[test]
+    fn the_first_limit_ends_the_run() {
+        let spec = Limits { steps: Some(10), seconds: Some(1e9) };
+        let c = Clock::new(spec, Limits::default());
+        assert!(c.share(9) < 1.0 && c.share(10) >= 1.0);
+        let c = Clock::new(spec, Limits { steps: None, seconds: Some(1e6) });
+        assert!(c.share(1000) < 1.0);
+    }
+}
