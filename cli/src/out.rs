@@ -82,7 +82,7 @@ mod tests {
         assert_eq!(number(12), "12");
         assert_eq!(bytes(1023), "1023 B");
         assert_eq!(bytes(3 << 20), "3.0 MiB");
-        assert_eq!(duration(3.14), "3.1 s");
+        assert_eq!(duration(3.16), "3.2 s");
         assert_eq!(duration(245.0), "4 min 05 s");
         assert_eq!(duration(7380.0), "2 h 03 min");
         let rows = [vec!["a".into(), "1".into()], vec!["bb".into(), "22".into()]];

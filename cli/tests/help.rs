@@ -35,7 +35,7 @@ fn wrong_use_exits_with_2() {
         (&["simulate", "v", "-o", "s", "--views", "0"], "--views"),
         (&["simulate", "v", "-o", "s", "--values", "hu:x"], "hu:MU_WATER"),
         (&["simulate", "v", "-o", "s", "--downsample", "0"], "--downsample"),
-        (&["reconstruct", "s", "--spec", "naf", "-o", "r", "--budget", "-1s"], "--budget"),
+        (&["reconstruct", "s", "--spec", "naf", "-o", "r", "--budget", "0s"], "--budget"),
         (&["reconstruct", "s", "--spec", "naf", "-o", "r", "--budget", "soon"], "600s"),
         (&["reconstruct", "s", "--spec", "naf", "-o", "r", "--steps", "0"], "--steps"),
         (&["reconstruct", "s", "--spec", "naf", "-o", "r", "--hold-out", "x"], "every:10"),

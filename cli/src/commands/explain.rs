@@ -55,10 +55,11 @@ struct Row {
 impl Row {
     fn of(name: &str, kind: &serde_json::Value, stage: &dyn Stage) -> Self {
         let i = stage.info();
+        let kind = kind["type"].as_str().unwrap_or_default();
         Self {
             stage: name.into(),
-            kind: kind["type"].as_str().unwrap_or_default().into(),
-            what: stage.describe(),
+            kind: kind.into(),
+            what: without(kind, stage.describe()),
             input: i.input,
             output: i.output,
             parameters: i.params,
@@ -71,6 +72,11 @@ impl Row {
             left_out: i.identity,
         }
     }
+}
+
+/// A description without its type's name, which has a column of its own.
+fn without(kind: &str, what: String) -> String {
+    what.strip_prefix(kind).map_or(what.clone(), |rest| rest.trim_start_matches([':', ',', ' ']).to_owned())
 }
 
 /// A line without channels.
@@ -130,7 +136,10 @@ fn report(loaded: &Loaded, pipeline: &Pipeline, backend: Compiled, scan: Option<
         stages.push(Row::of(&format!("normalizers.{i}"), &tree["normalizers"][i], n.as_ref()));
     }
     stages.push(Row::of("field", &tree["field"], pipeline.field.as_ref()));
-    let plain = |key: &str, what: String| Plain { kind: tree[key]["type"].as_str().unwrap_or_default().into(), what };
+    let plain = |key: &str, what: String| {
+        let kind = tree[key]["type"].as_str().unwrap_or_default();
+        Plain { kind: kind.into(), what: without(kind, what) }
+    };
     let parameters = pipeline.layout().len();
     // The weights that an initializer names are not read here: a spec is explained without them.
     let initializer = match &tree["initializer"] {
@@ -195,7 +204,8 @@ fn text(r: &Report) -> String {
         out::number(r.macs_per_sample as u64),
     ]);
     let mut lines = vec![];
-    lines.push(format!("{} ({})", if r.spec.is_empty() { "unnamed" } else { &r.spec }, r.source));
+    let shipped = r.source.strip_prefix(&r.spec) == Some(" (shipped)");
+    lines.push(if shipped || r.spec.is_empty() { r.source.clone() } else { format!("{} ({})", r.spec, r.source) });
     if !r.description.is_empty() {
         lines.push(r.description.clone());
     }

@@ -111,6 +111,7 @@ impl Reconstruct {
         let reference = self.reference.as_ref().map(|path| read_reference(path, &self.scan, &whole)).transpose()?;
         let held = self.hold_out.as_ref().map(|h| h.views(whole.geometry.views.len())).unwrap_or_default();
         let memory = pipeline.as_ref().map(|p| Memory::of(p, &whole, &compiled, reference.is_some()));
+        let fingerprint = checksum(&whole);
         let (scan, held_scan) = if held.is_empty() { (whole, None) } else { split(&whole, &held)? };
         let folder = RunFolder::create(&self.output, self.force)?;
         conefield_io::write_text_atomic(folder.file("spec.toml"), &to_toml(&loaded.spec)?)?;
@@ -128,7 +129,8 @@ impl Reconstruct {
             limits: self.ends.limits(),
             weights: &|path| files::read_weights(path),
         };
-        let solution = solver.solve(&job, &mut progress).map_err(|e| loaded.locate(e))?;
+        let mut solution = solver.solve(&job, &mut progress).map_err(|e| loaded.locate(e))?;
+        solution.volume.affine = solution.volume.affine.or(reference.as_ref().and_then(|r| r.affine));
         let last = progress.records().last().cloned();
         drop(progress);
 
@@ -151,7 +153,7 @@ impl Reconstruct {
                 views: scan.geometry.views.len() + held.len(),
                 detector: scan.geometry.detector,
                 volume: scan.geometry.volume.shape,
-                projections_fnv1a64: checksum(&scan),
+                projections_fnv1a64: fingerprint,
             },
             held_out_views: held,
             init: self.init.as_ref().map(|p| p.display().to_string()),

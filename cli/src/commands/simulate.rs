@@ -63,7 +63,6 @@ impl Simulate {
     pub fn run(self) -> Result<()> {
         refuse_existing(&self.output, self.force)?;
         let mut volume = self.values.apply(files::volume(&self.volume)?)?;
-        volume.affine = None;
         // A scan's volume stands on the rotation axis.
         volume.grid.center = [0.0; 3];
         if self.downsample > 1 {
