@@ -16,6 +16,7 @@ use conefield_backend_cpu::Cpu;
 use conefield_core::Result;
 use conefield_core::backend::Backend;
 use conefield_core::solver::Limits;
+use serde::Serialize;
 
 /// What to do.
 #[derive(Subcommand)]
@@ -78,10 +79,11 @@ impl BackendChoice {
 }
 
 /// When training ends, whichever comes first.
-#[derive(Debug, Clone, Args)]
+#[derive(Debug, Clone, Args, Serialize)]
 pub struct Ends {
     /// Stop training after this time, such as 600s or 10m.
     #[arg(long, value_name = "TIME", value_parser = crate::parse::seconds)]
+    #[serde(rename = "seconds")]
     pub budget: Option<f64>,
     /// Stop training after this many steps.
     #[arg(long, value_name = "N", value_parser = clap::value_parser!(u64).range(1..))]

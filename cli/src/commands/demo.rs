@@ -121,6 +121,7 @@ impl Demo {
             scan,
             held_out: None,
             reference: None,
+            peak: 1.0,
             spec: &loaded.spec,
             backend: &Cpu::new(),
             seed: self.seed,

@@ -44,9 +44,17 @@ pub fn parse(text: &str, source: &str, sets: &[String], shipped: &[Shipped]) -> 
     finish(layer.resolve(shipped, &mut vec![])?, source.into(), sets)
 }
 
-/// The spec as TOML with every default written.
+/// The spec as TOML with every default written. Refuses one that would not read back the same: TOML has no null, so
+/// a JSON spec that clears a setting whose default is something cannot be said in it.
 pub fn to_toml(spec: &Spec) -> Result<String> {
-    toml::to_string_pretty(spec).map_err(|e| Error::unsupported("writing the spec as TOML", e.to_string()))
+    let failed = |e: &dyn std::fmt::Display| Error::unsupported("writing the spec as TOML", e.to_string());
+    let text = toml::to_string_pretty(spec).map_err(|e| failed(&e))?;
+    let back: Spec = toml::from_str(&text).map_err(|e| failed(&e.message()))?;
+    let tree = |s: &Spec| serde_json::to_value(s).map_err(|e| failed(&e));
+    if tree(spec)? != tree(&back)? {
+        return Err(failed(&"a setting is null whose default is not; give it a value"));
+    }
+    Ok(text)
 }
 
 fn finish(mut written: Node, source: String, sets: &[String]) -> Result<Loaded> {
@@ -295,11 +303,12 @@ mod tests {
         way: Way,
         range: [f64; 2],
         top: Option<u32>,
+        floor: Option<u32>,
     }
 
     impl Default for TestGrid {
         fn default() -> Self {
-            Self { levels: 4, growth: 2.0, way: Way::Straight, range: [0.0, 1.0], top: None }
+            Self { levels: 4, growth: 2.0, way: Way::Straight, range: [0.0, 1.0], top: None, floor: Some(1) }
         }
     }
 
@@ -378,6 +387,8 @@ mod tests {
         let l = read("extends = 'curved'\nencoder.top = 7\n", &[]).unwrap();
         let text = to_toml(&l.spec).unwrap();
         assert_eq!(read(&text, &[]).unwrap().tree, l.tree, "{text}");
+        let cleared = read("{\"extends\": \"plain\", \"encoder\": {\"floor\": null}}", &[]).unwrap();
+        assert!(to_toml(&cleared.spec).unwrap_err().to_string().contains("null"));
         let json = serde_json::to_string(&l.tree).unwrap();
         assert_eq!(read(&json, &[]).unwrap().tree, l.tree);
     }
