@@ -1,7 +1,7 @@
 //! The contracts that conefield's stages, backends and solvers meet at.
 //!
 //! - [`geometry`], [`scan`]: what was measured, in millimetres.
-//! - [`simd`], [`dense`], [`stage`]: what a stage computes and how.
+//! - [`simd`], [`dense`], [`trilinear`], [`stage`]: what a stage computes and how.
 //! - [`arena`]: parameters, gradients and optimizer state under their names.
 //! - [`spec`], [`registry`]: what a user writes, and the stage types that it may name.
 //! - [`pipeline`], [`backend`], [`solver`]: from a spec to a volume.
@@ -21,5 +21,6 @@ pub mod simd;
 pub mod solver;
 pub mod spec;
 pub mod stage;
+pub mod trilinear;
 
 pub use error::{Error, Result};
