@@ -1,2 +1,7 @@
 //! Position encoders: hash grid, dense grid, frequency, concat
+
+pub mod concat;
+pub mod dense_grid;
+pub mod frequency;
 pub mod hash_grid;
+pub mod identity;

@@ -1,0 +1,302 @@
+//! Several encoders side by side: points `[n, 3]` to the channels of the first part, then of the second, and so on.
+
+use conefield_core::error::{Error, Result, ensure};
+use conefield_core::random::mix;
+use conefield_core::simd::Real;
+use conefield_core::spec::EncoderSpec;
+use conefield_core::stage::{Encoder, GradKind, Grads, Info, Kernel, Parameter, Reduced, Scope, Stage, Tile, TileMut};
+use schemars::{JsonSchema, Schema, SchemaGenerator, json_schema};
+use serde::{Deserialize, Serialize};
+use std::ops::Range;
+use std::sync::Arc;
+
+/// Settings of `concat`.
+#[derive(Serialize, Deserialize, JsonSchema)]
+#[serde(deny_unknown_fields)]
+pub struct Concat {
+    /// The parts, in the order of their channels: any encoders, this one included.
+    #[schemars(schema_with = "list_of_encoders")]
+    pub encoders: Vec<Box<dyn EncoderSpec>>,
+}
+
+fn list_of_encoders(_: &mut SchemaGenerator) -> Schema {
+    json_schema!({ "type": "array", "items": { "x-stage": "encoder" }, "minItems": 1 })
+}
+
+conefield_core::stage_type!(Encoder, "concat", Concat, "several encoders side by side");
+
+#[typetag::serde(name = "concat")]
+impl EncoderSpec for Concat {
+    fn build(&self) -> Result<Box<dyn Encoder>> {
+        let mut parts = vec![];
+        for (i, e) in self.encoders.iter().enumerate() {
+            let part = e.build().map_err(|e| inside(i, e))?;
+            let input = part.info().input;
+            ensure(input == 3, "spec", &format!("encoder.encoders.{i}"), format!("{input} channels in"), "3")?;
+            parts.push((i, Arc::from(part)));
+        }
+        Ok(Box::new(ConcatStage::new(parts)?))
+    }
+}
+
+/// The error of part `i` with the way to it.
+fn inside(i: usize, error: Error) -> Error {
+    match error {
+        Error::Invalid { place, field, found, expected } => {
+            let rest = field.strip_prefix("encoder.").unwrap_or(&field);
+            Error::Invalid { place, field: format!("encoder.encoders.{i}.{rest}"), found, expected }
+        }
+        other => other,
+    }
+}
+
+#[derive(Clone)]
+struct Part {
+    stage: Arc<dyn Encoder>,
+    info: Info,
+    /// Its place in the settings, which names its parameters.
+    number: usize,
+    outputs: Range<usize>,
+    params: Range<usize>,
+    tape: Range<usize>,
+}
+
+/// The stage that [`Concat`] builds.
+#[derive(Clone)]
+pub struct ConcatStage {
+    parts: Vec<Part>,
+    info: Info,
+}
+
+impl ConcatStage {
+    /// Puts parts, each with its place in the settings, side by side.
+    fn new(stages: Vec<(usize, Arc<dyn Encoder>)>) -> Result<Self> {
+        ensure(!stages.is_empty(), "spec", "encoder.encoders", "none", "at least one encoder")?;
+        let mut info = Info {
+            input: 3,
+            output: 0,
+            params: 0,
+            tape: 0,
+            scope: Scope::Row,
+            grads: GradKind::None,
+            macs: 0,
+            identity: false,
+        };
+        let mut parts = vec![];
+        for (number, stage) in stages {
+            let i = stage.info();
+            let part = Part {
+                outputs: info.output..info.output + i.output,
+                params: info.params..info.params + i.params,
+                tape: info.tape..info.tape + i.tape,
+                number,
+                stage,
+                info: i.clone(),
+            };
+            info.output = part.outputs.end;
+            info.params = part.params.end;
+            info.tape = part.tape.end;
+            info.macs += i.macs;
+            if i.scope == Scope::Ray {
+                info.scope = Scope::Ray;
+            }
+            // One scattered part makes the whole scattered; a dense part is then one range of the partition.
+            info.grads = match (info.grads, i.grads) {
+                (GradKind::None, g) | (g, GradKind::None) => g,
+                (GradKind::Dense, GradKind::Dense) => GradKind::Dense,
+                _ => GradKind::Scatter,
+            };
+            parts.push(part);
+        }
+        if info.grads == GradKind::Scatter && info.tape > 0 {
+            return Err(Error::unsupported(
+                "encoder.encoders",
+                "an encoder that keeps a tape beside one whose gradients are scattered; use them in separate specs",
+            ));
+        }
+        Ok(Self { parts, info })
+    }
+}
+
+/// A kernel of a part in one precision.
+type Pick<R> = fn(&dyn Encoder) -> Option<&dyn Kernel<R>>;
+
+fn channels<'a, R: Real>(data: &'a mut [R], range: &Range<usize>, rows: usize) -> TileMut<'a, R> {
+    TileMut::new(&mut data[range.start * rows..range.end * rows], rows)
+}
+
+impl ConcatStage {
+    fn forward_parts<R: Real>(
+        &self,
+        pick: Pick<R>,
+        params: &[R],
+        x: Tile<'_, R>,
+        y: TileMut<'_, R>,
+        tape: TileMut<'_, R>,
+    ) {
+        for part in &self.parts {
+            if let Some(kernel) = pick(part.stage.as_ref()) {
+                let y = channels(y.data, &part.outputs, x.rows);
+                let tape = channels(tape.data, &part.tape, x.rows);
+                kernel.forward(&params[part.params.clone()], x, y, tape);
+            }
+        }
+    }
+
+    fn backward_parts<R: Real>(
+        &self,
+        pick: Pick<R>,
+        params: &[R],
+        x: Tile<'_, R>,
+        tape: TileMut<'_, R>,
+        dy: Tile<'_, R>,
+        grads: Grads<'_, R>,
+        mut dx: Option<TileMut<'_, R>>,
+    ) {
+        let n = x.rows;
+        // Parts overwrite their input gradient, so that of every part but the first needs a place of its own.
+        let mut one = if dx.is_some() && self.parts.len() > 1 { vec![R::ZERO; 3 * n] } else { vec![] };
+        let range = &grads.range;
+        for (i, part) in self.parts.iter().enumerate() {
+            let (from, to) = (part.params.start.max(range.start), part.params.end.min(range.end));
+            let own = if from < to { from..to } else { part.params.start..part.params.start };
+            if own.is_empty() && dx.is_none() {
+                continue;
+            }
+            let Some(kernel) = pick(part.stage.as_ref()) else { continue };
+            let values = if own.is_empty() {
+                &mut []
+            } else {
+                &mut grads.values[own.start - range.start..own.end - range.start]
+            };
+            let own = own.start - part.params.start..own.end - part.params.start;
+            let part_dx = dx.as_mut().map(|dx| TileMut::new(if i == 0 { &mut *dx.data } else { &mut one }, n));
+            kernel.backward(
+                &params[part.params.clone()],
+                x,
+                channels(tape.data, &part.tape, n),
+                Tile::new(dy.channels(part.outputs.clone()), n),
+                Grads { values, range: own },
+                part_dx,
+            );
+            if let (Some(dx), true) = (&mut dx, i > 0) {
+                dx.data.iter_mut().zip(&one).for_each(|(sum, &d)| *sum += d);
+            }
+        }
+    }
+}
+
+impl Kernel<f32> for ConcatStage {
+    fn forward(&self, params: &[f32], x: Tile<'_, f32>, y: TileMut<'_, f32>, tape: TileMut<'_, f32>) {
+        self.forward_parts(|e| Some(e.kernel()), params, x, y, tape);
+    }
+
+    fn backward(
+        &self,
+        params: &[f32],
+        x: Tile<'_, f32>,
+        tape: TileMut<'_, f32>,
+        dy: Tile<'_, f32>,
+        grads: Grads<'_, f32>,
+        dx: Option<TileMut<'_, f32>>,
+    ) {
+        self.backward_parts(|e| Some(e.kernel()), params, x, tape, dy, grads, dx);
+    }
+}
+
+impl Kernel<f64> for ConcatStage {
+    fn forward(&self, params: &[f64], x: Tile<'_, f64>, y: TileMut<'_, f64>, tape: TileMut<'_, f64>) {
+        self.forward_parts(|e| e.reference(), params, x, y, tape);
+    }
+
+    fn backward(
+        &self,
+        params: &[f64],
+        x: Tile<'_, f64>,
+        tape: TileMut<'_, f64>,
+        dy: Tile<'_, f64>,
+        grads: Grads<'_, f64>,
+        dx: Option<TileMut<'_, f64>>,
+    ) {
+        self.backward_parts(|e| e.reference(), params, x, tape, dy, grads, dx);
+    }
+}
+
+impl Stage for ConcatStage {
+    fn info(&self) -> Info {
+        self.info.clone()
+    }
+
+    /// The parts' names behind their place, e.g. `1.0.table`.
+    fn parameters(&self) -> Vec<Parameter> {
+        let of = |p: &Part| {
+            let (number, start) = (p.number, p.params.start);
+            let named =
+                move |q: Parameter| Parameter { name: format!("{number}.{}", q.name), start: start + q.start, ..q };
+            p.stage.parameters().into_iter().map(named)
+        };
+        self.parts.iter().flat_map(of).collect()
+    }
+
+    fn init(&self, seed: u64, params: &mut [f32]) {
+        for p in &self.parts {
+            p.stage.init(mix(seed, p.number as u64), &mut params[p.params.clone()]);
+        }
+    }
+
+    fn kernel(&self) -> &dyn Kernel<f32> {
+        self
+    }
+
+    fn reference(&self) -> Option<&dyn Kernel<f64>> {
+        self.parts.iter().all(|p| p.stage.reference().is_some()).then_some(self as _)
+    }
+
+    fn partition(&self) -> Vec<Range<usize>> {
+        let of = |p: &Part| {
+            let start = p.params.start;
+            let ranges = match p.info.grads {
+                GradKind::None => vec![],
+                GradKind::Dense => vec![0..p.info.params],
+                GradKind::Scatter => p.stage.partition(),
+            };
+            ranges.into_iter().map(move |r| start + r.start..start + r.end)
+        };
+        self.parts.iter().flat_map(of).collect()
+    }
+
+    fn describe(&self) -> String {
+        let parts: Vec<_> = self.parts.iter().map(|p| p.stage.describe()).collect();
+        format!("concat: {} channels of ({})", self.info.output, parts.join(") + ("))
+    }
+}
+
+impl Encoder for ConcatStage {
+    fn keep_outputs(&self, keep: &[usize]) -> Result<Reduced<dyn Encoder>> {
+        let mut stages = vec![];
+        let mut params = vec![];
+        for p in &self.parts {
+            let keep: Vec<usize> = keep.iter().filter(|c| p.outputs.contains(c)).map(|c| c - p.outputs.start).collect();
+            if keep.is_empty() {
+                continue;
+            }
+            // A part that stays whole need not be able to leave out channels.
+            if keep.len() == p.outputs.len() {
+                stages.push((p.number, p.stage.clone()));
+                params.push(p.params.clone());
+                continue;
+            }
+            let r = p.stage.keep_outputs(&keep)?;
+            if r.channels != [0, 1, 2] {
+                return Err(Error::unsupported(r.stage.describe(), "a part of a concat must read all 3 coordinates"));
+            }
+            params.extend(r.params.iter().map(|q| p.params.start + q.start..p.params.start + q.end));
+            stages.push((p.number, Arc::from(r.stage)));
+        }
+        Ok(Reduced { stage: Box::new(Self::new(stages)?), params, channels: vec![0, 1, 2] })
+    }
+
+    fn coarse_to_fine(&self) -> bool {
+        self.parts.len() == 1 && self.parts[0].stage.coarse_to_fine()
+    }
+}

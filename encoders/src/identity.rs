@@ -1,0 +1,95 @@
+//! The position itself: points `[n, 3]` to `[n, 3]`, for fields that keep their own grid and for [`crate::concat`].
+
+use conefield_core::error::{Result, ensure};
+use conefield_core::simd::Real;
+use conefield_core::spec::EncoderSpec;
+use conefield_core::stage::{Encoder, GradKind, Grads, Info, Kernel, Parameter, Reduced, Scope, Stage, Tile, TileMut};
+use schemars::JsonSchema;
+use serde::{Deserialize, Serialize};
+
+/// Settings of `identity`: there are none.
+#[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize, JsonSchema)]
+#[serde(deny_unknown_fields)]
+pub struct Identity {}
+
+conefield_core::stage_type!(Encoder, "identity", Identity, "the three coordinates as they are");
+
+#[typetag::serde(name = "identity")]
+impl EncoderSpec for Identity {
+    fn build(&self) -> Result<Box<dyn Encoder>> {
+        Ok(Box::new(IdentityStage { axes: vec![0, 1, 2] }))
+    }
+}
+
+/// The stage that [`Identity`] builds.
+#[derive(Debug, Clone, PartialEq)]
+pub struct IdentityStage {
+    /// The coordinate of each output.
+    axes: Vec<usize>,
+}
+
+impl<R: Real> Kernel<R> for IdentityStage {
+    fn forward(&self, _: &[R], x: Tile<'_, R>, mut y: TileMut<'_, R>, _: TileMut<'_, R>) {
+        for (c, &axis) in self.axes.iter().enumerate() {
+            y.channel(c).copy_from_slice(x.channel(axis));
+        }
+    }
+
+    fn backward(
+        &self,
+        _: &[R],
+        _: Tile<'_, R>,
+        _: TileMut<'_, R>,
+        dy: Tile<'_, R>,
+        _: Grads<'_, R>,
+        dx: Option<TileMut<'_, R>>,
+    ) {
+        let Some(mut dx) = dx else { return };
+        dx.data.fill(R::ZERO);
+        for (c, &axis) in self.axes.iter().enumerate() {
+            dx.channel(axis).copy_from_slice(dy.channel(c));
+        }
+    }
+}
+
+impl Stage for IdentityStage {
+    fn info(&self) -> Info {
+        Info {
+            input: 3,
+            output: self.axes.len(),
+            params: 0,
+            tape: 0,
+            scope: Scope::Row,
+            grads: GradKind::None,
+            macs: 0,
+            identity: self.axes == [0, 1, 2],
+        }
+    }
+
+    fn parameters(&self) -> Vec<Parameter> {
+        vec![]
+    }
+
+    fn init(&self, _: u64, _: &mut [f32]) {}
+
+    fn kernel(&self) -> &dyn Kernel<f32> {
+        self
+    }
+
+    fn reference(&self) -> Option<&dyn Kernel<f64>> {
+        Some(self)
+    }
+
+    fn describe(&self) -> String {
+        let names: Vec<_> = self.axes.iter().map(|&a| ["x", "y", "z"][a]).collect();
+        format!("identity: {}", names.join(", "))
+    }
+}
+
+impl Encoder for IdentityStage {
+    fn keep_outputs(&self, keep: &[usize]) -> Result<Reduced<dyn Encoder>> {
+        ensure(!keep.is_empty(), "identity", "channels", "none kept", "at least one")?;
+        let stage = Self { axes: keep.iter().map(|&c| self.axes[c]).collect() };
+        Ok(Reduced { stage: Box::new(stage), params: vec![], channels: vec![0, 1, 2] })
+    }
+}
