@@ -1,0 +1,356 @@
+//! Layer normalisation (Ba et al. 2016, equation 4): every row of features `[n, F]` to mean 0 and variance 1 over its
+//! channels, then scaled and shifted channel by channel: `y = γ·(x − mean)/√(variance + eps) + β`, with the biased
+//! variance (divided by F), as PyTorch has it.
+//!
+//! Means are taken of differences to the row's first channel, so that a row of equal values gives exactly `β`,
+//! whatever its rounding. A row whose largest magnitude would overflow when squared is scaled down by a power of two
+//! first, which changes nothing but the share of `eps`, by then far below rounding.
+
+use conefield_core::dense::total;
+use conefield_core::error::{Result, ensure};
+use conefield_core::simd::{Op, Real, Select, Simd, SimdBase, SimdFloat, V, load, run, store};
+use conefield_core::spec::NormalizerSpec;
+use conefield_core::stage::{
+    GradKind, Grads, Info, Kernel, Normalizer, Parameter, Reduced, Scope, Stage, Tile, TileMut,
+};
+use schemars::JsonSchema;
+use serde::{Deserialize, Serialize};
+use std::ops::Range;
+
+/// Settings of `layer-norm`.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
+#[serde(deny_unknown_fields, default)]
+pub struct LayerNorm {
+    /// Added to the variance.
+    pub eps: f64,
+    /// Whether a learned scale and shift follow; they start at 1 and 0.
+    pub affine: bool,
+}
+
+impl Default for LayerNorm {
+    fn default() -> Self {
+        Self { eps: 1e-5, affine: true }
+    }
+}
+
+conefield_core::stage_type!(Normalizer, "layer-norm", LayerNorm, "mean 0 and variance 1 over the channels of a row");
+
+#[typetag::serde(name = "layer-norm")]
+impl NormalizerSpec for LayerNorm {
+    fn build(&self, width: usize) -> Result<Box<dyn Normalizer>> {
+        Ok(Box::new(LayerNormStage::new(self, width)?))
+    }
+}
+
+/// The stage that [`LayerNorm`] builds.
+#[derive(Debug, Clone, PartialEq)]
+pub struct LayerNormStage {
+    settings: LayerNorm,
+    input: usize,
+    /// The input channel of each output.
+    outputs: Vec<usize>,
+}
+
+/// Tape: mean of the (scaled) differences to the first channel, reciprocal deviation, scale.
+const TAPE: usize = 3;
+
+impl LayerNormStage {
+    /// The stage for `width` channels, or which setting is out of range.
+    pub fn new(settings: &LayerNorm, width: usize) -> Result<Self> {
+        let eps = settings.eps;
+        ensure((1e-30..=1.0).contains(&eps), "spec", "normalizers.eps", eps, "1e-30 to 1")?;
+        ensure(width > 0, "layer-norm", "channels", width, "at least one")?;
+        Ok(Self { settings: settings.clone(), input: width, outputs: (0..width).collect() })
+    }
+
+    /// `γ` of output `o`, and `β` of it `outputs.len()` further.
+    fn gamma<R: Real>(&self, params: &[R], o: usize) -> R {
+        if self.settings.affine { params[o] } else { R::ONE }
+    }
+
+    fn beta<R: Real>(&self, params: &[R], o: usize) -> R {
+        if self.settings.affine { params[self.outputs.len() + o] } else { R::ZERO }
+    }
+
+    /// What of `γ` and `β` outputs `kept` (ascending) have.
+    fn params_of(&self, kept: &[usize]) -> Vec<Range<usize>> {
+        let n = self.outputs.len();
+        let both = kept.iter().copied().chain(kept.iter().map(|o| n + o));
+        if self.settings.affine { both.map(|p| p..p + 1).collect() } else { vec![] }
+    }
+}
+
+/// Above the first number a row is scaled by the second. A variance counts as at least the third, so that it has a
+/// finite root where `eps` vanishes at that scale.
+fn huge<R: Real>() -> [R; 3] {
+    let powers = if size_of::<R>() == 4 { [50, -80, -120] } else { [400, -600, -960] };
+    powers.map(|p| R::of(f64::powi(2.0, p)))
+}
+
+struct Forward<'a, R> {
+    stage: &'a LayerNormStage,
+    params: &'a [R],
+    x: Tile<'a, R>,
+    y: TileMut<'a, R>,
+    tape: TileMut<'a, R>,
+}
+
+impl<R: Real> Op for Forward<'_, R> {
+    type Out = ();
+    #[inline(always)]
+    fn call<S: Simd>(mut self, s: S) {
+        let number = |v: R| V::<S, R>::splat(s, v);
+        let [limit, small, least] = huge::<R>();
+        let share = number(R::of(1.0 / self.stage.input as f64));
+        let eps = number(R::of(self.stage.settings.eps));
+        let mut i = 0;
+        while i < self.x.rows {
+            let mut largest = number(R::ZERO);
+            for x in self.x.data.chunks_exact(self.x.rows) {
+                largest = largest.max(load(s, x, i).abs());
+            }
+            let scale = largest.simd_gt(number(limit)).select(number(small), number(R::ONE));
+            let first = load(s, self.x.channel(0), i) * scale;
+            let mut mean = number(R::ZERO);
+            for x in self.x.data.chunks_exact(self.x.rows) {
+                mean = mean + (load(s, x, i) * scale - first);
+            }
+            let mean = mean * share;
+            let mut variance = number(R::ZERO);
+            for x in self.x.data.chunks_exact(self.x.rows) {
+                let d = (load(s, x, i) * scale - first) - mean;
+                variance = d.mul_add(d, variance);
+            }
+            let variance = variance.mul_add(share, (eps * scale * scale).max(number(least)));
+            let root = number(R::ONE) / variance.sqrt();
+            for (o, &c) in self.stage.outputs.iter().enumerate() {
+                let d = (load(s, self.x.channel(c), i) * scale - first) - mean;
+                let (gamma, beta) = (self.stage.gamma(self.params, o), self.stage.beta(self.params, o));
+                store::<S, R>((d * root).mul_add(number(gamma), number(beta)), self.y.channel(o), i);
+            }
+            for (c, v) in [mean, root, scale].into_iter().enumerate() {
+                store::<S, R>(v, self.tape.channel(c), i);
+            }
+            i += V::<S, R>::LEN;
+        }
+    }
+}
+
+struct Backward<'a, R> {
+    stage: &'a LayerNormStage,
+    params: &'a [R],
+    x: Tile<'a, R>,
+    tape: Tile<'a, R>,
+    dy: Tile<'a, R>,
+    grads: Grads<'a, R>,
+    dx: Option<TileMut<'a, R>>,
+}
+
+impl<R: Real> Backward<'_, R> {
+    /// `(x − mean)/deviation` of input `c`, a vector of rows from `i`.
+    #[inline(always)]
+    fn normal<S: Simd>(&self, s: S, c: usize, i: usize) -> V<S, R> {
+        let [mean, root, scale] = std::array::from_fn(|t| load(s, self.tape.channel(t), i));
+        let first = load(s, self.x.channel(0), i) * scale;
+        ((load(s, self.x.channel(c), i) * scale - first) - mean) * root
+    }
+}
+
+impl<R: Real> Op for Backward<'_, R> {
+    type Out = ();
+    #[inline(always)]
+    fn call<S: Simd>(mut self, s: S) {
+        let (n, stage) = (self.x.rows, self.stage);
+        let zero = V::<S, R>::splat(s, R::ZERO);
+        if stage.settings.affine {
+            let outputs = stage.outputs.len();
+            let range = self.grads.range.clone();
+            for (o, &c) in stage.outputs.iter().enumerate() {
+                if range.contains(&o) {
+                    let mut sum = zero;
+                    let mut i = 0;
+                    while i < n {
+                        sum = self.normal(s, c, i).mul_add(load(s, self.dy.channel(o), i), sum);
+                        i += V::<S, R>::LEN;
+                    }
+                    self.grads.values[o - range.start] += sum.as_slice().iter().copied().sum::<R>();
+                }
+                if range.contains(&(outputs + o)) {
+                    self.grads.values[outputs + o - range.start] += total(s, self.dy.channel(o));
+                }
+            }
+        }
+        let Some(mut dx) = self.dx.take() else { return };
+        let share = V::<S, R>::splat(s, R::of(1.0 / stage.input as f64));
+        let mut i = 0;
+        while i < n {
+            // With g = γ·dy: dx = (g − mean(g) − x̂·mean(g·x̂))/deviation, means over all inputs.
+            let (mut mean, mut along) = (zero, zero);
+            for (o, &c) in stage.outputs.iter().enumerate() {
+                let g = load(s, self.dy.channel(o), i) * stage.gamma(self.params, o);
+                mean = mean + g;
+                along = g.mul_add(self.normal(s, c, i), along);
+            }
+            let (mean, along) = (mean * share, along * share);
+            let back = load(s, self.tape.channel(1), i) * load(s, self.tape.channel(2), i);
+            let mut o = 0;
+            for c in 0..stage.input {
+                let mut g = zero;
+                if stage.outputs.get(o) == Some(&c) {
+                    g = load(s, self.dy.channel(o), i) * stage.gamma(self.params, o);
+                    o += 1;
+                }
+                let d = (g - mean - self.normal(s, c, i) * along) * back;
+                store::<S, R>(d, dx.channel(c), i);
+            }
+            i += V::<S, R>::LEN;
+        }
+    }
+}
+
+impl<R: Real> Kernel<R> for LayerNormStage {
+    fn forward(&self, params: &[R], x: Tile<'_, R>, y: TileMut<'_, R>, tape: TileMut<'_, R>) {
+        run(Forward { stage: self, params, x, y, tape });
+    }
+
+    fn backward(
+        &self,
+        params: &[R],
+        x: Tile<'_, R>,
+        tape: TileMut<'_, R>,
+        dy: Tile<'_, R>,
+        grads: Grads<'_, R>,
+        dx: Option<TileMut<'_, R>>,
+    ) {
+        let tape = Tile::new(tape.data, tape.rows);
+        run(Backward { stage: self, params, x, tape, dy, grads, dx });
+    }
+}
+
+impl Stage for LayerNormStage {
+    fn info(&self) -> Info {
+        let output = self.outputs.len();
+        Info {
+            input: self.input,
+            output,
+            params: if self.settings.affine { 2 * output } else { 0 },
+            tape: TAPE,
+            scope: Scope::Row,
+            grads: if self.settings.affine { GradKind::Dense } else { GradKind::None },
+            macs: 3 * self.input + output,
+            identity: false,
+        }
+    }
+
+    fn parameters(&self) -> Vec<Parameter> {
+        let n = self.outputs.len();
+        let block = |name: &str, start| Parameter { name: name.into(), shape: vec![n], start };
+        if self.settings.affine { vec![block("weight", 0), block("bias", n)] } else { vec![] }
+    }
+
+    fn init(&self, _: u64, params: &mut [f32]) {
+        if self.settings.affine {
+            let (gamma, beta) = params.split_at_mut(self.outputs.len());
+            gamma.fill(1.0);
+            beta.fill(0.0);
+        }
+    }
+
+    fn kernel(&self) -> &dyn Kernel<f32> {
+        self
+    }
+
+    fn reference(&self) -> Option<&dyn Kernel<f64>> {
+        Some(self)
+    }
+
+    fn describe(&self) -> String {
+        let of = if self.outputs.len() == self.input { String::new() } else { format!(" of {}", self.input) };
+        let affine = if self.settings.affine { "with" } else { "without" };
+        format!("layer-norm: {}{of} channels, eps {}, {affine} scale and shift", self.outputs.len(), self.settings.eps)
+    }
+}
+
+impl Normalizer for LayerNormStage {
+    fn keep_inputs(&self, keep: &[usize]) -> Result<Reduced<dyn Normalizer>> {
+        // Outputs stay where their input stays.
+        let channels: Vec<usize> = (0..self.outputs.len()).filter(|&o| keep.contains(&self.outputs[o])).collect();
+        ensure(!channels.is_empty(), "layer-norm", "channels", "none kept", "at least one")?;
+        let place = |c: usize| keep.iter().position(|&k| k == c);
+        let outputs = channels.iter().filter_map(|&o| place(self.outputs[o])).collect();
+        let stage = Self { settings: self.settings.clone(), input: keep.len(), outputs };
+        Ok(Reduced { stage: Box::new(stage), params: self.params_of(&channels), channels })
+    }
+
+    fn keep_outputs(&self, keep: &[usize]) -> Result<Reduced<dyn Normalizer>> {
+        ensure(!keep.is_empty(), "layer-norm", "channels", "none kept", "at least one")?;
+        let outputs = keep.iter().map(|&o| self.outputs[o]).collect();
+        let stage = Self { settings: self.settings.clone(), input: self.input, outputs };
+        Ok(Reduced { stage: Box::new(stage), params: self.params_of(keep), channels: (0..self.input).collect() })
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn apply<R: Real>(stage: &LayerNormStage, params: &[R], x: &[R], n: usize) -> Vec<R> {
+        let mut y = vec![R::ZERO; stage.outputs.len() * n];
+        let mut tape = vec![R::ZERO; TAPE * n];
+        stage.forward(params, Tile::new(x, n), TileMut::new(&mut y, n), TileMut::new(&mut tape, n));
+        y
+    }
+
+    #[test]
+    fn rows_follow_the_formula() {
+        let stage = LayerNormStage::new(&LayerNorm::default(), 5).unwrap();
+        let params = [1.0, 2.0, 0.5, -1.0, 1.0, 0.0, 0.1, 0.2, 0.3, 0.4];
+        let n = 3;
+        let x: Vec<f64> = (0..5 * n).map(|i| (i as f64 * 0.77).sin() * 4.0).collect();
+        let y = apply(&stage, &params, &x, n);
+        for i in 0..n {
+            let row: Vec<f64> = (0..5).map(|c| x[c * n + i]).collect();
+            let mean = row.iter().sum::<f64>() / 5.0;
+            let variance = row.iter().map(|v| (v - mean) * (v - mean)).sum::<f64>() / 5.0;
+            for c in 0..5 {
+                let want = (row[c] - mean) / (variance + 1e-5).sqrt() * params[c] + params[5 + c];
+                assert!((y[c * n + i] - want).abs() < 1e-12, "{c} {i}");
+            }
+        }
+    }
+
+    #[test]
+    fn equal_channels_give_the_shift_exactly_and_huge_ones_stay_finite() {
+        let stage = LayerNormStage::new(&LayerNorm::default(), 4).unwrap();
+        let params = [3.0f32, 3.0, 3.0, 3.0, 0.1, 0.2, 0.3, 0.4];
+        for v in [0.0, 1e-40, 0.1, 12345.678, 1e30, -3.4e38] {
+            assert_eq!(apply(&stage, &params, &[v; 4], 1), [0.1, 0.2, 0.3, 0.4], "{v}");
+        }
+        for v in [1e15f32, 1e18, 1e30, 3.4e38] {
+            let y = apply(&stage, &params, &[v, -v, v, -v], 1);
+            for (c, y) in y.iter().enumerate() {
+                let want = if c % 2 == 0 { 3.0 } else { -3.0 } + params[4 + c];
+                assert!((y - want).abs() < 1e-4, "{v}: {y} {want}");
+            }
+        }
+        let one = LayerNormStage::new(&LayerNorm::default(), 1).unwrap();
+        assert_eq!(apply(&one, &[5.0f32, 0.25], &[7.0, -1e30], 2), [0.25, 0.25]);
+    }
+
+    #[test]
+    fn dropped_outputs_keep_the_statistics_and_dropped_inputs_shrink_them() {
+        let stage = LayerNormStage::new(&LayerNorm { affine: false, ..LayerNorm::default() }, 4).unwrap();
+        let x = [1.0, 5.0, -2.0, 0.5f64];
+        let all = apply(&stage, &[], &x, 1);
+        let r = stage.keep_outputs(&[1, 3]).unwrap();
+        assert_eq!((r.channels, r.stage.info().input, r.stage.info().output), (vec![0, 1, 2, 3], 4, 2));
+        let dropped = LayerNormStage { outputs: vec![1, 3], ..stage.clone() };
+        assert_eq!(apply(&dropped, &[], &x, 1), [all[1], all[3]]);
+        let r = dropped.keep_inputs(&[0, 3]).unwrap();
+        assert_eq!((r.channels, r.stage.info().input, r.stage.info().output), (vec![1], 2, 1));
+        let mut y = [0.0; 1];
+        let k = r.stage.reference().unwrap();
+        k.forward(&[], Tile::new(&[1.0, 0.5], 1), TileMut::new(&mut y, 1), TileMut::new(&mut [0.0; 3], 1));
+        assert!((y[0] + 0.25 / (0.0625f64 + 1e-5).sqrt()).abs() < 1e-12, "{y:?}");
+    }
+}
