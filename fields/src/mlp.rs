@@ -244,7 +244,7 @@ impl<R: Real> Op for Forward<'_, R> {
 
 /// `h = f(z)`, `z = f'(z)`.
 #[inline(always)]
-fn activate<S: Simd, R: Real>(s: S, act: Activation, z: &mut [R], h: &mut [R]) {
+pub(crate) fn activate<S: Simd, R: Real>(s: S, act: Activation, z: &mut [R], h: &mut [R]) {
     // One loop an activation, so that none of them branches inside.
     macro_rules! each {
         ($($a:ident),*) => {

@@ -1,0 +1,32 @@
+//! Every stage as its own seeded scheme makes it.
+
+use conefield_core::arena::{Arena, InitReport, Layout, Weights};
+use conefield_core::error::Result;
+use conefield_core::spec::{Initializer, InitializerSpec};
+use schemars::JsonSchema;
+use serde::{Deserialize, Serialize};
+
+/// Settings of `random`: none, the schemes belong to the stages.
+#[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize, JsonSchema)]
+#[serde(deny_unknown_fields)]
+pub struct Random {}
+
+conefield_core::stage_type!(Initializer, "random", Random, "every stage by its own seeded scheme");
+
+#[typetag::serde(name = "random")]
+impl InitializerSpec for Random {
+    fn build(&self, _: &dyn Fn(&str) -> Result<Weights>) -> Result<Box<dyn Initializer>> {
+        Ok(Box::new(self.clone()))
+    }
+}
+
+impl Initializer for Random {
+    fn apply(&self, layout: &Layout, _: &mut Arena) -> Result<InitReport> {
+        let fresh = layout.blocks.iter().map(|b| (b.name.clone(), "random".into())).collect();
+        Ok(InitReport { fresh, ..InitReport::default() })
+    }
+
+    fn describe(&self) -> String {
+        "random: every stage by its own scheme".into()
+    }
+}
