@@ -113,7 +113,7 @@ impl<R: Real> Op for Forward<'_, R> {
             let first = load(s, self.x.channel(0), i) * scale;
             let mut mean = number(R::ZERO);
             for x in self.x.data.chunks_exact(self.x.rows) {
-                mean = mean + (load(s, x, i) * scale - first);
+                mean += load(s, x, i) * scale - first;
             }
             let mean = mean * share;
             let mut variance = number(R::ZERO);
@@ -188,7 +188,7 @@ impl<R: Real> Op for Backward<'_, R> {
             let (mut mean, mut along) = (zero, zero);
             for (o, &c) in stage.outputs.iter().enumerate() {
                 let g = load(s, self.dy.channel(o), i) * stage.gamma(self.params, o);
-                mean = mean + g;
+                mean += g;
                 along = g.mul_add(self.normal(s, c, i), along);
             }
             let (mean, along) = (mean * share, along * share);

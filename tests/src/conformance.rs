@@ -1,0 +1,149 @@
+//! The conformance kit: runs a stage through everything that hosts rely on and reports property by property.
+//!
+//! Gradients are compared with central differences of the stage's own forward pass, in double precision where the
+//! stage has a reference kernel and coarsely in single precision where it has not. Rows for that are drawn where the
+//! stage is smooth: a row is taken only if differences over a step and over four steps agree, so that no cell boundary
+//! and no kink of an activation lies near.
+
+mod behaviour;
+mod call;
+mod channels;
+mod gradients;
+
+use conefield_core::stage::{Encoder, Field, Normalizer, Stage};
+use std::fmt;
+use std::ops::Range;
+use std::panic::{AssertUnwindSafe, catch_unwind};
+
+/// How a stage is tried out.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Options {
+    /// Inputs are drawn uniformly from here.
+    pub inputs: Range<f64>,
+    /// Parameters are drawn uniformly from ± this; `None`: as the stage initialises them.
+    pub params: Option<f64>,
+    /// Rows for gradients.
+    pub rows: usize,
+    /// Largest relative error of gradients in double precision against differences.
+    pub tolerance: f64,
+    /// Largest error of single against double precision, as a share of the largest output; gradients may be four
+    /// times as far off.
+    pub single: f64,
+    /// Seed of everything drawn.
+    pub seed: u64,
+}
+
+impl Options {
+    /// For encoders: points of the unit cube, features of order one.
+    pub fn encoder() -> Self {
+        Self { inputs: 0.0..1.0, params: Some(0.7), rows: 24, tolerance: 1e-6, single: 2e-5, seed: 1 }
+    }
+
+    /// For normalizers and fields that read features of order one.
+    pub fn features() -> Self {
+        Self { inputs: -2.0..2.0, params: None, ..Self::encoder() }
+    }
+}
+
+/// What became of a property.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub enum Outcome {
+    /// It holds; how it was seen.
+    Passed(String),
+    /// It does not hold; what was found.
+    Failed(String),
+    /// It does not apply, and why.
+    Skipped(String),
+}
+
+/// What became of a stage's properties, in the order in which they were tried.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct Report {
+    /// The stage, in its own words.
+    pub stage: String,
+    /// Name and outcome of each property.
+    pub entries: Vec<(&'static str, Outcome)>,
+}
+
+impl Report {
+    /// Names of the properties that do not hold.
+    pub fn failed(&self) -> Vec<&'static str> {
+        self.entries.iter().filter(|(_, o)| matches!(o, Outcome::Failed(_))).map(|(n, _)| *n).collect()
+    }
+
+    /// Whether every property that applies holds.
+    pub fn passed(&self) -> bool {
+        self.failed().is_empty()
+    }
+
+    fn add(&mut self, name: &'static str, property: impl FnOnce() -> Outcome) {
+        let outcome = catch_unwind(AssertUnwindSafe(property)).unwrap_or_else(|panic| {
+            let text = panic.downcast_ref::<String>().cloned();
+            let text = text.or_else(|| panic.downcast_ref::<&str>().map(|s| s.to_string()));
+            Outcome::Failed(format!("panicked: {}", text.unwrap_or_default()))
+        });
+        self.entries.push((name, outcome));
+    }
+}
+
+impl fmt::Display for Report {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        writeln!(f, "{}", self.stage)?;
+        for (name, outcome) in &self.entries {
+            let (word, text) = match outcome {
+                Outcome::Passed(t) => ("ok", t),
+                Outcome::Failed(t) => ("FAILED", t),
+                Outcome::Skipped(t) => ("skipped", t),
+            };
+            writeln!(f, "  {word:<8} {name:<34} {text}")?;
+        }
+        Ok(())
+    }
+}
+
+/// Runs every property that any stage must have.
+pub fn check(stage: &dyn Stage, options: &Options) -> Report {
+    let mut report = Report { stage: stage.describe(), entries: vec![] };
+    report.add("info", || behaviour::info(stage, options));
+    report.add("parameters", || behaviour::parameters(stage));
+    report.add("init", || behaviour::init(stage, options));
+    report.add("finite differences: parameters", || gradients::parameters(stage, options));
+    report.add("finite differences: inputs", || gradients::inputs(stage, options));
+    report.add("single precision: outputs", || gradients::single_outputs(stage, options));
+    report.add("single precision: gradients", || gradients::single_gradients(stage, options));
+    report.add("tile sizes: outputs", || behaviour::tile_outputs(stage, options));
+    report.add("tile sizes: gradients", || behaviour::tile_gradients(stage, options));
+    report.add("outputs overwrite", || behaviour::outputs_overwrite(stage, options));
+    report.add("gradients add", || behaviour::gradients_add(stage, options));
+    report.add("input gradient overwrites", || behaviour::input_gradient_overwrites(stage, options));
+    report.add("partition", || behaviour::partition(stage));
+    report.add("partition gradients", || behaviour::partition_gradients(stage, options));
+    report.add("guards", || behaviour::guards(stage, options));
+    report.add("threads", || behaviour::threads(stage, options));
+    report.add("extremes", || behaviour::extremes(stage, options));
+    report.add("poison rows", || behaviour::poison(stage, options));
+    report.add("save and load", || behaviour::save_and_load(stage, options));
+    report
+}
+
+/// [`check`], and what an encoder must keep to when channels are left out.
+pub fn check_encoder(stage: &dyn Encoder, options: &Options) -> Report {
+    let mut report = check(stage, options);
+    report.add("keep outputs", || channels::encoder_outputs(stage, options));
+    report
+}
+
+/// [`check`], and what a normalizer must keep to when channels are left out.
+pub fn check_normalizer(stage: &dyn Normalizer, options: &Options) -> Report {
+    let mut report = check(stage, options);
+    report.add("keep outputs", || channels::normalizer_outputs(stage, options));
+    report.add("keep inputs", || channels::normalizer_inputs(stage, options));
+    report
+}
+
+/// [`check`], and what a field must keep to when channels are left out.
+pub fn check_field(stage: &dyn Field, options: &Options) -> Report {
+    let mut report = check(stage, options);
+    report.add("keep inputs", || channels::field_inputs(stage, options));
+    report
+}

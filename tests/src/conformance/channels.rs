@@ -1,0 +1,172 @@
+//! Stages without some of their channels.
+
+use super::call::{channels_of, data, differing, error, forward, gradients, params};
+use super::{Options, Outcome, check};
+use conefield_core::error::Result;
+use conefield_core::stage::{Encoder, Field, Normalizer, Stage};
+use std::collections::BTreeSet;
+use std::ops::Range;
+
+const ROWS: usize = 37;
+
+/// Some channels of `n`: all, all but the last, the first, the last, every second one.
+fn choices(n: usize) -> Vec<Vec<usize>> {
+    let mut all = vec![
+        (0..n).collect(),
+        (0..n.max(2) - 1).collect(),
+        vec![0],
+        vec![n - 1],
+        (0..n).step_by(2).collect(),
+        (n / 2..n).collect(),
+    ];
+    all.dedup();
+    all
+}
+
+/// Gradients may be summed in another order.
+const ROUNDING: f64 = 1e-5;
+
+fn gather(ranges: &[Range<usize>], params: &[f32]) -> Vec<f32> {
+    ranges.iter().flat_map(|r| params[r.clone()].iter().copied()).collect()
+}
+
+/// What holds for every smaller stage: its counts fit, and its names are the old ones.
+fn counts(full: &dyn Stage, small: &dyn Stage, params: &[Range<usize>], input: usize, output: usize) -> Option<String> {
+    let (info, params) = (small.info(), params.iter().map(Range::len).sum::<usize>());
+    let names: BTreeSet<String> = full.parameters().into_iter().map(|p| p.name).collect();
+    let new = small.parameters().into_iter().find(|p| !names.contains(&p.name));
+    if info.input != input || info.output != output {
+        Some(format!("{} to {} channels instead of {input} to {output}", info.input, info.output))
+    } else if info.params != params {
+        Some(format!("{} parameters, {params} were kept", info.params))
+    } else {
+        new.map(|p| format!("a block has the new name {}", p.name))
+    }
+}
+
+/// Runs the kit over a smaller stage.
+fn whole(stage: &dyn Stage, options: &Options) -> Option<String> {
+    let report = check(stage, options);
+    (!report.passed()).then(|| format!("the smaller stage fails {:?}:\n{report}", report.failed()))
+}
+
+/// Kept channels have the old bits; gradients are those of a zero gradient of the channels left out.
+fn same_outputs(
+    full: &dyn Stage,
+    small: &dyn Stage,
+    ranges: &[Range<usize>],
+    inputs: &[usize],
+    keep: &[usize],
+    options: &Options,
+) -> Option<String> {
+    let (info, less) = (full.info(), small.info());
+    if let Some(complaint) = counts(full, small, ranges, inputs.len(), keep.len()) {
+        return Some(complaint);
+    }
+    let p: Vec<f32> = params(full, options);
+    let q = gather(ranges, &p);
+    let (x, mut dy) = data::<f32>(&info, options, ROWS);
+    for c in (0..info.output).filter(|c| !keep.contains(c)) {
+        dy[c * ROWS..(c + 1) * ROWS].fill(0.0);
+    }
+    let (x1, dy1) = (channels_of(&x, ROWS, inputs), channels_of(&dy, ROWS, keep));
+    let [y, _] = forward(full.kernel(), &info, &p, &x, ROWS);
+    let [y1, _] = forward(small.kernel(), &less, &q, &x1, ROWS);
+    if let Some(complaint) = differing("output", &y1, &channels_of(&y, ROWS, keep)) {
+        return Some(complaint);
+    }
+    let [g, dx] = gradients(full.kernel(), &info, &p, &x, &dy, ROWS);
+    let [g1, dx1] = gradients(small.kernel(), &less, &q, &x1, &dy1, ROWS);
+    let e = error(&g1, &gather(ranges, &g)).max(error(&dx1, &channels_of(&dx, ROWS, inputs)));
+    (e > ROUNDING).then(|| format!("gradients are off by {e:.1e}"))
+}
+
+fn each(n: usize, mut one: impl FnMut(&[usize]) -> Result<Option<String>>) -> Outcome {
+    let all = choices(n);
+    for keep in &all {
+        match one(keep) {
+            Ok(None) => {}
+            Ok(Some(complaint)) => return Outcome::Failed(format!("keeping {keep:?}: {complaint}")),
+            Err(e) if e.to_string().is_empty() => return Outcome::Failed("refused without a word".into()),
+            Err(e) => return Outcome::Skipped(format!("keeping {keep:?}: {e}")),
+        }
+    }
+    Outcome::Passed(format!("{} choices", all.len()))
+}
+
+/// An encoder without some outputs.
+pub fn encoder_outputs(stage: &dyn Encoder, options: &Options) -> Outcome {
+    let n = stage.info().output;
+    each(n, |keep| {
+        let r = stage.keep_outputs(keep)?;
+        let mut complaint = same_outputs(stage, r.stage.as_ref(), &r.params, &r.channels, keep, options);
+        // Left out twice is left out at once.
+        if complaint.is_none() && keep.len() > 1 {
+            let again: Vec<usize> = (0..keep.len()).skip(1).step_by(2).collect();
+            let second = r.stage.keep_outputs(&again)?;
+            complaint = same_outputs(
+                r.stage.as_ref(),
+                second.stage.as_ref(),
+                &second.params,
+                &second.channels,
+                &again,
+                options,
+            )
+            .or_else(|| whole(second.stage.as_ref(), options))
+            .map(|c| format!("then {again:?}: {c}"));
+        }
+        Ok(complaint)
+    })
+}
+
+/// A normalizer without some outputs: the others keep their bits.
+pub fn normalizer_outputs(stage: &dyn Normalizer, options: &Options) -> Outcome {
+    each(stage.info().output, |keep| {
+        let r = stage.keep_outputs(keep)?;
+        Ok(same_outputs(stage, r.stage.as_ref(), &r.params, &r.channels, keep, options)
+            .or_else(|| whole(r.stage.as_ref(), options)))
+    })
+}
+
+/// A normalizer without some inputs is a smaller stage of the same kind.
+pub fn normalizer_inputs(stage: &dyn Normalizer, options: &Options) -> Outcome {
+    let info = stage.info();
+    each(info.input, |keep| {
+        let r = stage.keep_inputs(keep)?;
+        let small: &dyn Stage = r.stage.as_ref();
+        let outputs = &r.channels;
+        if !outputs.is_sorted_by(|a, b| a < b) || outputs.last().is_some_and(|&c| c >= info.output) {
+            return Ok(Some(format!("outputs {outputs:?} of {}", info.output)));
+        }
+        let mut complaint = counts(stage, small, &r.params, keep.len(), outputs.len());
+        if complaint.is_none() && keep.len() == info.input {
+            complaint = same_outputs(stage, small, &r.params, keep, outputs, options);
+        }
+        Ok(complaint.or_else(|| whole(r.stage.as_ref(), options)))
+    })
+}
+
+/// A field without some inputs is the field that sees zeros there.
+pub fn field_inputs(stage: &dyn Field, options: &Options) -> Outcome {
+    let info = stage.info();
+    each(info.input, |keep| {
+        let r = stage.keep_inputs(keep)?;
+        let small: &dyn Stage = r.stage.as_ref();
+        if let Some(c) = counts(stage, small, &r.params, keep.len(), info.output) {
+            return Ok(Some(c));
+        }
+        let p: Vec<f32> = params(stage, options);
+        let q = gather(&r.params, &p);
+        let (mut x, dy) = data::<f32>(&info, options, ROWS);
+        for c in (0..info.input).filter(|c| !keep.contains(c)) {
+            x[c * ROWS..(c + 1) * ROWS].fill(0.0);
+        }
+        let x1 = channels_of(&x, ROWS, keep);
+        let [y, _] = forward(stage.kernel(), &info, &p, &x, ROWS);
+        let [y1, _] = forward(small.kernel(), &small.info(), &q, &x1, ROWS);
+        let [g, dx] = gradients(stage.kernel(), &info, &p, &x, &dy, ROWS);
+        let [g1, dx1] = gradients(small.kernel(), &small.info(), &q, &x1, &dy, ROWS);
+        let e = error(&y1, &y).max(error(&g1, &gather(&r.params, &g))).max(error(&dx1, &channels_of(&dx, ROWS, keep)));
+        Ok((e > ROUNDING).then(|| format!("off by {e:.1e}")).or_else(|| whole(small, options)))
+    })
+}

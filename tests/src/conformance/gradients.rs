@@ -1,0 +1,225 @@
+//! Backward against differences of forward, and single against double precision.
+
+use super::call::{Draw, error, forward, gradients, params, within};
+use super::{Options, Outcome};
+use conefield_core::simd::Real;
+use conefield_core::stage::{Info, Kernel, Scope, Stage};
+
+/// Parameters and inputs that are differenced one by one, at most.
+const SINGLES: usize = 400;
+/// Directions through all parameters at once.
+const DIRECTIONS: u64 = 3;
+
+/// A step and the error that differences over it have at most.
+struct Step {
+    h: f64,
+    tolerance: f64,
+}
+
+fn step<R: Real>(options: &Options) -> Step {
+    if size_of::<R>() == 8 {
+        Step { h: 4e-6, tolerance: options.tolerance }
+    } else {
+        Step { h: 4e-3, tolerance: 2e-2_f64.max(options.tolerance) }
+    }
+}
+
+/// `Σ dy·y`, summed in double precision.
+fn loss<R: Real>(k: &dyn Kernel<R>, info: &Info, params: &[R], x: &[R], dy: &[R], rows: usize) -> f64 {
+    let [y, _] = forward(k, info, params, x, rows);
+    y.iter().zip(dy).map(|(y, d)| y.f64() * d.f64()).sum()
+}
+
+/// Derivative of `f` at 0 by central differences over two steps (Richardson): the error is of fourth order.
+fn slope(h: f64, mut f: impl FnMut(f64) -> f64) -> f64 {
+    let mut central = |h: f64| (f(h) - f(-h)) / (2.0 * h);
+    let (wide, narrow) = (central(h), central(0.5 * h));
+    (4.0 * narrow - wide) / 3.0
+}
+
+/// Inputs of rows around which the stage is smooth.
+fn smooth_rows<R: Real>(
+    k: &dyn Kernel<R>,
+    info: &Info,
+    params: &[R],
+    options: &Options,
+    rows: usize,
+) -> Option<Vec<R>> {
+    let mut draw = Draw::new(options.seed, 4);
+    if info.scope == Scope::Ray {
+        return Some(draw.many(&options.inputs, info.input * rows));
+    }
+    let dy: Vec<R> = draw.many(&(0.5..1.0), info.output);
+    let h = step::<R>(options).h;
+    let mut found: Vec<Vec<R>> = vec![];
+    for _ in 0..40 * rows {
+        let mut x: Vec<R> = draw.many(&options.inputs, info.input);
+        let mut at = |c: usize, d: f64| {
+            let keep = x[c];
+            x[c] = R::of(keep.f64() + d);
+            let l = loss(k, info, params, &x, &dy, 1);
+            x[c] = keep;
+            l
+        };
+        let slopes: Vec<[f64; 2]> =
+            (0..info.input).map(|c| [h, 4.0 * h].map(|h| (at(c, h) - at(c, -h)) / (2.0 * h))).collect();
+        let scale = slopes.iter().flatten().fold(1e-9f64, |m, s| m.max(s.abs()));
+        if slopes.iter().all(|[a, b]| (a - b).abs() <= 3e-3 * scale.max(1e-2)) {
+            found.push(x);
+            if found.len() == rows {
+                return Some((0..info.input).flat_map(|c| found.iter().map(move |r| r[c])).collect());
+            }
+        }
+    }
+    None
+}
+
+const NO_ROWS: &str = "no rows found around which the stage is smooth";
+
+/// Every parameter's gradient, one by one and along directions through all of them.
+pub fn parameters(stage: &dyn Stage, options: &Options) -> Outcome {
+    match stage.reference() {
+        Some(k) => parameters_in(stage, k, options),
+        None => parameters_in(stage, stage.kernel(), options),
+    }
+}
+
+fn parameters_in<R: Real>(stage: &dyn Stage, k: &dyn Kernel<R>, options: &Options) -> Outcome {
+    let info = stage.info();
+    if info.params == 0 {
+        return Outcome::Skipped("no parameters".into());
+    }
+    let rows = options.rows;
+    let mut p: Vec<R> = params(stage, options);
+    let Some(x) = smooth_rows(k, &info, &p, options, rows) else { return no_rows::<R>() };
+    let dy: Vec<R> = Draw::new(options.seed, 5).many(&(-1.0..1.0), info.output * rows);
+    let [g, _] = gradients(k, &info, &p, &x, &dy, rows);
+    let Step { h, tolerance } = step::<R>(options);
+    let largest = g.iter().map(|g| g.f64().abs()).fold(0.0, f64::max);
+    let mut draw = Draw::new(options.seed, 6);
+    let mut worst = 0.0f64;
+    // One by one: half of them where a gradient was found, half anywhere.
+    let touched: Vec<usize> = (0..info.params).filter(|&i| g[i] != R::ZERO).collect();
+    let chosen: Vec<usize> = if info.params <= SINGLES {
+        (0..info.params).collect()
+    } else {
+        let some = (0..SINGLES / 2).filter(|_| !touched.is_empty()).map(|_| touched[draw.below(touched.len())]);
+        let some: Vec<usize> = some.collect();
+        some.into_iter().chain((0..SINGLES / 2).map(|_| draw.below(info.params))).collect()
+    };
+    for &i in &chosen {
+        let keep = p[i];
+        let want = slope(h, |d| {
+            p[i] = R::of(keep.f64() + d);
+            loss(k, &info, &p, &x, &dy, rows)
+        });
+        p[i] = keep;
+        let scale = g[i].f64().abs().max(want.abs()) + 1e-2 * largest + 1e-9;
+        let e = (g[i].f64() - want).abs() / scale;
+        if e.is_nan() || e > tolerance {
+            return Outcome::Failed(format!("parameter {i}: gradient {:e}, differences {want:e}", g[i].f64()));
+        }
+        worst = worst.max(e);
+    }
+    for direction in 0..DIRECTIONS {
+        let v: Vec<f64> = {
+            let mut draw = Draw::new(options.seed, 100 + direction);
+            (0..info.params).map(|_| draw.from(&(-1.0..1.0))).collect()
+        };
+        let base = p.clone();
+        let want = slope(h, |d| {
+            for ((p, b), v) in p.iter_mut().zip(&base).zip(&v) {
+                *p = R::of(b.f64() + d * v);
+            }
+            loss(k, &info, &p, &x, &dy, rows)
+        });
+        p = base;
+        let found: f64 = g.iter().zip(&v).map(|(g, v)| g.f64() * v).sum();
+        let norm = g.iter().map(|g| g.f64() * g.f64()).sum::<f64>().sqrt();
+        let e = (found - want).abs() / (found.abs().max(want.abs()) + 1e-2 * norm + 1e-9);
+        if e.is_nan() || e > tolerance {
+            return Outcome::Failed(format!("direction {direction}: gradient {found:e}, differences {want:e}"));
+        }
+        worst = worst.max(e);
+    }
+    let n = chosen.len();
+    Outcome::Passed(format!("{n} of {} and {DIRECTIONS} directions, worst error {worst:.1e}", info.params))
+}
+
+/// Every input's gradient.
+pub fn inputs(stage: &dyn Stage, options: &Options) -> Outcome {
+    match stage.reference() {
+        Some(k) => inputs_in(stage, k, options),
+        None => inputs_in(stage, stage.kernel(), options),
+    }
+}
+
+fn inputs_in<R: Real>(stage: &dyn Stage, k: &dyn Kernel<R>, options: &Options) -> Outcome {
+    let info = stage.info();
+    let rows = options.rows;
+    let p: Vec<R> = params(stage, options);
+    let Some(mut x) = smooth_rows(k, &info, &p, options, rows) else { return no_rows::<R>() };
+    let dy: Vec<R> = Draw::new(options.seed, 7).many(&(-1.0..1.0), info.output * rows);
+    let [_, dx] = gradients(k, &info, &p, &x, &dy, rows);
+    let Step { h, tolerance } = step::<R>(options);
+    let largest = dx.iter().map(|g| g.f64().abs()).fold(0.0, f64::max);
+    let mut worst = 0.0f64;
+    let stride = x.len().div_ceil(SINGLES);
+    for i in (0..x.len()).step_by(stride) {
+        let keep = x[i];
+        let want = slope(h, |d| {
+            x[i] = R::of(keep.f64() + d);
+            loss(k, &info, &p, &x, &dy, rows)
+        });
+        x[i] = keep;
+        let scale = dx[i].f64().abs().max(want.abs()) + 1e-2 * largest + 1e-9;
+        let e = (dx[i].f64() - want).abs() / scale;
+        if e.is_nan() || e > tolerance {
+            let (c, r) = (i / rows, i % rows);
+            return Outcome::Failed(format!(
+                "channel {c} of row {r}: gradient {:e}, differences {want:e}",
+                dx[i].f64()
+            ));
+        }
+        worst = worst.max(e);
+    }
+    Outcome::Passed(format!("{} inputs, worst error {worst:.1e}", x.len().div_ceil(stride)))
+}
+
+fn no_rows<R: Real>() -> Outcome {
+    let text = format!("{NO_ROWS} over steps of {:.0e}", step::<R>(&Options::encoder()).h);
+    if size_of::<R>() == 8 { Outcome::Failed(text) } else { Outcome::Skipped(text) }
+}
+
+/// Inputs at which both precisions mean the same cells and sides of kinks.
+fn shared(stage: &dyn Stage, k: &dyn Kernel<f64>, options: &Options) -> Option<[Vec<f64>; 3]> {
+    let info = stage.info();
+    let p: Vec<f64> = params(stage, options);
+    let x = smooth_rows(k, &info, &p, options, options.rows)?;
+    let dy = Draw::new(options.seed, 8).many(&(-1.0..1.0), info.output * options.rows);
+    Some([p, x, dy])
+}
+
+fn narrow(v: &[f64]) -> Vec<f32> {
+    v.iter().map(|&v| v as f32).collect()
+}
+
+/// Outputs of the kernel that trains against the reference.
+pub fn single_outputs(stage: &dyn Stage, options: &Options) -> Outcome {
+    let Some(k) = stage.reference() else { return Outcome::Skipped("no double-precision kernel".into()) };
+    let Some([p, x, _]) = shared(stage, k, options) else { return no_rows::<f64>() };
+    let info = stage.info();
+    let [want, _] = forward(k, &info, &p, &x, options.rows);
+    let [y, _] = forward(stage.kernel(), &info, &narrow(&p), &narrow(&x), options.rows);
+    within("outputs", error(&y, &want), options.single)
+}
+
+/// Gradients of the kernel that trains against the reference.
+pub fn single_gradients(stage: &dyn Stage, options: &Options) -> Outcome {
+    let Some(k) = stage.reference() else { return Outcome::Skipped("no double-precision kernel".into()) };
+    let Some([p, x, dy]) = shared(stage, k, options) else { return no_rows::<f64>() };
+    let info = stage.info();
+    let [g, dx] = gradients(k, &info, &p, &x, &dy, options.rows);
+    let [g32, dx32] = gradients(stage.kernel(), &info, &narrow(&p), &narrow(&x), &narrow(&dy), options.rows);
+    within("parameters and inputs", error(&g32, &g).max(error(&dx32, &dx)), 4.0 * options.single)
+}

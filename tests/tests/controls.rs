@@ -1,0 +1,301 @@
+//! Negative controls: a small stage that passes the kit, and the same stage with one fault at a time, which must fail
+//! the property that the fault breaks. A kit that cannot fail proves nothing.
+
+use conefield_core::Result;
+use conefield_core::simd::Real;
+use conefield_core::stage::{Encoder, GradKind, Grads, Info, Kernel, Parameter, Reduced, Scope, Stage, Tile, TileMut};
+use conefield_tests::conformance::{Options, check, check_encoder};
+use std::ops::Range;
+use std::sync::atomic::{AtomicU32, Ordering};
+
+#[derive(Debug, Clone, Copy, PartialEq)]
+enum Fault {
+    None,
+    /// The parameter gradient is 1 % too large.
+    Gradient,
+    /// The last row is left out of the parameter gradient.
+    LastRow,
+    /// One of the parameters gets no gradient.
+    Forgotten,
+    /// The input gradient has the wrong sign.
+    InputGradient,
+    /// Gradients replace what is there.
+    OverwritesGradients,
+    /// The input gradient is added to what is there.
+    AddsInputGradient,
+    /// One number past the end of the output.
+    WritesOutside,
+    /// One number before the start of the gradients.
+    WritesBefore,
+    /// A NaN in one row reaches every row.
+    SpreadsNan,
+    /// The result depends on the number of rows.
+    TileSize,
+    /// An output is left as it was.
+    SkipsOutput,
+    /// Squares overflow.
+    Overflows,
+    /// The kernel that trains has three digits.
+    Coarse,
+    /// Calls leave a trace that later calls see.
+    Remembers,
+    /// Ranges overlap.
+    Overlap,
+    /// Ranges leave a gap.
+    Gap,
+    /// The sum depends on the range that is asked for.
+    RangeDependent,
+    /// Blocks do not cover the parameters.
+    MissingBlock,
+    /// Two blocks have one name.
+    TwinNames,
+    /// Some parameters are not initialised.
+    PartialInit,
+    /// It says that it does nothing.
+    FalseIdentity,
+    /// It panics on its way back.
+    Panics,
+    /// A smaller stage computes another channel.
+    WrongChannel,
+    /// A smaller stage keeps too many parameters.
+    TooManyKept,
+}
+
+/// `y_c = w_c·x_c + w_c²` on the channels in `channels`.
+struct Toy {
+    fault: Fault,
+    channels: Vec<usize>,
+    /// Whether there is a kernel in double precision.
+    double: bool,
+    calls: AtomicU32,
+}
+
+impl Toy {
+    fn new(fault: Fault) -> Self {
+        Self { fault, channels: vec![0, 1, 2], double: true, calls: AtomicU32::new(0) }
+    }
+}
+
+impl<R: Real> Kernel<R> for Toy {
+    fn forward(&self, params: &[R], x: Tile<'_, R>, mut y: TileMut<'_, R>, _: TileMut<'_, R>) {
+        let calls = self.calls.fetch_add(1, Ordering::Relaxed);
+        let rows = x.rows;
+        for (c, &from) in self.channels.iter().enumerate() {
+            let w = params[c];
+            let everything: R = x.data.iter().copied().sum();
+            for i in 0..rows {
+                let mut v = w * x.channel(from)[i] + w * w;
+                match self.fault {
+                    Fault::SpreadsNan => v += everything * R::ZERO,
+                    Fault::TileSize => v += R::of(rows as f64 * 1e-6),
+                    Fault::Remembers => v += R::of(f64::from(calls) * 1e-6),
+                    Fault::Overflows => v += v * v - v * v,
+                    Fault::Coarse if size_of::<R>() == 4 => v = R::of((v.f64() * 1e3).round() * 1e-3),
+                    _ => {}
+                }
+                if !(self.fault == Fault::SkipsOutput && i + 1 == rows && rows > 30) {
+                    y.channel(c)[i] = v;
+                }
+            }
+        }
+        if self.fault == Fault::WritesOutside {
+            let end = y.data.len();
+            poke(y.data, end as isize);
+        }
+    }
+
+    fn backward(
+        &self,
+        params: &[R],
+        x: Tile<'_, R>,
+        _: TileMut<'_, R>,
+        dy: Tile<'_, R>,
+        grads: Grads<'_, R>,
+        dx: Option<TileMut<'_, R>>,
+    ) {
+        assert!(self.fault != Fault::Panics, "as ordered");
+        for c in grads.range.clone() {
+            let w = params[c];
+            let rows = if self.fault == Fault::LastRow { x.rows - 1 } else { x.rows };
+            let mut sum = R::ZERO;
+            for i in 0..rows {
+                sum += dy.channel(c)[i] * (x.channel(self.channels[c])[i] + w + w);
+            }
+            match self.fault {
+                Fault::Gradient => sum *= R::of(1.01),
+                Fault::Forgotten if c == 1 => sum = R::ZERO,
+                Fault::RangeDependent if grads.range.len() == 1 => sum *= R::of(1.0 + 1e-6),
+                _ => {}
+            }
+            let g = &mut grads.values[c - grads.range.start];
+            if self.fault == Fault::OverwritesGradients { *g = sum } else { *g += sum }
+        }
+        if self.fault == Fault::WritesBefore {
+            poke(grads.values, -1);
+        }
+        let Some(mut dx) = dx else { return };
+        if self.fault != Fault::AddsInputGradient {
+            dx.data.fill(R::ZERO);
+        }
+        for (c, &from) in self.channels.iter().enumerate() {
+            let sign = if self.fault == Fault::InputGradient { R::of(-1.0) } else { R::ONE };
+            for i in 0..x.rows {
+                dx.channel(from)[i] += sign * params[c] * dy.channel(c)[i];
+            }
+        }
+    }
+}
+
+/// Writes beside a slice, as a plugin in another language might.
+#[allow(unsafe_code)]
+fn poke<R: Real>(data: &mut [R], at: isize) {
+    // SAFETY: every buffer of the kit that a stage writes to has a guard on either side within its allocation, and
+    // nothing reads that guard during the call.
+    unsafe { data.as_mut_ptr().offset(at).write(R::ONE) }
+}
+
+impl Stage for Toy {
+    fn info(&self) -> Info {
+        let n = self.channels.len();
+        Info {
+            input: 3,
+            output: n,
+            params: n,
+            tape: 0,
+            scope: Scope::Row,
+            grads: GradKind::Scatter,
+            macs: 2 * n,
+            identity: self.fault == Fault::FalseIdentity,
+        }
+    }
+
+    fn parameters(&self) -> Vec<Parameter> {
+        let number = |c: usize| if self.fault == Fault::TwinNames { c.min(1) } else { c };
+        let all = self.channels.iter().enumerate();
+        let all = all.map(|(i, &c)| Parameter { name: format!("{}.weight", number(c)), shape: vec![1], start: i });
+        all.skip(usize::from(self.fault == Fault::MissingBlock)).collect()
+    }
+
+    fn init(&self, seed: u64, params: &mut [f32]) {
+        let skip = usize::from(self.fault == Fault::PartialInit);
+        for (i, p) in params.iter_mut().enumerate().skip(skip) {
+            *p = 0.5 + 0.1 * i as f32 + 0.01 * (seed % 7) as f32;
+        }
+    }
+
+    fn kernel(&self) -> &dyn Kernel<f32> {
+        self
+    }
+
+    fn reference(&self) -> Option<&dyn Kernel<f64>> {
+        self.double.then_some(self as _)
+    }
+
+    fn partition(&self) -> Vec<Range<usize>> {
+        let n = self.channels.len();
+        match self.fault {
+            Fault::Overlap => vec![0..1, 0..n],
+            Fault::Gap => vec![1..n],
+            _ => (0..n).map(|c| c..c + 1).collect(),
+        }
+    }
+
+    fn describe(&self) -> String {
+        format!("toy: {:?}", self.fault)
+    }
+}
+
+impl Encoder for Toy {
+    fn keep_outputs(&self, keep: &[usize]) -> Result<Reduced<dyn Encoder>> {
+        let mut channels: Vec<usize> = keep.iter().map(|&c| self.channels[c]).collect();
+        let mut params: Vec<_> = keep.iter().map(|&c| c..c + 1).collect();
+        match self.fault {
+            Fault::WrongChannel => channels.reverse(),
+            Fault::TooManyKept => params = vec![0..self.channels.len()],
+            _ => {}
+        }
+        let stage = Toy { fault: self.fault, channels, double: self.double, calls: AtomicU32::new(0) };
+        Ok(Reduced { stage: Box::new(stage), params, channels: vec![0, 1, 2] })
+    }
+}
+
+/// Quiets the panics that a fault causes on purpose.
+fn quietly<T>(f: impl FnOnce() -> T) -> T {
+    std::panic::set_hook(Box::new(|_| {}));
+    let result = f();
+    let _ = std::panic::take_hook();
+    result
+}
+
+#[test]
+fn every_fault_fails_its_property_and_the_sound_stage_none() {
+    let faults = [
+        (Fault::Gradient, "finite differences: parameters"),
+        (Fault::LastRow, "finite differences: parameters"),
+        (Fault::LastRow, "tile sizes: gradients"),
+        (Fault::Forgotten, "finite differences: parameters"),
+        (Fault::InputGradient, "finite differences: inputs"),
+        (Fault::OverwritesGradients, "gradients add"),
+        (Fault::AddsInputGradient, "input gradient overwrites"),
+        (Fault::WritesOutside, "guards"),
+        (Fault::WritesBefore, "guards"),
+        (Fault::SpreadsNan, "poison rows"),
+        (Fault::TileSize, "tile sizes: outputs"),
+        (Fault::SkipsOutput, "outputs overwrite"),
+        (Fault::Overflows, "extremes"),
+        (Fault::Coarse, "single precision: outputs"),
+        (Fault::Remembers, "threads"),
+        (Fault::Overlap, "partition"),
+        (Fault::Gap, "partition"),
+        (Fault::RangeDependent, "partition gradients"),
+        (Fault::MissingBlock, "parameters"),
+        (Fault::TwinNames, "parameters"),
+        (Fault::PartialInit, "init"),
+        (Fault::FalseIdentity, "info"),
+        (Fault::Panics, "finite differences: inputs"),
+        (Fault::WrongChannel, "keep outputs"),
+        (Fault::TooManyKept, "keep outputs"),
+    ];
+    let sound = check_encoder(&Toy::new(Fault::None), &Options::encoder());
+    assert!(sound.passed(), "{sound}");
+    for (fault, property) in faults {
+        let report = quietly(|| check_encoder(&Toy::new(fault), &Options::encoder()));
+        assert!(report.failed().contains(&property), "{fault:?} passed {property:?}:\n{report}");
+    }
+}
+
+#[test]
+fn faults_of_one_kind_leave_the_other_properties_alone() {
+    for (fault, properties) in [
+        (Fault::Gradient, &["finite differences: parameters"][..]),
+        (Fault::OverwritesGradients, &["gradients add"]),
+        (Fault::WritesOutside, &["guards"]),
+        (Fault::SpreadsNan, &["poison rows"]),
+    ] {
+        let report = check(&Toy::new(fault), &Options::encoder());
+        assert_eq!(report.failed(), properties, "{report}");
+    }
+}
+
+#[test]
+fn a_stage_in_single_precision_only_is_differenced_coarsely() {
+    let toy = |fault| Toy { double: false, ..Toy::new(fault) };
+    let sound = check_encoder(&toy(Fault::None), &Options::encoder());
+    assert!(sound.passed(), "{sound}");
+    for (fault, property) in [
+        (Fault::Forgotten, "finite differences: parameters"),
+        (Fault::LastRow, "finite differences: parameters"),
+        (Fault::InputGradient, "finite differences: inputs"),
+    ] {
+        let report = check(&toy(fault), &Options::encoder());
+        assert!(report.failed().contains(&property), "{report}");
+    }
+}
+
+#[test]
+fn a_report_reads_well() {
+    let text = check(&Toy::new(Fault::OverwritesGradients), &Options::encoder()).to_string();
+    assert!(text.starts_with("toy: OverwritesGradients\n"), "{text}");
+    assert!(text.lines().any(|l| l.contains("FAILED") && l.contains("gradients add")), "{text}");
+    assert!(text.lines().any(|l| l.contains("ok") && l.contains("guards")), "{text}");
+}

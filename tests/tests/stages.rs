@@ -1,0 +1,177 @@
+//! Every built-in stage, with several settings each, through the conformance kit.
+
+use conefield_core::registry::{Kind, names};
+use conefield_core::spec::{EncoderSpec, FieldSpec, NormalizerSpec};
+use conefield_tests::conformance::{Options, Report, check_encoder, check_field, check_normalizer};
+use serde_json::{Value, json};
+
+// Stage types register themselves where their crate is linked.
+use conefield_encoders as _;
+use conefield_fields as _;
+use conefield_initializers as _;
+use conefield_normalizers as _;
+
+fn expect(report: Report) {
+    println!("{report}");
+    assert!(report.passed(), "{report}\nfails {:?}", report.failed());
+}
+
+fn encoder(settings: Value, options: &Options) {
+    let spec: Box<dyn EncoderSpec> = serde_json::from_value(settings).unwrap();
+    expect(check_encoder(spec.build().unwrap().as_ref(), options));
+}
+
+fn normalizer(settings: Value, width: usize, options: &Options) {
+    let spec: Box<dyn NormalizerSpec> = serde_json::from_value(settings).unwrap();
+    expect(check_normalizer(spec.build(width).unwrap().as_ref(), options));
+}
+
+fn field(settings: Value, width: usize, options: &Options) {
+    let spec: Box<dyn FieldSpec> = serde_json::from_value(settings).unwrap();
+    expect(check_field(spec.build(width).unwrap().as_ref(), options));
+}
+
+#[test]
+fn identity() {
+    encoder(json!({"type": "identity"}), &Options::encoder());
+}
+
+#[test]
+fn frequency() {
+    for (settings, single) in [
+        (json!({"type": "frequency"}), 2e-6),
+        (json!({"type": "frequency", "bands": 1, "max_frequency": 3.0}), 2e-6),
+        (json!({"type": "frequency", "bands": 5, "include_input": false, "max_frequency": 40.0}), 2e-5),
+        // A product f·x is rounded to 2⁻²⁴ of up to f turns.
+        (json!({"type": "frequency", "bands": 7, "spacing": "linear", "max_frequency": 100.0}), 5e-5),
+    ] {
+        encoder(settings, &Options { single, ..Options::encoder() });
+    }
+}
+
+#[test]
+fn frequency_outside_the_cube() {
+    encoder(
+        json!({"type": "frequency", "bands": 3, "max_frequency": 4.0}),
+        &Options { inputs: -30.0..30.0, ..Options::encoder() },
+    );
+}
+
+#[test]
+fn dense_grid() {
+    for settings in [
+        json!({"type": "dense-grid", "levels": 1, "base_resolution": 1, "features": 1}),
+        json!({"type": "dense-grid", "levels": 3, "base_resolution": 4, "growth": 1.7}),
+        json!({"type": "dense-grid", "levels": 2, "base_resolution": 3, "features": 8, "growth": 1.0}),
+        json!({"type": "dense-grid", "levels": 2, "base_resolution": 30, "features": 4}),
+    ] {
+        encoder(settings, &Options { single: 4e-5, ..Options::encoder() });
+    }
+}
+
+#[test]
+fn hash_grid() {
+    for (settings, single) in [
+        (json!({"type": "hash-grid", "levels": 3, "log2_table_size": 8, "base_resolution": 4}), 2e-5),
+        (json!({"type": "hash-grid", "levels": 4, "features": 1, "growth": 1.5, "log2_table_size": 10}), 2e-5),
+        (
+            json!({"type": "hash-grid", "convention": "instant-ngp", "levels": 2, "features": 8, "log2_table_size": 6}),
+            2e-5,
+        ),
+        // Positions in fine cells are rounded to 2⁻²⁴ of the resolution.
+        (json!({"type": "hash-grid", "levels": 8, "features": 4, "log2_table_size": 12}), 5e-4),
+    ] {
+        encoder(settings, &Options { single, ..Options::encoder() });
+    }
+}
+
+#[test]
+fn concat() {
+    let frequency = json!({"type": "frequency", "bands": 2, "max_frequency": 2.0});
+    let dense = json!({"type": "dense-grid", "levels": 2, "base_resolution": 3});
+    let hash = json!({"type": "hash-grid", "levels": 2, "log2_table_size": 7, "base_resolution": 4});
+    for encoders in [
+        json!([dense]),
+        json!([frequency, {"type": "identity"}]),
+        json!([frequency, dense, hash]),
+        json!([hash, {"type": "concat", "encoders": [{"type": "identity"}, dense]}, dense]),
+    ] {
+        encoder(json!({"type": "concat", "encoders": encoders}), &Options { single: 4e-5, ..Options::encoder() });
+    }
+}
+
+#[test]
+fn concat_says_where_a_mistake_stands() {
+    let settings = json!({"type": "concat", "encoders": [
+        {"type": "identity"},
+        {"type": "concat", "encoders": [{"type": "frequency", "bands": 0}]},
+    ]});
+    let spec: Box<dyn EncoderSpec> = serde_json::from_value(settings).unwrap();
+    let e = spec.build().err().unwrap().to_string();
+    assert!(e.contains("encoder.encoders.1.encoders.0.bands"), "{e}");
+    let none: Box<dyn EncoderSpec> = serde_json::from_value(json!({"type": "concat", "encoders": []})).unwrap();
+    assert!(none.build().err().unwrap().to_string().contains("at least one"));
+}
+
+#[test]
+fn layer_norm() {
+    for (settings, width) in [
+        (json!({"type": "layer-norm"}), 20),
+        (json!({"type": "layer-norm", "affine": false}), 7),
+        (json!({"type": "layer-norm", "eps": 0.1}), 2),
+        (json!({"type": "layer-norm"}), 33),
+    ] {
+        normalizer(settings.clone(), width, &Options { params: Some(1.0), ..Options::features() });
+        normalizer(settings, width, &Options::features());
+    }
+}
+
+#[test]
+fn layer_norm_of_one_channel() {
+    normalizer(json!({"type": "layer-norm"}), 1, &Options::features());
+}
+
+#[test]
+fn fft_mask() {
+    for width in [1, 20] {
+        normalizer(json!({"type": "fft-mask", "scope": "channel"}), width, &Options::features());
+    }
+}
+
+#[test]
+fn mlp() {
+    for (settings, width) in [
+        (json!({"type": "mlp"}), 20),
+        (json!({"type": "mlp", "width": 9, "depth": 1, "skips": [], "output": "none"}), 3),
+        (
+            json!({"type": "mlp", "width": 12, "depth": 3, "skips": [1, 2], "activation": "relu", "output": "softplus"}),
+            5,
+        ),
+        (json!({"type": "mlp", "width": 33, "activation": "leaky-relu", "output": "sigmoid", "init": "he"}), 17),
+        (json!({"type": "mlp", "width": 8, "activation": "squareplus", "init": "glorot", "output": "gelu"}), 4),
+    ] {
+        field(settings, width, &Options { single: 5e-5, ..Options::features() });
+    }
+}
+
+#[test]
+fn voxel_grid() {
+    for settings in [
+        json!({"type": "voxel-grid", "resolution": 6, "output": "none"}),
+        json!({"type": "voxel-grid", "resolution": [5, 1, 9], "output": "softplus"}),
+        json!({"type": "voxel-grid", "resolution": [1, 1, 1], "output": "squareplus"}),
+        json!({"type": "voxel-grid", "resolution": [7, 8, 4], "output": "relu"}),
+        json!({"type": "voxel-grid", "resolution": 70, "output": "squareplus"}),
+    ] {
+        field(settings, 3, &Options { single: 4e-5, ..Options::encoder() });
+    }
+}
+
+/// A stage type that is not in this list has not been through the kit.
+#[test]
+fn every_registered_stage_has_a_run_here() {
+    assert_eq!(names(Kind::Encoder), ["concat", "dense-grid", "frequency", "hash-grid", "identity"]);
+    assert_eq!(names(Kind::Normalizer), ["fft-mask", "layer-norm"]);
+    assert_eq!(names(Kind::Field), ["mlp", "voxel-grid"]);
+    assert_eq!(names(Kind::Initializer), ["checkpoint", "mci", "random"]);
+}
