@@ -1,0 +1,60 @@
+//! Names that a scan's description gives must stay inside the scan's folder.
+
+use conefield_core::{Error, Result};
+use std::path::{Component, Path, PathBuf};
+
+/// The file `name` of `folder`, refused if it is no plain file name.
+pub(crate) fn plain(folder: &Path, place: &str, field: &str, name: &str) -> Result<PathBuf> {
+    let mut parts = Path::new(name).components();
+    let one = matches!((parts.next(), parts.next()), (Some(Component::Normal(p)), None) if p == name);
+    if !one || name.contains(['/', '\\', ':', '\0']) {
+        return Err(Error::invalid(place, field, format!("\"{name}\""), "a plain file name inside the folder"));
+    }
+    inside(folder, place, field, name)
+}
+
+/// The file at the relative path `name` in `folder`, refused if it leads out, also through a link.
+pub(crate) fn inside(folder: &Path, place: &str, field: &str, name: &str) -> Result<PathBuf> {
+    let shown = || format!("\"{name}\"");
+    let down = Path::new(name).components().all(|c| matches!(c, Component::Normal(_) | Component::CurDir));
+    if name.is_empty() || !down || name.contains(['\\', ':', '\0']) {
+        return Err(Error::invalid(place, field, shown(), "a path inside the folder, without \"..\""));
+    }
+    let path = folder.join(name);
+    let real = path.canonicalize().map_err(|e| Error::invalid(place, field, format!("{} ({e})", shown()), "a file"))?;
+    let root = folder.canonicalize().map_err(|e| Error::io(folder, e))?;
+    if !real.starts_with(&root) {
+        let found = format!("{}, a link out of the folder", shown());
+        return Err(Error::invalid(place, field, found, "a file inside the folder"));
+    }
+    if !real.is_file() {
+        return Err(Error::invalid(place, field, shown(), "a file"));
+    }
+    Ok(path)
+}
+
+/// Refuses to replace a folder that holds anything but what `known` says the format itself writes.
+pub(crate) fn may_replace(folder: &Path, format: &str, known: impl Fn(&str) -> bool, mark: &[&str]) -> Result<()> {
+    let place = folder.display().to_string();
+    let io = |e| Error::io(folder, e);
+    if folder.symlink_metadata().is_err() {
+        return Ok(());
+    }
+    if !folder.is_dir() {
+        return Err(Error::invalid(place, "folder", "a file", "a new name, an empty folder or an earlier scan"));
+    }
+    let mut names = Vec::new();
+    for entry in std::fs::read_dir(folder).map_err(io)? {
+        names.push(entry.map_err(io)?.file_name().to_string_lossy().into_owned());
+    }
+    names.sort();
+    if names.is_empty() {
+        return Ok(());
+    }
+    let stranger = names.iter().find(|n| !known(n));
+    if let Some(n) = stranger.or_else(|| (!mark.iter().any(|m| names.iter().any(|n| n == m))).then(|| &names[0])) {
+        let expected = format!("a new name, an empty folder or a {format} with nothing else in it");
+        return Err(Error::invalid(place, "folder", format!("\"{n}\" in it"), expected));
+    }
+    Ok(())
+}

@@ -1,0 +1,165 @@
+//! A file, packed or not, that is read front to back and never trusted about its length.
+
+use crate::number::{Number, Order};
+use conefield_core::{Error, Result};
+use flate2::bufread::MultiGzDecoder;
+use std::fs::File;
+use std::io::{BufRead, BufReader, ErrorKind, Read};
+use std::path::{Path, PathBuf};
+
+/// Deflate stores at best 258 bytes in two bits: no gzip stream unpacks to more than this many times its size.
+const DEFLATE_LIMIT: u64 = 1032;
+
+/// Values decoded between two looks at the file: what a lying header can make us take before the lie shows.
+const CHUNK: usize = 1 << 18;
+
+/// An open file with its name and the bounds on what it can hold.
+pub(crate) struct Input {
+    path: PathBuf,
+    reader: Box<dyn Read>,
+    /// Bytes on disk.
+    size: u64,
+    packed: bool,
+    /// (Unpacked) bytes given out so far.
+    at: u64,
+}
+
+impl Input {
+    /// Opens `path` and unpacks it if it starts with gzip's magic number.
+    pub fn open(path: &Path) -> Result<Self> {
+        let io = |e| Error::io(path, e);
+        let file = File::open(path).map_err(io)?;
+        let info = file.metadata().map_err(io)?;
+        if !info.is_file() {
+            return Err(Error::invalid(path.display().to_string(), "file", "a folder or device", "a regular file"));
+        }
+        let mut plain = BufReader::with_capacity(1 << 18, file);
+        let packed = plain.fill_buf().map_err(io)?.starts_with(&[0x1f, 0x8b]);
+        let reader: Box<dyn Read> =
+            if packed { Box::new(BufReader::new(MultiGzDecoder::new(plain))) } else { Box::new(plain) };
+        Ok(Self { path: path.to_path_buf(), reader, size: info.len(), packed, at: 0 })
+    }
+
+    /// The file's name, as errors give it.
+    pub fn place(&self) -> String {
+        self.path.display().to_string()
+    }
+
+    /// An error about this file.
+    pub fn invalid(&self, field: impl Into<String>, found: impl ToString, expected: impl Into<String>) -> Error {
+        Error::invalid(self.place(), field, found, expected)
+    }
+
+    /// Reads up to `n` bytes, fewer only at the end of the file.
+    pub fn take(&mut self, n: usize) -> Result<Vec<u8>> {
+        let mut out = Vec::with_capacity(n.min(1 << 16));
+        let got = self.reader.by_ref().take(n as u64).read_to_end(&mut out);
+        match got {
+            Ok(_) => {
+                self.at += out.len() as u64;
+                Ok(out)
+            }
+            Err(e) => Err(self.broken(e)),
+        }
+    }
+
+    /// Reads exactly `n` bytes of `field`.
+    pub fn exactly(&mut self, n: usize, field: &str) -> Result<Vec<u8>> {
+        let out = self.take(n)?;
+        if out.len() < n {
+            return Err(self.ended(field, n as u64, out.len() as u64));
+        }
+        Ok(out)
+    }
+
+    /// Passes over `n` bytes of `field`.
+    pub fn skip(&mut self, n: u64, field: &str) -> Result<()> {
+        let got = std::io::copy(&mut self.reader.by_ref().take(n), &mut std::io::sink());
+        let got = got.map_err(|e| self.broken(e))?;
+        self.at += got;
+        if got < n { Err(self.ended(field, n, got)) } else { Ok(()) }
+    }
+
+    /// Reads `count` numbers up to the very end of the file, through `map`. What the file cannot hold is refused
+    /// before memory is taken for it, and a byte past the last number is refused as well.
+    pub fn numbers(
+        &mut self,
+        field: &str,
+        count: usize,
+        number: Number,
+        order: Order,
+        map: impl Fn(f64) -> f32 + Copy,
+    ) -> Result<Vec<f32>> {
+        let want = (count as u64)
+            .checked_mul(number.bytes() as u64)
+            .ok_or_else(|| self.invalid(field, format!("{count} values"), "a length that can be addressed"))?;
+        if self.packed {
+            let most = self.size.saturating_mul(DEFLATE_LIMIT);
+            if want > most {
+                return Err(self.invalid(
+                    field,
+                    format!("a header that claims {want} bytes in a gzip file of {} bytes", self.size),
+                    format!("at most {most} bytes, which is all that such a file can unpack to"),
+                ));
+            }
+        } else {
+            let left = self.size.saturating_sub(self.at);
+            if left != want {
+                return Err(self.invalid(
+                    field,
+                    format!("{left} bytes of data in the file"),
+                    format!("{want} bytes ({count} values of {} bytes, as the header says)", number.bytes()),
+                ));
+            }
+        }
+        let mut out: Vec<f32> = Vec::new();
+        let refuse = |s: &Self| s.invalid(field, format!("{count} values"), "an array that fits in memory");
+        // A plain file has just been measured; a packed one must prove its claim piece by piece.
+        if !self.packed {
+            out.try_reserve_exact(count).map_err(|_| refuse(self))?;
+        }
+        let mut left = count;
+        while left > 0 {
+            let n = left.min(CHUNK);
+            let raw = self.exactly(n * number.bytes(), field)?;
+            out.try_reserve(n).map_err(|_| refuse(self))?;
+            number.decode(order, &raw, &mut out, map);
+            left -= n;
+        }
+        // Reading on to the end also makes gzip compare its checksum.
+        if !self.take(1)?.is_empty() {
+            return Err(self.invalid(field, "more data", format!("the end of the file after {want} bytes")));
+        }
+        Ok(out)
+    }
+
+    fn ended(&self, field: &str, want: u64, got: u64) -> Error {
+        self.invalid(field, format!("the end of the file after {got} bytes"), format!("{want} bytes"))
+    }
+
+    fn broken(&self, e: std::io::Error) -> Error {
+        let damaged = matches!(e.kind(), ErrorKind::InvalidInput | ErrorKind::InvalidData | ErrorKind::UnexpectedEof);
+        if self.packed && damaged {
+            self.invalid("gzip stream", e, "a whole gzip stream")
+        } else {
+            Error::io(&self.path, e)
+        }
+    }
+}
+
+/// Reads a text of at most 256 MiB.
+pub(crate) fn read_text(path: &Path) -> Result<String> {
+    const MOST: u64 = 256 << 20;
+    let io = |e| Error::io(path, e);
+    let file = File::open(path).map_err(io)?;
+    let size = file.metadata().map_err(io)?.len();
+    if size > MOST {
+        let place = path.display().to_string();
+        return Err(Error::invalid(place, "file size", format!("{size} bytes"), format!("at most {MOST} bytes")));
+    }
+    let mut raw = Vec::new();
+    file.take(MOST).read_to_end(&mut raw).map_err(io)?;
+    String::from_utf8(raw).map_err(|e| {
+        Error::invalid(path.display().to_string(), "text", format!("a byte that is no UTF-8: {e}"), "UTF-8 text")
+    })
+}

@@ -1,0 +1,45 @@
+//! Every file that conefield reads or writes, each format in one module.
+//!
+//! - Volumes: [`read_volume`], [`write_volume`] (NIfTI, NumPy).
+//! - Scans: [`read_scan`], [`read_truth`], [`write_scan`] (conefield's own folder), [`read_r2`], [`write_r2`]
+//!   (R2-Gaussian's folder).
+//! - Weights and checkpoints: [`read_weights`], [`write_weights`] (safetensors).
+//! - Pictures: [`slices_png`], [`compare_png`], [`curves_png`].
+//!
+//! Readers tell a format from what a file holds, check a header before they take memory for what it claims, and
+//! refuse with the file, the field, what was found and what was expected. Lengths are converted once, here: inside
+//! the program they are millimetres. Voxel values stay in `1/unit` of the scan they belong to.
+//!
+//! Writers put everything beside its final name, sync it and rename it ([`write_atomic`]), so that a half-written
+//! file never stands under the name that was asked for.
+
+mod atomic;
+mod canvas;
+mod curves;
+mod folder;
+mod input;
+mod nifti;
+mod npy;
+mod number;
+mod orbit;
+mod r2;
+mod rays;
+mod scan;
+mod scan_folder;
+mod slices;
+mod text;
+mod volume;
+mod weights;
+
+#[cfg(test)]
+mod testing;
+
+pub use atomic::{write_atomic, write_folder_atomic, write_text_atomic};
+pub use curves::{Corner, CurveOptions, curves_png, curves_png_with};
+pub use orbit::Orbit;
+pub use r2::{R2Scan, read_r2, write_r2};
+pub use scan::{read_scan, read_truth};
+pub use scan_folder::write_scan;
+pub use slices::{compare_png, slices_png};
+pub use volume::{is_volume, read_volume, write_volume};
+pub use weights::{Weights, read_weights, write_weights};

@@ -1,0 +1,498 @@
+//! NIfTI-1 in one file (`.nii`, `.nii.gz`).
+//!
+//! The header is parsed by the `nifti` crate. The data is decoded here, because that bounds what a header can make
+//! us allocate, and the header is written here, because that lets the writer go through [`crate::write_atomic`].
+
+use crate::input::Input;
+use crate::number::{Number, Order};
+use conefield_core::geometry::{VoxelGrid, norm};
+use conefield_core::scan::Volume;
+use conefield_core::{Error, Result};
+use ndarray::{Array3, ShapeBuilder};
+use nifti::{Endianness, NiftiHeader};
+use std::io::Write;
+use std::path::Path;
+
+/// Bytes of a header.
+pub(crate) const HEADER: usize = 348;
+
+/// Where the data of a single file starts when there is no extension.
+const DATA: u64 = 352;
+
+/// Rows of voxel index → millimetres.
+type Affine = [[f64; 4]; 4];
+
+/// Whether `head` (at least [`HEADER`] bytes) carries the mark of NIfTI-1 or its header-and-image pair.
+pub(crate) fn is_header(head: &[u8]) -> bool {
+    head.get(344..347).is_some_and(|m| m == b"n+1" || m == b"ni1")
+}
+
+/// Whether `head` starts as NIfTI-2 does.
+pub(crate) fn is_second_version(head: &[u8]) -> bool {
+    head.get(4..7).is_some_and(|m| m == b"n+2" || m == b"ni2")
+}
+
+/// Reads on from `head`, the first [`HEADER`] bytes.
+pub(crate) fn read_from(input: &mut Input, head: &[u8]) -> Result<Volume> {
+    if head.get(344..348) == Some(b"ni1\0".as_slice()) {
+        return Err(Error::unsupported(
+            format!("{}: a NIfTI header whose image is in another file", input.place()),
+            "convert the pair to one .nii or .nii.gz file",
+        ));
+    }
+    let header = NiftiHeader::from_reader(head)
+        .map_err(|e| input.invalid("header", e, format!("a NIfTI-1 header of {HEADER} bytes")))?;
+    if header.sizeof_hdr != HEADER as i32 {
+        return Err(input.invalid("sizeof_hdr", header.sizeof_hdr, HEADER.to_string()));
+    }
+    let shape = shape(input, &header)?;
+    let number = number(input, &header)?;
+    let offset = offset(input, &header)?;
+    let (slope, inter) = scaling(input, &header)?;
+    let affine = affine(input, &header)?;
+    let spacing: [f64; 3] = std::array::from_fn(|k| norm([affine[0][k], affine[1][k], affine[2][k]]));
+    let grid = VoxelGrid { shape, spacing, center: [0.0; 3] };
+    grid.validate(&input.place())?;
+    let count = grid.len().unwrap_or(0);
+    let order = match header.endianness {
+        Endianness::Little => Order::Little,
+        Endianness::Big => Order::Big,
+    };
+    input.skip(offset - HEADER as u64, "vox_offset")?;
+    let values = input.numbers("data", count, number, order, |x| (slope * x + inter) as f32)?;
+    // The file runs x fastest; the program's arrays run z fastest.
+    let data = Array3::from_shape_vec((shape[0], shape[1], shape[2]).f(), values)
+        .map_err(|e| input.invalid("dim", e, "as many voxels as values"))?;
+    let data = data.as_standard_layout().into_owned();
+    if let Some((at, x)) = data.indexed_iter().find(|(_, x)| !x.is_finite()) {
+        return Err(input.invalid(format!("voxel [{}, {}, {}]", at.0, at.1, at.2), x, "a finite number"));
+    }
+    Ok(Volume { data, grid, affine: Some(affine) })
+}
+
+/// Three axes of at least one voxel; later axes may only say 1.
+fn shape(input: &Input, header: &NiftiHeader) -> Result<[usize; 3]> {
+    let dim = header.dim.map(|d| d as i16);
+    let shown = || format!("{dim:?}");
+    if !(3..=7).contains(&dim[0]) {
+        return Err(input.invalid("dim[0]", dim[0], "3 (a volume), up to 7 if the later axes are 1"));
+    }
+    if dim[1..4].iter().any(|d| *d < 1) {
+        return Err(input.invalid("dim", shown(), "at least one voxel along x, y and z"));
+    }
+    if let Some(k) = (4..=dim[0] as usize).find(|&k| dim[k] != 1) {
+        let expected = "1: one volume, not a series (take one out of it first)";
+        return Err(input.invalid(format!("dim[{k}]"), dim[k], expected));
+    }
+    Ok([dim[1] as usize, dim[2] as usize, dim[3] as usize])
+}
+
+fn number(input: &Input, header: &NiftiHeader) -> Result<Number> {
+    let number = match header.datatype {
+        2 => Number::U8,
+        4 => Number::I16,
+        8 => Number::I32,
+        16 => Number::F32,
+        64 => Number::F64,
+        256 => Number::I8,
+        512 => Number::U16,
+        768 => Number::U32,
+        1024 => Number::I64,
+        1280 => Number::U64,
+        other => {
+            let name = match other {
+                1 => " (bits)",
+                32 | 1792 | 2048 => " (complex)",
+                128 | 2304 => " (colour)",
+                1536 => " (128-bit float)",
+                _ => "",
+            };
+            let expected = "a real number of 8 to 64 bits: 2, 4, 8, 16, 64, 256, 512, 768, 1024 or 1280";
+            return Err(input.invalid("datatype", format!("{other}{name}"), expected));
+        }
+    };
+    let bits = 8 * number.bytes() as i16;
+    if header.bitpix != bits {
+        let expected = format!("{bits}, which datatype {} takes", header.datatype);
+        return Err(input.invalid("bitpix", header.bitpix, expected));
+    }
+    Ok(number)
+}
+
+fn offset(input: &Input, header: &NiftiHeader) -> Result<u64> {
+    let offset = header.vox_offset;
+    // Zero is common in the wild and can only mean the earliest place there is.
+    if offset == 0.0 {
+        return Ok(DATA);
+    }
+    // Beyond 2^24 a 32-bit float no longer counts single bytes; no extension is that long.
+    if offset.fract() != 0.0 || !(HEADER as f32..16_777_216.0).contains(&offset) {
+        return Err(input.invalid("vox_offset", offset, "a whole number of bytes from 352 to 16777215"));
+    }
+    Ok(offset as u64)
+}
+
+/// Slope and intercept; the standard takes a slope of 0 for "not scaled", and tools take one that is not finite so.
+fn scaling(input: &Input, header: &NiftiHeader) -> Result<(f64, f64)> {
+    let (slope, inter) = (header.scl_slope, header.scl_inter);
+    if !slope.is_finite() {
+        tracing::warn!("{}: scl_slope is {slope}: the values are taken as they are stored", input.place());
+        return Ok((1.0, 0.0));
+    }
+    if slope == 0.0 {
+        return Ok((1.0, 0.0));
+    }
+    if !inter.is_finite() {
+        return Err(input.invalid("scl_inter", inter, "a finite number beside a slope that is one"));
+    }
+    Ok((slope as f64, inter as f64))
+}
+
+/// Voxel index to millimetres: sform, else qform, else the voxel sizes alone.
+fn affine(input: &Input, header: &NiftiHeader) -> Result<Affine> {
+    let mm = match header.xyzt_units & 7 {
+        1 => 1000.0,
+        0 | 2 => 1.0,
+        3 => 0.001,
+        other => return Err(input.invalid("xyzt_units", other, "0 (not said), 1 (m), 2 (mm) or 3 (µm)")),
+    };
+    let (field, rows) = if header.sform_code > 0 {
+        ("sform (srow_x, srow_y, srow_z)", [header.srow_x, header.srow_y, header.srow_z].map(|r| r.map(f64::from)))
+    } else if header.qform_code > 0 {
+        ("qform (quatern, qoffset, pixdim)", quaternion(header))
+    } else {
+        let mut rows = [[0.0; 4]; 3];
+        for k in 0..3 {
+            rows[k][k] = f64::from(header.pixdim[k + 1]).abs();
+        }
+        ("pixdim", rows)
+    };
+    let determinant = {
+        let c = |k: usize| [rows[0][k], rows[1][k], rows[2][k]];
+        conefield_core::geometry::dot(conefield_core::geometry::cross(c(0), c(1)), c(2))
+    };
+    if !rows.iter().flatten().all(|x| x.is_finite()) || determinant == 0.0 {
+        return Err(input.invalid(field, format!("{rows:?}"), "finite numbers and three independent voxel axes"));
+    }
+    let [x, y, z] = rows.map(|r| r.map(|v| v * mm));
+    Ok([x, y, z, [0.0, 0.0, 0.0, 1.0]])
+}
+
+/// The standard's method 2: a rotation as a unit quaternion, voxel sizes, and the sign of the third axis in
+/// `pixdim[0]`.
+fn quaternion(header: &NiftiHeader) -> [[f64; 4]; 3] {
+    let [mut b, mut c, mut d] = [header.quatern_b, header.quatern_c, header.quatern_d].map(f64::from);
+    let squares = b * b + c * c + d * d;
+    // Stored without its first component, which rounding may leave a little below the root of zero.
+    let a = if squares > 1.0 {
+        let n = squares.sqrt();
+        (b, c, d) = (b / n, c / n, d / n);
+        0.0
+    } else {
+        (1.0 - squares).sqrt()
+    };
+    let size: [f64; 3] = std::array::from_fn(|k| f64::from(header.pixdim[k + 1]).abs());
+    let flip = if header.pixdim[0] < 0.0 { -1.0 } else { 1.0 };
+    let s = [size[0], size[1], size[2] * flip];
+    let r = [
+        [a * a + b * b - c * c - d * d, 2.0 * (b * c - a * d), 2.0 * (b * d + a * c)],
+        [2.0 * (b * c + a * d), a * a + c * c - b * b - d * d, 2.0 * (c * d - a * b)],
+        [2.0 * (b * d - a * c), 2.0 * (c * d + a * b), a * a + d * d - b * b - c * c],
+    ];
+    let t = [header.quatern_x, header.quatern_y, header.quatern_z].map(f64::from);
+    std::array::from_fn(|i| [r[i][0] * s[0], r[i][1] * s[1], r[i][2] * s[2], t[i]])
+}
+
+/// Writes `volume` as `f32` with an sform: its own affine, or one that puts the grid's centre at `grid.center`.
+pub(crate) fn write(w: &mut dyn Write, path: &Path, volume: &Volume) -> Result<()> {
+    let grid = &volume.grid;
+    let place = path.display().to_string();
+    if grid.shape.iter().any(|&n| n > i16::MAX as usize) {
+        let expected = "at most 32767 voxels an axis, which is all that NIfTI-1 can say (write .npy)";
+        return Err(Error::invalid(place, "shape", format!("{:?}", grid.shape), expected));
+    }
+    let (code, affine) = match volume.affine {
+        Some(a) if fits(&a, grid.spacing) => (1i16, a),
+        Some(_) => {
+            tracing::warn!(
+                "{place}: the affine's voxel sizes are not the grid's {:?} mm: it is replaced by one from the grid",
+                grid.spacing
+            );
+            (2, centred(grid))
+        }
+        None => (2, centred(grid)),
+    };
+    let mut h = [0u8; DATA as usize];
+    let mut put = |at: usize, bytes: &[u8]| h[at..at + bytes.len()].copy_from_slice(bytes);
+    put(0, &(HEADER as i32).to_le_bytes());
+    put(38, b"r");
+    let [nx, ny, nz] = grid.shape.map(|n| n as i16);
+    for (i, d) in [3, nx, ny, nz, 1, 1, 1, 1].iter().enumerate() {
+        put(40 + 2 * i, &d.to_le_bytes());
+    }
+    put(70, &16i16.to_le_bytes());
+    put(72, &32i16.to_le_bytes());
+    let [sx, sy, sz] = grid.spacing.map(|s| s as f32);
+    for (i, p) in [1.0, sx, sy, sz, 1.0, 1.0, 1.0, 1.0].iter().enumerate() {
+        put(76 + 4 * i, &p.to_le_bytes());
+    }
+    put(108, &(DATA as f32).to_le_bytes());
+    put(112, &1f32.to_le_bytes());
+    put(123, &[2]);
+    put(148, b"conefield");
+    put(254, &code.to_le_bytes());
+    for (i, x) in affine[..3].iter().flatten().enumerate() {
+        put(280 + 4 * i, &(*x as f32).to_le_bytes());
+    }
+    put(344, b"n+1\0");
+    let io = |e| Error::io(path, e);
+    w.write_all(&h).map_err(io)?;
+    let [nx, ny, nz] = grid.shape;
+    let mut row = Vec::with_capacity(nx * 4);
+    for z in 0..nz {
+        for y in 0..ny {
+            row.clear();
+            row.extend((0..nx).flat_map(|x| volume.data[[x, y, z]].to_le_bytes()));
+            w.write_all(&row).map_err(io)?;
+        }
+    }
+    Ok(())
+}
+
+/// Whether the affine's columns are as long as the voxels, to the precision of files.
+fn fits(affine: &Affine, spacing: [f64; 3]) -> bool {
+    (0..3).all(|k| {
+        let n = norm([affine[0][k], affine[1][k], affine[2][k]]);
+        (n - spacing[k]).abs() <= 1e-3 * spacing[k]
+    })
+}
+
+fn centred(grid: &VoxelGrid) -> Affine {
+    let first = grid.voxel([0; 3]);
+    let s = grid.spacing;
+    [[s[0], 0.0, 0.0, first[0]], [0.0, s[1], 0.0, first[1]], [0.0, 0.0, s[2], first[2]], [0.0, 0.0, 0.0, 1.0]]
+}
+
+#[cfg(test)]
+mod tests {
+    use crate::testing::data;
+    use crate::{read_volume, write_volume};
+    use conefield_core::scan::Volume;
+    use ndarray::Array3;
+    use std::io::{Read, Write};
+    use std::path::PathBuf;
+
+    fn volume() -> Volume {
+        let data = Array3::from_shape_fn((4, 3, 2), |(x, y, z)| x as f32 + 10.0 * y as f32 + 100.0 * z as f32);
+        Volume::centered(data, [0.5, 0.75, 2.0])
+    }
+
+    /// The bytes of [`volume`] as `.nii`.
+    fn bytes() -> Vec<u8> {
+        let dir = tempfile::tempdir().unwrap();
+        let path = dir.path().join("a.nii");
+        write_volume(&path, &volume()).unwrap();
+        std::fs::read(&path).unwrap()
+    }
+
+    fn gz(bytes: &[u8]) -> Vec<u8> {
+        let mut e = flate2::write::GzEncoder::new(Vec::new(), flate2::Compression::fast());
+        e.write_all(bytes).unwrap();
+        e.finish().unwrap()
+    }
+
+    struct File(#[allow(dead_code)] tempfile::TempDir, PathBuf);
+
+    fn file(name: &str, bytes: &[u8]) -> File {
+        let dir = tempfile::tempdir().unwrap();
+        let path = dir.path().join(name);
+        std::fs::write(&path, bytes).unwrap();
+        File(dir, path)
+    }
+
+    fn refused(bytes: &[u8], words: &[&str]) {
+        for (name, bytes) in [("bad.nii", bytes.to_vec()), ("bad.nii.gz", gz(bytes))] {
+            let f = file(name, &bytes);
+            let e = read_volume(&f.1).unwrap_err().to_string();
+            assert!(e.contains(name), "{e}");
+            assert!(words.iter().all(|w| e.contains(w)), "{words:?} are not all in: {e}");
+        }
+    }
+
+    fn with(at: usize, bytes_at: &[u8]) -> Vec<u8> {
+        let mut b = bytes();
+        b[at..at + bytes_at.len()].copy_from_slice(bytes_at);
+        b
+    }
+
+    #[test]
+    fn what_is_written_comes_back() {
+        let dir = tempfile::tempdir().unwrap();
+        let mut v = volume();
+        for name in ["a.nii", "a.nii.gz", "B.NII.GZ"] {
+            let path = dir.path().join(name);
+            write_volume(&path, &v).unwrap();
+            let back = read_volume(&path).unwrap();
+            assert_eq!(back.data, v.data);
+            assert!(back.data.is_standard_layout());
+            assert_eq!(back.grid, v.grid);
+            // The centre of 4×3×2 voxels of 0.5×0.75×2 mm is 1.5, 1 and 0.5 voxels from the first one.
+            let a = back.affine.unwrap();
+            assert_eq!([a[0][3], a[1][3], a[2][3]], [-0.75, -0.75, -1.0]);
+        }
+        let turned = [[0.0, 0.75, 0.0, 5.0], [-0.5, 0.0, 0.0, 6.0], [0.0, 0.0, 2.0, -7.0], [0.0, 0.0, 0.0, 1.0]];
+        v.affine = Some(turned);
+        let path = dir.path().join("turned.nii.gz");
+        write_volume(&path, &v).unwrap();
+        let back = read_volume(&path).unwrap();
+        assert_eq!((back.affine, back.grid), (Some(turned), v.grid));
+        // An affine of other voxels would make the file contradict itself.
+        v.affine.as_mut().unwrap()[1][0] = -0.9;
+        write_volume(&path, &v).unwrap();
+        assert_eq!(read_volume(&path).unwrap().grid, v.grid);
+    }
+
+    #[test]
+    fn content_decides_over_the_name() {
+        let f = file("packed.nii", &gz(&bytes()));
+        assert_eq!(read_volume(&f.1).unwrap().data, volume().data);
+        let f = file("plain.npy", &bytes());
+        assert_eq!(read_volume(&f.1).unwrap().data, volume().data);
+    }
+
+    #[test]
+    fn integers_scale_and_swap() {
+        // Big-endian int16 with slope and intercept, 2×1×1.
+        let mut b = vec![0u8; 352];
+        let mut put = |at: usize, x: &[u8]| b[at..at + x.len()].copy_from_slice(x);
+        put(0, &348i32.to_be_bytes());
+        for (i, d) in [4i16, 2, 1, 1, 1, 1, 1, 1].iter().enumerate() {
+            put(40 + 2 * i, &d.to_be_bytes());
+        }
+        put(70, &4i16.to_be_bytes());
+        put(72, &16i16.to_be_bytes());
+        for (i, p) in [1.0f32, 2.0, -3.0, 4.0].iter().enumerate() {
+            put(76 + 4 * i, &p.to_be_bytes());
+        }
+        put(112, &0.5f32.to_be_bytes());
+        put(116, &(-1.0f32).to_be_bytes());
+        put(123, &[3]);
+        put(344, b"n+1\0");
+        b.extend([(-4i16).to_be_bytes(), 6i16.to_be_bytes()].concat());
+        let v = read_volume(&file("a.nii", &b).1).unwrap();
+        assert_eq!(v.data.as_slice().unwrap(), [-3.0, 2.0]);
+        // Micrometres, no orientation: the voxel sizes alone.
+        assert_eq!(v.grid.spacing, [0.002, 0.003, 0.004]);
+        // A slope of zero or one that is no number: the values as stored.
+        for slope in [0.0f32, f32::NAN] {
+            b[112..116].copy_from_slice(&slope.to_be_bytes());
+            assert_eq!(read_volume(&file("a.nii", &b).1).unwrap().data.as_slice().unwrap(), [-4.0, 6.0]);
+        }
+        // A quarter turn about z, as method 2 stores it.
+        let mut put = |at: usize, x: &[u8]| b[at..at + x.len()].copy_from_slice(x);
+        put(252, &1i16.to_be_bytes());
+        put(264, &std::f32::consts::FRAC_1_SQRT_2.to_be_bytes());
+        put(268, &10f32.to_be_bytes());
+        put(76, &(-1f32).to_be_bytes());
+        put(123, &[2]);
+        let a = read_volume(&file("a.nii", &b).1).unwrap().affine.unwrap();
+        let want = [[0.0, -3.0, 0.0, 10.0], [2.0, 0.0, 0.0, 0.0], [0.0, 0.0, -4.0, 0.0]];
+        for (a, w) in a.iter().flatten().zip(want.iter().flatten()) {
+            assert!((a - w).abs() < 1e-6, "{a} {w}");
+        }
+    }
+
+    #[test]
+    fn hostile_headers_are_refused_in_words() {
+        let b = bytes();
+        refused(&b[..b.len() - 1], &["data", "96 bytes"]);
+        refused(&[b.as_slice(), &[0]].concat(), &["data", "96 bytes"]);
+        refused(&b[..351], &["bytes"]);
+        refused(&b[..100], &["NIfTI"]);
+        refused(&[], &["NIfTI"]);
+        refused(b"a text that is no volume", &["NIfTI", "NumPy"]);
+        refused(&with(0, &1i32.to_le_bytes()), &["sizeof_hdr"]);
+        refused(&with(42, &(-4i16).to_le_bytes()), &["dim", "-4"]);
+        refused(&with(42, &0i16.to_le_bytes()), &["dim", "at least one voxel"]);
+        refused(&with(40, &2i16.to_le_bytes()), &["dim[0]", "found 2"]);
+        refused(
+            &[with(40, &4i16.to_le_bytes())[..48].to_vec(), with(48, &9i16.to_le_bytes())[48..].to_vec()].concat(),
+            &["dim[4]", "found 9", "series"],
+        );
+        refused(&with(42, &[0xff, 0x7f, 0xff, 0x7f, 0xff, 0x7f]), &["data", "140724603846652"]);
+        refused(&with(70, &2048i16.to_le_bytes()), &["datatype", "complex"]);
+        refused(&with(70, &999i16.to_le_bytes()), &["datatype", "999"]);
+        refused(&with(72, &16i16.to_le_bytes()), &["bitpix", "found 16", "32"]);
+        refused(&with(108, &f32::NAN.to_le_bytes()), &["vox_offset", "NaN"]);
+        refused(&with(108, &1e9f32.to_le_bytes()), &["vox_offset"]);
+        refused(&with(108, &4096f32.to_le_bytes()), &["vox_offset", "end of the file"]);
+        refused(&with(116, &f32::INFINITY.to_le_bytes()), &["scl_inter", "inf"]);
+        refused(&with(280, &[0; 48]), &["sform", "independent"]);
+        refused(&with(280, &f32::NAN.to_le_bytes()), &["sform", "NaN"]);
+        refused(&with(123, &[5]), &["xyzt_units", "5"]);
+        refused(&with(344, b"ni1\0"), &["another file"]);
+        // Third stored voxel: x 2, y 0, z 0.
+        refused(&with(352 + 8, &f32::NAN.to_le_bytes()), &["voxel [2, 0, 0]", "NaN"]);
+    }
+
+    #[test]
+    fn a_damaged_gzip_stream_is_refused() {
+        let mut packed = gz(&bytes());
+        let n = packed.len();
+        packed[n - 6] ^= 0xff;
+        let f = file("a.nii.gz", &packed);
+        let e = read_volume(&f.1).unwrap_err().to_string();
+        assert!(e.contains("a.nii.gz") && e.contains("gzip stream"), "{e}");
+        packed.truncate(n / 2);
+        std::fs::write(&f.1, &packed).unwrap();
+        let e = read_volume(&f.1).unwrap_err().to_string();
+        assert!(e.contains("a.nii.gz") && e.contains("gzip stream"), "{e}");
+    }
+
+    proptest::proptest! {
+        #[test]
+        fn no_header_makes_it_panic(changes in proptest::collection::vec((0usize..448, 0u8..), 1..12)) {
+            let mut b = bytes();
+            for (at, x) in changes {
+                b[at] = x;
+            }
+            let _ = read_volume(&file("a.nii", &b).1);
+            let _ = read_volume(&file("a.nii.gz", &gz(&b)).1);
+        }
+    }
+
+    #[test]
+    fn a_clinical_file_keeps_its_place_and_spacing() {
+        let Some(path) = data("clinical/abdomen_ct_hu.nii.gz") else { return };
+        let v = read_volume(&path).unwrap();
+        assert_eq!(v.grid.shape, [122, 101, 112]);
+        for s in v.grid.spacing {
+            assert!((s - 3.0).abs() < 1e-6, "{s}");
+        }
+        assert_eq!(v.grid.center, [0.0; 3]);
+        let low = v.data.iter().copied().fold(f32::INFINITY, f32::min);
+        let high = v.data.iter().copied().fold(f32::NEG_INFINITY, f32::max);
+        assert!((-3100.0..=-900.0).contains(&low) && high > 300.0, "{low} to {high} are no Hounsfield units");
+        // Against the raw header: int32, sform rows at byte 280, x fastest.
+        let mut raw = Vec::new();
+        flate2::read::MultiGzDecoder::new(std::fs::File::open(&path).unwrap()).read_to_end(&mut raw).unwrap();
+        let f = |at: usize| f32::from_le_bytes(raw[at..at + 4].try_into().unwrap()) as f64;
+        let a = v.affine.unwrap();
+        for r in 0..3 {
+            for c in 0..4 {
+                assert_eq!(a[r][c], f(280 + 16 * r + 4 * c));
+            }
+        }
+        assert!((0..3).any(|r| a[r][3] != 0.0), "the file has an offset");
+        let start = f(108).max(352.0) as usize;
+        for (x, y, z) in [(0, 0, 0), (60, 50, 56), (121, 3, 111), (5, 100, 7)] {
+            let at = start + 4 * (x + 122 * (y + 101 * z));
+            assert_eq!(v.data[[x, y, z]], i32::from_le_bytes(raw[at..at + 4].try_into().unwrap()) as f32);
+        }
+        let dir = tempfile::tempdir().unwrap();
+        let out = dir.path().join("out.nii.gz");
+        write_volume(&out, &v).unwrap();
+        let back = read_volume(&out).unwrap();
+        assert_eq!((back.affine, back.grid, back.data), (v.affine, v.grid, v.data));
+    }
+}

@@ -1,0 +1,309 @@
+//! NumPy's `.npy`: a header in Python's notation, then the numbers.
+
+use crate::input::Input;
+use crate::number::{Number, Order};
+use conefield_core::{Error, Result};
+use ndarray::{Array, ArrayD, Dimension, IxDyn, ShapeBuilder};
+use ndarray_npy::WriteNpyExt;
+use std::io::Write;
+use std::path::Path;
+
+/// The six bytes that every file starts with.
+pub(crate) const MAGIC: &[u8] = b"\x93NUMPY";
+
+/// Longest header that is read; NumPy's own are below 200 bytes.
+const LONGEST_HEADER: usize = 1 << 16;
+
+/// What the header says.
+#[derive(Debug, PartialEq)]
+struct Header {
+    number: Number,
+    order: Order,
+    fortran: bool,
+    shape: Vec<usize>,
+}
+
+/// Reads an array with the named axes, converted to `f32` in C order; refuses values that are not finite.
+pub(crate) fn read(path: &Path, axes: &[&str]) -> Result<ArrayD<f32>> {
+    read_from(&mut Input::open(path)?, Vec::new(), axes)
+}
+
+/// Reads on from `start`, the bytes (at most the first eight) that were read from `input` to tell the format.
+pub(crate) fn read_from(input: &mut Input, start: Vec<u8>, axes: &[&str]) -> Result<ArrayD<f32>> {
+    let header = read_header(input, start)?;
+    let expected = || format!("{} axes ({})", axes.len(), axes.join(", "));
+    if header.shape.len() != axes.len() {
+        return Err(input.invalid("shape", shape_text(&header.shape), expected()));
+    }
+    if header.shape.contains(&0) {
+        return Err(input.invalid("shape", shape_text(&header.shape), "at least one element along every axis"));
+    }
+    let count = header
+        .shape
+        .iter()
+        .try_fold(1usize, |n, &s| n.checked_mul(s))
+        .filter(|n| n.checked_mul(8).is_some_and(|b| b <= isize::MAX as usize))
+        .ok_or_else(|| input.invalid("shape", shape_text(&header.shape), "a size that can be addressed"))?;
+    let values = input.numbers("data", count, header.number, header.order, |x| x as f32)?;
+    let array = ArrayD::from_shape_vec(IxDyn(&header.shape).set_f(header.fortran), values)
+        .map_err(|e| input.invalid("shape", e, expected()))?;
+    let array = if array.is_standard_layout() { array } else { array.as_standard_layout().into_owned() };
+    if let Some((at, x)) = array.indexed_iter().find(|(_, x)| !x.is_finite()) {
+        return Err(input.invalid(format!("data{:?}", at.slice()), x, "a finite number"));
+    }
+    Ok(array)
+}
+
+/// Writes `array` as little-endian `f32`.
+pub(crate) fn write<D: Dimension>(w: &mut dyn Write, path: &Path, array: &Array<f32, D>) -> Result<()> {
+    array.write_npy(w).map_err(|e| match e {
+        ndarray_npy::WriteNpyError::Io(e) => Error::io(path, e),
+        e => Error::invalid(path.display().to_string(), "data", e, "an array that NumPy's format can hold"),
+    })
+}
+
+fn read_header(input: &mut Input, start: Vec<u8>) -> Result<Header> {
+    let mut bytes = start;
+    let mut fill = |input: &mut Input, n: usize| -> Result<Vec<u8>> {
+        if bytes.len() < n {
+            let more = input.exactly(n - bytes.len(), "header")?;
+            bytes.extend(more);
+        }
+        Ok(bytes.drain(..n).collect())
+    };
+    let magic = fill(input, 8)?;
+    if !magic.starts_with(MAGIC) {
+        return Err(input.invalid("magic", format!("{:02x?}", &magic[..6]), "93 4e 55 4d 50 59 (\\x93NUMPY)"));
+    }
+    let length = match magic[6] {
+        1 => fill(input, 2)?.iter().rev().fold(0usize, |n, b| n << 8 | *b as usize),
+        2 | 3 => fill(input, 4)?.iter().rev().fold(0usize, |n, b| n << 8 | *b as usize),
+        v => return Err(input.invalid("version", v, "1, 2 or 3")),
+    };
+    if length > LONGEST_HEADER {
+        return Err(input.invalid("header length", length, format!("at most {LONGEST_HEADER} bytes")));
+    }
+    let raw = fill(input, length)?;
+    let text = String::from_utf8_lossy(&raw);
+    let (mut descr, mut fortran, mut shape) = (None, None, None);
+    let mut parser = Python { rest: text.trim() };
+    parser
+        .dict(|key, value| {
+            match (key, value) {
+                ("descr", Value::Text(t)) => descr = Some(t),
+                ("fortran_order", Value::Bool(b)) => fortran = Some(b),
+                ("shape", Value::Tuple(s)) => shape = Some(s),
+                _ => return None,
+            }
+            Some(())
+        })
+        .ok_or_else(|| {
+            let shown: String = text.chars().take(200).collect();
+            input.invalid("header", shown.trim(), "{'descr': '<f4', 'fortran_order': False, 'shape': (…), }")
+        })?;
+    let lacks = |field: &str| input.invalid(field, "nothing", "an entry in the header");
+    let descr = descr.ok_or_else(|| lacks("descr"))?;
+    let (number, order) = element(&descr).ok_or_else(|| {
+        input.invalid("descr", format!("'{descr}'"), "real numbers: b1, i1 to i8, u1 to u8, f4 or f8")
+    })?;
+    Ok(Header {
+        number,
+        order,
+        fortran: fortran.ok_or_else(|| lacks("fortran_order"))?,
+        shape: shape.ok_or_else(|| lacks("shape"))?,
+    })
+}
+
+fn element(descr: &str) -> Option<(Number, Order)> {
+    let (order, kind) = match descr.chars().next()? {
+        '<' => (Order::Little, &descr[1..]),
+        '>' => (Order::Big, &descr[1..]),
+        '|' => (Order::Little, &descr[1..]),
+        '=' => (if cfg!(target_endian = "big") { Order::Big } else { Order::Little }, &descr[1..]),
+        _ => (Order::Little, descr),
+    };
+    let number = match kind {
+        "b1" => Number::Bool,
+        "u1" => Number::U8,
+        "i1" => Number::I8,
+        "u2" => Number::U16,
+        "i2" => Number::I16,
+        "u4" => Number::U32,
+        "i4" => Number::I32,
+        "u8" => Number::U64,
+        "i8" => Number::I64,
+        "f4" => Number::F32,
+        "f8" => Number::F64,
+        _ => return None,
+    };
+    Some((number, order))
+}
+
+fn shape_text(shape: &[usize]) -> String {
+    format!("{shape:?}")
+}
+
+/// The three kinds of value that stand in a header.
+enum Value {
+    Text(String),
+    Bool(bool),
+    Tuple(Vec<usize>),
+}
+
+/// Reads the little of Python's notation that headers use.
+struct Python<'a> {
+    rest: &'a str,
+}
+
+impl Python<'_> {
+    fn eat(&mut self, token: &str) -> Option<()> {
+        self.rest = self.rest.trim_start().strip_prefix(token)?;
+        Some(())
+    }
+
+    fn dict(&mut self, mut entry: impl FnMut(&str, Value) -> Option<()>) -> Option<()> {
+        self.eat("{")?;
+        loop {
+            if self.eat("}").is_some() {
+                return self.rest.trim().is_empty().then_some(());
+            }
+            let key = self.text()?;
+            self.eat(":")?;
+            let value = self.value()?;
+            entry(&key, value)?;
+            if self.eat(",").is_none() {
+                self.eat("}")?;
+                return self.rest.trim().is_empty().then_some(());
+            }
+        }
+    }
+
+    fn text(&mut self) -> Option<String> {
+        self.rest = self.rest.trim_start();
+        let quote = self.rest.chars().next().filter(|c| matches!(c, '\'' | '"'))?;
+        let inner = &self.rest[1..];
+        let end = inner.find(quote)?;
+        self.rest = &inner[end + 1..];
+        Some(inner[..end].to_string())
+    }
+
+    fn value(&mut self) -> Option<Value> {
+        if self.eat("True").is_some() {
+            return Some(Value::Bool(true));
+        }
+        if self.eat("False").is_some() {
+            return Some(Value::Bool(false));
+        }
+        if self.eat("(").is_none() {
+            return self.text().map(Value::Text);
+        }
+        let mut shape = Vec::new();
+        loop {
+            if self.eat(")").is_some() {
+                return Some(Value::Tuple(shape));
+            }
+            self.rest = self.rest.trim_start();
+            let end = self.rest.find(|c: char| !c.is_ascii_digit())?;
+            shape.push(self.rest[..end].parse().ok()?);
+            self.rest = &self.rest[end..];
+            // Python 2 wrote long integers so.
+            let _ = self.eat("L");
+            if self.eat(",").is_none() {
+                self.eat(")")?;
+                return Some(Value::Tuple(shape));
+            }
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::testing::npy_bytes;
+    use ndarray::{Array3, array};
+
+    fn read_bytes(bytes: &[u8], axes: &[&str]) -> Result<ArrayD<f32>> {
+        let dir = tempfile::tempdir().unwrap();
+        let path = dir.path().join("a.npy");
+        std::fs::write(&path, bytes).unwrap();
+        read(&path, axes)
+    }
+
+    fn refused(bytes: &[u8], words: &[&str]) {
+        let e = read_bytes(bytes, &["x", "y", "z"]).unwrap_err().to_string();
+        assert!(e.contains("a.npy"), "{e}");
+        for w in words {
+            assert!(e.contains(w), "{w:?} is not in: {e}");
+        }
+    }
+
+    #[test]
+    fn what_is_written_comes_back() {
+        let dir = tempfile::tempdir().unwrap();
+        let path = dir.path().join("a.npy");
+        let a = Array3::from_shape_fn((3, 4, 5), |(x, y, z)| (x * 100 + y * 10 + z) as f32 - 7.5);
+        crate::write_atomic(&path, |w| write(w, &path, &a)).unwrap();
+        assert_eq!(read(&path, &["x", "y", "z"]).unwrap(), a.into_dyn());
+    }
+
+    #[test]
+    fn orders_and_types_are_read() {
+        let want = array![[0.0f32, 1.0, 2.0], [3.0, 4.0, 5.0]].into_dyn();
+        let c: Vec<u8> = (0..6u16).flat_map(|x| x.to_be_bytes()).collect();
+        assert_eq!(read_bytes(&npy_bytes(">u2", false, "(2, 3)", &c), &["r", "c"]).unwrap(), want);
+        let f: Vec<u8> = [0.0f64, 3.0, 1.0, 4.0, 2.0, 5.0].iter().flat_map(|x| x.to_le_bytes()).collect();
+        assert_eq!(read_bytes(&npy_bytes("<f8", true, "(2L, 3L)", &f), &["r", "c"]).unwrap(), want);
+        assert_eq!(
+            read_bytes(&npy_bytes("|b1", false, "(3,)", &[0, 1, 1]), &["i"]).unwrap(),
+            array![0.0f32, 1.0, 1.0].into_dyn()
+        );
+    }
+
+    #[test]
+    fn hostile_headers_are_refused_in_words() {
+        let ok = npy_bytes("<f4", false, "(1, 1, 2)", &[0; 8]);
+        assert!(read_bytes(&ok, &["x", "y", "z"]).is_ok());
+        refused(&ok[..ok.len() - 1], &["data", "7 bytes", "8 bytes"]);
+        refused(&ok[..20], &["header", "end of the file"]);
+        refused(&ok[..3], &["header"]);
+        refused(&[], &["header"]);
+        refused(b"not an array at all", &["magic"]);
+        refused(&npy_bytes("<f4", false, "(1, 2)", &[0; 8]), &["shape", "[1, 2]", "3 axes (x, y, z)"]);
+        refused(&npy_bytes("<f4", false, "(0, 1, 1)", &[]), &["shape", "at least one"]);
+        refused(&npy_bytes("<f4", false, "(4294967296, 4294967296, 4294967296)", &[]), &["shape", "addressed"]);
+        refused(&npy_bytes("<f4", false, "(99999999999999999999999, 1, 1)", &[]), &["header"]);
+        refused(&npy_bytes("<f4", false, "(100000, 100000, 10)", &[0; 8]), &["data", "8 bytes", "400000000000"]);
+        refused(&npy_bytes("<f4", false, "(-1, 1, 1)", &[0; 8]), &["header"]);
+        refused(&npy_bytes("|O", false, "(1, 1, 1)", &[0; 8]), &["descr", "'|O'"]);
+        refused(&npy_bytes("<c8", false, "(1, 1, 1)", &[0; 8]), &["descr", "<c8"]);
+        refused(&npy_bytes("é", false, "(1, 1, 1)", &[0; 8]), &["descr"]);
+        let mut long = ok.clone();
+        long.push(0);
+        refused(&long, &["data", "9 bytes"]);
+        let mut version = ok;
+        version[6] = 9;
+        refused(&version, &["version", "9"]);
+        let mut huge = npy_bytes("<f4", false, "(1, 1, 2)", &[0; 8]);
+        (huge[6], huge[8], huge[9], huge[10], huge[11]) = (2, 255, 255, 255, 255);
+        refused(&huge, &["header length"]);
+    }
+
+    #[test]
+    fn a_value_that_is_not_finite_is_named() {
+        let data: Vec<u8> = [0.0f32, f32::NAN].iter().flat_map(|x| x.to_le_bytes()).collect();
+        refused(&npy_bytes("<f4", false, "(1, 2, 1)", &data), &["data[0, 1, 0]", "NaN", "finite"]);
+    }
+
+    proptest::proptest! {
+        #[test]
+        fn no_bytes_make_it_panic(mut bytes in proptest::collection::vec(0u8.., 0..200), cut in 0usize..200) {
+            let mut good = npy_bytes("<f4", false, "(1, 1, 2)", &[0; 8]);
+            for (i, b) in bytes.drain(..).enumerate().filter(|(i, _)| i % 7 == 0) {
+                let n = good.len();
+                good[6 + i % (n - 6)] ^= b;
+            }
+            good.truncate(cut.max(8));
+            let _ = read_bytes(&good, &["x", "y", "z"]);
+        }
+    }
+}

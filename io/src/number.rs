@@ -1,0 +1,77 @@
+//! Numbers as files store them.
+
+/// How one number is stored.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(crate) enum Number {
+    Bool,
+    U8,
+    I8,
+    U16,
+    I16,
+    U32,
+    I32,
+    U64,
+    I64,
+    F32,
+    F64,
+}
+
+/// Which end of a number comes first.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(crate) enum Order {
+    Little,
+    Big,
+}
+
+impl Number {
+    /// Bytes a number.
+    pub fn bytes(self) -> usize {
+        match self {
+            Self::Bool | Self::U8 | Self::I8 => 1,
+            Self::U16 | Self::I16 => 2,
+            Self::U32 | Self::I32 | Self::F32 => 4,
+            Self::U64 | Self::I64 | Self::F64 => 8,
+        }
+    }
+
+    /// Appends the numbers in `raw` (whole numbers only) to `out`, through `map`.
+    pub fn decode(self, order: Order, raw: &[u8], out: &mut Vec<f32>, map: impl Fn(f64) -> f32) {
+        macro_rules! each {
+            ($t:ty) => {{
+                let (raw, _) = raw.as_chunks::<{ size_of::<$t>() }>();
+                match order {
+                    Order::Little => out.extend(raw.iter().map(|b| map(<$t>::from_le_bytes(*b) as f64))),
+                    Order::Big => out.extend(raw.iter().map(|b| map(<$t>::from_be_bytes(*b) as f64))),
+                }
+            }};
+        }
+        match self {
+            Self::Bool => out.extend(raw.iter().map(|b| map(if *b == 0 { 0.0 } else { 1.0 }))),
+            Self::U8 => each!(u8),
+            Self::I8 => each!(i8),
+            Self::U16 => each!(u16),
+            Self::I16 => each!(i16),
+            Self::U32 => each!(u32),
+            Self::I32 => each!(i32),
+            Self::U64 => each!(u64),
+            Self::I64 => each!(i64),
+            Self::F32 => each!(f32),
+            Self::F64 => each!(f64),
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn both_byte_orders_are_read() {
+        let mut out = Vec::new();
+        Number::I16.decode(Order::Little, &(-2i16).to_le_bytes(), &mut out, |x| x as f32);
+        Number::I16.decode(Order::Big, &(-2i16).to_be_bytes(), &mut out, |x| x as f32);
+        Number::F64.decode(Order::Big, &1.5f64.to_be_bytes(), &mut out, |x| x as f32);
+        Number::U64.decode(Order::Little, &u64::MAX.to_le_bytes(), &mut out, |x| x as f32);
+        assert_eq!(out, [-2.0, -2.0, 1.5, u64::MAX as f32]);
+    }
+}

@@ -1,0 +1,482 @@
+//! R2-Gaussian's folder: `meta_data.json`, one `.npy` a projection, `vol_gt.npy`.
+//!
+//! Its world is ours: source at `DSO·(cos a, sin a, 0)`, columns along `(-sin a, cos a, 0)`, rows towards −z; `nDetector`
+//! and `sDetector` are \[v, u\], the volume is \[x, y, z\]. `offDetector` is \[u, v\] and, as in TIGRE, its v points
+//! towards +z, against the rows. `offOrigin` is the volume's centre. Projections are integrals over the lengths of the
+//! file, whatever their unit is.
+
+use crate::input::read_text;
+use crate::orbit::Orbit;
+use crate::text::{Notation, parse};
+use crate::{folder, npy, rays, write_atomic, write_folder_atomic, write_text_atomic};
+use conefield_core::error::ensure;
+use conefield_core::geometry::{Geometry, VoxelGrid};
+use conefield_core::scan::{Scan, Unit, Volume};
+use conefield_core::{Error, Result};
+use ndarray::{Array2, Array3, Axis, Ix2, Ix3};
+use serde::Deserialize;
+use serde_json::json;
+use std::path::Path;
+
+/// The file that describes the folder.
+pub(crate) const META: &str = "meta_data.json";
+
+/// What an R2-Gaussian folder holds.
+#[derive(Debug, Clone)]
+pub struct R2Scan {
+    /// The views to reconstruct from.
+    pub train: Scan,
+    /// Views kept apart for testing.
+    pub test: Option<Scan>,
+    /// The volume they were simulated from, in `1/unit` of the scan.
+    pub volume: Option<Volume>,
+}
+
+#[derive(Deserialize)]
+struct Meta {
+    scanner: Scanner,
+    vol: Option<String>,
+    proj_train: Vec<Frame>,
+    #[serde(default)]
+    proj_test: Vec<Frame>,
+    /// Not R2-Gaussian's own, which reads past it: what our writer adds so that the unit survives.
+    unit: Option<Unit>,
+}
+
+#[derive(Deserialize)]
+struct Frame {
+    file_path: String,
+    angle: f64,
+}
+
+#[derive(Deserialize)]
+#[allow(non_snake_case)]
+struct Scanner {
+    mode: String,
+    DSD: f64,
+    DSO: f64,
+    nDetector: [usize; 2],
+    sDetector: Option<[f64; 2]>,
+    dDetector: Option<[f64; 2]>,
+    nVoxel: [usize; 3],
+    sVoxel: Option<[f64; 3]>,
+    dVoxel: Option<[f64; 3]>,
+    #[serde(default)]
+    offOrigin: [f64; 3],
+    #[serde(default)]
+    offDetector: [f64; 2],
+}
+
+/// Reads R2-Gaussian's folder: training views, test views and the volume.
+///
+/// The format does not name its unit of length. If the file has a `unit` entry, that holds. Otherwise the volume
+/// tells: where its values times the lengths of the file give the projections, as in the published data, the unit
+/// is called `r2` and taken for 1 mm; where the projections are a thousand times larger, the lengths are metres and
+/// the volume is in 1/mm. Anything else is taken as the first case, with a warning.
+pub fn read_r2(path: impl AsRef<Path>) -> Result<R2Scan> {
+    read(path.as_ref(), true)
+}
+
+/// As [`read_r2`], without the test views.
+pub(crate) fn read_train(folder: &Path) -> Result<R2Scan> {
+    read(folder, false)
+}
+
+fn read(folder: &Path, with_test: bool) -> Result<R2Scan> {
+    let file = folder.join(META);
+    let place = file.display().to_string();
+    let meta: Meta = parse(&file, &read_text(&file)?, Notation::Json)?;
+    let s = &meta.scanner;
+    if s.mode != "cone" {
+        let what = format!("{place}: scanner.mode: \"{}\"", s.mode);
+        return Err(Error::unsupported(what, "only \"cone\" is understood: rays must meet in one source"));
+    }
+    for (field, x) in [("scanner.DSO", s.DSO), ("scanner.DSD", s.DSD)] {
+        ensure(x.is_finite() && x > 0.0, &place, field, x, "a positive finite distance")?;
+    }
+    let pixel = each(&place, ["Detector", "[v, u]"], s.nDetector, s.sDetector, s.dDetector)?;
+    let spacing = each(&place, ["Voxel", "[x, y, z]"], s.nVoxel, s.sVoxel, s.dVoxel)?;
+    let grid = VoxelGrid { shape: s.nVoxel, spacing, center: s.offOrigin };
+    let orbit = |frames: &[Frame]| Orbit {
+        dso: s.DSO,
+        dsd: s.DSD,
+        pixel,
+        offset: [-s.offDetector[1], s.offDetector[0]],
+        angles: frames.iter().map(|f| f.angle).collect(),
+    };
+    let scan = |field: &str, frames: &[Frame]| -> Result<Scan> {
+        let geometry = Geometry { detector: s.nDetector, views: orbit(frames).views(), volume: grid };
+        geometry.validate(&format!("{place}: {field}"))?;
+        let projections = projections(folder, &place, field, frames, s.nDetector)?;
+        let provenance = json!({ "format": "r2", "folder": folder.file_name().map(|n| n.to_string_lossy()) });
+        Ok(Scan { geometry, projections, unit: Unit { name: "r2".into(), mm: 1.0 }, provenance })
+    };
+    let mut train = scan("proj_train", &meta.proj_train)?;
+    let mut test = (with_test && !meta.proj_test.is_empty()).then(|| scan("proj_test", &meta.proj_test)).transpose()?;
+    let data = meta.vol.as_deref().map(|name| volume(folder, &place, name, s.nVoxel)).transpose()?;
+    let (unit, mm, found) = length_unit(&place, meta.unit, &train, data.as_ref())?;
+    for s in [Some(&mut train), test.as_mut()].into_iter().flatten() {
+        s.geometry = s.geometry.scaled(mm);
+        s.unit = unit.clone();
+        s.provenance["unit_from"] = json!(found);
+        s.validate(&place)?;
+    }
+    let volume = data.map(|data| Volume { data, grid: train.geometry.volume, affine: None });
+    Ok(R2Scan { train, test, volume })
+}
+
+/// The unit, millimetres a length of the file, and how that is known.
+fn length_unit(
+    place: &str,
+    said: Option<Unit>,
+    train: &Scan,
+    volume: Option<&Array3<f32>>,
+) -> Result<(Unit, f64, &'static str)> {
+    if let Some(unit) = said {
+        let expected = "a positive finite number of millimetres";
+        ensure(unit.mm.is_finite() && unit.mm > 0.0, place, "unit.mm", unit.mm, expected)?;
+        let mm = unit.mm;
+        return Ok((unit, mm, "the file"));
+    }
+    let own = Unit { name: "r2".into(), mm: 1.0 };
+    let Some(ratio) = volume.and_then(|v| rays::measured_to_integrated(train, v)) else {
+        return Ok((own, 1.0, "nothing: lengths are taken for mm"));
+    };
+    let near = |x: f64| (0.8..1.25).contains(&(ratio / x));
+    if near(1000.0) {
+        return Ok((Unit::default(), 1000.0, "volume and projections: lengths in m, attenuation in 1/mm"));
+    }
+    if !near(1.0) {
+        tracing::warn!(
+            "{place}: the projections are {ratio:.3} times the integrals through the volume, not 1 or 1000: \
+             the volume may not be in the unit of the lengths"
+        );
+    }
+    Ok((own, 1.0, "volume and projections"))
+}
+
+/// Size of one pixel or voxel, from the whole (`s...`), the one (`d...`) or both if they agree.
+fn each<const N: usize>(
+    place: &str,
+    [what, axes]: [&str; 2],
+    n: [usize; N],
+    whole: Option<[f64; N]>,
+    one: Option<[f64; N]>,
+) -> Result<[f64; N]> {
+    let fields = |p: &str| format!("scanner.{p}{what}");
+    ensure(
+        n.iter().all(|&n| n > 0),
+        place,
+        &fields("n"),
+        format!("{n:?}"),
+        format!("at least 1 along each of {axes}"),
+    )?;
+    let divided = whole.map(|w| std::array::from_fn(|k| w[k] / n[k] as f64));
+    let (field, size): (_, [f64; N]) = match (one, divided) {
+        (Some(d), Some(w)) => {
+            let same = (0..N).all(|k| (d[k] - w[k]).abs() <= 1e-4 * w[k].abs());
+            ensure(same, place, &fields("d"), format!("{d:?}"), format!("{w:?}, which is s{what}/n{what}"))?;
+            (fields("d"), d)
+        }
+        (Some(d), None) => (fields("d"), d),
+        (None, Some(w)) => (fields("s"), w),
+        (None, None) => return Err(Error::invalid(place, fields("s"), "nothing", format!("lengths along {axes}"))),
+    };
+    ensure(
+        size.iter().all(|s| s.is_finite() && *s > 0.0),
+        place,
+        &field,
+        format!("{:?}", one.or(whole).unwrap_or(size)),
+        format!("positive finite lengths along {axes}"),
+    )?;
+    Ok(size)
+}
+
+fn projections(folder: &Path, place: &str, field: &str, frames: &[Frame], shape: [usize; 2]) -> Result<Array3<f32>> {
+    let mut all: Vec<f32> = Vec::new();
+    for (i, frame) in frames.iter().enumerate() {
+        let path = folder::inside(folder, place, &format!("{field}[{i}].file_path"), &frame.file_path)?;
+        let image: Array2<f32> = npy::read(&path, &["row", "column"])?
+            .into_dimensionality::<Ix2>()
+            .map_err(|e| Error::invalid(path.display().to_string(), "shape", e, "two axes"))?;
+        let (found, expected) = (format!("{:?}", image.shape()), format!("{shape:?}, as scanner.nDetector says"));
+        ensure(image.shape() == shape, &path.display().to_string(), "shape", found, expected)?;
+        all.extend(image.iter());
+    }
+    Array3::from_shape_vec((frames.len(), shape[0], shape[1]), all)
+        .map_err(|e| Error::invalid(place, field, e, "one projection a view"))
+}
+
+fn volume(folder: &Path, place: &str, name: &str, shape: [usize; 3]) -> Result<Array3<f32>> {
+    let path = folder::inside(folder, place, "vol", name)?;
+    let data = npy::read(&path, &["x", "y", "z"])?;
+    let (found, expected) = (format!("{:?}", data.shape()), format!("{shape:?}, as scanner.nVoxel says"));
+    ensure(data.shape() == shape, &path.display().to_string(), "shape", found, expected)?;
+    data.into_dimensionality::<Ix3>().map_err(|e| Error::invalid(path.display().to_string(), "shape", e, "three axes"))
+}
+
+/// Writes R2-Gaussian's folder, lengths in the unit of `train`. Its own reader wants a volume; without one the
+/// folder is written all the same, for other readers.
+///
+/// A scan that is no circle about z, or a test scan with another orbit, detector or grid, cannot be said in this
+/// format and is refused. An earlier folder is replaced only if it is empty or an R2-Gaussian folder with nothing
+/// else in it.
+pub fn write_r2(folder: impl AsRef<Path>, train: &Scan, test: Option<&Scan>, volume: Option<&Volume>) -> Result<()> {
+    let folder = folder.as_ref();
+    let place = folder.display().to_string();
+    let fit = |name: &str, s: &Scan| -> Result<Orbit> {
+        s.validate(&format!("{place}: {name}"))?;
+        Orbit::fit(&s.geometry.views).ok_or_else(|| {
+            let why = "R2-Gaussian's format only knows circles about z; write conefield's own format";
+            Error::unsupported(format!("{place}: {name} views that are not one circle"), why)
+        })
+    };
+    let orbit = fit("training", train)?;
+    let test = test.map(|t| fit("test", t).map(|o| (t, o))).transpose()?;
+    if let Some((t, o)) = &test {
+        let near = |a: f64, b: f64| (a - b).abs() <= 1e-6 * orbit.dsd;
+        let same = near(o.dso, orbit.dso)
+            && near(o.dsd, orbit.dsd)
+            && (0..2).all(|k| near(o.pixel[k], orbit.pixel[k]) && near(o.offset[k], orbit.offset[k]))
+            && t.geometry.detector == train.geometry.detector
+            && t.geometry.volume == train.geometry.volume;
+        let expected = "the orbit, detector and grid of the training views";
+        ensure(same, &place, "test views", "another geometry", expected)?;
+    }
+    if let Some(v) = volume {
+        let (found, expected) = (format!("{:?}", v.data.shape()), format!("{:?}", train.geometry.volume.shape));
+        ensure(v.data.shape() == train.geometry.volume.shape, &place, "shape of the volume", found, expected)?;
+    }
+    let known = |n: &str| [META, "proj_train", "proj_test", "vol_gt.npy"].contains(&n);
+    folder::may_replace(folder, "R2-Gaussian folder", known, &[META])?;
+
+    let mm = train.unit.mm;
+    let (g, grid) = (&train.geometry, &train.geometry.volume);
+    let size = grid.size();
+    let half = size.iter().copied().fold(0.0, f64::max) / 2.0;
+    let frames = |split: &str, angles: &[f64]| -> Vec<serde_json::Value> {
+        let frame = |(i, a): (usize, &f64)| json!({ "file_path": format!("{split}/{split}_{i:04}.npy"), "angle": a });
+        angles.iter().enumerate().map(frame).collect()
+    };
+    let mut meta = json!({
+        "scanner": {
+            "mode": "cone",
+            "filter": null,
+            "DSD": orbit.dsd / mm,
+            "DSO": orbit.dso / mm,
+            "nDetector": g.detector,
+            "sDetector": [orbit.pixel[0] * g.detector[0] as f64 / mm, orbit.pixel[1] * g.detector[1] as f64 / mm],
+            "nVoxel": grid.shape,
+            "sVoxel": size.map(|s| s / mm),
+            "offOrigin": grid.center.map(|c| c / mm),
+            "offDetector": [orbit.offset[1] / mm, -orbit.offset[0] / mm],
+            "accuracy": 0.5,
+            "totalAngle": 360.0,
+            "startAngle": orbit.angles.first().copied().unwrap_or(0.0).to_degrees(),
+            "noise": false,
+        },
+        "unit": train.unit,
+        // In units of half the longest side, as the published data has it.
+        "bbox": grid.bounds().map(|b| b.map(|x| x / half)),
+        "proj_train": frames("proj_train", &orbit.angles),
+        "proj_test": frames("proj_test", test.as_ref().map_or(&[], |(_, o)| &o.angles)),
+    });
+    if volume.is_some() {
+        meta["vol"] = json!("vol_gt.npy");
+    }
+    let text = serde_json::to_string_pretty(&meta)
+        .map_err(|e| Error::invalid(&place, META, e, "numbers that JSON can hold"))?;
+    write_folder_atomic(folder, |new| {
+        for (split, scan) in [("proj_train", Some(train)), ("proj_test", test.as_ref().map(|(t, _)| *t))] {
+            let sub = new.join(split);
+            std::fs::create_dir(&sub).map_err(|e| Error::io(&sub, e))?;
+            for (i, view) in scan.iter().flat_map(|s| s.projections.axis_iter(Axis(0))).enumerate() {
+                let path = sub.join(format!("{split}_{i:04}.npy"));
+                write_atomic(&path, |w| npy::write(w, &path, &view.to_owned()))?;
+            }
+        }
+        if let Some(v) = volume {
+            crate::write_volume(new.join("vol_gt.npy"), v)?;
+        }
+        write_text_atomic(new.join(META), &text)
+    })
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::testing::{data, scan};
+    use crate::{read_scan, read_truth};
+    use std::fs;
+
+    fn near(a: &Geometry, b: &Geometry) {
+        assert_eq!((a.detector, a.volume.shape), (b.detector, b.volume.shape));
+        for (v, w) in a.views.iter().zip(&b.views) {
+            let pair = [(v.source, w.source), (v.detector, w.detector), (v.u, w.u), (v.v, w.v)];
+            assert!(pair.iter().all(|(x, y)| (0..3).all(|k| (x[k] - y[k]).abs() < 1e-9)), "{v:?} {w:?}");
+        }
+        for k in 0..3 {
+            assert!((a.volume.spacing[k] - b.volume.spacing[k]).abs() < 1e-12);
+            assert!((a.volume.center[k] - b.volume.center[k]).abs() < 1e-12);
+        }
+    }
+
+    /// Root-mean-square difference of measured and integrated, relative to the measured, over a coarse detector.
+    fn error(s: &Scan, volume: &Volume, geometry: &Geometry) -> f64 {
+        let (mut d, mut m) = (0.0, 0.0);
+        for view in (0..geometry.views.len()).step_by(3) {
+            for row in (2..geometry.detector[0]).step_by(5) {
+                for column in (1..geometry.detector[1]).step_by(5) {
+                    let measured = f64::from(s.projections[[view, row, column]]);
+                    let ray = geometry.ray(view, row, column);
+                    let i = rays::integral(&volume.data, &geometry.volume, &ray) / s.unit.mm;
+                    d += (measured - i).powi(2);
+                    m += measured.powi(2);
+                }
+            }
+        }
+        (d / m).sqrt()
+    }
+
+    #[test]
+    fn conventions_agree_with_exact_projections() {
+        let Some(path) = data("interop/ellipsoids_50_r2") else { return };
+        let r = read_r2(&path).unwrap();
+        let (train, volume) = (&r.train, r.volume.as_ref().unwrap());
+        // Lengths of the file are metres, its attenuation is 1/mm: a cube of 100 mm, seen from 500 mm.
+        assert_eq!(train.unit, Unit::default());
+        assert!((train.geometry.volume.size()[0] - 100.0).abs() < 1e-9);
+        assert!((train.geometry.views[0].source[0] - 500.0).abs() < 1e-9);
+        assert_eq!((train.geometry.views.len(), train.geometry.detector), (50, [96, 96]));
+        let right = error(train, volume, &train.geometry);
+        let test = r.test.as_ref().unwrap();
+        let right_test = error(test, volume, &test.geometry);
+        let changed = |change: &dyn Fn(&mut conefield_core::geometry::View)| {
+            let mut g = train.geometry.clone();
+            g.views.iter_mut().for_each(change);
+            error(train, volume, &g)
+        };
+        let minus = |v: [f64; 3]| v.map(|x| -x);
+        let u = changed(&|v| v.u = minus(v.u));
+        let v = changed(&|v| v.v = minus(v.v));
+        let mirror = |p: [f64; 3]| [p[0], -p[1], p[2]];
+        let reversed = changed(&|v| {
+            (v.source, v.detector) = (mirror(v.source), mirror(v.detector));
+            // The same handedness of the detector, only the angle's sign differs.
+            v.u = minus(mirror(v.u));
+        });
+        println!("right {right:.4}, test {right_test:.4}, u {u:.4}, v {v:.4}, reversed {reversed:.4}");
+        assert!(right < 0.03 && right_test < 0.03, "{right} {right_test}");
+        for wrong in [u, v, reversed] {
+            assert!(wrong > 3.0 * right && wrong > 0.05, "{wrong} is hardly worse than {right}");
+        }
+        let (again, truth) = (read_scan(&path).unwrap(), read_truth(&path).unwrap().unwrap());
+        assert_eq!((again.projections, again.geometry), (train.projections.clone(), train.geometry.clone()));
+        assert_eq!(truth.data, volume.data);
+    }
+
+    #[test]
+    fn the_unit_comes_from_the_numbers() {
+        let dir = tempfile::tempdir().unwrap();
+        let mut s = scan();
+        s.unit = Unit { name: "r2".into(), mm: 1.0 };
+        // Without its offset the small detector sees the volume.
+        let mut orbit = Orbit::fit(&s.geometry.views).unwrap();
+        orbit.offset = [0.25, -0.5];
+        s.geometry.views = orbit.views();
+        let data = Array3::from_shape_fn((5, 6, 7), |(x, y, z)| 0.01 + 0.001 * (x + y * z) as f32);
+        let g = s.geometry.clone();
+        for ((a, v, u), p) in s.projections.indexed_iter_mut() {
+            *p = rays::integral(&data, &g.volume, &g.ray(a, v, u)) as f32;
+        }
+        let volume = Volume { data, grid: g.volume, affine: None };
+        let path = dir.path().join("r2");
+        write_r2(&path, &s, None, Some(&volume)).unwrap();
+        let file = path.join(META);
+        let mut meta: serde_json::Value = serde_json::from_str(&fs::read_to_string(&file).unwrap()).unwrap();
+        meta.as_object_mut().unwrap().remove("unit");
+        let mut save = |factor: f64| {
+            let scale = |v: &mut serde_json::Value| *v = json!(v.as_f64().unwrap() * factor);
+            let scanner = &mut meta["scanner"];
+            for key in ["DSO", "DSD"] {
+                scale(&mut scanner[key]);
+            }
+            for key in ["sDetector", "sVoxel", "offOrigin", "offDetector"] {
+                scanner[key].as_array_mut().unwrap().iter_mut().for_each(scale);
+            }
+            fs::write(&file, meta.to_string()).unwrap();
+        };
+        save(1.0);
+        let back = read_r2(&path).unwrap();
+        assert_eq!(back.train.unit.name, "r2");
+        near(&back.train.geometry, &g);
+        save(0.001);
+        let back = read_r2(&path).unwrap();
+        assert_eq!(back.train.unit, Unit::default());
+        near(&back.train.geometry, &g);
+        // Neither: taken as it stands.
+        save(100.0);
+        let back = read_r2(&path).unwrap();
+        assert_eq!(back.train.unit.name, "r2");
+        near(&back.train.geometry, &g.scaled(0.1));
+    }
+
+    #[test]
+    fn what_is_written_comes_back() {
+        let dir = tempfile::tempdir().unwrap();
+        let path = dir.path().join("r2");
+        let train = scan();
+        let (_, test) = train.split(&[1, 4]).unwrap();
+        let volume = Volume { data: Array3::from_elem((5, 6, 7), 0.5), grid: train.geometry.volume, affine: None };
+        write_r2(&path, &train, Some(&test), Some(&volume)).unwrap();
+        let back = read_r2(&path).unwrap();
+        near(&back.train.geometry, &train.geometry);
+        near(&back.test.as_ref().unwrap().geometry, &test.geometry);
+        assert_eq!(back.train.unit, train.unit);
+        assert_eq!(back.train.projections, train.projections);
+        assert_eq!(back.test.unwrap().projections, test.projections);
+        assert_eq!(back.volume.unwrap().data, volume.data);
+        // Lengths go out in the scan's own unit, centimetres here.
+        let meta: serde_json::Value = serde_json::from_str(&fs::read_to_string(path.join(META)).unwrap()).unwrap();
+        assert!((meta["scanner"]["DSO"].as_f64().unwrap() - 50.0).abs() < 1e-9);
+        // Once more over it, without volume and test.
+        write_r2(&path, &train, None, None).unwrap();
+        let back = read_r2(&path).unwrap();
+        assert!(back.test.is_none() && back.volume.is_none());
+        fs::write(path.join("mine.txt"), "").unwrap();
+        assert!(write_r2(&path, &train, None, None).unwrap_err().to_string().contains("mine.txt"));
+        let mut odd = train.clone();
+        odd.geometry.views[0].source[2] += 1.0;
+        let e = write_r2(dir.path().join("odd"), &odd, None, None).unwrap_err().to_string();
+        assert!(e.contains("circle"), "{e}");
+    }
+
+    #[test]
+    fn lying_descriptions_are_refused_in_words() {
+        let refused = |change: &dyn Fn(&mut serde_json::Value), words: &[&str]| {
+            let dir = tempfile::tempdir().unwrap();
+            let path = dir.path().join("r2");
+            write_r2(&path, &scan(), None, None).unwrap();
+            let file = path.join(META);
+            let mut meta: serde_json::Value = serde_json::from_str(&fs::read_to_string(&file).unwrap()).unwrap();
+            change(&mut meta);
+            fs::write(&file, serde_json::to_string_pretty(&meta).unwrap()).unwrap();
+            let e = read_r2(&path).unwrap_err().to_string();
+            assert!(words.iter().all(|w| e.contains(w)), "{words:?} are not all in: {e}");
+        };
+        refused(&|m| m["scanner"]["mode"] = json!("parallel"), &["meta_data.json", "mode", "parallel", "cone"]);
+        refused(&|m| m["scanner"]["DSO"] = json!(-1), &["scanner.DSO", "-1"]);
+        refused(&|m| m["scanner"]["DSO"] = json!("far"), &["line", "DSO", "far"]);
+        refused(&|m| m["scanner"]["nDetector"] = json!([4, 7]), &["proj_train_0000.npy", "[4, 6]", "[4, 7]"]);
+        refused(&|m| m["scanner"]["nDetector"] = json!([4, 0]), &["scanner.nDetector"]);
+        refused(&|m| m["scanner"]["nVoxel"] = json!([1u64 << 40, 1u64 << 40, 1]), &["volume.shape"]);
+        refused(&|m| m["scanner"]["sVoxel"] = json!(null), &["scanner.sVoxel", "nothing"]);
+        refused(&|m| m["scanner"]["dVoxel"] = json!([9, 9, 9]), &["scanner.dVoxel", "sVoxel"]);
+        refused(&|m| m["proj_train"] = json!([]), &["proj_train", "views"]);
+        refused(&|m| m["proj_train"][2]["file_path"] = json!("../x.npy"), &["proj_train[2].file_path", "inside"]);
+        refused(&|m| m["proj_train"][2]["file_path"] = json!("/etc/passwd"), &["proj_train[2].file_path", "inside"]);
+        refused(&|m| m["proj_train"][2]["file_path"] = json!("none.npy"), &["proj_train[2].file_path", "none.npy"]);
+        refused(&|m| m["vol"] = json!("vol_gt.npy"), &["vol", "vol_gt.npy"]);
+        refused(&|m| m["unit"]["mm"] = json!(0), &["unit.mm"]);
+    }
+}

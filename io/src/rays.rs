@@ -1,0 +1,65 @@
+//! Line integrals through a volume, exact enough to tell which unit a file is in.
+
+use conefield_core::geometry::{Ray, VoxelGrid};
+use conefield_core::scan::Scan;
+use ndarray::Array3;
+
+/// The integral of `data` along `ray`, in values times mm: trilinear between voxel centres, half a voxel a step.
+pub(crate) fn integral(data: &Array3<f32>, grid: &VoxelGrid, ray: &Ray) -> f64 {
+    let Some([near, far]) = ray.clip(grid.bounds()) else { return 0.0 };
+    let finest = grid.spacing.iter().copied().fold(f64::INFINITY, f64::min);
+    let steps = ((far - near) / (0.5 * finest)).ceil().clamp(1.0, 1e5) as usize;
+    let length = (far - near) / steps as f64;
+    let lower = grid.bounds()[0];
+    let mut sum = 0.0;
+    for i in 0..steps {
+        let p = ray.at(near + (i as f64 + 0.5) * length);
+        let mut low = [0usize; 3];
+        let mut high = [0usize; 3];
+        let mut part = [0.0f64; 3];
+        for k in 0..3 {
+            let last = (grid.shape[k] - 1) as f64;
+            // Between the outermost centres and the border the outermost value holds.
+            let x = ((p[k] - lower[k]) / grid.spacing[k] - 0.5).clamp(0.0, last);
+            low[k] = x as usize;
+            high[k] = (low[k] + 1).min(grid.shape[k] - 1);
+            part[k] = x - low[k] as f64;
+        }
+        for corner in 0..8 {
+            let mut weight = 1.0;
+            let mut at = low;
+            for k in 0..3 {
+                if corner >> k & 1 == 1 {
+                    weight *= part[k];
+                    at[k] = high[k];
+                } else {
+                    weight *= 1.0 - part[k];
+                }
+            }
+            sum += weight * f64::from(data[at]);
+        }
+    }
+    sum * length
+}
+
+/// How many times larger the measured line integrals are than those through `data` on the scan's own grid, by least
+/// squares over some rays; `None` where the volume casts no shadow on them.
+pub(crate) fn measured_to_integrated(scan: &Scan, data: &Array3<f32>) -> Option<f64> {
+    let g = &scan.geometry;
+    if data.shape() != g.volume.shape {
+        return None;
+    }
+    let views = g.views.len();
+    let stride = |n: usize, most: usize| n.div_ceil(most);
+    let (mut mi, mut ii) = (0.0, 0.0);
+    for view in (0..views).step_by(stride(views, 4)) {
+        for row in (0..g.detector[0]).step_by(stride(g.detector[0], 24)) {
+            for column in (0..g.detector[1]).step_by(stride(g.detector[1], 24)) {
+                let i = integral(data, &g.volume, &g.ray(view, row, column));
+                mi += i * f64::from(scan.projections[[view, row, column]]);
+                ii += i * i;
+            }
+        }
+    }
+    (ii > 0.0 && mi.is_finite()).then(|| mi / ii)
+}

@@ -1,0 +1,370 @@
+//! Pictures of volumes: middle slices side by side, with differences.
+
+use crate::canvas::{Align, Canvas, diverging, grey, number};
+use conefield_core::scan::Volume;
+use conefield_core::{Error, Result};
+use image::Rgb;
+use ndarray::{Array2, Axis};
+use std::path::Path;
+
+const INK: Rgb<u8> = Rgb([20; 3]);
+const PAPER: Rgb<u8> = Rgb([255; 3]);
+/// Width that small volumes are enlarged to, and that large ones are not to pass, in pixels of slices.
+const WIDTH: [f64; 2] = [1000.0, 4000.0];
+const GAP: u32 = 8;
+
+/// A middle slice, named after the axis it cuts.
+#[derive(Clone, Copy)]
+struct Plane {
+    name: &'static str,
+    axes: &'static str,
+    /// The axis across, and the two that are seen: to the right and up.
+    cut: usize,
+    seen: [usize; 2],
+}
+
+const AXIAL: Plane = Plane { name: "axial", axes: "x → y ↑", cut: 2, seen: [0, 1] };
+const CORONAL: Plane = Plane { name: "coronal", axes: "x → z ↑", cut: 1, seen: [0, 2] };
+const SAGITTAL: Plane = Plane { name: "sagittal", axes: "y → z ↑", cut: 0, seen: [1, 2] };
+
+/// One picture of the table.
+enum Cell<'a> {
+    Empty,
+    Values(&'a Volume),
+    /// Result and reference.
+    Difference(&'a Volume, &'a Volume),
+}
+
+struct Row<'a> {
+    plane: Plane,
+    /// Under the plane's name.
+    note: &'a str,
+    cells: Vec<Cell<'a>>,
+}
+
+/// Draws the three middle slices (axial, coronal, sagittal) of every panel side by side, grey from `window[0]` to
+/// `window[1]`.
+///
+/// With `difference_to`, the index of a panel, every other panel gets a column more: its values minus those of that
+/// panel, blue below and red above, on a scale that is the same for all and stands in the picture.
+pub fn slices_png(
+    path: impl AsRef<Path>,
+    panels: &[(&str, &Volume)],
+    window: [f32; 2],
+    difference_to: Option<usize>,
+) -> Result<()> {
+    let path = path.as_ref();
+    let place = path.display().to_string();
+    let reference = match difference_to {
+        Some(i) if i >= panels.len() => {
+            let expected = format!("an index below {}, the number of panels", panels.len());
+            return Err(Error::invalid(place, "difference_to", i, expected));
+        }
+        other => other,
+    };
+    let mut captions: Vec<String> = panels.iter().map(|(n, _)| n.to_string()).collect();
+    if let Some(r) = reference {
+        let others = || panels.iter().enumerate().filter(|(i, _)| *i != r);
+        captions.extend(others().map(|(_, (n, _))| format!("{n} − {}", panels[r].0)));
+    }
+    let rows = [AXIAL, CORONAL, SAGITTAL].map(|plane| {
+        let mut cells: Vec<Cell> = panels.iter().map(|(_, v)| Cell::Values(v)).collect();
+        if let Some(r) = reference {
+            let others = panels.iter().enumerate().filter(|(i, _)| *i != r);
+            cells.extend(others.map(|(_, (_, v))| Cell::Difference(v, panels[r].1)));
+        }
+        Row { plane, note: "", cells }
+    });
+    draw(path, &captions, &rows, window)
+}
+
+/// Draws results next to a reference, each under its caption (say `NAF 28.1 dB`): axial and coronal middle slices,
+/// and under each the result minus the reference.
+pub fn compare_png(
+    path: impl AsRef<Path>,
+    reference: (&str, &Volume),
+    results: &[(&str, &Volume)],
+    window: [f32; 2],
+) -> Result<()> {
+    let captions: Vec<String> = [reference].iter().chain(results).map(|(n, _)| n.to_string()).collect();
+    let mut rows = Vec::new();
+    for plane in [AXIAL, CORONAL] {
+        let values = [reference].iter().chain(results).map(|(_, v)| Cell::Values(v)).collect();
+        rows.push(Row { plane, note: "", cells: values });
+        let differences = results.iter().map(|(_, v)| Cell::Difference(v, reference.1));
+        rows.push(Row { plane, note: "difference", cells: [Cell::Empty].into_iter().chain(differences).collect() });
+    }
+    draw(path.as_ref(), &captions, &rows, window)
+}
+
+fn draw(path: &Path, captions: &[String], rows: &[Row], window: [f32; 2]) -> Result<()> {
+    let place = path.display().to_string();
+    if captions.is_empty() {
+        return Err(Error::invalid(place, "panels", "none", "at least one volume"));
+    }
+    if !(window[0].is_finite() && window[1].is_finite() && window[0] < window[1]) {
+        let expected = "two finite numbers, the first below the second";
+        return Err(Error::invalid(place, "window", format!("{window:?}"), expected));
+    }
+    for cell in rows.iter().flat_map(|r| &r.cells) {
+        check(&place, cell)?;
+    }
+    let columns = captions.len();
+    let width_mm: Vec<f64> = (0..columns).map(|c| most(rows.iter().map(|r| r.size(c)[0]))).collect();
+    let height_mm: Vec<f64> = rows.iter().map(|r| most((0..columns).map(|c| r.size(c)[1]))).collect();
+    // A whole voxel a pixel at least, unless that makes the picture too large to look at.
+    let finest = rows.iter().flat_map(|r| &r.cells).filter_map(Cell::volume).flat_map(|v| v.grid.spacing);
+    let finest = finest.fold(f64::INFINITY, f64::min);
+    let total: f64 = width_mm.iter().sum();
+    let tallest: f64 = height_mm.iter().sum();
+    let scale = (1.0 / finest).max(WIDTH[0] / total).min(WIDTH[1] / total).min(2.0 * WIDTH[1] / tallest);
+    let pixels = |mm: f64| ((mm * scale).round() as u32).max(1);
+    let widths: Vec<u32> = width_mm.iter().map(|w| pixels(*w)).collect();
+    let heights: Vec<u32> = height_mm.iter().map(|h| pixels(*h)).collect();
+    let text = (f64::from(widths.iter().sum::<u32>()) / 60.0).clamp(15.0, 40.0) as f32;
+
+    let spread = difference_spread(rows);
+    let left = (text * 6.2) as u32;
+    let top = (text * 1.9) as u32;
+    let bars = (text * if spread.is_some() { 8.4 } else { 4.6 }) as u32;
+    let inner: u32 = heights.iter().map(|h| h + GAP).sum();
+    let width = left + widths.iter().map(|w| w + GAP).sum::<u32>() + bars;
+    let mut canvas = Canvas::new(width, (top + inner).max((text * 9.0) as u32), PAPER)?;
+
+    let mut x = left;
+    for (c, caption) in captions.iter().enumerate() {
+        let at = (x as f32 + widths[c] as f32 / 2.0, text * 0.35);
+        let shown = canvas.shortened(caption, text, widths[c] as f32);
+        canvas.text(at, Align::Middle, text, INK, &shown);
+        let mut y = top;
+        for (row, &height) in rows.iter().zip(&heights) {
+            if let Some(cell) = row.cells.get(c) {
+                draw_cell(&mut canvas, [x, y, widths[c], height], row, cell, scale, window, spread.unwrap_or(1.0));
+            }
+            y += height + GAP;
+        }
+        x += widths[c] + GAP;
+    }
+    let mut y = top;
+    for (row, &height) in rows.iter().zip(&heights) {
+        let middle = y as f32 + height as f32 / 2.0;
+        let lines = [row.plane.name, if row.note.is_empty() { row.plane.axes } else { row.note }];
+        for (i, line) in lines.iter().enumerate() {
+            let at = (left as f32 - text * 0.6, middle + text * (i as f32 * 1.2 - 1.2));
+            canvas.text(at, Align::Right, text * if i == 0 { 1.0 } else { 0.85 }, INK, line);
+        }
+        y += height + GAP;
+    }
+    let bar = [x + (text * 0.5) as u32, top, (text * 0.9) as u32, inner.saturating_sub(GAP)];
+    draw_bar(&mut canvas, bar, text, [f64::from(window[0]), f64::from(window[1])], grey);
+    if let Some(s) = spread {
+        let bar = [bar[0] + (text * 4.0) as u32, bar[1], bar[2], bar[3]];
+        draw_bar(&mut canvas, bar, text, [-f64::from(s), f64::from(s)], |t| diverging(2.0 * t - 1.0));
+    }
+    canvas.write_png(path)
+}
+
+fn most(all: impl Iterator<Item = f64>) -> f64 {
+    all.fold(0.0, f64::max)
+}
+
+fn check(place: &str, cell: &Cell) -> Result<()> {
+    let Some(v) = cell.volume() else { return Ok(()) };
+    v.grid.validate(place)?;
+    if v.data.shape() != v.grid.shape {
+        let (found, expected) = (format!("{:?}", v.data.shape()), format!("{:?}", v.grid.shape));
+        return Err(Error::invalid(place, "shape of the data", found, expected));
+    }
+    match cell {
+        Cell::Difference(v, r) if v.data.shape() != r.data.shape() => {
+            let (found, expected) = (format!("{:?}", v.data.shape()), format!("{:?}", r.data.shape()));
+            Err(Error::invalid(place, "shape of a result", found, format!("{expected}, the reference's")))
+        }
+        _ => Ok(()),
+    }
+}
+
+impl Cell<'_> {
+    fn volume(&self) -> Option<&Volume> {
+        match self {
+            Cell::Empty => None,
+            Cell::Values(v) | Cell::Difference(v, _) => Some(v),
+        }
+    }
+}
+
+impl Row<'_> {
+    /// Width and height of a cell in mm.
+    fn size(&self, column: usize) -> [f64; 2] {
+        let size = self.cells.get(column).and_then(Cell::volume).map(|v| v.grid.size());
+        size.map_or([0.0; 2], |s| self.plane.seen.map(|k| s[k]))
+    }
+}
+
+/// The middle slice, `[right, up]`.
+fn slice(v: &Volume, plane: Plane) -> Array2<f32> {
+    v.data.index_axis(Axis(plane.cut), v.grid.shape[plane.cut] / 2).to_owned()
+}
+
+/// A round number that all but half a percent of the shown differences stay within; `None` without differences.
+fn difference_spread(rows: &[Row]) -> Option<f32> {
+    let mut all: Vec<f32> = Vec::new();
+    let mut any = false;
+    for row in rows {
+        for cell in &row.cells {
+            if let Cell::Difference(v, r) = cell {
+                any = true;
+                let d = slice(v, row.plane) - slice(r, row.plane);
+                all.extend(d.iter().map(|x| x.abs()).filter(|x| x.is_finite()));
+            }
+        }
+    }
+    if !any {
+        return None;
+    }
+    if all.is_empty() {
+        return Some(1.0);
+    }
+    let at = (all.len() - 1) * 995 / 1000;
+    let x = f64::from(*all.select_nth_unstable_by(at, f32::total_cmp).1);
+    if x <= 0.0 {
+        return Some(1.0);
+    }
+    let power = 10f64.powf(x.log10().floor());
+    let round = [1.0, 2.0, 3.0, 5.0, 10.0].into_iter().map(|m| m * power).find(|m| *m >= x * (1.0 - 1e-9));
+    Some((round.unwrap_or(x) as f32).max(f32::MIN_POSITIVE))
+}
+
+fn draw_cell(
+    canvas: &mut Canvas,
+    [x, y, width, height]: [u32; 4],
+    row: &Row,
+    cell: &Cell,
+    scale: f64,
+    window: [f32; 2],
+    spread: f32,
+) {
+    let Some(v) = cell.volume() else { return };
+    let plane = row.plane;
+    let (values, difference) = match cell {
+        Cell::Difference(v, r) => (slice(v, plane) - slice(r, plane), true),
+        _ => (slice(v, plane), false),
+    };
+    let size = plane.seen.map(|k| (v.grid.size()[k] * scale).round().max(1.0) as u32);
+    let (w, h) = (size[0].min(width), size[1].min(height));
+    let (x, y) = (x + (width - w) / 2, y + (height - h) / 2);
+    let n = values.dim();
+    // The nearest voxel, so that the picture shows the voxels that there are.
+    canvas.fill(x, y, w, h, |dx, dy| {
+        let i = ((f64::from(dx) + 0.5) / f64::from(w) * n.0 as f64) as usize;
+        let j = ((f64::from(h - 1 - dy) + 0.5) / f64::from(h) * n.1 as f64) as usize;
+        let value = values[[i.min(n.0 - 1), j.min(n.1 - 1)]];
+        if difference { diverging(value / spread) } else { grey((value - window[0]) / (window[1] - window[0])) }
+    });
+}
+
+/// A scale, lowest value at the foot, with its ends and its middle in numbers.
+fn draw_bar(
+    canvas: &mut Canvas,
+    [x, y, width, height]: [u32; 4],
+    text: f32,
+    ends: [f64; 2],
+    colour: impl Fn(f32) -> Rgb<u8>,
+) {
+    let height = height.min((text * 22.0) as u32).max((text * 6.0) as u32);
+    canvas.fill(x, y, width, height, |dx, dy| {
+        let frame = dx == 0 || dy == 0 || dx + 1 == width || dy + 1 == height;
+        if frame { Rgb([90; 3]) } else { colour(1.0 - dy as f32 / height as f32) }
+    });
+    for (i, value) in [ends[1], (ends[0] + ends[1]) / 2.0, ends[0]].into_iter().enumerate() {
+        let at = y as f32 + (height as f32 - text * 0.85) * i as f32 / 2.0;
+        canvas.text((x as f32 + width as f32 + text * 0.3, at), Align::Left, text * 0.85, INK, &number(value));
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::testing::data;
+    use ndarray::Array3;
+
+    fn ball(shape: [usize; 3], spacing: [f64; 3], blur: f64) -> Volume {
+        let mut v = Volume::centered(Array3::zeros((shape[0], shape[1], shape[2])), spacing);
+        let grid = v.grid;
+        for ((x, y, z), value) in v.data.indexed_iter_mut() {
+            let p = grid.voxel([x, y, z]);
+            let r = (p[0] * p[0] + p[1] * p[1] + p[2] * p[2]).sqrt();
+            let off = ((p[0] - 6.0).powi(2) + (p[1] - 8.0).powi(2) + (p[2] - 10.0).powi(2)).sqrt();
+            let soft = |d: f64, at: f64| 1.0 / (1.0 + ((d - at) / blur).exp());
+            *value = (0.5 * soft(r, 20.0) + 0.4 * soft(off, 5.0)) as f32;
+        }
+        v
+    }
+
+    /// Where pictures go to be looked at, if CONEFIELD_PICTURES names a folder.
+    fn folder() -> (Option<tempfile::TempDir>, std::path::PathBuf) {
+        match std::env::var_os("CONEFIELD_PICTURES") {
+            Some(p) => (None, p.into()),
+            None => {
+                let dir = tempfile::tempdir().unwrap();
+                let path = dir.path().to_path_buf();
+                (Some(dir), path)
+            }
+        }
+    }
+
+    #[test]
+    fn small_volumes_make_a_wide_picture_with_the_right_aspect() {
+        let (_dir, folder) = folder();
+        let path = folder.join("slices.png");
+        // Thick slices: half as many voxels along z for the same ball.
+        let (a, b) = (ball([48, 48, 24], [1.0, 1.0, 2.0], 0.3), ball([48, 48, 24], [1.0, 1.0, 2.0], 1.5));
+        slices_png(&path, &[("reference", &a), ("result 31.2 dB", &b)], [0.0, 1.0], Some(0)).unwrap();
+        let image = image::open(&path).unwrap().to_rgb8();
+        assert!(image.width() >= 900, "{}", image.width());
+        // Equal sides in mm are equal sides in pixels: three square rows.
+        assert!(image.height() > 1000 && image.height() < 1200, "{}", image.height());
+        // Red and blue of the difference are there.
+        assert!(image.pixels().any(|p| p.0[0] > 150 && p.0[2] < 120));
+        assert!(image.pixels().any(|p| p.0[2] > 150 && p.0[0] < 120));
+    }
+
+    #[test]
+    fn results_stand_beside_their_reference() {
+        let (_dir, folder) = folder();
+        let path = folder.join("compare.png");
+        let (a, b, c) = (ball([40; 3], [1.3; 3], 0.3), ball([40; 3], [1.3; 3], 1.0), ball([40; 3], [1.3; 3], 2.5));
+        let results = [("NAF 28.1 dB", &b), ("FDK 21.0 dB, a caption that is too long for its column", &c)];
+        compare_png(&path, ("reference", &a), &results, [0.0, 1.0]).unwrap();
+        assert!(image::open(&path).unwrap().width() >= 900);
+    }
+
+    #[test]
+    fn a_clinical_volume_is_drawn() {
+        let Some(path) = data("clinical/abdomen_ct_hu.nii.gz") else { return };
+        let (_dir, folder) = folder();
+        let v = crate::read_volume(path).unwrap();
+        let noisy = v.clone().mapped(|x| x * 0.95 + 20.0);
+        slices_png(folder.join("abdomen.png"), &[("CT (HU)", &v), ("changed", &noisy)], [-200.0, 300.0], Some(0))
+            .unwrap();
+        slices_png(folder.join("abdomen_one.png"), &[("CT (HU)", &v)], [-200.0, 300.0], None).unwrap();
+    }
+
+    #[test]
+    fn wrong_use_is_refused_in_words() {
+        let dir = tempfile::tempdir().unwrap();
+        let path = dir.path().join("a.png");
+        let (a, b) = (ball([4; 3], [1.0; 3], 1.0), ball([5; 3], [1.0; 3], 1.0));
+        let refused = |r: Result<()>, word: &str| {
+            let e = r.unwrap_err().to_string();
+            assert!(e.contains("a.png") && e.contains(word), "{e}");
+        };
+        refused(slices_png(&path, &[], [0.0, 1.0], None), "panels");
+        refused(slices_png(&path, &[("a", &a)], [1.0, 1.0], None), "window");
+        refused(slices_png(&path, &[("a", &a)], [0.0, 1.0], Some(1)), "difference_to");
+        refused(slices_png(&path, &[("a", &a), ("b", &b)], [0.0, 1.0], Some(0)), "shape of a result");
+        // One flat voxel, and no difference at all, are no trouble.
+        let dot = Volume::centered(Array3::zeros((1, 1, 1)), [1.0; 3]);
+        slices_png(&path, &[("a", &dot), ("b", &dot)], [0.0, 1.0], Some(0)).unwrap();
+    }
+}

@@ -1,0 +1,55 @@
+//! What several modules' tests share.
+
+use conefield_core::geometry::{Geometry, Millimetres, Radians, View, VoxelGrid};
+use conefield_core::scan::{Scan, Unit};
+use ndarray::Array3;
+use std::path::PathBuf;
+
+/// A file of the shared data, or `None` with a note on why the test has nothing to do.
+pub(crate) fn data(name: &str) -> Option<PathBuf> {
+    let root = std::env::var_os("CONEFIELD_DATA")
+        .map(PathBuf::from)
+        .unwrap_or_else(|| PathBuf::from(env!("CARGO_MANIFEST_DIR")).join("../../shared/data"));
+    let path = root.join(name);
+    if path.exists() {
+        return Some(path);
+    }
+    eprintln!("skipped: {} is not there; CONEFIELD_DATA names the folder of the shared data", path.display());
+    None
+}
+
+/// A `.npy` file with the given header entries.
+pub(crate) fn npy_bytes(descr: &str, fortran: bool, shape: &str, data: &[u8]) -> Vec<u8> {
+    let fortran = if fortran { "True" } else { "False" };
+    let mut header = format!("{{'descr': '{descr}', 'fortran_order': {fortran}, 'shape': {shape}, }}");
+    while (header.len() + 11) % 64 != 0 {
+        header.push(' ');
+    }
+    header.push('\n');
+    let mut out = b"\x93NUMPY\x01\x00".to_vec();
+    out.extend((header.len() as u16).to_le_bytes());
+    out.extend(header.as_bytes());
+    out.extend(data);
+    out
+}
+
+/// A small scan on a circle with an offset detector and voxels that are no cubes.
+pub(crate) fn scan() -> Scan {
+    let mm = Millimetres;
+    let views: Vec<View> = (0..7)
+        .map(|i| {
+            let angle = Radians(0.3 + i as f64 * std::f64::consts::TAU / 7.0);
+            View::circular(angle, mm(500.0), mm(800.0), [mm(2.0), mm(1.5)], [mm(-1.0), mm(30.0)])
+        })
+        .collect();
+    Scan {
+        geometry: Geometry {
+            detector: [4, 6],
+            views,
+            volume: VoxelGrid { shape: [5, 6, 7], spacing: [1.0, 1.25, 2.0], center: [0.5, 0.0, -3.0] },
+        },
+        projections: Array3::from_shape_fn((7, 4, 6), |(a, v, u)| a as f32 + 0.1 * v as f32 + 0.01 * u as f32),
+        unit: Unit { name: "cm".into(), mm: 10.0 },
+        provenance: serde_json::json!({"from": "a test", "noise": {"photons": 10000, "sigma": 0.5}}),
+    }
+}

@@ -1,0 +1,72 @@
+//! TOML and JSON with errors that name the line and, for an unknown key, the nearest valid one.
+
+use conefield_core::{Error, Result};
+use serde::de::DeserializeOwned;
+use std::path::Path;
+
+/// Which notation a text is in.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(crate) enum Notation {
+    Toml,
+    Json,
+}
+
+impl Notation {
+    /// JSON for a name that ends so, else TOML.
+    pub fn of(path: &Path) -> Self {
+        let json = path.extension().is_some_and(|e| e.eq_ignore_ascii_case("json"));
+        if json { Self::Json } else { Self::Toml }
+    }
+}
+
+/// Parses `text`, the content of `path`.
+pub(crate) fn parse<T: DeserializeOwned>(path: &Path, text: &str, notation: Notation) -> Result<T> {
+    match notation {
+        Notation::Toml => toml::from_str(text).map_err(|e| {
+            let line = e.span().map(|s| 1 + text[..s.start.min(text.len())].matches('\n').count());
+            explain(path, text, line, e.message())
+        }),
+        Notation::Json => serde_json::from_str(text).map_err(|e| {
+            let full = e.to_string();
+            let message = full.rsplit_once(" at line ").map_or(full.as_str(), |(m, _)| m);
+            explain(path, text, (e.line() > 0).then(|| e.line()), message)
+        }),
+    }
+}
+
+fn explain(path: &Path, text: &str, line: Option<usize>, message: &str) -> Error {
+    let place = match line {
+        Some(n) => format!("{}: line {n}", path.display()),
+        None => path.display().to_string(),
+    };
+    let names: Vec<&str> = message.split('`').skip(1).step_by(2).collect();
+    if message.starts_with("unknown field")
+        && let Some((unknown, valid)) = names.split_first()
+    {
+        return Error::invalid(place, *unknown, "a key that is not known here", suggestion(unknown, valid));
+    }
+    if let (true, Some(name)) = (message.starts_with("missing field"), names.first()) {
+        return Error::invalid(place, *name, "nothing", "a value");
+    }
+    let key = line
+        .and_then(|n| text.lines().nth(n - 1))
+        .and_then(|l| l.split_once(['=', ':']))
+        .map(|(k, _)| k.trim().trim_matches('"'))
+        .filter(|k| !k.is_empty() && !k.contains(['{', '[', '#']))
+        .unwrap_or("content");
+    match message.split_once(", expected ") {
+        Some((found, expected)) => Error::invalid(place, key, found.trim(), expected.trim()),
+        None => Error::invalid(place, key, message.trim(), "valid values"),
+    }
+}
+
+/// "`spacing`, the nearest of: ...".
+fn suggestion(unknown: &str, valid: &[&str]) -> String {
+    let near = |name: &str| strsim::jaro_winkler(&unknown.to_lowercase(), name);
+    let best = valid.iter().max_by(|a, b| near(a).total_cmp(&near(b)));
+    match best {
+        Some(b) if valid.len() > 1 => format!("`{b}` (the nearest of: {})", valid.join(", ")),
+        Some(b) => format!("`{b}`"),
+        None => "no key at all".into(),
+    }
+}

@@ -1,0 +1,144 @@
+//! The door for volumes: which format a file is in, and which one a name asks for.
+
+use crate::input::Input;
+use crate::{nifti, npy, write_atomic};
+use conefield_core::geometry::VoxelGrid;
+use conefield_core::scan::Volume;
+use conefield_core::{Error, Result};
+use flate2::{Compression, GzBuilder};
+use ndarray::{Array3, Ix3};
+use std::path::Path;
+
+/// Reads a volume: NIfTI-1 (any real number type, gzip or not) or a NumPy array of three axes.
+///
+/// The content decides, not the name. `grid.center` is `[0, 0, 0]`: where NIfTI's voxels lie in the patient stays in
+/// `affine`, in mm. A NumPy array has no voxel size and gets 1 mm. Values are converted to `f32`, scaled as NIfTI's
+/// header says; one that is not finite is refused.
+pub fn read_volume(path: impl AsRef<Path>) -> Result<Volume> {
+    let path = path.as_ref();
+    let mut input = Input::open(path)?;
+    let mut head = input.take(8)?;
+    if head.starts_with(npy::MAGIC) {
+        return from_numpy(path, npy::read_from(&mut input, head, &["x", "y", "z"])?);
+    }
+    head.extend(input.take(nifti::HEADER - head.len())?);
+    if nifti::is_second_version(&head) {
+        let what = format!("{}: a NIfTI-2 file", path.display());
+        return Err(Error::unsupported(what, "convert it to NIfTI-1 (.nii or .nii.gz)"));
+    }
+    if !nifti::is_header(&head) {
+        let mark = head.get(344..348).map_or_else(
+            || format!("a file of {} bytes", head.len()),
+            |m| format!("{:02x?} at byte 344 and {:02x?} at the start", m, &head[..6]),
+        );
+        let hint = match format_of(path) {
+            Some(Format::Npy) => "a NumPy array (93 4e 55 4d 50 59 at the start); a NIfTI-1 header is read too",
+            _ => "a NIfTI-1 header (6e 2b 31 00 at byte 344) or a NumPy array (93 4e 55 4d 50 59 at the start)",
+        };
+        return Err(input.invalid("format", mark, hint));
+    }
+    nifti::read_from(&mut input, &head)
+}
+
+/// Whether the file looks like a volume that [`read_volume`] understands; its data is not read.
+pub fn is_volume(path: impl AsRef<Path>) -> bool {
+    Input::open(path.as_ref())
+        .and_then(|mut i| i.take(nifti::HEADER))
+        .is_ok_and(|head| head.starts_with(npy::MAGIC) || nifti::is_header(&head))
+}
+
+/// Writes a volume as its name asks: `.nii`, `.nii.gz` (both `f32` with an sform in mm) or `.npy` (`f32`, C order,
+/// without voxel sizes).
+///
+/// An affine is kept if its voxel sizes are the grid's; without one, the grid's centre comes to lie at `grid.center`.
+pub fn write_volume(path: impl AsRef<Path>, volume: &Volume) -> Result<()> {
+    let path = path.as_ref();
+    let place = path.display().to_string();
+    let format = format_of(path)
+        .ok_or_else(|| Error::invalid(&place, "file name", file_name(path), "an end of .nii, .nii.gz or .npy"))?;
+    volume.grid.validate(&place)?;
+    if volume.data.shape() != volume.grid.shape {
+        let (found, expected) = (format!("{:?}", volume.data.shape()), format!("{:?}", volume.grid.shape));
+        return Err(Error::invalid(place, "shape of the data", found, expected));
+    }
+    if let Some((at, x)) = volume.data.indexed_iter().find(|(_, x)| !x.is_finite()) {
+        let field = format!("voxel [{}, {}, {}]", at.0, at.1, at.2);
+        return Err(Error::invalid(place, field, x, "a finite number"));
+    }
+    write_atomic(path, |w| match format {
+        Format::Nifti => nifti::write(w, path, volume),
+        Format::NiftiGz => {
+            let mut packed = GzBuilder::new().write(w, Compression::fast());
+            nifti::write(&mut packed, path, volume)?;
+            packed.finish().and_then(|w| w.flush()).map_err(|e| Error::io(path, e))
+        }
+        Format::Npy => npy::write(w, path, &volume.data),
+    })
+}
+
+/// A NumPy array as a volume of 1 mm voxels.
+pub(crate) fn from_numpy(path: &Path, array: ndarray::ArrayD<f32>) -> Result<Volume> {
+    let data: Array3<f32> = array
+        .into_dimensionality::<Ix3>()
+        .map_err(|e| Error::invalid(path.display().to_string(), "shape", e, "three axes (x, y, z)"))?;
+    let s = data.shape();
+    let grid = VoxelGrid { shape: [s[0], s[1], s[2]], spacing: [1.0; 3], center: [0.0; 3] };
+    Ok(Volume { data, grid, affine: None })
+}
+
+enum Format {
+    Nifti,
+    NiftiGz,
+    Npy,
+}
+
+fn file_name(path: &Path) -> String {
+    path.file_name().map(|n| n.to_string_lossy().into_owned()).unwrap_or_default()
+}
+
+fn format_of(path: &Path) -> Option<Format> {
+    let name = file_name(path).to_ascii_lowercase();
+    if name.ends_with(".nii.gz") {
+        Some(Format::NiftiGz)
+    } else if name.ends_with(".nii") {
+        Some(Format::Nifti)
+    } else if name.ends_with(".npy") {
+        Some(Format::Npy)
+    } else {
+        None
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn numpy_volumes_come_back() {
+        let dir = tempfile::tempdir().unwrap();
+        let path = dir.path().join("a.npy");
+        let v = Volume::centered(Array3::from_shape_fn((2, 3, 4), |(x, y, z)| (x + 2 * y + 6 * z) as f32), [2.0; 3]);
+        write_volume(&path, &v).unwrap();
+        let back = read_volume(&path).unwrap();
+        assert_eq!((back.data, back.grid.spacing, back.affine), (v.data, [1.0; 3], None));
+        assert!(is_volume(&path) && !is_volume(dir.path()));
+    }
+
+    #[test]
+    fn bad_names_and_values_are_refused_and_leave_the_file_whole() {
+        let dir = tempfile::tempdir().unwrap();
+        let path = dir.path().join("a.nii.gz");
+        let mut v = Volume::centered(Array3::ones((2, 2, 2)), [1.0; 3]);
+        write_volume(&path, &v).unwrap();
+        v.data[[1, 0, 1]] = f32::INFINITY;
+        let e = write_volume(&path, &v).unwrap_err().to_string();
+        assert!(e.contains("a.nii.gz") && e.contains("voxel [1, 0, 1]"), "{e}");
+        assert_eq!(read_volume(&path).unwrap().data, Array3::<f32>::ones((2, 2, 2)));
+        let e = write_volume(dir.path().join("a.tif"), &v).unwrap_err().to_string();
+        assert!(e.contains("a.tif") && e.contains(".nii.gz"), "{e}");
+        let e = read_volume(dir.path().join("none.nii")).unwrap_err().to_string();
+        assert!(e.contains("none.nii"), "{e}");
+        let e = read_volume(dir.path()).unwrap_err().to_string();
+        assert!(e.contains("regular file"), "{e}");
+    }
+}

@@ -1,0 +1,185 @@
+//! Weights and checkpoints as safetensors, `f32` only.
+//!
+//! Reading goes through the `safetensors` crate. Writing is done here: it streams, and it puts the metadata in a
+//! fixed order, so that the same weights give the same bytes.
+
+use crate::write_atomic;
+use conefield_core::{Error, Result};
+use safetensors::{Dtype, SafeTensors};
+use serde_json::{Map, Value, json};
+use std::collections::{BTreeMap, BTreeSet};
+use std::fs::File;
+use std::io::Read;
+use std::path::Path;
+
+/// The header's entry for free text.
+const METADATA: &str = "__metadata__";
+
+/// Longest header that the reading crate accepts.
+const LONGEST_HEADER: u64 = 100_000_000;
+
+/// Named tensors with free text about them.
+#[derive(Debug, Clone, Default, PartialEq)]
+pub struct Weights {
+    /// Shape and values, in C order, by name.
+    pub tensors: BTreeMap<String, (Vec<usize>, Vec<f32>)>,
+    /// Free text by key.
+    pub metadata: BTreeMap<String, String>,
+}
+
+/// Writes named `f32` tensors (name, shape, values in C order) and free text.
+pub fn write_weights(
+    path: impl AsRef<Path>,
+    tensors: &[(impl AsRef<str>, impl AsRef<[usize]>, &[f32])],
+    metadata: &BTreeMap<String, String>,
+) -> Result<()> {
+    let path = path.as_ref();
+    let place = path.display().to_string();
+    let mut header = Map::new();
+    if !metadata.is_empty() {
+        header.insert(METADATA.into(), json!(metadata));
+    }
+    let mut names = BTreeSet::new();
+    let mut at = 0usize;
+    for (name, shape, values) in tensors {
+        let (name, shape) = (name.as_ref(), shape.as_ref());
+        if name == METADATA || !names.insert(name) {
+            let expected = format!("a name of its own, other than {METADATA}");
+            return Err(Error::invalid(place, "tensor name", format!("\"{name}\""), expected));
+        }
+        if shape.iter().try_fold(1usize, |n, &s| n.checked_mul(s)) != Some(values.len()) {
+            let found = format!("{} values for the shape {shape:?}", values.len());
+            return Err(Error::invalid(place, format!("tensor {name}"), found, "as many values as the shape has"));
+        }
+        let end = at + size_of_val(*values);
+        header.insert(name.into(), json!({ "dtype": "F32", "shape": shape, "data_offsets": [at, end] }));
+        at = end;
+    }
+    let mut text = Value::Object(header).to_string();
+    // The data starts on a multiple of eight bytes, as the format asks.
+    text.push_str(&" ".repeat(text.len().next_multiple_of(8) - text.len()));
+    write_atomic(path, |w| {
+        let io = |e| Error::io(path, e);
+        w.write_all(&(text.len() as u64).to_le_bytes()).map_err(io)?;
+        w.write_all(text.as_bytes()).map_err(io)?;
+        let mut raw = Vec::with_capacity(1 << 16);
+        for part in tensors.iter().flat_map(|(.., values)| values.chunks(1 << 14)) {
+            raw.clear();
+            raw.extend(part.iter().flat_map(|x| x.to_le_bytes()));
+            w.write_all(&raw).map_err(io)?;
+        }
+        Ok(())
+    })
+}
+
+/// Reads a safetensors file of `f32` tensors.
+pub fn read_weights(path: impl AsRef<Path>) -> Result<Weights> {
+    let path = path.as_ref();
+    let place = path.display().to_string();
+    let io = |e| Error::io(path, e);
+    let mut file = File::open(path).map_err(io)?;
+    let size = file.metadata().map_err(io)?.len();
+    if size < 8 {
+        return Err(Error::invalid(place, "header length", format!("{size} bytes"), "a safetensors file"));
+    }
+    let mut length = [0u8; 8];
+    file.read_exact(&mut length).map_err(io)?;
+    let header = u64::from_le_bytes(length);
+    if header > (size - 8).min(LONGEST_HEADER) {
+        let expected = format!("at most {} in a file of {size} bytes", (size - 8).min(LONGEST_HEADER));
+        return Err(Error::invalid(place, "header length", header, expected));
+    }
+    let mut raw = Vec::new();
+    let too_large = || Error::invalid(&place, "file size", format!("{size} bytes"), "a file that fits in memory");
+    let whole = usize::try_from(size).map_err(|_| too_large())?;
+    raw.try_reserve_exact(whole).map_err(|_| too_large())?;
+    raw.extend(length);
+    file.take(size - 8).read_to_end(&mut raw).map_err(io)?;
+    let broken = |e| Error::invalid(&place, "header", e, "a whole safetensors file");
+    let (_, info) = SafeTensors::read_metadata(&raw).map_err(broken)?;
+    let metadata = info.metadata().iter().flatten().map(|(k, v)| (k.clone(), v.clone())).collect();
+    let views = SafeTensors::deserialize(&raw).map_err(broken)?;
+    let mut tensors = BTreeMap::new();
+    for (name, view) in views.iter() {
+        if view.dtype() != Dtype::F32 {
+            let expected = "F32; convert the weights to 32-bit floats first";
+            return Err(Error::invalid(
+                place,
+                format!("tensor {name}: dtype"),
+                format!("{:?}", view.dtype()),
+                expected,
+            ));
+        }
+        let (values, _) = view.data().as_chunks::<4>();
+        let values = values.iter().map(|b| f32::from_le_bytes(*b)).collect();
+        tensors.insert(name.to_string(), (view.shape().to_vec(), values));
+    }
+    Ok(Weights { tensors, metadata })
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use std::fs;
+
+    fn sample(path: &Path) -> Weights {
+        let metadata: BTreeMap<_, _> = (0..20).map(|i| (format!("key {i}"), format!("value {i}"))).collect();
+        let table: Vec<f32> = (0..40000).map(|i| i as f32 * 0.5).collect();
+        let tensors = [
+            ("mlp.0.weight", vec![2, 3], &[1.0f32, -2.0, 3.5, 0.0, 1e-38, 7.0][..]),
+            ("encoder.table", vec![40000], table.as_slice()),
+            ("empty", vec![0, 4], &[]),
+        ];
+        write_weights(path, &tensors, &metadata).unwrap();
+        let tensors = tensors.into_iter().map(|(n, s, v)| (n.to_string(), (s, v.to_vec()))).collect();
+        Weights { tensors, metadata }
+    }
+
+    #[test]
+    fn what_is_written_comes_back_in_the_same_bytes() {
+        let dir = tempfile::tempdir().unwrap();
+        let (a, b) = (dir.path().join("a.safetensors"), dir.path().join("b.safetensors"));
+        let want = sample(&a);
+        assert_eq!(read_weights(&a).unwrap(), want);
+        sample(&b);
+        assert_eq!(fs::read(&a).unwrap(), fs::read(&b).unwrap());
+    }
+
+    #[test]
+    fn slips_of_the_writer_are_refused() {
+        let dir = tempfile::tempdir().unwrap();
+        let path = dir.path().join("a.safetensors");
+        let none = BTreeMap::new();
+        let e = write_weights(&path, &[("w", [2, 2], &[1.0f32; 3][..])], &none).unwrap_err().to_string();
+        assert!(e.contains("tensor w") && e.contains("[2, 2]"), "{e}");
+        let twice = [("w", [1], &[1.0f32][..]), ("w", [1], &[1.0][..])];
+        assert!(write_weights(&path, &twice, &none).unwrap_err().to_string().contains("\"w\""));
+        assert!(!path.exists());
+    }
+
+    #[test]
+    fn hostile_files_are_refused_in_words() {
+        let dir = tempfile::tempdir().unwrap();
+        let path = dir.path().join("a.safetensors");
+        sample(&path);
+        let good = fs::read(&path).unwrap();
+        let refused = |bytes: &[u8], words: &[&str]| {
+            fs::write(&path, bytes).unwrap();
+            let e = read_weights(&path).unwrap_err().to_string();
+            assert!(words.iter().chain(&["a.safetensors"]).all(|w| e.contains(w)), "{words:?} not all in: {e}");
+        };
+        refused(&good[..5], &["header length"]);
+        refused(&good[..100], &["header length"]);
+        refused(&good[..good.len() - 1], &["header"]);
+        refused(&[good.as_slice(), &[0]].concat(), &["header"]);
+        refused(&[&u64::MAX.to_le_bytes(), &good[8..]].concat(), &["header length", "18446744073709551615"]);
+        for dtype in ["F16", "F64", "BF16"] {
+            let bytes = if dtype == "F64" { 8 } else { 2 };
+            let mut text =
+                format!("{{\"w\":{{\"dtype\":\"{dtype}\",\"shape\":[4],\"data_offsets\":[0,{}]}}}}", 4 * bytes);
+            text.push_str(&" ".repeat(text.len().next_multiple_of(8) - text.len()));
+            let raw = [&(text.len() as u64).to_le_bytes(), text.as_bytes(), &vec![0; 4 * bytes]].concat();
+            refused(&raw, &["tensor w", dtype, "F32"]);
+        }
+    }
+}
