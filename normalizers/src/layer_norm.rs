@@ -146,13 +146,28 @@ struct Backward<'a, R> {
     dx: Option<TileMut<'a, R>>,
 }
 
+/// What forward found about a vector of rows.
+#[derive(Clone, Copy)]
+struct Found<T> {
+    first: T,
+    mean: T,
+    root: T,
+    scale: T,
+}
+
 impl<R: Real> Backward<'_, R> {
-    /// `(x − mean)/deviation` of input `c`, a vector of rows from `i`.
     #[inline(always)]
-    fn normal<S: Simd>(&self, s: S, c: usize, i: usize) -> V<S, R> {
-        let [mean, root, scale] = std::array::from_fn(|t| load(s, self.tape.channel(t), i));
-        let first = load(s, self.x.channel(0), i) * scale;
-        ((load(s, self.x.channel(c), i) * scale - first) - mean) * root
+    fn found<S: Simd>(&self, s: S, i: usize) -> Found<V<S, R>> {
+        let mean = load(s, self.tape.channel(0), i);
+        let root = load(s, self.tape.channel(1), i);
+        let scale = load(s, self.tape.channel(2), i);
+        Found { first: load(s, self.x.channel(0), i) * scale, mean, root, scale }
+    }
+
+    /// `(x − mean)/deviation` of input `c`, the rows from `i`.
+    #[inline(always)]
+    fn normal<S: Simd>(&self, s: S, f: Found<V<S, R>>, c: usize, i: usize) -> V<S, R> {
+        ((load(s, self.x.channel(c), i) * f.scale - f.first) - f.mean) * f.root
     }
 }
 
@@ -170,7 +185,7 @@ impl<R: Real> Op for Backward<'_, R> {
                     let mut sum = zero;
                     let mut i = 0;
                     while i < n {
-                        sum = self.normal(s, c, i).mul_add(load(s, self.dy.channel(o), i), sum);
+                        sum = self.normal(s, self.found(s, i), c, i).mul_add(load(s, self.dy.channel(o), i), sum);
                         i += V::<S, R>::LEN;
                     }
                     self.grads.values[o - range.start] += sum.as_slice().iter().copied().sum::<R>();
@@ -185,14 +200,15 @@ impl<R: Real> Op for Backward<'_, R> {
         let mut i = 0;
         while i < n {
             // With g = γ·dy: dx = (g − mean(g) − x̂·mean(g·x̂))/deviation, means over all inputs.
+            let found = self.found(s, i);
             let (mut mean, mut along) = (zero, zero);
             for (o, &c) in stage.outputs.iter().enumerate() {
                 let g = load(s, self.dy.channel(o), i) * stage.gamma(self.params, o);
                 mean += g;
-                along = g.mul_add(self.normal(s, c, i), along);
+                along = g.mul_add(self.normal(s, found, c, i), along);
             }
             let (mean, along) = (mean * share, along * share);
-            let back = load(s, self.tape.channel(1), i) * load(s, self.tape.channel(2), i);
+            let back = found.root * found.scale;
             let mut o = 0;
             for c in 0..stage.input {
                 let mut g = zero;
@@ -200,7 +216,7 @@ impl<R: Real> Op for Backward<'_, R> {
                     g = load(s, self.dy.channel(o), i) * stage.gamma(self.params, o);
                     o += 1;
                 }
-                let d = (g - mean - self.normal(s, c, i) * along) * back;
+                let d = (g - mean - self.normal(s, found, c, i) * along) * back;
                 store::<S, R>(d, dx.channel(c), i);
             }
             i += V::<S, R>::LEN;
