@@ -89,7 +89,7 @@ impl<R: Real> Kernel<R> for Toy {
                     Fault::SpreadsNan => v += everything * R::ZERO,
                     Fault::TileSize => v += R::of(rows as f64 * 1e-6),
                     Fault::Remembers => v += R::of(f64::from(calls) * 1e-6),
-                    Fault::Overflows => v += v * v - v * v,
+                    Fault::Overflows => v = v * v / (v + R::of(1e-9)),
                     Fault::Coarse if size_of::<R>() == 4 => v = R::of((v.f64() * 1e3).round() * 1e-3),
                     _ => {}
                 }
