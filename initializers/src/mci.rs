@@ -1,4 +1,4 @@
-//! Mapping-consistency initialisation (Xu et al. 2025, NI-NeRF, section 3.3): what maps features to attenuation comes
+//! Mapping-consistency initialisation (Xu et al. 2025, NI-NeRF, section 2.4): what maps features to attenuation comes
 //! from a model that was trained on a known volume; the features themselves start afresh.
 //!
 //! Loaded are the normalizers' and the field's weights, that is every block whose name does not start with

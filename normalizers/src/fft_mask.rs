@@ -1,4 +1,5 @@
-//! Spectral channel mask (Xu et al. 2025, NI-NeRF, section 3.2): channels whose image is noise are removed for good.
+//! Spectral channel mask (Xu et al. 2025, NI-NeRF, section 2.3; details from its published code): channels whose image
+//! is noise are removed for good.
 //!
 //! Once, after `epoch` passes over the views, every channel is looked at on slices of the volume: its image is scaled
 //! to [0, 1] by its extremes, Fourier-transformed, and what lies within a quarter of the width of the zero frequency

@@ -1,4 +1,4 @@
-//! Layer normalisation (Ba et al. 2016, equation 4): every row of features `[n, F]` to mean 0 and variance 1 over its
+//! Layer normalisation (Ba et al. 2016, equation 3): every row of features `[n, F]` to mean 0 and variance 1 over its
 //! channels, then scaled and shifted channel by channel: `y = γ·(x − mean)/√(variance + eps) + β`, with the biased
 //! variance (divided by F), as PyTorch has it.
 //!
