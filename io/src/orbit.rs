@@ -50,11 +50,13 @@ impl Orbit {
         let (s, c) = angles[0].sin_cos();
         // Along the circle's own axes the first view gives every length.
         let reach = sub(first.detector, first.source);
+        // A rest of rounding is no shift.
+        let shift = |x: f64| if x.abs() < 1e-12 * norm(reach) { 0.0 } else { x };
         let orbit = Self {
             dso,
             dsd: -dot(reach, [c, s, 0.0]),
             pixel: [norm(first.v), norm(first.u)],
-            offset: [-first.detector[2], dot(first.detector, [-s, c, 0.0])],
+            offset: [shift(-first.detector[2]), shift(dot(first.detector, [-s, c, 0.0]))],
             angles,
         };
         let scale = dso.abs().max(orbit.dsd.abs());
