@@ -7,6 +7,7 @@ use conefield_core::{Error, Result};
 pub const SHIPPED: &[Shipped] = &[
     Shipped { name: "naf", text: include_str!("../../specs/naf.toml") },
     Shipped { name: "ni-naf", text: include_str!("../../specs/ni-naf.toml") },
+    Shipped { name: "ni-naf-published", text: include_str!("../../specs/ni-naf-published.toml") },
     Shipped { name: "nerf", text: include_str!("../../specs/nerf.toml") },
     Shipped { name: "dense", text: include_str!("../../specs/dense.toml") },
     Shipped { name: "fast", text: include_str!("../../specs/fast.toml") },

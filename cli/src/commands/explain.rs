@@ -17,7 +17,7 @@ use std::path::PathBuf;
 /// Show what a spec builds: stages, widths, parameters, memory, work.
 #[derive(Args)]
 pub struct Explain {
-    /// A shipped spec (naf, ni-naf, nerf, dense, fast) or a file.
+    /// A shipped spec (naf, ni-naf, ni-naf-published, nerf, dense, fast) or a file.
     spec: String,
     /// Change a setting, such as encoder.levels=8.
     #[arg(long = "set", value_name = "KEY=VALUE")]
@@ -180,7 +180,7 @@ fn for_scan(loaded: &Loaded, pipeline: &Pipeline, scan: &Scan, compiled: &Compil
 }
 
 fn text(r: &Report) -> String {
-    let heads = ["stage", "type", "in -> out", "parameters", "model", "MACs/sample", "gradient", "what"];
+    let heads = ["stage", "type", "in -> out", "parameters", "bytes", "MACs/sample", "gradient", "what"];
     let mut rows = vec![heads.map(str::to_owned).to_vec()];
     for s in &r.stages {
         let gradient = format!("{:?}", s.gradient).to_lowercase();
