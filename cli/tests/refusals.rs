@@ -120,6 +120,8 @@ fn views_that_are_not_there_are_refused() {
     common::done(&["simulate", "phantom:head:16", "-o", &scan, "--views", "4", "--detector", "8x8"]);
     let said = refused(1, &["reconstruct", &scan, "--spec", "naf", "-o", &run, "--hold-out", "4"]);
     assert!(said.contains("found 4, expected an index below 4"), "{said}");
+    let said = refused(1, &["reconstruct", &scan, "--spec", "naf", "-o", &run, "--init", "no.safetensors"]);
+    assert!(said.contains("no.safetensors"), "{said}");
     assert!(!dir.path().join("run").exists(), "nothing is made before the input is known to be good");
 }
 

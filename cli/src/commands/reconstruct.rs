@@ -105,6 +105,10 @@ impl Reconstruct {
     pub fn run(self) -> Result<()> {
         let loaded = specs::read(&self.spec, &self.all_sets())?;
         let solver = loaded.spec.solver.build().map_err(|e| loaded.locate(e))?;
+        // Weights that cannot be read are told before anything is made.
+        if let Some(i) = &loaded.spec.initializer {
+            i.build(&|path| files::read_weights(path)).map_err(|e| loaded.locate(e))?;
+        }
         let backend = self.backend.open();
         let pipeline = loaded.spec.encoder.as_ref().map(|_| specs::build(&loaded)).transpose()?;
         let compiled = pipeline.as_ref().map(|p| backend.compile(p)).transpose()?.map(|c| c.1).unwrap_or_default();
