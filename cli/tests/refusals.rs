@@ -64,6 +64,10 @@ fn settings_out_of_range_are_told_with_their_line() {
         "extends = \"naf\"\n\n[encoder]\nlevels = 0\n",
         "mine.toml:4:10: encoder.levels: found 0, expected 1 to 32",
     );
+    refused_spec(
+        "extends = \"naf\"\n[[normalizers]]\ntype = \"layer-norm\"\n[[normalizers]]\ntype = \"layer-norm\"\neps = 3\n",
+        "mine.toml:6:7: normalizers.1.eps: found 3",
+    );
     refused_spec("extends = \"naf\"\n[scene]\nfill = 2\n[projector]\nsamples = 0\n", "projector.samples");
 }
 

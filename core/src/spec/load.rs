@@ -79,11 +79,27 @@ impl Loaded {
     pub fn locate(&self, error: Error) -> Error {
         let Error::Invalid { place, field, found, expected } = error else { return error };
         let path = match place.as_str() {
-            "spec" => steps(&field),
+            "spec" => self.indexed(steps(&field), &found),
             _ => return Error::Invalid { place, field, found, expected },
         };
         let at = &self.written.nearest(&path.iter().map(String::as_str).collect::<Vec<_>>()).at;
         Error::Invalid { place: at.to_string(), field: path.join("."), found, expected }
+    }
+
+    /// A normalizer does not know which of the list it is: puts its index into a path that says `normalizers.eps`.
+    fn indexed(&self, mut path: Vec<String>, found: &str) -> Vec<String> {
+        let Some(Kind::Array(list)) = self.written.get("normalizers").map(|n| &n.kind) else { return path };
+        if let [first, key, ..] = &path[..]
+            && first == "normalizers"
+            && key.parse::<usize>().is_err()
+        {
+            let says = |n: &Node| n.get(key).is_some_and(|v| v.to_json().to_string().trim_matches('"') == found);
+            let index = list.iter().position(says).or_else(|| list.iter().position(|n| n.get(key).is_some()));
+            if let Some(index) = index {
+                path.insert(1, index.to_string());
+            }
+        }
+        path
     }
 }
 
