@@ -320,7 +320,7 @@ pub fn total<S: Simd, R: Real>(s: S, x: &[R]) -> R {
     let mut acc = V::<S, R>::splat(s, R::ZERO);
     let mut i = 0;
     while i < x.len() {
-        acc = acc + load(s, x, i);
+        acc += load(s, x, i);
         i += V::<S, R>::LEN;
     }
     acc.as_slice().iter().copied().sum()

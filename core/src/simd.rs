@@ -223,6 +223,19 @@ pub fn level() -> Level {
     })
 }
 
+/// The name of [`level`], as `CONEFIELD_SIMD` spells it.
+pub fn level_name() -> &'static str {
+    match level() {
+        #[cfg(target_arch = "x86_64")]
+        Level::Avx512(_) => "avx512",
+        #[cfg(target_arch = "x86_64")]
+        Level::Avx2(_) => "avx2",
+        #[cfg(target_arch = "x86_64")]
+        Level::Sse4_2(_) => "sse4.2",
+        _ => "baseline",
+    }
+}
+
 /// Up to a vector's worth of `x` from `at`; lanes past the end are 0.
 #[inline(always)]
 pub fn load<S: Simd, R: Real>(s: S, x: &[R], at: usize) -> V<S, R> {

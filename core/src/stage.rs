@@ -22,7 +22,7 @@ pub struct Tile<'a, R> {
 impl<'a, R> Tile<'a, R> {
     /// A tile over `data`, whose length is a multiple of `rows`.
     pub fn new(data: &'a [R], rows: usize) -> Self {
-        debug_assert!(rows > 0 && data.len() % rows == 0);
+        debug_assert!(rows > 0 && data.len().is_multiple_of(rows));
         Self { data, rows }
     }
 
@@ -56,7 +56,7 @@ pub struct TileMut<'a, R> {
 impl<'a, R> TileMut<'a, R> {
     /// A tile over `data`, whose length is a multiple of `rows`.
     pub fn new(data: &'a mut [R], rows: usize) -> Self {
-        debug_assert!(rows > 0 && data.len() % rows == 0);
+        debug_assert!(rows > 0 && data.len().is_multiple_of(rows));
         Self { data, rows }
     }
 

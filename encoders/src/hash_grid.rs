@@ -6,7 +6,7 @@
 
 use conefield_core::error::{Result, ensure};
 use conefield_core::random::{mix, unit};
-use conefield_core::simd::{Op, Real, Simd, run};
+use conefield_core::simd::{Op, Real, Simd, SimdBase, SimdFloat, V, load, run, store};
 use conefield_core::spec::EncoderSpec;
 use conefield_core::stage::{Encoder, GradKind, Grads, Info, Kernel, Parameter, Reduced, Scope, Stage, Tile, TileMut};
 use schemars::JsonSchema;
@@ -193,20 +193,20 @@ impl<R: Real> Located<R> {
 
     /// Locates rows `at..at + n` of `x`. Points outside the cube count as on its rim.
     #[inline(always)]
-    fn locate(&mut self, level: &Level, primes: [u32; 3], x: Tile<'_, R>, at: usize, n: usize) {
-        let scale = R::of(level.scale);
-        let top = R::of(level.scale + 0.5);
-        let half = R::of(0.5);
+    fn locate<S: Simd>(&mut self, s: S, level: &Level, primes: [u32; 3], x: Tile<'_, R>, at: usize, n: usize) {
+        let number = |x: f64| V::<S, R>::splat(s, R::of(x));
+        let (zero, half, scale, top) = (number(0.0), number(0.5), number(level.scale), number(level.scale + 0.5));
         let mut cell = [[0u32; BLOCK]; 3];
         for d in 0..3 {
             let x = &x.channel(d)[at..at + n];
-            for i in 0..n {
-                let p = x[i] * scale + half;
-                let p = if p > R::ZERO { p } else { R::ZERO };
-                let p = if p < top { p } else { top };
+            let mut i = 0;
+            while i < n {
+                // NaN becomes 0 here: `max` returns its other side.
+                let p = load(s, x, i).mul_add(scale, half).max(zero).min(top);
                 let c = p.floor();
-                self.fraction[d][i] = p - c;
-                cell[d][i] = c.int() as u32;
+                store::<S, R>(p - c, &mut self.fraction[d], i);
+                R::cells(s, c, &mut cell[d][i..]);
+                i += V::<S, R>::LEN;
             }
         }
         let [cx, cy, cz] = &cell;
@@ -244,6 +244,26 @@ impl<R: Real> Located<R> {
     }
 }
 
+/// Entry `i` of a level's table, `i` from [`Located::locate`] for that very level. Checking the bound of each of a
+/// row's 8 entries doubles the time of the backward pass.
+#[inline(always)]
+#[allow(unsafe_code)]
+fn entry<T>(table: &[T], i: u32) -> &T {
+    debug_assert!((i as usize) < table.len());
+    // SAFETY: callers slice `table` to the level's `entries`. `locate` yields indices below that: a hash is masked
+    // by `entries - 1`, and direct indices come from cells clamped to `side - 2`, whose corners end at `side³ - 1`.
+    unsafe { table.get_unchecked(i as usize) }
+}
+
+/// Like [`entry`], to be written.
+#[inline(always)]
+#[allow(unsafe_code)]
+fn entry_mut<T>(table: &mut [T], i: u32) -> &mut T {
+    debug_assert!((i as usize) < table.len());
+    // SAFETY: as for `entry`.
+    unsafe { table.get_unchecked_mut(i as usize) }
+}
+
 struct Forward<'a, R> {
     stage: &'a HashGridStage,
     params: &'a [R],
@@ -253,18 +273,19 @@ struct Forward<'a, R> {
 
 impl<R: Real> Forward<'_, R> {
     #[inline(always)]
-    fn features<const F: usize>(mut self) {
+    fn features<S: Simd, const F: usize>(mut self, s: S) {
         let mut located = Located::new();
         let mut out = [[R::ZERO; BLOCK]; F];
         for level in &self.stage.levels {
             let (table, _) = self.params[self.stage.params_of(level)].as_chunks::<F>();
+            assert_eq!(table.len(), level.entries as usize);
             for at in (0..self.x.rows).step_by(BLOCK) {
                 let n = BLOCK.min(self.x.rows - at);
-                located.locate(level, self.stage.primes, self.x, at, n);
+                located.locate(s, level, self.stage.primes, self.x, at, n);
                 for i in 0..n {
                     let mut sum = [R::ZERO; F];
                     for c in 0..8 {
-                        let (entry, w) = (&table[located.index[c][i] as usize], located.weight[c][i]);
+                        let (entry, w) = (entry(table, located.index[c][i]), located.weight[c][i]);
                         for f in 0..F {
                             sum[f] += w * entry[f];
                         }
@@ -286,12 +307,12 @@ impl<R: Real> Forward<'_, R> {
 impl<R: Real> Op for Forward<'_, R> {
     type Out = ();
     #[inline(always)]
-    fn call<S: Simd>(self, _: S) {
+    fn call<S: Simd>(self, s: S) {
         match self.stage.settings.features {
-            1 => self.features::<1>(),
-            2 => self.features::<2>(),
-            4 => self.features::<4>(),
-            _ => self.features::<8>(),
+            1 => self.features::<S, 1>(s),
+            2 => self.features::<S, 2>(s),
+            4 => self.features::<S, 4>(s),
+            _ => self.features::<S, 8>(s),
         }
     }
 }
@@ -307,7 +328,7 @@ struct Backward<'a, R> {
 
 impl<R: Real> Backward<'_, R> {
     #[inline(always)]
-    fn features<const F: usize>(mut self) {
+    fn features<S: Simd, const F: usize>(mut self, s: S) {
         let mut located = Located::new();
         let mut dy = [[R::ZERO; F]; BLOCK];
         if let Some(dx) = &mut self.dx {
@@ -324,16 +345,18 @@ impl<R: Real> Backward<'_, R> {
             for at in (0..self.x.rows).step_by(BLOCK) {
                 let n = BLOCK.min(self.x.rows - at);
                 for (f, channel) in level.outputs.iter().enumerate() {
-                    for i in 0..n {
-                        dy[i][f] = channel.map_or(R::ZERO, |c| self.dy.channel(c)[at + i]);
+                    match *channel {
+                        Some(c) => dy.iter_mut().zip(&self.dy.channel(c)[at..at + n]).for_each(|(dy, &v)| dy[f] = v),
+                        None => dy[..n].iter_mut().for_each(|dy| dy[f] = R::ZERO),
                     }
                 }
-                located.locate(level, self.stage.primes, self.x, at, n);
+                located.locate(s, level, self.stage.primes, self.x, at, n);
                 if whole {
                     let (grads, _) = self.grads.values[from - range.start..to - range.start].as_chunks_mut::<F>();
+                    assert_eq!(grads.len(), level.entries as usize);
                     for i in 0..n {
                         for c in 0..8 {
-                            let (g, w) = (&mut grads[located.index[c][i] as usize], located.weight[c][i]);
+                            let (g, w) = (entry_mut(grads, located.index[c][i]), located.weight[c][i]);
                             for f in 0..F {
                                 g[f] += w * dy[i][f];
                             }
@@ -381,12 +404,12 @@ impl<R: Real> Backward<'_, R> {
 impl<R: Real> Op for Backward<'_, R> {
     type Out = ();
     #[inline(always)]
-    fn call<S: Simd>(self, _: S) {
+    fn call<S: Simd>(self, s: S) {
         match self.stage.settings.features {
-            1 => self.features::<1>(),
-            2 => self.features::<2>(),
-            4 => self.features::<4>(),
-            _ => self.features::<8>(),
+            1 => self.features::<S, 1>(s),
+            2 => self.features::<S, 2>(s),
+            4 => self.features::<S, 4>(s),
+            _ => self.features::<S, 8>(s),
         }
     }
 }
@@ -495,6 +518,15 @@ impl Encoder for HashGridStage {
 mod tests {
     use super::*;
 
+    struct Locate<'a>(&'a mut Located<f64>, &'a Level, [u32; 3], Tile<'a, f64>);
+    impl Op for Locate<'_> {
+        type Out = ();
+        #[inline(always)]
+        fn call<S: Simd>(self, s: S) {
+            self.0.locate(s, self.1, self.2, self.3, 0, 1);
+        }
+    }
+
     /// The published index, in exact arithmetic.
     fn index(level: &Level, primes: [u64; 3], c: [u64; 3]) -> u64 {
         if level.dense {
@@ -515,7 +547,7 @@ mod tests {
             for p in [[0.0, 0.0, 0.0], [1.0, 1.0, 1.0], [0.3, 0.71, 0.999], [0.5, 0.25, 0.125f64]] {
                 let mut located = Located::<f64>::new();
                 let data: Vec<f64> = p.to_vec();
-                located.locate(level, stage.primes, Tile::new(&data, 1), 0, 1);
+                run(Locate(&mut located, level, stage.primes, Tile::new(&data, 1)));
                 let cell = p.map(|x| (x * level.scale + 0.5).floor() as u64);
                 let mut total = 0.0;
                 for c in 0..8u64 {

@@ -298,12 +298,12 @@ impl<R: Real> Op for Backward<'_, R> {
             if layer.skip > 0 {
                 affine_weights(s, dz, x.data, dw, layer.ld(), 0, None, n);
             }
-            if let Some(dx) = &mut dx {
-                if layer.skip > 0 || i == 0 {
-                    let out = if fresh { Into::Set } else { Into::Add };
-                    affine_input(s, weights(0), dz, dx.data, out, n);
-                    fresh = false;
-                }
+            if let Some(dx) = &mut dx
+                && (layer.skip > 0 || i == 0)
+            {
+                let out = if fresh { Into::Set } else { Into::Add };
+                affine_input(s, weights(0), dz, dx.data, out, n);
+                fresh = false;
             }
             if i > 0 {
                 let slope = stage.slope(i - 1);

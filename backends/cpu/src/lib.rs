@@ -62,7 +62,7 @@ impl Backend for Cpu {
             .ok_or_else(|| Error::unsupported("cpu backend", "a stage offers no kernel"))?;
         let slots = Slots::<f32>::new(&kernels);
         let explain = Explain {
-            backend: format!("cpu, {:?}, {} threads", simd::level(), rayon::current_num_threads()),
+            backend: format!("cpu, {}, {} threads", simd::level_name(), rayon::current_num_threads()),
             notes,
             scratch_bytes: slots.bytes(),
         };

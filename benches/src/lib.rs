@@ -1,0 +1,1 @@
+//! Speed of conefield, measured in `benches/`.
