@@ -1,0 +1,75 @@
+//! A tiny scan and runs on it, from specs in JSON.
+
+use conefield_backend_cpu::Cpu;
+use conefield_core::Result;
+use conefield_core::arena::Weights;
+use conefield_core::scan::{Scan, Volume};
+use conefield_core::solver::{Job, Limits, Observer, Record, Solution};
+use conefield_core::spec::{Spec, load};
+use conefield_projectors::simulate::{Protocol, simulate};
+use ndarray::Array3;
+use serde_json::{Value, json};
+
+// Stage types register themselves where their crate is linked.
+use conefield_encoders as _;
+use conefield_fields as _;
+use conefield_initializers as _;
+use conefield_normalizers as _;
+use conefield_solvers as _;
+
+/// A ball in air with a box inside, 16³ voxels of 10 mm, in 1/mm.
+pub fn truth() -> Volume {
+    let data = Array3::from_shape_fn((16, 16, 16), |(x, y, z)| {
+        let d = [x, y, z].map(|i| i as f32 - 7.5);
+        let ball = d.iter().map(|v| v * v).sum::<f32>() < 40.0;
+        let inside = (5..9).contains(&x) && (6..11).contains(&y) && (5..10).contains(&z);
+        f32::from(u8::from(ball)) * if inside { 0.02 } else { 0.01 }
+    });
+    Volume::centered(data, [10.0; 3])
+}
+
+/// Eight views of it, 16 × 16 pixels.
+pub fn scan() -> Scan {
+    let protocol: Protocol = serde_json::from_value(json!({
+        "dso": 500.0, "dsd": 750.0, "detector": [16, 16], "extent": {"side": [280.0, 280.0]},
+        "angles": {"even": {"views": 8}},
+    }))
+    .unwrap();
+    simulate(&truth(), &protocol).unwrap()
+}
+
+/// The spec that `value` says, read as a file of it would be.
+pub fn spec(value: &Value) -> Result<Spec> {
+    Ok(load::parse(&value.to_string(), "test.json", &[], &[])?.spec)
+}
+
+/// Keeps what a run says.
+#[derive(Default)]
+pub struct Heard(pub Vec<Record>);
+
+impl Observer for Heard {
+    fn progress(&mut self, _: u64, _: f64, _: f64) {}
+    fn record(&mut self, record: &Record) {
+        self.0.push(record.clone());
+    }
+    fn note(&mut self, _: &str) {}
+}
+
+/// A whole run of `value` on `scan`, with the weights file that it may name.
+pub fn solve(value: &Value, scan: &Scan, weights: &Weights) -> Result<(Solution, Vec<Record>)> {
+    let spec = spec(value)?;
+    let job = Job {
+        scan,
+        held_out: None,
+        reference: None,
+        peak: 1.0,
+        spec: &spec,
+        backend: &Cpu::new(),
+        seed: 7,
+        limits: Limits::default(),
+        weights: &|_| Ok(weights.clone()),
+    };
+    let mut heard = Heard::default();
+    let solution = spec.solver.build()?.solve(&job, &mut heard)?;
+    Ok((solution, heard.0))
+}

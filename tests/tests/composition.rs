@@ -1,0 +1,149 @@
+//! Stages of every kind put together in every way that fits, from JSON alone, and trained; what does not fit is
+//! refused in words.
+
+mod common;
+
+use common::{scan, solve};
+use conefield_core::arena::Weights;
+use serde_json::{Value, json};
+
+/// With whether channels stand from coarse to fine.
+fn encoders() -> Vec<(&'static str, Value, bool)> {
+    let hash = |convention: &str| json!({"type": "hash-grid", "convention": convention, "levels": 4, "base_resolution": 3, "log2_table_size": 9});
+    let frequency = json!({"type": "frequency", "bands": 3, "max_frequency": 4.0});
+    let dense = json!({"type": "dense-grid", "levels": 3, "base_resolution": 3});
+    let concat = json!({"type": "concat", "encoders": [{"type": "identity"}, frequency, dense, hash("naf")]});
+    vec![
+        ("naf", hash("naf"), true),
+        ("instant-ngp", hash("instant-ngp"), true),
+        ("frequency", frequency, true),
+        ("dense", dense, true),
+        ("concat", concat, false),
+        ("identity", json!({"type": "identity"}), false),
+    ]
+}
+
+fn chains(ordered: bool) -> Vec<Value> {
+    // 8 views, all of them an epoch: decided at step 16.
+    let mask = json!({"type": "fft-mask", "epoch": 2, "scope": if ordered { "finer" } else { "channel" }});
+    let norm = json!({"type": "layer-norm"});
+    vec![json!([]), json!([norm]), json!([mask, norm]), json!([norm, mask])]
+}
+
+fn projectors() -> Vec<Value> {
+    vec![
+        json!({"type": "ray-march", "samples": 24, "extent": "clipped", "sampling": "stratified"}),
+        json!({"type": "ray-march", "samples": 24, "extent": "published", "sampling": "uniform"}),
+        json!({"type": "ray-march", "step_mm": 8.0}),
+    ]
+}
+
+fn mlp() -> Value {
+    json!({"type": "mlp", "width": 16, "depth": 3, "skips": [1]})
+}
+
+fn pipeline(encoder: &Value, normalizers: &Value, field: &Value, projector: &Value) -> Value {
+    json!({
+        "encoder": encoder, "normalizers": normalizers, "field": field, "projector": projector,
+        "solver": {"type": "gradient", "steps": 30, "rays": 96, "lr": 0.02, "loss": "l2", "report_every": 5},
+    })
+}
+
+/// Trains; the loss falls by at least a fifth and the volume holds what the last loss says: finite attenuations.
+fn learns(name: &str, spec: &Value) {
+    let (solution, records) = solve(spec, &scan(), &Weights::default()).unwrap_or_else(|e| panic!("{name}: {e}"));
+    let (first, last) = (records.first().unwrap().loss, records.last().unwrap().loss);
+    assert_eq!((records.len(), solution.steps), (6, 30), "{name}");
+    assert!(last < 0.8 * first, "{name}: the loss went from {first} to {last}");
+    assert!(solution.volume.data.iter().all(|x| x.is_finite()), "{name}");
+    // A mask in the chain was decided on the way.
+    let masks = spec["normalizers"].as_array().unwrap().iter().filter(|n| n["type"] == "fft-mask").count();
+    let events: Vec<_> = records.iter().flat_map(|r| &r.events).collect();
+    assert_eq!(events.len(), masks, "{name}: {events:?}");
+}
+
+#[test]
+fn every_combination_that_fits_learns() {
+    for (name, encoder, ordered) in encoders() {
+        for (c, chain) in chains(ordered).iter().enumerate() {
+            for (p, projector) in projectors().iter().enumerate() {
+                learns(&format!("{name}, chain {c}, projector {p}"), &pipeline(&encoder, chain, &mlp(), projector));
+            }
+        }
+    }
+}
+
+#[test]
+fn voxels_behind_positions_learn() {
+    let grid = json!({"type": "voxel-grid", "resolution": 16});
+    for (p, projector) in projectors().iter().enumerate() {
+        let mut spec = pipeline(&json!({"type": "identity"}), &json!([]), &grid, projector);
+        // Every voxel moves by about the rate a step, from softplus(−2) on.
+        spec["solver"]["lr"] = json!(0.1);
+        learns(&format!("voxels, projector {p}"), &spec);
+    }
+}
+
+/// The refusal of `spec` holds every one of `words`.
+fn refused(what: &str, spec: &Value, words: &[&str]) {
+    match solve(spec, &scan(), &Weights::default()) {
+        Ok(_) => panic!("{what}: not refused"),
+        Err(e) => {
+            let e = e.to_string();
+            assert!(words.iter().all(|w| e.contains(w)), "{what}: {e:?} lacks one of {words:?}");
+        }
+    }
+}
+
+#[test]
+fn what_does_not_fit_is_refused_in_words() {
+    let hash = json!({"type": "hash-grid", "levels": 4, "base_resolution": 3, "log2_table_size": 9});
+    let none = json!([]);
+    let march = &projectors()[0];
+    let good = pipeline(&hash, &none, &mlp(), march);
+    let with = |change: &dyn Fn(&mut Value)| {
+        let mut v = good.clone();
+        change(&mut v);
+        v
+    };
+
+    let voxels = json!({"type": "voxel-grid", "resolution": 16});
+    refused("voxels behind features", &pipeline(&hash, &none, &voxels, march), &["8 channels", "identity"]);
+    let drops = json!([{"type": "fft-mask", "keep": [0, 2]}]);
+    let spec = pipeline(&json!({"type": "identity"}), &drops, &voxels, march);
+    refused("voxels without a coordinate", &spec, &["voxel-grid", "all three coordinates"]);
+    for stage in ["encoder", "field", "projector"] {
+        let spec = with(&|v| drop(v.as_object_mut().unwrap().remove(stage)));
+        refused(stage, &spec, &[stage, "nothing", "with a type"]);
+    }
+    refused("no solver", &with(&|v| drop(v.as_object_mut().unwrap().remove("solver"))), &["solver", "gradient"]);
+    refused("skip at the end", &with(&|v| v["field"]["skips"] = json!([3])), &["field.skips", "3", "1 to 2"]);
+    refused("skip at the start", &with(&|v| v["field"]["skips"] = json!([0])), &["field.skips", "0", "1 to 2"]);
+    for encoder in ["hash-grid", "dense-grid"] {
+        let spec = with(&|v| v["encoder"] = json!({"type": encoder, "levels": 0}));
+        refused("zero levels", &spec, &["encoder.levels", "found 0", "1 to 32"]);
+    }
+    let spec = with(&|v| v["encoder"] = json!({"type": "frequency", "bands": 0}));
+    refused("zero bands", &spec, &["encoder.bands", "found 0"]);
+    let spec = with(&|v| v["encoder"] = json!({"type": "concat", "encoders": []}));
+    refused("nothing to concat", &spec, &["encoder.encoders", "a list of 0"]);
+    let spec = with(&|v| v["encoder"] = json!({"type": "concat", "encoders": [{"type": "hash-grid", "levels": 0}]}));
+    refused("zero levels in a concat", &spec, &["encoder.encoders.0.levels", "found 0"]);
+    refused("unknown type", &with(&|v| v["field"]["type"] = json!("mlpp")), &["field.type", "mlpp", "mlp"]);
+    refused("unknown setting", &with(&|v| v["field"]["widht"] = json!(8)), &["field.widht", "width"]);
+    refused("zero samples", &with(&|v| v["projector"]["samples"] = json!(0)), &["projector.samples", "1 to 65536"]);
+}
+
+/// "All finer channels" needs an order: side by side, encoders have none, nor have coordinates. Frequency bands do.
+#[test]
+fn finer_channels_without_an_order_are_refused() {
+    for (name, encoder, ordered) in encoders() {
+        let mask = json!([{"type": "fft-mask", "epoch": 1, "scope": "finer"}]);
+        let spec = pipeline(&encoder, &mask, &mlp(), &projectors()[0]);
+        if ordered {
+            learns(name, &spec);
+        } else {
+            refused(name, &spec, &["fft-mask", "coarse to fine", "scope = \"channel\""]);
+        }
+    }
+}

@@ -1,0 +1,342 @@
+//! Whole pipelines: the gradient of a step, the same bits on any number of threads, any unit, weights from another
+//! scan, and masked channels that leave the work.
+
+mod common;
+
+use common::{Heard, scan, solve, spec, truth};
+use conefield_backend_cpu::Cpu;
+use conefield_backend_cpu::rows::Kernels;
+use conefield_backend_cpu::step::Slots;
+use conefield_core::arena::Weights;
+use conefield_core::backend::{Loss, TrainRay, TvBlocks, Work};
+use conefield_core::pipeline::{Model, Pipeline};
+use conefield_core::random::{mix, unit};
+use conefield_core::scan::{Scan, Volume};
+use conefield_core::scene::Scene;
+use conefield_core::solver::{Limits, PretrainJob, Solution};
+use serde_json::{Value, json};
+
+fn settings() -> Value {
+    json!({
+        "encoder": {"type": "hash-grid", "levels": 3, "base_resolution": 3, "log2_table_size": 8},
+        "normalizers": [{"type": "layer-norm"}],
+        "field": {"type": "mlp", "width": 12, "depth": 3, "skips": [1]},
+        "projector": {"type": "ray-march", "samples": 20, "sampling": "uniform"},
+        "solver": {"type": "gradient", "steps": 40, "rays": 128, "lr": 0.02, "loss": "l2", "report_every": 5},
+    })
+}
+
+// ---- the gradient of a whole step ----
+
+/// A step's loss in double precision, as a function of the parameters.
+struct Case<'a> {
+    pipeline: &'a Pipeline,
+    kernels: Kernels<'a, f64>,
+    work: Work<'a>,
+}
+
+impl Case<'_> {
+    fn step(&self, params: &[f64]) -> (f64, Vec<f64>) {
+        let mut grads = vec![0.0; params.len()];
+        let projector = self.pipeline.projector.as_ref();
+        let stats = Slots::new(&self.kernels).step(&self.kernels, projector, params, &mut grads, &self.work);
+        (stats.loss + stats.prior, grads)
+    }
+
+    /// Compares `grads` at the entries of `sampled` with central differences.
+    ///
+    /// The step is 1e-5 on parameters of order one. Central differences are wrong by h²·L‴/6, some 1e-10 times what
+    /// the third derivative is larger than the first, and by the rounding of the loss over h, 1e-16/1e-5 = 1e-11.
+    /// A thousand times that is allowed, relative to the block's largest gradient. A wrong formula is off by far
+    /// more: a percent of one entry is found, see the negative control.
+    fn compare(&self, params: &[f64], grads: &[f64], sampled: &[Vec<usize>]) -> Result<(), String> {
+        let h = 1e-5;
+        for block in sampled {
+            let largest = block.iter().map(|&p| grads[p].abs()).fold(0.0, f64::max);
+            for &p in block {
+                let at = |d: f64| {
+                    let mut moved = params.to_vec();
+                    moved[p] += d;
+                    self.step(&moved).0
+                };
+                let expected = (at(h) - at(-h)) / (2.0 * h);
+                if (grads[p] - expected).abs() > 1e-7 * largest + 1e-9 {
+                    return Err(format!("parameter {p}: gradient {}, differences {expected}", grads[p]));
+                }
+            }
+        }
+        Ok(())
+    }
+}
+
+/// Of every block the largest gradient and ten others.
+fn sample(pipeline: &Pipeline, grads: &[f64]) -> Vec<Vec<usize>> {
+    let blocks = &pipeline.layout().blocks;
+    let of = |b: &conefield_core::arena::Block| {
+        let largest = b.range.clone().max_by(|&i, &j| grads[i].abs().total_cmp(&grads[j].abs())).unwrap();
+        let every = (b.range.len() / 10).max(1);
+        let others = b.range.clone().step_by(every).filter(move |&p| p != largest);
+        std::iter::once(largest).chain(others).collect()
+    };
+    blocks.iter().map(of).collect()
+}
+
+fn gradients_of(settings: &Value) {
+    let pipeline = Pipeline::build(&spec(settings).unwrap()).unwrap();
+    let scan = scan();
+    let scene = Scene::new(&scan, &conefield_core::spec::Scene::default()).unwrap();
+    let mut rays = vec![];
+    for i in 0..40 {
+        if let Some(ray) = scene.pixel_ray(&scan.geometry, i % 8, (i * 5) % 16, (i * 7) % 16) {
+            // Near and far from what the field says, so that Huber's two parts both occur.
+            rays.push(TrainRay { ray, target: if i % 2 == 0 { 0.5 } else { 3.0 } });
+        }
+    }
+    assert!(rays.len() > 20);
+    let place = |i: u64| std::array::from_fn(|k| 0.05 + 0.9 * unit(mix(i, k as u64)));
+    let points: Vec<_> = (0..50).map(|i| (place(i), if i % 2 == 0 { 0.7 } else { 4.0 })).collect();
+    let tv = TvBlocks {
+        corners: (100..104).map(|i| place(i).map(|x: f32| 0.7 * x)).collect(),
+        spacing: [0.06, 0.05, 0.07],
+        edge: 3,
+        weight: 0.3,
+        smoothing: 1e-2,
+    };
+    let params: Vec<f64> = Model::random(Pipeline::build(&spec(settings).unwrap()).unwrap(), 3)
+        .arena
+        .params
+        .iter()
+        .enumerate()
+        .map(|(i, &p)| f64::from(p) + 0.4 * (f64::from(unit(mix(5, i as u64))) - 0.5))
+        .collect();
+    for loss in [Loss::L2, Loss::Huber { delta: 0.5 }] {
+        let kernels = Kernels::new(&pipeline, |s| s.reference()).unwrap();
+        let work = Work { step: 4, seed: 9, loss, rays: &rays, points: &points, tv: Some(&tv) };
+        let case = Case { pipeline: &pipeline, kernels, work };
+        let (value, grads) = case.step(&params);
+        assert!(value.is_finite() && grads.iter().filter(|g| **g != 0.0).count() > grads.len() / 2);
+        let sampled = sample(&pipeline, &grads);
+        case.compare(&params, &grads, &sampled).unwrap();
+        // Negative control: one entry, a percent off, in every block.
+        for block in &sampled {
+            let mut wrong = grads.clone();
+            wrong[block[0]] *= 1.01;
+            assert!(case.compare(&params, &wrong, std::slice::from_ref(block)).is_err());
+        }
+        // Every part is in the sum: without it the gradient is another.
+        let parts = [
+            Work { rays: &[], ..case.work.clone() },
+            Work { points: &[], ..case.work.clone() },
+            Work { tv: None, ..case.work.clone() },
+        ];
+        for work in parts {
+            let kernels = Kernels::new(&pipeline, |s| s.reference()).unwrap();
+            let (_, other) = Case { pipeline: &pipeline, kernels, work }.step(&params);
+            assert!(case.compare(&params, &other, &sampled).is_err());
+        }
+    }
+}
+
+#[test]
+fn a_steps_gradient_is_that_of_its_loss() {
+    gradients_of(&settings());
+}
+
+/// Scattered parameters in the field, and more than one encoder in front.
+#[test]
+fn a_steps_gradient_is_that_of_its_loss_in_other_pipelines() {
+    let mut voxels = settings();
+    voxels["encoder"] = json!({"type": "identity"});
+    voxels["normalizers"] = json!([]);
+    voxels["field"] = json!({"type": "voxel-grid", "resolution": 4});
+    gradients_of(&voxels);
+    let mut concat = settings();
+    let parts = json!([{"type": "frequency", "bands": 2, "max_frequency": 2.0}, {"type": "dense-grid", "levels": 2, "base_resolution": 2}]);
+    concat["encoder"] = json!({"type": "concat", "encoders": parts});
+    gradients_of(&concat);
+}
+
+// ---- threads ----
+
+fn bits(values: &[f32]) -> Vec<u32> {
+    values.iter().map(|v| v.to_bits()).collect()
+}
+
+#[test]
+fn the_number_of_threads_does_not_change_a_bit() {
+    let mut s = settings();
+    s["encoder"]["levels"] = json!(5);
+    s["projector"]["sampling"] = json!("stratified");
+    // 25 000 rows a step: every slot has several groups.
+    s["projector"]["samples"] = json!(48);
+    s["solver"]["rays"] = json!(512);
+    s["solver"]["steps"] = json!(10);
+    s["solver"]["tv"] = json!({"weight": 0.01, "blocks": 8, "edge": 4});
+    let scan = scan();
+    let run = |threads: usize, s: &Value| {
+        let pool = rayon::ThreadPoolBuilder::new().num_threads(threads).build().unwrap();
+        let (solution, records) = pool.install(|| solve(s, &scan, &Weights::default())).unwrap();
+        assert_eq!(solution.steps, 10);
+        let arena = solution.model.unwrap().arena;
+        let losses: Vec<u64> = records.iter().flat_map(|r| [r.loss, r.prior.unwrap()]).map(f64::to_bits).collect();
+        let volume = bits(solution.volume.data.as_slice().unwrap());
+        ([bits(&arena.params), bits(&arena.first), bits(&arena.second), volume], losses)
+    };
+    let one = run(1, &s);
+    assert!(one == run(2, &s), "two threads");
+    assert!(one == run(3, &s), "three threads");
+    // Negative control: bits that a hardly changed run does change.
+    s["solver"]["lr"] = json!(0.020001);
+    assert!(one != run(1, &s));
+}
+
+// ---- units ----
+
+fn psnr(volume: &Volume, scale: f64) -> f64 {
+    let truth = truth();
+    let square = |(a, b): (&f32, &f32)| (f64::from(*a) * scale - f64::from(*b)).powi(2);
+    let mse = volume.data.iter().zip(&truth.data).map(square).sum::<f64>() / volume.data.len() as f64;
+    10.0 * (0.02f64.powi(2) / mse).log10()
+}
+
+/// Lengths, the data set's unit and attenuation may be anything: the volume is the same, in its own unit.
+#[test]
+fn units_do_not_change_the_volume() {
+    let s = settings();
+    let base = scan();
+    let run = |scan: &Scan| solve(&s, scan, &Weights::default()).unwrap().0.volume;
+    let expected = psnr(&run(&base), 1.0);
+    assert!(expected > 10.0, "the run itself makes a volume: {expected} dB");
+    for (lengths, unit_mm, attenuation) in [
+        (1e3, 1.0, 1.0),
+        (1e-3, 1.0, 1.0),
+        (1e3, 1e3, 1.0),
+        (1e-3, 1e-3, 1.0),
+        (1.0, 1e3, 1.0),
+        (1.0, 1.0, 1e-6),
+        (1.0, 1.0, 1e6),
+        (1e3, 1e3, 1e-6),
+        (1e-3, 1.0, 1e6),
+    ] {
+        let mut other = base.clone();
+        other.geometry = base.geometry.scaled(lengths);
+        other.unit.mm = unit_mm;
+        other.projections.mapv_inplace(|a| (f64::from(a) * attenuation) as f32);
+        let volume = run(&other);
+        assert_eq!(volume.grid.spacing, base.geometry.volume.spacing.map(|x| x * lengths));
+        // Line integrals × a over lengths × l make a/l in 1/mm, and u times as much in 1/unit.
+        let found = psnr(&volume, lengths / (attenuation * unit_mm));
+        assert!(
+            (found - expected).abs() < 1e-3,
+            "lengths x {lengths}, unit of {unit_mm} mm, attenuation x {attenuation}: {found} dB, not {expected} dB"
+        );
+    }
+    // Negative control: a scale that does not come from the scan.
+    let mut fixed = settings();
+    fixed["scene"] = json!({"attenuation": {"fixed": 0.02}});
+    let mut other = base.clone();
+    let expected = psnr(&solve(&fixed, &base, &Weights::default()).unwrap().0.volume, 1.0);
+    other.projections.mapv_inplace(|a| a * 2.0);
+    let found = psnr(&solve(&fixed, &other, &Weights::default()).unwrap().0.volume, 0.5);
+    assert!((found - expected).abs() > 1e-3, "{found} dB and {expected} dB");
+}
+
+// ---- weights from another scan ----
+
+fn pretrained(s: &Value) -> (Model, Vec<f64>) {
+    let spec = spec(s).unwrap();
+    let volumes = [truth(), truth().mapped(|x| 3.0 * x)];
+    let job = PretrainJob {
+        volumes: &volumes,
+        spec: &spec,
+        backend: &Cpu::new(),
+        seed: 21,
+        limits: Limits { steps: Some(60), seconds: None },
+    };
+    let mut heard = Heard::default();
+    let model = spec.solver.build().unwrap().pretrain(&job, &mut heard).unwrap();
+    (model, heard.0.iter().map(|r| r.loss).collect())
+}
+
+fn parts(model: &Model) -> (Vec<u32>, Vec<u32>) {
+    let encoder = model.pipeline.ranges()[0].end;
+    (bits(&model.arena.params[..encoder]), bits(&model.arena.params[encoder..]))
+}
+
+#[test]
+fn weights_behind_the_encoder_go_to_another_scan() {
+    let mut s = settings();
+    s["solver"]["pretrain_points"] = json!(512);
+    let (trained, losses) = pretrained(&s);
+    assert!(losses.last().unwrap() < &(0.9 * losses[0]), "{losses:?}");
+    let weights = Weights::from_arena(trained.pipeline.layout(), &trained.arena.params, |_| true);
+
+    let run = |s: &Value, steps: u64| -> conefield_core::Result<(Solution, Vec<f64>)> {
+        let mut s = s.clone();
+        s["solver"]["steps"] = json!(steps);
+        let (solution, records) = solve(&s, &scan(), &weights)?;
+        Ok((solution, records.iter().map(|r| r.loss).collect()))
+    };
+    let fresh = run(&s, 0).unwrap().0.model.unwrap();
+    s["initializer"] = json!({"type": "mci", "weights": "other.safetensors"});
+    let loaded = run(&s, 0).unwrap().0.model.unwrap();
+    let ((fresh_encoder, fresh_rest), (encoder, rest)) = (parts(&fresh), parts(&loaded));
+    let (trained_encoder, trained_rest) = parts(&trained);
+    assert!(encoder == fresh_encoder && encoder != trained_encoder, "the encoder starts afresh");
+    assert!(rest == trained_rest && rest != fresh_rest, "everything behind it is loaded");
+
+    let (after, losses) = run(&s, 30).unwrap();
+    assert!(losses.last().unwrap() < &(0.8 * losses[0]), "{losses:?}");
+    let (encoder, rest) = parts(&after.model.unwrap());
+    assert!(encoder != fresh_encoder && rest != trained_rest, "all of it trains on");
+
+    for (field, value) in [("width", json!(16)), ("depth", json!(4))] {
+        let mut other = s.clone();
+        other["field"][field] = value;
+        let e = run(&other, 0).err().unwrap().to_string();
+        assert!(e.contains("other.safetensors") && e.contains("field.") && e.contains("shape"), "{e}");
+    }
+    // Another encoder with as many channels is no obstacle.
+    let mut other = s.clone();
+    other["encoder"] = json!({"type": "dense-grid", "levels": 3, "base_resolution": 4});
+    let other = run(&other, 0).unwrap().0.model.unwrap();
+    assert!(parts(&other).1 == trained_rest);
+}
+
+// ---- masks ----
+
+#[test]
+fn masked_channels_leave_the_work() {
+    let mut s = settings();
+    s["encoder"]["levels"] = json!(6);
+    s["encoder"]["base_resolution"] = json!(2);
+    // Fine levels hardly train in a pass and stay as random as they started.
+    let mask = json!({"type": "fft-mask", "epoch": 1, "rule": "relative", "threshold": 0.72});
+    s["normalizers"] = json!([mask, {"type": "layer-norm"}]);
+    let whole = Pipeline::build(&spec(&s).unwrap()).unwrap();
+    let (solution, records) = solve(&s, &scan(), &Weights::default()).unwrap();
+    let model = solution.model.unwrap();
+    let p = &model.pipeline;
+    let events: Vec<&String> = records.iter().flat_map(|r| &r.events).collect();
+    assert_eq!(events.len(), 1, "{events:?}");
+    println!("{}", events[0]);
+    // 8 views make an epoch: the record after step 8 tells.
+    assert!(records.iter().all(|r| r.events.is_empty() == (r.step != 10)));
+
+    let kept = p.encoder.info().output;
+    assert!((1..12).contains(&kept) && events[0].contains(&format!("{kept} of 12")), "{kept}: {}", events[0]);
+    let levels = |p: &Pipeline| p.layout().blocks.iter().filter(|b| b.name.starts_with("encoder.")).count();
+    assert_eq!((levels(&whole), levels(p)), (6, kept.div_ceil(2)));
+    assert!(p.layout().len() < whole.layout().len() && p.macs() < whole.macs());
+    for part in [&model.arena.params, &model.arena.grads, &model.arena.first, &model.arena.second] {
+        assert_eq!(part.len(), p.layout().len());
+    }
+    assert_eq!(p.field.info().input, kept);
+    assert_eq!(p.layout().find("normalizers.0.weight").unwrap().shape, [kept]);
+
+    // Training goes on: every loss is finite, the last below the one right after the mask, and weights still move.
+    assert!(records.iter().all(|r| r.loss.is_finite()));
+    let after = records.iter().find(|r| r.step == 15).unwrap().loss;
+    assert!(records.last().unwrap().loss < after, "{} after the mask, {}", after, records.last().unwrap().loss);
+    assert!(model.arena.first.iter().filter(|m| **m != 0.0).count() > model.arena.first.len() / 4);
+}
