@@ -10,6 +10,7 @@ pub const SHIPPED: &[Shipped] = &[
     Shipped { name: "ni-naf-published", text: include_str!("../../specs/ni-naf-published.toml") },
     Shipped { name: "nerf", text: include_str!("../../specs/nerf.toml") },
     Shipped { name: "dense", text: include_str!("../../specs/dense.toml") },
+    Shipped { name: "accurate", text: include_str!("../../specs/accurate.toml") },
     Shipped { name: "fast", text: include_str!("../../specs/fast.toml") },
 ];
 

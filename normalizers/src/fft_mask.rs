@@ -205,12 +205,6 @@ impl FftMaskStage {
             let report = format!("fft-mask: {} of {} channels kept as the spec says", keep.len(), self.width);
             return Ok(Mask { keep: keep.clone(), report });
         }
-        if s.scope == Scope::Finer && !probe.coarse_to_fine() {
-            return Err(Error::unsupported(
-                "fft-mask with scope \"finer\"",
-                "this encoder's channels do not stand from coarse to fine; use scope = \"channel\"",
-            ));
-        }
         let [w, h, d] = probe.shape();
         if w < 8 || h < 8 || d == 0 {
             let report =
@@ -376,8 +370,20 @@ impl Stage for FftMaskStage {
 
 impl Normalizer for FftMaskStage {
     fn refresh(&self, probe: &mut dyn Probe) -> Result<Option<Mask>> {
-        if self.done() || (self.settings.keep.is_none() && probe.epoch() < self.settings.epoch) {
+        if self.done() {
             return Ok(None);
+        }
+        if self.settings.keep.is_none() {
+            // Before the epoch too: what can't be decided later is refused at the first step.
+            if self.settings.scope == Scope::Finer && !probe.coarse_to_fine() {
+                return Err(Error::unsupported(
+                    "fft-mask with scope \"finer\"",
+                    "this encoder's channels do not stand from coarse to fine; use scope = \"channel\"",
+                ));
+            }
+            if probe.epoch() < self.settings.epoch {
+                return Ok(None);
+            }
         }
         let mask = self.decide(probe)?;
         self.done.store(true, Ordering::Relaxed);

@@ -17,7 +17,7 @@ use std::path::PathBuf;
 /// Show what a spec builds: stages, widths, parameters, memory, work.
 #[derive(Args)]
 pub struct Explain {
-    /// A shipped spec (naf, ni-naf, ni-naf-published, nerf, dense, fast) or a file.
+    /// A shipped spec (naf, ni-naf, ni-naf-published, nerf, dense, accurate, fast) or a file.
     spec: String,
     /// Change a setting, such as encoder.levels=8.
     #[arg(long = "set", value_name = "KEY=VALUE")]

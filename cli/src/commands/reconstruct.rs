@@ -27,7 +27,7 @@ use tracing::info;
 pub struct Reconstruct {
     /// The scan.
     scan: PathBuf,
-    /// A shipped spec (naf, ni-naf, ni-naf-published, nerf, dense, fast) or a file.
+    /// A shipped spec (naf, ni-naf, ni-naf-published, nerf, dense, accurate, fast) or a file.
     #[arg(long)]
     spec: String,
     /// The folder for the results; new or empty.

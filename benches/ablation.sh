@@ -1,0 +1,36 @@
+#!/usr/bin/env bash
+# The parts of the method one after the other (NAF, + LayerNorm, + MCI, + FFT mask) on real volumes, same seconds each:
+#   bash benches/ablation.sh DATA_FOLDER OUT_FOLDER [SECONDS]
+# DATA_FOLDER holds volumes/*.nii.gz. MCI weights come from abdomen alone. Writes a curve a volume and scores.txt.
+set -euo pipefail
+cd "$(dirname "$0")/.."
+data=$1
+out=$2
+seconds=${3:-120}
+cargo build --release --quiet -p conefield
+cargo build --release --quiet -p conefield-benches --bin curves
+bin=${CARGO_TARGET_DIR:-target}/release
+mkdir -p "$out"
+none='normalizers=[]'
+norm='normalizers=[{type="layer-norm"}]'
+mask='normalizers=[{type="fft-mask"},{type="layer-norm"}]'
+weights=$out/abdomen.safetensors
+[[ -f $weights ]] || "$bin/conefield" -q pretrain "$data/volumes/abdomen_128.nii.gz" --spec ni-naf --set "$norm" -o "$weights"
+: >"$out/scores.txt"
+for volume in engine_256 head_256 chest_128; do
+    scan=$out/$volume
+    [[ -d $scan ]] || "$bin/conefield" -q simulate "$data/volumes/$volume.nii.gz" -o "$scan" --protocol r2 --views 50 --noise tigre:1e4,10
+    run() {
+        local name=$1
+        shift
+        echo "== $volume $name" | tee -a "$out/scores.txt"
+        "$bin/conefield" -q reconstruct "$scan" --spec ni-naf -o "$out/$volume-$name" --force --budget "${seconds}s" \
+            --reference truth --set solver.report_every=25 "$@" | tee -a "$out/scores.txt"
+    }
+    run naf --set "$none"
+    run ln --set "$norm"
+    run ln-mci --set "$norm" --init "$weights"
+    run ln-mci-mask --set "$mask" --init "$weights"
+    "$bin/curves" "$out/$volume.png" "$volume, 50 noisy views" "NAF=$out/$volume-naf" "NAF+LN=$out/$volume-ln" \
+        "NAF+LN+MCI=$out/$volume-ln-mci" "NAF+LN+MCI+mask=$out/$volume-ln-mci-mask"
+done
