@@ -102,6 +102,6 @@ mod tests {
         for step in 1..=4000 {
             update(&mut arena, &Adam { lr: 1e-3, beta1: 0.9, beta2: 0.999, eps: 1e-8, step });
         }
-        assert!(arena.first.iter().chain(&arena.second).all(|&x| x == 0.0));
+        assert!(arena.first.iter().chain(arena.second.iter()).all(|&x| x == 0.0));
     }
 }
