@@ -72,26 +72,26 @@ impl Scene {
         std::array::from_fn(|k| ((p[k] - self.origin[k]) / self.side) as f32)
     }
 
-    /// A ray in the unit cube, or `None` where it misses the reconstruction box. `axis` is the unit vector from
-    /// the source to the detector along which the published codes measure depth.
-    pub fn ray(&self, ray: &Ray, axis: Vec3) -> Option<UnitRay> {
-        let inside = ray.clip(self.bounds)?;
+    /// A ray in the unit cube; one that misses the reconstruction box has no length inside. `axis` is the unit vector
+    /// from the source to the detector along which the published codes measure depth.
+    pub fn ray(&self, ray: &Ray, axis: Vec3) -> UnitRay {
+        let inside = ray.clip(self.bounds).unwrap_or([0.0; 2]);
         let depth = dot(ray.direction, axis);
         let to_axis = dot(sub(self.grid.center, ray.origin), axis);
         let s = self.side;
         let near = ((to_axis - self.published_reach) / depth).max(0.0);
         let far = (to_axis + self.published_reach) / depth;
-        Some(UnitRay {
+        UnitRay {
             origin: self.to_unit(ray.origin),
             direction: ray.direction.map(|x| x as f32),
             inside: inside.map(|t| (t / s) as f32),
             published: [(near / s) as f32, (far / s) as f32],
             per_mm: (1.0 / s) as f32,
-        })
+        }
     }
 
     /// The ray of a pixel of `geometry`.
-    pub fn pixel_ray(&self, geometry: &Geometry, view: usize, row: usize, column: usize) -> Option<UnitRay> {
+    pub fn pixel_ray(&self, geometry: &Geometry, view: usize, row: usize, column: usize) -> UnitRay {
         self.ray(&geometry.ray(view, row, column), geometry.views[view].normal().0)
     }
 

@@ -298,7 +298,7 @@ pub struct UnitRay {
     pub origin: [f32; 3],
     /// Unit vector.
     pub direction: [f32; 3],
-    /// Entry into and exit from the reconstruction box, in cube sides.
+    /// Entry into and exit from the reconstruction box, in cube sides; equal where the ray misses it.
     pub inside: [f32; 2],
     /// Beginning and end of the published sampling range (`near`, `far`), in cube sides.
     pub published: [f32; 2],
@@ -317,7 +317,7 @@ pub struct Samples {
 
 /// Rays to samples with weights.
 pub trait Projector: Send + Sync {
-    /// Samples that [`Projector::sample`] adds at most for `ray`.
+    /// Samples that [`Projector::sample`] adds at most for `ray`; 0 where it sees nothing of the scene.
     fn max_samples(&self, ray: &UnitRay) -> usize;
 
     /// Appends the samples of `ray`. `seed` decides random positions; `None` (rendering) means none are random.

@@ -80,8 +80,11 @@ impl RayMarch {
 
 impl Projector for RayMarch {
     fn max_samples(&self, ray: &UnitRay) -> usize {
-        let Some(step) = self.step_mm else { return self.samples };
         let [near, far] = self.range(ray);
+        if far <= near {
+            return 0;
+        }
+        let Some(step) = self.step_mm else { return self.samples };
         let wanted = f64::from(far - near) / (step * f64::from(ray.per_mm));
         (wanted.ceil() as usize).clamp(1, MOST_SAMPLES)
     }

@@ -13,7 +13,7 @@ use conefield_core::scan::{Scan, Volume};
 use conefield_core::scene::Scene;
 use conefield_core::solver::{Job, Limits, Observer, PretrainJob, Record, Solution, Solver};
 use conefield_core::spec::SolverSpec;
-use conefield_core::stage::UnitRay;
+use conefield_core::stage::{Projector, UnitRay};
 use ndarray::Array3;
 use rand::RngExt;
 use schemars::JsonSchema;
@@ -174,7 +174,8 @@ impl Solver for Gradient {
         let scene = Scene::new(job.scan, &job.spec.scene)?;
         let pipeline = Pipeline::build(job.spec)?;
         let initializer = job.spec.initializer.as_ref().map(|i| i.build(job.weights)).transpose()?;
-        let source = RaySource::new(job.scan, &scene, self.views, self.pixels, self.margin)?;
+        let source =
+            RaySource::new(job.scan, &scene, pipeline.projector.as_ref(), self.views, self.pixels, self.margin)?;
         observer.note(&format!("{:.0}% of the pixels are trained on", 100.0 * source.share()));
         let mut model = Model::random(pipeline, job.seed);
         if let Some(i) = initializer {
@@ -189,7 +190,7 @@ impl Solver for Gradient {
         }
         let (mut exe, explain) = job.backend.compile(&model.pipeline)?;
         observer.note(&explain.backend);
-        let watch = Watch::new(job, &scene);
+        let watch = Watch::new(job, &scene, model.pipeline.projector.as_ref());
         let steps_an_epoch = source.steps_an_epoch() as f64;
         let by_epochs = self.epochs.map(|e| (e * steps_an_epoch).ceil() as u64);
         let steps = [self.steps, by_epochs].into_iter().flatten().min();
@@ -344,7 +345,7 @@ struct Watch {
 }
 
 impl Watch {
-    fn new(job: &Job<'_>, scene: &Scene) -> Self {
+    fn new(job: &Job<'_>, scene: &Scene, projector: &dyn Projector) -> Self {
         let (mut points, mut reference) = (vec![], vec![]);
         let shape = scene.grid.shape;
         if let Some(r) = job.reference.filter(|r| r.data.shape() == shape) {
@@ -365,7 +366,8 @@ impl Watch {
                 let at = [i / (rows * columns), i / columns % rows, i % columns];
                 let target = scene.line_to_unit(scan.projections[at]);
                 top = top.max(f64::from(target));
-                if let Some(ray) = scene.pixel_ray(&scan.geometry, at[0], at[1], at[2]) {
+                let ray = scene.pixel_ray(&scan.geometry, at[0], at[1], at[2]);
+                if projector.max_samples(&ray) > 0 {
                     rays.push(TrainRay { ray, target });
                 }
             }

@@ -5,6 +5,7 @@ use conefield_core::error::{Error, Result};
 use conefield_core::random::stream;
 use conefield_core::scan::Scan;
 use conefield_core::scene::Scene;
+use conefield_core::stage::Projector;
 use ndarray::{Array2, ArrayView2};
 use rand::RngExt;
 use rand::seq::SliceRandom;
@@ -32,7 +33,7 @@ pub enum Pixels {
     /// Those that the object's shadow covers, with a margin: decided from smoothed neighbourhoods, so that the
     /// noise of a pixel does not decide about itself.
     Support,
-    /// Every pixel whose ray meets the reconstruction box.
+    /// Every pixel whose ray the projector samples.
     All,
 }
 
@@ -49,7 +50,14 @@ pub struct RaySource<'a> {
 
 impl<'a> RaySource<'a> {
     /// Finds the usable pixels. `margin` widens the support by that many pixels.
-    pub fn new(scan: &'a Scan, scene: &'a Scene, views: Views, which: Pixels, margin: usize) -> Result<Self> {
+    pub fn new(
+        scan: &'a Scan,
+        scene: &'a Scene,
+        projector: &dyn Projector,
+        views: Views,
+        which: Pixels,
+        margin: usize,
+    ) -> Result<Self> {
         let level = (which == Pixels::Support).then(|| air_level(scan));
         let pixels: Vec<Vec<u32>> = (0..scan.geometry.views.len())
             .into_par_iter()
@@ -65,7 +73,7 @@ impl<'a> RaySource<'a> {
                             (_, Some(s)) => s[[row, column]],
                             _ => true,
                         };
-                        counts && scene.pixel_ray(&scan.geometry, v, row, column).is_some()
+                        counts && projector.max_samples(&scene.pixel_ray(&scan.geometry, v, row, column)) > 0
                     })
                     .collect()
             })
@@ -109,10 +117,9 @@ impl<'a> RaySource<'a> {
             let p = pixels[rng.random_range(0..pixels.len())] as usize;
             let columns = self.scan.geometry.detector[1];
             let (row, column) = (p / columns, p % columns);
-            if let Some(ray) = self.scene.pixel_ray(&self.scan.geometry, view, row, column) {
-                let target = self.scene.line_to_unit(self.scan.projections[[view, row, column]]);
-                out.push(TrainRay { ray, target });
-            }
+            let ray = self.scene.pixel_ray(&self.scan.geometry, view, row, column);
+            let target = self.scene.line_to_unit(self.scan.projections[[view, row, column]]);
+            out.push(TrainRay { ray, target });
         }
     }
 }

@@ -142,6 +142,10 @@ impl Executable for CpuExecutable {
                 samples.points.clear();
                 samples.weights.clear();
                 projector.sample(ray, None, samples);
+                if samples.points.is_empty() {
+                    *out = 0.0;
+                    return;
+                }
                 scratch.load(&samples.points);
                 scratch.forward(&kernels, &model.arena.params, &kernels.ray_tiles(samples.points.len()));
                 mu.clear();

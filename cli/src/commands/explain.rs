@@ -174,7 +174,7 @@ fn for_scan(loaded: &Loaded, pipeline: &Pipeline, scan: &Scan, compiled: &Compil
         detector: g.detector,
         volume: g.volume.shape,
         attenuation_scale: scene.attenuation * scan.unit.mm,
-        samples_per_ray: middle.map_or(0, |r| pipeline.projector.max_samples(&r)),
+        samples_per_ray: pipeline.projector.max_samples(&middle),
         memory: Memory::of(pipeline, scan, compiled, false),
     })
 }
