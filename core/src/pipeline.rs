@@ -35,6 +35,14 @@ impl Pipeline {
         let need = |what: &str| crate::Error::invalid("spec", what, "nothing", format!("a table [{what}] with a type"));
         let encoder = spec.encoder.as_ref().ok_or_else(|| need("encoder"))?.build()?;
         let mut width = check("encoder", encoder.as_ref(), 3)?;
+        let scope = encoder.info().scope;
+        ensure(
+            scope == Scope::Row,
+            "spec",
+            "encoder",
+            "one whose rows look at each other",
+            "an encoder that treats each point alone",
+        )?;
         let mut normalizers = vec![];
         for (i, n) in spec.normalizers.iter().enumerate() {
             let n = n.build(width)?;

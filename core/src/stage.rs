@@ -7,7 +7,8 @@ use crate::error::{Error, Result};
 use crate::simd::Real;
 use std::ops::Range;
 
-/// Rows that the host puts into a tile at most. A stage must accept any number from 1 up.
+/// Rows that the host puts into a tile at most; the encoder gets thousands at once. A stage must accept any number
+/// from 1 up.
 pub const TILE_ROWS: usize = 256;
 
 /// Channels of some rows, read-only.

@@ -97,9 +97,6 @@ impl ConcatStage {
             info.params = part.params.end;
             info.tape = part.tape.end;
             info.macs += i.macs;
-            if i.scope == Scope::Ray {
-                info.scope = Scope::Ray;
-            }
             // One scattered part makes the whole scattered; a dense part is then one range of the partition.
             info.grads = match (info.grads, i.grads) {
                 (GradKind::None, g) | (g, GradKind::None) => g,

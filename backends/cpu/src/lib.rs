@@ -1,6 +1,7 @@
 //! The CPU backend.
 //!
-//! A step goes wave by wave (some ten thousand rows). In a wave, workers take groups of rows: sample, encode,
+//! A step goes wave by wave (some ten thousand rows). In a wave, each slot samples and encodes its share of the rays
+//! at once, so that it goes through a level's table while that is in the cache; then it takes them in groups:
 //! normalise, evaluate the field, integrate, take the loss and go backward, tile by tile, while a tile is in the
 //! cache ([`rows`]). Dense stages sum their gradients in copies of their own, one a slot, merged in order. Stages
 //! with scattered parameters get the rows of the wave a second time, each worker with a range of parameters of its
@@ -15,10 +16,13 @@ use conefield_core::backend::{Adam, Backend, Executable, Explain, StepStats, Wor
 use conefield_core::error::{Error, Result};
 use conefield_core::pipeline::{Model, Pipeline};
 use conefield_core::simd;
-use conefield_core::stage::{GradKind, Samples, TILE_ROWS, UnitRay};
+use conefield_core::stage::{GradKind, Samples, UnitRay};
 use rayon::prelude::*;
-use rows::{Kernels, Scratch};
+use rows::{Encoded, Kernels, Scratch};
 use step::Slots;
+
+/// Points that are encoded at once when the field is evaluated.
+const CHUNK_ROWS: usize = 4096;
 
 /// The CPU backend: rayon threads, SIMD chosen at run time.
 #[derive(Debug, Clone, Copy, Default)]
@@ -104,13 +108,14 @@ impl Executable for CpuExecutable {
 
     fn evaluate(&mut self, model: &Model, points: &[[f32; 3]], out: &mut [f32]) -> Result<()> {
         let kernels = kernels(&model.pipeline)?;
-        let rows = kernels.rows_at_points();
-        out.par_chunks_mut(rows * 8).zip(points.par_chunks(rows * 8)).for_each_init(
-            Scratch::default,
-            |scratch, (out, points)| {
-                for (out, points) in out.chunks_mut(rows).zip(points.chunks(rows)) {
-                    scratch.load(points);
-                    scratch.forward(&kernels, &model.arena.params, &[points.len()]);
+        out.par_chunks_mut(CHUNK_ROWS).zip(points.par_chunks(CHUNK_ROWS)).for_each_init(
+            || (Encoded::default(), Scratch::default()),
+            |(encoded, scratch), (out, points)| {
+                let params = &model.arena.params;
+                encoded.forward(&kernels, params, points);
+                let rows = kernels.rows_at_points();
+                for (i, out) in out.chunks_mut(rows).enumerate() {
+                    scratch.forward(&kernels, params, encoded, i * rows, &[out.len()]);
                     out.copy_from_slice(scratch.outputs());
                 }
             },
@@ -119,26 +124,17 @@ impl Executable for CpuExecutable {
     }
 
     fn encode(&mut self, model: &Model, points: &[[f32; 3]]) -> Result<Vec<f32>> {
-        let kernels = kernels(&model.pipeline)?;
-        let n = points.len();
-        let mut out = vec![0.0; n * kernels.encoder_width()];
-        let mut scratch = Scratch::default();
-        for (i, points) in points.chunks(TILE_ROWS).enumerate() {
-            scratch.load(points);
-            let features = scratch.encode(&kernels, &model.arena.params, points.len());
-            for (c, f) in features.chunks(points.len()).enumerate() {
-                out[c * n + i * TILE_ROWS..][..f.len()].copy_from_slice(f);
-            }
-        }
-        Ok(out)
+        let mut encoded = Encoded::default();
+        encoded.forward(&kernels(&model.pipeline)?, &model.arena.params, points);
+        Ok(encoded.features().to_vec())
     }
 
     fn render(&mut self, model: &Model, rays: &[UnitRay], out: &mut [f32]) -> Result<()> {
         let kernels = kernels(&model.pipeline)?;
         let projector = model.pipeline.projector.as_ref();
         out.par_iter_mut().zip(rays).for_each_init(
-            || (Scratch::default(), Samples::default(), vec![]),
-            |(scratch, samples, mu), (out, ray)| {
+            || (Encoded::default(), Scratch::default(), Samples::default(), vec![]),
+            |(encoded, scratch, samples, mu), (out, ray)| {
                 samples.points.clear();
                 samples.weights.clear();
                 projector.sample(ray, None, samples);
@@ -146,8 +142,9 @@ impl Executable for CpuExecutable {
                     *out = 0.0;
                     return;
                 }
-                scratch.load(&samples.points);
-                scratch.forward(&kernels, &model.arena.params, &kernels.ray_tiles(samples.points.len()));
+                let params = &model.arena.params;
+                encoded.forward(&kernels, params, &samples.points);
+                scratch.forward(&kernels, params, encoded, 0, &kernels.ray_tiles(samples.points.len()));
                 mu.clear();
                 mu.extend(scratch.outputs().iter().map(|&m| f64::from(m)));
                 *out = projector.integrate(&samples.weights, mu) as f32;

@@ -17,7 +17,7 @@ pub struct Step<'a, R: Real> {
     pub partition: Vec<Range<usize>>,
     /// Whether a stage before it learns, so that it must hand a gradient on.
     pub hands_on: bool,
-    /// Channels of a tile that it reads and writes; its tape follows its output.
+    /// Channels of a tile that it reads and writes; its tape follows its output. The encoder's features come first.
     input: Range<usize>,
     output: Range<usize>,
 }
@@ -34,7 +34,7 @@ impl<'a, R: Real> Kernels<'a, R> {
     pub fn new(pipeline: &'a Pipeline, pick: impl Fn(&'a dyn Stage) -> Option<&'a dyn Kernel<R>>) -> Option<Self> {
         let mut steps = vec![];
         let mut learns = false;
-        let (mut input, mut end) = (0..3, 3);
+        let (mut input, mut end) = (0..0, 0);
         for ((_, stage), range) in pipeline.stages().into_iter().zip(pipeline.ranges()) {
             let info = stage.info();
             let hands_on = learns;
@@ -44,7 +44,7 @@ impl<'a, R: Real> Kernels<'a, R> {
             }
             let partition = if info.grads == GradKind::Scatter { stage.partition() } else { vec![] };
             let output = end..end + info.output;
-            end = output.end + info.tape;
+            end = if steps.is_empty() { output.end } else { output.end + info.tape };
             let read = std::mem::replace(&mut input, output.clone());
             let (kernel, params) = (pick(stage)?, range.clone());
             steps.push(Step { kernel, info, params, partition, hands_on, input: read, output });
@@ -72,9 +72,9 @@ impl<'a, R: Real> Kernels<'a, R> {
         self.scope == Scope::Row
     }
 
-    /// Numbers a row that a tile holds: points, every stage's output, tape and gradient.
-    pub fn row_numbers(&self) -> usize {
-        3 + self.steps.iter().map(|s| s.info.output + s.info.tape).sum::<usize>()
+    /// Numbers a row that a tile holds: the encoder's features, then of every other stage output and tape.
+    fn row_numbers(&self) -> usize {
+        self.encoder_width() + self.steps[1..].iter().map(|s| s.info.output + s.info.tape).sum::<usize>()
     }
 
     fn widest(&self) -> usize {
@@ -89,7 +89,7 @@ pub fn even_tiles(n: usize) -> Vec<usize> {
     (0..n).step_by(each).map(|at| each.min(n - at)).collect()
 }
 
-/// One tile of a scattered stage's input and output gradient, kept until the second pass.
+/// What a scattered stage needs in the second pass.
 #[derive(Debug, Default, Clone)]
 pub struct Log<R> {
     /// Tile by tile: input channels, then output-gradient channels.
@@ -98,25 +98,118 @@ pub struct Log<R> {
     pub rows: Vec<usize>,
 }
 
-/// Working memory of a worker; it grows to what the largest group needs and is used again.
+impl<R> Log<R> {
+    /// Forgets everything.
+    pub fn clear(&mut self) {
+        self.data.clear();
+        self.rows.clear();
+    }
+}
+
+/// The encoder's part of the work: it sees many tiles' rows at once, so that it goes through the table of a level
+/// while that is in the cache.
+#[derive(Debug, Default)]
+pub struct Encoded<R> {
+    /// One tile of all rows: the points, then the features; once their gradients are known, these.
+    log: Log<R>,
+    tape: Vec<R>,
+}
+
+impl<R: Real> Encoded<R> {
+    /// Encodes `points`.
+    pub fn forward(&mut self, kernels: &Kernels<'_, R>, params: &[R], points: &[[f32; 3]]) {
+        let (s, n) = (&kernels.steps[0], points.len());
+        self.log.rows.clear();
+        self.log.rows.extend((n > 0).then_some(n));
+        self.log.data.resize((3 + s.info.output) * n, R::ZERO);
+        self.tape.resize(s.info.tape * n, R::ZERO);
+        let (x, y) = self.log.data.split_at_mut(3 * n);
+        for (k, x) in x.chunks_exact_mut(n.max(1)).enumerate() {
+            for (x, p) in x.iter_mut().zip(points) {
+                *x = R::of(f64::from(p[k]));
+            }
+        }
+        if n > 0 {
+            s.kernel.forward(
+                &params[s.params.clone()],
+                Tile::new(x, n),
+                TileMut::new(y, n),
+                TileMut::new(&mut self.tape, n),
+            );
+        }
+    }
+
+    /// Hands the gradients of all features to the encoder where it sums them itself.
+    pub fn backward(&mut self, kernels: &Kernels<'_, R>, params: &[R], dense: &mut DenseGrads<R>) {
+        let s = &kernels.steps[0];
+        let n = self.rows();
+        if s.info.grads == GradKind::Dense && s.info.params > 0 && n > 0 {
+            let (x, dy) = self.log.data.split_at(3 * n);
+            s.kernel.backward(
+                &params[s.params.clone()],
+                Tile::new(x, n),
+                TileMut::new(&mut self.tape, n),
+                Tile::new(dy, n),
+                Grads::all(dense.of(0)),
+                None,
+            );
+        }
+    }
+
+    /// What the encoder needs in the second pass, where its gradients are scattered.
+    pub fn log(&self) -> &Log<R> {
+        &self.log
+    }
+
+    /// Forgets all rows.
+    pub fn clear(&mut self) {
+        self.log.clear();
+    }
+
+    /// Features, channel-major.
+    pub fn features(&self) -> &[R] {
+        &self.log.data[3 * self.rows()..]
+    }
+
+    /// Bytes held.
+    pub fn bytes(&self) -> usize {
+        (self.log.data.capacity() + self.tape.capacity()) * size_of::<R>()
+    }
+
+    fn rows(&self) -> usize {
+        self.log.rows.first().copied().unwrap_or(0)
+    }
+
+    /// Copies the features of a tile's rows to `tile`.
+    fn load(&self, rows: Range<usize>, tile: &mut [R]) {
+        for (y, tile) in self.features().chunks_exact(self.rows()).zip(tile.chunks_exact_mut(rows.len())) {
+            tile.copy_from_slice(&y[rows.clone()]);
+        }
+    }
+
+    /// Replaces the features of a tile's rows by their gradients.
+    fn store(&mut self, rows: Range<usize>, tile: &[R]) {
+        let n = self.rows();
+        for (y, tile) in self.log.data[3 * n..].chunks_exact_mut(n).zip(tile.chunks_exact(rows.len())) {
+            y[rows.clone()].copy_from_slice(tile);
+        }
+    }
+}
+
+/// Working memory of a worker for all stages behind the encoder; it grows to what the largest group needs and is
+/// used again.
 #[derive(Debug, Default)]
 pub struct Scratch<R> {
-    points: Vec<[f32; 3]>,
-    /// Tile by tile: points, then of each stage output and tape.
+    /// Tile by tile: features, then of each stage output and tape.
     data: Vec<R>,
-    tiles: Vec<usize>,
+    /// Rows of each tile, and where they stand among the encoded ones.
+    tiles: Vec<Range<usize>>,
     outputs: Vec<R>,
     /// Gradients on the way back: of a stage's output and of its input.
     back: [Vec<R>; 2],
 }
 
 impl<R: Real> Scratch<R> {
-    /// Takes the rows to work on.
-    pub fn load(&mut self, points: &[[f32; 3]]) {
-        self.points.clear();
-        self.points.extend_from_slice(points);
-    }
-
     /// The field at every row of the last [`Scratch::forward`].
     pub fn outputs(&self) -> &[R] {
         &self.outputs
@@ -126,41 +219,34 @@ impl<R: Real> Scratch<R> {
     pub fn bytes(&self) -> usize {
         (self.data.capacity() + self.outputs.capacity() + self.back[0].capacity() + self.back[1].capacity())
             * size_of::<R>()
-            + self.points.capacity() * 12
     }
 
-    /// Runs every stage over tiles of `tiles` rows.
-    pub fn forward(&mut self, kernels: &Kernels<'_, R>, params: &[R], tiles: &[usize]) {
-        self.run(kernels, params, tiles, kernels.steps.len());
-    }
-
-    /// The encoder's features of the first `n` rows, channel-major.
-    pub fn encode(&mut self, kernels: &Kernels<'_, R>, params: &[R], n: usize) -> &[R] {
-        self.run(kernels, params, &[n], 1);
-        &self.outputs
-    }
-
-    fn run(&mut self, kernels: &Kernels<'_, R>, params: &[R], tiles: &[usize], steps: usize) {
+    /// Runs every stage behind the encoder over tiles of `tiles` rows, the first of which is row `first` of
+    /// `encoded`.
+    pub fn forward(
+        &mut self,
+        kernels: &Kernels<'_, R>,
+        params: &[R],
+        encoded: &Encoded<R>,
+        first: usize,
+        tiles: &[usize],
+    ) {
         let rows: usize = tiles.iter().sum();
-        debug_assert_eq!(rows, self.points.len());
-        if self.data.len() < rows * kernels.row_numbers() {
-            self.data.resize(rows * kernels.row_numbers(), R::ZERO);
+        let numbers = kernels.row_numbers();
+        if self.data.len() < rows * numbers {
+            self.data.resize(rows * numbers, R::ZERO);
         }
         self.tiles.clear();
-        self.tiles.extend_from_slice(tiles);
         self.outputs.clear();
         let mut tile = &mut self.data[..];
-        let mut points = &self.points[..];
+        let mut at = first;
         for &n in tiles {
-            let (own, rest) = std::mem::take(&mut tile).split_at_mut(n * kernels.row_numbers());
+            let (own, rest) = std::mem::take(&mut tile).split_at_mut(n * numbers);
             tile = rest;
-            for k in 0..3 {
-                for (x, p) in own[k * n..(k + 1) * n].iter_mut().zip(points) {
-                    *x = R::of(f64::from(p[k]));
-                }
-            }
-            points = &points[n..];
-            for s in &kernels.steps[..steps] {
+            encoded.load(at..at + n, &mut own[..kernels.encoder_width() * n]);
+            self.tiles.push(at..at + n);
+            at += n;
+            for s in &kernels.steps[1..] {
                 let (before, after) = own.split_at_mut(s.output.start * n);
                 let (y, tape) = after[..(s.info.output + s.info.tape) * n].split_at_mut(s.info.output * n);
                 s.kernel.forward(
@@ -170,13 +256,14 @@ impl<R: Real> Scratch<R> {
                     TileMut::new(tape, n),
                 );
             }
-            let y = &kernels.steps[steps - 1].output;
+            let y = &kernels.steps[kernels.steps.len() - 1].output;
             self.outputs.extend_from_slice(&own[y.start * n..y.end * n]);
         }
     }
 
-    /// Given the gradient of every row's output, adds the gradients of dense stages to `dense` (as long as the
-    /// arena; only their ranges are touched) and appends what scattered stages need to `logs`, one a stage.
+    /// Given the gradient of every row's output, adds the gradients of dense stages to `dense`, appends what
+    /// scattered stages need to `logs` (one a stage; the encoder's stays empty), and puts the gradients of the
+    /// features in their place in `encoded`.
     pub fn backward(
         &mut self,
         kernels: &Kernels<'_, R>,
@@ -184,11 +271,13 @@ impl<R: Real> Scratch<R> {
         dmu: &[R],
         dense: &mut DenseGrads<R>,
         logs: &mut [Log<R>],
+        encoded: &mut Encoded<R>,
     ) {
         let widest = kernels.widest();
         let mut tile = &mut self.data[..];
         let mut dmu = dmu;
-        for &n in &self.tiles {
+        'tiles: for rows in &self.tiles {
+            let n = rows.len();
             let (own, rest) = std::mem::take(&mut tile).split_at_mut(n * kernels.row_numbers());
             tile = rest;
             let [dy, dx] = &mut self.back;
@@ -196,9 +285,9 @@ impl<R: Real> Scratch<R> {
             dx.resize((widest * n).max(dx.len()), R::ZERO);
             dy[..n].copy_from_slice(&dmu[..n]);
             dmu = &dmu[n..];
-            for (k, s) in kernels.steps.iter().enumerate().rev() {
+            for (k, s) in kernels.steps.iter().enumerate().skip(1).rev() {
                 if s.info.params == 0 && !s.hands_on {
-                    break;
+                    continue 'tiles;
                 }
                 let (before, after) = own.split_at_mut(s.output.start * n);
                 let x = &before[s.input.start * n..s.input.end * n];
@@ -211,7 +300,7 @@ impl<R: Real> Scratch<R> {
                     log.rows.push(n);
                 }
                 if scattered && !s.hands_on {
-                    break;
+                    continue 'tiles;
                 }
                 let grads = if scattered || s.info.params == 0 {
                     Grads { values: &mut [], range: 0..0 }
@@ -227,10 +316,11 @@ impl<R: Real> Scratch<R> {
                     s.hands_on.then(|| TileMut::new(&mut dx[..s.info.input * n], n)),
                 );
                 if !s.hands_on {
-                    break;
+                    continue 'tiles;
                 }
                 std::mem::swap(dy, dx);
             }
+            encoded.store(rows.clone(), &dy[..kernels.encoder_width() * n]);
         }
     }
 }

@@ -1,6 +1,6 @@
 //! One training step: losses and their gradients over rays, points and blocks.
 
-use crate::rows::{DenseGrads, Kernels, Log, Scratch, even_tiles};
+use crate::rows::{DenseGrads, Encoded, Kernels, Log, Scratch, even_tiles};
 use conefield_core::backend::{StepStats, TvBlocks, Work};
 use conefield_core::random::mix;
 use conefield_core::simd::Real;
@@ -29,10 +29,13 @@ enum Group {
 /// What belongs to one slot.
 #[derive(Debug, Default)]
 struct Slot<R> {
+    encoded: Encoded<R>,
     scratch: Scratch<R>,
     samples: Samples,
-    /// Rows of each ray of the group.
+    /// Rows of each ray of the slot's groups.
     counts: Vec<usize>,
+    /// Rows and counts of each group.
+    placed: Vec<[Range<usize>; 2]>,
     mu: Vec<f64>,
     dmu: Vec<f64>,
     back: Vec<R>,
@@ -61,7 +64,8 @@ impl<R: Real> Slots<R> {
     /// Bytes held now.
     pub fn bytes(&self) -> usize {
         let logs = |s: &Slot<R>| s.logs.iter().map(|l| l.data.capacity() * size_of::<R>()).sum::<usize>();
-        self.slots.iter().map(|s| s.scratch.bytes() + logs(s) + s.dense.len() * size_of::<R>()).sum()
+        let own = |s: &Slot<R>| s.encoded.bytes() + s.scratch.bytes() + s.dense.len() * size_of::<R>();
+        self.slots.iter().map(|s| own(s) + logs(s)).sum()
     }
 
     /// Adds the gradients of `work`'s loss to `grads`.
@@ -83,9 +87,7 @@ impl<R: Real> Slots<R> {
             let share = wave.len().div_ceil(self.slots.len()).max(1);
             self.slots.par_iter_mut().enumerate().for_each(|(i, slot)| {
                 let from = (i * share).min(wave.len());
-                for group in &wave[from..(from + share).min(wave.len())] {
-                    slot.run(kernels, projector, params, work, group);
-                }
+                slot.run(kernels, projector, params, work, &wave[from..(from + share).min(wave.len())]);
             });
             let dense_done = Instant::now();
             self.scatter(kernels, params, grads);
@@ -118,7 +120,7 @@ impl<R: Real> Slots<R> {
         // The last ranges are the largest (finest levels): start with them, so that workers end together.
         tasks.into_par_iter().rev().with_max_len(1).for_each(|(k, range, values)| {
             let s = &kernels.steps[k];
-            for log in slots.iter().map(|slot| &slot.logs[k]) {
+            for log in slots.iter().map(|slot| if k == 0 { slot.encoded.log() } else { &slot.logs[k] }) {
                 let mut data = &log.data[..];
                 for &n in &log.rows {
                     let (x, after) = data.split_at(s.info.input * n);
@@ -136,9 +138,9 @@ impl<R: Real> Slots<R> {
                 }
             }
         });
-        for log in self.slots.iter_mut().flat_map(|s| &mut s.logs) {
-            log.data.clear();
-            log.rows.clear();
+        for slot in &mut self.slots {
+            slot.encoded.clear();
+            slot.logs.iter_mut().for_each(Log::clear);
         }
     }
 }
@@ -186,17 +188,33 @@ fn waves<R: Real>(kernels: &Kernels<'_, R>, projector: &dyn Projector, work: &Wo
 }
 
 impl<R: Real> Slot<R> {
+    /// Forward and backward of `groups`: all encoded at once, the rest group by group.
     fn run(
         &mut self,
         kernels: &Kernels<'_, R>,
         projector: &dyn Projector,
         params: &[R],
         work: &Work<'_>,
-        group: &Group,
+        groups: &[Group],
     ) {
         self.samples.points.clear();
         self.samples.weights.clear();
         self.counts.clear();
+        self.placed.clear();
+        for group in groups {
+            self.place(kernels, projector, work, group);
+        }
+        self.encoded.forward(kernels, params, &self.samples.points);
+        for (i, group) in groups.iter().enumerate() {
+            self.learn(kernels, projector, params, work, group, i);
+        }
+        self.encoded.backward(kernels, params, &mut self.dense);
+    }
+
+    /// Appends the samples of `group`.
+    fn place(&mut self, kernels: &Kernels<'_, R>, projector: &dyn Projector, work: &Work<'_>, group: &Group) {
+        let points = &mut self.samples.points;
+        let (start, counted) = (points.len(), self.counts.len());
         match group {
             Group::Rays(range) => {
                 for i in range.clone() {
@@ -206,38 +224,52 @@ impl<R: Real> Slot<R> {
                     self.counts.push(self.samples.points.len() - before);
                 }
             }
-            Group::Points(range) => self.samples.points.extend(work.points[range.clone()].iter().map(|p| p.0)),
+            Group::Points(range) => points.extend(work.points[range.clone()].iter().map(|p| p.0)),
             Group::Tv(range) => {
                 for corner in work.tv.iter().flat_map(|tv| &tv.corners[range.clone()]) {
-                    block_points(work.tv, *corner, &mut self.samples.points);
+                    block_points(work.tv, *corner, points);
                 }
             }
         }
-        let rows = self.samples.points.len();
-        if rows == 0 {
+        let points = &mut self.samples.points;
+        self.rows += (points.len() - start) as u64;
+        if let Some(&last) = points.last()
+            && kernels.mixes_rays()
+        {
+            // Whole vectors: the last row is repeated with no weight.
+            let padded = start + (points.len() - start).next_multiple_of(16);
+            points.resize(padded, last);
+        }
+        self.samples.weights.resize(points.len(), 0.0);
+        self.placed.push([start..points.len(), counted..self.counts.len()]);
+    }
+
+    /// What follows the encoder, for the group placed as number `at`.
+    fn learn(
+        &mut self,
+        kernels: &Kernels<'_, R>,
+        projector: &dyn Projector,
+        params: &[R],
+        work: &Work<'_>,
+        group: &Group,
+        at: usize,
+    ) {
+        let [rows, counts] = self.placed[at].clone();
+        if rows.is_empty() {
             return;
         }
-        self.rows += rows as u64;
-        let on_rays = matches!(group, Group::Rays(_));
-        let tiles = match (on_rays, kernels.mixes_rays()) {
-            (_, true) => {
-                // Whole vectors: the last row is repeated with no weight.
-                let padded = rows.next_multiple_of(16);
-                let last = self.samples.points[rows - 1];
-                self.samples.points.resize(padded, last);
-                even_tiles(padded)
-            }
-            (true, false) => self.counts.clone(),
-            (false, false) => vec![1; rows],
+        let tiles = match (matches!(group, Group::Rays(_)), kernels.mixes_rays()) {
+            (_, true) => even_tiles(rows.len()),
+            (true, false) => self.counts[counts.clone()].to_vec(),
+            (false, false) => vec![1; rows.len()],
         };
-        self.scratch.load(&self.samples.points);
-        self.scratch.forward(kernels, params, &tiles);
+        self.scratch.forward(kernels, params, &self.encoded, rows.start, &tiles);
         self.mu.clear();
         self.mu.extend(self.scratch.outputs().iter().map(|m| m.f64()));
         self.dmu.clear();
         self.dmu.resize(self.mu.len(), 0.0);
         match group {
-            Group::Rays(range) => self.ray_loss(projector, work, range.clone()),
+            Group::Rays(range) => self.ray_loss(projector, work, range.clone(), rows.start, counts),
             Group::Points(range) => {
                 let scale = 1.0 / work.points.len() as f64;
                 for (i, (_, target)) in work.points[range.clone()].iter().enumerate() {
@@ -255,15 +287,23 @@ impl<R: Real> Slot<R> {
         }
         self.back.clear();
         self.back.extend(self.dmu.iter().map(|&d| R::of(d)));
-        self.scratch.backward(kernels, params, &self.back, &mut self.dense, &mut self.logs);
+        self.scratch.backward(kernels, params, &self.back, &mut self.dense, &mut self.logs, &mut self.encoded);
     }
 
-    fn ray_loss(&mut self, projector: &dyn Projector, work: &Work<'_>, rays: Range<usize>) {
+    /// Losses of `rays`, whose rows begin at `first` of the slot's.
+    fn ray_loss(
+        &mut self,
+        projector: &dyn Projector,
+        work: &Work<'_>,
+        rays: Range<usize>,
+        first: usize,
+        counts: Range<usize>,
+    ) {
         let scale = 1.0 / work.rays.len() as f64;
         let mut at = 0;
-        for (i, &n) in rays.zip(&self.counts) {
+        for (i, &n) in rays.zip(&self.counts[counts]) {
             let rows = at..at + n;
-            let weights = &self.samples.weights[rows.clone()];
+            let weights = &self.samples.weights[first..][rows.clone()];
             let line = projector.integrate(weights, &self.mu[rows.clone()]);
             let (loss, slope) = work.loss.at(line - f64::from(work.rays[i].target));
             self.loss += loss * scale;
