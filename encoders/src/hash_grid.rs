@@ -261,7 +261,7 @@ fn entry<T>(table: &[T], i: u32) -> &T {
 #[allow(unsafe_code)]
 fn prefetch<T, R>(table: &[T], located: &Located<R>, n: usize) {
     #[cfg(target_arch = "x86_64")]
-    for index in located.index.iter().step_by(2) {
+    for index in &located.index {
         for &i in &index[..n] {
             // SAFETY: a prefetch reads nothing and faults on no address.
             unsafe {
