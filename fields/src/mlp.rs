@@ -37,9 +37,22 @@ pub enum Activation {
 }
 
 impl Activation {
-    /// Value and derivative.
+    /// Values and derivatives.
     #[inline(always)]
-    fn at<S: Simd, R: Real>(self, s: S, x: V<S, R>) -> (V<S, R>, V<S, R>) {
+    fn at<S: Simd, R: Real, const K: usize>(self, s: S, x: [V<S, R>; K]) -> [[V<S, R>; K]; 2] {
+        if self == Self::Gelu {
+            return gelu::<S, R, K>(s, x);
+        }
+        let (mut y, mut slope) = (x, x);
+        for k in 0..K {
+            (y[k], slope[k]) = self.of::<S, R>(s, x[k]);
+        }
+        [y, slope]
+    }
+
+    /// Value and derivative of one vector.
+    #[inline(always)]
+    fn of<S: Simd, R: Real>(self, s: S, x: V<S, R>) -> (V<S, R>, V<S, R>) {
         let number = |v: f64| V::<S, R>::splat(s, R::of(v));
         let (zero, one) = (number(0.0), number(1.0));
         match self {
@@ -53,8 +66,8 @@ impl Activation {
                 (x * slope, slope)
             }
             Self::Gelu => {
-                let (cdf, pdf) = R::normal_lanes(s, x);
-                (x * cdf, x.mul_add(pdf, cdf))
+                let [[y], [slope]] = gelu::<S, R, 1>(s, [x]);
+                (y, slope)
             }
             Self::Squareplus => {
                 // Past 1e18 the square would overflow, and the root is |x| to the last bit.
@@ -73,6 +86,17 @@ impl Activation {
             }
         }
     }
+}
+
+#[inline(always)]
+fn gelu<S: Simd, R: Real, const K: usize>(s: S, x: [V<S, R>; K]) -> [[V<S, R>; K]; 2] {
+    let [cdf, pdf] = R::normal_lanes(s, x);
+    let (mut y, mut slope) = (x, x);
+    for k in 0..K {
+        y[k] = x[k] * cdf[k];
+        slope[k] = x[k].mul_add(pdf[k], cdf[k]);
+    }
+    [y, slope]
 }
 
 #[inline(always)]
@@ -242,6 +266,9 @@ impl<R: Real> Op for Forward<'_, R> {
     }
 }
 
+/// Vectors whose activations are computed side by side.
+const AT_ONCE: usize = 4;
+
 /// `h = f(z)`, `z = f'(z)`.
 #[inline(always)]
 pub(crate) fn activate<S: Simd, R: Real>(s: S, act: Activation, z: &mut [R], h: &mut [R]) {
@@ -250,12 +277,25 @@ pub(crate) fn activate<S: Simd, R: Real>(s: S, act: Activation, z: &mut [R], h: 
         ($($a:ident),*) => {
             match act {
                 $(Activation::$a => {
+                    let len = V::<S, R>::LEN;
                     let mut i = 0;
+                    while i + AT_ONCE * len <= z.len() {
+                        let mut x = [V::<S, R>::splat(s, R::ZERO); AT_ONCE];
+                        for k in 0..AT_ONCE {
+                            x[k] = load(s, z, i + k * len);
+                        }
+                        let [y, slope] = Activation::$a.at::<S, R, AT_ONCE>(s, x);
+                        for k in 0..AT_ONCE {
+                            store::<S, R>(y[k], h, i + k * len);
+                            store::<S, R>(slope[k], z, i + k * len);
+                        }
+                        i += AT_ONCE * len;
+                    }
                     while i < z.len() {
-                        let (v, d) = Activation::$a.at::<S, R>(s, load(s, z, i));
-                        store::<S, R>(v, h, i);
-                        store::<S, R>(d, z, i);
-                        i += V::<S, R>::LEN;
+                        let [[y], [slope]] = Activation::$a.at::<S, R, 1>(s, [load(s, z, i)]);
+                        store::<S, R>(y, h, i);
+                        store::<S, R>(slope, z, i);
+                        i += len;
                     }
                 })*
             }
