@@ -44,6 +44,8 @@ impl Backend for Cpu {
         let mut notes = vec![];
         for (name, stage) in pipeline.stages() {
             let info = stage.info();
+            let what = stage.describe();
+            let name = format!("{name} ({})", what.split(':').next().unwrap_or(&what));
             if info.grads == GradKind::Scatter && info.tape > 0 {
                 return Err(Error::unsupported(
                     format!("{name} on the CPU backend"),
