@@ -2,7 +2,7 @@
 //!
 //! - Volumes: [`read_volume`], [`write_volume`] (NIfTI, NumPy).
 //! - Scans: [`read_scan`], [`read_truth`], [`write_scan`] (conefield's own folder), [`read_r2`], [`write_r2`]
-//!   (R2-Gaussian's folder).
+//!   (R2-Gaussian's folder), [`read_naf`], [`write_naf`] (NAF's file).
 //! - Weights and checkpoints: [`read_weights`], [`write_weights`] (safetensors).
 //! - Pictures: [`slices_png`], [`compare_png`], [`curves_png`].
 //!
@@ -18,16 +18,19 @@ mod canvas;
 mod curves;
 mod folder;
 mod input;
+mod naf;
 mod nifti;
 mod npy;
 mod number;
 mod orbit;
+mod pickle;
 mod r2;
 mod rays;
 mod scan;
 mod scan_folder;
 mod slices;
 mod text;
+mod unit;
 mod volume;
 mod weights;
 
@@ -36,6 +39,7 @@ mod testing;
 
 pub use atomic::{write_atomic, write_folder_atomic, write_text_atomic};
 pub use curves::{Corner, CurveOptions, curves_png, curves_png_with};
+pub use naf::{NafScan, read_naf, write_naf};
 pub use orbit::Orbit;
 pub use r2::{R2Scan, read_r2, write_r2};
 pub use scan::{read_scan, read_truth};

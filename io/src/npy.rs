@@ -114,7 +114,8 @@ fn read_header(input: &mut Input, start: Vec<u8>) -> Result<Header> {
     })
 }
 
-fn element(descr: &str) -> Option<(Number, Order)> {
+/// How NumPy's name for a type of real numbers, e.g. `<f4`, has them stored; `None` for any other.
+pub(crate) fn element(descr: &str) -> Option<(Number, Order)> {
     let (order, kind) = match descr.chars().next()? {
         '<' => (Order::Little, &descr[1..]),
         '>' => (Order::Big, &descr[1..]),

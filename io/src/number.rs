@@ -35,7 +35,7 @@ impl Number {
     }
 
     /// Appends the numbers in `raw` (whole numbers only) to `out`, through `map`.
-    pub fn decode(self, order: Order, raw: &[u8], out: &mut Vec<f32>, map: impl Fn(f64) -> f32) {
+    pub fn decode<T>(self, order: Order, raw: &[u8], out: &mut Vec<T>, map: impl Fn(f64) -> T) {
         macro_rules! each {
             ($t:ty) => {{
                 let (raw, _) = raw.as_chunks::<{ size_of::<$t>() }>();

@@ -1,6 +1,9 @@
 //! A circular orbit, as scan files say it in a few numbers.
 
+use conefield_core::error::ensure;
 use conefield_core::geometry::{Millimetres, Radians, View, dot, norm, sub};
+use conefield_core::scan::Scan;
+use conefield_core::{Error, Result};
 
 /// Views on one circle about z, all with the same distances and detector.
 #[derive(Debug, Clone, PartialEq)]
@@ -72,6 +75,30 @@ impl Orbit {
                     && near(v.v, w.v, pixel)
             });
         fits.then_some(orbit)
+    }
+
+    /// The orbits of `train` and `test` for a `format` that knows only circles, the same for both scans: anything
+    /// else is refused, and so is a test scan with another detector or grid.
+    pub fn common(place: &str, format: &str, train: &Scan, test: Option<&Scan>) -> Result<(Self, Option<Self>)> {
+        let fit = |name: &str, s: &Scan| -> Result<Self> {
+            s.validate(&format!("{place}: {name}"))?;
+            Self::fit(&s.geometry.views).ok_or_else(|| {
+                let why = format!("{format} only knows circles about z; write conefield's own format");
+                Error::unsupported(format!("{place}: {name} views that are not one circle"), why)
+            })
+        };
+        let orbit = fit("training", train)?;
+        let Some(test) = test else { return Ok((orbit, None)) };
+        let other = fit("test", test)?;
+        let near = |a: f64, b: f64| (a - b).abs() <= 1e-6 * orbit.dsd;
+        let same = near(other.dso, orbit.dso)
+            && near(other.dsd, orbit.dsd)
+            && (0..2).all(|k| near(other.pixel[k], orbit.pixel[k]) && near(other.offset[k], orbit.offset[k]))
+            && test.geometry.detector == train.geometry.detector
+            && test.geometry.volume == train.geometry.volume;
+        let expected = "the orbit, detector and grid of the training views";
+        ensure(same, place, "test views", "another geometry", expected)?;
+        Ok((orbit, Some(other)))
     }
 }
 

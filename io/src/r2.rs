@@ -8,6 +8,7 @@
 use crate::input::read_text;
 use crate::orbit::Orbit;
 use crate::text::{Notation, parse};
+use crate::unit::{self, Reading, Units};
 use crate::{folder, npy, rays, write_atomic, write_folder_atomic, write_text_atomic};
 use conefield_core::error::ensure;
 use conefield_core::geometry::{Geometry, VoxelGrid};
@@ -114,45 +115,36 @@ fn read(folder: &Path, with_test: bool) -> Result<R2Scan> {
     let mut train = scan("proj_train", &meta.proj_train)?;
     let mut test = (with_test && !meta.proj_test.is_empty()).then(|| scan("proj_test", &meta.proj_test)).transpose()?;
     let data = meta.vol.as_deref().map(|name| volume(folder, &place, name, s.nVoxel)).transpose()?;
-    let (unit, mm, found) = length_unit(&place, meta.unit, &train, data.as_ref())?;
+    let units = length_unit(&place, meta.unit, &train, data.as_ref())?;
     for s in [Some(&mut train), test.as_mut()].into_iter().flatten() {
-        s.geometry = s.geometry.scaled(mm);
-        s.unit = unit.clone();
-        s.provenance["unit_from"] = json!(found);
+        s.geometry = s.geometry.scaled(units.length_mm);
+        s.unit = units.unit.clone();
+        s.provenance["unit_from"] = json!(units.found);
         s.validate(&place)?;
     }
     let volume = data.map(|data| Volume { data, grid: train.geometry.volume, affine: None });
     Ok(R2Scan { train, test, volume })
 }
 
-/// The unit, millimetres a length of the file, and how that is known.
-fn length_unit(
-    place: &str,
-    said: Option<Unit>,
-    train: &Scan,
-    volume: Option<&Array3<f32>>,
-) -> Result<(Unit, f64, &'static str)> {
+/// What the numbers of a folder that does not name its unit can mean.
+const READINGS: [Reading; 2] = [
+    Reading { ratio: 1.0, unit: "r2", unit_mm: 1.0, length_mm: 1.0, found: "volume and projections" },
+    Reading {
+        ratio: 1000.0,
+        unit: "mm",
+        unit_mm: 1.0,
+        length_mm: 1000.0,
+        found: "volume and projections: lengths in m, attenuation in 1/mm",
+    },
+];
+
+fn length_unit(place: &str, said: Option<Unit>, train: &Scan, volume: Option<&Array3<f32>>) -> Result<Units> {
     if let Some(unit) = said {
-        let expected = "a positive finite number of millimetres";
-        ensure(unit.mm.is_finite() && unit.mm > 0.0, place, "unit.mm", unit.mm, expected)?;
-        let mm = unit.mm;
-        return Ok((unit, mm, "the file"));
+        unit::check(place, &unit)?;
+        return Ok(Units { length_mm: unit.mm, unit, found: unit::SAID });
     }
-    let own = Unit { name: "r2".into(), mm: 1.0 };
-    let Some(ratio) = volume.and_then(|v| rays::measured_to_integrated(train, v)) else {
-        return Ok((own, 1.0, "nothing: lengths are taken for mm"));
-    };
-    let near = |x: f64| (0.8..1.25).contains(&(ratio / x));
-    if near(1000.0) {
-        return Ok((Unit::default(), 1000.0, "volume and projections: lengths in m, attenuation in 1/mm"));
-    }
-    if !near(1.0) {
-        tracing::warn!(
-            "{place}: the projections are {ratio:.3} times the integrals through the volume, not 1 or 1000: \
-             the volume may not be in the unit of the lengths"
-        );
-    }
-    Ok((own, 1.0, "volume and projections"))
+    let agreement = volume.and_then(|v| rays::agreement(train, v));
+    Ok(unit::from_numbers(place, agreement, &READINGS, "nothing: lengths are taken for mm"))
 }
 
 /// Size of one pixel or voxel, from the whole (`s...`), the one (`d...`) or both if they agree.
@@ -224,25 +216,7 @@ fn volume(folder: &Path, place: &str, name: &str, shape: [usize; 3]) -> Result<A
 pub fn write_r2(folder: impl AsRef<Path>, train: &Scan, test: Option<&Scan>, volume: Option<&Volume>) -> Result<()> {
     let folder = folder.as_ref();
     let place = folder.display().to_string();
-    let fit = |name: &str, s: &Scan| -> Result<Orbit> {
-        s.validate(&format!("{place}: {name}"))?;
-        Orbit::fit(&s.geometry.views).ok_or_else(|| {
-            let why = "R2-Gaussian's format only knows circles about z; write conefield's own format";
-            Error::unsupported(format!("{place}: {name} views that are not one circle"), why)
-        })
-    };
-    let orbit = fit("training", train)?;
-    let test = test.map(|t| fit("test", t).map(|o| (t, o))).transpose()?;
-    if let Some((t, o)) = &test {
-        let near = |a: f64, b: f64| (a - b).abs() <= 1e-6 * orbit.dsd;
-        let same = near(o.dso, orbit.dso)
-            && near(o.dsd, orbit.dsd)
-            && (0..2).all(|k| near(o.pixel[k], orbit.pixel[k]) && near(o.offset[k], orbit.offset[k]))
-            && t.geometry.detector == train.geometry.detector
-            && t.geometry.volume == train.geometry.volume;
-        let expected = "the orbit, detector and grid of the training views";
-        ensure(same, &place, "test views", "another geometry", expected)?;
-    }
+    let (orbit, test_orbit) = Orbit::common(&place, "R2-Gaussian's format", train, test)?;
     if let Some(v) = volume {
         let (found, expected) = (format!("{:?}", v.data.shape()), format!("{:?}", train.geometry.volume.shape));
         ensure(v.data.shape() == train.geometry.volume.shape, &place, "shape of the volume", found, expected)?;
@@ -279,7 +253,7 @@ pub fn write_r2(folder: impl AsRef<Path>, train: &Scan, test: Option<&Scan>, vol
         // In units of half the longest side, as the published data has it.
         "bbox": grid.bounds().map(|b| b.map(|x| x / half)),
         "proj_train": frames("proj_train", &orbit.angles),
-        "proj_test": frames("proj_test", test.as_ref().map_or(&[], |(_, o)| &o.angles)),
+        "proj_test": frames("proj_test", test_orbit.as_ref().map_or(&[], |o| &o.angles)),
     });
     if volume.is_some() {
         meta["vol"] = json!("vol_gt.npy");
@@ -287,7 +261,7 @@ pub fn write_r2(folder: impl AsRef<Path>, train: &Scan, test: Option<&Scan>, vol
     let text = serde_json::to_string_pretty(&meta)
         .map_err(|e| Error::invalid(&place, META, e, "numbers that JSON can hold"))?;
     write_folder_atomic(folder, |new| {
-        for (split, scan) in [("proj_train", Some(train)), ("proj_test", test.as_ref().map(|(t, _)| *t))] {
+        for (split, scan) in [("proj_train", Some(train)), ("proj_test", test)] {
             let sub = new.join(split);
             std::fs::create_dir(&sub).map_err(|e| Error::io(&sub, e))?;
             for (i, view) in scan.iter().flat_map(|s| s.projections.axis_iter(Axis(0))).enumerate() {

@@ -42,24 +42,36 @@ pub(crate) fn integral(data: &Array3<f32>, grid: &VoxelGrid, ray: &Ray) -> f64 {
     sum * length
 }
 
-/// How many times larger the measured line integrals are than those through `data` on the scan's own grid, by least
-/// squares over some rays; `None` where the volume casts no shadow on them.
-pub(crate) fn measured_to_integrated(scan: &Scan, data: &Array3<f32>) -> Option<f64> {
+/// How well a volume explains a scan.
+#[derive(Debug, Clone, Copy)]
+pub(crate) struct Agreement {
+    /// How many times larger the measured line integrals are than those through the volume, by least squares.
+    pub ratio: f64,
+    /// What is left of the measured ones after that, relative to their root mean square.
+    pub residual: f64,
+}
+
+/// Compares the measured line integrals with those through `data` on the scan's own grid over some rays; `None` where
+/// the volume casts no shadow on them.
+pub(crate) fn agreement(scan: &Scan, data: &Array3<f32>) -> Option<Agreement> {
     let g = &scan.geometry;
     if data.shape() != g.volume.shape {
         return None;
     }
     let views = g.views.len();
     let stride = |n: usize, most: usize| n.div_ceil(most);
-    let (mut mi, mut ii) = (0.0, 0.0);
+    let (mut mm, mut mi, mut ii) = (0.0, 0.0, 0.0);
     for view in (0..views).step_by(stride(views, 4)) {
         for row in (0..g.detector[0]).step_by(stride(g.detector[0], 24)) {
             for column in (0..g.detector[1]).step_by(stride(g.detector[1], 24)) {
                 let i = integral(data, &g.volume, &g.ray(view, row, column));
-                mi += i * f64::from(scan.projections[[view, row, column]]);
+                let m = f64::from(scan.projections[[view, row, column]]);
+                mm += m * m;
+                mi += i * m;
                 ii += i * i;
             }
         }
     }
-    (ii > 0.0 && mi.is_finite()).then(|| mi / ii)
+    let left = if mm > 0.0 { (1.0 - mi * mi / (mm * ii)).max(0.0).sqrt() } else { 1.0 };
+    (ii > 0.0 && mi.is_finite()).then_some(Agreement { ratio: mi / ii, residual: left })
 }

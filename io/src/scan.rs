@@ -1,6 +1,6 @@
-//! The door for scans: which format a folder is in.
+//! The door for scans: which format a folder or file is in.
 
-use crate::{r2, scan_folder};
+use crate::{naf, pickle, r2, scan_folder};
 use conefield_core::scan::{Scan, Volume};
 use conefield_core::{Error, Result};
 use std::path::{Path, PathBuf};
@@ -11,14 +11,18 @@ enum Found {
     Own(PathBuf),
     /// R2-Gaussian's folder.
     R2(PathBuf),
+    /// NAF's file.
+    Naf(PathBuf),
 }
 
-/// Reads a scan from conefield's own folder (`scan.toml` or `scan.json`) or R2-Gaussian's (`meta_data.json`, the
-/// training views). The folder or the file that describes it may be named.
+/// Reads a scan from conefield's own folder (`scan.toml` or `scan.json`), R2-Gaussian's (`meta_data.json`, the training
+/// views) or NAF's pickle (the training views), whatever that is called. For folders, the file that describes them may
+/// be named as well.
 pub fn read_scan(path: impl AsRef<Path>) -> Result<Scan> {
     match find(path.as_ref())? {
         Found::Own(file) => scan_folder::read(&file),
         Found::R2(folder) => r2::read_train(&folder).map(|r| r.train),
+        Found::Naf(file) => naf::read_train(&file),
     }
 }
 
@@ -27,14 +31,19 @@ pub fn read_truth(path: impl AsRef<Path>) -> Result<Option<Volume>> {
     match find(path.as_ref())? {
         Found::Own(file) => scan_folder::read_truth(&file),
         Found::R2(folder) => r2::read_train(&folder).map(|r| r.volume),
+        Found::Naf(file) => naf::read_truth(&file),
     }
 }
 
 fn find(path: &Path) -> Result<Found> {
     let place = path.display().to_string();
-    let understood = "a folder with scan.toml or scan.json (conefield) or with meta_data.json (R2-Gaussian)";
+    let understood = "a folder with scan.toml or scan.json (conefield) or with meta_data.json (R2-Gaussian), \
+                      or a pickle (NAF)";
     let info = path.metadata().map_err(|e| Error::io(path, e))?;
     if !info.is_dir() {
+        if info.is_file() && pickle::is_pickle(path)? {
+            return Ok(Found::Naf(path.to_path_buf()));
+        }
         let name = path.file_name().and_then(|n| n.to_str()).unwrap_or_default();
         let folder = path.parent().filter(|p| !p.as_os_str().is_empty()).unwrap_or(Path::new("."));
         return match name {

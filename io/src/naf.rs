@@ -1,0 +1,635 @@
+//! The scan files of NAF and SAX-NeRF: one pickle of a dict with TIGRE's names.
+//!
+//! The world is ours: source at `DSO·(cos a, sin a, 0)`, columns along `(-sin a, cos a, 0)`, rows towards −z. `nDetector`,
+//! `dDetector` and `offDetector` are \[v, u\], and as in TIGRE the offset's v points towards +z, against the rows; volumes
+//! are \[x, y, z\]; `offOrigin` is the volume's centre. Lengths are millimetres. What `image` is in is not said:
+//! see [`read_naf`].
+
+use crate::orbit::Orbit;
+use crate::pickle::{self, Item, Out, Pickle};
+use crate::unit::{self, Reading, Units};
+use crate::{rays, write_atomic};
+use conefield_core::error::ensure;
+use conefield_core::geometry::{Geometry, VoxelGrid};
+use conefield_core::scan::{Scan, Unit, Volume};
+use conefield_core::{Error, Result};
+use ndarray::{Array3, Ix3};
+use serde_json::json;
+use std::path::Path;
+
+/// Keys without which there is no scan.
+const REQUIRED: [&str; 8] = ["mode", "DSO", "DSD", "nDetector", "dDetector", "nVoxel", "dVoxel", "train"];
+
+/// Keys that change the scan if they are there.
+const OPTIONAL: [&str; 7] = ["offOrigin", "offDetector", "image", "val", "numTrain", "numVal", "unit"];
+
+/// How near an unknown key must be to one that is missing to be taken for a slip.
+const NEAR: f64 = 0.9;
+
+/// Two turns either way: radians past this are more likely degrees.
+const MOST_RADIANS: f64 = 4.0 * std::f64::consts::PI + 1e-6;
+
+/// What the numbers of a file that does not name its unit can mean.
+const READINGS: [Reading; 2] = [
+    Reading {
+        ratio: 1.0,
+        unit: "mm",
+        unit_mm: 1.0,
+        length_mm: 1.0,
+        found: "image and projections: attenuation in 1/mm",
+    },
+    Reading {
+        ratio: 0.001,
+        unit: "m",
+        unit_mm: 1000.0,
+        length_mm: 1.0,
+        found: "image and projections: lengths in mm, attenuation in 1/m",
+    },
+];
+
+/// What a NAF file holds.
+#[derive(Debug, Clone)]
+pub struct NafScan {
+    /// The views to reconstruct from (`train`).
+    pub train: Scan,
+    /// Views kept apart for testing (`val`).
+    pub test: Option<Scan>,
+    /// The volume they were simulated from (`image`), in `1/unit` of the scan.
+    pub volume: Option<Volume>,
+}
+
+/// Reads a scan of NAF, SAX-NeRF or TIGRE's demos: training views, `val` views and `image`.
+///
+/// Lengths are mm and angles radians; a warning says so where angles look like degrees. The unit of `image` is not
+/// named by the format. If the file has a `unit` entry, as our writer makes, that holds. Otherwise the rays tell:
+/// where the integrals of `image` over millimetres give the projections, it is in 1/mm; where they are a thousand
+/// times larger, as in the published files, it is in 1/m. Anything else, and a file without `image`, is taken for
+/// 1/mm, the former with a warning. `provenance.unit_from` says which it was.
+///
+/// In `offDetector` the published code has the order \[u, v\] where TIGRE itself has \[v, u\]: the latter is taken unless
+/// the rays through `image` fit clearly better with the former (`provenance.offset_from`).
+///
+/// Nothing in the file is ever called. Names other than those of NumPy's arrays, missing or misspelt keys, shapes that
+/// do not fit each other and values that are not finite are refused with the byte or the key.
+pub fn read_naf(path: impl AsRef<Path>) -> Result<NafScan> {
+    read(path.as_ref(), true)
+}
+
+/// As [`read_naf`], without the test views.
+pub(crate) fn read_train(path: &Path) -> Result<Scan> {
+    read(path, false).map(|r| r.train)
+}
+
+/// Only the volume. Its voxels are in mm whatever its values are in, so the projections are not looked at.
+pub(crate) fn read_truth(path: &Path) -> Result<Option<Volume>> {
+    let place = path.display().to_string();
+    let bytes = pickle::read_bytes(path)?;
+    let pickle = Pickle::parse(&place, &bytes)?;
+    let file = Description::read(&pickle.top())?;
+    let data = file.image(&pickle.top())?;
+    Ok(data.map(|data| Volume { data, grid: file.grid, affine: None }))
+}
+
+fn read(path: &Path, with_test: bool) -> Result<NafScan> {
+    let place = path.display().to_string();
+    let bytes = pickle::read_bytes(path)?;
+    let pickle = Pickle::parse(&place, &bytes)?;
+    let top = pickle.top();
+    let file = Description::read(&top)?;
+    let name = path.file_name().map(|n| n.to_string_lossy());
+    let provenance = json!({ "format": "naf", "file": name });
+    let scan = |views: &Item| -> Result<Scan> {
+        let (geometry, projections) = file.views(&place, views)?;
+        Ok(Scan { geometry, projections, unit: Unit::default(), provenance: provenance.clone() })
+    };
+    let mut train = scan(&required(&top, "train")?)?;
+    check_count(&top, "numTrain", train.geometry.views.len())?;
+    let test = if with_test { top.get("val")? } else { None };
+    // NAF writes the key even if there are no such views.
+    let mut test = test.filter(|t| has_views(t)).map(|t| scan(&t)).transpose()?;
+    let data = file.image(&top)?;
+
+    let said = stated_unit(&place, &top)?;
+    let mut agreement = data.as_ref().and_then(|d| rays::agreement(&train, d));
+    let mut swapped = false;
+    if let (None, Some(data), Some(given)) = (&said, &data, agreement)
+        && file.offset[0] != file.offset[1]
+    {
+        let other = Description { offset: [file.offset[1], file.offset[0]], ..file.clone() };
+        let mut turned = train.clone();
+        other.turn(&mut turned.geometry, &file);
+        if let Some(better) = rays::agreement(&turned, data).filter(|o| o.residual < 0.5 * given.residual) {
+            tracing::warn!("{place}: offDetector fits the image as [u, v], not as [v, u]: taken so");
+            (train, agreement, swapped) = (turned, Some(better), true);
+            test.iter_mut().for_each(|t| other.turn(&mut t.geometry, &file));
+        }
+    }
+    let units = match said {
+        Some(unit) => Units { unit, length_mm: 1.0, found: unit::SAID },
+        None => {
+            unit::from_numbers(&place, agreement, &READINGS, "nothing: taken for lengths in mm, attenuation in 1/mm")
+        }
+    };
+    for s in [Some(&mut train), test.as_mut()].into_iter().flatten() {
+        s.geometry = s.geometry.scaled(units.length_mm);
+        s.unit = units.unit.clone();
+        s.provenance["unit_from"] = json!(units.found);
+        if swapped {
+            s.provenance["offset_from"] = json!("image and projections: offDetector is [u, v]");
+        }
+        s.validate(&place)?;
+    }
+    let volume = data.map(|data| Volume { data, grid: train.geometry.volume, affine: None });
+    Ok(NafScan { train, test, volume })
+}
+
+/// The entries that hold for all views, in mm.
+#[derive(Clone)]
+struct Description {
+    dso: f64,
+    dsd: f64,
+    detector: [usize; 2],
+    pixel: [f64; 2],
+    /// As in the file: along v towards +z, along u.
+    offset: [f64; 2],
+    grid: VoxelGrid,
+}
+
+impl Description {
+    fn read(top: &Item) -> Result<Self> {
+        check_keys(top)?;
+        let mode = required(top, "mode")?;
+        if mode.text()? != "cone" {
+            let expected = "\"cone\": rays must meet in one source";
+            return Err(mode.invalid(format!("\"{}\"", mode.text()?), expected));
+        }
+        let distance = |key: &str| -> Result<f64> {
+            let item = required(top, key)?;
+            positive(&item, [item.number()?], "a positive finite distance in mm").map(|[x]| x)
+        };
+        let offset = |key: &str| top.get(key);
+        let (detector, voxels) = (required(top, "nDetector")?, required(top, "nVoxel")?);
+        let (pixel, spacing) = (required(top, "dDetector")?, required(top, "dVoxel")?);
+        Ok(Self {
+            dso: distance("DSO")?,
+            dsd: distance("DSD")?,
+            detector: counts(&detector, "pixels along [v, u]")?,
+            pixel: positive(&pixel, pixel.list("pixel size along [v, u]")?, "positive lengths in mm along [v, u]")?,
+            offset: offset("offDetector")?.map_or(Ok([0.0; 2]), |i| i.list("mm along [v, u]"))?,
+            grid: VoxelGrid {
+                shape: counts(&voxels, "voxels along [x, y, z]")?,
+                spacing: positive(
+                    &spacing,
+                    spacing.list("voxel size along [x, y, z]")?,
+                    "positive lengths in mm along [x, y, z]",
+                )?,
+                center: offset("offOrigin")?.map_or(Ok([0.0; 3]), |i| i.list("mm along [x, y, z]"))?,
+            },
+        })
+    }
+
+    fn orbit(&self, angles: Vec<f64>) -> Orbit {
+        let offset = [-self.offset[0], self.offset[1]];
+        Orbit { dso: self.dso, dsd: self.dsd, pixel: self.pixel, offset, angles }
+    }
+
+    /// Geometry and projections of `train` or `val`. Shapes are compared before a number is decoded.
+    fn views(&self, place: &str, views: &Item) -> Result<(Geometry, Array3<f32>)> {
+        let item = required(views, "angles")?;
+        let angles = item.numbers()?;
+        if let Some(a) = angles.iter().find(|a| a.abs() > MOST_RADIANS) {
+            tracing::warn!("{place}: {}: {a} looks like degrees and is taken for radians", item.key());
+        }
+        let count = angles.len();
+        let geometry = Geometry { detector: self.detector, views: self.orbit(angles).views(), volume: self.grid };
+        geometry.validate(&format!("{place}: {}", views.key()))?;
+        let want = [count, self.detector[0], self.detector[1]];
+        let item = required(views, "projections")?;
+        let values = item.values(&want, "[view, row, column], as angles and nDetector say")?;
+        let values = values.into_dimensionality::<Ix3>().map_err(|e| item.invalid(e, "three axes"))?;
+        Ok((geometry, values))
+    }
+
+    /// Moves the detectors of `geometry`, made with the offset of `from`, to this one's.
+    fn turn(&self, geometry: &mut Geometry, from: &Self) {
+        let [dv, du] = [from.offset[0] - self.offset[0], self.offset[1] - from.offset[1]];
+        for view in &mut geometry.views {
+            for k in 0..3 {
+                view.detector[k] += dv / self.pixel[0] * view.v[k] + du / self.pixel[1] * view.u[k];
+            }
+        }
+    }
+
+    fn image(&self, top: &Item) -> Result<Option<Array3<f32>>> {
+        let Some(image) = top.get("image")? else { return Ok(None) };
+        let values = image.values(&self.grid.shape, "[x, y, z], as nVoxel says")?;
+        values.into_dimensionality::<Ix3>().map(Some).map_err(|e| image.invalid(e, "three axes"))
+    }
+}
+
+fn required<'p, 'a>(item: &Item<'p, 'a>, key: &str) -> Result<Item<'p, 'a>> {
+    if let Some(found) = item.get(key)? {
+        return Ok(found);
+    }
+    let keys = item.keys()?;
+    let unknown = keys.iter().filter(|k| !REQUIRED.contains(k) && !OPTIONAL.contains(k));
+    let found = match nearest(key, unknown) {
+        Some((name, _)) if keys.contains(&key) => format!("None (and \"{name}\")"),
+        Some((name, near)) if near > 0.75 => format!("no such key, but \"{name}\""),
+        _ if keys.contains(&key) => "None".into(),
+        _ => "no such key".into(),
+    };
+    let path = if item.key() == "content" { key.to_owned() } else { format!("{}.{key}", item.key()) };
+    Err(item.invalid_at(path, found, format!("the key \"{key}\"")))
+}
+
+/// Refuses an unknown key that reads like one of those that would have been used. Other keys are passed over: the
+/// published files have many that only their generator needs.
+fn check_keys(top: &Item) -> Result<()> {
+    let keys = top.keys()?;
+    for key in OPTIONAL.iter().filter(|k| !keys.contains(k)) {
+        let unknown = keys.iter().filter(|k| !REQUIRED.contains(k) && !OPTIONAL.contains(k));
+        if let Some((name, near)) = nearest(key, unknown)
+            && near > NEAR
+        {
+            return Err(top.invalid_at((*name).to_owned(), "a key that is not known here", format!("\"{key}\"")));
+        }
+    }
+    Ok(())
+}
+
+fn nearest<'k>(key: &str, names: impl Iterator<Item = &'k &'k str>) -> Option<(&'k str, f64)> {
+    let near = |name: &str| strsim::jaro_winkler(&name.to_lowercase(), &key.to_lowercase());
+    names.map(|n| (*n, near(n))).max_by(|a, b| a.1.total_cmp(&b.1))
+}
+
+fn counts<const N: usize>(item: &Item, axes: &str) -> Result<[usize; N]> {
+    let found: [f64; N] = item.list(axes)?;
+    let whole = found.iter().all(|x| x.fract() == 0.0 && (1.0..=f64::from(u32::MAX)).contains(x));
+    if !whole {
+        return Err(item.invalid(format!("{found:?}"), format!("at least 1, whole numbers of {axes}")));
+    }
+    Ok(found.map(|x| x as usize))
+}
+
+fn positive<const N: usize>(item: &Item, found: [f64; N], expected: &str) -> Result<[f64; N]> {
+    match found.iter().find(|x| **x <= 0.0) {
+        Some(_) if N > 1 => Err(item.invalid(format!("{found:?}"), expected)),
+        Some(x) => Err(item.invalid(x, expected)),
+        None => Ok(found),
+    }
+}
+
+/// NAF itself counts views by these keys; a file may say less than it holds.
+fn check_count(top: &Item, key: &str, views: usize) -> Result<()> {
+    let Some(item) = top.get(key)? else { return Ok(()) };
+    let said = item.number()?;
+    if said > views as f64 {
+        return Err(item.invalid(said, format!("{views}, as many as there are views")));
+    }
+    if said != views as f64 {
+        tracing::warn!("{key} is {said}, but there are {views} views: all are read");
+    }
+    Ok(())
+}
+
+fn has_views(views: &Item) -> bool {
+    views.get("angles").is_ok_and(|a| a.is_some_and(|a| !a.numbers().is_ok_and(|n| n.is_empty())))
+}
+
+/// The entry that our writer adds; NAF's programs read past it.
+fn stated_unit(place: &str, top: &Item) -> Result<Option<Unit>> {
+    let Some(item) = top.get("unit")? else { return Ok(None) };
+    let (name, mm) = (required(&item, "name")?.text()?, required(&item, "mm")?.number()?);
+    let unit = Unit { name: name.into(), mm };
+    unit::check(place, &unit)?;
+    Ok(Some(unit))
+}
+
+/// Writes a NAF file: lengths in mm, angles in radians, projections as line integrals, the volume as it is, in `1/unit`
+/// of `train`. A pickle of protocol 4 that NumPy 1 and 2 load.
+///
+/// NAF's own programs want both `image` and `val`, take `image` for 1/m and know no detector that is not square;
+/// without a volume or test views the file is written all the same, for other readers. An additional `unit` entry
+/// tells ours what the values are in.
+///
+/// A scan that is no circle about z, a volume of another shape than the scan's grid, or a test scan with another
+/// orbit, detector or grid cannot be said in this format and is refused.
+pub fn write_naf(path: impl AsRef<Path>, train: &Scan, test: Option<&Scan>, volume: Option<&Volume>) -> Result<()> {
+    let path = path.as_ref();
+    let place = path.display().to_string();
+    let (orbit, test_orbit) = Orbit::common(&place, "NAF's format", train, test)?;
+    let (g, grid) = (&train.geometry, &train.geometry.volume);
+    if let Some(v) = volume {
+        let (found, expected) = (format!("{:?}", v.data.shape()), format!("{:?}", grid.shape));
+        ensure(v.data.shape() == grid.shape, &place, "shape of the volume", found, expected)?;
+        if let Some((at, x)) = v.data.indexed_iter().find(|(_, x)| !x.is_finite()) {
+            let field = format!("voxel [{}, {}, {}]", at.0, at.1, at.2);
+            return Err(Error::invalid(place, field, x, "a finite number"));
+        }
+    }
+    let ints = |xs: &[usize]| Out::List(xs.iter().map(|x| Out::Int(*x)).collect());
+    let floats = |xs: &[f64]| Out::List(xs.iter().map(|x| Out::Float(*x)).collect());
+    let mut entries = vec![
+        ("mode", Out::Text("cone")),
+        ("filter", Out::None),
+        ("accuracy", Out::Float(0.5)),
+        ("DSO", Out::Float(orbit.dso)),
+        ("DSD", Out::Float(orbit.dsd)),
+        ("nDetector", ints(&g.detector)),
+        ("dDetector", floats(&orbit.pixel)),
+        ("nVoxel", ints(&grid.shape)),
+        ("dVoxel", floats(&grid.spacing)),
+        ("offOrigin", floats(&grid.center)),
+        ("offDetector", floats(&[0.0 - orbit.offset[0], orbit.offset[1]])),
+        ("totalAngle", Out::Float(total(&orbit.angles).to_degrees())),
+        ("startAngle", Out::Float(orbit.angles.first().copied().unwrap_or(0.0).to_degrees())),
+        ("randomAngle", Out::Bool(false)),
+        ("noise", Out::Int(0)),
+        ("normalize", Out::Bool(false)),
+        ("convert", Out::Bool(false)),
+        ("numTrain", Out::Int(orbit.angles.len())),
+        ("numVal", Out::Int(test_orbit.as_ref().map_or(0, |o| o.angles.len()))),
+        ("unit", Out::Dict(vec![("name", Out::Text(&train.unit.name)), ("mm", Out::Float(train.unit.mm))])),
+        ("train", views_out(&orbit.angles, &train.projections)),
+    ];
+    if let (Some(orbit), Some(test)) = (&test_orbit, test) {
+        entries.push(("val", views_out(&orbit.angles, &test.projections)));
+    }
+    if let Some(v) = volume {
+        entries.push(("image", Out::Floats(v.data.view().into_dyn())));
+    }
+    write_atomic(path, |w| pickle::write(w, &Out::Dict(entries)).map_err(|e| Error::io(path, e)))
+}
+
+fn views_out<'a>(angles: &'a [f64], projections: &'a Array3<f32>) -> Out<'a> {
+    Out::Dict(vec![("angles", Out::Doubles(angles)), ("projections", Out::Floats(projections.view().into_dyn()))])
+}
+
+/// From the first view to where the next after the last would stand.
+fn total(angles: &[f64]) -> f64 {
+    match angles {
+        [first, .., last] => (last - first) * angles.len() as f64 / (angles.len() - 1) as f64,
+        _ => std::f64::consts::TAU,
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::testing::{data, scan};
+    use crate::{read_r2, read_scan, read_truth};
+    use std::fs;
+    use std::path::PathBuf;
+
+    /// The largest distance in mm between what two geometries have.
+    fn apart(a: &Geometry, b: &Geometry) -> f64 {
+        assert_eq!((a.detector, a.volume.shape, a.views.len()), (b.detector, b.volume.shape, b.views.len()));
+        let far = |x: [f64; 3], y: [f64; 3]| (0..3).map(|k| (x[k] - y[k]).abs()).fold(0.0, f64::max);
+        let views =
+            a.views.iter().zip(&b.views).flat_map(|(v, w)| {
+                [far(v.source, w.source), far(v.detector, w.detector), far(v.u, w.u), far(v.v, w.v)]
+            });
+        let grid = [far(a.volume.spacing, b.volume.spacing), far(a.volume.center, b.volume.center)];
+        views.chain(grid).fold(0.0, f64::max)
+    }
+
+    /// A scan that its volume explains, with the offset that the standard one lacks the size for.
+    fn consistent(unit: Unit) -> (Scan, Volume) {
+        let mut s = scan();
+        let mut orbit = Orbit::fit(&s.geometry.views).unwrap();
+        orbit.offset = [0.25, -1.5];
+        s.geometry.views = orbit.views();
+        s.unit = unit;
+        let data = Array3::from_shape_fn((5, 6, 7), |(x, y, z)| 0.01 + 0.002 * (x + y * z) as f32);
+        let g = s.geometry.clone();
+        for ((a, v, u), p) in s.projections.indexed_iter_mut() {
+            *p = (rays::integral(&data, &g.volume, &g.ray(a, v, u)) / s.unit.mm) as f32;
+        }
+        (s, Volume { data, grid: g.volume, affine: None })
+    }
+
+    /// What the file of `train` would be without our own entry for the unit.
+    fn write_without_unit(path: &Path, train: &Scan, volume: Option<&Volume>) {
+        write_naf(path, train, None, volume).unwrap();
+        let bytes = fs::read(path).unwrap();
+        // The key becomes another of the same length, which is passed over.
+        let key = b"\x04\0\0\0\0\0\0\0unit";
+        let at = bytes.windows(key.len()).position(|w| w == key).unwrap() + key.len();
+        let mut bytes = bytes;
+        bytes[at - 4..at].copy_from_slice(b"____");
+        fs::write(path, bytes).unwrap();
+    }
+
+    #[test]
+    fn three_files_hold_the_same_scan() {
+        let (Some(one), Some(two), Some(folder)) = (
+            data("interop/ellipsoids_50_numpy1.pickle"),
+            data("interop/ellipsoids_50_numpy2.pickle"),
+            data("interop/ellipsoids_50_r2"),
+        ) else {
+            return;
+        };
+        let r2 = read_r2(&folder).unwrap();
+        for path in [one, two] {
+            let naf = read_naf(&path).unwrap();
+            assert_eq!(naf.train.unit, Unit::default());
+            assert!(apart(&naf.train.geometry, &r2.train.geometry) < 1e-6);
+            assert_eq!(naf.train.projections, r2.train.projections);
+            let (test, r2_test) = (naf.test.unwrap(), r2.test.as_ref().unwrap());
+            assert!(apart(&test.geometry, &r2_test.geometry) < 1e-6);
+            assert_eq!(test.projections, r2_test.projections);
+            assert_eq!(naf.volume.as_ref().unwrap().data, r2.volume.as_ref().unwrap().data);
+            let found = naf.train.provenance["unit_from"].as_str().unwrap();
+            assert!(found.contains("1/mm"), "{found}");
+            let (again, truth) = (read_scan(&path).unwrap(), read_truth(&path).unwrap().unwrap());
+            assert_eq!((again.geometry, again.projections), (naf.train.geometry, naf.train.projections));
+            assert_eq!((truth.data, truth.grid), (naf.volume.as_ref().unwrap().data.clone(), again_grid(&path)));
+        }
+    }
+
+    fn again_grid(path: &Path) -> VoxelGrid {
+        read_scan(path).unwrap().geometry.volume
+    }
+
+    #[test]
+    fn the_offset_is_along_v_then_u() {
+        let Some(path) = data("interop/ellipsoids_offset_60.pickle") else { return };
+        let naf = read_naf(&path).unwrap();
+        let g = &naf.train.geometry;
+        assert_eq!((g.detector, g.volume.shape, g.views.len()), ([72, 112], [64, 56, 48], 60));
+        assert_eq!(naf.train.provenance.get("offset_from"), None);
+        let volume = naf.volume.as_ref().unwrap();
+        let right = rays::agreement(&naf.train, &volume.data).unwrap();
+        assert!((right.ratio - 1.0).abs() < 0.02 && right.residual < 0.03, "{right:?}");
+        let orbit = Orbit::fit(&g.views).unwrap();
+        assert!((orbit.offset[1] - 30.0).abs() < 1e-9 && orbit.offset[0] == 0.0, "{orbit:?}");
+        for offset in [[30.0, 0.0], [-30.0, 0.0], [0.0, -30.0], [0.0, 0.0]] {
+            let mut moved = naf.train.clone();
+            moved.geometry.views = Orbit { offset, ..orbit.clone() }.views();
+            let wrong = rays::agreement(&moved, &volume.data).unwrap();
+            assert!(wrong.residual > 3.0 * right.residual, "{offset:?}: {wrong:?}, {right:?}");
+        }
+    }
+
+    #[test]
+    fn what_is_written_comes_back() {
+        let dir = tempfile::tempdir().unwrap();
+        let path = dir.path().join("any name");
+        let train = scan();
+        let (_, test) = train.split(&[1, 4]).unwrap();
+        let volume = Volume { data: Array3::from_elem((5, 6, 7), 0.5), grid: train.geometry.volume, affine: None };
+        write_naf(&path, &train, Some(&test), Some(&volume)).unwrap();
+        let back = read_naf(&path).unwrap();
+        assert!(apart(&back.train.geometry, &train.geometry) < 1e-9);
+        assert_eq!((&back.train.unit, &back.train.projections), (&train.unit, &train.projections));
+        assert_eq!(back.train.provenance["unit_from"], "the file");
+        let back_test = back.test.unwrap();
+        assert!(apart(&back_test.geometry, &test.geometry) < 1e-9);
+        assert_eq!(back_test.projections, test.projections);
+        assert_eq!(back.volume.unwrap().data, volume.data);
+        write_naf(&path, &train, None, None).unwrap();
+        let back = read_naf(&path).unwrap();
+        assert!(back.test.is_none() && back.volume.is_none() && read_truth(&path).unwrap().is_none());
+        let mut odd = train.clone();
+        odd.geometry.views[0].source[2] += 1.0;
+        let e = write_naf(dir.path().join("odd"), &odd, None, None).unwrap_err().to_string();
+        assert!(e.contains("NAF") && e.contains("circle"), "{e}");
+        let small = Volume::centered(Array3::ones((2, 2, 2)), [1.0; 3]);
+        assert!(write_naf(&path, &train, None, Some(&small)).unwrap_err().to_string().contains("[5, 6, 7]"));
+    }
+
+    #[test]
+    fn the_unit_comes_from_the_rays() {
+        let dir = tempfile::tempdir().unwrap();
+        let path = dir.path().join("a.pickle");
+        // As in the published files: millimetres, integrals over metres.
+        for unit in [Unit { name: "m".into(), mm: 1000.0 }, Unit::default()] {
+            let (s, volume) = consistent(unit);
+            write_without_unit(&path, &s, Some(&volume));
+            let back = read_naf(&path).unwrap();
+            assert_eq!(back.train.unit, s.unit);
+            assert!(apart(&back.train.geometry, &s.geometry) < 1e-9);
+            assert_eq!(back.volume.unwrap().data, volume.data);
+            write_without_unit(&path, &s, None);
+            let back = read_naf(&path).unwrap();
+            assert_eq!(back.train.unit, Unit::default());
+            assert!(back.train.provenance["unit_from"].as_str().unwrap().starts_with("nothing"));
+        }
+        let (s, volume) = consistent(Unit { name: "cm".into(), mm: 10.0 });
+        write_without_unit(&path, &s, Some(&volume));
+        assert_eq!(read_naf(&path).unwrap().train.unit, Unit::default());
+    }
+
+    #[test]
+    fn the_published_order_of_the_offset_is_told_from_the_rays() {
+        let dir = tempfile::tempdir().unwrap();
+        let path = dir.path().join("a.pickle");
+        let (s, volume) = consistent(Unit::default());
+        let mut swapped = s.clone();
+        let mut orbit = Orbit::fit(&s.geometry.views).unwrap();
+        // The file's [v, u] is [-offset[0], offset[1]].
+        orbit.offset = [-orbit.offset[1], -orbit.offset[0]];
+        swapped.geometry.views = orbit.views();
+        write_without_unit(&path, &swapped, Some(&volume));
+        let back = read_naf(&path).unwrap();
+        assert!(apart(&back.train.geometry, &s.geometry) < 1e-9);
+        assert!(back.train.provenance["offset_from"].as_str().unwrap().contains("[u, v]"));
+        // Our own files are never doubted.
+        write_naf(&path, &swapped, None, Some(&volume)).unwrap();
+        assert!(apart(&read_naf(&path).unwrap().train.geometry, &swapped.geometry) < 1e-9);
+    }
+
+    /// A minimal file whose entries can be changed.
+    fn written(change: &dyn Fn(&mut Vec<(&'static str, Out<'static>)>)) -> (tempfile::TempDir, PathBuf) {
+        let ints = |xs: &[usize]| Out::List(xs.iter().map(|x| Out::Int(*x)).collect());
+        let floats = |xs: &[f64]| Out::List(xs.iter().map(|x| Out::Float(*x)).collect());
+        let mut entries = vec![
+            ("mode", Out::Text("cone")),
+            ("DSO", Out::Int(500)),
+            ("DSD", Out::Float(800.0)),
+            ("nDetector", floats(&[2.0, 3.0])),
+            ("dDetector", ints(&[1, 2])),
+            ("nVoxel", Out::Doubles(&[2.0, 2.0, 2.0])),
+            ("dVoxel", Out::Doubles(&[1.0, 1.0, 1.5])),
+            ("rescale_slope", Out::Float(1.0)),
+            ("train", views(&[0.0, 1.0], [2, 2, 3], 0.5)),
+        ];
+        change(&mut entries);
+        let dir = tempfile::tempdir().unwrap();
+        let path = dir.path().join("a.pickle");
+        write_atomic(&path, |w| pickle::write(w, &Out::Dict(entries)).map_err(|e| Error::io(&path, e))).unwrap();
+        (dir, path)
+    }
+
+    fn views(angles: &'static [f64], shape: [usize; 3], value: f32) -> Out<'static> {
+        let projections: &'static Array3<f32> = Box::leak(Box::new(Array3::from_elem(shape, value)));
+        views_out(angles, projections)
+    }
+
+    #[test]
+    fn lists_arrays_ints_and_floats_will_do() {
+        let (_dir, path) = written(&|_| {});
+        let s = read_naf(&path).unwrap().train;
+        assert_eq!((s.geometry.detector, s.geometry.volume.shape), ([2, 3], [2, 2, 2]));
+        assert_eq!(s.geometry.volume.spacing, [1.0, 1.0, 1.5]);
+        // Degrees are read as they stand, with a warning; no test views are none.
+        let (_dir, path) = written(&|e| e.push(("val", views(&[], [0, 2, 3], 0.0))));
+        assert!(read_naf(&path).unwrap().test.is_none());
+        let (_dir, path) = written(&|e| e[8].1 = views(&[0.0, 180.0], [2, 2, 3], 0.5));
+        assert!(read_naf(&path).is_ok());
+    }
+
+    #[test]
+    fn lying_descriptions_are_refused_in_words() {
+        let refused = |change: &dyn Fn(&mut Vec<(&'static str, Out<'static>)>), words: &[&str]| {
+            let (_dir, path) = written(change);
+            let e = read_naf(&path).unwrap_err().to_string();
+            let words = [&["a.pickle"], words].concat();
+            assert!(words.iter().all(|w| e.contains(w)), "{words:?} are not all in: {e}");
+        };
+        refused(&|e| drop(e.remove(1)), &["DSO", "no such key"]);
+        refused(&|e| e[3].0 = "nDetektor", &["nDetector", "\"nDetektor\""]);
+        refused(&|e| e.push(("offDetecter", Out::Int(0))), &["offDetecter", "\"offDetector\""]);
+        refused(&|e| e[0].1 = Out::Text("parallel"), &["mode", "parallel", "cone"]);
+        refused(&|e| e[0].1 = Out::Int(1), &["mode", "found 1", "a text"]);
+        refused(&|e| e[1].1 = Out::Float(-1.0), &["DSO", "-1", "positive"]);
+        refused(&|e| e[1].1 = Out::Float(f64::NAN), &["DSO", "NaN", "finite"]);
+        refused(&|e| e[1].1 = Out::None, &["DSO", "None"]);
+        refused(&|e| e[3].1 = Out::Doubles(&[2.0]), &["nDetector", "[1]", "2 numbers"]);
+        refused(&|e| e[3].1 = Out::Doubles(&[2.5, 3.0]), &["nDetector", "2.5", "whole"]);
+        refused(&|e| e[3].1 = Out::Doubles(&[1e300, 3.0]), &["nDetector", "whole"]);
+        refused(&|e| e[5].1 = Out::Doubles(&[2.0, 0.0, 2.0]), &["nVoxel", "at least 1"]);
+        refused(&|e| e[5].1 = Out::Doubles(&[4e9, 4e9, 4e9]), &["volume.shape"]);
+        refused(&|e| e[6].1 = Out::Doubles(&[1.0, f64::INFINITY, 1.0]), &["dVoxel[1]", "inf"]);
+        refused(&|e| e[6].1 = Out::Doubles(&[1e3, 1e3, 1e3]), &["train", "inside the volume"]);
+        refused(&|e| e[3].1 = Out::Doubles(&[3.0, 2.0]), &["train.projections", "[2, 2, 3]", "[2, 3, 2]"]);
+        refused(&|e| e[3].1 = Out::Doubles(&[4e9, 4e9]), &["train"]);
+        refused(&|e| e[8].1 = views(&[0.0], [2, 2, 3], 0.0), &["train.projections", "[1, 2, 3]"]);
+        refused(&|e| e[8].1 = views(&[], [0, 2, 3], 0.0), &["train", "at least one view"]);
+        refused(&|e| e[8].1 = views(&[0.0, f64::NAN], [2, 2, 3], 0.0), &["train.angles[1]", "NaN"]);
+        refused(&|e| e[8].1 = views(&[0.0, 1.0], [2, 2, 3], f32::NAN), &["train.projections[0, 0, 0]", "NaN"]);
+        refused(&|e| e[8].1 = Out::List(vec![]), &["train", "a list of 0", "a dict"]);
+        refused(&|e| e.push(("numTrain", Out::Int(3))), &["numTrain", "found 3", "2"]);
+        refused(&|e| e.push(("image", Out::Doubles(&[1.0]))), &["image", "[1]", "[2, 2, 2]"]);
+        refused(&|e| e.push(("val", views(&[0.0], [1, 2, 2], 0.0))), &["val.projections", "[1, 2, 3]"]);
+        refused(&|e| e.push(("offDetector", Out::Doubles(&[1.0, 2.0, 3.0]))), &["offDetector", "[3]", "[v, u]"]);
+        let broken = |mm| Out::Dict(vec![("name", Out::Text("x")), ("mm", Out::Float(mm))]);
+        refused(&|e| e.push(("unit", broken(0.0))), &["unit.mm"]);
+        let dir = tempfile::tempdir().unwrap();
+        let path = dir.path().join("a.pickle");
+        fs::write(&path, b"\x80\x04].").unwrap();
+        let e = read_scan(&path).unwrap_err().to_string();
+        assert!(e.contains("content") && e.contains("a list of 0") && e.contains("a dict"), "{e}");
+    }
+
+    #[test]
+    fn no_cut_makes_it_panic() {
+        let (_dir, path) = written(&|_| {});
+        let bytes = fs::read(&path).unwrap();
+        for cut in 0..bytes.len() {
+            fs::write(&path, &bytes[..cut]).unwrap();
+            assert!(read_scan(&path).is_err() && read_naf(&path).is_err());
+        }
+    }
+}

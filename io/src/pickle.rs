@@ -1,0 +1,526 @@
+//! Python's pickle, protocols 2 to 5, as data.
+//!
+//! A pickle is a program for a stack machine that may call anything. This machine knows numbers, texts, bytes, tuples,
+//! lists, dicts and the names that NumPy's arrays need (`numpy.rs`); every other name or opcode is refused by name.
+//! It calls nothing. Texts, bytes and arrays stay where the file has them until they are asked for, so a file cannot
+//! claim more than it holds, and what it mentions often is kept once.
+
+mod numpy;
+mod op;
+mod value;
+mod write;
+
+#[cfg(test)]
+mod tests;
+
+use conefield_core::{Error, Result};
+use numpy::{Array, Dtype, Global};
+use std::collections::HashMap;
+use std::fs::File;
+use std::io::Read;
+use std::path::Path;
+use value::{Heap, Node, Refusal, Value};
+
+pub(crate) use value::{Item, Pickle};
+pub(crate) use write::{Out, write};
+
+/// Most values that a pickle may make: a hundred times what long lists of angles need.
+const MOST_VALUES: usize = 1 << 22;
+
+/// Most values that it may number to use again.
+const MOST_MEMO: usize = 1 << 20;
+
+/// Longest integer, in bytes.
+const LONGEST_INTEGER: usize = 16;
+
+const PROTOCOLS: std::ops::RangeInclusive<u8> = 2..=5;
+
+/// Whether the file starts as a pickle of protocol 2 or later does.
+pub(crate) fn is_pickle(path: &Path) -> Result<bool> {
+    let mut start = Vec::new();
+    let file = File::open(path).map_err(|e| Error::io(path, e))?;
+    file.take(2).read_to_end(&mut start).map_err(|e| Error::io(path, e))?;
+    // Python is at 5; a few more, so that the refusal can name them.
+    Ok(matches!(start[..], [op::PROTO, 0..=15]))
+}
+
+/// All of a regular file.
+pub(crate) fn read_bytes(path: &Path) -> Result<Vec<u8>> {
+    let io = |e| Error::io(path, e);
+    let file = File::open(path).map_err(io)?;
+    let info = file.metadata().map_err(io)?;
+    let invalid = |field: &str, found: String, expected: &str| {
+        Err(Error::invalid(path.display().to_string(), field, found, expected))
+    };
+    if !info.is_file() {
+        return invalid("file", "a folder or device".into(), "a regular file");
+    }
+    let mut bytes = Vec::new();
+    if !usize::try_from(info.len()).is_ok_and(|n| bytes.try_reserve_exact(n).is_ok()) {
+        return invalid("file size", format!("{} bytes", info.len()), "a file that fits in memory");
+    }
+    file.take(info.len()).read_to_end(&mut bytes).map_err(io)?;
+    Ok(bytes)
+}
+
+impl<'a> Pickle<'a> {
+    /// Reads `bytes`, the content of the file `place`.
+    pub fn parse(place: &str, bytes: &'a [u8]) -> Result<Self> {
+        let mut machine = Machine {
+            place,
+            bytes,
+            at: 0,
+            start: 0,
+            stack: Vec::new(),
+            marks: Vec::new(),
+            memo: HashMap::new(),
+            heap: Heap::default(),
+            made: 0,
+            encoded: 0,
+        };
+        let top = machine.run()?;
+        machine.heap.check_nesting(top).map_err(|r| Error::invalid(place, "content", r.found, r.expected))?;
+        Ok(Self { place: place.to_owned(), heap: machine.heap, top })
+    }
+}
+
+struct Machine<'p, 'a> {
+    place: &'p str,
+    bytes: &'a [u8],
+    /// The next byte.
+    at: usize,
+    /// The byte that the present opcode stands at.
+    start: usize,
+    stack: Vec<Value<'a>>,
+    /// Heights of the stack at the open marks.
+    marks: Vec<usize>,
+    memo: HashMap<u32, Value<'a>>,
+    heap: Heap<'a>,
+    /// Values made so far.
+    made: usize,
+    /// Bytes made by `_codecs.encode` so far.
+    encoded: usize,
+}
+
+impl<'a> Machine<'_, 'a> {
+    fn run(&mut self) -> Result<Value<'a>> {
+        let first = self.byte()?;
+        if first != op::PROTO {
+            return Err(self.wrong(format!("0x{first:02x}"), "0x80, the start of a pickle of protocol 2 or later"));
+        }
+        self.protocol()?;
+        loop {
+            self.start = self.at;
+            match self.byte()? {
+                op::STOP => break,
+                code => self.step(code)?,
+            }
+        }
+        let top = self.pop()?;
+        if !self.stack.is_empty() || !self.marks.is_empty() {
+            return Err(self.wrong(format!("{} values left over", self.stack.len()), "one value at the end"));
+        }
+        if self.at != self.bytes.len() {
+            let found = format!("{} bytes after the end", self.bytes.len() - self.at);
+            return Err(self.wrong(found, "the end of the file"));
+        }
+        Ok(top)
+    }
+
+    fn protocol(&mut self) -> Result<()> {
+        let version = self.byte()?;
+        if PROTOCOLS.contains(&version) {
+            return Ok(());
+        }
+        Err(self.wrong(format!("protocol {version}"), format!("{} to {}", PROTOCOLS.start(), PROTOCOLS.end())))
+    }
+
+    fn step(&mut self, code: u8) -> Result<()> {
+        match code {
+            op::PROTO => self.protocol(),
+            op::FRAME => {
+                let length = self.count::<8>()?;
+                self.within(length)
+            }
+            op::NONE => self.push(Value::None),
+            op::NEWTRUE => self.push(Value::Bool(true)),
+            op::NEWFALSE => self.push(Value::Bool(false)),
+            op::BININT => {
+                let x = i32::from_le_bytes(self.array()?);
+                self.push(Value::Int(x.into()))
+            }
+            op::BININT1 => {
+                let x = self.byte()?;
+                self.push(Value::Int(x.into()))
+            }
+            op::BININT2 => {
+                let x = u16::from_le_bytes(self.array()?);
+                self.push(Value::Int(x.into()))
+            }
+            op::LONG1 => self.integer::<1>(),
+            op::LONG4 => self.integer::<4>(),
+            op::BINFLOAT => {
+                let x = f64::from_be_bytes(self.array()?);
+                self.push(Value::Float(x))
+            }
+            op::SHORT_BINUNICODE => self.text::<1>(),
+            op::BINUNICODE => self.text::<4>(),
+            op::BINUNICODE8 => self.text::<8>(),
+            op::SHORT_BINBYTES | op::SHORT_BINSTRING => self.binary::<1>(),
+            op::BINBYTES | op::BINSTRING => self.binary::<4>(),
+            op::BINBYTES8 | op::BYTEARRAY8 => self.binary::<8>(),
+            op::EMPTY_TUPLE => self.make(Node::Tuple(Vec::new())),
+            op::TUPLE1 => self.tuple(1),
+            op::TUPLE2 => self.tuple(2),
+            op::TUPLE3 => self.tuple(3),
+            op::TUPLE => {
+                let items = self.above_mark()?;
+                self.make(Node::Tuple(items))
+            }
+            op::EMPTY_LIST => self.make(Node::List(Vec::new())),
+            op::LIST => {
+                let items = self.above_mark()?;
+                self.make(Node::List(items))
+            }
+            op::APPEND => {
+                let item = self.pop()?;
+                self.append(vec![item])
+            }
+            op::APPENDS => {
+                let items = self.above_mark()?;
+                self.append(items)
+            }
+            op::EMPTY_DICT => self.make(Node::Dict(Vec::new())),
+            op::DICT => {
+                let items = self.above_mark()?;
+                self.make(Node::Dict(Vec::new()))?;
+                self.set_items(items)
+            }
+            op::SETITEM => {
+                let value = self.pop()?;
+                let key = self.pop()?;
+                self.set_items(vec![key, value])
+            }
+            op::SETITEMS => {
+                let items = self.above_mark()?;
+                self.set_items(items)
+            }
+            op::MARK => {
+                self.count_value()?;
+                self.marks.push(self.stack.len());
+                Ok(())
+            }
+            op::POP => self.pop_or_mark(),
+            op::POP_MARK => self.above_mark().map(|_| ()),
+            op::DUP => {
+                let value = self.peek()?;
+                self.push(value)
+            }
+            op::MEMOIZE => {
+                let index = self.memo.len() as u32;
+                self.remember(index)
+            }
+            op::BINPUT => {
+                let index = self.byte()?;
+                self.remember(index.into())
+            }
+            op::LONG_BINPUT => {
+                let index = u32::from_le_bytes(self.array()?);
+                self.remember(index)
+            }
+            op::BINGET => {
+                let index = self.byte()?;
+                self.recall(index.into())
+            }
+            op::LONG_BINGET => {
+                let index = u32::from_le_bytes(self.array()?);
+                self.recall(index)
+            }
+            op::GLOBAL => {
+                let (module, name) = (self.line()?, self.line()?);
+                self.global(module, name)
+            }
+            op::STACK_GLOBAL => {
+                let (name, module) = (self.pop()?, self.pop()?);
+                match (self.heap.text(module), self.heap.text(name)) {
+                    (Some(module), Some(name)) => self.global(module, name),
+                    _ => Err(self.wrong(self.heap.kind(name), "a module and a name")),
+                }
+            }
+            op::REDUCE => self.reduce(),
+            op::BUILD => self.build(),
+            op::PERSID
+            | op::BINPERSID
+            | op::EXT1
+            | op::EXT2
+            | op::EXT4
+            | op::NEWOBJ
+            | op::NEWOBJ_EX
+            | op::INST
+            | op::OBJ
+            | op::NEXT_BUFFER
+            | op::READONLY_BUFFER => {
+                Err(self.wrong("an opcode that refers to something outside or makes an object", "data only"))
+            }
+            op::EMPTY_SET | op::ADDITEMS | op::FROZENSET => Err(self.wrong("a set", "a list, tuple or dict")),
+            op::INT | op::LONG | op::FLOAT | op::STRING | op::UNICODE | op::GET | op::PUT => {
+                Err(self.wrong("an opcode of protocol 0", "protocol 2 or later: write the file with Python 3"))
+            }
+            other => Err(self.wrong(format!("0x{other:02x}"), "an opcode of protocols 2 to 5")),
+        }
+    }
+
+    /// An error at the present opcode.
+    fn wrong(&self, found: impl ToString, expected: impl Into<String>) -> Error {
+        let name = self.bytes.get(self.start).and_then(|c| op::name(*c));
+        let field = match name {
+            Some(name) => format!("byte {} ({name})", self.start),
+            None => format!("byte {}", self.start),
+        };
+        Error::invalid(self.place, field, found, expected)
+    }
+
+    fn refuse(&self, refusal: Refusal) -> Error {
+        self.wrong(refusal.found, refusal.expected)
+    }
+
+    fn left(&self) -> usize {
+        self.bytes.len() - self.at
+    }
+
+    fn within(&self, length: u64) -> Result<()> {
+        if length > self.left() as u64 {
+            let found = format!("the end of the file after {} bytes", self.left());
+            return Err(self.wrong(found, format!("{length} bytes")));
+        }
+        Ok(())
+    }
+
+    fn take(&mut self, length: u64) -> Result<&'a [u8]> {
+        self.within(length)?;
+        let taken = &self.bytes[self.at..self.at + length as usize];
+        self.at += taken.len();
+        Ok(taken)
+    }
+
+    fn array<const N: usize>(&mut self) -> Result<[u8; N]> {
+        let mut out = [0; N];
+        out.copy_from_slice(self.take(N as u64)?);
+        Ok(out)
+    }
+
+    fn byte(&mut self) -> Result<u8> {
+        self.array::<1>().map(|[b]| b)
+    }
+
+    /// A length of `N` bytes.
+    fn count<const N: usize>(&mut self) -> Result<u64> {
+        Ok(self.array::<N>()?.iter().rev().fold(0, |n, b| n << 8 | u64::from(*b)))
+    }
+
+    fn line(&mut self) -> Result<&'a str> {
+        let rest = &self.bytes[self.at..];
+        let end = rest.iter().position(|b| *b == b'\n').ok_or_else(|| self.wrong("the end of the file", "a line"))?;
+        self.at += end + 1;
+        std::str::from_utf8(&rest[..end]).map_err(|e| self.wrong(format!("a name that is no UTF-8: {e}"), "a name"))
+    }
+
+    fn count_value(&mut self) -> Result<()> {
+        self.made += 1;
+        if self.made > MOST_VALUES {
+            return Err(self.wrong(format!("more than {MOST_VALUES} values"), "long data in NumPy arrays"));
+        }
+        Ok(())
+    }
+
+    fn push(&mut self, value: Value<'a>) -> Result<()> {
+        self.count_value()?;
+        self.stack.push(value);
+        Ok(())
+    }
+
+    fn make(&mut self, node: Node<'a>) -> Result<()> {
+        self.push(Value::Node(self.heap.nodes.len()))?;
+        self.heap.nodes.push(node);
+        Ok(())
+    }
+
+    /// The top of the stack; what lies below an open mark is out of reach.
+    fn peek(&self) -> Result<Value<'a>> {
+        let floor = self.marks.last().copied().unwrap_or(0);
+        match self.stack.last() {
+            Some(value) if self.stack.len() > floor => Ok(*value),
+            _ => Err(self.wrong("an empty stack", "a value on it")),
+        }
+    }
+
+    fn pop(&mut self) -> Result<Value<'a>> {
+        let value = self.peek()?;
+        self.stack.pop();
+        Ok(value)
+    }
+
+    /// As in Python, POP takes an open mark if nothing lies above it.
+    fn pop_or_mark(&mut self) -> Result<()> {
+        if self.marks.last() == Some(&self.stack.len()) {
+            self.marks.pop();
+            return Ok(());
+        }
+        self.pop().map(|_| ())
+    }
+
+    fn above_mark(&mut self) -> Result<Vec<Value<'a>>> {
+        match self.marks.pop() {
+            Some(mark) if mark <= self.stack.len() => Ok(self.stack.split_off(mark)),
+            _ => Err(self.wrong("no open mark", "a mark")),
+        }
+    }
+
+    fn tuple(&mut self, n: usize) -> Result<()> {
+        let mut items = (0..n).map(|_| self.pop()).collect::<Result<Vec<_>>>()?;
+        items.reverse();
+        self.make(Node::Tuple(items))
+    }
+
+    fn integer<const N: usize>(&mut self) -> Result<()> {
+        let length = self.count::<N>()?;
+        let raw = self.take(length)?;
+        if raw.len() > LONGEST_INTEGER {
+            let expected = format!("at most {LONGEST_INTEGER} bytes");
+            return Err(self.wrong(format!("an integer of {} bytes", raw.len()), expected));
+        }
+        // Two's complement: the last byte's sign goes on.
+        let sign = if raw.last().is_some_and(|b| b & 0x80 != 0) { 0xff } else { 0 };
+        let mut whole = [sign; LONGEST_INTEGER];
+        whole[..raw.len()].copy_from_slice(raw);
+        self.push(Value::Int(i128::from_le_bytes(whole)))
+    }
+
+    fn text<const N: usize>(&mut self) -> Result<()> {
+        let length = self.count::<N>()?;
+        let raw = self.take(length)?;
+        let text = std::str::from_utf8(raw).map_err(|e| self.wrong(format!("no UTF-8: {e}"), "UTF-8 text"))?;
+        self.push(Value::Text(text))
+    }
+
+    fn binary<const N: usize>(&mut self) -> Result<()> {
+        let length = self.count::<N>()?;
+        let raw = self.take(length)?;
+        self.push(Value::Bytes(raw))
+    }
+
+    fn remember(&mut self, index: u32) -> Result<()> {
+        let value = self.peek()?;
+        if self.memo.len() >= MOST_MEMO && !self.memo.contains_key(&index) {
+            return Err(self.wrong(format!("more than {MOST_MEMO} numbered values"), "fewer"));
+        }
+        self.memo.insert(index, value);
+        Ok(())
+    }
+
+    fn recall(&mut self, index: u32) -> Result<()> {
+        match self.memo.get(&index) {
+            Some(value) => self.push(*value),
+            None => Err(self.wrong(format!("number {index}"), "a value that was numbered before")),
+        }
+    }
+
+    fn append(&mut self, items: Vec<Value<'a>>) -> Result<()> {
+        let list = self.peek()?;
+        match self.node_mut(list) {
+            Some(Node::List(all)) => {
+                all.extend(items);
+                Ok(())
+            }
+            _ => Err(self.wrong(self.heap.kind(list), "a list to append to")),
+        }
+    }
+
+    fn set_items(&mut self, items: Vec<Value<'a>>) -> Result<()> {
+        let (pairs, rest) = items.as_chunks::<2>();
+        if !rest.is_empty() {
+            return Err(self.wrong("a key without a value", "pairs of key and value"));
+        }
+        let dict = self.peek()?;
+        match self.node_mut(dict) {
+            Some(Node::Dict(all)) => {
+                all.extend(pairs.iter().map(|[k, v]| (*k, *v)));
+                Ok(())
+            }
+            _ => Err(self.wrong(self.heap.kind(dict), "a dict to add to")),
+        }
+    }
+
+    fn node_mut(&mut self, value: Value<'a>) -> Option<&mut Node<'a>> {
+        match value {
+            Value::Node(n) => self.heap.nodes.get_mut(n),
+            _ => None,
+        }
+    }
+
+    fn global(&mut self, module: &str, name: &str) -> Result<()> {
+        let global = Global::find(module, name).map_err(|r| self.refuse(r))?;
+        self.push(Value::Global(global))
+    }
+
+    /// Where Python would call something: makes what the few known names stand for.
+    fn reduce(&mut self) -> Result<()> {
+        let arguments = self.pop()?;
+        let Value::Global(global) = self.pop()? else {
+            return Err(self.wrong("a call of something that is no name", "data only"));
+        };
+        match global {
+            Global::Reconstruct => match self.heap.tuple(arguments) {
+                Some([Value::Global(Global::Ndarray), _, _]) => self.make(Node::Array(None)),
+                _ => Err(self.wrong(self.heap.kind(arguments), "numpy.ndarray with a shape and a type")),
+            },
+            Global::FromBuffer => {
+                let array = Array::from_buffer(&self.heap, arguments).map_err(|r| self.refuse(r))?;
+                self.make(Node::Array(Some(array)))
+            }
+            Global::Dtype => {
+                let name = self.heap.items(arguments).and_then(|a| self.heap.text(*a.first()?));
+                let name = name.ok_or_else(|| self.wrong(self.heap.kind(arguments), "the name of a dtype"))?;
+                let dtype = Dtype::named(name).map_err(|r| self.refuse(r))?;
+                self.make(Node::Dtype(dtype))
+            }
+            Global::Scalar => {
+                let value = numpy::scalar(&self.heap, arguments).map_err(|r| self.refuse(r))?;
+                self.push(value)
+            }
+            Global::Encode => self.encode(arguments),
+            Global::Ndarray => Err(self.wrong(format!("a call of {}", global.name()), "data only")),
+        }
+    }
+
+    /// Protocol 2 has no bytes: Python writes them as text that `_codecs.encode` turns back.
+    fn encode(&mut self, arguments: Value<'a>) -> Result<()> {
+        let text = match self.heap.tuple(arguments) {
+            Some([Value::Text(text), codec]) if matches!(self.heap.text(codec), Some("latin1" | "latin-1")) => text,
+            _ => return Err(self.wrong(self.heap.kind(arguments), "a text and \"latin1\"")),
+        };
+        // A text that is turned again and again would grow past what the file holds.
+        self.encoded += text.len();
+        if self.encoded > self.bytes.len() {
+            return Err(self.wrong("the same text encoded again and again", "every text at most once"));
+        }
+        let bytes = text.chars().map(|c| u8::try_from(u32::from(c)).ok()).collect::<Option<Vec<u8>>>();
+        let bytes = bytes.ok_or_else(|| self.wrong("a character past U+00FF", "bytes as text"))?;
+        self.make(Node::Encoded(bytes))
+    }
+
+    fn build(&mut self) -> Result<()> {
+        let state = self.pop()?;
+        let object = self.peek()?;
+        let built = match self.heap.node(object) {
+            Some(Node::Dtype(d)) => d.with_state(&self.heap, state).map(Node::Dtype),
+            Some(Node::Array(None)) => Array::from_state(&self.heap, state).map(|a| Node::Array(Some(a))),
+            _ => Err(Refusal::new(self.heap.kind(object), "an array or a dtype to set the state of")),
+        };
+        let built = built.map_err(|r| self.refuse(r))?;
+        if let Some(node) = self.node_mut(object) {
+            *node = built;
+        }
+        Ok(())
+    }
+}

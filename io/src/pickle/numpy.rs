@@ -1,0 +1,235 @@
+//! The few names that a pickle may use, and what they make. None of them is ever called: each is a rule for data.
+
+use super::value::{Heap, Node, Refusal, Value};
+use crate::npy::element;
+use crate::number::{Number, Order};
+
+/// More axes than a scan or volume has.
+const MOST_AXES: usize = 8;
+
+/// A name that a pickle may use.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(super) enum Global {
+    Reconstruct,
+    Ndarray,
+    Dtype,
+    Scalar,
+    FromBuffer,
+    Encode,
+}
+
+impl Global {
+    pub fn find(module: &str, name: &str) -> Result<Self, Refusal> {
+        // NumPy 2 renamed its core.
+        let part = module.strip_prefix("numpy.core.").or_else(|| module.strip_prefix("numpy._core."));
+        match (module, part, name) {
+            ("numpy", _, "ndarray") => Ok(Self::Ndarray),
+            ("numpy", _, "dtype") => Ok(Self::Dtype),
+            (_, Some("multiarray"), "_reconstruct") => Ok(Self::Reconstruct),
+            (_, Some("multiarray"), "scalar") => Ok(Self::Scalar),
+            (_, Some("numeric"), "_frombuffer") => Ok(Self::FromBuffer),
+            ("_codecs", _, "encode") => Ok(Self::Encode),
+            _ => {
+                let shown = |t: &str| t.chars().take(60).flat_map(char::escape_debug).collect::<String>();
+                Err(Refusal::new(
+                    format!("the name {}.{}", shown(module), shown(name)),
+                    "data only: the names that NumPy's arrays, dtypes and numbers need",
+                ))
+            }
+        }
+    }
+
+    pub fn name(self) -> &'static str {
+        match self {
+            Self::Reconstruct => "numpy.core.multiarray._reconstruct",
+            Self::Ndarray => "numpy.ndarray",
+            Self::Dtype => "numpy.dtype",
+            Self::Scalar => "numpy.core.multiarray.scalar",
+            Self::FromBuffer => "numpy.core.numeric._frombuffer",
+            Self::Encode => "_codecs.encode",
+        }
+    }
+}
+
+/// How a NumPy array stores a number.
+#[derive(Debug, Clone, Copy)]
+pub(super) struct Dtype {
+    number: Number,
+    order: Order,
+}
+
+impl Dtype {
+    /// From the text that NumPy gives it, e.g. `f4`.
+    pub fn named(name: &str) -> Result<Self, Refusal> {
+        if name.trim_start_matches(['|', '<', '>', '=']).starts_with('O') {
+            let expected = "numbers: objects would have to be made by calls";
+            return Err(Refusal::new(format!("the object dtype \"{name}\""), expected));
+        }
+        match element(name) {
+            Some((number, order)) => Ok(Self { number, order }),
+            None => {
+                let shown: String = name.chars().take(20).collect();
+                Err(Refusal::new(format!("the dtype \"{shown}\""), "real numbers: b1, i1 to i8, u1 to u8, f4 or f8"))
+            }
+        }
+    }
+
+    /// With the state that NumPy adds: (version, byte order, subarray, names, fields, ...).
+    pub fn with_state<'a>(self, heap: &Heap<'a>, state: Value<'a>) -> Result<Self, Refusal> {
+        let wrong = || Refusal::new(heap.kind(state), "the state of a dtype of plain numbers");
+        let Some([_, order, subarray, names, fields, ..]) = heap.items(state) else { return Err(wrong()) };
+        if [subarray, names, fields].iter().any(|v| !matches!(v, Value::None)) {
+            return Err(Refusal::new("a dtype with fields or a subarray", "a dtype of plain numbers"));
+        }
+        let order = match heap.text(*order) {
+            Some("<") => Order::Little,
+            Some(">") => Order::Big,
+            Some("|" | "=") => self.order,
+            _ => return Err(wrong()),
+        };
+        Ok(Self { order, ..self })
+    }
+}
+
+/// An array whose numbers still lie where the file has them.
+#[derive(Debug)]
+pub(super) struct Array<'a> {
+    dtype: Dtype,
+    /// Lengths in the order of storage, slowest first.
+    stored: Vec<usize>,
+    /// Axis `k` of the array is axis `axes[k]` of the storage.
+    axes: Vec<usize>,
+    count: usize,
+    data: Value<'a>,
+}
+
+impl<'a> Array<'a> {
+    pub fn shape(&self) -> Vec<usize> {
+        self.axes.iter().map(|&a| self.stored[a]).collect()
+    }
+
+    pub fn stored(&self) -> &[usize] {
+        &self.stored
+    }
+
+    pub fn axes(&self) -> &[usize] {
+        &self.axes
+    }
+
+    pub fn count(&self) -> usize {
+        self.count
+    }
+
+    /// The numbers as `f32`, in the order of storage; `None` if they do not fit in memory.
+    pub fn floats(&self, heap: &Heap<'a>) -> Option<Vec<f32>> {
+        let mut out = Vec::new();
+        out.try_reserve_exact(self.count).ok()?;
+        let raw = heap.bytes(self.data).unwrap_or_default();
+        self.dtype.number.decode(self.dtype.order, raw, &mut out, |x| x as f32);
+        Some(out)
+    }
+
+    /// The numbers in the order of storage.
+    pub fn numbers(&self, heap: &Heap<'a>) -> Vec<f64> {
+        let mut out = Vec::new();
+        self.dtype.number.decode(self.dtype.order, heap.bytes(self.data).unwrap_or_default(), &mut out, |x| x);
+        out
+    }
+
+    /// From the state of an `ndarray`: (version, shape, dtype, Fortran order, data).
+    pub fn from_state(heap: &Heap<'a>, state: Value<'a>) -> Result<Self, Refusal> {
+        let wrong = || Refusal::new(heap.kind(state), "the state of an array: version, shape, dtype, order, data");
+        let [_, shape, dtype, fortran, data] = heap.tuple(state).ok_or_else(wrong)?;
+        let fortran = match fortran {
+            Value::Bool(b) => b,
+            Value::Int(i) => i != 0,
+            _ => return Err(wrong()),
+        };
+        Self::new(heap, data, dtype, shape, fortran)
+    }
+
+    /// From the arguments of `_frombuffer`: data, dtype, shape, order and perhaps the axes that order "K" needs.
+    pub fn from_buffer(heap: &Heap<'a>, arguments: Value<'a>) -> Result<Self, Refusal> {
+        let wrong = || Refusal::new(heap.kind(arguments), "data, dtype, shape and order of an array");
+        let (data, dtype, shape, order, axes) = match heap.items(arguments) {
+            Some(&[data, dtype, shape, order]) => (data, dtype, shape, order, Value::None),
+            Some(&[data, dtype, shape, order, axes]) => (data, dtype, shape, order, axes),
+            _ => return Err(wrong()),
+        };
+        let mut array = match heap.text(order) {
+            Some("C" | "K") => Self::new(heap, data, dtype, shape, false)?,
+            Some("F") => Self::new(heap, data, dtype, shape, true)?,
+            _ => return Err(Refusal::new(heap.kind(order), "\"C\", \"F\" or \"K\", the order of an array")),
+        };
+        if heap.text(order) == Some("K") && !matches!(axes, Value::None) {
+            array.axes = lengths(heap, axes)?;
+            let mut sorted = array.axes.clone();
+            sorted.sort_unstable();
+            if !sorted.into_iter().eq(0..array.stored.len()) {
+                return Err(Refusal::new(format!("{:?}", array.axes), "each axis of the array once"));
+            }
+        }
+        Ok(array)
+    }
+
+    fn new(
+        heap: &Heap<'a>,
+        data: Value<'a>,
+        dtype: Value<'a>,
+        shape: Value<'a>,
+        fortran: bool,
+    ) -> Result<Self, Refusal> {
+        let Some(&Node::Dtype(dtype)) = heap.node(dtype) else {
+            return Err(Refusal::new(heap.kind(dtype), "a dtype"));
+        };
+        let raw = heap.bytes(data).ok_or_else(|| Refusal::new(heap.kind(data), "the bytes of an array"))?;
+        let mut stored = match shape {
+            Value::Int(_) => vec![length(shape).ok_or_else(|| Refusal::new(heap.kind(shape), "a length"))?],
+            _ => lengths(heap, shape)?,
+        };
+        let bytes = stored.iter().try_fold(dtype.number.bytes(), |n, &s| n.checked_mul(s));
+        if bytes != Some(raw.len()) {
+            let claim = format!("{stored:?} numbers of {} bytes", dtype.number.bytes());
+            return Err(Refusal::new(format!("{} bytes of data", raw.len()), format!("what {claim} take")));
+        }
+        let mut axes: Vec<usize> = (0..stored.len()).collect();
+        if fortran {
+            stored.reverse();
+            axes.reverse();
+        }
+        Ok(Self { dtype, stored, axes, count: raw.len() / dtype.number.bytes(), data })
+    }
+}
+
+/// What a NumPy number holds: (dtype, data).
+pub(super) fn scalar<'a>(heap: &Heap<'a>, arguments: Value<'a>) -> Result<Value<'a>, Refusal> {
+    let wrong = || Refusal::new(heap.kind(arguments), "dtype and data of a number");
+    let [dtype, data] = heap.tuple(arguments).ok_or_else(wrong)?;
+    let (Some(Node::Dtype(dtype)), Some(raw)) = (heap.node(dtype), heap.bytes(data)) else { return Err(wrong()) };
+    if raw.len() != dtype.number.bytes() {
+        let expected = format!("{} bytes for one number", dtype.number.bytes());
+        return Err(Refusal::new(format!("{} bytes", raw.len()), expected));
+    }
+    let mut out = Vec::new();
+    dtype.number.decode(dtype.order, raw, &mut out, |x| x);
+    match (dtype.number, out.first()) {
+        (Number::Bool, Some(x)) => Ok(Value::Bool(*x != 0.0)),
+        (_, Some(x)) => Ok(Value::Float(*x)),
+        _ => Err(wrong()),
+    }
+}
+
+fn length(value: Value<'_>) -> Option<usize> {
+    match value {
+        Value::Int(i) => i.try_into().ok(),
+        _ => None,
+    }
+}
+
+fn lengths<'a>(heap: &Heap<'a>, value: Value<'a>) -> Result<Vec<usize>, Refusal> {
+    let expected = format!("the lengths of at most {MOST_AXES} axes");
+    heap.items(value)
+        .filter(|items| items.len() <= MOST_AXES)
+        .and_then(|items| items.iter().map(|v| length(*v)).collect())
+        .ok_or_else(|| Refusal::new(heap.kind(value), expected))
+}
