@@ -23,6 +23,7 @@ fn main() -> Result<(), Box<dyn Error>> {
         seed: 0,
         limits: Limits { steps: Some(200), seconds: None },
         weights: &|path| Err(conefield_core::Error::unsupported(path, "this example reads no weights")),
+        resume: None,
     };
     let solution = solver.solve(&job, &mut Silent)?;
     let psnr = conefield_metrics::psnr(solution.volume.data.view(), truth.data.view(), 1.0)?;

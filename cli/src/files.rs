@@ -1,9 +1,11 @@
 //! Between the files of `conefield-io` and what the subcommands work with.
 
 use conefield_core::arena::Weights;
+use conefield_core::checkpoint::{Checkpoint, Resume};
 use conefield_core::scan::{Scan, Volume};
 use conefield_core::{Error, Result};
 use conefield_projectors::simulate::{PhantomKind, phantom_of};
+use std::collections::BTreeMap;
 use std::path::Path;
 
 /// The volume that `name` means: `phantom:KIND[:SIZE]` or a file.
@@ -37,6 +39,42 @@ pub fn read_weights(path: impl AsRef<Path>) -> Result<Weights> {
 pub fn write_weights(path: impl AsRef<Path>, weights: &Weights) -> Result<()> {
     let tensors: Vec<_> = weights.tensors.iter().map(|(name, (shape, values))| (name, shape, &values[..])).collect();
     conefield_io::write_weights(path, &tensors, &weights.notes)
+}
+
+/// The entry of a checkpoint's text that says where the run stands; the others say which run it is.
+const STANDING: &str = "standing";
+
+/// Writes a checkpoint of the run that `run` describes.
+pub fn write_checkpoint(path: &Path, checkpoint: &Checkpoint<'_>, run: &BTreeMap<String, String>) -> Result<()> {
+    let standing = serde_json::to_string(&checkpoint.standing)
+        .map_err(|e| Error::unsupported("checkpoint", format!("cannot be put into words: {e}")))?;
+    let mut text = run.clone();
+    text.insert(STANDING.into(), standing);
+    conefield_io::write_checkpoint(path, &checkpoint.tensors(), &text)
+}
+
+/// Reads the checkpoint of the run that `run` describes; another run's is refused.
+pub fn read_checkpoint(path: &Path, run: &BTreeMap<String, String>) -> Result<Resume> {
+    let place = path.display().to_string();
+    if !path.exists() {
+        let expected = "a run that was interrupted; one that is finished or has no checkpoint yet starts anew";
+        return Err(Error::invalid(place, "--resume", "no checkpoint", expected));
+    }
+    let mut file = conefield_io::read_checkpoint(path)?;
+    let standing = file.metadata.remove(STANDING).unwrap_or_default();
+    for (key, now) in run {
+        let then = file.metadata.get(key).map_or("", String::as_str);
+        if then != now {
+            // Of long texts, the first line that differs.
+            let (a, b) = (then.lines(), now.lines());
+            let pair = a.zip(b).find(|(a, b)| a != b).unwrap_or((then, now));
+            let expected = format!("{} as in the interrupted run; --force starts anew", pair.0);
+            return Err(Error::invalid(place, format!("--resume: {key}"), pair.1, expected));
+        }
+    }
+    let standing = serde_json::from_str(&standing)
+        .map_err(|e| Error::invalid(&place, STANDING, e, "what conefield writes there"))?;
+    Ok(Resume { place, standing, weights: Weights { tensors: file.tensors, ..Weights::default() } })
 }
 
 /// Draws the middle slices of `volume`, with those of `reference` and their difference where there is one.

@@ -7,6 +7,7 @@ mod out;
 mod parse;
 mod progress;
 mod run;
+mod signals;
 pub mod specs;
 
 // Stage types register themselves when their crate is linked.
@@ -16,6 +17,7 @@ use {
 };
 
 use clap::{ArgAction, Parser};
+use conefield_core::Error;
 use std::process::ExitCode;
 
 /// Reconstructs CT volumes from few cone-beam X-ray views with neural attenuation fields.
@@ -35,7 +37,7 @@ struct Cli {
     threads: Option<u16>,
 }
 
-/// Runs the command line. Exit status: 0 done, 1 failed, 2 wrong use.
+/// Runs the command line. Exit status: 0 done, 1 failed, 2 wrong use, 130 or 143 interrupted.
 pub fn main() -> ExitCode {
     let cli = Cli::parse();
     progress::start_log(cli.verbose, cli.quiet);
@@ -49,7 +51,10 @@ pub fn main() -> ExitCode {
         Ok(()) => ExitCode::SUCCESS,
         Err(e) => {
             eprintln!("error: {e}");
-            ExitCode::FAILURE
+            match (&e, signals::caught()) {
+                (Error::Interrupted { .. }, Some(signal)) => ExitCode::from(128 + signal),
+                _ => ExitCode::FAILURE,
+            }
         }
     }
 }

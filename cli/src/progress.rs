@@ -1,13 +1,17 @@
 //! Progress and log, both on standard error.
 
+use crate::{files, signals};
+use conefield_core::Result;
+use conefield_core::checkpoint::Checkpoint;
 use conefield_core::solver::{Observer, Record};
 use indicatif::{MultiProgress, ProgressBar, ProgressDrawTarget, ProgressStyle};
+use std::collections::BTreeMap;
 use std::fs::File;
 use std::io::{self, IsTerminal, Write};
 use std::path::PathBuf;
 use std::sync::LazyLock;
 use std::time::{Duration, Instant};
-use tracing::{info, warn};
+use tracing::{debug, info, warn};
 use tracing_subscriber::EnvFilter;
 
 /// The bars on the terminal; the log is written between two drawings of them.
@@ -57,6 +61,19 @@ pub struct Progress {
     latest: Record,
     records: Vec<Record>,
     log: Option<(PathBuf, File)>,
+    keeper: Option<Keeper>,
+}
+
+/// Where checkpoints go, how often, and what they say of the run.
+pub struct Keeper {
+    /// The file.
+    pub path: PathBuf,
+    /// Time between two.
+    pub every: Duration,
+    /// What makes this run the one that it is.
+    pub run: BTreeMap<String, String>,
+    /// When the last one was written.
+    pub last: Instant,
 }
 
 impl Progress {
@@ -67,7 +84,21 @@ impl Progress {
             bar.set_style(style.progress_chars("=> "));
         }
         bar.set_prefix(what.to_owned());
-        Self { bar, told: Instant::now(), what: what.into(), latest: Record::default(), records: vec![], log }
+        Self {
+            bar,
+            told: Instant::now(),
+            what: what.into(),
+            latest: Record::default(),
+            records: vec![],
+            log,
+            keeper: None,
+        }
+    }
+
+    /// With checkpoints.
+    pub fn keeping(mut self, keeper: Option<Keeper>) -> Self {
+        self.keeper = keeper;
+        self
     }
 
     /// The records so far.
@@ -128,6 +159,22 @@ impl Observer for Progress {
 
     fn note(&mut self, text: &str) {
         info!("{text}");
+    }
+
+    fn cancelled(&self) -> bool {
+        signals::caught().is_some()
+    }
+
+    fn checkpoint_due(&self) -> bool {
+        self.keeper.as_ref().is_some_and(|k| k.last.elapsed() >= k.every)
+    }
+
+    fn checkpoint(&mut self, checkpoint: &Checkpoint<'_>) -> Result<()> {
+        let Some(keeper) = &mut self.keeper else { return Ok(()) };
+        files::write_checkpoint(&keeper.path, checkpoint, &keeper.run)?;
+        keeper.last = Instant::now();
+        debug!("checkpoint after step {}", checkpoint.standing.step);
+        Ok(())
     }
 }
 

@@ -1,13 +1,21 @@
-//! The folder of a run: `volume.nii.gz`, `metrics.jsonl`, `spec.toml`, `weights.safetensors`, `slices.png` and, last
-//! and only of a finished run, `record.json`.
+//! The folder of a run: `metrics.jsonl`, `spec.toml`, while it lasts `checkpoint.safetensors`, at the end
+//! `volume.nii.gz`, `weights.safetensors`, `slices.png` and, last and only of a finished run, `record.json`.
 
 use conefield_core::{Error, Result};
 use std::fs::{self, File};
+use std::io::ErrorKind;
 use std::path::{Path, PathBuf};
 
 /// Every file that a run writes.
-pub const FILES: [&str; 6] =
-    ["volume.nii.gz", "metrics.jsonl", "spec.toml", "weights.safetensors", "slices.png", "record.json"];
+pub const FILES: [&str; 7] = [
+    "volume.nii.gz",
+    "metrics.jsonl",
+    "spec.toml",
+    "weights.safetensors",
+    "slices.png",
+    "record.json",
+    "checkpoint.safetensors",
+];
 
 /// A folder that belongs to this run alone.
 pub struct RunFolder {
@@ -20,6 +28,7 @@ impl RunFolder {
     pub fn create(path: &Path, force: bool) -> Result<Self> {
         let io = |e| Error::io(path, e);
         fs::create_dir_all(path).map_err(io)?;
+        sweep(path)?;
         let mut found = vec![];
         for entry in fs::read_dir(path).map_err(io)? {
             found.push(entry.map_err(io)?.file_name().to_string_lossy().into_owned());
@@ -40,6 +49,14 @@ impl RunFolder {
         Ok(Self { path: path.to_path_buf() })
     }
 
+    /// The folder of a run that was interrupted.
+    pub fn reopen(path: &Path) -> Result<Self> {
+        if path.is_dir() {
+            sweep(path)?;
+        }
+        Ok(Self { path: path.to_path_buf() })
+    }
+
     /// The path of one of [`FILES`].
     pub fn file(&self, name: &str) -> PathBuf {
         debug_assert!(FILES.contains(&name));
@@ -52,4 +69,41 @@ impl RunFolder {
         let file = File::create(&path).map_err(|e| Error::io(&path, e))?;
         Ok((path, file))
     }
+
+    /// Opens `metrics.jsonl` of an interrupted run without the records from `step` on, which come again.
+    pub fn metrics_before(&self, step: u64) -> Result<(PathBuf, File)> {
+        let path = self.file("metrics.jsonl");
+        let io = |e| Error::io(&path, e);
+        let before = |line: &&str| {
+            let record: Option<serde_json::Value> = serde_json::from_str(line).ok();
+            record.and_then(|r| r["step"].as_u64()).is_some_and(|s| s < step)
+        };
+        // The last line may be half written.
+        let text = fs::read(&path).map_err(io)?;
+        let kept: String = String::from_utf8_lossy(&text).lines().filter(before).flat_map(|l| [l, "\n"]).collect();
+        conefield_io::write_text_atomic(&path, &kept)?;
+        let file = File::options().append(true).open(&path).map_err(io)?;
+        Ok((path, file))
+    }
+
+    /// Removes the checkpoint of a finished run.
+    pub fn finish(&self) -> Result<()> {
+        let path = self.file("checkpoint.safetensors");
+        match fs::remove_file(&path) {
+            Err(e) if e.kind() != ErrorKind::NotFound => Err(Error::io(&path, e)),
+            _ => Ok(()),
+        }
+    }
+}
+
+/// Removes what a killed run was about to write: files that never got their final name.
+fn sweep(folder: &Path) -> Result<()> {
+    let io = |e| Error::io(folder, e);
+    for entry in fs::read_dir(folder).map_err(io)? {
+        let entry = entry.map_err(io)?;
+        if conefield_io::is_unfinished(&entry.file_name()) && entry.path().is_file() {
+            fs::remove_file(entry.path()).map_err(|e| Error::io(entry.path(), e))?;
+        }
+    }
+    Ok(())
 }

@@ -37,7 +37,7 @@ pub enum Error {
         why: String,
     },
     /// The run was interrupted by the user.
-    #[error("interrupted at step {step}")]
+    #[error("interrupted after step {step}; where it keeps checkpoints, the same command with --resume goes on")]
     Interrupted {
         /// The last finished step.
         step: u64,

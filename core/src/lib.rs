@@ -8,6 +8,7 @@
 
 pub mod arena;
 pub mod backend;
+pub mod checkpoint;
 pub mod dense;
 pub mod error;
 pub mod geometry;

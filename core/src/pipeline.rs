@@ -4,7 +4,8 @@ use crate::arena::{Arena, Block, Layout};
 use crate::error::{Result, ensure};
 use crate::scene::Scene;
 use crate::spec::Spec;
-use crate::stage::{Encoder, Field, Info, Mask, Normalizer, Probe, Projector, Scope, Stage};
+use crate::stage::{Encoder, Field, Info, Normalizer, Probe, Projector, Scope, Stage};
+use serde::{Deserialize, Serialize};
 use std::ops::Range;
 
 /// The built stages of a spec, in order, with the arena's layout.
@@ -27,6 +28,17 @@ pub struct Model {
     pub pipeline: Pipeline,
     /// Their parameters and what training needs beside them.
     pub arena: Arena,
+    masks: Vec<Masked>,
+}
+
+/// Channels that a normalizer removed for good.
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct Masked {
+    /// Which normalizer, counted from 0.
+    pub normalizer: usize,
+    /// Channels that stayed, of those computed until then; ascending.
+    pub keep: Vec<usize>,
 }
 
 impl Pipeline {
@@ -126,10 +138,10 @@ impl Pipeline {
 
     /// Removes the channels that normalizer `at` masked: stages before it compute only what is still read, stages
     /// after it become narrower, and parameters that nothing reads leave the arena.
-    fn apply_mask(&mut self, at: usize, mask: &Mask, arena: &mut Arena) -> Result<()> {
+    fn apply_mask(&mut self, at: usize, masked: &[usize], arena: &mut Arena) -> Result<()> {
         let old = self.ranges.clone();
         let mut kept: Vec<Vec<Range<usize>>> = vec![vec![]; old.len()];
-        let mut keep = mask.keep.clone();
+        let mut keep = masked.to_vec();
         for i in at..self.normalizers.len() {
             let r = self.normalizers[i].keep_inputs(&keep)?;
             self.normalizers[i] = r.stage;
@@ -139,7 +151,7 @@ impl Pipeline {
         let r = self.field.keep_inputs(&keep)?;
         self.field = r.stage;
         kept[1 + self.normalizers.len()] = r.params;
-        let mut needed = mask.keep.clone();
+        let mut needed = masked.to_vec();
         for i in (0..at).rev() {
             let r = self.normalizers[i].keep_outputs(&needed)?;
             self.normalizers[i] = r.stage;
@@ -168,7 +180,7 @@ impl Model {
                 &mut arena.params[range.clone()],
             );
         }
-        Self { pipeline, arena }
+        Self { pipeline, arena, masks: vec![] }
     }
 
     /// Lets every normalizer look at the encoder, through `encode`, after `epoch` passes over the views. Returns
@@ -181,11 +193,39 @@ impl Model {
                 self.pipeline.normalizers[i].refresh(&mut look)?
             };
             if let Some(mask) = mask {
-                self.pipeline.apply_mask(i, &mask, &mut self.arena)?;
+                self.pipeline.apply_mask(i, &mask.keep, &mut self.arena)?;
+                self.masks.push(Masked { normalizer: i, keep: mask.keep });
                 reports.push(mask.report);
             }
         }
         Ok(reports)
+    }
+
+    /// What normalizers have masked so far, in order.
+    pub fn masks(&self) -> &[Masked] {
+        &self.masks
+    }
+
+    /// Removes channels as a normalizer decided in an earlier run; it will not decide again.
+    pub fn mask(&mut self, masked: &Masked) -> Result<()> {
+        let Masked { normalizer: at, keep } = masked;
+        let all = &self.pipeline.normalizers;
+        let stage = all.get(*at);
+        let width = stage.map_or(0, |n| n.info().input);
+        let ascending = keep.windows(2).all(|w| w[0] < w[1]) && keep.last().is_some_and(|&k| k < width);
+        ensure(
+            ascending,
+            "checkpoint",
+            "masks",
+            format!("normalizer {at} keeps {keep:?}"),
+            format!("one of {} normalizers and ascending channels of those that it reads", all.len()),
+        )?;
+        if let Some(n) = stage {
+            n.decided();
+        }
+        self.pipeline.apply_mask(*at, keep, &mut self.arena)?;
+        self.masks.push(masked.clone());
+        Ok(())
     }
 }
 

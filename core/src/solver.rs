@@ -1,6 +1,7 @@
 //! A solver: scan in, volume out.
 
 use crate::backend::Backend;
+use crate::checkpoint::{Checkpoint, Resume};
 use crate::error::Result;
 use crate::pipeline::Model;
 use crate::scan::{Scan, Volume};
@@ -27,6 +28,8 @@ pub struct Job<'a> {
     pub limits: Limits,
     /// Reads a weights file that the spec names.
     pub weights: &'a dyn Fn(&str) -> Result<crate::arena::Weights>,
+    /// Where an earlier run of the same job stood, to go on from.
+    pub resume: Option<&'a Resume>,
 }
 
 /// When to stop, whichever comes first.
@@ -73,9 +76,18 @@ pub trait Observer {
     fn record(&mut self, record: &Record);
     /// A sentence for the log.
     fn note(&mut self, text: &str);
-    /// Whether to stop after this step.
+    /// Whether to stop after this step, with [`crate::Error::Interrupted`].
     fn cancelled(&self) -> bool {
         false
+    }
+    /// Whether it is time to call [`Observer::checkpoint`].
+    fn checkpoint_due(&self) -> bool {
+        false
+    }
+    /// Keeps a checkpoint: when one is due, and before an interrupted run ends.
+    fn checkpoint(&mut self, checkpoint: &Checkpoint<'_>) -> Result<()> {
+        let _ = checkpoint;
+        Ok(())
     }
 }
 

@@ -276,6 +276,9 @@ pub trait Normalizer: Stage {
         Ok(None)
     }
 
+    /// Called when a resumed run removes channels as [`Normalizer::refresh`] once decided: it must not decide again.
+    fn decided(&self) {}
+
     /// The normalizer without the inputs that are not in `keep`: they are gone from its sums too.
     fn keep_inputs(&self, keep: &[usize]) -> Result<Reduced<dyn Normalizer>>;
 

@@ -1,9 +1,18 @@
 //! Writing so that the final name never holds half a file.
 
 use conefield_core::{Error, Result};
+use std::ffi::OsStr;
 use std::fs::{self, File};
 use std::io::{BufWriter, Write};
 use std::path::{Path, PathBuf};
+
+/// How the names of unfinished files begin and end.
+const UNFINISHED: [&str; 2] = [".conefield-", ".tmp"];
+
+/// Whether a file of this name is one that [`write_atomic`] had begun when its process was killed.
+pub fn is_unfinished(name: &OsStr) -> bool {
+    name.to_str().is_some_and(|n| n.starts_with(UNFINISHED[0]) && n.ends_with(UNFINISHED[1]))
+}
 
 /// Writes a file through `fill`: into a temporary file in the same folder, flushed and synced, then renamed.
 ///
@@ -17,7 +26,7 @@ pub fn write_atomic(path: impl AsRef<Path>, fill: impl FnOnce(&mut dyn Write) ->
         return Err(Error::invalid(path.display().to_string(), "file", "a folder", "a name for a file"));
     }
     let mut options = tempfile::Builder::new();
-    options.prefix(".conefield-").suffix(".tmp");
+    options.prefix(UNFINISHED[0]).suffix(UNFINISHED[1]);
     // Without this the file would be private to its owner, unlike any other that the user makes.
     #[cfg(unix)]
     options.permissions(<fs::Permissions as std::os::unix::fs::PermissionsExt>::from_mode(0o666));
@@ -49,7 +58,7 @@ pub fn write_folder_atomic(folder: impl AsRef<Path>, fill: impl FnOnce(&Path) ->
     }
     let temporary = |suffix: &str| {
         let mut options = tempfile::Builder::new();
-        options.prefix(".conefield-").suffix(suffix);
+        options.prefix(UNFINISHED[0]).suffix(suffix);
         #[cfg(unix)]
         options.permissions(<fs::Permissions as std::os::unix::fs::PermissionsExt>::from_mode(0o777));
         options.tempdir_in(&beside).map_err(at)

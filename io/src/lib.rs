@@ -3,7 +3,7 @@
 //! - Volumes: [`read_volume`], [`write_volume`] (NIfTI, NumPy).
 //! - Scans: [`read_scan`], [`read_truth`], [`write_scan`] (conefield's own folder), [`read_r2`], [`write_r2`]
 //!   (R2-Gaussian's folder), [`read_naf`], [`write_naf`] (NAF's file).
-//! - Weights and checkpoints: [`read_weights`], [`write_weights`] (safetensors).
+//! - Weights: [`read_weights`], [`write_weights`]; checkpoints: [`read_checkpoint`], [`write_checkpoint`] (safetensors).
 //! - Pictures: [`slices_png`], [`compare_png`], [`curves_png`].
 //!
 //! Readers tell a format from what a file holds, check a header before they take memory for what it claims, and
@@ -15,6 +15,7 @@
 
 mod atomic;
 mod canvas;
+mod checkpoint;
 mod curves;
 mod folder;
 mod input;
@@ -37,7 +38,8 @@ mod weights;
 #[cfg(test)]
 mod testing;
 
-pub use atomic::{write_atomic, write_folder_atomic, write_text_atomic};
+pub use atomic::{is_unfinished, write_atomic, write_folder_atomic, write_text_atomic};
+pub use checkpoint::{read_checkpoint, write_checkpoint};
 pub use curves::{Corner, CurveOptions, curves_png, curves_png_with};
 pub use naf::{NafScan, read_naf, write_naf};
 pub use orbit::Orbit;

@@ -386,8 +386,12 @@ impl Normalizer for FftMaskStage {
             }
         }
         let mask = self.decide(probe)?;
-        self.done.store(true, Ordering::Relaxed);
+        self.decided();
         Ok(Some(mask))
+    }
+
+    fn decided(&self) {
+        self.done.store(true, Ordering::Relaxed);
     }
 
     fn keep_inputs(&self, keep: &[usize]) -> Result<Reduced<dyn Normalizer>> {

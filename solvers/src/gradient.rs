@@ -6,6 +6,7 @@
 use crate::rays::{Pixels, RaySource, Views};
 use crate::schedule::{Clock, Decay};
 use conefield_core::backend::{Adam, Executable, Loss, TrainRay, TvBlocks, Work};
+use conefield_core::checkpoint::{Checkpoint, Resume, Standing};
 use conefield_core::error::{Error, Result, ensure};
 use conefield_core::pipeline::{Model, Pipeline};
 use conefield_core::random::stream;
@@ -178,7 +179,12 @@ impl Solver for Gradient {
             RaySource::new(job.scan, &scene, pipeline.projector.as_ref(), self.views, self.pixels, self.margin)?;
         observer.note(&format!("{:.0}% of the pixels are trained on", 100.0 * source.share()));
         let mut model = Model::random(pipeline, job.seed);
-        if let Some(i) = initializer {
+        let mut start = Start::default();
+        if let Some(resume) = job.resume {
+            resume.restore(&mut model)?;
+            start = Start::read(resume)?;
+            observer.note(&format!("resumed after step {}", start.standing.step));
+        } else if let Some(i) = initializer {
             let report = i.apply(model.pipeline.layout(), &mut model.arena)?;
             if !report.loaded.is_empty() {
                 observer.note(&format!(
@@ -194,15 +200,27 @@ impl Solver for Gradient {
         let steps_an_epoch = source.steps_an_epoch() as f64;
         let by_epochs = self.epochs.map(|e| (e * steps_an_epoch).ceil() as u64);
         let steps = [self.steps, by_epochs].into_iter().flatten().min();
-        let mut clock = Clock::new(Limits { steps, seconds: self.seconds }, job.limits);
-        let mut window = Window::default();
+        let Start { standing, mut window } = start;
+        let mut clock = Clock::new(Limits { steps, seconds: self.seconds }, job.limits, standing.seconds);
         let mut rays = Vec::with_capacity(self.rays);
         let mut tv = TvBlocks::default();
-        let (mut step, mut samples) = (0u64, 0u64);
+        let (mut step, mut samples) = (standing.step, standing.samples);
         clock.resume();
         loop {
+            let cancelled = observer.cancelled();
+            if step > standing.step && (cancelled || observer.checkpoint_due()) {
+                clock.pause();
+                let solver = window.save();
+                let masks = model.masks().to_vec();
+                let standing = Standing { step, samples, seconds: clock.seconds(), masks, solver };
+                observer.checkpoint(&Checkpoint { model: &model, standing })?;
+                clock.resume();
+            }
+            if cancelled {
+                return Err(Error::Interrupted { step });
+            }
             let share = clock.share(step);
-            let done = share >= 1.0 || observer.cancelled();
+            let done = share >= 1.0;
             if step > 0 && (step % self.report_every == 0 || done) && window.steps > 0 {
                 clock.pause();
                 let record =
@@ -297,8 +315,24 @@ fn blocks(prior: &TvPrior, scene: &Scene, seed: u64, step: u64, out: &mut TvBloc
     out.smoothing = prior.smoothing;
 }
 
-/// Sums since the last record.
+/// Where training begins.
 #[derive(Default)]
+struct Start {
+    standing: Standing,
+    window: Window,
+}
+
+impl Start {
+    fn read(resume: &Resume) -> Result<Self> {
+        let window = serde_json::from_value(resume.standing.solver.clone());
+        let window = window.map_err(|e| Error::invalid(&resume.place, "solver", e, "what this solver keeps"))?;
+        Ok(Self { standing: resume.standing.clone(), window })
+    }
+}
+
+/// Sums since the last record.
+#[derive(Default, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
 struct Window {
     steps: u64,
     loss: f64,
@@ -309,6 +343,10 @@ struct Window {
 }
 
 impl Window {
+    fn save(&self) -> serde_json::Value {
+        serde_json::json!(self)
+    }
+
     fn add(&mut self, loss: f64, prior: f64, samples: u64, seconds: f64) {
         self.steps += 1;
         self.loss += loss;

@@ -31,12 +31,15 @@ pub fn pretrain(settings: &Gradient, job: &PretrainJob<'_>, observer: &mut dyn O
     observer.note(&explain.backend);
     let mut waiting: Vec<Arena> = vec![model.arena.clone(); scenes.len() - 1];
     let limits = Limits { steps: Some(settings.pretrain_steps), seconds: None };
-    let mut clock = Clock::new(limits, job.limits);
+    let mut clock = Clock::new(limits, job.limits, 0.0);
     let mut points = Vec::with_capacity(settings.pretrain_points);
     let (mut step, mut loss, mut since) = (0u64, 0.0, 0u64);
     let mut at = 0;
     clock.resume();
-    while clock.share(step) < 1.0 && !observer.cancelled() {
+    while clock.share(step) < 1.0 {
+        if observer.cancelled() {
+            return Err(Error::Interrupted { step });
+        }
         if step > 0 && step.is_multiple_of(TURN) && !waiting.is_empty() {
             let mut next = waiting.remove(0);
             let Arena { params, first, second, .. } = &model.arena;

@@ -56,12 +56,15 @@ pub struct Clock {
 impl Clock {
     /// A stopped clock. A limit on the command line replaces the spec's limit of the same kind; where it names
     /// only time, the spec's number of steps does not end the run.
-    pub fn new(spec: Limits, cli: Limits) -> Self {
+    ///
+    /// `spent` seconds of training came before, in a run that is resumed.
+    pub fn new(spec: Limits, cli: Limits, spent: f64) -> Self {
         let limits = Limits {
             steps: cli.steps.or(if cli.seconds.is_some() { None } else { spec.steps }),
             seconds: cli.seconds.or(if cli.steps.is_some() { None } else { spec.seconds }),
         };
-        Self { limits, spent: Duration::ZERO, running: None }
+        let spent = Duration::try_from_secs_f64(spent).unwrap_or_default();
+        Self { limits, spent, running: None }
     }
 
     /// Training goes on.
@@ -103,9 +106,9 @@ mod tests {
     #[test]
     fn the_first_limit_ends_the_run() {
         let spec = Limits { steps: Some(10), seconds: Some(1e9) };
-        let c = Clock::new(spec, Limits::default());
+        let c = Clock::new(spec, Limits::default(), 0.0);
         assert!(c.share(9) < 1.0 && c.share(10) >= 1.0);
-        let c = Clock::new(spec, Limits { steps: None, seconds: Some(1e6) });
+        let c = Clock::new(spec, Limits { steps: None, seconds: Some(1e6) }, 0.0);
         assert!(c.share(1000) < 1.0);
     }
 }

@@ -4,7 +4,7 @@ use super::convert::refuse_existing;
 use super::evaluate::score;
 use super::reconstruct::mci;
 use crate::progress::Progress;
-use crate::{files, out, parse, specs};
+use crate::{files, out, parse, signals, specs};
 use clap::Args;
 use conefield_backend_cpu::Cpu;
 use conefield_core::scan::{Scan, Volume};
@@ -74,6 +74,7 @@ impl Demo {
         conefield_io::write_scan(folder.join("scan"), &scan, Some(&truth))?;
         info!("simulated {} views of {size} x {size} pixels", self.views);
 
+        signals::listen()?;
         let mut with = vec![];
         let mut name = "fast (LN)";
         match specs::fast_weights() {
@@ -127,6 +128,7 @@ impl Demo {
             seed: self.seed,
             limits: Limits { steps: None, seconds: Some(self.budget) },
             weights: &|path| files::read_weights(path),
+            resume: None,
         };
         let solution = solver.solve(&job, &mut Progress::new(name, None))?;
         let scores = score(name, &solution.volume, truth, 1.0)?;

@@ -3,7 +3,7 @@
 use super::{BackendChoice, Ends, reconstruct::notes};
 use crate::parse::{self, Values};
 use crate::progress::Progress;
-use crate::{files, out, specs};
+use crate::{files, out, signals, specs};
 use clap::Args;
 use conefield_core::Result;
 use conefield_core::arena::Weights;
@@ -60,6 +60,7 @@ impl Pretrain {
             seed: self.seed,
             limits: self.ends.limits(),
         };
+        signals::listen()?;
         let mut progress = Progress::new("pretrain", None);
         let model = solver.pretrain(&job, &mut progress).map_err(|e| loaded.locate(e))?;
         let last = progress.records().last().cloned().unwrap_or_default();

@@ -3,12 +3,13 @@
 use super::{BackendChoice, Ends, backends::simd_level, evaluate};
 use crate::memory::Memory;
 use crate::parse::{self, HoldOut};
-use crate::progress::Progress;
+use crate::progress::{Keeper, Progress};
 use crate::run::RunFolder;
-use crate::{files, out, specs};
+use crate::{files, out, signals, specs};
 use clap::Args;
 use conefield_core::arena::Weights;
 use conefield_core::backend::Explain;
+use conefield_core::checkpoint::Resume;
 use conefield_core::scan::{Scan, Volume};
 use conefield_core::solver::{Job, Solution};
 use conefield_core::spec::load::{Loaded, to_toml};
@@ -16,13 +17,15 @@ use conefield_core::{Error, Result};
 use conefield_metrics::Scores;
 use serde::Serialize;
 use std::collections::BTreeMap;
+use std::fs::File;
 use std::path::{Path, PathBuf};
+use std::time::{Duration, Instant};
 use tracing::info;
 
 /// Reconstruct a volume from a scan.
 ///
 /// RUN receives volume.nii.gz, metrics.jsonl, spec.toml (every setting), weights.safetensors, slices.png and, when all
-/// is done, record.json.
+/// is done, record.json. Ctrl-C ends the run after its step; the same command with --resume goes on.
 #[derive(Args)]
 pub struct Reconstruct {
     /// The scan.
@@ -36,6 +39,12 @@ pub struct Reconstruct {
     /// Replace the files of an earlier run in RUN.
     #[arg(long)]
     force: bool,
+    /// Go on with the run in RUN that was interrupted; all else must be as it was.
+    #[arg(long, conflicts_with = "force")]
+    resume: bool,
+    /// Time between two checkpoints, which --resume starts from.
+    #[arg(long, value_name = "TIME", default_value = "60s", value_parser = parse::seconds)]
+    checkpoint_every: f64,
     /// Change a setting, such as encoder.levels=8.
     #[arg(long = "set", value_name = "KEY=VALUE")]
     sets: Vec<String>,
@@ -118,12 +127,18 @@ impl Reconstruct {
         let memory = pipeline.as_ref().map(|p| Memory::of(p, &whole, &compiled, reference.is_some()));
         let fingerprint = checksum(&whole);
         let (scan, held_scan) = if held.is_empty() { (whole, None) } else { split(&whole, &held)? };
-        let folder = RunFolder::create(&self.output, self.force)?;
-        conefield_io::write_text_atomic(folder.file("spec.toml"), &to_toml(&loaded.spec)?)?;
+        let identity = self.identity(&loaded, &held, &fingerprint)?;
+        let (folder, metrics, resume) = self.open(&loaded, &identity)?;
         if let Some(m) = &memory {
             info!("memory: {}", m.line());
         }
-        let mut progress = Progress::new("reconstruct", Some(folder.metrics()?));
+        signals::listen()?;
+        let mut progress = Progress::new("reconstruct", Some(metrics)).keeping(Some(Keeper {
+            path: folder.file("checkpoint.safetensors"),
+            every: Duration::from_secs_f64(self.checkpoint_every),
+            run: identity,
+            last: Instant::now(),
+        }));
         let job = Job {
             scan: &scan,
             held_out: held_scan.as_ref(),
@@ -134,6 +149,7 @@ impl Reconstruct {
             seed: self.seed,
             limits: self.ends.limits(),
             weights: &|path| files::read_weights(path),
+            resume: resume.as_ref(),
         };
         let mut solution = solver.solve(&job, &mut progress).map_err(|e| loaded.locate(e))?;
         solution.volume.affine = solution.volume.affine.or(reference.as_ref().and_then(|r| r.affine));
@@ -181,7 +197,35 @@ impl Reconstruct {
             scores,
         };
         conefield_io::write_text_atomic(folder.file("record.json"), &out::to_json(&record)?)?;
+        folder.finish()?;
         if self.json { out::json(&record) } else { out::say(&summary(&record, &solution, &self.output)) }
+    }
+
+    /// What must be the same for a run to be resumed.
+    fn identity(&self, loaded: &Loaded, held: &[usize], projections: &str) -> Result<BTreeMap<String, String>> {
+        let mut all = notes(loaded, self.seed)?;
+        all.insert("projections".into(), projections.into());
+        all.insert("held_out_views".into(), format!("{held:?}"));
+        all.insert("limits".into(), out::to_json(&self.ends)?);
+        Ok(all)
+    }
+
+    /// The folder, its file for metrics, and where to go on from.
+    fn open(
+        &self,
+        loaded: &Loaded,
+        identity: &BTreeMap<String, String>,
+    ) -> Result<(RunFolder, (PathBuf, File), Option<Resume>)> {
+        if self.resume {
+            let folder = RunFolder::reopen(&self.output)?;
+            let resume = files::read_checkpoint(&folder.file("checkpoint.safetensors"), identity)?;
+            let metrics = folder.metrics_before(resume.standing.step)?;
+            return Ok((folder, metrics, Some(resume)));
+        }
+        let folder = RunFolder::create(&self.output, self.force)?;
+        conefield_io::write_text_atomic(folder.file("spec.toml"), &to_toml(&loaded.spec)?)?;
+        let metrics = folder.metrics()?;
+        Ok((folder, metrics, None))
     }
 
     /// `--set`s, with `--init` as the one that it stands for.

@@ -68,6 +68,7 @@ pub fn solve(value: &Value, scan: &Scan, weights: &Weights) -> Result<(Solution,
         seed: 7,
         limits: Limits::default(),
         weights: &|_| Ok(weights.clone()),
+        resume: None,
     };
     let mut heard = Heard::default();
     let solution = spec.solver.build()?.solve(&job, &mut heard)?;

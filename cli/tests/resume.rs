@@ -1,0 +1,151 @@
+//! A run that is killed or interrupted goes on to the same bits.
+#![cfg(unix)]
+
+mod common;
+use common::{done, refused, text};
+use std::path::{Path, PathBuf};
+use std::process::{Child, Command, Stdio};
+use std::time::{Duration, Instant};
+
+const SETTINGS: [&str; 4] =
+    ["encoder.levels=2", "encoder.log2_table_size=10", "solver.rays=48", "solver.report_every=7"];
+
+/// A scan of 8 views, made once a test.
+fn scan(dir: &Path) -> PathBuf {
+    let path = dir.join("scan");
+    done(&["simulate", "phantom:head:16", "-o", &text(&path), "--views", "8", "--detector", "16x16"]);
+    path
+}
+
+fn arguments(scan: &Path, run: &Path, steps: u64, more: &[&str]) -> Vec<String> {
+    let mut all: Vec<String> =
+        ["reconstruct", &text(scan), "--spec", "ni-naf", "-o", &text(run)].map(Into::into).into();
+    // The mask removes channels on the way: what it decided must come back too.
+    all.extend(["--steps".into(), steps.to_string(), "--set".into(), "projector.samples=16".into()]);
+    all.extend(["--set".into(), "normalizers.0.epoch=3".into()]);
+    for s in SETTINGS {
+        all.extend(["--set".into(), s.into()]);
+    }
+    all.extend(more.iter().map(|&m| m.into()));
+    all
+}
+
+fn start(arguments: &[String]) -> Child {
+    let mut command = Command::new(assert_cmd::cargo::cargo_bin("conefield"));
+    command.arg("--quiet").args(arguments).stdout(Stdio::null()).stderr(Stdio::piped());
+    command.spawn().expect("the command starts")
+}
+
+fn finish(arguments: &[String]) {
+    done(&arguments.iter().map(String::as_str).collect::<Vec<_>>());
+}
+
+fn same_results(a: &Path, b: &Path) {
+    for file in ["volume.nii.gz", "weights.safetensors"] {
+        assert!(std::fs::read(a.join(file)).unwrap() == std::fs::read(b.join(file)).unwrap(), "{file} differs");
+    }
+    let losses = |run: &Path| -> Vec<(u64, u64)> {
+        let lines = std::fs::read_to_string(run.join("metrics.jsonl")).unwrap();
+        let number = |line: &str| {
+            let r: serde_json::Value = serde_json::from_str(line).unwrap();
+            (r["step"].as_u64().unwrap(), r["loss"].as_f64().unwrap().to_bits())
+        };
+        lines.lines().map(number).collect()
+    };
+    assert_eq!(losses(a), losses(b));
+    assert!(!b.join("checkpoint.safetensors").exists());
+}
+
+#[test]
+fn ten_kills_at_random_moments_change_nothing() {
+    let dir = tempfile::tempdir().unwrap();
+    let scan = scan(dir.path());
+    let (whole, killed) = (dir.path().join("whole"), dir.path().join("killed"));
+    let started = Instant::now();
+    let steps = 600;
+    finish(&arguments(&scan, &whole, steps, &[]));
+    let length = started.elapsed();
+    let mut random = 0x2545_f491_4f6c_dd1du64;
+    let (mut kills, mut resumed) = (0, 0);
+    while kills < 10 {
+        let mode = if killed.join("checkpoint.safetensors").exists() { "--resume" } else { "--force" };
+        resumed += usize::from(mode == "--resume");
+        let mut child = start(&arguments(&scan, &killed, steps, &[mode, "--checkpoint-every", "0.02s"]));
+        random ^= random << 13;
+        random ^= random >> 7;
+        random ^= random << 17;
+        std::thread::sleep(length.mul_f64((random % 1000) as f64 / 1000.0 * 0.3));
+        child.kill().unwrap();
+        let ended = child.wait().unwrap();
+        if ended.success() {
+            // It was done before the blow fell: once more from the start.
+            same_results(&whole, &killed);
+        } else {
+            kills += 1;
+        }
+        assert!(!killed.join("volume.nii.gz").exists() || ended.success() || killed.join("metrics.jsonl").exists());
+    }
+    let mode = if killed.join("checkpoint.safetensors").exists() { "--resume" } else { "--force" };
+    finish(&arguments(&scan, &killed, steps, &[mode]));
+    same_results(&whole, &killed);
+    assert!(resumed > 0, "no kill came after a checkpoint");
+}
+
+#[test]
+fn a_signal_ends_the_step_keeps_a_checkpoint_and_says_so() {
+    let dir = tempfile::tempdir().unwrap();
+    let scan = scan(dir.path());
+    let whole = dir.path().join("whole");
+    let steps = 500;
+    finish(&arguments(&scan, &whole, steps, &[]));
+    for (signal, code) in [("INT", 130), ("TERM", 143)] {
+        let run = dir.path().join(signal);
+        let child = start(&arguments(&scan, &run, steps, &["--checkpoint-every", "1h"]));
+        let metrics = run.join("metrics.jsonl");
+        let until = Instant::now() + Duration::from_secs(60);
+        while std::fs::metadata(&metrics).map_or(0, |m| m.len()) == 0 && Instant::now() < until {
+            std::thread::sleep(Duration::from_millis(2));
+        }
+        let kill = Command::new("sh").arg("-c").arg(format!("kill -{signal} {}", child.id())).status().unwrap();
+        assert!(kill.success());
+        let output = child.wait_with_output().unwrap();
+        let said = String::from_utf8(output.stderr).unwrap();
+        assert_eq!(output.status.code(), Some(code), "{said}");
+        assert!(said.contains("interrupted") && said.contains("--resume"), "{said}");
+        assert!(run.join("checkpoint.safetensors").exists() && !run.join("volume.nii.gz").exists());
+        finish(&arguments(&scan, &run, steps, &["--resume"]));
+        same_results(&whole, &run);
+    }
+}
+
+#[test]
+fn another_run_s_checkpoint_and_none_are_refused_in_words() {
+    let dir = tempfile::tempdir().unwrap();
+    let scan = scan(dir.path());
+    let run = dir.path().join("run");
+    let resume = |steps: u64, more: &[&str]| {
+        let all = arguments(&scan, &run, steps, &[&["--resume"], more].concat());
+        refused(1, &all.iter().map(String::as_str).collect::<Vec<_>>())
+    };
+    assert!(resume(9, &[]).contains("no checkpoint"));
+    let mut child = start(&arguments(&scan, &run, 100_000, &["--checkpoint-every", "0.001s"]));
+    let file = run.join("checkpoint.safetensors");
+    let until = Instant::now() + Duration::from_secs(60);
+    while !file.exists() && Instant::now() < until {
+        std::thread::sleep(Duration::from_millis(2));
+    }
+    child.kill().unwrap();
+    child.wait().unwrap();
+    let said = resume(100_000, &["--seed", "1"]);
+    assert!(said.contains("seed") && said.contains("found 1"), "{said}");
+    let said = resume(100_000, &["--set", "solver.lr=0.5"]);
+    assert!(said.contains("spec") && said.contains("lr = 0.5"), "{said}");
+    let said = resume(9, &[]);
+    assert!(said.contains("limits"), "{said}");
+    // A damaged file.
+    let mut raw = std::fs::read(&file).unwrap();
+    let last = raw.len() - 3;
+    raw[last] ^= 0x10;
+    std::fs::write(&file, raw).unwrap();
+    assert!(resume(100_000, &[]).contains("crc32"));
+}

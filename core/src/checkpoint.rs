@@ -1,0 +1,87 @@
+//! Where a run stands between two steps: enough to go on to the same bits.
+
+use crate::arena::{Arena, Weights};
+use crate::error::{Error, Result};
+use crate::pipeline::{Masked, Model};
+use serde::{Deserialize, Serialize};
+
+/// What a run knows beside the arena. Everything random follows from the seed and the step.
+#[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct Standing {
+    /// Finished steps.
+    pub step: u64,
+    /// Training samples so far.
+    pub samples: u64,
+    /// Seconds of training so far.
+    pub seconds: f64,
+    /// What normalizers masked, in order.
+    pub masks: Vec<Masked>,
+    /// What the solver keeps for itself, such as sums that are not reported yet.
+    pub solver: serde_json::Value,
+}
+
+/// A run between two steps, to be written.
+pub struct Checkpoint<'a> {
+    /// The model with its optimizer's state.
+    pub model: &'a Model,
+    /// All else.
+    pub standing: Standing,
+}
+
+/// Parts of the arena that go into a checkpoint, under these names; gradients are zero between steps.
+const PARTS: [&str; 3] = ["params", "first", "second"];
+
+fn parts(arena: &Arena) -> [&[f32]; 3] {
+    [&arena.params, &arena.first, &arena.second]
+}
+
+impl Checkpoint<'_> {
+    /// Name, shape and values of every tensor: `params.…`, `first.…` and `second.…` of each block of the layout.
+    pub fn tensors(&self) -> Vec<(String, &[usize], &[f32])> {
+        let blocks = &self.model.pipeline.layout().blocks;
+        let mut all = vec![];
+        for (part, values) in PARTS.into_iter().zip(parts(&self.model.arena)) {
+            for b in blocks {
+                all.push((format!("{part}.{}", b.name), &b.shape[..], &values[b.range.clone()]));
+            }
+        }
+        all
+    }
+}
+
+/// A checkpoint read back.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Resume {
+    /// The file, for messages.
+    pub place: String,
+    /// All but the arena.
+    pub standing: Standing,
+    /// The tensors of [`Checkpoint::tensors`].
+    pub weights: Weights,
+}
+
+impl Resume {
+    /// Brings a model that was built from the same spec to where the run stood: masked channels leave it again, and
+    /// parameters and moments are replaced. Refuses a checkpoint that does not fit.
+    pub fn restore(&self, model: &mut Model) -> Result<()> {
+        for masked in &self.standing.masks {
+            model.mask(masked)?;
+        }
+        for (part, name) in PARTS.into_iter().enumerate() {
+            let prefix = format!("{name}.");
+            let own =
+                |(k, v): (&String, &(Vec<usize>, Vec<f32>))| Some((k.strip_prefix(&prefix)?.to_owned(), v.clone()));
+            let weights =
+                Weights { tensors: self.weights.tensors.iter().filter_map(own).collect(), ..Weights::default() };
+            let arena = &mut model.arena;
+            let values = [&mut arena.params, &mut arena.first, &mut arena.second];
+            let Some(values) = values.into_iter().nth(part) else { continue };
+            let report = weights.load(&self.place, model.pipeline.layout(), values, |_| true)?;
+            if let Some((tensor, why)) = report.unused.first() {
+                return Err(Error::invalid(&self.place, tensor, why, "only tensors of this pipeline"));
+            }
+        }
+        Ok(())
+    }
+}

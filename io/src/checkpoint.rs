@@ -1,0 +1,87 @@
+//! Checkpoints: safetensors with a format version and a checksum of the values.
+
+use crate::weights::{Weights, read_weights, write_weights};
+use conefield_core::{Error, Result};
+use flate2::Crc;
+use std::collections::BTreeMap;
+use std::path::Path;
+
+/// What a checkpoint calls itself.
+const FORMAT: &str = "conefield-checkpoint";
+/// Changes whenever an older reader would misread a newer file.
+const VERSION: &str = "1";
+
+/// Writes a checkpoint: named `f32` tensors (name, shape, values in C order) and free text. An earlier one of that
+/// name stays whole until the new one is on the disk.
+pub fn write_checkpoint(
+    path: impl AsRef<Path>,
+    tensors: &[(impl AsRef<str>, impl AsRef<[usize]>, &[f32])],
+    text: &BTreeMap<String, String>,
+) -> Result<()> {
+    let mut text = text.clone();
+    // The file holds tensors in the order of their names.
+    let mut order: Vec<_> = tensors.iter().map(|(name, _, values)| (name.as_ref(), *values)).collect();
+    order.sort_unstable_by_key(|(name, _)| *name);
+    let sum = checksum(order.into_iter().map(|(_, values)| values));
+    text.extend([("format", FORMAT.to_owned()), ("format_version", VERSION.to_owned()), ("crc32", sum)].map(owned));
+    write_weights(path, tensors, &text)
+}
+
+/// Reads a checkpoint. Refuses other files, other versions, and values that are not those that were written.
+pub fn read_checkpoint(path: impl AsRef<Path>) -> Result<Weights> {
+    let path = path.as_ref();
+    let mut file = read_weights(path)?;
+    let found = checksum(file.tensors.values().map(|(_, values)| &values[..]));
+    for (key, expected) in [("format", FORMAT), ("format_version", VERSION), ("crc32", &found)] {
+        let said = file.metadata.remove(key);
+        if said.as_deref() != Some(expected) {
+            let said = said.map_or("nothing".into(), |s| format!("\"{s}\""));
+            return Err(Error::invalid(path.display().to_string(), key, said, format!("\"{expected}\"")));
+        }
+    }
+    Ok(file)
+}
+
+fn owned((key, value): (&str, String)) -> (String, String) {
+    (key.to_owned(), value)
+}
+
+fn checksum<'a>(values: impl Iterator<Item = &'a [f32]>) -> String {
+    let mut crc = Crc::new();
+    let mut raw = Vec::with_capacity(1 << 16);
+    for part in values.flat_map(|v| v.chunks(1 << 14)) {
+        raw.clear();
+        raw.extend(part.iter().flat_map(|x| x.to_le_bytes()));
+        crc.update(&raw);
+    }
+    format!("{:08x}", crc.sum())
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_changed_value_another_version_and_other_files_are_refused() {
+        let dir = tempfile::tempdir().unwrap();
+        let path = dir.path().join("checkpoint.safetensors");
+        let text = BTreeMap::from([("step".to_owned(), "7".to_owned())]);
+        let tensors = [("b", [2], &[1.0f32, 2.0][..]), ("a", [3], &[0.5, -1.0, 4.0][..])];
+        write_checkpoint(&path, &tensors, &text).unwrap();
+        let back = read_checkpoint(&path).unwrap();
+        assert_eq!((back.metadata, back.tensors["a"].1[2]), (text.clone(), 4.0));
+        let good = std::fs::read(&path).unwrap();
+        let refused = |bytes: &[u8], word: &str| {
+            std::fs::write(&path, bytes).unwrap();
+            let e = read_checkpoint(&path).unwrap_err().to_string();
+            assert!(e.contains(word) && e.contains("checkpoint.safetensors"), "{word} is not in: {e}");
+        };
+        let last = good.len() - 1;
+        refused(&[&good[..last], &[good[last] ^ 1]].concat(), "crc32");
+        refused(&good[..last], "header");
+        let at = good.windows(20).position(|w| w == b"\"format_version\":\"1\"").unwrap();
+        refused(&[&good[..at + 18], b"2", &good[at + 19..]].concat(), "format_version");
+        write_weights(&path, &tensors, &text).unwrap();
+        assert!(read_checkpoint(&path).unwrap_err().to_string().contains("format"));
+    }
+}
