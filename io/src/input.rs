@@ -2,13 +2,13 @@
 
 use crate::number::{Number, Order};
 use conefield_core::{Error, Result};
-use flate2::bufread::MultiGzDecoder;
+use flate2::bufread::{MultiGzDecoder, ZlibDecoder};
 use std::fs::File;
 use std::io::{BufRead, BufReader, ErrorKind, Read};
 use std::path::{Path, PathBuf};
 
-/// Deflate stores at best 258 bytes in two bits: no gzip stream unpacks to more than this many times its size.
-const DEFLATE_LIMIT: u64 = 1032;
+/// Deflate stores at best 258 bytes in two bits: no such stream unpacks to more than this many times its size.
+pub(crate) const DEFLATE_LIMIT: u64 = 1032;
 
 /// Values decoded between two looks at the file: what a lying header can make us take before the lie shows.
 const CHUNK: usize = 1 << 18;
@@ -16,10 +16,11 @@ const CHUNK: usize = 1 << 18;
 /// An open file with its name and the bounds on what it can hold.
 pub(crate) struct Input {
     path: PathBuf,
-    reader: Box<dyn Read>,
+    reader: Box<dyn BufRead>,
     /// Bytes on disk.
     size: u64,
-    packed: bool,
+    /// What the bytes are unpacked from: `gzip` or `zlib`.
+    packed: Option<&'static str>,
     /// (Unpacked) bytes given out so far.
     at: u64,
 }
@@ -27,17 +28,37 @@ pub(crate) struct Input {
 impl Input {
     /// Opens `path` and unpacks it if it starts with gzip's magic number.
     pub fn open(path: &Path) -> Result<Self> {
+        let mut input = Self::open_plain(path)?;
+        let start = input.reader.fill_buf().map_err(|e| Error::io(path, e))?;
+        if start.starts_with(&[0x1f, 0x8b]) {
+            input.reader = Box::new(BufReader::new(MultiGzDecoder::new(input.reader)));
+            input.packed = Some("gzip");
+        }
+        Ok(input)
+    }
+
+    /// Opens `path` and gives out its bytes as they are.
+    pub fn open_plain(path: &Path) -> Result<Self> {
         let io = |e| Error::io(path, e);
         let file = File::open(path).map_err(io)?;
         let info = file.metadata().map_err(io)?;
         if !info.is_file() {
             return Err(Error::invalid(path.display().to_string(), "file", "a folder or device", "a regular file"));
         }
-        let mut plain = BufReader::with_capacity(1 << 18, file);
-        let packed = plain.fill_buf().map_err(io)?.starts_with(&[0x1f, 0x8b]);
-        let reader: Box<dyn Read> =
-            if packed { Box::new(BufReader::new(MultiGzDecoder::new(plain))) } else { Box::new(plain) };
-        Ok(Self { path: path.to_path_buf(), reader, size: info.len(), packed, at: 0 })
+        let reader = Box::new(BufReader::with_capacity(1 << 18, file));
+        Ok(Self { path: path.to_path_buf(), reader, size: info.len(), packed: None, at: 0 })
+    }
+
+    /// Unpacks from here on: the rest of a plain file must be one zlib stream.
+    pub fn inflate(self) -> Self {
+        let size = self.size.saturating_sub(self.at);
+        let reader = Box::new(BufReader::new(WholeZlib(ZlibDecoder::new(self.reader))));
+        Self { path: self.path, reader, size, packed: Some("zlib"), at: 0 }
+    }
+
+    /// Bytes between here and the end of a plain file, or `None` if that shows only when it is unpacked.
+    pub fn left(&self) -> Option<u64> {
+        self.packed.is_none().then(|| self.size.saturating_sub(self.at))
     }
 
     /// The file's name, as errors give it.
@@ -57,6 +78,18 @@ impl Input {
         match got {
             Ok(_) => {
                 self.at += out.len() as u64;
+                Ok(out)
+            }
+            Err(e) => Err(self.broken(e)),
+        }
+    }
+
+    /// Reads one line of at most `most` bytes with its line feed; without one at the end of the file or at `most`.
+    pub fn line(&mut self, most: usize) -> Result<Vec<u8>> {
+        let mut out = Vec::new();
+        match self.reader.by_ref().take(most as u64).read_until(b'\n', &mut out) {
+            Ok(n) => {
+                self.at += n as u64;
                 Ok(out)
             }
             Err(e) => Err(self.broken(e)),
@@ -93,13 +126,13 @@ impl Input {
         let want = (count as u64)
             .checked_mul(number.bytes() as u64)
             .ok_or_else(|| self.invalid(field, format!("{count} values"), "a length that can be addressed"))?;
-        if self.packed {
+        if let Some(packed) = self.packed {
             let most = self.size.saturating_mul(DEFLATE_LIMIT);
             if want > most {
                 return Err(self.invalid(
                     field,
-                    format!("a header that claims {want} bytes in a gzip file of {} bytes", self.size),
-                    format!("at most {most} bytes, which is all that such a file can unpack to"),
+                    format!("a header that claims {want} bytes in a {packed} stream of {} bytes", self.size),
+                    format!("at most {most} bytes, which is all that such a stream can unpack to"),
                 ));
             }
         } else {
@@ -115,7 +148,7 @@ impl Input {
         let mut out: Vec<f32> = Vec::new();
         let refuse = |s: &Self| s.invalid(field, format!("{count} values"), "an array that fits in memory");
         // A plain file has just been measured; a packed one must prove its claim piece by piece.
-        if !self.packed {
+        if self.packed.is_none() {
             out.try_reserve_exact(count).map_err(|_| refuse(self))?;
         }
         let mut left = count;
@@ -139,11 +172,23 @@ impl Input {
 
     fn broken(&self, e: std::io::Error) -> Error {
         let damaged = matches!(e.kind(), ErrorKind::InvalidInput | ErrorKind::InvalidData | ErrorKind::UnexpectedEof);
-        if self.packed && damaged {
-            self.invalid("gzip stream", e, "a whole gzip stream")
-        } else {
-            Error::io(&self.path, e)
+        match self.packed {
+            Some(packed) if damaged => self.invalid(format!("{packed} stream"), e, format!("a whole {packed} stream")),
+            _ => Error::io(&self.path, e),
         }
+    }
+}
+
+/// A zlib stream that nothing may follow.
+struct WholeZlib(ZlibDecoder<Box<dyn BufRead>>);
+
+impl Read for WholeZlib {
+    fn read(&mut self, out: &mut [u8]) -> std::io::Result<usize> {
+        let n = self.0.read(out)?;
+        if n == 0 && !out.is_empty() && !self.0.get_mut().fill_buf()?.is_empty() {
+            return Err(std::io::Error::new(ErrorKind::InvalidData, "bytes after the end of the stream"));
+        }
+        Ok(n)
     }
 }
 

@@ -1,6 +1,6 @@
 //! Every file that conefield reads or writes, each format in one module.
 //!
-//! - Volumes: [`read_volume`], [`write_volume`] (NIfTI, NumPy).
+//! - Volumes: [`read_volume`], [`write_volume`] (NIfTI, MetaImage, NumPy; a DICOM series in).
 //! - Scans: [`read_scan`], [`read_truth`], [`write_scan`] (conefield's own folder), [`read_r2`], [`write_r2`]
 //!   (R2-Gaussian's folder), [`read_naf`], [`write_naf`] (NAF's file).
 //! - Weights: [`read_weights`], [`write_weights`]; checkpoints: [`read_checkpoint`], [`write_checkpoint`] (safetensors).
@@ -13,12 +13,15 @@
 //! Writers put everything beside its final name, sync it and rename it ([`write_atomic`]), so that a half-written
 //! file never stands under the name that was asked for.
 
+mod affine;
 mod atomic;
 mod canvas;
 mod checkpoint;
 mod curves;
+mod dicom;
 mod folder;
 mod input;
+mod metaimage;
 mod naf;
 mod nifti;
 mod npy;

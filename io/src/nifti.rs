@@ -3,12 +3,13 @@
 //! The header is parsed by the `nifti` crate. The data is decoded here, because that bounds what a header can make
 //! us allocate, and the header is written here, because that lets the writer go through [`crate::write_atomic`].
 
+use crate::affine::{self, Affine};
 use crate::input::Input;
 use crate::number::{Number, Order};
-use conefield_core::geometry::{VoxelGrid, norm};
+use crate::volume;
+use conefield_core::geometry::VoxelGrid;
 use conefield_core::scan::Volume;
 use conefield_core::{Error, Result};
-use ndarray::{Array3, ShapeBuilder};
 use nifti::{Endianness, NiftiHeader};
 use std::io::Write;
 use std::path::Path;
@@ -18,9 +19,6 @@ pub(crate) const HEADER: usize = 348;
 
 /// Where the data of a single file starts when there is no extension.
 const DATA: u64 = 352;
-
-/// Rows of voxel index → millimetres.
-type Affine = [[f64; 4]; 4];
 
 /// Whether `head` (at least [`HEADER`] bytes) carries the mark of NIfTI-1 or its header-and-image pair.
 pub(crate) fn is_header(head: &[u8]) -> bool {
@@ -49,9 +47,8 @@ pub(crate) fn read_from(input: &mut Input, head: &[u8]) -> Result<Volume> {
     let number = number(input, &header)?;
     let offset = offset(input, &header)?;
     let (slope, inter) = scaling(input, &header)?;
-    let affine = affine(input, &header)?;
-    let spacing: [f64; 3] = std::array::from_fn(|k| norm([affine[0][k], affine[1][k], affine[2][k]]));
-    let grid = VoxelGrid { shape, spacing, center: [0.0; 3] };
+    let affine = orientation(input, &header)?;
+    let grid = VoxelGrid { shape, spacing: affine::spacing(&affine), center: [0.0; 3] };
     grid.validate(&input.place())?;
     let count = grid.len().unwrap_or(0);
     let order = match header.endianness {
@@ -60,14 +57,7 @@ pub(crate) fn read_from(input: &mut Input, head: &[u8]) -> Result<Volume> {
     };
     input.skip(offset - HEADER as u64, "vox_offset")?;
     let values = input.numbers("data", count, number, order, |x| (slope * x + inter) as f32)?;
-    // The file runs x fastest; the program's arrays run z fastest.
-    let data = Array3::from_shape_vec((shape[0], shape[1], shape[2]).f(), values)
-        .map_err(|e| input.invalid("dim", e, "as many voxels as values"))?;
-    let data = data.as_standard_layout().into_owned();
-    if let Some((at, x)) = data.indexed_iter().find(|(_, x)| !x.is_finite()) {
-        return Err(input.invalid(format!("voxel [{}, {}, {}]", at.0, at.1, at.2), x, "a finite number"));
-    }
-    Ok(Volume { data, grid, affine: Some(affine) })
+    volume::from_file_order(input, grid, affine, values)
 }
 
 /// Three axes of at least one voxel; later axes may only say 1.
@@ -149,7 +139,7 @@ fn scaling(input: &Input, header: &NiftiHeader) -> Result<(f64, f64)> {
 }
 
 /// Voxel index to millimetres: sform, else qform, else the voxel sizes alone.
-fn affine(input: &Input, header: &NiftiHeader) -> Result<Affine> {
+fn orientation(input: &Input, header: &NiftiHeader) -> Result<Affine> {
     let mm = match header.xyzt_units & 7 {
         1 => 1000.0,
         0 | 2 => 1.0,
@@ -167,15 +157,12 @@ fn affine(input: &Input, header: &NiftiHeader) -> Result<Affine> {
         }
         ("pixdim", rows)
     };
-    let determinant = {
-        let c = |k: usize| [rows[0][k], rows[1][k], rows[2][k]];
-        conefield_core::geometry::dot(conefield_core::geometry::cross(c(0), c(1)), c(2))
-    };
-    if !rows.iter().flatten().all(|x| x.is_finite()) || determinant == 0.0 {
+    let [x, y, z] = rows.map(|r| r.map(|v| v * mm));
+    let affine = [x, y, z, [0.0, 0.0, 0.0, 1.0]];
+    if !affine::is_regular(&affine) {
         return Err(input.invalid(field, format!("{rows:?}"), "finite numbers and three independent voxel axes"));
     }
-    let [x, y, z] = rows.map(|r| r.map(|v| v * mm));
-    Ok([x, y, z, [0.0, 0.0, 0.0, 1.0]])
+    Ok(affine)
 }
 
 /// The standard's method 2: a rotation as a unit quaternion, voxel sizes, and the sign of the third axis in
@@ -211,17 +198,9 @@ pub(crate) fn write(w: &mut dyn Write, path: &Path, volume: &Volume) -> Result<(
         let expected = "at most 32767 voxels an axis, which is all that NIfTI-1 can say (write .npy)";
         return Err(Error::invalid(place, "shape", format!("{:?}", grid.shape), expected));
     }
-    let (code, affine) = match volume.affine {
-        Some(a) if fits(&a, grid.spacing) => (1i16, a),
-        Some(_) => {
-            tracing::warn!(
-                "{place}: the affine's voxel sizes are not the grid's {:?} mm: it is replaced by one from the grid",
-                grid.spacing
-            );
-            (2, centred(grid))
-        }
-        None => (2, centred(grid)),
-    };
+    // 1: the scanner's own coordinates; 2: some others.
+    let (affine, own) = affine::of(volume, &place);
+    let code = if own { 1i16 } else { 2 };
     let mut h = [0u8; DATA as usize];
     let mut put = |at: usize, bytes: &[u8]| h[at..at + bytes.len()].copy_from_slice(bytes);
     put(0, &(HEADER as i32).to_le_bytes());
@@ -245,32 +224,8 @@ pub(crate) fn write(w: &mut dyn Write, path: &Path, volume: &Volume) -> Result<(
         put(280 + 4 * i, &(*x as f32).to_le_bytes());
     }
     put(344, b"n+1\0");
-    let io = |e| Error::io(path, e);
-    w.write_all(&h).map_err(io)?;
-    let [nx, ny, nz] = grid.shape;
-    let mut row = Vec::with_capacity(nx * 4);
-    for z in 0..nz {
-        for y in 0..ny {
-            row.clear();
-            row.extend((0..nx).flat_map(|x| volume.data[[x, y, z]].to_le_bytes()));
-            w.write_all(&row).map_err(io)?;
-        }
-    }
-    Ok(())
-}
-
-/// Whether the affine's columns are as long as the voxels, to the precision of files.
-fn fits(affine: &Affine, spacing: [f64; 3]) -> bool {
-    (0..3).all(|k| {
-        let n = norm([affine[0][k], affine[1][k], affine[2][k]]);
-        (n - spacing[k]).abs() <= 1e-3 * spacing[k]
-    })
-}
-
-fn centred(grid: &VoxelGrid) -> Affine {
-    let first = grid.voxel([0; 3]);
-    let s = grid.spacing;
-    [[s[0], 0.0, 0.0, first[0]], [0.0, s[1], 0.0, first[1]], [0.0, 0.0, s[2], first[2]], [0.0, 0.0, 0.0, 1.0]]
+    w.write_all(&h).map_err(|e| Error::io(path, e))?;
+    volume::to_file_order(w, path, &volume.data)
 }
 
 #[cfg(test)]
@@ -399,6 +354,54 @@ mod tests {
         let want = [[0.0, -3.0, 0.0, 10.0], [2.0, 0.0, 0.0, 0.0], [0.0, 0.0, -4.0, 0.0]];
         for (a, w) in a.iter().flatten().zip(want.iter().flatten()) {
             assert!((a - w).abs() < 1e-6, "{a} {w}");
+        }
+    }
+
+    #[test]
+    fn every_type_is_read_in_both_orders() {
+        macro_rules! both {
+            ($($code:literal $t:ty: $a:expr, $b:expr;)*) => {$(
+                for big in [false, true] {
+                    let mut b = vec![0u8; 352];
+                    let mut put = |at: usize, little: &[u8]| {
+                        let n = little.len();
+                        b[at..at + n].copy_from_slice(little);
+                        if big {
+                            b[at..at + n].reverse();
+                        }
+                    };
+                    put(0, &348i32.to_le_bytes());
+                    for (i, d) in [3i16, 2, 1, 1].iter().enumerate() {
+                        put(40 + 2 * i, &d.to_le_bytes());
+                    }
+                    put(70, &($code as i16).to_le_bytes());
+                    put(72, &(8 * size_of::<$t>() as i16).to_le_bytes());
+                    for i in 0..4 {
+                        put(76 + 4 * i, &1f32.to_le_bytes());
+                    }
+                    put(112, &0.5f32.to_le_bytes());
+                    put(116, &(-8f32).to_le_bytes());
+                    b[344..348].copy_from_slice(b"n+1\0");
+                    for x in [$a as $t, $b as $t] {
+                        b.extend(if big { x.to_be_bytes() } else { x.to_le_bytes() });
+                    }
+                    let found = read_volume(&file("a.nii", &b).1).unwrap().data;
+                    let want = [$a as $t, $b as $t].map(|x| (0.5 * x as f64 - 8.0) as f32);
+                    assert_eq!(found.as_slice().unwrap(), want, "{} big {big}", $code);
+                }
+            )*};
+        }
+        both! {
+            2 u8: 0, 255;
+            4 i16: -32768, 258;
+            8 i32: i32::MIN, 16909060;
+            16 f32: -1.5, 3.25e-3;
+            64 f64: -1.5, 0.1;
+            256 i8: -128, 127;
+            512 u16: 65535, 258;
+            768 u32: u32::MAX, 16909060;
+            1024 i64: i64::MIN, 72623859790382856i64;
+            1280 u64: u64::MAX, 72623859790382856i64;
         }
     }
 

@@ -1,21 +1,28 @@
 //! The door for volumes: which format a file is in, and which one a name asks for.
 
+use crate::affine::Affine;
 use crate::input::Input;
-use crate::{nifti, npy, write_atomic};
+use crate::{dicom, metaimage, nifti, npy, write_atomic};
 use conefield_core::geometry::VoxelGrid;
 use conefield_core::scan::Volume;
 use conefield_core::{Error, Result};
 use flate2::{Compression, GzBuilder};
-use ndarray::{Array3, Ix3};
+use ndarray::{Array3, Ix3, ShapeBuilder};
+use std::io::Write;
 use std::path::Path;
 
-/// Reads a volume: NIfTI-1 (any real number type, gzip or not) or a NumPy array of three axes.
+/// Reads a volume: NIfTI-1 (any real number type, gzip or not), MetaImage (`.mha`, `.mhd` with the file it names
+/// inside its folder, zlib or not), a NumPy array of three axes, or a folder that holds the DICOM files of one series, a
+/// slice each.
 ///
-/// The content decides, not the name. `grid.center` is `[0, 0, 0]`: where NIfTI's voxels lie in the patient stays in
-/// `affine`, in mm. A NumPy array has no voxel size and gets 1 mm. Values are converted to `f32`, scaled as NIfTI's
-/// header says; one that is not finite is refused.
+/// The content decides, not the name. `grid.center` is `[0, 0, 0]`: where the voxels lie in the patient stays in
+/// `affine`, in mm, RAS. A NumPy array has no voxel size and gets 1 mm. Values are converted to `f32`, scaled as
+/// NIfTI's header and DICOM's rescale slope and intercept say; one that is not finite is refused.
 pub fn read_volume(path: impl AsRef<Path>) -> Result<Volume> {
     let path = path.as_ref();
+    if path.is_dir() {
+        return dicom::read(path);
+    }
     let mut input = Input::open(path)?;
     let mut head = input.take(8)?;
     if head.starts_with(npy::MAGIC) {
@@ -26,6 +33,17 @@ pub fn read_volume(path: impl AsRef<Path>) -> Result<Volume> {
         let what = format!("{}: a NIfTI-2 file", path.display());
         return Err(Error::unsupported(what, "convert it to NIfTI-1 (.nii or .nii.gz)"));
     }
+    if dicom::is_header(&head) {
+        let what = format!("{}: one DICOM file", path.display());
+        return Err(Error::unsupported(what, "give the folder that holds the files of its series"));
+    }
+    if metaimage::is_header(&head) {
+        if input.left().is_none() {
+            let what = format!("{}: a MetaImage inside gzip", path.display());
+            return Err(Error::unsupported(what, "unpack it first; MetaImage has a compression of its own"));
+        }
+        return metaimage::read(path);
+    }
     if !nifti::is_header(&head) {
         let mark = head.get(344..348).map_or_else(
             || format!("a file of {} bytes", head.len()),
@@ -33,29 +51,37 @@ pub fn read_volume(path: impl AsRef<Path>) -> Result<Volume> {
         );
         let hint = match format_of(path) {
             Some(Format::Npy) => "a NumPy array (93 4e 55 4d 50 59 at the start); a NIfTI-1 header is read too",
-            _ => "a NIfTI-1 header (6e 2b 31 00 at byte 344) or a NumPy array (93 4e 55 4d 50 59 at the start)",
+            _ => {
+                "a NIfTI-1 header (6e 2b 31 00 at byte 344), a NumPy array (93 4e 55 4d 50 59 at the start) or a \
+                 MetaImage header (NDims = 3)"
+            }
         };
         return Err(input.invalid("format", mark, hint));
     }
     nifti::read_from(&mut input, &head)
 }
 
-/// Whether the file looks like a volume that [`read_volume`] understands; its data is not read.
+/// Whether the file, or the folder with DICOM files in it, looks like a volume that [`read_volume`] understands; its
+/// data is not read.
 pub fn is_volume(path: impl AsRef<Path>) -> bool {
-    Input::open(path.as_ref())
+    let path = path.as_ref();
+    if path.is_dir() {
+        return dicom::is_series(path);
+    }
+    Input::open(path)
         .and_then(|mut i| i.take(nifti::HEADER))
-        .is_ok_and(|head| head.starts_with(npy::MAGIC) || nifti::is_header(&head))
+        .is_ok_and(|head| head.starts_with(npy::MAGIC) || nifti::is_header(&head) || metaimage::is_header(&head))
 }
 
-/// Writes a volume as its name asks: `.nii`, `.nii.gz` (both `f32` with an sform in mm) or `.npy` (`f32`, C order,
-/// without voxel sizes).
+/// Writes a volume as its name asks: `.nii`, `.nii.gz` (both `f32` with an sform in mm), `.mha` (`f32`, zlib, with the
+/// same axes as directions and voxel sizes) or `.npy` (`f32`, C order, without voxel sizes).
 ///
 /// An affine is kept if its voxel sizes are the grid's; without one, the grid's centre comes to lie at `grid.center`.
 pub fn write_volume(path: impl AsRef<Path>, volume: &Volume) -> Result<()> {
     let path = path.as_ref();
     let place = path.display().to_string();
     let format = format_of(path)
-        .ok_or_else(|| Error::invalid(&place, "file name", file_name(path), "an end of .nii, .nii.gz or .npy"))?;
+        .ok_or_else(|| Error::invalid(&place, "file name", file_name(path), "an end of .nii, .nii.gz, .mha or .npy"))?;
     volume.grid.validate(&place)?;
     if volume.data.shape() != volume.grid.shape {
         let (found, expected) = (format!("{:?}", volume.data.shape()), format!("{:?}", volume.grid.shape));
@@ -73,7 +99,35 @@ pub fn write_volume(path: impl AsRef<Path>, volume: &Volume) -> Result<()> {
             packed.finish().and_then(|w| w.flush()).map_err(|e| Error::io(path, e))
         }
         Format::Npy => npy::write(w, path, &volume.data),
+        Format::MetaImage => metaimage::write(w, path, volume),
     })
+}
+
+/// A volume of `values` as NIfTI and MetaImage store them, x fastest; one that is not finite is refused.
+pub(crate) fn from_file_order(input: &Input, grid: VoxelGrid, affine: Affine, values: Vec<f32>) -> Result<Volume> {
+    let [nx, ny, nz] = grid.shape;
+    let data = Array3::from_shape_vec((nx, ny, nz).f(), values)
+        .map_err(|e| input.invalid("data", e, "as many values as voxels"))?;
+    // The program's arrays run z fastest.
+    let data = data.as_standard_layout().into_owned();
+    if let Some((at, x)) = data.indexed_iter().find(|(_, x)| !x.is_finite()) {
+        return Err(input.invalid(format!("voxel [{}, {}, {}]", at.0, at.1, at.2), x, "a finite number"));
+    }
+    Ok(Volume { data, grid, affine: Some(affine) })
+}
+
+/// Writes `data` to the file `path` as [`from_file_order`] reads it, little-endian.
+pub(crate) fn to_file_order(w: &mut dyn Write, path: &Path, data: &Array3<f32>) -> Result<()> {
+    let (nx, ny, nz) = data.dim();
+    let mut row = Vec::with_capacity(nx * 4);
+    for z in 0..nz {
+        for y in 0..ny {
+            row.clear();
+            row.extend((0..nx).flat_map(|x| data[[x, y, z]].to_le_bytes()));
+            w.write_all(&row).map_err(|e| Error::io(path, e))?;
+        }
+    }
+    Ok(())
 }
 
 /// A NumPy array as a volume of 1 mm voxels.
@@ -90,6 +144,7 @@ enum Format {
     Nifti,
     NiftiGz,
     Npy,
+    MetaImage,
 }
 
 fn file_name(path: &Path) -> String {
@@ -104,6 +159,8 @@ fn format_of(path: &Path) -> Option<Format> {
         Some(Format::Nifti)
     } else if name.ends_with(".npy") {
         Some(Format::Npy)
+    } else if name.ends_with(".mha") {
+        Some(Format::MetaImage)
     } else {
         None
     }
@@ -139,6 +196,6 @@ mod tests {
         let e = read_volume(dir.path().join("none.nii")).unwrap_err().to_string();
         assert!(e.contains("none.nii"), "{e}");
         let e = read_volume(dir.path()).unwrap_err().to_string();
-        assert!(e.contains("regular file"), "{e}");
+        assert!(e.contains("DICOM"), "{e}");
     }
 }

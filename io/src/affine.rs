@@ -1,0 +1,66 @@
+//! Voxel indices to millimetres, between the conventions of the file formats.
+//!
+//! The program keeps NIfTI's axes, which point to the patient's right, front and head (RAS). DICOM's and MetaImage's
+//! point to the left, back and head (LPS): the first two coordinates change their sign.
+
+use conefield_core::geometry::{VoxelGrid, cross, dot, norm};
+use conefield_core::scan::Volume;
+
+/// Rows of voxel index → millimetres, the last one `[0, 0, 0, 1]`.
+pub(crate) type Affine = [[f64; 4]; 4];
+
+/// From RAS to LPS, or back.
+pub(crate) fn flip(affine: Affine) -> Affine {
+    // `0.0 - x` and not `-x`: a zero must not become −0, which files would show.
+    let [x, y, z, w] = affine;
+    [x.map(|v| 0.0 - v), y.map(|v| 0.0 - v), z, w]
+}
+
+/// An affine whose columns are `axes`, the steps from one voxel to the next along x, y and z, and `first`, the centre
+/// of the first voxel.
+pub(crate) fn from_columns(axes: [[f64; 3]; 3], first: [f64; 3]) -> Affine {
+    let [a, b, c] = axes;
+    let row = |i: usize| [a[i], b[i], c[i], first[i]];
+    [row(0), row(1), row(2), [0.0, 0.0, 0.0, 1.0]]
+}
+
+/// The step from one voxel to the next along axis `k`.
+pub(crate) fn column(affine: &Affine, k: usize) -> [f64; 3] {
+    [affine[0][k], affine[1][k], affine[2][k]]
+}
+
+/// The voxel sizes.
+pub(crate) fn spacing(affine: &Affine) -> [f64; 3] {
+    std::array::from_fn(|k| norm(column(affine, k)))
+}
+
+/// Whether every number is finite and the three axes span the space.
+pub(crate) fn is_regular(affine: &Affine) -> bool {
+    let volume = dot(cross(column(affine, 0), column(affine, 1)), column(affine, 2));
+    affine.iter().flatten().all(|x| x.is_finite()) && volume.is_finite() && volume != 0.0
+}
+
+/// The affine to write for `volume` into the file `place`, and whether it is the volume's own: one whose voxel sizes
+/// are not the grid's would make the file contradict itself and gives way to one that puts the grid's centre at
+/// `grid.center`.
+pub(crate) fn of(volume: &Volume, place: &str) -> (Affine, bool) {
+    match volume.affine {
+        Some(a) if fits(&a, volume.grid.spacing) => return (a, true),
+        Some(_) => tracing::warn!(
+            "{place}: the affine's voxel sizes are not the grid's {:?} mm: it is replaced by one from the grid",
+            volume.grid.spacing
+        ),
+        None => {}
+    }
+    (centred(&volume.grid), false)
+}
+
+/// Whether the affine's columns are as long as the voxels, to the precision of files.
+fn fits(affine: &Affine, wanted: [f64; 3]) -> bool {
+    spacing(affine).iter().zip(wanted).all(|(n, s)| (n - s).abs() <= 1e-3 * s)
+}
+
+fn centred(grid: &VoxelGrid) -> Affine {
+    let s = grid.spacing;
+    from_columns([[s[0], 0.0, 0.0], [0.0, s[1], 0.0], [0.0, 0.0, s[2]]], grid.voxel([0; 3]))
+}

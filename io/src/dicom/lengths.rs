@@ -1,0 +1,257 @@
+//! A walk along the elements of a file that reads only their lengths.
+//!
+//! `dicom-object` takes memory for what an element claims, up to 4 GiB, and goes down nested sequences by recursion.
+//! This keeps both in bounds.
+
+use crate::input::DEFLATE_LIMIT;
+use conefield_core::{Error, Result};
+use dicom_object::Tag;
+use std::fs::File;
+use std::io::{BufReader, Read, Seek, SeekFrom};
+use std::path::Path;
+
+/// Everything but the pixels is shorter than this.
+const LONGEST_HEADER: u64 = 64 << 20;
+
+/// Sequences in items of sequences: real files stay below ten.
+const DEEPEST: usize = 32;
+
+const PIXELS: Tag = Tag(0x7fe0, 0x0010);
+const SYNTAX: Tag = Tag(0x0002, 0x0010);
+const ITEM: Tag = Tag(0xfffe, 0xe000);
+const ITEM_END: Tag = Tag(0xfffe, 0xe00d);
+const SEQUENCE_END: Tag = Tag(0xfffe, 0xe0dd);
+const UNDEFINED: u32 = u32::MAX;
+
+/// What a file has for pixels.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(super) enum Pixels {
+    None,
+    /// This many bytes as they are.
+    Plain(u64),
+    /// A compressed picture in at most this many bytes.
+    Packed(u64),
+}
+
+impl Pixels {
+    /// Refuses a picture of `want` bytes that cannot come from this many.
+    pub fn must_hold(self, place: &str, want: u64) -> Result<()> {
+        let (bytes, ok) = match self {
+            Self::None => (0, false),
+            // Odd lengths are padded to even ones.
+            Self::Plain(n) => (n, n == want || n == want + 1),
+            // No compression that is read here does better than deflate.
+            Self::Packed(n) => (n, want <= n.saturating_mul(DEFLATE_LIMIT)),
+        };
+        if ok {
+            return Ok(());
+        }
+        let expected = format!("{want} bytes, as Rows, Columns and BitsAllocated say");
+        Err(Error::invalid(place, "PixelData", format!("{bytes} bytes"), expected))
+    }
+}
+
+/// How elements are written.
+#[derive(Clone, Copy)]
+struct Coding {
+    explicit: bool,
+    big: bool,
+}
+
+enum Level {
+    /// An item or sequence up to this byte.
+    Until(u64),
+    /// One up to its delimiter, and what holds again after it.
+    Delimited(Coding),
+    /// Pieces of a compressed picture, up to the delimiter.
+    Pieces,
+}
+
+struct Walk {
+    place: String,
+    reader: BufReader<File>,
+    at: u64,
+    size: u64,
+    coding: Coding,
+}
+
+/// Walks along `path`, which carries DICOM's mark, up to its pixels.
+pub(super) fn check(path: &Path) -> Result<Pixels> {
+    let io = |e| Error::io(path, e);
+    let file = File::open(path).map_err(io)?;
+    let size = file.metadata().map_err(io)?.len();
+    let mut reader = BufReader::new(file);
+    reader.seek(SeekFrom::Start(132)).map_err(io)?;
+    let coding = Coding { explicit: true, big: false };
+    Walk { place: path.display().to_string(), reader, at: 132, size, coding }.run()
+}
+
+impl Walk {
+    fn run(mut self) -> Result<Pixels> {
+        let mut stack: Vec<Level> = Vec::new();
+        let mut syntax = None;
+        // The description of the file is explicit and little-endian whatever the rest is.
+        let mut in_rest = false;
+        loop {
+            while matches!(stack.last(), Some(Level::Until(end)) if self.at >= *end) {
+                stack.pop();
+            }
+            if self.at == self.size {
+                return Ok(Pixels::None);
+            }
+            if self.at > LONGEST_HEADER {
+                let found = format!("no PixelData in {LONGEST_HEADER} bytes");
+                return Err(self.invalid("elements", found, "a shorter header"));
+            }
+            if stack.len() > DEEPEST {
+                let found = format!("more than {DEEPEST} levels at byte {}", self.at);
+                return Err(self.invalid("sequences", found, "fewer levels"));
+            }
+            if !in_rest && self.peek_group()? != 2 {
+                in_rest = true;
+                self.coding = coding(&self.place, syntax.as_deref())?;
+            }
+            let tag = self.tag()?;
+            if tag.group() == 0xfffe {
+                let length = self.u32()?;
+                match (tag, stack.last()) {
+                    (ITEM, Some(Level::Pieces)) => self.skip(tag, length)?,
+                    (ITEM, _) if length == UNDEFINED => stack.push(Level::Delimited(self.coding)),
+                    (ITEM, _) => stack.push(Level::Until(self.end(tag, length)?)),
+                    (ITEM_END | SEQUENCE_END, Some(Level::Delimited(before))) => {
+                        self.coding = *before;
+                        stack.pop();
+                    }
+                    (SEQUENCE_END, Some(Level::Pieces)) => {
+                        stack.pop();
+                    }
+                    // Behind an item or sequence of known length a delimiter means nothing.
+                    (ITEM_END | SEQUENCE_END, Some(Level::Until(_))) => {}
+                    _ => return Err(self.invalid("elements", format!("{tag} at byte {}", self.at), "an element")),
+                }
+                continue;
+            }
+            let (sequence, unknown, length) = self.kind_and_length(tag)?;
+            if tag == PIXELS && stack.is_empty() {
+                return match length {
+                    UNDEFINED => Ok(Pixels::Packed(self.size - self.at)),
+                    n => self.end(tag, n).map(|_| Pixels::Plain(u64::from(n))),
+                };
+            }
+            if length == UNDEFINED {
+                let implicit = !self.coding.explicit;
+                stack.push(if sequence || unknown || implicit { Level::Delimited(self.coding) } else { Level::Pieces });
+                // Inside an unknown element of unknown length no kinds are given, by the standard.
+                if unknown {
+                    self.coding.explicit = false;
+                }
+            } else if sequence || (!self.coding.explicit && self.starts_with_item(length)?) {
+                stack.push(Level::Until(self.end(tag, length)?));
+            } else if tag == SYNTAX {
+                self.end(tag, length)?;
+                let mut text = vec![0; length.min(64) as usize];
+                self.read(&mut text)?;
+                self.skip(tag, length - text.len() as u32)?;
+                syntax = Some(String::from_utf8_lossy(&text).trim_end_matches(['\0', ' ']).to_owned());
+            } else {
+                self.skip(tag, length)?;
+            }
+        }
+    }
+
+    /// Whether an element is a sequence, whether its kind is unknown, and its length.
+    fn kind_and_length(&mut self, tag: Tag) -> Result<(bool, bool, u32)> {
+        if !self.coding.explicit {
+            return Ok((false, false, self.u32()?));
+        }
+        let mut kind = [0; 2];
+        self.read(&mut kind)?;
+        let length = match &kind {
+            b"OB" | b"OD" | b"OF" | b"OL" | b"OV" | b"OW" | b"SQ" | b"SV" | b"UC" | b"UN" | b"UR" | b"UT" | b"UV" => {
+                self.read(&mut [0; 2])?;
+                self.u32()?
+            }
+            k if k.iter().all(u8::is_ascii_uppercase) => u32::from(self.u16()?),
+            k => return Err(self.invalid(&format!("element {tag}"), format!("the kind {k:02x?}"), "two letters")),
+        };
+        Ok((&kind == b"SQ", &kind == b"UN", length))
+    }
+
+    /// The byte behind an element of `length` bytes that starts here; it must lie in the file.
+    fn end(&self, tag: Tag, length: u32) -> Result<u64> {
+        let left = self.size - self.at;
+        if u64::from(length) > left {
+            let expected = format!("at most {left} bytes, which is what the file still has");
+            return Err(self.invalid(&format!("element {tag}"), format!("a length of {length} bytes"), &expected));
+        }
+        Ok(self.at + u64::from(length))
+    }
+
+    fn skip(&mut self, tag: Tag, length: u32) -> Result<()> {
+        self.at = self.end(tag, length)?;
+        self.reader.seek_relative(i64::from(length)).map_err(|e| Error::io(&self.place, e))
+    }
+
+    fn starts_with_item(&mut self, length: u32) -> Result<bool> {
+        if length < 8 {
+            return Ok(false);
+        }
+        let tag = self.tag()?;
+        self.back(4)?;
+        Ok(tag == ITEM)
+    }
+
+    fn peek_group(&mut self) -> Result<u16> {
+        let group = self.u16()?;
+        self.back(2)?;
+        Ok(group)
+    }
+
+    fn back(&mut self, bytes: u32) -> Result<()> {
+        self.at -= u64::from(bytes);
+        self.reader.seek_relative(-i64::from(bytes)).map_err(|e| Error::io(&self.place, e))
+    }
+
+    fn read(&mut self, out: &mut [u8]) -> Result<()> {
+        if self.size - self.at < out.len() as u64 {
+            return Err(self.invalid(
+                "elements",
+                format!("the end of the file at byte {}", self.size),
+                "whole elements",
+            ));
+        }
+        self.at += out.len() as u64;
+        self.reader.read_exact(out).map_err(|e| Error::io(&self.place, e))
+    }
+
+    fn tag(&mut self) -> Result<Tag> {
+        Ok(Tag(self.u16()?, self.u16()?))
+    }
+
+    fn u16(&mut self) -> Result<u16> {
+        let mut b = [0; 2];
+        self.read(&mut b)?;
+        Ok(if self.coding.big { u16::from_be_bytes(b) } else { u16::from_le_bytes(b) })
+    }
+
+    fn u32(&mut self) -> Result<u32> {
+        let mut b = [0; 4];
+        self.read(&mut b)?;
+        Ok(if self.coding.big { u32::from_be_bytes(b) } else { u32::from_le_bytes(b) })
+    }
+
+    fn invalid(&self, field: &str, found: impl ToString, expected: &str) -> Error {
+        Error::invalid(&self.place, field, found, expected)
+    }
+}
+
+fn coding(place: &str, syntax: Option<&str>) -> Result<Coding> {
+    match syntax {
+        None => Err(Error::invalid(place, "TransferSyntaxUID", "no such element", "one in the file's description")),
+        Some("1.2.840.10008.1.2") => Ok(Coding { explicit: false, big: false }),
+        Some("1.2.840.10008.1.2.2") => Ok(Coding { explicit: true, big: true }),
+        // The rest is explicit where it is read at all. Deflated elements are not: there is nothing to walk along, and
+        // a bomb could be in them.
+        Some(other) => super::pixels::packing(place, other).map(|_| Coding { explicit: true, big: false }),
+    }
+}

@@ -1,0 +1,302 @@
+//! The stored values of one slice.
+
+use conefield_core::{Error, Result};
+use dicom_core::PrimitiveValue;
+use dicom_object::DefaultDicomObject;
+use dicom_object::mem::InMemElement;
+use jpeg_decoder::Decoder;
+
+/// How values are stored.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(super) struct Format {
+    pub rows: usize,
+    pub columns: usize,
+    /// Bytes a value: 1, 2 or 4.
+    pub bytes: usize,
+    /// Bits that count, of which `high` is the uppermost.
+    pub stored: u32,
+    pub high: u32,
+    pub signed: bool,
+}
+
+impl Format {
+    pub fn count(&self) -> usize {
+        self.rows * self.columns
+    }
+
+    /// The number in the bits that count.
+    fn number(&self, bits: u32) -> i64 {
+        let value = i64::from(bits >> (self.high + 1 - self.stored)) & ((1i64 << self.stored) - 1);
+        if self.signed && value >> (self.stored - 1) != 0 { value - (1i64 << self.stored) } else { value }
+    }
+}
+
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(super) enum Packing {
+    Plain,
+    RunLength,
+    Jpeg,
+}
+
+/// How pictures in the transfer syntax `uid` are packed.
+pub(super) fn packing(place: &str, uid: &str) -> Result<Packing> {
+    match uid {
+        "1.2.840.10008.1.2" | "1.2.840.10008.1.2.1" | "1.2.840.10008.1.2.2" => Ok(Packing::Plain),
+        "1.2.840.10008.1.2.5" => Ok(Packing::RunLength),
+        "1.2.840.10008.1.2.4.50" | "1.2.840.10008.1.2.4.57" | "1.2.840.10008.1.2.4.70" => Ok(Packing::Jpeg),
+        other => Err(unsupported(place, other)),
+    }
+}
+
+fn unsupported(place: &str, uid: &str) -> Error {
+    let name = match uid {
+        "1.2.840.10008.1.2.1.99" => " (deflated)",
+        "1.2.840.10008.1.2.4.51" => " (JPEG with 12 bits)",
+        "1.2.840.10008.1.2.4.80" | "1.2.840.10008.1.2.4.81" => " (JPEG-LS)",
+        "1.2.840.10008.1.2.4.90" | "1.2.840.10008.1.2.4.91" => " (JPEG 2000)",
+        "1.2.840.10008.1.2.4.201" | "1.2.840.10008.1.2.4.202" | "1.2.840.10008.1.2.4.203" => " (HTJ2K)",
+        _ => "",
+    };
+    Error::unsupported(
+        format!("{place}: TransferSyntaxUID {uid}{name}"),
+        "uncompressed, RLE and 8-bit or lossless JPEG files are read: decompress the series first \
+         (dcmdjpeg, gdcmconv --raw)",
+    )
+}
+
+/// The values of `object`'s picture, row after row, before they are rescaled.
+pub(super) fn values(
+    place: &str,
+    object: &DefaultDicomObject,
+    element: &InMemElement,
+    format: &Format,
+) -> Result<Vec<i64>> {
+    let fail = |found: String, expected: String| Error::invalid(place, "PixelData", found, expected);
+    let bits = match packing(place, object.meta().transfer_syntax())? {
+        Packing::Plain => plain(element, format),
+        packed => {
+            let pieces = element.fragments().ok_or("no compressed picture".to_owned());
+            pieces.map(|p| p.concat()).and_then(|bytes| match packed {
+                Packing::RunLength => run_length(&bytes, format),
+                _ => jpeg(&bytes, format),
+            })
+        }
+    };
+    let bits = bits.map_err(|found| fail(found, "a whole picture".into()))?;
+    if bits.len() != format.count() {
+        let expected = format!("{} ({} rows of {})", format.count(), format.rows, format.columns);
+        return Err(fail(format!("{} values", bits.len()), expected));
+    }
+    Ok(bits.into_iter().map(|b| format.number(b)).collect())
+}
+
+fn plain(element: &InMemElement, format: &Format) -> Result<Vec<u32>, String> {
+    let count = format.count();
+    let value = element.value().primitive().ok_or("a compressed picture in an uncompressed file")?;
+    // Words come in the machine's order already; what is read as bytes is little-endian.
+    match (value, format.bytes) {
+        (PrimitiveValue::U16(words), 2) => Ok(words.iter().take(count).map(|w| u32::from(*w)).collect()),
+        (PrimitiveValue::U16(words), 1) => {
+            Ok(words.iter().flat_map(|w| w.to_le_bytes()).take(count).map(u32::from).collect())
+        }
+        (PrimitiveValue::U16(words), _) => {
+            let pairs = words.chunks_exact(2).take(count);
+            Ok(pairs.map(|p| u32::from(p[0]) | u32::from(p[1]) << 16).collect())
+        }
+        (PrimitiveValue::U8(bytes), n) => {
+            let word = |b: &[u8]| b.iter().rev().fold(0, |w, b| w << 8 | u32::from(*b));
+            Ok(bytes.chunks_exact(n).take(count).map(word).collect())
+        }
+        _ => Err("neither bytes nor words".into()),
+    }
+}
+
+/// DICOM's run-length coding: for each byte of a value, the highest first, one run of PackBits.
+fn run_length(bytes: &[u8], format: &Format) -> Result<Vec<u32>, String> {
+    let word = |k: usize| bytes.get(4 * k..4 * k + 4).map(|b| b.iter().rev().fold(0, |w, b| w << 8 | usize::from(*b)));
+    let header = || format!("{} bytes without a run-length header", bytes.len());
+    let segments = word(0).ok_or_else(header)?;
+    if segments != format.bytes {
+        return Err(format!("{segments} run-length segments for values of {} bytes", format.bytes));
+    }
+    let mut out = vec![0u32; format.count()];
+    for k in 1..=segments {
+        let start = word(k).ok_or_else(header)?;
+        let end = if k < segments { word(k + 1).ok_or_else(header)? } else { bytes.len() };
+        let segment =
+            bytes.get(start..end).ok_or(format!("a segment from byte {start} to {end} of {}", bytes.len()))?;
+        let mut plane = Runs { rest: segment, repeat: 0, literal: 0 };
+        for value in &mut out {
+            let byte = plane.next().ok_or(format!("the end of segment {k} before the last value"))?;
+            *value = *value << 8 | u32::from(byte);
+        }
+    }
+    Ok(out)
+}
+
+/// The bytes that PackBits stand for.
+struct Runs<'a> {
+    rest: &'a [u8],
+    /// How often the next byte still comes.
+    repeat: usize,
+    /// How many bytes still come as they are.
+    literal: usize,
+}
+
+impl Iterator for Runs<'_> {
+    type Item = u8;
+
+    fn next(&mut self) -> Option<u8> {
+        while self.repeat == 0 && self.literal == 0 {
+            let (code, rest) = self.rest.split_first()?;
+            self.rest = rest;
+            match code {
+                0..=127 => self.literal = usize::from(*code) + 1,
+                128 => {}
+                129..=255 => self.repeat = 257 - usize::from(*code),
+            }
+        }
+        let (byte, rest) = self.rest.split_first()?;
+        if self.literal > 0 {
+            self.literal -= 1;
+            self.rest = rest;
+        } else {
+            self.repeat -= 1;
+            if self.repeat == 0 {
+                self.rest = rest;
+            }
+        }
+        Some(*byte)
+    }
+}
+
+/// JPEG of one channel; the picture's own size is compared before memory is taken for it.
+fn jpeg(bytes: &[u8], format: &Format) -> Result<Vec<u32>, String> {
+    let (precision, rows, columns, channels) = frame(bytes).ok_or("no JPEG picture")?;
+    if (rows, columns, channels) != (format.rows, format.columns, 1) {
+        return Err(format!("a JPEG picture of {rows} rows, {columns} columns and {channels} channels"));
+    }
+    if usize::from(precision).div_ceil(8) > format.bytes {
+        return Err(format!("a JPEG picture of {precision} bits in values of {} bytes", format.bytes));
+    }
+    let mut decoder = Decoder::new(bytes);
+    decoder.set_max_decoding_buffer_size(format.count() * 2);
+    let raw = decoder.decode().map_err(|e| format!("a JPEG picture that cannot be decoded: {e}"))?;
+    Ok(match precision {
+        0..=8 => raw.into_iter().map(u32::from).collect(),
+        _ => raw.as_chunks().0.iter().map(|b| u32::from(u16::from_ne_bytes(*b))).collect(),
+    })
+}
+
+/// Bits, rows, columns and channels of a JPEG picture.
+fn frame(bytes: &[u8]) -> Option<(u8, usize, usize, u8)> {
+    let two = |at: usize| bytes.get(at..at + 2).map(|b| usize::from(b[0]) << 8 | usize::from(b[1]));
+    let mut at = 2;
+    loop {
+        match (bytes.get(at)?, bytes.get(at + 1)?) {
+            (0xff, 0xff) => at += 1,
+            // A start of frame of any coding; C4, C8 and CC among them are tables.
+            (0xff, 0xc0..=0xc3 | 0xc5..=0xc7 | 0xc9..=0xcb | 0xcd..=0xcf) => {
+                return Some((*bytes.get(at + 4)?, two(at + 5)?, two(at + 7)?, *bytes.get(at + 9)?));
+            }
+            (0xff, 0xd8 | 0x01) => at += 2,
+            (0xff, 0xd9 | 0xda) => return None,
+            (0xff, _) => at += 2 + two(at + 2)?,
+            _ => return None,
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    const TWO: Format = Format { rows: 2, columns: 3, bytes: 2, stored: 12, high: 11, signed: true };
+
+    fn segments(parts: &[&[u8]]) -> Vec<u8> {
+        let mut out = (parts.len() as u32).to_le_bytes().to_vec();
+        let mut at = 64u32;
+        for k in 0..15 {
+            out.extend(parts.get(k).map_or(0, |_| at).to_le_bytes());
+            at += parts.get(k).map_or(0, |p| p.len() as u32);
+        }
+        out.extend(parts.concat());
+        out
+    }
+
+    #[test]
+    fn bits_that_count_become_numbers() {
+        assert_eq!([0x7ff, 0x800, 0xffff, 0xf001].map(|b| TWO.number(b)), [2047, -2048, -1, 1]);
+        let upper = Format { high: 15, signed: false, ..TWO };
+        assert_eq!(upper.number(0xabcd), 0xabc);
+        let all = Format { bytes: 4, stored: 32, high: 31, ..TWO };
+        assert_eq!([all.number(u32::MAX), Format { signed: false, ..all }.number(u32::MAX)], [-1, 0xffff_ffff]);
+        let bit = Format { bytes: 1, stored: 1, high: 0, signed: false, ..TWO };
+        assert_eq!(bit.number(3), 1);
+    }
+
+    #[test]
+    fn run_lengths_unpack_and_lies_are_refused() {
+        // Six times 1 (257 − 251), then 2 3 as they are, a no-op, four times 9.
+        let good = segments(&[&[251, 1], &[1, 2, 3, 128, 253, 9]]);
+        assert_eq!(run_length(&good, &TWO).unwrap(), [0x102, 0x103, 0x109, 0x109, 0x109, 0x109]);
+        for (bad, word) in [
+            (segments(&[&[251, 1]]), "1 run-length segments"),
+            (segments(&[&[251, 1], &[252, 1]]), "end of segment 2"),
+            (segments(&[&[251], &[251, 1]]), "end of segment 1"),
+            (good[..40].to_vec(), "segment from byte 64"),
+            (vec![2, 0, 0], "without a run-length header"),
+            (vec![], "without a run-length header"),
+        ] {
+            let e = run_length(&bad, &TWO).unwrap_err();
+            assert!(e.contains(word), "{e}");
+        }
+        let mut wild = good.clone();
+        wild[4..8].copy_from_slice(&u32::MAX.to_le_bytes());
+        assert!(run_length(&wild, &TWO).unwrap_err().contains("4294967295"));
+    }
+
+    #[test]
+    fn a_jpeg_of_another_size_is_refused_before_it_is_decoded() {
+        let start = |rows: u16, columns: u16, channels: u8, bits: u8| {
+            let [r, c] = [rows.to_be_bytes(), columns.to_be_bytes()];
+            [&[0xff, 0xd8, 0xff, 0xe0, 0, 4, 1, 2, 0xff, 0xc3, 0, 11, bits], &r[..], &c[..], &[channels, 1, 0x11, 0]]
+                .concat()
+        };
+        let refused = |bytes: &[u8]| jpeg(bytes, &TWO).unwrap_err();
+        assert!(refused(&start(65535, 65535, 1, 16)).contains("65535 rows"));
+        assert!(refused(&start(2, 3, 2, 16)).contains("2 channels"));
+        assert!(refused(&start(2, 3, 1, 17)).contains("17 bits"));
+        assert!(refused(&start(2, 3, 1, 16)).contains("cannot be decoded"));
+        assert!(refused(&[0xff, 0xd8, 0xff, 0xe0, 0xff, 0xff]).contains("no JPEG"));
+        assert!(refused(&[]).contains("no JPEG"));
+    }
+
+    /// Lossless, 2 rows of 3 columns, by ITK: 100 101 99 / −5 2047 −2048 as 16 bits.
+    const JPEG: [u8; 61] = [
+        0xff, 0xd8, 0xff, 0xc3, 0x00, 0x0b, 0x10, 0x00, 0x02, 0x00, 0x03, 0x01, 0x01, 0x11, 0x00, 0xff, 0xc4, 0x00,
+        0x18, 0x00, 0x00, 0x02, 0x03, 0x00, 0x00, 0x00, 0x00, 0x00, 0x00, 0x00, 0x00, 0x00, 0x00, 0x00, 0x00, 0x00,
+        0x01, 0x0c, 0x02, 0x07, 0x0f, 0xff, 0xda, 0x00, 0x08, 0x01, 0x01, 0x00, 0x01, 0x00, 0x00, 0xc0, 0x18, 0xcc,
+        0x69, 0x66, 0x01, 0x10, 0x00, 0xff, 0xd9,
+    ];
+
+    #[test]
+    fn lossless_jpeg_is_read() {
+        let all = Format { stored: 16, high: 15, ..TWO };
+        let found: Vec<i64> = jpeg(&JPEG, &all).unwrap().into_iter().map(|b| all.number(b)).collect();
+        assert_eq!(found, [100, 101, 99, -5, 2047, -2048]);
+    }
+
+    proptest::proptest! {
+        #[test]
+        fn no_bytes_make_it_panic(changes in proptest::collection::vec((0usize..61, 0u8..), 1..6), cut in 0usize..62) {
+            let mut bytes = JPEG.to_vec();
+            for (at, x) in changes {
+                bytes[at] = x;
+            }
+            bytes.truncate(cut.max(30));
+            let _ = jpeg(&bytes, &TWO);
+            let _ = run_length(&bytes, &TWO);
+        }
+    }
+}

@@ -1,0 +1,234 @@
+//! What a volume needs of one file of a series.
+
+use super::lengths::{self, Pixels};
+use super::pixels::{self, Format};
+use conefield_core::geometry::{dot, norm};
+use conefield_core::{Error, Result};
+use dicom_object::{DefaultDicomObject, OpenFileOptions, Tag};
+use std::path::{Path, PathBuf};
+
+/// An element with the name that errors give it.
+type Field = (Tag, &'static str);
+
+const PIXEL_DATA: Field = (Tag(0x7fe0, 0x0010), "PixelData");
+const SERIES: Field = (Tag(0x0020, 0x000e), "SeriesInstanceUID");
+const SERIES_NAME: Field = (Tag(0x0008, 0x103e), "SeriesDescription");
+const MODALITY: Field = (Tag(0x0008, 0x0060), "Modality");
+const ORIENTATION: Field = (Tag(0x0020, 0x0037), "ImageOrientationPatient");
+const POSITION: Field = (Tag(0x0020, 0x0032), "ImagePositionPatient");
+const SPACING: Field = (Tag(0x0028, 0x0030), "PixelSpacing");
+const THICKNESS: Field = (Tag(0x0018, 0x0050), "SliceThickness");
+const BETWEEN: Field = (Tag(0x0018, 0x0088), "SpacingBetweenSlices");
+const SLOPE: Field = (Tag(0x0028, 0x1053), "RescaleSlope");
+const INTERCEPT: Field = (Tag(0x0028, 0x1052), "RescaleIntercept");
+const ROWS: Field = (Tag(0x0028, 0x0010), "Rows");
+const COLUMNS: Field = (Tag(0x0028, 0x0011), "Columns");
+const SAMPLES: Field = (Tag(0x0028, 0x0002), "SamplesPerPixel");
+const FRAMES: Field = (Tag(0x0028, 0x0008), "NumberOfFrames");
+const ALLOCATED: Field = (Tag(0x0028, 0x0100), "BitsAllocated");
+const STORED: Field = (Tag(0x0028, 0x0101), "BitsStored");
+const HIGH: Field = (Tag(0x0028, 0x0102), "HighBit");
+const SIGN: Field = (Tag(0x0028, 0x0103), "PixelRepresentation");
+
+/// One slice without its values; lengths in mm, directions LPS.
+#[derive(Debug)]
+pub(super) struct Slice {
+    path: PathBuf,
+    pub series: String,
+    /// Modality and description of the series, for people.
+    pub about: String,
+    pub modality: String,
+    /// Along a row (to the next column) and down a column (to the next row), of length 1.
+    pub axes: [[f64; 3]; 2],
+    /// Centre of the first pixel.
+    pub position: [f64; 3],
+    /// From row to row and from column to column.
+    pub spacing: [f64; 2],
+    thickness: Option<f64>,
+    rescale: [f64; 2],
+    pub rows: usize,
+    pub columns: usize,
+    format: Format,
+}
+
+/// An open file's elements.
+struct Elements<'a> {
+    place: &'a str,
+    object: &'a DefaultDicomObject,
+}
+
+impl Elements<'_> {
+    fn invalid(&self, field: Field, found: impl ToString, expected: &str) -> Error {
+        Error::invalid(self.place, field.1, found, expected)
+    }
+
+    fn text(&self, field: Field) -> Option<String> {
+        let text = self.object.get(field.0)?.to_str().ok()?;
+        Some(text.trim_end_matches(['\0', ' ']).trim_start().to_owned()).filter(|t| !t.is_empty())
+    }
+
+    /// `N` finite numbers, or `None` without such an element.
+    fn numbers<const N: usize>(&self, field: Field) -> Result<Option<[f64; N]>> {
+        let Some(element) = self.object.get(field.0).filter(|e| e.value().multiplicity() > 0) else { return Ok(None) };
+        let expected = || format!("{N} finite numbers");
+        let all = element.to_multi_float64().map_err(|e| self.invalid(field, e, &expected()))?;
+        match <[f64; N]>::try_from(all) {
+            Ok(n) if n.iter().all(|x| x.is_finite()) => Ok(Some(n)),
+            Ok(n) => Err(self.invalid(field, format!("{n:?}"), &expected())),
+            Err(n) => Err(self.invalid(field, format!("{} numbers", n.len()), &expected())),
+        }
+    }
+
+    fn required<const N: usize>(&self, field: Field) -> Result<[f64; N]> {
+        self.numbers(field)?.ok_or_else(|| self.invalid(field, "no such element", &format!("{N} numbers")))
+    }
+
+    fn whole(&self, field: Field) -> Result<Option<i64>> {
+        let Some(element) = self.object.get(field.0).filter(|e| e.value().multiplicity() > 0) else { return Ok(None) };
+        element.to_int().map(Some).map_err(|e| self.invalid(field, e, "a whole number"))
+    }
+
+    /// A whole number that `fits`, or `default` without such an element.
+    fn within(&self, field: Field, default: Option<i64>, fits: impl Fn(i64) -> bool, expected: &str) -> Result<i64> {
+        match self.whole(field)?.or(default) {
+            Some(n) if fits(n) => Ok(n),
+            Some(n) => Err(self.invalid(field, n, expected)),
+            None => Err(self.invalid(field, "no such element", expected)),
+        }
+    }
+
+    fn format(&self) -> Result<Format> {
+        let side = |field| self.within(field, None, |n| (1..=65535).contains(&n), "1 to 65535");
+        let (rows, columns) = (side(ROWS)?, side(COLUMNS)?);
+        self.within(SAMPLES, Some(1), |n| n == 1, "1: one number a pixel")?;
+        self.within(FRAMES, Some(1), |n| n == 1, "1: one slice a file (split enhanced files first)")?;
+        let allocated = self.within(ALLOCATED, None, |n| matches!(n, 8 | 16 | 32), "8, 16 or 32")?;
+        let stored = self.within(STORED, Some(allocated), |n| (1..=allocated).contains(&n), "1 to BitsAllocated")?;
+        let in_range = |n| (stored - 1..allocated).contains(&n);
+        let high = self.within(HIGH, Some(stored - 1), in_range, "BitsStored - 1 to BitsAllocated - 1")?;
+        let sign = self.within(SIGN, Some(0), |n| n == 0 || n == 1, "0 (unsigned) or 1 (signed)")?;
+        Ok(Format {
+            rows: rows as usize,
+            columns: columns as usize,
+            bytes: allocated as usize / 8,
+            stored: stored as u32,
+            high: high as u32,
+            signed: sign == 1,
+        })
+    }
+
+    fn axes(&self) -> Result<[[f64; 3]; 2]> {
+        let six = self.required::<6>(ORIENTATION)?;
+        let axes = [[six[0], six[1], six[2]], [six[3], six[4], six[5]]];
+        // Files round the numbers: an axis is brought back to length 1.
+        if axes.iter().any(|a| (norm(*a) - 1.0).abs() > 1e-2) || dot(axes[0], axes[1]).abs() > 1e-2 {
+            return Err(self.invalid(
+                ORIENTATION,
+                format!("{six:?}"),
+                "two directions of length 1, upright to each other",
+            ));
+        }
+        Ok(axes.map(|a| a.map(|x| x / norm(a))))
+    }
+}
+
+impl Slice {
+    /// Reads all but the values of the DICOM file `path`, or `None` with a warning if there is no picture in it.
+    pub fn read(path: &Path) -> Result<Option<Self>> {
+        let place = path.display().to_string();
+        let pixels = lengths::check(path)?;
+        if pixels == Pixels::None {
+            tracing::warn!("{place}: left out, there is no picture in it");
+            return Ok(None);
+        }
+        let object = open(path, OpenFileOptions::new().read_until(PIXEL_DATA.0))?;
+        let e = Elements { place: &place, object: &object };
+        let format = e.format()?;
+        pixels.must_hold(&place, format.count() as u64 * format.bytes as u64)?;
+        let series = e.text(SERIES).ok_or_else(|| e.invalid(SERIES, "no such element", "the series' identifier"))?;
+        let modality = e.text(MODALITY).unwrap_or_default();
+        let about = format!("{modality}, {}", e.text(SERIES_NAME).unwrap_or_else(|| "no description".into()));
+        let spacing = e.required::<2>(SPACING)?;
+        if spacing.iter().any(|s| *s <= 0.0) {
+            return Err(e.invalid(SPACING, format!("{spacing:?}"), "millimetres above 0"));
+        }
+        let between = e.numbers::<1>(BETWEEN)?.map(|[x]| x.abs());
+        let thickness = between.or(e.numbers::<1>(THICKNESS)?.map(|[x]| x)).filter(|x| *x > 0.0);
+        let [slope] = e.numbers(SLOPE)?.unwrap_or([1.0]);
+        let [intercept] = e.numbers(INTERCEPT)?.unwrap_or([0.0]);
+        let (axes, position) = (e.axes()?, e.required(POSITION)?);
+        Ok(Some(Self {
+            path: path.to_path_buf(),
+            series,
+            about,
+            modality,
+            axes,
+            position,
+            spacing,
+            thickness,
+            rescale: [slope, intercept],
+            rows: format.rows,
+            columns: format.columns,
+            format,
+        }))
+    }
+
+    /// The file's name.
+    pub fn name(&self) -> String {
+        self.path.file_name().map(|n| n.to_string_lossy().into_owned()).unwrap_or_default()
+    }
+
+    /// Refuses a slice of another size, pixel size or orientation than `first`.
+    pub fn must_fit(&self, first: &Self) -> Result<()> {
+        let refuse = |field: Field, found: String, want: String| {
+            let expected = format!("{want}, as in {}", first.name());
+            Err(Error::invalid(self.path.display().to_string(), field.1, found, expected))
+        };
+        if self.rows != first.rows {
+            return refuse(ROWS, self.rows.to_string(), first.rows.to_string());
+        }
+        if self.columns != first.columns {
+            return refuse(COLUMNS, self.columns.to_string(), first.columns.to_string());
+        }
+        let near = |a: f64, b: f64, tolerance: f64| (a - b).abs() <= tolerance;
+        if !self.spacing.iter().zip(first.spacing).all(|(a, b)| near(*a, b, 1e-3 * b)) {
+            return refuse(SPACING, format!("{:?}", self.spacing), format!("{:?}", first.spacing));
+        }
+        if !self.axes.iter().flatten().zip(first.axes.iter().flatten()).all(|(a, b)| near(*a, *b, 1e-3)) {
+            return refuse(ORIENTATION, format!("{:?}", self.axes), format!("{:?}", first.axes));
+        }
+        Ok(())
+    }
+
+    /// The size of the voxels across a single slice.
+    pub fn thickness(&self) -> Result<f64> {
+        let expected = "millimetres above 0, which a single slice needs";
+        self.thickness.ok_or_else(|| Error::invalid(self.path.display().to_string(), THICKNESS.1, "none", expected))
+    }
+
+    /// The rescaled values, row after row.
+    pub fn values(&self) -> Result<Vec<f32>> {
+        let place = self.path.display().to_string();
+        let object = open(&self.path, OpenFileOptions::new().read_to(PIXEL_DATA.0))?;
+        let element = object.get(PIXEL_DATA.0);
+        let element = element.ok_or_else(|| Error::invalid(&place, PIXEL_DATA.1, "no such element", "a picture"))?;
+        let values = pixels::values(&place, &object, element, &self.format)?;
+        let [slope, intercept] = self.rescale;
+        let rescaled: Vec<f32> = values.into_iter().map(|v| (slope * v as f64 + intercept) as f32).collect();
+        if rescaled.iter().any(|x| !x.is_finite()) {
+            let expected = "a factor that keeps values in the range of 32-bit floats";
+            return Err(Error::invalid(place, SLOPE.1, slope, expected));
+        }
+        Ok(rescaled)
+    }
+}
+
+fn open(path: &Path, options: OpenFileOptions) -> Result<DefaultDicomObject> {
+    options.open_file(path).map_err(|e| {
+        // The outer message says only that reading failed; the reasons are below it.
+        let reasons: Vec<String> =
+            std::iter::successors(std::error::Error::source(&e), |e| e.source()).map(ToString::to_string).collect();
+        let found = if reasons.is_empty() { e.to_string() } else { reasons.join(": ") };
+        Error::invalid(path.display().to_string(), "elements", found, "a DICOM file")
+    })
+}

@@ -1,0 +1,649 @@
+//! MetaImage, ITK's own format: lines of `Name = value`, then the voxels in the same file (`.mha`) or in one beside
+//! it (`.mhd` with `.raw` or `.zraw`).
+
+use crate::affine::{self, Affine};
+use crate::input::Input;
+use crate::number::{Number, Order};
+use crate::{folder, volume};
+use conefield_core::geometry::{VoxelGrid, norm};
+use conefield_core::scan::Volume;
+use conefield_core::{Error, Result};
+use flate2::{Compression, write::ZlibEncoder};
+use std::io::{Seek, Write};
+use std::path::Path;
+
+/// Longest header that is read; real ones are below 1 KiB, but for comments.
+const LONGEST_HEADER: usize = 1 << 16;
+
+/// The last entry of a header.
+const DATA_FILE: &str = "ElementDataFile";
+
+/// Whether `head`, the start of a file, has the line that names the kind of object or the number of axes, after
+/// nothing but other lines of this form.
+pub(crate) fn is_header(head: &[u8]) -> bool {
+    head.split(|b| *b == b'\n')
+        .filter(|line| !line.trim_ascii().is_empty())
+        .map_while(entry)
+        .any(|(name, _)| name == "NDims" || name == "ObjectType")
+}
+
+/// Name and value of a line.
+fn entry(line: &[u8]) -> Option<(&str, &[u8])> {
+    let at = line.iter().position(|b| matches!(b, b'=' | b':'))?;
+    let name = std::str::from_utf8(line[..at].trim_ascii()).ok()?;
+    let good = !name.is_empty() && name.bytes().all(|b| b.is_ascii_alphanumeric() || b == b'_');
+    good.then_some((name, line[at + 1..].trim_ascii()))
+}
+
+/// What a header says, entry by entry.
+struct Header {
+    place: String,
+    entries: Vec<(String, Vec<u8>)>,
+}
+
+impl Header {
+    /// Reads up to and including the line that says where the data is.
+    fn read(input: &mut Input) -> Result<Self> {
+        let mut header = Self { place: input.place(), entries: Vec::new() };
+        let mut left = LONGEST_HEADER;
+        for number in 1.. {
+            let line = input.line(left)?;
+            left -= line.len();
+            if left == 0 {
+                let found = format!("no such line in {LONGEST_HEADER} bytes");
+                return Err(header.invalid(DATA_FILE, found, "a shorter header"));
+            }
+            if line.is_empty() {
+                let found = format!("the end of the file after {} lines", number - 1);
+                return Err(header.invalid(DATA_FILE, found, "a line that says where the data is"));
+            }
+            if line.trim_ascii().is_empty() {
+                continue;
+            }
+            let Some((name, value)) = entry(&line) else {
+                let start = String::from_utf8_lossy(&line[..line.len().min(40)]).into_owned();
+                return Err(header.invalid(&format!("line {number}"), format!("{start:?}"), "Name = value"));
+            };
+            header.entries.push((name.to_owned(), value.to_owned()));
+            if name == DATA_FILE {
+                break;
+            }
+        }
+        Ok(header)
+    }
+
+    fn invalid(&self, field: &str, found: impl ToString, expected: &str) -> Error {
+        Error::invalid(&self.place, field, found, expected)
+    }
+
+    /// The text of the entry `name`; only entries that are used must be text and stand there once.
+    fn text(&self, name: &str) -> Result<Option<&str>> {
+        let mut all = self.entries.iter().filter(|(n, _)| n == name);
+        let Some((_, value)) = all.next() else { return Ok(None) };
+        if all.next().is_some() {
+            return Err(self.invalid(name, "two entries", "one"));
+        }
+        let text = std::str::from_utf8(value);
+        text.map(Some).map_err(|e| self.invalid(name, format!("bytes that are no UTF-8 ({e})"), "a text"))
+    }
+
+    fn required(&self, name: &str) -> Result<&str> {
+        self.text(name)?.ok_or_else(|| self.invalid(name, "no such entry", "one, before ElementDataFile"))
+    }
+
+    /// The first of `names` that is there, with its name.
+    fn first<'a>(&self, names: &[&'a str]) -> Result<Option<(&'a str, &str)>> {
+        for &name in names {
+            if let Some(text) = self.text(name)? {
+                return Ok(Some((name, text)));
+            }
+        }
+        Ok(None)
+    }
+
+    fn flag(&self, name: &str) -> Result<Option<bool>> {
+        let Some(text) = self.text(name)? else { return Ok(None) };
+        match text.to_ascii_lowercase().as_str() {
+            "true" | "1" => Ok(Some(true)),
+            "false" | "0" => Ok(Some(false)),
+            _ => Err(self.invalid(name, text, "True or False")),
+        }
+    }
+
+    /// `count` numbers under the first of `names` that is there.
+    fn numbers<'a>(&self, names: &[&'a str], count: usize) -> Result<Option<(&'a str, Vec<f64>)>> {
+        let Some((name, text)) = self.first(names)? else { return Ok(None) };
+        let numbers: Option<Vec<f64>> =
+            text.split_ascii_whitespace().map(|t| t.parse().ok().filter(|x: &f64| x.is_finite())).collect();
+        match numbers {
+            Some(n) if n.len() == count => Ok(Some((name, n))),
+            _ => Err(self.invalid(name, shortened(text), &format!("{count} finite numbers"))),
+        }
+    }
+
+    /// Voxels along x, y and z, and the number of axes, of which a fourth may only say 1.
+    fn shape(&self) -> Result<([usize; 3], usize)> {
+        let text = self.required("NDims")?;
+        let axes = match text.parse() {
+            Ok(n @ 3..=4usize) => n,
+            _ => return Err(self.invalid("NDims", text, "3, or 4 with one entry along the last axis")),
+        };
+        let text = self.required("DimSize")?;
+        let sizes: Option<Vec<usize>> = text.split_ascii_whitespace().map(|t| t.parse().ok()).collect();
+        let bad = |expected: String| self.invalid("DimSize", shortened(text), &expected);
+        match sizes.as_deref() {
+            Some(s) if s.len() != axes => Err(bad(format!("{axes} numbers, as NDims says"))),
+            Some([x, y, z, rest @ ..]) if x.min(y).min(z) > &0 => {
+                if rest.iter().any(|n| *n != 1) {
+                    return Err(bad("1 along the fourth axis: one volume, not a series".into()));
+                }
+                let fits = x.checked_mul(*y).and_then(|n| n.checked_mul(*z)).and_then(|n| n.checked_mul(8));
+                fits.filter(|n| *n <= isize::MAX as usize)
+                    .map(|_| ([*x, *y, *z], axes))
+                    .ok_or_else(|| bad("a number of voxels that can be addressed".into()))
+            }
+            _ => Err(bad(format!("{axes} whole numbers above 0"))),
+        }
+    }
+
+    fn number(&self) -> Result<Number> {
+        let text = self.required("ElementType")?;
+        // LONG is four bytes in this format, whatever a compiler makes of it.
+        Ok(match text {
+            "MET_CHAR" => Number::I8,
+            "MET_UCHAR" => Number::U8,
+            "MET_SHORT" => Number::I16,
+            "MET_USHORT" => Number::U16,
+            "MET_INT" | "MET_LONG" => Number::I32,
+            "MET_UINT" | "MET_ULONG" => Number::U32,
+            "MET_LONG_LONG" => Number::I64,
+            "MET_ULONG_LONG" => Number::U64,
+            "MET_FLOAT" => Number::F32,
+            "MET_DOUBLE" => Number::F64,
+            _ => {
+                let expected = "MET_ and (U)CHAR, (U)SHORT, (U)INT, (U)LONG, (U)LONG_LONG, FLOAT or DOUBLE";
+                return Err(self.invalid("ElementType", shortened(text), expected));
+            }
+        })
+    }
+
+    fn order(&self) -> Result<Order> {
+        let names = ["BinaryDataByteOrderMSB", "ElementByteOrderMSB"];
+        let big = match (self.flag(names[0])?, self.flag(names[1])?) {
+            (Some(a), Some(b)) if a != b => {
+                return Err(self.invalid(names[1], b, &format!("{a}, as {} says", names[0])));
+            }
+            (a, b) => a.or(b).unwrap_or(false),
+        };
+        Ok(if big { Order::Big } else { Order::Little })
+    }
+
+    /// Millimetres a unit of length.
+    fn unit(&self) -> Result<f64> {
+        match self.text("DistanceUnits")? {
+            None | Some("mm" | "?" | "") => Ok(1.0),
+            Some("um") => Ok(0.001),
+            Some("cm") => Ok(10.0),
+            Some(other) => Err(self.invalid("DistanceUnits", shortened(other), "um, mm, cm or ?")),
+        }
+    }
+
+    /// Voxel sizes in mm and the affine.
+    fn place_of_voxels(&self, axes: usize) -> Result<([f64; 3], Affine)> {
+        let mm = self.unit()?;
+        let spacing = match self.numbers(&["ElementSpacing", "ElementSize"], axes)? {
+            Some((name, s)) if s[..3].iter().any(|x| *x <= 0.0) => {
+                return Err(self.invalid(name, format!("{s:?}"), "numbers above 0"));
+            }
+            Some((_, s)) => [s[0] * mm, s[1] * mm, s[2] * mm],
+            None => [mm; 3],
+        };
+        let first = self.numbers(&["Offset", "Position", "Origin"], axes)?;
+        let first = first.map_or([0.0; 3], |(_, p)| [p[0] * mm, p[1] * mm, p[2] * mm]);
+        let turn = self.numbers(&["TransformMatrix", "Orientation", "Rotation"], axes * axes)?;
+        let (name, turn) = turn.unwrap_or_else(|| {
+            ("TransformMatrix", (0..axes * axes).map(|i| f64::from(u8::from(i % (axes + 1) == 0))).collect())
+        });
+        let entry = |k: usize, i: usize| turn[k * axes + i];
+        if axes == 4 && (0..3).any(|k| entry(k, 3) != 0.0 || entry(3, k) != 0.0) {
+            return Err(self.invalid(name, format!("{turn:?}"), "a fourth axis apart from the others"));
+        }
+        // The file holds one axis after the other: its rows are the affine's columns.
+        let steps: [[f64; 3]; 3] = std::array::from_fn(|k| std::array::from_fn(|i| entry(k, i) * spacing[k]));
+        let lps = affine::from_columns(steps, first);
+        if !affine::is_regular(&lps) {
+            return Err(self.invalid(name, format!("{turn:?}"), "three independent voxel axes"));
+        }
+        // ITK multiplies both: an axis that is no unit vector stretches the voxels.
+        let spacing = std::array::from_fn(|k| {
+            let length = norm(std::array::from_fn(|i| entry(k, i)));
+            if (length - 1.0).abs() <= 1e-3 { spacing[k] } else { spacing[k] * length }
+        });
+        Ok((spacing, affine::flip(lps)))
+    }
+}
+
+/// A value as errors show it.
+fn shortened(text: &str) -> String {
+    match text.char_indices().nth(80) {
+        Some((at, _)) => format!("\"{}…\"", &text[..at]),
+        None => format!("\"{text}\""),
+    }
+}
+
+/// Reads a MetaImage of one number a voxel; the affine is RAS, in mm, and `grid.center` is `[0, 0, 0]`.
+pub(crate) fn read(path: &Path) -> Result<Volume> {
+    let mut input = Input::open_plain(path)?;
+    let header = Header::read(&mut input)?;
+    if let Some(kind) = header.text("ObjectType")?.filter(|k| *k != "Image") {
+        return Err(header.invalid("ObjectType", shortened(kind), "Image"));
+    }
+    let (shape, axes) = header.shape()?;
+    let number = header.number()?;
+    let order = header.order()?;
+    if let Some(n) = header.text("ElementNumberOfChannels")?.filter(|n| *n != "1") {
+        return Err(header.invalid("ElementNumberOfChannels", shortened(n), "1: one number a voxel"));
+    }
+    if header.flag("BinaryData")? == Some(false) {
+        return Err(header.invalid("BinaryData", "False (numbers as text)", "True"));
+    }
+    let compressed = header.flag("CompressedData")?.unwrap_or(false);
+    let (spacing, affine) = header.place_of_voxels(axes)?;
+    let grid = VoxelGrid { shape, spacing, center: [0.0; 3] };
+    grid.validate(&header.place)?;
+    let count = grid.len().unwrap_or(0);
+
+    let mut data = open_data(&header, path, input)?;
+    skip_header(&header, &mut data, compressed, count as u64 * number.bytes() as u64)?;
+    if compressed {
+        let left = data.left().unwrap_or(0);
+        let said = header.text("CompressedDataSize")?;
+        // Without a size, or with 0 in its place, the stream goes on to the end of the file.
+        if let Some(said) = said.filter(|s| *s != "0" && s.parse() != Ok(left)) {
+            let expected = format!("{left}, the bytes that {} has for them", data.place());
+            return Err(header.invalid("CompressedDataSize", shortened(said), &expected));
+        }
+        data = data.inflate();
+    }
+    let values = data.numbers("data", count, number, order, |x| x as f32)?;
+    volume::from_file_order(&data, grid, affine, values)
+}
+
+/// The file that holds the voxels: `header_file` itself, just past the header, or another one in its folder.
+fn open_data(header: &Header, path: &Path, header_file: Input) -> Result<Input> {
+    let name = header.required(DATA_FILE)?;
+    if name.eq_ignore_ascii_case("local") {
+        return Ok(header_file);
+    }
+    if name.starts_with("LIST") || name.contains('%') {
+        let expected = "LOCAL or one file (write the volume into one file first)";
+        return Err(header.invalid(DATA_FILE, shortened(name), expected));
+    }
+    let parent = path.parent().filter(|p| !p.as_os_str().is_empty()).unwrap_or(Path::new("."));
+    Input::open_plain(&folder::inside(parent, &header.place, DATA_FILE, name)?)
+}
+
+/// Passes over what stands before the voxels in the data file; a size of −1 says that the voxels are its last bytes.
+fn skip_header(header: &Header, data: &mut Input, compressed: bool, want: u64) -> Result<()> {
+    let Some(text) = header.text("HeaderSize")? else { return Ok(()) };
+    let left = data.left().unwrap_or(0);
+    let skip = match text.parse::<i64>() {
+        Ok(-1) if !compressed => left.saturating_sub(want),
+        Ok(n) if u64::try_from(n).is_ok_and(|n| n <= left) => n.unsigned_abs(),
+        _ => {
+            let expected = format!("a number of bytes up to {left}, or -1 if the data is not compressed");
+            return Err(header.invalid("HeaderSize", shortened(text), &expected));
+        }
+    };
+    data.skip(skip, "HeaderSize")
+}
+
+/// Writes `volume` as `f32`, compressed, in one file.
+pub(crate) fn write(w: &mut dyn Write, path: &Path, volume: &Volume) -> Result<()> {
+    let io = |e| Error::io(path, e);
+    let (ras, _) = affine::of(volume, &path.display().to_string());
+    // The grid's sizes and the lengths of the affine's columns may differ in the last bits: keep the former.
+    let lengths = affine::spacing(&ras);
+    let spacing: [f64; 3] = std::array::from_fn(|k| {
+        let s = volume.grid.spacing[k];
+        if (lengths[k] - s).abs() <= 1e-12 * s { s } else { lengths[k] }
+    });
+    let lps = affine::flip(ras);
+    let turn = (0..3).flat_map(|k| affine::column(&lps, k).map(|x| x / spacing[k]));
+    // The size of the packed data stands before it: pack it aside, in memory while it is small.
+    let folder = path.parent().filter(|p| !p.as_os_str().is_empty()).unwrap_or(Path::new("."));
+    let mut packed = ZlibEncoder::new(tempfile::spooled_tempfile_in(64 << 20, folder), Compression::fast());
+    volume::to_file_order(&mut packed, path, &volume.data)?;
+    let mut packed = packed.finish().map_err(io)?;
+    let size = packed.stream_position().map_err(io)?;
+    packed.rewind().map_err(io)?;
+    let [nx, ny, nz] = volume.grid.shape;
+    let text = format!(
+        "ObjectType = Image\nNDims = 3\nBinaryData = True\nBinaryDataByteOrderMSB = False\nCompressedData = True\n\
+         CompressedDataSize = {size}\nTransformMatrix = {}\nOffset = {}\nCenterOfRotation = 0 0 0\n\
+         ElementSpacing = {}\nDimSize = {nx} {ny} {nz}\nElementType = MET_FLOAT\nElementDataFile = LOCAL\n",
+        list(turn),
+        list(affine::column(&lps, 3)),
+        list(spacing),
+    );
+    w.write_all(text.as_bytes()).map_err(io)?;
+    std::io::copy(&mut packed, w).map_err(io)?;
+    Ok(())
+}
+
+/// Numbers so that reading them gives the same bits.
+fn list(numbers: impl IntoIterator<Item = f64>) -> String {
+    numbers.into_iter().map(|x| format!("{x:?}")).collect::<Vec<_>>().join(" ")
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::{is_volume, read_volume, write_volume};
+    use ndarray::Array3;
+    use std::path::PathBuf;
+
+    fn zlib(bytes: &[u8]) -> Vec<u8> {
+        let mut e = ZlibEncoder::new(Vec::new(), Compression::fast());
+        e.write_all(bytes).unwrap();
+        e.finish().unwrap()
+    }
+
+    struct File(tempfile::TempDir, PathBuf);
+
+    fn file(name: &str, parts: &[&[u8]]) -> File {
+        let dir = tempfile::tempdir().unwrap();
+        let path = dir.path().join(name);
+        std::fs::write(&path, parts.concat()).unwrap();
+        File(dir, path)
+    }
+
+    fn refused(parts: &[&[u8]], words: &[&str]) {
+        let f = file("bad.mha", parts);
+        let e = read_volume(&f.1).unwrap_err().to_string();
+        assert!(e.contains("bad.mha"), "{e}");
+        assert!(words.iter().all(|w| e.contains(w)), "{words:?} are not all in: {e}");
+    }
+
+    /// 2×3×1 voxels of one byte, 0 to 5, with further lines.
+    fn small(lines: &str) -> Vec<u8> {
+        let head = "ObjectType = Image\nNDims = 3\nDimSize = 2 3 1\nElementType = MET_UCHAR\n";
+        [format!("{head}{lines}ElementDataFile = LOCAL\n").as_bytes(), &[0, 1, 2, 3, 4, 5]].concat()
+    }
+
+    fn read_bytes(bytes: &[u8]) -> Volume {
+        let f = file("a.mha", &[bytes]);
+        assert!(is_volume(&f.1));
+        read_volume(&f.1).unwrap()
+    }
+
+    #[test]
+    fn a_header_by_hand_is_read() {
+        let lines = "ElementSpacing = 0.5 2 3e0\nOffset = 10 -20 30\nTransformMatrix = 0 1 0 -1 0 0 0 0 1\n\
+                     CenterOfRotation = 0 0 0\nAnatomicalOrientation = RAI\nComment = a = b: c\n";
+        let v = read_bytes(&small(lines));
+        assert_eq!((v.grid.shape, v.grid.spacing, v.grid.center), ([2, 3, 1], [0.5, 2.0, 3.0], [0.0; 3]));
+        // x fastest.
+        assert_eq!([v.data[[1, 0, 0]], v.data[[0, 1, 0]], v.data[[1, 2, 0]]], [1.0, 2.0, 5.0]);
+        assert!(v.data.is_standard_layout());
+        // The first axis runs along LPS (0, 1, 0), so along RAS (0, −1, 0); the second along −(−1, 0, 0).
+        let want = [[0.0, 2.0, 0.0, -10.0], [-0.5, 0.0, 0.0, 20.0], [0.0, 0.0, 3.0, 30.0], [0.0, 0.0, 0.0, 1.0]];
+        assert_eq!(v.affine, Some(want));
+        // The other names, ends of lines, separators and a fourth axis.
+        let other = "ObjectType: Image\r\nNDims = 4\r\n\r\nDimSize = 2 3 1 1\r\nElementType = MET_UCHAR\r\n\
+                     ElementSize = 0.5 2 3 1\r\nPosition = 10 -20 30 7\r\n\
+                     Rotation = 0 1 0 0 -1 0 0 0 0 0 1 0 0 0 0 1\r\nElementDataFile = Local\r\n";
+        let u = read_bytes(&[other.as_bytes(), &[0, 1, 2, 3, 4, 5]].concat());
+        assert_eq!((u.affine, u.grid, u.data), (v.affine, v.grid, v.data));
+        // Nothing said: 1 mm along LPS. Units are converted.
+        let v = read_bytes(&small(""));
+        assert_eq!(v.affine.unwrap()[0], [-1.0, 0.0, 0.0, 0.0]);
+        assert_eq!(read_bytes(&small("DistanceUnits = cm\nElementSpacing = 1 2 3\n")).grid.spacing, [10.0, 20.0, 30.0]);
+        // A comment may be in any encoding.
+        let latin = [b"Comment = caf\xe9\n".as_slice(), &small("")].concat();
+        assert_eq!(read_bytes(&latin).grid.shape, [2, 3, 1]);
+    }
+
+    #[test]
+    fn every_type_is_read_in_both_orders() {
+        macro_rules! both {
+            ($($name:literal $t:ty: $a:expr, $b:expr;)*) => {$(
+                for (order, bytes) in [
+                    ("False", [<$t>::to_le_bytes($a), <$t>::to_le_bytes($b)].concat()),
+                    ("True", [<$t>::to_be_bytes($a), <$t>::to_be_bytes($b)].concat()),
+                ] {
+                    for (lines, data) in [("", bytes.clone()), ("CompressedData = True\n", zlib(&bytes))] {
+                        let head = format!(
+                            "NDims = 3\nBinaryData = True\nBinaryDataByteOrderMSB = {order}\nDimSize = 1 2 1\n{lines}\
+                             ElementType = {}\nElementDataFile = LOCAL\n", $name);
+                        let v = read_bytes(&[head.as_bytes(), &data].concat());
+                        assert_eq!(v.data.as_slice().unwrap(), [$a as f32, $b as f32], "{} {order}", $name);
+                    }
+                }
+            )*};
+        }
+        both! {
+            "MET_CHAR" i8: -128, 127;
+            "MET_UCHAR" u8: 0, 255;
+            "MET_SHORT" i16: -32768, 258;
+            "MET_USHORT" u16: 65535, 258;
+            "MET_INT" i32: i32::MIN, 16909060;
+            "MET_UINT" u32: u32::MAX, 16909060;
+            "MET_LONG" i32: -5, 16909060;
+            "MET_ULONG" u32: 5, 16909060;
+            "MET_LONG_LONG" i64: i64::MIN, 72623859790382856i64;
+            "MET_ULONG_LONG" u64: u64::MAX, 72623859790382856u64;
+            "MET_FLOAT" f32: -1.5, 3.25e-30;
+            "MET_DOUBLE" f64: -1.5, 0.1;
+        }
+    }
+
+    #[test]
+    fn a_file_beside_the_header_is_read_but_none_elsewhere() {
+        let dir = tempfile::tempdir().unwrap();
+        let inner = dir.path().join("in");
+        std::fs::create_dir(&inner).unwrap();
+        let head = |lines: &str, name: &str| {
+            let start = "NDims = 3\nDimSize = 2 3 1\nElementType = MET_UCHAR\n";
+            std::fs::write(inner.join("a.mhd"), format!("{start}{lines}ElementDataFile = {name}\n")).unwrap();
+            read_volume(inner.join("a.mhd"))
+        };
+        let voxels = [0x1f, 0x8b, 2, 3, 4, 5];
+        // These bytes are gzip's mark by chance: a raw file is not looked into.
+        std::fs::write(inner.join("a.raw"), voxels).unwrap();
+        std::fs::write(inner.join("b.zraw"), zlib(&voxels)).unwrap();
+        std::fs::write(inner.join("c.raw"), [&[9; 7], voxels.as_slice()].concat()).unwrap();
+        std::fs::write(dir.path().join("out.raw"), voxels).unwrap();
+        let want = voxels.map(f32::from);
+        let size = zlib(&voxels).len();
+        for (lines, name) in [
+            ("".to_owned(), "a.raw"),
+            ("CompressedData = True\n".into(), "b.zraw"),
+            (format!("CompressedData = True\nCompressedDataSize = {size}\n"), "b.zraw"),
+            ("HeaderSize = 7\n".into(), "c.raw"),
+            ("HeaderSize = -1\n".into(), "./c.raw"),
+        ] {
+            let v = head(&lines, name).unwrap();
+            let found: Vec<f32> = v.data.t().iter().copied().collect();
+            assert_eq!(found, want, "{lines}{name}");
+        }
+        let absolute = dir.path().join("out.raw").display().to_string();
+        for (name, word) in [
+            ("../out.raw", "inside the folder"),
+            (absolute.as_str(), "inside the folder"),
+            ("sub/../../out.raw", "inside the folder"),
+            ("none.raw", "none.raw"),
+            ("LIST", "LOCAL or one file"),
+            ("slice%03d.raw 1 2 1", "LOCAL or one file"),
+            ("", "inside the folder"),
+        ] {
+            let e = head("", name).unwrap_err().to_string();
+            assert!(e.contains("a.mhd") && e.contains(DATA_FILE) && e.contains(word), "{name}: {e}");
+        }
+        let e = head("HeaderSize = 99\n", "a.raw").unwrap_err().to_string();
+        assert!(e.contains("HeaderSize") && e.contains("99"), "{e}");
+        #[cfg(unix)]
+        {
+            std::os::unix::fs::symlink(dir.path().join("out.raw"), inner.join("link.raw")).unwrap();
+            let e = head("", "link.raw").unwrap_err().to_string();
+            assert!(e.contains("out of the folder"), "{e}");
+        }
+    }
+
+    #[test]
+    fn hostile_files_are_refused_in_words() {
+        refused(&[], &["MetaImage", "0 bytes"]);
+        let whole = small("");
+        refused(&[&whole[..whole.len() - 1]], &["data", "5 bytes", "6 bytes"]);
+        refused(&[&whole, &[0]], &["data", "7 bytes", "6 bytes"]);
+        refused(&[&whole[..40]], &[DATA_FILE, "end of the file after 3 lines"]);
+        let with = |from: &str, to: &str| String::from_utf8(small("")).unwrap().replace(from, to).into_bytes();
+        for (n, bad) in [("NDims", "2"), ("NDims", "0"), ("NDims", "5"), ("NDims", "-3"), ("NDims", "x")] {
+            refused(&[&with("NDims = 3", &format!("NDims = {bad}"))], &[n, bad, "3, or 4"]);
+        }
+        refused(&[&with("NDims = 3", "NDims = 4")], &["DimSize", "2 3 1", "4 numbers"]);
+        refused(&[&with("NDims = 3", "NDims = 3\nNDims = 3")], &["NDims", "two entries"]);
+        let huge = "4294967296 4294967296 4294967296";
+        refused(&[&with("2 3 1", huge)], &["DimSize", huge, "can be addressed"]);
+        refused(&[&with("2 3 1", "99999999999999999999 1 1")], &["DimSize", "whole numbers"]);
+        refused(&[&with("2 3 1", "2 0 1")], &["DimSize", "above 0"]);
+        refused(&[&with("2 3 1", "2 -3 1")], &["DimSize", "above 0"]);
+        refused(&[&with("2 3 1", "100000 100000 10000")], &["data", "6 bytes", "100000000000000 bytes"]);
+        let four = "NDims = 4\nDimSize = 1 1 1 9\nElementType = MET_UCHAR\nElementDataFile = LOCAL\n";
+        refused(&[four.as_bytes(), &[0; 9]], &["DimSize", "series"]);
+        for bad in ["MET_STRING", "MET_OTHER", "MET_FLOAT_MATRIX", "float"] {
+            refused(&[&with("MET_UCHAR", bad)], &["ElementType", bad]);
+        }
+        refused(&[&small("ElementNumberOfChannels = 3\n")], &["ElementNumberOfChannels", "\"3\""]);
+        refused(&[&small("BinaryData = False\n")], &["BinaryData", "text"]);
+        refused(&[&small("CompressedData = maybe\n")], &["CompressedData", "maybe"]);
+        refused(&[&small("ElementByteOrderMSB = True\nBinaryDataByteOrderMSB = False\n")], &["ElementByteOrderMSB"]);
+        refused(&[&small("ElementSpacing = 1 0 1\n")], &["ElementSpacing", "above 0"]);
+        refused(&[&small("ElementSpacing = 1 nan 1\n")], &["ElementSpacing", "finite"]);
+        refused(&[&small("Offset = 1 2\n")], &["Offset", "3 finite numbers"]);
+        refused(&[&small("TransformMatrix = 1 0 0 1 0 0 0 0 1\n")], &["TransformMatrix", "independent"]);
+        refused(&[&small("DistanceUnits = ell\n")], &["DistanceUnits", "ell"]);
+        refused(&[&small("ObjectType = Tube\n")], &["ObjectType", "two entries"]);
+        refused(&[&with("ObjectType = Image", "ObjectType = Tube")], &["ObjectType", "Tube"]);
+        refused(&[&small("no value here\n")], &["line 5", "Name = value"]);
+        // Bytes that are no text, in a name and in a value that counts.
+        refused(&[b"NDims = 3\nCaf\xe9 = 1\n", &small("")], &["line 2", "Name = value"]);
+        refused(&[b"NDims = 3\nDimSize = \xff\xfe 1 1\nElementDataFile = LOCAL\n"], &["DimSize", "UTF-8"]);
+        // A header without an end.
+        refused(&[b"NDims = 3\n", &b"Comment = x\n".repeat(10_000)], &[DATA_FILE, "65536"]);
+        refused(&[b"NDims = 3\nComment = ", &[b'x'; 100_000]], &[DATA_FILE, "65536"]);
+        let nan = "NDims = 3\nDimSize = 1 1 2\nElementType = MET_FLOAT\nElementDataFile = LOCAL\n";
+        refused(&[nan.as_bytes(), &[0; 4], &f32::NAN.to_le_bytes()], &["voxel [0, 0, 1]", "NaN"]);
+        let f = file("a.mha.gz", &[]);
+        let mut e = flate2::write::GzEncoder::new(std::fs::File::create(&f.1).unwrap(), Compression::fast());
+        e.write_all(&whole).unwrap();
+        e.finish().unwrap();
+        assert!(read_volume(&f.1).unwrap_err().to_string().contains("MetaImage inside gzip"));
+    }
+
+    #[test]
+    fn hostile_streams_are_refused_in_words() {
+        let head = |size: &str, dims: &str| {
+            format!(
+                "NDims = 3\nDimSize = {dims}\nElementType = MET_UCHAR\nCompressedData = True\n\
+                 CompressedDataSize = {size}\nElementDataFile = LOCAL\n"
+            )
+            .into_bytes()
+        };
+        let six = zlib(&[7; 6]);
+        let n = six.len();
+        assert_eq!(read_bytes(&[head(&n.to_string(), "2 3 1"), six.clone()].concat()).data.sum(), 42.0);
+        // The size lies either way, or is none.
+        for bad in [(n - 1).to_string(), (n + 1).to_string(), "-1".into(), u64::MAX.to_string(), "x".into()] {
+            refused(&[&head(&bad, "2 3 1"), &six], &["CompressedDataSize", &bad, &format!("expected {n}")]);
+        }
+        // Too few bytes, and a claim that no stream of this length could keep.
+        refused(&[&head("0", "2 3 2"), &six], &["data", "after 6 bytes", "12 bytes"]);
+        refused(&[&head("0", "4000 4000 4000"), &six], &["data", "64000000000 bytes in a zlib stream"]);
+        // A bomb is not unpacked further than the header goes.
+        let bomb = zlib(&vec![0; 64 << 20]);
+        refused(&[&head("0", "2 3 1"), &bomb], &["data", "more data", "6 bytes"]);
+        // Damage, a missing end, something behind the end, another kind of stream.
+        let mut bad = six.clone();
+        bad[n - 1] ^= 1;
+        refused(&[&head("0", "2 3 1"), &bad], &["zlib stream"]);
+        refused(&[&head("0", "2 3 1"), &six[..n - 6]], &["zlib stream", "incomplete"]);
+        refused(&[&head("0", "2 3 1"), &six, &[0]], &["zlib stream", "after the end"]);
+        refused(&[&head("0", "2 3 1"), &[0x1f, 0x8b, 8, 0]], &["zlib stream"]);
+        refused(&[&head("0", "2 3 1")], &["data"]);
+    }
+
+    #[test]
+    fn nifti_and_back_keeps_spacing_orientation_and_values_to_the_bit() {
+        let dir = tempfile::tempdir().unwrap();
+        let (s, c) = 0.3f64.sin_cos();
+        let round = |x: f64| f64::from(x as f32);
+        // Turned about two axes, with the bits that NIfTI's numbers have.
+        let turned = [
+            [round(0.7 * c), round(-1.3 * s), 0.0, round(-12.34)],
+            [round(0.7 * s), round(1.3 * c * c), round(-2.1 * s), round(56.78)],
+            [0.0, round(1.3 * c * s), round(2.1 * c), round(0.1)],
+            [0.0, 0.0, 0.0, 1.0],
+        ];
+        let straight = [[-0.75, 0.0, 0.0, 5.5], [0.0, 0.0, 2.0, -6.0], [0.0, 0.125, 0.0, 7.25], [0.0, 0.0, 0.0, 1.0]];
+        let data = Array3::from_shape_fn((4, 3, 2), |(x, y, z)| ((x + 7 * y) as f32).sin() * 1e-3 + z as f32);
+        for (name, affine) in [("turned", turned), ("straight", straight)] {
+            let spacing = affine::spacing(&affine);
+            let grid = VoxelGrid { shape: [4, 3, 2], spacing, center: [0.0; 3] };
+            let v = Volume { data: data.clone(), grid, affine: Some(affine) };
+            let at = |end: &str| dir.path().join(format!("{name}{end}"));
+            write_volume(at(".nii"), &v).unwrap();
+            let first = read_volume(at(".nii")).unwrap();
+            write_volume(at(".mha"), &first).unwrap();
+            let second = read_volume(at(".mha")).unwrap();
+            write_volume(at("2.nii"), &second).unwrap();
+            write_volume(at("2.mha"), &read_volume(at("2.nii")).unwrap()).unwrap();
+            assert_eq!((second.grid, &second.data), (first.grid, &first.data), "{name}");
+            let bytes = |end: &str| std::fs::read(at(end)).unwrap();
+            assert!(bytes(".nii") == bytes("2.nii"), "{name}: the NIfTI files differ");
+            assert!(bytes(".mha") == bytes("2.mha"), "{name}: the MetaImage files differ");
+            if name == "straight" {
+                assert_eq!(second.affine, first.affine);
+            }
+        }
+        // Without an affine both put the grid's centre at the same place.
+        let mut v = Volume::centered(data, [0.5, 0.75, 2.0]);
+        v.grid.center = [1.0, 2.0, 3.0];
+        for end in ["c.mha", "c.nii"] {
+            write_volume(dir.path().join(end), &v).unwrap();
+            let a = read_volume(dir.path().join(end)).unwrap().affine.unwrap();
+            assert_eq!(a, [[0.5, 0.0, 0.0, 0.25], [0.0, 0.75, 0.0, 1.25], [0.0, 0.0, 2.0, 2.0], [0.0, 0.0, 0.0, 1.0]]);
+        }
+    }
+
+    #[test]
+    fn the_written_header_is_this_one() {
+        let f = file("a.mha", &[]);
+        write_volume(&f.1, &Volume::centered(Array3::zeros((2, 1, 1)), [0.1, 2.0, 3.0])).unwrap();
+        let bytes = std::fs::read(&f.1).unwrap();
+        let packed = zlib(&[0; 8]);
+        let text = format!(
+            "ObjectType = Image\nNDims = 3\nBinaryData = True\nBinaryDataByteOrderMSB = False\n\
+             CompressedData = True\nCompressedDataSize = {}\nTransformMatrix = -1.0 0.0 0.0 0.0 -1.0 0.0 0.0 0.0 1.0\n\
+             Offset = 0.05 0.0 0.0\nCenterOfRotation = 0 0 0\nElementSpacing = 0.1 2.0 3.0\nDimSize = 2 1 1\n\
+             ElementType = MET_FLOAT\nElementDataFile = LOCAL\n",
+            packed.len()
+        );
+        assert_eq!(String::from_utf8_lossy(&bytes[..text.len()]), text);
+        assert_eq!(bytes[text.len()..], packed);
+        assert!(f.0.path().read_dir().unwrap().count() == 1, "something is left beside the file");
+    }
+
+    proptest::proptest! {
+        #[test]
+        fn no_bytes_make_it_panic(changes in proptest::collection::vec((0usize..400, 0u8..), 1..12)) {
+            let lines = "Offset = 1 2 3\nElementSpacing = 1 2 3\nTransformMatrix = 1 0 0 0 1 0 0 0 1\nHeaderSize = 0\n";
+            let mut bytes = small(lines);
+            let n = bytes.len();
+            for (at, x) in changes {
+                bytes[at % n] = x;
+            }
+            let _ = read_volume(&file("a.mha", &[&bytes]).1);
+        }
+    }
+}

@@ -1,0 +1,219 @@
+//! Volumes to and from SimpleITK and nibabel.
+//!
+//! `CONEFIELD_PYTHON` names the interpreter, `python3` if it is not set. Without the modules a test says that it skips.
+
+use conefield_core::geometry::VoxelGrid;
+use conefield_core::scan::Volume;
+use conefield_io::{read_volume, write_volume};
+use ndarray::Array3;
+use std::path::Path;
+use std::process::Command;
+
+/// The interpreter, or `None` with a note if it lacks one of `modules`.
+fn python(modules: &[&str]) -> Option<String> {
+    let name = std::env::var("CONEFIELD_PYTHON").unwrap_or_else(|_| "python3".into());
+    let import = format!("import {}", modules.join(", "));
+    let found = Command::new(&name).args(["-c", &import]).output();
+    if found.is_ok_and(|o| o.status.success()) {
+        return Some(name);
+    }
+    eprintln!("skipped: {name} has no {}; CONEFIELD_PYTHON names one that has", modules.join(" and "));
+    None
+}
+
+/// Runs `script` in `folder` and gives what it printed.
+fn run(python: &str, folder: &Path, script: &str) -> String {
+    let out = Command::new(python).args(["-c", script]).current_dir(folder).output().unwrap();
+    assert!(out.status.success(), "{}", String::from_utf8_lossy(&out.stderr));
+    String::from_utf8(out.stdout).unwrap()
+}
+
+fn numbers(text: &str) -> Vec<f64> {
+    text.split_whitespace().map(|t| t.parse().unwrap()).collect()
+}
+
+/// 4×3×2 voxels, turned about two axes, off the origin.
+fn turned() -> Volume {
+    let (s, c) = 0.3f64.sin_cos();
+    let affine = [
+        [0.5 * c, -0.75 * s * c, 2.0 * s * s, -12.5],
+        [0.5 * s, 0.75 * c * c, -2.0 * s * c, 34.25],
+        [0.0, 0.75 * s, 2.0 * c, 5.0],
+        [0.0, 0.0, 0.0, 1.0],
+    ];
+    let grid = VoxelGrid { shape: [4, 3, 2], spacing: [0.5, 0.75, 2.0], center: [0.0; 3] };
+    let data = Array3::from_shape_fn((4, 3, 2), |(x, y, z)| x as f32 + 10.0 * y as f32 - 100.5 * z as f32);
+    Volume { data, grid, affine: Some(affine) }
+}
+
+fn assert_affine(found: &[f64], volume: &Volume, tolerance: f64, what: &str) {
+    let want = volume.affine.unwrap();
+    assert_eq!(found.len(), 16, "{what}: {found:?}");
+    for (f, w) in found.iter().zip(want.iter().flatten()) {
+        assert!((f - w).abs() <= tolerance, "{what}: {found:?}, not {want:?}");
+    }
+}
+
+fn assert_same(found: &Volume, want: &Volume, tolerance: f64, what: &str) {
+    assert_eq!(found.data, want.data, "{what}");
+    for (f, w) in found.grid.spacing.iter().zip(want.grid.spacing) {
+        assert!((f - w).abs() <= tolerance, "{what}: {:?}", found.grid.spacing);
+    }
+    assert_affine(&found.affine.unwrap().concat(), want, tolerance, what);
+}
+
+/// Prints the affine in RAS, then the voxels, x fastest, of an ITK image.
+const SHOW: &str = "
+import SimpleITK as sitk, numpy as np
+def show(image):
+    d = np.array(image.GetDirection()).reshape(3, 3) * np.array(image.GetSpacing())
+    a = np.vstack([np.column_stack([d, image.GetOrigin()]), [0, 0, 0, 1]])
+    a[:2] *= -1
+    print(*[float(x) for x in a.ravel()], *[float(x) for x in sitk.GetArrayFromImage(image).ravel()])
+";
+
+/// What [`SHOW`] prints of `volume`.
+fn assert_shown(text: &str, volume: &Volume, tolerance: f64, what: &str) {
+    let found = numbers(text);
+    assert_affine(&found[..16], volume, tolerance, what);
+    let values: Vec<f64> = volume.data.t().iter().map(|x| f64::from(*x)).collect();
+    assert_eq!(found[16..], values, "{what}");
+}
+
+#[test]
+fn simple_itk_reads_what_is_written() {
+    let Some(python) = python(&["SimpleITK", "numpy"]) else { return };
+    let dir = tempfile::tempdir().unwrap();
+    let v = turned();
+    for (name, tolerance) in [("a.mha", 1e-12), ("a.nii.gz", 1e-5)] {
+        write_volume(dir.path().join(name), &v).unwrap();
+        let text = run(&python, dir.path(), &format!("{SHOW}\nshow(sitk.ReadImage('{name}'))"));
+        assert_shown(&text, &v, tolerance, name);
+    }
+}
+
+#[test]
+fn what_simple_itk_writes_is_read() {
+    let Some(python) = python(&["SimpleITK", "numpy"]) else { return };
+    let dir = tempfile::tempdir().unwrap();
+    let v = turned();
+    write_volume(dir.path().join("a.mha"), &v).unwrap();
+    let script = "
+import SimpleITK as sitk
+a = sitk.ReadImage('a.mha')
+for end in ['mha', 'mhd', 'nii', 'nii.gz']:
+    for packed in [False, True]:
+        sitk.WriteImage(a, f'{int(packed)}.{end}', packed)
+for name in ['Int8', 'UInt8', 'Int16', 'UInt16', 'Int32', 'UInt32', 'Int64', 'UInt64', 'Float64']:
+    b = sitk.Cast(sitk.Abs(a) / 2, getattr(sitk, 'sitk' + name))
+    sitk.WriteImage(b, name + '.mha', True)
+    sitk.WriteImage(b, name + '.nii')
+    sitk.WriteImage(sitk.Cast(b, sitk.sitkFloat32), name + '_want.mha')
+";
+    run(&python, dir.path(), script);
+    for packed in 0..2 {
+        for end in ["mha", "mhd", "nii", "nii.gz"] {
+            let name = format!("{packed}.{end}");
+            assert_same(&read_volume(dir.path().join(&name)).unwrap(), &v, 1e-5, &name);
+        }
+    }
+    for kind in ["Int8", "UInt8", "Int16", "UInt16", "Int32", "UInt32", "Int64", "UInt64", "Float64"] {
+        let want = read_volume(dir.path().join(format!("{kind}_want.mha"))).unwrap();
+        for end in ["mha", "nii"] {
+            let name = format!("{kind}.{end}");
+            assert_same(&read_volume(dir.path().join(&name)).unwrap(), &want, 1e-5, &name);
+        }
+    }
+}
+
+#[test]
+fn nibabel_agrees_on_nifti() {
+    let Some(python) = python(&["nibabel", "numpy"]) else { return };
+    let dir = tempfile::tempdir().unwrap();
+    let v = turned();
+    write_volume(dir.path().join("a.nii.gz"), &v).unwrap();
+    let script = "
+import nibabel as nib, numpy as np
+def show(n):
+    print(*[float(x) for x in n.affine.ravel()], *[float(x) for x in n.get_fdata(dtype=np.float32).ravel(order='F')])
+a = nib.load('a.nii.gz')
+show(a)
+for kind in ['u1', 'i1', 'u2', 'i2', 'u4', 'i4', 'u8', 'i8', 'f4', 'f8']:
+    for order in '<>':
+        for form in 'qs':
+            header = nib.Nifti1Header(endianness=order)
+            header.set_data_dtype(np.dtype(order + kind))
+            stored = np.arange(24).reshape(4, 3, 2).astype(order + kind)
+            n = nib.Nifti1Image(stored, None, header)
+            n.header.set_xyzt_units('mm')
+            (n.set_qform if form == 'q' else n.set_sform)(a.affine, 1)
+            n.header.set_slope_inter(0.25, -3)
+            # As they are: the writer must not rescale them.
+            with open(f'{kind}{\"le\" if order == \"<\" else \"be\"}{form}.nii', 'wb') as f:
+                n.header['magic'] = b'n+1'
+                n.header['vox_offset'] = 352
+                f.write(n.header.binaryblock + bytes(4) + stored.tobytes(order='F'))
+            show(nib.load(f.name))
+";
+    let text = run(&python, dir.path(), script);
+    let mut lines = text.lines();
+    assert_shown(lines.next().unwrap(), &v, 1e-5, "a.nii.gz");
+    for kind in ["u1", "i1", "u2", "i2", "u4", "i4", "u8", "i8", "f4", "f8"] {
+        for order in ["le", "be"] {
+            for form in ["q", "s"] {
+                let name = format!("{kind}{order}{form}.nii");
+                let found = read_volume(dir.path().join(&name)).unwrap();
+                assert_shown(lines.next().unwrap(), &found, 1e-5, &name);
+                assert_eq!(found.data[[3, 2, 1]], 23.0 * 0.25 - 3.0, "{name}");
+            }
+        }
+    }
+    assert_eq!(lines.next(), None);
+}
+
+#[test]
+fn simple_itk_agrees_on_a_dicom_series() {
+    let Some(python) = python(&["SimpleITK", "numpy"]) else { return };
+    let dir = tempfile::tempdir().unwrap();
+    let v = turned();
+    write_volume(dir.path().join("a.mha"), &v).unwrap();
+    let script = format!(
+        "{SHOW}
+import os
+big = sitk.Resample(sitk.ReadImage('a.mha'), [40, 30, 6], sitk.Transform(), sitk.sitkLinear, sitk.ReadImage('a.mha').GetOrigin(),
+                    [0.05, 0.07, 0.3], sitk.ReadImage('a.mha').GetDirection())
+a = sitk.Cast(big * 7, sitk.sitkInt16)
+d = a.GetDirection()
+for kind in ['plain', 'JPEG']:
+    os.mkdir(kind)
+    w = sitk.ImageFileWriter()
+    w.KeepOriginalImageUIDOn()
+    if kind != 'plain':
+        w.UseCompressionOn()
+        w.SetCompressor(kind)
+    for k in range(a.GetDepth()):
+        s = a[:, :, k]
+        s.SetMetaData('0008|0060', 'CT')
+        s.SetMetaData('0020|000e', '1.2.3.4')
+        s.SetMetaData('0028|1052', '0')
+        s.SetMetaData('0028|1053', '1')
+        s.SetMetaData('0008|0018', f'1.2.3.4.{{k}}')
+        s.SetMetaData('0020|0037', '\\\\'.join(repr(d[i]) for i in [0, 3, 6, 1, 4, 7]))
+        s.SetMetaData('0020|0032', '\\\\'.join(map(repr, a.TransformIndexToPhysicalPoint((0, 0, k)))))
+        w.SetFileName(f'{{kind}}/{{9 - k}}.dcm')
+        w.Execute(s)
+    r = sitk.ImageSeriesReader()
+    r.SetFileNames(r.GetGDCMSeriesFileNames(kind))
+    show(r.Execute())
+"
+    );
+    let text = run(&python, dir.path(), &script);
+    for (kind, line) in ["plain", "JPEG"].iter().zip(text.lines()) {
+        let file = std::fs::read(dir.path().join(kind).join("4.dcm")).unwrap();
+        // The transfer syntax of lossless JPEG.
+        assert_eq!(file.windows(22).any(|w| w == b"1.2.840.10008.1.2.4.70"), *kind == "JPEG");
+        let found = read_volume(dir.path().join(kind)).unwrap();
+        assert_shown(line, &found, 1e-6, kind);
+        assert!(found.data.iter().any(|x| *x < 0.0) && found.data.iter().any(|x| *x > 100.0), "{kind}");
+    }
+}
