@@ -8,8 +8,7 @@ use std::path::PathBuf;
 
 /// Rewrite a volume or a scan in another format.
 ///
-/// Volumes: NIfTI (.nii, .nii.gz), MetaImage (.mha) and NumPy (.npy), by the name of OUT; IN may also be a .mhd or the
-/// folder of a DICOM series. Scans: as --to says.
+/// Volumes: NIfTI (.nii, .nii.gz) and NumPy (.npy), by the name of OUT. Scans: folders, as --to says.
 #[derive(Args)]
 pub struct Convert {
     /// A volume or a scan.
@@ -36,6 +35,8 @@ enum ScanFormat {
     Conefield,
     /// R2-Gaussian's folder.
     R2,
+    /// The one file (a pickle) of NAF and SAX-NeRF.
+    Naf,
 }
 
 impl Convert {
@@ -51,6 +52,7 @@ impl Convert {
             match self.to {
                 ScanFormat::Conefield => conefield_io::write_scan(&self.output, &scan, truth.as_ref())?,
                 ScanFormat::R2 => conefield_io::write_r2(&self.output, &scan, None, truth.as_ref())?,
+                ScanFormat::Naf => conefield_io::write_naf(&self.output, &scan, None, truth.as_ref())?,
             }
         }
         out::say(&self.output.display().to_string())
