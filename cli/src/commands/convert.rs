@@ -8,7 +8,8 @@ use std::path::PathBuf;
 
 /// Rewrite a volume or a scan in another format.
 ///
-/// Volumes: NIfTI (.nii, .nii.gz) and NumPy (.npy), by the name of OUT. Scans: folders, as --to says.
+/// Volumes: NIfTI (.nii, .nii.gz), MetaImage (.mha) and NumPy (.npy), by the name of OUT; IN may also be a .mhd or the
+/// folder of a DICOM series. Scans: as --to says.
 #[derive(Args)]
 pub struct Convert {
     /// A volume or a scan.
