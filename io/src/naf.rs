@@ -167,7 +167,6 @@ impl Description {
             let item = required(top, key)?;
             positive(&item, [item.number()?], "a positive finite distance in mm").map(|[x]| x)
         };
-        let offset = |key: &str| top.get(key);
         let (detector, voxels) = (required(top, "nDetector")?, required(top, "nVoxel")?);
         let (pixel, spacing) = (required(top, "dDetector")?, required(top, "dVoxel")?);
         Ok(Self {
@@ -175,7 +174,7 @@ impl Description {
             dsd: distance("DSD")?,
             detector: counts(&detector, "pixels along [v, u]")?,
             pixel: positive(&pixel, pixel.list("pixel size along [v, u]")?, "positive lengths in mm along [v, u]")?,
-            offset: offset("offDetector")?.map_or(Ok([0.0; 2]), |i| i.list("mm along [v, u]"))?,
+            offset: top.get("offDetector")?.map_or(Ok([0.0; 2]), |i| i.list("mm along [v, u]"))?,
             grid: VoxelGrid {
                 shape: counts(&voxels, "voxels along [x, y, z]")?,
                 spacing: positive(
@@ -183,7 +182,7 @@ impl Description {
                     spacing.list("voxel size along [x, y, z]")?,
                     "positive lengths in mm along [x, y, z]",
                 )?,
-                center: offset("offOrigin")?.map_or(Ok([0.0; 3]), |i| i.list("mm along [x, y, z]"))?,
+                center: top.get("offOrigin")?.map_or(Ok([0.0; 3]), |i| i.list("mm along [x, y, z]"))?,
             },
         })
     }
@@ -540,8 +539,10 @@ mod tests {
         assert!(apart(&read_naf(&path).unwrap().train.geometry, &swapped.geometry) < 1e-9);
     }
 
+    type Entries = Vec<(&'static str, Out<'static>)>;
+
     /// A minimal file whose entries can be changed.
-    fn written(change: &dyn Fn(&mut Vec<(&'static str, Out<'static>)>)) -> (tempfile::TempDir, PathBuf) {
+    fn written(change: &dyn Fn(&mut Entries)) -> (tempfile::TempDir, PathBuf) {
         let ints = |xs: &[usize]| Out::List(xs.iter().map(|x| Out::Int(*x)).collect());
         let floats = |xs: &[f64]| Out::List(xs.iter().map(|x| Out::Float(*x)).collect());
         let mut entries = vec![
@@ -582,7 +583,7 @@ mod tests {
 
     #[test]
     fn lying_descriptions_are_refused_in_words() {
-        let refused = |change: &dyn Fn(&mut Vec<(&'static str, Out<'static>)>), words: &[&str]| {
+        let refused = |change: &dyn Fn(&mut Entries), words: &[&str]| {
             let (_dir, path) = written(change);
             let e = read_naf(&path).unwrap_err().to_string();
             let words = [&["a.pickle"], words].concat();

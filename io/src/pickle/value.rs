@@ -122,7 +122,7 @@ impl<'a> Heap<'a> {
     fn child(&self, node: usize, index: usize) -> Option<Value<'a>> {
         match self.nodes.get(node)? {
             Node::Tuple(v) | Node::List(v) => v.get(index).copied(),
-            Node::Dict(v) => v.get(index / 2).map(|(key, value)| if index % 2 == 0 { *key } else { *value }),
+            Node::Dict(v) => v.get(index / 2).map(|(key, value)| [*key, *value][index % 2]),
             _ => None,
         }
     }
