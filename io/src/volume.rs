@@ -61,16 +61,19 @@ pub fn read_volume(path: impl AsRef<Path>) -> Result<Volume> {
     nifti::read_from(&mut input, &head)
 }
 
-/// Whether the file, or the folder with DICOM files in it, looks like a volume that [`read_volume`] understands; its
-/// data is not read.
+/// Whether the file, or the folder with DICOM files in it, looks like a volume; its data is not read. True of a single
+/// DICOM file as well, for which [`read_volume`] asks for the folder.
 pub fn is_volume(path: impl AsRef<Path>) -> bool {
     let path = path.as_ref();
     if path.is_dir() {
         return dicom::is_series(path);
     }
-    Input::open(path)
-        .and_then(|mut i| i.take(nifti::HEADER))
-        .is_ok_and(|head| head.starts_with(npy::MAGIC) || nifti::is_header(&head) || metaimage::is_header(&head))
+    Input::open(path).and_then(|mut i| i.take(nifti::HEADER)).is_ok_and(|head| {
+        head.starts_with(npy::MAGIC)
+            || nifti::is_header(&head)
+            || metaimage::is_header(&head)
+            || dicom::is_header(&head)
+    })
 }
 
 /// Writes a volume as its name asks: `.nii`, `.nii.gz` (both `f32` with an sform in mm), `.mha` (`f32`, zlib, with the

@@ -198,6 +198,7 @@ fn series_that_are_no_volume_are_refused() {
     refused(&empty, &["DICOM slices", "none among 0 files"]);
     // One file of a series is no volume; its folder is.
     let dir = series(EXPLICIT, |_, _| {});
+    assert!(is_volume(dir.path().join("5.dcm")));
     let e = read_volume(dir.path().join("5.dcm")).unwrap_err().to_string();
     assert!(e.contains("5.dcm") && e.contains("folder"), "{e}");
 }
