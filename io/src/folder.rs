@@ -15,6 +15,15 @@ pub(crate) fn plain(folder: &Path, place: &str, field: &str, name: &str) -> Resu
 
 /// The file at the relative path `name` in `folder`, refused if it leads out, also through a link.
 pub(crate) fn inside(folder: &Path, place: &str, field: &str, name: &str) -> Result<PathBuf> {
+    let path = within(folder, place, field, name)?;
+    if !path.is_file() {
+        return Err(Error::invalid(place, field, format!("\"{name}\""), "a file"));
+    }
+    Ok(path)
+}
+
+/// As [`inside`], for a file or a folder.
+pub(crate) fn within(folder: &Path, place: &str, field: &str, name: &str) -> Result<PathBuf> {
     let shown = || format!("\"{name}\"");
     let down = Path::new(name).components().all(|c| matches!(c, Component::Normal(_) | Component::CurDir));
     if name.is_empty() || !down || name.contains(['\\', ':', '\0']) {
@@ -26,9 +35,6 @@ pub(crate) fn inside(folder: &Path, place: &str, field: &str, name: &str) -> Res
     if !real.starts_with(&root) {
         let found = format!("{}, a link out of the folder", shown());
         return Err(Error::invalid(place, field, found, "a file inside the folder"));
-    }
-    if !real.is_file() {
-        return Err(Error::invalid(place, field, shown(), "a file"));
     }
     Ok(path)
 }

@@ -26,6 +26,11 @@ pub(crate) struct Input {
 }
 
 impl Input {
+    /// What `reader` gives, `size` bytes as far as is known, under the name that errors shall use.
+    pub fn within(name: PathBuf, reader: impl Read + 'static, size: u64) -> Self {
+        Self { path: name, reader: Box::new(BufReader::with_capacity(1 << 16, reader)), size, packed: None, at: 0 }
+    }
+
     /// Opens `path` and unpacks it if it starts with gzip's magic number.
     pub fn open(path: &Path) -> Result<Self> {
         let mut input = Self::open_plain(path)?;

@@ -3,6 +3,7 @@
 //! - Volumes: [`read_volume`], [`write_volume`] (NIfTI, MetaImage, NumPy; a DICOM series in).
 //! - Scans: [`read_scan`], [`read_truth`], [`write_scan`] (conefield's own folder), [`read_r2`], [`write_r2`]
 //!   (R2-Gaussian's folder), [`read_naf`], [`write_naf`] (NAF's file).
+//! - Projections as scanners give them: [`read_scanner`] (a description in TOML; TIFF, NumPy, RTK's XML geometry).
 //! - Weights: [`read_weights`], [`write_weights`]; checkpoints: [`read_checkpoint`], [`write_checkpoint`] (safetensors).
 //! - Pictures: [`slices_png`], [`compare_png`], [`curves_png`].
 //!
@@ -15,8 +16,12 @@
 
 mod affine;
 mod atomic;
+mod bad_pixels;
+mod border;
 mod canvas;
+mod check;
 mod checkpoint;
+mod counts;
 mod curves;
 mod dicom;
 mod folder;
@@ -25,15 +30,20 @@ mod metaimage;
 mod naf;
 mod nifti;
 mod npy;
+mod npz;
 mod number;
 mod orbit;
 mod pickle;
 mod r2;
 mod rays;
+mod rtk;
 mod scan;
 mod scan_folder;
+mod scanner;
 mod slices;
+mod stack;
 mod text;
+mod tiff;
 mod unit;
 mod volume;
 mod weights;
@@ -42,13 +52,17 @@ mod weights;
 mod testing;
 
 pub use atomic::{is_unfinished, write_atomic, write_folder_atomic, write_text_atomic};
+pub use check::{LineIntegralCheck, check_line_integrals};
 pub use checkpoint::{read_checkpoint, write_checkpoint};
+pub use counts::{Correction, CountsReport, OpenBeam, line_integrals};
 pub use curves::{Corner, CurveOptions, curves_png, curves_png_with};
 pub use naf::{NafScan, read_naf, write_naf};
 pub use orbit::Orbit;
 pub use r2::{R2Scan, read_r2, write_r2};
+pub use rtk::{read_rtk, write_rtk};
 pub use scan::{read_scan, read_truth};
 pub use scan_folder::write_scan;
+pub use scanner::{I0, ImportOptions, Imported, read_scanner};
 pub use slices::{compare_png, slices_png};
 pub use volume::{is_volume, read_volume, write_volume};
 pub use weights::{Weights, read_weights, write_weights};

@@ -30,9 +30,17 @@ pub(crate) fn read(path: &Path, axes: &[&str]) -> Result<ArrayD<f32>> {
 
 /// Reads on from `start`, the bytes (at most the first eight) that were read from `input` to tell the format.
 pub(crate) fn read_from(input: &mut Input, start: Vec<u8>, axes: &[&str]) -> Result<ArrayD<f32>> {
+    read_one_of(input, start, &[axes])
+}
+
+/// As [`read_from`], for an array with any one of several sets of axes.
+pub(crate) fn read_one_of(input: &mut Input, start: Vec<u8>, sets: &[&[&str]]) -> Result<ArrayD<f32>> {
     let header = read_header(input, start)?;
-    let expected = || format!("{} axes ({})", axes.len(), axes.join(", "));
-    if header.shape.len() != axes.len() {
+    let expected = || {
+        let each: Vec<String> = sets.iter().map(|a| format!("{} axes ({})", a.len(), a.join(", "))).collect();
+        each.join(" or ")
+    };
+    if !sets.iter().any(|axes| header.shape.len() == axes.len()) {
         return Err(input.invalid("shape", shape_text(&header.shape), expected()));
     }
     if header.shape.contains(&0) {

@@ -150,7 +150,7 @@ fn views(place: &str, d: &mut Description) -> Result<Vec<View>> {
     Ok(orbit.views())
 }
 
-fn folder_of(file: &Path) -> &Path {
+pub(crate) fn folder_of(file: &Path) -> &Path {
     file.parent().filter(|p| !p.as_os_str().is_empty()).unwrap_or(Path::new("."))
 }
 

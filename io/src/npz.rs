@@ -1,0 +1,174 @@
+//! NumPy's `.npz`: a ZIP archive of `.npy` files, stored or deflated.
+
+use crate::input::Input;
+use crate::npy;
+use conefield_core::{Error, Result};
+use flate2::Crc;
+use flate2::bufread::DeflateDecoder;
+use ndarray::ArrayD;
+use std::fs::File;
+use std::io::{BufReader, ErrorKind, Read, Seek, SeekFrom};
+use std::path::{Path, PathBuf};
+use zip::{CompressionMethod, ZipArchive};
+
+/// The bytes that a ZIP archive with anything in it starts with.
+pub(crate) const MAGIC: &[u8] = b"PK\x03\x04";
+
+/// Measured counts deflate to a half or a tenth; only what is empty shrinks more. An array larger than this many
+/// bytes ...
+const LARGE: u64 = 256 << 20;
+/// ... that unpacks to more than this many times its packed size is no measurement.
+const MOST_RATIO: u64 = 100;
+
+/// Reads the array `name` of the archive (the only one if `None`) with any of the sets of axes, as [`npy::read`] does.
+pub(crate) fn read(path: &Path, name: Option<&str>, sets: &[&[&str]]) -> Result<ArrayD<f32>> {
+    let place = path.display().to_string();
+    let io = |e| Error::io(path, e);
+    let broken = |e: zip::result::ZipError| match e {
+        zip::result::ZipError::Io(e) if e.kind() != ErrorKind::UnexpectedEof => io(e),
+        e => Error::invalid(&place, "archive", e, "a whole ZIP archive, as NumPy writes .npz"),
+    };
+    let file = BufReader::new(File::open(path).map_err(io)?);
+    let mut archive = ZipArchive::new(file).map_err(broken)?;
+    let names: Vec<String> = archive.file_names().filter_map(|n| n.ok().map(|n| n.into_owned())).collect();
+    let arrays: Vec<&str> = names.iter().filter_map(|n| n.strip_suffix(".npy")).collect();
+    let known = || format!("one of its arrays: {}", arrays.join(", "));
+    let name = match (name, &arrays[..]) {
+        (Some(n), _) if arrays.contains(&n) => n,
+        (Some(n), _) => return Err(Error::invalid(&place, "array", format!("no \"{n}\""), known())),
+        (None, [only]) => only,
+        (None, []) => return Err(Error::invalid(&place, "array", "none", "at least one .npy in the archive")),
+        (None, _) => {
+            let found = format!("{} of them and no name", arrays.len());
+            return Err(Error::invalid(&place, "array", found, format!("FILE.npz:NAME with {}", known())));
+        }
+    };
+    let index = names.iter().position(|n| n.strip_suffix(".npy") == Some(name)).unwrap_or(0);
+    let place = format!("{place}: {name}");
+    let entry = archive.by_index_raw(index).map_err(broken)?;
+    let (size, packed, method, checksum) = (entry.size(), entry.compressed_size(), entry.compression(), entry.crc32());
+    if entry.encrypted() {
+        return Err(Error::unsupported(place, "it is encrypted; save it without a password"));
+    }
+    let start = entry.data_start().ok_or_else(|| Error::invalid(&place, "archive", "no data", "where the data starts"));
+    let start = start?;
+    drop(entry);
+    if size > LARGE && size > packed.saturating_mul(MOST_RATIO) {
+        let found = format!("{size} bytes in {packed} packed ones");
+        let expected = format!("at most {MOST_RATIO} times the packed size, which measured values stay far below");
+        return Err(Error::invalid(place, "size", found, expected));
+    }
+    let mut file = archive.into_inner();
+    file.seek(SeekFrom::Start(start)).map_err(io)?;
+    let raw = file.take(packed);
+    let name = PathBuf::from(&place);
+    let mut input = match method {
+        CompressionMethod::Stored => Input::within(name, Checked::new(raw, checksum), size),
+        CompressionMethod::Deflated => Input::within(name, Checked::new(DeflateDecoder::new(raw), checksum), size),
+        other => {
+            return Err(Error::unsupported(place, format!("it is packed as {other}; stored and deflated are read")));
+        }
+    };
+    npy::read_one_of(&mut input, Vec::new(), sets)
+}
+
+/// Compares the checksum where the data ends.
+struct Checked<R> {
+    reader: R,
+    crc: Crc,
+    want: u32,
+}
+
+impl<R> Checked<R> {
+    fn new(reader: R, want: u32) -> Self {
+        Self { reader, crc: Crc::new(), want }
+    }
+}
+
+impl<R: Read> Read for Checked<R> {
+    fn read(&mut self, out: &mut [u8]) -> std::io::Result<usize> {
+        let n = self.reader.read(out)?;
+        self.crc.update(&out[..n]);
+        if n == 0 && !out.is_empty() && self.crc.sum() != self.want {
+            return Err(std::io::Error::new(ErrorKind::InvalidData, "the checksum is wrong: the archive is damaged"));
+        }
+        Ok(n)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::testing::npy_bytes;
+    use std::io::Write;
+    use zip::write::SimpleFileOptions;
+
+    fn archive(path: &Path, entries: &[(&str, &[u8])], method: CompressionMethod) {
+        let mut w = zip::ZipWriter::new(File::create(path).unwrap());
+        for (name, bytes) in entries {
+            w.start_file(*name, SimpleFileOptions::default().compression_method(method)).unwrap();
+            w.write_all(bytes).unwrap();
+        }
+        w.finish().unwrap();
+    }
+
+    const ONE: &[&[&str]] = &[&["row", "column"]];
+
+    #[test]
+    fn stored_and_deflated_arrays_are_read_and_damage_is_seen() {
+        let dir = tempfile::tempdir().unwrap();
+        let path = dir.path().join("a.npz");
+        let data: Vec<u8> = (0..6u16).flat_map(|x| (x * 1000).to_le_bytes()).collect();
+        let a = npy_bytes("<u2", false, "(2, 3)", &data);
+        for method in [CompressionMethod::Stored, CompressionMethod::Deflated] {
+            archive(&path, &[("a.npy", &a), ("b.npy", &a)], method);
+            assert_eq!(read(&path, Some("b"), ONE).unwrap()[[1, 2]], 5000.0);
+            let e = read(&path, None, ONE).unwrap_err().to_string();
+            assert!(e.contains("a.npz") && e.contains("a, b"), "{e}");
+            let e = read(&path, Some("c"), ONE).unwrap_err().to_string();
+            assert!(e.contains("no \"c\"") && e.contains("a, b"), "{e}");
+            archive(&path, &[("a.npy", &a)], method);
+            assert_eq!(read(&path, None, ONE).unwrap()[[0, 1]], 1000.0);
+            let whole = std::fs::read(&path).unwrap();
+            for cut in [0, 4, 30, whole.len() / 2, whole.len() - 1] {
+                std::fs::write(&path, &whole[..cut]).unwrap();
+                let e = read(&path, None, ONE).unwrap_err().to_string();
+                assert!(e.contains("a.npz"), "{e}");
+            }
+            // Any one changed byte either is told or changes nothing.
+            for at in 0..whole.len() {
+                let mut bytes = whole.clone();
+                bytes[at] ^= 0x41;
+                std::fs::write(&path, &bytes).unwrap();
+                if let Ok(found) = read(&path, None, ONE) {
+                    assert_eq!(found[[1, 1]], 4000.0, "byte {at}");
+                }
+            }
+        }
+    }
+
+    #[test]
+    fn a_bomb_is_refused_before_it_is_unpacked() {
+        let dir = tempfile::tempdir().unwrap();
+        let path = dir.path().join("bomb.npz");
+        let mut w = zip::ZipWriter::new(File::create(&path).unwrap());
+        w.start_file("a.npy", SimpleFileOptions::default().compression_method(CompressionMethod::Deflated)).unwrap();
+        w.write_all(&npy_bytes("|u1", false, "(20000, 15000)", &[])).unwrap();
+        let zeros = vec![0u8; 1_000_000];
+        (0..300).for_each(|_| w.write_all(&zeros).unwrap());
+        w.finish().unwrap();
+        let e = read(&path, None, ONE).unwrap_err().to_string();
+        assert!(e.contains("bomb.npz: a: size") && e.contains("100 times"), "{e}");
+        // A header that claims more than the entry holds.
+        archive(
+            &path,
+            &[("a.npy", &npy_bytes("|u1", false, "(200000, 150000)", &[1; 64]))],
+            CompressionMethod::Deflated,
+        );
+        let e = read(&path, None, ONE).unwrap_err().to_string();
+        assert!(e.contains("data") && e.contains("30000000000"), "{e}");
+        // An archive that says less about the size than it holds, or more.
+        archive(&path, &[("a.txt", b"hello")], CompressionMethod::Stored);
+        assert!(read(&path, None, ONE).unwrap_err().to_string().contains(".npy"));
+    }
+}

@@ -1,0 +1,395 @@
+//! A scanner in words: a TOML file that says where source and detector stood and which files hold what they saw.
+//!
+//! ```toml
+//! format = "conefield-scanner"
+//! version = 1
+//!
+//! [files]                            # beside or below this file
+//! projections = "scan.npz:counts"    # TIFF, .npy, .npz:ARRAY, a folder of images, or a list of those
+//! flat = "scan.npz:flat"             # optional: the open beam; several images are averaged
+//! dark = "scan.npz:dark"             # optional: no beam
+//!
+//! [circle]                           # or [vectors] or [rtk]
+//! dso = 500.0                        # source to rotation axis
+//! dsd = 800.0                        # source to detector plane
+//! pixel = { u = 2.0, v = 2.0 }
+//! offset = { u = 0.0, v = 0.0 }      # shift of the detector along its columns' and its rows' direction
+//! start_deg = 0.0                    # the first view's angle
+//! step_deg = 14.4                    # or range_deg = 360.0, or angles_deg = [...], counted from start_deg
+//! direction = "counterclockwise"     # of the source, seen from +z; that of a turning object is the opposite
+//!
+//! [layout]                           # how the arrays lie; this is the default
+//! axes = ["view", "row", "column"]
+//! flip_rows = false                  # true: the first row is the lowest
+//! flip_columns = false
+//!
+//! [values]
+//! kind = "counts"                    # or "line-integrals"
+//! i0 = 20000.0                       # or "air"; in place of files.flat
+//! floor = 1.0                        # optional: counts below are taken for this
+//! flat_includes_dark = true          # false: the dark field has been taken off the flat field already
+//!
+//! [volume]                           # what to reconstruct
+//! shape = [64, 64, 64]
+//! spacing = [1.5625, 1.5625, 1.5625]
+//! center = [0.0, 0.0, 0.0]
+//! ```
+//!
+//! `[vectors]` has `cone_vec = [[...], ...]`, ASTRA's twelve numbers a view: source, detector centre, the step to the
+//! next column (u) and to the next row (v), all in mm here. `[rtk]` has `file`, `pixel` and `offset`; see
+//! [`read_rtk`]. All lengths are mm; angles are degrees, as their keys say.
+
+use crate::check::{LineIntegralCheck, check_line_integrals};
+use crate::counts::{Correction, CountsReport, OpenBeam, line_integrals};
+use crate::input::read_text;
+use crate::orbit::Orbit;
+use crate::rtk::read_rtk;
+use crate::stack::{self, Layout, Names, StackAxis};
+use crate::text::{Notation, parse};
+use crate::{folder, scan_folder};
+use conefield_core::error::ensure;
+use conefield_core::geometry::{Geometry, View, VoxelGrid};
+use conefield_core::scan::{Scan, Unit};
+use conefield_core::{Error, Result};
+use serde::{Deserialize, Serialize};
+use serde_json::json;
+use std::path::Path;
+
+const FORMAT: &str = "conefield-scanner";
+const VERSION: u32 = 1;
+
+/// The counts of the open beam where no flat field says them.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub enum I0 {
+    /// This many in every pixel of every view, dark value included.
+    Number(f64),
+    /// What the border of each view shows; see [`OpenBeam::Air`].
+    Air,
+}
+
+/// What overrides the description.
+#[derive(Debug, Clone, Copy, PartialEq, Default)]
+pub struct ImportOptions {
+    /// In place of the file's `i0` and flat field.
+    pub i0: Option<I0>,
+    /// In place of the file's `floor`.
+    pub floor: Option<f64>,
+}
+
+/// What [`read_scanner`] makes of a description.
+#[derive(Debug, Clone)]
+pub struct Imported {
+    /// The scan, in mm.
+    pub scan: Scan,
+    /// What the conversion from counts met; `None` if the files hold line integrals.
+    pub counts: Option<CountsReport>,
+    /// Whether the result looks like line integrals.
+    pub check: LineIntegralCheck,
+}
+
+#[derive(Deserialize)]
+struct Mark {
+    format: Option<String>,
+    version: Option<u32>,
+}
+
+#[derive(Deserialize)]
+#[serde(deny_unknown_fields)]
+struct Description {
+    #[serde(rename = "format")]
+    _format: String,
+    #[serde(rename = "version")]
+    _version: u32,
+    files: Files,
+    circle: Option<Circle>,
+    vectors: Option<Vectors>,
+    rtk: Option<Rtk>,
+    #[serde(default)]
+    layout: LayoutTable,
+    #[serde(default)]
+    values: Values,
+    volume: VoxelGrid,
+}
+
+#[derive(Deserialize)]
+#[serde(deny_unknown_fields)]
+struct Files {
+    projections: Names,
+    flat: Option<Names>,
+    dark: Option<Names>,
+}
+
+#[derive(Deserialize, Clone, Copy, Default)]
+#[serde(deny_unknown_fields)]
+struct Uv {
+    u: f64,
+    v: f64,
+}
+
+#[derive(Deserialize, Clone, Copy, Default, PartialEq, Serialize)]
+#[serde(rename_all = "lowercase")]
+enum Direction {
+    #[default]
+    Counterclockwise,
+    Clockwise,
+}
+
+#[derive(Deserialize)]
+#[serde(deny_unknown_fields)]
+struct Circle {
+    dso: f64,
+    dsd: f64,
+    pixel: Uv,
+    #[serde(default)]
+    offset: Uv,
+    #[serde(default)]
+    start_deg: f64,
+    step_deg: Option<f64>,
+    range_deg: Option<f64>,
+    angles_deg: Option<Vec<f64>>,
+    direction: Direction,
+}
+
+#[derive(Deserialize)]
+#[serde(deny_unknown_fields)]
+struct Vectors {
+    cone_vec: Vec<[f64; 12]>,
+}
+
+#[derive(Deserialize)]
+#[serde(deny_unknown_fields)]
+struct Rtk {
+    file: String,
+    pixel: Uv,
+    #[serde(default)]
+    offset: Uv,
+}
+
+#[derive(Deserialize)]
+#[serde(deny_unknown_fields, default)]
+struct LayoutTable {
+    axes: [StackAxis; 3],
+    flip_rows: bool,
+    flip_columns: bool,
+}
+
+impl Default for LayoutTable {
+    fn default() -> Self {
+        Self { axes: [StackAxis::View, StackAxis::Row, StackAxis::Column], flip_rows: false, flip_columns: false }
+    }
+}
+
+#[derive(Deserialize, Clone, Copy, Default, PartialEq)]
+#[serde(rename_all = "kebab-case")]
+enum Kind {
+    #[default]
+    Counts,
+    LineIntegrals,
+}
+
+#[derive(Deserialize)]
+#[serde(untagged, expecting = "a number of counts or \"air\"")]
+enum I0Text {
+    Number(f64),
+    Word(String),
+}
+
+#[derive(Deserialize, Default)]
+#[serde(deny_unknown_fields)]
+struct Values {
+    #[serde(default)]
+    kind: Kind,
+    i0: Option<I0Text>,
+    floor: Option<f64>,
+    flat_includes_dark: Option<bool>,
+}
+
+/// Reads the scan that the TOML (or JSON) file `path` describes; the module's source shows its keys.
+///
+/// Files are relative to the description's folder and stay in it. Counts become line integrals as
+/// [`line_integrals`](crate::line_integrals) says; one of a flat field, `i0` and `options.i0` must be there. The
+/// geometry is checked against the shape of the projections before counts are converted.
+pub fn read_scanner(path: impl AsRef<Path>, options: &ImportOptions) -> Result<Imported> {
+    let path = path.as_ref();
+    let place = path.display().to_string();
+    let d = describe(path)?;
+    let folder = scan_folder::folder_of(path);
+    d.volume.validate(&place)?;
+    let layout = layout(&place, &d.layout)?;
+    let i0 = i0(&place, &d, options)?;
+    let read = |field: &str, names: &Names| stack::read_field(folder, &place, field, names, layout);
+    let values = stack::read(folder, &place, "files.projections", &d.files.projections, layout)?;
+    let (count, rows, columns) = values.dim();
+    let views = views(folder, &place, &d, count)?;
+    let geometry = Geometry { detector: [rows, columns], views, volume: d.volume };
+    geometry.validate(&place)?;
+    let (projections, counts) = if d.values.kind == Kind::LineIntegrals {
+        (values, None)
+    } else {
+        let open = match i0 {
+            Some(I0::Number(n)) => OpenBeam::Number(n),
+            Some(I0::Air) => OpenBeam::Air,
+            None => {
+                let expected = "files.flat, values.i0 or --i0; or values.kind = \"line-integrals\" if they are";
+                let lacks = || Error::invalid(&place, "files.flat", "nothing to compare counts with", expected);
+                OpenBeam::Flat(read("files.flat", d.files.flat.as_ref().ok_or_else(lacks)?)?)
+            }
+        };
+        let dark = d.files.dark.as_ref().map(|n| read("files.dark", n)).transpose()?;
+        let open = match (open, &dark, d.values.flat_includes_dark) {
+            // The formula takes the dark field off again. Fields of two shapes are told there.
+            (OpenBeam::Flat(flat), Some(dark), Some(false)) if flat.dim() == dark.dim() => OpenBeam::Flat(flat + dark),
+            (open, ..) => open,
+        };
+        let correction = Correction { open, dark, floor: options.floor.or(d.values.floor) };
+        let (a, report) = line_integrals(values, &correction, &place)?;
+        (a, Some(report))
+    };
+    let check = check_line_integrals(projections.view());
+    let provenance = json!({
+        "format": "scanner",
+        "file": path.file_name().map(|n| n.to_string_lossy()),
+        "projections": d.files.projections,
+        "counts": counts,
+    });
+    let scan = Scan { geometry, projections, unit: Unit::default(), provenance };
+    scan.validate(&place)?;
+    Ok(Imported { scan, counts, check })
+}
+
+fn describe(path: &Path) -> Result<Description> {
+    let text = read_text(path)?;
+    let place = path.display().to_string();
+    let notation = Notation::of(path);
+    // Before the keys are checked: a later version may well have others.
+    let mark: Mark = parse(path, &text, notation)?;
+    let format = mark.format.unwrap_or_else(|| "nothing".into());
+    ensure(format == FORMAT, &place, "format", format!("\"{format}\""), format!("\"{FORMAT}\""))?;
+    let version = mark.version.map_or("nothing".into(), |v| v.to_string());
+    ensure(mark.version == Some(VERSION), &place, "version", version, VERSION.to_string())?;
+    parse(path, &text, notation)
+}
+
+fn layout(place: &str, table: &LayoutTable) -> Result<Layout> {
+    let all = [StackAxis::View, StackAxis::Row, StackAxis::Column];
+    let expected = "each of \"view\", \"row\" and \"column\" once";
+    ensure(all.iter().all(|a| table.axes.contains(a)), place, "layout.axes", format!("{:?}", table.axes), expected)?;
+    Ok(Layout { axes: table.axes, flip_rows: table.flip_rows, flip_columns: table.flip_columns })
+}
+
+/// The one number of the open beam, or `None` if the flat field says it. Refuses what contradicts.
+fn i0(place: &str, d: &Description, options: &ImportOptions) -> Result<Option<I0>> {
+    let said = match &d.values.i0 {
+        None => None,
+        Some(I0Text::Number(n)) => Some(I0::Number(*n)),
+        Some(I0Text::Word(w)) if w == "air" => Some(I0::Air),
+        Some(I0Text::Word(w)) => {
+            let expected = "a number of counts or \"air\"";
+            return Err(Error::invalid(place, "values.i0", format!("\"{w}\""), expected));
+        }
+    };
+    let flat = d.files.flat.is_some();
+    if d.values.flat_includes_dark.is_some() && !(flat && d.files.dark.is_some()) {
+        let found = "a value without both files.flat and files.dark";
+        return Err(Error::invalid(place, "values.flat_includes_dark", found, "both files, or no such value"));
+    }
+    if d.values.kind == Kind::LineIntegrals {
+        let field = match (flat, d.files.dark.is_some(), said.or(options.i0), options.floor.or(d.values.floor)) {
+            (true, ..) => "files.flat",
+            (_, true, ..) => "files.dark",
+            (_, _, Some(_), _) => "values.i0",
+            (.., Some(_)) => "values.floor",
+            _ => return Ok(None),
+        };
+        let found = "a value beside values.kind = \"line-integrals\"";
+        return Err(Error::invalid(place, field, found, "nothing, or kind = \"counts\""));
+    }
+    if flat && said.is_some() {
+        return Err(Error::invalid(place, "values.i0", "i0 beside files.flat", "one of them"));
+    }
+    if flat && options.i0.is_some() {
+        tracing::info!("{place}: --i0 stands in for files.flat, which is not read");
+    }
+    Ok(options.i0.or(said))
+}
+
+fn views(folder: &Path, place: &str, d: &Description, count: usize) -> Result<Vec<View>> {
+    let fits = |field: &str, n: usize| {
+        let expected = format!("{count}, one for each view in the projections");
+        ensure(n == count, place, field, format!("{n} of them"), expected)
+    };
+    match (&d.circle, &d.vectors, &d.rtk) {
+        (Some(c), None, None) => {
+            let angles = angles(place, c, count)?;
+            fits("circle.angles_deg", angles.len())?;
+            for (field, x) in [("circle.dso", c.dso), ("circle.dsd", c.dsd)] {
+                ensure(x.is_finite() && x > 0.0, place, field, x, "a positive finite length in mm")?;
+            }
+            lengths(place, "circle", c.pixel, c.offset)?;
+            let (pixel, offset) = ([c.pixel.v, c.pixel.u], [c.offset.v, c.offset.u]);
+            Ok(Orbit { dso: c.dso, dsd: c.dsd, pixel, offset, angles }.views())
+        }
+        (None, Some(v), None) => {
+            fits("vectors.cone_vec", v.cone_vec.len())?;
+            let view = |n: &[f64; 12]| {
+                let part = |k: usize| [n[k], n[k + 1], n[k + 2]];
+                View { source: part(0), detector: part(3), u: part(6), v: part(9) }
+            };
+            Ok(v.cone_vec.iter().map(view).collect())
+        }
+        (None, None, Some(r)) => {
+            lengths(place, "rtk", r.pixel, r.offset)?;
+            let file = folder::inside(folder, place, "rtk.file", &r.file)?;
+            let views = read_rtk(file, [r.pixel.v, r.pixel.u], [r.offset.v, r.offset.u])?;
+            fits("rtk.file", views.len())?;
+            Ok(views)
+        }
+        (None, None, None) => Err(Error::invalid(place, "circle", "nothing", "one of [circle], [vectors] and [rtk]")),
+        _ => Err(Error::invalid(place, "circle", "several geometries", "one of [circle], [vectors] and [rtk]")),
+    }
+}
+
+fn lengths(place: &str, table: &str, pixel: Uv, offset: Uv) -> Result<()> {
+    for (field, x) in [("pixel.u", pixel.u), ("pixel.v", pixel.v)] {
+        ensure(x.is_finite() && x > 0.0, place, &format!("{table}.{field}"), x, "a positive finite length in mm")?;
+    }
+    for (field, x) in [("offset.u", offset.u), ("offset.v", offset.v)] {
+        ensure(x.is_finite(), place, &format!("{table}.{field}"), x, "a finite length in mm")?;
+    }
+    Ok(())
+}
+
+/// The angles in radians.
+fn angles(place: &str, c: &Circle, count: usize) -> Result<Vec<f64>> {
+    let finite = |field: &str, x: f64| ensure(x.is_finite(), place, field, x, "a finite number of degrees");
+    finite("circle.start_deg", c.start_deg)?;
+    let from_start: Vec<f64> = match (c.step_deg, c.range_deg, &c.angles_deg) {
+        (Some(step), None, None) => {
+            finite("circle.step_deg", step)?;
+            (0..count).map(|i| step * i as f64).collect()
+        }
+        (None, Some(range), None) => {
+            finite("circle.range_deg", range)?;
+            (0..count).map(|i| range * i as f64 / count as f64).collect()
+        }
+        (None, None, Some(list)) => {
+            for (i, a) in list.iter().enumerate() {
+                finite(&format!("circle.angles_deg[{i}]"), *a)?;
+            }
+            list.clone()
+        }
+        (None, None, None) => {
+            let expected = "step_deg, range_deg or angles_deg";
+            return Err(Error::invalid(place, "circle.step_deg", "no angles", expected));
+        }
+        _ => {
+            let expected = "one of step_deg, range_deg and angles_deg";
+            return Err(Error::invalid(place, "circle.step_deg", "several ways to say the angles", expected));
+        }
+    };
+    let sign = if c.direction == Direction::Clockwise { -1.0 } else { 1.0 };
+    Ok(from_start.iter().map(|a| (c.start_deg + sign * a).to_radians()).collect())
+}
+
+#[cfg(test)]
+mod tests;

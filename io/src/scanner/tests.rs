@@ -1,0 +1,322 @@
+use super::*;
+use crate::scan_folder::write_scan;
+use crate::testing::{data, npy_bytes};
+use crate::{R2Scan, rays, read_r2, read_scan};
+use ndarray::{Array3, Axis};
+use std::fs;
+use std::path::PathBuf;
+
+/// The description of the shared counts, with the geometry that `ellipsoids_50_r2` has.
+const ELLIPSOIDS: &str = r#"format = "conefield-scanner"
+version = 1
+
+[files]
+projections = "scan.npz:counts"
+flat = "scan.npz:flat"
+dark = "scan.npz:dark"
+
+[circle]
+dso = 500.0
+dsd = 800.0
+pixel = { u = 2.0, v = 2.0 }
+start_deg = 0.0
+step_deg = 14.4
+direction = "counterclockwise"
+
+[values]
+flat_includes_dark = false
+
+[volume]
+shape = [64, 64, 64]
+spacing = [1.5625, 1.5625, 1.5625]
+"#;
+
+/// The shared counts with a description to be changed, and the scan whose projections are exact.
+struct Ellipsoids {
+    dir: tempfile::TempDir,
+    exact: R2Scan,
+}
+
+impl Ellipsoids {
+    fn find() -> Option<Self> {
+        let (counts, exact) = (data("interop/ellipsoids_counts.npz")?, data("interop/ellipsoids_50_r2")?);
+        let dir = tempfile::tempdir().unwrap();
+        fs::copy(counts, dir.path().join("scan.npz")).unwrap();
+        Some(Self { dir, exact: read_r2(exact).unwrap() })
+    }
+
+    fn import(&self, text: &str, options: &ImportOptions) -> Result<Imported> {
+        let path = self.dir.path().join("scanner.toml");
+        fs::write(&path, text).unwrap();
+        read_scanner(path, options)
+    }
+
+    fn changed(&self, changes: &[(&str, &str)]) -> Scan {
+        let mut text = ELLIPSOIDS.to_string();
+        for (from, to) in changes {
+            assert!(text.contains(from), "{from}");
+            text = text.replace(from, to);
+        }
+        self.import(&text, &ImportOptions::default()).unwrap().scan
+    }
+
+    /// The exact line integrals of the views that the counts are of.
+    fn truth(&self) -> Array3<f32> {
+        let all = &self.exact.train.projections;
+        let every_other: Vec<usize> = (0..25).map(|i| 2 * i).collect();
+        all.select(Axis(0), &every_other)
+    }
+
+    /// Root-mean-square difference of a scan and the integrals through the volume along its rays, relative to the
+    /// integrals.
+    fn error(&self, scan: &Scan) -> f64 {
+        let volume = self.exact.volume.as_ref().unwrap();
+        let (mut d, mut m) = (0.0, 0.0);
+        let g = &scan.geometry;
+        for view in (0..25).step_by(2) {
+            for row in (0..g.detector[0]).step_by(3) {
+                for column in (0..g.detector[1]).step_by(3) {
+                    let i = rays::integral(&volume.data, &g.volume, &g.ray(view, row, column));
+                    d += (f64::from(scan.projections[[view, row, column]]) - i).powi(2);
+                    m += i.powi(2);
+                }
+            }
+        }
+        (d / m).sqrt()
+    }
+}
+
+fn rms(a: &Array3<f32>, b: &Array3<f32>) -> f64 {
+    let sum: f64 = a.iter().zip(b).map(|(x, y)| f64::from(x - y).powi(2)).sum();
+    (sum / a.len() as f64).sqrt()
+}
+
+#[test]
+fn counts_through_flat_and_dark_are_the_line_integrals_within_the_noise() {
+    let Some(e) = Ellipsoids::find() else { return };
+    let imported = e.import(ELLIPSOIDS, &ImportOptions::default()).unwrap();
+    let (found, truth) = (&imported.scan.projections, e.truth());
+    // Counting N photons leaves the line integral with a standard deviation of 1/√N: 0.0069 in the open beam of
+    // 20 890 counts, more behind the object. In units of that the residual must be 1.
+    let open = imported.counts.as_ref().unwrap().open_beam[1];
+    let mut sum = 0.0;
+    for (a, t) in found.iter().zip(&truth) {
+        sum += f64::from(a - t).powi(2) * open * f64::from(-t).exp();
+    }
+    let normalised = (sum / truth.len() as f64).sqrt();
+    let mean: f64 = found.iter().zip(&truth).map(|(a, t)| f64::from(a - t)).sum::<f64>() / truth.len() as f64;
+    println!("rms {:.5}, in units of the noise {normalised:.4}, mean {mean:.6}", rms(found, &truth));
+    assert!((0.95..1.05).contains(&normalised), "{normalised}");
+    assert!(mean.abs() < 2e-4, "{mean}");
+    // The flat field of this file is one from which the dark field has been taken off. Said wrongly, everything is
+    // too low by −ln(1 − 110/20 890), less than the noise of a pixel but far more than that of the mean.
+    let wrong = e.changed(&[("flat_includes_dark = false", "flat_includes_dark = true")]);
+    let shift: f64 = wrong.projections.iter().zip(&truth).map(|(a, t)| f64::from(a - t)).sum::<f64>();
+    let shift = shift / truth.len() as f64;
+    println!("with the dark field taken off twice the mean is {shift:.6}");
+    assert!((shift - (1.0f64 - 110.0 / 20891.0).ln()).abs() < 2e-4, "{shift}");
+    let report = imported.counts.unwrap();
+    assert_eq!((report.clamped, report.bad), (0.0, 0.0), "{report:?}");
+    assert!(imported.check.complaints.is_empty(), "{:?}", imported.check);
+
+    // Without the flat field the beam's shape stays in the picture, and the estimate at the border is what it is.
+    let air = ImportOptions { i0: Some(I0::Air), floor: None };
+    let by_air = e.import(ELLIPSOIDS, &air).unwrap();
+    let number = ImportOptions { i0: Some(I0::Number(21000.0)), floor: None };
+    let by_number = e.import(ELLIPSOIDS, &number).unwrap();
+    let (air, number) = (rms(&by_air.scan.projections, &truth), rms(&by_number.scan.projections, &truth));
+    println!("air {air:.4}, number {number:.4}");
+    assert!(air < 0.1 && number < 0.1 && air > 2.0 * rms(found, &truth), "{air} {number}");
+    // Where the beam is brighter than the one number, air comes out negative, and that is told.
+    assert!(by_number.check.complaints[0].contains("I0 is too low"), "{:?}", by_number.check);
+
+    // Taken for line integrals, the counts are told for what they are.
+    let raw = ELLIPSOIDS
+        .replace("flat = \"scan.npz:flat\"\ndark = \"scan.npz:dark\"", "")
+        .replace("flat_includes_dark = false", "kind = \"line-integrals\"");
+    let check = e.import(&raw, &ImportOptions::default()).unwrap().check;
+    assert!(check.complaints[0].contains("looks like intensities, not line integrals"), "{check:?}");
+}
+
+#[test]
+fn every_wrong_setting_is_measurably_worse() {
+    let Some(e) = Ellipsoids::find() else { return };
+    let right = e.error(&e.changed(&[]));
+    println!("right {right:.4}");
+    assert!(right < 0.05, "{right}");
+    let volume = "[volume]";
+    let half_u = "offset = { u = 1.0, v = 0.0 }\nstart_deg";
+    let half_v = "offset = { u = 0.0, v = -1.0 }\nstart_deg";
+    for (what, from, to, times) in [
+        ("rows flipped", volume, "[layout]\nflip_rows = true\n[volume]", 3.0),
+        ("columns flipped", volume, "[layout]\nflip_columns = true\n[volume]", 3.0),
+        ("rows and columns swapped", volume, "[layout]\naxes = [\"view\", \"column\", \"row\"]\n[volume]", 3.0),
+        ("turned the other way", "\"counterclockwise\"", "\"clockwise\"", 3.0),
+        ("start a quarter turn off", "start_deg = 0.0", "start_deg = 90.0", 3.0),
+        ("start a view off", "start_deg = 0.0", "start_deg = 14.4", 2.0),
+        ("half a pixel along u", "start_deg", half_u, 1.2),
+        ("half a pixel along v", "start_deg", half_v, 1.2),
+        ("pixel size", "u = 2.0, v", "u = 2.1, v", 1.2),
+        ("source too near", "dso = 500.0", "dso = 450.0", 1.2),
+    ] {
+        let wrong = e.error(&e.changed(&[(from, to)]));
+        println!("{what}: {wrong:.4}");
+        assert!(wrong > times * right, "{what}: {wrong} against {right}");
+    }
+}
+
+#[test]
+fn every_way_to_say_the_geometry_gives_the_same_scan() {
+    let Some(e) = Ellipsoids::find() else { return };
+    let want = e.changed(&[]);
+    let near = |a: &Scan| {
+        for (v, w) in a.geometry.views.iter().zip(&want.geometry.views) {
+            let pair = [(v.source, w.source), (v.detector, w.detector), (v.u, w.u), (v.v, w.v)];
+            assert!(pair.iter().all(|(x, y)| (0..3).all(|k| (x[k] - y[k]).abs() < 1e-9)), "{v:?} {w:?}");
+        }
+        assert_eq!(a.projections, want.projections);
+    };
+    near(&e.changed(&[("step_deg = 14.4", "range_deg = 360.0")]));
+    let angles: Vec<String> = (0..25).map(|i| format!("{}", -14.4 * i as f64)).collect();
+    let list = format!("angles_deg = [{}]", angles.join(", "));
+    near(&e.changed(&[("step_deg = 14.4", &list), ("counterclockwise", "clockwise")]));
+    let circle = &ELLIPSOIDS[ELLIPSOIDS.find("[circle]").unwrap()..ELLIPSOIDS.find("[values]").unwrap()];
+    let row = |v: &View| format!("{:?}", [v.source, v.detector, v.u, v.v].concat());
+    let rows: Vec<String> = want.geometry.views.iter().map(row).collect();
+    near(&e.changed(&[(circle, &format!("[vectors]\ncone_vec = [{}]\n\n", rows.join(",\n")))]));
+    // RTK's rows run up; the same stack is then upside down.
+    let xml = e.dir.path().join("geometry.xml");
+    assert!(crate::write_rtk(&xml, &want.geometry.views).unwrap());
+    let rtk = "[rtk]\nfile = \"geometry.xml\"\npixel = { u = 2.0, v = 2.0 }\n[layout]\nflip_rows = true\n\n";
+    let mut found = e.changed(&[(circle, rtk)]);
+    found.projections.invert_axis(Axis(1));
+    found.geometry.views.iter_mut().for_each(|v| v.v = v.v.map(|x| -x));
+    near(&found);
+    // Written as conefield's own folder it comes back.
+    let folder = e.dir.path().join("out");
+    write_scan(&folder, &want, None).unwrap();
+    near(&read_scan(&folder).unwrap());
+}
+
+/// Three views of four rows and six columns in 16-bit TIFFs, with a flat field; counts fall towards the middle.
+fn small() -> (tempfile::TempDir, PathBuf) {
+    use tiff::encoder::{TiffEncoder, colortype::Gray16};
+    let dir = tempfile::tempdir().unwrap();
+    fs::create_dir(dir.path().join("views")).unwrap();
+    let image = |path: &str, f: &dyn Fn(usize, usize) -> u16| {
+        let pixels: Vec<u16> = (0..24).map(|i| f(i / 6, i % 6)).collect();
+        let file = fs::File::create(dir.path().join(path)).unwrap();
+        TiffEncoder::new(file).unwrap().write_image::<Gray16>(6, 4, &pixels).unwrap();
+    };
+    for v in 0..3 {
+        image(&format!("views/v{v}.tif"), &|r, c| if (1..3).contains(&r) && c == v + 1 { 250 } else { 1000 });
+    }
+    image("flat.tif", &|_, _| 1000);
+    let text = ELLIPSOIDS
+        .replace("scan.npz:counts", "views")
+        .replace("scan.npz:flat", "flat.tif")
+        .replace("dark = \"scan.npz:dark\"\n", "")
+        .replace("[values]\nflat_includes_dark = false\n\n", "");
+    let path = dir.path().join("s.toml");
+    fs::write(&path, text).unwrap();
+    (dir, path)
+}
+
+#[test]
+fn tiffs_become_a_scan() {
+    let (_dir, path) = small();
+    let i = read_scanner(&path, &ImportOptions::default()).unwrap();
+    assert_eq!(i.scan.projections.dim(), (3, 4, 6));
+    assert!((i.scan.projections[[1, 2, 2]] - 4f32.ln()).abs() < 1e-6);
+    assert_eq!(i.scan.projections[[1, 2, 3]], 0.0);
+    assert_eq!(i.scan.provenance["counts"]["bad"], json!(0.0));
+}
+
+#[test]
+fn hostile_descriptions_and_files_are_refused_in_words() {
+    let refused = |change: &dyn Fn(&Path, String) -> String, words: &[&str]| {
+        let (dir, path) = small();
+        let text = change(dir.path(), fs::read_to_string(&path).unwrap());
+        fs::write(&path, text).unwrap();
+        let e = read_scanner(&path, &ImportOptions::default()).unwrap_err().to_string();
+        assert!(words.iter().all(|w| e.contains(w)), "{words:?} are not all in: {e}");
+    };
+    let edit = |from: &'static str, to: &'static str, words: &[&str]| {
+        refused(
+            &|_, t| {
+                assert!(t.contains(from), "{from}");
+                t.replace(from, to)
+            },
+            words,
+        );
+    };
+    edit("conefield-scanner", "conefield-scan", &["s.toml: format", "\"conefield-scan\"", "\"conefield-scanner\""]);
+    edit("version = 1", "version = 2", &["s.toml: version", "found 2"]);
+    edit("version = 1", "", &["version", "nothing"]);
+    edit("dso = ", "DSO = ", &["line 9", "DSO", "`dso` (the nearest of: dso, dsd"]);
+    edit("dso = 500.0", "", &["dso", "nothing"]);
+    edit("dso = 500.0", "dso = -1", &["circle.dso", "-1", "positive"]);
+    edit("dso = 500.0", "dso = nan", &["circle.dso", "NaN"]);
+    edit("dso = 500.0", "dso = 10.0", &["views[0]", "inside the volume"]);
+    edit("u = 2.0, v", "v", &["u", "nothing"]);
+    edit("u = 2.0, v", "u = 0.0, v", &["circle.pixel.u", "positive"]);
+    edit("direction = \"counterclockwise\"", "", &["direction", "nothing"]);
+    edit("\"counterclockwise\"", "\"left\"", &["direction", "left", "clockwise"]);
+    edit("step_deg = 14.4", "", &["circle.step_deg", "no angles", "angles_deg"]);
+    edit("step_deg = 14.4", "step_deg = 14.4\nrange_deg = 360", &["several ways", "one of"]);
+    edit("step_deg = 14.4", "step_deg = inf", &["circle.step_deg", "inf"]);
+    edit("step_deg = 14.4", "angles_deg = [0, 1]", &["circle.angles_deg", "2 of them", "3, one for each view"]);
+    edit("step_deg = 14.4", "angles_deg = [0, nan, 1]", &["circle.angles_deg[1]", "NaN"]);
+    edit("step_deg = 14.4", "step = 14.4", &["step", "`step_deg`"]);
+    edit("[volume]", "[layout]\naxes = [\"view\", \"row\", \"row\"]\n[volume]", &["layout.axes", "once"]);
+    edit("[volume]", "[layout]\naxes = [\"view\", \"row\"]\n[volume]", &["axes", "array of length 3"]);
+    edit("[volume]", "[vectors]\ncone_vec = []\n[volume]", &["several geometries", "one of"]);
+    edit("[volume]", "[values]\ni0 = \"dark\"\n[volume]", &["values.i0", "\"dark\"", "\"air\""]);
+    edit("[volume]", "[values]\ni0 = 7\n[volume]", &["values.i0", "files.flat", "one of them"]);
+    edit("[volume]", "[values]\nfloor = -1\n[volume]", &["floor", "above 0"]);
+    edit("[volume]", "[values]\nkind = \"line-integrals\"\n[volume]", &["files.flat", "line-integrals"]);
+    edit("[volume]", "[values]\nflat_includes_dark = true\n[volume]", &["values.flat_includes_dark", "files.dark"]);
+    edit("flat = \"flat.tif\"", "", &["files.flat", "nothing", "--i0"]);
+    edit("shape = [64, 64, 64]", "shape = [0, 64, 64]", &["volume.shape"]);
+    edit("\"views\"", "\"../views\"", &["files.projections", "without \"..\""]);
+    edit("\"views\"", "\"/etc/passwd\"", &["files.projections", "inside the folder"]);
+    edit("\"views\"", "\"none\"", &["files.projections", "none"]);
+    edit("\"views\"", "3", &["projections", "a file name or a list of file names"]);
+    edit("\"flat.tif\"", "\"flat.tif:a\"", &["files.flat"]);
+    // An odd number of numbers a view, or of views.
+    let circle = |t: &str| t[t.find("[circle]").unwrap()..t.find("[volume]").unwrap()].to_string();
+    let vectors = |list: &str| format!("[vectors]\ncone_vec = [{list}]\n\n");
+    refused(&|_, t| t.replace(&circle(&t), &vectors("[1.0, 2.0]")), &["cone_vec", "array of length 12"]);
+    refused(
+        &|_, t| t.replace(&circle(&t), &vectors("[1, 0, 0, 0, 0, 0, 0, 0, 0, 0, 0, 0]")),
+        &["vectors.cone_vec", "1 of them", "3, one for each view"],
+    );
+    refused(&|_, t| t.replace(&circle(&t), ""), &["circle", "nothing", "one of [circle]"]);
+    let rtk = "[rtk]\nfile = \"../g.xml\"\npixel = { u = 1, v = 1 }\n\n";
+    refused(&|_, t| t.replace(&circle(&t), rtk), &["rtk.file", "without \"..\""]);
+    // Files that are not what they seem.
+    let with = |name: &'static str, bytes: Vec<u8>, words: &[&str]| {
+        refused(
+            &|dir, t| {
+                fs::write(dir.join(name), &bytes).unwrap();
+                t
+            },
+            words,
+        );
+    };
+    with("views/v1.tif", b"II*\0\x08\0\0\0".to_vec(), &["v1.tif", "TIFF"]);
+    with("views/v1.tif", npy_bytes("<u2", false, "(4, 5)", &[1; 40]), &["v1.tif", "4 x 5", "4 x 6"]);
+    with("views/v1.tif", npy_bytes("<u2", false, "(9999999, 9999999)", &[1; 40]), &["v1.tif", "data"]);
+    with("views/v1.tif", npy_bytes("<f4", false, "(4, 6)", &[255; 96]), &["v1.tif", "data[0, 0]", "NaN"]);
+    with("views/v1.tif", npy_bytes("<u2", false, "(48,)", &[1; 96]), &["v1.tif", "3 axes", "2 axes"]);
+    with("flat.tif", npy_bytes("<u2", false, "(4, 5)", &[1; 40]), &["s.toml", "flat", "4 x 5", "4 x 6"]);
+    with("flat.tif", npy_bytes("|u1", false, "(4, 6)", &[0; 24]), &["s.toml", "open beam"]);
+    let zero = npy_bytes("|u1", false, "(3, 4, 6)", &[0; 72]);
+    refused(
+        &|dir, t| {
+            fs::write(dir.join("zero.npy"), &zero).unwrap();
+            t.replace("\"views\"", "\"zero.npy\"")
+        },
+        &["counts", "100.0 %", "light"],
+    );
+}

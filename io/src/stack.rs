@@ -1,0 +1,275 @@
+//! Stacks of projections and single fields, from TIFF, `.npy` and `.npz`, brought into the order `[view, row, column]`.
+
+use crate::input::Input;
+use crate::{folder, npy, npz, tiff};
+use conefield_core::{Error, Result};
+use ndarray::{Array2, Array3, ArrayD, Axis, Ix3};
+use serde::{Deserialize, Serialize};
+use std::path::{Path, PathBuf};
+
+/// One axis of a stack.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "lowercase")]
+pub(crate) enum StackAxis {
+    View,
+    Row,
+    Column,
+}
+
+/// How a file's arrays lie.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(crate) struct Layout {
+    /// What the three axes of a stack mean; an image has two of them, in the same order.
+    pub axes: [StackAxis; 3],
+    /// Whether the first row is the lowest along v.
+    pub flip_rows: bool,
+    pub flip_columns: bool,
+}
+
+impl Layout {
+    /// Brings the file's array of three axes into the order `[view, row, column]`.
+    fn arrange(&self, a: Array3<f32>) -> Array3<f32> {
+        let at = |axis| self.axes.iter().position(|&x| x == axis).unwrap_or(0);
+        let mut a = a.permuted_axes([at(StackAxis::View), at(StackAxis::Row), at(StackAxis::Column)]);
+        if self.flip_rows {
+            a.invert_axis(Axis(1));
+        }
+        if self.flip_columns {
+            a.invert_axis(Axis(2));
+        }
+        if a.is_standard_layout() { a } else { a.as_standard_layout().into_owned() }
+    }
+
+    /// Where the axis of views stands.
+    fn views(&self) -> usize {
+        self.axes.iter().position(|&x| x == StackAxis::View).unwrap_or(0)
+    }
+}
+
+/// One file or several.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(untagged, expecting = "a file name or a list of file names")]
+pub(crate) enum Names {
+    One(String),
+    Many(Vec<String>),
+}
+
+/// A file and, for `.npz`, the array in it.
+struct Source {
+    path: PathBuf,
+    array: Option<String>,
+}
+
+/// Reads a stack `[view, row, column]`: files one after the other, each with one view (two axes) or several.
+///
+/// Names are relative to `folder` and stay in it; a folder stands for its TIFF files, or its `.npy` files if it has
+/// none, in the order of the numbers in their names.
+pub(crate) fn read(folder: &Path, place: &str, field: &str, names: &Names, layout: Layout) -> Result<Array3<f32>> {
+    let sources = sources(folder, place, field, names)?;
+    let mut all: Option<(Vec<f32>, [usize; 2], usize)> = None;
+    let single = sources.len() == 1;
+    for source in &sources {
+        let stack = layout.arrange(raw(source, layout.views())?);
+        if single {
+            return Ok(stack);
+        }
+        let (views, rows, columns) = stack.dim();
+        let (values, size, count) = all.get_or_insert_with(|| (Vec::new(), [rows, columns], 0));
+        if *size != [rows, columns] {
+            let found = format!("{rows} x {columns}");
+            let expected = format!("{} x {} (rows x columns), as in {}", size[0], size[1], sources[0].path.display());
+            return Err(Error::invalid(source.path.display().to_string(), "image", found, expected));
+        }
+        values.try_reserve(stack.len()).map_err(|_| {
+            Error::invalid(place, field, format!("{} images", sources.len()), "images that fit in memory together")
+        })?;
+        values.extend(stack.iter());
+        *count += views;
+    }
+    let (values, [rows, columns], views) = all.unwrap_or_default();
+    Array3::from_shape_vec((views, rows, columns), values)
+        .map_err(|e| Error::invalid(place, field, e, "one image a view"))
+}
+
+/// Reads a flat or dark field `[row, column]`: the mean of its images.
+pub(crate) fn read_field(
+    folder: &Path,
+    place: &str,
+    field: &str,
+    names: &Names,
+    layout: Layout,
+) -> Result<Array2<f32>> {
+    let stack = read(folder, place, field, names, layout)?;
+    stack.mean_axis(Axis(0)).ok_or_else(|| Error::invalid(place, field, "no image", "at least one"))
+}
+
+/// The file's array with three axes in its own order; an image gets an axis of one view at `views`.
+fn raw(source: &Source, views: usize) -> Result<Array3<f32>> {
+    let path = &source.path;
+    let place = path.display().to_string();
+    let three = |a: ArrayD<f32>| {
+        let a = if a.ndim() == 2 { a.insert_axis(Axis(views)) } else { a };
+        a.into_dimensionality::<Ix3>().map_err(|e| Error::invalid(&place, "shape", e, "two or three axes"))
+    };
+    let sets: &[&[&str]] = &[&["view", "row", "column"], &["row", "column"]];
+    let mut input = Input::open(path)?;
+    let head = input.take(8)?;
+    if head.starts_with(npz::MAGIC) {
+        return three(npz::read(path, source.array.as_deref(), sets)?);
+    }
+    if let Some(array) = &source.array {
+        let expected = "an .npz archive, the only file whose arrays have names";
+        return Err(Error::invalid(place, "array", format!("the name \"{array}\""), expected));
+    }
+    if head.starts_with(npy::MAGIC) {
+        return three(npy::read_one_of(&mut input, head, sets)?);
+    }
+    if tiff::is_tiff(&head) {
+        let mut pages = tiff::read(path)?;
+        // Pages are always views: put them where the layout expects them.
+        if views == 1 {
+            pages.swap_axes(0, 1);
+        } else if views == 2 {
+            pages = pages.permuted_axes([1, 2, 0]);
+        }
+        return Ok(pages);
+    }
+    let expected = "TIFF (49 49 2a 00 or 4d 4d 00 2a), NumPy's .npy (93 4e 55 4d) or .npz (50 4b 03 04)";
+    Err(Error::invalid(place, "format", format!("{head:02x?} at the start"), expected))
+}
+
+fn sources(folder: &Path, place: &str, field: &str, names: &Names) -> Result<Vec<Source>> {
+    match names {
+        Names::One(name) => source(folder, place, field, name),
+        Names::Many(names) if names.is_empty() => Err(Error::invalid(place, field, "an empty list", "file names")),
+        Names::Many(names) => {
+            let mut all = Vec::new();
+            for (i, name) in names.iter().enumerate() {
+                all.extend(source(folder, place, &format!("{field}[{i}]"), name)?);
+            }
+            Ok(all)
+        }
+    }
+}
+
+fn source(folder: &Path, place: &str, field: &str, name: &str) -> Result<Vec<Source>> {
+    let (file, array) = match name.split_once(".npz:") {
+        Some((stem, array)) => (format!("{stem}.npz"), Some(array.to_string())),
+        None => (name.to_string(), None),
+    };
+    let path = folder::within(folder, place, field, &file)?;
+    if path.is_file() {
+        return Ok(vec![Source { path, array }]);
+    }
+    let io = |e| Error::io(&path, e);
+    let mut found: Vec<String> = Vec::new();
+    for entry in std::fs::read_dir(&path).map_err(io)? {
+        found.extend(entry.map_err(io)?.file_name().into_string());
+    }
+    let ends = |n: &str, ends: &[&str]| {
+        let end = n.rsplit_once('.').map(|(_, e)| e.to_ascii_lowercase()).unwrap_or_default();
+        !n.starts_with('.') && ends.contains(&end.as_str())
+    };
+    let mut chosen: Vec<&String> = found.iter().filter(|n| ends(n, &["tif", "tiff"])).collect();
+    if chosen.is_empty() {
+        chosen = found.iter().filter(|n| ends(n, &["npy"])).collect();
+    }
+    if chosen.is_empty() {
+        let what = format!("a folder \"{file}\" of {} other files", found.len());
+        return Err(Error::invalid(place, field, what, "a folder with .tif, .tiff or .npy files"));
+    }
+    chosen.sort_by_cached_key(|n| natural(n));
+    let inside = chosen.iter().map(|n| {
+        let path = folder::inside(folder, place, field, &format!("{}/{n}", file.trim_end_matches('/')))?;
+        Ok(Source { path, array: None })
+    });
+    inside.collect()
+}
+
+/// A key by which `view2` comes before `view10`: runs of digits count as numbers.
+fn natural(name: &str) -> (Vec<(String, usize, String)>, String) {
+    let mut parts = Vec::new();
+    let mut rest = name;
+    while !rest.is_empty() {
+        let digits = rest.find(|c: char| c.is_ascii_digit()).unwrap_or(rest.len());
+        let (text, tail) = rest.split_at(digits);
+        let end = tail.find(|c: char| !c.is_ascii_digit()).unwrap_or(tail.len());
+        let (number, tail) = tail.split_at(end);
+        let number = number.trim_start_matches('0');
+        // Of numbers without leading zeros the longer is the larger, whatever their length.
+        parts.push((text.to_lowercase(), number.len(), number.to_string()));
+        rest = tail;
+    }
+    (parts, name.to_string())
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::testing::npy_bytes;
+
+    const PLAIN: Layout =
+        Layout { axes: [StackAxis::View, StackAxis::Row, StackAxis::Column], flip_rows: false, flip_columns: false };
+
+    #[test]
+    fn names_sort_by_their_numbers() {
+        let mut names = ["p10.tif", "p9.tif", "p010.tif", "P1.tif", "p100000000000000000000000.tif", "a.tif"];
+        names.sort_by_cached_key(|n| natural(n));
+        assert_eq!(names, ["a.tif", "P1.tif", "p9.tif", "p010.tif", "p10.tif", "p100000000000000000000000.tif"]);
+    }
+
+    #[test]
+    fn axes_and_flips_bring_every_layout_to_view_row_column() {
+        use StackAxis::{Column, Row, View};
+        let want = Array3::from_shape_fn((2, 3, 4), |(v, r, c)| (100 * v + 10 * r + c) as f32);
+        for axes in [[View, Row, Column], [View, Column, Row], [Row, View, Column], [Column, Row, View]] {
+            for (flip_rows, flip_columns) in [(false, false), (true, false), (false, true), (true, true)] {
+                let layout = Layout { axes, flip_rows, flip_columns };
+                let mut a = want.clone();
+                if flip_rows {
+                    a.invert_axis(Axis(1));
+                }
+                if flip_columns {
+                    a.invert_axis(Axis(2));
+                }
+                let order = axes.map(|x| x as usize);
+                assert_eq!(layout.arrange(a.permuted_axes(order)), want, "{layout:?}");
+            }
+        }
+    }
+
+    #[test]
+    fn folders_lists_and_names_are_read_and_what_leads_out_is_refused() {
+        let dir = tempfile::tempdir().unwrap();
+        let at = |n: &str| dir.path().join(n);
+        std::fs::create_dir(at("views")).unwrap();
+        for i in [2usize, 10, 1] {
+            let image = npy_bytes("|u1", false, "(1, 2)", &[i as u8, 7]);
+            std::fs::write(at(&format!("views/p{i}.npy")), image).unwrap();
+        }
+        let read = |names: Names| super::read(dir.path(), "s.toml", "files.projections", &names, PLAIN);
+        let one = |n: &str| read(Names::One(n.into()));
+        assert_eq!(one("views").unwrap().slice(ndarray::s![.., 0, 0]).to_vec(), [1.0, 2.0, 10.0]);
+        let many = |n: &[&str]| read(Names::Many(n.iter().map(|s| s.to_string()).collect()));
+        assert_eq!(
+            many(&["views/p10.npy", "views/p1.npy"]).unwrap().slice(ndarray::s![.., 0, 0]).to_vec(),
+            [10.0, 1.0]
+        );
+        std::fs::write(at("odd.npy"), npy_bytes("|u1", false, "(2, 2)", &[0; 4])).unwrap();
+        std::fs::write(at("text.tif"), "no image").unwrap();
+        std::fs::create_dir(at("empty")).unwrap();
+        for (found, words) in [
+            (many(&["views/p1.npy", "odd.npy"]), ["odd.npy", "2 x 2", "1 x 2"]),
+            (many(&[]), ["s.toml", "files.projections", "empty list"]),
+            (one("../x.npy"), ["s.toml", "files.projections", "without \"..\""]),
+            (many(&["odd.npy", "/etc/passwd"]), ["s.toml", "files.projections[1]", "inside the folder"]),
+            (one("none.npy"), ["s.toml", "files.projections", "none.npy"]),
+            (one("text.tif"), ["text.tif", "format", "TIFF"]),
+            (one("odd.npy.npz:a"), ["s.toml", "files.projections", "odd.npy.npz"]),
+            (one("empty"), ["s.toml", "files.projections", ".tif"]),
+        ] {
+            let e = found.unwrap_err().to_string();
+            assert!(words.iter().all(|w| e.contains(w)), "{words:?} are not all in: {e}");
+        }
+    }
+}

@@ -1,0 +1,156 @@
+//! TIFF as detectors write it: one grey channel, integers or floats, one image a page.
+
+use conefield_core::{Error, Result};
+use ndarray::Array3;
+use std::fs::File;
+use std::io::BufReader;
+use std::path::Path;
+use tiff::decoder::{Decoder, DecodingResult, Limits};
+use tiff::{ColorType, TiffError};
+
+/// Whether `head`, the first bytes of a file, starts a TIFF (also a BigTIFF).
+pub(crate) fn is_tiff(head: &[u8]) -> bool {
+    [b"II*\0", b"MM\0*", b"II+\0", b"MM\0+"].iter().any(|m| head.starts_with(*m))
+}
+
+/// No packing that is read here (deflate, LZW, PackBits) unpacks to more than this many times its size.
+const MOST_RATIO: u64 = 2048;
+
+/// Reads all pages as `[page, row, column]`; they must be of one size.
+///
+/// 8 to 64 bits a pixel, integers or floats, converted to `f32`; other colours, sizes that the file cannot hold,
+/// values that are not finite and damaged files are refused.
+pub(crate) fn read(path: &Path) -> Result<Array3<f32>> {
+    let place = path.display().to_string();
+    let io = |e| Error::io(path, e);
+    let file = File::open(path).map_err(io)?;
+    let most = file.metadata().map_err(io)?.len().saturating_mul(MOST_RATIO);
+    let broken = |e: TiffError| Error::invalid(&place, "TIFF", e, "a whole TIFF image");
+    let mut decoder = Decoder::new(BufReader::new(file)).map_err(broken)?;
+    let (mut values, mut size, mut pages, mut claimed) = (Vec::<f32>::new(), None, 0usize, 0u64);
+    loop {
+        let (width, height) = decoder.dimensions().map_err(broken)?;
+        let bits = match decoder.colortype().map_err(broken)? {
+            ColorType::Gray(bits @ (8 | 16 | 32 | 64)) => bits,
+            other => {
+                let expected = "one grey channel of 8, 16, 32 or 64 bits";
+                return Err(Error::invalid(&place, format!("page {pages}"), format!("{other:?}"), expected));
+            }
+        };
+        let bytes = u64::from(width).saturating_mul(height.into()).saturating_mul(u64::from(bits) / 8);
+        claimed = claimed.saturating_add(bytes);
+        if bytes == 0 || claimed > most {
+            let found = format!("{height} x {width} pixels of {bits} bits");
+            let expected = format!("at least one pixel and at most {most} bytes, all that such a file can unpack to");
+            return Err(Error::invalid(&place, format!("page {pages}"), found, expected));
+        }
+        if *size.get_or_insert((height, width)) != (height, width) {
+            let found = format!("{height} x {width} pixels");
+            return Err(Error::invalid(&place, format!("page {pages}"), found, "the size of the first page"));
+        }
+        let count = usize::try_from(bytes).unwrap_or(usize::MAX);
+        let mut limits = Limits::default();
+        (limits.decoding_buffer_size, limits.ifd_value_size) = (count, 16 << 20);
+        limits.intermediate_buffer_size = limits.intermediate_buffer_size.max(count);
+        decoder = decoder.with_limits(limits);
+        append(&mut values, decoder.read_image().map_err(broken)?);
+        pages += 1;
+        if !decoder.more_images() {
+            break;
+        }
+        decoder.next_image().map_err(broken)?;
+    }
+    let (height, width) = size.unwrap_or_default();
+    let (rows, columns) = (height as usize, width as usize);
+    let all = Array3::from_shape_vec((pages, rows, columns), values)
+        .map_err(|e| Error::invalid(&place, "TIFF", e, format!("{rows} x {columns} values a page")))?;
+    match all.indexed_iter().find(|(_, x)| !x.is_finite()) {
+        Some(((p, r, c), x)) => {
+            Err(Error::invalid(place, format!("page {p}, row {r}, column {c}"), x, "a finite number"))
+        }
+        None => Ok(all),
+    }
+}
+
+fn append(out: &mut Vec<f32>, image: DecodingResult) {
+    use DecodingResult::*;
+    match image {
+        U8(v) => out.extend(v.iter().map(|&x| f32::from(x))),
+        I8(v) => out.extend(v.iter().map(|&x| f32::from(x))),
+        U16(v) => out.extend(v.iter().map(|&x| f32::from(x))),
+        I16(v) => out.extend(v.iter().map(|&x| f32::from(x))),
+        U32(v) => out.extend(v.iter().map(|&x| x as f32)),
+        I32(v) => out.extend(v.iter().map(|&x| x as f32)),
+        U64(v) => out.extend(v.iter().map(|&x| x as f32)),
+        I64(v) => out.extend(v.iter().map(|&x| x as f32)),
+        F16(v) => out.extend(v.iter().map(|&x| f32::from(x))),
+        F32(v) => out.extend(v),
+        F64(v) => out.extend(v.iter().map(|&x| x as f32)),
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use tiff::encoder::{TiffEncoder, colortype as kind};
+
+    #[test]
+    fn integers_and_floats_come_in_and_pages_become_views() {
+        let dir = tempfile::tempdir().unwrap();
+        let path = dir.path().join("a.tif");
+        macro_rules! each {
+            ($kind:ty, $t:ty) => {{
+                let mut w = TiffEncoder::new(File::create(&path).unwrap()).unwrap();
+                for page in 0..2u8 {
+                    let data: Vec<$t> = (0..6u8).map(|i| (10 * page + i) as $t).collect();
+                    w.write_image::<$kind>(3, 2, &data).unwrap();
+                }
+                drop(w);
+                let a = read(&path).unwrap();
+                assert_eq!(a.dim(), (2, 2, 3));
+                assert_eq!((a[[0, 0, 2]], a[[0, 1, 0]], a[[1, 1, 2]]), (2.0, 3.0, 15.0));
+            }};
+        }
+        each!(kind::Gray8, u8);
+        each!(kind::Gray16, u16);
+        each!(kind::Gray32, u32);
+        each!(kind::GrayI16, i16);
+        each!(kind::Gray32Float, f32);
+    }
+
+    fn refused(bytes: &[u8], words: &[&str]) {
+        let dir = tempfile::tempdir().unwrap();
+        let path = dir.path().join("a.tif");
+        std::fs::write(&path, bytes).unwrap();
+        let e = read(&path).unwrap_err().to_string();
+        assert!(e.contains("a.tif") && words.iter().all(|w| e.contains(w)), "{words:?} are not all in: {e}");
+    }
+
+    #[test]
+    fn damaged_and_foreign_images_are_refused() {
+        let mut file = std::io::Cursor::new(Vec::new());
+        let data: Vec<u16> = (0..400).collect();
+        TiffEncoder::new(&mut file).unwrap().write_image::<kind::Gray16>(20, 20, &data).unwrap();
+        let whole = file.into_inner();
+        for cut in [0, 3, 9, whole.len() / 2, whole.len() - 20] {
+            refused(&whole[..cut], &["TIFF"]);
+        }
+        // No changed byte makes it panic or take memory.
+        let dir = tempfile::tempdir().unwrap();
+        let path = dir.path().join("b.tif");
+        for at in (0..8).chain(800..whole.len()) {
+            for x in [0x01, 0x80, 0xff] {
+                let mut bytes = whole.clone();
+                bytes[at] ^= x;
+                std::fs::write(&path, &bytes).unwrap();
+                let _ = read(&path);
+            }
+        }
+        let mut file = std::io::Cursor::new(Vec::new());
+        TiffEncoder::new(&mut file).unwrap().write_image::<kind::RGB8>(2, 1, &[1u8; 6]).unwrap();
+        refused(&file.into_inner(), &["page 0", "RGB", "grey"]);
+        let mut file = std::io::Cursor::new(Vec::new());
+        TiffEncoder::new(&mut file).unwrap().write_image::<kind::Gray32Float>(2, 1, &[1.0, f32::NAN]).unwrap();
+        refused(&file.into_inner(), &["page 0, row 0, column 1", "NaN"]);
+    }
+}
