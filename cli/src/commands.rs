@@ -5,6 +5,7 @@ mod convert;
 mod demo;
 mod evaluate;
 mod explain;
+mod import;
 mod info;
 mod pretrain;
 mod reconstruct;
@@ -23,6 +24,8 @@ use serde::Serialize;
 pub enum Command {
     /// Make a scan of a known volume.
     Simulate(simulate::Simulate),
+    /// Make a scan of what a scanner gave.
+    Import(import::Import),
     /// Reconstruct a volume from a scan.
     Reconstruct(reconstruct::Reconstruct),
     /// Train a field on known volumes, for weights that other scans start from (MCI).
@@ -47,6 +50,7 @@ pub enum Command {
 pub fn run(command: Command) -> Result<()> {
     match command {
         Command::Simulate(c) => c.run(),
+        Command::Import(c) => c.run(),
         Command::Reconstruct(c) => c.run(),
         Command::Pretrain(c) => c.run(),
         Command::Evaluate(c) => c.run(),

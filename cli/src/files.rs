@@ -4,6 +4,7 @@ use conefield_core::arena::Weights;
 use conefield_core::checkpoint::{Checkpoint, Resume};
 use conefield_core::scan::{Scan, Volume};
 use conefield_core::{Error, Result};
+use conefield_io::LineIntegralCheck;
 use conefield_projectors::simulate::{PhantomKind, phantom_of};
 use std::collections::BTreeMap;
 use std::path::Path;
@@ -26,7 +27,15 @@ pub fn volume(name: &str) -> Result<Volume> {
 pub fn scan(path: &Path) -> Result<Scan> {
     let scan = conefield_io::read_scan(path)?;
     scan.validate(&path.display().to_string())?;
+    warn_of(path, &conefield_io::check_line_integrals(scan.projections.view()));
     Ok(scan)
+}
+
+/// Warns of a scan whose values hardly are line integrals.
+pub fn warn_of(path: &Path, check: &LineIntegralCheck) {
+    for complaint in &check.complaints {
+        tracing::warn!("{}: {complaint}", path.display());
+    }
 }
 
 /// Reads weights.

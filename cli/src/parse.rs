@@ -1,6 +1,7 @@
 //! Values on the command line. What does not parse is wrong use, told before any work.
 
 use conefield_core::scan::Volume;
+use conefield_io::I0;
 use conefield_projectors::simulate::{HuMapping, Noise};
 use std::fmt::Display;
 use std::path::PathBuf;
@@ -58,6 +59,14 @@ fn positive(text: &str, what: impl Display) -> Result<f64, String> {
 /// `none`, `tigre:I0,SIGMA` or `poisson:I0`.
 pub fn noise(text: &str) -> Result<Noise, String> {
     text.parse().map_err(|e: conefield_core::Error| e.to_string())
+}
+
+/// `air` or a number of counts.
+pub fn i0(text: &str) -> Result<I0, String> {
+    match text {
+        "air" => Ok(I0::Air),
+        _ => positive(text, "a number of counts above 0, or air").map(I0::Number),
+    }
 }
 
 /// Which views to keep aside.
@@ -166,6 +175,8 @@ mod tests {
         assert_eq!(noise("tigre:1e4,10"), Ok(Noise::Tigre { i0: 1e4, sigma: 10.0 }));
         assert_eq!(noise("poisson:1e5"), Ok(Noise::Poisson { i0: 1e5 }));
         assert!(noise("poisson:0").is_err() && noise("tigre:1e4").is_err() && noise("salt").is_err());
+        assert_eq!((i0("air"), i0("2e4")), (Ok(I0::Air), Ok(I0::Number(2e4))));
+        assert!(i0("0").is_err() && i0("water").is_err());
         assert_eq!(hold_out("3,17"), Ok(HoldOut::Views(vec![3, 17])));
         assert_eq!(hold_out("every:10").unwrap().views(25), [5, 15]);
         assert!(hold_out("every:1").is_err() && hold_out("a").is_err());

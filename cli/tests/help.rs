@@ -3,8 +3,19 @@
 mod common;
 use common::{conefield, done, refused};
 
-const COMMANDS: [&str; 10] =
-    ["simulate", "reconstruct", "pretrain", "evaluate", "explain", "info", "convert", "backends", "schema", "demo"];
+const COMMANDS: [&str; 11] = [
+    "simulate",
+    "import",
+    "reconstruct",
+    "pretrain",
+    "evaluate",
+    "explain",
+    "info",
+    "convert",
+    "backends",
+    "schema",
+    "demo",
+];
 
 #[test]
 fn every_subcommand_has_help() {
@@ -40,6 +51,7 @@ fn wrong_use_exits_with_2() {
         (&["reconstruct", "s", "--spec", "naf", "-o", "r", "--steps", "0"], "--steps"),
         (&["reconstruct", "s", "--spec", "naf", "-o", "r", "--hold-out", "x"], "every:10"),
         (&["reconstruct", "s", "--spec", "naf", "-o", "r", "--backend", "abacus"], "cpu"),
+        (&["import", "s.toml", "-o", "s", "--i0", "water"], "or air"),
         (&["evaluate", "a", "b", "--peak", "0"], "above 0"),
         (&["--threads", "0", "backends"], "--threads"),
         (&["pretrain", "--spec", "naf", "-o", "w"], "<VOLUME>"),

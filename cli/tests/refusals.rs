@@ -24,6 +24,7 @@ fn missing_files_are_named() {
         &["reconstruct", "nothing.nii.gz", "--spec", "naf", "-o", "run"],
         &["pretrain", "nothing.nii.gz", "--spec", "naf", "-o", "w.safetensors"],
         &["convert", "nothing.nii.gz", "out.nii"],
+        &["import", "nothing.nii.gz", "-o", "scan"],
         &["explain", "naf", "--scan", "nothing.nii.gz"],
     ] {
         let said = refused(1, args);

@@ -82,7 +82,7 @@ fn weights(path: &Path) -> Result<Value> {
 }
 
 /// One line a key; tables become dotted keys.
-fn lines(value: &Value) -> String {
+pub fn lines(value: &Value) -> String {
     fn walk(prefix: &str, value: &Value, rows: &mut Vec<Vec<String>>) {
         match value {
             Value::Object(map) => {

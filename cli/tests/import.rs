@@ -1,0 +1,63 @@
+//! `conefield import` from files to a scan that the other commands read.
+
+mod common;
+use common::{conefield, done, json, refused, text};
+use std::fs;
+use std::path::Path;
+use tempfile::tempdir;
+
+/// A `.npy` file of 16-bit counts.
+fn npy(path: &Path, shape: &str, counts: &[u16]) {
+    let mut header = format!("{{'descr': '<u2', 'fortran_order': False, 'shape': ({shape}), }}");
+    while (header.len() + 11) % 64 != 0 {
+        header.push(' ');
+    }
+    header.push('\n');
+    let mut out = b"\x93NUMPY\x01\x00".to_vec();
+    out.extend((header.len() as u16).to_le_bytes());
+    out.extend(header.as_bytes());
+    out.extend(counts.iter().flat_map(|c| c.to_le_bytes()));
+    fs::write(path, out).unwrap();
+}
+
+#[test]
+fn counts_become_a_scan_that_the_other_commands_read() {
+    let dir = tempdir().unwrap();
+    let at = |n: &str| dir.path().join(n);
+    let block = |i: usize| (6..10).contains(&(i / 16 % 16)) && (6..10).contains(&(i % 16));
+    let counts: Vec<u16> = (0..8 * 256).map(|i| if block(i) { 2500 } else { 10000 }).collect();
+    npy(&at("counts.npy"), "8, 16, 16", &counts);
+    let toml = "format = \"conefield-scanner\"\nversion = 1\nfiles.projections = \"counts.npy\"\n\
+        volume = { shape = [8, 8, 8], spacing = [2.0, 2.0, 2.0] }\n[circle]\ndso = 100.0\ndsd = 150.0\n\
+        pixel = { u = 2.0, v = 2.0 }\nrange_deg = 360.0\ndirection = \"clockwise\"\n";
+    fs::write(at("s.toml"), toml).unwrap();
+    let (scanner, out) = (text(&at("s.toml")), text(&at("scan")));
+
+    // Without an open beam there is nothing to compare with, and nothing is left behind.
+    let said = refused(1, &["import", &scanner, "-o", &out]);
+    assert!(said.contains("files.flat") && said.contains("--i0"), "{said}");
+    assert!(!at("scan").exists());
+
+    let found = json(&["import", &scanner, "-o", &out, "--i0", "10000", "--json"]);
+    assert_eq!(found["views"], 8);
+    assert_eq!(found["source_to_axis_mm"], 100.0);
+    assert_eq!(found["counts"]["clamped"], 0.0);
+    assert_eq!(found["line_integrals"]["complaints"], serde_json::json!([]));
+    let top = found["line_integrals"]["range"][1].as_f64().unwrap();
+    assert!((top - 4f64.ln()).abs() < 1e-5, "{top}");
+    let info = json(&["info", &out, "--json"]);
+    assert_eq!((&info["views"], &info["detector"]), (&found["views"], &found["detector"]));
+
+    // A scan that stands there is not replaced unasked; air says the same as the number.
+    assert!(refused(1, &["import", &scanner, "-o", &out, "--i0", "air"]).contains("--force"));
+    let said = done(&["import", &scanner, "-o", &out, "--i0", "air", "--force"]);
+    assert!(said.contains("source_to_detector_mm") && said.contains("counts.bad"), "{said}");
+
+    // Counts that are taken for line integrals get a warning, also when the scan is read later.
+    fs::write(at("s.toml"), format!("{toml}[values]\nkind = \"line-integrals\"\n")).unwrap();
+    done(&["import", &scanner, "-o", &out, "--force"]);
+    let log = assert_cmd::Command::cargo_bin("conefield").unwrap().args(["info", &out]).output().unwrap();
+    let log = String::from_utf8(log.stderr).unwrap();
+    assert!(log.contains("looks like intensities, not line integrals: pass --i0 or flat/dark"), "{log}");
+    conefield(&["info", &out]).assert().success();
+}
