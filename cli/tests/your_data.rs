@@ -75,7 +75,7 @@ fn every_step_of_the_page_works() {
         "-o",
         &wrong,
         "--steps",
-        "100",
+        "400",
         "--hold-out",
         "every:6",
     ]);
