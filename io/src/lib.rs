@@ -24,6 +24,7 @@ mod checkpoint;
 mod counts;
 mod curves;
 mod dicom;
+mod file_order;
 mod folder;
 mod input;
 mod metaimage;

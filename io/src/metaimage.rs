@@ -4,7 +4,7 @@
 use crate::affine::{self, Affine};
 use crate::input::Input;
 use crate::number::{Number, Order};
-use crate::{folder, volume};
+use crate::{file_order, folder};
 use conefield_core::geometry::{VoxelGrid, norm};
 use conefield_core::scan::Volume;
 use conefield_core::{Error, Result};
@@ -266,7 +266,7 @@ pub(crate) fn read(path: &Path) -> Result<Volume> {
         data = data.inflate();
     }
     let values = data.numbers("data", count, number, order, |x| x as f32)?;
-    volume::from_file_order(&data, grid, affine, values)
+    file_order::read(&data, grid, affine, values)
 }
 
 /// The file that holds the voxels: `header_file` itself, just past the header, or another one in its folder.
@@ -313,7 +313,7 @@ pub(crate) fn write(w: &mut dyn Write, path: &Path, volume: &Volume) -> Result<(
     // The size of the packed data stands before it: pack it aside, in memory while it is small.
     let folder = path.parent().filter(|p| !p.as_os_str().is_empty()).unwrap_or(Path::new("."));
     let mut packed = ZlibEncoder::new(tempfile::spooled_tempfile_in(64 << 20, folder), Compression::fast());
-    volume::to_file_order(&mut packed, path, &volume.data)?;
+    file_order::write(&mut packed, path, &volume.data)?;
     let mut packed = packed.finish().map_err(io)?;
     let size = packed.stream_position().map_err(io)?;
     packed.rewind().map_err(io)?;

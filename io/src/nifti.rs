@@ -4,9 +4,9 @@
 //! us allocate, and the header is written here, because that lets the writer go through [`crate::write_atomic`].
 
 use crate::affine::{self, Affine};
+use crate::file_order;
 use crate::input::Input;
 use crate::number::{Number, Order};
-use crate::volume;
 use conefield_core::geometry::VoxelGrid;
 use conefield_core::scan::Volume;
 use conefield_core::{Error, Result};
@@ -57,7 +57,7 @@ pub(crate) fn read_from(input: &mut Input, head: &[u8]) -> Result<Volume> {
     };
     input.skip(offset - HEADER as u64, "vox_offset")?;
     let values = input.numbers("data", count, number, order, |x| (slope * x + inter) as f32)?;
-    volume::from_file_order(input, grid, affine, values)
+    file_order::read(input, grid, affine, values)
 }
 
 /// Three axes of at least one voxel; later axes may only say 1.
@@ -225,7 +225,7 @@ pub(crate) fn write(w: &mut dyn Write, path: &Path, volume: &Volume) -> Result<(
     }
     put(344, b"n+1\0");
     w.write_all(&h).map_err(|e| Error::io(path, e))?;
-    volume::to_file_order(w, path, &volume.data)
+    file_order::write(w, path, &volume.data)
 }
 
 #[cfg(test)]

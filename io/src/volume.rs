@@ -1,14 +1,12 @@
 //! The door for volumes: which format a file is in, and which one a name asks for.
 
-use crate::affine::Affine;
 use crate::input::Input;
 use crate::{dicom, metaimage, nifti, npy, write_atomic};
 use conefield_core::geometry::VoxelGrid;
 use conefield_core::scan::Volume;
 use conefield_core::{Error, Result};
 use flate2::{Compression, GzBuilder};
-use ndarray::{Array3, Ix3, ShapeBuilder};
-use std::io::Write;
+use ndarray::{Array3, Ix3};
 use std::path::Path;
 
 /// Reads a volume: NIfTI-1 (any real number type, gzip or not), MetaImage (`.mha`, `.mhd` with the file it names
@@ -104,33 +102,6 @@ pub fn write_volume(path: impl AsRef<Path>, volume: &Volume) -> Result<()> {
         Format::Npy => npy::write(w, path, &volume.data),
         Format::MetaImage => metaimage::write(w, path, volume),
     })
-}
-
-/// A volume of `values` as NIfTI and MetaImage store them, x fastest; one that is not finite is refused.
-pub(crate) fn from_file_order(input: &Input, grid: VoxelGrid, affine: Affine, values: Vec<f32>) -> Result<Volume> {
-    let [nx, ny, nz] = grid.shape;
-    let data = Array3::from_shape_vec((nx, ny, nz).f(), values)
-        .map_err(|e| input.invalid("data", e, "as many values as voxels"))?;
-    // The program's arrays run z fastest.
-    let data = data.as_standard_layout().into_owned();
-    if let Some((at, x)) = data.indexed_iter().find(|(_, x)| !x.is_finite()) {
-        return Err(input.invalid(format!("voxel [{}, {}, {}]", at.0, at.1, at.2), x, "a finite number"));
-    }
-    Ok(Volume { data, grid, affine: Some(affine) })
-}
-
-/// Writes `data` to the file `path` as [`from_file_order`] reads it, little-endian.
-pub(crate) fn to_file_order(w: &mut dyn Write, path: &Path, data: &Array3<f32>) -> Result<()> {
-    let (nx, ny, nz) = data.dim();
-    let mut row = Vec::with_capacity(nx * 4);
-    for z in 0..nz {
-        for y in 0..ny {
-            row.clear();
-            row.extend((0..nx).flat_map(|x| data[[x, y, z]].to_le_bytes()));
-            w.write_all(&row).map_err(|e| Error::io(path, e))?;
-        }
-    }
-    Ok(())
 }
 
 /// A NumPy array as a volume of 1 mm voxels.
