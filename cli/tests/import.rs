@@ -2,23 +2,9 @@
 
 mod common;
 use common::{conefield, done, json, refused, text};
+use ndarray::Array3;
 use std::fs;
-use std::path::Path;
 use tempfile::tempdir;
-
-/// A `.npy` file of 16-bit counts.
-fn npy(path: &Path, shape: &str, counts: &[u16]) {
-    let mut header = format!("{{'descr': '<u2', 'fortran_order': False, 'shape': ({shape}), }}");
-    while (header.len() + 11) % 64 != 0 {
-        header.push(' ');
-    }
-    header.push('\n');
-    let mut out = b"\x93NUMPY\x01\x00".to_vec();
-    out.extend((header.len() as u16).to_le_bytes());
-    out.extend(header.as_bytes());
-    out.extend(counts.iter().flat_map(|c| c.to_le_bytes()));
-    fs::write(path, out).unwrap();
-}
 
 #[test]
 fn counts_become_a_scan_that_the_other_commands_read() {
@@ -26,7 +12,8 @@ fn counts_become_a_scan_that_the_other_commands_read() {
     let at = |n: &str| dir.path().join(n);
     let block = |i: usize| (6..10).contains(&(i / 16 % 16)) && (6..10).contains(&(i % 16));
     let counts: Vec<u16> = (0..8 * 256).map(|i| if block(i) { 2500 } else { 10000 }).collect();
-    npy(&at("counts.npy"), "8, 16, 16", &counts);
+    let counts = Array3::from_shape_vec((8, 16, 16), counts).unwrap();
+    ndarray_npy::write_npy(at("counts.npy"), &counts).unwrap();
     let toml = "format = \"conefield-scanner\"\nversion = 1\nfiles.projections = \"counts.npy\"\n\
         volume = { shape = [8, 8, 8], spacing = [2.0, 2.0, 2.0] }\n[circle]\ndso = 100.0\ndsd = 150.0\n\
         pixel = { u = 2.0, v = 2.0 }\nrange_deg = 360.0\ndirection = \"clockwise\"\n";

@@ -68,15 +68,13 @@ impl Resume {
         for masked in &self.standing.masks {
             model.mask(masked)?;
         }
-        for (part, name) in PARTS.into_iter().enumerate() {
-            let prefix = format!("{name}.");
+        let Arena { params, first, second, .. } = &mut model.arena;
+        for (part, values) in PARTS.into_iter().zip([params, first, second]) {
+            let prefix = format!("{part}.");
             let own =
                 |(k, v): (&String, &(Vec<usize>, Vec<f32>))| Some((k.strip_prefix(&prefix)?.to_owned(), v.clone()));
-            let weights =
-                Weights { tensors: self.weights.tensors.iter().filter_map(own).collect(), ..Weights::default() };
-            let arena = &mut model.arena;
-            let values = [&mut arena.params, &mut arena.first, &mut arena.second];
-            let Some(values) = values.into_iter().nth(part) else { continue };
+            let tensors = self.weights.tensors.iter().filter_map(own).collect();
+            let weights = Weights { tensors, ..Weights::default() };
             let report = weights.load(&self.place, model.pipeline.layout(), values, |_| true)?;
             if let Some((tensor, why)) = report.unused.first() {
                 return Err(Error::invalid(&self.place, tensor, why, "only tensors of this pipeline"));
