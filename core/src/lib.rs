@@ -4,6 +4,7 @@
 //! - [`simd`], [`dense`], [`trilinear`], [`stage`]: what a stage computes and how.
 //! - [`arena`]: parameters, gradients and optimizer state under their names.
 //! - [`spec`], [`registry`]: what a user writes, and the stage types that it may name.
+//! - [`voxel`]: line integrals of voxel volumes.
 //! - [`pipeline`], [`backend`], [`solver`]: from a spec to a volume.
 
 pub mod arena;
@@ -23,5 +24,6 @@ pub mod solver;
 pub mod spec;
 pub mod stage;
 pub mod trilinear;
+pub mod voxel;
 
 pub use error::{Error, Result};

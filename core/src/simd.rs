@@ -47,6 +47,10 @@ pub trait Real:
     fn int(self) -> i64;
     /// The whole part of every lane, which is at least 0 and below 2³¹, into `out`; as many as fit.
     fn cells<S: Simd>(s: S, x: V<S, Self>, out: &mut [u32]);
+    /// `K` neighbours of every lane: `line[at]`, `line[at + 1]`, … The lanes of `at` are whole numbers that do not fall
+    /// from one lane to the next. Where they lie within two vectors of each other, and `line` goes on for two vectors
+    /// from the first, registers are shuffled instead of reading memory lane by lane.
+    fn neighbours<S: Simd, const K: usize>(s: S, line: &[Self], at: V<S, Self>) -> [V<S, Self>; K];
     /// Whether neither infinite nor NaN.
     fn finite(self) -> bool;
     /// Exponential of every lane.
@@ -89,6 +93,25 @@ impl Real for f32 {
         } else {
             out.copy_from_slice(&cells.as_slice()[..n]);
         }
+    }
+    #[inline(always)]
+    fn neighbours<S: Simd, const K: usize>(s: S, line: &[Self], at: V<S, Self>) -> [V<S, Self>; K] {
+        let len = S::f32s::LEN;
+        let (first, last) = (at.as_slice()[0], at.as_slice()[len - 1]);
+        let base = first as usize;
+        if (last - first) as usize + K > 2 * len || base + 2 * len > line.len() {
+            return one_by_one(s, line, at);
+        }
+        let low = S::f32s::from_slice(s, &line[base..base + len]);
+        let high = S::f32s::from_slice(s, &line[base + len..base + 2 * len]);
+        // The four bytes of every lane's number.
+        let lane: S::u32s = (at - first).to_int();
+        let mut bytes = lane * 0x0404_0404 + 0x0302_0100;
+        std::array::from_fn(|_| {
+            let taken = low.concat_swizzle_dyn(high, bytes.to_bytes());
+            bytes += 0x0404_0404;
+            taken
+        })
     }
     #[inline(always)]
     fn finite(self) -> bool {
@@ -183,6 +206,10 @@ impl Real for f64 {
         }
     }
     #[inline(always)]
+    fn neighbours<S: Simd, const K: usize>(s: S, line: &[Self], at: V<S, Self>) -> [V<S, Self>; K] {
+        one_by_one(s, line, at)
+    }
+    #[inline(always)]
     fn finite(self) -> bool {
         self.is_finite()
     }
@@ -211,6 +238,13 @@ impl Real for f64 {
     fn softplus(self) -> Self {
         self.max(0.0) + (-self.abs()).exp().ln_1p()
     }
+}
+
+/// [`Real::neighbours`] by reading memory.
+#[inline(always)]
+fn one_by_one<S: Simd, R: Real, const K: usize>(s: S, line: &[R], at: V<S, R>) -> [V<S, R>; K] {
+    let at = at.as_slice();
+    std::array::from_fn(|k| V::<S, R>::from_fn(s, |lane| line[at[lane].int() as usize + k]))
 }
 
 /// A piece of work that is compiled for every instruction set. `call` must be `#[inline(always)]`.
@@ -315,6 +349,32 @@ mod tests {
             assert!((a[0] - b[0]).abs() < 3e-7, "Φ({}) = {} not {}", x[i], a[0], b[0]);
             assert!((a[1] - b[1]).abs() < 2e-7, "φ({}) = {} not {}", x[i], a[1], b[1]);
             assert!((a[2] / b[2] - 1.0).abs() < 5e-7, "exp({}) = {} not {}", x[i], a[2], b[2]);
+        }
+    }
+
+    struct Neighbours<'a, R>(&'a [R], f64);
+    impl<R: Real> Op for Neighbours<'_, R> {
+        type Out = Vec<[f64; 3]>;
+        #[inline(always)]
+        fn call<S: Simd>(self, s: S) -> Self::Out {
+            let at = V::<S, R>::from_fn(s, |i| R::of((3.0 + self.1 * i as f64).floor()));
+            let found = R::neighbours::<S, 3>(s, self.0, at);
+            let lane = |i: usize| std::array::from_fn(|k| found[k].as_slice()[i].f64());
+            (0..V::<S, R>::LEN).map(lane).collect()
+        }
+    }
+
+    #[test]
+    fn neighbours_are_found_near_and_far_apart() {
+        let line: Vec<f32> = (0..200).map(|i| (i * i) as f32).collect();
+        let wide: Vec<f64> = line.iter().map(|&x| x.into()).collect();
+        for step in [0.0, 0.3, 1.0, 1.7, 5.0] {
+            for found in [run(Neighbours(&line, step)), run(Neighbours(&wide, step))] {
+                for (i, three) in found.into_iter().enumerate() {
+                    let first = (3.0 + step * i as f64).floor();
+                    assert_eq!(three, [0.0, 1.0, 2.0].map(|k| (first + k) * (first + k)), "step {step} lane {i}");
+                }
+            }
         }
     }
 }

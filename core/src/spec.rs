@@ -9,9 +9,10 @@ pub mod schema;
 mod tree;
 
 use crate::arena::{Arena, InitReport, Layout, Weights};
-use crate::error::Result;
+use crate::error::{Error, Result};
 use crate::solver::Solver;
 use crate::stage::{Encoder, Field, Normalizer, Projector};
+use crate::voxel::VoxelProjector;
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
@@ -92,11 +93,20 @@ pub trait FieldSpec: Send + Sync {
     fn build(&self, width: usize) -> Result<Box<dyn Field>>;
 }
 
-/// Settings of a projector.
+/// Settings of a projector: of one that samples rays for a field, of one that projects voxels, or of both.
 #[typetag::serde(tag = "type")]
 pub trait ProjectorSpec: Send + Sync {
-    /// The stage.
-    fn build(&self) -> Result<Box<dyn Projector>>;
+    /// The stage that samples rays.
+    fn build(&self) -> Result<Box<dyn Projector>> {
+        let found = format!("{:?}, which projects voxels", self.typetag_name());
+        Err(Error::invalid("spec", "projector.type", found, "one that samples rays"))
+    }
+
+    /// The stage that projects voxels.
+    fn build_voxel(&self) -> Result<Box<dyn VoxelProjector>> {
+        let found = format!("{:?}, which samples rays", self.typetag_name());
+        Err(Error::invalid("spec", "projector.type", found, "one that projects voxels"))
+    }
 }
 
 /// Settings of an initializer.

@@ -1,0 +1,163 @@
+//! Geometry in voxels, and projections that lie column by column.
+
+use conefield_core::geometry::{Geometry, Vec3, VoxelGrid, cross, dot, norm, sub};
+use conefield_core::simd::Real;
+use ndarray::{ArrayView3, Axis};
+use rayon::prelude::*;
+
+/// A world position in voxels: whole numbers are voxel centres.
+pub fn to_voxels(grid: &VoxelGrid, p: Vec3) -> Vec3 {
+    let lower = grid.bounds()[0];
+    std::array::from_fn(|k| (p[k] - lower[k]) / grid.spacing[k] - 0.5)
+}
+
+/// A view whose detector rows are stacked along z: neither `u` nor the detector's normal has a part along z.
+#[derive(Debug, Clone, Copy)]
+pub struct Upright {
+    /// The source in voxels.
+    pub source: Vec3,
+    /// From the source to the lowest row's first column, in mm.
+    pub first: Vec3,
+    /// From column to column, in mm along x and y.
+    pub u: [f64; 2],
+    /// From row to row upwards, in mm along z; above 0.
+    pub v: f64,
+    /// Whether rows of the projections run downwards, so that the lowest is the last.
+    pub downwards: bool,
+}
+
+impl Upright {
+    /// View `view` of `geometry`, unless it is tilted.
+    pub fn of(geometry: &Geometry, view: usize) -> Option<Self> {
+        let w = &geometry.views[view];
+        let small = 1e-9;
+        let tilted = w.u[2].abs() > small * norm(w.u) || w.v[0].hypot(w.v[1]) > small * norm(w.v);
+        if tilted {
+            return None;
+        }
+        let downwards = w.v[2] < 0.0;
+        let lowest = if downwards { geometry.detector[0] as f64 - 1.0 } else { 0.0 };
+        Some(Self {
+            source: to_voxels(&geometry.volume, w.source),
+            first: sub(w.pixel(geometry.detector, lowest, 0.0), w.source),
+            u: [w.u[0], w.u[1]],
+            v: w.v[2].abs(),
+            downwards,
+        })
+    }
+
+    /// From the source to the lowest pixel of column `column`, in mm.
+    pub fn lowest(&self, column: usize) -> Vec3 {
+        let c = column as f64;
+        [self.first[0] + c * self.u[0], self.first[1] + c * self.u[1], self.first[2]]
+    }
+
+    /// The row of the projections that is `row`th from below.
+    pub fn row(&self, row: usize, rows: usize) -> usize {
+        if self.downwards { rows - 1 - row } else { row }
+    }
+}
+
+/// Zeros before the first row of a column, which a reader may touch.
+pub const BEFORE: usize = 16;
+/// Zeros after the last row of a column: as many as vectors read at most beyond it.
+pub const AFTER: usize = 48;
+
+/// Some views with the pixels of a detector column side by side, from below, between zeros.
+pub struct ColumnMajor<R> {
+    /// `[view][column][BEFORE + rows + AFTER]`.
+    data: Vec<R>,
+    rows: usize,
+    columns: usize,
+    /// Whether the first row of a view's projections is its highest.
+    downwards: Vec<bool>,
+}
+
+impl<R: Real> ColumnMajor<R> {
+    /// The views `views` of `geometry`, of which `projections` holds one each; `value` makes a number of a pixel from
+    /// its view (counted within `views`), row, column and measured value.
+    pub fn new(
+        geometry: &Geometry,
+        views: &[usize],
+        projections: ArrayView3<'_, R>,
+        value: impl Fn(usize, usize, usize, R) -> R + Sync,
+    ) -> Self {
+        let [rows, columns] = geometry.detector;
+        let stride = BEFORE + rows + AFTER;
+        let mut data = vec![R::ZERO; views.len() * columns * stride];
+        let downwards: Vec<bool> = views.iter().map(|&v| geometry.views[v].v[2] < 0.0).collect();
+        data.par_chunks_mut(columns * stride).zip(&downwards).enumerate().for_each(|(n, (out, &downwards))| {
+            let view = projections.index_axis(Axis(0), n);
+            // Strips of columns: each row's numbers are read side by side and written to lines that stay in cache.
+            const STRIP: usize = 16;
+            for left in (0..columns).step_by(STRIP) {
+                for row in 0..rows {
+                    let from_below = if downwards { rows - 1 - row } else { row };
+                    for column in left..(left + STRIP).min(columns) {
+                        out[column * stride + BEFORE + from_below] = value(n, row, column, view[[row, column]]);
+                    }
+                }
+            }
+        });
+        Self { data, rows, columns, downwards }
+    }
+
+    /// A column with its zeros; row 0 stands at [`BEFORE`].
+    pub fn column(&self, view: usize, column: usize) -> &[R] {
+        let stride = BEFORE + self.rows + AFTER;
+        let at = (view * self.columns + column) * stride;
+        &self.data[at..at + stride]
+    }
+
+    /// The pixel at a row (as in the projections) and column; 0 outside the detector.
+    pub fn pixel(&self, view: usize, row: isize, column: isize) -> R {
+        let (Ok(row), Ok(column)) = (usize::try_from(row), usize::try_from(column)) else { return R::ZERO };
+        if row >= self.rows || column >= self.columns {
+            return R::ZERO;
+        }
+        let from_below = if self.downwards[view] { self.rows - 1 - row } else { row };
+        self.column(view, column)[BEFORE + from_below]
+    }
+}
+
+/// How many views to hold column by column at once: a few MiB, which stay in the last cache.
+pub fn batch<R>(geometry: &Geometry) -> usize {
+    let view = (geometry.detector[0] + BEFORE + AFTER) * geometry.detector[1] * size_of::<R>();
+    ((12 << 20) / view.max(1)).clamp(1, 64)
+}
+
+/// Detector coordinates of world positions for a view, tilted or not: `u`, `v` in pixels and the depth.
+#[derive(Debug, Clone, Copy)]
+pub struct Pinhole {
+    source: Vec3,
+    /// Unit normal of the detector, away from the source.
+    pub normal: Vec3,
+    /// Distance of source and detector along the normal, mm.
+    pub distance: f64,
+    /// From the source to the pixel (0, 0), mm.
+    corner: Vec3,
+    /// Dual basis of the pixel axes within the detector.
+    dual: [Vec3; 2],
+}
+
+impl Pinhole {
+    /// View `view` of `geometry`.
+    pub fn of(geometry: &Geometry, view: usize) -> Self {
+        let w = &geometry.views[view];
+        let (normal, distance) = w.normal();
+        let n = cross(w.u, w.v);
+        let square = dot(n, n);
+        let dual = [cross(w.v, n), cross(n, w.u)].map(|d| d.map(|x| x / square));
+        let corner = sub(w.pixel(geometry.detector, 0.0, 0.0), w.source);
+        Self { source: w.source, normal, distance, corner, dual }
+    }
+
+    /// Row and column (whole numbers are pixel centres) where the ray through `p` meets the detector, and the depth
+    /// of `p`: its distance from the source along the normal in mm.
+    pub fn project(&self, p: Vec3) -> ([f64; 2], f64) {
+        let d = sub(p, self.source);
+        let depth = dot(self.normal, d);
+        let hit: Vec3 = std::array::from_fn(|k| d[k] * self.distance / depth - self.corner[k]);
+        ([dot(self.dual[1], hit), dot(self.dual[0], hit)], depth)
+    }
+}

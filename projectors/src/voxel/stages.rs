@@ -1,0 +1,158 @@
+//! The voxel projectors that a spec may name.
+
+use super::columns;
+use super::rays;
+use super::walk::{JosephWalk, SiddonWalk, TrilinearWalk};
+use conefield_core::error::{Result, ensure};
+use conefield_core::geometry::Geometry;
+use conefield_core::simd::Real;
+use conefield_core::spec::ProjectorSpec;
+use conefield_core::voxel::{VoxelOperator, VoxelProjector};
+use ndarray::{ArrayView3, ArrayViewMut3, Axis};
+use schemars::JsonSchema;
+use serde::{Deserialize, Serialize};
+
+/// Settings of `siddon`.
+#[derive(Debug, Clone, Copy, Default, PartialEq, Serialize, Deserialize, JsonSchema)]
+#[serde(deny_unknown_fields, default)]
+pub struct Siddon {}
+
+/// Settings of `joseph`.
+#[derive(Debug, Clone, Copy, Default, PartialEq, Serialize, Deserialize, JsonSchema)]
+#[serde(deny_unknown_fields, default)]
+pub struct Joseph {}
+
+/// Settings of `trilinear`.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize, JsonSchema)]
+#[serde(deny_unknown_fields, default)]
+pub struct Trilinear {
+    /// Samples along the smallest side of a voxel, at least.
+    pub samples_per_voxel: f64,
+}
+
+impl Default for Trilinear {
+    fn default() -> Self {
+        Self { samples_per_voxel: 2.0 }
+    }
+}
+
+conefield_core::stage_type!(Projector, "siddon", Siddon, "exact path lengths through voxels");
+conefield_core::stage_type!(Projector, "joseph", Joseph, "bilinear interpolation from plane to plane of voxels");
+conefield_core::stage_type!(Projector, "trilinear", Trilinear, "trilinear samples of voxels at equal steps");
+
+#[typetag::serde(name = "siddon")]
+impl ProjectorSpec for Siddon {
+    fn build_voxel(&self) -> Result<Box<dyn VoxelProjector>> {
+        Ok(Box::new(*self))
+    }
+}
+
+#[typetag::serde(name = "joseph")]
+impl ProjectorSpec for Joseph {
+    fn build_voxel(&self) -> Result<Box<dyn VoxelProjector>> {
+        Ok(Box::new(*self))
+    }
+}
+
+#[typetag::serde(name = "trilinear")]
+impl ProjectorSpec for Trilinear {
+    fn build_voxel(&self) -> Result<Box<dyn VoxelProjector>> {
+        let n = self.samples_per_voxel;
+        ensure((0.5..=64.0).contains(&n), "spec", "projector.samples_per_voxel", n, "0.5 to 64")?;
+        Ok(Box::new(*self))
+    }
+}
+
+impl VoxelProjector for Siddon {
+    fn operator(&self) -> &dyn VoxelOperator<f32> {
+        self
+    }
+    fn reference(&self) -> &dyn VoxelOperator<f64> {
+        self
+    }
+    fn describe(&self) -> String {
+        "siddon: exact lengths inside voxels".into()
+    }
+}
+
+impl VoxelProjector for Joseph {
+    fn operator(&self) -> &dyn VoxelOperator<f32> {
+        self
+    }
+    fn reference(&self) -> &dyn VoxelOperator<f64> {
+        self
+    }
+    fn describe(&self) -> String {
+        "joseph: bilinear from plane to plane".into()
+    }
+}
+
+impl VoxelProjector for Trilinear {
+    fn operator(&self) -> &dyn VoxelOperator<f32> {
+        self
+    }
+    fn reference(&self) -> &dyn VoxelOperator<f64> {
+        self
+    }
+    fn describe(&self) -> String {
+        format!("trilinear: {} samples a voxel", self.samples_per_voxel)
+    }
+}
+
+impl<R: Real> VoxelOperator<R> for Siddon {
+    fn forward(&self, geometry: &Geometry, views: &[usize], volume: ArrayView3<'_, R>, out: ArrayViewMut3<'_, R>) {
+        rays::forward(&SiddonWalk, geometry, views, volume, out);
+    }
+    fn adjoint(&self, geometry: &Geometry, views: &[usize], p: ArrayView3<'_, R>, volume: ArrayViewMut3<'_, R>) {
+        rays::adjoint(&SiddonWalk, geometry, views, p, volume);
+    }
+}
+
+impl<R: Real> VoxelOperator<R> for Trilinear {
+    fn forward(&self, geometry: &Geometry, views: &[usize], volume: ArrayView3<'_, R>, out: ArrayViewMut3<'_, R>) {
+        let walk = TrilinearWalk { samples_per_voxel: self.samples_per_voxel };
+        rays::forward(&walk, geometry, views, volume, out);
+    }
+    fn adjoint(&self, geometry: &Geometry, views: &[usize], p: ArrayView3<'_, R>, volume: ArrayViewMut3<'_, R>) {
+        let walk = TrilinearWalk { samples_per_voxel: self.samples_per_voxel };
+        rays::adjoint(&walk, geometry, views, p, volume);
+    }
+}
+
+/// Views that go column by column run so, the others ray by ray.
+impl<R: Real> VoxelOperator<R> for Joseph {
+    fn forward(&self, geometry: &Geometry, views: &[usize], volume: ArrayView3<'_, R>, mut out: ArrayViewMut3<'_, R>) {
+        let mut upright = vec![];
+        let mut images = vec![];
+        for (&v, mut image) in views.iter().zip(out.outer_iter_mut()) {
+            match columns::fits(geometry, v) {
+                Some(u) => {
+                    upright.push(u);
+                    images.push(image);
+                }
+                None => {
+                    let image = image.view_mut().insert_axis(Axis(0));
+                    rays::forward(&JosephWalk, geometry, &[v], volume, image);
+                }
+            }
+        }
+        columns::forward(geometry, &upright, volume, images);
+    }
+
+    fn adjoint(&self, geometry: &Geometry, views: &[usize], p: ArrayView3<'_, R>, mut volume: ArrayViewMut3<'_, R>) {
+        let fitting: Vec<_> = views.iter().map(|&v| columns::fits(geometry, v)).collect();
+        // Runs of views of the same kind, in order.
+        let mut from = 0;
+        for run in fitting.chunk_by(|a, b| a.is_some() == b.is_some()) {
+            let part = from..from + run.len();
+            let images = p.slice_axis(Axis(0), part.clone().into());
+            let upright: Vec<_> = run.iter().flatten().copied().collect();
+            if upright.is_empty() {
+                rays::adjoint(&JosephWalk, geometry, &views[part.clone()], images, volume.view_mut());
+            } else {
+                columns::adjoint(geometry, &upright, &views[part.clone()], images, &mut volume);
+            }
+            from = part.end;
+        }
+    }
+}

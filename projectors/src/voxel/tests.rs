@@ -1,0 +1,297 @@
+//! Adjointness, agreement of the ways to compute the same, and closed forms.
+
+use super::backproject::backproject;
+use super::columns;
+use super::layout::ColumnMajor;
+use super::rays;
+use super::walk::JosephWalk;
+use super::{Joseph, Siddon, Trilinear};
+use conefield_core::geometry::{Geometry, Millimetres, Radians, Vec3, View, VoxelGrid};
+use conefield_core::random::{mix, unit};
+use conefield_core::simd::Real;
+use conefield_core::voxel::{VoxelOperator, VoxelProjector};
+use ndarray::{Array3, ArrayView3, Zip};
+use proptest::prelude::*;
+
+fn circular(angle: f64, dso: f64, dsd: f64, pixel: [f64; 2], offset: [f64; 2]) -> View {
+    View::circular(Radians(angle), Millimetres(dso), Millimetres(dsd), pixel.map(Millimetres), offset.map(Millimetres))
+}
+
+/// Non-square detector and volume, anisotropic voxels beside the axis, offsets, angles at and between the axes.
+fn crooked(upright: bool) -> Geometry {
+    let angles = [0.0, 0.3, 0.785_398_163_397_448_3, 1.6, 2.9, 3.7, 4.712_388_980_384_69, 5.5];
+    let mut views: Vec<View> = angles.iter().map(|&a| circular(a, 90.0, 140.0, [2.1, 1.7], [3.0, -4.5])).collect();
+    views[3].v[2] *= -1.0; // rows that run upwards
+    if !upright {
+        for v in &mut views[1..3] {
+            v.v = [0.3, -0.2, -2.0];
+            v.u[2] = 0.25;
+            v.source[2] += 5.0;
+        }
+    }
+    Geometry {
+        detector: [29, 37],
+        views,
+        volume: VoxelGrid { shape: [17, 23, 13], spacing: [1.9, 1.3, 2.4], center: [1.0, -2.0, 3.0] },
+    }
+}
+
+fn all_views(g: &Geometry) -> Vec<usize> {
+    (0..g.views.len()).collect()
+}
+
+/// Numbers in [-0.5, 0.5).
+fn noise<R: Real>(shape: [usize; 3], seed: u64) -> Array3<R> {
+    let mut i = 0;
+    Array3::from_shape_simple_fn(shape, || {
+        i += 1;
+        R::of(f64::from(unit(mix(seed, i))) - 0.5)
+    })
+}
+
+fn dot<R: Real>(a: &Array3<R>, b: &Array3<R>) -> f64 {
+    Zip::from(a).and(b).fold(0.0, |sum, x, y| sum + x.f64() * y.f64())
+}
+
+fn forward<R: Real>(op: &dyn VoxelOperator<R>, g: &Geometry, x: ArrayView3<'_, R>) -> Array3<R> {
+    let mut out = Array3::from_elem((g.views.len(), g.detector[0], g.detector[1]), R::ONE);
+    op.forward(g, &all_views(g), x, out.view_mut());
+    out
+}
+
+fn adjoint<R: Real>(op: &dyn VoxelOperator<R>, g: &Geometry, y: ArrayView3<'_, R>) -> Array3<R> {
+    let mut out = Array3::from_elem(g.volume.shape, R::ZERO);
+    op.adjoint(g, &all_views(g), y, out.view_mut());
+    out
+}
+
+/// `|<Ax, y> − <x, Aᵀy>| / (‖Ax‖·‖y‖)`.
+fn mismatch<R: Real>(op: &dyn VoxelOperator<R>, g: &Geometry, seed: u64) -> f64 {
+    let x = noise::<R>(g.volume.shape, seed);
+    let y = noise::<R>([g.views.len(), g.detector[0], g.detector[1]], seed + 1);
+    let ax = forward(op, g, x.view());
+    let aty = adjoint(op, g, y.view());
+    let norm = (dot(&ax, &ax) * dot(&y, &y)).sqrt();
+    assert!(norm > 0.0);
+    (dot(&ax, &y) - dot(&x, &aty)).abs() / norm
+}
+
+fn projectors() -> Vec<Box<dyn VoxelProjector>> {
+    vec![Box::new(Siddon {}), Box::new(Joseph {}), Box::new(Trilinear::default())]
+}
+
+#[test]
+fn adjoints_are_exact() {
+    for upright in [true, false] {
+        let g = crooked(upright);
+        for p in projectors() {
+            let double = mismatch(p.reference(), &g, 7);
+            let single = mismatch(p.operator(), &g, 7);
+            assert!(double < 1e-12, "{}: {double:e} in f64", p.describe());
+            assert!(single < 1e-5, "{}: {single:e} in f32", p.describe());
+        }
+    }
+}
+
+/// The check above can fail: a forward of another projector is no adjoint's partner.
+#[test]
+fn a_wrong_adjoint_is_caught() {
+    struct Wrong;
+    impl VoxelOperator<f64> for Wrong {
+        fn forward(
+            &self,
+            g: &Geometry,
+            views: &[usize],
+            volume: ArrayView3<'_, f64>,
+            out: ndarray::ArrayViewMut3<'_, f64>,
+        ) {
+            Siddon {}.forward(g, views, volume, out);
+        }
+        fn adjoint(
+            &self,
+            g: &Geometry,
+            views: &[usize],
+            p: ArrayView3<'_, f64>,
+            volume: ndarray::ArrayViewMut3<'_, f64>,
+        ) {
+            Joseph {}.adjoint(g, views, p, volume);
+        }
+    }
+    assert!(mismatch(&Wrong, &crooked(true), 7) > 1e-4);
+}
+
+#[test]
+fn columns_agree_with_rays() {
+    let g = crooked(true);
+    let x = noise::<f64>(g.volume.shape, 3);
+    let fast = forward::<f64>(&Joseph {}, &g, x.view());
+    let mut slow = Array3::zeros(fast.dim());
+    rays::forward(&JosephWalk, &g, &all_views(&g), x.view(), slow.view_mut());
+    assert!(all_views(&g).iter().all(|&v| columns::fits(&g, v).is_some()));
+    let worst = Zip::from(&fast).and(&slow).fold(0.0f64, |w, a, b| w.max((a - b).abs()));
+    assert!(worst < 1e-11, "{worst:e}");
+    let single = forward::<f32>(&Joseph {}, &g, x.mapv(|v| v as f32).view());
+    let worst = Zip::from(&single).and(&slow).fold(0.0f64, |w, a, b| w.max((f64::from(*a) - b).abs()));
+    let largest = slow.iter().fold(0.0f64, |m, x| m.max(x.abs()));
+    assert!(worst < 5e-6 * largest, "{worst:e} of {largest}");
+}
+
+#[test]
+fn rows_finer_than_voxels_and_coarser_agree_too() {
+    for rows in [3.0, 0.5, 0.3, 0.1] {
+        let mut g = crooked(true);
+        g.detector = [(40.0 / rows) as usize, 9];
+        for v in &mut g.views {
+            v.v[2] *= rows;
+            v.u = v.u.map(|x| 3.0 * x);
+        }
+        assert!(mismatch::<f64>(&Joseph {}, &g, 5) < 1e-12, "rows of {rows}");
+        assert!(mismatch::<f32>(&Joseph {}, &g, 5) < 1e-5, "rows of {rows}");
+    }
+}
+
+#[test]
+fn any_number_of_threads_gives_the_same_bits() {
+    let g = crooked(true);
+    let x = noise::<f32>(g.volume.shape, 1);
+    let y = noise::<f32>([g.views.len(), g.detector[0], g.detector[1]], 2);
+    let on = |threads: usize| {
+        let pool = rayon::ThreadPoolBuilder::new().num_threads(threads).build().unwrap();
+        pool.install(|| {
+            let both =
+                |p: &dyn VoxelProjector| (forward(p.operator(), &g, x.view()), adjoint(p.operator(), &g, y.view()));
+            projectors().iter().map(|p| both(p.as_ref())).collect::<Vec<_>>()
+        })
+    };
+    assert_eq!(on(1), on(3));
+}
+
+/// Length of the ray within an ellipsoid.
+fn chord(g: &Geometry, center: Vec3, axes: Vec3, view: usize, row: usize, column: usize) -> f64 {
+    let ray = g.ray(view, row, column);
+    let o: Vec3 = std::array::from_fn(|k| (ray.origin[k] - center[k]) / axes[k]);
+    let d: Vec3 = std::array::from_fn(|k| ray.direction[k] / axes[k]);
+    let (a, b, c) = (dot3(d, d), dot3(o, d), dot3(o, o) - 1.0);
+    2.0 * (b * b - a * c).max(0.0).sqrt() / a
+}
+
+fn dot3(a: Vec3, b: Vec3) -> f64 {
+    a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
+}
+
+/// Voxels of the ellipsoid by the share of 4³ points inside.
+fn ellipsoid(grid: &VoxelGrid, center: Vec3, axes: Vec3) -> Array3<f32> {
+    Array3::from_shape_fn(grid.shape, |(x, y, z)| {
+        let p = grid.voxel([x, y, z]);
+        let mut inside = 0;
+        for i in 0..64 {
+            let sub = [i % 4, i / 4 % 4, i / 16].map(|s| (f64::from(s) + 0.5) / 4.0 - 0.5);
+            let q: Vec3 = std::array::from_fn(|k| (p[k] + sub[k] * grid.spacing[k] - center[k]) / axes[k]);
+            inside += i32::from(dot3(q, q) < 1.0);
+        }
+        inside as f32 / 64.0
+    })
+}
+
+/// Root mean square error against the closed form, over the mean of the closed form.
+fn error_at(p: &dyn VoxelProjector, n: usize) -> f64 {
+    let side = 40.0;
+    let g = Geometry {
+        detector: [24, 24],
+        views: [0.1, 1.2, 2.5].map(|a| circular(a, 100.0, 150.0, [2.6; 2], [0.7, -1.1])).to_vec(),
+        volume: VoxelGrid { shape: [n; 3], spacing: [side / n as f64; 3], center: [0.0; 3] },
+    };
+    let (center, axes) = ([2.0, -1.0, 1.5], [15.0, 11.0, 13.0]);
+    let found = forward(p.operator(), &g, ellipsoid(&g.volume, center, axes).view());
+    let (mut square, mut sum) = (0.0, 0.0);
+    for ((view, row, column), &x) in found.indexed_iter() {
+        let exact = chord(&g, center, axes, view, row, column);
+        square += (f64::from(x) - exact).powi(2);
+        sum += exact;
+    }
+    let count = found.len() as f64;
+    (square / count).sqrt() / (sum / count)
+}
+
+/// Voxels know the edge of a homogeneous body to a share of their size: the order is about 1 for every projector.
+#[test]
+fn projections_of_an_ellipsoid_converge() {
+    for (p, least) in projectors().iter().zip([0.9; 3]) {
+        let errors = [16, 32, 64].map(|n| error_at(p.as_ref(), n));
+        let order = (errors[0] / errors[2]).log2() / 2.0;
+        assert!(order > least, "{}: order {order:.2} of {errors:?}", p.describe());
+        assert!(errors[2] < 0.05, "{}: {errors:?}", p.describe());
+    }
+}
+
+/// Sums of 512 planes in single precision: rounding stays below 1e-6 of the sum.
+#[test]
+fn long_sums_keep_their_accuracy() {
+    let g = Geometry {
+        detector: [8, 40],
+        views: vec![circular(0.4, 1000.0, 1500.0, [2.0, 20.0], [0.0; 2])],
+        volume: VoxelGrid { shape: [512, 512, 12], spacing: [1.0; 3], center: [0.0; 3] },
+    };
+    let x = noise::<f32>(g.volume.shape, 11).mapv(|v| v + 0.6);
+    let single = forward::<f32>(&Joseph {}, &g, x.view());
+    let double = forward::<f64>(&Joseph {}, &g, x.mapv(f64::from).view());
+    for (a, b) in single.iter().zip(&double) {
+        assert!((f64::from(*a) - b).abs() <= 1e-6 * b.abs() + 1e-9, "{a} against {b}");
+    }
+}
+
+#[test]
+fn backprojection_by_lines_agrees_with_voxels() {
+    let g = crooked(true);
+    let y = noise::<f64>([g.views.len(), g.detector[0], g.detector[1]], 4);
+    let views = all_views(&g);
+    let scales: Vec<f64> = views.iter().map(|&v| 1e4 * (1.0 + v as f64)).collect();
+    let back = |g: &Geometry| {
+        let pixels = ColumnMajor::new(g, &views, y.view(), |_, _, _, x| x);
+        let mut out = Array3::zeros(g.volume.shape);
+        backproject(g, &views, &pixels, &scales, out.view_mut());
+        out
+    };
+    // A tilt that changes nothing but the path through the code.
+    let mut tilted = g.clone();
+    for v in &mut tilted.views {
+        v.u[2] = 3e-9 * v.u[0].hypot(v.u[1]);
+    }
+    assert!(views.iter().all(|&v| super::layout::Upright::of(&tilted, v).is_none()));
+    let (a, b) = (back(&g), back(&tilted));
+    let largest = a.iter().fold(0.0f64, |m: f64, x: &f64| m.max(x.abs()));
+    let worst = Zip::from(&a).and(&b).fold(0.0f64, |w, a, b| w.max((a - b).abs()));
+    assert!(largest > 0.0 && worst < 1e-6 * largest, "{worst:e} of {largest:e}");
+}
+
+proptest! {
+    #![proptest_config(ProptestConfig::with_cases(24))]
+    #[test]
+    fn any_orbit_has_an_exact_adjoint(
+        angle in 0.0..6.3f64,
+        dso in 60.0..300.0f64,
+        ratio in 1.05..3.0f64,
+        pixel in 0.3..6.0f64,
+        offset in -8.0..8.0f64,
+        shape in prop::array::uniform3(1usize..14),
+        spacing in prop::array::uniform3(0.4..3.0f64),
+        detector in prop::array::uniform2(1usize..20),
+        seed in 0u64..1000,
+    ) {
+        let g = Geometry {
+            detector,
+            views: vec![circular(angle, dso, dso * ratio, [pixel, pixel], [offset, -offset])],
+            volume: VoxelGrid { shape, spacing, center: [0.5, -0.3, 0.2] },
+        };
+        let x = noise::<f64>(g.volume.shape, seed);
+        let y = noise::<f64>([1, detector[0], detector[1]], seed + 1);
+        for p in projectors() {
+            let ax = forward(p.reference(), &g, x.view());
+            let aty = adjoint(p.reference(), &g, y.view());
+            let (left, right) = (dot(&ax, &y), dot(&x, &aty));
+            let scale = (dot(&ax, &ax) * dot(&y, &y)).sqrt() + 1e-9;
+            prop_assert!((left - right).abs() < 1e-11 * scale, "{}: {left} {right}", p.describe());
+            prop_assert!(ax.iter().all(|v| v.is_finite()));
+        }
+    }
+}

@@ -1,0 +1,211 @@
+//! Which voxels a ray meets and for how many millimetres each counts.
+
+use conefield_core::geometry::{Geometry, Vec3, VoxelGrid, norm, sub};
+use std::ops::Range;
+
+/// A ray in voxels: `source + t·ahead`, where `t = 1` is the pixel.
+#[derive(Debug, Clone, Copy)]
+pub struct VoxelRay {
+    /// The source in voxels; whole numbers are voxel centres.
+    pub source: Vec3,
+    /// From the source to the pixel, in voxels.
+    pub ahead: Vec3,
+    /// The same in mm: length of the way from `t = 0` to `t = 1`.
+    pub length: f64,
+}
+
+impl VoxelRay {
+    /// The ray of a pixel.
+    pub fn of(geometry: &Geometry, view: usize, row: usize, column: usize) -> Self {
+        let w = &geometry.views[view];
+        let d = sub(w.pixel(geometry.detector, row as f64, column as f64), w.source);
+        let h = geometry.volume.spacing;
+        Self {
+            source: super::layout::to_voxels(&geometry.volume, w.source),
+            ahead: std::array::from_fn(|k| d[k] / h[k]),
+            length: norm(d),
+        }
+    }
+
+    fn at(&self, k: usize, t: f64) -> f64 {
+        self.source[k] + t * self.ahead[k]
+    }
+
+    /// The `t` before the detector side is left where `lower ≤ position ≤ upper` on every axis, from the source on.
+    fn clip(&self, lower: Vec3, upper: Vec3) -> Option<[f64; 2]> {
+        let (mut near, mut far) = (0.0f64, f64::INFINITY);
+        for k in 0..3 {
+            if self.ahead[k] == 0.0 {
+                if self.source[k] < lower[k] || self.source[k] > upper[k] {
+                    return None;
+                }
+                continue;
+            }
+            let (a, b) = ((lower[k] - self.source[k]) / self.ahead[k], (upper[k] - self.source[k]) / self.ahead[k]);
+            near = near.max(a.min(b));
+            far = far.min(a.max(b));
+        }
+        (far > near).then_some([near, far])
+    }
+}
+
+/// Calls back with the voxels `(x, y, z)` of a ray and the millimetres that each counts for.
+pub trait Walk: Sync {
+    /// Visits the voxels with `x` in `slab`. What a voxel is given must not depend on the slab but by rounding.
+    fn walk(&self, ray: &VoxelRay, grid: &VoxelGrid, slab: &Range<usize>, visit: impl FnMut([usize; 3], f64));
+}
+
+/// The exact length of the ray inside each voxel (Siddon, Med. Phys. 12(2), 1985), voxel by voxel as Amanatides and
+/// Woo step (Eurographics 1987).
+#[derive(Debug, Clone, Copy)]
+pub struct SiddonWalk;
+
+impl Walk for SiddonWalk {
+    fn walk(&self, ray: &VoxelRay, grid: &VoxelGrid, slab: &Range<usize>, mut visit: impl FnMut([usize; 3], f64)) {
+        let n = grid.shape;
+        let lower = [slab.start as f64 - 0.5, -0.5, -0.5];
+        let upper = [slab.end as f64 - 0.5, n[1] as f64 - 0.5, n[2] as f64 - 0.5];
+        let Some([near, far]) = ray.clip(lower, upper) else { return };
+        let first = [slab.start, 0, 0];
+        let last = [slab.end - 1, n[1] - 1, n[2] - 1];
+        // Just inside, so that rounding cannot put the first voxel outside.
+        let start = near + 1e-9 * (far - near);
+        let mut voxel: [usize; 3] =
+            std::array::from_fn(|k| ((ray.at(k, start) + 0.5).floor().max(0.0) as usize).clamp(first[k], last[k]));
+        let wall = |k: usize, voxel: usize| {
+            let side = if ray.ahead[k] > 0.0 { 0.5 } else { -0.5 };
+            if ray.ahead[k] == 0.0 { f64::INFINITY } else { (voxel as f64 + side - ray.source[k]) / ray.ahead[k] }
+        };
+        let mut next: Vec3 = std::array::from_fn(|k| wall(k, voxel[k]));
+        let mut t = near;
+        loop {
+            let k = (0..3).min_by(|&a, &b| next[a].total_cmp(&next[b])).unwrap_or(0);
+            let end = next[k].min(far);
+            if end > t {
+                visit(voxel, (end - t) * ray.length);
+                t = end;
+            }
+            if next[k] >= far {
+                return;
+            }
+            let up = ray.ahead[k] > 0.0;
+            if voxel[k] == if up { last[k] } else { first[k] } {
+                return;
+            }
+            voxel[k] = if up { voxel[k] + 1 } else { voxel[k] - 1 };
+            next[k] = wall(k, voxel[k]);
+        }
+    }
+}
+
+/// Bilinear interpolation in the planes of voxel centres across the ray's main direction, one plane after another
+/// (Joseph, IEEE Trans. Med. Imaging 1(3), 1982). Outside the volume is nothing.
+#[derive(Debug, Clone, Copy)]
+pub struct JosephWalk;
+
+impl Walk for JosephWalk {
+    fn walk(&self, ray: &VoxelRay, grid: &VoxelGrid, slab: &Range<usize>, mut visit: impl FnMut([usize; 3], f64)) {
+        let n = grid.shape;
+        let main = main_axis(ray.ahead);
+        let [a, b] = [(main + 1) % 3, (main + 2) % 3];
+        let mut lower = [-1.0; 3];
+        let mut upper = n.map(|n| n as f64);
+        (lower[0], upper[0]) = (slab.start as f64 - 1.0, slab.end as f64);
+        (lower[main], upper[main]) = (lower[main].max(0.0), upper[main].min(n[main] as f64 - 1.0));
+        if main == 0 {
+            (lower[0], upper[0]) = (slab.start as f64, slab.end as f64 - 1.0);
+        }
+        // A plane more on both sides: positions on the edge are told voxel by voxel.
+        let (lo, hi) = (lower[main], upper[main]);
+        (lower[main], upper[main]) = (lo - 1.0, hi + 1.0);
+        let Some([near, far]) = ray.clip(lower, upper) else { return };
+        let ends = [ray.at(main, near), ray.at(main, far)];
+        let first = (ends[0].min(ends[1]) - 1.0).ceil().max(lo);
+        let last = (ends[0].max(ends[1]) + 1.0).floor().min(hi);
+        let step = ray.length / ray.ahead[main].abs();
+        let mut plane = first;
+        while plane <= last {
+            let t = (plane - ray.source[main]) / ray.ahead[main];
+            if t > 0.0 {
+                let (pa, pb) = (ray.at(a, t), ray.at(b, t));
+                let (ca, cb) = (pa.floor(), pb.floor());
+                let (fa, fb) = (pa - ca, pb - cb);
+                for (da, wa) in [(0.0, 1.0 - fa), (1.0, fa)] {
+                    for (db, wb) in [(0.0, 1.0 - fb), (1.0, fb)] {
+                        let mut at = [0.0; 3];
+                        (at[main], at[a], at[b]) = (plane, ca + da, cb + db);
+                        let inside = (0..3).all(|k| at[k] >= 0.0 && at[k] < n[k] as f64);
+                        let voxel = at.map(|x| x as usize);
+                        if inside && slab.contains(&voxel[0]) {
+                            visit(voxel, wa * wb * step);
+                        }
+                    }
+                }
+            }
+            plane += 1.0;
+        }
+    }
+}
+
+/// The axis along which the ray meets most planes of voxels.
+pub fn main_axis(ahead: Vec3) -> usize {
+    let a = ahead.map(f64::abs);
+    if a[0] >= a[1] && a[0] >= a[2] {
+        0
+    } else if a[1] >= a[2] {
+        1
+    } else {
+        2
+    }
+}
+
+/// Trilinear interpolation at the midpoints of equal steps inside the box that the voxels fill; in its outer half
+/// voxel the outermost values go on.
+#[derive(Debug, Clone, Copy)]
+pub struct TrilinearWalk {
+    /// Steps of at most the smallest voxel side divided by this.
+    pub samples_per_voxel: f64,
+}
+
+impl Walk for TrilinearWalk {
+    fn walk(&self, ray: &VoxelRay, grid: &VoxelGrid, slab: &Range<usize>, mut visit: impl FnMut([usize; 3], f64)) {
+        let n = grid.shape;
+        let Some([near, far]) = ray.clip([-0.5; 3], n.map(|n| n as f64 - 0.5)) else { return };
+        let side = grid.spacing.into_iter().fold(f64::INFINITY, f64::min);
+        let count = ((far - near) * ray.length * self.samples_per_voxel / side).ceil().max(1.0);
+        let step = (far - near) / count;
+        // Samples that may touch the slab.
+        let (lo, hi) = (slab.start as f64 - 1.0, slab.end as f64);
+        let mut from = 0.0;
+        let mut to = count;
+        if ray.ahead[0] == 0.0 {
+            if ray.source[0] < lo || ray.source[0] > hi {
+                return;
+            }
+        } else {
+            let index = |x: f64| ((x - ray.source[0]) / ray.ahead[0] - near) / step;
+            let (a, b) = (index(lo), index(hi));
+            from = (a.min(b) - 1.0).floor().max(0.0);
+            to = (a.max(b) + 1.0).ceil().min(count);
+        }
+        let mut i = from;
+        while i < to {
+            let t = near + (i + 0.5) * step;
+            let mut ends = [[(0usize, 0.0); 2]; 3];
+            for k in 0..3 {
+                let p = ray.at(k, t).clamp(0.0, n[k] as f64 - 1.0);
+                let cell = (p.floor() as usize).min(n[k].saturating_sub(2));
+                let f = p - cell as f64;
+                ends[k] = [(cell, 1.0 - f), ((cell + 1).min(n[k] - 1), f)];
+            }
+            for (x, wx) in ends[0].into_iter().filter(|(x, _)| slab.contains(x)) {
+                for (y, wy) in ends[1] {
+                    for (z, wz) in ends[2] {
+                        visit([x, y, z], wx * wy * wz * step * ray.length);
+                    }
+                }
+            }
+            i += 1.0;
+        }
+    }
+}
