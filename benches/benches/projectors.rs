@@ -1,0 +1,81 @@
+//! Speed of the voxel projectors on 50 views of 512² pixels and 256³ voxels: Joseph forward, its adjoint and the
+//! voxel-driven back-projection, against what the machine allows in the same run.
+//!
+//! `cargo bench -p conefield-benches --bench projectors`; `benches/peers/classical.sh` puts RTK beside it.
+
+use conefield_core::geometry::{Geometry, Millimetres, Radians, View, VoxelGrid};
+use conefield_core::voxel::VoxelOperator;
+use conefield_projectors::voxel::Joseph;
+use conefield_projectors::voxel::backproject::backproject;
+use conefield_projectors::voxel::layout::ColumnMajor;
+use ndarray::Array3;
+use rayon::prelude::*;
+use std::time::Instant;
+
+const RUNS: usize = 5;
+
+fn main() {
+    let geometry = geometry();
+    let views: Vec<usize> = (0..geometry.views.len()).collect();
+    let [rows, columns] = geometry.detector;
+    let volume = Array3::from_shape_fn(geometry.volume.shape, |(x, y, z)| ((x * 7 + y * 3 + z) % 11) as f32 / 11.0);
+    let mut projections = Array3::<f32>::zeros((views.len(), rows, columns));
+    let mut back = Array3::<f32>::zeros(geometry.volume.shape);
+    // Every pixel whose ray meets the box, in each of about 256 planes; every voxel in every view.
+    let forward = times(|| Joseph {}.forward(&geometry, &views, volume.view(), projections.view_mut()));
+    let samples = projections.iter().filter(|x| **x > 0.0).count() as f64 * 256.0;
+    let adjoint = times(|| Joseph {}.adjoint(&geometry, &views, projections.view(), back.view_mut()));
+    let updates = (volume.len() * views.len()) as f64;
+    let scales = vec![1.0; views.len()];
+    let driven = times(|| {
+        for part in views.chunks(8) {
+            let images = projections.slice(ndarray::s![part[0]..part[0] + part.len(), .., ..]);
+            let pixels = ColumnMajor::new(&geometry, part, images, |_, _, _, x| x);
+            backproject(&geometry, part, &pixels, &scales, back.view_mut());
+        }
+    });
+    report("joseph forward", forward, samples, "samples");
+    report("joseph adjoint", adjoint, samples, "samples");
+    report("voxel-driven back", driven, updates, "updates");
+    println!("limits of this machine, measured now:");
+    println!("  memory read        {:.1} GB/s", bandwidth() / 1e9);
+}
+
+fn geometry() -> Geometry {
+    let mm = Millimetres;
+    let angle = |i: usize| Radians(std::f64::consts::TAU * i as f64 / 50.0);
+    let view = |i| View::circular(angle(i), mm(640.0), mm(896.0), [mm(1.0); 2], [mm(0.0); 2]);
+    Geometry {
+        detector: [512, 512],
+        views: (0..50).map(view).collect(),
+        volume: VoxelGrid { shape: [256; 3], spacing: [1.0; 3], center: [0.0; 3] },
+    }
+}
+
+/// Minimum, median and maximum of some runs, in seconds.
+fn times(mut f: impl FnMut()) -> [f64; 3] {
+    let mut all: Vec<f64> = (0..RUNS)
+        .map(|_| {
+            let start = Instant::now();
+            f();
+            start.elapsed().as_secs_f64()
+        })
+        .collect();
+    all.sort_by(f64::total_cmp);
+    [all[0], all[RUNS / 2], all[RUNS - 1]]
+}
+
+fn report(name: &str, [low, median, high]: [f64; 3], work: f64, unit: &str) {
+    println!("{name:<20} {median:.3} s ({low:.3} to {high:.3}), {:.2} G {unit}/s", work / median / 1e9);
+}
+
+/// Bytes a second that all threads together read from memory.
+fn bandwidth() -> f64 {
+    let data = vec![1.0f32; 64 << 20];
+    let threads = rayon::current_num_threads();
+    let [_, t, _] = times(|| {
+        let sum: f32 = data.par_chunks(data.len() / threads).map(|c| c.iter().copied().fold(0.0, f32::max)).sum();
+        assert!(sum > 0.0);
+    });
+    4.0 * data.len() as f64 / t
+}
