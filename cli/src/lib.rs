@@ -4,6 +4,7 @@ mod commands;
 mod files;
 mod memory;
 mod out;
+mod outgoing;
 mod parse;
 mod progress;
 mod run;
@@ -52,7 +53,7 @@ pub fn main() -> ExitCode {
         Err(e) => {
             eprintln!("error: {e}");
             match (&e, signals::caught()) {
-                (Error::Interrupted { .. }, Some(signal)) => ExitCode::from(128 + signal),
+                (Error::Interrupted { .. } | Error::Cancelled { .. }, Some(signal)) => ExitCode::from(128 + signal),
                 _ => ExitCode::FAILURE,
             }
         }

@@ -1,6 +1,6 @@
 //! Every file that conefield reads or writes, each format in one module.
 //!
-//! - Volumes: [`read_volume`], [`write_volume`] (NIfTI, MetaImage, NumPy; a DICOM series in).
+//! - Volumes: [`read_volume`], [`write_volume`], [`write_voxels`] (NIfTI, MetaImage, NumPy; a DICOM series in).
 //! - Scans: [`read_scan`], [`read_truth`], [`write_scan`] (conefield's own folder), [`read_r2`], [`write_r2`]
 //!   (R2-Gaussian's folder), [`read_naf`], [`write_naf`] (NAF's file).
 //! - Projections as scanners give them: [`read_scanner`] (a description in TOML; TIFF, NumPy, RTK's XML geometry).
@@ -64,6 +64,6 @@ pub use rtk::{read_rtk, write_rtk};
 pub use scan::{read_scan, read_truth};
 pub use scan_folder::write_scan;
 pub use scanner::{I0, ImportOptions, Imported, read_scanner};
-pub use slices::{compare_png, slices_png};
-pub use volume::{is_volume, read_volume, write_volume};
+pub use slices::{MiddleSlices, compare_png, slices_png};
+pub use volume::{is_volume, read_volume, write_volume, write_voxels};
 pub use weights::{Weights, read_weights, write_weights};

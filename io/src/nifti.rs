@@ -4,11 +4,12 @@
 //! us allocate, and the header is written here, because that lets the writer go through [`crate::write_atomic`].
 
 use crate::affine::{self, Affine};
-use crate::file_order;
+use crate::file_order::{self, FileOrder};
 use crate::input::Input;
 use crate::number::{Number, Order};
 use conefield_core::geometry::VoxelGrid;
 use conefield_core::scan::Volume;
+use conefield_core::voxels::Voxels;
 use conefield_core::{Error, Result};
 use nifti::{Endianness, NiftiHeader};
 use std::io::Write;
@@ -190,16 +191,16 @@ fn quaternion(header: &NiftiHeader) -> [[f64; 4]; 3] {
     std::array::from_fn(|i| [r[i][0] * s[0], r[i][1] * s[1], r[i][2] * s[2], t[i]])
 }
 
-/// Writes `volume` as `f32` with an sform: its own affine, or one that puts the grid's centre at `grid.center`.
-pub(crate) fn write(w: &mut dyn Write, path: &Path, volume: &Volume) -> Result<()> {
-    let grid = &volume.grid;
+/// Writes `voxels` as `f32` with an sform: their own affine, or one that puts the grid's centre at `grid.center`.
+pub(crate) fn write(w: &mut dyn Write, path: &Path, voxels: &mut dyn Voxels) -> Result<()> {
+    let grid = voxels.grid();
     let place = path.display().to_string();
     if grid.shape.iter().any(|&n| n > i16::MAX as usize) {
         let expected = "at most 32767 voxels an axis, which is all that NIfTI-1 can say (write .npy)";
         return Err(Error::invalid(place, "shape", format!("{:?}", grid.shape), expected));
     }
     // 1: the scanner's own coordinates; 2: some others.
-    let (affine, own) = affine::of(volume, &place);
+    let (affine, own) = affine::of(voxels, &place);
     let code = if own { 1i16 } else { 2 };
     let mut h = [0u8; DATA as usize];
     let mut put = |at: usize, bytes: &[u8]| h[at..at + bytes.len()].copy_from_slice(bytes);
@@ -225,7 +226,7 @@ pub(crate) fn write(w: &mut dyn Write, path: &Path, volume: &Volume) -> Result<(
     }
     put(344, b"n+1\0");
     w.write_all(&h).map_err(|e| Error::io(path, e))?;
-    file_order::write(w, path, &volume.data)
+    file_order::write(w, path, voxels, FileOrder::XFastest)
 }
 
 #[cfg(test)]

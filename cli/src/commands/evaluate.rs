@@ -4,6 +4,7 @@ use crate::{files, out, parse};
 use clap::Args;
 use conefield_core::scan::Volume;
 use conefield_core::{Error, Result};
+use conefield_io::MiddleSlices;
 use conefield_metrics::Scores;
 use std::path::PathBuf;
 
@@ -35,7 +36,7 @@ impl Evaluate {
         let place = self.volume.display().to_string();
         let scores = score(&place, &volume, &reference, self.peak)?;
         if let Some(png) = &self.png {
-            files::picture(png, Some(&reference), &volume)?;
+            files::picture(png, Some(&MiddleSlices::of(&reference)), &MiddleSlices::of(&volume))?;
         }
         if self.json { out::json(&scores) } else { out::say(&lines(&scores)) }
     }

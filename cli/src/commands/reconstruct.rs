@@ -2,18 +2,19 @@
 
 use super::{BackendChoice, Ends, backends::simd_level, evaluate};
 use crate::memory::Memory;
+use crate::outgoing::{self, Written};
 use crate::parse::{self, HoldOut};
 use crate::progress::{Keeper, Progress};
 use crate::run::RunFolder;
 use crate::{files, out, signals, specs};
 use clap::Args;
-use conefield_core::arena::Weights;
 use conefield_core::backend::Explain;
 use conefield_core::checkpoint::Resume;
 use conefield_core::scan::{Scan, Volume};
 use conefield_core::solver::{Job, Solution};
 use conefield_core::spec::load::{Loaded, to_toml};
 use conefield_core::{Error, Result};
+use conefield_io::MiddleSlices;
 use conefield_metrics::Scores;
 use serde::Serialize;
 use std::collections::BTreeMap;
@@ -126,7 +127,7 @@ impl Reconstruct {
         let held = self.hold_out.as_ref().map(|h| h.views(whole.geometry.views.len())).unwrap_or_default();
         let memory = pipeline.as_ref().map(|p| Memory::of(p, &whole, &compiled, reference.is_some()));
         let fingerprint = checksum(&whole);
-        let (scan, held_scan) = if held.is_empty() { (whole, None) } else { split(&whole, &held)? };
+        let (scan, held_scan) = if held.is_empty() { (whole, None) } else { split(whole, &held)? };
         let identity = self.identity(&loaded, &held, &fingerprint)?;
         let (folder, metrics, resume) = self.open(&loaded, &identity)?;
         if let Some(m) = &memory {
@@ -151,21 +152,24 @@ impl Reconstruct {
             weights: &|path| files::read_weights(path),
             resume: resume.as_ref(),
         };
-        let mut solution = solver.solve(&job, &mut progress).map_err(|e| loaded.locate(e))?;
-        solution.volume.affine = solution.volume.affine.or(reference.as_ref().and_then(|r| r.affine));
+        let solution = solver.solve(&job, &mut progress).map_err(|e| loaded.locate(e))?;
         let last = progress.records().last().cloned();
         drop(progress);
 
         let place = folder.file("volume.nii.gz");
-        conefield_io::write_volume(&place, &solution.volume)?;
-        if let Some(model) = &solution.model {
-            let mut weights = Weights::from_arena(model.pipeline.layout(), &model.arena.params, |_| true);
-            weights.notes = notes(&loaded, self.seed)?;
-            files::write_weights(folder.file("weights.safetensors"), &weights)?;
+        let field = solution.result.field();
+        if let Some(field) = field {
+            files::write_field(folder.file("weights.safetensors"), field, notes(&loaded, self.seed)?)?;
         }
-        files::picture(folder.file("slices.png"), reference.as_ref(), &solution.volume)?;
-        let score = |r| evaluate::score(&place.display().to_string(), &solution.volume, r, self.peak);
-        let scores = reference.as_ref().map(score).transpose()?;
+        let start = Instant::now();
+        let mut voxels = solution.result.voxels(backend.as_ref())?;
+        let affine = reference.as_ref().and_then(|r| r.affine);
+        let Written { slices, whole } = outgoing::write(&place, voxels.as_mut(), affine, reference.is_some())?;
+        let export_s = start.elapsed().as_secs_f64();
+        let middle = reference.as_ref().map(MiddleSlices::of);
+        files::picture(folder.file("slices.png"), middle.as_ref(), &slices)?;
+        let score = |(volume, r)| evaluate::score(&place.display().to_string(), volume, r, self.peak);
+        let scores = whole.as_ref().zip(reference.as_ref()).map(score).transpose()?;
         let record = Record {
             version: env!("CARGO_PKG_VERSION"),
             spec: loaded.spec.name.clone(),
@@ -185,10 +189,10 @@ impl Reconstruct {
             simd: simd_level(),
             threads: rayon::current_num_threads(),
             memory,
-            parameters: solution.model.as_ref().map_or(0, |m| m.pipeline.layout().len()),
+            parameters: field.map_or(0, |f| f.model.pipeline.layout().len()),
             steps: solution.steps,
             train_s: solution.train_s,
-            export_s: solution.export_s,
+            export_s,
             samples: solution.samples,
             samples_per_s: if solution.train_s > 0.0 { solution.samples as f64 / solution.train_s } else { 0.0 },
             loss: last.as_ref().map(|r| r.loss),
@@ -255,7 +259,7 @@ fn read_reference(path: &Path, scan_path: &Path, scan: &Scan) -> Result<Volume> 
     Ok(volume)
 }
 
-fn split(scan: &Scan, held: &[usize]) -> Result<(Scan, Option<Scan>)> {
+fn split(scan: Scan, held: &[usize]) -> Result<(Scan, Option<Scan>)> {
     let (train, held) = scan.split(held)?;
     Ok((train, Some(held)))
 }
