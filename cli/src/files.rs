@@ -13,14 +13,30 @@ use std::path::Path;
 
 /// The volume that `name` means: `phantom:KIND[:SIZE]` or a file.
 pub fn volume(name: &str) -> Result<Volume> {
-    let Some(rest) = name.strip_prefix("phantom:") else { return conefield_io::read_volume(name) };
+    match phantom(name)? {
+        Some((kind, size)) => Ok(phantom_of(kind, size)),
+        None => conefield_io::read_volume(name),
+    }
+}
+
+/// Number of voxels of the volume that `name` means, without reading or making it.
+pub fn voxels(name: &str) -> Result<u64> {
+    match phantom(name)? {
+        Some((_, size)) => Ok((size as u64).pow(3)),
+        None => conefield_io::volume_voxels(name),
+    }
+}
+
+/// The kind and size of `phantom:KIND[:SIZE]`; any other name is a file's.
+fn phantom(name: &str) -> Result<Option<(PhantomKind, usize)>> {
+    let Some(rest) = name.strip_prefix("phantom:") else { return Ok(None) };
     let (kind, size) = match (rest.parse::<PhantomKind>(), rest.rsplit_once(':')) {
         (Ok(kind), _) => (kind, "128"),
         (_, Some((kind, size))) => (kind.parse()?, size),
         (Err(e), None) => return Err(e),
     };
     match size.parse() {
-        Ok(size @ 8..=1024) => Ok(phantom_of(kind, size)),
+        Ok(size @ 8..=1024) => Ok(Some((kind, size))),
         _ => Err(Error::invalid(name, "size", size, "a number of voxels from 8 to 1024")),
     }
 }

@@ -3,7 +3,6 @@
 use crate::backend::Backend;
 use crate::checkpoint::{Checkpoint, Resume};
 use crate::error::Result;
-use crate::geometry::VoxelGrid;
 use crate::pipeline::Model;
 use crate::scan::{Scan, Volume};
 use crate::spec::Spec;
@@ -108,7 +107,7 @@ pub enum Reconstruction {
     /// Voxels.
     Volume(Volume),
     /// A field that can be evaluated on any grid.
-    Field(Box<TrainedField>),
+    Field(TrainedField),
 }
 
 impl Reconstruction {
@@ -157,10 +156,10 @@ pub trait Solver: Send + Sync {
         Err(crate::Error::unsupported(self.describe(), "this solver has nothing to pre-train"))
     }
 
-    /// Bytes that it holds while it works on `pixels` measured values, beside scan, model and backend: iterates, lists
-    /// of rays.
-    fn working_memory(&self, pixels: u64, grid: &VoxelGrid) -> u64 {
-        let _ = (pixels, grid);
+    /// Bytes that it holds while it makes `voxels` of `pixels` measured values, beside scan, model and backend:
+    /// iterates, lists of rays.
+    fn working_memory(&self, pixels: u64, voxels: u64) -> u64 {
+        let _ = (pixels, voxels);
         0
     }
 

@@ -2,7 +2,7 @@
 //! it (`.mhd` with `.raw` or `.zraw`).
 
 use crate::affine::{self, Affine};
-use crate::file_order::{self, FileOrder};
+use crate::file_order::{self, FileOrder, PACKED};
 use crate::folder;
 use crate::input::Input;
 use crate::number::{Number, Order};
@@ -225,6 +225,11 @@ impl Header {
     }
 }
 
+/// Voxels along x, y and z, from the header.
+pub(crate) fn shape(path: &Path) -> Result<[usize; 3]> {
+    Header::read(&mut Input::open_plain(path)?)?.shape().map(|(shape, _)| shape)
+}
+
 /// A value as errors show it.
 fn shortened(text: &str) -> String {
     match text.char_indices().nth(80) {
@@ -315,7 +320,7 @@ pub(crate) fn write(w: &mut dyn Write, path: &Path, voxels: &mut dyn Voxels) -> 
     let turn = (0..3).flat_map(|k| affine::column(&lps, k).map(|x| x / spacing[k]));
     // The size of the packed data stands before it: pack it aside, in memory while it is small.
     let folder = path.parent().filter(|p| !p.as_os_str().is_empty()).unwrap_or(Path::new("."));
-    let mut packed = ZlibEncoder::new(tempfile::spooled_tempfile_in(64 << 20, folder), Compression::fast());
+    let mut packed = ZlibEncoder::new(tempfile::spooled_tempfile_in(PACKED as usize, folder), Compression::fast());
     file_order::write(&mut packed, path, voxels, FileOrder::XFastest)?;
     let mut packed = packed.finish().map_err(io)?;
     let size = packed.stream_position().map_err(io)?;

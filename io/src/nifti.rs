@@ -39,8 +39,7 @@ pub(crate) fn read_from(input: &mut Input, head: &[u8]) -> Result<Volume> {
             "convert the pair to one .nii or .nii.gz file",
         ));
     }
-    let header = NiftiHeader::from_reader(head)
-        .map_err(|e| input.invalid("header", e, format!("a NIfTI-1 header of {HEADER} bytes")))?;
+    let header = parse(input, head)?;
     if header.sizeof_hdr != HEADER as i32 {
         return Err(input.invalid("sizeof_hdr", header.sizeof_hdr, HEADER.to_string()));
     }
@@ -59,6 +58,16 @@ pub(crate) fn read_from(input: &mut Input, head: &[u8]) -> Result<Volume> {
     input.skip(offset - HEADER as u64, "vox_offset")?;
     let values = input.numbers("data", count, number, order, |x| (slope * x + inter) as f32)?;
     file_order::read(input, grid, affine, values)
+}
+
+fn parse(input: &Input, head: &[u8]) -> Result<NiftiHeader> {
+    NiftiHeader::from_reader(head)
+        .map_err(|e| input.invalid("header", e, format!("a NIfTI-1 header of {HEADER} bytes")))
+}
+
+/// Voxels along x, y and z, from `head`.
+pub(crate) fn shape_of(input: &Input, head: &[u8]) -> Result<[usize; 3]> {
+    shape(input, &parse(input, head)?)
 }
 
 /// Three axes of at least one voxel; later axes may only say 1.

@@ -91,6 +91,11 @@ fn header(shape: &[usize]) -> Vec<u8> {
     [MAGIC, &[1, 0], &(text.len() as u16).to_le_bytes(), text.as_bytes()].concat()
 }
 
+/// The shape that the header says; reads on as [`read_from`] does.
+pub(crate) fn shape(input: &mut Input, start: Vec<u8>) -> Result<Vec<usize>> {
+    read_header(input, start).map(|h| h.shape)
+}
+
 fn read_header(input: &mut Input, start: Vec<u8>) -> Result<Header> {
     let mut bytes = start;
     let mut fill = |input: &mut Input, n: usize| -> Result<Vec<u8>> {

@@ -19,13 +19,35 @@ use std::path::Path;
 /// NIfTI's header and DICOM's rescale slope and intercept say; one that is not finite is refused.
 pub fn read_volume(path: impl AsRef<Path>) -> Result<Volume> {
     let path = path.as_ref();
+    match open(path)? {
+        Opened::Series => dicom::read(path),
+        Opened::Npy(mut input, head) => from_numpy(path, npy::read_from(&mut input, head, &["x", "y", "z"])?),
+        Opened::MetaImage => metaimage::read(path),
+        Opened::Nifti(mut input, head) => nifti::read_from(&mut input, &head),
+    }
+}
+
+/// A volume's format, with the file where it stands and what was read of it to tell.
+pub(crate) enum Opened {
+    /// A folder.
+    Series,
+    /// Eight bytes are read.
+    Npy(Input, Vec<u8>),
+    /// It is opened anew.
+    MetaImage,
+    /// The header is read.
+    Nifti(Input, Vec<u8>),
+}
+
+/// Tells the format of a volume by what it holds.
+pub(crate) fn open(path: &Path) -> Result<Opened> {
     if path.is_dir() {
-        return dicom::read(path);
+        return Ok(Opened::Series);
     }
     let mut input = Input::open(path)?;
     let mut head = input.take(8)?;
     if head.starts_with(npy::MAGIC) {
-        return from_numpy(path, npy::read_from(&mut input, head, &["x", "y", "z"])?);
+        return Ok(Opened::Npy(input, head));
     }
     head.extend(input.take(nifti::HEADER - head.len())?);
     if nifti::is_second_version(&head) {
@@ -41,7 +63,7 @@ pub fn read_volume(path: impl AsRef<Path>) -> Result<Volume> {
             let what = format!("{}: a MetaImage inside gzip", path.display());
             return Err(Error::unsupported(what, "unpack it first; MetaImage has a compression of its own"));
         }
-        return metaimage::read(path);
+        return Ok(Opened::MetaImage);
     }
     if !nifti::is_header(&head) {
         let mark = head.get(344..348).map_or_else(
@@ -57,7 +79,7 @@ pub fn read_volume(path: impl AsRef<Path>) -> Result<Volume> {
         };
         return Err(input.invalid("format", mark, hint));
     }
-    nifti::read_from(&mut input, &head)
+    Ok(Opened::Nifti(input, head))
 }
 
 /// Whether the file, or the folder with DICOM files in it, looks like a volume; its data is not read. True of a single
@@ -89,7 +111,7 @@ pub fn write_volume(path: impl AsRef<Path>, mut volume: &Volume) -> Result<()> {
 }
 
 /// Writes voxels as [`write_volume`] does, slab by slab: no more than 16 MiB of them (or one layer) are in memory at
-/// once, and for `.mha` 64 MiB of what they are packed to; the rest of that waits in a file without a name beside it.
+/// once, and for `.mha` 32 MiB of what they are packed to; the rest of that waits in a file without a name beside it.
 pub fn write_voxels(path: impl AsRef<Path>, voxels: &mut dyn Voxels) -> Result<()> {
     let path = path.as_ref();
     let format = wanted(path)?;

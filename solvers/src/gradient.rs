@@ -8,7 +8,6 @@ use crate::schedule::{Clock, Decay};
 use conefield_core::backend::{Adam, Executable, Loss, TrainRay, TvBlocks, Work};
 use conefield_core::checkpoint::{Checkpoint, Resume, Standing};
 use conefield_core::error::{Error, Result, ensure};
-use conefield_core::geometry::VoxelGrid;
 use conefield_core::pipeline::{Model, Pipeline};
 use conefield_core::random::stream;
 use conefield_core::scene::Scene;
@@ -261,7 +260,7 @@ impl Solver for Gradient {
         clock.pause();
         drop(source);
         let field = TrainedField { model, scene, unit_mm: job.scan.unit.mm };
-        Ok(Solution { result: Reconstruction::Field(Box::new(field)), steps: step, train_s: clock.seconds(), samples })
+        Ok(Solution { result: Reconstruction::Field(field), steps: step, train_s: clock.seconds(), samples })
     }
 
     fn pretrain(&self, job: &PretrainJob<'_>, observer: &mut dyn Observer) -> Result<Model> {
@@ -269,7 +268,7 @@ impl Solver for Gradient {
     }
 
     /// The list of the pixels that are trained on, at most all of them.
-    fn working_memory(&self, pixels: u64, _: &VoxelGrid) -> u64 {
+    fn working_memory(&self, pixels: u64, _: u64) -> u64 {
         size_of::<u32>() as u64 * pixels
     }
 

@@ -1,5 +1,6 @@
 //! `conefield evaluate`
 
+use crate::memory::Memory;
 use crate::{files, out, parse};
 use clap::Args;
 use conefield_core::scan::Volume;
@@ -31,6 +32,9 @@ pub struct Evaluate {
 
 impl Evaluate {
     pub fn run(self) -> Result<()> {
+        let voxels = [&self.volume, &self.reference].map(conefield_io::volume_voxels);
+        let [volume, reference] = voxels;
+        Memory::of_volumes(&[volume?, reference?]).check(|_| vec![])?;
         let volume = conefield_io::read_volume(&self.volume)?;
         let reference = conefield_io::read_volume(&self.reference)?;
         let place = self.volume.display().to_string();

@@ -2,9 +2,12 @@
 
 use super::BackendChoice;
 use super::convert::refuse_existing;
+use crate::memory::{self, Memory};
 use crate::{files, out, outgoing, signals};
 use clap::Args;
-use conefield_core::Result;
+use conefield_core::trained::FieldVoxels;
+use conefield_core::{Error, Result};
+use conefield_io::SLAB_BYTES;
 use serde_json::json;
 use std::path::PathBuf;
 use std::time::Instant;
@@ -38,6 +41,11 @@ impl Export {
     pub fn run(self) -> Result<()> {
         refuse_existing(&self.output, self.force)?;
         let file = if self.run.is_dir() { self.run.join("weights.safetensors") } else { self.run };
+        let bytes = file.metadata().map_err(|e| Error::io(&file, e))?.len();
+        // The file and the numbers in it, then these and the model.
+        let reading = Memory { model: 2 * bytes, buffers: FieldVoxels::BYTES + SLAB_BYTES, ..Memory::default() };
+        let memory = Memory::most(&[reading]);
+        memory.check(|_| vec![])?;
         let field = files::read_field(&file)?;
         let trained = field.scene.grid;
         let grid = self.voxels.map_or(trained, |n| trained.with_longest(n.into()));
@@ -50,6 +58,7 @@ impl Export {
         if self.json {
             return out::json(&json!({
                 "volume": self.output, "shape": grid.shape, "spacing_mm": grid.spacing, "export_s": export_s,
+                "memory": memory, "peak_bytes": memory::peak(),
             }));
         }
         let [x, y, z] = grid.shape;

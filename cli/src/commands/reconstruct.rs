@@ -1,7 +1,7 @@
 //! `conefield reconstruct`
 
 use super::{BackendChoice, Ends, backends::simd_level, evaluate};
-use crate::memory::Memory;
+use crate::memory::{self, Memory};
 use crate::outgoing::{self, Written};
 use crate::parse::{self, HoldOut};
 use crate::progress::{Keeper, Progress};
@@ -10,8 +10,9 @@ use crate::{files, out, signals, specs};
 use clap::Args;
 use conefield_core::backend::Explain;
 use conefield_core::checkpoint::Resume;
+use conefield_core::pipeline::Pipeline;
 use conefield_core::scan::{Scan, Volume};
-use conefield_core::solver::{Job, Solution};
+use conefield_core::solver::{Job, Solution, Solver};
 use conefield_core::spec::load::{Loaded, to_toml};
 use conefield_core::{Error, Result};
 use conefield_io::MiddleSlices;
@@ -88,7 +89,8 @@ struct Record {
     backend: Explain,
     simd: String,
     threads: usize,
-    memory: Option<Memory>,
+    memory: Memory,
+    peak_bytes: Option<u64>,
     parameters: usize,
     steps: u64,
     train_s: f64,
@@ -122,17 +124,15 @@ impl Reconstruct {
         let backend = self.backend.open();
         let pipeline = loaded.spec.encoder.as_ref().map(|_| specs::build(&loaded)).transpose()?;
         let compiled = pipeline.as_ref().map(|p| backend.compile(p)).transpose()?.map(|c| c.1).unwrap_or_default();
+        let memory = self.memory(&loaded, solver.as_ref(), pipeline.as_ref(), &compiled)?;
+        info!("memory: {}", memory.line());
         let whole = files::scan(&self.scan)?;
         let reference = self.reference.as_ref().map(|path| read_reference(path, &self.scan, &whole)).transpose()?;
         let held = self.hold_out.as_ref().map(|h| h.views(whole.geometry.views.len())).unwrap_or_default();
-        let memory = pipeline.as_ref().map(|p| Memory::of(p, &whole, &compiled, reference.is_some()));
         let fingerprint = checksum(&whole);
         let (scan, held_scan) = if held.is_empty() { (whole, None) } else { split(whole, &held)? };
         let identity = self.identity(&loaded, &held, &fingerprint)?;
         let (folder, metrics, resume) = self.open(&loaded, &identity)?;
-        if let Some(m) = &memory {
-            info!("memory: {}", m.line());
-        }
         signals::listen()?;
         let mut progress = Progress::new("reconstruct", Some(metrics)).keeping(Some(Keeper {
             path: folder.file("checkpoint.safetensors"),
@@ -189,6 +189,7 @@ impl Reconstruct {
             simd: simd_level(),
             threads: rayon::current_num_threads(),
             memory,
+            peak_bytes: memory::peak(),
             parameters: field.map_or(0, |f| f.model.pipeline.layout().len()),
             steps: solution.steps,
             train_s: solution.train_s,
@@ -203,6 +204,37 @@ impl Reconstruct {
         conefield_io::write_text_atomic(folder.file("record.json"), &out::to_json(&record)?)?;
         folder.finish()?;
         if self.json { out::json(&record) } else { out::say(&summary(&record, &solution, &self.output)) }
+    }
+
+    /// What the run takes; one that does not fit is refused.
+    fn memory(
+        &self,
+        loaded: &Loaded,
+        solver: &dyn Solver,
+        pipeline: Option<&Pipeline>,
+        compiled: &Explain,
+    ) -> Result<Memory> {
+        let scan = conefield_io::scan_size(&self.scan)?;
+        let run = memory::Run {
+            scan,
+            split: self.hold_out.is_some(),
+            reference: self.reference.is_some(),
+            field: pipeline.is_some(),
+            parameters: pipeline.map_or(0, |p| p.layout().len() as u64),
+            backend: compiled.scratch_bytes as u64,
+            solver: solver.working_memory(scan.pixels, scan.voxels),
+            resume: self.resume,
+        };
+        let sets = self.all_sets();
+        let tables = loaded.tree["encoder"]["log2_table_size"].as_u64().unwrap_or(0);
+        let smaller = (10..tables as u32).rev().filter_map(|bits| {
+            let set = format!("encoder.log2_table_size={bits}");
+            let loaded = specs::read(&self.spec, &[&sets[..], &[set]].concat()).ok()?;
+            Some((bits, specs::build(&loaded).ok()?.layout().len() as u64))
+        });
+        let memory = run.memory();
+        memory.check(|available| run.smaller(available, smaller))?;
+        Ok(memory)
     }
 
     /// What must be the same for a run to be resumed.
