@@ -34,11 +34,11 @@ pub(crate) fn read(input: &Input, grid: VoxelGrid, affine: Affine, values: Vec<f
 /// Voxels that are in memory at once while a file is written.
 const SLAB: usize = 1 << 22;
 
-/// Bytes that a writer holds: a slab, and for MetaImage what it is packed to.
-pub const SLAB_BYTES: u64 = 4 * SLAB as u64 + PACKED;
+/// Bytes of a slab.
+pub const SLAB_BYTES: u64 = 4 * SLAB as u64;
 
-/// Bytes of packed data that wait in memory; more goes to a file.
-pub(crate) const PACKED: u64 = 32 << 20;
+/// Bytes of packed data that the writer of MetaImage keeps in memory; more goes to a file.
+pub const PACKED_BYTES: u64 = 32 << 20;
 
 /// Writes `voxels` to the file `path`, little-endian, slab by slab along the axis that is slowest in the file; one that
 /// is not finite is refused.

@@ -59,7 +59,7 @@ pub use check::{LineIntegralCheck, check_line_integrals};
 pub use checkpoint::{read_checkpoint, write_checkpoint};
 pub use counts::{Correction, CountsReport, OpenBeam, line_integrals};
 pub use curves::{Corner, CurveOptions, curves_png, curves_png_with};
-pub use file_order::SLAB_BYTES;
+pub use file_order::{PACKED_BYTES, SLAB_BYTES};
 pub use naf::{NafScan, read_naf, write_naf};
 pub use orbit::Orbit;
 pub use r2::{R2Scan, read_r2, write_r2};

@@ -2,7 +2,7 @@
 //! it (`.mhd` with `.raw` or `.zraw`).
 
 use crate::affine::{self, Affine};
-use crate::file_order::{self, FileOrder, PACKED};
+use crate::file_order::{self, FileOrder, PACKED_BYTES};
 use crate::folder;
 use crate::input::Input;
 use crate::number::{Number, Order};
@@ -320,7 +320,8 @@ pub(crate) fn write(w: &mut dyn Write, path: &Path, voxels: &mut dyn Voxels) -> 
     let turn = (0..3).flat_map(|k| affine::column(&lps, k).map(|x| x / spacing[k]));
     // The size of the packed data stands before it: pack it aside, in memory while it is small.
     let folder = path.parent().filter(|p| !p.as_os_str().is_empty()).unwrap_or(Path::new("."));
-    let mut packed = ZlibEncoder::new(tempfile::spooled_tempfile_in(PACKED as usize, folder), Compression::fast());
+    let mut packed =
+        ZlibEncoder::new(tempfile::spooled_tempfile_in(PACKED_BYTES as usize, folder), Compression::fast());
     file_order::write(&mut packed, path, voxels, FileOrder::XFastest)?;
     let mut packed = packed.finish().map_err(io)?;
     let size = packed.stream_position().map_err(io)?;

@@ -7,7 +7,7 @@ use crate::{files, out, outgoing, signals};
 use clap::Args;
 use conefield_core::trained::FieldVoxels;
 use conefield_core::{Error, Result};
-use conefield_io::SLAB_BYTES;
+use conefield_io::{PACKED_BYTES, SLAB_BYTES};
 use serde_json::json;
 use std::path::PathBuf;
 use std::time::Instant;
@@ -43,8 +43,8 @@ impl Export {
         let file = if self.run.is_dir() { self.run.join("weights.safetensors") } else { self.run };
         let bytes = file.metadata().map_err(|e| Error::io(&file, e))?.len();
         // The file and the numbers in it, then these and the model.
-        let reading = Memory { model: 2 * bytes, buffers: FieldVoxels::BYTES + SLAB_BYTES, ..Memory::default() };
-        let memory = Memory::most(&[reading]);
+        let buffers = FieldVoxels::BYTES + SLAB_BYTES + PACKED_BYTES;
+        let memory = Memory::most(&[Memory { model: 2 * bytes, buffers, ..Memory::default() }]);
         memory.check(|_| vec![])?;
         let field = files::read_field(&file)?;
         let trained = field.scene.grid;
