@@ -1,6 +1,6 @@
 //! The contracts that conefield's stages, backends and solvers meet at.
 //!
-//! - [`geometry`], [`scan`], [`voxels`]: what was measured, in millimetres, and what comes out.
+//! - [`geometry`], [`scan`], [`parts`]: what was measured, in millimetres, and what comes out.
 //! - [`simd`], [`dense`], [`trilinear`], [`stage`]: what a stage computes and how.
 //! - [`arena`]: parameters, gradients and optimizer state under their names.
 //! - [`spec`], [`registry`]: what a user writes, and the stage types that it may name.
@@ -14,6 +14,7 @@ pub mod dense;
 pub mod error;
 pub mod geometry;
 pub mod pages;
+pub mod parts;
 pub mod pipeline;
 pub mod random;
 pub mod registry;
@@ -26,6 +27,5 @@ pub mod stage;
 pub mod trained;
 pub mod trilinear;
 pub mod voxel;
-pub mod voxels;
 
 pub use error::{Error, Result};

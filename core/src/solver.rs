@@ -3,11 +3,11 @@
 use crate::backend::Backend;
 use crate::checkpoint::{Checkpoint, Resume};
 use crate::error::Result;
+use crate::parts::Voxels;
 use crate::pipeline::Model;
 use crate::scan::{Scan, Volume};
 use crate::spec::Spec;
 use crate::trained::TrainedField;
-use crate::voxels::Voxels;
 use serde::Serialize;
 
 /// What a solver works on.

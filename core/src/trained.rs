@@ -3,11 +3,11 @@
 use crate::backend::{Backend, Executable};
 use crate::error::{Error, Result};
 use crate::geometry::VoxelGrid;
+use crate::parts::{Part, Voxels};
 use crate::pipeline::{Masked, Model, Pipeline};
 use crate::scan::Affine;
 use crate::scene::Scene;
 use crate::spec::Spec;
-use crate::voxels::{Part, Voxels};
 use ndarray::ArrayViewMut3;
 use serde::{Deserialize, Serialize};
 

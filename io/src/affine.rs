@@ -4,8 +4,8 @@
 //! point to the left, back and head (LPS): the first two coordinates change their sign.
 
 use conefield_core::geometry::{VoxelGrid, cross, dot, norm};
+use conefield_core::parts::Voxels;
 pub(crate) use conefield_core::scan::Affine;
-use conefield_core::voxels::Voxels;
 
 /// From RAS to LPS, or back.
 pub(crate) fn flip(affine: Affine) -> Affine {

@@ -3,7 +3,7 @@
 use crate::file_order::{self, FileOrder};
 use crate::input::Input;
 use crate::number::{self, Number, Order};
-use conefield_core::voxels::Voxels;
+use conefield_core::parts::Voxels;
 use conefield_core::{Error, Result};
 use ndarray::{Array, ArrayD, Dimension, IxDyn, ShapeBuilder};
 use std::io::Write;

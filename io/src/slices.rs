@@ -2,8 +2,8 @@
 
 use crate::canvas::{Align, Canvas, diverging, grey, number};
 use conefield_core::geometry::VoxelGrid;
+use conefield_core::parts::Part;
 use conefield_core::scan::Volume;
-use conefield_core::voxels::Part;
 use conefield_core::{Error, Result};
 use image::Rgb;
 use ndarray::{Array2, ArrayView3, Axis, s};

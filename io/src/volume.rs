@@ -3,8 +3,8 @@
 use crate::input::Input;
 use crate::{dicom, metaimage, nifti, npy, write_atomic};
 use conefield_core::geometry::VoxelGrid;
+use conefield_core::parts::Voxels;
 use conefield_core::scan::Volume;
-use conefield_core::voxels::Voxels;
 use conefield_core::{Error, Result};
 use flate2::{Compression, GzBuilder};
 use ndarray::{Array3, Ix3};
@@ -173,7 +173,7 @@ fn format_of(path: &Path) -> Option<Format> {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use conefield_core::voxels::Part;
+    use conefield_core::parts::Part;
 
     #[test]
     fn numpy_volumes_come_back() {
