@@ -13,20 +13,22 @@ fn main() -> Result<(), Box<dyn Error>> {
 
     let loaded = conefield::specs::read("fast", &["field.width=16".into()])?;
     let solver = loaded.spec.solver.build()?;
+    let backend = Cpu::new();
     let job = Job {
         scan: &scan,
         held_out: None,
         reference: None,
         peak: 1.0,
         spec: &loaded.spec,
-        backend: &Cpu::new(),
+        backend: &backend,
         seed: 0,
         limits: Limits { steps: Some(200), seconds: None },
         weights: &|path| Err(conefield_core::Error::unsupported(path, "this example reads no weights")),
         resume: None,
     };
     let solution = solver.solve(&job, &mut Silent)?;
-    let psnr = conefield_metrics::psnr(solution.volume.data.view(), truth.data.view(), 1.0)?;
+    let volume = solution.result.volume(&backend)?;
+    let psnr = conefield_metrics::psnr(volume.data.view(), truth.data.view(), 1.0)?;
     println!("{} steps in {:.1} s: {psnr:.2} dB", solution.steps, solution.train_s);
     Ok(())
 }

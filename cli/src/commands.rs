@@ -5,6 +5,7 @@ mod convert;
 mod demo;
 mod evaluate;
 mod explain;
+mod export;
 mod import;
 mod info;
 mod pretrain;
@@ -32,6 +33,8 @@ pub enum Command {
     Pretrain(pretrain::Pretrain),
     /// Score a volume against a reference: PSNR, RMSE and three SSIMs.
     Evaluate(evaluate::Evaluate),
+    /// Evaluate the field of a finished run at other voxels.
+    Export(export::Export),
     /// Show what a spec builds: stages, widths, parameters, memory, work.
     Explain(explain::Explain),
     /// Say what a scan, volume or weights file holds.
@@ -54,6 +57,7 @@ pub fn run(command: Command) -> Result<()> {
         Command::Reconstruct(c) => c.run(),
         Command::Pretrain(c) => c.run(),
         Command::Evaluate(c) => c.run(),
+        Command::Export(c) => c.run(),
         Command::Explain(c) => c.run(),
         Command::Info(c) => c.run(),
         Command::Convert(c) => c.run(),

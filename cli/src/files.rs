@@ -2,23 +2,41 @@
 
 use conefield_core::arena::Weights;
 use conefield_core::checkpoint::{Checkpoint, Resume};
+use conefield_core::pipeline::Model;
 use conefield_core::scan::{Scan, Volume};
+use conefield_core::trained::TrainedField;
 use conefield_core::{Error, Result};
-use conefield_io::LineIntegralCheck;
+use conefield_io::{LineIntegralCheck, MiddleSlices};
 use conefield_projectors::simulate::{PhantomKind, phantom_of};
 use std::collections::BTreeMap;
 use std::path::Path;
 
 /// The volume that `name` means: `phantom:KIND[:SIZE]` or a file.
 pub fn volume(name: &str) -> Result<Volume> {
-    let Some(rest) = name.strip_prefix("phantom:") else { return conefield_io::read_volume(name) };
+    match phantom(name)? {
+        Some((kind, size)) => Ok(phantom_of(kind, size)),
+        None => conefield_io::read_volume(name),
+    }
+}
+
+/// Number of voxels of the volume that `name` means, without reading or making it.
+pub fn voxels(name: &str) -> Result<u64> {
+    match phantom(name)? {
+        Some((_, size)) => Ok((size as u64).pow(3)),
+        None => conefield_io::volume_voxels(name),
+    }
+}
+
+/// The kind and size of `phantom:KIND[:SIZE]`; any other name is a file's.
+fn phantom(name: &str) -> Result<Option<(PhantomKind, usize)>> {
+    let Some(rest) = name.strip_prefix("phantom:") else { return Ok(None) };
     let (kind, size) = match (rest.parse::<PhantomKind>(), rest.rsplit_once(':')) {
         (Ok(kind), _) => (kind, "128"),
         (_, Some((kind, size))) => (kind.parse()?, size),
         (Err(e), None) => return Err(e),
     };
     match size.parse() {
-        Ok(size @ 8..=1024) => Ok(phantom_of(kind, size)),
+        Ok(size @ 8..=1024) => Ok(Some((kind, size))),
         _ => Err(Error::invalid(name, "size", size, "a number of voxels from 8 to 1024")),
     }
 }
@@ -48,6 +66,36 @@ pub fn read_weights(path: impl AsRef<Path>) -> Result<Weights> {
 pub fn write_weights(path: impl AsRef<Path>, weights: &Weights) -> Result<()> {
     let tensors: Vec<_> = weights.tensors.iter().map(|(name, (shape, values))| (name, shape, &values[..])).collect();
     conefield_io::write_weights(path, &tensors, &weights.notes)
+}
+
+/// The note of a weights file that says where its field stands.
+const PLACEMENT: &str = "placement";
+
+/// Writes a trained field: its weights, with `notes` that hold the spec.
+pub fn write_field(path: impl AsRef<Path>, field: &TrainedField, mut notes: BTreeMap<String, String>) -> Result<()> {
+    let Model { pipeline, arena, .. } = &field.model;
+    let blocks = &pipeline.layout().blocks;
+    let tensors: Vec<_> = blocks.iter().map(|b| (&b.name, &b.shape, &arena.params[b.range.clone()])).collect();
+    let placement = serde_json::to_string(&field.placement())
+        .map_err(|e| Error::unsupported("weights", format!("cannot be put into words: {e}")))?;
+    notes.insert(PLACEMENT.into(), placement);
+    conefield_io::write_weights(path, &tensors, &notes)
+}
+
+/// Reads what [`write_field`] wrote.
+pub fn read_field(path: &Path) -> Result<TrainedField> {
+    let place = path.display().to_string();
+    let weights = read_weights(path)?;
+    let note = |key: &str| {
+        let expected = "weights that a run of \"conefield reconstruct\" left";
+        weights.notes.get(key).ok_or_else(|| Error::invalid(&place, key, "no such note", expected))
+    };
+    let spec = conefield_core::spec::load::parse(note("spec")?, &format!("{place}: spec.toml"), &[], &[])?.spec;
+    let placement = serde_json::from_str(note(PLACEMENT)?)
+        .map_err(|e| Error::invalid(&place, PLACEMENT, e, "what conefield writes there"))?;
+    TrainedField::restore(&spec, &placement, |model| {
+        weights.load(&place, model.pipeline.layout(), &mut model.arena.params, |_| true).map(drop)
+    })
 }
 
 /// The entry of a checkpoint's text that says where the run stands; the others say which run it is.
@@ -86,22 +134,12 @@ pub fn read_checkpoint(path: &Path, run: &BTreeMap<String, String>) -> Result<Re
     Ok(Resume { place, standing, weights: Weights { tensors: file.tensors, ..Weights::default() } })
 }
 
-/// Draws the middle slices of `volume`, with those of `reference` and their difference where there is one.
-pub fn picture(path: impl AsRef<Path>, reference: Option<&Volume>, volume: &Volume) -> Result<()> {
+/// Draws the middle slices of a result, with those of `reference` and their difference where there is one.
+pub fn picture(path: impl AsRef<Path>, reference: Option<&MiddleSlices>, result: &MiddleSlices) -> Result<()> {
     match reference {
-        Some(r) => conefield_io::slices_png(path, &[("reference", r), ("result", volume)], window(r), Some(0)),
-        None => conefield_io::slices_png(path, &[("result", volume)], window(volume), None),
+        Some(r) => conefield_io::slices_png(path, &[("reference", r), ("result", result)], r.window(), Some(0)),
+        None => conefield_io::slices_png(path, &[("result", result)], result.window(), None),
     }
-}
-
-/// From black to white: the values but for the outermost thousandth on either side.
-pub fn window(volume: &Volume) -> [f32; 2] {
-    let step = (volume.data.len() / 1_000_000).max(1);
-    let mut all: Vec<f32> = volume.data.iter().copied().step_by(step).filter(|x| x.is_finite()).collect();
-    all.sort_unstable_by(f32::total_cmp);
-    let at = |share: f64| all.get((all.len() as f64 * share) as usize).or(all.last()).copied().unwrap_or(0.0);
-    let (low, high) = (at(0.001), at(0.999));
-    if low < high { [low, high] } else { [low, low + low.abs().max(1.0)] }
 }
 
 #[cfg(test)]
@@ -116,11 +154,5 @@ mod tests {
             let e = volume(name).unwrap_err().to_string();
             assert!(e.contains(want), "{name}: {e}");
         }
-    }
-
-    #[test]
-    fn a_window_is_never_empty() {
-        let flat = Volume::centered(ndarray::Array3::zeros([2; 3]), [1.0; 3]);
-        assert_eq!(window(&flat), [0.0, 1.0]);
     }
 }

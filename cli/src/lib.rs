@@ -4,6 +4,7 @@ mod commands;
 mod files;
 mod memory;
 mod out;
+mod outgoing;
 mod parse;
 mod progress;
 mod run;
@@ -35,12 +36,18 @@ struct Cli {
     /// Worker threads [default: one a core].
     #[arg(long, global = true, value_name = "N", help_heading = "General options", value_parser = clap::value_parser!(u16).range(1..))]
     threads: Option<u16>,
+    /// Memory that a command may take, such as 8GiB [default: what is available]. One that needs more is refused.
+    #[arg(long, global = true, value_name = "SIZE", help_heading = "General options", value_parser = parse::bytes)]
+    memory: Option<u64>,
 }
 
 /// Runs the command line. Exit status: 0 done, 1 failed, 2 wrong use, 130 or 143 interrupted.
 pub fn main() -> ExitCode {
     let cli = Cli::parse();
     progress::start_log(cli.verbose, cli.quiet);
+    if let Some(bytes) = cli.memory {
+        memory::set_budget(bytes);
+    }
     if let Some(n) = cli.threads
         && let Err(e) = rayon::ThreadPoolBuilder::new().num_threads(n.into()).build_global()
     {
@@ -52,7 +59,7 @@ pub fn main() -> ExitCode {
         Err(e) => {
             eprintln!("error: {e}");
             match (&e, signals::caught()) {
-                (Error::Interrupted { .. }, Some(signal)) => ExitCode::from(128 + signal),
+                (Error::Interrupted { .. } | Error::Cancelled { .. }, Some(signal)) => ExitCode::from(128 + signal),
                 _ => ExitCode::FAILURE,
             }
         }

@@ -1,50 +1,256 @@
-//! What a run will hold in memory.
+//! What a command will hold in memory, reckoned before it takes any, and what there is.
+//!
+//! An estimate is the sum at the moment that takes most: reading, training or export. It leaves out what is small
+//! whatever the input is, but for the program itself.
 
-use conefield_core::backend::Explain;
-use conefield_core::pipeline::Pipeline;
-use conefield_core::scan::Scan;
+use crate::out::bytes;
+use conefield_core::trained::FieldVoxels;
+use conefield_core::{Error, Result};
+use conefield_io::{SLAB_BYTES, ScanSize};
 use serde::Serialize;
+use std::sync::OnceLock;
+use sysinfo::{MemoryRefreshKind, ProcessesToUpdate, RefreshKind, System, get_current_pid};
 
-/// Bytes by what holds them.
-#[derive(Debug, Clone, Serialize)]
+/// Code, threads and the libraries' own tables.
+const PROGRAM: u64 = 24 << 20;
+
+/// What `--memory` allows.
+static BUDGET: OnceLock<u64> = OnceLock::new();
+
+/// Sets what commands may take, instead of what the system has.
+pub fn set_budget(bytes: u64) {
+    let _ = BUDGET.set(bytes);
+}
+
+/// Bytes by what holds them, at the moment that takes most.
+#[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Serialize)]
 pub struct Memory {
-    /// The projections.
-    pub projections: u64,
-    /// The volume that comes out.
+    /// The projections, and what reading them takes.
+    pub scan: u64,
+    /// Volumes that are read or made: a result is held whole only to be scored.
     pub volume: u64,
-    /// The reference volume, where there is one.
+    /// The reference volume.
     pub reference: u64,
-    /// Parameters, gradients and both moments.
+    /// Parameters and gradients.
     pub model: u64,
-    /// What the backend works in.
-    pub scratch: u64,
+    /// Both moments of every parameter.
+    pub optimizer: u64,
+    /// What backend, solver and writer work in, and the program itself.
+    pub buffers: u64,
     /// All of it.
     pub total: u64,
 }
 
 impl Memory {
-    /// What reconstructing `scan` with `pipeline` takes.
-    pub fn of(pipeline: &Pipeline, scan: &Scan, backend: &Explain, with_reference: bool) -> Self {
-        let volume = 4 * scan.geometry.volume.len().unwrap_or(0) as u64;
-        let projections = 4 * scan.projections.len() as u64;
-        let reference = if with_reference { volume } else { 0 };
-        let model = 16 * pipeline.layout().len() as u64;
-        let scratch = backend.scratch_bytes as u64;
-        let total = projections + volume + reference + model + scratch;
-        Self { projections, volume, reference, model, scratch, total }
+    /// The sum taken, and the program.
+    fn summed(mut self) -> Self {
+        self.buffers += PROGRAM;
+        self.total = self.scan + self.volume + self.reference + self.model + self.optimizer + self.buffers;
+        self
+    }
+
+    /// The one of several moments that takes most.
+    pub fn most(moments: &[Memory]) -> Self {
+        moments.iter().map(|m| m.summed()).max_by_key(|m| m.total).unwrap_or_default()
     }
 
     /// In words.
     pub fn line(&self) -> String {
-        let b = crate::out::bytes;
-        let reference = if self.reference > 0 { format!(", reference {}", b(self.reference)) } else { String::new() };
-        format!(
-            "{} (projections {}, volume {}{reference}, model and optimizer {}, backend {})",
-            b(self.total),
-            b(self.projections),
-            b(self.volume),
-            b(self.model),
-            b(self.scratch),
-        )
+        let parts = [
+            ("scan", self.scan),
+            ("volume", self.volume),
+            ("reference", self.reference),
+            ("model", self.model),
+            ("optimizer", self.optimizer),
+            ("buffers", self.buffers),
+        ];
+        let parts = parts.iter().filter(|(_, n)| *n > 0).map(|(what, n)| format!("{what} {}", bytes(*n)));
+        format!("{}: {}", bytes(self.total), parts.collect::<Vec<_>>().join(", "))
+    }
+
+    /// Refuses what does not fit, with the figures; `smaller` names what would fit into so many bytes.
+    pub fn check(&self, smaller: impl FnOnce(u64) -> Vec<String>) -> Result<()> {
+        let (available, whose) = match BUDGET.get() {
+            Some(bytes) => (*bytes, "--memory allows"),
+            None => (available(), "are available"),
+        };
+        if self.total <= available {
+            return Ok(());
+        }
+        let smaller = smaller(available);
+        let hint = match smaller.as_slice() {
+            [] => "nothing that is smaller in one respect alone would fit".to_owned(),
+            all => format!("{} would fit", all.join(" or ")),
+        };
+        let there = match BUDGET.get() {
+            Some(_) => format!("{whose} {}", bytes(available)),
+            None => format!("{} {whose}", bytes(available)),
+        };
+        Err(Error::unsupported("memory", format!("needs {}; {there}; {hint}", self.line())))
+    }
+}
+
+/// Bytes that this process may take: what the machine has available, less where a control group limits it; no limit
+/// where the system does not tell.
+fn available() -> u64 {
+    let memory = RefreshKind::nothing().with_memory(MemoryRefreshKind::nothing().with_ram());
+    let Ok(mut system) = System::new_with_specifics(memory) else { return u64::MAX };
+    let machine = Some(system.available_memory()).filter(|n| *n > 0).unwrap_or(u64::MAX);
+    let limits = get_current_pid().ok().and_then(|pid| {
+        system.refresh_processes(ProcessesToUpdate::Some(&[pid]), false);
+        system.process(pid)?.cgroup_limits()
+    });
+    // The group's free memory lacks what the system caches for it and gives back when asked.
+    limits.map_or(machine, |l| machine.min(l.total_memory.saturating_sub(l.rss)))
+}
+
+/// The most that this process has held so far, where the system tells.
+pub fn peak() -> Option<u64> {
+    let status = std::fs::read_to_string("/proc/self/status").ok()?;
+    let line = status.lines().find_map(|l| l.strip_prefix("VmHWM:"))?;
+    line.trim().strip_suffix("kB")?.trim().parse::<u64>().ok().map(|k| k << 10)
+}
+
+impl Memory {
+    /// What holding volumes of so many voxels takes, read one after the other. A file's order of voxels is turned into
+    /// the program's, for which each is there twice for a moment.
+    pub fn of_volumes(voxels: &[u64]) -> Self {
+        let mut held = 0;
+        let moments = voxels.iter().map(|n| {
+            let volume = 4 * (held + 2 * n);
+            held += n;
+            Memory { volume, ..Memory::default() }
+        });
+        Self::most(&moments.collect::<Vec<_>>())
+    }
+}
+
+/// What a reconstruction works on.
+#[derive(Debug, Clone, Copy)]
+pub struct Run {
+    /// The scan.
+    pub scan: ScanSize,
+    /// Whether views are kept aside.
+    pub split: bool,
+    /// Whether there is a reference.
+    pub reference: bool,
+    /// Whether the solver trains a field; another one makes the whole volume.
+    pub field: bool,
+    /// Parameters.
+    pub parameters: u64,
+    /// Bytes that the backend works in.
+    pub backend: u64,
+    /// Bytes that the solver works in.
+    pub solver: u64,
+    /// Whether it goes on from a checkpoint.
+    pub resume: bool,
+}
+
+impl Run {
+    /// What it takes.
+    pub fn memory(&self) -> Memory {
+        let projections = 4 * self.scan.pixels;
+        let voxels = 4 * self.scan.voxels;
+        let reference = if self.reference { voxels } else { 0 };
+        let volume = if self.reference || !self.field { voxels } else { 0 };
+        let half = 8 * self.parameters;
+        // Parameters and moments from the file, and one of them again on its way into the model.
+        let checkpoint = if self.resume { 2 * half } else { 0 };
+        let reading = Memory { scan: projections + self.scan.reading, ..Memory::default() };
+        // A file's order of voxels is turned into the program's.
+        let comparing = Memory { scan: projections, reference: 2 * reference, ..Memory::default() };
+        let splitting = Memory { scan: if self.split { 2 * projections } else { 0 }, reference, ..Memory::default() };
+        let solving = Memory {
+            scan: projections,
+            reference,
+            model: half,
+            optimizer: half,
+            buffers: self.backend + self.solver + checkpoint,
+            ..Memory::default()
+        };
+        let exporting =
+            Memory { volume, buffers: self.backend + FieldVoxels::BYTES + SLAB_BYTES + checkpoint, ..solving };
+        Memory::most(&[reading, comparing, splitting, solving, exporting])
+    }
+
+    /// What would fit into `available` bytes, one thing smaller at a time; `tables` gives the number of parameters with
+    /// tables of so many bits, from the largest that is smaller than now.
+    pub fn smaller(&self, available: u64, tables: impl Iterator<Item = (u32, u64)>) -> Vec<String> {
+        let fits = |run: &Run| run.memory().total <= available;
+        let mut found = vec![];
+        let reference = Run { reference: false, ..*self };
+        if self.reference && fits(&reference) {
+            found.push("a run without --reference".to_owned());
+        }
+        let halved = |n: u64, k: u32| Run {
+            scan: ScanSize { voxels: n >> (3 * k), ..self.scan },
+            solver: if self.field { self.solver } else { self.solver >> (3 * k) },
+            ..*self
+        };
+        let side = |n: u64| (n as f64).cbrt().round() as u64;
+        if let Some(run) = (1..8).map(|k| halved(self.scan.voxels, k)).find(fits) {
+            found.push(format!("a volume of {}³ voxels", side(run.scan.voxels)));
+        }
+        let mut tables = tables.map(|(bits, parameters)| (bits, Run { parameters, ..*self }));
+        if let Some((bits, _)) = tables.find(|(_, run)| fits(run)) {
+            found.push(format!("tables of 2^{bits}"));
+        }
+        let binned = |k: u32| Run {
+            scan: ScanSize { pixels: self.scan.pixels >> (2 * k), ..self.scan },
+            solver: if self.field { self.solver >> (2 * k) } else { self.solver },
+            ..*self
+        };
+        if let Some(k) = (1..5).find(|k| fits(&binned(*k))) {
+            found.push(format!("a detector of 1/{} of the rows and columns", 1 << k));
+        }
+        found
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn run() -> Run {
+        Run {
+            scan: ScanSize { pixels: 1 << 20, voxels: 512 * 512 * 512, reading: 0 },
+            split: false,
+            reference: true,
+            field: true,
+            parameters: 1 << 22,
+            backend: 1 << 20,
+            solver: 4 << 20,
+            resume: false,
+        }
+    }
+
+    #[test]
+    fn the_moment_that_takes_most_is_told() {
+        let m = run().memory();
+        assert_eq!((m.reference, m.volume), (512 << 20, 512 << 20));
+        assert_eq!((m.model, m.optimizer), (32 << 20, 32 << 20));
+        assert_eq!(m.total, m.scan + m.volume + m.reference + m.model + m.optimizer + m.buffers);
+        let alone = Run { reference: false, ..run() }.memory();
+        assert_eq!((alone.reference, alone.volume), (0, 0));
+        assert!(m.line().contains("reference 512 MiB") && !alone.line().contains("reference"), "{}", m.line());
+    }
+
+    #[test]
+    fn only_what_fits_is_offered() {
+        let tables = || [(18, 1 << 21), (17, 1 << 20)].into_iter();
+        let found = run().smaller(400 << 20, tables());
+        assert_eq!(found, ["a run without --reference", "a volume of 256³ voxels"]);
+        let alone = Run { reference: false, ..run() };
+        let found = alone.smaller(alone.memory().total - (40 << 20), tables());
+        assert_eq!(found, ["tables of 2^17"]);
+        assert!(run().smaller(1 << 20, tables()).is_empty());
+    }
+
+    #[test]
+    fn the_machine_has_memory() {
+        assert!(available() > 1 << 20);
+        if cfg!(target_os = "linux") {
+            assert!(peak().is_some_and(|p| p > 1 << 20));
+        }
     }
 }

@@ -25,6 +25,21 @@ pub fn seconds(text: &str) -> Result<f64, String> {
     }
 }
 
+/// `8GiB`, `500MiB`, `1.5G` or a number of bytes.
+pub fn bytes(text: &str) -> Result<u64, String> {
+    let form = "expected bytes such as 8GiB, 500MiB or 1000000000";
+    let number = text.trim_end_matches(|c: char| c.is_ascii_alphabetic());
+    let power = match text[number.len()..].to_ascii_lowercase().as_str() {
+        "" | "b" => 0,
+        "k" | "kib" => 1,
+        "m" | "mib" => 2,
+        "g" | "gib" => 3,
+        "t" | "tib" => 4,
+        _ => return Err(form.into()),
+    };
+    positive(number, form.trim_start_matches("expected ")).map(|x| (x * 1024f64.powi(power)) as u64)
+}
+
 /// Two numbers with `separator` between them.
 fn pair<T: FromStr>(text: &str, separator: char, form: &str) -> Result<[T; 2], String> {
     let parsed = text.split_once(separator).and_then(|(a, b)| Some([a.trim().parse().ok()?, b.trim().parse().ok()?]));
@@ -169,6 +184,10 @@ mod tests {
         assert_eq!(seconds("90"), Ok(90.0));
         for bad in ["", "s", "-3s", "3x", "nan", "inf", "0", "1e999s"] {
             assert!(seconds(bad).is_err(), "{bad}");
+        }
+        assert_eq!([bytes("8GiB"), bytes("1.5m"), bytes("77")], [Ok(8 << 30), Ok(3 << 19), Ok(77)]);
+        for bad in ["", "GiB", "-1G", "3 GiB", "1GB", "nan"] {
+            assert!(bytes(bad).is_err(), "{bad}");
         }
         assert_eq!(detector("64x96"), Ok([64, 96]));
         assert!(detector("64").is_err() && detector("0x4").is_err() && detector("4x-1").is_err());

@@ -106,6 +106,22 @@ impl Progress {
         &self.records
     }
 
+    /// Shows that `share` of the work is done, with a line that says more, unless that was done just now.
+    pub fn show(&mut self, share: f64, line: impl FnOnce(&Self) -> String) {
+        let wait = if self.bar.is_hidden() { EVERY } else { Duration::from_millis(100) };
+        if self.told.elapsed() < wait {
+            return;
+        }
+        self.told = Instant::now();
+        let line = line(self);
+        if self.bar.is_hidden() {
+            info!("{} {:.0} %: {line}", self.what, 100.0 * share);
+        } else {
+            self.bar.set_position((1000.0 * share.clamp(0.0, 1.0)) as u64);
+            self.bar.set_message(line);
+        }
+    }
+
     /// How things stand, in a line.
     fn line(&self, step: u64, seconds_left: f64) -> String {
         let r = &self.latest;
@@ -128,18 +144,7 @@ impl Progress {
 
 impl Observer for Progress {
     fn progress(&mut self, step: u64, share: f64, seconds_left: f64) {
-        let wait = if self.bar.is_hidden() { EVERY } else { Duration::from_millis(100) };
-        if self.told.elapsed() < wait {
-            return;
-        }
-        self.told = Instant::now();
-        let line = self.line(step, seconds_left);
-        if self.bar.is_hidden() {
-            info!("{} {:.0} %: {line}", self.what, 100.0 * share);
-        } else {
-            self.bar.set_position((1000.0 * share.clamp(0.0, 1.0)) as u64);
-            self.bar.set_message(line);
-        }
+        self.show(share, |me| me.line(step, seconds_left));
     }
 
     fn record(&mut self, record: &Record) {

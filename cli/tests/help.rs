@@ -3,12 +3,13 @@
 mod common;
 use common::{conefield, done, refused};
 
-const COMMANDS: [&str; 11] = [
+const COMMANDS: [&str; 12] = [
     "simulate",
     "import",
     "reconstruct",
     "pretrain",
     "evaluate",
+    "export",
     "explain",
     "info",
     "convert",

@@ -42,6 +42,12 @@ pub enum Error {
         /// The last finished step.
         step: u64,
     },
+    /// The user interrupted the writing of a file.
+    #[error("{place}: interrupted while it was written; nothing new stands under this name")]
+    Cancelled {
+        /// The file.
+        place: String,
+    },
     /// Training left the finite numbers.
     #[error("training diverged at step {step}: {what}")]
     Diverged {

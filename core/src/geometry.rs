@@ -93,6 +93,15 @@ impl VoxelGrid {
         std::array::from_fn(|k| self.shape[k] as f64 * self.spacing[k])
     }
 
+    /// A grid of the same box with `n` voxels along its longest side, and along the others as many as make them nearly
+    /// cubes.
+    pub fn with_longest(&self, n: usize) -> Self {
+        let size = self.size();
+        let voxel = size.into_iter().fold(0.0, f64::max) / n as f64;
+        let shape = size.map(|s| ((s / voxel).round() as usize).max(1));
+        Self { shape, spacing: std::array::from_fn(|k| size[k] / shape[k] as f64), center: self.center }
+    }
+
     /// Lower and upper corner of the box that the voxels fill.
     pub fn bounds(&self) -> [Vec3; 2] {
         let size = self.size();

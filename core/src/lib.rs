@@ -1,11 +1,11 @@
 //! The contracts that conefield's stages, backends and solvers meet at.
 //!
-//! - [`geometry`], [`scan`]: what was measured, in millimetres.
+//! - [`geometry`], [`scan`], [`parts`]: what was measured, in millimetres, and what comes out.
 //! - [`simd`], [`dense`], [`trilinear`], [`stage`]: what a stage computes and how.
 //! - [`arena`]: parameters, gradients and optimizer state under their names.
 //! - [`spec`], [`registry`]: what a user writes, and the stage types that it may name.
 //! - [`voxel`]: line integrals of voxel volumes.
-//! - [`pipeline`], [`backend`], [`solver`]: from a spec to a volume.
+//! - [`pipeline`], [`backend`], [`solver`], [`trained`]: from a spec to a volume.
 
 pub mod arena;
 pub mod backend;
@@ -14,6 +14,7 @@ pub mod dense;
 pub mod error;
 pub mod geometry;
 pub mod pages;
+pub mod parts;
 pub mod pipeline;
 pub mod random;
 pub mod registry;
@@ -23,6 +24,7 @@ pub mod simd;
 pub mod solver;
 pub mod spec;
 pub mod stage;
+pub mod trained;
 pub mod trilinear;
 pub mod voxel;
 

@@ -94,6 +94,9 @@ impl Scan {
     }
 }
 
+/// Rows of voxel index → millimetres, the last one `[0, 0, 0, 1]`.
+pub type Affine = [[f64; 4]; 4];
+
 /// Voxels of attenuation (or any other quantity) with their place in the world.
 #[derive(Debug, Clone)]
 pub struct Volume {
@@ -102,7 +105,7 @@ pub struct Volume {
     /// Where the voxels are, in mm.
     pub grid: VoxelGrid,
     /// Voxel indices to the patient's or file's own coordinates in mm (NIfTI's affine, RAS), row-major, if known.
-    pub affine: Option<[[f64; 4]; 4]>,
+    pub affine: Option<Affine>,
 }
 
 impl Volume {

@@ -3,9 +3,11 @@
 use crate::backend::Backend;
 use crate::checkpoint::{Checkpoint, Resume};
 use crate::error::Result;
+use crate::parts::Voxels;
 use crate::pipeline::Model;
 use crate::scan::{Scan, Volume};
 use crate::spec::Spec;
+use crate::trained::TrainedField;
 use serde::Serialize;
 
 /// What a solver works on.
@@ -100,23 +102,50 @@ impl Observer for Silent {
     fn note(&mut self, _: &str) {}
 }
 
+/// What came out of a scan, in 1/unit of it.
+pub enum Reconstruction {
+    /// Voxels.
+    Volume(Volume),
+    /// A field that can be evaluated on any grid.
+    Field(TrainedField),
+}
+
+impl Reconstruction {
+    /// The voxels that the scan asks for, part by part; a field is evaluated by `backend`.
+    pub fn voxels<'a>(&'a self, backend: &dyn Backend) -> Result<Box<dyn Voxels + 'a>> {
+        Ok(match self {
+            Self::Volume(volume) => Box::new(volume),
+            Self::Field(field) => Box::new(field.voxels(backend, field.scene.grid)?),
+        })
+    }
+
+    /// The voxels that the scan asks for, all at once.
+    pub fn volume(&self, backend: &dyn Backend) -> Result<Volume> {
+        Volume::collect(self.voxels(backend)?.as_mut())
+    }
+
+    /// The field, of solvers that train one.
+    pub fn field(&self) -> Option<&TrainedField> {
+        match self {
+            Self::Volume(_) => None,
+            Self::Field(field) => Some(field),
+        }
+    }
+}
+
 /// What a solver made.
 pub struct Solution {
-    /// The volume, in 1/unit of the scan.
-    pub volume: Volume,
-    /// The trained model, of solvers that have one.
-    pub model: Option<Model>,
+    /// What came out.
+    pub result: Reconstruction,
     /// Steps done.
     pub steps: u64,
     /// Seconds of training.
     pub train_s: f64,
-    /// Seconds of export.
-    pub export_s: f64,
     /// Training samples.
     pub samples: u64,
 }
 
-/// Scan in, volume out.
+/// Scan in, reconstruction out.
 pub trait Solver: Send + Sync {
     /// Does the whole job.
     fn solve(&self, job: &Job<'_>, observer: &mut dyn Observer) -> Result<Solution>;
@@ -125,6 +154,13 @@ pub trait Solver: Send + Sync {
     fn pretrain(&self, job: &PretrainJob<'_>, observer: &mut dyn Observer) -> Result<Model> {
         let _ = (job, observer);
         Err(crate::Error::unsupported(self.describe(), "this solver has nothing to pre-train"))
+    }
+
+    /// Bytes that it holds while it makes `voxels` of `pixels` measured values, beside scan, model and backend:
+    /// iterates, lists of rays.
+    fn working_memory(&self, pixels: u64, voxels: u64) -> u64 {
+        let _ = (pixels, voxels);
+        0
     }
 
     /// A line for `explain`.

@@ -4,10 +4,8 @@
 //! point to the left, back and head (LPS): the first two coordinates change their sign.
 
 use conefield_core::geometry::{VoxelGrid, cross, dot, norm};
-use conefield_core::scan::Volume;
-
-/// Rows of voxel index → millimetres, the last one `[0, 0, 0, 1]`.
-pub(crate) type Affine = [[f64; 4]; 4];
+use conefield_core::parts::Voxels;
+pub(crate) use conefield_core::scan::Affine;
 
 /// From RAS to LPS, or back.
 pub(crate) fn flip(affine: Affine) -> Affine {
@@ -40,19 +38,20 @@ pub(crate) fn is_regular(affine: &Affine) -> bool {
     affine.iter().flatten().all(|x| x.is_finite()) && volume.is_finite() && volume != 0.0
 }
 
-/// The affine to write for `volume` into the file `place`, and whether it is the volume's own: one whose voxel sizes
+/// The affine to write for `voxels` into the file `place`, and whether it is their own: one whose voxel sizes
 /// are not the grid's would make the file contradict itself and gives way to one that puts the grid's centre at
 /// `grid.center`.
-pub(crate) fn of(volume: &Volume, place: &str) -> (Affine, bool) {
-    match volume.affine {
-        Some(a) if fits(&a, volume.grid.spacing) => return (a, true),
+pub(crate) fn of(voxels: &dyn Voxels, place: &str) -> (Affine, bool) {
+    let grid = voxels.grid();
+    match voxels.affine() {
+        Some(a) if fits(&a, grid.spacing) => return (a, true),
         Some(_) => tracing::warn!(
             "{place}: the affine's voxel sizes are not the grid's {:?} mm: it is replaced by one from the grid",
-            volume.grid.spacing
+            grid.spacing
         ),
         None => {}
     }
-    (centred(&volume.grid), false)
+    (centred(&grid), false)
 }
 
 /// Whether the affine's columns are as long as the voxels, to the precision of files.

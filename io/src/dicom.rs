@@ -61,7 +61,7 @@ pub(crate) fn read(folder: &Path) -> Result<Volume> {
 }
 
 /// The regular files of `folder` by name.
-fn files(folder: &Path) -> Result<Vec<PathBuf>> {
+pub(crate) fn files(folder: &Path) -> Result<Vec<PathBuf>> {
     let io = |e| Error::io(folder, e);
     let mut all = Vec::new();
     for entry in std::fs::read_dir(folder).map_err(io)? {

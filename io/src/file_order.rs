@@ -1,13 +1,23 @@
-//! The order in which NIfTI and MetaImage store voxels: x fastest. The program's arrays run z fastest.
+//! The order in which files store voxels: x fastest in NIfTI and MetaImage, z fastest in NumPy's files and in the
+//! program's arrays.
 
 use crate::affine::Affine;
 use crate::input::Input;
+use crate::number;
 use conefield_core::geometry::VoxelGrid;
+use conefield_core::parts::Voxels;
 use conefield_core::scan::Volume;
 use conefield_core::{Error, Result};
-use ndarray::{Array3, ShapeBuilder};
+use ndarray::{Array3, ArrayViewMut3, ShapeBuilder};
 use std::io::Write;
 use std::path::Path;
+
+/// Which axis runs fastest in a file.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(crate) enum FileOrder {
+    XFastest,
+    ZFastest,
+}
 
 /// A volume of `values` as NIfTI and MetaImage store them, x fastest; one that is not finite is refused.
 pub(crate) fn read(input: &Input, grid: VoxelGrid, affine: Affine, values: Vec<f32>) -> Result<Volume> {
@@ -21,16 +31,44 @@ pub(crate) fn read(input: &Input, grid: VoxelGrid, affine: Affine, values: Vec<f
     Ok(Volume { data, grid, affine: Some(affine) })
 }
 
-/// Writes `data` to the file `path` as [`read`] reads it, little-endian.
-pub(crate) fn write(w: &mut dyn Write, path: &Path, data: &Array3<f32>) -> Result<()> {
-    let (nx, ny, nz) = data.dim();
-    let mut row = Vec::with_capacity(nx * 4);
-    for z in 0..nz {
-        for y in 0..ny {
-            row.clear();
-            row.extend((0..nx).flat_map(|x| data[[x, y, z]].to_le_bytes()));
-            w.write_all(&row).map_err(|e| Error::io(path, e))?;
+/// Voxels that are in memory at once while a file is written.
+const SLAB: usize = 1 << 22;
+
+/// Bytes of a slab.
+pub const SLAB_BYTES: u64 = 4 * SLAB as u64;
+
+/// Bytes of packed data that the writer of MetaImage keeps in memory; more goes to a file.
+pub const PACKED_BYTES: u64 = 32 << 20;
+
+/// Writes `voxels` to the file `path`, little-endian, slab by slab along the axis that is slowest in the file; one that
+/// is not finite is refused.
+pub(crate) fn write(w: &mut dyn Write, path: &Path, voxels: &mut dyn Voxels, order: FileOrder) -> Result<()> {
+    let shape = voxels.grid().shape;
+    let axis = match order {
+        FileOrder::XFastest => 2,
+        FileOrder::ZFastest => 0,
+    };
+    let layer = shape.iter().product::<usize>() / shape[axis];
+    let thick = (SLAB / layer).clamp(1, shape[axis]);
+    let mut values = vec![0.0; thick * layer];
+    for from in (0..shape[axis]).step_by(thick) {
+        let mut part = shape.map(|n| 0..n);
+        part[axis] = from..(from + thick).min(shape[axis]);
+        let size = part.each_ref().map(|r| r.len());
+        let values = &mut values[..size.iter().product()];
+        let layout = size.set_f(order == FileOrder::XFastest);
+        let slab = ArrayViewMut3::from_shape(layout, values)
+            .map_err(|e| Error::invalid(path.display().to_string(), "shape", e, "a shape that can be addressed"))?;
+        voxels.fill(&part, slab)?;
+        if let Some(i) = values.iter().position(|x| !x.is_finite()) {
+            let at = match order {
+                FileOrder::XFastest => [i % size[0], i / size[0] % size[1], from + i / (size[0] * size[1])],
+                FileOrder::ZFastest => [from + i / (size[1] * size[2]), i / size[2] % size[1], i % size[2]],
+            };
+            let place = path.display().to_string();
+            return Err(Error::invalid(place, format!("voxel {at:?}"), values[i], "a finite number"));
         }
+        number::write(w, values).map_err(|e| Error::io(path, e))?;
     }
     Ok(())
 }

@@ -1,9 +1,10 @@
 //! Every file that conefield reads or writes, each format in one module.
 //!
-//! - Volumes: [`read_volume`], [`write_volume`] (NIfTI, MetaImage, NumPy; a DICOM series in).
+//! - Volumes: [`read_volume`], [`write_volume`], [`write_voxels`] (NIfTI, MetaImage, NumPy; a DICOM series in).
 //! - Scans: [`read_scan`], [`read_truth`], [`write_scan`] (conefield's own folder), [`read_r2`], [`write_r2`]
 //!   (R2-Gaussian's folder), [`read_naf`], [`write_naf`] (NAF's file).
 //! - Projections as scanners give them: [`read_scanner`] (a description in TOML; TIFF, NumPy, RTK's XML geometry).
+//! - Sizes, before memory is taken: [`scan_size`], [`volume_voxels`].
 //! - Weights: [`read_weights`], [`write_weights`]; checkpoints: [`read_checkpoint`], [`write_checkpoint`] (safetensors).
 //! - Pictures: [`slices_png`], [`compare_png`], [`curves_png`].
 //!
@@ -41,6 +42,7 @@ mod rtk;
 mod scan;
 mod scan_folder;
 mod scanner;
+mod size;
 mod slices;
 mod stack;
 mod text;
@@ -57,6 +59,7 @@ pub use check::{LineIntegralCheck, check_line_integrals};
 pub use checkpoint::{read_checkpoint, write_checkpoint};
 pub use counts::{Correction, CountsReport, OpenBeam, line_integrals};
 pub use curves::{Corner, CurveOptions, curves_png, curves_png_with};
+pub use file_order::{PACKED_BYTES, SLAB_BYTES};
 pub use naf::{NafScan, read_naf, write_naf};
 pub use orbit::Orbit;
 pub use r2::{R2Scan, read_r2, write_r2};
@@ -64,6 +67,7 @@ pub use rtk::{read_rtk, write_rtk};
 pub use scan::{read_scan, read_truth};
 pub use scan_folder::write_scan;
 pub use scanner::{I0, ImportOptions, Imported, read_scanner};
-pub use slices::{compare_png, slices_png};
-pub use volume::{is_volume, read_volume, write_volume};
+pub use size::{ScanSize, scan_size, volume_voxels};
+pub use slices::{MiddleSlices, compare_png, slices_png};
+pub use volume::{is_volume, read_volume, write_volume, write_voxels};
 pub use weights::{Weights, read_weights, write_weights};

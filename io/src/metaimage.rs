@@ -2,10 +2,12 @@
 //! it (`.mhd` with `.raw` or `.zraw`).
 
 use crate::affine::{self, Affine};
+use crate::file_order::{self, FileOrder, PACKED_BYTES};
+use crate::folder;
 use crate::input::Input;
 use crate::number::{Number, Order};
-use crate::{file_order, folder};
 use conefield_core::geometry::{VoxelGrid, norm};
+use conefield_core::parts::Voxels;
 use conefield_core::scan::Volume;
 use conefield_core::{Error, Result};
 use flate2::{Compression, write::ZlibEncoder};
@@ -223,6 +225,11 @@ impl Header {
     }
 }
 
+/// Voxels along x, y and z, from the header.
+pub(crate) fn shape(path: &Path) -> Result<[usize; 3]> {
+    Header::read(&mut Input::open_plain(path)?)?.shape().map(|(shape, _)| shape)
+}
+
 /// A value as errors show it.
 fn shortened(text: &str) -> String {
     match text.char_indices().nth(80) {
@@ -298,26 +305,28 @@ fn skip_header(header: &Header, data: &mut Input, compressed: bool, want: u64) -
     data.skip(skip, "HeaderSize")
 }
 
-/// Writes `volume` as `f32`, compressed, in one file.
-pub(crate) fn write(w: &mut dyn Write, path: &Path, volume: &Volume) -> Result<()> {
+/// Writes `voxels` as `f32`, compressed, in one file.
+pub(crate) fn write(w: &mut dyn Write, path: &Path, voxels: &mut dyn Voxels) -> Result<()> {
     let io = |e| Error::io(path, e);
-    let (ras, _) = affine::of(volume, &path.display().to_string());
+    let grid = voxels.grid();
+    let (ras, _) = affine::of(voxels, &path.display().to_string());
     // The grid's sizes and the lengths of the affine's columns may differ in the last bits: keep the former.
     let lengths = affine::spacing(&ras);
     let spacing: [f64; 3] = std::array::from_fn(|k| {
-        let s = volume.grid.spacing[k];
+        let s = grid.spacing[k];
         if (lengths[k] - s).abs() <= 1e-12 * s { s } else { lengths[k] }
     });
     let lps = affine::flip(ras);
     let turn = (0..3).flat_map(|k| affine::column(&lps, k).map(|x| x / spacing[k]));
     // The size of the packed data stands before it: pack it aside, in memory while it is small.
     let folder = path.parent().filter(|p| !p.as_os_str().is_empty()).unwrap_or(Path::new("."));
-    let mut packed = ZlibEncoder::new(tempfile::spooled_tempfile_in(64 << 20, folder), Compression::fast());
-    file_order::write(&mut packed, path, &volume.data)?;
+    let mut packed =
+        ZlibEncoder::new(tempfile::spooled_tempfile_in(PACKED_BYTES as usize, folder), Compression::fast());
+    file_order::write(&mut packed, path, voxels, FileOrder::XFastest)?;
     let mut packed = packed.finish().map_err(io)?;
     let size = packed.stream_position().map_err(io)?;
     packed.rewind().map_err(io)?;
-    let [nx, ny, nz] = volume.grid.shape;
+    let [nx, ny, nz] = grid.shape;
     let text = format!(
         "ObjectType = Image\nNDims = 3\nBinaryData = True\nBinaryDataByteOrderMSB = False\nCompressedData = True\n\
          CompressedDataSize = {size}\nTransformMatrix = {}\nOffset = {}\nCenterOfRotation = 0 0 0\n\

@@ -4,10 +4,11 @@
 //! us allocate, and the header is written here, because that lets the writer go through [`crate::write_atomic`].
 
 use crate::affine::{self, Affine};
-use crate::file_order;
+use crate::file_order::{self, FileOrder};
 use crate::input::Input;
 use crate::number::{Number, Order};
 use conefield_core::geometry::VoxelGrid;
+use conefield_core::parts::Voxels;
 use conefield_core::scan::Volume;
 use conefield_core::{Error, Result};
 use nifti::{Endianness, NiftiHeader};
@@ -38,8 +39,7 @@ pub(crate) fn read_from(input: &mut Input, head: &[u8]) -> Result<Volume> {
             "convert the pair to one .nii or .nii.gz file",
         ));
     }
-    let header = NiftiHeader::from_reader(head)
-        .map_err(|e| input.invalid("header", e, format!("a NIfTI-1 header of {HEADER} bytes")))?;
+    let header = parse(input, head)?;
     if header.sizeof_hdr != HEADER as i32 {
         return Err(input.invalid("sizeof_hdr", header.sizeof_hdr, HEADER.to_string()));
     }
@@ -58,6 +58,16 @@ pub(crate) fn read_from(input: &mut Input, head: &[u8]) -> Result<Volume> {
     input.skip(offset - HEADER as u64, "vox_offset")?;
     let values = input.numbers("data", count, number, order, |x| (slope * x + inter) as f32)?;
     file_order::read(input, grid, affine, values)
+}
+
+fn parse(input: &Input, head: &[u8]) -> Result<NiftiHeader> {
+    NiftiHeader::from_reader(head)
+        .map_err(|e| input.invalid("header", e, format!("a NIfTI-1 header of {HEADER} bytes")))
+}
+
+/// Voxels along x, y and z, from `head`.
+pub(crate) fn shape_of(input: &Input, head: &[u8]) -> Result<[usize; 3]> {
+    shape(input, &parse(input, head)?)
 }
 
 /// Three axes of at least one voxel; later axes may only say 1.
@@ -190,16 +200,16 @@ fn quaternion(header: &NiftiHeader) -> [[f64; 4]; 3] {
     std::array::from_fn(|i| [r[i][0] * s[0], r[i][1] * s[1], r[i][2] * s[2], t[i]])
 }
 
-/// Writes `volume` as `f32` with an sform: its own affine, or one that puts the grid's centre at `grid.center`.
-pub(crate) fn write(w: &mut dyn Write, path: &Path, volume: &Volume) -> Result<()> {
-    let grid = &volume.grid;
+/// Writes `voxels` as `f32` with an sform: their own affine, or one that puts the grid's centre at `grid.center`.
+pub(crate) fn write(w: &mut dyn Write, path: &Path, voxels: &mut dyn Voxels) -> Result<()> {
+    let grid = voxels.grid();
     let place = path.display().to_string();
     if grid.shape.iter().any(|&n| n > i16::MAX as usize) {
         let expected = "at most 32767 voxels an axis, which is all that NIfTI-1 can say (write .npy)";
         return Err(Error::invalid(place, "shape", format!("{:?}", grid.shape), expected));
     }
     // 1: the scanner's own coordinates; 2: some others.
-    let (affine, own) = affine::of(volume, &place);
+    let (affine, own) = affine::of(voxels, &place);
     let code = if own { 1i16 } else { 2 };
     let mut h = [0u8; DATA as usize];
     let mut put = |at: usize, bytes: &[u8]| h[at..at + bytes.len()].copy_from_slice(bytes);
@@ -225,7 +235,7 @@ pub(crate) fn write(w: &mut dyn Write, path: &Path, volume: &Volume) -> Result<(
     }
     put(344, b"n+1\0");
     w.write_all(&h).map_err(|e| Error::io(path, e))?;
-    file_order::write(w, path, &volume.data)
+    file_order::write(w, path, voxels, FileOrder::XFastest)
 }
 
 #[cfg(test)]

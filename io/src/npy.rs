@@ -1,10 +1,11 @@
 //! NumPy's `.npy`: a header in Python's notation, then the numbers.
 
+use crate::file_order::{self, FileOrder};
 use crate::input::Input;
-use crate::number::{Number, Order};
+use crate::number::{self, Number, Order};
+use conefield_core::parts::Voxels;
 use conefield_core::{Error, Result};
 use ndarray::{Array, ArrayD, Dimension, IxDyn, ShapeBuilder};
-use ndarray_npy::WriteNpyExt;
 use std::io::Write;
 use std::path::Path;
 
@@ -62,12 +63,37 @@ pub(crate) fn read_one_of(input: &mut Input, start: Vec<u8>, sets: &[&[&str]]) -
     Ok(array)
 }
 
-/// Writes `array` as little-endian `f32`.
+/// Writes `array` as little-endian `f32` in C order.
 pub(crate) fn write<D: Dimension>(w: &mut dyn Write, path: &Path, array: &Array<f32, D>) -> Result<()> {
-    array.write_npy(w).map_err(|e| match e {
-        ndarray_npy::WriteNpyError::Io(e) => Error::io(path, e),
-        e => Error::invalid(path.display().to_string(), "data", e, "an array that NumPy's format can hold"),
-    })
+    let io = |e| Error::io(path, e);
+    w.write_all(&header(array.shape())).map_err(io)?;
+    number::write(w, array.as_standard_layout().as_slice().unwrap_or(&[])).map_err(io)
+}
+
+/// Writes `voxels`, `[x, y, z]`, as [`write`] writes an array.
+pub(crate) fn write_voxels(w: &mut dyn Write, path: &Path, voxels: &mut dyn Voxels) -> Result<()> {
+    w.write_all(&header(&voxels.grid().shape)).map_err(|e| Error::io(path, e))?;
+    file_order::write(w, path, voxels, FileOrder::ZFastest)
+}
+
+/// What stands before little-endian `f32` of this shape in C order: the format's first version, as long as a multiple
+/// of 64 bytes.
+fn header(shape: &[usize]) -> Vec<u8> {
+    let axes: String = match shape {
+        [one] => format!("{one},"),
+        all => all.iter().map(usize::to_string).collect::<Vec<_>>().join(", "),
+    };
+    let mut text = format!("{{'descr': '<f4', 'fortran_order': False, 'shape': ({axes})}}");
+    let before = MAGIC.len() + 4;
+    let whole = (before + text.len() + 1).next_multiple_of(64);
+    text.push_str(&" ".repeat(whole - before - text.len() - 1));
+    text.push('\n');
+    [MAGIC, &[1, 0], &(text.len() as u16).to_le_bytes(), text.as_bytes()].concat()
+}
+
+/// The shape that the header says; reads on as [`read_from`] does.
+pub(crate) fn shape(input: &mut Input, start: Vec<u8>) -> Result<Vec<usize>> {
+    read_header(input, start).map(|h| h.shape)
 }
 
 fn read_header(input: &mut Input, start: Vec<u8>) -> Result<Header> {
@@ -230,6 +256,7 @@ mod tests {
     use super::*;
     use crate::testing::npy_bytes;
     use ndarray::{Array3, array};
+    use ndarray_npy::WriteNpyExt;
 
     fn read_bytes(bytes: &[u8], axes: &[&str]) -> Result<ArrayD<f32>> {
         let dir = tempfile::tempdir().unwrap();
@@ -252,7 +279,18 @@ mod tests {
         let path = dir.path().join("a.npy");
         let a = Array3::from_shape_fn((3, 4, 5), |(x, y, z)| (x * 100 + y * 10 + z) as f32 - 7.5);
         crate::write_atomic(&path, |w| write(w, &path, &a)).unwrap();
-        assert_eq!(read(&path, &["x", "y", "z"]).unwrap(), a.into_dyn());
+        assert_eq!(read(&path, &["x", "y", "z"]).unwrap(), a.clone().into_dyn());
+        // To the byte what a library writes, also of fewer axes; an array in another order is put into C order.
+        let bytes = |write: &dyn Fn(&mut Vec<u8>)| {
+            let mut out = vec![];
+            write(&mut out);
+            out
+        };
+        let turned = a.reversed_axes();
+        let c_order = turned.as_standard_layout();
+        assert!(bytes(&|w| write(w, &path, &turned).unwrap()) == bytes(&|w| c_order.write_npy(w).unwrap()));
+        let line = array![1.0f32, 2.0];
+        assert!(bytes(&|w| write(w, &path, &line).unwrap()) == bytes(&|w| line.write_npy(w).unwrap()));
     }
 
     #[test]

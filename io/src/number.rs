@@ -1,5 +1,7 @@
 //! Numbers as files store them.
 
+use std::io::Write;
+
 /// How one number is stored.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(crate) enum Number {
@@ -59,6 +61,17 @@ impl Number {
             Self::F64 => each!(f64),
         }
     }
+}
+
+/// Writes `values`, little-endian.
+pub(crate) fn write(w: &mut dyn Write, values: &[f32]) -> std::io::Result<()> {
+    let mut raw = Vec::with_capacity(1 << 16);
+    for part in values.chunks(1 << 14) {
+        raw.clear();
+        raw.extend(part.iter().flat_map(|x| x.to_le_bytes()));
+        w.write_all(&raw)?;
+    }
+    Ok(())
 }
 
 #[cfg(test)]

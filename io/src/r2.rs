@@ -9,7 +9,7 @@ use crate::input::read_text;
 use crate::orbit::Orbit;
 use crate::text::{Notation, parse};
 use crate::unit::{self, Reading, Units};
-use crate::{folder, npy, rays, write_atomic, write_folder_atomic, write_text_atomic};
+use crate::{ScanSize, folder, npy, rays, write_atomic, write_folder_atomic, write_text_atomic};
 use conefield_core::error::ensure;
 use conefield_core::geometry::{Geometry, VoxelGrid};
 use conefield_core::scan::{Scan, Unit, Volume};
@@ -124,6 +124,18 @@ fn read(folder: &Path, with_test: bool) -> Result<R2Scan> {
     }
     let volume = data.map(|data| Volume { data, grid: train.geometry.volume, affine: None });
     Ok(R2Scan { train, test, volume })
+}
+
+/// The size of the folder's training views. While it is read, a list of values that grows may hold as many again, and
+/// the volume is looked at.
+pub(crate) fn size(folder: &Path) -> Result<ScanSize> {
+    let file = folder.join(META);
+    let meta: Meta = parse(&file, &read_text(&file)?, Notation::Json)?;
+    let product = |all: &[usize]| all.iter().fold(1u64, |n, &s| n.saturating_mul(s as u64));
+    let pixels = product(&meta.scanner.nDetector).saturating_mul(meta.proj_train.len() as u64);
+    let voxels = product(&meta.scanner.nVoxel);
+    let volume = if meta.vol.is_some() { voxels } else { 0 };
+    Ok(ScanSize { pixels, voxels, reading: 4 * pixels.max(volume) })
 }
 
 /// What the numbers of a folder that does not name its unit can mean.

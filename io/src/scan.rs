@@ -6,7 +6,7 @@ use conefield_core::{Error, Result};
 use std::path::{Path, PathBuf};
 
 /// A scan on disk.
-enum Found {
+pub(crate) enum Found {
     /// conefield's own folder, with its description.
     Own(PathBuf),
     /// R2-Gaussian's folder.
@@ -35,7 +35,7 @@ pub fn read_truth(path: impl AsRef<Path>) -> Result<Option<Volume>> {
     }
 }
 
-fn find(path: &Path) -> Result<Found> {
+pub(crate) fn find(path: &Path) -> Result<Found> {
     let place = path.display().to_string();
     let understood = "a folder with scan.toml or scan.json (conefield) or with meta_data.json (R2-Gaussian), \
                       or a pickle (NAF)";

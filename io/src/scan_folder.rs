@@ -25,7 +25,7 @@ use crate::folder;
 use crate::input::read_text;
 use crate::orbit::Orbit;
 use crate::text::{Notation, parse};
-use crate::{npy, read_volume, write_atomic, write_folder_atomic, write_text_atomic, write_volume};
+use crate::{ScanSize, npy, read_volume, write_atomic, write_folder_atomic, write_text_atomic, write_volume};
 use conefield_core::error::ensure;
 use conefield_core::geometry::{Geometry, View, VoxelGrid};
 use conefield_core::scan::{Scan, Unit, Volume};
@@ -174,6 +174,16 @@ pub(crate) fn read(file: &Path) -> Result<Scan> {
     let scan = Scan { geometry, projections, unit: d.unit, provenance };
     scan.validate(&place)?;
     Ok(scan)
+}
+
+/// The size of the scan that `file` describes.
+pub(crate) fn size(file: &Path) -> Result<ScanSize> {
+    let place = file.display().to_string();
+    let mut d = describe(file)?;
+    d.volume.validate(&place)?;
+    let pixels = [views(&place, &mut d)?.len(), d.detector.rows, d.detector.columns];
+    let pixels = pixels.iter().fold(1u64, |n, &s| n.saturating_mul(s as u64));
+    Ok(ScanSize { pixels, voxels: d.volume.len().unwrap_or(0) as u64, reading: 0 })
 }
 
 /// Reads the volume that the scan of `file` was simulated from.

@@ -1,10 +1,12 @@
 //! Pictures of volumes: middle slices side by side, with differences.
 
 use crate::canvas::{Align, Canvas, diverging, grey, number};
+use conefield_core::geometry::VoxelGrid;
+use conefield_core::parts::Part;
 use conefield_core::scan::Volume;
 use conefield_core::{Error, Result};
 use image::Rgb;
-use ndarray::{Array2, Axis};
+use ndarray::{Array2, ArrayView3, Axis, s};
 use std::path::Path;
 
 const INK: Rgb<u8> = Rgb([20; 3]);
@@ -12,6 +14,49 @@ const PAPER: Rgb<u8> = Rgb([255; 3]);
 /// Width that small volumes are enlarged to, and that large ones are not to pass, in pixels of slices.
 const WIDTH: [f64; 2] = [1000.0, 4000.0];
 const GAP: u32 = 8;
+
+/// The three middle slices of a volume, which is all of it that pictures show.
+#[derive(Debug, Clone)]
+pub struct MiddleSlices {
+    grid: VoxelGrid,
+    /// Across x, y and z; the remaining axes in their order.
+    across: [Array2<f32>; 3],
+}
+
+impl MiddleSlices {
+    /// Slices of zeros, for [`MiddleSlices::gather`].
+    pub fn new(grid: VoxelGrid) -> Self {
+        let [x, y, z] = grid.shape;
+        Self { grid, across: [[y, z], [x, z], [x, y]].map(Array2::zeros) }
+    }
+
+    /// The slices of a whole volume.
+    pub fn of(volume: &Volume) -> Self {
+        let mut slices = Self::new(volume.grid);
+        slices.gather(&volume.grid.shape.map(|n| 0..n), volume.data.view());
+        slices
+    }
+
+    /// Takes over what the voxels of `part` have of the slices.
+    pub fn gather(&mut self, part: &Part, values: ArrayView3<'_, f32>) {
+        for (k, slice) in self.across.iter_mut().enumerate() {
+            let middle = self.grid.shape[k] / 2;
+            if part[k].contains(&middle) {
+                let [a, b] = [[1, 2], [0, 2], [0, 1]][k].map(|axis: usize| part[axis].clone());
+                slice.slice_mut(s![a, b]).assign(&values.index_axis(Axis(k), middle - part[k].start));
+            }
+        }
+    }
+
+    /// From black to white: the values shown but for the outermost thousandth on either side.
+    pub fn window(&self) -> [f32; 2] {
+        let mut all: Vec<f32> = self.across.iter().flatten().copied().filter(|x| x.is_finite()).collect();
+        all.sort_unstable_by(f32::total_cmp);
+        let at = |share: f64| all.get((all.len() as f64 * share) as usize).or(all.last()).copied().unwrap_or(0.0);
+        let (low, high) = (at(0.001), at(0.999));
+        if low < high { [low, high] } else { [low, low + low.abs().max(1.0)] }
+    }
+}
 
 /// A middle slice, named after the axis it cuts.
 #[derive(Clone, Copy)]
@@ -30,9 +75,9 @@ const SAGITTAL: Plane = Plane { name: "sagittal", axes: "y → z ↑", cut: 0, s
 /// One picture of the table.
 enum Cell<'a> {
     Empty,
-    Values(&'a Volume),
+    Values(&'a MiddleSlices),
     /// Result and reference.
-    Difference(&'a Volume, &'a Volume),
+    Difference(&'a MiddleSlices, &'a MiddleSlices),
 }
 
 struct Row<'a> {
@@ -49,7 +94,7 @@ struct Row<'a> {
 /// panel, blue below and red above, on a scale that is the same for all and stands in the picture.
 pub fn slices_png(
     path: impl AsRef<Path>,
-    panels: &[(&str, &Volume)],
+    panels: &[(&str, &MiddleSlices)],
     window: [f32; 2],
     difference_to: Option<usize>,
 ) -> Result<()> {
@@ -82,8 +127,8 @@ pub fn slices_png(
 /// and under each the result minus the reference.
 pub fn compare_png(
     path: impl AsRef<Path>,
-    reference: (&str, &Volume),
-    results: &[(&str, &Volume)],
+    reference: (&str, &MiddleSlices),
+    results: &[(&str, &MiddleSlices)],
     window: [f32; 2],
 ) -> Result<()> {
     let captions: Vec<String> = [reference].iter().chain(results).map(|(n, _)| n.to_string()).collect();
@@ -171,13 +216,9 @@ fn most(all: impl Iterator<Item = f64>) -> f64 {
 fn check(place: &str, cell: &Cell) -> Result<()> {
     let Some(v) = cell.volume() else { return Ok(()) };
     v.grid.validate(place)?;
-    if v.data.shape() != v.grid.shape {
-        let (found, expected) = (format!("{:?}", v.data.shape()), format!("{:?}", v.grid.shape));
-        return Err(Error::invalid(place, "shape of the data", found, expected));
-    }
     match cell {
-        Cell::Difference(v, r) if v.data.shape() != r.data.shape() => {
-            let (found, expected) = (format!("{:?}", v.data.shape()), format!("{:?}", r.data.shape()));
+        Cell::Difference(v, r) if v.grid.shape != r.grid.shape => {
+            let (found, expected) = (format!("{:?}", v.grid.shape), format!("{:?}", r.grid.shape));
             Err(Error::invalid(place, "shape of a result", found, format!("{expected}, the reference's")))
         }
         _ => Ok(()),
@@ -185,7 +226,7 @@ fn check(place: &str, cell: &Cell) -> Result<()> {
 }
 
 impl Cell<'_> {
-    fn volume(&self) -> Option<&Volume> {
+    fn volume(&self) -> Option<&MiddleSlices> {
         match self {
             Cell::Empty => None,
             Cell::Values(v) | Cell::Difference(v, _) => Some(v),
@@ -201,11 +242,6 @@ impl Row<'_> {
     }
 }
 
-/// The middle slice, `[right, up]`.
-fn slice(v: &Volume, plane: Plane) -> Array2<f32> {
-    v.data.index_axis(Axis(plane.cut), v.grid.shape[plane.cut] / 2).to_owned()
-}
-
 /// A round number that all but half a percent of the shown differences stay within; `None` without differences.
 fn difference_spread(rows: &[Row]) -> Option<f32> {
     let mut all: Vec<f32> = Vec::new();
@@ -214,7 +250,7 @@ fn difference_spread(rows: &[Row]) -> Option<f32> {
         for cell in &row.cells {
             if let Cell::Difference(v, r) = cell {
                 any = true;
-                let d = slice(v, row.plane) - slice(r, row.plane);
+                let d = &v.across[row.plane.cut] - &r.across[row.plane.cut];
                 all.extend(d.iter().map(|x| x.abs()).filter(|x| x.is_finite()));
             }
         }
@@ -246,9 +282,10 @@ fn draw_cell(
 ) {
     let Some(v) = cell.volume() else { return };
     let plane = row.plane;
+    // `[right, up]`
     let (values, difference) = match cell {
-        Cell::Difference(v, r) => (slice(v, plane) - slice(r, plane), true),
-        _ => (slice(v, plane), false),
+        Cell::Difference(v, r) => (&v.across[plane.cut] - &r.across[plane.cut], true),
+        _ => (v.across[plane.cut].clone(), false),
     };
     let size = plane.seen.map(|k| (v.grid.size()[k] * scale).round().max(1.0) as u32);
     let (w, h) = (size[0].min(width), size[1].min(height));
@@ -288,7 +325,7 @@ mod tests {
     use crate::testing::data;
     use ndarray::Array3;
 
-    fn ball(shape: [usize; 3], spacing: [f64; 3], blur: f64) -> Volume {
+    fn ball(shape: [usize; 3], spacing: [f64; 3], blur: f64) -> MiddleSlices {
         let mut v = Volume::centered(Array3::zeros((shape[0], shape[1], shape[2])), spacing);
         let grid = v.grid;
         for ((x, y, z), value) in v.data.indexed_iter_mut() {
@@ -298,7 +335,7 @@ mod tests {
             let soft = |d: f64, at: f64| 1.0 / (1.0 + ((d - at) / blur).exp());
             *value = (0.5 * soft(r, 20.0) + 0.4 * soft(off, 5.0)) as f32;
         }
-        v
+        MiddleSlices::of(&v)
     }
 
     /// Where pictures go to be looked at, if CONEFIELD_PICTURES names a folder.
@@ -344,10 +381,24 @@ mod tests {
         let Some(path) = data("clinical/abdomen_ct_hu.nii.gz") else { return };
         let (_dir, folder) = folder();
         let v = crate::read_volume(path).unwrap();
-        let noisy = v.clone().mapped(|x| x * 0.95 + 20.0);
+        let noisy = MiddleSlices::of(&v.clone().mapped(|x| x * 0.95 + 20.0));
+        let v = MiddleSlices::of(&v);
         slices_png(folder.join("abdomen.png"), &[("CT (HU)", &v), ("changed", &noisy)], [-200.0, 300.0], Some(0))
             .unwrap();
         slices_png(folder.join("abdomen_one.png"), &[("CT (HU)", &v)], [-200.0, 300.0], None).unwrap();
+    }
+
+    #[test]
+    fn slices_gathered_part_by_part_are_those_of_the_whole() {
+        let values = Array3::from_shape_fn((3, 4, 5), |(x, y, z)| (100 * x + 10 * y + z) as f32);
+        let v = Volume::centered(values, [1.0; 3]);
+        let whole = MiddleSlices::of(&v);
+        let mut gathered = MiddleSlices::new(v.grid);
+        for (x, z) in [(0..2, 0..3), (0..2, 3..5), (2..3, 0..3), (2..3, 3..5)] {
+            gathered.gather(&[x.clone(), 0..4, z.clone()], v.data.slice(s![x, .., z]));
+        }
+        assert_eq!(gathered.across, whole.across);
+        assert_eq!(whole.across[1][[2, 4]], 224.0);
     }
 
     #[test]
@@ -364,7 +415,8 @@ mod tests {
         refused(slices_png(&path, &[("a", &a)], [0.0, 1.0], Some(1)), "difference_to");
         refused(slices_png(&path, &[("a", &a), ("b", &b)], [0.0, 1.0], Some(0)), "shape of a result");
         // One flat voxel, and no difference at all, are no trouble.
-        let dot = Volume::centered(Array3::zeros((1, 1, 1)), [1.0; 3]);
+        let dot = MiddleSlices::of(&Volume::centered(Array3::zeros((1, 1, 1)), [1.0; 3]));
+        assert_eq!(dot.window(), [0.0, 1.0]);
         slices_png(&path, &[("a", &dot), ("b", &dot)], [0.0, 1.0], Some(0)).unwrap();
     }
 }

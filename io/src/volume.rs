@@ -3,6 +3,7 @@
 use crate::input::Input;
 use crate::{dicom, metaimage, nifti, npy, write_atomic};
 use conefield_core::geometry::VoxelGrid;
+use conefield_core::parts::Voxels;
 use conefield_core::scan::Volume;
 use conefield_core::{Error, Result};
 use flate2::{Compression, GzBuilder};
@@ -18,13 +19,35 @@ use std::path::Path;
 /// NIfTI's header and DICOM's rescale slope and intercept say; one that is not finite is refused.
 pub fn read_volume(path: impl AsRef<Path>) -> Result<Volume> {
     let path = path.as_ref();
+    match open(path)? {
+        Opened::Series => dicom::read(path),
+        Opened::Npy(mut input, head) => from_numpy(path, npy::read_from(&mut input, head, &["x", "y", "z"])?),
+        Opened::MetaImage => metaimage::read(path),
+        Opened::Nifti(mut input, head) => nifti::read_from(&mut input, &head),
+    }
+}
+
+/// A volume's format, with the file where it stands and what was read of it to tell.
+pub(crate) enum Opened {
+    /// A folder.
+    Series,
+    /// Eight bytes are read.
+    Npy(Input, Vec<u8>),
+    /// It is opened anew.
+    MetaImage,
+    /// The header is read.
+    Nifti(Input, Vec<u8>),
+}
+
+/// Tells the format of a volume by what it holds.
+pub(crate) fn open(path: &Path) -> Result<Opened> {
     if path.is_dir() {
-        return dicom::read(path);
+        return Ok(Opened::Series);
     }
     let mut input = Input::open(path)?;
     let mut head = input.take(8)?;
     if head.starts_with(npy::MAGIC) {
-        return from_numpy(path, npy::read_from(&mut input, head, &["x", "y", "z"])?);
+        return Ok(Opened::Npy(input, head));
     }
     head.extend(input.take(nifti::HEADER - head.len())?);
     if nifti::is_second_version(&head) {
@@ -40,7 +63,7 @@ pub fn read_volume(path: impl AsRef<Path>) -> Result<Volume> {
             let what = format!("{}: a MetaImage inside gzip", path.display());
             return Err(Error::unsupported(what, "unpack it first; MetaImage has a compression of its own"));
         }
-        return metaimage::read(path);
+        return Ok(Opened::MetaImage);
     }
     if !nifti::is_header(&head) {
         let mark = head.get(344..348).map_or_else(
@@ -56,7 +79,7 @@ pub fn read_volume(path: impl AsRef<Path>) -> Result<Volume> {
         };
         return Err(input.invalid("format", mark, hint));
     }
-    nifti::read_from(&mut input, &head)
+    Ok(Opened::Nifti(input, head))
 }
 
 /// Whether the file, or the folder with DICOM files in it, looks like a volume; its data is not read. True of a single
@@ -78,29 +101,30 @@ pub fn is_volume(path: impl AsRef<Path>) -> bool {
 /// same axes as directions and voxel sizes) or `.npy` (`f32`, C order, without voxel sizes).
 ///
 /// An affine is kept if its voxel sizes are the grid's; without one, the grid's centre comes to lie at `grid.center`.
-pub fn write_volume(path: impl AsRef<Path>, volume: &Volume) -> Result<()> {
+pub fn write_volume(path: impl AsRef<Path>, mut volume: &Volume) -> Result<()> {
     let path = path.as_ref();
-    let place = path.display().to_string();
-    let format = format_of(path)
-        .ok_or_else(|| Error::invalid(&place, "file name", file_name(path), "an end of .nii, .nii.gz, .mha or .npy"))?;
-    volume.grid.validate(&place)?;
     if volume.data.shape() != volume.grid.shape {
         let (found, expected) = (format!("{:?}", volume.data.shape()), format!("{:?}", volume.grid.shape));
-        return Err(Error::invalid(place, "shape of the data", found, expected));
+        return Err(Error::invalid(path.display().to_string(), "shape of the data", found, expected));
     }
-    if let Some((at, x)) = volume.data.indexed_iter().find(|(_, x)| !x.is_finite()) {
-        let field = format!("voxel [{}, {}, {}]", at.0, at.1, at.2);
-        return Err(Error::invalid(place, field, x, "a finite number"));
-    }
+    write_voxels(path, &mut volume)
+}
+
+/// Writes voxels as [`write_volume`] does, slab by slab: no more than 16 MiB of them (or one layer) are in memory at
+/// once, and for `.mha` 32 MiB of what they are packed to; the rest of that waits in a file without a name beside it.
+pub fn write_voxels(path: impl AsRef<Path>, voxels: &mut dyn Voxels) -> Result<()> {
+    let path = path.as_ref();
+    let format = wanted(path)?;
+    voxels.grid().validate(&path.display().to_string())?;
     write_atomic(path, |w| match format {
-        Format::Nifti => nifti::write(w, path, volume),
+        Format::Nifti => nifti::write(w, path, voxels),
         Format::NiftiGz => {
             let mut packed = GzBuilder::new().write(w, Compression::fast());
-            nifti::write(&mut packed, path, volume)?;
+            nifti::write(&mut packed, path, voxels)?;
             packed.finish().and_then(|w| w.flush()).map_err(|e| Error::io(path, e))
         }
-        Format::Npy => npy::write(w, path, &volume.data),
-        Format::MetaImage => metaimage::write(w, path, volume),
+        Format::Npy => npy::write_voxels(w, path, voxels),
+        Format::MetaImage => metaimage::write(w, path, voxels),
     })
 }
 
@@ -112,6 +136,12 @@ pub(crate) fn from_numpy(path: &Path, array: ndarray::ArrayD<f32>) -> Result<Vol
     let s = data.shape();
     let grid = VoxelGrid { shape: [s[0], s[1], s[2]], spacing: [1.0; 3], center: [0.0; 3] };
     Ok(Volume { data, grid, affine: None })
+}
+
+/// The format that a name asks for; one that asks for none is refused.
+fn wanted(path: &Path) -> Result<Format> {
+    let (place, expected) = (path.display().to_string(), "an end of .nii, .nii.gz, .mha or .npy");
+    format_of(path).ok_or_else(|| Error::invalid(place, "file name", file_name(path), expected))
 }
 
 enum Format {
@@ -143,6 +173,7 @@ fn format_of(path: &Path) -> Option<Format> {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use conefield_core::parts::Part;
 
     #[test]
     fn numpy_volumes_come_back() {
@@ -153,6 +184,48 @@ mod tests {
         let back = read_volume(&path).unwrap();
         assert_eq!((back.data, back.grid.spacing, back.affine), (v.data, [1.0; 3], None));
         assert!(is_volume(&path) && !is_volume(dir.path()));
+    }
+
+    /// Values made where they are asked for, of more voxels than a slab has.
+    struct Ramp {
+        largest: usize,
+        parts: usize,
+    }
+
+    fn ramp(at: [usize; 3]) -> f32 {
+        (at[0] + 200 * at[1] + 40_000 * at[2]) as f32
+    }
+
+    impl Voxels for Ramp {
+        fn grid(&self) -> VoxelGrid {
+            VoxelGrid { shape: [200, 190, 180], spacing: [1.0; 3], center: [0.0; 3] }
+        }
+        fn affine(&self) -> Option<conefield_core::scan::Affine> {
+            None
+        }
+        fn fill(&mut self, part: &Part, mut out: ndarray::ArrayViewMut3<'_, f32>) -> Result<()> {
+            for ((x, y, z), value) in out.indexed_iter_mut() {
+                *value = ramp([part[0].start + x, part[1].start + y, part[2].start + z]);
+            }
+            (self.largest, self.parts) = (self.largest.max(out.len()), self.parts + 1);
+            Ok(())
+        }
+    }
+
+    #[test]
+    fn every_format_is_written_slab_by_slab_to_the_bytes_of_the_whole() {
+        let dir = tempfile::tempdir().unwrap();
+        let whole = Volume::collect(&mut Ramp { largest: 0, parts: 0 }).unwrap();
+        assert_eq!(whole.data[[199, 189, 179]], ramp([199, 189, 179]));
+        for end in ["nii", "nii.gz", "mha", "npy"] {
+            let [streamed, at_once] = ["streamed", "at_once"].map(|n| dir.path().join(format!("{n}.{end}")));
+            let mut voxels = Ramp { largest: 0, parts: 0 };
+            write_voxels(&streamed, &mut voxels).unwrap();
+            assert!(voxels.parts > 1 && voxels.largest <= 1 << 22, "{end}");
+            assert!(read_volume(&streamed).unwrap().data == whole.data, "{end}");
+            write_volume(&at_once, &whole).unwrap();
+            assert!(std::fs::read(&streamed).unwrap() == std::fs::read(&at_once).unwrap(), "{end}");
+        }
     }
 
     #[test]

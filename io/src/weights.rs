@@ -3,7 +3,7 @@
 //! Reading goes through the `safetensors` crate. Writing is done here: it streams, and it puts the metadata in a
 //! fixed order, so that the same weights give the same bytes.
 
-use crate::write_atomic;
+use crate::{number, write_atomic};
 use conefield_core::{Error, Result};
 use safetensors::{Dtype, SafeTensors};
 use serde_json::{Map, Value, json};
@@ -62,13 +62,7 @@ pub fn write_weights(
         let io = |e| Error::io(path, e);
         w.write_all(&(text.len() as u64).to_le_bytes()).map_err(io)?;
         w.write_all(text.as_bytes()).map_err(io)?;
-        let mut raw = Vec::with_capacity(1 << 16);
-        for part in tensors.iter().flat_map(|(.., values)| values.chunks(1 << 14)) {
-            raw.clear();
-            raw.extend(part.iter().flat_map(|x| x.to_le_bytes()));
-            w.write_all(&raw).map_err(io)?;
-        }
-        Ok(())
+        tensors.iter().try_for_each(|(.., values)| number::write(w, values)).map_err(io)
     })
 }
 

@@ -10,12 +10,11 @@ use conefield_core::checkpoint::{Checkpoint, Resume, Standing};
 use conefield_core::error::{Error, Result, ensure};
 use conefield_core::pipeline::{Model, Pipeline};
 use conefield_core::random::stream;
-use conefield_core::scan::{Scan, Volume};
 use conefield_core::scene::Scene;
-use conefield_core::solver::{Job, Limits, Observer, PretrainJob, Record, Solution, Solver};
+use conefield_core::solver::{Job, Limits, Observer, PretrainJob, Reconstruction, Record, Solution, Solver};
 use conefield_core::spec::SolverSpec;
 use conefield_core::stage::{Projector, UnitRay};
-use ndarray::Array3;
+use conefield_core::trained::TrainedField;
 use rand::RngExt;
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
@@ -166,8 +165,6 @@ impl SolverSpec for Gradient {
 const WATCH: usize = 4;
 /// Rays of held-out views that are rendered for a record, at most.
 const HELD_OUT_RAYS: usize = 8192;
-/// Points that are exported at once.
-const SLAB_POINTS: usize = 1 << 20;
 
 impl Solver for Gradient {
     fn solve(&self, job: &Job<'_>, observer: &mut dyn Observer) -> Result<Solution> {
@@ -261,20 +258,18 @@ impl Solver for Gradient {
             observer.progress(step, share, clock.seconds() * (1.0 - share).max(0.0) / share.max(1e-9));
         }
         clock.pause();
-        let start = Instant::now();
-        let volume = export(&scene, &model, exe.as_mut(), job.scan)?;
-        Ok(Solution {
-            volume,
-            model: Some(model),
-            steps: step,
-            train_s: clock.seconds(),
-            export_s: start.elapsed().as_secs_f64(),
-            samples,
-        })
+        drop(source);
+        let field = TrainedField { model, scene, unit_mm: job.scan.unit.mm };
+        Ok(Solution { result: Reconstruction::Field(field), steps: step, train_s: clock.seconds(), samples })
     }
 
     fn pretrain(&self, job: &PretrainJob<'_>, observer: &mut dyn Observer) -> Result<Model> {
         crate::pretrain::pretrain(self, job, observer)
+    }
+
+    /// The list of the pixels that are trained on, at most all of them.
+    fn working_memory(&self, pixels: u64, _: u64) -> u64 {
+        size_of::<u32>() as u64 * pixels
     }
 
     fn describe(&self) -> String {
@@ -410,7 +405,7 @@ impl Watch {
                 }
             }
         }
-        Self { points, reference, scale: unit_scale(scene, job.scan), peak: job.peak, rays, top }
+        Self { points, reference, scale: (scene.attenuation * job.scan.unit.mm) as f32, peak: job.peak, rays, top }
     }
 
     fn fill(&self, mut record: Record, model: &Model, exe: &mut dyn Executable) -> Result<Record> {
@@ -431,34 +426,4 @@ impl Watch {
         }
         Ok(record)
     }
-}
-
-fn unit_scale(scene: &Scene, scan: &Scan) -> f32 {
-    (scene.attenuation * scan.unit.mm) as f32
-}
-
-/// The field at every voxel, in the scan's unit, slab by slab.
-fn export(scene: &Scene, model: &Model, exe: &mut dyn Executable, scan: &Scan) -> Result<Volume> {
-    let shape = scene.grid.shape;
-    let scale = unit_scale(scene, scan);
-    let mut data = Array3::zeros(shape);
-    let slab = (SLAB_POINTS / (shape[1] * shape[2])).max(1);
-    let mut points = vec![];
-    for from in (0..shape[0]).step_by(slab) {
-        let to = (from + slab).min(shape[0]);
-        points.clear();
-        for x in from..to {
-            for y in 0..shape[1] {
-                points.extend((0..shape[2]).map(|z| scene.voxel([x, y, z])));
-            }
-        }
-        let mut part = data.slice_mut(ndarray::s![from..to, .., ..]);
-        let Some(out) = part.as_slice_mut() else { unreachable!("a slab of a new array is contiguous") };
-        exe.evaluate(model, &points, out)?;
-        out.iter_mut().for_each(|m| *m *= scale);
-        if let Some(i) = out.iter().position(|m| !m.is_finite()) {
-            return Err(Error::Diverged { step: 0, what: format!("voxel {i} of the export is not finite") });
-        }
-    }
-    Ok(Volume { data, grid: scene.grid, affine: None })
 }

@@ -3,7 +3,7 @@
 
 mod common;
 
-use common::{scan, solve};
+use common::{scan, solve, volume};
 use conefield_core::arena::Weights;
 use serde_json::{Value, json};
 
@@ -68,12 +68,12 @@ fn learns(name: &str, spec: &Value) -> usize {
     let (first, last) = (records.first().unwrap().loss, records.last().unwrap().loss);
     assert_eq!((records.len(), solution.steps), (6, 30), "{name}");
     assert!(last < 0.5 * first, "{name}: the loss went from {first} to {last}");
-    assert!(solution.volume.data.iter().all(|x| x.is_finite()), "{name}");
+    assert!(volume(&solution).data.iter().all(|x| x.is_finite()), "{name}");
     // A mask in the chain was decided on the way.
     let masks = spec["normalizers"].as_array().unwrap().iter().filter(|n| n["type"] == "fft-mask").count();
     let events: Vec<_> = records.iter().flat_map(|r| &r.events).collect();
     assert_eq!(events.len(), masks, "{name}: {events:?}");
-    solution.model.unwrap().pipeline.field.info().input
+    solution.result.field().unwrap().model.pipeline.field.info().input
 }
 
 #[test]

@@ -3,7 +3,7 @@
 
 mod common;
 
-use common::{Heard, scan, solve, spec, truth};
+use common::{Heard, model, scan, solve, spec, truth, volume};
 use conefield_backend_cpu::Cpu;
 use conefield_backend_cpu::rows::Kernels;
 use conefield_backend_cpu::step::Slots;
@@ -14,6 +14,7 @@ use conefield_core::random::{mix, unit};
 use conefield_core::scan::{Scan, Volume};
 use conefield_core::scene::Scene;
 use conefield_core::solver::{Limits, PretrainJob, Solution};
+use conefield_core::trained::TrainedField;
 use serde_json::{Value, json};
 
 fn settings() -> Value {
@@ -178,9 +179,10 @@ fn the_number_of_threads_does_not_change_a_bit() {
         let pool = rayon::ThreadPoolBuilder::new().num_threads(threads).build().unwrap();
         let (solution, records) = pool.install(|| solve(s, &scan, &Weights::default())).unwrap();
         assert_eq!(solution.steps, 10);
-        let arena = solution.model.unwrap().arena;
+        let volume = volume(&solution);
+        let arena = &solution.result.field().unwrap().model.arena;
         let losses: Vec<u64> = records.iter().flat_map(|r| [r.loss, r.prior.unwrap()]).map(f64::to_bits).collect();
-        let volume = bits(solution.volume.data.as_slice().unwrap());
+        let volume = bits(volume.data.as_slice().unwrap());
         ([bits(&arena.params), bits(&arena.first), bits(&arena.second), volume], losses)
     };
     let one = run(1, &s);
@@ -189,6 +191,50 @@ fn the_number_of_threads_does_not_change_a_bit() {
     // Negative control: bits that a hardly changed run does change.
     s["solver"]["lr"] = json!(0.020001);
     assert!(one != run(1, &s));
+}
+
+// ---- export ----
+
+#[test]
+fn a_field_evaluated_part_by_part_is_the_same_to_the_bit() {
+    let (solution, _) = solve(&settings(), &scan(), &Weights::default()).unwrap();
+    let whole = volume(&solution);
+    let mut voxels = solution.result.voxels(&Cpu::new()).unwrap();
+    for part in [[0..16, 0..16, 3..4], [0..1, 5..16, 0..16], [7..12, 2..3, 1..16], [15..16, 15..16, 15..16]] {
+        let mut found = ndarray::Array3::zeros(part.each_ref().map(|r| r.len()));
+        voxels.fill(&part, found.view_mut()).unwrap();
+        let [x, y, z] = part.clone();
+        let want = whole.data.slice(ndarray::s![x, y, z]);
+        assert!(found.iter().zip(&want).all(|(a, b)| a.to_bits() == b.to_bits()), "{part:?}");
+    }
+}
+
+/// Weights with their placement make the same field again, with channels that a mask removed, and one on finer voxels
+/// goes through the same places.
+#[test]
+fn a_field_comes_back_from_its_weights() {
+    let mut s = settings();
+    let width = s["encoder"]["levels"].as_u64().unwrap() * s["encoder"]["features"].as_u64().unwrap_or(2);
+    let kept: Vec<u64> = (0..width - 1).collect();
+    s["normalizers"] = json!([{"type": "fft-mask", "keep": kept}, {"type": "layer-norm"}]);
+    let (solution, _) = solve(&s, &scan(), &Weights::default()).unwrap();
+    let field = solution.result.field().unwrap();
+    assert_eq!(field.placement().masks.len(), 1);
+    let weights = Weights::from_arena(field.model.pipeline.layout(), &field.model.arena.params, |_| true);
+    let placement = serde_json::from_str(&serde_json::to_string(&field.placement()).unwrap()).unwrap();
+    let again = TrainedField::restore(&spec(&s).unwrap(), &placement, |model| {
+        weights.load("test", model.pipeline.layout(), &mut model.arena.params, |_| true).map(drop)
+    })
+    .unwrap();
+    let whole = volume(&solution);
+    let values = |n: usize| {
+        let grid = again.scene.grid.with_longest(n);
+        Volume::collect(&mut again.voxels(&Cpu::new(), grid).unwrap()).unwrap()
+    };
+    assert_eq!(bits(values(16).data.as_slice().unwrap()), bits(whole.data.as_slice().unwrap()));
+    // The middle one of three voxels has the centre of the one that they replace.
+    let fine = values(48);
+    assert!((fine.data[[22, 22, 22]] - whole.data[[7, 7, 7]]).abs() < 1e-5 * whole.data[[7, 7, 7]].abs().max(1e-3));
 }
 
 // ---- units ----
@@ -205,7 +251,7 @@ fn psnr(volume: &Volume, scale: f64) -> f64 {
 fn units_do_not_change_the_volume() {
     let s = settings();
     let base = scan();
-    let run = |scan: &Scan| solve(&s, scan, &Weights::default()).unwrap().0.volume;
+    let run = |scan: &Scan| volume(&solve(&s, scan, &Weights::default()).unwrap().0);
     let expected = psnr(&run(&base), 1.0);
     assert!(expected > 10.0, "the run itself makes a volume: {expected} dB");
     for (lengths, unit_mm, attenuation) in [
@@ -236,9 +282,9 @@ fn units_do_not_change_the_volume() {
     let mut fixed = settings();
     fixed["scene"] = json!({"attenuation": {"fixed": 0.02}});
     let mut other = base.clone();
-    let expected = psnr(&solve(&fixed, &base, &Weights::default()).unwrap().0.volume, 1.0);
+    let expected = psnr(&volume(&solve(&fixed, &base, &Weights::default()).unwrap().0), 1.0);
     other.projections.mapv_inplace(|a| a * 2.0);
-    let found = psnr(&solve(&fixed, &other, &Weights::default()).unwrap().0.volume, 0.5);
+    let found = psnr(&volume(&solve(&fixed, &other, &Weights::default()).unwrap().0), 0.5);
     assert!((found - expected).abs() > 1e-3, "{found} dB and {expected} dB");
 }
 
@@ -278,9 +324,9 @@ fn weights_behind_the_encoder_go_to_another_scan() {
         let (solution, records) = solve(&s, &scan(), &weights)?;
         Ok((solution, records.iter().map(|r| r.loss).collect()))
     };
-    let fresh = run(&s, 0).unwrap().0.model.unwrap();
+    let fresh = model(run(&s, 0).unwrap().0);
     s["initializer"] = json!({"type": "mci", "weights": "other.safetensors"});
-    let loaded = run(&s, 0).unwrap().0.model.unwrap();
+    let loaded = model(run(&s, 0).unwrap().0);
     let ((fresh_encoder, fresh_rest), (encoder, rest)) = (parts(&fresh), parts(&loaded));
     let (trained_encoder, trained_rest) = parts(&trained);
     assert!(encoder == fresh_encoder && encoder != trained_encoder, "the encoder starts afresh");
@@ -288,7 +334,7 @@ fn weights_behind_the_encoder_go_to_another_scan() {
 
     let (after, losses) = run(&s, 30).unwrap();
     assert!(losses.last().unwrap() < &(0.8 * losses[0]), "{losses:?}");
-    let (encoder, rest) = parts(&after.model.unwrap());
+    let (encoder, rest) = parts(&model(after));
     assert!(encoder != fresh_encoder && rest != trained_rest, "all of it trains on");
 
     for (field, value) in [("width", json!(16)), ("depth", json!(4))] {
@@ -300,7 +346,7 @@ fn weights_behind_the_encoder_go_to_another_scan() {
     // Another encoder with as many channels is no obstacle.
     let mut other = s.clone();
     other["encoder"] = json!({"type": "dense-grid", "levels": 3, "base_resolution": 4});
-    let other = run(&other, 0).unwrap().0.model.unwrap();
+    let other = model(run(&other, 0).unwrap().0);
     assert!(parts(&other).1 == trained_rest);
 }
 
@@ -316,7 +362,7 @@ fn masked_channels_leave_the_work() {
     s["normalizers"] = json!([mask, {"type": "layer-norm"}]);
     let whole = Pipeline::build(&spec(&s).unwrap()).unwrap();
     let (solution, records) = solve(&s, &scan(), &Weights::default()).unwrap();
-    let model = solution.model.unwrap();
+    let model = model(solution);
     let p = &model.pipeline;
     let events: Vec<&String> = records.iter().flat_map(|r| &r.events).collect();
     assert_eq!(events.len(), 1, "{events:?}");

@@ -66,18 +66,18 @@ impl Backend for Cpu {
         }
         let kernels = Kernels::new(pipeline, |s| Some(s.kernel()))
             .ok_or_else(|| Error::unsupported("cpu backend", "a stage offers no kernel"))?;
-        let slots = Slots::<f32>::new(&kernels);
         let explain = Explain {
             backend: format!("cpu, {}, {} threads", simd::level_name(), rayon::current_num_threads()),
             notes,
-            scratch_bytes: slots.bytes(),
+            scratch_bytes: Slots::bytes(&kernels),
         };
-        Ok((Box::new(CpuExecutable { slots, clean: false }), explain))
+        Ok((Box::new(CpuExecutable { slots: None, clean: false }), explain))
     }
 }
 
 struct CpuExecutable {
-    slots: Slots<f32>,
+    /// Made by the first step: evaluation needs none.
+    slots: Option<Slots<f32>>,
     /// The arena's gradients are known to be zero.
     clean: bool,
 }
@@ -93,7 +93,7 @@ impl Executable for CpuExecutable {
             model.arena.grads.fill(0.0);
         }
         self.clean = false;
-        Ok(self.slots.step(
+        Ok(self.slots.get_or_insert_with(|| Slots::new(&kernels)).step(
             &kernels,
             model.pipeline.projector.as_ref(),
             &model.arena.params,

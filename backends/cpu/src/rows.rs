@@ -77,6 +77,22 @@ impl<'a, R: Real> Kernels<'a, R> {
         self.encoder_width() + self.steps[1..].iter().map(|s| s.info.output + s.info.tape).sum::<usize>()
     }
 
+    /// Numbers a row that [`Encoded`] holds.
+    pub fn encoded_numbers(&self) -> usize {
+        3 + self.steps[0].info.output + self.steps[0].info.tape
+    }
+
+    /// Numbers a row that all [`Log`]s but the encoder's hold.
+    pub fn logged_numbers(&self) -> usize {
+        let scattered = self.steps[1..].iter().filter(|s| s.info.grads == GradKind::Scatter);
+        scattered.map(|s| s.info.input + s.info.output).sum()
+    }
+
+    /// Numbers a row that [`Scratch`] holds.
+    pub fn scratch_numbers(&self) -> usize {
+        self.row_numbers() + 1
+    }
+
     fn widest(&self) -> usize {
         self.steps.iter().map(|s| s.info.output).max().unwrap_or(1).max(3)
     }
@@ -171,11 +187,6 @@ impl<R: Real> Encoded<R> {
         &self.log.data[3 * self.rows()..]
     }
 
-    /// Bytes held.
-    pub fn bytes(&self) -> usize {
-        (self.log.data.capacity() + self.tape.capacity()) * size_of::<R>()
-    }
-
     fn rows(&self) -> usize {
         self.log.rows.first().copied().unwrap_or(0)
     }
@@ -213,12 +224,6 @@ impl<R: Real> Scratch<R> {
     /// The field at every row of the last [`Scratch::forward`].
     pub fn outputs(&self) -> &[R] {
         &self.outputs
-    }
-
-    /// Bytes held.
-    pub fn bytes(&self) -> usize {
-        (self.data.capacity() + self.outputs.capacity() + self.back[0].capacity() + self.back[1].capacity())
-            * size_of::<R>()
     }
 
     /// Runs every stage behind the encoder over tiles of `tiles` rows, the first of which is row `first` of
@@ -339,11 +344,20 @@ impl<R: Real> DenseGrads<R> {
         let mut places = vec![];
         let mut end = 0;
         for s in &kernels.steps {
-            let n = if s.info.grads == GradKind::Dense { s.info.params } else { 0 };
+            let n = Self::of_step(s);
             places.push(end..end + n);
             end += n;
         }
         Self { values: vec![R::ZERO; end], places }
+    }
+
+    /// How many there are for `kernels`.
+    pub fn numbers(kernels: &Kernels<'_, R>) -> usize {
+        kernels.steps.iter().map(Self::of_step).sum()
+    }
+
+    fn of_step(s: &Step<'_, R>) -> usize {
+        if s.info.grads == GradKind::Dense { s.info.params } else { 0 }
     }
 
     /// The gradients of step `k`.

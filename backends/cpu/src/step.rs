@@ -15,6 +15,8 @@ const WAVE_ROWS: usize = 65_536;
 const GROUP_ROWS: usize = 512;
 /// Groups of a wave are dealt to this many slots at most, each with its own sums.
 const SLOTS: usize = 16;
+/// Bytes of a row's sample: position, weight, and the place of its ray.
+const SAMPLE_BYTES: usize = 4 * size_of::<f32>();
 /// Bytes that all slots' copies of dense gradients may take together.
 const DENSE_BYTES: usize = 128 << 20;
 
@@ -56,16 +58,22 @@ impl<R: Real> Slots<R> {
     /// Slots for `kernels`. Their number depends on the plan alone, since it decides the order of sums.
     pub fn new(kernels: &Kernels<'_, R>) -> Self {
         let dense = DenseGrads::new(kernels);
-        let count = (DENSE_BYTES / (dense.len() * size_of::<R>()).max(1)).clamp(1, SLOTS);
+        let count = Self::count(dense.len());
         let slot = || Slot { dense: dense.clone(), logs: vec![Log::default(); kernels.steps.len()], ..Slot::default() };
         Self { slots: std::iter::repeat_with(slot).take(count).collect() }
     }
 
-    /// Bytes held now.
-    pub fn bytes(&self) -> usize {
-        let logs = |s: &Slot<R>| s.logs.iter().map(|l| l.data.capacity() * size_of::<R>()).sum::<usize>();
-        let own = |s: &Slot<R>| s.encoded.bytes() + s.scratch.bytes() + s.dense.len() * size_of::<R>();
-        self.slots.iter().map(|s| own(s) + logs(s)).sum()
+    /// How many, for `dense` numbers of dense gradients.
+    fn count(dense: usize) -> usize {
+        (DENSE_BYTES / (dense * size_of::<R>()).max(1)).clamp(1, SLOTS)
+    }
+
+    /// Bytes that slots for `kernels` come to hold once steps are under way.
+    pub fn bytes(kernels: &Kernels<'_, R>) -> usize {
+        let dense = DenseGrads::numbers(kernels);
+        let wave = kernels.encoded_numbers() + kernels.logged_numbers();
+        let numbers = WAVE_ROWS * wave + Self::count(dense) * (dense + GROUP_ROWS * kernels.scratch_numbers());
+        numbers * size_of::<R>() + WAVE_ROWS * SAMPLE_BYTES
     }
 
     /// Adds the gradients of `work`'s loss to `grads`.

@@ -1,5 +1,6 @@
 //! `conefield convert`
 
+use crate::memory::Memory;
 use crate::parse::{self, Values};
 use crate::{files, out};
 use clap::{Args, ValueEnum};
@@ -45,9 +46,15 @@ impl Convert {
         std::fs::metadata(&self.input).map_err(|e| Error::io(&self.input, e))?;
         refuse_existing(&self.output, self.force)?;
         if conefield_io::is_volume(&self.input) {
+            let voxels = conefield_io::volume_voxels(&self.input)?;
+            Memory::of_volumes(&[voxels]).check(|_| vec![])?;
             let volume = self.values.apply(conefield_io::read_volume(&self.input)?)?;
             conefield_io::write_volume(&self.output, &volume)?;
         } else {
+            let size = conefield_io::scan_size(&self.input)?;
+            let scan = Memory { scan: 4 * size.pixels + size.reading, ..Memory::default() };
+            let truth = Memory { scan: 4 * size.pixels, volume: 8 * size.voxels, ..Memory::default() };
+            Memory::most(&[scan, truth]).check(|_| vec![])?;
             let scan = files::scan(&self.input)?;
             let truth = conefield_io::read_truth(&self.input)?;
             match self.to {

@@ -10,11 +10,13 @@ use conefield_backend_cpu::Cpu;
 use conefield_core::scan::{Scan, Volume};
 use conefield_core::solver::{Job, Limits};
 use conefield_core::{Error, Result};
+use conefield_io::MiddleSlices;
 use conefield_metrics::Scores;
 use conefield_projectors::simulate::{Noise, Protocol, phantom, simulate};
 use serde::Serialize;
 use serde_json::json;
 use std::path::PathBuf;
+use std::time::Instant;
 use tracing::info;
 
 /// Simulate a small scan, reconstruct it in two ways and compare.
@@ -93,9 +95,11 @@ impl Demo {
             conefield_io::write_volume(folder.join(file), &entry.volume)?;
         }
         let captions = entries.each_ref().map(|e| format!("{} {:.2} dB", e.name, e.scores.psnr));
-        let results = [(&captions[0][..], &entries[0].volume), (&captions[1][..], &entries[1].volume)];
+        let slices = entries.each_ref().map(|e| MiddleSlices::of(&e.volume));
+        let results = [(&captions[0][..], &slices[0]), (&captions[1][..], &slices[1])];
         let picture = folder.join("compare.png");
-        conefield_io::compare_png(&picture, ("phantom", &truth), &results, files::window(&truth))?;
+        let truth = MiddleSlices::of(&truth);
+        conefield_io::compare_png(&picture, ("phantom", &truth), &results, truth.window())?;
         if self.json {
             return out::json(&json!({ "folder": folder, "picture": picture, "results": entries }));
         }
@@ -118,21 +122,24 @@ impl Demo {
     fn compete(&self, name: &'static str, sets: &[String], scan: &Scan, truth: &Volume) -> Result<Entry> {
         let loaded = specs::read("fast", sets)?;
         let solver = loaded.spec.solver.build()?;
+        let backend = Cpu::new();
         let job = Job {
             scan,
             held_out: None,
             reference: None,
             peak: 1.0,
             spec: &loaded.spec,
-            backend: &Cpu::new(),
+            backend: &backend,
             seed: self.seed,
             limits: Limits { steps: None, seconds: Some(self.budget) },
             weights: &|path| files::read_weights(path),
             resume: None,
         };
         let solution = solver.solve(&job, &mut Progress::new(name, None))?;
-        let scores = score(name, &solution.volume, truth, 1.0)?;
-        let (steps, train_s, export_s) = (solution.steps, solution.train_s, solution.export_s);
-        Ok(Entry { name, steps, train_s, export_s, scores, volume: solution.volume })
+        let start = Instant::now();
+        let volume = solution.result.volume(&backend)?;
+        let export_s = start.elapsed().as_secs_f64();
+        let scores = score(name, &volume, truth, 1.0)?;
+        Ok(Entry { name, steps: solution.steps, train_s: solution.train_s, export_s, scores, volume })
     }
 }

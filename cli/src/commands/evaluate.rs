@@ -1,9 +1,11 @@
 //! `conefield evaluate`
 
+use crate::memory::Memory;
 use crate::{files, out, parse};
 use clap::Args;
 use conefield_core::scan::Volume;
 use conefield_core::{Error, Result};
+use conefield_io::MiddleSlices;
 use conefield_metrics::Scores;
 use std::path::PathBuf;
 
@@ -30,12 +32,15 @@ pub struct Evaluate {
 
 impl Evaluate {
     pub fn run(self) -> Result<()> {
+        let voxels = [&self.volume, &self.reference].map(conefield_io::volume_voxels);
+        let [volume, reference] = voxels;
+        Memory::of_volumes(&[volume?, reference?]).check(|_| vec![])?;
         let volume = conefield_io::read_volume(&self.volume)?;
         let reference = conefield_io::read_volume(&self.reference)?;
         let place = self.volume.display().to_string();
         let scores = score(&place, &volume, &reference, self.peak)?;
         if let Some(png) = &self.png {
-            files::picture(png, Some(&reference), &volume)?;
+            files::picture(png, Some(&MiddleSlices::of(&reference)), &MiddleSlices::of(&volume))?;
         }
         if self.json { out::json(&scores) } else { out::say(&lines(&scores)) }
     }

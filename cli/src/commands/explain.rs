@@ -1,18 +1,17 @@
 //! `conefield explain`
 
 use super::BackendChoice;
-use crate::memory::Memory;
+use crate::memory::{Memory, Run};
 use crate::{files, out, specs};
 use clap::Args;
 use conefield_core::backend::Explain as Compiled;
 use conefield_core::pipeline::Pipeline;
-use conefield_core::scan::Scan;
 use conefield_core::scene::Scene;
 use conefield_core::spec::load::Loaded;
 use conefield_core::stage::{GradKind, Stage};
 use conefield_core::{Error, Result};
 use serde::Serialize;
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 
 /// Show what a spec builds: stages, widths, parameters, memory, work.
 #[derive(Args)]
@@ -121,7 +120,7 @@ impl Explain {
         let pipeline = specs::build(&loaded)?;
         let (_, compiled) = self.backend.open().compile(&pipeline)?;
         let scan = match &self.scan {
-            Some(path) => Some(for_scan(&loaded, &pipeline, &files::scan(path)?, &compiled)?),
+            Some(path) => Some(for_scan(&loaded, &pipeline, path, &compiled)?),
             None => None,
         };
         let report = report(&loaded, &pipeline, compiled, scan)?;
@@ -165,9 +164,22 @@ fn report(loaded: &Loaded, pipeline: &Pipeline, backend: Compiled, scan: Option<
     })
 }
 
-fn for_scan(loaded: &Loaded, pipeline: &Pipeline, scan: &Scan, compiled: &Compiled) -> Result<ForScan> {
+fn for_scan(loaded: &Loaded, pipeline: &Pipeline, path: &Path, compiled: &Compiled) -> Result<ForScan> {
+    let size = conefield_io::scan_size(path)?;
+    let solver = loaded.spec.solver.build().map_err(|e| loaded.locate(e))?;
+    let run = Run {
+        scan: size,
+        split: false,
+        reference: false,
+        field: true,
+        parameters: pipeline.layout().len() as u64,
+        backend: compiled.scratch_bytes as u64,
+        solver: solver.working_memory(size.pixels, size.voxels),
+        resume: false,
+    };
+    let scan = files::scan(path)?;
     let g = &scan.geometry;
-    let scene = Scene::new(scan, &loaded.spec.scene).map_err(|e| loaded.locate(e))?;
+    let scene = Scene::new(&scan, &loaded.spec.scene).map_err(|e| loaded.locate(e))?;
     let middle = scene.pixel_ray(g, 0, g.detector[0] / 2, g.detector[1] / 2);
     Ok(ForScan {
         views: g.views.len(),
@@ -175,7 +187,7 @@ fn for_scan(loaded: &Loaded, pipeline: &Pipeline, scan: &Scan, compiled: &Compil
         volume: g.volume.shape,
         attenuation_scale: scene.attenuation * scan.unit.mm,
         samples_per_ray: pipeline.projector.max_samples(&middle),
-        memory: Memory::of(pipeline, scan, compiled, false),
+        memory: run.memory(),
     })
 }
 

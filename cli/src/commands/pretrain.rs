@@ -1,6 +1,7 @@
 //! `conefield pretrain`
 
 use super::{BackendChoice, Ends, reconstruct::notes};
+use crate::memory::Memory;
 use crate::parse::{self, Values};
 use crate::progress::Progress;
 use crate::{files, out, signals, specs};
@@ -46,13 +47,30 @@ pub struct Pretrain {
 }
 
 impl Pretrain {
+    /// Refuses what does not fit: every volume has parameters and moments of its own.
+    fn memory(&self, parameters: u64, backend: u64) -> Result<()> {
+        let voxels: Vec<u64> = self.volumes.iter().map(|v| files::voxels(v)).collect::<Result<_>>()?;
+        let need = |voxels: &[u64]| {
+            let half = 8 * parameters * voxels.len() as u64;
+            let volume = 4 * voxels.iter().sum::<u64>();
+            let training = Memory { volume, model: half, optimizer: half, buffers: backend, ..Memory::default() };
+            Memory::most(&[Memory::of_volumes(voxels), training])
+        };
+        need(&voxels).check(|available| {
+            let fewer = (1..voxels.len()).rev().find(|n| need(&voxels[..*n]).total <= available);
+            fewer.map(|n| format!("the first {n} of the {} volumes", voxels.len())).into_iter().collect()
+        })
+    }
+
     pub fn run(self) -> Result<()> {
         let loaded = specs::read(&self.spec, &self.sets)?;
         let solver = loaded.spec.solver.build().map_err(|e| loaded.locate(e))?;
-        specs::build(&loaded)?;
+        let backend = self.backend.open();
+        let pipeline = specs::build(&loaded)?;
+        let (_, compiled) = backend.compile(&pipeline)?;
+        self.memory(pipeline.layout().len() as u64, compiled.scratch_bytes as u64)?;
         let read = |name: &String| self.values.apply(files::volume(name)?);
         let volumes: Vec<Volume> = self.volumes.iter().map(read).collect::<Result<_>>()?;
-        let backend = self.backend.open();
         let job = PretrainJob {
             volumes: &volumes,
             spec: &loaded.spec,

@@ -1,19 +1,21 @@
 //! `conefield reconstruct`
 
 use super::{BackendChoice, Ends, backends::simd_level, evaluate};
-use crate::memory::Memory;
+use crate::memory::{self, Memory};
+use crate::outgoing::{self, Written};
 use crate::parse::{self, HoldOut};
 use crate::progress::{Keeper, Progress};
 use crate::run::RunFolder;
 use crate::{files, out, signals, specs};
 use clap::Args;
-use conefield_core::arena::Weights;
 use conefield_core::backend::Explain;
 use conefield_core::checkpoint::Resume;
+use conefield_core::pipeline::Pipeline;
 use conefield_core::scan::{Scan, Volume};
-use conefield_core::solver::{Job, Solution};
+use conefield_core::solver::{Job, Solution, Solver};
 use conefield_core::spec::load::{Loaded, to_toml};
 use conefield_core::{Error, Result};
+use conefield_io::MiddleSlices;
 use conefield_metrics::Scores;
 use serde::Serialize;
 use std::collections::BTreeMap;
@@ -87,7 +89,8 @@ struct Record {
     backend: Explain,
     simd: String,
     threads: usize,
-    memory: Option<Memory>,
+    memory: Memory,
+    peak_bytes: Option<u64>,
     parameters: usize,
     steps: u64,
     train_s: f64,
@@ -121,17 +124,15 @@ impl Reconstruct {
         let backend = self.backend.open();
         let pipeline = loaded.spec.encoder.as_ref().map(|_| specs::build(&loaded)).transpose()?;
         let compiled = pipeline.as_ref().map(|p| backend.compile(p)).transpose()?.map(|c| c.1).unwrap_or_default();
+        let memory = self.memory(&loaded, solver.as_ref(), pipeline.as_ref(), &compiled)?;
+        info!("memory: {}", memory.line());
         let whole = files::scan(&self.scan)?;
         let reference = self.reference.as_ref().map(|path| read_reference(path, &self.scan, &whole)).transpose()?;
         let held = self.hold_out.as_ref().map(|h| h.views(whole.geometry.views.len())).unwrap_or_default();
-        let memory = pipeline.as_ref().map(|p| Memory::of(p, &whole, &compiled, reference.is_some()));
         let fingerprint = checksum(&whole);
-        let (scan, held_scan) = if held.is_empty() { (whole, None) } else { split(&whole, &held)? };
+        let (scan, held_scan) = if held.is_empty() { (whole, None) } else { split(whole, &held)? };
         let identity = self.identity(&loaded, &held, &fingerprint)?;
         let (folder, metrics, resume) = self.open(&loaded, &identity)?;
-        if let Some(m) = &memory {
-            info!("memory: {}", m.line());
-        }
         signals::listen()?;
         let mut progress = Progress::new("reconstruct", Some(metrics)).keeping(Some(Keeper {
             path: folder.file("checkpoint.safetensors"),
@@ -151,21 +152,24 @@ impl Reconstruct {
             weights: &|path| files::read_weights(path),
             resume: resume.as_ref(),
         };
-        let mut solution = solver.solve(&job, &mut progress).map_err(|e| loaded.locate(e))?;
-        solution.volume.affine = solution.volume.affine.or(reference.as_ref().and_then(|r| r.affine));
+        let solution = solver.solve(&job, &mut progress).map_err(|e| loaded.locate(e))?;
         let last = progress.records().last().cloned();
         drop(progress);
 
         let place = folder.file("volume.nii.gz");
-        conefield_io::write_volume(&place, &solution.volume)?;
-        if let Some(model) = &solution.model {
-            let mut weights = Weights::from_arena(model.pipeline.layout(), &model.arena.params, |_| true);
-            weights.notes = notes(&loaded, self.seed)?;
-            files::write_weights(folder.file("weights.safetensors"), &weights)?;
+        let field = solution.result.field();
+        if let Some(field) = field {
+            files::write_field(folder.file("weights.safetensors"), field, notes(&loaded, self.seed)?)?;
         }
-        files::picture(folder.file("slices.png"), reference.as_ref(), &solution.volume)?;
-        let score = |r| evaluate::score(&place.display().to_string(), &solution.volume, r, self.peak);
-        let scores = reference.as_ref().map(score).transpose()?;
+        let start = Instant::now();
+        let mut voxels = solution.result.voxels(backend.as_ref())?;
+        let affine = reference.as_ref().and_then(|r| r.affine);
+        let Written { slices, whole } = outgoing::write(&place, voxels.as_mut(), affine, reference.is_some())?;
+        let export_s = start.elapsed().as_secs_f64();
+        let middle = reference.as_ref().map(MiddleSlices::of);
+        files::picture(folder.file("slices.png"), middle.as_ref(), &slices)?;
+        let score = |(volume, r)| evaluate::score(&place.display().to_string(), volume, r, self.peak);
+        let scores = whole.as_ref().zip(reference.as_ref()).map(score).transpose()?;
         let record = Record {
             version: env!("CARGO_PKG_VERSION"),
             spec: loaded.spec.name.clone(),
@@ -185,10 +189,11 @@ impl Reconstruct {
             simd: simd_level(),
             threads: rayon::current_num_threads(),
             memory,
-            parameters: solution.model.as_ref().map_or(0, |m| m.pipeline.layout().len()),
+            peak_bytes: memory::peak(),
+            parameters: field.map_or(0, |f| f.model.pipeline.layout().len()),
             steps: solution.steps,
             train_s: solution.train_s,
-            export_s: solution.export_s,
+            export_s,
             samples: solution.samples,
             samples_per_s: if solution.train_s > 0.0 { solution.samples as f64 / solution.train_s } else { 0.0 },
             loss: last.as_ref().map(|r| r.loss),
@@ -199,6 +204,37 @@ impl Reconstruct {
         conefield_io::write_text_atomic(folder.file("record.json"), &out::to_json(&record)?)?;
         folder.finish()?;
         if self.json { out::json(&record) } else { out::say(&summary(&record, &solution, &self.output)) }
+    }
+
+    /// What the run takes; one that does not fit is refused.
+    fn memory(
+        &self,
+        loaded: &Loaded,
+        solver: &dyn Solver,
+        pipeline: Option<&Pipeline>,
+        compiled: &Explain,
+    ) -> Result<Memory> {
+        let scan = conefield_io::scan_size(&self.scan)?;
+        let run = memory::Run {
+            scan,
+            split: self.hold_out.is_some(),
+            reference: self.reference.is_some(),
+            field: pipeline.is_some(),
+            parameters: pipeline.map_or(0, |p| p.layout().len() as u64),
+            backend: compiled.scratch_bytes as u64,
+            solver: solver.working_memory(scan.pixels, scan.voxels),
+            resume: self.resume,
+        };
+        let sets = self.all_sets();
+        let tables = loaded.tree["encoder"]["log2_table_size"].as_u64().unwrap_or(0);
+        let smaller = (10..tables as u32).rev().filter_map(|bits| {
+            let set = format!("encoder.log2_table_size={bits}");
+            let loaded = specs::read(&self.spec, &[&sets[..], &[set]].concat()).ok()?;
+            Some((bits, specs::build(&loaded).ok()?.layout().len() as u64))
+        });
+        let memory = run.memory();
+        memory.check(|available| run.smaller(available, smaller))?;
+        Ok(memory)
     }
 
     /// What must be the same for a run to be resumed.
@@ -255,7 +291,7 @@ fn read_reference(path: &Path, scan_path: &Path, scan: &Scan) -> Result<Volume> 
     Ok(volume)
 }
 
-fn split(scan: &Scan, held: &[usize]) -> Result<(Scan, Option<Scan>)> {
+fn split(scan: Scan, held: &[usize]) -> Result<(Scan, Option<Scan>)> {
     let (train, held) = scan.split(held)?;
     Ok((train, Some(held)))
 }

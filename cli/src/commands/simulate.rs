@@ -1,6 +1,7 @@
 //! `conefield simulate`
 
 use super::convert::refuse_existing;
+use crate::memory::Memory;
 use crate::parse::{self, Angles as AnglesArg, Values};
 use crate::{files, out};
 use clap::Args;
@@ -62,6 +63,8 @@ pub struct Simulate {
 impl Simulate {
     pub fn run(self) -> Result<()> {
         refuse_existing(&self.output, self.force)?;
+        let before = files::voxels(&self.volume)?;
+        Memory::of_volumes(&[before]).check(|_| vec![])?;
         let mut volume = self.values.apply(files::volume(&self.volume)?)?;
         // A scan's volume stands on the rotation axis.
         volume.grid.center = [0.0; 3];
@@ -70,6 +73,7 @@ impl Simulate {
             volume.grid.center = [0.0; 3];
         }
         let protocol = self.protocol(&volume)?;
+        self.memory(&volume, &protocol)?;
         if let Values::Hu(HuMapping::Mu { .. }) = self.values {
             // From 1/mm to the protocol's unit.
             let per_unit = protocol.unit.mm as f32;
@@ -94,6 +98,25 @@ impl Simulate {
             g.views.len(),
             protocol.noise,
         ))
+    }
+
+    /// Refuses what does not fit: projecting takes a copy of the volume with a rim.
+    fn memory(&self, volume: &Volume, protocol: &Protocol) -> Result<()> {
+        let g = protocol.geometry(&volume.grid)?;
+        let rim = g.volume.shape.iter().map(|&n| n as u64 + 2).product::<u64>();
+        let need = |views: usize, share: u64| {
+            let pixels = (views * g.detector[0] * g.detector[1]) as u64 / share;
+            let volume = 4 * (volume.data.len() as u64 + rim);
+            Memory::most(&[Memory { scan: 4 * pixels, volume, ..Memory::default() }])
+        };
+        need(g.views.len(), 1).check(|available| {
+            let fits = |m: Memory| m.total <= available;
+            let views = (1..=g.views.len()).rev().find(|&n| fits(need(n, 1)));
+            let detector = (1..5).find(|k| fits(need(g.views.len(), 1 << (2 * k))));
+            let views = views.map(|n| format!("{n} views"));
+            let detector = detector.map(|k| format!("a detector of {}x{}", g.detector[0] >> k, g.detector[1] >> k));
+            views.into_iter().chain(detector).collect()
+        })
     }
 
     fn protocol(&self, volume: &Volume) -> Result<Protocol> {

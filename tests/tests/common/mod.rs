@@ -3,8 +3,9 @@
 use conefield_backend_cpu::Cpu;
 use conefield_core::Result;
 use conefield_core::arena::Weights;
+use conefield_core::pipeline::Model;
 use conefield_core::scan::{Scan, Volume};
-use conefield_core::solver::{Job, Limits, Observer, Record, Solution};
+use conefield_core::solver::{Job, Limits, Observer, Reconstruction, Record, Solution};
 use conefield_core::spec::{Spec, load};
 use conefield_projectors::simulate::{Protocol, simulate};
 use ndarray::Array3;
@@ -73,4 +74,19 @@ pub fn solve(value: &Value, scan: &Scan, weights: &Weights) -> Result<(Solution,
     let mut heard = Heard::default();
     let solution = spec.solver.build()?.solve(&job, &mut heard)?;
     Ok((solution, heard.0))
+}
+
+/// The volume of a run.
+#[allow(dead_code)]
+pub fn volume(solution: &Solution) -> Volume {
+    solution.result.volume(&Cpu::new()).unwrap()
+}
+
+/// The trained model of a run.
+#[allow(dead_code)]
+pub fn model(solution: Solution) -> Model {
+    match solution.result {
+        Reconstruction::Field(field) => field.model,
+        Reconstruction::Volume(_) => panic!("this solver trains no model"),
+    }
 }

@@ -1,0 +1,130 @@
+//! Memory: the estimate against what a run takes, refusal before anything is taken, and export beyond it.
+
+mod common;
+use common::{done, json, refused, text};
+use conefield_core::geometry::{Geometry, Millimetres, Radians, View, VoxelGrid};
+use conefield_core::scan::{Scan, Unit};
+use ndarray::Array3;
+use serde_json::Value;
+use std::path::{Path, PathBuf};
+use std::time::Instant;
+
+const MIB: u64 = 1 << 20;
+
+/// A scan of `views` × `side` × `side` pixels, a box's shadow in each.
+fn scan(folder: &Path, views: usize, side: usize) -> PathBuf {
+    let mm = |x: f64| Millimetres(x);
+    let view = |i: usize| {
+        let (angle, pixel) = (Radians(i as f64 / 30.0), mm(200.0 / side as f64));
+        View::circular(angle, mm(500.0), mm(750.0), [pixel; 2], [mm(0.0); 2])
+    };
+    let volume = VoxelGrid { shape: [32; 3], spacing: [3.0; 3], center: [0.0; 3] };
+    let geometry = Geometry { detector: [side; 2], views: (0..views).map(view).collect(), volume };
+    let inside = |i: usize| i > side / 4 && i < 3 * side / 4;
+    let shadow = |(_, r, c)| if inside(r) && inside(c) { 1.5 } else { 0.0 };
+    let projections = Array3::from_shape_fn((views, side, side), shadow);
+    let scan = Scan { geometry, projections, unit: Unit::default(), provenance: Value::Null };
+    let path = folder.join("scan");
+    conefield_io::write_scan(&path, &scan, None).unwrap();
+    path
+}
+
+/// What a run was estimated to take and what it took, in bytes.
+fn measured(scan: &Path, run: &Path, sets: &[&str]) -> [u64; 2] {
+    let (scan, run) = (text(scan), text(run));
+    let mut args = vec!["reconstruct", &scan, "--spec", "fast", "-o", &run, "--json", "--steps", "2"];
+    args.extend(sets.iter().flat_map(|s| ["--set", s]));
+    let record = json(&args);
+    [&record["memory"]["total"], &record["peak_bytes"]].map(|n| n.as_u64().unwrap())
+}
+
+/// The estimate is within 0.8 and 1.35 of the peak where the scan takes most and where the model does.
+#[test]
+#[cfg_attr(not(target_os = "linux"), ignore = "the peak is read from /proc")]
+fn the_estimate_is_near_the_measured_peak() {
+    let dir = tempfile::tempdir().unwrap();
+    let large = scan(dir.path(), 60, 768);
+    let pixels = measured(&large, &dir.path().join("a"), &["solver.pixels=all", "encoder.levels=2"]);
+    let dir = tempfile::tempdir().unwrap();
+    let small = scan(dir.path(), 4, 32);
+    let sets = ["encoder.log2_table_size=21", "encoder.base_resolution=128", "encoder.levels=6"];
+    let tables = measured(&small, &dir.path().join("b"), &sets);
+    for (what, [estimate, peak]) in [("scan", pixels), ("model", tables)] {
+        let ratio = estimate as f64 / peak as f64;
+        println!("{what}: estimate {} MiB, peak {} MiB, ratio {ratio:.2}", estimate / MIB, peak / MIB);
+        assert!(peak > 150 * MIB, "{what}: {peak} bytes say little");
+        assert!((0.8..1.35).contains(&ratio), "{what}: estimate {estimate}, peak {peak}");
+    }
+}
+
+#[test]
+fn what_does_not_fit_is_refused_with_figures_before_anything_is_made() {
+    let dir = tempfile::tempdir().unwrap();
+    let scan = text(&scan(dir.path(), 4, 32));
+    let run = text(&dir.path().join("run"));
+    let tables = "encoder.log2_table_size=22";
+    let args = ["reconstruct", &scan, "--spec", "naf", "--set", tables, "-o", &run, "--memory", "300MiB"];
+    let start = Instant::now();
+    let said = refused(1, &args);
+    for want in
+        ["memory: needs ", "GiB: scan ", "model ", "optimizer ", "buffers ", "--memory allows 300 MiB; tables of 2^"]
+    {
+        assert!(said.contains(want), "{want:?} is not in: {said}");
+    }
+    assert!(!dir.path().join("run").exists());
+    assert!(start.elapsed().as_secs() < 20, "it was refused before work");
+    // What is offered does fit.
+    let bits = said.split("tables of 2^").nth(1).unwrap().split(' ').next().unwrap();
+    let fits = format!("encoder.log2_table_size={bits}");
+    let more = ["--steps", "1", "--set", "encoder.levels=4"];
+    done(
+        &[&["reconstruct", &scan, "--spec", "naf", "--set", &fits, "-o", &run, "--memory", "300MiB"], &more[..]]
+            .concat(),
+    );
+
+    let out = text(&dir.path().join("other"));
+    for args in [
+        &["simulate", "phantom:head:256", "-o", &out][..],
+        &["pretrain", "phantom:head:256", "--spec", "fast", "-o", &out],
+        &["reconstruct", &scan, "--spec", "fast", "-o", &out, "--reference", "truth"],
+        &["convert", &scan, &out],
+        &["export", &run, "-o", &format!("{out}.npy")],
+    ] {
+        let said = refused(1, &[args, &["--memory", "20MiB"]].concat());
+        assert!(said.contains("memory: needs ") && said.contains("--memory allows 20.0 MiB"), "{args:?}: {said}");
+        assert!(!Path::new(&out).exists(), "{args:?}");
+    }
+    // The detector is what is too large here.
+    let args = ["simulate", "phantom:head:16", "-o", &out, "--detector", "2048x2048", "--memory", "100MiB"];
+    let said = refused(1, &args);
+    assert!(said.contains(" views") && said.contains("a detector of 512x512 would fit"), "{said}");
+}
+
+/// A volume is written in less memory than half of it takes.
+#[test]
+#[cfg_attr(not(target_os = "linux"), ignore = "the peak is read from /proc")]
+fn an_export_does_not_hold_its_volume() {
+    let dir = tempfile::tempdir().unwrap();
+    let at = |name: &str| text(&dir.path().join(name));
+    scan(dir.path(), 4, 32);
+    let sets = ["--set", "encoder.levels=2", "--set", "field.width=8", "--set", "field.depth=2", "--steps", "2"];
+    done(
+        &[&["reconstruct", &at("scan"), "--spec", "fast", "-o", &at("run"), "--set", "field.skips=[]"], &sets[..]]
+            .concat(),
+    );
+    let export = |n: &str, name: &str| json(&["export", &at("run"), "-o", &at(name), "--voxels", n, "--json"]);
+    let peak = |made: &Value| made["peak_bytes"].as_u64().unwrap();
+    let (small, large) = (export("32", "small.nii"), export("360", "large.nii"));
+    let volume = 4 * 360u64.pow(3);
+    assert_eq!(large["shape"], serde_json::json!([360, 360, 360]));
+    assert_eq!(dir.path().join("large.nii").metadata().unwrap().len(), volume + 352);
+    let more = peak(&large) - peak(&small);
+    println!("volume {} MiB, {} MiB more than for a small one", volume / MIB, more / MIB);
+    assert!(more < volume / 2, "{more} bytes more for {volume}");
+    assert!(peak(&large) <= large["memory"]["total"].as_u64().unwrap());
+    // At the resolution of the run the voxels are those that the run wrote.
+    let run = conefield_io::read_volume(dir.path().join("run/volume.nii.gz")).unwrap();
+    assert!(conefield_io::read_volume(dir.path().join("small.nii")).unwrap().data == run.data);
+    let said = refused(1, &["export", &at("run"), "-o", &at("large.nii")]);
+    assert!(said.contains("--force"), "{said}");
+}

@@ -1,0 +1,48 @@
+//! Voxels that are had part by part, so that a volume need not be in memory as a whole.
+
+use crate::error::Result;
+use crate::geometry::VoxelGrid;
+use crate::scan::{Affine, Volume};
+use ndarray::{Array3, ArrayViewMut3};
+use std::ops::Range;
+
+/// A box of voxels: a range along each of x, y and z.
+pub type Part = [Range<usize>; 3];
+
+/// A volume in memory, or something that makes its voxels where they are asked for.
+pub trait Voxels {
+    /// Where the voxels are.
+    fn grid(&self) -> VoxelGrid;
+
+    /// Voxel indices to the patient's or file's own coordinates, if known; see [`Volume::affine`].
+    fn affine(&self) -> Option<Affine>;
+
+    /// Puts the values of `part` into `out`, which has its shape.
+    fn fill(&mut self, part: &Part, out: ArrayViewMut3<'_, f32>) -> Result<()>;
+}
+
+impl Voxels for &Volume {
+    fn grid(&self) -> VoxelGrid {
+        self.grid
+    }
+
+    fn affine(&self) -> Option<Affine> {
+        self.affine
+    }
+
+    fn fill(&mut self, part: &Part, mut out: ArrayViewMut3<'_, f32>) -> Result<()> {
+        let [x, y, z] = part.clone();
+        out.assign(&self.data.slice(ndarray::s![x, y, z]));
+        Ok(())
+    }
+}
+
+impl Volume {
+    /// All of `voxels`, in memory.
+    pub fn collect(voxels: &mut dyn Voxels) -> Result<Self> {
+        let grid = voxels.grid();
+        let mut data = Array3::zeros(grid.shape);
+        voxels.fill(&grid.shape.map(|n| 0..n), data.view_mut())?;
+        Ok(Self { data, grid, affine: voxels.affine() })
+    }
+}

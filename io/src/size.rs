@@ -1,0 +1,85 @@
+//! How large scans and volumes are, read from their headers before memory is taken for them.
+
+use crate::scan::{self, Found};
+use crate::volume::{self, Opened};
+use crate::{dicom, metaimage, nifti, npy, r2, scan_folder};
+use conefield_core::{Error, Result};
+use std::path::Path;
+
+/// The size of a scan.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct ScanSize {
+    /// Measured values, of all views. Of a pickle at most so many.
+    pub pixels: u64,
+    /// Voxels to reconstruct. Of a pickle at most so many.
+    pub voxels: u64,
+    /// Bytes that reading takes beside the projections.
+    pub reading: u64,
+}
+
+/// The size of a scan, from what describes it; its projections are not read. A pickle (NAF) tells its sizes only when
+/// it is read: all of the file is taken for 32-bit projections, and for voxels as well.
+pub fn scan_size(path: impl AsRef<Path>) -> Result<ScanSize> {
+    match scan::find(path.as_ref())? {
+        Found::Own(file) => scan_folder::size(&file),
+        Found::R2(folder) => r2::size(&folder),
+        Found::Naf(file) => {
+            let bytes = file_bytes(&file)?;
+            Ok(ScanSize { pixels: bytes / 4, voxels: bytes / 4, reading: bytes })
+        }
+    }
+}
+
+/// Number of voxels of a volume, from its header. Of a DICOM series, whose sizes stand in every slice, as many as its
+/// files have pairs of bytes.
+pub fn volume_voxels(path: impl AsRef<Path>) -> Result<u64> {
+    let path = path.as_ref();
+    let shape = match volume::open(path)? {
+        Opened::Series => {
+            let files = dicom::files(path)?;
+            return files.iter().map(|f| file_bytes(f)).sum::<Result<u64>>().map(|bytes| bytes / 2);
+        }
+        Opened::Npy(mut input, head) => npy::shape(&mut input, head)?,
+        Opened::MetaImage => metaimage::shape(path)?.to_vec(),
+        Opened::Nifti(input, head) => nifti::shape_of(&input, &head)?.to_vec(),
+    };
+    Ok(shape.iter().fold(1, |n, &s| n.saturating_mul(s as u64)))
+}
+
+fn file_bytes(path: &Path) -> Result<u64> {
+    path.metadata().map(|m| m.len()).map_err(|e| Error::io(path, e))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::testing::scan;
+    use conefield_core::scan::Volume;
+    use ndarray::Array3;
+
+    #[test]
+    fn sizes_are_told_without_the_data() {
+        let dir = tempfile::tempdir().unwrap();
+        let at = |name: &str| dir.path().join(name);
+        let v = Volume::centered(Array3::ones((5, 6, 7)), [1.0; 3]);
+        for name in ["a.nii", "a.nii.gz", "a.mha", "a.npy"] {
+            crate::write_volume(at(name), &v).unwrap();
+            assert_eq!(volume_voxels(at(name)).unwrap(), 210, "{name}");
+        }
+        // Only the header is looked at: a file that is cut off behind it has the same size.
+        let whole = std::fs::read(at("a.npy")).unwrap();
+        std::fs::write(at("cut.npy"), &whole[..128]).unwrap();
+        assert_eq!(volume_voxels(at("cut.npy")).unwrap(), 210);
+        assert!(volume_voxels(at("none.npy")).is_err());
+
+        let s = scan();
+        let (pixels, voxels) = (s.projections.len() as u64, s.geometry.volume.len().unwrap() as u64);
+        crate::write_scan(at("own"), &s, None).unwrap();
+        assert_eq!(scan_size(at("own")).unwrap(), ScanSize { pixels, voxels, reading: 0 });
+        crate::write_r2(at("r2"), &s, None, None).unwrap();
+        assert_eq!(scan_size(at("r2")).unwrap(), ScanSize { pixels, voxels, reading: 4 * pixels });
+        crate::write_naf(at("naf.pickle"), &s, None, None).unwrap();
+        let naf = scan_size(at("naf.pickle")).unwrap();
+        assert!(naf.pixels >= pixels && naf.reading >= 4 * pixels, "{naf:?}");
+    }
+}
