@@ -24,6 +24,7 @@ fn main() -> Result<(), Box<dyn Error>> {
         seed: 0,
         limits: Limits { steps: Some(200), seconds: None },
         weights: &|path| Err(conefield_core::Error::unsupported(path, "this example reads no weights")),
+        volumes: &|path| Err(conefield_core::Error::unsupported(path, "this example reads no volumes")),
         resume: None,
     };
     let solution = solver.solve(&job, &mut Silent)?;

@@ -107,7 +107,7 @@ pub fn write_checkpoint(path: &Path, checkpoint: &Checkpoint<'_>, run: &BTreeMap
         .map_err(|e| Error::unsupported("checkpoint", format!("cannot be put into words: {e}")))?;
     let mut text = run.clone();
     text.insert(STANDING.into(), standing);
-    conefield_io::write_checkpoint(path, &checkpoint.tensors(), &text)
+    conefield_io::write_checkpoint(path, &checkpoint.tensors, &text)
 }
 
 /// Reads the checkpoint of the run that `run` describes; another run's is refused.

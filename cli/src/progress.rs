@@ -127,7 +127,10 @@ impl Progress {
         let r = &self.latest;
         let mut line = format!("step {step}");
         if r.step > 0 {
-            line += &format!(", loss {:.3e}, {:.2} M samples/s", r.loss, r.samples_per_s / 1e6);
+            line += &format!(", loss {:.3e}", r.loss);
+        }
+        if let Some(speed) = r.samples_per_s {
+            line += &format!(", {:.2} M samples/s", speed / 1e6);
         }
         if let Some(h) = r.held_out {
             line += &format!(", held out {h:.4}");

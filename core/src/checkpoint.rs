@@ -23,8 +23,8 @@ pub struct Standing {
 
 /// A run between two steps, to be written.
 pub struct Checkpoint<'a> {
-    /// The model with its optimizer's state.
-    pub model: &'a Model,
+    /// Name, shape and values of all that the next step depends on.
+    pub tensors: Vec<(String, &'a [usize], &'a [f32])>,
     /// All else.
     pub standing: Standing,
 }
@@ -32,22 +32,16 @@ pub struct Checkpoint<'a> {
 /// Parts of the arena that go into a checkpoint, under these names; gradients are zero between steps.
 const PARTS: [&str; 3] = ["params", "first", "second"];
 
-fn parts(arena: &Arena) -> [&[f32]; 3] {
-    [&arena.params, &arena.first, &arena.second]
-}
-
-impl Checkpoint<'_> {
-    /// Name, shape and values of every tensor: `params.…`, `first.…` and `second.…` of each block of the layout.
-    pub fn tensors(&self) -> Vec<(String, &[usize], &[f32])> {
-        let blocks = &self.model.pipeline.layout().blocks;
-        let mut all = vec![];
-        for (part, values) in PARTS.into_iter().zip(parts(&self.model.arena)) {
-            for b in blocks {
-                all.push((format!("{part}.{}", b.name), &b.shape[..], &values[b.range.clone()]));
-            }
+/// A model's tensors for a checkpoint: `params.…`, `first.…` and `second.…` of each block of the layout.
+pub fn tensors(model: &Model) -> Vec<(String, &[usize], &[f32])> {
+    let parts: [&[f32]; 3] = [&model.arena.params, &model.arena.first, &model.arena.second];
+    let mut all = vec![];
+    for (part, values) in PARTS.into_iter().zip(parts) {
+        for b in &model.pipeline.layout().blocks {
+            all.push((format!("{part}.{}", b.name), &b.shape[..], &values[b.range.clone()]));
         }
-        all
     }
+    all
 }
 
 /// A checkpoint read back.
@@ -57,7 +51,7 @@ pub struct Resume {
     pub place: String,
     /// All but the arena.
     pub standing: Standing,
-    /// The tensors of [`Checkpoint::tensors`].
+    /// Its [`Checkpoint::tensors`].
     pub weights: Weights,
 }
 

@@ -30,6 +30,8 @@ pub struct Job<'a> {
     pub limits: Limits,
     /// Reads a weights file that the spec names.
     pub weights: &'a dyn Fn(&str) -> Result<crate::arena::Weights>,
+    /// Reads a volume that the spec names, in 1/unit of the scan.
+    pub volumes: &'a dyn Fn(&str) -> Result<Volume>,
     /// Where an earlier run of the same job stood, to go on from.
     pub resume: Option<&'a Resume>,
 }
@@ -50,15 +52,17 @@ pub struct Record {
     pub step: u64,
     /// Seconds of training so far (evaluation and export left out).
     pub seconds: f64,
-    /// Mean loss since the last record.
+    /// Mean loss since the last record; of solvers on voxels, the root mean square of the residual `p − A·x`.
     pub loss: f64,
     /// Mean weighted prior since the last record.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub prior: Option<f64>,
-    /// Learning rate.
-    pub lr: f64,
-    /// Training samples a second since the last record.
-    pub samples_per_s: f64,
+    /// Learning rate, of solvers that have one.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub lr: Option<f64>,
+    /// Training samples a second since the last record, of solvers that take samples.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub samples_per_s: Option<f64>,
     /// Root mean square error of the held-out views' line integrals, over their largest value.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub held_out: Option<f64>,

@@ -112,8 +112,25 @@ pub trait ProjectorSpec: Send + Sync {
 /// Settings of an initializer.
 #[typetag::serde(tag = "type")]
 pub trait InitializerSpec: Send + Sync {
-    /// The stage. `weights` reads a weights file that the settings name.
-    fn build(&self, weights: &dyn Fn(&str) -> Result<Weights>) -> Result<Box<dyn Initializer>>;
+    /// The stage that fills weights. `weights` reads a weights file that the settings name.
+    fn build(&self, weights: &dyn Fn(&str) -> Result<Weights>) -> Result<Box<dyn Initializer>> {
+        let _ = weights;
+        Err(Error::unsupported(format!("initializer {:?}", self.typetag_name()), "it brings a volume, not weights"))
+    }
+
+    /// The volume that it brings instead of weights.
+    fn volume(&self) -> Result<Option<VolumeStart>> {
+        Ok(None)
+    }
+}
+
+/// A known volume to start from.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct VolumeStart {
+    /// Its file.
+    pub path: String,
+    /// Steps in which a field learns it; solvers on voxels take it as it is.
+    pub steps: u64,
 }
 
 /// Settings of a solver.

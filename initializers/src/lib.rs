@@ -1,5 +1,6 @@
-//! Initializers: random, mapping-consistency (MCI), checkpoint
+//! Initializers: random, mapping-consistency (MCI), checkpoint, a known volume
 
 pub mod checkpoint;
 pub mod mci;
 pub mod random;
+pub mod volume;

@@ -3,10 +3,12 @@
 //! Every step draws rays, compares their integrals with the measurement (L1 in the published codes), optionally adds
 //! a total-variation prior on small random blocks of neighbouring points, and takes an Adam step.
 
+use crate::iterative::start_volume;
+use crate::pretrain::learn;
 use crate::rays::{Pixels, RaySource, Views};
 use crate::schedule::{Clock, Decay};
 use conefield_core::backend::{Adam, Executable, Loss, TrainRay, TvBlocks, Work};
-use conefield_core::checkpoint::{Checkpoint, Resume, Standing};
+use conefield_core::checkpoint::{Checkpoint, Resume, Standing, tensors};
 use conefield_core::error::{Error, Result, ensure};
 use conefield_core::pipeline::{Model, Pipeline};
 use conefield_core::random::stream;
@@ -171,7 +173,9 @@ impl Solver for Gradient {
         job.scan.validate("scan")?;
         let scene = Scene::new(job.scan, &job.spec.scene)?;
         let pipeline = Pipeline::build(job.spec)?;
-        let initializer = job.spec.initializer.as_ref().map(|i| i.build(job.weights)).transpose()?;
+        let volume = job.spec.initializer.as_ref().map(|i| i.volume()).transpose()?.flatten();
+        let fills_weights = job.spec.initializer.as_ref().filter(|_| volume.is_none());
+        let initializer = fills_weights.map(|i| i.build(job.weights)).transpose()?;
         let source =
             RaySource::new(job.scan, &scene, pipeline.projector.as_ref(), self.views, self.pixels, self.margin)?;
         observer.note(&format!("{:.0}% of the pixels are trained on", 100.0 * source.share()));
@@ -193,6 +197,11 @@ impl Solver for Gradient {
         }
         let (mut exe, explain) = job.backend.compile(&model.pipeline)?;
         observer.note(&explain.backend);
+        if let (Some(from), None) = (&volume, job.resume) {
+            let known = start_volume(job, &from.path)?;
+            learn(self, exe.as_mut(), &mut model, (&known, &scene), from.steps, job.seed)?;
+            observer.note(&format!("learned {} in {} steps", from.path, from.steps));
+        }
         let watch = Watch::new(job, &scene, model.pipeline.projector.as_ref());
         let steps_an_epoch = source.steps_an_epoch() as f64;
         let by_epochs = self.epochs.map(|e| (e * steps_an_epoch).ceil() as u64);
@@ -210,7 +219,7 @@ impl Solver for Gradient {
                 let solver = window.save();
                 let masks = model.masks().to_vec();
                 let standing = Standing { step, samples, seconds: clock.seconds(), masks, solver };
-                observer.checkpoint(&Checkpoint { model: &model, standing })?;
+                observer.checkpoint(&Checkpoint { tensors: tensors(&model), standing })?;
                 clock.resume();
             }
             if cancelled {
@@ -357,8 +366,8 @@ impl Window {
             seconds,
             loss: self.loss / n,
             prior: (self.prior > 0.0).then_some(self.prior / n),
-            lr,
-            samples_per_s: self.samples as f64 / self.seconds.max(1e-12),
+            lr: Some(lr),
+            samples_per_s: Some(self.samples as f64 / self.seconds.max(1e-12)),
             held_out: None,
             psnr: None,
             events: std::mem::take(&mut self.events),

@@ -1,9 +1,13 @@
 //! Solvers: scan in, volume out.
 //!
-//! [`gradient`] trains an attenuation field by stochastic gradients; [`pretrain`] trains one on a known volume, for
-//! weights that other scans reuse.
+//! - [`gradient`] trains an attenuation field by stochastic gradients; [`pretrain`] trains one on a known volume, for
+//!   weights that other scans reuse.
+//! - [`fdk`] filters and back-projects.
+//! - [`iterative`] improves voxels pass by pass: SART and its kin, CGLS, ASD-POCS, FISTA with total variation.
 
+pub mod fdk;
 pub mod gradient;
+pub mod iterative;
 pub mod pretrain;
 pub mod rays;
 pub mod schedule;

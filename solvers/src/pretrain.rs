@@ -4,7 +4,7 @@
 use crate::gradient::Gradient;
 use crate::schedule::Clock;
 use conefield_core::arena::Arena;
-use conefield_core::backend::{Loss, Work};
+use conefield_core::backend::{Executable, Loss, Work};
 use conefield_core::error::{Error, Result};
 use conefield_core::pipeline::{Model, Pipeline};
 use conefield_core::random::stream;
@@ -50,24 +50,20 @@ pub fn pretrain(settings: &Gradient, job: &PretrainJob<'_>, observer: &mut dyn O
             at = (at + 1) % scenes.len();
         }
         draw(&job.volumes[at], &scenes[at], job.seed, step, settings.pretrain_points, &mut points);
-        let work = Work { step, seed: job.seed, loss: Loss::L1, rays: &[], points: &points, tv: None };
-        let stats = exe.step(&mut model, &work)?;
-        if !stats.loss.is_finite() {
-            return Err(Error::Diverged { step, what: format!("the loss is {}", stats.loss) });
-        }
+        let found = fit(exe.as_mut(), &mut model, &points, step, job.seed)?;
         step += 1;
         let share = clock.share(step);
         let adam = settings.adam(step, 0.0, share);
         exe.update(&mut model, &adam)?;
-        (loss, since) = (loss + stats.loss, since + 1);
+        (loss, since) = (loss + found, since + 1);
         observer.progress(step, share, clock.seconds() * (1.0 - share).max(0.0) / share.max(1e-9));
         if step.is_multiple_of(settings.report_every) || share >= 1.0 {
-            let samples_per_s = (step * settings.pretrain_points as u64) as f64 / clock.seconds();
+            let samples_per_s = Some((step * settings.pretrain_points as u64) as f64 / clock.seconds());
             let record = Record {
                 step,
                 seconds: clock.seconds(),
                 loss: loss / since as f64,
-                lr: adam.lr,
+                lr: Some(adam.lr),
                 samples_per_s,
                 ..Record::default()
             };
@@ -76,6 +72,37 @@ pub fn pretrain(settings: &Gradient, job: &PretrainJob<'_>, observer: &mut dyn O
         }
     }
     Ok(model)
+}
+
+/// Gradients of the L1 loss at known points; returns the loss.
+fn fit(exe: &mut dyn Executable, model: &mut Model, points: &[([f32; 3], f32)], step: u64, seed: u64) -> Result<f64> {
+    let work = Work { step, seed, loss: Loss::L1, rays: &[], points, tv: None };
+    let stats = exe.step(model, &work)?;
+    if !stats.loss.is_finite() {
+        return Err(Error::Diverged { step, what: format!("the loss is {}", stats.loss) });
+    }
+    Ok(stats.loss)
+}
+
+/// Brings all of `model` close to `volume`, in 1/mm, within the scene of a scan: a warm start. The optimizer's
+/// moments are 0 afterwards.
+pub fn learn(
+    settings: &Gradient,
+    exe: &mut dyn Executable,
+    model: &mut Model,
+    (volume, scene): (&Volume, &Scene),
+    steps: u64,
+    seed: u64,
+) -> Result<()> {
+    let mut points = Vec::with_capacity(settings.pretrain_points);
+    for step in 0..steps {
+        draw(volume, scene, seed, step, settings.pretrain_points, &mut points);
+        fit(exe, model, &points, step, seed)?;
+        exe.update(model, &settings.adam(step + 1, 0.0, (step + 1) as f64 / steps as f64))?;
+    }
+    model.arena.first.fill(0.0);
+    model.arena.second.fill(0.0);
+    Ok(())
 }
 
 /// The scene that a scan of `volume` would have: its attenuation scale comes from the sums along x and y, which are

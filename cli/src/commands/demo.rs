@@ -133,6 +133,7 @@ impl Demo {
             seed: self.seed,
             limits: Limits { steps: None, seconds: Some(self.budget) },
             weights: &|path| files::read_weights(path),
+            volumes: &files::volume,
             resume: None,
         };
         let solution = solver.solve(&job, &mut Progress::new(name, None))?;

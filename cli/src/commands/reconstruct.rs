@@ -118,7 +118,9 @@ impl Reconstruct {
         let loaded = specs::read(&self.spec, &self.all_sets())?;
         let solver = loaded.spec.solver.build().map_err(|e| loaded.locate(e))?;
         // Weights that cannot be read are told before anything is made.
-        if let Some(i) = &loaded.spec.initializer {
+        if let Some(i) = &loaded.spec.initializer
+            && i.volume().map_err(|e| loaded.locate(e))?.is_none()
+        {
             i.build(&|path| files::read_weights(path)).map_err(|e| loaded.locate(e))?;
         }
         let backend = self.backend.open();
@@ -150,6 +152,7 @@ impl Reconstruct {
             seed: self.seed,
             limits: self.ends.limits(),
             weights: &|path| files::read_weights(path),
+            volumes: &files::volume,
             resume: resume.as_ref(),
         };
         let solution = solver.solve(&job, &mut progress).map_err(|e| loaded.locate(e))?;

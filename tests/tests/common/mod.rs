@@ -69,6 +69,7 @@ pub fn solve(value: &Value, scan: &Scan, weights: &Weights) -> Result<(Solution,
         seed: 7,
         limits: Limits::default(),
         weights: &|_| Ok(weights.clone()),
+        volumes: &|path| Err(conefield_core::Error::unsupported(path, "no volumes here")),
         resume: None,
     };
     let mut heard = Heard::default();

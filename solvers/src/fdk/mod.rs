@@ -1,0 +1,133 @@
+//! FDK: filtered back-projection of a cone-beam scan (Feldkamp, Davis and Kress, JOSA A 1(6), 1984).
+//!
+//! `μ(x) = Σ_i Δβ_i · (R/U_i)² · w_i · [cos-weighted p_i * ramp]`, with R the distance of source and axis, U_i the depth of
+//! the voxel, Δβ_i the view's share of the turn and w_i what its rays count ([`weights`]). Rows are filtered with the pitch
+//! that they have at the axis. No factor is fitted: the scale is right for any number of views and any magnification.
+
+pub mod filter;
+pub mod weights;
+
+use crate::iterative::voxels_only;
+use crate::iterative::watch::Watch;
+use conefield_core::Error;
+use conefield_core::error::{Result, ensure};
+use conefield_core::geometry::{dot, norm, sub};
+use conefield_core::scan::Volume;
+use conefield_core::solver::{Job, Observer, Reconstruction, Record, Solution, Solver};
+use conefield_core::spec::SolverSpec;
+use conefield_projectors::voxel::backproject::backproject;
+use conefield_projectors::voxel::layout::{ColumnMajor, batch};
+use filter::{Ramp, Window};
+use ndarray::{Array3, Axis};
+use rayon::prelude::*;
+use schemars::JsonSchema;
+use serde::{Deserialize, Serialize};
+use std::time::Instant;
+use weights::{Coverage, Orbit, place};
+
+/// Settings of `fdk`.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
+#[serde(deny_unknown_fields, default)]
+pub struct Fdk {
+    /// What the ramp filter is multiplied with.
+    pub window: Window,
+    /// Where the window ends, as a share of the highest frequency; nothing beyond it passes.
+    pub cutoff: f64,
+    /// Set negative attenuation to 0 in the end.
+    pub nonnegative: bool,
+}
+
+impl Default for Fdk {
+    fn default() -> Self {
+        Self { window: Window::Ramp, cutoff: 1.0, nonnegative: false }
+    }
+}
+
+conefield_core::stage_type!(Solver, "fdk", Fdk, "filtered back-projection");
+
+#[typetag::serde(name = "fdk")]
+impl SolverSpec for Fdk {
+    fn build(&self) -> Result<Box<dyn Solver>> {
+        let c = self.cutoff;
+        ensure(c > 0.0 && c <= 1.0, "spec", "solver.cutoff", c, "a number above 0 and at most 1")?;
+        Ok(Box::new(self.clone()))
+    }
+}
+
+impl Solver for Fdk {
+    fn solve(&self, job: &Job<'_>, observer: &mut dyn Observer) -> Result<Solution> {
+        let start = Instant::now();
+        let scan = job.scan;
+        scan.validate("scan")?;
+        voxels_only(job.spec)?;
+        let g = &scan.geometry;
+        let orbit = Orbit::of(g);
+        check(&orbit)?;
+        observer.note(&orbit.describe());
+        if orbit.coverage == Coverage::Limited {
+            observer.note("expect streaks along the missing directions; an iterative solver suits this scan better");
+        }
+        let [rows, columns] = g.detector;
+        let all: Vec<usize> = (0..g.views.len()).collect();
+        let mut volume = Array3::<f32>::zeros(g.volume.shape);
+        let mut done = 0;
+        for part in all.chunks(batch::<f32>(g)) {
+            if observer.cancelled() {
+                return Err(Error::Interrupted { step: done as u64 });
+            }
+            let mut images = scan.projections.slice_axis(Axis(0), (done..done + part.len()).into()).to_owned();
+            let scales: Vec<f64> = part.iter().map(|&v| orbit.steps[v] * orbit.radius[v].powi(2)).collect();
+            images.axis_iter_mut(Axis(0)).into_par_iter().zip(part).for_each(|(mut image, &view)| {
+                let v = &g.views[view];
+                let (normal, distance) = v.normal();
+                let radius = orbit.radius[view];
+                let ramp = Ramp::new(columns, norm(v.u) * radius / distance, self.window, self.cutoff);
+                let counts: Vec<f64> =
+                    (0..columns).map(|c| orbit.weight(view, place(g, view, c as f64, radius))).collect();
+                let Some(pixels) = image.as_slice_mut() else { return };
+                pixels.par_chunks_mut(16 * columns).enumerate().for_each(|(n, strip)| {
+                    for (r, line) in strip.chunks_mut(columns).enumerate() {
+                        for (c, x) in line.iter_mut().enumerate() {
+                            let d = sub(v.pixel(g.detector, (16 * n + r) as f64, c as f64), v.source);
+                            *x *= (counts[c] * dot(normal, d) / norm(d)) as f32;
+                        }
+                    }
+                    ramp.filter(strip, columns);
+                });
+            });
+            debug_assert_eq!(images.dim(), (part.len(), rows, columns));
+            let pixels = ColumnMajor::new(g, part, images.view(), |_, _, _, x| x);
+            drop(images);
+            backproject(g, part, &pixels, &scales, volume.view_mut());
+            done += part.len();
+            let share = done as f64 / all.len() as f64;
+            let spent = start.elapsed().as_secs_f64();
+            observer.progress(done as u64, share, spent * (1.0 - share) / share);
+        }
+        let mm = scan.unit.mm as f32;
+        let floor = if self.nonnegative { 0.0 } else { f32::NEG_INFINITY };
+        volume.par_mapv_inplace(|x| (x * mm).max(floor));
+        let train_s = start.elapsed().as_secs_f64();
+        let watch = Watch::new(job);
+        let record = Record { step: 1, seconds: train_s, psnr: watch.psnr(&volume, 1.0), ..Record::default() };
+        observer.record(&record);
+        let volume = Volume { data: volume, grid: g.volume, affine: None };
+        Ok(Solution { result: Reconstruction::Volume(volume), steps: 1, train_s, samples: 0 })
+    }
+
+    fn describe(&self) -> String {
+        format!("fdk: {:?} window to {} of the highest frequency", self.window, self.cutoff).to_lowercase()
+    }
+}
+
+/// FDK is for circles around z.
+fn check(orbit: &Orbit) -> Result<()> {
+    let (low, high) = orbit.radius.iter().fold((f64::INFINITY, 0.0f64), |(l, h), &r| (l.min(r), h.max(r)));
+    ensure(
+        low > 0.0 && high < 1.2 * low,
+        "scan",
+        "views",
+        format!("sources {low:.1} to {high:.1} mm from the axis z"),
+        "a circular orbit around z for fdk; iterative solvers take any",
+    )
+}

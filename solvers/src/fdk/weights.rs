@@ -1,0 +1,233 @@
+//! How much each ray counts: the step of the angle, and rays that are measured twice.
+//!
+//! - A full turn measures every line of the orbit's plane twice: each counts half.
+//! - A short scan measures some lines twice and others once: Parker's weights (Med. Phys. 9(2), 1982), for any arc of at
+//!   least π plus the fan by widening the fan (Silver, Med. Phys. 27(4), 2000).
+//! - A detector shifted sideways measures, over a full turn, the middle twice and the wide side once: Wang's weights
+//!   (Med. Phys. 29(7), 2002).
+//!
+//! What the orbit asks for is found from the views alone.
+
+use conefield_core::geometry::{Geometry, dot, norm, sub};
+use std::f64::consts::{FRAC_PI_2, FRAC_PI_4, PI, TAU};
+
+/// What the orbit is.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub enum Coverage {
+    /// A full turn with a centred detector.
+    Full,
+    /// A full turn with a detector that reaches further on one side: `overlap` mm on the virtual detector at the axis
+    /// are seen from both sides, `sign` is the side of u that reaches further.
+    Offset {
+        /// Half width of what is measured twice, mm at the axis.
+        overlap: f64,
+        /// 1 where u reaches further, −1 where −u does.
+        sign: f64,
+    },
+    /// An arc of at least π plus the fan, from `start`, in the direction of rising angles.
+    Short {
+        /// The first angle, rad.
+        start: f64,
+        /// Parker's half fan angle, widened to the arc: `arc = π + 2·delta`.
+        delta: f64,
+    },
+    /// Less than a short scan: no weights can make up for what was not measured.
+    Limited,
+}
+
+/// The orbit of a scan as FDK sees it.
+#[derive(Debug, Clone)]
+pub struct Orbit {
+    /// What it is.
+    pub coverage: Coverage,
+    /// The arc that is covered, rad.
+    pub arc: f64,
+    /// Fan angle, rad.
+    pub fan: f64,
+    /// Each view's angle, rad.
+    pub angles: Vec<f64>,
+    /// Each view's share of the turn, rad.
+    pub steps: Vec<f64>,
+    /// Distance of source and axis for each view, along the detector's normal, mm.
+    pub radius: Vec<f64>,
+    /// 1 where u points the way that the source moves at rising angles, −1 against it.
+    sense: f64,
+}
+
+impl Orbit {
+    /// Reads the orbit of `geometry` around the axis x = y = 0.
+    pub fn of(geometry: &Geometry) -> Self {
+        let views = &geometry.views;
+        let angles: Vec<f64> = views.iter().map(|v| v.source[1].atan2(v.source[0]).rem_euclid(TAU)).collect();
+        let mut order: Vec<usize> = (0..views.len()).collect();
+        order.sort_by(|&a, &b| angles[a].total_cmp(&angles[b]));
+        let n = order.len();
+        // Gap after each view in order.
+        let gaps: Vec<f64> =
+            (0..n).map(|i| (angles[order[(i + 1) % n]] - angles[order[i]]).rem_euclid(TAU)).collect();
+        let gaps = if n == 1 { vec![TAU] } else { gaps };
+        let (widest, gap) = gaps.iter().copied().enumerate().fold((0, 0.0), |a, b| if b.1 > a.1 { b } else { a });
+        let rest = (TAU - gap) / (n.max(2) - 1) as f64;
+        // One gap that is much wider than the others are on average is where the orbit ends.
+        let full = n < 3 || gap <= 2.5 * rest;
+        let mut steps = vec![0.0; n];
+        for i in 0..n {
+            let (before, after) = ((i + n - 1) % n, i);
+            let side = |g: usize| if !full && g == widest { rest } else { gaps[g] };
+            steps[order[i]] = 0.5 * (side(before) + side(after));
+        }
+        let arc = if full { TAU } else { TAU - gap + rest };
+        let radius: Vec<f64> = views.iter().map(|v| -dot([v.source[0], v.source[1], 0.0], v.normal().0)).collect();
+        let ends: Vec<[f64; 2]> = (0..n).map(|v| edges(geometry, v, radius[v])).collect();
+        let low = ends.iter().fold(f64::INFINITY, |m, e| m.min(e[0]));
+        let high = ends.iter().fold(f64::NEG_INFINITY, |m, e| m.max(e[1]));
+        let mean = radius.iter().sum::<f64>() / n as f64;
+        let fan = (low.abs() / mean).atan() + (high.abs() / mean).atan();
+        let pitch = norm(views[0].u) * radius[0] / views[0].normal().1;
+        let (narrow, wide) = (low.abs().min(high), low.abs().max(high));
+        let coverage = if full && wide - narrow > 1.5 * pitch && low < 0.0 && high > 0.0 {
+            Coverage::Offset { overlap: narrow, sign: if high > -low { 1.0 } else { -1.0 } }
+        } else if full {
+            Coverage::Full
+        } else if arc >= PI + fan - rest {
+            let first = angles[order[(widest + 1) % n]];
+            Coverage::Short { start: first - 0.5 * rest, delta: 0.5 * (arc - PI) }
+        } else {
+            Coverage::Limited
+        };
+        let v = &views[0];
+        let sense = (v.source[0] * v.u[1] - v.source[1] * v.u[0]).signum();
+        Self { coverage, arc, fan, angles, steps, radius, sense }
+    }
+
+    /// What a ray of view `view` counts, whose place on the virtual detector at the axis is `u` mm from the axis.
+    pub fn weight(&self, view: usize, u: f64) -> f64 {
+        match self.coverage {
+            Coverage::Full | Coverage::Limited => 0.5,
+            Coverage::Offset { overlap, sign } => {
+                let x = u * sign;
+                if x <= -overlap {
+                    0.0
+                } else if x >= overlap {
+                    1.0
+                } else {
+                    let radius = self.radius[view];
+                    let ratio = (x / radius).atan() / (overlap / radius).atan();
+                    0.5 * ((FRAC_PI_2 * ratio).sin() + 1.0)
+                }
+            }
+            Coverage::Short { start, delta } => {
+                // Towards rising u a ray turns against the rising angle.
+                let gamma = -self.sense * (u / self.radius[view]).atan();
+                parker((self.angles[view] - start).rem_euclid(TAU), gamma, delta)
+            }
+        }
+    }
+
+    /// In words, for the log.
+    pub fn describe(&self) -> String {
+        let degrees = |x: f64| x.to_degrees();
+        let arc = format!("{:.1} of 360 degrees, fan {:.1}", degrees(self.arc), degrees(self.fan));
+        match self.coverage {
+            Coverage::Full => format!("full turn: every ray counts half ({arc})"),
+            Coverage::Offset { overlap, .. } => {
+                format!("offset detector: Wang's weights over {:.1} mm either side of the axis ({arc})", overlap)
+            }
+            Coverage::Short { .. } => format!("short scan: Parker's weights ({arc})"),
+            Coverage::Limited => {
+                format!("limited angle, no weights can complete it ({arc}; {:.1} needed)", degrees(PI + self.fan))
+            }
+        }
+    }
+}
+
+/// Parker's weight at angle `beta` from the start of an arc of π + 2·delta, for a ray at `gamma` from the central one.
+/// The ray (β, γ) is measured again as (β + π + 2γ, −γ), and the two weights add up to 1.
+fn parker(beta: f64, gamma: f64, delta: f64) -> f64 {
+    let ramp = |x: f64, width: f64| {
+        if x >= width { 1.0 } else if x <= 0.0 { 0.0 } else { (FRAC_PI_4 * 2.0 * x / width).sin().powi(2) }
+    };
+    ramp(beta, 2.0 * (delta - gamma)) * ramp(PI + 2.0 * delta - beta, 2.0 * (delta + gamma))
+}
+
+/// Where the detector of view `view` begins and ends along u, at the axis' distance, mm from the axis.
+fn edges(geometry: &Geometry, view: usize, radius: f64) -> [f64; 2] {
+    let columns = geometry.detector[1] as f64;
+    [-0.5, columns - 0.5].map(|c| place(geometry, view, c, radius))
+}
+
+/// Where column `column` of view `view` looks on the virtual detector through the axis: mm along u from the ray that
+/// meets the axis at a right angle to u.
+pub fn place(geometry: &Geometry, view: usize, column: f64, radius: f64) -> f64 {
+    let v = &geometry.views[view];
+    let (_, distance) = v.normal();
+    let row = (geometry.detector[0] as f64 - 1.0) / 2.0;
+    let to = sub(v.pixel(geometry.detector, row, column), v.source);
+    let axis = [-v.source[0], -v.source[1], 0.0];
+    let unit = v.u.map(|x| x / norm(v.u));
+    dot(to, unit) * radius / distance - dot(axis, unit)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use conefield_core::geometry::{Millimetres, Radians, View, VoxelGrid};
+
+    fn scan(angles: impl Iterator<Item = f64>, offset: f64) -> Geometry {
+        let mm = Millimetres;
+        let view = |a| View::circular(Radians(a), mm(500.0), mm(750.0), [mm(1.0); 2], [mm(0.0), mm(offset)]);
+        Geometry {
+            detector: [10, 200],
+            views: angles.map(view).collect(),
+            volume: VoxelGrid { shape: [10; 3], spacing: [1.0; 3], center: [0.0; 3] },
+        }
+    }
+
+    #[test]
+    fn orbits_are_told_apart() {
+        let turn = |n: usize, arc: f64| (0..n).map(move |i| 0.3 + arc * i as f64 / n as f64);
+        assert_eq!(Orbit::of(&scan(turn(50, TAU), 0.0)).coverage, Coverage::Full);
+        assert_eq!(Orbit::of(&scan(turn(3, TAU), 0.0)).coverage, Coverage::Full);
+        assert!(matches!(Orbit::of(&scan(turn(100, 3.6), 0.0)).coverage, Coverage::Short { .. }));
+        assert_eq!(Orbit::of(&scan(turn(100, 2.9), 0.0)).coverage, Coverage::Limited);
+        let Coverage::Offset { overlap, sign } = Orbit::of(&scan(turn(50, TAU), 45.0)).coverage else {
+            panic!("an offset was not seen")
+        };
+        assert!((overlap - (100.0 - 45.0) / 1.5).abs() < 1e-9 && sign == 1.0);
+        assert_eq!(Orbit::of(&scan(turn(50, TAU).map(|a| -a), -45.0)).coverage, {
+            Coverage::Offset { overlap, sign: -1.0 }
+        });
+        // One missing view does not end an orbit.
+        let missing = (0..50).filter(|i| *i != 7).map(|i| TAU * i as f64 / 50.0);
+        assert_eq!(Orbit::of(&scan(missing, 0.0)).coverage, Coverage::Full);
+    }
+
+    #[test]
+    fn steps_add_up_to_the_arc() {
+        let uneven = [0.1, 0.2, 0.9, 1.4, 2.0, 2.2, 3.0, 3.9, 4.4, 5.0, 5.6, 6.1];
+        let o = Orbit::of(&scan(uneven.into_iter(), 0.0));
+        assert!((o.steps.iter().sum::<f64>() - TAU).abs() < 1e-12);
+        let o = Orbit::of(&scan((0..40).map(|i| 0.1 * f64::from(i)), 0.0));
+        assert!((o.steps.iter().sum::<f64>() - 4.0).abs() < 1e-12 && (o.arc - 4.0).abs() < 1e-12);
+    }
+
+    /// Two measurements of one line count 1 together, in every case.
+    #[test]
+    fn conjugate_rays_count_one() {
+        for gamma in [-0.15, -0.04, 0.0, 0.11] {
+            let delta = 0.2;
+            for i in 0..200 {
+                let beta = (PI + 2.0 * delta) * (f64::from(i) + 0.5) / 200.0;
+                let other = [beta + PI + 2.0 * gamma, beta - PI + 2.0 * gamma]
+                    .into_iter()
+                    .find(|b| (0.0..PI + 2.0 * delta).contains(b));
+                let sum = parker(beta, gamma, delta) + other.map_or(0.0, |b| parker(b, -gamma, delta));
+                assert!((sum - 1.0).abs() < 1e-9, "beta {beta} gamma {gamma}: {sum}");
+            }
+        }
+        let o = Orbit::of(&scan((0..50).map(|i| TAU * f64::from(i) / 50.0), 45.0));
+        for u in [-60.0, -30.0, -3.0, 0.0, 12.0, 36.0, 50.0] {
+            assert!((o.weight(0, u) + o.weight(0, -u) - 1.0).abs() < 1e-12, "u {u}");
+        }
+    }
+}

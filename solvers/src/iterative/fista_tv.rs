@@ -1,0 +1,210 @@
+//! Total variation by ordered-subset FISTA: `min_{x ≥ 0} ½‖A·x − p‖² + λ·TV(x)` (Beck and Teboulle, SIAM J. Imaging Sci.
+//! 2(1), 2009; ordered subsets with momentum as in Kim, Ramani and Fessler, IEEE Trans. Med. Imaging 34(1), 2015).
+//!
+//! The step is `1/L` with L an upper bound of the largest eigenvalue of AᵀA: for a matrix without negative entries
+//! `max_j (AᵀA·v)_j/v_j` is one for any positive v (Collatz and Wielandt), and power iterations make it tight.
+
+use super::order::{Order, subsets};
+use super::tv::{TvProx, anisotropy, total_variation};
+use super::{Method, Pass, Problem, Stop, drive, flat, flat_mut, noise, norm2, projector, start};
+use conefield_core::error::{Result, ensure};
+use conefield_core::random::stream;
+use conefield_core::solver::{Job, Observer, Solution, Solver};
+use conefield_core::spec::SolverSpec;
+use ndarray::{Array3, Zip};
+use rand::RngExt;
+use schemars::JsonSchema;
+use serde::{Deserialize, Serialize};
+
+/// How strong the prior is.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize, JsonSchema)]
+#[serde(rename_all = "kebab-case")]
+pub enum Weight {
+    /// λ, for attenuation counted per voxel (geometric mean of its sides) and the projector's lengths in voxels.
+    Fixed(f64),
+    /// Times the root mean square of back-projected noise, whose strength is read from the scan.
+    Noise(f64),
+}
+
+/// Settings of `fista-tv`.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
+#[serde(deny_unknown_fields, default)]
+pub struct FistaTv {
+    /// When it ends.
+    pub stop: Stop,
+    /// How strong the prior is.
+    pub weight: Weight,
+    /// Subsets of the views.
+    pub subsets: usize,
+    /// The order of the subsets.
+    pub order: Order,
+    /// Dual steps of the prior for each update.
+    pub inner: usize,
+}
+
+impl Default for FistaTv {
+    fn default() -> Self {
+        let stop = Stop { passes: Some(20), change: Some(2e-3), ..Stop::default() };
+        Self { stop, weight: Weight::Noise(2.0), subsets: 10, order: Order::Golden, inner: 4 }
+    }
+}
+
+conefield_core::stage_type!(Solver, "fista-tv", FistaTv, "total variation by ordered-subset FISTA");
+
+#[typetag::serde(name = "fista-tv")]
+impl SolverSpec for FistaTv {
+    fn build(&self) -> Result<Box<dyn Solver>> {
+        self.stop.validate()?;
+        ensure(self.subsets > 0, "spec", "solver.subsets", 0, "at least 1")?;
+        ensure((1..=1000).contains(&self.inner), "spec", "solver.inner", self.inner, "1 to 1000")?;
+        let (Weight::Fixed(w) | Weight::Noise(w)) = self.weight;
+        ensure(w.is_finite() && w >= 0.0, "spec", "solver.weight", w, "a finite number, 0 or more")?;
+        Ok(Box::new(self.clone()))
+    }
+}
+
+impl Solver for FistaTv {
+    fn solve(&self, job: &Job<'_>, observer: &mut dyn Observer) -> Result<Solution> {
+        job.scan.validate("scan")?;
+        let projector = projector(job)?;
+        observer.note(&format!("{}; {}", self.describe(), projector.describe()));
+        let problem = Problem { scan: job.scan, operator: projector.operator(), seed: job.seed };
+        let grid = &job.scan.geometry.volume;
+        let voxel = grid.spacing.iter().product::<f64>().cbrt();
+        // Attenuation a voxel x̂ = x·h and lengths in voxels Â = A/h: λ·TV(x) = λ̂·TV(x̂) = λ̂·h·TV(x).
+        let lambda = match self.weight {
+            Weight::Fixed(w) => w * voxel,
+            Weight::Noise(k) => {
+                let sigma = noise::sigma(job.scan);
+                let weight = k * sigma * noise_gain(&problem);
+                observer.note(&format!("noise of {sigma:.3e} in line integrals: weight {:.3e}", weight / voxel));
+                weight
+            }
+        };
+        let mut iterate = Iterate::new(self, &problem, start(job)?, lambda)?;
+        drive(job, &self.stop, projector.as_ref(), &mut iterate, observer)
+    }
+
+    fn describe(&self) -> String {
+        format!("fista-tv: {} subsets, {} dual steps, weight {:?}", self.subsets, self.inner, self.weight).to_lowercase()
+    }
+}
+
+/// Root mean square of `Aᵀn` over the voxels that rays meet, for white noise n of variance 1.
+fn noise_gain(problem: &Problem<'_>) -> f64 {
+    let g = &problem.scan.geometry;
+    let mut rng = stream(problem.seed ^ 0x0000_7e57_0015_e000, 0);
+    let signs = Array3::from_shape_simple_fn((g.views.len(), g.detector[0], g.detector[1]), || {
+        if rng.random::<bool>() { 1.0 } else { -1.0 }
+    });
+    let mut back = problem.zeros();
+    problem.back(&problem.views(), &signs, &mut back);
+    let met = back.iter().filter(|x| **x != 0.0).count();
+    (norm2(&back) / met.max(1) as f64).sqrt()
+}
+
+/// An upper bound of the largest eigenvalue of AᵀA.
+fn largest_eigenvalue(problem: &Problem<'_>) -> f64 {
+    let views = problem.views();
+    let mut v = Array3::ones(problem.scan.geometry.volume.shape);
+    let mut next = problem.zeros();
+    let mut bound = f64::INFINITY;
+    for _ in 0..3 {
+        problem.back(&views, &problem.forward(&views, &v), &mut next);
+        let top = next.iter().fold(0.0f32, |m, &x| m.max(x));
+        let ratio = |(a, b): (&f32, &f32)| if *b > 1e-6 { f64::from(a / b) } else { 0.0 };
+        bound = bound.min(next.iter().zip(&v).map(ratio).fold(0.0, f64::max));
+        Zip::from(&mut v).and(&next).par_for_each(|v, n| *v = n / top.max(f32::MIN_POSITIVE));
+    }
+    bound
+}
+
+struct Iterate {
+    subsets: Vec<Vec<usize>>,
+    order: Order,
+    inner: usize,
+    x: Array3<f32>,
+    /// Where the next gradient is taken.
+    ahead: Array3<f32>,
+    scratch: Array3<f32>,
+    fresh: Array3<f32>,
+    prox: TvProx,
+    anisotropy: [f32; 3],
+    /// λ in mm.
+    lambda: f64,
+    lipschitz: f64,
+    /// FISTA's t.
+    t: f64,
+}
+
+impl Iterate {
+    fn new(settings: &FistaTv, problem: &Problem<'_>, x: Array3<f32>, lambda: f64) -> Result<Self> {
+        let grid = &problem.scan.geometry.volume;
+        let lipschitz = largest_eigenvalue(problem);
+        ensure(lipschitz > 0.0, "scan", "geometry", "rays that all miss the volume", "rays through the volume")?;
+        Ok(Self {
+            subsets: subsets(problem.scan.geometry.views.len(), settings.subsets),
+            order: settings.order,
+            inner: settings.inner,
+            ahead: x.clone(),
+            scratch: problem.zeros(),
+            fresh: problem.zeros(),
+            x,
+            prox: TvProx::new(grid.shape, anisotropy(grid)),
+            anisotropy: anisotropy(grid),
+            lambda,
+            lipschitz,
+            t: 1.0,
+        })
+    }
+}
+
+impl Method for Iterate {
+    fn pass(&mut self, problem: &Problem<'_>, pass: u64) -> Result<Pass> {
+        let before = self.x.clone();
+        let mut residual = 0.0;
+        let count = self.subsets.len() as f64;
+        for s in self.order.of(self.subsets.len(), problem.seed, pass) {
+            let views = &self.subsets[s];
+            let difference = problem.residual(views, &self.ahead);
+            residual += norm2(&difference);
+            problem.back(views, &difference, &mut self.scratch);
+            let step = (count / self.lipschitz) as f32;
+            Zip::from(&mut self.scratch).and(&self.ahead).par_for_each(|g, z| *g = z + step * *g);
+            let tau = (self.lambda / self.lipschitz) as f32;
+            self.prox.apply(flat(&self.scratch), tau, self.inner, flat_mut(&mut self.fresh));
+            let t = 0.5 * (1.0 + (1.0 + 4.0 * self.t * self.t).sqrt());
+            let momentum = ((self.t - 1.0) / t) as f32;
+            self.t = t;
+            Zip::from(&mut self.ahead)
+                .and(&self.fresh)
+                .and(&self.x)
+                .par_for_each(|z, new, old| *z = new + momentum * (new - old));
+            std::mem::swap(&mut self.x, &mut self.fresh);
+        }
+        let square = norm2(&self.x);
+        let difference = Zip::from(&before).and(&self.x).par_map_collect(|a, b| a - b);
+        let change = (norm2(&difference) / square.max(1e-300)).sqrt();
+        let prior = self.lambda * total_variation(&self.x, self.anisotropy);
+        Ok(Pass { residual, change: Some(change), prior: Some(prior) })
+    }
+
+    fn volume(&self) -> &Array3<f32> {
+        &self.x
+    }
+
+    fn state(&mut self) -> Vec<(&'static str, &mut [f32])> {
+        let [a, b, c] = self.prox.state();
+        vec![
+            ("x", flat_mut(&mut self.x)),
+            ("ahead", flat_mut(&mut self.ahead)),
+            ("dual.x", a),
+            ("dual.y", b),
+            ("dual.z", c),
+        ]
+    }
+
+    fn numbers(&mut self) -> Vec<&mut f64> {
+        vec![&mut self.t]
+    }
+}

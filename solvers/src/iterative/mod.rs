@@ -1,0 +1,346 @@
+//! Iterative solvers on voxels: one driver, and a [`Method`] each.
+//!
+//! A step is one pass over all views. After each the driver reports, checkpoints, and looks at what ends the run.
+
+pub mod algebraic;
+pub mod asd_pocs;
+pub mod cgls;
+pub mod fista_tv;
+pub mod noise;
+pub mod order;
+pub mod tv;
+pub mod watch;
+
+use crate::schedule::Clock;
+use conefield_core::Error;
+use conefield_core::checkpoint::{Checkpoint, Resume, Standing};
+use conefield_core::error::{Result, ensure};
+use conefield_core::scan::{Scan, Volume};
+use conefield_core::solver::{Job, Limits, Observer, Reconstruction, Record, Solution};
+use conefield_core::spec::Spec;
+use conefield_core::voxel::{VoxelOperator, VoxelProjector};
+use ndarray::{Array3, Axis};
+use schemars::JsonSchema;
+use serde::{Deserialize, Serialize};
+use watch::{Watch, square_sum};
+
+/// When an iterative solver ends, whichever comes first.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
+#[serde(deny_unknown_fields, default)]
+pub struct Stop {
+    /// After this many passes over the views.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub passes: Option<u64>,
+    /// After this many seconds.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub seconds: Option<f64>,
+    /// When a pass changes the volume by less than this share of it, both in root mean square.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub change: Option<f64>,
+    /// When the held-out views' error has not fallen for this many passes; the best volume is kept.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub patience: Option<u64>,
+}
+
+impl Default for Stop {
+    fn default() -> Self {
+        Self { passes: Some(20), seconds: None, change: None, patience: None }
+    }
+}
+
+impl Stop {
+    /// Refuses a run without an end.
+    pub fn validate(&self) -> Result<()> {
+        let ends = self.passes.is_some() || self.seconds.is_some() || self.change.is_some();
+        ensure(ends, "spec", "solver.stop", "no end", "one of passes, seconds or change")?;
+        let change = self.change.is_none_or(|c| c.is_finite() && c > 0.0);
+        ensure(change, "spec", "solver.stop.change", format!("{:?}", self.change), "a positive finite number")?;
+        ensure(self.patience != Some(0), "spec", "solver.stop.patience", 0, "at least 1")
+    }
+}
+
+/// A scan and the operator that models it.
+pub struct Problem<'a> {
+    /// What was measured.
+    pub scan: &'a Scan,
+    /// The system matrix.
+    pub operator: &'a dyn VoxelOperator<f32>,
+    /// Seed of everything random.
+    pub seed: u64,
+}
+
+impl Problem<'_> {
+    /// `A·x` for some views.
+    pub fn forward(&self, views: &[usize], x: &Array3<f32>) -> Array3<f32> {
+        let [rows, columns] = self.scan.geometry.detector;
+        let mut out = Array3::zeros((views.len(), rows, columns));
+        self.operator.forward(&self.scan.geometry, views, x.view(), out.view_mut());
+        out
+    }
+
+    /// `p − A·x` for some views.
+    pub fn residual(&self, views: &[usize], x: &Array3<f32>) -> Array3<f32> {
+        let mut out = self.forward(views, x);
+        for (mut image, &v) in out.axis_iter_mut(Axis(0)).zip(views) {
+            image.zip_mut_with(&self.scan.view(v), |a, p| *a = p - *a);
+        }
+        out
+    }
+
+    /// Overwrites `out` with `Aᵀ·y` of some views.
+    pub fn back(&self, views: &[usize], y: &Array3<f32>, out: &mut Array3<f32>) {
+        out.fill(0.0);
+        self.operator.adjoint(&self.scan.geometry, views, y.view(), out.view_mut());
+    }
+
+    /// Every view.
+    pub fn views(&self) -> Vec<usize> {
+        (0..self.scan.geometry.views.len()).collect()
+    }
+
+    /// Voxels of 0.
+    pub fn zeros(&self) -> Array3<f32> {
+        Array3::zeros(self.scan.geometry.volume.shape)
+    }
+}
+
+/// What a pass came to.
+#[derive(Debug, Clone, Copy, Default)]
+pub struct Pass {
+    /// `‖p − A·x‖²` of the volumes that the pass met, each view once.
+    pub residual: f64,
+    /// Root mean square change of the volume over its root mean square, where the method knows it.
+    pub change: Option<f64>,
+    /// The value of the prior, where there is one.
+    pub prior: Option<f64>,
+}
+
+/// What changes from pass to pass.
+pub trait Method {
+    /// Goes through all views once. `pass` counts from 0.
+    fn pass(&mut self, problem: &Problem<'_>, pass: u64) -> Result<Pass>;
+
+    /// The volume as it stands, in 1/mm.
+    fn volume(&self) -> &Array3<f32>;
+
+    /// All that the next pass depends on, by name, for checkpoints.
+    fn state(&mut self) -> Vec<(&'static str, &mut [f32])>;
+
+    /// Numbers that belong to the state.
+    fn numbers(&mut self) -> Vec<&mut f64> {
+        vec![]
+    }
+}
+
+/// The voxel projector of a job's spec: Joseph's where it names none. Refuses a spec with stages of a field.
+pub fn projector(job: &Job<'_>) -> Result<Box<dyn VoxelProjector>> {
+    voxels_only(job.spec)?;
+    match &job.spec.projector {
+        Some(p) => p.build_voxel(),
+        None => Ok(Box::new(conefield_projectors::voxel::Joseph {})),
+    }
+}
+
+/// Refuses stages that only a field has.
+pub fn voxels_only(spec: &Spec) -> Result<()> {
+    let stages = [
+        ("encoder", spec.encoder.is_some()),
+        ("normalizers", !spec.normalizers.is_empty()),
+        ("field", spec.field.is_some()),
+    ];
+    for (stage, there) in stages {
+        let solver = spec.solver.typetag_name();
+        ensure(!there, "spec", stage, "a stage of a field", format!("none: {solver} reconstructs voxels"))?;
+    }
+    Ok(())
+}
+
+/// The volume to start from, in 1/mm: what the spec's initializer brings, or 0.
+pub fn start(job: &Job<'_>) -> Result<Array3<f32>> {
+    let shape = job.scan.geometry.volume.shape;
+    let Some(initializer) = &job.spec.initializer else { return Ok(Array3::zeros(shape)) };
+    let Some(start) = initializer.volume()? else {
+        let found = format!("{:?}, which fills weights", initializer.typetag_name());
+        return Err(Error::invalid("spec", "initializer.type", found, "\"volume\", or no initializer"));
+    };
+    let volume = start_volume(job, &start.path)?;
+    Ok(volume.data.as_standard_layout().into_owned())
+}
+
+/// Reads a volume that fits the scan, in 1/mm.
+pub fn start_volume(job: &Job<'_>, path: &str) -> Result<Volume> {
+    let shape = job.scan.geometry.volume.shape;
+    let volume = (job.volumes)(path)?;
+    let found = format!("{:?}", volume.data.shape());
+    ensure(volume.data.shape() == shape, path, "shape", found, format!("{shape:?}, the voxels of the scan"))?;
+    if let Some((at, x)) = volume.data.indexed_iter().find(|(_, x)| !x.is_finite()) {
+        return Err(Error::invalid(path, format!("voxel {at:?}"), x, "a finite attenuation"));
+    }
+    let mm = job.scan.unit.mm as f32;
+    Ok(Volume { grid: job.scan.geometry.volume, ..volume.mapped(|x| x / mm) })
+}
+
+/// Where the driver stands beside the method.
+#[derive(Debug, Default, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+struct Kept {
+    numbers: Vec<f64>,
+    best: Option<f64>,
+    since_best: u64,
+}
+
+/// Runs `method` on `job` until `stop` or the job's limits end it.
+pub fn drive(
+    job: &Job<'_>,
+    stop: &Stop,
+    projector: &dyn VoxelProjector,
+    method: &mut dyn Method,
+    observer: &mut dyn Observer,
+) -> Result<Solution> {
+    let problem = Problem { scan: job.scan, operator: projector.operator(), seed: job.seed };
+    let mm = job.scan.unit.mm as f32;
+    let watch = Watch::new(job);
+    let pixels = job.scan.projections.len() as f64;
+    let mut step = 0;
+    let mut kept = Kept::default();
+    let mut seconds = 0.0;
+    let mut best: Option<Array3<f32>> = None;
+    if let Some(resume) = job.resume {
+        kept = restore(resume, method)?;
+        best = best_of(resume, job);
+        (step, seconds) = (resume.standing.step, resume.standing.seconds);
+        observer.note(&format!("resumed after pass {step}"));
+    }
+    let mut clock = Clock::new(Limits { steps: stop.passes, seconds: stop.seconds }, job.limits, seconds);
+    let started = step;
+    let mut settled = false;
+    clock.resume();
+    loop {
+        let cancelled = observer.cancelled();
+        if step > started && (cancelled || observer.checkpoint_due()) {
+            clock.pause();
+            kept.numbers = method.numbers().iter().map(|x| **x).collect();
+            let standing = Standing {
+                step,
+                seconds: clock.seconds(),
+                solver: serde_json::json!(kept),
+                ..Standing::default()
+            };
+            let state = method.state();
+            let sizes: Vec<[usize; 1]> = state.iter().map(|(_, x)| [x.len()]).collect();
+            let mut tensors: Vec<(String, &[usize], &[f32])> =
+                state.iter().zip(&sizes).map(|((n, x), size)| (n.to_string(), &size[..], &**x)).collect();
+            let flat = best.as_ref().and_then(|b| b.as_slice());
+            let length = [flat.map_or(0, <[f32]>::len)];
+            if let Some(b) = flat {
+                tensors.push(("best".into(), &length, b));
+            }
+            observer.checkpoint(&Checkpoint { tensors, standing })?;
+            clock.resume();
+        }
+        if cancelled {
+            return Err(Error::Interrupted { step });
+        }
+        if clock.share(step) >= 1.0 || settled {
+            break;
+        }
+        let pass = method.pass(&problem, step)?;
+        step += 1;
+        if !pass.residual.is_finite() {
+            return Err(Error::Diverged { step, what: "the residual is not finite; try a smaller step".into() });
+        }
+        clock.pause();
+        let held_out = watch.held_out(problem.operator, method.volume());
+        let mut record = Record {
+            step,
+            seconds: clock.seconds(),
+            loss: (pass.residual / pixels).sqrt(),
+            prior: pass.prior,
+            held_out,
+            psnr: watch.psnr(method.volume(), mm),
+            ..Record::default()
+        };
+        if let (Some(patience), Some(error)) = (stop.patience, held_out) {
+            if kept.best.is_none_or(|b| error < b) {
+                kept.best = Some(error);
+                kept.since_best = 0;
+                best = Some(method.volume().clone());
+            } else {
+                kept.since_best += 1;
+                settled |= kept.since_best >= patience;
+            }
+        }
+        if let (Some(limit), Some(change)) = (stop.change, pass.change) {
+            settled |= change < limit;
+        }
+        if settled {
+            record.events.push("the stopping rule is met".into());
+        }
+        observer.record(&record);
+        clock.resume();
+        let share = clock.share(step);
+        observer.progress(step, share.min(1.0), clock.seconds() * (1.0 - share).max(0.0) / share.max(1e-9));
+    }
+    clock.pause();
+    let mut data = best.unwrap_or_else(|| method.volume().clone());
+    data.par_mapv_inplace(|x| x * mm);
+    if let Some((at, _)) = data.indexed_iter().find(|(_, x)| !x.is_finite()) {
+        return Err(Error::Diverged { step, what: format!("voxel {at:?} is not finite") });
+    }
+    let volume = Volume { data, grid: job.scan.geometry.volume, affine: None };
+    Ok(Solution { result: Reconstruction::Volume(volume), steps: step, train_s: clock.seconds(), samples: 0 })
+}
+
+fn restore(resume: &Resume, method: &mut dyn Method) -> Result<Kept> {
+    let kept: std::result::Result<Kept, _> = serde_json::from_value(resume.standing.solver.clone());
+    let kept = kept.map_err(|e| Error::invalid(&resume.place, "solver", e, "what this solver keeps"))?;
+    for (name, values) in method.state() {
+        let found = resume.weights.tensors.get(name).map(|t| &t.1);
+        let fits = found.filter(|t| t.len() == values.len());
+        let said = found.map_or("nothing".into(), |t| format!("{} numbers", t.len()));
+        let fits = fits.ok_or_else(|| {
+            Error::invalid(&resume.place, name, said, format!("{} numbers, as this run needs", values.len()))
+        })?;
+        values.copy_from_slice(fits);
+    }
+    let numbers = method.numbers();
+    ensure(
+        numbers.len() == kept.numbers.len(),
+        &resume.place,
+        "solver.numbers",
+        kept.numbers.len(),
+        format!("{} numbers", numbers.len()),
+    )?;
+    for (number, saved) in numbers.into_iter().zip(&kept.numbers) {
+        *number = *saved;
+    }
+    Ok(kept)
+}
+
+fn best_of(resume: &Resume, job: &Job<'_>) -> Option<Array3<f32>> {
+    let (_, values) = resume.weights.tensors.get("best")?;
+    Array3::from_shape_vec(job.scan.geometry.volume.shape, values.clone()).ok()
+}
+
+/// `1/x` where `x` is more than a millionth of the largest, else 0: rays that miss the volume and voxels that no ray
+/// meets take no part.
+pub fn inverse(mut x: Array3<f32>) -> Array3<f32> {
+    let least = 1e-6 * x.iter().fold(0.0f32, |m, &v| m.max(v));
+    x.par_mapv_inplace(|v| if v > least { 1.0 / v } else { 0.0 });
+    x
+}
+
+/// All of an array that this crate made.
+pub(crate) fn flat(x: &Array3<f32>) -> &[f32] {
+    x.as_slice().unwrap_or_else(|| unreachable!("arrays of this crate are contiguous"))
+}
+
+/// Like [`flat`], to be written.
+pub(crate) fn flat_mut(x: &mut Array3<f32>) -> &mut [f32] {
+    x.as_slice_mut().unwrap_or_else(|| unreachable!("arrays of this crate are contiguous"))
+}
+
+/// `‖x‖²` of an array.
+pub(crate) fn norm2(x: &Array3<f32>) -> f64 {
+    square_sum(flat(x))
+}

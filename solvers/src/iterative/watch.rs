@@ -1,0 +1,61 @@
+//! What is looked at while a voxel volume takes shape: PSNR against a reference, the error of held-out views.
+
+use conefield_core::geometry::Geometry;
+use conefield_core::scan::Scan;
+use conefield_core::solver::Job;
+use conefield_core::voxel::VoxelOperator;
+use ndarray::Array3;
+use rayon::prelude::*;
+
+/// Voxels between two that PSNR looks at.
+const EVERY: usize = 4;
+
+/// Looks at a job's reference and held-out views; never learns from them.
+pub struct Watch<'a> {
+    reference: Option<&'a Array3<f32>>,
+    held_out: Option<&'a Scan>,
+    peak: f64,
+}
+
+impl<'a> Watch<'a> {
+    /// What `job` lets be watched.
+    pub fn new(job: &Job<'a>) -> Self {
+        let shape = job.scan.geometry.volume.shape;
+        let reference = job.reference.map(|r| &r.data).filter(|r| r.shape() == shape);
+        Self { reference, held_out: job.held_out, peak: job.peak }
+    }
+
+    /// PSNR in dB of `scale·volume` over every 4th voxel an axis.
+    pub fn psnr(&self, volume: &Array3<f32>, scale: f32) -> Option<f64> {
+        let reference = self.reference?;
+        let some = |a: &'a Array3<f32>| a.slice(ndarray::s![..;EVERY, ..;EVERY, ..;EVERY]);
+        let found = volume.slice(ndarray::s![..;EVERY, ..;EVERY, ..;EVERY]);
+        let square = |(a, b): (&f32, &f32)| (f64::from(a * scale) - f64::from(*b)).powi(2);
+        let mse = found.iter().zip(some(reference)).map(square).sum::<f64>() / found.len() as f64;
+        Some(10.0 * (self.peak * self.peak / mse.max(1e-300)).log10())
+    }
+
+    /// Root mean square error of the held-out views' line integrals over their largest value.
+    pub fn held_out(&self, operator: &dyn VoxelOperator<f32>, volume: &Array3<f32>) -> Option<f64> {
+        let scan = self.held_out?;
+        let geometry: &Geometry = &scan.geometry;
+        let [rows, columns] = geometry.detector;
+        let mut found = Array3::zeros((1, rows, columns));
+        let (mut square, mut top) = (0.0, 0.0f32);
+        for view in 0..geometry.views.len() {
+            operator.forward(geometry, &[view], volume.view(), found.view_mut());
+            for (a, &b) in found.iter().zip(scan.view(view)) {
+                square += f64::from(a - b).powi(2);
+                top = top.max(b);
+            }
+        }
+        Some((square / scan.projections.len() as f64).sqrt() / f64::from(top).max(1e-300))
+    }
+}
+
+/// Sum of squares, the same whatever the number of threads.
+pub fn square_sum(x: &[f32]) -> f64 {
+    let parts: Vec<f64> =
+        x.par_chunks(1 << 16).map(|c| c.iter().map(|&v| f64::from(v) * f64::from(v)).sum::<f64>()).collect();
+    parts.iter().sum()
+}
