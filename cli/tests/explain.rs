@@ -42,8 +42,10 @@ fn a_scan_adds_its_memory() {
     done(&["simulate", "phantom:head:16", "-o", &scan, "--views", "4", "--detector", "8x12"]);
     let e = json(&["explain", "naf", "--scan", &scan, "--json"]);
     let m = &e["scan"]["memory"];
-    assert_eq!(m["projections"], 4 * 4 * 8 * 12);
-    assert_eq!(m["volume"], 4 * 16 * 16 * 16);
+    assert_eq!(m["scan"], 4 * 4 * 8 * 12);
+    assert_eq!([&m["model"], &m["optimizer"]].map(|n| n.as_u64()), [e["model_bytes"].as_u64().map(|n| n / 2); 2]);
+    // The volume is written as it is evaluated.
+    assert_eq!(m["volume"], 0);
     assert_eq!(e["scan"]["samples_per_ray"], 320);
     let all = done(&["explain", "naf", "--scan", &scan]);
     assert!(all.contains("this scan: 4 views of 8 x 12, volume 16 x 16 x 16, 320 samples"), "{all}");
