@@ -127,10 +127,22 @@ pub(crate) fn grey(x: f32) -> Rgb<u8> {
 pub(crate) fn diverging(x: f32) -> Rgb<u8> {
     const ENDS: [[f32; 3]; 5] =
         [[10.0, 40.0, 110.0], [67.0, 140.0, 195.0], [250.0, 250.0, 250.0], [225.0, 110.0, 80.0], [110.0, 5.0, 30.0]];
-    let at = (x.clamp(-1.0, 1.0) + 1.0) * 2.0;
+    between(&ENDS, (x.clamp(-1.0, 1.0) + 1.0) / 2.0)
+}
+
+/// From dark violet at 0 over blue and green to yellow at 1, as light as the value is high (after viridis).
+pub(crate) fn sequential(x: f32) -> Rgb<u8> {
+    const ENDS: [[f32; 3]; 5] =
+        [[68.0, 1.0, 84.0], [59.0, 82.0, 139.0], [33.0, 145.0, 140.0], [94.0, 201.0, 98.0], [253.0, 231.0, 37.0]];
+    between(&ENDS, x.clamp(0.0, 1.0))
+}
+
+/// The colour at `x`, from 0 to 1, among colours at equal distances.
+fn between(ends: &[[f32; 3]; 5], x: f32) -> Rgb<u8> {
+    let at = x * 4.0;
     let low = (at as usize).min(3);
     let part = at - low as f32;
-    Rgb(std::array::from_fn(|k| (ENDS[low][k] + (ENDS[low + 1][k] - ENDS[low][k]) * part).round() as u8))
+    Rgb(std::array::from_fn(|k| (ends[low][k] + (ends[low + 1][k] - ends[low][k]) * part).round() as u8))
 }
 
 /// A number in as few characters as tell it from its neighbours.
@@ -156,6 +168,7 @@ mod tests {
     fn colours_are_symmetric_about_white() {
         assert_eq!(diverging(0.0), Rgb([250; 3]));
         assert_eq!((diverging(-9.0), diverging(9.0)), (Rgb([10, 40, 110]), Rgb([110, 5, 30])));
+        assert_eq!((sequential(-1.0), sequential(2.0)), (Rgb([68, 1, 84]), Rgb([253, 231, 37])));
         assert_eq!((grey(-1.0), grey(2.0), grey(f32::NAN)), (Rgb([0; 3]), Rgb([255; 3]), Rgb([0; 3])));
     }
 

@@ -53,7 +53,7 @@ const COLOURS: [RGBColor; 8] = [
     RGBColor(150, 150, 40),
 ];
 
-const FONT: &str = "sans-serif";
+pub(crate) const FONT: &str = "sans-serif";
 
 /// Draws named series of `(x, y)` points as lines, on linear axes. Points that are not finite leave a gap.
 pub fn curves_png(
@@ -226,7 +226,7 @@ fn emptiest(points: &[(f64, f64)], x: &Range<f64>, y: &Range<f64>, options: &Cur
 }
 
 /// Gives the plotting crate its one font, so that nothing depends on what the system has.
-fn register() {
+pub(crate) fn register() {
     static ONCE: Once = Once::new();
     ONCE.call_once(|| {
         for (style, bytes) in [(FontStyle::Normal, dejavu::sans::regular()), (FontStyle::Bold, dejavu::sans::bold())] {

@@ -45,6 +45,7 @@ mod scanner;
 mod size;
 mod slices;
 mod stack;
+pub mod survey;
 mod text;
 mod tiff;
 mod unit;
