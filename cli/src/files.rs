@@ -6,7 +6,8 @@ use conefield_core::pipeline::Model;
 use conefield_core::scan::{Scan, Volume};
 use conefield_core::trained::TrainedField;
 use conefield_core::{Error, Result};
-use conefield_io::{LineIntegralCheck, MiddleSlices};
+use conefield_io::MiddleSlices;
+use conefield_io::survey::{Survey, survey};
 use conefield_projectors::simulate::{PhantomKind, phantom_of};
 use std::collections::BTreeMap;
 use std::path::Path;
@@ -41,18 +42,18 @@ fn phantom(name: &str) -> Result<Option<(PhantomKind, usize)>> {
     }
 }
 
-/// Reads a scan and checks it.
+/// Reads a scan, checks it and warns of what will trouble a reconstruction.
 pub fn scan(path: &Path) -> Result<Scan> {
     let scan = conefield_io::read_scan(path)?;
     scan.validate(&path.display().to_string())?;
-    warn_of(path, &conefield_io::check_line_integrals(scan.projections.view()));
+    warn_of(path, &survey(&scan));
     Ok(scan)
 }
 
-/// Warns of a scan whose values hardly are line integrals.
-pub fn warn_of(path: &Path, check: &LineIntegralCheck) {
-    for complaint in &check.complaints {
-        tracing::warn!("{}: {complaint}", path.display());
+/// Warns of what will trouble a reconstruction.
+pub fn warn_of(path: &Path, survey: &Survey) {
+    for warning in &survey.warnings {
+        tracing::warn!("{}: {warning}", path.display());
     }
 }
 

@@ -2,11 +2,13 @@
 //!
 //! - Volumes: [`read_volume`], [`write_volume`], [`write_voxels`] (NIfTI, MetaImage, NumPy; a DICOM series in).
 //! - Scans: [`read_scan`], [`read_truth`], [`write_scan`] (conefield's own folder), [`read_r2`], [`write_r2`]
-//!   (R2-Gaussian's folder), [`read_naf`], [`write_naf`] (NAF's file).
+//!   (R2-Gaussian's folder), [`read_naf`], [`write_naf`] (NAF's file), [`write_rtk`] (for RTK); [`read_data_set`] also
+//!   reads test views.
 //! - Projections as scanners give them: [`read_scanner`] (a description in TOML; TIFF, NumPy, RTK's XML geometry).
 //! - Sizes, before memory is taken: [`scan_size`], [`volume_voxels`].
 //! - Weights: [`read_weights`], [`write_weights`]; checkpoints: [`read_checkpoint`], [`write_checkpoint`] (safetensors).
-//! - Pictures: [`slices_png`], [`compare_png`], [`curves_png`].
+//! - Pictures: [`slices_png`], [`compare_png`], [`curves_png`], [`survey::survey_png`].
+//! - What a scan's geometry means and what in it will trouble a reconstruction: [`survey`].
 //!
 //! Readers tell a format from what a file holds, check a header before they take memory for what it claims, and
 //! refuse with the file, the field, what was found and what was expected. Lengths are converted once, here: inside
@@ -39,6 +41,7 @@ mod pickle;
 mod r2;
 mod rays;
 mod rtk;
+mod rtk_folder;
 mod scan;
 mod scan_folder;
 mod scanner;
@@ -61,11 +64,12 @@ pub use checkpoint::{read_checkpoint, write_checkpoint};
 pub use counts::{Correction, CountsReport, OpenBeam, line_integrals};
 pub use curves::{Corner, CurveOptions, curves_png, curves_png_with};
 pub use file_order::{PACKED_BYTES, SLAB_BYTES};
-pub use naf::{NafScan, read_naf, write_naf};
+pub use naf::{read_naf, write_naf};
 pub use orbit::Orbit;
-pub use r2::{R2Scan, read_r2, write_r2};
-pub use rtk::{read_rtk, write_rtk};
-pub use scan::{read_scan, read_truth};
+pub use r2::{read_r2, write_r2};
+pub use rtk::{read_rtk_geometry, write_rtk_geometry};
+pub use rtk_folder::write_rtk;
+pub use scan::{DataSet, read_data_set, read_scan, read_truth};
 pub use scan_folder::write_scan;
 pub use scanner::{I0, ImportOptions, Imported, read_scanner};
 pub use size::{ScanSize, scan_size, volume_voxels};

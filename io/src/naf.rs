@@ -6,6 +6,7 @@
 //! see [`read_naf`].
 
 use crate::orbit::Orbit;
+use crate::scan::DataSet;
 use crate::pickle::{self, Item, Out, Pickle};
 use crate::unit::{self, Reading, Units};
 use crate::{rays, write_atomic};
@@ -47,17 +48,6 @@ const READINGS: [Reading; 2] = [
     },
 ];
 
-/// What a NAF file holds.
-#[derive(Debug, Clone)]
-pub struct NafScan {
-    /// The views to reconstruct from (`train`).
-    pub train: Scan,
-    /// Views kept apart for testing (`val`).
-    pub test: Option<Scan>,
-    /// The volume they were simulated from (`image`), in `1/unit` of the scan.
-    pub volume: Option<Volume>,
-}
-
 /// Reads a scan of NAF, SAX-NeRF or TIGRE's demos: training views, `val` views and `image`.
 ///
 /// Lengths are mm and angles radians; a warning says so where angles look like degrees. The unit of `image` is not
@@ -71,7 +61,7 @@ pub struct NafScan {
 ///
 /// Nothing in the file is ever called. Names other than those of NumPy's arrays, missing or misspelt keys, shapes that
 /// do not fit each other and values that are not finite are refused with the byte or the key.
-pub fn read_naf(path: impl AsRef<Path>) -> Result<NafScan> {
+pub fn read_naf(path: impl AsRef<Path>) -> Result<DataSet> {
     read(path.as_ref(), true)
 }
 
@@ -90,7 +80,7 @@ pub(crate) fn read_truth(path: &Path) -> Result<Option<Volume>> {
     Ok(data.map(|data| Volume { data, grid: file.grid, affine: None }))
 }
 
-fn read(path: &Path, with_test: bool) -> Result<NafScan> {
+fn read(path: &Path, with_test: bool) -> Result<DataSet> {
     let place = path.display().to_string();
     let bytes = pickle::read_bytes(path)?;
     let pickle = Pickle::parse(&place, &bytes)?;
@@ -140,7 +130,7 @@ fn read(path: &Path, with_test: bool) -> Result<NafScan> {
         s.validate(&place)?;
     }
     let volume = data.map(|data| Volume { data, grid: train.geometry.volume, affine: None });
-    Ok(NafScan { train, test, volume })
+    Ok(DataSet { train, test, volume })
 }
 
 /// The entries that hold for all views, in mm.

@@ -7,6 +7,7 @@
 
 use crate::input::read_text;
 use crate::orbit::Orbit;
+use crate::scan::DataSet;
 use crate::text::{Notation, parse};
 use crate::unit::{self, Reading, Units};
 use crate::{ScanSize, folder, npy, rays, write_atomic, write_folder_atomic, write_text_atomic};
@@ -21,17 +22,6 @@ use std::path::Path;
 
 /// The file that describes the folder.
 pub(crate) const META: &str = "meta_data.json";
-
-/// What an R2-Gaussian folder holds.
-#[derive(Debug, Clone)]
-pub struct R2Scan {
-    /// The views to reconstruct from.
-    pub train: Scan,
-    /// Views kept apart for testing.
-    pub test: Option<Scan>,
-    /// The volume they were simulated from, in `1/unit` of the scan.
-    pub volume: Option<Volume>,
-}
 
 #[derive(Deserialize)]
 struct Meta {
@@ -74,16 +64,16 @@ struct Scanner {
 /// tells: where its values times the lengths of the file give the projections, as in the published data, the unit
 /// is called `r2` and taken for 1 mm; where the projections are a thousand times larger, the lengths are metres and
 /// the volume is in 1/mm. Anything else is taken as the first case, with a warning.
-pub fn read_r2(path: impl AsRef<Path>) -> Result<R2Scan> {
+pub fn read_r2(path: impl AsRef<Path>) -> Result<DataSet> {
     read(path.as_ref(), true)
 }
 
 /// As [`read_r2`], without the test views.
-pub(crate) fn read_train(folder: &Path) -> Result<R2Scan> {
+pub(crate) fn read_train(folder: &Path) -> Result<DataSet> {
     read(folder, false)
 }
 
-fn read(folder: &Path, with_test: bool) -> Result<R2Scan> {
+fn read(folder: &Path, with_test: bool) -> Result<DataSet> {
     let file = folder.join(META);
     let place = file.display().to_string();
     let meta: Meta = parse(&file, &read_text(&file)?, Notation::Json)?;
@@ -123,7 +113,7 @@ fn read(folder: &Path, with_test: bool) -> Result<R2Scan> {
         s.validate(&place)?;
     }
     let volume = data.map(|data| Volume { data, grid: train.geometry.volume, affine: None });
-    Ok(R2Scan { train, test, volume })
+    Ok(DataSet { train, test, volume })
 }
 
 /// The size of the folder's training views. While it is read, a list of values that grows may hold as many again, and
@@ -132,10 +122,11 @@ pub(crate) fn size(folder: &Path) -> Result<ScanSize> {
     let file = folder.join(META);
     let meta: Meta = parse(&file, &read_text(&file)?, Notation::Json)?;
     let product = |all: &[usize]| all.iter().fold(1u64, |n, &s| n.saturating_mul(s as u64));
-    let pixels = product(&meta.scanner.nDetector).saturating_mul(meta.proj_train.len() as u64);
+    let pixels_of = |frames: &[Frame]| product(&meta.scanner.nDetector).saturating_mul(frames.len() as u64);
+    let (pixels, test_pixels) = (pixels_of(&meta.proj_train), pixels_of(&meta.proj_test));
     let voxels = product(&meta.scanner.nVoxel);
     let volume = if meta.vol.is_some() { voxels } else { 0 };
-    Ok(ScanSize { pixels, voxels, reading: 4 * pixels.max(volume) })
+    Ok(ScanSize { pixels, voxels, test_pixels, reading: 4 * pixels.max(volume) })
 }
 
 /// What the numbers of a folder that does not name its unit can mean.

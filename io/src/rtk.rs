@@ -141,7 +141,7 @@ impl Projection {
 ///
 /// As in RTK, a number that a projection does not give is that of the projection before. A matrix that does not fit
 /// the numbers, a cylindrical detector and a parallel beam are refused.
-pub fn read_rtk(path: impl AsRef<Path>, pixel: [f64; 2], offset: [f64; 2]) -> Result<Vec<View>> {
+pub fn read_rtk_geometry(path: impl AsRef<Path>, pixel: [f64; 2], offset: [f64; 2]) -> Result<Vec<View>> {
     let path = path.as_ref();
     let place = path.display().to_string();
     let text = read_text(path)?;
@@ -226,7 +226,7 @@ fn check_matrix(place: &str, node: Node, projection: &Projection) -> Result<()> 
 /// then be flipped for RTK. Refuses detectors whose rows and columns are not at right angles, views of which only
 /// some have reversed rows, and numbers that are not finite. Pixels are the image's affair in RTK; its centre is the
 /// detector's point (0, 0).
-pub fn write_rtk(path: impl AsRef<Path>, views: &[View]) -> Result<bool> {
+pub fn write_rtk_geometry(path: impl AsRef<Path>, views: &[View]) -> Result<bool> {
     let path = path.as_ref();
     let place = path.display().to_string();
     let mut text = format!("<?xml version=\"1.0\"?>\n<!DOCTYPE RTKGEOMETRY>\n<{ROOT} version=\"3\">\n");
@@ -315,7 +315,7 @@ mod tests {
         let dir = tempfile::tempdir().unwrap();
         let path = dir.path().join("geometry.xml");
         std::fs::write(&path, text).unwrap();
-        read_rtk(&path, [1.0, 1.0], [0.0; 2])
+        read_rtk_geometry(&path, [1.0, 1.0], [0.0; 2])
     }
 
     #[test]
@@ -364,21 +364,21 @@ mod tests {
             detector: [4.0, i as f64],
         };
         let views: Vec<View> = (0..12).map(|i| tilted(i).view([2.0, 1.5], [0.0; 2])).collect();
-        assert!(!write_rtk(&path, &views).unwrap());
-        let back = read_rtk(&path, [2.0, 1.5], [0.0; 2]).unwrap();
+        assert!(!write_rtk_geometry(&path, &views).unwrap());
+        let back = read_rtk_geometry(&path, [2.0, 1.5], [0.0; 2]).unwrap();
         assert!(views.iter().zip(&back).all(|(a, b)| same(a, b)), "{views:?} {back:?}");
         // Our own circles have their rows the other way.
         let views = scan().geometry.views;
-        assert!(write_rtk(&path, &views).unwrap());
-        let back = read_rtk(&path, [2.0, 1.5], [0.0; 2]).unwrap();
+        assert!(write_rtk_geometry(&path, &views).unwrap());
+        let back = read_rtk_geometry(&path, [2.0, 1.5], [0.0; 2]).unwrap();
         let flipped: Vec<View> = back.iter().map(|b| View { v: b.v.map(|x| -x), ..*b }).collect();
         assert!(views.iter().zip(&flipped).all(|(a, b)| same(a, b)), "{views:?} {flipped:?}");
         let mut askew = views.clone();
         askew[3].u[2] = 0.5;
-        assert!(write_rtk(&path, &askew).unwrap_err().to_string().contains("views[3]"));
+        assert!(write_rtk_geometry(&path, &askew).unwrap_err().to_string().contains("views[3]"));
         let mut mixed = views;
         mixed[2].v = mixed[2].v.map(|x| -x);
-        assert!(write_rtk(&path, &mixed).unwrap_err().to_string().contains("views[2]"));
+        assert!(write_rtk_geometry(&path, &mixed).unwrap_err().to_string().contains("views[2]"));
     }
 
     #[test]

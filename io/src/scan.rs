@@ -1,9 +1,24 @@
 //! The door for scans: which format a folder or file is in.
 
-use crate::{naf, pickle, r2, scan_folder};
+use crate::text::format_of;
+use crate::{ImportOptions, naf, pickle, r2, scan_folder, scanner};
 use conefield_core::scan::{Scan, Volume};
 use conefield_core::{Error, Result};
 use std::path::{Path, PathBuf};
+
+/// The description of a scanner's images that is found by its folder's name.
+pub(crate) const SCANNER: &str = "scanner.toml";
+
+/// All that a file or folder holds of one scan.
+#[derive(Debug, Clone)]
+pub struct DataSet {
+    /// The views to reconstruct from.
+    pub train: Scan,
+    /// Views kept apart for testing.
+    pub test: Option<Scan>,
+    /// The volume that it was simulated from, in `1/unit` of the scan.
+    pub volume: Option<Volume>,
+}
 
 /// A scan on disk.
 pub(crate) enum Found {
@@ -13,16 +28,31 @@ pub(crate) enum Found {
     R2(PathBuf),
     /// NAF's file.
     Naf(PathBuf),
+    /// The description of what a scanner gave.
+    Scanner(PathBuf),
 }
 
 /// Reads a scan from conefield's own folder (`scan.toml` or `scan.json`), R2-Gaussian's (`meta_data.json`, the training
-/// views) or NAF's pickle (the training views), whatever that is called. For folders, the file that describes them may
-/// be named as well.
+/// views), NAF's pickle (the training views), whatever that is called, or what a scanner gave as its description says
+/// (`scanner.toml`, see [`read_scanner`](crate::read_scanner)). For folders, the file that describes them may be named
+/// as well.
 pub fn read_scan(path: impl AsRef<Path>) -> Result<Scan> {
     match find(path.as_ref())? {
         Found::Own(file) => scan_folder::read(&file),
         Found::R2(folder) => r2::read_train(&folder).map(|r| r.train),
         Found::Naf(file) => naf::read_train(&file),
+        Found::Scanner(file) => scanner::read_scanner(&file, &ImportOptions::default()).map(|i| i.scan),
+    }
+}
+
+/// Reads all that the scan's file or folder holds: training views, test views and volume.
+pub fn read_data_set(path: impl AsRef<Path>) -> Result<DataSet> {
+    match find(path.as_ref())? {
+        Found::R2(folder) => r2::read_r2(&folder),
+        Found::Naf(file) => naf::read_naf(&file),
+        Found::Own(_) | Found::Scanner(_) => {
+            Ok(DataSet { train: read_scan(&path)?, test: None, volume: read_truth(&path)? })
+        }
     }
 }
 
@@ -32,23 +62,28 @@ pub fn read_truth(path: impl AsRef<Path>) -> Result<Option<Volume>> {
         Found::Own(file) => scan_folder::read_truth(&file),
         Found::R2(folder) => r2::read_train(&folder).map(|r| r.volume),
         Found::Naf(file) => naf::read_truth(&file),
+        Found::Scanner(_) => Ok(None),
     }
 }
 
 pub(crate) fn find(path: &Path) -> Result<Found> {
     let place = path.display().to_string();
-    let understood = "a folder with scan.toml or scan.json (conefield) or with meta_data.json (R2-Gaussian), \
-                      or a pickle (NAF)";
+    let understood = "a folder with scan.toml or scan.json (conefield), scanner.toml (a scanner's images) or \
+                      meta_data.json (R2-Gaussian), or a pickle (NAF)";
     let info = path.metadata().map_err(|e| Error::io(path, e))?;
     if !info.is_dir() {
         if info.is_file() && pickle::is_pickle(path)? {
             return Ok(Found::Naf(path.to_path_buf()));
         }
-        let name = path.file_name().and_then(|n| n.to_str()).unwrap_or_default();
         let folder = path.parent().filter(|p| !p.as_os_str().is_empty()).unwrap_or(Path::new("."));
-        return match name {
-            "scan.toml" | "scan.json" => Ok(Found::Own(path.to_path_buf())),
-            "meta_data.json" => Ok(Found::R2(folder.to_path_buf())),
+        return match (path.file_name().and_then(|n| n.to_str()), path.extension().and_then(|e| e.to_str())) {
+            (Some("scan.toml" | "scan.json"), _) => Ok(Found::Own(path.to_path_buf())),
+            (Some(r2::META), _) => Ok(Found::R2(folder.to_path_buf())),
+            (_, Some("toml" | "json")) => match format_of(path).as_deref() {
+                Some(scan_folder::FORMAT) => Ok(Found::Own(path.to_path_buf())),
+                // Its reader says what it misses in a description.
+                _ => Ok(Found::Scanner(path.to_path_buf())),
+            },
             _ => Err(Error::invalid(place, "scan", "a file of another kind", understood)),
         };
     }
@@ -58,6 +93,7 @@ pub(crate) fn find(path: &Path) -> Result<Found> {
         (true, ..) => Ok(Found::Own(path.join("scan.toml"))),
         (_, true, _) => Ok(Found::Own(path.join("scan.json"))),
         (.., true) => Ok(Found::R2(path.to_path_buf())),
+        _ if has(SCANNER) => Ok(Found::Scanner(path.join(SCANNER))),
         _ => Err(Error::invalid(place, "scan", "none of the files that describe one", understood)),
     }
 }

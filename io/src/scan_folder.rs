@@ -22,9 +22,8 @@
 //! ```
 
 use crate::folder;
-use crate::input::read_text;
 use crate::orbit::Orbit;
-use crate::text::{Notation, parse};
+use crate::text::described;
 use crate::{ScanSize, npy, read_volume, write_atomic, write_folder_atomic, write_text_atomic, write_volume};
 use conefield_core::error::ensure;
 use conefield_core::geometry::{Geometry, View, VoxelGrid};
@@ -34,20 +33,13 @@ use ndarray::Ix3;
 use serde::{Deserialize, Serialize};
 use std::path::Path;
 
-const FORMAT: &str = "conefield-scan";
+pub(crate) const FORMAT: &str = "conefield-scan";
 const VERSION: u32 = 1;
 const PROJECTIONS: &str = "projections.npy";
 const TRUTH: &str = "truth.nii.gz";
 
 /// More views than any scanner takes; a larger `count` is a slip and would only fill memory.
 const MOST_VIEWS: usize = 1_000_000;
-
-/// Only what tells whether the rest can be understood at all.
-#[derive(Deserialize)]
-struct Mark {
-    format: Option<String>,
-    version: Option<u32>,
-}
 
 #[derive(Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
@@ -95,19 +87,7 @@ struct OrbitTable {
 }
 
 fn describe(file: &Path) -> Result<Description> {
-    let text = read_text(file)?;
-    let place = file.display().to_string();
-    let notation = Notation::of(file);
-    // Before the keys are checked: a later version may well have others.
-    let mark: Mark = parse(file, &text, notation)?;
-    let format = mark.format.unwrap_or_else(|| "nothing".into());
-    ensure(format == FORMAT, &place, "format", format!("\"{format}\""), format!("\"{FORMAT}\""))?;
-    match mark.version {
-        Some(VERSION) => {}
-        Some(v) => return Err(Error::invalid(place, "version", v, format!("{VERSION}, which this build reads"))),
-        None => return Err(Error::invalid(place, "version", "nothing", VERSION.to_string())),
-    }
-    parse(file, &text, notation)
+    described(file, FORMAT, VERSION)
 }
 
 fn views(place: &str, d: &mut Description) -> Result<Vec<View>> {
@@ -183,7 +163,7 @@ pub(crate) fn size(file: &Path) -> Result<ScanSize> {
     d.volume.validate(&place)?;
     let pixels = [views(&place, &mut d)?.len(), d.detector.rows, d.detector.columns];
     let pixels = pixels.iter().fold(1u64, |n, &s| n.saturating_mul(s as u64));
-    Ok(ScanSize { pixels, voxels: d.volume.len().unwrap_or(0) as u64, reading: 0 })
+    Ok(ScanSize { pixels, voxels: d.volume.len().unwrap_or(0) as u64, test_pixels: 0, reading: 0 })
 }
 
 /// Reads the volume that the scan of `file` was simulated from.

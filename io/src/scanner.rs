@@ -5,7 +5,7 @@
 //! version = 1
 //!
 //! [files]                            # beside or below this file
-//! projections = "scan.npz:counts"    # TIFF, .npy, .npz:ARRAY, a folder of images, or a list of those
+//! projections = "scan.npz:counts"    # TIFF, .npy, .npz:ARRAY, .mha, a folder of images, or a list of those
 //! flat = "scan.npz:flat"             # optional: the open beam; several images are averaged
 //! dark = "scan.npz:dark"             # optional: no beam
 //!
@@ -37,26 +37,26 @@
 //!
 //! `[vectors]` has `cone_vec = [[...], ...]`, ASTRA's twelve numbers a view: source, detector centre, the step to the
 //! next column (u) and to the next row (v), all in mm here. `[rtk]` has `file`, `pixel` and `offset`; see
-//! [`read_rtk`]. All lengths are mm; angles are degrees, as their keys say.
+//! [`read_rtk_geometry`]. All lengths are mm; angles are degrees, as their keys say.
 
 use crate::check::{LineIntegralCheck, check_line_integrals};
 use crate::counts::{Correction, CountsReport, OpenBeam, line_integrals};
-use crate::input::read_text;
 use crate::orbit::Orbit;
-use crate::rtk::read_rtk;
+use crate::rtk::read_rtk_geometry;
 use crate::stack::{self, Layout, Names, StackAxis};
-use crate::text::{Notation, parse};
-use crate::{folder, scan_folder};
+use crate::text::described;
+use crate::{ScanSize, folder, scan_folder};
 use conefield_core::error::ensure;
 use conefield_core::geometry::{Geometry, View, VoxelGrid};
 use conefield_core::scan::{Scan, Unit};
 use conefield_core::{Error, Result};
+use ndarray::{Array3, Axis};
 use serde::{Deserialize, Serialize};
 use serde_json::json;
 use std::path::Path;
 
-const FORMAT: &str = "conefield-scanner";
-const VERSION: u32 = 1;
+pub(crate) const FORMAT: &str = "conefield-scanner";
+pub(crate) const VERSION: u32 = 1;
 
 /// The counts of the open beam where no flat field says them.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -85,12 +85,6 @@ pub struct Imported {
     pub counts: Option<CountsReport>,
     /// Whether the result looks like line integrals.
     pub check: LineIntegralCheck,
-}
-
-#[derive(Deserialize)]
-struct Mark {
-    format: Option<String>,
-    version: Option<u32>,
 }
 
 #[derive(Deserialize)]
@@ -212,7 +206,7 @@ struct Values {
 pub fn read_scanner(path: impl AsRef<Path>, options: &ImportOptions) -> Result<Imported> {
     let path = path.as_ref();
     let place = path.display().to_string();
-    let d = describe(path)?;
+    let d: Description = described(path, FORMAT, VERSION)?;
     let folder = scan_folder::folder_of(path);
     d.volume.validate(&place)?;
     let layout = layout(&place, &d.layout)?;
@@ -245,6 +239,7 @@ pub fn read_scanner(path: impl AsRef<Path>, options: &ImportOptions) -> Result<I
         let (a, report) = line_integrals(values, &correction, &place)?;
         (a, Some(report))
     };
+    let (geometry, projections) = rows_down(geometry, projections);
     let check = check_line_integrals(projections.view());
     let provenance = json!({
         "format": "scanner",
@@ -257,17 +252,26 @@ pub fn read_scanner(path: impl AsRef<Path>, options: &ImportOptions) -> Result<I
     Ok(Imported { scan, counts, check })
 }
 
-fn describe(path: &Path) -> Result<Description> {
-    let text = read_text(path)?;
+/// The size of the scan that the description `path` leads to. Arranging the values and converting counts take copies.
+pub(crate) fn size(path: &Path) -> Result<ScanSize> {
     let place = path.display().to_string();
-    let notation = Notation::of(path);
-    // Before the keys are checked: a later version may well have others.
-    let mark: Mark = parse(path, &text, notation)?;
-    let format = mark.format.unwrap_or_else(|| "nothing".into());
-    ensure(format == FORMAT, &place, "format", format!("\"{format}\""), format!("\"{FORMAT}\""))?;
-    let version = mark.version.map_or("nothing".into(), |v| v.to_string());
-    ensure(mark.version == Some(VERSION), &place, "version", version, VERSION.to_string())?;
-    parse(path, &text, notation)
+    let d: Description = described(path, FORMAT, VERSION)?;
+    d.volume.validate(&place)?;
+    let folder = scan_folder::folder_of(path);
+    let pixels = stack::values(folder, &place, "files.projections", &d.files.projections)?;
+    Ok(ScanSize { pixels, voxels: d.volume.len().unwrap_or(0) as u64, test_pixels: 0, reading: pixels.saturating_mul(8) })
+}
+
+/// Turns the rows round where that makes the views one of this program's own circles, on which rows run down: what
+/// knows only those can then take the scan. RTK's rows run up.
+fn rows_down(mut geometry: Geometry, mut projections: Array3<f32>) -> (Geometry, Array3<f32>) {
+    let turned: Vec<View> = geometry.views.iter().map(|w| View { v: w.v.map(|x| 0.0 - x), ..*w }).collect();
+    if Orbit::fit(&turned).is_some() {
+        geometry.views = turned;
+        projections.invert_axis(Axis(1));
+        projections = projections.as_standard_layout().into_owned();
+    }
+    (geometry, projections)
 }
 
 fn layout(place: &str, table: &LayoutTable) -> Result<Layout> {
@@ -340,7 +344,7 @@ fn views(folder: &Path, place: &str, d: &Description, count: usize) -> Result<Ve
         (None, None, Some(r)) => {
             lengths(place, "rtk", r.pixel, r.offset)?;
             let file = folder::inside(folder, place, "rtk.file", &r.file)?;
-            let views = read_rtk(file, [r.pixel.v, r.pixel.u], [r.offset.v, r.offset.u])?;
+            let views = read_rtk_geometry(file, [r.pixel.v, r.pixel.u], [r.offset.v, r.offset.u])?;
             fits("rtk.file", views.len())?;
             Ok(views)
         }

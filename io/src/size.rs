@@ -2,7 +2,7 @@
 
 use crate::scan::{self, Found};
 use crate::volume::{self, Opened};
-use crate::{dicom, metaimage, nifti, npy, r2, scan_folder};
+use crate::{dicom, metaimage, nifti, npy, r2, scan_folder, scanner};
 use conefield_core::{Error, Result};
 use std::path::Path;
 
@@ -13,20 +13,25 @@ pub struct ScanSize {
     pub pixels: u64,
     /// Voxels to reconstruct. Of a pickle at most so many.
     pub voxels: u64,
+    /// Measured values of test views, which only [`read_data_set`](crate::read_data_set) reads. Of a pickle they are
+    /// among `pixels`.
+    pub test_pixels: u64,
     /// Bytes that reading takes beside the projections.
     pub reading: u64,
 }
 
 /// The size of a scan, from what describes it; its projections are not read. A pickle (NAF) tells its sizes only when
-/// it is read: all of the file is taken for 32-bit projections, and for voxels as well.
+/// it is read: all of the file is taken for 32-bit projections, and for voxels as well. Of a scanner's images only
+/// NumPy's and MetaImage's headers are read; other files are taken for one byte a value.
 pub fn scan_size(path: impl AsRef<Path>) -> Result<ScanSize> {
     match scan::find(path.as_ref())? {
         Found::Own(file) => scan_folder::size(&file),
         Found::R2(folder) => r2::size(&folder),
         Found::Naf(file) => {
             let bytes = file_bytes(&file)?;
-            Ok(ScanSize { pixels: bytes / 4, voxels: bytes / 4, reading: bytes })
+            Ok(ScanSize { pixels: bytes / 4, voxels: bytes / 4, test_pixels: 0, reading: bytes })
         }
+        Found::Scanner(file) => scanner::size(&file),
     }
 }
 
@@ -46,7 +51,7 @@ pub fn volume_voxels(path: impl AsRef<Path>) -> Result<u64> {
     Ok(shape.iter().fold(1, |n, &s| n.saturating_mul(s as u64)))
 }
 
-fn file_bytes(path: &Path) -> Result<u64> {
+pub(crate) fn file_bytes(path: &Path) -> Result<u64> {
     path.metadata().map(|m| m.len()).map_err(|e| Error::io(path, e))
 }
 
@@ -75,9 +80,12 @@ mod tests {
         let s = scan();
         let (pixels, voxels) = (s.projections.len() as u64, s.geometry.volume.len().unwrap() as u64);
         crate::write_scan(at("own"), &s, None).unwrap();
-        assert_eq!(scan_size(at("own")).unwrap(), ScanSize { pixels, voxels, reading: 0 });
-        crate::write_r2(at("r2"), &s, None, None).unwrap();
-        assert_eq!(scan_size(at("r2")).unwrap(), ScanSize { pixels, voxels, reading: 4 * pixels });
+        assert_eq!(scan_size(at("own")).unwrap(), ScanSize { pixels, voxels, test_pixels: 0, reading: 0 });
+        crate::write_r2(at("r2"), &s, Some(&s), None).unwrap();
+        let want = ScanSize { pixels, voxels, test_pixels: pixels, reading: 4 * pixels };
+        assert_eq!(scan_size(at("r2")).unwrap(), want);
+        crate::write_rtk(at("rtk"), &s).unwrap();
+        assert_eq!(scan_size(at("rtk")).unwrap(), ScanSize { test_pixels: 0, reading: 8 * pixels, ..want });
         crate::write_naf(at("naf.pickle"), &s, None, None).unwrap();
         let naf = scan_size(at("naf.pickle")).unwrap();
         assert!(naf.pixels >= pixels && naf.reading >= 4 * pixels, "{naf:?}");

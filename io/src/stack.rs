@@ -1,11 +1,15 @@
-//! Stacks of projections and single fields, from TIFF, `.npy` and `.npz`, brought into the order `[view, row, column]`.
+//! Stacks of projections and single fields, from TIFF, `.npy`, `.npz` and MetaImage, brought into the order `[view, row, column]`.
 
 use crate::input::Input;
-use crate::{folder, npy, npz, tiff};
+use crate::size::file_bytes;
+use crate::{folder, metaimage, npy, npz, tiff};
 use conefield_core::{Error, Result};
 use ndarray::{Array2, Array3, ArrayD, Axis, Ix3};
 use serde::{Deserialize, Serialize};
 use std::path::{Path, PathBuf};
+
+/// Bytes in which a MetaImage has said what it is.
+const LINES: usize = 256;
 
 /// One axis of a stack.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
@@ -91,6 +95,32 @@ pub(crate) fn read(folder: &Path, place: &str, field: &str, names: &Names, layou
         .map_err(|e| Error::invalid(place, field, e, "one image a view"))
 }
 
+/// How many values [`read`] gives, from the headers of NumPy's and MetaImage's files; of others as many as they have
+/// bytes.
+pub(crate) fn values(folder: &Path, place: &str, field: &str, names: &Names) -> Result<u64> {
+    let product = |all: &[usize]| all.iter().fold(1u64, |n, &s| n.saturating_mul(s as u64));
+    let mut sum = 0u64;
+    for Source { path, .. } in sources(folder, place, field, names)? {
+        let mut input = Input::open(&path)?;
+        let head = input.take(8)?;
+        sum = sum.saturating_add(if head.starts_with(npy::MAGIC) {
+            product(&npy::shape(&mut input, head)?)
+        } else if is_metaimage(&mut input, &head)? {
+            product(&metaimage::shape(&path)?)
+        } else {
+            file_bytes(&path)?
+        });
+    }
+    Ok(sum)
+}
+
+/// Whether a file that starts with `head` goes on as a MetaImage.
+fn is_metaimage(input: &mut Input, head: &[u8]) -> Result<bool> {
+    let mut lines = head.to_vec();
+    lines.extend(input.take(LINES)?);
+    Ok(metaimage::is_header(&lines))
+}
+
 /// Reads a flat or dark field `[row, column]`: the mean of its images.
 pub(crate) fn read_field(
     folder: &Path,
@@ -124,17 +154,21 @@ fn raw(source: &Source, views: usize) -> Result<Array3<f32>> {
     if head.starts_with(npy::MAGIC) {
         return three(npy::read_one_of(&mut input, head, sets)?);
     }
+    // Pages, and slices of MetaImage, are always views: they go where the layout expects them.
+    let pages = |a: Array3<f32>| match views {
+        1 => a.permuted_axes([1, 0, 2]),
+        2 => a.permuted_axes([1, 2, 0]),
+        _ => a,
+    };
     if tiff::is_tiff(&head) {
-        let mut pages = tiff::read(path)?;
-        // Pages are always views: put them where the layout expects them.
-        if views == 1 {
-            pages.swap_axes(0, 1);
-        } else if views == 2 {
-            pages = pages.permuted_axes([1, 2, 0]);
-        }
-        return Ok(pages);
+        return Ok(pages(tiff::read(path)?));
     }
-    let expected = "TIFF (49 49 2a 00 or 4d 4d 00 2a), NumPy's .npy (93 4e 55 4d) or .npz (50 4b 03 04)";
+    if is_metaimage(&mut input, &head)? {
+        // Columns are its x, rows its y.
+        return Ok(pages(metaimage::read(path)?.data.reversed_axes()));
+    }
+    let expected = "TIFF (49 49 2a 00 or 4d 4d 00 2a), NumPy's .npy (93 4e 55 4d) or .npz (50 4b 03 04), or MetaImage \
+                    (NDims = 3)";
     Err(Error::invalid(place, "format", format!("{head:02x?} at the start"), expected))
 }
 

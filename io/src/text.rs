@@ -1,6 +1,9 @@
 //! TOML and JSON with errors that name the line and, for an unknown key, the nearest valid one.
 
+use crate::input::read_text;
+use conefield_core::error::ensure;
 use conefield_core::{Error, Result};
+use serde::Deserialize;
 use serde::de::DeserializeOwned;
 use std::path::Path;
 
@@ -17,6 +20,33 @@ impl Notation {
         let json = path.extension().is_some_and(|e| e.eq_ignore_ascii_case("json"));
         if json { Self::Json } else { Self::Toml }
     }
+}
+
+/// What tells whether a description can be understood at all.
+#[derive(Default, Deserialize)]
+struct Mark {
+    format: Option<String>,
+    version: Option<u32>,
+}
+
+/// The format that the file `path` says it has, if it is a description at all.
+pub(crate) fn format_of(path: &Path) -> Option<String> {
+    let mark: Mark = parse(path, &read_text(path).ok()?, Notation::of(path)).ok()?;
+    mark.format
+}
+
+/// Reads the description `path`, which must say `format` and `version`.
+pub(crate) fn described<T: DeserializeOwned>(path: &Path, format: &str, version: u32) -> Result<T> {
+    let text = read_text(path)?;
+    let place = path.display().to_string();
+    let notation = Notation::of(path);
+    // Before the keys are checked: a later version may well have others.
+    let mark: Mark = parse(path, &text, notation)?;
+    let found = mark.format.unwrap_or_else(|| "nothing".into());
+    ensure(found == format, &place, "format", format!("\"{found}\""), format!("\"{format}\""))?;
+    let found = mark.version.map_or("nothing".into(), |v| v.to_string());
+    ensure(mark.version == Some(version), &place, "version", found, format!("{version}, which this build reads"))?;
+    parse(path, &text, notation)
 }
 
 /// Parses `text`, the content of `path`.

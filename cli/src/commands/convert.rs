@@ -5,12 +5,14 @@ use crate::parse::{self, Values};
 use crate::{files, out};
 use clap::{Args, ValueEnum};
 use conefield_core::{Error, Result};
+use conefield_io::DataSet;
+use conefield_io::survey::survey;
 use std::path::PathBuf;
 
 /// Rewrite a volume or a scan in another format.
 ///
 /// Volumes: NIfTI (.nii, .nii.gz), MetaImage (.mha) and NumPy (.npy), by the name of OUT; IN may also be a .mhd or the
-/// folder of a DICOM series. Scans: as --to says.
+/// folder of a DICOM series. Scans: as --to says; test views are kept where the format has a place for them (r2, naf).
 #[derive(Args)]
 pub struct Convert {
     /// A volume or a scan.
@@ -39,6 +41,8 @@ enum ScanFormat {
     R2,
     /// The one file (a pickle) of NAF and SAX-NeRF.
     Naf,
+    /// A folder for RTK: projections.mha and geometry.xml, with scanner.toml to read it here again.
+    Rtk,
 }
 
 impl Convert {
@@ -52,18 +56,34 @@ impl Convert {
             conefield_io::write_volume(&self.output, &volume)?;
         } else {
             let size = conefield_io::scan_size(&self.input)?;
-            let scan = Memory { scan: 4 * size.pixels + size.reading, ..Memory::default() };
-            let truth = Memory { scan: 4 * size.pixels, volume: 8 * size.voxels, ..Memory::default() };
-            Memory::most(&[scan, truth]).check(|_| vec![])?;
-            let scan = files::scan(&self.input)?;
-            let truth = conefield_io::read_truth(&self.input)?;
+            let scan = 4 * (size.pixels + size.test_pixels);
+            let reading = Memory { scan: scan + size.reading, volume: 4 * size.voxels, ..Memory::default() };
+            let truth = Memory { scan, volume: 8 * size.voxels, ..Memory::default() };
+            Memory::most(&[reading, truth]).check(|_| vec![])?;
+            let data = conefield_io::read_data_set(&self.input)?;
+            files::warn_of(&self.input, &survey(&data.train));
+            self.tell_lost(&data);
+            let (scan, test, truth) = (&data.train, data.test.as_ref(), data.volume.as_ref());
             match self.to {
-                ScanFormat::Conefield => conefield_io::write_scan(&self.output, &scan, truth.as_ref())?,
-                ScanFormat::R2 => conefield_io::write_r2(&self.output, &scan, None, truth.as_ref())?,
-                ScanFormat::Naf => conefield_io::write_naf(&self.output, &scan, None, truth.as_ref())?,
+                ScanFormat::Conefield => conefield_io::write_scan(&self.output, scan, truth)?,
+                ScanFormat::R2 => conefield_io::write_r2(&self.output, scan, test, truth)?,
+                ScanFormat::Naf => conefield_io::write_naf(&self.output, scan, test, truth)?,
+                ScanFormat::Rtk => conefield_io::write_rtk(&self.output, scan)?,
             }
         }
         out::say(&self.output.display().to_string())
+    }
+
+    /// Warns of what the format has no place for.
+    fn tell_lost(&self, data: &DataSet) {
+        let lost = |what: String| tracing::warn!("{}: {what}", self.output.display());
+        if let Some(test) = data.test.as_ref().filter(|_| matches!(self.to, ScanFormat::Conefield | ScanFormat::Rtk)) {
+            let n = test.geometry.views.len();
+            lost(format!("{n} test views are left out, for which this format has no place; r2 and naf keep them"));
+        }
+        if data.volume.is_some() && self.to == ScanFormat::Rtk {
+            lost("the true volume is left out, for which RTK has no place".into());
+        }
     }
 }
 

@@ -1,10 +1,10 @@
 //! `conefield import`
 
-use super::convert::refuse_existing;
-use crate::{files, out, parse};
+use super::{convert::refuse_existing, info};
+use crate::{out, parse};
 use clap::Args;
 use conefield_core::Result;
-use conefield_core::geometry::norm;
+use conefield_io::survey::survey;
 use conefield_io::{I0, ImportOptions, Imported};
 use serde_json::{Value, json};
 use std::path::PathBuf;
@@ -42,29 +42,20 @@ impl Import {
         refuse_existing(&self.output, self.force)?;
         let options = ImportOptions { i0: self.i0, floor: self.floor };
         let imported = conefield_io::read_scanner(&self.scanner, &options)?;
-        files::warn_of(&self.scanner, &imported.check);
         conefield_io::write_scan(&self.output, &imported.scan, None)?;
         let found = self.understood(&imported);
-        if self.json { out::json(&found) } else { out::say(&super::info::lines(&found)) }
+        if self.json { out::json(&found) } else { out::say(&(info::lines(&found) + &info::warnings(&found))) }
     }
 
     /// The geometry in mm and what the values are like.
     fn understood(&self, imported: &Imported) -> Value {
-        let g = &imported.scan.geometry;
-        let (first, last) = (&g.views[0], &g.views[g.views.len() - 1]);
-        json!({
-            "kind": "scan",
-            "scan": self.output,
-            "views": g.views.len(),
-            "detector": g.detector,
-            "pixel_mm": [norm(first.v), norm(first.u)],
-            "source_to_axis_mm": first.source[0].hypot(first.source[1]),
-            "source_to_detector_mm": first.normal().1,
-            "first_view": first,
-            "last_view": last,
-            "volume": { "shape": g.volume.shape, "spacing_mm": g.volume.spacing, "center_mm": g.volume.center },
-            "counts": imported.counts,
-            "line_integrals": imported.check,
-        })
+        let views = &imported.scan.geometry.views;
+        let mut found = info::facts(&imported.scan, &survey(&imported.scan));
+        found["scan"] = json!(self.output);
+        found["first_view"] = json!(views[0]);
+        found["last_view"] = json!(views[views.len() - 1]);
+        found["counts"] = json!(imported.counts);
+        found["line_integrals"] = json!(imported.check);
+        found
     }
 }

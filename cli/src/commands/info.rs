@@ -2,17 +2,27 @@
 
 use crate::{files, out};
 use clap::Args;
-use conefield_core::geometry::norm;
+use conefield_core::geometry::{Geometry, VoxelGrid};
+use conefield_core::scan::{Scan, Volume};
 use conefield_core::{Error, Result};
+use conefield_io::MiddleSlices;
+use conefield_io::survey::{Survey, setup, survey, survey_png};
 use ndarray::ArrayView3;
 use serde_json::{Value, json};
 use std::path::{Path, PathBuf};
 
-/// Say what a scan, volume or weights file holds.
+/// Say what a scan, volume or weights file holds, and warn of what in a scan will trouble a reconstruction.
+///
+/// A scan: lengths in mm, magnification, the voxels that the detector supports, the field of view, which part of the
+/// volume the views see, and what is missing. SCANNER.toml and RTK's XML geometry are understood, too.
 #[derive(Args)]
 pub struct Info {
     /// A scan, a volume or a weights file.
     file: PathBuf,
+    /// Also draw source path, detector and volume, with the share of views that see each point of it; of a volume, its
+    /// middle slices.
+    #[arg(long, value_name = "FILE")]
+    png: Option<PathBuf>,
     /// Print one JSON object.
     #[arg(long)]
     json: bool,
@@ -22,14 +32,42 @@ impl Info {
     pub fn run(self) -> Result<()> {
         let path = &self.file;
         std::fs::metadata(path).map_err(|e| Error::io(path, e))?;
-        let found = if path.extension().is_some_and(|e| e.eq_ignore_ascii_case("safetensors")) {
+        let png = self.png.as_deref();
+        let ends = |end: &str| path.extension().is_some_and(|e| e.eq_ignore_ascii_case(end));
+        let found = if ends("safetensors") {
+            no_picture(path, png)?;
             weights(path)?
+        } else if ends("xml") {
+            no_picture(path, png)?;
+            geometry(path)?
         } else if conefield_io::is_volume(path) {
-            volume(path)?
+            volume(path, png)?
         } else {
-            scan(path)?
+            scan(path, png)?
         };
-        if self.json { out::json(&found) } else { out::say(&lines(&found)) }
+        if self.json {
+            return out::json(&found);
+        }
+        out::say(&(lines(&found) + &warnings(&found)))
+    }
+}
+
+/// The warnings for people, a paragraph each.
+pub fn warnings(value: &Value) -> String {
+    let one = |w: &Value| {
+        let advice = w["advice"].as_str().filter(|a| !a.is_empty()).map_or(String::new(), |a| format!("\n  {a}"));
+        Some(format!("\n\nwarning: {}{advice}", w["found"].as_str()?))
+    };
+    value["warnings"].as_array().into_iter().flatten().filter_map(one).collect()
+}
+
+fn no_picture(path: &Path, png: Option<&Path>) -> Result<()> {
+    match png {
+        None => Ok(()),
+        Some(_) => {
+            let expected = "a scan or a volume, of which there is something to draw";
+            Err(Error::invalid(path.display().to_string(), "--png", "a file of another kind", expected))
+        }
     }
 }
 
@@ -42,34 +80,130 @@ fn statistics(values: ArrayView3<'_, f32>) -> Value {
     json!({ "min": low, "max": high, "mean": sum / values.len() as f64 })
 }
 
-fn volume(path: &Path) -> Result<Value> {
+fn volume(path: &Path, png: Option<&Path>) -> Result<Value> {
     let v = conefield_io::read_volume(path)?;
+    if let Some(png) = png {
+        files::picture(png, None, &MiddleSlices::of(&v))?;
+    }
+    let mut missing = Vec::new();
+    if v.affine.is_none() {
+        missing.push("voxel sizes and place: 1 mm and the centre are assumed");
+    }
     Ok(json!({
         "kind": "volume",
         "shape": v.grid.shape,
         "spacing_mm": v.grid.spacing,
+        "size_mm": v.grid.size(),
         "values": statistics(v.data.view()),
         "affine": v.affine,
+        "missing": missing,
+        "warnings": volume_warnings(&v),
     }))
 }
 
-fn scan(path: &Path) -> Result<Value> {
-    let s = files::scan(path)?;
+/// What hints at another meaning of the values than attenuation.
+fn volume_warnings(v: &Volume) -> Vec<Value> {
+    let low = v.data.iter().copied().fold(f32::INFINITY, f32::min);
+    let high = v.data.iter().copied().fold(f32::NEG_INFINITY, f32::max);
+    let advice = "simulate, pretrain and convert take --values hu:MU_WATER or clip:LO,HI for them";
+    let hounsfield = low <= -500.0 && high > 0.0;
+    let found = format!("values from {low} to {high} look like Hounsfield units, not attenuation");
+    hounsfield.then(|| json!({ "kind": "values", "found": found, "advice": advice })).into_iter().collect()
+}
+
+/// What is known of a scan: its geometry in mm, its values, and what will trouble a reconstruction.
+pub fn facts(s: &Scan, survey: &Survey) -> Value {
     let g = &s.geometry;
-    let first = &g.views[0];
-    let truth = conefield_io::read_truth(path)?;
-    Ok(json!({
+    let setup = &survey.setup;
+    json!({
         "kind": "scan",
         "views": g.views.len(),
         "detector": g.detector,
-        "pixel_mm": [norm(first.v), norm(first.u)],
-        "source_to_axis_mm": first.source[0].hypot(first.source[1]),
-        "source_to_detector_mm": first.normal().1,
-        "volume": { "shape": g.volume.shape, "spacing_mm": g.volume.spacing, "center_mm": g.volume.center },
+        "pixel_mm": setup.pixel_mm,
+        "detector_mm": setup.detector_mm,
+        "offset_mm": setup.offset_mm,
+        "source_to_axis_mm": setup.source_to_axis_mm,
+        "source_to_detector_mm": setup.source_to_detector_mm,
+        "magnification": setup.magnification,
+        "circle": setup.circle,
+        "angles": setup.angles,
+        "supported_voxel_mm": setup.supported_voxel_mm,
+        "supported_voxel_is": "pixel / magnification at the isocentre (u for x and y, v for z)",
+        "field_of_view": setup.field_of_view,
+        "volume": {
+            "shape": g.volume.shape, "spacing_mm": g.volume.spacing, "size_mm": g.volume.size(),
+            "center_mm": g.volume.center,
+        },
+        "coverage": survey.coverage,
+        "truncation": survey.truncation,
         "unit": s.unit,
-        "line_integrals": statistics(s.projections.view()),
-        "truth": truth.is_some(),
-        "provenance": s.provenance,
+        "attenuation_per_mm": survey.attenuation_per_mm,
+        "warnings": survey.warnings,
+    })
+}
+
+fn scan(path: &Path, png: Option<&Path>) -> Result<Value> {
+    let data = conefield_io::read_data_set(path)?;
+    let s = &data.train;
+    s.validate(&path.display().to_string())?;
+    let survey = survey(s);
+    if let Some(png) = png {
+        survey_png(png, &title(path, s, &survey), &s.geometry)?;
+    }
+    let mut found = facts(s, &survey);
+    let mut missing = Vec::new();
+    if s.unit.mm == 1.0 && s.provenance["unit_from"].as_str().is_some_and(|f| f.starts_with("nothing")) {
+        missing.push("a unit of length: mm is assumed");
+    }
+    if data.volume.is_none() {
+        missing.push("a volume to compare with (truth)");
+    }
+    if data.test.is_none() {
+        missing.push("test views: reconstruct --hold-out keeps some aside");
+    }
+    found["line_integrals"] = statistics(s.projections.view());
+    found["test_views"] = json!(data.test.as_ref().map_or(0, |t| t.geometry.views.len()));
+    found["truth"] = json!(data.volume.is_some());
+    found["missing"] = json!(missing);
+    found["provenance"] = s.provenance.clone();
+    Ok(found)
+}
+
+/// What stands over the picture.
+fn title(path: &Path, s: &Scan, survey: &Survey) -> String {
+    let name = path.canonicalize().ok().and_then(|p| p.file_name().map(|n| n.to_string_lossy().into_owned()));
+    let setup = &survey.setup;
+    let g = &s.geometry;
+    format!(
+        "{}: {} views, detector {} x {}, source to axis {:.1} mm, to detector {:.1} mm; {:.1} % of the volume seen enough",
+        name.unwrap_or_default(),
+        g.views.len(),
+        g.detector[0],
+        g.detector[1],
+        setup.source_to_axis_mm,
+        setup.source_to_detector_mm,
+        100.0 * survey.coverage.complete,
+    )
+}
+
+/// RTK's geometry file says nothing about pixels, projections and volume.
+fn geometry(path: &Path) -> Result<Value> {
+    let views = conefield_io::read_rtk_geometry(path, [1.0; 2], [0.0; 2])?;
+    let count = views.len();
+    let volume = VoxelGrid { shape: [1; 3], spacing: [1.0; 3], center: [0.0; 3] };
+    let setup = setup(&Geometry { detector: [1; 2], views, volume });
+    Ok(json!({
+        "kind": "geometry",
+        "views": count,
+        "source_to_axis_mm": setup.source_to_axis_mm,
+        "source_to_detector_mm": setup.source_to_detector_mm,
+        "magnification": setup.magnification,
+        "offset_mm": setup.offset_mm,
+        "angles": setup.angles,
+        "missing": [
+            "pixels and projections: RTK keeps them in an image", "a volume",
+            "conefield import takes the three together (docs/geometry.md, [rtk])",
+        ],
     }))
 }
 
@@ -81,7 +215,7 @@ fn weights(path: &Path) -> Result<Value> {
     Ok(json!({ "kind": "weights", "parameters": parameters, "tensors": tensors, "notes": w.notes }))
 }
 
-/// One line a key; tables become dotted keys.
+/// One line a key; tables become dotted keys. Warnings are left to [`warnings`].
 pub fn lines(value: &Value) -> String {
     fn walk(prefix: &str, value: &Value, rows: &mut Vec<Vec<String>>) {
         match value {
@@ -103,6 +237,8 @@ pub fn lines(value: &Value) -> String {
     let mut rest = value.clone();
     if let Value::Object(map) = &mut rest {
         map.remove("kind");
+        // People read them as sentences.
+        map.remove("warnings");
     }
     walk("", &rest, &mut rows);
     out::table(&rows, &[])

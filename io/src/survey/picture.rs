@@ -154,17 +154,15 @@ impl Picture<'_> {
         let style = (FONT, EM * 1.25).into_font().color(&INK).pos(Pos::new(HPos::Left, VPos::Top));
         area.draw(&Text::new(title.to_owned(), (EM as i32, (EM * 0.6) as i32), style)).map_err(text_of)?;
         let (_, rest) = area.split_vertically(head);
-        let bar = (EM * 6.0) as u32;
-        let (panels, bar) = rest.split_horizontally(width - bar);
+        let bar_width = (EM * 6.0) as u32;
+        let (panels, bar) = rest.split_horizontally(width - bar_width);
         let (above, below) = panels.split_vertically((height - head) * 56 / 100);
-        let (top, axial) = above.split_evenly((1, 2)).into_iter().fold((None, None), pair);
-        let (side, coronal) = below.split_evenly((1, 2)).into_iter().fold((None, None), pair);
-        if let (Some(top), Some(axial), Some(side), Some(coronal)) = (top, axial, side, coronal) {
-            self.from_above(&top)?;
-            self.from_the_side(&side)?;
-            self.map(&axial, [0, 1])?;
-            self.map(&coronal, [0, 2])?;
-        }
+        let middle = (width - bar_width) / 2;
+        let ((top, axial), (side, coronal)) = (above.split_horizontally(middle), below.split_horizontally(middle));
+        self.from_above(&top)?;
+        self.from_the_side(&side)?;
+        self.map(&axial, [0, 1])?;
+        self.map(&coronal, [0, 2])?;
         self.bar(&bar)?;
         area.present().map_err(text_of)
     }
@@ -333,8 +331,4 @@ impl Picture<'_> {
         }
         Ok(())
     }
-}
-
-fn pair<T>(sofar: (Option<T>, Option<T>), next: T) -> (Option<T>, Option<T>) {
-    if sofar.0.is_none() { (Some(next), None) } else { (sofar.0, Some(next)) }
 }
