@@ -175,7 +175,7 @@ fn title(path: &Path, s: &Scan, survey: &Survey) -> String {
     let setup = &survey.setup;
     let g = &s.geometry;
     format!(
-        "{}: {} views, detector {} x {}, source to axis {:.1} mm, to detector {:.1} mm; {:.1} % of the volume seen enough",
+        "{}: {} views, detector {} x {}, source to axis {:.1} mm, to detector {:.1} mm; {:.1} % of the volume covered",
         name.unwrap_or_default(),
         g.views.len(),
         g.detector[0],
@@ -215,6 +215,18 @@ fn weights(path: &Path) -> Result<Value> {
     Ok(json!({ "kind": "weights", "parameters": parameters, "tensors": tensors, "notes": w.notes }))
 }
 
+/// Numbers with as many digits as people read.
+fn rounded(value: &Value) -> Value {
+    match value {
+        Value::Array(all) => all.iter().map(rounded).collect(),
+        Value::Number(n) => match n.as_f64().filter(|_| n.is_f64()) {
+            Some(x) => format!("{x:.6e}").parse::<f64>().map_or(value.clone(), |x| json!(x)),
+            None => value.clone(),
+        },
+        other => other.clone(),
+    }
+}
+
 /// One line a key; tables become dotted keys. Warnings are left to [`warnings`].
 pub fn lines(value: &Value) -> String {
     fn walk(prefix: &str, value: &Value, rows: &mut Vec<Vec<String>>) {
@@ -230,7 +242,12 @@ pub fn lines(value: &Value) -> String {
                 rows.extend(text.lines().skip(1).map(|l| vec![String::new(), l.to_owned()]));
             }
             Value::String(text) => rows.push(vec![prefix.to_owned(), text.clone()]),
-            _ => rows.push(vec![prefix.to_owned(), value.to_string().replace(',', ", ")]),
+            Value::Array(all) if !all.is_empty() && all.iter().all(Value::is_string) => {
+                let texts = all.iter().filter_map(Value::as_str).enumerate();
+                rows.extend(texts.map(|(i, t)| vec![if i == 0 { prefix } else { "" }.to_owned(), t.to_owned()]));
+            }
+            Value::Array(all) if all.is_empty() => {}
+            _ => rows.push(vec![prefix.to_owned(), rounded(value).to_string().replace(',', ", ")]),
         }
     }
     let mut rows = vec![vec!["kind".to_owned(), value["kind"].as_str().unwrap_or_default().to_owned()]];

@@ -23,7 +23,7 @@ const EM: f64 = 17.0 * FINER as f64;
 /// Views that are drawn; of more, evenly chosen ones.
 const SHOWN: usize = 90;
 /// Points along the longer side of a map.
-const POINTS: usize = 110;
+const POINTS: usize = 160;
 
 const SOURCE: RGBColor = RGBColor(213, 94, 0);
 const DETECTOR: RGBColor = RGBColor(0, 114, 178);
@@ -77,8 +77,8 @@ impl Frame<'_> {
     /// Axes with equal millimetres, and a title.
     fn chart<'a, 'b>(&self, area: &'a Area<'b>) -> Result<Chart<'a, 'b>, String> {
         let (w, h) = area.dim_in_pixel();
-        let (left, foot, head, right) = (EM * 4.2, EM * 3.0, EM * 2.0, EM);
-        let inner = [f64::from(w) - left - right, f64::from(h) - foot - head];
+        let (edge, left, foot, head, right) = (EM * 0.6, EM * 4.2, EM * 3.0, EM * 2.0, EM);
+        let inner = [f64::from(w) - edge - left - right, f64::from(h) - foot - head];
         let size = [self.x[1] - self.x[0], self.y[1] - self.y[0]];
         // A millimetre is the same in both directions: the scarcer one decides.
         let mm = (size[0] / inner[0]).max(size[1] / inner[1]);
@@ -86,11 +86,12 @@ impl Frame<'_> {
             let middle = (r[0] + r[1]) / 2.0;
             middle - mm * pixels / 2.0..middle + mm * pixels / 2.0
         };
-        let at = ((left + inner[0] / 2.0) as i32, (EM * 0.5) as i32);
+        let at = ((edge + left + inner[0] / 2.0) as i32, (EM * 0.5) as i32);
         let style = (FONT, EM * 1.05).into_font().color(&INK).pos(Pos::new(HPos::Center, VPos::Top));
         area.draw(&Text::new(self.title.to_owned(), at, style)).map_err(text_of)?;
         let mut chart = ChartBuilder::on(area)
             .margin_top(head as i32)
+            .margin_left(edge as i32)
             .margin_right(right as i32)
             .x_label_area_size(foot as i32)
             .y_label_area_size(left as i32)
@@ -129,7 +130,7 @@ fn line(chart: &mut Chart, points: Vec<(f64, f64)>, style: impl Into<ShapeStyle>
     chart.draw_series([PathElement::new(points, style)]).map(|_| ()).map_err(text_of)
 }
 
-/// A line of strokes and gaps, each a hundredth of what is seen.
+/// Strokes from each second point to the next.
 fn dashed(chart: &mut Chart, points: &[(f64, f64)], style: ShapeStyle) -> Drawn {
     for pair in points.chunks(2).filter(|c| c.len() == 2) {
         line(chart, pair.to_vec(), style)?;
@@ -183,7 +184,9 @@ impl Picture<'_> {
         let flat = |p: Vec3| (p[0], p[1]);
         let [low, high] = self.geometry.volume.bounds();
         let seen = self.views().flat_map(|v| [v.source, self.ends(v)[0][0], self.ends(v)[0][1]]).chain([low, high]);
-        let (x, y) = around(seen.map(flat));
+        let (x, mut y) = around(seen.map(flat));
+        // The legend stands above.
+        y[1] += 0.12 * (y[1] - y[0]);
         let frame = Frame { title: "from above (+z)", labels: ["x (mm)", "y (mm)"], x, y };
         let mut chart = frame.chart(area)?;
         for view in self.views() {
@@ -199,7 +202,8 @@ impl Picture<'_> {
         self.first_view(&mut chart, 0, flat)?;
         let middle = ((low[0] + high[0]) / 2.0, high[1]);
         label(&mut chart, middle, Pos::new(HPos::Center, VPos::Bottom), INK, "volume")?;
-        self.turning(&mut chart, (x[1] - x[0]).max(y[1] - y[0]))
+        self.turning(&mut chart, (x[1] - x[0]).max(y[1] - y[0]))?;
+        self.legend(area)
     }
 
     /// An arrow from the first view's source the way that the views go.
@@ -229,15 +233,22 @@ impl Picture<'_> {
             line(chart, vec![source, end], SOURCE.mix(0.8).stroke_width(FINER))?;
         }
         line(chart, ends.to_vec(), DETECTOR.stroke_width(4 * FINER))?;
-        chart.draw_series([Circle::new(source, 6 * FINER as i32, SOURCE.filled())]).map_err(text_of)?;
-        let middle = ((ends[0].0 + ends[1].0) / 2.0, (ends[0].1 + ends[1].1) / 2.0);
-        // Towards the middle of the picture, where there is room.
-        let inwards = |p: (f64, f64), q: (f64, f64)| if p.0 < q.0 { HPos::Left } else { HPos::Right };
-        let space = |p: HPos, t: &str| if matches!(p, HPos::Left) { format!("  {t}") } else { format!("{t}  ") };
-        let (a, b) = (inwards(source, middle), inwards(middle, source));
-        label(chart, source, Pos::new(a, VPos::Bottom), SOURCE, &space(inwards(source, middle), "source, view 0"))?;
-        // Beyond the detector's first end, past the fan.
-        label(chart, ends[0], Pos::new(b, VPos::Top), DETECTOR, &space(inwards(middle, source), "detector, view 0"))
+        chart.draw_series([Circle::new(source, 6 * FINER as i32, SOURCE.filled())]).map(|_| ()).map_err(text_of)
+    }
+
+    /// What colours and lines mean, in the corner that a circle leaves empty.
+    fn legend(&self, area: &Area) -> Drawn {
+        let rows = [
+            (SOURCE, "source; large: view 0"),
+            (DETECTOR, "detector; thick: view 0"),
+            (INK, "circle: what all views see"),
+        ];
+        for (i, (colour, text)) in rows.into_iter().enumerate() {
+            let at = ((EM * 5.4) as i32, (EM * (2.3 + 1.15 * i as f64)) as i32);
+            let style = (FONT, EM * 0.85).into_font().color(&colour).pos(Pos::new(HPos::Left, VPos::Top));
+            area.draw(&Text::new(text, at, style)).map_err(text_of)?;
+        }
+        Ok(())
     }
 
     /// The plane through the axis and the first view's source.
@@ -304,7 +315,7 @@ impl Picture<'_> {
         for (colour, width) in [(WHITE, 4 * FINER), (INK, 2 * FINER)] {
             line(&mut chart, vec![a, (b.0, a.1), b, (a.0, b.1), a], colour.stroke_width(width))?;
         }
-        label(&mut chart, (b.0, a.1), Pos::new(HPos::Right, VPos::Bottom), WHITE, "volume ")
+        label(&mut chart, (b.0, a.1), Pos::new(HPos::Right, VPos::Bottom), INK, "volume ")
     }
 
     fn bar(&self, area: &Area) -> Drawn {

@@ -120,14 +120,14 @@ fn covered(scan: &Scan, s: &Survey, warn: Warn) {
     }
     let size = scan.geometry.volume.size();
     let radius = if c.needed < 1.0 { fov.one_sided_radius_mm } else { fov.radius_mm };
+    let none = if c.unseen > 0.0 { format!(", no view sees {}", percent(c.unseen)) } else { String::new() };
     let enough = if c.needed < 1.0 { "half the views" } else { "all views" };
     warn(
         WarningKind::Coverage,
         format!(
-            "{enough} see {} of the volume, none sees {}, and the worst voxel is seen by {} of them; the volume is \
-             {:.1} x {:.1} x {:.1} mm and the field of view is a cylinder of radius {radius:.1} mm and height {:.1} mm",
+            "{enough} see {} of the volume{none}, and the worst voxel is seen by {} of the views; the volume is {:.1} x \
+             {:.1} x {:.1} mm and the field of view a cylinder of radius {radius:.1} mm and height {:.1} mm",
             percent(c.complete),
-            percent(c.unseen),
             percent(c.least),
             size[0],
             size[1],
