@@ -118,9 +118,8 @@ impl Svg {
 /// What is drawn: a view at `angle` with a detector that stands aside.
 fn geometry(angle_deg: f64, offset: [f64; 2]) -> Geometry {
     let mm = Millimetres;
-    let view = |a: f64| {
-        View::circular(Radians(a.to_radians()), mm(200.0), mm(330.0), [mm(30.0), mm(30.0)], offset.map(mm))
-    };
+    let view =
+        |a: f64| View::circular(Radians(a.to_radians()), mm(200.0), mm(330.0), [mm(30.0), mm(30.0)], offset.map(mm));
     Geometry {
         detector: [4, 6],
         views: vec![view(angle_deg), view(angle_deg + 24.0)],
@@ -146,12 +145,17 @@ fn world() -> String {
     };
     s.path(&ring(200.0, 0.0, 360.0), line(FAINT).dashed());
     s.path(&[flat([-235.0, 0.0, 0.0]), flat([245.0, 0.0, 0.0])], line(INK).arrow());
-    s.path(&[flat([0.0, -235.0, 0.0]), flat([0.0, 240.0, 0.0])], line(INK).arrow());
+    s.path(&[flat([0.0, -222.0, 0.0]), flat([0.0, 240.0, 0.0])], line(INK).arrow());
     s.text(flat([238.0, -20.0, 0.0]), "middle", INK, "x");
     s.text(flat([15.0, 232.0, 0.0]), "middle", INK, "y");
     let [lo, hi] = g.volume.bounds();
-    s.area(&[[lo[0], lo[1]], [hi[0], lo[1]], [hi[0], hi[1]], [lo[0], hi[1]]].map(|p| flat([p[0], p[1], 0.0])), VOLUME, 0.2);
-    s.text(flat([lo[0], lo[1] - 16.0, 0.0]), "start", VOLUME, "volume");
+    s.area(
+        &[[lo[0], lo[1]], [hi[0], lo[1]], [hi[0], hi[1]], [lo[0], hi[1]]].map(|p| flat([p[0], p[1], 0.0])),
+        VOLUME,
+        0.2,
+    );
+    let corner = flat([lo[0], hi[1], 0.0]);
+    s.text((corner.0 + 5.0, corner.1 + 17.0), "start", VOLUME, "volume");
     let view = &g.views[0];
     let ends = [-0.5, 5.5].map(|c| flat(view.pixel(g.detector, 1.5, c)));
     let source = flat(view.source);
@@ -166,7 +170,7 @@ fn world() -> String {
     let next = flat(g.views[1].source);
     s.dot(next, SOURCE, 4.0);
     s.text((next.0 + 8.0, next.1 - 8.0), "start", SOURCE, "next view");
-    s.path(&ring(222.0, angle + 5.0, angle + 20.0), line(SOURCE).arrow());
+    s.path(&ring(184.0, angle + 3.0, angle + 20.0), line(SOURCE).arrow());
     s.path(&ring(90.0, 0.0, angle - 2.0), line(INK).arrow());
     s.text(flat([102.0, 28.0, 0.0]), "start", INK, "a");
     // The detector's own direction, and how far its middle is from where the axis falls.
@@ -187,7 +191,12 @@ fn world() -> String {
     s.path(&[(between.0 - 14.0, between.1 + 22.0), (between.0 - 2.0, between.1 + 4.0)], line(INK).wide(1.0));
     let dso = middle(source, flat([0.0; 3]));
     s.text((dso.0 - 6.0, dso.1 - 14.0), "end", INK, "DSO");
-    s.text((20.0, 545.0), "start", INK, "DSD: from the source to the detector's plane. Start: the first view's a. a grows from +x to +y.");
+    s.text(
+        (20.0, 545.0),
+        "start",
+        INK,
+        "DSD: from the source to the detector's plane. Start: the first view's a. a grows from +x to +y.",
+    );
 
     // The same view in the plane of source and axis.
     let o = (760.0, 250.0);
@@ -198,7 +207,11 @@ fn world() -> String {
     s.text(flat([-12.0, 0.0, 182.0]), "middle", INK, "z");
     s.path(&[flat([-150.0, 0.0, 0.0]), flat([225.0, 0.0, 0.0])], line(INK).arrow());
     s.text(flat([222.0, 0.0, -22.0]), "middle", INK, "x");
-    s.area(&[[lo[0], lo[2]], [hi[0], lo[2]], [hi[0], hi[2]], [lo[0], hi[2]]].map(|p| flat([p[0], 0.0, p[1]])), VOLUME, 0.2);
+    s.area(
+        &[[lo[0], lo[2]], [hi[0], lo[2]], [hi[0], hi[2]], [lo[0], hi[2]]].map(|p| flat([p[0], 0.0, p[1]])),
+        VOLUME,
+        0.2,
+    );
     let view = &side.views[0];
     let ends = [-0.5, 3.5].map(|r| flat(view.pixel(side.detector, r, 2.5)));
     for end in ends {
@@ -214,16 +227,17 @@ fn world() -> String {
     s.dot(flat(view.detector), DETECTOR, 5.0);
     s.dot(flat([-130.0, 0.0, 0.0]), INK, 4.0);
     let between = flat([-130.0, 0.0, -12.0]);
-    s.text((between.0 + 14.0, between.1 + 5.0), "start", INK, "offset v &gt; 0");
-    s.text((760.0, 470.0), "middle", INK, "A positive offset along v moves the detector down, towards −z.");
-    s.text((760.0, 492.0), "middle", INK, "R2-Gaussian and NAF count their v offset towards +z.");
+    s.text((between.0 + 10.0, between.1 + 6.0), "start", INK, "offset v");
+    s.text((590.0, 450.0), "start", INK, "A positive offset along v moves the detector down,");
+    s.text((590.0, 470.0), "start", INK, "towards −z. R2-Gaussian and NAF count theirs towards");
+    s.text((590.0, 490.0), "start", INK, "+z; along u all have the same sign.");
     s.finish()
 }
 
 /// The array of a view as the source sees it, and what the flips of an import mean.
 fn detector() -> String {
     let mut s = Svg::new(980.0, 400.0);
-    s.title((20.0, 28.0), "The detector as the source sees it: projections[view, row, column]");
+    s.title((20.0, 28.0), "projections[view, row, column], seen from the source");
     let g = geometry(0.0, [0.0; 2]);
     let [rows, columns] = g.detector;
     let view = &g.views[0];
@@ -246,19 +260,19 @@ fn detector() -> String {
     s.path(&[at(-0.9, -0.5), at(-0.9, 2.0)], line(DETECTOR).arrow());
     s.text((at(-0.9, 2.2).0, at(-0.9, 2.2).1 + 5.0), "start", DETECTOR, "u: column to column (+y at a = 0)");
     s.path(&[at(-0.5, -0.9), at(1.5, -0.9)], line(DETECTOR).arrow());
-    s.text((at(2.0, -0.9).0, at(1.9, -0.9).1 + 5.0), "middle", DETECTOR, "v (−z)");
+    s.text((at(2.0, -0.8).0, at(1.9, -0.8).1 + 5.0), "end", DETECTOR, "v (−z)");
     s.dot(flat(view.detector), SOURCE, 5.0);
     let centre = flat(view.detector);
     s.text((centre.0 + 9.0, centre.1 + 17.0), "start", SOURCE, "detector");
-    s.text((20.0, 330.0), "start", INK, "Pixel (r, c): detector + (r − (R−1)/2)·v + (c − (C−1)/2)·u, with R = 4, C = 6 here.");
-    s.text((20.0, 354.0), "start", INK, "An even number of pixels has its middle between two of them.");
+    s.text((20.0, 330.0), "start", INK, "Pixel (r, c): detector + (r − (R−1)/2)·v + (c − (C−1)/2)·u");
+    s.text((20.0, 354.0), "start", INK, "R = 4, C = 6 here: the middle of an even number is between two.");
 
     s.title((560.0, 28.0), "import: how the file's rows and columns lie");
     for (i, (name, rows, columns)) in [
-        ("as here, NAF, R2-Gaussian", false, false),
-        ("flip_rows: first row lowest (RTK)", true, false),
-        ("flip_columns: mirrored", false, true),
-        ("both: upside down", true, true),
+        ("as here, NAF, R2", false, false),
+        ("flip_rows", true, false),
+        ("flip_columns", false, true),
+        ("both", true, true),
     ]
     .into_iter()
     .enumerate()
@@ -276,8 +290,8 @@ fn detector() -> String {
         s.dot(at(6.0, 6.0), SOURCE, 5.0);
         s.text((corner.0, corner.1 + 110.0), "start", INK, name);
     }
-    s.text((580.0, 354.0), "start", INK, "F: what the source sees if the file's array is shown as an");
-    s.text((580.0, 374.0), "start", INK, "image. Dot: where the file's first pixel is in truth.");
+    s.text((580.0, 354.0), "start", INK, "An F in the file's image and the file's first pixel (dot),");
+    s.text((580.0, 374.0), "start", INK, "as they really lie, seen from the source.");
     s.finish()
 }
 
@@ -285,14 +299,18 @@ fn detector() -> String {
 fn space() -> String {
     let mut s = Svg::new(980.0, 520.0);
     let orbit = Orbit { dso: 200.0, dsd: 330.0, pixel: [30.0, 30.0], offset: [0.0, 0.0], angles: vec![0.35] };
-    let g = Geometry { volume: VoxelGrid { center: [10.0, 30.0, 20.0], ..geometry(0.0, [0.0; 2]).volume }, views: orbit.views(), ..geometry(0.0, [0.0; 2]) };
+    let g = Geometry {
+        volume: VoxelGrid { center: [10.0, 30.0, 20.0], ..geometry(0.0, [0.0; 2]).volume },
+        views: orbit.views(),
+        ..geometry(0.0, [0.0; 2])
+    };
     // x towards the reader, y to the right, z up.
-    let onto = |o: Point, p: Vec3| (o.0 + 1.0 * p[1] - 0.62 * p[0], o.1 - 1.0 * p[2] + 0.36 * p[0]);
-    s.title((20.0, 28.0), "A view: source, detector, u, v (ASTRA's cone_vec, one after the other)");
-    let o = (330.0, 250.0);
+    let onto = |o: Point, p: Vec3| (o.0 + 1.35 * p[1] - 0.84 * p[0], o.1 - 1.35 * p[2] + 0.49 * p[0]);
+    s.title((20.0, 28.0), "A view: source, detector, u, v");
+    let o = (270.0, 250.0);
     let flat = |p: Vec3| onto(o, p);
-    axes(&mut s, &flat, 110.0, ["x", "y", "z"]);
-    s.path(&[flat([0.0, 0.0, -90.0]), flat([0.0, 0.0, 0.0])], line(INK).dashed());
+    axes(&mut s, &flat, 105.0, ["x", "y", "z"]);
+    s.path(&[flat([0.0, 0.0, -80.0]), flat([0.0, 0.0, 0.0])], line(INK).dashed());
     let view = &g.views[0];
     let corner = |r: f64, c: f64| flat(view.pixel(g.detector, r, c));
     let corners = [corner(-0.5, -0.5), corner(-0.5, 5.5), corner(3.5, 5.5), corner(3.5, -0.5)];
@@ -311,13 +329,19 @@ fn space() -> String {
     s.dot(flat(view.source), SOURCE, 6.0);
     let at = flat(view.source);
     s.text((at.0, at.1 + 24.0), "middle", SOURCE, "source");
-    s.text((20.0, 455.0), "start", INK, "u and v are as long as a pixel: from one pixel's centre to the next column's");
-    s.text((20.0, 477.0), "start", INK, "and the next row's. Each view may have its own. The source is in front.");
+    let note = [
+        "u and v are as long as a pixel: from a pixel's centre to that of",
+        "the next column and of the next row. Each view may have its own.",
+        "ASTRA's cone_vec: the twelve numbers of source, detector, u, v.",
+    ];
+    for (i, text) in note.into_iter().enumerate() {
+        s.text((20.0, 450.0 + 22.0 * i as f64), "start", INK, text);
+    }
 
     s.title((560.0, 28.0), "The volume: data[x, y, z], z fastest in memory");
     let o = (730.0, 240.0);
     let flat = |p: Vec3| onto(o, p);
-    axes(&mut s, &flat, 135.0, ["x", "y", "z"]);
+    axes(&mut s, &flat, 115.0, ["x", "y", "z"]);
     let [lo, hi] = g.volume.bounds();
     let vertex = |i: usize| flat(std::array::from_fn(|k| if i >> k & 1 == 1 { hi[k] } else { lo[k] }));
     for face in [[0b001, 0b011, 0b111, 0b101], [0b100, 0b101, 0b111, 0b110], [0b010, 0b011, 0b111, 0b110]] {
@@ -328,8 +352,8 @@ fn space() -> String {
     }
     let first = flat(g.volume.voxel([0; 3]));
     s.dot(first, VOLUME, 5.0);
-    s.text((first.0 - 60.0, first.1 + 48.0), "end", VOLUME, "voxel [0, 0, 0]");
-    s.path(&[(first.0 - 58.0, first.1 + 42.0), (first.0 - 4.0, first.1 + 4.0)], line(VOLUME).wide(1.0));
+    s.text((first.0 - 76.0, first.1 - 70.0), "end", VOLUME, "voxel [0, 0, 0]");
+    s.path(&[(first.0 - 74.0, first.1 - 68.0), (first.0 - 5.0, first.1 - 5.0)], line(VOLUME).wide(1.0));
     let centre = flat(g.volume.center);
     s.path(&[flat([0.0; 3]), centre], line(SOURCE).arrow());
     s.text((centre.0 + 6.0, centre.1 - 6.0), "start", SOURCE, "center");

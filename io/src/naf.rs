@@ -6,8 +6,8 @@
 //! see [`read_naf`].
 
 use crate::orbit::Orbit;
-use crate::scan::DataSet;
 use crate::pickle::{self, Item, Out, Pickle};
+use crate::scan::DataSet;
 use crate::unit::{self, Reading, Units};
 use crate::{rays, write_atomic};
 use conefield_core::error::ensure;

@@ -117,7 +117,9 @@ mod tests {
         }
         let header = std::fs::read(path.join(PROJECTIONS)).unwrap();
         let header = String::from_utf8_lossy(&header[..400]);
-        for line in ["TransformMatrix = 1.0 0.0 0.0 0.0 1.0 0.0 0.0 0.0 1.0", "Offset = -3.75 -3.0 0.0", "DimSize = 6 4 7"] {
+        for line in
+            ["TransformMatrix = 1.0 0.0 0.0 0.0 1.0 0.0 0.0 0.0 1.0", "Offset = -3.75 -3.0 0.0", "DimSize = 6 4 7"]
+        {
             assert!(header.contains(line), "{line}: {header}");
         }
         // The last row of ours is RTK's first, the lowest.

@@ -36,7 +36,9 @@ pub fn arc(views: &[View]) -> Arc {
     let n = sorted.len();
     // Distance to the next view and where it starts, widest first.
     let mut gaps: Vec<[f64; 2]> = (0..n)
-        .map(|i| if i + 1 < n { [sorted[i + 1] - sorted[i], sorted[i]] } else { [sorted[0] + 360.0 - sorted[i], sorted[i]] })
+        .map(|i| {
+            if i + 1 < n { [sorted[i + 1] - sorted[i], sorted[i]] } else { [sorted[0] + 360.0 - sorted[i], sorted[i]] }
+        })
         .collect();
     gaps.sort_unstable_by(|a, b| b[0].total_cmp(&a[0]));
     let wide = |i: usize| gaps.get(i).map_or(0.0, |g| g[0]);

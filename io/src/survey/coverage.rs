@@ -59,11 +59,11 @@ pub fn coverage(geometry: &Geometry, setup: &Setup) -> Coverage {
         }
     }
     let shares = share_of_views(geometry, &points);
-    let part = |test: &dyn Fn(f64) -> bool| {
-        shares.iter().filter(|s| test(**s)).count() as f64 / shares.len().max(1) as f64
-    };
-    // One view of many more or less is an affair of rounding.
-    let enough = needed - 1.0 / geometry.views.len().min(VIEWS).max(2) as f64 * if needed < 1.0 { 1.01 } else { 0.0 };
+    let part =
+        |test: &dyn Fn(f64) -> bool| shares.iter().filter(|s| test(**s)).count() as f64 / shares.len().max(1) as f64;
+    // Whether just half or one view less is an affair of rounding.
+    let views = geometry.views.len().clamp(2, VIEWS) as f64;
+    let enough = if needed < 1.0 { needed - 1.01 / views } else { needed };
     Coverage {
         needed,
         complete: part(&|s| s >= enough),

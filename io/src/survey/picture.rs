@@ -30,7 +30,11 @@ const DETECTOR: RGBColor = RGBColor(0, 114, 178);
 const INK: RGBColor = RGBColor(20, 20, 20);
 
 type Area<'a> = DrawingArea<BitMapBackend<'a>, Shift>;
-type Chart<'a, 'b> = ChartContext<'a, BitMapBackend<'b>, Cartesian2d<plotters::coord::types::RangedCoordf64, plotters::coord::types::RangedCoordf64>>;
+type Chart<'a, 'b> = ChartContext<
+    'a,
+    BitMapBackend<'b>,
+    Cartesian2d<plotters::coord::types::RangedCoordf64, plotters::coord::types::RangedCoordf64>,
+>;
 type Drawn = Result<(), String>;
 
 fn text_of<E: std::error::Error + Send + Sync>(e: DrawingAreaErrorKind<E>) -> String {
@@ -160,8 +164,8 @@ impl Picture<'_> {
         let (above, below) = panels.split_vertically((height - head) * 56 / 100);
         let middle = (width - bar_width) / 2;
         let ((top, axial), (side, coronal)) = (above.split_horizontally(middle), below.split_horizontally(middle));
-        self.from_above(&top)?;
-        self.from_the_side(&side)?;
+        self.top_view(&top)?;
+        self.side_view(&side)?;
         self.map(&axial, [0, 1])?;
         self.map(&coronal, [0, 2])?;
         self.bar(&bar)?;
@@ -180,7 +184,7 @@ impl Picture<'_> {
         [[at(0.0, -columns), at(0.0, columns)], [at(-rows, 0.0), at(rows, 0.0)]]
     }
 
-    fn from_above(&self, area: &Area) -> Drawn {
+    fn top_view(&self, area: &Area) -> Drawn {
         let flat = |p: Vec3| (p[0], p[1]);
         let [low, high] = self.geometry.volume.bounds();
         let seen = self.views().flat_map(|v| [v.source, self.ends(v)[0][0], self.ends(v)[0][1]]).chain([low, high]);
@@ -220,7 +224,11 @@ impl Picture<'_> {
         line(chart, arc, SOURCE.stroke_width(2 * FINER))?;
         let tip = at(0.6, radius);
         let wing = size * 0.02;
-        let wings = [at(0.6 - wing * 1.6 / radius, radius + wing * 0.6), tip, at(0.6 - wing * 1.6 / radius, radius - wing * 0.6)];
+        let wings = [
+            at(0.6 - wing * 1.6 / radius, radius + wing * 0.6),
+            tip,
+            at(0.6 - wing * 1.6 / radius, radius - wing * 0.6),
+        ];
         chart.draw_series([Polygon::new(wings.to_vec(), SOURCE.filled())]).map(|_| ()).map_err(text_of)
     }
 
@@ -252,7 +260,7 @@ impl Picture<'_> {
     }
 
     /// The plane through the axis and the first view's source.
-    fn from_the_side(&self, area: &Area) -> Drawn {
+    fn side_view(&self, area: &Area) -> Drawn {
         let first = self.geometry.views[0].source;
         let r = first[0].hypot(first[1]).max(f64::MIN_POSITIVE);
         let (c, s) = (first[0] / r, first[1] / r);
@@ -261,8 +269,7 @@ impl Picture<'_> {
         let corners: Vec<(f64, f64)> =
             (0..8).map(|i| flat(std::array::from_fn(|k| if i >> k & 1 == 1 { high[k] } else { low[k] }))).collect();
         let ends = self.ends(&self.geometry.views[0])[1];
-        let (x, y) =
-            around(self.views().map(|v| v.source).chain(ends).map(flat).chain(corners.iter().copied()));
+        let (x, y) = around(self.views().map(|v| v.source).chain(ends).map(flat).chain(corners.iter().copied()));
         let labels = ["from the axis towards the source of view 0 (mm)", "z (mm)"];
         let frame = Frame { title: "from the side, in the plane of view 0", labels, x, y };
         let mut chart = frame.chart(area)?;

@@ -44,11 +44,8 @@ impl Setting {
         let view = |a: &f64| {
             View::circular(Radians(*a), Millimetres(self.dso), Millimetres(self.dsd), mm(self.pixel), mm(self.offset))
         };
-        let geometry = Geometry {
-            detector: self.detector,
-            views: self.angles.iter().map(view).collect(),
-            volume: self.volume,
-        };
+        let geometry =
+            Geometry { detector: self.detector, views: self.angles.iter().map(view).collect(), volume: self.volume };
         let shape = [geometry.views.len(), self.detector[0], self.detector[1]];
         let half = self.volume.size()[2] / 2.0;
         let projections = Array3::from_shape_fn(shape, |(view, row, column)| {

@@ -163,7 +163,10 @@ fn angles(scan: &Scan, s: &Survey, warn: Warn) {
     if a.like_degrees {
         warn(
             WarningKind::Degrees,
-            format!("views follow each other in steps of {:.4} rad, which divide 180, 360 or 720 evenly", a.step_deg.to_radians()),
+            format!(
+                "views follow each other in steps of {:.4} rad, which divide 180, 360 or 720 evenly",
+                a.step_deg.to_radians()
+            ),
             "the angles look like degrees that were taken for radians: convert them".into(),
         );
         return;
