@@ -259,7 +259,12 @@ pub(crate) fn size(path: &Path) -> Result<ScanSize> {
     d.volume.validate(&place)?;
     let folder = scan_folder::folder_of(path);
     let pixels = stack::values(folder, &place, "files.projections", &d.files.projections)?;
-    Ok(ScanSize { pixels, voxels: d.volume.len().unwrap_or(0) as u64, test_pixels: 0, reading: pixels.saturating_mul(8) })
+    Ok(ScanSize {
+        pixels,
+        voxels: d.volume.len().unwrap_or(0) as u64,
+        test_pixels: 0,
+        reading: pixels.saturating_mul(8),
+    })
 }
 
 /// Turns the rows round where that makes the views one of this program's own circles, on which rows run down: what
