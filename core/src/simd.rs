@@ -48,7 +48,7 @@ pub trait Real:
     /// The whole part of every lane, which is at least 0 and below 2³¹, into `out`; as many as fit.
     fn cells<S: Simd>(s: S, x: V<S, Self>, out: &mut [u32]);
     /// `K` neighbours of every lane: `line[at]`, `line[at + 1]`, … The lanes of `at` are whole numbers that do not fall
-    /// from one lane to the next. Where they lie within two vectors of each other, and `line` goes on for two vectors
+    /// from one lane to the next. Where they lie within four vectors of each other, and `line` goes on for as many
     /// from the first, registers are shuffled instead of reading memory lane by lane.
     fn neighbours<S: Simd, const K: usize>(s: S, line: &[Self], at: V<S, Self>) -> [V<S, Self>; K];
     /// Whether neither infinite nor NaN.
@@ -99,19 +99,33 @@ impl Real for f32 {
         let len = S::f32s::LEN;
         let (first, last) = (at.as_slice()[0], at.as_slice()[len - 1]);
         let base = first as usize;
-        if (last - first) as usize + K > 2 * len || base + 2 * len > line.len() {
-            return one_by_one(s, line, at);
-        }
-        let low = S::f32s::from_slice(s, &line[base..base + len]);
-        let high = S::f32s::from_slice(s, &line[base + len..base + 2 * len]);
+        let span = (last - first) as usize + K;
+        let register = |k: usize| S::f32s::from_slice(s, &line[base + k * len..base + (k + 1) * len]);
         // The four bytes of every lane's number.
-        let lane: S::u32s = (at - first).to_int();
-        let mut bytes = lane * 0x0404_0404 + 0x0302_0100;
-        std::array::from_fn(|_| {
-            let taken = low.concat_swizzle_dyn(high, bytes.to_bytes());
-            bytes += 0x0404_0404;
-            taken
-        })
+        let lane = at - first;
+        let number: S::u32s = lane.to_int();
+        let mut bytes = number * 0x0404_0404 + 0x0302_0100;
+        if span <= 2 * len && base + 2 * len <= line.len() {
+            let (low, high) = (register(0), register(1));
+            return std::array::from_fn(|_| {
+                let taken = low.concat_swizzle_dyn(high, bytes.to_bytes());
+                bytes += 0x0404_0404;
+                taken
+            });
+        }
+        if span <= 4 * len && base + 4 * len <= line.len() {
+            let near = [register(0), register(1)];
+            let far = [register(2), register(3)];
+            // Numbers of the far two registers count from their own first; those of the near two then mean nothing.
+            let start = S::u32s::splat(s, 0x0101_0101 * (8 * len) as u32);
+            return std::array::from_fn(|k| {
+                let a = near[0].concat_swizzle_dyn(near[1], bytes.to_bytes());
+                let b = far[0].concat_swizzle_dyn(far[1], (bytes - start).to_bytes());
+                bytes += 0x0404_0404;
+                lane.simd_ge(S::f32s::splat(s, (2 * len - k) as f32)).select(b, a)
+            });
+        }
+        one_by_one(s, line, at)
     }
     #[inline(always)]
     fn finite(self) -> bool {
@@ -368,7 +382,7 @@ mod tests {
     fn neighbours_are_found_near_and_far_apart() {
         let line: Vec<f32> = (0..200).map(|i| (i * i) as f32).collect();
         let wide: Vec<f64> = line.iter().map(|&x| x.into()).collect();
-        for step in [0.0, 0.3, 1.0, 1.7, 5.0] {
+        for step in [0.0, 0.3, 1.0, 1.7, 2.6, 3.4, 5.0] {
             for found in [run(Neighbours(&line, step)), run(Neighbours(&wide, step))] {
                 for (i, three) in found.into_iter().enumerate() {
                     let first = (3.0 + step * i as f64).floor();

@@ -93,7 +93,7 @@ impl<R: Real> Op for ByLine<'_, R> {
     fn call<S: Simd>(mut self, s: S) {
         let (count, ny, nz) = self.planes.dim();
         let [rows, columns] = self.view.geometry.detector;
-        let mut line = vec![R::ZERO; rows + 2 + 2 * AFTER];
+        let mut line = vec![R::ZERO; rows + 2 + AFTER];
         let l = self.lines;
         for y in 0..ny {
             for x in 0..count {

@@ -79,7 +79,7 @@ impl Column {
         rows: usize,
         others: usize,
         z: &Range<usize>,
-    ) -> Option<(Meeting<R>, [(usize, R); 2])> {
+    ) -> Option<(Meeting<R>, Lines<R>)> {
         let t = (plane as f64 - self.source[self.main]) / self.ahead[self.main];
         if t <= 0.0 {
             return None;
@@ -111,6 +111,9 @@ impl Column {
         Some((rows, [(low.0, R::of(low.1)), (high.0, R::of(high.1))]))
     }
 }
+
+/// Two lines of voxels, counted across the main axis, with their shares.
+type Lines<R> = [(usize, R); 2];
 
 /// Where equally distant readers stand along a line of numbers that has a zero before its first.
 pub(super) struct Meeting<R> {
@@ -189,7 +192,7 @@ impl<R: Real> Op for Forward<'_, R> {
     fn call<S: Simd>(self, s: S) {
         let [_, ny, nz] = self.shape;
         let stride = self.rows + AFTER;
-        let mut line = vec![R::ZERO; nz + 2 + 3 * AFTER];
+        let mut line = vec![R::ZERO; nz + 2 + AFTER];
         // Sums of a few planes, added up in turn: two short sums round less than one long one.
         let mut part = vec![R::ZERO; stride];
         for main in 0..2 {
@@ -229,7 +232,7 @@ fn union(a: &Range<usize>, b: &Range<usize>) -> Range<usize> {
     }
 }
 
-/// `line[1..] = shares[0]·a + shares[1]·b`, zero before and for some vectors after it.
+/// `line[1..] = shares[0]·a + shares[1]·b`, with a zero before and two after it; what lies beyond is never selected.
 #[inline(always)]
 pub(super) fn mix<S: Simd, R: Real>(s: S, a: &[R], b: &[R], shares: [R; 2], line: &mut [R]) {
     let len = V::<S, R>::LEN;
@@ -239,7 +242,7 @@ pub(super) fn mix<S: Simd, R: Real>(s: S, a: &[R], b: &[R], shares: [R; 2], line
         (load(s, a, i) * wa + load(s, b, i) * wb).store_slice(&mut line[1 + i..1 + i + len]);
         i += len;
     }
-    line[1 + a.len()..1 + a.len() + AFTER].fill(R::ZERO);
+    line[1 + a.len()..3 + a.len()].fill(R::ZERO);
 }
 
 /// Adds what the readers `m` find in a line of `numbers` numbers to `sums`.

@@ -61,7 +61,7 @@ impl Upright {
 /// Zeros before the first row of a column, which a reader may touch.
 pub const BEFORE: usize = 16;
 /// Zeros after the last row of a column: as many as vectors read at most beyond it.
-pub const AFTER: usize = 48;
+pub const AFTER: usize = 80;
 
 /// Some views with the pixels of a detector column side by side, from below, between zeros.
 pub struct ColumnMajor<R> {

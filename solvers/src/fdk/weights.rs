@@ -63,8 +63,7 @@ impl Orbit {
         order.sort_by(|&a, &b| angles[a].total_cmp(&angles[b]));
         let n = order.len();
         // Gap after each view in order.
-        let gaps: Vec<f64> =
-            (0..n).map(|i| (angles[order[(i + 1) % n]] - angles[order[i]]).rem_euclid(TAU)).collect();
+        let gaps: Vec<f64> = (0..n).map(|i| (angles[order[(i + 1) % n]] - angles[order[i]]).rem_euclid(TAU)).collect();
         let gaps = if n == 1 { vec![TAU] } else { gaps };
         let (widest, gap) = gaps.iter().copied().enumerate().fold((0, 0.0), |a, b| if b.1 > a.1 { b } else { a });
         let rest = (TAU - gap) / (n.max(2) - 1) as f64;
@@ -145,7 +144,13 @@ impl Orbit {
 /// The ray (β, γ) is measured again as (β + π + 2γ, −γ), and the two weights add up to 1.
 fn parker(beta: f64, gamma: f64, delta: f64) -> f64 {
     let ramp = |x: f64, width: f64| {
-        if x >= width { 1.0 } else if x <= 0.0 { 0.0 } else { (FRAC_PI_4 * 2.0 * x / width).sin().powi(2) }
+        if x >= width {
+            1.0
+        } else if x <= 0.0 {
+            0.0
+        } else {
+            (FRAC_PI_4 * 2.0 * x / width).sin().powi(2)
+        }
     };
     ramp(beta, 2.0 * (delta - gamma)) * ramp(PI + 2.0 * delta - beta, 2.0 * (delta + gamma))
 }

@@ -86,7 +86,16 @@ conefield_core::stage_type!(Solver, "sirt", Sirt, "simultaneous iterative recons
 impl SolverSpec for Sart {
     fn build(&self) -> Result<Box<dyn Solver>> {
         let s = self.clone();
-        Algebraic { name: "sart", subsets: usize::MAX, stop: s.stop, relaxation: s.relaxation, decay: s.decay, order: s.order, nonnegative: s.nonnegative }.build()
+        Algebraic {
+            name: "sart",
+            subsets: usize::MAX,
+            stop: s.stop,
+            relaxation: s.relaxation,
+            decay: s.decay,
+            order: s.order,
+            nonnegative: s.nonnegative,
+        }
+        .build()
     }
 }
 
@@ -95,7 +104,16 @@ impl SolverSpec for OsSart {
     fn build(&self) -> Result<Box<dyn Solver>> {
         ensure(self.subsets > 0, "spec", "solver.subsets", 0, "at least 1")?;
         let s = self.clone();
-        Algebraic { name: "os-sart", subsets: s.subsets, stop: s.stop, relaxation: s.relaxation, decay: s.decay, order: s.order, nonnegative: s.nonnegative }.build()
+        Algebraic {
+            name: "os-sart",
+            subsets: s.subsets,
+            stop: s.stop,
+            relaxation: s.relaxation,
+            decay: s.decay,
+            order: s.order,
+            nonnegative: s.nonnegative,
+        }
+        .build()
     }
 }
 
@@ -103,7 +121,16 @@ impl SolverSpec for OsSart {
 impl SolverSpec for Sirt {
     fn build(&self) -> Result<Box<dyn Solver>> {
         let s = self.clone();
-        Algebraic { name: "sirt", subsets: 1, stop: s.stop, relaxation: s.relaxation, decay: 1.0, order: Order::Sequential, nonnegative: s.nonnegative }.build()
+        Algebraic {
+            name: "sirt",
+            subsets: 1,
+            stop: s.stop,
+            relaxation: s.relaxation,
+            decay: 1.0,
+            order: Order::Sequential,
+            nonnegative: s.nonnegative,
+        }
+        .build()
     }
 }
 

@@ -86,7 +86,8 @@ impl Solver for FistaTv {
     }
 
     fn describe(&self) -> String {
-        format!("fista-tv: {} subsets, {} dual steps, weight {:?}", self.subsets, self.inner, self.weight).to_lowercase()
+        format!("fista-tv: {} subsets, {} dual steps, weight {:?}", self.subsets, self.inner, self.weight)
+            .to_lowercase()
     }
 }
 
