@@ -213,7 +213,7 @@ mod tests {
 
     fn run() -> Run {
         Run {
-            scan: ScanSize { pixels: 1 << 20, voxels: 512 * 512 * 512, reading: 0 },
+            scan: ScanSize { pixels: 1 << 20, voxels: 512 * 512 * 512, test_pixels: 0, reading: 0 },
             split: false,
             reference: true,
             field: true,
