@@ -3,6 +3,7 @@
 //! - [`geometry`], [`scan`], [`parts`]: what was measured, in millimetres, and what comes out.
 //! - [`simd`], [`dense`], [`trilinear`], [`stage`]: what a stage computes and how.
 //! - [`arena`]: parameters, gradients and optimizer state under their names.
+//! - [`files`]: opening what a user or a description names.
 //! - [`spec`], [`registry`]: what a user writes, and the stage types that it may name.
 //! - [`voxel`]: line integrals of voxel volumes.
 //! - [`pipeline`], [`backend`], [`solver`], [`trained`]: from a spec to a volume.
@@ -12,6 +13,7 @@ pub mod backend;
 pub mod checkpoint;
 pub mod dense;
 pub mod error;
+pub mod files;
 pub mod geometry;
 pub mod pages;
 pub mod parts;

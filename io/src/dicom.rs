@@ -14,11 +14,10 @@ mod tests;
 use crate::affine;
 use conefield_core::geometry::{VoxelGrid, cross, dot, norm, sub};
 use conefield_core::scan::Volume;
-use conefield_core::{Error, Result};
+use conefield_core::{Error, Result, files};
 use ndarray::{Array3, s};
 use slice::Slice;
 use std::collections::BTreeMap;
-use std::fs::File;
 use std::io::Read;
 use std::path::{Path, PathBuf};
 
@@ -75,9 +74,8 @@ pub(crate) fn files(folder: &Path) -> Result<Vec<PathBuf>> {
 }
 
 fn is_dicom(path: &Path) -> Result<bool> {
-    let io = |e| Error::io(path, e);
     let mut head = Vec::with_capacity(132);
-    File::open(path).map_err(io)?.take(132).read_to_end(&mut head).map_err(io)?;
+    files::open(path)?.0.take(132).read_to_end(&mut head).map_err(|e| Error::io(path, e))?;
     Ok(is_header(&head))
 }
 

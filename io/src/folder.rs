@@ -1,6 +1,7 @@
 //! Names that a scan's description gives must stay inside the scan's folder.
 
 use conefield_core::{Error, Result};
+use std::collections::HashSet;
 use std::path::{Component, Path, PathBuf};
 
 /// The file `name` of `folder`, refused if it is no plain file name.
@@ -37,6 +38,22 @@ pub(crate) fn within(folder: &Path, place: &str, field: &str, name: &str) -> Res
         return Err(Error::invalid(place, field, found, "a file inside the folder"));
     }
     Ok(path)
+}
+
+/// The files that a description has named so far. Few bytes that name one large file many times would fill memory.
+#[derive(Default)]
+pub(crate) struct Named(HashSet<(PathBuf, Option<String>)>);
+
+impl Named {
+    /// Refuses `part` (the array of an archive, say) of `path` if it was named before.
+    pub fn once(&mut self, place: &str, field: &str, path: &Path, part: Option<&str>) -> Result<()> {
+        let real = path.canonicalize().map_err(|e| Error::io(path, e))?;
+        if self.0.insert((real, part.map(str::to_owned))) {
+            return Ok(());
+        }
+        let found = format!("{} a second time", path.display());
+        Err(Error::invalid(place, field, found, "each file once"))
+    }
 }
 
 /// Refuses to replace a folder that holds anything but what `known` says the format itself writes.

@@ -1,14 +1,23 @@
 //! A file, packed or not, that is read front to back and never trusted about its length.
 
 use crate::number::{Number, Order};
-use conefield_core::{Error, Result};
+use conefield_core::{Error, Result, files};
 use flate2::bufread::{MultiGzDecoder, ZlibDecoder};
-use std::fs::File;
 use std::io::{BufRead, BufReader, ErrorKind, Read};
 use std::path::{Path, PathBuf};
 
-/// Deflate stores at best 258 bytes in two bits: no such stream unpacks to more than this many times its size.
-pub(crate) const DEFLATE_LIMIT: u64 = 1032;
+/// Deflate stores at best 258 bytes in two bits, LZW some 3000 in twelve: no such stream unpacks to more than this
+/// many times its size.
+const UNPACKED_LIMIT: u64 = 2048;
+
+/// Longest description of a scan, in bytes: fifty thousand views that lie on no circle.
+pub(crate) const LONGEST_TEXT: u64 = 16 << 20;
+
+/// Measured values deflate to a half or a tenth; only what is empty shrinks more. An array of more than this many
+/// numbers (256 MiB of `f32`) ...
+const LARGE: u64 = 1 << 26;
+/// ... that unpacks to more than this many times its packed size is no measurement.
+const MOST_RATIO: u64 = 100;
 
 /// Values decoded between two looks at the file: what a lying header can make us take before the lie shows.
 const CHUNK: usize = 1 << 18;
@@ -44,14 +53,9 @@ impl Input {
 
     /// Opens `path` and gives out its bytes as they are.
     pub fn open_plain(path: &Path) -> Result<Self> {
-        let io = |e| Error::io(path, e);
-        let file = File::open(path).map_err(io)?;
-        let info = file.metadata().map_err(io)?;
-        if !info.is_file() {
-            return Err(Error::invalid(path.display().to_string(), "file", "a folder or device", "a regular file"));
-        }
+        let (file, size) = files::open(path)?;
         let reader = Box::new(BufReader::with_capacity(1 << 18, file));
-        Ok(Self { path: path.to_path_buf(), reader, size: info.len(), packed: None, at: 0 })
+        Ok(Self { path: path.to_path_buf(), reader, size, packed: None, at: 0 })
     }
 
     /// Unpacks from here on: the rest of a plain file must be one zlib stream.
@@ -132,14 +136,10 @@ impl Input {
             .checked_mul(number.bytes() as u64)
             .ok_or_else(|| self.invalid(field, format!("{count} values"), "a length that can be addressed"))?;
         if let Some(packed) = self.packed {
-            let most = self.size.saturating_mul(DEFLATE_LIMIT);
-            if want > most {
-                return Err(self.invalid(
-                    field,
-                    format!("a header that claims {want} bytes in a {packed} stream of {} bytes", self.size),
-                    format!("at most {most} bytes, which is all that such a stream can unpack to"),
-                ));
-            }
+            must_unpack(self.size, want, count as u64).map_err(|expected| {
+                let found = format!("a header that claims {want} bytes in a {packed} stream of {} bytes", self.size);
+                self.invalid(field, found, expected)
+            })?;
         } else {
             let left = self.size.saturating_sub(self.at);
             if left != want {
@@ -184,6 +184,33 @@ impl Input {
     }
 }
 
+/// All of a regular file.
+pub(crate) fn read_bytes(path: &Path) -> Result<Vec<u8>> {
+    let (file, size) = files::open(path)?;
+    let mut bytes = Vec::new();
+    if !usize::try_from(size).is_ok_and(|n| bytes.try_reserve_exact(n).is_ok()) {
+        let place = path.display().to_string();
+        return Err(Error::invalid(place, "file size", format!("{size} bytes"), "a file that fits in memory"));
+    }
+    file.take(size).read_to_end(&mut bytes).map_err(|e| Error::io(path, e))?;
+    Ok(bytes)
+}
+
+/// Whether `packed` bytes may hold `count` numbers that take `unpacked` bytes; if not, how many they may.
+pub(crate) fn must_unpack(packed: u64, unpacked: u64, count: u64) -> Result<(), String> {
+    if unpacked > packed.saturating_mul(UNPACKED_LIMIT) {
+        let most = packed.saturating_mul(UNPACKED_LIMIT);
+        return Err(format!("at most {most} bytes, which is all that such a stream can unpack to"));
+    }
+    if count > LARGE && unpacked > packed.saturating_mul(MOST_RATIO) {
+        return Err(format!(
+            "at most {MOST_RATIO} times the packed size, which measured values stay far below (if it is right, give \
+             the file unpacked)"
+        ));
+    }
+    Ok(())
+}
+
 /// A zlib stream that nothing may follow.
 struct WholeZlib(ZlibDecoder<Box<dyn BufRead>>);
 
@@ -195,21 +222,4 @@ impl Read for WholeZlib {
         }
         Ok(n)
     }
-}
-
-/// Reads a text of at most 256 MiB.
-pub(crate) fn read_text(path: &Path) -> Result<String> {
-    const MOST: u64 = 256 << 20;
-    let io = |e| Error::io(path, e);
-    let file = File::open(path).map_err(io)?;
-    let size = file.metadata().map_err(io)?.len();
-    if size > MOST {
-        let place = path.display().to_string();
-        return Err(Error::invalid(place, "file size", format!("{size} bytes"), format!("at most {MOST} bytes")));
-    }
-    let mut raw = Vec::new();
-    file.take(MOST).read_to_end(&mut raw).map_err(io)?;
-    String::from_utf8(raw).map_err(|e| {
-        Error::invalid(path.display().to_string(), "text", format!("a byte that is no UTF-8: {e}"), "UTF-8 text")
-    })
 }

@@ -5,6 +5,7 @@
 //! are \[x, y, z\]; `offOrigin` is the volume's centre. Lengths are millimetres. What `image` is in is not said:
 //! see [`read_naf`].
 
+use crate::input::read_bytes;
 use crate::orbit::Orbit;
 use crate::pickle::{self, Item, Out, Pickle};
 use crate::scan::DataSet;
@@ -73,7 +74,7 @@ pub(crate) fn read_train(path: &Path) -> Result<Scan> {
 /// Only the volume. Its voxels are in mm whatever its values are in, so the projections are not looked at.
 pub(crate) fn read_truth(path: &Path) -> Result<Option<Volume>> {
     let place = path.display().to_string();
-    let bytes = pickle::read_bytes(path)?;
+    let bytes = read_bytes(path)?;
     let pickle = Pickle::parse(&place, &bytes)?;
     let file = Description::read(&pickle.top())?;
     let data = file.image(&pickle.top())?;
@@ -82,7 +83,7 @@ pub(crate) fn read_truth(path: &Path) -> Result<Option<Volume>> {
 
 fn read(path: &Path, with_test: bool) -> Result<DataSet> {
     let place = path.display().to_string();
-    let bytes = pickle::read_bytes(path)?;
+    let bytes = read_bytes(path)?;
     let pickle = Pickle::parse(&place, &bytes)?;
     let top = pickle.top();
     let file = Description::read(&top)?;

@@ -1,24 +1,17 @@
 //! NumPy's `.npz`: a ZIP archive of `.npy` files, stored or deflated.
 
-use crate::input::Input;
+use crate::input::{Input, must_unpack};
 use crate::npy;
-use conefield_core::{Error, Result};
+use conefield_core::{Error, Result, files};
 use flate2::Crc;
 use flate2::bufread::DeflateDecoder;
 use ndarray::ArrayD;
-use std::fs::File;
 use std::io::{BufReader, ErrorKind, Read, Seek, SeekFrom};
 use std::path::{Path, PathBuf};
 use zip::{CompressionMethod, ZipArchive};
 
 /// The bytes that a ZIP archive with anything in it starts with.
 pub(crate) const MAGIC: &[u8] = b"PK\x03\x04";
-
-/// Measured counts deflate to a half or a tenth; only what is empty shrinks more. An array larger than this many
-/// bytes ...
-const LARGE: u64 = 256 << 20;
-/// ... that unpacks to more than this many times its packed size is no measurement.
-const MOST_RATIO: u64 = 100;
 
 /// Reads the array `name` of the archive (the only one if `None`) with any of the sets of axes, as [`npy::read`] does.
 pub(crate) fn read(path: &Path, name: Option<&str>, sets: &[&[&str]]) -> Result<ArrayD<f32>> {
@@ -28,7 +21,7 @@ pub(crate) fn read(path: &Path, name: Option<&str>, sets: &[&[&str]]) -> Result<
         zip::result::ZipError::Io(e) if e.kind() != ErrorKind::UnexpectedEof => io(e),
         e => Error::invalid(&place, "archive", e, "a whole ZIP archive, as NumPy writes .npz"),
     };
-    let file = BufReader::new(File::open(path).map_err(io)?);
+    let file = BufReader::new(files::open(path)?.0);
     let mut archive = ZipArchive::new(file).map_err(broken)?;
     let names: Vec<String> = archive.file_names().filter_map(|n| n.ok().map(|n| n.into_owned())).collect();
     let arrays: Vec<&str> = names.iter().filter_map(|n| n.strip_suffix(".npy")).collect();
@@ -53,11 +46,10 @@ pub(crate) fn read(path: &Path, name: Option<&str>, sets: &[&[&str]]) -> Result<
     let start = entry.data_start().ok_or_else(|| Error::invalid(&place, "archive", "no data", "where the data starts"));
     let start = start?;
     drop(entry);
-    if size > LARGE && size > packed.saturating_mul(MOST_RATIO) {
-        let found = format!("{size} bytes in {packed} packed ones");
-        let expected = format!("at most {MOST_RATIO} times the packed size, which measured values stay far below");
-        return Err(Error::invalid(place, "size", found, expected));
-    }
+    // The type of the numbers is not known yet: the smallest, of one byte, makes most of them.
+    must_unpack(packed, size, size).map_err(|expected| {
+        Error::invalid(&place, "size", format!("{size} bytes in {packed} packed ones"), expected)
+    })?;
     let mut file = archive.into_inner();
     file.seek(SeekFrom::Start(start)).map_err(io)?;
     let raw = file.take(packed);
@@ -100,6 +92,7 @@ impl<R: Read> Read for Checked<R> {
 mod tests {
     use super::*;
     use crate::testing::npy_bytes;
+    use std::fs::File;
     use std::io::Write;
     use zip::write::SimpleFileOptions;
 

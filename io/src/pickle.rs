@@ -13,10 +13,9 @@ mod write;
 #[cfg(test)]
 mod tests;
 
-use conefield_core::{Error, Result};
+use conefield_core::{Error, Result, files};
 use numpy::{Array, Dtype, Global};
 use std::collections::HashMap;
-use std::fs::File;
 use std::io::Read;
 use std::path::Path;
 use value::{Heap, Node, Refusal, Value};
@@ -38,29 +37,10 @@ const PROTOCOLS: std::ops::RangeInclusive<u8> = 2..=5;
 /// Whether the file starts as a pickle of protocol 2 or later does.
 pub(crate) fn is_pickle(path: &Path) -> Result<bool> {
     let mut start = Vec::new();
-    let file = File::open(path).map_err(|e| Error::io(path, e))?;
+    let (file, _) = files::open(path)?;
     file.take(2).read_to_end(&mut start).map_err(|e| Error::io(path, e))?;
     // Python is at 5; a few more, so that the refusal can name them.
     Ok(matches!(start[..], [op::PROTO, 0..=15]))
-}
-
-/// All of a regular file.
-pub(crate) fn read_bytes(path: &Path) -> Result<Vec<u8>> {
-    let io = |e| Error::io(path, e);
-    let file = File::open(path).map_err(io)?;
-    let info = file.metadata().map_err(io)?;
-    let invalid = |field: &str, found: String, expected: &str| {
-        Err(Error::invalid(path.display().to_string(), field, found, expected))
-    };
-    if !info.is_file() {
-        return invalid("file", "a folder or device".into(), "a regular file");
-    }
-    let mut bytes = Vec::new();
-    if !usize::try_from(info.len()).is_ok_and(|n| bytes.try_reserve_exact(n).is_ok()) {
-        return invalid("file size", format!("{} bytes", info.len()), "a file that fits in memory");
-    }
-    file.take(info.len()).read_to_end(&mut bytes).map_err(io)?;
-    Ok(bytes)
 }
 
 impl<'a> Pickle<'a> {

@@ -5,13 +5,14 @@
 //! towards +z, against the rows. `offOrigin` is the volume's centre. Projections are integrals over the lengths of the
 //! file, whatever their unit is.
 
-use crate::input::read_text;
+use crate::input::LONGEST_TEXT;
 use crate::orbit::Orbit;
 use crate::scan::DataSet;
 use crate::text::{Notation, parse};
 use crate::unit::{self, Reading, Units};
 use crate::{ScanSize, folder, npy, rays, write_atomic, write_folder_atomic, write_text_atomic};
 use conefield_core::error::ensure;
+use conefield_core::files::read_text;
 use conefield_core::geometry::{Geometry, VoxelGrid};
 use conefield_core::scan::{Scan, Unit, Volume};
 use conefield_core::{Error, Result};
@@ -76,7 +77,7 @@ pub(crate) fn read_train(folder: &Path) -> Result<DataSet> {
 fn read(folder: &Path, with_test: bool) -> Result<DataSet> {
     let file = folder.join(META);
     let place = file.display().to_string();
-    let meta: Meta = parse(&file, &read_text(&file)?, Notation::Json)?;
+    let meta: Meta = parse(&file, &read_text(&file, LONGEST_TEXT)?, Notation::Json)?;
     let s = &meta.scanner;
     if s.mode != "cone" {
         let what = format!("{place}: scanner.mode: \"{}\"", s.mode);
@@ -120,7 +121,7 @@ fn read(folder: &Path, with_test: bool) -> Result<DataSet> {
 /// the volume is looked at.
 pub(crate) fn size(folder: &Path) -> Result<ScanSize> {
     let file = folder.join(META);
-    let meta: Meta = parse(&file, &read_text(&file)?, Notation::Json)?;
+    let meta: Meta = parse(&file, &read_text(&file, LONGEST_TEXT)?, Notation::Json)?;
     let product = |all: &[usize]| all.iter().fold(1u64, |n, &s| n.saturating_mul(s as u64));
     let pixels_of = |frames: &[Frame]| product(&meta.scanner.nDetector).saturating_mul(frames.len() as u64);
     let (pixels, test_pixels) = (pixels_of(&meta.proj_train), pixels_of(&meta.proj_test));
@@ -189,8 +190,11 @@ fn each<const N: usize>(
 
 fn projections(folder: &Path, place: &str, field: &str, frames: &[Frame], shape: [usize; 2]) -> Result<Array3<f32>> {
     let mut all: Vec<f32> = Vec::new();
+    let mut named = folder::Named::default();
     for (i, frame) in frames.iter().enumerate() {
-        let path = folder::inside(folder, place, &format!("{field}[{i}].file_path"), &frame.file_path)?;
+        let field = format!("{field}[{i}].file_path");
+        let path = folder::inside(folder, place, &field, &frame.file_path)?;
+        named.once(place, &field, &path, None)?;
         let image: Array2<f32> = npy::read(&path, &["row", "column"])?
             .into_dimensionality::<Ix2>()
             .map_err(|e| Error::invalid(path.display().to_string(), "shape", e, "two axes"))?;

@@ -10,17 +10,18 @@
 //!
 //! RTK names no unit of length; here it is mm. Angles are degrees.
 
-use crate::input::read_text;
 use crate::write_text_atomic;
 use conefield_core::error::ensure;
+use conefield_core::files::read_text;
 use conefield_core::geometry::{Vec3, View, cross, dot, norm, sub};
 use conefield_core::{Error, Result};
 use roxmltree::{Document, Node, ParsingOptions};
 use std::path::Path;
 
 const ROOT: &str = "RTKThreeDCircularGeometry";
-/// Elements in a file: far more than any scan has.
-const MOST_NODES: u32 = 50_000_000;
+/// Longest file, in bytes, and most of what the parser counts as nodes: fifty thousand views.
+const LONGEST: u64 = 64 << 20;
+const MOST_NODES: u32 = 4_000_000;
 
 /// RTK's nine numbers of one projection, lengths in mm, angles in degrees.
 #[derive(Debug, Clone, Copy, PartialEq, Default)]
@@ -144,7 +145,7 @@ impl Projection {
 pub fn read_rtk_geometry(path: impl AsRef<Path>, pixel: [f64; 2], offset: [f64; 2]) -> Result<Vec<View>> {
     let path = path.as_ref();
     let place = path.display().to_string();
-    let text = read_text(path)?;
+    let text = read_text(path, LONGEST)?;
     // RTK writes a document type without content; entities are limited by the parser.
     let options = ParsingOptions { allow_dtd: true, nodes_limit: MOST_NODES, ..ParsingOptions::default() };
     let document =

@@ -70,6 +70,8 @@ struct Source {
 /// none, in the order of the numbers in their names.
 pub(crate) fn read(folder: &Path, place: &str, field: &str, names: &Names, layout: Layout) -> Result<Array3<f32>> {
     let sources = sources(folder, place, field, names)?;
+    let mut named = folder::Named::default();
+    sources.iter().try_for_each(|s| named.once(place, field, &s.path, s.array.as_deref()))?;
     let mut all: Option<(Vec<f32>, [usize; 2], usize)> = None;
     let single = sources.len() == 1;
     for source in &sources {

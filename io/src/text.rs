@@ -1,7 +1,8 @@
 //! TOML and JSON with errors that name the line and, for an unknown key, the nearest valid one.
 
-use crate::input::read_text;
+use crate::input::LONGEST_TEXT;
 use conefield_core::error::ensure;
+use conefield_core::files::read_text;
 use conefield_core::{Error, Result};
 use serde::Deserialize;
 use serde::de::DeserializeOwned;
@@ -31,13 +32,13 @@ struct Mark {
 
 /// The format that the file `path` says it has, if it is a description at all.
 pub(crate) fn format_of(path: &Path) -> Option<String> {
-    let mark: Mark = parse(path, &read_text(path).ok()?, Notation::of(path)).ok()?;
+    let mark: Mark = parse(path, &read_text(path, LONGEST_TEXT).ok()?, Notation::of(path)).ok()?;
     mark.format
 }
 
 /// Reads the description `path`, which must say `format` and `version`.
 pub(crate) fn described<T: DeserializeOwned>(path: &Path, format: &str, version: u32) -> Result<T> {
-    let text = read_text(path)?;
+    let text = read_text(path, LONGEST_TEXT)?;
     let place = path.display().to_string();
     let notation = Notation::of(path);
     // Before the keys are checked: a later version may well have others.

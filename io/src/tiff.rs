@@ -1,8 +1,8 @@
 //! TIFF as detectors write it: one grey channel, integers or floats, one image a page.
 
-use conefield_core::{Error, Result};
+use crate::input::must_unpack;
+use conefield_core::{Error, Result, files};
 use ndarray::Array3;
-use std::fs::File;
 use std::io::BufReader;
 use std::path::Path;
 use tiff::decoder::{Decoder, DecodingResult, Limits};
@@ -13,21 +13,16 @@ pub(crate) fn is_tiff(head: &[u8]) -> bool {
     [b"II*\0", b"MM\0*", b"II+\0", b"MM\0+"].iter().any(|m| head.starts_with(*m))
 }
 
-/// No packing that is read here (deflate, LZW, PackBits) unpacks to more than this many times its size.
-const MOST_RATIO: u64 = 2048;
-
 /// Reads all pages as `[page, row, column]`; they must be of one size.
 ///
 /// 8 to 64 bits a pixel, integers or floats, converted to `f32`; other colours, sizes that the file cannot hold,
 /// values that are not finite and damaged files are refused.
 pub(crate) fn read(path: &Path) -> Result<Array3<f32>> {
     let place = path.display().to_string();
-    let io = |e| Error::io(path, e);
-    let file = File::open(path).map_err(io)?;
-    let most = file.metadata().map_err(io)?.len().saturating_mul(MOST_RATIO);
+    let (file, packed) = files::open(path)?;
     let broken = |e: TiffError| Error::invalid(&place, "TIFF", e, "a whole TIFF image");
     let mut decoder = Decoder::new(BufReader::new(file)).map_err(broken)?;
-    let (mut values, mut size, mut pages, mut claimed) = (Vec::<f32>::new(), None, 0usize, 0u64);
+    let (mut values, mut size, mut pages, mut claimed) = (Vec::<f32>::new(), None, 0usize, [0u64; 2]);
     loop {
         let (width, height) = decoder.dimensions().map_err(broken)?;
         let bits = match decoder.colortype().map_err(broken)? {
@@ -37,13 +32,14 @@ pub(crate) fn read(path: &Path) -> Result<Array3<f32>> {
                 return Err(Error::invalid(&place, format!("page {pages}"), format!("{other:?}"), expected));
             }
         };
-        let bytes = u64::from(width).saturating_mul(height.into()).saturating_mul(u64::from(bits) / 8);
-        claimed = claimed.saturating_add(bytes);
-        if bytes == 0 || claimed > most {
-            let found = format!("{height} x {width} pixels of {bits} bits");
-            let expected = format!("at least one pixel and at most {most} bytes, all that such a file can unpack to");
-            return Err(Error::invalid(&place, format!("page {pages}"), found, expected));
-        }
+        let pixels = u64::from(width) * u64::from(height);
+        let bytes = pixels.saturating_mul(u64::from(bits) / 8);
+        claimed = [claimed[0].saturating_add(bytes), claimed[1].saturating_add(pixels)];
+        let fits = must_unpack(packed, claimed[0], claimed[1]);
+        fits.and(if bytes == 0 { Err("at least one pixel".into()) } else { Ok(()) }).map_err(|expected| {
+            let found = format!("{height} x {width} pixels of {bits} bits in a file of {packed} bytes");
+            Error::invalid(&place, format!("page {pages}"), found, expected)
+        })?;
         if *size.get_or_insert((height, width)) != (height, width) {
             let found = format!("{height} x {width} pixels");
             return Err(Error::invalid(&place, format!("page {pages}"), found, "the size of the first page"));
@@ -92,6 +88,7 @@ fn append(out: &mut Vec<f32>, image: DecodingResult) {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use std::fs::File;
     use tiff::encoder::{TiffEncoder, colortype as kind};
 
     #[test]

@@ -4,11 +4,10 @@
 //! fixed order, so that the same weights give the same bytes.
 
 use crate::{number, write_atomic};
-use conefield_core::{Error, Result};
+use conefield_core::{Error, Result, files};
 use safetensors::{Dtype, SafeTensors};
 use serde_json::{Map, Value, json};
 use std::collections::{BTreeMap, BTreeSet};
-use std::fs::File;
 use std::io::Read;
 use std::path::Path;
 
@@ -71,8 +70,7 @@ pub fn read_weights(path: impl AsRef<Path>) -> Result<Weights> {
     let path = path.as_ref();
     let place = path.display().to_string();
     let io = |e| Error::io(path, e);
-    let mut file = File::open(path).map_err(io)?;
-    let size = file.metadata().map_err(io)?.len();
+    let (mut file, size) = files::open(path)?;
     if size < 8 {
         return Err(Error::invalid(place, "header length", format!("{size} bytes"), "a safetensors file"));
     }

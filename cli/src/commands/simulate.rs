@@ -5,11 +5,15 @@ use crate::memory::Memory;
 use crate::parse::{self, Angles as AnglesArg, Values};
 use crate::{files, out};
 use clap::Args;
+use conefield_core::files::read_text;
 use conefield_core::scan::Volume;
 use conefield_core::{Error, Result};
 use conefield_projectors::simulate::{Angles, HuMapping, Noise, Protocol, downsample, simulate};
 use serde_json::json;
 use std::path::{Path, PathBuf};
+
+/// Longest protocol or list of angles, in bytes.
+const LONGEST: u64 = 16 << 20;
 
 /// Make a scan of a known volume.
 ///
@@ -161,7 +165,7 @@ impl Simulate {
 }
 
 fn read_protocol(path: &Path) -> Result<Protocol> {
-    let text = std::fs::read_to_string(path).map_err(|e| Error::io(path, e))?;
+    let text = read_text(path, LONGEST)?;
     let place = path.display();
     if text.trim_start().starts_with('{') {
         return serde_json::from_str(&text)
@@ -175,7 +179,7 @@ fn read_protocol(path: &Path) -> Result<Protocol> {
 }
 
 fn read_angles(path: &Path) -> Result<Vec<f64>> {
-    let text = std::fs::read_to_string(path).map_err(|e| Error::io(path, e))?;
+    let text = read_text(path, LONGEST)?;
     let lines = text.lines().map(|l| l.split('#').next().unwrap_or_default().trim()).enumerate();
     let angles = lines.filter(|(_, l)| !l.is_empty()).map(|(i, l)| match l.parse::<f64>() {
         Ok(a) if a.is_finite() => Ok(a),

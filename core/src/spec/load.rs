@@ -7,8 +7,12 @@
 use super::tree::{At, Entry, Kind, Node, parse_json, parse_toml};
 use super::{Spec, check};
 use crate::error::{Error, Result};
+use crate::files;
 use serde_json::Value;
 use std::path::{Path, PathBuf};
+
+/// Longest spec, in bytes; those that come with the program are a hundredth of this.
+const LONGEST: u64 = 256 << 10;
 
 /// A spec that comes with the program.
 #[derive(Debug, Clone, Copy)]
@@ -135,9 +139,11 @@ impl Layer {
             return Ok(Self { origin: Origin::Shipped(s.name), text: s.text.into() });
         }
         let path = folder.map_or_else(|| PathBuf::from(what), |f| f.join(what));
-        match std::fs::read_to_string(&path) {
+        match files::read_text(&path, LONGEST) {
             Ok(text) => Ok(Self { origin: Origin::File(path), text }),
-            Err(e) if e.kind() == std::io::ErrorKind::NotFound => Err("neither a shipped spec nor a file".into()),
+            Err(Error::Io { source, .. }) if source.kind() == std::io::ErrorKind::NotFound => {
+                Err("neither a shipped spec nor a file".into())
+            }
             Err(e) => Err(e.to_string()),
         }
     }
@@ -208,7 +214,7 @@ impl Set {
         if path.is_empty() || !text.contains('=') || path.split('.').any(str::is_empty) {
             return Err(Error::invalid(label, "path", format!("{text:?}"), "path=value, such as encoder.levels=8"));
         }
-        let at = At::whole(label);
+        let at = At::whole(&label);
         // A TOML value, or else a text that needs no quotes.
         let parsed = parse_toml("", &format!("value = {value}")).ok().filter(|n| n.entries().len() == 1);
         let kind = match parsed.and_then(|mut n| n.take("value")) {

@@ -2,6 +2,7 @@
 
 use crate::error::{Error, Result};
 use serde_json::{Number, Value};
+use std::collections::HashSet;
 use std::fmt;
 use std::sync::Arc;
 use toml::de::{DeTable, DeValue};
@@ -9,31 +10,46 @@ use toml::de::{DeTable, DeValue};
 /// A place in a source: a file with line and column, or a `--set`.
 #[derive(Debug, Clone, PartialEq)]
 pub(super) struct At {
-    source: Arc<str>,
-    /// Line and column, from 1.
-    line: Option<(usize, usize)>,
+    source: Arc<Source>,
+    /// A byte of the source's text. Line and column are counted when they are shown: to count them for every value of
+    /// a long text would take the square of its length.
+    offset: Option<usize>,
+}
+
+/// A name with the text that stands there.
+#[derive(Debug, PartialEq)]
+struct Source {
+    name: String,
+    text: String,
+}
+
+impl Source {
+    fn new(name: &str, text: &str) -> Arc<Self> {
+        Arc::new(Self { name: name.into(), text: text.into() })
+    }
 }
 
 impl At {
     /// A source without lines.
-    pub(super) fn whole(source: impl Into<Arc<str>>) -> Self {
-        Self { source: source.into(), line: None }
+    pub(super) fn whole(name: &str) -> Self {
+        Self { source: Source::new(name, ""), offset: None }
     }
 
-    /// The byte `offset` of `text`.
-    fn byte(source: &Arc<str>, text: &str, offset: usize) -> Self {
-        let before = &text.as_bytes()[..offset.min(text.len())];
-        let line = before.iter().filter(|b| **b == b'\n').count() + 1;
-        let column = String::from_utf8_lossy(before.rsplit(|b| *b == b'\n').next().unwrap_or_default()).chars().count();
-        Self { source: source.clone(), line: Some((line, column + 1)) }
+    /// The byte `offset` of the source's text.
+    fn byte(source: &Arc<Source>, offset: usize) -> Self {
+        Self { source: source.clone(), offset: Some(offset) }
     }
 }
 
 impl fmt::Display for At {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        f.write_str(&self.source)?;
-        if let Some((line, column)) = self.line {
-            write!(f, ":{line}:{column}")?;
+        let Source { name, text } = &*self.source;
+        f.write_str(name)?;
+        if let Some(offset) = self.offset {
+            let before = &text.as_bytes()[..offset.min(text.len())];
+            let line = before.iter().filter(|b| **b == b'\n').count() + 1;
+            let rest = String::from_utf8_lossy(before.rsplit(|b| *b == b'\n').next().unwrap_or_default());
+            write!(f, ":{line}:{}", rest.chars().count() + 1)?;
         }
         Ok(())
     }
@@ -166,27 +182,27 @@ impl Node {
 
 /// Reads TOML.
 pub(super) fn parse_toml(source: &str, text: &str) -> Result<Node> {
-    let source: Arc<str> = source.into();
+    let source = Source::new(source, text);
     let root = DeTable::parse(text).map_err(|e| {
-        let at = At::byte(&source, text, e.span().map_or(0, |s| s.start));
+        let at = At::byte(&source, e.span().map_or(0, |s| s.start));
         Error::invalid(at.to_string(), "syntax", e.message().replace('\n', ", "), "TOML")
     })?;
-    toml_table(&source, text, root.get_ref(), At::byte(&source, text, 0))
+    toml_table(&source, root.get_ref(), At::byte(&source, 0))
 }
 
-fn toml_table(source: &Arc<str>, text: &str, table: &DeTable<'_>, at: At) -> Result<Node> {
+fn toml_table(source: &Arc<Source>, table: &DeTable<'_>, at: At) -> Result<Node> {
     let mut entries = Vec::with_capacity(table.len());
     for (key, value) in table {
         entries.push(Entry {
             key: key.get_ref().to_string(),
-            at: At::byte(source, text, key.span().start),
-            value: toml_value(source, text, value.get_ref(), At::byte(source, text, value.span().start))?,
+            at: At::byte(source, key.span().start),
+            value: toml_value(source, value.get_ref(), At::byte(source, value.span().start))?,
         });
     }
     Ok(Node { at, kind: Kind::Table(entries) })
 }
 
-fn toml_value(source: &Arc<str>, text: &str, value: &DeValue<'_>, at: At) -> Result<Node> {
+fn toml_value(source: &Arc<Source>, value: &DeValue<'_>, at: At) -> Result<Node> {
     let refuse = |found: &dyn fmt::Display, expected: &str| Error::invalid(at.to_string(), "value", found, expected);
     let kind = match value {
         DeValue::String(s) => Kind::String(s.to_string()),
@@ -204,23 +220,22 @@ fn toml_value(source: &Arc<str>, text: &str, value: &DeValue<'_>, at: At) -> Res
         DeValue::Array(items) => Kind::Array(
             items
                 .iter()
-                .map(|v| toml_value(source, text, v.get_ref(), At::byte(source, text, v.span().start)))
+                .map(|v| toml_value(source, v.get_ref(), At::byte(source, v.span().start)))
                 .collect::<Result<_>>()?,
         ),
-        DeValue::Table(t) => return toml_table(source, text, t, at),
+        DeValue::Table(t) => return toml_table(source, t, at),
     };
     Ok(Node { at, kind })
 }
 
 /// Reads JSON.
 pub(super) fn parse_json(source: &str, text: &str) -> Result<Node> {
-    let source: Arc<str> = source.into();
+    let source = Source::new(source, text);
     // serde_json checks syntax and depth; what follows only has to find its way through valid text.
     serde_json::from_str::<Value>(text).map_err(|e| {
-        let at = At { source: source.clone(), line: Some((e.line(), e.column())) };
         let why = e.to_string();
         let why = why.split(" at line ").next().unwrap_or_default();
-        Error::invalid(at.to_string(), "syntax", why, "JSON")
+        Error::invalid(format!("{}:{}:{}", source.name, e.line(), e.column()), "syntax", why, "JSON")
     })?;
     let mut reader = Json { source, text, at: 0 };
     reader.value()
@@ -228,14 +243,14 @@ pub(super) fn parse_json(source: &str, text: &str) -> Result<Node> {
 
 /// Reads text that is known to be valid JSON.
 struct Json<'a> {
-    source: Arc<str>,
+    source: Arc<Source>,
     text: &'a str,
     at: usize,
 }
 
 impl Json<'_> {
     fn place(&self) -> At {
-        At::byte(&self.source, self.text, self.at)
+        At::byte(&self.source, self.at)
     }
 
     fn peek(&mut self) -> u8 {
@@ -276,12 +291,13 @@ impl Json<'_> {
             b'{' => {
                 self.at += 1;
                 let mut entries: Vec<Entry> = vec![];
+                let mut keys = HashSet::new();
                 while !self.eat(b'}') {
                     self.eat(b',');
                     self.peek();
                     let at = self.place();
                     let key = self.string()?;
-                    if entries.iter().any(|e| e.key == key) {
+                    if !keys.insert(key.clone()) {
                         return Err(Error::invalid(at.to_string(), key, "the key a second time", "each key once"));
                     }
                     self.eat(b':');

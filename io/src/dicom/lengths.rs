@@ -3,8 +3,8 @@
 //! `dicom-object` takes memory for what an element claims, up to 4 GiB, and goes down nested sequences by recursion.
 //! This keeps both in bounds.
 
-use crate::input::DEFLATE_LIMIT;
-use conefield_core::{Error, Result};
+use crate::input::must_unpack;
+use conefield_core::{Error, Result, files};
 use dicom_object::Tag;
 use std::fs::File;
 use std::io::{BufReader, Read, Seek, SeekFrom};
@@ -34,14 +34,14 @@ pub(super) enum Pixels {
 }
 
 impl Pixels {
-    /// Refuses a picture of `want` bytes that cannot come from this many.
-    pub fn must_hold(self, place: &str, want: u64) -> Result<()> {
+    /// Refuses a picture of `count` values of `size` bytes that cannot come from this many.
+    pub fn must_hold(self, place: &str, count: u64, size: u64) -> Result<()> {
+        let want = count * size;
         let (bytes, ok) = match self {
             Self::None => (0, false),
             // Odd lengths are padded to even ones.
             Self::Plain(n) => (n, n == want || n == want + 1),
-            // No compression that is read here does better than deflate.
-            Self::Packed(n) => (n, want <= n.saturating_mul(DEFLATE_LIMIT)),
+            Self::Packed(n) => (n, must_unpack(n, want, count).is_ok()),
         };
         if ok {
             return Ok(());
@@ -78,8 +78,7 @@ struct Walk {
 /// Walks along `path`, which carries DICOM's mark, up to its pixels.
 pub(super) fn check(path: &Path) -> Result<Pixels> {
     let io = |e| Error::io(path, e);
-    let file = File::open(path).map_err(io)?;
-    let size = file.metadata().map_err(io)?.len();
+    let (file, size) = files::open(path)?;
     let mut reader = BufReader::new(file);
     reader.seek(SeekFrom::Start(132)).map_err(io)?;
     let coding = Coding { explicit: true, big: false };

@@ -144,7 +144,7 @@ impl Slice {
         let object = open(path, OpenFileOptions::new().read_until(PIXEL_DATA.0))?;
         let e = Elements { place: &place, object: &object };
         let format = e.format()?;
-        pixels.must_hold(&place, format.count() as u64 * format.bytes as u64)?;
+        pixels.must_hold(&place, format.count() as u64, format.bytes as u64)?;
         let series = e.text(SERIES).ok_or_else(|| e.invalid(SERIES, "no such element", "the series' identifier"))?;
         let modality = e.text(MODALITY).unwrap_or_default();
         let about = format!("{modality}, {}", e.text(SERIES_NAME).unwrap_or_else(|| "no description".into()));

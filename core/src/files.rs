@@ -1,0 +1,33 @@
+//! Opening what a user or a description names, which may be anything.
+
+use crate::error::{Error, Result};
+use std::fs::File;
+use std::io::Read;
+use std::path::Path;
+
+/// Opens a regular file; its size. Anything else could keep us waiting or give bytes without end.
+pub fn open(path: &Path) -> Result<(File, u64)> {
+    let io = |e| Error::io(path, e);
+    // Before it is opened: opening a pipe waits for its writer.
+    if !path.metadata().map_err(io)?.is_file() {
+        return Err(Error::invalid(path.display().to_string(), "file", "a folder or device", "a regular file"));
+    }
+    let file = File::open(path).map_err(io)?;
+    let size = file.metadata().map_err(io)?.len();
+    Ok((file, size))
+}
+
+/// Reads a text of at most `most` bytes.
+pub fn read_text(path: &Path, most: u64) -> Result<String> {
+    let invalid = |field: &str, found: String, expected: String| {
+        Error::invalid(path.display().to_string(), field, found, expected)
+    };
+    let (file, size) = open(path)?;
+    if size > most {
+        return Err(invalid("file size", format!("{size} bytes"), format!("at most {most} bytes")));
+    }
+    let mut raw = Vec::new();
+    file.take(most).read_to_end(&mut raw).map_err(|e| Error::io(path, e))?;
+    String::from_utf8(raw)
+        .map_err(|e| invalid("text", format!("a byte that is no UTF-8: {}", e.utf8_error()), "UTF-8 text".into()))
+}
