@@ -1,3 +1,5 @@
-//! What every conefield stage must do, as a library: [`conformance::check`] takes any stage, built in or loaded.
+//! What every conefield stage must do, as a library: [`conformance::check`] takes any stage, built in or loaded; and
+//! what every reader must withstand: [`hostile`].
 
 pub mod conformance;
+pub mod hostile;

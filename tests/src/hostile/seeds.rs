@@ -1,0 +1,259 @@
+//! Small valid inputs, one function a format, written with the project's own writers where it has one.
+
+use conefield_core::geometry::{Geometry, Millimetres, Radians, View, VoxelGrid};
+use conefield_core::scan::{Scan, Unit, Volume};
+use flate2::Compression;
+use flate2::read::GzDecoder;
+use flate2::write::{GzEncoder, ZlibEncoder};
+use ndarray::Array3;
+use std::collections::BTreeMap;
+use std::f64::consts::TAU;
+use std::fs::{self, File};
+use std::io::{Cursor, Read, Write};
+use std::path::Path;
+use tiff::encoder::{Compression as TiffCompression, TiffEncoder, colortype::Gray16};
+
+pub use super::dicom::{dicom, dicom_implicit, dicom_run_length};
+
+/// Views, rows and columns of every scan here.
+pub const SHAPE: [usize; 3] = [3, 4, 5];
+
+/// A volume of 4 × 3 × 2 voxels.
+pub fn volume() -> Volume {
+    let data = Array3::from_shape_fn((4, 3, 2), |(x, y, z)| (x + 10 * y + 100 * z) as f32 / 200.0);
+    Volume::centered(data, [0.5, 0.75, 2.0])
+}
+
+/// Three views on a circle, with an offset detector.
+pub fn scan() -> Scan {
+    let mm = Millimetres;
+    let view = |i: usize| {
+        let angle = Radians(0.3 + i as f64 * TAU / SHAPE[0] as f64);
+        View::circular(angle, mm(500.0), mm(800.0), [mm(2.0), mm(1.5)], [mm(-1.0), mm(3.0)])
+    };
+    Scan {
+        geometry: Geometry {
+            detector: [SHAPE[1], SHAPE[2]],
+            views: (0..SHAPE[0]).map(view).collect(),
+            volume: VoxelGrid { shape: [4, 3, 2], spacing: [0.5, 0.75, 2.0], center: [0.0; 3] },
+        },
+        projections: Array3::from_shape_fn(SHAPE, |(a, v, u)| (a + v * u) as f32 / 20.0),
+        unit: Unit::default(),
+        provenance: serde_json::json!({ "from": "a test", "noise": { "photons": 10000 } }),
+    }
+}
+
+fn put(path: &Path, bytes: &[u8]) {
+    fs::write(path, bytes).expect("a file of the test's own folder");
+}
+
+fn written(result: conefield_core::Result<()>) {
+    result.expect("a valid input is written");
+}
+
+/// `a.nii`.
+pub fn nifti(dir: &Path) {
+    written(conefield_io::write_volume(dir.join("a.nii"), &volume()));
+}
+
+/// `a.nii.gz`.
+pub fn nifti_gz(dir: &Path) {
+    written(conefield_io::write_volume(dir.join("a.nii.gz"), &volume()));
+}
+
+/// `a.npy`, a volume.
+pub fn npy(dir: &Path) {
+    written(conefield_io::write_volume(dir.join("a.npy"), &volume()));
+}
+
+/// `a.mha`, packed.
+pub fn metaimage(dir: &Path) {
+    written(conefield_io::write_volume(dir.join("a.mha"), &volume()));
+}
+
+/// The lines of a MetaImage of 4 × 3 × 2 bytes, whose last says where they are.
+pub fn metaimage_lines(data: &str) -> String {
+    format!(
+        "ObjectType = Image\nNDims = 3\nBinaryData = True\nBinaryDataByteOrderMSB = False\nCompressedData = False\n\
+         TransformMatrix = 1 0 0 0 1 0 0 0 1\nOffset = -1 0 2.5\nElementSpacing = 0.5 0.75 2\nDimSize = 4 3 2\n\
+         ElementType = MET_UCHAR\nElementDataFile = {data}\n"
+    )
+}
+
+/// `a.mhd` and `a.raw`.
+pub fn metaimage_header(dir: &Path) {
+    put(&dir.join("a.mhd"), metaimage_lines("a.raw").as_bytes());
+    put(&dir.join("a.raw"), &[7; 24]);
+}
+
+/// A description of a scanner with `geometry` and counts in `file`.
+pub fn scanner_toml(file: &str, geometry: &str) -> String {
+    format!(
+        "format = \"conefield-scanner\"\nversion = 1\n\n[files]\nprojections = \"{file}\"\n\n{geometry}\n\
+         [values]\nkind = \"counts\"\ni0 = 20000.0\n\n\
+         [volume]\nshape = [4, 3, 2]\nspacing = [0.5, 0.75, 2.0]\ncenter = [0.0, 0.0, 0.0]\n"
+    )
+}
+
+/// The table of a circular scan.
+pub const CIRCLE: &str = "[circle]\ndso = 500.0\ndsd = 800.0\npixel = { u = 2.0, v = 2.0 }\n\
+    offset = { u = 0.5, v = 0.0 }\nstart_deg = 10.0\nrange_deg = 360.0\ndirection = \"counterclockwise\"\n";
+
+/// ASTRA's vectors for three views.
+pub const VECTORS: &str = "[vectors]\ncone_vec = [\n  [500, 0, 0, -300, 0, 0, 0, 2, 0, 0, 0, -2],\n  \
+    [0, 500, 0, 0, -300, 0, -2, 0, 0, 0, 0, -2],\n  [-500, 0, 0, 300, 0, 0, 0, -2, 0, 0, 0, -2],\n]\n";
+
+/// The table that names RTK's file.
+pub const RTK: &str = "[rtk]\nfile = \"geometry.xml\"\npixel = { u = 2.0, v = 2.0 }\n";
+
+fn counts() -> Vec<u16> {
+    (0..SHAPE.iter().product::<usize>()).map(|i| 9000 + 97 * i as u16).collect()
+}
+
+/// A `.npy` file of `descr` with the header's shape as text.
+pub fn npy_bytes(descr: &str, shape: &str, data: &[u8]) -> Vec<u8> {
+    let mut header = format!("{{'descr': '{descr}', 'fortran_order': False, 'shape': {shape}, }}");
+    header.push_str(&" ".repeat((header.len() + 11).next_multiple_of(64) - header.len() - 11));
+    header.push('\n');
+    let length = (header.len() as u16).to_le_bytes();
+    [b"\x93NUMPY\x01\x00", &length[..], header.as_bytes(), data].concat()
+}
+
+fn counts_npy() -> Vec<u8> {
+    let raw: Vec<u8> = counts().iter().flat_map(|x| x.to_le_bytes()).collect();
+    npy_bytes("<u2", "(3, 4, 5)", &raw)
+}
+
+/// `scanner.toml` with a circle, `counts.npy`.
+pub fn scanner_npy(dir: &Path) {
+    put(&dir.join("counts.npy"), &counts_npy());
+    put(&dir.join("scanner.toml"), scanner_toml("counts.npy", CIRCLE).as_bytes());
+}
+
+/// `scanner.toml` with ASTRA's vectors, `counts.npy`.
+pub fn scanner_vectors(dir: &Path) {
+    scanner_npy(dir);
+    put(&dir.join("scanner.toml"), scanner_toml("counts.npy", VECTORS).as_bytes());
+}
+
+/// `scanner.toml`, `geometry.xml` of RTK, `counts.npy`.
+pub fn scanner_rtk(dir: &Path) {
+    scanner_npy(dir);
+    put(&dir.join("scanner.toml"), scanner_toml("counts.npy", RTK).as_bytes());
+    conefield_io::write_rtk(dir.join("geometry.xml"), &scan().geometry.views).expect("a circle is written");
+}
+
+/// `scanner.toml`, `counts.npz`.
+pub fn scanner_npz(dir: &Path) {
+    let mut w = zip::ZipWriter::new(File::create(dir.join("counts.npz")).expect("a file of the test's own folder"));
+    let options = zip::write::SimpleFileOptions::default().compression_method(zip::CompressionMethod::Deflated);
+    w.start_file("counts.npy", options).expect("an archive that can be written");
+    w.write_all(&counts_npy()).expect("an archive that can be written");
+    w.finish().expect("an archive that can be written");
+    put(&dir.join("scanner.toml"), scanner_toml("counts.npz:counts", CIRCLE).as_bytes());
+}
+
+/// A TIFF of the counts, a page a view.
+pub fn tiff_bytes(packing: TiffCompression) -> Vec<u8> {
+    let mut file = Cursor::new(Vec::new());
+    let mut w = TiffEncoder::new(&mut file).expect("memory").with_compression(packing);
+    for view in counts().chunks(SHAPE[1] * SHAPE[2]) {
+        w.write_image::<Gray16>(SHAPE[2] as u32, SHAPE[1] as u32, view).expect("memory");
+    }
+    file.into_inner()
+}
+
+fn scanner_tiff_of(dir: &Path, packing: TiffCompression) {
+    put(&dir.join("counts.tif"), &tiff_bytes(packing));
+    put(&dir.join("scanner.toml"), scanner_toml("counts.tif", CIRCLE).as_bytes());
+}
+
+/// `scanner.toml`, `counts.tif`.
+pub fn scanner_tiff(dir: &Path) {
+    scanner_tiff_of(dir, TiffCompression::Uncompressed);
+}
+
+/// `scanner.toml`, `counts.tif` packed by deflate.
+pub fn scanner_tiff_deflate(dir: &Path) {
+    scanner_tiff_of(dir, TiffCompression::Deflate(Default::default()));
+}
+
+/// `scanner.toml`, `counts.tif` packed by LZW.
+pub fn scanner_tiff_lzw(dir: &Path) {
+    scanner_tiff_of(dir, TiffCompression::Lzw);
+}
+
+/// `scan.pickle`, with the volume.
+pub fn naf(dir: &Path) {
+    written(conefield_io::write_naf(dir.join("scan.pickle"), &scan(), None, Some(&volume())));
+}
+
+/// The folder `r2`, with the volume.
+pub fn r2(dir: &Path) {
+    written(conefield_io::write_r2(dir.join("r2"), &scan(), None, Some(&volume())));
+}
+
+/// The folder `scan` with `scan.toml`, `projections.npy` and `truth.nii.gz`.
+pub fn scan_toml(dir: &Path) {
+    written(conefield_io::write_scan(dir.join("scan"), &scan(), Some(&volume())));
+}
+
+/// The folder `scan` with `scan.json`.
+pub fn scan_json(dir: &Path) {
+    scan_toml(dir);
+    let file = dir.join("scan/scan.toml");
+    let text = fs::read_to_string(&file).expect("what was written");
+    let value: serde_json::Value = toml::from_str(&text).expect("what was written");
+    fs::remove_file(file).expect("what was written");
+    put(&dir.join("scan/scan.json"), value.to_string().as_bytes());
+}
+
+fn tensors() -> Vec<(&'static str, Vec<usize>, &'static [f32])> {
+    vec![
+        ("encoder.table", vec![4], &[0.5, -1.0, 2.0, 0.0]),
+        ("field.0.weight", vec![2, 3], &[1.0, -2.0, 3.5, 0.0, 1e-38, 7.0]),
+    ]
+}
+
+/// `w.safetensors`.
+pub fn weights(dir: &Path) {
+    let text = BTreeMap::from([("made by".to_owned(), "a test".to_owned())]);
+    written(conefield_io::write_weights(dir.join("w.safetensors"), &tensors(), &text));
+}
+
+/// `c.safetensors`.
+pub fn checkpoint(dir: &Path) {
+    let text = BTreeMap::from([("standing".to_owned(), "{}".to_owned())]);
+    written(conefield_io::write_checkpoint(dir.join("c.safetensors"), &tensors(), &text));
+}
+
+/// `spec.toml`: the shipped `ni-naf`.
+pub fn spec_toml(dir: &Path) {
+    let naf = include_str!("../../../specs/naf.toml");
+    put(&dir.join("spec.toml"), naf.as_bytes());
+}
+
+/// `spec.json`: the same.
+pub fn spec_json(dir: &Path) {
+    let value: serde_json::Value = toml::from_str(include_str!("../../../specs/naf.toml")).expect("a shipped spec");
+    put(&dir.join("spec.json"), value.to_string().as_bytes());
+}
+
+/// In gzip.
+pub fn gzip(bytes: Vec<u8>) -> Vec<u8> {
+    let mut w = GzEncoder::new(Vec::new(), Compression::fast());
+    w.write_all(&bytes).and_then(|()| w.finish()).expect("memory")
+}
+
+/// Out of gzip.
+pub fn gunzip(bytes: Vec<u8>) -> Vec<u8> {
+    let mut out = Vec::new();
+    GzDecoder::new(&bytes[..]).read_to_end(&mut out).expect("what was packed here");
+    out
+}
+
+/// As a zlib stream.
+pub fn zlib(bytes: &[u8]) -> Vec<u8> {
+    let mut w = ZlibEncoder::new(Vec::new(), Compression::best());
+    w.write_all(bytes).and_then(|()| w.finish()).expect("memory")
+}
