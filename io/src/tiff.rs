@@ -1,9 +1,11 @@
 //! TIFF as detectors write it: one grey channel, integers or floats, one image a page.
 
+mod entries;
+
 use crate::input::must_unpack;
 use conefield_core::{Error, Result, files};
 use ndarray::Array3;
-use std::io::BufReader;
+use std::io::{BufReader, Seek};
 use std::path::Path;
 use tiff::decoder::{Decoder, DecodingResult, Limits};
 use tiff::{ColorType, TiffError};
@@ -21,7 +23,10 @@ pub(crate) fn read(path: &Path) -> Result<Array3<f32>> {
     let place = path.display().to_string();
     let (file, packed) = files::open(path)?;
     let broken = |e: TiffError| Error::invalid(&place, "TIFF", e, "a whole TIFF image");
-    let mut decoder = Decoder::new(BufReader::new(file)).map_err(broken)?;
+    let mut reader = BufReader::new(file);
+    entries::check(&place, &mut reader, packed)?;
+    reader.rewind().map_err(|e| Error::io(path, e))?;
+    let mut decoder = Decoder::new(reader).map_err(broken)?;
     let (mut values, mut size, mut pages, mut claimed) = (Vec::<f32>::new(), None, 0usize, [0u64; 2]);
     loop {
         let (width, height) = decoder.dimensions().map_err(broken)?;
@@ -44,10 +49,11 @@ pub(crate) fn read(path: &Path) -> Result<Array3<f32>> {
             let found = format!("{height} x {width} pixels");
             return Err(Error::invalid(&place, format!("page {pages}"), found, "the size of the first page"));
         }
-        let count = usize::try_from(bytes).unwrap_or(usize::MAX);
+        // The entries of the next page count as well; a value takes 32 bytes at most.
+        let most = bytes.max(packed.saturating_mul(32));
         let mut limits = Limits::default();
-        (limits.decoding_buffer_size, limits.ifd_value_size) = (count, 16 << 20);
-        limits.intermediate_buffer_size = limits.intermediate_buffer_size.max(count);
+        limits.decoding_buffer_size = usize::try_from(most).unwrap_or(usize::MAX);
+        (limits.ifd_value_size, limits.intermediate_buffer_size) = [limits.decoding_buffer_size; 2].into();
         decoder = decoder.with_limits(limits);
         append(&mut values, decoder.read_image().map_err(broken)?);
         pages += 1;

@@ -9,17 +9,14 @@ use std::time::Duration;
 #[global_allocator]
 static MEMORY: PeakAlloc = PeakAlloc;
 
-const METER: Meter = Meter {
-    current: || MEMORY.current_usage(),
-    peak: || MEMORY.peak_usage(),
-    reset: || MEMORY.reset_peak_usage(),
-};
+const METER: Meter =
+    Meter { current: || MEMORY.current_usage(), peak: || MEMORY.peak_usage(), reset: || MEMORY.reset_peak_usage() };
 
 /// What a reader may take: seeds are below 5 kB. Time is generous, as a loaded machine may stop for a while.
 const BOUNDS: Bounds = Bounds { bytes: 16 << 20, time: Duration::from_secs(5) };
 
 /// Mutations a reader.
-const COUNT: u64 = 9_000;
+const COUNT: u64 = 20_000;
 
 /// A folder in memory where the system has one: a file is written for every mutation.
 fn folder() -> tempfile::TempDir {
@@ -50,7 +47,12 @@ fn no_mutation_makes_a_reader_panic_hoard_or_hang() {
             seen.longest,
             start.elapsed()
         );
-        faults.extend(seen.faults.iter().take(5).map(|(n, f)| format!("{} mutation {n}: {f}", parser.name)));
+        let (seed, _) = parser.prepare(folder().path());
+        for (number, fault) in seen.faults.iter().take(5) {
+            let kept = Path::new(env!("CARGO_TARGET_TMPDIR")).join(format!("{}-{number}", parser.name));
+            std::fs::write(&kept, parser.damaged(&seed, *number)).unwrap();
+            faults.push(format!("{}: {fault} (the file is kept as {})", parser.name, kept.display()));
+        }
     }
     controls(&mut faults);
     std::panic::set_hook(quiet);

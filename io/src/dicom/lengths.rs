@@ -5,7 +5,9 @@
 
 use crate::input::must_unpack;
 use conefield_core::{Error, Result, files};
-use dicom_object::Tag;
+use dicom_core::VR;
+use dicom_core::dictionary::{DataDictionary, DataDictionaryEntry};
+use dicom_object::{StandardDataDictionary, Tag};
 use std::fs::File;
 use std::io::{BufReader, Read, Seek, SeekFrom};
 use std::path::Path;
@@ -75,8 +77,9 @@ struct Walk {
     coding: Coding,
 }
 
-/// Walks along `path`, which carries DICOM's mark, up to its pixels.
-pub(super) fn check(path: &Path) -> Result<Pixels> {
+/// Walks along `path`, which carries DICOM's mark, up to the end of its pixels: what they are, and the byte behind
+/// them, after which nothing has been looked at.
+pub(super) fn check(path: &Path) -> Result<(Pixels, u64)> {
     let io = |e| Error::io(path, e);
     let (file, size) = files::open(path)?;
     let mut reader = BufReader::new(file);
@@ -86,17 +89,18 @@ pub(super) fn check(path: &Path) -> Result<Pixels> {
 }
 
 impl Walk {
-    fn run(mut self) -> Result<Pixels> {
+    fn run(mut self) -> Result<(Pixels, u64)> {
         let mut stack: Vec<Level> = Vec::new();
         let mut syntax = None;
         // The description of the file is explicit and little-endian whatever the rest is.
         let mut in_rest = false;
+        let description_end = self.description_end()?;
         loop {
             while matches!(stack.last(), Some(Level::Until(end)) if self.at >= *end) {
                 stack.pop();
             }
             if self.at == self.size {
-                return Ok(Pixels::None);
+                return Ok((Pixels::None, self.at));
             }
             if self.at > LONGEST_HEADER {
                 let found = format!("no PixelData in {LONGEST_HEADER} bytes");
@@ -108,6 +112,15 @@ impl Walk {
             }
             if !in_rest && self.peek_group()? != 2 {
                 in_rest = true;
+                // `dicom-object` trusts this length: what it took for a part of the description would go unchecked.
+                if self.at != description_end {
+                    let expected = format!("{}, where other elements begin", self.at);
+                    return Err(self.invalid(
+                        "FileMetaInformationGroupLength",
+                        format!("an end at byte {description_end}"),
+                        &expected,
+                    ));
+                }
                 self.coding = coding(&self.place, syntax.as_deref())?;
             }
             let tag = self.tag()?;
@@ -130,11 +143,12 @@ impl Walk {
                 }
                 continue;
             }
-            let (sequence, unknown, length) = self.kind_and_length(tag)?;
+            let (kind, length) = self.kind_and_length(tag)?;
+            let (sequence, unknown) = (self.coding.explicit && kind == VR::SQ, self.coding.explicit && kind == VR::UN);
             if tag == PIXELS && stack.is_empty() {
                 return match length {
-                    UNDEFINED => Ok(Pixels::Packed(self.size - self.at)),
-                    n => self.end(tag, n).map(|_| Pixels::Plain(u64::from(n))),
+                    UNDEFINED => self.pieces(),
+                    n => self.end(tag, n).map(|end| (Pixels::Plain(u64::from(n)), end)),
                 };
             }
             if length == UNDEFINED {
@@ -158,22 +172,100 @@ impl Walk {
         }
     }
 
-    /// Whether an element is a sequence, whether its kind is unknown, and its length.
-    fn kind_and_length(&mut self, tag: Tag) -> Result<(bool, bool, u32)> {
-        if !self.coding.explicit {
-            return Ok((false, false, self.u32()?));
+    /// Where the file's description ends, as its first element says.
+    fn description_end(&mut self) -> Result<u64> {
+        let start = self.at;
+        let mut head = [0; 12];
+        self.read(&mut head)?;
+        self.back(12)?;
+        let [.., a, b, c, d] = head;
+        if head[..8] != [2, 0, 0, 0, b'U', b'L', 4, 0] {
+            let found = format!("{:02x?}", &head[..8]);
+            return Err(self.invalid(
+                "FileMetaInformationGroupLength",
+                found,
+                "02 00 00 00 55 4c 04 00, then a length",
+            ));
         }
-        let mut kind = [0; 2];
-        self.read(&mut kind)?;
-        let length = match &kind {
-            b"OB" | b"OD" | b"OF" | b"OL" | b"OV" | b"OW" | b"SQ" | b"SV" | b"UC" | b"UN" | b"UR" | b"UT" | b"UV" => {
-                self.read(&mut [0; 2])?;
-                self.u32()?
+        Ok(start + 12 + u64::from(u32::from_le_bytes([a, b, c, d])))
+    }
+
+    /// The pieces of a compressed picture, up to their delimiter or the end of the file.
+    fn pieces(mut self) -> Result<(Pixels, u64)> {
+        let start = self.at;
+        while self.at < self.size {
+            let tag = self.tag()?;
+            let length = self.u32()?;
+            match tag {
+                ITEM => self.skip(tag, length)?,
+                SEQUENCE_END => break,
+                _ => {
+                    return Err(self.invalid(
+                        "PixelData",
+                        format!("{tag} at byte {}", self.at),
+                        "a piece of a picture",
+                    ));
+                }
             }
-            k if k.iter().all(u8::is_ascii_uppercase) => u32::from(self.u16()?),
-            k => return Err(self.invalid(&format!("element {tag}"), format!("the kind {k:02x?}"), "two letters")),
+        }
+        Ok((Pixels::Packed(self.at - start), self.at))
+    }
+
+    /// The kind of an element's values and its length, which must be one of whole values.
+    fn kind_and_length(&mut self, tag: Tag) -> Result<(VR, u32)> {
+        let (kind, length) = if self.coding.explicit {
+            let mut kind = [0; 2];
+            self.read(&mut kind)?;
+            if !kind.iter().all(u8::is_ascii_uppercase) {
+                return Err(self.invalid(&format!("element {tag}"), format!("the kind {kind:02x?}"), "two letters"));
+            }
+            let kind = VR::from_binary(kind).unwrap_or(VR::UN);
+            let length = match kind {
+                VR::AE
+                | VR::AS
+                | VR::AT
+                | VR::CS
+                | VR::DA
+                | VR::DS
+                | VR::DT
+                | VR::FD
+                | VR::FL
+                | VR::IS
+                | VR::LO
+                | VR::LT
+                | VR::PN
+                | VR::SH
+                | VR::SL
+                | VR::SS
+                | VR::ST
+                | VR::TM
+                | VR::UI
+                | VR::UL
+                | VR::US => u32::from(self.u16()?),
+                // Of all other kinds, also of those that the standard may add, the length takes four bytes.
+                _ => {
+                    self.read(&mut [0; 2])?;
+                    self.u32()?
+                }
+            };
+            (kind, length)
+        } else {
+            let kind = StandardDataDictionary.by_tag(tag).map_or(VR::UN, |e| e.vr().relaxed());
+            (kind, self.u32()?)
         };
-        Ok((&kind == b"SQ", &kind == b"UN", length))
+        let size = match kind {
+            VR::US | VR::SS | VR::OW => 2,
+            VR::UL | VR::SL | VR::FL | VR::AT | VR::OF | VR::OL => 4,
+            VR::FD | VR::OD | VR::SV | VR::UV | VR::OV => 8,
+            _ => 1,
+        };
+        // `dicom-object` reads whole values only and would take the rest for the next element.
+        if length != UNDEFINED && !length.is_multiple_of(size) {
+            let found = format!("a length of {length} bytes");
+            let expected = format!("a multiple of {size}, which a value takes");
+            return Err(self.invalid(&format!("element {tag}"), found, &expected));
+        }
+        Ok((kind, length))
     }
 
     /// The byte behind an element of `length` bytes that starts here; it must lie in the file.

@@ -3,8 +3,9 @@
 use super::lengths::{self, Pixels};
 use super::pixels::{self, Format};
 use conefield_core::geometry::{dot, norm};
-use conefield_core::{Error, Result};
+use conefield_core::{Error, Result, files};
 use dicom_object::{DefaultDicomObject, OpenFileOptions, Tag};
+use std::io::Read;
 use std::path::{Path, PathBuf};
 
 /// An element with the name that errors give it.
@@ -34,6 +35,8 @@ const SIGN: Field = (Tag(0x0028, 0x0103), "PixelRepresentation");
 #[derive(Debug)]
 pub(super) struct Slice {
     path: PathBuf,
+    /// The byte behind the pixels.
+    end: u64,
     pub series: String,
     /// Modality and description of the series, for people.
     pub about: String,
@@ -136,12 +139,12 @@ impl Slice {
     /// Reads all but the values of the DICOM file `path`, or `None` with a warning if there is no picture in it.
     pub fn read(path: &Path) -> Result<Option<Self>> {
         let place = path.display().to_string();
-        let pixels = lengths::check(path)?;
+        let (pixels, end) = lengths::check(path)?;
         if pixels == Pixels::None {
             tracing::warn!("{place}: left out, there is no picture in it");
             return Ok(None);
         }
-        let object = open(path, OpenFileOptions::new().read_until(PIXEL_DATA.0))?;
+        let object = open(path, end, OpenFileOptions::new().read_until(PIXEL_DATA.0))?;
         let e = Elements { place: &place, object: &object };
         let format = e.format()?;
         pixels.must_hold(&place, format.count() as u64, format.bytes as u64)?;
@@ -159,6 +162,7 @@ impl Slice {
         let (axes, position) = (e.axes()?, e.required(POSITION)?);
         Ok(Some(Self {
             path: path.to_path_buf(),
+            end,
             series,
             about,
             modality,
@@ -209,7 +213,7 @@ impl Slice {
     /// The rescaled values, row after row.
     pub fn values(&self) -> Result<Vec<f32>> {
         let place = self.path.display().to_string();
-        let object = open(&self.path, OpenFileOptions::new().read_to(PIXEL_DATA.0))?;
+        let object = open(&self.path, self.end, OpenFileOptions::new().read_to(PIXEL_DATA.0))?;
         let element = object.get(PIXEL_DATA.0);
         let element = element.ok_or_else(|| Error::invalid(&place, PIXEL_DATA.1, "no such element", "a picture"))?;
         let values = pixels::values(&place, &object, element, &self.format)?;
@@ -223,8 +227,9 @@ impl Slice {
     }
 }
 
-fn open(path: &Path, options: OpenFileOptions) -> Result<DefaultDicomObject> {
-    options.open_file(path).map_err(|e| {
+/// The first `end` bytes of a file: those whose lengths are known to be true.
+fn open(path: &Path, end: u64, options: OpenFileOptions) -> Result<DefaultDicomObject> {
+    options.from_reader(files::open(path)?.0.take(end)).map_err(|e| {
         // The outer message says only that reading failed; the reasons are below it.
         let reasons: Vec<String> =
             std::iter::successors(std::error::Error::source(&e), |e| e.source()).map(ToString::to_string).collect();

@@ -32,19 +32,25 @@ pub fn project(volume: &Volume, geometry: &Geometry, per_voxel_samples: f64) -> 
     )?;
     let sampler = Sampler::new(volume, per_voxel_samples)?;
     let [rows, columns] = geometry.detector;
-    let mut out = Array3::<f32>::zeros((geometry.views.len(), rows, columns));
-    if let Some(pixels) = out.as_slice_mut() {
-        pixels.par_chunks_mut(rows * columns).enumerate().for_each(|(view, pixels)| {
-            pixels.par_chunks_mut(BAND * columns).enumerate().for_each(|(band, pixels)| {
-                for column in 0..columns {
-                    for (r, row) in pixels.chunks_mut(columns).enumerate() {
-                        row[column] = sampler.integral(geometry, view, band * BAND + r, column);
-                    }
-                }
-            });
-        });
+    let views = geometry.views.len();
+    let count = geometry.measurements().unwrap_or(usize::MAX);
+    let mut pixels = Vec::<f32>::new();
+    if pixels.try_reserve_exact(count).is_err() {
+        let found = format!("{views} views of {rows} x {columns}");
+        return Err(Error::invalid("projection", "detector", found, "projections that fit in memory"));
     }
-    Ok(out)
+    pixels.resize(count, 0.0);
+    pixels.par_chunks_mut(rows * columns).enumerate().for_each(|(view, pixels)| {
+        pixels.par_chunks_mut(BAND * columns).enumerate().for_each(|(band, pixels)| {
+            for column in 0..columns {
+                for (r, row) in pixels.chunks_mut(columns).enumerate() {
+                    row[column] = sampler.integral(geometry, view, band * BAND + r, column);
+                }
+            }
+        });
+    });
+    Array3::from_shape_vec((views, rows, columns), pixels)
+        .map_err(|e| Error::invalid("projection", "detector", e, "as many pixels as the shape has"))
 }
 
 /// The volume with a rim of one voxel, which repeats the outermost values, so that every sample inside the box has

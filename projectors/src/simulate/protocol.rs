@@ -6,6 +6,9 @@ use conefield_core::geometry::{Geometry, Millimetres, Radians, View, VoxelGrid};
 use conefield_core::scan::Unit;
 use serde::{Deserialize, Serialize};
 
+/// More views than any scanner takes; readers of scans have the same bound.
+const MOST_VIEWS: usize = 1_000_000;
+
 /// A circular orbit with a flat detector. Lengths count in the protocol's own [`Protocol::unit`].
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
@@ -174,16 +177,10 @@ impl Protocol {
         }
         let finite_offset = self.offset.iter().all(|x| x.is_finite());
         ensure(finite_offset, "protocol", "offset", format!("{:?}", self.offset), "finite numbers")?;
-        // An even orbit's angles are not made before their number is known to be one that can be stored.
+        // An even orbit's angles are not made before their number is known to be sensible.
         if let Angles::Even { views, .. } = self.angles {
-            let pixels = self.detector[0].checked_mul(self.detector[1]).and_then(|n| n.checked_mul(views));
-            ensure(
-                pixels.is_some_and(|n| n.checked_mul(8).is_some_and(|b| b <= isize::MAX as usize)),
-                "protocol",
-                "angles.even.views",
-                views,
-                "a number of pixels that can be addressed",
-            )?;
+            let expected = format!("at most {MOST_VIEWS}");
+            ensure(views <= MOST_VIEWS, "protocol", "angles.even.views", views, expected)?;
         }
         let angles = self.angles.radians();
         ensure(!angles.is_empty(), "protocol", "angles", "no view", "at least one view")?;

@@ -57,7 +57,9 @@ pub const PARSERS: &[Parser] = &[
     plain("r2", seeds::r2, "r2/meta_data.json", |d| scan(&d.join("r2"))),
     plain("scan_toml", seeds::scan_toml, "scan/scan.toml", |d| scan(&d.join("scan"))),
     plain("scan_json", seeds::scan_json, "scan/scan.json", |d| scan(&d.join("scan"))),
-    plain("weights", seeds::weights, "w.safetensors", |d| conefield_io::read_weights(d.join("w.safetensors")).map(drop)),
+    plain("weights", seeds::weights, "w.safetensors", |d| {
+        conefield_io::read_weights(d.join("w.safetensors")).map(drop)
+    }),
     plain("checkpoint", seeds::checkpoint, "c.safetensors", |d| {
         conefield_io::read_checkpoint(d.join("c.safetensors")).map(drop)
     }),

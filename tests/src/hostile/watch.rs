@@ -90,6 +90,13 @@ impl Parser {
         ((self.unpack)(packed), file)
     }
 
+    /// The file's content with mutation `number` of the unpacked `seed`.
+    pub fn damaged(&self, seed: &[u8], number: u64) -> Vec<u8> {
+        // So that no two readers get the same damage.
+        let salt = self.name.bytes().fold(0u64, |h, b| h.wrapping_mul(31).wrapping_add(b.into())) << 32;
+        (self.pack)(mutated(seed, salt | number, std::str::from_utf8(seed).is_ok()))
+    }
+
     /// Feeds the reader `count` mutations of its seed, which it must accept as it is. `dir` is an empty folder, best
     /// one in memory.
     pub fn run(&self, dir: &Path, count: u64, bounds: Bounds, meter: Meter) -> Seen {
@@ -97,12 +104,9 @@ impl Parser {
         if let Err(e) = (self.read)(dir) {
             panic!("{}: the seed itself is refused: {e}", self.name);
         }
-        let text = std::str::from_utf8(&seed).is_ok();
-        // So that no two readers get the same damage.
-        let salt = self.name.bytes().fold(0u64, |h, b| h.wrapping_mul(31).wrapping_add(b.into())) << 32;
         let mut seen = Seen { count, ..Seen::default() };
         for number in 0..count {
-            fs::write(&file, (self.pack)(mutated(&seed, salt | number, text))).expect("the seed's own file");
+            fs::write(&file, self.damaged(&seed, number)).expect("the seed's own file");
             let fault = match once(meter, || (self.read)(dir)) {
                 Err(fault) => Some(fault),
                 Ok((accepted, bytes, time)) => {
