@@ -1,0 +1,189 @@
+//! One bad input: how it is made, what is done with it, and how that must end.
+
+use assert_cmd::Command;
+use std::collections::BTreeMap;
+use std::fs;
+use std::path::Path;
+use std::time::{Duration, Instant, SystemTime};
+
+/// Address space that the command gets, in KiB: what it takes for a small input is far below.
+const MEMORY_KIB: u64 = 1 << 20;
+/// Processor seconds that it gets.
+const SECONDS: u64 = 20;
+/// When it is killed, if it only waits.
+const PATIENCE: Duration = Duration::from_secs(60);
+
+/// How a command must end.
+#[derive(Clone, Copy)]
+pub enum End {
+    /// With status 1 and one line that starts with `error:`.
+    Refused,
+    /// With status 2: wrong use of the command line.
+    WrongUse,
+    /// With status 0 and a warning: what is suspicious, not impossible.
+    Warned,
+}
+
+/// One bad input.
+pub struct Case {
+    what: &'static str,
+    make: Box<dyn Fn(&Path) + Sync + Send>,
+    args: &'static str,
+    end: End,
+    says: &'static [&'static str],
+}
+
+/// An input that must be refused: what it is, how it is made in an empty folder, the command's words (split at spaces;
+/// it runs in that folder), and what the message must hold.
+pub fn refused(
+    what: &'static str,
+    make: impl Fn(&Path) + Sync + Send + 'static,
+    args: &'static str,
+    says: &'static [&'static str],
+) -> Case {
+    Case { what, make: Box::new(make), args, end: End::Refused, says }
+}
+
+impl Case {
+    /// The same with another end.
+    pub fn ends(self, end: End) -> Self {
+        Self { end, ..self }
+    }
+
+    /// Runs the command under limits.
+    pub fn run(&self) -> Outcome {
+        let dir = tempfile::tempdir().unwrap();
+        (self.make)(dir.path());
+        let before = standing(dir.path());
+        let program = assert_cmd::cargo::cargo_bin("conefield");
+        // Two threads, as each takes address space of its own.
+        let limited = format!("ulimit -v {MEMORY_KIB}; ulimit -t {SECONDS}; ulimit -c 0; exec \"$0\" --threads 2 \"$@\"");
+        let mut command = Command::new("sh");
+        command.args(["-c", &limited]).arg(program).args(self.args.split(' '));
+        let start = Instant::now();
+        let output = command.current_dir(dir.path()).timeout(PATIENCE).output().unwrap();
+        let time = start.elapsed();
+        let said = String::from_utf8_lossy(&output.stderr).replace(&dir.path().display().to_string(), "DIR");
+        let after = standing(dir.path());
+        let mut outcome = Outcome {
+            what: self.what,
+            command: format!("conefield {}", self.args),
+            message: message(&said, self.end),
+            status: output.status.code(),
+            faults: vec![],
+        };
+        let mut fault = |text: String| outcome.faults.push(format!("{}: {}: {text}", self.args, self.what));
+        let status = match self.end {
+            End::Refused => 1,
+            End::WrongUse => 2,
+            End::Warned => 0,
+        };
+        if output.status.code() != Some(status) {
+            fault(format!("ended with {} after {time:?}: {said}", output.status));
+        }
+        if said.contains("panicked") {
+            fault(format!("panicked: {said}"));
+        }
+        if matches!(self.end, End::Refused) {
+            if !output.stdout.is_empty() {
+                fault(format!("printed {}", String::from_utf8_lossy(&output.stdout)));
+            }
+            let errors = said.lines().filter(|l| l.starts_with("error: ")).count();
+            if errors != 1 || !said.lines().last().is_some_and(|l| l.starts_with("error: ")) {
+                fault(format!("no single line of error at the end: {said}"));
+            }
+        }
+        if !matches!(self.end, End::Warned) && before != after {
+            fault(format!("left something behind: {before:?} became {after:?}"));
+        }
+        for want in self.says.iter().filter(|w| !outcome.message.contains(**w)) {
+            outcome.faults.push(format!("{}: {}: \"{want}\" is not in: {said}", self.args, self.what));
+        }
+        outcome
+    }
+}
+
+/// What a command did.
+pub struct Outcome {
+    pub what: &'static str,
+    pub command: String,
+    pub message: String,
+    pub status: Option<i32>,
+    pub faults: Vec<String>,
+}
+
+/// The line that matters.
+fn message(said: &str, end: End) -> String {
+    let mut lines = said.lines();
+    match end {
+        End::Refused | End::WrongUse => lines.find(|l| l.starts_with("error: ")).unwrap_or(said).to_owned(),
+        End::Warned => lines.find(|l| l.trim_start().starts_with("WARN")).unwrap_or(said).trim_start().to_owned(),
+    }
+}
+
+/// Everything below `folder`: length and time of change by path.
+fn standing(folder: &Path) -> BTreeMap<String, (u64, Option<SystemTime>)> {
+    let mut all = BTreeMap::new();
+    for entry in fs::read_dir(folder).unwrap() {
+        let path = entry.unwrap().path();
+        let info = path.symlink_metadata().unwrap();
+        if info.is_dir() {
+            all.extend(standing(&path));
+            all.insert(path.display().to_string(), (0, None));
+        } else {
+            all.insert(path.display().to_string(), (info.len(), info.modified().ok()));
+        }
+    }
+    all
+}
+
+/// Writes `bytes`.
+pub fn put(path: impl AsRef<Path>, bytes: impl AsRef<[u8]>) {
+    fs::write(path, bytes).unwrap();
+}
+
+/// Makes `seed`, then changes the bytes of `file`.
+pub fn changed(
+    seed: fn(&Path),
+    file: &'static str,
+    change: impl Fn(&mut Vec<u8>) + Sync + Send + 'static,
+) -> impl Fn(&Path) + Sync + Send {
+    move |dir| {
+        seed(dir);
+        let mut bytes = fs::read(dir.join(file)).unwrap();
+        let before = bytes.clone();
+        change(&mut bytes);
+        assert_ne!(bytes, before, "{file} is not changed");
+        put(dir.join(file), bytes);
+    }
+}
+
+/// Makes `seed`, then replaces `from` in the text of `file`, which must hold it, by `to`.
+pub fn replaced(
+    seed: fn(&Path),
+    file: &'static str,
+    from: &'static str,
+    to: &'static str,
+) -> impl Fn(&Path) + Sync + Send {
+    move |dir| {
+        seed(dir);
+        let text = fs::read_to_string(dir.join(file)).unwrap();
+        assert!(text.contains(from), "{from} is not in {file}:\n{text}");
+        put(dir.join(file), text.replacen(from, to, 1));
+    }
+}
+
+/// Overwrites bytes from `at` on.
+pub fn at(at: usize, bytes: impl AsRef<[u8]>) -> impl Fn(&mut Vec<u8>) + Sync + Send {
+    move |all| all[at..at + bytes.as_ref().len()].copy_from_slice(bytes.as_ref())
+}
+
+/// Cuts after `length` bytes.
+pub fn cut(length: usize) -> impl Fn(&mut Vec<u8>) + Sync + Send {
+    move |all| all.truncate(length)
+}
+
+/// Cuts the last `length` bytes.
+pub fn cut_end(length: usize) -> impl Fn(&mut Vec<u8>) + Sync + Send {
+    move |all| all.truncate(all.len() - length)
+}

@@ -1,0 +1,107 @@
+//! NAF's pickle, which in Python may run anything.
+
+use crate::case::{Case, End, changed, cut_end, put, refused};
+use conefield_tests::hostile::seeds::{SHAPE, naf, scan, volume};
+use std::path::Path;
+
+const INFO: &str = "info scan.pickle";
+
+fn pickle(bytes: impl AsRef<[u8]> + Sync + Send) -> impl Fn(&Path) + Sync + Send {
+    move |d| put(d.join("scan.pickle"), bytes.as_ref())
+}
+
+/// With the key `from` renamed to one of the same length.
+fn key(from: &'static str, to: &'static str) -> impl Fn(&Path) + Sync + Send {
+    changed(naf, "scan.pickle", move |b| {
+        let start = b.windows(from.len()).position(|w| w == from.as_bytes()).expect("a key of the seed");
+        b[start..start + to.len()].copy_from_slice(to.as_bytes());
+    })
+}
+
+/// With a float replaced wherever it stands.
+fn float(from: f64, to: f64) -> impl Fn(&Path) + Sync + Send {
+    changed(naf, "scan.pickle", move |b| {
+        let start = b.windows(8).position(|w| w == from.to_be_bytes()).expect("a number of the seed");
+        b[start..start + 8].copy_from_slice(&to.to_be_bytes());
+    })
+}
+
+/// With the first of the projections replaced.
+fn projection(to: f32) -> impl Fn(&Path) + Sync + Send {
+    move |d| {
+        naf(d);
+        let path = d.join("scan.pickle");
+        let mut bytes = std::fs::read(&path).unwrap();
+        let raw: Vec<u8> = scan().projections.iter().flat_map(|x| x.to_le_bytes()).collect();
+        let start = bytes.windows(raw.len()).position(|w| w == raw).expect("the projections as they are");
+        bytes[start..start + 4].copy_from_slice(&to.to_le_bytes());
+        put(path, bytes);
+    }
+}
+
+/// Angles in degrees, as if they were radians.
+fn degrees(d: &Path) {
+    let mut scan = scan();
+    for (i, view) in scan.geometry.views.iter_mut().enumerate() {
+        let turn = conefield_core::geometry::Radians(0.3 + i as f64);
+        let mm = conefield_core::geometry::Millimetres;
+        *view = conefield_core::geometry::View::circular(turn, mm(500.0), mm(800.0), [mm(2.0), mm(1.5)], [mm(0.0); 2]);
+    }
+    conefield_io::write_naf(d.join("scan.pickle"), &scan, None, Some(&volume())).unwrap();
+    let mut bytes = std::fs::read(d.join("scan.pickle")).unwrap();
+    let angles: Vec<u8> = (0..SHAPE[0]).flat_map(|i| (0.3 + i as f64).to_le_bytes()).collect();
+    let near = |w: &[u8]| {
+        let value = |w: &[u8]| f64::from_le_bytes(w.try_into().unwrap());
+        w.chunks(8).zip(angles.chunks(8)).all(|(a, b)| (value(a) - value(b)).abs() < 1e-9)
+    };
+    let start = bytes.windows(angles.len()).position(near).expect("the angles as they are");
+    for (i, degree) in [17.0f64, 137.0, 257.0].iter().enumerate() {
+        bytes[start + 8 * i..start + 8 * i + 8].copy_from_slice(&degree.to_le_bytes());
+    }
+    put(d.join("scan.pickle"), bytes);
+}
+
+pub fn cases() -> Vec<Case> {
+    vec![
+        refused("nothing but the mark", pickle(b"\x80\x04"), INFO, &["byte 2", "end of the file"]),
+        refused("cut at the end", changed(naf, "scan.pickle", cut_end(1)), INFO, &["end of the file"]),
+        refused("cut in the middle", changed(naf, "scan.pickle", |b| b.truncate(b.len() / 2)), "convert scan.pickle scan", &["end of the file"]),
+        refused("bytes behind the end", changed(naf, "scan.pickle", |b| b.push(0)), INFO, &["1 bytes after the end"]),
+        refused("os.system", pickle(b"\x80\x02cos\nsystem\nX\x09\0\0\0touch run\x85R."), "convert scan.pickle scan", &["the name os.system", "data only"]),
+        refused("builtins.eval", pickle(b"\x80\x04\x8c\x08builtins\x8c\x04eval\x93\x8c\x021\x031\x85R."), INFO, &["the name builtins.eval"]),
+        refused("numpy's own loader of other pickles", pickle(b"\x80\x02cnumpy\nload\nX\x01\0\0\0a\x85R."), INFO, &["the name numpy.load"]),
+        refused("a call by getattr", pickle(b"\x80\x02c__builtin__\ngetattr\n)R."), INFO, &["the name __builtin__.getattr"]),
+        refused("an object made by its class", pickle(b"\x80\x02cnumpy\nndarray\n)\x81."), INFO, &["NEWOBJ"]),
+        refused("a persistent reference", pickle(b"\x80\x02X\x01\0\0\0aQ."), INFO, &["BINPERSID", "data only"]),
+        refused("protocol 0", pickle(b"(dp0\n."), "convert scan.pickle scan", &["scan.pickle"]),
+        refused("an array of objects", pickle(b"\x80\x02cnumpy\ndtype\nX\x02\0\0\0O8\x85R."), INFO, &["the object dtype \"O8\""]),
+        refused("a list that holds itself", pickle(b"\x80\x02]q\0h\0a."), INFO, &["holds itself"]),
+        refused("100 000 lists in each other", |d| put(d.join("scan.pickle"), [b"\x80\x02".to_vec(), vec![b']'; 100_000], vec![b'a'; 99_999], b".".to_vec()].concat()), INFO, &["nested deeper"]),
+        refused("5 million values in 5 MB", |d| put(d.join("scan.pickle"), [b"\x80\x02".to_vec(), vec![b']'; 5_000_000], b".".to_vec()].concat()), INFO, &["values", "NumPy arrays"]),
+        refused("2 million numbered values", |d| {
+            let mut bytes = b"\x80\x02N".to_vec();
+            (0..2_000_000u32).for_each(|i| bytes.extend([b'r'].into_iter().chain(i.to_le_bytes())));
+            put(d.join("scan.pickle"), bytes);
+        }, INFO, &["numbered values"]),
+        refused("a tuple of tuples of tuples (2^30 by the memo)", |d| {
+            let mut bytes = b"\x80\x02)".to_vec();
+            (0..40).for_each(|_| bytes.extend(b"2\x86"));
+            bytes.push(b'.');
+            put(d.join("scan.pickle"), bytes);
+        }, INFO, &["nested deeper"]),
+        refused("a text of 4 GB", pickle(b"\x80\x02X\xff\xff\xff\xffabc."), INFO, &["4294967295 bytes"]),
+        refused("a text of 2^63 bytes", pickle(b"\x80\x04\x8d\xff\xff\xff\xff\xff\xff\xff\x7fabc."), INFO, &["9223372036854775807 bytes"]),
+        refused("a text that is no UTF-8", pickle(b"\x80\x02X\x02\0\0\0\xff\xfe."), INFO, &["UTF-8"]),
+        refused("an empty stack", pickle(b"\x80\x020."), INFO, &["an empty stack"]),
+        refused("no scan but a number", pickle(b"\x80\x02K\x01."), INFO, &["a dict"]),
+        refused("a missing key", pickle(b"\x80\x02}."), INFO, &["no such key", "mode"]),
+        refused("a misspelt key", key("nDetector", "nDetectro"), INFO, &["nDetector", "but \"nDetectro\""]),
+        refused("a misspelt key that may be missing", key("offOrigin", "offOrigim"), INFO, &["offOrigim", "\"offOrigin\""]),
+        refused("a distance that is NaN", float(500.0, f64::NAN), INFO, &["DSO", "finite"]),
+        refused("a negative distance", float(800.0, -800.0), INFO, &["DSD", "-800"]),
+        refused("a parallel beam", key("cone", "para"), INFO, &["mode", "\"para\"", "cone"]),
+        refused("a projection that is NaN", projection(f32::NAN), INFO, &["train.projections[0, 0, 0]", "NaN"]),
+        refused("a projection that is infinite", projection(f32::INFINITY), "convert scan.pickle scan", &["train.projections[0, 0, 0]", "inf"]),
+        refused("angles in degrees", degrees, INFO, &["257", "looks like degrees"]).ends(End::Warned),
+    ]
+}

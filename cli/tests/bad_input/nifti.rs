@@ -1,0 +1,90 @@
+//! NIfTI, packed or not.
+
+use crate::case::{Case, End, at, changed, cut, cut_end, put, refused};
+use conefield_tests::hostile::seeds::{gzip, nifti, nifti_gz};
+use std::fs::{self, File};
+use std::path::Path;
+
+const INFO: &str = "info a.nii";
+const INFO_GZ: &str = "info a.nii.gz";
+
+/// The header of the seed with three axes of `shape`.
+fn header(dir: &Path, shape: [i16; 3]) -> Vec<u8> {
+    nifti(dir);
+    let mut bytes = fs::read(dir.join("a.nii")).unwrap();
+    fs::remove_file(dir.join("a.nii")).unwrap();
+    bytes.truncate(352);
+    at(42, shape.map(i16::to_le_bytes).concat())(&mut bytes);
+    bytes
+}
+
+/// The header of the seed as bytes (2) of `shape`, then `zeros` of them, in gzip.
+fn bomb(dir: &Path, shape: [i16; 3], zeros: usize) {
+    let mut bytes = header(dir, shape);
+    at(70, [2, 0, 8, 0])(&mut bytes);
+    bytes.resize(352 + zeros, 0);
+    put(dir.join("a.nii.gz"), gzip(bytes));
+}
+
+pub fn cases() -> Vec<Case> {
+    vec![
+        refused("empty file", |d| put(d.join("a.nii"), ""), "convert a.nii out.mha", &["a.nii"]),
+        refused("empty file, asked about", |d| put(d.join("a.nii"), ""), INFO, &["a.nii"]),
+        refused("cut within the header", changed(nifti, "a.nii", cut(347)), "convert a.nii out.mha", &["a.nii"]),
+        refused("cut just before the voxels", changed(nifti, "a.nii", cut(350)), INFO, &["vox_offset"]),
+        refused("one byte of voxels missing", changed(nifti, "a.nii", cut_end(1)), INFO, &["95 bytes", "96 bytes"]),
+        refused("one byte too many", changed(nifti, "a.nii", |b| b.push(0)), INFO, &["97 bytes", "96 bytes"]),
+        refused("no voxels along x", changed(nifti, "a.nii", at(42, [0, 0])), INFO, &["dim", "at least one voxel"]),
+        refused("a negative axis", changed(nifti, "a.nii", at(44, [255, 255])), INFO, &["dim", "-1"]),
+        refused(
+            "32767 voxels along each axis of a file of 448 bytes",
+            changed(nifti, "a.nii", at(42, [255, 127, 255, 127, 255, 127])),
+            INFO,
+            &["96 bytes", "140724603453452 bytes"],
+        ),
+        refused("a series of volumes", changed(nifti, "a.nii", at(40, [4, 0, 4, 0, 3, 0, 2, 0, 9, 0])), INFO, &["dim[4]", "found 9"]),
+        refused("an unknown type of numbers", changed(nifti, "a.nii", at(70, [99, 0])), INFO, &["datatype", "99"]),
+        refused("complex numbers", changed(nifti, "a.nii", at(70, [32, 0])), INFO, &["datatype", "complex"]),
+        refused("a type and a width that contradict", changed(nifti, "a.nii", at(72, [16, 0])), INFO, &["bitpix", "16", "32"]),
+        refused("voxels of size NaN", changed(nifti, "a.nii", at(280, f32::NAN.to_le_bytes())), INFO, &["sform", "NaN"]),
+        refused("parallel axes", changed(nifti, "a.nii", at(280, [0; 32])), INFO, &["sform", "independent"]),
+        refused("data far behind the end", changed(nifti, "a.nii", at(108, 1e6f32.to_le_bytes())), INFO, &["vox_offset", "end of the file"]),
+        refused("data at byte NaN", changed(nifti, "a.nii", at(108, f32::NAN.to_le_bytes())), INFO, &["vox_offset", "NaN"]),
+        refused("a voxel that is infinite", changed(nifti, "a.nii", at(352, f32::INFINITY.to_le_bytes())), INFO, &["voxel [0, 0, 0]", "inf"]),
+        refused("a voxel that is NaN", changed(nifti, "a.nii", at(444, f32::NAN.to_le_bytes())), "evaluate a.nii a.nii", &["voxel [3, 2, 1]", "NaN"]),
+        refused("a header without its image", changed(nifti, "a.nii", at(344, b"ni1")), INFO, &["in another file", "convert"]),
+        refused("NIfTI-2", changed(nifti, "a.nii", |b| b[..12].copy_from_slice(b"\x1c\x02\0\0n+2\0\r\n\x1a\n")), "convert a.nii b.mha", &["NIfTI-2"]),
+        refused("a slope that is NaN", changed(nifti, "a.nii", at(112, f32::NAN.to_le_bytes())), INFO, &["scl_slope"]).ends(End::Warned),
+        refused("gzip, cut in the middle", changed(nifti_gz, "a.nii.gz", cut(60)), INFO_GZ, &["a.nii.gz", "gzip"]),
+        refused("gzip, cut within the checksum", changed(nifti_gz, "a.nii.gz", cut_end(3)), INFO_GZ, &["a.nii.gz", "gzip stream"]),
+        refused("gzip with a wrong checksum", changed(nifti_gz, "a.nii.gz", |b| { let n = b.len(); b[n - 8] ^= 1; }), INFO_GZ, &["gzip stream"]),
+        refused("gzip of nothing but its first bytes", |d| put(d.join("a.nii.gz"), [0x1f, 0x8b]), "convert a.nii.gz out.nii", &["a.nii.gz"]),
+        refused(
+            "gzip that claims 140 TB in 200 bytes",
+            |d| put(d.join("a.nii.gz"), gzip(header(d, [32767; 3]))),
+            INFO_GZ,
+            &["claims 140724603453452 bytes", "unpack to"],
+        ),
+        refused("gzip bomb: 400 MB of zeros as the header says, in 400 kB", |d| bomb(d, [1000, 1000, 400], 400_000_000), "convert a.nii.gz out.nii", &["400000000 bytes", "100 times"]),
+        refused("gzip bomb: 300 MB behind a volume of 24 bytes", |d| bomb(d, [4, 3, 2], 300_000_000), INFO_GZ, &["more data", "24 bytes"]),
+        refused(
+            "a sparse file of 1 TB that holds what its header says",
+            |d| {
+                let mut bytes = header(d, [10000; 3]);
+                at(70, [2, 0, 8, 0])(&mut bytes);
+                put(d.join("a.nii"), bytes);
+                File::options().append(true).open(d.join("a.nii")).unwrap().set_len(352 + 1_000_000_000_000).unwrap();
+            },
+            INFO,
+            &["fits in memory"],
+        ),
+        refused(
+            "a named pipe, which no one writes to",
+            |d| assert!(std::process::Command::new("mkfifo").arg(d.join("a.nii")).status().unwrap().success()),
+            INFO,
+            &["a.nii", "a regular file"],
+        ),
+        refused("a device without end", |d| std::os::unix::fs::symlink("/dev/zero", d.join("a.nii")).unwrap(), "convert a.nii out.nii", &["a.nii", "a regular file"]),
+        refused("a link to itself", |d| std::os::unix::fs::symlink("a.nii", d.join("a.nii")).unwrap(), INFO, &["a.nii", "symbolic links"]),
+    ]
+}
