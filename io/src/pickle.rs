@@ -34,13 +34,18 @@ const LONGEST_INTEGER: usize = 16;
 
 const PROTOCOLS: std::ops::RangeInclusive<u8> = 2..=5;
 
+/// Whether `start`, the first bytes of a file, are those of a pickle of protocol 2 or later.
+pub(crate) fn is_start(start: &[u8]) -> bool {
+    // Python is at 5; a few more, so that the refusal can name them.
+    matches!(start, [op::PROTO, 0..=15, ..])
+}
+
 /// Whether the file starts as a pickle of protocol 2 or later does.
 pub(crate) fn is_pickle(path: &Path) -> Result<bool> {
     let mut start = Vec::new();
     let (file, _) = files::open(path)?;
     file.take(2).read_to_end(&mut start).map_err(|e| Error::io(path, e))?;
-    // Python is at 5; a few more, so that the refusal can name them.
-    Ok(matches!(start[..], [op::PROTO, 0..=15]))
+    Ok(is_start(&start))
 }
 
 impl<'a> Pickle<'a> {

@@ -72,7 +72,7 @@ pub(crate) fn find(path: &Path) -> Result<Found> {
                       meta_data.json (R2-Gaussian), or a pickle (NAF)";
     let info = path.metadata().map_err(|e| Error::io(path, e))?;
     if !info.is_dir() {
-        if info.is_file() && pickle::is_pickle(path)? {
+        if pickle::is_pickle(path)? {
             return Ok(Found::Naf(path.to_path_buf()));
         }
         let folder = path.parent().filter(|p| !p.as_os_str().is_empty()).unwrap_or(Path::new("."));

@@ -1,7 +1,7 @@
 //! The door for volumes: which format a file is in, and which one a name asks for.
 
 use crate::input::Input;
-use crate::{dicom, metaimage, nifti, npy, write_atomic};
+use crate::{dicom, metaimage, nifti, npy, pickle, write_atomic};
 use conefield_core::geometry::VoxelGrid;
 use conefield_core::parts::Voxels;
 use conefield_core::scan::Volume;
@@ -82,18 +82,26 @@ pub(crate) fn open(path: &Path) -> Result<Opened> {
     Ok(Opened::Nifti(input, head))
 }
 
-/// Whether the file, or the folder with DICOM files in it, looks like a volume; its data is not read. True of a single
-/// DICOM file as well, for which [`read_volume`] asks for the folder.
+/// Whether the file, or the folder with DICOM files in it, looks like a volume; its data is not read. True as well of
+/// what [`read_volume`] refuses with the better reason: a single DICOM file, and a file that is named like a volume but
+/// damaged or none at all.
 pub fn is_volume(path: impl AsRef<Path>) -> bool {
     let path = path.as_ref();
     if path.is_dir() {
         return dicom::is_series(path);
     }
-    Input::open(path).and_then(|mut i| i.take(nifti::HEADER)).is_ok_and(|head| {
+    let named = format_of(path).is_some() || path.extension().is_some_and(|e| e.eq_ignore_ascii_case("mhd"));
+    let Ok(mut input) = Input::open(path) else { return named };
+    // Of what is read here only volumes are in gzip.
+    if input.left().is_none() {
+        return true;
+    }
+    input.take(nifti::HEADER).is_ok_and(|head| {
         head.starts_with(npy::MAGIC)
             || nifti::is_header(&head)
             || metaimage::is_header(&head)
             || dicom::is_header(&head)
+            || (named && !pickle::is_start(&head))
     })
 }
 

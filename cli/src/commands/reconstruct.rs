@@ -8,6 +8,7 @@ use crate::progress::{Keeper, Progress};
 use crate::run::RunFolder;
 use crate::{files, out, signals, specs};
 use clap::Args;
+use conefield_core::arena::Arena;
 use conefield_core::backend::Explain;
 use conefield_core::checkpoint::Resume;
 use conefield_core::pipeline::Pipeline;
@@ -117,17 +118,20 @@ impl Reconstruct {
     pub fn run(self) -> Result<()> {
         let loaded = specs::read(&self.spec, &self.all_sets())?;
         let solver = loaded.spec.solver.build().map_err(|e| loaded.locate(e))?;
-        // Weights that cannot be read are told before anything is made.
-        if let Some(i) = &loaded.spec.initializer
-            && i.volume().map_err(|e| loaded.locate(e))?.is_none()
-        {
-            i.build(&|path| files::read_weights(path)).map_err(|e| loaded.locate(e))?;
-        }
         let backend = self.backend.open();
         let pipeline = loaded.spec.encoder.as_ref().map(|_| specs::build(&loaded)).transpose()?;
         let compiled = pipeline.as_ref().map(|p| backend.compile(p)).transpose()?.map(|c| c.1).unwrap_or_default();
         let memory = self.memory(&loaded, solver.as_ref(), pipeline.as_ref(), &compiled)?;
         info!("memory: {}", memory.line());
+        // Weights that cannot be read or do not fit are told before anything is made.
+        if let Some(i) = &loaded.spec.initializer
+            && i.volume().map_err(|e| loaded.locate(e))?.is_none()
+        {
+            let initializer = i.build(&|path| files::read_weights(path)).map_err(|e| loaded.locate(e))?;
+            if let Some(layout) = pipeline.as_ref().map(|p| p.layout()) {
+                initializer.apply(layout, &mut Arena::new(layout.len()))?;
+            }
+        }
         let whole = files::scan(&self.scan)?;
         let reference = self.reference.as_ref().map(|path| read_reference(path, &self.scan, &whole)).transpose()?;
         let held = self.hold_out.as_ref().map(|h| h.views(whole.geometry.views.len())).unwrap_or_default();

@@ -57,7 +57,8 @@ impl Case {
         let before = standing(dir.path());
         let program = assert_cmd::cargo::cargo_bin("conefield");
         // Two threads, as each takes address space of its own.
-        let limited = format!("ulimit -v {MEMORY_KIB}; ulimit -t {SECONDS}; ulimit -c 0; exec \"$0\" --threads 2 \"$@\"");
+        let limited =
+            format!("ulimit -v {MEMORY_KIB}; ulimit -t {SECONDS}; ulimit -c 0; exec \"$0\" --threads 2 \"$@\"");
         let mut command = Command::new("sh");
         command.args(["-c", &limited]).arg(program).args(self.args.split(' '));
         let start = Instant::now();
@@ -174,7 +175,7 @@ pub fn replaced(
 }
 
 /// Overwrites bytes from `at` on.
-pub fn at(at: usize, bytes: impl AsRef<[u8]>) -> impl Fn(&mut Vec<u8>) + Sync + Send {
+pub fn at(at: usize, bytes: impl AsRef<[u8]> + Sync + Send) -> impl Fn(&mut Vec<u8>) + Sync + Send {
     move |all| all[at..at + bytes.as_ref().len()].copy_from_slice(bytes.as_ref())
 }
 

@@ -33,26 +33,111 @@ const SEQUENCE: [u8; 20] =
 
 pub fn cases() -> Vec<Case> {
     vec![
-        refused("an empty folder", |d| std::fs::create_dir(d.join("series")).unwrap(), "convert series out.nii", &["series"]),
+        refused(
+            "an empty folder",
+            |d| std::fs::create_dir(d.join("series")).unwrap(),
+            "convert series out.nii",
+            &["series"],
+        ),
         refused("a file cut within its description", changed(dicom, FILE, cut(200)), INFO, &["0.dcm"]),
         refused("a file cut within its pixels", changed(dicom, FILE, cut_end(1)), INFO, &["(7FE0,0010)", "11 bytes"]),
         refused("a file that is only the mark", changed(dicom, FILE, cut(132)), INFO, &["0.dcm"]),
         refused("no rows", value([0x28, 0, 0x10, 0], &[0, 0]), INFO, &["Rows", "found 0"]),
-        refused("65535 rows in 12 bytes", value([0x28, 0, 0x10, 0], &[255, 255]), INFO, &["PixelData", "12 bytes", "393210 bytes"]),
+        refused(
+            "65535 rows in 12 bytes",
+            value([0x28, 0, 0x10, 0], &[255, 255]),
+            INFO,
+            &["PixelData", "12 bytes", "393210 bytes"],
+        ),
         refused("numbers of 12 bits", value([0x28, 0, 0, 1], &[12, 0]), INFO, &["BitsAllocated", "12"]),
         refused("a pixel size that is no number", value([0x28, 0, 0x30, 0], b"a"), INFO, &["PixelSpacing"]),
         refused("a position that is NaN", value([0x20, 0, 0x32, 0], b"nan"), INFO, &["ImagePositionPatient"]),
-        refused("two slices at one place", |d| { dicom(d); std::fs::copy(d.join(FILE), d.join("series/2.dcm")).unwrap(); }, INFO, &["ImagePositionPatient", "0.dcm and 2.dcm"]),
-        refused("two series", |d| { changed(dicom, FILE, |b| { let at = find(b, [0x20, 0, 0x0e, 0]); b[at + 8] = b'9'; })(d) }, INFO, &["SeriesInstanceUID", "one series"]),
-        refused("an element of 2 GB", inserted(vec![0x20, 0, 0, 0x40, b'U', b'T', 0, 0, 0, 0, 0, 0x80]), INFO, &["(0020,4000)", "2147483648 bytes"]),
-        refused("an element of a kind that does not exist, of 1 GB", inserted(vec![0x20, 0, 0, 0x40, b'X', b'Y', 0, 0, 0, 0, 0, 0x40]), INFO, &["(0020,4000)", "1073741824 bytes"]),
-        refused("an element of half a value", inserted(vec![0x20, 0, 0, 0x40, b'U', b'L', 2, 0, 0, 0]), INFO, &["(0020,4000)", "a multiple of 4"]),
+        refused(
+            "two slices at one place",
+            |d| {
+                dicom(d);
+                std::fs::copy(d.join(FILE), d.join("series/2.dcm")).unwrap();
+            },
+            INFO,
+            &["ImagePositionPatient", "0.dcm and 2.dcm"],
+        ),
+        refused(
+            "two series",
+            |d| {
+                changed(dicom, FILE, |b| {
+                    let at = find(b, [0x20, 0, 0x0e, 0]);
+                    b[at + 8] = b'9';
+                })(d)
+            },
+            INFO,
+            &["SeriesInstanceUID", "one series"],
+        ),
+        refused(
+            "an element of 2 GB",
+            inserted(vec![0x20, 0, 0, 0x40, b'U', b'T', 0, 0, 0, 0, 0, 0x80]),
+            INFO,
+            &["(0020,4000)", "2147483648 bytes"],
+        ),
+        refused(
+            "an element of a kind that does not exist, of 1 GB",
+            inserted(vec![0x20, 0, 0, 0x40, b'X', b'Y', 0, 0, 0, 0, 0, 0x40]),
+            INFO,
+            &["(0020,4000)", "1073741824 bytes"],
+        ),
+        refused(
+            "an element of half a value",
+            inserted(vec![0x20, 0, 0, 0x40, b'U', b'L', 2, 0, 0, 0]),
+            INFO,
+            &["(0020,4000)", "a multiple of 4"],
+        ),
         refused("100 000 sequences in each other", inserted(SEQUENCE.repeat(100_000)), INFO, &["levels"]),
-        refused("a description that claims 4 GB", changed(dicom, FILE, |b| b[140..144].fill(255)), INFO, &["FileMetaInformationGroupLength"]),
-        refused("a compressed picture whose piece claims 4 GB", changed(dicom_run_length, FILE, |b| { let at = find(b, [0xfe, 0xff, 0, 0xe0]); b[at + 12..at + 16].copy_from_slice(&[0xff, 0xff, 0xff, 0xfe]); }), INFO, &["0.dcm", "bytes"]),
-        refused("run lengths that end early", changed(dicom_run_length, FILE, |b| { let at = b.len() - 18; b[at] = 128; }), INFO, &["PixelData", "segment"]),
-        refused("JPEG 2000", changed(dicom, FILE, |b| { let at = find(b, [2, 0, 0x10, 0]) + 8; b[at..at + 20].copy_from_slice(b"1.2.840.10008.1.2.9\0"); }), INFO, &["TransferSyntaxUID", "decompress"]),
-        refused("one file in place of the folder", dicom, "convert series/0.dcm out.nii", &["one DICOM file", "folder"]),
-        refused("no DICOM in the folder", |d| { std::fs::create_dir(d.join("series")).unwrap(); put(d.join("series/a.txt"), "x"); }, "evaluate series series", &["DICOM slices", "none among 1 files"]),
+        refused(
+            "a description that claims 4 GB",
+            changed(dicom, FILE, |b| b[140..144].fill(255)),
+            INFO,
+            &["FileMetaInformationGroupLength"],
+        ),
+        refused(
+            "a compressed picture whose piece claims 4 GB",
+            changed(dicom_run_length, FILE, |b| {
+                let at = find(b, [0xfe, 0xff, 0, 0xe0]);
+                b[at + 12..at + 16].copy_from_slice(&[0xff, 0xff, 0xff, 0xfe]);
+            }),
+            INFO,
+            &["0.dcm", "bytes"],
+        ),
+        refused(
+            "run lengths that end early",
+            changed(dicom_run_length, FILE, |b| {
+                let at = b.len() - 18;
+                b[at] = 128;
+            }),
+            INFO,
+            &["PixelData", "segment"],
+        ),
+        refused(
+            "JPEG 2000",
+            changed(dicom, FILE, |b| {
+                let at = find(b, [2, 0, 0x10, 0]) + 8;
+                b[at..at + 20].copy_from_slice(b"1.2.840.10008.1.2.9\0");
+            }),
+            INFO,
+            &["TransferSyntaxUID", "decompress"],
+        ),
+        refused(
+            "one file in place of the folder",
+            dicom,
+            "convert series/0.dcm out.nii",
+            &["one DICOM file", "folder"],
+        ),
+        refused(
+            "no DICOM in the folder",
+            |d| {
+                std::fs::create_dir(d.join("series")).unwrap();
+                put(d.join("series/a.txt"), "x");
+            },
+            "evaluate series series",
+            &["DICOM slices", "none among 1 files"],
+        ),
     ]
 }

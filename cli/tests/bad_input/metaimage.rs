@@ -8,7 +8,8 @@ const INFO: &str = "info a.mhd";
 
 /// A header with zlib data of `size` zeros beside it.
 fn packed(dir: &Path, shape: &str, size: usize) {
-    let text = metaimage_lines("a.zraw").replace("4 3 2\n", shape).replace("CompressedData = False", "CompressedData = True");
+    let text =
+        metaimage_lines("a.zraw").replace("4 3 2\n", shape).replace("CompressedData = False", "CompressedData = True");
     put(dir.join("a.mhd"), text);
     put(dir.join("a.zraw"), zlib(&vec![0; size]));
 }
@@ -19,31 +20,78 @@ fn lines(from: &'static str, to: &'static str) -> impl Fn(&Path) + Sync + Send {
 
 pub fn cases() -> Vec<Case> {
     vec![
-        refused("cut within the lines", changed(metaimage, "a.mha", cut(90)), "info a.mha", &["ElementDataFile", "end of the file"]),
-        refused("cut within the packed voxels", changed(metaimage, "a.mha", cut_end(5)), "info a.mha", &["CompressedDataSize"]),
+        refused(
+            "cut within the lines",
+            changed(metaimage, "a.mha", cut(90)),
+            "info a.mha",
+            &["line 5", "Name = value"],
+        ),
+        refused(
+            "cut within the packed voxels",
+            changed(metaimage, "a.mha", cut_end(5)),
+            "info a.mha",
+            &["CompressedDataSize"],
+        ),
         refused("no entry DimSize", lines("DimSize = 4 3 2\n", ""), INFO, &["DimSize", "no such entry"]),
         refused("a misspelt entry", lines("DimSize", "DimSise"), INFO, &["DimSize", "no such entry"]),
         refused("an axis without voxels", lines("4 3 2\n", "4 0 2\n"), INFO, &["DimSize", "4 0 2", "above 0"]),
         refused("a negative axis", lines("4 3 2\n", "4 -3 2\n"), INFO, &["DimSize", "above 0"]),
-        refused("a product past 2^64", lines("4 3 2\n", "4294967296 4294967296 4294967296\n"), INFO, &["DimSize", "addressed"]),
+        refused(
+            "a product past 2^64",
+            lines("4 3 2\n", "4294967296 4294967296 4294967296\n"),
+            INFO,
+            &["DimSize", "addressed"],
+        ),
         refused("three numbers for two axes", lines("NDims = 3", "NDims = 2"), INFO, &["NDims", "found 2"]),
         refused("a size of NaN", lines("0.5 0.75 2", "nan 0.75 2"), INFO, &["ElementSpacing", "finite"]),
         refused("an axis of length zero", lines("1 0 0 0 1", "0 0 0 0 1"), INFO, &["TransformMatrix", "independent"]),
-        refused("a text that is no UTF-8", |d| { metaimage_header(d); put(d.join("a.mhd"), b"ObjectType = Image\nNDims = \xff\xfe\n"); }, INFO, &["a.mhd"]),
+        refused(
+            "a text that is no UTF-8",
+            |d| {
+                metaimage_header(d);
+                put(d.join("a.mhd"), b"ObjectType = Image\nNDims = \xff\xfe\n");
+            },
+            INFO,
+            &["a.mhd"],
+        ),
         refused("an entry twice", lines("NDims = 3\n", "NDims = 3\nNDims = 3\n"), INFO, &["NDims", "two entries"]),
         refused("data in /etc/passwd", lines("a.raw", "/etc/passwd"), INFO, &["ElementDataFile", "inside the folder"]),
         refused("data in the folder above", lines("a.raw", "../a.raw"), INFO, &["ElementDataFile", "without \"..\""]),
         refused(
             "data behind a link that leads out",
-            |d| { metaimage_header(d); std::fs::remove_file(d.join("a.raw")).unwrap(); std::os::unix::fs::symlink("/etc/hostname", d.join("a.raw")).unwrap(); },
+            |d| {
+                metaimage_header(d);
+                std::fs::remove_file(d.join("a.raw")).unwrap();
+                std::os::unix::fs::symlink("/etc/hostname", d.join("a.raw")).unwrap();
+            },
             INFO,
             &["ElementDataFile", "link out of the folder"],
         ),
         refused("data in a list of files", lines("a.raw", "LIST"), INFO, &["ElementDataFile", "one file"]),
-        refused("a number of bytes to pass over that is past the end", lines("ObjectType", "HeaderSize = 99999999999\nObjectType"), INFO, &["HeaderSize", "up to 24"]),
-        refused("zlib that claims 64 TB", |d| packed(d, "40000 40000 40000\n", 24), INFO, &["claims 64000000000000 bytes"]),
-        refused("zlib bomb: 300 MB of zeros in 300 kB", |d| packed(d, "1000 1000 300\n", 300_000_000), "convert a.mhd out.nii", &["100 times"]),
+        refused(
+            "a number of bytes to pass over that is past the end",
+            lines("ObjectType", "HeaderSize = 99999999999\nObjectType"),
+            INFO,
+            &["HeaderSize", "up to 24"],
+        ),
+        refused(
+            "zlib that claims 64 TB",
+            |d| packed(d, "40000 40000 40000\n", 24),
+            INFO,
+            &["claims 64000000000000 bytes"],
+        ),
+        refused(
+            "zlib bomb: 300 MB of zeros in 300 kB",
+            |d| packed(d, "1000 1000 300\n", 300_000_000),
+            "convert a.mhd out.nii",
+            &["100 times"],
+        ),
         refused("zlib with less than it says", |d| packed(d, "4 3 2\n", 23), INFO, &["end of the file after 23 bytes"]),
-        refused("lines without an end, 1 MB", |d| put(d.join("a.mhd"), [b"NDims = 3\n".as_slice(), &vec![b'x'; 1 << 20]].concat()), INFO, &["ElementDataFile", "65536 bytes"]),
+        refused(
+            "lines without an end, 1 MB",
+            |d| put(d.join("a.mhd"), [b"NDims = 3\n".as_slice(), &vec![b'x'; 1 << 20]].concat()),
+            INFO,
+            &["ElementDataFile", "65536 bytes"],
+        ),
     ]
 }

@@ -26,7 +26,9 @@ fn laughs(dir: &Path) {
         let ten = format!("&a{};", i - 1).repeat(10);
         text.push_str(&format!("<!ENTITY a{i} \"{ten}\">\n"));
     }
-    text.push_str("]>\n<RTKThreeDCircularGeometry version=\"3\"><Projection>&a9;</Projection></RTKThreeDCircularGeometry>\n");
+    text.push_str(
+        "]>\n<RTKThreeDCircularGeometry version=\"3\"><Projection>&a9;</Projection></RTKThreeDCircularGeometry>\n",
+    );
     put(dir.join("geometry.xml"), text);
 }
 
@@ -42,36 +44,163 @@ pub fn cases() -> Vec<Case> {
         refused("a negative distance", circle("dso = 500.0", "dso = -500.0"), IMPORT, &["circle.dso", "-500"]),
         refused("an infinite distance", circle("dsd = 800.0", "dsd = inf"), IMPORT, &["circle.dsd", "inf"]),
         refused("a detector nearer than the axis", circle("dsd = 800.0", "dsd = 0"), IMPORT, &["circle.dsd"]),
-        refused("a source within the volume", circle("dso = 500.0", "dso = 0.1"), IMPORT, &["views[0]", "inside the volume"]),
-        refused("a pixel of size zero", circle("pixel = { u = 2.0", "pixel = { u = 0.0"), IMPORT, &["circle.pixel.u", "found 0"]),
-        refused("an angle that is NaN", circle("range_deg = 360.0", "angles_deg = [0, nan, 3]"), IMPORT, &["circle.angles_deg[1]", "NaN"]),
-        refused("angles said twice", circle("range_deg = 360.0", "range_deg = 360.0\nstep_deg = 1.0"), IMPORT, &["circle.step_deg", "several ways"]),
-        refused("two geometries", circle("[values]", "[vectors]\ncone_vec = []\n[values]"), IMPORT, &["circle", "several geometries"]),
+        refused(
+            "a source within the volume",
+            circle("dso = 500.0", "dso = 0.1"),
+            IMPORT,
+            &["views[0]", "inside the volume"],
+        ),
+        refused(
+            "a pixel of size zero",
+            circle("pixel = { u = 2.0", "pixel = { u = 0.0"),
+            IMPORT,
+            &["circle.pixel.u", "found 0"],
+        ),
+        refused(
+            "an angle that is NaN",
+            circle("range_deg = 360.0", "angles_deg = [0, nan, 3]"),
+            IMPORT,
+            &["circle.angles_deg[1]", "NaN"],
+        ),
+        refused(
+            "angles said twice",
+            circle("range_deg = 360.0", "range_deg = 360.0\nstep_deg = 1.0"),
+            IMPORT,
+            &["circle.step_deg", "several ways"],
+        ),
+        refused(
+            "two geometries",
+            circle("[values]", "[vectors]\ncone_vec = []\n[values]"),
+            IMPORT,
+            &["circle", "several geometries"],
+        ),
         refused("an open beam that is negative", circle("i0 = 20000.0", "i0 = -1"), IMPORT, &["-1"]),
-        refused("counts taken for line integrals", circle("kind = \"counts\"\ni0 = 20000.0", "kind = \"line-integrals\""), IMPORT, &["line integrals", "--i0"]).ends(End::Warned),
-        refused("a volume without voxels", circle("shape = [4, 3, 2]", "shape = [4, 0, 2]"), IMPORT, &["volume.shape", "at least one voxel"]),
-        refused("a volume past 2^64", circle("shape = [4, 3, 2]", "shape = [4294967296, 4294967296, 4294967296]"), IMPORT, &["volume.shape", "addressed"]),
-        refused("a file in the folder above", circle("counts.npy", "../counts.npy"), IMPORT, &["files.projections", "without \"..\""]),
-        refused("a file of the system", circle("counts.npy", "/etc/passwd"), IMPORT, &["files.projections", "inside the folder"]),
-        refused("one file a thousand times", |d| {
-            scanner_npy(d);
-            let list = format!("projections = [{}]", "\"counts.npy\", ".repeat(1000));
-            put(d.join("scanner.toml"), scanner_toml("counts.npy", CIRCLE).replace("projections = \"counts.npy\"", &list));
-        }, IMPORT, &["files.projections", "a second time"]),
-        refused("tables a thousand deep", |d| put(d.join("scanner.toml"), format!("a = {}1", "{a = ".repeat(1000))), IMPORT, &["scanner.toml: line 1"]),
-        refused("a text of 17 MB", |d| put(d.join("scanner.toml"), " ".repeat(17 << 20)), IMPORT, &["file size", "at most 16777216 bytes"]),
+        refused(
+            "counts taken for line integrals",
+            circle("kind = \"counts\"\ni0 = 20000.0", "kind = \"line-integrals\""),
+            IMPORT,
+            &["line integrals", "--i0"],
+        )
+        .ends(End::Warned),
+        refused(
+            "a volume without voxels",
+            circle("shape = [4, 3, 2]", "shape = [4, 0, 2]"),
+            IMPORT,
+            &["volume.shape", "at least one voxel"],
+        ),
+        refused(
+            "a volume past 2^64",
+            circle("shape = [4, 3, 2]", "shape = [4294967296, 4294967296, 4294967296]"),
+            IMPORT,
+            &["volume.shape", "addressed"],
+        ),
+        refused(
+            "a file in the folder above",
+            circle("counts.npy", "../counts.npy"),
+            IMPORT,
+            &["files.projections", "without \"..\""],
+        ),
+        refused(
+            "a file of the system",
+            circle("counts.npy", "/etc/passwd"),
+            IMPORT,
+            &["files.projections", "inside the folder"],
+        ),
+        refused(
+            "one file a thousand times",
+            |d| {
+                scanner_npy(d);
+                let list = format!("projections = [{}]", "\"counts.npy\", ".repeat(1000));
+                put(
+                    d.join("scanner.toml"),
+                    scanner_toml("counts.npy", CIRCLE).replace("projections = \"counts.npy\"", &list),
+                );
+            },
+            IMPORT,
+            &["files.projections", "a second time"],
+        ),
+        refused(
+            "tables a thousand deep",
+            |d| put(d.join("scanner.toml"), format!("a = {}1", "{a = ".repeat(1000))),
+            IMPORT,
+            &["scanner.toml: line 1"],
+        ),
+        refused(
+            "a text of 17 MB",
+            |d| put(d.join("scanner.toml"), " ".repeat(17 << 20)),
+            IMPORT,
+            &["file size", "at most 16777216 bytes"],
+        ),
         refused("ASTRA: eleven numbers in a vector", vectors("[500, 0, 0, ", "[500, 0, "), IMPORT, &["scanner.toml"]),
-        refused("ASTRA: fewer vectors than views", vectors("  [0, 500, 0, 0, -300, 0, -2, 0, 0, 0, 0, -2],\n", ""), IMPORT, &["vectors.cone_vec", "2 of them", "expected 3"]),
-        refused("ASTRA: a vector with NaN", vectors("[500, 0, 0, -300", "[nan, 0, 0, -300"), IMPORT, &["views[0]", "not finite"]),
-        refused("ASTRA: parallel rows and columns", vectors("0, 2, 0, 0, 0, -2]", "0, 2, 0, 0, 2, 0]"), IMPORT, &["views[0]", "parallel"]),
-        refused("ASTRA: a source in the detector's plane", vectors("[500, 0, 0, -300,", "[-300, 0, 0, -300,"), IMPORT, &["views[0]", "plane of the detector"]),
-        refused("RTK: an empty file", changed(scanner_rtk, "geometry.xml", Vec::clear), IMPORT, &["geometry.xml", "XML"]),
-        refused("RTK: cut in the middle", changed(scanner_rtk, "geometry.xml", |b| b.truncate(b.len() / 2)), IMPORT, &["geometry.xml", "XML"]),
-        refused("RTK: another root", rtk("<RTKThreeDCircularGeometry version=\"3\">", "<RTKThreeDCircularGeometry version=\"9\">"), IMPORT, &["version", "found 9"]),
-        refused("RTK: an angle that is NaN", rtk("<GantryAngle>", "<GantryAngle>nan"), IMPORT, &["GantryAngle", "\"nan"]),
-        refused("RTK: a misspelt element", rtk("<GantryAngle>", "<GantryAngel>3</GantryAngel><GantryAngle>"), IMPORT, &["line 5", "<GantryAngel>"]),
-        refused("RTK: a matrix that contradicts", rtk("<SourceToDetectorDistance>800", "<SourceToDetectorDistance>801"), IMPORT, &["Matrix"]),
+        refused(
+            "ASTRA: fewer vectors than views",
+            vectors("  [0, 500, 0, 0, -300, 0, -2, 0, 0, 0, 0, -2],\n", ""),
+            IMPORT,
+            &["vectors.cone_vec", "2 of them", "expected 3"],
+        ),
+        refused(
+            "ASTRA: a vector with NaN",
+            vectors("[500, 0, 0, -300", "[nan, 0, 0, -300"),
+            IMPORT,
+            &["views[0]", "not finite"],
+        ),
+        refused(
+            "ASTRA: parallel rows and columns",
+            vectors("0, 2, 0, 0, 0, -2]", "0, 2, 0, 0, 2, 0]"),
+            IMPORT,
+            &["views[0]", "parallel"],
+        ),
+        refused(
+            "ASTRA: a source in the detector's plane",
+            vectors("[500, 0, 0, -300,", "[-300, 0, 0, -300,"),
+            IMPORT,
+            &["views[0]", "plane of the detector"],
+        ),
+        refused(
+            "RTK: an empty file",
+            changed(scanner_rtk, "geometry.xml", Vec::clear),
+            IMPORT,
+            &["geometry.xml", "XML"],
+        ),
+        refused(
+            "RTK: cut in the middle",
+            changed(scanner_rtk, "geometry.xml", |b| b.truncate(b.len() / 2)),
+            IMPORT,
+            &["geometry.xml", "XML"],
+        ),
+        refused(
+            "RTK: another root",
+            rtk("<RTKThreeDCircularGeometry version=\"3\">", "<RTKThreeDCircularGeometry version=\"9\">"),
+            IMPORT,
+            &["version", "found 9"],
+        ),
+        refused(
+            "RTK: an angle that is NaN",
+            rtk("<GantryAngle>", "<GantryAngle>nan"),
+            IMPORT,
+            &["GantryAngle", "\"nan"],
+        ),
+        refused(
+            "RTK: a misspelt element",
+            rtk("<GantryAngle>", "<GantryAngel>3</GantryAngel><GantryAngle>"),
+            IMPORT,
+            &["line 7", "<GantryAngel>"],
+        ),
+        refused(
+            "RTK: a matrix that contradicts",
+            rtk("<SourceToDetectorDistance>800", "<SourceToDetectorDistance>801"),
+            IMPORT,
+            &["Matrix"],
+        ),
         refused("RTK: entities of entities (a billion words)", laughs, IMPORT, &["geometry.xml", "XML"]),
-        refused("RTK: elements 100 000 deep", |d| { scanner_rtk(d); put(d.join("geometry.xml"), "<a>".repeat(100_000)); }, IMPORT, &["geometry.xml"]),
+        refused(
+            "RTK: elements 100 000 deep",
+            |d| {
+                scanner_rtk(d);
+                put(d.join("geometry.xml"), "<a>".repeat(100_000));
+            },
+            IMPORT,
+            &["geometry.xml"],
+        ),
     ]
 }

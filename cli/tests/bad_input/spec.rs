@@ -1,6 +1,6 @@
 //! Pipeline specs in TOML and JSON.
 
-use crate::case::{Case, End, put, refused};
+use crate::case::{Case, put, refused};
 use std::path::Path;
 
 const TOML: &str = "explain spec.toml";
@@ -20,30 +20,130 @@ pub fn cases() -> Vec<Case> {
         refused("no UTF-8", |d| put(d.join("spec.toml"), b"name = \"\xff\xfe\""), TOML, &["spec.toml", "UTF-8"]),
         refused("no TOML", toml("[encoder\n"), TOML, &["spec.toml:1:"]),
         refused("JSON cut in the middle", json("{\"extends\": \"naf\", \"encoder\": {\"lev"), JSON, &["spec.json:1:"]),
-        refused("a JSON key twice", json("{\"extends\": \"naf\",\n \"name\": \"a\",\n \"name\": \"b\"}"), JSON, &["spec.json:3:2", "a second time"]),
-        refused("a misspelt key", toml("extends = \"naf\"\n[encoder]\nlevles = 3\n"), TOML, &["spec.toml:3:1", "levles", "\"levels\""]),
-        refused("a misspelt type", toml("extends = \"naf\"\n[field]\ntype = \"mpl\"\n"), TOML, &["spec.toml:3:8", "\"mpl\"", "\"mlp\""]),
-        refused("a text where a number is due", toml("extends = \"naf\"\n[encoder]\nlevels = \"16\"\n"), TOML, &["spec.toml:3:10", "the text \"16\""]),
-        refused("a negative number", toml("extends = \"naf\"\n[encoder]\nlevels = -1\n"), TOML, &["spec.toml:3:10", "-1"]),
-        refused("a number past 2^64", toml("extends = \"naf\"\n[encoder]\nlevels = 99999999999999999999\n"), TOML, &["spec.toml:3:10", "64 bits"]),
+        refused(
+            "a JSON key twice",
+            json("{\"extends\": \"naf\",\n \"name\": \"a\",\n \"name\": \"b\"}"),
+            JSON,
+            &["spec.json:3:2", "a second time"],
+        ),
+        refused(
+            "a misspelt key",
+            toml("extends = \"naf\"\n[encoder]\nlevles = 3\n"),
+            TOML,
+            &["spec.toml:3:1", "levles", "\"levels\""],
+        ),
+        refused(
+            "a misspelt type",
+            toml("extends = \"naf\"\n[field]\ntype = \"mpl\"\n"),
+            TOML,
+            &["spec.toml:3:8", "\"mpl\"", "\"mlp\""],
+        ),
+        refused(
+            "a text where a number is due",
+            toml("extends = \"naf\"\n[encoder]\nlevels = \"16\"\n"),
+            TOML,
+            &["spec.toml:3:10", "the text \"16\""],
+        ),
+        refused(
+            "a negative number",
+            toml("extends = \"naf\"\n[encoder]\nlevels = -1\n"),
+            TOML,
+            &["spec.toml:3:10", "-1"],
+        ),
+        refused(
+            "a number past 2^64",
+            toml("extends = \"naf\"\n[encoder]\nlevels = 99999999999999999999\n"),
+            TOML,
+            &["spec.toml:3:10", "64 bits"],
+        ),
         refused("NaN", toml("extends = \"naf\"\n[scene]\nfill = nan\n"), TOML, &["spec.toml:3:8", "finite"]),
-        refused("a grid past memory", toml("extends = \"naf\"\n[encoder]\nlog2_table_size = 60\n"), TOML, &["spec.toml:3:19", "found 60"]),
-        refused("a layer of 2^62 neurons", toml("extends = \"naf\"\n[field]\nwidth = 4611686018427387904\n"), TOML, &["spec.toml:3:9", "4611686018427387904"]),
-        refused("2^62 samples along a ray", toml("extends = \"naf\"\n[projector]\nsamples = 4611686018427387904\n"), TOML, &["spec.toml:3:11", "4611686018427387904"]),
-        refused("a batch of 2^62 rays", toml("extends = \"naf\"\n[solver]\nrays = 4611686018427387904\n"), TOML, &["spec.toml:3:", "4611686018427387904"]),
+        refused(
+            "a grid past memory",
+            toml("extends = \"naf\"\n[encoder]\nlog2_table_size = 60\n"),
+            TOML,
+            &["spec.toml:3:19", "found 60"],
+        ),
+        refused(
+            "a layer of 2^62 neurons",
+            toml("extends = \"naf\"\n[field]\nwidth = 4611686018427387904\n"),
+            TOML,
+            &["spec.toml:3:9", "4611686018427387904"],
+        ),
+        refused(
+            "2^62 samples along a ray",
+            toml("extends = \"naf\"\n[projector]\nsamples = 4611686018427387904\n"),
+            TOML,
+            &["spec.toml:3:11", "4611686018427387904"],
+        ),
+        refused(
+            "a batch of 2^62 rays",
+            toml("extends = \"naf\"\n[solver]\nrays = 4611686018427387904\n"),
+            TOML,
+            &["spec.toml:3:", "4611686018427387904"],
+        ),
         refused("a date", toml("extends = \"naf\"\nname = 2026-01-01\n"), TOML, &["spec.toml:2:8", "2026-01-01"]),
-        refused("a base that does not exist", toml("extends = \"nothing\"\n"), TOML, &["spec.toml:1:11", "neither a shipped spec nor a file"]),
+        refused(
+            "a base that does not exist",
+            toml("extends = \"nothing\"\n"),
+            TOML,
+            &["spec.toml:1:11", "neither a shipped spec nor a file"],
+        ),
         refused("a base that is this one", toml("extends = \"spec.toml\"\n"), TOML, &["spec.toml:1:11", "no circle"]),
         refused("a base without end", toml("extends = \"/dev/zero\"\n"), TOML, &["spec.toml:1:11", "a regular file"]),
-        refused("arrays 100 000 deep", |d| put(d.join("spec.json"), "[".repeat(100_000)), JSON, &["spec.json:1:", "recursion"]),
-        refused("tables 100 000 deep", |d| put(d.join("spec.toml"), format!("x = {}", "{x=".repeat(60_000))), TOML, &["spec.toml:1:"]),
-        refused("20 000 unknown keys", |d| put(d.join("spec.toml"), (0..20_000).map(|i| format!("k{i}=1\n")).collect::<String>()), TOML, &["spec.toml:1:1", "k0"]),
-        refused("a text of 300 kB", |d| put(d.join("spec.toml"), "#".repeat(300_000)), TOML, &["file size", "at most 262144 bytes"]),
-        refused("a folder", |d| std::fs::create_dir(d.join("spec.toml")).unwrap(), TOML, &["spec.toml", "a regular file"]),
+        refused(
+            "arrays 100 000 deep",
+            |d| put(d.join("spec.json"), "[".repeat(100_000)),
+            JSON,
+            &["spec.json:1:", "recursion"],
+        ),
+        refused(
+            "tables 100 000 deep",
+            |d| put(d.join("spec.toml"), format!("x = {}", "{x=".repeat(60_000))),
+            TOML,
+            &["spec.toml:1:"],
+        ),
+        refused(
+            "20 000 unknown keys",
+            |d| put(d.join("spec.toml"), (0..20_000).map(|i| format!("k{i}=1\n")).collect::<String>()),
+            TOML,
+            &["spec.toml:1:1", "k0"],
+        ),
+        refused(
+            "a text of 300 kB",
+            |d| put(d.join("spec.toml"), "#".repeat(300_000)),
+            TOML,
+            &["file size", "at most 262144 bytes"],
+        ),
+        refused(
+            "a folder",
+            |d| std::fs::create_dir(d.join("spec.toml")).unwrap(),
+            TOML,
+            &["spec.toml", "a regular file"],
+        ),
         refused("a name that is a slip", |_| (), "explain ni-nef", &["ni-nef", "\"ni-naf\""]),
-        refused("--set without a value", |_| (), "explain naf --set encoder.levels", &["--set encoder.levels", "path=value"]),
-        refused("--set past the end of a list", |_| (), "explain naf --set normalizers.18446744073709551615.type=layer-norm", &["normalizers", "to add one"]),
-        refused("--set of an unknown key", |_| (), "explain naf --set encoder.level=3", &["encoder.level", "\"levels\""]),
-        refused("a log2 of 32 levels of a coarse grid", toml("extends = \"naf\"\n[encoder]\ngrowth = 1e300\n"), TOML, &["spec.toml:3:10", "1e300"]).ends(End::Refused),
+        refused(
+            "--set without a value",
+            |_| (),
+            "explain naf --set encoder.levels",
+            &["--set encoder.levels", "path=value"],
+        ),
+        refused(
+            "--set past the end of a list",
+            |_| (),
+            "explain naf --set normalizers.18446744073709551615.type=layer-norm",
+            &["normalizers", "to add one"],
+        ),
+        refused(
+            "--set of an unknown key",
+            |_| (),
+            "explain naf --set encoder.level=3",
+            &["encoder.level", "\"levels\""],
+        ),
+        refused(
+            "a growth past all numbers",
+            toml("extends = \"naf\"\n[encoder]\ngrowth = 1e9\n"),
+            TOML,
+            &["spec.toml:3:10", "1000000000"],
+        ),
     ]
 }
