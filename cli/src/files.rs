@@ -121,7 +121,7 @@ pub fn read_checkpoint(path: &Path, run: &BTreeMap<String, String>) -> Result<Re
     let mut file = conefield_io::read_checkpoint(path)?;
     let standing = file.metadata.remove(STANDING).unwrap_or_default();
     for (key, now) in run {
-        let then = file.metadata.get(key).map_or("", String::as_str);
+        let then = file.metadata.get(key).map_or("nothing", String::as_str);
         if then != now {
             // Of long texts, the first line that differs.
             let (a, b) = (then.lines(), now.lines());

@@ -10,7 +10,7 @@ pub fn open(path: &Path) -> Result<(File, u64)> {
     let io = |e| Error::io(path, e);
     // Before it is opened: opening a pipe waits for its writer.
     if !path.metadata().map_err(io)?.is_file() {
-        return Err(Error::invalid(path.display().to_string(), "file", "a folder or device", "a regular file"));
+        return Err(Error::invalid(path.display().to_string(), "file", "a folder, pipe or device", "a regular file"));
     }
     let file = File::open(path).map_err(io)?;
     let size = file.metadata().map_err(io)?.len();

@@ -30,7 +30,7 @@ pub fn write_atomic(path: impl AsRef<Path>, fill: impl FnOnce(&mut dyn Write) ->
     // Without this the file would be private to its owner, unlike any other that the user makes.
     #[cfg(unix)]
     options.permissions(<fs::Permissions as std::os::unix::fs::PermissionsExt>::from_mode(0o666));
-    let file = options.tempfile_in(&folder).map_err(at)?;
+    let file = options.tempfile_in(&folder).map_err(|e| at(without_path(e)))?;
     let mut writer = BufWriter::with_capacity(1 << 20, file);
     fill(&mut writer)?;
     let file = writer.into_inner().map_err(|e| at(e.into_error()))?;
@@ -61,7 +61,7 @@ pub fn write_folder_atomic(folder: impl AsRef<Path>, fill: impl FnOnce(&Path) ->
         options.prefix(UNFINISHED[0]).suffix(suffix);
         #[cfg(unix)]
         options.permissions(<fs::Permissions as std::os::unix::fs::PermissionsExt>::from_mode(0o777));
-        options.tempdir_in(&beside).map_err(at)
+        options.tempdir_in(&beside).map_err(|e| at(without_path(e)))
     };
     let new = temporary(".tmp")?;
     fill(new.path())?;
@@ -87,6 +87,15 @@ pub fn write_folder_atomic(folder: impl AsRef<Path>, fill: impl FnOnce(&Path) ->
     let _ = new.keep();
     sync_folder(&beside);
     Ok(())
+}
+
+/// The system's own words: `tempfile` adds the temporary name, which means nothing to a user.
+fn without_path(e: std::io::Error) -> std::io::Error {
+    let text = e.to_string();
+    match text.split_once(" at path ") {
+        Some((words, _)) => std::io::Error::new(e.kind(), words.to_owned()),
+        None => e,
+    }
 }
 
 /// The folder that holds `path`.
@@ -152,7 +161,7 @@ mod tests {
     fn a_missing_folder_and_a_folder_in_the_way_are_named() {
         let dir = tempfile::tempdir().unwrap();
         let e = write_text_atomic(dir.path().join("no/such/a.txt"), "").unwrap_err().to_string();
-        assert!(e.contains("a.txt"), "{e}");
+        assert!(e.contains("a.txt") && !e.contains(UNFINISHED[0]), "{e}");
         let e = write_text_atomic(dir.path(), "").unwrap_err().to_string();
         assert!(e.contains("a folder"), "{e}");
     }

@@ -179,6 +179,7 @@ impl Input {
         let damaged = matches!(e.kind(), ErrorKind::InvalidInput | ErrorKind::InvalidData | ErrorKind::UnexpectedEof);
         match self.packed {
             Some(packed) if damaged => self.invalid(format!("{packed} stream"), e, format!("a whole {packed} stream")),
+            None if damaged => self.invalid("data", e, "data that is not damaged"),
             _ => Error::io(&self.path, e),
         }
     }

@@ -61,6 +61,10 @@ pub(crate) fn read_from(input: &mut Input, head: &[u8]) -> Result<Volume> {
 }
 
 fn parse(input: &Input, head: &[u8]) -> Result<NiftiHeader> {
+    if head.len() < HEADER {
+        let found = format!("the end of the file after {} bytes", head.len());
+        return Err(input.invalid("header", found, format!("a NIfTI-1 header of {HEADER} bytes")));
+    }
     NiftiHeader::from_reader(head)
         .map_err(|e| input.invalid("header", e, format!("a NIfTI-1 header of {HEADER} bytes")))
 }

@@ -5,7 +5,7 @@ mod entries;
 use crate::input::must_unpack;
 use conefield_core::{Error, Result, files};
 use ndarray::Array3;
-use std::io::{BufReader, Seek};
+use std::io::{BufReader, ErrorKind, Seek};
 use std::path::Path;
 use tiff::decoder::{Decoder, DecodingResult, Limits};
 use tiff::{ColorType, TiffError};
@@ -22,7 +22,13 @@ pub(crate) fn is_tiff(head: &[u8]) -> bool {
 pub(crate) fn read(path: &Path) -> Result<Array3<f32>> {
     let place = path.display().to_string();
     let (file, packed) = files::open(path)?;
-    let broken = |e: TiffError| Error::invalid(&place, "TIFF", e, "a whole TIFF image");
+    let broken = |e: TiffError| {
+        let found = match &e {
+            TiffError::IoError(e) if e.kind() == ErrorKind::UnexpectedEof => "the end of the file".to_owned(),
+            other => other.to_string(),
+        };
+        Error::invalid(&place, "TIFF", found, "a whole TIFF image")
+    };
     let mut reader = BufReader::new(file);
     entries::check(&place, &mut reader, packed)?;
     reader.rewind().map_err(|e| Error::io(path, e))?;

@@ -98,13 +98,6 @@ pub fn cases() -> Vec<Case> {
             "evaluate a.nii b.npy",
             &["[4, 3, 2]", "[1, 1, 1]"],
         ),
-        refused(
-            "a volume of one voxel, scored",
-            |d| put(d.join("b.npy"), npy_bytes("<f4", "(1, 1, 1)", &[0; 4])),
-            "evaluate b.npy b.npy",
-            &[],
-        )
-        .ends(End::Warned),
         refused("a name without a known end to write", nifti, "convert a.nii b.png", &["b.png", ".nii.gz"]),
         refused("a folder that does not exist to write in", nifti, "convert a.nii no/b.nii", &["no/b.nii"]),
         refused(

@@ -36,8 +36,10 @@ pub struct Loaded {
 
 /// Reads the spec `what`: the name of a shipped one or a TOML or JSON file. `sets` are `path=value` and lie on top.
 pub fn load(what: &str, sets: &[String], shipped: &[Shipped]) -> Result<Loaded> {
-    let layer = Layer::find(what, None, shipped)
-        .map_err(|why| Error::invalid("spec", what, why, format!("a file or {}", names(what, shipped))))?;
+    let layer = Layer::find(what, None, shipped).map_err(|e| match e {
+        Unfound::Nothing => Error::invalid("spec", what, NOTHING, format!("a file or {}", names(what, shipped))),
+        Unfound::Unreadable(e) => e,
+    })?;
     let source = layer.label();
     finish(layer.resolve(shipped, &mut vec![])?, source, sets)
 }
@@ -126,6 +128,17 @@ enum Origin {
     Text(String),
 }
 
+/// Why there is no layer of some name.
+enum Unfound {
+    /// Nothing is called so.
+    Nothing,
+    /// A file that cannot be read.
+    Unreadable(Error),
+}
+
+/// [`Unfound::Nothing`] in words.
+const NOTHING: &str = "neither a shipped spec nor a file";
+
 /// One spec file before layering.
 struct Layer {
     origin: Origin,
@@ -134,17 +147,15 @@ struct Layer {
 
 impl Layer {
     /// What `what` means, written in a file of `folder`; or why it means nothing.
-    fn find(what: &str, folder: Option<&Path>, shipped: &[Shipped]) -> Result<Self, String> {
+    fn find(what: &str, folder: Option<&Path>, shipped: &[Shipped]) -> Result<Self, Unfound> {
         if let Some(s) = shipped.iter().find(|s| s.name == what) {
             return Ok(Self { origin: Origin::Shipped(s.name), text: s.text.into() });
         }
         let path = folder.map_or_else(|| PathBuf::from(what), |f| f.join(what));
         match files::read_text(&path, LONGEST) {
             Ok(text) => Ok(Self { origin: Origin::File(path), text }),
-            Err(Error::Io { source, .. }) if source.kind() == std::io::ErrorKind::NotFound => {
-                Err("neither a shipped spec nor a file".into())
-            }
-            Err(e) => Err(e.to_string()),
+            Err(Error::Io { source, .. }) if source.kind() == std::io::ErrorKind::NotFound => Err(Unfound::Nothing),
+            Err(e) => Err(Unfound::Unreadable(e)),
         }
     }
 
@@ -176,8 +187,12 @@ impl Layer {
             Origin::File(p) => p.parent(),
             _ => None,
         };
-        let base = Self::find(what, folder, shipped).map_err(|why| {
-            Error::invalid(&at, "extends", format!("{what:?}, {why}"), format!("a file or {}", names(what, shipped)))
+        let base = Self::find(what, folder, shipped).map_err(|e| match e {
+            Unfound::Nothing => {
+                let expected = format!("a file or {}", names(what, shipped));
+                Error::invalid(&at, "extends", format!("{what:?}, {NOTHING}"), expected)
+            }
+            Unfound::Unreadable(e) => Error::invalid(&at, "extends", e, "a spec that can be read"),
         })?;
         above.push(self.origin.clone());
         if above.iter().any(|o| same(o, &base.origin)) {
