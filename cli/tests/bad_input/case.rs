@@ -57,8 +57,9 @@ impl Case {
         let before = standing(dir.path());
         let program = assert_cmd::cargo::cargo_bin("conefield");
         // Two threads, as each takes address space of its own.
-        let limited =
-            format!("ulimit -v {MEMORY_KIB}; ulimit -t {SECONDS}; ulimit -c 0; exec \"$0\" --threads 2 \"$@\"");
+        let limited = format!(
+            "ulimit -v {MEMORY_KIB}; ulimit -t {SECONDS}; ulimit -c 0; exec \"$0\" --threads 2 --memory 1GiB \"$@\""
+        );
         let mut command = Command::new("sh");
         command.args(["-c", &limited]).arg(program).args(self.args.split(' '));
         let start = Instant::now();

@@ -74,11 +74,12 @@ pub fn find(name: &str) -> Option<&'static Parser> {
 
 fn volume(path: &Path) -> Result<()> {
     // What `info` asks first.
-    let _ = conefield_io::is_volume(path);
+    let _ = (conefield_io::is_volume(path), conefield_io::volume_voxels(path));
     conefield_io::read_volume(path).map(drop)
 }
 
 fn scan(path: &Path) -> Result<()> {
+    let _ = conefield_io::scan_size(path);
     let truth = conefield_io::read_truth(path);
     let scan = conefield_io::read_scan(path)?;
     conefield_io::check_line_integrals(scan.projections.view());
