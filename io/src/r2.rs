@@ -127,7 +127,7 @@ pub(crate) fn size(folder: &Path) -> Result<ScanSize> {
     let (pixels, test_pixels) = (pixels_of(&meta.proj_train), pixels_of(&meta.proj_test));
     let voxels = product(&meta.scanner.nVoxel);
     let volume = if meta.vol.is_some() { voxels } else { 0 };
-    Ok(ScanSize { pixels, voxels, test_pixels, reading: 4 * pixels.max(volume) })
+    Ok(ScanSize { pixels, voxels, test_pixels, reading: pixels.max(volume).saturating_mul(4) })
 }
 
 /// What the numbers of a folder that does not name its unit can mean.

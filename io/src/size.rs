@@ -3,6 +3,7 @@
 use crate::scan::{self, Found};
 use crate::volume::{self, Opened};
 use crate::{dicom, metaimage, nifti, npy, r2, scan_folder, scanner};
+use conefield_core::error::ensure;
 use conefield_core::{Error, Result};
 use std::path::Path;
 
@@ -24,15 +25,21 @@ pub struct ScanSize {
 /// it is read: all of the file is taken for 32-bit projections, and for voxels as well. Of a scanner's images only
 /// NumPy's and MetaImage's headers are read; other files are taken for one byte a value.
 pub fn scan_size(path: impl AsRef<Path>) -> Result<ScanSize> {
-    match scan::find(path.as_ref())? {
-        Found::Own(file) => scan_folder::size(&file),
-        Found::R2(folder) => r2::size(&folder),
+    let path = path.as_ref();
+    let size = match scan::find(path)? {
+        Found::Own(file) => scan_folder::size(&file)?,
+        Found::R2(folder) => r2::size(&folder)?,
         Found::Naf(file) => {
             let bytes = file_bytes(&file)?;
-            Ok(ScanSize { pixels: bytes / 4, voxels: bytes / 4, test_pixels: 0, reading: bytes })
+            ScanSize { pixels: bytes / 4, voxels: bytes / 4, test_pixels: 0, reading: bytes }
         }
-        Found::Scanner(file) => scanner::size(&file),
+        Found::Scanner(file) => scanner::size(&file)?,
+    };
+    let all = [("pixels of all views", size.pixels), ("pixels of test views", size.test_pixels), ("voxels", size.voxels)];
+    for (field, n) in all {
+        must_exist(path, field, n)?;
     }
+    Ok(size)
 }
 
 /// Number of voxels of a volume, from its header. Of a DICOM series, whose sizes stand in every slice, as many as its
@@ -48,7 +55,22 @@ pub fn volume_voxels(path: impl AsRef<Path>) -> Result<u64> {
         Opened::MetaImage => metaimage::shape(path)?.to_vec(),
         Opened::Nifti(input, head) => nifti::shape_of(&input, &head)?.to_vec(),
     };
-    Ok(shape.iter().fold(1, |n, &s| n.saturating_mul(s as u64)))
+    let voxels = shape.iter().fold(1, |n: u64, &s| n.saturating_mul(s as u64));
+    must_exist(path, "voxels", voxels)?;
+    Ok(voxels)
+}
+
+/// More values than any machine holds. Below this, sums of bytes stay far from the end of their range.
+const MOST: u64 = 1 << 48;
+
+fn must_exist(path: &Path, field: &str, n: u64) -> Result<()> {
+    ensure(
+        n <= MOST,
+        &path.display().to_string(),
+        field,
+        n,
+        format!("at most {MOST}, past which no machine holds them"),
+    )
 }
 
 pub(crate) fn file_bytes(path: &Path) -> Result<u64> {

@@ -50,7 +50,7 @@ pub fn cases() -> Vec<Case> {
             "a detector past memory",
             none,
             "simulate phantom:head:16 -o scan --detector 1000000x1000000",
-            &["detector", "fit in memory"],
+            &["memory", "--memory allows 1.0 GiB"],
         ),
         refused(
             "blocks larger than the volume",

@@ -132,7 +132,7 @@ pub fn cases() -> Vec<Case> {
         refused(
             "gzip bomb: 400 MB of zeros as the header says, in 400 kB",
             |d| bomb(d, [1000, 1000, 400], 400_000_000),
-            "convert a.nii.gz out.nii",
+            INFO_GZ,
             &["400000000 bytes", "100 times"],
         ),
         refused(
@@ -140,6 +140,12 @@ pub fn cases() -> Vec<Case> {
             |d| bomb(d, [4, 3, 2], 300_000_000),
             INFO_GZ,
             &["more data", "24 bytes"],
+        ),
+        refused(
+            "gzip bomb, where the memory for it is asked first",
+            |d| bomb(d, [1000, 1000, 400], 400_000_000),
+            "convert a.nii.gz out.nii",
+            &["memory: needs 3.0 GiB", "--memory allows 1.0 GiB"],
         ),
         refused(
             "a sparse file of 1 TB that holds what its header says",

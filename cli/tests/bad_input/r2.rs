@@ -55,6 +55,12 @@ pub fn cases() -> Vec<Case> {
             &["detector", "addressed"],
         ),
         refused(
+            "voxels with a product past 2^64, before anything is read",
+            meta("\"nVoxel\": [\n      4", "\"nVoxel\": [\n      9223372036854775807"),
+            "reconstruct r2 --spec fast --steps 1 -o run",
+            &["voxels", "no machine"],
+        ),
+        refused(
             "a view in the folder above",
             meta("proj_train/proj_train_0000", "../proj_train_0000"),
             INFO,
