@@ -35,7 +35,8 @@ pub fn scan_size(path: impl AsRef<Path>) -> Result<ScanSize> {
         }
         Found::Scanner(file) => scanner::size(&file)?,
     };
-    let all = [("pixels of all views", size.pixels), ("pixels of test views", size.test_pixels), ("voxels", size.voxels)];
+    let all =
+        [("pixels of all views", size.pixels), ("pixels of test views", size.test_pixels), ("voxels", size.voxels)];
     for (field, n) in all {
         must_exist(path, field, n)?;
     }

@@ -87,6 +87,7 @@ fn scan(path: &Path) -> Result<()> {
 }
 
 fn scanner(folder: &Path) -> Result<()> {
+    let _ = conefield_io::scan_size(folder.join("scanner.toml"));
     conefield_io::read_scanner(folder.join("scanner.toml"), &Default::default()).map(drop)
 }
 

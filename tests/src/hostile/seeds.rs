@@ -140,7 +140,10 @@ pub fn scanner_vectors(dir: &Path) {
 pub fn scanner_rtk(dir: &Path) {
     scanner_npy(dir);
     put(&dir.join("scanner.toml"), scanner_toml("counts.npy", RTK).as_bytes());
-    conefield_io::write_rtk(dir.join("geometry.xml"), &scan().geometry.views).expect("a circle is written");
+    let folder = dir.join("rtk");
+    conefield_io::write_rtk(&folder, &scan()).expect("a circle is written");
+    fs::rename(folder.join("geometry.xml"), dir.join("geometry.xml")).expect("what was written");
+    fs::remove_dir_all(folder).expect("what was written");
 }
 
 /// `scanner.toml`, `counts.npz`.
