@@ -70,7 +70,7 @@ impl Case {
         let mut outcome = Outcome {
             what: self.what,
             command: format!("conefield {}", self.args),
-            message: message(&said, self.end),
+            message: message(&said, &String::from_utf8_lossy(&output.stdout), self.end, self.says),
             status: output.status.code(),
             faults: vec![],
         };
@@ -114,12 +114,16 @@ pub struct Outcome {
     pub faults: Vec<String>,
 }
 
-/// The line that matters.
-fn message(said: &str, end: End) -> String {
-    let mut lines = said.lines();
+/// The line that matters: the error, or the warning that `says` looks for, which `info` and `import` give as a part of
+/// their result and readers on standard error.
+fn message(said: &str, printed: &str, end: End, says: &[&str]) -> String {
     match end {
-        End::Refused | End::WrongUse => lines.find(|l| l.starts_with("error: ")).unwrap_or(said).to_owned(),
-        End::Warned => lines.find(|l| l.trim_start().starts_with("WARN")).unwrap_or(said).trim_start().to_owned(),
+        End::Refused | End::WrongUse => said.lines().find(|l| l.starts_with("error: ")).unwrap_or(said).to_owned(),
+        End::Warned => {
+            let mut lines = said.lines().chain(printed.lines()).map(str::trim_start);
+            let warns = |l: &&str| l.starts_with("WARN") || l.starts_with("warning: ");
+            lines.find(|l| warns(l) && says.iter().all(|w| l.contains(w))).unwrap_or_default().to_owned()
+        }
     }
 }
 
