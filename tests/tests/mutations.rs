@@ -77,7 +77,8 @@ fn controls(faults: &mut Vec<String>) {
         Ok(())
     });
     let quick = Bounds { time: Duration::from_millis(1), ..BOUNDS };
-    let told: [(&str, Parser, Bounds, fn(&Fault) -> bool); 3] = [
+    type Is = fn(&Fault) -> bool;
+    let told: [(&str, Parser, Bounds, Is); 3] = [
         ("a panic", panics, BOUNDS, |f| *f == Fault::Panic("on purpose".into())),
         ("a hoard", hoards, BOUNDS, |f| matches!(f, Fault::Memory(n) if *n >= 17 << 20)),
         ("a hang", hangs, quick, |f| matches!(f, Fault::Time(_))),
