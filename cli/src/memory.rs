@@ -183,8 +183,8 @@ impl Run {
             buffers: self.backend + solver + checkpoint,
             ..Memory::default()
         };
-        let exporting =
-            Memory { volume, buffers: self.backend + FieldVoxels::BYTES + SLAB_BYTES + checkpoint, ..solving };
+        let evaluating = if self.field { self.backend + FieldVoxels::BYTES } else { 0 };
+        let exporting = Memory { volume, buffers: evaluating + SLAB_BYTES + checkpoint, ..solving };
         Memory::most(&[reading, comparing, splitting, solving, exporting])
     }
 
