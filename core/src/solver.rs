@@ -161,10 +161,9 @@ pub trait Solver: Send + Sync {
     }
 
     /// Whether it trains a field of the spec's stages; otherwise it makes voxels and needs none. Refuses a spec with
-    /// stages that it would pass over.
+    /// stages that it would pass over. Of a solver that does not say, the spec tells.
     fn trains_field(&self, spec: &Spec) -> Result<bool> {
-        let _ = spec;
-        Ok(true)
+        Ok(spec.encoder.is_some() || spec.field.is_some())
     }
 
     /// What it will do with this scan, a line each, for `explain`.
