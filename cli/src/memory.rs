@@ -4,6 +4,7 @@
 //! whatever the input is, but for the program itself.
 
 use crate::out::bytes;
+use conefield_core::solver::Solver;
 use conefield_core::trained::FieldVoxels;
 use conefield_core::{Error, Result};
 use conefield_io::{SLAB_BYTES, ScanSize};
@@ -140,10 +141,16 @@ pub struct Run {
     pub parameters: u64,
     /// Bytes that the backend works in.
     pub backend: u64,
-    /// Bytes that the solver works in.
-    pub solver: u64,
+    /// Bytes that the solver works in: what goes with the measured values and what with the voxels.
+    pub solver: [u64; 2],
     /// Whether it goes on from a checkpoint.
     pub resume: bool,
+}
+
+/// What `solver` works in for a scan of this size, by what it goes with.
+pub fn working(solver: &dyn Solver, scan: &ScanSize) -> [u64; 2] {
+    let pixels = solver.working_memory(scan.pixels, 0);
+    [pixels, solver.working_memory(scan.pixels, scan.voxels).saturating_sub(pixels)]
 }
 
 impl Run {
@@ -154,22 +161,30 @@ impl Run {
         let reference = if self.reference { voxels } else { 0 };
         let volume = if self.reference || !self.field { voxels } else { 0 };
         let half = 8 * self.parameters;
-        // Parameters and moments from the file, and one of them again on its way into the model.
-        let checkpoint = if self.resume { 2 * half } else { 0 };
+        let solver: u64 = self.solver.iter().sum();
+        // A solver of voxels works on the volume that comes out.
+        let iterate = if self.field { 0 } else { voxels };
+        // Parameters and moments from the file, and one of them again on its way into the model; or iterates.
+        let checkpoint = match (self.resume, self.field) {
+            (true, true) => 2 * half,
+            (true, false) => solver + iterate,
+            _ => 0,
+        };
         let reading = Memory { scan: projections + self.scan.reading, ..Memory::default() };
         // A file's order of voxels is turned into the program's.
         let comparing = Memory { scan: projections, reference: 2 * reference, ..Memory::default() };
         let splitting = Memory { scan: if self.split { 2 * projections } else { 0 }, reference, ..Memory::default() };
         let solving = Memory {
             scan: projections,
+            volume: iterate,
             reference,
             model: half,
             optimizer: half,
-            buffers: self.backend + self.solver + checkpoint,
+            buffers: self.backend + solver + checkpoint,
             ..Memory::default()
         };
-        let exporting =
-            Memory { volume, buffers: self.backend + FieldVoxels::BYTES + SLAB_BYTES + checkpoint, ..solving };
+        let evaluating = if self.field { self.backend + FieldVoxels::BYTES } else { 0 };
+        let exporting = Memory { volume, buffers: evaluating + SLAB_BYTES + checkpoint, ..solving };
         Memory::most(&[reading, comparing, splitting, solving, exporting])
     }
 
@@ -184,7 +199,7 @@ impl Run {
         }
         let halved = |n: u64, k: u32| Run {
             scan: ScanSize { voxels: n >> (3 * k), ..self.scan },
-            solver: if self.field { self.solver } else { self.solver >> (3 * k) },
+            solver: [self.solver[0], self.solver[1] >> (3 * k)],
             ..*self
         };
         let side = |n: u64| (n as f64).cbrt().round() as u64;
@@ -197,7 +212,7 @@ impl Run {
         }
         let binned = |k: u32| Run {
             scan: ScanSize { pixels: self.scan.pixels >> (2 * k), ..self.scan },
-            solver: if self.field { self.solver >> (2 * k) } else { self.solver },
+            solver: [self.solver[0] >> (2 * k), self.solver[1]],
             ..*self
         };
         if let Some(k) = (1..5).find(|k| fits(&binned(*k))) {
@@ -219,7 +234,7 @@ mod tests {
             field: true,
             parameters: 1 << 22,
             backend: 1 << 20,
-            solver: 4 << 20,
+            solver: [4 << 20, 0],
             resume: false,
         }
     }

@@ -1,5 +1,7 @@
 //! The specs that come with the program, and the weights that the demonstration uses.
 
+use conefield_core::pipeline::Pipeline;
+use conefield_core::solver::Solver;
 use conefield_core::spec::load::{Loaded, Shipped, load};
 use conefield_core::{Error, Result};
 
@@ -34,9 +36,15 @@ pub fn fast_weights() -> Option<&'static [u8]> {
     None
 }
 
+/// Builds the pipeline of `loaded` where its solver trains a field. Refuses stages that the solver would pass over.
+pub fn pipeline(loaded: &Loaded, solver: &dyn Solver) -> Result<Option<Pipeline>> {
+    let field = solver.trains_field(&loaded.spec).map_err(|e| loaded.locate(e))?;
+    field.then(|| build(loaded)).transpose()
+}
+
 /// Builds the pipeline of `loaded`; refusals name the line of the spec.
-pub fn build(loaded: &Loaded) -> Result<conefield_core::pipeline::Pipeline> {
-    conefield_core::pipeline::Pipeline::build(&loaded.spec).map_err(|e: Error| loaded.locate(e))
+pub fn build(loaded: &Loaded) -> Result<Pipeline> {
+    Pipeline::build(&loaded.spec).map_err(|e: Error| loaded.locate(e))
 }
 
 #[cfg(test)]
@@ -49,10 +57,8 @@ mod tests {
             let loaded = read(s.name, &[]).unwrap();
             assert_eq!(loaded.spec.name, s.name);
             assert!(!loaded.spec.description.is_empty());
-            loaded.spec.solver.build().unwrap();
-            if loaded.spec.encoder.is_some() {
-                build(&loaded).unwrap();
-            }
+            let solver = loaded.spec.solver.build().unwrap();
+            assert_eq!(pipeline(&loaded, solver.as_ref()).unwrap().is_some(), loaded.spec.encoder.is_some());
         }
     }
 

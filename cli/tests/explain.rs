@@ -1,7 +1,7 @@
 //! What `explain` says.
 
 mod common;
-use common::{done, json, text};
+use common::{done, json, refused, text};
 use tempfile::tempdir;
 
 /// Words of the line that begins with `head`.
@@ -49,4 +49,49 @@ fn a_scan_adds_its_memory() {
     assert_eq!(e["scan"]["samples_per_ray"], 320);
     let all = done(&["explain", "naf", "--scan", &scan]);
     assert!(all.contains("this scan: 4 views of 8 x 12, volume 16 x 16 x 16, 320 samples"), "{all}");
+}
+
+#[test]
+fn solvers_on_voxels_are_told_without_a_field() {
+    let all = done(&["explain", "fdk"]);
+    assert!(all.starts_with("fdk (shipped)\n"), "{all}");
+    assert_eq!(line(&all, "solver"), "solver fdk hann window to 1 of the highest frequency");
+    for absent in ["encoder", "parameters", "backend", "projector"] {
+        assert!(!all.contains(absent), "{absent:?} is in: {all}");
+    }
+    let all = done(&["explain", "os-sart", "--set", "solver.subsets=4"]);
+    assert_eq!(line(&all, "projector"), "projector joseph bilinear from plane to plane");
+    assert!(line(&all, "solver").starts_with("solver os-sart 4 subsets, relaxation 0.8"), "{all}");
+    for spec in ["sart", "sirt", "cgls", "asd-pocs", "fista-tv"] {
+        assert!(line(&done(&["explain", spec]), "solver").starts_with(&format!("solver {spec} ")), "{spec}");
+    }
+    for set in ["encoder={type=\"identity\"}", "field={type=\"voxel-grid\"}", "projector={type=\"ray-march\"}"] {
+        let said = refused(1, &["explain", "sart", "--set", set]);
+        assert!(said.contains(set.split('=').next().unwrap()) && said.contains("voxels"), "{said}");
+    }
+}
+
+#[test]
+fn what_a_solver_on_voxels_does_with_a_scan_is_told() {
+    let dir = tempdir().unwrap();
+    let scan = text(&dir.path().join("scan"));
+    done(&["simulate", "phantom:head:16", "-o", &scan, "--views", "6", "--detector", "8x12"]);
+    let with = |spec: &str, set: &str| done(&["explain", spec, "--scan", &scan, "--set", set]);
+    let all = with("fdk", "solver.cutoff=0.5");
+    assert!(line(&all, "solver").contains("hann window to 0.5"), "{all}");
+    assert!(all.contains("this scan: 6 views of 8 x 12, volume 16 x 16 x 16\n"), "{all}");
+    assert!(all.contains("full turn: every ray counts half"), "{all}");
+    assert!(all.contains("memory for this scan: ") && all.contains("volume 16.0 KiB"), "{all}");
+    assert!(with("sart", "name=\"x\"").contains("  6 subsets of 1 view\n"));
+    assert!(with("os-sart", "solver.subsets=4").contains("  4 subsets of 1 or 2 views\n"));
+    assert!(with("asd-pocs", "solver.subsets=2").contains("  noise of "));
+    let e = json(&["explain", "sart", "--scan", &scan, "--json"]);
+    assert_eq!(e["stages"], serde_json::json!([]));
+    assert_eq!(e["scan"]["plan"][0], "6 subsets of 1 view");
+    assert!(e["backend"].is_null() && e["scan"]["samples_per_ray"].is_null());
+    let m = &e["scan"]["memory"];
+    assert_eq!(
+        [&m["scan"], &m["volume"], &m["model"]].map(|n| n.as_u64().unwrap()),
+        [4 * 6 * 8 * 12, 4 * 16 * 16 * 16, 0]
+    );
 }

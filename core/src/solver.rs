@@ -160,8 +160,20 @@ pub trait Solver: Send + Sync {
         Err(crate::Error::unsupported(self.describe(), "this solver has nothing to pre-train"))
     }
 
-    /// Bytes that it holds while it makes `voxels` of `pixels` measured values, beside scan, model and backend:
-    /// iterates, lists of rays.
+    /// Whether it trains a field of the spec's stages; otherwise it makes voxels and needs none. Refuses a spec with
+    /// stages that it would pass over. Of a solver that does not say, the spec tells.
+    fn trains_field(&self, spec: &Spec) -> Result<bool> {
+        Ok(spec.encoder.is_some() || spec.field.is_some())
+    }
+
+    /// What it will do with this scan, a line each, for `explain`.
+    fn plan(&self, scan: &Scan) -> Vec<String> {
+        let _ = scan;
+        vec![]
+    }
+
+    /// Bytes that it holds at most while it makes `voxels` of `pixels` measured values, beside scan, model, backend and the
+    /// volume that comes out: directions, residuals, lists of rays.
     fn working_memory(&self, pixels: u64, voxels: u64) -> u64 {
         let _ = (pixels, voxels);
         0

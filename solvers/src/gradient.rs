@@ -14,7 +14,7 @@ use conefield_core::pipeline::{Model, Pipeline};
 use conefield_core::random::stream;
 use conefield_core::scene::Scene;
 use conefield_core::solver::{Job, Limits, Observer, PretrainJob, Reconstruction, Record, Solution, Solver};
-use conefield_core::spec::SolverSpec;
+use conefield_core::spec::{SolverSpec, Spec};
 use conefield_core::stage::{Projector, UnitRay};
 use conefield_core::trained::TrainedField;
 use rand::RngExt;
@@ -274,6 +274,10 @@ impl Solver for Gradient {
 
     fn pretrain(&self, job: &PretrainJob<'_>, observer: &mut dyn Observer) -> Result<Model> {
         crate::pretrain::pretrain(self, job, observer)
+    }
+
+    fn trains_field(&self, _: &Spec) -> Result<bool> {
+        Ok(true)
     }
 
     /// The list of the pixels that are trained on, at most all of them.

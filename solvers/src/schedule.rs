@@ -86,9 +86,14 @@ impl Clock {
 
     /// Share of the run that is over after `steps` steps: 1 or more means the end.
     pub fn share(&self, steps: u64) -> f64 {
-        let by_steps = self.limits.steps.map_or(0.0, |n| if n == 0 { 1.0 } else { steps as f64 / n as f64 });
+        let by_steps = self.share_of_steps(steps);
         let by_time = self.limits.seconds.map_or(0.0, |t| if t <= 0.0 { 1.0 } else { self.seconds() / t });
         by_steps.max(by_time)
+    }
+
+    /// The same by the number of steps alone; 0 where none is set.
+    pub fn share_of_steps(&self, steps: u64) -> f64 {
+        self.limits.steps.map_or(0.0, |n| if n == 0 { 1.0 } else { steps as f64 / n as f64 })
     }
 }
 

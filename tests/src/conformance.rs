@@ -9,11 +9,14 @@ mod behaviour;
 mod call;
 mod channels;
 mod gradients;
+mod voxels;
 
 use conefield_core::stage::{Encoder, Field, Normalizer, Stage};
 use std::fmt;
 use std::ops::Range;
 use std::panic::{AssertUnwindSafe, catch_unwind};
+
+pub use voxels::check_voxel_projector;
 
 /// How a stage is tried out.
 #[derive(Debug, Clone, PartialEq)]

@@ -2,9 +2,13 @@
 //! the property that the fault breaks. A kit that cannot fail proves nothing.
 
 use conefield_core::Result;
+use conefield_core::geometry::Geometry;
 use conefield_core::simd::Real;
 use conefield_core::stage::{Encoder, GradKind, Grads, Info, Kernel, Parameter, Reduced, Scope, Stage, Tile, TileMut};
-use conefield_tests::conformance::{Options, check, check_encoder};
+use conefield_core::voxel::{VoxelOperator, VoxelProjector};
+use conefield_projectors::voxel::{Joseph, Siddon};
+use conefield_tests::conformance::{Options, check, check_encoder, check_voxel_projector};
+use ndarray::{ArrayView3, ArrayViewMut3};
 use std::ops::Range;
 use std::sync::atomic::{AtomicU32, Ordering};
 
@@ -298,4 +302,122 @@ fn a_report_reads_well() {
     assert!(text.starts_with("toy: OverwritesGradients\n"), "{text}");
     assert!(text.lines().any(|l| l.contains("FAILED") && l.contains("gradients add")), "{text}");
     assert!(text.lines().any(|l| l.contains("ok") && l.contains("guards")), "{text}");
+}
+
+/// What is wrong with a projector of voxels.
+#[derive(Debug, Clone, Copy, PartialEq)]
+enum VoxelFault {
+    None,
+    /// The way back is another projector's, the same but for edges.
+    OtherAdjoint,
+    /// The way back is a thousandth too long.
+    LongAdjoint,
+    /// In single precision a part of a thousandth of the way back is lost.
+    CoarseAdjoint,
+    /// A view takes a little of the one before it in the same call.
+    Neighbours,
+    /// The first of several views is given back twice.
+    FirstTwice,
+    /// Lengths are 2 % too long, there and back.
+    Longer,
+    /// Line integrals are added to what is there.
+    AddsLines,
+    /// The way back overwrites.
+    OverwritesVoxels,
+    /// The result depends on the number of threads.
+    Threads,
+    /// Every ray gives a little.
+    Leaks,
+    /// Small line integrals are rounded away.
+    Rounds,
+    /// 0 over 0 where a ray misses.
+    NotANumber,
+    /// It panics.
+    Panics,
+}
+
+impl<R: Real> VoxelOperator<R> for VoxelFault {
+    fn forward(&self, g: &Geometry, views: &[usize], volume: ArrayView3<'_, R>, mut out: ArrayViewMut3<'_, R>) {
+        let before = out.to_owned();
+        Joseph {}.forward(g, views, volume, out.view_mut());
+        let mut last = R::ZERO;
+        let many = rayon::current_num_threads() == 3;
+        for (i, x) in out.iter_mut().enumerate() {
+            match self {
+                Self::Neighbours => (*x, last) = (*x + R::of(1e-4) * last, *x),
+                Self::Longer => *x *= R::of(1.02),
+                Self::AddsLines => *x += before.as_slice().map_or(R::ZERO, |b| b[i]),
+                Self::Threads if many => *x *= R::of(1.0 + 1e-6),
+                Self::Leaks => *x += R::of(1e-12),
+                Self::Rounds => *x = R::of((x.f64() * 1e3).round() / 1e3),
+                Self::NotANumber => *x = *x * *x / *x,
+                Self::Panics => panic!("as ordered"),
+                _ => {}
+            }
+        }
+    }
+
+    fn adjoint(&self, g: &Geometry, views: &[usize], p: ArrayView3<'_, R>, mut volume: ArrayViewMut3<'_, R>) {
+        let mut p = p.to_owned();
+        match self {
+            Self::OverwritesVoxels => volume.fill(R::ZERO),
+            Self::LongAdjoint => p.mapv_inplace(|x| x * R::of(1.001)),
+            Self::Longer => p.mapv_inplace(|x| x * R::of(1.02)),
+            Self::CoarseAdjoint if size_of::<R>() == 4 => p.mapv_inplace(|x| R::of((x.f64() * 1e3).round() / 1e3)),
+            Self::FirstTwice if views.len() > 1 => {
+                p.index_axis_mut(ndarray::Axis(0), 0).mapv_inplace(|x| x + x);
+            }
+            _ => {}
+        }
+        match self {
+            Self::OtherAdjoint => Siddon {}.adjoint(g, views, p.view(), volume),
+            _ => Joseph {}.adjoint(g, views, p.view(), volume),
+        }
+    }
+}
+
+impl VoxelProjector for VoxelFault {
+    fn operator(&self) -> &dyn VoxelOperator<f32> {
+        self
+    }
+    fn reference(&self) -> &dyn VoxelOperator<f64> {
+        self
+    }
+    fn describe(&self) -> String {
+        format!("toy: {self:?}")
+    }
+}
+
+#[test]
+fn every_fault_of_a_voxel_projector_fails_its_property() {
+    let sound = check_voxel_projector(&VoxelFault::None);
+    assert!(sound.passed(), "{sound}");
+    for (fault, property) in [
+        (VoxelFault::OtherAdjoint, "adjoint: double precision"),
+        (VoxelFault::LongAdjoint, "adjoint: single precision"),
+        (VoxelFault::LongAdjoint, "adjoint: double precision"),
+        (VoxelFault::CoarseAdjoint, "adjoint: single precision"),
+        (VoxelFault::CoarseAdjoint, "single precision"),
+        (VoxelFault::Neighbours, "views stand alone"),
+        (VoxelFault::FirstTwice, "views stand alone"),
+        (VoxelFault::Longer, "closed form"),
+        (VoxelFault::AddsLines, "projections overwrite"),
+        (VoxelFault::OverwritesVoxels, "adjoint adds"),
+        (VoxelFault::Threads, "threads"),
+        (VoxelFault::Leaks, "rays that miss"),
+        (VoxelFault::Rounds, "linear"),
+        (VoxelFault::NotANumber, "finite"),
+        (VoxelFault::Panics, "closed form"),
+    ] {
+        let report = quietly(|| check_voxel_projector(&fault));
+        assert!(report.failed().contains(&property), "{fault:?} passed {property:?}:\n{report}");
+    }
+    // Faults that keep to all else fail nothing else.
+    for (fault, properties) in [
+        (VoxelFault::Longer, &["closed form"][..]),
+        (VoxelFault::OverwritesVoxels, &["adjoint adds"]),
+        (VoxelFault::Threads, &["threads"]),
+    ] {
+        assert_eq!(check_voxel_projector(&fault).failed(), properties, "{fault:?}");
+    }
 }

@@ -1,8 +1,10 @@
 //! Every built-in stage, with several settings each, through the conformance kit.
 
 use conefield_core::registry::{Kind, names};
-use conefield_core::spec::{EncoderSpec, FieldSpec, NormalizerSpec};
-use conefield_tests::conformance::{Options, Report, check_encoder, check_field, check_normalizer};
+use conefield_core::spec::{EncoderSpec, FieldSpec, NormalizerSpec, ProjectorSpec};
+use conefield_tests::conformance::{
+    Options, Report, check_encoder, check_field, check_normalizer, check_voxel_projector,
+};
 use serde_json::{Value, json};
 
 // Stage types register themselves where their crate is linked.
@@ -10,6 +12,7 @@ use conefield_encoders as _;
 use conefield_fields as _;
 use conefield_initializers as _;
 use conefield_normalizers as _;
+use conefield_projectors as _;
 
 fn expect(report: Report) {
     println!("{report}");
@@ -167,11 +170,26 @@ fn voxel_grid() {
     }
 }
 
+#[test]
+fn voxel_projectors() {
+    for settings in [
+        json!({"type": "siddon"}),
+        json!({"type": "joseph"}),
+        json!({"type": "trilinear"}),
+        json!({"type": "trilinear", "samples_per_voxel": 5.0}),
+    ] {
+        let spec: Box<dyn ProjectorSpec> = serde_json::from_value(settings).unwrap();
+        expect(check_voxel_projector(spec.build_voxel().unwrap().as_ref()));
+    }
+}
+
 /// A stage type that is not in this list has not been through the kit.
 #[test]
 fn every_registered_stage_has_a_run_here() {
     assert_eq!(names(Kind::Encoder), ["concat", "dense-grid", "frequency", "hash-grid", "identity"]);
     assert_eq!(names(Kind::Normalizer), ["fft-mask", "layer-norm"]);
     assert_eq!(names(Kind::Field), ["mlp", "voxel-grid"]);
-    assert_eq!(names(Kind::Initializer), ["checkpoint", "mci", "random"]);
+    assert_eq!(names(Kind::Initializer), ["checkpoint", "mci", "random", "volume"]);
+    // `ray-march` samples rays for a field, whose gradients are checked with the pipeline.
+    assert_eq!(names(Kind::Projector), ["joseph", "ray-march", "siddon", "trilinear"]);
 }

@@ -1,16 +1,18 @@
 //! `conefield explain`
 
 use super::BackendChoice;
-use crate::memory::{Memory, Run};
+use crate::memory::{self, Memory, Run};
 use crate::{files, out, specs};
 use clap::Args;
+use conefield_core::Result;
 use conefield_core::backend::Explain as Compiled;
 use conefield_core::pipeline::Pipeline;
 use conefield_core::scene::Scene;
+use conefield_core::solver::Solver;
 use conefield_core::spec::load::Loaded;
 use conefield_core::stage::{GradKind, Stage};
-use conefield_core::{Error, Result};
 use serde::Serialize;
+use serde_json::Value;
 use std::path::{Path, PathBuf};
 
 /// Show what a spec builds: stages, widths, parameters, memory, work.
@@ -52,7 +54,7 @@ struct Row {
 }
 
 impl Row {
-    fn of(name: &str, kind: &serde_json::Value, stage: &dyn Stage) -> Self {
+    fn of(name: &str, kind: &Value, stage: &dyn Stage) -> Self {
         let i = stage.info();
         let kind = kind["type"].as_str().unwrap_or_default();
         Self {
@@ -93,13 +95,14 @@ struct Report {
     source: String,
     description: String,
     stages: Vec<Row>,
-    projector: Plain,
+    projector: Option<Plain>,
     initializer: Option<Plain>,
     solver: Plain,
     parameters: usize,
     model_bytes: usize,
     macs_per_sample: usize,
-    backend: Compiled,
+    /// Of a field.
+    backend: Option<Compiled>,
     scan: Option<ForScan>,
 }
 
@@ -109,40 +112,58 @@ struct ForScan {
     views: usize,
     detector: [usize; 2],
     volume: [usize; 3],
-    attenuation_scale: f64,
-    samples_per_ray: usize,
+    /// Of a field.
+    attenuation_scale: Option<f64>,
+    /// Of a field.
+    samples_per_ray: Option<usize>,
+    /// What the solver will do with it.
+    plan: Vec<String>,
     memory: Memory,
 }
 
 impl Explain {
     pub fn run(self) -> Result<()> {
         let loaded = specs::read(&self.spec, &self.sets)?;
-        let pipeline = specs::build(&loaded)?;
-        let (_, compiled) = self.backend.open().compile(&pipeline)?;
-        let scan = match &self.scan {
-            Some(path) => Some(for_scan(&loaded, &pipeline, path, &compiled)?),
+        let solver = loaded.spec.solver.build().map_err(|e| loaded.locate(e))?;
+        let backend = self.backend.open();
+        let field = match specs::pipeline(&loaded, solver.as_ref())? {
+            Some(pipeline) => {
+                let compiled = backend.compile(&pipeline)?.1;
+                Some((pipeline, compiled))
+            }
             None => None,
         };
-        let report = report(&loaded, &pipeline, compiled, scan)?;
+        let scan = match &self.scan {
+            Some(path) => Some(for_scan(&loaded, solver.as_ref(), field.as_ref(), path)?),
+            None => None,
+        };
+        let report = report(&loaded, solver.as_ref(), field, scan)?;
         if self.json { out::json(&report) } else { out::say(&text(&report)) }
     }
 }
 
-fn report(loaded: &Loaded, pipeline: &Pipeline, backend: Compiled, scan: Option<ForScan>) -> Result<Report> {
+fn report(
+    loaded: &Loaded,
+    solver: &dyn Solver,
+    field: Option<(Pipeline, Compiled)>,
+    scan: Option<ForScan>,
+) -> Result<Report> {
     let tree = &loaded.tree;
-    let mut stages = vec![Row::of("encoder", &tree["encoder"], pipeline.encoder.as_ref())];
-    for (i, n) in pipeline.normalizers.iter().enumerate() {
-        stages.push(Row::of(&format!("normalizers.{i}"), &tree["normalizers"][i], n.as_ref()));
-    }
-    stages.push(Row::of("field", &tree["field"], pipeline.field.as_ref()));
+    let (pipeline, backend) = field.unzip();
+    let stages = pipeline.as_ref().map(|p| rows(tree, p)).unwrap_or_default();
     let plain = |key: &str, what: String| {
         let kind = tree[key]["type"].as_str().unwrap_or_default();
         Plain { kind: kind.into(), what: without(kind, what) }
     };
-    let parameters = pipeline.layout().len();
+    let parameters = pipeline.as_ref().map_or(0, |p| p.layout().len());
+    let projector = match (&pipeline, &loaded.spec.projector) {
+        (Some(p), _) => Some(p.projector.describe()),
+        (None, Some(p)) => Some(p.build_voxel().map_err(|e| loaded.locate(e))?.describe()),
+        (None, None) => None,
+    };
     // The weights that an initializer names are not read here: a spec is explained without them.
     let initializer = match &tree["initializer"] {
-        serde_json::Value::Object(settings) => {
+        Value::Object(settings) => {
             let shown = settings.iter().filter(|(k, v)| *k != "type" && !v.is_null());
             Some(plain("initializer", shown.map(|(k, v)| format!("{k} {v}")).collect::<Vec<_>>().join(", ")))
         }
@@ -153,45 +174,108 @@ fn report(loaded: &Loaded, pipeline: &Pipeline, backend: Compiled, scan: Option<
         source: loaded.source.clone(),
         description: loaded.spec.description.clone(),
         stages,
-        projector: plain("projector", pipeline.projector.describe()),
+        projector: projector.map(|what| plain("projector", what)),
         initializer,
-        solver: plain("solver", loaded.spec.solver.build().map_err(|e: Error| loaded.locate(e))?.describe()),
+        solver: plain("solver", solver.describe()),
         parameters,
         model_bytes: 16 * parameters,
-        macs_per_sample: pipeline.macs(),
+        macs_per_sample: pipeline.as_ref().map_or(0, Pipeline::macs),
         backend,
         scan,
     })
 }
 
-fn for_scan(loaded: &Loaded, pipeline: &Pipeline, path: &Path, compiled: &Compiled) -> Result<ForScan> {
+/// A field's stages, in order.
+fn rows(tree: &Value, pipeline: &Pipeline) -> Vec<Row> {
+    let mut stages = vec![Row::of("encoder", &tree["encoder"], pipeline.encoder.as_ref())];
+    for (i, n) in pipeline.normalizers.iter().enumerate() {
+        stages.push(Row::of(&format!("normalizers.{i}"), &tree["normalizers"][i], n.as_ref()));
+    }
+    stages.push(Row::of("field", &tree["field"], pipeline.field.as_ref()));
+    stages
+}
+
+fn for_scan(
+    loaded: &Loaded,
+    solver: &dyn Solver,
+    field: Option<&(Pipeline, Compiled)>,
+    path: &Path,
+) -> Result<ForScan> {
     let size = conefield_io::scan_size(path)?;
-    let solver = loaded.spec.solver.build().map_err(|e| loaded.locate(e))?;
     let run = Run {
         scan: size,
         split: false,
         reference: false,
-        field: true,
-        parameters: pipeline.layout().len() as u64,
-        backend: compiled.scratch_bytes as u64,
-        solver: solver.working_memory(size.pixels, size.voxels),
+        field: field.is_some(),
+        parameters: field.map_or(0, |(p, _)| p.layout().len() as u64),
+        backend: field.map_or(0, |(_, compiled)| compiled.scratch_bytes as u64),
+        solver: memory::working(solver, &size),
         resume: false,
     };
     let scan = files::scan(path)?;
     let g = &scan.geometry;
-    let scene = Scene::new(&scan, &loaded.spec.scene).map_err(|e| loaded.locate(e))?;
-    let middle = scene.pixel_ray(g, 0, g.detector[0] / 2, g.detector[1] / 2);
+    let seen = match field {
+        Some((pipeline, _)) => {
+            let scene = Scene::new(&scan, &loaded.spec.scene).map_err(|e| loaded.locate(e))?;
+            let middle = scene.pixel_ray(g, 0, g.detector[0] / 2, g.detector[1] / 2);
+            Some((scene.attenuation * scan.unit.mm, pipeline.projector.max_samples(&middle)))
+        }
+        None => None,
+    };
     Ok(ForScan {
         views: g.views.len(),
         detector: g.detector,
         volume: g.volume.shape,
-        attenuation_scale: scene.attenuation * scan.unit.mm,
-        samples_per_ray: pipeline.projector.max_samples(&middle),
+        attenuation_scale: seen.map(|s| s.0),
+        samples_per_ray: seen.map(|s| s.1),
+        plan: solver.plan(&scan),
         memory: run.memory(),
     })
 }
 
 fn text(r: &Report) -> String {
+    let mut lines = vec![];
+    let shipped = r.source.strip_prefix(&r.spec) == Some(" (shipped)");
+    lines.push(if shipped || r.spec.is_empty() { r.source.clone() } else { format!("{} ({})", r.spec, r.source) });
+    if !r.description.is_empty() {
+        lines.push(r.description.clone());
+    }
+    lines.push(String::new());
+    if !r.stages.is_empty() {
+        lines.push(stages(r));
+        lines.push(String::new());
+    }
+    let named =
+        [("projector", r.projector.as_ref()), ("initializer", r.initializer.as_ref()), ("solver", Some(&r.solver))];
+    let rest = named.iter().filter_map(|(stage, p)| p.map(|p| vec![stage.to_string(), p.kind.clone(), p.what.clone()]));
+    lines.push(out::table(&rest.collect::<Vec<_>>(), &[]));
+    if let Some(backend) = &r.backend {
+        lines.push(format!("\nbackend: {}", backend.backend));
+        lines.extend(backend.notes.iter().map(|n| format!("  {n}")));
+        lines.push(String::new());
+        lines.push(format!(
+            "memory for the model: {} (parameters {p}, gradients {p}, moments {})",
+            out::bytes(r.model_bytes as u64),
+            out::bytes(8 * r.parameters as u64),
+            p = out::bytes(4 * r.parameters as u64),
+        ));
+    }
+    if let Some(s) = &r.scan {
+        if r.backend.is_none() {
+            lines.push(String::new());
+        }
+        let ([rows, columns], [x, y, z]) = (s.detector, s.volume);
+        let samples = s.samples_per_ray.map_or(String::new(), |n| format!(", {n} samples on the middle ray"));
+        let views = s.views;
+        lines.push(format!("this scan: {views} views of {rows} x {columns}, volume {x} x {y} x {z}{samples}"));
+        lines.extend(s.plan.iter().map(|line| format!("  {line}")));
+        lines.push(format!("memory for this scan: {}", s.memory.line()));
+    }
+    lines.join("\n")
+}
+
+/// A field's stages as a table.
+fn stages(r: &Report) -> String {
     let heads = ["stage", "type", "in -> out", "parameters", "bytes", "MACs/sample", "gradient", "what"];
     let mut rows = vec![heads.map(str::to_owned).to_vec()];
     for s in &r.stages {
@@ -215,37 +299,5 @@ fn text(r: &Report) -> String {
         out::bytes(4 * r.parameters as u64),
         out::number(r.macs_per_sample as u64),
     ]);
-    let mut lines = vec![];
-    let shipped = r.source.strip_prefix(&r.spec) == Some(" (shipped)");
-    lines.push(if shipped || r.spec.is_empty() { r.source.clone() } else { format!("{} ({})", r.spec, r.source) });
-    if !r.description.is_empty() {
-        lines.push(r.description.clone());
-    }
-    lines.push(String::new());
-    lines.push(out::table(&rows, &[3, 4, 5]));
-    lines.push(String::new());
-    let mut rest = vec![vec!["projector".to_owned(), r.projector.kind.clone(), r.projector.what.clone()]];
-    if let Some(i) = &r.initializer {
-        rest.push(vec!["initializer".into(), i.kind.clone(), i.what.clone()]);
-    }
-    rest.push(vec!["solver".into(), r.solver.kind.clone(), r.solver.what.clone()]);
-    lines.push(out::table(&rest, &[]));
-    lines.push(format!("\nbackend: {}", r.backend.backend));
-    lines.extend(r.backend.notes.iter().map(|n| format!("  {n}")));
-    lines.push(String::new());
-    lines.push(format!(
-        "memory for the model: {} (parameters {p}, gradients {p}, moments {})",
-        out::bytes(r.model_bytes as u64),
-        out::bytes(8 * r.parameters as u64),
-        p = out::bytes(4 * r.parameters as u64),
-    ));
-    if let Some(s) = &r.scan {
-        let ([rows, columns], [x, y, z]) = (s.detector, s.volume);
-        lines.push(format!(
-            "this scan: {} views of {rows} x {columns}, volume {x} x {y} x {z}, {} samples on the middle ray",
-            s.views, s.samples_per_ray
-        ));
-        lines.push(format!("memory for this scan: {}", s.memory.line()));
-    }
-    lines.join("\n")
+    out::table(&rows, &[3, 4, 5])
 }

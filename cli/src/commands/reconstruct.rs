@@ -119,7 +119,7 @@ impl Reconstruct {
         let loaded = specs::read(&self.spec, &self.all_sets())?;
         let solver = loaded.spec.solver.build().map_err(|e| loaded.locate(e))?;
         let backend = self.backend.open();
-        let pipeline = loaded.spec.encoder.as_ref().map(|_| specs::build(&loaded)).transpose()?;
+        let pipeline = specs::pipeline(&loaded, solver.as_ref())?;
         let compiled = pipeline.as_ref().map(|p| backend.compile(p)).transpose()?.map(|c| c.1).unwrap_or_default();
         let memory = self.memory(&loaded, solver.as_ref(), pipeline.as_ref(), &compiled)?;
         info!("memory: {}", memory.line());
@@ -229,7 +229,7 @@ impl Reconstruct {
             field: pipeline.is_some(),
             parameters: pipeline.map_or(0, |p| p.layout().len() as u64),
             backend: compiled.scratch_bytes as u64,
-            solver: solver.working_memory(scan.pixels, scan.voxels),
+            solver: memory::working(solver, &scan),
             resume: self.resume,
         };
         let sets = self.all_sets();

@@ -1,6 +1,7 @@
 //! Scans made from volumes: phantoms, protocols, ray integrals and noise.
 //!
 //! - [`phantom`], [`phantom_of`]: objects made by the project itself.
+//! - [`Ellipsoid`]: bodies whose scan is known in closed form.
 //! - [`downsample`], [`HuMapping`]: from a clinical volume to the one that is to be scanned.
 //! - [`Protocol`]: where source and detector stand, how many views, which noise.
 //! - [`project`]: line integrals of the trilinear interpolation of a volume.
@@ -8,6 +9,7 @@
 //! - [`simulate`]: all of it, with a record of how the scan came about.
 
 mod abdomen;
+mod ellipsoids;
 mod head;
 mod noise;
 mod paint;
@@ -19,6 +21,7 @@ mod shape;
 #[cfg(test)]
 mod tests;
 
+pub use ellipsoids::{Ellipsoid, ellipsoids, scan_ellipsoids};
 pub use noise::{MIN_COUNT, Noise};
 pub use phantom::{PhantomKind, phantom, phantom_of};
 pub use prepare::{HuMapping, downsample};

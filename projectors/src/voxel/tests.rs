@@ -6,7 +6,8 @@ use super::layout::ColumnMajor;
 use super::rays;
 use super::walk::JosephWalk;
 use super::{Joseph, Siddon, Trilinear};
-use conefield_core::geometry::{Geometry, Millimetres, Radians, Vec3, View, VoxelGrid};
+use crate::simulate::{Ellipsoid, ellipsoids, scan_ellipsoids};
+use conefield_core::geometry::{Geometry, Millimetres, Radians, View, VoxelGrid};
 use conefield_core::random::{mix, unit};
 use conefield_core::simd::Real;
 use conefield_core::voxel::{VoxelOperator, VoxelProjector};
@@ -166,33 +167,6 @@ fn any_number_of_threads_gives_the_same_bits() {
     assert_eq!(on(1), on(3));
 }
 
-/// Length of the ray within an ellipsoid.
-fn chord(g: &Geometry, center: Vec3, axes: Vec3, view: usize, row: usize, column: usize) -> f64 {
-    let ray = g.ray(view, row, column);
-    let o: Vec3 = std::array::from_fn(|k| (ray.origin[k] - center[k]) / axes[k]);
-    let d: Vec3 = std::array::from_fn(|k| ray.direction[k] / axes[k]);
-    let (a, b, c) = (dot3(d, d), dot3(o, d), dot3(o, o) - 1.0);
-    2.0 * (b * b - a * c).max(0.0).sqrt() / a
-}
-
-fn dot3(a: Vec3, b: Vec3) -> f64 {
-    a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
-}
-
-/// Voxels of the ellipsoid by the share of 4³ points inside.
-fn ellipsoid(grid: &VoxelGrid, center: Vec3, axes: Vec3) -> Array3<f32> {
-    Array3::from_shape_fn(grid.shape, |(x, y, z)| {
-        let p = grid.voxel([x, y, z]);
-        let mut inside = 0;
-        for i in 0..64 {
-            let sub = [i % 4, i / 4 % 4, i / 16].map(|s| (f64::from(s) + 0.5) / 4.0 - 0.5);
-            let q: Vec3 = std::array::from_fn(|k| (p[k] + sub[k] * grid.spacing[k] - center[k]) / axes[k]);
-            inside += i32::from(dot3(q, q) < 1.0);
-        }
-        inside as f32 / 64.0
-    })
-}
-
 /// Root mean square error against the closed form, over the mean of the closed form.
 fn error_at(p: &dyn VoxelProjector, n: usize) -> f64 {
     let side = 40.0;
@@ -201,13 +175,12 @@ fn error_at(p: &dyn VoxelProjector, n: usize) -> f64 {
         views: [0.1, 1.2, 2.5].map(|a| circular(a, 100.0, 150.0, [2.6; 2], [0.7, -1.1])).to_vec(),
         volume: VoxelGrid { shape: [n; 3], spacing: [side / n as f64; 3], center: [0.0; 3] },
     };
-    let (center, axes) = ([2.0, -1.0, 1.5], [15.0, 11.0, 13.0]);
-    let found = forward(p.operator(), &g, ellipsoid(&g.volume, center, axes).view());
+    let body = [Ellipsoid { center: [2.0, -1.0, 1.5], axes: [15.0, 11.0, 13.0], value: 1.0 }];
+    let found = forward(p.operator(), &g, ellipsoids(&body, &g.volume).data.view());
     let (mut square, mut sum) = (0.0, 0.0);
-    for ((view, row, column), &x) in found.indexed_iter() {
-        let exact = chord(&g, center, axes, view, row, column);
-        square += (f64::from(x) - exact).powi(2);
-        sum += exact;
+    for (x, exact) in found.iter().zip(&scan_ellipsoids(&body, g).projections) {
+        square += f64::from(x - exact).powi(2);
+        sum += f64::from(*exact);
     }
     let count = found.len() as f64;
     (square / count).sqrt() / (sum / count)

@@ -11,12 +11,12 @@ use crate::iterative::voxels_only;
 use crate::iterative::watch::Watch;
 use conefield_core::Error;
 use conefield_core::error::{Result, ensure};
-use conefield_core::geometry::{dot, norm, sub};
-use conefield_core::scan::Volume;
+use conefield_core::geometry::{Geometry, dot, norm, sub};
+use conefield_core::scan::{Scan, Volume};
 use conefield_core::solver::{Job, Observer, Reconstruction, Record, Solution, Solver};
-use conefield_core::spec::SolverSpec;
+use conefield_core::spec::{SolverSpec, Spec};
 use conefield_projectors::voxel::backproject::backproject;
-use conefield_projectors::voxel::layout::{ColumnMajor, batch};
+use conefield_projectors::voxel::layout::{AFTER, BEFORE, ColumnMajor};
 use filter::{Ramp, Window};
 use ndarray::{Array3, Axis};
 use rayon::prelude::*;
@@ -59,23 +59,24 @@ impl Solver for Fdk {
         let start = Instant::now();
         let scan = job.scan;
         scan.validate("scan")?;
-        voxels_only(job.spec)?;
-        let g = &scan.geometry;
-        let orbit = Orbit::of(g);
+        alone(job.spec)?;
+        let orbit = Orbit::of(&scan.geometry);
         check(&orbit)?;
-        observer.note(&orbit.describe());
-        if orbit.coverage == Coverage::Limited {
-            observer.note("expect streaks along the missing directions; an iterative solver suits this scan better");
-        }
+        said(&orbit).iter().for_each(|line| observer.note(line));
+        let (g, measured) = orbit.symmetric(&scan.geometry);
+        let g = &g;
         let [rows, columns] = g.detector;
         let all: Vec<usize> = (0..g.views.len()).collect();
         let mut volume = Array3::<f32>::zeros(g.volume.shape);
         let mut done = 0;
-        for part in all.chunks(batch::<f32>(g)) {
+        let values = scan.projections.len() + volume.len();
+        for part in all.chunks(views_at_once(g, held(values as u64))) {
             if observer.cancelled() {
                 return Err(Error::Interrupted { step: done as u64 });
             }
-            let mut images = scan.projections.slice_axis(Axis(0), (done..done + part.len()).into()).to_owned();
+            let mut images = Array3::<f32>::zeros((part.len(), rows, columns));
+            let views = scan.projections.slice_axis(Axis(0), (done..done + part.len()).into());
+            images.slice_axis_mut(Axis(2), measured.clone().into()).assign(&views);
             let scales: Vec<f64> = part.iter().map(|&v| orbit.steps[v] * orbit.radius[v].powi(2)).collect();
             images.axis_iter_mut(Axis(0)).into_par_iter().zip(part).for_each(|(mut image, &view)| {
                 let v = &g.views[view];
@@ -84,7 +85,7 @@ impl Solver for Fdk {
                 let ramp = Ramp::new(columns, norm(v.u) * radius / distance, self.window, self.cutoff);
                 let counts: Vec<f64> =
                     (0..columns).map(|c| orbit.weight(view, place(g, view, c as f64, radius))).collect();
-                let Some(pixels) = image.as_slice_mut() else { return };
+                let pixels = image.as_slice_mut().unwrap_or_else(|| unreachable!("this array was made here"));
                 pixels.par_chunks_mut(16 * columns).enumerate().for_each(|(n, strip)| {
                     for (r, line) in strip.chunks_mut(columns).enumerate() {
                         for (c, x) in line.iter_mut().enumerate() {
@@ -95,7 +96,6 @@ impl Solver for Fdk {
                     ramp.filter(strip, columns);
                 });
             });
-            debug_assert_eq!(images.dim(), (part.len(), rows, columns));
             let pixels = ColumnMajor::new(g, part, images.view(), |_, _, _, x| x);
             drop(images);
             backproject(g, part, &pixels, &scales, volume.view_mut());
@@ -115,9 +115,59 @@ impl Solver for Fdk {
         Ok(Solution { result: Reconstruction::Volume(volume), steps: 1, train_s, samples: 0 })
     }
 
+    fn trains_field(&self, spec: &Spec) -> Result<bool> {
+        alone(spec)?;
+        Ok(false)
+    }
+
+    fn plan(&self, scan: &Scan) -> Vec<String> {
+        let orbit = Orbit::of(&scan.geometry);
+        check(&orbit).map_or_else(|e| vec![e.to_string()], |()| said(&orbit))
+    }
+
+    /// The views at hand, filtered and then once more column by column.
+    fn working_memory(&self, pixels: u64, voxels: u64) -> u64 {
+        2 * held(pixels.saturating_add(voxels))
+    }
+
     fn describe(&self) -> String {
         format!("fdk: {:?} window to {} of the highest frequency", self.window, self.cutoff).to_lowercase()
     }
+}
+
+/// What is told of an orbit.
+fn said(orbit: &Orbit) -> Vec<String> {
+    let mut lines = vec![orbit.describe()];
+    if orbit.coverage == Coverage::Limited {
+        lines.push("expect streaks along the missing directions; an iterative solver suits this scan better".into());
+    }
+    lines
+}
+
+/// Bytes of views to hold at once beside a scan and a volume of `values` numbers: a 32nd of theirs, but at least one MiB
+/// and no more than stays in the last cache.
+fn held(values: u64) -> u64 {
+    (values / 8).clamp(1 << 20, 12 << 20)
+}
+
+/// How many views take up `bytes`.
+fn views_at_once(geometry: &Geometry, bytes: u64) -> usize {
+    let of_one = ((geometry.detector[0] + BEFORE + AFTER) * geometry.detector[1] * size_of::<f32>()).max(1);
+    (bytes as usize / of_one).clamp(1, 64)
+}
+
+/// Refuses stages that would be passed over: FDK back-projects in its own way and starts from nothing.
+fn alone(spec: &Spec) -> Result<()> {
+    voxels_only(spec)?;
+    let named = [
+        ("projector.type", spec.projector.as_ref().map(|p| p.typetag_name())),
+        ("initializer.type", spec.initializer.as_ref().map(|i| i.typetag_name())),
+    ];
+    for (field, name) in named {
+        let found = name.map_or(String::new(), |n| format!("{n:?}"));
+        ensure(name.is_none(), "spec", field, found, "none: fdk back-projects in its own way and starts from nothing")?;
+    }
+    Ok(())
 }
 
 /// FDK is for circles around z.

@@ -4,12 +4,14 @@
 //! - A short scan measures some lines twice and others once: Parker's weights (Med. Phys. 9(2), 1982), for any arc of at
 //!   least π plus the fan by widening the fan (Silver, Med. Phys. 27(4), 2000).
 //! - A detector shifted sideways measures, over a full turn, the middle twice and the wide side once: Wang's weights
-//!   (Med. Phys. 29(7), 2002).
+//!   (Med. Phys. 29(7), 2002). Rows go on with zeros on the shorter side: filtered, they are not 0 there, and voxels on
+//!   that side need them.
 //!
 //! What the orbit asks for is found from the views alone.
 
 use conefield_core::geometry::{Geometry, dot, norm, sub};
 use std::f64::consts::{FRAC_PI_2, FRAC_PI_4, PI, TAU};
+use std::ops::Range;
 
 /// What the orbit is.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -31,9 +33,14 @@ pub enum Coverage {
         /// Parker's half fan angle, widened to the arc: `arc = π + 2·delta`.
         delta: f64,
     },
-    /// Less than a short scan: no weights can make up for what was not measured.
+    /// Less than a short scan, or part of a turn with a detector aside: no weights can make up for what was not
+    /// measured.
     Limited,
 }
+
+/// A detector that stands aside by more than this share of its width needs a full turn: the opposite rays of its longer
+/// side were not measured.
+const ASIDE: f64 = 0.1;
 
 /// The orbit of a scan as FDK sees it.
 #[derive(Debug, Clone)]
@@ -50,6 +57,8 @@ pub struct Orbit {
     pub steps: Vec<f64>,
     /// Distance of source and axis for each view, along the detector's normal, mm.
     pub radius: Vec<f64>,
+    /// How much further an offset detector reaches on one side than on the other, mm at the axis.
+    aside: f64,
     /// 1 where u points the way that the source moves at rising angles, −1 against it.
     sense: f64,
 }
@@ -88,7 +97,7 @@ impl Orbit {
             Coverage::Offset { overlap: narrow, sign: if high > -low { 1.0 } else { -1.0 } }
         } else if full {
             Coverage::Full
-        } else if arc >= PI + fan - rest {
+        } else if arc >= PI + fan - rest && wide - narrow < ASIDE * (wide + narrow) {
             let first = angles[order[(widest + 1) % n]];
             Coverage::Short { start: first - 0.5 * rest, delta: 0.5 * (arc - PI) }
         } else {
@@ -96,7 +105,25 @@ impl Orbit {
         };
         let v = &views[0];
         let sense = (v.source[0] * v.u[1] - v.source[1] * v.u[0]).signum();
-        Self { coverage, arc, fan, angles, steps, radius, sense }
+        Self { coverage, arc, fan, angles, steps, radius, aside: wide - narrow, sense }
+    }
+
+    /// `geometry` with as many columns added to the shorter side of an offset detector as the longer one has more, and
+    /// the columns that were measured.
+    pub fn symmetric(&self, geometry: &Geometry) -> (Geometry, Range<usize>) {
+        let mut wide = geometry.clone();
+        let columns = geometry.detector[1];
+        let Coverage::Offset { sign, .. } = self.coverage else { return (wide, 0..columns) };
+        let v = &geometry.views[0];
+        let more = self.aside * v.normal().1 / (norm(v.u) * self.radius[0]);
+        let more = (more - 1e-6).ceil() as usize;
+        wide.detector[1] += more;
+        for v in &mut wide.views {
+            // The middle moves towards the columns that are added.
+            v.detector = std::array::from_fn(|k| v.detector[k] - sign * 0.5 * more as f64 * v.u[k]);
+        }
+        let first = if sign > 0.0 { more } else { 0 };
+        (wide, first..first + columns)
     }
 
     /// What a ray of view `view` counts, whose place on the virtual detector at the axis is `u` mm from the axis.
@@ -134,7 +161,8 @@ impl Orbit {
             }
             Coverage::Short { .. } => format!("short scan: Parker's weights ({arc})"),
             Coverage::Limited => {
-                format!("limited angle, no weights can complete it ({arc}; {:.1} needed)", degrees(PI + self.fan))
+                let needed = degrees(PI + self.fan);
+                format!("no weights can complete it ({arc}; {needed:.1} needed, or 360 with a detector aside)")
             }
         }
     }
@@ -194,7 +222,9 @@ mod tests {
         assert_eq!(Orbit::of(&scan(turn(50, TAU), 0.0)).coverage, Coverage::Full);
         assert_eq!(Orbit::of(&scan(turn(3, TAU), 0.0)).coverage, Coverage::Full);
         assert!(matches!(Orbit::of(&scan(turn(100, 3.6), 0.0)).coverage, Coverage::Short { .. }));
+        assert!(matches!(Orbit::of(&scan(turn(100, 3.6), 4.0)).coverage, Coverage::Short { .. }));
         assert_eq!(Orbit::of(&scan(turn(100, 2.9), 0.0)).coverage, Coverage::Limited);
+        assert_eq!(Orbit::of(&scan(turn(100, 3.6), 45.0)).coverage, Coverage::Limited);
         let Coverage::Offset { overlap, sign } = Orbit::of(&scan(turn(50, TAU), 45.0)).coverage else {
             panic!("an offset was not seen")
         };
@@ -205,6 +235,27 @@ mod tests {
         // One missing view does not end an orbit.
         let missing = (0..50).filter(|i| *i != 7).map(|i| TAU * i as f64 / 50.0);
         assert_eq!(Orbit::of(&scan(missing, 0.0)).coverage, Coverage::Full);
+    }
+
+    #[test]
+    fn an_offset_detector_is_widened_where_it_is_short() {
+        for offset in [45.0, -45.0] {
+            let g = scan((0..9).map(|i| 0.7 * f64::from(i)), offset);
+            let (wide, measured) = Orbit::of(&g).symmetric(&g);
+            assert_eq!(wide.detector, [10, 290]);
+            assert_eq!(measured, if offset > 0.0 { 90..290 } else { 0..200 });
+            for (a, b) in g.views.iter().zip(&wide.views) {
+                for c in [0, 77] {
+                    let (p, q) =
+                        (a.pixel(g.detector, 3.0, c as f64), b.pixel(wide.detector, 3.0, (c + measured.start) as f64));
+                    assert!(norm(sub(p, q)) < 1e-9, "{p:?} and {q:?}");
+                }
+            }
+            let ends = edges(&wide, 0, 500.0);
+            assert!((ends[0] + ends[1]).abs() < 1e-9, "{ends:?}");
+        }
+        let g = scan((0..9).map(|i| 0.7 * f64::from(i)), 0.0);
+        assert_eq!(Orbit::of(&g).symmetric(&g), (g.clone(), 0..200));
     }
 
     #[test]

@@ -2,11 +2,14 @@
 //! inverse row sums of A and D the inverse column sums of the subset (Andersen and Kak, Ultrasonic Imaging 6, 1984).
 //! SART takes one view at a time, SIRT all at once.
 
-use super::order::{Order, subsets};
-use super::{Method, Pass, Problem, Stop, drive, flat_mut, inverse, projector, start};
+use super::order::{Order, subsets, told};
+use super::{
+    Method, Pass, Problem, Stop, change, drive, flat_mut, inverse, projecting, projector, refuse_others, start,
+};
 use conefield_core::error::{Result, ensure};
+use conefield_core::scan::Scan;
 use conefield_core::solver::{Job, Observer, Solution, Solver};
-use conefield_core::spec::SolverSpec;
+use conefield_core::spec::{SolverSpec, Spec};
 use ndarray::{Array3, Axis, Zip};
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
@@ -171,6 +174,20 @@ impl Solver for Algebraic {
         drive(job, &self.stop, projector.as_ref(), &mut sweep, observer)
     }
 
+    fn trains_field(&self, spec: &Spec) -> Result<bool> {
+        refuse_others(spec)?;
+        Ok(false)
+    }
+
+    fn plan(&self, scan: &Scan) -> Vec<String> {
+        vec![told(&subsets(scan.geometry.views.len(), self.subsets))]
+    }
+
+    fn working_memory(&self, pixels: u64, voxels: u64) -> u64 {
+        let before = if self.stop.change.is_some() { 4 * voxels } else { 0 };
+        Sweep::memory(self.subsets, pixels, voxels) + before + self.stop.kept(voxels)
+    }
+
     fn describe(&self) -> String {
         let subsets = match self.subsets {
             usize::MAX => "a view at a time".into(),
@@ -196,13 +213,21 @@ pub(super) struct Sweep {
 impl Sweep {
     pub(super) fn new(settings: &Algebraic, problem: &Problem<'_>, x: Array3<f32>) -> Self {
         let subsets = subsets(problem.scan.geometry.views.len(), settings.subsets);
-        let ones = Array3::ones(problem.scan.geometry.volume.shape);
-        let rows = inverse(problem.forward(&problem.views(), &ones));
+        let shape = problem.scan.geometry.volume.shape;
+        let rows = inverse(problem.forward(&problem.views(), &Array3::ones(shape)));
         let mut sweep = Self { settings: settings.clone(), subsets, x, rows, columns: None, update: problem.zeros() };
         if sweep.subsets.len() == 1 {
             sweep.columns = Some(column_sums(problem, &problem.views()));
         }
         sweep
+    }
+
+    /// Bytes beside the volume: inverse sums of rows and columns, an update, and a subset's residual or ones. How many
+    /// views there are is not known: SART's one view may be all of them.
+    pub(super) fn memory(subsets: usize, pixels: u64, voxels: u64) -> u64 {
+        let subsets = if subsets == usize::MAX { 1 } else { subsets.max(1) as u64 };
+        let subset = 4 * pixels / subsets;
+        4 * pixels + 2 * 4 * voxels + subset + projecting(subset / 4)
     }
 
     /// One pass with relaxation `relaxation`; returns `‖p − A·x‖²`.
@@ -216,6 +241,7 @@ impl Sweep {
                 image.zip_mut_with(&self.rows.index_axis(Axis(0), v), |r, w| *r *= w);
             }
             problem.back(views, &residual, &mut self.update);
+            drop(residual);
             let made;
             let columns = match &self.columns {
                 Some(c) => c,
@@ -246,11 +272,18 @@ fn column_sums(problem: &Problem<'_>, views: &[usize]) -> Array3<f32> {
 impl Method for Sweep {
     fn pass(&mut self, problem: &Problem<'_>, pass: u64) -> Result<Pass> {
         let relaxation = self.settings.relaxation * self.settings.decay.powi(pass.min(1 << 20) as i32);
-        Ok(Pass { residual: self.sweep(problem, pass, relaxation), ..Pass::default() })
+        let before = self.settings.stop.change.is_some().then(|| self.x.clone());
+        let residual = self.sweep(problem, pass, relaxation);
+        let change = before.map(|before| change(&self.x, &before));
+        Ok(Pass { residual, change, prior: None })
     }
 
     fn volume(&self) -> &Array3<f32> {
         &self.x
+    }
+
+    fn take(&mut self) -> Array3<f32> {
+        std::mem::take(&mut self.x)
     }
 
     fn state(&mut self) -> Vec<(&'static str, &mut [f32])> {

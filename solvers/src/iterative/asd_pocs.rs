@@ -2,13 +2,16 @@
 //! of steepest descent on total variation, whose length is tied to what the data pass changed.
 
 use super::algebraic::{Algebraic, Sweep};
-use super::order::Order;
+use super::order::{Order, subsets, told};
 use super::tv::{anisotropy, descend};
-use super::{Method, Pass, Problem, Stop, drive, flat_mut, noise, norm2, projector, start};
+use super::{
+    Method, Pass, Problem, Stop, change, distance, drive, flat_mut, noise, norm2, projector, refuse_others, start,
+};
 use conefield_core::error::{Result, ensure};
+use conefield_core::scan::Scan;
 use conefield_core::solver::{Job, Observer, Solution, Solver};
-use conefield_core::spec::SolverSpec;
-use ndarray::{Array3, Zip};
+use conefield_core::spec::{SolverSpec, Spec};
+use ndarray::Array3;
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
@@ -98,6 +101,23 @@ impl Solver for AsdPocs {
         drive(job, &self.stop, projector.as_ref(), &mut iterate, observer)
     }
 
+    fn trains_field(&self, spec: &Spec) -> Result<bool> {
+        refuse_others(spec)?;
+        Ok(false)
+    }
+
+    fn plan(&self, scan: &Scan) -> Vec<String> {
+        let noise = format!("noise of {:.3e} in line integrals", noise::sigma(scan));
+        vec![told(&subsets(scan.geometry.views.len(), self.subsets)), noise]
+    }
+
+    /// Beside a sweep's there are the volume before it and the descent's direction; after it, one more copy instead of
+    /// inverse column sums. The noise is read from differences of all pixels before that.
+    fn working_memory(&self, pixels: u64, voxels: u64) -> u64 {
+        let sweeping = Sweep::memory(self.subsets, pixels, voxels) + 2 * 4 * voxels;
+        sweeping.max(noise::memory(pixels)) + self.stop.kept(voxels)
+    }
+
     fn describe(&self) -> String {
         format!("asd-pocs: {} subsets, {} descents a pass, alpha {}", self.subsets, self.descents, self.alpha)
     }
@@ -111,10 +131,6 @@ struct Iterate {
     /// Length of a descent step.
     length: f64,
     work: Array3<f32>,
-}
-
-fn distance(a: &Array3<f32>, b: &Array3<f32>) -> f64 {
-    norm2(&Zip::from(a).and(b).par_map_collect(|a, b| a - b)).sqrt()
 }
 
 impl Method for Iterate {
@@ -138,12 +154,15 @@ impl Method for Iterate {
         if prior > s.ratio * data && residual.sqrt() > self.target {
             self.length *= s.alpha_decay;
         }
-        let change = distance(&self.sweep.x, &before) / norm2(&self.sweep.x).max(1e-300).sqrt();
-        Ok(Pass { residual, change: Some(change), prior: None })
+        Ok(Pass { residual, change: Some(change(&self.sweep.x, &before)), prior: None })
     }
 
     fn volume(&self) -> &Array3<f32> {
         &self.sweep.x
+    }
+
+    fn take(&mut self) -> Array3<f32> {
+        std::mem::take(&mut self.sweep.x)
     }
 
     fn state(&mut self) -> Vec<(&'static str, &mut [f32])> {

@@ -1,10 +1,10 @@
 //! Conjugate gradients on the normal equations `AᵀA·x = Aᵀp` (Hestenes and Stiefel 1952; Björck, Numerical Methods for
 //! Least Squares Problems, algorithm 7.4.1). Early passes find what is smooth; noise comes with more of them.
 
-use super::{Method, Pass, Problem, Stop, drive, flat_mut, norm2, projector, start};
+use super::{Method, Pass, Problem, Stop, drive, flat_mut, norm2, projecting, projector, refuse_others, start};
 use conefield_core::error::Result;
 use conefield_core::solver::{Job, Observer, Reconstruction, Solution, Solver};
-use conefield_core::spec::SolverSpec;
+use conefield_core::spec::{SolverSpec, Spec};
 use ndarray::{Array3, Zip};
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
@@ -47,6 +47,16 @@ impl Solver for Cgls {
             volume.data.par_mapv_inplace(|x| x.max(0.0));
         }
         Ok(solution)
+    }
+
+    fn trains_field(&self, spec: &Spec) -> Result<bool> {
+        refuse_others(spec)?;
+        Ok(false)
+    }
+
+    /// Direction and gradient, the residual and the direction's projections.
+    fn working_memory(&self, pixels: u64, voxels: u64) -> u64 {
+        2 * 4 * (pixels + voxels) + projecting(pixels) + self.stop.kept(voxels)
     }
 
     fn describe(&self) -> String {
@@ -98,6 +108,10 @@ impl Method for Iterate {
 
     fn volume(&self) -> &Array3<f32> {
         &self.x
+    }
+
+    fn take(&mut self) -> Array3<f32> {
+        std::mem::take(&mut self.x)
     }
 
     fn state(&mut self) -> Vec<(&'static str, &mut [f32])> {

@@ -17,15 +17,15 @@ use conefield_core::checkpoint::{Checkpoint, Resume, Standing};
 use conefield_core::error::{Result, ensure};
 use conefield_core::scan::{Scan, Volume};
 use conefield_core::solver::{Job, Limits, Observer, Reconstruction, Record, Solution};
-use conefield_core::spec::Spec;
+use conefield_core::spec::{Spec, VolumeStart};
 use conefield_core::voxel::{VoxelOperator, VoxelProjector};
 use ndarray::{Array3, Axis};
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
-use watch::{Watch, square_sum};
+use watch::{Watch, difference_square_sum, square_sum};
 
 /// When an iterative solver ends, whichever comes first.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
+#[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields, default)]
 pub struct Stop {
     /// After this many passes over the views.
@@ -42,20 +42,23 @@ pub struct Stop {
     pub patience: Option<u64>,
 }
 
-impl Default for Stop {
-    fn default() -> Self {
-        Self { passes: Some(20), seconds: None, change: None, patience: None }
-    }
-}
-
 impl Stop {
     /// Refuses a run without an end.
     pub fn validate(&self) -> Result<()> {
         let ends = self.passes.is_some() || self.seconds.is_some() || self.change.is_some();
         ensure(ends, "spec", "solver.stop", "no end", "one of passes, seconds or change")?;
-        let change = self.change.is_none_or(|c| c.is_finite() && c > 0.0);
-        ensure(change, "spec", "solver.stop.change", format!("{:?}", self.change), "a positive finite number")?;
+        for (name, limit) in [("change", self.change), ("seconds", self.seconds)] {
+            if let Some(x) = limit {
+                let field = format!("solver.stop.{name}");
+                ensure(x.is_finite() && x > 0.0, "spec", &field, x, "a positive finite number")?;
+            }
+        }
         ensure(self.patience != Some(0), "spec", "solver.stop.patience", 0, "at least 1")
+    }
+
+    /// Bytes of the volume that [`drive`] keeps for `patience`.
+    fn kept(&self, voxels: u64) -> u64 {
+        if self.patience.is_some() { 4 * voxels } else { 0 }
     }
 }
 
@@ -123,6 +126,11 @@ pub trait Method {
     /// The volume as it stands, in 1/mm.
     fn volume(&self) -> &Array3<f32>;
 
+    /// The volume, which the method needs no more.
+    fn take(&mut self) -> Array3<f32> {
+        self.volume().clone()
+    }
+
     /// All that the next pass depends on, by name, for checkpoints.
     fn state(&mut self) -> Vec<(&'static str, &mut [f32])>;
 
@@ -134,11 +142,21 @@ pub trait Method {
 
 /// The voxel projector of a job's spec: Joseph's where it names none. Refuses a spec with stages of a field.
 pub fn projector(job: &Job<'_>) -> Result<Box<dyn VoxelProjector>> {
-    voxels_only(job.spec)?;
-    match &job.spec.projector {
+    projector_of(job.spec)
+}
+
+fn projector_of(spec: &Spec) -> Result<Box<dyn VoxelProjector>> {
+    voxels_only(spec)?;
+    match &spec.projector {
         Some(p) => p.build_voxel(),
         None => Ok(Box::new(conefield_projectors::voxel::Joseph {})),
     }
+}
+
+/// Refuses what no solver here takes.
+pub(crate) fn refuse_others(spec: &Spec) -> Result<()> {
+    projector_of(spec)?;
+    start_of(spec).map(drop)
 }
 
 /// Refuses stages that only a field has.
@@ -157,14 +175,18 @@ pub fn voxels_only(spec: &Spec) -> Result<()> {
 
 /// The volume to start from, in 1/mm: what the spec's initializer brings, or 0.
 pub fn start(job: &Job<'_>) -> Result<Array3<f32>> {
-    let shape = job.scan.geometry.volume.shape;
-    let Some(initializer) = &job.spec.initializer else { return Ok(Array3::zeros(shape)) };
-    let Some(start) = initializer.volume()? else {
-        let found = format!("{:?}, which fills weights", initializer.typetag_name());
-        return Err(Error::invalid("spec", "initializer.type", found, "\"volume\", or no initializer"));
-    };
-    let volume = start_volume(job, &start.path)?;
-    Ok(volume.data.as_standard_layout().into_owned())
+    let Some(start) = start_of(job.spec)? else { return Ok(Array3::zeros(job.scan.geometry.volume.shape)) };
+    let data = start_volume(job, &start.path)?.data;
+    Ok(if data.is_standard_layout() { data } else { data.as_standard_layout().into_owned() })
+}
+
+/// What the spec's initializer brings. Refuses one that fills weights.
+fn start_of(spec: &Spec) -> Result<Option<VolumeStart>> {
+    let Some(initializer) = &spec.initializer else { return Ok(None) };
+    let start = initializer.volume()?;
+    let found = format!("{:?}, which fills weights", initializer.typetag_name());
+    ensure(start.is_some(), "spec", "initializer.type", found, "\"volume\", or no initializer")?;
+    Ok(start)
 }
 
 /// Reads a volume that fits the scan, in 1/mm.
@@ -187,6 +209,8 @@ struct Kept {
     numbers: Vec<f64>,
     best: Option<f64>,
     since_best: u64,
+    /// Whether the stopping rule is met.
+    settled: bool,
 }
 
 /// Runs `method` on `job` until `stop` or the job's limits end it.
@@ -213,7 +237,9 @@ pub fn drive(
     }
     let mut clock = Clock::new(Limits { steps: stop.passes, seconds: stop.seconds }, job.limits, seconds);
     let started = step;
-    let mut settled = false;
+    if stop.patience.is_some() && job.held_out.is_none() {
+        observer.note("stop.patience looks at views that are kept aside, and none are: it does not end this run");
+    }
     clock.resume();
     loop {
         let cancelled = observer.cancelled();
@@ -237,7 +263,9 @@ pub fn drive(
         if cancelled {
             return Err(Error::Interrupted { step });
         }
-        if clock.share(step) >= 1.0 || settled {
+        // Time alone does not end a run that has made nothing yet.
+        let share = if step == 0 { clock.share_of_steps(step) } else { clock.share(step) };
+        if share >= 1.0 || kept.settled {
             break;
         }
         let pass = method.pass(&problem, step)?;
@@ -263,13 +291,13 @@ pub fn drive(
                 best = Some(method.volume().clone());
             } else {
                 kept.since_best += 1;
-                settled |= kept.since_best >= patience;
+                kept.settled |= kept.since_best >= patience;
             }
         }
         if let (Some(limit), Some(change)) = (stop.change, pass.change) {
-            settled |= change < limit;
+            kept.settled |= change < limit;
         }
-        if settled {
+        if kept.settled {
             record.events.push("the stopping rule is met".into());
         }
         observer.record(&record);
@@ -278,7 +306,7 @@ pub fn drive(
         observer.progress(step, share.min(1.0), clock.seconds() * (1.0 - share).max(0.0) / share.max(1e-9));
     }
     clock.pause();
-    let mut data = best.unwrap_or_else(|| method.volume().clone());
+    let mut data = best.unwrap_or_else(|| method.take());
     data.par_mapv_inplace(|x| x * mm);
     if let Some((at, _)) = data.indexed_iter().find(|(_, x)| !x.is_finite()) {
         return Err(Error::Diverged { step, what: format!("voxel {at:?} is not finite") });
@@ -334,6 +362,21 @@ pub(crate) fn flat(x: &Array3<f32>) -> &[f32] {
 /// Like [`flat`], to be written.
 pub(crate) fn flat_mut(x: &mut Array3<f32>) -> &mut [f32] {
     x.as_slice_mut().unwrap_or_else(|| unreachable!("arrays of this crate are contiguous"))
+}
+
+/// Root mean square of `x − before` over that of `x`.
+pub(crate) fn change(x: &Array3<f32>, before: &Array3<f32>) -> f64 {
+    distance(x, before) / norm2(x).max(1e-300).sqrt()
+}
+
+/// `‖x − y‖`.
+pub(crate) fn distance(x: &Array3<f32>, y: &Array3<f32>) -> f64 {
+    difference_square_sum(flat(x), flat(y)).sqrt()
+}
+
+/// Bytes that a projector works in at most while it takes `values` measured ones back.
+fn projecting(values: u64) -> u64 {
+    (8 * values).min(12 << 20)
 }
 
 /// `‖x‖²` of an array.

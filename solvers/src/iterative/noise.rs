@@ -4,6 +4,11 @@ use conefield_core::scan::Scan;
 use ndarray::Axis;
 use rayon::prelude::*;
 
+/// Bytes that [`sigma`] takes: the differences, in lists and then in one.
+pub fn memory(pixels: u64) -> u64 {
+    2 * 4 * pixels
+}
+
 /// Standard deviation of the line integrals' noise where rays meet the object: second differences along rows hold little
 /// else than noise, and their median absolute value is hardly moved by edges. For white noise `p[-1] − 2p[0] + p[1]` has
 /// the variance 6σ². Noise that is correlated between pixels is underestimated.

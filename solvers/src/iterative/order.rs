@@ -23,6 +23,18 @@ pub fn subsets(views: usize, subsets: usize) -> Vec<Vec<usize>> {
     (0..n).map(|s| (s..views).step_by(n).collect()).collect()
 }
 
+/// In words: how many subsets of how many views.
+pub fn told(subsets: &[Vec<usize>]) -> String {
+    let sizes = || subsets.iter().map(Vec::len);
+    let (least, most) = (sizes().min().unwrap_or(0), sizes().max().unwrap_or(0));
+    let views = if least == most { format!("{most}") } else { format!("{least} or {most}") };
+    format!("{} {} of {views} {}", subsets.len(), plural(subsets.len(), "subset"), plural(most, "view"))
+}
+
+fn plural(n: usize, word: &str) -> String {
+    if n == 1 { word.into() } else { format!("{word}s") }
+}
+
 impl Order {
     /// The order of `count` subsets in pass `pass`.
     pub fn of(self, count: usize, seed: u64, pass: u64) -> Vec<usize> {
@@ -73,5 +85,8 @@ mod tests {
         let s = subsets(11, 3);
         assert_eq!(s, [vec![0, 3, 6, 9], vec![1, 4, 7, 10], vec![2, 5, 8]]);
         assert_eq!(subsets(4, 9).len(), 4);
+        assert_eq!(told(&s), "3 subsets of 3 or 4 views");
+        assert_eq!(told(&subsets(4, 9)), "4 subsets of 1 view");
+        assert_eq!(told(&subsets(4, 1)), "1 subset of 4 views");
     }
 }

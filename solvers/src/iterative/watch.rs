@@ -53,6 +53,17 @@ impl<'a> Watch<'a> {
     }
 }
 
+/// Sum of the squares of `x − y`, the same whatever the number of threads.
+pub fn difference_square_sum(x: &[f32], y: &[f32]) -> f64 {
+    let square = |(a, b): (&f32, &f32)| (f64::from(*a) - f64::from(*b)).powi(2);
+    let parts: Vec<f64> = x
+        .par_chunks(1 << 16)
+        .zip(y.par_chunks(1 << 16))
+        .map(|(x, y)| x.iter().zip(y).map(square).sum::<f64>())
+        .collect();
+    parts.iter().sum()
+}
+
 /// Sum of squares, the same whatever the number of threads.
 pub fn square_sum(x: &[f32]) -> f64 {
     let parts: Vec<f64> =

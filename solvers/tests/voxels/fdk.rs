@@ -1,0 +1,214 @@
+//! FDK's scale: means within homogeneous bodies, for every kind of orbit that it has weights for.
+//!
+//! A circular orbit says too little about what lies off its plane: there FDK is an approximation and loses attenuation
+//! with the square of the cone angle. The voxels are therefore a thin slab in the orbit's plane, where it is exact.
+
+use crate::kit::{Case, Heard, mean, view};
+use conefield_core::geometry::{Geometry, VoxelGrid};
+use conefield_core::scan::{Scan, Unit, Volume};
+use conefield_projectors::simulate::{Ellipsoid, scan_ellipsoids};
+use conefield_solvers::fdk::weights::{Coverage, Orbit, place};
+use std::f64::consts::{PI, TAU};
+
+/// Half width of the field of view at the axis, mm.
+const REACH: f64 = 26.4;
+/// Columns' pitch at the axis, mm.
+const PITCH: f64 = 0.8;
+/// How far a mean may be off.
+const EXACT: f64 = 0.005;
+
+/// How a scan is taken.
+#[derive(Debug, Clone, Copy)]
+struct Orbiting {
+    /// Source to axis, mm.
+    radius: f64,
+    magnification: f64,
+    /// How far the detector reaches to its shorter side, mm at the axis; the other side reaches to [`REACH`].
+    short_side: f64,
+    /// Whether the longer side is that of u.
+    along_u: bool,
+    /// Arc in radians, with a sign.
+    arc: f64,
+    views: usize,
+}
+
+const CENTRED: Orbiting =
+    Orbiting { radius: 100.0, magnification: 1.5, short_side: REACH, along_u: true, arc: TAU, views: 720 };
+
+impl Orbiting {
+    /// The arc of a short scan, and `more` fans beyond it.
+    fn short(self, more: f64) -> Self {
+        let fan = 2.0 * (REACH / self.radius).atan();
+        Self { arc: PI + (1.0 + more) * fan, ..self }
+    }
+
+    /// The other way round.
+    fn backwards(self) -> Self {
+        Self { arc: -self.arc, ..self }
+    }
+
+    /// With a detector that reaches over the axis by `short_side` mm, or over the axis the other way.
+    fn aside(self, short_side: f64, along_u: bool) -> Self {
+        Self { short_side, along_u, ..self }
+    }
+}
+
+fn bodies() -> [Ellipsoid; 2] {
+    [
+        Ellipsoid { center: [1.0, -1.5, 0.0], axes: [19.0, 15.0, 20.0], value: 0.02 },
+        Ellipsoid { center: [-6.0, 4.0, 0.0], axes: [8.0, 7.0, 16.0], value: 0.015 },
+    ]
+}
+
+fn geometry(o: Orbiting) -> Geometry {
+    let columns = ((REACH + o.short_side) / PITCH).round() as usize;
+    let side = if o.along_u { 0.5 } else { -0.5 };
+    let offset = side * (REACH - o.short_side) * o.magnification;
+    let pixel = [1.0, PITCH].map(|p| p * o.magnification);
+    let at = |i: usize| 0.2 + o.arc * i as f64 / o.views as f64;
+    Geometry {
+        detector: [14, columns],
+        views: (0..o.views)
+            .map(|i| view(at(i), [o.radius, o.magnification * o.radius], pixel, [0.0, offset]))
+            .collect(),
+        volume: VoxelGrid { shape: [48, 48, 8], spacing: [1.0; 3], center: [0.0; 3] },
+    }
+}
+
+fn scan(o: Orbiting) -> Scan {
+    scan_ellipsoids(&bodies(), geometry(o))
+}
+
+/// Means within the two bodies over what they should be. 3 mm of every edge are left out, which the pixels' width and
+/// windows blur.
+fn means(volume: &Volume) -> [f64; 2] {
+    let [large, small] = bodies();
+    let within = |p: [f64; 3]| p[2].abs() < 2.0 && large.grown(-3.0).contains(p);
+    let around = mean(volume, |p| within(p) && !small.grown(3.0).contains(p));
+    let inside = mean(volume, |p| within(p) && small.grown(-3.0).contains(p));
+    [around / large.value, inside / (large.value + small.value)]
+}
+
+/// How far the worse of the means is off.
+fn off(volume: &Volume) -> f64 {
+    means(volume).iter().fold(0.0, |w, m| w.max((m - 1.0).abs()))
+}
+
+fn fdk(scan: &Scan, settings: &str) -> (Volume, Heard) {
+    Case::of(scan).volume(&format!("[solver]\ntype = \"fdk\"\n{settings}"))
+}
+
+#[test]
+fn means_are_right_for_every_orbit_magnification_and_detector() {
+    let mut worst = 0.0f64;
+    for (radius, magnification) in [(80.0, 1.2), (100.0, 1.5), (200.0, 3.0)] {
+        let full = Orbiting { radius, magnification, ..CENTRED };
+        for (kind, orbit) in [
+            ("full turn", full),
+            ("full turn", full.backwards()),
+            ("offset detector", full.aside(5.2, true)),
+            ("offset detector", full.aside(5.2, false)),
+            ("offset detector", full.aside(5.2, true).backwards()),
+            ("offset detector", full.aside(16.0, false)),
+            ("short scan", full.short(0.0)),
+            ("short scan", full.short(0.0).backwards()),
+            ("short scan", full.short(1.0)),
+        ] {
+            let (volume, heard) = fdk(&scan(orbit), "");
+            assert!(heard.said(kind), "{orbit:?}: {:?}", heard.notes);
+            assert!(off(&volume) < EXACT, "{orbit:?}: {:?}", means(&volume));
+            worst = worst.max(off(&volume));
+        }
+    }
+    println!("the worst mean is off by {:.3} %", 100.0 * worst);
+}
+
+#[test]
+fn the_scale_does_not_depend_on_the_number_of_views() {
+    let of = |views| fdk(&scan(Orbiting { views, ..CENTRED }), "");
+    let all: Vec<[f64; 2]> = [720, 360, 180].map(|n| means(&of(n).0)).to_vec();
+    for m in &all {
+        let apart = [0, 1].map(|k| (m[k] - all[0][k]).abs());
+        assert!(apart.iter().all(|a| *a < 0.002), "{all:?}");
+    }
+    // So few views leave streaks, and yet they are a full turn: nothing is taken for the end of a short scan.
+    let (sparse, heard) = of(50);
+    assert!(heard.said("full turn") && !heard.said("Parker"), "{:?}", heard.notes);
+    assert!(off(&sparse) < 0.02, "{:?}", means(&sparse));
+}
+
+#[test]
+fn every_window_keeps_the_mean() {
+    let scan = scan(Orbiting { views: 360, ..CENTRED });
+    for window in ["ramp", "shepp-logan", "cosine", "hamming", "hann"] {
+        for cutoff in [1.0, 0.6] {
+            let (volume, _) = fdk(&scan, &format!("window = \"{window}\"\ncutoff = {cutoff}"));
+            assert!(off(&volume) < EXACT, "{window} to {cutoff}: {:?}", means(&volume));
+        }
+    }
+}
+
+#[test]
+fn units_rows_and_signs_are_kept() {
+    let mut scan = scan(Orbiting { views: 180, ..CENTRED });
+    let (plain, _) = fdk(&scan, "");
+    // Rows that run upwards, with the images turned round.
+    let mut turned = scan.clone();
+    turned.geometry.views.iter_mut().for_each(|v| v.v[2] *= -1.0);
+    turned.projections.invert_axis(ndarray::Axis(1));
+    let (volume, _) = fdk(&turned, "");
+    let apart = plain.data.iter().zip(&volume.data).fold(0.0f32, |m, (a, b)| m.max((a - b).abs()));
+    assert!(apart < 1e-6, "{apart}");
+    scan.unit = Unit { name: "cm".into(), mm: 10.0 };
+    let (volume, _) = fdk(&scan, "");
+    let apart = plain.data.iter().zip(&volume.data).fold(0.0f32, |m, (a, b)| m.max((10.0 * a - b).abs()));
+    assert!(apart < 1e-7, "{apart}");
+    assert!(plain.data.iter().any(|x| *x < 0.0), "what lies outside the bodies swings around 0");
+    let (volume, _) = fdk(&scan, "nonnegative = true");
+    assert!(volume.data.iter().all(|x| *x >= 0.0));
+}
+
+/// The scan as it would be without the weights of rays that are measured twice: FDK counts every ray half.
+fn unweighted(scan: &Scan) -> Scan {
+    let mut scan = scan.clone();
+    let orbit = Orbit::of(&scan.geometry);
+    for ((view, _, column), p) in scan.projections.indexed_iter_mut() {
+        let radius = orbit.radius[view];
+        let weight = orbit.weight(view, place(&scan.geometry, view, column as f64, radius));
+        *p = if weight > 1e-6 { *p * (0.5 / weight) as f32 } else { 0.0 };
+    }
+    scan
+}
+
+/// The means above tell a scale that is 1 % wrong and every kind of weights from none.
+#[test]
+fn wrong_scales_and_weights_are_seen() {
+    let views = 360;
+    let mut scaled = scan(Orbiting { views, ..CENTRED });
+    assert!(off(&fdk(&scaled, "").0) < EXACT);
+    scaled.projections.par_mapv_inplace(|x| 1.01 * x);
+    assert!(off(&fdk(&scaled, "").0) > EXACT);
+    for orbit in [CENTRED.aside(5.2, true), CENTRED.short(0.0), CENTRED.short(1.0)] {
+        let scan = scan(Orbiting { views, ..orbit });
+        assert!(off(&fdk(&scan, "").0) < EXACT);
+        let without = fdk(&unweighted(&scan), "").0;
+        assert!(off(&without) > 4.0 * EXACT, "{orbit:?}: {:?}", means(&without));
+    }
+    // The detector's side taken for the other one.
+    let mut bad = scan(Orbiting { views, ..CENTRED.aside(5.2, true) });
+    bad.geometry = geometry(Orbiting { views, ..CENTRED.aside(5.2, false) });
+    assert!(off(&fdk(&bad, "").0) > 4.0 * EXACT);
+}
+
+/// Half a detector over part of a turn leaves lines that nobody measured: no weights are made up for them.
+#[test]
+fn what_cannot_be_completed_is_said() {
+    let part = Orbiting { arc: 2.5, ..CENTRED };
+    for orbit in [part, CENTRED.short(0.0).aside(5.2, true), CENTRED.short(1.0).aside(5.2, false)] {
+        let orbit = Orbiting { views: 90, ..orbit };
+        assert_eq!(Orbit::of(&geometry(orbit)).coverage, Coverage::Limited, "{orbit:?}");
+        let (volume, heard) = fdk(&scan(orbit), "");
+        assert!(heard.said("expect streaks") && heard.said("iterative"), "{:?}", heard.notes);
+        assert!(volume.data.iter().all(|x| x.is_finite()));
+    }
+}

@@ -1,0 +1,158 @@
+//! What these tests share: a job in a few words, an observer that keeps what it hears, measures of a volume.
+
+use conefield_backend_cpu::Cpu;
+use conefield_core::arena::Weights;
+use conefield_core::checkpoint::{Checkpoint, Resume};
+use conefield_core::geometry::{Geometry, Millimetres, Radians, View, VoxelGrid};
+use conefield_core::scan::{Scan, Volume};
+use conefield_core::solver::{Job, Limits, Observer, Reconstruction, Record, Solution};
+use conefield_core::spec::Spec;
+use conefield_core::spec::load::parse;
+use conefield_core::{Error, Result};
+use conefield_projectors::simulate::Ellipsoid;
+
+// Stage types register themselves where their crate is linked.
+use conefield_encoders as _;
+use conefield_fields as _;
+use conefield_initializers as _;
+
+/// A view of a circular orbit; lengths in mm, `pixel` and `offset` along v and u.
+pub fn view(angle: f64, distances: [f64; 2], pixel: [f64; 2], offset: [f64; 2]) -> View {
+    let mm = Millimetres;
+    View::circular(Radians(angle), mm(distances[0]), mm(distances[1]), pixel.map(mm), offset.map(mm))
+}
+
+/// A job, less what most tests leave out.
+pub struct Case<'a> {
+    pub scan: &'a Scan,
+    pub held_out: Option<&'a Scan>,
+    pub reference: Option<&'a Volume>,
+    pub limits: Limits,
+    /// What stands in every volume file that the spec names.
+    pub file: Option<&'a Volume>,
+    pub resume: Option<&'a Resume>,
+}
+
+impl<'a> Case<'a> {
+    pub fn of(scan: &'a Scan) -> Self {
+        Self { scan, held_out: None, reference: None, limits: Limits::default(), file: None, resume: None }
+    }
+
+    /// Runs the solver of the spec `text`.
+    pub fn run(&self, text: &str, heard: &mut Heard) -> Result<Solution> {
+        let spec = spec(text)?;
+        let job = Job {
+            scan: self.scan,
+            held_out: self.held_out,
+            reference: self.reference,
+            peak: 1.0,
+            spec: &spec,
+            backend: &Cpu::new(),
+            seed: 3,
+            limits: self.limits,
+            weights: &|path| Err(Error::invalid(path, "weights", "nothing", "no test to read any")),
+            volumes: &|path| self.file.cloned().ok_or_else(|| Error::invalid(path, "file", "nothing", "a volume")),
+            resume: self.resume,
+        };
+        spec.solver.build()?.solve(&job, heard)
+    }
+
+    /// The volume that comes out and what was heard.
+    pub fn volume(&self, text: &str) -> (Volume, Heard) {
+        let mut heard = Heard::default();
+        let solution = self.run(text, &mut heard).unwrap();
+        (volume(solution), heard)
+    }
+}
+
+pub fn spec(text: &str) -> Result<Spec> {
+    parse(text, "test.toml", &[], &[]).map(|l| l.spec)
+}
+
+pub fn volume(solution: Solution) -> Volume {
+    match solution.result {
+        Reconstruction::Volume(v) => v,
+        Reconstruction::Field(_) => panic!("a field came out of a solver on voxels"),
+    }
+}
+
+/// Keeps what it hears; interrupts after some records and keeps the checkpoint.
+#[derive(Default)]
+pub struct Heard {
+    pub records: Vec<Record>,
+    pub notes: Vec<String>,
+    pub interrupt_after: Option<usize>,
+    pub kept: Option<Resume>,
+}
+
+impl Heard {
+    pub fn interrupting_after(records: usize) -> Self {
+        Self { interrupt_after: Some(records), ..Self::default() }
+    }
+
+    pub fn losses(&self) -> Vec<f64> {
+        self.records.iter().map(|r| r.loss).collect()
+    }
+
+    pub fn said(&self, words: &str) -> bool {
+        self.notes.iter().any(|n| n.contains(words))
+    }
+}
+
+impl Observer for Heard {
+    fn progress(&mut self, _: u64, share: f64, seconds_left: f64) {
+        assert!((0.0..=1.0).contains(&share) && seconds_left >= 0.0, "{share} and {seconds_left}");
+    }
+    fn record(&mut self, record: &Record) {
+        self.records.push(record.clone());
+    }
+    fn note(&mut self, text: &str) {
+        self.notes.push(text.into());
+    }
+    fn cancelled(&self) -> bool {
+        self.interrupt_after.is_some_and(|n| self.records.len() >= n)
+    }
+    /// As a file would: numbers of the standing go through JSON.
+    fn checkpoint(&mut self, c: &Checkpoint<'_>) -> Result<()> {
+        let standing = serde_json::from_str(&serde_json::to_string(&c.standing).unwrap()).unwrap();
+        let tensors = c.tensors.iter().map(|(n, shape, x)| (n.clone(), (shape.to_vec(), x.to_vec()))).collect();
+        let weights = Weights { tensors, ..Weights::default() };
+        self.kept = Some(Resume { place: "checkpoint".into(), standing, weights });
+        Ok(())
+    }
+}
+
+/// Mean of the voxels whose centres fulfil `within`; at least 20 of them.
+pub fn mean(volume: &Volume, within: impl Fn([f64; 3]) -> bool) -> f64 {
+    let found = volume.data.indexed_iter().filter(|((x, y, z), _)| within(volume.grid.voxel([*x, *y, *z])));
+    let (sum, count) = found.fold((0.0, 0), |(s, n), (_, v)| (s + f64::from(*v), n + 1));
+    assert!(count >= 20, "{count} voxels say little");
+    sum / f64::from(count)
+}
+
+/// PSNR in dB over all voxels, against the reference's largest value.
+pub fn psnr(volume: &Volume, reference: &Volume) -> f64 {
+    let square = |(a, b): (&f32, &f32)| f64::from(a - b).powi(2);
+    let mse = volume.data.iter().zip(&reference.data).map(square).sum::<f64>() / volume.data.len() as f64;
+    let top = reference.data.iter().fold(0.0f64, |m, &x| m.max(f64::from(x)));
+    10.0 * (top * top / mse).log10()
+}
+
+/// Some ellipsoids in a cube of 24³ voxels of 2 mm.
+pub fn bodies() -> Vec<Ellipsoid> {
+    vec![
+        Ellipsoid { center: [1.0, -1.0, 0.5], axes: [18.0, 15.0, 17.0], value: 0.02 },
+        Ellipsoid { center: [-6.0, 3.0, 1.0], axes: [5.0, 4.0, 8.0], value: 0.02 },
+        Ellipsoid { center: [7.0, -4.0, -3.0], axes: [4.0, 6.0, 5.0], value: -0.015 },
+    ]
+}
+
+/// `views` views of that cube on a full circle.
+pub fn geometry(views: usize) -> Geometry {
+    let turn = |i: usize| std::f64::consts::TAU * i as f64 / views as f64;
+    Geometry {
+        detector: [32, 36],
+        views: (0..views).map(|i| view(0.1 + turn(i), [150.0, 220.0], [2.8, 2.8], [0.0, 0.0])).collect(),
+        volume: VoxelGrid { shape: [24; 3], spacing: [2.0; 3], center: [0.0; 3] },
+    }
+}

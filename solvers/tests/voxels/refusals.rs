@@ -1,0 +1,115 @@
+//! Specs that solvers on voxels refuse, and that the message names the field.
+
+use crate::kit::{Case, Heard, bodies, geometry, spec};
+use conefield_projectors::simulate::scan_ellipsoids;
+
+const ALL: [&str; 7] = ["fdk", "sart", "os-sart", "sirt", "cgls", "asd-pocs", "fista-tv"];
+
+/// What is said of a spec that is refused when it is read, built or run.
+fn said(text: &str) -> String {
+    let scan = scan_ellipsoids(&bodies(), geometry(4));
+    match Case::of(&scan).run(text, &mut Heard::default()) {
+        Ok(_) => panic!("accepted: {text}"),
+        Err(e) => e.to_string(),
+    }
+}
+
+#[test]
+fn stages_of_a_field_have_no_place() {
+    for kind in ALL {
+        for (stage, text) in
+            [("encoder", "[encoder]\ntype = \"identity\"\n"), ("field", "[field]\ntype = \"voxel-grid\"\n")]
+        {
+            let e = said(&format!("{text}[solver]\ntype = \"{kind}\"\n"));
+            let want = format!("{stage}: found a stage of a field, expected none: {kind} reconstructs voxels");
+            assert!(e.contains(&want), "{kind}: {e}");
+        }
+        let e = said(&format!("[initializer]\ntype = \"random\"\n[solver]\ntype = \"{kind}\"\n"));
+        assert!(e.contains("initializer") && e.contains("\"random\""), "{kind}: {e}");
+        let e = said(&format!("[projector]\ntype = \"ray-march\"\n[solver]\ntype = \"{kind}\"\n"));
+        assert!(e.contains("projector") && e.contains("\"ray-march\""), "{kind}: {e}");
+    }
+    // What FDK would pass over is refused, too.
+    for (stage, text) in [
+        ("projector", "[projector]\ntype = \"joseph\"\n"),
+        ("initializer", "[initializer]\ntype = \"volume\"\npath = \"x.nii\"\n"),
+    ] {
+        let e = said(&format!("{text}[solver]\ntype = \"fdk\"\n"));
+        assert!(e.contains(&format!("{stage}.type: found")) && e.contains("fdk"), "{e}");
+    }
+    // A field cannot be rendered by what projects voxels.
+    let field = "[encoder]\ntype = \"identity\"\n[field]\ntype = \"voxel-grid\"\n[projector]\ntype = \"joseph\"\n";
+    let e = said(&format!("{field}[solver]\ntype = \"gradient\"\n"));
+    assert!(e.contains("projector.type: found \"joseph\", which projects voxels"), "{e}");
+}
+
+#[test]
+fn a_run_has_an_end() {
+    for kind in ALL.into_iter().filter(|k| *k != "fdk") {
+        for stop in ["{}", "{ patience = 3 }"] {
+            let e = said(&format!("[solver]\ntype = \"{kind}\"\nstop = {stop}\n"));
+            assert!(e.contains("solver.stop: found no end, expected one of passes, seconds or change"), "{kind}: {e}");
+        }
+        for (stop, field) in [
+            ("{ seconds = 0.0 }", "seconds"),
+            ("{ passes = 3, seconds = -1.0 }", "seconds"),
+            ("{ change = 0.0 }", "change"),
+            ("{ passes = 3, patience = 0 }", "patience"),
+            ("{ passes = -1 }", "passes"),
+        ] {
+            let e = said(&format!("[solver]\ntype = \"{kind}\"\nstop = {stop}\n"));
+            assert!(e.contains(&format!("solver.stop.{field}: found")), "{kind}, {stop}: {e}");
+        }
+        // What is set is all that ends it: no number of passes comes with the time.
+        let spec = spec(&format!("[solver]\ntype = \"{kind}\"\nstop = {{ seconds = 60.0 }}\n")).unwrap();
+        let stop = serde_json::to_value(&spec).unwrap()["solver"]["stop"].clone();
+        assert_eq!(stop, serde_json::json!({ "seconds": 60.0 }), "{kind}");
+    }
+}
+
+#[test]
+fn settings_out_of_range_are_named() {
+    for (kind, setting, field) in [
+        ("fdk", "window = \"han\"", "window"),
+        ("fdk", "cutoff = 0.0", "cutoff"),
+        ("fdk", "cutoff = 1.01", "cutoff"),
+        ("fdk", "windw = \"hann\"", "windw"),
+        ("sart", "relaxation = 0.0", "relaxation"),
+        ("sart", "relaxation = 2.0", "relaxation"),
+        ("sart", "decay = 0.0", "decay"),
+        ("sart", "decay = 1.1", "decay"),
+        ("sart", "order = \"silver\"", "order"),
+        ("sart", "stop = { passs = 3 }", "stop.passs"),
+        ("os-sart", "subsets = 0", "subsets"),
+        ("sirt", "order = \"golden\"", "order"),
+        ("sirt", "relaxation = -1.0", "relaxation"),
+        ("cgls", "relaxation = 1.0", "relaxation"),
+        ("asd-pocs", "subsets = 0", "subsets"),
+        ("asd-pocs", "alpha = 0.0", "alpha"),
+        ("asd-pocs", "alpha_decay = 0.0", "alpha_decay"),
+        ("asd-pocs", "ratio = -1.0", "ratio"),
+        ("asd-pocs", "tolerance = -1.0", "tolerance"),
+        ("fista-tv", "subsets = 0", "subsets"),
+        ("fista-tv", "inner = 0", "inner"),
+        ("fista-tv", "weight = { noise = -1.0 }", "weight"),
+        ("fista-tv", "weight = 3.0", "weight"),
+    ] {
+        let e = said(&format!("[solver]\ntype = \"{kind}\"\n{setting}\n"));
+        assert!(e.contains(&format!("solver.{field}")), "{kind}, {setting}: {e}");
+    }
+    let e = said("[projector]\ntype = \"trilinear\"\nsamples_per_voxel = 0.1\n[solver]\ntype = \"sart\"\n");
+    assert!(e.contains("projector.samples_per_voxel: found 0.1"), "{e}");
+    let e = said("[solver]\ntype = \"fdk\"\nwindow = \"han\"\n");
+    assert!(e.contains("hann"), "the nearest name is offered: {e}");
+}
+
+/// FDK is for circles around z.
+#[test]
+fn fdk_refuses_other_orbits() {
+    let mut scan = scan_ellipsoids(&bodies(), geometry(8));
+    for (i, v) in scan.geometry.views.iter_mut().enumerate() {
+        v.source = v.source.map(|x| x * (1.0 + 0.05 * i as f64));
+    }
+    let e = Case::of(&scan).run("[solver]\ntype = \"fdk\"\n", &mut Heard::default()).err().unwrap().to_string();
+    assert!(e.contains("scan: views: found sources") && e.contains("a circular orbit"), "{e}");
+}

@@ -1,0 +1,117 @@
+//! A known volume to start from: taken as it is by solvers on voxels, learned first by fields.
+
+use crate::kit::{Case, Heard, bodies, geometry, psnr};
+use conefield_core::scan::{Scan, Unit, Volume};
+use conefield_core::voxel::VoxelOperator;
+use conefield_projectors::simulate::{ellipsoids, scan_ellipsoids};
+use conefield_projectors::voxel::Joseph;
+
+const START: &str = "[initializer]\ntype = \"volume\"\npath = \"earlier.nii\"\n";
+
+const ALL: [&str; 6] = ["sart", "os-sart", "sirt", "cgls", "asd-pocs", "fista-tv"];
+
+fn truth() -> Volume {
+    ellipsoids(&bodies(), &geometry(1).volume)
+}
+
+/// Projections of the voxels themselves: what they are is then a solution without rest.
+fn scan_of(volume: &Volume) -> Scan {
+    let mut scan = scan_ellipsoids(&[], geometry(12));
+    let views: Vec<usize> = (0..12).collect();
+    let out = scan.projections.view_mut();
+    VoxelOperator::<f32>::forward(&Joseph {}, &scan.geometry, &views, volume.data.view(), out);
+    scan
+}
+
+fn solver(kind: &str) -> String {
+    let weight = if kind == "fista-tv" { "weight = { fixed = 0.0 }\n" } else { "" };
+    let descents = if kind == "asd-pocs" { "descents = 0\n" } else { "" };
+    format!("[solver]\ntype = \"{kind}\"\nstop = {{ passes = 1 }}\n{weight}{descents}")
+}
+
+#[test]
+fn the_truth_leaves_no_residual_and_stays() {
+    let truth = truth();
+    let scan = scan_of(&truth);
+    for kind in ALL {
+        let (cold, first) = Case::of(&scan).volume(&solver(kind));
+        let case = Case { file: Some(&truth), ..Case::of(&scan) };
+        let (warm, heard) = case.volume(&format!("{START}{}", solver(kind)));
+        let (warm_loss, cold_loss) = (heard.records[0].loss, first.records[0].loss);
+        println!("{kind}: residual {warm_loss:.1e} instead of {cold_loss:.1e}");
+        assert!(warm_loss < 1e-5 * cold_loss.max(0.1), "{kind}: {warm_loss:e} and {cold_loss:e}");
+        assert!(psnr(&warm, &truth) > 80.0 && psnr(&cold, &truth) < 40.0, "{kind}");
+    }
+}
+
+/// The file counts in 1/unit of the scan.
+#[test]
+fn the_start_is_what_the_file_holds() {
+    let truth = truth();
+    let mut scan = scan_of(&truth);
+    scan.unit = Unit { name: "cm".into(), mm: 10.0 };
+    let tenfold = truth.clone().mapped(|x| 10.0 * x);
+    for kind in ALL {
+        // No pass is made: what comes out is what stood in the file.
+        let limits = conefield_core::solver::Limits { steps: Some(0), seconds: None };
+        let case = Case { file: Some(&tenfold), limits, ..Case::of(&scan) };
+        let (volume, heard) = case.volume(&format!("{START}{}", solver(kind)));
+        assert!(heard.records.is_empty(), "{kind}");
+        let apart = volume.data.iter().zip(&tenfold.data).fold(0.0f32, |m, (a, b)| m.max((a - b).abs()));
+        assert!(apart < 1e-7, "{kind}: {apart}");
+    }
+}
+
+#[test]
+fn volumes_that_do_not_fit_are_refused() {
+    let truth = truth();
+    let scan = scan_of(&truth);
+    let other = Volume::centered(ndarray::Array3::zeros((24, 23, 24)), [2.0; 3]);
+    let mut holed = truth.clone();
+    holed.data[[1, 2, 3]] = f32::NAN;
+    let field = field(IDENTITY, GRID, 1);
+    for solver in ALL.map(solver).iter().chain([&field]) {
+        for (file, want) in [
+            (&other, "earlier.nii: shape: found [24, 23, 24], expected [24, 24, 24]"),
+            (&holed, "earlier.nii: voxel (1, 2, 3): found NaN"),
+        ] {
+            let case = Case { file: Some(file), ..Case::of(&scan) };
+            let e = case.run(&format!("{START}{solver}"), &mut Heard::default()).err().unwrap().to_string();
+            assert!(e.contains(want), "{e}");
+        }
+    }
+}
+
+const IDENTITY: &str = "type = \"identity\"";
+const GRID: &str = "type = \"voxel-grid\"\nresolution = 24";
+const DENSE: &str = "type = \"dense-grid\"\nlevels = 2\nbase_resolution = 12\ngrowth = 2.0";
+const MLP: &str = "type = \"mlp\"\nwidth = 16\ndepth = 3\nskips = []\noutput = \"squareplus\"";
+
+/// A field that is trained for a few steps, each of them told.
+fn field(encoder: &str, field: &str, steps: usize) -> String {
+    format!(
+        "[encoder]\n{encoder}\n[field]\n{field}\n[projector]\ntype = \"ray-march\"\nsamples = 48\n[solver]\n\
+         type = \"gradient\"\nsteps = {steps}\nreport_every = 1\nrays = 64\nlr = 0.03\npretrain_points = 4096\n\
+         pixels = \"all\"\n"
+    )
+}
+
+#[test]
+fn fields_learn_it_before_they_see_the_scan() {
+    let truth = truth();
+    let scan = scan_of(&truth);
+    for (name, encoder, net, gain) in [("voxel-grid", IDENTITY, GRID, 12.0), ("dense-grid", DENSE, MLP, 8.0)] {
+        let first = |head: &str, file: Option<&Volume>| {
+            let case = Case { file, reference: Some(&truth), ..Case::of(&scan) };
+            let mut heard = Heard::default();
+            case.run(&format!("{head}{}", field(encoder, net, 1)), &mut heard).unwrap();
+            (heard.records[0].psnr.unwrap(), heard)
+        };
+        let (random, _) = first("", None);
+        let start = format!("{START}steps = 300\n");
+        let (warm, heard) = first(&start, Some(&truth));
+        println!("{name}: {random:.1} dB from random weights, {warm:.1} dB from the volume");
+        assert!(heard.said("learned earlier.nii in 300 steps"), "{:?}", heard.notes);
+        assert!(warm > random + gain, "{name}: {random:.1} and {warm:.1} dB");
+    }
+}

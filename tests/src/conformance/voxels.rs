@@ -1,0 +1,341 @@
+//! What a projector of voxels must keep to: a linear operator that measures lengths, and its exact adjoint.
+
+use super::call::{differing, error, settle};
+use super::{Outcome, Report};
+use conefield_core::geometry::{Geometry, Millimetres, Radians, View, VoxelGrid};
+use conefield_core::random::{mix, unit};
+use conefield_core::simd::Real;
+use conefield_core::voxel::{VoxelOperator, VoxelProjector};
+use conefield_projectors::simulate::{Ellipsoid, ellipsoids, scan_ellipsoids};
+use ndarray::{Array3, Axis, Zip};
+use rayon::ThreadPoolBuilder;
+
+/// Largest mismatch of `<Ax, y>` and `<x, Aᵀy>` over `‖Ax‖·‖y‖`, in double and in single precision.
+const ADJOINT: [f64; 2] = [1e-12, 1e-5];
+/// Largest error of single against double precision, as a share of the largest number.
+const SINGLE: f64 = 1e-5;
+/// Root mean square error of an ellipsoid of some 14 voxels' radius against its closed form, over the mean.
+const CLOSED_FORM: f64 = 0.08;
+/// The same with half as many voxels along a side must be larger by this.
+const REFINED: f64 = 1.5;
+
+/// Runs every property that a projector of voxels must have.
+pub fn check_voxel_projector(projector: &dyn VoxelProjector) -> Report {
+    let mut report = Report { stage: projector.describe(), entries: vec![] };
+    let (single, double) = (projector.operator(), projector.reference());
+    report.add("adjoint: double precision", || adjoint(double, ADJOINT[0]));
+    report.add("adjoint: single precision", || adjoint(single, ADJOINT[1]));
+    report.add("single precision", || single_precision(projector));
+    report.add("closed form", || closed_form(single));
+    report.add("linear", || linear(double));
+    report.add("views stand alone", || views_stand_alone(projector));
+    report.add("projections overwrite", || projections_overwrite(single));
+    report.add("adjoint adds", || adjoint_adds(double));
+    report.add("threads", || threads(single));
+    report.add("rays that miss", || rays_that_miss(projector));
+    report.add("finite", || finite(single));
+    report
+}
+
+fn view(angle: f64, distances: [f64; 2], pixel: [f64; 2], offset: [f64; 2]) -> View {
+    let mm = Millimetres;
+    View::circular(Radians(angle), mm(distances[0]), mm(distances[1]), pixel.map(mm), offset.map(mm))
+}
+
+/// A detector that is no square, voxels that are no cubes and lie beside the axis, views at and between the axes; one with
+/// rows that run upwards and, unless `upright`, two that are tilted.
+fn crooked(upright: bool) -> Geometry {
+    let angles = [0.0, 0.3, std::f64::consts::FRAC_PI_4, 1.6, 2.9, 3.7];
+    let mut views: Vec<View> = angles.iter().map(|&a| view(a, [90.0, 140.0], [2.1, 1.7], [3.0, -4.5])).collect();
+    views[3].v[2] *= -1.0;
+    if !upright {
+        for v in &mut views[1..3] {
+            v.v = [0.3, -0.2, -2.0];
+            v.u[2] = 0.25;
+            v.source[2] += 5.0;
+        }
+    }
+    Geometry {
+        detector: [21, 27],
+        views,
+        volume: VoxelGrid { shape: [15, 19, 11], spacing: [1.9, 1.3, 2.4], center: [1.0, -2.0, 3.0] },
+    }
+}
+
+/// A single pixel, voxels in one line, rows much finer and much coarser than voxels.
+fn narrow() -> Vec<Geometry> {
+    let of = |detector, shape, pixel: f64| Geometry {
+        detector,
+        views: vec![view(0.4, [80.0, 130.0], [pixel; 2], [0.3, 0.2]), view(2.0, [80.0, 130.0], [pixel; 2], [0.0; 2])],
+        volume: VoxelGrid { shape, spacing: [1.5; 3], center: [0.0; 3] },
+    };
+    vec![
+        of([1, 1], [9, 9, 9], 2.0),
+        of([7, 9], [1, 12, 1], 2.0),
+        of([60, 5], [9, 8, 7], 0.3),
+        of([5, 6], [9, 8, 7], 9.0),
+    ]
+}
+
+fn geometries() -> Vec<Geometry> {
+    [vec![crooked(true), crooked(false)], narrow()].concat()
+}
+
+fn all_views(g: &Geometry) -> Vec<usize> {
+    (0..g.views.len()).collect()
+}
+
+/// Numbers in [-0.5, 0.5).
+fn noise<R: Real>(shape: [usize; 3], seed: u64) -> Array3<R> {
+    let mut i = 0;
+    Array3::from_shape_simple_fn(shape, || {
+        i += 1;
+        R::of(f64::from(unit(mix(seed, i))) - 0.5)
+    })
+}
+
+fn pixels(g: &Geometry, views: usize) -> [usize; 3] {
+    [views, g.detector[0], g.detector[1]]
+}
+
+fn forward<R: Real>(op: &dyn VoxelOperator<R>, g: &Geometry, views: &[usize], x: &Array3<R>) -> Array3<R> {
+    let mut out = Array3::from_elem(pixels(g, views.len()), R::ZERO);
+    op.forward(g, views, x.view(), out.view_mut());
+    out
+}
+
+fn back<R: Real>(op: &dyn VoxelOperator<R>, g: &Geometry, views: &[usize], y: &Array3<R>) -> Array3<R> {
+    let mut out = Array3::from_elem(g.volume.shape, R::ZERO);
+    op.adjoint(g, views, y.view(), out.view_mut());
+    out
+}
+
+fn dot<R: Real>(a: &Array3<R>, b: &Array3<R>) -> f64 {
+    Zip::from(a).and(b).fold(0.0, |sum, x, y| sum + x.f64() * y.f64())
+}
+
+fn flat<R: Real>(x: &Array3<R>) -> Vec<R> {
+    x.iter().copied().collect()
+}
+
+/// `Some(complaint)` where the relative error of `a` against `b` is above `most` or not a number.
+fn apart<A: Real, B: Real>(what: &str, a: &Array3<A>, b: &Array3<B>, most: f64) -> Option<String> {
+    let e = error(&flat(a), &flat(b));
+    // A NaN is not below anything.
+    (!(e <= most)).then(|| format!("{what}: off by {e:.1e}, at most {most:.0e}"))
+}
+
+fn adjoint<R: Real>(op: &dyn VoxelOperator<R>, most: f64) -> Outcome {
+    let mut worst = 0.0f64;
+    let mut complaint = None;
+    for (i, g) in geometries().iter().enumerate() {
+        let views = all_views(g);
+        for seed in [7, 8] {
+            let (x, y) = (noise::<R>(g.volume.shape, seed), noise::<R>(pixels(g, views.len()), seed + 100));
+            let (ax, aty) = (forward(op, g, &views, &x), back(op, g, &views, &y));
+            let norm = (dot(&ax, &ax) * dot(&y, &y)).sqrt();
+            let off = (dot(&ax, &y) - dot(&x, &aty)).abs() / norm;
+            worst = worst.max(off);
+            if !(off <= most) {
+                complaint = complaint.or(Some(format!("geometry {i}: <Ax, y> and <x, Aᵀy> differ by {off:.1e}")));
+            }
+        }
+    }
+    settle(complaint, &format!("off by {worst:.1e} at most"))
+}
+
+fn single_precision(p: &dyn VoxelProjector) -> Outcome {
+    let complaint = geometries().iter().enumerate().find_map(|(i, g)| {
+        let views = all_views(g);
+        let (x, y) = (noise::<f32>(g.volume.shape, 3), noise::<f32>(pixels(g, views.len()), 4));
+        let wide = |a: &Array3<f32>| a.mapv(f64::from);
+        let lines =
+            [forward(p.operator(), g, &views, &x).mapv(f64::from), forward(p.reference(), g, &views, &wide(&x))];
+        let voxels = [back(p.operator(), g, &views, &y).mapv(f64::from), back(p.reference(), g, &views, &wide(&y))];
+        apart(&format!("geometry {i}: line integrals"), &lines[0], &lines[1], SINGLE)
+            .or_else(|| apart(&format!("geometry {i}: voxels"), &voxels[0], &voxels[1], SINGLE))
+    });
+    settle(complaint, &format!("within {SINGLE:.0e} of double precision"))
+}
+
+/// Lengths are mm: an ellipsoid's projections approach their closed form as voxels become finer, and their sum is right.
+fn closed_form(op: &dyn VoxelOperator<f32>) -> Outcome {
+    let body = [Ellipsoid { center: [2.0, -1.0, 1.5], axes: [15.0, 11.0, 13.0], value: 0.02 }];
+    let of = |n: usize| {
+        let g = Geometry {
+            detector: [24, 24],
+            views: [0.1, 1.2, 2.5].map(|a| view(a, [100.0, 150.0], [2.6; 2], [0.7, -1.1])).to_vec(),
+            volume: VoxelGrid { shape: [n; 3], spacing: [40.0 / n as f64; 3], center: [0.0; 3] },
+        };
+        let found = forward(op, &g, &all_views(&g), &ellipsoids(&body, &g.volume).data);
+        let exact = scan_ellipsoids(&body, g).projections;
+        let square = found.iter().zip(&exact).map(|(a, b)| f64::from(a - b).powi(2)).sum::<f64>();
+        let sum = |x: &Array3<f32>| x.iter().map(|&v| f64::from(v)).sum::<f64>();
+        ((square * exact.len() as f64).sqrt() / sum(&exact), sum(&found) / sum(&exact))
+    };
+    let [(coarse, _), (fine, sum)] = [of(20), of(40)];
+    let complaint = if !(fine <= CLOSED_FORM) {
+        Some(format!("off by {fine:.3} of the mean, at most {CLOSED_FORM}"))
+    } else if !((sum - 1.0).abs() <= 0.01) {
+        Some(format!("all line integrals together are {sum:.4} of what they should be"))
+    } else if fine * REFINED > coarse {
+        Some(format!("off by {coarse:.3} on coarse voxels and still by {fine:.3} on voxels of half the size"))
+    } else {
+        None
+    };
+    settle(complaint, &format!("off by {coarse:.3} and {fine:.3} of the mean, in sum {sum:.4}"))
+}
+
+fn linear(op: &dyn VoxelOperator<f64>) -> Outcome {
+    let g = crooked(false);
+    let views = all_views(&g);
+    let mixed = |a: &Array3<f64>, b: &Array3<f64>| 2.5 * a - 0.75 * b;
+    let [x, y] = [1, 2].map(|s| noise::<f64>(g.volume.shape, s));
+    let [p, q] = [3, 4].map(|s| noise::<f64>(pixels(&g, views.len()), s));
+    let complaint = {
+        let [a, b, both] = [&x, &y, &mixed(&x, &y)].map(|v| forward(op, &g, &views, v));
+        apart("line integrals of a sum", &both, &mixed(&a, &b), 1e-12)
+    };
+    let complaint = complaint.or_else(|| {
+        let [a, b, both] = [&p, &q, &mixed(&p, &q)].map(|v| back(op, &g, &views, v));
+        apart("voxels from a sum", &both, &mixed(&a, &b), 1e-12)
+    });
+    settle(complaint, "sums and multiples go through")
+}
+
+/// A view's line integrals are the same bits whatever other views are asked for, in whatever order and how often; and the
+/// adjoint of several views is the sum of theirs.
+fn views_stand_alone(p: &dyn VoxelProjector) -> Outcome {
+    let g = crooked(false);
+    let x = noise::<f32>(g.volume.shape, 5);
+    let alone: Vec<Array3<f32>> = all_views(&g).iter().map(|&v| forward(p.operator(), &g, &[v], &x)).collect();
+    let mut complaint = None;
+    for views in [vec![0, 1, 2, 3, 4, 5], vec![5, 2, 0], vec![1, 1, 4, 1], vec![3, 4]] {
+        let all = forward(p.operator(), &g, &views, &x);
+        for (i, &v) in views.iter().enumerate() {
+            let found: Vec<f32> = all.index_axis(Axis(0), i).iter().copied().collect();
+            let what = format!("view {v} among {views:?}, pixel");
+            complaint = complaint.or_else(|| differing(&what, &found, &flat(&alone[v])));
+        }
+        let y = noise::<f64>(pixels(&g, views.len()), 6);
+        let mut sum = Array3::zeros(g.volume.shape);
+        for (&v, image) in views.iter().zip(y.axis_iter(Axis(0))) {
+            sum += &back(p.reference(), &g, &[v], &image.insert_axis(Axis(0)).to_owned());
+        }
+        let together = back(p.reference(), &g, &views, &y);
+        complaint = complaint.or_else(|| apart(&format!("voxels from views {views:?}"), &together, &sum, 1e-12));
+    }
+    let none = forward(p.operator(), &g, &[], &x);
+    complaint = complaint.or_else(|| (!none.is_empty()).then(|| "no views gave something".into()));
+    settle(complaint, "alone, together, turned round and repeated")
+}
+
+fn projections_overwrite(op: &dyn VoxelOperator<f32>) -> Outcome {
+    let complaint = geometries().iter().find_map(|g| {
+        let views = all_views(g);
+        let x = noise::<f32>(g.volume.shape, 5);
+        let clean = forward(op, g, &views, &x);
+        let mut over = Array3::from_elem(clean.dim(), f32::NAN);
+        op.forward(g, &views, x.view(), over.view_mut());
+        differing("pixel", &flat(&over), &flat(&clean))
+    });
+    settle(complaint, "over NaN as over 0")
+}
+
+fn adjoint_adds(op: &dyn VoxelOperator<f64>) -> Outcome {
+    let complaint = geometries().iter().find_map(|g| {
+        let views = all_views(g);
+        let (before, y) = (noise::<f64>(g.volume.shape, 5), noise::<f64>(pixels(g, views.len()), 6));
+        let mut after = before.clone();
+        op.adjoint(g, &views, y.view(), after.view_mut());
+        apart("what was there is not kept", &after, &(&before + &back(op, g, &views, &y)), 1e-12)
+    });
+    settle(complaint, "to what is there")
+}
+
+/// The same bits on pools of one and of three threads, and from callers at the same time.
+fn threads(op: &dyn VoxelOperator<f32>) -> Outcome {
+    let g = crooked(false);
+    let views = all_views(&g);
+    let (x, y) = (noise::<f32>(g.volume.shape, 1), noise::<f32>(pixels(&g, views.len()), 2));
+    let both = || [flat(&forward(op, &g, &views, &x)), flat(&back(op, &g, &views, &y))].concat();
+    let want = both();
+    let mut complaint = None;
+    for n in [1, 3] {
+        let Ok(pool) = ThreadPoolBuilder::new().num_threads(n).build() else {
+            return Outcome::Skipped(format!("no pool of {n} threads"));
+        };
+        complaint = complaint.or_else(|| differing(&format!("{n} threads, number"), &pool.install(both), &want));
+    }
+    let found: Vec<Vec<f32>> = std::thread::scope(|scope| {
+        let started: Vec<_> = (0..3).map(|_| scope.spawn(both)).collect();
+        started.into_iter().filter_map(|t| t.join().ok()).collect()
+    });
+    let missing = (found.len() != 3).then(|| "a caller panicked".to_string());
+    let complaint = complaint.or(missing);
+    let complaint = complaint.or_else(|| found.iter().find_map(|f| differing("several callers, number", f, &want)));
+    settle(complaint, "1 and 3 threads, 3 callers")
+}
+
+/// Rays that pass the voxels by give exactly 0 and take nothing back, and emptiness gives emptiness.
+fn rays_that_miss(p: &dyn VoxelProjector) -> Outcome {
+    let mut g = crooked(false);
+    // Twice as far out as the voxels reach.
+    g.detector = [61, 67];
+    let views = all_views(&g);
+    let [low, high] = g.volume.bounds();
+    // Interpolation may reach a voxel beyond the box.
+    let around = [0, 1].map(|s| {
+        let side = if s == 0 { low } else { high };
+        std::array::from_fn(|k| side[k] + g.volume.spacing[k] * if s == 0 { -1.0 } else { 1.0 })
+    });
+    let hit = Array3::from_shape_fn(pixels(&g, views.len()), |(v, r, c)| g.ray(v, r, c).clip(around).is_some());
+    let misses = hit.iter().filter(|h| !**h).count();
+    let lines = forward(p.operator(), &g, &views, &Array3::ones(g.volume.shape));
+    let mut complaint = (misses == 0 || misses == hit.len()).then(|| "no ray misses".to_string());
+    for (found, h) in lines.iter().zip(&hit) {
+        if !h && *found != 0.0 {
+            complaint = complaint.or(Some(format!("a ray that misses gives {found:e}")));
+        }
+    }
+    complaint = complaint.or_else(|| lines.iter().all(|x| *x == 0.0).then(|| "rays that meet voxels give 0".into()));
+    let outside = hit.mapv(|h| if h { 0.0 } else { 1.0 });
+    let zero =
+        |what: &str, x: &Array3<f64>| x.iter().find(|v| **v != 0.0).map(|v| format!("{what}: {v:e} instead of 0"));
+    let op = p.reference();
+    let complaint = complaint
+        .or_else(|| zero("voxels from rays that miss", &back(op, &g, &views, &outside)))
+        .or_else(|| zero("line integrals of nothing", &forward(op, &g, &views, &Array3::zeros(g.volume.shape))))
+        .or_else(|| zero("voxels from nothing", &back(op, &g, &views, &Array3::zeros(pixels(&g, views.len())))));
+    settle(complaint, &format!("{misses} of {} rays miss", hit.len()))
+}
+
+/// Rays along axes, on the faces between voxels and through corners, large and tiny numbers: never a NaN or an infinity.
+fn finite(op: &dyn VoxelOperator<f32>) -> Outcome {
+    // The middle ray runs along x through the faces between voxels, others through their edges.
+    let along = |shape: [usize; 3], detector| Geometry {
+        detector,
+        views: [0.0, 0.5, 1.0, 1.5, 0.25]
+            .map(|turn| view(turn * std::f64::consts::PI, [40.0, 80.0], [2.0; 2], [0.0; 2]))
+            .to_vec(),
+        volume: VoxelGrid { shape, spacing: [1.0; 3], center: [0.0; 3] },
+    };
+    let mut all =
+        vec![along([8, 8, 8], [9, 9]), along([8, 8, 8], [8, 8]), along([1, 1, 1], [3, 3]), along([7, 2, 1], [1, 1])];
+    // A source that nearly touches the voxels.
+    let mut near = along([8, 8, 8], [9, 9]);
+    near.views.iter_mut().for_each(|v| v.source = v.source.map(|x| x * 6.0 / 40.0));
+    all.push(near);
+    all.extend(geometries());
+    let mut complaint = None;
+    for (i, g) in all.iter().enumerate() {
+        let views = all_views(g);
+        for value in [1.0f32, -1e30, 1e-40, f32::MIN_POSITIVE] {
+            let lines = forward(op, g, &views, &Array3::from_elem(g.volume.shape, value));
+            let voxels = back(op, g, &views, &Array3::from_elem(pixels(g, views.len()), value));
+            let bad = lines.iter().chain(&voxels).find(|x| !x.is_finite());
+            complaint = complaint.or_else(|| bad.map(|x| format!("geometry {i} of {value:e}: {x}")));
+        }
+    }
+    settle(complaint, &format!("{} geometries", all.len()))
+}
