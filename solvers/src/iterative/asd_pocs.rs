@@ -2,11 +2,10 @@
 //! of steepest descent on total variation, whose length is tied to what the data pass changed.
 
 use super::algebraic::{Algebraic, Sweep};
+use super::noise::{self, Noise};
 use super::order::{Order, subsets, told};
 use super::tv::{anisotropy, descend};
-use super::{
-    Method, Pass, Problem, Stop, change, distance, drive, flat_mut, noise, norm2, projector, refuse_others, start,
-};
+use super::{Method, Pass, Problem, Stop, change, distance, drive, flat_mut, norm2, projector, refuse_others, start};
 use conefield_core::error::{Result, ensure};
 use conefield_core::scan::Scan;
 use conefield_core::solver::{Job, Observer, Solution, Solver};
@@ -90,7 +89,7 @@ impl Solver for AsdPocs {
         let projector = projector(job)?;
         observer.note(&format!("{}; {}", self.describe(), projector.describe()));
         let problem = Problem { scan: job.scan, operator: projector.operator(), seed: job.seed };
-        let sigma = noise::sigma(job.scan);
+        let sigma = Noise::of(job.scan, false).sigma;
         let mut iterate = Iterate {
             settings: self.clone(),
             sweep: Sweep::new(&self.data(), &problem, start(job)?),
@@ -107,7 +106,7 @@ impl Solver for AsdPocs {
     }
 
     fn plan(&self, scan: &Scan) -> Vec<String> {
-        let noise = format!("noise of {:.3e} in line integrals", noise::sigma(scan));
+        let noise = Noise::of(scan, false).to_string();
         vec![told(&subsets(scan.geometry.views.len(), self.subsets)), noise]
     }
 

@@ -1,42 +1,164 @@
 //! The noise of a scan, from the scan alone.
 
+use super::Problem;
 use conefield_core::scan::Scan;
-use ndarray::Axis;
+use ndarray::{Array3, Axis};
 use rayon::prelude::*;
 
-/// Bytes that [`sigma`] takes: the differences, in lists and then in one.
-pub fn memory(pixels: u64) -> u64 {
-    2 * 4 * pixels
+/// Pixels looked at, about.
+const LOOKED_AT: usize = 4 << 20;
+/// Groups of equally many pixels, from low to high line integrals.
+const GROUPS: usize = 16;
+
+/// Noise of line integrals `p` with the variance `sigma²·exp(growth·p)`: what Poisson counts leave behind the logarithm,
+/// with a growth of 1 (the variance of `−ln(I/I₀)` is about `1/I = exp(p)/I₀`).
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Noise {
+    /// Standard deviation where nothing is in the way.
+    pub sigma: f64,
+    /// How the variance grows with the line integral, 0 or more.
+    pub growth: f64,
 }
 
-/// Standard deviation of the line integrals' noise where rays meet the object: second differences along rows hold little
-/// else than noise, and their median absolute value is hardly moved by edges. For white noise `p[-1] − 2p[0] + p[1]` has
-/// the variance 6σ². Noise that is correlated between pixels is underestimated.
-pub fn sigma(scan: &Scan) -> f64 {
+impl std::fmt::Display for Noise {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        write!(f, "noise of {:.3e} in line integrals", self.sigma)?;
+        if self.growth > 0.0 {
+            write!(f, " near 0, variance growing as exp({:.2}·p)", self.growth)?;
+        }
+        Ok(())
+    }
+}
+
+impl Noise {
+    /// The noise where rays meet the object: second differences along rows hold little else, and the median of their
+    /// absolute values is hardly moved by edges. For white noise `p[-1] − 2p[0] + p[1]` has the variance 6σ². Noise that
+    /// is correlated between pixels is underestimated. `growing` also fits how it grows from group to group, a line
+    /// through the logarithms of the variances.
+    pub fn of(scan: &Scan, growing: bool) -> Self {
+        let mut all = differences(scan);
+        if all.is_empty() {
+            return Self { sigma: 0.0, growth: 0.0 };
+        }
+        all.par_sort_unstable_by(|a, b| a.0.total_cmp(&b.0).then(a.1.total_cmp(&b.1)));
+        let size = all.len().div_ceil(if growing { GROUPS } else { 1 });
+        let points: Vec<[f64; 2]> = all
+            .chunks_mut(size)
+            .map(|group| {
+                let level = group[group.len() / 2].0;
+                let (_, middle, _) = group.select_nth_unstable_by(group.len() / 2, |a, b| a.1.total_cmp(&b.1));
+                // The median of |x| of a normal distribution is 0.6745 standard deviations.
+                let sigma = f64::from(middle.1) / 0.674_489_750_196_081_7 / 6f64.sqrt();
+                [f64::from(level), sigma]
+            })
+            .collect();
+        line(&points)
+    }
+
+    /// Multiplies values of `views` with `exp(−power·growth·p)`, at most 1: with a power of 1 the weights of a
+    /// likelihood, inverse variances up to a factor. Returns `Σ w·y²`.
+    pub fn weigh(&self, power: f64, problem: &Problem<'_>, views: &[usize], y: &mut Array3<f32>) -> f64 {
+        let rate = (power * self.growth) as f32;
+        let sums: Vec<f64> = y
+            .axis_iter_mut(Axis(0))
+            .into_par_iter()
+            .zip(views)
+            .map(|(mut image, &view)| {
+                let mut sum = 0.0;
+                image.zip_mut_with(&problem.scan.view(view), |y, p| {
+                    let weighted = if rate > 0.0 { *y * (-rate * p.max(0.0)).exp() } else { *y };
+                    sum += f64::from(weighted) * f64::from(*y);
+                    *y = weighted;
+                });
+                sum
+            })
+            .collect();
+        sums.iter().sum()
+    }
+}
+
+/// Bytes that [`Noise::of`] takes: pairs of numbers, in lists and then in one.
+pub fn memory(pixels: u64) -> u64 {
+    2 * 8 * pixels.min(2 * LOOKED_AT as u64)
+}
+
+/// Levels and absolute second differences of pixels within the object.
+fn differences(scan: &Scan) -> Vec<(f32, f32)> {
     let top = scan.projections.iter().fold(0.0f32, |m, &x| m.max(x));
     // Outside the object negative noise is often cut off.
     let least = 0.1 * top;
-    let mut all: Vec<f32> = scan
-        .projections
-        .axis_iter(Axis(0))
-        .into_par_iter()
-        .flat_map_iter(|view| {
-            let mut found = vec![];
-            for row in view.rows() {
-                for c in 1..row.len().saturating_sub(1) {
-                    if row[c - 1] > least && row[c] > least && row[c + 1] > least {
-                        found.push((row[c - 1] - 2.0 * row[c] + row[c + 1]).abs());
-                    }
+    let every = scan.projections.len().div_ceil(LOOKED_AT).max(1);
+    let view = |(n, view): (usize, ndarray::ArrayView2<'_, f32>)| {
+        let mut found = vec![];
+        for row in view.rows() {
+            for c in (1 + n % every..row.len().saturating_sub(1)).step_by(every) {
+                let [a, b, c] = [row[c - 1], row[c], row[c + 1]];
+                if a > least && b > least && c > least {
+                    found.push(((a + b + c) / 3.0, (a - 2.0 * b + c).abs()));
                 }
             }
-            found
-        })
-        .collect();
-    if all.is_empty() {
-        return 0.0;
+        }
+        found
+    };
+    scan.projections.axis_iter(Axis(0)).into_par_iter().enumerate().flat_map_iter(view).collect()
+}
+
+/// The line of least squares through `ln σ²` over the level; level if it would fall.
+fn line(points: &[[f64; 2]]) -> Noise {
+    let seen: Vec<[f64; 2]> = points.iter().filter(|p| p[1] > 0.0).map(|p| [p[0], 2.0 * p[1].ln()]).collect();
+    let n = seen.len().max(1) as f64;
+    let mean: [f64; 2] = std::array::from_fn(|k| seen.iter().map(|p| p[k]).sum::<f64>() / n);
+    let [square, product] = [0, 1].map(|k| seen.iter().map(|p| (p[0] - mean[0]) * (p[k] - mean[k])).sum::<f64>());
+    if 2 * seen.len() <= points.len() {
+        // Most pixels equal their neighbours to the last bit: there is no noise.
+        return Noise { sigma: 0.0, growth: 0.0 };
     }
-    let middle = all.len() / 2;
-    let (_, median, _) = all.select_nth_unstable_by(middle, f32::total_cmp);
-    // The median of |x| of a normal distribution is 0.6745 standard deviations.
-    f64::from(*median) / 0.674_489_750_196_081_7 / 6f64.sqrt()
+    let growth = if square > 0.0 { (product / square).max(0.0) } else { 0.0 };
+    Noise { sigma: (0.5 * (mean[1] - growth * mean[0])).exp(), growth }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use conefield_core::geometry::{Geometry, Millimetres, Radians, View, VoxelGrid};
+    use conefield_core::random::stream;
+    use conefield_core::scan::Unit;
+    use rand_distr::{Distribution, Normal};
+
+    /// A hill of line integrals up to 3 with noise of the standard deviation `sigma(p)`.
+    fn scan(sigma: impl Fn(f64) -> f64) -> Scan {
+        let mm = Millimetres;
+        let view = View::circular(Radians(0.0), mm(300.0), mm(400.0), [mm(1.0); 2], [mm(0.0); 2]);
+        let volume = VoxelGrid { shape: [8; 3], spacing: [1.0; 3], center: [0.0; 3] };
+        let geometry = Geometry { detector: [128, 256], views: vec![view; 4], volume };
+        let mut rng = stream(5, 0);
+        let normal = Normal::new(0.0, 1.0).unwrap();
+        let mut projections = Array3::zeros((4, 128, 256));
+        for ((_, _, c), x) in projections.indexed_iter_mut() {
+            let p = 3.0 * (std::f64::consts::PI * c as f64 / 255.0).sin();
+            *x = (p + sigma(p) * normal.sample(&mut rng)) as f32;
+        }
+        Scan { geometry, projections, unit: Unit { name: "mm".into(), mm: 1.0 }, provenance: serde_json::Value::Null }
+    }
+
+    #[test]
+    fn the_law_of_the_noise_is_found() {
+        let found = Noise::of(&scan(|p| 0.01 * (0.5 * p).exp()), true);
+        assert!((found.sigma / 0.01 - 1.0).abs() < 0.1 && (found.growth - 1.0).abs() < 0.05, "{found:?}");
+        let found = Noise::of(&scan(|_| 0.02), true);
+        assert!((found.sigma / 0.02 - 1.0).abs() < 0.1 && found.growth < 0.05, "{found:?}");
+        let found = Noise::of(&scan(|_| 0.02), false);
+        assert!((found.sigma / 0.02 - 1.0).abs() < 0.05 && found.growth == 0.0, "{found:?}");
+    }
+
+    #[test]
+    fn without_noise_little_is_found() {
+        let found = Noise::of(&scan(|_| 0.0), true);
+        assert!(found.sigma < 1e-3, "{found:?}");
+        let mut flat = scan(|_| 0.0);
+        flat.projections.fill(0.0);
+        assert_eq!(Noise::of(&flat, true), Noise { sigma: 0.0, growth: 0.0 });
+        flat.projections.fill(1.0);
+        assert_eq!(Noise::of(&flat, true), Noise { sigma: 0.0, growth: 0.0 });
+    }
 }
