@@ -20,7 +20,7 @@ fn scan(folder: &Path, views: usize, side: usize) -> PathBuf {
 fn scan_of(folder: &Path, views: usize, side: usize, voxels: usize) -> PathBuf {
     let mm = |x: f64| Millimetres(x);
     let view = |i: usize| {
-        let (angle, pixel) = (Radians(6.283 * i as f64 / views as f64), mm(200.0 / side as f64));
+        let (angle, pixel) = (Radians(std::f64::consts::TAU * i as f64 / views as f64), mm(200.0 / side as f64));
         View::circular(angle, mm(500.0), mm(750.0), [pixel; 2], [mm(0.0); 2])
     };
     let volume = VoxelGrid { shape: [voxels; 3], spacing: [96.0 / voxels as f64; 3], center: [0.0; 3] };
