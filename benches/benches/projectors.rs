@@ -52,30 +52,6 @@ fn geometry() -> Geometry {
     }
 }
 
-/// Minimum, median and maximum of some runs, in seconds.
-fn times(mut f: impl FnMut()) -> [f64; 3] {
-    let mut all: Vec<f64> = (0..RUNS)
-        .map(|_| {
-            let start = Instant::now();
-            f();
-            start.elapsed().as_secs_f64()
-        })
-        .collect();
-    all.sort_by(f64::total_cmp);
-    [all[0], all[RUNS / 2], all[RUNS - 1]]
-}
-
 fn report(name: &str, [low, median, high]: [f64; 3], work: f64, unit: &str) {
     println!("{name:<20} {median:.3} s ({low:.3} to {high:.3}), {:.2} G {unit}/s", work / median / 1e9);
-}
-
-/// Bytes a second that all threads together read from memory.
-fn bandwidth() -> f64 {
-    let data = vec![1.0f32; 64 << 20];
-    let threads = rayon::current_num_threads();
-    let [_, t, _] = times(|| {
-        let sum: f32 = data.par_chunks(data.len() / threads).map(|c| c.iter().copied().fold(0.0, f32::max)).sum();
-        assert!(sum > 0.0);
-    });
-    4.0 * data.len() as f64 / t
 }

@@ -7,19 +7,16 @@
 //! PyTorch beside it.
 
 use conefield_backend_cpu::Cpu;
+use conefield_benches::{multiply_adds, random_reads, spread};
 use conefield_core::backend::{Adam, Backend, Loss, TrainRay, Work};
-use conefield_core::dense::{Weights, affine};
-use conefield_core::pages::Pages;
 use conefield_core::pipeline::{Model, Pipeline};
 use conefield_core::random::{mix, unit};
-use conefield_core::simd::{Op, Simd, run};
 use conefield_core::spec::{EncoderSpec, FieldSpec, NormalizerSpec, ProjectorSpec};
 use conefield_core::stage::UnitRay;
 use conefield_encoders::hash_grid::HashGrid;
 use conefield_fields::mlp::Mlp;
 use conefield_normalizers::layer_norm::LayerNorm;
 use conefield_projectors::ray_march::{RayMarch, Sampling};
-use rayon::prelude::*;
 use std::error::Error;
 use std::time::Instant;
 
@@ -88,9 +85,7 @@ fn main() -> Result<(), Box<dyn Error>> {
     );
 
     // Forward once, backward twice (gradients of inputs and of weights), for all but the interpolation.
-    let threads = rayon::current_num_threads() as f64;
-    let peak = multiply_adds() * threads;
-    let reads = random_reads() * threads;
+    let (peak, reads) = (multiply_adds(), random_reads());
     let per_sample = 3 * macs;
     // On each of the 7 hashed levels 4 of the 8 corners lie in lines of their own, read forward and updated backward.
     let lines = 2 * 4 * 7;
@@ -105,12 +100,6 @@ fn main() -> Result<(), Box<dyn Error>> {
     let limit = 1.0 / (1.0 / by_math + 1.0 / by_reads);
     println!("  one after another  {:.1} M samples/s; reached {:.0} %", limit / 1e6, 100.0 * samples / step / limit);
     Ok(())
-}
-
-/// Minimum, median and maximum.
-fn spread(times: &mut [f64]) -> [f64; 3] {
-    times.sort_by(f64::total_cmp);
-    [times[0], times[times.len() / 2], times[times.len() - 1]]
 }
 
 /// Rays of a scan at five half sides, through random pixels.
@@ -130,49 +119,4 @@ fn rays() -> Vec<TrainRay> {
             }
         })
         .collect()
-}
-
-/// Multiply-adds a second of one thread in a dense layer that stays in the first-level cache.
-fn multiply_adds() -> f64 {
-    struct Layer<'a>(&'a [f32], &'a [f32], &'a mut [f32]);
-    impl Op for Layer<'_> {
-        type Out = ();
-        #[inline(always)]
-        fn call<S: Simd>(self, s: S) {
-            affine(s, Weights { data: self.0, ld: 64, column: 0 }, None, self.1, self.2, 64);
-        }
-    }
-    let (w, x, mut y) = (vec![0.01; 64 * 64], vec![0.02; 64 * 64], vec![0.0; 64 * 64]);
-    let rounds = 4000;
-    let best = (0..5)
-        .map(|_| {
-            let start = Instant::now();
-            for _ in 0..rounds {
-                run(Layer(&w, &x, &mut y));
-            }
-            start.elapsed().as_secs_f64()
-        })
-        .fold(f64::MAX, f64::min);
-    (rounds * 64 * 64 * 64) as f64 / best
-}
-
-/// Reads a second of one thread from random cache lines of 32 MiB, all threads at it.
-fn random_reads() -> f64 {
-    let table = Pages::zeros(8 << 20);
-    let count = 4_000_000u32;
-    let each: Vec<f64> = (0..rayon::current_num_threads())
-        .into_par_iter()
-        .map(|t| {
-            let (mut state, mut sum) = (t as u32 + 1, 0.0);
-            let start = Instant::now();
-            for _ in 0..count {
-                state = state.wrapping_mul(1_664_525).wrapping_add(1_013_904_223);
-                sum += table[(state >> 9) as usize];
-            }
-            let time = start.elapsed().as_secs_f64();
-            assert!(sum == 0.0);
-            f64::from(count) / time
-        })
-        .collect();
-    each.iter().sum::<f64>() / each.len() as f64
 }

@@ -1,1 +1,93 @@
-//! Speed of conefield, measured in `benches/`.
+//! Speed of conefield, measured in `benches/`, and what the machine allows at most, measured in the same run.
+
+use conefield_core::dense::{Weights, affine};
+use conefield_core::pages::Pages;
+use conefield_core::simd::{Op, Simd, run};
+use rayon::prelude::*;
+use std::time::Instant;
+
+/// Minimum, median and maximum.
+pub fn spread(times: &mut [f64]) -> [f64; 3] {
+    times.sort_by(f64::total_cmp);
+    [times[0], times[times.len() / 2], times[times.len() - 1]]
+}
+
+/// Minimum, median and maximum of some runs, in seconds.
+pub fn times(runs: usize, mut f: impl FnMut()) -> [f64; 3] {
+    let mut all: Vec<f64> = (0..runs)
+        .map(|_| {
+            let start = Instant::now();
+            f();
+            start.elapsed().as_secs_f64()
+        })
+        .collect();
+    spread(&mut all)
+}
+
+/// Multiply-adds a second of all threads, in dense layers that stay in the first-level cache.
+pub fn multiply_adds() -> f64 {
+    struct Layer<'a>(&'a [f32], &'a [f32], &'a mut [f32]);
+    impl Op for Layer<'_> {
+        type Out = ();
+        #[inline(always)]
+        fn call<S: Simd>(self, s: S) {
+            affine(s, Weights { data: self.0, ld: 64, column: 0 }, None, self.1, self.2, 64);
+        }
+    }
+    let rounds = 4000;
+    let threads = rayon::current_num_threads();
+    let (w, x) = (vec![0.01; 64 * 64], vec![0.02; 64 * 64]);
+    let [best, ..] = times(5, || {
+        (0..threads).into_par_iter().for_each(|_| {
+            let mut y = vec![0.0; 64 * 64];
+            for _ in 0..rounds {
+                run(Layer(&w, &x, &mut y));
+            }
+        });
+    });
+    (threads * rounds * 64 * 64 * 64) as f64 / best
+}
+
+/// Bytes a second that all threads together read from memory, one after the other.
+pub fn bandwidth() -> f64 {
+    let data = vec![1.0f32; 64 << 20];
+    let threads = rayon::current_num_threads();
+    let [best, ..] = times(5, || {
+        let sum: f32 = data
+            .par_chunks(data.len().div_ceil(threads))
+            .map(|part| {
+                // As many sums as keep every load in flight.
+                let mut sums = [0.0f32; 64];
+                for line in part.as_chunks::<64>().0 {
+                    for (sum, x) in sums.iter_mut().zip(line) {
+                        *sum += x;
+                    }
+                }
+                sums.iter().sum::<f32>()
+            })
+            .sum();
+        assert!(sum > 0.0);
+    });
+    (4 * data.len()) as f64 / best
+}
+
+/// Reads a second of all threads together from random cache lines of 32 MiB.
+pub fn random_reads() -> f64 {
+    let table = Pages::zeros(8 << 20);
+    let count = 4_000_000u32;
+    let each: Vec<f64> = (0..rayon::current_num_threads())
+        .into_par_iter()
+        .map(|t| {
+            let (mut state, mut sum) = (t as u32 + 1, 0.0);
+            let start = Instant::now();
+            for _ in 0..count {
+                state = state.wrapping_mul(1_664_525).wrapping_add(1_013_904_223);
+                sum += table[(state >> 9) as usize];
+            }
+            let time = start.elapsed().as_secs_f64();
+            assert!(sum == 0.0);
+            f64::from(count) / time
+        })
+        .collect();
+    each.iter().sum()
+}

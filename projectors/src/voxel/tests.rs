@@ -20,7 +20,7 @@ fn circular(angle: f64, dso: f64, dsd: f64, pixel: [f64; 2], offset: [f64; 2]) -
 
 /// Non-square detector and volume, anisotropic voxels beside the axis, offsets, angles at and between the axes.
 fn crooked(upright: bool) -> Geometry {
-    let angles = [0.0, 0.3, 0.785_398_163_397_448_3, 1.6, 2.9, 3.7, 4.712_388_980_384_69, 5.5];
+    let angles = [0.0, 0.3, std::f64::consts::FRAC_PI_4, 1.6, 2.9, 3.7, 1.5 * std::f64::consts::PI, 5.5];
     let mut views: Vec<View> = angles.iter().map(|&a| circular(a, 90.0, 140.0, [2.1, 1.7], [3.0, -4.5])).collect();
     views[3].v[2] *= -1.0; // rows that run upwards
     if !upright {

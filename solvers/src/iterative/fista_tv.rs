@@ -1,8 +1,13 @@
 //! Total variation by ordered-subset FISTA: `min_{x ≥ 0} ½‖A·x − p‖² + λ·TV(x)` (Beck and Teboulle, SIAM J. Imaging Sci.
 //! 2(1), 2009; ordered subsets with momentum as in Kim, Ramani and Fessler, IEEE Trans. Med. Imaging 34(1), 2015).
 //!
-//! The step is `1/L` with L an upper bound of the largest eigenvalue of AᵀA: for a matrix without negative entries
-//! `max_j (AᵀA·v)_j/v_j` is one for any positive v (Collatz and Wielandt), and power iterations make it tight.
+//! With n subsets the step is `1/L`, L an upper bound of the largest eigenvalue of every `n·A_sᵀA_s`: for a matrix without
+//! negative entries `max_j (AᵀA·v)_j/v_j` is one for any positive v (Collatz and Wielandt), and power iterations make it
+//! tight.
+//!
+//! Subsets and unbounded momentum do not go together: what one subset's gradient lacks of the others' is amplified, and
+//! the iterates run away. FISTA's t is therefore held at 100/n (on 50 views with 10 subsets 10 was stable, 20 was not), and
+//! after a pass whose objective is above the last one's two subsets become one, down to plain FISTA, which converges.
 
 use super::order::{Order, subsets};
 use super::tv::{TvProx, anisotropy, total_variation};
@@ -48,6 +53,9 @@ impl Default for FistaTv {
         Self { stop, weight: Weight::Noise(2.0), subsets: 10, order: Order::Golden, inner: 4 }
     }
 }
+
+/// FISTA's t goes up to this over the number of subsets.
+const MOMENTUM: f64 = 400.0;
 
 conefield_core::stage_type!(Solver, "fista-tv", FistaTv, "total variation by ordered-subset FISTA");
 
@@ -104,24 +112,29 @@ fn noise_gain(problem: &Problem<'_>) -> f64 {
     (norm2(&back) / met.max(1) as f64).sqrt()
 }
 
-/// An upper bound of the largest eigenvalue of AᵀA.
-fn largest_eigenvalue(problem: &Problem<'_>) -> f64 {
-    let views = problem.views();
-    let mut v = Array3::ones(problem.scan.geometry.volume.shape);
+/// An upper bound of the largest eigenvalue of `n·A_sᵀA_s` over n subsets.
+fn largest_eigenvalue(problem: &Problem<'_>, subsets: &[Vec<usize>]) -> f64 {
     let mut next = problem.zeros();
-    let mut bound = f64::INFINITY;
-    for _ in 0..3 {
-        problem.back(&views, &problem.forward(&views, &v), &mut next);
-        let top = next.iter().fold(0.0f32, |m, &x| m.max(x));
-        let ratio = |(a, b): (&f32, &f32)| if *b > 1e-6 { f64::from(a / b) } else { 0.0 };
-        bound = bound.min(next.iter().zip(&v).map(ratio).fold(0.0, f64::max));
-        Zip::from(&mut v).and(&next).par_for_each(|v, n| *v = n / top.max(f32::MIN_POSITIVE));
+    let mut worst = 0.0f64;
+    for views in subsets {
+        let mut v = Array3::ones(problem.scan.geometry.volume.shape);
+        let mut bound = f64::INFINITY;
+        for _ in 0..2 {
+            problem.back(views, &problem.forward(views, &v), &mut next);
+            let top = next.iter().fold(0.0f32, |m, &x| m.max(x));
+            let ratio = |(a, b): (&f32, &f32)| if *b > 1e-6 { f64::from(a / b) } else { 0.0 };
+            bound = bound.min(next.iter().zip(&v).map(ratio).fold(0.0, f64::max));
+            Zip::from(&mut v).and(&next).par_for_each(|v, n| *v = n / top.max(f32::MIN_POSITIVE));
+        }
+        worst = worst.max(bound);
     }
-    bound
+    subsets.len() as f64 * worst
 }
 
 struct Iterate {
-    subsets: Vec<Vec<usize>>,
+    views: usize,
+    /// How many subsets there are now.
+    subsets: f64,
     order: Order,
     inner: usize,
     x: Array3<f32>,
@@ -136,15 +149,20 @@ struct Iterate {
     lipschitz: f64,
     /// FISTA's t.
     t: f64,
+    /// The last pass' objective.
+    objective: f64,
 }
 
 impl Iterate {
     fn new(settings: &FistaTv, problem: &Problem<'_>, x: Array3<f32>, lambda: f64) -> Result<Self> {
         let grid = &problem.scan.geometry.volume;
-        let lipschitz = largest_eigenvalue(problem);
+        let views = problem.scan.geometry.views.len();
+        let parts = subsets(views, settings.subsets);
+        let lipschitz = largest_eigenvalue(problem, &parts);
         ensure(lipschitz > 0.0, "scan", "geometry", "rays that all miss the volume", "rays through the volume")?;
         Ok(Self {
-            subsets: subsets(problem.scan.geometry.views.len(), settings.subsets),
+            views,
+            subsets: parts.len() as f64,
             order: settings.order,
             inner: settings.inner,
             ahead: x.clone(),
@@ -156,6 +174,7 @@ impl Iterate {
             lambda,
             lipschitz,
             t: 1.0,
+            objective: f64::INFINITY,
         })
     }
 }
@@ -164,19 +183,19 @@ impl Method for Iterate {
     fn pass(&mut self, problem: &Problem<'_>, pass: u64) -> Result<Pass> {
         let before = self.x.clone();
         let mut residual = 0.0;
-        let count = self.subsets.len() as f64;
-        for s in self.order.of(self.subsets.len(), problem.seed, pass) {
-            let views = &self.subsets[s];
+        let subsets = subsets(self.views, self.subsets as usize);
+        for s in self.order.of(subsets.len(), problem.seed, pass) {
+            let views = &subsets[s];
             let difference = problem.residual(views, &self.ahead);
             residual += norm2(&difference);
             problem.back(views, &difference, &mut self.scratch);
-            let step = (count / self.lipschitz) as f32;
+            let step = (self.subsets / self.lipschitz) as f32;
             Zip::from(&mut self.scratch).and(&self.ahead).par_for_each(|g, z| *g = z + step * *g);
             let tau = (self.lambda / self.lipschitz) as f32;
             self.prox.apply(flat(&self.scratch), tau, self.inner, flat_mut(&mut self.fresh));
             let t = 0.5 * (1.0 + (1.0 + 4.0 * self.t * self.t).sqrt());
             let momentum = ((self.t - 1.0) / t) as f32;
-            self.t = t;
+            self.t = t.min((MOMENTUM / self.subsets).max(1.0));
             Zip::from(&mut self.ahead)
                 .and(&self.fresh)
                 .and(&self.x)
@@ -187,6 +206,11 @@ impl Method for Iterate {
         let difference = Zip::from(&before).and(&self.x).par_map_collect(|a, b| a - b);
         let change = (norm2(&difference) / square.max(1e-300)).sqrt();
         let prior = self.lambda * total_variation(&self.x, self.anisotropy);
+        let objective = 0.5 * residual + prior;
+        if objective > self.objective {
+            self.subsets = (0.5 * self.subsets).ceil();
+        }
+        self.objective = objective;
         Ok(Pass { residual, change: Some(change), prior: Some(prior) })
     }
 
@@ -206,6 +230,6 @@ impl Method for Iterate {
     }
 
     fn numbers(&mut self) -> Vec<&mut f64> {
-        vec![&mut self.t]
+        vec![&mut self.t, &mut self.subsets, &mut self.objective]
     }
 }

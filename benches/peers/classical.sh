@@ -1,0 +1,28 @@
+#!/usr/bin/env bash
+# The projectors and FDK, ours and RTK's (CPU), one after the other on this machine and the same scan:
+#   bash benches/peers/classical.sh VOLUME.nii.gz OUT_FOLDER
+# 50 views of 512 × 512 of a volume of 256³. RTK is installed into a virtual environment in target/.
+set -euo pipefail
+cd "$(dirname "$0")/../.."
+volume=$1
+out=$2
+venv=target/rtk
+if [[ ! -x $venv/bin/python ]]; then
+    python3 -m venv "$venv"
+    "$venv/bin/pip" install --quiet itk-rtk numpy nibabel
+fi
+cargo build --release --quiet -p conefield
+cargo bench --quiet -p conefield-benches --bench projectors --no-run
+bin=${CARGO_TARGET_DIR:-target}/release/conefield
+scan=$out/scan
+mkdir -p "$out"
+[[ -d $scan ]] || "$bin" -q simulate "$volume" -o "$scan" --protocol r2 --views 50 --noise tigre:1e4,10
+# Twice each, in turn, so that a change of the machine's speed shows.
+for _ in 1 2; do
+    cargo bench --quiet -p conefield-benches --bench projectors -- "$scan"
+    "$venv/bin/python" benches/peers/rtk.py "$scan" "$volume"
+done
+for window in ramp hann; do
+    "$bin" -q reconstruct "$scan" --spec fdk --set "solver.window=$window" --set solver.nonnegative=false -o "$out/fdk-$window" \
+        --force --reference truth
+done
