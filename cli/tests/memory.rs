@@ -20,7 +20,7 @@ fn scan(folder: &Path, views: usize, side: usize) -> PathBuf {
 fn scan_of(folder: &Path, views: usize, side: usize, voxels: usize) -> PathBuf {
     let mm = |x: f64| Millimetres(x);
     let view = |i: usize| {
-        let (angle, pixel) = (Radians(6.283 * i as f64 / views as f64), mm(200.0 / side as f64));
+        let (angle, pixel) = (Radians(std::f64::consts::TAU * i as f64 / views as f64), mm(200.0 / side as f64));
         View::circular(angle, mm(500.0), mm(750.0), [pixel; 2], [mm(0.0); 2])
     };
     let volume = VoxelGrid { shape: [voxels; 3], spacing: [96.0 / voxels as f64; 3], center: [0.0; 3] };
@@ -37,7 +37,7 @@ fn scan_of(folder: &Path, views: usize, side: usize, voxels: usize) -> PathBuf {
 /// What a run was estimated to take and what it took, in bytes.
 fn measured(scan: &Path, run: &Path, spec: &str, sets: &[&str]) -> [u64; 2] {
     let (scan, run) = (text(scan), text(run));
-    let mut args = vec!["reconstruct", &scan, "--spec", spec, "-o", &run, "--json", "--steps", "2"];
+    let mut args = vec!["reconstruct", &scan, "--spec", spec, "-o", &run, "--json", "--steps", "1"];
     args.extend(sets.iter().flat_map(|s| ["--set", s]));
     let record = json(&args);
     [&record["memory"]["total"], &record["peak_bytes"]].map(|n| n.as_u64().unwrap())
@@ -92,9 +92,9 @@ fn the_estimate_is_near_the_peak_of_solvers_on_voxels() {
     let nonnegative = ["solver.nonnegative=true"];
     run("cgls", 60, 512, 64, &nonnegative);
     run("cgls", 16, 128, 224, &[]);
-    run("sirt", 30, 384, 160, &[]);
-    run("os-sart", 60, 384, 128, &["solver.stop.change=0.001"]);
-    run("asd-pocs", 40, 256, 160, &["solver.descents=1"]);
+    run("sirt", 30, 320, 144, &[]);
+    run("os-sart", 40, 320, 128, &["solver.stop.change=0.001", "solver.subsets=5"]);
+    run("asd-pocs", 16, 256, 160, &["solver.descents=1", "solver.subsets=4"]);
 }
 
 #[test]

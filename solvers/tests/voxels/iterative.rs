@@ -16,7 +16,7 @@ const ALL: [(&str, &str); 6] = [
     ("sirt", ""),
     ("cgls", ""),
     ("asd-pocs", "subsets = 6"),
-    ("fista-tv", "subsets = 6\nweight = { fixed = 1e-4 }"),
+    ("fista-tv", "subsets = 6\nweight = { fixed = 0.1 }"),
 ];
 
 fn spec(kind: &str, settings: &str) -> String {
@@ -92,7 +92,7 @@ fn fewer_views_than_fdk_needs_are_enough() {
         ("sirt", String::new(), 33.0),
         ("cgls", passes(6), 31.2),
         ("asd-pocs", "subsets = 5".into(), 38.0),
-        ("fista-tv", format!("subsets = 5\nweight = {{ fixed = 1e-4 }}\n{}", passes(6)), 29.0),
+        ("fista-tv", "subsets = 5\nweight = { fixed = 0.1 }".into(), 38.0),
     ] {
         let found = of(&spec(kind, &settings));
         println!("{kind}: {found:.1} dB");
@@ -119,7 +119,6 @@ fn attenuation_is_not_negative_unless_asked_for() {
 fn every_order_of_the_views_serves() {
     let (scan, truth) = (scan(), truth());
     for (kind, settings) in ALL.into_iter().filter(|(k, _)| ["sart", "os-sart", "fista-tv"].contains(k)) {
-        let least = if kind == "fista-tv" { 20.0 } else { 35.0 };
         let of = |order: &str| {
             let more = format!("{settings}\norder = \"{order}\"\n{}", passes(8));
             Case::of(&scan).volume(&spec(kind, &more)).0
@@ -127,7 +126,7 @@ fn every_order_of_the_views_serves() {
         let all = ["sequential", "random", "golden"].map(of);
         let reached = all.each_ref().map(|v| psnr(v, &truth));
         println!("{kind}: {reached:.2?} dB");
-        assert!(reached.iter().all(|r| *r > least), "{kind}: {reached:?}");
+        assert!(reached.iter().all(|r| *r > 35.0), "{kind}: {reached:?}");
         assert!(all[0].data != all[1].data && all[1].data != all[2].data && all[0].data != all[2].data, "{kind}");
         same_bits(&all[1], &of("random"), kind);
     }

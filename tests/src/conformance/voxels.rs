@@ -118,11 +118,15 @@ fn flat<R: Real>(x: &Array3<R>) -> Vec<R> {
     x.iter().copied().collect()
 }
 
+/// Whether `x` is above `most` or not a number.
+fn above(x: f64, most: f64) -> bool {
+    x.is_nan() || x > most
+}
+
 /// `Some(complaint)` where the relative error of `a` against `b` is above `most` or not a number.
 fn apart<A: Real, B: Real>(what: &str, a: &Array3<A>, b: &Array3<B>, most: f64) -> Option<String> {
     let e = error(&flat(a), &flat(b));
-    // A NaN is not below anything.
-    (!(e <= most)).then(|| format!("{what}: off by {e:.1e}, at most {most:.0e}"))
+    above(e, most).then(|| format!("{what}: off by {e:.1e}, at most {most:.0e}"))
 }
 
 fn adjoint<R: Real>(op: &dyn VoxelOperator<R>, most: f64) -> Outcome {
@@ -136,7 +140,7 @@ fn adjoint<R: Real>(op: &dyn VoxelOperator<R>, most: f64) -> Outcome {
             let norm = (dot(&ax, &ax) * dot(&y, &y)).sqrt();
             let off = (dot(&ax, &y) - dot(&x, &aty)).abs() / norm;
             worst = worst.max(off);
-            if !(off <= most) {
+            if above(off, most) {
                 complaint = complaint.or(Some(format!("geometry {i}: <Ax, y> and <x, Aᵀy> differ by {off:.1e}")));
             }
         }
@@ -174,9 +178,9 @@ fn closed_form(op: &dyn VoxelOperator<f32>) -> Outcome {
         ((square * exact.len() as f64).sqrt() / sum(&exact), sum(&found) / sum(&exact))
     };
     let [(coarse, _), (fine, sum)] = [of(20), of(40)];
-    let complaint = if !(fine <= CLOSED_FORM) {
+    let complaint = if above(fine, CLOSED_FORM) {
         Some(format!("off by {fine:.3} of the mean, at most {CLOSED_FORM}"))
-    } else if !((sum - 1.0).abs() <= 0.01) {
+    } else if above((sum - 1.0).abs(), 0.01) {
         Some(format!("all line integrals together are {sum:.4} of what they should be"))
     } else if fine * REFINED > coarse {
         Some(format!("off by {coarse:.3} on coarse voxels and still by {fine:.3} on voxels of half the size"))
