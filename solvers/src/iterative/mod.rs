@@ -211,7 +211,8 @@ pub fn drive(
         (step, seconds) = (resume.standing.step, resume.standing.seconds);
         observer.note(&format!("resumed after pass {step}"));
     }
-    let mut clock = Clock::new(Limits { steps: stop.passes, seconds: stop.seconds }, job.limits, seconds);
+    let mut clock =
+        Clock::new(Limits { steps: stop.passes, seconds: stop.seconds, at_most: None }, job.limits, seconds);
     let started = step;
     let mut settled = false;
     clock.resume();
@@ -237,7 +238,7 @@ pub fn drive(
         if cancelled {
             return Err(Error::Interrupted { step });
         }
-        if clock.share(step) >= 1.0 || settled {
+        if clock.done(step) >= 1.0 || settled {
             break;
         }
         let pass = method.pass(&problem, step)?;
@@ -274,7 +275,7 @@ pub fn drive(
         }
         observer.record(&record);
         clock.resume();
-        let share = clock.share(step);
+        let share = clock.done(step);
         observer.progress(step, share.min(1.0), clock.seconds() * (1.0 - share).max(0.0) / share.max(1e-9));
     }
     clock.pause();
