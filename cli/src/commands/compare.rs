@@ -421,7 +421,7 @@ fn ended_by(status: ExitStatus) -> Option<u8> {
     let signal = std::os::unix::process::ExitStatusExt::signal(&status);
     #[cfg(not(unix))]
     let signal = None;
-    signal.or(status.code().map(|c| c - 128)).and_then(|s| u8::try_from(s).ok())
+    signal.or(status.code().and_then(|c| c.checked_sub(128))).and_then(|s| u8::try_from(s).ok())
 }
 
 fn read_json<T: serde::de::DeserializeOwned>(path: &Path) -> Result<T> {
