@@ -230,11 +230,13 @@ fn a_signal_stops_it_and_resume_goes_on_to_the_same_bits() {
         let line = arguments(&scan, "fdk,sirt", out, more);
         line.into_iter().map(|w| if w == "3" { "4000".into() } else { w }).collect::<Vec<String>>()
     };
-    let (whole, out) = (dir.path().join("whole"), dir.path().join("out"));
+    let whole = dir.path().join("whole");
     done(&words(&line(&whole, &[])));
+    let mut out = PathBuf::new();
     for (signal, code) in [("INT", 130), ("TERM", 143)] {
+        out = dir.path().join(signal);
         let mut command = Command::new(assert_cmd::cargo::cargo_bin("conefield"));
-        command.arg("--quiet").args(line(&out, &["--force"])).stdout(Stdio::piped()).stderr(Stdio::piped());
+        command.arg("--quiet").args(line(&out, &[])).stdout(Stdio::piped()).stderr(Stdio::piped());
         let child = command.spawn().unwrap();
         let metrics = out.join("sirt/metrics.jsonl");
         let until = Instant::now() + Duration::from_secs(60);
@@ -269,5 +271,5 @@ fn a_cap_on_time_ends_what_a_budget_would_stretch() {
         json(&line)["steps"].as_u64().unwrap()
     };
     assert_eq!(run("whole", &["--at-most", "1h", "--set", "solver.stop.passes=5"]), 5);
-    assert_eq!(run("cut", &["--at-most", "1e-9s"]), 1);
+    assert!(run("cut", &["--at-most", "1e-9s"]) < 2);
 }
