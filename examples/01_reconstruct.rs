@@ -22,7 +22,7 @@ fn main() -> Result<(), Box<dyn Error>> {
         spec: &loaded.spec,
         backend: &backend,
         seed: 0,
-        limits: Limits { steps: Some(200), seconds: None },
+        limits: Limits { steps: Some(200), ..Limits::default() },
         weights: &|path| Err(conefield_core::Error::unsupported(path, "this example reads no weights")),
         volumes: &|path| Err(conefield_core::Error::unsupported(path, "this example reads no volumes")),
         resume: None,

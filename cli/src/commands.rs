@@ -1,6 +1,7 @@
 //! The subcommands.
 
 mod backends;
+mod compare;
 mod convert;
 mod demo;
 mod evaluate;
@@ -9,16 +10,18 @@ mod export;
 mod import;
 mod info;
 mod pretrain;
+mod protocol;
 mod reconstruct;
 mod schema;
 mod simulate;
 
-use clap::{Args, Subcommand, ValueEnum};
+use clap::{ArgAction, Args, Subcommand, ValueEnum};
 use conefield_backend_cpu::Cpu;
 use conefield_core::Result;
 use conefield_core::backend::Backend;
 use conefield_core::solver::Limits;
-use serde::Serialize;
+use serde::{Deserialize, Serialize};
+use std::ffi::OsString;
 
 /// What to do.
 #[derive(Subcommand)]
@@ -29,6 +32,8 @@ pub enum Command {
     Import(import::Import),
     /// Reconstruct a volume from a scan.
     Reconstruct(reconstruct::Reconstruct),
+    /// Reconstruct a scan in several ways under one protocol: a table and a picture.
+    Compare(compare::Compare),
     /// Train a field on known volumes, for weights that other scans start from (MCI).
     Pretrain(pretrain::Pretrain),
     /// Score a volume against a reference: PSNR, RMSE and three SSIMs.
@@ -50,11 +55,12 @@ pub enum Command {
 }
 
 /// Runs a subcommand.
-pub fn run(command: Command) -> Result<()> {
+pub fn run(command: Command, general: &General) -> Result<()> {
     match command {
         Command::Simulate(c) => c.run(),
         Command::Import(c) => c.run(),
         Command::Reconstruct(c) => c.run(),
+        Command::Compare(c) => c.run(general),
         Command::Pretrain(c) => c.run(),
         Command::Evaluate(c) => c.run(),
         Command::Export(c) => c.run(),
@@ -67,8 +73,41 @@ pub fn run(command: Command) -> Result<()> {
     }
 }
 
+/// Options of every subcommand.
+#[derive(Args)]
+pub struct General {
+    /// More log messages; twice for all.
+    #[arg(short, long, global = true, action = ArgAction::Count, help_heading = "General options")]
+    pub verbose: u8,
+    /// No progress, and of the log errors only.
+    #[arg(short, long, global = true, conflicts_with = "verbose", help_heading = "General options")]
+    pub quiet: bool,
+    /// Worker threads [default: one a core].
+    #[arg(long, global = true, value_name = "N", help_heading = "General options", value_parser = clap::value_parser!(u16).range(1..))]
+    pub threads: Option<u16>,
+    /// Memory that a command may take, such as 8GiB [default: what is available]. One that needs more is refused.
+    #[arg(long, global = true, value_name = "SIZE", help_heading = "General options", value_parser = crate::parse::bytes)]
+    pub memory: Option<u64>,
+}
+
+impl General {
+    /// The same again, for a child process.
+    pub fn arguments(&self) -> Vec<OsString> {
+        let mut all: Vec<OsString> = vec!["--verbose".into(); self.verbose.into()];
+        if self.quiet {
+            all.push("--quiet".into());
+        }
+        let numbers = [("--threads", self.threads.map(u64::from)), ("--memory", self.memory)];
+        for (flag, number) in numbers {
+            all.extend(number.map(|n| format!("{flag}={n}").into()));
+        }
+        all
+    }
+}
+
 /// Which backend computes.
-#[derive(Debug, Clone, Copy, Default, PartialEq, Eq, ValueEnum)]
+#[derive(Debug, Clone, Copy, Default, PartialEq, Eq, ValueEnum, Serialize)]
+#[serde(rename_all = "kebab-case")]
 pub enum BackendChoice {
     /// The fastest here.
     #[default]
@@ -87,7 +126,7 @@ impl BackendChoice {
 }
 
 /// When training ends, whichever comes first.
-#[derive(Debug, Clone, Args, Serialize)]
+#[derive(Debug, Clone, Args, Serialize, Deserialize)]
 pub struct Ends {
     /// Stop training after this time, such as 600s or 10m.
     #[arg(long, value_name = "TIME", value_parser = crate::parse::seconds)]
@@ -96,11 +135,16 @@ pub struct Ends {
     /// Stop training after this many steps.
     #[arg(long, value_name = "N", value_parser = clap::value_parser!(u64).range(1..))]
     pub steps: Option<u64>,
+    /// Stop training after this time at the latest. Unlike --budget this replaces no end of the spec, and what aims at
+    /// the end, such as a learning rate that goes down, does not look at it.
+    #[arg(long, value_name = "TIME", value_parser = crate::parse::seconds)]
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub at_most: Option<f64>,
 }
 
 impl Ends {
     /// As limits of a job.
     pub fn limits(&self) -> Limits {
-        Limits { steps: self.steps, seconds: self.budget }
+        Limits { steps: self.steps, seconds: self.budget, at_most: self.at_most }
     }
 }

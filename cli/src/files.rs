@@ -120,19 +120,25 @@ pub fn read_checkpoint(path: &Path, run: &BTreeMap<String, String>) -> Result<Re
     }
     let mut file = conefield_io::read_checkpoint(path)?;
     let standing = file.metadata.remove(STANDING).unwrap_or_default();
-    for (key, now) in run {
-        let then = file.metadata.get(key).map_or("nothing", String::as_str);
+    same_run(&place, &file.metadata, run)?;
+    let standing = serde_json::from_str(&standing)
+        .map_err(|e| Error::invalid(&place, STANDING, e, "what conefield writes there"))?;
+    Ok(Resume { place, standing, weights: Weights { tensors: file.tensors, ..Weights::default() } })
+}
+
+/// Refuses to go on with a run that was another one than `now`; `place` is the file that tells of it.
+pub fn same_run(place: &str, then: &BTreeMap<String, String>, now: &BTreeMap<String, String>) -> Result<()> {
+    for (key, now) in now {
+        let then = then.get(key).map_or("nothing", String::as_str);
         if then != now {
             // Of long texts, the first line that differs.
             let (a, b) = (then.lines(), now.lines());
             let pair = a.zip(b).find(|(a, b)| a != b).unwrap_or((then, now));
-            let expected = format!("{} as in the interrupted run; --force starts anew", pair.0);
+            let expected = format!("{} as in the earlier run; --force starts anew", pair.0);
             return Err(Error::invalid(place, format!("--resume: {key}"), pair.1, expected));
         }
     }
-    let standing = serde_json::from_str(&standing)
-        .map_err(|e| Error::invalid(&place, STANDING, e, "what conefield writes there"))?;
-    Ok(Resume { place, standing, weights: Weights { tensors: file.tensors, ..Weights::default() } })
+    Ok(())
 }
 
 /// Draws the middle slices of a result, with those of `reference` and their difference where there is one.

@@ -10,6 +10,7 @@ mod progress;
 mod run;
 mod signals;
 pub mod specs;
+mod table;
 
 // Stage types register themselves when their crate is linked.
 use {
@@ -17,7 +18,7 @@ use {
     conefield_projectors as _, conefield_solvers as _,
 };
 
-use clap::{ArgAction, Parser};
+use clap::Parser;
 use conefield_core::Error;
 use std::process::ExitCode;
 
@@ -27,39 +28,32 @@ use std::process::ExitCode;
 struct Cli {
     #[command(subcommand)]
     command: commands::Command,
-    /// More log messages; twice for all.
-    #[arg(short, long, global = true, action = ArgAction::Count, help_heading = "General options")]
-    verbose: u8,
-    /// No progress, and of the log errors only.
-    #[arg(short, long, global = true, conflicts_with = "verbose", help_heading = "General options")]
-    quiet: bool,
-    /// Worker threads [default: one a core].
-    #[arg(long, global = true, value_name = "N", help_heading = "General options", value_parser = clap::value_parser!(u16).range(1..))]
-    threads: Option<u16>,
-    /// Memory that a command may take, such as 8GiB [default: what is available]. One that needs more is refused.
-    #[arg(long, global = true, value_name = "SIZE", help_heading = "General options", value_parser = parse::bytes)]
-    memory: Option<u64>,
+    #[command(flatten)]
+    general: commands::General,
 }
 
 /// Runs the command line. Exit status: 0 done, 1 failed, 2 wrong use, 130 or 143 interrupted.
 pub fn main() -> ExitCode {
     let cli = Cli::parse();
-    progress::start_log(cli.verbose, cli.quiet);
-    if let Some(bytes) = cli.memory {
+    let general = cli.general;
+    progress::start_log(general.verbose, general.quiet);
+    if let Some(bytes) = general.memory {
         memory::set_budget(bytes);
     }
-    if let Some(n) = cli.threads
+    if let Some(n) = general.threads
         && let Err(e) = rayon::ThreadPoolBuilder::new().num_threads(n.into()).build_global()
     {
         eprintln!("error: {n} threads: {e}");
         return ExitCode::FAILURE;
     }
-    match commands::run(cli.command) {
+    match commands::run(cli.command, &general) {
         Ok(()) => ExitCode::SUCCESS,
         Err(e) => {
             eprintln!("error: {e}");
             match (&e, signals::caught()) {
-                (Error::Interrupted { .. } | Error::Cancelled { .. }, Some(signal)) => ExitCode::from(128 + signal),
+                (Error::Interrupted { .. } | Error::Stopped { .. } | Error::Cancelled { .. }, Some(signal)) => {
+                    ExitCode::from(128 + signal)
+                }
                 _ => ExitCode::FAILURE,
             }
         }

@@ -104,6 +104,15 @@ impl HoldOut {
     }
 }
 
+impl Display for HoldOut {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        match self {
+            Self::Views(views) => write!(f, "{}", views.iter().map(usize::to_string).collect::<Vec<_>>().join(",")),
+            Self::Every(k) => write!(f, "every:{k}"),
+        }
+    }
+}
+
 /// `3,17` or `every:10`.
 pub fn hold_out(text: &str) -> Result<HoldOut, String> {
     let form = || "expected view numbers from 0, such as 3,17, or every:10".to_owned();

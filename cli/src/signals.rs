@@ -3,6 +3,7 @@
 use conefield_core::{Error, Result};
 use signal_hook::consts::{SIGINT, SIGTERM};
 use signal_hook::flag;
+use std::io;
 use std::path::Path;
 use std::sync::atomic::{AtomicBool, AtomicUsize, Ordering};
 use std::sync::{Arc, OnceLock};
@@ -21,6 +22,20 @@ pub fn listen() -> Result<()> {
             .map_err(|e| Error::io(Path::new("signal handlers"), e))?;
     }
     Ok(())
+}
+
+/// Takes the end of standard input for a termination: whoever started this run holds the other end.
+pub fn follow_input() {
+    std::thread::spawn(|| {
+        let _ = io::copy(&mut io::stdin().lock(), &mut io::sink());
+        note(SIGTERM as u8);
+    });
+}
+
+/// Goes on as if this signal had come, unless one has.
+pub fn note(signal: u8) {
+    let caught = CAUGHT.get_or_init(Arc::default);
+    let _ = caught.compare_exchange(0, signal.into(), Ordering::Relaxed, Ordering::Relaxed);
 }
 
 /// The signal that came, if any did.

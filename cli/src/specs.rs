@@ -23,6 +23,12 @@ pub const SHIPPED: &[Shipped] = &[
     Shipped { name: "fista-tv", text: include_str!("../../specs/fista-tv.toml") },
 ];
 
+/// What a help text says of a spec: the names of all that are shipped.
+pub fn help() -> String {
+    let names: Vec<&str> = SHIPPED.iter().map(|s| s.name).collect();
+    format!("A shipped spec ({}) or a file", names.join(", "))
+}
+
 /// Reads a spec by its shipped name or from a file, with `sets` on top.
 pub fn read(what: &str, sets: &[String]) -> Result<Loaded> {
     load(what, sets, SHIPPED)

@@ -3,10 +3,11 @@
 mod common;
 use common::{conefield, done, refused};
 
-const COMMANDS: [&str; 12] = [
+const COMMANDS: [&str; 13] = [
     "simulate",
     "import",
     "reconstruct",
+    "compare",
     "pretrain",
     "evaluate",
     "export",
@@ -33,6 +34,26 @@ fn every_subcommand_has_help() {
 }
 
 #[test]
+fn lists_of_specs_and_stage_types_are_whole() {
+    let readme = include_str!("../../README.md");
+    let shipped = conefield::specs::SHIPPED;
+    let names: Vec<&str> = shipped.iter().map(|s| s.name).collect();
+    for command in ["reconstruct", "compare", "pretrain", "explain"] {
+        let help = done(&[command, "--help"]).split_whitespace().collect::<Vec<_>>().join(" ");
+        assert!(help.contains(&format!("shipped spec ({}) or a file", names.join(", "))), "{command}: {help}");
+    }
+    for name in names {
+        assert!(readme.contains(&format!("\n| `{name}` | ")), "README.md: the spec {name}");
+    }
+    let types = conefield_core::registry::stage_types();
+    assert!(types.len() > 20, "{}", types.len());
+    for t in types {
+        let row = format!("\n| {} | `{}` | {} |\n", format!("{:?}", t.kind).to_lowercase(), t.name, t.doc);
+        assert!(readme.contains(&row), "README.md lacks {row}");
+    }
+}
+
+#[test]
 fn version_is_told() {
     assert_eq!(done(&["--version"]).trim(), concat!("conefield ", env!("CARGO_PKG_VERSION")));
 }
@@ -52,6 +73,8 @@ fn wrong_use_exits_with_2() {
         (&["reconstruct", "s", "--spec", "naf", "-o", "r", "--steps", "0"], "--steps"),
         (&["reconstruct", "s", "--spec", "naf", "-o", "r", "--hold-out", "x"], "every:10"),
         (&["reconstruct", "s", "--spec", "naf", "-o", "r", "--backend", "abacus"], "cpu"),
+        (&["compare", "s", "-o", "r"], "--specs <SPEC,SPEC>"),
+        (&["compare", "s", "--specs", "fdk", "-o", "r", "--force", "--resume"], "--resume"),
         (&["import", "s.toml", "-o", "s", "--i0", "water"], "or air"),
         (&["evaluate", "a", "b", "--peak", "0"], "above 0"),
         (&["--threads", "0", "backends"], "--threads"),

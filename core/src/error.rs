@@ -42,6 +42,12 @@ pub enum Error {
         /// The last finished step.
         step: u64,
     },
+    /// The user interrupted a work of several parts.
+    #[error("interrupted during {part}; the same command with --resume goes on")]
+    Stopped {
+        /// The part that is not done.
+        part: String,
+    },
     /// The user interrupted the writing of a file.
     #[error("{place}: interrupted while it was written; nothing new stands under this name")]
     Cancelled {

@@ -43,6 +43,8 @@ pub struct Limits {
     pub steps: Option<u64>,
     /// Seconds of training.
     pub seconds: Option<f64>,
+    /// Seconds of training at the latest. What follows the run's end, such as a learning rate, does not look at it.
+    pub at_most: Option<f64>,
 }
 
 /// One line of `metrics.jsonl`.
@@ -53,6 +55,7 @@ pub struct Record {
     /// Seconds of training so far (evaluation and export left out).
     pub seconds: f64,
     /// Mean loss since the last record; of solvers on voxels, the root mean square of the residual `p − A·x`.
+    /// Not a number where a solver has none.
     pub loss: f64,
     /// Mean weighted prior since the last record.
     #[serde(skip_serializing_if = "Option::is_none")]

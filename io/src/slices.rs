@@ -7,6 +7,7 @@ use conefield_core::scan::Volume;
 use conefield_core::{Error, Result};
 use image::Rgb;
 use ndarray::{Array2, ArrayView3, Axis, s};
+use std::ops::Range;
 use std::path::Path;
 
 const INK: Rgb<u8> = Rgb([20; 3]);
@@ -14,6 +15,8 @@ const PAPER: Rgb<u8> = Rgb([255; 3]);
 /// Width that small volumes are enlarged to, and that large ones are not to pass, in pixels of slices.
 const WIDTH: [f64; 2] = [1000.0, 4000.0];
 const GAP: u32 = 8;
+/// Columns side by side; more go below, so that slices and captions stay legible.
+const COLUMNS: usize = 5;
 
 /// The three middle slices of a volume, which is all of it that pictures show.
 #[derive(Debug, Clone)]
@@ -142,6 +145,13 @@ pub fn compare_png(
     draw(path.as_ref(), &captions, &rows, window)
 }
 
+/// Columns that stand side by side: as even as can be, [`COLUMNS`] at most.
+fn bands(columns: usize) -> Vec<Range<usize>> {
+    let bands = columns.div_ceil(COLUMNS).max(1);
+    let wide = columns.div_ceil(bands).max(1);
+    (0..columns).step_by(wide).map(|from| from..(from + wide).min(columns)).collect()
+}
+
 fn draw(path: &Path, captions: &[String], rows: &[Row], window: [f32; 2]) -> Result<()> {
     let place = path.display().to_string();
     if captions.is_empty() {
@@ -155,13 +165,17 @@ fn draw(path: &Path, captions: &[String], rows: &[Row], window: [f32; 2]) -> Res
         check(&place, cell)?;
     }
     let columns = captions.len();
-    let width_mm: Vec<f64> = (0..columns).map(|c| most(rows.iter().map(|r| r.size(c)[0]))).collect();
+    let bands = bands(columns);
+    // Columns of one place are as wide in every band.
+    let wide = bands[0].len();
+    let place_mm = |c: usize| most((c..columns).step_by(wide).flat_map(|c| rows.iter().map(move |r| r.size(c)[0])));
+    let width_mm: Vec<f64> = (0..wide).map(place_mm).collect();
     let height_mm: Vec<f64> = rows.iter().map(|r| most((0..columns).map(|c| r.size(c)[1]))).collect();
     // A whole voxel a pixel at least, unless that makes the picture too large to look at.
     let finest = rows.iter().flat_map(|r| &r.cells).filter_map(Cell::volume).flat_map(|v| v.grid.spacing);
     let finest = finest.fold(f64::INFINITY, f64::min);
     let total: f64 = width_mm.iter().sum();
-    let tallest: f64 = height_mm.iter().sum();
+    let tallest: f64 = height_mm.iter().sum::<f64>() * bands.len() as f64;
     let scale = (1.0 / finest).max(WIDTH[0] / total).min(WIDTH[1] / total).min(2.0 * WIDTH[1] / tallest);
     let pixels = |mm: f64| ((mm * scale).round() as u32).max(1);
     let widths: Vec<u32> = width_mm.iter().map(|w| pixels(*w)).collect();
@@ -173,33 +187,38 @@ fn draw(path: &Path, captions: &[String], rows: &[Row], window: [f32; 2]) -> Res
     let top = (text * 1.9) as u32;
     let bars = (text * if spread.is_some() { 8.4 } else { 4.6 }) as u32;
     let inner: u32 = heights.iter().map(|h| h + GAP).sum();
+    let band = top + inner;
     let width = left + widths.iter().map(|w| w + GAP).sum::<u32>() + bars;
-    let mut canvas = Canvas::new(width, (top + inner).max((text * 9.0) as u32), PAPER)?;
+    let mut canvas = Canvas::new(width, (band * bands.len() as u32).max((text * 9.0) as u32), PAPER)?;
 
-    let mut x = left;
-    for (c, caption) in captions.iter().enumerate() {
-        let at = (x as f32 + widths[c] as f32 / 2.0, text * 0.35);
-        let shown = canvas.shortened(caption, text, widths[c] as f32);
-        canvas.text(at, Align::Middle, text, INK, &shown);
-        let mut y = top;
+    for (n, columns) in bands.into_iter().enumerate() {
+        let first = band * n as u32;
+        let mut x = left;
+        for (c, &wide) in columns.zip(&widths) {
+            let at = (x as f32 + wide as f32 / 2.0, first as f32 + text * 0.35);
+            let shown = canvas.shortened(&captions[c], text, wide as f32);
+            canvas.text(at, Align::Middle, text, INK, &shown);
+            let mut y = first + top;
+            for (row, &height) in rows.iter().zip(&heights) {
+                if let Some(cell) = row.cells.get(c) {
+                    draw_cell(&mut canvas, [x, y, wide, height], row, cell, scale, window, spread.unwrap_or(1.0));
+                }
+                y += height + GAP;
+            }
+            x += wide + GAP;
+        }
+        let mut y = first + top;
         for (row, &height) in rows.iter().zip(&heights) {
-            if let Some(cell) = row.cells.get(c) {
-                draw_cell(&mut canvas, [x, y, widths[c], height], row, cell, scale, window, spread.unwrap_or(1.0));
+            let middle = y as f32 + height as f32 / 2.0;
+            let lines = [row.plane.name, if row.note.is_empty() { row.plane.axes } else { row.note }];
+            for (i, line) in lines.iter().enumerate() {
+                let at = (left as f32 - text * 0.6, middle + text * (i as f32 * 1.2 - 1.2));
+                canvas.text(at, Align::Right, text * if i == 0 { 1.0 } else { 0.85 }, INK, line);
             }
             y += height + GAP;
         }
-        x += widths[c] + GAP;
     }
-    let mut y = top;
-    for (row, &height) in rows.iter().zip(&heights) {
-        let middle = y as f32 + height as f32 / 2.0;
-        let lines = [row.plane.name, if row.note.is_empty() { row.plane.axes } else { row.note }];
-        for (i, line) in lines.iter().enumerate() {
-            let at = (left as f32 - text * 0.6, middle + text * (i as f32 * 1.2 - 1.2));
-            canvas.text(at, Align::Right, text * if i == 0 { 1.0 } else { 0.85 }, INK, line);
-        }
-        y += height + GAP;
-    }
+    let x = left + widths.iter().map(|w| w + GAP).sum::<u32>();
     let bar = [x + (text * 0.5) as u32, top, (text * 0.9) as u32, inner.saturating_sub(GAP)];
     draw_bar(&mut canvas, bar, text, [f64::from(window[0]), f64::from(window[1])], grey);
     if let Some(s) = spread {
@@ -374,6 +393,28 @@ mod tests {
         let results = [("NAF 28.1 dB", &b), ("FDK 21.0 dB, a caption that is too long for its column", &c)];
         compare_png(&path, ("reference", &a), &results, [0.0, 1.0]).unwrap();
         assert!(image::open(&path).unwrap().width() >= 900);
+    }
+
+    #[test]
+    fn many_results_stand_in_bands_of_legible_columns() {
+        assert_eq!(bands(5), [0..5]);
+        assert_eq!(bands(6), [0..3, 3..6]);
+        assert_eq!(bands(9), [0..5, 5..9]);
+        let (_dir, folder) = folder();
+        let blurred: Vec<MiddleSlices> = (0..8).map(|i| ball([24; 3], [2.0; 3], 0.5 + 0.4 * f64::from(i))).collect();
+        let names: Vec<String> = (0..8).map(|i| format!("method {i} 2{i}.00 dB")).collect();
+        let results: Vec<(&str, &MiddleSlices)> = names.iter().map(|n| &n[..]).zip(&blurred).collect();
+        let sizes = [4, 8].map(|n| {
+            let path = folder.join(format!("compare{n}.png"));
+            compare_png(&path, ("reference", &ball([24; 3], [2.0; 3], 0.3)), &results[..n], [0.0, 1.0]).unwrap();
+            image::open(&path).unwrap().to_rgb8().dimensions()
+        });
+        // A second band below the first, in columns as wide.
+        assert_eq!((sizes[1].0, sizes[1].1), (sizes[0].0, 2 * sizes[0].1));
+        assert!(sizes[0].0 >= 1000, "{sizes:?}");
+        let path = folder.join("slices8.png");
+        slices_png(&path, &results, [0.0, 1.0], None).unwrap();
+        assert!(image::open(&path).unwrap().width() >= 1000);
     }
 
     #[test]

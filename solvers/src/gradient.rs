@@ -207,7 +207,8 @@ impl Solver for Gradient {
         let by_epochs = self.epochs.map(|e| (e * steps_an_epoch).ceil() as u64);
         let steps = [self.steps, by_epochs].into_iter().flatten().min();
         let Start { standing, mut window } = start;
-        let mut clock = Clock::new(Limits { steps, seconds: self.seconds }, job.limits, standing.seconds);
+        let mut clock =
+            Clock::new(Limits { steps, seconds: self.seconds, at_most: None }, job.limits, standing.seconds);
         let mut rays = Vec::with_capacity(self.rays);
         let mut tv = TvBlocks::default();
         let (mut step, mut samples) = (standing.step, standing.samples);
@@ -226,7 +227,7 @@ impl Solver for Gradient {
                 return Err(Error::Interrupted { step });
             }
             let share = clock.share(step);
-            let done = share >= 1.0;
+            let done = clock.done(step) >= 1.0;
             if step > 0 && (step % self.report_every == 0 || done) && window.steps > 0 {
                 clock.pause();
                 let record =
@@ -263,7 +264,7 @@ impl Solver for Gradient {
             samples += stats.samples;
             exe.update(&mut model, &self.adam(step, epoch, share))?;
             window.add(stats.loss, stats.prior, stats.samples, start.elapsed().as_secs_f64());
-            let share = clock.share(step);
+            let share = clock.done(step);
             observer.progress(step, share, clock.seconds() * (1.0 - share).max(0.0) / share.max(1e-9));
         }
         clock.pause();

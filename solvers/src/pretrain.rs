@@ -30,13 +30,13 @@ pub fn pretrain(settings: &Gradient, job: &PretrainJob<'_>, observer: &mut dyn O
     let (mut exe, explain) = job.backend.compile(&model.pipeline)?;
     observer.note(&explain.backend);
     let mut waiting: Vec<Arena> = vec![model.arena.clone(); scenes.len() - 1];
-    let limits = Limits { steps: Some(settings.pretrain_steps), seconds: None };
+    let limits = Limits { steps: Some(settings.pretrain_steps), ..Limits::default() };
     let mut clock = Clock::new(limits, job.limits, 0.0);
     let mut points = Vec::with_capacity(settings.pretrain_points);
     let (mut step, mut loss, mut since) = (0u64, 0.0, 0u64);
     let mut at = 0;
     clock.resume();
-    while clock.share(step) < 1.0 {
+    while clock.done(step) < 1.0 {
         if observer.cancelled() {
             return Err(Error::Interrupted { step });
         }
@@ -56,6 +56,7 @@ pub fn pretrain(settings: &Gradient, job: &PretrainJob<'_>, observer: &mut dyn O
         let adam = settings.adam(step, 0.0, share);
         exe.update(&mut model, &adam)?;
         (loss, since) = (loss + found, since + 1);
+        let share = clock.done(step);
         observer.progress(step, share, clock.seconds() * (1.0 - share).max(0.0) / share.max(1e-9));
         if step.is_multiple_of(settings.report_every) || share >= 1.0 {
             let samples_per_s = Some((step * settings.pretrain_points as u64) as f64 / clock.seconds());

@@ -62,6 +62,7 @@ impl Clock {
         let limits = Limits {
             steps: cli.steps.or(if cli.seconds.is_some() { None } else { spec.steps }),
             seconds: cli.seconds.or(if cli.steps.is_some() { None } else { spec.seconds }),
+            at_most: cli.at_most.or(spec.at_most),
         };
         let spent = Duration::try_from_secs_f64(spent).unwrap_or_default();
         Self { limits, spent, running: None }
@@ -84,7 +85,7 @@ impl Clock {
         (self.spent + self.running.map_or(Duration::ZERO, |s| s.elapsed())).as_secs_f64()
     }
 
-    /// Share of the run that is over after `steps` steps: 1 or more means the end.
+    /// Share of the run that is over after `steps` steps, as schedules take it: what cuts a run short is no part of it.
     pub fn share(&self, steps: u64) -> f64 {
         let by_steps = self.share_of_steps(steps);
         let by_time = self.limits.seconds.map_or(0.0, |t| if t <= 0.0 { 1.0 } else { self.seconds() / t });
@@ -94,6 +95,12 @@ impl Clock {
     /// The same by the number of steps alone; 0 where none is set.
     pub fn share_of_steps(&self, steps: u64) -> f64 {
         self.limits.steps.map_or(0.0, |n| if n == 0 { 1.0 } else { steps as f64 / n as f64 })
+    }
+
+    /// Like [`Clock::share`], but with what cuts the run short: 1 or more means the end.
+    pub fn done(&self, steps: u64) -> f64 {
+        let cut = self.limits.at_most.map_or(0.0, |t| if t <= 0.0 { 1.0 } else { self.seconds() / t });
+        self.share(steps).max(cut)
     }
 }
 
@@ -110,10 +117,20 @@ mod tests {
 
     #[test]
     fn the_first_limit_ends_the_run() {
-        let spec = Limits { steps: Some(10), seconds: Some(1e9) };
+        let spec = Limits { steps: Some(10), seconds: Some(1e9), at_most: None };
         let c = Clock::new(spec, Limits::default(), 0.0);
         assert!(c.share(9) < 1.0 && c.share(10) >= 1.0);
-        let c = Clock::new(spec, Limits { steps: None, seconds: Some(1e6) }, 0.0);
+        let c = Clock::new(spec, Limits { seconds: Some(1e6), ..Limits::default() }, 0.0);
         assert!(c.share(1000) < 1.0);
+    }
+
+    #[test]
+    fn what_cuts_a_run_short_stretches_no_schedule() {
+        let spec = Limits { steps: Some(10), ..Limits::default() };
+        for (at_most, over) in [(1e9, false), (3.0, true)] {
+            let c = Clock::new(spec, Limits { at_most: Some(at_most), ..Limits::default() }, 4.0);
+            assert_eq!((c.share(5), c.done(5) >= 1.0), (0.5, over));
+            assert!(c.done(10) >= 1.0);
+        }
     }
 }

@@ -298,7 +298,7 @@ fn pretrained(s: &Value) -> (Model, Vec<f64>) {
         spec: &spec,
         backend: &Cpu::new(),
         seed: 21,
-        limits: Limits { steps: Some(60), seconds: None },
+        limits: Limits { steps: Some(60), ..Limits::default() },
     };
     let mut heard = Heard::default();
     let model = spec.solver.build().unwrap().pretrain(&job, &mut heard).unwrap();

@@ -4,6 +4,7 @@ use super::convert::refuse_existing;
 use super::evaluate::score;
 use super::reconstruct::mci;
 use crate::progress::Progress;
+use crate::table::{SCORES, Table, cells_of};
 use crate::{files, out, parse, signals, specs};
 use clap::Args;
 use conefield_backend_cpu::Cpu;
@@ -103,19 +104,13 @@ impl Demo {
         if self.json {
             return out::json(&json!({ "folder": folder, "picture": picture, "results": entries }));
         }
-        let ssim = |s: Option<f64>| s.map_or("-".into(), |x| format!("{x:.4}"));
-        let mut rows = vec![["", "PSNR dB", "ssim_2d", "ssim_3d", "steps", "training"].map(str::to_owned).to_vec()];
+        let heads = [&[""][..], &SCORES, &["steps", "training"]].concat();
+        let mut rows = vec![heads.into_iter().map(str::to_owned).collect()];
         for e in &entries {
-            rows.push(vec![
-                e.name.into(),
-                format!("{:.2}", e.scores.psnr),
-                ssim(e.scores.ssim_2d),
-                ssim(e.scores.ssim_3d),
-                out::number(e.steps),
-                out::duration(e.train_s),
-            ]);
+            let rest = [out::number(e.steps), out::duration(e.train_s)];
+            rows.push([&[e.name.to_owned()][..], &cells_of(&e.scores), &rest].concat());
         }
-        out::say(&out::table(&rows, &[1, 2, 3, 4, 5]))?;
+        out::say(&Table { rows, notes: vec![] }.text())?;
         out::say(&format!("\npicture: {}\nscan and volumes beside it", picture.display()))
     }
 
@@ -131,7 +126,7 @@ impl Demo {
             spec: &loaded.spec,
             backend: &backend,
             seed: self.seed,
-            limits: Limits { steps: None, seconds: Some(self.budget) },
+            limits: Limits { seconds: Some(self.budget), ..Limits::default() },
             weights: &|path| files::read_weights(path),
             volumes: &files::volume,
             resume: None,

@@ -18,7 +18,7 @@ use std::path::{Path, PathBuf};
 /// Show what a spec builds: stages, widths, parameters, memory, work.
 #[derive(Args)]
 pub struct Explain {
-    /// A shipped spec (naf, ni-naf, ni-naf-published, nerf, dense, accurate, fast) or a file.
+    #[arg(help = specs::help())]
     spec: String,
     /// Change a setting, such as encoder.levels=8.
     #[arg(long = "set", value_name = "KEY=VALUE")]

@@ -21,8 +21,7 @@ pub struct Pretrain {
     /// The known volumes: files, or phantoms such as phantom:head:128.
     #[arg(required = true, value_name = "VOLUME")]
     volumes: Vec<String>,
-    /// A shipped spec (naf, ni-naf, ni-naf-published, nerf, dense, accurate, fast) or a file.
-    #[arg(long)]
+    #[arg(long, help = specs::help())]
     spec: String,
     /// The weights file to write (.safetensors).
     #[arg(short, long = "output", value_name = "WEIGHTS")]

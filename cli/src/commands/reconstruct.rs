@@ -1,21 +1,20 @@
 //! `conefield reconstruct`
 
-use super::{BackendChoice, Ends, backends::simd_level, evaluate};
+use super::{Ends, backends::simd_level, evaluate, protocol::Protocol};
 use crate::memory::{self, Memory};
 use crate::outgoing::{self, Written};
-use crate::parse::{self, HoldOut};
 use crate::progress::{Keeper, Progress};
 use crate::run::RunFolder;
 use crate::{files, out, signals, specs};
 use clap::Args;
+use conefield_core::Result;
 use conefield_core::arena::Arena;
-use conefield_core::backend::Explain;
+use conefield_core::backend::{Backend, Explain};
 use conefield_core::checkpoint::Resume;
 use conefield_core::pipeline::Pipeline;
-use conefield_core::scan::{Scan, Volume};
-use conefield_core::solver::{Job, Solution, Solver};
+use conefield_core::scan::Scan;
+use conefield_core::solver::{Job, Solver};
 use conefield_core::spec::load::{Loaded, to_toml};
-use conefield_core::{Error, Result};
 use conefield_io::MiddleSlices;
 use conefield_metrics::Scores;
 use serde::Serialize;
@@ -33,8 +32,7 @@ use tracing::info;
 pub struct Reconstruct {
     /// The scan.
     scan: PathBuf,
-    /// A shipped spec (naf, ni-naf, ni-naf-published, nerf, dense, accurate, fast) or a file.
-    #[arg(long)]
+    #[arg(long, help = specs::help())]
     spec: String,
     /// The folder for the results; new or empty.
     #[arg(short, long = "output", value_name = "RUN")]
@@ -45,35 +43,52 @@ pub struct Reconstruct {
     /// Go on with the run in RUN that was interrupted; all else must be as it was.
     #[arg(long, conflicts_with = "force")]
     resume: bool,
-    /// Time between two checkpoints, which --resume starts from.
-    #[arg(long, value_name = "TIME", default_value = "60s", value_parser = parse::seconds)]
-    checkpoint_every: f64,
-    /// Change a setting, such as encoder.levels=8.
-    #[arg(long = "set", value_name = "KEY=VALUE")]
-    sets: Vec<String>,
     #[command(flatten)]
-    ends: Ends,
-    /// Which backend.
-    #[arg(long, default_value = "auto")]
-    backend: BackendChoice,
-    /// The volume sought, to compare with: a file, or "truth" for the one that the scan comes with.
-    #[arg(long, value_name = "VOLUME")]
-    reference: Option<PathBuf>,
-    /// The data range for PSNR and SSIM.
-    #[arg(long, default_value = "1", value_parser = parse::above_zero)]
-    peak: f64,
-    /// Views to keep aside and predict, such as 3,17 or every:10.
-    #[arg(long, value_name = "VIEWS", value_parser = parse::hold_out)]
-    hold_out: Option<HoldOut>,
+    protocol: Protocol,
     /// Weights that "conefield pretrain" made, to start from.
     #[arg(long, value_name = "WEIGHTS")]
     init: Option<PathBuf>,
-    /// Seed of everything random.
-    #[arg(long, default_value_t = 0)]
-    seed: u64,
     /// Print one JSON object: what record.json holds.
     #[arg(long)]
     json: bool,
+    /// The run is part of another command's work: its error also goes to standard output, and the end of standard
+    /// input ends it as a signal does.
+    #[arg(long, hide = true)]
+    as_part: bool,
+}
+
+/// What an error that goes to standard output begins with.
+pub const FAILED: &str = "failed: ";
+
+/// What a spec builds.
+pub struct Parts {
+    solver: Box<dyn Solver>,
+    /// Of specs that train a field.
+    pipeline: Option<Pipeline>,
+    compiled: Explain,
+}
+
+impl Parts {
+    /// Builds a spec for `backend`.
+    pub fn of(loaded: &Loaded, backend: &dyn Backend) -> Result<Self> {
+        let solver = loaded.spec.solver.build().map_err(|e| loaded.locate(e))?;
+        let pipeline = specs::pipeline(loaded, solver.as_ref())?;
+        let compiled = pipeline.as_ref().map(|p| backend.compile(p)).transpose()?.map(|c| c.1).unwrap_or_default();
+        Ok(Self { solver, pipeline, compiled })
+    }
+
+    /// Refuses weights to start from that cannot be read or do not fit.
+    pub fn check_weights(&self, loaded: &Loaded) -> Result<()> {
+        if let Some(i) = &loaded.spec.initializer
+            && i.volume().map_err(|e| loaded.locate(e))?.is_none()
+        {
+            let initializer = i.build(&|path| files::read_weights(path)).map_err(|e| loaded.locate(e))?;
+            if let Some(layout) = self.pipeline.as_ref().map(|p| p.layout()) {
+                initializer.apply(layout, &mut Arena::new(layout.len()))?;
+            }
+        }
+        Ok(())
+    }
 }
 
 /// What is needed to repeat a run, and what came out.
@@ -96,8 +111,11 @@ struct Record {
     steps: u64,
     train_s: f64,
     export_s: f64,
+    /// From the start of the command to this record. Of what came before a --resume, the training alone.
+    total_s: f64,
     samples: u64,
-    samples_per_s: f64,
+    /// Of solvers that take samples.
+    samples_per_s: Option<f64>,
     loss: Option<f64>,
     held_out: Option<f64>,
     peak: f64,
@@ -106,43 +124,68 @@ struct Record {
 
 /// Which scan it was.
 #[derive(Debug, Serialize)]
-struct ScanRecord {
+pub struct ScanRecord {
     path: String,
     views: usize,
     detector: [usize; 2],
     volume: [usize; 3],
-    projections_fnv1a64: String,
+    pub projections_fnv1a64: String,
+}
+
+impl ScanRecord {
+    /// The whole scan at `path`.
+    pub fn of(path: &Path, scan: &Scan) -> Self {
+        Self {
+            path: path.display().to_string(),
+            views: scan.geometry.views.len(),
+            detector: scan.geometry.detector,
+            volume: scan.geometry.volume.shape,
+            projections_fnv1a64: checksum(scan),
+        }
+    }
+
+    /// In words.
+    pub fn line(&self) -> String {
+        let (views, [rows, columns], [x, y, z]) = (self.views, self.detector, self.volume);
+        format!("{}: {views} views of {rows} x {columns} pixels, {x} x {y} x {z} voxels", self.path)
+    }
 }
 
 impl Reconstruct {
     pub fn run(self) -> Result<()> {
+        if !self.as_part {
+            return self.reconstruct();
+        }
+        signals::follow_input();
+        let done = self.reconstruct();
+        if let Err(e) = &done {
+            out::say(&format!("{FAILED}{e}"))?;
+        }
+        done
+    }
+
+    fn reconstruct(&self) -> Result<()> {
+        let begin = Instant::now();
+        let protocol = &self.protocol;
         let loaded = specs::read(&self.spec, &self.all_sets())?;
-        let solver = loaded.spec.solver.build().map_err(|e| loaded.locate(e))?;
-        let backend = self.backend.open();
-        let pipeline = specs::pipeline(&loaded, solver.as_ref())?;
-        let compiled = pipeline.as_ref().map(|p| backend.compile(p)).transpose()?.map(|c| c.1).unwrap_or_default();
-        let memory = self.memory(&loaded, solver.as_ref(), pipeline.as_ref(), &compiled)?;
+        let backend = protocol.backend.open();
+        let parts = Parts::of(&loaded, backend.as_ref())?;
+        let memory = self.memory(&loaded, &parts)?;
         info!("memory: {}", memory.line());
         // Weights that cannot be read or do not fit are told before anything is made.
-        if let Some(i) = &loaded.spec.initializer
-            && i.volume().map_err(|e| loaded.locate(e))?.is_none()
-        {
-            let initializer = i.build(&|path| files::read_weights(path)).map_err(|e| loaded.locate(e))?;
-            if let Some(layout) = pipeline.as_ref().map(|p| p.layout()) {
-                initializer.apply(layout, &mut Arena::new(layout.len()))?;
-            }
-        }
+        parts.check_weights(&loaded)?;
+        let Parts { solver, compiled, .. } = parts;
         let whole = files::scan(&self.scan)?;
-        let reference = self.reference.as_ref().map(|path| read_reference(path, &self.scan, &whole)).transpose()?;
-        let held = self.hold_out.as_ref().map(|h| h.views(whole.geometry.views.len())).unwrap_or_default();
-        let fingerprint = checksum(&whole);
+        let reference = protocol.reference(&self.scan, &whole)?;
+        let held = protocol.held_out(whole.geometry.views.len());
+        let scan_record = ScanRecord::of(&self.scan, &whole);
         let (scan, held_scan) = if held.is_empty() { (whole, None) } else { split(whole, &held)? };
-        let identity = self.identity(&loaded, &held, &fingerprint)?;
+        let identity = identity(&loaded, protocol, &held, &scan_record.projections_fnv1a64)?;
         let (folder, metrics, resume) = self.open(&loaded, &identity)?;
         signals::listen()?;
         let mut progress = Progress::new("reconstruct", Some(metrics)).keeping(Some(Keeper {
             path: folder.file("checkpoint.safetensors"),
-            every: Duration::from_secs_f64(self.checkpoint_every),
+            every: Duration::from_secs_f64(protocol.checkpoint_every),
             run: identity,
             last: Instant::now(),
         }));
@@ -150,11 +193,11 @@ impl Reconstruct {
             scan: &scan,
             held_out: held_scan.as_ref(),
             reference: reference.as_ref(),
-            peak: self.peak,
+            peak: protocol.peak,
             spec: &loaded.spec,
             backend: backend.as_ref(),
-            seed: self.seed,
-            limits: self.ends.limits(),
+            seed: protocol.seed,
+            limits: protocol.ends.limits(),
             weights: &|path| files::read_weights(path),
             volumes: &files::volume,
             resume: resume.as_ref(),
@@ -166,7 +209,7 @@ impl Reconstruct {
         let place = folder.file("volume.nii.gz");
         let field = solution.result.field();
         if let Some(field) = field {
-            files::write_field(folder.file("weights.safetensors"), field, notes(&loaded, self.seed)?)?;
+            files::write_field(folder.file("weights.safetensors"), field, notes(&loaded, protocol.seed)?)?;
         }
         let start = Instant::now();
         let mut voxels = solution.result.voxels(backend.as_ref())?;
@@ -175,23 +218,17 @@ impl Reconstruct {
         let export_s = start.elapsed().as_secs_f64();
         let middle = reference.as_ref().map(MiddleSlices::of);
         files::picture(folder.file("slices.png"), middle.as_ref(), &slices)?;
-        let score = |(volume, r)| evaluate::score(&place.display().to_string(), volume, r, self.peak);
+        let score = |(volume, r)| evaluate::score(&place.display().to_string(), volume, r, protocol.peak);
         let scores = whole.as_ref().zip(reference.as_ref()).map(score).transpose()?;
         let record = Record {
             version: env!("CARGO_PKG_VERSION"),
             spec: loaded.spec.name.clone(),
-            seed: self.seed,
-            scan: ScanRecord {
-                path: self.scan.display().to_string(),
-                views: scan.geometry.views.len() + held.len(),
-                detector: scan.geometry.detector,
-                volume: scan.geometry.volume.shape,
-                projections_fnv1a64: fingerprint,
-            },
+            seed: protocol.seed,
+            scan: scan_record,
             held_out_views: held,
-            limits: self.ends.clone(),
+            limits: protocol.ends.clone(),
             init: self.init.as_ref().map(|p| p.display().to_string()),
-            reference: self.reference.as_ref().map(|p| p.display().to_string()),
+            reference: protocol.reference.as_ref().map(|p| p.display().to_string()),
             backend: compiled,
             simd: simd_level(),
             threads: rayon::current_num_threads(),
@@ -201,35 +238,31 @@ impl Reconstruct {
             steps: solution.steps,
             train_s: solution.train_s,
             export_s,
+            total_s: begin.elapsed().as_secs_f64() + resume.as_ref().map_or(0.0, |r| r.standing.seconds),
             samples: solution.samples,
-            samples_per_s: if solution.train_s > 0.0 { solution.samples as f64 / solution.train_s } else { 0.0 },
-            loss: last.as_ref().map(|r| r.loss),
+            samples_per_s: (solution.samples > 0 && solution.train_s > 0.0)
+                .then(|| solution.samples as f64 / solution.train_s),
+            loss: last.as_ref().map(|r| r.loss).filter(|l| l.is_finite()),
             held_out: last.as_ref().and_then(|r| r.held_out),
-            peak: self.peak,
+            peak: protocol.peak,
             scores,
         };
         conefield_io::write_text_atomic(folder.file("record.json"), &out::to_json(&record)?)?;
         folder.finish()?;
-        if self.json { out::json(&record) } else { out::say(&summary(&record, &solution, &self.output)) }
+        if self.json { out::json(&record) } else { out::say(&summary(&record, &self.output)) }
     }
 
     /// What the run takes; one that does not fit is refused.
-    fn memory(
-        &self,
-        loaded: &Loaded,
-        solver: &dyn Solver,
-        pipeline: Option<&Pipeline>,
-        compiled: &Explain,
-    ) -> Result<Memory> {
+    fn memory(&self, loaded: &Loaded, parts: &Parts) -> Result<Memory> {
         let scan = conefield_io::scan_size(&self.scan)?;
         let run = memory::Run {
             scan,
-            split: self.hold_out.is_some(),
-            reference: self.reference.is_some(),
-            field: pipeline.is_some(),
-            parameters: pipeline.map_or(0, |p| p.layout().len() as u64),
-            backend: compiled.scratch_bytes as u64,
-            solver: memory::working(solver, &scan),
+            split: self.protocol.hold_out.is_some(),
+            reference: self.protocol.reference.is_some(),
+            field: parts.pipeline.is_some(),
+            parameters: parts.pipeline.as_ref().map_or(0, |p| p.layout().len() as u64),
+            backend: parts.compiled.scratch_bytes as u64,
+            solver: memory::working(parts.solver.as_ref(), &scan),
             resume: self.resume,
         };
         let sets = self.all_sets();
@@ -242,15 +275,6 @@ impl Reconstruct {
         let memory = run.memory();
         memory.check(|available| run.smaller(available, smaller))?;
         Ok(memory)
-    }
-
-    /// What must be the same for a run to be resumed.
-    fn identity(&self, loaded: &Loaded, held: &[usize], projections: &str) -> Result<BTreeMap<String, String>> {
-        let mut all = notes(loaded, self.seed)?;
-        all.insert("projections".into(), projections.into());
-        all.insert("held_out_views".into(), format!("{held:?}"));
-        all.insert("limits".into(), out::to_json(&self.ends)?);
-        Ok(all)
     }
 
     /// The folder, its file for metrics, and where to go on from.
@@ -273,7 +297,7 @@ impl Reconstruct {
 
     /// `--set`s, with `--init` as the one that it stands for.
     fn all_sets(&self) -> Vec<String> {
-        let mut sets = self.sets.clone();
+        let mut sets = self.protocol.sets.clone();
         if let Some(path) = &self.init {
             sets.push(mci(path));
         }
@@ -281,26 +305,23 @@ impl Reconstruct {
     }
 }
 
-fn read_reference(path: &Path, scan_path: &Path, scan: &Scan) -> Result<Volume> {
-    let volume = if path == Path::new("truth") && !path.exists() {
-        let place = scan_path.display().to_string();
-        conefield_io::read_truth(scan_path)?
-            .ok_or_else(|| Error::invalid(place, "--reference truth", "a scan without a truth", "a volume file"))?
-    } else {
-        conefield_io::read_volume(path)?
-    };
-    let want = scan.geometry.volume.shape;
-    if volume.data.shape() != want {
-        let found = format!("{:?}", volume.data.shape());
-        let expected = format!("{want:?}, the voxels that this scan asks for");
-        return Err(Error::invalid(path.display().to_string(), "shape", found, expected));
-    }
-    Ok(volume)
-}
-
-fn split(scan: Scan, held: &[usize]) -> Result<(Scan, Option<Scan>)> {
+pub fn split(scan: Scan, held: &[usize]) -> Result<(Scan, Option<Scan>)> {
     let (train, held) = scan.split(held)?;
     Ok((train, Some(held)))
+}
+
+/// What must be the same for a run to be resumed, or to be taken for done.
+pub fn identity(
+    loaded: &Loaded,
+    protocol: &Protocol,
+    held: &[usize],
+    projections: &str,
+) -> Result<BTreeMap<String, String>> {
+    let mut all = notes(loaded, protocol.seed)?;
+    all.insert("projections".into(), projections.into());
+    all.insert("held_out_views".into(), format!("{held:?}"));
+    all.insert("limits".into(), out::to_json(&protocol.ends)?);
+    Ok(all)
 }
 
 /// The setting that starts from the weights in `path`.
@@ -325,14 +346,14 @@ fn checksum(scan: &Scan) -> String {
     format!("{hash:016x}")
 }
 
-fn summary(r: &Record, solution: &Solution, output: &Path) -> String {
+fn summary(r: &Record, output: &Path) -> String {
     let [x, y, z] = r.scan.volume;
+    let speed = r.samples_per_s.map(|s| format!(" ({:.2} M samples/s)", s / 1e6)).unwrap_or_default();
     let mut lines = vec![format!(
-        "{x} x {y} x {z} voxels from {} views: {} steps in {} ({:.2} M samples/s), export {}",
+        "{x} x {y} x {z} voxels from {} views: {} in {}{speed}, export {}",
         r.scan.views - r.held_out_views.len(),
-        solution.steps,
+        if r.steps == 1 { "1 step".into() } else { format!("{} steps", r.steps) },
         out::duration(r.train_s),
-        r.samples_per_s / 1e6,
         out::duration(r.export_s),
     )];
     if let Some(h) = r.held_out {

@@ -13,6 +13,7 @@ use conefield_core::spec::{SolverSpec, Spec};
 use ndarray::{Array3, Axis, Zip};
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
+use std::time::Instant;
 
 /// Settings of `sart`.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
@@ -166,12 +167,13 @@ impl Algebraic {
 
 impl Solver for Algebraic {
     fn solve(&self, job: &Job<'_>, observer: &mut dyn Observer) -> Result<Solution> {
+        let begun = Instant::now();
         job.scan.validate("scan")?;
         let projector = projector(job)?;
         observer.note(&format!("{}; {}", self.describe(), projector.describe()));
         let problem = Problem { scan: job.scan, operator: projector.operator(), seed: job.seed };
         let mut sweep = Sweep::new(self, &problem, start(job)?);
-        drive(job, &self.stop, projector.as_ref(), &mut sweep, observer)
+        drive(job, &self.stop, begun, projector.as_ref(), &mut sweep, observer)
     }
 
     fn trains_field(&self, spec: &Spec) -> Result<bool> {

@@ -13,6 +13,7 @@ use conefield_core::spec::{SolverSpec, Spec};
 use ndarray::Array3;
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
+use std::time::Instant;
 
 /// Settings of `asd-pocs`.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
@@ -85,6 +86,7 @@ impl AsdPocs {
 
 impl Solver for AsdPocs {
     fn solve(&self, job: &Job<'_>, observer: &mut dyn Observer) -> Result<Solution> {
+        let begun = Instant::now();
         job.scan.validate("scan")?;
         let projector = projector(job)?;
         observer.note(&format!("{}; {}", self.describe(), projector.describe()));
@@ -97,7 +99,7 @@ impl Solver for AsdPocs {
             length: 0.0,
             work: problem.zeros(),
         };
-        drive(job, &self.stop, projector.as_ref(), &mut iterate, observer)
+        drive(job, &self.stop, begun, projector.as_ref(), &mut iterate, observer)
     }
 
     fn trains_field(&self, spec: &Spec) -> Result<bool> {

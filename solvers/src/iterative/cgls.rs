@@ -8,6 +8,7 @@ use conefield_core::spec::{SolverSpec, Spec};
 use ndarray::{Array3, Zip};
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
+use std::time::Instant;
 
 /// Settings of `cgls`.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
@@ -37,12 +38,13 @@ impl SolverSpec for Cgls {
 
 impl Solver for Cgls {
     fn solve(&self, job: &Job<'_>, observer: &mut dyn Observer) -> Result<Solution> {
+        let begun = Instant::now();
         job.scan.validate("scan")?;
         let projector = projector(job)?;
         observer.note(&format!("{}; {}", self.describe(), projector.describe()));
         let problem = Problem { scan: job.scan, operator: projector.operator(), seed: job.seed };
         let mut iterate = Iterate::new(&problem, start(job)?);
-        let mut solution = drive(job, &self.stop, projector.as_ref(), &mut iterate, observer)?;
+        let mut solution = drive(job, &self.stop, begun, projector.as_ref(), &mut iterate, observer)?;
         if let (true, Reconstruction::Volume(volume)) = (self.nonnegative, &mut solution.result) {
             volume.data.par_mapv_inplace(|x| x.max(0.0));
         }

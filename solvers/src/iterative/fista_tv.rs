@@ -27,6 +27,7 @@ use ndarray::{Array3, Zip};
 use rand::RngExt;
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
+use std::time::Instant;
 
 /// How strong the prior is.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize, JsonSchema)]
@@ -59,7 +60,15 @@ pub struct FistaTv {
 impl Default for FistaTv {
     fn default() -> Self {
         let stop = Stop { passes: Some(20), change: Some(2e-3), ..Stop::default() };
-        Self { stop, weight: Weight::Noise(1.0), weighted: true, subsets: 10, order: Order::Golden, inner: 4 }
+        Self {
+            stop,
+            weight: Weight::Noise(1.0),
+           
+            weighted: true,
+            subsets: 10,
+            order: Order::Golden,
+            inner: 4,
+        }
     }
 }
 
@@ -83,6 +92,7 @@ impl SolverSpec for FistaTv {
 
 impl Solver for FistaTv {
     fn solve(&self, job: &Job<'_>, observer: &mut dyn Observer) -> Result<Solution> {
+        let begun = Instant::now();
         job.scan.validate("scan")?;
         let projector = projector(job)?;
         observer.note(&format!("{}; {}", self.describe(), projector.describe()));
@@ -97,7 +107,7 @@ impl Solver for FistaTv {
         };
         observer.note(&format!("{noise}: the prior's weight is {:.3e}", lambda / voxel));
         let mut iterate = Iterate::new(self, &problem, noise, start(job)?, lambda)?;
-        drive(job, &self.stop, projector.as_ref(), &mut iterate, observer)
+        drive(job, &self.stop, begun, projector.as_ref(), &mut iterate, observer)
     }
 
     fn trains_field(&self, spec: &Spec) -> Result<bool> {
@@ -184,7 +194,14 @@ struct Iterate {
 }
 
 impl Iterate {
-    fn new(settings: &FistaTv, problem: &Problem<'_>, noise: Noise, x: Array3<f32>, lambda: f64) -> Result<Self> {
+    fn new(
+        settings: &FistaTv,
+        problem: &Problem<'_>,
+        noise: Noise,
+        x: Array3<f32>,
+        lambda: f64,
+        threshold: f32,
+    ) -> Result<Self> {
         let grid = &problem.scan.geometry.volume;
         let views = problem.scan.geometry.views.len();
         let parts = subsets(views, settings.subsets);

@@ -22,6 +22,7 @@ use conefield_core::voxel::{VoxelOperator, VoxelProjector};
 use ndarray::{Array3, Axis};
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
+use std::time::Instant;
 use watch::{Watch, difference_square_sum, square_sum};
 
 /// When an iterative solver ends, whichever comes first.
@@ -213,10 +214,11 @@ struct Kept {
     settled: bool,
 }
 
-/// Runs `method` on `job` until `stop` or the job's limits end it.
+/// Runs `method` on `job` until `stop` or the job's limits end it. What was computed since `begun` counts as its time.
 pub fn drive(
     job: &Job<'_>,
     stop: &Stop,
+    begun: Instant,
     projector: &dyn VoxelProjector,
     method: &mut dyn Method,
     observer: &mut dyn Observer,
@@ -235,7 +237,8 @@ pub fn drive(
         (step, seconds) = (resume.standing.step, resume.standing.seconds);
         observer.note(&format!("resumed after pass {step}"));
     }
-    let mut clock = Clock::new(Limits { steps: stop.passes, seconds: stop.seconds }, job.limits, seconds);
+    let limits = Limits { steps: stop.passes, seconds: stop.seconds, at_most: None };
+    let mut clock = Clock::new(limits, job.limits, seconds + begun.elapsed().as_secs_f64());
     let started = step;
     if stop.patience.is_some() && job.held_out.is_none() {
         observer.note("stop.patience looks at views that are kept aside, and none are: it does not end this run");
@@ -264,7 +267,7 @@ pub fn drive(
             return Err(Error::Interrupted { step });
         }
         // Time alone does not end a run that has made nothing yet.
-        let share = if step == 0 { clock.share_of_steps(step) } else { clock.share(step) };
+        let share = if step == 0 { clock.share_of_steps(step) } else { clock.done(step) };
         if share >= 1.0 || kept.settled {
             break;
         }
@@ -302,7 +305,7 @@ pub fn drive(
         }
         observer.record(&record);
         clock.resume();
-        let share = clock.share(step);
+        let share = clock.done(step);
         observer.progress(step, share.min(1.0), clock.seconds() * (1.0 - share).max(0.0) / share.max(1e-9));
     }
     clock.pause();

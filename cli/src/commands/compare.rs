@@ -1,0 +1,562 @@
+//! `conefield compare`
+
+use super::protocol::{Protocol, word};
+use super::reconstruct::{FAILED, Parts, ScanRecord, identity, split};
+use super::{BackendChoice, Ends, General, backends::simd_level};
+use crate::memory::{Memory, Run};
+use crate::table::{SCORES, Table, score_cells};
+use crate::{files, out, run, signals, specs};
+use clap::Args;
+use conefield_core::error::ensure;
+use conefield_core::spec::load::Loaded;
+use conefield_core::{Error, Result};
+use conefield_io::MiddleSlices;
+use serde::{Deserialize, Serialize};
+use serde_json::Value;
+use std::collections::BTreeMap;
+use std::fs;
+use std::io::{ErrorKind, Read};
+use std::path::{Path, PathBuf};
+use std::process::{Command, ExitStatus, Stdio};
+use std::time::Duration;
+use tracing::info;
+
+/// Reconstruct a scan in several ways under one protocol: a table and a picture.
+///
+/// FOLDER receives table.md, table.json, compare.png and a folder for every spec, named after it, with what
+/// "conefield reconstruct" leaves. Each run is a process of its own: its memory is its own, and where one fails the
+/// others still run. Every --set holds for every spec. Ctrl-C ends the run under way after its step; the same command
+/// with --resume goes on and leaves alone what is done.
+#[derive(Args)]
+pub struct Compare {
+    /// The scan.
+    scan: PathBuf,
+    #[arg(long, required = true, value_name = "SPEC,SPEC", value_delimiter = ',', help = help())]
+    specs: Vec<String>,
+    /// The folder for the results; new or empty.
+    #[arg(short, long = "output", value_name = "FOLDER")]
+    output: PathBuf,
+    /// Replace an earlier comparison in FOLDER with all its runs.
+    #[arg(long)]
+    force: bool,
+    /// Go on with the comparison in FOLDER; all else must be as it was, but for specs that are added.
+    #[arg(long, conflicts_with = "force")]
+    resume: bool,
+    #[command(flatten)]
+    protocol: Protocol,
+    /// Print one JSON object: what table.json holds.
+    #[arg(long)]
+    json: bool,
+}
+
+fn help() -> String {
+    format!("What to compare, in the table's order. Each: {}", specs::help())
+}
+
+/// What lies beside the runs.
+const FILES: [&str; 3] = ["table.md", "table.json", "compare.png"];
+/// Longest record or spec that is read back, in bytes.
+const LONGEST: u64 = 1 << 20;
+/// Between two looks at a run's process.
+const LOOK: Duration = Duration::from_millis(20);
+
+/// A spec and how its run starts.
+struct Method {
+    /// Its own name, which is also its folder's.
+    name: String,
+    /// As it was asked for.
+    spec: String,
+    loaded: Loaded,
+    start: Start,
+}
+
+/// What stands in a method's folder decides how its run starts.
+#[derive(Debug, Clone, Copy, PartialEq)]
+enum Start {
+    /// Nothing does.
+    Anew,
+    /// What a run left that came to no checkpoint.
+    Replacing,
+    /// A checkpoint.
+    Resuming,
+    /// A finished run.
+    Done,
+}
+
+/// What is known of the input once all of it was looked at.
+struct Input {
+    scan: ScanRecord,
+    held: Vec<usize>,
+    reference: Option<MiddleSlices>,
+}
+
+/// All that `table.json` says.
+#[derive(Serialize)]
+struct Report<'a> {
+    protocol: Shared<'a>,
+    methods: Vec<Entry>,
+}
+
+/// What is the same for all.
+#[derive(Serialize)]
+struct Shared<'a> {
+    version: &'static str,
+    scan: ScanRecord,
+    held_out_views: Vec<usize>,
+    reference: Option<String>,
+    peak: f64,
+    seed: u64,
+    limits: &'a Ends,
+    sets: &'a [String],
+    backend: BackendChoice,
+    simd: String,
+    threads: usize,
+    memory_limit: Option<u64>,
+}
+
+/// A line of the table.
+#[derive(Serialize)]
+struct Entry {
+    name: String,
+    spec: String,
+    run: PathBuf,
+    status: &'static str,
+    error: Option<String>,
+    #[serde(flatten)]
+    figures: Option<Figures>,
+}
+
+/// What the table takes from a run's `record.json`, under the names that it has there.
+#[derive(Debug, Clone, Serialize, Deserialize)]
+struct Figures {
+    steps: u64,
+    train_s: f64,
+    export_s: f64,
+    total_s: f64,
+    peak_bytes: Option<u64>,
+    threads: usize,
+    parameters: usize,
+    samples: u64,
+    samples_per_s: Option<f64>,
+    loss: Option<f64>,
+    held_out: Option<f64>,
+    /// Kept as it stands, with the reasons for what is missing.
+    scores: Option<Value>,
+}
+
+impl Compare {
+    pub fn run(self, general: &General) -> Result<()> {
+        // Whatever is wrong with the input is told before anything is made.
+        let mut methods = self.methods()?;
+        let input = self.input()?;
+        self.look_into_folder()?;
+        for method in &mut methods {
+            method.start = self.start(method, &input)?;
+        }
+        self.open_folder()?;
+        signals::listen()?;
+        let mut entries = vec![];
+        for (i, method) in methods.iter().enumerate() {
+            let part = format!("{} ({} of {})", method.name, i + 1, methods.len());
+            entries.push(self.entry(method, part, general)?);
+        }
+        let Input { scan, held, reference } = input;
+        let report = Report { protocol: self.shared(scan, held, general), methods: entries };
+        let table = table(&report);
+        conefield_io::write_text_atomic(self.output.join("table.json"), &out::to_json(&report)?)?;
+        conefield_io::write_text_atomic(self.output.join("table.md"), &table.markdown())?;
+        let picture = self.draw(&report.methods, reference.as_ref())?;
+        if self.json {
+            out::json(&report)?;
+        } else {
+            out::say(&table.text())?;
+            out::say(&format!("\n{}table and runs in {}", picture, self.output.display()))?;
+        }
+        let failed: Vec<&str> = report.methods.iter().filter(|m| m.error.is_some()).map(|m| &m.name[..]).collect();
+        match failed.len() {
+            0 => Ok(()),
+            n => {
+                let why = format!("{n} of {} methods failed: {}", methods.len(), failed.join(", "));
+                Err(Error::unsupported("compare", why))
+            }
+        }
+    }
+
+    /// Every spec, read and built. Names must serve as folders and differ.
+    fn methods(&self) -> Result<Vec<Method>> {
+        let mut methods: Vec<Method> = vec![];
+        let backend = self.protocol.backend.open();
+        for spec in &self.specs {
+            let loaded = specs::read(spec, &self.protocol.sets)?;
+            Parts::of(&loaded, backend.as_ref())?.check_weights(&loaded)?;
+            let stem = Path::new(spec).file_stem().map(|s| s.to_string_lossy().into_owned()).unwrap_or_default();
+            let name = if loaded.spec.name.is_empty() { stem } else { loaded.spec.name.clone() };
+            let begins = name.starts_with(|c: char| c.is_alphanumeric());
+            let plain =
+                name.chars().all(|c| c.is_alphanumeric() || " ._+()-".contains(c)) && !name.ends_with([' ', '.']);
+            let free = !FILES.contains(&&name.to_lowercase()[..]) && name.len() <= 100;
+            let expected = "a name for a folder: letters, digits, and between them spaces and ._+()-";
+            ensure(begins && plain && free, &loaded.source, "name", format!("{name:?}"), expected)?;
+            if let Some(other) = methods.iter().find(|m| m.name.to_lowercase() == name.to_lowercase()) {
+                let found = format!("{name:?}, the name of {}", other.loaded.source);
+                return Err(Error::invalid(&loaded.source, "name", found, "a name of its own, for table and folder"));
+            }
+            methods.push(Method { name, spec: spec.clone(), loaded, start: Start::Anew });
+        }
+        Ok(methods)
+    }
+
+    /// Reads scan and reference, to refuse what does not fit; of both only little is kept.
+    fn input(&self) -> Result<Input> {
+        let all = Run {
+            scan: conefield_io::scan_size(&self.scan)?,
+            split: self.protocol.hold_out.is_some(),
+            reference: self.protocol.reference.is_some(),
+            field: true,
+            parameters: 0,
+            backend: 0,
+            solver: [0; 2],
+            resume: false,
+        };
+        all.memory().check(|_| vec![])?;
+        let scan = files::scan(&self.scan)?;
+        let reference = self.protocol.reference(&self.scan, &scan)?;
+        let record = ScanRecord::of(&self.scan, &scan);
+        let held = self.protocol.held_out(scan.geometry.views.len());
+        if !held.is_empty() {
+            split(scan, &held)?;
+        }
+        Ok(Input { scan: record, held, reference: reference.as_ref().map(MiddleSlices::of) })
+    }
+
+    /// What an earlier comparison left in the folder: files, and folders of runs. Refuses anything else, and an
+    /// earlier comparison where nothing says what to do with it.
+    fn look_into_folder(&self) -> Result<(Vec<PathBuf>, Vec<PathBuf>)> {
+        let place = self.output.display().to_string();
+        let (mut old, mut runs) = (vec![], vec![]);
+        let entries = match fs::read_dir(&self.output) {
+            Err(e) if e.kind() == ErrorKind::NotFound => return Ok((old, runs)),
+            entries => entries.map_err(|e| Error::io(&self.output, e))?,
+        };
+        for entry in entries {
+            let entry = entry.map_err(|e| Error::io(&self.output, e))?;
+            let (name, path) = (entry.file_name(), entry.path());
+            let known = FILES.iter().any(|f| name == *f) || conefield_io::is_unfinished(&name);
+            match entry.file_type() {
+                Ok(t) if t.is_file() && known => old.push(path),
+                Ok(t) if t.is_dir() && is_run(&path) => runs.push(path),
+                _ => {
+                    let found = format!("a folder with {} in it", name.to_string_lossy());
+                    return Err(Error::invalid(place, "output", found, "a new or empty folder"));
+                }
+            }
+        }
+        let expected = "a new or empty folder, --resume to go on or --force to replace it";
+        let free = self.force || self.resume || (old.is_empty() && runs.is_empty());
+        ensure(free, &place, "output", "an earlier comparison", expected)?;
+        Ok((old, runs))
+    }
+
+    /// Makes the folder; with `--force` without what stood in it.
+    fn open_folder(&self) -> Result<()> {
+        let (mut old, runs) = self.look_into_folder()?;
+        if self.force {
+            for run in &runs {
+                let entries = fs::read_dir(run).map_err(|e| Error::io(run, e))?;
+                old.extend(entries.filter_map(|e| e.ok()).map(|e| e.path()));
+            }
+            old.iter().try_for_each(|f| fs::remove_file(f).map_err(|e| Error::io(f, e)))?;
+            runs.iter().try_for_each(|f| fs::remove_dir(f).map_err(|e| Error::io(f, e)))?;
+        }
+        fs::create_dir_all(&self.output).map_err(|e| Error::io(&self.output, e))
+    }
+
+    /// How the run of `method` starts. Refuses to go on with another one's.
+    fn start(&self, method: &Method, input: &Input) -> Result<Start> {
+        let folder = self.output.join(&method.name);
+        if !self.resume || !folder.exists() {
+            return Ok(Start::Anew);
+        }
+        let mut now = identity(&method.loaded, &self.protocol, &input.held, &input.scan.projections_fnv1a64)?;
+        let [record, checkpoint, volume] =
+            ["record.json", "checkpoint.safetensors", "volume.nii.gz"].map(|f| folder.join(f));
+        if record.exists() && volume.exists() {
+            now.insert("reference".into(), Value::from(self.reference()).to_string());
+            now.insert("peak".into(), self.protocol.peak.to_string());
+            files::same_run(&record.display().to_string(), &recorded(&folder)?, &now)?;
+            return Ok(Start::Done);
+        }
+        if checkpoint.exists() {
+            files::read_checkpoint(&checkpoint, &now)?;
+            return Ok(Start::Resuming);
+        }
+        Ok(Start::Replacing)
+    }
+
+    /// Runs `method` unless that is done; its line of the table.
+    fn entry(&self, method: &Method, part: String, general: &General) -> Result<Entry> {
+        let run = self.output.join(&method.name);
+        let error = if method.start == Start::Done {
+            info!("{part} is done already");
+            None
+        } else {
+            info!("{part}");
+            self.reconstruct(method, part, general)?
+        };
+        let figures = match &error {
+            Some(_) => None,
+            None => Some(read_json(&run.join("record.json"))?),
+        };
+        let status = if error.is_some() { "failed" } else { "done" };
+        Ok(Entry { name: method.name.clone(), spec: method.spec.clone(), run, status, error, figures })
+    }
+
+    /// Runs `method` in a process of its own; what went wrong with it, if anything did.
+    fn reconstruct(&self, method: &Method, part: String, general: &General) -> Result<Option<String>> {
+        if signals::caught().is_some() {
+            return Err(Error::Stopped { part });
+        }
+        let program = std::env::current_exe().map_err(|e| Error::io("conefield", e))?;
+        let io = |e| Error::io(&program, e);
+        let mut command = Command::new(&program);
+        command.args(general.arguments()).args(["reconstruct", "--as-part"]);
+        command.arg(word("--spec", &method.spec)).arg(word("--output", self.output.join(&method.name)));
+        command.args(match method.start {
+            Start::Resuming => &["--resume"][..],
+            Start::Replacing => &["--force"],
+            Start::Anew | Start::Done => &[],
+        });
+        command.args(self.protocol.arguments()).arg("--").arg(&self.scan);
+        let mut child = command.stdin(Stdio::piped()).stdout(Stdio::piped()).spawn().map_err(io)?;
+        let mut input = child.stdin.take();
+        let output = child.stdout.take();
+        let said = std::thread::spawn(move || {
+            let mut said = vec![];
+            let _ = output.map(|mut o| o.read_to_end(&mut said));
+            String::from_utf8_lossy(&said).into_owned()
+        });
+        let status = loop {
+            if let Some(status) = child.try_wait().map_err(io)? {
+                break status;
+            }
+            // Ctrl-C reaches the child by itself; a signal to this process alone reaches it by the end of its input.
+            if signals::caught().is_some() {
+                input = None;
+            }
+            std::thread::sleep(LOOK);
+        };
+        drop(input);
+        let said = said.join().unwrap_or_default();
+        if let Some(signal) = ended_by(status).filter(|_| !status.success()).filter(|s| [2, 15].contains(s)) {
+            signals::note(signal);
+        }
+        if signals::caught().is_some() {
+            return Err(Error::Stopped { part });
+        }
+        let line = said.lines().find_map(|l| l.strip_prefix(FAILED)).map(str::to_owned);
+        Ok((!status.success()).then(|| line.unwrap_or_else(|| format!("the process ended with {status}"))))
+    }
+
+    fn reference(&self) -> Option<String> {
+        self.protocol.reference.as_ref().map(|r| r.display().to_string())
+    }
+
+    fn shared(&self, scan: ScanRecord, held_out_views: Vec<usize>, general: &General) -> Shared<'_> {
+        Shared {
+            version: env!("CARGO_PKG_VERSION"),
+            scan,
+            held_out_views,
+            reference: self.reference(),
+            peak: self.protocol.peak,
+            seed: self.protocol.seed,
+            limits: &self.protocol.ends,
+            sets: &self.protocol.sets,
+            backend: self.protocol.backend,
+            simd: simd_level(),
+            threads: rayon::current_num_threads(),
+            memory_limit: general.memory,
+        }
+    }
+
+    /// Draws the results side by side; the picture in words.
+    fn draw(&self, entries: &[Entry], reference: Option<&MiddleSlices>) -> Result<String> {
+        let path = self.output.join("compare.png");
+        let mut panels = vec![];
+        for entry in entries {
+            let Some(figures) = &entry.figures else { continue };
+            let volume = entry.run.join("volume.nii.gz");
+            Memory::of_volumes(&[conefield_io::volume_voxels(&volume)?]).check(|_| vec![])?;
+            let caption = match figures.psnr() {
+                Some(psnr) => format!("{} {psnr:.2} dB", entry.name),
+                None => entry.name.clone(),
+            };
+            panels.push((caption, MiddleSlices::of(&conefield_io::read_volume(&volume)?)));
+        }
+        let panels: Vec<(&str, &MiddleSlices)> = panels.iter().map(|(c, s)| (&c[..], s)).collect();
+        match (reference, panels.first()) {
+            (_, None) => {
+                // One of an earlier comparison would not belong to this table.
+                let _ = fs::remove_file(&path);
+                return Ok(String::new());
+            }
+            (Some(r), _) => conefield_io::compare_png(&path, ("reference", r), &panels, r.window())?,
+            (None, Some((_, first))) => conefield_io::slices_png(&path, &panels, first.window(), None)?,
+        }
+        Ok(format!("picture: {}\n", path.display()))
+    }
+}
+
+/// Whether a folder holds nothing but what a run leaves.
+fn is_run(folder: &Path) -> bool {
+    let known = |e: fs::DirEntry| {
+        let name = e.file_name();
+        run::FILES.iter().any(|f| name == *f) || conefield_io::is_unfinished(&name)
+    };
+    fs::read_dir(folder).is_ok_and(|entries| entries.into_iter().all(|e| e.is_ok_and(known)))
+}
+
+/// What ended a process: its exit status above 128, as shells have it, or the signal itself.
+fn ended_by(status: ExitStatus) -> Option<u8> {
+    #[cfg(unix)]
+    let signal = std::os::unix::process::ExitStatusExt::signal(&status);
+    #[cfg(not(unix))]
+    let signal = None;
+    signal.or(status.code().and_then(|c| c.checked_sub(128))).and_then(|s| u8::try_from(s).ok())
+}
+
+fn read_json<T: serde::de::DeserializeOwned>(path: &Path) -> Result<T> {
+    let text = conefield_core::files::read_text(path, LONGEST)?;
+    let expected = "what conefield writes there; --force starts anew";
+    serde_json::from_str(&text).map_err(|e| Error::invalid(path.display().to_string(), "JSON", e, expected))
+}
+
+/// Which run a finished one was, as [`identity`] has it, and what it was compared with.
+fn recorded(folder: &Path) -> Result<BTreeMap<String, String>> {
+    #[derive(Deserialize)]
+    struct Known {
+        version: String,
+        seed: u64,
+        scan: KnownScan,
+        held_out_views: Vec<usize>,
+        limits: Ends,
+        reference: Value,
+        peak: f64,
+    }
+    #[derive(Deserialize)]
+    struct KnownScan {
+        projections_fnv1a64: String,
+    }
+    let known: Known = read_json(&folder.join("record.json"))?;
+    Ok(BTreeMap::from([
+        ("conefield".into(), known.version),
+        ("seed".into(), known.seed.to_string()),
+        ("spec".into(), conefield_core::files::read_text(&folder.join("spec.toml"), LONGEST)?),
+        ("projections".into(), known.scan.projections_fnv1a64),
+        ("held_out_views".into(), format!("{:?}", known.held_out_views)),
+        ("limits".into(), out::to_json(&known.limits)?),
+        ("reference".into(), known.reference.to_string()),
+        ("peak".into(), known.peak.to_string()),
+    ]))
+}
+
+impl Figures {
+    /// dB; infinite, which JSON has no number for, where the result is the reference.
+    fn psnr(&self) -> Option<f64> {
+        self.scores.as_ref().map(|s| s["psnr"].as_f64().unwrap_or(f64::INFINITY))
+    }
+
+    /// The table's columns: how the result fits, by what is known, and what it took.
+    fn cells(&self, with: &Columns) -> Vec<String> {
+        let mut cells = vec![];
+        if with.scores {
+            let ssims =
+                ["ssim_2d", "ssim_3d", "ssim_skimage"].map(|name| self.scores.as_ref().and_then(|s| s[name].as_f64()));
+            cells.extend(score_cells(self.psnr().unwrap_or(f64::NAN), ssims));
+        }
+        let figure = |x: Option<f64>| x.map_or("-".into(), |x| format!("{x:.4e}"));
+        cells.extend(with.held_out.then(|| figure(self.held_out)));
+        cells.extend(with.loss.then(|| figure(self.loss)));
+        cells.push(out::number(self.steps));
+        cells.extend([self.train_s, self.total_s].map(|s| format!("{s:.2}")));
+        cells.push(self.peak_bytes.map_or("-".into(), out::bytes));
+        cells
+    }
+}
+
+/// Which figures tell how a result fits: scores where there is a reference, otherwise held-out views, otherwise the
+/// loss, which says least.
+struct Columns {
+    scores: bool,
+    held_out: bool,
+    loss: bool,
+}
+
+fn table(report: &Report) -> Table {
+    let protocol = &report.protocol;
+    let (scores, held_out) = (protocol.reference.is_some(), !protocol.held_out_views.is_empty());
+    let with = Columns { scores, held_out, loss: !scores && !held_out };
+    let mut heads = vec!["method"];
+    heads.extend(SCORES.iter().filter(|_| with.scores));
+    heads.extend(with.held_out.then_some("held-out error"));
+    heads.extend(with.loss.then_some("loss"));
+    heads.extend(["steps or passes", "solving s", "all s", "peak memory"]);
+    let mut rows = vec![heads.iter().map(|h| h.to_string()).collect::<Vec<_>>()];
+    let mut notes = vec![protocol.line()];
+    for entry in &report.methods {
+        let cells = match (&entry.figures, &entry.error) {
+            (Some(figures), _) => figures.cells(&with),
+            (None, error) => {
+                notes.extend(error.as_ref().map(|e| format!("{} failed: {e}", entry.name)));
+                (1..heads.len()).map(|c| if c == 1 { "failed" } else { "-" }.to_owned()).collect()
+            }
+        };
+        rows.push([vec![entry.name.clone()], cells].concat());
+    }
+    Table { rows, notes }
+}
+
+impl Shared<'_> {
+    /// The protocol in a sentence.
+    fn line(&self) -> String {
+        let mut parts = vec![self.scan.line()];
+        match self.held_out_views.len() {
+            0 => {}
+            n => parts.push(format!("{n} views held out")),
+        }
+        parts.extend(self.reference.as_ref().map(|r| format!("reference {r}, peak {}", self.peak)));
+        parts.extend(self.limits.steps.map(|n| format!("{} steps", out::number(n))));
+        parts.extend(self.limits.budget.map(|t| format!("budget {}", out::duration(t))));
+        parts.extend(self.limits.at_most.map(|t| format!("at most {}", out::duration(t))));
+        parts.extend(self.sets.iter().map(|s| format!("`{s}`")));
+        parts.push(format!("seed {}, {} threads, conefield {}", self.seed, self.threads, self.version));
+        parts.join("; ")
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn an_equal_result_has_no_number_for_its_psnr() {
+        let scores = serde_json::json!({ "psnr": null, "ssim_2d": 1.0, "ssim_3d": null, "ssim_skimage": 1.0 });
+        let figures = Figures {
+            steps: 1,
+            train_s: 1.0,
+            export_s: 0.5,
+            total_s: 2.0,
+            peak_bytes: None,
+            threads: 2,
+            parameters: 0,
+            samples: 0,
+            samples_per_s: None,
+            loss: None,
+            held_out: None,
+            scores: Some(scores),
+        };
+        let cells = figures.cells(&Columns { scores: true, held_out: true, loss: false });
+        assert_eq!(cells, ["inf", "1.0000", "-", "1.0000", "-", "1", "1.00", "2.00", "-"]);
+        let cells = figures.cells(&Columns { scores: false, held_out: false, loss: true });
+        assert_eq!(cells, ["-", "1", "1.00", "2.00", "-"]);
+    }
+}

@@ -1,0 +1,117 @@
+//! What a reconstruction is asked for beside scan and spec: the same for every method that is compared.
+
+use super::{BackendChoice, Ends};
+use crate::parse::{self, HoldOut};
+use clap::{Args, ValueEnum};
+use conefield_core::scan::{Scan, Volume};
+use conefield_core::{Error, Result};
+use std::ffi::{OsStr, OsString};
+use std::path::{Path, PathBuf};
+
+/// The options that `reconstruct` and `compare` share.
+#[derive(Debug, Clone, Args)]
+pub struct Protocol {
+    /// Time between two checkpoints, which --resume starts from.
+    #[arg(long, value_name = "TIME", default_value = "60s", value_parser = parse::seconds)]
+    pub checkpoint_every: f64,
+    /// Change a setting, such as encoder.levels=8.
+    #[arg(long = "set", value_name = "KEY=VALUE")]
+    pub sets: Vec<String>,
+    #[command(flatten)]
+    pub ends: Ends,
+    /// Which backend.
+    #[arg(long, default_value = "auto")]
+    pub backend: BackendChoice,
+    /// The volume sought, to compare with: a file, or "truth" for the one that the scan comes with.
+    #[arg(long, value_name = "VOLUME")]
+    pub reference: Option<PathBuf>,
+    /// The data range for PSNR and SSIM.
+    #[arg(long, default_value = "1", value_parser = parse::above_zero)]
+    pub peak: f64,
+    /// Views to keep aside and predict, such as 3,17 or every:10.
+    #[arg(long, value_name = "VIEWS", value_parser = parse::hold_out)]
+    pub hold_out: Option<HoldOut>,
+    /// Seed of everything random.
+    #[arg(long, default_value_t = 0)]
+    pub seed: u64,
+}
+
+impl Protocol {
+    /// The reference, if there is one, as large as `scan` asks for.
+    pub fn reference(&self, scan_path: &Path, scan: &Scan) -> Result<Option<Volume>> {
+        let Some(path) = &self.reference else { return Ok(None) };
+        let volume = if path == Path::new("truth") && !path.exists() {
+            let place = scan_path.display().to_string();
+            conefield_io::read_truth(scan_path)?
+                .ok_or_else(|| Error::invalid(place, "--reference truth", "a scan without a truth", "a volume file"))?
+        } else {
+            conefield_io::read_volume(path)?
+        };
+        let want = scan.geometry.volume.shape;
+        if volume.data.shape() != want {
+            let found = format!("{:?}", volume.data.shape());
+            let expected = format!("{want:?}, the voxels that this scan asks for");
+            return Err(Error::invalid(path.display().to_string(), "shape", found, expected));
+        }
+        Ok(Some(volume))
+    }
+
+    /// Indices of the views that are kept aside, of `n`.
+    pub fn held_out(&self, n: usize) -> Vec<usize> {
+        self.hold_out.as_ref().map(|h| h.views(n)).unwrap_or_default()
+    }
+
+    /// The same again, for a child process. Flag and value are one word: a value may begin with a dash.
+    pub fn arguments(&self) -> Vec<OsString> {
+        let Self { checkpoint_every, sets, ends, backend, reference, peak, hold_out, seed } = self;
+        let backend = backend.to_possible_value().map(|v| v.get_name().to_owned());
+        let all = [
+            ("--checkpoint-every", Some(checkpoint_every.to_string())),
+            ("--budget", ends.budget.map(|t| t.to_string())),
+            ("--steps", ends.steps.map(|n| n.to_string())),
+            ("--at-most", ends.at_most.map(|t| t.to_string())),
+            ("--backend", backend),
+            ("--peak", Some(peak.to_string())),
+            ("--hold-out", hold_out.as_ref().map(HoldOut::to_string)),
+            ("--seed", Some(seed.to_string())),
+        ];
+        let all = all.into_iter().filter_map(|(flag, value)| Some(word(flag, value?)));
+        let sets = sets.iter().map(|s| word("--set", s));
+        all.chain(sets).chain(reference.iter().map(|r| word("--reference", r))).collect()
+    }
+}
+
+/// `--flag=value`
+pub fn word(flag: &str, value: impl AsRef<OsStr>) -> OsString {
+    let mut word = OsString::from(flag);
+    word.push("=");
+    word.push(value);
+    word
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use clap::Parser;
+
+    #[derive(Parser)]
+    struct Line {
+        #[command(flatten)]
+        protocol: Protocol,
+    }
+
+    #[test]
+    fn a_child_is_told_the_same() {
+        let full = "x --checkpoint-every 0.1m --set a=b --set c=[1,2] --budget 1h --steps 7 --at-most 1e-9s --backend cpu \
+                    --reference -v.nii --peak 2.5 --hold-out";
+        for held in ["3,17", "every:10"] {
+            // `--reference -v.nii` needs its equals sign.
+            let line: Vec<String> = full.replace("--reference ", "--reference=").split(' ').map(Into::into).collect();
+            let line: Vec<String> = line.into_iter().filter(|w| !w.is_empty()).chain([held.into()]).collect();
+            let first = Line::try_parse_from(line).unwrap().protocol;
+            let again = [OsString::from("x")].into_iter().chain(first.arguments());
+            let second = Line::try_parse_from(again).unwrap().protocol;
+            assert_eq!(format!("{first:?}"), format!("{second:?}"));
+        }
+    }
+}

@@ -1,0 +1,275 @@
+//! `compare`: one table in three forms, one picture, and runs that stand for themselves.
+
+mod common;
+use common::{conefield, done, json, refused, text};
+use serde_json::Value;
+use std::fs;
+use std::path::{Path, PathBuf};
+use std::time::SystemTime;
+use tempfile::{TempDir, tempdir};
+
+/// A small scan in a folder of its own.
+fn scan() -> (TempDir, PathBuf) {
+    let dir = tempdir().unwrap();
+    let path = dir.path().join("scan");
+    done(&["simulate", "phantom:head:24", "-o", &text(&path), "--views", "12", "--detector", "24x24"]);
+    (dir, path)
+}
+
+fn arguments(scan: &Path, specs: &str, output: &Path, more: &[&str]) -> Vec<String> {
+    let (scan, output) = (text(scan), text(output));
+    [&["compare", &scan, "--specs", specs, "-o", &output, "--steps", "3"], more]
+        .concat()
+        .iter()
+        .map(|a| a.to_string())
+        .collect()
+}
+
+fn words(line: &[String]) -> Vec<&str> {
+    line.iter().map(String::as_str).collect()
+}
+
+fn read(path: &Path) -> Value {
+    serde_json::from_str(&fs::read_to_string(path).unwrap()).unwrap()
+}
+
+/// Cells of the Markdown table, one row a method.
+fn markdown(folder: &Path) -> Vec<Vec<String>> {
+    let text = fs::read_to_string(folder.join("table.md")).unwrap();
+    let rows = text
+        .lines()
+        .filter(|l| l.starts_with('|'))
+        .map(|l| l.trim_matches('|').split('|').map(|c| c.trim().to_owned()).collect::<Vec<_>>());
+    rows.filter(|r| !r[0].starts_with("---")).collect()
+}
+
+/// When every file below `folder` was last written.
+fn times(folder: &Path) -> Vec<(PathBuf, SystemTime)> {
+    let mut all: Vec<_> = fs::read_dir(folder)
+        .unwrap()
+        .map(|e| e.unwrap())
+        .map(|e| (e.path(), e.metadata().unwrap().modified().unwrap()))
+        .collect();
+    all.sort();
+    all
+}
+
+#[test]
+fn table_picture_and_records_agree_and_resume_skips_what_is_done() {
+    let (dir, scan) = scan();
+    let out = dir.path().join("out");
+    let all = ["--reference", "truth", "--hold-out", "every:4", "--seed", "3"];
+    let line = arguments(&scan, "fdk,sirt,fast", &out, &all);
+    let shown = done(&words(&line));
+    let table = read(&out.join("table.json"));
+    let protocol = &table["protocol"];
+    assert_eq!(protocol["scan"]["views"], 12);
+    assert_eq!(protocol["scan"]["detector"], serde_json::json!([24, 24]));
+    assert_eq!(protocol["scan"]["volume"], serde_json::json!([24, 24, 24]));
+    assert_eq!(
+        (&protocol["seed"], &protocol["reference"], &protocol["limits"]["steps"]),
+        (&3.into(), &"truth".into(), &3.into())
+    );
+    let rows = markdown(&out);
+    let heads = [
+        "method",
+        "PSNR dB",
+        "ssim_2d",
+        "ssim_3d",
+        "ssim_skimage",
+        "held-out error",
+        "steps or passes",
+        "solving s",
+        "all s",
+        "peak memory",
+    ];
+    assert_eq!(rows[0], heads);
+    let methods = table["methods"].as_array().unwrap();
+    assert_eq!(methods.iter().map(|m| m["name"].as_str().unwrap()).collect::<Vec<_>>(), ["fdk", "sirt", "fast"]);
+    for (method, row) in methods.iter().zip(&rows[1..]) {
+        let name = method["name"].as_str().unwrap();
+        assert_eq!(method["run"], text(&out.join(name)));
+        assert_eq!(method["status"], "done");
+        let record = read(&out.join(name).join("record.json"));
+        for key in
+            ["steps", "train_s", "export_s", "total_s", "peak_bytes", "samples_per_s", "loss", "held_out", "scores"]
+        {
+            assert_eq!(method[key], record[key], "{name}: {key}");
+        }
+        let number = |key: &str| record["scores"][key].as_f64().unwrap();
+        assert_eq!(row[0], name);
+        assert_eq!(row[1], format!("{:.2}", number("psnr")));
+        for (cell, key) in row[2..5].iter().zip(["ssim_2d", "ssim_3d", "ssim_skimage"]) {
+            assert_eq!(*cell, format!("{:.4}", number(key)), "{name}: {key}");
+        }
+        assert_eq!(row[6], record["steps"].to_string());
+        assert!(record["total_s"].as_f64() >= record["train_s"].as_f64());
+        // The terminal has the same cells.
+        let told = shown.lines().find(|l| l.split("  ").next() == Some(name)).unwrap();
+        let told: Vec<&str> = told.split("  ").map(str::trim).filter(|c| !c.is_empty()).collect();
+        assert_eq!(told, *row);
+    }
+    // No step of FDK takes samples or has a loss or an error of views: nothing is made up for it.
+    assert_eq!([&methods[0]["samples_per_s"], &methods[0]["loss"], &methods[0]["held_out"]], [&Value::Null; 3]);
+    assert_eq!(rows[1][5], "-");
+    assert_eq!([&methods[1]["steps"], &methods[2]["steps"]], [3, 3]);
+    let picture = image::open(out.join("compare.png")).unwrap();
+    assert!((1000..3000).contains(&picture.width()) && (600..3000).contains(&picture.height()));
+
+    // A run that was interrupted before its first checkpoint, and one that is added; the others stay as they are.
+    let before = times(&out.join("fdk"));
+    fs::remove_file(out.join("sirt/record.json")).unwrap();
+    let line = arguments(&scan, "fdk,sirt,fast,cgls", &out, &[&all[..], &["--resume", "--json"]].concat());
+    let again = json(&words(&line));
+    assert_eq!(again, read(&out.join("table.json")));
+    assert_eq!(times(&out.join("fdk")), before);
+    assert_eq!(again["methods"][0], table["methods"][0]);
+    assert_eq!(again["methods"][1]["scores"], table["methods"][1]["scores"]);
+    assert_eq!(again["methods"].as_array().unwrap().len(), 4);
+
+    // What is done belongs to its protocol.
+    for (more, want) in [
+        (&["--reference", "truth", "--hold-out", "every:4", "--seed", "4"][..], "seed"),
+        (&["--reference", "truth", "--seed", "3"], "held_out_views"),
+        (&["--hold-out", "every:4", "--seed", "3"], "reference"),
+        (&["--reference", "truth", "--hold-out", "every:4", "--seed", "3", "--at-most", "9s"], "limits"),
+        (
+            &["--reference", "truth", "--hold-out", "every:4", "--seed", "3", "--set", "solver.nonnegative=false"],
+            "spec",
+        ),
+    ] {
+        let line = arguments(&scan, "fdk", &out, &[more, &["--resume"]].concat());
+        let said = refused(1, &words(&line));
+        assert!(said.contains(&format!("--resume: {want}")), "{said}");
+    }
+    assert_eq!(times(&out.join("fdk")), before);
+    let said = refused(1, &words(&arguments(&scan, "fdk", &out, &all)));
+    assert!(said.contains("an earlier comparison") && said.contains("--resume"), "{said}");
+    done(&words(&arguments(&scan, "sirt", &out, &["--force"])));
+    assert!(!out.join("fdk").exists() && out.join("sirt/record.json").exists());
+    // Without reference and held-out views there is the loss.
+    assert_eq!(markdown(&out)[0][1], "loss");
+    assert!(read(&out.join("table.json"))["methods"][0]["scores"].is_null());
+}
+
+#[test]
+fn a_method_that_fails_leaves_the_others_their_rows() {
+    let (dir, scan) = scan();
+    let out = dir.path().join("out");
+    let (spec, off) = (dir.path().join("wild.toml"), dir.path().join("off.toml"));
+    fs::write(&spec, "extends = \"fast\"\nname = \"wild\"\n[solver]\nlr = 1e30\n").unwrap();
+    // Found when it is read by the solver: a volume to start from that is not there.
+    fs::write(&off, "extends = \"sirt\"\nname = \"off\"\n[initializer]\ntype = \"volume\"\npath = \"none.nii\"\n")
+        .unwrap();
+    let specs = format!("{},fdk,{}", text(&spec), text(&off));
+    let line = arguments(&scan, &specs, &out, &["--reference", "truth"]);
+    let output = conefield(&words(&line)).assert().code(1).get_output().clone();
+    let (shown, said) = (String::from_utf8(output.stdout).unwrap(), String::from_utf8(output.stderr).unwrap());
+    let table = read(&out.join("table.json"));
+    let status = |i: usize| table["methods"][i]["status"].as_str().unwrap();
+    assert_eq!((status(1), status(2)), ("done", "failed"), "{shown}\n{said}");
+    let why = table["methods"][2]["error"].as_str().unwrap();
+    assert!(why.contains("none.nii") && !why.contains('\n'), "{why}");
+    let rows = markdown(&out);
+    assert_eq!(&rows[3][..2], ["off", "failed"]);
+    assert!(shown.contains(&format!("off failed: {why}")), "{shown}");
+    assert!(said.contains("methods failed: ") && said.contains("off"), "{said}");
+    assert!(image::open(out.join("compare.png")).is_ok());
+    // What failed is tried again, what is done is not.
+    let before = times(&out.join("fdk"));
+    let line = arguments(&scan, &specs, &out, &["--reference", "truth", "--resume"]);
+    conefield(&words(&line)).assert().code(1);
+    assert_eq!(times(&out.join("fdk")), before);
+}
+
+#[test]
+fn bad_input_makes_no_folder() {
+    let (dir, scan) = scan();
+    let out = dir.path().join("out");
+    let (small, slash) = (dir.path().join("small.nii"), dir.path().join("slash.toml"));
+    done(&["simulate", "phantom:head:16", "-o", &text(&dir.path().join("other")), "--views", "2", "--detector", "8x8"]);
+    done(&["convert", &text(&dir.path().join("other/truth.nii.gz")), &text(&small)]);
+    fs::write(&slash, "extends = \"fdk\"\nname = \"../fdk\"\n").unwrap();
+    let twice = format!(
+        "fdk,{}",
+        text(&{
+            let path = dir.path().join("again.toml");
+            fs::write(&path, "extends = \"fdk\"\n").unwrap();
+            path
+        })
+    );
+    for (specs, more, want) in [
+        ("fdk,fkd", &[][..], "neither a shipped spec nor a file"),
+        ("fdk,fdk", &[], "a name of its own"),
+        (&twice, &[], "a name of its own"),
+        (&text(&slash), &[], "a name for a folder"),
+        ("fdk", &["--reference", "nothing.nii"], "nothing.nii"),
+        ("fdk", &["--reference", &text(&small)], "[24, 24, 24], the voxels that this scan asks for"),
+        ("fdk", &["--hold-out", "12"], "expected an index below 12"),
+        ("fdk,sirt", &["--set", "encoder.levels=3"], "encoder"),
+    ] {
+        let said = refused(1, &words(&arguments(&scan, specs, &out, more)));
+        assert!(said.contains(want), "{specs} {more:?}: {said}");
+        assert!(!out.exists(), "{specs} {more:?}");
+    }
+    let said = refused(1, &words(&arguments(Path::new("no-scan"), "fdk", &out, &[])));
+    assert!(said.contains("no-scan") && !out.exists(), "{said}");
+    // A folder with anything else in it stays as it is, whatever is asked for.
+    let said = refused(1, &words(&arguments(&scan, "fdk", dir.path(), &["--force"])));
+    assert!(said.contains("in it, expected a new or empty folder"), "{said}");
+    assert!(scan.join("scan.toml").exists());
+}
+
+#[cfg(unix)]
+#[test]
+fn a_signal_stops_it_and_resume_goes_on_to_the_same_bits() {
+    use std::process::{Command, Stdio};
+    use std::time::{Duration, Instant};
+    let (dir, scan) = scan();
+    let line = |out: &Path, more: &[&str]| {
+        let line = arguments(&scan, "fdk,sirt", out, more);
+        line.into_iter().map(|w| if w == "3" { "4000".into() } else { w }).collect::<Vec<String>>()
+    };
+    let whole = dir.path().join("whole");
+    done(&words(&line(&whole, &[])));
+    let mut out = PathBuf::new();
+    for (signal, code) in [("INT", 130), ("TERM", 143)] {
+        out = dir.path().join(signal);
+        let mut command = Command::new(assert_cmd::cargo::cargo_bin("conefield"));
+        command.arg("--quiet").args(line(&out, &[])).stdout(Stdio::piped()).stderr(Stdio::piped());
+        let child = command.spawn().unwrap();
+        let metrics = out.join("sirt/metrics.jsonl");
+        let until = Instant::now() + Duration::from_secs(60);
+        while fs::metadata(&metrics).map_or(0, |m| m.len()) == 0 && Instant::now() < until {
+            std::thread::sleep(Duration::from_millis(2));
+        }
+        // To the one process alone: its child learns of it from its input.
+        assert!(Command::new("sh").arg("-c").arg(format!("kill -{signal} {}", child.id())).status().unwrap().success());
+        let output = child.wait_with_output().unwrap();
+        let said = String::from_utf8(output.stderr).unwrap();
+        assert_eq!(output.status.code(), Some(code), "{said}");
+        assert!(said.contains("interrupted during sirt (2 of 2); the same command with --resume"), "{said}");
+        assert!(output.stdout.is_empty() && !out.join("table.json").exists());
+        assert!(out.join("sirt/checkpoint.safetensors").exists() && out.join("fdk/record.json").exists());
+    }
+    let said = refused(1, &words(&line(&out, &["--resume", "--seed", "1"])));
+    assert!(said.contains("--resume: seed"), "{said}");
+    let before = times(&out.join("fdk"));
+    done(&words(&line(&out, &["--resume"])));
+    assert_eq!(times(&out.join("fdk")), before);
+    let volume = |folder: &Path| fs::read(folder.join("sirt/volume.nii.gz")).unwrap();
+    assert!(volume(&whole) == volume(&out));
+}
+
+#[test]
+fn a_cap_on_time_ends_what_a_budget_would_stretch() {
+    let (dir, scan) = scan();
+    let run = |name: &str, more: &[&str]| {
+        let out = text(&dir.path().join(name));
+        let scan = text(&scan);
+        let line = [&["reconstruct", &scan, "--spec", "sirt", "-o", &out, "--json"], more].concat();
+        json(&line)["steps"].as_u64().unwrap()
+    };
+    assert_eq!(run("whole", &["--at-most", "1h", "--set", "solver.stop.passes=5"]), 5);
+    assert!(run("cut", &["--at-most", "1e-9s"]) < 2);
+}
