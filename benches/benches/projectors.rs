@@ -1,44 +1,65 @@
-//! Speed of the voxel projectors on 50 views of 512² pixels and 256³ voxels: Joseph forward, its adjoint and the
-//! voxel-driven back-projection, against what the machine allows in the same run.
+//! Speed of the voxel projectors and of FDK on 50 views of 512² pixels and 256³ voxels: Joseph forward, its adjoint and
+//! the voxel-driven back-projection, against what the machine allows in the same run.
 //!
 //! `cargo bench -p conefield-benches --bench projectors`; `benches/peers/classical.sh` puts RTK beside it.
 
+use conefield_backend_cpu::Cpu;
+use conefield_benches::{bandwidth, multiply_adds, times};
 use conefield_core::geometry::{Geometry, Millimetres, Radians, View, VoxelGrid};
+use conefield_core::scan::{Scan, Unit};
+use conefield_core::solver::{Job, Limits, Silent};
+use conefield_core::spec::load::parse;
 use conefield_core::voxel::VoxelOperator;
+use conefield_core::{Error, Result};
 use conefield_projectors::voxel::Joseph;
 use conefield_projectors::voxel::backproject::backproject;
 use conefield_projectors::voxel::layout::ColumnMajor;
+use conefield_solvers as _;
 use ndarray::Array3;
-use rayon::prelude::*;
-use std::time::Instant;
 
 const RUNS: usize = 5;
 
-fn main() {
+/// What a machine does at most in a second.
+struct Limit {
+    multiply_adds: f64,
+    bytes: f64,
+}
+
+fn main() -> Result<()> {
     let geometry = geometry();
     let views: Vec<usize> = (0..geometry.views.len()).collect();
     let [rows, columns] = geometry.detector;
     let volume = Array3::from_shape_fn(geometry.volume.shape, |(x, y, z)| ((x * 7 + y * 3 + z) % 11) as f32 / 11.0);
     let mut projections = Array3::<f32>::zeros((views.len(), rows, columns));
     let mut back = Array3::<f32>::zeros(geometry.volume.shape);
+    let forward = times(RUNS, || Joseph {}.forward(&geometry, &views, volume.view(), projections.view_mut()));
     // Every pixel whose ray meets the box, in each of about 256 planes; every voxel in every view.
-    let forward = times(|| Joseph {}.forward(&geometry, &views, volume.view(), projections.view_mut()));
     let samples = projections.iter().filter(|x| **x > 0.0).count() as f64 * 256.0;
-    let adjoint = times(|| Joseph {}.adjoint(&geometry, &views, projections.view(), back.view_mut()));
     let updates = (volume.len() * views.len()) as f64;
+    let adjoint = times(RUNS, || Joseph {}.adjoint(&geometry, &views, projections.view(), back.view_mut()));
     let scales = vec![1.0; views.len()];
-    let driven = times(|| {
+    let driven = times(RUNS, || {
         for part in views.chunks(8) {
             let images = projections.slice(ndarray::s![part[0]..part[0] + part.len(), .., ..]);
             let pixels = ColumnMajor::new(&geometry, part, images, |_, _, _, x| x);
             backproject(&geometry, part, &pixels, &scales, back.view_mut());
         }
     });
-    report("joseph forward", forward, samples, "samples");
-    report("joseph adjoint", adjoint, samples, "samples");
-    report("voxel-driven back", driven, updates, "updates");
-    println!("limits of this machine, measured now:");
-    println!("  memory read        {:.1} GB/s", bandwidth() / 1e9);
+    let scan = Scan { geometry, projections, unit: Unit::default(), provenance: serde_json::Value::Null };
+    let fdk = fdk(&scan)?;
+    let limit = Limit { multiply_adds: multiply_adds(), bytes: bandwidth() };
+    println!(
+        "limits of this machine, measured now: {:.0} G multiply-adds/s, {:.1} GB/s from memory",
+        limit.multiply_adds / 1e9,
+        limit.bytes / 1e9
+    );
+    // A volume is read (and written) once for a batch of views, not once a view.
+    let volume = 4.0 * volume.len() as f64;
+    report("joseph forward", forward, samples, volume, &limit);
+    report("joseph adjoint", adjoint, samples, 2.0 * volume, &limit);
+    report("voxel-driven back", driven, updates, 2.0 * volume * views.len().div_ceil(8) as f64, &limit);
+    report("fdk", fdk, updates, 2.0 * volume * views.len().div_ceil(8) as f64, &limit);
+    Ok(())
 }
 
 fn geometry() -> Geometry {
@@ -52,6 +73,37 @@ fn geometry() -> Geometry {
     }
 }
 
-fn report(name: &str, [low, median, high]: [f64; 3], work: f64, unit: &str) {
-    println!("{name:<20} {median:.3} s ({low:.3} to {high:.3}), {:.2} G {unit}/s", work / median / 1e9);
+/// The whole solver, filters and all.
+fn fdk(scan: &Scan) -> Result<[f64; 3]> {
+    let spec = parse("name = \"fdk\"\n[solver]\ntype = \"fdk\"\n", "bench", &[], &[])?.spec;
+    let solver = spec.solver.build()?;
+    let job = Job {
+        scan,
+        held_out: None,
+        reference: None,
+        peak: 1.0,
+        spec: &spec,
+        backend: &Cpu::new(),
+        seed: 0,
+        limits: Limits::default(),
+        weights: &|path| Err(Error::invalid(path, "weights", "a name", "none")),
+        volumes: &|path| Err(Error::invalid(path, "volume", "a name", "none")),
+        resume: None,
+    };
+    let mut failed = None;
+    let spent = times(RUNS, || failed = solver.solve(&job, &mut Silent).err());
+    failed.map_or(Ok(spent), Err)
+}
+
+/// A sample or update is an interpolation between four numbers: 4 multiply-adds at least, of which two are shared by the
+/// numbers along a line. `bytes` come from memory and go there at least.
+fn report(name: &str, [low, median, high]: [f64; 3], work: f64, bytes: f64, limit: &Limit) {
+    let (by_math, by_memory) = (4.0 * work / limit.multiply_adds, bytes / limit.bytes);
+    println!(
+        "{name:<20} {median:.3} s ({low:.3} to {high:.3}), {:.2} G updates/s, {:.0} % of the multiply-adds, {:.0} % of the \
+         memory's rate",
+        work / median / 1e9,
+        100.0 * by_math / median,
+        100.0 * by_memory / median
+    );
 }

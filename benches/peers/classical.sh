@@ -1,5 +1,5 @@
 #!/usr/bin/env bash
-# The projectors and FDK, ours and RTK's (CPU), one after the other on this machine and the same scan:
+# The projectors and FDK, ours and RTK's (CPU), in turn on this machine, on scans of one size, and FDK's PSNR on one scan:
 #   bash benches/peers/classical.sh VOLUME.nii.gz OUT_FOLDER
 # 50 views of 512 × 512 of a volume of 256³. RTK is installed into a virtual environment in target/.
 set -euo pipefail
@@ -19,7 +19,7 @@ mkdir -p "$out"
 [[ -d $scan ]] || "$bin" -q simulate "$volume" -o "$scan" --protocol r2 --views 50 --noise tigre:1e4,10
 # Twice each, in turn, so that a change of the machine's speed shows.
 for _ in 1 2; do
-    cargo bench --quiet -p conefield-benches --bench projectors -- "$scan"
+    cargo bench --quiet -p conefield-benches --bench projectors
     "$venv/bin/python" benches/peers/rtk.py "$scan" "$volume"
 done
 for window in ramp hann; do

@@ -94,6 +94,7 @@ fn the_estimate_is_near_the_peak_of_solvers_on_voxels() {
     run("cgls", 16, 128, 224, &[]);
     run("sirt", 30, 320, 144, &[]);
     run("os-sart", 40, 320, 128, &["solver.stop.change=0.001", "solver.subsets=5"]);
+    run("fista-tv", 16, 256, 144, &[]);
     run("asd-pocs", 16, 256, 160, &["solver.descents=1", "solver.subsets=4"]);
 }
 

@@ -66,6 +66,9 @@ pub struct Record {
     /// Training samples a second since the last record, of solvers that take samples.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub samples_per_s: Option<f64>,
+    /// Root mean square change of the volume by this pass over its root mean square, of solvers on voxels.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub change: Option<f64>,
     /// Root mean square error of the held-out views' line integrals, over their largest value.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub held_out: Option<f64>,

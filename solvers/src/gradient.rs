@@ -373,9 +373,8 @@ impl Window {
             prior: (self.prior > 0.0).then_some(self.prior / n),
             lr: Some(lr),
             samples_per_s: Some(self.samples as f64 / self.seconds.max(1e-12)),
-            held_out: None,
-            psnr: None,
             events: std::mem::take(&mut self.events),
+            ..Record::default()
         }
     }
 }

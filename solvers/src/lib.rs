@@ -11,3 +11,4 @@ pub mod iterative;
 pub mod pretrain;
 pub mod rays;
 pub mod schedule;
+mod shadow;

@@ -63,15 +63,15 @@ pub struct Sirt {
 
 impl Default for Sart {
     fn default() -> Self {
-        let stop = Stop { passes: Some(6), ..Stop::default() };
+        let stop = Stop { passes: Some(15), ..Stop::default() };
         Self { stop, relaxation: 0.3, decay: 0.9, order: Order::Golden, nonnegative: true }
     }
 }
 
 impl Default for OsSart {
     fn default() -> Self {
-        let stop = Stop { passes: Some(10), ..Stop::default() };
-        Self { stop, subsets: 10, relaxation: 0.8, decay: 0.9, order: Order::Golden, nonnegative: true }
+        let stop = Stop { passes: Some(20), ..Stop::default() };
+        Self { stop, subsets: 10, relaxation: 1.0, decay: 0.9, order: Order::Golden, nonnegative: true }
     }
 }
 
@@ -171,9 +171,9 @@ impl Solver for Algebraic {
         job.scan.validate("scan")?;
         let projector = projector(job)?;
         observer.note(&format!("{}; {}", self.describe(), projector.describe()));
-        let problem = Problem { scan: job.scan, operator: projector.operator(), seed: job.seed };
+        let problem = Problem::new(job, projector.as_ref());
         let mut sweep = Sweep::new(self, &problem, start(job)?);
-        drive(job, &self.stop, begun, projector.as_ref(), &mut sweep, observer)
+        drive(job, &self.stop, begun, &problem, &mut sweep, observer)
     }
 
     fn trains_field(&self, spec: &Spec) -> Result<bool> {

@@ -43,10 +43,10 @@ impl Default for AsdPocs {
     fn default() -> Self {
         Self {
             stop: Stop { passes: Some(20), ..Stop::default() },
-            subsets: 10,
-            relaxation: 0.8,
+            subsets: 50,
+            relaxation: 1.0,
             decay: 0.97,
-            alpha: 0.2,
+            alpha: 0.05,
             alpha_decay: 0.95,
             ratio: 0.95,
             descents: 20,
@@ -90,7 +90,7 @@ impl Solver for AsdPocs {
         job.scan.validate("scan")?;
         let projector = projector(job)?;
         observer.note(&format!("{}; {}", self.describe(), projector.describe()));
-        let problem = Problem { scan: job.scan, operator: projector.operator(), seed: job.seed };
+        let problem = Problem::new(job, projector.as_ref());
         let sigma = Noise::of(job.scan, false).sigma;
         let mut iterate = Iterate {
             settings: self.clone(),
@@ -99,7 +99,7 @@ impl Solver for AsdPocs {
             length: 0.0,
             work: problem.zeros(),
         };
-        drive(job, &self.stop, begun, projector.as_ref(), &mut iterate, observer)
+        drive(job, &self.stop, begun, &problem, &mut iterate, observer)
     }
 
     fn trains_field(&self, spec: &Spec) -> Result<bool> {

@@ -22,7 +22,7 @@ pub struct Cgls {
 
 impl Default for Cgls {
     fn default() -> Self {
-        Self { stop: Stop { passes: Some(12), ..Stop::default() }, nonnegative: true }
+        Self { stop: Stop { passes: Some(15), ..Stop::default() }, nonnegative: true }
     }
 }
 
@@ -42,9 +42,9 @@ impl Solver for Cgls {
         job.scan.validate("scan")?;
         let projector = projector(job)?;
         observer.note(&format!("{}; {}", self.describe(), projector.describe()));
-        let problem = Problem { scan: job.scan, operator: projector.operator(), seed: job.seed };
+        let problem = Problem::new(job, projector.as_ref());
         let mut iterate = Iterate::new(&problem, start(job)?);
-        let mut solution = drive(job, &self.stop, begun, projector.as_ref(), &mut iterate, observer)?;
+        let mut solution = drive(job, &self.stop, begun, &problem, &mut iterate, observer)?;
         if let (true, Reconstruction::Volume(volume)) = (self.nonnegative, &mut solution.result) {
             volume.data.par_mapv_inplace(|x| x.max(0.0));
         }

@@ -49,6 +49,9 @@ pub struct FistaTv {
     pub weight: Weight,
     /// Weigh measured values by how little noise they have, where the scan's noise grows with attenuation.
     pub weighted: bool,
+    /// Take pixels that the object's shadow leaves out for 0, whatever noise they hold. Where negative values were cut off,
+    /// noise has a mean above 0, which puts a haze around the object.
+    pub air: bool,
     /// Subsets of the views.
     pub subsets: usize,
     /// The order of the subsets.
@@ -59,12 +62,12 @@ pub struct FistaTv {
 
 impl Default for FistaTv {
     fn default() -> Self {
-        let stop = Stop { passes: Some(20), change: Some(2e-3), ..Stop::default() };
+        let stop = Stop { passes: Some(16), change: Some(1e-3), ..Stop::default() };
         Self {
             stop,
-            weight: Weight::Noise(1.0),
-           
+            weight: Weight::Noise(1.2),
             weighted: true,
+            air: true,
             subsets: 10,
             order: Order::Golden,
             inner: 4,
@@ -96,7 +99,11 @@ impl Solver for FistaTv {
         job.scan.validate("scan")?;
         let projector = projector(job)?;
         observer.note(&format!("{}; {}", self.describe(), projector.describe()));
-        let problem = Problem { scan: job.scan, operator: projector.operator(), seed: job.seed };
+        let mut problem = Problem::new(job, projector.as_ref());
+        if self.air {
+            problem.clear_air();
+            observer.note(&format!("{:.0} % of the pixels are air", 100.0 * problem.air_share()));
+        }
         let grid = &job.scan.geometry.volume;
         let voxel = grid.spacing.iter().product::<f64>().cbrt();
         // Attenuation a voxel x̂ = x·h and lengths in voxels Â = A/h: λ·TV(x) = λ̂·TV(x̂) = λ̂·h·TV(x).
@@ -107,7 +114,7 @@ impl Solver for FistaTv {
         };
         observer.note(&format!("{noise}: the prior's weight is {:.3e}", lambda / voxel));
         let mut iterate = Iterate::new(self, &problem, noise, start(job)?, lambda)?;
-        drive(job, &self.stop, begun, projector.as_ref(), &mut iterate, observer)
+        drive(job, &self.stop, begun, &problem, &mut iterate, observer)
     }
 
     fn trains_field(&self, spec: &Spec) -> Result<bool> {
@@ -121,9 +128,9 @@ impl Solver for FistaTv {
     }
 
     /// Beside the volume there are the point ahead of it, the fresh and the last volume, a gradient and the dual of three
-    /// components; and the residuals of a subset, which may come to be all views.
+    /// components; and the residuals of a subset, which may come to be all views, and where there is air.
     fn working_memory(&self, pixels: u64, voxels: u64) -> u64 {
-        let passing = 7 * 4 * voxels + 4 * pixels + projecting(pixels);
+        let passing = 7 * 4 * voxels + (4 + 1) * pixels + projecting(pixels);
         passing.max(noise::memory(pixels)) + self.stop.kept(voxels)
     }
 
@@ -194,14 +201,7 @@ struct Iterate {
 }
 
 impl Iterate {
-    fn new(
-        settings: &FistaTv,
-        problem: &Problem<'_>,
-        noise: Noise,
-        x: Array3<f32>,
-        lambda: f64,
-        threshold: f32,
-    ) -> Result<Self> {
+    fn new(settings: &FistaTv, problem: &Problem<'_>, noise: Noise, x: Array3<f32>, lambda: f64) -> Result<Self> {
         let grid = &problem.scan.geometry.volume;
         let views = problem.scan.geometry.views.len();
         let parts = subsets(views, settings.subsets);

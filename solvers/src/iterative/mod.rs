@@ -12,6 +12,7 @@ pub mod tv;
 pub mod watch;
 
 use crate::schedule::Clock;
+use crate::shadow::{air_level, shadow};
 use conefield_core::Error;
 use conefield_core::checkpoint::{Checkpoint, Resume, Standing};
 use conefield_core::error::{Result, ensure};
@@ -19,7 +20,8 @@ use conefield_core::scan::{Scan, Volume};
 use conefield_core::solver::{Job, Limits, Observer, Reconstruction, Record, Solution};
 use conefield_core::spec::{Spec, VolumeStart};
 use conefield_core::voxel::{VoxelOperator, VoxelProjector};
-use ndarray::{Array3, Axis};
+use ndarray::{Array2, Array3, Axis, Zip};
+use rayon::prelude::*;
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 use std::time::Instant;
@@ -63,6 +65,9 @@ impl Stop {
     }
 }
 
+/// Pixels by which an object's shadow is widened before what is left counts as air.
+const MARGIN: usize = 4;
+
 /// A scan and the operator that models it.
 pub struct Problem<'a> {
     /// What was measured.
@@ -71,9 +76,30 @@ pub struct Problem<'a> {
     pub operator: &'a dyn VoxelOperator<f32>,
     /// Seed of everything random.
     pub seed: u64,
+    /// Where each view shows the object, if the other pixels are to count as 0.
+    shadow: Option<Vec<Array2<bool>>>,
 }
 
-impl Problem<'_> {
+impl<'a> Problem<'a> {
+    /// A job's, with every pixel as it was measured.
+    pub fn new(job: &Job<'a>, projector: &'a dyn VoxelProjector) -> Self {
+        Self { scan: job.scan, operator: projector.operator(), seed: job.seed, shadow: None }
+    }
+
+    /// Takes pixels outside the object's shadow for 0.
+    pub fn clear_air(&mut self) {
+        let level = air_level(self.scan);
+        let views = self.scan.projections.outer_iter().into_par_iter();
+        self.shadow = Some(views.map(|view| shadow(view, level, MARGIN)).collect());
+    }
+
+    /// Share of the pixels that [`Problem::clear_air`] found outside the shadow.
+    pub fn air_share(&self) -> f64 {
+        let Some(shadows) = &self.shadow else { return 0.0 };
+        let inside: usize = shadows.iter().map(|s| s.iter().filter(|x| **x).count()).sum();
+        1.0 - inside as f64 / self.scan.projections.len().max(1) as f64
+    }
+
     /// `A·x` for some views.
     pub fn forward(&self, views: &[usize], x: &Array3<f32>) -> Array3<f32> {
         let [rows, columns] = self.scan.geometry.detector;
@@ -82,11 +108,17 @@ impl Problem<'_> {
         out
     }
 
-    /// `p − A·x` for some views.
+    /// `p − A·x` for some views, with p 0 in air if that is asked for.
     pub fn residual(&self, views: &[usize], x: &Array3<f32>) -> Array3<f32> {
         let mut out = self.forward(views, x);
         for (mut image, &v) in out.axis_iter_mut(Axis(0)).zip(views) {
-            image.zip_mut_with(&self.scan.view(v), |a, p| *a = p - *a);
+            match &self.shadow {
+                None => image.zip_mut_with(&self.scan.view(v), |a, p| *a = p - *a),
+                Some(shadow) => Zip::from(&mut image)
+                    .and(self.scan.view(v))
+                    .and(&shadow[v])
+                    .for_each(|a, p, inside| *a = if *inside { p - *a } else { -*a }),
+            }
         }
         out
     }
@@ -219,11 +251,10 @@ pub fn drive(
     job: &Job<'_>,
     stop: &Stop,
     begun: Instant,
-    projector: &dyn VoxelProjector,
+    problem: &Problem<'_>,
     method: &mut dyn Method,
     observer: &mut dyn Observer,
 ) -> Result<Solution> {
-    let problem = Problem { scan: job.scan, operator: projector.operator(), seed: job.seed };
     let mm = job.scan.unit.mm as f32;
     let watch = Watch::new(job);
     let pixels = job.scan.projections.len() as f64;
@@ -271,7 +302,7 @@ pub fn drive(
         if share >= 1.0 || kept.settled {
             break;
         }
-        let pass = method.pass(&problem, step)?;
+        let pass = method.pass(problem, step)?;
         step += 1;
         if !pass.residual.is_finite() {
             return Err(Error::Diverged { step, what: "the residual is not finite; try a smaller step".into() });
@@ -283,6 +314,7 @@ pub fn drive(
             seconds: clock.seconds(),
             loss: (pass.residual / pixels).sqrt(),
             prior: pass.prior,
+            change: pass.change,
             held_out,
             psnr: watch.psnr(method.volume(), mm),
             ..Record::default()

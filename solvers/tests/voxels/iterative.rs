@@ -1,7 +1,7 @@
 //! Every iterative solver on a small scan in closed form: what it reaches, what ends it, and that nothing but the job
 //! decides about its bits.
 
-use crate::kit::{Case, Heard, bodies, geometry, psnr, volume};
+use crate::kit::{Case, Heard, bodies, geometry, mean, psnr, volume};
 use conefield_core::Error;
 use conefield_core::geometry::VoxelGrid;
 use conefield_core::random::{mix, unit};
@@ -37,7 +37,10 @@ fn truth() -> Volume {
 
 /// The scan with noise of a twentieth of its largest value.
 fn noisy() -> Scan {
-    let mut scan = scan();
+    with_noise(scan())
+}
+
+fn with_noise(mut scan: Scan) -> Scan {
     let top = scan.projections.iter().fold(0.0f32, |m, &x| m.max(x));
     let mut i = 0;
     scan.projections.mapv_inplace(|p| {
@@ -113,6 +116,26 @@ fn attenuation_is_not_negative_unless_asked_for() {
             assert!(least("nonnegative = false") < -1e-4, "{kind}");
         }
     }
+}
+
+/// Noise that is cut off at 0 has a mean above it, which puts a haze around the object unless air is known for air.
+#[test]
+fn air_is_taken_for_empty() {
+    // Pixels fine enough that much of the detector is beside the shadow.
+    let mut g = geometry(24);
+    g.detector = [128, 144];
+    g.views.iter_mut().for_each(|v| (v.u, v.v) = (v.u.map(|x| x / 4.0), v.v.map(|x| x / 4.0)));
+    let mut scan = with_noise(scan_ellipsoids(&bodies(), g));
+    scan.projections.mapv_inplace(|p| p.max(0.0));
+    let haze = |air: bool| {
+        let text = spec("fista-tv", &format!("subsets = 6\nweight = {{ fixed = 0.02 }}\nair = {air}\n{}", passes(8)));
+        let (volume, heard) = Case::of(&scan).volume(&text);
+        assert_eq!(heard.said("of the pixels are air"), air);
+        mean(&volume, |x| x.iter().any(|x| x.abs() > 21.0))
+    };
+    let (with, without) = (haze(true), haze(false));
+    println!("{with:.2e} and {without:.2e} 1/mm around the object");
+    assert!(with < 0.5 * without, "{with:.2e} against {without:.2e} 1/mm");
 }
 
 #[test]

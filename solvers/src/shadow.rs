@@ -1,0 +1,69 @@
+//! Where an object's shadow falls on the detector.
+
+use conefield_core::scan::Scan;
+use ndarray::{Array2, ArrayView2};
+
+/// The value that a smoothed pixel of air stays below: the noise's standard deviation, estimated from differences of
+/// neighbouring pixels, or 1/500 of the largest values, whichever is more.
+pub fn air_level(scan: &Scan) -> f32 {
+    let top = scan.projections.iter().copied().fold(0.0f32, f32::max);
+    let mut differences: Vec<f32> = scan
+        .projections
+        .outer_iter()
+        .flat_map(|view| {
+            let low = move |x: f32| x < 0.1 * top;
+            view.rows()
+                .into_iter()
+                .flat_map(|row| row.windows(2).into_iter().map(|w| (w[0], w[1])).collect::<Vec<_>>())
+                .filter(|&(a, b)| low(a) && low(b))
+                .map(|(a, b)| (a - b).abs())
+                .step_by(7)
+                .collect::<Vec<_>>()
+        })
+        .collect();
+    let sigma = if differences.len() < 100 {
+        0.0
+    } else {
+        // |a − b| of two equal normals is above 1.05 σ·√2·0.6745… in half of the cases; pixels clipped at zero make
+        // ties at 0, so the 75th percentile is used: 1.150 σ √2.
+        let k = differences.len() * 3 / 4;
+        let (_, q, _) = differences.select_nth_unstable_by(k, f32::total_cmp);
+        *q / (1.150 * std::f32::consts::SQRT_2)
+    };
+    sigma.max(top / 500.0)
+}
+
+/// Pixels whose 7 × 7 neighbourhood is above `level` in the mean, widened by `margin` pixels.
+pub fn shadow(view: ArrayView2<'_, f32>, level: f32, margin: usize) -> Array2<bool> {
+    let smooth = box_filter(view.to_owned(), 3, |window| window.iter().sum::<f32>() / window.len() as f32);
+    let hit = smooth.mapv(|x| f32::from(u8::from(x > level)));
+    box_filter(hit, margin, |window| window.iter().copied().fold(0.0, f32::max)).mapv(|x| x > 0.0)
+}
+
+/// Applies `f` to windows of ± `reach` along rows, then along columns; windows are cut at the border.
+fn box_filter(mut image: Array2<f32>, reach: usize, f: impl Fn(&[f32]) -> f32) -> Array2<f32> {
+    for axis in [1, 0] {
+        for mut lane in image.lanes_mut(ndarray::Axis(axis)) {
+            let line = lane.to_vec();
+            for (i, x) in lane.iter_mut().enumerate() {
+                *x = f(&line[i.saturating_sub(reach)..(i + reach + 1).min(line.len())]);
+            }
+        }
+    }
+    image
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_shadow_covers_the_object_and_its_margin_but_not_noise() {
+        let view = Array2::from_shape_fn((40, 40), |(r, c)| {
+            let noise = 0.01 * (((r * 31 + c * 17) % 13) as f32 / 6.0 - 1.0);
+            if (15..25).contains(&r) && (15..25).contains(&c) { 1.0 } else { noise.max(0.0) }
+        });
+        let s = shadow(view.view(), 0.02, 4);
+        assert!(s[[20, 20]] && s[[12, 20]] && !s[[2, 2]] && !s[[35, 35]]);
+    }
+}
