@@ -61,7 +61,7 @@ fn solvers_on_voxels_are_told_without_a_field() {
     }
     let all = done(&["explain", "os-sart", "--set", "solver.subsets=4"]);
     assert_eq!(line(&all, "projector"), "projector joseph bilinear from plane to plane");
-    assert!(line(&all, "solver").starts_with("solver os-sart 4 subsets, relaxation 0.8"), "{all}");
+    assert!(line(&all, "solver").starts_with("solver os-sart 4 subsets, relaxation 1 times 0.9"), "{all}");
     for spec in ["sart", "sirt", "cgls", "asd-pocs", "fista-tv"] {
         assert!(line(&done(&["explain", spec]), "solver").starts_with(&format!("solver {spec} ")), "{spec}");
     }
