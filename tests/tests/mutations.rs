@@ -1,9 +1,9 @@
 //! Every reader takes damaged input without a panic, a hoard of memory or a hang. See `docs/bad-inputs.md`.
 
 use conefield_tests::hostile::watch::{Bounds, Fault, Meter};
-use conefield_tests::hostile::{PARSERS, Parser, find, seeds};
+use conefield_tests::hostile::{PARSERS, Parser, find};
 use peak_alloc::PeakAlloc;
-use std::path::{Path, PathBuf};
+use std::path::Path;
 use std::time::Duration;
 
 #[global_allocator]
@@ -25,7 +25,7 @@ fn folder() -> tempfile::TempDir {
     tempfile::tempdir_in(parent).unwrap()
 }
 
-/// One test, as the allocator counts for the whole process.
+/// The only test of this program: the allocator counts for the whole process.
 #[test]
 fn no_mutation_makes_a_reader_panic_hoard_or_hang() {
     let count = std::env::var("CONEFIELD_MUTATIONS").map_or(COUNT, |n| n.parse().unwrap());
@@ -88,37 +88,5 @@ fn controls(faults: &mut Vec<String>) {
         if !seen.faults.iter().any(|(_, f)| is(f)) {
             faults.push(format!("the harness does not tell {what}"));
         }
-    }
-}
-
-/// The folder that fuzzing starts from: `CONEFIELD_CORPUS=DIR cargo test -p conefield-tests --test mutations corpus`
-/// writes it.
-#[test]
-fn the_corpus_for_fuzzing_is_small() {
-    let kept = std::env::var_os("CONEFIELD_CORPUS").map(PathBuf::from);
-    let dir = folder();
-    let mut size = 0;
-    for parser in PARSERS {
-        let (bytes, _) = parser.prepare(folder().path());
-        size += bytes.len();
-        let to = kept.as_deref().unwrap_or(dir.path()).join(parser.name);
-        std::fs::create_dir_all(&to).unwrap();
-        std::fs::write(to.join("seed"), bytes).unwrap();
-    }
-    assert!(size < 200_000, "{size} bytes");
-    assert_eq!(seeds::gunzip(seeds::gzip(vec![7; 9])), [7; 9]);
-}
-
-/// The fuzz targets are those of the list.
-#[test]
-fn every_reader_has_its_fuzz_target() {
-    let fuzz = Path::new(env!("CARGO_MANIFEST_DIR")).join("../fuzz");
-    let manifest: toml::Table = toml::from_str(&std::fs::read_to_string(fuzz.join("Cargo.toml")).unwrap()).unwrap();
-    let bins = manifest["bin"].as_array().unwrap();
-    let names: Vec<&str> = bins.iter().map(|b| b["name"].as_str().unwrap()).collect();
-    assert_eq!(names, PARSERS.iter().map(|p| p.name).collect::<Vec<_>>());
-    for name in names {
-        let target = std::fs::read_to_string(fuzz.join(format!("fuzz_targets/{name}.rs"))).unwrap();
-        assert!(target.contains(&format!("target!(\"{name}\")")), "{target}");
     }
 }
