@@ -1,6 +1,6 @@
 #!/usr/bin/env bash
 # The projectors and FDK, ours and RTK's (CPU), in turn on this machine, on scans of one size, and FDK's PSNR on one scan:
-#   bash benches/peers/classical.sh VOLUME.nii.gz OUT_FOLDER
+#   bash benches/peers/classical.sh VOLUME.nii.gz OUT_FOLDER [ROUNDS]
 # 50 views of 512 × 512 of a volume of 256³. RTK is installed into a virtual environment in target/.
 set -euo pipefail
 cd "$(dirname "$0")/../.."
@@ -17,8 +17,8 @@ bin=${CARGO_TARGET_DIR:-target}/release/conefield
 scan=$out/scan
 mkdir -p "$out"
 [[ -d $scan ]] || "$bin" -q simulate "$volume" -o "$scan" --protocol r2 --views 50 --noise tigre:1e4,10
-# Twice each, in turn, so that a change of the machine's speed shows.
-for _ in 1 2; do
+# In turn, so that a change of the machine's speed shows.
+for _ in $(seq "${3:-2}"); do
     cargo bench --quiet -p conefield-benches --bench projectors
     "$venv/bin/python" benches/peers/rtk.py "$scan" "$volume"
 done
