@@ -14,19 +14,8 @@ fn main() -> Result<(), Box<dyn Error>> {
     let loaded = conefield::specs::read("fast", &["field.width=16".into()])?;
     let solver = loaded.spec.solver.build()?;
     let backend = Cpu::new();
-    let job = Job {
-        scan: &scan,
-        held_out: None,
-        reference: None,
-        peak: 1.0,
-        spec: &loaded.spec,
-        backend: &backend,
-        seed: 0,
-        limits: Limits { steps: Some(200), ..Limits::default() },
-        weights: &|path| Err(conefield_core::Error::unsupported(path, "this example reads no weights")),
-        volumes: &|path| Err(conefield_core::Error::unsupported(path, "this example reads no volumes")),
-        resume: None,
-    };
+    let limits = Limits { steps: Some(200), ..Limits::default() };
+    let job = Job { limits, ..Job::new(&scan, &loaded.spec, &backend) };
     let solution = solver.solve(&job, &mut Silent)?;
     let volume = solution.result.volume(&backend)?;
     let psnr = conefield_metrics::psnr(volume.data.view(), truth.data.view(), 1.0)?;

@@ -5,12 +5,12 @@
 
 use conefield_backend_cpu::Cpu;
 use conefield_benches::{bandwidth, multiply_adds, times};
+use conefield_core::Result;
 use conefield_core::geometry::{Geometry, Millimetres, Radians, View, VoxelGrid};
 use conefield_core::scan::{Scan, Unit};
-use conefield_core::solver::{Job, Limits, Silent};
+use conefield_core::solver::{Job, Silent};
 use conefield_core::spec::load::parse;
 use conefield_core::voxel::VoxelOperator;
-use conefield_core::{Error, Result};
 use conefield_projectors::voxel::Joseph;
 use conefield_projectors::voxel::backproject::backproject;
 use conefield_projectors::voxel::layout::ColumnMajor;
@@ -77,19 +77,8 @@ fn geometry() -> Geometry {
 fn fdk(scan: &Scan) -> Result<[f64; 3]> {
     let spec = parse("name = \"fdk\"\n[solver]\ntype = \"fdk\"\n", "bench", &[], &[])?.spec;
     let solver = spec.solver.build()?;
-    let job = Job {
-        scan,
-        held_out: None,
-        reference: None,
-        peak: 1.0,
-        spec: &spec,
-        backend: &Cpu::new(),
-        seed: 0,
-        limits: Limits::default(),
-        weights: &|path| Err(Error::invalid(path, "weights", "a name", "none")),
-        volumes: &|path| Err(Error::invalid(path, "volume", "a name", "none")),
-        resume: None,
-    };
+    let backend = Cpu::new();
+    let job = Job::new(scan, &spec, &backend);
     let mut failed = None;
     let spent = times(RUNS, || failed = solver.solve(&job, &mut Silent).err());
     failed.map_or(Ok(spent), Err)

@@ -126,8 +126,8 @@ impl Progress {
     fn line(&self, step: u64, seconds_left: f64) -> String {
         let r = &self.latest;
         let mut line = format!("step {step}");
-        if r.step > 0 {
-            line += &format!(", loss {:.3e}", r.loss);
+        if let Some(loss) = r.loss {
+            line += &format!(", loss {loss:.3e}");
         }
         if let Some(speed) = r.samples_per_s {
             line += &format!(", {:.2} M samples/s", speed / 1e6);

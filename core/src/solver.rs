@@ -1,8 +1,9 @@
 //! A solver: scan in, volume out.
 
+use crate::arena::Weights;
 use crate::backend::Backend;
 use crate::checkpoint::{Checkpoint, Resume};
-use crate::error::Result;
+use crate::error::{Error, Result};
 use crate::parts::Voxels;
 use crate::pipeline::Model;
 use crate::scan::{Scan, Volume};
@@ -29,11 +30,39 @@ pub struct Job<'a> {
     /// Limits that the command line adds to the spec's.
     pub limits: Limits,
     /// Reads a weights file that the spec names.
-    pub weights: &'a dyn Fn(&str) -> Result<crate::arena::Weights>,
+    pub weights: &'a dyn Fn(&str) -> Result<Weights>,
     /// Reads a volume that the spec names, in 1/unit of the scan.
     pub volumes: &'a dyn Fn(&str) -> Result<Volume>,
     /// Where an earlier run of the same job stood, to go on from.
     pub resume: Option<&'a Resume>,
+}
+
+impl<'a> Job<'a> {
+    /// A job with nothing beside what every one has: no views kept aside, no reference (and a peak of 1), no limits, seed 0,
+    /// and no files that the spec may name.
+    pub fn new(scan: &'a Scan, spec: &'a Spec, backend: &'a dyn Backend) -> Self {
+        Self {
+            scan,
+            held_out: None,
+            reference: None,
+            peak: 1.0,
+            spec,
+            backend,
+            seed: 0,
+            limits: Limits::default(),
+            weights: &no_weights,
+            volumes: &no_volumes,
+            resume: None,
+        }
+    }
+}
+
+fn no_weights(path: &str) -> Result<Weights> {
+    Err(Error::unsupported(path, "this job reads no weights"))
+}
+
+fn no_volumes(path: &str) -> Result<Volume> {
+    Err(Error::unsupported(path, "this job reads no volumes"))
 }
 
 /// When to stop, whichever comes first.
@@ -54,9 +83,8 @@ pub struct Record {
     pub step: u64,
     /// Seconds of training so far (evaluation and export left out).
     pub seconds: f64,
-    /// Mean loss since the last record; of solvers on voxels, the root mean square of the residual `p − A·x`.
-    /// Not a number where a solver has none.
-    pub loss: f64,
+    /// Mean loss since the last record; of solvers on voxels, the root mean square of the residual `p − A·x`. FDK has none.
+    pub loss: Option<f64>,
     /// Mean weighted prior since the last record.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub prior: Option<f64>,
@@ -163,7 +191,7 @@ pub trait Solver: Send + Sync {
     /// Trains the spec's field on a known volume, voxel by voxel, for weights that other scans reuse.
     fn pretrain(&self, job: &PretrainJob<'_>, observer: &mut dyn Observer) -> Result<Model> {
         let _ = (job, observer);
-        Err(crate::Error::unsupported(self.describe(), "this solver has nothing to pre-train"))
+        Err(Error::unsupported(self.describe(), "this solver has nothing to pre-train"))
     }
 
     /// Whether it trains a field of the spec's stages; otherwise it makes voxels and needs none. Refuses a spec with

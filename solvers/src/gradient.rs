@@ -6,14 +6,14 @@
 use crate::iterative::start_volume;
 use crate::pretrain::learn;
 use crate::rays::{Pixels, RaySource, Views};
-use crate::schedule::{Clock, Decay};
+use crate::schedule::{Clock, Decay, Ends};
 use conefield_core::backend::{Adam, Executable, Loss, TrainRay, TvBlocks, Work};
 use conefield_core::checkpoint::{Checkpoint, Resume, Standing, tensors};
 use conefield_core::error::{Error, Result, ensure};
 use conefield_core::pipeline::{Model, Pipeline};
 use conefield_core::random::stream;
 use conefield_core::scene::Scene;
-use conefield_core::solver::{Job, Limits, Observer, PretrainJob, Reconstruction, Record, Solution, Solver};
+use conefield_core::solver::{Job, Observer, PretrainJob, Reconstruction, Record, Solution, Solver};
 use conefield_core::spec::{SolverSpec, Spec};
 use conefield_core::stage::{Projector, UnitRay};
 use conefield_core::trained::TrainedField;
@@ -207,8 +207,7 @@ impl Solver for Gradient {
         let by_epochs = self.epochs.map(|e| (e * steps_an_epoch).ceil() as u64);
         let steps = [self.steps, by_epochs].into_iter().flatten().min();
         let Start { standing, mut window } = start;
-        let mut clock =
-            Clock::new(Limits { steps, seconds: self.seconds, at_most: None }, job.limits, standing.seconds);
+        let mut clock = Clock::new(Ends { steps, seconds: self.seconds }, job.limits, standing.seconds);
         let mut rays = Vec::with_capacity(self.rays);
         let mut tv = TvBlocks::default();
         let (mut step, mut samples) = (standing.step, standing.samples);
@@ -257,7 +256,7 @@ impl Solver for Gradient {
             if !(stats.loss.is_finite() && stats.prior.is_finite()) {
                 return Err(Error::Diverged {
                     step,
-                    what: format!("the loss is {}; try a smaller solver.lr", stats.loss),
+                    what: format!("the loss is {}, the prior {}; try a smaller solver.lr", stats.loss, stats.prior),
                 });
             }
             step += 1;
@@ -369,7 +368,7 @@ impl Window {
         Record {
             step,
             seconds,
-            loss: self.loss / n,
+            loss: Some(self.loss / n),
             prior: (self.prior > 0.0).then_some(self.prior / n),
             lr: Some(lr),
             samples_per_s: Some(self.samples as f64 / self.seconds.max(1e-12)),

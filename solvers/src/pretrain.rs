@@ -2,7 +2,7 @@
 //! initialization. What the LayerNorm and the field learn there is reused for every other scan.
 
 use crate::gradient::Gradient;
-use crate::schedule::Clock;
+use crate::schedule::{Clock, Ends};
 use conefield_core::arena::Arena;
 use conefield_core::backend::{Executable, Loss, Work};
 use conefield_core::error::{Error, Result};
@@ -10,7 +10,7 @@ use conefield_core::pipeline::{Model, Pipeline};
 use conefield_core::random::stream;
 use conefield_core::scan::Volume;
 use conefield_core::scene::Scene;
-use conefield_core::solver::{Limits, Observer, PretrainJob, Record};
+use conefield_core::solver::{Observer, PretrainJob, Record};
 use conefield_core::spec::AttenuationScale;
 use ndarray::Axis;
 use rand::RngExt;
@@ -30,8 +30,8 @@ pub fn pretrain(settings: &Gradient, job: &PretrainJob<'_>, observer: &mut dyn O
     let (mut exe, explain) = job.backend.compile(&model.pipeline)?;
     observer.note(&explain.backend);
     let mut waiting: Vec<Arena> = vec![model.arena.clone(); scenes.len() - 1];
-    let limits = Limits { steps: Some(settings.pretrain_steps), ..Limits::default() };
-    let mut clock = Clock::new(limits, job.limits, 0.0);
+    let ends = Ends { steps: Some(settings.pretrain_steps), seconds: None };
+    let mut clock = Clock::new(ends, job.limits, 0.0);
     let mut points = Vec::with_capacity(settings.pretrain_points);
     let (mut step, mut loss, mut since) = (0u64, 0.0, 0u64);
     let mut at = 0;
@@ -63,7 +63,7 @@ pub fn pretrain(settings: &Gradient, job: &PretrainJob<'_>, observer: &mut dyn O
             let record = Record {
                 step,
                 seconds: clock.seconds(),
-                loss: loss / since as f64,
+                loss: Some(loss / since as f64),
                 lr: Some(adam.lr),
                 samples_per_s,
                 ..Record::default()

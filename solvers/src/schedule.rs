@@ -45,6 +45,15 @@ impl Decay {
     }
 }
 
+/// When a spec ends a run, whichever comes first.
+#[derive(Debug, Clone, Copy, Default, PartialEq)]
+pub struct Ends {
+    /// Steps.
+    pub steps: Option<u64>,
+    /// Seconds of training.
+    pub seconds: Option<f64>,
+}
+
 /// Counts steps and training time against their limits.
 #[derive(Debug)]
 pub struct Clock {
@@ -54,15 +63,15 @@ pub struct Clock {
 }
 
 impl Clock {
-    /// A stopped clock. A limit on the command line replaces the spec's limit of the same kind; where it names
+    /// A stopped clock. A limit on the command line replaces the spec's end of the same kind; where it names
     /// only time, the spec's number of steps does not end the run.
     ///
     /// `spent` seconds of training came before, in a run that is resumed.
-    pub fn new(spec: Limits, cli: Limits, spent: f64) -> Self {
+    pub fn new(spec: Ends, cli: Limits, spent: f64) -> Self {
         let limits = Limits {
             steps: cli.steps.or(if cli.seconds.is_some() { None } else { spec.steps }),
             seconds: cli.seconds.or(if cli.steps.is_some() { None } else { spec.seconds }),
-            at_most: cli.at_most.or(spec.at_most),
+            at_most: cli.at_most,
         };
         let spent = Duration::try_from_secs_f64(spent).unwrap_or_default();
         Self { limits, spent, running: None }
@@ -117,7 +126,7 @@ mod tests {
 
     #[test]
     fn the_first_limit_ends_the_run() {
-        let spec = Limits { steps: Some(10), seconds: Some(1e9), at_most: None };
+        let spec = Ends { steps: Some(10), seconds: Some(1e9) };
         let c = Clock::new(spec, Limits::default(), 0.0);
         assert!(c.share(9) < 1.0 && c.share(10) >= 1.0);
         let c = Clock::new(spec, Limits { seconds: Some(1e6), ..Limits::default() }, 0.0);
@@ -126,7 +135,7 @@ mod tests {
 
     #[test]
     fn what_cuts_a_run_short_stretches_no_schedule() {
-        let spec = Limits { steps: Some(10), ..Limits::default() };
+        let spec = Ends { steps: Some(10), seconds: None };
         for (at_most, over) in [(1e9, false), (3.0, true)] {
             let c = Clock::new(spec, Limits { at_most: Some(at_most), ..Limits::default() }, 4.0);
             assert_eq!((c.share(5), c.done(5) >= 1.0), (0.5, over));

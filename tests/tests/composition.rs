@@ -65,7 +65,7 @@ fn pipeline(encoder: &Value, normalizers: &Value, field: &Value, projector: &Val
 /// Trains: the loss falls to less than half, the volume is finite. Returns how many channels the field reads.
 fn learns(name: &str, spec: &Value) -> usize {
     let (solution, records) = solve(spec, &scan(), &Weights::default()).unwrap_or_else(|e| panic!("{name}: {e}"));
-    let (first, last) = (records.first().unwrap().loss, records.last().unwrap().loss);
+    let (first, last) = (records.first().unwrap().loss.unwrap(), records.last().unwrap().loss.unwrap());
     assert_eq!((records.len(), solution.steps), (6, 30), "{name}");
     assert!(last < 0.5 * first, "{name}: the loss went from {first} to {last}");
     assert!(volume(&solution).data.iter().all(|x| x.is_finite()), "{name}");

@@ -181,7 +181,8 @@ fn the_number_of_threads_does_not_change_a_bit() {
         assert_eq!(solution.steps, 10);
         let volume = volume(&solution);
         let arena = &solution.result.field().unwrap().model.arena;
-        let losses: Vec<u64> = records.iter().flat_map(|r| [r.loss, r.prior.unwrap()]).map(f64::to_bits).collect();
+        let losses: Vec<u64> =
+            records.iter().flat_map(|r| [r.loss.unwrap(), r.prior.unwrap()]).map(f64::to_bits).collect();
         let volume = bits(volume.data.as_slice().unwrap());
         ([bits(&arena.params), bits(&arena.first), bits(&arena.second), volume], losses)
     };
@@ -302,7 +303,7 @@ fn pretrained(s: &Value) -> (Model, Vec<f64>) {
     };
     let mut heard = Heard::default();
     let model = spec.solver.build().unwrap().pretrain(&job, &mut heard).unwrap();
-    (model, heard.0.iter().map(|r| r.loss).collect())
+    (model, heard.0.iter().map(|r| r.loss.unwrap()).collect())
 }
 
 fn parts(model: &Model) -> (Vec<u32>, Vec<u32>) {
@@ -322,7 +323,7 @@ fn weights_behind_the_encoder_go_to_another_scan() {
         let mut s = s.clone();
         s["solver"]["steps"] = json!(steps);
         let (solution, records) = solve(&s, &scan(), &weights)?;
-        Ok((solution, records.iter().map(|r| r.loss).collect()))
+        Ok((solution, records.iter().map(|r| r.loss.unwrap()).collect()))
     };
     let fresh = model(run(&s, 0).unwrap().0);
     s["initializer"] = json!({"type": "mci", "weights": "other.safetensors"});
@@ -382,8 +383,9 @@ fn masked_channels_leave_the_work() {
     assert_eq!(p.layout().find("normalizers.0.weight").unwrap().shape, [kept]);
 
     // Training goes on: every loss is finite, the last below the one right after the mask, and weights still move.
-    assert!(records.iter().all(|r| r.loss.is_finite()));
-    let after = records.iter().find(|r| r.step == 15).unwrap().loss;
-    assert!(records.last().unwrap().loss < after, "{} after the mask, {}", after, records.last().unwrap().loss);
+    assert!(records.iter().all(|r| r.loss.unwrap().is_finite()));
+    let after = records.iter().find(|r| r.step == 15).unwrap().loss.unwrap();
+    let last = records.last().unwrap().loss.unwrap();
+    assert!(last < after, "{after} after the mask, {last}");
     assert!(model.arena.first.iter().filter(|m| **m != 0.0).count() > model.arena.first.len() / 4);
 }

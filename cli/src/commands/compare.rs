@@ -149,11 +149,11 @@ impl Compare {
         // Whatever is wrong with the input is told before anything is made.
         let mut methods = self.methods()?;
         let input = self.input()?;
-        self.look_into_folder()?;
+        let old = self.look_into_folder()?;
         for method in &mut methods {
             method.start = self.start(method, &input)?;
         }
-        self.open_folder()?;
+        self.open_folder(old)?;
         signals::listen()?;
         let mut entries = vec![];
         for (i, method) in methods.iter().enumerate() {
@@ -258,8 +258,7 @@ impl Compare {
     }
 
     /// Makes the folder; with `--force` without what stood in it.
-    fn open_folder(&self) -> Result<()> {
-        let (mut old, runs) = self.look_into_folder()?;
+    fn open_folder(&self, (mut old, runs): (Vec<PathBuf>, Vec<PathBuf>)) -> Result<()> {
         if self.force {
             for run in &runs {
                 let entries = fs::read_dir(run).map_err(|e| Error::io(run, e))?;

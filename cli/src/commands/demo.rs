@@ -119,17 +119,10 @@ impl Demo {
         let solver = loaded.spec.solver.build()?;
         let backend = Cpu::new();
         let job = Job {
-            scan,
-            held_out: None,
-            reference: None,
-            peak: 1.0,
-            spec: &loaded.spec,
-            backend: &backend,
             seed: self.seed,
             limits: Limits { seconds: Some(self.budget), ..Limits::default() },
             weights: &|path| files::read_weights(path),
-            volumes: &files::volume,
-            resume: None,
+            ..Job::new(scan, &loaded.spec, &backend)
         };
         let solution = solver.solve(&job, &mut Progress::new(name, None))?;
         let start = Instant::now();

@@ -1,14 +1,14 @@
 //! `conefield explain`
 
 use super::BackendChoice;
-use crate::memory::{self, Memory, Run};
+use super::reconstruct::Parts;
+use crate::memory::Memory;
 use crate::{files, out, specs};
 use clap::Args;
 use conefield_core::Result;
 use conefield_core::backend::Explain as Compiled;
 use conefield_core::pipeline::Pipeline;
 use conefield_core::scene::Scene;
-use conefield_core::solver::Solver;
 use conefield_core::spec::load::Loaded;
 use conefield_core::stage::{GradKind, Stage};
 use serde::Serialize;
@@ -124,32 +124,17 @@ struct ForScan {
 impl Explain {
     pub fn run(self) -> Result<()> {
         let loaded = specs::read(&self.spec, &self.sets)?;
-        let solver = loaded.spec.solver.build().map_err(|e| loaded.locate(e))?;
-        let backend = self.backend.open();
-        let field = match specs::pipeline(&loaded, solver.as_ref())? {
-            Some(pipeline) => {
-                let compiled = backend.compile(&pipeline)?.1;
-                Some((pipeline, compiled))
-            }
-            None => None,
-        };
-        let scan = match &self.scan {
-            Some(path) => Some(for_scan(&loaded, solver.as_ref(), field.as_ref(), path)?),
-            None => None,
-        };
-        let report = report(&loaded, solver.as_ref(), field, scan)?;
+        let parts = Parts::of(&loaded, self.backend.open().as_ref())?;
+        let scan = self.scan.as_ref().map(|path| for_scan(&loaded, &parts, path)).transpose()?;
+        let report = report(&loaded, parts, scan)?;
         if self.json { out::json(&report) } else { out::say(&text(&report)) }
     }
 }
 
-fn report(
-    loaded: &Loaded,
-    solver: &dyn Solver,
-    field: Option<(Pipeline, Compiled)>,
-    scan: Option<ForScan>,
-) -> Result<Report> {
+fn report(loaded: &Loaded, parts: Parts, scan: Option<ForScan>) -> Result<Report> {
     let tree = &loaded.tree;
-    let (pipeline, backend) = field.unzip();
+    let Parts { solver, pipeline, compiled } = parts;
+    let backend = pipeline.is_some().then_some(compiled);
     let stages = pipeline.as_ref().map(|p| rows(tree, p)).unwrap_or_default();
     let plain = |key: &str, what: String| {
         let kind = tree[key]["type"].as_str().unwrap_or_default();
@@ -195,27 +180,12 @@ fn rows(tree: &Value, pipeline: &Pipeline) -> Vec<Row> {
     stages
 }
 
-fn for_scan(
-    loaded: &Loaded,
-    solver: &dyn Solver,
-    field: Option<&(Pipeline, Compiled)>,
-    path: &Path,
-) -> Result<ForScan> {
-    let size = conefield_io::scan_size(path)?;
-    let run = Run {
-        scan: size,
-        split: false,
-        reference: false,
-        field: field.is_some(),
-        parameters: field.map_or(0, |(p, _)| p.layout().len() as u64),
-        backend: field.map_or(0, |(_, compiled)| compiled.scratch_bytes as u64),
-        solver: memory::working(solver, &size),
-        resume: false,
-    };
+fn for_scan(loaded: &Loaded, parts: &Parts, path: &Path) -> Result<ForScan> {
+    let run = parts.run(conefield_io::scan_size(path)?);
     let scan = files::scan(path)?;
     let g = &scan.geometry;
-    let seen = match field {
-        Some((pipeline, _)) => {
+    let seen = match &parts.pipeline {
+        Some(pipeline) => {
             let scene = Scene::new(&scan, &loaded.spec.scene).map_err(|e| loaded.locate(e))?;
             let middle = scene.pixel_ray(g, 0, g.detector[0] / 2, g.detector[1] / 2);
             Some((scene.attenuation * scan.unit.mm, pipeline.projector.max_samples(&middle)))
@@ -228,7 +198,7 @@ fn for_scan(
         volume: g.volume.shape,
         attenuation_scale: seen.map(|s| s.0),
         samples_per_ray: seen.map(|s| s.1),
-        plan: solver.plan(&scan),
+        plan: parts.solver.plan(&scan),
         memory: run.memory(),
     })
 }

@@ -94,13 +94,13 @@ impl Pretrain {
             }));
         }
         out::say(&format!(
-            "{}: {} tensors, {} parameters, after {} steps in {}, loss {:.3e}",
+            "{}: {} tensors, {} parameters, after {} steps in {}{}",
             self.output.display(),
             weights.tensors.len(),
             out::number(numbers as u64),
             last.step,
             out::duration(last.seconds),
-            last.loss,
+            last.loss.map_or(String::new(), |l| format!(", loss {l:.3e}")),
         ))
     }
 }

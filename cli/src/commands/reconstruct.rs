@@ -15,7 +15,7 @@ use conefield_core::pipeline::Pipeline;
 use conefield_core::scan::Scan;
 use conefield_core::solver::{Job, Solver};
 use conefield_core::spec::load::{Loaded, to_toml};
-use conefield_io::MiddleSlices;
+use conefield_io::{MiddleSlices, ScanSize};
 use conefield_metrics::Scores;
 use serde::Serialize;
 use std::collections::BTreeMap;
@@ -62,10 +62,11 @@ pub const FAILED: &str = "failed: ";
 
 /// What a spec builds.
 pub struct Parts {
-    solver: Box<dyn Solver>,
+    pub solver: Box<dyn Solver>,
     /// Of specs that train a field.
-    pipeline: Option<Pipeline>,
-    compiled: Explain,
+    pub pipeline: Option<Pipeline>,
+    /// What the backend made of it; empty without a pipeline.
+    pub compiled: Explain,
 }
 
 impl Parts {
@@ -75,6 +76,20 @@ impl Parts {
         let pipeline = specs::pipeline(loaded, solver.as_ref())?;
         let compiled = pipeline.as_ref().map(|p| backend.compile(p)).transpose()?.map(|c| c.1).unwrap_or_default();
         Ok(Self { solver, pipeline, compiled })
+    }
+
+    /// A run of it on a scan of this size, without reference, held-out views and checkpoint.
+    pub fn run(&self, scan: ScanSize) -> memory::Run {
+        memory::Run {
+            scan,
+            split: false,
+            reference: false,
+            field: self.pipeline.is_some(),
+            parameters: self.pipeline.as_ref().map_or(0, |p| p.layout().len() as u64),
+            backend: self.compiled.scratch_bytes as u64,
+            solver: memory::working(self.solver.as_ref(), &scan),
+            resume: false,
+        }
     }
 
     /// Refuses weights to start from that cannot be read or do not fit.
@@ -190,17 +205,15 @@ impl Reconstruct {
             last: Instant::now(),
         }));
         let job = Job {
-            scan: &scan,
             held_out: held_scan.as_ref(),
             reference: reference.as_ref(),
             peak: protocol.peak,
-            spec: &loaded.spec,
-            backend: backend.as_ref(),
             seed: protocol.seed,
             limits: protocol.ends.limits(),
             weights: &|path| files::read_weights(path),
             volumes: &files::volume,
             resume: resume.as_ref(),
+            ..Job::new(&scan, &loaded.spec, backend.as_ref())
         };
         let solution = solver.solve(&job, &mut progress).map_err(|e| loaded.locate(e))?;
         let last = progress.records().last().cloned();
@@ -242,7 +255,7 @@ impl Reconstruct {
             samples: solution.samples,
             samples_per_s: (solution.samples > 0 && solution.train_s > 0.0)
                 .then(|| solution.samples as f64 / solution.train_s),
-            loss: last.as_ref().map(|r| r.loss).filter(|l| l.is_finite()),
+            loss: last.as_ref().and_then(|r| r.loss),
             held_out: last.as_ref().and_then(|r| r.held_out),
             peak: protocol.peak,
             scores,
@@ -254,16 +267,11 @@ impl Reconstruct {
 
     /// What the run takes; one that does not fit is refused.
     fn memory(&self, loaded: &Loaded, parts: &Parts) -> Result<Memory> {
-        let scan = conefield_io::scan_size(&self.scan)?;
         let run = memory::Run {
-            scan,
             split: self.protocol.hold_out.is_some(),
             reference: self.protocol.reference.is_some(),
-            field: parts.pipeline.is_some(),
-            parameters: parts.pipeline.as_ref().map_or(0, |p| p.layout().len() as u64),
-            backend: parts.compiled.scratch_bytes as u64,
-            solver: memory::working(parts.solver.as_ref(), &scan),
             resume: self.resume,
+            ..parts.run(conefield_io::scan_size(&self.scan)?)
         };
         let sets = self.all_sets();
         let tables = loaded.tree["encoder"]["log2_table_size"].as_u64().unwrap_or(0);

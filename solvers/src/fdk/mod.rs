@@ -110,7 +110,7 @@ impl Solver for Fdk {
         let train_s = start.elapsed().as_secs_f64();
         let watch = Watch::new(job);
         let psnr = watch.psnr(&volume, 1.0);
-        let record = Record { step: 1, seconds: train_s, loss: f64::NAN, psnr, ..Record::default() };
+        let record = Record { step: 1, seconds: train_s, psnr, ..Record::default() };
         observer.record(&record);
         let volume = Volume { data: volume, grid: g.volume, affine: None };
         Ok(Solution { result: Reconstruction::Volume(volume), steps: 1, train_s, samples: 0 })

@@ -3,9 +3,7 @@
 //! SART takes one view at a time, SIRT all at once.
 
 use super::order::{Order, subsets, told};
-use super::{
-    Method, Pass, Problem, Stop, change, drive, flat_mut, inverse, projecting, projector, refuse_others, start,
-};
+use super::{Method, Pass, Problem, Stop, change, drive, flat_mut, inverse, open, projecting, refuse_others, start};
 use conefield_core::error::{Result, ensure};
 use conefield_core::scan::Scan;
 use conefield_core::solver::{Job, Observer, Solution, Solver};
@@ -168,9 +166,7 @@ impl Algebraic {
 impl Solver for Algebraic {
     fn solve(&self, job: &Job<'_>, observer: &mut dyn Observer) -> Result<Solution> {
         let begun = Instant::now();
-        job.scan.validate("scan")?;
-        let projector = projector(job)?;
-        observer.note(&format!("{}; {}", self.describe(), projector.describe()));
+        let projector = open(&self.describe(), job, observer)?;
         let problem = Problem::new(job, projector.as_ref());
         let mut sweep = Sweep::new(self, &problem, start(job)?);
         drive(job, &self.stop, begun, &problem, &mut sweep, observer)
@@ -232,8 +228,10 @@ impl Sweep {
         4 * pixels + 2 * 4 * voxels + subset + projecting(subset / 4)
     }
 
-    /// One pass with relaxation `relaxation`; returns `‖p − A·x‖²`.
-    pub(super) fn sweep(&mut self, problem: &Problem<'_>, pass: u64, relaxation: f64) -> f64 {
+    /// Pass `pass`, counted from 0; returns `‖p − A·x‖²`.
+    pub(super) fn sweep(&mut self, problem: &Problem<'_>, pass: u64) -> f64 {
+        let relaxation = (self.settings.relaxation * self.settings.decay.powi(pass.min(1 << 20) as i32)) as f32;
+        let floor = if self.settings.nonnegative { 0.0 } else { f32::NEG_INFINITY };
         let mut square = 0.0;
         for s in self.settings.order.of(self.subsets.len(), problem.seed, pass) {
             let views = &self.subsets[s];
@@ -252,8 +250,6 @@ impl Sweep {
                     &made
                 }
             };
-            let floor = if self.settings.nonnegative { 0.0 } else { f32::NEG_INFINITY };
-            let relaxation = relaxation as f32;
             Zip::from(&mut self.x)
                 .and(&self.update)
                 .and(columns)
@@ -273,9 +269,8 @@ fn column_sums(problem: &Problem<'_>, views: &[usize]) -> Array3<f32> {
 
 impl Method for Sweep {
     fn pass(&mut self, problem: &Problem<'_>, pass: u64) -> Result<Pass> {
-        let relaxation = self.settings.relaxation * self.settings.decay.powi(pass.min(1 << 20) as i32);
         let before = self.settings.stop.change.is_some().then(|| self.x.clone());
-        let residual = self.sweep(problem, pass, relaxation);
+        let residual = self.sweep(problem, pass);
         let change = before.map(|before| change(&self.x, &before));
         Ok(Pass { residual, change, prior: None })
     }

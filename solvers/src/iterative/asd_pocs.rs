@@ -5,7 +5,7 @@ use super::algebraic::{Algebraic, Sweep};
 use super::noise::{self, Noise};
 use super::order::{Order, subsets, told};
 use super::tv::{anisotropy, descend};
-use super::{Method, Pass, Problem, Stop, change, distance, drive, flat_mut, norm2, projector, refuse_others, start};
+use super::{Method, Pass, Problem, Stop, change, distance, drive, flat_mut, norm2, open, refuse_others, start};
 use conefield_core::error::{Result, ensure};
 use conefield_core::scan::Scan;
 use conefield_core::solver::{Job, Observer, Solution, Solver};
@@ -87,9 +87,7 @@ impl AsdPocs {
 impl Solver for AsdPocs {
     fn solve(&self, job: &Job<'_>, observer: &mut dyn Observer) -> Result<Solution> {
         let begun = Instant::now();
-        job.scan.validate("scan")?;
-        let projector = projector(job)?;
-        observer.note(&format!("{}; {}", self.describe(), projector.describe()));
+        let projector = open(&self.describe(), job, observer)?;
         let problem = Problem::new(job, projector.as_ref());
         let sigma = Noise::of(job.scan, false).sigma;
         let mut iterate = Iterate {
@@ -139,8 +137,7 @@ impl Method for Iterate {
         let s = &self.settings;
         let grid = &problem.scan.geometry.volume;
         let before = self.sweep.x.clone();
-        let relaxation = s.relaxation * s.decay.powi(pass.min(1 << 20) as i32);
-        let residual = self.sweep.sweep(problem, pass, relaxation);
+        let residual = self.sweep.sweep(problem, pass);
         let data = distance(&self.sweep.x, &before);
         if pass == 0 {
             self.length = s.alpha * data / s.descents.max(1) as f64;

@@ -1,7 +1,7 @@
 //! Conjugate gradients on the normal equations `AᵀA·x = Aᵀp` (Hestenes and Stiefel 1952; Björck, Numerical Methods for
 //! Least Squares Problems, algorithm 7.4.1). Early passes find what is smooth; noise comes with more of them.
 
-use super::{Method, Pass, Problem, Stop, drive, flat_mut, norm2, projecting, projector, refuse_others, start};
+use super::{Method, Pass, Problem, Stop, drive, flat_mut, norm2, open, projecting, refuse_others, start};
 use conefield_core::error::Result;
 use conefield_core::solver::{Job, Observer, Reconstruction, Solution, Solver};
 use conefield_core::spec::{SolverSpec, Spec};
@@ -39,9 +39,7 @@ impl SolverSpec for Cgls {
 impl Solver for Cgls {
     fn solve(&self, job: &Job<'_>, observer: &mut dyn Observer) -> Result<Solution> {
         let begun = Instant::now();
-        job.scan.validate("scan")?;
-        let projector = projector(job)?;
-        observer.note(&format!("{}; {}", self.describe(), projector.describe()));
+        let projector = open(&self.describe(), job, observer)?;
         let problem = Problem::new(job, projector.as_ref());
         let mut iterate = Iterate::new(&problem, start(job)?);
         let mut solution = drive(job, &self.stop, begun, &problem, &mut iterate, observer)?;

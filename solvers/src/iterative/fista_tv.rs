@@ -16,7 +16,7 @@ use super::noise::{self, Noise};
 use super::order::{Order, subsets, told};
 use super::tv::{TvProx, anisotropy, total_variation};
 use super::{
-    Method, Pass, Problem, Stop, change, drive, flat, flat_mut, norm2, projecting, projector, refuse_others, start,
+    Method, Pass, Problem, Stop, change, drive, flat, flat_mut, norm2, open, projecting, refuse_others, start,
 };
 use conefield_core::error::{Result, ensure};
 use conefield_core::random::stream;
@@ -25,6 +25,7 @@ use conefield_core::solver::{Job, Observer, Solution, Solver};
 use conefield_core::spec::{SolverSpec, Spec};
 use ndarray::{Array3, Zip};
 use rand::RngExt;
+use rayon::prelude::*;
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 use std::time::Instant;
@@ -96,9 +97,7 @@ impl SolverSpec for FistaTv {
 impl Solver for FistaTv {
     fn solve(&self, job: &Job<'_>, observer: &mut dyn Observer) -> Result<Solution> {
         let begun = Instant::now();
-        job.scan.validate("scan")?;
-        let projector = projector(job)?;
-        observer.note(&format!("{}; {}", self.describe(), projector.describe()));
+        let projector = open(&self.describe(), job, observer)?;
         let mut problem = Problem::new(job, projector.as_ref());
         if self.air {
             problem.clear_air();
@@ -167,9 +166,9 @@ fn largest_eigenvalue(problem: &Problem<'_>, noise: Noise, subsets: &[Vec<usize>
             let mut projected = problem.forward(views, &v);
             noise.weigh(1.0, problem, views, &mut projected);
             problem.back(views, &projected, &mut next);
-            let top = next.iter().fold(0.0f32, |m, &x| m.max(x));
+            let top = flat(&next).par_iter().copied().reduce(|| 0.0, f32::max);
             let ratio = |(a, b): (&f32, &f32)| if *b > 1e-6 { f64::from(a / b) } else { 0.0 };
-            bound = bound.min(next.iter().zip(&v).map(ratio).fold(0.0, f64::max));
+            bound = bound.min(flat(&next).par_iter().zip(flat(&v)).map(ratio).reduce(|| 0.0, f64::max));
             Zip::from(&mut v).and(&next).par_for_each(|v, n| *v = n / top.max(f32::MIN_POSITIVE));
         }
         worst = worst.max(bound);
@@ -263,6 +262,10 @@ impl Method for Iterate {
 
     fn volume(&self) -> &Array3<f32> {
         &self.x
+    }
+
+    fn take(&mut self) -> Array3<f32> {
+        std::mem::take(&mut self.x)
     }
 
     fn state(&mut self) -> Vec<(&'static str, &mut [f32])> {

@@ -11,13 +11,13 @@ pub mod order;
 pub mod tv;
 pub mod watch;
 
-use crate::schedule::Clock;
+use crate::schedule::{Clock, Ends};
 use crate::shadow::{air_level, shadow};
 use conefield_core::Error;
 use conefield_core::checkpoint::{Checkpoint, Resume, Standing};
 use conefield_core::error::{Result, ensure};
 use conefield_core::scan::{Scan, Volume};
-use conefield_core::solver::{Job, Limits, Observer, Reconstruction, Record, Solution};
+use conefield_core::solver::{Job, Observer, Reconstruction, Record, Solution};
 use conefield_core::spec::{Spec, VolumeStart};
 use conefield_core::voxel::{VoxelOperator, VoxelProjector};
 use ndarray::{Array2, Array3, Axis, Zip};
@@ -160,9 +160,7 @@ pub trait Method {
     fn volume(&self) -> &Array3<f32>;
 
     /// The volume, which the method needs no more.
-    fn take(&mut self) -> Array3<f32> {
-        self.volume().clone()
-    }
+    fn take(&mut self) -> Array3<f32>;
 
     /// All that the next pass depends on, by name, for checkpoints.
     fn state(&mut self) -> Vec<(&'static str, &mut [f32])>;
@@ -173,11 +171,15 @@ pub trait Method {
     }
 }
 
-/// The voxel projector of a job's spec: Joseph's where it names none. Refuses a spec with stages of a field.
-pub fn projector(job: &Job<'_>) -> Result<Box<dyn VoxelProjector>> {
-    projector_of(job.spec)
+/// Begins a job: refuses a scan that makes no sense, says what solves it and how, and gives the projector.
+pub(crate) fn open(solver: &str, job: &Job<'_>, observer: &mut dyn Observer) -> Result<Box<dyn VoxelProjector>> {
+    job.scan.validate("scan")?;
+    let projector = projector_of(job.spec)?;
+    observer.note(&format!("{solver}; {}", projector.describe()));
+    Ok(projector)
 }
 
+/// The voxel projector of a spec: Joseph's where it names none. Refuses a spec with stages of a field.
 fn projector_of(spec: &Spec) -> Result<Box<dyn VoxelProjector>> {
     voxels_only(spec)?;
     match &spec.projector {
@@ -268,8 +270,8 @@ pub fn drive(
         (step, seconds) = (resume.standing.step, resume.standing.seconds);
         observer.note(&format!("resumed after pass {step}"));
     }
-    let limits = Limits { steps: stop.passes, seconds: stop.seconds, at_most: None };
-    let mut clock = Clock::new(limits, job.limits, seconds + begun.elapsed().as_secs_f64());
+    let ends = Ends { steps: stop.passes, seconds: stop.seconds };
+    let mut clock = Clock::new(ends, job.limits, seconds + begun.elapsed().as_secs_f64());
     let started = step;
     if stop.patience.is_some() && job.held_out.is_none() {
         observer.note("stop.patience looks at views that are kept aside, and none are: it does not end this run");
@@ -312,7 +314,7 @@ pub fn drive(
         let mut record = Record {
             step,
             seconds: clock.seconds(),
-            loss: (pass.residual / pixels).sqrt(),
+            loss: Some((pass.residual / pixels).sqrt()),
             prior: pass.prior,
             change: pass.change,
             held_out,

@@ -41,18 +41,15 @@ impl<'a> Case<'a> {
     /// Runs the solver of the spec `text`.
     pub fn run(&self, text: &str, heard: &mut Heard) -> Result<Solution> {
         let spec = spec(text)?;
+        let backend = Cpu::new();
         let job = Job {
-            scan: self.scan,
             held_out: self.held_out,
             reference: self.reference,
-            peak: 1.0,
-            spec: &spec,
-            backend: &Cpu::new(),
             seed: 3,
             limits: self.limits,
-            weights: &|path| Err(Error::invalid(path, "weights", "nothing", "no test to read any")),
             volumes: &|path| self.file.cloned().ok_or_else(|| Error::invalid(path, "file", "nothing", "a volume")),
             resume: self.resume,
+            ..Job::new(self.scan, &spec, &backend)
         };
         spec.solver.build()?.solve(&job, heard)
     }
@@ -91,7 +88,7 @@ impl Heard {
     }
 
     pub fn losses(&self) -> Vec<f64> {
-        self.records.iter().map(|r| r.loss).collect()
+        self.records.iter().map(|r| r.loss.unwrap()).collect()
     }
 
     pub fn said(&self, words: &str) -> bool {

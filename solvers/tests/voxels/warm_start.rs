@@ -37,7 +37,7 @@ fn the_truth_leaves_no_residual_and_stays() {
         let (cold, first) = Case::of(&scan).volume(&solver(kind));
         let case = Case { file: Some(&truth), ..Case::of(&scan) };
         let (warm, heard) = case.volume(&format!("{START}{}", solver(kind)));
-        let (warm_loss, cold_loss) = (heard.records[0].loss, first.records[0].loss);
+        let (warm_loss, cold_loss) = (heard.losses()[0], first.losses()[0]);
         println!("{kind}: residual {warm_loss:.1e} instead of {cold_loss:.1e}");
         assert!(warm_loss < 1e-5 * cold_loss.max(0.1), "{kind}: {warm_loss:e} and {cold_loss:e}");
         assert!(psnr(&warm, &truth) > 80.0 && psnr(&cold, &truth) < 40.0, "{kind}");

@@ -5,7 +5,7 @@ use conefield_core::Result;
 use conefield_core::arena::Weights;
 use conefield_core::pipeline::Model;
 use conefield_core::scan::{Scan, Volume};
-use conefield_core::solver::{Job, Limits, Observer, Reconstruction, Record, Solution};
+use conefield_core::solver::{Job, Observer, Reconstruction, Record, Solution};
 use conefield_core::spec::{Spec, load};
 use conefield_projectors::simulate::{Protocol, simulate};
 use ndarray::Array3;
@@ -59,19 +59,8 @@ impl Observer for Heard {
 /// A whole run of `value` on `scan`, with the weights file that it may name.
 pub fn solve(value: &Value, scan: &Scan, weights: &Weights) -> Result<(Solution, Vec<Record>)> {
     let spec = spec(value)?;
-    let job = Job {
-        scan,
-        held_out: None,
-        reference: None,
-        peak: 1.0,
-        spec: &spec,
-        backend: &Cpu::new(),
-        seed: 7,
-        limits: Limits::default(),
-        weights: &|_| Ok(weights.clone()),
-        volumes: &|path| Err(conefield_core::Error::unsupported(path, "no volumes here")),
-        resume: None,
-    };
+    let backend = Cpu::new();
+    let job = Job { seed: 7, weights: &|_| Ok(weights.clone()), ..Job::new(scan, &spec, &backend) };
     let mut heard = Heard::default();
     let solution = spec.solver.build()?.solve(&job, &mut heard)?;
     Ok((solution, heard.0))
