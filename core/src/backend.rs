@@ -121,7 +121,8 @@ pub trait Backend: Send + Sync {
     fn compile(&self, pipeline: &Pipeline) -> Result<(Box<dyn Executable>, Explain)>;
 }
 
-/// A compiled pipeline. After a mask changed the pipeline, compile again.
+/// A compiled pipeline. After a mask changed the pipeline, compile again. What a stage reports with
+/// [`crate::stage::Stage::fault`] during a call is the call's error.
 pub trait Executable: Send {
     /// Gradients of `work`'s loss, written over the arena's gradients.
     fn step(&mut self, model: &mut Model, work: &Work<'_>) -> Result<StepStats>;

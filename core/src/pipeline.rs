@@ -131,6 +131,12 @@ impl Pipeline {
         if ray { Scope::Ray } else { Scope::Row }
     }
 
+    /// What a stage could not do since this was last asked; see [`Stage::fault`].
+    pub fn fault(&self) -> Result<()> {
+        self.stages().iter().try_for_each(|(_, s)| s.fault())?;
+        self.projector.fault()
+    }
+
     /// Multiply-adds a sample, forward.
     pub fn macs(&self) -> usize {
         self.stages().iter().map(|(_, s)| s.info().macs).sum()

@@ -1,9 +1,15 @@
 //! The stage types that a spec may name.
 //!
 //! Built-in types register themselves with [`stage_type!`](crate::stage_type) beside their `typetag` implementation;
-//! editors' schemas and the lists in error messages come from here.
+//! types of libraries that are loaded at run time come in by [`add`]. Editors' schemas and the lists in error messages
+//! come from here.
 
+use crate::error::{Error, Result};
+use crate::spec::{EncoderSpec, FieldSpec, InitializerSpec, NormalizerSpec, ProjectorSpec, SolverSpec};
 use schemars::Schema;
+use serde_json::Value;
+use std::fmt;
+use std::sync::{PoisonError, RwLock};
 
 /// The kinds of stage that a spec puts together.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, serde::Serialize)]
@@ -23,6 +29,35 @@ pub enum Kind {
     Solver,
 }
 
+impl Kind {
+    /// Every kind, in the order of a pipeline.
+    pub const ALL: [Self; 6] =
+        [Self::Encoder, Self::Normalizer, Self::Field, Self::Projector, Self::Initializer, Self::Solver];
+
+    /// What it is called in a spec.
+    pub fn name(self) -> &'static str {
+        match self {
+            Self::Encoder => "encoder",
+            Self::Normalizer => "normalizer",
+            Self::Field => "field",
+            Self::Projector => "projector",
+            Self::Initializer => "initializer",
+            Self::Solver => "solver",
+        }
+    }
+
+    /// The kind called `name`.
+    pub fn named(name: &str) -> Option<Self> {
+        Self::ALL.into_iter().find(|k| k.name() == name)
+    }
+}
+
+impl fmt::Display for Kind {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.pad(self.name())
+    }
+}
+
 /// A type that a spec may name.
 pub struct StageType {
     /// What it is.
@@ -31,22 +66,145 @@ pub struct StageType {
     pub name: &'static str,
     /// One line for people.
     pub doc: &'static str,
+    /// Where it comes from.
+    pub origin: Origin,
+}
+
+/// Where a stage type comes from.
+pub enum Origin {
+    /// It is linked into the program; `typetag` knows it.
+    Linked {
+        /// The package that brings it.
+        package: &'static str,
+        /// JSON Schema of its settings, without `type`.
+        schema: fn() -> Schema,
+    },
+    /// It came with a library at run time.
+    Loaded {
+        /// The library, for people: name, version, file.
+        owner: String,
+        /// JSON Schema of its settings, without `type`.
+        schema: Value,
+        /// Makes settings of it.
+        make: Make,
+    },
+}
+
+/// Makes a stage's settings from what a spec says beside its `type`.
+pub type MakeFn<T> = Box<dyn Fn(Value) -> Result<Box<T>> + Send + Sync>;
+
+/// [`MakeFn`] of each kind.
+pub enum Make {
+    /// Of an encoder.
+    Encoder(MakeFn<dyn EncoderSpec>),
+    /// Of a normalizer.
+    Normalizer(MakeFn<dyn NormalizerSpec>),
+    /// Of a field.
+    Field(MakeFn<dyn FieldSpec>),
+    /// Of a projector.
+    Projector(MakeFn<dyn ProjectorSpec>),
+    /// Of an initializer.
+    Initializer(MakeFn<dyn InitializerSpec>),
+    /// Of a solver.
+    Solver(MakeFn<dyn SolverSpec>),
+}
+
+impl Make {
+    fn kind(&self) -> Kind {
+        match self {
+            Self::Encoder(_) => Kind::Encoder,
+            Self::Normalizer(_) => Kind::Normalizer,
+            Self::Field(_) => Kind::Field,
+            Self::Projector(_) => Kind::Projector,
+            Self::Initializer(_) => Kind::Initializer,
+            Self::Solver(_) => Kind::Solver,
+        }
+    }
+}
+
+impl StageType {
     /// JSON Schema of its settings, without `type`.
-    pub schema: fn() -> Schema,
+    pub fn schema(&self) -> Value {
+        match &self.origin {
+            Origin::Linked { schema, .. } => schema().to_value(),
+            Origin::Loaded { schema, .. } => schema.clone(),
+        }
+    }
+
+    /// Who brings it.
+    pub fn owner(&self) -> String {
+        match &self.origin {
+            Origin::Linked { package, .. } => format!("conefield itself ({package})"),
+            Origin::Loaded { owner, .. } => owner.clone(),
+        }
+    }
 }
 
 inventory::collect!(StageType);
 
+/// Types of loaded libraries. Libraries stay loaded to the end, so their types are kept as long.
+static LOADED: RwLock<Vec<&'static StageType>> = RwLock::new(vec![]);
+
 /// Every registered type, by kind and name.
 pub fn stage_types() -> Vec<&'static StageType> {
-    let mut all: Vec<_> = inventory::iter::<StageType>.into_iter().collect();
+    let loaded = LOADED.read().unwrap_or_else(PoisonError::into_inner);
+    let mut all: Vec<_> = inventory::iter::<StageType>.into_iter().chain(loaded.iter().copied()).collect();
     all.sort_by_key(|t| (t.kind, t.name));
     all
+}
+
+/// The type called `name`.
+pub fn find(kind: Kind, name: &str) -> Option<&'static StageType> {
+    stage_types().into_iter().find(|t| t.kind == kind && t.name == name)
 }
 
 /// The names registered for `kind`.
 pub fn names(kind: Kind) -> Vec<&'static str> {
     stage_types().into_iter().filter(|t| t.kind == kind).map(|t| t.name).collect()
+}
+
+/// Adds the types of one library: all of them, or none and an error that names both owners of a name that is taken.
+/// `owner` says which library, in words.
+pub fn add(owner: &str, types: Vec<NewType>) -> Result<()> {
+    let mut loaded = LOADED.write().unwrap_or_else(PoisonError::into_inner);
+    let mut fresh: Vec<&NewType> = vec![];
+    for t in &types {
+        let kind = t.make.kind();
+        let taken = inventory::iter::<StageType>.into_iter().chain(loaded.iter().copied());
+        let taken = taken.filter(|s| s.kind == kind && s.name == t.name).map(StageType::owner).next();
+        let twin = fresh.iter().any(|s| s.make.kind() == kind && s.name == t.name).then(|| owner.to_string());
+        if let Some(other) = taken.or(twin) {
+            let found = format!("a name that {other} has");
+            return Err(Error::invalid(owner, format!("{kind} type {:?}", t.name), found, "a name of its own"));
+        }
+        fresh.push(t);
+    }
+    loaded.extend(types.into_iter().map(|t| &*Box::leak(Box::new(t.owned_by(owner)))));
+    Ok(())
+}
+
+/// A type to be [`add`]ed.
+pub struct NewType {
+    /// The value of `type`.
+    pub name: String,
+    /// One line for people.
+    pub doc: String,
+    /// JSON Schema of its settings, without `type`.
+    pub schema: Value,
+    /// Makes settings of it.
+    pub make: Make,
+}
+
+impl NewType {
+    fn owned_by(self, owner: &str) -> StageType {
+        let Self { name, doc, schema, make } = self;
+        StageType {
+            kind: make.kind(),
+            name: name.leak(),
+            doc: doc.leak(),
+            origin: Origin::Loaded { owner: owner.into(), schema, make },
+        }
+    }
 }
 
 #[doc(hidden)]
@@ -63,8 +221,33 @@ macro_rules! stage_type {
                 kind: $crate::registry::Kind::$kind,
                 name: $name,
                 doc: $doc,
-                schema: || $crate::registry::schemars::schema_for!($settings),
+                origin: $crate::registry::Origin::Linked {
+                    package: env!("CARGO_PKG_NAME"),
+                    schema: || $crate::registry::schemars::schema_for!($settings),
+                },
             }
         }
     };
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn new(name: &str) -> NewType {
+        let make: MakeFn<dyn ProjectorSpec> = Box::new(|_| Err(Error::unsupported("a test", "it makes nothing")));
+        let schema = serde_json::json!({});
+        NewType { name: name.into(), doc: "for tests".into(), schema, make: Make::Projector(make) }
+    }
+
+    #[test]
+    fn a_name_that_is_taken_is_refused_with_both_owners_and_nothing_is_added() {
+        add("one 1.0 (one.so)", vec![new("test-one")]).unwrap();
+        let e = add("two 1.0 (two.so)", vec![new("test-two"), new("test-one")]).unwrap_err().to_string();
+        assert!(e.contains("one 1.0 (one.so)") && e.contains("two 1.0 (two.so)") && e.contains("test-one"), "{e}");
+        assert!(find(Kind::Projector, "test-two").is_none());
+        assert!(find(Kind::Projector, "test-one").is_some_and(|t| t.owner() == "one 1.0 (one.so)"));
+        let e = add("three", vec![new("test-twin"), new("test-twin")]).unwrap_err().to_string();
+        assert!(e.contains("test-twin"), "{e}");
+    }
 }

@@ -6,6 +6,7 @@
 mod check;
 pub mod load;
 pub mod schema;
+pub mod stage;
 mod tree;
 
 use crate::arena::{Arena, InitReport, Layout, Weights};
@@ -29,19 +30,43 @@ pub struct Spec {
     /// How the scan is mapped to what stages see.
     #[serde(default)]
     pub scene: Scene,
+    /// Libraries with stages that the spec names.
+    #[serde(default, skip_serializing_if = "Plugins::is_empty")]
+    pub plugins: Plugins,
     /// Points to features.
+    #[serde(default, deserialize_with = "stage::one")]
     pub encoder: Option<Box<dyn EncoderSpec>>,
     /// Features to features, in order.
-    #[serde(default)]
+    #[serde(default, deserialize_with = "stage::list")]
     pub normalizers: Vec<Box<dyn NormalizerSpec>>,
     /// Features to attenuation.
+    #[serde(default, deserialize_with = "stage::one")]
     pub field: Option<Box<dyn FieldSpec>>,
     /// Rays to samples.
+    #[serde(default, deserialize_with = "stage::one")]
     pub projector: Option<Box<dyn ProjectorSpec>>,
     /// Where weights come from.
+    #[serde(default, deserialize_with = "stage::one")]
     pub initializer: Option<Box<dyn InitializerSpec>>,
     /// Scan to volume.
+    #[serde(deserialize_with = "stage::needed")]
     pub solver: Box<dyn SolverSpec>,
+}
+
+/// Libraries with stages that a spec names. A spec alone never makes the program load one: its user allows it.
+#[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize, JsonSchema)]
+#[serde(deny_unknown_fields, default)]
+pub struct Plugins {
+    /// The files of the libraries, relative to the spec's own. Loaded only where the user says so, with
+    /// `--allow-plugins-from-spec`, or names the same file with `--plugin`.
+    pub paths: Vec<String>,
+}
+
+impl Plugins {
+    /// Whether none is named.
+    pub fn is_empty(&self) -> bool {
+        self.paths.is_empty()
+    }
 }
 
 /// How the scan is mapped to the unit cube and to attenuations of order one.

@@ -212,6 +212,13 @@ pub trait Stage: Send + Sync {
         vec![0..self.info().params]
     }
 
+    /// What its kernels could not do since this was last asked. A kernel has no result of its own, as it runs on tiles
+    /// from many threads; one that may fail, as those of loaded libraries may, leaves numbers that mean nothing and says
+    /// so here. Backends ask after every call.
+    fn fault(&self) -> Result<()> {
+        Ok(())
+    }
+
     /// The same formula for a GPU, or `None` where there is only the CPU.
     fn wgsl(&self, _namer: &Namer) -> Option<Fragment> {
         None
@@ -337,6 +344,11 @@ pub trait Projector: Send + Sync {
         for (d, &w) in dmu.iter_mut().zip(weights) {
             *d = f64::from(w) * dline;
         }
+    }
+
+    /// What it could not do since this was last asked, as [`Stage::fault`].
+    fn fault(&self) -> Result<()> {
+        Ok(())
     }
 
     /// A line for `explain`.

@@ -15,6 +15,7 @@ use std::sync::Arc;
 #[serde(deny_unknown_fields)]
 pub struct Concat {
     /// The parts, in the order of their channels: any encoders, this one included.
+    #[serde(deserialize_with = "conefield_core::spec::stage::list")]
     #[schemars(schema_with = "list_of_encoders")]
     pub encoders: Vec<Box<dyn EncoderSpec>>,
 }
@@ -260,6 +261,10 @@ impl Stage for ConcatStage {
             ranges.into_iter().map(move |r| start + r.start..start + r.end)
         };
         self.parts.iter().flat_map(of).collect()
+    }
+
+    fn fault(&self) -> Result<()> {
+        self.parts.iter().try_for_each(|p| p.stage.fault())
     }
 
     fn describe(&self) -> String {

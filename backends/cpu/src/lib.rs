@@ -93,13 +93,15 @@ impl Executable for CpuExecutable {
             model.arena.grads.fill(0.0);
         }
         self.clean = false;
-        Ok(self.slots.get_or_insert_with(|| Slots::new(&kernels)).step(
+        let stats = self.slots.get_or_insert_with(|| Slots::new(&kernels)).step(
             &kernels,
             model.pipeline.projector.as_ref(),
             &model.arena.params,
             &mut model.arena.grads,
             work,
-        ))
+        );
+        model.pipeline.fault()?;
+        Ok(stats)
     }
 
     fn update(&mut self, model: &mut Model, adam: &Adam) -> Result<()> {
@@ -122,12 +124,13 @@ impl Executable for CpuExecutable {
                 }
             },
         );
-        Ok(())
+        model.pipeline.fault()
     }
 
     fn encode(&mut self, model: &Model, points: &[[f32; 3]]) -> Result<Vec<f32>> {
         let mut encoded = Encoded::default();
         encoded.forward(&kernels(&model.pipeline)?, &model.arena.params, points);
+        model.pipeline.fault()?;
         Ok(encoded.features().to_vec())
     }
 
@@ -152,6 +155,6 @@ impl Executable for CpuExecutable {
                 *out = projector.integrate(&samples.weights, mu) as f32;
             },
         );
-        Ok(())
+        model.pipeline.fault()
     }
 }

@@ -1,10 +1,10 @@
 //! Checks a spec as written against what the registered stage types know, so that a mistake is told with its line,
 //! its path and the nearest valid name.
 
-use super::schema::{NESTED, STAGES, kind_name, kind_named, of_scene, of_type};
+use super::schema::{NESTED, STAGES, of_type, tables};
 use super::tree::{At, Kind as Is, Node};
 use crate::error::{Error, Result};
-use crate::registry::{Kind, names, stage_types};
+use crate::registry::{Kind, find, names};
 use serde_json::Value;
 
 /// Keys of a spec beside its stages.
@@ -17,9 +17,8 @@ pub(super) fn spec(root: &Node) -> Result<()> {
         let key = e.key.as_str();
         if TEXTS.contains(&key) {
             setting(&e.value, &serde_json::json!({ "type": "string" }), &Context::new(&Value::Null, None), key)?;
-        } else if key == "scene" {
-            let schema = of_scene();
-            setting(&e.value, &schema, &Context::new(&schema, None), key)?;
+        } else if let Some((_, schema)) = tables().iter().find(|t| t.0 == key) {
+            setting(&e.value, schema, &Context::new(schema, None), key)?;
         } else if key == "normalizers" {
             let Is::Array(items) = &e.value.kind else {
                 return Err(invalid(&e.value.at, key, e.value.shown(), "a list of tables, [[normalizers]]".into()));
@@ -30,7 +29,8 @@ pub(super) fn spec(root: &Node) -> Result<()> {
         } else if let Some((_, kind)) = STAGES.iter().find(|s| s.0 == key) {
             stage(&e.value, *kind, key)?;
         } else {
-            let known: Vec<&str> = TEXTS.into_iter().chain(["scene"]).chain(STAGES.iter().map(|s| s.0)).collect();
+            let known: Vec<&str> =
+                TEXTS.into_iter().chain(["scene", "plugins"]).chain(STAGES.iter().map(|s| s.0)).collect();
             return Err(unknown(&e.at, key, key, &known));
         }
     }
@@ -55,8 +55,8 @@ fn stage(node: &Node, kind: Kind, path: &str) -> Result<()> {
     let Some(text) = name.text() else {
         return Err(invalid(&name.at, &join(path, "type"), name.shown(), types()));
     };
-    let Some(found) = stage_types().into_iter().find(|t| t.kind == kind && t.name == text) else {
-        let found = format!("no {} type {text:?}", kind_name(kind));
+    let Some(found) = find(kind, text) else {
+        let found = format!("no {} type {text:?}", kind.name());
         return Err(invalid(&name.at, &join(path, "type"), found, suggest(text, &known)));
     };
     let schema = of_type(found);
@@ -84,7 +84,7 @@ impl<'a> Context<'a> {
 /// Checks a value against the schema of its setting.
 fn setting(node: &Node, schema: &Value, cx: &Context<'_>, path: &str) -> Result<()> {
     let schema = cx.resolve(schema);
-    if let Some(kind) = schema[NESTED].as_str().and_then(kind_named) {
+    if let Some(kind) = schema[NESTED].as_str().and_then(Kind::named) {
         return stage(node, kind, path);
     }
     if let (Some(kind), true, true) = (cx.kind, is_open(schema), node.get("type").is_some()) {
@@ -205,9 +205,9 @@ fn constants(schema: &Value, cx: &Context<'_>) -> Vec<Value> {
 /// In words, what a schema allows.
 fn wanted(schema: &Value, cx: &Context<'_>) -> String {
     let schema = cx.resolve(schema);
-    if let Some(kind) = schema[NESTED].as_str().and_then(kind_named) {
+    if let Some(kind) = schema[NESTED].as_str().and_then(Kind::named) {
         let article = if kind == Kind::Encoder || kind == Kind::Initializer { "an" } else { "a" };
-        return format!("a table with {article} {} type: {}", kind_name(kind), listed(&names(kind)));
+        return format!("a table with {article} {} type: {}", kind.name(), listed(&names(kind)));
     }
     let fixed = constants(schema, cx);
     let mut words: Vec<String> = fixed.iter().map(plain).collect();

@@ -36,19 +36,71 @@ pub struct Loaded {
 
 /// Reads the spec `what`: the name of a shipped one or a TOML or JSON file. `sets` are `path=value` and lie on top.
 pub fn load(what: &str, sets: &[String], shipped: &[Shipped]) -> Result<Loaded> {
-    let layer = Layer::find(what, None, shipped).map_err(|e| match e {
-        Unfound::Nothing => Error::invalid("spec", what, NOTHING, format!("a file or {}", names(what, shipped))),
-        Unfound::Unreadable(e) => e,
-    })?;
-    let source = layer.label();
-    finish(layer.resolve(shipped, &mut vec![])?, source, sets)
+    Draft::find(what, sets, shipped)?.finish()
 }
 
 /// Reads a spec from `text`, called `source` in errors; TOML unless it begins like JSON.
 pub fn parse(text: &str, source: &str, sets: &[String], shipped: &[Shipped]) -> Result<Loaded> {
-    let layer = Layer { origin: Origin::Text(source.into()), text: text.into() };
-    finish(layer.resolve(shipped, &mut vec![])?, source.into(), sets)
+    Draft::of(text, source, sets, shipped)?.finish()
 }
+
+/// A spec with all its layers, not yet checked: the stage types that it names may still have to be loaded.
+pub struct Draft {
+    written: Node,
+    source: String,
+}
+
+impl Draft {
+    /// As [`load`].
+    pub fn find(what: &str, sets: &[String], shipped: &[Shipped]) -> Result<Self> {
+        let layer = Layer::find(what, None, shipped).map_err(|e| match e {
+            Unfound::Nothing => Error::invalid("spec", what, NOTHING, format!("a file or {}", names(what, shipped))),
+            Unfound::Unreadable(e) => e,
+        })?;
+        Self::layered(layer, sets, shipped)
+    }
+
+    /// As [`parse`].
+    pub fn of(text: &str, source: &str, sets: &[String], shipped: &[Shipped]) -> Result<Self> {
+        Self::layered(Layer { origin: Origin::Text(source.into()), text: text.into() }, sets, shipped)
+    }
+
+    fn layered(layer: Layer, sets: &[String], shipped: &[Shipped]) -> Result<Self> {
+        let source = layer.label();
+        let mut written = layer.resolve(shipped, &mut vec![])?;
+        let mut sets = sets.iter().map(|s| Set::parse(s)).collect::<Result<Vec<_>>>()?;
+        // A type clears the keys of the old one, so it goes before the keys beside it, whatever the order on the line.
+        sets.sort_by_key(|s| (s.path.len(), s.path.last().is_some_and(|k| k != "type")));
+        for set in sets {
+            set.apply(&mut written)?;
+        }
+        Ok(Self { written, source })
+    }
+
+    /// The plugins that it names, each with where it stands.
+    pub fn plugins(&self) -> Vec<(String, PathBuf)> {
+        let paths = self.written.get(PLUGINS).and_then(|p| p.get(PATHS)).map(|p| &p.kind);
+        let Some(Kind::Array(paths)) = paths else { return vec![] };
+        paths.iter().filter_map(|p| Some((p.at.to_string(), PathBuf::from(p.text()?)))).collect()
+    }
+
+    /// Checks it against the stage types that there are.
+    pub fn finish(self) -> Result<Loaded> {
+        let Self { written, source } = self;
+        check::spec(&written)?;
+        let spec: Spec = serde_path_to_error::deserialize(written.to_json()).map_err(|e| {
+            let path: Vec<String> = steps(&e.path().to_string());
+            let at = &written.nearest(&path.iter().map(String::as_str).collect::<Vec<_>>()).at;
+            Error::invalid(at.to_string(), path.join("."), e.inner(), "a value that the setting can hold")
+        })?;
+        let tree = serde_json::to_value(&spec).map_err(|e| Error::unsupported("writing the spec", e.to_string()))?;
+        Ok(Loaded { spec, tree, source, written })
+    }
+}
+
+/// Where a spec names plugins.
+const PLUGINS: &str = "plugins";
+const PATHS: &str = "paths";
 
 /// The spec as TOML with every default written. Refuses one that would not read back the same: TOML has no null, so
 /// a JSON spec that clears a setting whose default is something cannot be said in it.
@@ -61,23 +113,6 @@ pub fn to_toml(spec: &Spec) -> Result<String> {
         return Err(failed(&"a setting is null whose default is not; give it a value"));
     }
     Ok(text)
-}
-
-fn finish(mut written: Node, source: String, sets: &[String]) -> Result<Loaded> {
-    let mut sets = sets.iter().map(|s| Set::parse(s)).collect::<Result<Vec<_>>>()?;
-    // A type clears the keys of the old one, so it goes before the keys beside it, whatever the order on the line.
-    sets.sort_by_key(|s| (s.path.len(), s.path.last().is_some_and(|k| k != "type")));
-    for set in sets {
-        set.apply(&mut written)?;
-    }
-    check::spec(&written)?;
-    let spec: Spec = serde_path_to_error::deserialize(written.to_json()).map_err(|e| {
-        let path: Vec<String> = steps(&e.path().to_string());
-        let at = &written.nearest(&path.iter().map(String::as_str).collect::<Vec<_>>()).at;
-        Error::invalid(at.to_string(), path.join("."), e.inner(), "a value that the setting can hold")
-    })?;
-    let tree = serde_json::to_value(&spec).map_err(|e| Error::unsupported("writing the spec", e.to_string()))?;
-    Ok(Loaded { spec, tree, source, written })
 }
 
 impl Loaded {
@@ -177,6 +212,9 @@ impl Layer {
         };
         let mut node = if is_json { parse_json(&label, &self.text)? } else { parse_toml(&label, &self.text)? };
         node.take("$schema");
+        if let Origin::File(path) = &self.origin {
+            anchor_plugins(&mut node, path);
+        }
         let Some(extends) = node.take("extends") else { return Ok(node) };
         let at = extends.value.at.to_string();
         let Some(what) = extends.value.text() else {
@@ -201,6 +239,21 @@ impl Layer {
         let mut tree = base.resolve(shipped, above)?;
         tree.merge(node);
         Ok(tree)
+    }
+}
+
+/// Makes the plugin paths of a spec file, which are relative to it, absolute: they outlive the file's place in layers.
+fn anchor_plugins(node: &mut Node, file: &Path) {
+    let folder = file.parent().unwrap_or(Path::new(""));
+    let Some(Kind::Array(paths)) = node.get_mut(PLUGINS).and_then(|p| p.get_mut(PATHS)).map(|p| &mut p.kind) else {
+        return;
+    };
+    for path in paths {
+        if let Kind::String(path) = &mut path.kind
+            && let Ok(absolute) = std::path::absolute(folder.join(&*path))
+        {
+            *path = absolute.display().to_string();
+        }
     }
 }
 

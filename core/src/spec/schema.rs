@@ -1,6 +1,6 @@
 //! JSON Schemas: of one stage type, and of a whole spec for editors.
 
-use super::Scene;
+use super::{Plugins, Scene};
 use crate::registry::{Kind, StageType, stage_types};
 use serde_json::{Map, Value, json};
 
@@ -18,26 +18,9 @@ pub(super) const STAGES: [(&str, Kind); 6] = [
     ("solver", Kind::Solver),
 ];
 
-/// What a kind is called in a spec.
-pub(super) fn kind_name(kind: Kind) -> &'static str {
-    match kind {
-        Kind::Encoder => "encoder",
-        Kind::Normalizer => "normalizer",
-        Kind::Field => "field",
-        Kind::Projector => "projector",
-        Kind::Initializer => "initializer",
-        Kind::Solver => "solver",
-    }
-}
-
-/// The kind called `name`.
-pub(super) fn kind_named(name: &str) -> Option<Kind> {
-    STAGES.iter().map(|s| s.1).find(|k| kind_name(*k) == name)
-}
-
 /// The settings schema of a stage type, with its `type` key.
 pub(super) fn of_type(stage: &StageType) -> Value {
-    let mut schema = (stage.schema)().to_value();
+    let mut schema = stage.schema();
     if let Value::Object(s) = &mut schema {
         s.remove("$schema");
         let properties = s.entry("properties").or_insert_with(|| json!({}));
@@ -48,28 +31,33 @@ pub(super) fn of_type(stage: &StageType) -> Value {
     schema
 }
 
-/// The schema of `scene`.
-pub(super) fn of_scene() -> Value {
-    let mut schema = schemars::schema_for!(Scene).to_value();
-    if let Value::Object(s) = &mut schema {
-        s.remove("$schema");
-    }
-    schema
+/// The keys of a spec that hold settings of no stage, with their schemas.
+pub(super) fn tables() -> [(&'static str, Value); 2] {
+    let of = |schema: schemars::Schema| {
+        let mut schema = schema.to_value();
+        if let Value::Object(s) = &mut schema {
+            s.remove("$schema");
+        }
+        schema
+    };
+    [("scene", of(schemars::schema_for!(Scene))), ("plugins", of(schemars::schema_for!(Plugins)))]
 }
 
 /// The JSON Schema of a spec file, for editors: every registered stage type with its settings.
 pub fn pipeline() -> Value {
     let mut defs = Map::new();
-    defs.insert("scene".into(), relocated(of_scene(), "scene"));
+    for (name, schema) in tables() {
+        defs.insert(name.into(), relocated(schema, name));
+    }
     for (_, kind) in STAGES {
         let mut any = vec![];
         for t in stage_types().into_iter().filter(|t| t.kind == kind) {
-            let name = format!("{}.{}", kind_name(kind), t.name);
+            let name = format!("{}.{}", kind.name(), t.name);
             defs.insert(name.clone(), relocated(of_type(t), &name));
             any.push(json!({ "$ref": format!("#/$defs/{name}") }));
         }
         defs.insert(
-            kind_name(kind).into(),
+            kind.name().into(),
             json!({ "type": "object", "properties": { "type": { "type": "string" } }, "anyOf": any }),
         );
     }
@@ -85,6 +73,7 @@ pub fn pipeline() -> Value {
             "name": { "type": "string", "description": "Short name, shown in tables." },
             "description": { "type": "string", "description": "What it is for, in a sentence." },
             "scene": stage("scene", "How the scan is mapped to what stages see."),
+            "plugins": stage("plugins", "Libraries with stages that the spec names."),
             "encoder": stage("encoder", "Points to features."),
             "normalizers": {
                 "description": "Features to features, in order.",
