@@ -1,5 +1,4 @@
-//! What every conefield stage must do, as a library: [`conformance::check`] takes any stage, built in or loaded; and
-//! what every reader must withstand: [`hostile`].
+//! What every reader of conefield must withstand: [`hostile`]. The conformance kit of stages is a crate of its own,
+//! `conefield-conformance` in `kit`, since plugins' authors use it too.
 
-pub mod conformance;
 pub mod hostile;

@@ -1,13 +1,18 @@
 //! Negative controls: a small stage that passes the kit, and the same stage with one fault at a time, which must fail
 //! the property that the fault breaks. A kit that cannot fail proves nothing.
 
-use conefield_core::Result;
+use conefield_conformance::{Options, check, check_encoder, check_initializer, check_projector, check_voxel_projector};
+use conefield_core::arena::{Arena, InitReport, Layout};
 use conefield_core::geometry::Geometry;
 use conefield_core::simd::Real;
-use conefield_core::stage::{Encoder, GradKind, Grads, Info, Kernel, Parameter, Reduced, Scope, Stage, Tile, TileMut};
+use conefield_core::spec::Initializer;
+use conefield_core::stage::{
+    Encoder, GradKind, Grads, Info, Kernel, Parameter, Projector, Reduced, Samples, Scope, Stage, Tile, TileMut,
+    UnitRay,
+};
 use conefield_core::voxel::{VoxelOperator, VoxelProjector};
+use conefield_core::{Error, Result};
 use conefield_projectors::voxel::{Joseph, Siddon};
-use conefield_tests::conformance::{Options, check, check_encoder, check_voxel_projector};
 use ndarray::{ArrayView3, ArrayViewMut3};
 use std::ops::Range;
 use std::sync::atomic::{AtomicU32, Ordering};
@@ -419,5 +424,180 @@ fn every_fault_of_a_voxel_projector_fails_its_property() {
         (VoxelFault::Threads, &["threads"]),
     ] {
         assert_eq!(check_voxel_projector(&fault).failed(), properties, "{fault:?}");
+    }
+}
+
+/// What is wrong with a projector of rays.
+#[derive(Debug, Clone, Copy, PartialEq)]
+enum RayFault {
+    None,
+    /// One sample more than it says.
+    TooMany,
+    /// One weight is missing.
+    LostWeight,
+    /// A weight is NaN.
+    NotANumber,
+    /// Samples lie beside their ray.
+    Beside,
+    /// What was there before goes.
+    Clears,
+    /// Samples depend on the call.
+    Remembers,
+    /// A ray that misses the box gets a sample.
+    SeesAir,
+    /// Lengths are 1 % too long.
+    Longer,
+    /// The way back is 1 % too long.
+    LongAdjoint,
+    /// The way back adds.
+    AddsAdjoint,
+    /// It says that something went wrong.
+    Reports,
+}
+
+struct ToyRays {
+    fault: RayFault,
+    calls: AtomicU32,
+}
+
+impl Projector for ToyRays {
+    fn max_samples(&self, ray: &UnitRay) -> usize {
+        let hit = ray.inside[1] > ray.inside[0] || self.fault == RayFault::SeesAir;
+        if hit { 10 } else { 0 }
+    }
+
+    fn sample(&self, ray: &UnitRay, _: Option<u64>, out: &mut Samples) {
+        if self.fault == RayFault::Clears {
+            *out = Samples::default();
+        }
+        let calls = self.calls.fetch_add(1, Ordering::Relaxed);
+        let [near, far] = ray.inside;
+        let n = self.max_samples(ray) + usize::from(self.fault == RayFault::TooMany);
+        let mut delta = (far - near) / n.max(1) as f32;
+        if self.fault == RayFault::Longer {
+            delta *= 1.01;
+        }
+        for i in 0..n {
+            let shift = if self.fault == RayFault::Remembers { (calls % 7) as f32 * 1e-3 } else { 0.0 };
+            let t = near + (i as f32 + 0.5 + shift) * delta;
+            let mut point: [f32; 3] = std::array::from_fn(|k| ray.origin[k] + t * ray.direction[k]);
+            if self.fault == RayFault::Beside {
+                point[0] += 0.01 * (1.0 - ray.direction[0].abs());
+            }
+            out.points.push(point);
+            out.weights.push(if self.fault == RayFault::NotANumber && i == 3 { f32::NAN } else { delta });
+        }
+        if self.fault == RayFault::LostWeight {
+            out.weights.pop();
+        }
+    }
+
+    fn adjoint(&self, weights: &[f32], dline: f64, dmu: &mut [f64]) {
+        let scale = if self.fault == RayFault::LongAdjoint { 1.01 } else { 1.0 };
+        for (d, &w) in dmu.iter_mut().zip(weights) {
+            let before = if self.fault == RayFault::AddsAdjoint { *d } else { 0.0 };
+            *d = before + scale * f64::from(w) * dline;
+        }
+    }
+
+    fn fault(&self) -> Result<()> {
+        if self.fault == RayFault::Reports { Err(Error::unsupported("toy", "as ordered")) } else { Ok(()) }
+    }
+
+    fn describe(&self) -> String {
+        format!("toy rays: {:?}", self.fault)
+    }
+}
+
+#[test]
+fn every_fault_of_a_ray_projector_fails_its_property() {
+    let toy = |fault| ToyRays { fault, calls: AtomicU32::new(0) };
+    let sound = check_projector(&toy(RayFault::None));
+    assert!(sound.passed(), "{sound}");
+    for (fault, property) in [
+        (RayFault::TooMany, "samples are bounded"),
+        (RayFault::LostWeight, "samples are bounded"),
+        (RayFault::NotANumber, "samples are finite"),
+        (RayFault::Beside, "samples lie on their ray"),
+        (RayFault::Clears, "samples add"),
+        (RayFault::Remembers, "repeatable"),
+        (RayFault::SeesAir, "rays that miss"),
+        (RayFault::Longer, "constant attenuation"),
+        (RayFault::LongAdjoint, "adjoint"),
+        (RayFault::AddsAdjoint, "adjoint overwrites"),
+        (RayFault::Reports, "no fault"),
+    ] {
+        let report = quietly(|| check_projector(&toy(fault)));
+        assert!(report.failed().contains(&property), "{fault:?} passed {property:?}:\n{report}");
+    }
+}
+
+/// What is wrong with an initializer.
+#[derive(Debug, Clone, Copy, PartialEq)]
+enum WeightFault {
+    None,
+    /// It fills more than it tells of.
+    Silent,
+    /// A block is told of nowhere.
+    Forgets,
+    /// One number is infinite.
+    Infinite,
+    /// Numbers depend on the call.
+    Remembers,
+    /// It refuses.
+    Refuses,
+}
+
+struct ToyWeights {
+    fault: WeightFault,
+    calls: AtomicU32,
+}
+
+impl Initializer for ToyWeights {
+    fn apply(&self, layout: &Layout, arena: &mut Arena) -> Result<InitReport> {
+        if self.fault == WeightFault::Refuses {
+            return Err(Error::unsupported("toy", "as ordered"));
+        }
+        let calls = self.calls.fetch_add(1, Ordering::Relaxed);
+        let mut report = InitReport::default();
+        for b in &layout.blocks {
+            let own = b.name.starts_with("field");
+            if own || (self.fault == WeightFault::Silent && b.name.starts_with("normalizers")) {
+                arena.params[b.range.clone()].fill(0.25);
+            }
+            if own && self.fault == WeightFault::Infinite {
+                arena.params[b.range.start] = f32::INFINITY;
+            }
+            if own && self.fault == WeightFault::Remembers {
+                arena.params[b.range.start] = calls as f32;
+            }
+            if own {
+                report.loaded.push(b.name.clone());
+            } else if self.fault != WeightFault::Forgets {
+                report.fresh.push((b.name.clone(), "not filled".into()));
+            }
+        }
+        Ok(report)
+    }
+
+    fn describe(&self) -> String {
+        format!("toy weights: {:?}", self.fault)
+    }
+}
+
+#[test]
+fn every_fault_of_an_initializer_fails_its_property() {
+    let toy = |fault| ToyWeights { fault, calls: AtomicU32::new(0) };
+    let sound = check_initializer(&toy(WeightFault::None));
+    assert!(sound.passed(), "{sound}");
+    for (fault, property) in [
+        (WeightFault::Silent, "leaves the rest alone"),
+        (WeightFault::Forgets, "applies"),
+        (WeightFault::Infinite, "finite"),
+        (WeightFault::Remembers, "repeatable"),
+        (WeightFault::Refuses, "applies"),
+    ] {
+        let report = check_initializer(&toy(fault));
+        assert!(report.failed().contains(&property), "{fault:?} passed {property:?}:\n{report}");
     }
 }

@@ -1,10 +1,12 @@
 //! Every built-in stage, with several settings each, through the conformance kit.
 
-use conefield_core::registry::{Kind, names};
-use conefield_core::spec::{EncoderSpec, FieldSpec, NormalizerSpec, ProjectorSpec};
-use conefield_tests::conformance::{
-    Options, Report, check_encoder, check_field, check_normalizer, check_voxel_projector,
+use conefield_conformance::{
+    Options, Report, check_encoder, check_field, check_initializer, check_normalizer, check_projector,
+    check_voxel_projector,
 };
+use conefield_core::arena::Weights;
+use conefield_core::registry::{Kind, names};
+use conefield_core::spec::{EncoderSpec, FieldSpec, InitializerSpec, NormalizerSpec, ProjectorSpec};
 use serde_json::{Value, json};
 
 // Stage types register themselves where their crate is linked.
@@ -183,6 +185,25 @@ fn voxel_projectors() {
     }
 }
 
+#[test]
+fn ray_projectors() {
+    for settings in [
+        json!({"type": "ray-march"}),
+        json!({"type": "ray-march", "samples": 1}),
+        json!({"type": "ray-march", "sampling": "stratified", "extent": "clipped"}),
+        json!({"type": "ray-march", "step_mm": 3.0, "extent": "published"}),
+    ] {
+        let spec: Box<dyn ProjectorSpec> = serde_json::from_value(settings).unwrap();
+        expect(check_projector(spec.build().unwrap().as_ref()));
+    }
+}
+
+#[test]
+fn random_initializer() {
+    let spec: Box<dyn InitializerSpec> = serde_json::from_value(json!({"type": "random"})).unwrap();
+    expect(check_initializer(spec.build(&|_| Ok(Weights::default())).unwrap().as_ref()));
+}
+
 /// A stage type that is not in this list has not been through the kit.
 #[test]
 fn every_registered_stage_has_a_run_here() {
@@ -190,6 +211,5 @@ fn every_registered_stage_has_a_run_here() {
     assert_eq!(names(Kind::Normalizer), ["fft-mask", "layer-norm"]);
     assert_eq!(names(Kind::Field), ["mlp", "voxel-grid"]);
     assert_eq!(names(Kind::Initializer), ["checkpoint", "mci", "random", "volume"]);
-    // `ray-march` samples rays for a field, whose gradients are checked with the pipeline.
     assert_eq!(names(Kind::Projector), ["joseph", "ray-march", "siddon", "trilinear"]);
 }

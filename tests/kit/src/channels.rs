@@ -1,7 +1,7 @@
 //! Stages without some of their channels.
 
-use super::call::{channels_of, data, differing, error, forward, gradients, params};
-use super::{Options, Outcome, check};
+use crate::call::{channels_of, data, differing, error, forward, gradients, params};
+use crate::{Options, Outcome, check};
 use conefield_core::error::Result;
 use conefield_core::stage::{Encoder, Field, Normalizer, Stage};
 use std::collections::BTreeSet;

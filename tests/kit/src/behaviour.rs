@@ -1,10 +1,10 @@
 //! How a stage treats what it is handed: sizes, buffers, threads, numbers at the edge.
 
-use super::call::{
+use crate::call::{
     Before, Guarded, backward, data, differing, error, forward, forward_over, gradients, params, rows_of, settle,
     within,
 };
-use super::{Options, Outcome};
+use crate::{Options, Outcome};
 use conefield_core::arena::{Block, Layout, Weights};
 use conefield_core::stage::{GradKind, Grads, Scope, Stage, Tile, TileMut};
 use std::collections::BTreeSet;

@@ -1,6 +1,6 @@
 //! Calls of a stage's kernels on drawn data, and comparisons.
 
-use super::{Options, Outcome};
+use crate::{Options, Outcome};
 use conefield_core::random::{mix, unit};
 use conefield_core::simd::Real;
 use conefield_core::stage::{Grads, Info, Kernel, Stage, Tile, TileMut};

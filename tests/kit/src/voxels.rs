@@ -1,7 +1,7 @@
 //! What a projector of voxels must keep to: a linear operator that measures lengths, and its exact adjoint.
 
-use super::call::{differing, error, settle};
-use super::{Outcome, Report};
+use crate::call::{differing, error, settle};
+use crate::{Outcome, Report};
 use conefield_core::geometry::{Geometry, Millimetres, Radians, View, VoxelGrid};
 use conefield_core::random::{mix, unit};
 use conefield_core::simd::Real;

@@ -9,14 +9,18 @@ mod behaviour;
 mod call;
 mod channels;
 mod gradients;
+mod rays;
 mod voxels;
+mod weights;
 
 use conefield_core::stage::{Encoder, Field, Normalizer, Stage};
 use std::fmt;
 use std::ops::Range;
 use std::panic::{AssertUnwindSafe, catch_unwind};
 
+pub use rays::check_projector;
 pub use voxels::check_voxel_projector;
+pub use weights::check_initializer;
 
 /// How a stage is tried out.
 #[derive(Debug, Clone, PartialEq)]
@@ -126,6 +130,7 @@ pub fn check(stage: &dyn Stage, options: &Options) -> Report {
     report.add("extremes", || behaviour::extremes(stage, options));
     report.add("poison rows", || behaviour::poison(stage, options));
     report.add("save and load", || behaviour::save_and_load(stage, options));
+    report.add("no fault", || call::settle(stage.fault().err().map(|e| e.to_string()), "none was reported"));
     report
 }
 

@@ -1,7 +1,7 @@
 //! Backward against differences of forward, and single against double precision.
 
-use super::call::{Draw, error, forward, gradients, params, within};
-use super::{Options, Outcome};
+use crate::call::{Draw, error, forward, gradients, params, within};
+use crate::{Options, Outcome};
 use conefield_core::simd::Real;
 use conefield_core::stage::{Info, Kernel, Scope, Stage};
 

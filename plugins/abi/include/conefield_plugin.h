@@ -1,0 +1,736 @@
+/* The contract between conefield and its plugins, version 1.0. Made from plugins/abi/src/lib.rs. */
+
+#ifndef CONEFIELD_PLUGIN_H
+#define CONEFIELD_PLUGIN_H
+
+#include <stddef.h>
+#include <stdint.h>
+
+/*
+ Major version of this contract. A plugin of another one is refused.
+ */
+#define CONEFIELD_ABI_MAJOR 1
+
+/*
+ Minor version: tables have grown so many times.
+ */
+#define CONEFIELD_ABI_MINOR 0
+
+/*
+ Points to features.
+ */
+#define CONEFIELD_ENCODER 0
+
+/*
+ Features to features.
+ */
+#define CONEFIELD_NORMALIZER 1
+
+/*
+ Features to attenuation.
+ */
+#define CONEFIELD_FIELD 2
+
+/*
+ Rays to samples.
+ */
+#define CONEFIELD_PROJECTOR 3
+
+/*
+ Fills weights.
+ */
+#define CONEFIELD_INITIALIZER 4
+
+/*
+ A row looks at itself alone.
+ */
+#define CONEFIELD_SCOPE_ROW 0
+
+/*
+ A row looks at the rows of its ray: tiles hold one whole ray, or a single row off any ray.
+ */
+#define CONEFIELD_SCOPE_RAY 1
+
+/*
+ No parameters.
+ */
+#define CONEFIELD_GRADS_NONE 0
+
+/*
+ Few parameters, all touched by every row: each worker sums a copy.
+ */
+#define CONEFIELD_GRADS_DENSE 1
+
+/*
+ Many parameters, few touched by a row: workers own the ranges of `partition`. Such a stage keeps no tape.
+ */
+#define CONEFIELD_GRADS_SCATTER 2
+
+/*
+ `reduce` leaves out channels that come out.
+ */
+#define CONEFIELD_OUTPUTS 0
+
+/*
+ `reduce` leaves out channels that go in.
+ */
+#define CONEFIELD_INPUTS 1
+
+/*
+ What a function returns.
+ */
+typedef int32_t ConefieldStatus;
+
+/*
+ UTF-8 text, not ended by a zero.
+ */
+typedef struct ConefieldStr {
+  /*
+   First byte; may be NULL if `length` is 0.
+   */
+  const uint8_t *data;
+  /*
+   Bytes.
+   */
+  size_t length;
+} ConefieldStr;
+
+/*
+ Room for text that a plugin writes, as UTF-8.
+ */
+typedef struct ConefieldText {
+  /*
+   Where to.
+   */
+  uint8_t *data;
+  /*
+   Bytes that fit.
+   */
+  size_t capacity;
+  /*
+   Bytes of the whole text, set by the plugin; what is beyond `capacity` is not written, and the host may ask again.
+   */
+  size_t length;
+} ConefieldText;
+
+/*
+ Widths, counts and cost of an encoder, a normalizer or a field.
+ */
+typedef struct ConefieldInfo {
+  /*
+   Channels in.
+   */
+  size_t input;
+  /*
+   Channels out.
+   */
+  size_t output;
+  /*
+   Parameters.
+   */
+  size_t params;
+  /*
+   Blocks of parameters, each with a name.
+   */
+  size_t blocks;
+  /*
+   Ranges that `partition` gives; 0 or 1 without it.
+   */
+  size_t partitions;
+  /*
+   Numbers a row that forward leaves for backward.
+   */
+  size_t tape;
+  /*
+   Multiply-adds a row, forward.
+   */
+  size_t macs;
+  /*
+   `CONEFIELD_SCOPE_…`
+   */
+  uint32_t scope;
+  /*
+   `CONEFIELD_GRADS_…`
+   */
+  uint32_t grads;
+  /*
+   1 if output equals input: hosts leave the stage out.
+   */
+  uint32_t identity;
+  /*
+   1 if an encoder's channels stand in order from coarse to fine.
+   */
+  uint32_t coarse_to_fine;
+  /*
+   1 if it has kernels in double precision.
+   */
+  uint32_t double_precision;
+} ConefieldInfo;
+
+/*
+ One named block of parameters. Blocks stand one after the other and cover all parameters.
+ */
+typedef struct ConefieldParameter {
+  /*
+   Its name within the stage, such as `table`.
+   */
+  struct ConefieldStr name;
+  /*
+   Its shape, row-major.
+   */
+  const size_t *shape;
+  /*
+   Numbers in `shape`.
+   */
+  size_t dimensions;
+} ConefieldParameter;
+
+/*
+ Channels of rows, to be read.
+ */
+typedef struct ConefieldTile {
+  /*
+   Row 0 of channel 0.
+   */
+  const float *data;
+  /*
+   Channels.
+   */
+  size_t channels;
+  /*
+   Rows, at least 1.
+   */
+  size_t rows;
+  /*
+   Floats from a channel to the next, at least `rows`.
+   */
+  size_t stride;
+} ConefieldTile;
+
+/*
+ Channels of rows, to be written.
+ */
+typedef struct ConefieldTileMut {
+  /*
+   Row 0 of channel 0; NULL where the host does not want it.
+   */
+  float *data;
+  /*
+   Channels.
+   */
+  size_t channels;
+  /*
+   Rows, at least 1.
+   */
+  size_t rows;
+  /*
+   Floats from a channel to the next, at least `rows`.
+   */
+  size_t stride;
+} ConefieldTileMut;
+
+/*
+ Gradients of the parameters `start..start + length` of a stage, to be added to.
+ */
+typedef struct ConefieldGrads {
+  /*
+   That of parameter `start`.
+   */
+  float *data;
+  /*
+   The first parameter.
+   */
+  size_t start;
+  /*
+   Parameters; the stage leaves all others alone.
+   */
+  size_t length;
+} ConefieldGrads;
+
+/*
+ [`ConefieldTile`] in double precision.
+ */
+typedef struct ConefieldTile64 {
+  /*
+   Row 0 of channel 0.
+   */
+  const double *data;
+  /*
+   Channels.
+   */
+  size_t channels;
+  /*
+   Rows, at least 1.
+   */
+  size_t rows;
+  /*
+   Doubles from a channel to the next, at least `rows`.
+   */
+  size_t stride;
+} ConefieldTile64;
+
+/*
+ [`ConefieldTileMut`] in double precision.
+ */
+typedef struct ConefieldTileMut64 {
+  /*
+   Row 0 of channel 0; NULL where the host does not want it.
+   */
+  double *data;
+  /*
+   Channels.
+   */
+  size_t channels;
+  /*
+   Rows, at least 1.
+   */
+  size_t rows;
+  /*
+   Doubles from a channel to the next, at least `rows`.
+   */
+  size_t stride;
+} ConefieldTileMut64;
+
+/*
+ [`ConefieldGrads`] in double precision.
+ */
+typedef struct ConefieldGrads64 {
+  /*
+   That of parameter `start`.
+   */
+  double *data;
+  /*
+   The first parameter.
+   */
+  size_t start;
+  /*
+   Parameters; the stage leaves all others alone.
+   */
+  size_t length;
+} ConefieldGrads64;
+
+/*
+ Parameters or channels `start..end`.
+ */
+typedef struct ConefieldRange {
+  /*
+   The first.
+   */
+  size_t start;
+  /*
+   One past the last.
+   */
+  size_t end;
+} ConefieldRange;
+
+/*
+ A stage without some of its channels.
+ */
+typedef struct ConefieldReduced {
+  /*
+   The smaller stage, a new one.
+   */
+  void *stage;
+  /*
+   Which of the old parameters it keeps, in its order; valid as long as it lives.
+   */
+  const struct ConefieldRange *params;
+  /*
+   Ranges in `params`.
+   */
+  size_t params_count;
+  /*
+   Which channels remain on the other side of the stage; valid as long as it lives.
+   */
+  const size_t *channels;
+  /*
+   Channels in `channels`.
+   */
+  size_t channels_count;
+} ConefieldReduced;
+
+/*
+ What a normalizer may look at between steps.
+ */
+typedef struct ConefieldProbe {
+  /*
+   To be handed to the functions below.
+   */
+  void *context;
+  /*
+   The encoder's features, `[width][count]`, at `count` points `x, y, z` of the unit cube.
+   */
+  ConefieldStatus (*encode)(void *context, const float *points, size_t count, float *features);
+  /*
+   The unit-cube position of the centre of voxel `x, y, z`.
+   */
+  void (*voxel)(void *context, size_t x, size_t y, size_t z, float *position);
+  /*
+   Channels still computed.
+   */
+  size_t width;
+  /*
+   Voxels of the volume to be exported along x, y, z.
+   */
+  size_t shape[3];
+  /*
+   Finished passes over all views.
+   */
+  double epoch;
+  /*
+   1 if channels stand in order from coarse to fine.
+   */
+  uint32_t coarse_to_fine;
+} ConefieldProbe;
+
+/*
+ Functions of an encoder, a normalizer or a field. `stage` is what `create` made.
+ */
+typedef struct ConefieldMap {
+  /*
+   Bytes of this table.
+   */
+  size_t size;
+  /*
+   Widths and counts; always the same for one stage.
+   */
+  ConefieldStatus (*info)(const void *stage, struct ConefieldInfo *info);
+  /*
+   Block `index` of the parameters. NULL if there are none.
+   */
+  ConefieldStatus (*parameter)(const void *stage, size_t index, struct ConefieldParameter *parameter);
+  /*
+   Fills all parameters, repeatable by `seed`. NULL if there are none.
+   */
+  ConefieldStatus (*init)(const void *stage,
+                          uint64_t seed,
+                          float *params,
+                          size_t length,
+                          struct ConefieldText *error);
+  /*
+   Overwrites `y` with f(x; params), and `tape` with what backward needs.
+   */
+  ConefieldStatus (*forward)(const void *stage,
+                             const float *params,
+                             struct ConefieldTile x,
+                             struct ConefieldTileMut y,
+                             struct ConefieldTileMut tape,
+                             struct ConefieldText *error);
+  /*
+   Given `dy` = ∂L/∂y, adds ∂L/∂params to `grads` and, unless its data is NULL, overwrites `dx` with ∂L/∂x. `tape` is
+   as forward left it and may be used as scratch; of a stage with scattered gradients it has no channels. The order
+   in which one parameter's gradient is summed must not depend on the range in `grads`.
+   */
+  ConefieldStatus (*backward)(const void *stage,
+                              const float *params,
+                              struct ConefieldTile x,
+                              struct ConefieldTileMut tape,
+                              struct ConefieldTile dy,
+                              struct ConefieldGrads grads,
+                              struct ConefieldTileMut dx,
+                              struct ConefieldText *error);
+  /*
+   `forward` in double precision, by which gradients are checked; NULL if there is none.
+   */
+  ConefieldStatus (*forward_f64)(const void *stage,
+                                 const double *params,
+                                 struct ConefieldTile64 x,
+                                 struct ConefieldTileMut64 y,
+                                 struct ConefieldTileMut64 tape,
+                                 struct ConefieldText *error);
+  /*
+   `backward` in double precision; NULL if there is none.
+   */
+  ConefieldStatus (*backward_f64)(const void *stage,
+                                  const double *params,
+                                  struct ConefieldTile64 x,
+                                  struct ConefieldTileMut64 tape,
+                                  struct ConefieldTile64 dy,
+                                  struct ConefieldGrads64 grads,
+                                  struct ConefieldTileMut64 dx,
+                                  struct ConefieldText *error);
+  /*
+   Range `index` of the parameters that a worker may own; ranges are disjoint, ascending and cover all. NULL: one range.
+   */
+  ConefieldStatus (*partition)(const void *stage, size_t index, struct ConefieldRange *range);
+  /*
+   Makes the stage that computes only the outputs `keep` (`side` is [`CONEFIELD_OUTPUTS`]) or does without the inputs
+   that are not in `keep` ([`CONEFIELD_INPUTS`]); `keep` ascends. NULL: it cannot, and masks that need it are refused.
+   */
+  ConefieldStatus (*reduce)(const void *stage,
+                            uint32_t side,
+                            const size_t *keep,
+                            size_t keep_count,
+                            struct ConefieldReduced *reduced,
+                            struct ConefieldText *error);
+  /*
+   Of a normalizer, before every step. To remove channels for good: writes those that stay, ascending, to `keep` (room
+   for `probe.width`), sets `keep_count`, and says in `report` what was measured. Otherwise sets `keep_count` to
+   `SIZE_MAX`. NULL: it never removes any.
+   */
+  ConefieldStatus (*refresh)(const void *stage,
+                             const struct ConefieldProbe *probe,
+                             size_t *keep,
+                             size_t *keep_count,
+                             struct ConefieldText *report,
+                             struct ConefieldText *error);
+  /*
+   Of a normalizer: a resumed run removes channels as `refresh` once decided, it must not decide again. May be NULL.
+   */
+  void (*decided)(const void *stage);
+  /*
+   WGSL functions `{prefix}_fwd` and `{prefix}_bwd` of the same formula, and the bytes of workgroup memory that they
+   need. NULL: it runs on the CPU alone.
+   */
+  ConefieldStatus (*wgsl)(const void *stage,
+                          struct ConefieldStr prefix,
+                          struct ConefieldText *source,
+                          uint32_t *workgroup_bytes);
+} ConefieldMap;
+
+/*
+ A ray in the unit cube: `origin + t * direction`, where `t` counts cube sides.
+ */
+typedef struct ConefieldRay {
+  /*
+   Start.
+   */
+  float origin[3];
+  /*
+   Unit vector.
+   */
+  float direction[3];
+  /*
+   Entry into and exit from the reconstruction box; equal where the ray misses it.
+   */
+  float inside[2];
+  /*
+   Beginning and end of the published sampling range (near, far).
+   */
+  float published[2];
+  /*
+   Cube sides a millimetre.
+   */
+  float per_mm;
+} ConefieldRay;
+
+/*
+ Functions of a projector.
+ */
+typedef struct ConefieldProjector {
+  /*
+   Bytes of this table.
+   */
+  size_t size;
+  /*
+   Samples that `sample` writes at most for `ray`; 0 where it sees nothing of the scene.
+   */
+  size_t (*max_samples)(const void *stage, const struct ConefieldRay *ray);
+  /*
+   Writes the samples of `ray`: `x, y, z` in the unit cube to `points`, the length that each stands for, in cube sides,
+   to `weights`, and how many they are (at most `capacity`) to `count`. `seed` decides random positions; NULL
+   (rendering) means that none are random.
+   */
+  ConefieldStatus (*sample)(const void *stage,
+                            const struct ConefieldRay *ray,
+                            const uint64_t *seed,
+                            float *points,
+                            float *weights,
+                            size_t capacity,
+                            size_t *count,
+                            struct ConefieldText *error);
+  /*
+   The line integral of `count` attenuations. NULL: their sum, each times its weight.
+   */
+  double (*integrate)(const void *stage, const float *weights, const double *mu, size_t count);
+  /*
+   The exact adjoint of `integrate`: overwrites `dmu` with its derivatives times `dline`. NULL as `integrate`.
+   */
+  void (*adjoint)(const void *stage, const float *weights, double dline, double *dmu, size_t count);
+  /*
+   As [`ConefieldMap::wgsl`].
+   */
+  ConefieldStatus (*wgsl)(const void *stage,
+                          struct ConefieldStr prefix,
+                          struct ConefieldText *source,
+                          uint32_t *workgroup_bytes);
+} ConefieldProjector;
+
+/*
+ A named block of all parameters of a pipeline.
+ */
+typedef struct ConefieldBlock {
+  /*
+   Its full name, such as `field.0.weight`.
+   */
+  struct ConefieldStr name;
+  /*
+   Its shape, row-major.
+   */
+  const size_t *shape;
+  /*
+   Numbers in `shape`.
+   */
+  size_t dimensions;
+  /*
+   Its first parameter.
+   */
+  size_t start;
+  /*
+   Its parameters.
+   */
+  size_t length;
+} ConefieldBlock;
+
+/*
+ Functions of an initializer.
+ */
+typedef struct ConefieldInitializer {
+  /*
+   Bytes of this table.
+   */
+  size_t size;
+  /*
+   Fills what it fills of `params`, which every stage's own scheme has filled before, and sets the entry of `filled` to
+   1 for every block that it filled.
+   */
+  ConefieldStatus (*apply)(const void *stage,
+                           const struct ConefieldBlock *blocks,
+                           size_t block_count,
+                           float *params,
+                           size_t length,
+                           uint8_t *filled,
+                           struct ConefieldText *error);
+} ConefieldInitializer;
+
+/*
+ A stage type that a plugin brings.
+ */
+typedef struct ConefieldStage {
+  /*
+   `CONEFIELD_ENCODER`, …
+   */
+  uint32_t kind;
+  /*
+   The value of `type` in a spec: lower-case letters, digits and hyphens.
+   */
+  struct ConefieldStr name;
+  /*
+   One line for people.
+   */
+  struct ConefieldStr doc;
+  /*
+   JSON Schema of its settings: an object whose `properties` have a `default` each, or are `required`. Its `examples`,
+   if any, are settings that `conefield plugins check` tries.
+   */
+  struct ConefieldStr schema;
+  /*
+   Handed to `create`.
+   */
+  const void *context;
+  /*
+   Makes a stage from `settings`: one JSON object that fits the schema, with every default written. `width` is the
+   number of channels that go in; 3 for an encoder, 0 where there are none. Returns [`CONEFIELD_INVALID`] and a text
+   such as `bands: found 0, expected at least 1` for settings that make no stage.
+   */
+  ConefieldStatus (*create)(const void *context,
+                            struct ConefieldStr settings,
+                            size_t width,
+                            void **stage,
+                            struct ConefieldText *error);
+  /*
+   Frees what `create` or `reduce` made.
+   */
+  void (*destroy)(void *stage);
+  /*
+   One line on a stage, such as `10 levels x 2`.
+   */
+  ConefieldStatus (*describe)(const void *stage, struct ConefieldText *text);
+  /*
+   Of an encoder, a normalizer or a field; otherwise NULL.
+   */
+  const struct ConefieldMap *map;
+  /*
+   Of a projector; otherwise NULL.
+   */
+  const struct ConefieldProjector *projector;
+  /*
+   Of an initializer; otherwise NULL.
+   */
+  const struct ConefieldInitializer *initializer;
+} ConefieldStage;
+
+/*
+ What a plugin is and brings.
+ */
+typedef struct ConefieldPlugin {
+  /*
+   Bytes of this table.
+   */
+  size_t size;
+  /*
+   [`CONEFIELD_ABI_MAJOR`] as the plugin was built with.
+   */
+  uint32_t abi_major;
+  /*
+   [`CONEFIELD_ABI_MINOR`] as the plugin was built with.
+   */
+  uint32_t abi_minor;
+  /*
+   The plugin's name.
+   */
+  struct ConefieldStr name;
+  /*
+   Its own version.
+   */
+  struct ConefieldStr version;
+  /*
+   Its licence, an SPDX expression.
+   */
+  struct ConefieldStr licence;
+  /*
+   Its stage types, one after the other.
+   */
+  const struct ConefieldStage *stages;
+  /*
+   How many.
+   */
+  size_t stage_count;
+  /*
+   Bytes from one to the next.
+   */
+  size_t stage_size;
+} ConefieldPlugin;
+
+/*
+ All is well.
+ */
+#define CONEFIELD_OK 0
+
+/*
+ What was handed over, such as settings, cannot be used; the error text says why.
+ */
+#define CONEFIELD_INVALID 1
+
+/*
+ It could be asked for, but this stage cannot do it.
+ */
+#define CONEFIELD_UNSUPPORTED 2
+
+/*
+ It went wrong.
+ */
+#define CONEFIELD_FAILED 3
+
+/*
+ A panic or an exception was caught.
+ */
+#define CONEFIELD_PANICKED 4
+
+#endif  /* CONEFIELD_PLUGIN_H */
+
+/* The one function that a plugin exports. What it returns lives as long as the library. */
+#ifdef __cplusplus
+extern "C"
+#endif
+const struct ConefieldPlugin *conefield_plugin(void);

@@ -1,0 +1,549 @@
+//! The contract between conefield and a plugin, as C sees it. `include/conefield_plugin.h` is made from this file.
+//!
+//! A plugin is a shared library that exports [`conefield_plugin`](ConefieldEntry) and returns a table of what it
+//! brings. Rules that types cannot say:
+//!
+//! - **Versions.** `abi_major` must be the host's. Within a major version tables of functions only grow at their end, each
+//!   says its own `size`, and a function beyond it counts as NULL; so older plugins load into newer hosts and newer
+//!   plugins into older hosts. Everything else here keeps its layout.
+//! - **Memory.** Nothing is handed over: the host frees what it made, the plugin frees what it made (`destroy`). What a
+//!   plugin points to in its tables lives as long as the library, which is never unloaded; what a stage points to lives
+//!   as long as the stage.
+//! - **Tiles** are channel-major: channel `c` of row `i` is `data[c * stride + i]`. A pointer may be NULL where there is
+//!   nothing (no channels, no parameters). Floats are aligned to their own size and no more.
+//! - **Threads.** A stage is called from many threads at once: `info`, `parameter`, `partition`, `describe`, `init`,
+//!   `forward`, `backward`, `max_samples`, `sample`, `integrate`, `adjoint`, `apply` and `wgsl` must allow that. `create`,
+//!   `destroy`, `reduce`, `refresh` and `decided` of one stage are not called at the same time as anything else of that
+//!   stage, though from any thread.
+//! - **Unwinding** must not leave the library: catch panics and exceptions, return [`CONEFIELD_PANICKED`].
+//! - **Same bits.** The result must not depend on threads, on time, or on how rows are dealt to tiles.
+
+use std::ffi::c_void;
+
+/// Major version of this contract. A plugin of another one is refused.
+pub const CONEFIELD_ABI_MAJOR: u32 = 1;
+/// Minor version: tables have grown so many times.
+pub const CONEFIELD_ABI_MINOR: u32 = 0;
+
+/// What a function returns.
+pub type ConefieldStatus = i32;
+/// All is well.
+pub const CONEFIELD_OK: ConefieldStatus = 0;
+/// What was handed over, such as settings, cannot be used; the error text says why.
+pub const CONEFIELD_INVALID: ConefieldStatus = 1;
+/// It could be asked for, but this stage cannot do it.
+pub const CONEFIELD_UNSUPPORTED: ConefieldStatus = 2;
+/// It went wrong.
+pub const CONEFIELD_FAILED: ConefieldStatus = 3;
+/// A panic or an exception was caught.
+pub const CONEFIELD_PANICKED: ConefieldStatus = 4;
+
+/// Points to features.
+pub const CONEFIELD_ENCODER: u32 = 0;
+/// Features to features.
+pub const CONEFIELD_NORMALIZER: u32 = 1;
+/// Features to attenuation.
+pub const CONEFIELD_FIELD: u32 = 2;
+/// Rays to samples.
+pub const CONEFIELD_PROJECTOR: u32 = 3;
+/// Fills weights.
+pub const CONEFIELD_INITIALIZER: u32 = 4;
+
+/// A row looks at itself alone.
+pub const CONEFIELD_SCOPE_ROW: u32 = 0;
+/// A row looks at the rows of its ray: tiles hold one whole ray, or a single row off any ray.
+pub const CONEFIELD_SCOPE_RAY: u32 = 1;
+
+/// No parameters.
+pub const CONEFIELD_GRADS_NONE: u32 = 0;
+/// Few parameters, all touched by every row: each worker sums a copy.
+pub const CONEFIELD_GRADS_DENSE: u32 = 1;
+/// Many parameters, few touched by a row: workers own the ranges of `partition`. Such a stage keeps no tape.
+pub const CONEFIELD_GRADS_SCATTER: u32 = 2;
+
+/// `reduce` leaves out channels that come out.
+pub const CONEFIELD_OUTPUTS: u32 = 0;
+/// `reduce` leaves out channels that go in.
+pub const CONEFIELD_INPUTS: u32 = 1;
+
+/// UTF-8 text, not ended by a zero.
+#[repr(C)]
+#[derive(Debug, Clone, Copy)]
+pub struct ConefieldStr {
+    /// First byte; may be NULL if `length` is 0.
+    pub data: *const u8,
+    /// Bytes.
+    pub length: usize,
+}
+
+/// Room for text that a plugin writes, as UTF-8.
+#[repr(C)]
+#[derive(Debug)]
+pub struct ConefieldText {
+    /// Where to.
+    pub data: *mut u8,
+    /// Bytes that fit.
+    pub capacity: usize,
+    /// Bytes of the whole text, set by the plugin; what is beyond `capacity` is not written, and the host may ask again.
+    pub length: usize,
+}
+
+/// Channels of rows, to be read.
+#[repr(C)]
+#[derive(Debug, Clone, Copy)]
+pub struct ConefieldTile {
+    /// Row 0 of channel 0.
+    pub data: *const f32,
+    /// Channels.
+    pub channels: usize,
+    /// Rows, at least 1.
+    pub rows: usize,
+    /// Floats from a channel to the next, at least `rows`.
+    pub stride: usize,
+}
+
+/// Channels of rows, to be written.
+#[repr(C)]
+#[derive(Debug, Clone, Copy)]
+pub struct ConefieldTileMut {
+    /// Row 0 of channel 0; NULL where the host does not want it.
+    pub data: *mut f32,
+    /// Channels.
+    pub channels: usize,
+    /// Rows, at least 1.
+    pub rows: usize,
+    /// Floats from a channel to the next, at least `rows`.
+    pub stride: usize,
+}
+
+/// Gradients of the parameters `start..start + length` of a stage, to be added to.
+#[repr(C)]
+#[derive(Debug, Clone, Copy)]
+pub struct ConefieldGrads {
+    /// That of parameter `start`.
+    pub data: *mut f32,
+    /// The first parameter.
+    pub start: usize,
+    /// Parameters; the stage leaves all others alone.
+    pub length: usize,
+}
+
+/// [`ConefieldTile`] in double precision.
+#[repr(C)]
+#[derive(Debug, Clone, Copy)]
+pub struct ConefieldTile64 {
+    /// Row 0 of channel 0.
+    pub data: *const f64,
+    /// Channels.
+    pub channels: usize,
+    /// Rows, at least 1.
+    pub rows: usize,
+    /// Doubles from a channel to the next, at least `rows`.
+    pub stride: usize,
+}
+
+/// [`ConefieldTileMut`] in double precision.
+#[repr(C)]
+#[derive(Debug, Clone, Copy)]
+pub struct ConefieldTileMut64 {
+    /// Row 0 of channel 0; NULL where the host does not want it.
+    pub data: *mut f64,
+    /// Channels.
+    pub channels: usize,
+    /// Rows, at least 1.
+    pub rows: usize,
+    /// Doubles from a channel to the next, at least `rows`.
+    pub stride: usize,
+}
+
+/// [`ConefieldGrads`] in double precision.
+#[repr(C)]
+#[derive(Debug, Clone, Copy)]
+pub struct ConefieldGrads64 {
+    /// That of parameter `start`.
+    pub data: *mut f64,
+    /// The first parameter.
+    pub start: usize,
+    /// Parameters; the stage leaves all others alone.
+    pub length: usize,
+}
+
+/// Widths, counts and cost of an encoder, a normalizer or a field.
+#[repr(C)]
+#[derive(Debug, Clone, Copy)]
+pub struct ConefieldInfo {
+    /// Channels in.
+    pub input: usize,
+    /// Channels out.
+    pub output: usize,
+    /// Parameters.
+    pub params: usize,
+    /// Blocks of parameters, each with a name.
+    pub blocks: usize,
+    /// Ranges that `partition` gives; 0 or 1 without it.
+    pub partitions: usize,
+    /// Numbers a row that forward leaves for backward.
+    pub tape: usize,
+    /// Multiply-adds a row, forward.
+    pub macs: usize,
+    /// `CONEFIELD_SCOPE_…`
+    pub scope: u32,
+    /// `CONEFIELD_GRADS_…`
+    pub grads: u32,
+    /// 1 if output equals input: hosts leave the stage out.
+    pub identity: u32,
+    /// 1 if an encoder's channels stand in order from coarse to fine.
+    pub coarse_to_fine: u32,
+    /// 1 if it has kernels in double precision.
+    pub double_precision: u32,
+}
+
+/// One named block of parameters. Blocks stand one after the other and cover all parameters.
+#[repr(C)]
+#[derive(Debug, Clone, Copy)]
+pub struct ConefieldParameter {
+    /// Its name within the stage, such as `table`.
+    pub name: ConefieldStr,
+    /// Its shape, row-major.
+    pub shape: *const usize,
+    /// Numbers in `shape`.
+    pub dimensions: usize,
+}
+
+/// Parameters or channels `start..end`.
+#[repr(C)]
+#[derive(Debug, Clone, Copy)]
+pub struct ConefieldRange {
+    /// The first.
+    pub start: usize,
+    /// One past the last.
+    pub end: usize,
+}
+
+/// A stage without some of its channels.
+#[repr(C)]
+#[derive(Debug, Clone, Copy)]
+pub struct ConefieldReduced {
+    /// The smaller stage, a new one.
+    pub stage: *mut c_void,
+    /// Which of the old parameters it keeps, in its order; valid as long as it lives.
+    pub params: *const ConefieldRange,
+    /// Ranges in `params`.
+    pub params_count: usize,
+    /// Which channels remain on the other side of the stage; valid as long as it lives.
+    pub channels: *const usize,
+    /// Channels in `channels`.
+    pub channels_count: usize,
+}
+
+/// What a normalizer may look at between steps.
+#[repr(C)]
+#[derive(Debug, Clone, Copy)]
+pub struct ConefieldProbe {
+    /// To be handed to the functions below.
+    pub context: *mut c_void,
+    /// The encoder's features, `[width][count]`, at `count` points `x, y, z` of the unit cube.
+    pub encode: Option<
+        unsafe extern "C" fn(
+            context: *mut c_void,
+            points: *const f32,
+            count: usize,
+            features: *mut f32,
+        ) -> ConefieldStatus,
+    >,
+    /// The unit-cube position of the centre of voxel `x, y, z`.
+    pub voxel: Option<unsafe extern "C" fn(context: *mut c_void, x: usize, y: usize, z: usize, position: *mut f32)>,
+    /// Channels still computed.
+    pub width: usize,
+    /// Voxels of the volume to be exported along x, y, z.
+    pub shape: [usize; 3],
+    /// Finished passes over all views.
+    pub epoch: f64,
+    /// 1 if channels stand in order from coarse to fine.
+    pub coarse_to_fine: u32,
+}
+
+/// Functions of an encoder, a normalizer or a field. `stage` is what `create` made.
+#[repr(C)]
+#[derive(Debug, Clone, Copy)]
+pub struct ConefieldMap {
+    /// Bytes of this table.
+    pub size: usize,
+    /// Widths and counts; always the same for one stage.
+    pub info: Option<unsafe extern "C" fn(stage: *const c_void, info: *mut ConefieldInfo) -> ConefieldStatus>,
+    /// Block `index` of the parameters. NULL if there are none.
+    pub parameter: Option<
+        unsafe extern "C" fn(stage: *const c_void, index: usize, parameter: *mut ConefieldParameter) -> ConefieldStatus,
+    >,
+    /// Fills all parameters, repeatable by `seed`. NULL if there are none.
+    pub init: Option<
+        unsafe extern "C" fn(
+            stage: *const c_void,
+            seed: u64,
+            params: *mut f32,
+            length: usize,
+            error: *mut ConefieldText,
+        ) -> ConefieldStatus,
+    >,
+    /// Overwrites `y` with f(x; params), and `tape` with what backward needs.
+    pub forward: Option<
+        unsafe extern "C" fn(
+            stage: *const c_void,
+            params: *const f32,
+            x: ConefieldTile,
+            y: ConefieldTileMut,
+            tape: ConefieldTileMut,
+            error: *mut ConefieldText,
+        ) -> ConefieldStatus,
+    >,
+    /// Given `dy` = ∂L/∂y, adds ∂L/∂params to `grads` and, unless its data is NULL, overwrites `dx` with ∂L/∂x. `tape` is
+    /// as forward left it and may be used as scratch; of a stage with scattered gradients it has no channels. The order
+    /// in which one parameter's gradient is summed must not depend on the range in `grads`.
+    pub backward: Option<
+        unsafe extern "C" fn(
+            stage: *const c_void,
+            params: *const f32,
+            x: ConefieldTile,
+            tape: ConefieldTileMut,
+            dy: ConefieldTile,
+            grads: ConefieldGrads,
+            dx: ConefieldTileMut,
+            error: *mut ConefieldText,
+        ) -> ConefieldStatus,
+    >,
+    /// `forward` in double precision, by which gradients are checked; NULL if there is none.
+    pub forward_f64: Option<
+        unsafe extern "C" fn(
+            stage: *const c_void,
+            params: *const f64,
+            x: ConefieldTile64,
+            y: ConefieldTileMut64,
+            tape: ConefieldTileMut64,
+            error: *mut ConefieldText,
+        ) -> ConefieldStatus,
+    >,
+    /// `backward` in double precision; NULL if there is none.
+    pub backward_f64: Option<
+        unsafe extern "C" fn(
+            stage: *const c_void,
+            params: *const f64,
+            x: ConefieldTile64,
+            tape: ConefieldTileMut64,
+            dy: ConefieldTile64,
+            grads: ConefieldGrads64,
+            dx: ConefieldTileMut64,
+            error: *mut ConefieldText,
+        ) -> ConefieldStatus,
+    >,
+    /// Range `index` of the parameters that a worker may own; ranges are disjoint, ascending and cover all. NULL: one range.
+    pub partition:
+        Option<unsafe extern "C" fn(stage: *const c_void, index: usize, range: *mut ConefieldRange) -> ConefieldStatus>,
+    /// Makes the stage that computes only the outputs `keep` (`side` is [`CONEFIELD_OUTPUTS`]) or does without the inputs
+    /// that are not in `keep` ([`CONEFIELD_INPUTS`]); `keep` ascends. NULL: it cannot, and masks that need it are refused.
+    pub reduce: Option<
+        unsafe extern "C" fn(
+            stage: *const c_void,
+            side: u32,
+            keep: *const usize,
+            keep_count: usize,
+            reduced: *mut ConefieldReduced,
+            error: *mut ConefieldText,
+        ) -> ConefieldStatus,
+    >,
+    /// Of a normalizer, before every step. To remove channels for good: writes those that stay, ascending, to `keep` (room
+    /// for `probe.width`), sets `keep_count`, and says in `report` what was measured. Otherwise sets `keep_count` to
+    /// `SIZE_MAX`. NULL: it never removes any.
+    pub refresh: Option<
+        unsafe extern "C" fn(
+            stage: *const c_void,
+            probe: *const ConefieldProbe,
+            keep: *mut usize,
+            keep_count: *mut usize,
+            report: *mut ConefieldText,
+            error: *mut ConefieldText,
+        ) -> ConefieldStatus,
+    >,
+    /// Of a normalizer: a resumed run removes channels as `refresh` once decided, it must not decide again. May be NULL.
+    pub decided: Option<unsafe extern "C" fn(stage: *const c_void)>,
+    /// WGSL functions `{prefix}_fwd` and `{prefix}_bwd` of the same formula, and the bytes of workgroup memory that they
+    /// need. NULL: it runs on the CPU alone.
+    pub wgsl: Option<
+        unsafe extern "C" fn(
+            stage: *const c_void,
+            prefix: ConefieldStr,
+            source: *mut ConefieldText,
+            workgroup_bytes: *mut u32,
+        ) -> ConefieldStatus,
+    >,
+}
+
+/// A ray in the unit cube: `origin + t * direction`, where `t` counts cube sides.
+#[repr(C)]
+#[derive(Debug, Clone, Copy)]
+pub struct ConefieldRay {
+    /// Start.
+    pub origin: [f32; 3],
+    /// Unit vector.
+    pub direction: [f32; 3],
+    /// Entry into and exit from the reconstruction box; equal where the ray misses it.
+    pub inside: [f32; 2],
+    /// Beginning and end of the published sampling range (near, far).
+    pub published: [f32; 2],
+    /// Cube sides a millimetre.
+    pub per_mm: f32,
+}
+
+/// Functions of a projector.
+#[repr(C)]
+#[derive(Debug, Clone, Copy)]
+pub struct ConefieldProjector {
+    /// Bytes of this table.
+    pub size: usize,
+    /// Samples that `sample` writes at most for `ray`; 0 where it sees nothing of the scene.
+    pub max_samples: Option<unsafe extern "C" fn(stage: *const c_void, ray: *const ConefieldRay) -> usize>,
+    /// Writes the samples of `ray`: `x, y, z` in the unit cube to `points`, the length that each stands for, in cube sides,
+    /// to `weights`, and how many they are (at most `capacity`) to `count`. `seed` decides random positions; NULL
+    /// (rendering) means that none are random.
+    pub sample: Option<
+        unsafe extern "C" fn(
+            stage: *const c_void,
+            ray: *const ConefieldRay,
+            seed: *const u64,
+            points: *mut f32,
+            weights: *mut f32,
+            capacity: usize,
+            count: *mut usize,
+            error: *mut ConefieldText,
+        ) -> ConefieldStatus,
+    >,
+    /// The line integral of `count` attenuations. NULL: their sum, each times its weight.
+    pub integrate:
+        Option<unsafe extern "C" fn(stage: *const c_void, weights: *const f32, mu: *const f64, count: usize) -> f64>,
+    /// The exact adjoint of `integrate`: overwrites `dmu` with its derivatives times `dline`. NULL as `integrate`.
+    pub adjoint: Option<
+        unsafe extern "C" fn(stage: *const c_void, weights: *const f32, dline: f64, dmu: *mut f64, count: usize),
+    >,
+    /// As [`ConefieldMap::wgsl`].
+    pub wgsl: Option<
+        unsafe extern "C" fn(
+            stage: *const c_void,
+            prefix: ConefieldStr,
+            source: *mut ConefieldText,
+            workgroup_bytes: *mut u32,
+        ) -> ConefieldStatus,
+    >,
+}
+
+/// A named block of all parameters of a pipeline.
+#[repr(C)]
+#[derive(Debug, Clone, Copy)]
+pub struct ConefieldBlock {
+    /// Its full name, such as `field.0.weight`.
+    pub name: ConefieldStr,
+    /// Its shape, row-major.
+    pub shape: *const usize,
+    /// Numbers in `shape`.
+    pub dimensions: usize,
+    /// Its first parameter.
+    pub start: usize,
+    /// Its parameters.
+    pub length: usize,
+}
+
+/// Functions of an initializer.
+#[repr(C)]
+#[derive(Debug, Clone, Copy)]
+pub struct ConefieldInitializer {
+    /// Bytes of this table.
+    pub size: usize,
+    /// Fills what it fills of `params`, which every stage's own scheme has filled before, and sets the entry of `filled` to
+    /// 1 for every block that it filled.
+    pub apply: Option<
+        unsafe extern "C" fn(
+            stage: *const c_void,
+            blocks: *const ConefieldBlock,
+            block_count: usize,
+            params: *mut f32,
+            length: usize,
+            filled: *mut u8,
+            error: *mut ConefieldText,
+        ) -> ConefieldStatus,
+    >,
+}
+
+/// A stage type that a plugin brings.
+#[repr(C)]
+#[derive(Debug, Clone, Copy)]
+pub struct ConefieldStage {
+    /// `CONEFIELD_ENCODER`, …
+    pub kind: u32,
+    /// The value of `type` in a spec: lower-case letters, digits and hyphens.
+    pub name: ConefieldStr,
+    /// One line for people.
+    pub doc: ConefieldStr,
+    /// JSON Schema of its settings: an object whose `properties` have a `default` each, or are `required`. Its `examples`,
+    /// if any, are settings that `conefield plugins check` tries.
+    pub schema: ConefieldStr,
+    /// Handed to `create`.
+    pub context: *const c_void,
+    /// Makes a stage from `settings`: one JSON object that fits the schema, with every default written. `width` is the
+    /// number of channels that go in; 3 for an encoder, 0 where there are none. Returns [`CONEFIELD_INVALID`] and a text
+    /// such as `bands: found 0, expected at least 1` for settings that make no stage.
+    pub create: Option<
+        unsafe extern "C" fn(
+            context: *const c_void,
+            settings: ConefieldStr,
+            width: usize,
+            stage: *mut *mut c_void,
+            error: *mut ConefieldText,
+        ) -> ConefieldStatus,
+    >,
+    /// Frees what `create` or `reduce` made.
+    pub destroy: Option<unsafe extern "C" fn(stage: *mut c_void)>,
+    /// One line on a stage, such as `10 levels x 2`.
+    pub describe: Option<unsafe extern "C" fn(stage: *const c_void, text: *mut ConefieldText) -> ConefieldStatus>,
+    /// Of an encoder, a normalizer or a field; otherwise NULL.
+    pub map: *const ConefieldMap,
+    /// Of a projector; otherwise NULL.
+    pub projector: *const ConefieldProjector,
+    /// Of an initializer; otherwise NULL.
+    pub initializer: *const ConefieldInitializer,
+}
+
+/// What a plugin is and brings.
+#[repr(C)]
+#[derive(Debug, Clone, Copy)]
+pub struct ConefieldPlugin {
+    /// Bytes of this table.
+    pub size: usize,
+    /// [`CONEFIELD_ABI_MAJOR`] as the plugin was built with.
+    pub abi_major: u32,
+    /// [`CONEFIELD_ABI_MINOR`] as the plugin was built with.
+    pub abi_minor: u32,
+    /// The plugin's name.
+    pub name: ConefieldStr,
+    /// Its own version.
+    pub version: ConefieldStr,
+    /// Its licence, an SPDX expression.
+    pub licence: ConefieldStr,
+    /// Its stage types, one after the other.
+    pub stages: *const ConefieldStage,
+    /// How many.
+    pub stage_count: usize,
+    /// Bytes from one to the next.
+    pub stage_size: usize,
+}
+
+/// The one function that a plugin exports, under the name [`ENTRY`]. What it returns lives as long as the library; NULL
+/// where there is nothing to offer.
+pub type ConefieldEntry = unsafe extern "C" fn() -> *const ConefieldPlugin;
+
+/// The name of the function that a plugin exports.
+pub const ENTRY: &str = "conefield_plugin";
+
+impl ConefieldStr {
+    /// `text`, which must outlive every use of this.
+    pub const fn of(text: &str) -> Self {
+        Self { data: text.as_ptr(), length: text.len() }
+    }
+}

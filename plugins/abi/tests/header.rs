@@ -1,0 +1,138 @@
+//! The C header is what `src/lib.rs` says, and the layout is what it was: both are what plugins were built with.
+
+use conefield_plugin_abi::*;
+use std::mem::offset_of;
+use std::path::Path;
+
+/// Writes the header anew with `CONEFIELD_BLESS=1`.
+#[test]
+fn the_header_is_current() {
+    let folder = Path::new(env!("CARGO_MANIFEST_DIR"));
+    let config = cbindgen::Config {
+        language: cbindgen::Language::C,
+        include_guard: Some("CONEFIELD_PLUGIN_H".into()),
+        usize_is_size_t: true,
+        cpp_compat: true,
+        no_includes: true,
+        sys_includes: vec!["stddef.h".into(), "stdint.h".into()],
+        style: cbindgen::Style::Both,
+        documentation_style: cbindgen::DocumentationStyle::C,
+        header: Some(
+            "/* The contract between conefield and its plugins, version 1.0. Made from plugins/abi/src/lib.rs. */"
+                .into(),
+        ),
+        trailer: Some(
+            "/* The one function that a plugin exports. What it returns lives as long as the library. */\n#ifdef \
+             __cplusplus\nextern \"C\"\n#endif\nconst struct ConefieldPlugin *conefield_plugin(void);"
+                .into(),
+        ),
+        export: cbindgen::ExportConfig {
+            include: [
+                "ConefieldPlugin",
+                "ConefieldMap",
+                "ConefieldProjector",
+                "ConefieldInitializer",
+                "ConefieldStage",
+            ]
+            .map(String::from)
+            .to_vec(),
+            exclude: vec!["ENTRY".into(), "ConefieldEntry".into()],
+            ..Default::default()
+        },
+        ..Default::default()
+    };
+    let made = cbindgen::Builder::new().with_src(folder.join("src/lib.rs")).with_config(config).generate().unwrap();
+    let mut text = vec![];
+    made.write(&mut text);
+    let text = String::from_utf8(text).unwrap();
+    let path = folder.join("include/conefield_plugin.h");
+    if std::env::var_os("CONEFIELD_BLESS").is_some() {
+        std::fs::write(&path, &text).unwrap();
+    }
+    let found = std::fs::read_to_string(&path).unwrap_or_default();
+    assert!(found == text, "{} is not current; CONEFIELD_BLESS=1 writes it", path.display());
+}
+
+/// A change here breaks every plugin that was built: it needs a new major version.
+#[test]
+#[cfg(target_pointer_width = "64")]
+fn the_layout_is_pinned() {
+    assert_eq!((CONEFIELD_ABI_MAJOR, CONEFIELD_ABI_MINOR), (1, 0));
+    let sizes = [
+        size_of::<ConefieldStr>(),
+        size_of::<ConefieldText>(),
+        size_of::<ConefieldTile>(),
+        size_of::<ConefieldTileMut>(),
+        size_of::<ConefieldGrads>(),
+        size_of::<ConefieldInfo>(),
+        size_of::<ConefieldParameter>(),
+        size_of::<ConefieldRange>(),
+        size_of::<ConefieldReduced>(),
+        size_of::<ConefieldProbe>(),
+        size_of::<ConefieldMap>(),
+        size_of::<ConefieldRay>(),
+        size_of::<ConefieldProjector>(),
+        size_of::<ConefieldBlock>(),
+        size_of::<ConefieldInitializer>(),
+        size_of::<ConefieldStage>(),
+        size_of::<ConefieldPlugin>(),
+    ];
+    assert_eq!(sizes, [16, 24, 32, 32, 24, 80, 32, 16, 40, 72, 104, 44, 48, 48, 16, 112, 88]);
+    let plugin = [
+        offset_of!(ConefieldPlugin, size),
+        offset_of!(ConefieldPlugin, abi_major),
+        offset_of!(ConefieldPlugin, abi_minor),
+        offset_of!(ConefieldPlugin, name),
+        offset_of!(ConefieldPlugin, version),
+        offset_of!(ConefieldPlugin, licence),
+        offset_of!(ConefieldPlugin, stages),
+        offset_of!(ConefieldPlugin, stage_count),
+        offset_of!(ConefieldPlugin, stage_size),
+    ];
+    assert_eq!(plugin, [0, 8, 12, 16, 32, 48, 64, 72, 80]);
+    let stage = [
+        offset_of!(ConefieldStage, kind),
+        offset_of!(ConefieldStage, name),
+        offset_of!(ConefieldStage, doc),
+        offset_of!(ConefieldStage, schema),
+        offset_of!(ConefieldStage, context),
+        offset_of!(ConefieldStage, create),
+        offset_of!(ConefieldStage, destroy),
+        offset_of!(ConefieldStage, describe),
+        offset_of!(ConefieldStage, map),
+        offset_of!(ConefieldStage, projector),
+        offset_of!(ConefieldStage, initializer),
+    ];
+    assert_eq!(stage, [0, 8, 24, 40, 56, 64, 72, 80, 88, 96, 104]);
+    let map = [
+        offset_of!(ConefieldMap, size),
+        offset_of!(ConefieldMap, info),
+        offset_of!(ConefieldMap, parameter),
+        offset_of!(ConefieldMap, init),
+        offset_of!(ConefieldMap, forward),
+        offset_of!(ConefieldMap, backward),
+        offset_of!(ConefieldMap, forward_f64),
+        offset_of!(ConefieldMap, backward_f64),
+        offset_of!(ConefieldMap, partition),
+        offset_of!(ConefieldMap, reduce),
+        offset_of!(ConefieldMap, refresh),
+        offset_of!(ConefieldMap, decided),
+        offset_of!(ConefieldMap, wgsl),
+    ];
+    assert_eq!(map, [0, 8, 16, 24, 32, 40, 48, 56, 64, 72, 80, 88, 96]);
+    let info = [
+        offset_of!(ConefieldInfo, input),
+        offset_of!(ConefieldInfo, output),
+        offset_of!(ConefieldInfo, params),
+        offset_of!(ConefieldInfo, blocks),
+        offset_of!(ConefieldInfo, partitions),
+        offset_of!(ConefieldInfo, tape),
+        offset_of!(ConefieldInfo, macs),
+        offset_of!(ConefieldInfo, scope),
+        offset_of!(ConefieldInfo, grads),
+        offset_of!(ConefieldInfo, identity),
+        offset_of!(ConefieldInfo, coarse_to_fine),
+        offset_of!(ConefieldInfo, double_precision),
+    ];
+    assert_eq!(info, [0, 8, 16, 24, 32, 40, 48, 56, 60, 64, 68, 72]);
+}

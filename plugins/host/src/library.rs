@@ -1,0 +1,378 @@
+//! A library and the tables in it.
+
+// Everything unsafe here reads what a library says about itself. A library that lies in its pointers cannot be told from
+// one that does not; lengths, versions, numbers and texts are checked before they are used.
+#![allow(unsafe_code)]
+
+use conefield_core::error::{Error, Result, ensure};
+use conefield_core::registry::Kind;
+use conefield_plugin_abi::*;
+use serde_json::Value;
+use std::collections::BTreeMap;
+use std::ffi::c_void;
+use std::mem::{MaybeUninit, offset_of};
+use std::path::{Path, PathBuf};
+use std::sync::{Arc, Mutex, PoisonError};
+use std::{fmt, ptr, slice};
+
+/// Longest text that a table may hold.
+const LONGEST_TEXT: usize = 1 << 20;
+/// Most stages that a library may bring.
+const MOST_STAGES: usize = 1024;
+
+/// A loaded library.
+pub struct Library {
+    /// Its file.
+    pub path: PathBuf,
+    /// Its name.
+    pub name: String,
+    /// Its version.
+    pub version: String,
+    /// Its licence.
+    pub licence: String,
+    /// The version of the contract that it was built with.
+    pub abi: (u32, u32),
+    /// Its stage types, all of them sound as far as their tables go.
+    pub types: Vec<Arc<Type>>,
+}
+
+/// A stage type of a library.
+pub struct Type {
+    /// Which kind.
+    pub kind: Kind,
+    /// Its name in specs.
+    pub name: String,
+    /// One line for people.
+    pub doc: String,
+    /// JSON Schema of its settings.
+    pub schema: Value,
+    /// The library, in words.
+    pub owner: String,
+    pub(crate) functions: Functions,
+    context: *const c_void,
+    create: CreateFn,
+    destroy: unsafe extern "C" fn(*mut c_void),
+    describe: unsafe extern "C" fn(*const c_void, *mut ConefieldText) -> ConefieldStatus,
+}
+
+type CreateFn =
+    unsafe extern "C" fn(*const c_void, ConefieldStr, usize, *mut *mut c_void, *mut ConefieldText) -> ConefieldStatus;
+
+// SAFETY: its pointers lead into the library, which is never unloaded, and the contract allows its functions to be called
+// from any thread.
+unsafe impl Send for Type {}
+// SAFETY: as above; nothing here changes.
+unsafe impl Sync for Type {}
+
+/// What can be asked of a stage.
+#[derive(Clone, Copy)]
+pub(crate) enum Functions {
+    Map(ConefieldMap),
+    Projector(ConefieldProjector),
+    Initializer(ConefieldInitializer),
+}
+
+impl Library {
+    /// Loads the library at `path` and reads its tables. A file that was loaded before is read again from what is loaded.
+    pub fn open(path: &Path) -> Result<Self> {
+        let real = path.canonicalize().map_err(|e| Error::io(path, e))?;
+        let place = path.display().to_string();
+        ensure(real.is_file(), &place, "plugin", "no file", "a shared library")?;
+        let plugin = table_of(&real, &place)?;
+        // SAFETY: the library says that this is its table, which lives as long as it does.
+        unsafe { Self::read(&real, &place, plugin) }
+    }
+
+    unsafe fn read(path: &Path, place: &str, plugin: *const ConefieldPlugin) -> Result<Self> {
+        // Size and version stand first and are read before anything that another version may have elsewhere.
+        let bad = |field: &str, found: &dyn fmt::Display, expected: &str| Error::invalid(place, field, found, expected);
+        ensure(!plugin.is_null() && plugin.is_aligned(), place, "plugin table", "nothing", "a table")?;
+        // SAFETY: see the top of this file; both fields stand at the start of the table in every version.
+        let (size, major) =
+            unsafe { (ptr::addr_of!((*plugin).size).read(), ptr::addr_of!((*plugin).abi_major).read()) };
+        if size < offset_of!(ConefieldPlugin, name) {
+            return Err(bad("plugin table", &format!("{size} bytes"), "a table with a version"));
+        }
+        // SAFETY: as above.
+        let minor = unsafe { ptr::addr_of!((*plugin).abi_minor).read() };
+        if major != CONEFIELD_ABI_MAJOR {
+            let expected = format!(
+                "{CONEFIELD_ABI_MAJOR}.x, as this conefield has it; build the plugin against conefield {}",
+                env!("CARGO_PKG_VERSION")
+            );
+            return Err(bad("ABI version", &format!("{major}.{minor}"), &expected));
+        }
+        // SAFETY: see the top of this file.
+        let t: ConefieldPlugin = unsafe { sized(plugin, size_of::<ConefieldPlugin>(), place, "plugin table")? };
+        // SAFETY: as above.
+        let (name, version, licence) = unsafe {
+            (text(t.name, place, "name")?, text(t.version, place, "version")?, text(t.licence, place, "licence")?)
+        };
+        ensure(!name.is_empty(), place, "name", "nothing", "the plugin's name")?;
+        ensure((1..=MOST_STAGES).contains(&t.stage_count), place, "stages", t.stage_count, "1 to 1024")?;
+        ensure(
+            t.stage_size >= size_of::<ConefieldStage>() && t.stage_size.is_multiple_of(align_of::<ConefieldStage>()),
+            place,
+            "stage table",
+            format!("{} bytes a stage", t.stage_size),
+            format!("at least {}", size_of::<ConefieldStage>()),
+        )?;
+        ensure(!t.stages.is_null() && t.stages.is_aligned(), place, "stages", "nothing", "a table")?;
+        let owner = format!("{name} {version} ({})", path.display());
+        let mut types = vec![];
+        for i in 0..t.stage_count {
+            // SAFETY: see the top of this file.
+            let stage = unsafe { t.stages.byte_add(i * t.stage_size).read() };
+            // SAFETY: as above.
+            types.push(Arc::new(unsafe { Type::read(&stage, place, i, &owner)? }));
+        }
+        Ok(Self { path: path.into(), name, version, licence, abi: (major, minor), types })
+    }
+
+    /// The library in words.
+    pub fn owner(&self) -> String {
+        format!("{} {} ({})", self.name, self.version, self.path.display())
+    }
+}
+
+/// Tables of the libraries that were loaded, by file. They are never unloaded: stages, and what the system keeps for
+/// threads, may outlive any moment at which that would be safe.
+static TABLES: Mutex<BTreeMap<PathBuf, usize>> = Mutex::new(BTreeMap::new());
+
+/// The table of the library at `path`.
+fn table_of(path: &Path, place: &str) -> Result<*const ConefieldPlugin> {
+    let mut tables = TABLES.lock().unwrap_or_else(PoisonError::into_inner);
+    if let Some(&table) = tables.get(path) {
+        return Ok(table as *const ConefieldPlugin);
+    }
+    // SAFETY: the system runs the library's constructors. That is what the user asks for by naming the file.
+    let library = unsafe { libloading::Library::new(path) };
+    let library = library.map_err(|e| {
+        let why = std::error::Error::source(&e).map_or_else(|| e.to_string(), ToString::to_string);
+        Error::invalid(place, "plugin", why, "a shared library for this system")
+    })?;
+    // SAFETY: a function of this name is what the contract says, or the file is no plugin.
+    let entry = unsafe { library.get::<ConefieldEntry>(ENTRY) }.map(|f| *f);
+    let Ok(entry) = entry else {
+        let found = format!("a library without the function {ENTRY}");
+        return Err(Error::invalid(place, "plugin", found, "a conefield plugin"));
+    };
+    // SAFETY: as above.
+    let table = unsafe { entry() };
+    std::mem::forget(library);
+    tables.insert(path.into(), table as usize);
+    Ok(table)
+}
+
+/// A table that says its size first. What an older plugin's lacks stays zero; what a newer one's has more is left.
+unsafe fn sized<T>(table: *const T, least: usize, place: &str, what: &str) -> Result<T> {
+    ensure(!table.is_null() && table.is_aligned(), place, what, "nothing", "a table")?;
+    // SAFETY: every table begins with its size.
+    let size = unsafe { table.cast::<usize>().read() };
+    ensure(size >= least, place, what, format!("{size} bytes"), format!("at least {least}: the table is too short"))?;
+    let mut copy = MaybeUninit::<T>::zeroed();
+    // SAFETY: the table has `size` bytes, `T` is plain data for which zero means nothing or NULL.
+    unsafe {
+        ptr::copy_nonoverlapping(table.cast::<u8>(), copy.as_mut_ptr().cast(), size.min(size_of::<T>()));
+        Ok(copy.assume_init())
+    }
+}
+
+/// A text of a table.
+unsafe fn text(s: ConefieldStr, place: &str, what: &str) -> Result<String> {
+    let fits = s.length <= LONGEST_TEXT && (s.length == 0 || !s.data.is_null());
+    ensure(fits, place, what, format!("a text of {} bytes", s.length), "at most 1 MiB at some address")?;
+    // SAFETY: the table says so.
+    let bytes = if s.length == 0 { &[] } else { unsafe { slice::from_raw_parts(s.data, s.length) } };
+    let text = std::str::from_utf8(bytes).map_err(|e| Error::invalid(place, what, e, "UTF-8"))?;
+    Ok(text.into())
+}
+
+impl Type {
+    unsafe fn read(t: &ConefieldStage, place: &str, index: usize, owner: &str) -> Result<Self> {
+        let at = format!("stage {index}");
+        // SAFETY: see the top of this file.
+        let (name, doc, schema) = unsafe {
+            (text(t.name, place, &at)?, text(t.doc, place, &at)?, text(t.schema, place, &format!("{at}: schema"))?)
+        };
+        let plain = |c: char| c.is_ascii_lowercase() || c.is_ascii_digit() || c == '-';
+        let good = (1..=64).contains(&name.len()) && name.chars().all(plain);
+        ensure(good, place, &format!("{at}: name"), format!("{name:?}"), "lower-case letters, digits and hyphens")?;
+        let at = format!("stage {name:?}");
+        let mut schema: Value = serde_json::from_str(&schema)
+            .map_err(|e| Error::invalid(place, format!("{at}: schema"), e, "a JSON Schema"))?;
+        let Some(keys) = schema.as_object_mut() else {
+            return Err(Error::invalid(place, format!("{at}: schema"), schema, "a JSON Schema of an object"));
+        };
+        // A setting that the schema does not know is a mistake, whether it says so or not.
+        keys.entry("additionalProperties").or_insert(Value::Bool(false));
+        let missing = |what: &str| Error::invalid(place, &at, format!("no function {what}"), "one");
+        let needed = |what: &str, there: bool| if there { Ok(()) } else { Err(missing(what)) };
+        let what = format!("{at}: functions");
+        // SAFETY: see the top of this file.
+        let (kind, functions) = unsafe {
+            match t.kind {
+                CONEFIELD_ENCODER | CONEFIELD_NORMALIZER | CONEFIELD_FIELD => {
+                    let map = sized(t.map, offset_of!(ConefieldMap, forward_f64), place, &what)?;
+                    needed("info", map.info.is_some())?;
+                    needed("forward", map.forward.is_some())?;
+                    needed("backward", map.backward.is_some())?;
+                    let kind = [Kind::Encoder, Kind::Normalizer, Kind::Field][t.kind as usize];
+                    (kind, Functions::Map(map))
+                }
+                CONEFIELD_PROJECTOR => {
+                    let least = offset_of!(ConefieldProjector, integrate);
+                    let projector = sized(t.projector, least, place, &what)?;
+                    needed("max_samples", projector.max_samples.is_some())?;
+                    needed("sample", projector.sample.is_some())?;
+                    let both = projector.integrate.is_some() == projector.adjoint.is_some();
+                    ensure(both, place, &at, "one of integrate and adjoint", "both or none")?;
+                    (Kind::Projector, Functions::Projector(projector))
+                }
+                CONEFIELD_INITIALIZER => {
+                    let initializer = sized(t.initializer, size_of::<ConefieldInitializer>(), place, &what)?;
+                    needed("apply", initializer.apply.is_some())?;
+                    (Kind::Initializer, Functions::Initializer(initializer))
+                }
+                other => return Err(Error::invalid(place, &at, format!("kind {other}"), "0 to 4")),
+            }
+        };
+        Ok(Self {
+            kind,
+            name,
+            doc,
+            schema,
+            owner: owner.into(),
+            functions,
+            context: t.context,
+            create: t.create.ok_or_else(|| missing("create"))?,
+            destroy: t.destroy.ok_or_else(|| missing("destroy"))?,
+            describe: t.describe.ok_or_else(|| missing("describe"))?,
+        })
+    }
+
+    /// Makes a stage from settings, without their type, for `width` channels in. A refusal names the setting under the
+    /// stage's kind, as built-in stages do.
+    pub(crate) fn create(self: &Arc<Self>, settings: &Value, width: usize) -> Result<Handle> {
+        let settings = settings.to_string();
+        let mut stage = ptr::null_mut();
+        let mut error = Text::new();
+        // SAFETY: everything handed over lives for the time of the call.
+        let status =
+            unsafe { (self.create)(self.context, ConefieldStr::of(&settings), width, &mut stage, error.room()) };
+        if status != CONEFIELD_OK {
+            return Err(self.refusal(status, &error.text()));
+        }
+        if stage.is_null() {
+            return Err(self.failed("create", CONEFIELD_FAILED, "it made nothing"));
+        }
+        Ok(Handle { ty: self.clone(), stage })
+    }
+
+    /// What `create` refused, as an error about the spec.
+    fn refusal(&self, status: ConefieldStatus, text: &str) -> Error {
+        let parts = text.split_once(": found ").and_then(|(field, rest)| {
+            let (found, expected) = rest.rsplit_once(", expected ")?;
+            Some((field, found, expected))
+        });
+        match (status, parts) {
+            (CONEFIELD_INVALID, Some((field, found, expected))) => {
+                let kind = if self.kind == Kind::Normalizer { "normalizers" } else { self.kind.name() };
+                let inside = field == kind || field.starts_with(&format!("{kind}."));
+                let field = if inside { field.into() } else { format!("{kind}.{field}") };
+                Error::invalid("spec", field, found, expected)
+            }
+            (CONEFIELD_INVALID, None) => Error::invalid("spec", self.kind.name(), text, "settings that make a stage"),
+            _ => self.failed("create", status, text),
+        }
+    }
+
+    /// A call that went wrong, in words.
+    pub(crate) fn failed(&self, call: &str, status: ConefieldStatus, text: &str) -> Error {
+        let how = match status {
+            CONEFIELD_INVALID => "refused",
+            CONEFIELD_UNSUPPORTED => "cannot",
+            CONEFIELD_PANICKED => "panicked",
+            _ => "failed",
+        };
+        let text = text.strip_prefix("panicked: ").unwrap_or(text);
+        let text = if text.is_empty() { "it gave no reason" } else { text };
+        Error::unsupported(
+            format!("{} {:?} of plugin {}", self.kind, self.name, self.owner),
+            format!("{call} {how}: {text}"),
+        )
+    }
+}
+
+/// A stage that a library made.
+pub(crate) struct Handle {
+    pub ty: Arc<Type>,
+    pub stage: *mut c_void,
+}
+
+// SAFETY: the contract allows a stage to be called from many threads and to be freed from any.
+unsafe impl Send for Handle {}
+// SAFETY: as above.
+unsafe impl Sync for Handle {}
+
+impl Drop for Handle {
+    fn drop(&mut self) {
+        // SAFETY: it was made by `create` or `reduce`, and nothing uses it any more.
+        unsafe { (self.ty.destroy)(self.stage) };
+    }
+}
+
+impl Handle {
+    /// The stage in its own words.
+    pub fn describe(&self) -> String {
+        let mut text = Text::new();
+        // SAFETY: the stage is alive.
+        unsafe { (self.ty.describe)(self.stage, text.room()) };
+        let text = text.text();
+        let line = text.lines().next().unwrap_or_default();
+        if line.starts_with(&self.ty.name) { line.into() } else { format!("{}: {line}", self.ty.name) }
+    }
+}
+
+/// Room for a line from a library.
+pub(crate) struct Text {
+    bytes: [u8; 512],
+    room: ConefieldText,
+}
+
+impl Text {
+    pub fn new() -> Self {
+        Self { bytes: [0; 512], room: ConefieldText { data: ptr::null_mut(), capacity: 0, length: 0 } }
+    }
+
+    /// To be handed to one call.
+    pub fn room(&mut self) -> *mut ConefieldText {
+        self.room = ConefieldText { data: self.bytes.as_mut_ptr(), capacity: self.bytes.len(), length: 0 };
+        &mut self.room
+    }
+
+    /// What was written.
+    pub fn text(&self) -> String {
+        let n = self.room.length.min(self.bytes.len());
+        String::from_utf8_lossy(&self.bytes[..n]).into_owned()
+    }
+}
+
+/// A text of any length: asks again if it did not fit.
+pub(crate) fn whole_text(
+    mut ask: impl FnMut(*mut ConefieldText) -> ConefieldStatus,
+) -> Result<String, (ConefieldStatus, String)> {
+    let mut bytes = vec![0u8; 4096];
+    for _ in 0..2 {
+        let mut room = ConefieldText { data: bytes.as_mut_ptr(), capacity: bytes.len(), length: 0 };
+        let status = ask(&mut room);
+        let n = room.length;
+        if status == CONEFIELD_OK && n > bytes.len() && n <= LONGEST_TEXT {
+            bytes.resize(n, 0);
+            continue;
+        }
+        let text = String::from_utf8_lossy(&bytes[..n.min(bytes.len())]).into_owned();
+        return if status == CONEFIELD_OK { Ok(text) } else { Err((status, text)) };
+    }
+    Err((CONEFIELD_FAILED, "its text changes in length".into()))
+}

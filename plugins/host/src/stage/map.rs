@@ -1,0 +1,462 @@
+//! Encoders, normalizers and fields.
+
+#![allow(unsafe_code)]
+
+use super::Fault;
+use crate::library::{Functions, Handle, Text, Type, whole_text};
+use crate::trial;
+use conefield_core::error::{Error, Result, ensure};
+use conefield_core::stage::{
+    Encoder, Field, Fragment, GradKind, Grads, Info, Kernel, Mask, Namer, Normalizer, Parameter, Probe, Reduced, Scope,
+    Stage, Tile, TileMut,
+};
+use conefield_plugin_abi::*;
+use serde_json::Value;
+use std::collections::BTreeSet;
+use std::ffi::c_void;
+use std::ops::Range;
+use std::panic::{AssertUnwindSafe, catch_unwind};
+use std::sync::Arc;
+use std::{ptr, slice};
+
+/// Most parameters, channels, … that a stage may say it has: more would overflow what hosts compute from them.
+const MOST: usize = 1 << 40;
+
+/// An encoder, a normalizer or a field of a library.
+pub struct MapStage {
+    handle: Handle,
+    map: ConefieldMap,
+    info: Info,
+    coarse_to_fine: bool,
+    double: bool,
+    parameters: Vec<Parameter>,
+    partition: Vec<Range<usize>>,
+    describe: String,
+    fault: Fault,
+}
+
+/// Makes a stage and tries it out.
+pub(crate) fn build(ty: &Arc<Type>, settings: &Value, width: usize) -> Result<MapStage> {
+    let stage = Arc::new(MapStage::new(ty.create(settings, width)?)?);
+    if stage.info.input != width {
+        let found = format!("{width} channels for a stage that takes {}", stage.info.input);
+        return Err(Error::invalid("spec", ty.kind.name(), found, "as many as it was made for"));
+    }
+    trial::map(&stage)?;
+    Arc::into_inner(stage).ok_or_else(|| ty.failed("a trial", CONEFIELD_FAILED, "it has not ended"))
+}
+
+impl MapStage {
+    fn new(handle: Handle) -> Result<Self> {
+        let Functions::Map(map) = handle.ty.functions else {
+            return Err(handle.ty.failed("create", CONEFIELD_FAILED, "it is no map of rows"));
+        };
+        let wrong = |what: &str| handle.ty.failed("info", CONEFIELD_FAILED, what);
+        let mut i = ConefieldInfo {
+            input: 0,
+            output: 0,
+            params: 0,
+            blocks: 0,
+            partitions: 0,
+            tape: 0,
+            macs: 0,
+            scope: 0,
+            grads: 0,
+            identity: 0,
+            coarse_to_fine: 0,
+            double_precision: 0,
+        };
+        // SAFETY: the stage is alive, `i` is to be written.
+        let status = map.info.map_or(CONEFIELD_FAILED, |info| unsafe { info(handle.stage, &mut i) });
+        if status != CONEFIELD_OK {
+            return Err(handle.ty.failed("info", status, ""));
+        }
+        if [i.input, i.output].contains(&0) || [i.input, i.output, i.params, i.tape, i.macs].iter().any(|&n| n > MOST) {
+            return Err(wrong(&format!("{} channels in, {} out, {} parameters", i.input, i.output, i.params)));
+        }
+        let scope = match i.scope {
+            CONEFIELD_SCOPE_ROW => Scope::Row,
+            CONEFIELD_SCOPE_RAY => Scope::Ray,
+            other => return Err(wrong(&format!("it looks as far as {other}, which is none of the known scopes"))),
+        };
+        let grads = match i.grads {
+            CONEFIELD_GRADS_NONE => GradKind::None,
+            CONEFIELD_GRADS_DENSE => GradKind::Dense,
+            CONEFIELD_GRADS_SCATTER => GradKind::Scatter,
+            other => return Err(wrong(&format!("its gradients are {other}, which is none of the known kinds"))),
+        };
+        if (i.params == 0) != (grads == GradKind::None) {
+            return Err(wrong(&format!("{} parameters with gradients {grads:?}", i.params)));
+        }
+        if i.params > 0 && map.init.is_none() {
+            return Err(wrong("there are parameters and no function init"));
+        }
+        let parameters = parameters(&handle, &map, &i)?;
+        let partition = partition(&handle, &map, &i, grads)?;
+        let info = Info {
+            input: i.input,
+            output: i.output,
+            params: i.params,
+            tape: i.tape,
+            scope,
+            grads,
+            macs: i.macs,
+            identity: i.identity != 0,
+        };
+        let describe = handle.describe();
+        let coarse_to_fine = i.coarse_to_fine != 0;
+        let double = i.double_precision != 0;
+        if double && (map.forward_f64.is_none() || map.backward_f64.is_none()) {
+            return Err(wrong("it has no kernels in double precision, and says that it has"));
+        }
+        Ok(Self { handle, map, info, coarse_to_fine, double, parameters, partition, describe, fault: Fault::default() })
+    }
+
+    /// The type that it is of.
+    pub(crate) fn ty(&self) -> &Type {
+        &self.handle.ty
+    }
+
+    /// Notes what a call that may fail said.
+    fn settle(&self, call: &str, status: ConefieldStatus, error: &Text) -> bool {
+        let fine = status == CONEFIELD_OK;
+        if !fine {
+            self.fault.set(self.ty().failed(call, status, &error.text()));
+        }
+        fine
+    }
+
+    fn reduce(&self, side: u32, keep: &[usize]) -> Result<(Self, Vec<Range<usize>>, Vec<usize>)> {
+        let (ty, info) = (self.ty(), &self.info);
+        let Some(reduce) = self.map.reduce else {
+            let what = format!("{} {:?} of plugin {}", ty.kind, ty.name, ty.owner);
+            return Err(Error::unsupported(what, "it cannot leave out channels"));
+        };
+        let mut r = ConefieldReduced {
+            stage: ptr::null_mut(),
+            params: ptr::null(),
+            params_count: 0,
+            channels: ptr::null(),
+            channels_count: 0,
+        };
+        let mut error = Text::new();
+        // SAFETY: the stage is alive; everything handed over lives for the time of the call.
+        let status = unsafe { reduce(self.handle.stage, side, keep.as_ptr(), keep.len(), &mut r, error.room()) };
+        if status != CONEFIELD_OK {
+            return Err(ty.failed("reduce", status, &error.text()));
+        }
+        let wrong = |what: &str| ty.failed("reduce", CONEFIELD_FAILED, what);
+        if r.stage.is_null() {
+            return Err(wrong("it made nothing"));
+        }
+        let smaller = Self::new(Handle { ty: self.handle.ty.clone(), stage: r.stage })?;
+        if r.params_count > info.params || r.channels_count > info.input.max(info.output) {
+            return Err(wrong("it keeps more than there is"));
+        }
+        // SAFETY: the plugin says that so many stand there as long as the smaller stage lives.
+        let (ranges, channels) = unsafe { (many(r.params, r.params_count), many(r.channels, r.channels_count)) };
+        let params: Vec<Range<usize>> = ranges.iter().map(|r| r.start..r.end).collect();
+        let sound = params.iter().all(|r| r.start <= r.end && r.end <= info.params);
+        let kept: usize = if sound { params.iter().map(Range::len).sum() } else { usize::MAX };
+        let others = if side == CONEFIELD_OUTPUTS { info.input } else { info.output };
+        if kept != smaller.info.params || channels.iter().any(|&c| c >= others) {
+            return Err(wrong("what it keeps does not fit the smaller stage"));
+        }
+        Ok((smaller, params, channels.to_vec()))
+    }
+}
+
+/// `n` things at `data`.
+unsafe fn many<'a, T>(data: *const T, n: usize) -> &'a [T] {
+    // SAFETY: the caller knows that so many stand there.
+    if n == 0 || data.is_null() { &[] } else { unsafe { slice::from_raw_parts(data, n) } }
+}
+
+fn parameters(handle: &Handle, map: &ConefieldMap, i: &ConefieldInfo) -> Result<Vec<Parameter>> {
+    let wrong = |what: String| handle.ty.failed("parameter", CONEFIELD_FAILED, &what);
+    let mut all: Vec<Parameter> = vec![];
+    let mut names = BTreeSet::new();
+    let mut start = 0usize;
+    for index in 0..i.blocks {
+        let mut p = ConefieldParameter {
+            name: ConefieldStr { data: ptr::null(), length: 0 },
+            shape: ptr::null(),
+            dimensions: 0,
+        };
+        // SAFETY: the stage is alive, `p` is to be written.
+        let status = map.parameter.map_or(CONEFIELD_FAILED, |f| unsafe { f(handle.stage, index, &mut p) });
+        if status != CONEFIELD_OK {
+            return Err(wrong(format!("block {index} of {} cannot be had", i.blocks)));
+        }
+        if p.name.length == 0 || p.name.length > 256 || p.dimensions > 8 || p.name.data.is_null() {
+            return Err(wrong(format!(
+                "block {index} has a name of {} bytes, {} dimensions",
+                p.name.length, p.dimensions
+            )));
+        }
+        // SAFETY: the plugin says that so many stand there as long as the stage lives.
+        let (name, shape) = unsafe { (many(p.name.data, p.name.length), many(p.shape, p.dimensions)) };
+        let name = String::from_utf8_lossy(name).into_owned();
+        let count = shape.iter().try_fold(1usize, |n, &d| n.checked_mul(d)).filter(|&n| n <= i.params);
+        let Some(count) = count else { return Err(wrong(format!("block {name:?} has shape {shape:?}"))) };
+        if !names.insert(name.clone()) {
+            return Err(wrong(format!("two blocks are called {name:?}")));
+        }
+        all.push(Parameter { name, shape: shape.to_vec(), start });
+        start += count;
+        if start > i.params {
+            break;
+        }
+    }
+    if start != i.params {
+        return Err(wrong(format!("blocks of {start} parameters in all, where there are {}", i.params)));
+    }
+    Ok(all)
+}
+
+fn partition(handle: &Handle, map: &ConefieldMap, i: &ConefieldInfo, grads: GradKind) -> Result<Vec<Range<usize>>> {
+    let whole = || vec![0..i.params];
+    let Some(f) = map.partition.filter(|_| grads == GradKind::Scatter && i.partitions > 1) else { return Ok(whole()) };
+    let wrong = |what: String| handle.ty.failed("partition", CONEFIELD_FAILED, &what);
+    let mut all = vec![];
+    let mut end = 0;
+    for index in 0..i.partitions {
+        let mut r = ConefieldRange { start: 0, end: 0 };
+        // SAFETY: the stage is alive, `r` is to be written.
+        let status = unsafe { f(handle.stage, index, &mut r) };
+        if status != CONEFIELD_OK || r.start != end || r.end < r.start || r.end > i.params {
+            return Err(wrong(format!("range {index} is {}..{} after {end} of {}", r.start, r.end, i.params)));
+        }
+        all.push(r.start..r.end);
+        end = r.end;
+    }
+    if end == i.params { Ok(all) } else { Err(wrong(format!("ranges end at {end} of {}", i.params))) }
+}
+
+macro_rules! kernel {
+    ($real:ty, $forward:ident $backward:ident, $tile:ident $tile_mut:ident $grads:ident) => {
+        impl Kernel<$real> for MapStage {
+            fn forward(&self, params: &[$real], x: Tile<'_, $real>, y: TileMut<'_, $real>, tape: TileMut<'_, $real>) {
+                let rows = x.rows;
+                let read = |t: &[$real]| $tile { data: t.as_ptr(), channels: t.len() / rows, rows, stride: rows };
+                let write =
+                    |t: &mut [$real]| $tile_mut { data: t.as_mut_ptr(), channels: t.len() / rows, rows, stride: rows };
+                let mut error = Text::new();
+                // SAFETY: the stage is alive, and every pointer goes with the length of what it leads to.
+                let status = self.map.$forward.map_or(CONEFIELD_UNSUPPORTED, |f| unsafe {
+                    let (x, out, tape) = (read(x.data), write(y.data), write(tape.data));
+                    f(self.handle.stage, params.as_ptr(), x, out, tape, error.room())
+                });
+                if !self.settle("forward", status, &error) {
+                    y.data.fill(<$real>::NAN);
+                }
+            }
+
+            fn backward(
+                &self,
+                params: &[$real],
+                x: Tile<'_, $real>,
+                tape: TileMut<'_, $real>,
+                dy: Tile<'_, $real>,
+                grads: Grads<'_, $real>,
+                mut dx: Option<TileMut<'_, $real>>,
+            ) {
+                let rows = x.rows;
+                let read = |t: &[$real]| $tile { data: t.as_ptr(), channels: t.len() / rows, rows, stride: rows };
+                let write =
+                    |t: &mut [$real]| $tile_mut { data: t.as_mut_ptr(), channels: t.len() / rows, rows, stride: rows };
+                let mut error = Text::new();
+                // SAFETY: as for `forward`.
+                let status = self.map.$backward.map_or(CONEFIELD_UNSUPPORTED, |f| unsafe {
+                    let nowhere = $tile_mut { data: ptr::null_mut(), channels: 0, rows, stride: rows };
+                    let (x, tape, dy) = (read(x.data), write(tape.data), read(dy.data));
+                    let dx = dx.as_mut().map_or(nowhere, |dx| write(dx.data));
+                    let (start, length) = (grads.range.start, grads.values.len());
+                    let grads = $grads { data: grads.values.as_mut_ptr(), start, length };
+                    f(self.handle.stage, params.as_ptr(), x, tape, dy, grads, dx, error.room())
+                });
+                if !self.settle("backward", status, &error)
+                    && let Some(dx) = dx
+                {
+                    dx.data.fill(<$real>::NAN);
+                }
+            }
+        }
+    };
+}
+
+kernel! { f32, forward backward, ConefieldTile ConefieldTileMut ConefieldGrads }
+kernel! { f64, forward_f64 backward_f64, ConefieldTile64 ConefieldTileMut64 ConefieldGrads64 }
+
+impl Stage for MapStage {
+    fn info(&self) -> Info {
+        self.info.clone()
+    }
+
+    fn parameters(&self) -> Vec<Parameter> {
+        self.parameters.clone()
+    }
+
+    fn init(&self, seed: u64, params: &mut [f32]) {
+        let Some(init) = self.map.init.filter(|_| !params.is_empty()) else { return };
+        let mut error = Text::new();
+        // SAFETY: the stage is alive, `params` has that length.
+        let status = unsafe { init(self.handle.stage, seed, params.as_mut_ptr(), params.len(), error.room()) };
+        self.settle("init", status, &error);
+    }
+
+    fn kernel(&self) -> &dyn Kernel<f32> {
+        self
+    }
+
+    fn reference(&self) -> Option<&dyn Kernel<f64>> {
+        self.double.then_some(self as _)
+    }
+
+    fn partition(&self) -> Vec<Range<usize>> {
+        self.partition.clone()
+    }
+
+    fn fault(&self) -> Result<()> {
+        self.fault.take()
+    }
+
+    fn wgsl(&self, namer: &Namer) -> Option<Fragment> {
+        fragment(&self.handle, self.map.wgsl, namer)
+    }
+
+    fn describe(&self) -> String {
+        self.describe.clone()
+    }
+}
+
+type WgslFn = unsafe extern "C" fn(*const c_void, ConefieldStr, *mut ConefieldText, *mut u32) -> ConefieldStatus;
+
+/// The WGSL of a stage, if it has any.
+pub(crate) fn fragment(handle: &Handle, wgsl: Option<WgslFn>, namer: &Namer) -> Option<Fragment> {
+    let wgsl = wgsl?;
+    let mut workgroup_bytes = 0;
+    // SAFETY: the stage is alive; everything handed over lives for the time of the call.
+    let ask = |room| unsafe { wgsl(handle.stage, ConefieldStr::of(&namer.prefix), room, &mut workgroup_bytes) };
+    let source = whole_text(ask).ok()?;
+    Some(Fragment { source, workgroup_bytes })
+}
+
+impl Encoder for MapStage {
+    fn keep_outputs(&self, keep: &[usize]) -> Result<Reduced<dyn Encoder>> {
+        let (stage, params, channels) = self.reduce(CONEFIELD_OUTPUTS, keep)?;
+        Ok(Reduced { stage: Box::new(stage), params, channels })
+    }
+
+    fn coarse_to_fine(&self) -> bool {
+        self.coarse_to_fine
+    }
+}
+
+impl Field for MapStage {
+    fn keep_inputs(&self, keep: &[usize]) -> Result<Reduced<dyn Field>> {
+        let (stage, params, channels) = self.reduce(CONEFIELD_INPUTS, keep)?;
+        Ok(Reduced { stage: Box::new(stage), params, channels })
+    }
+}
+
+impl Normalizer for MapStage {
+    fn refresh(&self, probe: &mut dyn Probe) -> Result<Option<Mask>> {
+        let Some(refresh) = self.map.refresh else { return Ok(None) };
+        let width = self.info.input;
+        let (shape, epoch, coarse) = (probe.shape(), probe.epoch(), probe.coarse_to_fine());
+        let mut look = Look { probe, width, error: None };
+        let seen = ConefieldProbe {
+            context: ptr::from_mut(&mut look).cast(),
+            encode: Some(encode),
+            voxel: Some(voxel),
+            width,
+            shape,
+            epoch,
+            coarse_to_fine: coarse.into(),
+        };
+        let (mut keep, mut count) = (vec![0usize; width], usize::MAX);
+        let (mut report, mut error) = (Text::new(), Text::new());
+        // SAFETY: the stage is alive; everything handed over lives for the time of the call, and `keep` has room for
+        // `width`.
+        let status =
+            unsafe { refresh(self.handle.stage, &seen, keep.as_mut_ptr(), &mut count, report.room(), error.room()) };
+        if let Some(e) = look.error {
+            return Err(e);
+        }
+        if status != CONEFIELD_OK {
+            return Err(self.ty().failed("refresh", status, &error.text()));
+        }
+        if count == usize::MAX {
+            return Ok(None);
+        }
+        keep.truncate(count);
+        let sound = count >= 1 && count <= width && keep.is_sorted_by(|a, b| a < b) && keep[count - 1] < width;
+        if !sound {
+            let what = format!("it keeps {count} channels {keep:?} of {width}");
+            return Err(self.ty().failed("refresh", CONEFIELD_FAILED, &what));
+        }
+        Ok(Some(Mask { keep, report: report.text() }))
+    }
+
+    fn decided(&self) {
+        if let Some(decided) = self.map.decided {
+            // SAFETY: the stage is alive.
+            unsafe { decided(self.handle.stage) };
+        }
+    }
+
+    fn keep_inputs(&self, keep: &[usize]) -> Result<Reduced<dyn Normalizer>> {
+        let (stage, params, channels) = self.reduce(CONEFIELD_INPUTS, keep)?;
+        Ok(Reduced { stage: Box::new(stage), params, channels })
+    }
+
+    fn keep_outputs(&self, keep: &[usize]) -> Result<Reduced<dyn Normalizer>> {
+        let (stage, params, channels) = self.reduce(CONEFIELD_OUTPUTS, keep)?;
+        Ok(Reduced { stage: Box::new(stage), params, channels })
+    }
+}
+
+/// A probe that a library looks through.
+struct Look<'a> {
+    probe: &'a mut dyn Probe,
+    width: usize,
+    error: Option<Error>,
+}
+
+unsafe extern "C" fn encode(
+    context: *mut c_void,
+    points: *const f32,
+    count: usize,
+    features: *mut f32,
+) -> ConefieldStatus {
+    // SAFETY: `context` is the `Look` of the refresh that is under way, and it has no other user.
+    let look = unsafe { &mut *context.cast::<Look<'_>>() };
+    let done = catch_unwind(AssertUnwindSafe(|| {
+        // SAFETY: the plugin says that there are `count` points.
+        let points = unsafe { many(points.cast::<[f32; 3]>(), count) };
+        let found = look.probe.encode(points)?;
+        let fits = found.len() == look.width * points.len();
+        ensure(fits, "plugin", "probe", found.len(), format!("{} features", look.width * points.len()))?;
+        // SAFETY: the plugin says that there is room for `width` features of every point.
+        unsafe { ptr::copy_nonoverlapping(found.as_ptr(), features, found.len()) };
+        Ok(())
+    }));
+    match done {
+        Ok(Ok(())) => CONEFIELD_OK,
+        Ok(Err(e)) => {
+            look.error = Some(e);
+            CONEFIELD_FAILED
+        }
+        Err(_) => CONEFIELD_PANICKED,
+    }
+}
+
+unsafe extern "C" fn voxel(context: *mut c_void, x: usize, y: usize, z: usize, position: *mut f32) {
+    // SAFETY: as in `encode`.
+    let look = unsafe { &mut *context.cast::<Look<'_>>() };
+    if let Ok(at) = catch_unwind(AssertUnwindSafe(|| look.probe.voxel([x, y, z]))) {
+        // SAFETY: there is room for three numbers.
+        unsafe { ptr::copy_nonoverlapping(at.as_ptr(), position, 3) };
+    }
+}

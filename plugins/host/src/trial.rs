@@ -1,0 +1,186 @@
+//! A stage is tried out before any real work is handed to it: on a few rows, between guard zones, under a time limit. What
+//! writes outside its tile, leaves outputs unwritten, returns numbers that are not finite, fails or does not come back is
+//! refused here. Whether gradients are right only the conformance kit can say.
+
+use crate::library::Type;
+use crate::stage::map::MapStage;
+use crate::stage::projector::ProjectorStage;
+use conefield_core::error::{Error, Result};
+use conefield_core::random::{mix, unit};
+use conefield_core::stage::{GradKind, Grads, Projector, Samples, Stage, TILE_ROWS, Tile, TileMut, UnitRay};
+use std::ops::Range;
+use std::sync::Arc;
+use std::sync::mpsc;
+use std::thread;
+use std::time::Duration;
+
+/// How long a trial may take.
+pub const LIMIT: Duration = Duration::from_secs(5);
+
+/// Numbers on either side of a buffer that nobody may write to: more than a tile of the widest common stages.
+const GUARD: usize = 1 << 14;
+/// A NaN that no arithmetic makes.
+const UNTOUCHED: u32 = 0x7fc5_a7e1;
+
+/// Stages of more parameters are not initialised for their trial; that takes long, and the run does it anyway.
+const MANY: usize = 1 << 20;
+
+/// A buffer between guard zones.
+struct Guarded(Vec<f32>);
+
+impl Guarded {
+    fn new(n: usize) -> Self {
+        Self(vec![f32::from_bits(UNTOUCHED); n + 2 * GUARD])
+    }
+
+    fn inner(&mut self) -> &mut [f32] {
+        let n = self.0.len();
+        &mut self.0[GUARD..n - GUARD]
+    }
+
+    fn zeroed(n: usize) -> Self {
+        let mut g = Self::new(n);
+        g.inner().fill(0.0);
+        g
+    }
+
+    /// What is wrong with the zones.
+    fn broken(&self, what: &str) -> Option<String> {
+        let n = self.0.len();
+        let outside = (0..GUARD).chain(n - GUARD..n);
+        let at = outside.into_iter().find(|&i| self.0[i].to_bits() != UNTOUCHED)?;
+        let place =
+            if at < GUARD { format!("{} before", GUARD - at) } else { format!("{} past", at - (n - GUARD) + 1) };
+        Some(format!("it writes outside its {what}: {place} {} numbers", n - 2 * GUARD))
+    }
+
+    /// What is wrong with what was written.
+    fn unsound(&mut self, what: &str) -> Option<String> {
+        let n = self.inner().len();
+        let all = self.inner().iter().enumerate();
+        all.filter(|(_, v)| !v.is_finite())
+            .map(|(i, v)| {
+                let how = if v.to_bits() == UNTOUCHED { "is left unwritten".into() } else { format!("is {v}") };
+                format!("number {i} of {n} of its {what} {how}")
+            })
+            .next()
+    }
+}
+
+/// Runs `trial` under the time limit.
+fn timed(ty: &Type, trial: impl FnOnce() -> Result<()> + Send + 'static) -> Result<()> {
+    let (done, wait) = mpsc::channel();
+    thread::spawn(move || {
+        let outcome = trial();
+        // Nobody listens any more if this came too late.
+        let _ = done.send(outcome);
+    });
+    wait.recv_timeout(LIMIT).unwrap_or_else(|e| {
+        let what = match e {
+            mpsc::RecvTimeoutError::Timeout => format!("it has not come back after {} s", LIMIT.as_secs()),
+            mpsc::RecvTimeoutError::Disconnected => "it ended its thread".into(),
+        };
+        Err(refused(ty, &what))
+    })
+}
+
+fn refused(ty: &Type, what: &str) -> Error {
+    Error::unsupported(format!("{} {:?} of plugin {}", ty.kind, ty.name, ty.owner), format!("refused: {what}"))
+}
+
+/// Tries an encoder, a normalizer or a field.
+pub(crate) fn map(stage: &Arc<MapStage>) -> Result<()> {
+    let (ty, trial) = (stage.clone(), stage.clone());
+    timed(ty.ty(), move || {
+        let complaint = try_map(&trial)?;
+        complaint.map_or(Ok(()), |c| Err(refused(trial.ty(), &c)))
+    })
+}
+
+fn try_map(stage: &MapStage) -> Result<Option<String>> {
+    let (info, kernel) = (stage.info(), stage.kernel());
+    let mut params = Guarded::zeroed(info.params);
+    if info.params <= MANY {
+        stage.init(1, params.inner());
+        stage.fault()?;
+        if let Some(c) = params.broken("parameters").or_else(|| params.unsound("initial parameters")) {
+            return Ok(Some(c));
+        }
+    }
+    let range: Range<usize> = match info.grads {
+        GradKind::Scatter => stage.partition().into_iter().min_by_key(Range::len).unwrap_or(0..info.params),
+        _ => 0..info.params,
+    };
+    for rows in [1, 3, TILE_ROWS] {
+        let mut x = Guarded::new(info.input * rows);
+        for (i, x) in x.inner().iter_mut().enumerate() {
+            *x = unit(mix(7, i as u64));
+        }
+        let [mut y, mut tape, mut dx] = [info.output, info.tape, info.input].map(|c| Guarded::new(c * rows));
+        let mut grads = Guarded::zeroed(range.len());
+        kernel.forward(
+            params.inner(),
+            Tile::new(x.inner(), rows),
+            TileMut::new(y.inner(), rows),
+            TileMut::new(tape.inner(), rows),
+        );
+        stage.fault()?;
+        let mut complaint = y.broken("output").or_else(|| tape.broken("tape"));
+        complaint = complaint.or_else(|| y.unsound("output")).or_else(|| {
+            (info.identity && y.inner() != x.inner()).then(|| "its output is not its input, as it says".into())
+        });
+        if complaint.is_some() {
+            return Ok(complaint);
+        }
+        let dy = vec![1.0; info.output * rows];
+        kernel.backward(
+            params.inner(),
+            Tile::new(x.inner(), rows),
+            TileMut::new(tape.inner(), rows),
+            Tile::new(&dy, rows),
+            Grads { values: grads.inner(), range: range.clone() },
+            Some(TileMut::new(dx.inner(), rows)),
+        );
+        stage.fault()?;
+        let complaint = grads.broken("gradients").or_else(|| dx.broken("input gradient"));
+        let complaint = complaint.or_else(|| tape.broken("tape")).or_else(|| x.broken("input"));
+        let complaint = complaint.or_else(|| params.broken("parameters"));
+        let complaint = complaint.or_else(|| grads.unsound("gradients")).or_else(|| dx.unsound("input gradient"));
+        if complaint.is_some() {
+            return Ok(complaint);
+        }
+    }
+    Ok(None)
+}
+
+/// Tries a projector.
+pub(crate) fn projector(stage: &Arc<ProjectorStage>) -> Result<()> {
+    let (ty, trial) = (stage.clone(), stage.clone());
+    timed(ty.ty(), move || {
+        let ray = |origin, direction: [f32; 3], inside| UnitRay {
+            origin,
+            direction,
+            inside,
+            published: [0.5, 3.0],
+            per_mm: 0.01,
+        };
+        let third = (1.0f32 / 3.0).sqrt();
+        for ray in [
+            ray([-1.0, 0.5, 0.5], [1.0, 0.0, 0.0], [1.0, 2.0]),
+            ray([-third; 3], [third; 3], [1.0, 1.0 + 1.0 / third]),
+            ray([0.5, 2.0, 0.25], [0.0, -1.0, 0.0], [1.0, 2.0]),
+            ray([-1.0, 5.0, 0.5], [1.0, 0.0, 0.0], [0.0, 0.0]),
+        ] {
+            for seed in [None, Some(3)] {
+                let mut samples = Samples::default();
+                trial.sample_guarded(&ray, seed, GUARD, &mut samples)?;
+                let mu = vec![1.0; samples.weights.len()];
+                let line = trial.integrate(&samples.weights, &mu);
+                if !line.is_finite() {
+                    return Err(refused(trial.ty(), &format!("the line integral of ones is {line}")));
+                }
+            }
+        }
+        Ok(())
+    })
+}

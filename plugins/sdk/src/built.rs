@@ -1,0 +1,151 @@
+//! A stage behind the pointer that the host holds.
+
+use conefield_core::arena::Weights;
+use conefield_core::error::{Error, Result};
+use conefield_core::registry::{Kind, StageType};
+use conefield_core::spec::stage::read;
+use conefield_core::spec::{EncoderSpec, FieldSpec, Initializer, InitializerSpec, NormalizerSpec, ProjectorSpec};
+use conefield_core::stage::{Encoder, Field, GradKind, Info, Normalizer, Parameter, Projector, Reduced, Scope, Stage};
+use conefield_plugin_abi::*;
+use serde_json::Value;
+use std::ops::Range;
+
+/// What the host holds.
+pub struct Built {
+    pub stage: AnyStage,
+    /// Of an encoder, a normalizer or a field.
+    pub map: Option<MapInfo>,
+    /// What a smaller stage kept of the one that it was made from.
+    pub kept: (Vec<ConefieldRange>, Vec<usize>),
+}
+
+/// A stage of any kind.
+pub enum AnyStage {
+    Encoder(Box<dyn Encoder>),
+    Normalizer(Box<dyn Normalizer>),
+    Field(Box<dyn Field>),
+    Projector(Box<dyn Projector>),
+    Initializer(Box<dyn Initializer>),
+}
+
+/// What the host asks of a map again and again.
+pub struct MapInfo {
+    pub info: ConefieldInfo,
+    pub blocks: Vec<Parameter>,
+    pub partition: Vec<Range<usize>>,
+}
+
+impl Built {
+    /// The stage that `settings`, without their type, make of `t`.
+    pub fn new(t: &StageType, mut settings: Value, width: usize) -> Result<Self> {
+        let Some(keys) = settings.as_object_mut() else {
+            return Err(Error::invalid("spec", t.kind.name(), &settings, "a table of settings"));
+        };
+        keys.insert("type".into(), t.name.into());
+        let refused = |e: String| Error::invalid("spec", t.kind.name(), e, "settings of this type");
+        let no_weights = |path: &str| -> Result<Weights> {
+            Err(Error::unsupported(path, "a plugin's initializer reads its own files"))
+        };
+        let stage = match t.kind {
+            Kind::Encoder => AnyStage::Encoder(read::<dyn EncoderSpec>(settings).map_err(refused)?.build()?),
+            Kind::Normalizer => {
+                AnyStage::Normalizer(read::<dyn NormalizerSpec>(settings).map_err(refused)?.build(width)?)
+            }
+            Kind::Field => AnyStage::Field(read::<dyn FieldSpec>(settings).map_err(refused)?.build(width)?),
+            Kind::Projector => AnyStage::Projector(read::<dyn ProjectorSpec>(settings).map_err(refused)?.build()?),
+            Kind::Initializer => {
+                let spec = read::<dyn InitializerSpec>(settings).map_err(refused)?;
+                AnyStage::Initializer(spec.build(&no_weights)?)
+            }
+            Kind::Solver => return Err(Error::unsupported(t.name, "solvers cannot come from plugins")),
+        };
+        Ok(Self::of(stage))
+    }
+
+    fn of(stage: AnyStage) -> Self {
+        let map = stage.map().map(|s| {
+            let i = s.info();
+            let partition = if i.grads == GradKind::Scatter { s.partition() } else { vec![] };
+            let coarse_to_fine = matches!(&stage, AnyStage::Encoder(e) if e.coarse_to_fine());
+            let blocks = s.parameters();
+            let mut info = info(&i, blocks.len(), partition.len());
+            info.coarse_to_fine = coarse_to_fine.into();
+            info.double_precision = s.reference().is_some().into();
+            MapInfo { info, blocks, partition }
+        });
+        Self { stage, map, kept: (vec![], vec![]) }
+    }
+
+    /// The stage without some of its channels.
+    pub fn reduced(&self, side: u32, keep: &[usize]) -> Result<Self> {
+        let of = |params: Vec<Range<usize>>, channels, stage| Self {
+            kept: (params.iter().map(|r| ConefieldRange { start: r.start, end: r.end }).collect(), channels),
+            ..Self::of(stage)
+        };
+        Ok(match (&self.stage, side) {
+            (AnyStage::Encoder(e), CONEFIELD_OUTPUTS) => {
+                let Reduced { stage, params, channels } = e.keep_outputs(keep)?;
+                of(params, channels, AnyStage::Encoder(stage))
+            }
+            (AnyStage::Normalizer(n), CONEFIELD_OUTPUTS) => {
+                let Reduced { stage, params, channels } = n.keep_outputs(keep)?;
+                of(params, channels, AnyStage::Normalizer(stage))
+            }
+            (AnyStage::Normalizer(n), CONEFIELD_INPUTS) => {
+                let Reduced { stage, params, channels } = n.keep_inputs(keep)?;
+                of(params, channels, AnyStage::Normalizer(stage))
+            }
+            (AnyStage::Field(f), CONEFIELD_INPUTS) => {
+                let Reduced { stage, params, channels } = f.keep_inputs(keep)?;
+                of(params, channels, AnyStage::Field(stage))
+            }
+            _ => return Err(Error::unsupported("this stage", "channels cannot be left out on that side")),
+        })
+    }
+}
+
+impl AnyStage {
+    /// As an encoder, a normalizer or a field.
+    pub fn map(&self) -> Option<&dyn Stage> {
+        match self {
+            Self::Encoder(s) => Some(s.as_ref()),
+            Self::Normalizer(s) => Some(s.as_ref()),
+            Self::Field(s) => Some(s.as_ref()),
+            Self::Projector(_) | Self::Initializer(_) => None,
+        }
+    }
+
+    pub fn describe(&self) -> String {
+        match self {
+            Self::Projector(p) => p.describe(),
+            Self::Initializer(i) => i.describe(),
+            Self::Encoder(s) => s.describe(),
+            Self::Normalizer(s) => s.describe(),
+            Self::Field(s) => s.describe(),
+        }
+    }
+}
+
+fn info(i: &Info, blocks: usize, partitions: usize) -> ConefieldInfo {
+    ConefieldInfo {
+        input: i.input,
+        output: i.output,
+        params: i.params,
+        blocks,
+        partitions,
+        tape: i.tape,
+        macs: i.macs,
+        scope: match i.scope {
+            Scope::Row => CONEFIELD_SCOPE_ROW,
+            Scope::Ray => CONEFIELD_SCOPE_RAY,
+        },
+        grads: match i.grads {
+            GradKind::None => CONEFIELD_GRADS_NONE,
+            GradKind::Dense => CONEFIELD_GRADS_DENSE,
+            GradKind::Scatter => CONEFIELD_GRADS_SCATTER,
+        },
+        identity: i.identity.into(),
+        coarse_to_fine: 0,
+        double_precision: 0,
+    }
+}

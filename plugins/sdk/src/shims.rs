@@ -1,0 +1,590 @@
+//! The functions that the host calls: each turns pointers into slices, runs the stage, and turns what goes wrong, panics
+//! included, into a status and a text.
+
+// Pointers come from the host, by the rules of the contract (`conefield_plugin_abi`): they are valid for the lengths beside
+// them for the time of the call, do not overlap where one of them is written to, and `stage` is what `create` or `reduce`
+// made. Every block below that is unsafe relies on that alone.
+#![allow(unsafe_code)]
+
+use crate::built::{AnyStage, Built, MapInfo};
+use conefield_core::arena::{Arena, Block, Layout};
+use conefield_core::error::{Error, Result};
+use conefield_core::registry::StageType;
+use conefield_core::simd::Real;
+use conefield_core::stage::{Fragment, Grads, Kernel, Namer, Probe, Projector, Samples, Stage, Tile, TileMut, UnitRay};
+use conefield_plugin_abi::*;
+use std::borrow::Cow;
+use std::cell::RefCell;
+use std::ffi::c_void;
+use std::panic::{AssertUnwindSafe, catch_unwind};
+use std::{mem, ptr, slice};
+
+/// Functions of every encoder, normalizer and field.
+pub static MAP: ConefieldMap = ConefieldMap {
+    size: size_of::<ConefieldMap>(),
+    info: Some(info),
+    parameter: Some(parameter),
+    init: Some(init),
+    forward: Some(forward),
+    backward: Some(backward),
+    forward_f64: Some(forward_f64),
+    backward_f64: Some(backward_f64),
+    partition: Some(partition),
+    reduce: Some(reduce),
+    refresh: Some(refresh),
+    decided: Some(decided),
+    wgsl: Some(wgsl),
+};
+
+/// Functions of every projector.
+pub static PROJECTOR: ConefieldProjector = ConefieldProjector {
+    size: size_of::<ConefieldProjector>(),
+    max_samples: Some(max_samples),
+    sample: Some(sample),
+    integrate: Some(integrate),
+    adjoint: Some(adjoint),
+    wgsl: Some(wgsl),
+};
+
+/// Functions of every initializer.
+pub static INITIALIZER: ConefieldInitializer =
+    ConefieldInitializer { size: size_of::<ConefieldInitializer>(), apply: Some(apply) };
+
+/// Runs `f`; what goes wrong becomes a status, its text goes to `error`.
+fn guard(error: *mut ConefieldText, f: impl FnOnce() -> Result<()>) -> ConefieldStatus {
+    match catch_unwind(AssertUnwindSafe(f)) {
+        Ok(Ok(())) => CONEFIELD_OK,
+        Ok(Err(e)) => {
+            let (status, text) = match &e {
+                // The host knows the place.
+                Error::Invalid { field, found, expected, .. } => {
+                    (CONEFIELD_INVALID, format!("{field}: found {found}, expected {expected}"))
+                }
+                Error::Unsupported { .. } => (CONEFIELD_UNSUPPORTED, e.to_string()),
+                _ => (CONEFIELD_FAILED, e.to_string()),
+            };
+            write(error, &text);
+            status
+        }
+        Err(panic) => {
+            let text = panic.downcast_ref::<String>().map(String::as_str);
+            let text = text.or_else(|| panic.downcast_ref::<&str>().copied()).unwrap_or("without a word");
+            write(error, &format!("panicked: {text}"));
+            // To drop what was thrown could panic again.
+            mem::forget(panic);
+            CONEFIELD_PANICKED
+        }
+    }
+}
+
+/// Writes as much of `text` as there is room for.
+fn write(out: *mut ConefieldText, text: &str) {
+    // SAFETY: see the top of this file.
+    let Some(out) = (unsafe { out.as_mut() }) else { return };
+    out.length = text.len();
+    let n = text.len().min(out.capacity);
+    if n > 0 {
+        // SAFETY: see the top of this file.
+        unsafe { ptr::copy_nonoverlapping(text.as_ptr(), out.data, n) };
+    }
+}
+
+/// `n` things at `data`, which may be NULL for none.
+unsafe fn many<'a, T>(data: *const T, n: usize) -> &'a [T] {
+    // SAFETY: see the top of this file.
+    if n == 0 { &[] } else { unsafe { slice::from_raw_parts(data, n) } }
+}
+
+/// As [`many`], to be written.
+unsafe fn many_mut<'a, T>(data: *mut T, n: usize) -> &'a mut [T] {
+    // SAFETY: see the top of this file.
+    if n == 0 { &mut [] } else { unsafe { slice::from_raw_parts_mut(data, n) } }
+}
+
+unsafe fn text<'a>(s: ConefieldStr) -> Result<&'a str> {
+    // SAFETY: see the top of this file.
+    let bytes = unsafe { many(s.data, s.length) };
+    std::str::from_utf8(bytes).map_err(|e| Error::unsupported("a text from the host", e.to_string()))
+}
+
+unsafe fn built<'a>(stage: *const c_void) -> &'a Built {
+    // SAFETY: see the top of this file.
+    unsafe { &*stage.cast::<Built>() }
+}
+
+unsafe fn map<'a>(stage: *const c_void) -> Result<(&'a dyn Stage, &'a MapInfo)> {
+    // SAFETY: see the top of this file.
+    let built = unsafe { built(stage) };
+    let both = built.stage.map().zip(built.map.as_ref());
+    both.ok_or_else(|| Error::unsupported("this stage", "it is no encoder, normalizer or field"))
+}
+
+unsafe fn projector<'a>(stage: *const c_void) -> Result<&'a dyn Projector> {
+    // SAFETY: see the top of this file.
+    match unsafe { &built(stage).stage } {
+        AnyStage::Projector(p) => Ok(p.as_ref()),
+        _ => Err(Error::unsupported("this stage", "it is no projector")),
+    }
+}
+
+pub unsafe extern "C" fn create(
+    context: *const c_void,
+    settings: ConefieldStr,
+    width: usize,
+    stage: *mut *mut c_void,
+    error: *mut ConefieldText,
+) -> ConefieldStatus {
+    guard(error, || {
+        // SAFETY: see the top of this file; `context` is what the table says, a static.
+        let (t, settings) = unsafe { (&*context.cast::<StageType>(), text(settings)?) };
+        let settings = serde_json::from_str(settings).map_err(|e| Error::invalid("spec", t.kind.name(), e, "JSON"))?;
+        let built = Box::new(Built::new(t, settings, width)?);
+        // SAFETY: see the top of this file.
+        unsafe { *stage = Box::into_raw(built).cast() };
+        Ok(())
+    })
+}
+
+pub unsafe extern "C" fn destroy(stage: *mut c_void) {
+    guard(ptr::null_mut(), || {
+        // SAFETY: see the top of this file; the host lets go of it here.
+        drop(unsafe { Box::from_raw(stage.cast::<Built>()) });
+        Ok(())
+    });
+}
+
+pub unsafe extern "C" fn describe(stage: *const c_void, out: *mut ConefieldText) -> ConefieldStatus {
+    guard(out, || {
+        // SAFETY: see the top of this file.
+        write(out, &unsafe { built(stage) }.stage.describe());
+        Ok(())
+    })
+}
+
+unsafe extern "C" fn info(stage: *const c_void, out: *mut ConefieldInfo) -> ConefieldStatus {
+    guard(ptr::null_mut(), || {
+        // SAFETY: see the top of this file.
+        unsafe { *out = map(stage)?.1.info };
+        Ok(())
+    })
+}
+
+unsafe extern "C" fn parameter(stage: *const c_void, index: usize, out: *mut ConefieldParameter) -> ConefieldStatus {
+    guard(ptr::null_mut(), || {
+        // SAFETY: see the top of this file.
+        let blocks = unsafe { &map(stage)?.1.blocks };
+        let p = blocks.get(index).ok_or_else(|| Error::unsupported("parameters", "there are not so many"))?;
+        let name = ConefieldStr { data: p.name.as_ptr(), length: p.name.len() };
+        let parameter = ConefieldParameter { name, shape: p.shape.as_ptr(), dimensions: p.shape.len() };
+        // SAFETY: see the top of this file.
+        unsafe { *out = parameter };
+        Ok(())
+    })
+}
+
+unsafe extern "C" fn partition(stage: *const c_void, index: usize, out: *mut ConefieldRange) -> ConefieldStatus {
+    guard(ptr::null_mut(), || {
+        // SAFETY: see the top of this file.
+        let ranges = unsafe { &map(stage)?.1.partition };
+        let r = ranges.get(index).ok_or_else(|| Error::unsupported("ranges", "there are not so many"))?;
+        // SAFETY: see the top of this file.
+        unsafe { *out = ConefieldRange { start: r.start, end: r.end } };
+        Ok(())
+    })
+}
+
+unsafe extern "C" fn init(
+    stage: *const c_void,
+    seed: u64,
+    params: *mut f32,
+    length: usize,
+    error: *mut ConefieldText,
+) -> ConefieldStatus {
+    guard(error, || {
+        // SAFETY: see the top of this file.
+        unsafe { map(stage)?.0.init(seed, many_mut(params, length)) };
+        Ok(())
+    })
+}
+
+/// Channels that the host has laid out with a stride.
+struct Strided<R> {
+    data: *mut R,
+    channels: usize,
+    rows: usize,
+    stride: usize,
+}
+
+impl<R: Real> Strided<R> {
+    fn close(&self) -> bool {
+        self.stride == self.rows || self.channels <= 1
+    }
+
+    /// The channels, one right after the other.
+    unsafe fn read<'a>(&self) -> Cow<'a, [R]> {
+        // SAFETY: see the top of this file.
+        unsafe {
+            if self.close() {
+                return Cow::Borrowed(many(self.data, self.channels * self.rows));
+            }
+            let channel = |c| many(self.data.add(c * self.stride), self.rows);
+            Cow::Owned((0..self.channels).flat_map(|c| channel(c).iter().copied()).collect())
+        }
+    }
+
+    /// Runs `f` on the channels, one right after the other.
+    unsafe fn write<T>(&self, f: impl FnOnce(&mut [R]) -> T) -> T {
+        // SAFETY: see the top of this file.
+        unsafe {
+            if self.close() {
+                return f(many_mut(self.data, self.channels * self.rows));
+            }
+            let mut dense = self.read().into_owned();
+            let out = f(&mut dense);
+            for (c, from) in dense.chunks_exact(self.rows).enumerate() {
+                many_mut(self.data.add(c * self.stride), self.rows).copy_from_slice(from);
+            }
+            out
+        }
+    }
+}
+
+macro_rules! strided {
+    ($($tile:ident $real:ty)*) => {$(
+        impl From<$tile> for Strided<$real> {
+            fn from(t: $tile) -> Self {
+                Self { data: t.data as *mut $real, channels: t.channels, rows: t.rows, stride: t.stride }
+            }
+        }
+    )*};
+}
+
+strided! { ConefieldTile f32 ConefieldTileMut f32 ConefieldTile64 f64 ConefieldTileMut64 f64 }
+
+unsafe fn run_forward<R: Real>(
+    kernel: &dyn Kernel<R>,
+    info: &ConefieldInfo,
+    params: *const R,
+    x: Strided<R>,
+    y: Strided<R>,
+    tape: Strided<R>,
+) {
+    let rows = x.rows;
+    // SAFETY: see the top of this file.
+    unsafe {
+        let (params, x) = (many(params, info.params), x.read());
+        y.write(|y| {
+            tape.write(|tape| {
+                kernel.forward(params, Tile::new(&x, rows), TileMut::new(y, rows), TileMut::new(tape, rows));
+            });
+        });
+    }
+}
+
+unsafe fn run_backward<R: Real>(
+    kernel: &dyn Kernel<R>,
+    info: &ConefieldInfo,
+    params: *const R,
+    [x, tape, dy, dx]: [Strided<R>; 4],
+    (grads, start, length): (*mut R, usize, usize),
+) {
+    let rows = x.rows;
+    let wanted = !dx.data.is_null();
+    // SAFETY: see the top of this file.
+    unsafe {
+        let (params, x, dy) = (many(params, info.params), x.read(), dy.read());
+        let grads = Grads { values: many_mut(grads, length), range: start..start + length };
+        tape.write(|tape| {
+            let (x, tape, dy) = (Tile::new(&x, rows), TileMut::new(tape, rows), Tile::new(&dy, rows));
+            if wanted {
+                dx.write(|dx| kernel.backward(params, x, tape, dy, grads, Some(TileMut::new(dx, rows))));
+            } else {
+                kernel.backward(params, x, tape, dy, grads, None);
+            }
+        });
+    }
+}
+
+const NO_DOUBLE: &str = "it has no kernel in double precision";
+
+macro_rules! kernels {
+    ($forward:ident $backward:ident $real:ty, $tile:ident $tile_mut:ident $grads:ident, $pick:expr) => {
+        unsafe extern "C" fn $forward(
+            stage: *const c_void,
+            params: *const $real,
+            x: $tile,
+            y: $tile_mut,
+            tape: $tile_mut,
+            error: *mut ConefieldText,
+        ) -> ConefieldStatus {
+            guard(error, || {
+                // SAFETY: see the top of this file.
+                unsafe {
+                    let (stage, known) = map(stage)?;
+                    let kernel: Option<&dyn Kernel<$real>> = $pick(stage);
+                    let kernel = kernel.ok_or_else(|| Error::unsupported(stage.describe(), NO_DOUBLE))?;
+                    run_forward(kernel, &known.info, params, x.into(), y.into(), tape.into());
+                    stage.fault()
+                }
+            })
+        }
+
+        unsafe extern "C" fn $backward(
+            stage: *const c_void,
+            params: *const $real,
+            x: $tile,
+            tape: $tile_mut,
+            dy: $tile,
+            grads: $grads,
+            dx: $tile_mut,
+            error: *mut ConefieldText,
+        ) -> ConefieldStatus {
+            guard(error, || {
+                // SAFETY: see the top of this file.
+                unsafe {
+                    let (stage, known) = map(stage)?;
+                    let kernel: Option<&dyn Kernel<$real>> = $pick(stage);
+                    let kernel = kernel.ok_or_else(|| Error::unsupported(stage.describe(), NO_DOUBLE))?;
+                    let tiles = [x.into(), tape.into(), dy.into(), dx.into()];
+                    run_backward(kernel, &known.info, params, tiles, (grads.data, grads.start, grads.length));
+                    stage.fault()
+                }
+            })
+        }
+    };
+}
+
+kernels! { forward backward f32, ConefieldTile ConefieldTileMut ConefieldGrads, |s: &'static dyn Stage| Some(s.kernel()) }
+kernels! { forward_f64 backward_f64 f64, ConefieldTile64 ConefieldTileMut64 ConefieldGrads64, |s: &'static dyn Stage| s.reference() }
+
+unsafe extern "C" fn reduce(
+    stage: *const c_void,
+    side: u32,
+    keep: *const usize,
+    keep_count: usize,
+    out: *mut ConefieldReduced,
+    error: *mut ConefieldText,
+) -> ConefieldStatus {
+    guard(error, || {
+        // SAFETY: see the top of this file.
+        let smaller = unsafe { Box::new(built(stage).reduced(side, many(keep, keep_count))?) };
+        let (params, channels) = &smaller.kept;
+        let mut reduced = ConefieldReduced {
+            stage: ptr::null_mut(),
+            params: params.as_ptr(),
+            params_count: params.len(),
+            channels: channels.as_ptr(),
+            channels_count: channels.len(),
+        };
+        reduced.stage = Box::into_raw(smaller).cast();
+        // SAFETY: see the top of this file.
+        unsafe { *out = reduced };
+        Ok(())
+    })
+}
+
+/// The host's encoder, to be looked at.
+struct Look<'a>(&'a ConefieldProbe);
+
+impl Probe for Look<'_> {
+    fn encode(&mut self, points: &[[f32; 3]]) -> Result<Vec<f32>> {
+        let failed = || Error::unsupported("the encoder", "it could not be looked at");
+        let encode = self.0.encode.ok_or_else(failed)?;
+        let mut features = vec![0.0; self.0.width * points.len()];
+        // SAFETY: see the top of this file; there is room for every feature.
+        let status = unsafe { encode(self.0.context, points.as_ptr().cast(), points.len(), features.as_mut_ptr()) };
+        if status == CONEFIELD_OK { Ok(features) } else { Err(failed()) }
+    }
+
+    fn shape(&self) -> [usize; 3] {
+        self.0.shape
+    }
+
+    fn voxel(&self, [x, y, z]: [usize; 3]) -> [f32; 3] {
+        let mut position = [0.0; 3];
+        if let Some(voxel) = self.0.voxel {
+            // SAFETY: see the top of this file.
+            unsafe { voxel(self.0.context, x, y, z, position.as_mut_ptr()) };
+        }
+        position
+    }
+
+    fn epoch(&self) -> f64 {
+        self.0.epoch
+    }
+
+    fn coarse_to_fine(&self) -> bool {
+        self.0.coarse_to_fine != 0
+    }
+}
+
+unsafe extern "C" fn refresh(
+    stage: *const c_void,
+    probe: *const ConefieldProbe,
+    keep: *mut usize,
+    keep_count: *mut usize,
+    report: *mut ConefieldText,
+    error: *mut ConefieldText,
+) -> ConefieldStatus {
+    guard(error, || {
+        // SAFETY: see the top of this file.
+        let (stage, probe) = unsafe { (&built(stage).stage, &*probe) };
+        let mask = match stage {
+            AnyStage::Normalizer(n) => n.refresh(&mut Look(probe))?,
+            _ => None,
+        };
+        let mut count = usize::MAX;
+        if let Some(mask) = mask {
+            if mask.keep.len() > probe.width {
+                return Err(Error::unsupported("the mask", "it keeps more channels than there are"));
+            }
+            // SAFETY: see the top of this file; there is room for `probe.width`.
+            unsafe { many_mut(keep, mask.keep.len()).copy_from_slice(&mask.keep) };
+            count = mask.keep.len();
+            write(report, &mask.report);
+        }
+        // SAFETY: see the top of this file.
+        unsafe { *keep_count = count };
+        Ok(())
+    })
+}
+
+unsafe extern "C" fn decided(stage: *const c_void) {
+    guard(ptr::null_mut(), || {
+        // SAFETY: see the top of this file.
+        if let AnyStage::Normalizer(n) = unsafe { &built(stage).stage } {
+            n.decided();
+        }
+        Ok(())
+    });
+}
+
+unsafe extern "C" fn wgsl(
+    stage: *const c_void,
+    prefix: ConefieldStr,
+    source: *mut ConefieldText,
+    workgroup_bytes: *mut u32,
+) -> ConefieldStatus {
+    guard(source, || {
+        // SAFETY: see the top of this file.
+        let (stage, prefix) = unsafe { (&built(stage).stage, text(prefix)?) };
+        let namer = Namer { prefix: prefix.into() };
+        let fragment = match stage {
+            AnyStage::Projector(p) => p.wgsl(&namer),
+            other => other.map().and_then(|s| s.wgsl(&namer)),
+        };
+        let Fragment { source: code, workgroup_bytes: bytes } =
+            fragment.ok_or_else(|| Error::unsupported("this stage", "it has no WGSL"))?;
+        write(source, &code);
+        // SAFETY: see the top of this file.
+        unsafe { *workgroup_bytes = bytes };
+        Ok(())
+    })
+}
+
+unsafe fn ray(ray: *const ConefieldRay) -> UnitRay {
+    // SAFETY: see the top of this file.
+    let ConefieldRay { origin, direction, inside, published, per_mm } = unsafe { *ray };
+    UnitRay { origin, direction, inside, published, per_mm }
+}
+
+unsafe extern "C" fn max_samples(stage: *const c_void, at: *const ConefieldRay) -> usize {
+    let mut most = 0;
+    guard(ptr::null_mut(), || {
+        // SAFETY: see the top of this file.
+        most = unsafe { projector(stage)?.max_samples(&ray(at)) };
+        Ok(())
+    });
+    most
+}
+
+thread_local! {
+    /// Samples of a ray, before they are handed over.
+    static SAMPLES: RefCell<Samples> = RefCell::default();
+}
+
+unsafe extern "C" fn sample(
+    stage: *const c_void,
+    at: *const ConefieldRay,
+    seed: *const u64,
+    points: *mut f32,
+    weights: *mut f32,
+    capacity: usize,
+    count: *mut usize,
+    error: *mut ConefieldText,
+) -> ConefieldStatus {
+    guard(error, || {
+        // SAFETY: see the top of this file.
+        let (stage, ray, seed) = unsafe { (projector(stage)?, ray(at), seed.as_ref().copied()) };
+        SAMPLES.with_borrow_mut(|samples| {
+            samples.points.clear();
+            samples.weights.clear();
+            stage.sample(&ray, seed, samples);
+            stage.fault()?;
+            let n = samples.points.len();
+            if n > capacity || samples.weights.len() != n {
+                let why = format!("{n} points and {} weights, room for {capacity}", samples.weights.len());
+                return Err(Error::unsupported("the samples of a ray", why));
+            }
+            // SAFETY: see the top of this file; both have room for `capacity`.
+            unsafe {
+                many_mut(points.cast::<[f32; 3]>(), n).copy_from_slice(&samples.points);
+                many_mut(weights, n).copy_from_slice(&samples.weights);
+                *count = n;
+            }
+            Ok(())
+        })
+    })
+}
+
+unsafe extern "C" fn integrate(stage: *const c_void, weights: *const f32, mu: *const f64, count: usize) -> f64 {
+    let mut line = f64::NAN;
+    guard(ptr::null_mut(), || {
+        // SAFETY: see the top of this file.
+        line = unsafe { projector(stage)?.integrate(many(weights, count), many(mu, count)) };
+        Ok(())
+    });
+    line
+}
+
+unsafe extern "C" fn adjoint(stage: *const c_void, weights: *const f32, dline: f64, dmu: *mut f64, count: usize) {
+    guard(ptr::null_mut(), || {
+        // SAFETY: see the top of this file.
+        unsafe { projector(stage)?.adjoint(many(weights, count), dline, many_mut(dmu, count)) };
+        Ok(())
+    });
+}
+
+unsafe extern "C" fn apply(
+    stage: *const c_void,
+    blocks: *const ConefieldBlock,
+    block_count: usize,
+    params: *mut f32,
+    length: usize,
+    filled: *mut u8,
+    error: *mut ConefieldText,
+) -> ConefieldStatus {
+    guard(error, || {
+        // SAFETY: see the top of this file.
+        let (stage, blocks) = unsafe { (&built(stage).stage, many(blocks, block_count)) };
+        let AnyStage::Initializer(initializer) = stage else {
+            return Err(Error::unsupported("this stage", "it is no initializer"));
+        };
+        let block = |b: &ConefieldBlock| -> Result<Block> {
+            // SAFETY: see the top of this file.
+            let (name, shape) = unsafe { (text(b.name)?, many(b.shape, b.dimensions)) };
+            Ok(Block { name: name.into(), shape: shape.to_vec(), range: b.start..b.start + b.length })
+        };
+        let layout = Layout { blocks: blocks.iter().map(block).collect::<Result<_>>()? };
+        // SAFETY: see the top of this file.
+        let (params, filled) = unsafe { (many_mut(params, length), many_mut(filled, block_count)) };
+        let mut arena = Arena::new(length);
+        arena.params.copy_from_slice(params);
+        let report = initializer.apply(&layout, &mut arena)?;
+        params.copy_from_slice(&arena.params);
+        for (filled, b) in filled.iter_mut().zip(&layout.blocks) {
+            *filled = report.loaded.contains(&b.name).into();
+        }
+        Ok(())
+    })
+}

@@ -1,0 +1,72 @@
+//! What an initializer must keep to: it fills what it says, with finite numbers, the same each time, and nothing else.
+
+use crate::Report;
+use crate::call::{Draw, differing, settle};
+use conefield_core::arena::{Arena, Block, InitReport, Layout};
+use conefield_core::error::Result;
+use conefield_core::spec::Initializer;
+
+/// Runs every property that an initializer must have, on the layout of a small pipeline.
+pub fn check_initializer(initializer: &dyn Initializer) -> Report {
+    let mut report = Report { stage: initializer.describe(), entries: vec![] };
+    let layout = layout();
+    report.add("applies", || match run(initializer, &layout) {
+        Ok((_, found)) => {
+            let n = layout.blocks.len();
+            let told = found.loaded.len() + found.fresh.len();
+            let complaint = (told != n).then(|| format!("it tells of {told} of {n} blocks"));
+            settle(complaint, &format!("{} of {n} blocks filled", found.loaded.len()))
+        }
+        Err(e) => settle(Some(e.to_string()), ""),
+    });
+    report.add("finite", || {
+        let bad = run(initializer, &layout).ok().and_then(|(p, _)| p.iter().position(|v| !v.is_finite()));
+        settle(bad.map(|i| format!("parameter {i}")), "every parameter")
+    });
+    report.add("repeatable", || {
+        let complaint = match (run(initializer, &layout), run(initializer, &layout)) {
+            (Ok((a, _)), Ok((b, _))) => differing("parameter", &a, &b),
+            _ => None,
+        };
+        settle(complaint, "the same bits twice")
+    });
+    report.add("leaves the rest alone", || {
+        let complaint = run(initializer, &layout).ok().and_then(|(p, found)| {
+            let before = start(&layout);
+            let mut rest = layout.blocks.iter().filter(|b| !found.loaded.contains(&b.name));
+            rest.find_map(|b| differing(&b.name, &p[b.range.clone()], &before[b.range.clone()]))
+        });
+        settle(complaint, "blocks that it does not tell of keep their bits")
+    });
+    report
+}
+
+fn layout() -> Layout {
+    let mut blocks = vec![];
+    let mut at = 0;
+    let shapes: [(&str, &[usize]); 6] = [
+        ("encoder.0.table", &[300, 2]),
+        ("encoder.1.table", &[64, 2]),
+        ("normalizers.0.weight", &[4]),
+        ("normalizers.0.bias", &[4]),
+        ("field.0.weight", &[8, 4]),
+        ("field.0.bias", &[8]),
+    ];
+    for (name, shape) in shapes {
+        let n: usize = shape.iter().product();
+        blocks.push(Block { name: name.into(), shape: shape.to_vec(), range: at..at + n });
+        at += n;
+    }
+    Layout { blocks }
+}
+
+fn start(layout: &Layout) -> Vec<f32> {
+    Draw::new(5, 5).many(&(-0.1..0.1), layout.len())
+}
+
+fn run(initializer: &dyn Initializer, layout: &Layout) -> Result<(Vec<f32>, InitReport)> {
+    let mut arena = Arena::new(layout.len());
+    arena.params.copy_from_slice(&start(layout));
+    let report = initializer.apply(layout, &mut arena)?;
+    Ok((arena.params.to_vec(), report))
+}
