@@ -9,6 +9,7 @@ mod explain;
 mod export;
 mod import;
 mod info;
+mod plugins;
 mod pretrain;
 mod protocol;
 mod reconstruct;
@@ -22,6 +23,7 @@ use conefield_core::backend::Backend;
 use conefield_core::solver::Limits;
 use serde::{Deserialize, Serialize};
 use std::ffi::OsString;
+use std::path::PathBuf;
 
 /// What to do.
 #[derive(Subcommand)]
@@ -48,6 +50,8 @@ pub enum Command {
     Convert(convert::Convert),
     /// List what can do the computing here.
     Backends(backends::Backends),
+    /// Stages from shared libraries: list them, check them, begin one.
+    Plugins(plugins::Plugins),
     /// Print the JSON Schema of spec files, for editors.
     Schema(schema::SchemaArgs),
     /// Simulate a small scan, reconstruct it in two ways and compare.
@@ -68,6 +72,7 @@ pub fn run(command: Command, general: &General) -> Result<()> {
         Command::Info(c) => c.run(),
         Command::Convert(c) => c.run(),
         Command::Backends(c) => c.run(),
+        Command::Plugins(c) => c.run(),
         Command::Schema(c) => c.run(),
         Command::Demo(c) => c.run(),
     }
@@ -88,6 +93,12 @@ pub struct General {
     /// Memory that a command may take, such as 8GiB [default: what is available]. One that needs more is refused.
     #[arg(long, global = true, value_name = "SIZE", help_heading = "General options", value_parser = crate::parse::bytes)]
     pub memory: Option<u64>,
+    /// Load the stages of this plugin, or of every plugin in this folder; repeatable.
+    #[arg(long = "plugin", global = true, value_name = "PATH", help_heading = "General options")]
+    pub plugins: Vec<PathBuf>,
+    /// Let specs load the plugins that they name. A plugin is code: allow it to specs that you trust.
+    #[arg(long, global = true, help_heading = "General options")]
+    pub allow_plugins_from_spec: bool,
 }
 
 impl General {
@@ -96,6 +107,13 @@ impl General {
         let mut all: Vec<OsString> = vec!["--verbose".into(); self.verbose.into()];
         if self.quiet {
             all.push("--quiet".into());
+        }
+        for path in &self.plugins {
+            all.push("--plugin".into());
+            all.push(path.into());
+        }
+        if self.allow_plugins_from_spec {
+            all.push("--allow-plugins-from-spec".into());
         }
         let numbers = [("--threads", self.threads.map(u64::from)), ("--memory", self.memory)];
         for (flag, number) in numbers {

@@ -91,7 +91,7 @@ pub fn read_field(path: &Path) -> Result<TrainedField> {
         let expected = "weights that a run of \"conefield reconstruct\" left";
         weights.notes.get(key).ok_or_else(|| Error::invalid(&place, key, "no such note", expected))
     };
-    let spec = conefield_core::spec::load::parse(note("spec")?, &format!("{place}: spec.toml"), &[], &[])?.spec;
+    let spec = crate::specs::reread(note("spec")?, &format!("{place}: spec.toml"))?.spec;
     let placement = serde_json::from_str(note(PLACEMENT)?)
         .map_err(|e| Error::invalid(&place, PLACEMENT, e, "what conefield writes there"))?;
     TrainedField::restore(&spec, &placement, |model| {

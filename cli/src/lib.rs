@@ -6,6 +6,7 @@ mod memory;
 mod out;
 mod outgoing;
 mod parse;
+mod plugins;
 mod progress;
 mod run;
 mod signals;
@@ -46,7 +47,11 @@ pub fn main() -> ExitCode {
         eprintln!("error: {n} threads: {e}");
         return ExitCode::FAILURE;
     }
-    match commands::run(cli.command, &general) {
+    plugins::search(&general.plugins, general.allow_plugins_from_spec);
+    // What is refused is what `plugins` is there to show.
+    let listed = matches!(cli.command, commands::Command::Plugins(_));
+    let settled = if listed { Ok(()) } else { plugins::settle() };
+    match settled.and_then(|()| commands::run(cli.command, &general)) {
         Ok(()) => ExitCode::SUCCESS,
         Err(e) => {
             eprintln!("error: {e}");

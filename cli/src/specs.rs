@@ -1,8 +1,9 @@
 //! The specs that come with the program, and the weights that the demonstration uses.
 
+use crate::plugins;
 use conefield_core::pipeline::Pipeline;
 use conefield_core::solver::Solver;
-use conefield_core::spec::load::{Loaded, Shipped, load};
+use conefield_core::spec::load::{Draft, Loaded, Shipped};
 use conefield_core::{Error, Result};
 
 /// The files in `specs/`.
@@ -31,7 +32,16 @@ pub fn help() -> String {
 
 /// Reads a spec by its shipped name or from a file, with `sets` on top.
 pub fn read(what: &str, sets: &[String]) -> Result<Loaded> {
-    load(what, sets, SHIPPED)
+    let draft = Draft::find(what, sets, SHIPPED)?;
+    plugins::of_spec(&draft)?;
+    draft.finish()
+}
+
+/// Reads a spec that a file holds, called `source` in errors.
+pub fn reread(text: &str, source: &str) -> Result<Loaded> {
+    let draft = Draft::of(text, source, &[], &[])?;
+    plugins::of_spec(&draft)?;
+    draft.finish()
 }
 
 /// The MCI weights for the spec `fast`, as a safetensors file.

@@ -4,6 +4,7 @@ use super::protocol::{Protocol, word};
 use super::reconstruct::{FAILED, Parts, ScanRecord, identity, split};
 use super::{BackendChoice, Ends, General, backends::simd_level};
 use crate::memory::{Memory, Run};
+use crate::plugins::{self, Used};
 use crate::table::{SCORES, Table, score_cells};
 use crate::{files, out, run, signals, specs};
 use clap::Args;
@@ -440,13 +441,15 @@ fn recorded(folder: &Path) -> Result<BTreeMap<String, String>> {
         limits: Ends,
         reference: Value,
         peak: f64,
+        #[serde(default)]
+        plugins: Vec<Used>,
     }
     #[derive(Deserialize)]
     struct KnownScan {
         projections_fnv1a64: String,
     }
     let known: Known = read_json(&folder.join("record.json"))?;
-    Ok(BTreeMap::from([
+    let mut all = BTreeMap::from([
         ("conefield".into(), known.version),
         ("seed".into(), known.seed.to_string()),
         ("spec".into(), conefield_core::files::read_text(&folder.join("spec.toml"), LONGEST)?),
@@ -455,7 +458,9 @@ fn recorded(folder: &Path) -> Result<BTreeMap<String, String>> {
         ("limits".into(), out::to_json(&known.limits)?),
         ("reference".into(), known.reference.to_string()),
         ("peak".into(), known.peak.to_string()),
-    ]))
+    ]);
+    all.extend(plugins::identity(&known.plugins));
+    Ok(all)
 }
 
 impl Figures {

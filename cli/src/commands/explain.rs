@@ -3,7 +3,7 @@
 use super::BackendChoice;
 use super::reconstruct::Parts;
 use crate::memory::Memory;
-use crate::{files, out, specs};
+use crate::{files, out, plugins, specs};
 use clap::Args;
 use conefield_core::Result;
 use conefield_core::backend::Explain as Compiled;
@@ -101,6 +101,9 @@ struct Report {
     parameters: usize,
     model_bytes: usize,
     macs_per_sample: usize,
+    /// Whose stages the spec names.
+    #[serde(skip_serializing_if = "Vec::is_empty")]
+    plugins: Vec<plugins::Used>,
     /// Of a field.
     backend: Option<Compiled>,
     scan: Option<ForScan>,
@@ -165,6 +168,7 @@ fn report(loaded: &Loaded, parts: Parts, scan: Option<ForScan>) -> Result<Report
         parameters,
         model_bytes: 16 * parameters,
         macs_per_sample: pipeline.as_ref().map_or(0, Pipeline::macs),
+        plugins: plugins::used(tree),
         backend,
         scan,
     })
@@ -219,6 +223,9 @@ fn text(r: &Report) -> String {
         [("projector", r.projector.as_ref()), ("initializer", r.initializer.as_ref()), ("solver", Some(&r.solver))];
     let rest = named.iter().filter_map(|(stage, p)| p.map(|p| vec![stage.to_string(), p.kind.clone(), p.what.clone()]));
     lines.push(out::table(&rest.collect::<Vec<_>>(), &[]));
+    for plugin in &r.plugins {
+        lines.push(format!("\nplugin: {}", plugin.line()));
+    }
     if let Some(backend) = &r.backend {
         lines.push(format!("\nbackend: {}", backend.backend));
         lines.extend(backend.notes.iter().map(|n| format!("  {n}")));

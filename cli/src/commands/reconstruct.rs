@@ -3,6 +3,7 @@
 use super::{Ends, backends::simd_level, evaluate, protocol::Protocol};
 use crate::memory::{self, Memory};
 use crate::outgoing::{self, Written};
+use crate::plugins::{self, Used};
 use crate::progress::{Keeper, Progress};
 use crate::run::RunFolder;
 use crate::{files, out, signals, specs};
@@ -117,6 +118,9 @@ struct Record {
     limits: Ends,
     init: Option<String>,
     reference: Option<String>,
+    /// Whose stages the spec names.
+    #[serde(skip_serializing_if = "Vec::is_empty")]
+    plugins: Vec<Used>,
     backend: Explain,
     simd: String,
     threads: usize,
@@ -242,6 +246,7 @@ impl Reconstruct {
             limits: protocol.ends.clone(),
             init: self.init.as_ref().map(|p| p.display().to_string()),
             reference: protocol.reference.as_ref().map(|p| p.display().to_string()),
+            plugins: plugins::used(&loaded.tree),
             backend: compiled,
             simd: simd_level(),
             threads: rayon::current_num_threads(),
@@ -340,11 +345,13 @@ pub fn mci(path: &Path) -> String {
 
 /// What weights say of where they come from.
 pub fn notes(loaded: &Loaded, seed: u64) -> Result<BTreeMap<String, String>> {
-    Ok(BTreeMap::from([
+    let mut notes = BTreeMap::from([
         ("conefield".into(), env!("CARGO_PKG_VERSION").into()),
         ("seed".into(), seed.to_string()),
         ("spec".into(), to_toml(&loaded.spec)?),
-    ]))
+    ]);
+    notes.extend(plugins::identity(&plugins::used(&loaded.tree)));
+    Ok(notes)
 }
 
 /// FNV-1a of the projections' bytes, to recognise a scan by.

@@ -1,0 +1,330 @@
+//! `conefield plugins check`
+
+use crate::{out, parse, plugins};
+use clap::Args;
+use conefield_conformance::{
+    Options, Outcome, Report, check_encoder, check_field, check_initializer, check_normalizer, check_projector,
+};
+use conefield_core::arena::Weights;
+use conefield_core::registry::{self, Make, Origin};
+use conefield_core::stage::Namer;
+use conefield_core::{Error, Result};
+use conefield_plugins::library::Type;
+use conefield_plugins::spec::with_defaults;
+use conefield_plugins::{Library, Place};
+use serde::Serialize;
+use serde_json::Value;
+use std::io::Read;
+use std::path::PathBuf;
+use std::process::{Command, ExitStatus, Stdio};
+use std::thread;
+use std::time::{Duration, Instant};
+
+/// Run the conformance kit on every stage of a plugin: finite differences, shapes, extremes, independence of tiles and
+/// threads, guard zones, save and load. The plugin runs in a process of its own, so that what it does there cannot hide.
+#[derive(Args)]
+pub struct Check {
+    /// The plugin's library.
+    library: PathBuf,
+    /// Check this stage type alone.
+    #[arg(long = "type", value_name = "TYPE")]
+    name: Option<String>,
+    /// Settings to check, as one JSON object; repeatable [default: the defaults, and the examples in its schema].
+    #[arg(long, value_name = "JSON", value_parser = settings)]
+    settings: Vec<Value>,
+    /// Channels that go into a normalizer or a field; repeatable [default: 1, 3, 8 and 20].
+    #[arg(long, value_name = "N", value_parser = clap::value_parser!(u16).range(1..))]
+    width: Vec<u16>,
+    /// Largest error of single against double precision, as a share of the largest output.
+    #[arg(long, value_name = "SHARE", default_value_t = 2e-5)]
+    single: f64,
+    /// End the check after this time.
+    #[arg(long, value_name = "TIME", value_parser = parse::seconds, default_value = "10m")]
+    time_limit: f64,
+    /// Print one JSON object.
+    #[arg(long)]
+    json: bool,
+    /// Check in this process.
+    #[arg(long, hide = true)]
+    here: bool,
+}
+
+fn settings(text: &str) -> std::result::Result<Value, String> {
+    let value: Value = serde_json::from_str(text).map_err(|e| e.to_string())?;
+    if value.is_object() { Ok(value) } else { Err("expected a JSON object, such as '{\"levels\": 4}'".into()) }
+}
+
+/// All that was found.
+#[derive(Serialize)]
+struct Checked {
+    plugin: String,
+    version: String,
+    licence: String,
+    abi: String,
+    path: String,
+    stages: Vec<StageReport>,
+    passed: bool,
+}
+
+/// One stage with one set of settings.
+#[derive(Serialize)]
+struct StageReport {
+    kind: String,
+    #[serde(rename = "type")]
+    name: String,
+    settings: Value,
+    #[serde(skip_serializing_if = "Option::is_none")]
+    width: Option<usize>,
+    stage: String,
+    properties: Vec<Property>,
+    passed: bool,
+}
+
+#[derive(Serialize)]
+struct Property {
+    name: &'static str,
+    outcome: &'static str,
+    text: String,
+}
+
+impl Check {
+    pub fn run(self) -> Result<()> {
+        if self.here { self.check() } else { self.apart() }
+    }
+
+    /// Runs the check in a child process, whose end, whatever it is, can be told.
+    fn apart(&self) -> Result<()> {
+        let program = std::env::current_exe().map_err(|e| Error::io("conefield", e))?;
+        let io = |e| Error::io(&program, e);
+        let mut command = Command::new(&program);
+        command.args(std::env::args_os().skip(1)).arg("--here");
+        let mut child = command.stdin(Stdio::null()).stderr(Stdio::piped()).spawn().map_err(io)?;
+        let errors = child.stderr.take();
+        let said = thread::spawn(move || {
+            let mut said = vec![];
+            let _ = errors.map(|mut e| e.read_to_end(&mut said));
+            String::from_utf8_lossy(&said).into_owned()
+        });
+        let place = self.library.display().to_string();
+        let begin = Instant::now();
+        let status = loop {
+            if let Some(status) = child.try_wait().map_err(io)? {
+                break status;
+            }
+            if begin.elapsed().as_secs_f64() > self.time_limit {
+                let _ = child.kill();
+                let _ = child.wait();
+                let why = format!("not done after {}, ended; --time-limit allows more", out::duration(self.time_limit));
+                return Err(Error::unsupported(place, why));
+            }
+            thread::sleep(Duration::from_millis(20));
+        };
+        let said = said.join().unwrap_or_default();
+        if status.success() {
+            return Ok(());
+        }
+        let line = said.lines().rev().find_map(|l| l.strip_prefix("error: "));
+        match (status.code(), line) {
+            (Some(1), Some(line)) => {
+                let (what, why) = line.split_once(": ").unwrap_or((&place, line));
+                Err(Error::unsupported(what, why))
+            }
+            (Some(2), _) => Err(Error::unsupported("plugins check", said.trim())),
+            _ => Err(Error::unsupported(place, format!("took the checking process down ({})", ending(status)))),
+        }
+    }
+
+    fn check(&self) -> Result<()> {
+        let report = plugins::with(|found| -> Result<Checked> {
+            found.add(self.library.clone(), Place::Named);
+            let real = self.library.canonicalize().map_err(|e| Error::io(&self.library, e))?;
+            let at = found.found.iter().position(|f| match &f.library {
+                Ok(l) => l.path == real,
+                Err(_) => f.path == self.library,
+            });
+            match at.map(|i| found.found.swap_remove(i).library) {
+                Some(library) => self.report(&library?),
+                None => Err(Error::invalid(real.display().to_string(), "plugin", "nothing", "a plugin")),
+            }
+        })?;
+        if self.json {
+            out::json(&report)?
+        } else {
+            out::say(&text(&report))?
+        }
+        let failed: Vec<String> = report
+            .stages
+            .iter()
+            .flat_map(|s| {
+                s.properties.iter().filter(|p| p.outcome == FAILED).map(|p| format!("{}: {}", s.name, p.name))
+            })
+            .collect();
+        if failed.is_empty() {
+            return Ok(());
+        }
+        let mut first = failed.clone();
+        first.dedup();
+        first.truncate(6);
+        let more = if failed.len() > first.len() { ", …" } else { "" };
+        let many = if failed.len() == 1 { "1 property does".into() } else { format!("{} properties do", failed.len()) };
+        let why = format!("{many} not hold: {}{more}", first.join(", "));
+        Err(Error::unsupported(self.library.display().to_string(), why))
+    }
+
+    fn report(&self, library: &Library) -> Result<Checked> {
+        let mut stages = vec![];
+        for t in library.types.iter().filter(|t| self.name.as_ref().is_none_or(|n| *n == t.name)) {
+            let mut tries: Vec<Value> = self.settings.clone();
+            if tries.is_empty() {
+                let needed = t.schema["required"].as_array().is_some_and(|r| !r.is_empty());
+                tries.extend((!needed).then(|| serde_json::json!({})));
+                tries.extend(t.schema["examples"].as_array().into_iter().flatten().cloned());
+            }
+            if tries.is_empty() {
+                let expected = "--settings, or examples in its schema: it has settings without a default";
+                return Err(Error::invalid(library.owner(), &t.name, "nothing to check it with", expected));
+            }
+            for settings in tries {
+                self.stage(t, &with_defaults(&t.schema, settings), &mut stages)?;
+            }
+        }
+        if stages.is_empty() {
+            let known: Vec<&str> = library.types.iter().map(|t| &t.name[..]).collect();
+            let expected = format!("one of {}", known.join(", "));
+            return Err(Error::invalid(library.owner(), "--type", self.name.clone().unwrap_or_default(), expected));
+        }
+        Ok(Checked {
+            plugin: library.name.clone(),
+            version: library.version.clone(),
+            licence: library.licence.clone(),
+            abi: format!("{}.{}", library.abi.0, library.abi.1),
+            path: library.path.display().to_string(),
+            passed: stages.iter().all(|s| s.passed),
+            stages,
+        })
+    }
+
+    /// Checks one stage type with one set of settings, at every width that makes sense.
+    fn stage(&self, t: &Type, settings: &Value, all: &mut Vec<StageReport>) -> Result<()> {
+        let Some(Origin::Loaded { make, .. }) = registry::find(t.kind, &t.name).map(|t| &t.origin) else {
+            return Err(Error::unsupported(&t.name, "it is not registered"));
+        };
+        let options = |o: Options| Options { single: self.single, ..o };
+        let mut add = |width, report| all.push(StageReport::of(t, settings, width, report));
+        match make {
+            Make::Encoder(make) => {
+                let stage = make(settings.clone())?.build()?;
+                add(
+                    None,
+                    with_wgsl(
+                        check_encoder(stage.as_ref(), &options(Options::encoder())),
+                        stage.wgsl(&namer()).is_some(),
+                    ),
+                );
+            }
+            Make::Normalizer(make) => {
+                for width in self.widths() {
+                    let stage = make(settings.clone())?.build(width)?;
+                    let report = check_normalizer(stage.as_ref(), &options(Options::features()));
+                    add(Some(width), with_wgsl(report, stage.wgsl(&namer()).is_some()));
+                }
+            }
+            Make::Field(make) => {
+                let mut refused = None;
+                let mut built = false;
+                for width in self.widths() {
+                    // A field may take points of the cube alone.
+                    let stage = match make(settings.clone())?.build(width) {
+                        Ok(stage) => stage,
+                        Err(e) => {
+                            refused = Some(e);
+                            continue;
+                        }
+                    };
+                    built = true;
+                    let report = check_field(stage.as_ref(), &options(Options::features()));
+                    add(Some(width), with_wgsl(report, stage.wgsl(&namer()).is_some()));
+                }
+                if let (false, Some(e)) = (built, refused) {
+                    return Err(e);
+                }
+            }
+            Make::Projector(make) => {
+                let stage = make(settings.clone())?.build()?;
+                add(None, with_wgsl(check_projector(stage.as_ref()), stage.wgsl(&namer()).is_some()));
+            }
+            Make::Initializer(make) => {
+                let none =
+                    |path: &str| -> Result<Weights> { Err(Error::unsupported(path, "no weights are read here")) };
+                let stage = make(settings.clone())?.build(&none)?;
+                add(None, check_initializer(stage.as_ref()));
+            }
+            Make::Solver(_) => return Err(Error::unsupported(&t.name, "solvers cannot come from plugins")),
+        }
+        Ok(())
+    }
+
+    fn widths(&self) -> Vec<usize> {
+        if self.width.is_empty() { vec![1, 3, 8, 20] } else { self.width.iter().map(|&w| w.into()).collect() }
+    }
+}
+
+fn namer() -> Namer {
+    Namer { prefix: "stage".into() }
+}
+
+const FAILED: &str = "failed";
+
+/// The report with a line on the stage's WGSL: there is no backend here that could run it.
+fn with_wgsl(mut report: Report, there: bool) -> Report {
+    let why = if there { "this build has no GPU backend to run it on" } else { "the stage offers none" };
+    report.entries.push(("WGSL parity", Outcome::Skipped(why.into())));
+    report
+}
+
+impl StageReport {
+    fn of(t: &Type, settings: &Value, width: Option<usize>, report: Report) -> Self {
+        let passed = report.passed();
+        let property = |(name, outcome)| {
+            let (outcome, text) = match outcome {
+                Outcome::Passed(text) => ("passed", text),
+                Outcome::Failed(text) => (FAILED, text),
+                Outcome::Skipped(text) => ("skipped", text),
+            };
+            Property { name, outcome, text }
+        };
+        Self {
+            kind: t.kind.to_string(),
+            name: t.name.clone(),
+            settings: settings.clone(),
+            width,
+            stage: report.stage,
+            properties: report.entries.into_iter().map(property).collect(),
+            passed,
+        }
+    }
+}
+
+fn text(r: &Checked) -> String {
+    let mut lines = vec![format!("{} {}, {}, ABI {}: {}", r.plugin, r.version, r.licence, r.abi, r.path)];
+    for s in &r.stages {
+        let width = s.width.map_or(String::new(), |w| format!(", {w} channels in"));
+        lines.push(format!("\n{} {} {}{width}\n  {}", s.kind, s.name, s.settings, s.stage));
+        for p in &s.properties {
+            let outcome = if p.outcome == FAILED { "FAILED" } else { p.outcome };
+            lines.push(format!("  {outcome:<8} {:<34} {}", p.name, p.text));
+        }
+    }
+    let count = |o: &str| r.stages.iter().flat_map(|s| &s.properties).filter(|p| p.outcome == o).count();
+    lines.push(format!("\n{} passed, {} skipped, {} failed", count("passed"), count("skipped"), count(FAILED)));
+    lines.join("\n")
+}
+
+/// How a process ended.
+fn ending(status: ExitStatus) -> String {
+    #[cfg(unix)]
+    if let Some(signal) = std::os::unix::process::ExitStatusExt::signal(&status) {
+        return format!("signal {signal}");
+    }
+    status.to_string()
+}

@@ -1,0 +1,201 @@
+//! `conefield plugins new`
+
+use crate::out;
+use clap::{Args, ValueEnum};
+use conefield_core::registry::Kind;
+use conefield_core::{Error, Result};
+use std::fs;
+use std::path::{Path, PathBuf};
+
+/// Make a folder with the start of a plugin: a stage, its test, and a spec that uses it. It builds as it is.
+#[derive(Args)]
+pub struct New {
+    /// The plugin's name, which is also the folder's and the stage type's: lower-case letters, digits and hyphens.
+    name: String,
+    /// What the stage is.
+    #[arg(long)]
+    kind: StageKind,
+    /// What it is written in.
+    #[arg(long, default_value = "rust")]
+    lang: Language,
+    /// Make the folder in this one.
+    #[arg(long, value_name = "FOLDER", default_value = ".")]
+    into: PathBuf,
+    /// conefield's sources, which a Rust plugin builds against [default: those that this program was built from, if they
+    /// are still there, or else the published crates].
+    #[arg(long, value_name = "FOLDER")]
+    sources: Option<PathBuf>,
+}
+
+#[derive(Debug, Clone, Copy, PartialEq, Eq, ValueEnum)]
+enum StageKind {
+    Encoder,
+    Normalizer,
+    Field,
+    Projector,
+    Initializer,
+}
+
+#[derive(Debug, Clone, Copy, PartialEq, Eq, ValueEnum)]
+enum Language {
+    Rust,
+    C,
+}
+
+macro_rules! template {
+    ($name:literal) => {
+        include_str!(concat!("../../../../plugins/templates/", $name))
+    };
+}
+
+/// The contract, as C reads it.
+const HEADER: &str = include_str!("../../../../plugins/abi/include/conefield_plugin.h");
+
+/// What is written, and what comes of it.
+struct Start {
+    /// Names within the folder, and texts.
+    files: Vec<(String, String)>,
+    /// The library that they build to.
+    library: String,
+    /// The command that builds it.
+    build: &'static str,
+}
+
+impl StageKind {
+    fn kind(self) -> Kind {
+        match self {
+            Self::Encoder => Kind::Encoder,
+            Self::Normalizer => Kind::Normalizer,
+            Self::Field => Kind::Field,
+            Self::Projector => Kind::Projector,
+            Self::Initializer => Kind::Initializer,
+        }
+    }
+
+    /// The stage and its test, in Rust.
+    fn rust(self) -> [&'static str; 2] {
+        match self {
+            Self::Encoder => [template!("rust/encoder.rs"), template!("rust/encoder_test.rs")],
+            Self::Normalizer => [template!("rust/normalizer.rs"), template!("rust/normalizer_test.rs")],
+            Self::Field => [template!("rust/field.rs"), template!("rust/field_test.rs")],
+            Self::Projector => [template!("rust/projector.rs"), template!("rust/projector_test.rs")],
+            Self::Initializer => [template!("rust/initializer.rs"), template!("rust/initializer_test.rs")],
+        }
+    }
+
+    fn c(self) -> &'static str {
+        match self {
+            Self::Encoder => template!("c/encoder.c"),
+            Self::Normalizer => template!("c/normalizer.c"),
+            Self::Field => template!("c/field.c"),
+            Self::Projector => template!("c/projector.c"),
+            Self::Initializer => template!("c/initializer.c"),
+        }
+    }
+}
+
+impl New {
+    pub fn run(self) -> Result<()> {
+        let plain = |c: char| c.is_ascii_lowercase() || c.is_ascii_digit() || c == '-';
+        let good = self.name.starts_with(|c: char| c.is_ascii_lowercase())
+            && self.name.chars().all(plain)
+            && (2..=40).contains(&self.name.len())
+            && !self.name.ends_with('-');
+        if !good {
+            let expected = "2 to 40 lower-case letters, digits and hyphens, a letter first";
+            return Err(Error::invalid("plugins new", "NAME", format!("{:?}", self.name), expected));
+        }
+        let folder = self.into.join(&self.name);
+        if folder.exists() {
+            let expected = "a name of which there is no folder yet";
+            return Err(Error::invalid(folder.display().to_string(), "NAME", "something that is there", expected));
+        }
+        let Start { files, library, build } = match self.lang {
+            Language::Rust => self.rust()?,
+            Language::C => self.c(),
+        };
+        for (file, text) in &files {
+            let path = folder.join(file);
+            let parent = path.parent().unwrap_or(&folder);
+            fs::create_dir_all(parent).map_err(|e| Error::io(parent, e))?;
+            conefield_io::write_text_atomic(&path, text)?;
+        }
+        out::say(&format!(
+            "{}: {} files. Next:\n  cd {}\n  {build}\n  conefield plugins check {library}\n  conefield --plugin {library} \
+             reconstruct SCAN --spec spec.toml -o run",
+            folder.display(),
+            files.len(),
+            folder.display(),
+        ))
+    }
+
+    fn rust(&self) -> Result<Start> {
+        let [stage, test] = self.kind.rust();
+        let files = vec![
+            ("Cargo.toml".into(), self.fill(template!("rust/Cargo.toml"))?),
+            (".gitignore".into(), "/target\n".into()),
+            ("src/lib.rs".into(), self.fill(stage)?),
+            ("tests/conformance.rs".into(), self.fill(test)?),
+            ("spec.toml".into(), self.spec()),
+        ];
+        let name = self.name.replace('-', "_");
+        let (prefix, suffix) = (std::env::consts::DLL_PREFIX, std::env::consts::DLL_SUFFIX);
+        let library = format!("target/release/{prefix}{name}{suffix}");
+        Ok(Start { files, library, build: "cargo build --release" })
+    }
+
+    fn c(&self) -> Start {
+        let named = |text: &str| text.replace("@name@", &self.name);
+        let files = vec![
+            (format!("{}.c", self.name), named(self.kind.c())),
+            ("conefield_plugin.h".into(), HEADER.into()),
+            ("Makefile".into(), named(template!("c/Makefile"))),
+            ("spec.toml".into(), self.spec()),
+        ];
+        Start { files, library: format!("./{}.so", self.name), build: "make" }
+    }
+
+    /// A small pipeline with the new stage in it.
+    fn spec(&self) -> String {
+        let (name, kind) = (&self.name, self.kind.kind());
+        let table = if kind == Kind::Normalizer { "[[normalizers]]".into() } else { format!("[{kind}]") };
+        format!(
+            "# The small spec that ships with conefield, with the stage of this plugin.\nextends = \"fast\"\nname = \
+             \"{name}\"\n\n{table}\ntype = \"{name}\"\n"
+        )
+    }
+
+    /// A Rust template with names and dependencies filled in.
+    fn fill(&self, template: &str) -> Result<String> {
+        let from = |package: &str, folder: &str| -> Result<String> {
+            Ok(match self.sources()? {
+                Some(root) => {
+                    let path = toml::Value::String(root.join(folder).display().to_string());
+                    format!("{package} = {{ path = {path} }}")
+                }
+                None => format!("{package} = \"{}\"", env!("CARGO_PKG_VERSION")),
+            })
+        };
+        Ok(template
+            .replace("@sdk@", &from("conefield-plugin", "plugins/sdk")?)
+            .replace("@kit@", &from("conefield-conformance", "tests/kit")?)
+            .replace("@name@", &self.name)
+            .replace("@crate@", &self.name.replace('-', "_")))
+    }
+
+    /// Where conefield's sources lie.
+    fn sources(&self) -> Result<Option<PathBuf>> {
+        let sound = |root: &Path| root.join("plugins/sdk/Cargo.toml").is_file();
+        match &self.sources {
+            Some(root) if sound(root) => root.canonicalize().map(Some).map_err(|e| Error::io(root, e)),
+            Some(root) => {
+                let expected = "a folder with conefield's sources: it has plugins/sdk";
+                Err(Error::invalid("plugins new", "--sources", root.display(), expected))
+            }
+            None => {
+                let root = Path::new(env!("CARGO_MANIFEST_DIR")).parent().map(Path::to_path_buf);
+                Ok(root.filter(|r| sound(r)))
+            }
+        }
+    }
+}

@@ -1,0 +1,163 @@
+/* An encoder for conefield in C: points of the unit cube to features.
+ *
+ * This start has waves of doubling frequency along each axis, each with an amplitude that is learned:
+ * y = a * sin(2^k * pi * x). `conefield plugins check` compares its gradients with finite differences.
+ */
+#include "conefield_plugin.h"
+
+#include <math.h>
+#include <stdio.h>
+#include <stdlib.h>
+#include <string.h>
+
+#define TEXT(literal) { (const uint8_t *)(literal), sizeof(literal) - 1 }
+
+/* Writes a line for people. */
+static void say(struct ConefieldText *out, const char *line) {
+    if (out == NULL) return;
+    out->length = strlen(line);
+    memcpy(out->data, line, out->length < out->capacity ? out->length : out->capacity);
+}
+
+/* The number under `key` of the settings. The host has checked them against the schema and filled in defaults: they are one
+ * flat JSON object, and the key is there. */
+static double number(struct ConefieldStr settings, const char *key) {
+    char text[1024], quoted[64];
+    size_t n = settings.length < sizeof text - 1 ? settings.length : sizeof text - 1;
+    memcpy(text, settings.data, n);
+    text[n] = 0;
+    snprintf(quoted, sizeof quoted, "\"%s\":", key);
+    const char *at = strstr(text, quoted);
+    return at == NULL ? 0.0 : strtod(at + strlen(quoted), NULL);
+}
+
+typedef struct {
+    size_t bands;
+    size_t shape[2];
+} Waves;
+
+static ConefieldStatus create(const void *context, struct ConefieldStr settings, size_t width, void **stage,
+                              struct ConefieldText *error) {
+    (void)context;
+    (void)width; /* 3, of an encoder */
+    double bands = number(settings, "bands");
+    if (!(bands >= 1 && bands <= 16)) {
+        char line[80];
+        snprintf(line, sizeof line, "bands: found %g, expected 1 to 16", bands);
+        say(error, line);
+        return CONEFIELD_INVALID;
+    }
+    Waves *w = malloc(sizeof *w);
+    if (w == NULL) return CONEFIELD_FAILED;
+    *w = (Waves){.bands = (size_t)bands, .shape = {3, (size_t)bands}};
+    *stage = w;
+    return CONEFIELD_OK;
+}
+
+static void destroy(void *stage) {
+    free(stage);
+}
+
+static ConefieldStatus describe(const void *stage, struct ConefieldText *text) {
+    char line[80];
+    snprintf(line, sizeof line, "%zu waves along each axis", ((const Waves *)stage)->bands);
+    say(text, line);
+    return CONEFIELD_OK;
+}
+
+static ConefieldStatus info(const void *stage, struct ConefieldInfo *out) {
+    size_t n = 3 * ((const Waves *)stage)->bands;
+    *out = (struct ConefieldInfo){.input = 3, .output = n, .params = n, .blocks = 1, .macs = 10 * n,
+                                  .scope = CONEFIELD_SCOPE_ROW, .grads = CONEFIELD_GRADS_DENSE};
+    return CONEFIELD_OK;
+}
+
+static ConefieldStatus parameter(const void *stage, size_t index, struct ConefieldParameter *out) {
+    (void)index; /* there is one block */
+    *out = (struct ConefieldParameter){.name = TEXT("amplitude"), .shape = ((const Waves *)stage)->shape, .dimensions = 2};
+    return CONEFIELD_OK;
+}
+
+static ConefieldStatus init(const void *stage, uint64_t seed, float *params, size_t length, struct ConefieldText *error) {
+    (void)stage;
+    (void)seed;
+    (void)error;
+    for (size_t i = 0; i < length; i++) params[i] = 1.0f;
+    return CONEFIELD_OK;
+}
+
+/* The angular frequency of channel `c`. */
+static float frequency(const Waves *w, size_t c) {
+    return 3.14159265358979f * (float)(1u << (c % w->bands));
+}
+
+static ConefieldStatus forward(const void *stage, const float *params, struct ConefieldTile x,
+                               struct ConefieldTileMut y, struct ConefieldTileMut tape, struct ConefieldText *error) {
+    (void)tape;
+    (void)error;
+    const Waves *w = stage;
+    for (size_t c = 0; c < 3 * w->bands; c++) {
+        const float *from = x.data + (c / w->bands) * x.stride;
+        float *to = y.data + c * y.stride;
+        for (size_t i = 0; i < x.rows; i++) to[i] = params[c] * sinf(frequency(w, c) * from[i]);
+    }
+    return CONEFIELD_OK;
+}
+
+static ConefieldStatus backward(const void *stage, const float *params, struct ConefieldTile x,
+                                struct ConefieldTileMut tape, struct ConefieldTile dy, struct ConefieldGrads grads,
+                                struct ConefieldTileMut dx, struct ConefieldText *error) {
+    (void)tape;
+    (void)error;
+    const Waves *w = stage;
+    for (size_t c = 0; c < dx.channels; c++) memset(dx.data + c * dx.stride, 0, dx.rows * sizeof(float));
+    for (size_t c = 0; c < 3 * w->bands; c++) {
+        size_t axis = c / w->bands;
+        const float *from = x.data + axis * x.stride, *d = dy.data + c * dy.stride;
+        float f = frequency(w, c), sum = 0;
+        for (size_t i = 0; i < x.rows; i++) {
+            sum += d[i] * sinf(f * from[i]);
+            if (dx.data != NULL) dx.data[axis * dx.stride + i] += d[i] * params[c] * f * cosf(f * from[i]);
+        }
+        if (c >= grads.start && c - grads.start < grads.length) grads.data[c - grads.start] += sum;
+    }
+    return CONEFIELD_OK;
+}
+
+static const struct ConefieldMap MAP = {
+    .size = sizeof MAP,
+    .info = info,
+    .parameter = parameter,
+    .init = init,
+    .forward = forward,
+    .backward = backward,
+};
+
+static const struct ConefieldStage STAGES[] = {{
+    .kind = CONEFIELD_ENCODER,
+    .name = TEXT("@name@"),
+    .doc = TEXT("waves of doubling frequency with learned amplitudes"),
+    .schema = TEXT(
+        "{\"type\":\"object\",\"properties\":{\"bands\":{\"type\":\"integer\",\"minimum\":1,\"maximum\":16,\"default\":6,"
+        "\"description\":\"Frequencies along each axis.\"}},\"examples\":[{\"bands\":1}]}"),
+    .create = create,
+    .destroy = destroy,
+    .describe = describe,
+    .map = &MAP,
+}};
+
+static const struct ConefieldPlugin PLUGIN = {
+    .size = sizeof PLUGIN,
+    .abi_major = CONEFIELD_ABI_MAJOR,
+    .abi_minor = CONEFIELD_ABI_MINOR,
+    .name = TEXT("@name@"),
+    .version = TEXT("0.1.0"),
+    .licence = TEXT("Apache-2.0 OR MIT"),
+    .stages = STAGES,
+    .stage_count = sizeof STAGES / sizeof *STAGES,
+    .stage_size = sizeof *STAGES,
+};
+
+const struct ConefieldPlugin *conefield_plugin(void) {
+    return &PLUGIN;
+}

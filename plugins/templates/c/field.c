@@ -1,0 +1,164 @@
+/* A field for conefield in C: features to attenuation.
+ *
+ * This start is a weighted sum through a softplus, which is never negative: y = log(1 + exp(w * x + b)).
+ * `conefield plugins check` compares its gradients with finite differences.
+ */
+#include "conefield_plugin.h"
+
+#include <math.h>
+#include <stdio.h>
+#include <stdlib.h>
+#include <string.h>
+
+#define TEXT(literal) { (const uint8_t *)(literal), sizeof(literal) - 1 }
+
+/* Writes a line for people. */
+static void say(struct ConefieldText *out, const char *line) {
+    if (out == NULL) return;
+    out->length = strlen(line);
+    memcpy(out->data, line, out->length < out->capacity ? out->length : out->capacity);
+}
+
+/* The number under `key` of the settings. The host has checked them against the schema and filled in defaults: they are one
+ * flat JSON object, and the key is there. */
+static double number(struct ConefieldStr settings, const char *key) {
+    char text[1024], quoted[64];
+    size_t n = settings.length < sizeof text - 1 ? settings.length : sizeof text - 1;
+    memcpy(text, settings.data, n);
+    text[n] = 0;
+    snprintf(quoted, sizeof quoted, "\"%s\":", key);
+    const char *at = strstr(text, quoted);
+    return at == NULL ? 0.0 : strtod(at + strlen(quoted), NULL);
+}
+
+typedef struct {
+    size_t width, one;
+    double bias;
+} Sum;
+
+static ConefieldStatus create(const void *context, struct ConefieldStr settings, size_t width, void **stage,
+                              struct ConefieldText *error) {
+    (void)context;
+    (void)error;
+    Sum *s = malloc(sizeof *s);
+    if (s == NULL) return CONEFIELD_FAILED;
+    *s = (Sum){.width = width, .one = 1, .bias = number(settings, "bias")};
+    *stage = s;
+    return CONEFIELD_OK;
+}
+
+static void destroy(void *stage) {
+    free(stage);
+}
+
+static ConefieldStatus describe(const void *stage, struct ConefieldText *text) {
+    char line[80];
+    snprintf(line, sizeof line, "softplus of a sum of %zu channels", ((const Sum *)stage)->width);
+    say(text, line);
+    return CONEFIELD_OK;
+}
+
+/* One number of tape: the slope of the softplus. */
+static ConefieldStatus info(const void *stage, struct ConefieldInfo *out) {
+    size_t n = ((const Sum *)stage)->width;
+    *out = (struct ConefieldInfo){.input = n, .output = 1, .params = n + 1, .blocks = 2, .tape = 1, .macs = n,
+                                  .scope = CONEFIELD_SCOPE_ROW, .grads = CONEFIELD_GRADS_DENSE};
+    return CONEFIELD_OK;
+}
+
+static ConefieldStatus parameter(const void *stage, size_t index, struct ConefieldParameter *out) {
+    static const struct ConefieldStr names[] = {TEXT("weight"), TEXT("bias")};
+    const Sum *s = stage;
+    *out = (struct ConefieldParameter){.name = names[index], .shape = index == 0 ? &s->width : &s->one, .dimensions = 1};
+    return CONEFIELD_OK;
+}
+
+static ConefieldStatus init(const void *stage, uint64_t seed, float *params, size_t length, struct ConefieldText *error) {
+    (void)error;
+    const Sum *s = stage;
+    float bound = 1.0f / sqrtf((float)s->width);
+    for (size_t i = 0; i < length; i++) {
+        seed = seed * 6364136223846793005u + 1442695040888963407u;
+        params[i] = bound * (2.0f * (float)(seed >> 40) / 16777216.0f - 1.0f);
+    }
+    params[s->width] = (float)s->bias;
+    return CONEFIELD_OK;
+}
+
+static ConefieldStatus forward(const void *stage, const float *params, struct ConefieldTile x,
+                               struct ConefieldTileMut y, struct ConefieldTileMut tape, struct ConefieldText *error) {
+    (void)error;
+    const Sum *s = stage;
+    for (size_t i = 0; i < x.rows; i++) y.data[i] = params[s->width];
+    for (size_t c = 0; c < s->width; c++)
+        for (size_t i = 0; i < x.rows; i++) y.data[i] += params[c] * x.data[c * x.stride + i];
+    for (size_t i = 0; i < x.rows; i++) {
+        float sum = y.data[i];
+        tape.data[i] = 1.0f / (1.0f + expf(-sum));
+        y.data[i] = fmaxf(sum, 0.0f) + log1pf(expf(-fabsf(sum)));
+    }
+    return CONEFIELD_OK;
+}
+
+/* Adds to the gradient of parameter `at`, if that is asked for. */
+static void add(struct ConefieldGrads grads, size_t at, float sum) {
+    if (at >= grads.start && at - grads.start < grads.length) grads.data[at - grads.start] += sum;
+}
+
+static ConefieldStatus backward(const void *stage, const float *params, struct ConefieldTile x,
+                                struct ConefieldTileMut tape, struct ConefieldTile dy, struct ConefieldGrads grads,
+                                struct ConefieldTileMut dx, struct ConefieldText *error) {
+    (void)error;
+    const Sum *s = stage;
+    float bias = 0;
+    /* From here on the tape holds the gradient of the sum. */
+    for (size_t i = 0; i < x.rows; i++) bias += tape.data[i] *= dy.data[i];
+    for (size_t c = 0; c < s->width; c++) {
+        float weight = 0;
+        for (size_t i = 0; i < x.rows; i++) {
+            weight += x.data[c * x.stride + i] * tape.data[i];
+            if (dx.data != NULL) dx.data[c * dx.stride + i] = params[c] * tape.data[i];
+        }
+        add(grads, c, weight);
+    }
+    add(grads, s->width, bias);
+    return CONEFIELD_OK;
+}
+
+static const struct ConefieldMap MAP = {
+    .size = sizeof MAP,
+    .info = info,
+    .parameter = parameter,
+    .init = init,
+    .forward = forward,
+    .backward = backward,
+};
+
+static const struct ConefieldStage STAGES[] = {{
+    .kind = CONEFIELD_FIELD,
+    .name = TEXT("@name@"),
+    .doc = TEXT("a weighted sum through a softplus"),
+    .schema = TEXT(
+        "{\"type\":\"object\",\"properties\":{\"bias\":{\"type\":\"number\",\"default\":-1.0,"
+        "\"description\":\"The shift that training starts from.\"}}}"),
+    .create = create,
+    .destroy = destroy,
+    .describe = describe,
+    .map = &MAP,
+}};
+
+static const struct ConefieldPlugin PLUGIN = {
+    .size = sizeof PLUGIN,
+    .abi_major = CONEFIELD_ABI_MAJOR,
+    .abi_minor = CONEFIELD_ABI_MINOR,
+    .name = TEXT("@name@"),
+    .version = TEXT("0.1.0"),
+    .licence = TEXT("Apache-2.0 OR MIT"),
+    .stages = STAGES,
+    .stage_count = sizeof STAGES / sizeof *STAGES,
+    .stage_size = sizeof *STAGES,
+};
+
+const struct ConefieldPlugin *conefield_plugin(void) {
+    return &PLUGIN;
+}

@@ -1,0 +1,176 @@
+/* A normalizer for conefield in C: features to features.
+ *
+ * This start scales and shifts every channel by numbers that are learned: y = w * x + b. `conefield plugins check` compares
+ * its gradients with finite differences.
+ */
+#include "conefield_plugin.h"
+
+#include <math.h>
+#include <stdio.h>
+#include <stdlib.h>
+#include <string.h>
+
+#define TEXT(literal) { (const uint8_t *)(literal), sizeof(literal) - 1 }
+
+/* Writes a line for people. */
+static void say(struct ConefieldText *out, const char *line) {
+    if (out == NULL) return;
+    out->length = strlen(line);
+    memcpy(out->data, line, out->length < out->capacity ? out->length : out->capacity);
+}
+
+/* The number under `key` of the settings. The host has checked them against the schema and filled in defaults: they are one
+ * flat JSON object, and the key is there. */
+static double number(struct ConefieldStr settings, const char *key) {
+    char text[1024], quoted[64];
+    size_t n = settings.length < sizeof text - 1 ? settings.length : sizeof text - 1;
+    memcpy(text, settings.data, n);
+    text[n] = 0;
+    snprintf(quoted, sizeof quoted, "\"%s\":", key);
+    const char *at = strstr(text, quoted);
+    return at == NULL ? 0.0 : strtod(at + strlen(quoted), NULL);
+}
+
+typedef struct {
+    size_t width;
+    double scale;
+} Affine;
+
+static ConefieldStatus create(const void *context, struct ConefieldStr settings, size_t width, void **stage,
+                              struct ConefieldText *error) {
+    (void)context;
+    (void)error;
+    Affine *a = malloc(sizeof *a);
+    if (a == NULL) return CONEFIELD_FAILED;
+    *a = (Affine){.width = width, .scale = number(settings, "scale")};
+    *stage = a;
+    return CONEFIELD_OK;
+}
+
+static void destroy(void *stage) {
+    free(stage);
+}
+
+static ConefieldStatus describe(const void *stage, struct ConefieldText *text) {
+    char line[80];
+    snprintf(line, sizeof line, "%zu channels, each with a scale and a shift", ((const Affine *)stage)->width);
+    say(text, line);
+    return CONEFIELD_OK;
+}
+
+static ConefieldStatus info(const void *stage, struct ConefieldInfo *out) {
+    size_t n = ((const Affine *)stage)->width;
+    *out = (struct ConefieldInfo){.input = n, .output = n, .params = 2 * n, .blocks = 2, .macs = n,
+                                  .scope = CONEFIELD_SCOPE_ROW, .grads = CONEFIELD_GRADS_DENSE};
+    return CONEFIELD_OK;
+}
+
+static ConefieldStatus parameter(const void *stage, size_t index, struct ConefieldParameter *out) {
+    static const struct ConefieldStr names[] = {TEXT("scale"), TEXT("shift")};
+    *out = (struct ConefieldParameter){.name = names[index], .shape = &((const Affine *)stage)->width, .dimensions = 1};
+    return CONEFIELD_OK;
+}
+
+static ConefieldStatus init(const void *stage, uint64_t seed, float *params, size_t length, struct ConefieldText *error) {
+    (void)seed;
+    (void)error;
+    const Affine *a = stage;
+    for (size_t i = 0; i < length; i++) params[i] = i < a->width ? (float)a->scale : 0.0f;
+    return CONEFIELD_OK;
+}
+
+static ConefieldStatus forward(const void *stage, const float *params, struct ConefieldTile x,
+                               struct ConefieldTileMut y, struct ConefieldTileMut tape, struct ConefieldText *error) {
+    (void)tape;
+    (void)error;
+    size_t n = ((const Affine *)stage)->width;
+    for (size_t c = 0; c < n; c++)
+        for (size_t i = 0; i < x.rows; i++)
+            y.data[c * y.stride + i] = params[c] * x.data[c * x.stride + i] + params[n + c];
+    return CONEFIELD_OK;
+}
+
+/* Adds to the gradient of parameter `at`, if that is asked for. */
+static void add(struct ConefieldGrads grads, size_t at, float sum) {
+    if (at >= grads.start && at - grads.start < grads.length) grads.data[at - grads.start] += sum;
+}
+
+static ConefieldStatus backward(const void *stage, const float *params, struct ConefieldTile x,
+                                struct ConefieldTileMut tape, struct ConefieldTile dy, struct ConefieldGrads grads,
+                                struct ConefieldTileMut dx, struct ConefieldText *error) {
+    (void)tape;
+    (void)error;
+    size_t n = ((const Affine *)stage)->width;
+    for (size_t c = 0; c < n; c++) {
+        const float *d = dy.data + c * dy.stride, *from = x.data + c * x.stride;
+        float scale = 0, shift = 0;
+        for (size_t i = 0; i < x.rows; i++) {
+            scale += d[i] * from[i];
+            shift += d[i];
+            if (dx.data != NULL) dx.data[c * dx.stride + i] = params[c] * d[i];
+        }
+        add(grads, c, scale);
+        add(grads, n + c, shift);
+    }
+    return CONEFIELD_OK;
+}
+
+/* Channels stand alone: without some, the rest is a smaller stage of the same kind. The lists of what it keeps live as long
+ * as it does, behind it in the same memory. */
+static ConefieldStatus reduce(const void *stage, uint32_t side, const size_t *keep, size_t count,
+                              struct ConefieldReduced *out, struct ConefieldText *error) {
+    (void)side;
+    (void)error;
+    const Affine *a = stage;
+    Affine *smaller = malloc(sizeof *smaller + 2 * count * sizeof(struct ConefieldRange) + count * sizeof(size_t));
+    if (smaller == NULL) return CONEFIELD_FAILED;
+    *smaller = (Affine){.width = count, .scale = a->scale};
+    struct ConefieldRange *params = (struct ConefieldRange *)(smaller + 1);
+    size_t *channels = (size_t *)(params + 2 * count);
+    for (size_t i = 0; i < count; i++) {
+        channels[i] = keep[i];
+        params[i] = (struct ConefieldRange){keep[i], keep[i] + 1};
+        params[count + i] = (struct ConefieldRange){a->width + keep[i], a->width + keep[i] + 1};
+    }
+    *out = (struct ConefieldReduced){smaller, params, 2 * count, channels, count};
+    return CONEFIELD_OK;
+}
+
+static const struct ConefieldMap MAP = {
+    .size = sizeof MAP,
+    .info = info,
+    .parameter = parameter,
+    .init = init,
+    .forward = forward,
+    .backward = backward,
+    .reduce = reduce,
+};
+
+static const struct ConefieldStage STAGES[] = {{
+    .kind = CONEFIELD_NORMALIZER,
+    .name = TEXT("@name@"),
+    .doc = TEXT("a learned scale and shift of every channel"),
+    .schema = TEXT(
+        "{\"type\":\"object\",\"properties\":{\"scale\":{\"type\":\"number\",\"default\":1.0,"
+        "\"description\":\"The scale that training starts from.\"}}}"),
+    .create = create,
+    .destroy = destroy,
+    .describe = describe,
+    .map = &MAP,
+}};
+
+static const struct ConefieldPlugin PLUGIN = {
+    .size = sizeof PLUGIN,
+    .abi_major = CONEFIELD_ABI_MAJOR,
+    .abi_minor = CONEFIELD_ABI_MINOR,
+    .name = TEXT("@name@"),
+    .version = TEXT("0.1.0"),
+    .licence = TEXT("Apache-2.0 OR MIT"),
+    .stages = STAGES,
+    .stage_count = sizeof STAGES / sizeof *STAGES,
+    .stage_size = sizeof *STAGES,
+};
+
+const struct ConefieldPlugin *conefield_plugin(void) {
+    return &PLUGIN;
+}

@@ -1,0 +1,120 @@
+/* A projector for conefield in C: rays to samples, each with the length that it stands for.
+ *
+ * This start takes the middles of equal intervals within the reconstruction box. The line integral is the sum of
+ * attenuation times length; the host does that, and its adjoint, where `integrate` and `adjoint` are left out.
+ */
+#include "conefield_plugin.h"
+
+#include <math.h>
+#include <stdio.h>
+#include <stdlib.h>
+#include <string.h>
+
+#define TEXT(literal) { (const uint8_t *)(literal), sizeof(literal) - 1 }
+
+/* Writes a line for people. */
+static void say(struct ConefieldText *out, const char *line) {
+    if (out == NULL) return;
+    out->length = strlen(line);
+    memcpy(out->data, line, out->length < out->capacity ? out->length : out->capacity);
+}
+
+/* The number under `key` of the settings. The host has checked them against the schema and filled in defaults: they are one
+ * flat JSON object, and the key is there. */
+static double number(struct ConefieldStr settings, const char *key) {
+    char text[1024], quoted[64];
+    size_t n = settings.length < sizeof text - 1 ? settings.length : sizeof text - 1;
+    memcpy(text, settings.data, n);
+    text[n] = 0;
+    snprintf(quoted, sizeof quoted, "\"%s\":", key);
+    const char *at = strstr(text, quoted);
+    return at == NULL ? 0.0 : strtod(at + strlen(quoted), NULL);
+}
+
+typedef struct {
+    size_t samples;
+} March;
+
+static ConefieldStatus create(const void *context, struct ConefieldStr settings, size_t width, void **stage,
+                              struct ConefieldText *error) {
+    (void)context;
+    (void)width;
+    double samples = number(settings, "samples");
+    if (!(samples >= 1 && samples <= 65536)) {
+        char line[80];
+        snprintf(line, sizeof line, "samples: found %g, expected 1 to 65536", samples);
+        say(error, line);
+        return CONEFIELD_INVALID;
+    }
+    March *m = malloc(sizeof *m);
+    if (m == NULL) return CONEFIELD_FAILED;
+    m->samples = (size_t)samples;
+    *stage = m;
+    return CONEFIELD_OK;
+}
+
+static void destroy(void *stage) {
+    free(stage);
+}
+
+static ConefieldStatus describe(const void *stage, struct ConefieldText *text) {
+    char line[80];
+    snprintf(line, sizeof line, "%zu samples a ray", ((const March *)stage)->samples);
+    say(text, line);
+    return CONEFIELD_OK;
+}
+
+static size_t max_samples(const void *stage, const struct ConefieldRay *ray) {
+    return ray->inside[1] > ray->inside[0] ? ((const March *)stage)->samples : 0;
+}
+
+static ConefieldStatus sample(const void *stage, const struct ConefieldRay *ray, const uint64_t *seed, float *points,
+                              float *weights, size_t capacity, size_t *count, struct ConefieldText *error) {
+    (void)seed; /* nothing is random here */
+    (void)capacity; /* as many as max_samples said */
+    (void)error;
+    size_t n = max_samples(stage, ray);
+    float near = ray->inside[0], length = n > 0 ? (ray->inside[1] - near) / (float)n : 0.0f;
+    for (size_t i = 0; i < n; i++) {
+        float t = near + ((float)i + 0.5f) * length;
+        for (size_t k = 0; k < 3; k++) points[3 * i + k] = ray->origin[k] + t * ray->direction[k];
+        weights[i] = length;
+    }
+    *count = n;
+    return CONEFIELD_OK;
+}
+
+static const struct ConefieldProjector PROJECTOR = {
+    .size = sizeof PROJECTOR,
+    .max_samples = max_samples,
+    .sample = sample,
+};
+
+static const struct ConefieldStage STAGES[] = {{
+    .kind = CONEFIELD_PROJECTOR,
+    .name = TEXT("@name@"),
+    .doc = TEXT("equal intervals within the box"),
+    .schema = TEXT(
+        "{\"type\":\"object\",\"properties\":{\"samples\":{\"type\":\"integer\",\"minimum\":1,\"default\":128,"
+        "\"description\":\"Samples of every ray that meets the box.\"}}}"),
+    .create = create,
+    .destroy = destroy,
+    .describe = describe,
+    .projector = &PROJECTOR,
+}};
+
+static const struct ConefieldPlugin PLUGIN = {
+    .size = sizeof PLUGIN,
+    .abi_major = CONEFIELD_ABI_MAJOR,
+    .abi_minor = CONEFIELD_ABI_MINOR,
+    .name = TEXT("@name@"),
+    .version = TEXT("0.1.0"),
+    .licence = TEXT("Apache-2.0 OR MIT"),
+    .stages = STAGES,
+    .stage_count = sizeof STAGES / sizeof *STAGES,
+    .stage_size = sizeof *STAGES,
+};
+
+const struct ConefieldPlugin *conefield_plugin(void) {
+    return &PLUGIN;
+}

@@ -1,0 +1,13 @@
+//! The stage through conefield's conformance kit.
+
+use @crate@::Settings;
+use conefield_conformance::{Options, check_field};
+use conefield_plugin::spec::FieldSpec;
+
+#[test]
+fn it_conforms() {
+    for width in [1, 5, 20] {
+        let report = check_field(Settings::default().build(width).unwrap().as_ref(), &Options::features());
+        assert!(report.passed(), "{report}");
+    }
+}

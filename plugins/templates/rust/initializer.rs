@@ -1,0 +1,60 @@
+//! An initializer for conefield: fills parameters before training.
+//!
+//! This start fills every block whose name begins with `prefix` with uniform numbers; every other block stays as its
+//! stage's own scheme made it.
+
+use conefield_plugin::arena::{Arena, InitReport, Layout, Weights};
+use conefield_plugin::error::{Result, ensure};
+use conefield_plugin::random::{mix, unit};
+use conefield_plugin::spec::{Initializer, InitializerSpec};
+use schemars::JsonSchema;
+use serde::{Deserialize, Serialize};
+
+conefield_plugin::export!();
+conefield_plugin::stage_type!(Initializer, "@name@", Settings, "uniform numbers in the blocks of one stage");
+
+/// What a spec may set.
+#[derive(Debug, Clone, Serialize, Deserialize, JsonSchema)]
+#[serde(deny_unknown_fields, default)]
+pub struct Settings {
+    /// Fill blocks whose name begins with this, such as `encoder` or `field.0.weight`.
+    pub prefix: String,
+    /// Numbers lie between plus and minus this.
+    pub bound: f32,
+}
+
+impl Default for Settings {
+    fn default() -> Self {
+        Self { prefix: "encoder".into(), bound: 1e-4 }
+    }
+}
+
+#[typetag::serde(name = "@name@")]
+impl InitializerSpec for Settings {
+    fn build(&self, _: &dyn Fn(&str) -> Result<Weights>) -> Result<Box<dyn Initializer>> {
+        let good = self.bound.is_finite() && self.bound >= 0.0;
+        ensure(good, "spec", "initializer.bound", self.bound, "a finite number of at least 0")?;
+        Ok(Box::new(self.clone()))
+    }
+}
+
+impl Initializer for Settings {
+    fn apply(&self, layout: &Layout, arena: &mut Arena) -> Result<InitReport> {
+        let mut report = InitReport::default();
+        for block in &layout.blocks {
+            if !block.name.starts_with(&self.prefix) {
+                report.fresh.push((block.name.clone(), "not asked for".into()));
+                continue;
+            }
+            for i in block.range.clone() {
+                arena.params[i] = self.bound * (2.0 * unit(mix(1, i as u64)) - 1.0);
+            }
+            report.loaded.push(block.name.clone());
+        }
+        Ok(report)
+    }
+
+    fn describe(&self) -> String {
+        format!("@name@: {} within {}", self.prefix, self.bound)
+    }
+}

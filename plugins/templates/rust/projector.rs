@@ -1,0 +1,65 @@
+//! A projector for conefield: rays to samples, each with the length that it stands for.
+//!
+//! This start takes the middles of equal intervals within the reconstruction box. The line integral is the sum of
+//! attenuation times length, and its adjoint comes with the trait.
+
+use conefield_plugin::error::{Result, ensure};
+use conefield_plugin::random::{mix, unit};
+use conefield_plugin::spec::ProjectorSpec;
+use conefield_plugin::stage::{Projector, Samples, UnitRay};
+use schemars::JsonSchema;
+use serde::{Deserialize, Serialize};
+
+conefield_plugin::export!();
+conefield_plugin::stage_type!(Projector, "@name@", Settings, "equal intervals within the box");
+
+/// What a spec may set.
+#[derive(Debug, Clone, Serialize, Deserialize, JsonSchema)]
+#[serde(deny_unknown_fields, default)]
+pub struct Settings {
+    /// Samples of every ray that meets the box.
+    pub samples: usize,
+    /// Take a random place in every interval instead of its middle.
+    pub random: bool,
+}
+
+impl Default for Settings {
+    fn default() -> Self {
+        Self { samples: 128, random: false }
+    }
+}
+
+#[typetag::serde(name = "@name@")]
+impl ProjectorSpec for Settings {
+    fn build(&self) -> Result<Box<dyn Projector>> {
+        ensure((1..=65_536).contains(&self.samples), "spec", "projector.samples", self.samples, "1 to 65536")?;
+        Ok(Box::new(self.clone()))
+    }
+}
+
+impl Projector for Settings {
+    fn max_samples(&self, ray: &UnitRay) -> usize {
+        let [near, far] = ray.inside;
+        if far > near { self.samples } else { 0 }
+    }
+
+    /// `seed` is `None` when a finished field is rendered: nothing is random then.
+    fn sample(&self, ray: &UnitRay, seed: Option<u64>, out: &mut Samples) {
+        let [near, far] = ray.inside;
+        let n = self.max_samples(ray);
+        let length = (far - near) / n as f32;
+        for i in 0..n {
+            let place = match seed {
+                Some(seed) if self.random => unit(mix(seed, i as u64)),
+                _ => 0.5,
+            };
+            let t = near + (i as f32 + place) * length;
+            out.points.push(std::array::from_fn(|k| ray.origin[k] + t * ray.direction[k]));
+            out.weights.push(length);
+        }
+    }
+
+    fn describe(&self) -> String {
+        format!("@name@: {} samples a ray", self.samples)
+    }
+}
