@@ -7,12 +7,10 @@
 //! PyTorch beside it.
 
 use conefield_backend_cpu::Cpu;
-use conefield_benches::{multiply_adds, random_reads, spread};
-use conefield_core::backend::{Adam, Backend, Loss, TrainRay, Work};
+use conefield_benches::{multiply_adds, random_reads, rays, spread};
+use conefield_core::backend::{Adam, Backend, Loss, Work};
 use conefield_core::pipeline::{Model, Pipeline};
-use conefield_core::random::{mix, unit};
 use conefield_core::spec::{EncoderSpec, FieldSpec, NormalizerSpec, ProjectorSpec};
-use conefield_core::stage::UnitRay;
 use conefield_encoders::hash_grid::HashGrid;
 use conefield_fields::mlp::Mlp;
 use conefield_normalizers::layer_norm::LayerNorm;
@@ -36,7 +34,7 @@ fn main() -> Result<(), Box<dyn Error>> {
     println!("backend              {}", explain.backend);
     let macs = pipeline.macs();
     let mut model = Model::random(pipeline, 1);
-    let rays = rays();
+    let rays = rays(RAYS);
     let (mut total, mut dense, mut scatter, mut adam) = (vec![], vec![], vec![], vec![]);
     for step in 1..=STEPS {
         let start = Instant::now();
@@ -100,23 +98,4 @@ fn main() -> Result<(), Box<dyn Error>> {
     let limit = 1.0 / (1.0 / by_math + 1.0 / by_reads);
     println!("  one after another  {:.1} M samples/s; reached {:.0} %", limit / 1e6, 100.0 * samples / step / limit);
     Ok(())
-}
-
-/// Rays of a scan at five half sides, through random pixels.
-fn rays() -> Vec<TrainRay> {
-    let random = |i: u64, k: u64| unit(mix(i, k));
-    (0..RAYS as u64)
-        .map(|i| {
-            let (s, c) = (random(i, 1) * std::f32::consts::TAU).sin_cos();
-            let origin = [0.5 + 2.5 * c, 0.5 + 2.5 * s, 0.5];
-            let (u, v) = (0.7 * (random(i, 2) - 0.5), 0.7 * (random(i, 3) - 0.5));
-            let to = [0.5 - u * s - origin[0], 0.5 + u * c - origin[1], 0.5 + v - origin[2]];
-            let length = to.iter().map(|d| d * d).sum::<f32>().sqrt();
-            let direction = to.map(|d| d / length);
-            TrainRay {
-                ray: UnitRay { origin, direction, inside: [2.0, 3.0], published: [1.8, 3.2], per_mm: 0.01 },
-                target: 0.3,
-            }
-        })
-        .collect()
 }

@@ -1,8 +1,11 @@
 //! Speed of conefield, measured in `benches/`, and what the machine allows at most, measured in the same run.
 
+use conefield_core::backend::TrainRay;
 use conefield_core::dense::{Weights, affine};
 use conefield_core::pages::Pages;
+use conefield_core::random::{mix, unit};
 use conefield_core::simd::{Op, Simd, run};
+use conefield_core::stage::UnitRay;
 use rayon::prelude::*;
 use std::time::Instant;
 
@@ -90,4 +93,23 @@ pub fn random_reads() -> f64 {
         })
         .collect();
     each.iter().sum()
+}
+
+/// `count` rays of a scan at five half sides, through random pixels.
+pub fn rays(count: usize) -> Vec<TrainRay> {
+    let random = |i: u64, k: u64| unit(mix(i, k));
+    (0..count as u64)
+        .map(|i| {
+            let (s, c) = (random(i, 1) * std::f32::consts::TAU).sin_cos();
+            let origin = [0.5 + 2.5 * c, 0.5 + 2.5 * s, 0.5];
+            let (u, v) = (0.7 * (random(i, 2) - 0.5), 0.7 * (random(i, 3) - 0.5));
+            let to = [0.5 - u * s - origin[0], 0.5 + u * c - origin[1], 0.5 + v - origin[2]];
+            let length = to.iter().map(|d| d * d).sum::<f32>().sqrt();
+            let direction = to.map(|d| d / length);
+            TrainRay {
+                ray: UnitRay { origin, direction, inside: [2.0, 3.0], published: [1.8, 3.2], per_mm: 0.01 },
+                target: 0.3,
+            }
+        })
+        .collect()
 }

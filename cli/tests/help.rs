@@ -3,7 +3,7 @@
 mod common;
 use common::{conefield, done, refused};
 
-const COMMANDS: [&str; 13] = [
+const COMMANDS: [&str; 14] = [
     "simulate",
     "import",
     "reconstruct",
@@ -15,6 +15,7 @@ const COMMANDS: [&str; 13] = [
     "info",
     "convert",
     "backends",
+    "plugins",
     "schema",
     "demo",
 ];

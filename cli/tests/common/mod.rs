@@ -4,9 +4,10 @@ use assert_cmd::Command;
 use serde_json::Value;
 use std::path::Path;
 
-/// The command with `args`, quiet.
+/// The command with `args`, quiet, without the plugins of whoever runs the tests.
 pub fn conefield(args: &[&str]) -> Command {
     let mut c = Command::cargo_bin("conefield").expect("the command is built with its tests");
+    c.env_remove("CONEFIELD_PLUGIN_PATH").env("XDG_DATA_HOME", env!("CARGO_TARGET_TMPDIR"));
     c.arg("--quiet").args(args);
     c
 }

@@ -1,0 +1,183 @@
+//! A pipeline with stages of plugins is the same as one with the same code built in: same bits of weights and volume, and
+//! after a kill the same bits again.
+
+use crate::build::example;
+use crate::common::{conefield, done, json, refused, text};
+use conefield_backend_cpu::Cpu;
+use conefield_core::solver::{Job, Limits, Silent};
+use std::path::{Path, PathBuf};
+
+// Stage types register themselves where their crate is linked.
+use conefield_encoders as _;
+use conefield_fields as _;
+use conefield_initializers as _;
+use conefield_normalizers as _;
+use conefield_projectors as _;
+use conefield_solvers as _;
+
+// The plugins' own files, built into this test.
+#[path = "../../../plugins/examples/triplane/src/planes.rs"]
+mod planes;
+#[path = "../../../plugins/examples/siren/src/sine.rs"]
+mod sine;
+#[path = "../../../plugins/examples/siren/src/smooth.rs"]
+mod smooth;
+
+const SPEC: &str = r#"
+name = "of plugins"
+
+[encoder]
+type = "triplane"
+resolution = 12
+features = 3
+
+[[normalizers]]
+type = "layer-norm"
+
+[[normalizers]]
+type = "ray-smooth"
+
+[field]
+type = "siren"
+width = 12
+
+[projector]
+type = "ray-march"
+samples = 24
+sampling = "stratified"
+
+[initializer]
+type = "random"
+
+[solver]
+type = "gradient"
+rays = 48
+"#;
+
+struct Place {
+    dir: tempfile::TempDir,
+    scan: PathBuf,
+    spec: PathBuf,
+    plugins: [String; 2],
+}
+
+fn place() -> Place {
+    let dir = tempfile::tempdir().unwrap();
+    let (scan, spec) = (dir.path().join("scan"), dir.path().join("plugins.toml"));
+    done(&["simulate", "phantom:head:16", "-o", &text(&scan), "--views", "8", "--detector", "16x16"]);
+    std::fs::write(&spec, SPEC).unwrap();
+    Place { dir, scan, spec, plugins: ["siren", "triplane"].map(|p| text(&example(p))) }
+}
+
+impl Place {
+    fn reconstruct<'a>(&'a self, run: &'a str, steps: &'a str, more: &[&'a str]) -> Vec<&'a str> {
+        let [siren, triplane] = &self.plugins;
+        let mut all = vec!["--plugin", siren, "--plugin", triplane, "reconstruct"];
+        all.extend([self.scan.to_str().unwrap(), "--spec", self.spec.to_str().unwrap(), "-o", run, "--seed", "7"]);
+        all.extend(["--steps", steps]);
+        all.extend(more);
+        all
+    }
+}
+
+#[test]
+fn as_built_in() {
+    let place = place();
+    let run = text(&place.dir.path().join("run"));
+    done(&place.reconstruct(&run, "60", &[]));
+
+    let scan = conefield_io::read_scan(&place.scan).unwrap();
+    let spec = conefield_core::spec::load::parse(SPEC, "plugins.toml", &[], &[]).unwrap().spec;
+    let (backend, limits) = (Cpu::new(), Limits { steps: Some(60), ..Limits::default() });
+    let job = Job { seed: 7, limits, ..Job::new(&scan, &spec, &backend) };
+    let solution = spec.solver.build().unwrap().solve(&job, &mut Silent).unwrap();
+    let field = solution.result.field().unwrap();
+    let weights = conefield_io::read_weights(Path::new(&run).join("weights.safetensors")).unwrap();
+    let blocks = &field.model.pipeline.layout().blocks;
+    assert_eq!(weights.tensors.len(), blocks.len());
+    for b in blocks {
+        let (shape, values) = &weights.tensors[&b.name];
+        assert_eq!(*shape, b.shape, "{}", b.name);
+        let bits = |v: &[f32]| v.iter().map(|v| v.to_bits()).collect::<Vec<_>>();
+        assert!(bits(values) == bits(&field.model.arena.params[b.range.clone()]), "{} differs", b.name);
+    }
+    let volume = conefield_io::read_volume(Path::new(&run).join("volume.nii.gz")).unwrap();
+    let built_in = solution.result.volume(&Cpu::new()).unwrap();
+    assert!(volume.data == built_in.data, "the volumes differ");
+}
+
+#[test]
+fn killed_and_resumed() {
+    let place = place();
+    let [whole, killed] = ["whole", "killed"].map(|f| text(&place.dir.path().join(f)));
+    done(&place.reconstruct(&whole, "3000", &[]));
+    let checkpoint = Path::new(&killed).join("checkpoint.safetensors");
+    let arguments = place.reconstruct(&killed, "3000", &["--checkpoint-every", "0.02s"]);
+    let mut child = std::process::Command::new(assert_cmd::cargo::cargo_bin("conefield"))
+        .arg("--quiet")
+        .args(&arguments)
+        .spawn()
+        .unwrap();
+    while !checkpoint.exists() && child.try_wait().unwrap().is_none() {
+        std::thread::sleep(std::time::Duration::from_millis(5));
+    }
+    child.kill().unwrap();
+    child.wait().unwrap();
+    assert!(checkpoint.exists(), "it was over before it could be killed");
+
+    // Without the plugins the spec means nothing.
+    let mut bare = arguments[4..].to_vec();
+    bare.push("--resume");
+    let e = refused(1, &bare);
+    assert!(e.contains("no encoder type \"triplane\""), "{e}");
+
+    let mut again = arguments.clone();
+    again.push("--resume");
+    done(&again);
+    for file in ["volume.nii.gz", "weights.safetensors"] {
+        let [a, b] = [&whole, &killed].map(|r| std::fs::read(Path::new(r).join(file)).unwrap());
+        assert!(a == b, "{file} differs");
+    }
+}
+
+#[test]
+fn explained_and_in_the_schema() {
+    let place = place();
+    let [siren, triplane] = &place.plugins;
+    let spec = text(&place.spec);
+    let report =
+        json(&["--plugin", siren, "--plugin", triplane, "explain", &spec, "--scan", &text(&place.scan), "--json"]);
+    assert_eq!(report["stages"][0]["type"], "triplane");
+    assert_eq!(report["stages"][3]["what"], "9 -> 2 layers of 12 -> 1, sines of frequency 3");
+    assert_eq!(report["plugins"].as_array().unwrap().len(), 2);
+    assert_eq!(report["stages"][0]["parameters"], 3 * (12 * 12 + 12) * 3);
+    let schema = json(&["--plugin", siren, "schema"]);
+    assert!(schema["$defs"]["field.siren"]["properties"]["omega"].is_object());
+    // A mistake in a plugin's settings is told like one in built-in settings.
+    let set = |s| refused(1, &["--plugin", siren, "--plugin", triplane, "explain", &spec, "--set", s]);
+    let e = set("field.omgea=2.0");
+    assert!(e.contains("field.omgea: found an unknown key, expected \"omega\""), "{e}");
+    let e = set("field.omega=-2.0");
+    assert!(e.contains("--set field.omega=-2.0: field.omega: found -2, expected above 0"), "{e}");
+}
+
+/// Weights pre-trained with a plugin's field start another run of it.
+#[test]
+fn mapping_consistency() {
+    let place = place();
+    let [siren, triplane] = &place.plugins;
+    let weights = text(&place.dir.path().join("weights.safetensors"));
+    let spec = text(&place.spec);
+    let small = ["--steps", "20", "--set", "solver.pretrain_points=200"];
+    let pretrain =
+        ["--plugin", siren, "--plugin", triplane, "pretrain", "phantom:head:16", "--spec", &spec, "-o", &weights];
+    done(&[&pretrain[..], &small].concat());
+    let run = text(&place.dir.path().join("mci"));
+    done(&place.reconstruct(&run, "5", &["--init", &weights]));
+    // A field of another width is refused by name.
+    let other = text(&place.dir.path().join("other"));
+    let output =
+        conefield(&place.reconstruct(&other, "5", &["--init", &weights, "--set", "field.width=13"])).output().unwrap();
+    let e = String::from_utf8(output.stderr).unwrap();
+    assert!(!output.status.success() && e.contains("field.0.weight"), "{e}");
+}

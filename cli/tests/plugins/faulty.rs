@@ -1,0 +1,239 @@
+//! Plugins that do one thing wrong each, and what becomes of them: refused when loaded, refused when tried out, found by
+//! the check, or an error of the run. `docs/faulty-plugins.md` is made from this; `CONEFIELD_BLESS=1` writes it anew.
+
+use crate::build::{cargo, cc, library, sources};
+use crate::common::{conefield, done, text};
+use std::fmt::Write as _;
+use std::path::Path;
+
+/// What a plugin does wrong.
+struct Fault {
+    /// For the page.
+    what: &'static str,
+    /// How it is compiled.
+    defines: &'static [&'static str],
+    /// What each of `plugins list`, `plugins check` and `reconstruct` says: a part of the message, or nothing if all is well.
+    list: &'static str,
+    check: &'static str,
+    reconstruct: &'static str,
+}
+
+const fn fault(
+    what: &'static str,
+    defines: &'static [&'static str],
+    [list, check, reconstruct]: [&'static str; 3],
+) -> Fault {
+    Fault { what, defines, list, check, reconstruct }
+}
+
+/// Refused alike wherever it is loaded.
+const fn refused(what: &'static str, defines: &'static [&'static str], why: &'static str) -> Fault {
+    fault(what, defines, [why; 3])
+}
+
+/// Loads, but no stage can be made of it.
+const fn untried(what: &'static str, defines: &'static [&'static str], why: &'static str) -> Fault {
+    fault(what, defines, ["", why, why])
+}
+
+const FAULTS: &[Fault] = &[
+    fault("nothing", &["FAULT=NONE"], ["", "", ""]),
+    refused(
+        "no plugin: the function is missing",
+        &["ENTRY=another_name"],
+        "a library without the function conefield_plugin",
+    ),
+    refused("another version of the contract", &["FAULT=WRONG_ABI"], "ABI version: found 2.0, expected 1.x"),
+    refused("a table that is too short", &["FAULT=SHORT_TABLE"], "the table is too short"),
+    refused("functions that are too few", &["FAULT=SHORT_FUNCTIONS"], "the table is too short"),
+    refused("a function that must be there is NULL", &["FAULT=NO_FORWARD"], "no function forward"),
+    refused("no stages", &["FAULT=NO_STAGES"], "stages: found 0"),
+    refused("a name that no spec could write", &["NAME=\"Faulty Encoder\""], "lower-case letters, digits and hyphens"),
+    refused("a name that is taken", &["NAME=\"hash-grid\""], "a name that conefield itself (conefield-encoders) has"),
+    refused("a schema that is no JSON", &["SCHEMA=\"{type: object}\""], "a JSON Schema"),
+    untried("more channels out than it writes", &["FAULT=MORE_CHANNELS"], "is left unwritten"),
+    untried(
+        "more parameters than its blocks have",
+        &["FAULT=MORE_PARAMETERS"],
+        "blocks of 3 parameters in all, where there are 5",
+    ),
+    untried("two blocks of one name", &["FAULT=TWIN_BLOCKS"], "two blocks are called \"factor\""),
+    untried("writes past its tile", &["FAULT=PAST_TILE"], "it writes outside its output: 1 past"),
+    untried("writes before its gradients", &["FAULT=BEFORE_GRADIENTS"], "it writes outside its gradients: 1 before"),
+    untried("returns NaN", &["FAULT=NOT_A_NUMBER"], "number 0 of 3 of its output is NaN"),
+    untried("fails", &["FAULT=FAILS"], "forward failed: no more numbers"),
+    untried("sleeps", &["FAULT=SLEEPS"], "it has not come back after 5 s"),
+    fault(
+        "a parameter gradient that is 10 % too large",
+        &["FAULT=WRONG_GRADIENT"],
+        ["", "finite differences: parameters", ""],
+    ),
+    fault(
+        "an input gradient of the wrong sign",
+        &["FAULT=WRONG_INPUT_GRADIENT"],
+        ["", "finite differences: inputs", ""],
+    ),
+    fault("results that depend on earlier calls", &["FAULT=REMEMBERS"], ["", "tile sizes: outputs", ""]),
+    fault("returns NaN after a hundred calls", &["FAULT=NOT_A_NUMBER_LATER"], ["", "extremes", "training diverged"]),
+    fault("fails after a hundred calls", &["FAULT=FAILS_LATER"], ["", "no fault", "forward failed: no more numbers"]),
+    fault("calls abort", &["FAULT=ABORTS"], ["", "took the checking process down (signal 6)", ABORTED]),
+];
+
+/// No process survives this.
+const ABORTED: &str = "(the process is gone)";
+
+/// The same with panics in a Rust plugin.
+const PANICS: &[(&str, &str, [&str; 2])] = &[
+    (
+        "panics in create",
+        "create",
+        ["create panicked: as ordered, in create", "create panicked: as ordered, in create"],
+    ),
+    (
+        "panics in forward",
+        "forward",
+        ["forward panicked: as ordered, in forward", "forward panicked: as ordered, in forward"],
+    ),
+    (
+        "panics in backward",
+        "backward",
+        ["backward panicked: as ordered, in backward", "backward panicked: as ordered, in backward"],
+    ),
+    ("panics after a hundred calls", "later", ["no fault", "forward panicked: as ordered, in call"]),
+];
+
+/// The last line that a command says, or nothing if all is well. Folders of this test are left out.
+fn said(args: &[&str], hide: &[&Path]) -> String {
+    let output = conefield(args).output().unwrap();
+    if output.status.success() {
+        return String::new();
+    }
+    let mut err = String::from_utf8(output.stderr).unwrap();
+    if std::os::unix::process::ExitStatusExt::signal(&output.status).is_some() {
+        return ABORTED.into();
+    }
+    for folder in hide {
+        err = err.replace(&format!("{}/", folder.canonicalize().unwrap().display()), "");
+        err = err.replace(&format!("{}/", folder.display()), "");
+    }
+    let last = err.lines().rev().find_map(|l| l.strip_prefix("error: ")).unwrap_or_default();
+    last.to_owned()
+}
+
+fn refusal(library: &str, hide: &[&Path]) -> String {
+    let listed: serde_json::Value =
+        serde_json::from_str(&done(&["--plugin", library, "plugins", "list", "--json"])).unwrap();
+    let mut why = listed["plugins"][0]["refused"].as_str().unwrap_or_default().to_owned();
+    for folder in hide {
+        why = why.replace(&format!("{}/", folder.canonicalize().unwrap().display()), "");
+        why = why.replace(&format!("{}/", folder.display()), "");
+    }
+    why
+}
+
+/// A line of the page: what each command says, or nothing if all is well.
+struct Row {
+    what: String,
+    list: String,
+    check: String,
+    run: String,
+}
+
+impl Row {
+    fn of(what: &str, said: [&str; 3], want: [&str; 3]) -> Self {
+        let [list, check, run] = [0, 1, 2].map(|i| told(said[i], want[i]));
+        Self { what: what.into(), list, check, run }
+    }
+}
+
+fn fits(what: &str, command: &str, found: &str, want: &str) {
+    let fine = if want.is_empty() { found.is_empty() } else { found.contains(want) };
+    assert!(fine, "{what}: {command} said {found:?}, expected {want:?}");
+}
+
+#[test]
+fn every_fault_is_found_and_none_takes_the_process_down() {
+    let dir = tempfile::tempdir().unwrap();
+    let scan = text(&dir.path().join("scan"));
+    done(&["simulate", "phantom:head:16", "-o", &scan, "--views", "6", "--detector", "16x16"]);
+    let mut rows = vec![];
+    let reconstruct = |library: &str, number: usize, spec: &[&str], hide: &[&Path]| {
+        let run = text(&dir.path().join(format!("run-{number}")));
+        let mut args = vec!["--plugin", library, "reconstruct", &scan, "--spec", "fast", "-o", &run, "--steps", "300"];
+        args.extend(["--set", "solver.rays=16", "--set", "projector.samples=16"]);
+        args.extend(spec);
+        let found = said(&args, hide);
+        // What has failed leaves no volume.
+        let volume = dir.path().join(format!("run-{number}/volume.nii.gz"));
+        assert!(found.is_empty() || !volume.exists(), "{library}");
+        found
+    };
+    let here = [dir.path()];
+    for (i, fault) in FAULTS.iter().enumerate() {
+        let library = dir.path().join("faulty.so");
+        cc(&sources().join("plugins/tests/faulty.c"), fault.defines, &library);
+        let library = text(&library);
+        let list = refusal(&library, &here);
+        let check = said(&["plugins", "check", &library], &here);
+        let run = reconstruct(&library, i, &["--set", "encoder.type=faulty"], &here);
+        fits(fault.what, "list", &list, fault.list);
+        fits(fault.what, "check", &check, fault.check);
+        fits(fault.what, "reconstruct", &run, fault.reconstruct);
+        rows.push(Row::of(fault.what, [&list, &check, &run], [fault.list, fault.check, fault.reconstruct]));
+    }
+    cargo(&sources().join("plugins/tests"), &["build", "--release", "--locked", "-p", "panics"]);
+    let panics = library("panics");
+    let folder = panics.parent().unwrap();
+    for (i, (what, when, [check, run])) in PANICS.iter().enumerate() {
+        let library = text(&panics);
+        let settings = format!("{{\"when\": \"{when}\"}}");
+        let checked = said(&["plugins", "check", &library, "--settings", &settings], &[folder]);
+        let when = format!("encoder.when={when}");
+        let ran = reconstruct(&library, 100 + i, &["--set", "encoder.type=panics", "--set", &when], &[folder]);
+        fits(what, "check", &checked, check);
+        fits(what, "reconstruct", &ran, run);
+        rows.push(Row::of(what, ["", &checked, &ran], ["", check, run]));
+    }
+    page(&rows);
+}
+
+/// A message up to what must be in it: what follows may depend on how many threads there are.
+fn told(message: &str, want: &str) -> String {
+    if message.contains("not hold: ") {
+        return format!("does not hold: {want}");
+    }
+    let end = message.find(want).map_or(message.len(), |at| at + want.len());
+    let more = if end < message.len() { " …" } else { "" };
+    format!("{}{more}", &message[..end]).replace('|', "\\|").replace('\n', " ")
+}
+
+/// The page of all faults.
+fn page(rows: &[Row]) {
+    let mut text = String::from(
+        "# Faulty plugins\n\nWhat becomes of plugins that do one thing wrong each. Made by `cli/tests/plugins/faulty.rs` from \
+         `plugins/tests`; `CONEFIELD_BLESS=1 cargo test -p conefield --test plugins` writes it anew.\n\n- *load*: refused when \
+         it is loaded, by `plugins list` (which shows the others), `plugins check` and a reconstruction alike.\n- *trial*: a \
+         stage is tried out when it is made, on a few rows, between guard zones and under a time limit: a check and a \
+         reconstruction end there, before any work.\n- *check*: found by `plugins check`; gradients that are wrong only the \
+         check can find.\n- *run*: an error of the run, which leaves no volume.\n\nA plugin runs in the process that loads it. One \
+         that calls `abort`, or writes far outside what it was handed, takes that process down; the check runs in a process \
+         of its own and says so.\n\n| what it does | found by | what is said |\n| --- | --- | --- |\n",
+    );
+    for Row { what, list, check, run } in rows {
+        let found = match (list.is_empty(), check.is_empty(), run.is_empty()) {
+            (false, ..) => vec![("load", list)],
+            (true, true, true) => vec![("nobody: nothing is wrong", run)],
+            _ if check == run => vec![("trial", run)],
+            _ => [("check", check), ("run", run)].into_iter().filter(|(_, said)| !said.is_empty()).collect(),
+        };
+        for (by, said) in found {
+            let _ = writeln!(text, "| {what} | {by} | {said} |");
+        }
+    }
+    let path = sources().join("docs/faulty-plugins.md");
+    if std::env::var_os("CONEFIELD_BLESS").is_some() {
+        std::fs::write(&path, &text).unwrap();
+    }
+    let found = std::fs::read_to_string(&path).unwrap_or_default();
+    assert!(found == text, "{} is not current; CONEFIELD_BLESS=1 writes it\n{text}", path.display());
+}

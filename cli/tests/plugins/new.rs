@@ -1,0 +1,81 @@
+//! `conefield plugins new`: from a name to a reconstruction, in both languages and of every kind.
+
+use crate::build::{cargo, library, sources};
+use crate::common::{done, json, refused, text};
+use std::path::{Path, PathBuf};
+use std::process::Command;
+
+const KINDS: [&str; 5] = ["encoder", "normalizer", "field", "projector", "initializer"];
+
+/// A scan small enough for seconds.
+fn scan(dir: &Path) -> PathBuf {
+    let path = dir.join("scan");
+    done(&["simulate", "phantom:head:16", "-o", &text(&path), "--views", "8", "--detector", "16x16"]);
+    path
+}
+
+/// A check and a short run of the plugin in `folder`, built to `library`; the run's record.
+fn use_it(folder: &Path, library: &Path, scan: &Path) -> serde_json::Value {
+    let library = text(library);
+    let report = json(&["plugins", "check", &library, "--json"]);
+    assert_eq!(report["passed"], true, "{report:#}");
+    let spec = text(&folder.join("spec.toml"));
+    let run = text(&folder.join("run"));
+    let small = ["--steps", "12", "--set", "solver.rays=32", "--json"];
+    json(&[&["--plugin", &library, "reconstruct", &text(scan), "--spec", &spec, "-o", &run][..], &small].concat())
+}
+
+#[test]
+fn in_rust() {
+    let dir = tempfile::tempdir().unwrap();
+    let scan = scan(dir.path());
+    for kind in KINDS {
+        let name = format!("new-{kind}");
+        let into = text(dir.path());
+        let said = done(&["plugins", "new", &name, "--kind", kind, "--lang", "rust", "--into", &into]);
+        assert!(said.contains("cargo build --release"), "{said}");
+        let folder = dir.path().join(&name);
+        // The versions that this build has, so that nothing else is downloaded.
+        std::fs::copy(sources().join("Cargo.lock"), folder.join("Cargo.lock")).unwrap();
+        cargo(&folder, &["build", "--release"]);
+        if kind == "encoder" {
+            cargo(&folder, &["test", "--release"]);
+        }
+        let record = use_it(&folder, &library(&name), &scan);
+        assert_eq!(record["plugins"][0]["name"], name.as_str());
+        assert_eq!(record["plugins"][0]["version"], "0.1.0");
+        assert_eq!(record["steps"], 12);
+    }
+}
+
+#[test]
+fn in_c() {
+    let dir = tempfile::tempdir().unwrap();
+    let scan = scan(dir.path());
+    for kind in KINDS {
+        let name = format!("new-{kind}");
+        done(&["plugins", "new", &name, "--kind", kind, "--lang", "c", "--into", &text(dir.path())]);
+        let folder = dir.path().join(&name);
+        let made =
+            Command::new("make").current_dir(&folder).env("CFLAGS", "-O2 -Wall -Wextra -Werror").output().unwrap();
+        assert!(made.status.success(), "{}", String::from_utf8_lossy(&made.stderr));
+        let record = use_it(&folder, &folder.join(format!("{name}.so")), &scan);
+        assert_eq!(record["plugins"][0]["name"], name.as_str());
+    }
+}
+
+#[test]
+fn names_and_folders_are_checked() {
+    let dir = tempfile::tempdir().unwrap();
+    let into = text(dir.path());
+    for name in ["Wavelet", "a", "../b", "wave let", "-wave", "wave-"] {
+        let e = refused(1, &["plugins", "new", "--kind", "encoder", "--into", &into, "--", name]);
+        assert!(e.contains("lower-case letters"), "{e}");
+    }
+    std::fs::create_dir(dir.path().join("taken")).unwrap();
+    let e = refused(1, &["plugins", "new", "taken", "--kind", "encoder", "--into", &into]);
+    assert!(e.contains("something that is there"), "{e}");
+    let e = refused(1, &["plugins", "new", "mine", "--kind", "encoder", "--into", &into, "--sources", &into]);
+    assert!(e.contains("--sources"), "{e}");
+    assert!(!dir.path().join("mine").exists());
+}

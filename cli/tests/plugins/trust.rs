@@ -1,0 +1,114 @@
+//! What is loaded, and what is not: only what the user names, or puts where plugins are looked for.
+
+use crate::build::{cc, sources};
+use crate::common::{conefield, text};
+use serde_json::Value;
+use std::path::{Path, PathBuf};
+
+fn dense(dir: &Path) -> PathBuf {
+    let out = dir.join("dense.so");
+    cc(&sources().join("plugins/examples/dense/dense.c"), &["NDEBUG"], &out);
+    out
+}
+
+fn run(command: &mut assert_cmd::Command) -> (bool, String, String) {
+    let output = command.output().unwrap();
+    let [out, err] = [output.stdout, output.stderr].map(|b| String::from_utf8(b).unwrap());
+    (output.status.success(), out, err)
+}
+
+fn list(command: &mut assert_cmd::Command) -> Value {
+    let (fine, out, err) = run(command);
+    assert!(fine, "{err}");
+    serde_json::from_str(&out).unwrap()
+}
+
+/// A spec of a stranger beside the library that it names.
+fn spec(dir: &Path) -> PathBuf {
+    let path = dir.join("spec.toml");
+    let text = "extends = 'fast'\n[plugins]\npaths = ['dense.so']\n[encoder]\ntype = 'one-grid'\n";
+    std::fs::write(&path, text).unwrap();
+    path
+}
+
+#[test]
+fn a_spec_loads_nothing_without_leave() {
+    let dir = tempfile::tempdir().unwrap();
+    let library = text(&dense(dir.path()));
+    let spec = text(&spec(dir.path()));
+    let (fine, _, err) = run(&mut conefield(&["explain", &spec]));
+    assert!(
+        !fine && err.contains("spec.toml:3:10: plugins.paths") && err.contains("--allow-plugins-from-spec"),
+        "{err}"
+    );
+    assert!(err.contains(&library), "{err}");
+    let (fine, out, err) = run(&mut conefield(&["--allow-plugins-from-spec", "explain", &spec]));
+    assert!(fine && out.contains("one grid of 32 nodes") && out.contains("plugin: dense 0.1.0"), "{out}{err}");
+    let (fine, out, err) = run(&mut conefield(&["--plugin", &library, "explain", &spec]));
+    assert!(fine && out.contains("one grid of 32 nodes"), "{out}{err}");
+    // Leave is for libraries that are plugins.
+    std::fs::write(dir.path().join("dense.so"), "not a library").unwrap();
+    let (fine, _, err) = run(&mut conefield(&["--allow-plugins-from-spec", "explain", &spec]));
+    assert!(!fine && err.contains("a shared library for this system"), "{err}");
+}
+
+#[test]
+fn the_resolved_spec_names_the_library_wherever_it_is_read() {
+    let dir = tempfile::tempdir().unwrap();
+    dense(dir.path());
+    let (spec, scan, out) = (text(&spec(dir.path())), text(&dir.path().join("scan")), text(&dir.path().join("run")));
+    let simulate = ["simulate", "phantom:head:16", "-o", &scan, "--views", "6", "--detector", "16x16"];
+    assert!(run(&mut conefield(&simulate)).0);
+    let steps = ["--steps", "3", "--set", "solver.rays=16"];
+    let reconstruct = ["--allow-plugins-from-spec", "reconstruct", &scan, "--spec", &spec, "-o", &out];
+    let (fine, _, err) = run(&mut conefield(&[&reconstruct[..], &steps].concat()));
+    assert!(fine, "{err}");
+    let resolved = text(&dir.path().join("run/spec.toml"));
+    let (fine, said, err) = run(&mut conefield(&["--allow-plugins-from-spec", "explain", &resolved]));
+    assert!(fine && said.contains("one grid of 32 nodes"), "{err}");
+    let again = text(&dir.path().join("finer.nii.gz"));
+    let (fine, _, err) = run(&mut conefield(&["export", &out, "--voxels", "20", "-o", &again]));
+    assert!(!fine && err.contains("--allow-plugins-from-spec"), "{err}");
+    let (fine, _, err) =
+        run(&mut conefield(&["--allow-plugins-from-spec", "export", &out, "--voxels", "20", "-o", &again]));
+    assert!(fine, "{err}");
+}
+
+#[test]
+fn plugins_are_found_where_they_are_looked_for() {
+    let dir = tempfile::tempdir().unwrap();
+    let home = dir.path().join("home");
+    let folder = home.join("conefield/plugins");
+    std::fs::create_dir_all(&folder).unwrap();
+    let library = dense(&folder);
+    // One by one: the user's folder, the environment, the command line, each with what it says of itself.
+    let found = list(conefield(&["plugins", "list", "--json"]).env("XDG_DATA_HOME", &home));
+    assert_eq!(found["plugins"][0]["place"], "user-folder");
+    assert_eq!(found["plugins"][0]["plugin"]["stages"][0]["type"], "one-grid");
+    let found = list(conefield(&["plugins", "list", "--json"]).env("CONEFIELD_PLUGIN_PATH", &folder));
+    assert_eq!(found["plugins"][0]["place"], "environment");
+    let found = list(conefield(&["plugins", "list", "--json", "--plugin"]).arg(&library));
+    assert_eq!(found["plugins"][0]["place"], "named");
+    assert_eq!(found["plugins"][0]["plugin"]["abi"], "1.0");
+    // The same file twice is one plugin.
+    let found =
+        list(conefield(&["plugins", "list", "--json"]).env("XDG_DATA_HOME", &home).arg("--plugin").arg(&library));
+    assert_eq!(found["plugins"].as_array().unwrap().len(), 1);
+    // A copy brings types that are taken: both owners are named.
+    std::fs::copy(&library, folder.join("other.so")).unwrap();
+    let found = list(conefield(&["plugins", "list", "--json"]).env("XDG_DATA_HOME", &home));
+    let why = found["plugins"][1]["refused"].as_str().unwrap();
+    assert!(why.contains("dense.so") && why.contains("other.so") && why.contains("one-grid"), "{why}");
+    // What is broken in a folder is a warning; what is broken and named is an error.
+    let (fine, _, _) = run(conefield(&["explain", "fast"]).env("XDG_DATA_HOME", &home));
+    assert!(fine);
+    let output = assert_cmd::Command::cargo_bin("conefield")
+        .unwrap()
+        .args(["explain", "fast"])
+        .env("XDG_DATA_HOME", &home)
+        .output()
+        .unwrap();
+    assert!(output.status.success() && String::from_utf8_lossy(&output.stderr).contains("plugin refused"));
+    let (fine, _, err) = run(&mut conefield(&["--plugin", "nowhere.so", "explain", "fast"]));
+    assert!(!fine && err.contains("nowhere.so"), "{err}");
+}

@@ -1,0 +1,215 @@
+//! A multi-layer perceptron whose activation is a sine (Sitzmann et al., "Implicit neural representations with periodic
+//! activation functions", 2020): `h₁ = sin(ω·(W₁x + b₁))`, `hₖ = sin(ω·(Wₖhₖ₋₁ + bₖ))`, and `μ = softplus(w·h + b)`, which is
+//! never negative.
+
+use conefield_plugin::error::{Result, ensure};
+use conefield_plugin::random::{mix, unit};
+use conefield_plugin::simd::Real;
+use conefield_plugin::spec::FieldSpec;
+use conefield_plugin::stage::{Field, GradKind, Grads, Info, Kernel, Parameter, Scope, Stage, Tile, TileMut};
+use schemars::JsonSchema;
+use serde::{Deserialize, Serialize};
+
+conefield_plugin::stage_type!(Field, "siren", Siren, "multi-layer perceptron of sines");
+
+/// Settings of `siren`.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
+#[serde(deny_unknown_fields, default)]
+pub struct Siren {
+    /// Channels of every hidden layer.
+    pub width: usize,
+    /// Hidden layers.
+    pub depth: usize,
+    /// Angular frequency of the sines. The paper has 30 for coordinates; features of order one want less.
+    pub omega: f64,
+}
+
+impl Default for Siren {
+    fn default() -> Self {
+        Self { width: 32, depth: 2, omega: 3.0 }
+    }
+}
+
+#[typetag::serde(name = "siren")]
+impl FieldSpec for Siren {
+    fn build(&self, width: usize) -> Result<Box<dyn Field>> {
+        ensure((1..=1024).contains(&self.width), "spec", "field.width", self.width, "1 to 1024")?;
+        ensure((1..=16).contains(&self.depth), "spec", "field.depth", self.depth, "1 to 16")?;
+        let good = self.omega.is_finite() && self.omega > 0.0 && self.omega <= 1000.0;
+        ensure(good, "spec", "field.omega", self.omega, "above 0 and at most 1000")?;
+        Ok(Box::new(SirenField::new(self.clone(), width)))
+    }
+}
+
+/// One layer: `output` sums over `input` channels, and where its weights and biases stand.
+#[derive(Debug, Clone, Copy)]
+struct Layer {
+    input: usize,
+    output: usize,
+    weights: usize,
+    biases: usize,
+}
+
+/// The field that [`Siren`] builds.
+pub struct SirenField {
+    settings: Siren,
+    input: usize,
+    layers: Vec<Layer>,
+}
+
+impl SirenField {
+    fn new(settings: Siren, input: usize) -> Self {
+        let mut layers = vec![];
+        let (mut wide, mut at) = (input, 0);
+        for k in 0..=settings.depth {
+            let output = if k == settings.depth { 1 } else { settings.width };
+            layers.push(Layer { input: wide, output, weights: at, biases: at + wide * output });
+            at += (wide + 1) * output;
+            wide = output;
+        }
+        Self { settings, input, layers }
+    }
+
+    fn params(&self) -> usize {
+        self.layers.last().map_or(0, |l| l.biases + l.output)
+    }
+}
+
+/// `y = W·x + b`, channel by channel, so that the inner loop runs over rows.
+fn sums<R: Real>(layer: &Layer, params: &[R], x: &[R], y: &mut [R], rows: usize) {
+    for (o, y) in y.chunks_exact_mut(rows).enumerate() {
+        y.fill(params[layer.biases + o]);
+        let weights = &params[layer.weights + o * layer.input..][..layer.input];
+        for (x, &w) in x.chunks_exact(rows).zip(weights) {
+            for (y, &x) in y.iter_mut().zip(x) {
+                *y += w * x;
+            }
+        }
+    }
+}
+
+impl<R: Real> Kernel<R> for SirenField {
+    /// Leaves the outputs of every hidden layer, then the slopes of all activations.
+    fn forward(&self, params: &[R], x: Tile<'_, R>, y: TileMut<'_, R>, tape: TileMut<'_, R>) {
+        let rows = x.rows;
+        let omega = R::of(self.settings.omega);
+        let hidden = self.settings.depth * self.settings.width * rows;
+        let (outputs, slopes) = tape.data.split_at_mut(hidden);
+        let (last, inner) = self.layers.split_last().expect("a field has layers");
+        for (k, layer) in inner.iter().enumerate() {
+            let size = self.settings.width * rows;
+            let (before, after) = outputs.split_at_mut(k * size);
+            let input = if k == 0 { x.data } else { &before[(k - 1) * size..] };
+            let output = &mut after[..size];
+            sums(layer, params, input, output, rows);
+            for (h, slope) in output.iter_mut().zip(&mut slopes[k * size..(k + 1) * size]) {
+                let (sin, cos) = (omega * *h).sin_cos();
+                (*h, *slope) = (sin, omega * cos);
+            }
+        }
+        let input = &outputs[hidden - last.input * rows..];
+        sums(last, params, input, y.data, rows);
+        for (y, slope) in y.data.iter_mut().zip(&mut slopes[hidden..]) {
+            *slope = R::of(1.0 / (1.0 + (-y.f64()).exp()));
+            *y = y.softplus();
+        }
+    }
+
+    fn backward(
+        &self,
+        params: &[R],
+        x: Tile<'_, R>,
+        tape: TileMut<'_, R>,
+        dy: Tile<'_, R>,
+        grads: Grads<'_, R>,
+        mut dx: Option<TileMut<'_, R>>,
+    ) {
+        let rows = x.rows;
+        let size = self.settings.width * rows;
+        let hidden = self.settings.depth * size;
+        let (outputs, slopes) = tape.data.split_at_mut(hidden);
+        let mut add = |at: usize, sum: R| {
+            if grads.range.contains(&at) {
+                grads.values[at - grads.range.start] += sum;
+            }
+        };
+        // The gradient of each layer's sums takes the place of its slopes.
+        slopes[hidden..].iter_mut().zip(dy.data).for_each(|(slope, &dy)| *slope *= dy);
+        for (k, layer) in self.layers.iter().enumerate().rev() {
+            let (before, own) = slopes.split_at_mut(k * size);
+            let own = &own[..layer.output * rows];
+            let input = if k == 0 { x.data } else { &outputs[(k - 1) * size..k * size] };
+            for (o, d) in own.chunks_exact(rows).enumerate() {
+                for (i, x) in input.chunks_exact(rows).enumerate() {
+                    add(layer.weights + o * layer.input + i, x.iter().zip(d).map(|(&x, &d)| x * d).sum());
+                }
+                add(layer.biases + o, d.iter().copied().sum());
+            }
+            // To the outputs of the layer before; times its slopes these are the gradients of its sums.
+            let back = |i: usize, row: usize| -> R {
+                (0..layer.output).map(|o| params[layer.weights + o * layer.input + i] * own[o * rows + row]).sum()
+            };
+            if k > 0 {
+                let slopes = &mut before[(k - 1) * size..];
+                for (i, slopes) in slopes.chunks_exact_mut(rows).enumerate() {
+                    slopes.iter_mut().enumerate().for_each(|(row, slope)| *slope *= back(i, row));
+                }
+            } else if let Some(dx) = &mut dx {
+                for i in 0..layer.input {
+                    dx.channel(i).iter_mut().enumerate().for_each(|(row, dx)| *dx = back(i, row));
+                }
+            }
+        }
+    }
+}
+
+impl Stage for SirenField {
+    fn info(&self) -> Info {
+        Info {
+            input: self.input,
+            output: 1,
+            params: self.params(),
+            tape: 2 * self.settings.depth * self.settings.width + 1,
+            scope: Scope::Row,
+            grads: GradKind::Dense,
+            macs: self.layers.iter().map(|l| l.input * l.output).sum(),
+            identity: false,
+        }
+    }
+
+    fn parameters(&self) -> Vec<Parameter> {
+        let of = |(k, l): (usize, &Layer)| {
+            [
+                Parameter { name: format!("{k}.weight"), shape: vec![l.output, l.input], start: l.weights },
+                Parameter { name: format!("{k}.bias"), shape: vec![l.output], start: l.biases },
+            ]
+        };
+        self.layers.iter().enumerate().flat_map(of).collect()
+    }
+
+    /// The paper's scheme: uniform within 1/n for the first layer of n inputs, within √(6/n)/ω for the others.
+    fn init(&self, seed: u64, params: &mut [f32]) {
+        for (k, l) in self.layers.iter().enumerate() {
+            let n = l.input as f64;
+            let bound = if k == 0 { 1.0 / n } else { (6.0 / n).sqrt() / self.settings.omega };
+            for i in l.weights..l.biases + l.output {
+                params[i] = bound as f32 * (2.0 * unit(mix(seed, i as u64)) - 1.0);
+            }
+        }
+    }
+
+    fn kernel(&self) -> &dyn Kernel<f32> {
+        self
+    }
+
+    fn reference(&self) -> Option<&dyn Kernel<f64>> {
+        Some(self)
+    }
+
+    fn describe(&self) -> String {
+        let Siren { width, depth, omega } = &self.settings;
+        format!("siren: {} -> {depth} layers of {width} -> 1, sines of frequency {omega}", self.input)
+    }
+}
+
+impl Field for SirenField {}

@@ -1,0 +1,175 @@
+/* Plugins that do one thing wrong each, chosen by -DFAULT=… or by another NAME, SCHEMA or ENTRY: what the host and the conformance kit must find. Without a
+ * fault it is a sound encoder: y = a * x, each coordinate times a number that is learned. */
+#define _POSIX_C_SOURCE 199309L
+#include "conefield_plugin.h"
+
+#include <math.h>
+#include <stdatomic.h>
+#include <stdlib.h>
+#include <string.h>
+#include <time.h>
+
+enum Fault {
+    NONE,
+    WRONG_ABI,
+    SHORT_TABLE,
+    SHORT_FUNCTIONS,
+    NO_FORWARD,
+    NO_STAGES,
+    NOT_A_NUMBER,
+    NOT_A_NUMBER_LATER,
+    MORE_CHANNELS,
+    MORE_PARAMETERS,
+    TWIN_BLOCKS,
+    PAST_TILE,
+    BEFORE_GRADIENTS,
+    WRONG_GRADIENT,
+    WRONG_INPUT_GRADIENT,
+    REMEMBERS,
+    FAILS,
+    FAILS_LATER,
+    SLEEPS,
+    ABORTS,
+};
+#ifndef FAULT
+#define FAULT NONE
+#endif
+#ifndef ENTRY
+#define ENTRY conefield_plugin
+#endif
+#ifndef NAME
+#define NAME "faulty"
+#endif
+#ifndef SCHEMA
+#define SCHEMA "{\"type\":\"object\",\"properties\":{}}"
+#endif
+
+#define TEXT(literal) { (const uint8_t *)(literal), sizeof(literal) - 1 }
+
+static void say(struct ConefieldText *out, const char *line) {
+    if (out == NULL) return;
+    out->length = strlen(line);
+    memcpy(out->data, line, out->length < out->capacity ? out->length : out->capacity);
+}
+
+static atomic_int calls;
+
+static ConefieldStatus create(const void *context, struct ConefieldStr settings, size_t width, void **stage,
+                              struct ConefieldText *error) {
+    (void)context, (void)settings, (void)width, (void)error;
+    static int nothing;
+    *stage = &nothing;
+    return CONEFIELD_OK;
+}
+
+static void destroy(void *stage) {
+    (void)stage;
+}
+
+static ConefieldStatus describe(const void *stage, struct ConefieldText *text) {
+    (void)stage;
+    say(text, "each coordinate times a number");
+    return CONEFIELD_OK;
+}
+
+static ConefieldStatus info(const void *stage, struct ConefieldInfo *out) {
+    (void)stage;
+    *out = (struct ConefieldInfo){
+        .input = 3,
+        .output = FAULT == MORE_CHANNELS ? 4 : 3,
+        .params = FAULT == MORE_PARAMETERS ? 5 : 3,
+        .blocks = FAULT == TWIN_BLOCKS ? 3 : 1,
+        .macs = 3,
+        .grads = CONEFIELD_GRADS_DENSE,
+    };
+    return CONEFIELD_OK;
+}
+
+static ConefieldStatus parameter(const void *stage, size_t index, struct ConefieldParameter *out) {
+    (void)stage, (void)index;
+    static const size_t shape[] = {FAULT == TWIN_BLOCKS ? 1 : 3};
+    *out = (struct ConefieldParameter){.name = TEXT("factor"), .shape = shape, .dimensions = 1};
+    return CONEFIELD_OK;
+}
+
+static ConefieldStatus init(const void *stage, uint64_t seed, float *params, size_t length, struct ConefieldText *error) {
+    (void)stage, (void)seed, (void)error;
+    for (size_t i = 0; i < length; i++) params[i] = 1.0f;
+    return CONEFIELD_OK;
+}
+
+static ConefieldStatus forward(const void *stage, const float *params, struct ConefieldTile x,
+                               struct ConefieldTileMut y, struct ConefieldTileMut tape, struct ConefieldText *error) {
+    (void)stage, (void)tape;
+    int call = atomic_fetch_add(&calls, 1);
+    if (FAULT == ABORTS) abort();
+    if (FAULT == SLEEPS) nanosleep(&(struct timespec){.tv_sec = 600}, NULL);
+    if (FAULT == FAILS || (FAULT == FAILS_LATER && call > 100)) {
+        say(error, "no more numbers");
+        return CONEFIELD_FAILED;
+    }
+    for (size_t c = 0; c < 3; c++)
+        for (size_t i = 0; i < x.rows; i++) {
+            float v = params[c] * x.data[c * x.stride + i];
+            if (FAULT == NOT_A_NUMBER || (FAULT == NOT_A_NUMBER_LATER && call > 100)) v = NAN;
+            if (FAULT == REMEMBERS) v += 1e-6f * (float)(call % 1000);
+            y.data[c * y.stride + i] = v;
+        }
+    if (FAULT == PAST_TILE) y.data[y.channels * y.stride] = 1.0f;
+    return CONEFIELD_OK;
+}
+
+static ConefieldStatus backward(const void *stage, const float *params, struct ConefieldTile x,
+                                struct ConefieldTileMut tape, struct ConefieldTile dy, struct ConefieldGrads grads,
+                                struct ConefieldTileMut dx, struct ConefieldText *error) {
+    (void)stage, (void)tape, (void)error;
+    for (size_t c = 0; c < 3; c++) {
+        float sum = 0;
+        for (size_t i = 0; i < x.rows; i++) {
+            sum += dy.data[c * dy.stride + i] * x.data[c * x.stride + i];
+            if (dx.data != NULL)
+                dx.data[c * dx.stride + i] =
+                    params[c] * dy.data[c * dy.stride + i] * (FAULT == WRONG_INPUT_GRADIENT ? -1.0f : 1.0f);
+        }
+        if (FAULT == WRONG_GRADIENT) sum *= 1.1f;
+        if (c >= grads.start && c - grads.start < grads.length) grads.data[c - grads.start] += sum;
+    }
+    if (FAULT == BEFORE_GRADIENTS) grads.data[-1] = 1.0f;
+    return CONEFIELD_OK;
+}
+
+static const struct ConefieldMap MAP = {
+    .size = FAULT == SHORT_FUNCTIONS ? 24 : sizeof MAP,
+    .info = info,
+    .parameter = parameter,
+    .init = init,
+    .forward = FAULT == NO_FORWARD ? NULL : forward,
+    .backward = backward,
+};
+
+static const struct ConefieldStage STAGES[] = {{
+    .kind = CONEFIELD_ENCODER,
+    .name = TEXT(NAME),
+    .doc = TEXT("each coordinate times a number"),
+    .schema = TEXT(SCHEMA),
+    .create = create,
+    .destroy = destroy,
+    .describe = describe,
+    .map = &MAP,
+}};
+
+static const struct ConefieldPlugin PLUGIN = {
+    .size = FAULT == SHORT_TABLE ? 32 : sizeof PLUGIN,
+    .abi_major = FAULT == WRONG_ABI ? CONEFIELD_ABI_MAJOR + 1 : CONEFIELD_ABI_MAJOR,
+    .abi_minor = CONEFIELD_ABI_MINOR,
+    .name = TEXT("faulty"),
+    .version = TEXT("0.1.0"),
+    .licence = TEXT("Apache-2.0 OR MIT"),
+    .stages = STAGES,
+    .stage_count = FAULT == NO_STAGES ? 0 : sizeof STAGES / sizeof *STAGES,
+    .stage_size = sizeof *STAGES,
+};
+
+const struct ConefieldPlugin *ENTRY(void) {
+    return &PLUGIN;
+}

@@ -1,0 +1,22 @@
+//! The built-in hash grid once more, as a plugin: what the way through the contract costs.
+
+use conefield_encoders::hash_grid::HashGrid;
+use conefield_plugin::error::Result;
+use conefield_plugin::spec::EncoderSpec;
+use conefield_plugin::stage::Encoder;
+use schemars::JsonSchema;
+use serde::{Deserialize, Serialize};
+
+conefield_plugin::export!();
+conefield_plugin::stage_type!(Encoder, "rehashed", Rehashed, "the built-in hash grid as a plugin");
+
+#[derive(Serialize, Deserialize, JsonSchema)]
+#[serde(transparent)]
+struct Rehashed(HashGrid);
+
+#[typetag::serde(name = "rehashed")]
+impl EncoderSpec for Rehashed {
+    fn build(&self) -> Result<Box<dyn Encoder>> {
+        self.0.build()
+    }
+}
