@@ -1,7 +1,7 @@
 //! A pipeline with stages of plugins is the same as one with the same code built in: same bits of weights and volume, and
 //! after a kill the same bits again.
 
-use crate::build::example;
+use crate::build::{cargo, example, library, sources};
 use crate::common::{conefield, done, json, refused, text};
 use conefield_backend_cpu::Cpu;
 use conefield_core::solver::{Job, Limits, Silent};
@@ -180,4 +180,30 @@ fn mapping_consistency() {
         conefield(&place.reconstruct(&other, "5", &["--init", &weights, "--set", "field.width=13"])).output().unwrap();
     let e = String::from_utf8(output.stderr).unwrap();
     assert!(!output.status.success() && e.contains("field.0.weight"), "{e}");
+}
+
+/// Masks that a plugin's normalizer decides on remove channels of a plugin's encoder, as built-in ones do.
+#[test]
+fn masks_of_plugins() {
+    let place = place();
+    cargo(&sources().join("plugins/tests"), &["build", "--release", "--locked", "-p", "rehashed"]);
+    let plugin = text(&library("rehashed"));
+    let runs = [("hash-grid", "fft-mask"), ("rehashed", "remask")].map(|(encoder, mask)| {
+        let spec = text(&place.dir.path().join(format!("{encoder}.toml")));
+        let lines = format!(
+            "extends = 'ni-naf'\n[[normalizers]]\ntype = '{mask}'\nepoch = 3\nkeep = [0, 1, 3]\n[[normalizers]]\ntype = 'layer-norm'\n\
+             [encoder]\ntype = '{encoder}'\nconvention = 'naf'\nfeatures = 2\ngrowth = 2.0\nlevels = 3\nlog2_table_size = 10\nbase_resolution = 16\n\
+             [projector]\nsamples = 16\n[solver]\nrays = 48\n"
+        );
+        std::fs::write(&spec, lines).unwrap();
+        let run = place.dir.path().join(encoder);
+        let scan = text(&place.scan);
+        done(&["--plugin", &plugin, "reconstruct", &scan, "--spec", &spec, "-o", &text(&run), "--steps", "80"]);
+        let metrics = std::fs::read_to_string(run.join("metrics.jsonl")).unwrap();
+        assert!(metrics.contains("events"), "nothing was masked: {metrics}");
+        conefield_io::read_weights(run.join("weights.safetensors")).unwrap().tensors
+    });
+    let shape = &runs[0]["normalizers.0.weight"].0;
+    assert_eq!(*shape, [3], "three channels are left");
+    assert!(runs[0] == runs[1], "the weights differ");
 }

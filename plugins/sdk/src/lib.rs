@@ -4,7 +4,7 @@
 //! trait of another kind), a stage that implements [`Stage`](stage::Stage) and [`Kernel`](stage::Kernel). The crate's type
 //! is `cdylib`, and [`export!`] at its root offers every type that the crate registers with [`stage_type!`]:
 //!
-//! ```ignore
+//! ```text
 //! conefield_plugin::export!();
 //! conefield_plugin::stage_type!(Encoder, "wavelet", Wavelet, "Gaussian-windowed waves");
 //!

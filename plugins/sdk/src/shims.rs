@@ -588,3 +588,148 @@ unsafe extern "C" fn apply(
         Ok(())
     })
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use conefield_core::registry::{Kind, find};
+    use conefield_core::spec::EncoderSpec;
+    use conefield_core::stage::{Encoder, GradKind, Info, Parameter, Scope};
+    use schemars::JsonSchema;
+    use serde::{Deserialize, Serialize};
+
+    /// `y = w·x`, or a panic.
+    #[derive(Clone, Serialize, Deserialize, JsonSchema)]
+    struct Scaled {
+        panics: bool,
+    }
+
+    conefield_core::stage_type!(Encoder, "scaled", Scaled, "for tests");
+    #[typetag::serde(name = "scaled")]
+    impl EncoderSpec for Scaled {
+        fn build(&self) -> Result<Box<dyn Encoder>> {
+            Ok(Box::new(self.clone()))
+        }
+    }
+
+    impl Kernel<f32> for Scaled {
+        fn forward(&self, params: &[f32], x: Tile<'_, f32>, y: TileMut<'_, f32>, tape: TileMut<'_, f32>) {
+            assert!(!self.panics, "told to, {}", "é".repeat(600));
+            for (y, x) in y.data.iter_mut().zip(x.data) {
+                *y = params[0] * x;
+            }
+            tape.data.copy_from_slice(&x.data[..x.rows]);
+        }
+
+        fn backward(
+            &self,
+            params: &[f32],
+            x: Tile<'_, f32>,
+            tape: TileMut<'_, f32>,
+            dy: Tile<'_, f32>,
+            grads: Grads<'_, f32>,
+            dx: Option<TileMut<'_, f32>>,
+        ) {
+            assert_eq!(*tape.data, x.data[..x.rows]);
+            grads.values[0] += dy.data.iter().zip(x.data).map(|(d, x)| d * x).sum::<f32>();
+            if let Some(dx) = dx {
+                dx.data.iter_mut().zip(dy.data).for_each(|(dx, d)| *dx = params[0] * d);
+            }
+        }
+    }
+
+    impl Stage for Scaled {
+        fn info(&self) -> Info {
+            let (scope, grads) = (Scope::Row, GradKind::Dense);
+            Info { input: 3, output: 3, params: 1, tape: 1, scope, grads, macs: 3, identity: false }
+        }
+        fn parameters(&self) -> Vec<Parameter> {
+            vec![Parameter { name: "w".into(), shape: vec![1], start: 0 }]
+        }
+        fn init(&self, _: u64, params: &mut [f32]) {
+            params.fill(2.0);
+        }
+        fn kernel(&self) -> &dyn Kernel<f32> {
+            self
+        }
+        fn describe(&self) -> String {
+            "scaled".into()
+        }
+    }
+
+    impl Encoder for Scaled {}
+
+    fn made(settings: &str, error: *mut ConefieldText) -> (ConefieldStatus, *mut c_void) {
+        let t = find(Kind::Encoder, "scaled").unwrap();
+        let mut stage = ptr::null_mut();
+        let settings = ConefieldStr::of(settings);
+        let status = unsafe { create(ptr::from_ref(t).cast(), settings, 3, &mut stage, error) };
+        (status, stage)
+    }
+
+    fn room(bytes: &mut [u8]) -> ConefieldText {
+        ConefieldText { data: bytes.as_mut_ptr(), capacity: bytes.len(), length: 0 }
+    }
+
+    /// Rows `0..3` of 3 channels that lie 5 apart; what lies between is -1 and stays so.
+    #[test]
+    fn strided_tiles_are_read_and_written_in_place() {
+        let (status, stage) = made(r#"{"panics": false}"#, ptr::null_mut());
+        assert_eq!(status, CONEFIELD_OK);
+        let spread = |v: [f32; 9]| -> Vec<f32> { v.chunks(3).flat_map(|c| [c[0], c[1], c[2], -1.0, -1.0]).collect() };
+        let x = spread([1., 2., 3., 4., 5., 6., 7., 8., 9.]);
+        let (mut y, mut tape, mut dx) = (vec![-1.0f32; 15], vec![-1.0f32; 5], vec![-1.0f32; 15]);
+        let tile = |v: &[f32], channels| ConefieldTile { data: v.as_ptr(), channels, rows: 3, stride: 5 };
+        let tile_mut =
+            |v: &mut [f32], channels| ConefieldTileMut { data: v.as_mut_ptr(), channels, rows: 3, stride: 5 };
+        let (params, mut grads) = ([2.0f32], [10.0f32]);
+        let none = ptr::null_mut();
+        unsafe {
+            let (out, left) = (tile_mut(&mut y, 3), tile_mut(&mut tape, 1));
+            assert_eq!(forward(stage, params.as_ptr(), tile(&x, 3), out, left, none), CONEFIELD_OK);
+            assert_eq!(y, spread([2., 4., 6., 8., 10., 12., 14., 16., 18.]));
+            assert_eq!(tape, [1., 2., 3., -1., -1.]);
+            let dy = spread([1., 0., 0., 0., 1., 0., 0., 0., 1.]);
+            let to = ConefieldGrads { data: grads.as_mut_ptr(), start: 0, length: 1 };
+            let (left, out) = (tile_mut(&mut tape, 1), tile_mut(&mut dx, 3));
+            let status = backward(stage, params.as_ptr(), tile(&x, 3), left, tile(&dy, 3), to, out, none);
+            assert_eq!(status, CONEFIELD_OK);
+            assert_eq!(grads, [10. + 1. + 5. + 9.]);
+            assert_eq!(dx, spread([2., 0., 0., 0., 2., 0., 0., 0., 2.]));
+            destroy(stage);
+        }
+    }
+
+    #[test]
+    fn a_panic_is_a_status_and_a_text_that_fits_its_room() {
+        let (_, stage) = made(r#"{"panics": true}"#, ptr::null_mut());
+        let mut bytes = [0u8; 16];
+        let mut error = room(&mut bytes);
+        let (x, mut y, mut tape) = ([0.5f32; 3], [0.0f32; 3], [0.0f32; 1]);
+        let status = unsafe {
+            forward(
+                stage,
+                [1.0f32].as_ptr(),
+                ConefieldTile { data: x.as_ptr(), channels: 3, rows: 1, stride: 1 },
+                ConefieldTileMut { data: y.as_mut_ptr(), channels: 3, rows: 1, stride: 1 },
+                ConefieldTileMut { data: tape.as_mut_ptr(), channels: 1, rows: 1, stride: 1 },
+                &mut error,
+            )
+        };
+        assert_eq!((status, error.length), (CONEFIELD_PANICKED, "panicked: told to, ".len() + 1200));
+        assert_eq!(&bytes, b"panicked: told t");
+        unsafe { destroy(stage) };
+    }
+
+    #[test]
+    fn settings_that_do_not_fit_are_refused_in_words() {
+        let mut bytes = [0u8; 200];
+        let mut error = room(&mut bytes);
+        let (status, stage) = made(r#"{"panics": 3}"#, &mut error);
+        assert_eq!(status, CONEFIELD_INVALID);
+        assert!(stage.is_null());
+        let n = error.length;
+        let said = String::from_utf8_lossy(&bytes[..n]);
+        assert!(said.contains("boolean"), "{said}");
+    }
+}

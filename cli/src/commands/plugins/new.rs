@@ -161,7 +161,7 @@ impl New {
         let table = if kind == Kind::Normalizer { "[[normalizers]]".into() } else { format!("[{kind}]") };
         format!(
             "# The small spec that ships with conefield, with the stage of this plugin.\nextends = \"fast\"\nname = \
-             \"{name}\"\n\n{table}\ntype = \"{name}\"\n"
+             \"{name}\"\ndescription = \"The spec fast with the {kind} of the plugin {name}.\"\n\n{table}\ntype = \"{name}\"\n"
         )
     }
 

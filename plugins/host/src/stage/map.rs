@@ -22,6 +22,9 @@ use std::{ptr, slice};
 /// Most parameters, channels, … that a stage may say it has: more would overflow what hosts compute from them.
 const MOST: usize = 1 << 40;
 
+/// Bytes of what a normalizer says of a mask: a few for each of many channels.
+const LONGEST_REPORT: usize = 1 << 16;
+
 /// An encoder, a normalizer or a field of a library.
 pub struct MapStage {
     handle: Handle,
@@ -376,11 +379,13 @@ impl Normalizer for MapStage {
             coarse_to_fine: coarse.into(),
         };
         let (mut keep, mut count) = (vec![0usize; width], usize::MAX);
-        let (mut report, mut error) = (Text::new(), Text::new());
+        let mut error = Text::new();
+        let mut report = vec![0u8; LONGEST_REPORT];
+        let mut room = ConefieldText { data: report.as_mut_ptr(), capacity: report.len(), length: 0 };
         // SAFETY: the stage is alive; everything handed over lives for the time of the call, and `keep` has room for
         // `width`.
         let status =
-            unsafe { refresh(self.handle.stage, &seen, keep.as_mut_ptr(), &mut count, report.room(), error.room()) };
+            unsafe { refresh(self.handle.stage, &seen, keep.as_mut_ptr(), &mut count, &mut room, error.room()) };
         if let Some(e) = look.error {
             return Err(e);
         }
@@ -396,7 +401,8 @@ impl Normalizer for MapStage {
             let what = format!("it keeps {count} channels {keep:?} of {width}");
             return Err(self.ty().failed("refresh", CONEFIELD_FAILED, &what));
         }
-        Ok(Some(Mask { keep, report: report.text() }))
+        report.truncate(room.length);
+        Ok(Some(Mask { keep, report: String::from_utf8_lossy(&report).into_owned() }))
     }
 
     fn decided(&self) {
