@@ -29,6 +29,7 @@ enum Fault {
     FAILS,
     FAILS_LATER,
     SLEEPS,
+    SLEEPS_IN_CREATE,
     ABORTS,
 };
 #ifndef FAULT
@@ -58,6 +59,7 @@ static ConefieldStatus create(const void *context, struct ConefieldStr settings,
                               struct ConefieldText *error) {
     (void)context, (void)settings, (void)width, (void)error;
     static int nothing;
+    if (FAULT == SLEEPS_IN_CREATE) nanosleep(&(struct timespec){.tv_sec = 600}, NULL);
     *stage = &nothing;
     return CONEFIELD_OK;
 }

@@ -1,11 +1,16 @@
 //! Ordinary stages made of a library's.
 
+#![allow(unsafe_code)]
+
 pub mod initializer;
 pub mod map;
 pub mod projector;
 
-use conefield_core::error::Error;
-use conefield_core::error::Result;
+use crate::library::{Handle, whole_text};
+use conefield_core::error::{Error, Result};
+use conefield_core::stage::{Fragment, Namer};
+use conefield_plugin_abi::*;
+use std::ffi::c_void;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::{Mutex, PoisonError};
 
@@ -29,4 +34,16 @@ impl Fault {
         self.there.store(false, Ordering::Release);
         self.first.lock().unwrap_or_else(PoisonError::into_inner).take().map_or(Ok(()), Err)
     }
+}
+
+type WgslFn = unsafe extern "C" fn(*const c_void, ConefieldStr, *mut ConefieldText, *mut u32) -> ConefieldStatus;
+
+/// The WGSL of a stage, if it has any.
+pub(crate) fn fragment(handle: &Handle, wgsl: Option<WgslFn>, namer: &Namer) -> Option<Fragment> {
+    let wgsl = wgsl?;
+    let mut workgroup_bytes = 0;
+    // SAFETY: the stage is alive; everything handed over lives for the time of the call.
+    let ask = |room| unsafe { wgsl(handle.stage, ConefieldStr::of(&namer.prefix), room, &mut workgroup_bytes) };
+    let source = whole_text(ask).ok()?;
+    Some(Fragment { source, workgroup_bytes })
 }

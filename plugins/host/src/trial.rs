@@ -3,13 +3,10 @@
 //! refused here. Whether gradients are right only the conformance kit can say.
 
 use crate::library::Type;
-use crate::stage::map::MapStage;
-use crate::stage::projector::ProjectorStage;
 use conefield_core::error::{Error, Result};
 use conefield_core::random::{mix, unit};
-use conefield_core::stage::{GradKind, Grads, Projector, Samples, Stage, TILE_ROWS, Tile, TileMut, UnitRay};
+use conefield_core::stage::{GradKind, Grads, Stage, TILE_ROWS, Tile, TileMut, UnitRay};
 use std::ops::Range;
-use std::sync::Arc;
 use std::sync::mpsc;
 use std::thread;
 use std::time::Duration;
@@ -19,8 +16,8 @@ pub const LIMIT: Duration = Duration::from_secs(5);
 
 /// Numbers on either side of a buffer that nobody may write to: more than a tile of the widest common stages.
 const GUARD: usize = 1 << 14;
-/// A NaN that no arithmetic makes.
-const UNTOUCHED: u32 = 0x7fc5_a7e1;
+/// A NaN that no arithmetic makes: the mark of what nobody has written to.
+pub(crate) const UNTOUCHED: u32 = 0x7fc5_a7e1;
 
 /// Stages of more parameters are not initialised for their trial; that takes long, and the run does it anyway.
 const MANY: usize = 1 << 20;
@@ -67,13 +64,12 @@ impl Guarded {
     }
 }
 
-/// Runs `trial` under the time limit.
-fn timed(ty: &Type, trial: impl FnOnce() -> Result<()> + Send + 'static) -> Result<()> {
+/// Makes something of a library under the time limit, on a thread of its own: one that hangs is left behind.
+pub(crate) fn timed<T: Send + 'static>(ty: &Type, make: impl FnOnce() -> Result<T> + Send + 'static) -> Result<T> {
     let (done, wait) = mpsc::channel();
     thread::spawn(move || {
-        let outcome = trial();
         // Nobody listens any more if this came too late.
-        let _ = done.send(outcome);
+        let _ = done.send(make());
     });
     wait.recv_timeout(LIMIT).unwrap_or_else(|e| {
         let what = match e {
@@ -88,16 +84,13 @@ fn refused(ty: &Type, what: &str) -> Error {
     Error::unsupported(format!("{} {:?} of plugin {}", ty.kind, ty.name, ty.owner), format!("refused: {what}"))
 }
 
-/// Tries an encoder, a normalizer or a field.
-pub(crate) fn map(stage: &Arc<MapStage>) -> Result<()> {
-    let (ty, trial) = (stage.clone(), stage.clone());
-    timed(ty.ty(), move || {
-        let complaint = try_map(&trial)?;
-        complaint.map_or(Ok(()), |c| Err(refused(trial.ty(), &c)))
-    })
+/// Tries an encoder, a normalizer or a field of type `ty`.
+pub(crate) fn map(ty: &Type, stage: &dyn Stage) -> Result<()> {
+    try_map(stage)?.map_or(Ok(()), |complaint| Err(refused(ty, &complaint)))
 }
 
-fn try_map(stage: &MapStage) -> Result<Option<String>> {
+/// The first complaint about a stage.
+fn try_map(stage: &dyn Stage) -> Result<Option<String>> {
     let (info, kernel) = (stage.info(), stage.kernel());
     let mut params = Guarded::zeroed(info.params);
     if info.params <= MANY {
@@ -153,34 +146,29 @@ fn try_map(stage: &MapStage) -> Result<Option<String>> {
     Ok(None)
 }
 
-/// Tries a projector.
-pub(crate) fn projector(stage: &Arc<ProjectorStage>) -> Result<()> {
-    let (ty, trial) = (stage.clone(), stage.clone());
-    timed(ty.ty(), move || {
-        let ray = |origin, direction: [f32; 3], inside| UnitRay {
-            origin,
-            direction,
-            inside,
-            published: [0.5, 3.0],
-            per_mm: 0.01,
-        };
-        let third = (1.0f32 / 3.0).sqrt();
-        for ray in [
-            ray([-1.0, 0.5, 0.5], [1.0, 0.0, 0.0], [1.0, 2.0]),
-            ray([-third; 3], [third; 3], [1.0, 1.0 + 1.0 / third]),
-            ray([0.5, 2.0, 0.25], [0.0, -1.0, 0.0], [1.0, 2.0]),
-            ray([-1.0, 5.0, 0.5], [1.0, 0.0, 0.0], [0.0, 0.0]),
-        ] {
-            for seed in [None, Some(3)] {
-                let mut samples = Samples::default();
-                trial.sample_guarded(&ray, seed, GUARD, &mut samples)?;
-                let mu = vec![1.0; samples.weights.len()];
-                let line = trial.integrate(&samples.weights, &mu);
-                if !line.is_finite() {
-                    return Err(refused(trial.ty(), &format!("the line integral of ones is {line}")));
-                }
+/// Tries a projector of type `ty`: `cast` samples a ray, with that many untouchable numbers behind the samples, and gives
+/// the line integral of ones.
+pub(crate) fn projector(ty: &Type, cast: impl Fn(&UnitRay, Option<u64>, usize) -> Result<f64>) -> Result<()> {
+    let ray = |origin, direction: [f32; 3], inside| UnitRay {
+        origin,
+        direction,
+        inside,
+        published: [0.5, 3.0],
+        per_mm: 0.01,
+    };
+    let third = (1.0f32 / 3.0).sqrt();
+    for ray in [
+        ray([-1.0, 0.5, 0.5], [1.0, 0.0, 0.0], [1.0, 2.0]),
+        ray([-third; 3], [third; 3], [1.0, 1.0 + 1.0 / third]),
+        ray([0.5, 2.0, 0.25], [0.0, -1.0, 0.0], [1.0, 2.0]),
+        ray([-1.0, 5.0, 0.5], [1.0, 0.0, 0.0], [0.0, 0.0]),
+    ] {
+        for seed in [None, Some(3)] {
+            let line = cast(&ray, seed, GUARD)?;
+            if !line.is_finite() {
+                return Err(refused(ty, &format!("the line integral of ones is {line}")));
             }
         }
-        Ok(())
-    })
+    }
+    Ok(())
 }

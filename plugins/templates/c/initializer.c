@@ -3,33 +3,7 @@
  * This start fills every block of the encoder with uniform numbers; every other block stays as its stage's own scheme made
  * it.
  */
-#include "conefield_plugin.h"
-
-#include <math.h>
-#include <stdio.h>
-#include <stdlib.h>
-#include <string.h>
-
-#define TEXT(literal) { (const uint8_t *)(literal), sizeof(literal) - 1 }
-
-/* Writes a line for people. */
-static void say(struct ConefieldText *out, const char *line) {
-    if (out == NULL) return;
-    out->length = strlen(line);
-    memcpy(out->data, line, out->length < out->capacity ? out->length : out->capacity);
-}
-
-/* The number under `key` of the settings. The host has checked them against the schema and filled in defaults: they are one
- * flat JSON object, and the key is there. */
-static double number(struct ConefieldStr settings, const char *key) {
-    char text[1024], quoted[64];
-    size_t n = settings.length < sizeof text - 1 ? settings.length : sizeof text - 1;
-    memcpy(text, settings.data, n);
-    text[n] = 0;
-    snprintf(quoted, sizeof quoted, "\"%s\":", key);
-    const char *at = strstr(text, quoted);
-    return at == NULL ? 0.0 : strtod(at + strlen(quoted), NULL);
-}
+@head@
 
 typedef struct {
     double bound;
@@ -98,18 +72,4 @@ static const struct ConefieldStage STAGES[] = {{
     .initializer = &INITIALIZER,
 }};
 
-static const struct ConefieldPlugin PLUGIN = {
-    .size = sizeof PLUGIN,
-    .abi_major = CONEFIELD_ABI_MAJOR,
-    .abi_minor = CONEFIELD_ABI_MINOR,
-    .name = TEXT("@name@"),
-    .version = TEXT("0.1.0"),
-    .licence = TEXT("Apache-2.0 OR MIT"),
-    .stages = STAGES,
-    .stage_count = sizeof STAGES / sizeof *STAGES,
-    .stage_size = sizeof *STAGES,
-};
-
-const struct ConefieldPlugin *conefield_plugin(void) {
-    return &PLUGIN;
-}
+@plugin@

@@ -83,6 +83,7 @@ impl StageKind {
         }
     }
 
+    /// The stage in C: what every plugin begins and ends with is filled in.
     fn c(self) -> &'static str {
         match self {
             Self::Encoder => template!("c/encoder.c"),
@@ -145,7 +146,8 @@ impl New {
     }
 
     fn c(&self) -> Start {
-        let named = |text: &str| text.replace("@name@", &self.name);
+        let [head, plugin] = [template!("c/head.c"), template!("c/plugin.c")].map(str::trim_end);
+        let named = |text: &str| text.replace("@head@", head).replace("@plugin@", plugin).replace("@name@", &self.name);
         let files = vec![
             (format!("{}.c", self.name), named(self.kind.c())),
             ("conefield_plugin.h".into(), HEADER.into()),

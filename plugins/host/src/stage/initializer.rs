@@ -3,6 +3,7 @@
 #![allow(unsafe_code)]
 
 use crate::library::{Functions, Handle, Text, Type};
+use crate::trial::{UNTOUCHED, timed};
 use conefield_core::arena::{Arena, InitReport, Layout};
 use conefield_core::error::Result;
 use conefield_core::spec::Initializer;
@@ -19,17 +20,19 @@ pub struct InitializerStage {
 
 /// Makes an initializer.
 pub(crate) fn build(ty: &Arc<Type>, settings: &Value) -> Result<InitializerStage> {
-    let handle = ty.create(settings, 0)?;
-    let Functions::Initializer(functions) = ty.functions else {
-        return Err(ty.failed("create", CONEFIELD_FAILED, "it is no initializer"));
-    };
-    let describe = handle.describe();
-    Ok(InitializerStage { handle, functions, describe })
+    let (own, settings) = (ty.clone(), settings.clone());
+    timed(ty, move || {
+        let handle = own.create(&settings, 0)?;
+        let Functions::Initializer(functions) = own.functions else {
+            return Err(own.failed("create", CONEFIELD_FAILED, "it is no initializer"));
+        };
+        let describe = handle.describe();
+        Ok(InitializerStage { handle, functions, describe })
+    })
 }
 
 /// Numbers behind the parameters that nobody may write to.
 const GUARD: usize = 1 << 12;
-const UNTOUCHED: u32 = 0x7fc5_a7e1;
 
 impl Initializer for InitializerStage {
     fn apply(&self, layout: &Layout, arena: &mut Arena) -> Result<InitReport> {

@@ -2,8 +2,8 @@
 
 #![allow(unsafe_code)]
 
-use super::Fault;
-use crate::library::{Functions, Handle, Text, Type, whole_text};
+use super::{Fault, fragment};
+use crate::library::{Functions, Handle, Text, Type};
 use crate::trial;
 use conefield_core::error::{Error, Result, ensure};
 use conefield_core::stage::{
@@ -40,13 +40,14 @@ pub struct MapStage {
 
 /// Makes a stage and tries it out.
 pub(crate) fn build(ty: &Arc<Type>, settings: &Value, width: usize) -> Result<MapStage> {
-    let stage = Arc::new(MapStage::new(ty.create(settings, width)?)?);
-    if stage.info.input != width {
+    let (own, settings) = (ty.clone(), settings.clone());
+    trial::timed(ty, move || {
+        let stage = MapStage::new(own.create(&settings, width)?)?;
         let found = format!("{width} channels for a stage that takes {}", stage.info.input);
-        return Err(Error::invalid("spec", ty.kind.name(), found, "as many as it was made for"));
-    }
-    trial::map(&stage)?;
-    Arc::into_inner(stage).ok_or_else(|| ty.failed("a trial", CONEFIELD_FAILED, "it has not ended"))
+        ensure(stage.info.input == width, "spec", own.kind.name(), found, "as many as it was made for")?;
+        trial::map(&own, &stage)?;
+        Ok(stage)
+    })
 }
 
 impl MapStage {
@@ -331,18 +332,6 @@ impl Stage for MapStage {
     fn describe(&self) -> String {
         self.describe.clone()
     }
-}
-
-type WgslFn = unsafe extern "C" fn(*const c_void, ConefieldStr, *mut ConefieldText, *mut u32) -> ConefieldStatus;
-
-/// The WGSL of a stage, if it has any.
-pub(crate) fn fragment(handle: &Handle, wgsl: Option<WgslFn>, namer: &Namer) -> Option<Fragment> {
-    let wgsl = wgsl?;
-    let mut workgroup_bytes = 0;
-    // SAFETY: the stage is alive; everything handed over lives for the time of the call.
-    let ask = |room| unsafe { wgsl(handle.stage, ConefieldStr::of(&namer.prefix), room, &mut workgroup_bytes) };
-    let source = whole_text(ask).ok()?;
-    Some(Fragment { source, workgroup_bytes })
 }
 
 impl Encoder for MapStage {

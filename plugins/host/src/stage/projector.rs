@@ -2,8 +2,7 @@
 
 #![allow(unsafe_code)]
 
-use super::Fault;
-use super::map::fragment;
+use super::{Fault, fragment};
 use crate::library::{Functions, Handle, Text, Type};
 use crate::trial;
 use conefield_core::error::Result;
@@ -26,14 +25,21 @@ pub struct ProjectorStage {
 
 /// Makes a projector and tries it out.
 pub(crate) fn build(ty: &Arc<Type>, settings: &Value) -> Result<ProjectorStage> {
-    let handle = ty.create(settings, 0)?;
-    let Functions::Projector(functions) = ty.functions else {
-        return Err(ty.failed("create", CONEFIELD_FAILED, "it is no projector"));
-    };
-    let describe = handle.describe();
-    let stage = Arc::new(ProjectorStage { handle, functions, describe, fault: Fault::default() });
-    trial::projector(&stage)?;
-    Arc::into_inner(stage).ok_or_else(|| ty.failed("a trial", CONEFIELD_FAILED, "it has not ended"))
+    let (own, settings) = (ty.clone(), settings.clone());
+    trial::timed(ty, move || {
+        let handle = own.create(&settings, 0)?;
+        let Functions::Projector(functions) = own.functions else {
+            return Err(own.failed("create", CONEFIELD_FAILED, "it is no projector"));
+        };
+        let describe = handle.describe();
+        let stage = ProjectorStage { handle, functions, describe, fault: Fault::default() };
+        trial::projector(&own, |ray, seed, guard| {
+            let mut samples = Samples::default();
+            stage.sample_guarded(ray, seed, guard, &mut samples)?;
+            Ok(stage.integrate(&samples.weights, &vec![1.0; samples.weights.len()]))
+        })?;
+        Ok(stage)
+    })
 }
 
 fn raw(ray: &UnitRay) -> ConefieldRay {
@@ -61,7 +67,7 @@ impl ProjectorStage {
         if capacity == 0 {
             return Ok(());
         }
-        let (start, mark) = (out.points.len(), f32::from_bits(0x7fc5_a7e1));
+        let (start, mark) = (out.points.len(), f32::from_bits(trial::UNTOUCHED));
         out.points.resize(start + capacity + guard, [mark; 3]);
         out.weights.resize(start + capacity + guard, mark);
         let done = self.fill(ray, seed, capacity, &mut out.points[start..], &mut out.weights[start..]);
@@ -102,7 +108,7 @@ impl ProjectorStage {
         if count > capacity {
             return failed(&format!("{count} samples where it said that {capacity} are the most"));
         }
-        let untouched = |v: f32| v.to_bits() == 0x7fc5_a7e1;
+        let untouched = |v: f32| v.to_bits() == trial::UNTOUCHED;
         if points[capacity..].iter().flatten().chain(&weights[capacity..]).any(|&v| !untouched(v)) {
             return failed(&format!("it writes past the {capacity} samples that there is room for"));
         }
