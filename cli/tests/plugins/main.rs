@@ -5,6 +5,7 @@ mod bits;
 mod build;
 #[path = "../common/mod.rs"]
 mod common;
+mod examples;
 mod faulty;
 mod new;
 mod trust;

@@ -75,6 +75,11 @@ static size_t params_of(const Grid *g) {
     return g->resolution * g->resolution * g->resolution * g->features;
 }
 
+/* A worker may own a slab of the grid along x. Few and wide ones: each goes through all rows. */
+static size_t slabs_of(const Grid *g) {
+    return g->resolution < 8 ? g->resolution : 8;
+}
+
 static ConefieldStatus info(const void *stage, struct ConefieldInfo *out) {
     const Grid *g = stage;
     *out = (struct ConefieldInfo){
@@ -82,7 +87,7 @@ static ConefieldStatus info(const void *stage, struct ConefieldInfo *out) {
         .output = g->features,
         .params = params_of(g),
         .blocks = 1,
-        .partitions = g->resolution,
+        .partitions = slabs_of(g),
         .macs = 8 * g->features,
         .scope = CONEFIELD_SCOPE_ROW,
         .grads = CONEFIELD_GRADS_SCATTER,
@@ -96,11 +101,11 @@ static ConefieldStatus parameter(const void *stage, size_t index, struct Conefie
     return CONEFIELD_OK;
 }
 
-/* A worker may own a slice of the grid along x. */
 static ConefieldStatus partition(const void *stage, size_t index, struct ConefieldRange *out) {
     const Grid *g = stage;
     size_t slice = params_of(g) / g->resolution;
-    *out = (struct ConefieldRange){index * slice, (index + 1) * slice};
+    size_t slabs = slabs_of(g), first = index * g->resolution / slabs, end = (index + 1) * g->resolution / slabs;
+    *out = (struct ConefieldRange){first * slice, end * slice};
     return CONEFIELD_OK;
 }
 
@@ -112,6 +117,17 @@ static ConefieldStatus init(const void *stage, uint64_t seed, float *params, siz
         params[i] = 1e-2f * (2.0f * (float)(seed >> 40) / 16777216.0f - 1.0f);
     }
     return CONEFIELD_OK;
+}
+
+/* The node below a coordinate that counts cells. NaN compares false: its node is 0. */
+static size_t node_below(const Grid *g, float at) {
+    size_t node = at > 0.0f ? (size_t)at : 0;
+    return node > g->resolution - 2 ? g->resolution - 2 : node;
+}
+
+/* A coordinate of the cube in cells of the grid; outside the cube that of the nearest face. */
+static float cells_at(const Grid *g, float p) {
+    return (p < 0.0f ? 0.0f : p > 1.0f ? 1.0f : p) * (float)(g->resolution - 1);
 }
 
 /* The eight nodes around a point: first parameter, weight, and the weight's derivative along each axis. */
@@ -126,10 +142,8 @@ static void corners_of(const Grid *g, struct ConefieldTile x, size_t row, Corner
     for (size_t k = 0; k < 3; k++) {
         float p = x.data[k * x.stride + row];
         cells[k] = p > 0.0f && p < 1.0f ? (float)(g->resolution - 1) : 0.0f;
-        float at = (p < 0.0f ? 0.0f : p > 1.0f ? 1.0f : p) * (float)(g->resolution - 1);
-        /* NaN compares false: it stays in `right`, and the node is 0. */
-        node[k] = at > 0.0f ? (size_t)at : 0;
-        if (node[k] > g->resolution - 2) node[k] = g->resolution - 2;
+        float at = cells_at(g, p);
+        node[k] = node_below(g, at);
         right[k] = at - (float)node[k];
     }
     for (size_t i = 0; i < 8; i++) {
@@ -171,9 +185,15 @@ static ConefieldStatus backward(const void *stage, const float *params, struct C
     (void)tape;
     (void)error;
     const Grid *g = stage;
+    size_t slice = params_of(g) / g->resolution;
     for (size_t row = 0; row < x.rows; row++) {
         Corner corners[8];
         float slope[3] = {0, 0, 0};
+        if (dx.data == NULL) {
+            /* Most rows lie in slabs of others. */
+            size_t node = node_below(g, cells_at(g, x.data[row]));
+            if ((node + 2) * slice <= grads.start || node * slice >= grads.start + grads.length) continue;
+        }
         corners_of(g, x, row, corners);
         for (size_t i = 0; i < 8; i++) {
             for (size_t c = 0; c < g->features; c++) {
