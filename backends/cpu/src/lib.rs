@@ -16,9 +16,9 @@ use conefield_core::backend::{Adam, Backend, Executable, Explain, StepStats, Wor
 use conefield_core::error::{Error, Result};
 use conefield_core::pipeline::{Model, Pipeline};
 use conefield_core::simd;
-use conefield_core::stage::{GradKind, Samples, UnitRay};
+use conefield_core::stage::{GradKind, Samples, TILE_ROWS, UnitRay};
 use rayon::prelude::*;
-use rows::{Encoded, Kernels, Scratch};
+use rows::{Belong, Encoded, Kernels, Scratch};
 use step::Slots;
 
 /// Points that are encoded at once when the field is evaluated.
@@ -117,9 +117,8 @@ impl Executable for CpuExecutable {
             |(encoded, scratch), (out, points)| {
                 let params = &model.arena.params;
                 encoded.forward(&kernels, params, points);
-                let rows = kernels.rows_at_points();
-                for (i, out) in out.chunks_mut(rows).enumerate() {
-                    scratch.forward(&kernels, params, encoded, i * rows, &[out.len()]);
+                for (i, out) in out.chunks_mut(TILE_ROWS).enumerate() {
+                    scratch.forward(&kernels, params, encoded, i * TILE_ROWS, &[out.len()], Belong::Nowhere);
                     out.copy_from_slice(scratch.outputs());
                 }
             },
@@ -149,7 +148,8 @@ impl Executable for CpuExecutable {
                 }
                 let params = &model.arena.params;
                 encoded.forward(&kernels, params, &samples.points);
-                scratch.forward(&kernels, params, encoded, 0, &kernels.ray_tiles(samples.points.len()));
+                let tiles = kernels.ray_tiles(samples.points.len());
+                scratch.forward(&kernels, params, encoded, 0, &tiles, Belong::ToRays);
                 mu.clear();
                 mu.extend(scratch.outputs().iter().map(|&m| f64::from(m)));
                 *out = projector.integrate(&samples.weights, mu) as f32;

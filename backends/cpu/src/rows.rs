@@ -22,6 +22,13 @@ pub struct Step<'a, R: Real> {
     output: Range<usize>,
 }
 
+impl<R: Real> Step<'_, R> {
+    /// Whether rows must be handed to it one at a time.
+    fn apart(&self, belong: Belong) -> bool {
+        belong == Belong::Nowhere && self.info.scope == Scope::Ray
+    }
+}
+
 /// Every stage that does something, in order.
 pub struct Kernels<'a, R: Real> {
     /// Encoder first, field last.
@@ -55,11 +62,6 @@ impl<'a, R: Real> Kernels<'a, R> {
     /// Channels that the encoder computes.
     pub fn encoder_width(&self) -> usize {
         self.steps[0].info.output
-    }
-
-    /// Rows of a tile of points that belong to no ray.
-    pub fn rows_at_points(&self) -> usize {
-        if self.scope == Scope::Ray { 1 } else { TILE_ROWS }
     }
 
     /// Tiles for one ray of `n` samples.
@@ -115,10 +117,107 @@ pub struct Log<R> {
 }
 
 impl<R> Log<R> {
+    /// Appends a tile, or where its rows stand `apart` a tile for each.
+    fn push(&mut self, x: Tile<'_, R>, dy: Tile<'_, R>, apart: bool)
+    where
+        R: Copy,
+    {
+        if !apart {
+            self.data.extend_from_slice(x.data);
+            self.data.extend_from_slice(dy.data);
+            self.rows.push(x.rows);
+            return;
+        }
+        for i in 0..x.rows {
+            self.data.extend(row(x, i));
+            self.data.extend(row(dy, i));
+            self.rows.push(1);
+        }
+    }
+
     /// Forgets everything.
     pub fn clear(&mut self) {
         self.data.clear();
         self.rows.clear();
+    }
+}
+
+/// Row `i` of a tile.
+fn row<R: Copy>(tile: Tile<'_, R>, i: usize) -> impl Iterator<Item = R> {
+    tile.data.iter().skip(i).step_by(tile.rows).copied()
+}
+
+/// Writes row `i` of a tile.
+fn set_row<R: Copy>(tile: &mut TileMut<'_, R>, i: usize, from: &[R]) {
+    let rows = tile.rows;
+    for (to, &v) in tile.data.iter_mut().skip(i).step_by(rows).zip(from) {
+        *to = v;
+    }
+}
+
+/// Hands a stage the rows of a tile one at a time.
+#[derive(Debug, Default)]
+struct Single<R> {
+    x: Vec<R>,
+    y: Vec<R>,
+    tape: Vec<R>,
+    dx: Vec<R>,
+}
+
+impl<R: Real> Single<R> {
+    fn forward(
+        &mut self,
+        kernel: &dyn Kernel<R>,
+        params: &[R],
+        x: Tile<'_, R>,
+        mut y: TileMut<'_, R>,
+        mut tape: TileMut<'_, R>,
+    ) {
+        self.y.resize(y.width(), R::ZERO);
+        self.tape.resize(tape.width(), R::ZERO);
+        for i in 0..x.rows {
+            self.x.clear();
+            self.x.extend(row(x, i));
+            kernel.forward(
+                params,
+                Tile::new(&self.x, 1),
+                TileMut::new(&mut self.y, 1),
+                TileMut::new(&mut self.tape, 1),
+            );
+            set_row(&mut y, i, &self.y);
+            set_row(&mut tape, i, &self.tape);
+        }
+    }
+
+    fn backward(
+        &mut self,
+        kernel: &dyn Kernel<R>,
+        params: &[R],
+        x: Tile<'_, R>,
+        tape: TileMut<'_, R>,
+        dy: Tile<'_, R>,
+        grads: Grads<'_, R>,
+        mut dx: Option<TileMut<'_, R>>,
+    ) {
+        let left = Tile::new(&*tape.data, tape.rows);
+        self.dx.resize(x.width(), R::ZERO);
+        for i in 0..x.rows {
+            for (to, from) in [(&mut self.x, x), (&mut self.y, dy), (&mut self.tape, left)] {
+                to.clear();
+                to.extend(row(from, i));
+            }
+            kernel.backward(
+                params,
+                Tile::new(&self.x, 1),
+                TileMut::new(&mut self.tape, 1),
+                Tile::new(&self.y, 1),
+                Grads { values: &mut *grads.values, range: grads.range.clone() },
+                dx.is_some().then(|| TileMut::new(&mut self.dx, 1)),
+            );
+            if let Some(dx) = &mut dx {
+                set_row(dx, i, &self.dx);
+            }
+        }
     }
 }
 
@@ -207,6 +306,16 @@ impl<R: Real> Encoded<R> {
     }
 }
 
+/// What the rows of a tile have to do with each other.
+#[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
+pub enum Belong {
+    /// They are samples of one ray, or of several where no stage looks along rays.
+    #[default]
+    ToRays,
+    /// They are points off any ray: a stage that looks along rays gets them one at a time.
+    Nowhere,
+}
+
 /// Working memory of a worker for all stages behind the encoder; it grows to what the largest group needs and is
 /// used again.
 #[derive(Debug, Default)]
@@ -218,6 +327,9 @@ pub struct Scratch<R> {
     outputs: Vec<R>,
     /// Gradients on the way back: of a stage's output and of its input.
     back: [Vec<R>; 2],
+    belong: Belong,
+    /// One row, of a stage that gets them one at a time.
+    single: Single<R>,
 }
 
 impl<R: Real> Scratch<R> {
@@ -235,7 +347,9 @@ impl<R: Real> Scratch<R> {
         encoded: &Encoded<R>,
         first: usize,
         tiles: &[usize],
+        belong: Belong,
     ) {
+        self.belong = belong;
         let rows: usize = tiles.iter().sum();
         let numbers = kernels.row_numbers();
         if self.data.len() < rows * numbers {
@@ -254,12 +368,14 @@ impl<R: Real> Scratch<R> {
             for s in &kernels.steps[1..] {
                 let (before, after) = own.split_at_mut(s.output.start * n);
                 let (y, tape) = after[..(s.info.output + s.info.tape) * n].split_at_mut(s.info.output * n);
-                s.kernel.forward(
-                    &params[s.params.clone()],
-                    Tile::new(&before[s.input.start * n..s.input.end * n], n),
-                    TileMut::new(y, n),
-                    TileMut::new(tape, n),
-                );
+                let params = &params[s.params.clone()];
+                let x = Tile::new(&before[s.input.start * n..s.input.end * n], n);
+                let (y, tape) = (TileMut::new(y, n), TileMut::new(tape, n));
+                if s.apart(belong) {
+                    self.single.forward(s.kernel, params, x, y, tape);
+                } else {
+                    s.kernel.forward(params, x, y, tape);
+                }
             }
             let y = &kernels.steps[kernels.steps.len() - 1].output;
             self.outputs.extend_from_slice(&own[y.start * n..y.end * n]);
@@ -298,11 +414,9 @@ impl<R: Real> Scratch<R> {
                 let x = &before[s.input.start * n..s.input.end * n];
                 let g = &dy[..s.info.output * n];
                 let scattered = s.info.grads == GradKind::Scatter;
+                let apart = s.apart(self.belong);
                 if scattered {
-                    let log = &mut logs[k];
-                    log.data.extend_from_slice(x);
-                    log.data.extend_from_slice(g);
-                    log.rows.push(n);
+                    logs[k].push(Tile::new(x, n), Tile::new(g, n), apart);
                 }
                 if scattered && !s.hands_on {
                     continue 'tiles;
@@ -312,14 +426,14 @@ impl<R: Real> Scratch<R> {
                 } else {
                     Grads::all(dense.of(k))
                 };
-                s.kernel.backward(
-                    &params[s.params.clone()],
-                    Tile::new(x, n),
-                    TileMut::new(&mut after[s.info.output * n..(s.info.output + s.info.tape) * n], n),
-                    Tile::new(g, n),
-                    grads,
-                    s.hands_on.then(|| TileMut::new(&mut dx[..s.info.input * n], n)),
-                );
+                let (params, x, g) = (&params[s.params.clone()], Tile::new(x, n), Tile::new(g, n));
+                let tape = TileMut::new(&mut after[s.info.output * n..(s.info.output + s.info.tape) * n], n);
+                let dx_here = s.hands_on.then(|| TileMut::new(&mut dx[..s.info.input * n], n));
+                if apart {
+                    self.single.backward(s.kernel, params, x, tape, g, grads, dx_here);
+                } else {
+                    s.kernel.backward(params, x, tape, g, grads, dx_here);
+                }
                 if !s.hands_on {
                     continue 'tiles;
                 }

@@ -1,6 +1,6 @@
 //! One training step: losses and their gradients over rays, points and blocks.
 
-use crate::rows::{DenseGrads, Encoded, Kernels, Log, Scratch, even_tiles};
+use crate::rows::{Belong, DenseGrads, Encoded, Kernels, Log, Scratch, even_tiles};
 use conefield_core::backend::{StepStats, TvBlocks, Work};
 use conefield_core::random::mix;
 use conefield_core::simd::Real;
@@ -266,12 +266,12 @@ impl<R: Real> Slot<R> {
         if rows.is_empty() {
             return;
         }
-        let tiles = match (matches!(group, Group::Rays(_)), kernels.mixes_rays()) {
-            (_, true) => even_tiles(rows.len()),
-            (true, false) => self.counts[counts.clone()].to_vec(),
-            (false, false) => vec![1; rows.len()],
+        let (tiles, belong) = match (group, kernels.mixes_rays()) {
+            (Group::Rays(_), false) => (self.counts[counts.clone()].to_vec(), Belong::ToRays),
+            (Group::Rays(_), true) => (even_tiles(rows.len()), Belong::ToRays),
+            (Group::Points(_) | Group::Tv(_), _) => (even_tiles(rows.len()), Belong::Nowhere),
         };
-        self.scratch.forward(kernels, params, &self.encoded, rows.start, &tiles);
+        self.scratch.forward(kernels, params, &self.encoded, rows.start, &tiles, belong);
         self.mu.clear();
         self.mu.extend(self.scratch.outputs().iter().map(|m| m.f64()));
         self.dmu.clear();

@@ -4,7 +4,13 @@
 use crate::build::{cargo, example, library, sources};
 use crate::common::{conefield, done, json, refused, text};
 use conefield_backend_cpu::Cpu;
+use conefield_core::backend::{Backend, Loss, TvBlocks, Work};
+use conefield_core::pipeline::{Model, Pipeline};
+use conefield_core::random::{mix, unit};
 use conefield_core::solver::{Job, Limits, Silent};
+use conefield_core::spec::stage::read;
+use conefield_core::spec::{EncoderSpec, FieldSpec, NormalizerSpec, ProjectorSpec};
+use conefield_core::stage::UnitRay;
 use std::path::{Path, PathBuf};
 
 // Stage types register themselves where their crate is linked.
@@ -206,4 +212,53 @@ fn masks_of_plugins() {
     let shape = &runs[0]["normalizers.0.weight"].0;
     assert_eq!(*shape, [3], "three channels are left");
     assert!(runs[0] == runs[1], "the weights differ");
+}
+
+/// A point off any ray is a ray of one sample: there a stage that looks along rays changes nothing, neither values nor
+/// gradients, while along rays it does.
+#[test]
+fn points_off_any_ray_stand_alone() {
+    let build = |smooth: bool| {
+        let encoder =
+            serde_json::json!({"type": "hash-grid", "levels": 2, "log2_table_size": 10, "base_resolution": 4});
+        let encoder = read::<dyn EncoderSpec>(encoder).unwrap().build().unwrap();
+        let width = encoder.info().output;
+        let smoothing = || smooth::RaySmooth { strength: 0.5 }.build(width).unwrap();
+        let normalizers = smooth.then(smoothing).into_iter().collect();
+        let field = serde_json::json!({"type": "mlp", "width": 8});
+        let field = read::<dyn FieldSpec>(field).unwrap().build(width).unwrap();
+        let march = read::<dyn ProjectorSpec>(serde_json::json!({"type": "ray-march", "samples": 20})).unwrap();
+        let model = Model::random(Pipeline::assemble(encoder, normalizers, field, march.build().unwrap()), 3);
+        let exe = Cpu::new().compile(&model.pipeline).unwrap().0;
+        (model, exe)
+    };
+    let ((mut plain, mut exe), (mut smoothed, mut smoothed_exe)) = (build(false), build(true));
+    // Large features, so that smoothing them shows.
+    for (i, p) in plain.arena.params.iter_mut().enumerate() {
+        *p += 0.3 * (i as f32 * 0.7).sin();
+    }
+    smoothed.arena.params.copy_from_slice(&plain.arena.params);
+    let point = |i: usize, k: u64| unit(mix(i as u64, k));
+    let points: Vec<[f32; 3]> = (0..700).map(|i| [point(i, 1), point(i, 2), point(i, 3)]).collect();
+    let mut values = [vec![0.0; points.len()], vec![0.0; points.len()]];
+    exe.evaluate(&plain, &points, &mut values[0]).unwrap();
+    smoothed_exe.evaluate(&smoothed, &points, &mut values[1]).unwrap();
+    assert!(values[0] == values[1], "values differ");
+
+    let known: Vec<([f32; 3], f32)> = points.iter().map(|p| (*p, 0.3)).collect();
+    let corners = points[..40].iter().map(|p| p.map(|x| 0.8 * x)).collect();
+    let tv = TvBlocks { corners, spacing: [0.02; 3], edge: 4, weight: 0.1, smoothing: 1e-3 };
+    let work = Work { step: 1, seed: 2, loss: Loss::L2, rays: &[], points: &known, tv: Some(&tv) };
+    let stats = exe.step(&mut plain, &work).unwrap();
+    let found = smoothed_exe.step(&mut smoothed, &work).unwrap();
+    assert_eq!((stats.loss.to_bits(), stats.prior.to_bits()), (found.loss.to_bits(), found.prior.to_bits()));
+    assert!(stats.loss > 0.0 && stats.prior > 0.0 && plain.arena.grads.iter().any(|g| *g != 0.0));
+    assert!(plain.arena.grads == smoothed.arena.grads, "gradients differ");
+
+    let (origin, direction) = ([-1.0, 0.4, 0.6], [1.0, 0.0, 0.0]);
+    let ray = UnitRay { origin, direction, inside: [1.0, 2.0], published: [1.0, 2.0], per_mm: 0.01 };
+    let mut lines = [[0.0f32], [0.0f32]];
+    exe.render(&plain, &[ray], &mut lines[0]).unwrap();
+    smoothed_exe.render(&smoothed, &[ray], &mut lines[1]).unwrap();
+    assert_ne!(lines[0], lines[1], "smoothing along rays shows nowhere");
 }

@@ -18,11 +18,6 @@ fn every_example_is_checked_and_reconstructs() {
     cc(&sources().join("plugins/examples/dense/dense.c"), &["NDEBUG"], &dense);
     let scan = text(&dir.path().join("scan"));
     done(&["simulate", "phantom:head:32", "-o", &scan, "--views", "16", "--detector", "32x32"]);
-    // Without a prior, whose points lie off any ray: a stage along rays takes those one by one.
-    let spec = text(&dir.path().join("small.toml"));
-    let small = "extends = 'ni-naf'\nnormalizers = [{ type = 'layer-norm' }]\n[encoder]\nlevels = 5\nlog2_table_size = 14\n\
-                 [projector]\nsamples = 48\n[solver]\nrays = 256\nlr = 5e-3\n";
-    std::fs::write(&spec, small).unwrap();
     for (library, sets) in [
         (example("siren"), &["field.type=siren"][..]),
         (example("siren"), &["normalizers.0.type=ray-smooth"]),
@@ -34,8 +29,9 @@ fn every_example_is_checked_and_reconstructs() {
         let report = json(&["plugins", "check", &library, "--single", "5e-5", "--json"]);
         assert_eq!(report["passed"], true, "{report:#}");
         let run = text(&dir.path().join(sets[0]));
-        let mut args = vec!["--plugin", &library, "reconstruct", &scan, "--spec", &spec, "-o", &run, "--json"];
-        args.extend(["--reference", "truth", "--steps", "150"]);
+        let mut args = vec!["--plugin", &library, "reconstruct", &scan, "--spec", "fast", "-o", &run, "--json"];
+        args.extend(["--reference", "truth", "--steps", "150", "--set", "projector.samples=48"]);
+        args.extend(["--set", "solver.rays=256"]);
         for set in sets {
             args.extend(["--set", set]);
         }
