@@ -25,11 +25,7 @@ const STEPS: u64 = 60;
 const WARM_UP: u64 = 10;
 
 fn main() -> Result<(), Box<dyn Error>> {
-    let mut plugins = Plugins::default();
-    plugins.add(library()?, Place::Named);
-    if let Some(Err(e)) = plugins.found.pop().map(|f| f.library) {
-        return Err(e.into());
-    }
+    Plugins::default().load(library()?, Place::Named)?;
     let loaded = stage::read::<dyn EncoderSpec>(serde_json::json!({ "type": "rehashed" }))?;
     let rays = rays(RAYS);
     let mut built_in = Runner::new(HashGrid::default().build()?)?;

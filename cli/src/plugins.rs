@@ -46,25 +46,14 @@ pub fn settle() -> Result<()> {
 pub fn of_spec(draft: &Draft) -> Result<()> {
     for (place, path) in draft.plugins() {
         with(|plugins| {
-            if plugins.has(&path) {
-                return Ok(());
-            }
-            if !LEAVE.load(Ordering::Relaxed) {
+            if plugins.get(&path).is_none() && !LEAVE.load(Ordering::Relaxed) {
                 let expected = format!(
                     "your leave: --allow-plugins-from-spec for all that the spec names, or --plugin {} for this one",
                     path.display()
                 );
                 return Err(Error::invalid(&place, "plugins.paths", path.display(), expected));
             }
-            plugins.add(path, Place::Spec);
-            match plugins.found.pop() {
-                Some(found) => {
-                    let library = found.library?;
-                    plugins.found.push(conefield_plugins::Found { library: Ok(library), ..found });
-                    Ok(())
-                }
-                None => Ok(()),
-            }
+            plugins.load(path, Place::Spec)
         })?;
     }
     Ok(())

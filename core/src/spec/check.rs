@@ -13,11 +13,12 @@ const TEXTS: [&str; 2] = ["name", "description"];
 /// Refuses unknown keys, unknown types and values of another type than their setting has.
 pub(super) fn spec(root: &Node) -> Result<()> {
     table(root, "spec")?;
+    let tables = tables();
     for e in root.entries() {
         let key = e.key.as_str();
         if TEXTS.contains(&key) {
             setting(&e.value, &serde_json::json!({ "type": "string" }), &Context::new(&Value::Null, None), key)?;
-        } else if let Some((_, schema)) = tables().iter().find(|t| t.0 == key) {
+        } else if let Some((_, schema)) = tables.iter().find(|t| t.0 == key) {
             setting(&e.value, schema, &Context::new(schema, None), key)?;
         } else if key == "normalizers" {
             let Is::Array(items) = &e.value.kind else {

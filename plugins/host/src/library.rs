@@ -287,6 +287,11 @@ impl Type {
         }
     }
 
+    /// What it is and whose.
+    pub(crate) fn words(&self) -> String {
+        format!("{} {:?} of plugin {}", self.kind, self.name, self.owner)
+    }
+
     /// A call that went wrong, in words.
     pub(crate) fn failed(&self, call: &str, status: ConefieldStatus, text: &str) -> Error {
         let how = match status {
@@ -297,10 +302,7 @@ impl Type {
         };
         let text = text.strip_prefix("panicked: ").unwrap_or(text);
         let text = if text.is_empty() { "it gave no reason" } else { text };
-        Error::unsupported(
-            format!("{} {:?} of plugin {}", self.kind, self.name, self.owner),
-            format!("{call} {how}: {text}"),
-        )
+        Error::unsupported(self.words(), format!("{call} {how}: {text}"))
     }
 }
 

@@ -73,7 +73,7 @@ impl Plugins {
         for (place, paths) in places {
             for path in paths {
                 match files(&path) {
-                    Ok(files) => files.into_iter().for_each(|file| plugins.add(file, place)),
+                    Ok(files) => files.into_iter().for_each(|file| plugins.note(file, place)),
                     Err(e) => plugins.found.push(Found { path, place, library: Err(e) }),
                 }
             }
@@ -82,18 +82,26 @@ impl Plugins {
     }
 
     /// Loads and registers the library at `path`, if it is not there yet.
-    pub fn add(&mut self, path: PathBuf, place: Place) {
-        if self.has(&path) {
-            return;
+    pub fn load(&mut self, path: PathBuf, place: Place) -> Result<()> {
+        if self.get(&path).is_none() {
+            let library = Library::open(&path)?;
+            spec::register(&library)?;
+            self.found.push(Found { path, place, library: Ok(library) });
         }
-        let library = Library::open(&path).and_then(|l| spec::register(&l).map(|()| l));
-        self.found.push(Found { path, place, library });
+        Ok(())
     }
 
-    /// Whether the library at `path` is loaded.
-    pub fn has(&self, path: &Path) -> bool {
-        let real = path.canonicalize();
-        real.is_ok_and(|real| self.loaded().any(|l| l.path == real))
+    /// As [`Plugins::load`]; what is wrong is kept with the file.
+    fn note(&mut self, path: PathBuf, place: Place) {
+        if let Err(e) = self.load(path.clone(), place) {
+            self.found.push(Found { path, place, library: Err(e) });
+        }
+    }
+
+    /// The library that was loaded from `path`.
+    pub fn get(&self, path: &Path) -> Option<&Library> {
+        let real = path.canonicalize().ok()?;
+        self.loaded().find(|l| l.path == real)
     }
 
     /// Every library that is loaded.

@@ -81,7 +81,7 @@ pub(crate) fn timed<T: Send + 'static>(ty: &Type, make: impl FnOnce() -> Result<
 }
 
 fn refused(ty: &Type, what: &str) -> Error {
-    Error::unsupported(format!("{} {:?} of plugin {}", ty.kind, ty.name, ty.owner), format!("refused: {what}"))
+    Error::unsupported(ty.words(), format!("refused: {what}"))
 }
 
 /// Tries an encoder, a normalizer or a field of type `ty`.

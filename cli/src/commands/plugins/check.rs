@@ -135,17 +135,10 @@ impl Check {
     }
 
     fn check(&self) -> Result<()> {
-        let report = plugins::with(|found| -> Result<Checked> {
-            found.add(self.library.clone(), Place::Named);
-            let real = self.library.canonicalize().map_err(|e| Error::io(&self.library, e))?;
-            let at = found.found.iter().position(|f| match &f.library {
-                Ok(l) => l.path == real,
-                Err(_) => f.path == self.library,
-            });
-            match at.map(|i| found.found.swap_remove(i).library) {
-                Some(library) => self.report(&library?),
-                None => Err(Error::invalid(real.display().to_string(), "plugin", "nothing", "a plugin")),
-            }
+        let report = plugins::with(|plugins| -> Result<Checked> {
+            plugins.load(self.library.clone(), Place::Named)?;
+            let gone = || Error::unsupported(self.library.display().to_string(), "it is no longer there");
+            self.report(plugins.get(&self.library).ok_or_else(gone)?)
         })?;
         if self.json {
             out::json(&report)?

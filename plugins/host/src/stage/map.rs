@@ -117,7 +117,7 @@ impl MapStage {
     }
 
     /// The type that it is of.
-    pub(crate) fn ty(&self) -> &Type {
+    fn ty(&self) -> &Type {
         &self.handle.ty
     }
 
@@ -133,8 +133,7 @@ impl MapStage {
     fn reduce(&self, side: u32, keep: &[usize]) -> Result<(Self, Vec<Range<usize>>, Vec<usize>)> {
         let (ty, info) = (self.ty(), &self.info);
         let Some(reduce) = self.map.reduce else {
-            let what = format!("{} {:?} of plugin {}", ty.kind, ty.name, ty.owner);
-            return Err(Error::unsupported(what, "it cannot leave out channels"));
+            return Err(Error::unsupported(ty.words(), "it cannot leave out channels"));
         };
         let mut r = ConefieldReduced {
             stage: ptr::null_mut(),

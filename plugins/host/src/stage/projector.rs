@@ -49,19 +49,13 @@ fn raw(ray: &UnitRay) -> ConefieldRay {
 
 impl ProjectorStage {
     /// The type that it is of.
-    pub(crate) fn ty(&self) -> &Type {
+    fn ty(&self) -> &Type {
         &self.handle.ty
     }
 
     /// Appends the samples of `ray`, written with `guard` untouchable numbers behind them. What is wrong with them is an
     /// error, and nothing is appended.
-    pub(crate) fn sample_guarded(
-        &self,
-        ray: &UnitRay,
-        seed: Option<u64>,
-        guard: usize,
-        out: &mut Samples,
-    ) -> Result<()> {
+    fn sample_guarded(&self, ray: &UnitRay, seed: Option<u64>, guard: usize, out: &mut Samples) -> Result<()> {
         let capacity = self.max_samples(ray);
         self.fault.take()?;
         if capacity == 0 {
