@@ -123,6 +123,9 @@ pub trait Backend: Send + Sync {
 
 /// A compiled pipeline. After a mask changed the pipeline, compile again. What a stage reports with
 /// [`crate::stage::Stage::fault`] during a call is the call's error.
+///
+/// Parameters, gradients and moments may live on a device: the first call takes the arena of its model there, later
+/// ones change that copy. [`Executable::fetch`] brings it back, [`Executable::renew`] takes another arena there.
 pub trait Executable: Send {
     /// Gradients of `work`'s loss, written over the arena's gradients.
     fn step(&mut self, model: &mut Model, work: &Work<'_>) -> Result<StepStats>;
@@ -134,4 +137,11 @@ pub trait Executable: Send {
     fn encode(&mut self, model: &Model, points: &[[f32; 3]]) -> Result<Vec<f32>>;
     /// Line integrals of `rays`.
     fn render(&mut self, model: &Model, rays: &[UnitRay], out: &mut [f32]) -> Result<()>;
+    /// Brings the model's arena to where the calls so far have left it.
+    fn fetch(&mut self, _model: &mut Model) -> Result<()> {
+        Ok(())
+    }
+    /// Says that something else has changed the model's arena, after it was fetched if its state was wanted: the next
+    /// call takes it as it is then.
+    fn renew(&mut self) {}
 }

@@ -54,6 +54,14 @@ pub enum Error {
         /// The file.
         place: String,
     },
+    /// A device that computes refused or was lost.
+    #[error("{device}: {what}")]
+    Device {
+        /// Its name.
+        device: String,
+        /// What happened.
+        what: String,
+    },
     /// Training left the finite numbers.
     #[error("training diverged at step {step}: {what}")]
     Diverged {

@@ -2,6 +2,7 @@
 //!
 //! - [`geometry`], [`scan`], [`parts`]: what was measured, in millimetres, and what comes out.
 //! - [`simd`], [`dense`], [`trilinear`], [`stage`]: what a stage computes and how.
+//! - [`wgsl`]: the same for a GPU.
 //! - [`arena`]: parameters, gradients and optimizer state under their names.
 //! - [`files`]: opening what a user or a description names.
 //! - [`spec`], [`registry`]: what a user writes, and the stage types that it may name.
@@ -29,5 +30,6 @@ pub mod stage;
 pub mod trained;
 pub mod trilinear;
 pub mod voxel;
+pub mod wgsl;
 
 pub use error::{Error, Result};

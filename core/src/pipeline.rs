@@ -1,6 +1,7 @@
 //! A pipeline: encoder, normalizers and field, built and checked, with the layout of their parameters.
 
 use crate::arena::{Arena, Block, Layout};
+use crate::backend::{Backend, Executable};
 use crate::error::{Result, ensure};
 use crate::scene::Scene;
 use crate::spec::Spec;
@@ -189,19 +190,26 @@ impl Model {
         Self { pipeline, arena, masks: vec![] }
     }
 
-    /// Lets every normalizer look at the encoder, through `encode`, after `epoch` passes over the views. Returns
-    /// what was masked, for the log; compile again if anything was.
-    pub fn refresh(&mut self, scene: &Scene, epoch: f64, encode: &mut Encode<'_>) -> Result<Vec<String>> {
+    /// Lets every normalizer look at the encoder, through `exe`, after `epoch` passes over the views. What was masked
+    /// is gone from pipeline and arena when this returns, and `exe` is compiled again for what is left. Returns what
+    /// normalizers had to say, for the log.
+    pub fn refresh(
+        &mut self,
+        scene: &Scene,
+        epoch: f64,
+        backend: &dyn Backend,
+        exe: &mut Box<dyn Executable>,
+    ) -> Result<Vec<String>> {
         let mut reports = vec![];
         for i in 0..self.pipeline.normalizers.len() {
-            let mask = {
-                let mut look = Look { model: self, scene, epoch, encode: &mut *encode };
-                self.pipeline.normalizers[i].refresh(&mut look)?
-            };
+            let mut look = Look { model: self, scene, epoch, exe: exe.as_mut() };
+            let mask = self.pipeline.normalizers[i].refresh(&mut look)?;
             if let Some(mask) = mask {
+                exe.fetch(self)?;
                 self.pipeline.apply_mask(i, &mask.keep, &mut self.arena)?;
                 self.masks.push(Masked { normalizer: i, keep: mask.keep });
                 reports.push(mask.report);
+                *exe = backend.compile(&self.pipeline)?.0;
             }
         }
         Ok(reports)
@@ -235,19 +243,16 @@ impl Model {
     }
 }
 
-/// Evaluates a model's encoder at points of the unit cube, channel-major.
-pub type Encode<'a> = dyn FnMut(&Model, &[[f32; 3]]) -> Result<Vec<f32>> + 'a;
-
-struct Look<'a, 'b> {
+struct Look<'a> {
     model: &'a Model,
     scene: &'a Scene,
     epoch: f64,
-    encode: &'a mut Encode<'b>,
+    exe: &'a mut dyn Executable,
 }
 
-impl Probe for Look<'_, '_> {
+impl Probe for Look<'_> {
     fn encode(&mut self, points: &[[f32; 3]]) -> Result<Vec<f32>> {
-        (self.encode)(self.model, points)
+        self.exe.encode(self.model, points)
     }
     fn shape(&self) -> [usize; 3] {
         self.scene.grid.shape

@@ -5,6 +5,7 @@
 
 use crate::error::{Error, Result};
 use crate::simd::Real;
+use crate::wgsl::Fragment;
 use std::ops::Range;
 
 /// Rows that the host puts into a tile at most; the encoder gets thousands at once. A stage must accept any number
@@ -171,22 +172,6 @@ pub trait Kernel<R: Real>: Send + Sync {
     );
 }
 
-/// Names for a stage's WGSL functions, unique in the composed kernel.
-#[derive(Debug, Clone)]
-pub struct Namer {
-    /// Prefix of every function that the fragment defines.
-    pub prefix: String,
-}
-
-/// A stage's WGSL: functions `{prefix}_fwd` and `{prefix}_bwd` that call accessors which the host generates.
-#[derive(Debug, Clone)]
-pub struct Fragment {
-    /// The functions.
-    pub source: String,
-    /// Workgroup memory that they need, in bytes.
-    pub workgroup_bytes: u32,
-}
-
 /// A map from rows of `info.input` channels to rows of `info.output` channels.
 pub trait Stage: Send + Sync {
     /// Widths, counts and cost.
@@ -219,8 +204,8 @@ pub trait Stage: Send + Sync {
         Ok(())
     }
 
-    /// The same formula for a GPU, or `None` where there is only the CPU.
-    fn wgsl(&self, _namer: &Namer) -> Option<Fragment> {
+    /// The same formula for a GPU, or `None` where there is only the CPU; see [`crate::wgsl`].
+    fn wgsl(&self) -> Option<Fragment> {
         None
     }
 
@@ -354,8 +339,9 @@ pub trait Projector: Send + Sync {
     /// A line for `explain`.
     fn describe(&self) -> String;
 
-    /// The same formula for a GPU.
-    fn wgsl(&self, _namer: &Namer) -> Option<Fragment> {
+    /// [`Projector::sample`] for a GPU, of a projector that integrates as [`Projector::integrate`] does by itself; see
+    /// [`crate::wgsl`].
+    fn wgsl(&self) -> Option<Fragment> {
         None
     }
 }

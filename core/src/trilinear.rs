@@ -44,7 +44,7 @@ impl Grid {
     }
 
     /// Steps to the next vertex along x, y, z; 0 along an axis with one vertex, which is its own neighbour.
-    fn strides(&self) -> [usize; 3] {
+    pub fn strides(&self) -> [usize; 3] {
         let [x, y, z] = self.side;
         let step = |n: usize, s: usize| if n > 1 { s } else { 0 };
         [step(x, y * z), step(y, z), step(z, 1)]

@@ -4,9 +4,11 @@ use conefield_core::error::{Error, Result, ensure};
 use conefield_core::random::mix;
 use conefield_core::simd::Real;
 use conefield_core::spec::EncoderSpec;
+use conefield_core::wgsl::{Fragment, Sum};
 use conefield_core::stage::{Encoder, GradKind, Grads, Info, Kernel, Parameter, Reduced, Scope, Stage, Tile, TileMut};
 use schemars::{JsonSchema, Schema, SchemaGenerator, json_schema};
 use serde::{Deserialize, Serialize};
+use std::fmt::Write;
 use std::ops::Range;
 use std::sync::Arc;
 
@@ -114,6 +116,29 @@ impl ConcatStage {
         }
         Ok(Self { parts, info })
     }
+}
+
+/// What a part expects of its host, by what the whole gets of it; the part's parameters begin at `first`.
+fn hosted(name: &str, first: u32, fragment: &Fragment) -> String {
+    let mut out = format!(
+        "const {name}wants_dx = stage_wants_dx;
+fn {name}param(i: u32) -> f32 {{ return stage_param({first}u + i); }}
+fn {name}grad(i: u32, v: f32) {{ stage_grad({first}u + i, v); }}
+"
+    );
+    for sum in fragment.sums() {
+        let _ = match sum {
+            Sum::Vector(m) => writeln!(
+                out,
+                "fn {name}sum_{m}(at: u32, a: ptr<function, array<f32, {m}>>) {{ stage_sum_{m}({first}u + at, a); }}"
+            ),
+            Sum::Outer(m, k) => writeln!(
+                out,
+                "fn {name}outer_{m}_{k}(at: u32, ld: u32, a: ptr<function, array<f32, {m}>>, b: ptr<function, array<f32, {k}>>) {{ stage_outer_{m}_{k}({first}u + at, ld, a, b); }}"
+            ),
+        };
+    }
+    out
 }
 
 /// A kernel of a part in one precision.
@@ -265,6 +290,50 @@ impl Stage for ConcatStage {
 
     fn fault(&self) -> Result<()> {
         self.parts.iter().try_for_each(|p| p.stage.fault())
+    }
+
+    fn wgsl(&self) -> Option<Fragment> {
+        let width = self.info.output;
+        let (mut parts, mut forward, mut backward) = (String::new(), String::new(), String::new());
+        for (i, part) in self.parts.iter().enumerate() {
+            let fragment = part.stage.wgsl()?;
+            let name = format!("stage_{i}_");
+            parts += &hosted(&name, u32::try_from(part.params.start).ok()?, &fragment);
+            parts += &fragment.named(&name);
+            let (n, first) = (part.outputs.len(), part.outputs.start);
+            let copy = format!("for (var c = 0u; c < {n}u; c++)");
+            let _ = write!(
+                forward,
+                "    var y{i}: array<f32, {n}>;
+    {name}forward(x, &y{i});
+    {copy} {{ (*y)[{first}u + c] = y{i}[c]; }}
+"
+            );
+            let _ = write!(
+                backward,
+                "    var d{i}: array<f32, {n}>;
+    {copy} {{ d{i}[c] = (*dy)[{first}u + c]; }}
+    {name}backward(x, &d{i}, &part);
+    for (var k = 0u; k < 3u; k++) {{ sum[k] += part[k]; }}
+"
+            );
+        }
+        let functions = format!(
+            "fn stage_forward(x: ptr<function, array<f32, 3>>, y: ptr<function, array<f32, {width}>>) {{
+{forward}}}
+
+fn stage_backward(
+    x: ptr<function, array<f32, 3>>,
+    dy: ptr<function, array<f32, {width}>>,
+    dx: ptr<function, array<f32, 3>>,
+) {{
+    var sum: array<f32, 3>;
+    var part: array<f32, 3>;
+{backward}    *dx = sum;
+}}
+"
+        );
+        Some(Fragment::new(&[&parts, &functions]))
     }
 
     fn describe(&self) -> String {

@@ -9,8 +9,10 @@ use conefield_core::error::{Error, Result, ensure};
 use conefield_core::random::{mix, unit};
 use conefield_core::simd::{Op, Real, Simd, run};
 use conefield_core::spec::EncoderSpec;
+use conefield_core::wgsl::{Fragment, TRILINEAR};
 use conefield_core::stage::{Encoder, GradKind, Grads, Info, Kernel, Parameter, Reduced, Scope, Stage, Tile, TileMut};
 use conefield_core::trilinear::{BLOCK, Grid, Located};
+use crate::levels::{LevelCode, functions};
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 use std::ops::Range;
@@ -301,6 +303,21 @@ impl Stage for DenseGridStage {
             l.grid.slabs(SLAB / f).into_iter().map(move |r| start + r.start * f..start + r.end * f)
         };
         self.levels.iter().flat_map(slabs).collect()
+    }
+
+    fn wgsl(&self) -> Option<Fragment> {
+        let code = |l: &Level| {
+            let ([x, y, z], [sx, sy, sz]) = (l.grid.side(), l.grid.strides());
+            let (cells, start) = ((x - 1) as f32, l.start);
+            let value = format!(
+                "stage_Level(vec3<u32>({x}u, {y}u, {z}u), vec3<u32>({sx}u, {sy}u, {sz}u), {cells:?}, {start}u)"
+            );
+            LevelCode { value, outputs: l.outputs.clone() }
+        };
+        let levels: Vec<_> = self.levels.iter().map(code).collect();
+        let constants = format!("const stage_FEATURES = {}u;\n", self.features);
+        let functions = functions(&levels, self.outputs);
+        Some(Fragment::new(&[&constants, TRILINEAR, include_str!("dense_grid.wgsl"), &functions]))
     }
 
     fn describe(&self) -> String {

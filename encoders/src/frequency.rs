@@ -8,10 +8,12 @@
 use conefield_core::error::{Result, ensure};
 use conefield_core::simd::{Op, Real, Select, Simd, SimdBase, SimdFloat, V, load, run, store};
 use conefield_core::spec::EncoderSpec;
+use conefield_core::wgsl::Fragment;
 use conefield_core::stage::{Encoder, GradKind, Grads, Info, Kernel, Parameter, Reduced, Scope, Stage, Tile, TileMut};
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 use std::f64::consts::TAU;
+use std::fmt::Write;
 
 /// How frequencies lie between 1 and the highest.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
@@ -245,6 +247,41 @@ impl Stage for FrequencyStage {
 
     fn reference(&self) -> Option<&dyn Kernel<f64>> {
         Some(self)
+    }
+
+    fn wgsl(&self) -> Option<Fragment> {
+        let (mut forward, mut backward) = (String::new(), String::new());
+        for (axis, c) in &self.inputs {
+            let _ = writeln!(forward, "    (*y)[{c}] = (*x)[{axis}];");
+            let _ = writeln!(backward, "    (*dx)[{axis}] = (*dy)[{c}];");
+        }
+        for (w, wave) in self.waves.iter().enumerate() {
+            let Wave { axis, frequency, sin, cos } = wave;
+            let _ = writeln!(forward, "    let w{w} = stage_sin_cos_turns((*x)[{axis}] * {:?});", *frequency as f32);
+            let _ = writeln!(backward, "    let w{w} = stage_sin_cos_turns((*x)[{axis}] * {:?});", *frequency as f32);
+            for (c, part) in [(sin, 'x'), (cos, 'y')] {
+                let Some(c) = c else { continue };
+                let _ = writeln!(forward, "    (*y)[{c}] = w{w}.{part};");
+            }
+            let dy = |c: &Option<usize>| c.map_or("0.0".to_owned(), |c| format!("(*dy)[{c}]"));
+            let (slope, sin, cos) = ((TAU * frequency) as f32, dy(sin), dy(cos));
+            let _ = writeln!(backward, "    (*dx)[{axis}] += {slope:?} * ({sin} * w{w}.y - {cos} * w{w}.x);");
+        }
+        let width = self.outputs;
+        let functions = format!(
+            "fn stage_forward(x: ptr<function, array<f32, 3>>, y: ptr<function, array<f32, {width}>>) {{
+{forward}}}
+
+fn stage_backward(
+    x: ptr<function, array<f32, 3>>,
+    dy: ptr<function, array<f32, {width}>>,
+    dx: ptr<function, array<f32, 3>>,
+) {{
+    *dx = array<f32, 3>();
+{backward}}}
+"
+        );
+        Some(Fragment::new(&[include_str!("frequency.wgsl"), &functions]))
     }
 
     fn describe(&self) -> String {

@@ -8,7 +8,9 @@ use conefield_core::error::{Result, ensure};
 use conefield_core::random::{mix, unit};
 use conefield_core::simd::{Op, Real, Simd, SimdBase, SimdFloat, V, load, run, store};
 use conefield_core::spec::EncoderSpec;
+use conefield_core::wgsl::Fragment;
 use conefield_core::stage::{Encoder, GradKind, Grads, Info, Kernel, Parameter, Reduced, Scope, Stage, Tile, TileMut};
+use crate::levels::{LevelCode, functions};
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 use std::ops::Range;
@@ -497,6 +499,20 @@ impl Stage for HashGridStage {
 
     fn partition(&self) -> Vec<Range<usize>> {
         self.levels.iter().map(|l| self.params_of(l)).collect()
+    }
+
+    fn wgsl(&self) -> Option<Fragment> {
+        let f = self.settings.features;
+        let code = |l: &Level| {
+            let (side, start) = (if l.dense { l.side } else { 0 }, u32::try_from(l.start * f).ok()?);
+            let value = format!("stage_Level({:?}, {side}u, {}u, {start}u)", l.scale as f32, l.entries - 1);
+            Some(LevelCode { value, outputs: l.outputs.clone() })
+        };
+        let levels = self.levels.iter().map(code).collect::<Option<Vec<_>>>()?;
+        let [x, y, z] = self.primes;
+        let constants =
+            format!("const stage_FEATURES = {f}u;\nconst stage_PRIMES = vec3<u32>({x}u, {y}u, {z}u);\n");
+        Some(Fragment::new(&[&constants, include_str!("hash_grid.wgsl"), &functions(&levels, self.outputs)]))
     }
 
     fn describe(&self) -> String {

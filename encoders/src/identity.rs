@@ -3,6 +3,7 @@
 use conefield_core::error::{Result, ensure};
 use conefield_core::simd::Real;
 use conefield_core::spec::EncoderSpec;
+use conefield_core::wgsl::Fragment;
 use conefield_core::stage::{Encoder, GradKind, Grads, Info, Kernel, Parameter, Reduced, Scope, Stage, Tile, TileMut};
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
@@ -78,6 +79,24 @@ impl Stage for IdentityStage {
 
     fn reference(&self) -> Option<&dyn Kernel<f64>> {
         Some(self)
+    }
+
+    fn wgsl(&self) -> Option<Fragment> {
+        let n = self.axes.len();
+        let each = |line: &dyn Fn(usize, usize) -> String| -> String {
+            self.axes.iter().enumerate().map(|(c, &axis)| line(c, axis)).collect()
+        };
+        Some(Fragment::new(&[&format!(
+            "fn stage_forward(x: ptr<function, array<f32, 3>>, y: ptr<function, array<f32, {n}>>) {{
+{}}}
+
+fn stage_backward(x: ptr<function, array<f32, 3>>, dy: ptr<function, array<f32, {n}>>, dx: ptr<function, array<f32, 3>>) {{
+    *dx = array<f32, 3>();
+{}}}
+",
+            each(&|c, axis| format!("    (*y)[{c}] = (*x)[{axis}];\n")),
+            each(&|c, axis| format!("    (*dx)[{axis}] = (*dy)[{c}];\n")),
+        )]))
     }
 
     fn describe(&self) -> String {

@@ -5,3 +5,4 @@ pub mod dense_grid;
 pub mod frequency;
 pub mod hash_grid;
 pub mod identity;
+mod levels;

@@ -3,15 +3,21 @@
 //! Layers count linear maps: `depth = 4, width = 32, skips = [2]` is F→32→32→(F+32)→32→1, the shape of NAF
 //! (Zha et al. 2022) and NI-NeRF (Xu et al. 2025). A skip layer reads the features first, then the layer before.
 
+mod wgsl;
+
 use conefield_core::dense::{Output as Into, Weights, affine, affine_input, affine_weights};
 use conefield_core::error::{Result, ensure};
 use conefield_core::random::{mix, unit};
 use conefield_core::simd::{Op, Real, Select, Simd, SimdBase, SimdFloat, V, load, run, store};
 use conefield_core::spec::FieldSpec;
 use conefield_core::stage::{Field, GradKind, Grads, Info, Kernel, Parameter, Reduced, Scope, Stage, Tile, TileMut};
+use conefield_core::wgsl::Fragment;
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 use std::ops::Range;
+
+/// WGSL of every [`Activation`].
+pub(crate) const ACTIVATION: &str = include_str!("activation.wgsl");
 
 /// SquarePlus's `b` as NI-NeRF has it.
 pub const SQUAREPLUS_B: f64 = 1.523_821_03;
@@ -37,6 +43,19 @@ pub enum Activation {
 }
 
 impl Activation {
+    /// Its function in [`ACTIVATION`].
+    pub(crate) fn wgsl(self) -> &'static str {
+        match self {
+            Self::None => "stage_none",
+            Self::Relu => "stage_relu",
+            Self::LeakyRelu => "stage_leaky_relu",
+            Self::Gelu => "stage_gelu",
+            Self::Squareplus => "stage_squareplus",
+            Self::Softplus => "stage_softplus",
+            Self::Sigmoid => "stage_sigmoid",
+        }
+    }
+
     /// Values and derivatives.
     #[inline(always)]
     fn at<S: Simd, R: Real, const K: usize>(self, s: S, x: [V<S, R>; K]) -> [[V<S, R>; K]; 2] {
@@ -423,6 +442,10 @@ impl Stage for MlpStage {
 
     fn reference(&self) -> Option<&dyn Kernel<f64>> {
         Some(self)
+    }
+
+    fn wgsl(&self) -> Option<Fragment> {
+        Some(Fragment::new(&[ACTIVATION, &wgsl::functions(self)]))
     }
 
     fn describe(&self) -> String {

@@ -3,12 +3,13 @@
 //! Values stand at the voxels' centres and are interpolated trilinearly; half a voxel from the rim they no longer
 //! change. The activation follows the interpolation, so that edges may fall between voxels.
 
-use crate::mlp::{Activation, activate};
+use crate::mlp::{ACTIVATION, Activation, activate};
 use conefield_core::error::{Error, Result, ensure};
 use conefield_core::simd::{Op, Real, Simd, run};
 use conefield_core::spec::FieldSpec;
 use conefield_core::stage::{Field, GradKind, Grads, Info, Kernel, Parameter, Reduced, Scope, Stage, Tile, TileMut};
 use conefield_core::trilinear::{BLOCK, Grid, Located};
+use conefield_core::wgsl::{Fragment, TRILINEAR};
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 use std::ops::Range;
@@ -217,6 +218,18 @@ impl Stage for VoxelGridStage {
 
     fn partition(&self) -> Vec<Range<usize>> {
         self.grid.slabs(SLAB)
+    }
+
+    fn wgsl(&self) -> Option<Fragment> {
+        let ([x, y, z], [sx, sy, sz]) = (self.grid.side(), self.grid.strides());
+        let settings = format!(
+            "const stage_SIDE = vec3<u32>({x}u, {y}u, {z}u);
+const stage_STRIDES = vec3<u32>({sx}u, {sy}u, {sz}u);
+fn stage_output(x: f32) -> vec2<f32> {{ return {}(x); }}
+",
+            self.output.wgsl()
+        );
+        Some(Fragment::new(&[&settings, TRILINEAR, ACTIVATION, include_str!("voxel_grid.wgsl")]))
     }
 
     fn describe(&self) -> String {

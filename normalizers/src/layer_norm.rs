@@ -13,6 +13,7 @@ use conefield_core::spec::NormalizerSpec;
 use conefield_core::stage::{
     GradKind, Grads, Info, Kernel, Normalizer, Parameter, Reduced, Scope, Stage, Tile, TileMut,
 };
+use conefield_core::wgsl::Fragment;
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 use std::ops::Range;
@@ -78,6 +79,10 @@ impl LayerNormStage {
         let both = kept.iter().copied().chain(kept.iter().map(|o| n + o));
         if self.settings.affine { both.map(|p| p..p + 1).collect() } else { vec![] }
     }
+}
+
+fn list(numbers: &[usize]) -> String {
+    numbers.iter().map(usize::to_string).collect::<Vec<_>>().join(", ")
 }
 
 /// Above the first number a row is scaled by the second. A variance counts as at least the third, so that it has a
@@ -278,6 +283,35 @@ impl Stage for LayerNormStage {
 
     fn reference(&self) -> Option<&dyn Kernel<f64>> {
         Some(self)
+    }
+
+    fn wgsl(&self) -> Option<Fragment> {
+        let (input, n, eps, affine) = (self.input, self.outputs.len(), self.settings.eps as f32, self.settings.affine);
+        let whole = self.outputs.iter().copied().eq(0..input);
+        let of = if whole { "o".into() } else { format!("array<u32, {n}>({})[o]", list(&self.outputs)) };
+        // Parameters that every row touches are summed over rows.
+        let sums = if affine {
+            format!(
+                "    var normal: array<f32, {n}>;
+    for (var o = 0u; o < {n}u; o++) {{ normal[o] = stage_normal(x, r, stage_input_of(o)) * (*dy)[o]; }}
+    stage_sum_{n}(0u, &normal);
+    stage_sum_{n}({n}u, dy);
+"
+            )
+        } else {
+            String::new()
+        };
+        let settings = format!(
+            "const stage_INPUT = {input}u;
+const stage_OUTPUT = {n}u;
+const stage_EPS = {eps:?};
+const stage_AFFINE = {affine};
+fn stage_input_of(o: u32) -> u32 {{ return {of}; }}
+fn stage_gradients(x: ptr<function, array<f32, {input}>>, r: stage_Row, dy: ptr<function, array<f32, {n}>>) {{
+{sums}}}
+"
+        );
+        Some(Fragment::new(&[&settings, include_str!("layer_norm.wgsl")]))
     }
 
     fn describe(&self) -> String {

@@ -8,6 +8,7 @@ use conefield_core::error::{Result, ensure};
 use conefield_core::random::{mix, unit};
 use conefield_core::spec::ProjectorSpec;
 use conefield_core::stage::{Projector, Samples, UnitRay};
+use conefield_core::wgsl::Fragment;
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
@@ -110,6 +111,15 @@ impl Projector for RayMarch {
             None => format!("{} samples a ray", self.samples),
         };
         format!("ray-march: {count}, {:?}, {:?}", self.sampling, self.extent).to_lowercase()
+    }
+
+    fn wgsl(&self) -> Option<Fragment> {
+        let settings = format!(
+            "const stage_PUBLISHED = {};\nconst stage_STRATIFIED = {};\n",
+            self.extent == Extent::Published,
+            self.sampling == Sampling::Stratified
+        );
+        Some(Fragment::new(&[&settings, include_str!("ray_march.wgsl")]))
     }
 }
 

@@ -219,6 +219,7 @@ impl Solver for Gradient {
                 let solver = window.save();
                 let masks = model.masks().to_vec();
                 let standing = Standing { step, samples, seconds: clock.seconds(), masks, solver };
+                exe.fetch(&mut model)?;
                 observer.checkpoint(&Checkpoint { tensors: tensors(&model), standing })?;
                 clock.resume();
             }
@@ -240,11 +241,7 @@ impl Solver for Gradient {
                 break;
             }
             let epoch = step as f64 / steps_an_epoch;
-            let reports = model.refresh(&scene, epoch, &mut |m, points| exe.encode(m, points))?;
-            if !reports.is_empty() {
-                exe = job.backend.compile(&model.pipeline)?.0;
-                window.events.extend(reports);
-            }
+            window.events.extend(model.refresh(&scene, epoch, job.backend, &mut exe)?);
             source.draw(job.seed, step, self.rays, &mut rays);
             let tv = self.tv.as_ref().map(|prior| {
                 blocks(prior, &scene, job.seed, step, &mut tv);
@@ -267,6 +264,7 @@ impl Solver for Gradient {
             observer.progress(step, share, clock.seconds() * (1.0 - share).max(0.0) / share.max(1e-9));
         }
         clock.pause();
+        exe.fetch(&mut model)?;
         drop(source);
         let field = TrainedField { model, scene, unit_mm: job.scan.unit.mm };
         Ok(Solution { result: Reconstruction::Field(field), steps: step, train_s: clock.seconds(), samples })

@@ -41,6 +41,8 @@ pub fn pretrain(settings: &Gradient, job: &PretrainJob<'_>, observer: &mut dyn O
             return Err(Error::Interrupted { step });
         }
         if step > 0 && step.is_multiple_of(TURN) && !waiting.is_empty() {
+            exe.fetch(&mut model)?;
+            exe.renew();
             let mut next = waiting.remove(0);
             let Arena { params, first, second, .. } = &model.arena;
             next.params[shared_from..].copy_from_slice(&params[shared_from..]);
@@ -72,6 +74,7 @@ pub fn pretrain(settings: &Gradient, job: &PretrainJob<'_>, observer: &mut dyn O
             (loss, since) = (0.0, 0);
         }
     }
+    exe.fetch(&mut model)?;
     Ok(model)
 }
 
@@ -101,6 +104,8 @@ pub fn learn(
         fit(exe, model, &points, step, seed)?;
         exe.update(model, &settings.adam(step + 1, 0.0, (step + 1) as f64 / steps as f64))?;
     }
+    exe.fetch(model)?;
+    exe.renew();
     model.arena.first.fill(0.0);
     model.arena.second.fill(0.0);
     Ok(())

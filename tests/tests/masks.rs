@@ -1,6 +1,8 @@
 //! Masks in whole pipelines: what is removed, and that what is left computes what it did before.
 
+use conefield_backend_cpu::Cpu;
 use conefield_core::Result;
+use conefield_core::backend::Backend;
 use conefield_core::geometry::VoxelGrid;
 use conefield_core::pipeline::{Model, Pipeline};
 use conefield_core::scene::Scene;
@@ -71,7 +73,9 @@ fn points() -> Vec<[f32; 3]> {
 fn refresh(model: &mut Model, epoch: f64) -> Result<Vec<String>> {
     let grid = VoxelGrid { shape: [16, 12, 8], spacing: [1.0; 3], center: [0.0; 3] };
     let scene = Scene::with_attenuation(grid, &conefield_core::spec::Scene::default(), 1.0)?;
-    model.refresh(&scene, epoch, &mut |m, points| Ok(evaluate(m, points, None).swap_remove(0)))
+    let backend = Cpu::new();
+    let mut exe = backend.compile(&model.pipeline)?.0;
+    model.refresh(&scene, epoch, &backend, &mut exe)
 }
 
 fn dense() -> Value {

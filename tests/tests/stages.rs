@@ -1,11 +1,14 @@
 //! Every built-in stage, with several settings each, through the conformance kit.
 
+mod device;
+
 use conefield_conformance::{
     Options, Report, check_encoder, check_field, check_initializer, check_normalizer, check_projector,
-    check_voxel_projector,
+    check_projector_wgsl, check_voxel_projector, check_wgsl,
 };
 use conefield_core::arena::Weights;
 use conefield_core::registry::{Kind, names};
+use conefield_core::stage::Stage;
 use conefield_core::spec::{EncoderSpec, FieldSpec, InitializerSpec, NormalizerSpec, ProjectorSpec};
 use serde_json::{Value, json};
 
@@ -21,19 +24,33 @@ fn expect(report: Report) {
     assert!(report.passed(), "{report}\nfails {:?}", report.failed());
 }
 
+/// The stage's WGSL, where there is a device. Every built-in stage that does anything has one.
+fn on_a_device(stage: &dyn Stage, options: &Options) {
+    assert!(stage.info().identity || stage.wgsl().is_some(), "{} offers no WGSL", stage.describe());
+    if let Some(shared) = device::shared("the WGSL of a stage") {
+        expect(check_wgsl(stage, options, &|s, p, x, dy, rows| shared.pass(s, p, x, dy, rows)));
+    }
+}
+
 fn encoder(settings: Value, options: &Options) {
     let spec: Box<dyn EncoderSpec> = serde_json::from_value(settings).unwrap();
-    expect(check_encoder(spec.build().unwrap().as_ref(), options));
+    let stage = spec.build().unwrap();
+    expect(check_encoder(stage.as_ref(), options));
+    on_a_device(stage.as_ref(), options);
 }
 
 fn normalizer(settings: Value, width: usize, options: &Options) {
     let spec: Box<dyn NormalizerSpec> = serde_json::from_value(settings).unwrap();
-    expect(check_normalizer(spec.build(width).unwrap().as_ref(), options));
+    let stage = spec.build(width).unwrap();
+    expect(check_normalizer(stage.as_ref(), options));
+    on_a_device(stage.as_ref(), options);
 }
 
 fn field(settings: Value, width: usize, options: &Options) {
     let spec: Box<dyn FieldSpec> = serde_json::from_value(settings).unwrap();
-    expect(check_field(spec.build(width).unwrap().as_ref(), options));
+    let stage = spec.build(width).unwrap();
+    expect(check_field(stage.as_ref(), options));
+    on_a_device(stage.as_ref(), options);
 }
 
 #[test]
@@ -194,7 +211,12 @@ fn ray_projectors() {
         json!({"type": "ray-march", "step_mm": 3.0, "extent": "published"}),
     ] {
         let spec: Box<dyn ProjectorSpec> = serde_json::from_value(settings).unwrap();
-        expect(check_projector(spec.build().unwrap().as_ref()));
+        let projector = spec.build().unwrap();
+        expect(check_projector(projector.as_ref()));
+        assert!(projector.wgsl().is_some());
+        if let Some(shared) = device::shared("the WGSL of a projector") {
+            expect(check_projector_wgsl(projector.as_ref(), &|p, rays| shared.samples(p, rays)));
+        }
     }
 }
 

@@ -199,14 +199,14 @@ fn inputs_in<R: Real>(stage: &dyn Stage, k: &dyn Kernel<R>, options: &Options) -
     Outcome::Passed(format!("{} inputs, worst error {worst:.1e}", x.len().div_ceil(stride)))
 }
 
-fn no_rows<R: Real>() -> Outcome {
+pub fn no_rows<R: Real>() -> Outcome {
     let shortest = steps::<R>(&Options::encoder()).all.last().copied().unwrap_or_default();
     let text = format!("{NO_ROWS} over steps of {shortest:.0e}");
     if size_of::<R>() == 8 { Outcome::Failed(text) } else { Outcome::Skipped(text) }
 }
 
 /// Inputs at which both precisions mean the same cells and sides of kinks.
-fn shared(stage: &dyn Stage, k: &dyn Kernel<f64>, options: &Options) -> Option<[Vec<f64>; 3]> {
+pub fn shared(stage: &dyn Stage, k: &dyn Kernel<f64>, options: &Options) -> Option<[Vec<f64>; 3]> {
     let info = stage.info();
     let p: Vec<f64> = params(stage, options);
     let (x, _) = smooth_rows(k, &info, &p, options, options.rows)?;
@@ -214,7 +214,7 @@ fn shared(stage: &dyn Stage, k: &dyn Kernel<f64>, options: &Options) -> Option<[
     Some([p, x, dy])
 }
 
-fn narrow(v: &[f64]) -> Vec<f32> {
+pub fn narrow(v: &[f64]) -> Vec<f32> {
     v.iter().map(|&v| v as f32).collect()
 }
 

@@ -11,6 +11,7 @@ mod channels;
 mod gradients;
 mod rays;
 mod voxels;
+mod wgsl;
 mod weights;
 
 use conefield_core::stage::{Encoder, Field, Normalizer, Stage};
@@ -21,6 +22,7 @@ use std::panic::{AssertUnwindSafe, catch_unwind};
 pub use rays::check_projector;
 pub use voxels::check_voxel_projector;
 pub use weights::check_initializer;
+pub use wgsl::{Pass, Sample, check_projector_wgsl, check_wgsl};
 
 /// How a stage is tried out.
 #[derive(Debug, Clone, PartialEq)]

@@ -25,7 +25,7 @@ pub fn check_projector(projector: &dyn Projector) -> Report {
 }
 
 /// Rays through the unit cube in many directions, some along axes, with box and published range in agreement.
-fn rays() -> Vec<UnitRay> {
+pub fn rays() -> Vec<UnitRay> {
     let mut draw = Draw::new(11, 9);
     let mut all = vec![];
     for i in 0..40 {
@@ -58,7 +58,7 @@ fn rays() -> Vec<UnitRay> {
     all
 }
 
-fn samples(p: &dyn Projector, ray: &UnitRay, seed: Option<u64>) -> Samples {
+pub fn samples(p: &dyn Projector, ray: &UnitRay, seed: Option<u64>) -> Samples {
     let mut s = Samples::default();
     p.sample(ray, seed, &mut s);
     s

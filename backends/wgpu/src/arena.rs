@@ -1,0 +1,70 @@
+//! Parameters, gradients and moments on the device, in as many buffers as its limits ask for.
+
+use crate::compose::Chain;
+use crate::device::Gpu;
+use crate::kernel::Buffers;
+use conefield_core::arena::Arena;
+use conefield_core::error::Result;
+use std::ops::Range;
+
+/// The arena's parts, by the names under which kernels know them.
+pub const PARTS: [&str; 4] = ["params", "grads", "first", "second"];
+
+/// Bytes that are copied to or from the device at once.
+const PIECE: u64 = 16 << 20;
+
+/// Which numbers of the arena a buffer holds.
+pub fn segment(chain: &Chain, s: usize, params: usize, size: usize) -> Range<usize> {
+    debug_assert!(s < chain.segments());
+    s * size..((s + 1) * size).min(params)
+}
+
+/// Makes the buffers of `params` parameters, `size` in each.
+pub fn allocate(gpu: &Gpu, buffers: &mut Buffers, chain: &Chain, params: usize, size: usize) -> Result<()> {
+    use wgpu::BufferUsages as U;
+    for part in PARTS {
+        for s in 0..chain.segments() {
+            let bytes = 4 * segment(chain, s, params, size).len() as u64;
+            buffers.reserve(gpu, &format!("{part}_{s}"), bytes, U::STORAGE | U::COPY_SRC | U::COPY_DST)?;
+        }
+    }
+    Ok(())
+}
+
+/// Takes the arena to the device.
+pub fn upload(gpu: &Gpu, buffers: &Buffers, chain: &Chain, arena: &Arena, size: usize) -> Result<()> {
+    let parts = [&arena.params, &arena.grads, &arena.first, &arena.second];
+    for (part, data) in PARTS.iter().zip(parts) {
+        for s in 0..chain.segments() {
+            let Some(buffer) = buffers.get(&format!("{part}_{s}")) else { continue };
+            let bytes: &[u8] = bytemuck::cast_slice(&data[segment(chain, s, data.len(), size)]);
+            for (i, piece) in bytes.chunks(PIECE as usize).enumerate() {
+                gpu.queue.write_buffer(buffer, i as u64 * PIECE, piece);
+                // Hands the piece over, so that not all of them wait in memory at once.
+                gpu.queue.submit([]);
+            }
+        }
+    }
+    gpu.fault()
+}
+
+/// Brings the arena back from the device.
+pub fn download(gpu: &Gpu, buffers: &Buffers, chain: &Chain, arena: &mut Arena, size: usize) -> Result<()> {
+    use wgpu::BufferUsages as U;
+    let staging = gpu.buffer("staging", PIECE.min(4 * arena.params.len() as u64), U::MAP_READ | U::COPY_DST)?;
+    let parts = [&mut arena.params, &mut arena.grads, &mut arena.first, &mut arena.second];
+    for (part, data) in PARTS.iter().zip(parts) {
+        for s in 0..chain.segments() {
+            let Some(buffer) = buffers.get(&format!("{part}_{s}")) else { continue };
+            let range = segment(chain, s, data.len(), size);
+            for (i, piece) in data[range].chunks_mut(PIECE as usize / 4).enumerate() {
+                let bytes = 4 * piece.len() as u64;
+                let mut encoder = gpu.device.create_command_encoder(&Default::default());
+                encoder.copy_buffer_to_buffer(buffer, i as u64 * PIECE, &staging, 0, bytes);
+                gpu.queue.submit([encoder.finish()]);
+                gpu.read(&staging, bytes, |found| bytemuck::cast_slice_mut(piece).copy_from_slice(found))?;
+            }
+        }
+    }
+    Ok(())
+}

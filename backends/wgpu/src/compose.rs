@@ -1,0 +1,606 @@
+//! Kernels composed from the fragments of a pipeline's stages.
+//!
+//! Rows go through a kernel one an invocation, 64 to a group. `forward` takes them from the encoder to μ and keeps the
+//! features of an encoder with parameters, which are dear to compute again; `backward` starts from these, runs what lies
+//! between once more, and goes back. Sums over rows are taken within a group and added to the group's own partial sums,
+//! which `merge` adds up; scattered gradients are added where they belong at once.
+
+use crate::device::Atomics;
+use crate::source::{Access, Source};
+use conefield_core::error::{Error, Result};
+use conefield_core::pipeline::Pipeline;
+use conefield_core::stage::{GradKind, Info, Projector, Scope, Stage};
+use conefield_core::wgsl::{Fragment, RANDOM, RAY, Sum};
+use std::fmt::Write;
+use std::ops::Range;
+
+/// Rows of a group.
+pub const GROUP: u32 = 64;
+
+/// What of the device the text of kernels depends on.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct Target {
+    /// How gradients of scattered parameters are added up.
+    pub atomics: Atomics,
+    /// Parameters that one buffer holds, a multiple of 64.
+    pub segment: usize,
+}
+
+/// A stage on its way into kernels.
+#[derive(Debug, Clone)]
+pub struct Link {
+    /// Its name and type, for messages.
+    pub name: String,
+    /// How its functions' names begin.
+    prefix: String,
+    fragment: Fragment,
+    /// Widths and counts.
+    pub info: Info,
+    /// Its parameters in the arena.
+    range: Range<usize>,
+    /// Where its sums over rows stand among all partial sums; `None` where they go to the arena's gradients at once.
+    partial: Option<usize>,
+    /// Whether a stage before it has parameters.
+    wants_dx: bool,
+}
+
+/// The stages that do work, in order, with all that kernels need of them.
+#[derive(Debug, Clone)]
+pub struct Chain {
+    links: Vec<Link>,
+    /// Whether the first link is the encoder, or the encoder hands on positions as they are.
+    encoder: bool,
+    /// Parameters whose gradients are summed over rows.
+    pub dense: usize,
+    /// Parameters of the arena.
+    params: usize,
+    target: Target,
+}
+
+fn fragment_of(name: &str, fragment: Option<Fragment>) -> Result<Fragment> {
+    fragment.ok_or_else(|| {
+        Error::unsupported(format!("{name} on the wgpu backend"), "the stage offers no WGSL; it runs with --backend cpu")
+    })
+}
+
+/// A stage's name with what it is.
+fn titled(name: &str, what: &str) -> String {
+    format!("{name} ({})", what.split(':').next().unwrap_or(what))
+}
+
+impl Chain {
+    /// The stages of a pipeline; refuses those that cannot run on a GPU.
+    pub fn new(pipeline: &Pipeline, target: Target) -> Result<Self> {
+        let mut chain = Self { links: vec![], encoder: false, dense: 0, params: pipeline.layout().len(), target };
+        for (i, ((name, stage), range)) in pipeline.stages().into_iter().zip(pipeline.ranges()).enumerate() {
+            if stage.info().identity {
+                continue;
+            }
+            chain.encoder |= i == 0;
+            let before = chain.links.iter().any(|l: &Link| l.info.params > 0);
+            chain.link(&name, stage, range.clone(), before)?;
+        }
+        Ok(chain)
+    }
+
+    /// One stage alone, with all that it can do.
+    pub fn single(stage: &dyn Stage, target: Target) -> Result<Self> {
+        let params = stage.info().params;
+        let mut chain = Self { links: vec![], encoder: false, dense: 0, params, target };
+        chain.link("stage", stage, 0..params, true)?;
+        Ok(chain)
+    }
+
+    fn link(&mut self, name: &str, stage: &dyn Stage, range: Range<usize>, wants_dx: bool) -> Result<()> {
+        let (info, name) = (stage.info(), titled(name, &stage.describe()));
+        if info.scope == Scope::Ray {
+            return Err(Error::unsupported(
+                format!("{name} on the wgpu backend"),
+                "the stage looks along rays and kernels see one row at a time; it runs with --backend cpu",
+            ));
+        }
+        if u32::try_from(self.params).is_err() {
+            return Err(Error::unsupported("the wgpu backend", format!("{} parameters; 2^32 can be told apart", self.params)));
+        }
+        let fragment = fragment_of(&name, stage.wgsl())?;
+        let partial = (info.grads == GradKind::Dense).then_some(self.dense);
+        self.dense += partial.map_or(0, |_| info.params);
+        let prefix = format!("s{}_", self.links.len());
+        self.links.push(Link { name, prefix, fragment, info, range, partial, wants_dx });
+        Ok(())
+    }
+
+    /// The stages.
+    pub fn links(&self) -> &[Link] {
+        &self.links
+    }
+
+    /// Buffers that the arena is cut into.
+    pub fn segments(&self) -> usize {
+        self.params.div_ceil(self.target.segment).max(1)
+    }
+
+    /// Channels of the features that `forward` keeps for `backward`; 0 where the encoder has no parameters.
+    pub fn kept(&self) -> usize {
+        let first = self.links.first().filter(|l| self.encoder && l.info.params > 0);
+        first.map_or(0, |l| l.info.output)
+    }
+
+    /// Parameters of the arena.
+    pub fn params(&self) -> usize {
+        self.params
+    }
+
+    /// Channels out of the encoder.
+    pub fn features(&self) -> usize {
+        self.links.first().filter(|_| self.encoder).map_or(3, |l| l.info.output)
+    }
+
+    /// `backward` has something to do.
+    pub fn learns(&self) -> bool {
+        self.params > 0
+    }
+
+    fn declare(&self, source: &mut Source, gradients: bool) {
+        for s in 0..self.segments() {
+            source.bind(&format!("params_{s}"), Access::Read, "array<f32>");
+        }
+        let mut text = String::from("fn arena_param(i: u32) -> f32 {\n");
+        self.each_segment(&mut text, |s, i| format!("return params_{s}[{i}];"));
+        text += "    return 0.0;\n}\n";
+        if gradients {
+            let number = match self.target.atomics {
+                Atomics::Native => "f32",
+                Atomics::CompareExchange => "u32",
+            };
+            for s in 0..self.segments() {
+                source.bind(&format!("grads_{s}"), Access::Write, &format!("array<atomic<{number}>>"));
+                if self.target.atomics == Atomics::CompareExchange {
+                    let _ = write!(
+                        text,
+                        "fn arena_add_{s}(i: u32, v: f32) {{
+    var old = atomicLoad(&grads_{s}[i]);
+    loop {{
+        let found = atomicCompareExchangeWeak(&grads_{s}[i], old, bitcast<u32>(bitcast<f32>(old) + v));
+        if found.exchanged {{ break; }}
+        old = found.old_value;
+    }}
+}}
+"
+                    );
+                }
+            }
+            text += "fn arena_grad(i: u32, v: f32) {\n    if v == 0.0 { return; }\n";
+            self.each_segment(&mut text, |s, i| match self.target.atomics {
+                Atomics::Native => format!("atomicAdd(&grads_{s}[{i}], v); return;"),
+                Atomics::CompareExchange => format!("arena_add_{s}({i}, v); return;"),
+            });
+            text += "}\n";
+        }
+        source.add("the arena", &text);
+    }
+
+    /// What to do in each segment with the entry's place in it.
+    fn each_segment(&self, text: &mut String, line: impl Fn(usize, &str) -> String) {
+        let size = self.target.segment;
+        for s in 0..self.segments() {
+            if s + 1 == self.segments() {
+                let i = if s == 0 { "i".to_owned() } else { format!("i - {}u", s * size) };
+                let _ = writeln!(text, "    {}", line(s, &i));
+            } else {
+                let i = if s == 0 { "i".to_owned() } else { format!("i - {}u", s * size) };
+                let _ = writeln!(text, "    if i < {}u {{ {} }}", (s + 1) * size, line(s, &i));
+            }
+        }
+    }
+
+    /// What `link` may call, and its own functions.
+    fn include(&self, source: &mut Source, link: &Link, gradients: bool) {
+        let Link { name, prefix, fragment, range, partial, wants_dx, .. } = link;
+        let first = range.start;
+        let mut text = format!(
+            "const {prefix}wants_dx = {wants_dx};
+fn {prefix}param(i: u32) -> f32 {{ return arena_param({first}u + i); }}
+"
+        );
+        // A kernel that only goes forward has no place for gradients; what adds to them is there, and does nothing.
+        let add = match (gradients, partial) {
+            (false, _) => String::new(),
+            (true, None) => format!("arena_grad({first}u + i, v);"),
+            (true, Some(offset)) => format!("partial[group * {}u + {offset}u + i] += v;", self.dense),
+        };
+        let scattered = if gradients { format!("arena_grad({first}u + i, v);") } else { String::new() };
+        let _ = write!(
+            text,
+            "fn {prefix}grad(i: u32, v: f32) {{ {scattered} }}
+fn {prefix}accumulate(i: u32, v: f32) {{ {add} }}
+"
+        );
+        for sum in fragment.sums() {
+            match (sum, gradients) {
+                (Sum::Vector(m), true) => text += &vector(prefix, m),
+                (Sum::Outer(m, k), true) => text += &outer(prefix, m, k),
+                (Sum::Vector(m), false) => {
+                    let _ = writeln!(text, "fn {prefix}sum_{m}(at: u32, a: ptr<function, array<f32, {m}>>) {{}}");
+                }
+                (Sum::Outer(m, k), false) => {
+                    let _ = writeln!(
+                        text,
+                        "fn {prefix}outer_{m}_{k}(at: u32, ld: u32, a: ptr<function, array<f32, {m}>>, b: ptr<function, array<f32, {k}>>) {{}}"
+                    );
+                }
+            }
+        }
+        source.add(&format!("what the host gives {name}"), &text);
+        source.add(name, &fragment.named(prefix));
+    }
+
+    fn step(source: &mut Source) {
+        source.add("step", include_str!("kernels/step.wgsl"));
+        source.bind("step", Access::Uniform, "Step");
+    }
+
+    /// From positions to μ; keeps features where `keep`.
+    pub fn forward(&self, keep: bool) -> Source {
+        let mut source = Source::default();
+        Self::step(&mut source);
+        source.bind("samples", Access::Read, "array<vec4<f32>>");
+        source.bind("mu", Access::Write, "array<f32>");
+        let keep = if keep { self.kept() } else { 0 };
+        if keep > 0 {
+            source.bind("features", Access::Write, "array<f32>");
+        }
+        self.declare(&mut source, false);
+        self.links.iter().for_each(|l| self.include(&mut source, l, false));
+        let mut body = String::from("        let at = samples[row];\n        var x0 = array<f32, 3>(at.x, at.y, at.z);\n");
+        for (i, l) in self.links.iter().enumerate() {
+            let _ = write!(
+                body,
+                "        var x{}: array<f32, {}>;\n        {}forward(&x{i}, &x{});\n",
+                i + 1,
+                l.info.output,
+                l.prefix,
+                i + 1
+            );
+            if i == 0 && keep > 0 {
+                let _ = writeln!(
+                    body,
+                    "        for (var c = 0u; c < {keep}u; c++) {{ features[c * step.stride + row] = x1[c]; }}"
+                );
+            }
+        }
+        let _ = writeln!(body, "        mu[row] = x{}[0];", self.links.len());
+        source.add("forward", &rows(&body));
+        source
+    }
+
+    /// From positions to features, channel-major.
+    pub fn encode(&self) -> Source {
+        let mut source = Source::default();
+        Self::step(&mut source);
+        source.bind("samples", Access::Read, "array<vec4<f32>>");
+        source.bind("features", Access::Write, "array<f32>");
+        let mut body = String::from("        let at = samples[row];\n        var x0 = array<f32, 3>(at.x, at.y, at.z);\n");
+        let (mut from, width) = ("x0", self.features());
+        if self.encoder {
+            self.declare(&mut source, false);
+            let l = &self.links[0];
+            self.include(&mut source, l, false);
+            let _ = writeln!(body, "        var x1: array<f32, {width}>;\n        {}forward(&x0, &x1);", l.prefix);
+            from = "x1";
+        }
+        let _ = writeln!(body, "        for (var c = 0u; c < {width}u; c++) {{ features[c * step.stride + row] = {from}[c]; }}");
+        source.add("encode", &rows(&body));
+        source
+    }
+
+    /// From the derivative by μ to gradients.
+    pub fn backward(&self) -> Source {
+        let mut source = Source::default();
+        Self::step(&mut source);
+        source.bind("samples", Access::Read, "array<vec4<f32>>");
+        source.bind("dmu", Access::Read, "array<f32>");
+        let kept = self.kept();
+        if kept > 0 {
+            source.bind("features", Access::Read, "array<f32>");
+        }
+        self.sums(&mut source);
+        self.declare(&mut source, true);
+        self.links.iter().for_each(|l| self.include(&mut source, l, true));
+        let n = self.links.len();
+        let mut body = String::from(
+            "        var at = vec4<f32>();
+        var d = 0.0;
+        if live { at = samples[row]; d = dmu[row]; }
+        var x0 = array<f32, 3>(at.x, at.y, at.z);
+",
+        );
+        for (i, l) in self.links[..n - 1].iter().enumerate() {
+            let _ = writeln!(body, "        var x{}: array<f32, {}>;", i + 1, l.info.output);
+            if i == 0 && kept > 0 {
+                let _ = writeln!(
+                    body,
+                    "        if live {{ for (var c = 0u; c < {kept}u; c++) {{ x1[c] = features[c * step.stride + row]; }} }}"
+                );
+            } else {
+                let _ = writeln!(body, "        {}forward(&x{i}, &x{});", l.prefix, i + 1);
+            }
+        }
+        let _ = writeln!(body, "        var d{n} = array<f32, 1>(d);");
+        self.back(&mut body);
+        source.add("backward", &groups(&body));
+        source
+    }
+
+    /// Calls of `backward`, from the last link as far as there are parameters.
+    fn back(&self, body: &mut String) {
+        for (i, l) in self.links.iter().enumerate().rev() {
+            if l.info.params == 0 && !l.wants_dx {
+                break;
+            }
+            let _ = write!(
+                body,
+                "        var d{i}: array<f32, {}>;\n        {}backward(&x{i}, &d{}, &d{i});\n",
+                l.info.input,
+                l.prefix,
+                i + 1
+            );
+        }
+    }
+
+    /// Sums over rows and where they go.
+    fn sums(&self, source: &mut Source) {
+        if self.dense > 0 {
+            source.bind("partial", Access::Write, "array<f32>");
+        }
+        source.add("sums", include_str!("kernels/sums.wgsl"));
+    }
+
+    /// Adds all groups' partial sums to the arena's gradients.
+    pub fn merge(&self) -> Source {
+        let mut source = Source::default();
+        Self::step(&mut source);
+        source.bind("partial", Access::Read, "array<f32>");
+        self.declare(&mut source, true);
+        let mut text = String::from("fn arena_index(i: u32) -> u32 {\n");
+        for l in &self.links {
+            if let Some(offset) = l.partial {
+                let (end, first) = (offset + l.info.params, l.range.start);
+                let _ = writeln!(text, "    if i < {end}u {{ return {first}u + i - {offset}u; }}");
+            }
+        }
+        let dense = self.dense;
+        let _ = write!(
+            text,
+            "    return 0u;
+}}
+
+// `step.rows` is the number of groups.
+@compute @workgroup_size(64)
+fn main(@builtin(global_invocation_id) id: vec3<u32>) {{
+    if id.x >= {dense}u {{ return; }}
+    var sum = 0.0;
+    for (var g = 0u; g < step.rows; g++) {{ sum += partial[g * {dense}u + id.x]; }}
+    arena_grad(arena_index(id.x), sum);
+}}
+"
+        );
+        source.add("merge", &text);
+        source
+    }
+
+    /// One stage alone: `y` of `x`, both channel-major in buffers of their own.
+    pub fn single_forward(&self) -> Source {
+        let mut source = Source::default();
+        Self::step(&mut source);
+        source.bind("x", Access::Read, "array<f32>");
+        source.bind("y", Access::Write, "array<f32>");
+        self.declare(&mut source, false);
+        let l = &self.links[0];
+        self.include(&mut source, l, false);
+        let Info { input, output, .. } = l.info;
+        source.add(
+            "forward",
+            &rows(&format!(
+                "        var x0: array<f32, {input}>;
+        for (var c = 0u; c < {input}u; c++) {{ x0[c] = x[c * step.stride + row]; }}
+        var x1: array<f32, {output}>;
+        {}forward(&x0, &x1);
+        for (var c = 0u; c < {output}u; c++) {{ y[c * step.stride + row] = x1[c]; }}
+",
+                l.prefix
+            )),
+        );
+        source
+    }
+
+    /// One stage alone: gradients and `dx` of `x` and `dy`.
+    pub fn single_backward(&self) -> Source {
+        let mut source = Source::default();
+        Self::step(&mut source);
+        for (name, access) in [("x", Access::Read), ("dy", Access::Read), ("dx", Access::Write)] {
+            source.bind(name, access, "array<f32>");
+        }
+        self.sums(&mut source);
+        self.declare(&mut source, true);
+        let l = &self.links[0];
+        self.include(&mut source, l, true);
+        let Info { input, output, .. } = l.info;
+        source.add(
+            "backward",
+            &groups(&format!(
+                "        var x0: array<f32, {input}>;
+        var d1: array<f32, {output}>;
+        var d0: array<f32, {input}>;
+        if live {{
+            for (var c = 0u; c < {input}u; c++) {{ x0[c] = x[c * step.stride + row]; }}
+            for (var c = 0u; c < {output}u; c++) {{ d1[c] = dy[c * step.stride + row]; }}
+        }}
+        {}backward(&x0, &d1, &d0);
+        if live {{ for (var c = 0u; c < {input}u; c++) {{ dx[c * step.stride + row] = d0[c]; }} }}
+",
+                l.prefix
+            )),
+        );
+        source
+    }
+}
+
+/// A kernel whose invocations take rows one by one.
+fn rows(body: &str) -> String {
+    format!(
+        "@compute @workgroup_size(64)
+fn main(@builtin(global_invocation_id) id: vec3<u32>, @builtin(num_workgroups) groups: vec3<u32>) {{
+    for (var row = id.x; row < step.rows; row += groups.x * 64u) {{
+{body}    }}
+}}
+"
+    )
+}
+
+/// A kernel whose groups take 64 rows at a time, together; rows past the end are there and not `live`.
+fn groups(body: &str) -> String {
+    format!(
+        "@compute @workgroup_size(64)
+fn main(
+    @builtin(workgroup_id) id: vec3<u32>,
+    @builtin(num_workgroups) all: vec3<u32>,
+    @builtin(local_invocation_index) index: u32,
+) {{
+    lane = index;
+    group = id.x;
+    let pieces = (step.rows + 63u) / 64u;
+    for (var piece = id.x; piece < pieces; piece += all.x) {{
+        let row = piece * 64u + index;
+        let live = row < step.rows;
+{body}    }}
+}}
+"
+    )
+}
+
+/// Adds the sums of `m` channels over the rows of a group.
+fn vector(prefix: &str, m: usize) -> String {
+    format!(
+        "fn {prefix}sum_{m}(at: u32, a: ptr<function, array<f32, {m}>>) {{
+    for (var first = 0u; first < {m}u; first += 32u) {{
+        workgroupBarrier();
+        for (var c = 0u; c < 32u; c++) {{
+            if first + c < {m}u {{ left[sums_place(lane, c)] = (*a)[first + c]; }}
+        }}
+        workgroupBarrier();
+        let sum = sums_channel();
+        if lane < 32u && first + lane < {m}u {{ {prefix}accumulate(at + first + lane, sum); }}
+    }}
+}}
+"
+    )
+}
+
+/// Adds the sums of all products of `m` and `k` channels over the rows of a group.
+fn outer(prefix: &str, m: usize, k: usize) -> String {
+    format!(
+        "fn {prefix}outer_{m}_{k}(at: u32, ld: u32, a: ptr<function, array<f32, {m}>>, b: ptr<function, array<f32, {k}>>) {{
+    let j = (lane >> 3u) * 4u;
+    let c = (lane & 7u) * 4u;
+    for (var top = 0u; top < {m}u; top += 32u) {{
+        workgroupBarrier();
+        for (var i = 0u; i < 32u; i++) {{
+            if top + i < {m}u {{ left[sums_place(lane, i)] = (*a)[top + i]; }}
+        }}
+        for (var side = 0u; side < {k}u; side += 32u) {{
+            workgroupBarrier();
+            for (var i = 0u; i < 32u; i++) {{
+                if side + i < {k}u {{ right[sums_place(lane, i)] = (*b)[side + i]; }}
+            }}
+            workgroupBarrier();
+            if top + j < {m}u && side + c < {k}u {{
+                let block = sums_block(j, c);
+                for (var p = 0u; p < 4u; p++) {{
+                    for (var q = 0u; q < 4u; q++) {{
+                        if top + j + p < {m}u && side + c + q < {k}u {{
+                            {prefix}accumulate(at + (top + j + p) * ld + side + c + q, block[p][q]);
+                        }}
+                    }}
+                }}
+            }}
+        }}
+    }}
+}}
+"
+    )
+}
+
+/// Samples of rays.
+pub fn sample(projector: &dyn Projector) -> Result<Source> {
+    let name = titled("projector", &projector.describe());
+    let fragment = fragment_of(&name, projector.wgsl())?;
+    let mut source = Source::default();
+    Chain::step(&mut source);
+    source.add("rays", RAY);
+    source.bind("rays", Access::Read, "array<Ray>");
+    source.bind("samples", Access::Write, "array<vec4<f32>>");
+    source.add("random numbers", RANDOM);
+    source.add(&name, &fragment.named("projector_"));
+    source.add("sample", include_str!("kernels/sample.wgsl"));
+    Ok(source)
+}
+
+/// Points of blocks.
+pub fn blocks() -> Source {
+    let mut source = Source::default();
+    Chain::step(&mut source);
+    source.bind("corners", Access::Read, "array<vec4<f32>>");
+    source.bind("samples", Access::Write, "array<vec4<f32>>");
+    source.add("blocks", include_str!("kernels/blocks.wgsl"));
+    source
+}
+
+/// Which rows a loss is of.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Part {
+    /// Samples of rays.
+    Rays,
+    /// Known points.
+    Points,
+    /// Blocks for total variation.
+    Blocks,
+}
+
+/// The loss of a part and its derivative by μ.
+pub fn loss(part: Part) -> Source {
+    let mut source = Source::default();
+    Chain::step(&mut source);
+    source.bind("mu", Access::Read, "array<f32>");
+    source.bind("dmu", Access::Write, "array<f32>");
+    source.bind("losses", Access::Write, "array<f32>");
+    source.add("total", include_str!("kernels/total.wgsl"));
+    if part != Part::Blocks {
+        source.add("penalty", include_str!("kernels/penalty.wgsl"));
+    }
+    match part {
+        Part::Rays => {
+            source.add("rays", RAY);
+            source.bind("rays", Access::Read, "array<Ray>");
+            source.bind("samples", Access::Read, "array<vec4<f32>>");
+            source.add("loss of rays", include_str!("kernels/rays.wgsl"));
+        }
+        Part::Points => {
+            source.bind("targets", Access::Read, "array<f32>");
+            source.add("loss of points", include_str!("kernels/points.wgsl"));
+        }
+        Part::Blocks => source.add("loss of blocks", include_str!("kernels/tv.wgsl")),
+    }
+    source
+}
+
+/// The optimizer.
+pub fn adam() -> Source {
+    let mut source = Source::default();
+    source.bind("rule", Access::Uniform, "Rule");
+    for name in ["params", "grads", "first", "second"] {
+        source.bind(name, Access::Write, "array<f32>");
+    }
+    source.add("adam", include_str!("kernels/adam.wgsl"));
+    source
+}

@@ -1,0 +1,261 @@
+//! Adapters and what they can do; an open device and its errors.
+
+use conefield_core::error::{Error, Result};
+use serde::Serialize;
+use std::fmt;
+use std::sync::{Arc, Mutex, PoisonError};
+
+/// How gradients of scattered parameters are added up.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize)]
+#[serde(rename_all = "kebab-case")]
+pub enum Atomics {
+    /// The device adds `f32` atomically.
+    Native,
+    /// Compare and exchange, again until nobody was faster: what every device can do.
+    CompareExchange,
+}
+
+impl fmt::Display for Atomics {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.write_str(match self {
+            Self::Native => "native f32 atomics",
+            Self::CompareExchange => "f32 sums by compare and exchange",
+        })
+    }
+}
+
+/// A device that can be asked for, and its limits.
+#[derive(Debug, Clone, PartialEq, Serialize)]
+pub struct Adapter {
+    /// Its place in the list, by which it is chosen.
+    pub index: usize,
+    /// Name of the device.
+    pub name: String,
+    /// Vulkan, Metal or DX12.
+    pub api: String,
+    /// Discrete, integrated, virtual, or a CPU that acts as one.
+    pub kind: String,
+    /// Driver and its version.
+    pub driver: String,
+    /// Whether a CPU does the work.
+    pub software: bool,
+    /// Bytes of the largest buffer that a kernel may read or write.
+    pub binding_bytes: u64,
+    /// Bytes of the largest buffer.
+    pub buffer_bytes: u64,
+    /// Storage buffers that one kernel may use.
+    pub storage_buffers: u32,
+    /// Bytes of workgroup memory.
+    pub workgroup_bytes: u32,
+    /// How gradients of scattered parameters would be added up.
+    pub atomics: Atomics,
+    /// Whether kernels can be timed on the device.
+    pub timestamps: bool,
+}
+
+impl Adapter {
+    fn of(index: usize, adapter: &wgpu::Adapter) -> Self {
+        let (info, limits, features) = (adapter.get_info(), adapter.limits(), adapter.features());
+        let atomics = if features.contains(wgpu::Features::SHADER_FLOAT32_ATOMIC) {
+            Atomics::Native
+        } else {
+            Atomics::CompareExchange
+        };
+        Self {
+            index,
+            name: info.name,
+            api: info.backend.to_string(),
+            kind: match info.device_type {
+                wgpu::DeviceType::DiscreteGpu => "discrete GPU",
+                wgpu::DeviceType::IntegratedGpu => "integrated GPU",
+                wgpu::DeviceType::VirtualGpu => "virtual GPU",
+                wgpu::DeviceType::Cpu => "software",
+                wgpu::DeviceType::Other => "other",
+            }
+            .into(),
+            driver: [info.driver, info.driver_info].join(" ").trim().into(),
+            software: info.device_type == wgpu::DeviceType::Cpu,
+            binding_bytes: u64::from(limits.max_storage_buffer_binding_size),
+            buffer_bytes: limits.max_buffer_size,
+            storage_buffers: limits.max_storage_buffers_per_shader_stage,
+            workgroup_bytes: limits.max_compute_workgroup_storage_size,
+            atomics,
+            timestamps: features.contains(wgpu::Features::TIMESTAMP_QUERY),
+        }
+    }
+
+    /// Which to prefer: the largest number.
+    fn rank(&self) -> u32 {
+        match self.kind.as_str() {
+            "discrete GPU" => 4,
+            "integrated GPU" => 3,
+            "virtual GPU" => 2,
+            "other" => 1,
+            _ => 0,
+        }
+    }
+}
+
+impl fmt::Display for Adapter {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        write!(f, "{} ({}, {}, {})", self.name, self.kind, self.api, self.driver)
+    }
+}
+
+fn found() -> Vec<wgpu::Adapter> {
+    let mut description = wgpu::InstanceDescriptor::new_without_display_handle();
+    description.backends = wgpu::Backends::VULKAN | wgpu::Backends::METAL | wgpu::Backends::DX12;
+    let instance = wgpu::Instance::new(description);
+    pollster::block_on(instance.enumerate_adapters(wgpu::Backends::all()))
+}
+
+/// Every adapter here.
+pub fn adapters() -> Vec<Adapter> {
+    found().iter().enumerate().map(|(i, a)| Adapter::of(i, a)).collect()
+}
+
+/// What may be set otherwise than an adapter offers, to try what others have to do.
+#[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
+pub struct Limits {
+    /// Sums of scattered gradients by compare and exchange, even where the device adds by itself.
+    pub compare_exchange: bool,
+    /// Bytes of the largest binding, if fewer than the device allows.
+    pub binding_bytes: Option<u64>,
+}
+
+/// An open device.
+pub struct Gpu {
+    /// What it is.
+    pub adapter: Adapter,
+    pub(crate) device: wgpu::Device,
+    pub(crate) queue: wgpu::Queue,
+    /// The first thing that went wrong and was not asked for where it happened.
+    failed: Arc<Mutex<Option<String>>>,
+}
+
+impl Gpu {
+    /// Opens adapter `index`, or the one that promises most.
+    pub fn open(index: Option<usize>, limits: Limits) -> Result<Self> {
+        let all = found();
+        let described: Vec<_> = all.iter().enumerate().map(|(i, a)| Adapter::of(i, a)).collect();
+        let best = described.iter().max_by_key(|a| (a.rank(), std::cmp::Reverse(a.index))).map(|a| a.index);
+        let chosen = index.or(best).and_then(|i| described.get(i));
+        let Some(mut adapter) = chosen.cloned() else {
+            return Err(match index {
+                Some(i) if !all.is_empty() => Error::invalid(
+                    "--backend",
+                    "adapter",
+                    i,
+                    format!("0 to {}, as `conefield backends` lists them", all.len() - 1),
+                ),
+                _ => Error::unsupported("the wgpu backend", "no Vulkan, Metal or DX12 adapter was found on this machine"),
+            });
+        };
+        if limits.compare_exchange {
+            adapter.atomics = Atomics::CompareExchange;
+        }
+        if let Some(bytes) = limits.binding_bytes {
+            adapter.binding_bytes = adapter.binding_bytes.min(bytes);
+        }
+        let source = &all[adapter.index];
+        let wanted = wgpu::Features::SHADER_FLOAT32_ATOMIC | wgpu::Features::TIMESTAMP_QUERY;
+        let description = wgpu::DeviceDescriptor {
+            label: Some("conefield"),
+            required_features: source.features() & wanted,
+            required_limits: source.limits(),
+            experimental_features: wgpu::ExperimentalFeatures::disabled(),
+            memory_hints: wgpu::MemoryHints::Performance,
+            trace: wgpu::Trace::Off,
+        };
+        let (device, queue) = pollster::block_on(source.request_device(&description))
+            .map_err(|e| Error::unsupported(format!("the wgpu backend on {adapter}"), e.to_string()))?;
+        let failed = Arc::new(Mutex::new(None));
+        let keep = failed.clone();
+        device.on_uncaptured_error(Arc::new(move |e: wgpu::Error| note(&keep, in_words(&e))));
+        let keep = failed.clone();
+        device.set_device_lost_callback(move |reason, message| {
+            if reason != wgpu::DeviceLostReason::Destroyed {
+                note(&keep, format!("the device was lost: {message}"));
+            }
+        });
+        Ok(Self { adapter, device, queue, failed })
+    }
+
+    /// What has gone wrong on the device since this was last asked.
+    pub fn fault(&self) -> Result<()> {
+        match self.failed.lock().unwrap_or_else(PoisonError::into_inner).take() {
+            Some(what) => Err(self.error(what)),
+            None => Ok(()),
+        }
+    }
+
+    pub(crate) fn error(&self, what: impl Into<String>) -> Error {
+        Error::Device { device: self.adapter.to_string(), what: what.into() }
+    }
+
+    /// Waits until everything handed to the device is done.
+    pub fn wait(&self) -> Result<()> {
+        let polled = self.device.poll(wgpu::PollType::wait_indefinitely());
+        self.fault()?;
+        polled.map(drop).map_err(|e| self.error(e.to_string()))
+    }
+
+    /// Runs `make`; what goes wrong in it is its error.
+    pub(crate) fn checked<T>(&self, what: &str, make: impl FnOnce() -> T) -> Result<T> {
+        let scopes = [wgpu::ErrorFilter::OutOfMemory, wgpu::ErrorFilter::Validation, wgpu::ErrorFilter::Internal]
+            .map(|filter| self.device.push_error_scope(filter));
+        let made = make();
+        let mut first = None;
+        for scope in scopes.into_iter().rev() {
+            first = pollster::block_on(scope.pop()).or(first);
+        }
+        first.map_or(Ok(made), |e| Err(self.error(format!("{what}: {}", in_words(&e)))))
+    }
+
+    /// A buffer of `bytes`, zero at first.
+    pub(crate) fn buffer(&self, name: &str, bytes: u64, usage: wgpu::BufferUsages) -> Result<wgpu::Buffer> {
+        let size = bytes.max(16).next_multiple_of(16);
+        if size > self.adapter.buffer_bytes {
+            return Err(self.error(format!("{name} takes {size} bytes, more than a buffer's {}", self.adapter.buffer_bytes)));
+        }
+        self.checked(&format!("{name}, {size} bytes"), || {
+            self.device.create_buffer(&wgpu::BufferDescriptor { label: Some(name), size, usage, mapped_at_creation: false })
+        })
+    }
+
+    /// Hands `bytes` of `from` to `read`, once the device has come to them.
+    pub(crate) fn read(&self, from: &wgpu::Buffer, bytes: u64, read: impl FnOnce(&[u8])) -> Result<()> {
+        if bytes == 0 {
+            return self.wait();
+        }
+        let slice = from.slice(..bytes);
+        let state = Arc::new(Mutex::new(None));
+        let keep = state.clone();
+        slice.map_async(wgpu::MapMode::Read, move |r| {
+            *keep.lock().unwrap_or_else(PoisonError::into_inner) = Some(r);
+        });
+        self.wait()?;
+        let mapped = state.lock().unwrap_or_else(PoisonError::into_inner).take();
+        match mapped {
+            Some(Ok(())) => {}
+            Some(Err(e)) => return Err(self.error(e.to_string())),
+            None => return Err(self.error("what it computed cannot be read back")),
+        }
+        let view = slice.get_mapped_range().map_err(|e| self.error(e.to_string()))?;
+        read(&view);
+        drop(view);
+        from.unmap();
+        Ok(())
+    }
+}
+
+fn note(keep: &Mutex<Option<String>>, what: String) {
+    keep.lock().unwrap_or_else(PoisonError::into_inner).get_or_insert(what);
+}
+
+fn in_words(e: &wgpu::Error) -> String {
+    match e {
+        wgpu::Error::OutOfMemory { .. } => "out of memory on the device; smaller tables or fewer rays a step may fit".into(),
+        other => other.to_string(),
+    }
+}

@@ -1,0 +1,551 @@
+//! A pipeline at work on a device: steps, updates, evaluation.
+
+use crate::arena;
+use crate::compose::{self, Chain, GROUP, Part};
+use crate::kernel::{Buffers, Kernel, fits};
+use crate::source::Source;
+use crate::wave::{self, GpuRay, MOST_GROUPS, Wave};
+use crate::{Gpu, Shared};
+use conefield_core::backend::{Adam, Executable, Loss, StepStats, Work};
+use conefield_core::error::Result;
+use conefield_core::pipeline::Model;
+use conefield_core::stage::{Projector, UnitRay};
+use std::collections::HashMap;
+use std::sync::Arc;
+use std::time::Instant;
+use wgpu::BufferUsages as U;
+
+/// Bytes that all groups' partial sums may take together.
+const PARTIAL_BYTES: usize = 64 << 20;
+/// Groups of `backward` at most: enough to fill a device, few enough that their sums are merged fast.
+const BACKWARD_GROUPS: usize = 2048;
+/// Rows of a wave at first, at least, and at most.
+const FIRST_ROWS: u32 = 1 << 16;
+const LEAST_ROWS: u32 = 1 << 12;
+const MOST_ROWS: u32 = 1 << 20;
+/// A wave should take less than the second, of the half second after which a watchdog may step in, and may grow where it
+/// takes less than the first.
+const WAVE_SECONDS: [f64; 2] = [0.06, 0.25];
+
+/// What is the same for all of a launch: `Step` in `kernels/step.wgsl`.
+#[repr(C)]
+#[derive(Debug, Clone, Copy, Default, bytemuck::Pod, bytemuck::Zeroable)]
+pub(crate) struct Step {
+    pub rows: u32,
+    pub ray_rows: u32,
+    pub rays: u32,
+    pub point_rows: u32,
+    pub blocks: u32,
+    pub edge: u32,
+    pub stride: u32,
+    pub training: u32,
+    pub loss: u32,
+    pub delta: f32,
+    pub ray_scale: f32,
+    pub point_scale: f32,
+    pub spacing: [f32; 3],
+    pub smoothing: f32,
+    pub tv_scale: f32,
+    pub pad: [u32; 3],
+}
+
+/// `Rule` in `kernels/adam.wgsl`.
+#[repr(C)]
+#[derive(Debug, Clone, Copy, bytemuck::Pod, bytemuck::Zeroable)]
+struct Rule {
+    count: u32,
+    rate: f32,
+    beta1: f32,
+    beta2: f32,
+    rest1: f32,
+    rest2: f32,
+    root: f32,
+    eps: f32,
+}
+
+/// The kernels of a pipeline, composed and checked; compiled when they are first used.
+pub struct Kernels {
+    sources: HashMap<&'static str, Source>,
+}
+
+impl Kernels {
+    /// Composes every kernel and refuses what is no valid WGSL or needs more than the device has.
+    pub fn new(shared: &Shared, chain: &Chain, projector: &dyn Projector) -> Result<Self> {
+        let mut sources = HashMap::from([
+            ("sample", compose::sample(projector)?),
+            ("blocks", compose::blocks()),
+            ("forward", chain.forward(true)),
+            ("evaluate", chain.forward(false)),
+            ("encode", chain.encode()),
+            ("loss of rays", compose::loss(Part::Rays)),
+            ("loss of points", compose::loss(Part::Points)),
+            ("loss of blocks", compose::loss(Part::Blocks)),
+            ("adam", compose::adam()),
+        ]);
+        if chain.learns() {
+            sources.insert("backward", chain.backward());
+        }
+        if chain.dense > 0 {
+            sources.insert("merge", chain.merge());
+        }
+        for (label, source) in &sources {
+            source.validate()?;
+            fits(&shared.gpu, label, source)?;
+        }
+        Ok(Self { sources })
+    }
+
+    /// The text of a kernel.
+    pub fn text(&self, label: &str) -> Option<&str> {
+        self.sources.get(label).map(Source::text)
+    }
+}
+
+/// A pipeline on a device.
+pub struct Wgpu {
+    shared: Arc<Shared>,
+    chain: Chain,
+    kernels: Kernels,
+    compiled: HashMap<&'static str, Arc<Kernel>>,
+    bound: HashMap<&'static str, wgpu::BindGroup>,
+    buffers: Buffers,
+    /// The arena is on the device.
+    loaded: bool,
+    /// Gradients there are known to be zero.
+    clean: bool,
+    /// Rows that a wave may have.
+    most: u32,
+    /// Rows for which there is room.
+    room: u32,
+}
+
+impl Wgpu {
+    pub(crate) fn new(shared: Arc<Shared>, chain: Chain, kernels: Kernels) -> Self {
+        Self {
+            shared,
+            chain,
+            kernels,
+            compiled: HashMap::new(),
+            bound: HashMap::new(),
+            buffers: Buffers::default(),
+            loaded: false,
+            clean: false,
+            most: FIRST_ROWS,
+            room: 0,
+        }
+    }
+
+    /// Bytes that it comes to hold on the device.
+    pub fn device_bytes(&self) -> u64 {
+        let rows = u64::from(MOST_ROWS) * self.row_bytes();
+        16 * self.chain.params() as u64 + rows + 4 * (self.groups() * self.chain.dense) as u64
+    }
+
+    /// Bytes that it comes to hold in the machine's memory for copies.
+    pub fn host_bytes(&self) -> usize {
+        MOST_ROWS as usize * 20 + (32 << 20)
+    }
+
+    /// Positions and weights, μ and its derivative, targets, features.
+    fn row_bytes(&self) -> u64 {
+        16 + 4 + 4 + 4 + 4 * self.chain.kept().max(self.chain.features()) as u64
+    }
+
+    /// Groups of `backward`.
+    fn groups(&self) -> usize {
+        let each = 4 * self.chain.dense.max(1);
+        (PARTIAL_BYTES / each).clamp(1, BACKWARD_GROUPS)
+    }
+
+    fn gpu(&self) -> &Gpu {
+        &self.shared.gpu
+    }
+
+    /// Takes the arena to the device unless it is there.
+    fn load(&mut self, model: &Model) -> Result<()> {
+        if self.loaded {
+            return Ok(());
+        }
+        let (shared, size) = (self.shared.clone(), self.shared.target().segment);
+        let params = model.arena.params.len();
+        arena::allocate(&shared.gpu, &mut self.buffers, &self.chain, params, size)?;
+        arena::upload(&shared.gpu, &self.buffers, &self.chain, &model.arena, size)?;
+        self.buffers.reserve(&shared.gpu, "step", size_of::<Step>() as u64, U::UNIFORM | U::COPY_DST)?;
+        self.buffers.reserve(&shared.gpu, "rule", size_of::<Rule>() as u64, U::UNIFORM | U::COPY_DST)?;
+        if self.chain.dense > 0 {
+            let bytes = 4 * (self.groups() * self.chain.dense) as u64;
+            self.buffers.reserve(&shared.gpu, "partial", bytes, U::STORAGE | U::COPY_DST)?;
+        }
+        (self.loaded, self.clean) = (true, false);
+        Ok(())
+    }
+
+    fn reserve(&mut self, name: &str, bytes: u64, usage: U) -> Result<()> {
+        if self.buffers.reserve(&self.shared.gpu, name, bytes, usage)? {
+            self.bound.clear();
+        }
+        Ok(())
+    }
+
+    /// Makes room for `rows` rows.
+    fn reserve_rows(&mut self, rows: u32) -> Result<()> {
+        if rows <= self.room {
+            return Ok(());
+        }
+        let n = u64::from(rows);
+        self.reserve("samples", 16 * n, U::STORAGE | U::COPY_DST)?;
+        self.reserve("mu", 4 * n, U::STORAGE | U::COPY_SRC)?;
+        self.reserve("dmu", 4 * n, U::STORAGE)?;
+        self.reserve("targets", 4 * n, U::STORAGE | U::COPY_DST)?;
+        self.reserve("features", 4 * n * self.chain.kept().max(1) as u64, U::STORAGE | U::COPY_SRC)?;
+        self.room = rows;
+        Ok(())
+    }
+
+    /// The kernel called `label`, compiled, with its buffers.
+    fn ready(&mut self, label: &'static str) -> Result<(Arc<Kernel>, wgpu::BindGroup)> {
+        let kernel = match self.compiled.get(label) {
+            Some(kernel) => kernel.clone(),
+            None => {
+                let source = self.kernels.sources.get(label);
+                let source = source.ok_or_else(|| self.gpu().error(format!("no kernel {label}")))?;
+                let kernel = self.shared.kernels.get(&self.shared.gpu, label, source)?;
+                self.compiled.insert(label, kernel.clone());
+                kernel
+            }
+        };
+        if !self.bound.contains_key(label) {
+            let group = kernel.bind(&self.shared.gpu, &self.buffers)?;
+            self.bound.insert(label, group);
+        }
+        Ok((kernel, self.bound[label].clone()))
+    }
+
+    /// Launches kernels one after the other, each with its number of groups.
+    fn launch(&mut self, encoder: &mut wgpu::CommandEncoder, launches: &[(&'static str, usize)]) -> Result<()> {
+        for &(label, groups) in launches.iter().filter(|(_, groups)| *groups > 0) {
+            let (kernel, bound) = self.ready(label)?;
+            let mut pass = encoder
+                .begin_compute_pass(&wgpu::ComputePassDescriptor { label: Some(kernel.label()), timestamp_writes: None });
+            kernel.launch(&mut pass, &bound, groups.min(MOST_GROUPS) as u32);
+        }
+        Ok(())
+    }
+
+    fn write(&self, name: &str, bytes: &[u8]) -> Result<()> {
+        let buffer = self.buffers.get(name).ok_or_else(|| self.gpu().error(format!("no buffer {name}")))?;
+        if !bytes.is_empty() {
+            self.gpu().queue.write_buffer(buffer, 0, bytes);
+        }
+        Ok(())
+    }
+
+    fn encoder(&self) -> wgpu::CommandEncoder {
+        self.gpu().device.create_command_encoder(&Default::default())
+    }
+
+    /// Adds a copy of the beginning of `name` to `encoder`, for [`Wgpu::read`].
+    fn copy(&mut self, encoder: &mut wgpu::CommandEncoder, name: &str, bytes: u64, at: u64) -> Result<()> {
+        let from = self.buffers.get(name).cloned().ok_or_else(|| self.gpu().error(format!("no buffer {name}")))?;
+        if let Some(to) = self.buffers.get("staging")
+            && bytes > 0
+        {
+            encoder.copy_buffer_to_buffer(&from, 0, to, at, bytes);
+        }
+        Ok(())
+    }
+
+    fn read(&self, bytes: u64, read: impl FnOnce(&[u8])) -> Result<()> {
+        match self.buffers.get("staging") {
+            Some(staging) => self.gpu().read(staging, bytes, read),
+            None => self.gpu().wait(),
+        }
+    }
+
+    /// Evaluates the field in waves: `samples` of each are written, `label` is run on them.
+    fn in_pieces(
+        &mut self,
+        points: &[[f32; 3]],
+        label: &'static str,
+        result: &str,
+        width: usize,
+        mut take: impl FnMut(usize, &[f32], usize),
+    ) -> Result<()> {
+        let mut at = 0;
+        let mut samples: Vec<[f32; 4]> = vec![];
+        while at < points.len() {
+            let started = Instant::now();
+            let piece = &points[at..(at + self.most as usize).min(points.len())];
+            let rows = piece.len() as u32;
+            self.reserve_rows(rows)?;
+            let stride = self.room;
+            let bytes = 4 * u64::from(stride) * width as u64;
+            self.reserve(result, bytes, U::STORAGE | U::COPY_SRC)?;
+            // What is read back ends with the last channel's rows.
+            let wanted = 4 * (u64::from(stride) * (width as u64 - 1) + u64::from(rows));
+            self.reserve("staging", wanted, U::MAP_READ | U::COPY_DST)?;
+            samples.clear();
+            samples.extend(piece.iter().map(|p| [p[0], p[1], p[2], 0.0]));
+            self.write("samples", bytemuck::cast_slice(&samples))?;
+            self.write("step", bytemuck::bytes_of(&Step { rows, stride, ..Step::default() }))?;
+            let mut encoder = self.encoder();
+            self.launch(&mut encoder, &[(label, piece.len().div_ceil(GROUP as usize))])?;
+            self.copy(&mut encoder, result, wanted, 0)?;
+            self.gpu().queue.submit([encoder.finish()]);
+            self.read(wanted, |bytes| take(at, bytemuck::cast_slice(bytes), stride as usize))?;
+            at += piece.len();
+            self.pace(started.elapsed().as_secs_f64(), 1, rows);
+        }
+        Ok(())
+    }
+
+    /// Chooses how many rows a wave may have, by how long the last ones took.
+    fn pace(&mut self, seconds: f64, waves: usize, rows: u32) {
+        let each = seconds / waves.max(1) as f64;
+        if each > WAVE_SECONDS[1] && self.most > LEAST_ROWS {
+            self.most /= 2;
+        } else if each < WAVE_SECONDS[0] && rows > self.most / 2 && self.most < MOST_ROWS {
+            self.most *= 2;
+        }
+    }
+
+    /// The kernels of one wave of a step.
+    fn learn(&mut self, wave: &Wave, work: &Work<'_>, sums: u64) -> Result<()> {
+        self.reserve_rows(wave.rows)?;
+        self.reserve("rays", (wave.rays.len().max(1) * size_of::<GpuRay>()) as u64, U::STORAGE | U::COPY_DST)?;
+        self.reserve("losses", 4 * wave.losses().max(1) as u64, U::STORAGE | U::COPY_SRC)?;
+        self.write("rays", bytemuck::cast_slice(&wave.rays))?;
+        let mut step = Step {
+            rows: wave.rows,
+            ray_rows: wave.ray_rows,
+            rays: wave.rays.len() as u32,
+            point_rows: wave.points.len() as u32,
+            stride: self.room,
+            training: 1,
+            ray_scale: 1.0 / work.rays.len().max(1) as f32,
+            point_scale: 1.0 / work.points.len().max(1) as f32,
+            ..penalty(work.loss)
+        };
+        if !wave.points.is_empty() {
+            let points = &work.points[wave.points.clone()];
+            let samples: Vec<[f32; 4]> = points.iter().map(|(p, _)| [p[0], p[1], p[2], 0.0]).collect();
+            let targets: Vec<f32> = points.iter().map(|p| p.1).collect();
+            let buffer = self.buffers.get("samples").ok_or_else(|| self.gpu().error("no buffer samples"))?;
+            self.gpu().queue.write_buffer(buffer, 16 * u64::from(wave.ray_rows), bytemuck::cast_slice(&samples));
+            self.write("targets", bytemuck::cast_slice(&targets))?;
+        }
+        let mut block_rows = 0;
+        if let (Some(tv), false) = (work.tv, wave.blocks.is_empty()) {
+            let corners: Vec<[f32; 4]> =
+                tv.corners[wave.blocks.clone()].iter().map(|c| [c[0], c[1], c[2], 0.0]).collect();
+            self.reserve("corners", 16 * corners.len() as u64, U::STORAGE | U::COPY_DST)?;
+            self.write("corners", bytemuck::cast_slice(&corners))?;
+            let points = tv.edge.pow(3);
+            step.blocks = wave.blocks.len() as u32;
+            step.edge = tv.edge as u32;
+            step.spacing = tv.spacing;
+            step.smoothing = tv.smoothing as f32;
+            step.tv_scale = tv_scale(tv.weight, tv.corners.len() * points);
+            block_rows = wave.blocks.len() * points;
+        }
+        self.write("step", bytemuck::bytes_of(&step))?;
+        let groups = |rows: usize| rows.div_ceil(GROUP as usize);
+        let backward = if self.chain.learns() { groups(wave.rows as usize).min(self.groups()) } else { 0 };
+        let mut encoder = self.encoder();
+        self.launch(
+            &mut encoder,
+            &[
+                ("sample", groups(wave.ray_rows as usize)),
+                ("blocks", groups(block_rows)),
+                ("forward", groups(wave.rows as usize)),
+                ("loss of rays", wave.rays.len()),
+                ("loss of points", groups(wave.points.len())),
+                ("loss of blocks", wave.blocks.len()),
+                ("backward", backward),
+            ],
+        )?;
+        self.copy(&mut encoder, "losses", 4 * wave.losses() as u64, sums)?;
+        self.gpu().queue.submit([encoder.finish()]);
+        Ok(())
+    }
+}
+
+fn tv_scale(weight: f64, points: usize) -> f32 {
+    (weight / points.max(1) as f64) as f32
+}
+
+/// The penalty, as kernels know it.
+fn penalty(loss: Loss) -> Step {
+    let (loss, delta) = match loss {
+        Loss::L1 => (0, 0.0),
+        Loss::L2 => (1, 0.0),
+        Loss::Huber { delta } => (2, delta as f32),
+    };
+    Step { loss, delta, ..Step::default() }
+}
+
+/// The number of the penalty that is the difference itself.
+const LINE: u32 = 3;
+
+impl Executable for Wgpu {
+    fn step(&mut self, model: &mut Model, work: &Work<'_>) -> Result<StepStats> {
+        self.load(model)?;
+        let started = Instant::now();
+        if !self.clean || self.chain.dense > 0 {
+            let mut encoder = self.encoder();
+            if !self.clean {
+                for s in 0..self.chain.segments() {
+                    self.buffers.get(&format!("grads_{s}")).inspect(|b| encoder.clear_buffer(b, 0, None));
+                }
+            }
+            self.buffers.get("partial").inspect(|b| encoder.clear_buffer(b, 0, None));
+            self.gpu().queue.submit([encoder.finish()]);
+        }
+        self.clean = false;
+        let waves = wave::of_step(model.pipeline.projector.as_ref(), work, self.most);
+        let losses: usize = waves.iter().map(Wave::losses).sum();
+        self.reserve("staging", 4 * losses as u64, U::MAP_READ | U::COPY_DST)?;
+        let mut at = 0;
+        for wave in &waves {
+            self.learn(wave, work, at)?;
+            at += 4 * wave.losses() as u64;
+        }
+        if self.chain.dense > 0 {
+            self.write("step", bytemuck::bytes_of(&Step { rows: self.groups() as u32, ..Step::default() }))?;
+            let mut encoder = self.encoder();
+            self.launch(&mut encoder, &[("merge", self.chain.dense.div_ceil(GROUP as usize))])?;
+            self.gpu().queue.submit([encoder.finish()]);
+        }
+        let mut stats = StepStats { samples: waves.iter().map(|w| u64::from(w.rows)).sum(), ..StepStats::default() };
+        let (ray_scale, point_scale) = (1.0 / work.rays.len() as f64, 1.0 / work.points.len() as f64);
+        let tv_scale = work.tv.map_or(0.0, |tv| tv.weight / (tv.corners.len() * tv.edge.pow(3)) as f64);
+        self.read(4 * losses as u64, |bytes| {
+            let mut sums = bytemuck::cast_slice::<u8, f32>(bytes).iter().map(|&l| f64::from(l));
+            let mut next = |n: usize| sums.by_ref().take(n).sum::<f64>();
+            for wave in &waves {
+                let (rays, points, blocks) =
+                    (next(wave.rays.len()), next(wave.points.len().div_ceil(64)), next(wave.blocks.len()));
+                if !wave.rays.is_empty() {
+                    stats.loss += rays * ray_scale;
+                }
+                if !wave.points.is_empty() {
+                    stats.loss += points * point_scale;
+                }
+                if !wave.blocks.is_empty() {
+                    stats.prior += blocks * tv_scale;
+                }
+            }
+        })?;
+        let seconds = started.elapsed().as_secs_f64();
+        stats.dense_s = seconds;
+        self.pace(seconds, waves.len(), waves.iter().map(|w| w.rows).max().unwrap_or(0));
+        Ok(stats)
+    }
+
+    fn update(&mut self, model: &mut Model, adam: &Adam) -> Result<()> {
+        self.load(model)?;
+        let (bias1, bias2) =
+            (1.0 - adam.beta1.powf(adam.step as f64), 1.0 - adam.beta2.powf(adam.step as f64));
+        let size = self.shared.target().segment;
+        if !self.compiled.contains_key("adam") {
+            let source = &self.kernels.sources["adam"];
+            self.compiled.insert("adam", self.shared.kernels.get(&self.shared.gpu, "adam", source)?);
+        }
+        let kernel = self.compiled["adam"].clone();
+        for s in 0..self.chain.segments() {
+            let count = arena::segment(&self.chain, s, model.arena.params.len(), size).len();
+            let rule = Rule {
+                count: count as u32,
+                rate: (adam.lr / bias1) as f32,
+                beta1: adam.beta1 as f32,
+                beta2: adam.beta2 as f32,
+                rest1: (1.0 - adam.beta1) as f32,
+                rest2: (1.0 - adam.beta2) as f32,
+                root: (1.0 / bias2.sqrt()) as f32,
+                eps: adam.eps as f32,
+            };
+            self.write("rule", bytemuck::bytes_of(&rule))?;
+            let names: Vec<(&str, String)> = arena::PARTS.iter().map(|p| (*p, format!("{p}_{s}"))).collect();
+            let find = |name: &str| {
+                let own = names.iter().find(|(part, _)| *part == name).map_or(name, |(_, own)| own);
+                self.buffers.get(own)
+            };
+            let bound = kernel.bind_as(&self.shared.gpu, find)?;
+            let mut encoder = self.encoder();
+            {
+                let mut pass = encoder.begin_compute_pass(&Default::default());
+                kernel.launch(&mut pass, &bound, count.div_ceil(256).clamp(1, MOST_GROUPS) as u32);
+            }
+            self.gpu().queue.submit([encoder.finish()]);
+        }
+        self.clean = true;
+        self.gpu().fault()
+    }
+
+    fn evaluate(&mut self, model: &Model, points: &[[f32; 3]], out: &mut [f32]) -> Result<()> {
+        self.load(model)?;
+        self.in_pieces(points, "evaluate", "mu", 1, |at, found, _| {
+            let n = found.len().min(out.len() - at);
+            out[at..at + n].copy_from_slice(&found[..n]);
+        })
+    }
+
+    fn encode(&mut self, model: &Model, points: &[[f32; 3]]) -> Result<Vec<f32>> {
+        self.load(model)?;
+        let width = self.chain.features();
+        let n = points.len();
+        let mut out = vec![0.0; width * n];
+        self.in_pieces(points, "encode", "features", width, |at, found, stride| {
+            for (c, out) in out.chunks_exact_mut(n).enumerate() {
+                let channel = &found[c * stride..];
+                let rows = channel.len().min(stride).min(n - at);
+                out[at..at + rows].copy_from_slice(&channel[..rows]);
+            }
+        })?;
+        Ok(out)
+    }
+
+    fn render(&mut self, model: &Model, rays: &[UnitRay], out: &mut [f32]) -> Result<()> {
+        self.load(model)?;
+        let waves = wave::of_rays(model.pipeline.projector.as_ref(), rays, self.most);
+        let mut out = out.iter_mut();
+        for wave in &waves {
+            self.reserve_rows(wave.rows)?;
+            let bytes = 4 * wave.rays.len() as u64;
+            self.reserve("rays", (wave.rays.len().max(1) * size_of::<GpuRay>()) as u64, U::STORAGE | U::COPY_DST)?;
+            self.reserve("losses", bytes.max(4), U::STORAGE | U::COPY_SRC)?;
+            self.reserve("staging", bytes, U::MAP_READ | U::COPY_DST)?;
+            self.write("rays", bytemuck::cast_slice(&wave.rays))?;
+            let (rows, rays) = (wave.rows, wave.rays.len() as u32);
+            let step = Step { rows, ray_rows: rows, rays, stride: self.room, loss: LINE, ..Step::default() };
+            self.write("step", bytemuck::bytes_of(&step))?;
+            let groups = wave.rows.div_ceil(GROUP) as usize;
+            let mut encoder = self.encoder();
+            self.launch(
+                &mut encoder,
+                &[("sample", groups), ("evaluate", groups), ("loss of rays", wave.rays.len())],
+            )?;
+            self.copy(&mut encoder, "losses", bytes, 0)?;
+            self.gpu().queue.submit([encoder.finish()]);
+            self.read(bytes, |found| {
+                for (out, line) in out.by_ref().zip(bytemuck::cast_slice::<u8, f32>(found)) {
+                    *out = *line;
+                }
+            })?;
+        }
+        Ok(())
+    }
+
+    fn fetch(&mut self, model: &mut Model) -> Result<()> {
+        if !self.loaded {
+            return Ok(());
+        }
+        let size = self.shared.target().segment;
+        arena::download(self.gpu(), &self.buffers, &self.chain, &mut model.arena, size)
+    }
+
+    fn renew(&mut self) {
+        self.loaded = false;
+        self.bound.clear();
+    }
+}

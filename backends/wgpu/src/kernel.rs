@@ -1,0 +1,168 @@
+//! Compiled kernels, kept by their text, and their launch on named buffers.
+
+use crate::device::Gpu;
+use crate::source::{Access, Source};
+use conefield_core::error::{Error, Result};
+use std::collections::HashMap;
+use std::sync::{Arc, Mutex, PoisonError};
+
+/// A compiled kernel.
+pub struct Kernel {
+    label: String,
+    pipeline: wgpu::ComputePipeline,
+    layout: wgpu::BindGroupLayout,
+    /// Names of its buffers, in order.
+    buffers: Vec<String>,
+}
+
+/// Compiled kernels by their text.
+#[derive(Default)]
+pub struct Cache(Mutex<HashMap<String, Arc<Kernel>>>);
+
+impl Cache {
+    /// The kernel of `source`, compiled now unless it has been before.
+    pub fn get(&self, gpu: &Gpu, label: &str, source: &Source) -> Result<Arc<Kernel>> {
+        let mut known = self.0.lock().unwrap_or_else(PoisonError::into_inner);
+        if let Some(kernel) = known.get(source.text()) {
+            return Ok(kernel.clone());
+        }
+        let kernel = Arc::new(compile(gpu, label, source)?);
+        known.insert(source.text().into(), kernel.clone());
+        Ok(kernel)
+    }
+}
+
+/// Refuses a kernel that uses more buffers than the device binds.
+pub fn fits(gpu: &Gpu, label: &str, source: &Source) -> Result<()> {
+    let (needs, has) = (source.storage_buffers(), gpu.adapter.storage_buffers);
+    if needs <= has {
+        return Ok(());
+    }
+    Err(Error::unsupported(
+        format!("kernel {label} on {}", gpu.adapter),
+        format!("it reads and writes {needs} storage buffers, the adapter binds {has}; smaller tables need fewer"),
+    ))
+}
+
+fn compile(gpu: &Gpu, label: &str, source: &Source) -> Result<Kernel> {
+    fits(gpu, label, source)?;
+    source.validate()?;
+    let entry = |(i, access): (usize, Access)| wgpu::BindGroupLayoutEntry {
+        binding: i as u32,
+        visibility: wgpu::ShaderStages::COMPUTE,
+        ty: wgpu::BindingType::Buffer {
+            ty: match access {
+                Access::Uniform => wgpu::BufferBindingType::Uniform,
+                Access::Read => wgpu::BufferBindingType::Storage { read_only: true },
+                Access::Write => wgpu::BufferBindingType::Storage { read_only: false },
+            },
+            has_dynamic_offset: false,
+            min_binding_size: None,
+        },
+        count: None,
+    };
+    let entries: Vec<_> = source.bindings().iter().map(|b| b.access).enumerate().map(entry).collect();
+    let (pipeline, layout) = gpu.checked(&format!("kernel {label}"), || {
+        let module = gpu.device.create_shader_module(wgpu::ShaderModuleDescriptor {
+            label: Some(label),
+            source: wgpu::ShaderSource::Wgsl(source.text().into()),
+        });
+        let layout = gpu
+            .device
+            .create_bind_group_layout(&wgpu::BindGroupLayoutDescriptor { label: Some(label), entries: &entries });
+        let whole = gpu.device.create_pipeline_layout(&wgpu::PipelineLayoutDescriptor {
+            label: Some(label),
+            bind_group_layouts: &[Some(&layout)],
+            immediate_size: 0,
+        });
+        let pipeline = gpu.device.create_compute_pipeline(&wgpu::ComputePipelineDescriptor {
+            label: Some(label),
+            layout: Some(&whole),
+            module: &module,
+            entry_point: Some("main"),
+            // Kernels write workgroup memory before they read it.
+            compilation_options: wgpu::PipelineCompilationOptions {
+                zero_initialize_workgroup_memory: false,
+                ..Default::default()
+            },
+            cache: None,
+        });
+        (pipeline, layout)
+    })?;
+    Ok(Kernel {
+        label: label.into(),
+        pipeline,
+        layout,
+        buffers: source.bindings().iter().map(|b| b.name.clone()).collect(),
+    })
+}
+
+/// Buffers by the names that kernels know them by.
+#[derive(Default)]
+pub struct Buffers(HashMap<String, wgpu::Buffer>);
+
+impl Buffers {
+    /// Adds a buffer, in place of one that had the name.
+    pub fn insert(&mut self, name: impl Into<String>, buffer: wgpu::Buffer) {
+        self.0.insert(name.into(), buffer);
+    }
+
+    /// The buffer called `name`.
+    pub fn get(&self, name: &str) -> Option<&wgpu::Buffer> {
+        self.0.get(name)
+    }
+
+    /// Makes sure of a buffer `name` of at least `bytes`; whether it is a new one.
+    pub fn reserve(&mut self, gpu: &Gpu, name: &str, bytes: u64, usage: wgpu::BufferUsages) -> Result<bool> {
+        if self.get(name).is_some_and(|b| b.size() >= bytes) {
+            return Ok(false);
+        }
+        let buffer = gpu.buffer(name, bytes, usage)?;
+        self.insert(name, buffer);
+        Ok(true)
+    }
+
+    /// Bytes of all.
+    pub fn bytes(&self) -> u64 {
+        self.0.values().map(wgpu::Buffer::size).sum()
+    }
+}
+
+impl Kernel {
+    /// Its buffers, bound.
+    pub fn bind(&self, gpu: &Gpu, buffers: &Buffers) -> Result<wgpu::BindGroup> {
+        self.bind_as(gpu, |name| buffers.get(name))
+    }
+
+    /// Its buffers, each the one that `find` has for its name, bound.
+    pub fn bind_as<'a>(
+        &self,
+        gpu: &Gpu,
+        find: impl Fn(&str) -> Option<&'a wgpu::Buffer>,
+    ) -> Result<wgpu::BindGroup> {
+        let mut entries = vec![];
+        for (i, name) in self.buffers.iter().enumerate() {
+            let buffer = find(name).ok_or_else(|| gpu.error(format!("kernel {}: no buffer {name}", self.label)))?;
+            entries.push(wgpu::BindGroupEntry { binding: i as u32, resource: buffer.as_entire_binding() });
+        }
+        gpu.checked(&format!("buffers of kernel {}", self.label), || {
+            gpu.device.create_bind_group(&wgpu::BindGroupDescriptor {
+                label: Some(&self.label),
+                layout: &self.layout,
+                entries: &entries,
+            })
+        })
+    }
+
+    /// Its name.
+    pub fn label(&self) -> &str {
+        &self.label
+    }
+
+    /// Puts a launch of `groups` groups into a pass.
+    pub fn launch(&self, pass: &mut wgpu::ComputePass<'_>, bound: &wgpu::BindGroup, groups: u32) {
+        pass.set_pipeline(&self.pipeline);
+        pass.set_bind_group(0, bound, &[]);
+        pass.dispatch_workgroups(groups, 1, 1);
+    }
+}

@@ -1,0 +1,23 @@
+struct Step {
+    // Rows: first the samples of rays, then points, then those of blocks.
+    rows: u32,
+    ray_rows: u32,
+    rays: u32,
+    point_rows: u32,
+    blocks: u32,
+    // Points along a block's edge.
+    edge: u32,
+    // Rows from one channel of the features to the next.
+    stride: u32,
+    // Whether random positions are random.
+    training: u32,
+    // Which penalty; see `penalty`.
+    loss: u32,
+    delta: f32,
+    ray_scale: f32,
+    point_scale: f32,
+    // Distance of neighbouring points in a block.
+    spacing: vec3<f32>,
+    smoothing: f32,
+    tv_scale: f32,
+}

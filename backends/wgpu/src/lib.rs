@@ -1,0 +1,122 @@
+//! The wgpu backend: a pipeline as a few kernels, on any GPU that Vulkan, Metal or DX12 reaches.
+//!
+//! - [`device`]: adapters and what they can do.
+//! - [`compose`], [`source`]: the text of kernels, put together from the stages' fragments.
+//! - [`kernel`]: compiled kernels and the buffers that they use.
+//! - [`arena`]: parameters, gradients and moments on the device.
+//! - [`wave`]: a step's work cut into pieces of bounded size.
+//! - [`executable`]: steps, updates, evaluation.
+//! - [`single`]: one stage alone, by which it is compared with the CPU.
+//!
+//! Sums have no fixed order where many rows touch one parameter: results agree with the CPU's to rounding, and two runs
+//! with each other.
+
+pub mod arena;
+pub mod compose;
+pub mod device;
+pub mod executable;
+pub mod kernel;
+pub mod single;
+pub mod source;
+pub mod wave;
+
+use compose::{Chain, Target};
+use conefield_core::backend::{Backend, Executable, Explain};
+use conefield_core::error::Result;
+use conefield_core::pipeline::Pipeline;
+use conefield_core::stage::GradKind;
+pub use device::{Adapter, Atomics, Gpu, Limits, adapters};
+use executable::{Kernels, Wgpu as Running};
+use kernel::Cache;
+use std::sync::Arc;
+
+/// An open device with the kernels compiled so far.
+pub struct Wgpu {
+    shared: Arc<Shared>,
+}
+
+/// What every executable of a backend shares.
+pub struct Shared {
+    /// The device.
+    pub gpu: Gpu,
+    /// Kernels by their text.
+    pub kernels: Cache,
+}
+
+impl Shared {
+    /// What the text of kernels depends on.
+    pub fn target(&self) -> Target {
+        let adapter = &self.gpu.adapter;
+        let bytes = adapter.binding_bytes.min(adapter.buffer_bytes);
+        Target { atomics: adapter.atomics, segment: ((bytes / 4) as usize / 64 * 64).max(64) }
+    }
+}
+
+impl Wgpu {
+    /// Opens adapter `index`, or the one that promises most.
+    pub fn open(index: Option<usize>) -> Result<Self> {
+        Self::with_limits(index, Limits::default())
+    }
+
+    /// The same, with less than the adapter offers.
+    pub fn with_limits(index: Option<usize>, limits: Limits) -> Result<Self> {
+        let gpu = Gpu::open(index, limits)?;
+        Ok(Self { shared: Arc::new(Shared { gpu, kernels: Cache::default() }) })
+    }
+
+    /// The device.
+    pub fn adapter(&self) -> &Adapter {
+        &self.shared.gpu.adapter
+    }
+
+    /// What runs single stages on this device.
+    pub fn shared(&self) -> &Arc<Shared> {
+        &self.shared
+    }
+}
+
+impl Backend for Wgpu {
+    fn name(&self) -> &'static str {
+        "wgpu"
+    }
+
+    fn compile(&self, pipeline: &Pipeline) -> Result<(Box<dyn Executable>, Explain)> {
+        let shared = &self.shared;
+        let chain = Chain::new(pipeline, shared.target())?;
+        let kernels = Kernels::new(shared, &chain, pipeline.projector.as_ref())?;
+        let adapter = &shared.gpu.adapter;
+        let running = Running::new(shared.clone(), chain.clone(), kernels);
+        let device_bytes = running.device_bytes();
+        let mut notes: Vec<String> = vec![];
+        for (name, stage) in pipeline.stages() {
+            let info = stage.info();
+            let what = stage.describe();
+            let name = format!("{name} ({})", what.split(':').next().unwrap_or(&what));
+            notes.push(match (info.identity, info.grads) {
+                (true, _) => format!("{name}: identity, left out"),
+                (_, GradKind::None) => format!("{name}: fused"),
+                (_, GradKind::Dense) => format!("{name}: fused, gradients summed in each group of 64 rows"),
+                (_, GradKind::Scatter) => format!("{name}: fused, gradients by {}", adapter.atomics),
+            });
+        }
+        notes.push("split: samples and line integrals are kernels of their own, since a ray's rows meet there".into());
+        notes.push(match chain.kept() {
+            0 => "split: forward and backward; the encoder is computed again, which costs less than its features".into(),
+            n => format!("split: forward and backward; {n} features a sample are kept in between"),
+        });
+        if chain.segments() > 1 {
+            notes.push(format!(
+                "parameters in {} buffers, as one may have {} bytes",
+                chain.segments(),
+                adapter.binding_bytes
+            ));
+        }
+        let explain = Explain {
+            backend: format!("wgpu, {adapter}"),
+            notes,
+            // A software device works in the memory of the machine.
+            scratch_bytes: running.host_bytes() + if adapter.software { device_bytes as usize } else { 0 },
+        };
+        Ok((Box::new(running), explain))
+    }
+}

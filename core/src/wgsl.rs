@@ -1,0 +1,116 @@
+//! A stage's formula for a GPU: WGSL functions over one row, which a backend puts together into kernels.
+//!
+//! A fragment defines, and uses, names that begin with [`PREFIX`]. A backend gives every stage a prefix of its own, so
+//! that fragments never meet. What a stage must define, with its widths `IN` and `OUT` written as numbers:
+//!
+//! ```wgsl
+//! fn stage_forward(x: ptr<function, array<f32, IN>>, y: ptr<function, array<f32, OUT>>)
+//! fn stage_backward(x: ptr<function, array<f32, IN>>, dy: ptr<function, array<f32, OUT>>, dx: ptr<function, array<f32, IN>>)
+//! ```
+//!
+//! `forward` overwrites `y`. `backward` adds to gradients and overwrites `dx`, but where `stage_wants_dx` is false it may
+//! leave `dx` alone. Nothing is kept between the two: what `backward` needs it computes again. What the host defines for
+//! them:
+//!
+//! ```wgsl
+//! const stage_wants_dx: bool;
+//! fn stage_param(i: u32) -> f32                                          // parameter i of the stage
+//! fn stage_grad(i: u32, v: f32)                                          // adds v to the gradient of parameter i
+//! fn stage_sum_M(at: u32, a: ptr<function, array<f32, M>>)               // adds Σ a[j] to parameters at + j
+//! fn stage_outer_M_K(at: u32, ld: u32, a: ptr<function, array<f32, M>>, b: ptr<function, array<f32, K>>)
+//!                                                                        // adds Σ a[j]·b[k] to at + j·ld + k
+//! ```
+//!
+//! `stage_grad` is for parameters of which a row touches few. `stage_sum_M` and `stage_outer_M_K`, sums over rows for
+//! any numbers `M` and `K` in the name, are for those that every row touches: all rows call them together, so never
+//! inside a branch or a loop that only some rows take.
+//!
+//! A projector defines
+//!
+//! ```wgsl
+//! fn stage_sample(ray: Ray, i: u32, training: bool) -> vec4<f32>
+//! ```
+//!
+//! sample `i` of `ray.count` on a ray: its position in the unit cube and its weight. `ray.count` is what
+//! [`Projector::max_samples`](crate::stage::Projector::max_samples) says; samples beyond what the ray has weigh 0. The
+//! line integral is the sum of weight times attenuation. [`RAY`] defines `Ray`, [`RANDOM`] random numbers.
+
+use std::collections::BTreeSet;
+
+/// How every name begins that a fragment defines or uses of its host's.
+pub const PREFIX: &str = "stage_";
+
+/// `struct Ray`: [`UnitRay`](crate::stage::UnitRay) with its seed and its number of samples.
+pub const RAY: &str = include_str!("wgsl/ray.wgsl");
+/// `random_mix` and `random_unit`: the twins of [`mix`](crate::random::mix) and [`unit`](crate::random::unit).
+pub const RANDOM: &str = include_str!("wgsl/random.wgsl");
+/// `stage_trilinear_locate`, `…_index`, `…_weight` and `…_slopes`: the twin of [`crate::trilinear`].
+pub const TRILINEAR: &str = include_str!("wgsl/trilinear.wgsl");
+
+/// WGSL of one stage.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct Fragment {
+    /// The functions.
+    pub source: String,
+}
+
+/// A sum over rows that a fragment asks for.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
+pub enum Sum {
+    /// `stage_sum_M`.
+    Vector(usize),
+    /// `stage_outer_M_K`.
+    Outer(usize, usize),
+}
+
+impl Fragment {
+    /// A fragment of pieces, one after the other.
+    pub fn new(pieces: &[&str]) -> Self {
+        Self { source: pieces.join("\n") }
+    }
+
+    /// The same functions with names that begin with `prefix` instead of [`PREFIX`].
+    pub fn named(&self, prefix: &str) -> String {
+        let mut out = String::with_capacity(self.source.len());
+        let mut rest = self.source.as_str();
+        while let Some(at) = rest.find(PREFIX) {
+            let inside = rest[..at].ends_with(|c: char| c.is_alphanumeric() || c == '_');
+            out.push_str(&rest[..at]);
+            out.push_str(if inside { PREFIX } else { prefix });
+            rest = &rest[at + PREFIX.len()..];
+        }
+        out.push_str(rest);
+        out
+    }
+
+    /// The sums over rows that it uses, by the names that occur in it.
+    pub fn sums(&self) -> BTreeSet<Sum> {
+        let words = self.source.split(|c: char| !(c.is_alphanumeric() || c == '_'));
+        let sum = |word: &str| {
+            let rest = word.strip_prefix(PREFIX)?;
+            if let Some(m) = rest.strip_prefix("sum_") {
+                return Some(Sum::Vector(m.parse().ok()?));
+            }
+            let (m, k) = rest.strip_prefix("outer_")?.split_once('_')?;
+            Some(Sum::Outer(m.parse().ok()?, k.parse().ok()?))
+        };
+        words.filter_map(sum).collect()
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn names_are_changed_where_they_begin() {
+        let f = Fragment::new(&["fn stage_a() { backstage_b(stage_param(0u)); stage_stage_c(); }"]);
+        assert_eq!(f.named("s1_"), "fn s1_a() { backstage_b(s1_param(0u)); s1_stage_c(); }");
+    }
+
+    #[test]
+    fn sums_are_found_by_their_names() {
+        let f = Fragment::new(&["stage_sum_20(at, &a); stage_outer_32_20(at, 20u, &a, &b); other_sum_3(); stage_sum_x();"]);
+        assert_eq!(f.sums().into_iter().collect::<Vec<_>>(), [Sum::Vector(20), Sum::Outer(32, 20)]);
+    }
+}

@@ -1,0 +1,154 @@
+//! A stage's WGSL on a device against its Rust: double precision, single precision and the device side by side.
+
+use crate::call::{Draw, error, forward, gradients};
+use crate::gradients::{narrow, no_rows, shared};
+use crate::rays::{rays, samples};
+use crate::{Options, Outcome, Report};
+use conefield_core::error::Result;
+use conefield_core::stage::{Projector, Samples, Stage, UnitRay};
+
+/// Runs a stage's WGSL on parameters, inputs and output gradients (channel-major, so many rows). Returns outputs,
+/// gradients of the parameters and gradients of the inputs.
+pub type Pass<'a> = dyn Fn(&dyn Stage, &[f32], &[f32], &[f32], usize) -> Result<[Vec<f32>; 3]> + 'a;
+
+/// Runs a projector's WGSL on rays, each with its seed where positions are random.
+pub type Sample<'a> = dyn Fn(&dyn Projector, &[(UnitRay, Option<u64>)]) -> Result<Vec<Samples>> + 'a;
+
+/// How often the rows around which a stage is smooth are gone through: several groups, the last one not full.
+const ROUNDS: usize = 9;
+
+/// Runs every property that a stage's WGSL must have.
+pub fn check_wgsl(stage: &dyn Stage, options: &Options, pass: &Pass<'_>) -> Report {
+    let mut report = Report { stage: stage.describe(), entries: vec![] };
+    report.add("WGSL parity", || parity(stage, options, pass));
+    report.add("WGSL extremes", || extremes(stage, options, pass));
+    report
+}
+
+/// Outputs and gradients against double precision. Single precision on the CPU is said beside it: the device may be
+/// as far off as that may, gradients four times as far, because their sums have no fixed order.
+fn parity(stage: &dyn Stage, options: &Options, pass: &Pass<'_>) -> Outcome {
+    let info = stage.info();
+    if stage.wgsl().is_none() {
+        return Outcome::Skipped(if info.identity { "left out on a device".into() } else { "it offers none".into() });
+    }
+    let rounds = |v: &[f64], change: bool| -> Vec<f64> {
+        let n = options.rows;
+        let of = |c: &[f64]| -> Vec<f64> {
+            (0..ROUNDS).flat_map(|r| c.iter().map(move |v| if change { v * (1.0 - 0.2 * r as f64) } else { *v })).collect()
+        };
+        v.chunks_exact(n).flat_map(of).collect()
+    };
+    let rows = ROUNDS * options.rows;
+    let Some(k) = stage.reference() else { return single_only(stage, options, pass) };
+    let Some([p, x, dy]) = shared(stage, k, options) else { return no_rows::<f64>() };
+    let (x, dy) = (rounds(&x, false), narrow(&rounds(&dy, true)));
+    let dy64: Vec<f64> = dy.iter().map(|&v| f64::from(v)).collect();
+    let [y64, _] = forward(k, &info, &p, &x, rows);
+    let [g64, dx64] = gradients(k, &info, &p, &x, &dy64, rows);
+    let (p, x) = (narrow(&p), narrow(&x));
+    let [y32, _] = forward(stage.kernel(), &info, &p, &x, rows);
+    let [g32, dx32] = gradients(stage.kernel(), &info, &p, &x, &dy, rows);
+    let [y, g, dx] = match pass(stage, &p, &x, &dy, rows) {
+        Ok(found) => found,
+        Err(e) => return Outcome::Failed(e.to_string()),
+    };
+    let mut words = vec![];
+    let mut fine = true;
+    for (what, found, cpu, exact, limit) in [
+        ("outputs", &y, &y32, &y64, options.single),
+        ("parameters", &g, &g32, &g64, 4.0 * options.single),
+        ("inputs", &dx, &dx32, &dx64, 4.0 * options.single),
+    ] {
+        if exact.is_empty() {
+            continue;
+        }
+        let (e, on_cpu) = (error(found, exact), error(cpu, exact));
+        fine &= e <= limit;
+        words.push(format!("{what} {e:.1e} (CPU {on_cpu:.1e}, limit {limit:.0e})"));
+    }
+    let words = words.join(", ");
+    if fine { Outcome::Passed(words) } else { Outcome::Failed(words) }
+}
+
+/// Against single precision on the CPU, where there is no other.
+fn single_only(stage: &dyn Stage, options: &Options, pass: &Pass<'_>) -> Outcome {
+    let info = stage.info();
+    let rows = ROUNDS * options.rows;
+    let p: Vec<f32> = crate::call::params(stage, options);
+    let (x, dy) = crate::call::data(&info, options, rows);
+    let [y32, _] = forward(stage.kernel(), &info, &p, &x, rows);
+    let [g32, dx32] = gradients(stage.kernel(), &info, &p, &x, &dy, rows);
+    match pass(stage, &p, &x, &dy, rows) {
+        Err(e) => Outcome::Failed(e.to_string()),
+        Ok([y, g, dx]) => {
+            let e = error(&y, &y32).max(error(&g, &g32) / 4.0).max(error(&dx, &dx32) / 4.0);
+            crate::call::within("against single precision on the CPU", e, 2.0 * options.single)
+        }
+    }
+}
+
+/// What the CPU answers with finite numbers the device does too: zeros, denormals (which it may flush to zero) and
+/// huge numbers.
+fn extremes(stage: &dyn Stage, options: &Options, pass: &Pass<'_>) -> Outcome {
+    let info = stage.info();
+    if stage.wgsl().is_none() {
+        return Outcome::Skipped("no WGSL".into());
+    }
+    let p: Vec<f32> = crate::call::params(stage, options);
+    let rows = 70;
+    for value in [0.0f32, -0.0, 1e-40, 1e-30, 1.0, -1.0, 1e30, -1e30] {
+        let mut draw = Draw::new(options.seed, 41);
+        let mut x: Vec<f32> = draw.many(&options.inputs, info.input * rows);
+        x.iter_mut().step_by(3).for_each(|v| *v = value);
+        let dy: Vec<f32> = draw.many(&(-1.0..1.0), info.output * rows);
+        let [y32, _] = forward(stage.kernel(), &info, &p, &x, rows);
+        let [g32, dx32] = gradients(stage.kernel(), &info, &p, &x, &dy, rows);
+        let [y, g, dx] = match pass(stage, &p, &x, &dy, rows) {
+            Ok(found) => found,
+            Err(e) => return Outcome::Failed(e.to_string()),
+        };
+        for (what, found, cpu) in [("outputs", y, y32), ("gradients", g, g32), ("input gradients", dx, dx32)] {
+            let lost = |(a, b): (&f32, &f32)| b.is_finite() && b.abs() < 1e35 && !a.is_finite();
+            if let Some(i) = found.iter().zip(&cpu).position(lost) {
+                return Outcome::Failed(format!("inputs of {value:e}: {what} {i} is {}, on the CPU {}", found[i], cpu[i]));
+            }
+        }
+    }
+    Outcome::Passed("finite wherever the CPU is".into())
+}
+
+/// Runs every property that a projector's WGSL must have.
+pub fn check_projector_wgsl(projector: &dyn Projector, sample: &Sample<'_>) -> Report {
+    let mut report = Report { stage: projector.describe(), entries: vec![] };
+    report.add("WGSL parity", || same_samples(projector, sample));
+    report
+}
+
+/// Largest difference of positions and weights, in cube sides: rounding of positions two sides from the origin.
+const PLACES: f32 = 2e-6;
+
+fn same_samples(projector: &dyn Projector, sample: &Sample<'_>) -> Outcome {
+    if projector.wgsl().is_none() {
+        return Outcome::Skipped("it offers none".into());
+    }
+    let seeds = [None, Some(5), Some(0xfedc_ba98_7654_3210)];
+    let all: Vec<_> = rays().into_iter().flat_map(|r| seeds.map(|s| (r, s))).collect();
+    let found = match sample(projector, &all) {
+        Ok(found) => found,
+        Err(e) => return Outcome::Failed(e.to_string()),
+    };
+    let mut worst = 0.0f32;
+    for (i, ((ray, seed), found)) in all.iter().zip(&found).enumerate() {
+        let want = samples(projector, ray, *seed);
+        if found.points.len() < want.points.len() || found.weights[want.weights.len()..].iter().any(|w| *w != 0.0) {
+            return Outcome::Failed(format!("ray {i}: {} samples against {}", found.points.len(), want.points.len()));
+        }
+        for ((a, b), (v, w)) in found.points.iter().zip(&want.points).zip(found.weights.iter().zip(&want.weights)) {
+            let place = (0..3).map(|k| (a[k] - b[k]).abs()).fold((v - w).abs(), f32::max);
+            worst = if place.is_nan() { f32::INFINITY } else { worst.max(place) };
+        }
+    }
+    let text = format!("{} rays, largest difference {worst:.1e} cube sides, limit {PLACES:.0e}", all.len());
+    if worst <= PLACES { Outcome::Passed(text) } else { Outcome::Failed(text) }
+}
