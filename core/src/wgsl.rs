@@ -110,7 +110,8 @@ mod tests {
 
     #[test]
     fn sums_are_found_by_their_names() {
-        let f = Fragment::new(&["stage_sum_20(at, &a); stage_outer_32_20(at, 20u, &a, &b); other_sum_3(); stage_sum_x();"]);
+        let f =
+            Fragment::new(&["stage_sum_20(at, &a); stage_outer_32_20(at, 20u, &a, &b); other_sum_3(); stage_sum_x();"]);
         assert_eq!(f.sums().into_iter().collect::<Vec<_>>(), [Sum::Vector(20), Sum::Outer(32, 20)]);
     }
 }

@@ -5,14 +5,14 @@
 //! A level with `r` cells a side has `(r + 1)³` vertices at the corners of its cells, which fill the cube exactly:
 //! `p = clamp(x, 0, 1)·r`.
 
+use crate::levels::{LevelCode, functions};
 use conefield_core::error::{Error, Result, ensure};
 use conefield_core::random::{mix, unit};
 use conefield_core::simd::{Op, Real, Simd, run};
 use conefield_core::spec::EncoderSpec;
-use conefield_core::wgsl::{Fragment, TRILINEAR};
 use conefield_core::stage::{Encoder, GradKind, Grads, Info, Kernel, Parameter, Reduced, Scope, Stage, Tile, TileMut};
 use conefield_core::trilinear::{BLOCK, Grid, Located};
-use crate::levels::{LevelCode, functions};
+use conefield_core::wgsl::{Fragment, TRILINEAR};
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 use std::ops::Range;

@@ -8,8 +8,8 @@
 use conefield_core::error::{Result, ensure};
 use conefield_core::simd::{Op, Real, Select, Simd, SimdBase, SimdFloat, V, load, run, store};
 use conefield_core::spec::EncoderSpec;
-use conefield_core::wgsl::Fragment;
 use conefield_core::stage::{Encoder, GradKind, Grads, Info, Kernel, Parameter, Reduced, Scope, Stage, Tile, TileMut};
+use conefield_core::wgsl::Fragment;
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 use std::f64::consts::TAU;

@@ -4,13 +4,13 @@
 //! point's cell, trilinearly interpolated. A level whose vertices fit the table is indexed directly, a finer one by
 //! `h(c) = (c_x·π₁ ⊕ c_y·π₂ ⊕ c_z·π₃) mod T` with products modulo 2³² by definition.
 
+use crate::levels::{LevelCode, functions};
 use conefield_core::error::{Result, ensure};
 use conefield_core::random::{mix, unit};
 use conefield_core::simd::{Op, Real, Simd, SimdBase, SimdFloat, V, load, run, store};
 use conefield_core::spec::EncoderSpec;
-use conefield_core::wgsl::Fragment;
 use conefield_core::stage::{Encoder, GradKind, Grads, Info, Kernel, Parameter, Reduced, Scope, Stage, Tile, TileMut};
-use crate::levels::{LevelCode, functions};
+use conefield_core::wgsl::Fragment;
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 use std::ops::Range;
@@ -510,8 +510,7 @@ impl Stage for HashGridStage {
         };
         let levels = self.levels.iter().map(code).collect::<Option<Vec<_>>>()?;
         let [x, y, z] = self.primes;
-        let constants =
-            format!("const stage_FEATURES = {f}u;\nconst stage_PRIMES = vec3<u32>({x}u, {y}u, {z}u);\n");
+        let constants = format!("const stage_FEATURES = {f}u;\nconst stage_PRIMES = vec3<u32>({x}u, {y}u, {z}u);\n");
         Some(Fragment::new(&[&constants, include_str!("hash_grid.wgsl"), &functions(&levels, self.outputs)]))
     }
 

@@ -8,8 +8,8 @@ use conefield_conformance::{
 };
 use conefield_core::arena::Weights;
 use conefield_core::registry::{Kind, names};
-use conefield_core::stage::Stage;
 use conefield_core::spec::{EncoderSpec, FieldSpec, InitializerSpec, NormalizerSpec, ProjectorSpec};
+use conefield_core::stage::Stage;
 use serde_json::{Value, json};
 
 // Stage types register themselves where their crate is linked.
@@ -169,7 +169,10 @@ fn mlp() {
             json!({"type": "mlp", "width": 12, "depth": 3, "skips": [1, 2], "activation": "relu", "output": "softplus"}),
             5,
         ),
-        (json!({"type": "mlp", "width": 33, "activation": "leaky-relu", "output": "sigmoid", "init": "he"}), 17),
+        (
+            json!({"type": "mlp", "width": 33, "depth": 2, "skips": [1], "activation": "leaky-relu", "output": "sigmoid", "init": "he"}),
+            17,
+        ),
         (json!({"type": "mlp", "width": 8, "activation": "squareplus", "init": "glorot", "output": "gelu"}), 4),
     ] {
         field(settings, width, &Options { single: 5e-5, ..Options::features() });

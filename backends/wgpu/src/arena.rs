@@ -28,6 +28,9 @@ pub fn allocate(gpu: &Gpu, buffers: &mut Buffers, chain: &Chain, params: usize, 
             buffers.reserve(gpu, &format!("{part}_{s}"), bytes, U::STORAGE | U::COPY_SRC | U::COPY_DST)?;
         }
     }
+    if chain.uniform() {
+        buffers.reserve(gpu, "dense", 4 * chain.dense as u64, U::UNIFORM | U::COPY_DST)?;
+    }
     Ok(())
 }
 
@@ -45,7 +48,27 @@ pub fn upload(gpu: &Gpu, buffers: &Buffers, chain: &Chain, arena: &Arena, size: 
             }
         }
     }
+    let mut encoder = gpu.device.create_command_encoder(&Default::default());
+    refresh_dense(buffers, chain, &mut encoder, size);
+    gpu.queue.submit([encoder.finish()]);
     gpu.fault()
+}
+
+/// Copies the parameters that every row reads to the uniform buffer.
+pub fn refresh_dense(buffers: &Buffers, chain: &Chain, encoder: &mut wgpu::CommandEncoder, size: usize) {
+    let Some(dense) = buffers.get("dense") else { return };
+    let mut at = 0;
+    for range in chain.dense_ranges() {
+        let mut from = range.start;
+        while from < range.end {
+            let (s, end) = (from / size, range.end.min((from / size + 1) * size));
+            let bytes = 4 * (end - from) as u64;
+            if let Some(params) = buffers.get(&format!("params_{s}")) {
+                encoder.copy_buffer_to_buffer(params, 4 * (from - s * size) as u64, dense, at, bytes);
+            }
+            (from, at) = (end, at + bytes);
+        }
+    }
 }
 
 /// Brings the arena back from the device.

@@ -24,6 +24,8 @@ pub struct Target {
     pub atomics: Atomics,
     /// Parameters that one buffer holds, a multiple of 64.
     pub segment: usize,
+    /// Bytes of the largest uniform buffer.
+    pub uniform_bytes: usize,
 }
 
 /// A stage on its way into kernels.
@@ -59,7 +61,10 @@ pub struct Chain {
 
 fn fragment_of(name: &str, fragment: Option<Fragment>) -> Result<Fragment> {
     fragment.ok_or_else(|| {
-        Error::unsupported(format!("{name} on the wgpu backend"), "the stage offers no WGSL; it runs with --backend cpu")
+        Error::unsupported(
+            format!("{name} on the wgpu backend"),
+            "the stage offers no WGSL; it runs with --backend cpu",
+        )
     })
 }
 
@@ -100,7 +105,10 @@ impl Chain {
             ));
         }
         if u32::try_from(self.params).is_err() {
-            return Err(Error::unsupported("the wgpu backend", format!("{} parameters; 2^32 can be told apart", self.params)));
+            return Err(Error::unsupported(
+                "the wgpu backend",
+                format!("{} parameters; 2^32 can be told apart", self.params),
+            ));
         }
         let fragment = fragment_of(&name, stage.wgsl())?;
         let partial = (info.grads == GradKind::Dense).then_some(self.dense);
@@ -113,6 +121,17 @@ impl Chain {
     /// The stages.
     pub fn links(&self) -> &[Link] {
         &self.links
+    }
+
+    /// Whether the parameters that every row reads are in a uniform buffer, from which a device reads fastest.
+    pub fn uniform(&self) -> bool {
+        self.dense > 0 && 4 * self.dense.next_multiple_of(4) <= self.target.uniform_bytes
+    }
+
+    /// Of the parameters whose gradients are summed over rows: their places in the arena, in the order in which they
+    /// stand in `partial` and in the uniform buffer.
+    pub fn dense_ranges(&self) -> impl Iterator<Item = Range<usize>> {
+        self.links.iter().filter(|l| l.partial.is_some()).map(|l| l.range.clone())
     }
 
     /// Buffers that the arena is cut into.
@@ -144,6 +163,9 @@ impl Chain {
     fn declare(&self, source: &mut Source, gradients: bool) {
         for s in 0..self.segments() {
             source.bind(&format!("params_{s}"), Access::Read, "array<f32>");
+        }
+        if self.uniform() {
+            source.bind("dense", Access::Uniform, &format!("array<vec4<f32>, {}>", self.dense.div_ceil(4)));
         }
         let mut text = String::from("fn arena_param(i: u32) -> f32 {\n");
         self.each_segment(&mut text, |s, i| format!("return params_{s}[{i}];"));
@@ -198,9 +220,13 @@ impl Chain {
     fn include(&self, source: &mut Source, link: &Link, gradients: bool) {
         let Link { name, prefix, fragment, range, partial, wants_dx, .. } = link;
         let first = range.start;
+        let param = match partial {
+            Some(offset) if self.uniform() => format!("dense[({offset}u + i) >> 2u][({offset}u + i) & 3u]"),
+            _ => format!("arena_param({first}u + i)"),
+        };
         let mut text = format!(
             "const {prefix}wants_dx = {wants_dx};
-fn {prefix}param(i: u32) -> f32 {{ return arena_param({first}u + i); }}
+fn {prefix}param(i: u32) -> f32 {{ return {param}; }}
 "
         );
         // A kernel that only goes forward has no place for gradients; what adds to them is there, and does nothing.
@@ -252,7 +278,8 @@ fn {prefix}accumulate(i: u32, v: f32) {{ {add} }}
         }
         self.declare(&mut source, false);
         self.links.iter().for_each(|l| self.include(&mut source, l, false));
-        let mut body = String::from("        let at = samples[row];\n        var x0 = array<f32, 3>(at.x, at.y, at.z);\n");
+        let mut body =
+            String::from("        let at = samples[row];\n        var x0 = array<f32, 3>(at.x, at.y, at.z);\n");
         for (i, l) in self.links.iter().enumerate() {
             let _ = write!(
                 body,
@@ -280,7 +307,8 @@ fn {prefix}accumulate(i: u32, v: f32) {{ {add} }}
         Self::step(&mut source);
         source.bind("samples", Access::Read, "array<vec4<f32>>");
         source.bind("features", Access::Write, "array<f32>");
-        let mut body = String::from("        let at = samples[row];\n        var x0 = array<f32, 3>(at.x, at.y, at.z);\n");
+        let mut body =
+            String::from("        let at = samples[row];\n        var x0 = array<f32, 3>(at.x, at.y, at.z);\n");
         let (mut from, width) = ("x0", self.features());
         if self.encoder {
             self.declare(&mut source, false);
@@ -289,7 +317,10 @@ fn {prefix}accumulate(i: u32, v: f32) {{ {add} }}
             let _ = writeln!(body, "        var x1: array<f32, {width}>;\n        {}forward(&x0, &x1);", l.prefix);
             from = "x1";
         }
-        let _ = writeln!(body, "        for (var c = 0u; c < {width}u; c++) {{ features[c * step.stride + row] = {from}[c]; }}");
+        let _ = writeln!(
+            body,
+            "        for (var c = 0u; c < {width}u; c++) {{ features[c * step.stride + row] = {from}[c]; }}"
+        );
         source.add("encode", &rows(&body));
         source
     }

@@ -43,6 +43,8 @@ pub struct Adapter {
     pub binding_bytes: u64,
     /// Bytes of the largest buffer.
     pub buffer_bytes: u64,
+    /// Bytes of the largest uniform buffer that a kernel may read.
+    pub uniform_bytes: u64,
     /// Storage buffers that one kernel may use.
     pub storage_buffers: u32,
     /// Bytes of workgroup memory.
@@ -76,6 +78,7 @@ impl Adapter {
             driver: [info.driver, info.driver_info].join(" ").trim().into(),
             software: info.device_type == wgpu::DeviceType::Cpu,
             binding_bytes: u64::from(limits.max_storage_buffer_binding_size),
+            uniform_bytes: limits.max_uniform_buffer_binding_size.min(1 << 16),
             buffer_bytes: limits.max_buffer_size,
             storage_buffers: limits.max_storage_buffers_per_shader_stage,
             workgroup_bytes: limits.max_compute_workgroup_storage_size,
@@ -121,6 +124,8 @@ pub struct Limits {
     pub compare_exchange: bool,
     /// Bytes of the largest binding, if fewer than the device allows.
     pub binding_bytes: Option<u64>,
+    /// Bytes of the largest uniform buffer, if fewer than the device allows.
+    pub uniform_bytes: Option<u64>,
 }
 
 /// An open device.
@@ -148,7 +153,9 @@ impl Gpu {
                     i,
                     format!("0 to {}, as `conefield backends` lists them", all.len() - 1),
                 ),
-                _ => Error::unsupported("the wgpu backend", "no Vulkan, Metal or DX12 adapter was found on this machine"),
+                _ => {
+                    Error::unsupported("the wgpu backend", "no Vulkan, Metal or DX12 adapter was found on this machine")
+                }
             });
         };
         if limits.compare_exchange {
@@ -156,6 +163,9 @@ impl Gpu {
         }
         if let Some(bytes) = limits.binding_bytes {
             adapter.binding_bytes = adapter.binding_bytes.min(bytes);
+        }
+        if let Some(bytes) = limits.uniform_bytes {
+            adapter.uniform_bytes = adapter.uniform_bytes.min(bytes);
         }
         let source = &all[adapter.index];
         let wanted = wgpu::Features::SHADER_FLOAT32_ATOMIC | wgpu::Features::TIMESTAMP_QUERY;
@@ -216,10 +226,17 @@ impl Gpu {
     pub(crate) fn buffer(&self, name: &str, bytes: u64, usage: wgpu::BufferUsages) -> Result<wgpu::Buffer> {
         let size = bytes.max(16).next_multiple_of(16);
         if size > self.adapter.buffer_bytes {
-            return Err(self.error(format!("{name} takes {size} bytes, more than a buffer's {}", self.adapter.buffer_bytes)));
+            return Err(
+                self.error(format!("{name} takes {size} bytes, more than a buffer's {}", self.adapter.buffer_bytes))
+            );
         }
         self.checked(&format!("{name}, {size} bytes"), || {
-            self.device.create_buffer(&wgpu::BufferDescriptor { label: Some(name), size, usage, mapped_at_creation: false })
+            self.device.create_buffer(&wgpu::BufferDescriptor {
+                label: Some(name),
+                size,
+                usage,
+                mapped_at_creation: false,
+            })
         })
     }
 
@@ -255,7 +272,9 @@ fn note(keep: &Mutex<Option<String>>, what: String) {
 
 fn in_words(e: &wgpu::Error) -> String {
     match e {
-        wgpu::Error::OutOfMemory { .. } => "out of memory on the device; smaller tables or fewer rays a step may fit".into(),
+        wgpu::Error::OutOfMemory { .. } => {
+            "out of memory on the device; smaller tables or fewer rays a step may fit".into()
+        }
         other => other.to_string(),
     }
 }

@@ -225,8 +225,10 @@ impl Wgpu {
     fn launch(&mut self, encoder: &mut wgpu::CommandEncoder, launches: &[(&'static str, usize)]) -> Result<()> {
         for &(label, groups) in launches.iter().filter(|(_, groups)| *groups > 0) {
             let (kernel, bound) = self.ready(label)?;
-            let mut pass = encoder
-                .begin_compute_pass(&wgpu::ComputePassDescriptor { label: Some(kernel.label()), timestamp_writes: None });
+            let mut pass = encoder.begin_compute_pass(&wgpu::ComputePassDescriptor {
+                label: Some(kernel.label()),
+                timestamp_writes: None,
+            });
             kernel.launch(&mut pass, &bound, groups.min(MOST_GROUPS) as u32);
         }
         Ok(())
@@ -444,8 +446,7 @@ impl Executable for Wgpu {
 
     fn update(&mut self, model: &mut Model, adam: &Adam) -> Result<()> {
         self.load(model)?;
-        let (bias1, bias2) =
-            (1.0 - adam.beta1.powf(adam.step as f64), 1.0 - adam.beta2.powf(adam.step as f64));
+        let (bias1, bias2) = (1.0 - adam.beta1.powf(adam.step as f64), 1.0 - adam.beta2.powf(adam.step as f64));
         let size = self.shared.target().segment;
         if !self.compiled.contains_key("adam") {
             let source = &self.kernels.sources["adam"];
@@ -478,6 +479,9 @@ impl Executable for Wgpu {
             }
             self.gpu().queue.submit([encoder.finish()]);
         }
+        let mut encoder = self.encoder();
+        arena::refresh_dense(&self.buffers, &self.chain, &mut encoder, size);
+        self.gpu().queue.submit([encoder.finish()]);
         self.clean = true;
         self.gpu().fault()
     }
@@ -521,10 +525,7 @@ impl Executable for Wgpu {
             self.write("step", bytemuck::bytes_of(&step))?;
             let groups = wave.rows.div_ceil(GROUP) as usize;
             let mut encoder = self.encoder();
-            self.launch(
-                &mut encoder,
-                &[("sample", groups), ("evaluate", groups), ("loss of rays", wave.rays.len())],
-            )?;
+            self.launch(&mut encoder, &[("sample", groups), ("evaluate", groups), ("loss of rays", wave.rays.len())])?;
             self.copy(&mut encoder, "losses", bytes, 0)?;
             self.gpu().queue.submit([encoder.finish()]);
             self.read(bytes, |found| {

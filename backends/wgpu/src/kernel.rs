@@ -5,6 +5,7 @@ use crate::source::{Access, Source};
 use conefield_core::error::{Error, Result};
 use std::collections::HashMap;
 use std::sync::{Arc, Mutex, PoisonError};
+use std::time::Instant;
 
 /// A compiled kernel.
 pub struct Kernel {
@@ -47,6 +48,7 @@ pub fn fits(gpu: &Gpu, label: &str, source: &Source) -> Result<()> {
 fn compile(gpu: &Gpu, label: &str, source: &Source) -> Result<Kernel> {
     fits(gpu, label, source)?;
     source.validate()?;
+    let started = Instant::now();
     let entry = |(i, access): (usize, Access)| wgpu::BindGroupLayoutEntry {
         binding: i as u32,
         visibility: wgpu::ShaderStages::COMPUTE,
@@ -89,6 +91,7 @@ fn compile(gpu: &Gpu, label: &str, source: &Source) -> Result<Kernel> {
         });
         (pipeline, layout)
     })?;
+    tracing::debug!("kernel {label} compiled in {:.2} s", started.elapsed().as_secs_f64());
     Ok(Kernel {
         label: label.into(),
         pipeline,
@@ -135,11 +138,7 @@ impl Kernel {
     }
 
     /// Its buffers, each the one that `find` has for its name, bound.
-    pub fn bind_as<'a>(
-        &self,
-        gpu: &Gpu,
-        find: impl Fn(&str) -> Option<&'a wgpu::Buffer>,
-    ) -> Result<wgpu::BindGroup> {
+    pub fn bind_as<'a>(&self, gpu: &Gpu, find: impl Fn(&str) -> Option<&'a wgpu::Buffer>) -> Result<wgpu::BindGroup> {
         let mut entries = vec![];
         for (i, name) in self.buffers.iter().enumerate() {
             let buffer = find(name).ok_or_else(|| gpu.error(format!("kernel {}: no buffer {name}", self.label)))?;

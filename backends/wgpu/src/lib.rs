@@ -48,7 +48,11 @@ impl Shared {
     pub fn target(&self) -> Target {
         let adapter = &self.gpu.adapter;
         let bytes = adapter.binding_bytes.min(adapter.buffer_bytes);
-        Target { atomics: adapter.atomics, segment: ((bytes / 4) as usize / 64 * 64).max(64) }
+        Target {
+            atomics: adapter.atomics,
+            segment: ((bytes / 4) as usize / 64 * 64).max(64),
+            uniform_bytes: adapter.uniform_bytes as usize,
+        }
     }
 }
 
@@ -101,7 +105,9 @@ impl Backend for Wgpu {
         }
         notes.push("split: samples and line integrals are kernels of their own, since a ray's rows meet there".into());
         notes.push(match chain.kept() {
-            0 => "split: forward and backward; the encoder is computed again, which costs less than its features".into(),
+            0 => {
+                "split: forward and backward; the encoder is computed again, which costs less than its features".into()
+            }
             n => format!("split: forward and backward; {n} features a sample are kept in between"),
         });
         if chain.segments() > 1 {

@@ -14,14 +14,7 @@ use wgpu::BufferUsages as U;
 impl Shared {
     /// Runs a stage forward and backward on `x` and `dy`, channel-major with `rows` rows. Returns its outputs, the
     /// gradients of its parameters and those of its inputs.
-    pub fn pass(
-        &self,
-        stage: &dyn Stage,
-        params: &[f32],
-        x: &[f32],
-        dy: &[f32],
-        rows: usize,
-    ) -> Result<[Vec<f32>; 3]> {
+    pub fn pass(&self, stage: &dyn Stage, params: &[f32], x: &[f32], dy: &[f32], rows: usize) -> Result<[Vec<f32>; 3]> {
         let (gpu, target) = (&self.gpu, self.target());
         let chain = Chain::single(stage, target)?;
         let info = stage.info();

@@ -94,7 +94,10 @@ impl Source {
         for (name, end) in &self.pieces {
             if line <= *end {
                 let text = self.text.lines().nth(line - 1).unwrap_or_default().trim();
-                return Error::unsupported(format!("WGSL of {name}, line {}", line - first + 1), format!("{why}: {text}"));
+                return Error::unsupported(
+                    format!("WGSL of {name}, line {}", line - first + 1),
+                    format!("{why}: {text}"),
+                );
             }
             first = end + 1;
         }

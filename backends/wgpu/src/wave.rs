@@ -54,11 +54,7 @@ impl Wave {
 }
 
 /// Puts rays into waves of at most `most` rows, or one ray that has more.
-fn cast<'a>(
-    projector: &dyn Projector,
-    rays: impl Iterator<Item = (&'a UnitRay, f32, u64)>,
-    most: u32,
-) -> Vec<Wave> {
+fn cast<'a>(projector: &dyn Projector, rays: impl Iterator<Item = (&'a UnitRay, f32, u64)>, most: u32) -> Vec<Wave> {
     let mut waves = vec![Wave::default()];
     for (ray, measured, seed) in rays {
         let count = projector.max_samples(ray) as u32;
@@ -81,7 +77,8 @@ fn cast<'a>(
 pub fn of_step(projector: &dyn Projector, work: &Work<'_>, most: u32) -> Vec<Wave> {
     let seed = mix(work.seed, work.step);
     let rays = work.rays.iter().enumerate();
-    let mut waves = cast(projector, rays.map(|(i, TrainRay { ray, target })| (ray, *target, mix(seed, i as u64))), most);
+    let mut waves =
+        cast(projector, rays.map(|(i, TrainRay { ray, target })| (ray, *target, mix(seed, i as u64))), most);
     let mut at = 0;
     while at < work.points.len() {
         let room = waves.last().map_or(0, |w| most.saturating_sub(w.rows) as usize);

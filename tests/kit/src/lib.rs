@@ -11,8 +11,8 @@ mod channels;
 mod gradients;
 mod rays;
 mod voxels;
-mod wgsl;
 mod weights;
+mod wgsl;
 
 use conefield_core::stage::{Encoder, Field, Normalizer, Stage};
 use std::fmt;

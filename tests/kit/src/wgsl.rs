@@ -35,7 +35,9 @@ fn parity(stage: &dyn Stage, options: &Options, pass: &Pass<'_>) -> Outcome {
     let rounds = |v: &[f64], change: bool| -> Vec<f64> {
         let n = options.rows;
         let of = |c: &[f64]| -> Vec<f64> {
-            (0..ROUNDS).flat_map(|r| c.iter().map(move |v| if change { v * (1.0 - 0.2 * r as f64) } else { *v })).collect()
+            (0..ROUNDS)
+                .flat_map(|r| c.iter().map(move |v| if change { v * (1.0 - 0.2 * r as f64) } else { *v }))
+                .collect()
         };
         v.chunks_exact(n).flat_map(of).collect()
     };
@@ -111,7 +113,10 @@ fn extremes(stage: &dyn Stage, options: &Options, pass: &Pass<'_>) -> Outcome {
         for (what, found, cpu) in [("outputs", y, y32), ("gradients", g, g32), ("input gradients", dx, dx32)] {
             let lost = |(a, b): (&f32, &f32)| b.is_finite() && b.abs() < 1e35 && !a.is_finite();
             if let Some(i) = found.iter().zip(&cpu).position(lost) {
-                return Outcome::Failed(format!("inputs of {value:e}: {what} {i} is {}, on the CPU {}", found[i], cpu[i]));
+                return Outcome::Failed(format!(
+                    "inputs of {value:e}: {what} {i} is {}, on the CPU {}",
+                    found[i], cpu[i]
+                ));
             }
         }
     }

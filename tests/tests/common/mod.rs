@@ -3,6 +3,7 @@
 use conefield_backend_cpu::Cpu;
 use conefield_core::Result;
 use conefield_core::arena::Weights;
+use conefield_core::backend::Backend;
 use conefield_core::pipeline::Model;
 use conefield_core::scan::{Scan, Volume};
 use conefield_core::solver::{Job, Observer, Reconstruction, Record, Solution};
@@ -58,9 +59,18 @@ impl Observer for Heard {
 
 /// A whole run of `value` on `scan`, with the weights file that it may name.
 pub fn solve(value: &Value, scan: &Scan, weights: &Weights) -> Result<(Solution, Vec<Record>)> {
+    solve_on(&Cpu::new(), value, scan, weights)
+}
+
+/// The same on any backend.
+pub fn solve_on(
+    backend: &dyn Backend,
+    value: &Value,
+    scan: &Scan,
+    weights: &Weights,
+) -> Result<(Solution, Vec<Record>)> {
     let spec = spec(value)?;
-    let backend = Cpu::new();
-    let job = Job { seed: 7, weights: &|_| Ok(weights.clone()), ..Job::new(scan, &spec, &backend) };
+    let job = Job { seed: 7, weights: &|_| Ok(weights.clone()), ..Job::new(scan, &spec, backend) };
     let mut heard = Heard::default();
     let solution = spec.solver.build()?.solve(&job, &mut heard)?;
     Ok((solution, heard.0))

@@ -1,6 +1,6 @@
 //! The device on which tests run kernels: a software one does.
 
-use conefield_backend_wgpu::{Shared, Wgpu};
+use conefield_backend_wgpu::{Limits, Shared, Wgpu};
 use std::sync::{Arc, OnceLock};
 
 /// The device, opened once a program; `None`, said on stderr with what is not tried, where there is no adapter.
@@ -11,4 +11,19 @@ pub fn shared(what: &str) -> Option<Arc<Shared>> {
         eprintln!("SKIPPED: no adapter for {what}");
     }
     device.clone()
+}
+
+/// Backends on the device that are told that it can do less: as it is, without atomic sums, and with buffers so small
+/// that everything is cut into pieces.
+#[allow(dead_code)]
+pub fn backends(what: &str) -> Vec<(&'static str, Wgpu)> {
+    let small = Limits { binding_bytes: Some(2048), uniform_bytes: Some(0), ..Limits::default() };
+    let exchange = Limits { compare_exchange: true, ..Limits::default() };
+    let all = [("as it is", Limits::default()), ("compare and exchange", exchange), ("small buffers", small)];
+    let opened = all.into_iter().filter_map(|(name, limits)| Some((name, Wgpu::with_limits(None, limits).ok()?)));
+    let opened: Vec<_> = opened.collect();
+    if opened.is_empty() {
+        eprintln!("SKIPPED: no adapter for {what}");
+    }
+    opened
 }

@@ -1,0 +1,473 @@
+//! The wgpu backend against the CPU's: whole steps, runs, masks, weights, checkpoints, refusals.
+
+mod common;
+mod device;
+
+use common::{Heard, model, scan, solve, solve_on, spec, truth};
+use conefield_backend_cpu::Cpu;
+use conefield_backend_cpu::rows::Kernels;
+use conefield_backend_cpu::step::Slots;
+use conefield_core::Result;
+use conefield_core::arena::Weights;
+use conefield_core::backend::{Adam, Backend, Loss, TrainRay, TvBlocks, Work};
+use conefield_core::checkpoint::{Checkpoint, Resume};
+use conefield_core::pipeline::{Model, Pipeline};
+use conefield_core::random::{mix, unit};
+use conefield_core::scene::Scene;
+use conefield_core::solver::{Job, Limits, Observer, PretrainJob, Record};
+use conefield_core::stage::{Encoder, Field, Info, Kernel, Normalizer, Parameter, Projector, Reduced, Scope, Stage};
+use conefield_core::wgsl::Fragment;
+use serde_json::{Value, json};
+
+fn settings() -> Value {
+    json!({
+        "encoder": {"type": "hash-grid", "levels": 3, "base_resolution": 3, "log2_table_size": 8},
+        "normalizers": [{"type": "layer-norm"}],
+        "field": {"type": "mlp", "width": 8, "depth": 3, "skips": [1]},
+        "projector": {"type": "ray-march", "samples": 20, "sampling": "stratified"},
+        "solver": {"type": "gradient", "steps": 40, "rays": 128, "lr": 0.02, "loss": "l2", "report_every": 5},
+    })
+}
+
+fn place(i: u64) -> [f32; 3] {
+    std::array::from_fn(|k| 0.05 + 0.9 * unit(mix(i, k as u64)))
+}
+
+// ---- whole steps ----
+
+/// Largest difference, block by block as a share of the block's largest gradient.
+fn worst(pipeline: &Pipeline, found: &[f32], exact: &[f64]) -> f64 {
+    let of = |b: &conefield_core::arena::Block| {
+        let top = exact[b.range.clone()].iter().fold(1e-30f64, |m, g| m.max(g.abs()));
+        b.range.clone().map(|i| (f64::from(found[i]) - exact[i]).abs() / top).fold(0.0, f64::max)
+    };
+    pipeline.layout().blocks.iter().map(of).fold(0.0, f64::max)
+}
+
+/// Gradients and losses of a step with rays, points and blocks: double precision, the CPU, and every device. Sums of a
+/// thousand rows in single precision are off by some 1e-6; positions in cells, and with them weights of corners, by
+/// 1e-6 more. A wrong formula is off by far more, see the negative controls.
+fn steps_agree(settings: &Value) {
+    let limit = 2e-5;
+    let devices = device::backends("whole steps");
+    let pipeline = Pipeline::build(&spec(settings).unwrap()).unwrap();
+    let scan = scan();
+    let scene = Scene::new(&scan, &conefield_core::spec::Scene::default()).unwrap();
+    let rays: Vec<TrainRay> = (0..40)
+        .map(|i| {
+            let ray = scene.pixel_ray(&scan.geometry, i % 8, (i * 5) % 16, (i * 7) % 16);
+            TrainRay { ray, target: if i % 2 == 0 { 0.5 } else { 3.0 } }
+        })
+        .collect();
+    let points: Vec<_> = (0..150).map(|i| (place(i), if i % 2 == 0 { 0.7 } else { 4.0 })).collect();
+    let tv = TvBlocks {
+        corners: (200..205).map(|i| place(i).map(|x: f32| 0.7 * x)).collect(),
+        spacing: [0.06, 0.05, 0.07],
+        edge: 5,
+        weight: 0.3,
+        smoothing: 1e-2,
+    };
+    let filled = || {
+        let mut model = Model::random(Pipeline::build(&spec(settings).unwrap()).unwrap(), 3);
+        for (i, p) in model.arena.params.iter_mut().enumerate() {
+            *p += 0.4 * (unit(mix(5, i as u64)) - 0.5);
+        }
+        model
+    };
+    let params: Vec<f64> = filled().arena.params.iter().map(|&p| f64::from(p)).collect();
+    for loss in [Loss::L1, Loss::L2, Loss::Huber { delta: 0.5 }] {
+        let work = Work { step: 4, seed: 9, loss, rays: &rays, points: &points, tv: Some(&tv) };
+        let kernels = Kernels::new(&pipeline, |s| s.reference()).unwrap();
+        let mut exact = vec![0.0; params.len()];
+        let projector = pipeline.projector.as_ref();
+        let want = Slots::new(&kernels).step(&kernels, projector, &params, &mut exact, &work);
+        let on = |backend: &dyn Backend| {
+            let mut model = filled();
+            let mut exe = backend.compile(&model.pipeline).unwrap().0;
+            let stats = exe.step(&mut model, &work).unwrap();
+            exe.fetch(&mut model).unwrap();
+            (stats, model.arena.grads.to_vec())
+        };
+        let (_, cpu) = on(&Cpu::new());
+        for (name, backend) in &devices {
+            let (stats, grads) = on(backend);
+            let (e, on_cpu) = (worst(&pipeline, &grads, &exact), worst(&pipeline, &cpu, &exact));
+            println!("{loss:?}, {name}: gradients {e:.1e} (CPU {on_cpu:.1e}), loss {} and {}", stats.loss, want.loss);
+            assert!(e < limit, "{loss:?}, {name}: {e:e}");
+            assert!((stats.loss - want.loss).abs() < 1e-5 * want.loss, "{} {}", stats.loss, want.loss);
+            assert!((stats.prior - want.prior).abs() < 1e-5 * want.prior, "{} {}", stats.prior, want.prior);
+            assert_eq!(stats.samples, 20 * 40 - missed(&pipeline, &rays) + 150 + 5 * 125, "{name}");
+            // Negative control: a percent of one block's largest gradient.
+            let mut wrong = grads.clone();
+            let block = &pipeline.layout().blocks[0];
+            let top = block.range.clone().max_by(|&i, &j| exact[i].abs().total_cmp(&exact[j].abs())).unwrap();
+            wrong[top] *= 1.01;
+            assert!(worst(&pipeline, &wrong, &exact) > limit);
+        }
+    }
+}
+
+/// Samples that rays do not have because they miss the box.
+fn missed(pipeline: &Pipeline, rays: &[TrainRay]) -> u64 {
+    rays.iter().map(|r| 20 - pipeline.projector.max_samples(&r.ray).min(20) as u64).sum()
+}
+
+#[test]
+fn a_step_is_that_of_the_cpu() {
+    steps_agree(&settings());
+}
+
+#[test]
+fn a_step_is_that_of_the_cpu_with_voxels() {
+    let mut s = settings();
+    s["encoder"] = json!({"type": "identity"});
+    s["normalizers"] = json!([]);
+    s["field"] = json!({"type": "voxel-grid", "resolution": 9});
+    steps_agree(&s);
+}
+
+#[test]
+fn a_step_is_that_of_the_cpu_with_several_encoders_and_published_rays() {
+    let mut s = settings();
+    s["encoder"] = json!({"type": "concat", "encoders": [
+        {"type": "frequency", "bands": 2, "max_frequency": 2.0},
+        {"type": "dense-grid", "levels": 2, "base_resolution": 3},
+    ]});
+    s["projector"] = json!({"type": "ray-march", "samples": 20, "sampling": "uniform", "extent": "published"});
+    steps_agree(&s);
+}
+
+#[test]
+fn a_step_is_that_of_the_cpu_without_parameters_in_the_encoder() {
+    let mut s = settings();
+    s["encoder"] = json!({"type": "frequency", "bands": 3, "max_frequency": 4.0});
+    steps_agree(&s);
+}
+
+/// Updates, values at points, features and line integrals after some steps.
+#[test]
+fn what_is_asked_of_a_trained_model_is_that_of_the_cpu() {
+    let scan = scan();
+    let scene = Scene::new(&scan, &conefield_core::spec::Scene::default()).unwrap();
+    let rays: Vec<TrainRay> = (0..64)
+        .map(|i| TrainRay { ray: scene.pixel_ray(&scan.geometry, i % 8, (i * 5) % 16, (i * 7) % 16), target: 0.7 })
+        .collect();
+    let points: Vec<[f32; 3]> = (0..5000).map(place).collect();
+    let run = |backend: &dyn Backend| {
+        let mut model = Model::random(Pipeline::build(&spec(&settings()).unwrap()).unwrap(), 3);
+        let mut exe = backend.compile(&model.pipeline).unwrap().0;
+        for step in 1..=10 {
+            let work = Work { step, seed: 9, loss: Loss::L2, rays: &rays, points: &[], tv: None };
+            exe.step(&mut model, &work).unwrap();
+            exe.update(&mut model, &Adam { lr: 1e-2, beta1: 0.9, beta2: 0.999, eps: 1e-8, step }).unwrap();
+        }
+        let mut values = vec![0.0; points.len()];
+        exe.evaluate(&model, &points, &mut values).unwrap();
+        let features = exe.encode(&model, &points).unwrap();
+        let rays: Vec<_> = rays.iter().map(|r| r.ray).collect();
+        let mut lines = vec![0.0; rays.len()];
+        exe.render(&model, &rays, &mut lines).unwrap();
+        exe.fetch(&mut model).unwrap();
+        [values, features, lines, model.arena.params.to_vec()]
+    };
+    let want = run(&Cpu::new());
+    for (name, backend) in device::backends("a trained model") {
+        for (what, (found, want)) in
+            ["values", "features", "lines", "parameters"].iter().zip(run(&backend).iter().zip(&want))
+        {
+            let top = want.iter().fold(0.0f32, |m, v| m.max(v.abs()));
+            let e = found.iter().zip(want).map(|(a, b)| (a - b).abs()).fold(0.0f32, f32::max) / top;
+            println!("{name}: {what} {e:.1e}");
+            // Adam divides by the root of the second moment, which makes of rounding in a tiny gradient a step.
+            assert!(e < 2e-3, "{name}: {what} off by {e:e}");
+        }
+    }
+}
+
+// ---- runs ----
+
+fn psnr(value: &Value, backend: &dyn Backend) -> (f64, Vec<Record>) {
+    let (solution, records) = solve_on(backend, value, &scan(), &Weights::default()).unwrap();
+    let (found, truth) = (solution.result.volume(backend).unwrap(), truth());
+    let square = |(a, b): (&f32, &f32)| (f64::from(*a) - f64::from(*b)).powi(2);
+    let mse = found.data.iter().zip(&truth.data).map(square).sum::<f64>() / truth.data.len() as f64;
+    (10.0 * (0.02f64.powi(2) / mse).log10(), records)
+}
+
+#[test]
+fn a_run_with_held_out_views_and_a_prior_ends_where_the_cpu_does() {
+    let mut s = settings();
+    s["solver"]["tv"] = json!({"weight": 0.01, "blocks": 4, "edge": 4});
+    let (want, records) = psnr(&s, &Cpu::new());
+    for (name, backend) in device::backends("a run").into_iter().take(1) {
+        let (found, on_device) = psnr(&s, &backend);
+        println!("{name}: {found:.3} dB, CPU {want:.3} dB");
+        assert!((found - want).abs() < 0.1, "{name}: {found} dB, CPU {want} dB");
+        let losses = |r: &[Record]| (r[0].loss.unwrap(), r.last().unwrap().loss.unwrap());
+        let ((a, b), (c, d)) = (losses(&records), losses(&on_device));
+        assert!((a - c).abs() < 1e-4 * a && (b - d).abs() < 0.05 * b, "{a} {b} {c} {d}");
+    }
+}
+
+#[test]
+fn masked_channels_leave_the_kernels() {
+    let Some((_, backend)) = device::backends("masks").into_iter().next() else { return };
+    let mut s = settings();
+    s["encoder"]["levels"] = json!(6);
+    s["encoder"]["base_resolution"] = json!(2);
+    let mask = json!({"type": "fft-mask", "epoch": 1, "rule": "relative", "threshold": 0.72});
+    s["normalizers"] = json!([mask, {"type": "layer-norm"}]);
+    let (solution, records) = solve_on(&backend, &s, &scan(), &Weights::default()).unwrap();
+    let events: Vec<&String> = records.iter().flat_map(|r| &r.events).collect();
+    assert_eq!(events.len(), 1, "{events:?}");
+    let kept = model(solution).pipeline.encoder.info().output;
+    assert!((1..12).contains(&kept), "{kept}");
+    let on_cpu = model(solve(&s, &scan(), &Weights::default()).unwrap().0).pipeline.encoder.info().output;
+    assert_eq!(kept, on_cpu);
+    assert!(records.last().unwrap().loss.unwrap() < records[1].loss.unwrap());
+}
+
+#[test]
+fn pretraining_on_several_volumes_is_that_of_the_cpu() {
+    let mut s = settings();
+    s["solver"]["pretrain_points"] = json!(512);
+    let spec = spec(&s).unwrap();
+    let volumes = [truth(), truth().mapped(|x| 3.0 * x)];
+    let run = |backend: &dyn Backend| {
+        let limits = Limits { steps: Some(60), ..Limits::default() };
+        let job = PretrainJob { volumes: &volumes, spec: &spec, backend, seed: 21, limits };
+        let mut heard = Heard::default();
+        let model = spec.solver.build().unwrap().pretrain(&job, &mut heard).unwrap();
+        let losses: Vec<f64> = heard.0.iter().map(|r| r.loss.unwrap()).collect();
+        (losses, model.arena.params.to_vec())
+    };
+    let (want, _) = run(&Cpu::new());
+    for (name, backend) in device::backends("pretraining").into_iter().take(1) {
+        let (found, params) = run(&backend);
+        assert!(params.iter().all(|p| p.is_finite()));
+        for (a, b) in found.iter().zip(&want) {
+            assert!((a - b).abs() < 0.02 * b, "{name}: {found:?} {want:?}");
+        }
+    }
+}
+
+/// Keeps the last checkpoint and stops there.
+struct Stop {
+    at: u64,
+    kept: Option<Resume>,
+    step: u64,
+}
+
+impl Observer for Stop {
+    fn progress(&mut self, step: u64, _: f64, _: f64) {
+        self.step = step;
+    }
+    fn record(&mut self, _: &Record) {}
+    fn note(&mut self, _: &str) {}
+    fn cancelled(&self) -> bool {
+        self.step >= self.at
+    }
+    fn checkpoint(&mut self, c: &Checkpoint<'_>) -> Result<()> {
+        let tensors = c.tensors.iter().map(|(n, s, v)| (n.clone(), (s.to_vec(), v.to_vec()))).collect();
+        let weights = Weights { tensors, ..Weights::default() };
+        self.kept = Some(Resume { place: "kept".into(), standing: c.standing.clone(), weights });
+        Ok(())
+    }
+}
+
+#[test]
+fn a_run_begun_on_one_backend_goes_on_on_the_other() {
+    let Some((_, device)) = device::backends("checkpoints").into_iter().next() else { return };
+    let (scan, spec) = (scan(), spec(&settings()).unwrap());
+    let solver = spec.solver.build().unwrap();
+    let whole = psnr(&settings(), &Cpu::new()).1.last().unwrap().loss.unwrap();
+    let cpu = Cpu::new();
+    let pairs: [[&dyn Backend; 2]; 3] = [[&cpu, &device], [&device, &cpu], [&device, &device]];
+    for [first, second] in pairs {
+        let mut stop = Stop { at: 20, kept: None, step: 0 };
+        let stopped = solver.solve(&Job { seed: 7, ..Job::new(&scan, &spec, first) }, &mut stop);
+        assert!(stopped.is_err());
+        let resume = stop.kept.unwrap();
+        assert_eq!(resume.standing.step, 20);
+        let mut heard = Heard::default();
+        let job = Job { seed: 7, resume: Some(&resume), ..Job::new(&scan, &spec, second) };
+        solver.solve(&job, &mut heard).unwrap();
+        let loss = heard.0.last().unwrap().loss.unwrap();
+        assert!((loss - whole).abs() < 0.03 * whole, "{} then {}: {loss}, {whole}", first.name(), second.name());
+        assert_eq!(heard.0.last().unwrap().step, 40);
+    }
+}
+
+// ---- refusals ----
+
+/// A field whose WGSL is another's, changed.
+struct Changed {
+    inner: Box<dyn Field>,
+    change: fn(String) -> Option<String>,
+    scope: Scope,
+}
+
+impl Stage for Changed {
+    fn info(&self) -> Info {
+        Info { scope: self.scope, ..self.inner.info() }
+    }
+    fn parameters(&self) -> Vec<Parameter> {
+        self.inner.parameters()
+    }
+    fn init(&self, seed: u64, params: &mut [f32]) {
+        self.inner.init(seed, params);
+    }
+    fn kernel(&self) -> &dyn Kernel<f32> {
+        self.inner.kernel()
+    }
+    fn reference(&self) -> Option<&dyn Kernel<f64>> {
+        self.inner.reference()
+    }
+    fn wgsl(&self) -> Option<Fragment> {
+        let source = (self.change)(self.inner.wgsl()?.source)?;
+        Some(Fragment { source })
+    }
+    fn describe(&self) -> String {
+        "changed: for a test".into()
+    }
+}
+impl Field for Changed {
+    fn keep_inputs(&self, keep: &[usize]) -> Result<Reduced<dyn Field>> {
+        self.inner.keep_inputs(keep)
+    }
+}
+
+fn changed(change: fn(String) -> Option<String>, scope: Scope) -> Pipeline {
+    let built = Pipeline::build(&spec(&settings()).unwrap()).unwrap();
+    let Pipeline { encoder, normalizers, field, projector, .. } = built;
+    Pipeline::assemble(encoder, normalizers, Box::new(Changed { inner: field, change, scope }), projector)
+}
+
+#[test]
+fn what_cannot_run_on_a_device_is_refused_in_words() {
+    let Some((_, backend)) = device::backends("refusals").into_iter().next() else { return };
+    let refused = |change, scope, words: &[&str]| {
+        let e = backend.compile(&changed(change, scope)).err().unwrap().to_string();
+        assert!(words.iter().all(|w| e.contains(w)), "{e:?} lacks one of {words:?}");
+    };
+    refused(|_| None, Scope::Row, &["field (changed)", "no WGSL", "--backend cpu"]);
+    refused(Some, Scope::Ray, &["field (changed)", "along rays", "--backend cpu"]);
+    let broken = |s: String| {
+        Some(s.replacen("fn stage_forward", "fn stage_extra() -> f32 {\n    return nothing;\n}\nfn stage_forward", 1))
+    };
+    refused(broken, Scope::Row, &["field (changed)", "line", "return nothing;"]);
+    let narrow = |s: String| Some(s.replacen("fn stage_backward", "fn stage_back", 1));
+    refused(narrow, Scope::Row, &["backward"]);
+    assert!(backend.compile(&changed(Some, Scope::Row)).is_ok());
+    let e = conefield_backend_wgpu::Wgpu::open(Some(99)).err().unwrap().to_string();
+    assert!(e.contains("99") && e.contains("conefield backends"), "{e}");
+}
+
+// ---- the WGSL of stages ----
+
+/// A constant of a shader that is slightly off is found.
+#[test]
+fn a_perturbed_constant_fails_the_parity_check() {
+    let Some(shared) = device::shared("negative controls") else { return };
+    let options = conefield_conformance::Options::features();
+    let check = |change: fn(String) -> Option<String>| {
+        let settings = json!({"type": "mlp", "width": 5, "depth": 2, "skips": []});
+        let spec: Box<dyn conefield_core::spec::FieldSpec> = serde_json::from_value(settings).unwrap();
+        let stage = Changed { inner: spec.build(3).unwrap(), change, scope: Scope::Row };
+        conefield_conformance::check_wgsl(&stage, &options, &|s, p, x, dy, rows| shared.pass(s, p, x, dy, rows))
+    };
+    assert!(check(Some).passed());
+    let perturbed: [fn(String) -> Option<String>; 4] = [
+        |s| Some(s.replace("0.23164189", "0.2318")),
+        |s| Some(s.replace("1.52382103", "1.5240")),
+        |s| Some(s.replacen("stage_outer_5_3(0u", "stage_outer_5_3(1u", 1)),
+        |s| Some(s.replace("s0[0] *=", "s0[0] *= 1.001 *")),
+    ];
+    for (i, change) in perturbed.into_iter().enumerate() {
+        assert_eq!(check(change).failed(), ["WGSL parity"], "perturbation {i}");
+    }
+}
+
+/// Stages of random settings: widths that are no multiple of anything, channels left out here and there.
+#[test]
+fn stages_of_random_shapes_agree() {
+    let Some(shared) = device::shared("random shapes") else { return };
+    let pass = |s: &dyn Stage, p: &[f32], x: &[f32], dy: &[f32], rows: usize| shared.pass(s, p, x, dy, rows);
+    let mut n = 0u64;
+    let mut below = |k: u64| {
+        n += 1;
+        mix(77, n) % k
+    };
+    for _ in 0..4 {
+        let grid = json!({
+            "type": if below(2) == 0 { "hash-grid" } else { "dense-grid" },
+            "levels": 1 + below(4), "features": 1 << below(3), "base_resolution": 2 + below(5),
+            "growth": 1.0 + below(10) as f64 / 10.0,
+        });
+        let spec: Box<dyn conefield_core::spec::EncoderSpec> = serde_json::from_value(grid.clone()).unwrap();
+        let whole: Box<dyn Encoder> = spec.build().unwrap();
+        let keep: Vec<usize> = (0..whole.info().output).filter(|_| below(3) > 0).collect();
+        let stage = if keep.is_empty() { whole } else { whole.keep_outputs(&keep).unwrap().stage };
+        let options = conefield_conformance::Options {
+            rows: 1 + below(20) as usize,
+            single: 5e-5,
+            ..conefield_conformance::Options::encoder()
+        };
+        let report = conefield_conformance::check_wgsl(stage.as_ref(), &options, &pass);
+        assert!(report.passed(), "{grid}: {report}");
+    }
+    for _ in 0..3 {
+        let width = 2 + below(36) as usize;
+        let spec: Box<dyn conefield_core::spec::NormalizerSpec> =
+            serde_json::from_value(json!({"type": "layer-norm"})).unwrap();
+        let norm: Box<dyn Normalizer> = spec.build(width).unwrap();
+        let keep: Vec<usize> = (0..width).filter(|c| *c == 0 || below(3) > 0).collect();
+        let stage = norm.keep_outputs(&keep).unwrap().stage;
+        let options =
+            conefield_conformance::Options { params: Some(1.0), ..conefield_conformance::Options::features() };
+        let report = conefield_conformance::check_wgsl(stage.as_ref(), &options, &pass);
+        assert!(report.passed(), "layer-norm of {width}, {keep:?}: {report}");
+    }
+    for _ in 0..3 {
+        let depth = 1 + below(3);
+        let skips: Vec<u64> = (1..depth).filter(|_| below(2) == 0).collect();
+        let activation = ["relu", "leaky-relu", "gelu", "squareplus", "softplus", "sigmoid"][below(6) as usize];
+        let mlp =
+            json!({"type": "mlp", "width": 1 + below(11), "depth": depth, "skips": skips, "activation": activation});
+        let spec: Box<dyn conefield_core::spec::FieldSpec> = serde_json::from_value(mlp.clone()).unwrap();
+        let stage = spec.build(1 + below(9) as usize).unwrap();
+        let options = conefield_conformance::Options { single: 5e-5, ..conefield_conformance::Options::features() };
+        let report = conefield_conformance::check_wgsl(stage.as_ref(), &options, &pass);
+        assert!(report.passed(), "{mlp}: {report}");
+    }
+}
+
+#[test]
+fn samples_are_random_in_the_same_way() {
+    let Some(shared) = device::shared("samples") else { return };
+    struct Off(Box<dyn Projector>);
+    impl Projector for Off {
+        fn max_samples(&self, ray: &conefield_core::stage::UnitRay) -> usize {
+            self.0.max_samples(ray)
+        }
+        fn sample(
+            &self,
+            ray: &conefield_core::stage::UnitRay,
+            seed: Option<u64>,
+            out: &mut conefield_core::stage::Samples,
+        ) {
+            self.0.sample(ray, seed, out);
+        }
+        fn describe(&self) -> String {
+            self.0.describe()
+        }
+        fn wgsl(&self) -> Option<Fragment> {
+            Some(Fragment { source: self.0.wgsl()?.source.replace("0.5", "0.49") })
+        }
+    }
+    let spec: Box<dyn conefield_core::spec::ProjectorSpec> =
+        serde_json::from_value(json!({"type": "ray-march", "samples": 77})).unwrap();
+    let run = |p: &dyn Projector| conefield_conformance::check_projector_wgsl(p, &|p, rays| shared.samples(p, rays));
+    assert!(run(spec.build().unwrap().as_ref()).passed());
+    assert!(!run(&Off(spec.build().unwrap())).passed());
+}
