@@ -16,10 +16,8 @@ mod reconstruct;
 mod schema;
 mod simulate;
 
-use clap::{ArgAction, Args, Subcommand, ValueEnum};
-use conefield_backend_cpu::Cpu;
+use clap::{ArgAction, Args, Subcommand};
 use conefield_core::Result;
-use conefield_core::backend::Backend;
 use conefield_core::solver::Limits;
 use serde::{Deserialize, Serialize};
 use std::ffi::OsString;
@@ -120,26 +118,6 @@ impl General {
             all.extend(number.map(|n| format!("{flag}={n}").into()));
         }
         all
-    }
-}
-
-/// Which backend computes.
-#[derive(Debug, Clone, Copy, Default, PartialEq, Eq, ValueEnum, Serialize)]
-#[serde(rename_all = "kebab-case")]
-pub enum BackendChoice {
-    /// The fastest here.
-    #[default]
-    Auto,
-    /// Rayon and SIMD.
-    Cpu,
-}
-
-impl BackendChoice {
-    /// The backend.
-    pub fn open(self) -> Box<dyn Backend> {
-        match self {
-            Self::Auto | Self::Cpu => Box::new(Cpu::new()),
-        }
     }
 }
 

@@ -1,5 +1,6 @@
 //! The `conefield` command, one module a subcommand, and the specs that come with it.
 
+mod backend;
 mod commands;
 mod files;
 mod memory;

@@ -88,7 +88,7 @@ impl Adapter {
     }
 
     /// Which to prefer: the largest number.
-    fn rank(&self) -> u32 {
+    pub fn rank(&self) -> u32 {
         match self.kind.as_str() {
             "discrete GPU" => 4,
             "integrated GPU" => 3,

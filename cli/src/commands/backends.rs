@@ -2,6 +2,7 @@
 
 use crate::out;
 use clap::Args;
+use conefield_backend_wgpu::{Adapter, adapters};
 use conefield_core::{Result, simd};
 use serde_json::json;
 
@@ -16,11 +17,34 @@ pub struct Backends {
 impl Backends {
     pub fn run(self) -> Result<()> {
         let (level, threads) = (simd_level(), rayon::current_num_threads());
+        let adapters = adapters();
         if self.json {
-            return out::json(&json!({ "backends": [{ "name": "cpu", "simd": level, "threads": threads }] }));
+            let cpu = json!({ "name": "cpu", "simd": level, "threads": threads });
+            let wgpu = json!({ "name": "wgpu", "adapters": adapters });
+            return out::json(&json!({ "backends": [cpu, wgpu] }));
         }
-        out::say(&format!("cpu  {level}, {threads} threads"))
+        let mut lines = vec![format!("cpu     {level}, {threads} threads")];
+        if adapters.is_empty() {
+            lines.push("wgpu    no Vulkan, Metal or DX12 adapter was found".into());
+        }
+        lines.extend(adapters.iter().map(line));
+        out::say(&lines.join("\n"))
     }
+}
+
+/// An adapter with what limits it.
+fn line(a: &Adapter) -> String {
+    let bytes = |n: u64| out::bytes(n);
+    format!(
+        "wgpu:{}  {a}\n        buffers up to {}, {} at once of up to {}, {} of workgroup memory, {}{}",
+        a.index,
+        bytes(a.buffer_bytes),
+        a.storage_buffers,
+        bytes(a.binding_bytes),
+        bytes(a.workgroup_bytes.into()),
+        a.atomics,
+        if a.timestamps { ", timestamps" } else { "" }
+    )
 }
 
 /// The instruction set that kernels use on this machine.

@@ -2,7 +2,8 @@
 
 use super::protocol::{Protocol, word};
 use super::reconstruct::{FAILED, Parts, ScanRecord, identity, split};
-use super::{BackendChoice, Ends, General, backends::simd_level};
+use super::{Ends, General, backends::simd_level};
+use crate::backend::BackendChoice;
 use crate::memory::{Memory, Run};
 use crate::plugins::{self, Used};
 use crate::table::{SCORES, Table, score_cells};
@@ -186,7 +187,7 @@ impl Compare {
     /// Every spec, read and built. Names must serve as folders and differ.
     fn methods(&self) -> Result<Vec<Method>> {
         let mut methods: Vec<Method> = vec![];
-        let backend = self.protocol.backend.open();
+        let backend = self.protocol.backend.open()?;
         for spec in &self.specs {
             let loaded = specs::read(spec, &self.protocol.sets)?;
             Parts::of(&loaded, backend.as_ref())?.check_weights(&loaded)?;

@@ -1,7 +1,7 @@
 //! `conefield explain`
 
-use super::BackendChoice;
 use super::reconstruct::Parts;
+use crate::backend::BackendChoice;
 use crate::memory::Memory;
 use crate::{files, out, plugins, specs};
 use clap::Args;
@@ -26,8 +26,8 @@ pub struct Explain {
     /// Also the memory that this scan takes.
     #[arg(long)]
     scan: Option<PathBuf>,
-    /// Which backend.
-    #[arg(long, default_value = "auto")]
+    /// Which backend: auto, cpu, wgpu, or wgpu:N with the number of an adapter.
+    #[arg(long, value_name = "BACKEND", default_value_t)]
     backend: BackendChoice,
     /// Print one JSON object.
     #[arg(long)]
@@ -127,7 +127,7 @@ struct ForScan {
 impl Explain {
     pub fn run(self) -> Result<()> {
         let loaded = specs::read(&self.spec, &self.sets)?;
-        let parts = Parts::of(&loaded, self.backend.open().as_ref())?;
+        let parts = Parts::of(&loaded, self.backend.open()?.as_ref())?;
         let scan = self.scan.as_ref().map(|path| for_scan(&loaded, &parts, path)).transpose()?;
         let report = report(&loaded, parts, scan)?;
         if self.json { out::json(&report) } else { out::say(&text(&report)) }

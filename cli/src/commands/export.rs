@@ -1,7 +1,7 @@
 //! `conefield export`
 
-use super::BackendChoice;
 use super::convert::refuse_existing;
+use crate::backend::BackendChoice;
 use crate::memory::{self, Memory};
 use crate::{files, out, outgoing, signals};
 use clap::Args;
@@ -26,8 +26,8 @@ pub struct Export {
     /// Voxels along the longest side [default: as the scan asked for].
     #[arg(long, value_name = "N", value_parser = clap::value_parser!(u16).range(1..))]
     voxels: Option<u16>,
-    /// Which backend.
-    #[arg(long, default_value = "auto")]
+    /// Which backend: auto, cpu, wgpu, or wgpu:N with the number of an adapter.
+    #[arg(long, value_name = "BACKEND", default_value_t)]
     backend: BackendChoice,
     /// Replace VOLUME.
     #[arg(long)]
@@ -49,7 +49,7 @@ impl Export {
         let field = files::read_field(&file)?;
         let trained = field.scene.grid;
         let grid = self.voxels.map_or(trained, |n| trained.with_longest(n.into()));
-        let backend = self.backend.open();
+        let backend = self.backend.open()?;
         signals::listen()?;
         let start = Instant::now();
         let mut voxels = field.voxels(backend.as_ref(), grid)?;

@@ -1,6 +1,7 @@
 //! `conefield pretrain`
 
-use super::{BackendChoice, Ends, reconstruct::notes};
+use super::{Ends, reconstruct::notes};
+use crate::backend::BackendChoice;
 use crate::memory::Memory;
 use crate::parse::{self, Values};
 use crate::progress::Progress;
@@ -34,8 +35,8 @@ pub struct Pretrain {
     values: Values,
     #[command(flatten)]
     ends: Ends,
-    /// Which backend.
-    #[arg(long, default_value = "auto")]
+    /// Which backend: auto, cpu, wgpu, or wgpu:N with the number of an adapter.
+    #[arg(long, value_name = "BACKEND", default_value_t)]
     backend: BackendChoice,
     /// Seed of everything random.
     #[arg(long, default_value_t = 0)]
@@ -64,7 +65,7 @@ impl Pretrain {
     pub fn run(self) -> Result<()> {
         let loaded = specs::read(&self.spec, &self.sets)?;
         let solver = loaded.spec.solver.build().map_err(|e| loaded.locate(e))?;
-        let backend = self.backend.open();
+        let backend = self.backend.open()?;
         let pipeline = specs::build(&loaded)?;
         let (_, compiled) = backend.compile(&pipeline)?;
         self.memory(pipeline.layout().len() as u64, compiled.scratch_bytes as u64)?;

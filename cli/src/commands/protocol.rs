@@ -1,8 +1,9 @@
 //! What a reconstruction is asked for beside scan and spec: the same for every method that is compared.
 
-use super::{BackendChoice, Ends};
+use super::Ends;
+use crate::backend::BackendChoice;
 use crate::parse::{self, HoldOut};
-use clap::{Args, ValueEnum};
+use clap::Args;
 use conefield_core::scan::{Scan, Volume};
 use conefield_core::{Error, Result};
 use std::ffi::{OsStr, OsString};
@@ -19,8 +20,8 @@ pub struct Protocol {
     pub sets: Vec<String>,
     #[command(flatten)]
     pub ends: Ends,
-    /// Which backend.
-    #[arg(long, default_value = "auto")]
+    /// Which backend: auto, cpu, wgpu, or wgpu:N with the number of an adapter.
+    #[arg(long, value_name = "BACKEND", default_value_t)]
     pub backend: BackendChoice,
     /// The volume sought, to compare with: a file, or "truth" for the one that the scan comes with.
     #[arg(long, value_name = "VOLUME")]
@@ -64,13 +65,12 @@ impl Protocol {
     /// The same again, for a child process. Flag and value are one word: a value may begin with a dash.
     pub fn arguments(&self) -> Vec<OsString> {
         let Self { checkpoint_every, sets, ends, backend, reference, peak, hold_out, seed } = self;
-        let backend = backend.to_possible_value().map(|v| v.get_name().to_owned());
         let all = [
             ("--checkpoint-every", Some(checkpoint_every.to_string())),
             ("--budget", ends.budget.map(|t| t.to_string())),
             ("--steps", ends.steps.map(|n| n.to_string())),
             ("--at-most", ends.at_most.map(|t| t.to_string())),
-            ("--backend", backend),
+            ("--backend", Some(backend.to_string())),
             ("--peak", Some(peak.to_string())),
             ("--hold-out", hold_out.as_ref().map(HoldOut::to_string)),
             ("--seed", Some(seed.to_string())),
@@ -102,7 +102,7 @@ mod tests {
 
     #[test]
     fn a_child_is_told_the_same() {
-        let full = "x --checkpoint-every 0.1m --set a=b --set c=[1,2] --budget 1h --steps 7 --at-most 1e-9s --backend cpu \
+        let full = "x --checkpoint-every 0.1m --set a=b --set c=[1,2] --budget 1h --steps 7 --at-most 1e-9s --backend wgpu:2 \
                     --reference -v.nii --peak 2.5 --hold-out";
         for held in ["3,17", "every:10"] {
             // `--reference -v.nii` needs its equals sign.

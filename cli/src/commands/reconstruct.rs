@@ -187,7 +187,7 @@ impl Reconstruct {
         let begin = Instant::now();
         let protocol = &self.protocol;
         let loaded = specs::read(&self.spec, &self.all_sets())?;
-        let backend = protocol.backend.open();
+        let backend = protocol.backend.open()?;
         let parts = Parts::of(&loaded, backend.as_ref())?;
         let memory = self.memory(&loaded, &parts)?;
         info!("memory: {}", memory.line());

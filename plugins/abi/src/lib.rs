@@ -365,16 +365,9 @@ pub struct ConefieldMap {
     >,
     /// Of a normalizer: a resumed run removes channels as `refresh` once decided, it must not decide again. May be NULL.
     pub decided: Option<unsafe extern "C" fn(stage: *const c_void)>,
-    /// WGSL functions `{prefix}_fwd` and `{prefix}_bwd` of the same formula, and the bytes of workgroup memory that they
-    /// need. NULL: it runs on the CPU alone.
-    pub wgsl: Option<
-        unsafe extern "C" fn(
-            stage: *const c_void,
-            prefix: ConefieldStr,
-            source: *mut ConefieldText,
-            workgroup_bytes: *mut u32,
-        ) -> ConefieldStatus,
-    >,
+    /// WGSL of the same formula: functions `stage_forward` and `stage_backward` of a row, as docs/plugins.md says. NULL:
+    /// it runs on the CPU alone.
+    pub wgsl: Option<unsafe extern "C" fn(stage: *const c_void, source: *mut ConefieldText) -> ConefieldStatus>,
 }
 
 /// A ray in the unit cube: `origin + t * direction`, where `t` counts cube sides.
@@ -423,15 +416,9 @@ pub struct ConefieldProjector {
     pub adjoint: Option<
         unsafe extern "C" fn(stage: *const c_void, weights: *const f32, dline: f64, dmu: *mut f64, count: usize),
     >,
-    /// As [`ConefieldMap::wgsl`].
-    pub wgsl: Option<
-        unsafe extern "C" fn(
-            stage: *const c_void,
-            prefix: ConefieldStr,
-            source: *mut ConefieldText,
-            workgroup_bytes: *mut u32,
-        ) -> ConefieldStatus,
-    >,
+    /// WGSL of `sample`, of a projector that integrates as one without `integrate` does: a function `stage_sample`, as
+    /// docs/plugins.md says. NULL: it runs on the CPU alone.
+    pub wgsl: Option<unsafe extern "C" fn(stage: *const c_void, source: *mut ConefieldText) -> ConefieldStatus>,
 }
 
 /// A named block of all parameters of a pipeline.

@@ -8,7 +8,7 @@ pub mod projector;
 
 use crate::library::{Handle, whole_text};
 use conefield_core::error::{Error, Result};
-use conefield_core::stage::{Fragment, Namer};
+use conefield_core::wgsl::Fragment;
 use conefield_plugin_abi::*;
 use std::ffi::c_void;
 use std::sync::atomic::{AtomicBool, Ordering};
@@ -36,14 +36,13 @@ impl Fault {
     }
 }
 
-type WgslFn = unsafe extern "C" fn(*const c_void, ConefieldStr, *mut ConefieldText, *mut u32) -> ConefieldStatus;
+type WgslFn = unsafe extern "C" fn(*const c_void, *mut ConefieldText) -> ConefieldStatus;
 
 /// The WGSL of a stage, if it has any.
-pub(crate) fn fragment(handle: &Handle, wgsl: Option<WgslFn>, namer: &Namer) -> Option<Fragment> {
+pub(crate) fn fragment(handle: &Handle, wgsl: Option<WgslFn>) -> Option<Fragment> {
     let wgsl = wgsl?;
-    let mut workgroup_bytes = 0;
     // SAFETY: the stage is alive; everything handed over lives for the time of the call.
-    let ask = |room| unsafe { wgsl(handle.stage, ConefieldStr::of(&namer.prefix), room, &mut workgroup_bytes) };
+    let ask = |room| unsafe { wgsl(handle.stage, room) };
     let source = whole_text(ask).ok()?;
-    Some(Fragment { source, workgroup_bytes })
+    Some(Fragment { source })
 }

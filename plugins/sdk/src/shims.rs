@@ -11,7 +11,7 @@ use conefield_core::arena::{Arena, Block, Layout};
 use conefield_core::error::{Error, Result};
 use conefield_core::registry::StageType;
 use conefield_core::simd::Real;
-use conefield_core::stage::{Fragment, Grads, Kernel, Namer, Probe, Projector, Samples, Stage, Tile, TileMut, UnitRay};
+use conefield_core::stage::{Grads, Kernel, Probe, Projector, Samples, Stage, Tile, TileMut, UnitRay};
 use conefield_plugin_abi::*;
 use std::borrow::Cow;
 use std::cell::RefCell;
@@ -459,25 +459,15 @@ unsafe extern "C" fn decided(stage: *const c_void) {
     });
 }
 
-unsafe extern "C" fn wgsl(
-    stage: *const c_void,
-    prefix: ConefieldStr,
-    source: *mut ConefieldText,
-    workgroup_bytes: *mut u32,
-) -> ConefieldStatus {
+unsafe extern "C" fn wgsl(stage: *const c_void, source: *mut ConefieldText) -> ConefieldStatus {
     guard(source, || {
         // SAFETY: see the top of this file.
-        let (stage, prefix) = unsafe { (&built(stage).stage, text(prefix)?) };
-        let namer = Namer { prefix: prefix.into() };
-        let fragment = match stage {
-            AnyStage::Projector(p) => p.wgsl(&namer),
-            other => other.map().and_then(|s| s.wgsl(&namer)),
+        let fragment = match unsafe { &built(stage).stage } {
+            AnyStage::Projector(p) => p.wgsl(),
+            other => other.map().and_then(|s| s.wgsl()),
         };
-        let Fragment { source: code, workgroup_bytes: bytes } =
-            fragment.ok_or_else(|| Error::unsupported("this stage", "it has no WGSL"))?;
-        write(source, &code);
-        // SAFETY: see the top of this file.
-        unsafe { *workgroup_bytes = bytes };
+        let fragment = fragment.ok_or_else(|| Error::unsupported("this stage", "it has no WGSL"))?;
+        write(source, &fragment.source);
         Ok(())
     })
 }

@@ -2,12 +2,14 @@
 
 use crate::{out, parse, plugins};
 use clap::Args;
+use conefield_backend_wgpu::{Shared, Wgpu};
 use conefield_conformance::{
     Options, Outcome, Report, check_encoder, check_field, check_initializer, check_normalizer, check_projector,
+    check_projector_wgsl, check_wgsl,
 };
 use conefield_core::arena::Weights;
 use conefield_core::registry::{self, Make, Origin};
-use conefield_core::stage::Namer;
+use conefield_core::stage::{Projector, Stage};
 use conefield_core::{Error, Result};
 use conefield_plugins::library::Type;
 use conefield_plugins::spec::with_defaults;
@@ -17,6 +19,7 @@ use serde_json::Value;
 use std::io::Read;
 use std::path::PathBuf;
 use std::process::{Command, ExitStatus, Stdio};
+use std::sync::OnceLock;
 use std::thread;
 use std::time::{Duration, Instant};
 
@@ -166,6 +169,7 @@ impl Check {
 
     fn report(&self, library: &Library) -> Result<Checked> {
         let mut stages = vec![];
+        let device = Device::default();
         for t in library.types.iter().filter(|t| self.name.as_ref().is_none_or(|n| *n == t.name)) {
             let mut tries: Vec<Value> = self.settings.clone();
             if tries.is_empty() {
@@ -178,7 +182,7 @@ impl Check {
                 return Err(Error::invalid(library.owner(), &t.name, "nothing to check it with", expected));
             }
             for settings in tries {
-                self.stage(t, &with_defaults(&t.schema, settings), &mut stages)?;
+                self.stage(t, &with_defaults(&t.schema, settings), &device, &mut stages)?;
             }
         }
         if stages.is_empty() {
@@ -198,28 +202,25 @@ impl Check {
     }
 
     /// Checks one stage type with one set of settings, at every width that makes sense.
-    fn stage(&self, t: &Type, settings: &Value, all: &mut Vec<StageReport>) -> Result<()> {
+    fn stage(&self, t: &Type, settings: &Value, device: &Device, all: &mut Vec<StageReport>) -> Result<()> {
         let Some(Origin::Loaded { make, .. }) = registry::find(t.kind, &t.name).map(|t| &t.origin) else {
             return Err(Error::unsupported(&t.name, "it is not registered"));
         };
         let options = |o: Options| Options { single: self.single, ..o };
+        let widest = self.widths().into_iter().max().unwrap_or(0);
         let mut add = |width, report| all.push(StageReport::of(t, settings, width, report));
         match make {
             Make::Encoder(make) => {
                 let stage = make(settings.clone())?.build()?;
-                add(
-                    None,
-                    with_wgsl(
-                        check_encoder(stage.as_ref(), &options(Options::encoder())),
-                        stage.wgsl(&namer()).is_some(),
-                    ),
-                );
+                let options = options(Options::encoder());
+                add(None, device.map(check_encoder(stage.as_ref(), &options), stage.as_ref(), &options, true));
             }
             Make::Normalizer(make) => {
                 for width in self.widths() {
                     let stage = make(settings.clone())?.build(width)?;
-                    let report = check_normalizer(stage.as_ref(), &options(Options::features()));
-                    add(Some(width), with_wgsl(report, stage.wgsl(&namer()).is_some()));
+                    let options = options(Options::features());
+                    let report = check_normalizer(stage.as_ref(), &options);
+                    add(Some(width), device.map(report, stage.as_ref(), &options, width == widest));
                 }
             }
             Make::Field(make) => {
@@ -235,8 +236,9 @@ impl Check {
                         }
                     };
                     built = true;
-                    let report = check_field(stage.as_ref(), &options(Options::features()));
-                    add(Some(width), with_wgsl(report, stage.wgsl(&namer()).is_some()));
+                    let options = options(Options::features());
+                    let report = check_field(stage.as_ref(), &options);
+                    add(Some(width), device.map(report, stage.as_ref(), &options, width == widest));
                 }
                 if let (false, Some(e)) = (built, refused) {
                     return Err(e);
@@ -244,7 +246,7 @@ impl Check {
             }
             Make::Projector(make) => {
                 let stage = make(settings.clone())?.build()?;
-                add(None, with_wgsl(check_projector(stage.as_ref()), stage.wgsl(&namer()).is_some()));
+                add(None, device.projector(check_projector(stage.as_ref()), stage.as_ref()));
             }
             Make::Initializer(make) => {
                 let none =
@@ -262,17 +264,41 @@ impl Check {
     }
 }
 
-fn namer() -> Namer {
-    Namer { prefix: "stage".into() }
-}
-
 const FAILED: &str = "failed";
 
-/// The report with a line on the stage's WGSL: there is no backend here that could run it.
-fn with_wgsl(mut report: Report, there: bool) -> Report {
-    let why = if there { "this build has no GPU backend to run it on" } else { "the stage offers none" };
-    report.entries.push(("WGSL parity", Outcome::Skipped(why.into())));
-    report
+/// Where a stage's WGSL is tried, opened when the first stage offers some.
+#[derive(Default)]
+struct Device(OnceLock<Result<Wgpu, String>>);
+
+impl Device {
+    /// The report with what became of the stage's WGSL.
+    fn beside(&self, mut report: Report, offers: bool, check: impl FnOnce(&Shared) -> Report) -> Report {
+        let open = || Wgpu::open(None).map_err(|e| e.to_string());
+        let skipped = |why: String| vec![("WGSL parity", Outcome::Skipped(why))];
+        report.entries.extend(match offers.then(|| self.0.get_or_init(open)) {
+            None => skipped("the stage offers none".into()),
+            Some(Err(why)) => skipped(why.clone()),
+            Some(Ok(device)) => check(device.shared()).entries,
+        });
+        report
+    }
+
+    /// The same for stages that map rows. Compiling takes long on some devices: one width is enough.
+    fn map(&self, report: Report, stage: &dyn Stage, options: &Options, this_width: bool) -> Report {
+        if !this_width {
+            return report;
+        }
+        self.beside(report, stage.wgsl().is_some(), |shared| {
+            check_wgsl(stage, options, &|s, p, x, dy, rows| shared.pass(s, p, x, dy, rows))
+        })
+    }
+
+    /// The same for projectors.
+    fn projector(&self, report: Report, stage: &dyn Projector) -> Report {
+        self.beside(report, stage.wgsl().is_some(), |shared| {
+            check_projector_wgsl(stage, &|p, rays| shared.samples(p, rays))
+        })
+    }
 }
 
 impl StageReport {

@@ -7,8 +7,10 @@ use conefield_plugin::random::{mix, unit};
 use conefield_plugin::simd::Real;
 use conefield_plugin::spec::FieldSpec;
 use conefield_plugin::stage::{Field, GradKind, Grads, Info, Kernel, Parameter, Scope, Stage, Tile, TileMut};
+use conefield_plugin::wgsl::Fragment;
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
+use std::fmt::Write;
 
 conefield_plugin::stage_type!(Field, "siren", Siren, "multi-layer perceptron of sines");
 
@@ -204,6 +206,66 @@ impl Stage for SirenField {
 
     fn reference(&self) -> Option<&dyn Kernel<f64>> {
         Some(self)
+    }
+
+    /// The same layers for one row. Every row touches every weight: gradients are sums over rows.
+    fn wgsl(&self) -> Option<Fragment> {
+        let (n, last) = (self.input, self.layers.len() - 1);
+        let (mut layers, mut back) = (String::new(), String::new());
+        for (k, Layer { input, output, weights, biases }) in self.layers.iter().enumerate() {
+            let from = if k == 0 { "(*x)".into() } else { format!("h{}", k - 1) };
+            let activation = if k == last { "stage_softplus" } else { "stage_sine" };
+            let _ = write!(
+                layers,
+                "    var h{k}: array<f32, {output}>;
+    var s{k}: array<f32, {output}>;
+    for (var o = 0u; o < {output}u; o++) {{
+        var sum = stage_param({biases}u + o);
+        for (var i = 0u; i < {input}u; i++) {{ sum += stage_param({weights}u + o * {input}u + i) * {from}[i]; }}
+        let found = {activation}(sum);
+        h{k}[o] = found.x;
+        s{k}[o] = found.y;
+    }}
+"
+            );
+        }
+        for (k, Layer { input, output, weights, biases }) in self.layers.iter().enumerate().rev() {
+            let from = if k == 0 { "x".into() } else { format!("&h{}", k - 1) };
+            let put = if k == 0 { "(*dx)[i] =".into() } else { format!("s{}[i] *=", k - 1) };
+            let _ = write!(
+                back,
+                "    stage_outer_{output}_{input}({weights}u, {input}u, &s{k}, {from});
+    stage_sum_{output}({biases}u, &s{k});
+    for (var i = 0u; i < {input}u; i++) {{
+        var sum = 0.0;
+        for (var o = 0u; o < {output}u; o++) {{ sum += stage_param({weights}u + o * {input}u + i) * s{k}[o]; }}
+        {put} sum;
+    }}
+"
+            );
+        }
+        let omega = self.settings.omega as f32;
+        Some(Fragment::new(&[&format!(
+            "fn stage_sine(x: f32) -> vec2<f32> {{ return vec2<f32>(sin({omega:?} * x), {omega:?} * cos({omega:?} * x)); }}
+
+fn stage_softplus(x: f32) -> vec2<f32> {{
+    let e = exp(-min(abs(x), 87.0));
+    return vec2<f32>(max(x, 0.0) + log(1.0 + e), select(e, 1.0, x >= 0.0) / (1.0 + e));
+}}
+
+fn stage_forward(x: ptr<function, array<f32, {n}>>, y: ptr<function, array<f32, 1>>) {{
+{layers}    (*y)[0] = h{last}[0];
+}}
+
+fn stage_backward(
+    x: ptr<function, array<f32, {n}>>,
+    dy: ptr<function, array<f32, 1>>,
+    dx: ptr<function, array<f32, {n}>>,
+) {{
+{layers}    s{last}[0] *= (*dy)[0];
+{back}}}
+"
+        )]))
     }
 
     fn describe(&self) -> String {

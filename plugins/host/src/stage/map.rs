@@ -7,9 +7,10 @@ use crate::library::{Functions, Handle, Text, Type};
 use crate::trial;
 use conefield_core::error::{Error, Result, ensure};
 use conefield_core::stage::{
-    Encoder, Field, Fragment, GradKind, Grads, Info, Kernel, Mask, Namer, Normalizer, Parameter, Probe, Reduced, Scope,
-    Stage, Tile, TileMut,
+    Encoder, Field, GradKind, Grads, Info, Kernel, Mask, Normalizer, Parameter, Probe, Reduced, Scope, Stage, Tile,
+    TileMut,
 };
+use conefield_core::wgsl::Fragment;
 use conefield_plugin_abi::*;
 use serde_json::Value;
 use std::collections::BTreeSet;
@@ -324,8 +325,8 @@ impl Stage for MapStage {
         self.fault.take()
     }
 
-    fn wgsl(&self, namer: &Namer) -> Option<Fragment> {
-        fragment(&self.handle, self.map.wgsl, namer)
+    fn wgsl(&self) -> Option<Fragment> {
+        fragment(&self.handle, self.map.wgsl)
     }
 
     fn describe(&self) -> String {

@@ -6,7 +6,8 @@ use super::{Fault, fragment};
 use crate::library::{Functions, Handle, Text, Type};
 use crate::trial;
 use conefield_core::error::Result;
-use conefield_core::stage::{Fragment, Namer, Projector, Samples, UnitRay};
+use conefield_core::stage::{Projector, Samples, UnitRay};
+use conefield_core::wgsl::Fragment;
 use conefield_plugin_abi::*;
 use serde_json::Value;
 use std::ptr;
@@ -157,7 +158,7 @@ impl Projector for ProjectorStage {
         self.describe.clone()
     }
 
-    fn wgsl(&self, namer: &Namer) -> Option<Fragment> {
-        fragment(&self.handle, self.functions.wgsl, namer)
+    fn wgsl(&self) -> Option<Fragment> {
+        fragment(&self.handle, self.functions.wgsl)
     }
 }
