@@ -141,6 +141,10 @@ pub trait Executable: Send {
     fn fetch(&mut self, _model: &mut Model) -> Result<()> {
         Ok(())
     }
+    /// Seconds of each of its kernels since this was last asked, of a backend that was told to measure them.
+    fn profile(&mut self) -> Vec<(String, f64)> {
+        vec![]
+    }
     /// Says that something else has changed the model's arena, after it was fetched if its state was wanted: the next
     /// call takes it as it is then.
     fn renew(&mut self) {}

@@ -117,7 +117,7 @@ pub fn adapters() -> Vec<Adapter> {
     found().iter().enumerate().map(|(i, a)| Adapter::of(i, a)).collect()
 }
 
-/// What may be set otherwise than an adapter offers, to try what others have to do.
+/// What may be set otherwise than an adapter offers, to try what others have to do, and to measure.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
 pub struct Limits {
     /// Sums of scattered gradients by compare and exchange, even where the device adds by itself.
@@ -126,6 +126,8 @@ pub struct Limits {
     pub binding_bytes: Option<u64>,
     /// Bytes of the largest uniform buffer, if fewer than the device allows.
     pub uniform_bytes: Option<u64>,
+    /// Time every kernel, where the device has timestamps; every call then waits for the device.
+    pub profile: bool,
 }
 
 /// An open device.

@@ -3,6 +3,7 @@
 use crate::arena;
 use crate::compose::{self, Chain, GROUP, Part};
 use crate::kernel::{Buffers, Kernel, fits};
+use crate::profile::Profile;
 use crate::source::Source;
 use crate::wave::{self, GpuRay, MOST_GROUPS, Wave};
 use crate::{Gpu, Shared};
@@ -117,6 +118,7 @@ pub struct Wgpu {
     most: u32,
     /// Rows for which there is room.
     room: u32,
+    profile: Option<Profile>,
 }
 
 impl Wgpu {
@@ -132,6 +134,7 @@ impl Wgpu {
             clean: false,
             most: FIRST_ROWS,
             room: 0,
+            profile: None,
         }
     }
 
@@ -175,6 +178,9 @@ impl Wgpu {
         if self.chain.dense > 0 {
             let bytes = 4 * (self.groups() * self.chain.dense) as u64;
             self.buffers.reserve(&shared.gpu, "partial", bytes, U::STORAGE | U::COPY_DST)?;
+        }
+        if shared.profile && self.profile.is_none() {
+            self.profile = Profile::new(&shared.gpu)?;
         }
         (self.loaded, self.clean) = (true, false);
         Ok(())
@@ -225,10 +231,9 @@ impl Wgpu {
     fn launch(&mut self, encoder: &mut wgpu::CommandEncoder, launches: &[(&'static str, usize)]) -> Result<()> {
         for &(label, groups) in launches.iter().filter(|(_, groups)| *groups > 0) {
             let (kernel, bound) = self.ready(label)?;
-            let mut pass = encoder.begin_compute_pass(&wgpu::ComputePassDescriptor {
-                label: Some(kernel.label()),
-                timestamp_writes: None,
-            });
+            let timestamp_writes = self.profile.as_mut().and_then(|p| p.around(label));
+            let mut pass = encoder
+                .begin_compute_pass(&wgpu::ComputePassDescriptor { label: Some(kernel.label()), timestamp_writes });
             kernel.launch(&mut pass, &bound, groups.min(MOST_GROUPS) as u32);
         }
         Ok(())
@@ -296,9 +301,15 @@ impl Wgpu {
             self.gpu().queue.submit([encoder.finish()]);
             self.read(wanted, |bytes| take(at, bytemuck::cast_slice(bytes), stride as usize))?;
             at += piece.len();
+            self.collect()?;
             self.pace(started.elapsed().as_secs_f64(), 1, rows);
         }
         Ok(())
+    }
+
+    /// Adds up the times of kernels that have run.
+    fn collect(&mut self) -> Result<()> {
+        self.profile.as_mut().map_or(Ok(()), |p| p.collect(&self.shared.gpu))
     }
 
     /// Chooses how many rows a wave may have, by how long the last ones took.
@@ -438,6 +449,7 @@ impl Executable for Wgpu {
                 }
             }
         })?;
+        self.collect()?;
         let seconds = started.elapsed().as_secs_f64();
         stats.dense_s = seconds;
         self.pace(seconds, waves.len(), waves.iter().map(|w| w.rows).max().unwrap_or(0));
@@ -474,7 +486,9 @@ impl Executable for Wgpu {
             let bound = kernel.bind_as(&self.shared.gpu, find)?;
             let mut encoder = self.encoder();
             {
-                let mut pass = encoder.begin_compute_pass(&Default::default());
+                let timestamp_writes = self.profile.as_mut().and_then(|p| p.around("adam"));
+                let mut pass =
+                    encoder.begin_compute_pass(&wgpu::ComputePassDescriptor { label: Some("adam"), timestamp_writes });
                 kernel.launch(&mut pass, &bound, count.div_ceil(256).clamp(1, MOST_GROUPS) as u32);
             }
             self.gpu().queue.submit([encoder.finish()]);
@@ -483,6 +497,7 @@ impl Executable for Wgpu {
         arena::refresh_dense(&self.buffers, &self.chain, &mut encoder, size);
         self.gpu().queue.submit([encoder.finish()]);
         self.clean = true;
+        self.collect()?;
         self.gpu().fault()
     }
 
@@ -535,6 +550,10 @@ impl Executable for Wgpu {
             })?;
         }
         Ok(())
+    }
+
+    fn profile(&mut self) -> Vec<(String, f64)> {
+        self.profile.as_mut().map(Profile::take).unwrap_or_default()
     }
 
     fn fetch(&mut self, model: &mut Model) -> Result<()> {

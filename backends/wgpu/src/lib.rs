@@ -6,6 +6,7 @@
 //! - [`arena`]: parameters, gradients and moments on the device.
 //! - [`wave`]: a step's work cut into pieces of bounded size.
 //! - [`executable`]: steps, updates, evaluation.
+//! - [`profile`]: time on the device.
 //! - [`single`]: one stage alone, by which it is compared with the CPU.
 //!
 //! Sums have no fixed order where many rows touch one parameter: results agree with the CPU's to rounding, and two runs
@@ -16,6 +17,7 @@ pub mod compose;
 pub mod device;
 pub mod executable;
 pub mod kernel;
+pub mod profile;
 pub mod single;
 pub mod source;
 pub mod wave;
@@ -41,6 +43,8 @@ pub struct Shared {
     pub gpu: Gpu,
     /// Kernels by their text.
     pub kernels: Cache,
+    /// Whether executables time their kernels.
+    pub profile: bool,
 }
 
 impl Shared {
@@ -65,7 +69,7 @@ impl Wgpu {
     /// The same, with less than the adapter offers.
     pub fn with_limits(index: Option<usize>, limits: Limits) -> Result<Self> {
         let gpu = Gpu::open(index, limits)?;
-        Ok(Self { shared: Arc::new(Shared { gpu, kernels: Cache::default() }) })
+        Ok(Self { shared: Arc::new(Shared { gpu, kernels: Cache::default(), profile: limits.profile }) })
     }
 
     /// The device.

@@ -479,13 +479,10 @@ typedef struct ConefieldMap {
    */
   void (*decided)(const void *stage);
   /*
-   WGSL functions `{prefix}_fwd` and `{prefix}_bwd` of the same formula, and the bytes of workgroup memory that they
-   need. NULL: it runs on the CPU alone.
+   WGSL of the same formula: functions `stage_forward` and `stage_backward` of a row, as docs/plugins.md says. NULL:
+   it runs on the CPU alone.
    */
-  ConefieldStatus (*wgsl)(const void *stage,
-                          struct ConefieldStr prefix,
-                          struct ConefieldText *source,
-                          uint32_t *workgroup_bytes);
+  ConefieldStatus (*wgsl)(const void *stage, struct ConefieldText *source);
 } ConefieldMap;
 
 /*
@@ -548,12 +545,10 @@ typedef struct ConefieldProjector {
    */
   void (*adjoint)(const void *stage, const float *weights, double dline, double *dmu, size_t count);
   /*
-   As [`ConefieldMap::wgsl`].
+   WGSL of `sample`, of a projector that integrates as one without `integrate` does: a function `stage_sample`, as
+   docs/plugins.md says. NULL: it runs on the CPU alone.
    */
-  ConefieldStatus (*wgsl)(const void *stage,
-                          struct ConefieldStr prefix,
-                          struct ConefieldText *source,
-                          uint32_t *workgroup_bytes);
+  ConefieldStatus (*wgsl)(const void *stage, struct ConefieldText *source);
 } ConefieldProjector;
 
 /*
