@@ -1,4 +1,4 @@
-"""The published training step in PyTorch on the CPU: what `cargo bench --bench training` measures, by a peer.
+"""The published training step in PyTorch: what `cargo bench --bench training` (or, with --device cuda, gpu) measures, by a peer.
 
 10 levels x 2 features, tables of 2^19, LayerNorm, 20-32-32-(+20)-32-1 with GELU and SquarePlus, 1024 rays x 320
 samples, L1, Adam. Prints training samples/s and export points/s, eager and (with --compile) compiled.
@@ -71,10 +71,18 @@ def main():
     parser.add_argument("--steps", type=int, default=8)
     parser.add_argument("--compile", action="store_true")
     parser.add_argument("--threads", type=int, default=0)
+    parser.add_argument("--device", default="cpu")
     arguments = parser.parse_args()
     if arguments.threads:
         torch.set_num_threads(arguments.threads)
     torch.manual_seed(0)
+    torch.set_default_device(arguments.device)
+    cuda = arguments.device.startswith("cuda")
+
+    def wait():
+        if cuda:
+            torch.cuda.synchronize()
+
     field = Field()
     run = torch.compile(field) if arguments.compile else field
     optimizer = torch.optim.Adam(field.parameters(), lr=1e-3)
@@ -90,16 +98,19 @@ def main():
         optimizer.zero_grad()
         loss.backward()
         optimizer.step()
+        wait()
         if step >= 2:
             times.append(time.perf_counter() - begin)
     rate = RAYS * SAMPLES / statistics.median(times) / 1e6
     kind = "compiled" if arguments.compile else "eager"
-    print(f"PyTorch {torch.__version__} {kind}, {torch.get_num_threads()} threads: training {rate:.2f} M samples/s")
+    where = torch.cuda.get_device_name() if cuda else f"{torch.get_num_threads()} threads"
+    print(f"PyTorch {torch.__version__} {kind}, {where}: training {rate:.2f} M samples/s")
     with torch.no_grad():
         times = []
         for _ in range(4):
             begin = time.perf_counter()
             run(points)
+            wait()
             times.append(time.perf_counter() - begin)
     print(f"  export {RAYS * SAMPLES / statistics.median(times) / 1e6:.2f} M points/s")
 

@@ -5,6 +5,8 @@ use conefield_backend_wgpu::{Wgpu, adapters};
 use conefield_core::Result;
 use conefield_core::backend::{Backend, Executable, Explain};
 use conefield_core::pipeline::Pipeline;
+use conefield_core::voxel::{VoxelProjector, VoxelView};
+use ndarray::{ArrayView3, ArrayViewMut3};
 use serde::{Serialize, Serializer};
 use std::fmt;
 use std::path::Path;
@@ -112,6 +114,22 @@ impl Backend for Auto {
         let (exe, mut explain) = self.cpu.compile(pipeline)?;
         explain.notes.insert(0, format!("chosen by --backend auto: {why}"));
         Ok((exe, explain))
+    }
+
+    fn place(&self, projector: Box<dyn VoxelProjector>) -> Result<Box<dyn VoxelProjector>> {
+        match self.gpu() {
+            Ok(gpu) if projector.wgsl().is_some() => gpu.place(projector),
+            _ => Ok(projector),
+        }
+    }
+
+    fn backproject(
+        &self,
+        views: &[VoxelView],
+        images: ArrayView3<'_, f32>,
+        volume: ArrayViewMut3<'_, f32>,
+    ) -> Result<bool> {
+        self.gpu().map_or(Ok(false), |gpu| gpu.backproject(views, images, volume))
     }
 }
 

@@ -3,6 +3,8 @@
 use crate::error::Result;
 use crate::pipeline::{Model, Pipeline};
 use crate::stage::UnitRay;
+use crate::voxel::{VoxelProjector, VoxelView};
+use ndarray::{ArrayView3, ArrayViewMut3};
 use serde::Serialize;
 
 /// A ray with its measured value, both scaled to what stages see.
@@ -119,6 +121,21 @@ pub trait Backend: Send + Sync {
     fn name(&self) -> &'static str;
     /// Checks that every stage can run here and says how; never falls back silently.
     fn compile(&self, pipeline: &Pipeline) -> Result<(Box<dyn Executable>, Explain)>;
+    /// The projector with its work on this backend's device; as it is where the backend has none of its own.
+    fn place(&self, projector: Box<dyn VoxelProjector>) -> Result<Box<dyn VoxelProjector>> {
+        Ok(projector)
+    }
+    /// Adds to each voxel of `volume` `Σ s/U²·p(row, column)` over the views whose pixels are `images`
+    /// (`[view, row, column]`), bilinear between pixels and 0 outside the detector. Returns whether it did: a backend
+    /// without a device leaves it to the solver.
+    fn backproject(
+        &self,
+        _views: &[VoxelView],
+        _images: ArrayView3<'_, f32>,
+        _volume: ArrayViewMut3<'_, f32>,
+    ) -> Result<bool> {
+        Ok(false)
+    }
 }
 
 /// A compiled pipeline. After a mask changed the pipeline, compile again. What a stage reports with

@@ -1,7 +1,9 @@
 //! Line integrals of a voxel volume, as classical solvers need them: a linear operator and its exact adjoint.
 
+use crate::error::Result;
 use crate::geometry::Geometry;
 use crate::simd::Real;
+use crate::wgsl::Fragment;
 use ndarray::{ArrayView3, ArrayViewMut3};
 
 /// A projector of voxel volumes, in single precision for work and in double precision to be checked by.
@@ -11,6 +13,11 @@ pub trait VoxelProjector: Send + Sync {
 
     /// The same formula in double precision.
     fn reference(&self) -> &dyn VoxelOperator<f64>;
+
+    /// The same formula for a GPU: `stage_walk`; see [`crate::wgsl`].
+    fn wgsl(&self) -> Option<Fragment> {
+        None
+    }
 
     /// A line for `explain`.
     fn describe(&self) -> String;
@@ -37,4 +44,23 @@ pub trait VoxelOperator<R: Real>: Send + Sync {
         projections: ArrayView3<'_, R>,
         volume: ArrayViewMut3<'_, R>,
     );
+
+    /// What it could not do since this was last asked, as [`crate::stage::Stage::fault`].
+    fn fault(&self) -> Result<()> {
+        Ok(())
+    }
+}
+
+/// A view as voxel-driven back-projection sees it: depth, row and column of a voxel `(x, y, z)`, each
+/// `n[0] + n[1]·x + n[2]·y + n[3]·z`, row and column after division by the depth.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct VoxelView {
+    /// Distance from the source along the detector's normal, mm.
+    pub depth: [f64; 4],
+    /// Row times depth; whole rows are pixel centres.
+    pub row: [f64; 4],
+    /// Column times depth.
+    pub column: [f64; 4],
+    /// What the view is multiplied with, beside the inverse square of the depth, mm².
+    pub scale: f64,
 }

@@ -35,6 +35,18 @@
 //! [`Projector::max_samples`](crate::stage::Projector::max_samples) says; samples beyond what the ray has weigh 0. The
 //! line integral is the sum of weight times attenuation. [`RAY`] defines `Ray`, [`RANDOM`] random numbers.
 
+//!
+//! A projector of voxels defines
+//!
+//! ```wgsl
+//! fn stage_walk(ray: VoxelRay)
+//! ```
+//!
+//! which calls `stage_visit(voxel: vec3<u32>, weight: f32)` for every voxel that the ray meets, with the millimetres for
+//! which it counts. One walk serves both directions, so that they are adjoint. `stage_shape() -> vec3<u32>` and
+//! `stage_spacing() -> vec3<f32>` are the volume's; a `VoxelRay` has `source` and `ahead`, the way to the pixel, in voxels
+//! (whole numbers are voxel centres), and `length`, that way in mm.
+
 use std::collections::BTreeSet;
 
 /// How every name begins that a fragment defines or uses of its host's.

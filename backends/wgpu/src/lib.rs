@@ -6,8 +6,10 @@
 //! - [`arena`]: parameters, gradients and moments on the device.
 //! - [`wave`]: a step's work cut into pieces of bounded size.
 //! - [`executable`]: steps, updates, evaluation.
+//! - [`measure`]: what a device can do at most.
 //! - [`profile`]: time on the device.
 //! - [`single`]: one stage alone, by which it is compared with the CPU.
+//! - [`voxels`]: projection of voxel volumes and FDK's back-projection.
 //!
 //! Sums have no fixed order where many rows touch one parameter: results agree with the CPU's to rounding, and two runs
 //! with each other.
@@ -17,9 +19,11 @@ pub mod compose;
 pub mod device;
 pub mod executable;
 pub mod kernel;
+pub mod measure;
 pub mod profile;
 pub mod single;
 pub mod source;
+pub mod voxels;
 pub mod wave;
 
 use compose::{Chain, Target};
@@ -27,10 +31,13 @@ use conefield_core::backend::{Backend, Executable, Explain};
 use conefield_core::error::Result;
 use conefield_core::pipeline::Pipeline;
 use conefield_core::stage::GradKind;
+use conefield_core::voxel::{VoxelProjector, VoxelView};
 pub use device::{Adapter, Atomics, Gpu, Limits, adapters};
 use executable::{Kernels, Wgpu as Running};
 use kernel::Cache;
+use ndarray::{ArrayView3, ArrayViewMut3};
 use std::sync::Arc;
+use voxels::OnDevice;
 
 /// An open device with the kernels compiled so far.
 pub struct Wgpu {
@@ -128,5 +135,18 @@ impl Backend for Wgpu {
             scratch_bytes: running.host_bytes() + if adapter.software { device_bytes as usize } else { 0 },
         };
         Ok((Box::new(running), explain))
+    }
+
+    fn place(&self, projector: Box<dyn VoxelProjector>) -> Result<Box<dyn VoxelProjector>> {
+        Ok(Box::new(OnDevice::new(self.shared.clone(), projector)?))
+    }
+
+    fn backproject(
+        &self,
+        views: &[VoxelView],
+        images: ArrayView3<'_, f32>,
+        volume: ArrayViewMut3<'_, f32>,
+    ) -> Result<bool> {
+        voxels::backproject(&self.shared, views, images, volume).map(|()| true)
     }
 }

@@ -2,6 +2,7 @@
 
 use conefield_core::geometry::{Geometry, Vec3, VoxelGrid, cross, dot, norm, sub};
 use conefield_core::simd::Real;
+use conefield_core::voxel::VoxelView;
 use ndarray::{ArrayView3, Axis};
 use rayon::prelude::*;
 
@@ -150,6 +151,22 @@ impl Pinhole {
         let dual = [cross(w.v, n), cross(n, w.u)].map(|d| d.map(|x| x / square));
         let corner = sub(w.pixel(geometry.detector, 0.0, 0.0), w.source);
         Self { source: w.source, normal, distance, corner, dual }
+    }
+
+    /// The same for the voxels of `grid` by their index, for a view that counts `scale`.
+    pub fn voxels(&self, grid: &VoxelGrid, scale: f64) -> VoxelView {
+        let corner = sub(grid.voxel([0; 3]), self.source);
+        let linear = |axis: Vec3| {
+            let along: Vec3 = std::array::from_fn(|k| axis[k] * grid.spacing[k]);
+            [dot(axis, corner), along[0], along[1], along[2]]
+        };
+        let depth = linear(self.normal);
+        let place = |dual: Vec3| {
+            let along = linear(dual.map(|x| x * self.distance));
+            let offset = dot(dual, self.corner);
+            std::array::from_fn(|k| along[k] - offset * depth[k])
+        };
+        VoxelView { depth, row: place(self.dual[1]), column: place(self.dual[0]), scale }
     }
 
     /// Row and column (whole numbers are pixel centres) where the ray through `p` meets the detector, and the depth

@@ -8,6 +8,7 @@ use conefield_core::geometry::Geometry;
 use conefield_core::simd::Real;
 use conefield_core::spec::ProjectorSpec;
 use conefield_core::voxel::{VoxelOperator, VoxelProjector};
+use conefield_core::wgsl::Fragment;
 use ndarray::{ArrayView3, ArrayViewMut3, Axis};
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
@@ -70,6 +71,9 @@ impl VoxelProjector for Siddon {
     fn reference(&self) -> &dyn VoxelOperator<f64> {
         self
     }
+    fn wgsl(&self) -> Option<Fragment> {
+        Some(Fragment::new(&[include_str!("walk.wgsl"), include_str!("siddon.wgsl")]))
+    }
     fn describe(&self) -> String {
         "siddon: exact lengths inside voxels".into()
     }
@@ -82,6 +86,9 @@ impl VoxelProjector for Joseph {
     fn reference(&self) -> &dyn VoxelOperator<f64> {
         self
     }
+    fn wgsl(&self) -> Option<Fragment> {
+        Some(Fragment::new(&[include_str!("walk.wgsl"), include_str!("joseph.wgsl")]))
+    }
     fn describe(&self) -> String {
         "joseph: bilinear from plane to plane".into()
     }
@@ -93,6 +100,10 @@ impl VoxelProjector for Trilinear {
     }
     fn reference(&self) -> &dyn VoxelOperator<f64> {
         self
+    }
+    fn wgsl(&self) -> Option<Fragment> {
+        let samples = format!("const stage_SAMPLES = {:?};\n", self.samples_per_voxel as f32);
+        Some(Fragment::new(&[&samples, include_str!("walk.wgsl"), include_str!("trilinear.wgsl")]))
     }
     fn describe(&self) -> String {
         format!("trilinear: {} samples a voxel", self.samples_per_voxel)

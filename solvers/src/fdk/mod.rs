@@ -15,8 +15,9 @@ use conefield_core::geometry::{Geometry, dot, norm, sub};
 use conefield_core::scan::{Scan, Volume};
 use conefield_core::solver::{Job, Observer, Reconstruction, Record, Solution, Solver};
 use conefield_core::spec::{SolverSpec, Spec};
+use conefield_core::voxel::VoxelView;
 use conefield_projectors::voxel::backproject::backproject;
-use conefield_projectors::voxel::layout::{AFTER, BEFORE, ColumnMajor};
+use conefield_projectors::voxel::layout::{AFTER, BEFORE, ColumnMajor, Pinhole};
 use filter::{Ramp, Window};
 use ndarray::{Array3, Axis};
 use rayon::prelude::*;
@@ -96,9 +97,13 @@ impl Solver for Fdk {
                     ramp.filter(strip, columns);
                 });
             });
-            let pixels = ColumnMajor::new(g, part, images.view(), |_, _, _, x| x);
-            drop(images);
-            backproject(g, part, &pixels, &scales, volume.view_mut());
+            let seen = part.iter().zip(&scales).map(|(&v, &scale)| Pinhole::of(g, v).voxels(&g.volume, scale));
+            let seen: Vec<VoxelView> = seen.collect();
+            if !job.backend.backproject(&seen, images.view(), volume.view_mut())? {
+                let pixels = ColumnMajor::new(g, part, images.view(), |_, _, _, x| x);
+                drop(images);
+                backproject(g, part, &pixels, &scales, volume.view_mut());
+            }
             done += part.len();
             let share = done as f64 / all.len() as f64;
             let spent = start.elapsed().as_secs_f64();

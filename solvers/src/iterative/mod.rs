@@ -174,7 +174,7 @@ pub trait Method {
 /// Begins a job: refuses a scan that makes no sense, says what solves it and how, and gives the projector.
 pub(crate) fn open(solver: &str, job: &Job<'_>, observer: &mut dyn Observer) -> Result<Box<dyn VoxelProjector>> {
     job.scan.validate("scan")?;
-    let projector = projector_of(job.spec)?;
+    let projector = job.backend.place(projector_of(job.spec)?)?;
     observer.note(&format!("{solver}; {}", projector.describe()));
     Ok(projector)
 }
@@ -305,6 +305,7 @@ pub fn drive(
             break;
         }
         let pass = method.pass(problem, step)?;
+        problem.operator.fault()?;
         step += 1;
         if !pass.residual.is_finite() {
             return Err(Error::Diverged { step, what: "the residual is not finite; try a smaller step".into() });

@@ -58,6 +58,7 @@ impl Observer for Heard {
 }
 
 /// A whole run of `value` on `scan`, with the weights file that it may name.
+#[allow(dead_code)]
 pub fn solve(value: &Value, scan: &Scan, weights: &Weights) -> Result<(Solution, Vec<Record>)> {
     solve_on(&Cpu::new(), value, scan, weights)
 }

@@ -4,6 +4,7 @@ use conefield_backend_wgpu::{Limits, Shared, Wgpu};
 use std::sync::{Arc, OnceLock};
 
 /// The device, opened once a program; `None`, said on stderr with what is not tried, where there is no adapter.
+#[allow(dead_code)]
 pub fn shared(what: &str) -> Option<Arc<Shared>> {
     static DEVICE: OnceLock<Option<Arc<Shared>>> = OnceLock::new();
     let device = DEVICE.get_or_init(|| Wgpu::open(None).ok().map(|w| w.shared().clone()));

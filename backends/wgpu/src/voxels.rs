@@ -1,0 +1,456 @@
+//! Projection of voxel volumes, its adjoint, and FDK's back-projection, on the device.
+//!
+//! A volume that is larger than a buffer may be is gone through slab by slab along x, projections view by view. The
+//! adjoint adds to voxels atomically: sums have no fixed order.
+
+use crate::Shared;
+use crate::compose::GROUP;
+use crate::device::Atomics;
+use crate::kernel::Buffers;
+use crate::source::{Access, Source};
+use crate::wave::MOST_GROUPS;
+use conefield_core::error::{Error, Result};
+use conefield_core::geometry::{Geometry, sub};
+use conefield_core::voxel::{VoxelOperator, VoxelProjector, VoxelView};
+use conefield_core::wgsl::Fragment;
+use ndarray::{ArrayView3, ArrayViewMut3, Axis, s};
+use std::ops::Range;
+use std::sync::{Arc, Mutex, PoisonError};
+use std::time::Instant;
+use wgpu::BufferUsages as U;
+
+/// Bytes of projections on the device at once.
+const LINES_BYTES: u64 = 64 << 20;
+/// Rays or voxels of a launch at first, at least and at most; how long one should take.
+const FIRST: u32 = 1 << 15;
+const LEAST: u32 = 1 << 10;
+const MOST: u32 = 1 << 22;
+const SECONDS: [f64; 2] = [0.05, 0.25];
+
+/// `Projection` in `kernels/project.wgsl`.
+#[repr(C)]
+#[derive(Debug, Clone, Copy, Default, bytemuck::Pod, bytemuck::Zeroable)]
+struct Projection {
+    shape: [u32; 3],
+    count: u32,
+    spacing: [f32; 3],
+    columns: u32,
+    held: u32,
+    held_end: u32,
+    pixels: u32,
+    begin: u32,
+    end: u32,
+    pad: [u32; 3],
+}
+
+/// `Back` in `kernels/backproject.wgsl`.
+#[repr(C)]
+#[derive(Debug, Clone, Copy, Default, bytemuck::Pod, bytemuck::Zeroable)]
+struct Back {
+    shape: [u32; 3],
+    views: u32,
+    held: u32,
+    begin: u32,
+    end: u32,
+    rows: u32,
+    columns: u32,
+    pad: [u32; 3],
+}
+
+/// `SeenView` in `kernels/backproject.wgsl`.
+#[repr(C)]
+#[derive(Debug, Clone, Copy, bytemuck::Pod, bytemuck::Zeroable)]
+struct SeenView {
+    depth: [f32; 4],
+    row: [f32; 4],
+    column: [f32; 4],
+    scale: f32,
+    pad: [f32; 3],
+}
+
+/// `ProjectedView` in `kernels/project.wgsl`.
+fn projected(geometry: &Geometry, view: usize) -> [[f32; 4]; 4] {
+    let (w, grid) = (&geometry.views[view], &geometry.volume);
+    let lower = grid.voxel([0; 3]);
+    let voxels = |d: [f64; 3]| {
+        let v: [f32; 3] = std::array::from_fn(|k| (d[k] / grid.spacing[k]) as f32);
+        [v[0], v[1], v[2], 0.0]
+    };
+    let corner = sub(w.pixel(geometry.detector, 0.0, 0.0), w.source);
+    [voxels(sub(w.source, lower)), voxels(corner), voxels(w.u), voxels(w.v)]
+}
+
+fn kernel(fragment: &Fragment, name: &str, atomics: Atomics, forward: bool) -> Source {
+    let mut source = Source::default();
+    source.add("projection", include_str!("kernels/project.wgsl"));
+    source.bind("projection", Access::Uniform, "Projection");
+    source.bind("views", Access::Read, "array<ProjectedView>");
+    let (number, add) = match atomics {
+        Atomics::Native => ("f32", "atomicAdd(&volume[i], v);".to_owned()),
+        Atomics::CompareExchange => (
+            "u32",
+            "var old = atomicLoad(&volume[i]);
+        loop {
+            let found = atomicCompareExchangeWeak(&volume[i], old, bitcast<u32>(bitcast<f32>(old) + v));
+            if found.exchanged { break; }
+            old = found.old_value;
+        }"
+            .to_owned(),
+        ),
+    };
+    let (what, begin, end) = if forward {
+        source.bind("volume", Access::Read, "array<f32>");
+        source.bind("lines", Access::Write, "array<f32>");
+        ("value += weight * volume[i];".to_owned(), "value = 0.0;", "lines[i] += value;")
+    } else {
+        source.bind("volume", Access::Write, &format!("array<atomic<{number}>>"));
+        source.bind("lines", Access::Read, "array<f32>");
+        let begin = "value = lines[i];\n        if value == 0.0 { continue; }";
+        (format!("let v = weight * value;\n        {add}"), begin, "")
+    };
+    source.add(
+        "visit",
+        &format!(
+            "var<private> value: f32;
+
+fn walk_visit(voxel: vec3<u32>, weight: f32) {{
+    if voxel.x >= projection.held && voxel.x < projection.held_end {{
+        let i = walk_index(voxel);
+        {what}
+    }}
+}}
+"
+        ),
+    );
+    source.add(name, &fragment.named("walk_"));
+    source.add(
+        "rays",
+        &format!(
+            "@compute @workgroup_size(64)
+fn main(@builtin(global_invocation_id) id: vec3<u32>, @builtin(num_workgroups) groups: vec3<u32>) {{
+    for (var i = projection.begin + id.x; i < projection.end; i += groups.x * 64u) {{
+        {begin}
+        walk_walk(projected(i));
+        {end}
+    }}
+}}
+"
+        ),
+    );
+    source
+}
+
+/// What a launch works on: buffers that are used again, and how many rays or voxels it may take.
+struct Room {
+    buffers: Buffers,
+    most: u32,
+}
+
+impl Default for Room {
+    fn default() -> Self {
+        Self { buffers: Buffers::default(), most: FIRST }
+    }
+}
+
+impl Room {
+    /// Runs `source` over `0..count` in launches, each after `uniform` has written where it begins and ends.
+    fn run<T: bytemuck::Pod>(
+        &mut self,
+        shared: &Shared,
+        label: &str,
+        source: &Source,
+        uniform: (&str, impl Fn(u32, u32) -> T),
+        count: u32,
+    ) -> Result<()> {
+        let gpu = &shared.gpu;
+        let kernel = shared.kernels.get(gpu, label, source)?;
+        self.buffers.reserve(gpu, uniform.0, size_of::<T>() as u64, U::UNIFORM | U::COPY_DST)?;
+        let bound = kernel.bind(gpu, &self.buffers)?;
+        let started = Instant::now();
+        let (mut at, mut launches) = (0, 0);
+        while at < count {
+            let end = count.min(at.saturating_add(self.most));
+            let value = uniform.1(at, end);
+            self.buffers.get(uniform.0).inspect(|b| gpu.queue.write_buffer(b, 0, bytemuck::bytes_of(&value)));
+            let mut encoder = gpu.device.create_command_encoder(&Default::default());
+            let groups = (end - at).div_ceil(GROUP).min(MOST_GROUPS as u32);
+            kernel.launch(&mut encoder.begin_compute_pass(&Default::default()), &bound, groups);
+            gpu.queue.submit([encoder.finish()]);
+            at = end;
+            launches += 1;
+        }
+        gpu.wait()?;
+        let each = started.elapsed().as_secs_f64() / f64::from(launches.max(1));
+        if each > SECONDS[1] && self.most > LEAST {
+            self.most /= 2;
+        } else if each < SECONDS[0] && launches > 1 && self.most < MOST {
+            self.most *= 2;
+        }
+        Ok(())
+    }
+
+    fn write(&self, shared: &Shared, name: &str, data: &[f32]) {
+        self.buffers.get(name).inspect(|b| shared.gpu.queue.write_buffer(b, 0, bytemuck::cast_slice(data)));
+    }
+
+    fn clear(&self, shared: &Shared, name: &str) {
+        let mut encoder = shared.gpu.device.create_command_encoder(&Default::default());
+        self.buffers.get(name).inspect(|b| encoder.clear_buffer(b, 0, None));
+        shared.gpu.queue.submit([encoder.finish()]);
+    }
+
+    /// Copies `name`'s numbers to `out`.
+    fn read(&mut self, shared: &Shared, name: &str, out: &mut [f32]) -> Result<()> {
+        let gpu = &shared.gpu;
+        let bytes = 4 * out.len() as u64;
+        self.buffers.reserve(gpu, "staging", bytes, U::MAP_READ | U::COPY_DST)?;
+        let (Some(from), Some(staging)) = (self.buffers.get(name), self.buffers.get("staging")) else { return Ok(()) };
+        let mut encoder = gpu.device.create_command_encoder(&Default::default());
+        encoder.copy_buffer_to_buffer(from, 0, staging, 0, bytes);
+        gpu.queue.submit([encoder.finish()]);
+        gpu.read(staging, bytes, |found| out.copy_from_slice(bytemuck::cast_slice(found)))
+    }
+}
+
+impl Shared {
+    /// Planes of x of a volume that one buffer holds.
+    fn slabs(&self, shape: [usize; 3]) -> Result<Vec<Range<usize>>> {
+        let plane = 4 * (shape[1] * shape[2]) as u64;
+        let bytes = self.gpu.adapter.binding_bytes.min(self.gpu.adapter.buffer_bytes);
+        let most = (bytes / plane) as usize;
+        if most == 0 {
+            return Err(self.gpu.error(format!("a plane of voxels takes {plane} bytes, a buffer holds {bytes}")));
+        }
+        // Parts of nearly the same size.
+        let parts = shape[0].div_ceil(most).max(1);
+        let each = shape[0].div_ceil(parts).max(1);
+        Ok((0..shape[0]).step_by(each).map(|x| x..(x + each).min(shape[0])).collect())
+    }
+}
+
+/// A projector's work on a device.
+pub struct DeviceOperator {
+    shared: Arc<Shared>,
+    forward: Source,
+    adjoint: Source,
+    room: Mutex<Room>,
+    fault: Mutex<Option<Error>>,
+}
+
+/// A projector with its work on a device.
+pub struct OnDevice {
+    inner: Box<dyn VoxelProjector>,
+    operator: DeviceOperator,
+}
+
+impl OnDevice {
+    /// Takes a projector's work to the device; refuses one without WGSL.
+    pub fn new(shared: Arc<Shared>, inner: Box<dyn VoxelProjector>) -> Result<Self> {
+        let name = format!("projector ({})", inner.describe());
+        let fragment = inner.wgsl().ok_or_else(|| {
+            Error::unsupported(format!("{name} on the wgpu backend"), "it offers no WGSL; it runs with --backend cpu")
+        })?;
+        let atomics = shared.gpu.adapter.atomics;
+        let [forward, adjoint] = [true, false].map(|forward| kernel(&fragment, &name, atomics, forward));
+        forward.validate()?;
+        adjoint.validate()?;
+        let operator = DeviceOperator { shared, forward, adjoint, room: Mutex::default(), fault: Mutex::default() };
+        Ok(Self { inner, operator })
+    }
+}
+
+impl VoxelProjector for OnDevice {
+    fn operator(&self) -> &dyn VoxelOperator<f32> {
+        &self.operator
+    }
+    fn reference(&self) -> &dyn VoxelOperator<f64> {
+        self.inner.reference()
+    }
+    fn wgsl(&self) -> Option<Fragment> {
+        self.inner.wgsl()
+    }
+    fn describe(&self) -> String {
+        format!("{}, on {}", self.inner.describe(), self.operator.shared.gpu.adapter)
+    }
+}
+
+impl DeviceOperator {
+    /// How many views are on the device at once.
+    fn views_at_once(&self, pixels: usize) -> usize {
+        let bytes = LINES_BYTES.min(self.shared.gpu.adapter.binding_bytes);
+        (bytes as usize / (4 * pixels).max(1)).max(1)
+    }
+
+    /// Writes the views and says what a launch on the planes `held` is told.
+    fn prepare(&self, room: &mut Room, geometry: &Geometry, views: &[usize]) -> Result<Projection> {
+        let data: Vec<f32> = views.iter().flat_map(|&v| projected(geometry, v)).flatten().collect();
+        room.buffers.reserve(&self.shared.gpu, "views", 4 * data.len() as u64, U::STORAGE | U::COPY_DST)?;
+        room.write(&self.shared, "views", &data);
+        let [rows, columns] = geometry.detector;
+        let pixels = (rows * columns) as u32;
+        Ok(Projection {
+            shape: geometry.volume.shape.map(|n| n as u32),
+            count: views.len() as u32 * pixels,
+            spacing: geometry.volume.spacing.map(|h| h as f32),
+            columns: columns as u32,
+            pixels,
+            ..Projection::default()
+        })
+    }
+
+    fn buffers(&self, room: &mut Room, slab: usize, lines: usize) -> Result<()> {
+        let usage = U::STORAGE | U::COPY_SRC | U::COPY_DST;
+        room.buffers.reserve(&self.shared.gpu, "volume", 4 * slab as u64, usage)?;
+        room.buffers.reserve(&self.shared.gpu, "lines", 4 * lines as u64, usage)?;
+        Ok(())
+    }
+
+    fn project(
+        &self,
+        geometry: &Geometry,
+        views: &[usize],
+        volume: ArrayView3<'_, f32>,
+        mut out: ArrayViewMut3<'_, f32>,
+    ) -> Result<()> {
+        let room = &mut *self.room.lock().unwrap_or_else(PoisonError::into_inner);
+        let shared = &self.shared;
+        let plane = volume.len() / volume.len_of(Axis(0)).max(1);
+        let pixels = geometry.detector[0] * geometry.detector[1];
+        let chunk = self.views_at_once(pixels);
+        let slabs = shared.slabs(geometry.volume.shape)?;
+        for (views, mut out) in views.chunks(chunk).zip(out.axis_chunks_iter_mut(Axis(0), chunk)) {
+            let uniform = self.prepare(room, geometry, views)?;
+            self.buffers(room, slabs[0].len() * plane, views.len() * pixels)?;
+            room.clear(shared, "lines");
+            for slab in &slabs {
+                let part = volume.slice(s![slab.clone(), .., ..]);
+                let part = part.as_standard_layout();
+                room.write(shared, "volume", part.as_slice().unwrap_or_default());
+                let (held, held_end) = (slab.start as u32, slab.end as u32);
+                let told = |begin, end| Projection { held, held_end, begin, end, ..uniform };
+                room.run(shared, "forward projection", &self.forward, ("projection", told), uniform.count)?;
+            }
+            let mut lines = vec![0.0; out.len()];
+            room.read(shared, "lines", &mut lines)?;
+            out.iter_mut().zip(lines).for_each(|(o, l)| *o = l);
+        }
+        Ok(())
+    }
+
+    fn back(
+        &self,
+        geometry: &Geometry,
+        views: &[usize],
+        projections: ArrayView3<'_, f32>,
+        mut volume: ArrayViewMut3<'_, f32>,
+    ) -> Result<()> {
+        let room = &mut *self.room.lock().unwrap_or_else(PoisonError::into_inner);
+        let shared = &self.shared;
+        let plane = volume.len() / volume.len_of(Axis(0)).max(1);
+        let pixels = geometry.detector[0] * geometry.detector[1];
+        let chunk = self.views_at_once(pixels);
+        for slab in shared.slabs(geometry.volume.shape)? {
+            self.buffers(room, slab.len() * plane, chunk.min(views.len()) * pixels)?;
+            room.clear(shared, "volume");
+            for (views, lines) in views.chunks(chunk).zip(projections.axis_chunks_iter(Axis(0), chunk)) {
+                let uniform = self.prepare(room, geometry, views)?;
+                room.write(shared, "lines", lines.as_standard_layout().as_slice().unwrap_or_default());
+                let (held, held_end) = (slab.start as u32, slab.end as u32);
+                let told = |begin, end| Projection { held, held_end, begin, end, ..uniform };
+                room.run(shared, "adjoint of projection", &self.adjoint, ("projection", told), uniform.count)?;
+            }
+            let mut found = vec![0.0; slab.len() * plane];
+            room.read(shared, "volume", &mut found)?;
+            volume.slice_mut(s![slab, .., ..]).iter_mut().zip(found).for_each(|(v, f)| *v += f);
+        }
+        Ok(())
+    }
+
+    fn keep(&self, done: Result<()>) {
+        if let Err(e) = done {
+            self.fault.lock().unwrap_or_else(PoisonError::into_inner).get_or_insert(e);
+        }
+    }
+}
+
+impl VoxelOperator<f32> for DeviceOperator {
+    fn forward(&self, geometry: &Geometry, views: &[usize], volume: ArrayView3<'_, f32>, out: ArrayViewMut3<'_, f32>) {
+        self.keep(self.project(geometry, views, volume, out));
+    }
+
+    fn adjoint(
+        &self,
+        geometry: &Geometry,
+        views: &[usize],
+        projections: ArrayView3<'_, f32>,
+        volume: ArrayViewMut3<'_, f32>,
+    ) {
+        self.keep(self.back(geometry, views, projections, volume));
+    }
+
+    fn fault(&self) -> Result<()> {
+        self.fault.lock().unwrap_or_else(PoisonError::into_inner).take().map_or(Ok(()), Err)
+    }
+}
+
+/// FDK's back-projection on the device; see [`conefield_core::backend::Backend::backproject`].
+pub fn backproject(
+    shared: &Shared,
+    views: &[VoxelView],
+    images: ArrayView3<'_, f32>,
+    mut volume: ArrayViewMut3<'_, f32>,
+) -> Result<()> {
+    let mut source = Source::default();
+    source.add("back-projection", include_str!("kernels/backproject.wgsl"));
+    source.bind("back", Access::Uniform, "Back");
+    source.bind("views", Access::Read, "array<SeenView>");
+    source.bind("images", Access::Read, "array<f32>");
+    source.bind("volume", Access::Write, "array<f32>");
+    let gpu = &shared.gpu;
+    let (count, rows, columns) = images.dim();
+    let shape: [usize; 3] = volume.dim().into();
+    let plane = shape[1] * shape[2];
+    let bytes = 4 * (rows * columns) as u64;
+    if bytes > gpu.adapter.binding_bytes {
+        return Err(gpu.error(format!("a view takes {bytes} bytes, a buffer holds {}", gpu.adapter.binding_bytes)));
+    }
+    let chunk = (LINES_BYTES.min(gpu.adapter.binding_bytes) / bytes).max(1) as usize;
+    let narrow = |n: [f64; 4]| n.map(|x| x as f32);
+    let seen = |v: &VoxelView| SeenView {
+        depth: narrow(v.depth),
+        row: narrow(v.row),
+        column: narrow(v.column),
+        scale: v.scale as f32,
+        pad: [0.0; 3],
+    };
+    let mut room = Room::default();
+    let usage = U::STORAGE | U::COPY_SRC | U::COPY_DST;
+    for slab in shared.slabs(shape)? {
+        let voxels = slab.len() * plane;
+        room.buffers.reserve(gpu, "volume", 4 * voxels as u64, usage)?;
+        room.clear(shared, "volume");
+        for (views, images) in views.chunks(chunk).zip(images.axis_chunks_iter(Axis(0), chunk)) {
+            let seen: Vec<SeenView> = views.iter().map(seen).collect();
+            let n = chunk.min(count) as u64;
+            room.buffers.reserve(gpu, "views", n * size_of::<SeenView>() as u64, usage)?;
+            room.buffers.reserve(gpu, "images", n * bytes, usage)?;
+            room.write(shared, "views", bytemuck::cast_slice(&seen));
+            room.write(shared, "images", images.as_standard_layout().as_slice().unwrap_or_default());
+            let told = |begin, end| Back {
+                shape: shape.map(|n| n as u32),
+                views: views.len() as u32,
+                held: slab.start as u32,
+                begin,
+                end,
+                rows: rows as u32,
+                columns: columns as u32,
+                pad: [0; 3],
+            };
+            room.run(shared, "back-projection", &source, ("back", told), voxels as u32)?;
+        }
+        let mut found = vec![0.0; voxels];
+        room.read(shared, "volume", &mut found)?;
+        volume.slice_mut(s![slab, .., ..]).iter_mut().zip(found).for_each(|(v, f)| *v += f);
+    }
+    Ok(())
+}

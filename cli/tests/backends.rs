@@ -1,0 +1,136 @@
+//! The wgpu backend as a user meets it: listed, explained, and running what the CPU runs.
+
+mod common;
+use common::{done, refused, text};
+use serde_json::Value;
+use std::path::{Path, PathBuf};
+
+fn listed() -> Value {
+    serde_json::from_str(&done(&["backends", "--json"])).unwrap()
+}
+
+/// Whether there is an adapter, a software one included; said on stderr where there is none.
+fn adapter(what: &str) -> bool {
+    let there = !listed()["backends"][1]["adapters"].as_array().unwrap().is_empty();
+    if !there {
+        eprintln!("SKIPPED: no adapter for {what}");
+    }
+    there
+}
+
+fn scan(dir: &Path, voxels: usize, views: usize) -> PathBuf {
+    let (path, phantom, detector) = (dir.join("scan"), format!("phantom:head:{voxels}"), format!("{voxels}x{voxels}"));
+    done(&["simulate", &phantom, "-o", &text(&path), "--views", &views.to_string(), "--detector", &detector]);
+    path
+}
+
+fn reconstruct(scan: &Path, run: &Path, more: &[&str]) -> Value {
+    let (scan, run) = (text(scan), text(run));
+    let all = ["reconstruct", &scan, "--spec", "ni-naf", "-o", &run, "--reference", "truth", "--json"];
+    serde_json::from_str(&done(&[&all[..], more].concat())).unwrap()
+}
+
+#[test]
+fn adapters_are_listed_with_their_limits() {
+    let listed = listed();
+    assert_eq!(listed["backends"][0]["name"], "cpu");
+    for (i, a) in listed["backends"][1]["adapters"].as_array().unwrap().iter().enumerate() {
+        assert_eq!(a["index"], i);
+        assert!(a["binding_bytes"].as_u64().unwrap() >= 1 << 20, "{a}");
+        assert!(a["name"].is_string() && a["atomics"].is_string());
+    }
+    let words = done(&["backends"]);
+    assert!(words.contains("cpu") && words.contains("wgpu"), "{words}");
+}
+
+#[test]
+fn explain_says_what_a_gpu_makes_of_a_spec() {
+    if !adapter("explain") {
+        return;
+    }
+    let said = done(&["explain", "ni-naf", "--backend", "wgpu"]);
+    for words in
+        ["wgpu", "encoder (hash-grid): fused, gradients by", "identity, left out", "split: forward and backward"]
+    {
+        assert!(said.contains(words), "{said} lacks {words:?}");
+    }
+    let auto = done(&["explain", "ni-naf"]);
+    assert!(auto.contains("chosen by --backend auto"), "{auto}");
+    let e = refused(1, &["explain", "ni-naf", "--backend", "wgpu:99"]);
+    assert!(e.contains("99") && e.contains("conefield backends"), "{e}");
+    let e = refused(2, &["explain", "ni-naf", "--backend", "cuda"]);
+    assert!(e.contains("auto, cpu, wgpu"), "{e}");
+}
+
+/// 500 steps of the published method, its mask decided on the way, end at the same PSNR.
+#[test]
+fn ni_naf_ends_where_the_cpu_ends() {
+    if !adapter("a run of ni-naf") {
+        return;
+    }
+    let dir = tempfile::tempdir().unwrap();
+    let scan = scan(dir.path(), 64, 25);
+    let run = |backend: &str| {
+        let settings = ["--steps=500", "--set=solver.rays=64", "--set=projector.samples=48"];
+        let tables = ["--set=encoder.log2_table_size=14", "--backend", backend];
+        let record = reconstruct(&scan, &dir.path().join(backend), &[&settings[..], &tables].concat());
+        assert!(record["backend"]["backend"].as_str().unwrap().starts_with(backend));
+        let psnr = record["scores"]["psnr"].as_f64().unwrap();
+        println!("{backend}: {psnr:.3} dB, {} parameters", record["parameters"]);
+        (psnr, record["parameters"].as_u64().unwrap())
+    };
+    let ((cpu, parameters), (gpu, on_gpu)) = (run("cpu"), run("wgpu"));
+    assert!((cpu - gpu).abs() < 0.1, "CPU {cpu} dB, GPU {gpu} dB");
+    assert_eq!(parameters, on_gpu, "the mask keeps the same channels");
+    assert!(cpu > 15.0, "{cpu} dB is no reconstruction");
+}
+
+const TINY: [&str; 5] = [
+    "--set=encoder.levels=2",
+    "--set=encoder.log2_table_size=10",
+    "--set=solver.rays=48",
+    "--set=projector.samples=16",
+    "--set=field.width=8",
+];
+
+/// A checkpoint of one backend is one of the other, and so are a finished run's weights.
+#[cfg(unix)]
+#[test]
+fn an_interrupted_run_goes_on_on_the_other_backend() {
+    if !adapter("an interrupted run") {
+        return;
+    }
+    use std::process::{Command, Stdio};
+    use std::time::Duration;
+    let dir = tempfile::tempdir().unwrap();
+    let scan = scan(dir.path(), 16, 8);
+    for (first, second) in [("wgpu", "cpu"), ("cpu", "wgpu")] {
+        let run = dir.path().join(first);
+        let command = [&["--steps=400", "--checkpoint-every=0.01s"][..], &TINY].concat();
+        let mut child = Command::new(assert_cmd::cargo::cargo_bin("conefield"))
+            .args(["--quiet", "reconstruct", &text(&scan), "--spec", "ni-naf", "-o", &text(&run)])
+            .args(["--reference", "truth", "--backend", first])
+            .args(&command)
+            .stdout(Stdio::null())
+            .stderr(Stdio::null())
+            .spawn()
+            .unwrap();
+        let checkpoint = run.join("checkpoint.safetensors");
+        while !checkpoint.exists() && child.try_wait().unwrap().is_none() {
+            std::thread::sleep(Duration::from_millis(2));
+        }
+        child.kill().unwrap();
+        child.wait().unwrap();
+        assert!(checkpoint.exists(), "the run on {first} was too fast to be killed");
+        let record = reconstruct(&scan, &run, &[&command[..], &["--backend", second, "--resume"]].concat());
+        assert_eq!(record["steps"], 400);
+        assert!(record["backend"]["backend"].as_str().unwrap().starts_with(second));
+    }
+    let volumes = ["cpu", "wgpu"].map(|backend| {
+        let path = text(&dir.path().join(format!("{backend}.npy")));
+        done(&["export", &text(&dir.path().join("wgpu")), "-o", &path, "--backend", backend]);
+        path
+    });
+    let scores: Value = serde_json::from_str(&done(&["evaluate", &volumes[0], &volumes[1], "--json"])).unwrap();
+    assert!(scores["psnr"].as_f64().unwrap() > 100.0, "{scores}");
+}
