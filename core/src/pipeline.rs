@@ -4,7 +4,7 @@ use crate::arena::{Arena, Block, Layout};
 use crate::backend::{Backend, Executable};
 use crate::error::{Result, ensure};
 use crate::scene::Scene;
-use crate::spec::Spec;
+use crate::spec::{Spec, Tables};
 use crate::stage::{Encoder, Field, Info, Normalizer, Probe, Projector, Scope, Stage};
 use serde::{Deserialize, Serialize};
 use std::ops::Range;
@@ -19,6 +19,8 @@ pub struct Pipeline {
     pub field: Box<dyn Field>,
     /// Rays to samples.
     pub projector: Box<dyn Projector>,
+    /// How tables of features are read.
+    pub tables: Tables,
     layout: Layout,
     ranges: Vec<Range<usize>>,
 }
@@ -66,7 +68,9 @@ impl Pipeline {
         let out = check("field", field.as_ref(), width)?;
         ensure(out == 1, "spec", "field", format!("{out} channels out"), "1, the attenuation")?;
         let projector = spec.projector.as_ref().ok_or_else(|| need("projector"))?.build()?;
-        Ok(Self::assemble(encoder, normalizers, field, projector))
+        let mut pipeline = Self::assemble(encoder, normalizers, field, projector);
+        pipeline.tables = spec.precision.tables;
+        Ok(pipeline)
     }
 
     /// Puts built stages together; their widths must fit.
@@ -76,7 +80,8 @@ impl Pipeline {
         field: Box<dyn Field>,
         projector: Box<dyn Projector>,
     ) -> Self {
-        let mut p = Self { encoder, normalizers, field, projector, layout: Layout::default(), ranges: vec![] };
+        let (tables, layout) = (Tables::default(), Layout::default());
+        let mut p = Self { encoder, normalizers, field, projector, tables, layout, ranges: vec![] };
         p.lay_out();
         p
     }

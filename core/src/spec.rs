@@ -33,6 +33,9 @@ pub struct Spec {
     /// Libraries with stages that the spec names.
     #[serde(default, skip_serializing_if = "Plugins::is_empty")]
     pub plugins: Plugins,
+    /// In which precision a field computes.
+    #[serde(default, skip_serializing_if = "Precision::is_single")]
+    pub precision: Precision,
     /// Points to features.
     #[serde(default, deserialize_with = "stage::one")]
     pub encoder: Option<Box<dyn EncoderSpec>>,
@@ -66,6 +69,44 @@ impl Plugins {
     /// Whether none is named.
     pub fn is_empty(&self) -> bool {
         self.paths.is_empty()
+    }
+}
+
+/// In which precision a field computes. Sums, gradients, moments and the parameters that training changes are `f32`.
+#[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
+#[serde(deny_unknown_fields, default)]
+pub struct Precision {
+    /// In which tables of features are read. The wgpu backend alone reads halves.
+    pub tables: Tables,
+}
+
+impl Precision {
+    /// Whether all is `f32`.
+    pub fn is_single(&self) -> bool {
+        self.tables == Tables::F32
+    }
+}
+
+/// How parameters are read of which a row touches few.
+#[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
+#[serde(rename_all = "kebab-case")]
+pub enum Tables {
+    /// As they are.
+    #[default]
+    F32,
+    /// Rounded to 11 bits, magnitudes from 6e-8 to 65504.
+    F16,
+    /// Rounded to 8 bits, magnitudes as of `f32`.
+    Bf16,
+}
+
+impl std::fmt::Display for Tables {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        f.write_str(match self {
+            Self::F32 => "f32",
+            Self::F16 => "f16",
+            Self::Bf16 => "bf16",
+        })
     }
 }
 

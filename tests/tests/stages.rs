@@ -8,7 +8,7 @@ use conefield_conformance::{
 };
 use conefield_core::arena::Weights;
 use conefield_core::registry::{Kind, names};
-use conefield_core::spec::{EncoderSpec, FieldSpec, InitializerSpec, NormalizerSpec, ProjectorSpec};
+use conefield_core::spec::{EncoderSpec, FieldSpec, InitializerSpec, NormalizerSpec, ProjectorSpec, Tables};
 use conefield_core::stage::Stage;
 use serde_json::{Value, json};
 
@@ -28,7 +28,7 @@ fn expect(report: Report) {
 fn on_a_device(stage: &dyn Stage, options: &Options) {
     assert!(stage.info().identity || stage.wgsl().is_some(), "{} offers no WGSL", stage.describe());
     if let Some(shared) = device::shared("the WGSL of a stage") {
-        expect(check_wgsl(stage, options, &|s, p, x, dy, rows| shared.pass(s, p, x, dy, rows)));
+        expect(check_wgsl(stage, options, &|s, p, x, dy, rows| shared.pass(s, Tables::F32, p, x, dy, rows)));
     }
 }
 

@@ -15,6 +15,7 @@ use conefield_core::pipeline::{Model, Pipeline};
 use conefield_core::random::{mix, unit};
 use conefield_core::scene::Scene;
 use conefield_core::solver::{Job, Limits, Observer, PretrainJob, Record};
+use conefield_core::spec::Tables;
 use conefield_core::stage::{Encoder, Field, Info, Kernel, Normalizer, Parameter, Projector, Reduced, Scope, Stage};
 use conefield_core::wgsl::Fragment;
 use serde_json::{Value, json};
@@ -374,7 +375,9 @@ fn a_perturbed_constant_fails_the_parity_check() {
         let settings = json!({"type": "mlp", "width": 5, "depth": 2, "skips": []});
         let spec: Box<dyn conefield_core::spec::FieldSpec> = serde_json::from_value(settings).unwrap();
         let stage = Changed { inner: spec.build(3).unwrap(), change, scope: Scope::Row };
-        conefield_conformance::check_wgsl(&stage, &options, &|s, p, x, dy, rows| shared.pass(s, p, x, dy, rows))
+        conefield_conformance::check_wgsl(&stage, &options, &|s, p, x, dy, rows| {
+            shared.pass(s, Tables::F32, p, x, dy, rows)
+        })
     };
     assert!(check(Some).passed());
     let perturbed: [fn(String) -> Option<String>; 4] = [
@@ -392,7 +395,8 @@ fn a_perturbed_constant_fails_the_parity_check() {
 #[test]
 fn stages_of_random_shapes_agree() {
     let Some(shared) = device::shared("random shapes") else { return };
-    let pass = |s: &dyn Stage, p: &[f32], x: &[f32], dy: &[f32], rows: usize| shared.pass(s, p, x, dy, rows);
+    let pass =
+        |s: &dyn Stage, p: &[f32], x: &[f32], dy: &[f32], rows: usize| shared.pass(s, Tables::F32, p, x, dy, rows);
     let mut n = 0u64;
     let mut below = |k: u64| {
         n += 1;
@@ -470,4 +474,50 @@ fn samples_are_random_in_the_same_way() {
     let run = |p: &dyn Projector| conefield_conformance::check_projector_wgsl(p, &|p, rays| shared.samples(p, rays));
     assert!(run(spec.build().unwrap().as_ref()).passed());
     assert!(!run(&Off(spec.build().unwrap())).passed());
+}
+
+// ---- halves ----
+
+/// Tables in halves are as far off as rounding to 11 and 8 bits makes them, and training in them loses next to nothing.
+#[test]
+fn tables_in_halves_are_off_by_their_rounding() {
+    let Some(shared) = device::shared("tables in halves") else { return };
+    let grid = json!({"type": "hash-grid", "levels": 3, "log2_table_size": 8, "base_resolution": 4});
+    let spec: Box<dyn conefield_core::spec::EncoderSpec> = serde_json::from_value(grid).unwrap();
+    let stage = spec.build().unwrap();
+    let n = 300;
+    let params: Vec<f32> = (0..stage.info().params as u64).map(|i| 2.0 * unit(mix(8, i)) - 1.0).collect();
+    let x: Vec<f32> = (0..3 * n).map(|i| unit(mix(9, i))).collect();
+    let dy = vec![1.0; stage.info().output * n as usize];
+    let run = |tables| shared.pass(stage.as_ref(), tables, &params, &x, &dy, n as usize).unwrap();
+    let [want, grads, _] = run(Tables::F32);
+    for (tables, bits) in [(Tables::F16, 11), (Tables::Bf16, 8)] {
+        let [y, same, _] = run(tables);
+        let off = y.iter().zip(&want).map(|(a, b)| (a - b).abs()).fold(0.0f32, f32::max);
+        let rounding = 0.5f32.powi(bits);
+        println!("{tables}: off by {off:.1e}, rounding {rounding:.1e}");
+        assert!(off <= rounding && off > rounding / 30.0, "{tables}: {off}");
+        let top = grads.iter().fold(0.0f32, |m, g| m.max(g.abs()));
+        assert!(grads.iter().zip(&same).all(|(a, b)| (a - b).abs() <= 1e-5 * top), "gradients stay f32");
+    }
+}
+
+#[test]
+fn a_run_with_tables_in_halves_ends_near_one_in_f32() {
+    let e = {
+        let mut s = settings();
+        s["precision"] = json!({"tables": "f16"});
+        solve(&s, &scan(), &Weights::default()).err().unwrap().to_string()
+    };
+    assert!(e.contains("precision.tables") && e.contains("--backend wgpu"), "{e}");
+    for (name, backend) in device::backends("a run in halves").into_iter().step_by(2) {
+        let (whole, _) = psnr(&settings(), &backend);
+        for tables in ["f16", "bf16"] {
+            let mut s = settings();
+            s["precision"] = json!({ "tables": tables });
+            let (halves, _) = psnr(&s, &backend);
+            println!("{name}, {tables}: {halves:.3} dB, f32 {whole:.3} dB");
+            assert!((halves - whole).abs() < 0.2 && halves != whole, "{name}, {tables}: {halves} dB, f32 {whole} dB");
+        }
+    }
 }

@@ -13,9 +13,10 @@ pub mod rows;
 pub mod step;
 
 use conefield_core::backend::{Adam, Backend, Executable, Explain, StepStats, Work};
-use conefield_core::error::{Error, Result};
+use conefield_core::error::{Error, Result, ensure};
 use conefield_core::pipeline::{Model, Pipeline};
 use conefield_core::simd;
+use conefield_core::spec::Tables;
 use conefield_core::stage::{GradKind, Samples, TILE_ROWS, UnitRay};
 use rayon::prelude::*;
 use rows::{Belong, Encoded, Kernels, Scratch};
@@ -41,6 +42,9 @@ impl Backend for Cpu {
     }
 
     fn compile(&self, pipeline: &Pipeline) -> Result<(Box<dyn Executable>, Explain)> {
+        let found = format!("{:?}", pipeline.tables.to_string());
+        let expected = "\"f32\" on the CPU; --backend wgpu reads halves";
+        ensure(pipeline.tables == Tables::F32, "spec", "precision.tables", found, expected)?;
         let mut notes = vec![];
         for (name, stage) in pipeline.stages() {
             let info = stage.info();

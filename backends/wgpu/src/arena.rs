@@ -1,8 +1,10 @@
 //! Parameters, gradients and moments on the device, in as many buffers as its limits ask for.
 
-use crate::compose::Chain;
+use crate::Shared;
+use crate::compose::{self, Chain};
 use crate::device::Gpu;
 use crate::kernel::Buffers;
+use crate::wave::MOST_GROUPS;
 use conefield_core::arena::Arena;
 use conefield_core::error::Result;
 use std::ops::Range;
@@ -28,6 +30,12 @@ pub fn allocate(gpu: &Gpu, buffers: &mut Buffers, chain: &Chain, params: usize, 
             buffers.reserve(gpu, &format!("{part}_{s}"), bytes, U::STORAGE | U::COPY_SRC | U::COPY_DST)?;
         }
     }
+    if chain.halves().is_some() {
+        for s in 0..chain.segments() {
+            let bytes = 2 * segment(chain, s, params, size).len() as u64;
+            buffers.reserve(gpu, &format!("halves_{s}"), bytes, U::STORAGE)?;
+        }
+    }
     if chain.uniform() {
         buffers.reserve(gpu, "dense", 4 * chain.dense as u64, U::UNIFORM | U::COPY_DST)?;
     }
@@ -35,7 +43,8 @@ pub fn allocate(gpu: &Gpu, buffers: &mut Buffers, chain: &Chain, params: usize, 
 }
 
 /// Takes the arena to the device.
-pub fn upload(gpu: &Gpu, buffers: &Buffers, chain: &Chain, arena: &Arena, size: usize) -> Result<()> {
+pub fn upload(shared: &Shared, buffers: &Buffers, chain: &Chain, arena: &Arena) -> Result<()> {
+    let (gpu, size) = (&shared.gpu, shared.target().segment);
     let parts = [&arena.params, &arena.grads, &arena.first, &arena.second];
     for (part, data) in PARTS.iter().zip(parts) {
         for s in 0..chain.segments() {
@@ -48,14 +57,30 @@ pub fn upload(gpu: &Gpu, buffers: &Buffers, chain: &Chain, arena: &Arena, size: 
             }
         }
     }
+    refresh(shared, buffers, chain)
+}
+
+/// Makes the copies anew that parameters are read from: of those that every row reads in the uniform buffer, of tables
+/// in halves.
+pub fn refresh(shared: &Shared, buffers: &Buffers, chain: &Chain) -> Result<()> {
+    let (gpu, size) = (&shared.gpu, shared.target().segment);
     let mut encoder = gpu.device.create_command_encoder(&Default::default());
-    refresh_dense(buffers, chain, &mut encoder, size);
+    copy_dense(buffers, chain, &mut encoder, size);
+    if let Some(tables) = chain.halves() {
+        let kernel = shared.kernels.get(gpu, "halve", &compose::halve(tables))?;
+        for s in 0..chain.segments() {
+            let own = |name: &str| buffers.get(&format!("{name}_{s}"));
+            let bound = kernel.bind_as(gpu, own)?;
+            let words = own("halves").map_or(0, |b| b.size() / 4);
+            let groups = words.div_ceil(256).clamp(1, MOST_GROUPS as u64) as u32;
+            kernel.launch(&mut encoder.begin_compute_pass(&Default::default()), &bound, groups);
+        }
+    }
     gpu.queue.submit([encoder.finish()]);
     gpu.fault()
 }
 
-/// Copies the parameters that every row reads to the uniform buffer.
-pub fn refresh_dense(buffers: &Buffers, chain: &Chain, encoder: &mut wgpu::CommandEncoder, size: usize) {
+fn copy_dense(buffers: &Buffers, chain: &Chain, encoder: &mut wgpu::CommandEncoder, size: usize) {
     let Some(dense) = buffers.get("dense") else { return };
     let mut at = 0;
     for range in chain.dense_ranges() {

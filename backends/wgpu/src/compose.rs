@@ -9,6 +9,7 @@ use crate::device::Atomics;
 use crate::source::{Access, Source};
 use conefield_core::error::{Error, Result};
 use conefield_core::pipeline::Pipeline;
+use conefield_core::spec::Tables;
 use conefield_core::stage::{GradKind, Info, Projector, Scope, Stage};
 use conefield_core::wgsl::{Fragment, RANDOM, RAY, Sum};
 use std::fmt::Write;
@@ -56,6 +57,8 @@ pub struct Chain {
     pub dense: usize,
     /// Parameters of the arena.
     params: usize,
+    /// How parameters are read whose gradients are scattered.
+    tables: Tables,
     target: Target,
 }
 
@@ -76,7 +79,14 @@ fn titled(name: &str, what: &str) -> String {
 impl Chain {
     /// The stages of a pipeline; refuses those that cannot run on a GPU.
     pub fn new(pipeline: &Pipeline, target: Target) -> Result<Self> {
-        let mut chain = Self { links: vec![], encoder: false, dense: 0, params: pipeline.layout().len(), target };
+        let mut chain = Self {
+            links: vec![],
+            encoder: false,
+            dense: 0,
+            params: pipeline.layout().len(),
+            tables: pipeline.tables,
+            target,
+        };
         for (i, ((name, stage), range)) in pipeline.stages().into_iter().zip(pipeline.ranges()).enumerate() {
             if stage.info().identity {
                 continue;
@@ -89,9 +99,9 @@ impl Chain {
     }
 
     /// One stage alone, with all that it can do.
-    pub fn single(stage: &dyn Stage, target: Target) -> Result<Self> {
+    pub fn single(stage: &dyn Stage, tables: Tables, target: Target) -> Result<Self> {
         let params = stage.info().params;
-        let mut chain = Self { links: vec![], encoder: false, dense: 0, params, target };
+        let mut chain = Self { links: vec![], encoder: false, dense: 0, params, tables, target };
         chain.link("stage", stage, 0..params, true)?;
         Ok(chain)
     }
@@ -126,6 +136,12 @@ impl Chain {
     /// Whether the parameters that every row reads are in a uniform buffer, from which a device reads fastest.
     pub fn uniform(&self) -> bool {
         self.dense > 0 && 4 * self.dense.next_multiple_of(4) <= self.target.uniform_bytes
+    }
+
+    /// How the copy of the parameters is rounded that tables are read from; `None` where they are read as they are.
+    pub fn halves(&self) -> Option<Tables> {
+        let scattered = self.links.iter().any(|l| l.info.grads == GradKind::Scatter);
+        (scattered && self.tables != Tables::F32).then_some(self.tables)
     }
 
     /// Of the parameters whose gradients are summed over rows: their places in the arena, in the order in which they
@@ -164,12 +180,25 @@ impl Chain {
         for s in 0..self.segments() {
             source.bind(&format!("params_{s}"), Access::Read, "array<f32>");
         }
+        if self.halves().is_some() {
+            for s in 0..self.segments() {
+                source.bind(&format!("halves_{s}"), Access::Read, "array<u32>");
+            }
+        }
         if self.uniform() {
             source.bind("dense", Access::Uniform, &format!("array<vec4<f32>, {}>", self.dense.div_ceil(4)));
         }
         let mut text = String::from("fn arena_param(i: u32) -> f32 {\n");
         self.each_segment(&mut text, |s, i| format!("return params_{s}[{i}];"));
         text += "    return 0.0;\n}\n";
+        if let Some(tables) = self.halves() {
+            text += "fn arena_half(i: u32) -> f32 {\n";
+            self.each_segment(&mut text, |s, i| match tables {
+                Tables::F16 => format!("let at = {i}; return unpack2x16float(halves_{s}[at >> 1u])[at & 1u];"),
+                _ => format!("let at = {i}; return bitcast<f32>((halves_{s}[at >> 1u] >> ((at & 1u) * 16u)) << 16u);"),
+            });
+            text += "    return 0.0;\n}\n";
+        }
         if gradients {
             let number = match self.target.atomics {
                 Atomics::Native => "f32",
@@ -218,9 +247,12 @@ impl Chain {
 
     /// What `link` may call, and its own functions.
     fn include(&self, source: &mut Source, link: &Link, gradients: bool) {
-        let Link { name, prefix, fragment, range, partial, wants_dx, .. } = link;
+        let Link { name, prefix, fragment, info, range, partial, wants_dx } = link;
         let first = range.start;
         let param = match partial {
+            None if self.halves().is_some() && info.grads == GradKind::Scatter => {
+                format!("arena_half({first}u + i)")
+            }
             Some(offset) if self.uniform() => format!("dense[({offset}u + i) >> 2u][({offset}u + i) & 3u]"),
             _ => format!("arena_param({first}u + i)"),
         };
@@ -622,6 +654,27 @@ pub fn loss(part: Part) -> Source {
         }
         Part::Blocks => source.add("loss of blocks", include_str!("kernels/tv.wgsl")),
     }
+    source
+}
+
+/// Rounds parameters to halves, two in a word.
+pub fn halve(tables: Tables) -> Source {
+    let mut source = Source::default();
+    source.bind("params", Access::Read, "array<f32>");
+    source.bind("halves", Access::Write, "array<u32>");
+    let pack = match tables {
+        Tables::F16 => "fn pack(a: f32, b: f32) -> u32 { return pack2x16float(vec2<f32>(a, b)); }",
+        // To the nearest, ties to even.
+        _ => {
+            "fn round16(x: f32) -> u32 {
+    let bits = bitcast<u32>(x);
+    return (bits + 0x7fffu + ((bits >> 16u) & 1u)) >> 16u;
+}
+fn pack(a: f32, b: f32) -> u32 { return round16(a) | (round16(b) << 16u); }"
+        }
+    };
+    source.add("pack", pack);
+    source.add("halve", include_str!("kernels/halve.wgsl"));
     source
 }
 

@@ -21,7 +21,7 @@ const PARTIAL_BYTES: usize = 64 << 20;
 /// Groups of `backward` at most: enough to fill a device, few enough that their sums are merged fast.
 const BACKWARD_GROUPS: usize = 2048;
 /// Rows of a wave at first, at least, and at most.
-const FIRST_ROWS: u32 = 1 << 16;
+const FIRST_ROWS: u32 = 1 << 14;
 const LEAST_ROWS: u32 = 1 << 12;
 const MOST_ROWS: u32 = 1 << 20;
 /// A wave should take less than the second, of the half second after which a watchdog may step in, and may grow where it
@@ -141,7 +141,8 @@ impl Wgpu {
     /// Bytes that it comes to hold on the device.
     pub fn device_bytes(&self) -> u64 {
         let rows = u64::from(MOST_ROWS) * self.row_bytes();
-        16 * self.chain.params() as u64 + rows + 4 * (self.groups() * self.chain.dense) as u64
+        let halves = self.chain.halves().map_or(0, |_| 2);
+        (16 + halves) * self.chain.params() as u64 + rows + 4 * (self.groups() * self.chain.dense) as u64
     }
 
     /// Bytes that it comes to hold in the machine's memory for copies.
@@ -172,7 +173,7 @@ impl Wgpu {
         let (shared, size) = (self.shared.clone(), self.shared.target().segment);
         let params = model.arena.params.len();
         arena::allocate(&shared.gpu, &mut self.buffers, &self.chain, params, size)?;
-        arena::upload(&shared.gpu, &self.buffers, &self.chain, &model.arena, size)?;
+        arena::upload(&shared, &self.buffers, &self.chain, &model.arena)?;
         self.buffers.reserve(&shared.gpu, "step", size_of::<Step>() as u64, U::UNIFORM | U::COPY_DST)?;
         self.buffers.reserve(&shared.gpu, "rule", size_of::<Rule>() as u64, U::UNIFORM | U::COPY_DST)?;
         if self.chain.dense > 0 {
@@ -493,9 +494,7 @@ impl Executable for Wgpu {
             }
             self.gpu().queue.submit([encoder.finish()]);
         }
-        let mut encoder = self.encoder();
-        arena::refresh_dense(&self.buffers, &self.chain, &mut encoder, size);
-        self.gpu().queue.submit([encoder.finish()]);
+        arena::refresh(&self.shared, &self.buffers, &self.chain)?;
         self.clean = true;
         self.collect()?;
         self.gpu().fault()

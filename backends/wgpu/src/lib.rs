@@ -121,6 +121,9 @@ impl Backend for Wgpu {
             }
             n => format!("split: forward and backward; {n} features a sample are kept in between"),
         });
+        if let Some(tables) = chain.halves() {
+            notes.push(format!("tables are read from a copy in {tables}"));
+        }
         if chain.segments() > 1 {
             notes.push(format!(
                 "parameters in {} buffers, as one may have {} bytes",

@@ -8,21 +8,30 @@ use crate::kernel::Buffers;
 use crate::wave::GpuRay;
 use conefield_core::arena::Arena;
 use conefield_core::error::Result;
+use conefield_core::spec::Tables;
 use conefield_core::stage::{Projector, Samples, Stage, UnitRay};
 use wgpu::BufferUsages as U;
 
 impl Shared {
     /// Runs a stage forward and backward on `x` and `dy`, channel-major with `rows` rows. Returns its outputs, the
     /// gradients of its parameters and those of its inputs.
-    pub fn pass(&self, stage: &dyn Stage, params: &[f32], x: &[f32], dy: &[f32], rows: usize) -> Result<[Vec<f32>; 3]> {
+    pub fn pass(
+        &self,
+        stage: &dyn Stage,
+        tables: Tables,
+        params: &[f32],
+        x: &[f32],
+        dy: &[f32],
+        rows: usize,
+    ) -> Result<[Vec<f32>; 3]> {
         let (gpu, target) = (&self.gpu, self.target());
-        let chain = Chain::single(stage, target)?;
+        let chain = Chain::single(stage, tables, target)?;
         let info = stage.info();
         let mut buffers = Buffers::default();
         let mut arena = Arena::new(params.len());
         arena.params.copy_from_slice(params);
         arena::allocate(gpu, &mut buffers, &chain, params.len(), target.segment)?;
-        arena::upload(gpu, &buffers, &chain, &arena, target.segment)?;
+        arena::upload(self, &buffers, &chain, &arena)?;
         let groups = rows.div_ceil(GROUP as usize).min(7);
         let (inputs, outputs) = (4 * (info.input * rows) as u64, 4 * (info.output * rows) as u64);
         let usage = U::STORAGE | U::COPY_DST | U::COPY_SRC;

@@ -73,7 +73,8 @@ impl Source {
             Ok(module) => module,
             Err(e) => return Err(self.fault(e.location(&self.text).map(|l| l.line_number as usize), e.message())),
         };
-        let capabilities = naga::valid::Capabilities::SHADER_FLOAT32_ATOMIC;
+        use naga::valid::Capabilities;
+        let capabilities = Capabilities::SHADER_FLOAT32_ATOMIC | Capabilities::SHADER_FLOAT16_IN_FLOAT32;
         let mut validator = naga::valid::Validator::new(naga::valid::ValidationFlags::all(), capabilities);
         validator.validate(&module).map(drop).map_err(|e| {
             let line = e.location(&self.text).map(|l| l.line_number as usize);

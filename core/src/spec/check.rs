@@ -31,7 +31,7 @@ pub(super) fn spec(root: &Node) -> Result<()> {
             stage(&e.value, *kind, key)?;
         } else {
             let known: Vec<&str> =
-                TEXTS.into_iter().chain(["scene", "plugins"]).chain(STAGES.iter().map(|s| s.0)).collect();
+                TEXTS.into_iter().chain(["scene", "plugins", "precision"]).chain(STAGES.iter().map(|s| s.0)).collect();
             return Err(unknown(&e.at, key, key, &known));
         }
     }

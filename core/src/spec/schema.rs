@@ -1,6 +1,6 @@
 //! JSON Schemas: of one stage type, and of a whole spec for editors.
 
-use super::{Plugins, Scene};
+use super::{Plugins, Precision, Scene};
 use crate::registry::{Kind, StageType, stage_types};
 use serde_json::{Map, Value, json};
 
@@ -32,7 +32,7 @@ pub(super) fn of_type(stage: &StageType) -> Value {
 }
 
 /// The keys of a spec that hold settings of no stage, with their schemas.
-pub(super) fn tables() -> [(&'static str, Value); 2] {
+pub(super) fn tables() -> [(&'static str, Value); 3] {
     let of = |schema: schemars::Schema| {
         let mut schema = schema.to_value();
         if let Value::Object(s) = &mut schema {
@@ -40,7 +40,11 @@ pub(super) fn tables() -> [(&'static str, Value); 2] {
         }
         schema
     };
-    [("scene", of(schemars::schema_for!(Scene))), ("plugins", of(schemars::schema_for!(Plugins)))]
+    [
+        ("scene", of(schemars::schema_for!(Scene))),
+        ("plugins", of(schemars::schema_for!(Plugins))),
+        ("precision", of(schemars::schema_for!(Precision))),
+    ]
 }
 
 /// The JSON Schema of a spec file, for editors: every registered stage type with its settings.
@@ -74,6 +78,7 @@ pub fn pipeline() -> Value {
             "description": { "type": "string", "description": "What it is for, in a sentence." },
             "scene": stage("scene", "How the scan is mapped to what stages see."),
             "plugins": stage("plugins", "Libraries with stages that the spec names."),
+            "precision": stage("precision", "In which precision a field computes."),
             "encoder": stage("encoder", "Points to features."),
             "normalizers": {
                 "description": "Features to features, in order.",

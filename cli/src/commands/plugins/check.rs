@@ -9,6 +9,7 @@ use conefield_conformance::{
 };
 use conefield_core::arena::Weights;
 use conefield_core::registry::{self, Make, Origin};
+use conefield_core::spec::Tables;
 use conefield_core::stage::{Projector, Stage};
 use conefield_core::{Error, Result};
 use conefield_plugins::library::Type;
@@ -289,7 +290,7 @@ impl Device {
             return report;
         }
         self.beside(report, stage.wgsl().is_some(), |shared| {
-            check_wgsl(stage, options, &|s, p, x, dy, rows| shared.pass(s, p, x, dy, rows))
+            check_wgsl(stage, options, &|s, p, x, dy, rows| shared.pass(s, Tables::F32, p, x, dy, rows))
         })
     }
 
