@@ -40,7 +40,7 @@ impl Profile {
         }))
     }
 
-    /// Timestamps for the pass of `label`. At most [`LAUNCHES`] between two calls of [`Profile::collect`]; further ones
+    /// Timestamps for the pass of `label`. At most 512 between two calls of [`Profile::collect`]; further ones
     /// are not timed.
     pub fn around(&mut self, label: &'static str) -> Option<wgpu::ComputePassTimestampWrites<'_>> {
         let at = self.waiting.len() as u32;
