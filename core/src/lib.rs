@@ -2,6 +2,7 @@
 //!
 //! - [`geometry`], [`scan`], [`parts`]: what was measured, in millimetres, and what comes out.
 //! - [`simd`], [`dense`], [`trilinear`], [`stage`]: what a stage computes and how.
+//! - [`support`]: where the object can be.
 //! - [`wgsl`]: the same for a GPU.
 //! - [`arena`]: parameters, gradients and optimizer state under their names.
 //! - [`files`]: opening what a user or a description names.
@@ -27,6 +28,7 @@ pub mod simd;
 pub mod solver;
 pub mod spec;
 pub mod stage;
+pub mod support;
 pub mod trained;
 pub mod trilinear;
 pub mod voxel;

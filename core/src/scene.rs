@@ -5,6 +5,8 @@ use crate::geometry::{Geometry, Ray, Vec3, VoxelGrid, dot, norm, sub};
 use crate::scan::Scan;
 use crate::spec;
 use crate::stage::UnitRay;
+use crate::support::Support;
+use std::sync::Arc;
 
 /// Maps lengths to cube sides and attenuation to order one, by the scan alone.
 #[derive(Debug, Clone, PartialEq)]
@@ -15,6 +17,8 @@ pub struct Scene {
     pub side: f64,
     /// The box to reconstruct, mm.
     pub bounds: [Vec3; 2],
+    /// Where in it the object can be, if that is known.
+    pub support: Option<Arc<Support>>,
     /// The voxels to export.
     pub grid: VoxelGrid,
     /// The attenuation that stages see as 1, in 1/mm.
@@ -61,10 +65,29 @@ impl Scene {
             origin: std::array::from_fn(|k| grid.center[k] - side / 2.0),
             side,
             bounds,
+            support: None,
             grid,
             attenuation,
             published_reach: size[0].hypot(size[1]) / 2.0 + 0.0125 * longest,
         })
+    }
+
+    /// The scene with the unit cube around `support` instead of the whole volume.
+    pub fn within(mut self, support: Support, settings: &spec::Scene) -> Self {
+        let (box_, all) = (support.bounds(), self.grid.bounds());
+        self.bounds =
+            [std::array::from_fn(|k| box_[0][k].max(all[0][k])), std::array::from_fn(|k| box_[1][k].min(all[1][k]))];
+        let [low, high] = self.bounds;
+        let longest = (0..3).map(|k| high[k] - low[k]).fold(0.0, f64::max);
+        self.side = longest / settings.fill;
+        self.origin = std::array::from_fn(|k| (low[k] + high[k] - self.side) / 2.0);
+        self.support = Some(Arc::new(support));
+        self
+    }
+
+    /// Whether the object may be at `p` (mm).
+    pub fn holds(&self, p: Vec3) -> bool {
+        self.support.as_ref().is_none_or(|s| s.holds(p))
     }
 
     /// A world position in the unit cube.
@@ -75,7 +98,11 @@ impl Scene {
     /// A ray in the unit cube; one that misses the reconstruction box has no length inside. `axis` is the unit vector
     /// from the source to the detector along which the published codes measure depth.
     pub fn ray(&self, ray: &Ray, axis: Vec3) -> UnitRay {
-        let inside = ray.clip(self.bounds).unwrap_or([0.0; 2]);
+        let inside = match &self.support {
+            Some(support) => support.clip(ray),
+            None => ray.clip(self.bounds),
+        }
+        .unwrap_or([0.0; 2]);
         let depth = dot(ray.direction, axis);
         let to_axis = dot(sub(self.grid.center, ray.origin), axis);
         let s = self.side;

@@ -119,12 +119,26 @@ pub struct Scene {
     pub fill: f64,
     /// The attenuation that stages see as 1.
     pub attenuation: AttenuationScale,
+    /// Where in the volume the object can be.
+    pub support: SupportRule,
 }
 
 impl Default for Scene {
     fn default() -> Self {
-        Self { fill: 1.0, attenuation: AttenuationScale::Scan }
+        Self { fill: 1.0, attenuation: AttenuationScale::Scan, support: SupportRule::Box }
     }
+}
+
+/// Where in the volume the object can be.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
+#[serde(rename_all = "kebab-case")]
+pub enum SupportRule {
+    /// Anywhere.
+    Box,
+    /// Where no view shows air: a cell that several views see nothing but air through is left out, the unit cube is
+    /// fitted to the rest, and rays are sampled between the first and the last cell that is left. Views whose sides the
+    /// object reaches say nothing.
+    Carve,
 }
 
 /// The attenuation that stages see as 1.

@@ -8,6 +8,7 @@ use crate::pipeline::{Masked, Model, Pipeline};
 use crate::scan::Affine;
 use crate::scene::Scene;
 use crate::spec::Spec;
+use crate::support::Support;
 use ndarray::ArrayViewMut3;
 use serde::{Deserialize, Serialize};
 
@@ -36,6 +37,9 @@ pub struct Placement {
     pub unit_mm: f64,
     /// Channels that normalizers removed, in order.
     pub masks: Vec<Masked>,
+    /// Where in the volume the object can be, if that was found out.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub support: Option<Support>,
 }
 
 impl TrainedField {
@@ -46,6 +50,7 @@ impl TrainedField {
             attenuation: self.scene.attenuation,
             unit_mm: self.unit_mm,
             masks: self.model.masks().to_vec(),
+            support: self.scene.support.as_deref().cloned(),
         }
     }
 
@@ -57,7 +62,10 @@ impl TrainedField {
         }
         load(&mut model)?;
         placement.grid.validate("placement")?;
-        let scene = Scene::with_attenuation(placement.grid, &spec.scene, placement.attenuation)?;
+        let mut scene = Scene::with_attenuation(placement.grid, &spec.scene, placement.attenuation)?;
+        if let Some(support) = placement.support.clone() {
+            scene = scene.within(support, &spec.scene);
+        }
         Ok(Self { model, scene, unit_mm: placement.unit_mm })
     }
 
@@ -65,23 +73,25 @@ impl TrainedField {
     pub fn voxels(&self, backend: &dyn Backend, grid: VoxelGrid) -> Result<FieldVoxels<'_>> {
         let (exe, _) = backend.compile(&self.model.pipeline)?;
         let scale = (self.scene.attenuation * self.unit_mm) as f32;
-        Ok(FieldVoxels { field: self, grid, exe, scale, points: vec![], values: vec![] })
+        Ok(FieldVoxels { field: self, grid, exe, scale, points: vec![], places: vec![], values: vec![] })
     }
 }
 
-/// A field's values at the voxels of a grid, evaluated where they are asked for.
+/// A field's values at the voxels of a grid, evaluated where they are asked for; 0 where the object cannot be.
 pub struct FieldVoxels<'a> {
     field: &'a TrainedField,
     grid: VoxelGrid,
     exe: Box<dyn Executable>,
     scale: f32,
     points: Vec<[f32; 3]>,
+    /// Which of the voxels at hand the points are.
+    places: Vec<usize>,
     values: Vec<f32>,
 }
 
 impl FieldVoxels<'_> {
     /// Bytes that evaluation works in, beside what the backend needs.
-    pub const BYTES: u64 = 16 * POINTS as u64;
+    pub const BYTES: u64 = 24 * POINTS as u64;
 }
 
 impl Voxels for FieldVoxels<'_> {
@@ -94,7 +104,7 @@ impl Voxels for FieldVoxels<'_> {
     }
 
     fn fill(&mut self, part: &Part, mut out: ArrayViewMut3<'_, f32>) -> Result<()> {
-        let Self { field, grid, exe, scale, points, values } = self;
+        let Self { field, grid, exe, scale, points, places, values } = self;
         let [xs, ys, zs] = part;
         // In the order in which `out` is gone through.
         let mut voxels = xs.clone().flat_map(|x| ys.clone().flat_map(move |y| zs.clone().map(move |z| [x, y, z])));
@@ -102,22 +112,33 @@ impl Voxels for FieldVoxels<'_> {
         let mut at = 0;
         loop {
             points.clear();
-            points.extend(voxels.by_ref().take(POINTS).map(|v| field.scene.to_unit(grid.voxel(v))));
-            if points.is_empty() {
+            places.clear();
+            let mut taken = 0;
+            for (i, voxel) in voxels.by_ref().take(POINTS).enumerate() {
+                let p = grid.voxel(voxel);
+                if field.scene.holds(p) {
+                    points.push(field.scene.to_unit(p));
+                    places.push(i);
+                }
+                taken = i + 1;
+            }
+            if taken == 0 {
                 return Ok(());
             }
             values.resize(points.len(), 0.0);
             exe.evaluate(&field.model, points, values)?;
-            for (value, out) in values.iter().zip(out.by_ref()) {
-                *out = value * *scale;
+            let mut known = places.iter().zip(values.iter()).peekable();
+            for (i, out) in out.by_ref().take(taken).enumerate() {
+                *out = known.next_if(|(at, _)| **at == i).map_or(0.0, |(_, value)| value * *scale);
             }
             if let Some(i) = values.iter().position(|m| !m.is_finite()) {
-                let (i, [ny, nz]) = (at + i, [ys.len(), zs.len()]);
+                let value = values[i];
+                let (i, [ny, nz]) = (at + places[i], [ys.len(), zs.len()]);
                 let voxel = [xs.start + i / (ny * nz), ys.start + i / nz % ny, zs.start + i % nz];
                 let (field, expected) = (format!("voxel {voxel:?}"), "a finite number; a smaller solver.lr may help");
-                return Err(Error::invalid("the trained field", field, values[i - at], expected));
+                return Err(Error::invalid("the trained field", field, value, expected));
             }
-            at += values.len();
+            at += taken;
         }
     }
 }

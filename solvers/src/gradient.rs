@@ -7,6 +7,7 @@ use crate::iterative::start_volume;
 use crate::pretrain::learn;
 use crate::rays::{Pixels, RaySource, Views};
 use crate::schedule::{Clock, Decay, Ends};
+use crate::support;
 use conefield_core::backend::{Adam, Executable, Loss, TrainRay, TvBlocks, Work};
 use conefield_core::checkpoint::{Checkpoint, Resume, Standing, tensors};
 use conefield_core::error::{Error, Result, ensure};
@@ -171,7 +172,8 @@ const HELD_OUT_RAYS: usize = 8192;
 impl Solver for Gradient {
     fn solve(&self, job: &Job<'_>, observer: &mut dyn Observer) -> Result<Solution> {
         job.scan.validate("scan")?;
-        let scene = Scene::new(job.scan, &job.spec.scene)?;
+        let (scene, found) = support::scene(job.scan, &job.spec.scene)?;
+        found.iter().for_each(|line| observer.note(line));
         let pipeline = Pipeline::build(job.spec)?;
         let volume = job.spec.initializer.as_ref().map(|i| i.volume()).transpose()?.flatten();
         let fills_weights = job.spec.initializer.as_ref().filter(|_| volume.is_none());
@@ -380,6 +382,8 @@ impl Window {
 struct Watch {
     points: Vec<[f32; 3]>,
     reference: Vec<f32>,
+    /// Voxels where the object cannot be, and the sum of their squares in the reference.
+    outside: (usize, f64),
     /// From what stages see to the reference's unit.
     scale: f32,
     peak: f64,
@@ -389,14 +393,19 @@ struct Watch {
 
 impl Watch {
     fn new(job: &Job<'_>, scene: &Scene, projector: &dyn Projector) -> Self {
-        let (mut points, mut reference) = (vec![], vec![]);
+        let (mut points, mut reference, mut outside) = (vec![], vec![], (0, 0.0));
         let shape = scene.grid.shape;
         if let Some(r) = job.reference.filter(|r| r.data.shape() == shape) {
             for x in (0..shape[0]).step_by(WATCH) {
                 for y in (0..shape[1]).step_by(WATCH) {
                     for z in (0..shape[2]).step_by(WATCH) {
-                        points.push(scene.voxel([x, y, z]));
-                        reference.push(r.data[[x, y, z]]);
+                        let value = r.data[[x, y, z]];
+                        if scene.holds(scene.grid.voxel([x, y, z])) {
+                            points.push(scene.voxel([x, y, z]));
+                            reference.push(value);
+                        } else {
+                            outside = (outside.0 + 1, outside.1 + f64::from(value).powi(2));
+                        }
                     }
                 }
             }
@@ -415,7 +424,15 @@ impl Watch {
                 }
             }
         }
-        Self { points, reference, scale: (scene.attenuation * job.scan.unit.mm) as f32, peak: job.peak, rays, top }
+        Self {
+            points,
+            reference,
+            outside,
+            scale: (scene.attenuation * job.scan.unit.mm) as f32,
+            peak: job.peak,
+            rays,
+            top,
+        }
     }
 
     fn fill(&self, mut record: Record, model: &Model, exe: &mut dyn Executable) -> Result<Record> {
@@ -423,7 +440,8 @@ impl Watch {
             let mut mu = vec![0.0; self.points.len()];
             exe.evaluate(model, &self.points, &mut mu)?;
             let square = |(m, r): (&f32, &f32)| (f64::from(m * self.scale) - f64::from(*r)).powi(2);
-            let mse = mu.iter().zip(&self.reference).map(square).sum::<f64>() / mu.len() as f64;
+            let sum = mu.iter().zip(&self.reference).map(square).sum::<f64>() + self.outside.1;
+            let mse = sum / (mu.len() + self.outside.0) as f64;
             record.psnr = Some(10.0 * (self.peak * self.peak / mse.max(1e-300)).log10());
         }
         if !self.rays.is_empty() {

@@ -12,3 +12,4 @@ pub mod pretrain;
 pub mod rays;
 pub mod schedule;
 mod shadow;
+pub mod support;

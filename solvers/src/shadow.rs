@@ -41,7 +41,7 @@ pub fn shadow(view: ArrayView2<'_, f32>, level: f32, margin: usize) -> Array2<bo
 }
 
 /// Applies `f` to windows of ± `reach` along rows, then along columns; windows are cut at the border.
-fn box_filter(mut image: Array2<f32>, reach: usize, f: impl Fn(&[f32]) -> f32) -> Array2<f32> {
+pub fn box_filter(mut image: Array2<f32>, reach: usize, f: impl Fn(&[f32]) -> f32) -> Array2<f32> {
     for axis in [1, 0] {
         for mut lane in image.lanes_mut(ndarray::Axis(axis)) {
             let line = lane.to_vec();

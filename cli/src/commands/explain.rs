@@ -8,9 +8,9 @@ use clap::Args;
 use conefield_core::Result;
 use conefield_core::backend::Explain as Compiled;
 use conefield_core::pipeline::Pipeline;
-use conefield_core::scene::Scene;
 use conefield_core::spec::load::Loaded;
 use conefield_core::stage::{GradKind, Stage};
+use conefield_solvers::support::scene;
 use serde::Serialize;
 use serde_json::Value;
 use std::path::{Path, PathBuf};
@@ -188,9 +188,11 @@ fn for_scan(loaded: &Loaded, parts: &Parts, path: &Path) -> Result<ForScan> {
     let run = parts.run(conefield_io::scan_size(path)?);
     let scan = files::scan(path)?;
     let g = &scan.geometry;
+    let mut found = vec![];
     let seen = match &parts.pipeline {
         Some(pipeline) => {
-            let scene = Scene::new(&scan, &loaded.spec.scene).map_err(|e| loaded.locate(e))?;
+            let (scene, support) = scene(&scan, &loaded.spec.scene).map_err(|e| loaded.locate(e))?;
+            found.extend(support);
             let middle = scene.pixel_ray(g, 0, g.detector[0] / 2, g.detector[1] / 2);
             Some((scene.attenuation * scan.unit.mm, pipeline.projector.max_samples(&middle)))
         }
@@ -202,7 +204,7 @@ fn for_scan(loaded: &Loaded, parts: &Parts, path: &Path) -> Result<ForScan> {
         volume: g.volume.shape,
         attenuation_scale: seen.map(|s| s.0),
         samples_per_ray: seen.map(|s| s.1),
-        plan: parts.solver.plan(&scan),
+        plan: found.into_iter().chain(parts.solver.plan(&scan)).collect(),
         memory: run.memory(),
     })
 }
