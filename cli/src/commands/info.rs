@@ -227,6 +227,19 @@ fn rounded(value: &Value) -> Value {
     }
 }
 
+/// A line that people can read: what is longer is cut.
+fn shown(text: &str) -> String {
+    let length = text.chars().count();
+    if length <= LONG {
+        return text.to_owned();
+    }
+    let begin: String = text.chars().take(LONG).collect();
+    format!("{begin}… ({length} characters, with --json all of them)")
+}
+
+/// Characters of a line that people still read.
+const LONG: usize = 400;
+
 /// One line a key; tables become dotted keys. Warnings are left to [`warnings`].
 pub fn lines(value: &Value) -> String {
     fn walk(prefix: &str, value: &Value, rows: &mut Vec<Vec<String>>) {
@@ -241,7 +254,7 @@ pub fn lines(value: &Value) -> String {
                 rows.push(vec![prefix.to_owned(), text.lines().next().unwrap_or_default().to_owned()]);
                 rows.extend(text.lines().skip(1).map(|l| vec![String::new(), l.to_owned()]));
             }
-            Value::String(text) => rows.push(vec![prefix.to_owned(), text.clone()]),
+            Value::String(text) => rows.push(vec![prefix.to_owned(), shown(text)]),
             Value::Array(all) if !all.is_empty() && all.iter().all(Value::is_string) => {
                 let texts = all.iter().filter_map(Value::as_str).enumerate();
                 rows.extend(texts.map(|(i, t)| vec![if i == 0 { prefix } else { "" }.to_owned(), t.to_owned()]));
