@@ -84,14 +84,14 @@ impl Fragment {
     /// The same functions with names that begin with `prefix` instead of [`PREFIX`].
     pub fn named(&self, prefix: &str) -> String {
         let mut out = String::with_capacity(self.source.len());
-        let mut rest = self.source.as_str();
-        while let Some(at) = rest.find(PREFIX) {
-            let inside = rest[..at].ends_with(|c: char| c.is_alphanumeric() || c == '_');
-            out.push_str(&rest[..at]);
+        let mut end = 0;
+        for (at, _) in self.source.match_indices(PREFIX) {
+            let inside = self.source[..at].ends_with(|c: char| c.is_alphanumeric() || c == '_');
+            out.push_str(&self.source[end..at]);
             out.push_str(if inside { PREFIX } else { prefix });
-            rest = &rest[at + PREFIX.len()..];
+            end = at + PREFIX.len();
         }
-        out.push_str(rest);
+        out.push_str(&self.source[end..]);
         out
     }
 
