@@ -3,7 +3,8 @@
 use conefield_core::error::{Error, Result};
 use serde::Serialize;
 use std::fmt;
-use std::sync::{Arc, Mutex, PoisonError};
+use std::sync::{Arc, Mutex, PoisonError, mpsc};
+use std::time::Duration;
 
 /// How gradients of scattered parameters are added up.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize)]
@@ -248,13 +249,17 @@ impl Gpu {
             return self.wait();
         }
         let slice = from.slice(..bytes);
-        let state = Arc::new(Mutex::new(None));
-        let keep = state.clone();
-        slice.map_async(wgpu::MapMode::Read, move |r| {
-            *keep.lock().unwrap_or_else(PoisonError::into_inner) = Some(r);
-        });
+        let (tell, told) = mpsc::channel();
+        slice.map_async(wgpu::MapMode::Read, move |r| drop(tell.send(r)));
         self.wait()?;
-        let mapped = state.lock().unwrap_or_else(PoisonError::into_inner).take();
+        // Another thread's wait may be what calls back, and a moment later than this one's ends.
+        let mapped = loop {
+            match told.recv_timeout(CALLBACK) {
+                Err(mpsc::RecvTimeoutError::Timeout) => self.wait()?,
+                Err(mpsc::RecvTimeoutError::Disconnected) => break None,
+                Ok(r) => break Some(r),
+            }
+        };
         match mapped {
             Some(Ok(())) => {}
             Some(Err(e)) => return Err(self.error(e.to_string())),
@@ -267,6 +272,9 @@ impl Gpu {
         Ok(())
     }
 }
+
+/// How long to wait for a call back before the device is asked again.
+const CALLBACK: Duration = Duration::from_millis(20);
 
 fn note(keep: &Mutex<Option<String>>, what: String) {
     keep.lock().unwrap_or_else(PoisonError::into_inner).get_or_insert(what);
