@@ -115,6 +115,11 @@ pub enum GradKind {
     Scatter,
 }
 
+/// A stage's name with the type that its description begins with, for messages.
+pub fn titled(name: &str, what: &str) -> String {
+    format!("{name} ({})", what.split(':').next().unwrap_or(what))
+}
+
 /// All that a planner needs to know of a stage.
 #[derive(Debug, Clone, PartialEq, serde::Serialize)]
 pub struct Info {
@@ -235,6 +240,12 @@ pub trait Encoder: Stage {
     fn coarse_to_fine(&self) -> bool {
         false
     }
+
+    /// Of each channel, how many cells along the unit cube's side it tells apart, where that is known: what is finer than
+    /// the data can be left out.
+    fn resolutions(&self) -> Option<Vec<f64>> {
+        None
+    }
 }
 
 /// A look at the encoder between steps.
@@ -329,6 +340,12 @@ pub trait Projector: Send + Sync {
         for (d, &w) in dmu.iter_mut().zip(weights) {
             *d = f64::from(w) * dline;
         }
+    }
+
+    /// The projector for a volume whose voxels have sides of `voxel_mm` at least, where its settings count in voxels.
+    fn fitted(&self, voxel_mm: f64) -> Option<Box<dyn Projector>> {
+        let _ = voxel_mm;
+        None
     }
 
     /// What it could not do since this was last asked, as [`Stage::fault`].

@@ -66,6 +66,22 @@ pub struct Fragment {
     pub source: String,
 }
 
+/// `stage_forward` and `stage_backward` of a stage from `input` to `output` channels, from the lines of their bodies.
+pub fn functions(input: usize, output: usize, forward: &str, backward: &str) -> String {
+    format!(
+        "fn stage_forward(x: ptr<function, array<f32, {input}>>, y: ptr<function, array<f32, {output}>>) {{
+{forward}}}
+
+fn stage_backward(
+    x: ptr<function, array<f32, {input}>>,
+    dy: ptr<function, array<f32, {output}>>,
+    dx: ptr<function, array<f32, {input}>>,
+) {{
+{backward}}}
+"
+    )
+}
+
 /// A sum over rows that a fragment asks for.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
 pub enum Sum {

@@ -5,7 +5,7 @@ use conefield_core::random::mix;
 use conefield_core::simd::Real;
 use conefield_core::spec::EncoderSpec;
 use conefield_core::stage::{Encoder, GradKind, Grads, Info, Kernel, Parameter, Reduced, Scope, Stage, Tile, TileMut};
-use conefield_core::wgsl::{Fragment, Sum};
+use conefield_core::wgsl::{Fragment, Sum, functions};
 use schemars::{JsonSchema, Schema, SchemaGenerator, json_schema};
 use serde::{Deserialize, Serialize};
 use std::fmt::Write;
@@ -318,21 +318,8 @@ impl Stage for ConcatStage {
 "
             );
         }
-        let functions = format!(
-            "fn stage_forward(x: ptr<function, array<f32, 3>>, y: ptr<function, array<f32, {width}>>) {{
-{forward}}}
-
-fn stage_backward(
-    x: ptr<function, array<f32, 3>>,
-    dy: ptr<function, array<f32, {width}>>,
-    dx: ptr<function, array<f32, 3>>,
-) {{
-    var sum: array<f32, 3>;
-    var part: array<f32, 3>;
-{backward}    *dx = sum;
-}}
-"
-        );
+        let begin = "    var sum: array<f32, 3>;\n    var part: array<f32, 3>;\n";
+        let functions = functions(3, width, &forward, &format!("{begin}{backward}    *dx = sum;\n"));
         Some(Fragment::new(&[&parts, &functions]))
     }
 
@@ -369,5 +356,10 @@ impl Encoder for ConcatStage {
 
     fn coarse_to_fine(&self) -> bool {
         self.parts.len() == 1 && self.parts[0].stage.coarse_to_fine()
+    }
+
+    fn resolutions(&self) -> Option<Vec<f64>> {
+        let parts: Option<Vec<_>> = self.parts.iter().map(|p| p.stage.resolutions()).collect();
+        parts.map(|p| p.concat())
     }
 }

@@ -5,7 +5,7 @@
 //! A level with `r` cells a side has `(r + 1)³` vertices at the corners of its cells, which fill the cube exactly:
 //! `p = clamp(x, 0, 1)·r`.
 
-use crate::levels::{LevelCode, functions};
+use crate::levels::{LevelCode, by_channel, functions};
 use conefield_core::error::{Error, Result, ensure};
 use conefield_core::random::{mix, unit};
 use conefield_core::simd::{Op, Real, Simd, run};
@@ -354,6 +354,11 @@ impl Encoder for DenseGridStage {
 
     fn coarse_to_fine(&self) -> bool {
         true
+    }
+
+    fn resolutions(&self) -> Option<Vec<f64>> {
+        let cells = |l: &Level| (l.grid.side()[0] - 1) as f64;
+        Some(by_channel(self.levels.iter().map(|l| (cells(l), &l.outputs[..])), self.outputs))
     }
 }
 

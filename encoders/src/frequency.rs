@@ -9,7 +9,7 @@ use conefield_core::error::{Result, ensure};
 use conefield_core::simd::{Op, Real, Select, Simd, SimdBase, SimdFloat, V, load, run, store};
 use conefield_core::spec::EncoderSpec;
 use conefield_core::stage::{Encoder, GradKind, Grads, Info, Kernel, Parameter, Reduced, Scope, Stage, Tile, TileMut};
-use conefield_core::wgsl::Fragment;
+use conefield_core::wgsl::{Fragment, functions};
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 use std::f64::consts::TAU;
@@ -268,19 +268,7 @@ impl Stage for FrequencyStage {
             let _ = writeln!(backward, "    (*dx)[{axis}] += {slope:?} * ({sin} * w{w}.y - {cos} * w{w}.x);");
         }
         let width = self.outputs;
-        let functions = format!(
-            "fn stage_forward(x: ptr<function, array<f32, 3>>, y: ptr<function, array<f32, {width}>>) {{
-{forward}}}
-
-fn stage_backward(
-    x: ptr<function, array<f32, 3>>,
-    dy: ptr<function, array<f32, {width}>>,
-    dx: ptr<function, array<f32, 3>>,
-) {{
-    *dx = array<f32, 3>();
-{backward}}}
-"
-        );
+        let functions = functions(3, width, &forward, &format!("    *dx = array<f32, 3>();\n{backward}"));
         Some(Fragment::new(&[include_str!("frequency.wgsl"), &functions]))
     }
 
@@ -316,6 +304,15 @@ impl Encoder for FrequencyStage {
 
     fn coarse_to_fine(&self) -> bool {
         true
+    }
+
+    /// A period takes two cells to be told from its neighbours.
+    fn resolutions(&self) -> Option<Vec<f64>> {
+        let mut cells = vec![1.0; self.outputs];
+        for w in &self.waves {
+            [w.sin, w.cos].into_iter().flatten().for_each(|c| cells[c] = 2.0 * w.frequency);
+        }
+        Some(cells)
     }
 }
 

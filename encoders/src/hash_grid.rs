@@ -4,7 +4,7 @@
 //! point's cell, trilinearly interpolated. A level whose vertices fit the table is indexed directly, a finer one by
 //! `h(c) = (c_x·π₁ ⊕ c_y·π₂ ⊕ c_z·π₃) mod T` with products modulo 2³² by definition.
 
-use crate::levels::{LevelCode, functions};
+use crate::levels::{LevelCode, by_channel, functions};
 use conefield_core::error::{Result, ensure};
 use conefield_core::random::{mix, unit};
 use conefield_core::simd::{Op, Real, Simd, SimdBase, SimdFloat, V, load, run, store};
@@ -547,6 +547,10 @@ impl Encoder for HashGridStage {
 
     fn coarse_to_fine(&self) -> bool {
         true
+    }
+
+    fn resolutions(&self) -> Option<Vec<f64>> {
+        Some(by_channel(self.levels.iter().map(|l| (l.scale + 1.0, &l.outputs[..])), self.outputs))
     }
 }
 

@@ -4,7 +4,7 @@ use conefield_core::error::{Result, ensure};
 use conefield_core::simd::Real;
 use conefield_core::spec::EncoderSpec;
 use conefield_core::stage::{Encoder, GradKind, Grads, Info, Kernel, Parameter, Reduced, Scope, Stage, Tile, TileMut};
-use conefield_core::wgsl::Fragment;
+use conefield_core::wgsl::{Fragment, functions};
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
@@ -86,17 +86,9 @@ impl Stage for IdentityStage {
         let each = |line: &dyn Fn(usize, usize) -> String| -> String {
             self.axes.iter().enumerate().map(|(c, &axis)| line(c, axis)).collect()
         };
-        Some(Fragment::new(&[&format!(
-            "fn stage_forward(x: ptr<function, array<f32, 3>>, y: ptr<function, array<f32, {n}>>) {{
-{}}}
-
-fn stage_backward(x: ptr<function, array<f32, 3>>, dy: ptr<function, array<f32, {n}>>, dx: ptr<function, array<f32, 3>>) {{
-    *dx = array<f32, 3>();
-{}}}
-",
-            each(&|c, axis| format!("    (*y)[{c}] = (*x)[{axis}];\n")),
-            each(&|c, axis| format!("    (*dx)[{axis}] = (*dy)[{c}];\n")),
-        )]))
+        let forward = each(&|c, axis| format!("    (*y)[{c}] = (*x)[{axis}];\n"));
+        let backward = each(&|c, axis| format!("    (*dx)[{axis}] = (*dy)[{c}];\n"));
+        Some(Fragment::new(&[&functions(3, n, &forward, &format!("    *dx = array<f32, 3>();\n{backward}"))]))
     }
 
     fn describe(&self) -> String {
@@ -110,5 +102,9 @@ impl Encoder for IdentityStage {
         ensure(!keep.is_empty(), "identity", "channels", "none kept", "at least one")?;
         let stage = Self { axes: keep.iter().map(|&c| self.axes[c]).collect() };
         Ok(Reduced { stage: Box::new(stage), params: vec![], channels: vec![0, 1, 2] })
+    }
+
+    fn resolutions(&self) -> Option<Vec<f64>> {
+        Some(vec![1.0; self.axes.len()])
     }
 }

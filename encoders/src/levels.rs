@@ -1,7 +1,18 @@
-//! WGSL of an encoder of several levels, each with features of its own: calls of `stage_level_forward` and
+//! What encoders of several levels, each with features of its own, share: which level a channel comes from, and WGSL: calls of `stage_level_forward` and
 //! `stage_level_backward`, level by level, with the levels' settings written into them.
 
+use conefield_core::wgsl;
 use std::fmt::Write;
+
+/// Of each of `width` channels the cells along a side of the level that it comes from; levels are given with their output
+/// channels.
+pub fn by_channel<'a>(levels: impl Iterator<Item = (f64, &'a [Option<usize>])>, width: usize) -> Vec<f64> {
+    let mut cells = vec![0.0; width];
+    for (resolution, outputs) in levels {
+        outputs.iter().flatten().for_each(|&c| cells[c] = resolution);
+    }
+    cells
+}
 
 /// A level as WGSL sees it.
 pub struct LevelCode {
@@ -23,22 +34,8 @@ pub fn functions(levels: &[LevelCode], width: usize) -> String {
         }
         let _ = writeln!(backward, "    slope += stage_level_backward(p, {value}, &d{l});");
     }
-    format!(
-        "fn stage_forward(x: ptr<function, array<f32, 3>>, y: ptr<function, array<f32, {width}>>) {{
-    let p = vec3<f32>((*x)[0], (*x)[1], (*x)[2]);
-{forward}}}
-
-fn stage_backward(
-    x: ptr<function, array<f32, 3>>,
-    dy: ptr<function, array<f32, {width}>>,
-    dx: ptr<function, array<f32, 3>>,
-) {{
-    let p = vec3<f32>((*x)[0], (*x)[1], (*x)[2]);
-    var slope = vec3<f32>(0.0);
-{backward}    (*dx)[0] = slope.x;
-    (*dx)[1] = slope.y;
-    (*dx)[2] = slope.z;
-}}
-"
-    )
+    let p = "    let p = vec3<f32>((*x)[0], (*x)[1], (*x)[2]);\n";
+    let slope = "    (*dx)[0] = slope.x;\n    (*dx)[1] = slope.y;\n    (*dx)[2] = slope.z;\n";
+    let backward = format!("{p}    var slope = vec3<f32>(0.0);\n{backward}{slope}");
+    wgsl::functions(3, width, &format!("{p}{forward}"), &backward)
 }

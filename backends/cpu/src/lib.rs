@@ -17,7 +17,7 @@ use conefield_core::error::{Error, Result, ensure};
 use conefield_core::pipeline::{Model, Pipeline};
 use conefield_core::simd;
 use conefield_core::spec::Tables;
-use conefield_core::stage::{GradKind, Samples, TILE_ROWS, UnitRay};
+use conefield_core::stage::{GradKind, Samples, TILE_ROWS, UnitRay, titled};
 use rayon::prelude::*;
 use rows::{Belong, Encoded, Kernels, Scratch};
 use step::Slots;
@@ -48,8 +48,7 @@ impl Backend for Cpu {
         let mut notes = vec![];
         for (name, stage) in pipeline.stages() {
             let info = stage.info();
-            let what = stage.describe();
-            let name = format!("{name} ({})", what.split(':').next().unwrap_or(&what));
+            let name = titled(&name, &stage.describe());
             if info.grads == GradKind::Scatter && info.tape > 0 {
                 return Err(Error::unsupported(
                     format!("{name} on the CPU backend"),

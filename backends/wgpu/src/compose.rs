@@ -10,7 +10,7 @@ use crate::source::{Access, Source};
 use conefield_core::error::{Error, Result};
 use conefield_core::pipeline::Pipeline;
 use conefield_core::spec::Tables;
-use conefield_core::stage::{GradKind, Info, Projector, Scope, Stage};
+use conefield_core::stage::{GradKind, Info, Projector, Scope, Stage, titled};
 use conefield_core::wgsl::{Fragment, RANDOM, RAY, Sum};
 use std::fmt::Write;
 use std::ops::Range;
@@ -69,11 +69,6 @@ fn fragment_of(name: &str, fragment: Option<Fragment>) -> Result<Fragment> {
             "the stage offers no WGSL; it runs with --backend cpu",
         )
     })
-}
-
-/// A stage's name with what it is.
-fn titled(name: &str, what: &str) -> String {
-    format!("{name} ({})", what.split(':').next().unwrap_or(what))
 }
 
 impl Chain {
@@ -200,32 +195,14 @@ impl Chain {
             text += "    return 0.0;\n}\n";
         }
         if gradients {
-            let number = match self.target.atomics {
-                Atomics::Native => "f32",
-                Atomics::CompareExchange => "u32",
-            };
+            let atomics = self.target.atomics;
             for s in 0..self.segments() {
-                source.bind(&format!("grads_{s}"), Access::Write, &format!("array<atomic<{number}>>"));
-                if self.target.atomics == Atomics::CompareExchange {
-                    let _ = write!(
-                        text,
-                        "fn arena_add_{s}(i: u32, v: f32) {{
-    var old = atomicLoad(&grads_{s}[i]);
-    loop {{
-        let found = atomicCompareExchangeWeak(&grads_{s}[i], old, bitcast<u32>(bitcast<f32>(old) + v));
-        if found.exchanged {{ break; }}
-        old = found.old_value;
-    }}
-}}
-"
-                    );
-                }
+                source.bind(&format!("grads_{s}"), Access::Write, &format!("array<atomic<{}>>", atomics.number()));
+                let _ =
+                    writeln!(text, "fn arena_add_{s}(i: u32, v: f32) {{\n{}}}", atomics.add(&format!("grads_{s}[i]")));
             }
             text += "fn arena_grad(i: u32, v: f32) {\n    if v == 0.0 { return; }\n";
-            self.each_segment(&mut text, |s, i| match self.target.atomics {
-                Atomics::Native => format!("atomicAdd(&grads_{s}[{i}], v); return;"),
-                Atomics::CompareExchange => format!("arena_add_{s}({i}, v); return;"),
-            });
+            self.each_segment(&mut text, |s, i| format!("arena_add_{s}({i}, v); return;"));
             text += "}\n";
         }
         source.add("the arena", &text);
@@ -235,13 +212,12 @@ impl Chain {
     fn each_segment(&self, text: &mut String, line: impl Fn(usize, &str) -> String) {
         let size = self.target.segment;
         for s in 0..self.segments() {
-            if s + 1 == self.segments() {
-                let i = if s == 0 { "i".to_owned() } else { format!("i - {}u", s * size) };
-                let _ = writeln!(text, "    {}", line(s, &i));
-            } else {
-                let i = if s == 0 { "i".to_owned() } else { format!("i - {}u", s * size) };
-                let _ = writeln!(text, "    if i < {}u {{ {} }}", (s + 1) * size, line(s, &i));
-            }
+            let i = if s == 0 { "i".to_owned() } else { format!("i - {}u", s * size) };
+            let line = line(s, &i);
+            let _ = match s + 1 == self.segments() {
+                true => writeln!(text, "    {line}"),
+                false => writeln!(text, "    if i < {}u {{ {line} }}", (s + 1) * size),
+            };
         }
     }
 

@@ -16,6 +16,32 @@ pub enum Atomics {
     CompareExchange,
 }
 
+impl Atomics {
+    /// The type, in WGSL, of a number that is added to atomically.
+    pub fn number(self) -> &'static str {
+        match self {
+            Self::Native => "f32",
+            Self::CompareExchange => "u32",
+        }
+    }
+
+    /// Adds `v` to `place`, in WGSL.
+    pub fn add(self, place: &str) -> String {
+        match self {
+            Self::Native => format!("    atomicAdd(&{place}, v);\n"),
+            Self::CompareExchange => format!(
+                "    var old = atomicLoad(&{place});
+    loop {{
+        let found = atomicCompareExchangeWeak(&{place}, old, bitcast<u32>(bitcast<f32>(old) + v));
+        if found.exchanged {{ break; }}
+        old = found.old_value;
+    }}
+"
+            ),
+        }
+    }
+}
+
 impl fmt::Display for Atomics {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         f.write_str(match self {
@@ -86,6 +112,11 @@ impl Adapter {
             atomics,
             timestamps: features.contains(wgpu::Features::TIMESTAMP_QUERY),
         }
+    }
+
+    /// Bytes that a kernel may read or write of one buffer at most.
+    pub fn bound_bytes(&self) -> u64 {
+        self.binding_bytes.min(self.buffer_bytes)
     }
 
     /// Which to prefer: the largest number.

@@ -3,11 +3,12 @@
 use crate::arena;
 use crate::compose::{self, Chain, GROUP, Part};
 use crate::kernel::{Buffers, Kernel, fits};
+use crate::pace::Pace;
 use crate::profile::Profile;
 use crate::source::Source;
 use crate::wave::{self, GpuRay, MOST_GROUPS, Wave};
 use crate::{Gpu, Shared};
-use conefield_core::backend::{Adam, Executable, Loss, StepStats, Work};
+use conefield_core::backend::{Adam, Executable, Loss, StepStats, TvBlocks, Work};
 use conefield_core::error::Result;
 use conefield_core::pipeline::Model;
 use conefield_core::stage::{Projector, UnitRay};
@@ -24,9 +25,6 @@ const BACKWARD_GROUPS: usize = 2048;
 const FIRST_ROWS: u32 = 1 << 14;
 const LEAST_ROWS: u32 = 1 << 12;
 const MOST_ROWS: u32 = 1 << 20;
-/// A wave should take less than the second, of the half second after which a watchdog may step in, and may grow where it
-/// takes less than the first.
-const WAVE_SECONDS: [f64; 2] = [0.06, 0.25];
 
 /// What is the same for all of a launch: `Step` in `kernels/step.wgsl`.
 #[repr(C)]
@@ -95,11 +93,6 @@ impl Kernels {
         }
         Ok(Self { sources })
     }
-
-    /// The text of a kernel.
-    pub fn text(&self, label: &str) -> Option<&str> {
-        self.sources.get(label).map(Source::text)
-    }
 }
 
 /// A pipeline on a device.
@@ -115,7 +108,7 @@ pub struct Wgpu {
     /// Gradients there are known to be zero.
     clean: bool,
     /// Rows that a wave may have.
-    most: u32,
+    pace: Pace,
     /// Rows for which there is room.
     room: u32,
     profile: Option<Profile>,
@@ -132,7 +125,7 @@ impl Wgpu {
             buffers: Buffers::default(),
             loaded: false,
             clean: false,
-            most: FIRST_ROWS,
+            pace: Pace::new(FIRST_ROWS, LEAST_ROWS, MOST_ROWS),
             room: 0,
             profile: None,
         }
@@ -209,18 +202,21 @@ impl Wgpu {
         Ok(())
     }
 
-    /// The kernel called `label`, compiled, with its buffers.
+    /// The kernel called `label`, compiled.
+    fn kernel(&mut self, label: &'static str) -> Result<Arc<Kernel>> {
+        if let Some(kernel) = self.compiled.get(label) {
+            return Ok(kernel.clone());
+        }
+        let source = self.kernels.sources.get(label);
+        let source = source.ok_or_else(|| self.gpu().error(format!("no kernel {label}")))?;
+        let kernel = self.shared.kernels.get(&self.shared.gpu, label, source)?;
+        self.compiled.insert(label, kernel.clone());
+        Ok(kernel)
+    }
+
+    /// The same with its buffers.
     fn ready(&mut self, label: &'static str) -> Result<(Arc<Kernel>, wgpu::BindGroup)> {
-        let kernel = match self.compiled.get(label) {
-            Some(kernel) => kernel.clone(),
-            None => {
-                let source = self.kernels.sources.get(label);
-                let source = source.ok_or_else(|| self.gpu().error(format!("no kernel {label}")))?;
-                let kernel = self.shared.kernels.get(&self.shared.gpu, label, source)?;
-                self.compiled.insert(label, kernel.clone());
-                kernel
-            }
-        };
+        let kernel = self.kernel(label)?;
         if !self.bound.contains_key(label) {
             let group = kernel.bind(&self.shared.gpu, &self.buffers)?;
             self.bound.insert(label, group);
@@ -283,7 +279,7 @@ impl Wgpu {
         let mut samples: Vec<[f32; 4]> = vec![];
         while at < points.len() {
             let started = Instant::now();
-            let piece = &points[at..(at + self.most as usize).min(points.len())];
+            let piece = &points[at..(at + self.pace.size() as usize).min(points.len())];
             let rows = piece.len() as u32;
             self.reserve_rows(rows)?;
             let stride = self.room;
@@ -303,7 +299,7 @@ impl Wgpu {
             self.read(wanted, |bytes| take(at, bytemuck::cast_slice(bytes), stride as usize))?;
             at += piece.len();
             self.collect()?;
-            self.pace(started.elapsed().as_secs_f64(), 1, rows);
+            self.pace.heard(started.elapsed().as_secs_f64(), 1, rows);
         }
         Ok(())
     }
@@ -313,22 +309,17 @@ impl Wgpu {
         self.profile.as_mut().map_or(Ok(()), |p| p.collect(&self.shared.gpu))
     }
 
-    /// Chooses how many rows a wave may have, by how long the last ones took.
-    fn pace(&mut self, seconds: f64, waves: usize, rows: u32) {
-        let each = seconds / waves.max(1) as f64;
-        if each > WAVE_SECONDS[1] && self.most > LEAST_ROWS {
-            self.most /= 2;
-        } else if each < WAVE_SECONDS[0] && rows > self.most / 2 && self.most < MOST_ROWS {
-            self.most *= 2;
-        }
+    /// Makes room for a wave and writes its rays.
+    fn place(&mut self, wave: &Wave) -> Result<()> {
+        self.reserve_rows(wave.rows)?;
+        self.reserve("rays", (wave.rays.len().max(1) * size_of::<GpuRay>()) as u64, U::STORAGE | U::COPY_DST)?;
+        self.reserve("losses", 4 * wave.losses().max(1) as u64, U::STORAGE | U::COPY_SRC)?;
+        self.write("rays", bytemuck::cast_slice(&wave.rays))
     }
 
     /// The kernels of one wave of a step.
     fn learn(&mut self, wave: &Wave, work: &Work<'_>, sums: u64) -> Result<()> {
-        self.reserve_rows(wave.rows)?;
-        self.reserve("rays", (wave.rays.len().max(1) * size_of::<GpuRay>()) as u64, U::STORAGE | U::COPY_DST)?;
-        self.reserve("losses", 4 * wave.losses().max(1) as u64, U::STORAGE | U::COPY_SRC)?;
-        self.write("rays", bytemuck::cast_slice(&wave.rays))?;
+        self.place(wave)?;
         let mut step = Step {
             rows: wave.rows,
             ray_rows: wave.ray_rows,
@@ -359,7 +350,7 @@ impl Wgpu {
             step.edge = tv.edge as u32;
             step.spacing = tv.spacing;
             step.smoothing = tv.smoothing as f32;
-            step.tv_scale = tv_scale(tv.weight, tv.corners.len() * points);
+            step.tv_scale = tv_scale(tv) as f32;
             block_rows = wave.blocks.len() * points;
         }
         self.write("step", bytemuck::bytes_of(&step))?;
@@ -384,8 +375,9 @@ impl Wgpu {
     }
 }
 
-fn tv_scale(weight: f64, points: usize) -> f32 {
-    (weight / points.max(1) as f64) as f32
+/// What a point's variation counts by.
+fn tv_scale(tv: &TvBlocks) -> f64 {
+    tv.weight / (tv.corners.len() * tv.edge.pow(3)).max(1) as f64
 }
 
 /// The penalty, as kernels know it.
@@ -416,7 +408,7 @@ impl Executable for Wgpu {
             self.gpu().queue.submit([encoder.finish()]);
         }
         self.clean = false;
-        let waves = wave::of_step(model.pipeline.projector.as_ref(), work, self.most);
+        let waves = wave::of_step(model.pipeline.projector.as_ref(), work, self.pace.size());
         let losses: usize = waves.iter().map(Wave::losses).sum();
         self.reserve("staging", 4 * losses as u64, U::MAP_READ | U::COPY_DST)?;
         let mut at = 0;
@@ -431,29 +423,22 @@ impl Executable for Wgpu {
             self.gpu().queue.submit([encoder.finish()]);
         }
         let mut stats = StepStats { samples: waves.iter().map(|w| u64::from(w.rows)).sum(), ..StepStats::default() };
-        let (ray_scale, point_scale) = (1.0 / work.rays.len() as f64, 1.0 / work.points.len() as f64);
-        let tv_scale = work.tv.map_or(0.0, |tv| tv.weight / (tv.corners.len() * tv.edge.pow(3)) as f64);
+        let [ray_scale, point_scale] = [work.rays.len(), work.points.len()].map(|n| 1.0 / n.max(1) as f64);
+        let tv_scale = work.tv.map_or(0.0, tv_scale);
         self.read(4 * losses as u64, |bytes| {
             let mut sums = bytemuck::cast_slice::<u8, f32>(bytes).iter().map(|&l| f64::from(l));
             let mut next = |n: usize| sums.by_ref().take(n).sum::<f64>();
             for wave in &waves {
                 let (rays, points, blocks) =
-                    (next(wave.rays.len()), next(wave.points.len().div_ceil(64)), next(wave.blocks.len()));
-                if !wave.rays.is_empty() {
-                    stats.loss += rays * ray_scale;
-                }
-                if !wave.points.is_empty() {
-                    stats.loss += points * point_scale;
-                }
-                if !wave.blocks.is_empty() {
-                    stats.prior += blocks * tv_scale;
-                }
+                    (next(wave.rays.len()), next(wave.points.len().div_ceil(GROUP as usize)), next(wave.blocks.len()));
+                stats.loss += rays * ray_scale + points * point_scale;
+                stats.prior += blocks * tv_scale;
             }
         })?;
         self.collect()?;
         let seconds = started.elapsed().as_secs_f64();
         stats.dense_s = seconds;
-        self.pace(seconds, waves.len(), waves.iter().map(|w| w.rows).max().unwrap_or(0));
+        self.pace.heard(seconds, waves.len(), waves.iter().map(|w| w.rows).max().unwrap_or(0));
         Ok(stats)
     }
 
@@ -461,11 +446,7 @@ impl Executable for Wgpu {
         self.load(model)?;
         let (bias1, bias2) = (1.0 - adam.beta1.powf(adam.step as f64), 1.0 - adam.beta2.powf(adam.step as f64));
         let size = self.shared.target().segment;
-        if !self.compiled.contains_key("adam") {
-            let source = &self.kernels.sources["adam"];
-            self.compiled.insert("adam", self.shared.kernels.get(&self.shared.gpu, "adam", source)?);
-        }
-        let kernel = self.compiled["adam"].clone();
+        let kernel = self.kernel("adam")?;
         for s in 0..self.chain.segments() {
             let count = arena::segment(&self.chain, s, model.arena.params.len(), size).len();
             let rule = Rule {
@@ -525,15 +506,12 @@ impl Executable for Wgpu {
 
     fn render(&mut self, model: &Model, rays: &[UnitRay], out: &mut [f32]) -> Result<()> {
         self.load(model)?;
-        let waves = wave::of_rays(model.pipeline.projector.as_ref(), rays, self.most);
+        let waves = wave::of_rays(model.pipeline.projector.as_ref(), rays, self.pace.size());
         let mut out = out.iter_mut();
         for wave in &waves {
-            self.reserve_rows(wave.rows)?;
+            self.place(wave)?;
             let bytes = 4 * wave.rays.len() as u64;
-            self.reserve("rays", (wave.rays.len().max(1) * size_of::<GpuRay>()) as u64, U::STORAGE | U::COPY_DST)?;
-            self.reserve("losses", bytes.max(4), U::STORAGE | U::COPY_SRC)?;
             self.reserve("staging", bytes, U::MAP_READ | U::COPY_DST)?;
-            self.write("rays", bytemuck::cast_slice(&wave.rays))?;
             let (rows, rays) = (wave.rows, wave.rays.len() as u32);
             let step = Step { rows, ray_rows: rows, rays, stride: self.room, loss: LINE, ..Step::default() };
             self.write("step", bytemuck::bytes_of(&step))?;

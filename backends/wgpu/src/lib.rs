@@ -20,6 +20,7 @@ pub mod device;
 pub mod executable;
 pub mod kernel;
 pub mod measure;
+mod pace;
 pub mod profile;
 pub mod single;
 pub mod source;
@@ -30,7 +31,7 @@ use compose::{Chain, Target};
 use conefield_core::backend::{Backend, Executable, Explain};
 use conefield_core::error::Result;
 use conefield_core::pipeline::Pipeline;
-use conefield_core::stage::GradKind;
+use conefield_core::stage::{GradKind, titled};
 use conefield_core::voxel::{VoxelProjector, VoxelView};
 pub use device::{Adapter, Atomics, Gpu, Limits, adapters};
 use executable::{Kernels, Wgpu as Running};
@@ -58,7 +59,7 @@ impl Shared {
     /// What the text of kernels depends on.
     pub fn target(&self) -> Target {
         let adapter = &self.gpu.adapter;
-        let bytes = adapter.binding_bytes.min(adapter.buffer_bytes);
+        let bytes = adapter.bound_bytes();
         Target {
             atomics: adapter.atomics,
             segment: ((bytes / 4) as usize / 64 * 64).max(64),
@@ -105,8 +106,7 @@ impl Backend for Wgpu {
         let mut notes: Vec<String> = vec![];
         for (name, stage) in pipeline.stages() {
             let info = stage.info();
-            let what = stage.describe();
-            let name = format!("{name} ({})", what.split(':').next().unwrap_or(&what));
+            let name = titled(&name, &stage.describe());
             notes.push(match (info.identity, info.grads) {
                 (true, _) => format!("{name}: identity, left out"),
                 (_, GradKind::None) => format!("{name}: fused"),
@@ -128,7 +128,7 @@ impl Backend for Wgpu {
             notes.push(format!(
                 "parameters in {} buffers, as one may have {} bytes",
                 chain.segments(),
-                adapter.binding_bytes
+                adapter.bound_bytes()
             ));
         }
         let explain = Explain {

@@ -7,6 +7,7 @@ use crate::Shared;
 use crate::compose::GROUP;
 use crate::device::Atomics;
 use crate::kernel::Buffers;
+use crate::pace::Pace;
 use crate::source::{Access, Source};
 use crate::wave::MOST_GROUPS;
 use conefield_core::error::{Error, Result};
@@ -21,11 +22,10 @@ use wgpu::BufferUsages as U;
 
 /// Bytes of projections on the device at once.
 const LINES_BYTES: u64 = 64 << 20;
-/// Rays or voxels of a launch at first, at least and at most; how long one should take.
+/// Rays or voxels of a launch at first, at least and at most.
 const FIRST: u32 = 1 << 15;
 const LEAST: u32 = 1 << 10;
 const MOST: u32 = 1 << 22;
-const SECONDS: [f64; 2] = [0.05, 0.25];
 
 /// `Projection` in `kernels/project.wgsl`.
 #[repr(C)]
@@ -85,28 +85,15 @@ fn kernel(fragment: &Fragment, name: &str, atomics: Atomics, forward: bool) -> S
     source.add("projection", include_str!("kernels/project.wgsl"));
     source.bind("projection", Access::Uniform, "Projection");
     source.bind("views", Access::Read, "array<ProjectedView>");
-    let (number, add) = match atomics {
-        Atomics::Native => ("f32", "atomicAdd(&volume[i], v);".to_owned()),
-        Atomics::CompareExchange => (
-            "u32",
-            "var old = atomicLoad(&volume[i]);
-        loop {
-            let found = atomicCompareExchangeWeak(&volume[i], old, bitcast<u32>(bitcast<f32>(old) + v));
-            if found.exchanged { break; }
-            old = found.old_value;
-        }"
-            .to_owned(),
-        ),
-    };
     let (what, begin, end) = if forward {
         source.bind("volume", Access::Read, "array<f32>");
         source.bind("lines", Access::Write, "array<f32>");
         ("value += weight * volume[i];".to_owned(), "value = 0.0;", "lines[i] += value;")
     } else {
-        source.bind("volume", Access::Write, &format!("array<atomic<{number}>>"));
+        source.bind("volume", Access::Write, &format!("array<atomic<{}>>", atomics.number()));
         source.bind("lines", Access::Read, "array<f32>");
         let begin = "value = lines[i];\n        if value == 0.0 { continue; }";
-        (format!("let v = weight * value;\n        {add}"), begin, "")
+        (format!("let v = weight * value;\n{}", atomics.add("volume[i]")), begin, "")
     };
     source.add(
         "visit",
@@ -143,12 +130,12 @@ fn main(@builtin(global_invocation_id) id: vec3<u32>, @builtin(num_workgroups) g
 /// What a launch works on: buffers that are used again, and how many rays or voxels it may take.
 struct Room {
     buffers: Buffers,
-    most: u32,
+    pace: Pace,
 }
 
 impl Default for Room {
     fn default() -> Self {
-        Self { buffers: Buffers::default(), most: FIRST }
+        Self { buffers: Buffers::default(), pace: Pace::new(FIRST, LEAST, MOST) }
     }
 }
 
@@ -169,7 +156,7 @@ impl Room {
         let started = Instant::now();
         let (mut at, mut launches) = (0, 0);
         while at < count {
-            let end = count.min(at.saturating_add(self.most));
+            let end = count.min(at.saturating_add(self.pace.size()));
             let value = uniform.1(at, end);
             self.buffers.get(uniform.0).inspect(|b| gpu.queue.write_buffer(b, 0, bytemuck::bytes_of(&value)));
             let mut encoder = gpu.device.create_command_encoder(&Default::default());
@@ -180,12 +167,7 @@ impl Room {
             launches += 1;
         }
         gpu.wait()?;
-        let each = started.elapsed().as_secs_f64() / f64::from(launches.max(1));
-        if each > SECONDS[1] && self.most > LEAST {
-            self.most /= 2;
-        } else if each < SECONDS[0] && launches > 1 && self.most < MOST {
-            self.most *= 2;
-        }
+        self.pace.heard(started.elapsed().as_secs_f64(), launches, count.min(self.pace.size()));
         Ok(())
     }
 
@@ -216,7 +198,7 @@ impl Shared {
     /// Planes of x of a volume that one buffer holds.
     fn slabs(&self, shape: [usize; 3]) -> Result<Vec<Range<usize>>> {
         let plane = 4 * (shape[1] * shape[2]) as u64;
-        let bytes = self.gpu.adapter.binding_bytes.min(self.gpu.adapter.buffer_bytes);
+        let bytes = self.gpu.adapter.bound_bytes();
         let most = (bytes / plane) as usize;
         if most == 0 {
             return Err(self.gpu.error(format!("a plane of voxels takes {plane} bytes, a buffer holds {bytes}")));
@@ -277,7 +259,7 @@ impl VoxelProjector for OnDevice {
 impl DeviceOperator {
     /// How many views are on the device at once.
     fn views_at_once(&self, pixels: usize) -> usize {
-        let bytes = LINES_BYTES.min(self.shared.gpu.adapter.binding_bytes);
+        let bytes = LINES_BYTES.min(self.shared.gpu.adapter.bound_bytes());
         (bytes as usize / (4 * pixels).max(1)).max(1)
     }
 
@@ -411,10 +393,11 @@ pub fn backproject(
     let shape: [usize; 3] = volume.dim().into();
     let plane = shape[1] * shape[2];
     let bytes = 4 * (rows * columns) as u64;
-    if bytes > gpu.adapter.binding_bytes {
-        return Err(gpu.error(format!("a view takes {bytes} bytes, a buffer holds {}", gpu.adapter.binding_bytes)));
+    let most = gpu.adapter.bound_bytes();
+    if bytes > most {
+        return Err(gpu.error(format!("a view takes {bytes} bytes, a buffer holds {most}")));
     }
-    let chunk = (LINES_BYTES.min(gpu.adapter.binding_bytes) / bytes).max(1) as usize;
+    let chunk = (LINES_BYTES.min(most) / bytes).max(1) as usize;
     let narrow = |n: [f64; 4]| n.map(|x| x as f32);
     let seen = |v: &VoxelView| SeenView {
         depth: narrow(v.depth),

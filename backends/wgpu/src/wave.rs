@@ -1,5 +1,6 @@
 //! A step's work cut into waves of bounded size, so that no launch holds a device for long.
 
+use crate::compose::GROUP;
 use conefield_core::backend::{TrainRay, Work};
 use conefield_core::random::mix;
 use conefield_core::stage::{Projector, UnitRay};
@@ -49,7 +50,7 @@ pub struct Wave {
 impl Wave {
     /// Partial losses that its kernels leave: one a ray, one for 64 points, one a block.
     pub fn losses(&self) -> usize {
-        self.rays.len() + self.points.len().div_ceil(64) + self.blocks.len()
+        self.rays.len() + self.points.len().div_ceil(GROUP as usize) + self.blocks.len()
     }
 }
 

@@ -22,19 +22,7 @@ pub fn functions(stage: &MlpStage) -> String {
         layer(stage, i, true, &mut backward);
     }
     gradients(stage, &mut backward);
-    let input = stage.input;
-    format!(
-        "fn stage_forward(x: ptr<function, array<f32, {input}>>, y: ptr<function, array<f32, 1>>) {{
-{forward}}}
-
-fn stage_backward(
-    x: ptr<function, array<f32, {input}>>,
-    dy: ptr<function, array<f32, 1>>,
-    dx: ptr<function, array<f32, {input}>>,
-) {{
-{backward}}}
-"
-    )
+    conefield_core::wgsl::functions(stage.input, 1, &forward, &backward)
 }
 
 /// Where a layer finds what it reads: the features or the layer before.
