@@ -34,12 +34,13 @@ pub struct Model {
     masks: Vec<Masked>,
 }
 
-/// Channels that a normalizer removed for good.
+/// Channels that were removed for good.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct Masked {
-    /// Which normalizer, counted from 0.
-    pub normalizer: usize,
+    /// Which normalizer removed some of its own, counted from 0; none where the scene has no need of some of the encoder's.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub normalizer: Option<usize>,
     /// Channels that stayed, of those computed until then; ascending.
     pub keep: Vec<usize>,
 }
@@ -148,6 +149,23 @@ impl Pipeline {
         self.stages().iter().map(|(_, s)| s.info().macs).sum()
     }
 
+    /// The encoder's channels that a scene needs of which `cells` along the unit cube's side are to be told apart: all up to
+    /// the coarsest that suffice. `None` where it needs all.
+    pub fn needed(&self, cells: f64) -> Option<Vec<usize>> {
+        let all = self.encoder.resolutions()?;
+        // A hair more, so that a cube of 256 voxels takes 256 cells for enough.
+        let enough = all.iter().copied().filter(|r| 1.001 * r >= cells).fold(f64::INFINITY, f64::min);
+        let keep: Vec<usize> = (0..all.len()).filter(|&c| all[c] <= enough).collect();
+        (keep.len() < all.len()).then_some(keep)
+    }
+
+    /// Takes a scene's voxels for the measure of what counts in them.
+    pub fn fit(&mut self, voxel_mm: f64) {
+        if let Some(fitted) = self.projector.fitted(voxel_mm) {
+            self.projector = fitted;
+        }
+    }
+
     /// Removes the channels that normalizer `at` masked: stages before it compute only what is still read, stages
     /// after it become narrower, and parameters that nothing reads leave the arena.
     fn apply_mask(&mut self, at: usize, masked: &[usize], arena: &mut Arena) -> Result<()> {
@@ -212,7 +230,7 @@ impl Model {
             if let Some(mask) = mask {
                 exe.fetch(self)?;
                 self.pipeline.apply_mask(i, &mask.keep, &mut self.arena)?;
-                self.masks.push(Masked { normalizer: i, keep: mask.keep });
+                self.masks.push(Masked { normalizer: Some(i), keep: mask.keep });
                 reports.push(mask.report);
                 *exe = backend.compile(&self.pipeline)?.0;
             }
@@ -225,24 +243,27 @@ impl Model {
         &self.masks
     }
 
-    /// Removes channels as a normalizer decided in an earlier run; it will not decide again.
+    /// Removes channels as was decided before: by the scene, or by a normalizer, which will not decide again.
     pub fn mask(&mut self, masked: &Masked) -> Result<()> {
-        let Masked { normalizer: at, keep } = masked;
+        let Masked { normalizer, keep } = masked;
         let all = &self.pipeline.normalizers;
-        let stage = all.get(*at);
-        let width = stage.map_or(0, |n| n.info().input);
+        let stage = normalizer.map(|at| all.get(at));
+        let width = match stage {
+            None => self.pipeline.encoder.info().output,
+            Some(n) => n.map_or(0, |n| n.info().input),
+        };
         let ascending = keep.windows(2).all(|w| w[0] < w[1]) && keep.last().is_some_and(|&k| k < width);
         ensure(
             ascending,
             "checkpoint",
             "masks",
-            format!("normalizer {at} keeps {keep:?}"),
+            format!("{} keeps {keep:?}", normalizer.map_or("the scene".into(), |at| format!("normalizer {at}"))),
             format!("one of {} normalizers and ascending channels of those that it reads", all.len()),
         )?;
-        if let Some(n) = stage {
+        if let Some(n) = stage.flatten() {
             n.decided();
         }
-        self.pipeline.apply_mask(*at, keep, &mut self.arena)?;
+        self.pipeline.apply_mask(normalizer.unwrap_or(0), keep, &mut self.arena)?;
         self.masks.push(masked.clone());
         Ok(())
     }

@@ -1,7 +1,7 @@
 //! The scene: between the world in millimetres and the unit cube that stages see.
 
 use crate::error::{Result, ensure};
-use crate::geometry::{Geometry, Ray, Vec3, VoxelGrid, dot, norm, sub};
+use crate::geometry::{Geometry, Ray, Vec3, View, VoxelGrid, dot, norm, sub};
 use crate::scan::Scan;
 use crate::spec;
 use crate::stage::UnitRay;
@@ -130,6 +130,24 @@ impl Scene {
     /// The line integral that stages see as 1.
     pub fn line_scale(&self) -> f64 {
         self.attenuation * self.side
+    }
+
+    /// The shortest side of a voxel to export, mm.
+    pub fn voxel_mm(&self) -> f64 {
+        self.grid.spacing.into_iter().fold(f64::INFINITY, f64::min)
+    }
+
+    /// How many cells along the cube's side the data tell apart: voxels to export, or pixels at the distance of the volume's
+    /// centre where these are larger.
+    pub fn cells(&self, geometry: &Geometry) -> f64 {
+        let pixel = |w: &View| {
+            let [rows, columns] = geometry.detector;
+            let middle = w.pixel(geometry.detector, (rows as f64 - 1.0) / 2.0, (columns as f64 - 1.0) / 2.0);
+            let magnification = norm(sub(middle, w.source)) / self.distance(w.source).max(f64::MIN_POSITIVE);
+            norm(w.u).min(norm(w.v)) / magnification
+        };
+        let finest = geometry.views.iter().map(pixel).fold(f64::INFINITY, f64::min);
+        self.side / finest.max(self.voxel_mm())
     }
 
     /// Spacing of the voxels to export, in cube sides.

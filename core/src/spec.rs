@@ -121,12 +121,26 @@ pub struct Scene {
     pub attenuation: AttenuationScale,
     /// Where in the volume the object can be.
     pub support: SupportRule,
+    /// Which of the encoder's channels are computed.
+    pub levels: LevelRule,
 }
 
 impl Default for Scene {
     fn default() -> Self {
-        Self { fill: 1.0, attenuation: AttenuationScale::Scan, support: SupportRule::Box }
+        let (support, levels) = (SupportRule::Box, LevelRule::All);
+        Self { fill: 1.0, attenuation: AttenuationScale::Scan, support, levels }
     }
+}
+
+/// Which of the encoder's channels are computed.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
+#[serde(rename_all = "kebab-case")]
+pub enum LevelRule {
+    /// All.
+    All,
+    /// None that is finer than the data: than a voxel to export, or than what a pixel sees at the distance of the volume's
+    /// centre. The coarsest that suffice stay.
+    Needed,
 }
 
 /// Where in the volume the object can be.

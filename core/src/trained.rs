@@ -56,16 +56,18 @@ impl TrainedField {
 
     /// The field of `spec` where `placement` says, with the parameters that `load` puts into its model.
     pub fn restore(spec: &Spec, placement: &Placement, load: impl FnOnce(&mut Model) -> Result<()>) -> Result<Self> {
-        let mut model = Model::random(Pipeline::build(spec)?, 0);
-        for masked in &placement.masks {
-            model.mask(masked)?;
-        }
-        load(&mut model)?;
         placement.grid.validate("placement")?;
         let mut scene = Scene::with_attenuation(placement.grid, &spec.scene, placement.attenuation)?;
         if let Some(support) = placement.support.clone() {
             scene = scene.within(support, &spec.scene);
         }
+        let mut pipeline = Pipeline::build(spec)?;
+        pipeline.fit(scene.voxel_mm());
+        let mut model = Model::random(pipeline, 0);
+        for masked in &placement.masks {
+            model.mask(masked)?;
+        }
+        load(&mut model)?;
         Ok(Self { model, scene, unit_mm: placement.unit_mm })
     }
 

@@ -36,11 +36,15 @@ pub enum Extent {
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields, default)]
 pub struct RayMarch {
-    /// Samples a ray. Ignored where `step_mm` is given.
+    /// Samples a ray. Ignored where a step is given.
     pub samples: usize,
     /// Distance of samples in mm, instead of a count.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub step_mm: Option<f64>,
+    /// Distance of samples in sides of a voxel (the shortest), instead of a count: a ray gets as many samples as its path
+    /// through the object asks for.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub step_voxels: Option<f64>,
     /// Where samples stand in their interval.
     pub sampling: Sampling,
     /// Which part of a ray is sampled.
@@ -49,7 +53,7 @@ pub struct RayMarch {
 
 impl Default for RayMarch {
     fn default() -> Self {
-        Self { samples: 192, step_mm: None, sampling: Sampling::Stratified, extent: Extent::Clipped }
+        Self { samples: 192, step_mm: None, step_voxels: None, sampling: Sampling::Stratified, extent: Extent::Clipped }
     }
 }
 
@@ -63,9 +67,14 @@ impl ProjectorSpec for RayMarch {
     fn build(&self) -> Result<Box<dyn Projector>> {
         let n = self.samples;
         ensure((1..=MOST_SAMPLES).contains(&n), "spec", "projector.samples", n, "1 to 65536")?;
-        if let Some(step) = self.step_mm {
-            ensure(step.is_finite() && step > 0.0, "spec", "projector.step_mm", step, "a positive number of mm")?;
-        }
+        let positive = |step: Option<f64>| step.is_none_or(|s| s.is_finite() && s > 0.0);
+        let shown = |step: Option<f64>| step.map_or(String::new(), |s| s.to_string());
+        let step = self.step_mm;
+        ensure(positive(step), "spec", "projector.step_mm", shown(step), "a positive number of mm")?;
+        let step = self.step_voxels;
+        ensure(positive(step), "spec", "projector.step_voxels", shown(step), "a positive number of voxels")?;
+        let both = self.step_mm.is_some() && step.is_some();
+        ensure(!both, "spec", "projector.step_voxels", "step_mm beside it", "one of them")?;
         Ok(Box::new(self.clone()))
     }
 }
@@ -105,10 +114,17 @@ impl Projector for RayMarch {
         }
     }
 
+    fn fitted(&self, voxel_mm: f64) -> Option<Box<dyn Projector>> {
+        let step = self.step_voxels? * voxel_mm;
+        Some(Box::new(Self { step_mm: Some(step), step_voxels: None, ..self.clone() }))
+    }
+
     fn describe(&self) -> String {
-        let count = match self.step_mm {
-            Some(step) => format!("a sample every {step} mm"),
-            None => format!("{} samples a ray", self.samples),
+        let count = match (self.step_mm, self.step_voxels) {
+            (Some(step), _) => format!("a sample every {step} mm"),
+            (_, Some(1.0)) => "a sample every voxel".into(),
+            (_, Some(step)) => format!("a sample every {step} voxels"),
+            _ => format!("{} samples a ray", self.samples),
         };
         format!("ray-march: {count}, {:?}, {:?}", self.sampling, self.extent).to_lowercase()
     }
@@ -141,7 +157,7 @@ mod tests {
     fn weights_sum_to_the_length_and_the_last_interval_counts() {
         for extent in [Extent::Clipped, Extent::Published] {
             for step_mm in [None, Some(0.7)] {
-                let p = RayMarch { samples: 7, step_mm, sampling: Sampling::Uniform, extent };
+                let p = RayMarch { samples: 7, step_mm, step_voxels: None, sampling: Sampling::Uniform, extent };
                 let mut s = Samples::default();
                 p.sample(&ray(), None, &mut s);
                 let length: f32 = s.weights.iter().sum();

@@ -3,15 +3,15 @@
 //! Every step draws rays, compares their integrals with the measurement (L1 in the published codes), optionally adds
 //! a total-variation prior on small random blocks of neighbouring points, and takes an Adam step.
 
+use crate::fit::{Fitted, fit};
 use crate::iterative::start_volume;
 use crate::pretrain::learn;
 use crate::rays::{Pixels, RaySource, Views};
 use crate::schedule::{Clock, Decay, Ends};
-use crate::support;
 use conefield_core::backend::{Adam, Executable, Loss, TrainRay, TvBlocks, Work};
 use conefield_core::checkpoint::{Checkpoint, Resume, Standing, tensors};
 use conefield_core::error::{Error, Result, ensure};
-use conefield_core::pipeline::{Model, Pipeline};
+use conefield_core::pipeline::{Masked, Model, Pipeline};
 use conefield_core::random::stream;
 use conefield_core::scene::Scene;
 use conefield_core::solver::{Job, Observer, PretrainJob, Reconstruction, Record, Solution, Solver};
@@ -172,9 +172,9 @@ const HELD_OUT_RAYS: usize = 8192;
 impl Solver for Gradient {
     fn solve(&self, job: &Job<'_>, observer: &mut dyn Observer) -> Result<Solution> {
         job.scan.validate("scan")?;
-        let (scene, found) = support::scene(job.scan, &job.spec.scene)?;
+        let mut pipeline = Pipeline::build(job.spec)?;
+        let Fitted { scene, needed, found } = fit(job.scan, &job.spec.scene, &mut pipeline)?;
         found.iter().for_each(|line| observer.note(line));
-        let pipeline = Pipeline::build(job.spec)?;
         let volume = job.spec.initializer.as_ref().map(|i| i.volume()).transpose()?.flatten();
         let fills_weights = job.spec.initializer.as_ref().filter(|_| volume.is_none());
         let initializer = fills_weights.map(|i| i.build(job.weights)).transpose()?;
@@ -196,6 +196,9 @@ impl Solver for Gradient {
                     report.loaded.len() + report.fresh.len()
                 ));
             }
+        }
+        if let (Some(keep), None) = (needed, job.resume) {
+            model.mask(&Masked { normalizer: None, keep })?;
         }
         let (mut exe, explain) = job.backend.compile(&model.pipeline)?;
         observer.note(&explain.backend);

@@ -2,10 +2,12 @@
 //!
 //! - [`gradient`] trains an attenuation field by stochastic gradients; [`pretrain`] trains one on a known volume, for
 //!   weights that other scans reuse.
+//! - [`fit`] finds out what a scan has need of, [`support`] where its object can be.
 //! - [`fdk`] filters and back-projects.
 //! - [`iterative`] improves voxels pass by pass: SART and its kin, CGLS, ASD-POCS, FISTA with total variation.
 
 pub mod fdk;
+pub mod fit;
 pub mod gradient;
 pub mod iterative;
 pub mod pretrain;

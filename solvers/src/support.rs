@@ -7,11 +7,8 @@
 //! air is not known. Cells beside those that are left stay too.
 
 use crate::shadow::box_filter;
-use conefield_core::error::Result;
 use conefield_core::geometry::{Vec3, VoxelGrid};
 use conefield_core::scan::Scan;
-use conefield_core::scene::Scene;
-use conefield_core::spec::{self, SupportRule};
 use conefield_core::support::Support;
 use conefield_projectors::voxel::layout::Pinhole;
 use ndarray::{Array2, ArrayView1, ArrayView2, Axis};
@@ -28,20 +25,6 @@ const TOGETHER: usize = 8;
 /// Share of the views that see a cell which must show air there, and how many at least.
 const SHARE: f64 = 0.15;
 const VIEWS: usize = 2;
-
-/// The scene of a scan under a spec's settings, and what was found out about the object's place, for people.
-pub fn scene(scan: &Scan, settings: &spec::Scene) -> Result<(Scene, Option<String>)> {
-    let scene = Scene::new(scan, settings)?;
-    if settings.support == SupportRule::Box {
-        return Ok((scene, None));
-    }
-    let found = carve(scan);
-    let said = format!("support: {}", found.said);
-    Ok(match found.support {
-        Some(support) => (scene.within(support, settings), Some(said)),
-        None => (scene, Some(said)),
-    })
-}
 
 /// What carving came to.
 pub struct Found {

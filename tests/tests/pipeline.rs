@@ -389,3 +389,54 @@ fn masked_channels_leave_the_work() {
     assert!(last < after, "{after} after the mask, {last}");
     assert!(model.arena.first.iter().filter(|m| **m != 0.0).count() > model.arena.first.len() / 4);
 }
+
+// ---- what a scan has need of ----
+
+/// 160 mm of voxels of 10 mm, seen by pixels of 11.7 mm at their distance: 14 cells are told apart, 16 suffice.
+#[test]
+fn channels_finer_than_the_data_leave_the_work() {
+    let mut s = settings();
+    s["encoder"] = json!({"type": "hash-grid", "levels": 6, "base_resolution": 2, "log2_table_size": 8});
+    // A mask that has its own say afterwards.
+    s["normalizers"] = json!([{"type": "fft-mask", "epoch": 1, "keep": [0, 1, 2, 3, 4, 5, 6]}, {"type": "layer-norm"}]);
+    s["scene"] = json!({"levels": "needed"});
+    let (solution, records) = solve(&s, &scan(), &Weights::default()).unwrap();
+    assert_eq!(records.iter().flat_map(|r| &r.events).count(), 1);
+    let field = solution.result.field().unwrap();
+    let masks = field.placement().masks;
+    let by: Vec<_> = masks.iter().map(|m| (m.normalizer, m.keep.len())).collect();
+    assert_eq!(by, [(None, 8), (Some(0), 7)]);
+    let names: Vec<_> = field.model.pipeline.layout().blocks.iter().map(|b| b.name.as_str()).collect();
+    assert!(names.contains(&"encoder.3.table") && !names.contains(&"encoder.4.table"), "{names:?}");
+
+    // It comes back from its weights.
+    let weights = Weights::from_arena(field.model.pipeline.layout(), &field.model.arena.params, |_| true);
+    let again = TrainedField::restore(&spec(&s).unwrap(), &field.placement(), |model| {
+        weights.load("test", model.pipeline.layout(), &mut model.arena.params, |_| true).map(drop)
+    })
+    .unwrap();
+    let values = Volume::collect(&mut again.voxels(&Cpu::new(), again.scene.grid).unwrap()).unwrap();
+    assert_eq!(bits(values.data.as_slice().unwrap()), bits(volume(&solution).data.as_slice().unwrap()));
+
+    // A grid that is coarser than the data keeps all.
+    s["encoder"]["levels"] = json!(3);
+    s["normalizers"] = json!([{"type": "layer-norm"}]);
+    let (solution, _) = solve(&s, &scan(), &Weights::default()).unwrap();
+    assert!(solution.result.field().unwrap().placement().masks.is_empty());
+}
+
+#[test]
+fn a_step_in_voxels_is_one_in_millimetres() {
+    let mut s = settings();
+    let run = |projector: Value| {
+        let mut s = s.clone();
+        s["projector"] = projector;
+        bits(&model(solve(&s, &scan(), &Weights::default()).unwrap().0).arena.params)
+    };
+    let voxels = run(json!({"type": "ray-march", "step_voxels": 1.5}));
+    assert_eq!(voxels, run(json!({"type": "ray-march", "step_mm": 15.0})));
+    assert_ne!(voxels, run(json!({"type": "ray-march", "step_mm": 10.0})));
+    s["projector"] = json!({"type": "ray-march", "step_voxels": 1.5, "step_mm": 2.0});
+    let e = solve(&s, &scan(), &Weights::default()).err().unwrap().to_string();
+    assert!(e.contains("projector.step_voxels"), "{e}");
+}

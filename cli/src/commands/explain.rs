@@ -10,7 +10,7 @@ use conefield_core::backend::Explain as Compiled;
 use conefield_core::pipeline::Pipeline;
 use conefield_core::spec::load::Loaded;
 use conefield_core::stage::{GradKind, Stage};
-use conefield_solvers::support::scene;
+use conefield_solvers::fit::fit;
 use serde::Serialize;
 use serde_json::Value;
 use std::path::{Path, PathBuf};
@@ -127,8 +127,8 @@ struct ForScan {
 impl Explain {
     pub fn run(self) -> Result<()> {
         let loaded = specs::read(&self.spec, &self.sets)?;
-        let parts = Parts::of(&loaded, self.backend.open()?.as_ref())?;
-        let scan = self.scan.as_ref().map(|path| for_scan(&loaded, &parts, path)).transpose()?;
+        let mut parts = Parts::of(&loaded, self.backend.open()?.as_ref())?;
+        let scan = self.scan.as_ref().map(|path| for_scan(&loaded, &mut parts, path)).transpose()?;
         let report = report(&loaded, parts, scan)?;
         if self.json { out::json(&report) } else { out::say(&text(&report)) }
     }
@@ -184,15 +184,16 @@ fn rows(tree: &Value, pipeline: &Pipeline) -> Vec<Row> {
     stages
 }
 
-fn for_scan(loaded: &Loaded, parts: &Parts, path: &Path) -> Result<ForScan> {
+fn for_scan(loaded: &Loaded, parts: &mut Parts, path: &Path) -> Result<ForScan> {
     let run = parts.run(conefield_io::scan_size(path)?);
     let scan = files::scan(path)?;
     let g = &scan.geometry;
     let mut found = vec![];
-    let seen = match &parts.pipeline {
+    let seen = match &mut parts.pipeline {
         Some(pipeline) => {
-            let (scene, support) = scene(&scan, &loaded.spec.scene).map_err(|e| loaded.locate(e))?;
-            found.extend(support);
+            let fitted = fit(&scan, &loaded.spec.scene, pipeline).map_err(|e| loaded.locate(e))?;
+            let scene = fitted.scene;
+            found.extend(fitted.found);
             let middle = scene.pixel_ray(g, 0, g.detector[0] / 2, g.detector[1] / 2);
             Some((scene.attenuation * scan.unit.mm, pipeline.projector.max_samples(&middle)))
         }
