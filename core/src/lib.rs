@@ -7,6 +7,7 @@
 //! - [`arena`]: parameters, gradients and optimizer state under their names.
 //! - [`files`]: opening what a user or a description names.
 //! - [`spec`], [`registry`]: what a user writes, and the stage types that it may name.
+//! - [`host`]: stages on the host, for what looks at a model beside training.
 //! - [`voxel`]: line integrals of voxel volumes.
 //! - [`pipeline`], [`backend`], [`solver`], [`trained`]: from a spec to a volume.
 
@@ -17,6 +18,7 @@ pub mod dense;
 pub mod error;
 pub mod files;
 pub mod geometry;
+pub mod host;
 pub mod pages;
 pub mod parts;
 pub mod pipeline;

@@ -9,7 +9,7 @@ use crate::pipeline::Model;
 use crate::scan::{Scan, Volume};
 use crate::spec::Spec;
 use crate::trained::TrainedField;
-use serde::Serialize;
+use serde::{Deserialize, Serialize};
 
 /// What a solver works on.
 pub struct Job<'a> {
@@ -103,9 +103,26 @@ pub struct Record {
     /// PSNR against the reference over every 4th voxel an axis, dB.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub psnr: Option<f64>,
+    /// Drift found since the last record, of a spec with `solver.drift`.
+    #[serde(skip_serializing_if = "Vec::is_empty")]
+    pub drift: Vec<DriftRecord>,
     /// What else happened since the last record, e.g. channels masked.
     #[serde(skip_serializing_if = "Vec::is_empty")]
     pub events: Vec<String>,
+}
+
+/// How much normalizers and field have changed under the same features.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct DriftRecord {
+    /// Finished steps when features were recorded.
+    pub from_step: u64,
+    /// Finished steps when they were evaluated again.
+    pub step: u64,
+    /// Finished passes over the views by then.
+    pub epoch: f64,
+    /// Mean absolute difference of the attenuation, in the scale that stages see.
+    pub mean_l1: f64,
 }
 
 /// Hears of a run's progress and may stop it.

@@ -3,6 +3,7 @@
 //! Every step draws rays, compares their integrals with the measurement (L1 in the published codes), optionally adds
 //! a total-variation prior on small random blocks of neighbouring points, and takes an Adam step.
 
+use crate::drift::{Drift, DriftWatch};
 use crate::fit::{Fitted, fit};
 use crate::iterative::start_volume;
 use crate::pretrain::learn;
@@ -14,7 +15,7 @@ use conefield_core::error::{Error, Result, ensure};
 use conefield_core::pipeline::{Masked, Model, Pipeline};
 use conefield_core::random::stream;
 use conefield_core::scene::Scene;
-use conefield_core::solver::{Job, Observer, PretrainJob, Reconstruction, Record, Solution, Solver};
+use conefield_core::solver::{DriftRecord, Job, Observer, PretrainJob, Reconstruction, Record, Solution, Solver};
 use conefield_core::spec::{SolverSpec, Spec};
 use conefield_core::stage::{Projector, UnitRay};
 use conefield_core::trained::TrainedField;
@@ -97,6 +98,8 @@ pub struct Gradient {
     pub eps: f64,
     /// Total-variation prior, if any.
     pub tv: Option<TvPrior>,
+    /// Logs how much normalizers and field change under the same features, if asked for.
+    pub drift: Option<Drift>,
     /// Steps between two records of the metrics.
     pub report_every: u64,
     /// Points a step of pre-training.
@@ -121,6 +124,7 @@ impl Default for Gradient {
             betas: [0.9, 0.999],
             eps: 1e-8,
             tv: None,
+            drift: None,
             report_every: 50,
             pretrain_points: 65_536,
             pretrain_steps: 1000,
@@ -160,6 +164,7 @@ impl SolverSpec for Gradient {
         }
         ensure(self.pretrain_points > 0, place, "solver.pretrain_points", 0, "at least 1")?;
         self.decay.validate()?;
+        self.drift.as_ref().map_or(Ok(()), Drift::validate)?;
         Ok(Box::new(self.clone()))
     }
 }
@@ -211,6 +216,8 @@ impl Solver for Gradient {
         let steps_an_epoch = source.steps_an_epoch() as f64;
         let by_epochs = self.epochs.map(|e| (e * steps_an_epoch).ceil() as u64);
         let steps = [self.steps, by_epochs].into_iter().flatten().min();
+        let watcher = |d| DriftWatch::new(d, &scene, job.seed, steps_an_epoch, job.resume, &model);
+        let mut drift = self.drift.as_ref().map(watcher).transpose()?;
         let Start { standing, mut window } = start;
         let mut clock = Clock::new(Ends { steps, seconds: self.seconds }, job.limits, standing.seconds);
         let mut rays = Vec::with_capacity(self.rays);
@@ -218,6 +225,11 @@ impl Solver for Gradient {
         let (mut step, mut samples) = (standing.step, standing.samples);
         clock.resume();
         loop {
+            if let Some(drift) = drift.as_mut().filter(|d| d.due(step)) {
+                clock.pause();
+                window.drift.extend(drift.look(step, &mut model, exe.as_mut(), &mut window.events)?);
+                clock.resume();
+            }
             let cancelled = observer.cancelled();
             if step > standing.step && (cancelled || observer.checkpoint_due()) {
                 clock.pause();
@@ -225,7 +237,9 @@ impl Solver for Gradient {
                 let masks = model.masks().to_vec();
                 let standing = Standing { step, samples, seconds: clock.seconds(), masks, solver };
                 exe.fetch(&mut model)?;
-                observer.checkpoint(&Checkpoint { tensors: tensors(&model), standing })?;
+                let mut tensors = tensors(&model);
+                tensors.extend(drift.iter().flat_map(|d| d.tensors(&model)));
+                observer.checkpoint(&Checkpoint { tensors, standing })?;
                 clock.resume();
             }
             if cancelled {
@@ -350,6 +364,8 @@ struct Window {
     prior: f64,
     samples: u64,
     seconds: f64,
+    #[serde(default)]
+    drift: Vec<DriftRecord>,
     events: Vec<String>,
 }
 
@@ -375,6 +391,7 @@ impl Window {
             prior: (self.prior > 0.0).then_some(self.prior / n),
             lr: Some(lr),
             samples_per_s: Some(self.samples as f64 / self.seconds.max(1e-12)),
+            drift: std::mem::take(&mut self.drift),
             events: std::mem::take(&mut self.events),
             ..Record::default()
         }

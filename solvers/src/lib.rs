@@ -3,9 +3,11 @@
 //! - [`gradient`] trains an attenuation field by stochastic gradients; [`pretrain`] trains one on a known volume, for
 //!   weights that other scans reuse.
 //! - [`fit`] finds out what a scan has need of, [`support`] where its object can be.
+//! - [`drift`] measures how much of a field changes while it trains.
 //! - [`fdk`] filters and back-projects.
 //! - [`iterative`] improves voxels pass by pass: SART and its kin, CGLS, ASD-POCS, FISTA with total variation.
 
+pub mod drift;
 pub mod fdk;
 pub mod fit;
 pub mod gradient;

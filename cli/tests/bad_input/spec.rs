@@ -56,6 +56,18 @@ pub fn cases() -> Vec<Case> {
             TOML,
             &["spec.toml:3:10", "64 bits"],
         ),
+        refused(
+            "features evaluated again after no time",
+            toml("extends = \"naf\"\n[solver]\ndrift = { every = 0.0 }\n"),
+            TOML,
+            &["solver.drift.every", "positive"],
+        ),
+        refused(
+            "no points to record features of",
+            toml("extends = \"naf\"\n[solver]\ndrift = { points = 0 }\n"),
+            TOML,
+            &["solver.drift.points", "1 to 65536"],
+        ),
         refused("NaN", toml("extends = \"naf\"\n[scene]\nfill = nan\n"), TOML, &["spec.toml:3:8", "finite"]),
         refused(
             "a grid past memory",

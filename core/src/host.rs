@@ -1,0 +1,57 @@
+//! Stages on the host by their `f32` kernels, whatever backend trains: for what looks at a model beside training.
+
+use crate::error::{Result, ensure};
+use crate::pipeline::Model;
+use crate::stage::{Scope, Stage, TILE_ROWS, Tile, TileMut};
+use std::ops::Range;
+
+/// The encoder's features `[F][rows]` as the normalizers hand them to the field, `[F'][rows]`. Rows are points off any
+/// ray. The model's arena must be up to date ([`crate::backend::Executable::fetch`]).
+pub fn normalize(model: &Model, features: &[f32], rows: usize) -> Result<Vec<f32>> {
+    through(model, 1..model.pipeline.normalizers.len() + 1, features, rows)
+}
+
+/// The attenuation `[rows]` that normalizers and field make of the encoder's features `[F][rows]`, in the scale that
+/// stages see. As [`normalize`] otherwise.
+pub fn attenuation(model: &Model, features: &[f32], rows: usize) -> Result<Vec<f32>> {
+    through(model, 1..model.pipeline.normalizers.len() + 2, features, rows)
+}
+
+/// `features` through some neighbouring stages of the pipeline.
+fn through(model: &Model, which: Range<usize>, features: &[f32], rows: usize) -> Result<Vec<f32>> {
+    let pipeline = &model.pipeline;
+    let stages: Vec<(&dyn Stage, &[f32])> = pipeline
+        .stages()
+        .into_iter()
+        .zip(pipeline.ranges())
+        .map(|((_, stage), range)| (stage, &model.arena.params[range.clone()]))
+        .collect();
+    let stages = &stages[which];
+    let width = pipeline.encoder.info().output;
+    ensure(
+        features.len() == width * rows,
+        "features",
+        "length",
+        features.len(),
+        format!("{width} channels of {rows} rows"),
+    )?;
+    let wide = stages.last().map_or(width, |(stage, _)| stage.info().output);
+    let mut out = vec![0.0; wide * rows];
+    // A stage that looks along rays gets points off any ray one at a time.
+    let most = if stages.iter().any(|(s, _)| s.info().scope == Scope::Ray) { 1 } else { TILE_ROWS };
+    for at in (0..rows).step_by(most) {
+        let n = most.min(rows - at);
+        let mut x: Vec<f32> = features.chunks_exact(rows).flat_map(|c| &c[at..at + n]).copied().collect();
+        for (stage, params) in stages {
+            let info = stage.info();
+            let (mut y, mut tape) = (vec![0.0; info.output * n], vec![0.0; info.tape * n]);
+            stage.kernel().forward(params, Tile::new(&x, n), TileMut::new(&mut y, n), TileMut::new(&mut tape, n));
+            x = y;
+        }
+        for (out, x) in out.chunks_exact_mut(rows).zip(x.chunks_exact(n)) {
+            out[at..at + n].copy_from_slice(x);
+        }
+    }
+    pipeline.fault()?;
+    Ok(out)
+}

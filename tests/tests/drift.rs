@@ -1,0 +1,212 @@
+//! The drift that `solver.drift` logs: what it measures, and what it leaves alone.
+
+mod common;
+
+use common::{Heard, model, scan, solve, spec};
+use conefield_backend_cpu::Cpu;
+use conefield_core::Result;
+use conefield_core::arena::Weights;
+use conefield_core::backend::Backend;
+use conefield_core::checkpoint::{Checkpoint, Resume};
+use conefield_core::host;
+use conefield_core::pipeline::{Model, Pipeline};
+use conefield_core::scene::Scene;
+use conefield_core::solver::{DriftRecord, Job, Observer, Record};
+use conefield_solvers::drift::{Drift, DriftWatch};
+use serde_json::{Value, json};
+
+/// 40 steps over 8 views: 5 epochs.
+fn settings() -> Value {
+    json!({
+        "encoder": {"type": "hash-grid", "levels": 3, "base_resolution": 3, "log2_table_size": 8},
+        "normalizers": [{"type": "layer-norm"}],
+        "field": {"type": "mlp", "width": 12, "depth": 3, "skips": [1], "output": "none"},
+        "projector": {"type": "ray-march", "samples": 20},
+        "solver": {"type": "gradient", "steps": 40, "rays": 64, "lr": 0.02, "report_every": 5,
+                   "drift": {"every": 1.5, "points": 300}},
+    })
+}
+
+fn with(path: &str, value: Value) -> Value {
+    let mut all = settings();
+    *all.pointer_mut(path).unwrap() = value;
+    all
+}
+
+fn drift(records: &[Record]) -> Vec<DriftRecord> {
+    records.iter().flat_map(|r| r.drift.clone()).collect()
+}
+
+fn events(records: &[Record]) -> Vec<String> {
+    records.iter().flat_map(|r| r.events.clone()).collect()
+}
+
+#[test]
+fn stages_on_the_host_compute_what_the_backend_does() {
+    let model = Model::random(Pipeline::build(&spec(&settings()).unwrap()).unwrap(), 3);
+    let (mut exe, _) = Cpu::new().compile(&model.pipeline).unwrap();
+    // More than a tile of rows, and not a whole number of tiles.
+    let points: Vec<[f32; 3]> = (0..300).map(|i| [0.1, 0.37, 0.73].map(|k| (i as f32 * k).fract())).collect();
+    let mut expected = vec![0.0; points.len()];
+    exe.evaluate(&model, &points, &mut expected).unwrap();
+    let features = exe.encode(&model, &points).unwrap();
+    assert_eq!(host::attenuation(&model, &features, points.len()).unwrap(), expected);
+    let normal = host::normalize(&model, &features, points.len()).unwrap();
+    assert_eq!(normal.len(), features.len());
+    for row in [0, 255, 256, 299] {
+        let mean: f32 = normal.chunks_exact(300).map(|c| c[row]).sum::<f32>() / 6.0;
+        assert!(mean.abs() < 1e-5, "{mean}");
+    }
+    let e = host::normalize(&model, &features[1..], points.len()).unwrap_err().to_string();
+    assert!(e.contains("1799") && e.contains("6 channels"), "{e}");
+}
+
+#[test]
+fn a_field_that_moves_by_a_known_amount_drifts_by_it() {
+    let (scan, spec) = (scan(), spec(&settings()).unwrap());
+    let scene = Scene::new(&scan, &spec.scene).unwrap();
+    let mut model = Model::random(Pipeline::build(&spec).unwrap(), 3);
+    let (mut exe, _) = Cpu::new().compile(&model.pipeline).unwrap();
+    let watch = Drift { every: 2.0, points: 500 };
+    let mut watch = DriftWatch::new(&watch, &scene, 3, 4.0, None, &model).unwrap();
+    let mut events = vec![];
+    let mut look = |step: u64, model: &mut Model| {
+        assert!(watch.due(step) && !watch.due(step + 1));
+        let found = watch.look(step, model, exe.as_mut(), &mut events).unwrap();
+        assert!(!watch.due(step));
+        found
+    };
+    assert_eq!(look(0, &mut model), None);
+    // The last bias alone adds to every attenuation.
+    let last = model.arena.params.len() - 1;
+    model.arena.params[last] += 0.25;
+    let found = look(8, &mut model).unwrap();
+    assert!((found.mean_l1 - 0.25).abs() < 1e-6, "{found:?}");
+    assert_eq!((found.from_step, found.step, found.epoch), (0, 8, 2.0));
+    // Against the last recording, not the first.
+    assert_eq!(look(16, &mut model).unwrap().mean_l1, 0.0);
+    // The encoder is not within what is evaluated again; a LayerNorm is.
+    let ranges = model.pipeline.ranges().to_vec();
+    model.arena.params[ranges[0].clone()].iter_mut().for_each(|p| *p = 1.0 - *p);
+    assert_eq!(look(24, &mut model).unwrap().mean_l1, 0.0);
+    model.arena.params[ranges[1].clone()].iter_mut().for_each(|p| *p += 0.5);
+    assert!(look(32, &mut model).unwrap().mean_l1 > 1e-3);
+    assert!(events.is_empty());
+}
+
+#[test]
+fn drift_is_logged_where_it_is_asked_for_and_changes_nothing() {
+    let scan = scan();
+    let none = Weights::default();
+    let (solution, records) = solve(&settings(), &scan, &none).unwrap();
+    let found = drift(&records);
+    let steps: Vec<[u64; 2]> = found.iter().map(|d| [d.from_step, d.step]).collect();
+    assert_eq!(steps, [[0, 12], [12, 24], [24, 36]]);
+    assert!(found.iter().all(|d| d.mean_l1 > 0.0 && d.mean_l1.is_finite()), "{found:?}");
+    assert!((found[1].epoch - 3.0).abs() < 1e-12);
+    let (plain, without) = solve(&with("/solver/drift", Value::Null), &scan, &none).unwrap();
+    assert!(drift(&without).is_empty() && !serde_json::to_string(&without[0]).unwrap().contains("drift"));
+    assert_eq!(model(solution).arena.params, model(plain).arena.params);
+    // A rate too small to change a number leaves nothing to see.
+    let (_, still) = solve(&with("/solver/lr", json!(1e-30)), &scan, &none).unwrap();
+    assert!(drift(&still).iter().all(|d| d.mean_l1 == 0.0) && drift(&still).len() == 3);
+}
+
+#[test]
+fn an_interval_in_which_channels_are_masked_has_no_drift() {
+    let masked = json!([{"type": "fft-mask", "epoch": 2, "threshold": 1e-6}, {"type": "layer-norm"}]);
+    let (solution, records) = solve(&with("/normalizers", masked), &scan(), &Weights::default()).unwrap();
+    assert_eq!(model(solution).masks().len(), 1, "nothing was masked");
+    let steps: Vec<u64> = drift(&records).iter().map(|d| d.step).collect();
+    assert_eq!(steps, [12, 36]);
+    let said = events(&records);
+    assert!(said.iter().any(|e| e.contains("no drift from step 12 to 24")), "{said:?}");
+}
+
+/// Keeps a checkpoint after a step and stops there.
+struct Stop {
+    at: u64,
+    step: u64,
+    kept: Option<Resume>,
+    heard: Vec<Record>,
+}
+
+impl Observer for Stop {
+    fn progress(&mut self, step: u64, _: f64, _: f64) {
+        self.step = step;
+    }
+    fn record(&mut self, record: &Record) {
+        self.heard.push(record.clone());
+    }
+    fn note(&mut self, _: &str) {}
+    fn cancelled(&self) -> bool {
+        self.step >= self.at
+    }
+    fn checkpoint(&mut self, c: &Checkpoint<'_>) -> Result<()> {
+        let tensors = c.tensors.iter().map(|(n, s, v)| (n.clone(), (s.to_vec(), v.to_vec()))).collect();
+        let weights = Weights { tensors, ..Weights::default() };
+        self.kept = Some(Resume { place: "kept".into(), standing: c.standing.clone(), weights });
+        Ok(())
+    }
+}
+
+fn stopped(value: &Value, at: u64) -> Stop {
+    let (scan, spec, cpu) = (scan(), spec(value).unwrap(), Cpu::new());
+    let mut stop = Stop { at, step: 0, kept: None, heard: vec![] };
+    let job = Job { seed: 7, ..Job::new(&scan, &spec, &cpu) };
+    assert!(spec.solver.build().unwrap().solve(&job, &mut stop).is_err());
+    stop
+}
+
+fn resumed(value: &Value, resume: &Resume) -> Result<Vec<Record>> {
+    let (scan, spec, cpu) = (scan(), spec(value).unwrap(), Cpu::new());
+    let mut heard = Heard::default();
+    let job = Job { seed: 7, resume: Some(resume), ..Job::new(&scan, &spec, &cpu) };
+    spec.solver.build().unwrap().solve(&job, &mut heard)?;
+    Ok(heard.0)
+}
+
+#[test]
+fn a_resumed_run_finds_the_same_drift_to_the_bit() {
+    let masks = json!([{"type": "fft-mask", "epoch": 2, "threshold": 1e-6}, {"type": "layer-norm"}]);
+    for settings in [settings(), with("/normalizers", masks)] {
+        let whole = solve(&settings, &scan(), &Weights::default()).unwrap().1;
+        // Between two looks, at one, after a mask that spoilt the recording, and before any.
+        for at in [5, 12, 14, 18, 24] {
+            let stop = stopped(&settings, at);
+            let records = [stop.heard, resumed(&settings, &stop.kept.unwrap()).unwrap()].concat();
+            assert_eq!(drift(&records), drift(&whole), "at {at}");
+            assert_eq!(events(&records), events(&whole), "at {at}");
+        }
+    }
+}
+
+#[test]
+fn a_recording_of_another_shape_is_refused() {
+    let mut resume = stopped(&settings(), 14).kept.unwrap();
+    let features = resume.weights.tensors.remove("drift.features").unwrap();
+    let refused = |resume: &Resume, words: &[&str]| {
+        let e = resumed(&settings(), resume).unwrap_err().to_string();
+        assert!(words.iter().all(|w| e.contains(w)), "{e}");
+    };
+    refused(&resume, &["kept", "drift.features", "nothing", "[6, 300]"]);
+    resume.weights.tensors.insert("drift.features".into(), (vec![300, 6], features.1));
+    refused(&resume, &["drift.features", "[300, 6]", "[6, 300]"]);
+}
+
+#[test]
+fn times_and_sizes_that_are_none_are_refused() {
+    for (drift, word) in [
+        (json!({"every": 0.0}), "solver.drift.every"),
+        (json!({"every": -1.0}), "solver.drift.every"),
+        (json!({"points": 0}), "solver.drift.points"),
+        (json!({"points": 65537}), "65536"),
+        (json!({"epochs": 3}), "epochs"),
+    ] {
+        let said = match spec(&with("/solver/drift", drift)) {
+            Ok(spec) => spec.solver.build().err().map(|e| e.to_string()),
+            Err(e) => Some(e.to_string()),
+        };
+        assert!(said.as_ref().is_some_and(|s| s.contains(word)), "{said:?}");
+    }
+}
