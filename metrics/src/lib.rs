@@ -1,4 +1,5 @@
-//! How far a reconstructed volume is from its reference: PSNR, RMSE and the three SSIMs in use.
+//! How far a reconstructed volume is from its reference: PSNR, RMSE and the three SSIMs in use; and how
+//! far two label maps agree: Dice.
 //!
 //! Three definitions of SSIM are published under the one name and differ by several hundredths. Each has its own
 //! function here ([`ssim_2d`], [`ssim_3d`], [`ssim_skimage`]) and [`evaluate`] reports all of them, so that a number
@@ -7,11 +8,13 @@
 //! Volumes are `[x, y, z]`. `peak` is the data range: 1 for volumes in `[0, 1]`, and what all published figures use.
 
 mod check;
+mod dice;
 mod error;
 mod score;
 mod ssim;
 mod window;
 
+pub use dice::{Dice, LabelDice, dice, label_map};
 pub use error::{Axis, WorstSlice, psnr, rmse, worst_slices};
 pub use score::{Scores, evaluate};
 pub use ssim::{ssim_2d, ssim_3d, ssim_skimage};

@@ -1,0 +1,159 @@
+//! Dice's coefficient of two label maps, label by label: `2·|A ∩ B| / (|A| + |B|)` (Dice 1945) over the voxels that
+//! carry a label.
+
+use conefield_core::error::{Error, Result, ensure};
+use ndarray::{Array3, ArrayView3};
+use serde::Serialize;
+use std::collections::BTreeMap;
+
+/// Above this not every whole number is an `f32`.
+const LARGEST: f32 = 16_777_216.0;
+
+/// The agreement of one label.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize)]
+pub struct LabelDice {
+    /// The label, from 1.
+    pub label: u32,
+    /// From 0 to 1; 0 where only one of the maps has the label.
+    pub dice: f64,
+    /// Voxels of the result that carry it.
+    pub voxels: u64,
+    /// Voxels of the reference that carry it.
+    pub reference_voxels: u64,
+}
+
+/// The agreement of two label maps.
+#[derive(Debug, Clone, PartialEq, Serialize)]
+pub struct Dice {
+    /// Mean over all labels that either map has, each counting alike; `None` where there is only background.
+    pub mean: Option<f64>,
+    /// Label by label, ascending.
+    pub labels: Vec<LabelDice>,
+    /// Labels that the reference lacks.
+    pub only_in_result: Vec<u32>,
+    /// Labels that the result lacks.
+    pub only_in_reference: Vec<u32>,
+}
+
+/// The labels that a volume of whole numbers holds. `place` names it where it holds anything else.
+pub fn label_map(place: &str, volume: ArrayView3<f32>) -> Result<Array3<u32>> {
+    let whole = |x: f32| x.fract() == 0.0 && (0.0..LARGEST).contains(&x);
+    if let Some(((x, y, z), value)) = volume.indexed_iter().find(|(_, v)| !whole(**v)) {
+        let expected = "a label: a whole number from 0 (background) to 16777215";
+        return Err(Error::invalid(place, format!("voxel [{x}, {y}, {z}]"), value, expected));
+    }
+    Ok(volume.mapv(|x| x as u32))
+}
+
+/// Compares two label maps of one shape. Label 0 is background and counts for nothing.
+pub fn dice(result: ArrayView3<u32>, reference: ArrayView3<u32>) -> Result<Dice> {
+    let (found, expected) = (format!("{:?}", result.shape()), format!("{:?}", reference.shape()));
+    let same = result.shape() == reference.shape();
+    ensure(same, "dice", "shape of the result", found, format!("{expected}, the shape of the reference"))?;
+    // In the result, in the reference, in both.
+    let mut counts: BTreeMap<u32, [u64; 3]> = BTreeMap::new();
+    let mut count = |(a, b): (u32, u32), voxels: u64| {
+        for (label, which, there) in [(a, 0, true), (b, 1, true), (a, 2, a == b)] {
+            if label > 0 && there {
+                counts.entry(label).or_default()[which] += voxels;
+            }
+        }
+    };
+    // Neighbours mostly carry the same labels: they are counted together.
+    let (mut last, mut run) = ((0, 0), 0);
+    for (&a, &b) in result.iter().zip(&reference) {
+        if (a, b) != last {
+            count(last, run);
+            (last, run) = ((a, b), 0);
+        }
+        run += 1;
+    }
+    count(last, run);
+    let label = |(&label, &[a, b, both]): (&u32, &[u64; 3])| LabelDice {
+        label,
+        dice: 2.0 * both as f64 / (a + b) as f64,
+        voxels: a,
+        reference_voxels: b,
+    };
+    let labels: Vec<LabelDice> = counts.iter().map(label).collect();
+    let alone = |only: fn(&LabelDice) -> bool| labels.iter().filter(|l| only(l)).map(|l| l.label).collect();
+    Ok(Dice {
+        mean: (!labels.is_empty()).then(|| labels.iter().map(|l| l.dice).sum::<f64>() / labels.len() as f64),
+        only_in_result: alone(|l| l.reference_voxels == 0),
+        only_in_reference: alone(|l| l.voxels == 0),
+        labels,
+    })
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// 1 within a box, 0 outside.
+    fn block(label: u32, x: std::ops::Range<usize>) -> Array3<u32> {
+        Array3::from_shape_fn((10, 6, 4), |(i, _, _)| if x.contains(&i) { label } else { 0 })
+    }
+
+    #[test]
+    fn boxes_that_overlap_by_a_known_part() {
+        // 4 and 6 planes, 3 in common: 2·3/(4 + 6).
+        let found = dice(block(7, 1..5).view(), block(7, 2..8).view()).unwrap();
+        assert_eq!(found.labels, [LabelDice { label: 7, dice: 0.6, voxels: 96, reference_voxels: 144 }]);
+        assert_eq!(found.mean, Some(0.6));
+        assert!(found.only_in_result.is_empty() && found.only_in_reference.is_empty());
+    }
+
+    #[test]
+    fn every_label_counts_alike_and_absent_ones_count_as_0() {
+        // Label 1: 2 planes, the same in both; 2: the result alone; 9: the reference alone.
+        let mut a = block(1, 0..2);
+        let mut b = a.clone();
+        a += &block(2, 4..5);
+        b += &block(9, 6..10);
+        let found = dice(a.view(), b.view()).unwrap();
+        assert_eq!(found.labels.iter().map(|l| (l.label, l.dice)).collect::<Vec<_>>(), [(1, 1.0), (2, 0.0), (9, 0.0)]);
+        assert_eq!(found.mean, Some(1.0 / 3.0));
+        assert_eq!((found.only_in_result, found.only_in_reference), (vec![2], vec![9]));
+        // Each way round the same.
+        assert_eq!(dice(b.view(), a.view()).unwrap().mean, Some(1.0 / 3.0));
+        // Another label at the same place is no agreement.
+        assert_eq!(dice(block(3, 2..6).view(), block(4, 2..6).view()).unwrap().mean, Some(0.0));
+    }
+
+    #[test]
+    fn discs_agree_as_their_areas_say() {
+        // Discs of radius r at distance d overlap by 2r²·acos(d/2r) − (d/2)·√(4r² − d²); Dice is that over π·r².
+        let n = 400;
+        let (r, d) = (150.0f64, 90.0f64);
+        let disc = |x0: f64| {
+            Array3::from_shape_fn((n, n, 1), |(x, y, _)| u32::from((x as f64 - x0).hypot(y as f64 - 199.5) < r))
+        };
+        let overlap = 2.0 * r * r * (d / (2.0 * r)).acos() - d / 2.0 * (4.0 * r * r - d * d).sqrt();
+        let expected = overlap / (std::f64::consts::PI * r * r);
+        let found = dice(disc(154.5).view(), disc(154.5 + d).view()).unwrap().mean.unwrap();
+        assert!((found - expected).abs() < 1e-3, "{found} {expected}");
+    }
+
+    #[test]
+    fn only_background_has_no_score() {
+        let empty = Array3::zeros((3, 3, 3));
+        let found = dice(empty.view(), empty.view()).unwrap();
+        assert_eq!((found.mean, found.labels.len()), (None, 0));
+    }
+
+    #[test]
+    fn what_is_no_label_map_is_refused_in_words() {
+        let mut v = Array3::<f32>::zeros((2, 3, 4));
+        v[[1, 2, 3]] = 117.0;
+        assert_eq!(label_map("a.nii", v.view()).unwrap()[[1, 2, 3]], 117);
+        for (bad, word) in
+            [(0.5, "0.5"), (-1.0, "-1"), (f32::NAN, "NaN"), (f32::INFINITY, "inf"), (LARGEST, "16777216")]
+        {
+            v[[0, 1, 2]] = bad;
+            let e = label_map("a.nii", v.view()).unwrap_err().to_string();
+            assert!(e.contains("a.nii: voxel [0, 1, 2]") && e.contains(word), "{e}");
+        }
+        let e = dice(Array3::zeros((2, 2, 2)).view(), Array3::zeros((2, 2, 3)).view()).unwrap_err().to_string();
+        assert!(e.contains("[2, 2, 2]") && e.contains("[2, 2, 3]"), "{e}");
+    }
+}
