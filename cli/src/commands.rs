@@ -7,6 +7,7 @@ mod demo;
 mod evaluate;
 mod explain;
 mod export;
+mod features;
 mod import;
 mod info;
 mod plugins;
@@ -36,10 +37,12 @@ pub enum Command {
     Compare(compare::Compare),
     /// Train a field on known volumes, for weights that other scans start from (MCI).
     Pretrain(pretrain::Pretrain),
-    /// Score a volume against a reference: PSNR, RMSE and three SSIMs.
+    /// Score a volume (PSNR, RMSE, three SSIMs) or label maps (Dice) against a reference.
     Evaluate(evaluate::Evaluate),
     /// Evaluate the field of a finished run at other voxels.
     Export(export::Export),
+    /// Draw the principal components of a finished run's features as colours.
+    Features(features::Features),
     /// Show what a spec builds: stages, widths, parameters, memory, work.
     Explain(explain::Explain),
     /// Say what a scan, volume or weights file holds.
@@ -66,6 +69,7 @@ pub fn run(command: Command, general: &General) -> Result<()> {
         Command::Pretrain(c) => c.run(),
         Command::Evaluate(c) => c.run(),
         Command::Export(c) => c.run(),
+        Command::Features(c) => c.run(),
         Command::Explain(c) => c.run(),
         Command::Info(c) => c.run(),
         Command::Convert(c) => c.run(),

@@ -7,9 +7,11 @@ mod memory;
 mod out;
 mod outgoing;
 mod parse;
+mod pca;
 mod plugins;
 mod progress;
 mod run;
+mod segmenter;
 mod signals;
 pub mod specs;
 mod table;
@@ -57,9 +59,10 @@ pub fn main() -> ExitCode {
         Err(e) => {
             eprintln!("error: {e}");
             match (&e, signals::caught()) {
-                (Error::Interrupted { .. } | Error::Stopped { .. } | Error::Cancelled { .. }, Some(signal)) => {
-                    ExitCode::from(128 + signal)
-                }
+                (
+                    Error::Interrupted { .. } | Error::Stopped { .. } | Error::Cancelled { .. } | Error::Aborted { .. },
+                    Some(signal),
+                ) => ExitCode::from(128 + signal),
                 _ => ExitCode::FAILURE,
             }
         }

@@ -146,6 +146,13 @@ pub fn angles(text: &str) -> Result<Angles, String> {
     }
 }
 
+/// `LO,HI` in Hounsfield units.
+pub fn hu(text: &str) -> Result<[f64; 2], String> {
+    let form = "LO,HI in Hounsfield units with LO below HI, such as -1000,2000";
+    let both = finite(pair(text, ',', form)?)?;
+    if both[0] < both[1] { Ok(both) } else { Err(format!("expected {form}")) }
+}
+
 /// What voxel values mean.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub enum Values {
@@ -216,6 +223,8 @@ mod tests {
         assert!(angles("0:0").is_err());
         assert_eq!(values("hu:0.02"), Ok(Values::Hu(HuMapping::Mu { mu_water: 0.02 })));
         assert_eq!(values("clip:-1000,2000"), Ok(Values::Hu(HuMapping::Clip { low: -1000.0, high: 2000.0 })));
+        assert_eq!(hu("-1000,2000"), Ok([-1000.0, 2000.0]));
+        assert!(hu("2,1").is_err() && hu("1").is_err() && hu("0,inf").is_err());
         assert!(values("clip:3,1").is_err() && values("hu:-1").is_err());
     }
 }

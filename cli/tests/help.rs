@@ -3,7 +3,7 @@
 mod common;
 use common::{conefield, done, refused};
 
-const COMMANDS: [&str; 14] = [
+const COMMANDS: [&str; 15] = [
     "simulate",
     "import",
     "reconstruct",
@@ -11,6 +11,7 @@ const COMMANDS: [&str; 14] = [
     "pretrain",
     "evaluate",
     "export",
+    "features",
     "explain",
     "info",
     "convert",
@@ -78,6 +79,9 @@ fn wrong_use_exits_with_2() {
         (&["compare", "s", "--specs", "fdk", "-o", "r", "--force", "--resume"], "--resume"),
         (&["import", "s.toml", "-o", "s", "--i0", "water"], "or air"),
         (&["evaluate", "a", "b", "--peak", "0"], "above 0"),
+        (&["evaluate", "a", "b", "--hu", "-1000,2000"], "--segmenter"),
+        (&["evaluate", "a", "b", "--labels", "--segmenter", "s {in} {out}"], "--labels"),
+        (&["features", "r", "-o", "f.png", "--after", "field"], "normalizers"),
         (&["--threads", "0", "backends"], "--threads"),
         (&["pretrain", "--spec", "naf", "-o", "w"], "<VOLUME>"),
     ] {

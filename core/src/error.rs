@@ -54,6 +54,12 @@ pub enum Error {
         /// The file.
         place: String,
     },
+    /// The user interrupted a work that leaves nothing behind.
+    #[error("interrupted during {part}")]
+    Aborted {
+        /// What was under way.
+        part: String,
+    },
     /// A device that computes refused or was lost.
     #[error("{device}: {what}")]
     Device {

@@ -7,7 +7,7 @@
 //! - Projections as scanners give them: [`read_scanner`] (a description in TOML; TIFF, NumPy, RTK's XML geometry).
 //! - Sizes, before memory is taken: [`scan_size`], [`volume_voxels`].
 //! - Weights: [`read_weights`], [`write_weights`]; checkpoints: [`read_checkpoint`], [`write_checkpoint`] (safetensors).
-//! - Pictures: [`slices_png`], [`compare_png`], [`curves_png`], [`survey::survey_png`].
+//! - Pictures: [`slices_png`], [`compare_png`], [`features_png`], [`curves_png`], [`survey::survey_png`].
 //! - What a scan's geometry means and what in it will trouble a reconstruction: [`survey`].
 //!
 //! Readers tell a format from what a file holds, check a header before they take memory for what it claims, and
@@ -73,6 +73,6 @@ pub use scan::{DataSet, read_data_set, read_scan, read_truth};
 pub use scan_folder::write_scan;
 pub use scanner::{I0, ImportOptions, Imported, read_scanner};
 pub use size::{ScanSize, scan_size, volume_voxels};
-pub use slices::{MiddleSlices, compare_png, slices_png};
+pub use slices::{MiddleSlices, compare_png, features_png, slices_png};
 pub use volume::{is_volume, read_volume, write_volume, write_voxels};
 pub use weights::{Weights, read_weights, write_weights};

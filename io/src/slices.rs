@@ -81,6 +81,8 @@ enum Cell<'a> {
     Values(&'a MiddleSlices),
     /// Result and reference.
     Difference(&'a MiddleSlices, &'a MiddleSlices),
+    /// Red, green and blue from 0 to 1.
+    Colours([&'a MiddleSlices; 3]),
 }
 
 struct Row<'a> {
@@ -143,6 +145,14 @@ pub fn compare_png(
         rows.push(Row { plane, note: "difference", cells: [Cell::Empty].into_iter().chain(differences).collect() });
     }
     draw(path.as_ref(), &captions, &rows, window)
+}
+
+/// Draws features as colours beside the attenuation: `colours` are red, green and blue from 0 to 1, or NaN where there is
+/// nothing to show.
+pub fn features_png(path: impl AsRef<Path>, attenuation: &MiddleSlices, colours: [&MiddleSlices; 3]) -> Result<()> {
+    let cells = || vec![Cell::Values(attenuation), Cell::Colours(colours)];
+    let rows = [AXIAL, CORONAL, SAGITTAL].map(|plane| Row { plane, note: "", cells: cells() });
+    draw(path.as_ref(), &["attenuation".into(), "features".into()], &rows, attenuation.window())
 }
 
 /// Columns that stand side by side: as even as can be, [`COLUMNS`] at most.
@@ -235,12 +245,17 @@ fn most(all: impl Iterator<Item = f64>) -> f64 {
 fn check(place: &str, cell: &Cell) -> Result<()> {
     let Some(v) = cell.volume() else { return Ok(()) };
     v.grid.validate(place)?;
-    match cell {
-        Cell::Difference(v, r) if v.grid.shape != r.grid.shape => {
-            let (found, expected) = (format!("{:?}", v.grid.shape), format!("{:?}", r.grid.shape));
-            Err(Error::invalid(place, "shape of a result", found, format!("{expected}, the reference's")))
+    let (what, others) = match cell {
+        Cell::Difference(_, r) => ("result", vec![*r]),
+        Cell::Colours(c) => ("colour", c.to_vec()),
+        _ => return Ok(()),
+    };
+    match others.into_iter().find(|o| o.grid.shape != v.grid.shape) {
+        Some(other) => {
+            let (found, expected) = (format!("{:?}", v.grid.shape), format!("{:?}", other.grid.shape));
+            Err(Error::invalid(place, format!("shape of a {what}"), found, format!("{expected}, the other's")))
         }
-        _ => Ok(()),
+        None => Ok(()),
     }
 }
 
@@ -248,7 +263,7 @@ impl Cell<'_> {
     fn volume(&self) -> Option<&MiddleSlices> {
         match self {
             Cell::Empty => None,
-            Cell::Values(v) | Cell::Difference(v, _) => Some(v),
+            Cell::Values(v) | Cell::Difference(v, _) | Cell::Colours([v, ..]) => Some(v),
         }
     }
 }
@@ -302,21 +317,27 @@ fn draw_cell(
     let Some(v) = cell.volume() else { return };
     let plane = row.plane;
     // `[right, up]`
-    let (values, difference) = match cell {
-        Cell::Difference(v, r) => (&v.across[plane.cut] - &r.across[plane.cut], true),
-        _ => (v.across[plane.cut].clone(), false),
-    };
     let size = plane.seen.map(|k| (v.grid.size()[k] * scale).round().max(1.0) as u32);
     let (w, h) = (size[0].min(width), size[1].min(height));
     let (x, y) = (x + (width - w) / 2, y + (height - h) / 2);
-    let n = values.dim();
+    let n = v.across[plane.cut].dim();
     // The nearest voxel, so that the picture shows the voxels that there are.
     canvas.fill(x, y, w, h, |dx, dy| {
         let i = ((f64::from(dx) + 0.5) / f64::from(w) * n.0 as f64) as usize;
         let j = ((f64::from(h - 1 - dy) + 0.5) / f64::from(h) * n.1 as f64) as usize;
-        let value = values[[i.min(n.0 - 1), j.min(n.1 - 1)]];
-        if difference { diverging(value / spread) } else { grey((value - window[0]) / (window[1] - window[0])) }
+        let at = |v: &MiddleSlices| v.across[plane.cut][[i.min(n.0 - 1), j.min(n.1 - 1)]];
+        match cell {
+            Cell::Empty => PAPER,
+            Cell::Values(v) => grey((at(v) - window[0]) / (window[1] - window[0])),
+            Cell::Difference(v, r) => diverging((at(v) - at(r)) / spread),
+            Cell::Colours(c) => mixed(c.map(at)),
+        }
     });
+}
+
+/// Red, green and blue from 0 to 1; paper where one is not known.
+fn mixed(colours: [f32; 3]) -> Rgb<u8> {
+    if colours.iter().all(|c| c.is_finite()) { Rgb(colours.map(|c| grey(c).0[0])) } else { PAPER }
 }
 
 /// A scale, lowest value at the foot, with its ends and its middle in numbers.
@@ -427,6 +448,26 @@ mod tests {
         slices_png(folder.join("abdomen.png"), &[("CT (HU)", &v), ("changed", &noisy)], [-200.0, 300.0], Some(0))
             .unwrap();
         slices_png(folder.join("abdomen_one.png"), &[("CT (HU)", &v)], [-200.0, 300.0], None).unwrap();
+    }
+
+    #[test]
+    fn features_are_drawn_in_colours_beside_the_attenuation() {
+        let (_dir, folder) = folder();
+        let path = folder.join("features.png");
+        let values = |f: fn(usize, usize, usize) -> f32| {
+            MiddleSlices::of(&Volume::centered(Array3::from_shape_fn((8, 8, 8), |(x, y, z)| f(x, y, z)), [1.0; 3]))
+        };
+        let red = values(|x, _, _| if x == 7 { f32::NAN } else { f32::from(u8::from(x < 4)) });
+        let (green, blue) = (values(|_, y, _| f32::from(u8::from(y < 4))), values(|_, _, _| 0.5));
+        features_png(&path, &values(|x, y, z| (x + y + z) as f32), [&red, &green, &blue]).unwrap();
+        let image = image::open(&path).unwrap().to_rgb8();
+        let count = |c: [u8; 3]| image.pixels().filter(|p| p.0 == c).count();
+        for colour in [[255, 255, 128], [255, 0, 128], [0, 255, 128], [0, 0, 128]] {
+            assert!(count(colour) > 1000, "{colour:?}");
+        }
+        let other = MiddleSlices::of(&Volume::centered(Array3::zeros((8, 8, 9)), [1.0; 3]));
+        let e = features_png(&path, &red, [&red, &other, &blue]).unwrap_err().to_string();
+        assert!(e.contains("[8, 8, 9]"), "{e}");
     }
 
     #[test]

@@ -1,18 +1,24 @@
 //! `conefield evaluate`
 
 use crate::memory::Memory;
-use crate::{files, out, parse};
+use crate::segmenter::Segmenter;
+use crate::{files, out, parse, signals};
 use clap::Args;
+use conefield_core::Result;
+use conefield_core::error::ensure;
 use conefield_core::scan::Volume;
-use conefield_core::{Error, Result};
 use conefield_io::MiddleSlices;
-use conefield_metrics::Scores;
+use conefield_metrics::{Dice, Scores, dice, label_map};
+use serde::Serialize;
 use std::path::PathBuf;
 
-/// Score a volume against a reference: PSNR, RMSE and three SSIMs.
+/// Score a volume (PSNR, RMSE, three SSIMs) or label maps (Dice) against a reference.
 ///
 /// ssim_2d: 11x11 Gaussian window on slices of three axes (R2-Gaussian). ssim_3d: 11x11x11 Gaussian window (NI-NeRF).
 /// ssim_skimage: 7x7 uniform window on slices of three axes (scikit-image, NAF).
+///
+/// Dice is 2|A∩B|/(|A|+|B|) over the voxels of a label. Label 0 is background. A label that only one map has scores 0
+/// and counts in the mean like any other.
 #[derive(Args)]
 pub struct Evaluate {
     /// The volume to score.
@@ -25,16 +31,57 @@ pub struct Evaluate {
     /// Also draw the middle slices of reference, volume and difference.
     #[arg(long, value_name = "FILE")]
     png: Option<PathBuf>,
+    /// Both are label maps, of whole numbers: score them by Dice alone.
+    #[arg(long, conflicts_with_all = ["peak", "png", "segmenter"])]
+    labels: bool,
+    /// Also let this command make a label map of each and score these by Dice, such as 'TotalSegmentator -i {in} -o {out}
+    /// --ml'. {in} and {out} stand for .nii.gz files; words are split as a shell does, but no shell runs. Both volumes
+    /// come with the reference's voxel sizes and place.
+    #[arg(long, value_name = "CMD")]
+    segmenter: Option<Segmenter>,
+    /// The Hounsfield units that the values 0 and 1 stand for, to which the segmenter's input is brought.
+    #[arg(long, value_name = "LO,HI", value_parser = parse::hu, requires = "segmenter", allow_hyphen_values = true)]
+    hu: Option<[f64; 2]>,
     /// Print one JSON object.
     #[arg(long)]
     json: bool,
+}
+
+/// All that was asked for.
+#[derive(Serialize)]
+struct Report {
+    #[serde(flatten)]
+    scores: Option<Scores>,
+    #[serde(skip_serializing_if = "Option::is_none")]
+    dice: Option<Dice>,
 }
 
 impl Evaluate {
     pub fn run(self) -> Result<()> {
         let voxels = [&self.volume, &self.reference].map(conefield_io::volume_voxels);
         let [volume, reference] = voxels;
-        Memory::of_volumes(&[volume?, reference?]).check(|_| vec![])?;
+        let (volume, reference) = (volume?, reference?);
+        let maps = if self.segmenter.is_some() { &[volume, reference][..] } else { &[] };
+        Memory::of_volumes(&[&[volume, reference], maps].concat()).check(|_| vec![])?;
+        let report = if self.labels { self.label_maps()? } else { self.volumes()? };
+        if self.json {
+            return out::json(&report);
+        }
+        let parts = [report.scores.as_ref().map(lines), report.dice.as_ref().map(dice_lines)];
+        out::say(&parts.into_iter().flatten().collect::<Vec<_>>().join("\n\n"))
+    }
+
+    /// The agreement of two label maps.
+    fn label_maps(&self) -> Result<Report> {
+        let read =
+            |path: &PathBuf| label_map(&path.display().to_string(), conefield_io::read_volume(path)?.data.view());
+        let (volume, reference) = (read(&self.volume)?, read(&self.reference)?);
+        same_shape(&self.volume.display().to_string(), volume.shape(), reference.shape())?;
+        Ok(Report { scores: None, dice: Some(dice(volume.view(), reference.view())?) })
+    }
+
+    /// The scores of a volume, with the agreement of what the segmenter finds in it and in the reference.
+    fn volumes(&self) -> Result<Report> {
         let volume = conefield_io::read_volume(&self.volume)?;
         let reference = conefield_io::read_volume(&self.reference)?;
         let place = self.volume.display().to_string();
@@ -42,21 +89,38 @@ impl Evaluate {
         if let Some(png) = &self.png {
             files::picture(png, Some(&MiddleSlices::of(&reference)), &MiddleSlices::of(&volume))?;
         }
-        if self.json { out::json(&scores) } else { out::say(&lines(&scores)) }
+        let dice = match &self.segmenter {
+            None => None,
+            Some(segmenter) => {
+                signals::listen()?;
+                // What a segmenter finds may depend on the size of voxels: both volumes come with the same.
+                let volume = Volume { data: volume.data, grid: reference.grid, affine: reference.affine };
+                let [volume, reference] = [volume, reference].map(|v| self.in_hu(v));
+                let volume = segmenter.run(&place, &volume)?;
+                let reference = segmenter.run(&self.reference.display().to_string(), &reference)?;
+                Some(dice(volume.view(), reference.view())?)
+            }
+        };
+        Ok(Report { scores: Some(scores), dice })
     }
+
+    /// `volume` as the segmenter is to see it.
+    fn in_hu(&self, volume: Volume) -> Volume {
+        match self.hu {
+            None => volume,
+            Some([low, high]) => volume.mapped(|x| (low + f64::from(x) * (high - low)) as f32),
+        }
+    }
+}
+
+/// Refuses a volume of another shape than the reference's.
+fn same_shape(place: &str, found: &[usize], expected: &[usize]) -> Result<()> {
+    ensure(found == expected, place, "shape", format!("{found:?}"), format!("{expected:?}, the reference's shape"))
 }
 
 /// Scores `volume`, called `place` in errors.
 pub fn score(place: &str, volume: &Volume, reference: &Volume, peak: f64) -> Result<Scores> {
-    let (found, expected) = (volume.data.shape(), reference.data.shape());
-    if found != expected {
-        return Err(Error::invalid(
-            place,
-            "shape",
-            format!("{found:?}"),
-            format!("{expected:?}, the reference's shape"),
-        ));
-    }
+    same_shape(place, volume.data.shape(), reference.data.shape())?;
     conefield_metrics::evaluate(volume.data.view(), reference.data.view(), peak)
 }
 
@@ -73,4 +137,29 @@ pub fn lines(s: &Scores) -> String {
         rows.push(vec![format!("worst {axis}"), format!("slice {}, {:.3} dB", w.index, w.psnr)]);
     }
     out::table(&rows, &[])
+}
+
+/// The agreement of label maps for people.
+fn dice_lines(d: &Dice) -> String {
+    let mut rows = vec![["label", "dice", "voxels", "reference"].map(str::to_owned).to_vec()];
+    for l in &d.labels {
+        rows.push(vec![
+            l.label.to_string(),
+            format!("{:.4}", l.dice),
+            out::number(l.voxels),
+            out::number(l.reference_voxels),
+        ]);
+    }
+    let mean = d.mean.map_or("not defined: no label but background in either".into(), |m| format!("{m:.4}"));
+    let mut all = match d.labels.len() {
+        0 => format!("mean dice  {mean}"),
+        n => format!("{}\nmean dice of {n} labels  {mean}", out::table(&rows, &[0, 1, 2, 3])),
+    };
+    for (where_, labels) in [("volume", &d.only_in_result), ("reference", &d.only_in_reference)] {
+        if !labels.is_empty() {
+            let labels: Vec<String> = labels.iter().map(u32::to_string).collect();
+            all += &format!("\nonly in the {where_}, counted as 0: {}", labels.join(", "));
+        }
+    }
+    all
 }

@@ -33,8 +33,8 @@ pub struct Case {
     says: &'static [&'static str],
 }
 
-/// An input that must be refused: what it is, how it is made in an empty folder, the command's words (split at spaces;
-/// it runs in that folder), and what the message must hold.
+/// An input that must be refused: what it is, how it is made in an empty folder, the command's words (split at spaces,
+/// or as a shell does where there are single quotes; it runs in that folder), and what the message must hold.
 pub fn refused(
     what: &'static str,
     make: impl Fn(&Path) + Sync + Send + 'static,
@@ -61,7 +61,11 @@ impl Case {
             "ulimit -v {MEMORY_KIB}; ulimit -t {SECONDS}; ulimit -c 0; exec \"$0\" --threads 2 --memory 1GiB \"$@\""
         );
         let mut command = Command::new("sh");
-        command.args(["-c", &limited]).arg(program).args(self.args.split(' '));
+        let words: Vec<String> = match self.args.contains('\'') {
+            true => shlex::split(self.args).unwrap(),
+            false => self.args.split(' ').map(str::to_owned).collect(),
+        };
+        command.args(["-c", &limited]).arg(program).args(words);
         let start = Instant::now();
         let output = command.current_dir(dir.path()).timeout(PATIENCE).output().unwrap();
         let time = start.elapsed();

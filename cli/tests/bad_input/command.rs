@@ -6,6 +6,21 @@ use std::path::Path;
 
 fn none(_: &Path) {}
 
+/// A volume of 4 x 3 x 2 voxels, label maps of it that are none, and a program of `sh` that gets `{in}` and `{out}`.
+fn segmenter(text: &'static str) -> impl Fn(&Path) + Sync + Send {
+    move |d| {
+        nifti(d);
+        put(d.join("half.npy"), npy_bytes("<f4", "(4, 3, 2)", &0.5f32.to_le_bytes().repeat(24)));
+        put(d.join("zero.npy"), npy_bytes("<f4", "(4, 3, 2)", &[0; 96]));
+        put(d.join("one.npy"), npy_bytes("<f4", "(1, 1, 1)", &[0; 4]));
+        put(d.join("segment"), format!("#!/bin/sh\n{text}\n"));
+        #[cfg(unix)]
+        std::fs::set_permissions(d.join("segment"), std::os::unix::fs::PermissionsExt::from_mode(0o755)).unwrap();
+    }
+}
+
+const SEGMENT: &str = "evaluate a.nii a.nii --segmenter './segment {in} {out}'";
+
 pub fn cases() -> Vec<Case> {
     let wrong = |what, args, says| refused(what, none, args, says).ends(End::WrongUse);
     vec![
@@ -20,6 +35,13 @@ pub fn cases() -> Vec<Case> {
         wrong("noise of no photons", "simulate phantom:head:16 -o scan --noise poisson:0", &["poisson"]),
         wrong("a window that is reversed", "convert a.nii b.nii --values clip:3,1", &["LO below HI"]),
         wrong("a peak of zero", "evaluate a.nii b.nii --peak 0", &["above 0"]),
+        wrong("label maps with a data range", "evaluate a.nii b.nii --labels --peak 2", &["--peak"]),
+        wrong(
+            "a segmenter that is not told where to write",
+            "evaluate a.nii b.nii --segmenter 'tool {in}'",
+            &["{out}"],
+        ),
+        wrong("Hounsfield units that are reversed", "evaluate a.nii b.nii --hu 2000,-1000", &["LO below HI"]),
         wrong(
             "a time of 10^300 seconds",
             "reconstruct scan --spec fast -o run --checkpoint-every 1e300",
@@ -98,6 +120,45 @@ pub fn cases() -> Vec<Case> {
             "evaluate a.nii b.npy",
             &["[4, 3, 2]", "[1, 1, 1]"],
         ),
+        refused(
+            "a label map with halves",
+            segmenter(""),
+            "evaluate half.npy half.npy --labels",
+            &["half.npy", "voxel [0, 0, 0]", "0.5", "whole number"],
+        ),
+        refused(
+            "label maps of two shapes",
+            segmenter(""),
+            "evaluate one.npy zero.npy --labels",
+            &["one.npy", "[1, 1, 1]", "[4, 3, 2]"],
+        ),
+        refused(
+            "a segmenter that is not there",
+            nifti,
+            "evaluate a.nii a.nii --segmenter './segment {in} {out}'",
+            &["segmenter ./segment", "No such file"],
+        ),
+        refused(
+            "a segmenter that fails",
+            segmenter("echo loading >&2; echo no weights here >&2; exit 3"),
+            SEGMENT,
+            &["given a.nii", "exit status: 3", "loading | no weights here"],
+        ),
+        refused("a segmenter that writes nothing", segmenter(""), SEGMENT, &["no file", "{out}", "it said nothing"]),
+        refused("a segmenter that writes text", segmenter("echo hello > $2"), SEGMENT, &["cannot be used", "{out}"]),
+        refused(
+            "a segmenter that writes another shape",
+            segmenter("cp one.npy $2"),
+            SEGMENT,
+            &["the label map of a.nii", "1 voxels", "24"],
+        ),
+        refused(
+            "a segmenter that writes halves",
+            segmenter("cp half.npy $2"),
+            SEGMENT,
+            &["the label map of a.nii", "voxel [0, 0, 0]", "0.5"],
+        ),
+        refused("features of a run that is not there", none, "features run -o f.png", &["run"]),
         refused("a name without a known end to write", nifti, "convert a.nii b.png", &["b.png", ".nii.gz"]),
         refused("a folder that does not exist to write in", nifti, "convert a.nii no/b.nii", &["no/b.nii"]),
         refused(

@@ -1,0 +1,214 @@
+//! `conefield features`
+
+use super::convert::refuse_existing;
+use crate::backend::BackendChoice;
+use crate::memory::Memory;
+use crate::pca::Pca;
+use crate::{files, out};
+use clap::{Args, ValueEnum};
+use conefield_core::error::{Error, Result};
+use conefield_core::geometry::VoxelGrid;
+use conefield_core::host;
+use conefield_core::parts::Part;
+use conefield_core::trained::TrainedField;
+use conefield_io::MiddleSlices;
+use ndarray::Array3;
+use serde_json::json;
+use std::path::PathBuf;
+
+/// Draw what the encoder of a finished run has learned: the first three principal components of its features as red,
+/// green and blue.
+///
+/// The components are those of all points of the three middle slices where the object can be; each runs from its 1st to
+/// its 99th percentile. Their signs mean nothing. The reconstruction stands beside them.
+#[derive(Args)]
+pub struct Features {
+    /// The folder of the run, or its weights.safetensors.
+    run: PathBuf,
+    /// The picture to write (PNG).
+    #[arg(short, long = "output", visible_alias = "out", value_name = "FILE")]
+    output: PathBuf,
+    /// Which features: as they leave the encoder, or as normalizers hand them to the field.
+    #[arg(long, value_enum, default_value = "encoder")]
+    after: After,
+    /// Voxels along the longest side [default: as the scan asked for].
+    #[arg(long, value_name = "N", value_parser = clap::value_parser!(u16).range(1..))]
+    voxels: Option<u16>,
+    /// Which backend: auto, cpu, wgpu, or wgpu:N with the number of an adapter.
+    #[arg(long, value_name = "BACKEND", default_value_t)]
+    backend: BackendChoice,
+    /// Replace FILE.
+    #[arg(long)]
+    force: bool,
+    /// Print one JSON object.
+    #[arg(long)]
+    json: bool,
+}
+
+/// Behind which stages features are looked at.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, ValueEnum)]
+enum After {
+    Encoder,
+    Normalizers,
+}
+
+/// Components that are drawn, one a colour.
+const DRAWN: usize = 3;
+
+impl Features {
+    pub fn run(self) -> Result<()> {
+        refuse_existing(&self.output, self.force)?;
+        let file = if self.run.is_dir() { self.run.join("weights.safetensors") } else { self.run.clone() };
+        let bytes = file.metadata().map_err(|e| Error::io(&file, e))?.len();
+        // The file and the numbers in it, then these and the model.
+        Memory::most(&[Memory { model: 2 * bytes, ..Memory::default() }]).check(|_| vec![])?;
+        let TrainedField { model, scene, unit_mm } = files::read_field(&file)?;
+        let grid = self.voxels.map_or(scene.grid, |n| scene.grid.with_longest(n.into()));
+        let planes = planes(&grid);
+        let count: u64 = planes.iter().map(|p| p.iter().map(|r| r.len() as u64).product::<u64>()).sum();
+        let width = model.pipeline.encoder.info().output as u64;
+        let buffers = count * (4 * 3 * width + 64);
+        Memory::most(&[Memory { model: 2 * bytes, buffers, ..Memory::default() }]).check(|_| vec![])?;
+        let voxels: Vec<[usize; 3]> = planes.iter().flat_map(indices).collect();
+        let held: Vec<bool> = voxels.iter().map(|v| scene.holds(grid.voxel(*v))).collect();
+        let points: Vec<[f32; 3]> =
+            voxels.iter().zip(&held).filter(|(_, held)| **held).map(|(v, _)| scene.to_unit(grid.voxel(*v))).collect();
+        let n = points.len();
+        let place = file.display().to_string();
+        if n == 0 {
+            let expected = "at least one point where the object can be";
+            return Err(Error::invalid(place, "middle slices", "none", expected));
+        }
+        let (mut exe, _) = self.backend.open()?.compile(&model.pipeline)?;
+        let mut features = exe.encode(&model, &points)?;
+        let mut attenuation = vec![0.0; n];
+        exe.evaluate(&model, &points, &mut attenuation)?;
+        if self.after == After::Normalizers {
+            features = host::normalize(&model, &features, n)?;
+        }
+        if let Some(x) = features.iter().chain(&attenuation).find(|x| !x.is_finite()) {
+            return Err(Error::invalid(place, "features", x, "finite numbers"));
+        }
+        let channels = features.len() / n;
+        let pca = Pca::of(&features, n);
+        let Some(explained) = pca.explained() else {
+            let found = format!("{channels} channels that are the same at all {n} points");
+            return Err(Error::invalid(place, "features", found, "features that differ"));
+        };
+        let drawn: Vec<Vec<f32>> = (0..channels.min(DRAWN)).map(|k| pca.component(k, &features, n)).collect();
+        let follows: Vec<Option<f64>> = drawn.iter().map(|c| correlation(c, &attenuation)).collect();
+        let slices = |values: &[f32], outside: f32| slices(&grid, &planes, &held, values, outside);
+        let mut colours: Vec<MiddleSlices> = drawn.iter().map(|c| slices(&stretched(c), f32::NAN)).collect();
+        colours.resize_with(DRAWN, || slices(&vec![0.0; n], f32::NAN));
+        let scale = (scene.attenuation * unit_mm) as f32;
+        attenuation.iter_mut().for_each(|x| *x *= scale);
+        conefield_io::features_png(&self.output, &slices(&attenuation, 0.0), [&colours[0], &colours[1], &colours[2]])?;
+        let shares = &explained[..drawn.len()];
+        if self.json {
+            return out::json(&json!({
+                "picture": self.output, "after": if self.after == After::Encoder { "encoder" } else { "normalizers" },
+                "channels": channels, "points": n, "explained": shares, "correlation": follows,
+            }));
+        }
+        let mut rows = vec![["component", "variance", "correlation with attenuation"].map(str::to_owned).to_vec()];
+        for ((share, follows), colour) in shares.iter().zip(&follows).zip(["red", "green", "blue"]) {
+            let follows = follows.map_or("-".into(), |r| format!("{r:.2}"));
+            rows.push(vec![colour.into(), format!("{:.1} %", 100.0 * share), follows]);
+        }
+        let total = 100.0 * shares.iter().sum::<f64>();
+        let (table, picture) = (out::table(&rows, &[1, 2]), self.output.display());
+        out::say(&format!("{table}\n{picture}: {total:.1} % of the variance of {channels} channels at {n} points"))
+    }
+}
+
+/// The middle slices across x, y and z.
+fn planes(grid: &VoxelGrid) -> [Part; 3] {
+    std::array::from_fn(|cut| {
+        std::array::from_fn(|k| {
+            let (n, middle) = (grid.shape[k], grid.shape[k] / 2);
+            if k == cut { middle..middle + 1 } else { 0..n }
+        })
+    })
+}
+
+/// The voxels of a part, as an array has them.
+fn indices([xs, ys, zs]: &Part) -> impl Iterator<Item = [usize; 3]> {
+    let (ys, zs) = (ys.clone(), zs.clone());
+    xs.clone().flat_map(move |x| {
+        let zs = zs.clone();
+        ys.clone().flat_map(move |y| zs.clone().map(move |z| [x, y, z]))
+    })
+}
+
+/// Values at the points that are held as slices; the other points are `outside`.
+fn slices(grid: &VoxelGrid, planes: &[Part; 3], held: &[bool], values: &[f32], outside: f32) -> MiddleSlices {
+    let mut slices = MiddleSlices::new(*grid);
+    let mut values = values.iter();
+    let mut held = held.iter();
+    for part in planes {
+        let shape = [part[0].len(), part[1].len(), part[2].len()];
+        // In the order of `indices`, which is the array's.
+        let plane = Array3::from_shape_simple_fn(shape, || match held.next() {
+            Some(true) => values.next().copied().unwrap_or(outside),
+            _ => outside,
+        });
+        slices.gather(part, plane.view());
+    }
+    slices
+}
+
+/// From the 1st to the 99th percentile as 0 to 1.
+fn stretched(values: &[f32]) -> Vec<f32> {
+    let mut sorted = values.to_vec();
+    sorted.sort_unstable_by(f32::total_cmp);
+    let at = |share: f64| sorted[((sorted.len() - 1) as f64 * share).round() as usize];
+    let (low, high) = (at(0.01), at(0.99));
+    let span = if high > low { high - low } else { 1.0 };
+    values.iter().map(|x| ((x - low) / span).clamp(0.0, 1.0)).collect()
+}
+
+/// Pearson's correlation; `None` where one of the two is the same everywhere.
+fn correlation(a: &[f32], b: &[f32]) -> Option<f64> {
+    let n = a.len() as f64;
+    let mean = |v: &[f32]| v.iter().map(|&x| f64::from(x)).sum::<f64>() / n;
+    let (ma, mb) = (mean(a), mean(b));
+    let (mut ab, mut aa, mut bb) = (0.0, 0.0, 0.0);
+    for (&a, &b) in a.iter().zip(b) {
+        let (a, b) = (f64::from(a) - ma, f64::from(b) - mb);
+        (ab, aa, bb) = (ab + a * b, aa + a * a, bb + b * b);
+    }
+    let r = ab / (aa * bb).sqrt();
+    r.is_finite().then_some(r)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn values_come_back_to_their_voxels() {
+        let grid = VoxelGrid { shape: [3, 4, 5], spacing: [1.0; 3], center: [0.0; 3] };
+        let planes = planes(&grid);
+        let value = |[x, y, z]: [usize; 3]| (100 * x + 10 * y + z) as f32;
+        let voxels: Vec<[usize; 3]> = planes.iter().flat_map(indices).collect();
+        assert_eq!(voxels.len(), 4 * 5 + 3 * 5 + 3 * 4);
+        let held: Vec<bool> = voxels.iter().map(|v| v[2] > 0).collect();
+        let values: Vec<f32> = voxels.iter().filter(|v| v[2] > 0).map(|v| value(*v)).collect();
+        let found = slices(&grid, &planes, &held, &values, -1.0);
+        let whole = Array3::from_shape_fn((3, 4, 5), |(x, y, z)| if z > 0 { value([x, y, z]) } else { -1.0 });
+        let expected = MiddleSlices::of(&conefield_core::scan::Volume::centered(whole, [1.0; 3]));
+        assert_eq!(format!("{found:?}"), format!("{expected:?}"));
+    }
+
+    #[test]
+    fn colours_fill_their_range_and_correlations_are_known() {
+        let ramp: Vec<f32> = (0..=100).map(|i| i as f32).collect();
+        let s = stretched(&ramp);
+        assert_eq!((s[0], s[1], s[50], s[99], s[100]), (0.0, 0.0, 0.5, 1.0, 1.0));
+        assert_eq!(stretched(&[4.0; 3]), [0.0; 3]);
+        let down: Vec<f32> = ramp.iter().map(|x| 3.0 - 0.5 * x).collect();
+        assert!((correlation(&ramp, &down).unwrap() + 1.0).abs() < 1e-12);
+        assert_eq!(correlation(&ramp, &vec![2.0; 101]), None);
+        assert_eq!(correlation(&[-1.0, 0.0, 1.0], &[1.0, 0.0, 1.0]), Some(0.0));
+    }
+}
