@@ -1,30 +1,45 @@
-//! Draws PSNR against training time of finished runs: `curves OUT.png TITLE NAME=RUN_FOLDER...`.
+//! Draws PSNR against training time of finished runs, or their drift against epochs:
+//! `curves [--drift] OUT.png TITLE NAME=RUN_FOLDER...`.
 
-use conefield_io::curves_png;
+use conefield_io::{CurveOptions, curves_png_with};
+use serde_json::Value;
 use std::error::Error;
 use std::path::Path;
 
 type Curve = (String, Vec<(f64, f64)>);
 
 fn main() -> Result<(), Box<dyn Error>> {
-    let arguments: Vec<String> = std::env::args().skip(1).collect();
+    let mut arguments: Vec<String> = std::env::args().skip(1).collect();
+    let drift = arguments.first().is_some_and(|a| a == "--drift");
+    arguments.drain(..usize::from(drift));
     let [out, title, runs @ ..] = &arguments[..] else {
-        return Err("usage: curves OUT.png TITLE NAME=RUN_FOLDER...".into());
+        return Err("usage: curves [--drift] OUT.png TITLE NAME=RUN_FOLDER...".into());
     };
-    let curves: Vec<Curve> = runs.iter().map(|r| read(r)).collect::<Result<_, _>>()?;
-    curves_png(out, title, "seconds of training", "PSNR, dB", &curves)?;
+    let points = if drift { drifts } else { qualities };
+    let curves: Vec<Curve> = runs.iter().map(|r| read(r, points)).collect::<Result<_, _>>()?;
+    let (x, y) = if drift { ("epochs", "drift (mean L1)") } else { ("seconds of training", "PSNR, dB") };
+    let options = CurveOptions { log_y: drift, ..CurveOptions::default() };
+    curves_png_with(out, title, x, y, &curves, &options)?;
     Ok(())
 }
 
-fn read(run: &str) -> Result<Curve, Box<dyn Error>> {
+fn read(run: &str, points: fn(&Value) -> Vec<(f64, f64)>) -> Result<Curve, Box<dyn Error>> {
     let (name, folder) = run.split_once('=').ok_or("a run is NAME=FOLDER")?;
     let text = std::fs::read_to_string(Path::new(folder).join("metrics.jsonl"))?;
-    let mut points = vec![];
+    let mut all = vec![];
     for line in text.lines() {
-        let record: serde_json::Value = serde_json::from_str(line)?;
-        if let (Some(t), Some(psnr)) = (record["seconds"].as_f64(), record["psnr"].as_f64()) {
-            points.push((t, psnr));
-        }
+        all.extend(points(&serde_json::from_str(line)?));
     }
-    Ok((name.to_string(), points))
+    Ok((name.to_string(), all))
+}
+
+/// PSNR against seconds, of a record that has one.
+fn qualities(record: &Value) -> Vec<(f64, f64)> {
+    record["seconds"].as_f64().zip(record["psnr"].as_f64()).into_iter().collect()
+}
+
+/// Drift against epochs, as often as a record has it.
+fn drifts(record: &Value) -> Vec<(f64, f64)> {
+    let all = record["drift"].as_array().into_iter().flatten();
+    all.filter_map(|d| d["epoch"].as_f64().zip(d["mean_l1"].as_f64())).collect()
 }

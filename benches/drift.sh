@@ -1,0 +1,39 @@
+#!/usr/bin/env bash
+# How much normalizers and field change under the same features (solver.drift), with and without LayerNorm and MCI:
+#   bash benches/drift.sh DATA_FOLDER OUT_FOLDER [STEPS [VOLUME]]
+# DATA_FOLDER holds volumes/*.nii.gz. MCI weights come from abdomen alone, for each way with normalizers of its own. Steps
+# (1000) end a run, so that the load of the machine does not matter. The learning rate stays as it is, or its fall would
+# look like stability; it is five times the published one, with 192 samples inside the volume, as in ablation.sh.
+# Leaves OUT_FOLDER/VOLUME-drift.png (drift against epochs) and VOLUME-psnr.png; finished runs are not run again.
+set -euo pipefail
+cd "$(dirname "$0")/.."
+data=$1
+out=$2
+steps=${3:-1000}
+volume=${4:-chest_128}
+cargo build --release --quiet -p conefield
+cargo build --release --quiet -p conefield-benches --bin curves
+bin=${CARGO_TARGET_DIR:-target}/release
+mkdir -p "$out"
+scan=$out/$volume
+[[ -d $scan ]] || "$bin/conefield" -q simulate "$data/volumes/$volume.nii.gz" -o "$scan" --protocol r2 --views 50 --noise tigre:1e4,10
+none='normalizers=[]'
+norm='normalizers=[{type="layer-norm"}]'
+for way in none norm; do
+    weights=$out/abdomen-$way.safetensors
+    [[ -f $weights ]] || "$bin/conefield" -q pretrain "$data/volumes/abdomen_128.nii.gz" --spec ni-naf --set "${!way}" -o "$weights" --steps 300
+done
+run() {
+    local run=$out/$volume-$1
+    shift
+    [[ -f $run/record.json ]] || "$bin/conefield" -q reconstruct "$scan" --spec ni-naf -o "$run" --force --steps "$steps" \
+        --reference truth --set solver.report_every=25 --set solver.lr=5e-3 --set 'solver.decay="none"' \
+        --set projector.samples=192 --set 'solver.drift={every=1}' "$@"
+}
+run naf --set "$none"
+run mci --set "$none" --init "$out/abdomen-none.safetensors"
+run ln --set "$norm"
+run ln-mci --set "$norm" --init "$out/abdomen-norm.safetensors"
+runs=("NAF=$out/$volume-naf" "NAF+MCI=$out/$volume-mci" "NAF+LN=$out/$volume-ln" "NAF+LN+MCI=$out/$volume-ln-mci")
+"$bin/curves" --drift "$out/$volume-drift.png" "$volume, 50 noisy views: drift over one epoch" "${runs[@]}"
+"$bin/curves" "$out/$volume-psnr.png" "$volume, 50 noisy views" "${runs[@]}"
