@@ -3,7 +3,7 @@
 #   bash benches/drift.sh DATA_FOLDER OUT_FOLDER [STEPS [VOLUME]]
 # DATA_FOLDER holds volumes/*.nii.gz. MCI weights come from abdomen alone, for each way with normalizers of its own. Steps
 # (1000) end a run, so that the load of the machine does not matter. The learning rate stays as it is, or its fall would
-# look like stability; it is five times the published one, with 192 samples inside the volume, as in ablation.sh.
+# look like stability; it is five times the published one. Tables, rays and samples are few, so that a run takes a minute.
 # Leaves OUT_FOLDER/VOLUME-drift.png (drift against epochs) and VOLUME-psnr.png; finished runs are not run again.
 set -euo pipefail
 cd "$(dirname "$0")/.."
@@ -19,16 +19,18 @@ scan=$out/$volume
 [[ -d $scan ]] || "$bin/conefield" -q simulate "$data/volumes/$volume.nii.gz" -o "$scan" --protocol r2 --views 50 --noise tigre:1e4,10
 none='normalizers=[]'
 norm='normalizers=[{type="layer-norm"}]'
+small=(--spec ni-naf --set encoder.log2_table_size=17)
 for way in none norm; do
     weights=$out/abdomen-$way.safetensors
-    [[ -f $weights ]] || "$bin/conefield" -q pretrain "$data/volumes/abdomen_128.nii.gz" --spec ni-naf --set "${!way}" -o "$weights" --steps 300
+    [[ -f $weights ]] || "$bin/conefield" -q pretrain "$data/volumes/abdomen_128.nii.gz" "${small[@]}" --set "${!way}" \
+        --set solver.pretrain_points=16384 -o "$weights" --steps 400
 done
 run() {
     local run=$out/$volume-$1
     shift
-    [[ -f $run/record.json ]] || "$bin/conefield" -q reconstruct "$scan" --spec ni-naf -o "$run" --force --steps "$steps" \
+    [[ -f $run/record.json ]] || "$bin/conefield" -q reconstruct "$scan" "${small[@]}" -o "$run" --force --steps "$steps" \
         --reference truth --set solver.report_every=25 --set solver.lr=5e-3 --set 'solver.decay="none"' \
-        --set projector.samples=192 --set 'solver.drift={every=1}' "$@"
+        --set solver.rays=512 --set projector.samples=96 --set 'solver.drift={every=1}' "$@"
 }
 run naf --set "$none"
 run mci --set "$none" --init "$out/abdomen-none.safetensors"

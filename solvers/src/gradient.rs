@@ -98,7 +98,7 @@ pub struct Gradient {
     pub eps: f64,
     /// Total-variation prior, if any.
     pub tv: Option<TvPrior>,
-    /// Logs how much normalizers and field change under the same features, if asked for.
+    /// While a scan is reconstructed, logs how much normalizers and field change under the same features, if asked for.
     pub drift: Option<Drift>,
     /// Steps between two records of the metrics.
     pub report_every: u64,
