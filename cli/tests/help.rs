@@ -3,11 +3,12 @@
 mod common;
 use common::{conefield, done, refused};
 
-const COMMANDS: [&str; 14] = [
+const COMMANDS: [&str; 15] = [
     "simulate",
     "import",
     "reconstruct",
     "compare",
+    "tradeoff",
     "pretrain",
     "evaluate",
     "export",
@@ -75,6 +76,11 @@ fn wrong_use_exits_with_2() {
         (&["reconstruct", "s", "--spec", "naf", "-o", "r", "--hold-out", "x"], "every:10"),
         (&["reconstruct", "s", "--spec", "naf", "-o", "r", "--backend", "abacus"], "cpu"),
         (&["compare", "s", "-o", "r"], "--specs <SPEC,SPEC>"),
+        (&["reconstruct", "s", "-o", "r"], "--spec <SPEC>"),
+        (&["reconstruct", "s", "-o", "r", "--budget", "9s", "--steps", "3"], "--steps"),
+        (&["reconstruct", "s", "-o", "r", "--budget", "9s", "--front", "f", "--spec", "naf"], "--front"),
+        (&["tradeoff", "-o", "r"], "<SCAN>"),
+        (&["tradeoff", "s", "-o", "r", "--keep", "2"], "at most 1"),
         (&["compare", "s", "--specs", "fdk", "-o", "r", "--force", "--resume"], "--resume"),
         (&["import", "s.toml", "-o", "s", "--i0", "water"], "or air"),
         (&["evaluate", "a", "b", "--peak", "0"], "above 0"),
