@@ -21,7 +21,9 @@ fn a_plan_names_every_part_and_the_record_holds_them_against_it() {
     for spec in ["fast", "sirt", "fdk"] {
         let run = dir.path().join(spec);
         let all = ["reconstruct", &scan, "--spec", spec, "-o", &text(&run), "--reference", "truth", "--json"];
-        let record = json(&[&all[..], &["--budget", "3s"]].concat());
+        let small = ["encoder.log2_table_size=10", "solver.rays=64", "projector.samples=16", "solver.tv.blocks=4"];
+        let small = small.iter().filter(|_| spec == "fast").flat_map(|s| ["--set", *s]).collect::<Vec<_>>();
+        let record = json(&[&all[..], &small, &["--budget", "3s"]].concat());
         let number = |key: &str| record[key].as_f64().unwrap_or_else(|| panic!("{spec}: {key}"));
         let parts = ["load_s", "prepare_s", "train_s", "export_s", "picture_s", "score_s"].map(number);
         let total = number("total_s");
@@ -52,8 +54,9 @@ fn without_a_spec_the_best_of_the_shipped_front_is_taken() {
 fn a_budget_that_is_too_short_is_refused_with_what_would_do() {
     let (dir, scan) = scan();
     let out = dir.path().join("run");
+    let (scan, path) = (text(&scan), text(&out));
     for more in [&["--spec", "fast"][..], &["--spec", "sart"], &[]] {
-        let all = [&["reconstruct", &text(&scan), "-o", &text(&out), "--budget", "1e-4s"], more].concat();
+        let all = [&["reconstruct", &scan, "-o", &path, "--budget", "1e-4s"], more].concat();
         let said = refused(1, &all);
         assert!(said.starts_with("error: the budget: time: found 0.00 s, expected at least "), "{said}");
         assert!(said.contains("to write and compare") && !out.exists(), "{said}");

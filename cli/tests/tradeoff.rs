@@ -20,7 +20,7 @@ solver.subsets = [2, 4]
 [[base]]
 spec = "tiny.toml"
 "#;
-const TINY: &str = "extends = \"fast\"\nname = \"tiny\"\n[encoder]\nlevels = 3\nlog2_table_size = 10\n[projector]\nsamples = 24\n";
+const TINY: &str = "extends = \"fast\"\nname = \"tiny\"\n[encoder]\nlevels = 3\nlog2_table_size = 10\n[projector]\nsamples = 24\n[solver]\nrays = 64\ntv = { weight = 0.02, blocks = 4 }\n";
 
 /// A small scan and levers in a folder of their own.
 fn made() -> (TempDir, PathBuf, PathBuf) {
@@ -142,7 +142,8 @@ fn without_a_reference_views_rank() {
     assert!(found["ranking"].as_array().unwrap().is_empty());
     let points = found["points"].as_array().unwrap();
     assert!(points.iter().all(|p| p["psnr"].is_null() && p["held_out"].as_f64().unwrap() > 0.0));
-    let least = points.iter().min_by(|a, b| a["held_out"].as_f64().unwrap().total_cmp(&b["held_out"].as_f64().unwrap()));
+    let least =
+        points.iter().min_by(|a, b| a["held_out"].as_f64().unwrap().total_cmp(&b["held_out"].as_f64().unwrap()));
     assert!(names(&found["front"]).contains(&least.unwrap()["name"].as_str().unwrap()));
     assert!(fs::read_to_string(out.join("tradeoff.md")).unwrap().starts_with("| front | budget | held-out error |"));
 }

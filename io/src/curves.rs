@@ -29,6 +29,8 @@ pub struct CurveOptions {
     pub log_x: bool,
     /// A logarithmic y axis; points at zero or below are left out.
     pub log_y: bool,
+    /// Share of the x axis that is left free on either side.
+    pub x_margin: f64,
     /// Width and height in pixels.
     pub size: [u32; 2],
     /// The legend's corner; the emptiest one if not given.
@@ -37,7 +39,7 @@ pub struct CurveOptions {
 
 impl Default for CurveOptions {
     fn default() -> Self {
-        Self { log_x: false, log_y: false, size: [1200, 800], legend: None }
+        Self { log_x: false, log_y: false, x_margin: 0.0, size: [1200, 800], legend: None }
     }
 }
 
@@ -126,7 +128,7 @@ impl Panel<'_> {
             let expected = "at least one finite point (above zero on a logarithmic axis)";
             return Err(Error::invalid(place, "series", format!("{} without a point to draw", series.len()), expected));
         }
-        let x = range(all.iter().map(|p| p.0), options.log_x, 0.0);
+        let x = range(all.iter().map(|p| p.0), options.log_x, options.x_margin);
         let y = range(all.iter().map(|p| p.1), options.log_y, 0.05);
         let plot = Plot { title, labels, series, options, shown: &shown };
         let corner = options.legend.unwrap_or_else(|| emptiest(&all, &x, &y, options));

@@ -102,16 +102,20 @@ impl Clock {
     pub fn share(&self, steps: u64) -> f64 {
         let by_steps = self.share_of_steps(steps);
         let by_time = self.limits.seconds.map_or(0.0, |t| if t <= 0.0 { 1.0 } else { self.seconds() / t });
-        by_steps.max(by_time).max(self.share_of_deadline())
+        by_steps.max(by_time).max(self.share_of_deadline(steps))
     }
 
-    /// Pauses count: what else a run does takes time from it, too.
-    fn share_of_deadline(&self) -> f64 {
+    /// Pauses count: what else a run does takes time from it, too. It ends no run before its first step.
+    fn share_of_deadline(&self, steps: u64) -> f64 {
         let Some(end) = self.limits.deadline else { return 0.0 };
         let (made, before) = self.made;
         let whole = before + end.saturating_duration_since(made);
         let gone = before + made.elapsed();
-        if gone >= whole { 1.0 } else { gone.as_secs_f64() / whole.as_secs_f64() }
+        match (gone >= whole, steps) {
+            (true, 0) => 1.0 - f64::EPSILON,
+            (true, _) => 1.0,
+            _ => gone.as_secs_f64() / whole.as_secs_f64(),
+        }
     }
 
     /// Whether so many seconds more end before the deadline.
@@ -164,13 +168,15 @@ mod tests {
     #[test]
     fn a_deadline_replaces_the_other_ends_and_counts_pauses() {
         let spec = Ends { steps: Some(1), seconds: Some(1e-9) };
-        let within = |seconds| Limits { deadline: Some(Instant::now() + Duration::from_secs(seconds)), ..Limits::default() };
+        let within =
+            |seconds| Limits { deadline: Some(Instant::now() + Duration::from_secs(seconds)), ..Limits::default() };
         let c = Clock::new(spec, within(1000), 3000.0);
         // 3000 of 4000 seconds came before the run was resumed. The clock does not run.
         assert!((0.75..0.76).contains(&c.share(5)), "{}", c.share(5));
         assert!(c.allows(900.0) && !c.allows(1001.0));
         let over = Clock::new(spec, within(0), 0.0);
-        assert!(over.share(0) >= 1.0 && over.done(0) >= 1.0 && !over.allows(1e-3));
+        assert!(over.share(1) >= 1.0 && over.done(1) >= 1.0 && !over.allows(1e-3));
+        assert!(over.done(0) < 1.0, "nothing was made yet");
         assert!(Clock::new(spec, Limits::default(), 0.0).allows(f64::MAX));
     }
 }

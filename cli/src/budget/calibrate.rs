@@ -1,5 +1,5 @@
 //! What the parts of a run take on this machine, measured for about a second: real training steps on some views of the
-//! scan, or real passes over a slab of it, and what comes after the training.
+//! scan, or real passes over a coarser one, and what comes after the training.
 
 use crate::commands::Parts;
 use crate::files;
@@ -11,7 +11,7 @@ use conefield_core::scan::{Scan, Volume};
 use conefield_core::solver::{Job, Limits, Observer, Record};
 use conefield_core::spec::load::Loaded;
 use conefield_io::MiddleSlices;
-use ndarray::s;
+use ndarray::{Array3, s};
 use serde::Serialize;
 use std::time::Instant;
 
@@ -19,13 +19,13 @@ use std::time::Instant;
 const VIEWS: usize = 8;
 /// Voxels that evaluating and packing are measured on.
 const VOXELS: usize = 1 << 18;
-/// Voxels that scoring is measured on.
-const SCORED: usize = 1 << 20;
+/// Longest side of the part of the reference that scoring is measured on.
+const SCORED: usize = 128;
 /// Bytes a second that files grow by, once packed: of a slow disk, as a run syncs what it writes.
 const DISK: f64 = 2e8;
-/// Fewest detector rows and layers of voxels of a slab.
-const ROWS: usize = 8;
-const LAYERS: usize = 4;
+/// How many times as large pixels and voxels are at first, and how many there are at least along a side.
+const COARSEST: usize = 8;
+const FEWEST: usize = 8;
 
 /// What is measured on.
 pub struct Bench<'a> {
@@ -77,7 +77,9 @@ fn field(bench: &Bench<'_>, loaded: &Loaded, parts: &Parts, seconds: f64) -> Res
     let limits = Limits { at_most: Some(seconds), ..Limits::default() };
     let begin = Instant::now();
     let solution = parts.solver.solve(&job(bench, loaded, &scan, limits), &mut laps)?;
-    let prepare_s = (begin.elapsed().as_secs_f64() - solution.train_s).max(0.0);
+    // What comes before the first step goes through all pixels of all views.
+    let fewer = n as f64 / scan.geometry.views.len() as f64;
+    let prepare_s = fewer * (begin.elapsed().as_secs_f64() - solution.train_s).max(0.0);
     let step_s = laps.typical().unwrap_or(solution.train_s / solution.steps.max(1) as f64);
     let mut export_s = 0.0;
     if let Some(field) = solution.result.field() {
@@ -89,19 +91,20 @@ fn field(bench: &Bench<'_>, loaded: &Loaded, parts: &Parts, seconds: f64) -> Res
     Ok(Costs { prepare_s, step_s, export_s, ..Costs::default() })
 }
 
-/// Two passes over the middle of the volume and the detector rows that look at it: once or, where the first slab was
-/// done too soon to tell, over a thicker one.
+/// Two passes on a coarser detector and volume, as coarse as time wants it: all views and all that is done with them stay in
+/// proportion.
 fn voxels(bench: &Bench<'_>, loaded: &Loaded, parts: &Parts, seconds: f64) -> Result<Costs> {
-    let mut wanted = 0.0;
+    let mut factor = COARSEST;
     loop {
-        let (scan, share) = slab(bench.scan, wanted);
+        let (scan, share) = coarse(bench.scan, factor);
         let mut laps = Laps::default();
         let limits = Limits { steps: Some(2), ..Limits::default() };
         let begin = Instant::now();
         let solution = parts.solver.solve(&job(bench, loaded, &scan, limits), &mut laps)?;
         let took = begin.elapsed().as_secs_f64();
-        if took < 0.3 * seconds && share < 1.0 {
-            wanted = (share * (0.7 * seconds / took).clamp(2.0, 16.0)).min(1.0);
+        // Half as coarse takes eight times as long.
+        if 8.0 * took < seconds && factor > 1 {
+            factor /= 2;
             continue;
         }
         let step_s = match (solution.steps, laps.typical()) {
@@ -125,20 +128,28 @@ fn job<'a>(bench: &'a Bench<'_>, loaded: &'a Loaded, scan: &'a Scan, limits: Lim
     }
 }
 
-/// About this share of the detector rows and of the layers of the volume, both from the middle, and the share it is.
-fn slab(scan: &Scan, share: f64) -> (Scan, f64) {
-    // As many left as are there, but for an even number: the middle stays where it is.
-    let part = |all: usize, least: usize| {
-        let wanted = ((all as f64 * share).round() as usize).max(least);
-        if wanted >= all { all } else { all - 2 * ((all - wanted) / 2) }
-    };
+/// The same scan with pixels and voxels `factor` times as large, as far as that leaves some, and the share of the work that is
+/// left: rays times the voxels on the way of one.
+fn coarse(scan: &Scan, factor: usize) -> (Scan, f64) {
     let mut geometry = scan.geometry.clone();
-    let (all, deep) = (geometry.detector[0], geometry.volume.shape[2]);
-    geometry.detector[0] = part(all, ROWS);
-    geometry.volume.shape[2] = part(deep, LAYERS);
-    let first = (all - geometry.detector[0]) / 2;
-    let projections = scan.projections.slice(s![.., first..first + geometry.detector[0], ..]).to_owned();
-    let share = 0.5 * (geometry.detector[0] as f64 / all as f64 + geometry.volume.shape[2] as f64 / deep as f64);
+    let ([rows, columns], shape, size) = (geometry.detector, geometry.volume.shape, geometry.volume.size());
+    let longest = shape.into_iter().max().unwrap_or(1);
+    let factor = factor.min(rows.min(columns).min(longest) / FEWEST).max(1);
+    geometry.detector = [rows / factor, columns / factor];
+    geometry.volume.shape = shape.map(|n| (n / factor).max(1));
+    geometry.volume.spacing = std::array::from_fn(|k| size[k] / geometry.volume.shape[k] as f64);
+    for view in &mut geometry.views {
+        view.u = view.u.map(|x| x * factor as f64);
+        view.v = view.v.map(|x| x * factor as f64);
+    }
+    let [few, narrow] = geometry.detector;
+    let mut projections = Array3::zeros((geometry.views.len(), few, narrow));
+    for ((view, row, column), pixel) in projections.indexed_iter_mut() {
+        let (row, column) = (row * factor, column * factor);
+        let block = scan.projections.slice(s![view, row..row + factor, column..column + factor]);
+        *pixel = block.sum() / (factor * factor) as f32;
+    }
+    let share = (few * narrow) as f64 / (rows * columns) as f64 * (longest / factor) as f64 / longest as f64;
     (Scan { geometry, projections, unit: scan.unit.clone(), provenance: scan.provenance.clone() }, share)
 }
 
@@ -172,13 +183,16 @@ fn picture(bench: &Bench<'_>) -> Result<f64> {
 
 fn score(bench: &Bench<'_>) -> Result<f64> {
     let Some(reference) = bench.reference else { return Ok(0.0) };
-    let [x, y, z] = reference.grid.shape;
-    let deep = (SCORED / (x * y).max(1)).clamp(16.min(z), z);
-    let first = (z - deep) / 2;
-    let some = reference.data.slice(s![.., .., first..first + deep]);
+    // The middle of it: half of every side, unless that is little or much.
+    let [x, y, z] = reference.grid.shape.map(|n| {
+        let part = (n / 2).clamp(32.min(n), SCORED);
+        (n - part) / 2..(n - part) / 2 + part
+    });
+    let share = (x.len() * y.len() * z.len()) as f64 / reference.data.len() as f64;
+    let some = reference.data.slice(s![x, y, z]);
     let begin = Instant::now();
     conefield_metrics::evaluate(some, some, bench.peak)?;
-    Ok(begin.elapsed().as_secs_f64() * z as f64 / deep as f64)
+    Ok(begin.elapsed().as_secs_f64() / share)
 }
 
 /// When each step was done.
@@ -219,16 +233,21 @@ mod tests {
     use conefield_projectors::simulate::{PhantomKind, Protocol, phantom_of, simulate};
 
     #[test]
-    fn a_slab_keeps_the_middle() {
-        let truth = phantom_of(PhantomKind::Head, 33);
-        let scan = simulate(&truth, &Protocol::r2(&truth.grid).with_detector([40, 40]).with_views(3)).unwrap();
-        let (thin, share) = slab(&scan, 0.0);
-        assert_eq!((thin.geometry.detector, thin.geometry.volume.shape), ([8, 40], [33, 33, 5]));
-        assert!((share - 0.5 * (8.0 / 40.0 + 5.0 / 33.0)).abs() < 1e-12);
-        assert_eq!(thin.projections.slice(s![1, 0, ..]), scan.projections.slice(s![1, 16, ..]));
-        thin.validate("slab").unwrap();
-        let (all, share) = slab(&scan, 2.0);
-        assert_eq!((all.projections.dim(), share), (scan.projections.dim(), 1.0));
+    fn a_coarse_scan_is_of_the_same_box_and_has_its_share_of_the_work() {
+        let truth = phantom_of(PhantomKind::Head, 32);
+        let scan = simulate(&truth, &Protocol::r2(&truth.grid).with_detector([48, 64]).with_views(3)).unwrap();
+        let (half, share) = coarse(&scan, 2);
+        assert_eq!((half.geometry.detector, half.geometry.volume.shape, share), ([24, 32], [16; 3], 1.0 / 8.0));
+        assert_eq!(half.geometry.volume.size(), scan.geometry.volume.size());
+        let mean = |s: &Scan| s.projections.mean().unwrap();
+        assert!((mean(&half) - mean(&scan)).abs() < 1e-5 * mean(&scan));
+        let corner = |s: &Scan, r, c| s.geometry.views[1].pixel(s.geometry.detector, r, c);
+        let (a, b) = (corner(&half, -0.5, -0.5), corner(&scan, -0.5, -0.5));
+        assert!(a.iter().zip(b).all(|(a, b)| (a - b).abs() < 1e-9), "{a:?} {b:?}");
+        half.validate("coarse").unwrap();
+        let (least, _) = coarse(&scan, 64);
+        assert_eq!(least.geometry.volume.shape, [8; 3]);
+        assert_eq!(coarse(&scan, 1).0.projections, scan.projections);
     }
 
     #[test]

@@ -229,9 +229,13 @@ mod tests {
         for (from, to, says) in [
             ("psnr = 30.0", "psnr = nan", "psnr or held_out"),
             ("steps = 4", "steps = 0", "points[0].runs"),
-            ("kind", "kinds", "a:6: front"),
+            ("kind", "kinds", "a:9: front"),
             ("views = 10", "views = 0", "scans: a"),
-            ("[[points.runs]]", "[[points.runs]]\nsteps = 4\ntrain_s = 2.0\ntotal_s = 3.0\npsnr = 1\n[[points.runs]]", "one a scan"),
+            (
+                "[[points.runs]]",
+                "[[points.runs]]\nsteps = 4\ntrain_s = 2.0\ntotal_s = 3.0\npsnr = 1\n[[points.runs]]",
+                "one a scan",
+            ),
         ] {
             let text = text("field").replace(from, to);
             let e = Front::parse(&text, "a").unwrap_err().to_string();

@@ -17,7 +17,7 @@ const ENOUGH: f64 = 0.9;
 /// Methods that are measured at most before one is taken.
 const MEASURED: usize = 3;
 /// Longest that a method is measured for, in seconds and as a share of the budget.
-const CALIBRATION: (f64, f64) = (1.0, 0.05);
+const CALIBRATION: (f64, f64) = (1.0, 0.1);
 /// Steps without which a field is nothing.
 const STEPS: f64 = 10.0;
 
@@ -131,7 +131,7 @@ impl Budget {
                 Kind::Voxels => "one pass".into(),
             };
             let expected = format!(
-                "at least {} here and now: {} until the plan was made, {} for {first} of {}, {} to write and compare",
+                "at least {} here and now: {} until the plan was made, {} to prepare and for {first} of {}, {} to write and compare",
                 time(needed.max(self.seconds * 1.01)),
                 time(load_s + self.spent),
                 time(costs.prepare_s + least),

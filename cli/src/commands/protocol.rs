@@ -110,7 +110,8 @@ mod tests {
                     --reference -v.nii --peak 2.5 --hold-out";
         for (held, ends) in [("3,17", "--seconds 1h --steps 7 --at-most 1e-9s"), ("every:10", "--budget 2m")] {
             // `--reference -v.nii` needs its equals sign.
-            let line: Vec<String> = full.replace("ENDS", ends).replace("--reference ", "--reference=").split(' ').map(Into::into).collect();
+            let line: Vec<String> =
+                full.replace("ENDS", ends).replace("--reference ", "--reference=").split(' ').map(Into::into).collect();
             let line: Vec<String> = line.into_iter().filter(|w| !w.is_empty()).chain([held.into()]).collect();
             let first = Line::try_parse_from(line).unwrap().protocol;
             let again = [OsString::from("x")].into_iter().chain(first.arguments());

@@ -12,7 +12,6 @@ use crate::progress::{Keeper, Progress};
 use crate::run::RunFolder;
 use crate::{files, out, signals, specs};
 use clap::Args;
-use conefield_core::{Error, Result};
 use conefield_core::arena::Arena;
 use conefield_core::backend::{Backend, Explain};
 use conefield_core::checkpoint::Resume;
@@ -20,6 +19,7 @@ use conefield_core::pipeline::Pipeline;
 use conefield_core::scan::Scan;
 use conefield_core::solver::{Job, Limits, Solver};
 use conefield_core::spec::load::{Loaded, to_toml};
+use conefield_core::{Error, Result};
 use conefield_io::{MiddleSlices, ScanSize};
 use std::collections::BTreeMap;
 use std::fs::File;
@@ -184,12 +184,13 @@ impl Reconstruct {
             }
             (Some(budget), None, Some(front)) => {
                 let more = self.all_sets();
-                let build =
-                    |spec: &str, sets: &[String]| self.method(spec, &[sets, &more].concat(), backend.as_ref());
+                let build = |spec: &str, sets: &[String]| self.method(spec, &[sets, &more].concat(), backend.as_ref());
                 let (method, plan) = budget.choose(&bench, &front, build)?;
                 (method, Some(plan))
             }
-            _ => return Err(Error::invalid("reconstruct", "--spec", "nothing", "a spec, or --budget to choose one by")),
+            _ => {
+                return Err(Error::invalid("reconstruct", "--spec", "nothing", "a spec, or --budget to choose one by"));
+            }
         };
         plan.iter().flat_map(|p| p.lines(&method)).for_each(|line| info!("{line}"));
         info!("memory: {}", method.memory.line());

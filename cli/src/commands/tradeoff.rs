@@ -275,7 +275,13 @@ impl Tradeoff {
                     }
                     let left = self.left(search, &going, r, c, scan);
                     let name = &search.scans[scan].name();
-                    let part = format!("{} on {name}, {} of {} at {}", candidate.name, c + 1, going.len(), out::duration(budget));
+                    let part = format!(
+                        "{} on {name}, {} of {} at {}",
+                        candidate.name,
+                        c + 1,
+                        going.len(),
+                        out::duration(budget)
+                    );
                     info!("{part}: at most {} left", out::duration(left));
                     over.push(self.trial(folder, search, candidate, budget, scan, part, general)?);
                     write_state(folder, search, &rungs, over)?;
@@ -369,8 +375,7 @@ fn outcome(search: &Search, over: &[Over], candidate: &Candidate, budget: f64) -
     if here.iter().any(|o| o.status == Status::TooShort) {
         return Outcome::TooShort;
     }
-    let all: Option<Vec<f64>> =
-        here.iter().map(|o| o.figures.as_ref().and_then(|f| accuracy(search, f))).collect();
+    let all: Option<Vec<f64>> = here.iter().map(|o| o.figures.as_ref().and_then(|f| accuracy(search, f))).collect();
     match all.filter(|a| !a.is_empty()) {
         Some(a) => Outcome::Accuracy(a.iter().sum::<f64>() / a.len() as f64),
         None => Outcome::Failed,

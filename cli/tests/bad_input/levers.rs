@@ -42,7 +42,12 @@ pub fn cases() -> Vec<Case> {
             &["base[0].levers.solver.cutoff", "7.0"],
         ),
         refused("budgets that fall", |_| {}, "tradeoff scan -o out --budgets 9s,3s", &["--budgets", "rise"]),
-        refused("fewer candidates than bases", |_| {}, "tradeoff scan -o out --candidates 1", &["--candidates", "at least"]),
+        refused(
+            "fewer candidates than bases",
+            |_| {},
+            "tradeoff scan -o out --candidates 1",
+            &["--candidates", "at least"],
+        ),
         refused("a front that is missing", |_| {}, PICK, &["front.toml"]),
         refused("a front that is no TOML", front("made = \n"), PICK, &["front.toml:1"]),
         refused("a front of nothing", front("made = 'x'\nscans = []\npoints = []\n"), PICK, &["scans", "none"]),

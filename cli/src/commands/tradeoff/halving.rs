@@ -102,7 +102,10 @@ mod tests {
 
     #[test]
     fn halves_and_thirds_are_what_they_say() {
-        assert_eq!([kept(8, 0.5), kept(9, 1.0 / 3.0), kept(7, 0.5), kept(1, 0.1), kept(0, 0.5), kept(5, 1.0)], [4, 3, 4, 1, 0, 5]);
+        assert_eq!(
+            [kept(8, 0.5), kept(9, 1.0 / 3.0), kept(7, 0.5), kept(1, 0.1), kept(0, 0.5), kept(5, 1.0)],
+            [4, 3, 4, 1, 0, 5]
+        );
         assert_eq!(to_come(8, 4, 4, 0.5), [12, 6, 3, 2]);
     }
 }

@@ -195,11 +195,7 @@ fn set(lever: &Lever, value: &toml::Value) -> String {
 }
 
 /// Goes through `"encoder.levels" = [..]`, `encoder.levels = [..]` and `[encoder] levels = [..]` alike.
-fn flatten(
-    above: &str,
-    table: toml::Table,
-    each: &mut impl FnMut(String, toml::Value) -> Result<()>,
-) -> Result<()> {
+fn flatten(above: &str, table: toml::Table, each: &mut impl FnMut(String, toml::Value) -> Result<()>) -> Result<()> {
     for (key, value) in table {
         let path = if above.is_empty() { key } else { format!("{above}.{key}") };
         match value {
@@ -235,8 +231,9 @@ mod tests {
     #[test]
     fn a_product_is_used_up_without_repeating() {
         // The base itself has 10 subsets: 3 x 2 combinations, of which it is one.
-        let levers =
-            parse("[[base]]\nspec = 'os-sart'\n[base.levers]\nsolver.subsets = [5, 10, 25]\nsolver.relaxation = [0.4, 0.5]\n");
+        let levers = parse(
+            "[[base]]\nspec = 'os-sart'\n[base.levers]\nsolver.subsets = [5, 10, 25]\nsolver.relaxation = [0.4, 0.5]\n",
+        );
         let all = levers.unwrap().candidates(100, 3).unwrap();
         let default = specs::read("os-sart", &[]).unwrap().tree["solver"].clone();
         let own = [5, 10, 25].contains(&default["subsets"].as_i64().unwrap())
@@ -252,7 +249,11 @@ mod tests {
         let sets = |text: &str| {
             parse(&format!("[[base]]\nspec = 'fdk'\n{text}\n")).unwrap().candidates(2, 0).unwrap()[1].sets.clone()
         };
-        for text in ["levers.solver.cutoff = [0.5]", "[base.levers]\n'solver.cutoff' = [0.5]", "[base.levers.solver]\ncutoff = [0.5]"] {
+        for text in [
+            "levers.solver.cutoff = [0.5]",
+            "[base.levers]\n'solver.cutoff' = [0.5]",
+            "[base.levers.solver]\ncutoff = [0.5]",
+        ] {
             assert_eq!(sets(text), ["solver.cutoff=0.5"], "{text}");
         }
     }

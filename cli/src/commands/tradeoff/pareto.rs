@@ -48,8 +48,11 @@ mod tests {
     use proptest::prelude::*;
 
     fn some() -> impl Strategy<Value = Vec<Standing>> {
-        let one = (1.0f64..100.0, 1e6f64..1e9, 0u32..40)
-            .prop_map(|(seconds, bytes, a)| Standing { seconds, bytes, accuracy: f64::from(a) });
+        let one = (1.0f64..100.0, 1e6f64..1e9, 0u32..40).prop_map(|(seconds, bytes, a)| Standing {
+            seconds,
+            bytes,
+            accuracy: f64::from(a),
+        });
         prop::collection::vec(one, 0..60)
     }
 
@@ -89,7 +92,8 @@ mod tests {
     #[test]
     fn what_measurement_cannot_tell_apart_is_decided_by_accuracy() {
         let s = |seconds, bytes, accuracy| Standing { seconds, bytes, accuracy };
-        let all = [s(60.0, 1e8, 30.0), s(59.0, 1e8, 29.0), s(10.0, 1e8, 20.0), s(70.0, 5e7, 25.0), s(9.0, 2e8, f64::NAN)];
+        let all =
+            [s(60.0, 1e8, 30.0), s(59.0, 1e8, 29.0), s(10.0, 1e8, 20.0), s(70.0, 5e7, 25.0), s(9.0, 2e8, f64::NAN)];
         assert_eq!(front(&all), [2, 0, 3]);
         assert!(front(&[]).is_empty());
         assert_eq!(front(&[all[0], all[0]]), [0, 1], "equals stay");

@@ -3,7 +3,8 @@
 /// Between −1 (the reverse order) and 1 (the same); equal values share their mean rank. None of fewer than three pairs, or
 /// where one of the figures is the same for all.
 pub fn spearman(a: &[f64], b: &[f64]) -> Option<f64> {
-    let pairs: Vec<(f64, f64)> = a.iter().copied().zip(b.iter().copied()).filter(|(a, b)| !(a.is_nan() || b.is_nan())).collect();
+    let pairs: Vec<(f64, f64)> =
+        a.iter().copied().zip(b.iter().copied()).filter(|(a, b)| !(a.is_nan() || b.is_nan())).collect();
     if pairs.len() < 3 {
         return None;
     }

@@ -131,9 +131,8 @@ impl Report {
     /// The points that are worth a spec: all fronts, and the best of each budget.
     fn chosen(&self) -> Vec<&Mean> {
         let lists = [&self.front, &self.front_of_fields, &self.front_of_voxels];
-        let named = |p: &&Mean| {
-            lists.iter().any(|l| l.contains(&p.name)) || self.best.iter().any(|b| b.point == p.name)
-        };
+        let named =
+            |p: &&Mean| lists.iter().any(|l| l.contains(&p.name)) || self.best.iter().any(|b| b.point == p.name);
         self.points.iter().filter(named).collect()
     }
 
@@ -255,7 +254,8 @@ impl Report {
         for rung in &self.rungs {
             let short = self.count(rung.budget_s, Status::TooShort);
             let failed = self.count(rung.budget_s, Status::Failed);
-            let mut line = format!("{}: {} tried, {} went on", out::duration(rung.budget_s), rung.tried.len(), rung.kept.len());
+            let mut line =
+                format!("{}: {} tried, {} went on", out::duration(rung.budget_s), rung.tried.len(), rung.kept.len());
             for (n, what) in [(short, "had too little time"), (failed, "failed")] {
                 if n > 0 {
                     line += &format!(", {n} trials {what}");
@@ -308,13 +308,19 @@ impl Report {
         };
         let over_time = series(|p| p.total_s, |s| Standing { bytes: 1.0, ..s });
         let over_memory = series(|p| p.standing.bytes / f64::from(1 << 20), |s| Standing { seconds: 1.0, ..s });
-        let options = CurveOptions { log_x: true, size: [1000, 750], ..CurveOptions::default() };
+        // A logarithmic axis of less than a decade would have no figures.
+        let options = |series: &[(String, Vec<(f64, f64)>)]| {
+            let all = || series.iter().flat_map(|(_, s)| s).map(|p| p.0).filter(|x| x.is_finite());
+            let log_x = all().fold(0.0, f64::max) > 10.0 * all().fold(f64::INFINITY, f64::min);
+            CurveOptions { log_x, x_margin: 0.04, size: [1000, 750], ..CurveOptions::default() }
+        };
+        let [of_time, of_memory] = [options(&over_time), options(&over_memory)];
         let names: Vec<String> = self.search.scans.iter().map(|s| s.name()).collect();
         let title = names.join(", ");
-        let panel = |x, series| Panel { title: &title, labels: [x, label], series, options: &options };
-        let time = panel("seconds of the whole run", &over_time[..]);
+        let panel = |x, series, options| Panel { title: &title, labels: [x, label], series, options };
+        let time = panel("seconds of the whole run", &over_time[..], &of_time);
         if self.points.iter().any(|p| p.peak_bytes.is_some()) {
-            return panels_png(path, &[time, panel("peak memory, MiB", &over_memory[..])]);
+            return panels_png(path, &[time, panel("peak memory, MiB", &over_memory[..], &of_memory)]);
         }
         panels_png(path, &[time])
     }
