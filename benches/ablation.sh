@@ -26,7 +26,7 @@ for volume in engine_256 head_256 chest_128; do
         local name=$1
         shift
         echo "== $volume $name" | tee -a "$out/scores.txt"
-        "$bin/conefield" -q reconstruct "$scan" --spec ni-naf -o "$out/$volume-$name" --force --budget "${seconds}s" \
+        "$bin/conefield" -q reconstruct "$scan" --spec ni-naf -o "$out/$volume-$name" --force --seconds "${seconds}" \
             --reference truth --set solver.report_every=25 --set solver.lr=5e-3 --set projector.samples=192 "$@" | tee -a "$out/scores.txt"
     }
     run naf --set "$none"

@@ -32,7 +32,7 @@ if [[ -n $data ]]; then
         budget=60s
     fi
     for spec in ni-naf accurate; do
-        "$bin" -q reconstruct "$out/scan" --spec "$spec" -o "$out/$spec" --force --backend "wgpu:$adapter" --budget "$budget" \
+        "$bin" -q reconstruct "$out/scan" --spec "$spec" -o "$out/$spec" --force --backend "wgpu:$adapter" --seconds "$budget" \
             --reference truth --set solver.report_every=25 "${small[@]}"
         python3 - "$out/$spec/metrics.jsonl" "$spec" <<'PY'
 import json, sys

@@ -14,8 +14,13 @@ mod plugins;
 mod pretrain;
 mod protocol;
 mod reconstruct;
+mod record;
 mod schema;
 mod simulate;
+mod tradeoff;
+mod trial;
+
+pub use reconstruct::{Method, Parts};
 
 use clap::{ArgAction, Args, Subcommand};
 use conefield_core::Result;
@@ -35,6 +40,8 @@ pub enum Command {
     Reconstruct(reconstruct::Reconstruct),
     /// Reconstruct a scan in several ways under one protocol: a table and a picture.
     Compare(compare::Compare),
+    /// Search what to spend time and memory on: accuracy against both, measured.
+    Tradeoff(tradeoff::Tradeoff),
     /// Train a field on known volumes, for weights that other scans start from (MCI).
     Pretrain(pretrain::Pretrain),
     /// Score a volume (PSNR, RMSE, three SSIMs) or label maps (Dice) against a reference.
@@ -66,6 +73,7 @@ pub fn run(command: Command, general: &General) -> Result<()> {
         Command::Import(c) => c.run(),
         Command::Reconstruct(c) => c.run(),
         Command::Compare(c) => c.run(general),
+        Command::Tradeoff(c) => c.run(general),
         Command::Pretrain(c) => c.run(),
         Command::Evaluate(c) => c.run(),
         Command::Export(c) => c.run(),
@@ -128,14 +136,13 @@ impl General {
 /// When training ends, whichever comes first.
 #[derive(Debug, Clone, Args, Serialize, Deserialize)]
 pub struct Ends {
-    /// Stop training after this time, such as 600s or 10m.
+    /// Stop training after this time, such as 600s or 10m: of training alone, not of what comes before and after.
     #[arg(long, value_name = "TIME", value_parser = crate::parse::seconds)]
-    #[serde(rename = "seconds")]
-    pub budget: Option<f64>,
+    pub seconds: Option<f64>,
     /// Stop training after this many steps.
     #[arg(long, value_name = "N", value_parser = clap::value_parser!(u64).range(1..))]
     pub steps: Option<u64>,
-    /// Stop training after this time at the latest. Unlike --budget this replaces no end of the spec, and what aims at
+    /// Stop training after this time at the latest. Unlike --seconds this replaces no end of the spec, and what aims at
     /// the end, such as a learning rate that goes down, does not look at it.
     #[arg(long, value_name = "TIME", value_parser = crate::parse::seconds)]
     #[serde(default, skip_serializing_if = "Option::is_none")]
@@ -145,6 +152,6 @@ pub struct Ends {
 impl Ends {
     /// As limits of a job.
     pub fn limits(&self) -> Limits {
-        Limits { steps: self.steps, seconds: self.budget, at_most: self.at_most }
+        Limits { steps: self.steps, seconds: self.seconds, at_most: self.at_most, deadline: None }
     }
 }

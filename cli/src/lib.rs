@@ -1,6 +1,7 @@
 //! The `conefield` command, one module a subcommand, and the specs that come with it.
 
 mod backend;
+mod budget;
 mod commands;
 mod files;
 mod memory;

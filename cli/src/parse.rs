@@ -191,6 +191,22 @@ pub fn above_zero(text: &str) -> Result<f64, String> {
     positive(text, "a number above 0")
 }
 
+/// A share, above 0 and at most 1.
+pub fn share(text: &str) -> Result<f64, String> {
+    let form = "a share above 0 and at most 1, such as 0.5";
+    positive(text, form).and_then(|x| if x <= 1.0 { Ok(x) } else { Err(format!("expected {form}")) })
+}
+
+/// Views to keep aside, where there may be none.
+#[derive(Debug, Clone, PartialEq)]
+pub struct HoldOutOrNone(pub Option<HoldOut>);
+
+/// As [`hold_out`], or `none`.
+pub fn hold_out_or_none(text: &str) -> Result<HoldOutOrNone, String> {
+    let views = if text == "none" { None } else { Some(hold_out(text)?) };
+    Ok(HoldOutOrNone(views))
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;
@@ -217,6 +233,10 @@ mod tests {
         assert!(i0("0").is_err() && i0("water").is_err());
         assert_eq!(hold_out("3,17"), Ok(HoldOut::Views(vec![3, 17])));
         assert_eq!(hold_out("every:10").unwrap().views(25), [5, 15]);
+        assert_eq!(hold_out_or_none("none"), Ok(HoldOutOrNone(None)));
+        assert!(hold_out_or_none("no").is_err());
+        assert_eq!(share("1"), Ok(1.0));
+        assert!(share("0").is_err() && share("1.01").is_err() && share("nan").is_err());
         assert!(hold_out("every:1").is_err() && hold_out("a").is_err());
         assert_eq!(angles("0:360"), Ok(Angles::Even { start: 0.0, range: 360.0 }));
         assert_eq!(angles("a.txt"), Ok(Angles::File("a.txt".into())));

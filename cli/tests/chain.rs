@@ -220,7 +220,7 @@ fn simulation_takes_noise_offset_and_angles() {
 fn the_demonstration_compares_two_ways() {
     let dir = tempdir().unwrap();
     let out = text(&dir.path().join("demo"));
-    let found = json(&["demo", "-o", &out, "--budget", "1s", "--size", "24", "--views", "8", "--json"]);
+    let found = json(&["demo", "-o", &out, "--seconds", "1s", "--size", "24", "--views", "8", "--json"]);
     let results = found["results"].as_array().unwrap();
     assert_eq!(results.len(), 2);
     assert!(results.iter().all(|r| r["scores"]["psnr"].as_f64().is_some_and(f64::is_finite)));

@@ -109,9 +109,9 @@ fn table_picture_and_records_agree_and_resume_skips_what_is_done() {
         let told: Vec<&str> = told.split("  ").map(str::trim).filter(|c| !c.is_empty()).collect();
         assert_eq!(told, *row);
     }
-    // No step of FDK takes samples or has a loss or an error of views: nothing is made up for it.
-    assert_eq!([&methods[0]["samples_per_s"], &methods[0]["loss"], &methods[0]["held_out"]], [&Value::Null; 3]);
-    assert_eq!(rows[1][5], "-");
+    // No step of FDK takes samples or has a loss: nothing is made up for it. Views that it has not seen it predicts.
+    assert_eq!([&methods[0]["samples_per_s"], &methods[0]["loss"]], [&Value::Null; 2]);
+    assert!(methods[0]["held_out"].as_f64().is_some_and(|e| e > 0.0) && rows[1][5] != "-");
     assert_eq!([&methods[1]["steps"], &methods[2]["steps"]], [3, 3]);
     let picture = image::open(out.join("compare.png")).unwrap();
     assert!((1000..3000).contains(&picture.width()) && (600..3000).contains(&picture.height()));

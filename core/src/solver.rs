@@ -10,6 +10,7 @@ use crate::scan::{Scan, Volume};
 use crate::spec::Spec;
 use crate::trained::TrainedField;
 use serde::{Deserialize, Serialize};
+use std::time::Instant;
 
 /// What a solver works on.
 pub struct Job<'a> {
@@ -74,6 +75,9 @@ pub struct Limits {
     pub seconds: Option<f64>,
     /// Seconds of training at the latest. What follows the run's end, such as a learning rate, does not look at it.
     pub at_most: Option<f64>,
+    /// When training is to be over by the clock on the wall, whatever happens beside it. Solvers that cannot stop anywhere
+    /// stop before they would pass it.
+    pub deadline: Option<Instant>,
 }
 
 /// One line of `metrics.jsonl`.

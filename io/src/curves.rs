@@ -29,6 +29,8 @@ pub struct CurveOptions {
     pub log_x: bool,
     /// A logarithmic y axis; points at zero or below are left out.
     pub log_y: bool,
+    /// Share of the x axis that is left free on either side.
+    pub x_margin: f64,
     /// Width and height in pixels.
     pub size: [u32; 2],
     /// The legend's corner; the emptiest one if not given.
@@ -37,7 +39,7 @@ pub struct CurveOptions {
 
 impl Default for CurveOptions {
     fn default() -> Self {
-        Self { log_x: false, log_y: false, size: [1200, 800], legend: None }
+        Self { log_x: false, log_y: false, x_margin: 0.0, size: [1200, 800], legend: None }
     }
 }
 
@@ -75,38 +77,69 @@ pub fn curves_png_with(
     series: &[(String, Vec<(f64, f64)>)],
     options: &CurveOptions,
 ) -> Result<()> {
+    panels_png(path, &[Panel { title, labels: [x_label, y_label], series, options }])
+}
+
+/// One of several plots.
+pub struct Panel<'a> {
+    /// What stands above it.
+    pub title: &'a str,
+    /// What the x axis and the y axis say.
+    pub labels: [&'a str; 2],
+    /// As for [`curves_png`].
+    pub series: &'a [(String, Vec<(f64, f64)>)],
+    /// What it does differently.
+    pub options: &'a CurveOptions,
+}
+
+/// Draws plots side by side in one picture, from top to bottom as high as the highest.
+pub fn panels_png(path: impl AsRef<Path>, panels: &[Panel<'_>]) -> Result<()> {
     let path = path.as_ref();
     let place = path.display().to_string();
-    let [width, height] = options.size;
-    if !(200..=10_000).contains(&width) || !(150..=10_000).contains(&height) {
-        let expected = "200 to 10000 by 150 to 10000 pixels";
-        return Err(Error::invalid(place, "size", format!("{:?}", options.size), expected));
+    for panel in panels {
+        let [width, height] = panel.options.size;
+        if !(200..=10_000).contains(&width) || !(150..=10_000).contains(&height) {
+            let expected = "200 to 10000 by 150 to 10000 pixels";
+            return Err(Error::invalid(place, "size", format!("{:?}", panel.options.size), expected));
+        }
     }
-    // Past these bounds the extent of an axis is no finite number any more.
-    let fits = |v: f64, log: bool| v.abs() < 1e100 && (!log || v > 1e-100);
-    let shown = |p: &(f64, f64)| fits(p.0, options.log_x) && fits(p.1, options.log_y);
-    let all: Vec<(f64, f64)> = series.iter().flat_map(|(_, s)| s).copied().filter(|p| shown(p)).collect();
-    if all.is_empty() {
-        let expected = "at least one finite point (above zero on a logarithmic axis)";
-        return Err(Error::invalid(place, "series", format!("{} without a point to draw", series.len()), expected));
-    }
-    let x = range(all.iter().map(|p| p.0), options.log_x, 0.0);
-    let y = range(all.iter().map(|p| p.1), options.log_y, 0.05);
+    let width: u32 = panels.iter().map(|p| p.options.size[0]).sum();
+    let height = panels.iter().map(|p| p.options.size[1]).max().unwrap_or(0);
     register();
     let mut pixels = vec![255u8; 3 * width as usize * height as usize];
     {
-        let plot = Plot { title, labels: [x_label, y_label], series, options, shown: &shown };
-        let area = BitMapBackend::with_buffer(&mut pixels, (width, height)).into_drawing_area();
-        let corner = options.legend.unwrap_or_else(|| emptiest(&all, &x, &y, options));
-        let drawn = match (options.log_x, options.log_y) {
-            (false, false) => plot.draw(&area, x, y, corner),
-            (true, false) => plot.draw(&area, x.log_scale(), y, corner),
-            (false, true) => plot.draw(&area, x, y.log_scale(), corner),
-            (true, true) => plot.draw(&area, x.log_scale(), y.log_scale(), corner),
-        };
-        drawn.map_err(|e| Error::invalid(place, "plot", e, "a series that can be drawn"))?;
+        let mut area = BitMapBackend::with_buffer(&mut pixels, (width, height)).into_drawing_area();
+        for panel in panels {
+            let (left, right) = area.split_horizontally(panel.options.size[0]);
+            panel.draw(&place, &left)?;
+            area = right;
+        }
     }
     write_png(path, width, height, &pixels)
+}
+
+impl Panel<'_> {
+    fn draw(&self, place: &str, area: &DrawingArea<BitMapBackend, plotters::coord::Shift>) -> Result<()> {
+        let Self { title, labels, series, options } = *self;
+        let fits = |v: f64, log: bool| v.abs() < 1e100 && (!log || v > 1e-100);
+        let shown = |p: &(f64, f64)| fits(p.0, options.log_x) && fits(p.1, options.log_y);
+        let all: Vec<(f64, f64)> = series.iter().flat_map(|(_, s)| s).copied().filter(|p| shown(p)).collect();
+        if all.is_empty() {
+            let expected = "at least one finite point (above zero on a logarithmic axis)";
+            return Err(Error::invalid(place, "series", format!("{} without a point to draw", series.len()), expected));
+        }
+        let x = range(all.iter().map(|p| p.0), options.log_x, options.x_margin);
+        let y = range(all.iter().map(|p| p.1), options.log_y, 0.05);
+        let plot = Plot { title, labels, series, options, shown: &shown };
+        let corner = options.legend.unwrap_or_else(|| emptiest(&all, &x, &y, options));
+        let drawn = match (options.log_x, options.log_y) {
+            (false, false) => plot.draw(area, x, y, corner),
+            (true, false) => plot.draw(area, x.log_scale(), y, corner),
+            (false, true) => plot.draw(area, x, y.log_scale(), corner),
+            (true, true) => plot.draw(area, x.log_scale(), y.log_scale(), corner),
+        };
+        drawn.map_err(|e| Error::invalid(place, "plot", e, "a series that can be drawn"))
+    }
 }
 
 struct Plot<'a> {
@@ -283,6 +316,24 @@ mod tests {
         let options = CurveOptions { log_x: true, log_y: true, ..Default::default() };
         let loss = vec![("loss".to_string(), (0..500).map(|i| (i as f64, 3.0 / (1.0 + i as f64))).collect())];
         curves_png_with(folder.join("loss_log.png"), "", "step", "loss", &loss, &options).unwrap();
+    }
+
+    #[test]
+    fn panels_stand_side_by_side() {
+        let (_dir, folder) = folder();
+        let path = folder.join("panels.png");
+        let (series, options) = (series(), CurveOptions { size: [600, 400], ..Default::default() });
+        let panel = |title| Panel { title, labels: ["x", "y"], series: &series, options: &options };
+        panels_png(&path, &[panel("left"), panel("right")]).unwrap();
+        let image = image::open(&path).unwrap().to_rgb8();
+        assert_eq!(image.dimensions(), (1200, 400));
+        // The same picture twice, but for the titles.
+        let same = (60..400).all(|y| (0..600).all(|x| image.get_pixel(x, y) == image.get_pixel(x + 600, y)));
+        assert!(same);
+        let nothing = vec![];
+        let empty = Panel { title: "", labels: ["", ""], series: &nothing, options: &options };
+        let path = folder.join("no-panel.png");
+        assert!(panels_png(&path, &[panel("left"), empty]).is_err() && !path.exists());
     }
 
     #[test]

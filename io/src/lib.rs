@@ -62,7 +62,7 @@ pub use atomic::{is_unfinished, write_atomic, write_folder_atomic, write_text_at
 pub use check::{LineIntegralCheck, check_line_integrals};
 pub use checkpoint::{read_checkpoint, write_checkpoint};
 pub use counts::{Correction, CountsReport, OpenBeam, line_integrals};
-pub use curves::{Corner, CurveOptions, curves_png, curves_png_with};
+pub use curves::{Corner, CurveOptions, Panel, curves_png, curves_png_with, panels_png};
 pub use file_order::{PACKED_BYTES, SLAB_BYTES};
 pub use naf::{read_naf, write_naf};
 pub use orbit::Orbit;
@@ -74,5 +74,5 @@ pub use scan_folder::write_scan;
 pub use scanner::{I0, ImportOptions, Imported, read_scanner};
 pub use size::{ScanSize, scan_size, volume_voxels};
 pub use slices::{MiddleSlices, compare_png, features_png, slices_png};
-pub use volume::{is_volume, read_volume, write_volume, write_voxels};
+pub use volume::{is_volume, packed_bytes, read_volume, write_volume, write_voxels};
 pub use weights::{Weights, read_weights, write_weights};

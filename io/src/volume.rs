@@ -8,6 +8,7 @@ use conefield_core::scan::Volume;
 use conefield_core::{Error, Result};
 use flate2::{Compression, GzBuilder};
 use ndarray::{Array3, Ix3};
+use std::io::Write;
 use std::path::Path;
 
 /// Reads a volume: NIfTI-1 (any real number type, gzip or not), MetaImage (`.mha`, `.mhd` with the file it names
@@ -136,6 +137,29 @@ pub fn write_voxels(path: impl AsRef<Path>, voxels: &mut dyn Voxels) -> Result<(
     })
 }
 
+/// Bytes that `voxels` become as `.nii.gz`: all of the work of [`write_voxels`] but for the disk's, to measure it by.
+pub fn packed_bytes(voxels: &mut dyn Voxels) -> Result<u64> {
+    let place = Path::new("packed voxels");
+    voxels.grid().validate("packed voxels")?;
+    let mut packed = GzBuilder::new().write(Counting(0), Compression::fast());
+    nifti::write(&mut packed, place, voxels)?;
+    packed.finish().map(|counted| counted.0).map_err(|e| Error::io(place, e))
+}
+
+/// Counts bytes and drops them.
+struct Counting(u64);
+
+impl Write for Counting {
+    fn write(&mut self, bytes: &[u8]) -> std::io::Result<usize> {
+        self.0 += bytes.len() as u64;
+        Ok(bytes.len())
+    }
+
+    fn flush(&mut self) -> std::io::Result<()> {
+        Ok(())
+    }
+}
+
 /// A NumPy array as a volume of 1 mm voxels.
 pub(crate) fn from_numpy(path: &Path, array: ndarray::ArrayD<f32>) -> Result<Volume> {
     let data: Array3<f32> = array
@@ -192,6 +216,9 @@ mod tests {
         let back = read_volume(&path).unwrap();
         assert_eq!((back.data, back.grid.spacing, back.affine), (v.data, [1.0; 3], None));
         assert!(is_volume(&path) && !is_volume(dir.path()));
+        let packed = dir.path().join("a.nii.gz");
+        write_volume(&packed, &v).unwrap();
+        assert_eq!(packed_bytes(&mut &v).unwrap(), packed.metadata().unwrap().len());
     }
 
     /// Values made where they are asked for, of more voxels than a slab has.

@@ -60,21 +60,25 @@ pub struct Clock {
     limits: Limits,
     spent: Duration,
     running: Option<Instant>,
+    /// When it was made, and what had been spent by then: a deadline counts from there.
+    made: (Instant, Duration),
 }
 
 impl Clock {
     /// A stopped clock. A limit on the command line replaces the spec's end of the same kind; where it names
-    /// only time, the spec's number of steps does not end the run.
+    /// only time, the spec's number of steps does not end the run. A deadline replaces both.
     ///
     /// `spent` seconds of training came before, in a run that is resumed.
     pub fn new(spec: Ends, cli: Limits, spent: f64) -> Self {
+        let timed = cli.seconds.is_some() || cli.deadline.is_some();
+        let counted = cli.steps.is_some() || cli.deadline.is_some();
         let limits = Limits {
-            steps: cli.steps.or(if cli.seconds.is_some() { None } else { spec.steps }),
-            seconds: cli.seconds.or(if cli.steps.is_some() { None } else { spec.seconds }),
-            at_most: cli.at_most,
+            steps: cli.steps.or(if timed { None } else { spec.steps }),
+            seconds: cli.seconds.or(if counted { None } else { spec.seconds }),
+            ..cli
         };
         let spent = Duration::try_from_secs_f64(spent).unwrap_or_default();
-        Self { limits, spent, running: None }
+        Self { limits, spent, running: None, made: (Instant::now(), spent) }
     }
 
     /// Training goes on.
@@ -98,7 +102,25 @@ impl Clock {
     pub fn share(&self, steps: u64) -> f64 {
         let by_steps = self.share_of_steps(steps);
         let by_time = self.limits.seconds.map_or(0.0, |t| if t <= 0.0 { 1.0 } else { self.seconds() / t });
-        by_steps.max(by_time)
+        by_steps.max(by_time).max(self.share_of_deadline(steps))
+    }
+
+    /// Pauses count: what else a run does takes time from it, too. It ends no run before its first step.
+    fn share_of_deadline(&self, steps: u64) -> f64 {
+        let Some(end) = self.limits.deadline else { return 0.0 };
+        let (made, before) = self.made;
+        let whole = before + end.saturating_duration_since(made);
+        let gone = before + made.elapsed();
+        match (gone >= whole, steps) {
+            (true, 0) => 1.0 - f64::EPSILON,
+            (true, _) => 1.0,
+            _ => gone.as_secs_f64() / whole.as_secs_f64(),
+        }
+    }
+
+    /// Whether so many seconds more end before the deadline.
+    pub fn allows(&self, seconds: f64) -> bool {
+        self.limits.deadline.is_none_or(|end| end.saturating_duration_since(Instant::now()).as_secs_f64() >= seconds)
     }
 
     /// The same by the number of steps alone; 0 where none is set.
@@ -141,5 +163,20 @@ mod tests {
             assert_eq!((c.share(5), c.done(5) >= 1.0), (0.5, over));
             assert!(c.done(10) >= 1.0);
         }
+    }
+
+    #[test]
+    fn a_deadline_replaces_the_other_ends_and_counts_pauses() {
+        let spec = Ends { steps: Some(1), seconds: Some(1e-9) };
+        let within =
+            |seconds| Limits { deadline: Some(Instant::now() + Duration::from_secs(seconds)), ..Limits::default() };
+        let c = Clock::new(spec, within(1000), 3000.0);
+        // 3000 of 4000 seconds came before the run was resumed. The clock does not run.
+        assert!((0.75..0.76).contains(&c.share(5)), "{}", c.share(5));
+        assert!(c.allows(900.0) && !c.allows(1001.0));
+        let over = Clock::new(spec, within(0), 0.0);
+        assert!(over.share(1) >= 1.0 && over.done(1) >= 1.0 && !over.allows(1e-3));
+        assert!(over.done(0) < 1.0, "nothing was made yet");
+        assert!(Clock::new(spec, Limits::default(), 0.0).allows(f64::MAX));
     }
 }

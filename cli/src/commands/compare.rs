@@ -1,10 +1,12 @@
 //! `conefield compare`
 
-use super::protocol::{Protocol, word};
-use super::reconstruct::{FAILED, Parts, ScanRecord, identity, split};
+use super::protocol::Protocol;
+use super::reconstruct::{Parts, identity};
+use super::record::ScanRecord;
+use super::trial::{Figures, Input, LONGEST, Trial, read_json};
 use super::{Ends, General, backends::simd_level};
 use crate::backend::BackendChoice;
-use crate::memory::{Memory, Run};
+use crate::memory::Memory;
 use crate::plugins::{self, Used};
 use crate::table::{SCORES, Table, score_cells};
 use crate::{files, out, run, signals, specs};
@@ -17,10 +19,8 @@ use serde::{Deserialize, Serialize};
 use serde_json::Value;
 use std::collections::BTreeMap;
 use std::fs;
-use std::io::{ErrorKind, Read};
+use std::io::ErrorKind;
 use std::path::{Path, PathBuf};
-use std::process::{Command, ExitStatus, Stdio};
-use std::time::Duration;
 use tracing::info;
 
 /// Reconstruct a scan in several ways under one protocol: a table and a picture.
@@ -57,10 +57,6 @@ fn help() -> String {
 
 /// What lies beside the runs.
 const FILES: [&str; 3] = ["table.md", "table.json", "compare.png"];
-/// Longest record or spec that is read back, in bytes.
-const LONGEST: u64 = 1 << 20;
-/// Between two looks at a run's process.
-const LOOK: Duration = Duration::from_millis(20);
 
 /// A spec and how its run starts.
 struct Method {
@@ -85,13 +81,6 @@ enum Start {
     Done,
 }
 
-/// What is known of the input once all of it was looked at.
-struct Input {
-    scan: ScanRecord,
-    held: Vec<usize>,
-    reference: Option<MiddleSlices>,
-}
-
 /// All that `table.json` says.
 #[derive(Serialize)]
 struct Report<'a> {
@@ -109,6 +98,7 @@ struct Shared<'a> {
     peak: f64,
     seed: u64,
     limits: &'a Ends,
+    budget_s: Option<f64>,
     sets: &'a [String],
     backend: BackendChoice,
     simd: String,
@@ -128,29 +118,11 @@ struct Entry {
     figures: Option<Figures>,
 }
 
-/// What the table takes from a run's `record.json`, under the names that it has there.
-#[derive(Debug, Clone, Serialize, Deserialize)]
-struct Figures {
-    steps: u64,
-    train_s: f64,
-    export_s: f64,
-    total_s: f64,
-    peak_bytes: Option<u64>,
-    threads: usize,
-    parameters: usize,
-    samples: u64,
-    samples_per_s: Option<f64>,
-    loss: Option<f64>,
-    held_out: Option<f64>,
-    /// Kept as it stands, with the reasons for what is missing.
-    scores: Option<Value>,
-}
-
 impl Compare {
     pub fn run(self, general: &General) -> Result<()> {
         // Whatever is wrong with the input is told before anything is made.
         let mut methods = self.methods()?;
-        let input = self.input()?;
+        let input = Input::read(&self.scan, &self.protocol)?;
         let old = self.look_into_folder()?;
         for method in &mut methods {
             method.start = self.start(method, &input)?;
@@ -206,29 +178,6 @@ impl Compare {
             methods.push(Method { name, spec: spec.clone(), loaded, start: Start::Anew });
         }
         Ok(methods)
-    }
-
-    /// Reads scan and reference, to refuse what does not fit; of both only little is kept.
-    fn input(&self) -> Result<Input> {
-        let all = Run {
-            scan: conefield_io::scan_size(&self.scan)?,
-            split: self.protocol.hold_out.is_some(),
-            reference: self.protocol.reference.is_some(),
-            field: true,
-            parameters: 0,
-            backend: 0,
-            solver: [0; 2],
-            resume: false,
-        };
-        all.memory().check(|_| vec![])?;
-        let scan = files::scan(&self.scan)?;
-        let reference = self.protocol.reference(&self.scan, &scan)?;
-        let record = ScanRecord::of(&self.scan, &scan);
-        let held = self.protocol.held_out(scan.geometry.views.len());
-        if !held.is_empty() {
-            split(scan, &held)?;
-        }
-        Ok(Input { scan: record, held, reference: reference.as_ref().map(MiddleSlices::of) })
     }
 
     /// What an earlier comparison left in the folder: files, and folders of runs. Refuses anything else, and an
@@ -306,7 +255,7 @@ impl Compare {
         };
         let figures = match &error {
             Some(_) => None,
-            None => Some(read_json(&run.join("record.json"))?),
+            None => Some(Figures::of_run(&run)?),
         };
         let status = if error.is_some() { "failed" } else { "done" };
         Ok(Entry { name: method.name.clone(), spec: method.spec.clone(), run, status, error, figures })
@@ -314,48 +263,18 @@ impl Compare {
 
     /// Runs `method` in a process of its own; what went wrong with it, if anything did.
     fn reconstruct(&self, method: &Method, part: String, general: &General) -> Result<Option<String>> {
-        if signals::caught().is_some() {
-            return Err(Error::Stopped { part });
-        }
-        let program = std::env::current_exe().map_err(|e| Error::io("conefield", e))?;
-        let io = |e| Error::io(&program, e);
-        let mut command = Command::new(&program);
-        command.args(general.arguments()).args(["reconstruct", "--as-part"]);
-        command.arg(word("--spec", &method.spec)).arg(word("--output", self.output.join(&method.name)));
-        command.args(match method.start {
-            Start::Resuming => &["--resume"][..],
-            Start::Replacing => &["--force"],
-            Start::Anew | Start::Done => &[],
-        });
-        command.args(self.protocol.arguments()).arg("--").arg(&self.scan);
-        let mut child = command.stdin(Stdio::piped()).stdout(Stdio::piped()).spawn().map_err(io)?;
-        let mut input = child.stdin.take();
-        let output = child.stdout.take();
-        let said = std::thread::spawn(move || {
-            let mut said = vec![];
-            let _ = output.map(|mut o| o.read_to_end(&mut said));
-            String::from_utf8_lossy(&said).into_owned()
-        });
-        let status = loop {
-            if let Some(status) = child.try_wait().map_err(io)? {
-                break status;
-            }
-            // Ctrl-C reaches the child by itself; a signal to this process alone reaches it by the end of its input.
-            if signals::caught().is_some() {
-                input = None;
-            }
-            std::thread::sleep(LOOK);
+        let trial = Trial {
+            scan: &self.scan,
+            spec: &method.spec,
+            output: &self.output.join(&method.name),
+            protocol: &self.protocol,
+            more: match method.start {
+                Start::Resuming => &["--resume"],
+                Start::Replacing => &["--force"],
+                Start::Anew | Start::Done => &[],
+            },
         };
-        drop(input);
-        let said = said.join().unwrap_or_default();
-        if let Some(signal) = ended_by(status).filter(|_| !status.success()).filter(|s| [2, 15].contains(s)) {
-            signals::note(signal);
-        }
-        if signals::caught().is_some() {
-            return Err(Error::Stopped { part });
-        }
-        let line = said.lines().find_map(|l| l.strip_prefix(FAILED)).map(str::to_owned);
-        Ok((!status.success()).then(|| line.unwrap_or_else(|| format!("the process ended with {status}"))))
+        trial.run(part, general)
     }
 
     fn reference(&self) -> Option<String> {
@@ -371,6 +290,7 @@ impl Compare {
             peak: self.protocol.peak,
             seed: self.protocol.seed,
             limits: &self.protocol.ends,
+            budget_s: self.protocol.budget,
             sets: &self.protocol.sets,
             backend: self.protocol.backend,
             simd: simd_level(),
@@ -416,21 +336,6 @@ fn is_run(folder: &Path) -> bool {
     fs::read_dir(folder).is_ok_and(|entries| entries.into_iter().all(|e| e.is_ok_and(known)))
 }
 
-/// What ended a process: its exit status above 128, as shells have it, or the signal itself.
-fn ended_by(status: ExitStatus) -> Option<u8> {
-    #[cfg(unix)]
-    let signal = std::os::unix::process::ExitStatusExt::signal(&status);
-    #[cfg(not(unix))]
-    let signal = None;
-    signal.or(status.code().and_then(|c| c.checked_sub(128))).and_then(|s| u8::try_from(s).ok())
-}
-
-fn read_json<T: serde::de::DeserializeOwned>(path: &Path) -> Result<T> {
-    let text = conefield_core::files::read_text(path, LONGEST)?;
-    let expected = "what conefield writes there; --force starts anew";
-    serde_json::from_str(&text).map_err(|e| Error::invalid(path.display().to_string(), "JSON", e, expected))
-}
-
 /// Which run a finished one was, as [`identity`] has it, and what it was compared with.
 fn recorded(folder: &Path) -> Result<BTreeMap<String, String>> {
     #[derive(Deserialize)]
@@ -440,6 +345,8 @@ fn recorded(folder: &Path) -> Result<BTreeMap<String, String>> {
         scan: KnownScan,
         held_out_views: Vec<usize>,
         limits: Ends,
+        #[serde(default)]
+        budget_s: Option<f64>,
         reference: Value,
         peak: f64,
         #[serde(default)]
@@ -457,6 +364,7 @@ fn recorded(folder: &Path) -> Result<BTreeMap<String, String>> {
         ("projections".into(), known.scan.projections_fnv1a64),
         ("held_out_views".into(), format!("{:?}", known.held_out_views)),
         ("limits".into(), out::to_json(&known.limits)?),
+        ("budget".into(), format!("{:?}", known.budget_s)),
         ("reference".into(), known.reference.to_string()),
         ("peak".into(), known.peak.to_string()),
     ]);
@@ -464,28 +372,20 @@ fn recorded(folder: &Path) -> Result<BTreeMap<String, String>> {
     Ok(all)
 }
 
-impl Figures {
-    /// dB; infinite, which JSON has no number for, where the result is the reference.
-    fn psnr(&self) -> Option<f64> {
-        self.scores.as_ref().map(|s| s["psnr"].as_f64().unwrap_or(f64::INFINITY))
+/// The table's columns: how the result fits, by what is known, and what it took.
+fn cells(figures: &Figures, with: &Columns) -> Vec<String> {
+    let mut cells = vec![];
+    if with.scores {
+        let ssims = ["ssim_2d", "ssim_3d", "ssim_skimage"].map(|name| figures.score(name));
+        cells.extend(score_cells(figures.psnr().unwrap_or(f64::NAN), ssims));
     }
-
-    /// The table's columns: how the result fits, by what is known, and what it took.
-    fn cells(&self, with: &Columns) -> Vec<String> {
-        let mut cells = vec![];
-        if with.scores {
-            let ssims =
-                ["ssim_2d", "ssim_3d", "ssim_skimage"].map(|name| self.scores.as_ref().and_then(|s| s[name].as_f64()));
-            cells.extend(score_cells(self.psnr().unwrap_or(f64::NAN), ssims));
-        }
-        let figure = |x: Option<f64>| x.map_or("-".into(), |x| format!("{x:.4e}"));
-        cells.extend(with.held_out.then(|| figure(self.held_out)));
-        cells.extend(with.loss.then(|| figure(self.loss)));
-        cells.push(out::number(self.steps));
-        cells.extend([self.train_s, self.total_s].map(|s| format!("{s:.2}")));
-        cells.push(self.peak_bytes.map_or("-".into(), out::bytes));
-        cells
-    }
+    let figure = |x: Option<f64>| x.map_or("-".into(), |x| format!("{x:.4e}"));
+    cells.extend(with.held_out.then(|| figure(figures.held_out)));
+    cells.extend(with.loss.then(|| figure(figures.loss)));
+    cells.push(out::number(figures.steps));
+    cells.extend([figures.train_s, figures.total_s].map(|s| format!("{s:.2}")));
+    cells.push(figures.peak_bytes.map_or("-".into(), out::bytes));
+    cells
 }
 
 /// Which figures tell how a result fits: scores where there is a reference, otherwise held-out views, otherwise the
@@ -509,7 +409,7 @@ fn table(report: &Report) -> Table {
     let mut notes = vec![protocol.line()];
     for entry in &report.methods {
         let cells = match (&entry.figures, &entry.error) {
-            (Some(figures), _) => figures.cells(&with),
+            (Some(figures), _) => cells(figures, &with),
             (None, error) => {
                 notes.extend(error.as_ref().map(|e| format!("{} failed: {e}", entry.name)));
                 (1..heads.len()).map(|c| if c == 1 { "failed" } else { "-" }.to_owned()).collect()
@@ -530,7 +430,8 @@ impl Shared<'_> {
         }
         parts.extend(self.reference.as_ref().map(|r| format!("reference {r}, peak {}", self.peak)));
         parts.extend(self.limits.steps.map(|n| format!("{} steps", out::number(n))));
-        parts.extend(self.limits.budget.map(|t| format!("budget {}", out::duration(t))));
+        parts.extend(self.limits.seconds.map(|t| format!("{} of training", out::duration(t))));
+        parts.extend(self.budget_s.map(|t| format!("budget {}", out::duration(t))));
         parts.extend(self.limits.at_most.map(|t| format!("at most {}", out::duration(t))));
         parts.extend(self.sets.iter().map(|s| format!("`{s}`")));
         parts.push(format!("seed {}, {} threads, conefield {}", self.seed, self.threads, self.version));
@@ -559,9 +460,9 @@ mod tests {
             held_out: None,
             scores: Some(scores),
         };
-        let cells = figures.cells(&Columns { scores: true, held_out: true, loss: false });
-        assert_eq!(cells, ["inf", "1.0000", "-", "1.0000", "-", "1", "1.00", "2.00", "-"]);
-        let cells = figures.cells(&Columns { scores: false, held_out: false, loss: true });
-        assert_eq!(cells, ["-", "1", "1.00", "2.00", "-"]);
+        let shown = cells(&figures, &Columns { scores: true, held_out: true, loss: false });
+        assert_eq!(shown, ["inf", "1.0000", "-", "1.0000", "-", "1", "1.00", "2.00", "-"]);
+        let shown = cells(&figures, &Columns { scores: false, held_out: false, loss: true });
+        assert_eq!(shown, ["-", "1", "1.00", "2.00", "-"]);
     }
 }

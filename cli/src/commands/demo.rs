@@ -29,9 +29,9 @@ pub struct Demo {
     /// The folder for scan, volumes and picture.
     #[arg(short, long = "output", value_name = "FOLDER", default_value = "conefield-demo")]
     output: PathBuf,
-    /// Training time of each of the two.
+    /// Stop the training of each of the two after this time.
     #[arg(long, value_name = "TIME", default_value = "60s", value_parser = parse::seconds)]
-    budget: f64,
+    seconds: f64,
     /// Voxels along a side of the volume.
     #[arg(long, value_name = "N", default_value_t = 96, value_parser = clap::value_parser!(u16).range(16..=256))]
     size: u16,
@@ -120,7 +120,7 @@ impl Demo {
         let backend = Cpu::new();
         let job = Job {
             seed: self.seed,
-            limits: Limits { seconds: Some(self.budget), ..Limits::default() },
+            limits: Limits { seconds: Some(self.seconds), ..Limits::default() },
             weights: &|path| files::read_weights(path),
             ..Job::new(scan, &loaded.spec, &backend)
         };

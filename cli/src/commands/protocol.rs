@@ -20,6 +20,9 @@ pub struct Protocol {
     pub sets: Vec<String>,
     #[command(flatten)]
     pub ends: Ends,
+    /// Plan training so that the whole run, from start to last file, takes this time, such as 60s or 10m.
+    #[arg(long, value_name = "TIME", value_parser = parse::seconds, conflicts_with_all = ["steps", "seconds", "at_most"])]
+    pub budget: Option<f64>,
     /// Which backend: auto, cpu, wgpu, or wgpu:N with the number of an adapter.
     #[arg(long, value_name = "BACKEND", default_value_t)]
     pub backend: BackendChoice,
@@ -64,10 +67,11 @@ impl Protocol {
 
     /// The same again, for a child process. Flag and value are one word: a value may begin with a dash.
     pub fn arguments(&self) -> Vec<OsString> {
-        let Self { checkpoint_every, sets, ends, backend, reference, peak, hold_out, seed } = self;
+        let Self { checkpoint_every, sets, ends, budget, backend, reference, peak, hold_out, seed } = self;
         let all = [
             ("--checkpoint-every", Some(checkpoint_every.to_string())),
-            ("--budget", ends.budget.map(|t| t.to_string())),
+            ("--seconds", ends.seconds.map(|t| t.to_string())),
+            ("--budget", budget.map(|t| t.to_string())),
             ("--steps", ends.steps.map(|n| n.to_string())),
             ("--at-most", ends.at_most.map(|t| t.to_string())),
             ("--backend", Some(backend.to_string())),
@@ -102,11 +106,12 @@ mod tests {
 
     #[test]
     fn a_child_is_told_the_same() {
-        let full = "x --checkpoint-every 0.1m --set a=b --set c=[1,2] --budget 1h --steps 7 --at-most 1e-9s --backend wgpu:2 \
+        let full = "x --checkpoint-every 0.1m --set a=b --set c=[1,2] ENDS --backend wgpu:2 \
                     --reference -v.nii --peak 2.5 --hold-out";
-        for held in ["3,17", "every:10"] {
+        for (held, ends) in [("3,17", "--seconds 1h --steps 7 --at-most 1e-9s"), ("every:10", "--budget 2m")] {
             // `--reference -v.nii` needs its equals sign.
-            let line: Vec<String> = full.replace("--reference ", "--reference=").split(' ').map(Into::into).collect();
+            let line: Vec<String> =
+                full.replace("ENDS", ends).replace("--reference ", "--reference=").split(' ').map(Into::into).collect();
             let line: Vec<String> = line.into_iter().filter(|w| !w.is_empty()).chain([held.into()]).collect();
             let first = Line::try_parse_from(line).unwrap().protocol;
             let again = [OsString::from("x")].into_iter().chain(first.arguments());

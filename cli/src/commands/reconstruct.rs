@@ -1,24 +1,26 @@
 //! `conefield reconstruct`
 
-use super::{Ends, backends::simd_level, evaluate, protocol::Protocol};
+use super::record::{Record, ScanRecord, summary};
+use super::{backends::simd_level, evaluate, protocol::Protocol};
+use crate::budget::calibrate::Bench;
+use crate::budget::front::{Front, Kind};
+use crate::budget::plan::Budget;
 use crate::memory::{self, Memory};
 use crate::outgoing::{self, Written};
-use crate::plugins::{self, Used};
+use crate::plugins;
 use crate::progress::{Keeper, Progress};
 use crate::run::RunFolder;
 use crate::{files, out, signals, specs};
 use clap::Args;
-use conefield_core::Result;
 use conefield_core::arena::Arena;
 use conefield_core::backend::{Backend, Explain};
 use conefield_core::checkpoint::Resume;
 use conefield_core::pipeline::Pipeline;
 use conefield_core::scan::Scan;
-use conefield_core::solver::{Job, Solver};
+use conefield_core::solver::{Job, Limits, Solver};
 use conefield_core::spec::load::{Loaded, to_toml};
+use conefield_core::{Error, Result};
 use conefield_io::{MiddleSlices, ScanSize};
-use conefield_metrics::Scores;
-use serde::Serialize;
 use std::collections::BTreeMap;
 use std::fs::File;
 use std::path::{Path, PathBuf};
@@ -28,13 +30,17 @@ use tracing::info;
 /// Reconstruct a volume from a scan.
 ///
 /// RUN receives volume.nii.gz, metrics.jsonl, spec.toml (every setting), weights.safetensors, slices.png and, when all
-/// is done, record.json. Ctrl-C ends the run after its step; the same command with --resume goes on.
+/// is done, record.json. Ctrl-C ends the run after its step; the same command with --resume goes on. With --budget the
+/// whole command is planned to take so long, after a second of measuring what this machine can do.
 #[derive(Args)]
 pub struct Reconstruct {
     /// The scan.
     scan: PathBuf,
-    #[arg(long, help = specs::help())]
-    spec: String,
+    #[arg(long, required_unless_present = "budget", help = spec_help())]
+    spec: Option<String>,
+    /// Choose from this front instead of the shipped one, where --budget chooses the spec.
+    #[arg(long, value_name = "FILE", conflicts_with = "spec", requires = "budget")]
+    front: Option<PathBuf>,
     /// The folder for the results; new or empty.
     #[arg(short, long = "output", value_name = "RUN")]
     output: PathBuf,
@@ -58,8 +64,26 @@ pub struct Reconstruct {
     as_part: bool,
 }
 
+fn spec_help() -> String {
+    format!("{}; with --budget it may be left out: the best that fits is taken", specs::help())
+}
+
 /// What an error that goes to standard output begins with.
 pub const FAILED: &str = "failed: ";
+
+/// A spec, what it builds and what that takes.
+pub struct Method {
+    pub loaded: Loaded,
+    pub parts: Parts,
+    pub memory: Memory,
+}
+
+impl Method {
+    /// What it works on.
+    pub fn kind(&self) -> Kind {
+        if self.parts.pipeline.is_some() { Kind::Field } else { Kind::Voxels }
+    }
+}
 
 /// What a spec builds.
 pub struct Parts {
@@ -107,69 +131,6 @@ impl Parts {
     }
 }
 
-/// What is needed to repeat a run, and what came out.
-#[derive(Debug, Serialize)]
-struct Record {
-    version: &'static str,
-    spec: String,
-    seed: u64,
-    scan: ScanRecord,
-    held_out_views: Vec<usize>,
-    limits: Ends,
-    init: Option<String>,
-    reference: Option<String>,
-    /// Whose stages the spec names.
-    #[serde(skip_serializing_if = "Vec::is_empty")]
-    plugins: Vec<Used>,
-    backend: Explain,
-    simd: String,
-    threads: usize,
-    memory: Memory,
-    peak_bytes: Option<u64>,
-    parameters: usize,
-    steps: u64,
-    train_s: f64,
-    export_s: f64,
-    /// From the start of the command to this record. Of what came before a --resume, the training alone.
-    total_s: f64,
-    samples: u64,
-    /// Of solvers that take samples.
-    samples_per_s: Option<f64>,
-    loss: Option<f64>,
-    held_out: Option<f64>,
-    peak: f64,
-    scores: Option<Scores>,
-}
-
-/// Which scan it was.
-#[derive(Debug, Serialize)]
-pub struct ScanRecord {
-    path: String,
-    views: usize,
-    detector: [usize; 2],
-    volume: [usize; 3],
-    pub projections_fnv1a64: String,
-}
-
-impl ScanRecord {
-    /// The whole scan at `path`.
-    pub fn of(path: &Path, scan: &Scan) -> Self {
-        Self {
-            path: path.display().to_string(),
-            views: scan.geometry.views.len(),
-            detector: scan.geometry.detector,
-            volume: scan.geometry.volume.shape,
-            projections_fnv1a64: checksum(scan),
-        }
-    }
-
-    /// In words.
-    pub fn line(&self) -> String {
-        let (views, [rows, columns], [x, y, z]) = (self.views, self.detector, self.volume);
-        format!("{}: {views} views of {rows} x {columns} pixels, {x} x {y} x {z} voxels", self.path)
-    }
-}
-
 impl Reconstruct {
     pub fn run(self) -> Result<()> {
         if !self.as_part {
@@ -186,21 +147,59 @@ impl Reconstruct {
     fn reconstruct(&self) -> Result<()> {
         let begin = Instant::now();
         let protocol = &self.protocol;
-        let loaded = specs::read(&self.spec, &self.all_sets())?;
         let backend = protocol.backend.open()?;
-        let parts = Parts::of(&loaded, backend.as_ref())?;
-        let memory = self.memory(&loaded, &parts)?;
-        info!("memory: {}", memory.line());
-        // Weights that cannot be read or do not fit are told before anything is made.
-        parts.check_weights(&loaded)?;
-        let Parts { solver, compiled, .. } = parts;
+        // What is wrong with a spec, or weights that cannot be read or do not fit, is told before anything is made.
+        let asked = self.asked().map(|(spec, sets)| self.method(&spec, &sets, backend.as_ref())).transpose()?;
+        let front = match (&asked, &self.front) {
+            (Some(_), _) => None,
+            (None, Some(path)) => Some(Front::read(path)?),
+            (None, None) => Some(Front::shipped()?),
+        };
         let whole = files::scan(&self.scan)?;
         let reference = protocol.reference(&self.scan, &whole)?;
         let held = protocol.held_out(whole.geometry.views.len());
         let scan_record = ScanRecord::of(&self.scan, &whole);
         let (scan, held_scan) = if held.is_empty() { (whole, None) } else { split(whole, &held)? };
-        let identity = identity(&loaded, protocol, &held, &scan_record.projections_fnv1a64)?;
-        let (folder, metrics, resume) = self.open(&loaded, &identity)?;
+        let load_s = begin.elapsed().as_secs_f64();
+
+        let identity = |m: &Method| identity(&m.loaded, protocol, &held, &scan_record.projections_fnv1a64);
+        let resumed = match &asked {
+            Some(method) if self.resume => Some(self.reopen(&identity(method)?)?),
+            _ => None,
+        };
+        let spent = resumed.as_ref().map_or(0.0, |(_, _, r)| r.standing.seconds);
+        let bench = Bench {
+            scan: &scan,
+            reference: reference.as_ref(),
+            peak: protocol.peak,
+            backend: backend.as_ref(),
+            seed: protocol.seed,
+        };
+        let budget = protocol.budget.map(|seconds| Budget { begin, seconds, spent });
+        let (method, plan) = match (budget, asked, front) {
+            (None, Some(method), _) => (method, None),
+            (Some(budget), Some(method), _) => {
+                let plan = budget.plan(&bench, &method)?;
+                (method, Some(plan))
+            }
+            (Some(budget), None, Some(front)) => {
+                let more = self.all_sets();
+                let build = |spec: &str, sets: &[String]| self.method(spec, &[sets, &more].concat(), backend.as_ref());
+                let (method, plan) = budget.choose(&bench, &front, build)?;
+                (method, Some(plan))
+            }
+            _ => {
+                return Err(Error::invalid("reconstruct", "--spec", "nothing", "a spec, or --budget to choose one by"));
+            }
+        };
+        plan.iter().flat_map(|p| p.lines(&method)).for_each(|line| info!("{line}"));
+        info!("memory: {}", method.memory.line());
+        let identity = identity(&method)?;
+        let Method { loaded, parts: Parts { solver, compiled, .. }, memory } = method;
+        let (folder, metrics, resume) = match resumed {
+            Some((folder, metrics, resume)) => (folder, metrics, Some(resume)),
+            None => self.create(&loaded)?,
+        };
         signals::listen()?;
         let mut progress = Progress::new("reconstruct", Some(metrics)).keeping(Some(Keeper {
             path: folder.file("checkpoint.safetensors"),
@@ -213,30 +212,36 @@ impl Reconstruct {
             reference: reference.as_ref(),
             peak: protocol.peak,
             seed: protocol.seed,
-            limits: protocol.ends.limits(),
+            limits: Limits { deadline: plan.as_ref().map(|p| p.deadline), ..protocol.ends.limits() },
             weights: &|path| files::read_weights(path),
             volumes: &files::volume,
             resume: resume.as_ref(),
             ..Job::new(&scan, &loaded.spec, backend.as_ref())
         };
+        let start = Instant::now();
         let solution = solver.solve(&job, &mut progress).map_err(|e| loaded.locate(e))?;
+        let prepare_s = (start.elapsed().as_secs_f64() + spent - solution.train_s).max(0.0);
         let last = progress.records().last().cloned();
         drop(progress);
 
         let place = folder.file("volume.nii.gz");
         let field = solution.result.field();
+        let start = Instant::now();
         if let Some(field) = field {
             files::write_field(folder.file("weights.safetensors"), field, notes(&loaded, protocol.seed)?)?;
         }
-        let start = Instant::now();
         let mut voxels = solution.result.voxels(backend.as_ref())?;
         let affine = reference.as_ref().and_then(|r| r.affine);
         let Written { slices, whole } = outgoing::write(&place, voxels.as_mut(), affine, reference.is_some())?;
         let export_s = start.elapsed().as_secs_f64();
+        let start = Instant::now();
         let middle = reference.as_ref().map(MiddleSlices::of);
         files::picture(folder.file("slices.png"), middle.as_ref(), &slices)?;
+        let picture_s = start.elapsed().as_secs_f64();
+        let start = Instant::now();
         let score = |(volume, r)| evaluate::score(&place.display().to_string(), volume, r, protocol.peak);
         let scores = whole.as_ref().zip(reference.as_ref()).map(score).transpose()?;
+        let score_s = start.elapsed().as_secs_f64();
         let record = Record {
             version: env!("CARGO_PKG_VERSION"),
             spec: loaded.spec.name.clone(),
@@ -244,6 +249,8 @@ impl Reconstruct {
             scan: scan_record,
             held_out_views: held,
             limits: protocol.ends.clone(),
+            budget_s: protocol.budget,
+            plan,
             init: self.init.as_ref().map(|p| p.display().to_string()),
             reference: protocol.reference.as_ref().map(|p| p.display().to_string()),
             plugins: plugins::used(&loaded.tree),
@@ -254,9 +261,13 @@ impl Reconstruct {
             peak_bytes: memory::peak(),
             parameters: field.map_or(0, |f| f.model.pipeline.layout().len()),
             steps: solution.steps,
+            load_s,
+            prepare_s,
             train_s: solution.train_s,
             export_s,
-            total_s: begin.elapsed().as_secs_f64() + resume.as_ref().map_or(0.0, |r| r.standing.seconds),
+            picture_s,
+            score_s,
+            total_s: begin.elapsed().as_secs_f64() + spent,
             samples: solution.samples,
             samples_per_s: (solution.samples > 0 && solution.train_s > 0.0)
                 .then(|| solution.samples as f64 / solution.train_s),
@@ -270,19 +281,35 @@ impl Reconstruct {
         if self.json { out::json(&record) } else { out::say(&summary(&record, &self.output)) }
     }
 
+    /// The spec that is asked for and what is set of it. A run that is resumed knows what it chose.
+    fn asked(&self) -> Option<(String, Vec<String>)> {
+        match &self.spec {
+            Some(spec) => Some((spec.clone(), self.all_sets())),
+            None => self.resume.then(|| (self.output.join("spec.toml").display().to_string(), vec![])),
+        }
+    }
+
+    /// Reads and builds a spec. One that does not fit into memory is refused.
+    fn method(&self, spec: &str, sets: &[String], backend: &dyn Backend) -> Result<Method> {
+        let loaded = specs::read(spec, sets)?;
+        let parts = Parts::of(&loaded, backend)?;
+        let memory = self.memory(spec, sets, &loaded, &parts)?;
+        parts.check_weights(&loaded)?;
+        Ok(Method { loaded, parts, memory })
+    }
+
     /// What the run takes; one that does not fit is refused.
-    fn memory(&self, loaded: &Loaded, parts: &Parts) -> Result<Memory> {
+    fn memory(&self, spec: &str, sets: &[String], loaded: &Loaded, parts: &Parts) -> Result<Memory> {
         let run = memory::Run {
             split: self.protocol.hold_out.is_some(),
             reference: self.protocol.reference.is_some(),
             resume: self.resume,
             ..parts.run(conefield_io::scan_size(&self.scan)?)
         };
-        let sets = self.all_sets();
         let tables = loaded.tree["encoder"]["log2_table_size"].as_u64().unwrap_or(0);
         let smaller = (10..tables as u32).rev().filter_map(|bits| {
             let set = format!("encoder.log2_table_size={bits}");
-            let loaded = specs::read(&self.spec, &[&sets[..], &[set]].concat()).ok()?;
+            let loaded = specs::read(spec, &[sets, &[set]].concat()).ok()?;
             Some((bits, specs::build(&loaded).ok()?.layout().len() as u64))
         });
         let memory = run.memory();
@@ -290,18 +317,16 @@ impl Reconstruct {
         Ok(memory)
     }
 
-    /// The folder, its file for metrics, and where to go on from.
-    fn open(
-        &self,
-        loaded: &Loaded,
-        identity: &BTreeMap<String, String>,
-    ) -> Result<(RunFolder, (PathBuf, File), Option<Resume>)> {
-        if self.resume {
-            let folder = RunFolder::reopen(&self.output)?;
-            let resume = files::read_checkpoint(&folder.file("checkpoint.safetensors"), identity)?;
-            let metrics = folder.metrics_before(resume.standing.step)?;
-            return Ok((folder, metrics, Some(resume)));
-        }
+    /// The folder of an interrupted run, its file for metrics, and where to go on from.
+    fn reopen(&self, identity: &BTreeMap<String, String>) -> Result<(RunFolder, (PathBuf, File), Resume)> {
+        let folder = RunFolder::reopen(&self.output)?;
+        let resume = files::read_checkpoint(&folder.file("checkpoint.safetensors"), identity)?;
+        let metrics = folder.metrics_before(resume.standing.step)?;
+        Ok((folder, metrics, resume))
+    }
+
+    /// A new folder with its spec.
+    fn create(&self, loaded: &Loaded) -> Result<(RunFolder, (PathBuf, File), Option<Resume>)> {
         let folder = RunFolder::create(&self.output, self.force)?;
         conefield_io::write_text_atomic(folder.file("spec.toml"), &to_toml(&loaded.spec)?)?;
         let metrics = folder.metrics()?;
@@ -334,6 +359,7 @@ pub fn identity(
     all.insert("projections".into(), projections.into());
     all.insert("held_out_views".into(), format!("{held:?}"));
     all.insert("limits".into(), out::to_json(&protocol.ends)?);
+    all.insert("budget".into(), format!("{:?}", protocol.budget));
     Ok(all)
 }
 
@@ -352,31 +378,4 @@ pub fn notes(loaded: &Loaded, seed: u64) -> Result<BTreeMap<String, String>> {
     ]);
     notes.extend(plugins::identity(&plugins::used(&loaded.tree)));
     Ok(notes)
-}
-
-/// FNV-1a of the projections' bytes, to recognise a scan by.
-fn checksum(scan: &Scan) -> String {
-    let bytes = scan.projections.iter().flat_map(|x| x.to_le_bytes());
-    let hash = bytes.fold(0xcbf2_9ce4_8422_2325u64, |h, b| (h ^ u64::from(b)).wrapping_mul(0x0100_0000_01b3));
-    format!("{hash:016x}")
-}
-
-fn summary(r: &Record, output: &Path) -> String {
-    let [x, y, z] = r.scan.volume;
-    let speed = r.samples_per_s.map(|s| format!(" ({:.2} M samples/s)", s / 1e6)).unwrap_or_default();
-    let mut lines = vec![format!(
-        "{x} x {y} x {z} voxels from {} views: {} in {}{speed}, export {}",
-        r.scan.views - r.held_out_views.len(),
-        if r.steps == 1 { "1 step".into() } else { format!("{} steps", r.steps) },
-        out::duration(r.train_s),
-        out::duration(r.export_s),
-    )];
-    if let Some(h) = r.held_out {
-        lines.push(format!("held-out error  {h:.5} of the largest line integral ({} views)", r.held_out_views.len()));
-    }
-    if let Some(s) = &r.scores {
-        lines.push(evaluate::lines(s));
-    }
-    lines.push(format!("results in {}", output.display()));
-    lines.join("\n")
 }

@@ -9,6 +9,7 @@
 mod case;
 mod command;
 mod dicom;
+mod levers;
 mod metaimage;
 mod naf;
 mod nifti;
@@ -38,6 +39,7 @@ fn every_bad_input_ends_as_the_page_says() {
         ("The project's own scan folder", scan_folder::cases()),
         ("Weights and checkpoints", weights::cases()),
         ("Pipeline specs", spec::cases()),
+        ("Levers and fronts", levers::cases()),
         ("Values on the command line", command::cases()),
     ];
     let count: usize = sections.iter().map(|(_, cases)| cases.len()).sum();

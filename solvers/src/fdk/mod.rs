@@ -16,6 +16,7 @@ use conefield_core::scan::{Scan, Volume};
 use conefield_core::solver::{Job, Observer, Reconstruction, Record, Solution, Solver};
 use conefield_core::spec::{SolverSpec, Spec};
 use conefield_core::voxel::VoxelView;
+use conefield_projectors::voxel::Joseph;
 use conefield_projectors::voxel::backproject::backproject;
 use conefield_projectors::voxel::layout::{AFTER, BEFORE, ColumnMajor, Pinhole};
 use filter::{Ramp, Window};
@@ -109,14 +110,16 @@ impl Solver for Fdk {
             let spent = start.elapsed().as_secs_f64();
             observer.progress(done as u64, share, spent * (1.0 - share) / share);
         }
-        let mm = scan.unit.mm as f32;
         let floor = if self.nonnegative { 0.0 } else { f32::NEG_INFINITY };
-        volume.par_mapv_inplace(|x| (x * mm).max(floor));
+        volume.par_mapv_inplace(|x| x.max(floor));
         let train_s = start.elapsed().as_secs_f64();
+        let mm = scan.unit.mm as f32;
         let watch = Watch::new(job);
-        let psnr = watch.psnr(&volume, 1.0);
-        let record = Record { step: 1, seconds: train_s, psnr, ..Record::default() };
-        observer.record(&record);
+        let psnr = watch.psnr(&volume, mm);
+        let projector = job.backend.place(Box::new(Joseph {}))?;
+        let held_out = watch.held_out(projector.operator(), &volume);
+        observer.record(&Record { step: 1, seconds: train_s, psnr, held_out, ..Record::default() });
+        volume.par_mapv_inplace(|x| x * mm);
         let volume = Volume { data: volume, grid: g.volume, affine: None };
         Ok(Solution { result: Reconstruction::Volume(volume), steps: 1, train_s, samples: 0 })
     }

@@ -273,6 +273,7 @@ pub fn drive(
     let ends = Ends { steps: stop.passes, seconds: stop.seconds };
     let mut clock = Clock::new(ends, job.limits, seconds + begun.elapsed().as_secs_f64());
     let started = step;
+    let mut last_pass = 0.0;
     if stop.patience.is_some() && job.held_out.is_none() {
         observer.note("stop.patience looks at views that are kept aside, and none are: it does not end this run");
     }
@@ -301,9 +302,10 @@ pub fn drive(
         }
         // Time alone does not end a run that has made nothing yet.
         let share = if step == 0 { clock.share_of_steps(step) } else { clock.done(step) };
-        if share >= 1.0 || kept.settled {
+        if share >= 1.0 || kept.settled || (step > 0 && !clock.allows(last_pass)) {
             break;
         }
+        let pass_begun = Instant::now();
         let pass = method.pass(problem, step)?;
         problem.operator.fault()?;
         step += 1;
@@ -340,6 +342,7 @@ pub fn drive(
         }
         observer.record(&record);
         clock.resume();
+        last_pass = pass_begun.elapsed().as_secs_f64();
         let share = clock.done(step);
         observer.progress(step, share.min(1.0), clock.seconds() * (1.0 - share).max(0.0) / share.max(1e-9));
     }

@@ -1,0 +1,48 @@
+#!/usr/bin/env bash
+# What a time buys: fronts of engine_256 and head_256, then the shipped front and presets from abdomen_128 and engine_256 together:
+#   bash benches/tradeoff.sh DATA_FOLDER OUT_FOLDER [BUDGETS [CANDIDATES [PRESET_BUDGETS]]]
+# DATA_FOLDER holds volumes/*.nii.gz. Each search takes at most the sum of its budgets, every one times the candidates that are
+# left (half go on), a scan; it says so and goes on where it was interrupted. Nothing else should run on the machine.
+# Leaves OUT_FOLDER/{engine_256,head_256,tuning}, OUT_FOLDER/front.toml (for specs/tradeoff/) and OUT_FOLDER/presets.
+set -euo pipefail
+cd "$(dirname "$0")/.."
+data=$1
+out=$2
+budgets=${3:-10s,30s,60s,120s,300s,600s,1200s}
+candidates=${4:-32}
+presets=${5:-60 300 1200}
+cargo build --release --quiet -p conefield
+bin=${CARGO_TARGET_DIR:-target}/release/conefield
+mkdir -p "$out"
+for volume in abdomen_128 engine_256 head_256; do
+    scan=$out/scans/$volume
+    mkdir -p "$out/scans"
+    [[ -d $scan ]] || "$bin" -q simulate "$data/volumes/$volume.nii.gz" -o "$scan" --protocol r2 --views 50 --noise tigre:1e4,10
+done
+search() {
+    local name=$1
+    shift
+    local again=()
+    [[ ! -d $out/$name ]] || again=(--resume)
+    "$bin" tradeoff "$@" --reference truth --budgets "$budgets" --candidates "$candidates" -o "$out/$name" "${again[@]}"
+}
+search engine_256 "$out/scans/engine_256"
+search head_256 "$out/scans/head_256"
+search tuning "$out/scans/abdomen_128" "$out/scans/engine_256"
+cp "$out/tuning/front.toml" "$out/front.toml"
+mkdir -p "$out/presets"
+names=(fast balanced accurate)
+i=0
+for seconds in $presets; do
+    point=$(python3 - "$out/tuning/tradeoff.json" "$seconds" <<'PY'
+import json, sys
+best = json.load(open(sys.argv[1]))["best"]
+print(next((b["point"] for b in best if b["kind"] == "field" and b["budget_s"] == float(sys.argv[2])), ""))
+PY
+    )
+    if [[ -n $point ]]; then
+        sed "s/^name = .*/name = \"${names[$i]}\"/" "$out/tuning/front/$point.toml" >"$out/presets/${names[$i]}.toml"
+        echo "${names[$i]}: $point"
+    fi
+    i=$((i + 1))
+done

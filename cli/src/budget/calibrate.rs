@@ -1,0 +1,275 @@
+//! What the parts of a run take on this machine, measured for about a second: real training steps on some views of the
+//! scan, or real passes over a coarser one, and what comes after the training.
+
+use crate::commands::Parts;
+use crate::files;
+use conefield_core::Result;
+use conefield_core::backend::Backend;
+use conefield_core::geometry::VoxelGrid;
+use conefield_core::parts::Voxels;
+use conefield_core::scan::{Scan, Volume};
+use conefield_core::solver::{Job, Limits, Observer, Record};
+use conefield_core::spec::load::Loaded;
+use conefield_io::MiddleSlices;
+use ndarray::{Array3, s};
+use serde::Serialize;
+use std::time::Instant;
+
+/// Views that training steps are measured on; a step takes as long on few as on many.
+const VIEWS: usize = 8;
+/// Voxels that evaluating and packing are measured on.
+const VOXELS: usize = 1 << 18;
+/// Longest side of the part of the reference that scoring is measured on.
+const SCORED: usize = 128;
+/// Bytes a second that files grow by, once packed: of a slow disk, as a run syncs what it writes.
+const DISK: f64 = 2e8;
+/// How many times as large pixels and voxels are at first, and how many there are at least along a side.
+const COARSEST: usize = 8;
+const FEWEST: usize = 8;
+
+/// What is measured on.
+pub struct Bench<'a> {
+    pub scan: &'a Scan,
+    pub reference: Option<&'a Volume>,
+    pub peak: f64,
+    pub backend: &'a dyn Backend,
+    pub seed: u64,
+}
+
+/// Seconds that the parts of a run take here.
+#[derive(Debug, Clone, Copy, Default, PartialEq, Serialize)]
+pub struct Costs {
+    /// Before the first step.
+    pub prepare_s: f64,
+    /// A step or pass.
+    pub step_s: f64,
+    /// Writing weights, and evaluating, packing and writing voxels.
+    pub export_s: f64,
+    /// Drawing slices.
+    pub picture_s: f64,
+    /// Comparing with the reference.
+    pub score_s: f64,
+}
+
+impl Costs {
+    /// What comes after the training.
+    pub fn after_s(&self) -> f64 {
+        self.export_s + self.picture_s + self.score_s
+    }
+}
+
+/// Measures what `loaded` takes, in about `seconds`.
+pub fn calibrate(bench: &Bench<'_>, loaded: &Loaded, parts: &Parts, seconds: f64) -> Result<Costs> {
+    let solved = match &parts.pipeline {
+        Some(_) => field(bench, loaded, parts, 0.5 * seconds)?,
+        None => voxels(bench, loaded, parts, 0.5 * seconds)?,
+    };
+    Ok(Costs { picture_s: picture(bench)?, score_s: score(bench)?, ..solved })
+}
+
+/// Steps on some of the views, then some layers of the field.
+fn field(bench: &Bench<'_>, loaded: &Loaded, parts: &Parts, seconds: f64) -> Result<Costs> {
+    let n = bench.scan.geometry.views.len();
+    let every = n.div_ceil(VIEWS);
+    let others: Vec<usize> = (0..n).filter(|v| v % every != 0).collect();
+    let scan = bench.scan.split(&others)?.0;
+    let mut laps = Laps::default();
+    let limits = Limits { at_most: Some(seconds), ..Limits::default() };
+    let begin = Instant::now();
+    let solution = parts.solver.solve(&job(bench, loaded, &scan, limits), &mut laps)?;
+    // What comes before the first step goes through all pixels of all views.
+    let fewer = n as f64 / scan.geometry.views.len() as f64;
+    let prepare_s = fewer * (begin.elapsed().as_secs_f64() - solution.train_s).max(0.0);
+    let step_s = laps.typical().unwrap_or(solution.train_s / solution.steps.max(1) as f64);
+    let mut export_s = 0.0;
+    if let Some(field) = solution.result.field() {
+        let whole = field.scene.grid;
+        let few = layers(whole, VOXELS);
+        let mut voxels = field.voxels(bench.backend, few)?;
+        export_s = packing(&mut voxels, whole)? + 4.0 * field.model.pipeline.layout().len() as f64 / DISK;
+    }
+    Ok(Costs { prepare_s, step_s, export_s, ..Costs::default() })
+}
+
+/// Two passes on a coarser detector and volume, as coarse as time wants it: all views and all that is done with them stay in
+/// proportion.
+fn voxels(bench: &Bench<'_>, loaded: &Loaded, parts: &Parts, seconds: f64) -> Result<Costs> {
+    let mut factor = COARSEST;
+    loop {
+        let (scan, share) = coarse(bench.scan, factor);
+        let mut laps = Laps::default();
+        let limits = Limits { steps: Some(2), ..Limits::default() };
+        let begin = Instant::now();
+        let solution = parts.solver.solve(&job(bench, loaded, &scan, limits), &mut laps)?;
+        let took = begin.elapsed().as_secs_f64();
+        // Half as coarse takes eight times as long.
+        if 8.0 * took < seconds && factor > 1 {
+            factor /= 2;
+            continue;
+        }
+        let step_s = match (solution.steps, laps.typical()) {
+            (2.., Some(lap)) => lap,
+            _ => solution.train_s / solution.steps.max(1) as f64,
+        };
+        let prepare_s = (took - step_s * solution.steps as f64).max(0.0) / share;
+        let volume = solution.result.volume(bench.backend)?;
+        let export_s = packing(&mut &volume, bench.scan.geometry.volume)?;
+        return Ok(Costs { prepare_s, step_s: step_s / share, export_s, ..Costs::default() });
+    }
+}
+
+fn job<'a>(bench: &'a Bench<'_>, loaded: &'a Loaded, scan: &'a Scan, limits: Limits) -> Job<'a> {
+    Job {
+        seed: bench.seed,
+        limits,
+        weights: &|path| files::read_weights(path),
+        volumes: &files::volume,
+        ..Job::new(scan, &loaded.spec, bench.backend)
+    }
+}
+
+/// The same scan with pixels and voxels `factor` times as large, as far as that leaves some, and the share of the work that is
+/// left: rays times the voxels on the way of one.
+fn coarse(scan: &Scan, factor: usize) -> (Scan, f64) {
+    let mut geometry = scan.geometry.clone();
+    let ([rows, columns], shape, size) = (geometry.detector, geometry.volume.shape, geometry.volume.size());
+    let longest = shape.into_iter().max().unwrap_or(1);
+    let factor = factor.min(rows.min(columns).min(longest) / FEWEST).max(1);
+    geometry.detector = [rows / factor, columns / factor];
+    geometry.volume.shape = shape.map(|n| (n / factor).max(1));
+    geometry.volume.spacing = std::array::from_fn(|k| size[k] / geometry.volume.shape[k] as f64);
+    for view in &mut geometry.views {
+        view.u = view.u.map(|x| x * factor as f64);
+        view.v = view.v.map(|x| x * factor as f64);
+    }
+    let [few, narrow] = geometry.detector;
+    let mut projections = Array3::zeros((geometry.views.len(), few, narrow));
+    for ((view, row, column), pixel) in projections.indexed_iter_mut() {
+        let (row, column) = (row * factor, column * factor);
+        let block = scan.projections.slice(s![view, row..row + factor, column..column + factor]);
+        *pixel = block.sum() / (factor * factor) as f32;
+    }
+    let share = (few * narrow) as f64 / (rows * columns) as f64 * (longest / factor) as f64 / longest as f64;
+    (Scan { geometry, projections, unit: scan.unit.clone(), provenance: scan.provenance.clone() }, share)
+}
+
+/// The same box in fewer layers along z: at most about so many voxels.
+fn layers(grid: VoxelGrid, voxels: usize) -> VoxelGrid {
+    let [x, y, z] = grid.shape;
+    let fewer = (voxels / (x * y).max(1)).clamp(1, z);
+    let spacing = [grid.spacing[0], grid.spacing[1], grid.spacing[2] * z as f64 / fewer as f64];
+    VoxelGrid { shape: [x, y, fewer], spacing, ..grid }
+}
+
+/// Seconds of making, packing and writing all voxels of `whole`, by those of `some`.
+fn packing(some: &mut dyn Voxels, whole: VoxelGrid) -> Result<f64> {
+    let count = |g: VoxelGrid| g.len().unwrap_or(usize::MAX) as f64;
+    let larger = count(whole) / count(some.grid()).max(1.0);
+    let begin = Instant::now();
+    let bytes = conefield_io::packed_bytes(some)?;
+    Ok(larger * (begin.elapsed().as_secs_f64() + bytes as f64 / DISK))
+}
+
+fn picture(bench: &Bench<'_>) -> Result<f64> {
+    let result = MiddleSlices::new(bench.scan.geometry.volume);
+    let reference = bench.reference.map(MiddleSlices::of);
+    let path = std::env::temp_dir().join(format!("conefield-{}.png", std::process::id()));
+    let begin = Instant::now();
+    let drawn = files::picture(&path, reference.as_ref(), &result);
+    let seconds = begin.elapsed().as_secs_f64();
+    let _ = std::fs::remove_file(&path);
+    drawn.map(|()| seconds)
+}
+
+fn score(bench: &Bench<'_>) -> Result<f64> {
+    let Some(reference) = bench.reference else { return Ok(0.0) };
+    // The middle of it: half of every side, unless that is little or much.
+    let [x, y, z] = reference.grid.shape.map(|n| {
+        let part = (n / 2).clamp(32.min(n), SCORED);
+        (n - part) / 2..(n - part) / 2 + part
+    });
+    let share = (x.len() * y.len() * z.len()) as f64 / reference.data.len() as f64;
+    let some = reference.data.slice(s![x, y, z]);
+    let begin = Instant::now();
+    conefield_metrics::evaluate(some, some, bench.peak)?;
+    Ok(begin.elapsed().as_secs_f64() / share)
+}
+
+/// When each step was done.
+#[derive(Default)]
+struct Laps {
+    done: Vec<Instant>,
+}
+
+impl Laps {
+    /// The median of the later half: the first steps touch memory for the first time.
+    fn typical(&self) -> Option<f64> {
+        let all: Vec<f64> = self.done.windows(2).map(|w| (w[1] - w[0]).as_secs_f64()).collect();
+        let mut late = all[all.len() / 2..].to_vec();
+        late.sort_by(f64::total_cmp);
+        late.get(late.len() / 2).copied()
+    }
+}
+
+impl Observer for Laps {
+    fn progress(&mut self, _: u64, _: f64, _: f64) {
+        self.done.push(Instant::now());
+    }
+
+    fn record(&mut self, _: &Record) {}
+
+    fn note(&mut self, _: &str) {}
+
+    fn cancelled(&self) -> bool {
+        crate::signals::caught().is_some()
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::specs;
+    use conefield_backend_cpu::Cpu;
+    use conefield_projectors::simulate::{PhantomKind, Protocol, phantom_of, simulate};
+
+    #[test]
+    fn a_coarse_scan_is_of_the_same_box_and_has_its_share_of_the_work() {
+        let truth = phantom_of(PhantomKind::Head, 32);
+        let scan = simulate(&truth, &Protocol::r2(&truth.grid).with_detector([48, 64]).with_views(3)).unwrap();
+        let (half, share) = coarse(&scan, 2);
+        assert_eq!((half.geometry.detector, half.geometry.volume.shape, share), ([24, 32], [16; 3], 1.0 / 8.0));
+        assert_eq!(half.geometry.volume.size(), scan.geometry.volume.size());
+        let mean = |s: &Scan| s.projections.mean().unwrap();
+        assert!((mean(&half) - mean(&scan)).abs() < 1e-5 * mean(&scan));
+        let corner = |s: &Scan, r, c| s.geometry.views[1].pixel(s.geometry.detector, r, c);
+        let (a, b) = (corner(&half, -0.5, -0.5), corner(&scan, -0.5, -0.5));
+        assert!(a.iter().zip(b).all(|(a, b)| (a - b).abs() < 1e-9), "{a:?} {b:?}");
+        half.validate("coarse").unwrap();
+        let (least, _) = coarse(&scan, 64);
+        assert_eq!(least.geometry.volume.shape, [8; 3]);
+        assert_eq!(coarse(&scan, 1).0.projections, scan.projections);
+    }
+
+    #[test]
+    fn fewer_layers_fill_the_same_box() {
+        let grid = VoxelGrid { shape: [64, 64, 48], spacing: [1.0, 1.0, 2.0], center: [0.0; 3] };
+        let few = layers(grid, 4096 * 12);
+        assert_eq!((few.shape, few.size()), ([64, 64, 12], grid.size()));
+        assert_eq!(layers(grid, usize::MAX), grid);
+    }
+
+    #[test]
+    fn every_kind_of_solver_is_measured() {
+        let truth = phantom_of(PhantomKind::Head, 24);
+        let scan = simulate(&truth, &Protocol::r2(&truth.grid).with_detector([24, 24]).with_views(12)).unwrap();
+        let backend = Cpu::new();
+        let bench = Bench { scan: &scan, reference: Some(&truth), peak: 1.0, backend: &backend, seed: 0 };
+        for spec in ["fast", "fdk", "sart", "cgls", "fista-tv", "asd-pocs"] {
+            let loaded = specs::read(spec, &[]).unwrap();
+            let parts = Parts::of(&loaded, &backend).unwrap();
+            let costs = calibrate(&bench, &loaded, &parts, 0.05).unwrap();
+            let all = [costs.step_s, costs.export_s, costs.picture_s, costs.score_s];
+            assert!(all.iter().all(|s| *s > 0.0 && s.is_finite()) && costs.prepare_s >= 0.0, "{spec}: {costs:?}");
+        }
+    }
+}

@@ -1,0 +1,245 @@
+//! A front file: methods of which none is beaten in time, memory and accuracy, with what they took and reached on
+//! tuning scans. `conefield tradeoff` makes it, `conefield reconstruct --budget` picks from it.
+
+use conefield_core::error::{Error, Result, ensure};
+use serde::{Deserialize, Serialize};
+use std::path::Path;
+
+/// The front that comes with the program.
+const SHIPPED: &str = include_str!("../../../specs/tradeoff/front.toml");
+/// Longest front file, in bytes.
+const LONGEST: u64 = 4 << 20;
+
+/// What a method works on. The two are searched apart: fields need longer before they show what they can.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Serialize, Deserialize)]
+#[serde(rename_all = "kebab-case")]
+pub enum Kind {
+    /// It trains a field.
+    Field,
+    /// It makes voxels.
+    Voxels,
+}
+
+impl Kind {
+    /// What its steps are called.
+    pub fn steps(self) -> &'static str {
+        match self {
+            Self::Field => "steps",
+            Self::Voxels => "passes",
+        }
+    }
+}
+
+/// A whole front.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct Front {
+    /// By which program, in how many threads.
+    pub made: String,
+    /// The scans that it was measured on.
+    pub scans: Vec<Tuned>,
+    /// Its points.
+    pub points: Vec<Point>,
+}
+
+/// A scan that a front was measured on.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct Tuned {
+    pub name: String,
+    pub views: usize,
+    pub detector: [usize; 2],
+    pub volume: [usize; 3],
+}
+
+/// A method with what it took and reached.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct Point {
+    pub name: String,
+    pub kind: Kind,
+    /// The spec that it starts from, and what is changed of it, as `--set` has it.
+    pub spec: String,
+    #[serde(default)]
+    pub sets: Vec<String>,
+    /// The budget that it was measured under.
+    pub budget_s: f64,
+    /// One for each of the front's scans, in their order.
+    pub runs: Vec<Reached>,
+}
+
+/// A point's run on one scan.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct Reached {
+    /// Its cost in its own steps or passes: with the seconds of one, measured anew on any machine, its time there.
+    pub steps: u64,
+    pub train_s: f64,
+    pub total_s: f64,
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub peak_bytes: Option<u64>,
+    /// dB, where the reference was known.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub psnr: Option<f64>,
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub ssim_2d: Option<f64>,
+    /// Error of views that were kept aside, over the largest line integral.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub held_out: Option<f64>,
+}
+
+/// How large a scan is.
+#[derive(Debug, Clone, Copy)]
+pub struct Size {
+    pub pixels: f64,
+    pub voxels: f64,
+}
+
+impl Size {
+    pub fn new(views: usize, detector: [usize; 2], volume: [usize; 3]) -> Self {
+        let product = |n: &[usize]| n.iter().map(|n| *n as f64).product();
+        Self { pixels: views as f64 * product(&detector), voxels: product(&volume) }
+    }
+
+    /// What projecting it costs: every pixel's ray goes through the volume.
+    fn projecting(self) -> f64 {
+        self.pixels * self.voxels.cbrt()
+    }
+}
+
+/// What a point would take of a scan on the machine that the front was made on.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Expected {
+    /// Steps or passes.
+    pub steps: f64,
+    /// Seconds of one.
+    pub step_s: f64,
+    /// Seconds of all else.
+    pub beside_s: f64,
+}
+
+impl Front {
+    /// The shipped one.
+    pub fn shipped() -> Result<Self> {
+        Self::parse(SHIPPED, "front.toml (shipped)")
+    }
+
+    /// Reads a front file.
+    pub fn read(path: &Path) -> Result<Self> {
+        Self::parse(&conefield_core::files::read_text(path, LONGEST)?, &path.display().to_string())
+    }
+
+    fn parse(text: &str, place: &str) -> Result<Self> {
+        let front: Self = toml::from_str(text).map_err(|e| {
+            let line = e.span().map_or(1, |s| 1 + text[..s.start.min(text.len())].matches('\n').count());
+            Error::invalid(format!("{place}:{line}"), "front", e.message(), "what conefield tradeoff writes")
+        })?;
+        ensure(!front.scans.is_empty(), place, "scans", "none", "the scans that it was measured on")?;
+        ensure(!front.points.is_empty(), place, "points", "none", "at least one method")?;
+        for scan in &front.scans {
+            let empty = scan.views == 0 || scan.detector.contains(&0) || scan.volume.contains(&0);
+            ensure(!empty, place, &format!("scans: {}", scan.name), "a size of 0", "views, pixels and voxels")?;
+        }
+        for (i, point) in front.points.iter().enumerate() {
+            let field = |what: &str| format!("points[{i}].{what}");
+            let (found, want) = (point.runs.len(), front.scans.len());
+            ensure(found == want, place, &field("runs"), format!("{found}"), format!("{want}, one a scan"))?;
+            for run in &point.runs {
+                let times = [point.budget_s, run.train_s, run.total_s];
+                let good = times.iter().all(|t| t.is_finite() && *t >= 0.0) && run.steps > 0;
+                ensure(good, place, &field("runs"), format!("{run:?}"), "steps, and seconds that are 0 or more")?;
+                let told = [run.psnr, run.held_out].iter().flatten().any(|x| x.is_finite());
+                ensure(told, place, &field("runs"), format!("{run:?}"), "a finite psnr or held_out")?;
+            }
+        }
+        Ok(front)
+    }
+
+    /// What `point` is expected to take of a scan of this size. A step of a field costs the same whatever the scan.
+    pub fn expected(&self, point: &Point, size: Size) -> Expected {
+        let mut sum = Expected { steps: 0.0, step_s: 0.0, beside_s: 0.0 };
+        let n = point.runs.len() as f64;
+        for (run, scan) in point.runs.iter().zip(&self.scans) {
+            let then = Size::new(scan.views, scan.detector, scan.volume);
+            let larger = match point.kind {
+                Kind::Field => 1.0,
+                Kind::Voxels => size.projecting() / then.projecting(),
+            };
+            sum.steps += run.steps as f64 / n;
+            sum.step_s += run.train_s / run.steps as f64 * larger / n;
+            sum.beside_s += (run.total_s - run.train_s).max(0.0) * size.voxels / then.voxels / n;
+        }
+        sum
+    }
+}
+
+impl Point {
+    /// What it reached, higher is better: the mean PSNR in dB, or where that is not known the error of views that were
+    /// kept aside with its sign turned.
+    pub fn accuracy(&self) -> f64 {
+        let mean = |of: fn(&Reached) -> Option<f64>| {
+            let all: Option<Vec<f64>> = self.runs.iter().map(of).collect();
+            all.map(|a| a.iter().sum::<f64>() / a.len().max(1) as f64)
+        };
+        mean(|r| r.psnr).or_else(|| mean(|r| r.held_out).map(|e| -e)).unwrap_or(f64::NEG_INFINITY)
+    }
+
+    /// What it reached, in words.
+    pub fn told(&self, front: &Front) -> String {
+        let one = |(run, scan): (&Reached, &Tuned)| match (run.psnr, run.held_out) {
+            (Some(psnr), _) => format!("{psnr:.2} dB on {}", scan.name),
+            (None, error) => format!("held-out error {:.4} on {}", error.unwrap_or(f64::NAN), scan.name),
+        };
+        self.runs.iter().zip(&front.scans).map(one).collect::<Vec<_>>().join(", ")
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::specs;
+
+    #[test]
+    fn the_shipped_front_loads_and_its_specs_build() {
+        let front = Front::shipped().unwrap();
+        for point in &front.points {
+            let loaded = specs::read(&point.spec, &point.sets).unwrap();
+            let solver = loaded.spec.solver.build().unwrap();
+            let field = specs::pipeline(&loaded, solver.as_ref()).unwrap().is_some();
+            assert_eq!(field, point.kind == Kind::Field, "{}", point.name);
+            assert!(point.accuracy().is_finite() && !point.told(&front).contains("NaN"));
+        }
+    }
+
+    #[test]
+    fn a_scan_of_another_size_costs_voxels_in_proportion_and_fields_nothing_more() {
+        let text = |kind: &str| {
+            format!(
+                "made = \"test\"\n[[scans]]\nname = \"a\"\nviews = 10\ndetector = [10, 10]\nvolume = [10, 10, 10]\n\
+                 [[points]]\nname = \"p\"\nkind = \"{kind}\"\nspec = \"fdk\"\nbudget_s = 9.0\n\
+                 [[points.runs]]\nsteps = 4\ntrain_s = 2.0\ntotal_s = 3.0\npsnr = 30.0\n"
+            )
+        };
+        let size = Size::new(20, [10, 10], [20, 20, 20]);
+        for (kind, step_s) in [("voxels", 2.0), ("field", 0.5)] {
+            let front = Front::parse(&text(kind), "a").unwrap();
+            let want = Expected { steps: 4.0, step_s, beside_s: 8.0 };
+            assert_eq!(front.expected(&front.points[0], size), want);
+        }
+        for (from, to, says) in [
+            ("psnr = 30.0", "psnr = nan", "psnr or held_out"),
+            ("steps = 4", "steps = 0", "points[0].runs"),
+            ("kind", "kinds", "a:9: front"),
+            ("views = 10", "views = 0", "scans: a"),
+            (
+                "[[points.runs]]",
+                "[[points.runs]]\nsteps = 4\ntrain_s = 2.0\ntotal_s = 3.0\npsnr = 1\n[[points.runs]]",
+                "one a scan",
+            ),
+        ] {
+            let text = text("field").replace(from, to);
+            let e = Front::parse(&text, "a").unwrap_err().to_string();
+            assert!(e.contains(says), "{e}");
+        }
+    }
+}

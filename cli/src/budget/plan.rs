@@ -1,0 +1,339 @@
+//! What to do with a budget: the method, if that is left open, and when training must end.
+
+use super::TOO_SHORT;
+use super::calibrate::{Bench, Costs, calibrate};
+use super::front::{Expected, Front, Kind, Size};
+use crate::commands::Method;
+use crate::out;
+use conefield_core::{Error, Result};
+use serde::Serialize;
+use std::cell::RefCell;
+use std::time::{Duration, Instant};
+
+/// Share of the budget that is planned for: what cannot be foreseen has the rest.
+const AIM: f64 = 0.98;
+/// Share of a point's steps from which there is time enough for it.
+const ENOUGH: f64 = 0.9;
+/// Methods that are measured at most before one is taken.
+const MEASURED: usize = 3;
+/// Longest that a method is measured for, in seconds and as a share of the budget.
+const CALIBRATION: (f64, f64) = (1.0, 0.1);
+/// Steps without which a field is nothing.
+const STEPS: f64 = 10.0;
+
+/// The time that there is.
+#[derive(Debug, Clone, Copy)]
+pub struct Budget {
+    /// When the command started.
+    pub begin: Instant,
+    /// Seconds from there.
+    pub seconds: f64,
+    /// Seconds of training that an interrupted run has had of them.
+    pub spent: f64,
+}
+
+/// What is going to be done, for people and for the record.
+#[derive(Debug, Clone, Serialize)]
+pub struct Plan {
+    /// The point of the front, where the method was chosen.
+    pub point: Option<String>,
+    pub why: String,
+    /// What other methods would have taken.
+    #[serde(skip_serializing_if = "Vec::is_empty")]
+    pub passed_over: Vec<String>,
+    /// Steps or passes that there is time for.
+    pub steps: u64,
+    /// Until the plan was made, in all.
+    pub load_s: f64,
+    /// Of that, measuring.
+    pub calibrate_s: f64,
+    /// Seconds expected of each part to come.
+    pub expected: Costs,
+    /// Seconds of training that are planned.
+    pub train_s: f64,
+    #[serde(skip)]
+    kind: Kind,
+    /// When training is to be over.
+    #[serde(skip)]
+    pub deadline: Instant,
+}
+
+impl Budget {
+    /// Seconds that are left, of what is planned for.
+    fn left(&self) -> f64 {
+        AIM * self.seconds - self.spent - self.begin.elapsed().as_secs_f64()
+    }
+
+    /// Plans `method`, which was asked for.
+    pub fn plan(&self, bench: &Bench<'_>, method: &Method) -> Result<Plan> {
+        let start = Instant::now();
+        let costs = calibrate(bench, &method.loaded, &method.parts, self.measuring())?;
+        self.settle(None, "the spec that was asked for".into(), vec![], method, costs, start)
+    }
+
+    /// The best method of `front` that fits, made by `build` from a spec and what is set of it, and its plan.
+    pub fn choose(
+        &self,
+        bench: &Bench<'_>,
+        front: &Front,
+        build: impl Fn(&str, &[String]) -> Result<Method>,
+    ) -> Result<(Method, Plan)> {
+        let start = Instant::now();
+        let g = &bench.scan.geometry;
+        let size = Size::new(g.views.len(), g.detector, g.volume.shape);
+        let mut points: Vec<_> = front.points.iter().collect();
+        points.sort_by(|a, b| b.accuracy().total_cmp(&a.accuracy()));
+        let expected: Vec<(Kind, Expected)> = points.iter().map(|p| (p.kind, front.expected(p, size))).collect();
+        let built = RefCell::new(vec![]);
+        let measure = |i: usize| {
+            let method = build(&points[i].spec, &points[i].sets)?;
+            let costs = calibrate(bench, &method.loaded, &method.parts, self.measuring() / 2.0)?;
+            built.borrow_mut().push((i, method));
+            Ok(costs)
+        };
+        let Choice { point: at, costs, fits, passed_over } = pick(&expected, || self.left(), measure)?;
+        let method = built.take().into_iter().find(|(i, _)| *i == at).map(|(_, m)| m);
+        let method = method.ok_or_else(|| Error::unsupported("the budget", "no method of the front was measured"))?;
+        let point = points[at];
+        let why = match fits {
+            true => format!("the best of the front that fits ({})", point.told(front)),
+            false => format!("no method of the front fits whole, this one takes least ({})", point.told(front)),
+        };
+        let passed_over = passed_over.into_iter().map(|(i, why)| format!("{}: {why}", points[i].name)).collect();
+        let plan = self.settle(Some(point.name.clone()), why, passed_over, &method, costs, start)?;
+        Ok((method, plan))
+    }
+
+    /// How long a method is measured, in seconds.
+    fn measuring(&self) -> f64 {
+        (CALIBRATION.1 * self.seconds).min(CALIBRATION.0)
+    }
+
+    /// The plan, or a refusal that says how much time would do.
+    fn settle(
+        &self,
+        point: Option<String>,
+        why: String,
+        passed_over: Vec<String>,
+        method: &Method,
+        costs: Costs,
+        start: Instant,
+    ) -> Result<Plan> {
+        let kind = method.kind();
+        let left = self.left();
+        let load_s = self.begin.elapsed().as_secs_f64();
+        let train_s = left - costs.after_s() - costs.prepare_s;
+        let least = least(kind) * costs.step_s;
+        if train_s < least {
+            let needed = (load_s + self.spent + costs.prepare_s + least + costs.after_s()) / AIM;
+            let first = match kind {
+                Kind::Field => format!("{STEPS} steps"),
+                Kind::Voxels => "one pass".into(),
+            };
+            let expected = format!(
+                "at least {} here and now: {} until the plan was made, {} to prepare and for {first} of {}, {} to write and compare",
+                time(needed.max(self.seconds * 1.01)),
+                time(load_s + self.spent),
+                time(costs.prepare_s + least),
+                method.loaded.spec.name,
+                time(costs.after_s()),
+            );
+            return Err(Error::invalid(TOO_SHORT.trim_end_matches(": "), "time", time(self.seconds), expected));
+        }
+        Ok(Plan {
+            point,
+            why,
+            passed_over,
+            steps: (train_s / costs.step_s.max(1e-12)) as u64,
+            load_s,
+            calibrate_s: start.elapsed().as_secs_f64(),
+            expected: costs,
+            train_s,
+            kind,
+            deadline: Instant::now() + Duration::from_secs_f64((left - costs.after_s()).max(0.0)),
+        })
+    }
+}
+
+/// Steps or passes without which nothing comes of a method.
+fn least(kind: Kind) -> f64 {
+    match kind {
+        Kind::Field => STEPS,
+        Kind::Voxels => 1.0,
+    }
+}
+
+/// A time of which tenths matter where it is short.
+fn time(seconds: f64) -> String {
+    if seconds < 10.0 { format!("{seconds:.2} s") } else { out::duration(seconds) }
+}
+
+impl Plan {
+    /// In words.
+    pub fn lines(&self, method: &Method) -> Vec<String> {
+        let named = match &self.point {
+            Some(point) => format!("{point} (spec {})", method.loaded.spec.name),
+            None => format!("spec {}", method.loaded.spec.name),
+        };
+        let (e, steps) = (&self.expected, self.kind.steps());
+        let mut lines = vec![format!("planned: {named}, {}", self.why)];
+        lines.extend(self.passed_over.iter().map(|line| format!("passed over: {line}")));
+        lines.push(format!(
+            "planned: {} to read and to measure, {} to prepare, {} for about {} {steps} of {}, {} to write and compare",
+            time(self.load_s),
+            time(e.prepare_s),
+            time(self.train_s),
+            out::number(self.steps),
+            time(e.step_s),
+            time(e.after_s()),
+        ));
+        lines
+    }
+}
+
+/// What [`pick`] came to.
+struct Choice {
+    /// Which point, and what it takes here.
+    point: usize,
+    costs: Costs,
+    /// Whether there is time for all of its steps.
+    fits: bool,
+    /// Better ones, and why not.
+    passed_over: Vec<(usize, String)>,
+}
+
+/// Takes the first of `points`, the best first, that fits into `left` seconds. What a point takes is reckoned from the
+/// front's own machine at first; `measure` finds out what it takes here, which also tells how much faster or slower
+/// others of its kind will be.
+fn pick(
+    points: &[(Kind, Expected)],
+    left: impl Fn() -> f64,
+    mut measure: impl FnMut(usize) -> Result<Costs>,
+) -> Result<Choice> {
+    let mut known: Vec<Option<Result<Costs, String>>> = points.iter().map(|_| None).collect();
+    // Of fields and of voxels; what is known of one kind is the best guess for the other.
+    let mut slower: [Option<f64>; 2] = [None; 2];
+    let of = |kind: Kind| kind as usize;
+    while known.iter().flatten().filter(|k| k.is_ok()).count() < MEASURED {
+        let needed = |i: usize| {
+            let (kind, e) = points[i];
+            match &known[i] {
+                Some(Ok(c)) => c.prepare_s + ENOUGH * e.steps * c.step_s + c.after_s(),
+                Some(Err(_)) => f64::INFINITY,
+                None => {
+                    let factor = slower[of(kind)].or(slower[1 - of(kind)]).unwrap_or(1.0);
+                    factor * (ENOUGH * e.steps * e.step_s + e.beside_s)
+                }
+            }
+        };
+        let all: Vec<f64> = (0..points.len()).map(needed).collect();
+        let now = left();
+        let first = all.iter().position(|t| *t <= now);
+        let cheapest = (0..points.len()).min_by(|a, b| all[*a].total_cmp(&all[*b])).unwrap_or(0);
+        let at = first.unwrap_or(cheapest);
+        match &known[at] {
+            None => {
+                let measured = measure(at);
+                if let Ok(costs) = &measured {
+                    let (kind, e) = points[at];
+                    slower[of(kind)] = Some(costs.step_s / e.step_s.max(1e-12));
+                }
+                known[at] = Some(measured.map_err(|e| e.to_string()));
+            }
+            Some(_) => break,
+        }
+    }
+    let now = left();
+    let mut passed_over = vec![];
+    let mut fallback: Option<(usize, Costs, f64)> = None;
+    for (i, (kind, e)) in points.iter().enumerate() {
+        match &known[i] {
+            Some(Ok(c)) => {
+                let needed = c.prepare_s + ENOUGH * e.steps * c.step_s + c.after_s();
+                if needed <= now {
+                    return Ok(Choice { point: i, costs: *c, fits: true, passed_over });
+                }
+                passed_over.push((i, format!("would take {} more, {} are left", time(needed), time(now))));
+                let least = c.prepare_s + least(*kind) * c.step_s + c.after_s();
+                if fallback.is_none_or(|f| least < f.2) {
+                    fallback = Some((i, *c, least));
+                }
+            }
+            Some(Err(why)) => passed_over.push((i, why.clone())),
+            None => {}
+        }
+    }
+    match fallback {
+        Some((point, costs, _)) => {
+            passed_over.retain(|(i, _)| *i != point);
+            Ok(Choice { point, costs, fits: false, passed_over })
+        }
+        None => {
+            let why: Vec<&str> = passed_over.iter().map(|(_, why)| &why[..]).collect();
+            Err(Error::unsupported("the front", format!("none of its methods can run here: {}", why.join("; "))))
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// Two fields and two methods on voxels, the best first; seconds on the front's machine 100, 40, 20 and 2.
+    fn points() -> Vec<(Kind, Expected)> {
+        let point = |kind, steps, step_s| (kind, Expected { steps, step_s, beside_s: 0.0 });
+        vec![
+            point(Kind::Field, 1000.0, 0.1),
+            point(Kind::Voxels, 20.0, 2.0),
+            point(Kind::Field, 400.0, 0.05),
+            point(Kind::Voxels, 1.0, 2.0),
+        ]
+    }
+
+    /// What is chosen with `left` seconds on a machine that is `factor` times as slow, and what was measured for it.
+    fn chosen(left: f64, factor: f64) -> (usize, bool, Vec<usize>) {
+        let points = points();
+        let mut measured = vec![];
+        let measure = |i: usize| {
+            measured.push(i);
+            Ok(Costs { step_s: factor * points[i].1.step_s, ..Costs::default() })
+        };
+        let choice = pick(&points, || left, measure).unwrap();
+        (choice.point, choice.fits, measured)
+    }
+
+    #[test]
+    fn the_best_that_fits_is_taken() {
+        assert_eq!(chosen(100.0, 1.0), (0, true, vec![0]));
+        assert_eq!(chosen(60.0, 1.0), (1, true, vec![1]));
+        assert_eq!(chosen(25.0, 1.0), (2, true, vec![2]));
+        assert_eq!(chosen(3.0, 1.0), (3, true, vec![3]));
+    }
+
+    #[test]
+    fn measuring_one_tells_of_its_kind() {
+        // The field that would take 90 s takes 270, and the method on voxels as much more than it would: 108 s.
+        assert_eq!(chosen(100.0, 3.0), (2, true, vec![0, 2]));
+        // A faster machine does better than the front's would.
+        assert_eq!(chosen(50.0, 0.5), (0, true, vec![1, 0]));
+    }
+
+    #[test]
+    fn where_nothing_fits_the_least_is_taken() {
+        let (point, fits, measured) = chosen(1.0, 1.0);
+        assert_eq!((point, fits, measured), (3, false, vec![3]));
+        let refused = pick(&points(), || 1e9, |_| Err(Error::unsupported("memory", "too little")));
+        assert!(refused.err().unwrap().to_string().contains("too little"));
+    }
+
+    #[test]
+    fn one_that_cannot_run_is_passed_over() {
+        let points = points();
+        let measure = |i: usize| match i {
+            0 => Err(Error::unsupported("memory", "too little")),
+            _ => Ok(Costs { step_s: points[i].1.step_s, ..Costs::default() }),
+        };
+        let choice = pick(&points, || 100.0, measure).unwrap();
+        assert_eq!((choice.point, choice.passed_over.len()), (1, 1));
+    }
+}

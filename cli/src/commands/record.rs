@@ -1,0 +1,123 @@
+//! What a run leaves on record.
+
+use super::{Ends, evaluate};
+use crate::budget::plan::Plan;
+use crate::memory::Memory;
+use crate::out;
+use crate::plugins::Used;
+use conefield_core::backend::Explain;
+use conefield_core::scan::Scan;
+use conefield_metrics::Scores;
+use serde::Serialize;
+use std::path::Path;
+
+/// What is needed to repeat a run, and what came out.
+#[derive(Debug, Serialize)]
+pub struct Record {
+    pub version: &'static str,
+    pub spec: String,
+    pub seed: u64,
+    pub scan: ScanRecord,
+    pub held_out_views: Vec<usize>,
+    pub limits: Ends,
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub budget_s: Option<f64>,
+    /// What a budget came to.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub plan: Option<Plan>,
+    pub init: Option<String>,
+    pub reference: Option<String>,
+    /// Whose stages the spec names.
+    #[serde(skip_serializing_if = "Vec::is_empty")]
+    pub plugins: Vec<Used>,
+    pub backend: Explain,
+    pub simd: String,
+    pub threads: usize,
+    pub memory: Memory,
+    pub peak_bytes: Option<u64>,
+    pub parameters: usize,
+    pub steps: u64,
+    /// Reading all that there is to read.
+    pub load_s: f64,
+    /// What solving took beside training: before the first step, and to look at the metrics.
+    pub prepare_s: f64,
+    pub train_s: f64,
+    /// Writing weights and voxels.
+    pub export_s: f64,
+    pub picture_s: f64,
+    pub score_s: f64,
+    /// From the start of the command to this record. Of what came before a --resume, the training alone.
+    pub total_s: f64,
+    pub samples: u64,
+    /// Of solvers that take samples.
+    pub samples_per_s: Option<f64>,
+    pub loss: Option<f64>,
+    pub held_out: Option<f64>,
+    pub peak: f64,
+    pub scores: Option<Scores>,
+}
+
+/// Which scan it was.
+#[derive(Debug, Serialize)]
+pub struct ScanRecord {
+    pub path: String,
+    pub views: usize,
+    pub detector: [usize; 2],
+    pub volume: [usize; 3],
+    pub projections_fnv1a64: String,
+}
+
+impl ScanRecord {
+    /// The whole scan at `path`.
+    pub fn of(path: &Path, scan: &Scan) -> Self {
+        Self {
+            path: path.display().to_string(),
+            views: scan.geometry.views.len(),
+            detector: scan.geometry.detector,
+            volume: scan.geometry.volume.shape,
+            projections_fnv1a64: checksum(scan),
+        }
+    }
+
+    /// The name of its file or folder.
+    pub fn name(&self) -> String {
+        Path::new(&self.path).file_stem().map(|s| s.to_string_lossy().into_owned()).unwrap_or_default()
+    }
+
+    /// In words.
+    pub fn line(&self) -> String {
+        let (views, [rows, columns], [x, y, z]) = (self.views, self.detector, self.volume);
+        format!("{}: {views} views of {rows} x {columns} pixels, {x} x {y} x {z} voxels", self.path)
+    }
+}
+
+/// FNV-1a of the projections' bytes, to recognise a scan by.
+fn checksum(scan: &Scan) -> String {
+    let bytes = scan.projections.iter().flat_map(|x| x.to_le_bytes());
+    let hash = bytes.fold(0xcbf2_9ce4_8422_2325u64, |h, b| (h ^ u64::from(b)).wrapping_mul(0x0100_0000_01b3));
+    format!("{hash:016x}")
+}
+
+/// The record for people.
+pub fn summary(r: &Record, output: &Path) -> String {
+    let [x, y, z] = r.scan.volume;
+    let speed = r.samples_per_s.map(|s| format!(" ({:.2} M samples/s)", s / 1e6)).unwrap_or_default();
+    let mut lines = vec![format!(
+        "{x} x {y} x {z} voxels from {} views: {} in {}{speed}, export {}",
+        r.scan.views - r.held_out_views.len(),
+        if r.steps == 1 { "1 step".into() } else { format!("{} steps", r.steps) },
+        out::duration(r.train_s),
+        out::duration(r.export_s),
+    )];
+    if let Some(budget) = r.budget_s {
+        lines.push(format!("{} in all, of a budget of {}", out::duration(r.total_s), out::duration(budget)));
+    }
+    if let Some(h) = r.held_out {
+        lines.push(format!("held-out error  {h:.5} of the largest line integral ({} views)", r.held_out_views.len()));
+    }
+    if let Some(s) = &r.scores {
+        lines.push(evaluate::lines(s));
+    }
+    lines.push(format!("results in {}", output.display()));
+    lines.join("\n")
+}

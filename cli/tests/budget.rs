@@ -1,0 +1,98 @@
+//! `reconstruct --budget`: what is planned, what is refused, and what the record says of it.
+
+mod common;
+use common::{done, json, refused, text};
+use serde_json::Value;
+use std::fs;
+use std::path::PathBuf;
+use tempfile::{TempDir, tempdir};
+
+fn scan() -> (TempDir, PathBuf) {
+    let dir = tempdir().unwrap();
+    let path = dir.path().join("scan");
+    done(&["simulate", "phantom:head:16", "-o", &text(&path), "--views", "12", "--detector", "16x16"]);
+    (dir, path)
+}
+
+#[test]
+fn a_plan_names_every_part_and_the_record_holds_them_against_it() {
+    let (dir, scan) = scan();
+    let scan = text(&scan);
+    for spec in ["fast", "sirt", "fdk"] {
+        let run = dir.path().join(spec);
+        let all = ["reconstruct", &scan, "--spec", spec, "-o", &text(&run), "--reference", "truth", "--json"];
+        let small = ["encoder.log2_table_size=10", "solver.rays=64", "projector.samples=16", "solver.tv.blocks=4"];
+        let small = small.iter().filter(|_| spec == "fast").flat_map(|s| ["--set", *s]).collect::<Vec<_>>();
+        let record = json(&[&all[..], &small, &["--budget", "3s"]].concat());
+        let number = |key: &str| record[key].as_f64().unwrap_or_else(|| panic!("{spec}: {key}"));
+        let parts = ["load_s", "prepare_s", "train_s", "export_s", "picture_s", "score_s"].map(number);
+        let total = number("total_s");
+        assert!(parts.iter().all(|p| *p >= 0.0) && parts.iter().sum::<f64>() <= total + 1e-3, "{parts:?} of {total}");
+        assert_eq!((number("budget_s"), &record["limits"]["seconds"]), (3.0, &Value::Null));
+        let plan = &record["plan"];
+        assert!(plan["point"].is_null() && plan["why"].as_str().unwrap().contains("asked for"), "{plan}");
+        assert!(plan["train_s"].as_f64().unwrap() > 0.0 && plan["steps"].as_u64().unwrap() > 0, "{plan}");
+        assert!(plan["expected"]["step_s"].as_f64().unwrap() > 0.0, "{plan}");
+        let steps = record["steps"].as_u64().unwrap();
+        // FDK has one pass whatever time there is.
+        assert!(if spec == "fdk" { steps == 1 } else { steps > 1 }, "{spec}: {steps}");
+    }
+}
+
+#[test]
+fn without_a_spec_the_best_of_the_shipped_front_is_taken() {
+    let (dir, scan) = scan();
+    let run = text(&dir.path().join("run"));
+    let record = json(&["reconstruct", &text(&scan), "-o", &run, "--budget", "4s", "--json"]);
+    let plan = &record["plan"];
+    assert!(plan["point"].is_string() && plan["why"].as_str().unwrap().contains("front"), "{plan}");
+    // It can be repeated alone.
+    assert!(dir.path().join("run/spec.toml").is_file());
+}
+
+#[test]
+fn a_budget_that_is_too_short_is_refused_with_what_would_do() {
+    let (dir, scan) = scan();
+    let out = dir.path().join("run");
+    let (scan, path) = (text(&scan), text(&out));
+    for more in [&["--spec", "fast"][..], &["--spec", "sart"], &[]] {
+        let all = [&["reconstruct", &scan, "-o", &path, "--budget", "1e-4s"], more].concat();
+        let said = refused(1, &all);
+        assert!(said.starts_with("error: the budget: time: found 0.00 s, expected at least "), "{said}");
+        assert!(said.contains("to write and compare") && !out.exists(), "{said}");
+    }
+}
+
+#[cfg(unix)]
+#[test]
+fn an_interrupted_run_goes_on_with_what_it_chose() {
+    use std::process::{Command, Stdio};
+    use std::time::{Duration, Instant};
+    let (dir, scan) = scan();
+    let (front, out) = (dir.path().join("front.toml"), dir.path().join("run"));
+    fs::write(
+        &front,
+        "made = \"test\"\n[[scans]]\nname = \"a\"\nviews = 12\ndetector = [16, 16]\nvolume = [16, 16, 16]\n\
+         [[points]]\nname = \"p\"\nkind = \"voxels\"\nspec = \"sirt\"\nsets = [\"solver.relaxation=1.5\"]\nbudget_s = 1.0\n\
+         [[points.runs]]\nsteps = 10\ntrain_s = 0.1\ntotal_s = 0.2\npsnr = 20.0\n",
+    )
+    .unwrap();
+    let (scan, front, path) = (text(&scan), text(&front), text(&out));
+    let line = ["reconstruct", &scan, "-o", &path, "--budget", "6s", "--front", &front];
+    let mut command = Command::new(assert_cmd::cargo::cargo_bin("conefield"));
+    let child = command.arg("--quiet").args(line).stdout(Stdio::piped()).stderr(Stdio::piped()).spawn().unwrap();
+    let metrics = out.join("metrics.jsonl");
+    let until = Instant::now() + Duration::from_secs(60);
+    while fs::metadata(&metrics).map_or(0, |m| m.len()) == 0 && Instant::now() < until {
+        std::thread::sleep(Duration::from_millis(2));
+    }
+    assert!(Command::new("sh").arg("-c").arg(format!("kill -INT {}", child.id())).status().unwrap().success());
+    let output = child.wait_with_output().unwrap();
+    assert_eq!(output.status.code(), Some(130), "{}", String::from_utf8(output.stderr).unwrap());
+    let said = refused(1, &[&line[..5], &["7s", "--resume"]].concat());
+    assert!(said.contains("--resume: budget"), "{said}");
+    let record = json(&[&line[..6], &["--resume", "--json"]].concat());
+    let spec = fs::read_to_string(out.join("spec.toml")).unwrap();
+    assert!(spec.contains("type = \"sirt\"") && spec.contains("relaxation = 1.5"), "{spec}");
+    assert!(record["steps"].as_u64().unwrap() > 1 && !out.join("checkpoint.safetensors").exists());
+}
