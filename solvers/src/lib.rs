@@ -9,6 +9,7 @@
 pub mod fdk;
 pub mod fit;
 pub mod gradient;
+pub mod guard;
 pub mod iterative;
 pub mod pretrain;
 pub mod rays;

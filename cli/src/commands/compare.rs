@@ -216,6 +216,7 @@ impl Compare {
             reference: self.protocol.reference.is_some(),
             field: true,
             parameters: 0,
+            kept: 0,
             backend: 0,
             solver: [0; 2],
             resume: false,

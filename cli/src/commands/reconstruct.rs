@@ -88,6 +88,7 @@ impl Parts {
             field: self.pipeline.is_some(),
             parameters: self.pipeline.as_ref().map_or(0, |p| p.layout().len() as u64),
             backend: self.compiled.scratch_bytes as u64,
+            kept: self.solver.memory_per_parameter(),
             solver: memory::working(self.solver.as_ref(), &scan),
             resume: false,
         }
@@ -128,6 +129,8 @@ struct Record {
     peak_bytes: Option<u64>,
     parameters: usize,
     steps: u64,
+    /// Times that training ran away and went back.
+    rollbacks: u64,
     train_s: f64,
     export_s: f64,
     /// From the start of the command to this record. Of what came before a --resume, the training alone.
@@ -254,6 +257,7 @@ impl Reconstruct {
             peak_bytes: memory::peak(),
             parameters: field.map_or(0, |f| f.model.pipeline.layout().len()),
             steps: solution.steps,
+            rollbacks: solution.rollbacks,
             train_s: solution.train_s,
             export_s,
             total_s: begin.elapsed().as_secs_f64() + resume.as_ref().map_or(0.0, |r| r.standing.seconds),
@@ -371,6 +375,12 @@ fn summary(r: &Record, output: &Path) -> String {
         out::duration(r.train_s),
         out::duration(r.export_s),
     )];
+    if r.rollbacks > 0 {
+        let times = if r.rollbacks == 1 { "once".into() } else { format!("{} times", r.rollbacks) };
+        lines.push(format!(
+            "training ran away and went back {times}, with half the learning rate; metrics.jsonl says when"
+        ));
+    }
     if let Some(h) = r.held_out {
         lines.push(format!("held-out error  {h:.5} of the largest line integral ({} views)", r.held_out_views.len()));
     }
