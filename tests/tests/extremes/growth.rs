@@ -161,9 +161,9 @@ fn step(rays: usize, samples: usize) -> [f64; 2] {
     [(found.loss - want.loss).abs() / want.loss, apart(&g, &g64)]
 }
 
-/// A share, or that it is no more than rounding twice.
+/// A share, or that there is none: nothing to be off.
 fn cell(e: f64) -> String {
-    if e == 0.0 { "0".into() } else { format!("{e:.1e}") }
+    if e == 0.0 { "-".into() } else { format!("{e:.1e}") }
 }
 
 pub fn check() {

@@ -19,16 +19,16 @@ pub fn sizes() -> Vec<Case> {
     let mut all = vec![];
     for (n, growth) in [(1, 2.0), (20, 2.0), (32, 1.0), (32, 1.5)] {
         let cells = 16.0 * f64::powi(growth, n as i32 - 1);
-        let what = format!("{n} levels, {cells:.0} cells a side on the finest");
+        let what = format!("levels: {n}, {cells:.0} cells a side on the finest");
         all.push(Case::right(what, trains, move || with(levels(n, growth, 16))));
     }
     for (n, growth) in [(21, 2.0), (29, 2.0), (32, 2.0), (32, 16.0)] {
         let finest = (16.0 * f64::powi(growth, n as i32 - 1)).log2();
-        let what = format!("{n} levels, 2^{finest:.0} cells a side on the finest");
+        let what = format!("levels: {n}, 2^{finest:.0} cells a side on the finest");
         all.push(Case::refused(what, &["encoder.levels", "2^23 cells a side"], move || with(levels(n, growth, 16))));
     }
     for (n, words) in [(0, &["encoder.levels: found 0"][..]), (33, &["encoder.levels: found 33"])] {
-        all.push(Case::refused(format!("{n} levels"), words, move || with(levels(n, 1.1, 16))));
+        all.push(Case::refused(format!("levels: {n}"), words, move || with(levels(n, 1.1, 16))));
     }
     for cells in [16, 1 << 10, 1 << 16, 1 << 20] {
         let what = format!("features of a level of {cells} cells a side");
