@@ -34,7 +34,7 @@ pub struct Memory {
     pub reference: u64,
     /// Parameters and gradients.
     pub model: u64,
-    /// Both moments of every parameter.
+    /// Both moments of every parameter, and with parameters those of the last good state.
     pub optimizer: u64,
     /// What backend, solver and writer work in, and the program itself.
     pub buffers: u64,
@@ -139,6 +139,8 @@ pub struct Run {
     pub field: bool,
     /// Parameters.
     pub parameters: u64,
+    /// Bytes that the solver keeps for each of them.
+    pub kept: u64,
     /// Bytes that the backend works in.
     pub backend: u64,
     /// Bytes that the solver works in: what goes with the measured values and what with the voxels.
@@ -161,12 +163,14 @@ impl Run {
         let reference = if self.reference { voxels } else { 0 };
         let volume = if self.reference || !self.field { voxels } else { 0 };
         let half = 8 * self.parameters;
+        let kept = self.kept * self.parameters;
         let solver: u64 = self.solver.iter().sum();
         // A solver of voxels works on the volume that comes out.
         let iterate = if self.field { 0 } else { voxels };
-        // Parameters and moments from the file, and one of them again on its way into the model; or iterates.
+        // Parameters and moments from the file, the last good ones too, and one of them again on its way into the model;
+        // or iterates.
         let checkpoint = match (self.resume, self.field) {
-            (true, true) => 2 * half,
+            (true, true) => 2 * half + kept,
             (true, false) => solver + iterate,
             _ => 0,
         };
@@ -179,7 +183,7 @@ impl Run {
             volume: iterate,
             reference,
             model: half,
-            optimizer: half,
+            optimizer: half + kept,
             buffers: self.backend + solver + checkpoint,
             ..Memory::default()
         };
@@ -233,6 +237,7 @@ mod tests {
             reference: true,
             field: true,
             parameters: 1 << 22,
+            kept: 12,
             backend: 1 << 20,
             solver: [4 << 20, 0],
             resume: false,
@@ -243,7 +248,7 @@ mod tests {
     fn the_moment_that_takes_most_is_told() {
         let m = run().memory();
         assert_eq!((m.reference, m.volume), (512 << 20, 512 << 20));
-        assert_eq!((m.model, m.optimizer), (32 << 20, 32 << 20));
+        assert_eq!((m.model, m.optimizer), (32 << 20, 80 << 20));
         assert_eq!(m.total, m.scan + m.volume + m.reference + m.model + m.optimizer + m.buffers);
         let alone = Run { reference: false, ..run() }.memory();
         assert_eq!((alone.reference, alone.volume), (0, 0));

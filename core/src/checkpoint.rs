@@ -1,6 +1,6 @@
 //! Where a run stands between two steps: enough to go on to the same bits.
 
-use crate::arena::{Arena, Weights};
+use crate::arena::{Arena, Layout, Weights};
 use crate::error::{Error, Result};
 use crate::pipeline::{Masked, Model};
 use serde::{Deserialize, Serialize};
@@ -34,11 +34,20 @@ const PARTS: [&str; 3] = ["params", "first", "second"];
 
 /// A model's tensors for a checkpoint: `params.…`, `first.…` and `second.…` of each block of the layout.
 pub fn tensors(model: &Model) -> Vec<(String, &[usize], &[f32])> {
-    let parts: [&[f32]; 3] = [&model.arena.params, &model.arena.first, &model.arena.second];
+    let Arena { params, first, second, .. } = &model.arena;
+    tensors_of("", model.pipeline.layout(), [params, first, second])
+}
+
+/// Parameters and both moments of `layout` under the names of [`tensors`], with `prefix` before them.
+pub fn tensors_of<'a>(
+    prefix: &str,
+    layout: &'a Layout,
+    parts: [&'a [f32]; 3],
+) -> Vec<(String, &'a [usize], &'a [f32])> {
     let mut all = vec![];
     for (part, values) in PARTS.into_iter().zip(parts) {
-        for b in &model.pipeline.layout().blocks {
-            all.push((format!("{part}.{}", b.name), &b.shape[..], &values[b.range.clone()]));
+        for b in &layout.blocks {
+            all.push((format!("{prefix}{part}.{}", b.name), &b.shape[..], &values[b.range.clone()]));
         }
     }
     all
@@ -63,13 +72,18 @@ impl Resume {
             model.mask(masked)?;
         }
         let Arena { params, first, second, .. } = &mut model.arena;
-        for (part, values) in PARTS.into_iter().zip([params, first, second]) {
-            let prefix = format!("{part}.");
+        self.load("", model.pipeline.layout(), [params, first, second])
+    }
+
+    /// What [`tensors_of`] gave of `layout` under `prefix`.
+    pub fn load(&self, prefix: &str, layout: &Layout, parts: [&mut [f32]; 3]) -> Result<()> {
+        for (part, values) in PARTS.into_iter().zip(parts) {
+            let prefix = format!("{prefix}{part}.");
             let own =
                 |(k, v): (&String, &(Vec<usize>, Vec<f32>))| Some((k.strip_prefix(&prefix)?.to_owned(), v.clone()));
             let tensors = self.weights.tensors.iter().filter_map(own).collect();
             let weights = Weights { tensors, ..Weights::default() };
-            let report = weights.load(&self.place, model.pipeline.layout(), values, |_| true)?;
+            let report = weights.load(&self.place, layout, values, |_| true)?;
             if let Some((tensor, why)) = report.unused.first() {
                 return Err(Error::invalid(&self.place, tensor, why, "only tensors of this pipeline"));
             }

@@ -202,6 +202,8 @@ pub struct Solution {
     pub train_s: f64,
     /// Training samples.
     pub samples: u64,
+    /// Times that training ran away and went back to an earlier state.
+    pub rollbacks: u64,
 }
 
 /// Scan in, reconstruction out.
@@ -231,6 +233,11 @@ pub trait Solver: Send + Sync {
     /// volume that comes out: directions, residuals, lists of rays.
     fn working_memory(&self, pixels: u64, voxels: u64) -> u64 {
         let _ = (pixels, voxels);
+        0
+    }
+
+    /// Bytes that it holds for each parameter of the field, beside model and optimizer.
+    fn memory_per_parameter(&self) -> u64 {
         0
     }
 

@@ -129,9 +129,10 @@ impl Voxels for FieldVoxels<'_> {
             }
             values.resize(points.len(), 0.0);
             exe.evaluate(&field.model, points, values)?;
+            values.iter_mut().for_each(|m| *m *= *scale);
             let mut known = places.iter().zip(values.iter()).peekable();
             for (i, out) in out.by_ref().take(taken).enumerate() {
-                *out = known.next_if(|(at, _)| **at == i).map_or(0.0, |(_, value)| value * *scale);
+                *out = known.next_if(|(at, _)| **at == i).map_or(0.0, |(_, value)| *value);
             }
             if let Some(i) = values.iter().position(|m| !m.is_finite()) {
                 let value = values[i];

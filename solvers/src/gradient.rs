@@ -5,6 +5,7 @@
 
 use crate::drift::{Drift, DriftWatch};
 use crate::fit::{Fitted, fit};
+use crate::guard::{Guard, Watched, strayed};
 use crate::iterative::start_volume;
 use crate::pretrain::learn;
 use crate::rays::{Pixels, RaySource, Views};
@@ -100,6 +101,9 @@ pub struct Gradient {
     pub tv: Option<TvPrior>,
     /// While a scan is reconstructed, logs how much normalizers and field change under the same features, if asked for.
     pub drift: Option<Drift>,
+    /// Times that a run may go back to its last good state, with half the learning rate, when its loss runs away or is no
+    /// longer finite; 0 keeps no such state.
+    pub rollbacks: u64,
     /// Steps between two records of the metrics.
     pub report_every: u64,
     /// Points a step of pre-training.
@@ -125,6 +129,7 @@ impl Default for Gradient {
             eps: 1e-8,
             tv: None,
             drift: None,
+            rollbacks: 8,
             report_every: 50,
             pretrain_points: 65_536,
             pretrain_steps: 1000,
@@ -187,10 +192,12 @@ impl Solver for Gradient {
             RaySource::new(job.scan, &scene, pipeline.projector.as_ref(), self.views, self.pixels, self.margin)?;
         observer.note(&format!("{:.0}% of the pixels are trained on", 100.0 * source.share()));
         let mut model = Model::random(pipeline, job.seed);
+        let mut guard = Guard::new(self.rollbacks, self.loss.into(), job.scan, &scene);
         let mut start = Start::default();
         if let Some(resume) = job.resume {
             resume.restore(&mut model)?;
             start = Start::read(resume)?;
+            guard.resume(std::mem::take(&mut start.kept.guard), resume, &model)?;
             observer.note(&format!("resumed after step {}", start.standing.step));
         } else if let Some(i) = initializer {
             let report = i.apply(model.pipeline.layout(), &mut model.arena)?;
@@ -218,7 +225,7 @@ impl Solver for Gradient {
         let steps = [self.steps, by_epochs].into_iter().flatten().min();
         let watcher = |d| DriftWatch::new(d, &scene, job.seed, steps_an_epoch, job.resume, &model);
         let mut drift = self.drift.as_ref().map(watcher).transpose()?;
-        let Start { standing, mut window } = start;
+        let Start { standing, kept: Kept { mut window, .. } } = start;
         let mut clock = Clock::new(Ends { steps, seconds: self.seconds }, job.limits, standing.seconds);
         let mut rays = Vec::with_capacity(self.rays);
         let mut tv = TvBlocks::default();
@@ -233,13 +240,17 @@ impl Solver for Gradient {
             let cancelled = observer.cancelled();
             if step > standing.step && (cancelled || observer.checkpoint_due()) {
                 clock.pause();
-                let solver = window.save();
+                let solver = serde_json::json!({ "window": window, "guard": guard.watched() });
                 let masks = model.masks().to_vec();
                 let standing = Standing { step, samples, seconds: clock.seconds(), masks, solver };
                 exe.fetch(&mut model)?;
-                let mut tensors = tensors(&model);
-                tensors.extend(drift.iter().flat_map(|d| d.tensors(&model)));
-                observer.checkpoint(&Checkpoint { tensors, standing })?;
+                // What the guard has yet to find out is not worth to go on from: an earlier checkpoint stays.
+                if strayed(&model.arena).is_none() {
+                    let mut tensors = tensors(&model);
+                    tensors.extend(drift.iter().flat_map(|d| d.tensors(&model)));
+                    tensors.extend(guard.tensors(model.pipeline.layout()));
+                    observer.checkpoint(&Checkpoint { tensors, standing })?;
+                }
                 clock.resume();
             }
             if cancelled {
@@ -247,10 +258,16 @@ impl Solver for Gradient {
             }
             let share = clock.share(step);
             let done = clock.done(step) >= 1.0;
+            if done && let Some(said) = guard.finish(step, &mut model, exe.as_mut())? {
+                window.tell(said, observer);
+            }
             if step > 0 && (step % self.report_every == 0 || done) && window.steps > 0 {
                 clock.pause();
-                let record =
-                    window.record(step, clock.seconds(), self.lr * self.decay.at(step as f64 / steps_an_epoch, share));
+                let record = window.record(
+                    step,
+                    clock.seconds(),
+                    guard.rate() * self.lr * self.decay.at(step as f64 / steps_an_epoch, share),
+                );
                 let record = watch.fill(record, &model, exe.as_mut())?;
                 observer.record(&record);
                 window = Window::default();
@@ -269,16 +286,16 @@ impl Solver for Gradient {
             let work = Work { step, seed: job.seed, loss: self.loss.into(), rays: &rays, points: &[], tv };
             let start = Instant::now();
             let stats = exe.step(&mut model, &work)?;
-            if !(stats.loss.is_finite() && stats.prior.is_finite()) {
-                return Err(Error::Diverged {
-                    step,
-                    what: format!("the loss is {}, the prior {}; try a smaller solver.lr", stats.loss, stats.prior),
-                });
-            }
+            let back = guard.judge(&work, &stats, &mut model, exe.as_mut())?;
             step += 1;
             samples += stats.samples;
-            exe.update(&mut model, &self.adam(step, epoch, share))?;
-            window.add(stats.loss, stats.prior, stats.samples, start.elapsed().as_secs_f64());
+            match back {
+                Some(said) => window.tell(said, observer),
+                None => {
+                    exe.update(&mut model, &guard.next(self.adam(step, epoch, share)))?;
+                    window.add(stats.loss, stats.prior, stats.samples, start.elapsed().as_secs_f64());
+                }
+            }
             let share = clock.done(step);
             observer.progress(step, share, clock.seconds() * (1.0 - share).max(0.0) / share.max(1e-9));
         }
@@ -286,7 +303,8 @@ impl Solver for Gradient {
         exe.fetch(&mut model)?;
         drop(source);
         let field = TrainedField { model, scene, unit_mm: job.scan.unit.mm };
-        Ok(Solution { result: Reconstruction::Field(field), steps: step, train_s: clock.seconds(), samples })
+        let (train_s, rollbacks) = (clock.seconds(), guard.rollbacks());
+        Ok(Solution { result: Reconstruction::Field(field), steps: step, train_s, samples, rollbacks })
     }
 
     fn pretrain(&self, job: &PretrainJob<'_>, observer: &mut dyn Observer) -> Result<Model> {
@@ -300,6 +318,11 @@ impl Solver for Gradient {
     /// The list of the pixels that are trained on, at most all of them.
     fn working_memory(&self, pixels: u64, _: u64) -> u64 {
         size_of::<u32>() as u64 * pixels
+    }
+
+    /// Parameters and moments of the last good state.
+    fn memory_per_parameter(&self) -> u64 {
+        if self.rollbacks > 0 { 3 * size_of::<f32>() as u64 } else { 0 }
     }
 
     fn describe(&self) -> String {
@@ -344,15 +367,23 @@ fn blocks(prior: &TvPrior, scene: &Scene, seed: u64, step: u64, out: &mut TvBloc
 #[derive(Default)]
 struct Start {
     standing: Standing,
-    window: Window,
+    kept: Kept,
 }
 
 impl Start {
     fn read(resume: &Resume) -> Result<Self> {
-        let window = serde_json::from_value(resume.standing.solver.clone());
-        let window = window.map_err(|e| Error::invalid(&resume.place, "solver", e, "what this solver keeps"))?;
-        Ok(Self { standing: resume.standing.clone(), window })
+        let kept = serde_json::from_value(resume.standing.solver.clone());
+        let kept = kept.map_err(|e| Error::invalid(&resume.place, "solver", e, "what this solver keeps"))?;
+        Ok(Self { standing: resume.standing.clone(), kept })
     }
+}
+
+/// What a checkpoint keeps for this solver.
+#[derive(Default, Deserialize)]
+#[serde(deny_unknown_fields)]
+struct Kept {
+    window: Window,
+    guard: Watched,
 }
 
 /// Sums since the last record.
@@ -370,8 +401,10 @@ struct Window {
 }
 
 impl Window {
-    fn save(&self) -> serde_json::Value {
-        serde_json::json!(self)
+    /// Says what happened, now and in the next record.
+    fn tell(&mut self, said: String, observer: &mut dyn Observer) {
+        observer.note(&said);
+        self.events.push(said);
     }
 
     fn add(&mut self, loss: f64, prior: f64, samples: u64, seconds: f64) {

@@ -11,6 +11,7 @@ pub mod drift;
 pub mod fdk;
 pub mod fit;
 pub mod gradient;
+pub mod guard;
 pub mod iterative;
 pub mod pretrain;
 pub mod rays;

@@ -2,6 +2,7 @@
 //! initialization. What the LayerNorm and the field learn there is reused for every other scan.
 
 use crate::gradient::Gradient;
+use crate::guard::strayed;
 use crate::schedule::{Clock, Ends};
 use conefield_core::arena::Arena;
 use conefield_core::backend::{Executable, Loss, Work};
@@ -75,7 +76,8 @@ pub fn pretrain(settings: &Gradient, job: &PretrainJob<'_>, observer: &mut dyn O
         }
     }
     exe.fetch(&mut model)?;
-    Ok(model)
+    // The last update is behind the last loss.
+    strayed(&model.arena).map_or(Ok(model), |what| Err(Error::Diverged { step, what }))
 }
 
 /// Gradients of the L1 loss at known points; returns the loss.

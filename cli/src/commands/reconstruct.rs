@@ -112,6 +112,7 @@ impl Parts {
             field: self.pipeline.is_some(),
             parameters: self.pipeline.as_ref().map_or(0, |p| p.layout().len() as u64),
             backend: self.compiled.scratch_bytes as u64,
+            kept: self.solver.memory_per_parameter(),
             solver: memory::working(self.solver.as_ref(), &scan),
             resume: false,
         }
@@ -261,6 +262,7 @@ impl Reconstruct {
             peak_bytes: memory::peak(),
             parameters: field.map_or(0, |f| f.model.pipeline.layout().len()),
             steps: solution.steps,
+            rollbacks: solution.rollbacks,
             load_s,
             prepare_s,
             train_s: solution.train_s,

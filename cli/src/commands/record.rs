@@ -37,6 +37,8 @@ pub struct Record {
     pub peak_bytes: Option<u64>,
     pub parameters: usize,
     pub steps: u64,
+    /// Times that training ran away and went back.
+    pub rollbacks: u64,
     /// Reading all that there is to read.
     pub load_s: f64,
     /// What solving took beside training: before the first step, and to look at the metrics.
@@ -111,6 +113,12 @@ pub fn summary(r: &Record, output: &Path) -> String {
     )];
     if let Some(budget) = r.budget_s {
         lines.push(format!("{} in all, of a budget of {}", out::duration(r.total_s), out::duration(budget)));
+    }
+    if r.rollbacks > 0 {
+        let times = if r.rollbacks == 1 { "once".into() } else { format!("{} times", r.rollbacks) };
+        lines.push(format!(
+            "training ran away and went back {times}, with half the learning rate; metrics.jsonl says when"
+        ));
     }
     if let Some(h) = r.held_out {
         lines.push(format!("held-out error  {h:.5} of the largest line integral ({} views)", r.held_out_views.len()));

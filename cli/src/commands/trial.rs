@@ -109,6 +109,7 @@ impl Input {
             reference: protocol.reference.is_some(),
             field: true,
             parameters: 0,
+            kept: 0,
             backend: 0,
             solver: [0; 2],
             resume: false,

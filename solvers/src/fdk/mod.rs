@@ -7,8 +7,8 @@
 pub mod filter;
 pub mod weights;
 
-use crate::iterative::voxels_only;
 use crate::iterative::watch::Watch;
+use crate::iterative::{finite, voxels_only};
 use conefield_core::Error;
 use conefield_core::error::{Result, ensure};
 use conefield_core::geometry::{Geometry, dot, norm, sub};
@@ -111,7 +111,9 @@ impl Solver for Fdk {
             observer.progress(done as u64, share, spent * (1.0 - share) / share);
         }
         let floor = if self.nonnegative { 0.0 } else { f32::NEG_INFINITY };
-        volume.par_mapv_inplace(|x| x.max(floor));
+        // A comparison, not a maximum, which would turn NaN into the floor.
+        volume.par_mapv_inplace(|x| if x < floor { floor } else { x });
+        finite(&volume, 1)?;
         let train_s = start.elapsed().as_secs_f64();
         let mm = scan.unit.mm as f32;
         let watch = Watch::new(job);
@@ -121,7 +123,7 @@ impl Solver for Fdk {
         observer.record(&Record { step: 1, seconds: train_s, psnr, held_out, ..Record::default() });
         volume.par_mapv_inplace(|x| x * mm);
         let volume = Volume { data: volume, grid: g.volume, affine: None };
-        Ok(Solution { result: Reconstruction::Volume(volume), steps: 1, train_s, samples: 0 })
+        Ok(Solution { result: Reconstruction::Volume(volume), steps: 1, train_s, samples: 0, rollbacks: 0 })
     }
 
     fn trains_field(&self, spec: &Spec) -> Result<bool> {

@@ -174,6 +174,11 @@ pub trait Method {
 /// Begins a job: refuses a scan that makes no sense, says what solves it and how, and gives the projector.
 pub(crate) fn open(solver: &str, job: &Job<'_>, observer: &mut dyn Observer) -> Result<Box<dyn VoxelProjector>> {
     job.scan.validate("scan")?;
+    let g = &job.scan.geometry;
+    let (bounds, [rows, columns]) = (g.volume.bounds(), g.detector);
+    let meets = |v, p: usize| g.ray(v, p / columns, p % columns).clip(bounds).is_some();
+    let met = (0..g.views.len()).any(|v| (0..rows * columns).any(|p| meets(v, p)));
+    ensure(met, "scan", "geometry", "rays that all miss the volume", "rays through the volume")?;
     let projector = job.backend.place(projector_of(job.spec)?)?;
     observer.note(&format!("{solver}; {}", projector.describe()));
     Ok(projector)
@@ -264,6 +269,8 @@ pub fn drive(
     let mut kept = Kept::default();
     let mut seconds = 0.0;
     let mut best: Option<Array3<f32>> = None;
+    // Differences ten times those of an empty volume, and growing, are no reconstruction.
+    let (empty, mut last) = (problem.scan.projections.as_slice().map_or(f64::MAX, square_sum), None);
     if let Some(resume) = job.resume {
         kept = restore(resume, method)?;
         best = best_of(resume, job);
@@ -309,9 +316,13 @@ pub fn drive(
         let pass = method.pass(problem, step)?;
         problem.operator.fault()?;
         step += 1;
-        if !pass.residual.is_finite() {
-            return Err(Error::Diverged { step, what: "the residual is not finite; try a smaller step".into() });
+        let away = pass.residual > 100.0 * empty && last.is_some_and(|l| pass.residual > l);
+        if away || !pass.residual.is_finite() {
+            let times = (pass.residual / empty).sqrt();
+            let what = format!("the residual is {times:.3e} times that of an empty volume; try a smaller relaxation");
+            return Err(Error::Diverged { step, what });
         }
+        last = Some(pass.residual);
         clock.pause();
         let held_out = watch.held_out(problem.operator, method.volume());
         let mut record = Record {
@@ -349,11 +360,23 @@ pub fn drive(
     clock.pause();
     let mut data = best.unwrap_or_else(|| method.take());
     data.par_mapv_inplace(|x| x * mm);
-    if let Some((at, _)) = data.indexed_iter().find(|(_, x)| !x.is_finite()) {
-        return Err(Error::Diverged { step, what: format!("voxel {at:?} is not finite") });
-    }
+    finite(&data, step)?;
     let volume = Volume { data, grid: job.scan.geometry.volume, affine: None };
-    Ok(Solution { result: Reconstruction::Volume(volume), steps: step, train_s: clock.seconds(), samples: 0 })
+    Ok(Solution {
+        result: Reconstruction::Volume(volume),
+        steps: step,
+        train_s: clock.seconds(),
+        samples: 0,
+        rollbacks: 0,
+    })
+}
+
+/// Refuses a volume with a number that is not finite.
+pub(crate) fn finite(volume: &Array3<f32>, step: u64) -> Result<()> {
+    match volume.indexed_iter().find(|(_, x)| !x.is_finite()) {
+        Some((at, x)) => Err(Error::Diverged { step, what: format!("voxel {at:?} is {x}") }),
+        None => Ok(()),
+    }
 }
 
 fn restore(resume: &Resume, method: &mut dyn Method) -> Result<Kept> {

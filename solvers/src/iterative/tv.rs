@@ -205,8 +205,13 @@ impl Op for Ascend<'_> {
 }
 
 /// Adds `−step·∇TV/‖∇TV‖` of the smoothed total variation to `x`: a step of ASD-POCS. `work` is scratch of `x`'s length.
+/// Differences are counted in `smoothing`, so that their squares are of order one whatever the unit of `x`.
 pub fn descend(x: &mut [f32], shape: [usize; 3], g: [f32; 3], step: f64, smoothing: f32, work: &mut [f32]) {
     let [nx, ny, nz] = shape;
+    if !smoothing.is_normal() {
+        return;
+    }
+    let unit = 1.0 / smoothing;
     let plane = ny * nz;
     let squares: Vec<f64> = work
         .par_chunks_mut(plane)
@@ -215,7 +220,7 @@ pub fn descend(x: &mut [f32], shape: [usize; 3], g: [f32; 3], step: f64, smoothi
             let mut sum = 0.0;
             for j in 0..ny {
                 for k in 0..nz {
-                    let grad = slope(x, shape, g, smoothing, [i, j, k]);
+                    let grad = slope(x, shape, g, unit, [i, j, k]);
                     out[j * nz + k] = grad;
                     sum += f64::from(grad) * f64::from(grad);
                 }
@@ -233,16 +238,16 @@ pub fn descend(x: &mut [f32], shape: [usize; 3], g: [f32; 3], step: f64, smoothi
     debug_assert_eq!(nx * plane, x.len());
 }
 
-/// Derivative of the smoothed total variation by one voxel.
+/// Derivative of the smoothed total variation by one voxel; differences times `unit` are held against 1.
 #[inline(always)]
-fn slope(x: &[f32], shape: [usize; 3], g: [f32; 3], smoothing: f32, at: [usize; 3]) -> f32 {
+fn slope(x: &[f32], shape: [usize; 3], g: [f32; 3], unit: f32, at: [usize; 3]) -> f32 {
     let stride = [shape[1] * shape[2], shape[2], 1];
     let index = at[0] * stride[0] + at[1] * stride[1] + at[2];
     // Forward differences at a voxel and what they are in length.
     let forward = |at: [usize; 3], index: usize| {
-        let d: [f32; 3] =
-            std::array::from_fn(|k| if at[k] + 1 < shape[k] { g[k] * (x[index + stride[k]] - x[index]) } else { 0.0 });
-        let length = (d[0] * d[0] + d[1] * d[1] + d[2] * d[2] + smoothing * smoothing).sqrt();
+        let to_next = |k: usize| g[k] * ((x[index + stride[k]] - x[index]) * unit);
+        let d: [f32; 3] = std::array::from_fn(|k| if at[k] + 1 < shape[k] { to_next(k) } else { 0.0 });
+        let length = (d[0] * d[0] + d[1] * d[1] + d[2] * d[2] + 1.0).sqrt();
         (d, length)
     };
     let (d, length) = forward(at, index);
