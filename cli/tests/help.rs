@@ -3,7 +3,7 @@
 mod common;
 use common::{conefield, done, refused};
 
-const COMMANDS: [&str; 15] = [
+const COMMANDS: [&str; 16] = [
     "simulate",
     "import",
     "reconstruct",
