@@ -214,7 +214,7 @@ mod tests {
         let v = Volume::centered(Array3::from_shape_fn((2, 3, 4), |(x, y, z)| (x + 2 * y + 6 * z) as f32), [2.0; 3]);
         write_volume(&path, &v).unwrap();
         let back = read_volume(&path).unwrap();
-        assert_eq!((back.data, back.grid.spacing, back.affine), (v.data, [1.0; 3], None));
+        assert_eq!((&back.data, back.grid.spacing, back.affine), (&v.data, [1.0; 3], None));
         assert!(is_volume(&path) && !is_volume(dir.path()));
         let packed = dir.path().join("a.nii.gz");
         write_volume(&packed, &v).unwrap();

@@ -199,7 +199,7 @@ impl Chain {
             for s in 0..self.segments() {
                 source.bind(&format!("grads_{s}"), Access::Write, &format!("array<atomic<{}>>", atomics.number()));
                 let _ =
-                    writeln!(text, "fn arena_add_{s}(i: u32, v: f32) {{\n{}}}", atomics.add(&format!("grads_{s}[i]")));
+                    writeln!(text, "fn arena_add_{s}(i: u32, v: f32) {{\n{}}}", atomics.sum(&format!("grads_{s}[i]")));
             }
             text += "fn arena_grad(i: u32, v: f32) {\n    if v == 0.0 { return; }\n";
             self.each_segment(&mut text, |s, i| format!("arena_add_{s}({i}, v); return;"));

@@ -26,7 +26,7 @@ impl Atomics {
     }
 
     /// Adds `v` to `place`, in WGSL.
-    pub fn add(self, place: &str) -> String {
+    pub fn sum(self, place: &str) -> String {
         match self {
             Self::Native => format!("    atomicAdd(&{place}, v);\n"),
             Self::CompareExchange => format!(

@@ -93,7 +93,7 @@ fn kernel(fragment: &Fragment, name: &str, atomics: Atomics, forward: bool) -> S
         source.bind("volume", Access::Write, &format!("array<atomic<{}>>", atomics.number()));
         source.bind("lines", Access::Read, "array<f32>");
         let begin = "value = lines[i];\n        if value == 0.0 { continue; }";
-        (format!("let v = weight * value;\n{}", atomics.add("volume[i]")), begin, "")
+        (format!("let v = weight * value;\n{}", atomics.sum("volume[i]")), begin, "")
     };
     source.add(
         "visit",
