@@ -364,10 +364,10 @@ fn recorded(folder: &Path) -> Result<BTreeMap<String, String>> {
         ("projections".into(), known.scan.projections_fnv1a64),
         ("held_out_views".into(), format!("{:?}", known.held_out_views)),
         ("limits".into(), out::to_json(&known.limits)?),
-        ("budget".into(), format!("{:?}", known.budget_s)),
         ("reference".into(), known.reference.to_string()),
         ("peak".into(), known.peak.to_string()),
     ]);
+    all.extend(known.budget_s.map(|b| ("budget".into(), b.to_string())));
     all.extend(plugins::identity(&known.plugins));
     Ok(all)
 }

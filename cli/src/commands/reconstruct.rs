@@ -361,7 +361,7 @@ pub fn identity(
     all.insert("projections".into(), projections.into());
     all.insert("held_out_views".into(), format!("{held:?}"));
     all.insert("limits".into(), out::to_json(&protocol.ends)?);
-    all.insert("budget".into(), format!("{:?}", protocol.budget));
+    all.extend(protocol.budget.map(|b| ("budget".into(), b.to_string())));
     Ok(all)
 }
 
