@@ -261,7 +261,7 @@ mod tests {
         let found = run().smaller(400 << 20, tables());
         assert_eq!(found, ["a run without --reference", "a volume of 256³ voxels"]);
         let alone = Run { reference: false, ..run() };
-        let found = alone.smaller(alone.memory().total - (40 << 20), tables());
+        let found = alone.smaller(alone.memory().total - (70 << 20), tables());
         assert_eq!(found, ["tables of 2^17"]);
         assert!(run().smaller(1 << 20, tables()).is_empty());
     }

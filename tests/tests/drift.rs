@@ -2,16 +2,16 @@
 
 mod common;
 
-use common::{Heard, model, scan, solve, spec};
+use common::{Heard, Stop, model, scan, solve, spec};
 use conefield_backend_cpu::Cpu;
 use conefield_core::Result;
 use conefield_core::arena::Weights;
 use conefield_core::backend::Backend;
-use conefield_core::checkpoint::{Checkpoint, Resume};
+use conefield_core::checkpoint::Resume;
 use conefield_core::host;
 use conefield_core::pipeline::{Model, Pipeline};
 use conefield_core::scene::Scene;
-use conefield_core::solver::{DriftRecord, Job, Observer, Record};
+use conefield_core::solver::{DriftRecord, Job, Record};
 use conefield_solvers::drift::{Drift, DriftWatch};
 use serde_json::{Value, json};
 
@@ -123,36 +123,9 @@ fn an_interval_in_which_channels_are_masked_has_no_drift() {
     assert!(said.iter().any(|e| e.contains("no drift from step 12 to 24")), "{said:?}");
 }
 
-/// Keeps a checkpoint after a step and stops there.
-struct Stop {
-    at: u64,
-    step: u64,
-    kept: Option<Resume>,
-    heard: Vec<Record>,
-}
-
-impl Observer for Stop {
-    fn progress(&mut self, step: u64, _: f64, _: f64) {
-        self.step = step;
-    }
-    fn record(&mut self, record: &Record) {
-        self.heard.push(record.clone());
-    }
-    fn note(&mut self, _: &str) {}
-    fn cancelled(&self) -> bool {
-        self.step >= self.at
-    }
-    fn checkpoint(&mut self, c: &Checkpoint<'_>) -> Result<()> {
-        let tensors = c.tensors.iter().map(|(n, s, v)| (n.clone(), (s.to_vec(), v.to_vec()))).collect();
-        let weights = Weights { tensors, ..Weights::default() };
-        self.kept = Some(Resume { place: "kept".into(), standing: c.standing.clone(), weights });
-        Ok(())
-    }
-}
-
 fn stopped(value: &Value, at: u64) -> Stop {
     let (scan, spec, cpu) = (scan(), spec(value).unwrap(), Cpu::new());
-    let mut stop = Stop { at, step: 0, kept: None, heard: vec![] };
+    let mut stop = Stop::at(at);
     let job = Job { seed: 7, ..Job::new(&scan, &spec, &cpu) };
     assert!(spec.solver.build().unwrap().solve(&job, &mut stop).is_err());
     stop

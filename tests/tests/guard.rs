@@ -3,14 +3,14 @@
 mod common;
 mod device;
 
-use common::{model, scan, solve, solve_on, spec};
+use common::{Stop, model, scan, solve, solve_on, spec};
 use conefield_backend_cpu::Cpu;
 use conefield_core::arena::{Arena, Weights};
 use conefield_core::backend::{Adam, Backend, Executable, Explain, StepStats, Work};
-use conefield_core::checkpoint::{Checkpoint, Resume};
+use conefield_core::checkpoint::Resume;
 use conefield_core::error::{Error, Result};
 use conefield_core::pipeline::{Model, Pipeline};
-use conefield_core::solver::{Job, Observer, Record, Solution};
+use conefield_core::solver::{Job, Record, Solution};
 use conefield_core::stage::UnitRay;
 use serde_json::{Value, json};
 
@@ -227,34 +227,6 @@ fn a_run_that_cannot_be_saved_ends_in_words() {
     assert!(e.starts_with("training diverged at step 0: the loss is NaN"), "{e}");
 }
 
-/// Stops after a step, or keeps a checkpoint after every one.
-struct Stop {
-    at: u64,
-    step: u64,
-    kept: Option<Resume>,
-    heard: Vec<Record>,
-}
-
-impl Observer for Stop {
-    fn progress(&mut self, step: u64, _: f64, _: f64) {
-        self.step = step;
-    }
-    fn record(&mut self, record: &Record) {
-        self.heard.push(record.clone());
-    }
-    fn note(&mut self, _: &str) {}
-    fn cancelled(&self) -> bool {
-        self.step >= self.at
-    }
-    fn checkpoint(&mut self, c: &Checkpoint<'_>) -> Result<()> {
-        let tensors = c.tensors.iter().map(|(n, s, v)| (n.clone(), (s.to_vec(), v.to_vec()))).collect();
-        let weights = Weights { tensors, ..Weights::default() };
-        let standing = serde_json::from_str(&serde_json::to_string(&c.standing).unwrap()).unwrap();
-        self.kept = Some(Resume { place: "kept".into(), standing, weights });
-        Ok(())
-    }
-}
-
 /// Wherever a run is interrupted, before, after or between rollbacks, it goes on to the same bits; and so where channels
 /// left the work.
 #[test]
@@ -272,7 +244,7 @@ fn a_run_that_went_back_resumes_to_the_same_bits() {
         let (scan, spec) = (scan(), spec(&value).unwrap());
         let (solver, backend) = (spec.solver.build().unwrap(), Faulty { fault, device: None });
         let solve = |resume: Option<&Resume>, at| {
-            let mut stop = Stop { at, step: 0, kept: None, heard: vec![] };
+            let mut stop = Stop::at(at);
             let result = solver.solve(&Job { seed: 7, resume, ..Job::new(&scan, &spec, &backend) }, &mut stop);
             let result = result.map(|s| (s.rollbacks, outcome(s))).map_err(|e| e.to_string());
             (result, stop)

@@ -3,18 +3,17 @@
 mod common;
 mod device;
 
-use common::{Heard, model, scan, solve, solve_on, spec, truth};
+use common::{Heard, Stop, model, scan, solve, solve_on, spec, truth};
 use conefield_backend_cpu::Cpu;
 use conefield_backend_cpu::rows::Kernels;
 use conefield_backend_cpu::step::Slots;
 use conefield_core::Result;
 use conefield_core::arena::Weights;
 use conefield_core::backend::{Adam, Backend, Loss, TrainRay, TvBlocks, Work};
-use conefield_core::checkpoint::{Checkpoint, Resume};
 use conefield_core::pipeline::{Model, Pipeline};
 use conefield_core::random::{mix, unit};
 use conefield_core::scene::Scene;
-use conefield_core::solver::{Job, Limits, Observer, PretrainJob, Record};
+use conefield_core::solver::{Job, Limits, PretrainJob, Record};
 use conefield_core::spec::Tables;
 use conefield_core::stage::{Encoder, Field, Info, Kernel, Normalizer, Parameter, Projector, Reduced, Scope, Stage};
 use conefield_core::wgsl::Fragment;
@@ -252,30 +251,6 @@ fn pretraining_on_several_volumes_is_that_of_the_cpu() {
     }
 }
 
-/// Keeps the last checkpoint and stops there.
-struct Stop {
-    at: u64,
-    kept: Option<Resume>,
-    step: u64,
-}
-
-impl Observer for Stop {
-    fn progress(&mut self, step: u64, _: f64, _: f64) {
-        self.step = step;
-    }
-    fn record(&mut self, _: &Record) {}
-    fn note(&mut self, _: &str) {}
-    fn cancelled(&self) -> bool {
-        self.step >= self.at
-    }
-    fn checkpoint(&mut self, c: &Checkpoint<'_>) -> Result<()> {
-        let tensors = c.tensors.iter().map(|(n, s, v)| (n.clone(), (s.to_vec(), v.to_vec()))).collect();
-        let weights = Weights { tensors, ..Weights::default() };
-        self.kept = Some(Resume { place: "kept".into(), standing: c.standing.clone(), weights });
-        Ok(())
-    }
-}
-
 #[test]
 fn a_run_begun_on_one_backend_goes_on_on_the_other() {
     let Some((_, device)) = device::backends("checkpoints").into_iter().next() else { return };
@@ -285,7 +260,7 @@ fn a_run_begun_on_one_backend_goes_on_on_the_other() {
     let cpu = Cpu::new();
     let pairs: [[&dyn Backend; 2]; 3] = [[&cpu, &device], [&device, &cpu], [&device, &device]];
     for [first, second] in pairs {
-        let mut stop = Stop { at: 20, kept: None, step: 0 };
+        let mut stop = Stop::at(20);
         let stopped = solver.solve(&Job { seed: 7, ..Job::new(&scan, &spec, first) }, &mut stop);
         assert!(stopped.is_err());
         let resume = stop.kept.unwrap();

@@ -4,6 +4,7 @@ use conefield_backend_cpu::Cpu;
 use conefield_core::Result;
 use conefield_core::arena::Weights;
 use conefield_core::backend::Backend;
+use conefield_core::checkpoint::{Checkpoint, Resume};
 use conefield_core::pipeline::Model;
 use conefield_core::scan::{Scan, Volume};
 use conefield_core::solver::{Job, Observer, Reconstruction, Record, Solution};
@@ -55,6 +56,45 @@ impl Observer for Heard {
         self.0.push(record.clone());
     }
     fn note(&mut self, _: &str) {}
+}
+
+/// Stops after a step, with the checkpoint that is kept there.
+#[derive(Default)]
+pub struct Stop {
+    /// The step.
+    pub at: u64,
+    step: u64,
+    /// What an interrupted run goes on from, as it would come back from a file.
+    pub kept: Option<Resume>,
+    /// Records until then.
+    pub heard: Vec<Record>,
+}
+
+#[allow(dead_code)]
+impl Stop {
+    pub fn at(step: u64) -> Self {
+        Self { at: step, ..Self::default() }
+    }
+}
+
+impl Observer for Stop {
+    fn progress(&mut self, step: u64, _: f64, _: f64) {
+        self.step = step;
+    }
+    fn record(&mut self, record: &Record) {
+        self.heard.push(record.clone());
+    }
+    fn note(&mut self, _: &str) {}
+    fn cancelled(&self) -> bool {
+        self.step >= self.at
+    }
+    fn checkpoint(&mut self, c: &Checkpoint<'_>) -> Result<()> {
+        let tensors = c.tensors.iter().map(|(n, s, v)| (n.clone(), (s.to_vec(), v.to_vec()))).collect();
+        let weights = Weights { tensors, ..Weights::default() };
+        let standing = serde_json::from_str(&serde_json::to_string(&c.standing).unwrap()).unwrap();
+        self.kept = Some(Resume { place: "kept".into(), standing, weights });
+        Ok(())
+    }
 }
 
 /// A whole run of `value` on `scan`, with the weights file that it may name.
