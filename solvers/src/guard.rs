@@ -181,12 +181,15 @@ impl Guard {
         exe.fetch(model)?;
         match away.or_else(|| strayed(&model.arena)) {
             Some(what) => self.back(step, &what, model, exe).map(Some),
-            None => Ok(self.in_vain()),
+            None => Ok(self.in_vain(step)),
         }
     }
 
-    /// That the last steps are no better than an empty volume, if so.
-    fn in_vain(&self) -> Option<String> {
+    /// That the last steps are no better than an empty volume, if so. The first ones seldom are, whatever comes of them.
+    fn in_vain(&self, step: u64) -> Option<String> {
+        if step < 4 * WINDOW {
+            return None;
+        }
         let Watched { sum, empty, last, .. } = self.watched;
         let (found, empty) = (sum + last[0], empty + last[1]);
         let text = "the field is no better than an empty volume; another solver.lr or more steps may help";

@@ -320,7 +320,7 @@ mod tests {
             sum
         };
         for at in [[0, 0, 0], [1, 2, 3], [3, 4, 5], [2, 0, 5]] {
-            let found = f64::from(slope(x.as_slice().unwrap(), shape, g, 0.1, at));
+            let found = f64::from(slope(x.as_slice().unwrap(), shape, g, 1.0 / 0.1, at));
             let was = x[at];
             x[at] = was + 2e-3;
             let up = smooth(&x);
