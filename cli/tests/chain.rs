@@ -142,6 +142,27 @@ fn every_shipped_spec_reconstructs() {
     }
 }
 
+/// A volume that one method made is what another one starts from and is held to.
+#[test]
+fn a_volume_starts_another_run() {
+    let (dir, scan) = scan();
+    let (scan, place) = (text(&scan), |name: &str| text(&dir.path().join(name)));
+    let run = |spec: &str, name: &str, more: &[&str]| {
+        json(&[&["reconstruct", &scan, "--spec", spec, "-o", &place(name), "--json", "--steps", "1"], more].concat())
+    };
+    run("sirt", "first", &[]);
+    let volume = place("first/volume.nii.gz");
+    let record = run("fista-tv", "held", &["--init", &volume, "--set", "solver.pull=1e6"]);
+    assert_eq!(record["init"], volume.as_str());
+    let scores = json(&["evaluate", &place("held/volume.nii.gz"), &volume, "--json"]);
+    assert!(scores["psnr"].as_f64().unwrap() > 40.0, "{scores}");
+    let spec = fs::read_to_string(dir.path().join("held/spec.toml")).unwrap();
+    assert!(spec.contains("type = \"volume\""), "{spec}");
+    let alone = ["reconstruct", &scan, "--spec", "fista-tv", "-o", &place("alone"), "--set", "solver.pull=0.1"];
+    let said = common::refused(1, &alone);
+    assert!(said.contains("solver.pull"), "{said}");
+}
+
 #[test]
 fn pretrained_weights_start_another_run() {
     let (dir, scan) = scan();

@@ -52,8 +52,8 @@ pub struct Reconstruct {
     resume: bool,
     #[command(flatten)]
     protocol: Protocol,
-    /// Weights that "conefield pretrain" made, to start from.
-    #[arg(long, value_name = "WEIGHTS")]
+    /// What to start from: weights that "conefield pretrain" made, or a volume.
+    #[arg(long, value_name = "FILE")]
     init: Option<PathBuf>,
     /// Print one JSON object: what record.json holds.
     #[arg(long)]
@@ -339,7 +339,7 @@ impl Reconstruct {
     fn all_sets(&self) -> Vec<String> {
         let mut sets = self.protocol.sets.clone();
         if let Some(path) = &self.init {
-            sets.push(mci(path));
+            sets.push(if conefield_io::is_volume(path) { known_volume(path) } else { mci(path) });
         }
         sets
     }
@@ -369,6 +369,12 @@ pub fn identity(
 pub fn mci(path: &Path) -> String {
     let path = toml::Value::String(path.display().to_string());
     format!("initializer={{ type = \"mci\", weights = {path} }}")
+}
+
+/// The setting that starts from the volume in `path`.
+fn known_volume(path: &Path) -> String {
+    let path = toml::Value::String(path.display().to_string());
+    format!("initializer={{ type = \"volume\", path = {path} }}")
 }
 
 /// What weights say of where they come from.

@@ -59,6 +59,9 @@ pub struct FistaTv {
     pub order: Order,
     /// Dual steps of the prior for each update.
     pub inner: usize,
+    /// How strongly the volume is held to the one that the initializer brings: the weight μ of a third term `½μ‖x − x₀‖²`, as
+    /// a share of the largest eigenvalue L of the data's. 0 only starts from it.
+    pub pull: f64,
 }
 
 impl Default for FistaTv {
@@ -72,6 +75,7 @@ impl Default for FistaTv {
             subsets: 10,
             order: Order::Golden,
             inner: 4,
+            pull: 0.0,
         }
     }
 }
@@ -90,6 +94,8 @@ impl SolverSpec for FistaTv {
         ensure((1..=1000).contains(&self.inner), "spec", "solver.inner", self.inner, "1 to 1000")?;
         let (Weight::Fixed(w) | Weight::Noise(w)) = self.weight;
         ensure(w.is_finite() && w >= 0.0, "spec", "solver.weight", w, "a finite number, 0 or more")?;
+        let pull = self.pull;
+        ensure(pull.is_finite() && pull >= 0.0, "spec", "solver.pull", pull, "a finite number, 0 or more")?;
         Ok(Box::new(self.clone()))
     }
 }
@@ -118,6 +124,8 @@ impl Solver for FistaTv {
 
     fn trains_field(&self, spec: &Spec) -> Result<bool> {
         refuse_others(spec)?;
+        let held = self.pull == 0.0 || spec.initializer.is_some();
+        ensure(held, "spec", "solver.pull", self.pull, "0, or an initializer with a volume to be held to")?;
         Ok(false)
     }
 
@@ -129,14 +137,19 @@ impl Solver for FistaTv {
     /// Beside the volume there are the point ahead of it, the fresh and the last volume, a gradient and the dual of three
     /// components; and the residuals of a subset, which may come to be all views, and where there is air.
     fn working_memory(&self, pixels: u64, voxels: u64) -> u64 {
-        let passing = 7 * 4 * voxels + (4 + 1) * pixels + projecting(pixels);
+        let volumes = if self.pull > 0.0 { 8 } else { 7 };
+        let passing = volumes * 4 * voxels + (4 + 1) * pixels + projecting(pixels);
         passing.max(noise::memory(pixels)) + self.stop.kept(voxels)
     }
 
     fn describe(&self) -> String {
         let weights = if self.weighted { "weighted by noise" } else { "unweighted" };
-        format!("fista-tv: {} subsets, {} dual steps, weight {:?}, {weights}", self.subsets, self.inner, self.weight)
-            .to_lowercase()
+        let held = if self.pull > 0.0 { format!(", held to a volume by {}", self.pull) } else { String::new() };
+        format!(
+            "fista-tv: {} subsets, {} dual steps, weight {:?}, {weights}{held}",
+            self.subsets, self.inner, self.weight
+        )
+        .to_lowercase()
     }
 }
 
@@ -193,6 +206,9 @@ struct Iterate {
     /// λ in mm.
     lambda: f64,
     lipschitz: f64,
+    /// μ over L, and what it pulls to.
+    pull: f32,
+    towards: Array3<f32>,
     /// FISTA's t.
     t: f64,
     /// The last pass' objective.
@@ -206,6 +222,7 @@ impl Iterate {
         let parts = subsets(views, settings.subsets);
         let lipschitz = largest_eigenvalue(problem, noise, &parts);
         ensure(lipschitz > 0.0, "scan", "geometry", "rays that all miss the volume", "rays through the volume")?;
+        let towards = if settings.pull > 0.0 { x.clone() } else { Array3::zeros((0, 0, 0)) };
         Ok(Self {
             views,
             noise,
@@ -219,7 +236,9 @@ impl Iterate {
             prox: TvProx::new(grid.shape, anisotropy(grid)),
             anisotropy: anisotropy(grid),
             lambda,
-            lipschitz,
+            lipschitz: lipschitz * (1.0 + settings.pull),
+            pull: (settings.pull / (1.0 + settings.pull)) as f32,
+            towards,
             t: 1.0,
             objective: f64::INFINITY,
         })
@@ -239,6 +258,13 @@ impl Method for Iterate {
             problem.back(views, &difference, &mut self.scratch);
             let step = (self.subsets / self.lipschitz) as f32;
             Zip::from(&mut self.scratch).and(&self.ahead).par_for_each(|g, z| *g = z + step * *g);
+            if self.pull > 0.0 {
+                let pull = self.pull;
+                Zip::from(&mut self.scratch)
+                    .and(&self.ahead)
+                    .and(&self.towards)
+                    .par_for_each(|g, z, to| *g += pull * (to - z));
+            }
             let tau = (self.lambda / self.lipschitz) as f32;
             self.prox.apply(flat(&self.scratch), tau, self.inner, flat_mut(&mut self.fresh));
             let t = 0.5 * (1.0 + (1.0 + 4.0 * self.t * self.t).sqrt());

@@ -82,6 +82,30 @@ fn volumes_that_do_not_fit_are_refused() {
     }
 }
 
+/// FISTA-TV with a pull ends between what the scan says and what it is held to, the nearer to that the stronger the pull.
+#[test]
+fn a_pull_holds_to_the_start() {
+    let truth = truth();
+    let scan = scan_of(&truth);
+    let start = truth.clone().mapped(|x| 0.9 * x + 1e-3);
+    let case = Case { file: Some(&start), ..Case::of(&scan) };
+    let spec = |pull: f64| {
+        format!(
+            "{START}[solver]\ntype = \"fista-tv\"\nstop = {{ passes = 6 }}\nweight = {{ fixed = 0.0 }}\npull = {pull:?}\n"
+        )
+    };
+    let free = case.volume(&spec(0.0)).0;
+    let apart: Vec<f64> =
+        [1e-2, 1.0, 1e4].iter().map(|&p| psnr(&case.volume(&spec(p)).0, &start) - psnr(&free, &start)).collect();
+    assert!(apart[0] > 1.0 && apart[1] > apart[0] + 6.0 && apart[2] > apart[1] + 20.0, "{apart:?}");
+    // Without a pull it goes to the truth, held a little it stays behind.
+    assert!(psnr(&free, &truth) > psnr(&case.volume(&spec(1.0)).0, &truth) + 3.0);
+
+    let alone = crate::kit::spec("[solver]\ntype = \"fista-tv\"\npull = 0.1\n").unwrap();
+    let e = alone.solver.build().unwrap().trains_field(&alone).unwrap_err().to_string();
+    assert!(e.contains("solver.pull: found 0.1, expected 0, or an initializer"), "{e}");
+}
+
 const IDENTITY: &str = "type = \"identity\"";
 const GRID: &str = "type = \"voxel-grid\"\nresolution = 24";
 const DENSE: &str = "type = \"dense-grid\"\nlevels = 2\nbase_resolution = 12\ngrowth = 2.0";
