@@ -300,7 +300,6 @@ impl Solver for Gradient {
             observer.progress(step, share, clock.seconds() * (1.0 - share).max(0.0) / share.max(1e-9));
         }
         clock.pause();
-        exe.fetch(&mut model)?;
         drop(source);
         let field = TrainedField { model, scene, unit_mm: job.scan.unit.mm };
         let (train_s, rollbacks) = (clock.seconds(), guard.rollbacks());

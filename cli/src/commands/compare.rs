@@ -163,8 +163,7 @@ impl Compare {
         for spec in &self.specs {
             let loaded = specs::read(spec, &self.protocol.sets)?;
             Parts::of(&loaded, backend.as_ref())?.check_weights(&loaded)?;
-            let stem = Path::new(spec).file_stem().map(|s| s.to_string_lossy().into_owned()).unwrap_or_default();
-            let name = if loaded.spec.name.is_empty() { stem } else { loaded.spec.name.clone() };
+            let name = if loaded.spec.name.is_empty() { files::stem(spec) } else { loaded.spec.name.clone() };
             let begins = name.starts_with(|c: char| c.is_alphanumeric());
             let plain =
                 name.chars().all(|c| c.is_alphanumeric() || " ._+()-".contains(c)) && !name.ends_with([' ', '.']);

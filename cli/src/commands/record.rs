@@ -3,8 +3,8 @@
 use super::{Ends, evaluate};
 use crate::budget::plan::Plan;
 use crate::memory::Memory;
-use crate::out;
 use crate::plugins::Used;
+use crate::{files, out};
 use conefield_core::backend::Explain;
 use conefield_core::scan::Scan;
 use conefield_metrics::Scores;
@@ -83,7 +83,7 @@ impl ScanRecord {
 
     /// The name of its file or folder.
     pub fn name(&self) -> String {
-        Path::new(&self.path).file_stem().map(|s| s.to_string_lossy().into_owned()).unwrap_or_default()
+        files::stem(&self.path)
     }
 
     /// In words.
