@@ -123,6 +123,7 @@ impl Compare {
         // Whatever is wrong with the input is told before anything is made.
         let mut methods = self.methods()?;
         let input = Input::read(&self.scan, &self.protocol)?;
+        methods.iter().try_for_each(|m| specs::check_held_out(&m.loaded, &input.held))?;
         let old = self.look_into_folder()?;
         for method in &mut methods {
             method.start = self.start(method, &input)?;

@@ -88,6 +88,12 @@ pub fn cases() -> Vec<Case> {
             &["spec.toml:3:11", "4611686018427387904"],
         ),
         refused(
+            "patience of no record",
+            toml("extends = \"naf\"\n[solver]\npatience = 0\n"),
+            TOML,
+            &["spec.toml:3:12", "solver.patience", "at least 1"],
+        ),
+        refused(
             "samples told in two ways",
             toml("extends = \"naf\"\n[projector]\nsamples = 64\nstep_voxels = 2\n"),
             TOML,
