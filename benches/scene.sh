@@ -27,7 +27,7 @@ for volume in $volumes; do
         runs+=("$name=$out/$volume-$name")
     }
     # As published: as many samples on every ray.
-    count=(--set 'projector={ type = "ray-march", samples = 256 }' --set solver.rays=1024)
+    count=(--set projector.samples=320 --set solver.rays=1024)
     run none box all "${count[@]}"
     run support carve all "${count[@]}"
     run levels box needed "${count[@]}"

@@ -26,7 +26,7 @@ const SAMPLES: usize = 320;
 fn pipeline() -> Result<Pipeline, Box<dyn Error>> {
     let encoder = HashGrid::default().build()?;
     let width = encoder.info().output;
-    let march = RayMarch { samples: SAMPLES, sampling: Sampling::Uniform, ..RayMarch::default() };
+    let march = RayMarch { samples: Some(SAMPLES), sampling: Sampling::Uniform, ..RayMarch::default() };
     let norm = LayerNorm::default().build(width)?;
     Ok(Pipeline::assemble(encoder, vec![norm], Mlp::default().build(width)?, march.build()?))
 }

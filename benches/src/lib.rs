@@ -7,6 +7,9 @@ use conefield_core::random::{mix, unit};
 use conefield_core::simd::{Op, Simd, run};
 use conefield_core::stage::UnitRay;
 use rayon::prelude::*;
+use serde_json::Value;
+use std::error::Error;
+use std::path::Path;
 use std::time::Instant;
 
 /// Minimum, median and maximum.
@@ -112,4 +115,17 @@ pub fn rays(count: usize) -> Vec<TrainRay> {
             }
         })
         .collect()
+}
+
+/// Name and folder of the run that `NAME=RUN_FOLDER` says, and the lines of its `metrics.jsonl`.
+pub fn metrics(run: &str) -> Result<(&str, &Path, Vec<Value>), Box<dyn Error>> {
+    let (name, folder) = run.split_once('=').ok_or("a run is NAME=FOLDER")?;
+    let folder = Path::new(folder);
+    let text = std::fs::read_to_string(folder.join("metrics.jsonl"))?;
+    Ok((name, folder, text.lines().map(serde_json::from_str).collect::<Result<_, _>>()?))
+}
+
+/// Seconds of training and PSNR, of a record of the metrics that has one.
+pub fn quality(record: &Value) -> Option<(f64, f64)> {
+    record["seconds"].as_f64().zip(record["psnr"].as_f64())
 }

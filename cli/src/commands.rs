@@ -18,6 +18,7 @@ mod record;
 mod schema;
 mod simulate;
 mod tradeoff;
+mod trained;
 mod trial;
 
 pub use reconstruct::{Method, Parts};

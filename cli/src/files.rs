@@ -42,6 +42,11 @@ fn phantom(name: &str) -> Result<Option<(PhantomKind, usize)>> {
     }
 }
 
+/// The name of a file or folder, without what it ends with.
+pub fn stem(path: &str) -> String {
+    Path::new(path).file_stem().map(|s| s.to_string_lossy().into_owned()).unwrap_or_default()
+}
+
 /// Reads a scan, checks it and warns of what will trouble a reconstruction.
 pub fn scan(path: &Path) -> Result<Scan> {
     let scan = conefield_io::read_scan(path)?;

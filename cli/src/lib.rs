@@ -15,6 +15,7 @@ mod run;
 mod segmenter;
 mod signals;
 pub mod specs;
+mod statistics;
 mod table;
 
 // Stage types register themselves when their crate is linked.

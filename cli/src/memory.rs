@@ -34,7 +34,7 @@ pub struct Memory {
     pub reference: u64,
     /// Parameters and gradients.
     pub model: u64,
-    /// Both moments of every parameter, and with parameters those of the last good state.
+    /// Both moments of every parameter, with parameters those of the last good state, and parameters of the best one.
     pub optimizer: u64,
     /// What backend, solver and writer work in, and the program itself.
     pub buffers: u64,

@@ -63,6 +63,18 @@ pub fn build(loaded: &Loaded) -> Result<Pipeline> {
     Pipeline::build(&loaded.spec).map_err(|e: Error| loaded.locate(e))
 }
 
+/// Refuses a setting that looks at views kept aside where `held`, the views that are, has none.
+pub fn check_held_out(loaded: &Loaded, held: &[usize]) -> Result<()> {
+    let solver = loaded.spec.solver.build().map_err(|e| loaded.locate(e))?;
+    match solver.needs_held_out() {
+        Some(setting) if held.is_empty() => {
+            let expected = "views to look at, such as --hold-out every:10";
+            Err(loaded.locate(Error::invalid("spec", setting, "no views kept aside", expected)))
+        }
+        _ => Ok(()),
+    }
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;

@@ -1,4 +1,4 @@
-//! The method's own experiments: drift, features as colours, label maps.
+//! The method's own experiments: drift, features as colours, label maps, an end by views kept aside.
 
 mod common;
 use common::{done, json, refused, text};
@@ -38,6 +38,21 @@ fn drift_stands_in_the_metrics_where_it_is_asked_for() {
     // The training is the same with and without.
     let volume = |run: &Path| fs::read(run.join("volume.nii.gz")).unwrap();
     assert!(volume(&plain) == volume(&run));
+}
+
+#[test]
+fn the_state_of_the_best_record_comes_out_and_is_told() {
+    // Every step is looked at, and steps are so long that not each is better than the one before.
+    let more = ["--hold-out", "every:4", "--set", "solver.patience=2", "--set", "solver.report_every=1"];
+    let (_dir, run) = run(&[&more[..], &["--set", "solver.decay=none", "--set", "solver.lr=0.1"]].concat());
+    let (all, record) = (records(&run), fs::read_to_string(run.join("record.json")).unwrap());
+    let record: Value = serde_json::from_str(&record).unwrap();
+    let error = |r: &Value| r["held_out"].as_f64().unwrap();
+    let best = all.iter().min_by(|a, b| error(a).total_cmp(&error(b))).unwrap();
+    assert_eq!((&record["best_step"], &record["held_out"]), (&best["step"], &best["held_out"]), "{all:?}");
+    let (steps, after) = (record["steps"].as_u64().unwrap(), best["step"].as_u64().unwrap() + 2);
+    assert!(steps == after && steps < 60, "{all:?}");
+    assert!(all.last().unwrap()["events"][0].as_str().unwrap().contains("stopping rule"));
 }
 
 #[test]

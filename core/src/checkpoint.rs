@@ -38,11 +38,11 @@ pub fn tensors(model: &Model) -> Vec<(String, &[usize], &[f32])> {
     tensors_of("", model.pipeline.layout(), [params, first, second])
 }
 
-/// Parameters and both moments of `layout` under the names of [`tensors`], with `prefix` before them.
-pub fn tensors_of<'a>(
+/// Parameters of `layout`, or these and both moments, under the names of [`tensors`], with `prefix` before them.
+pub fn tensors_of<'a, const N: usize>(
     prefix: &str,
     layout: &'a Layout,
-    parts: [&'a [f32]; 3],
+    parts: [&'a [f32]; N],
 ) -> Vec<(String, &'a [usize], &'a [f32])> {
     let mut all = vec![];
     for (part, values) in PARTS.into_iter().zip(parts) {
@@ -76,7 +76,7 @@ impl Resume {
     }
 
     /// What [`tensors_of`] gave of `layout` under `prefix`.
-    pub fn load(&self, prefix: &str, layout: &Layout, parts: [&mut [f32]; 3]) -> Result<()> {
+    pub fn load<const N: usize>(&self, prefix: &str, layout: &Layout, parts: [&mut [f32]; N]) -> Result<()> {
         for (part, values) in PARTS.into_iter().zip(parts) {
             let prefix = format!("{prefix}{part}.");
             let own =

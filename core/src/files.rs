@@ -31,3 +31,22 @@ pub fn read_text(path: &Path, most: u64) -> Result<String> {
     String::from_utf8(raw)
         .map_err(|e| invalid("text", format!("a byte that is no UTF-8: {}", e.utf8_error()), "UTF-8 text".into()))
 }
+
+/// The line of `text`, from 1, that a TOML error is about, where it says so.
+pub fn toml_line(text: &str, error: &toml::de::Error) -> Option<usize> {
+    let before = &text.as_bytes()[..error.span()?.start.min(text.len())];
+    Some(1 + before.iter().filter(|b| **b == b'\n').count())
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_toml_error_has_its_line() {
+        for (text, line) in [("a = = 1", 1), ("a = 1\n\nb = é", 3), ("a = 1\na = 2\n", 2), ("\n[b", 2)] {
+            let error = toml::from_str::<toml::Table>(text).unwrap_err();
+            assert_eq!(toml_line(text, &error), Some(line), "{text}");
+        }
+    }
+}

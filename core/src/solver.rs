@@ -204,6 +204,18 @@ pub struct Solution {
     pub samples: u64,
     /// Times that training ran away and went back to an earlier state.
     pub rollbacks: u64,
+    /// The record whose state came out, where views that are kept aside chose it.
+    pub best: Option<Best>,
+}
+
+/// A record that predicted views that are kept aside best.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct Best {
+    /// Its [`Record::step`].
+    pub step: u64,
+    /// Its [`Record::held_out`].
+    pub held_out: f64,
 }
 
 /// Scan in, reconstruction out.
@@ -221,6 +233,11 @@ pub trait Solver: Send + Sync {
     /// stages that it would pass over. Of a solver that does not say, the spec tells.
     fn trains_field(&self, spec: &Spec) -> Result<bool> {
         Ok(spec.encoder.is_some() || spec.field.is_some())
+    }
+
+    /// The setting that looks at views kept aside, if there is one: it is without effect in a job that has none.
+    fn needs_held_out(&self) -> Option<&'static str> {
+        None
     }
 
     /// What it will do with this scan, a line each, for `explain`.

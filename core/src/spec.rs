@@ -5,6 +5,7 @@
 
 mod check;
 pub mod load;
+mod one_of;
 pub mod schema;
 pub mod stage;
 mod tree;

@@ -2,7 +2,7 @@
 
 use crate::input::LONGEST_TEXT;
 use conefield_core::error::ensure;
-use conefield_core::files::read_text;
+use conefield_core::files::{read_text, toml_line};
 use conefield_core::{Error, Result};
 use serde::Deserialize;
 use serde::de::DeserializeOwned;
@@ -53,10 +53,7 @@ pub(crate) fn described<T: DeserializeOwned>(path: &Path, format: &str, version:
 /// Parses `text`, the content of `path`.
 pub(crate) fn parse<T: DeserializeOwned>(path: &Path, text: &str, notation: Notation) -> Result<T> {
     match notation {
-        Notation::Toml => toml::from_str(text).map_err(|e| {
-            let line = e.span().map(|s| 1 + text[..s.start.min(text.len())].matches('\n').count());
-            explain(path, text, line, e.message())
-        }),
+        Notation::Toml => toml::from_str(text).map_err(|e| explain(path, text, toml_line(text, &e), e.message())),
         Notation::Json => serde_json::from_str(text).map_err(|e| {
             let full = e.to_string();
             let message = full.rsplit_once(" at line ").map_or(full.as_str(), |(m, _)| m);

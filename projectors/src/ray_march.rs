@@ -35,9 +35,11 @@ pub enum Extent {
 /// Settings of `ray-march`.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields, default)]
+#[schemars(extend("x-one-of" = [["samples", "step_mm", "step_voxels"]]))]
 pub struct RayMarch {
-    /// Samples a ray. Ignored where a step is given.
-    pub samples: usize,
+    /// Samples a ray; 192 where neither they nor a step are given.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub samples: Option<usize>,
     /// Distance of samples in mm, instead of a count.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub step_mm: Option<f64>,
@@ -53,19 +55,22 @@ pub struct RayMarch {
 
 impl Default for RayMarch {
     fn default() -> Self {
-        Self { samples: 192, step_mm: None, step_voxels: None, sampling: Sampling::Stratified, extent: Extent::Clipped }
+        let (sampling, extent) = (Sampling::Stratified, Extent::Clipped);
+        Self { samples: None, step_mm: None, step_voxels: None, sampling, extent }
     }
 }
 
 conefield_core::stage_type!(Projector, "ray-march", RayMarch, "equal intervals along the ray, one sample each");
 
+/// Samples a ray where nothing is said of them.
+const SAMPLES: usize = 192;
 /// More than this on a ray is a mistake of units.
 const MOST_SAMPLES: usize = 65_536;
 
 #[typetag::serde(name = "ray-march")]
 impl ProjectorSpec for RayMarch {
     fn build(&self) -> Result<Box<dyn Projector>> {
-        let n = self.samples;
+        let n = self.count();
         ensure((1..=MOST_SAMPLES).contains(&n), "spec", "projector.samples", n, "1 to 65536")?;
         let positive = |step: Option<f64>| step.is_none_or(|s| s.is_finite() && s > 0.0);
         let shown = |step: Option<f64>| step.map_or(String::new(), |s| s.to_string());
@@ -73,13 +78,20 @@ impl ProjectorSpec for RayMarch {
         ensure(positive(step), "spec", "projector.step_mm", shown(step), "a positive number of mm")?;
         let step = self.step_voxels;
         ensure(positive(step), "spec", "projector.step_voxels", shown(step), "a positive number of voxels")?;
-        let both = self.step_mm.is_some() && step.is_some();
-        ensure(!both, "spec", "projector.step_voxels", "step_mm beside it", "one of them")?;
+        let ways =
+            [("samples", self.samples.is_some()), ("step_mm", self.step_mm.is_some()), ("step_voxels", step.is_some())];
+        let said: Vec<&str> = ways.iter().filter(|w| w.1).map(|w| w.0).collect();
+        ensure(said.len() <= 1, "spec", "projector", said.join(" and "), "one of samples, step_mm and step_voxels")?;
         Ok(Box::new(self.clone()))
     }
 }
 
 impl RayMarch {
+    /// Samples a ray, where they are counted.
+    fn count(&self) -> usize {
+        self.samples.unwrap_or(SAMPLES)
+    }
+
     fn range(&self, ray: &UnitRay) -> [f32; 2] {
         match self.extent {
             Extent::Published => ray.published,
@@ -94,7 +106,7 @@ impl Projector for RayMarch {
         if far <= near {
             return 0;
         }
-        let Some(step) = self.step_mm else { return self.samples };
+        let Some(step) = self.step_mm else { return self.count() };
         let wanted = f64::from(far - near) / (step * f64::from(ray.per_mm));
         (wanted.ceil() as usize).clamp(1, MOST_SAMPLES)
     }
@@ -124,7 +136,7 @@ impl Projector for RayMarch {
             (Some(step), _) => format!("a sample every {step} mm"),
             (_, Some(1.0)) => "a sample every voxel".into(),
             (_, Some(step)) => format!("a sample every {step} voxels"),
-            _ => format!("{} samples a ray", self.samples),
+            _ => format!("{} samples a ray", self.count()),
         };
         format!("ray-march: {count}, {:?}, {:?}", self.sampling, self.extent).to_lowercase()
     }
@@ -157,7 +169,8 @@ mod tests {
     fn weights_sum_to_the_length_and_the_last_interval_counts() {
         for extent in [Extent::Clipped, Extent::Published] {
             for step_mm in [None, Some(0.7)] {
-                let p = RayMarch { samples: 7, step_mm, step_voxels: None, sampling: Sampling::Uniform, extent };
+                let samples = if step_mm.is_none() { Some(7) } else { None };
+                let p = RayMarch { samples, step_mm, step_voxels: None, sampling: Sampling::Uniform, extent };
                 let mut s = Samples::default();
                 p.sample(&ray(), None, &mut s);
                 let length: f32 = s.weights.iter().sum();
@@ -169,8 +182,22 @@ mod tests {
     }
 
     #[test]
+    fn samples_are_told_in_one_way() {
+        let all = RayMarch { samples: Some(7), step_mm: Some(1.0), step_voxels: Some(2.0), ..RayMarch::default() };
+        for both in [
+            RayMarch { samples: None, ..all.clone() },
+            RayMarch { step_mm: None, ..all.clone() },
+            RayMarch { step_voxels: None, ..all.clone() },
+        ] {
+            let e = both.build().err().unwrap().to_string();
+            assert!(e.contains("one of samples, step_mm and step_voxels"), "{e}");
+        }
+        assert_eq!(RayMarch::default().build().unwrap().max_samples(&ray()), SAMPLES);
+    }
+
+    #[test]
     fn stratified_samples_stay_in_their_interval_and_repeat_by_seed() {
-        let p = RayMarch { samples: 16, ..RayMarch::default() };
+        let p = RayMarch { samples: Some(16), ..RayMarch::default() };
         let (mut a, mut b, mut c) = (Samples::default(), Samples::default(), Samples::default());
         p.sample(&ray(), Some(5), &mut a);
         p.sample(&ray(), Some(5), &mut b);

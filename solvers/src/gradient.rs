@@ -7,6 +7,7 @@ use crate::drift::{Drift, DriftWatch};
 use crate::fit::{Fitted, fit};
 use crate::guard::{Guard, Watched, strayed};
 use crate::iterative::start_volume;
+use crate::patience::{Patience, Waited};
 use crate::pretrain::learn;
 use crate::rays::{Pixels, RaySource, Views};
 use crate::schedule::{Clock, Decay, Ends};
@@ -79,6 +80,10 @@ pub struct Gradient {
     pub steps: Option<u64>,
     /// Ends after this many seconds of training. Which limit comes first ends the run.
     pub seconds: Option<f64>,
+    /// Ends when the held-out views' error has not fallen for this many records, of `report_every` steps each; the best of them
+    /// is kept. A learning rate that goes down does so until the end that is set: what it still brings may come late.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub patience: Option<u64>,
     /// Rays a step.
     pub rays: usize,
     /// Where a step takes its rays from.
@@ -118,6 +123,7 @@ impl Default for Gradient {
             epochs: None,
             steps: Some(1500),
             seconds: None,
+            patience: None,
             rays: 1024,
             views: Views::All,
             pixels: Pixels::Support,
@@ -150,6 +156,7 @@ impl SolverSpec for Gradient {
         let betas = self.betas.iter().all(|b| (0.0..1.0).contains(b));
         ensure(betas, place, "solver.betas", format!("{:?}", self.betas), "two numbers from 0 to below 1")?;
         ensure(self.report_every > 0, place, "solver.report_every", 0, "at least 1")?;
+        ensure(self.patience != Some(0), place, "solver.patience", 0, "at least 1")?;
         ensure(
             self.epochs.is_some() || self.steps.is_some() || self.seconds.is_some(),
             place,
@@ -193,11 +200,16 @@ impl Solver for Gradient {
         observer.note(&format!("{:.0}% of the pixels are trained on", 100.0 * source.share()));
         let mut model = Model::random(pipeline, job.seed);
         let mut guard = Guard::new(self.rollbacks, self.loss.into(), job.scan, &scene);
+        let mut patience = Patience::new(self.patience);
+        if self.patience.is_some() && job.held_out.is_none() {
+            observer.note("solver.patience looks at views that are kept aside, and none are: it does not end this run");
+        }
         let mut start = Start::default();
         if let Some(resume) = job.resume {
             resume.restore(&mut model)?;
             start = Start::read(resume)?;
             guard.resume(std::mem::take(&mut start.kept.guard), resume, &model)?;
+            patience.resume(std::mem::take(&mut start.kept.patience), resume, &model)?;
             observer.note(&format!("resumed after step {}", start.standing.step));
         } else if let Some(i) = initializer {
             let report = i.apply(model.pipeline.layout(), &mut model.arena)?;
@@ -240,7 +252,8 @@ impl Solver for Gradient {
             let cancelled = observer.cancelled();
             if step > standing.step && (cancelled || observer.checkpoint_due()) {
                 clock.pause();
-                let solver = serde_json::json!({ "window": window, "guard": guard.watched() });
+                let solver =
+                    serde_json::json!({ "window": window, "guard": guard.watched(), "patience": patience.waited() });
                 let masks = model.masks().to_vec();
                 let standing = Standing { step, samples, seconds: clock.seconds(), masks, solver };
                 exe.fetch(&mut model)?;
@@ -249,6 +262,7 @@ impl Solver for Gradient {
                     let mut tensors = tensors(&model);
                     tensors.extend(drift.iter().flat_map(|d| d.tensors(&model)));
                     tensors.extend(guard.tensors(model.pipeline.layout()));
+                    tensors.extend(patience.tensors(model.pipeline.layout()));
                     observer.checkpoint(&Checkpoint { tensors, standing })?;
                 }
                 clock.resume();
@@ -261,6 +275,7 @@ impl Solver for Gradient {
             if done && let Some(said) = guard.finish(step, &mut model, exe.as_mut())? {
                 window.tell(said, observer);
             }
+            let mut settled = false;
             if step > 0 && (step % self.report_every == 0 || done) && window.steps > 0 {
                 clock.pause();
                 let record = window.record(
@@ -268,16 +283,21 @@ impl Solver for Gradient {
                     clock.seconds(),
                     guard.rate() * self.lr * self.decay.at(step as f64 / steps_an_epoch, share),
                 );
-                let record = watch.fill(record, &model, exe.as_mut())?;
+                let mut record = watch.fill(record, &model, exe.as_mut())?;
+                settled = patience.judge(&record, &mut model, exe.as_mut())?;
+                if settled {
+                    record.events.push("the stopping rule is met".into());
+                }
                 observer.record(&record);
                 window = Window::default();
                 clock.resume();
             }
-            if done {
+            if done || settled {
                 break;
             }
             let epoch = step as f64 / steps_an_epoch;
             window.events.extend(model.refresh(&scene, epoch, job.backend, &mut exe)?);
+            patience.renew(&model);
             source.draw(job.seed, step, self.rays, &mut rays);
             let tv = self.tv.as_ref().map(|prior| {
                 blocks(prior, &scene, job.seed, step, &mut tv);
@@ -300,11 +320,15 @@ impl Solver for Gradient {
             observer.progress(step, share, clock.seconds() * (1.0 - share).max(0.0) / share.max(1e-9));
         }
         clock.pause();
-        exe.fetch(&mut model)?;
         drop(source);
+        let best = patience.finish(&mut model);
         let field = TrainedField { model, scene, unit_mm: job.scan.unit.mm };
         let (train_s, rollbacks) = (clock.seconds(), guard.rollbacks());
-        Ok(Solution { result: Reconstruction::Field(field), steps: step, train_s, samples, rollbacks })
+        Ok(Solution { result: Reconstruction::Field(field), steps: step, train_s, samples, rollbacks, best })
+    }
+
+    fn needs_held_out(&self) -> Option<&'static str> {
+        self.patience.map(|_| "solver.patience")
     }
 
     fn pretrain(&self, job: &PretrainJob<'_>, observer: &mut dyn Observer) -> Result<Model> {
@@ -320,14 +344,19 @@ impl Solver for Gradient {
         size_of::<u32>() as u64 * pixels
     }
 
-    /// Parameters and moments of the last good state.
+    /// Parameters and moments of the last good state, and parameters of the best one.
     fn memory_per_parameter(&self) -> u64 {
-        if self.rollbacks > 0 { 3 * size_of::<f32>() as u64 } else { 0 }
+        let good = if self.rollbacks > 0 { 3 } else { 0 };
+        size_of::<f32>() as u64 * (good + u64::from(self.patience.is_some()))
     }
 
     fn describe(&self) -> String {
         let tv = self.tv.as_ref().map_or(String::new(), |t| format!(", total variation {}", t.weight));
-        format!("gradient: {} rays a step, {:?}, Adam {}{tv}", self.rays, self.loss, self.lr).to_lowercase()
+        let ends = self.patience.map_or(String::new(), |n| {
+            let records = if n == 1 { "a record".into() } else { format!("{n} records") };
+            format!(", ends after {records} of {} steps without a smaller held-out error", self.report_every)
+        });
+        format!("gradient: {} rays a step, {:?}, Adam {}{tv}{ends}", self.rays, self.loss, self.lr).to_lowercase()
     }
 }
 
@@ -384,6 +413,7 @@ impl Start {
 struct Kept {
     window: Window,
     guard: Watched,
+    patience: Waited,
 }
 
 /// Sums since the last record.

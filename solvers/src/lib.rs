@@ -4,6 +4,7 @@
 //!   weights that other scans reuse.
 //! - [`fit`] finds out what a scan has need of, [`support`] where its object can be.
 //! - [`drift`] measures how much of a field changes while it trains.
+//! - [`guard`] takes a run that goes astray back, [`patience`] ends one that no longer gets better.
 //! - [`fdk`] filters and back-projects.
 //! - [`iterative`] improves voxels pass by pass: SART and its kin, CGLS, ASD-POCS, FISTA with total variation.
 
@@ -13,6 +14,7 @@ pub mod fit;
 pub mod gradient;
 pub mod guard;
 pub mod iterative;
+pub mod patience;
 pub mod pretrain;
 pub mod rays;
 pub mod schedule;

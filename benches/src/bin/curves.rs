@@ -1,10 +1,10 @@
 //! Draws PSNR against training time of finished runs, or their drift against epochs:
 //! `curves [--drift] OUT.png TITLE NAME=RUN_FOLDER...`.
 
+use conefield_benches::{metrics, quality};
 use conefield_io::{CurveOptions, curves_png_with};
 use serde_json::Value;
 use std::error::Error;
-use std::path::Path;
 
 type Curve = (String, Vec<(f64, f64)>);
 
@@ -24,18 +24,13 @@ fn main() -> Result<(), Box<dyn Error>> {
 }
 
 fn read(run: &str, points: fn(&Value) -> Vec<(f64, f64)>) -> Result<Curve, Box<dyn Error>> {
-    let (name, folder) = run.split_once('=').ok_or("a run is NAME=FOLDER")?;
-    let text = std::fs::read_to_string(Path::new(folder).join("metrics.jsonl"))?;
-    let mut all = vec![];
-    for line in text.lines() {
-        all.extend(points(&serde_json::from_str(line)?));
-    }
-    Ok((name.to_string(), all))
+    let (name, _, records) = metrics(run)?;
+    Ok((name.to_string(), records.iter().flat_map(points).collect()))
 }
 
 /// PSNR against seconds, of a record that has one.
 fn qualities(record: &Value) -> Vec<(f64, f64)> {
-    record["seconds"].as_f64().zip(record["psnr"].as_f64()).into_iter().collect()
+    quality(record).into_iter().collect()
 }
 
 /// Drift against epochs, as often as a record has it.

@@ -1,9 +1,9 @@
 //! A table of finished runs, and of each after how many seconds it was where the first one ended:
 //! `reach NAME=RUN_FOLDER...`.
 
+use conefield_benches::{metrics, quality};
 use serde_json::Value;
 use std::error::Error;
-use std::path::Path;
 
 struct Run {
     name: String,
@@ -36,14 +36,9 @@ fn main() -> Result<(), Box<dyn Error>> {
 }
 
 fn read(run: &str) -> Result<Run, Box<dyn Error>> {
-    let (name, folder) = run.split_once('=').ok_or("a run is NAME=FOLDER")?;
-    let text = |file: &str| std::fs::read_to_string(Path::new(folder).join(file));
-    let mut curve = vec![];
-    for line in text("metrics.jsonl")?.lines() {
-        let record: Value = serde_json::from_str(line)?;
-        curve.extend(record["seconds"].as_f64().zip(record["psnr"].as_f64()));
-    }
-    Ok(Run { name: name.into(), record: serde_json::from_str(&text("record.json")?)?, curve })
+    let (name, folder, records) = metrics(run)?;
+    let record = serde_json::from_str(&std::fs::read_to_string(folder.join("record.json"))?)?;
+    Ok(Run { name: name.into(), record, curve: records.iter().filter_map(quality).collect() })
 }
 
 /// When a curve first comes to `mark`, straight between its points.

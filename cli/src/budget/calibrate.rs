@@ -3,13 +3,13 @@
 
 use crate::commands::Parts;
 use crate::files;
-use conefield_core::Result;
 use conefield_core::backend::Backend;
 use conefield_core::geometry::VoxelGrid;
 use conefield_core::parts::Voxels;
 use conefield_core::scan::{Scan, Volume};
 use conefield_core::solver::{Job, Limits, Observer, Record};
 use conefield_core::spec::load::Loaded;
+use conefield_core::{Error, Result};
 use conefield_io::MiddleSlices;
 use ndarray::{Array3, s};
 use serde::Serialize;
@@ -173,12 +173,10 @@ fn packing(some: &mut dyn Voxels, whole: VoxelGrid) -> Result<f64> {
 fn picture(bench: &Bench<'_>) -> Result<f64> {
     let result = MiddleSlices::new(bench.scan.geometry.volume);
     let reference = bench.reference.map(MiddleSlices::of);
-    let path = std::env::temp_dir().join(format!("conefield-{}.png", std::process::id()));
+    let folder = tempfile::tempdir().map_err(|e| Error::io(std::env::temp_dir(), e))?;
     let begin = Instant::now();
-    let drawn = files::picture(&path, reference.as_ref(), &result);
-    let seconds = begin.elapsed().as_secs_f64();
-    let _ = std::fs::remove_file(&path);
-    drawn.map(|()| seconds)
+    files::picture(folder.path().join("slices.png"), reference.as_ref(), &result)?;
+    Ok(begin.elapsed().as_secs_f64())
 }
 
 fn score(bench: &Bench<'_>) -> Result<f64> {

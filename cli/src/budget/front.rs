@@ -1,7 +1,9 @@
 //! A front file: methods of which none is beaten in time, memory and accuracy, with what they took and reached on
 //! tuning scans. `conefield tradeoff` makes it, `conefield reconstruct --budget` picks from it.
 
+use crate::statistics::mean;
 use conefield_core::error::{Error, Result, ensure};
+use conefield_core::files::toml_line;
 use serde::{Deserialize, Serialize};
 use std::path::Path;
 
@@ -131,7 +133,7 @@ impl Front {
 
     fn parse(text: &str, place: &str) -> Result<Self> {
         let front: Self = toml::from_str(text).map_err(|e| {
-            let line = e.span().map_or(1, |s| 1 + text[..s.start.min(text.len())].matches('\n').count());
+            let line = toml_line(text, &e).unwrap_or(1);
             Error::invalid(format!("{place}:{line}"), "front", e.message(), "what conefield tradeoff writes")
         })?;
         ensure(!front.scans.is_empty(), place, "scans", "none", "the scans that it was measured on")?;
@@ -177,10 +179,7 @@ impl Point {
     /// What it reached, higher is better: the mean PSNR in dB, or where that is not known the error of views that were
     /// kept aside with its sign turned.
     pub fn accuracy(&self) -> f64 {
-        let mean = |of: fn(&Reached) -> Option<f64>| {
-            let all: Option<Vec<f64>> = self.runs.iter().map(of).collect();
-            all.map(|a| a.iter().sum::<f64>() / a.len().max(1) as f64)
-        };
+        let mean = |of: fn(&Reached) -> Option<f64>| mean(self.runs.iter().map(of));
         mean(|r| r.psnr).or_else(|| mean(|r| r.held_out).map(|e| -e)).unwrap_or(f64::NEG_INFINITY)
     }
 

@@ -123,6 +123,7 @@ impl Compare {
         // Whatever is wrong with the input is told before anything is made.
         let mut methods = self.methods()?;
         let input = Input::read(&self.scan, &self.protocol)?;
+        methods.iter().try_for_each(|m| specs::check_held_out(&m.loaded, &input.held))?;
         let old = self.look_into_folder()?;
         for method in &mut methods {
             method.start = self.start(method, &input)?;
@@ -163,8 +164,7 @@ impl Compare {
         for spec in &self.specs {
             let loaded = specs::read(spec, &self.protocol.sets)?;
             Parts::of(&loaded, backend.as_ref())?.check_weights(&loaded)?;
-            let stem = Path::new(spec).file_stem().map(|s| s.to_string_lossy().into_owned()).unwrap_or_default();
-            let name = if loaded.spec.name.is_empty() { stem } else { loaded.spec.name.clone() };
+            let name = if loaded.spec.name.is_empty() { files::stem(spec) } else { loaded.spec.name.clone() };
             let begins = name.starts_with(|c: char| c.is_alphanumeric());
             let plain =
                 name.chars().all(|c| c.is_alphanumeric() || " ._+()-".contains(c)) && !name.ends_with([' ', '.']);

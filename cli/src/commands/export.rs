@@ -1,12 +1,11 @@
 //! `conefield export`
 
 use super::convert::refuse_existing;
-use crate::backend::BackendChoice;
-use crate::memory::{self, Memory};
-use crate::{files, out, outgoing, signals};
+use super::trained::Trained;
+use crate::{memory, out, outgoing, signals};
 use clap::Args;
+use conefield_core::Result;
 use conefield_core::trained::FieldVoxels;
-use conefield_core::{Error, Result};
 use conefield_io::{PACKED_BYTES, SLAB_BYTES};
 use serde_json::json;
 use std::path::PathBuf;
@@ -18,17 +17,11 @@ use std::time::Instant;
 /// may be larger than memory.
 #[derive(Args)]
 pub struct Export {
-    /// The folder of the run, or its weights.safetensors.
-    run: PathBuf,
+    #[command(flatten)]
+    trained: Trained,
     /// The volume to write: .nii, .nii.gz, .mha or .npy.
     #[arg(short, long = "output", visible_alias = "out", value_name = "VOLUME")]
     output: PathBuf,
-    /// Voxels along the longest side [default: as the scan asked for].
-    #[arg(long, value_name = "N", value_parser = clap::value_parser!(u16).range(1..))]
-    voxels: Option<u16>,
-    /// Which backend: auto, cpu, wgpu, or wgpu:N with the number of an adapter.
-    #[arg(long, value_name = "BACKEND", default_value_t)]
-    backend: BackendChoice,
     /// Replace VOLUME.
     #[arg(long)]
     force: bool,
@@ -40,19 +33,13 @@ pub struct Export {
 impl Export {
     pub fn run(self) -> Result<()> {
         refuse_existing(&self.output, self.force)?;
-        let file = if self.run.is_dir() { self.run.join("weights.safetensors") } else { self.run };
-        let bytes = file.metadata().map_err(|e| Error::io(&file, e))?.len();
-        // The file and the numbers in it, then these and the model.
         let buffers = FieldVoxels::BYTES + SLAB_BYTES + PACKED_BYTES;
-        let memory = Memory::most(&[Memory { model: 2 * bytes, buffers, ..Memory::default() }]);
-        memory.check(|_| vec![])?;
-        let field = files::read_field(&file)?;
-        let trained = field.scene.grid;
-        let grid = self.voxels.map_or(trained, |n| trained.with_longest(n.into()));
-        let backend = self.backend.open()?;
+        let opened = self.trained.open(buffers)?;
+        let (memory, grid) = (opened.memory(buffers)?, opened.grid);
+        let backend = self.trained.backend.open()?;
         signals::listen()?;
         let start = Instant::now();
-        let mut voxels = field.voxels(backend.as_ref(), grid)?;
+        let mut voxels = opened.field.voxels(backend.as_ref(), grid)?;
         outgoing::write(&self.output, &mut voxels, None, false)?;
         let export_s = start.elapsed().as_secs_f64();
         if self.json {

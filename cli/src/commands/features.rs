@@ -1,10 +1,10 @@
 //! `conefield features`
 
 use super::convert::refuse_existing;
-use crate::backend::BackendChoice;
-use crate::memory::Memory;
+use super::trained::{Opened, Trained};
+use crate::out;
 use crate::pca::Pca;
-use crate::{files, out};
+use crate::statistics::pearson;
 use clap::{Args, ValueEnum};
 use conefield_core::error::{Error, Result};
 use conefield_core::geometry::VoxelGrid;
@@ -23,20 +23,14 @@ use std::path::PathBuf;
 /// its 99th percentile. Their signs mean nothing. The reconstruction stands beside them.
 #[derive(Args)]
 pub struct Features {
-    /// The folder of the run, or its weights.safetensors.
-    run: PathBuf,
+    #[command(flatten)]
+    trained: Trained,
     /// The picture to write (PNG).
     #[arg(short, long = "output", visible_alias = "out", value_name = "FILE")]
     output: PathBuf,
     /// Which features: as they leave the encoder, or as normalizers hand them to the field.
     #[arg(long, value_enum, default_value = "encoder")]
     after: After,
-    /// Voxels along the longest side [default: as the scan asked for].
-    #[arg(long, value_name = "N", value_parser = clap::value_parser!(u16).range(1..))]
-    voxels: Option<u16>,
-    /// Which backend: auto, cpu, wgpu, or wgpu:N with the number of an adapter.
-    #[arg(long, value_name = "BACKEND", default_value_t)]
-    backend: BackendChoice,
     /// Replace FILE.
     #[arg(long)]
     force: bool,
@@ -58,17 +52,12 @@ const DRAWN: usize = 3;
 impl Features {
     pub fn run(self) -> Result<()> {
         refuse_existing(&self.output, self.force)?;
-        let file = if self.run.is_dir() { self.run.join("weights.safetensors") } else { self.run.clone() };
-        let bytes = file.metadata().map_err(|e| Error::io(&file, e))?.len();
-        // The file and the numbers in it, then these and the model.
-        Memory::most(&[Memory { model: 2 * bytes, ..Memory::default() }]).check(|_| vec![])?;
-        let TrainedField { model, scene, unit_mm } = files::read_field(&file)?;
-        let grid = self.voxels.map_or(scene.grid, |n| scene.grid.with_longest(n.into()));
-        let planes = planes(&grid);
+        let opened = self.trained.open(0)?;
+        let planes = planes(&opened.grid);
         let count: u64 = planes.iter().map(|p| p.iter().map(|r| r.len() as u64).product::<u64>()).sum();
-        let width = model.pipeline.encoder.info().output as u64;
-        let buffers = count * (4 * 3 * width + 64);
-        Memory::most(&[Memory { model: 2 * bytes, buffers, ..Memory::default() }]).check(|_| vec![])?;
+        let width = opened.field.model.pipeline.encoder.info().output as u64;
+        opened.memory(count * (4 * 3 * width + 64))?;
+        let Opened { file, field: TrainedField { model, scene, unit_mm }, grid, .. } = opened;
         let voxels: Vec<[usize; 3]> = planes.iter().flat_map(indices).collect();
         let held: Vec<bool> = voxels.iter().map(|v| scene.holds(grid.voxel(*v))).collect();
         let points: Vec<[f32; 3]> =
@@ -79,7 +68,7 @@ impl Features {
             let expected = "at least one point where the object can be";
             return Err(Error::invalid(place, "middle slices", "none", expected));
         }
-        let (mut exe, _) = self.backend.open()?.compile(&model.pipeline)?;
+        let (mut exe, _) = self.trained.backend.open()?.compile(&model.pipeline)?;
         let mut features = exe.encode(&model, &points)?;
         let mut attenuation = vec![0.0; n];
         exe.evaluate(&model, &points, &mut attenuation)?;
@@ -96,7 +85,9 @@ impl Features {
             return Err(Error::invalid(place, "features", found, "features that differ"));
         };
         let drawn: Vec<Vec<f32>> = (0..channels.min(DRAWN)).map(|k| pca.component(k, &features, n)).collect();
-        let follows: Vec<Option<f64>> = drawn.iter().map(|c| correlation(c, &attenuation)).collect();
+        let wide = |v: &[f32]| v.iter().copied().map(f64::from).collect::<Vec<_>>();
+        let density = wide(&attenuation);
+        let follows: Vec<Option<f64>> = drawn.iter().map(|c| pearson(&wide(c), &density)).collect();
         let slices = |values: &[f32], outside: f32| slices(&grid, &planes, &held, values, outside);
         let mut colours: Vec<MiddleSlices> = drawn.iter().map(|c| slices(&stretched(c), f32::NAN)).collect();
         colours.resize_with(DRAWN, || slices(&vec![0.0; n], f32::NAN));
@@ -167,20 +158,6 @@ fn stretched(values: &[f32]) -> Vec<f32> {
     values.iter().map(|x| ((x - low) / span).clamp(0.0, 1.0)).collect()
 }
 
-/// Pearson's correlation; `None` where one of the two is the same everywhere.
-fn correlation(a: &[f32], b: &[f32]) -> Option<f64> {
-    let n = a.len() as f64;
-    let mean = |v: &[f32]| v.iter().map(|&x| f64::from(x)).sum::<f64>() / n;
-    let (ma, mb) = (mean(a), mean(b));
-    let (mut ab, mut aa, mut bb) = (0.0, 0.0, 0.0);
-    for (&a, &b) in a.iter().zip(b) {
-        let (a, b) = (f64::from(a) - ma, f64::from(b) - mb);
-        (ab, aa, bb) = (ab + a * b, aa + a * a, bb + b * b);
-    }
-    let r = ab / (aa * bb).sqrt();
-    r.is_finite().then_some(r)
-}
-
 #[cfg(test)]
 mod tests {
     use super::*;
@@ -201,14 +178,10 @@ mod tests {
     }
 
     #[test]
-    fn colours_fill_their_range_and_correlations_are_known() {
+    fn colours_fill_their_range() {
         let ramp: Vec<f32> = (0..=100).map(|i| i as f32).collect();
         let s = stretched(&ramp);
         assert_eq!((s[0], s[1], s[50], s[99], s[100]), (0.0, 0.0, 0.5, 1.0, 1.0));
         assert_eq!(stretched(&[4.0; 3]), [0.0; 3]);
-        let down: Vec<f32> = ramp.iter().map(|x| 3.0 - 0.5 * x).collect();
-        assert!((correlation(&ramp, &down).unwrap() + 1.0).abs() < 1e-12);
-        assert_eq!(correlation(&ramp, &vec![2.0; 101]), None);
-        assert_eq!(correlation(&[-1.0, 0.0, 1.0], &[1.0, 0.0, 1.0]), Some(0.0));
     }
 }

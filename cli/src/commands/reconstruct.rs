@@ -160,6 +160,7 @@ impl Reconstruct {
         let reference = protocol.reference(&self.scan, &whole)?;
         let held = protocol.held_out(whole.geometry.views.len());
         let scan_record = ScanRecord::of(&self.scan, &whole);
+        asked.iter().try_for_each(|m| specs::check_held_out(&m.loaded, &held))?;
         let (scan, held_scan) = if held.is_empty() { (whole, None) } else { split(whole, &held)? };
         let load_s = begin.elapsed().as_secs_f64();
 
@@ -193,6 +194,7 @@ impl Reconstruct {
                 return Err(Error::invalid("reconstruct", "--spec", "nothing", "a spec, or --budget to choose one by"));
             }
         };
+        specs::check_held_out(&method.loaded, &held)?;
         plan.iter().flat_map(|p| p.lines(&method)).for_each(|line| info!("{line}"));
         info!("memory: {}", method.memory.line());
         let identity = identity(&method)?;
@@ -274,7 +276,8 @@ impl Reconstruct {
             samples_per_s: (solution.samples > 0 && solution.train_s > 0.0)
                 .then(|| solution.samples as f64 / solution.train_s),
             loss: last.as_ref().and_then(|r| r.loss),
-            held_out: last.as_ref().and_then(|r| r.held_out),
+            held_out: solution.best.map(|b| b.held_out).or(last.as_ref().and_then(|r| r.held_out)),
+            best_step: solution.best.map(|b| b.step),
             peak: protocol.peak,
             scores,
         };

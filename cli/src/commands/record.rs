@@ -3,8 +3,8 @@
 use super::{Ends, evaluate};
 use crate::budget::plan::Plan;
 use crate::memory::Memory;
-use crate::out;
 use crate::plugins::Used;
+use crate::{files, out};
 use conefield_core::backend::Explain;
 use conefield_core::scan::Scan;
 use conefield_metrics::Scores;
@@ -54,7 +54,11 @@ pub struct Record {
     /// Of solvers that take samples.
     pub samples_per_s: Option<f64>,
     pub loss: Option<f64>,
+    /// Of what came out.
     pub held_out: Option<f64>,
+    /// After which step that was, where held-out views chose it.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub best_step: Option<u64>,
     pub peak: f64,
     pub scores: Option<Scores>,
 }
@@ -83,7 +87,7 @@ impl ScanRecord {
 
     /// The name of its file or folder.
     pub fn name(&self) -> String {
-        Path::new(&self.path).file_stem().map(|s| s.to_string_lossy().into_owned()).unwrap_or_default()
+        files::stem(&self.path)
     }
 
     /// In words.
@@ -121,7 +125,9 @@ pub fn summary(r: &Record, output: &Path) -> String {
         ));
     }
     if let Some(h) = r.held_out {
-        lines.push(format!("held-out error  {h:.5} of the largest line integral ({} views)", r.held_out_views.len()));
+        let best = r.best_step.map_or(String::new(), |n| format!(", the least: what came after step {n} was kept"));
+        let views = r.held_out_views.len();
+        lines.push(format!("held-out error  {h:.5} of the largest line integral ({views} views){best}"));
     }
     if let Some(s) = &r.scores {
         lines.push(evaluate::lines(s));

@@ -5,7 +5,7 @@ use crate::memory::Memory;
 use crate::parse::{self, Angles as AnglesArg, Values};
 use crate::{files, out};
 use clap::Args;
-use conefield_core::files::read_text;
+use conefield_core::files::{read_text, toml_line};
 use conefield_core::scan::Volume;
 use conefield_core::{Error, Result};
 use conefield_projectors::simulate::{Angles, HuMapping, Noise, Protocol, downsample, simulate};
@@ -172,8 +172,7 @@ fn read_protocol(path: &Path) -> Result<Protocol> {
             .map_err(|e| Error::invalid(format!("{place}:{}:{}", e.line(), e.column()), "protocol", e, "a protocol"));
     }
     toml::from_str(&text).map_err(|e| {
-        let before = e.span().and_then(|s| text.get(..s.start)).unwrap_or_default();
-        let line = before.matches('\n').count() + 1;
+        let line = toml_line(&text, &e).unwrap_or(1);
         Error::invalid(format!("{place}:{line}"), "protocol", e.message(), "a protocol")
     })
 }

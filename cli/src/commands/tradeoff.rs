@@ -3,7 +3,6 @@
 mod halving;
 mod levers;
 mod pareto;
-mod rank;
 mod report;
 
 use super::protocol::Protocol;
@@ -13,6 +12,7 @@ use super::{Ends, General, backends::simd_level};
 use crate::backend::BackendChoice;
 use crate::budget::TOO_SHORT;
 use crate::parse::{self, HoldOut};
+use crate::statistics::mean;
 use crate::{out, signals};
 use clap::Args;
 use conefield_core::error::ensure;
@@ -375,11 +375,8 @@ fn outcome(search: &Search, over: &[Over], candidate: &Candidate, budget: f64) -
     if here.iter().any(|o| o.status == Status::TooShort) {
         return Outcome::TooShort;
     }
-    let all: Option<Vec<f64>> = here.iter().map(|o| o.figures.as_ref().and_then(|f| accuracy(search, f))).collect();
-    match all.filter(|a| !a.is_empty()) {
-        Some(a) => Outcome::Accuracy(a.iter().sum::<f64>() / a.len() as f64),
-        None => Outcome::Failed,
-    }
+    let accuracies = here.iter().map(|o| o.figures.as_ref().and_then(|f| accuracy(search, f)));
+    mean(accuracies).map_or(Outcome::Failed, Outcome::Accuracy)
 }
 
 /// A value in few words.

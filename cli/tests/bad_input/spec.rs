@@ -88,6 +88,18 @@ pub fn cases() -> Vec<Case> {
             &["spec.toml:3:11", "4611686018427387904"],
         ),
         refused(
+            "patience of no record",
+            toml("extends = \"naf\"\n[solver]\npatience = 0\n"),
+            TOML,
+            &["spec.toml:3:12", "solver.patience", "at least 1"],
+        ),
+        refused(
+            "samples told in two ways",
+            toml("extends = \"naf\"\n[projector]\nsamples = 64\nstep_voxels = 2\n"),
+            TOML,
+            &["spec.toml:4:1", "projector.step_voxels", "samples beside it", "one of samples, step_mm, step_voxels"],
+        ),
+        refused(
             "a batch of 2^62 rays",
             toml("extends = \"naf\"\n[solver]\nrays = 4611686018427387904\n"),
             TOML,

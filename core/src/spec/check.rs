@@ -1,6 +1,7 @@
 //! Checks a spec as written against what the registered stage types know, so that a mistake is told with its line,
 //! its path and the nearest valid name.
 
+use super::one_of;
 use super::schema::{NESTED, STAGES, of_type, tables};
 use super::tree::{At, Kind as Is, Node};
 use crate::error::{Error, Result};
@@ -61,22 +62,24 @@ fn stage(node: &Node, kind: Kind, path: &str) -> Result<()> {
         return Err(invalid(&name.at, &join(path, "type"), found, suggest(text, &known)));
     };
     let schema = of_type(found);
-    object(node, &schema, &Context::new(&schema, Some(kind)), path)
+    let cx = Context::new(&schema, Some(kind));
+    one_of::check(node, &schema, &cx, path)?;
+    object(node, &schema, &cx, path)
 }
 
 /// Where references of a schema lead, and what kind of stage it belongs to.
-struct Context<'a> {
+pub(super) struct Context<'a> {
     root: &'a Value,
     kind: Option<Kind>,
 }
 
 impl<'a> Context<'a> {
-    fn new(root: &'a Value, kind: Option<Kind>) -> Self {
+    pub(super) fn new(root: &'a Value, kind: Option<Kind>) -> Self {
         Self { root, kind }
     }
 
     /// The schema that `schema` refers to, or itself.
-    fn resolve<'b>(&'b self, schema: &'b Value) -> &'b Value {
+    pub(super) fn resolve<'b>(&'b self, schema: &'b Value) -> &'b Value {
         let target = schema["$ref"].as_str().and_then(|r| self.root.pointer(r.trim_start_matches('#')));
         target.unwrap_or(schema)
     }
@@ -91,6 +94,7 @@ fn setting(node: &Node, schema: &Value, cx: &Context<'_>, path: &str) -> Result<
     if let (Some(kind), true, true) = (cx.kind, is_open(schema), node.get("type").is_some()) {
         return stage(node, kind, path);
     }
+    one_of::check(node, schema, cx, path)?;
     let wrong = || invalid(&node.at, path, node.shown(), wanted(schema, cx));
     let choices: Vec<&Value> =
         ["anyOf", "oneOf"].iter().filter_map(|k| schema[*k].as_array()).flatten().map(|s| cx.resolve(s)).collect();
@@ -271,11 +275,11 @@ fn table(node: &Node, path: &str) -> Result<()> {
     }
 }
 
-fn join(path: &str, key: &str) -> String {
+pub(super) fn join(path: &str, key: &str) -> String {
     format!("{path}.{key}")
 }
 
-fn invalid(at: &At, path: &str, found: String, expected: String) -> Error {
+pub(super) fn invalid(at: &At, path: &str, found: String, expected: String) -> Error {
     Error::invalid(at.to_string(), path, found, expected)
 }
 
@@ -298,7 +302,7 @@ pub(super) fn suggest(name: &str, known: &[&str]) -> String {
     }
 }
 
-fn listed(known: &[&str]) -> String {
+pub(super) fn listed(known: &[&str]) -> String {
     match known {
         [] => "none is known here".into(),
         [one] => (*one).into(),

@@ -5,7 +5,7 @@
 //! then becomes a [`Spec`].
 
 use super::tree::{At, Entry, Kind, Node, parse_json, parse_toml};
-use super::{Spec, check};
+use super::{Spec, check, one_of};
 use crate::error::{Error, Result};
 use crate::files;
 use serde_json::Value;
@@ -86,7 +86,8 @@ impl Draft {
 
     /// Checks it against the stage types that there are.
     pub fn finish(self) -> Result<Loaded> {
-        let Self { written, source } = self;
+        let Self { mut written, source } = self;
+        one_of::settle(&mut written);
         check::spec(&written)?;
         let spec: Spec = serde_path_to_error::deserialize(written.to_json()).map_err(|e| {
             let path: Vec<String> = steps(&e.path().to_string());
@@ -210,7 +211,10 @@ impl Layer {
             Origin::File(p) if p.extension().is_some_and(|e| e.eq_ignore_ascii_case("toml")) => false,
             _ => self.text.trim_start().starts_with('{'),
         };
-        let mut node = if is_json { parse_json(&label, &self.text)? } else { parse_toml(&label, &self.text)? };
+        // Over the first one lie the `--set`s.
+        let depth = 1 + above.len();
+        let parse = if is_json { parse_json } else { parse_toml };
+        let mut node = parse(&label, &self.text, depth)?;
         node.take("$schema");
         if let Origin::File(path) = &self.origin {
             anchor_plugins(&mut node, path);
@@ -284,7 +288,7 @@ impl Set {
         }
         let at = At::whole(&label);
         // A TOML value, or else a text that needs no quotes.
-        let parsed = parse_toml("", &format!("value = {value}")).ok().filter(|n| n.entries().len() == 1);
+        let parsed = parse_toml("", &format!("value = {value}"), 0).ok().filter(|n| n.entries().len() == 1);
         let kind = match parsed.and_then(|mut n| n.take("value")) {
             Some(e) => e.value.kind,
             None => Kind::String(value.to_owned()),
@@ -426,6 +430,32 @@ mod tests {
     }
 
     #[derive(Serialize, Deserialize, JsonSchema)]
+    #[serde(rename_all = "kebab-case")]
+    enum Pace {
+        Even,
+        Fast(f64),
+        Slow { by: f64 },
+    }
+
+    #[derive(Default, Serialize, Deserialize, JsonSchema)]
+    #[serde(deny_unknown_fields, default)]
+    #[schemars(extend("x-one-of" = [["steps", "seconds", "passes"]]))]
+    struct TestClock {
+        steps: Option<u64>,
+        seconds: Option<f64>,
+        passes: Option<u64>,
+        pace: Option<Pace>,
+    }
+
+    crate::stage_type!(Solver, "test-clock", TestClock, "for tests");
+    #[typetag::serde(name = "test-clock")]
+    impl SolverSpec for TestClock {
+        fn build(&self) -> Result<Box<dyn crate::solver::Solver>> {
+            Err(Error::unsupported("test-clock", "for tests"))
+        }
+    }
+
+    #[derive(Serialize, Deserialize, JsonSchema)]
     #[serde(deny_unknown_fields, default)]
     struct TestSolver {
         steps: u64,
@@ -451,6 +481,7 @@ mod tests {
             text: "name = 'plain'\n[encoder]\ntype = 'test-grid'\nlevels = 3\n[solver]\ntype = 'test-solver'\n",
         },
         Shipped { name: "curved", text: "extends = 'plain'\nname = 'curved'\n[encoder]\nway = 'round'\n" },
+        Shipped { name: "timed", text: "[solver]\ntype = 'test-clock'\nseconds = 9\npace = { slow = { by = 2 } }\n" },
     ];
 
     fn read(text: &str, sets: &[&str]) -> Result<Loaded> {
@@ -558,6 +589,32 @@ mod tests {
     }
 
     #[test]
+    fn what_an_upper_layer_says_takes_the_place_of_another_way_to_say_it() {
+        let said = |text: &str, sets: &[&str]| {
+            let solver = read(text, sets).unwrap().tree["solver"].clone();
+            let keys = ["steps", "seconds", "passes"].iter().filter(|k| !solver[**k].is_null());
+            (keys.copied().collect::<Vec<_>>().join(" "), solver["pace"].to_string())
+        };
+        let base = "extends = 'timed'\n";
+        assert_eq!(said(base, &[]), ("seconds".into(), "{\"slow\":{\"by\":2.0}}".into()));
+        assert_eq!(said(&format!("{base}solver.steps = 3\n"), &[]).0, "steps");
+        assert_eq!(said(&format!("{base}solver.steps = 3\n"), &["solver.passes=4"]).0, "passes");
+        assert_eq!(said(&format!("{base}solver.steps = 3\n"), &["solver.seconds=4"]).0, "seconds");
+        assert_eq!(said("{\"extends\": \"timed\", \"solver\": {\"passes\": null}}", &[]).0, "seconds");
+        for set in ["solver.pace.fast=0.5", "solver.pace={fast=0.5}"] {
+            assert_eq!(said(base, &[set]).1, "{\"fast\":0.5}", "{set}");
+        }
+        assert_eq!(said(base, &["solver.pace.slow.by=3"]).1, "{\"slow\":{\"by\":3.0}}");
+        // Two ways in one layer are a mistake.
+        let e = refusal(&format!("{base}[solver]\nsteps = 3\npasses = 4\n"), &[]);
+        assert!(e.starts_with("a.toml:4:1: solver.passes: found steps beside it, expected one of steps, "), "{e}");
+        let e = refusal(base, &["solver.steps=3", "solver.passes=4"]);
+        assert!(e.starts_with("--set solver.passes=4: solver.passes: found steps beside it"), "{e}");
+        let e = refusal(base, &["solver.pace={fast=1,slow={by=2}}"]);
+        assert!(e.contains("solver.pace"), "{e}");
+    }
+
+    #[test]
     fn errors_of_a_stage_get_their_line() {
         let l = read("extends = 'plain'\n[encoder]\ngrowth = 2\nlevels = 9\n", &[]).unwrap();
         let e = l.locate(l.spec.encoder.as_ref().unwrap().build().err().unwrap()).to_string();
@@ -578,6 +635,9 @@ mod tests {
     #[test]
     fn an_unknown_name_lists_what_there_is() {
         let e = load("plan", &[], SHIPPED).err().unwrap().to_string();
-        assert!(e.contains("neither a shipped spec nor a file") && e.contains("\"plain\" (of plain, curved)"), "{e}");
+        assert!(
+            e.contains("neither a shipped spec nor a file") && e.contains("\"plain\" (of plain, curved, timed)"),
+            "{e}"
+        );
     }
 }

@@ -8,6 +8,10 @@ use serde_json::{Map, Value, json};
 /// `schema_with` function that returns `{"x-stage": "encoder"}`.
 pub const NESTED: &str = "x-stage";
 
+/// Marks, in a settings schema, groups of keys of which a table has only one:
+/// `#[schemars(extend("x-one-of" = [["steps", "seconds"]]))]`.
+pub const ONE_OF: &str = "x-one-of";
+
 /// The keys of a spec that hold a stage, with the kind that stands there. `normalizers` is a list.
 pub(super) const STAGES: [(&str, Kind); 6] = [
     ("encoder", Kind::Encoder),

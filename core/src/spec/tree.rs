@@ -21,18 +21,30 @@ pub(super) struct At {
 struct Source {
     name: String,
     text: String,
+    /// Layers of a spec that lie over it.
+    depth: usize,
 }
 
 impl Source {
-    fn new(name: &str, text: &str) -> Arc<Self> {
-        Arc::new(Self { name: name.into(), text: text.into() })
+    fn new(name: &str, text: &str, depth: usize) -> Arc<Self> {
+        Arc::new(Self { name: name.into(), text: text.into(), depth })
     }
 }
 
 impl At {
-    /// A source without lines.
+    /// A source without lines, over all layers.
     pub(super) fn whole(name: &str) -> Self {
-        Self { source: Source::new(name, ""), offset: None }
+        Self { source: Source::new(name, "", 0), offset: None }
+    }
+
+    /// The byte of its source, if it has any.
+    pub(super) fn offset(&self) -> Option<usize> {
+        self.offset
+    }
+
+    /// How many layers of a spec lie over its source.
+    pub(super) fn depth(&self) -> usize {
+        self.source.depth
     }
 
     /// The byte `offset` of the source's text.
@@ -43,7 +55,7 @@ impl At {
 
 impl fmt::Display for At {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        let Source { name, text } = &*self.source;
+        let Source { name, text, .. } = &*self.source;
         f.write_str(name)?;
         if let Some(offset) = self.offset {
             let before = &text.as_bytes()[..offset.min(text.len())];
@@ -188,9 +200,9 @@ impl Node {
     }
 }
 
-/// Reads TOML.
-pub(super) fn parse_toml(source: &str, text: &str) -> Result<Node> {
-    let source = Source::new(source, text);
+/// Reads TOML, over which `depth` layers lie.
+pub(super) fn parse_toml(source: &str, text: &str, depth: usize) -> Result<Node> {
+    let source = Source::new(source, text, depth);
     let root = DeTable::parse(text).map_err(|e| {
         let at = At::byte(&source, e.span().map_or(0, |s| s.start));
         Error::invalid(at.to_string(), "syntax", e.message().replace('\n', ", "), "TOML")
@@ -236,9 +248,9 @@ fn toml_value(source: &Arc<Source>, value: &DeValue<'_>, at: At) -> Result<Node>
     Ok(Node { at, kind })
 }
 
-/// Reads JSON.
-pub(super) fn parse_json(source: &str, text: &str) -> Result<Node> {
-    let source = Source::new(source, text);
+/// Reads JSON, over which `depth` layers lie.
+pub(super) fn parse_json(source: &str, text: &str, depth: usize) -> Result<Node> {
+    let source = Source::new(source, text, depth);
     // serde_json checks syntax and depth; what follows only has to find its way through valid text.
     serde_json::from_str::<Value>(text).map_err(|e| {
         let why = e.to_string();
@@ -343,8 +355,8 @@ mod tests {
 
     #[test]
     fn toml_and_json_read_alike_and_know_their_lines() {
-        let t = parse_toml("a.toml", "x = 1\n[b]\n  y = [2.5, \"é\"]\n").unwrap();
-        let j = parse_json("a.json", "{ \"x\": 1,\n \"b\": {\n\n \"y\": [2.5, \"\\u00e9\"] } }").unwrap();
+        let t = parse_toml("a.toml", "x = 1\n[b]\n  y = [2.5, \"é\"]\n", 1).unwrap();
+        let j = parse_json("a.json", "{ \"x\": 1,\n \"b\": {\n\n \"y\": [2.5, \"\\u00e9\"] } }", 1).unwrap();
         assert_eq!(t.to_json(), j.to_json());
         assert_eq!(t.nearest(&["b", "y", "1"]).at.to_string(), "a.toml:3:13");
         assert_eq!(j.nearest(&["b", "y", "1"]).at.to_string(), "a.json:4:13");
@@ -353,20 +365,20 @@ mod tests {
 
     #[test]
     fn syntax_errors_name_the_line() {
-        let e = parse_toml("a.toml", "x = 1\ny = = 2\n").unwrap_err().to_string();
+        let e = parse_toml("a.toml", "x = 1\ny = = 2\n", 1).unwrap_err().to_string();
         assert!(e.starts_with("a.toml:2:"), "{e}");
-        let e = parse_json("a.json", "{\n \"x\": }").unwrap_err().to_string();
+        let e = parse_json("a.json", "{\n \"x\": }", 1).unwrap_err().to_string();
         assert!(e.starts_with("a.json:2:"), "{e}");
-        let e = parse_json("a.json", "{ \"x\": 1,\n \"x\": 2}").unwrap_err().to_string();
+        let e = parse_json("a.json", "{ \"x\": 1,\n \"x\": 2}", 1).unwrap_err().to_string();
         assert!(e.starts_with("a.json:2:2: x: found the key a second time"), "{e}");
-        let e = parse_toml("a.toml", "x = nan").unwrap_err().to_string();
+        let e = parse_toml("a.toml", "x = nan", 1).unwrap_err().to_string();
         assert!(e.contains("a finite number"), "{e}");
     }
 
     #[test]
     fn a_changed_type_drops_the_keys_of_the_old_one() {
-        let mut base = parse_toml("base", "[a]\ntype = 'one'\nk = 1\n[b]\ntype = 'one'\nk = 1\n").unwrap();
-        base.merge(parse_toml("over", "[a]\ntype = 'two'\n[b]\nl = 2\n").unwrap());
+        let mut base = parse_toml("base", "[a]\ntype = 'one'\nk = 1\n[b]\ntype = 'one'\nk = 1\n", 1).unwrap();
+        base.merge(parse_toml("over", "[a]\ntype = 'two'\n[b]\nl = 2\n", 1).unwrap());
         let want = serde_json::json!({"a": {"type": "two"}, "b": {"type": "one", "k": 1, "l": 2}});
         assert_eq!(base.to_json(), want);
     }

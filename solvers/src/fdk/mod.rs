@@ -118,12 +118,14 @@ impl Solver for Fdk {
         let mm = scan.unit.mm as f32;
         let watch = Watch::new(job);
         let psnr = watch.psnr(&volume, mm);
-        let projector = job.backend.place(Box::new(Joseph {}))?;
-        let held_out = watch.held_out(projector.operator(), &volume);
+        let held_out = match job.held_out {
+            Some(_) => watch.held_out(job.backend.place(Box::new(Joseph {}))?.operator(), &volume),
+            None => None,
+        };
         observer.record(&Record { step: 1, seconds: train_s, psnr, held_out, ..Record::default() });
         volume.par_mapv_inplace(|x| x * mm);
         let volume = Volume { data: volume, grid: g.volume, affine: None };
-        Ok(Solution { result: Reconstruction::Volume(volume), steps: 1, train_s, samples: 0, rollbacks: 0 })
+        Ok(Solution { result: Reconstruction::Volume(volume), steps: 1, train_s, samples: 0, rollbacks: 0, best: None })
     }
 
     fn trains_field(&self, spec: &Spec) -> Result<bool> {

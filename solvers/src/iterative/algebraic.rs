@@ -181,6 +181,10 @@ impl Solver for Algebraic {
         vec![told(&subsets(scan.geometry.views.len(), self.subsets))]
     }
 
+    fn needs_held_out(&self) -> Option<&'static str> {
+        self.stop.needs_held_out()
+    }
+
     fn working_memory(&self, pixels: u64, voxels: u64) -> u64 {
         let before = if self.stop.change.is_some() { 4 * voxels } else { 0 };
         Sweep::memory(self.subsets, pixels, voxels) + before + self.stop.kept(voxels)

@@ -110,6 +110,10 @@ impl Solver for AsdPocs {
         vec![told(&subsets(scan.geometry.views.len(), self.subsets)), noise]
     }
 
+    fn needs_held_out(&self) -> Option<&'static str> {
+        self.stop.needs_held_out()
+    }
+
     /// Beside a sweep's there are the volume before it and the descent's direction; after it, one more copy instead of
     /// inverse column sums. The noise is read from differences of all pixels before that.
     fn working_memory(&self, pixels: u64, voxels: u64) -> u64 {

@@ -54,6 +54,10 @@ impl Solver for Cgls {
         Ok(false)
     }
 
+    fn needs_held_out(&self) -> Option<&'static str> {
+        self.stop.needs_held_out()
+    }
+
     /// Direction and gradient, the residual and the direction's projections.
     fn working_memory(&self, pixels: u64, voxels: u64) -> u64 {
         2 * 4 * (pixels + voxels) + projecting(pixels) + self.stop.kept(voxels)

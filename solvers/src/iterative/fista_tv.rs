@@ -134,6 +134,10 @@ impl Solver for FistaTv {
         vec![told(&subsets(scan.geometry.views.len(), self.subsets)), noise]
     }
 
+    fn needs_held_out(&self) -> Option<&'static str> {
+        self.stop.needs_held_out()
+    }
+
     /// Beside the volume there are the point ahead of it, the fresh and the last volume, a gradient and the dual of three
     /// components; and the residuals of a subset, which may come to be all views, and where there is air.
     fn working_memory(&self, pixels: u64, voxels: u64) -> u64 {

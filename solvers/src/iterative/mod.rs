@@ -17,7 +17,7 @@ use conefield_core::Error;
 use conefield_core::checkpoint::{Checkpoint, Resume, Standing};
 use conefield_core::error::{Result, ensure};
 use conefield_core::scan::{Scan, Volume};
-use conefield_core::solver::{Job, Observer, Reconstruction, Record, Solution};
+use conefield_core::solver::{Best, Job, Observer, Reconstruction, Record, Solution};
 use conefield_core::spec::{Spec, VolumeStart};
 use conefield_core::voxel::{VoxelOperator, VoxelProjector};
 use ndarray::{Array2, Array3, Axis, Zip};
@@ -57,6 +57,11 @@ impl Stop {
             }
         }
         ensure(self.patience != Some(0), "spec", "solver.stop.patience", 0, "at least 1")
+    }
+
+    /// See [`conefield_core::solver::Solver::needs_held_out`].
+    fn needs_held_out(&self) -> Option<&'static str> {
+        self.patience.map(|_| "solver.stop.patience")
     }
 
     /// Bytes of the volume that [`drive`] keeps for `patience`.
@@ -368,6 +373,7 @@ pub fn drive(
         train_s: clock.seconds(),
         samples: 0,
         rollbacks: 0,
+        best: kept.best.map(|held_out| Best { step: step - kept.since_best, held_out }),
     })
 }
 

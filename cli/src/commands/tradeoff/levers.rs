@@ -2,8 +2,9 @@
 //! its levers' values.
 
 use crate::budget::front::Kind;
-use crate::specs;
+use crate::{files, specs};
 use conefield_core::error::{Error, Result, ensure};
+use conefield_core::files::toml_line;
 use conefield_core::random::mix;
 use serde::{Deserialize, Serialize};
 use serde_json::Value;
@@ -80,7 +81,7 @@ impl Levers {
 
     fn parse(text: &str, place: &str, folder: &Path) -> Result<Self> {
         let written: Written = toml::from_str(text).map_err(|e| {
-            let line = e.span().map_or(1, |s| 1 + text[..s.start.min(text.len())].matches('\n').count());
+            let line = toml_line(text, &e).unwrap_or(1);
             let expected = "a [[base]] with a spec and its [base.levers]; --show-levers prints an example";
             Error::invalid(format!("{place}:{line}"), "levers", e.message(), expected)
         })?;
@@ -138,7 +139,7 @@ impl Base {
         let refused = |e: Error| Error::invalid(place, format!("{field}.spec"), &found, e.to_string());
         let loaded = specs::read(&spec, &[]).map_err(refused)?;
         let name: String = match &loaded.spec.name[..] {
-            "" => Path::new(&spec).file_stem().map(|s| s.to_string_lossy().into_owned()).unwrap_or_default(),
+            "" => files::stem(&spec),
             name => name.chars().map(|c| if c.is_alphanumeric() || "._+-".contains(c) { c } else { '-' }).collect(),
         };
         let mut levers = vec![];

@@ -1,12 +1,12 @@
 //! What a search came to: the front as table, figure and JSON, its specs, and how well held-out views rank.
 
 use super::pareto::{Standing, front};
-use super::rank::spearman;
 use super::{FILES, FOLDERS, Over, Rung, Search, Status, accuracy};
 use crate::budget::front::{Front, Kind, Point, Reached, Tuned};
 use crate::commands::trial::Figures;
 use crate::out;
 use crate::specs;
+use crate::statistics::{mean, spearman};
 use crate::table::Table;
 use conefield_core::spec::load::to_toml;
 use conefield_core::{Error, Result};
@@ -337,10 +337,7 @@ fn points(search: &Search, trials: &[Over]) -> Vec<Mean> {
             let runs: Option<Vec<Figures>> =
                 (0..search.scans.len()).map(|s| here(s).and_then(|t| t.figures.clone())).collect();
             let Some(runs) = runs.filter(|r| !r.is_empty()) else { continue };
-            let mean = |of: &dyn Fn(&Figures) -> Option<f64>| {
-                let all: Option<Vec<f64>> = runs.iter().map(of).collect();
-                all.map(|a| a.iter().sum::<f64>() / a.len() as f64)
-            };
+            let mean = |of: &dyn Fn(&Figures) -> Option<f64>| mean(runs.iter().map(of));
             let Some(accuracy) = mean(&|f| accuracy(search, f)) else { continue };
             let peak_bytes: Option<u64> = runs.iter().map(|f| f.peak_bytes).max().flatten();
             let total_s = mean(&|f| Some(f.total_s)).unwrap_or(f64::NAN);

@@ -1,0 +1,58 @@
+//! What commands that look at the field of a finished run share.
+
+use crate::backend::BackendChoice;
+use crate::files;
+use crate::memory::Memory;
+use clap::Args;
+use conefield_core::geometry::VoxelGrid;
+use conefield_core::trained::TrainedField;
+use conefield_core::{Error, Result};
+use std::path::PathBuf;
+
+/// A finished run, the voxels to look at and what computes them.
+#[derive(Args)]
+pub struct Trained {
+    /// The folder of the run, or its weights.safetensors.
+    run: PathBuf,
+    /// Voxels along the longest side [default: as the scan asked for].
+    #[arg(long, value_name = "N", value_parser = clap::value_parser!(u16).range(1..))]
+    voxels: Option<u16>,
+    /// Which backend: auto, cpu, wgpu, or wgpu:N with the number of an adapter.
+    #[arg(long, value_name = "BACKEND", default_value_t)]
+    pub backend: BackendChoice,
+}
+
+/// Its field.
+pub struct Opened {
+    pub file: PathBuf,
+    pub field: TrainedField,
+    /// The voxels that are asked for.
+    pub grid: VoxelGrid,
+    bytes: u64,
+}
+
+impl Trained {
+    /// Reads the field, if it fits into memory with `buffers` bytes beside it.
+    pub fn open(&self, buffers: u64) -> Result<Opened> {
+        let file = if self.run.is_dir() { self.run.join("weights.safetensors") } else { self.run.clone() };
+        let bytes = file.metadata().map_err(|e| Error::io(&file, e))?.len();
+        memory(bytes, buffers)?;
+        let field = files::read_field(&file)?;
+        let trained = field.scene.grid;
+        let grid = self.voxels.map_or(trained, |n| trained.with_longest(n.into()));
+        Ok(Opened { file, field, grid, bytes })
+    }
+}
+
+impl Opened {
+    /// What the field takes with `buffers` bytes beside it; refused where that does not fit.
+    pub fn memory(&self, buffers: u64) -> Result<Memory> {
+        memory(self.bytes, buffers)
+    }
+}
+
+/// The file and the numbers in it, then these and the model.
+fn memory(bytes: u64, buffers: u64) -> Result<Memory> {
+    let memory = Memory::most(&[Memory { model: 2 * bytes, buffers, ..Memory::default() }]);
+    memory.check(|_| vec![]).map(|()| memory)
+}

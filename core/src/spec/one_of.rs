@@ -1,0 +1,79 @@
+//! Keys of a table that exclude each other. What an upper layer says takes the place of what lower ones say in another way;
+//! one layer that says two is refused.
+
+use super::check::{Context, invalid, join, listed};
+use super::schema::{ONE_OF, STAGES, of_type};
+use super::tree::{Entry, Kind as Is, Node};
+use crate::error::Result;
+use crate::registry::{Kind, find};
+use serde_json::Value;
+
+/// Leaves in the stages of `root`, of keys that exclude each other, those of the uppermost layer.
+pub(super) fn settle(root: &mut Node) {
+    for (key, kind) in STAGES {
+        let Some(node) = root.get_mut(key) else { continue };
+        match &mut node.kind {
+            Is::Array(items) => items.iter_mut().for_each(|n| stage(n, kind)),
+            _ => stage(node, kind),
+        }
+    }
+}
+
+fn stage(node: &mut Node, kind: Kind) {
+    let Some(found) = node.get("type").and_then(Node::text).and_then(|name| find(kind, name)) else { return };
+    let schema = of_type(found);
+    setting(node, &schema, &Context::new(&schema, None));
+}
+
+fn setting(node: &mut Node, schema: &Value, cx: &Context<'_>) {
+    let Is::Table(entries) = &mut node.kind else { return };
+    for group in groups(schema, cx) {
+        let said = |key: &str, value: &Node| group.contains(&key) && value.kind != Is::Null;
+        let upper = entries.iter().filter(|e| said(&e.key, &e.value)).map(|e| e.at.depth()).min();
+        entries.retain(|e| !said(&e.key, &e.value) || Some(e.at.depth()) == upper);
+    }
+    for e in entries {
+        let own = alternatives(schema, cx).into_iter().filter_map(|s| s["properties"].get(&e.key));
+        own.for_each(|s| setting(&mut e.value, s, cx));
+    }
+}
+
+/// Refuses a table with two keys that exclude each other.
+pub(super) fn check(node: &Node, schema: &Value, cx: &Context<'_>, path: &str) -> Result<()> {
+    for group in groups(schema, cx) {
+        let said = |e: &&Entry| group.contains(&&*e.key) && e.value.kind != Is::Null;
+        let mut said: Vec<&Entry> = node.entries().iter().filter(said).collect();
+        said.sort_by_key(|e| e.at.offset());
+        if let [first, second, ..] = said[..] {
+            let found = format!("{} beside it", first.key);
+            return Err(invalid(&second.at, &join(path, &second.key), found, listed(&group)));
+        }
+    }
+    Ok(())
+}
+
+/// Groups of keys of which a table has one: those that are marked, and the names of an enumeration's values.
+fn groups<'a>(schema: &'a Value, cx: &'a Context<'_>) -> Vec<Vec<&'a str>> {
+    let mut all = vec![];
+    for schema in alternatives(schema, cx) {
+        let marked = schema[ONE_OF].as_array().into_iter().flatten();
+        all.extend(marked.map(|g| g.as_array().into_iter().flatten().filter_map(Value::as_str).collect()));
+        let values = schema["oneOf"].as_array().into_iter().flatten();
+        all.push(values.filter_map(|s| tag(cx.resolve(s))).collect());
+    }
+    all
+}
+
+/// A schema and those that it lets one choose from.
+fn alternatives<'a>(schema: &'a Value, cx: &'a Context<'_>) -> Vec<&'a Value> {
+    let schema = cx.resolve(schema);
+    let choices = ["anyOf", "oneOf"].iter().filter_map(|k| schema[*k].as_array()).flatten();
+    std::iter::once(schema).chain(choices.flat_map(|s| alternatives(s, cx))).collect()
+}
+
+/// The name of an enumeration's value that is written as a table of it alone.
+fn tag(choice: &Value) -> Option<&str> {
+    let (properties, required) = (choice["properties"].as_object()?, choice["required"].as_array()?);
+    let name = required.first()?.as_str()?;
+    (properties.len() == 1 && required.len() == 1 && properties.contains_key(name)).then_some(name)
+}

@@ -1,0 +1,142 @@
+//! Training that ends when views that are kept aside are no longer predicted better.
+
+mod common;
+
+use common::{Stop, model, scan, spec};
+use conefield_backend_cpu::Cpu;
+use conefield_core::checkpoint::Resume;
+use conefield_core::scan::Scan;
+use conefield_core::solver::{Best, Job, Limits, Record, Solution};
+use rand::{RngExt, SeedableRng};
+use serde_json::{Value, json};
+
+/// A scan to learn from and views that are kept aside; the first with noise so strong that a field soon learns nothing else.
+fn scans(noise: f32) -> (Scan, Scan) {
+    let (mut train, held) = scan().split(&[2, 6]).unwrap();
+    let top = train.projections.iter().fold(0.0f32, |m, p| m.max(*p));
+    let mut random = rand_chacha::ChaCha8Rng::seed_from_u64(5);
+    train.projections.mapv_inplace(|p| p + noise * top * (random.random::<f32>() - 0.5));
+    (train, held)
+}
+
+fn settings(steps: u64, patience: Option<u64>) -> Value {
+    let mut value = json!({
+        "encoder": {"type": "hash-grid", "levels": 4, "base_resolution": 4, "log2_table_size": 12},
+        "normalizers": [{"type": "layer-norm"}],
+        "field": {"type": "mlp", "width": 16, "depth": 3, "skips": [1]},
+        "projector": {"type": "ray-march", "samples": 20},
+        "solver": {"type": "gradient", "steps": steps, "rays": 64, "lr": 0.01, "decay": "none", "pixels": "all",
+                   "report_every": 20},
+    });
+    if let Some(n) = patience {
+        value["solver"]["patience"] = json!(n);
+    }
+    value
+}
+
+fn solve(value: &Value, (train, held): &(Scan, Scan), limits: Limits) -> (Solution, Vec<Record>) {
+    let (spec, backend) = (spec(value).unwrap(), Cpu::new());
+    let job = Job { seed: 7, held_out: Some(held), limits, ..Job::new(train, &spec, &backend) };
+    let mut heard = Stop::at(u64::MAX);
+    let solution = spec.solver.build().unwrap().solve(&job, &mut heard).unwrap();
+    (solution, heard.heard)
+}
+
+fn params(solution: Solution) -> Vec<u32> {
+    model(solution).arena.params.iter().map(|x| x.to_bits()).collect()
+}
+
+/// The record with the least error, and how many came after it.
+fn least(records: &[Record]) -> (Best, usize) {
+    let error = |r: &Record| r.held_out.unwrap();
+    let at = (0..records.len()).min_by(|&a, &b| error(&records[a]).total_cmp(&error(&records[b]))).unwrap();
+    (Best { step: records[at].step, held_out: error(&records[at]) }, records.len() - 1 - at)
+}
+
+#[test]
+fn a_run_that_learns_noise_ends_early_and_returns_the_best() {
+    let scans = scans(1.0);
+    let (solution, records) = solve(&settings(4000, Some(5)), &scans, Limits::default());
+    let (best, after) = least(&records);
+    let errors: Vec<_> = records.iter().map(|r| r.held_out.unwrap()).collect();
+    assert!(solution.steps < 4000 && after == 5, "{errors:.4?}");
+    assert_eq!((solution.best, solution.steps), (Some(best), best.step + 5 * 20));
+    let met = |r: &Record| r.events.iter().any(|e| e.contains("stopping rule"));
+    assert!(met(records.last().unwrap()) && !records[..records.len() - 1].iter().any(met));
+    // What comes out is what a run of so many steps comes to, and going on would have made it worse.
+    let (early, _) = solve(&settings(best.step, None), &scans, Limits::default());
+    assert_eq!(early.best, None);
+    assert!(params(solution) == params(early));
+    let (_, late) = solve(&settings(1000, None), &scans, Limits::default());
+    assert!(late.last().unwrap().held_out.unwrap() > 1.05 * best.held_out, "{late:?}");
+}
+
+#[test]
+fn a_run_that_improves_goes_to_its_end_whatever_sets_it() {
+    let (clean, noisy) = (scans(0.0), scans(1.0));
+    let (solution, records) = solve(&settings(200, Some(5)), &clean, Limits::default());
+    assert_eq!((solution.steps, solution.best), (200, Some(least(&records).0)));
+    assert!(records.iter().all(|r| r.events.is_empty()), "{records:?}");
+    let limits = Limits { steps: Some(60), ..Limits::default() };
+    assert_eq!(solve(&settings(200, Some(5)), &clean, limits).0.steps, 60);
+    // A run that is cut short returns the best so far, too.
+    let limits = Limits { steps: Some(800), ..Limits::default() };
+    let (solution, records) = solve(&settings(200, Some(1000)), &noisy, limits);
+    let (best, after) = least(&records);
+    assert!(solution.steps == 800 && after > 0 && solution.best == Some(best), "{records:?}");
+}
+
+#[test]
+fn without_patience_nothing_changes() {
+    let scans = scans(1.0);
+    let (plain, with) = (settings(200, None), settings(200, Some(1000)));
+    let told = |r: &[Record]| r.iter().map(|r| (r.step, r.loss, r.held_out)).collect::<Vec<_>>();
+    let ((a, of_a), (b, of_b)) = (solve(&plain, &scans, Limits::default()), solve(&with, &scans, Limits::default()));
+    assert_eq!(told(&of_a), told(&of_b));
+    // Looking changes nothing of the training; only what comes out may be an earlier state.
+    assert_eq!(params(a) == params(b), least(&of_a).1 == 0);
+}
+
+/// Wherever a run is interrupted, it goes on to the same bits, the same records and the same end; and so where channels left
+/// the work, which starts the comparison anew.
+#[test]
+fn a_run_resumes_to_the_same_best() {
+    let (train, held) = scans(1.0);
+    let mut masked = settings(4000, Some(4));
+    masked["normalizers"] = json!([{"type": "fft-mask", "epoch": 2, "keep": [0, 1, 2, 3, 4]}, {"type": "layer-norm"}]);
+    for (value, masks) in [(settings(4000, Some(4)), false), (masked, true)] {
+        let (spec, backend) = (spec(&value).unwrap(), Cpu::new());
+        let solver = spec.solver.build().unwrap();
+        let solve = |resume: Option<&Resume>, at| {
+            let mut stop = Stop::at(at);
+            let job = Job { seed: 7, held_out: Some(&held), resume, ..Job::new(&train, &spec, &backend) };
+            let result = solver.solve(&job, &mut stop).map(|s| (s.steps, s.best, params(s))).map_err(|e| e.to_string());
+            (result, stop)
+        };
+        let (whole, heard) = solve(None, u64::MAX);
+        let (steps, best, _) = whole.clone().unwrap();
+        let said = |r: &Record| r.events.iter().any(|e| e.contains("fft-mask: 5 of 8 channels kept"));
+        assert_eq!(heard.heard.iter().position(said).is_some_and(|at| at > 0), masks, "after the first best record");
+        assert!(steps < 4000 && best.is_some_and(|b| b.step == steps - 4 * 20), "{steps}, {best:?}");
+        for at in [1, 19, 20, 21, 47, 48, 49, 50, best.unwrap().step, best.unwrap().step + 1, steps - 1, steps] {
+            let (stopped, first) = solve(None, at);
+            assert!(stopped.unwrap_err().contains("interrupted"), "at {at}");
+            let (again, second) = solve(first.kept.as_ref(), u64::MAX);
+            assert!(again == whole, "interrupted after step {at}");
+            let told = |s: &Stop| s.heard.iter().map(|r| (r.step, r.held_out, r.events.clone())).collect::<Vec<_>>();
+            assert_eq!([told(&first), told(&second)].concat(), told(&heard), "after step {at}");
+        }
+    }
+}
+
+#[test]
+fn what_it_needs_is_told() {
+    let built = |patience| spec(&settings(9, patience)).unwrap().solver.build().unwrap();
+    let (with, without) = (built(Some(3)), built(None));
+    assert_eq!((with.needs_held_out(), without.needs_held_out()), (Some("solver.patience"), None));
+    assert_eq!(with.memory_per_parameter() - without.memory_per_parameter(), 4);
+    let said = "ends after 3 records of 20 steps without a smaller held-out error";
+    assert!(with.describe().ends_with(said) && !without.describe().contains("held-out"), "{}", with.describe());
+    let e = spec(&settings(9, Some(0))).unwrap().solver.build().err().unwrap().to_string();
+    assert!(e.contains("solver.patience: found 0, expected at least 1"), "{e}");
+}
