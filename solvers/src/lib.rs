@@ -2,7 +2,8 @@
 //!
 //! - [`gradient`] trains an attenuation field by stochastic gradients; [`pretrain`] trains one on a known volume, for
 //!   weights that other scans reuse.
-//! - [`fit`] finds out what a scan has need of, [`support`] where its object can be.
+//! - [`fit`] finds out what a scan has need of, [`support`] where its object can be, [`refine`] where the field that is
+//!   trained has nothing in it.
 //! - [`drift`] measures how much of a field changes while it trains.
 //! - [`fdk`] filters and back-projects.
 //! - [`iterative`] improves voxels pass by pass: SART and its kin, CGLS, ASD-POCS, FISTA with total variation.
@@ -15,6 +16,7 @@ pub mod guard;
 pub mod iterative;
 pub mod pretrain;
 pub mod rays;
+pub mod refine;
 pub mod schedule;
 mod shadow;
 pub mod support;
