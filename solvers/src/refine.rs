@@ -172,6 +172,10 @@ impl Refinement {
             let full: Vec<bool> = self.highest.iter().map(|&m| m >= self.settings.below as f32).collect();
             occupied.iter_mut().zip(widened(&full, self.grid.shape)).for_each(|(o, near)| *o &= near);
         }
+        if !occupied.contains(&true) {
+            // A field without anything in it has yet to begin.
+            occupied.clone_from(&self.held);
+        }
         let count = occupied.iter().filter(|o| **o).count();
         let all = count == occupied.len();
         self.occupancy = (!all).then(|| Occupancy::new([low, high], self.grid.shape, &occupied, self.settings.probe));

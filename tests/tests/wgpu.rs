@@ -103,8 +103,8 @@ fn steps_agree(settings: &Value) {
             assert!((stats.prior - want.prior).abs() < 1e-5 * want.prior, "{} {}", stats.prior, want.prior);
             let all = 20 * 40 - missed(&pipeline, &rays) + 150 + 5 * 125;
             assert_eq!(stats.samples, want.samples, "{name}");
-            // Negative control: in slabs at least a fifth of the rays' samples were left out, otherwise none.
-            assert!(if occupancy.is_some() { all - want.samples > 100 } else { all == want.samples }, "{name}");
+            // Negative control: where slabs are empty some samples were left out, otherwise none.
+            assert!(if occupancy.is_some() { all - want.samples > 20 } else { all == want.samples }, "{name}");
             // Negative control: a percent of one block's largest gradient.
             let mut wrong = grads.clone();
             let block = &pipeline.layout().blocks[0];
