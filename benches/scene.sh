@@ -32,6 +32,7 @@ for volume in $volumes; do
     run support carve all "${count[@]}"
     run levels box needed "${count[@]}"
     run samples box all
+    run occupancy carve all --set 'scene.occupancy={ refined = {} }'
     run all carve needed
     printf '\n`%s`\n\n' "$volume" >>"$out/scene.md"
     "$bin/reach" "${runs[@]}" | tee -a "$out/scene.md"

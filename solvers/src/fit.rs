@@ -1,11 +1,11 @@
 //! What a scan has need of: where its object can be, how fine its data are, how far apart samples stand.
 
-use crate::support::carve;
+use crate::support::{carve, cells};
 use conefield_core::error::Result;
 use conefield_core::pipeline::Pipeline;
 use conefield_core::scan::Scan;
 use conefield_core::scene::Scene;
-use conefield_core::spec::{self, LevelRule, SupportRule};
+use conefield_core::spec::{self, LevelRule, OccupancyRule, Refined, SupportRule};
 
 /// A scene, and what of a pipeline it has need of.
 pub struct Fitted {
@@ -29,6 +29,9 @@ pub fn fit(scan: &Scan, settings: &spec::Scene, pipeline: &mut Pipeline) -> Resu
             None => scene,
         };
     }
+    if let OccupancyRule::Refined(refined) = settings.occupancy {
+        found.push(format!("occupancy: {}", occupancy(&scene, refined)));
+    }
     pipeline.fit(scene.voxel_mm());
     let mut needed = None;
     if settings.levels == LevelRule::Needed {
@@ -37,6 +40,15 @@ pub fn fit(scan: &Scan, settings: &spec::Scene, pipeline: &mut Pipeline) -> Resu
         found.push(format!("levels: {}", levels(pipeline, needed.as_deref(), cells)?));
     }
     Ok(Fitted { scene, needed, found })
+}
+
+/// How the support is refined while the field trains.
+fn occupancy(scene: &Scene, Refined { after, every, below, probe }: Refined) -> String {
+    let [x, y, z] = cells(&scene.grid).shape;
+    format!(
+        "from step {after} on looked for every {every} steps in {x} x {y} x {z} cells; those below {below} of the \
+         attenuation scale are sampled by one ray in {probe}"
+    )
 }
 
 /// Which of the encoder's channels are needed to tell `cells` apart.

@@ -10,6 +10,7 @@ use crate::iterative::start_volume;
 use crate::patience::{Patience, Waited};
 use crate::pretrain::learn;
 use crate::rays::{Pixels, RaySource, Views};
+use crate::refine::{Refinement, Since};
 use crate::schedule::{Clock, Decay, Ends};
 use conefield_core::backend::{Adam, Executable, Loss, TrainRay, TvBlocks, Work};
 use conefield_core::checkpoint::{Checkpoint, Resume, Standing, tensors};
@@ -237,7 +238,9 @@ impl Solver for Gradient {
         let steps = [self.steps, by_epochs].into_iter().flatten().min();
         let watcher = |d| DriftWatch::new(d, &scene, job.seed, steps_an_epoch, job.resume, &model);
         let mut drift = self.drift.as_ref().map(watcher).transpose()?;
-        let Start { standing, kept: Kept { mut window, .. } } = start;
+        let Start { standing, kept: Kept { mut window, since, .. } } = start;
+        let rule = &job.spec.scene.occupancy;
+        let mut refinement = Refinement::new(rule, &scene, job.seed, since.unwrap_or_default(), job.resume)?;
         let mut clock = Clock::new(Ends { steps, seconds: self.seconds }, job.limits, standing.seconds);
         let mut rays = Vec::with_capacity(self.rays);
         let mut tv = TvBlocks::default();
@@ -252,8 +255,12 @@ impl Solver for Gradient {
             let cancelled = observer.cancelled();
             if step > standing.step && (cancelled || observer.checkpoint_due()) {
                 clock.pause();
-                let solver =
-                    serde_json::json!({ "window": window, "guard": guard.watched(), "patience": patience.waited() });
+                let solver = serde_json::json!({
+                    "window": window,
+                    "guard": guard.watched(),
+                    "patience": patience.waited(),
+                    "since": refinement.as_ref().map(Refinement::since),
+                });
                 let masks = model.masks().to_vec();
                 let standing = Standing { step, samples, seconds: clock.seconds(), masks, solver };
                 exe.fetch(&mut model)?;
@@ -263,6 +270,7 @@ impl Solver for Gradient {
                     tensors.extend(drift.iter().flat_map(|d| d.tensors(&model)));
                     tensors.extend(guard.tensors(model.pipeline.layout()));
                     tensors.extend(patience.tensors(model.pipeline.layout()));
+                    tensors.extend(refinement.iter().map(Refinement::tensor));
                     observer.checkpoint(&Checkpoint { tensors, standing })?;
                 }
                 clock.resume();
@@ -298,19 +306,28 @@ impl Solver for Gradient {
             let epoch = step as f64 / steps_an_epoch;
             window.events.extend(model.refresh(&scene, epoch, job.backend, &mut exe)?);
             patience.renew(&model);
+            if let Some(refinement) = &mut refinement
+                && let Some(said) = refinement.look(step, &model, exe.as_mut())?
+            {
+                window.tell(said, observer);
+            }
             source.draw(job.seed, step, self.rays, &mut rays);
             let tv = self.tv.as_ref().map(|prior| {
                 blocks(prior, &scene, job.seed, step, &mut tv);
                 &tv
             });
-            let work = Work { step, seed: job.seed, loss: self.loss.into(), rays: &rays, points: &[], tv };
+            let occupancy = refinement.as_ref().and_then(Refinement::occupancy);
+            let work = Work { step, seed: job.seed, loss: self.loss.into(), rays: &rays, points: &[], tv, occupancy };
             let start = Instant::now();
             let stats = exe.step(&mut model, &work)?;
             let back = guard.judge(&work, &stats, &mut model, exe.as_mut())?;
             step += 1;
             samples += stats.samples;
             match back {
-                Some(said) => window.tell(said, observer),
+                Some(said) => {
+                    window.tell(said, observer);
+                    refinement.iter_mut().for_each(|r| r.forget(step));
+                }
                 None => {
                     exe.update(&mut model, &guard.next(self.adam(step, epoch, share)))?;
                     window.add(stats.loss, stats.prior, stats.samples, start.elapsed().as_secs_f64());
@@ -414,6 +431,8 @@ struct Kept {
     window: Window,
     guard: Watched,
     patience: Waited,
+    #[serde(default)]
+    since: Option<Since>,
 }
 
 /// Sums since the last record.

@@ -229,6 +229,9 @@ impl<R: Real> Slot<R> {
                     let before = self.samples.points.len();
                     let seed = mix(mix(work.seed, work.step), i as u64);
                     projector.sample(&work.rays[i].ray, Some(seed), &mut self.samples);
+                    if let Some(occupancy) = work.occupancy {
+                        occupancy.thin(seed, &mut self.samples, before);
+                    }
                     self.counts.push(self.samples.points.len() - before);
                 }
             }
@@ -264,6 +267,12 @@ impl<R: Real> Slot<R> {
     ) {
         let [rows, counts] = self.placed[at].clone();
         if rows.is_empty() {
+            // Rays without samples still have something measured that they do not explain.
+            if let Group::Rays(range) = group {
+                self.mu.clear();
+                self.dmu.clear();
+                self.ray_loss(projector, work, range.clone(), rows.start, counts);
+            }
             return;
         }
         let (tiles, belong) = match (group, kernels.mixes_rays()) {

@@ -3,11 +3,13 @@
 //! Rows go through a kernel one an invocation, 64 to a group. `forward` takes them from the encoder to μ and keeps the
 //! features of an encoder with parameters, which are dear to compute again; `backward` starts from these, runs what lies
 //! between once more, and goes back. Sums over rows are taken within a group and added to the group's own partial sums,
-//! which `merge` adds up; scattered gradients are added where they belong at once.
+//! which `merge` adds up; scattered gradients are added where they belong at once. Samples of rays that weigh 0 are passed
+//! over, and by `backward` all 64 of a group where none has a derivative.
 
 use crate::device::Atomics;
 use crate::source::{Access, Source};
 use conefield_core::error::{Error, Result};
+use conefield_core::occupancy::PROBE;
 use conefield_core::pipeline::Pipeline;
 use conefield_core::spec::Tables;
 use conefield_core::stage::{GradKind, Info, Projector, Scope, Stage, titled};
@@ -286,8 +288,15 @@ fn {prefix}accumulate(i: u32, v: f32) {{ {add} }}
         }
         self.declare(&mut source, false);
         self.links.iter().for_each(|l| self.include(&mut source, l, false));
-        let mut body =
-            String::from("        let at = samples[row];\n        var x0 = array<f32, 3>(at.x, at.y, at.z);\n");
+        let mut body = String::from(
+            "        let at = samples[row];
+        if row < step.ray_rows && at.w == 0.0 {
+            mu[row] = 0.0;
+            continue;
+        }
+        var x0 = array<f32, 3>(at.x, at.y, at.z);
+",
+        );
         for (i, l) in self.links.iter().enumerate() {
             let _ = write!(
                 body,
@@ -350,7 +359,9 @@ fn {prefix}accumulate(i: u32, v: f32) {{ {add} }}
         let mut body = String::from(
             "        var at = vec4<f32>();
         var d = 0.0;
-        if live { at = samples[row]; d = dmu[row]; }
+        if row < step.rows { at = samples[row]; d = dmu[row]; }
+        let live = d != 0.0;
+        if !any_of_group(live) { continue; }
         var x0 = array<f32, 3>(at.x, at.y, at.z);
 ",
         );
@@ -367,6 +378,7 @@ fn {prefix}accumulate(i: u32, v: f32) {{ {add} }}
         }
         let _ = writeln!(body, "        var d{n} = array<f32, 1>(d);");
         self.back(&mut body);
+        source.add("any", include_str!("kernels/any.wgsl"));
         source.add("backward", &groups(&body));
         source
     }
@@ -468,7 +480,8 @@ fn main(@builtin(global_invocation_id) id: vec3<u32>) {{
         source.add(
             "backward",
             &groups(&format!(
-                "        var x0: array<f32, {input}>;
+                "        let live = row < step.rows;
+        var x0: array<f32, {input}>;
         var d1: array<f32, {output}>;
         var d0: array<f32, {input}>;
         if live {{
@@ -497,7 +510,7 @@ fn main(@builtin(global_invocation_id) id: vec3<u32>, @builtin(num_workgroups) g
     )
 }
 
-/// A kernel whose groups take 64 rows at a time, together; rows past the end are there and not `live`.
+/// A kernel whose groups take 64 rows at a time, together; rows past the end are there too.
 fn groups(body: &str) -> String {
     format!(
         "@compute @workgroup_size(64)
@@ -511,7 +524,6 @@ fn main(
     let pieces = (step.rows + 63u) / 64u;
     for (var piece = id.x; piece < pieces; piece += all.x) {{
         let row = piece * 64u + index;
-        let live = row < step.rows;
 {body}    }}
 }}
 "
@@ -570,8 +582,8 @@ fn outer(prefix: &str, m: usize, k: usize) -> String {
     )
 }
 
-/// Samples of rays.
-pub fn sample(projector: &dyn Projector) -> Result<Source> {
+/// Samples of rays; where cells are known to be empty, of those that are not.
+pub fn sample(projector: &dyn Projector, occupancy: bool) -> Result<Source> {
     let name = titled("projector", &projector.describe());
     let fragment = fragment_of(&name, projector.wgsl())?;
     let mut source = Source::default();
@@ -581,6 +593,16 @@ pub fn sample(projector: &dyn Projector) -> Result<Source> {
     source.bind("samples", Access::Write, "array<vec4<f32>>");
     source.add("random numbers", RANDOM);
     source.add(&name, &fragment.named("projector_"));
+    if occupancy {
+        source.bind("cells", Access::Uniform, "Cells");
+        source.bind("occupied", Access::Read, "array<u32>");
+        source.bind("left_out", Access::Write, "array<atomic<u32>>");
+        let (low, high) = (PROBE as u32, (PROBE >> 32) as u32);
+        source.add("probes", &format!("const PROBE = vec2<u32>({low}u, {high}u);"));
+        source.add("occupancy", include_str!("kernels/occupancy.wgsl"));
+    } else {
+        source.add("occupancy", "fn taken(ray: Ray, sample: vec4<f32>) -> vec4<f32> { return sample; }");
+    }
     source.add("sample", include_str!("kernels/sample.wgsl"));
     Ok(source)
 }

@@ -68,6 +68,24 @@ pub fn cases() -> Vec<Case> {
             TOML,
             &["solver.drift.points", "1 to 65536"],
         ),
+        refused(
+            "an occupancy by another name",
+            toml("extends = \"naf\"\n[scene]\noccupancy = \"refind\"\n"),
+            TOML,
+            &["spec.toml:3:13", "scene.occupancy"],
+        ),
+        refused(
+            "cells that are looked at never",
+            toml("extends = \"naf\"\n[scene]\noccupancy = { refined = { every = 0 } }\n"),
+            TOML,
+            &["scene.occupancy.refined.every", "at least 1"],
+        ),
+        refused(
+            "cells that are empty below NaN",
+            toml("extends = \"naf\"\n[scene]\noccupancy = { refined = { below = nan } }\n"),
+            TOML,
+            &["scene.occupancy.refined.below", "finite"],
+        ),
         refused("NaN", toml("extends = \"naf\"\n[scene]\nfill = nan\n"), TOML, &["spec.toml:3:8", "finite"]),
         refused(
             "a grid past memory",

@@ -21,6 +21,7 @@ use conefield_normalizers as _;
 use conefield_solvers as _;
 
 /// A ball in air with a box inside, 16³ voxels of 10 mm, in 1/mm.
+#[allow(dead_code)]
 pub fn truth() -> Volume {
     let data = Array3::from_shape_fn((16, 16, 16), |(x, y, z)| {
         let d = [x, y, z].map(|i| i as f32 - 7.5);
@@ -32,6 +33,7 @@ pub fn truth() -> Volume {
 }
 
 /// Eight views of it, 16 × 16 pixels.
+#[allow(dead_code)]
 pub fn scan() -> Scan {
     let protocol: Protocol = serde_json::from_value(json!({
         "dso": 500.0, "dsd": 750.0, "detector": [16, 16], "extent": {"side": [280.0, 280.0]},

@@ -151,7 +151,7 @@ fn step(rays: usize, samples: usize) -> [f64; 2] {
     let moved = |(i, p): (usize, &f32)| p + 0.4 * (unit(mix(5, i as u64)) - 0.5);
     let params: Vec<f32> = start.iter().enumerate().map(moved).collect();
     let exact: Vec<f64> = params.iter().map(|p| f64::from(*p)).collect();
-    let work = Work { step: 4, seed: 9, loss: Loss::L2, rays: &rays, points: &[], tv: None };
+    let work = Work { step: 4, seed: 9, loss: Loss::L2, rays: &rays, points: &[], tv: None, occupancy: None };
     let single = Kernels::new(&pipeline, |s| Some(s.kernel())).unwrap();
     let double = Kernels::new(&pipeline, |s| s.reference()).unwrap();
     let (mut g, mut g64) = (vec![0.0f32; params.len()], vec![0.0f64; params.len()]);
