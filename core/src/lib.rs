@@ -1,7 +1,7 @@
 //! The contracts that conefield's stages, backends and solvers meet at.
 //!
 //! - [`geometry`], [`scan`], [`parts`]: what was measured, in millimetres, and what comes out.
-//! - [`simd`], [`dense`], [`trilinear`], [`stage`]: what a stage computes and how.
+//! - [`simd`], [`half`], [`dense`], [`trilinear`], [`stage`]: what a stage computes and how.
 //! - [`support`]: where the object can be; [`occupancy`]: where a field is known to be empty.
 //! - [`wgsl`]: the same for a GPU.
 //! - [`arena`]: parameters, gradients and optimizer state under their names.
@@ -18,6 +18,7 @@ pub mod dense;
 pub mod error;
 pub mod files;
 pub mod geometry;
+pub mod half;
 pub mod host;
 pub mod occupancy;
 pub mod pages;

@@ -1,8 +1,9 @@
-//! Memory for parameters: a slice of `f32` on huge pages where the system has them.
+//! Memory for parameters: a slice of numbers on huge pages where the system has them.
 //!
 //! Hash tables are read at random all over. On pages of 4 KiB most of those reads miss the processor's address
 //! cache, and a step takes about twice as long.
 
+use bytemuck::Pod;
 use memmap2::MmapMut;
 use std::fmt;
 use std::ops::{Deref, DerefMut};
@@ -10,32 +11,33 @@ use std::ops::{Deref, DerefMut};
 /// Below this a plain page does.
 const WORTH_IT: usize = 1 << 21;
 
-/// A fixed number of `f32`, zero at first.
-pub struct Pages(Storage);
+/// A fixed number of numbers, zero at first.
+pub struct Pages<T: Pod = f32>(Storage<T>);
 
-enum Storage {
-    Small(Vec<f32>),
+enum Storage<T> {
+    Small(Vec<T>),
     Mapped { map: MmapMut, len: usize },
 }
 
-impl Pages {
+impl<T: Pod> Pages<T> {
     /// `len` zeros.
     pub fn zeros(len: usize) -> Self {
-        if len * 4 >= WORTH_IT
-            && let Ok(map) = MmapMut::map_anon(len * 4)
+        let bytes = len * size_of::<T>();
+        if bytes >= WORTH_IT
+            && let Ok(map) = MmapMut::map_anon(bytes)
         {
             // Only advice: without huge pages everything works, slower.
             #[cfg(target_os = "linux")]
             let _ = map.advise(memmap2::Advice::HugePage);
             return Self(Storage::Mapped { map, len });
         }
-        Self(Storage::Small(vec![0.0; len]))
+        Self(Storage::Small(vec![T::zeroed(); len]))
     }
 }
 
-impl Deref for Pages {
-    type Target = [f32];
-    fn deref(&self) -> &[f32] {
+impl<T: Pod> Deref for Pages<T> {
+    type Target = [T];
+    fn deref(&self) -> &[T] {
         match &self.0 {
             Storage::Small(v) => v,
             Storage::Mapped { map, len } => &bytemuck::cast_slice(map)[..*len],
@@ -43,8 +45,8 @@ impl Deref for Pages {
     }
 }
 
-impl DerefMut for Pages {
-    fn deref_mut(&mut self) -> &mut [f32] {
+impl<T: Pod> DerefMut for Pages<T> {
+    fn deref_mut(&mut self) -> &mut [T] {
         match &mut self.0 {
             Storage::Small(v) => v,
             Storage::Mapped { map, len } => &mut bytemuck::cast_slice_mut(map)[..*len],
@@ -52,13 +54,13 @@ impl DerefMut for Pages {
     }
 }
 
-impl Default for Pages {
+impl<T: Pod> Default for Pages<T> {
     fn default() -> Self {
         Self::zeros(0)
     }
 }
 
-impl Clone for Pages {
+impl<T: Pod> Clone for Pages<T> {
     fn clone(&self) -> Self {
         let mut new = Self::zeros(self.len());
         new.copy_from_slice(self);
@@ -66,21 +68,21 @@ impl Clone for Pages {
     }
 }
 
-impl PartialEq for Pages {
+impl<T: Pod + PartialEq> PartialEq for Pages<T> {
     fn eq(&self, other: &Self) -> bool {
         **self == **other
     }
 }
 
-impl fmt::Debug for Pages {
+impl<T: Pod> fmt::Debug for Pages<T> {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         write!(f, "{} numbers", self.len())
     }
 }
 
-impl FromIterator<f32> for Pages {
-    fn from_iter<I: IntoIterator<Item = f32>>(iter: I) -> Self {
-        let v: Vec<f32> = iter.into_iter().collect();
+impl<T: Pod> FromIterator<T> for Pages<T> {
+    fn from_iter<I: IntoIterator<Item = T>>(iter: I) -> Self {
+        let v: Vec<T> = iter.into_iter().collect();
         let mut new = Self::zeros(v.len());
         new.copy_from_slice(&v);
         new
@@ -94,7 +96,7 @@ mod tests {
     #[test]
     fn small_and_mapped_slices_behave_alike() {
         for len in [0, 5, 3 << 20] {
-            let mut p = Pages::zeros(len);
+            let mut p: Pages = Pages::zeros(len);
             assert_eq!(p.len(), len);
             assert!(p.iter().all(|&x| x == 0.0));
             if len > 0 {

@@ -77,7 +77,8 @@ impl Plugins {
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields, default)]
 pub struct Precision {
-    /// In which tables of features are read. The wgpu backend alone reads halves.
+    /// In which tables of features are read. Training changes and weights files keep them in `f32`; halves are a copy
+    /// of them.
     pub tables: Tables,
 }
 
@@ -95,7 +96,7 @@ pub enum Tables {
     /// As they are.
     #[default]
     F32,
-    /// Rounded to 11 bits, magnitudes from 6e-8 to 65504.
+    /// Rounded to 11 bits, magnitudes from 6e-8 to 65504, which stands for all that is larger.
     F16,
     /// Rounded to 8 bits, magnitudes as of `f32`.
     Bf16,

@@ -4,6 +4,7 @@
 //! A tile is channel-major: channel `c` of row `i` stands at `c·rows + i`. Rows are samples, in ray-major order.
 
 use crate::error::{Error, Result};
+use crate::half::{Bf16, F16};
 use crate::simd::Real;
 use crate::wgsl::Fragment;
 use std::ops::Range;
@@ -159,22 +160,57 @@ impl Parameter {
     }
 }
 
-/// The arithmetic of a stage in one precision.
-pub trait Kernel<R: Real>: Send + Sync {
+/// The arithmetic of a stage in one precision, of parameters that stand in memory as `P`.
+pub trait Kernel<R: Real, P = R>: Send + Sync {
     /// `y = f(x; params)`. Fills `tape` (`[info.tape][rows]`) with what [`Kernel::backward`] needs.
-    fn forward(&self, params: &[R], x: Tile<'_, R>, y: TileMut<'_, R>, tape: TileMut<'_, R>);
+    fn forward(&self, params: &[P], x: Tile<'_, R>, y: TileMut<'_, R>, tape: TileMut<'_, R>);
 
     /// `tape` holds what forward left and may be used as scratch. Given `dy = ∂L/∂y`: *adds* `∂L/∂params` to `grads` and, where `dx` is given, overwrites it with `∂L/∂x`.
     /// The order in which a parameter's gradient is summed must not depend on `grads.range`.
     fn backward(
         &self,
-        params: &[R],
+        params: &[P],
         x: Tile<'_, R>,
         tape: TileMut<'_, R>,
         dy: Tile<'_, R>,
         grads: Grads<'_, R>,
         dx: Option<TileMut<'_, R>>,
     );
+}
+
+impl<R: Real, P, K: Kernel<R, P> + ?Sized> Kernel<R, P> for &K {
+    fn forward(&self, params: &[P], x: Tile<'_, R>, y: TileMut<'_, R>, tape: TileMut<'_, R>) {
+        (**self).forward(params, x, y, tape);
+    }
+
+    fn backward(
+        &self,
+        params: &[P],
+        x: Tile<'_, R>,
+        tape: TileMut<'_, R>,
+        dy: Tile<'_, R>,
+        grads: Grads<'_, R>,
+        dx: Option<TileMut<'_, R>>,
+    ) {
+        (**self).backward(params, x, tape, dy, grads, dx);
+    }
+}
+
+/// A stage's arithmetic on parameters that are read in halves: what [`Stage::kernel`] makes of the same values.
+/// Gradients are `f32`.
+#[derive(Clone, Copy)]
+pub struct Halves<'a> {
+    /// Of `binary16`.
+    pub f16: &'a dyn Kernel<f32, F16>,
+    /// Of `bfloat16`.
+    pub bf16: &'a dyn Kernel<f32, Bf16>,
+}
+
+impl<'a> Halves<'a> {
+    /// Of a stage that has one source for both.
+    pub fn of<K: Kernel<f32, F16> + Kernel<f32, Bf16>>(kernel: &'a K) -> Self {
+        Self { f16: kernel, bf16: kernel }
+    }
 }
 
 /// A map from rows of `info.input` channels to rows of `info.output` channels.
@@ -193,6 +229,12 @@ pub trait Stage: Send + Sync {
 
     /// The same formula in double precision, by which gradients are checked.
     fn reference(&self) -> Option<&dyn Kernel<f64>> {
+        None
+    }
+
+    /// The arithmetic that reads parameters in halves, or `None` where they are read as they are. Hosts want it of
+    /// [`GradKind::Scatter`] stages where a spec asks for it ([`crate::spec::Precision`]).
+    fn halves(&self) -> Option<Halves<'_>> {
         None
     }
 

@@ -1,10 +1,13 @@
 //! Several encoders side by side: points `[n, 3]` to the channels of the first part, then of the second, and so on.
 
 use conefield_core::error::{Error, Result, ensure};
+use conefield_core::half::{Bf16, F16};
 use conefield_core::random::mix;
 use conefield_core::simd::Real;
 use conefield_core::spec::EncoderSpec;
-use conefield_core::stage::{Encoder, GradKind, Grads, Info, Kernel, Parameter, Reduced, Scope, Stage, Tile, TileMut};
+use conefield_core::stage::{
+    Encoder, GradKind, Grads, Halves, Info, Kernel, Parameter, Reduced, Scope, Stage, Tile, TileMut,
+};
 use conefield_core::wgsl::{Fragment, Sum, functions};
 use schemars::{JsonSchema, Schema, SchemaGenerator, json_schema};
 use serde::{Deserialize, Serialize};
@@ -62,6 +65,16 @@ struct Part {
     outputs: Range<usize>,
     params: Range<usize>,
     tape: Range<usize>,
+}
+
+impl Part {
+    /// What reads its parameters in halves, if it has any.
+    fn in_halves<P>(&self, pick: fn(Halves<'_>) -> &dyn Kernel<f32, P>) -> Option<Own<'_, f32, P>> {
+        match self.info.params {
+            0 => Some(Own::Alone(self.stage.kernel())),
+            _ => self.stage.halves().map(|h| Own::Reads(pick(h))),
+        }
+    }
 }
 
 /// The stage that [`Concat`] builds.
@@ -141,35 +154,44 @@ fn {name}grad(i: u32, v: f32) {{ stage_grad({first}u + i, v); }}
     out
 }
 
-/// A kernel of a part in one precision.
-type Pick<R> = fn(&dyn Encoder) -> Option<&dyn Kernel<R>>;
+/// A kernel of a part, on parameters that stand in memory as `P`.
+enum Own<'a, R: Real, P> {
+    Reads(&'a dyn Kernel<R, P>),
+    /// Of a part without parameters.
+    Alone(&'a dyn Kernel<R>),
+}
+
+/// The kernel of a part in one precision.
+type Pick<R, P> = fn(&Part) -> Option<Own<'_, R, P>>;
 
 fn channels<'a, R: Real>(data: &'a mut [R], range: &Range<usize>, rows: usize) -> TileMut<'a, R> {
     TileMut::new(&mut data[range.start * rows..range.end * rows], rows)
 }
 
 impl ConcatStage {
-    fn forward_parts<R: Real>(
+    fn forward_parts<R: Real, P>(
         &self,
-        pick: Pick<R>,
-        params: &[R],
+        pick: Pick<R, P>,
+        params: &[P],
         x: Tile<'_, R>,
         y: TileMut<'_, R>,
         tape: TileMut<'_, R>,
     ) {
         for part in &self.parts {
-            if let Some(kernel) = pick(part.stage.as_ref()) {
-                let y = channels(y.data, &part.outputs, x.rows);
-                let tape = channels(tape.data, &part.tape, x.rows);
-                kernel.forward(&params[part.params.clone()], x, y, tape);
+            let y = channels(y.data, &part.outputs, x.rows);
+            let tape = channels(tape.data, &part.tape, x.rows);
+            match pick(part) {
+                Some(Own::Reads(kernel)) => kernel.forward(&params[part.params.clone()], x, y, tape),
+                Some(Own::Alone(kernel)) => kernel.forward(&[], x, y, tape),
+                None => {}
             }
         }
     }
 
-    fn backward_parts<R: Real>(
+    fn backward_parts<R: Real, P>(
         &self,
-        pick: Pick<R>,
-        params: &[R],
+        pick: Pick<R, P>,
+        params: &[P],
         x: Tile<'_, R>,
         tape: TileMut<'_, R>,
         dy: Tile<'_, R>,
@@ -186,7 +208,6 @@ impl ConcatStage {
             if own.is_empty() && dx.is_none() {
                 continue;
             }
-            let Some(kernel) = pick(part.stage.as_ref()) else { continue };
             let values = if own.is_empty() {
                 &mut []
             } else {
@@ -194,14 +215,15 @@ impl ConcatStage {
             };
             let own = own.start - part.params.start..own.end - part.params.start;
             let part_dx = dx.as_mut().map(|dx| TileMut::new(if i == 0 { &mut *dx.data } else { &mut one }, n));
-            kernel.backward(
-                &params[part.params.clone()],
-                x,
-                channels(tape.data, &part.tape, n),
-                Tile::new(dy.channels(part.outputs.clone()), n),
-                Grads { values, range: own },
-                part_dx,
-            );
+            let (tape, grads) = (channels(tape.data, &part.tape, n), Grads { values, range: own });
+            let dy = Tile::new(dy.channels(part.outputs.clone()), n);
+            match pick(part) {
+                Some(Own::Reads(kernel)) => {
+                    kernel.backward(&params[part.params.clone()], x, tape, dy, grads, part_dx);
+                }
+                Some(Own::Alone(kernel)) => kernel.backward(&[], x, tape, dy, grads, part_dx),
+                None => continue,
+            }
             if let (Some(dx), true) = (&mut dx, i > 0) {
                 dx.data.iter_mut().zip(&one).for_each(|(sum, &d)| *sum += d);
             }
@@ -209,41 +231,32 @@ impl ConcatStage {
     }
 }
 
-impl Kernel<f32> for ConcatStage {
-    fn forward(&self, params: &[f32], x: Tile<'_, f32>, y: TileMut<'_, f32>, tape: TileMut<'_, f32>) {
-        self.forward_parts(|e| Some(e.kernel()), params, x, y, tape);
-    }
+/// The kernels of one precision, from those that `$pick` finds of the parts.
+macro_rules! kernels {
+    ($real:ty, $stored:ty, $pick:expr) => {
+        impl Kernel<$real, $stored> for ConcatStage {
+            fn forward(&self, params: &[$stored], x: Tile<'_, $real>, y: TileMut<'_, $real>, tape: TileMut<'_, $real>) {
+                self.forward_parts($pick, params, x, y, tape);
+            }
 
-    fn backward(
-        &self,
-        params: &[f32],
-        x: Tile<'_, f32>,
-        tape: TileMut<'_, f32>,
-        dy: Tile<'_, f32>,
-        grads: Grads<'_, f32>,
-        dx: Option<TileMut<'_, f32>>,
-    ) {
-        self.backward_parts(|e| Some(e.kernel()), params, x, tape, dy, grads, dx);
-    }
+            fn backward(
+                &self,
+                params: &[$stored],
+                x: Tile<'_, $real>,
+                tape: TileMut<'_, $real>,
+                dy: Tile<'_, $real>,
+                grads: Grads<'_, $real>,
+                dx: Option<TileMut<'_, $real>>,
+            ) {
+                self.backward_parts($pick, params, x, tape, dy, grads, dx);
+            }
+        }
+    };
 }
-
-impl Kernel<f64> for ConcatStage {
-    fn forward(&self, params: &[f64], x: Tile<'_, f64>, y: TileMut<'_, f64>, tape: TileMut<'_, f64>) {
-        self.forward_parts(|e| e.reference(), params, x, y, tape);
-    }
-
-    fn backward(
-        &self,
-        params: &[f64],
-        x: Tile<'_, f64>,
-        tape: TileMut<'_, f64>,
-        dy: Tile<'_, f64>,
-        grads: Grads<'_, f64>,
-        dx: Option<TileMut<'_, f64>>,
-    ) {
-        self.backward_parts(|e| e.reference(), params, x, tape, dy, grads, dx);
-    }
-}
+kernels!(f32, f32, |p| Some(Own::Reads(p.stage.kernel())));
+kernels!(f64, f64, |p| p.stage.reference().map(Own::Reads));
+kernels!(f32, F16, |p| p.in_halves(|h| h.f16));
+kernels!(f32, Bf16, |p| p.in_halves(|h| h.bf16));
 
 impl Stage for ConcatStage {
     fn info(&self) -> Info {
@@ -273,6 +286,10 @@ impl Stage for ConcatStage {
 
     fn reference(&self) -> Option<&dyn Kernel<f64>> {
         self.parts.iter().all(|p| p.stage.reference().is_some()).then_some(self as _)
+    }
+
+    fn halves(&self) -> Option<Halves<'_>> {
+        self.parts.iter().all(|p| p.in_halves(|h| h.f16).is_some()).then(|| Halves::of(self))
     }
 
     fn partition(&self) -> Vec<Range<usize>> {

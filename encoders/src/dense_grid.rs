@@ -7,10 +7,13 @@
 
 use crate::levels::{LevelCode, by_channel, functions};
 use conefield_core::error::{Error, Result, ensure};
+use conefield_core::half::Stored;
 use conefield_core::random::{mix, unit};
 use conefield_core::simd::{Op, Real, Simd, run};
 use conefield_core::spec::EncoderSpec;
-use conefield_core::stage::{Encoder, GradKind, Grads, Info, Kernel, Parameter, Reduced, Scope, Stage, Tile, TileMut};
+use conefield_core::stage::{
+    Encoder, GradKind, Grads, Halves, Info, Kernel, Parameter, Reduced, Scope, Stage, Tile, TileMut,
+};
 use conefield_core::trilinear::{BLOCK, Grid, Located};
 use conefield_core::wgsl::{Fragment, TRILINEAR};
 use schemars::JsonSchema;
@@ -130,14 +133,14 @@ impl DenseGridStage {
     }
 }
 
-struct Forward<'a, R> {
+struct Forward<'a, R, P> {
     stage: &'a DenseGridStage,
-    params: &'a [R],
+    params: &'a [P],
     x: Tile<'a, R>,
     y: TileMut<'a, R>,
 }
 
-impl<R: Real> Forward<'_, R> {
+impl<R: Real, P: Stored<R>> Forward<'_, R, P> {
     #[inline(always)]
     fn features<S: Simd, const F: usize>(mut self, s: S) {
         let mut located = Located::default();
@@ -164,16 +167,16 @@ impl<R: Real> Forward<'_, R> {
     }
 }
 
-struct Backward<'a, R> {
+struct Backward<'a, R, P> {
     stage: &'a DenseGridStage,
-    params: &'a [R],
+    params: &'a [P],
     x: Tile<'a, R>,
     dy: Tile<'a, R>,
     grads: Grads<'a, R>,
     dx: Option<TileMut<'a, R>>,
 }
 
-impl<R: Real> Backward<'_, R> {
+impl<R: Real, P: Stored<R>> Backward<'_, R, P> {
     #[inline(always)]
     fn features<S: Simd, const F: usize>(mut self, s: S) {
         let mut located = Located::default();
@@ -210,7 +213,7 @@ impl<R: Real> Backward<'_, R> {
                 if let Some(dx) = &mut self.dx {
                     for i in 0..n {
                         let cell = &table[located.base(i)..];
-                        let corners = offsets.map(|o| (0..F).map(|f| cell[o][f] * dy[i][f]).sum());
+                        let corners = offsets.map(|o| (0..F).map(|f| cell[o][f].value() * dy[i][f]).sum());
                         for (d, slope) in located.slopes(i, corners).into_iter().enumerate() {
                             dx.channel(d)[at + i] += slope;
                         }
@@ -224,7 +227,7 @@ impl<R: Real> Backward<'_, R> {
 /// Runs `features` with the number of features as a constant.
 macro_rules! by_features {
     ($op:ident) => {
-        impl<R: Real> Op for $op<'_, R> {
+        impl<R: Real, P: Stored<R>> Op for $op<'_, R, P> {
             type Out = ();
             #[inline(always)]
             fn call<S: Simd>(self, s: S) {
@@ -241,14 +244,14 @@ macro_rules! by_features {
 by_features!(Forward);
 by_features!(Backward);
 
-impl<R: Real> Kernel<R> for DenseGridStage {
-    fn forward(&self, params: &[R], x: Tile<'_, R>, y: TileMut<'_, R>, _: TileMut<'_, R>) {
+impl<R: Real, P: Stored<R>> Kernel<R, P> for DenseGridStage {
+    fn forward(&self, params: &[P], x: Tile<'_, R>, y: TileMut<'_, R>, _: TileMut<'_, R>) {
         run(Forward { stage: self, params, x, y });
     }
 
     fn backward(
         &self,
-        params: &[R],
+        params: &[P],
         x: Tile<'_, R>,
         _: TileMut<'_, R>,
         dy: Tile<'_, R>,
@@ -294,6 +297,10 @@ impl Stage for DenseGridStage {
 
     fn reference(&self) -> Option<&dyn Kernel<f64>> {
         Some(self)
+    }
+
+    fn halves(&self) -> Option<Halves<'_>> {
+        Some(Halves::of(self))
     }
 
     fn partition(&self) -> Vec<Range<usize>> {

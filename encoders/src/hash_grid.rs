@@ -6,10 +6,13 @@
 
 use crate::levels::{LevelCode, by_channel, functions};
 use conefield_core::error::{Result, ensure};
+use conefield_core::half::Stored;
 use conefield_core::random::{mix, unit};
 use conefield_core::simd::{Op, Real, Simd, SimdBase, SimdFloat, V, load, run, store};
 use conefield_core::spec::EncoderSpec;
-use conefield_core::stage::{Encoder, GradKind, Grads, Info, Kernel, Parameter, Reduced, Scope, Stage, Tile, TileMut};
+use conefield_core::stage::{
+    Encoder, GradKind, Grads, Halves, Info, Kernel, Parameter, Reduced, Scope, Stage, Tile, TileMut,
+};
 use conefield_core::wgsl::Fragment;
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
@@ -285,16 +288,19 @@ fn entry_mut<T>(table: &mut [T], i: u32) -> &mut T {
     unsafe { table.get_unchecked_mut(i as usize) }
 }
 
-struct Forward<'a, R> {
+struct Forward<'a, R, P> {
     stage: &'a HashGridStage,
-    params: &'a [R],
+    params: &'a [P],
     x: Tile<'a, R>,
     y: TileMut<'a, R>,
 }
 
-impl<R: Real> Forward<'_, R> {
+impl<R: Real, P: Stored<R>> Forward<'_, R, P> {
     #[inline(always)]
     fn features<S: Simd, const F: usize>(mut self, s: S) {
+        // Halves are made wide a block at a time: a loop over neighbours becomes vector code.
+        let widen = size_of::<P>() < size_of::<R>();
+        let (mut read, mut wide) = ([[P::default(); F]; 8 * BLOCK], [[R::ZERO; F]; 8 * BLOCK]);
         let mut located = Located::new();
         let mut out = [[R::ZERO; BLOCK]; F];
         for level in &self.stage.levels {
@@ -304,12 +310,26 @@ impl<R: Real> Forward<'_, R> {
                 let n = BLOCK.min(self.x.rows - at);
                 located.locate(s, level, self.stage.primes, self.x, at, n);
                 prefetch(table, &located, n);
+                if widen {
+                    for i in 0..n {
+                        for c in 0..8 {
+                            read[8 * i + c] = *entry(table, located.index[c][i]);
+                        }
+                    }
+                    for (wide, &read) in wide.as_flattened_mut().iter_mut().zip(read.as_flattened()) {
+                        *wide = read.value();
+                    }
+                }
                 for i in 0..n {
                     let mut sum = [R::ZERO; F];
                     for c in 0..8 {
-                        let (entry, w) = (entry(table, located.index[c][i]), located.weight[c][i]);
+                        let w = located.weight[c][i];
                         for f in 0..F {
-                            sum[f] += w * entry[f];
+                            sum[f] += w * if widen {
+                                wide[8 * i + c][f]
+                            } else {
+                                entry(table, located.index[c][i])[f].value()
+                            };
                         }
                     }
                     for f in 0..F {
@@ -326,7 +346,7 @@ impl<R: Real> Forward<'_, R> {
     }
 }
 
-impl<R: Real> Op for Forward<'_, R> {
+impl<R: Real, P: Stored<R>> Op for Forward<'_, R, P> {
     type Out = ();
     #[inline(always)]
     fn call<S: Simd>(self, s: S) {
@@ -339,16 +359,16 @@ impl<R: Real> Op for Forward<'_, R> {
     }
 }
 
-struct Backward<'a, R> {
+struct Backward<'a, R, P> {
     stage: &'a HashGridStage,
-    params: &'a [R],
+    params: &'a [P],
     x: Tile<'a, R>,
     dy: Tile<'a, R>,
     grads: Grads<'a, R>,
     dx: Option<TileMut<'a, R>>,
 }
 
-impl<R: Real> Backward<'_, R> {
+impl<R: Real, P: Stored<R>> Backward<'_, R, P> {
     #[inline(always)]
     fn features<S: Simd, const F: usize>(mut self, s: S) {
         let mut located = Located::new();
@@ -403,7 +423,7 @@ impl<R: Real> Backward<'_, R> {
                     for i in 0..n {
                         let v: [R; 8] = std::array::from_fn(|c| {
                             let entry = &table[located.index[c][i] as usize];
-                            (0..F).map(|f| entry[f] * dy[i][f]).sum()
+                            (0..F).map(|f| entry[f].value() * dy[i][f]).sum()
                         });
                         for d in 0..3 {
                             let mut slope = R::ZERO;
@@ -424,7 +444,7 @@ impl<R: Real> Backward<'_, R> {
     }
 }
 
-impl<R: Real> Op for Backward<'_, R> {
+impl<R: Real, P: Stored<R>> Op for Backward<'_, R, P> {
     type Out = ();
     #[inline(always)]
     fn call<S: Simd>(self, s: S) {
@@ -437,14 +457,14 @@ impl<R: Real> Op for Backward<'_, R> {
     }
 }
 
-impl<R: Real> Kernel<R> for HashGridStage {
-    fn forward(&self, params: &[R], x: Tile<'_, R>, y: TileMut<'_, R>, _: TileMut<'_, R>) {
+impl<R: Real, P: Stored<R>> Kernel<R, P> for HashGridStage {
+    fn forward(&self, params: &[P], x: Tile<'_, R>, y: TileMut<'_, R>, _: TileMut<'_, R>) {
         run(Forward { stage: self, params, x, y });
     }
 
     fn backward(
         &self,
-        params: &[R],
+        params: &[P],
         x: Tile<'_, R>,
         _: TileMut<'_, R>,
         dy: Tile<'_, R>,
@@ -495,6 +515,10 @@ impl Stage for HashGridStage {
 
     fn reference(&self) -> Option<&dyn Kernel<f64>> {
         Some(self)
+    }
+
+    fn halves(&self) -> Option<Halves<'_>> {
+        Some(Halves::of(self))
     }
 
     fn partition(&self) -> Vec<Range<usize>> {

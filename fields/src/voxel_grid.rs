@@ -5,9 +5,12 @@
 
 use crate::mlp::{ACTIVATION, Activation, activate};
 use conefield_core::error::{Error, Result, ensure};
+use conefield_core::half::Stored;
 use conefield_core::simd::{Op, Real, Simd, run};
 use conefield_core::spec::FieldSpec;
-use conefield_core::stage::{Field, GradKind, Grads, Info, Kernel, Parameter, Reduced, Scope, Stage, Tile, TileMut};
+use conefield_core::stage::{
+    Field, GradKind, Grads, Halves, Info, Kernel, Parameter, Reduced, Scope, Stage, Tile, TileMut,
+};
 use conefield_core::trilinear::{BLOCK, Grid, Located};
 use conefield_core::wgsl::{Fragment, TRILINEAR};
 use schemars::JsonSchema;
@@ -88,14 +91,14 @@ impl VoxelGridStage {
     }
 }
 
-struct Forward<'a, R> {
+struct Forward<'a, R, P> {
     stage: &'a VoxelGridStage,
-    params: &'a [R],
+    params: &'a [P],
     x: Tile<'a, R>,
     y: TileMut<'a, R>,
 }
 
-impl<R: Real> Op for Forward<'_, R> {
+impl<R: Real, P: Stored<R>> Op for Forward<'_, R, P> {
     type Out = ();
     #[inline(always)]
     fn call<S: Simd>(self, s: S) {
@@ -114,16 +117,16 @@ impl<R: Real> Op for Forward<'_, R> {
     }
 }
 
-struct Backward<'a, R> {
+struct Backward<'a, R, P> {
     stage: &'a VoxelGridStage,
-    params: &'a [R],
+    params: &'a [P],
     x: Tile<'a, R>,
     dy: Tile<'a, R>,
     grads: Grads<'a, R>,
     dx: Option<TileMut<'a, R>>,
 }
 
-impl<R: Real> Op for Backward<'_, R> {
+impl<R: Real, P: Stored<R>> Op for Backward<'_, R, P> {
     type Out = ();
     #[inline(always)]
     fn call<S: Simd>(mut self, s: S) {
@@ -158,7 +161,7 @@ impl<R: Real> Op for Backward<'_, R> {
             }
             if let Some(dx) = &mut self.dx {
                 for i in 0..n {
-                    let corners = offsets.map(|o| table[located.base(i) + o][0]);
+                    let corners = offsets.map(|o| table[located.base(i) + o][0].value());
                     for (d, v) in located.slopes(i, corners).into_iter().enumerate() {
                         dx.channel(d)[at + i] = v * slope[i];
                     }
@@ -168,14 +171,14 @@ impl<R: Real> Op for Backward<'_, R> {
     }
 }
 
-impl<R: Real> Kernel<R> for VoxelGridStage {
-    fn forward(&self, params: &[R], x: Tile<'_, R>, y: TileMut<'_, R>, _: TileMut<'_, R>) {
+impl<R: Real, P: Stored<R>> Kernel<R, P> for VoxelGridStage {
+    fn forward(&self, params: &[P], x: Tile<'_, R>, y: TileMut<'_, R>, _: TileMut<'_, R>) {
         run(Forward { stage: self, params, x, y });
     }
 
     fn backward(
         &self,
-        params: &[R],
+        params: &[P],
         x: Tile<'_, R>,
         _: TileMut<'_, R>,
         dy: Tile<'_, R>,
@@ -214,6 +217,10 @@ impl Stage for VoxelGridStage {
 
     fn reference(&self) -> Option<&dyn Kernel<f64>> {
         Some(self)
+    }
+
+    fn halves(&self) -> Option<Halves<'_>> {
+        Some(Halves::of(self))
     }
 
     fn partition(&self) -> Vec<Range<usize>> {

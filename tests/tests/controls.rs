@@ -4,11 +4,12 @@
 use conefield_conformance::{Options, check, check_encoder, check_initializer, check_projector, check_voxel_projector};
 use conefield_core::arena::{Arena, InitReport, Layout};
 use conefield_core::geometry::Geometry;
+use conefield_core::half::Stored;
 use conefield_core::simd::Real;
 use conefield_core::spec::Initializer;
 use conefield_core::stage::{
-    Encoder, GradKind, Grads, Info, Kernel, Parameter, Projector, Reduced, Samples, Scope, Stage, Tile, TileMut,
-    UnitRay,
+    Encoder, GradKind, Grads, Halves, Info, Kernel, Parameter, Projector, Reduced, Samples, Scope, Stage, Tile,
+    TileMut, UnitRay,
 };
 use conefield_core::voxel::{VoxelOperator, VoxelProjector};
 use conefield_core::{Error, Result};
@@ -58,6 +59,10 @@ enum Fault {
     MissingBlock,
     /// Two blocks have one name.
     TwinNames,
+    /// What reads halves is a percent off.
+    CoarseHalves,
+    /// What reads halves goes another way back.
+    HalvesGradient,
     /// Some parameters are not initialised.
     PartialInit,
     /// It says that it does nothing.
@@ -85,12 +90,12 @@ impl Toy {
     }
 }
 
-impl<R: Real> Kernel<R> for Toy {
-    fn forward(&self, params: &[R], x: Tile<'_, R>, mut y: TileMut<'_, R>, _: TileMut<'_, R>) {
+impl<R: Real, P: Stored<R>> Kernel<R, P> for Toy {
+    fn forward(&self, params: &[P], x: Tile<'_, R>, mut y: TileMut<'_, R>, _: TileMut<'_, R>) {
         let calls = self.calls.fetch_add(1, Ordering::Relaxed);
         let rows = x.rows;
         for (c, &from) in self.channels.iter().enumerate() {
-            let w = params[c];
+            let w = params[c].value();
             let everything: R = x.data.iter().copied().sum();
             for i in 0..rows {
                 let mut v = w * x.channel(from)[i] + w * w;
@@ -99,6 +104,7 @@ impl<R: Real> Kernel<R> for Toy {
                     Fault::TileSize => v += R::of(rows as f64 * 1e-6),
                     Fault::Remembers => v += R::of(f64::from(calls) * 1e-6),
                     Fault::Overflows => v = v * v / (v + R::of(1e-9)),
+                    Fault::CoarseHalves if size_of::<P>() == 2 => v *= R::of(1.01),
                     Fault::Coarse if size_of::<R>() == 4 => v = R::of((v.f64() * 1e3).round() * 1e-3),
                     _ => {}
                 }
@@ -115,7 +121,7 @@ impl<R: Real> Kernel<R> for Toy {
 
     fn backward(
         &self,
-        params: &[R],
+        params: &[P],
         x: Tile<'_, R>,
         _: TileMut<'_, R>,
         dy: Tile<'_, R>,
@@ -124,13 +130,14 @@ impl<R: Real> Kernel<R> for Toy {
     ) {
         assert!(self.fault != Fault::Panics, "as ordered");
         for c in grads.range.clone() {
-            let w = params[c];
+            let w = params[c].value();
             let rows = if self.fault == Fault::LastRow { x.rows - 1 } else { x.rows };
             let mut sum = R::ZERO;
             for i in 0..rows {
                 sum += dy.channel(c)[i] * (x.channel(self.channels[c])[i] + w + w);
             }
             match self.fault {
+                Fault::HalvesGradient if size_of::<P>() == 2 => sum *= R::of(1.01),
                 Fault::Gradient => sum *= R::of(1.01),
                 Fault::Forgotten if c == 1 => sum = R::ZERO,
                 Fault::RangeDependent if grads.range.len() == 1 => sum *= R::of(1.0 + 1e-6),
@@ -149,7 +156,7 @@ impl<R: Real> Kernel<R> for Toy {
         for (c, &from) in self.channels.iter().enumerate() {
             let sign = if self.fault == Fault::InputGradient { R::of(-1.0) } else { R::ONE };
             for i in 0..x.rows {
-                dx.channel(from)[i] += sign * params[c] * dy.channel(c)[i];
+                dx.channel(from)[i] += sign * params[c].value() * dy.channel(c)[i];
             }
         }
     }
@@ -198,6 +205,10 @@ impl Stage for Toy {
 
     fn reference(&self) -> Option<&dyn Kernel<f64>> {
         self.double.then_some(self as _)
+    }
+
+    fn halves(&self) -> Option<Halves<'_>> {
+        Some(Halves::of(self))
     }
 
     fn partition(&self) -> Vec<Range<usize>> {
@@ -253,6 +264,8 @@ fn every_fault_fails_its_property_and_the_sound_stage_none() {
         (Fault::SkipsOutput, "outputs overwrite"),
         (Fault::Overflows, "extremes"),
         (Fault::Coarse, "single precision: outputs"),
+        (Fault::CoarseHalves, "halves: outputs"),
+        (Fault::HalvesGradient, "halves: gradients"),
         (Fault::Remembers, "threads"),
         (Fault::Overlap, "partition"),
         (Fault::Gap, "partition"),

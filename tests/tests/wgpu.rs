@@ -3,7 +3,7 @@
 mod common;
 mod device;
 
-use common::{Heard, Stop, model, scan, solve, solve_on, spec, truth};
+use common::{Heard, Stop, model, psnr, scan, solve, solve_on, spec, truth};
 use conefield_backend_cpu::Cpu;
 use conefield_backend_cpu::rows::Kernels;
 use conefield_backend_cpu::step::Slots;
@@ -193,14 +193,6 @@ fn what_is_asked_of_a_trained_model_is_that_of_the_cpu() {
 }
 
 // ---- runs ----
-
-fn psnr(value: &Value, backend: &dyn Backend) -> (f64, Vec<Record>) {
-    let (solution, records) = solve_on(backend, value, &scan(), &Weights::default()).unwrap();
-    let (found, truth) = (solution.result.volume(backend).unwrap(), truth());
-    let square = |(a, b): (&f32, &f32)| (f64::from(*a) - f64::from(*b)).powi(2);
-    let mse = found.data.iter().zip(&truth.data).map(square).sum::<f64>() / truth.data.len() as f64;
-    (10.0 * (0.02f64.powi(2) / mse).log10(), records)
-}
 
 #[test]
 fn a_run_with_held_out_views_and_a_prior_ends_where_the_cpu_does() {
@@ -457,50 +449,4 @@ fn samples_are_random_in_the_same_way() {
     let run = |p: &dyn Projector| conefield_conformance::check_projector_wgsl(p, &|p, rays| shared.samples(p, rays));
     assert!(run(spec.build().unwrap().as_ref()).passed());
     assert!(!run(&Off(spec.build().unwrap())).passed());
-}
-
-// ---- halves ----
-
-/// Tables in halves are as far off as rounding to 11 and 8 bits makes them, and training in them loses next to nothing.
-#[test]
-fn tables_in_halves_are_off_by_their_rounding() {
-    let Some(shared) = device::shared("tables in halves") else { return };
-    let grid = json!({"type": "hash-grid", "levels": 3, "log2_table_size": 8, "base_resolution": 4});
-    let spec: Box<dyn conefield_core::spec::EncoderSpec> = serde_json::from_value(grid).unwrap();
-    let stage = spec.build().unwrap();
-    let n = 300;
-    let params: Vec<f32> = (0..stage.info().params as u64).map(|i| 2.0 * unit(mix(8, i)) - 1.0).collect();
-    let x: Vec<f32> = (0..3 * n).map(|i| unit(mix(9, i))).collect();
-    let dy = vec![1.0; stage.info().output * n as usize];
-    let run = |tables| shared.pass(stage.as_ref(), tables, &params, &x, &dy, n as usize).unwrap();
-    let [want, grads, _] = run(Tables::F32);
-    for (tables, bits) in [(Tables::F16, 11), (Tables::Bf16, 8)] {
-        let [y, same, _] = run(tables);
-        let off = y.iter().zip(&want).map(|(a, b)| (a - b).abs()).fold(0.0f32, f32::max);
-        let rounding = 0.5f32.powi(bits);
-        println!("{tables}: off by {off:.1e}, rounding {rounding:.1e}");
-        assert!(off <= rounding && off > rounding / 30.0, "{tables}: {off}");
-        let top = grads.iter().fold(0.0f32, |m, g| m.max(g.abs()));
-        assert!(grads.iter().zip(&same).all(|(a, b)| (a - b).abs() <= 1e-5 * top), "gradients stay f32");
-    }
-}
-
-#[test]
-fn a_run_with_tables_in_halves_ends_near_one_in_f32() {
-    let e = {
-        let mut s = settings();
-        s["precision"] = json!({"tables": "f16"});
-        solve(&s, &scan(), &Weights::default()).err().unwrap().to_string()
-    };
-    assert!(e.contains("precision.tables") && e.contains("--backend wgpu"), "{e}");
-    for (name, backend) in device::backends("a run in halves").into_iter().step_by(2) {
-        let (whole, _) = psnr(&settings(), &backend);
-        for tables in ["f16", "bf16"] {
-            let mut s = settings();
-            s["precision"] = json!({ "tables": tables });
-            let (halves, _) = psnr(&s, &backend);
-            println!("{name}, {tables}: {halves:.3} dB, f32 {whole:.3} dB");
-            assert!((halves - whole).abs() < 0.2 && halves != whole, "{name}, {tables}: {halves} dB, f32 {whole} dB");
-        }
-    }
 }

@@ -1,14 +1,16 @@
-//! Adam (Kingma & Ba 2015, algorithm 1) over the whole arena, one pass.
+//! Adam (Kingma & Ba 2015, algorithm 1) over the whole arena, one pass, in which the copy in halves is made anew.
 
+use crate::halves::Rounded;
 use conefield_core::arena::Arena;
 use conefield_core::backend::Adam;
+use conefield_core::half::{F16, Half, round};
 use conefield_core::simd::{Op, Select, Simd, SimdBase, SimdFloat, V, load, run, store};
 use rayon::prelude::*;
 
 const BLOCK: usize = 16_384;
 
-/// One step with the arena's gradients, which are zero afterwards.
-pub fn update(arena: &mut Arena, adam: &Adam) {
+/// One step with the arena's gradients, which are zero afterwards. `copy` is that of the new parameters afterwards.
+pub fn update(arena: &mut Arena, adam: &Adam, copy: Option<&mut Rounded>) {
     let bias1 = 1.0 - adam.beta1.powf(adam.step as f64);
     let bias2 = 1.0 - adam.beta2.powf(adam.step as f64);
     let rule = Rule {
@@ -18,13 +20,25 @@ pub fn update(arena: &mut Arena, adam: &Adam) {
         root: (1.0 / bias2.sqrt()) as f32,
         eps: adam.eps as f32,
     };
-    arena
-        .params
-        .par_chunks_mut(BLOCK)
-        .zip(arena.grads.par_chunks_mut(BLOCK))
-        .zip(arena.first.par_chunks_mut(BLOCK))
-        .zip(arena.second.par_chunks_mut(BLOCK))
-        .for_each(|(((p, g), m), v)| run(Block { rule, p, g, m, v }));
+    match copy {
+        None => sweep::<F16>(arena, rule, &mut []),
+        Some(Rounded::F16(copy)) => sweep(arena, rule, copy),
+        Some(Rounded::Bf16(copy)) => sweep(arena, rule, copy),
+    }
+}
+
+/// `copy` is as long as the arena or empty.
+fn sweep<H: Half>(arena: &mut Arena, rule: Rule, copy: &mut [H]) {
+    let Arena { params, grads, first, second } = arena;
+    let mut copies = copy.chunks_mut(BLOCK);
+    let blocks: Vec<_> = params
+        .chunks_mut(BLOCK)
+        .zip(grads.chunks_mut(BLOCK))
+        .zip(first.chunks_mut(BLOCK))
+        .zip(second.chunks_mut(BLOCK))
+        .map(|(((p, g), m), v)| Block { rule, p, g, m, v, copy: copies.next().unwrap_or_default() })
+        .collect();
+    blocks.into_par_iter().for_each(run);
 }
 
 #[derive(Clone, Copy)]
@@ -36,19 +50,20 @@ struct Rule {
     eps: f32,
 }
 
-struct Block<'a> {
+struct Block<'a, H> {
     rule: Rule,
     p: &'a mut [f32],
     g: &'a mut [f32],
     m: &'a mut [f32],
     v: &'a mut [f32],
+    copy: &'a mut [H],
 }
 
-impl Op for Block<'_> {
+impl<H: Half> Op for Block<'_, H> {
     type Out = ();
     #[inline(always)]
     fn call<S: Simd>(self, s: S) {
-        let Self { rule, p, g, m, v } = self;
+        let Self { rule, p, g, m, v, copy } = self;
         let number = |x: f32| V::<S, f32>::splat(s, x);
         let zero = number(0.0);
         let mut i = 0;
@@ -64,12 +79,14 @@ impl Op for Block<'_> {
             store::<S, f32>(zero, g, i);
             i += V::<S, f32>::LEN;
         }
+        round(p, copy);
     }
 }
 
 #[cfg(test)]
 mod tests {
     use super::*;
+    use conefield_core::spec::Tables;
 
     #[test]
     fn follows_the_algorithm_in_double_precision() {
@@ -86,11 +103,34 @@ mod tests {
                 let (mh, vh) = (m[i] / (1.0 - 0.9f64.powi(step as i32)), v[i] / (1.0 - 0.999f64.powi(step as i32)));
                 p[i] -= 1e-2 * mh / (vh.sqrt() + 1e-8);
             }
-            update(&mut arena, &Adam { lr: 1e-2, beta1: 0.9, beta2: 0.999, eps: 1e-8, step });
+            update(&mut arena, &Adam { lr: 1e-2, beta1: 0.9, beta2: 0.999, eps: 1e-8, step }, None);
             assert!(arena.grads.iter().all(|&g| g == 0.0));
         }
         for i in 0..n {
             assert!((f64::from(arena.params[i]) - p[i]).abs() < 1e-5, "{} {}", arena.params[i], p[i]);
+        }
+    }
+
+    #[test]
+    fn the_copy_is_that_of_the_new_parameters() {
+        let n = 2 * BLOCK + 37;
+        let start: Vec<f32> = (0..n).map(|i| (i as f32 * 0.37).sin() * 10f32.powi(i as i32 % 13 - 7)).collect();
+        let mut plain = Arena::new(n);
+        plain.params.copy_from_slice(&start);
+        plain.grads.iter_mut().zip(&start).for_each(|(g, p)| *g = 3.0 * p);
+        let adam = Adam { lr: 1e-2, beta1: 0.9, beta2: 0.999, eps: 1e-8, step: 1 };
+        for tables in [Tables::F16, Tables::Bf16] {
+            let mut arena = plain.clone();
+            let mut copy = Rounded::new(tables, &arena.params).unwrap();
+            update(&mut arena, &adam, Some(&mut copy));
+            let mut alone = plain.clone();
+            update(&mut alone, &adam, None);
+            assert!(arena == alone && arena.params != plain.params);
+            match (copy, Rounded::new(tables, &arena.params).unwrap()) {
+                (Rounded::F16(a), Rounded::F16(b)) => assert!(a == b),
+                (Rounded::Bf16(a), Rounded::Bf16(b)) => assert!(a == b),
+                _ => panic!("another format"),
+            }
         }
     }
 
@@ -100,7 +140,7 @@ mod tests {
         arena.first.fill(1e-29);
         arena.second.fill(1e-35);
         for step in 1..=4000 {
-            update(&mut arena, &Adam { lr: 1e-3, beta1: 0.9, beta2: 0.999, eps: 1e-8, step });
+            update(&mut arena, &Adam { lr: 1e-3, beta1: 0.9, beta2: 0.999, eps: 1e-8, step }, None);
         }
         assert!(arena.first.iter().chain(arena.second.iter()).all(|&x| x == 0.0));
     }

@@ -5,19 +5,22 @@
 //! normalise, evaluate the field, integrate, take the loss and go backward, tile by tile, while a tile is in the
 //! cache ([`rows`]). Dense stages sum their gradients in copies of their own, one a slot, merged in order. Stages
 //! with scattered parameters get the rows of the wave a second time, each worker with a range of parameters of its
-//! own ([`step`]). The number of slots and the order of every sum depend on the plan alone: the same bits come out
+//! own ([`step`]). Where tables are read in halves, these are a copy of the parameters ([`halves`]) that each update makes
+//! anew ([`adam`]). The number of slots and the order of every sum depend on the plan alone: the same bits come out
 //! on any number of threads.
 
 pub mod adam;
+pub mod halves;
 pub mod rows;
 pub mod step;
 
 use conefield_core::backend::{Adam, Backend, Executable, Explain, StepStats, Work};
-use conefield_core::error::{Error, Result, ensure};
+use conefield_core::error::{Error, Result};
 use conefield_core::pipeline::{Model, Pipeline};
 use conefield_core::simd;
 use conefield_core::spec::Tables;
 use conefield_core::stage::{GradKind, Samples, TILE_ROWS, UnitRay, titled};
+use halves::Rounded;
 use rayon::prelude::*;
 use rows::{Belong, Encoded, Kernels, Scratch};
 use step::Slots;
@@ -42,9 +45,8 @@ impl Backend for Cpu {
     }
 
     fn compile(&self, pipeline: &Pipeline) -> Result<(Box<dyn Executable>, Explain)> {
-        let found = format!("{:?}", pipeline.tables.to_string());
-        let expected = "\"f32\" on the CPU; --backend wgpu reads halves";
-        ensure(pipeline.tables == Tables::F32, "spec", "precision.tables", found, expected)?;
+        let tables = pipeline.tables;
+        let mut halves = false;
         let mut notes = vec![];
         for (name, stage) in pipeline.stages() {
             let info = stage.info();
@@ -54,6 +56,14 @@ impl Backend for Cpu {
                     format!("{name} on the CPU backend"),
                     "a stage with scattered parameters must not keep a tape",
                 ));
+            }
+            if info.grads == GradKind::Scatter && tables != Tables::F32 {
+                halves = true;
+                if stage.halves().is_none() {
+                    let why =
+                        format!("it cannot read its parameters in {tables}; it can with precision.tables = \"f32\"");
+                    return Err(Error::unsupported(format!("{name} on the CPU backend"), why));
+                }
             }
             notes.push(match (info.identity, info.grads) {
                 (true, _) => format!("{name}: identity, left out"),
@@ -67,14 +77,18 @@ impl Backend for Cpu {
                 }
             });
         }
-        let kernels = Kernels::new(pipeline, |s| Some(s.kernel()))
-            .ok_or_else(|| Error::unsupported("cpu backend", "a stage offers no kernel"))?;
+        if halves {
+            notes.push(format!("tables are read from a copy in {tables}"));
+        }
+        let kernels = kernels(pipeline, None)?;
+        let copy = if halves { Rounded::BYTES * pipeline.layout().len() } else { 0 };
         let explain = Explain {
             backend: format!("cpu, {}, {} threads", simd::level_name(), rayon::current_num_threads()),
             notes,
-            scratch_bytes: Slots::bytes(&kernels),
+            scratch_bytes: Slots::bytes(&kernels) + copy,
         };
-        Ok((Box::new(CpuExecutable { slots: None, clean: false }), explain))
+        let tables = if halves { tables } else { Tables::F32 };
+        Ok((Box::new(CpuExecutable { slots: None, clean: false, tables, copy: None, current: false }), explain))
     }
 }
 
@@ -83,15 +97,43 @@ struct CpuExecutable {
     slots: Option<Slots<f32>>,
     /// The arena's gradients are known to be zero.
     clean: bool,
+    /// How tables are read.
+    tables: Tables,
+    /// What they are read from, if not from the arena.
+    copy: Option<Rounded>,
+    /// It is that of the arena.
+    current: bool,
 }
 
-fn kernels(pipeline: &Pipeline) -> Result<Kernels<'_, f32>> {
-    Kernels::new(pipeline, |s| Some(s.kernel())).ok_or_else(|| Error::unsupported("cpu backend", "no kernel"))
+/// The kernels of `pipeline`, which [`Backend::compile`] has seen.
+fn kernels<'a>(pipeline: &'a Pipeline, copy: Option<&'a Rounded>) -> Result<Kernels<'a, f32>> {
+    let lacks = || Error::unsupported("the CPU backend", "a stage that is not the one which it was compiled for");
+    Kernels::reading(pipeline, copy).ok_or_else(lacks)
+}
+
+impl CpuExecutable {
+    /// The kernels with what they read, made where it is not current.
+    fn kernels<'a>(&'a mut self, model: &'a Model) -> Result<Kernels<'a, f32>> {
+        self.refresh(model);
+        kernels(&model.pipeline, self.copy.as_ref())
+    }
+
+    /// Makes the copy that of the arena.
+    fn refresh(&mut self, model: &Model) {
+        let params = &model.arena.params;
+        match &mut self.copy {
+            _ if self.current => {}
+            Some(copy) => copy.renew(params),
+            None => self.copy = Rounded::new(self.tables, params),
+        }
+        self.current = true;
+    }
 }
 
 impl Executable for CpuExecutable {
     fn step(&mut self, model: &mut Model, work: &Work<'_>) -> Result<StepStats> {
-        let kernels = kernels(&model.pipeline)?;
+        self.refresh(model);
+        let kernels = kernels(&model.pipeline, self.copy.as_ref())?;
         if !self.clean {
             model.arena.grads.fill(0.0);
         }
@@ -108,13 +150,13 @@ impl Executable for CpuExecutable {
     }
 
     fn update(&mut self, model: &mut Model, adam: &Adam) -> Result<()> {
-        adam::update(&mut model.arena, adam);
+        adam::update(&mut model.arena, adam, self.copy.as_mut().filter(|_| self.current));
         self.clean = true;
         Ok(())
     }
 
     fn evaluate(&mut self, model: &Model, points: &[[f32; 3]], out: &mut [f32]) -> Result<()> {
-        let kernels = kernels(&model.pipeline)?;
+        let kernels = self.kernels(model)?;
         out.par_chunks_mut(CHUNK_ROWS).zip(points.par_chunks(CHUNK_ROWS)).for_each_init(
             || (Encoded::default(), Scratch::default()),
             |(encoded, scratch), (out, points)| {
@@ -131,13 +173,13 @@ impl Executable for CpuExecutable {
 
     fn encode(&mut self, model: &Model, points: &[[f32; 3]]) -> Result<Vec<f32>> {
         let mut encoded = Encoded::default();
-        encoded.forward(&kernels(&model.pipeline)?, &model.arena.params, points);
+        encoded.forward(&self.kernels(model)?, &model.arena.params, points);
         model.pipeline.fault()?;
         Ok(encoded.features().to_vec())
     }
 
     fn render(&mut self, model: &Model, rays: &[UnitRay], out: &mut [f32]) -> Result<()> {
-        let kernels = kernels(&model.pipeline)?;
+        let kernels = self.kernels(model)?;
         let projector = model.pipeline.projector.as_ref();
         out.par_iter_mut().zip(rays).for_each_init(
             || (Encoded::default(), Scratch::default(), Samples::default(), vec![]),
@@ -159,5 +201,9 @@ impl Executable for CpuExecutable {
             },
         );
         model.pipeline.fault()
+    }
+
+    fn renew(&mut self) {
+        self.current = false;
     }
 }

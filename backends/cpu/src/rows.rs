@@ -1,5 +1,6 @@
 //! Forward and backward of a group of rows, tile by tile.
 
+use crate::halves::Rounded;
 use conefield_core::pipeline::Pipeline;
 use conefield_core::simd::Real;
 use conefield_core::stage::{GradKind, Grads, Info, Kernel, Scope, Stage, TILE_ROWS, Tile, TileMut};
@@ -8,7 +9,7 @@ use std::ops::Range;
 /// A stage ready to run: its arithmetic, its widths and its place in the arena.
 pub struct Step<'a, R: Real> {
     /// The arithmetic.
-    pub kernel: &'a dyn Kernel<R>,
+    pub kernel: Box<dyn Kernel<R> + 'a>,
     /// Widths and counts.
     pub info: Info,
     /// Its parameters in the arena.
@@ -39,6 +40,14 @@ pub struct Kernels<'a, R: Real> {
 impl<'a, R: Real> Kernels<'a, R> {
     /// The kernels of `pipeline` in the precision that `pick` chooses; `None` where a stage lacks it.
     pub fn new(pipeline: &'a Pipeline, pick: impl Fn(&'a dyn Stage) -> Option<&'a dyn Kernel<R>>) -> Option<Self> {
+        Self::of(pipeline, |stage, _| Some(Box::new(pick(stage)?)))
+    }
+
+    /// `pick` gets each stage with the place of its parameters in the arena.
+    fn of(
+        pipeline: &'a Pipeline,
+        pick: impl Fn(&'a dyn Stage, Range<usize>) -> Option<Box<dyn Kernel<R> + 'a>>,
+    ) -> Option<Self> {
         let mut steps = vec![];
         let mut learns = false;
         let (mut input, mut end) = (0..0, 0);
@@ -53,7 +62,7 @@ impl<'a, R: Real> Kernels<'a, R> {
             let output = end..end + info.output;
             end = if steps.is_empty() { output.end } else { output.end + info.tape };
             let read = std::mem::replace(&mut input, output.clone());
-            let (kernel, params) = (pick(stage)?, range.clone());
+            let (kernel, params) = (pick(stage, range.clone())?, range.clone());
             steps.push(Step { kernel, info, params, partition, hands_on, input: read, output });
         }
         Some(Self { steps, scope: pipeline.scope() })
@@ -97,6 +106,17 @@ impl<'a, R: Real> Kernels<'a, R> {
 
     fn widest(&self) -> usize {
         self.steps.iter().map(|s| s.info.output).max().unwrap_or(1).max(3)
+    }
+}
+
+impl<'a> Kernels<'a, f32> {
+    /// The kernels that train. Stages with scattered parameters read them in `copy`, where there is one; `None` where
+    /// one of them has no kernel for that.
+    pub fn reading(pipeline: &'a Pipeline, copy: Option<&'a Rounded>) -> Option<Self> {
+        Self::of(pipeline, |stage, range| match copy {
+            Some(copy) if stage.info().grads == GradKind::Scatter => copy.kernel(stage, range),
+            _ => Some(Box::new(stage.kernel())),
+        })
     }
 }
 
@@ -372,7 +392,7 @@ impl<R: Real> Scratch<R> {
                 let x = Tile::new(&before[s.input.start * n..s.input.end * n], n);
                 let (y, tape) = (TileMut::new(y, n), TileMut::new(tape, n));
                 if s.apart(belong) {
-                    self.single.forward(s.kernel, params, x, y, tape);
+                    self.single.forward(s.kernel.as_ref(), params, x, y, tape);
                 } else {
                     s.kernel.forward(params, x, y, tape);
                 }
@@ -430,7 +450,7 @@ impl<R: Real> Scratch<R> {
                 let tape = TileMut::new(&mut after[s.info.output * n..(s.info.output + s.info.tape) * n], n);
                 let dx_here = s.hands_on.then(|| TileMut::new(&mut dx[..s.info.input * n], n));
                 if apart {
-                    self.single.backward(s.kernel, params, x, tape, g, grads, dx_here);
+                    self.single.backward(s.kernel.as_ref(), params, x, tape, g, grads, dx_here);
                 } else {
                     s.kernel.backward(params, x, tape, g, grads, dx_here);
                 }

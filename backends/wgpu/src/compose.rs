@@ -661,12 +661,23 @@ pub fn halve(tables: Tables) -> Source {
     source.bind("params", Access::Read, "array<f32>");
     source.bind("halves", Access::Write, "array<u32>");
     let pack = match tables {
-        Tables::F16 => "fn pack(a: f32, b: f32) -> u32 { return pack2x16float(vec2<f32>(a, b)); }",
+        // What is finite stays finite.
+        Tables::F16 => {
+            "fn within(x: f32) -> f32 {
+    let finite = (bitcast<u32>(x) & 0x7fffffffu) < 0x7f800000u;
+    return select(x, clamp(x, -65504.0, 65504.0), finite);
+}
+fn pack(a: f32, b: f32) -> u32 { return pack2x16float(vec2<f32>(within(a), within(b))); }"
+        }
         // To the nearest, ties to even.
         _ => {
             "fn round16(x: f32) -> u32 {
     let bits = bitcast<u32>(x);
-    return (bits + 0x7fffu + ((bits >> 16u) & 1u)) >> 16u;
+    let magnitude = bits & 0x7fffffffu;
+    let finite = min(magnitude, 0x7f7f0000u);
+    let rounded = (finite + 0x7fffu + ((finite >> 16u) & 1u)) >> 16u;
+    let special = select(0x7f80u, 0x7fc0u, magnitude > 0x7f800000u);
+    return ((bits >> 16u) & 0x8000u) | select(special, rounded, magnitude < 0x7f800000u);
 }
 fn pack(a: f32, b: f32) -> u32 { return round16(a) | (round16(b) << 16u); }"
         }

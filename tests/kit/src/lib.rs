@@ -9,6 +9,7 @@ mod behaviour;
 mod call;
 mod channels;
 mod gradients;
+mod halves;
 mod rays;
 mod voxels;
 mod weights;
@@ -120,6 +121,8 @@ pub fn check(stage: &dyn Stage, options: &Options) -> Report {
     report.add("finite differences: inputs", || gradients::inputs(stage, options));
     report.add("single precision: outputs", || gradients::single_outputs(stage, options));
     report.add("single precision: gradients", || gradients::single_gradients(stage, options));
+    report.add("halves: outputs", || halves::outputs(stage, options));
+    report.add("halves: gradients", || halves::gradients(stage, options));
     report.add("tile sizes: outputs", || behaviour::tile_outputs(stage, options));
     report.add("tile sizes: gradients", || behaviour::tile_gradients(stage, options));
     report.add("outputs overwrite", || behaviour::outputs_overwrite(stage, options));

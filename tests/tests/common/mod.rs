@@ -119,6 +119,16 @@ pub fn solve_on(
     Ok((solution, heard.0))
 }
 
+/// A run on [`scan`]: PSNR against [`truth`], and what was recorded.
+#[allow(dead_code)]
+pub fn psnr(value: &Value, backend: &dyn Backend) -> (f64, Vec<Record>) {
+    let (solution, records) = solve_on(backend, value, &scan(), &Weights::default()).unwrap();
+    let (found, truth) = (solution.result.volume(backend).unwrap(), truth());
+    let square = |(a, b): (&f32, &f32)| (f64::from(*a) - f64::from(*b)).powi(2);
+    let mse = found.data.iter().zip(&truth.data).map(square).sum::<f64>() / truth.data.len() as f64;
+    (10.0 * (0.02f64.powi(2) / mse).log10(), records)
+}
+
 /// The volume of a run.
 #[allow(dead_code)]
 pub fn volume(solution: &Solution) -> Volume {

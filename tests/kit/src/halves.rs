@@ -1,0 +1,62 @@
+//! Parameters that are read in halves: the same arithmetic, of rounded numbers.
+
+use crate::call::{data, error, forward, gradients as backward, params};
+use crate::{Options, Outcome};
+use conefield_core::half::{Bf16, F16, Half, Reader, round};
+use conefield_core::stage::{Halves, Kernel, Stage};
+
+/// Largest error against the kernel that trains on the rounded parameters.
+const SAME: f64 = 1e-6;
+/// Outputs may be off by so many roundings of the largest parameter.
+const ROUNDINGS: f64 = 4.0;
+
+/// What a kernel that reads halves is off: outputs or gradients, of the same numbers and by rounding them.
+type Off = fn(&dyn Stage, &dyn Kernel<f32>, &Options, [&[f32]; 2]) -> [f64; 2];
+
+/// Outputs are those of the rounded parameters, and as far from those of the unrounded as rounding makes them.
+pub fn outputs(stage: &dyn Stage, options: &Options) -> Outcome {
+    let off: Off = |stage, halves, options, [exact, rounded]| {
+        let info = stage.info();
+        let (x, _) = data::<f32>(&info, options, options.rows);
+        let of = |k: &dyn Kernel<f32>, p: &[f32]| forward(k, &info, p, &x, options.rows)[0].clone();
+        let y = of(halves, rounded);
+        [error(&y, &of(stage.kernel(), rounded)), error(&y, &of(stage.kernel(), exact))]
+    };
+    compared(stage, options, off)
+}
+
+/// Gradients of parameters and inputs are those at the rounded parameters, in single precision.
+pub fn gradients(stage: &dyn Stage, options: &Options) -> Outcome {
+    let off: Off = |stage, halves, options, [_, rounded]| {
+        let info = stage.info();
+        let (x, dy) = data::<f32>(&info, options, options.rows);
+        let [g, dx] = backward(halves, &info, rounded, &x, &dy, options.rows);
+        let [want, want_dx] = backward(stage.kernel(), &info, rounded, &x, &dy, options.rows);
+        [error(&g, &want).max(error(&dx, &want_dx)), 0.0]
+    };
+    compared(stage, options, off)
+}
+
+fn compared(stage: &dyn Stage, options: &Options, off: Off) -> Outcome {
+    let Some(Halves { f16, bf16 }) = stage.halves() else {
+        return Outcome::Skipped("it reads parameters as they are".into());
+    };
+    let (mut words, mut fine) = (vec![], true);
+    for (name, [same, rounding], bits) in
+        [("f16", of(stage, f16, options, off), 11), ("bf16", of(stage, bf16, options, off), 8)]
+    {
+        let limit = ROUNDINGS * 0.5f64.powi(bits);
+        fine &= same <= SAME && rounding <= limit;
+        words.push(format!("{name} {same:.1e} (limit {SAME:.0e}), by rounding {rounding:.1e} (limit {limit:.0e})"));
+    }
+    let words = words.join(", ");
+    if fine { Outcome::Passed(words) } else { Outcome::Failed(words) }
+}
+
+fn of<H: Half>(stage: &dyn Stage, kernel: &dyn Kernel<f32, H>, options: &Options, off: Off) -> [f64; 2] {
+    let exact: Vec<f32> = params(stage, options);
+    let mut halves = vec![H::default(); exact.len()];
+    round(&exact, &mut halves);
+    let rounded: Vec<f32> = halves.iter().map(|h| h.value()).collect();
+    off(stage, &Reader { kernel, params: &halves }, options, [&exact, &rounded])
+}
