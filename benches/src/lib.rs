@@ -79,7 +79,7 @@ pub fn bandwidth() -> f64 {
 
 /// Reads a second of all threads together from random cache lines of 32 MiB.
 pub fn random_reads() -> f64 {
-    let table = Pages::zeros(8 << 20);
+    let table: Pages = Pages::zeros(8 << 20);
     let count = 4_000_000u32;
     let each: Vec<f64> = (0..rayon::current_num_threads())
         .into_par_iter()
