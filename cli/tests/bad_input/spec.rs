@@ -170,12 +170,6 @@ pub fn cases() -> Vec<Case> {
             &["--set encoder.levels", "path=value"],
         ),
         refused(
-            "tables in eight bits",
-            |_| (),
-            "explain naf --set precision.tables=f8",
-            &["precision.tables", "f8", "f16", "bf16"],
-        ),
-        refused(
             "--set past the end of a list",
             |_| (),
             "explain naf --set normalizers.18446744073709551615.type=layer-norm",

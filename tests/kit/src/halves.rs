@@ -2,7 +2,7 @@
 
 use crate::call::{data, error, forward, gradients as backward, params};
 use crate::{Options, Outcome};
-use conefield_core::half::{Bf16, F16, Half, Reader, round};
+use conefield_core::half::{Half, Reader, round};
 use conefield_core::stage::{Halves, Kernel, Stage};
 
 /// Largest error against the kernel that trains on the rounded parameters.
