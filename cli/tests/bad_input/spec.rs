@@ -81,10 +81,10 @@ pub fn cases() -> Vec<Case> {
             &["scene.occupancy.refined.every", "at least 1"],
         ),
         refused(
-            "cells that are empty below NaN",
-            toml("extends = \"naf\"\n[scene]\noccupancy = { refined = { below = nan } }\n"),
+            "cells that are empty below -1",
+            toml("extends = \"naf\"\n[scene]\noccupancy = { refined = { below = -1.0 } }\n"),
             TOML,
-            &["scene.occupancy.refined.below", "finite"],
+            &["scene.occupancy.refined.below", "-1"],
         ),
         refused("NaN", toml("extends = \"naf\"\n[scene]\nfill = nan\n"), TOML, &["spec.toml:3:8", "finite"]),
         refused(

@@ -97,7 +97,7 @@ fn a_pull_holds_to_the_start() {
     let free = case.volume(&spec(0.0)).0;
     let apart: Vec<f64> =
         [1e-2, 1.0, 1e4].iter().map(|&p| psnr(&case.volume(&spec(p)).0, &start) - psnr(&free, &start)).collect();
-    assert!(apart[0] > 1.0 && apart[1] > apart[0] + 6.0 && apart[2] > apart[1] + 20.0, "{apart:?}");
+    assert!(apart[0] > 0.2 && apart[1] > apart[0] + 6.0 && apart[2] > apart[1] + 20.0, "{apart:?}");
     // Without a pull it goes to the truth, held a little it stays behind.
     assert!(psnr(&free, &truth) > psnr(&case.volume(&spec(1.0)).0, &truth) + 3.0);
 
