@@ -342,7 +342,7 @@ impl Reconstruct {
     fn all_sets(&self) -> Vec<String> {
         let mut sets = self.protocol.sets.clone();
         if let Some(path) = &self.init {
-            sets.push(if conefield_io::is_volume(path) { known_volume(path) } else { mci(path) });
+            sets.push(if conefield_io::is_volume(path) { initializer("volume", "path", path) } else { mci(path) });
         }
         sets
     }
@@ -370,14 +370,13 @@ pub fn identity(
 
 /// The setting that starts from the weights in `path`.
 pub fn mci(path: &Path) -> String {
-    let path = toml::Value::String(path.display().to_string());
-    format!("initializer={{ type = \"mci\", weights = {path} }}")
+    initializer("mci", "weights", path)
 }
 
-/// The setting that starts from the volume in `path`.
-fn known_volume(path: &Path) -> String {
+/// The setting of an initializer that reads the file `path`, under `key`.
+fn initializer(kind: &str, key: &str, path: &Path) -> String {
     let path = toml::Value::String(path.display().to_string());
-    format!("initializer={{ type = \"volume\", path = {path} }}")
+    format!("initializer={{ type = \"{kind}\", {key} = {path} }}")
 }
 
 /// What weights say of where they come from.

@@ -210,9 +210,8 @@ struct Iterate {
     /// λ in mm.
     lambda: f64,
     lipschitz: f64,
-    /// μ over L, and what it pulls to.
-    pull: f32,
-    towards: Array3<f32>,
+    /// The share of a step that goes to a volume, and that volume, if there is a pull.
+    pull: Option<(f32, Array3<f32>)>,
     /// FISTA's t.
     t: f64,
     /// The last pass' objective.
@@ -226,7 +225,7 @@ impl Iterate {
         let parts = subsets(views, settings.subsets);
         let lipschitz = largest_eigenvalue(problem, noise, &parts);
         ensure(lipschitz > 0.0, "scan", "geometry", "rays that all miss the volume", "rays through the volume")?;
-        let towards = if settings.pull > 0.0 { x.clone() } else { Array3::zeros((0, 0, 0)) };
+        let pull = (settings.pull > 0.0).then(|| ((settings.pull / (1.0 + settings.pull)) as f32, x.clone()));
         Ok(Self {
             views,
             noise,
@@ -241,8 +240,7 @@ impl Iterate {
             anisotropy: anisotropy(grid),
             lambda,
             lipschitz: lipschitz * (1.0 + settings.pull),
-            pull: (settings.pull / (1.0 + settings.pull)) as f32,
-            towards,
+            pull,
             t: 1.0,
             objective: f64::INFINITY,
         })
@@ -262,12 +260,9 @@ impl Method for Iterate {
             problem.back(views, &difference, &mut self.scratch);
             let step = (self.subsets / self.lipschitz) as f32;
             Zip::from(&mut self.scratch).and(&self.ahead).par_for_each(|g, z| *g = z + step * *g);
-            if self.pull > 0.0 {
-                let pull = self.pull;
-                Zip::from(&mut self.scratch)
-                    .and(&self.ahead)
-                    .and(&self.towards)
-                    .par_for_each(|g, z, to| *g += pull * (to - z));
+            if let Some((pull, towards)) = &self.pull {
+                let toward = |g: &mut f32, z: &f32, to: &f32| *g += pull * (to - z);
+                Zip::from(&mut self.scratch).and(&self.ahead).and(towards).par_for_each(toward);
             }
             let tau = (self.lambda / self.lipschitz) as f32;
             self.prox.apply(flat(&self.scratch), tau, self.inner, flat_mut(&mut self.fresh));
