@@ -26,6 +26,8 @@ const DISK: f64 = 2e8;
 /// How many times as large pixels and voxels are at first, and how many there are at least along a side.
 const COARSEST: usize = 8;
 const FEWEST: usize = 8;
+/// How many times as long half as coarse takes: eight times the work, of which small scans have little.
+const GROWTH: f64 = 5.0;
 
 /// What is measured on.
 pub struct Bench<'a> {
@@ -91,10 +93,11 @@ fn field(bench: &Bench<'_>, loaded: &Loaded, parts: &Parts, seconds: f64) -> Res
     Ok(Costs { prepare_s, step_s, export_s, ..Costs::default() })
 }
 
-/// Two passes on a coarser detector and volume, as coarse as time wants it: all views and all that is done with them stay in
-/// proportion.
+/// Two passes on a coarser detector and volume, then on a finer one while time lets: all views and all that is done with them
+/// stay in proportion.
 fn voxels(bench: &Bench<'_>, loaded: &Loaded, parts: &Parts, seconds: f64) -> Result<Costs> {
     let mut factor = COARSEST;
+    let mut coarser = None;
     loop {
         let (scan, share) = coarse(bench.scan, factor);
         let mut laps = Laps::default();
@@ -102,19 +105,42 @@ fn voxels(bench: &Bench<'_>, loaded: &Loaded, parts: &Parts, seconds: f64) -> Re
         let begin = Instant::now();
         let solution = parts.solver.solve(&job(bench, loaded, &scan, limits), &mut laps)?;
         let took = begin.elapsed().as_secs_f64();
-        // Half as coarse takes eight times as long.
-        if 8.0 * took < seconds && factor > 1 {
-            factor /= 2;
-            continue;
-        }
         let step_s = match (solution.steps, laps.typical()) {
             (2.., Some(lap)) => lap,
             _ => solution.train_s / solution.steps.max(1) as f64,
         };
-        let prepare_s = (took - step_s * solution.steps as f64).max(0.0) / share;
+        let measured = Passes { share, step_s, prepare_s: (took - step_s * solution.steps as f64).max(0.0) };
+        if GROWTH * took < seconds && factor > 1 {
+            factor /= 2;
+            coarser = Some(measured);
+            continue;
+        }
         let volume = solution.result.volume(bench.backend)?;
         let export_s = packing(&mut &volume, bench.scan.geometry.volume)?;
-        return Ok(Costs { prepare_s, step_s: step_s / share, export_s, ..Costs::default() });
+        let Passes { step_s, prepare_s, .. } = measured.whole(coarser);
+        return Ok(Costs { prepare_s, step_s, export_s, ..Costs::default() });
+    }
+}
+
+/// What passes took of a scan with a share of the work.
+#[derive(Clone, Copy)]
+struct Passes {
+    share: f64,
+    step_s: f64,
+    prepare_s: f64,
+}
+
+impl Passes {
+    /// What they take of all of it: two shares tell what goes with the work from what does not.
+    fn whole(self, coarser: Option<Self>) -> Self {
+        let scaled = |of: fn(&Self) -> f64| match &coarser {
+            Some(less) if less.share < self.share => {
+                let slope = (of(&self) - of(less)).max(0.0) / (self.share - less.share);
+                of(&self) + slope * (1.0 - self.share)
+            }
+            _ => of(&self) / self.share,
+        };
+        Self { share: 1.0, step_s: scaled(|p| p.step_s), prepare_s: scaled(|p| p.prepare_s) }
     }
 }
 
@@ -246,6 +272,20 @@ mod tests {
         let (least, _) = coarse(&scan, 64);
         assert_eq!(least.geometry.volume.shape, [8; 3]);
         assert_eq!(coarse(&scan, 1).0.projections, scan.projections);
+    }
+
+    #[test]
+    fn what_does_not_go_with_the_work_is_told_from_what_does() {
+        // 0.05 s whatever the work, and 6 s of all of it; passes take 3 s.
+        let of = |share: f64| Passes { share, prepare_s: 0.05 + 6.0 * share, step_s: 3.0 * share };
+        let whole = of(1.0 / 64.0).whole(Some(of(1.0 / 512.0)));
+        assert!((whole.prepare_s - 6.05).abs() < 1e-9 && (whole.step_s - 3.0).abs() < 1e-9);
+        // One share alone cannot tell, nor can two that are the same.
+        assert_eq!(of(0.5).whole(None).prepare_s, 6.1);
+        assert_eq!(of(0.5).whole(Some(of(0.5))).prepare_s, 6.1);
+        // Never less than what was seen.
+        let odd = Passes { prepare_s: 0.01, ..of(0.5) }.whole(Some(of(0.1)));
+        assert_eq!(odd.prepare_s, 0.01);
     }
 
     #[test]
