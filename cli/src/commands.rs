@@ -21,8 +21,6 @@ mod tradeoff;
 mod trained;
 mod trial;
 
-pub use reconstruct::{Method, Parts};
-
 use clap::{ArgAction, Args, Subcommand};
 use conefield_core::Result;
 use conefield_core::solver::Limits;
@@ -30,40 +28,24 @@ use serde::{Deserialize, Serialize};
 use std::ffi::OsString;
 use std::path::PathBuf;
 
-/// What to do.
+/// What to do; the help of each is that of its arguments.
 #[derive(Subcommand)]
 pub enum Command {
-    /// Make a scan of a known volume.
     Simulate(simulate::Simulate),
-    /// Make a scan of what a scanner gave.
     Import(import::Import),
-    /// Reconstruct a volume from a scan.
     Reconstruct(reconstruct::Reconstruct),
-    /// Reconstruct a scan in several ways under one protocol: a table and a picture.
     Compare(compare::Compare),
-    /// Search what to spend time and memory on: accuracy against both, measured.
     Tradeoff(tradeoff::Tradeoff),
-    /// Train a field on known volumes, for weights that other scans start from (MCI).
     Pretrain(pretrain::Pretrain),
-    /// Score a volume (PSNR, RMSE, three SSIMs) or label maps (Dice) against a reference.
     Evaluate(evaluate::Evaluate),
-    /// Evaluate the field of a finished run at other voxels.
     Export(export::Export),
-    /// Draw the principal components of a finished run's features as colours.
     Features(features::Features),
-    /// Show what a spec builds: stages, widths, parameters, memory, work.
     Explain(explain::Explain),
-    /// Say what a scan, volume or weights file holds.
     Info(info::Info),
-    /// Rewrite a volume or a scan in another format.
     Convert(convert::Convert),
-    /// List what can do the computing here.
     Backends(backends::Backends),
-    /// Stages from shared libraries: list them, check them, begin one.
     Plugins(plugins::Plugins),
-    /// Print the JSON Schema of spec files, for editors.
     Schema(schema::SchemaArgs),
-    /// Simulate a small scan, reconstruct it in two ways and compare.
     Demo(demo::Demo),
 }
 
@@ -153,6 +135,6 @@ pub struct Ends {
 impl Ends {
     /// As limits of a job.
     pub fn limits(&self) -> Limits {
-        Limits { steps: self.steps, seconds: self.seconds, at_most: self.at_most, deadline: None }
+        Limits { steps: self.steps, seconds: self.seconds, at_most: self.at_most, ..Limits::default() }
     }
 }

@@ -5,6 +5,7 @@ mod budget;
 mod commands;
 mod files;
 mod memory;
+mod method;
 mod out;
 mod outgoing;
 mod parse;

@@ -145,6 +145,8 @@ pub struct Run {
     pub backend: u64,
     /// Bytes that the solver works in: what goes with the measured values and what with the voxels.
     pub solver: [u64; 2],
+    /// Bytes of looking beyond the volume, and of the scan without what was found there.
+    pub surround: [u64; 2],
     /// Whether it goes on from a checkpoint.
     pub resume: bool,
 }
@@ -178,8 +180,9 @@ impl Run {
         // A file's order of voxels is turned into the program's.
         let comparing = Memory { scan: projections, reference: 2 * reference, ..Memory::default() };
         let splitting = Memory { scan: if self.split { 2 * projections } else { 0 }, reference, ..Memory::default() };
+        let surrounding = Memory { scan: projections, reference, buffers: self.surround[0], ..Memory::default() };
         let solving = Memory {
-            scan: projections,
+            scan: projections + self.surround[1],
             volume: iterate,
             reference,
             model: half,
@@ -188,8 +191,9 @@ impl Run {
             ..Memory::default()
         };
         let evaluating = if self.field { self.backend + FieldVoxels::BYTES } else { 0 };
-        let exporting = Memory { volume, buffers: evaluating + SLAB_BYTES + checkpoint, ..solving };
-        Memory::most(&[reading, comparing, splitting, solving, exporting])
+        let buffers = evaluating + SLAB_BYTES + checkpoint;
+        let exporting = Memory { scan: projections, volume, buffers, ..solving };
+        Memory::most(&[reading, comparing, splitting, surrounding, solving, exporting])
     }
 
     /// What would fit into `available` bytes, one thing smaller at a time; `tables` gives the number of parameters with
@@ -217,6 +221,7 @@ impl Run {
         let binned = |k: u32| Run {
             scan: ScanSize { pixels: self.scan.pixels >> (2 * k), ..self.scan },
             solver: [self.solver[0] >> (2 * k), self.solver[1]],
+            surround: [self.surround[0], self.surround[1] >> (2 * k)],
             ..*self
         };
         if let Some(k) = (1..5).find(|k| fits(&binned(*k))) {
@@ -240,6 +245,7 @@ mod tests {
             kept: 12,
             backend: 1 << 20,
             solver: [4 << 20, 0],
+            surround: [0; 2],
             resume: false,
         }
     }

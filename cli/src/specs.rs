@@ -14,7 +14,9 @@ pub const SHIPPED: &[Shipped] = &[
     Shipped { name: "nerf", text: include_str!("../../specs/nerf.toml") },
     Shipped { name: "dense", text: include_str!("../../specs/dense.toml") },
     Shipped { name: "accurate", text: include_str!("../../specs/accurate.toml") },
+    Shipped { name: "balanced", text: include_str!("../../specs/balanced.toml") },
     Shipped { name: "fast", text: include_str!("../../specs/fast.toml") },
+    Shipped { name: "field-tv", text: include_str!("../../specs/field-tv.toml") },
     Shipped { name: "fdk", text: include_str!("../../specs/fdk.toml") },
     Shipped { name: "sart", text: include_str!("../../specs/sart.toml") },
     Shipped { name: "os-sart", text: include_str!("../../specs/os-sart.toml") },
@@ -54,6 +56,7 @@ pub fn fast_weights() -> Option<&'static [u8]> {
 
 /// Builds the pipeline of `loaded` where its solver trains a field. Refuses stages that the solver would pass over.
 pub fn pipeline(loaded: &Loaded, solver: &dyn Solver) -> Result<Option<Pipeline>> {
+    loaded.spec.scene.surround.validate().map_err(|e| loaded.locate(e))?;
     let field = solver.trains_field(&loaded.spec).map_err(|e| loaded.locate(e))?;
     field.then(|| build(loaded)).transpose()
 }

@@ -123,7 +123,7 @@ fn threads_do_not_change_a_bit() {
 #[test]
 fn every_shipped_spec_reconstructs() {
     let (dir, scan) = scan();
-    for spec in ["naf", "ni-naf", "ni-naf-published", "nerf", "dense", "accurate", "fast"] {
+    for spec in ["naf", "ni-naf", "ni-naf-published", "nerf", "dense", "accurate", "balanced", "fast", "field-tv"] {
         let run = text(&dir.path().join(spec));
         let record = json(&[
             "reconstruct",

@@ -62,6 +62,43 @@ fn a_scan_adds_its_memory() {
 }
 
 #[test]
+fn what_lies_beyond_the_volume_is_told_and_taken_off() {
+    let dir = tempdir().unwrap();
+    let (scan, protocol) = (text(&dir.path().join("scan")), dir.path().join("protocol.toml"));
+    // A detector of a quarter of the published width.
+    let narrow = "dso = 5.0\ndsd = 7.0\ndetector = [32, 8]\nextent = { side = [4.0, 1.0] }\nangles = { even = { views = 12 } }\n";
+    std::fs::write(&protocol, format!("{narrow}unit = {{ name = \"half side\", mm = 50.0 }}\n")).unwrap();
+    done(&["simulate", "phantom:head:16", "-o", &scan, "--protocol", &text(&protocol)]);
+    let set = "scene.surround.coarse.cells=8";
+    for spec in ["fdk", "fast"] {
+        assert!(!done(&["explain", spec, "--scan", &scan]).contains("surround"));
+        let all = done(&["explain", spec, "--scan", &scan, "--set", set]);
+        assert!(all.contains("surround: the object reaches the sides of 12 of 12 views: "), "{all}");
+    }
+    let run = |name: &str, sets: &[&str]| {
+        let out = text(&dir.path().join(name));
+        let record = json(&[&["reconstruct", &scan, "--spec", "os-sart", "-o", &out, "--json"], sets].concat());
+        (
+            record["memory"]["total"].as_u64().unwrap(),
+            std::fs::read(dir.path().join(name).join("volume.nii.gz")).unwrap(),
+        )
+    };
+    let (without, with) = (run("without", &[]), run("with", &["--set", set]));
+    assert!(with.0 > without.0 && with.1 != without.1);
+    assert_eq!(with, run("again", &["--set", set]), "it is found the same again");
+}
+
+#[test]
+fn carving_serves_solvers_on_voxels() {
+    let dir = tempdir().unwrap();
+    let scan = text(&dir.path().join("scan"));
+    done(&["simulate", "phantom:head:16", "-o", &scan, "--views", "12", "--detector", "64x64"]);
+    let set = "scene.support=\"carve\"";
+    let all = done(&["explain", "sirt", "--scan", &scan, "--set", set]);
+    assert!(all.contains("support: ") && all.contains("by the air in 12 of 12 views"), "{all}");
+}
+
+#[test]
 fn solvers_on_voxels_are_told_without_a_field() {
     let all = done(&["explain", "fdk"]);
     assert!(all.starts_with("fdk (shipped)\n"), "{all}");

@@ -31,6 +31,16 @@ fn every_subcommand_has_help() {
         assert!(help.contains(&format!("Usage: conefield {c}")), "{help}");
         assert!(!help.contains("[OPTIONS]") || help.contains("--help"));
     }
+    // What a command leaves where stands in its help, not only in one line.
+    for (command, words) in [
+        ("tradeoff", "Candidates are drawn from levers"),
+        ("reconstruct", "RUN receives volume.nii.gz"),
+        ("evaluate", "Dice is 2|A"),
+        ("import", "SCANNER.toml names the files"),
+    ] {
+        let help = done(&[command, "--help"]).split_whitespace().collect::<Vec<_>>().join(" ");
+        assert!(help.contains(words), "{command}: {help}");
+    }
     // One line for every subcommand and for `help` itself: nothing is listed that is not tested here.
     let listed = all.lines().skip_while(|l| *l != "Commands:").skip(1).take_while(|l| !l.is_empty()).count();
     assert_eq!(listed, COMMANDS.len() + 1);

@@ -68,6 +68,23 @@ fn the_estimate_is_near_the_measured_peak() {
     }
 }
 
+/// What looks beyond the volume is reckoned for an object that is cut off on all sides.
+#[test]
+#[cfg_attr(not(target_os = "linux"), ignore = "the peak is read from /proc")]
+fn the_estimate_is_near_the_peak_of_a_look_beyond_the_volume() {
+    let dir = tempfile::tempdir().unwrap();
+    let path = scan(dir.path(), 8, 64);
+    let mut cut = conefield_io::read_scan(&path).unwrap();
+    cut.projections.fill(1.5);
+    std::fs::remove_dir_all(&path).unwrap();
+    conefield_io::write_scan(&path, &cut, None).unwrap();
+    let sets = ["scene.surround.coarse.passes=1", "scene.surround.coarse.margin=1.0"];
+    let [estimate, peak] = measured(&path, &dir.path().join("run"), "sirt", &sets);
+    println!("estimate {} MiB, peak {} MiB", estimate / MIB, peak / MIB);
+    assert!(peak > 150 * MIB, "{peak} bytes say little");
+    assert!((0.8..1.35).contains(&(estimate as f64 / peak as f64)), "{estimate} and {peak}");
+}
+
 /// Of solvers on voxels as well, where the scan, the volume or both take most; FDK takes little but these two.
 #[test]
 #[cfg_attr(not(target_os = "linux"), ignore = "the peak is read from /proc")]

@@ -36,7 +36,9 @@ fn missing_files_are_named() {
 fn an_unknown_spec_lists_the_shipped_ones() {
     let said = refused(1, &["explain", "ni-nef"]);
     assert!(
-        said.contains("\"ni-naf\" (of naf, ni-naf, ni-naf-published, nerf, dense, accurate, fast, fdk, "),
+        said.contains(
+            "\"ni-naf\" (of naf, ni-naf, ni-naf-published, nerf, dense, accurate, balanced, fast, field-tv, fdk, "
+        ),
         "{said}"
     );
 }

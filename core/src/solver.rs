@@ -7,12 +7,13 @@ use crate::error::{Error, Result};
 use crate::parts::Voxels;
 use crate::pipeline::Model;
 use crate::scan::{Scan, Volume};
-use crate::spec::Spec;
+use crate::spec::{Scene, Spec};
 use crate::trained::TrainedField;
 use serde::{Deserialize, Serialize};
 use std::time::Instant;
 
 /// What a solver works on.
+#[derive(Clone, Copy)]
 pub struct Job<'a> {
     /// Views to learn from.
     pub scan: &'a Scan,
@@ -78,6 +79,8 @@ pub struct Limits {
     /// When training is to be over by the clock on the wall, whatever happens beside it. Solvers that cannot stop anywhere
     /// stop before they would pass it.
     pub deadline: Option<Instant>,
+    /// The same for what goes on after the training, of a solver that is a [`Successor`] of another one.
+    pub then: Option<Instant>,
 }
 
 /// One line of `metrics.jsonl`.
@@ -167,13 +170,20 @@ pub enum Reconstruction {
     Volume(Volume),
     /// A field that can be evaluated on any grid.
     Field(TrainedField),
+    /// Voxels that a solver made of a field's, and that field.
+    Refined {
+        /// What came out.
+        volume: Volume,
+        /// What it was made of.
+        field: Box<TrainedField>,
+    },
 }
 
 impl Reconstruction {
     /// The voxels that the scan asks for, part by part; a field is evaluated by `backend`.
     pub fn voxels<'a>(&'a self, backend: &dyn Backend) -> Result<Box<dyn Voxels + 'a>> {
         Ok(match self {
-            Self::Volume(volume) => Box::new(volume),
+            Self::Volume(volume) | Self::Refined { volume, .. } => Box::new(volume),
             Self::Field(field) => Box::new(field.voxels(backend, field.scene.grid)?),
         })
     }
@@ -188,6 +198,7 @@ impl Reconstruction {
         match self {
             Self::Volume(_) => None,
             Self::Field(field) => Some(field),
+            Self::Refined { field, .. } => Some(field),
         }
     }
 }
@@ -258,8 +269,26 @@ pub trait Solver: Send + Sync {
         0
     }
 
+    /// Of a solver that lets another one go on where the first ended: the two. `scene` is that of the spec.
+    fn successor(&self, scene: &Scene) -> Option<Successor<'_>> {
+        let _ = scene;
+        None
+    }
+
     /// A line for `explain`.
     fn describe(&self) -> String;
+}
+
+/// A solver that goes on where another one ended.
+pub struct Successor<'a> {
+    /// The one that begins.
+    pub first: &'a dyn Solver,
+    /// The one that goes on.
+    pub then: &'a dyn Solver,
+    /// What that one is given as its spec; its initializer brings the first one's volume, through [`Job::volumes`].
+    pub spec: Spec,
+    /// Its steps at most.
+    pub passes: u64,
 }
 
 /// What pre-training works on.

@@ -57,6 +57,25 @@ pub struct Spec {
     pub solver: Box<dyn SolverSpec>,
 }
 
+impl Spec {
+    /// A spec of nothing but a solver on voxels.
+    pub fn voxels(solver: Box<dyn SolverSpec>, scene: Scene) -> Self {
+        Self {
+            name: String::new(),
+            description: String::new(),
+            scene,
+            plugins: Plugins::default(),
+            precision: Precision::default(),
+            encoder: None,
+            normalizers: vec![],
+            field: None,
+            projector: None,
+            initializer: None,
+            solver,
+        }
+    }
+}
+
 /// Libraries with stages that a spec names. A spec alone never makes the program load one: its user allows it.
 #[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields, default)]
@@ -127,12 +146,62 @@ pub struct Scene {
     pub occupancy: OccupancyRule,
     /// Which of the encoder's channels are computed.
     pub levels: LevelRule,
+    /// What lies beyond the volume. Of all solvers.
+    #[serde(skip_serializing_if = "SurroundRule::is_none")]
+    pub surround: SurroundRule,
 }
 
 impl Default for Scene {
     fn default() -> Self {
         let (support, occupancy, levels) = (SupportRule::Box, OccupancyRule::Fixed, LevelRule::All);
-        Self { fill: 1.0, attenuation: AttenuationScale::Scan, support, occupancy, levels }
+        let surround = SurroundRule::None;
+        Self { fill: 1.0, attenuation: AttenuationScale::Scan, support, occupancy, levels, surround }
+    }
+}
+
+/// What lies beyond the volume.
+#[derive(Debug, Clone, Copy, Default, PartialEq, Serialize, Deserialize, JsonSchema)]
+#[serde(rename_all = "kebab-case")]
+pub enum SurroundRule {
+    /// Nothing.
+    #[default]
+    None,
+    /// What coarse cells show, where the object reaches the sides of views: total variation makes them of the whole
+    /// field of view first, and their line integrals are taken off the measured ones.
+    Coarse(Surround),
+}
+
+/// How far and how finely the space beyond the volume is looked at.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize, JsonSchema)]
+#[serde(deny_unknown_fields, default)]
+pub struct Surround {
+    /// How far cells go beyond the volume on every side, as a share of its longest side; less where a source stands closer.
+    pub margin: f64,
+    /// Cells along the volume's longest side.
+    pub cells: usize,
+    /// Passes over the views.
+    pub passes: u64,
+}
+
+impl Default for Surround {
+    fn default() -> Self {
+        Self { margin: 0.75, cells: 64, passes: 16 }
+    }
+}
+
+impl SurroundRule {
+    /// Whether there is none.
+    pub fn is_none(&self) -> bool {
+        *self == Self::None
+    }
+
+    /// Refuses settings that mean nothing.
+    pub fn validate(&self) -> Result<()> {
+        let Self::Coarse(Surround { margin, cells, passes }) = *self else { return Ok(()) };
+        let key = |name: &str| format!("scene.surround.coarse.{name}");
+        ensure(margin > 0.0 && margin <= 4.0, "spec", &key("margin"), margin, "a number above 0 and at most 4")?;
+        ensure((4..=256).contains(&cells), "spec", &key("cells"), cells, "4 to 256")?;
+        ensure((1..=1000).contains(&passes), "spec", &key("passes"), passes, "1 to 1000")
     }
 }
 
@@ -196,8 +265,8 @@ pub enum SupportRule {
     /// Anywhere.
     Box,
     /// Where no view shows air: a cell that several views see nothing but air through is left out, the unit cube is
-    /// fitted to the rest, and rays are sampled between the first and the last cell that is left. Views whose sides the
-    /// object reaches say nothing.
+    /// fitted to the rest, and rays are sampled between the first and the last cell that is left; solvers that improve voxels
+    /// keep the others at 0. Views whose sides the object reaches say nothing.
     Carve,
 }
 

@@ -6,6 +6,7 @@ use conefield_core::pipeline::Pipeline;
 use conefield_core::scan::Scan;
 use conefield_core::scene::Scene;
 use conefield_core::spec::{self, LevelRule, OccupancyRule, Refined, SupportRule};
+use conefield_core::support::Support;
 
 /// A scene, and what of a pipeline it has need of.
 pub struct Fitted {
@@ -17,17 +18,24 @@ pub struct Fitted {
     pub found: Vec<String>,
 }
 
+/// Where the object can be, if the settings have it looked for, and what was found.
+pub fn support(scan: &Scan, settings: &spec::Scene) -> (Option<Support>, Option<String>) {
+    match settings.support {
+        SupportRule::Box => (None, None),
+        SupportRule::Carve => {
+            let carved = carve(scan);
+            (carved.support, Some(format!("support: {}", carved.said)))
+        }
+    }
+}
+
 /// The scene of a scan under a spec's settings. Makes `pipeline` count in its voxels.
 pub fn fit(scan: &Scan, settings: &spec::Scene, pipeline: &mut Pipeline) -> Result<Fitted> {
     let mut scene = Scene::new(scan, settings)?;
-    let mut found = vec![];
-    if settings.support == SupportRule::Carve {
-        let carved = carve(scan);
-        found.push(format!("support: {}", carved.said));
-        scene = match carved.support {
-            Some(support) => scene.within(support, settings),
-            None => scene,
-        };
+    let (support, said) = support(scan, settings);
+    let mut found: Vec<String> = said.into_iter().collect();
+    if let Some(support) = support {
+        scene = scene.within(support, settings);
     }
     if let OccupancyRule::Refined(refined) = settings.occupancy {
         found.push(format!("occupancy: {}", occupancy(&scene, refined)));

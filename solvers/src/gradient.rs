@@ -12,6 +12,7 @@ use crate::pretrain::learn;
 use crate::rays::{Pixels, RaySource, Views};
 use crate::refine::{Refinement, Since};
 use crate::schedule::{Clock, Decay, Ends};
+use crate::surround::Within;
 use conefield_core::backend::{Adam, Executable, Loss, TrainRay, TvBlocks, Work};
 use conefield_core::checkpoint::{Checkpoint, Resume, Standing, tensors};
 use conefield_core::error::{Error, Result, ensure};
@@ -193,6 +194,8 @@ impl Solver for Gradient {
         let mut pipeline = Pipeline::build(job.spec)?;
         let Fitted { scene, needed, found } = fit(job.scan, &job.spec.scene, &mut pipeline)?;
         found.iter().for_each(|line| observer.note(line));
+        let within = Within::of(job, observer)?;
+        let job = &Within::job(within.as_ref(), job);
         let volume = job.spec.initializer.as_ref().map(|i| i.volume()).transpose()?.flatten();
         let fills_weights = job.spec.initializer.as_ref().filter(|_| volume.is_none());
         let initializer = fills_weights.map(|i| i.build(job.weights)).transpose()?;

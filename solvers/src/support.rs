@@ -34,29 +34,64 @@ pub struct Found {
     pub said: String,
 }
 
+/// A scan's views, reduced to means of blocks.
+pub(crate) struct Blocks {
+    /// Pixels along a block's side.
+    size: usize,
+    /// Of each view.
+    means: Vec<Array2<f32>>,
+    /// Of their noise.
+    deviation: f32,
+    /// The largest of all pixels.
+    top: f32,
+    /// Their level in air, where some view shows air.
+    air: Option<f32>,
+}
+
+impl Blocks {
+    /// Of all views.
+    pub(crate) fn of(scan: &Scan) -> Self {
+        let g = &scan.geometry;
+        let size = g.detector[1].div_ceil(BLOCKS).max(2);
+        let means: Vec<Array2<f32>> =
+            (0..g.views.len()).into_par_iter().map(|v| block_means(scan.view(v), size)).collect();
+        let top = scan.projections.iter().copied().fold(0.0f32, f32::max);
+        let deviation = deviation(&means, top);
+        let air = air(&means, deviation, top);
+        Self { size, means, deviation, top, air }
+    }
+
+    /// Whether the object reaches one of the outer lines of a view along `axis`: 0 its first and last row, 1 its first and
+    /// last column.
+    pub(crate) fn cut(&self, view: usize, axis: usize) -> bool {
+        let means = &self.means[view];
+        let Some(air) = self.air else { return self.top > 0.0 };
+        [0, means.len_of(Axis(axis)) - 1]
+            .iter()
+            .any(|&i| reached(means.index_axis(Axis(axis), i), air, self.deviation, self.top))
+    }
+}
+
 /// Carves the volume of a scan.
 pub fn carve(scan: &Scan) -> Found {
     let g = &scan.geometry;
     let nothing = |why: &str| Found { support: None, said: format!("the whole volume, {why}") };
-    let size = g.detector[1].div_ceil(BLOCKS).max(2);
-    let blocks: Vec<Array2<f32>> =
-        (0..g.views.len()).into_par_iter().map(|v| block_means(scan.view(v), size)).collect();
-    let top = scan.projections.iter().copied().fold(0.0f32, f32::max);
-    let deviation = deviation(&blocks, top);
-    let Some(air) = air(&blocks, deviation, top) else { return nothing("as no view shows air") };
+    let blocks = Blocks::of(scan);
+    let &Blocks { size, deviation, top, air, .. } = &blocks;
+    let Some(air) = air else { return nothing("as no view shows air") };
     let level = air + DEVIATIONS * deviation + 1e-3 * top;
     let cells = cells(&g.volume);
     // Half a cell's diagonal on the detector, in blocks, where it is magnified most.
     let half = 0.5 * cells.spacing.iter().map(|s| s * s).sum::<f64>().sqrt();
     let views: Vec<View> = blocks
-        .into_par_iter()
+        .means
+        .par_iter()
         .enumerate()
         .filter_map(|(v, means)| {
             let pinhole = Pinhole::of(g, v);
-            let cut = [0, means.ncols() - 1].iter().any(|&c| reached(means.column(c), air, deviation, top));
             let object = means.mapv(|m| m > level);
             let nearest = corners(&cells).into_iter().map(|p| pinhole.project(p).1).fold(f64::INFINITY, f64::min);
-            if cut || nearest <= 0.0 {
+            if blocks.cut(v, 1) || nearest <= 0.0 {
                 return None;
             }
             let w = &g.views[v];

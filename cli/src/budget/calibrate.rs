@@ -1,13 +1,14 @@
 //! What the parts of a run take on this machine, measured for about a second: real training steps on some views of the
 //! scan, or real passes over a coarser one, and what comes after the training.
 
-use crate::commands::Parts;
 use crate::files;
+use crate::method::Parts;
 use conefield_core::backend::Backend;
 use conefield_core::geometry::VoxelGrid;
 use conefield_core::parts::Voxels;
 use conefield_core::scan::{Scan, Volume};
-use conefield_core::solver::{Job, Limits, Observer, Record};
+use conefield_core::solver::{Job, Limits, Observer, Record, Solver};
+use conefield_core::spec::Spec;
 use conefield_core::spec::load::Loaded;
 use conefield_core::{Error, Result};
 use conefield_io::MiddleSlices;
@@ -45,6 +46,9 @@ pub struct Costs {
     pub prepare_s: f64,
     /// A step or pass.
     pub step_s: f64,
+    /// Of a solver that goes on after the training: all that it would do, and the least that makes sense.
+    pub then_s: f64,
+    pub then_least_s: f64,
     /// Writing weights, and evaluating, packing and writing voxels.
     pub export_s: f64,
     /// Drawing slices.
@@ -56,21 +60,37 @@ pub struct Costs {
 impl Costs {
     /// What comes after the training.
     pub fn after_s(&self) -> f64 {
-        self.export_s + self.picture_s + self.score_s
+        self.then_s + self.export_s + self.picture_s + self.score_s
     }
 }
 
 /// Measures what `loaded` takes, in about `seconds`.
 pub fn calibrate(bench: &Bench<'_>, loaded: &Loaded, parts: &Parts, seconds: f64) -> Result<Costs> {
-    let solved = match &parts.pipeline {
-        Some(_) => field(bench, loaded, parts, 0.5 * seconds)?,
-        None => voxels(bench, loaded, parts, 0.5 * seconds)?,
+    let half = 0.5 * seconds;
+    let begins = |solver: &dyn Solver, seconds: f64| match &parts.pipeline {
+        Some(_) => field(bench, &loaded.spec, solver, seconds),
+        None => voxels(bench, &loaded.spec, solver, seconds),
+    };
+    let solved = match parts.solver.successor(&loaded.spec.scene) {
+        None => begins(parts.solver.as_ref(), half)?,
+        Some(next) => {
+            let first = begins(next.first, 0.5 * half)?;
+            let then = voxels(bench, &next.spec, next.then, half)?;
+            // The first one's voxels are evaluated for the second one to start from.
+            let before = first.export_s + then.prepare_s;
+            Costs {
+                then_s: before + next.passes as f64 * then.step_s,
+                then_least_s: before + then.step_s,
+                export_s: then.export_s,
+                ..first
+            }
+        }
     };
     Ok(Costs { picture_s: picture(bench)?, score_s: score(bench)?, ..solved })
 }
 
 /// Steps on some of the views, then some layers of the field.
-fn field(bench: &Bench<'_>, loaded: &Loaded, parts: &Parts, seconds: f64) -> Result<Costs> {
+fn field(bench: &Bench<'_>, spec: &Spec, solver: &dyn Solver, seconds: f64) -> Result<Costs> {
     let n = bench.scan.geometry.views.len();
     let every = n.div_ceil(VIEWS);
     let others: Vec<usize> = (0..n).filter(|v| v % every != 0).collect();
@@ -78,7 +98,7 @@ fn field(bench: &Bench<'_>, loaded: &Loaded, parts: &Parts, seconds: f64) -> Res
     let mut laps = Laps::default();
     let limits = Limits { at_most: Some(seconds), ..Limits::default() };
     let begin = Instant::now();
-    let solution = parts.solver.solve(&job(bench, loaded, &scan, limits), &mut laps)?;
+    let solution = solver.solve(&job(bench, spec, &scan, limits), &mut laps)?;
     // What comes before the first step goes through all pixels of all views.
     let fewer = n as f64 / scan.geometry.views.len() as f64;
     let prepare_s = fewer * (begin.elapsed().as_secs_f64() - solution.train_s).max(0.0);
@@ -95,7 +115,7 @@ fn field(bench: &Bench<'_>, loaded: &Loaded, parts: &Parts, seconds: f64) -> Res
 
 /// Two passes on a coarser detector and volume, then on a finer one while time lets: all views and all that is done with them
 /// stay in proportion.
-fn voxels(bench: &Bench<'_>, loaded: &Loaded, parts: &Parts, seconds: f64) -> Result<Costs> {
+fn voxels(bench: &Bench<'_>, spec: &Spec, solver: &dyn Solver, seconds: f64) -> Result<Costs> {
     let mut factor = COARSEST;
     let mut coarser = None;
     loop {
@@ -103,7 +123,10 @@ fn voxels(bench: &Bench<'_>, loaded: &Loaded, parts: &Parts, seconds: f64) -> Re
         let mut laps = Laps::default();
         let limits = Limits { steps: Some(2), ..Limits::default() };
         let begin = Instant::now();
-        let solution = parts.solver.solve(&job(bench, loaded, &scan, limits), &mut laps)?;
+        // A volume to start from takes as long as an empty one.
+        let grid = scan.geometry.volume;
+        let empty = |_: &str| Ok(Volume { data: Array3::zeros(grid.shape), grid, affine: None });
+        let solution = solver.solve(&Job { volumes: &empty, ..job(bench, spec, &scan, limits) }, &mut laps)?;
         let took = begin.elapsed().as_secs_f64();
         let step_s = match (solution.steps, laps.typical()) {
             (2.., Some(lap)) => lap,
@@ -144,13 +167,13 @@ impl Passes {
     }
 }
 
-fn job<'a>(bench: &'a Bench<'_>, loaded: &'a Loaded, scan: &'a Scan, limits: Limits) -> Job<'a> {
+fn job<'a>(bench: &'a Bench<'_>, spec: &'a Spec, scan: &'a Scan, limits: Limits) -> Job<'a> {
     Job {
         seed: bench.seed,
         limits,
         weights: &|path| files::read_weights(path),
         volumes: &files::volume,
-        ..Job::new(scan, &loaded.spec, bench.backend)
+        ..Job::new(scan, spec, bench.backend)
     }
 }
 

@@ -3,7 +3,7 @@
 use super::TOO_SHORT;
 use super::calibrate::{Bench, Costs, calibrate};
 use super::front::{Expected, Front, Kind, Size};
-use crate::commands::Method;
+use crate::method::Method;
 use crate::out;
 use conefield_core::{Error, Result};
 use serde::Serialize;
@@ -56,6 +56,9 @@ pub struct Plan {
     /// When training is to be over.
     #[serde(skip)]
     pub deadline: Instant,
+    /// When a solver that goes on after the training is to be over.
+    #[serde(skip)]
+    pub then: Option<Instant>,
 }
 
 impl Budget {
@@ -121,6 +124,9 @@ impl Budget {
     ) -> Result<Plan> {
         let kind = method.kind();
         let left = self.left();
+        // Of little time half is the training's, as far as what follows it can do with less.
+        let room = 0.5 * (left - costs.prepare_s - (costs.after_s() - costs.then_s));
+        let costs = Costs { then_s: costs.then_s.min(room.max(costs.then_least_s)), ..costs };
         let load_s = self.begin.elapsed().as_secs_f64();
         let train_s = left - costs.after_s() - costs.prepare_s;
         let least = least(kind) * costs.step_s;
@@ -150,9 +156,15 @@ impl Budget {
             expected: costs,
             train_s,
             kind,
-            deadline: Instant::now() + Duration::from_secs_f64((left - costs.after_s()).max(0.0)),
+            deadline: within(left - costs.after_s()),
+            then: (costs.then_s > 0.0).then(|| within(left - costs.after_s() + costs.then_s)),
         })
     }
+}
+
+/// The moment so many seconds from now.
+fn within(seconds: f64) -> Instant {
+    Instant::now() + Duration::from_secs_f64(seconds.max(0.0))
 }
 
 /// Steps or passes without which nothing comes of a method.
@@ -178,6 +190,9 @@ impl Plan {
         let (e, steps) = (&self.expected, self.kind.steps());
         let mut lines = vec![format!("planned: {named}, {}", self.why)];
         lines.extend(self.passed_over.iter().map(|line| format!("passed over: {line}")));
+        if e.then_s > 0.0 {
+            lines.push(format!("planned: {} at most for what goes on after the training", time(e.then_s)));
+        }
         lines.push(format!(
             "planned: {} to read and to measure, {} to prepare, {} for about {} {steps} of {}, {} to write and compare",
             time(self.load_s),
@@ -185,7 +200,7 @@ impl Plan {
             time(self.train_s),
             out::number(self.steps),
             time(e.step_s),
-            time(e.after_s()),
+            time(e.after_s() - e.then_s),
         ));
         lines
     }

@@ -1,12 +1,13 @@
 //! `conefield compare`
 
 use super::protocol::Protocol;
-use super::reconstruct::{Parts, identity};
+use super::reconstruct::identity;
 use super::record::ScanRecord;
 use super::trial::{Figures, Input, LONGEST, Trial, read_json};
 use super::{Ends, General, backends::simd_level};
 use crate::backend::BackendChoice;
 use crate::memory::Memory;
+use crate::method::Parts;
 use crate::plugins::{self, Used};
 use crate::table::{SCORES, Table, score_cells};
 use crate::{files, out, run, signals, specs};

@@ -1,8 +1,8 @@
 //! `conefield explain`
 
-use super::reconstruct::Parts;
 use crate::backend::BackendChoice;
 use crate::memory::Memory;
+use crate::method::Parts;
 use crate::{files, out, plugins, specs};
 use clap::Args;
 use conefield_core::Result;
@@ -10,7 +10,8 @@ use conefield_core::backend::Explain as Compiled;
 use conefield_core::pipeline::Pipeline;
 use conefield_core::spec::load::Loaded;
 use conefield_core::stage::{GradKind, Stage};
-use conefield_solvers::fit::fit;
+use conefield_solvers::fit::{fit, support};
+use conefield_solvers::surround::told;
 use serde::Serialize;
 use serde_json::Value;
 use std::path::{Path, PathBuf};
@@ -136,7 +137,7 @@ impl Explain {
 
 fn report(loaded: &Loaded, parts: Parts, scan: Option<ForScan>) -> Result<Report> {
     let tree = &loaded.tree;
-    let Parts { solver, pipeline, compiled } = parts;
+    let Parts { solver, pipeline, compiled, .. } = parts;
     let backend = pipeline.is_some().then_some(compiled);
     let stages = pipeline.as_ref().map(|p| rows(tree, p)).unwrap_or_default();
     let plain = |key: &str, what: String| {
@@ -188,7 +189,8 @@ fn for_scan(loaded: &Loaded, parts: &mut Parts, path: &Path) -> Result<ForScan> 
     let run = parts.run(conefield_io::scan_size(path)?);
     let scan = files::scan(path)?;
     let g = &scan.geometry;
-    let mut found = vec![];
+    let mut found: Vec<String> =
+        told(&scan, &loaded.spec.scene)?.map(|s| format!("surround: {s}")).into_iter().collect();
     let seen = match &mut parts.pipeline {
         Some(pipeline) => {
             let fitted = fit(&scan, &loaded.spec.scene, pipeline).map_err(|e| loaded.locate(e))?;
@@ -197,7 +199,10 @@ fn for_scan(loaded: &Loaded, parts: &mut Parts, path: &Path) -> Result<ForScan> 
             let middle = scene.pixel_ray(g, 0, g.detector[0] / 2, g.detector[1] / 2);
             Some((scene.attenuation * scan.unit.mm, pipeline.projector.max_samples(&middle)))
         }
-        None => None,
+        None => {
+            found.extend(support(&scan, &loaded.spec.scene).1);
+            None
+        }
     };
     Ok(ForScan {
         views: g.views.len(),

@@ -3,24 +3,23 @@
 use super::record::{Record, ScanRecord, summary};
 use super::{backends::simd_level, evaluate, protocol::Protocol};
 use crate::budget::calibrate::Bench;
-use crate::budget::front::{Front, Kind};
+use crate::budget::front::Front;
 use crate::budget::plan::Budget;
 use crate::memory::{self, Memory};
+use crate::method::{Method, Parts};
 use crate::outgoing::{self, Written};
 use crate::plugins;
 use crate::progress::{Keeper, Progress};
 use crate::run::RunFolder;
 use crate::{files, out, signals, specs};
 use clap::Args;
-use conefield_core::arena::Arena;
-use conefield_core::backend::{Backend, Explain};
+use conefield_core::backend::Backend;
 use conefield_core::checkpoint::Resume;
-use conefield_core::pipeline::Pipeline;
 use conefield_core::scan::Scan;
-use conefield_core::solver::{Job, Limits, Solver};
+use conefield_core::solver::{Job, Limits};
 use conefield_core::spec::load::{Loaded, to_toml};
 use conefield_core::{Error, Result};
-use conefield_io::{MiddleSlices, ScanSize};
+use conefield_io::MiddleSlices;
 use std::collections::BTreeMap;
 use std::fs::File;
 use std::path::{Path, PathBuf};
@@ -70,67 +69,6 @@ fn spec_help() -> String {
 
 /// What an error that goes to standard output begins with.
 pub const FAILED: &str = "failed: ";
-
-/// A spec, what it builds and what that takes.
-pub struct Method {
-    pub loaded: Loaded,
-    pub parts: Parts,
-    pub memory: Memory,
-}
-
-impl Method {
-    /// What it works on.
-    pub fn kind(&self) -> Kind {
-        if self.parts.pipeline.is_some() { Kind::Field } else { Kind::Voxels }
-    }
-}
-
-/// What a spec builds.
-pub struct Parts {
-    pub solver: Box<dyn Solver>,
-    /// Of specs that train a field.
-    pub pipeline: Option<Pipeline>,
-    /// What the backend made of it; empty without a pipeline.
-    pub compiled: Explain,
-}
-
-impl Parts {
-    /// Builds a spec for `backend`.
-    pub fn of(loaded: &Loaded, backend: &dyn Backend) -> Result<Self> {
-        let solver = loaded.spec.solver.build().map_err(|e| loaded.locate(e))?;
-        let pipeline = specs::pipeline(loaded, solver.as_ref())?;
-        let compiled = pipeline.as_ref().map(|p| backend.compile(p)).transpose()?.map(|c| c.1).unwrap_or_default();
-        Ok(Self { solver, pipeline, compiled })
-    }
-
-    /// A run of it on a scan of this size, without reference, held-out views and checkpoint.
-    pub fn run(&self, scan: ScanSize) -> memory::Run {
-        memory::Run {
-            scan,
-            split: false,
-            reference: false,
-            field: self.pipeline.is_some(),
-            parameters: self.pipeline.as_ref().map_or(0, |p| p.layout().len() as u64),
-            backend: self.compiled.scratch_bytes as u64,
-            kept: self.solver.memory_per_parameter(),
-            solver: memory::working(self.solver.as_ref(), &scan),
-            resume: false,
-        }
-    }
-
-    /// Refuses weights to start from that cannot be read or do not fit.
-    pub fn check_weights(&self, loaded: &Loaded) -> Result<()> {
-        if let Some(i) = &loaded.spec.initializer
-            && i.volume().map_err(|e| loaded.locate(e))?.is_none()
-        {
-            let initializer = i.build(&|path| files::read_weights(path)).map_err(|e| loaded.locate(e))?;
-            if let Some(layout) = self.pipeline.as_ref().map(|p| p.layout()) {
-                initializer.apply(layout, &mut Arena::new(layout.len()))?;
-            }
-        }
-        Ok(())
-    }
-}
 
 impl Reconstruct {
     pub fn run(self) -> Result<()> {
@@ -215,7 +153,11 @@ impl Reconstruct {
             reference: reference.as_ref(),
             peak: protocol.peak,
             seed: protocol.seed,
-            limits: Limits { deadline: plan.as_ref().map(|p| p.deadline), ..protocol.ends.limits() },
+            limits: Limits {
+                deadline: plan.as_ref().map(|p| p.deadline),
+                then: plan.as_ref().and_then(|p| p.then),
+                ..protocol.ends.limits()
+            },
             weights: &|path| files::read_weights(path),
             volumes: &files::volume,
             resume: resume.as_ref(),

@@ -112,6 +112,7 @@ impl Input {
             kept: 0,
             backend: 0,
             solver: [0; 2],
+            surround: [0; 2],
             resume: false,
         };
         all.memory().check(|_| vec![])?;

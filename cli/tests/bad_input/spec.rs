@@ -86,6 +86,24 @@ pub fn cases() -> Vec<Case> {
             TOML,
             &["scene.occupancy.refined.below", "-1"],
         ),
+        refused(
+            "a surround by another name",
+            toml("extends = \"naf\"\n[scene]\nsurround = \"coarsely\"\n"),
+            TOML,
+            &["spec.toml:3:12", "scene.surround"],
+        ),
+        refused(
+            "a surround without cells",
+            toml("extends = \"naf\"\n[scene]\nsurround = { coarse = { cells = 0 } }\n"),
+            TOML,
+            &["scene.surround.coarse.cells", "4 to 256"],
+        ),
+        refused(
+            "a surround that goes nowhere, of a solver on voxels",
+            toml("extends = \"fdk\"\n[scene]\nsurround = { coarse = { margin = -1.0 } }\n"),
+            TOML,
+            &["scene.surround.coarse.margin", "-1"],
+        ),
         refused("NaN", toml("extends = \"naf\"\n[scene]\nfill = nan\n"), TOML, &["spec.toml:3:8", "finite"]),
         refused(
             "a grid past memory",

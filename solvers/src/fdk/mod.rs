@@ -9,6 +9,7 @@ pub mod weights;
 
 use crate::iterative::watch::Watch;
 use crate::iterative::{finite, voxels_only};
+use crate::surround::Within;
 use conefield_core::Error;
 use conefield_core::error::{Result, ensure};
 use conefield_core::geometry::{Geometry, dot, norm, sub};
@@ -59,9 +60,11 @@ impl SolverSpec for Fdk {
 impl Solver for Fdk {
     fn solve(&self, job: &Job<'_>, observer: &mut dyn Observer) -> Result<Solution> {
         let start = Instant::now();
-        let scan = job.scan;
-        scan.validate("scan")?;
+        job.scan.validate("scan")?;
         alone(job.spec)?;
+        let within = Within::of(job, observer)?;
+        let job = &Within::job(within.as_ref(), job);
+        let scan = job.scan;
         let orbit = Orbit::of(&scan.geometry);
         check(&orbit)?;
         said(&orbit).iter().for_each(|line| observer.note(line));

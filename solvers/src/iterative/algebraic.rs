@@ -3,7 +3,7 @@
 //! SART takes one view at a time, SIRT all at once.
 
 use super::order::{Order, subsets, told};
-use super::{Method, Pass, Problem, Stop, change, drive, flat_mut, inverse, open, projecting, refuse_others, start};
+use super::{Method, Opened, Pass, Problem, Stop, change, drive, flat_mut, inverse, projecting, refuse_others};
 use conefield_core::error::{Result, ensure};
 use conefield_core::scan::Scan;
 use conefield_core::solver::{Job, Observer, Solution, Solver};
@@ -166,9 +166,10 @@ impl Algebraic {
 impl Solver for Algebraic {
     fn solve(&self, job: &Job<'_>, observer: &mut dyn Observer) -> Result<Solution> {
         let begun = Instant::now();
-        let projector = open(&self.describe(), job, observer)?;
-        let problem = Problem::new(job, projector.as_ref());
-        let mut sweep = Sweep::new(self, &problem, start(job)?);
+        let opened = Opened::of(&self.describe(), job, observer)?;
+        let job = &opened.job(job);
+        let problem = opened.problem(job);
+        let mut sweep = Sweep::new(self, &problem, problem.start(job)?);
         drive(job, &self.stop, begun, &problem, &mut sweep, observer)
     }
 
@@ -215,8 +216,7 @@ pub(super) struct Sweep {
 impl Sweep {
     pub(super) fn new(settings: &Algebraic, problem: &Problem<'_>, x: Array3<f32>) -> Self {
         let subsets = subsets(problem.scan.geometry.views.len(), settings.subsets);
-        let shape = problem.scan.geometry.volume.shape;
-        let rows = inverse(problem.forward(&problem.views(), &Array3::ones(shape)));
+        let rows = inverse(problem.forward(&problem.views(), &problem.ones()));
         let mut sweep = Self { settings: settings.clone(), subsets, x, rows, columns: None, update: problem.zeros() };
         if sweep.subsets.len() == 1 {
             sweep.columns = Some(column_sums(problem, &problem.views()));

@@ -5,7 +5,7 @@ use super::algebraic::{Algebraic, Sweep};
 use super::noise::{self, Noise};
 use super::order::{Order, subsets, told};
 use super::tv::{anisotropy, descend};
-use super::{Method, Pass, Problem, Stop, change, distance, drive, flat_mut, norm2, open, refuse_others, start};
+use super::{Method, Opened, Pass, Problem, Stop, change, distance, drive, flat_mut, norm2, refuse_others};
 use conefield_core::error::{Result, ensure};
 use conefield_core::scan::Scan;
 use conefield_core::solver::{Job, Observer, Solution, Solver};
@@ -87,12 +87,13 @@ impl AsdPocs {
 impl Solver for AsdPocs {
     fn solve(&self, job: &Job<'_>, observer: &mut dyn Observer) -> Result<Solution> {
         let begun = Instant::now();
-        let projector = open(&self.describe(), job, observer)?;
-        let problem = Problem::new(job, projector.as_ref());
+        let opened = Opened::of(&self.describe(), job, observer)?;
+        let job = &opened.job(job);
+        let problem = opened.problem(job);
         let sigma = Noise::of(job.scan, false).sigma;
         let mut iterate = Iterate {
             settings: self.clone(),
-            sweep: Sweep::new(&self.data(), &problem, start(job)?),
+            sweep: Sweep::new(&self.data(), &problem, problem.start(job)?),
             target: self.tolerance * sigma * (job.scan.projections.len() as f64).sqrt(),
             length: 0.0,
             work: problem.zeros(),
@@ -151,6 +152,7 @@ impl Method for Iterate {
         for _ in 0..s.descents {
             let x = flat_mut(&mut self.sweep.x);
             descend(x, grid.shape, anisotropy(grid), self.length, 1e-3 * mean as f32, flat_mut(&mut self.work));
+            problem.outside(&mut self.sweep.x, 0.0);
         }
         let prior = distance(&self.sweep.x, &fitted);
         if prior > s.ratio * data && residual.sqrt() > self.target {

@@ -1,7 +1,7 @@
 //! Conjugate gradients on the normal equations `AᵀA·x = Aᵀp` (Hestenes and Stiefel 1952; Björck, Numerical Methods for
 //! Least Squares Problems, algorithm 7.4.1). Early passes find what is smooth; noise comes with more of them.
 
-use super::{Method, Pass, Problem, Stop, drive, flat_mut, norm2, open, projecting, refuse_others, start};
+use super::{Method, Opened, Pass, Problem, Stop, drive, flat_mut, norm2, projecting, refuse_others};
 use conefield_core::error::Result;
 use conefield_core::solver::{Job, Observer, Reconstruction, Solution, Solver};
 use conefield_core::spec::{SolverSpec, Spec};
@@ -39,9 +39,10 @@ impl SolverSpec for Cgls {
 impl Solver for Cgls {
     fn solve(&self, job: &Job<'_>, observer: &mut dyn Observer) -> Result<Solution> {
         let begun = Instant::now();
-        let projector = open(&self.describe(), job, observer)?;
-        let problem = Problem::new(job, projector.as_ref());
-        let mut iterate = Iterate::new(&problem, start(job)?);
+        let opened = Opened::of(&self.describe(), job, observer)?;
+        let job = &opened.job(job);
+        let problem = opened.problem(job);
+        let mut iterate = Iterate::new(&problem, problem.start(job)?);
         let mut solution = drive(job, &self.stop, begun, &problem, &mut iterate, observer)?;
         if let (true, Reconstruction::Volume(volume)) = (self.nonnegative, &mut solution.result) {
             volume.data.par_mapv_inplace(|x| x.max(0.0));

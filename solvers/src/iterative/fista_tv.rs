@@ -15,9 +15,7 @@
 use super::noise::{self, Noise};
 use super::order::{Order, subsets, told};
 use super::tv::{TvProx, anisotropy, total_variation};
-use super::{
-    Method, Pass, Problem, Stop, change, drive, flat, flat_mut, norm2, open, projecting, refuse_others, start,
-};
+use super::{Method, Opened, Pass, Problem, Stop, change, drive, flat, flat_mut, norm2, projecting, refuse_others};
 use conefield_core::error::{Result, ensure};
 use conefield_core::random::stream;
 use conefield_core::scan::Scan;
@@ -103,8 +101,9 @@ impl SolverSpec for FistaTv {
 impl Solver for FistaTv {
     fn solve(&self, job: &Job<'_>, observer: &mut dyn Observer) -> Result<Solution> {
         let begun = Instant::now();
-        let projector = open(&self.describe(), job, observer)?;
-        let mut problem = Problem::new(job, projector.as_ref());
+        let opened = Opened::of(&self.describe(), job, observer)?;
+        let job = &opened.job(job);
+        let mut problem = opened.problem(job);
         if self.air {
             problem.clear_air();
             observer.note(&format!("{:.0} % of the pixels are air", 100.0 * problem.air_share()));
@@ -118,7 +117,7 @@ impl Solver for FistaTv {
             Weight::Noise(k) => k * noise.sigma * noise_gain(&problem, noise),
         };
         observer.note(&format!("{noise}: the prior's weight is {:.3e}", lambda / voxel));
-        let mut iterate = Iterate::new(self, &problem, noise, start(job)?, lambda)?;
+        let mut iterate = Iterate::new(self, &problem, noise, problem.start(job)?, lambda)?;
         drive(job, &self.stop, begun, &problem, &mut iterate, observer)
     }
 
@@ -177,7 +176,7 @@ fn largest_eigenvalue(problem: &Problem<'_>, noise: Noise, subsets: &[Vec<usize>
     let mut next = problem.zeros();
     let mut worst = 0.0f64;
     for views in subsets {
-        let mut v = Array3::ones(problem.scan.geometry.volume.shape);
+        let mut v = problem.ones();
         let mut bound = f64::INFINITY;
         for _ in 0..2 {
             let mut projected = problem.forward(views, &v);
@@ -264,6 +263,8 @@ impl Method for Iterate {
                 let toward = |g: &mut f32, z: &f32, to: &f32| *g += pull * (to - z);
                 Zip::from(&mut self.scratch).and(&self.ahead).and(towards).par_for_each(toward);
             }
+            // What is far below 0 stays at 0, whatever its neighbours are.
+            problem.outside(&mut self.scratch, f32::MIN);
             let tau = (self.lambda / self.lipschitz) as f32;
             self.prox.apply(flat(&self.scratch), tau, self.inner, flat_mut(&mut self.fresh));
             let t = 0.5 * (1.0 + (1.0 + 4.0 * self.t * self.t).sqrt());

@@ -11,8 +11,10 @@ pub mod order;
 pub mod tv;
 pub mod watch;
 
+use crate::fit::support;
 use crate::schedule::{Clock, Ends};
 use crate::shadow::{air_level, shadow};
+use crate::surround::Within;
 use conefield_core::Error;
 use conefield_core::checkpoint::{Checkpoint, Resume, Standing};
 use conefield_core::error::{Result, ensure};
@@ -81,16 +83,13 @@ pub struct Problem<'a> {
     pub operator: &'a dyn VoxelOperator<f32>,
     /// Seed of everything random.
     pub seed: u64,
+    /// The voxels that may be other than 0, if not all.
+    inside: Option<&'a Array3<bool>>,
     /// Where each view shows the object, if the other pixels are to count as 0.
     shadow: Option<Vec<Array2<bool>>>,
 }
 
 impl<'a> Problem<'a> {
-    /// A job's, with every pixel as it was measured.
-    pub fn new(job: &Job<'a>, projector: &'a dyn VoxelProjector) -> Self {
-        Self { scan: job.scan, operator: projector.operator(), seed: job.seed, shadow: None }
-    }
-
     /// Takes pixels outside the object's shadow for 0.
     pub fn clear_air(&mut self) {
         let level = air_level(self.scan);
@@ -128,10 +127,18 @@ impl<'a> Problem<'a> {
         out
     }
 
-    /// Overwrites `out` with `Aᵀ·y` of some views.
+    /// Overwrites `out` with `Aᵀ·y` of some views: 0 where no object can be, so that what starts at 0 there stays.
     pub fn back(&self, views: &[usize], y: &Array3<f32>, out: &mut Array3<f32>) {
         out.fill(0.0);
         self.operator.adjoint(&self.scan.geometry, views, y.view(), out.view_mut());
+        self.outside(out, 0.0);
+    }
+
+    /// Sets the voxels in which no object can be to `value`.
+    pub fn outside(&self, x: &mut Array3<f32>, value: f32) {
+        if let Some(inside) = self.inside {
+            Zip::from(x).and(inside).par_for_each(|x, inside| *x = if *inside { *x } else { value });
+        }
     }
 
     /// Every view.
@@ -142,6 +149,22 @@ impl<'a> Problem<'a> {
     /// Voxels of 0.
     pub fn zeros(&self) -> Array3<f32> {
         Array3::zeros(self.scan.geometry.volume.shape)
+    }
+
+    /// Voxels of 1 where the object can be, and of 0 elsewhere.
+    pub fn ones(&self) -> Array3<f32> {
+        let mut ones = Array3::ones(self.scan.geometry.volume.shape);
+        self.outside(&mut ones, 0.0);
+        ones
+    }
+
+    /// The volume to start from, in 1/mm: what the initializer of the job's spec brings, or 0.
+    pub fn start(&self, job: &Job<'_>) -> Result<Array3<f32>> {
+        let Some(start) = start_of(job.spec)? else { return Ok(self.zeros()) };
+        let data = start_volume(job, &start.path)?.data;
+        let mut x = if data.is_standard_layout() { data } else { data.as_standard_layout().into_owned() };
+        self.outside(&mut x, 0.0);
+        Ok(x)
     }
 }
 
@@ -176,17 +199,47 @@ pub trait Method {
     }
 }
 
-/// Begins a job: refuses a scan that makes no sense, says what solves it and how, and gives the projector.
-pub(crate) fn open(solver: &str, job: &Job<'_>, observer: &mut dyn Observer) -> Result<Box<dyn VoxelProjector>> {
-    job.scan.validate("scan")?;
-    let g = &job.scan.geometry;
-    let (bounds, [rows, columns]) = (g.volume.bounds(), g.detector);
-    let meets = |v, p: usize| g.ray(v, p / columns, p % columns).clip(bounds).is_some();
-    let met = (0..g.views.len()).any(|v| (0..rows * columns).any(|p| meets(v, p)));
-    ensure(met, "scan", "geometry", "rays that all miss the volume", "rays through the volume")?;
-    let projector = job.backend.place(projector_of(job.spec)?)?;
-    observer.note(&format!("{solver}; {}", projector.describe()));
-    Ok(projector)
+/// What a job on voxels begins with.
+pub(crate) struct Opened {
+    projector: Box<dyn VoxelProjector>,
+    /// The voxels that the object can be in, where that is known.
+    inside: Option<Array3<bool>>,
+    /// The scan without what lies beyond the volume.
+    within: Option<Within>,
+}
+
+impl Opened {
+    /// Refuses a scan that makes no sense, says what solves it and how, and finds out where the object is.
+    pub(crate) fn of(solver: &str, job: &Job<'_>, observer: &mut dyn Observer) -> Result<Self> {
+        job.scan.validate("scan")?;
+        let g = &job.scan.geometry;
+        let (bounds, [rows, columns]) = (g.volume.bounds(), g.detector);
+        let meets = |v, p: usize| g.ray(v, p / columns, p % columns).clip(bounds).is_some();
+        let met = (0..g.views.len()).any(|v| (0..rows * columns).any(|p| meets(v, p)));
+        ensure(met, "scan", "geometry", "rays that all miss the volume", "rays through the volume")?;
+        let projector = job.backend.place(projector_of(job.spec)?)?;
+        observer.note(&format!("{solver}; {}", projector.describe()));
+        // By the views as they were measured: what is taken off them afterwards is known too coarsely to carve by.
+        let (support, said) = support(job.scan, &job.spec.scene);
+        said.iter().for_each(|line| observer.note(line));
+        let inside = support.map(|support| {
+            let mut inside = Array3::from_elem(g.volume.shape, false);
+            Zip::indexed(&mut inside).par_for_each(|(x, y, z), i| *i = support.holds(g.volume.voxel([x, y, z])));
+            inside
+        });
+        Ok(Self { projector, inside, within: Within::of(job, observer)? })
+    }
+
+    /// The job on what is inside the volume.
+    pub(crate) fn job<'a>(&'a self, job: &Job<'a>) -> Job<'a> {
+        Within::job(self.within.as_ref(), job)
+    }
+
+    /// Its problem, with every pixel as it was measured.
+    pub(crate) fn problem<'a>(&'a self, job: &Job<'a>) -> Problem<'a> {
+        let (operator, inside) = (self.projector.operator(), self.inside.as_ref());
+        Problem { scan: job.scan, operator, seed: job.seed, inside, shadow: None }
+    }
 }
 
 /// The voxel projector of a spec: Joseph's where it names none. Refuses a spec with stages of a field.
@@ -216,13 +269,6 @@ pub fn voxels_only(spec: &Spec) -> Result<()> {
         ensure(!there, "spec", stage, "a stage of a field", format!("none: {solver} reconstructs voxels"))?;
     }
     Ok(())
-}
-
-/// The volume to start from, in 1/mm: what the spec's initializer brings, or 0.
-pub fn start(job: &Job<'_>) -> Result<Array3<f32>> {
-    let Some(start) = start_of(job.spec)? else { return Ok(Array3::zeros(job.scan.geometry.volume.shape)) };
-    let data = start_volume(job, &start.path)?.data;
-    Ok(if data.is_standard_layout() { data } else { data.as_standard_layout().into_owned() })
 }
 
 /// What the spec's initializer brings. Refuses one that fills weights.

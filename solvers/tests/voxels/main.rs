@@ -1,7 +1,9 @@
 //! Solvers on voxels, held against ellipsoids whose scans are known in closed form.
 
+mod carved;
 mod fdk;
 mod iterative;
 mod kit;
 mod refusals;
+mod surround;
 mod warm_start;

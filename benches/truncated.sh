@@ -1,0 +1,67 @@
+#!/usr/bin/env bash
+# A body that is wider than the detector, with and without a look beyond the volume:
+#   bash benches/truncated.sh DATA_FOLDER OUT_FOLDER [SECONDS [SPECS]]
+# DATA_FOLDER holds volumes/abdomen_128.nii.gz. The detector is half as wide as the published one, the volume to reconstruct the
+# 64 x 64 x 128 voxels that all views see. Fields train for SECONDS (60); methods on voxels end by themselves. A line each:
+# PSNR and ssim-2d over that volume, and all seconds; "whole" has all 128 x 128 x 128 voxels as its volume, the same scored.
+set -euo pipefail
+cd "$(dirname "$0")/.."
+data=$1
+out=$2
+seconds=${3:-60}
+specs=${4:-fdk os-sart fista-tv accurate}
+cargo build --release --quiet -p conefield
+bin=${CARGO_TARGET_DIR:-target}/release/conefield
+mkdir -p "$out"
+cat >"$out/protocol.toml" <<'T'
+unit = { name = "cube half side", mm = 64.0 }
+dso = 5.0
+dsd = 7.0
+detector = [512, 256]
+extent = { side = [4.0, 2.0] }
+angles = { even = { views = 50 } }
+noise = "tigre:1e4,10"
+T
+whole=$out/whole
+middle=$out/middle
+if [[ ! -f $middle/scan.toml ]]; then
+    "$bin" -q simulate "$data/volumes/abdomen_128.nii.gz" -o "$whole" --protocol "$out/protocol.toml"
+    mkdir -p "$middle"
+    cp "$whole/projections.npy" "$middle/"
+    sed -e 's/^shape = .*/shape = [64, 64, 128]/' -e '/^truth = /d' "$whole/scan.toml" >"$middle/scan.toml"
+fi
+cut() { # the middle 64 x 64 columns of a volume
+    python3 - "$1" "$2" <<'PY'
+import gzip, struct, sys
+raw = gzip.open(sys.argv[1]).read()
+at = int(struct.unpack_from("<f", raw, 108)[0])
+nx, ny, nz = struct.unpack_from("<3h", raw, 42)
+head = bytearray(raw[:at])
+struct.pack_into("<3h", head, 42, 64, 64, nz)
+size = struct.unpack_from("<h", raw, 72)[0] // 8
+x0, y0 = (nx - 64) // 2, (ny - 64) // 2
+rows = [raw[at + ((z * ny + y) * nx + x0) * size:][:64 * size] for z in range(nz) for y in range(y0, y0 + 64)]
+open(sys.argv[2], "wb").write(bytes(head) + b"".join(rows))
+PY
+}
+cut "$whole/truth.nii.gz" "$out/truth.nii"
+for spec in $specs; do
+    case $spec in naf | ni-naf* | nerf | dense | accurate | balanced | fast) ends=(--seconds "${seconds}s") ;; *) ends=() ;; esac
+    for way in without with whole; do
+        scan=$middle
+        sets=()
+        [[ $way != with ]] || sets=(--set 'scene.surround={ coarse = {} }')
+        [[ $way != whole ]] || scan=$whole
+        run=$out/$spec-$way
+        "$bin" -q reconstruct "$scan" --spec "$spec" -o "$run" --force "${ends[@]}" "${sets[@]}" >/dev/null
+        volume=$run/volume.nii.gz
+        [[ $way != whole ]] || { cut "$volume" "$run/middle.nii" && volume=$run/middle.nii; }
+        "$bin" evaluate "$volume" "$out/truth.nii" --json >"$run/scores.json"
+        python3 - "$spec" "$way" "$run" <<'PY'
+import json, sys
+spec, way, run = sys.argv[1:]
+scores, record = json.load(open(f"{run}/scores.json")), json.load(open(f"{run}/record.json"))
+print(f"{spec:10} {way:8} {scores['psnr']:6.2f} dB  {scores['ssim_2d']:.3f}  {record['total_s']:6.1f} s")
+PY
+    done
+done | tee "$out/truncated.txt"

@@ -1,0 +1,52 @@
+//! Solvers on voxels that know where the object can be.
+
+use crate::kit::{Case, bodies, geometry, psnr};
+use conefield_core::scan::Volume;
+use conefield_projectors::simulate::{Noise, ellipsoids, scan_ellipsoids};
+use conefield_solvers::support::carve;
+
+/// Volumes of a noisy scan: without, with the support, and what the support is.
+fn solved(kind: &str, start: Option<&Volume>) -> [Volume; 2] {
+    let scan = noisy();
+    let initializer = start.map_or("", |_| "[initializer]\ntype = \"volume\"\npath = \"earlier.nii\"\n");
+    ["box", "carve"].map(|support| {
+        let text = format!(
+            "[scene]\nsupport = \"{support}\"\n{initializer}[solver]\ntype = \"{kind}\"\nstop = {{ passes = 6 }}\n"
+        );
+        Case { file: start, ..Case::of(&scan) }.volume(&text).0
+    })
+}
+
+fn noisy() -> conefield_core::scan::Scan {
+    let mut scan = scan_ellipsoids(&bodies(), geometry(24));
+    let noise: Noise = "poisson:1e4".parse().unwrap();
+    noise.add(&mut scan.projections, 5);
+    scan
+}
+
+#[test]
+fn voxels_outside_stay_empty_and_those_inside_get_no_worse() {
+    let truth = ellipsoids(&bodies(), &geometry(1).volume);
+    let support = carve(&noisy()).support.unwrap();
+    let outside = |v: &Volume| {
+        let there = |((x, y, z), _): &((usize, usize, usize), &f32)| !support.holds(v.grid.voxel([*x, *y, *z]));
+        v.data.indexed_iter().filter(there).map(|(_, x)| f64::from(x.abs())).sum::<f64>()
+    };
+    for kind in ["sart", "os-sart", "sirt", "cgls", "asd-pocs", "fista-tv"] {
+        let [without, with] = solved(kind, None);
+        let (before, after) = (psnr(&without, &truth), psnr(&with, &truth));
+        println!("{kind}: {before:.2} to {after:.2} dB, {:.4} outside before", outside(&without));
+        assert!(outside(&without) > 0.0 && outside(&with) == 0.0, "{kind}");
+        assert!(after > before - 0.05, "{kind}: {before} to {after}");
+    }
+}
+
+/// What a volume to start from has outside goes with the rest.
+#[test]
+fn a_start_is_cut_to_the_support() {
+    let full = Volume { data: ndarray::Array3::from_elem([24; 3], 0.01), ..ellipsoids(&[], &geometry(1).volume) };
+    let support = carve(&noisy()).support.unwrap();
+    let [_, with] = solved("cgls", Some(&full));
+    let outside = with.data.indexed_iter().filter(|((x, y, z), _)| !support.holds(with.grid.voxel([*x, *y, *z])));
+    assert!(outside.map(|(_, v)| *v).all(|v| v == 0.0));
+}

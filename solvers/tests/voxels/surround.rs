@@ -1,0 +1,132 @@
+//! A body that goes on beyond the volume and the detector: what lies outside is found on coarse cells and taken off.
+
+use crate::kit::{Case, Heard, mean, psnr, spec, view};
+use conefield_backend_cpu::Cpu;
+use conefield_core::geometry::{Geometry, VoxelGrid};
+use conefield_core::scan::Scan;
+use conefield_core::solver::Job;
+use conefield_core::spec::SurroundRule;
+use conefield_projectors::simulate::{Ellipsoid, ellipsoids, scan_ellipsoids};
+use conefield_solvers::surround::told;
+
+/// A body of ± 55 by 45 by 40 mm with things in it, within ± 20 mm of the middle and outside.
+fn bodies() -> Vec<Ellipsoid> {
+    let body = |center, axes, value| Ellipsoid { center, axes, value };
+    vec![
+        body([3.0, -2.0, 0.0], [55.0, 45.0, 40.0], 0.02),
+        body([-6.0, 3.0, 1.0], [5.0, 4.0, 8.0], 0.01),
+        body([8.0, -6.0, -5.0], [4.0, 6.0, 5.0], -0.015),
+        body([42.0, 2.0, 0.0], [6.0, 8.0, 30.0], 0.02),
+        body([-20.0, -28.0, 5.0], [12.0, 9.0, 10.0], -0.015),
+    ]
+}
+
+/// The middle ± 20 mm of it, on a detector that sees ± 24 mm there (or ± 77 mm).
+fn geometry(wide: bool) -> Geometry {
+    let turn = |i: usize| std::f64::consts::TAU * i as f64 / 40.0;
+    let side = if wide { 154 } else { 48 };
+    Geometry {
+        detector: [side; 2],
+        views: (0..40).map(|i| view(0.1 + turn(i), [300.0, 420.0], [1.4; 2], [0.0; 2])).collect(),
+        volume: VoxelGrid { shape: [40; 3], spacing: [1.0; 3], center: [0.0; 3] },
+    }
+}
+
+fn scan() -> Scan {
+    scan_ellipsoids(&bodies(), geometry(false))
+}
+
+/// As far as the body goes.
+const SURROUND: &str = "[scene]\nsurround = { coarse = { margin = 1.0, cells = 32 } }\n";
+
+fn solver(kind: &str) -> String {
+    let stop = if kind == "fdk" { "" } else { "stop = { passes = 10 }\n" };
+    format!("[solver]\ntype = \"{kind}\"\n{stop}")
+}
+
+#[test]
+fn every_solver_loses_the_rim_that_the_outside_leaves() {
+    let (scan, truth) = (scan(), ellipsoids(&bodies(), &geometry(false).volume));
+    let rim = |p: [f64; 3]| (17.0..19.0).contains(&p[0].hypot(p[1])) && p[2].abs() < 15.0;
+    for kind in ["fdk", "os-sart", "cgls", "asd-pocs", "fista-tv"] {
+        let (without, _) = Case::of(&scan).volume(&solver(kind));
+        let (with, heard) = Case::of(&scan).volume(&format!("{SURROUND}{}", solver(kind)));
+        assert!(heard.said("beyond the volume"), "{:?}", heard.notes);
+        let error = |v| (mean(v, rim) - mean(&truth, rim)).abs() / mean(&truth, rim);
+        let (before, after) = (psnr(&without, &truth), psnr(&with, &truth));
+        println!(
+            "{kind}: {before:.2} to {after:.2} dB, the rim is off by {:.3} to {:.3}",
+            error(&without),
+            error(&with)
+        );
+        assert!(after > before + 4.0 && error(&with) < 0.5 * error(&without), "{kind}");
+    }
+}
+
+/// The line integrals that are left are those of what is inside.
+#[test]
+fn what_is_left_is_the_inside() {
+    let scan = scan();
+    let spec = spec(&format!("{SURROUND}{}", solver("sirt"))).unwrap();
+    let backend = Cpu::new();
+    let left = conefield_solvers::surround::subtracted(&Job::new(&scan, &spec, &backend), &mut Heard::default());
+    let left = left.unwrap().unwrap();
+    // In closed form: the chords less those beyond the box.
+    let inside = conefield_projectors::simulate::project(
+        &ellipsoids(&bodies(), &VoxelGrid { shape: [160; 3], spacing: [0.25; 3], center: [0.0; 3] }),
+        &geometry(false),
+        2.0,
+    );
+    let inside = inside.unwrap();
+    let rms =
+        |f: &dyn Fn(usize) -> f64| ((0..inside.len()).map(|i| f(i).powi(2)).sum::<f64>() / inside.len() as f64).sqrt();
+    let flat = |a: &ndarray::Array3<f32>| a.iter().map(|x| f64::from(*x)).collect::<Vec<_>>();
+    let (left, inside, whole) = (flat(&left.projections), flat(&inside), flat(&scan.projections));
+    let (error, outside) = (rms(&|i| left[i] - inside[i]), rms(&|i| whole[i] - inside[i]));
+    println!("left of the outside: {error:.4} of {outside:.4}");
+    assert!(error < 0.1 * outside, "{error} of {outside}");
+}
+
+#[test]
+fn a_scan_that_shows_all_of_the_object_is_left_alone() {
+    let scan = scan_ellipsoids(&bodies(), geometry(true));
+    let (without, _) = Case::of(&scan).volume(&solver("os-sart"));
+    let (with, heard) = Case::of(&scan).volume(&format!("{SURROUND}{}", solver("os-sart")));
+    assert!(heard.said("surround: nothing, as the object reaches the sides of no view"), "{:?}", heard.notes);
+    assert_eq!(with.data, without.data);
+}
+
+#[test]
+fn what_would_be_looked_at_is_told_before() {
+    let settings = |text: &str| spec(&format!("[scene]\n{text}\n{}", solver("sirt"))).unwrap().scene;
+    assert_eq!(told(&scan(), &settings("surround = \"none\"")).unwrap(), None);
+    let said = |scan: &Scan, text: &str| told(scan, &settings(text)).unwrap().unwrap();
+    let all = said(&scan(), "surround = { coarse = { cells = 20, margin = 0.5 } }");
+    assert!(all.contains("40 of 40 views: 40 x 40 x 40 cells of 2.000 mm"), "{all}");
+    // Only as far as sources and detectors leave room.
+    let mut close = scan();
+    close.geometry.views.iter_mut().for_each(|v| v.source = v.source.map(|x| x * 0.13));
+    let all = said(&close, "surround = { coarse = { cells = 20, margin = 2.0 } }");
+    let side: usize = all.split(" views: ").nth(1).unwrap().split(' ').next().unwrap().parse().unwrap();
+    assert!((22..46).contains(&side), "{all}");
+    // A body that is only longer than the detector is looked for above and below.
+    let long = [Ellipsoid { center: [0.0; 3], axes: [15.0, 15.0, 60.0], value: 0.02 }];
+    let all = said(&scan_ellipsoids(&long, geometry(false)), "surround = { coarse = { cells = 20, margin = 0.5 } }");
+    assert!(all.contains("20 x 20 x 40 cells"), "{all}");
+}
+
+#[test]
+fn settings_that_mean_nothing_are_refused() {
+    for (text, says) in
+        [("margin = 0.0", "margin"), ("margin = 5.0", "at most 4"), ("cells = 2", "4 to 256"), ("passes = 0", "passes")]
+    {
+        let text = format!("[scene]\nsurround = {{ coarse = {{ {text} }} }}\n{}", solver("sirt"));
+        let e = Case::of(&scan()).run(&text, &mut Heard::default()).err().unwrap().to_string();
+        assert!(e.contains("scene.surround.coarse") && e.contains(says), "{e}");
+    }
+    let many = "[scene]\nsurround = { coarse = { cells = 256, margin = 4.0 } }\n";
+    let e =
+        Case::of(&scan()).run(&format!("{many}{}", solver("sirt")), &mut Heard::default()).err().unwrap().to_string();
+    assert!(e.contains("cells in all, expected at most 16777216"), "{e}");
+    assert_eq!(SurroundRule::default(), SurroundRule::None);
+}
