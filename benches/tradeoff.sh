@@ -1,6 +1,8 @@
 #!/usr/bin/env bash
-# What a time buys: fronts of engine_256 and head_256, then the shipped front and presets from abdomen_128 and engine_256 together:
-#   bash benches/tradeoff.sh DATA_FOLDER OUT_FOLDER [BUDGETS [CANDIDATES [PRESET_BUDGETS]]]
+# What a time buys: fronts of engine_256 (all views) and head_256 (every tenth kept aside, to see how well they rank), then a front and
+# presets from abdomen_128 and engine_256 together:
+#   bash benches/tradeoff.sh DATA_FOLDER OUT_FOLDER [BUDGETS [CANDIDATES [PRESET_BUDGETS [SEARCHES]]]]
+# SEARCHES ("engine_256 head_256 tuning") may name fewer.
 # DATA_FOLDER holds volumes/*.nii.gz. Each search takes at most the sum of its budgets, every one times the candidates that are
 # left (half go on), a scan; it says so and goes on where it was interrupted. Nothing else should run on the machine.
 # Leaves OUT_FOLDER/{engine_256,head_256,tuning}, OUT_FOLDER/front.toml (for specs/tradeoff/) and OUT_FOLDER/presets.
@@ -8,9 +10,10 @@ set -euo pipefail
 cd "$(dirname "$0")/.."
 data=$1
 out=$2
-budgets=${3:-10s,30s,60s,120s,300s,600s,1200s}
-candidates=${4:-32}
-presets=${5:-60 300 1200}
+budgets=${3:-10s,30s,60s,180s,1200s}
+candidates=${4:-8}
+presets=${5:-30 60 1200}
+searches=${6:-engine_256 head_256 tuning}
 cargo build --release --quiet -p conefield
 bin=${CARGO_TARGET_DIR:-target}/release/conefield
 mkdir -p "$out"
@@ -22,13 +25,15 @@ done
 search() {
     local name=$1
     shift
+    [[ " $searches " == *" $name "* ]] || return 0
     local again=()
     [[ ! -d $out/$name ]] || again=(--resume)
     "$bin" tradeoff "$@" --reference truth --budgets "$budgets" --candidates "$candidates" -o "$out/$name" "${again[@]}"
 }
-search engine_256 "$out/scans/engine_256"
+search engine_256 "$out/scans/engine_256" --hold-out none
 search head_256 "$out/scans/head_256"
 search tuning "$out/scans/abdomen_128" "$out/scans/engine_256"
+[[ " $searches " == *" tuning "* ]] || exit 0
 cp "$out/tuning/front.toml" "$out/front.toml"
 mkdir -p "$out/presets"
 names=(fast balanced accurate)

@@ -70,13 +70,13 @@ impl RunFolder {
         Ok((path, file))
     }
 
-    /// Opens `metrics.jsonl` of an interrupted run without the records from `step` on, which come again.
-    pub fn metrics_before(&self, step: u64) -> Result<(PathBuf, File)> {
+    /// Opens `metrics.jsonl` of an interrupted run without the records after `step`, which come again.
+    pub fn metrics_until(&self, step: u64) -> Result<(PathBuf, File)> {
         let path = self.file("metrics.jsonl");
         let io = |e| Error::io(&path, e);
         let before = |line: &&str| {
             let record: Option<serde_json::Value> = serde_json::from_str(line).ok();
-            record.and_then(|r| r["step"].as_u64()).is_some_and(|s| s < step)
+            record.and_then(|r| r["step"].as_u64()).is_some_and(|s| s <= step)
         };
         // The last line may be half written.
         let text = fs::read(&path).map_err(io)?;

@@ -18,11 +18,18 @@ fn scan() -> (TempDir, PathBuf) {
 fn a_plan_names_every_part_and_the_record_holds_them_against_it() {
     let (dir, scan) = scan();
     let scan = text(&scan);
-    for spec in ["fast", "sirt", "fdk"] {
+    for spec in ["fast", "sirt", "fdk", "field-tv"] {
         let run = dir.path().join(spec);
         let all = ["reconstruct", &scan, "--spec", spec, "-o", &text(&run), "--reference", "truth", "--json"];
         let small = ["encoder.log2_table_size=10", "solver.rays=64", "projector.samples=16", "solver.tv.blocks=4"];
-        let small = small.iter().filter(|_| spec == "fast").flat_map(|s| ["--set", *s]).collect::<Vec<_>>();
+        // Of a sequence the field's settings stand one deeper.
+        let deeper: Vec<String> = small.iter().map(|s| s.replace("solver.", "solver.first.")).collect();
+        let small: Vec<&str> = match spec {
+            "fast" => small.to_vec(),
+            "field-tv" => deeper.iter().map(String::as_str).collect(),
+            _ => vec![],
+        };
+        let small: Vec<&str> = small.into_iter().flat_map(|s| ["--set", s]).collect();
         let record = json(&[&all[..], &small, &["--budget", "3s"]].concat());
         let number = |key: &str| record[key].as_f64().unwrap_or_else(|| panic!("{spec}: {key}"));
         let parts = ["load_s", "prepare_s", "train_s", "export_s", "picture_s", "score_s"].map(number);
@@ -33,6 +40,9 @@ fn a_plan_names_every_part_and_the_record_holds_them_against_it() {
         assert!(plan["point"].is_null() && plan["why"].as_str().unwrap().contains("asked for"), "{plan}");
         assert!(plan["train_s"].as_f64().unwrap() > 0.0 && plan["steps"].as_u64().unwrap() > 0, "{plan}");
         assert!(plan["expected"]["step_s"].as_f64().unwrap() > 0.0, "{plan}");
+        let then = plan["expected"]["then_s"].as_f64().unwrap();
+        assert_eq!(then > 0.0, spec == "field-tv", "{spec}: {then}");
+        assert!(total < 3.3, "{spec}: {total}");
         let steps = record["steps"].as_u64().unwrap();
         // FDK has one pass whatever time there is.
         assert!(if spec == "fdk" { steps == 1 } else { steps > 1 }, "{spec}: {steps}");

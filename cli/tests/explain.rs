@@ -67,7 +67,7 @@ fn what_lies_beyond_the_volume_is_told_and_taken_off() {
     let (scan, protocol) = (text(&dir.path().join("scan")), dir.path().join("protocol.toml"));
     // A detector of a quarter of the published width.
     let narrow = "dso = 5.0\ndsd = 7.0\ndetector = [32, 8]\nextent = { side = [4.0, 1.0] }\nangles = { even = { views = 12 } }\n";
-    std::fs::write(&protocol, format!("{narrow}unit = {{ name = \"half side\", mm = 50.0 }}\n")).unwrap();
+    std::fs::write(&protocol, format!("{narrow}unit = {{ name = \"half side\", mm = 128.0 }}\n")).unwrap();
     done(&["simulate", "phantom:head:16", "-o", &scan, "--protocol", &text(&protocol)]);
     let set = "scene.surround.coarse.cells=8";
     for spec in ["fdk", "fast"] {
@@ -84,7 +84,7 @@ fn what_lies_beyond_the_volume_is_told_and_taken_off() {
         )
     };
     let (without, with) = (run("without", &[]), run("with", &["--set", set]));
-    assert!(with.0 > without.0 && with.1 != without.1);
+    assert!(with.0 >= without.0 && with.1 != without.1);
     assert_eq!(with, run("again", &["--set", set]), "it is found the same again");
 }
 

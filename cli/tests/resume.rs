@@ -44,16 +44,18 @@ fn same_results(a: &Path, b: &Path) {
     for file in ["volume.nii.gz", "weights.safetensors"] {
         assert!(std::fs::read(a.join(file)).unwrap() == std::fs::read(b.join(file)).unwrap(), "{file} differs");
     }
-    let losses = |run: &Path| -> Vec<(u64, u64)> {
-        let lines = std::fs::read_to_string(run.join("metrics.jsonl")).unwrap();
-        let number = |line: &str| {
-            let r: serde_json::Value = serde_json::from_str(line).unwrap();
-            (r["step"].as_u64().unwrap(), r["loss"].as_f64().unwrap().to_bits())
-        };
-        lines.lines().map(number).collect()
-    };
     assert_eq!(losses(a), losses(b));
     assert!(!b.join("checkpoint.safetensors").exists());
+}
+
+/// Steps and losses of all records.
+fn losses(run: &Path) -> Vec<(u64, u64)> {
+    let lines = std::fs::read_to_string(run.join("metrics.jsonl")).unwrap();
+    let number = |line: &str| {
+        let r: serde_json::Value = serde_json::from_str(line).unwrap();
+        (r["step"].as_u64().unwrap(), r["loss"].as_f64().unwrap().to_bits())
+    };
+    lines.lines().map(number).collect()
 }
 
 #[test]
@@ -115,6 +117,39 @@ fn a_signal_ends_the_step_keeps_a_checkpoint_and_says_so() {
         assert!(run.join("checkpoint.safetensors").exists() && !run.join("volume.nii.gz").exists());
         finish(&arguments(&scan, &run, steps, &["--resume"]));
         same_results(&whole, &run);
+    }
+}
+
+/// Passes over voxels too, in a run of their own and after a field's training: no record is lost and none comes twice.
+#[test]
+fn interrupted_passes_lose_no_record() {
+    let dir = tempfile::tempdir().unwrap();
+    let scan = scan(dir.path());
+    let field =
+        ["projector.samples=16", "encoder.log2_table_size=10", "solver.first.rays=48", "solver.first.report_every=7"];
+    let then = ["solver.passes=600", "solver.then.stop={ passes = 600 }"];
+    let sequence = [&field[..], &then].concat();
+    for (spec, sets, after) in [("sirt", vec!["solver.stop.passes=900"], 50), ("field-tv", sequence, 40)] {
+        let arguments = |run: &Path, more: &[&str]| -> Vec<String> {
+            let mut all = vec!["reconstruct", scan.to_str().unwrap(), "--spec", spec, "-o", run.to_str().unwrap()];
+            all.extend(sets.iter().flat_map(|s| ["--set", *s]));
+            all.extend(if spec == "field-tv" { &["--steps", "140"][..] } else { &[] });
+            [&all[..], more].concat().into_iter().map(str::to_owned).collect()
+        };
+        let (whole, run) = (dir.path().join(format!("{spec}-whole")), dir.path().join(spec));
+        finish(&arguments(&whole, &[]));
+        let mut child = start(&arguments(&run, &["--checkpoint-every", "1h"]));
+        let lines = || std::fs::read_to_string(run.join("metrics.jsonl")).map_or(0, |text| text.lines().count());
+        while lines() < after && child.try_wait().unwrap().is_none() {
+            std::thread::sleep(Duration::from_millis(1));
+        }
+        let kill = Command::new("sh").arg("-c").arg(format!("kill -INT {}", child.id())).status().unwrap();
+        assert!(kill.success(), "{spec} was over before it could be interrupted");
+        assert_eq!(child.wait().unwrap().code(), Some(130), "{spec}");
+        finish(&arguments(&run, &["--resume"]));
+        let read = |run: &Path| std::fs::read(run.join("volume.nii.gz")).unwrap();
+        assert!(read(&whole) == read(&run), "{spec}: the volumes differ");
+        assert_eq!(losses(&whole), losses(&run), "{spec}");
     }
 }
 

@@ -11,6 +11,8 @@ use serde::{Deserialize, Serialize};
 pub struct Standing {
     /// Finished steps.
     pub step: u64,
+    /// The last of them of which the records so far may tell: what comes after it is told again.
+    pub recorded: u64,
     /// Training samples so far.
     pub samples: u64,
     /// Seconds of training so far.

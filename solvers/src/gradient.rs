@@ -265,7 +265,9 @@ impl Solver for Gradient {
                     "since": refinement.as_ref().map(Refinement::since),
                 });
                 let masks = model.masks().to_vec();
-                let standing = Standing { step, samples, seconds: clock.seconds(), masks, solver };
+                // The record of this step, if one is due, comes after the checkpoint.
+                let recorded = step.saturating_sub(1);
+                let standing = Standing { step, recorded, samples, seconds: clock.seconds(), masks, solver };
                 exe.fetch(&mut model)?;
                 // What the guard has yet to find out is not worth to go on from: an earlier checkpoint stays.
                 if strayed(&model.arena).is_none() {

@@ -16,11 +16,11 @@ use ndarray::Array3;
 use serde_json::json;
 use std::path::PathBuf;
 
-/// Draw what the encoder of a finished run has learned: the first three principal components of its features as red,
-/// green and blue.
+/// Draw the principal components of a finished run's features as colours.
 ///
-/// The components are those of all points of the three middle slices where the object can be; each runs from its 1st to
-/// its 99th percentile. Their signs mean nothing. The reconstruction stands beside them.
+/// The first three show what its encoder has learned, as red, green and blue. The components are those of all points of
+/// the three middle slices where the object can be; each runs from its 1st to its 99th percentile. Their signs mean
+/// nothing. The reconstruction stands beside them.
 #[derive(Args)]
 pub struct Features {
     #[command(flatten)]

@@ -9,10 +9,10 @@ use conefield_io::{I0, ImportOptions, Imported};
 use serde_json::{Value, json};
 use std::path::PathBuf;
 
-/// Make a scan of what a scanner gave: projections in files, and words on where source and detector stood.
+/// Make a scan of what a scanner gave.
 ///
-/// SCANNER.toml names the files (TIFF, .npy, .npz), the geometry in mm and how arrays lie; docs/geometry.md has all
-/// keys. Raw counts become line integrals; dead and hot pixels are interpolated.
+/// SCANNER.toml names the files with the projections (TIFF, .npy, .npz), says in mm where source and detector stood and
+/// how arrays lie; docs/geometry.md has all keys. Raw counts become line integrals; dead and hot pixels are interpolated.
 #[derive(Args)]
 pub struct Import {
     /// The description of the scanner.

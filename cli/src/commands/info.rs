@@ -11,9 +11,9 @@ use ndarray::ArrayView3;
 use serde_json::{Value, json};
 use std::path::{Path, PathBuf};
 
-/// Say what a scan, volume or weights file holds, and warn of what in a scan will trouble a reconstruction.
+/// Say what a scan, volume or weights file holds.
 ///
-/// A scan: lengths in mm, magnification, the voxels that the detector supports, the field of view, which part of the
+/// It warns of what in a scan will trouble a reconstruction. A scan: lengths in mm, magnification, the voxels that the detector supports, the field of view, which part of the
 /// volume the views see, and what is missing. SCANNER.toml and RTK's XML geometry are understood, too.
 #[derive(Args)]
 pub struct Info {

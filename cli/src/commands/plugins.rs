@@ -7,7 +7,7 @@ mod new;
 use clap::{Args, Subcommand};
 use conefield_core::Result;
 
-/// Stages from shared libraries: what is found, whether it keeps to the contract, and a start for one's own.
+/// Stages from shared libraries: list them, check them, begin one.
 #[derive(Args)]
 pub struct Plugins {
     #[command(subcommand)]

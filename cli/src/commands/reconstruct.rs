@@ -268,7 +268,7 @@ impl Reconstruct {
     fn reopen(&self, identity: &BTreeMap<String, String>) -> Result<(RunFolder, (PathBuf, File), Resume)> {
         let folder = RunFolder::reopen(&self.output)?;
         let resume = files::read_checkpoint(&folder.file("checkpoint.safetensors"), identity)?;
-        let metrics = folder.metrics_before(resume.standing.step)?;
+        let metrics = folder.metrics_until(resume.standing.recorded)?;
         Ok((folder, metrics, resume))
     }
 

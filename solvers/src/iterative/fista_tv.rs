@@ -15,7 +15,9 @@
 use super::noise::{self, Noise};
 use super::order::{Order, subsets, told};
 use super::tv::{TvProx, anisotropy, total_variation};
-use super::{Method, Opened, Pass, Problem, Stop, change, drive, flat, flat_mut, norm2, projecting, refuse_others};
+use super::{
+    Method, Opened, Pass, Problem, Stop, change, distance, drive, flat, flat_mut, norm2, projecting, refuse_others,
+};
 use conefield_core::error::{Result, ensure};
 use conefield_core::random::stream;
 use conefield_core::scan::Scan;
@@ -278,7 +280,10 @@ impl Method for Iterate {
         }
         let change = change(&self.x, &before);
         let prior = self.lambda * total_variation(&self.x, self.anisotropy);
-        let objective = 0.5 * weighted + prior;
+        let held = |(share, towards): &(f32, Array3<f32>)| {
+            0.5 * f64::from(*share) * self.lipschitz * distance(&self.x, towards).powi(2)
+        };
+        let objective = 0.5 * weighted + prior + self.pull.as_ref().map_or(0.0, held);
         if objective > self.objective {
             self.subsets = (0.5 * self.subsets).ceil();
         }

@@ -341,8 +341,8 @@ pub fn drive(
         if step > started && (cancelled || observer.checkpoint_due()) {
             clock.pause();
             kept.numbers = method.numbers().iter().map(|x| **x).collect();
-            let standing =
-                Standing { step, seconds: clock.seconds(), solver: serde_json::json!(kept), ..Standing::default() };
+            let solver = serde_json::json!(kept);
+            let standing = Standing { step, recorded: step, seconds: clock.seconds(), solver, ..Standing::default() };
             let state = method.state();
             let sizes: Vec<[usize; 1]> = state.iter().map(|(_, x)| [x.len()]).collect();
             let mut tensors: Vec<(String, &[usize], &[f32])> =

@@ -69,7 +69,7 @@ pub fn spec(text: &str) -> Result<Spec> {
 pub fn volume(solution: Solution) -> Volume {
     match solution.result {
         Reconstruction::Volume(v) => v,
-        Reconstruction::Field(_) => panic!("a field came out of a solver on voxels"),
+        _ => panic!("a field came out of a solver on voxels"),
     }
 }
 

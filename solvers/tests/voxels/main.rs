@@ -5,5 +5,6 @@ mod fdk;
 mod iterative;
 mod kit;
 mod refusals;
+mod sequence;
 mod surround;
 mod warm_start;

@@ -140,6 +140,6 @@ pub fn volume(solution: &Solution) -> Volume {
 pub fn model(solution: Solution) -> Model {
     match solution.result {
         Reconstruction::Field(field) => field.model,
-        Reconstruction::Volume(_) => panic!("this solver trains no model"),
+        _ => panic!("this solver trains no model"),
     }
 }

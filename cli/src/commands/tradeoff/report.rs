@@ -12,6 +12,7 @@ use conefield_core::spec::load::to_toml;
 use conefield_core::{Error, Result};
 use conefield_io::{CurveOptions, Panel, panels_png};
 use serde::Serialize;
+use serde_json::Value;
 use std::fs;
 use std::path::Path;
 
@@ -160,12 +161,7 @@ impl Report {
             );
             let mut sets = candidate.sets.clone();
             let steps = (point.steps.round() as u64).max(1);
-            // FDK has no number to set.
-            if base.tree["solver"].get("stop").is_some() {
-                sets.push(format!("solver.stop.passes={steps}"));
-            } else if base.tree["solver"].get("steps").is_some() {
-                sets.push(format!("solver.steps={steps}"));
-            }
+            sets.extend(end("solver", &base.tree["solver"], steps));
             for (key, value) in [("name", &point.name), ("description", &said)] {
                 sets.push(format!("{key}={}", toml::Value::String(value.clone())));
             }
@@ -379,4 +375,35 @@ fn ranking(search: &Search, trials: &[Over]) -> Vec<Ranking> {
         }
     }
     all
+}
+
+/// What makes the solver with these settings, at `path`, end after `steps` steps or passes. FDK has no number to set; of a
+/// sequence the second solver's passes are among them.
+fn end(path: &str, solver: &Value, steps: u64) -> Option<String> {
+    if let Some(first) = solver.get("first") {
+        let passes = solver["passes"].as_u64().unwrap_or(0);
+        return end(&format!("{path}.first"), first, steps.saturating_sub(passes).max(1));
+    }
+    let key = [("stop", "stop.passes"), ("steps", "steps")].into_iter().find(|(key, _)| solver.get(key).is_some());
+    key.map(|(_, key)| format!("{path}.{key}={steps}"))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn every_kind_of_solver_ends_after_its_steps() {
+        for (spec, want) in [
+            ("fdk", None),
+            ("os-sart", Some("solver.stop.passes=105")),
+            ("fast", Some("solver.steps=105")),
+            ("field-tv", Some("solver.first.steps=100")),
+        ] {
+            let loaded = specs::read(spec, &[]).unwrap();
+            let set = end("solver", &loaded.tree["solver"], 105);
+            assert_eq!(set.as_deref(), want, "{spec}");
+            specs::read(spec, &set.into_iter().collect::<Vec<_>>()).unwrap();
+        }
+    }
 }
