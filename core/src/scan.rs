@@ -1,8 +1,8 @@
 //! A scan: projections with their geometry; a volume: voxels with their grid.
 
 use crate::error::{Result, ensure};
-use crate::geometry::{Geometry, VoxelGrid};
-use ndarray::{Array3, ArrayView2};
+use crate::geometry::{Geometry, Vec3, View, VoxelGrid};
+use ndarray::{Array3, ArrayView2, Zip, s};
 use serde::{Deserialize, Serialize};
 
 /// The length unit of the data set that a scan came from. Inside the program lengths are mm and attenuation is
@@ -82,6 +82,27 @@ impl Scan {
         Ok((self.select(&keep), self.select(&out)))
     }
 
+    /// The scan with means of blocks of `size` × `size` pixels as its pixels; rows and columns at the end that fill no block
+    /// are left out. `size` is at least 1 and at most the detector's shorter side.
+    pub fn binned(&self, size: usize) -> Scan {
+        let g = &self.geometry;
+        let detector = g.detector.map(|n| n / size);
+        let larger = |a: Vec3| a.map(|x| x * size as f64);
+        let binned = |w: &View| {
+            let [row, column] = detector.map(|n| (n * size) as f64 / 2.0 - 0.5);
+            View { source: w.source, detector: w.pixel(g.detector, row, column), u: larger(w.u), v: larger(w.v) }
+        };
+        let views: Vec<View> = g.views.iter().map(binned).collect();
+        let mut projections = Array3::zeros((views.len(), detector[0], detector[1]));
+        Zip::indexed(&mut projections).par_for_each(|(view, row, column), mean| {
+            let (row, column) = (row * size, column * size);
+            let block = self.projections.slice(s![view, row..row + size, column..column + size]);
+            *mean = block.sum() / (size * size) as f32;
+        });
+        let geometry = Geometry { detector, views, volume: g.volume };
+        Scan { geometry, projections, unit: self.unit.clone(), provenance: self.provenance.clone() }
+    }
+
     fn select(&self, views: &[usize]) -> Scan {
         let mut geometry = self.geometry.clone();
         geometry.views = views.iter().map(|&v| self.geometry.views[v]).collect();
@@ -120,5 +141,33 @@ impl Volume {
     pub fn mapped(mut self, f: impl Fn(f32) -> f32 + Sync + Send) -> Self {
         self.data.par_mapv_inplace(f);
         self
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::geometry::{Millimetres, Radians};
+
+    /// Of 7 × 9 pixels blocks of 2 × 2 leave out the last row and column: what is left keeps its place.
+    #[test]
+    fn blocks_stand_where_their_pixels_stood() {
+        let mm = Millimetres;
+        let geometry = Geometry {
+            detector: [7, 9],
+            views: vec![View::circular(Radians(0.3), mm(100.0), mm(150.0), [mm(2.0), mm(1.0)], [mm(3.0), mm(-1.0)])],
+            volume: VoxelGrid { shape: [4; 3], spacing: [1.0; 3], center: [0.0; 3] },
+        };
+        let projections = Array3::from_shape_fn((1, 7, 9), |(_, r, c)| (10 * r + c) as f32);
+        let scan = Scan { geometry, projections, unit: Unit::default(), provenance: serde_json::Value::Null };
+        let binned = scan.binned(2);
+        assert_eq!(binned.geometry.detector, [3, 4]);
+        assert_eq!(binned.projections[[0, 1, 2]], (24.0 + 25.0 + 34.0 + 35.0) / 4.0);
+        let place = |s: &Scan, row, column| s.geometry.views[0].pixel(s.geometry.detector, row, column);
+        for (row, column) in [(0.0, 0.0), (2.0, 3.0), (1.0, 2.0)] {
+            let (a, b) = (place(&binned, row, column), place(&scan, 2.0 * row + 0.5, 2.0 * column + 0.5));
+            assert!(a.iter().zip(b).all(|(a, b)| (a - b).abs() < 1e-9), "{a:?} {b:?}");
+        }
+        assert_eq!(scan.binned(1).projections, scan.projections);
     }
 }

@@ -197,20 +197,11 @@ fn coarse(scan: &Scan, cells: VoxelGrid) -> Scan {
     };
     let pixel = g.views.iter().map(seen).fold(0.0, f64::max);
     let size = ((side / pixel) as usize).clamp(1, rows.min(columns));
-    let few = [rows / size, columns / size];
-    let views = g.views.iter().map(|w| {
-        let [row, column] = few.map(|n| (n * size) as f64 / 2.0 - 0.5);
-        let larger = |a: [f64; 3]| a.map(|x| x * size as f64);
-        View { source: w.source, detector: w.pixel(g.detector, row, column), u: larger(w.u), v: larger(w.v) }
-    });
-    let geometry = Geometry { detector: few, views: views.collect(), volume: cells };
-    let mut projections = Array3::zeros((g.views.len(), few[0], few[1]));
-    Zip::indexed(&mut projections).par_for_each(|(view, row, column), p| {
-        let (row, column) = (row * size, column * size);
-        let block = scan.projections.slice(s![view, row..row + size, column..column + size]);
-        *p = block.sum() / (size * size) as f32;
-    });
-    Scan { geometry, projections, unit: Unit::default(), provenance: serde_json::Value::Null }
+    let mut coarse = scan.binned(size);
+    coarse.geometry.volume = cells;
+    // What comes of it is in 1/mm.
+    coarse.unit = Unit::default();
+    coarse
 }
 
 /// Says nothing of the work before the work, but can be stopped.

@@ -180,26 +180,15 @@ fn job<'a>(bench: &'a Bench<'_>, spec: &'a Spec, scan: &'a Scan, limits: Limits)
 /// The same scan with pixels and voxels `factor` times as large, as far as that leaves some, and the share of the work that is
 /// left: rays times the voxels on the way of one.
 fn coarse(scan: &Scan, factor: usize) -> (Scan, f64) {
-    let mut geometry = scan.geometry.clone();
-    let ([rows, columns], shape, size) = (geometry.detector, geometry.volume.shape, geometry.volume.size());
-    let longest = shape.into_iter().max().unwrap_or(1);
+    let ([rows, columns], volume) = (scan.geometry.detector, scan.geometry.volume);
+    let longest = volume.shape.into_iter().max().unwrap_or(1);
     let factor = factor.min(rows.min(columns).min(longest) / FEWEST).max(1);
-    geometry.detector = [rows / factor, columns / factor];
-    geometry.volume.shape = shape.map(|n| (n / factor).max(1));
-    geometry.volume.spacing = std::array::from_fn(|k| size[k] / geometry.volume.shape[k] as f64);
-    for view in &mut geometry.views {
-        view.u = view.u.map(|x| x * factor as f64);
-        view.v = view.v.map(|x| x * factor as f64);
-    }
-    let [few, narrow] = geometry.detector;
-    let mut projections = Array3::zeros((geometry.views.len(), few, narrow));
-    for ((view, row, column), pixel) in projections.indexed_iter_mut() {
-        let (row, column) = (row * factor, column * factor);
-        let block = scan.projections.slice(s![view, row..row + factor, column..column + factor]);
-        *pixel = block.sum() / (factor * factor) as f32;
-    }
+    let mut coarse = scan.binned(factor);
+    let (shape, size) = (volume.shape.map(|n| (n / factor).max(1)), volume.size());
+    coarse.geometry.volume = VoxelGrid { shape, spacing: std::array::from_fn(|k| size[k] / shape[k] as f64), ..volume };
+    let [few, narrow] = coarse.geometry.detector;
     let share = (few * narrow) as f64 / (rows * columns) as f64 * (longest / factor) as f64 / longest as f64;
-    (Scan { geometry, projections, unit: scan.unit.clone(), provenance: scan.provenance.clone() }, share)
+    (coarse, share)
 }
 
 /// The same box in fewer layers along z: at most about so many voxels.
