@@ -1,4 +1,4 @@
-//! What the parts of a run take on this machine, measured for about a second: real training steps on some views of the
+//! What the parts of a run take on this machine, measured for a second or a few: real training steps on some views of the
 //! scan, or real passes over a coarser one, and what comes after the training.
 
 use crate::files;
@@ -66,16 +66,16 @@ impl Costs {
 
 /// Measures what `loaded` takes, in about `seconds`.
 pub fn calibrate(bench: &Bench<'_>, loaded: &Loaded, parts: &Parts, seconds: f64) -> Result<Costs> {
-    let half = 0.5 * seconds;
-    let begins = |solver: &dyn Solver, seconds: f64| match &parts.pipeline {
-        Some(_) => field(bench, &loaded.spec, solver, seconds),
+    // Passes have all of it: one coarse scan alone cannot tell what goes with the work, and they would seem three times too dear.
+    let begins = |solver: &dyn Solver, share: f64| match &parts.pipeline {
+        Some(_) => field(bench, &loaded.spec, solver, share * seconds),
         None => voxels(bench, &loaded.spec, solver, seconds),
     };
     let solved = match parts.solver.successor(&loaded.spec.scene) {
-        None => begins(parts.solver.as_ref(), half)?,
+        None => begins(parts.solver.as_ref(), 0.5)?,
         Some(next) => {
-            let first = begins(next.first, 0.5 * half)?;
-            let then = voxels(bench, &next.spec, next.then, half)?;
+            let first = begins(next.first, 0.25)?;
+            let then = voxels(bench, &next.spec, next.then, seconds)?;
             // The first one's voxels are evaluated for the second one to start from.
             let before = first.export_s + then.prepare_s;
             Costs {
