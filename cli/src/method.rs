@@ -9,10 +9,10 @@ use conefield_core::arena::Arena;
 use conefield_core::backend::{Backend, Explain};
 use conefield_core::pipeline::Pipeline;
 use conefield_core::solver::Solver;
-use conefield_core::spec::SurroundRule;
+use conefield_core::spec::Scene;
 use conefield_core::spec::load::Loaded;
 use conefield_io::ScanSize;
-use conefield_solvers::surround;
+use conefield_solvers::{iterative, surround};
 
 /// A spec, what it builds and what that takes.
 pub struct Method {
@@ -35,7 +35,7 @@ pub struct Parts {
     pub pipeline: Option<Pipeline>,
     /// What the backend made of it; empty without a pipeline.
     pub compiled: Explain,
-    surround: SurroundRule,
+    scene: Scene,
 }
 
 impl Parts {
@@ -44,11 +44,15 @@ impl Parts {
         let solver = loaded.spec.solver.build().map_err(|e| loaded.locate(e))?;
         let pipeline = specs::pipeline(loaded, solver.as_ref())?;
         let compiled = pipeline.as_ref().map(|p| backend.compile(p)).transpose()?.map(|c| c.1).unwrap_or_default();
-        Ok(Self { solver, pipeline, compiled, surround: loaded.spec.scene.surround })
+        Ok(Self { solver, pipeline, compiled, scene: loaded.spec.scene.clone() })
     }
 
     /// A run of it on a scan of this size, without reference, held-out views and checkpoint.
     pub fn run(&self, scan: ScanSize) -> memory::Run {
+        let mut solver = memory::working(self.solver.as_ref(), &scan);
+        if self.pipeline.is_none() || self.solver.successor(&self.scene).is_some() {
+            solver[1] += iterative::memory(&self.scene, scan.voxels);
+        }
         memory::Run {
             scan,
             split: false,
@@ -57,8 +61,8 @@ impl Parts {
             parameters: self.pipeline.as_ref().map_or(0, |p| p.layout().len() as u64),
             backend: self.compiled.scratch_bytes as u64,
             kept: self.solver.memory_per_parameter(),
-            solver: memory::working(self.solver.as_ref(), &scan),
-            surround: surround::memory(self.surround, scan.pixels),
+            solver,
+            surround: surround::memory(self.scene.surround, scan.pixels),
             resume: false,
         }
     }
@@ -74,5 +78,24 @@ impl Parts {
             }
         }
         Ok(())
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use conefield_backend_cpu::Cpu;
+
+    #[test]
+    fn a_mask_of_voxels_is_reckoned_where_a_solver_of_voxels_has_one() {
+        let scan = ScanSize { pixels: 1 << 16, voxels: 1 << 18, test_pixels: 0, reading: 0 };
+        let takes = |spec: &str, support: &str| {
+            let loaded = specs::read(spec, &[format!("scene.support={support}")]).unwrap();
+            let [_, voxels] = Parts::of(&loaded, &Cpu::new()).unwrap().run(scan).solver;
+            voxels
+        };
+        for (spec, mask) in [("fista-tv", 1 << 18), ("field-tv", 1 << 18), ("fast", 0)] {
+            assert_eq!(takes(spec, "carve"), takes(spec, "box") + mask, "{spec}");
+        }
     }
 }

@@ -20,7 +20,7 @@ use conefield_core::checkpoint::{Checkpoint, Resume, Standing};
 use conefield_core::error::{Result, ensure};
 use conefield_core::scan::{Scan, Volume};
 use conefield_core::solver::{Best, Job, Observer, Reconstruction, Record, Solution};
-use conefield_core::spec::{Spec, VolumeStart};
+use conefield_core::spec::{Scene, Spec, SupportRule, VolumeStart};
 use conefield_core::voxel::{VoxelOperator, VoxelProjector};
 use ndarray::{Array2, Array3, Axis, Zip};
 use rayon::prelude::*;
@@ -206,6 +206,14 @@ pub(crate) struct Opened {
     inside: Option<Array3<bool>>,
     /// The scan without what lies beyond the volume.
     within: Option<Within>,
+}
+
+/// Bytes that knowing where the object can be takes, of a volume of so many `voxels`.
+pub fn memory(settings: &Scene, voxels: u64) -> u64 {
+    match settings.support {
+        SupportRule::Box => 0,
+        SupportRule::Carve => voxels,
+    }
 }
 
 impl Opened {
