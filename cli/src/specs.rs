@@ -17,6 +17,7 @@ pub const SHIPPED: &[Shipped] = &[
     Shipped { name: "balanced", text: include_str!("../../specs/balanced.toml") },
     Shipped { name: "fast", text: include_str!("../../specs/fast.toml") },
     Shipped { name: "field-tv", text: include_str!("../../specs/field-tv.toml") },
+    Shipped { name: "accurate-tv", text: include_str!("../../specs/accurate-tv.toml") },
     Shipped { name: "fdk", text: include_str!("../../specs/fdk.toml") },
     Shipped { name: "sart", text: include_str!("../../specs/sart.toml") },
     Shipped { name: "os-sart", text: include_str!("../../specs/os-sart.toml") },

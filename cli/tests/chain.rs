@@ -123,7 +123,10 @@ fn threads_do_not_change_a_bit() {
 #[test]
 fn every_shipped_spec_reconstructs() {
     let (dir, scan) = scan();
-    for spec in ["naf", "ni-naf", "ni-naf-published", "nerf", "dense", "accurate", "balanced", "fast", "field-tv"] {
+    let single = ["naf", "ni-naf", "ni-naf-published", "nerf", "dense", "accurate", "balanced", "fast"];
+    // The passes of a second solver count on from there.
+    let sequences = [("field-tv", 6), ("accurate-tv", 6)];
+    for (spec, passes) in single.map(|spec| (spec, 0)).into_iter().chain(sequences) {
         let run = text(&dir.path().join(spec));
         let record = json(&[
             "reconstruct",
@@ -138,8 +141,6 @@ fn every_shipped_spec_reconstructs() {
             "--set",
             "projector.samples=16",
         ]);
-        // The passes of a second solver count on from there.
-        let passes = if spec == "field-tv" { 5 } else { 0 };
         assert_eq!(record["steps"], 2 + passes, "{spec}");
     }
 }
