@@ -394,13 +394,13 @@ mod tests {
 
     #[test]
     fn every_kind_of_solver_ends_after_its_steps() {
-        for (spec, want) in [
-            ("fdk", None),
-            ("os-sart", Some("solver.stop.passes=105")),
-            ("fast", Some("solver.steps=105")),
-            ("field-tv", Some("solver.first.steps=100")),
+        for (spec, sets, want) in [
+            ("fdk", vec![], None),
+            ("os-sart", vec![], Some("solver.stop.passes=105")),
+            ("fast", vec![], Some("solver.steps=105")),
+            ("field-tv", vec!["solver.passes=5".to_owned()], Some("solver.first.steps=100")),
         ] {
-            let loaded = specs::read(spec, &[]).unwrap();
+            let loaded = specs::read(spec, &sets).unwrap();
             let set = end("solver", &loaded.tree["solver"], 105);
             assert_eq!(set.as_deref(), want, "{spec}");
             specs::read(spec, &set.into_iter().collect::<Vec<_>>()).unwrap();
