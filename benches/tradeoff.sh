@@ -11,7 +11,7 @@ cd "$(dirname "$0")/.."
 data=$1
 out=$2
 budgets=${3:-10s,30s,60s,180s,1200s}
-candidates=${4:-8}
+candidates=${4:-9}
 presets=${5:-30 60 1200}
 searches=${6:-engine_256 head_256 tuning}
 cargo build --release --quiet -p conefield

@@ -94,6 +94,15 @@ mod tests {
         }
     }
 
+    /// A table cannot be extended from under another key, so sequences repeat the settings of the field they begin with.
+    #[test]
+    fn sequences_begin_as_their_fields_do() {
+        for (sequence, field) in [("field-tv", "balanced"), ("accurate-tv", "accurate")] {
+            let [whole, alone] = [sequence, field].map(|name| read(name, &[]).unwrap().tree["solver"].clone());
+            assert_eq!(whole["first"], alone, "{sequence}");
+        }
+    }
+
     #[test]
     fn every_file_is_shipped() {
         let folder = concat!(env!("CARGO_MANIFEST_DIR"), "/../specs");

@@ -17,7 +17,7 @@ const ENOUGH: f64 = 0.9;
 /// Methods that are measured at most before one is taken.
 const MEASURED: usize = 3;
 /// Longest that a method is measured for, in seconds and as a share of the budget: of short budgets, and of those in which three
-/// seconds are little. Passes over a scan half as coarse are a third nearer to what whole ones take.
+/// seconds are little. The less coarse the scan that passes are measured on, the better they tell what whole ones take.
 const CALIBRATION: [(f64, f64); 2] = [(1.0, 0.1), (3.0, 0.04)];
 /// Steps without which a field is nothing.
 const STEPS: f64 = 10.0;

@@ -199,6 +199,14 @@ pub trait Method {
     }
 }
 
+/// Bytes that knowing where the object can be takes, of a volume of so many `voxels`.
+pub fn memory(settings: &Scene, voxels: u64) -> u64 {
+    match settings.support {
+        SupportRule::Box => 0,
+        SupportRule::Carve => voxels,
+    }
+}
+
 /// What a job on voxels begins with.
 pub(crate) struct Opened {
     projector: Box<dyn VoxelProjector>,
@@ -206,14 +214,6 @@ pub(crate) struct Opened {
     inside: Option<Array3<bool>>,
     /// The scan without what lies beyond the volume.
     within: Option<Within>,
-}
-
-/// Bytes that knowing where the object can be takes, of a volume of so many `voxels`.
-pub fn memory(settings: &Scene, voxels: u64) -> u64 {
-    match settings.support {
-        SupportRule::Box => 0,
-        SupportRule::Carve => voxels,
-    }
 }
 
 impl Opened {
