@@ -1,7 +1,8 @@
 #!/usr/bin/env bash
 # What modelling only what a scan has need of is worth: `accurate` with each rule alone and all for SECONDS (60), and with none,
 # as published, for 10/3 as long:
-#   bash benches/scene.sh DATA_FOLDER OUT_FOLDER [SECONDS [VOLUMES]]
+#   bash benches/scene.sh DATA_FOLDER OUT_FOLDER [SECONDS [VOLUMES [RUNS]]]
+# RUNS ("none support levels channels samples occupancy accurate all") may name fewer.
 # DATA_FOLDER holds volumes/*.nii.gz. OUT_FOLDER/scene.md has a table a volume: what each ends with, and after how many seconds
 # it was where the run with none of the rules ended.
 set -euo pipefail
@@ -10,6 +11,7 @@ data=$1
 out=$2
 seconds=${3:-60}
 volumes=${4:-engine_256 teapot_256 head_256 chest_128 abdomen_128}
+wanted=${5:-none support levels channels samples occupancy accurate all}
 cargo build --release --quiet -p conefield
 cargo build --release --quiet -p conefield-benches --bin reach
 bin=${CARGO_TARGET_DIR:-target}/release
@@ -22,6 +24,7 @@ for volume in $volumes; do
     run() {
         local name=$1 time=$2 support=$3 levels=$4
         shift 4
+        [[ " $wanted " == *" $name "* ]] || return 0
         "$bin/conefield" -q reconstruct "$scan" --spec accurate -o "$out/$volume-$name" --force --reference truth \
             --set solver.seconds="$time" --set solver.steps=1000000 --set scene.support="$support" \
             --set scene.levels="$levels" "$@" >/dev/null
@@ -32,6 +35,7 @@ for volume in $volumes; do
     run none "$(python3 -c "print($seconds * 10 / 3)")" box all "${count[@]}"
     run support "$seconds" carve all "${count[@]}"
     run levels "$seconds" box needed "${count[@]}"
+    run channels "$seconds" box all "${count[@]}" --set 'normalizers=[{ type = "fft-mask", rule = "relative", epoch = 2.0 }, { type = "layer-norm" }]'
     run samples "$seconds" box all
     run occupancy "$seconds" carve all --set 'scene.occupancy={ refined = {} }'
     run accurate "$seconds" carve all

@@ -1,11 +1,11 @@
 #!/usr/bin/env bash
-# What a time buys: fronts of engine_256 (all views) and head_256 (every tenth kept aside, to see how well they rank), then a front and
-# presets from abdomen_128 and engine_256 together:
+# What a time buys: fronts of engine_256 and head_256, then presets from abdomen_128 and engine_256 together, of fields alone:
 #   bash benches/tradeoff.sh DATA_FOLDER OUT_FOLDER [BUDGETS [CANDIDATES [PRESET_BUDGETS [SEARCHES]]]]
-# SEARCHES ("engine_256 head_256 tuning") may name fewer.
+# SEARCHES ("engine_256 head_256 tuning") may name fewer. BUDGETS are those of the two fronts; the presets are each the best under one
+# of PRESET_BUDGETS, in seconds. HOLD_OUT=every:10 before the command keeps views of the head aside, to see how well they rank.
 # DATA_FOLDER holds volumes/*.nii.gz. Each search takes at most the sum of its budgets, every one times the candidates that are
 # left (half go on), a scan; it says so and goes on where it was interrupted. Nothing else should run on the machine.
-# Leaves OUT_FOLDER/{engine_256,head_256,tuning}, OUT_FOLDER/front.toml (for specs/tradeoff/) and OUT_FOLDER/presets.
+# Leaves OUT_FOLDER/{engine_256,head_256,tuning} and OUT_FOLDER/presets.
 set -euo pipefail
 cd "$(dirname "$0")/.."
 data=$1
@@ -23,18 +23,18 @@ for volume in abdomen_128 engine_256 head_256; do
     [[ -d $scan ]] || "$bin" -q simulate "$data/volumes/$volume.nii.gz" -o "$scan" --protocol r2 --views 50 --noise tigre:1e4,10
 done
 search() {
-    local name=$1
-    shift
+    local name=$1 budgets=$2
+    shift 2
     [[ " $searches " == *" $name "* ]] || return 0
     local again=()
     [[ ! -d $out/$name ]] || again=(--resume)
     "$bin" tradeoff "$@" --reference truth --budgets "$budgets" --candidates "$candidates" -o "$out/$name" "${again[@]}"
 }
-search engine_256 "$out/scans/engine_256" --hold-out none
-search head_256 "$out/scans/head_256"
-search tuning "$out/scans/abdomen_128" "$out/scans/engine_256"
+search engine_256 "$budgets" "$out/scans/engine_256" --hold-out none
+search head_256 "$budgets" "$out/scans/head_256" --hold-out "${HOLD_OUT:-none}"
+search tuning "$(printf '%ss,' $presets | sed 's/,$//')" "$out/scans/abdomen_128" "$out/scans/engine_256" --hold-out none \
+    --bases fast,balanced,accurate
 [[ " $searches " == *" tuning "* ]] || exit 0
-cp "$out/tuning/front.toml" "$out/front.toml"
 mkdir -p "$out/presets"
 names=(fast balanced accurate)
 i=0

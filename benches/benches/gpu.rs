@@ -131,6 +131,14 @@ fn main() -> Result<(), Box<dyn Error>> {
     println!("training             {} samples, {published} rays x {SAMPLES}", rate(samples, time));
     let time = training.steps(large, warm_up, steps)?;
     println!("training, large      {} samples, {large} rays x {SAMPLES}", rate((large * SAMPLES) as f64, time));
+    if backend.adapter().subgroups.is_some() {
+        let mut training =
+            Training::new(&Wgpu::with_limits(adapter, Limits { subgroups: true, ..Limits::default() })?)?;
+        for (what, count) in [("with subgroups", published), ("with subgroups, large", large)] {
+            let time = training.steps(count, warm_up, steps)?;
+            println!("{what:<20} {} samples", rate((count * SAMPLES) as f64, time));
+        }
+    }
 
     let side = if software { 32 } else { 256 };
     let points: Vec<[f32; 3]> = (0..side * side * side)

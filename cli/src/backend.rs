@@ -1,7 +1,7 @@
 //! Which backend computes.
 
 use conefield_backend_cpu::Cpu;
-use conefield_backend_wgpu::{Wgpu, adapters};
+use conefield_backend_wgpu::{Limits, Wgpu, adapters};
 use conefield_core::Result;
 use conefield_core::backend::{Backend, Executable, Explain};
 use conefield_core::pipeline::Pipeline;
@@ -21,19 +21,28 @@ pub enum BackendChoice {
     Auto,
     /// Rayon and SIMD.
     Cpu,
-    /// An adapter by its number, or the one that promises most.
-    Wgpu(Option<usize>),
+    /// A GPU.
+    Wgpu {
+        /// The adapter's number; otherwise the one that promises most.
+        index: Option<usize>,
+        /// Gradients of tables are added up in subgroups first.
+        subgroups: bool,
+    },
 }
 
 impl FromStr for BackendChoice {
     type Err = String;
     fn from_str(s: &str) -> Result<Self, String> {
-        match s.split_once(':') {
+        let (name, subgroups) = s.strip_suffix("+subgroups").map_or((s, false), |name| (name, true));
+        match name.split_once(':') {
             None if s == "auto" => Ok(Self::Auto),
             None if s == "cpu" => Ok(Self::Cpu),
-            None if s == "wgpu" => Ok(Self::Wgpu(None)),
-            Some(("wgpu", n)) if n.parse::<usize>().is_ok() => Ok(Self::Wgpu(n.parse().ok())),
-            _ => Err("expected auto, cpu, wgpu, or wgpu:N with the number of an adapter".into()),
+            None if name == "wgpu" => Ok(Self::Wgpu { index: None, subgroups }),
+            Some(("wgpu", n)) if n.parse::<usize>().is_ok() => Ok(Self::Wgpu { index: n.parse().ok(), subgroups }),
+            _ => {
+                Err("expected auto, cpu, wgpu, or wgpu:N with the number of an adapter; after wgpu also +subgroups"
+                    .into())
+            }
         }
     }
 }
@@ -43,8 +52,11 @@ impl fmt::Display for BackendChoice {
         match self {
             Self::Auto => f.write_str("auto"),
             Self::Cpu => f.write_str("cpu"),
-            Self::Wgpu(None) => f.write_str("wgpu"),
-            Self::Wgpu(Some(n)) => write!(f, "wgpu:{n}"),
+            Self::Wgpu { index, subgroups } => {
+                f.write_str("wgpu")?;
+                index.map_or(Ok(()), |n| write!(f, ":{n}"))?;
+                f.write_str(if *subgroups { "+subgroups" } else { "" })
+            }
         }
     }
 }
@@ -61,7 +73,9 @@ impl BackendChoice {
         Ok(match self {
             Self::Auto => Box::<Auto>::default(),
             Self::Cpu => Box::new(Cpu::new()),
-            Self::Wgpu(index) => Box::new(Wgpu::open(index)?),
+            Self::Wgpu { index, subgroups } => {
+                Box::new(Wgpu::with_limits(index, Limits { subgroups, ..Limits::default() })?)
+            }
         })
     }
 }

@@ -5,7 +5,6 @@
 //! of the format.
 
 use crate::simd::Real;
-use crate::stage::{Grads, Kernel, Tile, TileMut};
 use bytemuck::{Pod, Zeroable};
 
 /// A number as it stands in memory, to be computed with as `R`.
@@ -91,32 +90,6 @@ impl Half for Bf16 {
 pub fn round<H: Half>(from: &[f32], to: &mut [H]) {
     for (to, &from) in to.iter_mut().zip(from) {
         *to = H::nearest(from);
-    }
-}
-
-/// A kernel with parameters in halves, which it reads instead of those that it is handed.
-pub struct Reader<'a, H> {
-    /// The arithmetic.
-    pub kernel: &'a dyn Kernel<f32, H>,
-    /// What it reads.
-    pub params: &'a [H],
-}
-
-impl<H: Half> Kernel<f32> for Reader<'_, H> {
-    fn forward(&self, _: &[f32], x: Tile<'_, f32>, y: TileMut<'_, f32>, tape: TileMut<'_, f32>) {
-        self.kernel.forward(self.params, x, y, tape);
-    }
-
-    fn backward(
-        &self,
-        _: &[f32],
-        x: Tile<'_, f32>,
-        tape: TileMut<'_, f32>,
-        dy: Tile<'_, f32>,
-        grads: Grads<'_, f32>,
-        dx: Option<TileMut<'_, f32>>,
-    ) {
-        self.kernel.backward(self.params, x, tape, dy, grads, dx);
     }
 }
 

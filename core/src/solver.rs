@@ -213,6 +213,8 @@ pub struct Solution {
     pub train_s: f64,
     /// Training samples.
     pub samples: u64,
+    /// Seconds of `train_s` that they took; another solver that goes on in voxels takes none.
+    pub sampling_s: f64,
     /// Times that training ran away and went back to an earlier state.
     pub rollbacks: u64,
     /// The record whose state came out, where views that are kept aside chose it.

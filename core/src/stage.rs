@@ -4,7 +4,7 @@
 //! A tile is channel-major: channel `c` of row `i` stands at `c·rows + i`. Rows are samples, in ray-major order.
 
 use crate::error::{Error, Result};
-use crate::half::{Bf16, F16};
+use crate::half::{Bf16, F16, Half};
 use crate::simd::Real;
 use crate::wgsl::Fragment;
 use std::ops::Range;
@@ -210,6 +210,32 @@ impl<'a> Halves<'a> {
     /// Of a stage that has one source for both.
     pub fn of<K: Kernel<f32, F16> + Kernel<f32, Bf16>>(kernel: &'a K) -> Self {
         Self { f16: kernel, bf16: kernel }
+    }
+}
+
+/// A kernel with parameters in halves, which it reads instead of those that it is handed.
+pub struct Reader<'a, H> {
+    /// The arithmetic.
+    pub kernel: &'a dyn Kernel<f32, H>,
+    /// What it reads.
+    pub params: &'a [H],
+}
+
+impl<H: Half> Kernel<f32> for Reader<'_, H> {
+    fn forward(&self, _: &[f32], x: Tile<'_, f32>, y: TileMut<'_, f32>, tape: TileMut<'_, f32>) {
+        self.kernel.forward(self.params, x, y, tape);
+    }
+
+    fn backward(
+        &self,
+        _: &[f32],
+        x: Tile<'_, f32>,
+        tape: TileMut<'_, f32>,
+        dy: Tile<'_, f32>,
+        grads: Grads<'_, f32>,
+        dx: Option<TileMut<'_, f32>>,
+    ) {
+        self.kernel.backward(self.params, x, tape, dy, grads, dx);
     }
 }
 

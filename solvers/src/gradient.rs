@@ -346,7 +346,8 @@ impl Solver for Gradient {
         let best = patience.finish(&mut model);
         let field = TrainedField { model, scene, unit_mm: job.scan.unit.mm };
         let (train_s, rollbacks) = (clock.seconds(), guard.rollbacks());
-        Ok(Solution { result: Reconstruction::Field(field), steps: step, train_s, samples, rollbacks, best })
+        let result = Reconstruction::Field(field);
+        Ok(Solution { result, steps: step, train_s, samples, sampling_s: train_s, rollbacks, best })
     }
 
     fn needs_held_out(&self) -> Option<&'static str> {

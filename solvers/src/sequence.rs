@@ -131,6 +131,7 @@ impl Solver for Turns {
             steps: first.steps + second.steps,
             train_s: first.train_s + second.train_s,
             samples: first.samples,
+            sampling_s: first.sampling_s,
             rollbacks: first.rollbacks + second.rollbacks,
             best,
         })

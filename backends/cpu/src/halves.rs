@@ -1,10 +1,10 @@
 //! The copy of the parameters from which tables are read in halves.
 
-use conefield_core::half::{Bf16, F16, Half, Reader, round};
+use conefield_core::half::{Bf16, F16, Half, round};
 use conefield_core::pages::Pages;
 use conefield_core::simd::{Op, Simd, run};
 use conefield_core::spec::Tables;
-use conefield_core::stage::{Halves, Kernel, Stage};
+use conefield_core::stage::{Halves, Kernel, Reader, Stage};
 use rayon::prelude::*;
 use std::ops::Range;
 

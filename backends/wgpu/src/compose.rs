@@ -25,6 +25,8 @@ pub const GROUP: u32 = 64;
 pub struct Target {
     /// How gradients of scattered parameters are added up.
     pub atomics: Atomics,
+    /// Whether lanes of a subgroup add up first what goes to the same entry.
+    pub subgroups: bool,
     /// Parameters that one buffer holds, a multiple of 64.
     pub segment: usize,
     /// Bytes of the largest uniform buffer.
@@ -245,7 +247,7 @@ fn {prefix}param(i: u32) -> f32 {{ return {param}; }}
             (true, None) => format!("arena_grad({first}u + i, v);"),
             (true, Some(offset)) => format!("partial[group * {}u + {offset}u + i] += v;", self.dense),
         };
-        let scattered = if gradients { format!("arena_grad({first}u + i, v);") } else { String::new() };
+        let scattered = if gradients { format!("arena_scatter({first}u + i, v);") } else { String::new() };
         let _ = write!(
             text,
             "fn {prefix}grad(i: u32, v: f32) {{ {scattered} }}
@@ -354,6 +356,7 @@ fn {prefix}accumulate(i: u32, v: f32) {{ {add} }}
         }
         self.sums(&mut source);
         self.declare(&mut source, true);
+        self.scatter(&mut source);
         self.links.iter().for_each(|l| self.include(&mut source, l, true));
         let n = self.links.len();
         let mut body = String::from(
@@ -405,6 +408,13 @@ fn {prefix}accumulate(i: u32, v: f32) {{ {add} }}
             source.bind("partial", Access::Write, "array<f32>");
         }
         source.add("sums", include_str!("kernels/sums.wgsl"));
+    }
+
+    /// How rows add to the arena's gradients.
+    fn scatter(&self, source: &mut Source) {
+        let alone = "fn arena_scatter(i: u32, v: f32) { arena_grad(i, v); }";
+        let text = if self.target.subgroups { include_str!("kernels/together.wgsl") } else { alone };
+        source.add("scattered gradients", text);
     }
 
     /// Adds all groups' partial sums to the arena's gradients.
@@ -474,6 +484,7 @@ fn main(@builtin(global_invocation_id) id: vec3<u32>) {{
         }
         self.sums(&mut source);
         self.declare(&mut source, true);
+        self.scatter(&mut source);
         let l = &self.links[0];
         self.include(&mut source, l, true);
         let Info { input, output, .. } = l.info;

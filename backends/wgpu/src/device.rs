@@ -78,6 +78,8 @@ pub struct Adapter {
     pub workgroup_bytes: u32,
     /// How gradients of scattered parameters would be added up.
     pub atomics: Atomics,
+    /// Fewest and most lanes of a subgroup, where kernels may use subgroup operations.
+    pub subgroups: Option<[u32; 2]>,
     /// Whether kernels can be timed on the device.
     pub timestamps: bool,
 }
@@ -90,6 +92,7 @@ impl Adapter {
         } else {
             Atomics::CompareExchange
         };
+        let lanes = [info.subgroup_min_size, info.subgroup_max_size];
         Self {
             index,
             name: info.name,
@@ -110,6 +113,7 @@ impl Adapter {
             storage_buffers: limits.max_storage_buffers_per_shader_stage,
             workgroup_bytes: limits.max_compute_workgroup_storage_size,
             atomics,
+            subgroups: features.contains(wgpu::Features::SUBGROUP).then_some(lanes),
             timestamps: features.contains(wgpu::Features::TIMESTAMP_QUERY),
         }
     }
@@ -149,7 +153,7 @@ pub fn adapters() -> Vec<Adapter> {
     found().iter().enumerate().map(|(i, a)| Adapter::of(i, a)).collect()
 }
 
-/// What may be set otherwise than an adapter offers, to try what others have to do, and to measure.
+/// What may be set otherwise than an adapter's defaults: less than it offers, to try what others have to do, and more.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
 pub struct Limits {
     /// Sums of scattered gradients by compare and exchange, even where the device adds by itself.
@@ -158,6 +162,8 @@ pub struct Limits {
     pub binding_bytes: Option<u64>,
     /// Bytes of the largest uniform buffer, if fewer than the device allows.
     pub uniform_bytes: Option<u64>,
+    /// Lanes of a subgroup add up first what goes to the same entry. Refused where the device has no subgroup operations.
+    pub subgroups: bool,
     /// Time every kernel, where the device has timestamps; every call then waits for the device.
     pub profile: bool,
 }
@@ -192,6 +198,10 @@ impl Gpu {
                 }
             });
         };
+        if limits.subgroups && adapter.subgroups.is_none() {
+            let found = "an adapter without subgroup operations";
+            return Err(Error::invalid("--backend", "subgroups", format!("{found}: {adapter}"), "one that has them"));
+        }
         if limits.compare_exchange {
             adapter.atomics = Atomics::CompareExchange;
         }
@@ -202,7 +212,7 @@ impl Gpu {
             adapter.uniform_bytes = adapter.uniform_bytes.min(bytes);
         }
         let source = &all[adapter.index];
-        let wanted = wgpu::Features::SHADER_FLOAT32_ATOMIC | wgpu::Features::TIMESTAMP_QUERY;
+        let wanted = wgpu::Features::SHADER_FLOAT32_ATOMIC | wgpu::Features::TIMESTAMP_QUERY | wgpu::Features::SUBGROUP;
         let description = wgpu::DeviceDescriptor {
             label: Some("conefield"),
             required_features: source.features() & wanted,

@@ -51,6 +51,8 @@ pub struct Shared {
     pub gpu: Gpu,
     /// Kernels by their text.
     pub kernels: Cache,
+    /// Whether lanes of a subgroup add up first what goes to the same entry.
+    pub subgroups: bool,
     /// Whether executables time their kernels.
     pub profile: bool,
 }
@@ -62,6 +64,7 @@ impl Shared {
         let bytes = adapter.bound_bytes();
         Target {
             atomics: adapter.atomics,
+            subgroups: self.subgroups,
             segment: ((bytes / 4) as usize / 64 * 64).max(64),
             uniform_bytes: adapter.uniform_bytes as usize,
         }
@@ -77,7 +80,8 @@ impl Wgpu {
     /// The same, with less than the adapter offers.
     pub fn with_limits(index: Option<usize>, limits: Limits) -> Result<Self> {
         let gpu = Gpu::open(index, limits)?;
-        Ok(Self { shared: Arc::new(Shared { gpu, kernels: Cache::default(), profile: limits.profile }) })
+        let Limits { subgroups, profile, .. } = limits;
+        Ok(Self { shared: Arc::new(Shared { gpu, kernels: Cache::default(), subgroups, profile }) })
     }
 
     /// The device.
@@ -111,7 +115,10 @@ impl Backend for Wgpu {
                 (true, _) => format!("{name}: identity, left out"),
                 (_, GradKind::None) => format!("{name}: fused"),
                 (_, GradKind::Dense) => format!("{name}: fused, gradients summed in each group of 64 rows"),
-                (_, GradKind::Scatter) => format!("{name}: fused, gradients by {}", adapter.atomics),
+                (_, GradKind::Scatter) => {
+                    let first = if shared.subgroups { ", added up in subgroups first" } else { "" };
+                    format!("{name}: fused, gradients by {}{first}", adapter.atomics)
+                }
             });
         }
         notes.push("split: samples and line integrals are kernels of their own, since a ray's rows meet there".into());

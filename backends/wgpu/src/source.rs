@@ -74,7 +74,8 @@ impl Source {
             Err(e) => return Err(self.fault(e.location(&self.text).map(|l| l.line_number as usize), e.message())),
         };
         use naga::valid::Capabilities;
-        let capabilities = Capabilities::SHADER_FLOAT32_ATOMIC | Capabilities::SHADER_FLOAT16_IN_FLOAT32;
+        let capabilities =
+            Capabilities::SHADER_FLOAT32_ATOMIC | Capabilities::SHADER_FLOAT16_IN_FLOAT32 | Capabilities::SUBGROUP;
         let mut validator = naga::valid::Validator::new(naga::valid::ValidationFlags::all(), capabilities);
         validator.validate(&module).map(drop).map_err(|e| {
             let line = e.location(&self.text).map(|l| l.line_number as usize);

@@ -35,8 +35,12 @@ impl Backends {
 /// An adapter with what limits it.
 fn line(a: &Adapter) -> String {
     let bytes = |n: u64| out::bytes(n);
+    let subgroups = a.subgroups.map_or(String::new(), |[least, most]| match least == most {
+        true => format!(", subgroups of {least}"),
+        false => format!(", subgroups of {least} to {most}"),
+    });
     format!(
-        "wgpu:{}  {a}\n        buffers up to {}, {} at once of up to {}, {} of workgroup memory, {}{}",
+        "wgpu:{}  {a}\n        buffers up to {}, {} at once of up to {}, {} of workgroup memory, {}{subgroups}{}",
         a.index,
         bytes(a.buffer_bytes),
         a.storage_buffers,

@@ -27,7 +27,8 @@ pub struct Explain {
     /// Also the memory that this scan takes.
     #[arg(long)]
     scan: Option<PathBuf>,
-    /// Which backend: auto, cpu, wgpu, or wgpu:N with the number of an adapter.
+    /// Which backend: auto, cpu, wgpu, or wgpu:N with the number of an adapter; +subgroups after wgpu adds up gradients
+    /// of tables in subgroups first.
     #[arg(long, value_name = "BACKEND", default_value_t)]
     backend: BackendChoice,
     /// Print one JSON object.

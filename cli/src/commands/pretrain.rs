@@ -35,7 +35,8 @@ pub struct Pretrain {
     values: Values,
     #[command(flatten)]
     ends: Ends,
-    /// Which backend: auto, cpu, wgpu, or wgpu:N with the number of an adapter.
+    /// Which backend: auto, cpu, wgpu, or wgpu:N with the number of an adapter; +subgroups after wgpu adds up gradients
+    /// of tables in subgroups first.
     #[arg(long, value_name = "BACKEND", default_value_t)]
     backend: BackendChoice,
     /// Seed of everything random.

@@ -23,7 +23,8 @@ pub struct Protocol {
     /// Plan training so that the whole run, from start to last file, takes this time, such as 60s or 10m.
     #[arg(long, value_name = "TIME", value_parser = parse::seconds, conflicts_with_all = ["steps", "seconds", "at_most"])]
     pub budget: Option<f64>,
-    /// Which backend: auto, cpu, wgpu, or wgpu:N with the number of an adapter.
+    /// Which backend: auto, cpu, wgpu, or wgpu:N with the number of an adapter; +subgroups after wgpu adds up gradients
+    /// of tables in subgroups first.
     #[arg(long, value_name = "BACKEND", default_value_t)]
     pub backend: BackendChoice,
     /// The volume sought, to compare with: a file, or "truth" for the one that the scan comes with.

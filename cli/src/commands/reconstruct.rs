@@ -215,8 +215,7 @@ impl Reconstruct {
             score_s,
             total_s: begin.elapsed().as_secs_f64() + spent,
             samples: solution.samples,
-            samples_per_s: (solution.samples > 0 && solution.train_s > 0.0)
-                .then(|| solution.samples as f64 / solution.train_s),
+            samples_per_s: (solution.sampling_s > 0.0).then(|| solution.samples as f64 / solution.sampling_s),
             loss: last.as_ref().and_then(|r| r.loss),
             held_out: solution.best.map(|b| b.held_out).or(last.as_ref().and_then(|r| r.held_out)),
             best_step: solution.best.map(|b| b.step),

@@ -48,6 +48,9 @@ pub struct Tradeoff {
     /// What may be turned [default: the shipped levers].
     #[arg(long, value_name = "FILE")]
     levers: Option<PathBuf>,
+    /// Only these bases of the levers, by name.
+    #[arg(long, value_name = "BASE,BASE", value_delimiter = ',')]
+    bases: Vec<String>,
     /// Print the shipped levers and end.
     #[arg(long)]
     show_levers: bool,
@@ -67,7 +70,8 @@ pub struct Tradeoff {
     /// Views to keep aside and predict, such as 3,17 or every:10; with a reference also none.
     #[arg(long, value_name = "VIEWS", default_value = "every:10", value_parser = parse::hold_out_or_none)]
     hold_out: parse::HoldOutOrNone,
-    /// Which backend: auto, cpu, wgpu, or wgpu:N with the number of an adapter.
+    /// Which backend: auto, cpu, wgpu, or wgpu:N with the number of an adapter; +subgroups after wgpu adds up gradients
+    /// of tables in subgroups first.
     #[arg(long, value_name = "BACKEND", default_value_t)]
     backend: BackendChoice,
     /// Seed of everything random, the drawing of candidates included.
@@ -148,7 +152,7 @@ impl Tradeoff {
         }
         // Whatever is wrong with the input is told before anything is made.
         let Some(output) = &self.output else { return Err(Error::invalid("tradeoff", "-o", "nothing", "a folder")) };
-        let levers = self.levers.as_deref().map_or_else(Levers::shipped, Levers::read)?;
+        let levers = self.levers.as_deref().map_or_else(Levers::shipped, Levers::read)?.only(&self.bases)?;
         let search = self.search(levers.candidates(self.candidates.into(), self.seed)?, general)?;
         let mut over = self.open(output, &search)?;
         signals::listen()?;

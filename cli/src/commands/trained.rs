@@ -17,7 +17,8 @@ pub struct Trained {
     /// Voxels along the longest side [default: as the scan asked for].
     #[arg(long, value_name = "N", value_parser = clap::value_parser!(u16).range(1..))]
     voxels: Option<u16>,
-    /// Which backend: auto, cpu, wgpu, or wgpu:N with the number of an adapter.
+    /// Which backend: auto, cpu, wgpu, or wgpu:N with the number of an adapter; +subgroups after wgpu adds up gradients
+    /// of tables in subgroups first.
     #[arg(long, value_name = "BACKEND", default_value_t)]
     pub backend: BackendChoice,
 }

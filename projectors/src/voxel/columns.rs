@@ -5,8 +5,7 @@
 //! is read at equal distances, one a row. Both run along z, where voxels are neighbours in memory. The adjoint goes
 //! the same way back: rows are gathered into a line with the same hat-shaped weights, and the line is shared out.
 
-use super::layout::{AFTER, BEFORE, ColumnMajor, Upright, batch};
-use super::walk::main_axis;
+use super::layout::{AFTER, BEFORE, ColumnMajor, Upright, batch, main_axis};
 use conefield_core::geometry::{Geometry, Vec3, VoxelGrid};
 use conefield_core::simd::{Op, Real, Simd, SimdBase, SimdFloat, V, load, run, store};
 use ndarray::{ArrayView3, ArrayViewMut2, ArrayViewMut3, Axis};

@@ -12,6 +12,18 @@ pub fn to_voxels(grid: &VoxelGrid, p: Vec3) -> Vec3 {
     std::array::from_fn(|k| (p[k] - lower[k]) / grid.spacing[k] - 0.5)
 }
 
+/// The axis along which the ray meets most planes of voxels.
+pub fn main_axis(ahead: Vec3) -> usize {
+    let a = ahead.map(f64::abs);
+    if a[0] >= a[1] && a[0] >= a[2] {
+        0
+    } else if a[1] >= a[2] {
+        1
+    } else {
+        2
+    }
+}
+
 /// A view whose detector rows are stacked along z: neither `u` nor the detector's normal has a part along z.
 #[derive(Debug, Clone, Copy)]
 pub struct Upright {

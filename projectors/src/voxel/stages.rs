@@ -1,8 +1,8 @@
 //! The voxel projectors that a spec may name.
 
-use super::columns;
 use super::rays;
-use super::walk::{JosephWalk, SiddonWalk, TrilinearWalk};
+use super::walk::{SiddonWalk, TrilinearWalk};
+use super::{bundles, columns};
 use conefield_core::error::{Result, ensure};
 use conefield_core::geometry::Geometry;
 use conefield_core::simd::Real;
@@ -130,24 +130,24 @@ impl<R: Real> VoxelOperator<R> for Trilinear {
     }
 }
 
-/// Views that go column by column run so, the others ray by ray.
+/// Views that go column by column run so, the others bundle by bundle.
 impl<R: Real> VoxelOperator<R> for Joseph {
     fn forward(&self, geometry: &Geometry, views: &[usize], volume: ArrayView3<'_, R>, mut out: ArrayViewMut3<'_, R>) {
-        let mut upright = vec![];
-        let mut images = vec![];
-        for (&v, mut image) in views.iter().zip(out.outer_iter_mut()) {
+        let (mut upright, mut others) = ((vec![], vec![]), (vec![], vec![]));
+        for (&v, image) in views.iter().zip(out.outer_iter_mut()) {
             match columns::fits(geometry, v) {
                 Some(u) => {
-                    upright.push(u);
-                    images.push(image);
+                    upright.0.push(u);
+                    upright.1.push(image);
                 }
                 None => {
-                    let image = image.view_mut().insert_axis(Axis(0));
-                    rays::forward(&JosephWalk, geometry, &[v], volume, image);
+                    others.0.push(v);
+                    others.1.push(image);
                 }
             }
         }
-        columns::forward(geometry, &upright, volume, images);
+        columns::forward(geometry, &upright.0, volume, upright.1);
+        bundles::forward(geometry, &others.0, volume, others.1);
     }
 
     fn adjoint(&self, geometry: &Geometry, views: &[usize], p: ArrayView3<'_, R>, mut volume: ArrayViewMut3<'_, R>) {
@@ -159,7 +159,7 @@ impl<R: Real> VoxelOperator<R> for Joseph {
             let images = p.slice_axis(Axis(0), part.clone().into());
             let upright: Vec<_> = run.iter().flatten().copied().collect();
             if upright.is_empty() {
-                rays::adjoint(&JosephWalk, geometry, &views[part.clone()], images, volume.view_mut());
+                bundles::adjoint(geometry, &views[part.clone()], images, &mut volume);
             } else {
                 columns::adjoint(geometry, &upright, &views[part.clone()], images, &mut volume);
             }

@@ -27,12 +27,12 @@ impl VoxelRay {
         }
     }
 
-    fn at(&self, k: usize, t: f64) -> f64 {
+    pub(super) fn at(&self, k: usize, t: f64) -> f64 {
         self.source[k] + t * self.ahead[k]
     }
 
     /// The `t` before the detector side is left where `lower ≤ position ≤ upper` on every axis, from the source on.
-    fn clip(&self, lower: Vec3, upper: Vec3) -> Option<[f64; 2]> {
+    pub(super) fn clip(&self, lower: Vec3, upper: Vec3) -> Option<[f64; 2]> {
         let (mut near, mut far) = (0.0f64, f64::INFINITY);
         for k in 0..3 {
             if self.ahead[k] == 0.0 {
@@ -95,67 +95,6 @@ impl Walk for SiddonWalk {
             voxel[k] = if up { voxel[k] + 1 } else { voxel[k] - 1 };
             next[k] = wall(k, voxel[k]);
         }
-    }
-}
-
-/// Bilinear interpolation in the planes of voxel centres across the ray's main direction, one plane after another
-/// (Joseph, IEEE Trans. Med. Imaging 1(3), 1982). Outside the volume is nothing.
-#[derive(Debug, Clone, Copy)]
-pub struct JosephWalk;
-
-impl Walk for JosephWalk {
-    fn walk(&self, ray: &VoxelRay, grid: &VoxelGrid, slab: &Range<usize>, mut visit: impl FnMut([usize; 3], f64)) {
-        let n = grid.shape;
-        let main = main_axis(ray.ahead);
-        let [a, b] = [(main + 1) % 3, (main + 2) % 3];
-        let mut lower = [-1.0; 3];
-        let mut upper = n.map(|n| n as f64);
-        (lower[0], upper[0]) = (slab.start as f64 - 1.0, slab.end as f64);
-        (lower[main], upper[main]) = (lower[main].max(0.0), upper[main].min(n[main] as f64 - 1.0));
-        if main == 0 {
-            (lower[0], upper[0]) = (slab.start as f64, slab.end as f64 - 1.0);
-        }
-        // A plane more on both sides: positions on the edge are told voxel by voxel.
-        let (lo, hi) = (lower[main], upper[main]);
-        (lower[main], upper[main]) = (lo - 1.0, hi + 1.0);
-        let Some([near, far]) = ray.clip(lower, upper) else { return };
-        let ends = [ray.at(main, near), ray.at(main, far)];
-        let first = (ends[0].min(ends[1]) - 1.0).ceil().max(lo);
-        let last = (ends[0].max(ends[1]) + 1.0).floor().min(hi);
-        let step = ray.length / ray.ahead[main].abs();
-        let mut plane = first;
-        while plane <= last {
-            let t = (plane - ray.source[main]) / ray.ahead[main];
-            if t > 0.0 {
-                let (pa, pb) = (ray.at(a, t), ray.at(b, t));
-                let (ca, cb) = (pa.floor(), pb.floor());
-                let (fa, fb) = (pa - ca, pb - cb);
-                for (da, wa) in [(0.0, 1.0 - fa), (1.0, fa)] {
-                    for (db, wb) in [(0.0, 1.0 - fb), (1.0, fb)] {
-                        let mut at = [0.0; 3];
-                        (at[main], at[a], at[b]) = (plane, ca + da, cb + db);
-                        let inside = (0..3).all(|k| at[k] >= 0.0 && at[k] < n[k] as f64);
-                        let voxel = at.map(|x| x as usize);
-                        if inside && slab.contains(&voxel[0]) {
-                            visit(voxel, wa * wb * step);
-                        }
-                    }
-                }
-            }
-            plane += 1.0;
-        }
-    }
-}
-
-/// The axis along which the ray meets most planes of voxels.
-pub fn main_axis(ahead: Vec3) -> usize {
-    let a = ahead.map(f64::abs);
-    if a[0] >= a[1] && a[0] >= a[2] {
-        0
-    } else if a[1] >= a[2] {
-        1
-    } else {
-        2
     }
 }
 

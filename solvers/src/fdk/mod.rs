@@ -128,7 +128,8 @@ impl Solver for Fdk {
         observer.record(&Record { step: 1, seconds: train_s, psnr, held_out, ..Record::default() });
         volume.par_mapv_inplace(|x| x * mm);
         let volume = Volume { data: volume, grid: g.volume, affine: None };
-        Ok(Solution { result: Reconstruction::Volume(volume), steps: 1, train_s, samples: 0, rollbacks: 0, best: None })
+        let result = Reconstruction::Volume(volume);
+        Ok(Solution { result, steps: 1, train_s, samples: 0, sampling_s: 0.0, rollbacks: 0, best: None })
     }
 
     fn trains_field(&self, spec: &Spec) -> Result<bool> {

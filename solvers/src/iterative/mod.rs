@@ -426,6 +426,7 @@ pub fn drive(
         steps: step,
         train_s: clock.seconds(),
         samples: 0,
+        sampling_s: 0.0,
         rollbacks: 0,
         best: kept.best.map(|held_out| Best { step: step - kept.since_best, held_out }),
     })

@@ -2,8 +2,8 @@
 
 use crate::call::{data, error, forward, gradients as backward, params};
 use crate::{Options, Outcome};
-use conefield_core::half::{Half, Reader, round};
-use conefield_core::stage::{Halves, Kernel, Stage};
+use conefield_core::half::{Half, round};
+use conefield_core::stage::{Halves, Kernel, Reader, Stage};
 
 /// Largest error against the kernel that trains on the rounded parameters.
 const SAME: f64 = 1e-6;

@@ -14,13 +14,16 @@ pub fn shared(what: &str) -> Option<Arc<Shared>> {
     device.clone()
 }
 
-/// Backends on the device that are told that it can do less: as it is, without atomic sums, and with buffers so small
-/// that everything is cut into pieces.
+/// Backends on the device: as it is, told that it can do less (no atomic sums; buffers so small that everything is cut into
+/// pieces), and with subgroup operations where it has them.
 #[allow(dead_code)]
 pub fn backends(what: &str) -> Vec<(&'static str, Wgpu)> {
     let small = Limits { binding_bytes: Some(2048), uniform_bytes: Some(0), ..Limits::default() };
     let exchange = Limits { compare_exchange: true, ..Limits::default() };
-    let all = [("as it is", Limits::default()), ("compare and exchange", exchange), ("small buffers", small)];
+    let subgroups = Limits { subgroups: true, ..Limits::default() };
+    let plain = Limits::default();
+    let all =
+        [("as it is", plain), ("compare and exchange", exchange), ("small buffers", small), ("subgroups", subgroups)];
     let opened = all.into_iter().filter_map(|(name, limits)| Some((name, Wgpu::with_limits(None, limits).ok()?)));
     let opened: Vec<_> = opened.collect();
     if opened.is_empty() {

@@ -98,6 +98,17 @@ impl Levers {
         Ok(Self { bases })
     }
 
+    /// Only the bases with these names; all where none is named.
+    pub fn only(mut self, names: &[String]) -> Result<Self> {
+        let all: Vec<&str> = self.bases.iter().map(|b| &b.name[..]).collect();
+        if let Some(name) = names.iter().find(|n| !all.contains(&&n[..])) {
+            let expected = format!("some of {}", all.join(", "));
+            return Err(Error::invalid("tradeoff", "--bases", format!("{name:?}"), expected));
+        }
+        self.bases.retain(|b| names.is_empty() || names.contains(&b.name));
+        Ok(self)
+    }
+
     /// `count` candidates: every base, then a draw of each in turn. There are fewer where the products are used up.
     pub fn candidates(&self, count: usize, seed: u64) -> Result<Vec<Candidate>> {
         let least = self.bases.len();
@@ -227,6 +238,15 @@ mod tests {
         assert_eq!(levers.candidates(30, 0).unwrap(), all, "the same seed draws the same");
         assert_ne!(levers.candidates(30, 1).unwrap(), all);
         assert_eq!(levers.candidates(12, 0).unwrap(), all[..12], "more candidates leave the first ones");
+    }
+
+    #[test]
+    fn bases_that_are_not_named_are_left_out() {
+        let names = ["balanced".to_owned(), "fdk".to_owned()];
+        let all = Levers::shipped().unwrap().only(&names).unwrap().candidates(6, 0).unwrap();
+        assert!(all.len() == 6 && all.iter().all(|c| names.contains(&c.base)), "{all:?}");
+        let e = Levers::shipped().unwrap().only(&["fkd".into()]).err().unwrap().to_string();
+        assert!(e.contains("--bases") && e.contains("\"fkd\"") && e.contains("fista-tv"), "{e}");
     }
 
     #[test]
