@@ -4,7 +4,7 @@
 //! bundle meet a plane, between which voxels and with which shares, is one computation for all of them; only the voxels
 //! themselves are read, or written, one after the other. Forward, a strip of columns goes through a few planes, row after
 //! row, before it turns to the next ones; back, some planes gather from all bundles. Both take their shares from
-//! [`Bundle::meet`], so they are adjoint by construction.
+//! `Bundle::meet`, so they are adjoint by construction.
 
 use super::layout::{main_axis, to_voxels};
 use conefield_core::geometry::{Geometry, Vec3, VoxelGrid, norm, sub};
