@@ -32,7 +32,7 @@ search() {
 }
 search engine_256 "$budgets" "$out/scans/engine_256" --hold-out none
 search head_256 "$budgets" "$out/scans/head_256" --hold-out "${HOLD_OUT:-none}"
-search tuning "$(printf '%ss,' $presets | sed 's/,$//')" "$out/scans/abdomen_128" "$out/scans/engine_256" --hold-out none \
+search tuning "${presets// /s,}s" "$out/scans/abdomen_128" "$out/scans/engine_256" --hold-out none \
     --bases fast,balanced,accurate
 [[ " $searches " == *" tuning "* ]] || exit 0
 mkdir -p "$out/presets"

@@ -13,6 +13,10 @@ use std::path::Path;
 use std::str::FromStr;
 use std::sync::OnceLock;
 
+/// What `--help` says of `--backend`.
+pub const HELP: &str = "Which backend: auto, cpu, wgpu, or wgpu:N with the number of an adapter; +subgroups after wgpu adds up \
+                        gradients of tables in subgroups first";
+
 /// What `--backend` says.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
 pub enum BackendChoice {

@@ -77,7 +77,7 @@ impl Wgpu {
         Self::with_limits(index, Limits::default())
     }
 
-    /// The same, with less than the adapter offers.
+    /// The same, set otherwise than the adapter's defaults.
     pub fn with_limits(index: Option<usize>, limits: Limits) -> Result<Self> {
         let gpu = Gpu::open(index, limits)?;
         let Limits { subgroups, profile, .. } = limits;

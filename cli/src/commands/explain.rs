@@ -1,6 +1,6 @@
 //! `conefield explain`
 
-use crate::backend::BackendChoice;
+use crate::backend::{self, BackendChoice};
 use crate::memory::Memory;
 use crate::method::Parts;
 use crate::{files, out, plugins, specs};
@@ -27,9 +27,7 @@ pub struct Explain {
     /// Also the memory that this scan takes.
     #[arg(long)]
     scan: Option<PathBuf>,
-    /// Which backend: auto, cpu, wgpu, or wgpu:N with the number of an adapter; +subgroups after wgpu adds up gradients
-    /// of tables in subgroups first.
-    #[arg(long, value_name = "BACKEND", default_value_t)]
+    #[arg(long, value_name = "BACKEND", default_value_t, help = backend::HELP)]
     backend: BackendChoice,
     /// Print one JSON object.
     #[arg(long)]

@@ -1,7 +1,7 @@
 //! `conefield pretrain`
 
 use super::{Ends, reconstruct::notes};
-use crate::backend::BackendChoice;
+use crate::backend::{self, BackendChoice};
 use crate::memory::Memory;
 use crate::parse::{self, Values};
 use crate::progress::Progress;
@@ -35,9 +35,7 @@ pub struct Pretrain {
     values: Values,
     #[command(flatten)]
     ends: Ends,
-    /// Which backend: auto, cpu, wgpu, or wgpu:N with the number of an adapter; +subgroups after wgpu adds up gradients
-    /// of tables in subgroups first.
-    #[arg(long, value_name = "BACKEND", default_value_t)]
+    #[arg(long, value_name = "BACKEND", default_value_t, help = backend::HELP)]
     backend: BackendChoice,
     /// Seed of everything random.
     #[arg(long, default_value_t = 0)]

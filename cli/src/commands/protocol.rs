@@ -1,7 +1,7 @@
 //! What a reconstruction is asked for beside scan and spec: the same for every method that is compared.
 
 use super::Ends;
-use crate::backend::BackendChoice;
+use crate::backend::{self, BackendChoice};
 use crate::parse::{self, HoldOut};
 use clap::Args;
 use conefield_core::scan::{Scan, Volume};
@@ -23,9 +23,7 @@ pub struct Protocol {
     /// Plan training so that the whole run, from start to last file, takes this time, such as 60s or 10m.
     #[arg(long, value_name = "TIME", value_parser = parse::seconds, conflicts_with_all = ["steps", "seconds", "at_most"])]
     pub budget: Option<f64>,
-    /// Which backend: auto, cpu, wgpu, or wgpu:N with the number of an adapter; +subgroups after wgpu adds up gradients
-    /// of tables in subgroups first.
-    #[arg(long, value_name = "BACKEND", default_value_t)]
+    #[arg(long, value_name = "BACKEND", default_value_t, help = backend::HELP)]
     pub backend: BackendChoice,
     /// The volume sought, to compare with: a file, or "truth" for the one that the scan comes with.
     #[arg(long, value_name = "VOLUME")]

@@ -9,7 +9,7 @@ use super::protocol::Protocol;
 use super::record::ScanRecord;
 use super::trial::{Figures, Input, Trial, read_json};
 use super::{Ends, General, backends::simd_level};
-use crate::backend::BackendChoice;
+use crate::backend::{self, BackendChoice};
 use crate::budget::TOO_SHORT;
 use crate::parse::{self, HoldOut};
 use crate::statistics::mean;
@@ -70,9 +70,7 @@ pub struct Tradeoff {
     /// Views to keep aside and predict, such as 3,17 or every:10; with a reference also none.
     #[arg(long, value_name = "VIEWS", default_value = "every:10", value_parser = parse::hold_out_or_none)]
     hold_out: parse::HoldOutOrNone,
-    /// Which backend: auto, cpu, wgpu, or wgpu:N with the number of an adapter; +subgroups after wgpu adds up gradients
-    /// of tables in subgroups first.
-    #[arg(long, value_name = "BACKEND", default_value_t)]
+    #[arg(long, value_name = "BACKEND", default_value_t, help = backend::HELP)]
     backend: BackendChoice,
     /// Seed of everything random, the drawing of candidates included.
     #[arg(long, default_value_t = 0)]

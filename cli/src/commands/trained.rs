@@ -1,6 +1,6 @@
 //! What commands that look at the field of a finished run share.
 
-use crate::backend::BackendChoice;
+use crate::backend::{self, BackendChoice};
 use crate::files;
 use crate::memory::Memory;
 use clap::Args;
@@ -17,9 +17,7 @@ pub struct Trained {
     /// Voxels along the longest side [default: as the scan asked for].
     #[arg(long, value_name = "N", value_parser = clap::value_parser!(u16).range(1..))]
     voxels: Option<u16>,
-    /// Which backend: auto, cpu, wgpu, or wgpu:N with the number of an adapter; +subgroups after wgpu adds up gradients
-    /// of tables in subgroups first.
-    #[arg(long, value_name = "BACKEND", default_value_t)]
+    #[arg(long, value_name = "BACKEND", default_value_t, help = backend::HELP)]
     pub backend: BackendChoice,
 }
 

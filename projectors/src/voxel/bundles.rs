@@ -6,8 +6,9 @@
 //! row, before it turns to the next ones; back, some planes gather from all bundles. Both take their shares from
 //! `Bundle::meet`, so they are adjoint by construction.
 
-use super::layout::{main_axis, to_voxels};
-use conefield_core::geometry::{Geometry, Vec3, VoxelGrid, norm, sub};
+use super::layout::main_axis;
+use super::walk::VoxelRay;
+use conefield_core::geometry::{Geometry, Vec3, VoxelGrid};
 use conefield_core::simd::{Op, Real, Simd, SimdBase, SimdFloat, V, load, run, store};
 use ndarray::{ArrayView3, ArrayViewMut2, ArrayViewMut3, Axis};
 use rayon::prelude::*;
@@ -26,6 +27,11 @@ const HELD: usize = 32 << 20;
 type Heading = (usize, bool);
 
 const HEADINGS: [Heading; 6] = [(0, true), (0, false), (1, true), (1, false), (2, true), (2, false)];
+
+fn heading_of(ray: &VoxelRay) -> Heading {
+    let main = main_axis(ray.ahead);
+    (main, ray.ahead[main] > 0.0)
+}
 
 /// The axes across `main`, in order.
 fn across(main: usize) -> [usize; 2] {
@@ -65,35 +71,28 @@ impl<R: Real> Beside<R> {
 impl<R: Real> Bundle<R> {
     /// Adds the bundles of the pixels from `column` on to `all`: one for each heading among them.
     fn of(geometry: &Geometry, [view, row, column]: [usize; 3], image: usize, all: &mut Vec<Self>) {
-        let (w, grid) = (&geometry.views[view], &geometry.volume);
-        let source = to_voxels(grid, w.source);
-        let count = BUNDLE.min(geometry.detector[1] - column);
-        let mut ways = [([0.0; 3], 0.0, HEADINGS[0]); BUNDLE];
-        for (i, way) in ways[..count].iter_mut().enumerate() {
-            let d = sub(w.pixel(geometry.detector, row as f64, (column + i) as f64), w.source);
-            let ahead: Vec3 = std::array::from_fn(|k| d[k] / grid.spacing[k]);
-            let main = main_axis(ahead);
-            *way = (ahead, norm(d) / ahead[main].abs(), (main, ahead[main] > 0.0));
-        }
-        let ways = &ways[..count];
-        for heading in HEADINGS.into_iter().filter(|h| ways.iter().any(|w| w.2 == *h)) {
+        let grid = &geometry.volume;
+        let rays: [VoxelRay; BUNDLE] = std::array::from_fn(|i| VoxelRay::of(geometry, view, row, column + i));
+        let rays = &rays[..BUNDLE.min(geometry.detector[1] - column)];
+        let source = rays[0].source;
+        for heading in HEADINGS.into_iter().filter(|h| rays.iter().any(|r| heading_of(r) == *h)) {
             let (main, others) = (heading.0, across(heading.0));
             let half = 0.5 * (grid.shape[main] as f64 - 1.0);
             let (mut middle, mut slope) = ([[R::ZERO; BUNDLE]; 2], [[R::ZERO; BUNDLE]; 2]);
             let mut step = [R::ZERO; BUNDLE];
             let mut planes = grid.shape[main]..0;
-            for (i, (ahead, mm, _)) in ways.iter().enumerate().filter(|(_, w)| w.2 == heading) {
-                let slopes = others.map(|k| ahead[k] / ahead[main]);
-                let met = met(grid, source, heading, slopes);
-                if met.is_empty() {
+            for (i, ray) in rays.iter().enumerate().filter(|(_, r)| heading_of(r) == heading) {
+                let slopes = others.map(|k| ray.ahead[k] / ray.ahead[main]);
+                let crossed = crossed(grid, source, heading, slopes);
+                if crossed.is_empty() {
                     continue;
                 }
-                planes = planes.start.min(met.start)..planes.end.max(met.end);
+                planes = planes.start.min(crossed.start)..planes.end.max(crossed.end);
                 for d in 0..2 {
                     middle[d][i] = R::of(source[others[d]] + (half - source[main]) * slopes[d] + 1.0);
                     slope[d][i] = R::of(slopes[d]);
                 }
-                step[i] = R::of(*mm);
+                step[i] = R::of(ray.length / ray.ahead[main].abs());
             }
             if !planes.is_empty() {
                 all.push(Self { image, row, column, main, planes, middle, slope, step });
@@ -129,7 +128,7 @@ impl<R: Real> Bundle<R> {
 }
 
 /// The planes that a ray from `source` may meet voxels in, and one more on either side.
-fn met(grid: &VoxelGrid, source: Vec3, (main, up): Heading, slopes: [f64; 2]) -> Range<usize> {
+fn crossed(grid: &VoxelGrid, source: Vec3, (main, up): Heading, slopes: [f64; 2]) -> Range<usize> {
     let last = grid.shape[main] as f64 - 1.0;
     // In front of the source.
     let (mut low, mut high) = (0.0f64, last);
@@ -227,17 +226,19 @@ pub fn adjoint<R: Real>(
     volume: &mut ArrayViewMut3<'_, R>,
 ) {
     let [rows, columns] = geometry.detector;
-    let lines: Vec<[usize; 2]> = (0..views.len() * rows).map(|i| [i / rows, i % rows]).collect();
     let bytes = columns.div_ceil(BUNDLE) * size_of::<Bundle<R>>();
-    for some in lines.chunks((HELD / bytes.max(1)).max(1)) {
-        let of_line = |&[image, row]: &[usize; 2]| {
-            let mut all = vec![];
-            for column in (0..columns).step_by(BUNDLE) {
-                Bundle::of(geometry, [views[image], row, column], image, &mut all);
-            }
-            all
-        };
-        let bundles: Vec<Bundle<R>> = some.par_iter().flat_map_iter(of_line).collect();
+    let of_line = |line: usize| {
+        let (image, row) = (line / rows, line % rows);
+        let mut all = vec![];
+        for column in (0..columns).step_by(BUNDLE) {
+            Bundle::of(geometry, [views[image], row, column], image, &mut all);
+        }
+        all
+    };
+    let (lines, held) = (views.len() * rows, (HELD / bytes.max(1)).max(1));
+    for from in (0..lines).step_by(held) {
+        let some = from..(from + held).min(lines);
+        let bundles: Vec<Bundle<R>> = some.into_par_iter().flat_map_iter(of_line).collect();
         for main in (0..3).filter(|&main| bundles.iter().any(|b| b.main == main)) {
             let [a, b] = across(main);
             let mut turned = volume.view_mut().permuted_axes([main, a, b]);

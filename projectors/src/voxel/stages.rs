@@ -146,8 +146,13 @@ impl<R: Real> VoxelOperator<R> for Joseph {
                 }
             }
         }
-        columns::forward(geometry, &upright.0, volume, upright.1);
-        bundles::forward(geometry, &others.0, volume, others.1);
+        // Most scans have views of one kind only, and nothing is to be prepared for the other.
+        if !upright.0.is_empty() {
+            columns::forward(geometry, &upright.0, volume, upright.1);
+        }
+        if !others.0.is_empty() {
+            bundles::forward(geometry, &others.0, volume, others.1);
+        }
     }
 
     fn adjoint(&self, geometry: &Geometry, views: &[usize], p: ArrayView3<'_, R>, mut volume: ArrayViewMut3<'_, R>) {
