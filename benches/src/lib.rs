@@ -79,7 +79,8 @@ pub fn bandwidth() -> f64 {
 
 /// Reads a second of all threads together from random cache lines of 32 MiB.
 pub fn random_reads() -> f64 {
-    let table: Pages = Pages::zeros(8 << 20);
+    // Written once: pages that were only ever read are all one page of zeros, which stays in the cache.
+    let table: Pages = (0..8 << 20).map(|i| (i % 3) as f32).collect();
     let count = 4_000_000u32;
     let each: Vec<f64> = (0..rayon::current_num_threads())
         .into_par_iter()
@@ -91,7 +92,7 @@ pub fn random_reads() -> f64 {
                 sum += table[(state >> 9) as usize];
             }
             let time = start.elapsed().as_secs_f64();
-            assert!(sum == 0.0);
+            assert!(sum > 0.0);
             f64::from(count) / time
         })
         .collect();

@@ -33,6 +33,8 @@ pub trait Real:
     + Sum
     + 'static
 {
+    /// Four numbers side by side, on every machine.
+    type Four<S: Simd>: SimdFloat<S, Element = Self, Array = [Self; 4]>;
     /// 0.
     const ZERO: Self;
     /// 1.
@@ -66,6 +68,7 @@ pub trait Real:
 }
 
 impl Real for f32 {
+    type Four<S: Simd> = fearless_simd::f32x4<S>;
     const ZERO: Self = 0.0;
     const ONE: Self = 1.0;
     #[inline(always)]
@@ -195,6 +198,7 @@ impl Real for f32 {
 }
 
 impl Real for f64 {
+    type Four<S: Simd> = fearless_simd::f64x4<S>;
     const ZERO: Self = 0.0;
     const ONE: Self = 1.0;
     #[inline(always)]
@@ -309,15 +313,32 @@ pub fn level_name() -> &'static str {
     }
 }
 
+/// Lanes of the widest vector there is.
+const WIDEST: usize = 16;
+
 /// Up to a vector's worth of `x` from `at`; lanes past the end are 0.
 #[inline(always)]
 pub fn load<S: Simd, R: Real>(s: S, x: &[R], at: usize) -> V<S, R> {
     let len = V::<S, R>::LEN;
-    if at + len <= x.len() {
-        V::<S, R>::from_slice(s, &x[at..at + len])
+    // Both ways end in one load of a vector: joined after it, they are joined lane by lane.
+    let tail;
+    let whole = if at + len <= x.len() {
+        &x[at..at + len]
     } else {
-        V::<S, R>::from_fn(s, |i| x.get(at + i).copied().unwrap_or(R::ZERO))
-    }
+        tail = padded(x, at);
+        &tail[..len]
+    };
+    V::<S, R>::from_slice(s, whole)
+}
+
+/// What `x` has from `at`, and zeros.
+#[cold]
+#[inline(never)]
+fn padded<R: Real>(x: &[R], at: usize) -> [R; WIDEST] {
+    let rest = x.get(at..).unwrap_or_default();
+    let mut tail = [R::ZERO; WIDEST];
+    tail[..rest.len()].copy_from_slice(rest);
+    tail
 }
 
 /// Stores the lanes of `v` that fit into `y` from `at`.
@@ -327,9 +348,18 @@ pub fn store<S: Simd, R: Real>(v: V<S, R>, y: &mut [R], at: usize) {
     if at + len <= y.len() {
         v.store_slice(&mut y[at..at + len]);
     } else {
-        let n = y.len() - at;
-        y[at..].copy_from_slice(&v.as_slice()[..n]);
+        let mut lanes = [R::ZERO; WIDEST];
+        v.store_slice(&mut lanes[..len]);
+        store_tail(&lanes, y, at);
     }
+}
+
+/// The first of `lanes`, as many as `y` has from `at`.
+#[cold]
+#[inline(never)]
+fn store_tail<R: Real>(lanes: &[R; WIDEST], y: &mut [R], at: usize) {
+    let n = y.len() - at;
+    y[at..].copy_from_slice(&lanes[..n]);
 }
 
 #[cfg(test)]

@@ -176,11 +176,31 @@ pub trait Kernel<R: Real, P = R>: Send + Sync {
         grads: Grads<'_, R>,
         dx: Option<TileMut<'_, R>>,
     );
+
+    /// How many passes [`Kernel::forward`] goes in, each over a table of its own: a host with many tiles sends all of
+    /// them through one before the next, while its table is in the cache.
+    fn passes(&self) -> usize {
+        1
+    }
+
+    /// One pass of [`Kernel::forward`], `pass` of [`Kernel::passes`]; all of them in order are the whole.
+    fn forward_pass(&self, pass: usize, params: &[P], x: Tile<'_, R>, y: TileMut<'_, R>, tape: TileMut<'_, R>) {
+        debug_assert_eq!(pass, 0);
+        self.forward(params, x, y, tape);
+    }
 }
 
 impl<R: Real, P, K: Kernel<R, P> + ?Sized> Kernel<R, P> for &K {
     fn forward(&self, params: &[P], x: Tile<'_, R>, y: TileMut<'_, R>, tape: TileMut<'_, R>) {
         (**self).forward(params, x, y, tape);
+    }
+
+    fn passes(&self) -> usize {
+        (**self).passes()
+    }
+
+    fn forward_pass(&self, pass: usize, params: &[P], x: Tile<'_, R>, y: TileMut<'_, R>, tape: TileMut<'_, R>) {
+        (**self).forward_pass(pass, params, x, y, tape);
     }
 
     fn backward(
@@ -224,6 +244,21 @@ pub struct Reader<'a, H> {
 impl<H: Half> Kernel<f32> for Reader<'_, H> {
     fn forward(&self, _: &[f32], x: Tile<'_, f32>, y: TileMut<'_, f32>, tape: TileMut<'_, f32>) {
         self.kernel.forward(self.params, x, y, tape);
+    }
+
+    fn passes(&self) -> usize {
+        self.kernel.passes()
+    }
+
+    fn forward_pass(
+        &self,
+        pass: usize,
+        _: &[f32],
+        x: Tile<'_, f32>,
+        y: TileMut<'_, f32>,
+        tape: TileMut<'_, f32>,
+    ) {
+        self.kernel.forward_pass(pass, self.params, x, y, tape);
     }
 
     fn backward(

@@ -161,6 +161,15 @@ enum Own<'a, R: Real, P> {
     Alone(&'a dyn Kernel<R>),
 }
 
+impl<R: Real, P> Own<'_, R, P> {
+    fn passes(&self) -> usize {
+        match self {
+            Self::Reads(kernel) => kernel.passes(),
+            Self::Alone(kernel) => kernel.passes(),
+        }
+    }
+}
+
 /// The kernel of a part in one precision.
 type Pick<R, P> = fn(&Part) -> Option<Own<'_, R, P>>;
 
@@ -185,6 +194,36 @@ impl ConcatStage {
                 Some(Own::Alone(kernel)) => kernel.forward(&[], x, y, tape),
                 None => {}
             }
+        }
+    }
+
+    /// Passes of every part, one after the other.
+    fn passes_of_parts<R: Real, P>(&self, pick: Pick<R, P>) -> usize {
+        self.parts.iter().map(|part| pick(part).map_or(0, |own| own.passes())).sum()
+    }
+
+    fn forward_pass_of_parts<R: Real, P>(
+        &self,
+        pick: Pick<R, P>,
+        mut pass: usize,
+        params: &[P],
+        x: Tile<'_, R>,
+        y: TileMut<'_, R>,
+        tape: TileMut<'_, R>,
+    ) {
+        for part in &self.parts {
+            let Some(own) = pick(part) else { continue };
+            if pass >= own.passes() {
+                pass -= own.passes();
+                continue;
+            }
+            let y = channels(y.data, &part.outputs, x.rows);
+            let tape = channels(tape.data, &part.tape, x.rows);
+            match own {
+                Own::Reads(kernel) => kernel.forward_pass(pass, &params[part.params.clone()], x, y, tape),
+                Own::Alone(kernel) => kernel.forward_pass(pass, &[], x, y, tape),
+            }
+            return;
         }
     }
 
@@ -237,6 +276,21 @@ macro_rules! kernels {
         impl Kernel<$real, $stored> for ConcatStage {
             fn forward(&self, params: &[$stored], x: Tile<'_, $real>, y: TileMut<'_, $real>, tape: TileMut<'_, $real>) {
                 self.forward_parts($pick, params, x, y, tape);
+            }
+
+            fn passes(&self) -> usize {
+                self.passes_of_parts::<$real, $stored>($pick)
+            }
+
+            fn forward_pass(
+                &self,
+                pass: usize,
+                params: &[$stored],
+                x: Tile<'_, $real>,
+                y: TileMut<'_, $real>,
+                tape: TileMut<'_, $real>,
+            ) {
+                self.forward_pass_of_parts($pick, pass, params, x, y, tape);
             }
 
             fn backward(

@@ -135,6 +135,7 @@ impl DenseGridStage {
 
 struct Forward<'a, R, P> {
     stage: &'a DenseGridStage,
+    levels: Range<usize>,
     params: &'a [P],
     x: Tile<'a, R>,
     y: TileMut<'a, R>,
@@ -145,7 +146,7 @@ impl<R: Real, P: Stored<R>> Forward<'_, R, P> {
     fn features<S: Simd, const F: usize>(mut self, s: S) {
         let mut located = Located::default();
         let mut out = [[R::ZERO; BLOCK]; F];
-        for level in &self.stage.levels {
+        for level in &self.stage.levels[self.levels.clone()] {
             let (table, _) = self.params[self.stage.params_of(level)].as_chunks::<F>();
             let offsets = level.grid.offsets();
             for at in (0..self.x.rows).step_by(BLOCK) {
@@ -246,7 +247,15 @@ by_features!(Backward);
 
 impl<R: Real, P: Stored<R>> Kernel<R, P> for DenseGridStage {
     fn forward(&self, params: &[P], x: Tile<'_, R>, y: TileMut<'_, R>, _: TileMut<'_, R>) {
-        run(Forward { stage: self, params, x, y });
+        run(Forward { stage: self, levels: 0..self.levels.len(), params, x, y });
+    }
+
+    fn passes(&self) -> usize {
+        self.levels.len()
+    }
+
+    fn forward_pass(&self, pass: usize, params: &[P], x: Tile<'_, R>, y: TileMut<'_, R>, _: TileMut<'_, R>) {
+        run(Forward { stage: self, levels: pass..pass + 1, params, x, y });
     }
 
     fn backward(

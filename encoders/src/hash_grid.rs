@@ -288,8 +288,20 @@ fn entry_mut<T>(table: &mut [T], i: u32) -> &mut T {
     unsafe { table.get_unchecked_mut(i as usize) }
 }
 
+/// The features of one entry, in registers of four. Left to itself the compiler works on many rows at once and gathers
+/// their entries number by number, which takes several times as long as one read an entry.
+#[inline(always)]
+fn fours<S: Simd, R: Real, const F: usize>(s: S, x: &[R; F]) -> [R::Four<S>; 2] {
+    let mut lanes = [[R::ZERO; 4]; 2];
+    for f in 0..F {
+        lanes[f / 4][f % 4] = x[f];
+    }
+    [R::Four::<S>::from_slice(s, &lanes[0]), R::Four::<S>::from_slice(s, &lanes[1])]
+}
+
 struct Forward<'a, R, P> {
     stage: &'a HashGridStage,
+    levels: Range<usize>,
     params: &'a [P],
     x: Tile<'a, R>,
     y: TileMut<'a, R>,
@@ -303,7 +315,7 @@ impl<R: Real, P: Stored<R>> Forward<'_, R, P> {
         let (mut read, mut wide) = ([[P::default(); F]; 8 * BLOCK], [[R::ZERO; F]; 8 * BLOCK]);
         let mut located = Located::new();
         let mut out = [[R::ZERO; BLOCK]; F];
-        for level in &self.stage.levels {
+        for level in &self.stage.levels[self.levels.clone()] {
             let (table, _) = self.params[self.stage.params_of(level)].as_chunks::<F>();
             assert_eq!(table.len(), level.entries as usize);
             for at in (0..self.x.rows).step_by(BLOCK) {
@@ -321,19 +333,20 @@ impl<R: Real, P: Stored<R>> Forward<'_, R, P> {
                     }
                 }
                 for i in 0..n {
-                    let mut sum = [R::ZERO; F];
+                    let mut sum = [R::Four::<S>::splat(s, R::ZERO); 2];
                     for c in 0..8 {
-                        let w = located.weight[c][i];
-                        for f in 0..F {
-                            sum[f] += w * if widen {
-                                wide[8 * i + c][f]
-                            } else {
-                                entry(table, located.index[c][i])[f].value()
-                            };
+                        let read = if widen {
+                            wide[8 * i + c]
+                        } else {
+                            entry(table, located.index[c][i]).map(|p| p.value())
+                        };
+                        let (w, read) = (R::Four::<S>::splat(s, located.weight[c][i]), fours(s, &read));
+                        for q in 0..F.div_ceil(4) {
+                            sum[q] = read[q].mul_add(w, sum[q]);
                         }
                     }
                     for f in 0..F {
-                        out[f][i] = sum[f];
+                        out[f][i] = sum[f / 4].as_slice()[f % 4];
                     }
                 }
                 for (out, channel) in out.iter().zip(&level.outputs) {
@@ -398,10 +411,16 @@ impl<R: Real, P: Stored<R>> Backward<'_, R, P> {
                     assert_eq!(grads.len(), level.entries as usize);
                     prefetch(grads, &located, n);
                     for i in 0..n {
+                        let dy = fours(s, &dy[i]);
                         for c in 0..8 {
-                            let (g, w) = (entry_mut(grads, located.index[c][i]), located.weight[c][i]);
+                            let w = R::Four::<S>::splat(s, located.weight[c][i]);
+                            let g = entry_mut(grads, located.index[c][i]);
+                            let mut sum = fours(s, g);
+                            for q in 0..F.div_ceil(4) {
+                                sum[q] = dy[q].mul_add(w, sum[q]);
+                            }
                             for f in 0..F {
-                                g[f] += w * dy[i][f];
+                                g[f] = sum[f / 4].as_slice()[f % 4];
                             }
                         }
                     }
@@ -459,7 +478,15 @@ impl<R: Real, P: Stored<R>> Op for Backward<'_, R, P> {
 
 impl<R: Real, P: Stored<R>> Kernel<R, P> for HashGridStage {
     fn forward(&self, params: &[P], x: Tile<'_, R>, y: TileMut<'_, R>, _: TileMut<'_, R>) {
-        run(Forward { stage: self, params, x, y });
+        run(Forward { stage: self, levels: 0..self.levels.len(), params, x, y });
+    }
+
+    fn passes(&self) -> usize {
+        self.levels.len()
+    }
+
+    fn forward_pass(&self, pass: usize, params: &[P], x: Tile<'_, R>, y: TileMut<'_, R>, _: TileMut<'_, R>) {
+        run(Forward { stage: self, levels: pass..pass + 1, params, x, y });
     }
 
     fn backward(

@@ -299,14 +299,13 @@ pub(crate) fn activate<S: Simd, R: Real>(s: S, act: Activation, z: &mut [R], h: 
                     let len = V::<S, R>::LEN;
                     let mut i = 0;
                     while i + AT_ONCE * len <= z.len() {
-                        let mut x = [V::<S, R>::splat(s, R::ZERO); AT_ONCE];
-                        for k in 0..AT_ONCE {
-                            x[k] = load(s, z, i + k * len);
-                        }
+                        // Whole vectors: a tail's branch between them would have them wait for one another.
+                        let (z, h) = (&mut z[i..i + AT_ONCE * len], &mut h[i..i + AT_ONCE * len]);
+                        let x = std::array::from_fn(|k| V::<S, R>::from_slice(s, &z[k * len..(k + 1) * len]));
                         let [y, slope] = Activation::$a.at::<S, R, AT_ONCE>(s, x);
                         for k in 0..AT_ONCE {
-                            store::<S, R>(y[k], h, i + k * len);
-                            store::<S, R>(slope[k], z, i + k * len);
+                            y[k].store_slice(&mut h[k * len..(k + 1) * len]);
+                            slope[k].store_slice(&mut z[k * len..(k + 1) * len]);
                         }
                         i += AT_ONCE * len;
                     }

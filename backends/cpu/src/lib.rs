@@ -1,10 +1,10 @@
 //! The CPU backend.
 //!
-//! A step goes wave by wave (some ten thousand rows). In a wave, each slot samples and encodes its share of the rays
-//! at once, so that it goes through a level's table while that is in the cache; then it takes them in groups:
-//! normalise, evaluate the field, integrate, take the loss and go backward, tile by tile, while a tile is in the
-//! cache ([`rows`]). Dense stages sum their gradients in copies of their own, one a slot, merged in order. Stages
-//! with scattered parameters get the rows of the wave a second time, each worker with a range of parameters of its
+//! A step goes wave by wave (some hundred thousand rows). In a wave, every slot samples its share of the rays; all slots
+//! then go through the encoder pass by pass, so that a level's table is read while it is in the cache; then each takes
+//! its share in groups: normalise, evaluate the field, integrate, take the loss and go backward, tile by tile, while a
+//! tile is in the cache ([`rows`]). Dense stages sum their gradients in copies of their own, one a slot, merged in order.
+//! Stages with scattered parameters get the rows of the wave a second time, each worker with a range of parameters of its
 //! own ([`step`]). Where tables are read in halves, these are a copy of the parameters ([`halves`]) that each update makes
 //! anew ([`adam`]). The number of slots and the order of every sum depend on the plan alone: the same bits come out
 //! on any number of threads.
@@ -26,7 +26,7 @@ use rows::{Belong, Encoded, Kernels, Scratch};
 use step::Slots;
 
 /// Points that are encoded at once when the field is evaluated.
-const CHUNK_ROWS: usize = 4096;
+const CHUNK_ROWS: usize = 32_768;
 
 /// The CPU backend: rayon threads, SIMD chosen at run time.
 #[derive(Debug, Clone, Copy, Default)]

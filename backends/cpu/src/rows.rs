@@ -68,6 +68,11 @@ impl<'a, R: Real> Kernels<'a, R> {
         Some(Self { steps, scope: pipeline.scope() })
     }
 
+    /// Passes that the encoder goes in.
+    pub fn encoder_passes(&self) -> usize {
+        self.steps[0].kernel.passes()
+    }
+
     /// Channels that the encoder computes.
     pub fn encoder_width(&self) -> usize {
         self.steps[0].info.output
@@ -253,19 +258,33 @@ pub struct Encoded<R> {
 impl<R: Real> Encoded<R> {
     /// Encodes `points`.
     pub fn forward(&mut self, kernels: &Kernels<'_, R>, params: &[R], points: &[[f32; 3]]) {
+        self.begin(kernels, points);
+        for pass in 0..kernels.encoder_passes() {
+            self.pass(kernels, params, pass);
+        }
+    }
+
+    /// Takes `points`, which [`Encoded::pass`] then encodes.
+    pub fn begin(&mut self, kernels: &Kernels<'_, R>, points: &[[f32; 3]]) {
         let (s, n) = (&kernels.steps[0], points.len());
         self.log.rows.clear();
         self.log.rows.extend((n > 0).then_some(n));
         self.log.data.resize((3 + s.info.output) * n, R::ZERO);
         self.tape.resize(s.info.tape * n, R::ZERO);
-        let (x, y) = self.log.data.split_at_mut(3 * n);
-        for (k, x) in x.chunks_exact_mut(n.max(1)).enumerate() {
+        for (k, x) in self.log.data[..3 * n].chunks_exact_mut(n.max(1)).enumerate() {
             for (x, p) in x.iter_mut().zip(points) {
                 *x = R::of(f64::from(p[k]));
             }
         }
+    }
+
+    /// One pass of the encoder, `pass` of [`Kernels::encoder_passes`].
+    pub fn pass(&mut self, kernels: &Kernels<'_, R>, params: &[R], pass: usize) {
+        let (s, n) = (&kernels.steps[0], self.rows());
+        let (x, y) = self.log.data.split_at_mut(3 * n);
         if n > 0 {
-            s.kernel.forward(
+            s.kernel.forward_pass(
+                pass,
                 &params[s.params.clone()],
                 Tile::new(x, n),
                 TileMut::new(y, n),

@@ -9,8 +9,10 @@ use rayon::prelude::*;
 use std::ops::Range;
 use std::time::Instant;
 
-/// Rows of a wave: its logs stay in the last-level cache, its work keeps many workers busy.
-const WAVE_ROWS: usize = 65_536;
+/// Rows of a wave at most: enough for every entry of a large table to be used several times while it is in the cache.
+const WAVE_ROWS: usize = 393_216;
+/// Bytes that a wave may take, of stages that keep many numbers a row.
+const WAVE_BYTES: usize = 64 << 20;
 /// Rows of a group: what a worker carries through forward and backward at once.
 const GROUP_ROWS: usize = 512;
 /// Groups of a wave are dealt to this many slots at most, each with its own sums.
@@ -71,9 +73,8 @@ impl<R: Real> Slots<R> {
     /// Bytes that slots for `kernels` come to hold once steps are under way.
     pub fn bytes(kernels: &Kernels<'_, R>) -> usize {
         let dense = DenseGrads::numbers(kernels);
-        let wave = kernels.encoded_numbers() + kernels.logged_numbers();
-        let numbers = WAVE_ROWS * wave + Self::count(dense) * (dense + GROUP_ROWS * kernels.scratch_numbers());
-        numbers * size_of::<R>() + WAVE_ROWS * SAMPLE_BYTES
+        let numbers = Self::count(dense) * (dense + GROUP_ROWS * kernels.scratch_numbers());
+        numbers * size_of::<R>() + wave_rows(kernels) * row_bytes(kernels)
     }
 
     /// Adds the gradients of `work`'s loss to `grads`.
@@ -93,9 +94,13 @@ impl<R: Real> Slots<R> {
         for wave in waves(kernels, projector, work) {
             let start = Instant::now();
             let share = wave.len().div_ceil(self.slots.len()).max(1);
+            let groups = |i: usize| &wave[(i * share).min(wave.len())..((i + 1) * share).min(wave.len())];
+            self.slots.par_iter_mut().enumerate().for_each(|(i, slot)| slot.begin(kernels, projector, work, groups(i)));
+            for pass in 0..kernels.encoder_passes() {
+                self.slots.par_iter_mut().for_each(|slot| slot.encoded.pass(kernels, params, pass));
+            }
             self.slots.par_iter_mut().enumerate().for_each(|(i, slot)| {
-                let from = (i * share).min(wave.len());
-                slot.run(kernels, projector, params, work, &wave[from..(from + share).min(wave.len())]);
+                slot.learn_all(kernels, projector, params, work, groups(i));
             });
             let dense_done = Instant::now();
             self.scatter(kernels, params, grads);
@@ -153,6 +158,16 @@ impl<R: Real> Slots<R> {
     }
 }
 
+/// Rows of a wave. They depend on the plan alone, since they decide the order of sums.
+fn wave_rows<R: Real>(kernels: &Kernels<'_, R>) -> usize {
+    (WAVE_BYTES / row_bytes(kernels)).clamp(GROUP_ROWS, WAVE_ROWS)
+}
+
+/// Bytes of a row that are kept until its wave is through.
+fn row_bytes<R: Real>(kernels: &Kernels<'_, R>) -> usize {
+    (kernels.encoded_numbers() + kernels.logged_numbers()) * size_of::<R>() + SAMPLE_BYTES
+}
+
 /// Cuts the work into groups, and these into waves.
 fn waves<R: Real>(kernels: &Kernels<'_, R>, projector: &dyn Projector, work: &Work<'_>) -> Vec<Vec<Group>> {
     let mut groups: Vec<(Group, usize)> = vec![];
@@ -180,10 +195,11 @@ fn waves<R: Real>(kernels: &Kernels<'_, R>, projector: &dyn Projector, work: &Wo
             groups.push((Group::Tv(start..end), (end - start) * block));
         }
     }
+    let most = wave_rows(kernels);
     let mut waves = vec![vec![]];
     let mut rows = 0;
     for (group, n) in groups {
-        if rows > 0 && rows + n > WAVE_ROWS {
+        if rows > 0 && rows + n > most {
             waves.push(vec![]);
             rows = 0;
         }
@@ -196,15 +212,8 @@ fn waves<R: Real>(kernels: &Kernels<'_, R>, projector: &dyn Projector, work: &Wo
 }
 
 impl<R: Real> Slot<R> {
-    /// Forward and backward of `groups`: all encoded at once, the rest group by group.
-    fn run(
-        &mut self,
-        kernels: &Kernels<'_, R>,
-        projector: &dyn Projector,
-        params: &[R],
-        work: &Work<'_>,
-        groups: &[Group],
-    ) {
+    /// Samples `groups`, which the encoder then goes through.
+    fn begin(&mut self, kernels: &Kernels<'_, R>, projector: &dyn Projector, work: &Work<'_>, groups: &[Group]) {
         self.samples.points.clear();
         self.samples.weights.clear();
         self.counts.clear();
@@ -212,7 +221,18 @@ impl<R: Real> Slot<R> {
         for group in groups {
             self.place(kernels, projector, work, group);
         }
-        self.encoded.forward(kernels, params, &self.samples.points);
+        self.encoded.begin(kernels, &self.samples.points);
+    }
+
+    /// Once `groups` are encoded: forward and backward of all that follows, group by group.
+    fn learn_all(
+        &mut self,
+        kernels: &Kernels<'_, R>,
+        projector: &dyn Projector,
+        params: &[R],
+        work: &Work<'_>,
+        groups: &[Group],
+    ) {
         for (i, group) in groups.iter().enumerate() {
             self.learn(kernels, projector, params, work, group, i);
         }
