@@ -250,14 +250,7 @@ impl<H: Half> Kernel<f32> for Reader<'_, H> {
         self.kernel.passes()
     }
 
-    fn forward_pass(
-        &self,
-        pass: usize,
-        _: &[f32],
-        x: Tile<'_, f32>,
-        y: TileMut<'_, f32>,
-        tape: TileMut<'_, f32>,
-    ) {
+    fn forward_pass(&self, pass: usize, _: &[f32], x: Tile<'_, f32>, y: TileMut<'_, f32>, tape: TileMut<'_, f32>) {
         self.kernel.forward_pass(pass, self.params, x, y, tape);
     }
 

@@ -335,11 +335,8 @@ impl<R: Real, P: Stored<R>> Forward<'_, R, P> {
                 for i in 0..n {
                     let mut sum = [R::Four::<S>::splat(s, R::ZERO); 2];
                     for c in 0..8 {
-                        let read = if widen {
-                            wide[8 * i + c]
-                        } else {
-                            entry(table, located.index[c][i]).map(|p| p.value())
-                        };
+                        let read =
+                            if widen { wide[8 * i + c] } else { entry(table, located.index[c][i]).map(|p| p.value()) };
                         let (w, read) = (R::Four::<S>::splat(s, located.weight[c][i]), fours(s, &read));
                         for q in 0..F.div_ceil(4) {
                             sum[q] = read[q].mul_add(w, sum[q]);

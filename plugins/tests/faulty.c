@@ -22,6 +22,8 @@ enum Fault {
     MORE_PARAMETERS,
     TWIN_BLOCKS,
     PAST_TILE,
+    NO_FORWARD_PASS,
+    WRONG_PASSES,
     BEFORE_GRADIENTS,
     WRONG_GRADIENT,
     WRONG_INPUT_GRADIENT,
@@ -121,6 +123,18 @@ static ConefieldStatus forward(const void *stage, const float *params, struct Co
     return CONEFIELD_OK;
 }
 
+static size_t passes(const void *stage) {
+    (void)stage;
+    return FAULT == NO_FORWARD_PASS || FAULT == WRONG_PASSES ? 2 : 1;
+}
+
+static ConefieldStatus forward_pass(const void *stage, size_t pass, const float *params, struct ConefieldTile x,
+                                    struct ConefieldTileMut y, struct ConefieldTileMut tape, struct ConefieldText *error) {
+    ConefieldStatus status = forward(stage, params, x, y, tape, error);
+    if (FAULT == WRONG_PASSES && pass == 1) y.data[0] += 1.0f;
+    return status;
+}
+
 static ConefieldStatus backward(const void *stage, const float *params, struct ConefieldTile x,
                                 struct ConefieldTileMut tape, struct ConefieldTile dy, struct ConefieldGrads grads,
                                 struct ConefieldTileMut dx, struct ConefieldText *error) {
@@ -147,6 +161,8 @@ static const struct ConefieldMap MAP = {
     .init = init,
     .forward = FAULT == NO_FORWARD ? NULL : forward,
     .backward = backward,
+    .passes = passes,
+    .forward_pass = FAULT == NO_FORWARD_PASS ? NULL : forward_pass,
 };
 
 static const struct ConefieldStage STAGES[] = {{

@@ -59,6 +59,12 @@ const FAULTS: &[Fault] = &[
     ),
     untried("two blocks of one name", &["FAULT=TWIN_BLOCKS"], "two blocks are called \"factor\""),
     untried("writes past its tile", &["FAULT=PAST_TILE"], "it writes outside its output: 1 past"),
+    untried(
+        "passes without a function for them",
+        &["FAULT=NO_FORWARD_PASS"],
+        "it goes forward in 2 passes with no function forward_pass",
+    ),
+    untried("passes that are not its forward", &["FAULT=WRONG_PASSES"], "its passes together are not its forward"),
     untried("writes before its gradients", &["FAULT=BEFORE_GRADIENTS"], "it writes outside its gradients: 1 before"),
     untried("returns NaN", &["FAULT=NOT_A_NUMBER"], "number 0 of 3 of its output is NaN"),
     untried("fails", &["FAULT=FAILS"], "forward failed: no more numbers"),

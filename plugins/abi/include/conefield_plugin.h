@@ -14,7 +14,7 @@
 /*
  Minor version: tables have grown so many times.
  */
-#define CONEFIELD_ABI_MINOR 0
+#define CONEFIELD_ABI_MINOR 1
 
 /*
  Points to features.
@@ -483,6 +483,22 @@ typedef struct ConefieldMap {
    it runs on the CPU alone.
    */
   ConefieldStatus (*wgsl)(const void *stage, struct ConefieldText *source);
+  /*
+   How many passes `forward` goes in, each over a table of its own; always the same for one stage. A host with many
+   tiles sends all of them through one pass before the next, while its table is in the cache. NULL: one. Since 1.1.
+   */
+  size_t (*passes)(const void *stage);
+  /*
+   Pass `pass` of `forward`, counted from 0; all in order leave the same bits as `forward`. What other passes write
+   stays. NULL where `passes` is. Since 1.1.
+   */
+  ConefieldStatus (*forward_pass)(const void *stage,
+                                  size_t pass,
+                                  const float *params,
+                                  struct ConefieldTile x,
+                                  struct ConefieldTileMut y,
+                                  struct ConefieldTileMut tape,
+                                  struct ConefieldText *error);
 } ConefieldMap;
 
 /*

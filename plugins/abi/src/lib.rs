@@ -12,7 +12,7 @@
 //! - **Tiles** are channel-major: channel `c` of row `i` is `data[c * stride + i]`. A pointer may be NULL where there is
 //!   nothing (no channels, no parameters). Floats are aligned to their own size and no more.
 //! - **Threads.** A stage is called from many threads at once: `info`, `parameter`, `partition`, `describe`, `init`,
-//!   `forward`, `backward`, `max_samples`, `sample`, `integrate`, `adjoint`, `apply` and `wgsl` must allow that. `create`,
+//!   `forward`, `passes`, `forward_pass`, `backward`, `max_samples`, `sample`, `integrate`, `adjoint`, `apply` and `wgsl` must allow that. `create`,
 //!   `destroy`, `reduce`, `refresh` and `decided` of one stage are not called at the same time as anything else of that
 //!   stage, though from any thread.
 //! - **Unwinding** must not leave the library: catch panics and exceptions, return [`CONEFIELD_PANICKED`].
@@ -23,7 +23,7 @@ use std::ffi::c_void;
 /// Major version of this contract. A plugin of another one is refused.
 pub const CONEFIELD_ABI_MAJOR: u32 = 1;
 /// Minor version: tables have grown so many times.
-pub const CONEFIELD_ABI_MINOR: u32 = 0;
+pub const CONEFIELD_ABI_MINOR: u32 = 1;
 
 /// What a function returns.
 pub type ConefieldStatus = i32;
@@ -368,6 +368,22 @@ pub struct ConefieldMap {
     /// WGSL of the same formula: functions `stage_forward` and `stage_backward` of a row, as docs/plugins.md says. NULL:
     /// it runs on the CPU alone.
     pub wgsl: Option<unsafe extern "C" fn(stage: *const c_void, source: *mut ConefieldText) -> ConefieldStatus>,
+    /// How many passes `forward` goes in, each over a table of its own; always the same for one stage. A host with many
+    /// tiles sends all of them through one pass before the next, while its table is in the cache. NULL: one. Since 1.1.
+    pub passes: Option<unsafe extern "C" fn(stage: *const c_void) -> usize>,
+    /// Pass `pass` of `forward`, counted from 0; all in order leave the same bits as `forward`. What other passes write
+    /// stays. NULL where `passes` is. Since 1.1.
+    pub forward_pass: Option<
+        unsafe extern "C" fn(
+            stage: *const c_void,
+            pass: usize,
+            params: *const f32,
+            x: ConefieldTile,
+            y: ConefieldTileMut,
+            tape: ConefieldTileMut,
+            error: *mut ConefieldText,
+        ) -> ConefieldStatus,
+    >,
 }
 
 /// A ray in the unit cube: `origin + t * direction`, where `t` counts cube sides.

@@ -57,7 +57,7 @@ fn the_header_is_current() {
 #[test]
 #[cfg(target_pointer_width = "64")]
 fn the_layout_is_pinned() {
-    assert_eq!((CONEFIELD_ABI_MAJOR, CONEFIELD_ABI_MINOR), (1, 0));
+    assert_eq!((CONEFIELD_ABI_MAJOR, CONEFIELD_ABI_MINOR), (1, 1));
     let sizes = [
         size_of::<ConefieldStr>(),
         size_of::<ConefieldText>(),
@@ -77,7 +77,7 @@ fn the_layout_is_pinned() {
         size_of::<ConefieldStage>(),
         size_of::<ConefieldPlugin>(),
     ];
-    assert_eq!(sizes, [16, 24, 32, 32, 24, 80, 32, 16, 40, 72, 104, 44, 48, 48, 16, 112, 88]);
+    assert_eq!(sizes, [16, 24, 32, 32, 24, 80, 32, 16, 40, 72, 120, 44, 48, 48, 16, 112, 88]);
     let plugin = [
         offset_of!(ConefieldPlugin, size),
         offset_of!(ConefieldPlugin, abi_major),
@@ -118,8 +118,10 @@ fn the_layout_is_pinned() {
         offset_of!(ConefieldMap, refresh),
         offset_of!(ConefieldMap, decided),
         offset_of!(ConefieldMap, wgsl),
+        offset_of!(ConefieldMap, passes),
+        offset_of!(ConefieldMap, forward_pass),
     ];
-    assert_eq!(map, [0, 8, 16, 24, 32, 40, 48, 56, 64, 72, 80, 88, 96]);
+    assert_eq!(map, [0, 8, 16, 24, 32, 40, 48, 56, 64, 72, 80, 88, 96, 104, 112]);
     let info = [
         offset_of!(ConefieldInfo, input),
         offset_of!(ConefieldInfo, output),

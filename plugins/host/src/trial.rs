@@ -125,6 +125,20 @@ fn try_map(stage: &dyn Stage) -> Result<Option<String>> {
         if complaint.is_some() {
             return Ok(complaint);
         }
+        if kernel.passes() > 1 {
+            let [mut again, mut left] = [info.output, info.tape].map(|c| Guarded::new(c * rows));
+            for pass in 0..kernel.passes() {
+                let (y, tape) = (TileMut::new(again.inner(), rows), TileMut::new(left.inner(), rows));
+                kernel.forward_pass(pass, params.inner(), Tile::new(x.inner(), rows), y, tape);
+            }
+            stage.fault()?;
+            let complaint = again.broken("output in passes").or_else(|| left.broken("tape in passes"));
+            let same = again.inner() == y.inner() && left.inner() == tape.inner();
+            let complaint = complaint.or_else(|| (!same).then(|| "its passes together are not its forward".into()));
+            if complaint.is_some() {
+                return Ok(complaint);
+            }
+        }
         let dy = vec![1.0; info.output * rows];
         kernel.backward(
             params.inner(),

@@ -34,6 +34,8 @@ pub static MAP: ConefieldMap = ConefieldMap {
     refresh: Some(refresh),
     decided: Some(decided),
     wgsl: Some(wgsl),
+    passes: Some(passes),
+    forward_pass: Some(forward_pass),
 };
 
 /// Functions of every projector.
@@ -261,13 +263,12 @@ macro_rules! strided {
 
 strided! { ConefieldTile f32 ConefieldTileMut f32 ConefieldTile64 f64 ConefieldTileMut64 f64 }
 
+/// `forward` of a kernel, or one pass of it.
 unsafe fn run_forward<R: Real>(
-    kernel: &dyn Kernel<R>,
     info: &ConefieldInfo,
     params: *const R,
-    x: Strided<R>,
-    y: Strided<R>,
-    tape: Strided<R>,
+    [x, y, tape]: [Strided<R>; 3],
+    forward: impl FnOnce(&[R], Tile<'_, R>, TileMut<'_, R>, TileMut<'_, R>),
 ) {
     let rows = x.rows;
     // SAFETY: see the top of this file.
@@ -275,7 +276,7 @@ unsafe fn run_forward<R: Real>(
         let (params, x) = (many(params, info.params), x.read());
         y.write(|y| {
             tape.write(|tape| {
-                kernel.forward(params, Tile::new(&x, rows), TileMut::new(y, rows), TileMut::new(tape, rows));
+                forward(params, Tile::new(&x, rows), TileMut::new(y, rows), TileMut::new(tape, rows));
             });
         });
     }
@@ -323,7 +324,8 @@ macro_rules! kernels {
                     let (stage, known) = map(stage)?;
                     let kernel: Option<&dyn Kernel<$real>> = $pick(stage);
                     let kernel = kernel.ok_or_else(|| Error::unsupported(stage.describe(), NO_DOUBLE))?;
-                    run_forward(kernel, &known.info, params, x.into(), y.into(), tape.into());
+                    let tiles = [x.into(), y.into(), tape.into()];
+                    run_forward(&known.info, params, tiles, |params, x, y, tape| kernel.forward(params, x, y, tape));
                     stage.fault()
                 }
             })
@@ -356,6 +358,38 @@ macro_rules! kernels {
 
 kernels! { forward backward f32, ConefieldTile ConefieldTileMut ConefieldGrads, |s: &'static dyn Stage| Some(s.kernel()) }
 kernels! { forward_f64 backward_f64 f64, ConefieldTile64 ConefieldTileMut64 ConefieldGrads64, |s: &'static dyn Stage| s.reference() }
+
+unsafe extern "C" fn passes(stage: *const c_void) -> usize {
+    let mut passes = 0;
+    guard(ptr::null_mut(), || {
+        // SAFETY: see the top of this file.
+        passes = unsafe { map(stage)? }.0.kernel().passes();
+        Ok(())
+    });
+    passes
+}
+
+unsafe extern "C" fn forward_pass(
+    stage: *const c_void,
+    pass: usize,
+    params: *const f32,
+    x: ConefieldTile,
+    y: ConefieldTileMut,
+    tape: ConefieldTileMut,
+    error: *mut ConefieldText,
+) -> ConefieldStatus {
+    guard(error, || {
+        // SAFETY: see the top of this file.
+        unsafe {
+            let (stage, known) = map(stage)?;
+            let (kernel, tiles) = (stage.kernel(), [x.into(), y.into(), tape.into()]);
+            run_forward(&known.info, params, tiles, |params, x, y, tape| {
+                kernel.forward_pass(pass, params, x, y, tape);
+            });
+            stage.fault()
+        }
+    })
+}
 
 unsafe extern "C" fn reduce(
     stage: *const c_void,

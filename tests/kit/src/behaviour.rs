@@ -1,8 +1,8 @@
 //! How a stage treats what it is handed: sizes, buffers, threads, numbers at the edge.
 
 use crate::call::{
-    Before, Guarded, backward, data, differing, error, forward, forward_over, gradients, params, rows_of, settle,
-    within,
+    Before, Guarded, backward, data, differing, error, forward, forward_in_passes, forward_over, gradients, params,
+    rows_of, settle, within,
 };
 use crate::{Options, Outcome};
 use conefield_core::arena::{Block, Layout, Weights};
@@ -91,6 +91,19 @@ pub fn tile_outputs(stage: &dyn Stage, options: &Options) -> Outcome {
         }
     }
     Outcome::Passed("1, 7, 64 and 256 rows give the bits of one tile".into())
+}
+
+/// All passes in order leave what forward leaves.
+pub fn passes(stage: &dyn Stage, options: &Options) -> Outcome {
+    let (info, k, p) = (stage.info(), stage.kernel(), params::<f32>(stage, options));
+    let n = 37;
+    let (x, _) = data(&info, options, n);
+    let (whole, parts) = (forward(k, &info, &p, &x, n), forward_in_passes(k, &info, &p, &x, n));
+    let complaint = differing("in passes, output", &parts[0], &whole[0]);
+    settle(
+        complaint.or_else(|| differing("in passes, tape", &parts[1], &whole[1])),
+        &format!("{}, together the bits of forward", k.passes()),
+    )
 }
 
 /// Gradients do not depend on the tiles that they are summed over, but for rounding.

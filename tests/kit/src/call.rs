@@ -102,6 +102,16 @@ pub fn forward_over<R: Real>(
     [y.into_inner(), tape.into_inner()]
 }
 
+/// [`forward`], pass by pass.
+pub fn forward_in_passes<R: Real>(k: &dyn Kernel<R>, info: &Info, params: &[R], x: &[R], rows: usize) -> [Vec<R>; 2] {
+    let [mut y, mut tape] = [info.output, info.tape].map(|c| Guarded::new(c * rows, R::of(f64::NAN)));
+    for pass in 0..k.passes() {
+        let (y, tape) = (TileMut::new(y.inner(), rows), TileMut::new(tape.inner(), rows));
+        k.forward_pass(pass, params, Tile::new(x, rows), y, tape);
+    }
+    [y.into_inner(), tape.into_inner()]
+}
+
 /// What [`backward`] starts from.
 #[derive(Clone, Copy)]
 pub struct Before<R> {

@@ -124,6 +124,7 @@ pub fn check(stage: &dyn Stage, options: &Options) -> Report {
     report.add("halves: outputs", || halves::outputs(stage, options));
     report.add("halves: gradients", || halves::gradients(stage, options));
     report.add("tile sizes: outputs", || behaviour::tile_outputs(stage, options));
+    report.add("passes", || behaviour::passes(stage, options));
     report.add("tile sizes: gradients", || behaviour::tile_gradients(stage, options));
     report.add("outputs overwrite", || behaviour::outputs_overwrite(stage, options));
     report.add("gradients add", || behaviour::gradients_add(stage, options));

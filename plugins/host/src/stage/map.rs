@@ -23,6 +23,9 @@ use std::{ptr, slice};
 /// Most parameters, channels, … that a stage may say it has: more would overflow what hosts compute from them.
 const MOST: usize = 1 << 40;
 
+/// Most passes that a stage may go forward in: a host does something for each.
+const MOST_PASSES: usize = 1 << 16;
+
 /// Bytes of what a normalizer says of a mask: a few for each of many channels.
 const LONGEST_REPORT: usize = 1 << 16;
 
@@ -33,6 +36,7 @@ pub struct MapStage {
     info: Info,
     coarse_to_fine: bool,
     double: bool,
+    passes: usize,
     parameters: Vec<Parameter>,
     partition: Vec<Range<usize>>,
     describe: String,
@@ -114,7 +118,14 @@ impl MapStage {
         if double && (map.forward_f64.is_none() || map.backward_f64.is_none()) {
             return Err(wrong("it has no kernels in double precision, and says that it has"));
         }
-        Ok(Self { handle, map, info, coarse_to_fine, double, parameters, partition, describe, fault: Fault::default() })
+        // SAFETY: the stage is alive.
+        let passes = map.passes.map_or(1, |f| unsafe { f(handle.stage) });
+        if passes == 0 || passes > MOST_PASSES || (passes > 1 && map.forward_pass.is_none()) {
+            let there = if map.forward_pass.is_some() { "a" } else { "no" };
+            return Err(wrong(&format!("it goes forward in {passes} passes with {there} function forward_pass")));
+        }
+        let fault = Fault::default();
+        Ok(Self { handle, map, info, coarse_to_fine, double, passes, parameters, partition, describe, fault })
     }
 
     /// The type that it is of.
@@ -238,7 +249,7 @@ fn partition(handle: &Handle, map: &ConefieldMap, i: &ConefieldInfo, grads: Grad
 }
 
 macro_rules! kernel {
-    ($real:ty, $forward:ident $backward:ident, $tile:ident $tile_mut:ident $grads:ident) => {
+    ($real:ty, $forward:ident $backward:ident, $tile:ident $tile_mut:ident $grads:ident, $($passes:item)*) => {
         impl Kernel<$real> for MapStage {
             fn forward(&self, params: &[$real], x: Tile<'_, $real>, y: TileMut<'_, $real>, tape: TileMut<'_, $real>) {
                 let rows = x.rows;
@@ -285,12 +296,36 @@ macro_rules! kernel {
                     dx.data.fill(<$real>::NAN);
                 }
             }
+
+            $($passes)*
         }
     };
 }
 
-kernel! { f32, forward backward, ConefieldTile ConefieldTileMut ConefieldGrads }
-kernel! { f64, forward_f64 backward_f64, ConefieldTile64 ConefieldTileMut64 ConefieldGrads64 }
+kernel! {
+    f32, forward backward, ConefieldTile ConefieldTileMut ConefieldGrads,
+    fn passes(&self) -> usize {
+        self.passes
+    }
+
+    fn forward_pass(&self, pass: usize, params: &[f32], x: Tile<'_, f32>, y: TileMut<'_, f32>, tape: TileMut<'_, f32>) {
+        let Some(f) = self.map.forward_pass.filter(|_| self.passes > 1) else {
+            return self.forward(params, x, y, tape);
+        };
+        let rows = x.rows;
+        let read = ConefieldTile { data: x.data.as_ptr(), channels: x.data.len() / rows, rows, stride: rows };
+        let [out, left] = [&mut *y.data, &mut *tape.data].map(|t| {
+            ConefieldTileMut { data: t.as_mut_ptr(), channels: t.len() / rows, rows, stride: rows }
+        });
+        let mut error = Text::new();
+        // SAFETY: as for `forward`.
+        let status = unsafe { f(self.handle.stage, pass, params.as_ptr(), read, out, left, error.room()) };
+        if !self.settle("forward_pass", status, &error) {
+            y.data.fill(f32::NAN);
+        }
+    }
+}
+kernel! { f64, forward_f64 backward_f64, ConefieldTile64 ConefieldTileMut64 ConefieldGrads64, }
 
 impl Stage for MapStage {
     fn info(&self) -> Info {
