@@ -25,8 +25,10 @@ use rayon::prelude::*;
 use rows::{Belong, Encoded, Kernels, Scratch};
 use step::Slots;
 
-/// Points that are encoded at once when the field is evaluated.
+/// Points that are encoded at once when the field is evaluated, or rays rendered.
 const CHUNK_ROWS: usize = 32_768;
+/// Rays that are rendered at once at most.
+const CHUNK_RAYS: usize = 256;
 
 /// The CPU backend: rayon threads, SIMD chosen at run time.
 #[derive(Debug, Clone, Copy, Default)]
@@ -82,10 +84,11 @@ impl Backend for Cpu {
         }
         let kernels = kernels(pipeline, None)?;
         let copy = if halves { Rounded::BYTES * pipeline.layout().len() } else { 0 };
+        let evaluating = rayon::current_num_threads() * CHUNK_ROWS * kernels.encoded_numbers() * size_of::<f32>();
         let explain = Explain {
             backend: format!("cpu, {}, {} threads", simd::level_name(), rayon::current_num_threads()),
             notes,
-            scratch_bytes: Slots::bytes(&kernels) + copy,
+            scratch_bytes: Slots::bytes(&kernels) + evaluating + copy,
         };
         let tables = if halves { tables } else { Tables::F32 };
         Ok((Box::new(CpuExecutable { slots: None, clean: false, tables, copy: None, current: false }), explain))
@@ -181,23 +184,32 @@ impl Executable for CpuExecutable {
     fn render(&mut self, model: &Model, rays: &[UnitRay], out: &mut [f32]) -> Result<()> {
         let kernels = self.kernels(model)?;
         let projector = model.pipeline.projector.as_ref();
-        out.par_iter_mut().zip(rays).for_each_init(
-            || (Encoded::default(), Scratch::default(), Samples::default(), vec![]),
-            |(encoded, scratch, samples, mu), (out, ray)| {
+        let longest = rays.iter().map(|ray| projector.max_samples(ray)).max().unwrap_or(0);
+        let each = (CHUNK_ROWS / longest.max(1)).clamp(1, CHUNK_RAYS);
+        out.par_chunks_mut(each).zip(rays.par_chunks(each)).for_each_init(
+            || (Encoded::default(), Scratch::default(), Samples::default(), vec![], vec![]),
+            |(encoded, scratch, samples, counts, mu), (out, rays)| {
                 samples.points.clear();
                 samples.weights.clear();
-                projector.sample(ray, None, samples);
-                if samples.points.is_empty() {
-                    *out = 0.0;
-                    return;
+                counts.clear();
+                for ray in rays {
+                    let before = samples.points.len();
+                    projector.sample(ray, None, samples);
+                    counts.push(samples.points.len() - before);
                 }
                 let params = &model.arena.params;
                 encoded.forward(&kernels, params, &samples.points);
-                let tiles = kernels.ray_tiles(samples.points.len());
-                scratch.forward(&kernels, params, encoded, 0, &tiles, Belong::ToRays);
-                mu.clear();
-                mu.extend(scratch.outputs().iter().map(|&m| f64::from(m)));
-                *out = projector.integrate(&samples.weights, mu) as f32;
+                let mut first = 0;
+                for (out, &n) in out.iter_mut().zip(&*counts) {
+                    *out = 0.0;
+                    if n > 0 {
+                        scratch.forward(&kernels, params, encoded, first, &kernels.ray_tiles(n), Belong::ToRays);
+                        mu.clear();
+                        mu.extend(scratch.outputs().iter().map(|&m| f64::from(m)));
+                        *out = projector.integrate(&samples.weights[first..first + n], mu) as f32;
+                    }
+                    first += n;
+                }
             },
         );
         model.pipeline.fault()
