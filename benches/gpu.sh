@@ -31,7 +31,7 @@ if [[ -n $data ]]; then
         small=(--set solver.rays=64 --set projector.samples=64)
         budget=60s
     fi
-    for spec in ni-naf accurate; do
+    for spec in ni-naf balanced; do
         "$bin" -q reconstruct "$out/scan" --spec "$spec" -o "$out/$spec" --force --backend "wgpu:$adapter" --seconds "$budget" \
             --reference truth --set solver.report_every=25 "${small[@]}"
         python3 - "$out/$spec/metrics.jsonl" "$spec" <<'PY'

@@ -3,13 +3,13 @@
 #   bash benches/truncated.sh DATA_FOLDER OUT_FOLDER [SECONDS [SPECS]]
 # DATA_FOLDER holds volumes/abdomen_128.nii.gz. The detector is half as wide as the published one, the volume to reconstruct the
 # 64 x 64 x 128 voxels that all views see. Fields train for SECONDS (60); methods on voxels end by themselves. A line each:
-# PSNR and ssim-2d over that volume, and all seconds; "whole" has all 128 x 128 x 128 voxels as its volume, the same scored.
+# PSNR and ssim_2d over that volume, and all seconds; "whole" has all 128 x 128 x 128 voxels as its volume, the same scored.
 set -euo pipefail
 cd "$(dirname "$0")/.."
 data=$1
 out=$2
 seconds=${3:-60}
-specs=${4:-fdk os-sart fista-tv accurate}
+specs=${4:-fdk os-sart fista-tv balanced}
 cargo build --release --quiet -p conefield
 bin=${CARGO_TARGET_DIR:-target}/release/conefield
 mkdir -p "$out"

@@ -32,7 +32,7 @@ for n in $views; do
         comparisons+=("$n=$folder")
     }
     compare classical fdk,sart,fista-tv
-    compare neural naf,ni-naf,accurate --seconds "${seconds}s"
+    compare neural naf,ni-naf,balanced --seconds "${seconds}s"
 done
 "$bin/views" "$out" "$volume, noisy views, ${seconds} s a neural method" "${comparisons[@]}"
 cat "$out/views.md"

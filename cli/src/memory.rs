@@ -124,6 +124,19 @@ impl Memory {
         });
         Self::most(&moments.collect::<Vec<_>>())
     }
+
+    /// What reading a scan's views takes.
+    pub fn of_views(size: &ScanSize) -> Self {
+        let scan = 4 * (size.pixels + size.test_pixels) + size.reading;
+        Self::most(&[Memory { scan, ..Memory::default() }])
+    }
+
+    /// The same with the volume that it comes with.
+    pub fn of_data_set(size: &ScanSize) -> Self {
+        let scan = 4 * (size.pixels + size.test_pixels);
+        let reading = Memory { scan: scan + size.reading, volume: 4 * size.voxels, ..Memory::default() };
+        Self::most(&[reading, Memory { scan, volume: 8 * size.voxels, ..Memory::default() }])
+    }
 }
 
 /// What a reconstruction works on.

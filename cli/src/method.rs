@@ -36,6 +36,8 @@ pub struct Parts {
     /// What the backend made of it; empty without a pipeline.
     pub compiled: Explain,
     scene: Scene,
+    /// Whether a volume is read to start from.
+    from_volume: bool,
 }
 
 impl Parts {
@@ -44,7 +46,9 @@ impl Parts {
         let solver = loaded.spec.solver.build().map_err(|e| loaded.locate(e))?;
         let pipeline = specs::pipeline(loaded, solver.as_ref())?;
         let compiled = pipeline.as_ref().map(|p| backend.compile(p)).transpose()?.map(|c| c.1).unwrap_or_default();
-        Ok(Self { solver, pipeline, compiled, scene: loaded.spec.scene.clone() })
+        let start = loaded.spec.initializer.as_ref().map(|i| i.volume()).transpose();
+        let from_volume = start.map_err(|e| loaded.locate(e))?.flatten().is_some();
+        Ok(Self { solver, pipeline, compiled, scene: loaded.spec.scene.clone(), from_volume })
     }
 
     /// A run of it on a scan of this size, without reference, held-out views and checkpoint.
@@ -52,6 +56,10 @@ impl Parts {
         let mut solver = memory::working(self.solver.as_ref(), &scan);
         if self.pipeline.is_none() || self.solver.successor(&self.scene).is_some() {
             solver[1] += iterative::memory(&self.scene, scan.voxels);
+        }
+        // Solvers of voxels work in that volume. It is there twice while a file's order is turned into the program's.
+        if self.pipeline.is_some() && self.from_volume {
+            solver[1] += 8 * scan.voxels;
         }
         memory::Run {
             scan,
@@ -97,5 +105,17 @@ mod tests {
         for (spec, mask) in [("fista-tv", 1 << 18), ("field-tv", 1 << 18), ("fast", 0)] {
             assert_eq!(takes(spec, "carve"), takes(spec, "box") + mask, "{spec}");
         }
+    }
+
+    #[test]
+    fn a_volume_that_a_field_learns_first_is_reckoned() {
+        let scan = ScanSize { pixels: 1 << 16, voxels: 1 << 18, test_pixels: 0, reading: 0 };
+        let takes = |sets: &[String]| {
+            let loaded = specs::read("fast", sets).unwrap();
+            let [_, voxels] = Parts::of(&loaded, &Cpu::new()).unwrap().run(scan).solver;
+            voxels
+        };
+        let from = "initializer={ type = \"volume\", path = \"some.nii.gz\" }".to_owned();
+        assert_eq!(takes(&[from]), takes(&[]) + (8 << 18));
     }
 }

@@ -3,6 +3,7 @@
 use conefield_core::scan::Volume;
 use conefield_io::I0;
 use conefield_projectors::simulate::{HuMapping, Noise};
+use std::collections::BTreeSet;
 use std::fmt::Display;
 use std::path::PathBuf;
 use std::str::FromStr;
@@ -95,10 +96,10 @@ pub enum HoldOut {
 }
 
 impl HoldOut {
-    /// Indices among `n` views.
+    /// Indices among `n` views, each once, in their order.
     pub fn views(&self, n: usize) -> Vec<usize> {
         match self {
-            Self::Views(v) => v.clone(),
+            Self::Views(v) => v.iter().copied().collect::<BTreeSet<_>>().into_iter().collect(),
             Self::Every(k) => (0..n).skip(k / 2).step_by(*k).collect(),
         }
     }
@@ -233,6 +234,7 @@ mod tests {
         assert!(i0("0").is_err() && i0("water").is_err());
         assert_eq!(hold_out("3,17"), Ok(HoldOut::Views(vec![3, 17])));
         assert_eq!(hold_out("every:10").unwrap().views(25), [5, 15]);
+        assert_eq!(hold_out("7,3,7").unwrap().views(25), [3, 7]);
         assert_eq!(hold_out_or_none("none"), Ok(HoldOutOrNone(None)));
         assert!(hold_out_or_none("no").is_err());
         assert_eq!(share("1"), Ok(1.0));

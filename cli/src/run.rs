@@ -28,10 +28,12 @@ impl RunFolder {
     pub fn create(path: &Path, force: bool) -> Result<Self> {
         let io = |e| Error::io(path, e);
         fs::create_dir_all(path).map_err(io)?;
-        sweep(path)?;
         let mut found = vec![];
         for entry in fs::read_dir(path).map_err(io)? {
-            found.push(entry.map_err(io)?.file_name().to_string_lossy().into_owned());
+            let name = entry.map_err(io)?.file_name();
+            if !conefield_io::is_unfinished(&name) {
+                found.push(name.to_string_lossy().into_owned());
+            }
         }
         found.sort();
         let place = path.display().to_string();
@@ -43,6 +45,8 @@ impl RunFolder {
             let found = "an earlier run";
             return Err(Error::invalid(place, "output", found, "a new or empty folder, or --force to replace the run"));
         }
+        // Not before: in a folder that is refused, another command may be about to finish such a file.
+        sweep(path)?;
         for old in found {
             fs::remove_file(path.join(&old)).map_err(|e| Error::io(path.join(&old), e))?;
         }

@@ -101,6 +101,9 @@ fn an_interrupted_run_goes_on_with_what_it_chose() {
     assert_eq!(output.status.code(), Some(130), "{}", String::from_utf8(output.stderr).unwrap());
     let said = refused(1, &[&line[..5], &["7s", "--resume"]].concat());
     assert!(said.contains("--resume: budget"), "{said}");
+    let unplanned = ["reconstruct", &scan, "-o", &path, "--spec", &text(&out.join("spec.toml")), "--resume"];
+    let said = refused(1, &unplanned);
+    assert!(said.contains("--resume: budget"), "{said}");
     let record = json(&[&line[..6], &["--resume", "--json"]].concat());
     let spec = fs::read_to_string(out.join("spec.toml")).unwrap();
     assert!(spec.contains("type = \"sirt\"") && spec.contains("relaxation = 1.5"), "{spec}");

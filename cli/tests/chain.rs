@@ -238,6 +238,21 @@ fn simulation_takes_noise_offset_and_angles() {
     assert_eq!(arc["line_integrals"], again["line_integrals"], "the seed decides");
     let other = made("other", &["--angles", "-90:180", "--views", "5", "--noise", "poisson:1e3", "--seed", "1"]);
     assert_ne!(arc["line_integrals"], other["line_integrals"]);
+    let protocol = dir.path().join("protocol.toml");
+    let text_of = "dso = 5.0\ndsd = 7.0\ndetector = [12, 20]\nextent = { side = [4.0, 4.0] }\nnoise = \"poisson:1e3\"\nseed = 1\n\
+                   angles = { even = { views = 5, start_deg = -90.0, arc_deg = 180.0 } }\nunit = { name = \"half\", mm = 300.0 }\n";
+    fs::write(&protocol, text_of).unwrap();
+    let protocol = text(&protocol);
+    let told = |more: &[&str]| {
+        let out = text(&dir.path().join("told"));
+        let line = ["simulate", "phantom:head:16", "-o", &out, "--protocol", &protocol, "--force", "--json"];
+        json(&[&line[..], more].concat())["seed"].clone()
+    };
+    assert_eq!(
+        (told(&[]), told(&["--seed", "0"])),
+        (1.into(), 0.into()),
+        "the protocol's seed, unless another is asked for"
+    );
 }
 
 #[test]

@@ -35,6 +35,18 @@ fn sets_and_json() {
     assert!(e["backend"]["backend"].as_str().unwrap().starts_with("cpu"));
 }
 
+/// A key that excludes another one takes its place in nested stages, too.
+#[test]
+fn the_uppermost_layer_decides_in_stages_of_stages() {
+    let said = done(&["explain", "field-tv", "--set", "solver.first.decay={ exponential = 0.1 }"]);
+    assert!(said.contains("field-tv"), "{said}");
+    let dir = tempdir().unwrap();
+    let path = dir.path().join("mine.toml");
+    std::fs::write(&path, "extends = \"field-tv\"\nname = \"mine\"\n[solver.first]\ndecay = { exponential = 0.1 }\n")
+        .unwrap();
+    done(&["explain", &text(&path)]);
+}
+
 #[test]
 fn a_scan_adds_its_memory() {
     let dir = tempdir().unwrap();

@@ -123,6 +123,23 @@ fn a_run_is_not_mixed_with_other_files() {
     assert!(said.contains("--force"), "{said}");
 }
 
+/// Another command may be about to finish a file there.
+#[test]
+fn a_folder_that_is_refused_is_left_as_it_is() {
+    let dir = tempdir().unwrap();
+    let (scan, other) = (dir.path().join("scan"), dir.path().join("other"));
+    common::done(&["simulate", "phantom:head:16", "-o", &text(&scan), "--views", "4", "--detector", "8x8"]);
+    fs::create_dir(&other).unwrap();
+    fs::write(other.join("notes.txt"), "mine").unwrap();
+    fs::write(other.join(".conefield-0.tmp"), "under way").unwrap();
+    let said = refused(1, &["reconstruct", &text(&scan), "--spec", "fdk", "-o", &text(&other)]);
+    assert!(said.contains("notes.txt"), "{said}");
+    assert!(other.join(".conefield-0.tmp").exists());
+    fs::remove_file(other.join("notes.txt")).unwrap();
+    common::done(&["reconstruct", &text(&scan), "--spec", "fdk", "-o", &text(&other)]);
+    assert!(!other.join(".conefield-0.tmp").exists());
+}
+
 #[test]
 fn views_that_are_not_there_are_refused() {
     let dir = tempdir().unwrap();
@@ -130,6 +147,8 @@ fn views_that_are_not_there_are_refused() {
     common::done(&["simulate", "phantom:head:16", "-o", &scan, "--views", "4", "--detector", "8x8"]);
     let said = refused(1, &["reconstruct", &scan, "--spec", "naf", "-o", &run, "--hold-out", "4"]);
     assert!(said.contains("found 4, expected an index below 4"), "{said}");
+    let said = refused(1, &["reconstruct", &scan, "--spec", "naf", "-o", &run, "--hold-out", "every:100"]);
+    assert!(said.contains("--hold-out: found every:100, which is none of 4 views"), "{said}");
     let said = refused(1, &["reconstruct", &scan, "--spec", "naf", "-o", &run, "--init", "no.safetensors"]);
     assert!(said.contains("no.safetensors"), "{said}");
     assert!(!dir.path().join("run").exists(), "nothing is made before the input is known to be good");

@@ -5,7 +5,7 @@ use crate::backend::{Backend, Executable};
 use crate::error::{Result, ensure};
 use crate::scene::Scene;
 use crate::spec::{OccupancyRule, Spec, Tables};
-use crate::stage::{Encoder, Field, Info, Normalizer, Probe, Projector, Scope, Stage};
+use crate::stage::{Encoder, Field, Info, Lengths, Normalizer, Probe, Projector, Scope, Stage};
 use serde::{Deserialize, Serialize};
 use std::ops::Range;
 
@@ -76,6 +76,8 @@ impl Pipeline {
         // What such a stage makes of a sample depends on those that would be left out.
         let apart = *occupancy == OccupancyRule::Fixed || pipeline.scope() == Scope::Row;
         ensure(apart, "spec", "scene.occupancy", "refined", "\"fixed\", as a stage looks along rays")?;
+        // Of any scene: whether the encoder knows what the projector counts in.
+        pipeline.projector.fitted(pipeline.lengths(1.0, 1.0))?;
         Ok(pipeline)
     }
 
@@ -164,11 +166,18 @@ impl Pipeline {
         (keep.len() < all.len()).then_some(keep)
     }
 
-    /// Takes a scene's voxels for the measure of what counts in them.
-    pub fn fit(&mut self, voxel_mm: f64) {
-        if let Some(fitted) = self.projector.fitted(voxel_mm) {
+    /// Takes a scene's lengths for the measure of what counts in them.
+    pub fn fit(&mut self, scene: &Scene) -> Result<()> {
+        if let Some(fitted) = self.projector.fitted(self.lengths(scene.voxel_mm(), scene.side))? {
             self.projector = fitted;
         }
+        Ok(())
+    }
+
+    /// What settings may count in, of a unit cube with a side of `side` mm.
+    fn lengths(&self, voxel_mm: f64, side: f64) -> Lengths {
+        let finest = self.encoder.resolutions().map(|all| all.into_iter().fold(1.0, f64::max));
+        Lengths { voxel_mm, cell_mm: finest.filter(|n| *n > 1.0).map(|n| side / n) }
     }
 
     /// Removes the channels that normalizer `at` masked: stages before it compute only what is still read, stages

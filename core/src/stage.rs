@@ -344,6 +344,15 @@ pub trait Encoder: Stage {
     }
 }
 
+/// Lengths of a scene that a projector's settings may count in.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Lengths {
+    /// The shortest side of a voxel, mm.
+    pub voxel_mm: f64,
+    /// The side of the encoder's finest cell, mm, where it says how fine it is.
+    pub cell_mm: Option<f64>,
+}
+
 /// A look at the encoder between steps.
 pub trait Probe {
     /// The encoder's features at `points` (unit cube), channel-major `[F][n]`, for the channels still computed.
@@ -438,10 +447,10 @@ pub trait Projector: Send + Sync {
         }
     }
 
-    /// The projector for a volume whose voxels have sides of `voxel_mm` at least, where its settings count in voxels.
-    fn fitted(&self, voxel_mm: f64) -> Option<Box<dyn Projector>> {
-        let _ = voxel_mm;
-        None
+    /// The projector for a scene with these lengths, where its settings count in them.
+    fn fitted(&self, lengths: Lengths) -> Result<Option<Box<dyn Projector>>> {
+        let _ = lengths;
+        Ok(None)
     }
 
     /// What it could not do since this was last asked, as [`Stage::fault`].

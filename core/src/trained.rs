@@ -62,7 +62,7 @@ impl TrainedField {
             scene = scene.within(support, &spec.scene);
         }
         let mut pipeline = Pipeline::build(spec)?;
-        pipeline.fit(scene.voxel_mm());
+        pipeline.fit(&scene)?;
         let mut model = Model::random(pipeline, 0);
         for masked in &placement.masks {
             model.mask(masked)?;

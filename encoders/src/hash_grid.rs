@@ -201,14 +201,16 @@ impl<R: Real> Located<R> {
     fn locate<S: Simd>(&mut self, s: S, level: &Level, primes: [u32; 3], x: Tile<'_, R>, at: usize, n: usize) {
         let number = |x: f64| V::<S, R>::splat(s, R::of(x));
         let (zero, half, scale, top) = (number(0.0), number(0.5), number(level.scale), number(level.scale + 0.5));
+        // `top` may have been rounded up to where another cell would begin.
+        let last = number(f64::from(level.side - 2));
         let mut cell = [[0u32; BLOCK]; 3];
         for d in 0..3 {
             let x = &x.channel(d)[at..at + n];
             let mut i = 0;
             while i < n {
-                // NaN becomes 0 here: `max` returns its other side.
-                let p = load(s, x, i).mul_add(scale, half).max(zero).min(top);
-                let c = p.floor();
+                // NaN becomes 0 here: the precise form returns its other side.
+                let p = load(s, x, i).mul_add(scale, half).max_precise(zero).min(top);
+                let c = p.floor().min(last);
                 store::<S, R>(p - c, &mut self.fraction[d], i);
                 R::cells(s, c, &mut cell[d][i..]);
                 i += V::<S, R>::LEN;
@@ -553,7 +555,8 @@ impl Stage for HashGridStage {
         let f = self.settings.features;
         let code = |l: &Level| {
             let (side, start) = (if l.dense { l.side } else { 0 }, u32::try_from(l.start * f).ok()?);
-            let value = format!("stage_Level({:?}, {side}u, {}u, {start}u)", l.scale as f32, l.entries - 1);
+            let (scale, last) = (l.scale as f32, (l.side - 2) as f32);
+            let value = format!("stage_Level({scale:?}, {last:?}, {side}u, {}u, {start}u)", l.entries - 1);
             Some(LevelCode { value, outputs: l.outputs.clone() })
         };
         let levels = self.levels.iter().map(code).collect::<Option<Vec<_>>>()?;
@@ -606,8 +609,8 @@ impl Encoder for HashGridStage {
 mod tests {
     use super::*;
 
-    struct Locate<'a>(&'a mut Located<f64>, &'a Level, [u32; 3], Tile<'a, f64>);
-    impl Op for Locate<'_> {
+    struct Locate<'a, R>(&'a mut Located<R>, &'a Level, [u32; 3], Tile<'a, R>);
+    impl<R: Real> Op for Locate<'_, R> {
         type Out = ();
         #[inline(always)]
         fn call<S: Simd>(self, s: S) {
@@ -651,6 +654,25 @@ mod tests {
         let naf = HashGridStage::new(&HashGrid::default()).unwrap();
         let entries: Vec<_> = naf.levels.iter().take(4).map(|l| (l.entries, l.dense)).collect();
         assert_eq!(entries, [(4913, true), (35937, true), (274_625, true), (524_288, false)]);
+    }
+
+    /// At the rim of these levels `scale + 0.5`, just below a whole number, is that number in single precision.
+    #[test]
+    fn rounding_at_the_rim_stays_inside_the_table() {
+        for (base_resolution, growth) in [(25, 1.14), (50, 1.13), (50, 1.15), (50, 2.01), (30, 2.05)] {
+            let stage =
+                HashGridStage::new(&HashGrid { levels: 2, base_resolution, growth, ..HashGrid::default() }).unwrap();
+            let level = &stage.levels[1];
+            let up = (level.scale + 0.5) as f32;
+            assert!(f64::from(up) > level.scale + 0.5 && up.fract() == 0.0, "{base_resolution} x {growth}");
+            for x in [1.0f32, 2.0, f32::INFINITY] {
+                let mut located = Located::<f32>::new();
+                run(Locate(&mut located, level, stage.primes, Tile::new(&[x; 3], 1)));
+                assert!(located.index.iter().all(|i| i[0] < level.entries), "{base_resolution} x {growth} at {x}");
+                let total: f32 = located.weight.iter().map(|w| w[0]).sum();
+                assert!((total - 1.0).abs() < 1e-6);
+            }
+        }
     }
 
     #[test]

@@ -4,6 +4,8 @@
 struct stage_Level {
     // Position in cells: x·scale + 1/2, at most `top`.
     scale: f32,
+    // The last cell along a side.
+    last: f32,
     // Vertices along a side where the level is indexed directly, else 0.
     side: u32,
     // Entries less one, where indices are hashes.
@@ -17,11 +19,11 @@ struct stage_Cell {
     fraction: vec3<f32>,
 }
 
-fn stage_locate(x: vec3<f32>, scale: f32) -> stage_Cell {
-    let p = x * scale + 0.5;
+fn stage_locate(x: vec3<f32>, level: stage_Level) -> stage_Cell {
+    let p = x * level.scale + 0.5;
     // A coordinate that is not a number counts as 0.
-    let q = select(vec3<f32>(0.0), min(p, vec3<f32>(scale + 0.5)), p > vec3<f32>(0.0));
-    let corner = floor(q);
+    let q = select(vec3<f32>(0.0), min(p, vec3<f32>(level.scale + 0.5)), p > vec3<f32>(0.0));
+    let corner = min(floor(q), vec3<f32>(level.last));
     return stage_Cell(vec3<u32>(corner), q - corner);
 }
 
@@ -39,7 +41,7 @@ fn stage_weights(cell: stage_Cell, c: u32) -> vec3<f32> {
 }
 
 fn stage_level_forward(x: vec3<f32>, level: stage_Level) -> array<f32, stage_FEATURES> {
-    let cell = stage_locate(x, level.scale);
+    let cell = stage_locate(x, level);
     var sum: array<f32, stage_FEATURES>;
     for (var c = 0u; c < 8u; c++) {
         let entry = stage_entry(level, cell, c);
@@ -53,7 +55,7 @@ fn stage_level_forward(x: vec3<f32>, level: stage_Level) -> array<f32, stage_FEA
 
 // Adds to the gradients of the level's entries; returns the derivative by the point.
 fn stage_level_backward(x: vec3<f32>, level: stage_Level, dy: ptr<function, array<f32, stage_FEATURES>>) -> vec3<f32> {
-    let cell = stage_locate(x, level.scale);
+    let cell = stage_locate(x, level);
     var slope = vec3<f32>(0.0);
     for (var c = 0u; c < 8u; c++) {
         let entry = stage_entry(level, cell, c);

@@ -130,7 +130,7 @@ fn offset(input: &Input, header: &NiftiHeader) -> Result<u64> {
         return Ok(DATA);
     }
     // Beyond 2^24 a 32-bit float no longer counts single bytes; no extension is that long.
-    if offset.fract() != 0.0 || !(HEADER as f32..16_777_216.0).contains(&offset) {
+    if offset.fract() != 0.0 || !(DATA as f32..16_777_216.0).contains(&offset) {
         return Err(input.invalid("vox_offset", offset, "a whole number of bytes from 352 to 16777215"));
     }
     Ok(offset as u64)

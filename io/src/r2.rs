@@ -230,6 +230,11 @@ pub fn write_r2(folder: impl AsRef<Path>, train: &Scan, test: Option<&Scan>, vol
     }
     let known = |n: &str| [META, "proj_train", "proj_test", "vol_gt.npy"].contains(&n);
     folder::may_replace(folder, "R2-Gaussian folder", known, &[META])?;
+    for split in ["proj_train", "proj_test"] {
+        let known = |n: &str| n.starts_with(&format!("{split}_")) && n.ends_with(".npy");
+        let first = format!("{split}_0000.npy");
+        folder::may_replace(&folder.join(split), "R2-Gaussian folder", known, &[&first])?;
+    }
 
     let mm = train.unit.mm;
     let (g, grid) = (&train.geometry, &train.geometry.volume);

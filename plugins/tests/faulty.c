@@ -24,6 +24,7 @@ enum Fault {
     PAST_TILE,
     NO_FORWARD_PASS,
     WRONG_PASSES,
+    REDUCES_NOTHING,
     BEFORE_GRADIENTS,
     WRONG_GRADIENT,
     WRONG_INPUT_GRADIENT,
@@ -154,6 +155,17 @@ static ConefieldStatus backward(const void *stage, const float *params, struct C
     return CONEFIELD_OK;
 }
 
+/* Says that it leaves out channels, and hands itself back. */
+static ConefieldStatus reduce(const void *stage, uint32_t side, const size_t *keep, size_t count,
+                              struct ConefieldReduced *out, struct ConefieldText *error) {
+    (void)side, (void)keep, (void)count, (void)error;
+    static const struct ConefieldRange all = {0, 3};
+    static const size_t channels[] = {0, 1, 2};
+    *out = (struct ConefieldReduced){
+        .stage = (void *)stage, .params = &all, .params_count = 1, .channels = channels, .channels_count = 3};
+    return CONEFIELD_OK;
+}
+
 static const struct ConefieldMap MAP = {
     .size = FAULT == SHORT_FUNCTIONS ? 24 : sizeof MAP,
     .info = info,
@@ -161,6 +173,7 @@ static const struct ConefieldMap MAP = {
     .init = init,
     .forward = FAULT == NO_FORWARD ? NULL : forward,
     .backward = backward,
+    .reduce = FAULT == REDUCES_NOTHING ? reduce : NULL,
     .passes = passes,
     .forward_pass = FAULT == NO_FORWARD_PASS ? NULL : forward_pass,
 };

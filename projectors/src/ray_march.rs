@@ -4,10 +4,10 @@
 //! end (the published sum gives the last sample a weight of 1e-10). Samples stand in the middle of their interval
 //! (midpoint rule, second order) or at a random place in it (stratified, unbiased).
 
-use conefield_core::error::{Result, ensure};
+use conefield_core::error::{Error, Result, ensure};
 use conefield_core::random::{mix, unit};
 use conefield_core::spec::ProjectorSpec;
-use conefield_core::stage::{Projector, Samples, UnitRay};
+use conefield_core::stage::{Lengths, Projector, Samples, UnitRay};
 use conefield_core::wgsl::Fragment;
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
@@ -35,7 +35,7 @@ pub enum Extent {
 /// Settings of `ray-march`.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields, default)]
-#[schemars(extend("x-one-of" = [["samples", "step_mm", "step_voxels"]]))]
+#[schemars(extend("x-one-of" = [["samples", "step_mm", "step_voxels", "step_cells"]]))]
 pub struct RayMarch {
     /// Samples a ray; 192 where neither they nor a step are given.
     #[serde(skip_serializing_if = "Option::is_none")]
@@ -47,6 +47,9 @@ pub struct RayMarch {
     /// through the object asks for.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub step_voxels: Option<f64>,
+    /// The same in sides of the encoder's finest cell: between samples that are closer than these a field has little to tell.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub step_cells: Option<f64>,
     /// Where samples stand in their interval.
     pub sampling: Sampling,
     /// Which part of a ray is sampled.
@@ -56,7 +59,7 @@ pub struct RayMarch {
 impl Default for RayMarch {
     fn default() -> Self {
         let (sampling, extent) = (Sampling::Stratified, Extent::Clipped);
-        Self { samples: None, step_mm: None, step_voxels: None, sampling, extent }
+        Self { samples: None, step_mm: None, step_voxels: None, step_cells: None, sampling, extent }
     }
 }
 
@@ -74,14 +77,20 @@ impl ProjectorSpec for RayMarch {
         ensure((1..=MOST_SAMPLES).contains(&n), "spec", "projector.samples", n, "1 to 65536")?;
         let positive = |step: Option<f64>| step.is_none_or(|s| s.is_finite() && s > 0.0);
         let shown = |step: Option<f64>| step.map_or(String::new(), |s| s.to_string());
-        let step = self.step_mm;
-        ensure(positive(step), "spec", "projector.step_mm", shown(step), "a positive number of mm")?;
-        let step = self.step_voxels;
-        ensure(positive(step), "spec", "projector.step_voxels", shown(step), "a positive number of voxels")?;
-        let ways =
-            [("samples", self.samples.is_some()), ("step_mm", self.step_mm.is_some()), ("step_voxels", step.is_some())];
-        let said: Vec<&str> = ways.iter().filter(|w| w.1).map(|w| w.0).collect();
-        ensure(said.len() <= 1, "spec", "projector", said.join(" and "), "one of samples, step_mm and step_voxels")?;
+        let steps = [
+            ("step_mm", self.step_mm, "mm"),
+            ("step_voxels", self.step_voxels, "voxels"),
+            ("step_cells", self.step_cells, "cells"),
+        ];
+        for (name, step, unit) in steps {
+            let expected = format!("a positive number of {unit}");
+            ensure(positive(step), "spec", &format!("projector.{name}"), shown(step), expected)?;
+        }
+        let said =
+            self.samples.map(|_| "samples").into_iter().chain(steps.iter().filter(|s| s.1.is_some()).map(|s| s.0));
+        let said: Vec<&str> = said.collect();
+        let expected = "one of samples, step_mm, step_voxels and step_cells";
+        ensure(said.len() <= 1, "spec", "projector", said.join(" and "), expected)?;
         Ok(Box::new(self.clone()))
     }
 }
@@ -126,16 +135,28 @@ impl Projector for RayMarch {
         }
     }
 
-    fn fitted(&self, voxel_mm: f64) -> Option<Box<dyn Projector>> {
-        let step = self.step_voxels? * voxel_mm;
-        Some(Box::new(Self { step_mm: Some(step), step_voxels: None, ..self.clone() }))
+    fn fitted(&self, lengths: Lengths) -> Result<Option<Box<dyn Projector>>> {
+        let step = match (self.step_voxels, self.step_cells) {
+            (Some(n), _) => n * lengths.voxel_mm,
+            (_, Some(n)) => {
+                let unknown = || {
+                    let found = "an encoder that does not say how fine it is";
+                    Error::invalid("spec", "projector.step_cells", found, "samples, step_mm or step_voxels with it")
+                };
+                n * lengths.cell_mm.ok_or_else(unknown)?
+            }
+            _ => return Ok(None),
+        };
+        Ok(Some(Box::new(Self { step_mm: Some(step), step_voxels: None, step_cells: None, ..self.clone() })))
     }
 
     fn describe(&self) -> String {
-        let count = match (self.step_mm, self.step_voxels) {
-            (Some(step), _) => format!("a sample every {step} mm"),
-            (_, Some(1.0)) => "a sample every voxel".into(),
-            (_, Some(step)) => format!("a sample every {step} voxels"),
+        let count = match (self.step_mm, self.step_voxels, self.step_cells) {
+            (Some(step), ..) => format!("a sample every {step} mm"),
+            (_, Some(1.0), _) => "a sample every voxel".into(),
+            (_, Some(step), _) => format!("a sample every {step} voxels"),
+            (.., Some(1.0)) => "a sample every finest cell of the encoder".into(),
+            (.., Some(step)) => format!("a sample every {step} of the encoder's finest cells"),
             _ => format!("{} samples a ray", self.count()),
         };
         format!("ray-march: {count}, {:?}, {:?}", self.sampling, self.extent).to_lowercase()
@@ -170,7 +191,7 @@ mod tests {
         for extent in [Extent::Clipped, Extent::Published] {
             for step_mm in [None, Some(0.7)] {
                 let samples = if step_mm.is_none() { Some(7) } else { None };
-                let p = RayMarch { samples, step_mm, step_voxels: None, sampling: Sampling::Uniform, extent };
+                let p = RayMarch { samples, step_mm, sampling: Sampling::Uniform, extent, ..RayMarch::default() };
                 let mut s = Samples::default();
                 p.sample(&ray(), None, &mut s);
                 let length: f32 = s.weights.iter().sum();
@@ -190,7 +211,7 @@ mod tests {
             RayMarch { step_voxels: None, ..all.clone() },
         ] {
             let e = both.build().err().unwrap().to_string();
-            assert!(e.contains("one of samples, step_mm and step_voxels"), "{e}");
+            assert!(e.contains("one of samples, step_mm, step_voxels and step_cells"), "{e}");
         }
         assert_eq!(RayMarch::default().build().unwrap().max_samples(&ray()), SAMPLES);
     }
@@ -208,6 +229,21 @@ mod tests {
             let t = q[0] * 16.0;
             assert!(t >= i as f32 - 1e-4 && t <= i as f32 + 1.0001);
         }
+    }
+
+    #[test]
+    fn steps_in_voxels_and_cells_become_millimetres() {
+        let lengths = Lengths { voxel_mm: 0.5, cell_mm: Some(0.8) };
+        let fitted = |p: &RayMarch, lengths| p.fitted(lengths).map(|p| p.map(|p| p.describe()));
+        let voxels = RayMarch { step_voxels: Some(3.0), ..RayMarch::default() };
+        let cells = RayMarch { step_cells: Some(2.0), ..RayMarch::default() };
+        assert!(fitted(&voxels, lengths).unwrap().unwrap().contains("every 1.5 mm"));
+        assert!(fitted(&cells, lengths).unwrap().unwrap().contains("every 1.6 mm"));
+        assert!(fitted(&RayMarch::default(), lengths).unwrap().is_none());
+        let e = fitted(&cells, Lengths { cell_mm: None, ..lengths }).unwrap_err().to_string();
+        assert!(e.contains("projector.step_cells") && e.contains("does not say how fine"), "{e}");
+        assert!(RayMarch { step_cells: Some(-1.0), ..RayMarch::default() }.build().is_err());
+        assert_eq!(cells.describe(), "ray-march: a sample every 2 of the encoder's finest cells, stratified, clipped");
     }
 
     #[test]

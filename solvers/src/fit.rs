@@ -29,7 +29,7 @@ pub fn support(scan: &Scan, settings: &spec::Scene) -> (Option<Support>, Option<
     }
 }
 
-/// The scene of a scan under a spec's settings. Makes `pipeline` count in its voxels.
+/// The scene of a scan under a spec's settings. Makes `pipeline` count in its lengths.
 pub fn fit(scan: &Scan, settings: &spec::Scene, pipeline: &mut Pipeline) -> Result<Fitted> {
     let mut scene = Scene::new(scan, settings)?;
     let (support, said) = support(scan, settings);
@@ -40,7 +40,7 @@ pub fn fit(scan: &Scan, settings: &spec::Scene, pipeline: &mut Pipeline) -> Resu
     if let OccupancyRule::Refined(refined) = settings.occupancy {
         found.push(format!("occupancy: {}", occupancy(&scene, refined)));
     }
-    pipeline.fit(scene.voxel_mm());
+    pipeline.fit(&scene)?;
     let mut needed = None;
     if settings.levels == LevelRule::Needed {
         let cells = scene.cells(&scan.geometry);

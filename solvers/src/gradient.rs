@@ -154,7 +154,9 @@ impl SolverSpec for Gradient {
         let positive = |x: f64| x.is_finite() && x > 0.0;
         ensure((1..=1 << 20).contains(&self.rays), place, "solver.rays", self.rays, "1 to 2^20")?;
         ensure(positive(self.lr), place, "solver.lr", self.lr, "a positive finite number")?;
-        ensure(positive(self.eps), place, "solver.eps", self.eps, "a positive finite number")?;
+        // Second moments are cleared below 1e-36: a smaller ε would leave steps of any size, or 0/0.
+        let eps = self.eps.is_finite() && self.eps >= 1e-16;
+        ensure(eps, place, "solver.eps", self.eps, "a finite number, at least 1e-16")?;
         let betas = self.betas.iter().all(|b| (0.0..1.0).contains(b));
         ensure(betas, place, "solver.betas", format!("{:?}", self.betas), "two numbers from 0 to below 1")?;
         ensure(self.report_every > 0, place, "solver.report_every", 0, "at least 1")?;
@@ -166,6 +168,11 @@ impl SolverSpec for Gradient {
             "no end",
             "one of epochs, steps or seconds",
         )?;
+        for (name, end) in [("epochs", self.epochs), ("seconds", self.seconds)] {
+            if let Some(x) = end {
+                ensure(positive(x), place, &format!("solver.{name}"), x, "a positive finite number")?;
+            }
+        }
         if let Penalty::Huber(delta) = self.loss {
             ensure(positive(delta), place, "solver.loss", delta, "a positive finite number")?;
         }
@@ -176,7 +183,8 @@ impl SolverSpec for Gradient {
             ensure(positive(tv.smoothing), place, "solver.tv.smoothing", tv.smoothing, "a positive finite number")?;
             ensure((1..=1 << 16).contains(&tv.blocks), place, "solver.tv.blocks", tv.blocks, "1 to 65536")?;
         }
-        ensure(self.pretrain_points > 0, place, "solver.pretrain_points", 0, "at least 1")?;
+        let points = self.pretrain_points;
+        ensure((1..=1 << 22).contains(&points), place, "solver.pretrain_points", points, "1 to 2^22")?;
         self.decay.validate()?;
         self.drift.as_ref().map_or(Ok(()), Drift::validate)?;
         Ok(Box::new(self.clone()))
@@ -232,7 +240,7 @@ impl Solver for Gradient {
         observer.note(&explain.backend);
         if let (Some(from), None) = (&volume, job.resume) {
             let known = start_volume(job, &from.path)?;
-            learn(self, exe.as_mut(), &mut model, (&known, &scene), from.steps, job.seed)?;
+            learn(self, exe.as_mut(), &mut model, (&known, &scene), from.steps, job, observer)?;
             observer.note(&format!("learned {} in {} steps", from.path, from.steps));
         }
         let watch = Watch::new(job, &scene, model.pipeline.projector.as_ref());
@@ -496,6 +504,8 @@ struct Watch {
     scale: f32,
     peak: f64,
     rays: Vec<TrainRay>,
+    /// Rays that meet nothing that is modelled, and the sum of the squares of what they measured.
+    missing: (usize, f64),
     top: f64,
 }
 
@@ -518,7 +528,7 @@ impl Watch {
                 }
             }
         }
-        let (mut rays, mut top) = (vec![], 0.0f64);
+        let (mut rays, mut missing, mut top) = (vec![], (0, 0.0), 0.0f64);
         if let Some(scan) = job.held_out {
             let [rows, columns] = scan.geometry.detector;
             let every = (scan.projections.len() / HELD_OUT_RAYS).max(1) | 1;
@@ -530,6 +540,8 @@ impl Watch {
                 let ray = scene.pixel_ray(&scan.geometry, at[0], at[1], at[2]);
                 if projector.max_samples(&ray) > 0 {
                     rays.push(TrainRay { ray, target });
+                } else {
+                    missing = (missing.0 + 1, missing.1 + f64::from(target).powi(2));
                 }
             }
         }
@@ -540,6 +552,7 @@ impl Watch {
             scale: (scene.attenuation * job.scan.unit.mm) as f32,
             peak: job.peak,
             rays,
+            missing,
             top,
         }
     }
@@ -558,7 +571,8 @@ impl Watch {
             let mut lines = vec![0.0; rays.len()];
             exe.render(model, &rays, &mut lines)?;
             let square = |(a, r): (&f32, &TrainRay)| (f64::from(*a) - f64::from(r.target)).powi(2);
-            let mse = lines.iter().zip(&self.rays).map(square).sum::<f64>() / rays.len() as f64;
+            let sum = lines.iter().zip(&self.rays).map(square).sum::<f64>() + self.missing.1;
+            let mse = sum / (rays.len() + self.missing.0) as f64;
             record.held_out = Some(mse.sqrt() / self.top.max(1e-300));
         }
         Ok(record)

@@ -11,10 +11,11 @@ use conefield_core::pipeline::{Model, Pipeline};
 use conefield_core::random::stream;
 use conefield_core::scan::Volume;
 use conefield_core::scene::Scene;
-use conefield_core::solver::{Observer, PretrainJob, Record};
+use conefield_core::solver::{Job, Observer, PretrainJob, Record};
 use conefield_core::spec::AttenuationScale;
 use ndarray::Axis;
 use rand::RngExt;
+use std::time::Instant;
 
 /// Steps on one volume before the next has its turn.
 const TURN: u64 = 25;
@@ -90,20 +91,27 @@ fn fit(exe: &mut dyn Executable, model: &mut Model, points: &[([f32; 3], f32)], 
     Ok(stats.loss)
 }
 
-/// Brings all of `model` close to `volume`, in 1/mm, within the scene of a scan: a warm start. The optimizer's
-/// moments are 0 afterwards.
+/// Brings all of `model` close to `volume`, in 1/mm, within the scene of a scan: a warm start, which a deadline of the job
+/// cuts short. The optimizer's moments are 0 afterwards.
 pub fn learn(
     settings: &Gradient,
     exe: &mut dyn Executable,
     model: &mut Model,
     (volume, scene): (&Volume, &Scene),
     steps: u64,
-    seed: u64,
+    job: &Job<'_>,
+    observer: &dyn Observer,
 ) -> Result<()> {
     let mut points = Vec::with_capacity(settings.pretrain_points);
     for step in 0..steps {
-        draw(volume, scene, seed, step, settings.pretrain_points, &mut points);
-        fit(exe, model, &points, step, seed)?;
+        if observer.cancelled() {
+            return Err(Error::Interrupted { step: 0 });
+        }
+        if job.limits.deadline.is_some_and(|end| Instant::now() >= end) {
+            break;
+        }
+        draw(volume, scene, job.seed, step, settings.pretrain_points, &mut points);
+        fit(exe, model, &points, step, job.seed)?;
         exe.update(model, &settings.adam(step + 1, 0.0, (step + 1) as f64 / steps as f64))?;
     }
     exe.fetch(model)?;

@@ -173,7 +173,8 @@ impl Solver for Turns {
     }
 }
 
-/// Hears of the first solver. A checkpoint is due when it is over: that is what an interrupted second one starts from.
+/// Hears of the first solver. A checkpoint is due when steps or time end it: that is what an interrupted second one starts from. (A
+/// field that held-out views end goes on from its last checkpoint instead, to the same end.)
 struct First<'a> {
     observer: &'a mut dyn Observer,
     over: bool,

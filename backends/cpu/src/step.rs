@@ -13,7 +13,7 @@ use std::time::Instant;
 const WAVE_ROWS: usize = 393_216;
 /// Bytes that a wave may take, of stages that keep many numbers a row.
 const WAVE_BYTES: usize = 64 << 20;
-/// Rows of a group: what a worker carries through forward and backward at once.
+/// Rows that a worker carries through forward and backward at once: those of a group, or a part of a larger one.
 const GROUP_ROWS: usize = 512;
 /// Groups of a wave are dealt to this many slots at most, each with its own sums.
 const SLOTS: usize = 16;
@@ -211,6 +211,11 @@ fn waves<R: Real>(kernels: &Kernels<'_, R>, projector: &dyn Projector, work: &Wo
     waves
 }
 
+/// Parts of `rows` that are no longer than [`GROUP_ROWS`].
+fn cut(rows: Range<usize>) -> impl Iterator<Item = Range<usize>> {
+    rows.clone().step_by(GROUP_ROWS).map(move |start| start..(start + GROUP_ROWS).min(rows.end))
+}
+
 impl<R: Real> Slot<R> {
     /// Samples `groups`, which the encoder then goes through.
     fn begin(&mut self, kernels: &Kernels<'_, R>, projector: &dyn Projector, work: &Work<'_>, groups: &[Group]) {
@@ -295,14 +300,20 @@ impl<R: Real> Slot<R> {
             }
             return;
         }
-        let (tiles, belong) = match (group, kernels.mixes_rays()) {
-            (Group::Rays(_), false) => (self.counts[counts.clone()].to_vec(), Belong::ToRays),
-            (Group::Rays(_), true) => (even_tiles(rows.len()), Belong::ToRays),
-            (Group::Points(_) | Group::Tv(_), _) => (even_tiles(rows.len()), Belong::Nowhere),
+        let belong = match group {
+            Group::Rays(_) => Belong::ToRays,
+            Group::Points(_) | Group::Tv(_) => Belong::Nowhere,
         };
-        self.scratch.forward(kernels, params, &self.encoded, rows.start, &tiles, belong);
+        // A ray or block of more rows than a group has goes through in parts: what a worker holds does not grow with it.
+        let parts: Vec<(usize, Vec<usize>)> = match (group, kernels.mixes_rays()) {
+            (Group::Rays(_), false) => vec![(rows.start, self.counts[counts.clone()].to_vec())],
+            _ => cut(rows.clone()).map(|part| (part.start, even_tiles(part.len()))).collect(),
+        };
         self.mu.clear();
-        self.mu.extend(self.scratch.outputs().iter().map(|m| m.f64()));
+        for (start, tiles) in &parts {
+            self.scratch.forward(kernels, params, &self.encoded, *start, tiles, belong);
+            self.mu.extend(self.scratch.outputs().iter().map(|m| m.f64()));
+        }
         self.dmu.clear();
         self.dmu.resize(self.mu.len(), 0.0);
         match group {
@@ -322,9 +333,15 @@ impl<R: Real> Slot<R> {
                 }
             }
         }
-        self.back.clear();
-        self.back.extend(self.dmu.iter().map(|&d| R::of(d)));
-        self.scratch.backward(kernels, params, &self.back, &mut self.dense, &mut self.logs, &mut self.encoded);
+        for (start, tiles) in &parts {
+            if parts.len() > 1 {
+                self.scratch.forward(kernels, params, &self.encoded, *start, tiles, belong);
+            }
+            let from = start - rows.start;
+            self.back.clear();
+            self.back.extend(self.dmu[from..from + tiles.iter().sum::<usize>()].iter().map(|&d| R::of(d)));
+            self.scratch.backward(kernels, params, &self.back, &mut self.dense, &mut self.logs, &mut self.encoded);
+        }
     }
 
     /// Losses of `rays`, whose rows begin at `first` of the slot's.

@@ -16,7 +16,7 @@ fn main() -> Result<(), Box<dyn Error>> {
     let runs: Vec<Run> = std::env::args().skip(1).map(|r| read(&r)).collect::<Result<_, _>>()?;
     let first = runs.first().and_then(|r| r.curve.last()).ok_or("usage: reach NAME=RUN_FOLDER...")?;
     let mark = first.1;
-    println!("| run | PSNR dB | ssim-2d | steps | parameters | peak memory | seconds to {mark:.2} dB |");
+    println!("| run | PSNR dB | ssim_2d | steps | parameters | peak memory | seconds to {mark:.2} dB |");
     println!("| --- | ---: | ---: | ---: | ---: | ---: | ---: |");
     for Run { name, record, curve } in &runs {
         let number = |value: &Value, scale: f64, digits: usize| {

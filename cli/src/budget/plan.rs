@@ -131,7 +131,8 @@ impl Budget {
         let load_s = self.begin.elapsed().as_secs_f64();
         let train_s = left - costs.after_s() - costs.prepare_s;
         let least = least(kind) * costs.step_s;
-        if train_s < least {
+        // A run that is resumed has made something, and goes on to its end.
+        if train_s < least && self.spent == 0.0 {
             let needed = (load_s + self.spent + costs.prepare_s + least + costs.after_s()) / AIM;
             let first = match kind {
                 Kind::Field => format!("{STEPS} steps"),
@@ -155,7 +156,7 @@ impl Budget {
             load_s,
             calibrate_s: start.elapsed().as_secs_f64(),
             expected: costs,
-            train_s,
+            train_s: train_s.max(0.0),
             kind,
             deadline: within(left - costs.after_s()),
             then: (costs.then_s > 0.0).then(|| within(left - costs.after_s() + costs.then_s)),

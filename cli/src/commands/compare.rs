@@ -1,7 +1,7 @@
 //! `conefield compare`
 
 use super::protocol::Protocol;
-use super::reconstruct::identity;
+use super::reconstruct::{budget, identity};
 use super::record::ScanRecord;
 use super::trial::{Figures, Input, LONGEST, Trial, read_json};
 use super::{Ends, General, backends::simd_level};
@@ -228,7 +228,7 @@ impl Compare {
         if !self.resume || !folder.exists() {
             return Ok(Start::Anew);
         }
-        let mut now = identity(&method.loaded, &self.protocol, &input.held, &input.scan.projections_fnv1a64)?;
+        let mut now = identity(&method.loaded, &self.protocol, &input.held, &input.scan)?;
         let [record, checkpoint, volume] =
             ["record.json", "checkpoint.safetensors", "volume.nii.gz"].map(|f| folder.join(f));
         if record.exists() && volume.exists() {
@@ -356,6 +356,7 @@ fn recorded(folder: &Path) -> Result<BTreeMap<String, String>> {
     #[derive(Deserialize)]
     struct KnownScan {
         projections_fnv1a64: String,
+        geometry_fnv1a64: String,
     }
     let known: Known = read_json(&folder.join("record.json"))?;
     let mut all = BTreeMap::from([
@@ -363,12 +364,13 @@ fn recorded(folder: &Path) -> Result<BTreeMap<String, String>> {
         ("seed".into(), known.seed.to_string()),
         ("spec".into(), conefield_core::files::read_text(&folder.join("spec.toml"), LONGEST)?),
         ("projections".into(), known.scan.projections_fnv1a64),
+        ("geometry".into(), known.scan.geometry_fnv1a64),
+        ("budget".into(), budget(known.budget_s)),
         ("held_out_views".into(), format!("{:?}", known.held_out_views)),
         ("limits".into(), out::to_json(&known.limits)?),
         ("reference".into(), known.reference.to_string()),
         ("peak".into(), known.peak.to_string()),
     ]);
-    all.extend(known.budget_s.map(|b| ("budget".into(), b.to_string())));
     all.extend(plugins::identity(&known.plugins));
     Ok(all)
 }

@@ -55,11 +55,7 @@ impl Convert {
             let volume = self.values.apply(conefield_io::read_volume(&self.input)?)?;
             conefield_io::write_volume(&self.output, &volume)?;
         } else {
-            let size = conefield_io::scan_size(&self.input)?;
-            let scan = 4 * (size.pixels + size.test_pixels);
-            let reading = Memory { scan: scan + size.reading, volume: 4 * size.voxels, ..Memory::default() };
-            let truth = Memory { scan, volume: 8 * size.voxels, ..Memory::default() };
-            Memory::most(&[reading, truth]).check(|_| vec![])?;
+            Memory::of_data_set(&conefield_io::scan_size(&self.input)?).check(|_| vec![])?;
             let data = conefield_io::read_data_set(&self.input)?;
             files::warn_of(&self.input, &survey(&data.train));
             self.tell_lost(&data);

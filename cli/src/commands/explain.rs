@@ -185,7 +185,9 @@ fn rows(tree: &Value, pipeline: &Pipeline) -> Vec<Row> {
 }
 
 fn for_scan(loaded: &Loaded, parts: &mut Parts, path: &Path) -> Result<ForScan> {
-    let run = parts.run(conefield_io::scan_size(path)?);
+    let size = conefield_io::scan_size(path)?;
+    Memory::of_views(&size).check(|_| vec![])?;
+    let run = parts.run(size);
     let scan = files::scan(path)?;
     let g = &scan.geometry;
     let mut found: Vec<String> =

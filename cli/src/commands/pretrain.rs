@@ -19,7 +19,7 @@ use std::path::PathBuf;
 /// The weights file holds normalizers and field; the encoder stays with the volume that it was trained on.
 #[derive(Args)]
 pub struct Pretrain {
-    /// The known volumes: files, or phantoms such as phantom:head:128.
+    /// The known volumes: files, or phantoms as "conefield simulate" has them.
     #[arg(required = true, value_name = "VOLUME")]
     volumes: Vec<String>,
     #[arg(long, help = specs::help())]

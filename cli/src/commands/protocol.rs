@@ -4,6 +4,7 @@ use super::Ends;
 use crate::backend::{self, BackendChoice};
 use crate::parse::{self, HoldOut};
 use clap::Args;
+use conefield_core::error::ensure;
 use conefield_core::scan::{Scan, Volume};
 use conefield_core::{Error, Result};
 use std::ffi::{OsStr, OsString};
@@ -59,9 +60,13 @@ impl Protocol {
         Ok(Some(volume))
     }
 
-    /// Indices of the views that are kept aside, of `n`.
-    pub fn held_out(&self, n: usize) -> Vec<usize> {
-        self.hold_out.as_ref().map(|h| h.views(n)).unwrap_or_default()
+    /// Indices of the views that are kept aside, of `n`. Refuses a choice that keeps none aside.
+    pub fn held_out(&self, n: usize) -> Result<Vec<usize>> {
+        let Some(choice) = &self.hold_out else { return Ok(vec![]) };
+        let held = choice.views(n);
+        let found = format!("{choice}, which is none of {n} views");
+        ensure(!held.is_empty(), "command line", "--hold-out", found, "at least one view")?;
+        Ok(held)
     }
 
     /// The same again, for a child process. Flag and value are one word: a value may begin with a dash.

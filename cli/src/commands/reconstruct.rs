@@ -30,7 +30,7 @@ use tracing::info;
 ///
 /// RUN receives volume.nii.gz, metrics.jsonl, spec.toml (every setting), weights.safetensors, slices.png and, when all
 /// is done, record.json. Ctrl-C ends the run after its step; the same command with --resume goes on. With --budget the
-/// whole command is planned to take so long, after a second of measuring what this machine can do.
+/// whole command is planned to take so long, after one to three seconds, less for short budgets, of measuring what this machine can do.
 #[derive(Args)]
 pub struct Reconstruct {
     /// The scan.
@@ -96,13 +96,13 @@ impl Reconstruct {
         };
         let whole = files::scan(&self.scan)?;
         let reference = protocol.reference(&self.scan, &whole)?;
-        let held = protocol.held_out(whole.geometry.views.len());
-        let scan_record = ScanRecord::of(&self.scan, &whole);
+        let held = protocol.held_out(whole.geometry.views.len())?;
+        let scan_record = ScanRecord::of(&self.scan, &whole)?;
         asked.iter().try_for_each(|m| specs::check_held_out(&m.loaded, &held))?;
         let (scan, held_scan) = if held.is_empty() { (whole, None) } else { split(whole, &held)? };
         let load_s = begin.elapsed().as_secs_f64();
 
-        let identity = |m: &Method| identity(&m.loaded, protocol, &held, &scan_record.projections_fnv1a64);
+        let identity = |m: &Method| identity(&m.loaded, protocol, &held, &scan_record);
         let resumed = match &asked {
             Some(method) if self.resume => Some(self.reopen(&identity(method)?)?),
             _ => None,
@@ -299,14 +299,20 @@ pub fn identity(
     loaded: &Loaded,
     protocol: &Protocol,
     held: &[usize],
-    projections: &str,
+    scan: &ScanRecord,
 ) -> Result<BTreeMap<String, String>> {
     let mut all = notes(loaded, protocol.seed)?;
-    all.insert("projections".into(), projections.into());
+    all.insert("projections".into(), scan.projections_fnv1a64.clone());
+    all.insert("geometry".into(), scan.geometry_fnv1a64.clone());
     all.insert("held_out_views".into(), format!("{held:?}"));
     all.insert("limits".into(), out::to_json(&protocol.ends)?);
-    all.extend(protocol.budget.map(|b| ("budget".into(), b.to_string())));
+    all.insert("budget".into(), budget(protocol.budget));
     Ok(all)
+}
+
+/// A budget as [`identity`] has it.
+pub fn budget(seconds: Option<f64>) -> String {
+    seconds.map_or("none".into(), |s| s.to_string())
 }
 
 /// The setting that starts from the weights in `path`.

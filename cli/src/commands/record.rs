@@ -5,6 +5,7 @@ use crate::budget::plan::Plan;
 use crate::memory::Memory;
 use crate::plugins::Used;
 use crate::{files, out};
+use conefield_core::Result;
 use conefield_core::backend::Explain;
 use conefield_core::scan::Scan;
 use conefield_metrics::Scores;
@@ -71,18 +72,22 @@ pub struct ScanRecord {
     pub detector: [usize; 2],
     pub volume: [usize; 3],
     pub projections_fnv1a64: String,
+    /// Of where everything stood, and of the unit.
+    pub geometry_fnv1a64: String,
 }
 
 impl ScanRecord {
-    /// The whole scan at `path`.
-    pub fn of(path: &Path, scan: &Scan) -> Self {
-        Self {
+    /// The whole scan that was read from `path`.
+    pub fn of(path: &Path, scan: &Scan) -> Result<Self> {
+        let placed = out::to_json(&(&scan.geometry, &scan.unit))?;
+        Ok(Self {
             path: path.display().to_string(),
             views: scan.geometry.views.len(),
             detector: scan.geometry.detector,
             volume: scan.geometry.volume.shape,
-            projections_fnv1a64: checksum(scan),
-        }
+            projections_fnv1a64: checksum(scan.projections.iter().flat_map(|x| x.to_le_bytes())),
+            geometry_fnv1a64: checksum(placed.into_bytes().into_iter()),
+        })
     }
 
     /// The name of its file or folder.
@@ -97,9 +102,8 @@ impl ScanRecord {
     }
 }
 
-/// FNV-1a of the projections' bytes, to recognise a scan by.
-fn checksum(scan: &Scan) -> String {
-    let bytes = scan.projections.iter().flat_map(|x| x.to_le_bytes());
+/// FNV-1a, to recognise a scan by.
+fn checksum(bytes: impl Iterator<Item = u8>) -> String {
     let hash = bytes.fold(0xcbf2_9ce4_8422_2325u64, |h, b| (h ^ u64::from(b)).wrapping_mul(0x0100_0000_01b3));
     format!("{hash:016x}")
 }

@@ -21,13 +21,14 @@ const LONGEST: u64 = 16 << 20;
 /// volume as its truth.
 #[derive(Args)]
 pub struct Simulate {
-    /// The volume: a file, or phantom:NAME or phantom:NAME:SIZE for one that the program makes, such as
-    /// phantom:head:128.
+    /// The volume: a file, or one that the program makes: phantom:head, phantom:abdomen or phantom:random:SEED, each also
+    /// with :SIZE (8 to 1024 voxels a side) [default: 128].
     volume: String,
     /// The folder for the scan.
     #[arg(short, long = "output", value_name = "SCAN")]
     output: PathBuf,
-    /// Where source and detector stand: r2, the published synthetic set-up, or a TOML or JSON file.
+    /// Where source and detector stand: r2, the published synthetic set-up, or a TOML or JSON file (docs/geometry.md has its
+    /// keys).
     #[arg(long, default_value = "r2", value_name = "r2|FILE")]
     protocol: String,
     /// Number of views [default: the protocol's; r2: 50].
@@ -53,9 +54,9 @@ pub struct Simulate {
     /// water in 1/mm) or clip:LO,HI (LO to HI becomes 0 to 1).
     #[arg(long, default_value = "as-is", value_parser = parse::values)]
     values: Values,
-    /// Seed of the noise.
-    #[arg(long, default_value_t = 0)]
-    seed: u64,
+    /// Seed of the noise [default: the protocol's; r2: 0].
+    #[arg(long)]
+    seed: Option<u64>,
     /// Replace SCAN.
     #[arg(long)]
     force: bool,
@@ -92,7 +93,7 @@ impl Simulate {
         if self.json {
             return out::json(&json!({
                 "scan": self.output, "views": g.views.len(), "detector": g.detector, "volume": g.volume.shape,
-                "noise": protocol.noise, "seed": self.seed,
+                "noise": protocol.noise, "seed": protocol.seed,
             }));
         }
         let ([rows, columns], [x, y, z]) = (g.detector, g.volume.shape);
@@ -134,7 +135,9 @@ impl Simulate {
         if let Some(n) = self.noise {
             p.noise = n;
         }
-        p.seed = self.seed;
+        if let Some(seed) = self.seed {
+            p.seed = seed;
+        }
         if let Some(mm) = self.offset {
             p.offset = mm.map(|x| x / p.unit.mm);
         }

@@ -118,8 +118,8 @@ impl Input {
         all.memory().check(|_| vec![])?;
         let scan = files::scan(path)?;
         let reference = protocol.reference(path, &scan)?;
-        let record = ScanRecord::of(path, &scan);
-        let held = protocol.held_out(scan.geometry.views.len());
+        let record = ScanRecord::of(path, &scan)?;
+        let held = protocol.held_out(scan.geometry.views.len())?;
         if !held.is_empty() {
             split(scan, &held)?;
         }

@@ -2,7 +2,7 @@
 //! one layer that says two is refused.
 
 use super::check::{Context, invalid, join, listed};
-use super::schema::{ONE_OF, STAGES, of_type};
+use super::schema::{NESTED, ONE_OF, STAGES, of_type};
 use super::tree::{Entry, Kind as Is, Node};
 use crate::error::Result;
 use crate::registry::{Kind, find};
@@ -26,7 +26,15 @@ fn stage(node: &mut Node, kind: Kind) {
 }
 
 fn setting(node: &mut Node, schema: &Value, cx: &Context<'_>) {
-    let Is::Table(entries) = &mut node.kind else { return };
+    let schema = cx.resolve(schema);
+    if let Some(kind) = schema[NESTED].as_str().and_then(Kind::named) {
+        return stage(node, kind);
+    }
+    let entries = match &mut node.kind {
+        Is::Array(items) => return items.iter_mut().for_each(|n| setting(n, &schema["items"], cx)),
+        Is::Table(entries) => entries,
+        _ => return,
+    };
     for group in groups(schema, cx) {
         let said = |key: &str, value: &Node| group.contains(&key) && value.kind != Is::Null;
         let upper = entries.iter().filter(|e| said(&e.key, &e.value)).map(|e| e.at.depth()).min();

@@ -4,6 +4,7 @@
 
 use crate::library::Type;
 use conefield_core::error::{Error, Result};
+use conefield_core::pages::Pages;
 use conefield_core::random::{mix, unit};
 use conefield_core::stage::{GradKind, Grads, Stage, TILE_ROWS, Tile, TileMut, UnitRay};
 use std::ops::Range;
@@ -22,12 +23,15 @@ pub(crate) const UNTOUCHED: u32 = 0x7fc5_a7e1;
 /// Stages of more parameters are not initialised for their trial; that takes long, and the run does it anyway.
 const MANY: usize = 1 << 20;
 
-/// A buffer between guard zones.
-struct Guarded(Vec<f32>);
+/// A buffer between guard zones. What is only zeroed takes no memory until it is written to: a trial comes before what a run
+/// would take is reckoned.
+struct Guarded(Pages);
 
 impl Guarded {
     fn new(n: usize) -> Self {
-        Self(vec![f32::from_bits(UNTOUCHED); n + 2 * GUARD])
+        let mut g = Self::zeroed(n);
+        g.inner().fill(f32::from_bits(UNTOUCHED));
+        g
     }
 
     fn inner(&mut self) -> &mut [f32] {
@@ -36,9 +40,11 @@ impl Guarded {
     }
 
     fn zeroed(n: usize) -> Self {
-        let mut g = Self::new(n);
-        g.inner().fill(0.0);
-        g
+        let mut pages = Pages::zeros(n + 2 * GUARD);
+        for zone in [0..GUARD, GUARD + n..n + 2 * GUARD] {
+            pages[zone].fill(f32::from_bits(UNTOUCHED));
+        }
+        Self(pages)
     }
 
     /// What is wrong with the zones.

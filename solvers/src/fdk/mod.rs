@@ -66,7 +66,7 @@ impl Solver for Fdk {
         let job = &Within::job(within.as_ref(), job);
         let scan = job.scan;
         let orbit = Orbit::of(&scan.geometry);
-        check(&orbit)?;
+        check(&orbit, &scan.geometry)?;
         said(&orbit).iter().for_each(|line| observer.note(line));
         let (g, measured) = orbit.symmetric(&scan.geometry);
         let g = &g;
@@ -122,7 +122,7 @@ impl Solver for Fdk {
         let watch = Watch::new(job);
         let psnr = watch.psnr(&volume, mm);
         let held_out = match job.held_out {
-            Some(_) => watch.held_out(job.backend.place(Box::new(Joseph {}))?.operator(), &volume),
+            Some(_) => watch.held_out(job.backend.place(Box::new(Joseph {}))?.operator(), &volume)?,
             None => None,
         };
         observer.record(&Record { step: 1, seconds: train_s, psnr, held_out, ..Record::default() });
@@ -139,7 +139,7 @@ impl Solver for Fdk {
 
     fn plan(&self, scan: &Scan) -> Vec<String> {
         let orbit = Orbit::of(&scan.geometry);
-        check(&orbit).map_or_else(|e| vec![e.to_string()], |()| said(&orbit))
+        check(&orbit, &scan.geometry).map_or_else(|e| vec![e.to_string()], |()| said(&orbit))
     }
 
     /// The views at hand, filtered and then once more column by column.
@@ -187,14 +187,23 @@ fn alone(spec: &Spec) -> Result<()> {
     Ok(())
 }
 
-/// FDK is for circles around z.
-fn check(orbit: &Orbit) -> Result<()> {
-    let (low, high) = orbit.radius.iter().fold((f64::INFINITY, 0.0f64), |(l, h), &r| (l.min(r), h.max(r)));
-    ensure(
-        low > 0.0 && high < 1.2 * low,
-        "scan",
-        "views",
-        format!("sources {low:.1} to {high:.1} mm from the axis z"),
-        "a circular orbit around z for fdk; iterative solvers take any",
-    )
+/// Sources may lie along z by this share of the circle's radius, and rows of the detector rise by it: what calibrated scans
+/// differ from a circle by is less, a helix and a detector on its side are more.
+const TILT: f64 = 0.05;
+
+/// FDK is for circles around z, whose rows of the detector lie across z.
+fn check(orbit: &Orbit, geometry: &Geometry) -> Result<()> {
+    let span = |values: &mut dyn Iterator<Item = f64>| {
+        values.fold((f64::INFINITY, f64::NEG_INFINITY), |(l, h), r| (l.min(r), h.max(r)))
+    };
+    let circle = "a circular orbit around z for fdk; iterative solvers take any";
+    let (low, high) = span(&mut orbit.radius.iter().copied());
+    let found = format!("sources {low:.1} to {high:.1} mm from the axis z");
+    ensure(low > 0.0 && high < 1.2 * low, "scan", "views", found, circle)?;
+    let (bottom, top) = span(&mut geometry.views.iter().map(|v| v.source[2]));
+    let found = format!("sources from {bottom:.1} to {top:.1} mm along z");
+    ensure(top - bottom <= TILT * low, "scan", "views", found, circle)?;
+    let steep = geometry.views.iter().position(|v| v.u[2].abs() > TILT * norm(v.u));
+    let found = steep.map_or(String::new(), |v| format!("a detector whose rows rise along z in view {v}"));
+    ensure(steep.is_none(), "scan", "views", found, "rows across z for fdk; iterative solvers take any")
 }

@@ -346,6 +346,12 @@ pub fn drive(
     clock.resume();
     loop {
         let cancelled = observer.cancelled();
+        // Time alone does not end a run that has made nothing yet.
+        let share = if step == 0 { clock.share_of_steps(step) } else { clock.done(step) };
+        let over = share >= 1.0 || kept.settled || (step > 0 && !clock.allows(last_pass));
+        if over {
+            observer.progress(step, 1.0, 0.0);
+        }
         if step > started && (cancelled || observer.checkpoint_due()) {
             clock.pause();
             kept.numbers = method.numbers().iter().map(|x| **x).collect();
@@ -366,9 +372,7 @@ pub fn drive(
         if cancelled {
             return Err(Error::Interrupted { step });
         }
-        // Time alone does not end a run that has made nothing yet.
-        let share = if step == 0 { clock.share_of_steps(step) } else { clock.done(step) };
-        if share >= 1.0 || kept.settled || (step > 0 && !clock.allows(last_pass)) {
+        if over {
             break;
         }
         let pass_begun = Instant::now();
@@ -383,7 +387,7 @@ pub fn drive(
         }
         last = Some(pass.residual);
         clock.pause();
-        let held_out = watch.held_out(problem.operator, method.volume());
+        let held_out = watch.held_out(problem.operator, method.volume())?;
         let mut record = Record {
             step,
             seconds: clock.seconds(),

@@ -1,5 +1,6 @@
 //! What is looked at while a voxel volume takes shape: PSNR against a reference, the error of held-out views.
 
+use conefield_core::error::Result;
 use conefield_core::geometry::Geometry;
 use conefield_core::scan::Scan;
 use conefield_core::solver::Job;
@@ -36,8 +37,8 @@ impl<'a> Watch<'a> {
     }
 
     /// Root mean square error of the held-out views' line integrals over their largest value.
-    pub fn held_out(&self, operator: &dyn VoxelOperator<f32>, volume: &Array3<f32>) -> Option<f64> {
-        let scan = self.held_out?;
+    pub fn held_out(&self, operator: &dyn VoxelOperator<f32>, volume: &Array3<f32>) -> Result<Option<f64>> {
+        let Some(scan) = self.held_out else { return Ok(None) };
         let geometry: &Geometry = &scan.geometry;
         let [rows, columns] = geometry.detector;
         let mut found = Array3::zeros((1, rows, columns));
@@ -49,7 +50,8 @@ impl<'a> Watch<'a> {
                 top = top.max(b);
             }
         }
-        Some((square / scan.projections.len() as f64).sqrt() / f64::from(top).max(1e-300))
+        operator.fault()?;
+        Ok(Some((square / scan.projections.len() as f64).sqrt() / f64::from(top).max(1e-300)))
     }
 }
 

@@ -1,6 +1,7 @@
 //! Specs that solvers on voxels refuse, and that the message names the field.
 
 use crate::kit::{Case, Heard, bodies, geometry, spec};
+use conefield_core::geometry::View;
 use conefield_projectors::simulate::scan_ellipsoids;
 
 const ALL: [&str; 7] = ["fdk", "sart", "os-sart", "sirt", "cgls", "asd-pocs", "fista-tv"];
@@ -41,6 +42,26 @@ fn stages_of_a_field_have_no_place() {
     let field = "[encoder]\ntype = \"identity\"\n[field]\ntype = \"voxel-grid\"\n[projector]\ntype = \"joseph\"\n";
     let e = said(&format!("{field}[solver]\ntype = \"gradient\"\n"));
     assert!(e.contains("projector.type: found \"joseph\", which projects voxels"), "{e}");
+}
+
+#[test]
+fn fdk_refuses_what_is_no_circle() {
+    let refused = |change: &dyn Fn(usize, &mut View)| {
+        let mut geometry = geometry(8);
+        geometry.views.iter_mut().enumerate().for_each(|(i, v)| change(i, v));
+        let scan = scan_ellipsoids(&bodies(), geometry);
+        Case::of(&scan).run("[solver]\ntype = \"fdk\"\n", &mut Heard::default()).err().map(|e| e.to_string())
+    };
+    assert_eq!(refused(&|_, _| ()), None);
+    // A calibrated scan is tilted by a fraction of a degree.
+    assert_eq!(refused(&|i, v| (v.source[2], v.u[2]) = (0.01 * i as f64, 0.01 * v.u[1])), None);
+    let said = refused(&|i, v| {
+        let along = 5.0 * i as f64;
+        (v.source[2], v.detector[2]) = (v.source[2] + along, v.detector[2] + along);
+    });
+    assert!(said.unwrap().contains("sources from 0.0 to 35.0 mm along z, expected a circular orbit"));
+    let said = refused(&|_, v| std::mem::swap(&mut v.u, &mut v.v));
+    assert!(said.unwrap().contains("a detector whose rows rise along z in view 0"));
 }
 
 #[test]

@@ -139,3 +139,13 @@ fn fields_learn_it_before_they_see_the_scan() {
         assert!(warm > random + gain, "{name}: {random:.1} and {warm:.1} dB");
     }
 }
+
+#[test]
+fn learning_a_volume_can_be_stopped() {
+    let truth = truth();
+    let scan = scan_of(&truth);
+    let text = format!("{START}steps = 1000000\n{}", field(IDENTITY, GRID, 1));
+    let mut heard = Heard::interrupting_after(0);
+    let stopped = Case { file: Some(&truth), ..Case::of(&scan) }.run(&text, &mut heard);
+    assert!(matches!(stopped.err().unwrap(), conefield_core::Error::Interrupted { step: 0 }));
+}

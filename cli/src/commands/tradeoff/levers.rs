@@ -129,8 +129,16 @@ impl Levers {
                     let Some(tree) = base.built(&sets).ok().map(|(tree, _)| tree) else { continue };
                     if !seen.contains(&tree) {
                         seen.push(tree);
-                        *made += 1;
-                        all.push(base.candidate(*made, sets));
+                        // A base of the user's may be called what a draw would be.
+                        let mut next = || {
+                            *made += 1;
+                            base.candidate(*made, sets.clone())
+                        };
+                        let mut candidate = next();
+                        while all.iter().any(|c| c.name == candidate.name) {
+                            candidate = next();
+                        }
+                        all.push(candidate);
                         return true;
                     }
                 }

@@ -173,8 +173,12 @@ impl MapStage {
         let params: Vec<Range<usize>> = ranges.iter().map(|r| r.start..r.end).collect();
         let sound = params.iter().all(|r| r.start <= r.end && r.end <= info.params);
         let kept: usize = if sound { params.iter().map(Range::len).sum() } else { usize::MAX };
-        let others = if side == CONEFIELD_OUTPUTS { info.input } else { info.output };
-        if kept != smaller.info.params || channels.iter().any(|&c| c >= others) {
+        let (others, widths) = match side {
+            CONEFIELD_OUTPUTS => (info.input, [smaller.info.output, smaller.info.input]),
+            _ => (info.output, [smaller.info.input, smaller.info.output]),
+        };
+        let rising = channels.is_sorted_by(|a, b| a < b) && channels.iter().all(|&c| c < others);
+        if kept != smaller.info.params || !rising || widths != [keep.len(), channels.len()] {
             return Err(wrong("what it keeps does not fit the smaller stage"));
         }
         Ok((smaller, params, channels.to_vec()))
@@ -248,18 +252,32 @@ fn partition(handle: &Handle, map: &ConefieldMap, i: &ConefieldInfo, grads: Grad
     if end == i.params { Ok(all) } else { Err(wrong(format!("ranges end at {end} of {}", i.params))) }
 }
 
+/// Channel-major rows, as a library sees them.
+trait Across<T> {
+    fn across(self, rows: usize) -> T;
+}
+
 macro_rules! kernel {
     ($real:ty, $forward:ident $backward:ident, $tile:ident $tile_mut:ident $grads:ident, $($passes:item)*) => {
+        impl Across<$tile> for &[$real] {
+            fn across(self, rows: usize) -> $tile {
+                $tile { data: self.as_ptr(), channels: self.len() / rows, rows, stride: rows }
+            }
+        }
+
+        impl Across<$tile_mut> for &mut [$real] {
+            fn across(self, rows: usize) -> $tile_mut {
+                $tile_mut { data: self.as_mut_ptr(), channels: self.len() / rows, rows, stride: rows }
+            }
+        }
+
         impl Kernel<$real> for MapStage {
             fn forward(&self, params: &[$real], x: Tile<'_, $real>, y: TileMut<'_, $real>, tape: TileMut<'_, $real>) {
                 let rows = x.rows;
-                let read = |t: &[$real]| $tile { data: t.as_ptr(), channels: t.len() / rows, rows, stride: rows };
-                let write =
-                    |t: &mut [$real]| $tile_mut { data: t.as_mut_ptr(), channels: t.len() / rows, rows, stride: rows };
                 let mut error = Text::new();
                 // SAFETY: the stage is alive, and every pointer goes with the length of what it leads to.
                 let status = self.map.$forward.map_or(CONEFIELD_UNSUPPORTED, |f| unsafe {
-                    let (x, out, tape) = (read(x.data), write(y.data), write(tape.data));
+                    let (x, out, tape) = (x.data.across(rows), y.data.across(rows), tape.data.across(rows));
                     f(self.handle.stage, params.as_ptr(), x, out, tape, error.room())
                 });
                 if !self.settle("forward", status, &error) {
@@ -277,15 +295,12 @@ macro_rules! kernel {
                 mut dx: Option<TileMut<'_, $real>>,
             ) {
                 let rows = x.rows;
-                let read = |t: &[$real]| $tile { data: t.as_ptr(), channels: t.len() / rows, rows, stride: rows };
-                let write =
-                    |t: &mut [$real]| $tile_mut { data: t.as_mut_ptr(), channels: t.len() / rows, rows, stride: rows };
                 let mut error = Text::new();
                 // SAFETY: as for `forward`.
                 let status = self.map.$backward.map_or(CONEFIELD_UNSUPPORTED, |f| unsafe {
                     let nowhere = $tile_mut { data: ptr::null_mut(), channels: 0, rows, stride: rows };
-                    let (x, tape, dy) = (read(x.data), write(tape.data), read(dy.data));
-                    let dx = dx.as_mut().map_or(nowhere, |dx| write(dx.data));
+                    let (x, tape, dy) = (x.data.across(rows), tape.data.across(rows), dy.data.across(rows));
+                    let dx = dx.as_mut().map_or(nowhere, |dx| dx.data.across(rows));
                     let (start, length) = (grads.range.start, grads.values.len());
                     let grads = $grads { data: grads.values.as_mut_ptr(), start, length };
                     f(self.handle.stage, params.as_ptr(), x, tape, dy, grads, dx, error.room())
@@ -313,13 +328,12 @@ kernel! {
             return self.forward(params, x, y, tape);
         };
         let rows = x.rows;
-        let read = ConefieldTile { data: x.data.as_ptr(), channels: x.data.len() / rows, rows, stride: rows };
-        let [out, left] = [&mut *y.data, &mut *tape.data].map(|t| {
-            ConefieldTileMut { data: t.as_mut_ptr(), channels: t.len() / rows, rows, stride: rows }
-        });
         let mut error = Text::new();
         // SAFETY: as for `forward`.
-        let status = unsafe { f(self.handle.stage, pass, params.as_ptr(), read, out, left, error.room()) };
+        let status = unsafe {
+            let (x, out, tape) = (x.data.across(rows), y.data.across(rows), tape.data.across(rows));
+            f(self.handle.stage, pass, params.as_ptr(), x, out, tape, error.room())
+        };
         if !self.settle("forward_pass", status, &error) {
             y.data.fill(f32::NAN);
         }
