@@ -80,11 +80,7 @@ const FAULTS: &[Fault] = &[
         &["FAULT=WRONG_INPUT_GRADIENT"],
         ["", "finite differences: inputs", ""],
     ),
-    fault(
-        "keeps all channels where some are to go",
-        &["FAULT=REDUCES_NOTHING"],
-        ["", "what it keeps does not fit the smaller stage", ""],
-    ),
+    fault("keeps all channels where some are to go", &["FAULT=REDUCES_NOTHING"], ["", "keep outputs", ""]),
     fault("results that depend on earlier calls", &["FAULT=REMEMBERS"], ["", "tile sizes: outputs", ""]),
     fault("returns NaN after a hundred calls", &["FAULT=NOT_A_NUMBER_LATER"], ["", "extremes", "training diverged"]),
     fault("fails after a hundred calls", &["FAULT=FAILS_LATER"], ["", "no fault", "forward failed: no more numbers"]),

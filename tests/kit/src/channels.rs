@@ -2,7 +2,7 @@
 
 use crate::call::{channels_of, data, differing, error, forward, gradients, params};
 use crate::{Options, Outcome, check};
-use conefield_core::error::Result;
+use conefield_core::error::{Error, Result};
 use conefield_core::stage::{Encoder, Field, Normalizer, Stage};
 use std::collections::BTreeSet;
 use std::ops::Range;
@@ -88,7 +88,8 @@ fn each(n: usize, mut one: impl FnMut(&[usize]) -> Result<Option<String>>) -> Ou
             Ok(None) => {}
             Ok(Some(complaint)) => return Outcome::Failed(format!("keeping {keep:?}: {complaint}")),
             Err(e) if e.to_string().is_empty() => return Outcome::Failed("refused without a word".into()),
-            Err(e) => return Outcome::Skipped(format!("keeping {keep:?}: {e}")),
+            Err(e @ Error::Unsupported { .. }) => return Outcome::Skipped(format!("keeping {keep:?}: {e}")),
+            Err(e) => return Outcome::Failed(format!("keeping {keep:?}: {e}")),
         }
     }
     Outcome::Passed(format!("{} choices", all.len()))

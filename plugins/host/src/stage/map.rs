@@ -179,7 +179,10 @@ impl MapStage {
         };
         let rising = channels.is_sorted_by(|a, b| a < b) && channels.iter().all(|&c| c < others);
         if kept != smaller.info.params || !rising || widths != [keep.len(), channels.len()] {
-            return Err(wrong("what it keeps does not fit the smaller stage"));
+            let [own, other] = widths;
+            let found = format!("a stage with {own} and {other} channels, of which {kept} parameters were kept");
+            let expected = format!("what is kept to fit it, {} and {} channels", keep.len(), channels.len());
+            return Err(Error::invalid(ty.words(), "reduce", found, expected));
         }
         Ok((smaller, params, channels.to_vec()))
     }
