@@ -43,8 +43,8 @@ impl Default for CurveOptions {
     }
 }
 
-/// Told apart by all but the rarest colour vision, and in grey (after Okabe and Ito).
-const COLOURS: [RGBColor; 8] = [
+/// The first eight are told apart by all but the rarest colour vision, and in grey (after Okabe and Ito).
+const COLOURS: [RGBColor; 10] = [
     RGBColor(0, 114, 178),
     RGBColor(213, 94, 0),
     RGBColor(0, 158, 115),
@@ -53,6 +53,8 @@ const COLOURS: [RGBColor; 8] = [
     RGBColor(86, 180, 233),
     RGBColor(0, 0, 0),
     RGBColor(150, 150, 40),
+    RGBColor(110, 60, 170),
+    RGBColor(120, 70, 30),
 ];
 
 pub(crate) const FONT: &str = "sans-serif";
