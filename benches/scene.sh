@@ -1,6 +1,6 @@
 #!/usr/bin/env bash
-# What modelling only what a scan has need of is worth: a field of six levels (benches/six-levels.toml) with each rule alone and all for SECONDS (60), and with none,
-# as published, for 10/3 as long:
+# What modelling only what a scan has need of is worth: a field of six levels (benches/six-levels.toml) with each rule alone
+# and all for SECONDS (60), and with none, as published, for 10/3 as long:
 #   bash benches/scene.sh DATA_FOLDER OUT_FOLDER [SECONDS [VOLUMES [RUNS]]]
 # RUNS ("none support levels channels samples occupancy six-levels all") may name fewer.
 # DATA_FOLDER holds volumes/*.nii.gz. OUT_FOLDER/scene.md has a table a volume: what each ends with, and after how many seconds

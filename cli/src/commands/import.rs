@@ -11,8 +11,8 @@ use std::path::PathBuf;
 
 /// Make a scan of what a scanner gave.
 ///
-/// SCANNER.toml names the files with the projections (TIFF, .npy, .npz, .mha), says in mm where source and detector stood and
-/// how arrays lie; docs/geometry.md has all keys. Raw counts become line integrals; dead and hot pixels are interpolated.
+/// SCANNER.toml names the files with the projections (TIFF, .npy, .npz, .mha), says in mm where source and detector stood
+/// and how arrays lie; docs/geometry.md has all keys. Raw counts become line integrals; dead and hot pixels are interpolated.
 #[derive(Args)]
 pub struct Import {
     /// The description of the scanner.

@@ -14,7 +14,8 @@ use std::path::{Path, PathBuf};
 /// Say what a scan, volume or weights file holds.
 ///
 /// Of a scan: lengths in mm, magnification, the voxels that the detector supports, the field of view, which part of the
-/// volume the views see, what is missing, and warnings of what will trouble a reconstruction. SCANNER.toml and RTK's XML geometry are understood, too.
+/// volume the views see, what is missing, and warnings of what will trouble a reconstruction. SCANNER.toml and RTK's XML
+/// geometry are understood, too.
 #[derive(Args)]
 pub struct Info {
     /// A scan, a volume or a weights file.

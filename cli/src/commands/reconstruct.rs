@@ -30,7 +30,8 @@ use tracing::info;
 ///
 /// RUN receives volume.nii.gz, metrics.jsonl, spec.toml (every setting), weights.safetensors, slices.png and, when all
 /// is done, record.json. Ctrl-C ends the run after its step; the same command with --resume goes on. With --budget the
-/// whole command is planned to take so long, after one to three seconds, less for short budgets, of measuring what this machine can do.
+/// whole command is planned to take so long; it first measures what this machine can do, for one to three seconds, or less
+/// of a short budget.
 #[derive(Args)]
 pub struct Reconstruct {
     /// The scan.

@@ -130,14 +130,13 @@ impl Levers {
                     if !seen.contains(&tree) {
                         seen.push(tree);
                         // A base of the user's may be called what a draw would be.
-                        let mut next = || {
+                        let candidate = loop {
                             *made += 1;
-                            base.candidate(*made, sets.clone())
+                            let candidate = base.candidate(*made, sets.clone());
+                            if all.iter().all(|c| c.name != candidate.name) {
+                                break candidate;
+                            }
                         };
-                        let mut candidate = next();
-                        while all.iter().any(|c| c.name == candidate.name) {
-                            candidate = next();
-                        }
                         all.push(candidate);
                         return true;
                     }
@@ -232,6 +231,19 @@ mod tests {
 
     fn parse(text: &str) -> Result<Levers> {
         Levers::parse(text, "levers.toml", Path::new(""))
+    }
+
+    #[test]
+    fn a_base_may_be_called_what_a_draw_would_be() {
+        let dir = tempfile::tempdir().unwrap();
+        let path = dir.path().join("levers.toml");
+        std::fs::write(dir.path().join("mine.toml"), "extends = \"fast\"\nname = \"fast-1\"\n").unwrap();
+        let levers = "solver.rays = [64, 128, 256]\n";
+        let text = format!("[[base]]\nspec = \"fast\"\n[base.levers]\n{levers}[[base]]\nspec = \"mine.toml\"\n");
+        std::fs::write(&path, text).unwrap();
+        let all = Levers::read(&path).unwrap().candidates(4, 0).unwrap();
+        let names: Vec<&str> = all.iter().map(|c| &c.name[..]).collect();
+        assert_eq!(names, ["fast", "fast-1", "fast-2", "fast-3"]);
     }
 
     #[test]
