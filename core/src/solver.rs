@@ -107,7 +107,7 @@ pub struct Record {
     /// Root mean square error of the held-out views' line integrals, over their largest value.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub held_out: Option<f64>,
-    /// PSNR against the reference over every 4th voxel an axis, dB.
+    /// PSNR against the reference over one voxel, drawn, of each block of 4³, dB.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub psnr: Option<f64>,
     /// Drift found since the last record, of a spec with `solver.drift`.

@@ -13,6 +13,7 @@ use crate::rays::{Pixels, RaySource, Views};
 use crate::refine::{Refinement, Since};
 use crate::schedule::{Clock, Decay, Ends};
 use crate::surround::Within;
+use crate::watched;
 use conefield_core::backend::{Adam, Executable, Loss, TrainRay, TvBlocks, Work};
 use conefield_core::checkpoint::{Checkpoint, Resume, Standing, tensors};
 use conefield_core::error::{Error, Result, ensure};
@@ -191,8 +192,6 @@ impl SolverSpec for Gradient {
     }
 }
 
-/// Voxels between the points at which PSNR is watched during training.
-const WATCH: usize = 4;
 /// Rays of held-out views that are rendered for a record, at most.
 const HELD_OUT_RAYS: usize = 8192;
 
@@ -514,17 +513,13 @@ impl Watch {
         let (mut points, mut reference, mut outside) = (vec![], vec![], (0, 0.0));
         let shape = scene.grid.shape;
         if let Some(r) = job.reference.filter(|r| r.data.shape() == shape) {
-            for x in (0..shape[0]).step_by(WATCH) {
-                for y in (0..shape[1]).step_by(WATCH) {
-                    for z in (0..shape[2]).step_by(WATCH) {
-                        let value = r.data[[x, y, z]];
-                        if scene.holds(scene.grid.voxel([x, y, z])) {
-                            points.push(scene.voxel([x, y, z]));
-                            reference.push(value);
-                        } else {
-                            outside = (outside.0 + 1, outside.1 + f64::from(value).powi(2));
-                        }
-                    }
+            for voxel in watched::voxels(shape) {
+                let value = r.data[voxel];
+                if scene.holds(scene.grid.voxel(voxel)) {
+                    points.push(scene.voxel(voxel));
+                    reference.push(value);
+                } else {
+                    outside = (outside.0 + 1, outside.1 + f64::from(value).powi(2));
                 }
             }
         }

@@ -25,3 +25,4 @@ pub mod sequence;
 mod shadow;
 pub mod support;
 pub mod surround;
+mod watched;

@@ -1,5 +1,6 @@
 //! What is looked at while a voxel volume takes shape: PSNR against a reference, the error of held-out views.
 
+use crate::watched;
 use conefield_core::error::Result;
 use conefield_core::geometry::Geometry;
 use conefield_core::scan::Scan;
@@ -7,9 +8,6 @@ use conefield_core::solver::Job;
 use conefield_core::voxel::VoxelOperator;
 use ndarray::Array3;
 use rayon::prelude::*;
-
-/// Voxels between two that PSNR looks at.
-const EVERY: usize = 4;
 
 /// Looks at a job's reference and held-out views; never learns from them.
 pub struct Watch<'a> {
@@ -26,13 +24,15 @@ impl<'a> Watch<'a> {
         Self { reference, held_out: job.held_out, peak: job.peak }
     }
 
-    /// PSNR in dB of `scale·volume` over every 4th voxel an axis.
+    /// PSNR in dB of `scale·volume` over the voxels of `watched`.
     pub fn psnr(&self, volume: &Array3<f32>, scale: f32) -> Option<f64> {
         let reference = self.reference?;
-        let some = |a: &'a Array3<f32>| a.slice(ndarray::s![..;EVERY, ..;EVERY, ..;EVERY]);
-        let found = volume.slice(ndarray::s![..;EVERY, ..;EVERY, ..;EVERY]);
-        let square = |(a, b): (&f32, &f32)| (f64::from(a * scale) - f64::from(*b)).powi(2);
-        let mse = found.iter().zip(some(reference)).map(square).sum::<f64>() / found.len() as f64;
+        let (mut sum, mut n) = (0.0, 0usize);
+        for voxel in watched::voxels(volume.dim().into()) {
+            sum += (f64::from(volume[voxel] * scale) - f64::from(reference[voxel])).powi(2);
+            n += 1;
+        }
+        let mse = sum / n as f64;
         Some(10.0 * (self.peak * self.peak / mse.max(1e-300)).log10())
     }
 

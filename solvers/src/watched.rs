@@ -1,0 +1,51 @@
+//! The voxels on which PSNR is watched while a volume takes shape.
+
+use conefield_core::random::mix;
+
+/// Edge of a block of which one voxel is watched.
+const EDGE: usize = 4;
+
+/// One voxel of each block of 4³, drawn: every voxel as likely as any other, where every 4th one along an axis would give
+/// some slices four times their weight and others none. The same ones in every run and for every solver, so that records
+/// compare.
+pub fn voxels(shape: [usize; 3]) -> impl Iterator<Item = [usize; 3]> {
+    let edge = shape.map(|n| n.clamp(1, EDGE));
+    let blocks: [usize; 3] = std::array::from_fn(|k| shape[k].div_ceil(edge[k]));
+    (0..blocks.iter().product()).filter_map(move |block| {
+        let at = [block / (blocks[1] * blocks[2]), block / blocks[2] % blocks[1], block % blocks[2]];
+        let drawn = mix(block as u64, 0);
+        let voxel: [usize; 3] = std::array::from_fn(|k| at[k] * edge[k] + (drawn >> (16 * k)) as usize % edge[k]);
+        // A block that the volume's rim cuts has one as seldom as it has voxels.
+        (0..3).all(|k| voxel[k] < shape[k]).then_some(voxel)
+    })
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn no_slice_has_more_than_its_share() {
+        for shape in [[64; 3], [61, 62, 63]] {
+            let found: Vec<_> = voxels(shape).collect();
+            let share = shape.iter().product::<usize>() as f64 / 64.0;
+            assert!((found.len() as f64 / share - 1.0).abs() < 0.05, "{shape:?}: {} of {share}", found.len());
+            for axis in 0..3 {
+                for slice in 0..shape[axis] {
+                    let n = found.iter().filter(|v| v[axis] == slice).count() as f64;
+                    let share = share / shape[axis] as f64;
+                    // Five standard deviations.
+                    assert!((n - share).abs() < 5.0 * share.sqrt(), "{shape:?}, {axis}, {slice}: {n} of {share}");
+                }
+            }
+        }
+    }
+
+    #[test]
+    fn small_and_flat_volumes_have_some() {
+        assert_eq!(voxels([1, 1, 1]).collect::<Vec<_>>(), [[0, 0, 0]]);
+        assert_eq!(voxels([512, 512, 1]).count(), 128 * 128);
+        assert!(voxels([5, 1, 2]).count() >= 1);
+        assert_eq!(voxels([0, 3, 3]).count(), 0);
+    }
+}
