@@ -1,0 +1,43 @@
+#!/usr/bin/env bash
+# What ending when views kept aside get no better is worth, for a field (balanced, a rate that stays) and for SART:
+#   bash benches/patience.sh DATA_FOLDER OUT_FOLDER [SECONDS [VOLUMES]]
+# DATA_FOLDER holds volumes/*.nii.gz. Every tenth view is kept aside. A field has SECONDS (90), SART ten passes; with patience
+# they end sooner, and keep the best record. OUT_FOLDER/patience.md has what each ended with.
+set -euo pipefail
+cd "$(dirname "$0")/.."
+data=$1
+out=$2
+seconds=${3:-90}
+volumes=${4:-engine_256 teapot_256 head_256 chest_128 abdomen_128}
+cargo build --release --quiet -p conefield
+bin=${CARGO_TARGET_DIR:-target}/release/conefield
+mkdir -p "$out"
+field=(--spec balanced --set solver.seconds="$seconds" --set solver.steps=1000000)
+for volume in $volumes; do
+    scan=$out/$volume
+    [[ -d $scan ]] || "$bin" -q simulate "$data/volumes/$volume.nii.gz" -o "$scan" --protocol r2 --views 50 --noise tigre:1e4,10
+    run() {
+        local name=$1
+        shift
+        "$bin" -q reconstruct "$scan" -o "$out/$volume-$name" --force --reference truth --hold-out every:10 "$@" >/dev/null
+    }
+    run field-cosine "${field[@]}"
+    run field-constant "${field[@]}" --set 'solver.decay="none"'
+    run field-patience "${field[@]}" --set 'solver.decay="none"' --set solver.patience=5
+    run sart-passes --spec sart --set 'solver.stop={passes=10}'
+    run sart-patience --spec sart --set 'solver.stop={passes=10,patience=2}'
+done
+python3 - "$out" $volumes <<'PY' | tee "$out/patience.md"
+import json, sys
+out, *volumes = sys.argv[1:]
+runs = ["field-cosine", "field-constant", "field-patience", "sart-passes", "sart-patience"]
+print("| | " + " | ".join(runs) + " |\n|---" + "|---" * len(runs) + "|")
+for volume in volumes:
+    cells = []
+    for run in runs:
+        with open(f"{out}/{volume}-{run}/record.json") as file:
+            record = json.load(file)
+        scores = record["scores"]
+        cells.append(f"{scores['psnr']:.2f} dB, {scores['ssim_2d']:.3f}, {record['train_s']:.0f} s, {record['steps']} steps")
+    print(f"| {volume} | " + " | ".join(cells) + " |")
+PY
