@@ -6,6 +6,7 @@
 # something; NAF with its published rate stays at its first plateau that long.
 set -euo pipefail
 cd "$(dirname "$0")/.."
+source benches/common.sh
 data=$1
 out=$2
 seconds=${3:-120}
@@ -21,7 +22,7 @@ weights=$out/abdomen.safetensors
 : >"$out/scores.txt"
 for volume in engine_256 head_256 chest_128; do
     scan=$out/$volume
-    [[ -d $scan ]] || "$bin/conefield" -q simulate "$data/volumes/$volume.nii.gz" -o "$scan" --protocol r2 --views 50 --noise tigre:1e4,10
+    published_scan "$data" "$volume" "$scan"
     run() {
         local name=$1
         shift

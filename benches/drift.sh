@@ -7,6 +7,7 @@
 # Leaves OUT_FOLDER/VOLUME-drift.png (drift against epochs) and VOLUME-psnr.png; finished runs are not run again.
 set -euo pipefail
 cd "$(dirname "$0")/.."
+source benches/common.sh
 data=$1
 out=$2
 steps=${3:-1000}
@@ -16,7 +17,7 @@ cargo build --release --quiet -p conefield-benches --bin curves
 bin=${CARGO_TARGET_DIR:-target}/release
 mkdir -p "$out"
 scan=$out/$volume
-[[ -d $scan ]] || "$bin/conefield" -q simulate "$data/volumes/$volume.nii.gz" -o "$scan" --protocol r2 --views 50 --noise tigre:1e4,10
+published_scan "$data" "$volume" "$scan"
 none='normalizers=[]'
 norm='normalizers=[{type="layer-norm"}]'
 small=(--spec ni-naf --set encoder.log2_table_size=17)

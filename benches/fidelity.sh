@@ -2,34 +2,37 @@
 # PSNR at equal step counts beside the published training's curve, over 3 seeds:
 #   bash benches/fidelity.sh DATA_FOLDER OUT_FOLDER [PYTHON]
 # DATA_FOLDER holds volumes/engine_256.nii.gz and reference_curve.csv (columns step and psnr_sub). With a PYTHON that has torch
-# and numpy also from the published code's initial weights (benches/peers/initial.py); seeds then choose views and rays alone.
+# and safetensors also from the published code's initial weights (benches/peers/initial.py); seeds then choose views and rays alone.
 set -euo pipefail
 cd "$(dirname "$0")/.."
+source benches/common.sh
 data=$1
 out=$2
 python=${3:-}
 cargo build --release --quiet -p conefield
 bin=${CARGO_TARGET_DIR:-target}/release/conefield
 mkdir -p "$out"
-[[ -d $out/scan ]] || "$bin" -q simulate "$data/volumes/engine_256.nii.gz" -o "$out/scan" --protocol r2 --views 50 --noise tigre:1e4,10
+published_scan "$data" engine_256 "$out/scan"
 run() {
     local name=$1
     shift
-    "$bin" -q reconstruct "$out/scan" --spec ni-naf-published -o "$out/$name" --force --reference truth "$@"
+    "$bin" -q reconstruct "$out/scan" --spec ni-naf-published -o "$out/$name" --force --reference truth "$@" >/dev/null
 }
 names=()
-for seed in 0 1 2; do
-    run "own-$seed" --steps 480 --seed "$seed"
-    names+=("own-$seed")
-done
-if [[ -n $python ]]; then
-    run names --steps 1
-    "$python" benches/peers/initial.py "$out/names/weights.safetensors" "$out/initial.safetensors"
+seeds() {
+    local from=$1
+    shift
     for seed in 0 1 2; do
-        run "same-$seed" --steps 480 --seed "$seed" \
-            --set "initializer={ type = \"checkpoint\", weights = \"$(realpath "$out")/initial.safetensors\" }"
-        names+=("same-$seed")
+        run "$from-$seed" --steps 480 --seed "$seed" "$@"
+        names+=("$from-$seed")
     done
+}
+seeds own
+if [[ -n $python ]]; then
+    initial=$(realpath "$out")/initial.safetensors
+    run one-step --steps 1
+    "$python" benches/peers/initial.py "$out/one-step/weights.safetensors" "$initial"
+    seeds same --set "initializer={ type = \"checkpoint\", weights = \"$initial\" }"
 fi
 python3 - "$data/reference_curve.csv" "$out" "${names[@]}" <<'PY'
 import csv, json, sys

@@ -6,6 +6,7 @@
 # less work of each.
 set -euo pipefail
 cd "$(dirname "$0")/.."
+source benches/common.sh
 adapter=${1:-0}
 data=${2:-}
 out=${3:-gpu-out}
@@ -24,7 +25,7 @@ software=$("$bin" backends --json | python3 -c "import json, sys; print(json.loa
 if [[ -n $data ]]; then
     echo "== seconds to PSNR on engine_256, 50 noisy views"
     mkdir -p "$out"
-    [[ -d $out/scan ]] || "$bin" -q simulate "$data/volumes/engine_256.nii.gz" -o "$out/scan" --protocol r2 --views 50 --noise tigre:1e4,10
+    published_scan "$data" engine_256 "$out/scan"
     small=()
     budget=300s
     if [[ $software == True ]]; then

@@ -5,6 +5,7 @@
 # they end sooner, and keep the best record. OUT_FOLDER/patience.md has what each ended with.
 set -euo pipefail
 cd "$(dirname "$0")/.."
+source benches/common.sh
 data=$1
 out=$2
 seconds=${3:-90}
@@ -15,7 +16,7 @@ mkdir -p "$out"
 field=(--spec balanced --set solver.seconds="$seconds" --set solver.steps=1000000)
 for volume in $volumes; do
     scan=$out/$volume
-    [[ -d $scan ]] || "$bin" -q simulate "$data/volumes/$volume.nii.gz" -o "$scan" --protocol r2 --views 50 --noise tigre:1e4,10
+    published_scan "$data" "$volume" "$scan"
     run() {
         local name=$1
         shift

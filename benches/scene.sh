@@ -7,6 +7,7 @@
 # it was where the run with none of the rules ended.
 set -euo pipefail
 cd "$(dirname "$0")/.."
+source benches/common.sh
 data=$1
 out=$2
 seconds=${3:-60}
@@ -19,7 +20,7 @@ mkdir -p "$out"
 : >"$out/scene.md"
 for volume in $volumes; do
     scan=$out/$volume
-    [[ -d $scan ]] || "$bin/conefield" -q simulate "$data/volumes/$volume.nii.gz" -o "$scan" --protocol r2 --views 50 --noise tigre:1e4,10
+    published_scan "$data" "$volume" "$scan"
     runs=()
     run() {
         local name=$1 time=$2 support=$3 levels=$4

@@ -6,6 +6,7 @@
 # each volume's folder its picture and runs.
 set -euo pipefail
 cd "$(dirname "$0")/.."
+source benches/common.sh
 data=$1
 out=$2
 seconds=${3:-600}
@@ -18,7 +19,7 @@ mkdir -p "$out"
 for volume in $volumes; do
     scan=$out/scan-$volume
     table=$out/$volume
-    [[ -d $scan ]] || "$bin" -q simulate "$data/volumes/$volume.nii.gz" -o "$scan" --protocol r2 --views 50 --noise tigre:1e4,10
+    published_scan "$data" "$volume" "$scan"
     again=()
     [[ ! -d $table ]] || again=(--resume)
     "$bin" -q compare "$scan" --specs "$specs" --reference truth \

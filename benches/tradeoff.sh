@@ -8,6 +8,7 @@
 # Leaves OUT_FOLDER/{engine_256,head_256,tuning} and OUT_FOLDER/presets.
 set -euo pipefail
 cd "$(dirname "$0")/.."
+source benches/common.sh
 data=$1
 out=$2
 budgets=${3:-10s,30s,60s,180s,1200s}
@@ -20,7 +21,7 @@ mkdir -p "$out"
 for volume in abdomen_128 engine_256 head_256; do
     scan=$out/scans/$volume
     mkdir -p "$out/scans"
-    [[ -d $scan ]] || "$bin" -q simulate "$data/volumes/$volume.nii.gz" -o "$scan" --protocol r2 --views 50 --noise tigre:1e4,10
+    published_scan "$data" "$volume" "$scan"
 done
 search() {
     local name=$1 budgets=$2

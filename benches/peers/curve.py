@@ -4,8 +4,8 @@
 
 Written from the published description, apart from conefield's code: LayerNorm, no mask, no MCI, one view a step in
 random order, 1024 rays with a positive projection, 320 uniform samples from near to far, L1, Adam 1e-3, the scene
-scaled by 0.2. With --seed 11 the initial weights are the published code's. SCAN_FOLDER is what `conefield simulate VOLUME --protocol r2 --views N` writes (a cube of voxels, one
-full turn). Needs torch, numpy and nibabel.
+scaled by 0.2. With --seed 11 the initial weights are the published code's. SCAN_FOLDER is what `conefield simulate
+VOLUME --protocol r2 --views N` writes (a cube of voxels, one full turn). Needs torch, numpy and nibabel.
 """
 
 import argparse
@@ -49,9 +49,10 @@ def main():
     views, *shape = projections.shape
     angles = 2 * math.pi * np.arange(views) / views
     # Of the four ways to take every 4th voxel this one fits the published curve best; they differ by up to 0.3 dB.
-    axes = [((np.arange(2, n, 4) + 0.5) / n * 2 - 1) * SCALE for n in volume.shape]
+    some = slice(2, None, 4)
+    axes = [((np.arange(n)[some] + 0.5) / n * 2 - 1) * SCALE for n in volume.shape]
     points = torch.tensor(np.stack(np.meshgrid(*axes, indexing="ij"), -1).reshape(-1, 3), dtype=torch.float32)
-    truth = torch.tensor(volume[2::4, 2::4, 2::4].reshape(-1))
+    truth = torch.tensor(volume[some, some, some].reshape(-1))
     field = Field()
     optimizer = torch.optim.Adam(field.parameters(), lr=1e-3)
     positive = [np.nonzero(view.numpy().ravel() > 0)[0] for view in projections]
