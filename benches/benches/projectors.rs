@@ -8,7 +8,7 @@ use conefield_benches::{bandwidth, multiply_adds, times};
 use conefield_core::Result;
 use conefield_core::geometry::{Geometry, Millimetres, Radians, View, VoxelGrid, norm};
 use conefield_core::scan::{Scan, Unit};
-use conefield_core::solver::{Job, Silent};
+use conefield_core::method::{Job, Silent};
 use conefield_core::spec::load::parse;
 use conefield_core::voxel::VoxelOperator;
 use conefield_projectors::voxel::Joseph;

@@ -10,7 +10,7 @@ use conefield_backend_cpu::Cpu;
 use conefield_benches::{multiply_adds, random_reads, rays, spread};
 use conefield_core::backend::{Adam, Backend, Loss, Work};
 use conefield_core::pipeline::{Model, Pipeline};
-use conefield_core::spec::{EncoderSpec, FieldSpec, NormalizerSpec, ProjectorSpec};
+use conefield_core::settings::{EncoderSpec, FieldSpec, NormalizerSpec, ProjectorSpec};
 use conefield_encoders::hash_grid::HashGrid;
 use conefield_fields::mlp::Mlp;
 use conefield_normalizers::layer_norm::LayerNorm;

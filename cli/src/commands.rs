@@ -23,7 +23,7 @@ mod trial;
 
 use clap::{ArgAction, Args, Subcommand};
 use conefield_core::Result;
-use conefield_core::solver::Limits;
+use conefield_core::method::Limits;
 use serde::{Deserialize, Serialize};
 use std::ffi::OsString;
 use std::path::PathBuf;

@@ -96,10 +96,11 @@ pub fn read_field(path: &Path) -> Result<TrainedField> {
         let expected = "weights that a run of \"conefield reconstruct\" left";
         weights.notes.get(key).ok_or_else(|| Error::invalid(&place, key, "no such note", expected))
     };
-    let spec = crate::specs::reread(note("spec")?, &format!("{place}: spec.toml"))?.spec;
+    let loaded = crate::specs::reread(note("spec")?, &format!("{place}: spec.toml"))?;
+    let plan = crate::method::plan_without_files(&loaded, &Cpu::new())?;
     let placement = serde_json::from_str(note(PLACEMENT)?)
         .map_err(|e| Error::invalid(&place, PLACEMENT, e, "what conefield writes there"))?;
-    TrainedField::restore(&spec, &placement, |model| {
+    plan.restore(&placement, &mut |model| {
         weights.load(&place, model.pipeline.layout(), &mut model.arena.params, |_| true).map(drop)
     })
 }

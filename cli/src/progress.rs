@@ -3,7 +3,7 @@
 use crate::{files, signals};
 use conefield_core::Result;
 use conefield_core::checkpoint::Checkpoint;
-use conefield_core::solver::{Observer, Record};
+use conefield_core::method::{Observer, Record};
 use indicatif::{MultiProgress, ProgressBar, ProgressDrawTarget, ProgressStyle};
 use std::collections::BTreeMap;
 use std::fs::File;

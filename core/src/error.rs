@@ -97,6 +97,18 @@ impl Error {
         Self::Io { path: path.as_ref().to_path_buf(), source }
     }
 
+    /// The same error for the owner of the stage that it is about: `key` goes before a field of a spec. A stage does not
+    /// know where it stands.
+    pub fn within(self, key: &str) -> Self {
+        match self {
+            Self::Invalid { place, field, found, expected } if place == "spec" => {
+                let field = if field.is_empty() { key.to_owned() } else { format!("{key}.{field}") };
+                Self::Invalid { place, field, found, expected }
+            }
+            other => other,
+        }
+    }
+
     /// A thing that cannot be done, with the reason.
     pub fn unsupported(what: impl Into<String>, why: impl Into<String>) -> Self {
         Self::Unsupported { what: what.into(), why: why.into() }

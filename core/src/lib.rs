@@ -2,14 +2,14 @@
 //!
 //! - [`geometry`], [`scan`], [`parts`]: what was measured, in millimetres, and what comes out.
 //! - [`simd`], [`half`], [`dense`], [`trilinear`], [`stage`]: what a stage computes and how.
-//! - [`support`]: where the object can be; [`occupancy`]: where a field is known to be empty.
+//! - [`support`]: where the object can be; [`scene`]: between the world and what stages see.
 //! - [`wgsl`]: the same for a GPU.
 //! - [`arena`]: parameters, gradients and optimizer state under their names.
 //! - [`files`]: opening what a user or a description names.
-//! - [`spec`], [`registry`]: what a user writes, and the stage types that it may name.
+//! - [`settings`], [`spec`], [`registry`]: what a user writes, and the types that it may name.
 //! - [`host`]: stages on the host, for what looks at a model beside training.
 //! - [`voxel`]: line integrals of voxel volumes.
-//! - [`pipeline`], [`backend`], [`solver`], [`trained`]: from a spec to a volume.
+//! - [`pipeline`], [`backend`], [`trained`], [`method`]: from a method's stages to a volume.
 
 pub mod arena;
 pub mod backend;
@@ -20,16 +20,17 @@ pub mod files;
 pub mod geometry;
 pub mod half;
 pub mod host;
-pub mod occupancy;
+pub mod method;
 pub mod pages;
 pub mod parts;
 pub mod pipeline;
+pub mod precision;
 pub mod random;
 pub mod registry;
 pub mod scan;
 pub mod scene;
+pub mod settings;
 pub mod simd;
-pub mod solver;
 pub mod spec;
 pub mod stage;
 pub mod support;

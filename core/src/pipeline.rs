@@ -3,22 +3,24 @@
 use crate::arena::{Arena, Block, Layout};
 use crate::backend::{Backend, Executable};
 use crate::error::{Result, ensure};
+use crate::precision::Tables;
 use crate::scene::Scene;
-use crate::spec::{OccupancyRule, Spec, Tables};
 use crate::stage::{Encoder, Field, Info, Lengths, Normalizer, Probe, Projector, Scope, Stage};
 use serde::{Deserialize, Serialize};
 use std::ops::Range;
+use std::sync::Arc;
 
-/// The built stages of a spec, in order, with the arena's layout.
+/// The built stages of a field, in order, with the arena's layout. A copy shares the stages.
+#[derive(Clone)]
 pub struct Pipeline {
     /// Points to features.
-    pub encoder: Box<dyn Encoder>,
+    pub encoder: Arc<dyn Encoder>,
     /// Features to features.
-    pub normalizers: Vec<Box<dyn Normalizer>>,
+    pub normalizers: Vec<Arc<dyn Normalizer>>,
     /// Features to attenuation.
-    pub field: Box<dyn Field>,
+    pub field: Arc<dyn Field>,
     /// Rays to samples.
-    pub projector: Box<dyn Projector>,
+    pub projector: Arc<dyn Projector>,
     /// How tables of features are read.
     pub tables: Tables,
     layout: Layout,
@@ -46,52 +48,35 @@ pub struct Masked {
 }
 
 impl Pipeline {
-    /// Builds every stage of `spec` and refuses combinations that do not fit, before any parameter is allocated.
-    pub fn build(spec: &Spec) -> Result<Self> {
-        let need = |what: &str| crate::Error::invalid("spec", what, "nothing", format!("a table [{what}] with a type"));
-        let encoder = spec.encoder.as_ref().ok_or_else(|| need("encoder"))?.build()?;
+    /// Puts stages together. Refuses those that do not fit, before any parameter is allocated; the error names the key of
+    /// the stage.
+    pub fn new(
+        encoder: Box<dyn Encoder>,
+        normalizers: Vec<Box<dyn Normalizer>>,
+        field: Box<dyn Field>,
+        projector: Box<dyn Projector>,
+    ) -> Result<Self> {
         let mut width = check("encoder", encoder.as_ref(), 3)?;
-        let scope = encoder.info().scope;
         ensure(
-            scope == Scope::Row,
+            encoder.info().scope == Scope::Row,
             "spec",
             "encoder",
             "one whose rows look at each other",
             "an encoder that treats each point alone",
         )?;
-        let mut normalizers = vec![];
-        for (i, n) in spec.normalizers.iter().enumerate() {
-            let n = n.build(width)?;
-            width = check(&format!("normalizers[{i}]"), n.as_ref(), width)?;
-            normalizers.push(n);
+        for (i, n) in normalizers.iter().enumerate() {
+            width = check(&format!("normalizers.{i}"), n.as_ref(), width)?;
         }
-        let field = spec.field.as_ref().ok_or_else(|| need("field"))?.build(width)?;
         let out = check("field", field.as_ref(), width)?;
         ensure(out == 1, "spec", "field", format!("{out} channels out"), "1, the attenuation")?;
-        let projector = spec.projector.as_ref().ok_or_else(|| need("projector"))?.build()?;
-        let mut pipeline = Self::assemble(encoder, normalizers, field, projector);
-        pipeline.tables = spec.precision.tables;
-        let occupancy = &spec.scene.occupancy;
-        occupancy.validate()?;
-        // What such a stage makes of a sample depends on those that would be left out.
-        let apart = *occupancy == OccupancyRule::Fixed || pipeline.scope() == Scope::Row;
-        ensure(apart, "spec", "scene.occupancy", "refined", "\"fixed\", as a stage looks along rays")?;
-        // Of any scene: whether the encoder knows what the projector counts in.
-        pipeline.projector.fitted(pipeline.lengths(1.0, 1.0))?;
-        Ok(pipeline)
-    }
-
-    /// Puts built stages together; their widths must fit.
-    pub fn assemble(
-        encoder: Box<dyn Encoder>,
-        normalizers: Vec<Box<dyn Normalizer>>,
-        field: Box<dyn Field>,
-        projector: Box<dyn Projector>,
-    ) -> Self {
         let (tables, layout) = (Tables::default(), Layout::default());
-        let mut p = Self { encoder, normalizers, field, projector, tables, layout, ranges: vec![] };
-        p.lay_out();
-        p
+        let (encoder, field, projector) = (Arc::from(encoder), Arc::from(field), Arc::from(projector));
+        let normalizers = normalizers.into_iter().map(Arc::from).collect();
+        let mut pipeline = Self { encoder, normalizers, field, projector, tables, layout, ranges: vec![] };
+        pipeline.lay_out();
+        // Of any scene: whether the encoder knows what the projector counts in.
+        pipeline.fitted(pipeline.lengths(1.0, 1.0))?;
+        Ok(pipeline)
     }
 
     fn lay_out(&mut self) {
@@ -166,12 +151,18 @@ impl Pipeline {
         (keep.len() < all.len()).then_some(keep)
     }
 
-    /// Takes a scene's lengths for the measure of what counts in them.
-    pub fn fit(&mut self, scene: &Scene) -> Result<()> {
-        if let Some(fitted) = self.projector.fitted(self.lengths(scene.voxel_mm(), scene.side))? {
-            self.projector = fitted;
+    /// Takes a scene's lengths for the measure of what counts in them. Returns whether that changed a stage.
+    pub fn fit(&mut self, scene: &Scene) -> Result<bool> {
+        let fitted = self.fitted(self.lengths(scene.voxel_mm(), scene.side))?;
+        let changed = fitted.is_some();
+        if let Some(projector) = fitted {
+            self.projector = Arc::from(projector);
         }
-        Ok(())
+        Ok(changed)
+    }
+
+    fn fitted(&self, lengths: Lengths) -> Result<Option<Box<dyn Projector>>> {
+        self.projector.fitted(lengths).map_err(|e| e.within("projector"))
     }
 
     /// What settings may count in, of a unit cube with a side of `side` mm.
@@ -188,22 +179,22 @@ impl Pipeline {
         let mut keep = masked.to_vec();
         for i in at..self.normalizers.len() {
             let r = self.normalizers[i].keep_inputs(&keep)?;
-            self.normalizers[i] = r.stage;
+            self.normalizers[i] = Arc::from(r.stage);
             kept[1 + i] = r.params;
             keep = r.channels;
         }
         let r = self.field.keep_inputs(&keep)?;
-        self.field = r.stage;
+        self.field = Arc::from(r.stage);
         kept[1 + self.normalizers.len()] = r.params;
         let mut needed = masked.to_vec();
         for i in (0..at).rev() {
             let r = self.normalizers[i].keep_outputs(&needed)?;
-            self.normalizers[i] = r.stage;
+            self.normalizers[i] = Arc::from(r.stage);
             kept[1 + i] = r.params;
             needed = r.channels;
         }
         let r = self.encoder.keep_outputs(&needed)?;
-        self.encoder = r.stage;
+        self.encoder = Arc::from(r.stage);
         kept[0] = r.params;
         let ranges: Vec<_> =
             kept.iter().zip(&old).flat_map(|(k, o)| k.iter().map(|r| o.start + r.start..o.start + r.end)).collect();

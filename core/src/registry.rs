@@ -5,44 +5,54 @@
 //! come from here.
 
 use crate::error::{Error, Result};
-use crate::spec::{EncoderSpec, FieldSpec, InitializerSpec, NormalizerSpec, ProjectorSpec, SolverSpec};
+use crate::settings::{EncoderSpec, FieldSpec, InitializerSpec, NormalizerSpec, ProjectorSpec, VoxelProjectorSpec};
 use schemars::Schema;
 use serde_json::Value;
 use std::fmt;
 use std::sync::{PoisonError, RwLock};
 
-/// The kinds of stage that a spec puts together.
+/// What a spec names: a method, and the kinds of stage that methods put together.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, serde::Serialize)]
 #[serde(rename_all = "kebab-case")]
 pub enum Kind {
+    /// Scan to volume.
+    Method,
     /// Points to features.
     Encoder,
     /// Features to features.
     Normalizer,
     /// Features to attenuation.
     Field,
-    /// Rays to samples.
+    /// Rays to samples of a field.
     Projector,
+    /// Voxels to line integrals.
+    VoxelProjector,
     /// Where weights come from.
     Initializer,
-    /// Scan to volume.
-    Solver,
 }
 
 impl Kind {
-    /// Every kind, in the order of a pipeline.
-    pub const ALL: [Self; 6] =
-        [Self::Encoder, Self::Normalizer, Self::Field, Self::Projector, Self::Initializer, Self::Solver];
+    /// Every kind: methods, then their stages in order.
+    pub const ALL: [Self; 7] = [
+        Self::Method,
+        Self::Encoder,
+        Self::Normalizer,
+        Self::Field,
+        Self::Projector,
+        Self::VoxelProjector,
+        Self::Initializer,
+    ];
 
     /// What it is called in a spec.
     pub fn name(self) -> &'static str {
         match self {
+            Self::Method => "method",
             Self::Encoder => "encoder",
             Self::Normalizer => "normalizer",
             Self::Field => "field",
             Self::Projector => "projector",
+            Self::VoxelProjector => "voxel-projector",
             Self::Initializer => "initializer",
-            Self::Solver => "solver",
         }
     }
 
@@ -103,10 +113,10 @@ pub enum Make {
     Field(MakeFn<dyn FieldSpec>),
     /// Of a projector.
     Projector(MakeFn<dyn ProjectorSpec>),
+    /// Of a projector of voxels.
+    VoxelProjector(MakeFn<dyn VoxelProjectorSpec>),
     /// Of an initializer.
     Initializer(MakeFn<dyn InitializerSpec>),
-    /// Of a solver.
-    Solver(MakeFn<dyn SolverSpec>),
 }
 
 impl Make {
@@ -116,8 +126,8 @@ impl Make {
             Self::Normalizer(_) => Kind::Normalizer,
             Self::Field(_) => Kind::Field,
             Self::Projector(_) => Kind::Projector,
+            Self::VoxelProjector(_) => Kind::VoxelProjector,
             Self::Initializer(_) => Kind::Initializer,
-            Self::Solver(_) => Kind::Solver,
         }
     }
 }

@@ -287,7 +287,7 @@ pub trait Stage: Send + Sync {
     }
 
     /// The arithmetic that reads parameters in halves, or `None` where they are read as they are. Hosts want it of
-    /// [`GradKind::Scatter`] stages where a spec asks for it ([`crate::spec::Precision`]).
+    /// [`GradKind::Scatter`] stages where a spec asks for it ([`crate::precision::Precision`]).
     fn halves(&self) -> Option<Halves<'_>> {
         None
     }

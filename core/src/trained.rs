@@ -6,8 +6,7 @@ use crate::geometry::VoxelGrid;
 use crate::parts::{Part, Voxels};
 use crate::pipeline::{Masked, Model, Pipeline};
 use crate::scan::Affine;
-use crate::scene::Scene;
-use crate::spec::Spec;
+use crate::scene::{Scene, SceneSettings};
 use crate::support::Support;
 use ndarray::ArrayViewMut3;
 use serde::{Deserialize, Serialize};
@@ -54,14 +53,18 @@ impl TrainedField {
         }
     }
 
-    /// The field of `spec` where `placement` says, with the parameters that `load` puts into its model.
-    pub fn restore(spec: &Spec, placement: &Placement, load: impl FnOnce(&mut Model) -> Result<()>) -> Result<Self> {
+    /// The field of these stages where `placement` says, with the parameters that `load` puts into its model.
+    pub fn restore(
+        mut pipeline: Pipeline,
+        settings: &SceneSettings,
+        placement: &Placement,
+        load: &mut dyn FnMut(&mut Model) -> Result<()>,
+    ) -> Result<Self> {
         placement.grid.validate("placement")?;
-        let mut scene = Scene::with_attenuation(placement.grid, &spec.scene, placement.attenuation)?;
+        let mut scene = Scene::with_attenuation(placement.grid, settings, placement.attenuation)?;
         if let Some(support) = placement.support.clone() {
-            scene = scene.within(support, &spec.scene);
+            scene = scene.within(support, settings);
         }
-        let mut pipeline = Pipeline::build(spec)?;
         pipeline.fit(&scene)?;
         let mut model = Model::random(pipeline, 0);
         for masked in &placement.masks {

@@ -4,7 +4,7 @@ use conefield_core::error::{Error, Result, ensure};
 use conefield_core::half::{Bf16, F16};
 use conefield_core::random::mix;
 use conefield_core::simd::Real;
-use conefield_core::spec::EncoderSpec;
+use conefield_core::settings::EncoderSpec;
 use conefield_core::stage::{
     Encoder, GradKind, Grads, Halves, Info, Kernel, Parameter, Reduced, Scope, Stage, Tile, TileMut,
 };
@@ -36,23 +36,12 @@ impl EncoderSpec for Concat {
     fn build(&self) -> Result<Box<dyn Encoder>> {
         let mut parts = vec![];
         for (i, e) in self.encoders.iter().enumerate() {
-            let part = e.build().map_err(|e| inside(i, e))?;
+            let part = e.build().map_err(|e| e.within(&format!("encoders.{i}")))?;
             let input = part.info().input;
-            ensure(input == 3, "spec", &format!("encoder.encoders.{i}"), format!("{input} channels in"), "3")?;
+            ensure(input == 3, "spec", &format!("encoders.{i}"), format!("{input} channels in"), "3")?;
             parts.push((i, Arc::from(part)));
         }
         Ok(Box::new(ConcatStage::new(parts)?))
-    }
-}
-
-/// The error of part `i` with the way to it.
-fn inside(i: usize, error: Error) -> Error {
-    match error {
-        Error::Invalid { place, field, found, expected } => {
-            let rest = field.strip_prefix("encoder.").unwrap_or(&field);
-            Error::Invalid { place, field: format!("encoder.encoders.{i}.{rest}"), found, expected }
-        }
-        other => other,
     }
 }
 
@@ -87,7 +76,7 @@ pub struct ConcatStage {
 impl ConcatStage {
     /// Puts parts, each with its place in the settings, side by side.
     fn new(stages: Vec<(usize, Arc<dyn Encoder>)>) -> Result<Self> {
-        ensure(!stages.is_empty(), "spec", "encoder.encoders", "none", "at least one encoder")?;
+        ensure(!stages.is_empty(), "spec", "encoders", "none", "at least one encoder")?;
         let mut info = Info {
             input: 3,
             output: 0,
@@ -123,7 +112,7 @@ impl ConcatStage {
         }
         if info.grads == GradKind::Scatter && info.tape > 0 {
             return Err(Error::unsupported(
-                "encoder.encoders",
+                "concat: encoders",
                 "an encoder that keeps a tape beside one whose gradients are scattered; use them in separate specs",
             ));
         }

@@ -9,7 +9,7 @@ use conefield_core::dense::{Output as Into, Weights, affine, affine_input, affin
 use conefield_core::error::{Result, ensure};
 use conefield_core::random::{mix, unit};
 use conefield_core::simd::{Op, Real, Select, Simd, SimdBase, SimdFloat, V, load, run, store};
-use conefield_core::spec::FieldSpec;
+use conefield_core::settings::FieldSpec;
 use conefield_core::stage::{Field, GradKind, Grads, Info, Kernel, Parameter, Reduced, Scope, Stage, Tile, TileMut};
 use conefield_core::wgsl::Fragment;
 use schemars::JsonSchema;
@@ -213,10 +213,10 @@ impl MlpStage {
     pub fn new(settings: &Mlp, input: usize) -> Result<Self> {
         let s = settings;
         let depth = s.depth;
-        ensure((1..=64).contains(&depth), "spec", "field.depth", depth, "1 to 64 linear layers")?;
-        ensure((1..=1024).contains(&s.width), "spec", "field.width", s.width, "1 to 1024 channels")?;
+        ensure((1..=64).contains(&depth), "spec", "depth", depth, "1 to 64 linear layers")?;
+        ensure((1..=1024).contains(&s.width), "spec", "width", s.width, "1 to 1024 channels")?;
         for &k in &s.skips {
-            ensure(k > 0 && k < depth, "spec", "field.skips", k, format!("layers 1 to {}", depth - 1))?;
+            ensure(k > 0 && k < depth, "spec", "skips", k, format!("layers 1 to {}", depth - 1))?;
         }
         let mut layers = vec![];
         let mut start = 0;

@@ -7,7 +7,7 @@ use crate::mlp::{ACTIVATION, Activation, activate};
 use conefield_core::error::{Error, Result, ensure};
 use conefield_core::half::Stored;
 use conefield_core::simd::{Op, Real, Simd, run};
-use conefield_core::spec::FieldSpec;
+use conefield_core::settings::FieldSpec;
 use conefield_core::stage::{
     Field, GradKind, Grads, Halves, Info, Kernel, Parameter, Reduced, Scope, Stage, Tile, TileMut,
 };
@@ -82,11 +82,11 @@ impl VoxelGridStage {
         ensure(
             axes.iter().all(|n| (1..=1 << 20).contains(n)) && voxels.is_some_and(|v| v <= MOST),
             "spec",
-            "field.resolution",
+            "resolution",
             format!("{axes:?}"),
             "1 to 2^20 voxels a side and at most 2^31 together",
         )?;
-        ensure(settings.init.is_finite(), "spec", "field.init", settings.init, "a finite number")?;
+        ensure(settings.init.is_finite(), "spec", "init", settings.init, "a finite number")?;
         Ok(Self { grid: Grid::centres(axes.map(|n| n as usize)), output: settings.output, init: settings.init as f32 })
     }
 }
@@ -285,7 +285,7 @@ mod tests {
         assert!(e.contains("20 channels") && e.contains("identity"), "{e}");
         for resolution in [Resolution::Cube(0), Resolution::Axes([1 << 20; 3]), Resolution::Cube(2048)] {
             let e = VoxelGridStage::new(&VoxelGrid { resolution, ..VoxelGrid::default() }, 3).unwrap_err().to_string();
-            assert!(e.contains("field.resolution") && e.contains("2^31"), "{e}");
+            assert!(e.contains("resolution") && e.contains("2^31"), "{e}");
         }
     }
 }

@@ -2,7 +2,7 @@
 
 use conefield_core::arena::{Arena, InitReport, Layout, Weights};
 use conefield_core::error::{Result, ensure};
-use conefield_core::spec::{Initializer, InitializerSpec};
+use conefield_core::settings::{Initializer, InitializerSpec};
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
@@ -19,7 +19,7 @@ conefield_core::stage_type!(Initializer, "checkpoint", Checkpoint, "every weight
 #[typetag::serde(name = "checkpoint")]
 impl InitializerSpec for Checkpoint {
     fn build(&self, weights: &dyn Fn(&str) -> Result<Weights>) -> Result<Box<dyn Initializer>> {
-        ensure(!self.weights.is_empty(), "spec", "initializer.weights", "no name", "a weights file")?;
+        ensure(!self.weights.is_empty(), "spec", "weights", "no name", "a weights file")?;
         Ok(Box::new(CheckpointInitializer { path: self.weights.clone(), weights: weights(&self.weights)? }))
     }
 }

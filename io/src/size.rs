@@ -4,6 +4,7 @@ use crate::scan::{self, Found};
 use crate::volume::{self, Opened};
 use crate::{dicom, metaimage, nifti, npy, r2, scan_folder, scanner};
 use conefield_core::error::ensure;
+use conefield_core::scan::ScanHeader;
 use conefield_core::{Error, Result};
 use std::path::Path;
 
@@ -19,6 +20,13 @@ pub struct ScanSize {
     pub test_pixels: u64,
     /// Bytes that reading takes beside the projections.
     pub reading: u64,
+}
+
+impl ScanSize {
+    /// As many values in one view and one row, as not every file tells more of them before it is read.
+    pub fn header(&self) -> ScanHeader {
+        ScanHeader { views: 1, detector: [1, self.pixels as usize], volume: [self.voxels as usize, 1, 1] }
+    }
 }
 
 /// The size of a scan, from what describes it; its projections are not read. A pickle (NAF) tells its sizes only when

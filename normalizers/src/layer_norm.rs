@@ -9,7 +9,7 @@
 use conefield_core::dense::total;
 use conefield_core::error::{Result, ensure};
 use conefield_core::simd::{Op, Real, Select, Simd, SimdBase, SimdFloat, V, load, run, store};
-use conefield_core::spec::NormalizerSpec;
+use conefield_core::settings::NormalizerSpec;
 use conefield_core::stage::{
     GradKind, Grads, Info, Kernel, Normalizer, Parameter, Reduced, Scope, Stage, Tile, TileMut,
 };
@@ -59,7 +59,7 @@ impl LayerNormStage {
     /// The stage for `width` channels, or which setting is out of range.
     pub fn new(settings: &LayerNorm, width: usize) -> Result<Self> {
         let eps = settings.eps;
-        ensure((1e-30..=1.0).contains(&eps), "spec", "normalizers.eps", eps, "1e-30 to 1")?;
+        ensure((1e-30..=1.0).contains(&eps), "spec", "eps", eps, "1e-30 to 1")?;
         ensure(width > 0, "layer-norm", "channels", width, "at least one")?;
         Ok(Self { settings: settings.clone(), input: width, outputs: (0..width).collect() })
     }

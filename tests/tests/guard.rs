@@ -10,7 +10,7 @@ use conefield_core::backend::{Adam, Backend, Executable, Explain, StepStats, Wor
 use conefield_core::checkpoint::Resume;
 use conefield_core::error::{Error, Result};
 use conefield_core::pipeline::{Model, Pipeline};
-use conefield_core::solver::{Job, Record, Solution};
+use conefield_core::method::{Job, Record, Solution};
 use conefield_core::stage::UnitRay;
 use serde_json::{Value, json};
 

@@ -13,8 +13,9 @@ use conefield_core::half::{Bf16, F16, Half, Stored};
 use conefield_core::pipeline::{Model, Pipeline};
 use conefield_core::random::{mix, unit};
 use conefield_core::scene::Scene;
-use conefield_core::solver::{Job, Solver};
-use conefield_core::spec::{EncoderSpec, Tables};
+use conefield_core::method::{Job, Solver};
+use conefield_core::settings::{EncoderSpec};
+use conefield_core::spec::{Tables};
 use conefield_core::stage::{Encoder, Info, Kernel, Parameter, Reduced, Stage};
 use serde_json::{Value, json};
 
@@ -61,7 +62,7 @@ fn filled(settings: &Value) -> Model {
 
 fn rays() -> Vec<TrainRay> {
     let scan = scan();
-    let scene = Scene::new(&scan, &conefield_core::spec::Scene::default()).unwrap();
+    let scene = Scene::new(&scan, &conefield_core::scene::SceneSettings::default()).unwrap();
     let ray = |i: usize| scene.pixel_ray(&scan.geometry, i % 8, (i * 5) % 16, (i * 7) % 16);
     (0..40).map(|i| TrainRay { ray: ray(i), target: if i % 2 == 0 { 0.5 } else { 3.0 } }).collect()
 }

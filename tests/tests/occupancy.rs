@@ -14,7 +14,7 @@ use conefield_core::pipeline::{Model, Pipeline};
 use conefield_core::random::mix;
 use conefield_core::scan::Scan;
 use conefield_core::scene::Scene;
-use conefield_core::solver::{Job, Record, Solution};
+use conefield_core::method::{Job, Record, Solution};
 use conefield_core::stage::{Projector, Samples, UnitRay};
 use serde_json::{Value, json};
 
@@ -79,7 +79,7 @@ fn full(p: [f32; 3]) -> bool {
 }
 
 fn rays(scan: &Scan) -> Vec<TrainRay> {
-    let scene = Scene::new(scan, &conefield_core::spec::Scene::default()).unwrap();
+    let scene = Scene::new(scan, &conefield_core::scene::SceneSettings::default()).unwrap();
     let ray = |i: usize| scene.pixel_ray(&scan.geometry, i % 8, (i * 5) % 16, (i * 7) % 16);
     (0..90).map(|i| TrainRay { ray: ray(i), target: if i % 2 == 0 { 0.5 } else { 3.0 } }).collect()
 }

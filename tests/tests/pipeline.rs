@@ -13,7 +13,7 @@ use conefield_core::pipeline::{Model, Pipeline};
 use conefield_core::random::{mix, unit};
 use conefield_core::scan::{Scan, Volume};
 use conefield_core::scene::Scene;
-use conefield_core::solver::{Limits, PretrainJob, Solution};
+use conefield_core::method::{Limits, PretrainJob, Solution};
 use conefield_core::trained::TrainedField;
 use serde_json::{Value, json};
 
@@ -86,7 +86,7 @@ fn sample(pipeline: &Pipeline, grads: &[f64]) -> Vec<Vec<usize>> {
 fn gradients_of(settings: &Value, count: usize, edge: usize) {
     let pipeline = Pipeline::build(&spec(settings).unwrap()).unwrap();
     let scan = scan();
-    let scene = Scene::new(&scan, &conefield_core::spec::Scene::default()).unwrap();
+    let scene = Scene::new(&scan, &conefield_core::scene::SceneSettings::default()).unwrap();
     let mut rays = vec![];
     for i in 0..count {
         let ray = scene.pixel_ray(&scan.geometry, i % 8, (i * 5) % 16, (i * 7) % 16);

@@ -7,7 +7,7 @@ use common::{Heard, Stop, solve, spec, volume};
 use conefield_backend_cpu::Cpu;
 use conefield_core::arena::Weights;
 use conefield_core::scan::{Scan, Volume};
-use conefield_core::solver::{Job, Solution};
+use conefield_core::method::{Job, Solution};
 use conefield_projectors::simulate::{Noise, Protocol, simulate};
 use ndarray::Array3;
 use serde_json::{Value, json};

@@ -14,8 +14,8 @@ use conefield_core::occupancy::Occupancy;
 use conefield_core::pipeline::{Model, Pipeline};
 use conefield_core::random::{mix, unit};
 use conefield_core::scene::Scene;
-use conefield_core::solver::{Job, Limits, PretrainJob, Record};
-use conefield_core::spec::Tables;
+use conefield_core::method::{Job, Limits, PretrainJob, Record};
+use conefield_core::precision::Tables;
 use conefield_core::stage::{Encoder, Field, Info, Kernel, Normalizer, Parameter, Projector, Reduced, Scope, Stage};
 use conefield_core::wgsl::Fragment;
 use serde_json::{Value, json};
@@ -53,7 +53,7 @@ fn steps_agree(settings: &Value) {
     let devices = device::backends("whole steps");
     let pipeline = Pipeline::build(&spec(settings).unwrap()).unwrap();
     let scan = scan();
-    let scene = Scene::new(&scan, &conefield_core::spec::Scene::default()).unwrap();
+    let scene = Scene::new(&scan, &conefield_core::scene::SceneSettings::default()).unwrap();
     let rays: Vec<TrainRay> = (0..40)
         .map(|i| {
             let ray = scene.pixel_ray(&scan.geometry, i % 8, (i * 5) % 16, (i * 7) % 16);
@@ -156,7 +156,7 @@ fn a_step_is_that_of_the_cpu_without_parameters_in_the_encoder() {
 #[test]
 fn what_is_asked_of_a_trained_model_is_that_of_the_cpu() {
     let scan = scan();
-    let scene = Scene::new(&scan, &conefield_core::spec::Scene::default()).unwrap();
+    let scene = Scene::new(&scan, &conefield_core::scene::SceneSettings::default()).unwrap();
     let rays: Vec<TrainRay> = (0..64)
         .map(|i| TrainRay { ray: scene.pixel_ray(&scan.geometry, i % 8, (i * 5) % 16, (i * 7) % 16), target: 0.7 })
         .collect();
@@ -348,7 +348,7 @@ fn a_perturbed_constant_fails_the_parity_check() {
     let options = conefield_conformance::Options::features();
     let check = |change: fn(String) -> Option<String>| {
         let settings = json!({"type": "mlp", "width": 5, "depth": 2, "skips": []});
-        let spec: Box<dyn conefield_core::spec::FieldSpec> = serde_json::from_value(settings).unwrap();
+        let spec: Box<dyn conefield_core::settings::FieldSpec> = serde_json::from_value(settings).unwrap();
         let stage = Changed { inner: spec.build(3).unwrap(), change, scope: Scope::Row };
         conefield_conformance::check_wgsl(&stage, &options, &|s, p, x, dy, rows| {
             shared.pass(s, Tables::F32, p, x, dy, rows)
@@ -383,7 +383,7 @@ fn stages_of_random_shapes_agree() {
             "levels": 1 + below(4), "features": 1 << below(3), "base_resolution": 2 + below(5),
             "growth": 1.0 + below(10) as f64 / 10.0,
         });
-        let spec: Box<dyn conefield_core::spec::EncoderSpec> = serde_json::from_value(grid.clone()).unwrap();
+        let spec: Box<dyn conefield_core::settings::EncoderSpec> = serde_json::from_value(grid.clone()).unwrap();
         let whole: Box<dyn Encoder> = spec.build().unwrap();
         let keep: Vec<usize> = (0..whole.info().output).filter(|_| below(3) > 0).collect();
         let stage = if keep.is_empty() { whole } else { whole.keep_outputs(&keep).unwrap().stage };
@@ -397,7 +397,7 @@ fn stages_of_random_shapes_agree() {
     }
     for _ in 0..3 {
         let width = 2 + below(36) as usize;
-        let spec: Box<dyn conefield_core::spec::NormalizerSpec> =
+        let spec: Box<dyn conefield_core::settings::NormalizerSpec> =
             serde_json::from_value(json!({"type": "layer-norm"})).unwrap();
         let norm: Box<dyn Normalizer> = spec.build(width).unwrap();
         let keep: Vec<usize> = (0..width).filter(|c| *c == 0 || below(3) > 0).collect();
@@ -413,7 +413,7 @@ fn stages_of_random_shapes_agree() {
         let activation = ["relu", "leaky-relu", "gelu", "squareplus", "softplus", "sigmoid"][below(6) as usize];
         let mlp =
             json!({"type": "mlp", "width": 1 + below(11), "depth": depth, "skips": skips, "activation": activation});
-        let spec: Box<dyn conefield_core::spec::FieldSpec> = serde_json::from_value(mlp.clone()).unwrap();
+        let spec: Box<dyn conefield_core::settings::FieldSpec> = serde_json::from_value(mlp.clone()).unwrap();
         let stage = spec.build(1 + below(9) as usize).unwrap();
         let options = conefield_conformance::Options { single: 5e-5, ..conefield_conformance::Options::features() };
         let report = conefield_conformance::check_wgsl(stage.as_ref(), &options, &pass);
@@ -444,7 +444,7 @@ fn samples_are_random_in_the_same_way() {
             Some(Fragment { source: self.0.wgsl()?.source.replace("0.5", "0.49") })
         }
     }
-    let spec: Box<dyn conefield_core::spec::ProjectorSpec> =
+    let spec: Box<dyn conefield_core::settings::ProjectorSpec> =
         serde_json::from_value(json!({"type": "ray-march", "samples": 77})).unwrap();
     let run = |p: &dyn Projector| conefield_conformance::check_projector_wgsl(p, &|p, rays| shared.samples(p, rays));
     assert!(run(spec.build().unwrap().as_ref()).passed());

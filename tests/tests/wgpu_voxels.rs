@@ -9,7 +9,7 @@ use conefield_core::arena::Weights;
 use conefield_core::backend::Backend;
 use conefield_core::geometry::Geometry;
 use conefield_core::random::{mix, unit};
-use conefield_core::spec::ProjectorSpec;
+use conefield_core::settings::ProjectorSpec;
 use conefield_core::voxel::{VoxelOperator, VoxelProjector};
 use conefield_core::wgsl::Fragment;
 use ndarray::Array3;

@@ -18,7 +18,7 @@ use conefield_core::backend::{Adam, Backend, Executable, Explain, StepStats, Wor
 use conefield_core::error::{Error, Result};
 use conefield_core::pipeline::{Model, Pipeline};
 use conefield_core::simd;
-use conefield_core::spec::Tables;
+use conefield_core::precision::Tables;
 use conefield_core::stage::{GradKind, Samples, TILE_ROWS, UnitRay, titled};
 use halves::Rounded;
 use rayon::prelude::*;

@@ -11,7 +11,7 @@ use crate::source::{Access, Source};
 use conefield_core::error::{Error, Result};
 use conefield_core::occupancy::PROBE;
 use conefield_core::pipeline::Pipeline;
-use conefield_core::spec::Tables;
+use conefield_core::precision::Tables;
 use conefield_core::stage::{GradKind, Info, Projector, Scope, Stage, titled};
 use conefield_core::wgsl::{Fragment, RANDOM, RAY, Sum};
 use std::fmt::Write;

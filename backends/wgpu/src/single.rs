@@ -8,7 +8,7 @@ use crate::kernel::Buffers;
 use crate::wave::GpuRay;
 use conefield_core::arena::Arena;
 use conefield_core::error::Result;
-use conefield_core::spec::Tables;
+use conefield_core::precision::Tables;
 use conefield_core::stage::{Projector, Samples, Stage, UnitRay};
 use wgpu::BufferUsages as U;
 

@@ -9,7 +9,7 @@ use crate::{files, out, parse, signals, specs};
 use clap::Args;
 use conefield_backend_cpu::Cpu;
 use conefield_core::scan::{Scan, Volume};
-use conefield_core::solver::{Job, Limits};
+use conefield_core::method::{Job, Limits};
 use conefield_core::{Error, Result};
 use conefield_io::MiddleSlices;
 use conefield_metrics::Scores;
@@ -84,7 +84,7 @@ impl Demo {
             Some(raw) => {
                 let path = folder.join("fast.safetensors");
                 conefield_io::write_atomic(&path, |w| w.write_all(raw).map_err(|e| Error::io(&path, e)))?;
-                with.push(mci(&path));
+                with.push(method::init(&specs::read("fast", &[])?.tree, &path));
                 name = "fast (LN, MCI)";
             }
             None => info!("this build comes without pre-trained weights: MCI is left out"),
@@ -116,15 +116,14 @@ impl Demo {
 
     fn compete(&self, name: &'static str, sets: &[String], scan: &Scan, truth: &Volume) -> Result<Entry> {
         let loaded = specs::read("fast", sets)?;
-        let solver = loaded.spec.solver.build()?;
         let backend = Cpu::new();
+        let mut plan = method::plan(&loaded, &backend)?;
         let job = Job {
             seed: self.seed,
             limits: Limits { seconds: Some(self.seconds), ..Limits::default() },
-            weights: &|path| files::read_weights(path),
-            ..Job::new(scan, &loaded.spec, &backend)
+            ..Job::new(scan, &backend)
         };
-        let solution = solver.solve(&job, &mut Progress::new(name, None))?;
+        let solution = plan.run(&job, &mut Progress::new(name, None))?;
         let start = Instant::now();
         let volume = solution.result.volume(&backend)?;
         let export_s = start.elapsed().as_secs_f64();

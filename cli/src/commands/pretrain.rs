@@ -5,12 +5,12 @@ use crate::backend::{self, BackendChoice};
 use crate::memory::Memory;
 use crate::parse::{self, Values};
 use crate::progress::Progress;
-use crate::{files, out, signals, specs};
+use crate::{files, method, out, signals, specs};
 use clap::Args;
 use conefield_core::Result;
 use conefield_core::arena::Weights;
 use conefield_core::scan::Volume;
-use conefield_core::solver::PretrainJob;
+use conefield_core::method::PretrainJob;
 use serde_json::json;
 use std::path::PathBuf;
 
@@ -63,23 +63,21 @@ impl Pretrain {
 
     pub fn run(self) -> Result<()> {
         let loaded = specs::read(&self.spec, &self.sets)?;
-        let solver = loaded.spec.solver.build().map_err(|e| loaded.locate(e))?;
         let backend = self.backend.open()?;
-        let pipeline = specs::build(&loaded)?;
-        let (_, compiled) = backend.compile(&pipeline)?;
-        self.memory(pipeline.layout().len() as u64, compiled.scratch_bytes as u64)?;
+        let mut plan = method::plan(&loaded, backend.as_ref())?;
+        let outline = plan.outline();
+        self.memory(outline.parameters() as u64, outline.backend().scratch_bytes as u64)?;
         let read = |name: &String| self.values.apply(files::volume(name)?);
         let volumes: Vec<Volume> = self.volumes.iter().map(read).collect::<Result<_>>()?;
         let job = PretrainJob {
             volumes: &volumes,
-            spec: &loaded.spec,
             backend: backend.as_ref(),
             seed: self.seed,
             limits: self.ends.limits(),
         };
         signals::listen()?;
         let mut progress = Progress::new("pretrain", None);
-        let model = solver.pretrain(&job, &mut progress).map_err(|e| loaded.locate(e))?;
+        let model = plan.pretrain(&job, &mut progress).map_err(|e| loaded.locate(e))?;
         let last = progress.records().last().cloned().unwrap_or_default();
         drop(progress);
         let keep = |name: &str| !name.starts_with("encoder.");

@@ -5,8 +5,8 @@ use super::{backends::simd_level, evaluate, protocol::Protocol};
 use crate::budget::calibrate::Bench;
 use crate::budget::front::Front;
 use crate::budget::plan::Budget;
-use crate::memory::{self, Memory};
-use crate::method::{Method, Parts};
+use crate::memory;
+use crate::method::{self, Planned};
 use crate::outgoing::{self, Written};
 use crate::plugins;
 use crate::progress::{Keeper, Progress};
@@ -16,7 +16,7 @@ use clap::Args;
 use conefield_core::backend::Backend;
 use conefield_core::checkpoint::Resume;
 use conefield_core::scan::Scan;
-use conefield_core::solver::{Job, Limits};
+use conefield_core::method::{Job, Limits};
 use conefield_core::spec::load::{Loaded, to_toml};
 use conefield_core::{Error, Result};
 use conefield_io::MiddleSlices;
@@ -99,11 +99,11 @@ impl Reconstruct {
         let reference = protocol.reference(&self.scan, &whole)?;
         let held = protocol.held_out(whole.geometry.views.len())?;
         let scan_record = ScanRecord::of(&self.scan, &whole)?;
-        asked.iter().try_for_each(|m| specs::check_held_out(&m.loaded, &held))?;
+        asked.iter().try_for_each(|m| specs::check_held_out(&m.loaded, m.plan.as_ref(), &held))?;
         let (scan, held_scan) = if held.is_empty() { (whole, None) } else { split(whole, &held)? };
         let load_s = begin.elapsed().as_secs_f64();
 
-        let identity = |m: &Method| identity(&m.loaded, protocol, &held, &scan_record);
+        let identity = |m: &Planned| identity(&m.loaded, protocol, &held, &scan_record);
         let resumed = match &asked {
             Some(method) if self.resume => Some(self.reopen(&identity(method)?)?),
             _ => None,
@@ -117,27 +117,28 @@ impl Reconstruct {
             seed: protocol.seed,
         };
         let budget = protocol.budget.map(|seconds| Budget { begin, seconds, spent });
-        let (method, plan) = match (budget, asked, front) {
+        let (method, schedule) = match (budget, asked, front) {
             (None, Some(method), _) => (method, None),
-            (Some(budget), Some(method), _) => {
-                let plan = budget.plan(&bench, &method)?;
-                (method, Some(plan))
+            (Some(budget), Some(mut method), _) => {
+                let schedule = budget.plan(&bench, &mut method)?;
+                (method, Some(schedule))
             }
             (Some(budget), None, Some(front)) => {
-                let more = self.all_sets();
-                let build = |spec: &str, sets: &[String]| self.method(spec, &[sets, &more].concat(), backend.as_ref());
-                let (method, plan) = budget.choose(&bench, &front, build)?;
-                (method, Some(plan))
+                let more = &protocol.sets;
+                let build = |spec: &str, sets: &[String]| self.method(spec, &[sets, more].concat(), backend.as_ref());
+                let (method, schedule) = budget.choose(&bench, &front, build)?;
+                (method, Some(schedule))
             }
             _ => {
                 return Err(Error::invalid("reconstruct", "--spec", "nothing", "a spec, or --budget to choose one by"));
             }
         };
-        specs::check_held_out(&method.loaded, &held)?;
-        plan.iter().flat_map(|p| p.lines(&method)).for_each(|line| info!("{line}"));
+        specs::check_held_out(&method.loaded, method.plan.as_ref(), &held)?;
+        schedule.iter().flat_map(|s| s.lines(&method)).for_each(|line| info!("{line}"));
         info!("memory: {}", method.memory.line());
         let identity = identity(&method)?;
-        let Method { loaded, parts: Parts { solver, compiled, .. }, memory } = method;
+        let Planned { loaded, mut plan, memory } = method;
+        let outline = plan.outline();
         let (folder, metrics, resume) = match resumed {
             Some((folder, metrics, resume)) => (folder, metrics, Some(resume)),
             None => self.create(&loaded)?,
@@ -155,17 +156,16 @@ impl Reconstruct {
             peak: protocol.peak,
             seed: protocol.seed,
             limits: Limits {
-                deadline: plan.as_ref().map(|p| p.deadline),
-                then: plan.as_ref().and_then(|p| p.then),
+                deadline: schedule.as_ref().map(|s| s.deadline),
+                then: schedule.as_ref().and_then(|s| s.then),
                 ..protocol.ends.limits()
             },
-            weights: &|path| files::read_weights(path),
             volumes: &files::volume,
             resume: resume.as_ref(),
-            ..Job::new(&scan, &loaded.spec, backend.as_ref())
+            ..Job::new(&scan, backend.as_ref())
         };
         let start = Instant::now();
-        let solution = solver.solve(&job, &mut progress).map_err(|e| loaded.locate(e))?;
+        let solution = plan.run(&job, &mut progress).map_err(|e| loaded.locate(e))?;
         let prepare_s = (start.elapsed().as_secs_f64() + spent - solution.train_s).max(0.0);
         let last = progress.records().last().cloned();
         drop(progress);
@@ -196,11 +196,11 @@ impl Reconstruct {
             held_out_views: held,
             limits: protocol.ends.clone(),
             budget_s: protocol.budget,
-            plan,
+            plan: schedule,
             init: self.init.as_ref().map(|p| p.display().to_string()),
             reference: protocol.reference.as_ref().map(|p| p.display().to_string()),
             plugins: plugins::used(&loaded.tree),
-            backend: compiled,
+            backend: outline.backend(),
             simd: simd_level(),
             threads: rayon::current_num_threads(),
             memory,
@@ -231,37 +231,25 @@ impl Reconstruct {
     /// The spec that is asked for and what is set of it. A run that is resumed knows what it chose.
     fn asked(&self) -> Option<(String, Vec<String>)> {
         match &self.spec {
-            Some(spec) => Some((spec.clone(), self.all_sets())),
+            Some(spec) => Some((spec.clone(), self.protocol.sets.clone())),
             None => self.resume.then(|| (self.output.join("spec.toml").display().to_string(), vec![])),
         }
     }
 
-    /// Reads and builds a spec. One that does not fit into memory is refused.
-    fn method(&self, spec: &str, sets: &[String], backend: &dyn Backend) -> Result<Method> {
-        let loaded = specs::read(spec, sets)?;
-        let parts = Parts::of(&loaded, backend)?;
-        let memory = self.memory(spec, sets, &loaded, &parts)?;
-        parts.check_weights(&loaded)?;
-        Ok(Method { loaded, parts, memory })
-    }
-
-    /// What the run takes; one that does not fit is refused.
-    fn memory(&self, spec: &str, sets: &[String], loaded: &Loaded, parts: &Parts) -> Result<Memory> {
+    /// Reads, builds and prices a spec. One that does not fit into memory is refused.
+    fn method(&self, spec: &str, sets: &[String], backend: &dyn Backend) -> Result<Planned> {
         let run = memory::Run {
+            scan: conefield_io::scan_size(&self.scan)?,
             split: self.protocol.hold_out.is_some(),
             reference: self.protocol.reference.is_some(),
             resume: self.resume,
-            ..parts.run(conefield_io::scan_size(&self.scan)?)
         };
-        let tables = loaded.tree["encoder"]["log2_table_size"].as_u64().unwrap_or(0);
-        let smaller = (10..tables as u32).rev().filter_map(|bits| {
-            let set = format!("encoder.log2_table_size={bits}");
-            let loaded = specs::read(spec, &[sets, &[set]].concat()).ok()?;
-            Some((bits, specs::build(&loaded).ok()?.layout().len() as u64))
-        });
-        let memory = run.memory();
-        memory.check(|available| run.smaller(available, smaller))?;
-        Ok(memory)
+        let mut sets = sets.to_vec();
+        // A run that is resumed without a spec has it in its own.
+        if let Some(path) = self.init.as_ref().filter(|_| self.spec.is_some() || !self.resume) {
+            sets.push(method::init(&specs::read(spec, &sets)?.tree, path));
+        }
+        method::planned(spec, &sets, backend, &run)
     }
 
     /// The folder of an interrupted run, its file for metrics, and where to go on from.
@@ -278,15 +266,6 @@ impl Reconstruct {
         conefield_io::write_text_atomic(folder.file("spec.toml"), &to_toml(&loaded.spec)?)?;
         let metrics = folder.metrics()?;
         Ok((folder, metrics, None))
-    }
-
-    /// `--set`s, with `--init` as the one that it stands for.
-    fn all_sets(&self) -> Vec<String> {
-        let mut sets = self.protocol.sets.clone();
-        if let Some(path) = &self.init {
-            sets.push(if conefield_io::is_volume(path) { initializer("volume", "path", path) } else { mci(path) });
-        }
-        sets
     }
 }
 
@@ -314,17 +293,6 @@ pub fn identity(
 /// A budget as [`identity`] has it.
 pub fn budget(seconds: Option<f64>) -> String {
     seconds.map_or("none".into(), |s| s.to_string())
-}
-
-/// The setting that starts from the weights in `path`.
-pub fn mci(path: &Path) -> String {
-    initializer("mci", "weights", path)
-}
-
-/// The setting of an initializer that reads the file `path`, under `key`.
-fn initializer(kind: &str, key: &str, path: &Path) -> String {
-    let path = toml::Value::String(path.display().to_string());
-    format!("initializer={{ type = \"{kind}\", {key} = {path} }}")
 }
 
 /// What weights say of where they come from.

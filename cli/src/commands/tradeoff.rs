@@ -306,7 +306,7 @@ impl Tradeoff {
 
     /// Seconds that the search takes from here at most: trial `c` on `scan` of budget `r` is next.
     fn left(&self, search: &Search, going: &[&Candidate], r: usize, c: usize, scan: usize) -> f64 {
-        let fields = going.iter().filter(|c| c.kind == crate::budget::front::Kind::Field).count();
+        let fields = going.iter().filter(|c| c.kind == crate::budget::front::Unknowns::Field).count();
         let rungs = search.budgets_s.len() - r;
         let later = to_come(fields, going.len() - fields, rungs, search.keep);
         let all = later.iter().zip(&search.budgets_s[r..]).map(|(n, budget)| *n as f64 * budget).sum::<f64>();

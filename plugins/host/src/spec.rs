@@ -5,7 +5,7 @@ use crate::stage::{initializer, map, projector};
 use conefield_core::arena::Weights;
 use conefield_core::error::Result;
 use conefield_core::registry::{self, Kind, Make, NewType};
-use conefield_core::spec::{EncoderSpec, FieldSpec, Initializer, InitializerSpec, NormalizerSpec, ProjectorSpec};
+use conefield_core::settings::{EncoderSpec, FieldSpec, Initializer, InitializerSpec, NormalizerSpec, ProjectorSpec};
 use conefield_core::stage::{Encoder, Field, Normalizer, Projector};
 use serde::{Serialize, Serializer};
 use serde_json::Value;

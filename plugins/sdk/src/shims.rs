@@ -617,7 +617,7 @@ unsafe extern "C" fn apply(
 mod tests {
     use super::*;
     use conefield_core::registry::{Kind, find};
-    use conefield_core::spec::EncoderSpec;
+    use conefield_core::settings::EncoderSpec;
     use conefield_core::stage::{Encoder, GradKind, Info, Parameter, Scope};
     use schemars::JsonSchema;
     use serde::{Deserialize, Serialize};

@@ -6,7 +6,7 @@ use super::{bundles, columns};
 use conefield_core::error::{Result, ensure};
 use conefield_core::geometry::Geometry;
 use conefield_core::simd::Real;
-use conefield_core::spec::ProjectorSpec;
+use conefield_core::settings::ProjectorSpec;
 use conefield_core::voxel::{VoxelOperator, VoxelProjector};
 use conefield_core::wgsl::Fragment;
 use ndarray::{ArrayView3, ArrayViewMut3, Axis};
@@ -59,7 +59,7 @@ impl ProjectorSpec for Joseph {
 impl ProjectorSpec for Trilinear {
     fn build_voxel(&self) -> Result<Box<dyn VoxelProjector>> {
         let n = self.samples_per_voxel;
-        ensure((0.5..=64.0).contains(&n), "spec", "projector.samples_per_voxel", n, "0.5 to 64")?;
+        ensure((0.5..=64.0).contains(&n), "spec", "samples_per_voxel", n, "0.5 to 64")?;
         Ok(Box::new(*self))
     }
 }

@@ -6,7 +6,7 @@ use conefield_core::Error;
 use conefield_core::geometry::VoxelGrid;
 use conefield_core::random::{mix, unit};
 use conefield_core::scan::{Scan, Volume};
-use conefield_core::solver::Limits;
+use conefield_core::method::Limits;
 use conefield_projectors::simulate::{ellipsoids, scan_ellipsoids};
 
 /// Types with settings that suit 24 views.
@@ -261,7 +261,7 @@ fn passes_time_or_a_small_change_end_a_run() {
         let n = heard.records.len();
         println!("{kind}: {n} passes to a change of 3 %");
         assert!(n > 1 && n < 200, "{kind}: {n} passes");
-        let events = |r: &conefield_core::solver::Record| r.events.iter().any(|e| e.contains("stopping rule"));
+        let events = |r: &conefield_core::method::Record| r.events.iter().any(|e| e.contains("stopping rule"));
         assert!(events(&heard.records[n - 1]) && !heard.records[..n - 1].iter().any(events), "{kind}");
     }
 }

@@ -5,7 +5,7 @@ use conefield_core::arena::Weights;
 use conefield_core::checkpoint::{Checkpoint, Resume};
 use conefield_core::geometry::{Geometry, Millimetres, Radians, View, VoxelGrid};
 use conefield_core::scan::{Scan, Volume};
-use conefield_core::solver::{Job, Limits, Observer, Reconstruction, Record, Solution};
+use conefield_core::method::{Job, Limits, Observer, Reconstruction, Record, Solution};
 use conefield_core::spec::Spec;
 use conefield_core::spec::load::parse;
 use conefield_core::{Error, Result};

@@ -53,7 +53,7 @@ fn the_start_is_what_the_file_holds() {
     let tenfold = truth.clone().mapped(|x| 10.0 * x);
     for kind in ALL {
         // No pass is made: what comes out is what stood in the file.
-        let limits = conefield_core::solver::Limits { steps: Some(0), ..Default::default() };
+        let limits = conefield_core::method::Limits { steps: Some(0), ..Default::default() };
         let case = Case { file: Some(&tenfold), limits, ..Case::of(&scan) };
         let (volume, heard) = case.volume(&format!("{START}{}", solver(kind)));
         assert!(heard.records.is_empty(), "{kind}");

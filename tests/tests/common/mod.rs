@@ -7,7 +7,7 @@ use conefield_core::backend::Backend;
 use conefield_core::checkpoint::{Checkpoint, Resume};
 use conefield_core::pipeline::Model;
 use conefield_core::scan::{Scan, Volume};
-use conefield_core::solver::{Job, Observer, Reconstruction, Record, Solution};
+use conefield_core::method::{Job, Observer, Reconstruction, Record, Solution};
 use conefield_core::spec::{Spec, load};
 use conefield_projectors::simulate::{Protocol, simulate};
 use ndarray::Array3;

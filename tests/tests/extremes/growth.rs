@@ -14,7 +14,8 @@ use conefield_core::pipeline::{Model, Pipeline};
 use conefield_core::random::{mix, unit};
 use conefield_core::scene::Scene;
 use conefield_core::simd::Real;
-use conefield_core::spec::{EncoderSpec, FieldSpec, NormalizerSpec, Tables};
+use conefield_core::settings::{EncoderSpec, FieldSpec, NormalizerSpec};
+use conefield_core::spec::{Tables};
 use conefield_core::stage::{Grads, Kernel, Reader, Stage, Tile, TileMut};
 use conefield_io::{CurveOptions, curves_png_with};
 use serde_json::{Value, json};
@@ -192,7 +193,7 @@ fn step(rays: usize, samples: usize, tables: Tables) -> [f64; 2] {
     value["projector"]["samples"] = json!(samples);
     let pipeline = Pipeline::build(&spec(&value).unwrap()).unwrap();
     let scan = scan();
-    let scene = Scene::new(&scan, &conefield_core::spec::Scene::default()).unwrap();
+    let scene = Scene::new(&scan, &conefield_core::scene::SceneSettings::default()).unwrap();
     let rays: Vec<TrainRay> = (0..rays)
         .map(|i| {
             let ray = scene.pixel_ray(&scan.geometry, i % 8, 4 + (i * 5) % 8, 4 + (i * 3) % 8);

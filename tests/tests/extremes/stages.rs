@@ -3,7 +3,7 @@
 use crate::case::{Case, Ends, Seen};
 use crate::growth::{Pair, apart};
 use crate::scans::with;
-use conefield_core::spec::{EncoderSpec, NormalizerSpec};
+use conefield_core::settings::{EncoderSpec, NormalizerSpec};
 use conefield_core::stage::Normalizer;
 use serde_json::{Value, json};
 

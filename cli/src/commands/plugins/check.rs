@@ -9,7 +9,7 @@ use conefield_conformance::{
 };
 use conefield_core::arena::Weights;
 use conefield_core::registry::{self, Make, Origin};
-use conefield_core::spec::Tables;
+use conefield_core::precision::Tables;
 use conefield_core::stage::{Projector, Stage};
 use conefield_core::{Error, Result};
 use conefield_plugins::library::Type;

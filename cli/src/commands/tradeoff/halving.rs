@@ -1,7 +1,7 @@
 //! Successive halving (Jamieson and Talwalkar, AISTATS 2016): many candidates get little time, the best share of them
 //! more. Fields and methods on voxels are ranked apart.
 
-use crate::budget::front::Kind;
+use crate::budget::front::Unknowns;
 
 /// What a candidate came to under a budget.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -21,9 +21,9 @@ pub fn kept(n: usize, keep: f64) -> usize {
 
 /// Which go on to the next budget, in the order given: of each kind the best share of those that were judged, and all
 /// that could not be.
-pub fn go_on(tried: &[(Kind, Outcome)], keep: f64) -> Vec<usize> {
+pub fn go_on(tried: &[(Unknowns, Outcome)], keep: f64) -> Vec<usize> {
     let mut all = vec![];
-    for kind in [Kind::Field, Kind::Voxels] {
+    for kind in [Unknowns::Field, Unknowns::Voxels] {
         let of_kind = tried.iter().enumerate().filter(|(_, (k, _))| *k == kind);
         let mut judged = 0;
         let mut ranked: Vec<(usize, f64)> = vec![];
@@ -54,8 +54,8 @@ mod tests {
     use super::*;
     use proptest::prelude::*;
 
-    fn outcomes() -> impl Strategy<Value = Vec<(Kind, Outcome)>> {
-        let kind = prop_oneof![Just(Kind::Field), Just(Kind::Voxels)];
+    fn outcomes() -> impl Strategy<Value = Vec<(Unknowns, Outcome)>> {
+        let kind = prop_oneof![Just(Unknowns::Field), Just(Unknowns::Voxels)];
         // Few values, so that some are equal.
         let outcome = prop_oneof![
             4 => (0..6).prop_map(|a| Outcome::Accuracy(f64::from(a))),
@@ -70,7 +70,7 @@ mod tests {
         fn the_best_share_of_each_kind_goes_on(tried in outcomes(), keep in 0.05f64..=1.0) {
             let on = go_on(&tried, keep);
             prop_assert!(on.windows(2).all(|w| w[0] < w[1]));
-            for kind in [Kind::Field, Kind::Voxels] {
+            for kind in [Unknowns::Field, Unknowns::Voxels] {
                 let of = |i: &usize| tried[*i].0 == kind;
                 let accuracy = |i: &usize| match tried[*i].1 { Outcome::Accuracy(a) => Some(a), _ => None };
                 let all: Vec<usize> = (0..tried.len()).filter(of).collect();

@@ -1,8 +1,9 @@
 //! What may be turned, and the candidates that come of it: every base as it is, and seeded draws from the product of
 //! its levers' values.
 
-use crate::budget::front::Kind;
-use crate::{files, specs};
+use crate::budget::front::Unknowns;
+use crate::{files, method, specs};
+use conefield_backend_cpu::Cpu;
 use conefield_core::error::{Error, Result, ensure};
 use conefield_core::files::toml_line;
 use conefield_core::random::mix;
@@ -43,7 +44,7 @@ struct Base {
     name: String,
     /// As `--spec` has it.
     spec: String,
-    kind: Kind,
+    kind: Unknowns,
     /// The spec without its name and description, to tell whether two are the same.
     tree: Value,
     levers: Vec<Lever>,
@@ -64,7 +65,7 @@ pub struct Candidate {
     /// As `--spec` has it, and what `--set` changes of it.
     pub spec: String,
     pub sets: Vec<String>,
-    pub kind: Kind,
+    pub kind: Unknowns,
 }
 
 impl Levers {
@@ -171,7 +172,7 @@ impl Base {
             levers.push(Lever { key, values });
             Ok(())
         })?;
-        let mut base = Self { name, spec, kind: Kind::Voxels, tree: Value::Null, levers };
+        let mut base = Self { name, spec, kind: Unknowns::Voxels, tree: Value::Null, levers };
         (base.tree, base.kind) = base.built(&[]).map_err(refused)?;
         for lever in &base.levers {
             for value in &lever.values {
@@ -191,15 +192,14 @@ impl Base {
     }
 
     /// The base with `sets`, built for trial.
-    fn built(&self, sets: &[String]) -> Result<(Value, Kind)> {
+    fn built(&self, sets: &[String]) -> Result<(Value, Unknowns)> {
         let loaded = specs::read(&self.spec, sets)?;
-        let solver = loaded.spec.solver.build().map_err(|e| loaded.locate(e))?;
-        let field = specs::pipeline(&loaded, solver.as_ref())?.is_some();
+        let plan = method::plan_without_files(&loaded, &Cpu::new())?;
         let mut tree = loaded.tree;
         for key in ["name", "description"] {
             tree[key] = Value::Null;
         }
-        Ok((tree, if field { Kind::Field } else { Kind::Voxels }))
+        Ok((tree, method::unknowns(plan.as_ref())))
     }
 
     fn candidate(&self, number: usize, sets: Vec<String>) -> Candidate {
@@ -251,7 +251,7 @@ mod tests {
         let levers = Levers::shipped().unwrap();
         let all = levers.candidates(30, 0).unwrap();
         assert_eq!(all.len(), 30);
-        assert!(all.iter().any(|c| c.kind == Kind::Field) && all.iter().any(|c| c.kind == Kind::Voxels));
+        assert!(all.iter().any(|c| c.kind == Unknowns::Field) && all.iter().any(|c| c.kind == Unknowns::Voxels));
         for (i, c) in all.iter().enumerate() {
             assert!(all[..i].iter().all(|o| o.name != c.name && (o.base != c.base || o.sets != c.sets)), "{}", c.name);
         }

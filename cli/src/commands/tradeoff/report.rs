@@ -2,7 +2,7 @@
 
 use super::pareto::{Standing, front};
 use super::{FILES, FOLDERS, Over, Rung, Search, Status, accuracy};
-use crate::budget::front::{Front, Kind, Point, Reached, Tuned};
+use crate::budget::front::{Front, Point, Reached, Tuned, Unknowns};
 use crate::commands::trial::Figures;
 use crate::out;
 use crate::specs;
@@ -48,7 +48,7 @@ struct Ranking {
 struct Mean {
     name: String,
     candidate: String,
-    kind: Kind,
+    kind: Unknowns,
     budget_s: f64,
     steps: f64,
     train_s: f64,
@@ -67,7 +67,7 @@ struct Mean {
 #[derive(Serialize)]
 struct Best {
     budget_s: f64,
-    kind: Kind,
+    kind: Unknowns,
     point: String,
 }
 
@@ -78,15 +78,15 @@ impl Report {
             let why = trials.iter().find_map(|t| t.error.clone()).unwrap_or_else(|| "there is none".into());
             return Err(Error::unsupported("tradeoff", format!("no trial came to a result; the first: {why}")));
         }
-        let of = |kind: Option<Kind>| {
+        let of = |kind: Option<Unknowns>| {
             let some: Vec<&Mean> = points.iter().filter(|p| kind.is_none_or(|k| k == p.kind)).collect();
             let all: Vec<Standing> = some.iter().map(|p| p.standing).collect();
             front(&all).into_iter().map(|i| some[i].name.clone()).collect::<Vec<_>>()
         };
-        let (all, fields, voxels) = (of(None), of(Some(Kind::Field)), of(Some(Kind::Voxels)));
+        let (all, fields, voxels) = (of(None), of(Some(Unknowns::Field)), of(Some(Unknowns::Voxels)));
         let mut best = vec![];
         for &budget_s in &search.budgets_s {
-            for kind in [Kind::Field, Kind::Voxels] {
+            for kind in [Unknowns::Field, Unknowns::Voxels] {
                 let here = points.iter().filter(|p| p.budget_s == budget_s && p.kind == kind);
                 let most = here.max_by(|a, b| a.standing.accuracy.total_cmp(&b.standing.accuracy));
                 best.extend(most.map(|p| Best { budget_s, kind, point: p.name.clone() }));
