@@ -6,9 +6,9 @@ use conefield_core::pipeline::Model;
 use conefield_core::scan::{Scan, Volume};
 use conefield_core::trained::TrainedField;
 use conefield_core::{Error, Result};
-use conefield_io::MiddleSlices;
-use conefield_io::survey::{Survey, survey};
+use conefield_diagnosis::{Survey, survey};
 use conefield_projectors::simulate::{PhantomKind, phantom_of};
+use conefield_report::MiddleSlices;
 use std::collections::BTreeMap;
 use std::path::Path;
 
@@ -149,8 +149,8 @@ pub fn same_run(place: &str, then: &BTreeMap<String, String>, now: &BTreeMap<Str
 /// Draws the middle slices of a result, with those of `reference` and their difference where there is one.
 pub fn picture(path: impl AsRef<Path>, reference: Option<&MiddleSlices>, result: &MiddleSlices) -> Result<()> {
     match reference {
-        Some(r) => conefield_io::slices_png(path, &[("reference", r), ("result", result)], r.window(), Some(0)),
-        None => conefield_io::slices_png(path, &[("result", result)], result.window(), None),
+        Some(r) => conefield_report::slices_png(path, &[("reference", r), ("result", result)], r.window(), Some(0)),
+        None => conefield_report::slices_png(path, &[("result", result)], result.window(), None),
     }
 }
 

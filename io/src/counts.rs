@@ -4,10 +4,12 @@
 //! dark value `d` to what it counts and each pixel answers by its own factor, which the flat field `f` (a view
 //! without object) holds: `A = −ln((I − d)/(f − d))`.
 
-use crate::bad_pixels::{Filling, from_fields, outliers};
-use crate::border::{median, pieces, quantile};
+use crate::filling::Filling;
 use conefield_core::error::ensure;
 use conefield_core::{Error, Result};
+use conefield_diagnosis::bad_pixels::{from_fields, outliers};
+use conefield_diagnosis::border::border_medians;
+use conefield_diagnosis::quantiles::{median, quantile};
 use ndarray::parallel::prelude::*;
 use ndarray::{Array2, Array3, Axis, Zip};
 use serde::Serialize;
@@ -114,7 +116,7 @@ pub fn line_integrals(
     refuse_bad(place, known.len(), pixels)?;
     if correction.open == OpenBeam::Air {
         for (v, (view, open)) in values.axis_iter(Axis(0)).zip(&mut open).enumerate() {
-            *open = quantile(&pieces(view, |r, c| !bad[[r, c]]), 0.85).unwrap_or(0.0);
+            *open = quantile(&border_medians(view, |r, c| !bad[[r, c]]), 0.85).unwrap_or(0.0);
             let expected = "light at the border: with nothing there, give I0 as a number or a flat field";
             ensure(*open > 0.0, place, &format!("air of view {v}"), format!("{open} counts above dark"), expected)?;
         }

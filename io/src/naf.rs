@@ -6,13 +6,14 @@
 //! see [`read_naf`].
 
 use crate::input::read_bytes;
-use crate::orbit::Orbit;
+use crate::orbit::common_orbit;
 use crate::pickle::{self, Item, Out, Pickle};
 use crate::scan::DataSet;
 use crate::unit::{self, Reading, Units};
 use crate::{rays, write_atomic};
 use conefield_core::error::ensure;
 use conefield_core::geometry::{Geometry, VoxelGrid};
+use conefield_core::orbit::Orbit;
 use conefield_core::scan::{Scan, Unit, Volume};
 use conefield_core::{Error, Result};
 use ndarray::{Array3, Ix3};
@@ -308,7 +309,7 @@ fn stated_unit(place: &str, top: &Item) -> Result<Option<Unit>> {
 pub fn write_naf(path: impl AsRef<Path>, train: &Scan, test: Option<&Scan>, volume: Option<&Volume>) -> Result<()> {
     let path = path.as_ref();
     let place = path.display().to_string();
-    let (orbit, test_orbit) = Orbit::common(&place, "NAF's format", train, test)?;
+    let (orbit, test_orbit) = common_orbit(&place, "NAF's format", train, test)?;
     let (g, grid) = (&train.geometry, &train.geometry.volume);
     if let Some(v) = volume {
         let (found, expected) = (format!("{:?}", v.data.shape()), format!("{:?}", grid.shape));

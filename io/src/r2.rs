@@ -6,7 +6,7 @@
 //! file, whatever their unit is.
 
 use crate::input::LONGEST_TEXT;
-use crate::orbit::Orbit;
+use crate::orbit::common_orbit;
 use crate::scan::DataSet;
 use crate::text::{Notation, parse};
 use crate::unit::{self, Reading, Units};
@@ -14,6 +14,7 @@ use crate::{ScanSize, folder, npy, rays, write_atomic, write_folder_atomic, writ
 use conefield_core::error::ensure;
 use conefield_core::files::read_text;
 use conefield_core::geometry::{Geometry, VoxelGrid};
+use conefield_core::orbit::Orbit;
 use conefield_core::scan::{Scan, Unit, Volume};
 use conefield_core::{Error, Result};
 use ndarray::{Array2, Array3, Axis, Ix2, Ix3};
@@ -223,7 +224,7 @@ fn volume(folder: &Path, place: &str, name: &str, shape: [usize; 3]) -> Result<A
 pub fn write_r2(folder: impl AsRef<Path>, train: &Scan, test: Option<&Scan>, volume: Option<&Volume>) -> Result<()> {
     let folder = folder.as_ref();
     let place = folder.display().to_string();
-    let (orbit, test_orbit) = Orbit::common(&place, "R2-Gaussian's format", train, test)?;
+    let (orbit, test_orbit) = common_orbit(&place, "R2-Gaussian's format", train, test)?;
     if let Some(v) = volume {
         let (found, expected) = (format!("{:?}", v.data.shape()), format!("{:?}", train.geometry.volume.shape));
         ensure(v.data.shape() == train.geometry.volume.shape, &place, "shape of the volume", found, expected)?;

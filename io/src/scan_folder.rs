@@ -22,11 +22,11 @@
 //! ```
 
 use crate::folder;
-use crate::orbit::Orbit;
 use crate::text::described;
 use crate::{ScanSize, npy, read_volume, write_atomic, write_folder_atomic, write_text_atomic, write_volume};
 use conefield_core::error::ensure;
 use conefield_core::geometry::{Geometry, View, VoxelGrid};
+use conefield_core::orbit::Orbit;
 use conefield_core::scan::{Scan, Unit, Volume};
 use conefield_core::{Error, Result};
 use ndarray::Ix3;

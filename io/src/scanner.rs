@@ -39,15 +39,14 @@
 //! next column (u) and to the next row (v), all in mm here. `[rtk]` has `file`, `pixel` and `offset`; see
 //! [`read_rtk_geometry`]. All lengths are mm; angles are degrees, as their keys say.
 
-use crate::check::{LineIntegralCheck, check_line_integrals};
 use crate::counts::{Correction, CountsReport, OpenBeam, line_integrals};
-use crate::orbit::Orbit;
 use crate::rtk::read_rtk_geometry;
 use crate::stack::{self, Layout, Names, StackAxis};
 use crate::text::described;
 use crate::{ScanSize, folder, scan_folder};
 use conefield_core::error::ensure;
 use conefield_core::geometry::{Geometry, View, VoxelGrid};
+use conefield_core::orbit::Orbit;
 use conefield_core::scan::{Scan, Unit};
 use conefield_core::{Error, Result};
 use ndarray::{Array3, Axis};
@@ -83,8 +82,6 @@ pub struct Imported {
     pub scan: Scan,
     /// What the conversion from counts met; `None` if the files hold line integrals.
     pub counts: Option<CountsReport>,
-    /// Whether the result looks like line integrals.
-    pub check: LineIntegralCheck,
 }
 
 #[derive(Deserialize)]
@@ -240,7 +237,6 @@ pub fn read_scanner(path: impl AsRef<Path>, options: &ImportOptions) -> Result<I
         (a, Some(report))
     };
     let (geometry, projections) = rows_down(geometry, projections);
-    let check = check_line_integrals(projections.view());
     let provenance = json!({
         "format": "scanner",
         "file": path.file_name().map(|n| n.to_string_lossy()),
@@ -249,7 +245,7 @@ pub fn read_scanner(path: impl AsRef<Path>, options: &ImportOptions) -> Result<I
     });
     let scan = Scan { geometry, projections, unit: Unit::default(), provenance };
     scan.validate(&place)?;
-    Ok(Imported { scan, counts, check })
+    Ok(Imported { scan, counts })
 }
 
 /// The size of the scan that the description `path` leads to. Arranging the values and converting counts take copies.

@@ -11,7 +11,7 @@ use conefield_core::solver::{Job, Limits, Observer, Record, Solver};
 use conefield_core::spec::Spec;
 use conefield_core::spec::load::Loaded;
 use conefield_core::{Error, Result};
-use conefield_io::MiddleSlices;
+use conefield_report::MiddleSlices;
 use ndarray::{Array3, s};
 use serde::Serialize;
 use std::time::Instant;

@@ -15,7 +15,7 @@ use clap::Args;
 use conefield_core::error::ensure;
 use conefield_core::spec::load::Loaded;
 use conefield_core::{Error, Result};
-use conefield_io::MiddleSlices;
+use conefield_report::MiddleSlices;
 use serde::{Deserialize, Serialize};
 use serde_json::Value;
 use std::collections::BTreeMap;
@@ -321,8 +321,8 @@ impl Compare {
                 let _ = fs::remove_file(&path);
                 return Ok(String::new());
             }
-            (Some(r), _) => conefield_io::compare_png(&path, ("reference", r), &panels, r.window())?,
-            (None, Some((_, first))) => conefield_io::slices_png(&path, &panels, first.window(), None)?,
+            (Some(r), _) => conefield_report::compare_png(&path, ("reference", r), &panels, r.window())?,
+            (None, Some((_, first))) => conefield_report::slices_png(&path, &panels, first.window(), None)?,
         }
         Ok(format!("picture: {}\n", path.display()))
     }

@@ -5,8 +5,8 @@ use crate::parse::{self, Values};
 use crate::{files, out};
 use clap::{Args, ValueEnum};
 use conefield_core::{Error, Result};
+use conefield_diagnosis::survey;
 use conefield_io::DataSet;
-use conefield_io::survey::survey;
 use std::path::PathBuf;
 
 /// Rewrite a volume or a scan in another format.

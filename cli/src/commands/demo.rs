@@ -11,9 +11,9 @@ use conefield_backend_cpu::Cpu;
 use conefield_core::scan::{Scan, Volume};
 use conefield_core::solver::{Job, Limits};
 use conefield_core::{Error, Result};
-use conefield_io::MiddleSlices;
 use conefield_metrics::Scores;
 use conefield_projectors::simulate::{Noise, Protocol, phantom, simulate};
+use conefield_report::MiddleSlices;
 use serde::Serialize;
 use serde_json::json;
 use std::path::PathBuf;
@@ -100,7 +100,7 @@ impl Demo {
         let results = [(&captions[0][..], &slices[0]), (&captions[1][..], &slices[1])];
         let picture = folder.join("compare.png");
         let truth = MiddleSlices::of(&truth);
-        conefield_io::compare_png(&picture, ("phantom", &truth), &results, truth.window())?;
+        conefield_report::compare_png(&picture, ("phantom", &truth), &results, truth.window())?;
         if self.json {
             return out::json(&json!({ "folder": folder, "picture": picture, "results": entries }));
         }

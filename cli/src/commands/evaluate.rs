@@ -7,8 +7,8 @@ use clap::Args;
 use conefield_core::Result;
 use conefield_core::error::ensure;
 use conefield_core::scan::Volume;
-use conefield_io::MiddleSlices;
 use conefield_metrics::{Dice, Scores, dice, label_map};
+use conefield_report::MiddleSlices;
 use serde::Serialize;
 use std::path::PathBuf;
 

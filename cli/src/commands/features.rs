@@ -11,7 +11,7 @@ use conefield_core::geometry::VoxelGrid;
 use conefield_core::host;
 use conefield_core::parts::Part;
 use conefield_core::trained::TrainedField;
-use conefield_io::MiddleSlices;
+use conefield_report::MiddleSlices;
 use ndarray::Array3;
 use serde_json::json;
 use std::path::PathBuf;
@@ -93,7 +93,11 @@ impl Features {
         colours.resize_with(DRAWN, || slices(&vec![0.0; n], f32::NAN));
         let scale = (scene.attenuation * unit_mm) as f32;
         attenuation.iter_mut().for_each(|x| *x *= scale);
-        conefield_io::features_png(&self.output, &slices(&attenuation, 0.0), [&colours[0], &colours[1], &colours[2]])?;
+        conefield_report::features_png(
+            &self.output,
+            &slices(&attenuation, 0.0),
+            [&colours[0], &colours[1], &colours[2]],
+        )?;
         let shares = &explained[..drawn.len()];
         if self.json {
             return out::json(&json!({

@@ -4,7 +4,7 @@ use super::{convert::refuse_existing, info};
 use crate::{out, parse};
 use clap::Args;
 use conefield_core::Result;
-use conefield_io::survey::survey;
+use conefield_diagnosis::survey;
 use conefield_io::{I0, ImportOptions, Imported};
 use serde_json::{Value, json};
 use std::path::PathBuf;
@@ -50,12 +50,13 @@ impl Import {
     /// The geometry in mm and what the values are like.
     fn understood(&self, imported: &Imported) -> Value {
         let views = &imported.scan.geometry.views;
-        let mut found = info::facts(&imported.scan, &survey(&imported.scan));
+        let survey = survey(&imported.scan);
+        let mut found = info::facts(&imported.scan, &survey);
         found["scan"] = json!(self.output);
         found["first_view"] = json!(views[0]);
         found["last_view"] = json!(views[views.len() - 1]);
         found["counts"] = json!(imported.counts);
-        found["line_integrals"] = json!(imported.check);
+        found["line_integrals"] = json!(survey.check);
         found
     }
 }

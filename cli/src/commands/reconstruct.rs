@@ -19,7 +19,7 @@ use conefield_core::scan::Scan;
 use conefield_core::solver::{Job, Limits};
 use conefield_core::spec::load::{Loaded, to_toml};
 use conefield_core::{Error, Result};
-use conefield_io::MiddleSlices;
+use conefield_report::MiddleSlices;
 use std::collections::BTreeMap;
 use std::fs::File;
 use std::path::{Path, PathBuf};

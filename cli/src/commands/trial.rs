@@ -7,7 +7,7 @@ use super::record::ScanRecord;
 use crate::memory::Run;
 use crate::{files, signals};
 use conefield_core::{Error, Result};
-use conefield_io::MiddleSlices;
+use conefield_report::MiddleSlices;
 use serde::{Deserialize, Serialize};
 use serde_json::Value;
 use std::io::Read;

@@ -10,7 +10,7 @@ use crate::statistics::{mean, spearman};
 use crate::table::Table;
 use conefield_core::spec::load::to_toml;
 use conefield_core::{Error, Result};
-use conefield_io::{CurveOptions, Panel, panels_png};
+use conefield_report::{CurveOptions, Panel, panels_png};
 use serde::Serialize;
 use serde_json::Value;
 use std::fs;

@@ -1,8 +1,8 @@
 //! Draws the conventions of docs/geometry.md, with every place taken from the library:
-//! `cargo run -p conefield-io --example draw_geometry` writes docs/geometry-*.svg. A test here compares.
+//! `cargo run -p conefield-report --example draw_geometry` writes docs/geometry-*.svg. A test here compares.
 
 use conefield_core::geometry::{Geometry, Millimetres, Radians, Vec3, View, VoxelGrid};
-use conefield_io::Orbit;
+use conefield_core::orbit::Orbit;
 use std::fmt::Write;
 use std::path::PathBuf;
 
@@ -398,6 +398,6 @@ fn main() -> conefield_core::Result<()> {
 fn the_drawings_in_docs_are_current() {
     for (path, text) in drawings() {
         let file = std::fs::read_to_string(&path).unwrap_or_default();
-        assert!(file == text, "write {} anew: cargo run -p conefield-io --example draw_geometry", path.display());
+        assert!(file == text, "write {} anew: cargo run -p conefield-report --example draw_geometry", path.display());
     }
 }
