@@ -4,7 +4,7 @@ use crate::geometry::{Millimetres, Radians, View, dot, norm, sub};
 
 /// Views on one circle about z, all with the same distances and detector.
 #[derive(Debug, Clone, PartialEq)]
-pub struct Orbit {
+pub struct CircularOrbit {
     /// Source to rotation axis, in mm.
     pub dso: f64,
     /// Source to detector plane, in mm.
@@ -20,7 +20,7 @@ pub struct Orbit {
 /// How far, relative to the source's distance from the detector, a view may lie off the circle.
 const TOLERANCE: f64 = 1e-9;
 
-impl Orbit {
+impl CircularOrbit {
     /// The view at `angle` (radians).
     pub fn view(&self, angle: f64) -> View {
         let mm = |x: [f64; 2]| x.map(Millimetres);
@@ -92,7 +92,7 @@ mod tests {
     #[test]
     fn an_orbit_is_found_again() {
         let views = circle();
-        let o = Orbit::fit(&views).unwrap();
+        let o = CircularOrbit::fit(&views).unwrap();
         assert!((o.dso - 500.0).abs() < 1e-9 && (o.dsd - 800.0).abs() < 1e-9, "{o:?}");
         assert!((o.offset[0] + 1.0).abs() < 1e-9 && (o.offset[1] - 30.0).abs() < 1e-9, "{o:?}");
         for (i, a) in o.angles.iter().enumerate() {
@@ -106,12 +106,12 @@ mod tests {
             let mut views = circle();
             let v = &mut views[4];
             [&mut v.source, &mut v.detector, &mut v.u, &mut v.v][change][2] += 1e-4;
-            assert_eq!(Orbit::fit(&views), None);
+            assert_eq!(CircularOrbit::fit(&views), None);
         }
         // Columns that run the other way are no orbit of ours either.
         let mut views = circle();
         views.iter_mut().for_each(|v| v.u = v.u.map(|x| -x));
-        assert_eq!(Orbit::fit(&views), None);
-        assert_eq!(Orbit::fit(&[]), None);
+        assert_eq!(CircularOrbit::fit(&views), None);
+        assert_eq!(CircularOrbit::fit(&[]), None);
     }
 }

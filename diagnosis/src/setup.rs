@@ -3,7 +3,7 @@
 use crate::arc::{ScanArc, scan_arc};
 use crate::shadow::Shadow;
 use conefield_core::geometry::{Geometry, Vec3, norm};
-use conefield_core::orbit::Orbit;
+use conefield_core::orbit::CircularOrbit;
 use serde::Serialize;
 
 /// A scan's lengths and angles; where views differ, the median over them. The axis is z; the isocentre is its point at
@@ -85,7 +85,7 @@ pub fn setup(geometry: &Geometry) -> Setup {
     let finite = |x: f64| if x.is_finite() { x.max(0.0) } else { 0.0 };
     let [dso, dsd, magnification, pv, pu, ov, ou] = std::array::from_fn(middle);
     Setup {
-        circle: Orbit::fit(&geometry.views).is_some(),
+        circle: CircularOrbit::fit(&geometry.views).is_some(),
         source_to_axis_mm: dso,
         source_to_detector_mm: dsd,
         magnification,

@@ -63,4 +63,4 @@ pub use scan_folder::write_scan;
 pub use scanner::{I0, ImportOptions, Imported, read_scanner};
 pub use size::{ScanSize, scan_size, volume_voxels};
 pub use volume::{is_volume, packed_bytes, read_volume, write_volume, write_voxels};
-pub use weights::{Weights, read_weights, write_weights};
+pub use weights::{read_weights, write_weights};

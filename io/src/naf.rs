@@ -13,7 +13,7 @@ use crate::unit::{self, Reading, Units};
 use crate::{rays, write_atomic};
 use conefield_core::error::ensure;
 use conefield_core::geometry::{Geometry, VoxelGrid};
-use conefield_core::orbit::Orbit;
+use conefield_core::orbit::CircularOrbit;
 use conefield_core::scan::{Scan, Unit, Volume};
 use conefield_core::{Error, Result};
 use ndarray::{Array3, Ix3};
@@ -179,9 +179,9 @@ impl Description {
         })
     }
 
-    fn orbit(&self, angles: Vec<f64>) -> Orbit {
+    fn orbit(&self, angles: Vec<f64>) -> CircularOrbit {
         let offset = [-self.offset[0], self.offset[1]];
-        Orbit { dso: self.dso, dsd: self.dsd, pixel: self.pixel, offset, angles }
+        CircularOrbit { dso: self.dso, dsd: self.dsd, pixel: self.pixel, offset, angles }
     }
 
     /// Geometry and projections of `train` or `val`. Shapes are compared before a number is decoded.
@@ -388,7 +388,7 @@ mod tests {
     /// A scan that its volume explains, with the offset that the standard one lacks the size for.
     fn consistent(unit: Unit) -> (Scan, Volume) {
         let mut s = scan();
-        let mut orbit = Orbit::fit(&s.geometry.views).unwrap();
+        let mut orbit = CircularOrbit::fit(&s.geometry.views).unwrap();
         orbit.offset = [0.25, -1.5];
         s.geometry.views = orbit.views();
         s.unit = unit;
@@ -453,11 +453,11 @@ mod tests {
         let volume = naf.volume.as_ref().unwrap();
         let right = rays::agreement(&naf.train, &volume.data).unwrap();
         assert!((right.ratio - 1.0).abs() < 0.02 && right.residual < 0.03, "{right:?}");
-        let orbit = Orbit::fit(&g.views).unwrap();
+        let orbit = CircularOrbit::fit(&g.views).unwrap();
         assert!((orbit.offset[1] - 30.0).abs() < 1e-9 && orbit.offset[0] == 0.0, "{orbit:?}");
         for offset in [[30.0, 0.0], [-30.0, 0.0], [0.0, -30.0], [0.0, 0.0]] {
             let mut moved = naf.train.clone();
-            moved.geometry.views = Orbit { offset, ..orbit.clone() }.views();
+            moved.geometry.views = CircularOrbit { offset, ..orbit.clone() }.views();
             let wrong = rays::agreement(&moved, &volume.data).unwrap();
             assert!(wrong.residual > 3.0 * right.residual, "{offset:?}: {wrong:?}, {right:?}");
         }
@@ -518,7 +518,7 @@ mod tests {
         let path = dir.path().join("a.pickle");
         let (s, volume) = consistent(Unit::default());
         let mut swapped = s.clone();
-        let mut orbit = Orbit::fit(&s.geometry.views).unwrap();
+        let mut orbit = CircularOrbit::fit(&s.geometry.views).unwrap();
         // The file's [v, u] is [-offset[0], offset[1]].
         orbit.offset = [-orbit.offset[1], -orbit.offset[0]];
         swapped.geometry.views = orbit.views();

@@ -1,7 +1,7 @@
 //! The one circle that some formats know.
 
 use conefield_core::error::ensure;
-use conefield_core::orbit::Orbit;
+use conefield_core::orbit::CircularOrbit;
 use conefield_core::scan::Scan;
 use conefield_core::{Error, Result};
 
@@ -12,10 +12,10 @@ pub(crate) fn common_orbit(
     format: &str,
     train: &Scan,
     test: Option<&Scan>,
-) -> Result<(Orbit, Option<Orbit>)> {
-    let fit = |name: &str, s: &Scan| -> Result<Orbit> {
+) -> Result<(CircularOrbit, Option<CircularOrbit>)> {
+    let fit = |name: &str, s: &Scan| -> Result<CircularOrbit> {
         s.validate(&format!("{place}: {name}"))?;
-        Orbit::fit(&s.geometry.views).ok_or_else(|| {
+        CircularOrbit::fit(&s.geometry.views).ok_or_else(|| {
             let why = format!("{format} only knows circles about z; write conefield's own format");
             Error::unsupported(format!("{place}: {name} views that are not one circle"), why)
         })

@@ -14,7 +14,7 @@ use crate::{ScanSize, folder, npy, rays, write_atomic, write_folder_atomic, writ
 use conefield_core::error::ensure;
 use conefield_core::files::read_text;
 use conefield_core::geometry::{Geometry, VoxelGrid};
-use conefield_core::orbit::Orbit;
+use conefield_core::orbit::CircularOrbit;
 use conefield_core::scan::{Scan, Unit, Volume};
 use conefield_core::{Error, Result};
 use ndarray::{Array2, Array3, Axis, Ix2, Ix3};
@@ -90,7 +90,7 @@ fn read(folder: &Path, with_test: bool) -> Result<DataSet> {
     let pixel = each(&place, ["Detector", "[v, u]"], s.nDetector, s.sDetector, s.dDetector)?;
     let spacing = each(&place, ["Voxel", "[x, y, z]"], s.nVoxel, s.sVoxel, s.dVoxel)?;
     let grid = VoxelGrid { shape: s.nVoxel, spacing, center: s.offOrigin };
-    let orbit = |frames: &[Frame]| Orbit {
+    let orbit = |frames: &[Frame]| CircularOrbit {
         dso: s.DSO,
         dsd: s.DSD,
         pixel,
@@ -191,7 +191,7 @@ fn each<const N: usize>(
 
 fn projections(folder: &Path, place: &str, field: &str, frames: &[Frame], shape: [usize; 2]) -> Result<Array3<f32>> {
     let mut all: Vec<f32> = Vec::new();
-    let mut named = folder::Named::default();
+    let mut named = folder::NamedFiles::default();
     for (i, frame) in frames.iter().enumerate() {
         let field = format!("{field}[{i}].file_path");
         let path = folder::inside(folder, place, &field, &frame.file_path)?;
@@ -368,7 +368,7 @@ mod tests {
         let mut s = scan();
         s.unit = Unit { name: "r2".into(), mm: 1.0 };
         // Without its offset the small detector sees the volume.
-        let mut orbit = Orbit::fit(&s.geometry.views).unwrap();
+        let mut orbit = CircularOrbit::fit(&s.geometry.views).unwrap();
         orbit.offset = [0.25, -0.5];
         s.geometry.views = orbit.views();
         let data = Array3::from_shape_fn((5, 6, 7), |(x, y, z)| 0.01 + 0.001 * (x + y * z) as f32);

@@ -6,7 +6,7 @@ use crate::method::Parts;
 use crate::{files, out, plugins, specs};
 use clap::Args;
 use conefield_core::Result;
-use conefield_core::backend::Explain as Compiled;
+use conefield_core::backend::Explain;
 use conefield_core::pipeline::Pipeline;
 use conefield_core::spec::load::Loaded;
 use conefield_core::stage::{GradKind, Stage};
@@ -18,7 +18,7 @@ use std::path::{Path, PathBuf};
 
 /// Show what a spec builds: stages, widths, parameters, memory, work.
 #[derive(Args)]
-pub struct Explain {
+pub struct ExplainArgs {
     #[arg(help = specs::help())]
     spec: String,
     /// Change a setting, such as encoder.levels=8.
@@ -105,7 +105,7 @@ struct Report {
     #[serde(skip_serializing_if = "Vec::is_empty")]
     plugins: Vec<plugins::Used>,
     /// Of a field.
-    backend: Option<Compiled>,
+    backend: Option<Explain>,
     scan: Option<ForScan>,
 }
 
@@ -124,7 +124,7 @@ struct ForScan {
     memory: Memory,
 }
 
-impl Explain {
+impl ExplainArgs {
     pub fn run(self) -> Result<()> {
         let loaded = specs::read(&self.spec, &self.sets)?;
         let mut parts = Parts::of(&loaded, self.backend.open()?.as_ref())?;

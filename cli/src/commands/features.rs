@@ -1,7 +1,7 @@
 //! `conefield features`
 
 use super::convert::refuse_existing;
-use super::trained::{Opened, Trained};
+use super::trained::{OpenedField, Trained};
 use crate::out;
 use crate::pca::Pca;
 use crate::statistics::pearson;
@@ -22,7 +22,7 @@ use std::path::PathBuf;
 /// the three middle slices where the object can be; each runs from its 1st to its 99th percentile. Their signs mean
 /// nothing. The reconstruction stands beside them.
 #[derive(Args)]
-pub struct Features {
+pub struct FeaturesArgs {
     #[command(flatten)]
     trained: Trained,
     /// The picture to write (PNG).
@@ -49,7 +49,7 @@ enum After {
 /// Components that are drawn, one a colour.
 const DRAWN: usize = 3;
 
-impl Features {
+impl FeaturesArgs {
     pub fn run(self) -> Result<()> {
         refuse_existing(&self.output, self.force)?;
         let opened = self.trained.open(0)?;
@@ -57,7 +57,7 @@ impl Features {
         let count: u64 = planes.iter().map(|p| p.iter().map(|r| r.len() as u64).product::<u64>()).sum();
         let width = opened.field.model.pipeline.encoder.info().output as u64;
         opened.memory(count * (4 * 3 * width + 64))?;
-        let Opened { file, field: TrainedField { model, scene, unit_mm }, grid, .. } = opened;
+        let OpenedField { file, field: TrainedField { model, scene, unit_mm }, grid, .. } = opened;
         let voxels: Vec<[usize; 3]> = planes.iter().flat_map(indices).collect();
         let held: Vec<bool> = voxels.iter().map(|v| scene.holds(grid.voxel(*v))).collect();
         let points: Vec<[f32; 3]> =

@@ -14,7 +14,7 @@ use std::path::PathBuf;
 /// SCANNER.toml names the files with the projections (TIFF, .npy, .npz, .mha), says in mm where source and detector stood
 /// and how arrays lie; docs/geometry.md has all keys. Raw counts become line integrals; dead and hot pixels are interpolated.
 #[derive(Args)]
-pub struct Import {
+pub struct ImportArgs {
     /// The description of the scanner.
     #[arg(value_name = "SCANNER.toml")]
     scanner: PathBuf,
@@ -37,7 +37,7 @@ pub struct Import {
     json: bool,
 }
 
-impl Import {
+impl ImportArgs {
     pub fn run(self) -> Result<()> {
         refuse_existing(&self.output, self.force)?;
         let options = ImportOptions { i0: self.i0, floor: self.floor };

@@ -18,7 +18,7 @@ use std::path::{Path, PathBuf};
 /// volume the views see, what is missing, and warnings of what will trouble a reconstruction. SCANNER.toml and RTK's XML
 /// geometry are understood, too.
 #[derive(Args)]
-pub struct Info {
+pub struct InfoArgs {
     /// A scan, a volume or a weights file.
     file: PathBuf,
     /// Also draw source path, detector and volume, with the share of views that see each point of it; of a volume, its
@@ -30,7 +30,7 @@ pub struct Info {
     json: bool,
 }
 
-impl Info {
+impl InfoArgs {
     pub fn run(self) -> Result<()> {
         let path = &self.file;
         std::fs::metadata(path).map_err(|e| Error::io(path, e))?;
