@@ -6,9 +6,10 @@ use conefield_core::pipeline::Model;
 use conefield_core::scan::{Scan, Volume};
 use conefield_core::trained::TrainedField;
 use conefield_core::{Error, Result};
-use conefield_io::MiddleSlices;
-use conefield_io::survey::{Survey, survey};
+use conefield_diagnosis::{Survey, survey};
+pub use conefield_io::read_weights;
 use conefield_projectors::simulate::{PhantomKind, phantom_of};
+use conefield_report::MiddleSlices;
 use std::collections::BTreeMap;
 use std::path::Path;
 
@@ -60,12 +61,6 @@ pub fn warn_of(path: &Path, survey: &Survey) {
     for warning in &survey.warnings {
         tracing::warn!("{}: {warning}", path.display());
     }
-}
-
-/// Reads weights.
-pub fn read_weights(path: impl AsRef<Path>) -> Result<Weights> {
-    let file = conefield_io::read_weights(path)?;
-    Ok(Weights { tensors: file.tensors, notes: file.metadata })
 }
 
 /// Writes weights with their notes.
@@ -125,8 +120,8 @@ pub fn read_checkpoint(path: &Path, run: &BTreeMap<String, String>) -> Result<Re
         return Err(Error::invalid(place, "--resume", "no checkpoint", expected));
     }
     let mut file = conefield_io::read_checkpoint(path)?;
-    let standing = file.metadata.remove(STANDING).unwrap_or_default();
-    same_run(&place, &file.metadata, run)?;
+    let standing = file.notes.remove(STANDING).unwrap_or_default();
+    same_run(&place, &file.notes, run)?;
     let standing = serde_json::from_str(&standing)
         .map_err(|e| Error::invalid(&place, STANDING, e, "what conefield writes there"))?;
     Ok(Resume { place, standing, weights: Weights { tensors: file.tensors, ..Weights::default() } })
@@ -150,8 +145,8 @@ pub fn same_run(place: &str, then: &BTreeMap<String, String>, now: &BTreeMap<Str
 /// Draws the middle slices of a result, with those of `reference` and their difference where there is one.
 pub fn picture(path: impl AsRef<Path>, reference: Option<&MiddleSlices>, result: &MiddleSlices) -> Result<()> {
     match reference {
-        Some(r) => conefield_io::slices_png(path, &[("reference", r), ("result", result)], r.window(), Some(0)),
-        None => conefield_io::slices_png(path, &[("result", result)], result.window(), None),
+        Some(r) => conefield_report::slices_png(path, &[("reference", r), ("result", result)], r.window(), Some(0)),
+        None => conefield_report::slices_png(path, &[("result", result)], result.window(), None),
     }
 }
 

@@ -1,6 +1,6 @@
 //! The contracts that conefield's stages, backends and solvers meet at.
 //!
-//! - [`geometry`], [`scan`], [`parts`]: what was measured, in millimetres, and what comes out.
+//! - [`geometry`], [`orbit`], [`scan`], [`parts`]: what was measured, in millimetres, and what comes out.
 //! - [`simd`], [`half`], [`dense`], [`trilinear`], [`stage`]: what a stage computes and how.
 //! - [`support`]: where the object can be; [`scene`]: between the world and what stages see.
 //! - [`wgsl`]: the same for a GPU.
@@ -21,6 +21,7 @@ pub mod geometry;
 pub mod half;
 pub mod host;
 pub mod method;
+pub mod orbit;
 pub mod pages;
 pub mod parts;
 pub mod pipeline;

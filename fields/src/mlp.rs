@@ -5,7 +5,7 @@
 
 mod wgsl;
 
-use conefield_core::dense::{Output as Into, Weights, affine, affine_input, affine_weights};
+use conefield_core::dense::{Output as Into, WeightMatrix, affine, affine_input, affine_weights};
 use conefield_core::error::{Result, ensure};
 use conefield_core::random::{mix, unit};
 use conefield_core::simd::{Op, Real, Select, Simd, SimdBase, SimdFloat, V, load, run, store};
@@ -273,7 +273,7 @@ impl<R: Real> Op for Forward<'_, R> {
             let until = stage.slope(i).end;
             let (before, both) = split(tape.data, from..until, n);
             let (h, z) = if last { (&mut y.data[..], both) } else { both.split_at_mut(layer.output * n) };
-            let weights = |column| Weights { data: &params[layer.weights()], ld: layer.ld(), column };
+            let weights = |column| WeightMatrix { data: &params[layer.weights()], ld: layer.ld(), column };
             let input =
                 if i == 0 { x.data } else { &before[stage.hidden(i - 1).start * n..stage.hidden(i - 1).end * n] };
             affine(s, weights(layer.skip), Some(&params[layer.bias()]), input, z, n);
@@ -346,7 +346,7 @@ impl<R: Real> Op for Backward<'_, R> {
         }
         let mut fresh = true;
         for (i, layer) in stage.layers.iter().enumerate().rev() {
-            let weights = |column| Weights { data: &params[layer.weights()], ld: layer.ld(), column };
+            let weights = |column| WeightMatrix { data: &params[layer.weights()], ld: layer.ld(), column };
             let (before, dz) = tape.data.split_at_mut(stage.slope(i).start * n);
             let dz = &dz[..layer.output * n];
             let input =

@@ -2,7 +2,7 @@
 
 use crate::file_order::{self, FileOrder};
 use crate::input::Input;
-use crate::number::{self, Number, Order};
+use crate::number::{self, ByteOrder, Number};
 use conefield_core::parts::Voxels;
 use conefield_core::{Error, Result};
 use ndarray::{Array, ArrayD, Dimension, IxDyn, ShapeBuilder};
@@ -19,7 +19,7 @@ const LONGEST_HEADER: usize = 1 << 16;
 #[derive(Debug, PartialEq)]
 struct Header {
     number: Number,
-    order: Order,
+    order: ByteOrder,
     fortran: bool,
     shape: Vec<usize>,
 }
@@ -149,13 +149,13 @@ fn read_header(input: &mut Input, start: Vec<u8>) -> Result<Header> {
 }
 
 /// How NumPy's name for a type of real numbers, e.g. `<f4`, has them stored; `None` for any other.
-pub(crate) fn element(descr: &str) -> Option<(Number, Order)> {
+pub(crate) fn element(descr: &str) -> Option<(Number, ByteOrder)> {
     let (order, kind) = match descr.chars().next()? {
-        '<' => (Order::Little, &descr[1..]),
-        '>' => (Order::Big, &descr[1..]),
-        '|' => (Order::Little, &descr[1..]),
-        '=' => (if cfg!(target_endian = "big") { Order::Big } else { Order::Little }, &descr[1..]),
-        _ => (Order::Little, descr),
+        '<' => (ByteOrder::Little, &descr[1..]),
+        '>' => (ByteOrder::Big, &descr[1..]),
+        '|' => (ByteOrder::Little, &descr[1..]),
+        '=' => (if cfg!(target_endian = "big") { ByteOrder::Big } else { ByteOrder::Little }, &descr[1..]),
+        _ => (ByteOrder::Little, descr),
     };
     let number = match kind {
         "b1" => Number::Bool,

@@ -1,7 +1,7 @@
 //! How large scans and volumes are, read from their headers before memory is taken for them.
 
-use crate::scan::{self, Found};
-use crate::volume::{self, Opened};
+use crate::scan::{self, ScanFile};
+use crate::volume::{self, VolumeFile};
 use crate::{dicom, metaimage, nifti, npy, r2, scan_folder, scanner};
 use conefield_core::error::ensure;
 use conefield_core::scan::ScanHeader;
@@ -35,13 +35,13 @@ impl ScanSize {
 pub fn scan_size(path: impl AsRef<Path>) -> Result<ScanSize> {
     let path = path.as_ref();
     let size = match scan::find(path)? {
-        Found::Own(file) => scan_folder::size(&file)?,
-        Found::R2(folder) => r2::size(&folder)?,
-        Found::Naf(file) => {
+        ScanFile::Own(file) => scan_folder::size(&file)?,
+        ScanFile::R2(folder) => r2::size(&folder)?,
+        ScanFile::Naf(file) => {
             let bytes = file_bytes(&file)?;
             ScanSize { pixels: bytes / 4, voxels: bytes / 4, test_pixels: 0, reading: bytes }
         }
-        Found::Scanner(file) => scanner::size(&file)?,
+        ScanFile::Scanner(file) => scanner::size(&file)?,
     };
     let all =
         [("pixels of all views", size.pixels), ("pixels of test views", size.test_pixels), ("voxels", size.voxels)];
@@ -56,13 +56,13 @@ pub fn scan_size(path: impl AsRef<Path>) -> Result<ScanSize> {
 pub fn volume_voxels(path: impl AsRef<Path>) -> Result<u64> {
     let path = path.as_ref();
     let shape = match volume::open(path)? {
-        Opened::Series => {
+        VolumeFile::Series => {
             let files = dicom::files(path)?;
             return files.iter().map(|f| file_bytes(f)).sum::<Result<u64>>().map(|bytes| bytes / 2);
         }
-        Opened::Npy(mut input, head) => npy::shape(&mut input, head)?,
-        Opened::MetaImage => metaimage::shape(path)?.to_vec(),
-        Opened::Nifti(input, head) => nifti::shape_of(&input, &head)?.to_vec(),
+        VolumeFile::Npy(mut input, head) => npy::shape(&mut input, head)?,
+        VolumeFile::MetaImage => metaimage::shape(path)?.to_vec(),
+        VolumeFile::Nifti(input, head) => nifti::shape_of(&input, &head)?.to_vec(),
     };
     let voxels = shape.iter().fold(1, |n: u64, &s| n.saturating_mul(s as u64));
     must_exist(path, "voxels", voxels)?;

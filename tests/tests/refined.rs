@@ -8,7 +8,7 @@ use conefield_backend_cpu::Cpu;
 use conefield_core::arena::Weights;
 use conefield_core::scan::{Scan, Volume};
 use conefield_core::method::{Job, Solution};
-use conefield_projectors::simulate::{Noise, Protocol, simulate};
+use conefield_projectors::simulate::{DetectorNoise, Protocol, simulate};
 use ndarray::Array3;
 use serde_json::{Value, json};
 
@@ -24,12 +24,12 @@ fn object(more: impl Fn([usize; 3]) -> Option<f32>) -> Volume {
     Volume::centered(data, [2.0 / N as f64; 3])
 }
 
-fn scan(volume: &Volume, noise: Noise) -> Scan {
+fn scan(volume: &Volume, noise: DetectorNoise) -> Scan {
     let protocol = Protocol::r2(&volume.grid).with_detector([64, 64]).with_views(24).with_noise(noise, 3);
     simulate(volume, &protocol).unwrap()
 }
 
-fn noisy() -> Noise {
+fn noisy() -> DetectorNoise {
     "tigre:1e4,10".parse().unwrap()
 }
 
@@ -68,7 +68,7 @@ fn error(truth: &Volume, found: &Volume, at: impl Fn([usize; 3]) -> bool) -> [f6
 }
 
 /// Trains on a scan of `truth` with the rule and without it: the detail is as good, the whole is, and there was less to do.
-fn keeps(name: &str, truth: &Volume, noise: Noise, supports: &[&str], detail: impl Fn([usize; 3]) -> bool) {
+fn keeps(name: &str, truth: &Volume, noise: DetectorNoise, supports: &[&str], detail: impl Fn([usize; 3]) -> bool) {
     let scan = scan(truth, noise);
     for &support in supports {
         let (off, without) = run(&scan, &settings(support, json!("fixed")));
@@ -91,19 +91,19 @@ fn keeps(name: &str, truth: &Volume, noise: Noise, supports: &[&str], detail: im
 #[test]
 fn a_thin_wire_stays() {
     let wire = |[x, y, _]: [usize; 3]| x == 26 && y == 6;
-    keeps("wire", &object(|at| wire(at).then_some(3.0)), Noise::None, &["box", "carve"], wire);
+    keeps("wire", &object(|at| wire(at).then_some(3.0)), DetectorNoise::None, &["box", "carve"], wire);
 }
 
 #[test]
 fn a_bright_voxel_at_the_rim_stays() {
     let voxel = |at: [usize; 3]| at == [30, 16, 24];
-    keeps("voxel", &object(|at| voxel(at).then_some(8.0)), Noise::None, &["box"], voxel);
+    keeps("voxel", &object(|at| voxel(at).then_some(8.0)), DetectorNoise::None, &["box"], voxel);
 }
 
 #[test]
 fn a_faint_block_in_air_stays() {
     let block = |at: [usize; 3]| at.iter().zip([24, 5, 18]).all(|(x, from)| (from..from + 4).contains(x));
-    keeps("faint block", &object(|at| block(at).then_some(0.5)), Noise::None, &["box"], block);
+    keeps("faint block", &object(|at| block(at).then_some(0.5)), DetectorNoise::None, &["box"], block);
 }
 
 #[test]
@@ -126,7 +126,7 @@ fn what_appears_late_comes_back() {
     let near =
         |at: [usize; 3], by: usize| at.iter().zip([24, 5, 18]).all(|(x, from)| (from - by..from + 4 + by).contains(x));
     let [before, after] = [object(|_| None), object(|at| near(at, 0).then_some(0.8))];
-    let [blind, scan] = [&before, &after].map(|v| scan(v, Noise::None));
+    let [blind, scan] = [&before, &after].map(|v| scan(v, DetectorNoise::None));
     let cpu = Cpu::new();
     let settings = |occupancy: Value| {
         let mut s = settings("box", occupancy);

@@ -8,7 +8,7 @@ use conefield_core::parts::Voxels;
 use conefield_core::scan::{Scan, Volume};
 use conefield_core::method::{Job, Limits, Observer, Plan, Record};
 use conefield_core::{Error, Result};
-use conefield_io::MiddleSlices;
+use conefield_report::MiddleSlices;
 use ndarray::{Array3, s};
 use serde::Serialize;
 use std::time::Instant;

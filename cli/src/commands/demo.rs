@@ -11,9 +11,9 @@ use conefield_backend_cpu::Cpu;
 use conefield_core::scan::{Scan, Volume};
 use conefield_core::method::{Job, Limits};
 use conefield_core::{Error, Result};
-use conefield_io::MiddleSlices;
 use conefield_metrics::Scores;
-use conefield_projectors::simulate::{Noise, Protocol, phantom, simulate};
+use conefield_projectors::simulate::{DetectorNoise, Protocol, phantom, simulate};
+use conefield_report::MiddleSlices;
 use serde::Serialize;
 use serde_json::json;
 use std::path::PathBuf;
@@ -25,7 +25,7 @@ use tracing::info;
 /// A head-like phantom is scanned with the published noise. The spec "fast", started from pre-trained weights (MCI),
 /// then competes with the same field without LayerNorm and MCI, each given the same time.
 #[derive(Args)]
-pub struct Demo {
+pub struct DemoArgs {
     /// The folder for scan, volumes and picture.
     #[arg(short, long = "output", value_name = "FOLDER", default_value = "conefield-demo")]
     output: PathBuf,
@@ -61,14 +61,14 @@ struct Entry {
     volume: Volume,
 }
 
-impl Demo {
+impl DemoArgs {
     pub fn run(self) -> Result<()> {
         let folder = &self.output;
         refuse_existing(folder, self.force)?;
         std::fs::create_dir_all(folder).map_err(|e| Error::io(folder, e))?;
         let size = usize::from(self.size);
         let truth = phantom(size);
-        let noise = Noise::Tigre { i0: 1e4, sigma: 10.0 };
+        let noise = DetectorNoise::Tigre { i0: 1e4, sigma: 10.0 };
         let protocol = Protocol::r2(&truth.grid)
             .with_detector([size; 2])
             .with_views(self.views.into())
@@ -100,7 +100,7 @@ impl Demo {
         let results = [(&captions[0][..], &slices[0]), (&captions[1][..], &slices[1])];
         let picture = folder.join("compare.png");
         let truth = MiddleSlices::of(&truth);
-        conefield_io::compare_png(&picture, ("phantom", &truth), &results, truth.window())?;
+        conefield_report::compare_png(&picture, ("phantom", &truth), &results, truth.window())?;
         if self.json {
             return out::json(&json!({ "folder": folder, "picture": picture, "results": entries }));
         }

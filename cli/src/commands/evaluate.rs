@@ -7,8 +7,8 @@ use clap::Args;
 use conefield_core::Result;
 use conefield_core::error::ensure;
 use conefield_core::scan::Volume;
-use conefield_io::MiddleSlices;
 use conefield_metrics::{Dice, Scores, dice, label_map};
+use conefield_report::MiddleSlices;
 use serde::Serialize;
 use std::path::PathBuf;
 
@@ -20,7 +20,7 @@ use std::path::PathBuf;
 /// Dice is 2|A∩B|/(|A|+|B|) over the voxels of a label. Label 0 is background. A label that only one map has scores 0
 /// and counts in the mean like any other.
 #[derive(Args)]
-pub struct Evaluate {
+pub struct EvaluateArgs {
     /// The volume to score.
     volume: PathBuf,
     /// What it should be.
@@ -56,7 +56,7 @@ struct Report {
     dice: Option<Dice>,
 }
 
-impl Evaluate {
+impl EvaluateArgs {
     pub fn run(self) -> Result<()> {
         let voxels = [&self.volume, &self.reference].map(conefield_io::volume_voxels);
         let [volume, reference] = voxels;

@@ -12,7 +12,7 @@ use std::path::{Path, PathBuf};
 
 /// Show what a spec builds: stages, widths, parameters, memory, work.
 #[derive(Args)]
-pub struct Explain {
+pub struct ExplainArgs {
     #[arg(help = specs::help())]
     spec: String,
     /// Change a setting, such as encoder.levels=8.
@@ -55,7 +55,7 @@ struct ForScan {
     memory: Memory,
 }
 
-impl Explain {
+impl ExplainArgs {
     pub fn run(self) -> Result<()> {
         let loaded = specs::read(&self.spec, &self.sets)?;
         // The weights that an initializer names are not read here: a spec is explained without them.

@@ -1,6 +1,6 @@
 //! `conefield pretrain`
 
-use super::{Ends, reconstruct::notes};
+use super::{EndOptions, reconstruct::notes};
 use crate::backend::{self, BackendChoice};
 use crate::memory::Memory;
 use crate::parse::{self, Values};
@@ -18,7 +18,7 @@ use std::path::PathBuf;
 ///
 /// The weights file holds normalizers and field; the encoder stays with the volume that it was trained on.
 #[derive(Args)]
-pub struct Pretrain {
+pub struct PretrainArgs {
     /// The known volumes: files, or phantoms as "conefield simulate" has them.
     #[arg(required = true, value_name = "VOLUME")]
     volumes: Vec<String>,
@@ -34,7 +34,7 @@ pub struct Pretrain {
     #[arg(long, default_value = "as-is", value_parser = parse::values)]
     values: Values,
     #[command(flatten)]
-    ends: Ends,
+    ends: EndOptions,
     #[arg(long, value_name = "BACKEND", default_value_t, help = backend::HELP)]
     backend: BackendChoice,
     /// Seed of everything random.
@@ -45,7 +45,7 @@ pub struct Pretrain {
     json: bool,
 }
 
-impl Pretrain {
+impl PretrainArgs {
     /// Refuses what does not fit: every volume has parameters and moments of its own.
     fn memory(&self, parameters: u64, backend: u64) -> Result<()> {
         let voxels: Vec<u64> = self.volumes.iter().map(|v| files::voxels(v)).collect::<Result<_>>()?;

@@ -1,13 +1,13 @@
 //! `conefield reconstruct`
 
-use super::record::{Record, ScanRecord, summary};
-use super::{backends::simd_level, evaluate, protocol::Protocol};
+use super::record::{RunRecord, ScanRecord, summary};
+use super::{backends::simd_level, evaluate, protocol::RunProtocol};
 use crate::budget::calibrate::Bench;
 use crate::budget::front::Front;
 use crate::budget::plan::Budget;
 use crate::memory;
 use crate::method::{self, Planned};
-use crate::outgoing::{self, Written};
+use crate::outgoing::{self, WrittenVolume};
 use crate::plugins;
 use crate::progress::{Keeper, Progress};
 use crate::run::RunFolder;
@@ -19,7 +19,7 @@ use conefield_core::scan::Scan;
 use conefield_core::method::{Job, Limits};
 use conefield_core::spec::load::{Loaded, to_toml};
 use conefield_core::{Error, Result};
-use conefield_io::MiddleSlices;
+use conefield_report::MiddleSlices;
 use std::collections::BTreeMap;
 use std::fs::File;
 use std::path::{Path, PathBuf};
@@ -33,7 +33,7 @@ use tracing::info;
 /// whole command is planned to take so long; it first measures what this machine can do, for one to three seconds, or less
 /// of a short budget.
 #[derive(Args)]
-pub struct Reconstruct {
+pub struct ReconstructArgs {
     /// The scan.
     scan: PathBuf,
     #[arg(long, required_unless_present = "budget", help = spec_help())]
@@ -51,7 +51,7 @@ pub struct Reconstruct {
     #[arg(long, conflicts_with = "force")]
     resume: bool,
     #[command(flatten)]
-    protocol: Protocol,
+    protocol: RunProtocol,
     /// What to start from: weights that "conefield pretrain" made, or a volume.
     #[arg(long, value_name = "FILE")]
     init: Option<PathBuf>,
@@ -71,7 +71,7 @@ fn spec_help() -> String {
 /// What an error that goes to standard output begins with.
 pub const FAILED: &str = "failed: ";
 
-impl Reconstruct {
+impl ReconstructArgs {
     pub fn run(self) -> Result<()> {
         if !self.as_part {
             return self.reconstruct();
@@ -178,7 +178,7 @@ impl Reconstruct {
         }
         let mut voxels = solution.result.voxels(backend.as_ref())?;
         let affine = reference.as_ref().and_then(|r| r.affine);
-        let Written { slices, whole } = outgoing::write(&place, voxels.as_mut(), affine, reference.is_some())?;
+        let WrittenVolume { slices, whole } = outgoing::write(&place, voxels.as_mut(), affine, reference.is_some())?;
         let export_s = start.elapsed().as_secs_f64();
         let start = Instant::now();
         let middle = reference.as_ref().map(MiddleSlices::of);
@@ -188,7 +188,7 @@ impl Reconstruct {
         let score = |(volume, r)| evaluate::score(&place.display().to_string(), volume, r, protocol.peak);
         let scores = whole.as_ref().zip(reference.as_ref()).map(score).transpose()?;
         let score_s = start.elapsed().as_secs_f64();
-        let record = Record {
+        let record = RunRecord {
             version: env!("CARGO_PKG_VERSION"),
             spec: loaded.spec.name.clone(),
             seed: protocol.seed,
@@ -277,7 +277,7 @@ pub fn split(scan: Scan, held: &[usize]) -> Result<(Scan, Option<Scan>)> {
 /// What must be the same for a run to be resumed, or to be taken for done.
 pub fn identity(
     loaded: &Loaded,
-    protocol: &Protocol,
+    protocol: &RunProtocol,
     held: &[usize],
     scan: &ScanRecord,
 ) -> Result<BTreeMap<String, String>> {

@@ -26,7 +26,7 @@ use rayon::prelude::*;
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 use std::time::Instant;
-use weights::{Coverage, Orbit, place};
+use weights::{Coverage, FdkOrbit, place};
 
 /// Settings of `fdk`.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
@@ -65,7 +65,7 @@ impl Solver for Fdk {
         let within = Within::of(job, observer)?;
         let job = &Within::job(within.as_ref(), job);
         let scan = job.scan;
-        let orbit = Orbit::of(&scan.geometry);
+        let orbit = FdkOrbit::of(&scan.geometry);
         check(&orbit, &scan.geometry)?;
         said(&orbit).iter().for_each(|line| observer.note(line));
         let (g, measured) = orbit.symmetric(&scan.geometry);
@@ -138,7 +138,7 @@ impl Solver for Fdk {
     }
 
     fn plan(&self, scan: &Scan) -> Vec<String> {
-        let orbit = Orbit::of(&scan.geometry);
+        let orbit = FdkOrbit::of(&scan.geometry);
         check(&orbit, &scan.geometry).map_or_else(|e| vec![e.to_string()], |()| said(&orbit))
     }
 
@@ -153,7 +153,7 @@ impl Solver for Fdk {
 }
 
 /// What is told of an orbit.
-fn said(orbit: &Orbit) -> Vec<String> {
+fn said(orbit: &FdkOrbit) -> Vec<String> {
     let mut lines = vec![orbit.describe()];
     if orbit.coverage == Coverage::Limited {
         lines.push("expect streaks along the missing directions; an iterative solver suits this scan better".into());
@@ -192,7 +192,7 @@ fn alone(spec: &Spec) -> Result<()> {
 const TILT: f64 = 0.05;
 
 /// FDK is for circles around z, whose rows of the detector lie across z.
-fn check(orbit: &Orbit, geometry: &Geometry) -> Result<()> {
+fn check(orbit: &FdkOrbit, geometry: &Geometry) -> Result<()> {
     let span = |values: &mut dyn Iterator<Item = f64>| {
         values.fold((f64::INFINITY, f64::NEG_INFINITY), |(l, h), r| (l.min(r), h.max(r)))
     };

@@ -2,7 +2,7 @@
 
 use crate::kit::{Case, bodies, geometry, psnr};
 use conefield_core::scan::Volume;
-use conefield_projectors::simulate::{Noise, ellipsoids, scan_ellipsoids};
+use conefield_projectors::simulate::{DetectorNoise, ellipsoids, scan_ellipsoids};
 use conefield_solvers::support::carve;
 
 /// Volumes of a noisy scan: without, with the support, and what the support is.
@@ -19,7 +19,7 @@ fn solved(kind: &str, start: Option<&Volume>) -> [Volume; 2] {
 
 fn noisy() -> conefield_core::scan::Scan {
     let mut scan = scan_ellipsoids(&bodies(), geometry(24));
-    let noise: Noise = "poisson:1e4".parse().unwrap();
+    let noise: DetectorNoise = "poisson:1e4".parse().unwrap();
     noise.add(&mut scan.projections, 5);
     scan
 }

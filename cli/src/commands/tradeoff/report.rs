@@ -1,6 +1,6 @@
 //! What a search came to: the front as table, figure and JSON, its specs, and how well held-out views rank.
 
-use super::pareto::{Standing, front};
+use super::pareto::{Performance, front};
 use super::{FILES, FOLDERS, Over, Rung, Search, Status, accuracy};
 use crate::budget::front::{Front, Point, Reached, Tuned, Unknowns};
 use crate::commands::trial::Figures;
@@ -10,7 +10,7 @@ use crate::statistics::{mean, spearman};
 use crate::table::Table;
 use conefield_core::spec::load::to_toml;
 use conefield_core::{Error, Result};
-use conefield_io::{CurveOptions, Panel, panels_png};
+use conefield_report::{CurveOptions, Panel, panels_png};
 use serde::Serialize;
 use serde_json::Value;
 use std::fs;
@@ -18,7 +18,7 @@ use std::path::Path;
 
 /// All that `tradeoff.json` says.
 #[derive(Serialize)]
-pub struct Report {
+pub struct TradeoffReport {
     search: Search,
     rungs: Vec<Rung>,
     trials: Vec<Over>,
@@ -58,7 +58,7 @@ struct Mean {
     ssim_2d: Option<f64>,
     held_out: Option<f64>,
     #[serde(skip)]
-    standing: Standing,
+    standing: Performance,
     #[serde(skip)]
     runs: Vec<Figures>,
 }
@@ -71,7 +71,7 @@ struct Best {
     point: String,
 }
 
-impl Report {
+impl TradeoffReport {
     pub fn new(search: Search, rungs: Vec<Rung>, trials: Vec<Over>) -> Result<Self> {
         let points = points(&search, &trials);
         if points.is_empty() {
@@ -80,7 +80,7 @@ impl Report {
         }
         let of = |kind: Option<Unknowns>| {
             let some: Vec<&Mean> = points.iter().filter(|p| kind.is_none_or(|k| k == p.kind)).collect();
-            let all: Vec<Standing> = some.iter().map(|p| p.standing).collect();
+            let all: Vec<Performance> = some.iter().map(|p| p.standing).collect();
             front(&all).into_iter().map(|i| some[i].name.clone()).collect::<Vec<_>>()
         };
         let (all, fields, voxels) = (of(None), of(Some(Unknowns::Field)), of(Some(Unknowns::Voxels)));
@@ -288,8 +288,8 @@ impl Report {
             }
         }
         let base_of = |p: &Mean| self.candidate(p).map_or("", |c| &c.base[..]).to_owned();
-        let series = |x: fn(&Mean) -> f64, alone: fn(Standing) -> Standing| {
-            let standings: Vec<Standing> = self.points.iter().map(|p| alone(p.standing)).collect();
+        let series = |x: fn(&Mean) -> f64, alone: fn(Performance) -> Performance| {
+            let standings: Vec<Performance> = self.points.iter().map(|p| alone(p.standing)).collect();
             let line = front(&standings).into_iter().map(|i| &self.points[i]);
             let mut line: Vec<(f64, f64)> = line.map(|p| (x(p), value(p))).collect();
             line.sort_by(|a, b| a.0.total_cmp(&b.0));
@@ -302,8 +302,8 @@ impl Report {
             }
             all
         };
-        let over_time = series(|p| p.total_s, |s| Standing { bytes: 1.0, ..s });
-        let over_memory = series(|p| p.standing.bytes / f64::from(1 << 20), |s| Standing { seconds: 1.0, ..s });
+        let over_time = series(|p| p.total_s, |s| Performance { bytes: 1.0, ..s });
+        let over_memory = series(|p| p.standing.bytes / f64::from(1 << 20), |s| Performance { seconds: 1.0, ..s });
         // A logarithmic axis of less than a decade would have no figures.
         let options = |series: &[(String, Vec<(f64, f64)>)]| {
             let all = || series.iter().flat_map(|(_, s)| s).map(|p| p.0).filter(|x| x.is_finite());
@@ -350,7 +350,7 @@ fn points(search: &Search, trials: &[Over]) -> Vec<Mean> {
                 psnr: mean(&Figures::psnr),
                 ssim_2d: mean(&|f| f.score("ssim_2d")),
                 held_out: mean(&|f| f.held_out),
-                standing: Standing { seconds: total_s, bytes, accuracy },
+                standing: Performance { seconds: total_s, bytes, accuracy },
                 runs,
             });
         }

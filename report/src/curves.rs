@@ -275,17 +275,7 @@ pub(crate) fn register() {
 #[cfg(test)]
 mod tests {
     use super::*;
-
-    fn folder() -> (Option<tempfile::TempDir>, std::path::PathBuf) {
-        match std::env::var_os("CONEFIELD_PICTURES") {
-            Some(p) => (None, p.into()),
-            None => {
-                let dir = tempfile::tempdir().unwrap();
-                let path = dir.path().to_path_buf();
-                (Some(dir), path)
-            }
-        }
-    }
+    use crate::testing::folder;
 
     fn series() -> Vec<(String, Vec<(f64, f64)>)> {
         let curve = |top: f64, slow: f64| {

@@ -9,7 +9,7 @@ const OPENING: f64 = 60.0;
 
 /// The views' directions from the axis, in degrees.
 #[derive(Debug, Clone, PartialEq, Serialize)]
-pub struct Arc {
+pub struct ScanArc {
     /// Of the first view, from +x towards +y.
     pub first_deg: f64,
     /// From the first view to the second, by the shorter way; positive from +x towards +y.
@@ -29,7 +29,7 @@ pub struct Arc {
 }
 
 /// Looks where `views` stand.
-pub fn arc(views: &[View]) -> Arc {
+pub(crate) fn scan_arc(views: &[View]) -> ScanArc {
     let turns: Vec<f64> = views.iter().map(|v| v.source[1].atan2(v.source[0]).rem_euclid(TAU)).collect();
     let mut sorted: Vec<f64> = turns.iter().map(|a| a.to_degrees()).collect();
     sorted.sort_unstable_by(f64::total_cmp);
@@ -52,7 +52,7 @@ pub fn arc(views: &[View]) -> Arc {
         [a, b, ..] => (b - a + TAU / 2.0).rem_euclid(TAU) - TAU / 2.0,
         _ => 0.0,
     };
-    Arc {
+    ScanArc {
         first_deg: turns.first().copied().unwrap_or(0.0).to_degrees(),
         step_deg: step.to_degrees(),
         covered_deg: if full_circle { 360.0 } else { sum + mean },

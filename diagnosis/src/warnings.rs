@@ -1,6 +1,6 @@
 //! What will trouble a reconstruction, with figures and a way out.
 
-use super::Survey;
+use crate::survey::Survey;
 use conefield_core::scan::Scan;
 use serde::Serialize;
 use std::fmt;
@@ -73,7 +73,7 @@ fn percent(x: f64) -> String {
 }
 
 /// Everything that is wrong with `scan`.
-pub(super) fn of(scan: &Scan, s: &Survey) -> Vec<Warning> {
+pub(crate) fn warnings(scan: &Scan, s: &Survey) -> Vec<Warning> {
     let mut all = Vec::new();
     let mut warn = |kind, found: String, advice: String| all.push(Warning { kind, found, advice });
     for complaint in &s.check.complaints {

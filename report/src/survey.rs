@@ -1,17 +1,15 @@
 //! A picture of a scan's geometry: source path, detector, volume, and which part of it the views see.
 
-use super::coverage::{shadows, share};
-use super::{Setup, Shadow, setup};
 use crate::canvas::{number, sequential, write_png};
 use crate::curves::{FONT, register};
 use conefield_core::geometry::{Geometry, Vec3, View};
 use conefield_core::{Error, Result};
+use conefield_diagnosis::{Setup, setup, share_of_views};
 use image::imageops::{FilterType, resize};
 use image::{Rgb, RgbImage};
 use plotters::coord::Shift;
 use plotters::prelude::*;
 use plotters::style::text_anchor::{HPos, Pos, VPos};
-use rayon::prelude::*;
 use std::ops::Range;
 use std::path::Path;
 
@@ -54,7 +52,7 @@ pub fn survey_png(path: impl AsRef<Path>, title: &str, geometry: &Geometry) -> R
     let mut pixels = vec![255u8; 3 * width as usize * height as usize];
     {
         let area = BitMapBackend::with_buffer(&mut pixels, (width, height)).into_drawing_area();
-        let picture = Picture { geometry, setup: setup(geometry), shadows: shadows(geometry) };
+        let picture = Picture { geometry, setup: setup(geometry) };
         picture.draw(&area, title).map_err(|e| Error::invalid(&place, "picture", e, "a geometry that can be drawn"))?;
     }
     let fine: RgbImage = image::ImageBuffer::<Rgb<u8>, _>::from_raw(width, height, pixels)
@@ -66,7 +64,6 @@ pub fn survey_png(path: impl AsRef<Path>, title: &str, geometry: &Geometry) -> R
 struct Picture<'g> {
     geometry: &'g Geometry,
     setup: Setup,
-    shadows: Vec<Shadow>,
 }
 
 /// The area's pixels, what axes and titles take of them, and the part of the world in the rest.
@@ -292,7 +289,6 @@ impl Picture<'_> {
         let [low, high] = grid.bounds();
         let room = 0.12 * seen.map(|k| grid.size()[k]).into_iter().fold(0.0, f64::max);
         let range = |k: usize| [low[k] - room, high[k] + room];
-        let cut = 3 - seen[0] - seen[1];
         let title = format!("{}–{} through the volume's middle", NAMES[seen[0]], NAMES[seen[1]]);
         let labels = seen.map(|k| format!("{} (mm)", NAMES[k]));
         let frame = Frame { title: &title, labels: [&labels[0], &labels[1]], x: range(seen[0]), y: range(seen[1]) };
@@ -301,18 +297,16 @@ impl Picture<'_> {
         let step = (x.end - x.start).max(y.end - y.start) / POINTS as f64;
         let count = |r: &Range<f64>| ((r.end - r.start) / step).ceil().max(1.0) as usize;
         let (nx, ny) = (count(&x), count(&y));
-        let cells: Vec<([f64; 2], f64)> = (0..nx * ny)
-            .into_par_iter()
-            .map(|i| {
-                let corner = [x.start + step * (i % nx) as f64, y.start + step * (i / nx) as f64];
-                let mut p = grid.center;
-                (p[seen[0]], p[seen[1]]) = (corner[0] + step / 2.0, corner[1] + step / 2.0);
-                debug_assert_eq!(p[cut], grid.center[cut]);
-                (corner, share(&self.shadows, self.geometry.detector, p))
-            })
-            .collect();
-        let tiles = cells.iter().map(|([cx, cy], share)| {
-            let c = sequential(*share as f32);
+        let corners: Vec<[f64; 2]> =
+            (0..nx * ny).map(|i| [x.start + step * (i % nx) as f64, y.start + step * (i / nx) as f64]).collect();
+        let centre = |corner: &[f64; 2]| {
+            let mut p = grid.center;
+            (p[seen[0]], p[seen[1]]) = (corner[0] + step / 2.0, corner[1] + step / 2.0);
+            p
+        };
+        let shares = share_of_views(self.geometry, &corners.iter().map(centre).collect::<Vec<_>>());
+        let tiles = corners.iter().zip(shares).map(|([cx, cy], share)| {
+            let c = sequential(share as f32);
             let end = ((cx + step).min(x.end), (cy + step).min(y.end));
             Rectangle::new([(*cx, *cy), end], RGBColor(c.0[0], c.0[1], c.0[2]).filled())
         });

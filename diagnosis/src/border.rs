@@ -1,25 +1,14 @@
 //! What stands along the border of a projection, where most scans see air.
 
+use crate::quantiles::median;
 use ndarray::ArrayView2;
 
 /// Pieces that each of the four border strips is cut into.
 const PIECES: usize = 4;
 
-/// The middle value, or `None` of nothing. Of an even number the upper one of the two.
-pub(crate) fn median(values: &mut [f32]) -> Option<f32> {
-    let middle = values.len() / 2;
-    (!values.is_empty()).then(|| *values.select_nth_unstable_by(middle, f32::total_cmp).1)
-}
-
-/// The value below which `share` of the `sorted` ones lie.
-pub(crate) fn quantile(sorted: &[f32], share: f64) -> Option<f32> {
-    let last = sorted.len().checked_sub(1)?;
-    sorted.get((share * last as f64).round() as usize).copied()
-}
-
 /// Medians of the pieces of the border of `view` (`[row, column]`), in rising order: strips of a 32nd of the shorter
 /// side, four pieces a side. Pixels that `usable` refuses do not count.
-pub(crate) fn pieces(view: ArrayView2<'_, f32>, usable: impl Fn(usize, usize) -> bool) -> Vec<f32> {
+pub fn border_medians(view: ArrayView2<'_, f32>, usable: impl Fn(usize, usize) -> bool) -> Vec<f32> {
     let (rows, columns) = view.dim();
     let width = (rows.min(columns) / 32).max(1);
     let mut out = Vec::with_capacity(4 * PIECES);
@@ -45,19 +34,19 @@ pub(crate) fn pieces(view: ArrayView2<'_, f32>, usable: impl Fn(usize, usize) ->
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::quantiles::quantile;
     use ndarray::Array2;
 
     #[test]
     fn the_border_is_found_whatever_the_size() {
         for (rows, columns) in [(1, 1), (2, 9), (64, 96), (5, 200)] {
             let view = Array2::from_elem((rows, columns), 3.0f32);
-            let found = pieces(view.view(), |_, _| true);
+            let found = border_medians(view.view(), |_, _| true);
             assert!(!found.is_empty() && found.iter().all(|&x| x == 3.0), "{rows} x {columns}: {found:?}");
         }
         let view = Array2::from_shape_fn((64, 64), |(_, c)| if c < 32 { 1.0 } else { 2.0 });
-        let found = pieces(view.view(), |_, _| true);
+        let found = border_medians(view.view(), |_, _| true);
         assert_eq!((found.len(), quantile(&found, 0.1), quantile(&found, 0.9)), (16, Some(1.0), Some(2.0)));
-        assert!(pieces(view.view(), |_, _| false).is_empty());
-        assert_eq!((median(&mut []), quantile(&[], 0.5)), (None, None));
+        assert!(border_medians(view.view(), |_, _| false).is_empty());
     }
 }

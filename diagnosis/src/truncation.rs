@@ -1,7 +1,7 @@
 //! Whether the object reaches past the left or right side of the detector.
 
-use super::Setup;
-use crate::check::LineIntegralCheck;
+use crate::line_integrals::LineIntegralCheck;
+use crate::setup::Setup;
 use ndarray::{ArrayView3, Axis, s};
 use serde::Serialize;
 
@@ -25,7 +25,7 @@ pub struct Truncation {
 }
 
 /// Looks at the sides of `projections`, `[view, row, column]`.
-pub fn truncation(projections: ArrayView3<'_, f32>, setup: &Setup, check: &LineIntegralCheck) -> Truncation {
+pub(crate) fn truncation(projections: ArrayView3<'_, f32>, setup: &Setup, check: &LineIntegralCheck) -> Truncation {
     let (_, rows, columns) = projections.dim();
     let high = check.typical_range[1].max(0.0);
     let threshold = LEVEL * high + check.air.clamp(0.0, LEVEL * high);

@@ -1,7 +1,9 @@
 //! A clean scan gives no warning, and each fault gives its own.
 
 use super::*;
-use conefield_core::geometry::{Millimetres, Radians, VoxelGrid};
+use crate::WarningKind;
+use crate::arc::scan_arc;
+use conefield_core::geometry::{Geometry, Millimetres, Radians, View, VoxelGrid};
 use conefield_core::scan::Unit;
 use ndarray::Array3;
 use std::f64::consts::TAU;
@@ -119,7 +121,7 @@ fn scans_that_are_unusual_but_whole_give_no_warning() {
         assert_eq!(Setting { angles: golden, ..clean() }.kinds(), [], "golden angle, {n}");
     }
     for n in 4..400 {
-        assert!(!arc(&Setting { angles: even(n, TAU), ..clean() }.views()).like_degrees, "{n}");
+        assert!(!scan_arc(&Setting { angles: even(n, TAU), ..clean() }.views()).like_degrees, "{n}");
     }
     let mut noisy = clean().scan();
     let noise = |i: usize| 0.04 * (((i * 7919) % 101) as f32 / 50.0 - 1.0);

@@ -1,6 +1,7 @@
 //! Whether projections look like line integrals, and what is likely wrong if they do not.
 
-use crate::border::{median, pieces, quantile};
+use crate::border::border_medians;
+use crate::quantiles::{median, quantile};
 use ndarray::{ArrayView3, Axis, s};
 use serde::Serialize;
 
@@ -47,7 +48,7 @@ pub fn check_line_integrals(projections: ArrayView3<'_, f32>) -> LineIntegralChe
         if rows == 0 || columns == 0 {
             break;
         }
-        let border = pieces(view, |_, _| true);
+        let border = border_medians(view, |_, _| true);
         dark.extend(quantile(&border, 0.15));
         bright.extend(quantile(&border, 0.85));
         let centre = view.slice(s![rows / 4..rows - rows / 4, columns / 4..columns - columns / 4]);

@@ -1,8 +1,8 @@
 //! Draws the conventions of docs/geometry.md, with every place taken from the library:
-//! `cargo run -p conefield-io --example draw_geometry` writes docs/geometry-*.svg. A test here compares.
+//! `cargo run -p conefield-report --example draw_geometry` writes docs/geometry-*.svg. A test here compares.
 
 use conefield_core::geometry::{Geometry, Millimetres, Radians, Vec3, View, VoxelGrid};
-use conefield_io::Orbit;
+use conefield_core::orbit::CircularOrbit;
 use std::fmt::Write;
 use std::path::PathBuf;
 
@@ -134,6 +134,12 @@ fn middle(a: Point, b: Point) -> Point {
 /// The orbit from above, and one view from the side.
 fn world() -> String {
     let mut s = Svg::new(980.0, 560.0);
+    from_above(&mut s);
+    from_side(&mut s);
+    s.finish()
+}
+
+fn from_above(s: &mut Svg) {
     let angle: f64 = 38.0;
     let g = geometry(angle, [0.0, 25.0]);
     let (o, scale) = ((270.0, 290.0), 1.05);
@@ -197,10 +203,13 @@ fn world() -> String {
         INK,
         "DSD: from the source to the detector's plane. Start: the first view's a. a grows from +x to +y.",
     );
+}
 
-    // The same view in the plane of source and axis.
+/// The same view in the plane of source and axis.
+fn from_side(s: &mut Svg) {
     let o = (760.0, 250.0);
     let side = geometry(0.0, [25.0, 0.0]);
+    let [lo, hi] = side.volume.bounds();
     let flat = |p: Vec3| (o.0 + 0.9 * p[0], o.1 - 0.9 * p[2]);
     s.title((580.0, 28.0), "From the side (a = 0, y points away)");
     s.path(&[flat([0.0, 0.0, -170.0]), flat([0.0, 0.0, 190.0])], line(INK).arrow());
@@ -231,7 +240,6 @@ fn world() -> String {
     s.text((590.0, 450.0), "start", INK, "A positive offset along v moves the detector down,");
     s.text((590.0, 470.0), "start", INK, "towards −z. R2-Gaussian and NAF count theirs towards");
     s.text((590.0, 490.0), "start", INK, "+z; along u all have the same sign.");
-    s.finish()
 }
 
 /// The array of a view as the source sees it, and what the flips of an import mean.
@@ -298,7 +306,7 @@ fn detector() -> String {
 /// Volume and vectors in space.
 fn space() -> String {
     let mut s = Svg::new(980.0, 520.0);
-    let orbit = Orbit { dso: 200.0, dsd: 330.0, pixel: [30.0, 30.0], offset: [0.0, 0.0], angles: vec![0.35] };
+    let orbit = CircularOrbit { dso: 200.0, dsd: 330.0, pixel: [30.0, 30.0], offset: [0.0, 0.0], angles: vec![0.35] };
     let g = Geometry {
         volume: VoxelGrid { center: [10.0, 30.0, 20.0], ..geometry(0.0, [0.0; 2]).volume },
         views: orbit.views(),
@@ -398,6 +406,6 @@ fn main() -> conefield_core::Result<()> {
 fn the_drawings_in_docs_are_current() {
     for (path, text) in drawings() {
         let file = std::fs::read_to_string(&path).unwrap_or_default();
-        assert!(file == text, "write {} anew: cargo run -p conefield-io --example draw_geometry", path.display());
+        assert!(file == text, "write {} anew: cargo run -p conefield-report --example draw_geometry", path.display());
     }
 }

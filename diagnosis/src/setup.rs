@@ -1,42 +1,10 @@
-//! What a scan's geometry means in millimetres, and what in a scan will trouble a reconstruction.
-//!
-//! [`survey`] needs nothing but a [`Scan`]: where source, detector and axis stand, which voxels the detector supports,
-//! which part of the volume the views see, and warnings with their figures and a way out of each.
+//! A scan's lengths and angles, in millimetres and degrees.
 
-mod angles;
-mod coverage;
-mod picture;
-mod truncation;
-mod warnings;
-
-pub use angles::{Arc, arc};
-pub use coverage::{Coverage, coverage, share_of_views};
-pub use picture::survey_png;
-pub use truncation::{Truncation, truncation};
-pub use warnings::{Warning, WarningKind};
-
-use crate::check::{LineIntegralCheck, check_line_integrals};
-use conefield_core::geometry::{Geometry, Vec3, View, cross, dot, norm, sub};
-use conefield_core::scan::Scan;
+use crate::arc::{ScanArc, scan_arc};
+use crate::shadow::Shadow;
+use conefield_core::geometry::{Geometry, Vec3, norm};
+use conefield_core::orbit::CircularOrbit;
 use serde::Serialize;
-
-/// All that [`survey`] finds.
-#[derive(Debug, Clone, Serialize)]
-pub struct Survey {
-    /// Lengths and angles.
-    pub setup: Setup,
-    /// Which part of the volume the views see.
-    pub coverage: Coverage,
-    /// Whether the object reaches past the detector's sides.
-    pub truncation: Truncation,
-    /// Whether the projections look like line integrals.
-    pub check: LineIntegralCheck,
-    /// The order of magnitude of the attenuation in 1/mm: the highest line integrals (but for a thousandth) over the
-    /// volume's longer side across the axis.
-    pub attenuation_per_mm: f64,
-    /// What will trouble a reconstruction; empty if nothing will.
-    pub warnings: Vec<Warning>,
-}
 
 /// A scan's lengths and angles; where views differ, the median over them. The axis is z; the isocentre is its point at
 /// the height of the source.
@@ -62,7 +30,7 @@ pub struct Setup {
     /// Where the views see something.
     pub field_of_view: FieldOfView,
     /// Where on the circle the views stand.
-    pub angles: Arc,
+    pub angles: ScanArc,
 }
 
 /// The cylinder about the axis that the views see.
@@ -74,20 +42,6 @@ pub struct FieldOfView {
     pub one_sided_radius_mm: f64,
     /// What every view sees of the axis.
     pub height_mm: f64,
-}
-
-/// Surveys `scan`. Values and geometry are taken to be finite and to fit each other ([`Scan::validate`]).
-pub fn survey(scan: &Scan) -> Survey {
-    let g = &scan.geometry;
-    let setup = setup(g);
-    let coverage = coverage(g, &setup);
-    let check = check_line_integrals(scan.projections.view());
-    let truncation = truncation(scan.projections.view(), &setup, &check);
-    let size = g.volume.size();
-    let attenuation_per_mm = f64::from(check.typical_range[1]) / size[0].max(size[1]);
-    let mut survey = Survey { setup, coverage, truncation, check, attenuation_per_mm, warnings: Vec::new() };
-    survey.warnings = warnings::of(scan, &survey);
-    survey
 }
 
 /// The lengths and angles of `geometry`.
@@ -131,7 +85,7 @@ pub fn setup(geometry: &Geometry) -> Setup {
     let finite = |x: f64| if x.is_finite() { x.max(0.0) } else { 0.0 };
     let [dso, dsd, magnification, pv, pu, ov, ou] = std::array::from_fn(middle);
     Setup {
-        circle: crate::Orbit::fit(&geometry.views).is_some(),
+        circle: CircularOrbit::fit(&geometry.views).is_some(),
         source_to_axis_mm: dso,
         source_to_detector_mm: dsd,
         magnification,
@@ -144,7 +98,7 @@ pub fn setup(geometry: &Geometry) -> Setup {
             one_sided_radius_mm: finite(least(1)),
             height_mm: finite(least(3) - most(2)),
         },
-        angles: arc(&geometry.views),
+        angles: scan_arc(&geometry.views),
     }
 }
 
@@ -166,49 +120,3 @@ impl Setup {
         self.detector_mm[1] / 2.0 - self.offset_mm[1].abs()
     }
 }
-
-/// Where points of the world fall on a view's detector.
-pub(crate) struct Shadow {
-    source: Vec3,
-    detector: Vec3,
-    /// From the source to the plane of the detector.
-    pub depth: f64,
-    normal: Vec3,
-    /// Their products with a vector in the plane are its columns and rows.
-    columns: Vec3,
-    rows: Vec3,
-}
-
-/// Where a point falls, from the detector's centre, in pixels.
-pub(crate) struct Fall {
-    pub row: f64,
-    pub column: f64,
-    pub magnification: f64,
-}
-
-impl Shadow {
-    pub fn of(view: &View) -> Self {
-        let (normal, depth) = view.normal();
-        let over = |a: Vec3, b: Vec3| {
-            let c = cross(a, normal);
-            let length = dot(b, c);
-            c.map(|x| x / length)
-        };
-        let (columns, rows) = (over(view.v, view.u), over(view.u, view.v));
-        Self { source: view.source, detector: view.detector, depth, normal, columns, rows }
-    }
-
-    /// `None` for what is not before the source.
-    pub fn of_point(&self, p: Vec3) -> Option<Fall> {
-        let to = sub(p, self.source);
-        let magnification = self.depth / dot(self.normal, to);
-        if !(magnification > 0.0 && magnification.is_finite()) {
-            return None;
-        }
-        let on: Vec3 = std::array::from_fn(|k| self.source[k] + magnification * to[k] - self.detector[k]);
-        Some(Fall { row: dot(on, self.rows), column: dot(on, self.columns), magnification })
-    }
-}
-
-#[cfg(test)]
-mod tests;

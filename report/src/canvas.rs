@@ -1,8 +1,8 @@
 //! A picture to draw on: rectangles, text in DejaVu Sans, and colours for values.
 
-use crate::write_atomic;
 use ab_glyph::{Font, FontRef, PxScale, ScaleFont, point};
 use conefield_core::{Error, Result};
+use conefield_io::write_atomic;
 use image::{ExtendedColorType, ImageEncoder, Rgb, RgbImage};
 use std::path::Path;
 

@@ -1,6 +1,7 @@
 //! Which part of the volume the views see.
 
-use super::{Setup, Shadow};
+use crate::setup::Setup;
+use crate::shadow::Shadow;
 use conefield_core::geometry::{Geometry, Vec3};
 use rayon::prelude::*;
 use serde::Serialize;
@@ -11,7 +12,7 @@ const VIEWS: usize = 360;
 
 /// Shares of the volume's voxels by the share of views that see them, from an even sample.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize)]
-pub struct Coverage {
+pub struct VolumeCoverage {
     /// The share of views that is enough: all, or half if the detector stands aside on a full circle.
     pub needed: f64,
     /// Voxels that enough views see.
@@ -25,12 +26,12 @@ pub struct Coverage {
 }
 
 /// The shadows of evenly chosen views.
-pub(crate) fn shadows(geometry: &Geometry) -> Vec<Shadow> {
+fn shadows(geometry: &Geometry) -> Vec<Shadow> {
     geometry.views.iter().step_by(geometry.views.len().div_ceil(VIEWS).max(1)).map(Shadow::of).collect()
 }
 
 /// The share of `shadows` in which `point` falls on a detector of `[rows, columns]`.
-pub(crate) fn share(shadows: &[Shadow], detector: [usize; 2], point: Vec3) -> f64 {
+fn share(shadows: &[Shadow], detector: [usize; 2], point: Vec3) -> f64 {
     let [rows, columns] = detector.map(|n| n as f64 / 2.0);
     let sees = |s: &&Shadow| s.of_point(point).is_some_and(|f| f.row.abs() <= rows && f.column.abs() <= columns);
     shadows.iter().filter(sees).count() as f64 / shadows.len().max(1) as f64
@@ -44,7 +45,7 @@ pub fn share_of_views(geometry: &Geometry, points: &[Vec3]) -> Vec<f64> {
 }
 
 /// Looks how many of the views see each part of the volume.
-pub fn coverage(geometry: &Geometry, setup: &Setup) -> Coverage {
+pub(crate) fn volume_coverage(geometry: &Geometry, setup: &Setup) -> VolumeCoverage {
     let needed = if setup.half_is_enough() { 0.5 } else { 1.0 };
     let grid = &geometry.volume;
     let along = |k: usize| {
@@ -64,7 +65,7 @@ pub fn coverage(geometry: &Geometry, setup: &Setup) -> Coverage {
     // Whether just half or one view less is an affair of rounding.
     let views = geometry.views.len().clamp(2, VIEWS) as f64;
     let enough = if needed < 1.0 { needed - 1.01 / views } else { needed };
-    Coverage {
+    VolumeCoverage {
         needed,
         complete: part(&|s| s >= enough),
         unseen: part(&|s| s == 0.0),

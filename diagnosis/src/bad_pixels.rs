@@ -1,7 +1,7 @@
-//! Pixels that do not measure: found in flat and dark fields and as outliers that stay, filled from neighbours.
+//! Pixels that do not measure: found in flat and dark fields, and as outliers that stay.
 
-use crate::border::median;
-use ndarray::{Array2, ArrayView2, ArrayView3, ArrayViewMut2, Axis};
+use crate::quantiles::{median, quantile};
+use ndarray::{Array2, ArrayView2, ArrayView3, Axis};
 
 /// A pixel that answers with less than this share of the median response is dead.
 const DEAD: f32 = 0.1;
@@ -20,11 +20,7 @@ const MOST_VIEWS: usize = 32;
 
 /// Marks pixels that the open beam hardly moves or that are far brighter than the others. `response` is flat − dark
 /// (or whatever stands for it), `dark` the dark field; both `[row, column]`.
-pub(crate) fn from_fields(
-    response: Option<ArrayView2<f32>>,
-    dark: Option<ArrayView2<f32>>,
-    open: f32,
-) -> Vec<[usize; 2]> {
+pub fn from_fields(response: Option<ArrayView2<f32>>, dark: Option<ArrayView2<f32>>, open: f32) -> Vec<[usize; 2]> {
     let middle = |a: ArrayView2<f32>| median(&mut a.iter().copied().collect::<Vec<_>>()).unwrap_or(0.0);
     let typical = response.map_or(open, middle);
     let mut bad = Vec::new();
@@ -43,7 +39,7 @@ pub(crate) fn from_fields(
 
 /// Marks pixels of line integrals `[view, row, column]` that stand out from their neighbours in nearly every view,
 /// as no part of a turning object does. Needs five views; looks at 32 at most. Pixels in `known` are left out.
-pub(crate) fn outliers(projections: ArrayView3<f32>, known: &Array2<bool>) -> Vec<[usize; 2]> {
+pub fn outliers(projections: ArrayView3<f32>, known: &Array2<bool>) -> Vec<[usize; 2]> {
     let (views, rows, columns) = projections.dim();
     if views < LEAST_VIEWS {
         return Vec::new();
@@ -75,64 +71,12 @@ pub(crate) fn outliers(projections: ArrayView3<f32>, known: &Array2<bool>) -> Ve
         let sigma = 1.4826 * median(&mut off.iter().copied().collect::<Vec<_>>()).unwrap_or(0.0);
         let mut sorted: Vec<f32> = view.iter().copied().collect();
         sorted.sort_unstable_by(f32::total_cmp);
-        let at = |share| crate::border::quantile(&sorted, share).unwrap_or(0.0);
+        let at = |share| quantile(&sorted, share).unwrap_or(0.0);
         let least = (DEVIATIONS * sigma).max(SHARE_OF_RANGE * (at(0.99) - at(0.01)));
         times.zip_mut_with(&off, |n, &x| *n += u16::from(x > least));
     }
     let enough = (SHARE_OF_VIEWS * looked.len() as f64).ceil() as u16;
     times.indexed_iter().filter(|((i, j), n)| **n >= enough && !known[[*i, *j]]).map(|((i, j), _)| [i, j]).collect()
-}
-
-/// How the bad pixels of a detector are filled in.
-pub(crate) struct Filling {
-    pixels: Vec<Patch>,
-}
-
-/// One bad pixel and the good ones that it is filled from, with their weights.
-struct Patch {
-    at: [usize; 2],
-    from: Vec<([usize; 2], f32)>,
-}
-
-impl Filling {
-    /// Each bad pixel gets the mean of the good ones in the smallest square around it that has any two, weighted by
-    /// one over their squared distance. `None` where there is no good pixel at all.
-    pub fn new(bad: &Array2<bool>) -> Option<Self> {
-        let (rows, columns) = bad.dim();
-        let good = bad.iter().filter(|b| !**b).count();
-        let mut pixels = Vec::new();
-        for ((i, j), _) in bad.indexed_iter().filter(|(_, b)| **b) {
-            let mut from = Vec::new();
-            for reach in 1..rows.max(columns) {
-                from.clear();
-                for r in i.saturating_sub(reach)..(i + reach + 1).min(rows) {
-                    for c in j.saturating_sub(reach)..(j + reach + 1).min(columns) {
-                        if !bad[[r, c]] {
-                            let squared = (r.abs_diff(i)).pow(2) + (c.abs_diff(j)).pow(2);
-                            from.push(([r, c], 1.0 / squared as f32));
-                        }
-                    }
-                }
-                if from.len() >= good.min(2) {
-                    break;
-                }
-            }
-            let sum: f32 = from.iter().map(|f| f.1).sum();
-            if from.is_empty() {
-                return None;
-            }
-            from.iter_mut().for_each(|f| f.1 /= sum);
-            pixels.push(Patch { at: [i, j], from });
-        }
-        Some(Self { pixels })
-    }
-
-    /// Fills in one view.
-    pub fn fill(&self, mut view: ArrayViewMut2<f32>) {
-        for Patch { at, from } in &self.pixels {
-            view[*at] = from.iter().map(|(p, w)| w * view[*p]).sum();
-        }
-    }
 }
 
 #[cfg(test)]
@@ -163,18 +107,5 @@ mod tests {
         p.slice_mut(ndarray::s![.., 0, 0]).fill(-3.0);
         assert_eq!(outliers(p.view(), &known), [[0, 0], [7, 6]]);
         assert!(outliers(p.slice(ndarray::s![..3, .., ..]), &known).is_empty());
-    }
-
-    #[test]
-    fn neighbours_fill_a_linear_ramp_exactly() {
-        let ramp = Array2::from_shape_fn((9, 9), |(i, j)| 3.0 * i as f32 - 2.0 * j as f32);
-        let mut bad = Array2::from_elem((9, 9), false);
-        (bad[[4, 4]], bad[[0, 0]]) = (true, true);
-        let mut view = ramp.clone();
-        (view[[4, 4]], view[[0, 0]]) = (1e9, f32::NAN);
-        Filling::new(&bad).unwrap().fill(view.view_mut());
-        assert!((view[[4, 4]] - ramp[[4, 4]]).abs() < 1e-5 && (view[[0, 0]] - ramp[[0, 0]]).abs() <= 3.0);
-        bad.fill(true);
-        assert!(Filling::new(&bad).is_none());
     }
 }

@@ -362,7 +362,7 @@ fn draw_bar(
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::testing::data;
+    use crate::testing::{data, folder};
     use ndarray::Array3;
 
     fn ball(shape: [usize; 3], spacing: [f64; 3], blur: f64) -> MiddleSlices {
@@ -376,18 +376,6 @@ mod tests {
             *value = (0.5 * soft(r, 20.0) + 0.4 * soft(off, 5.0)) as f32;
         }
         MiddleSlices::of(&v)
-    }
-
-    /// Where pictures go to be looked at, if CONEFIELD_PICTURES names a folder.
-    fn folder() -> (Option<tempfile::TempDir>, std::path::PathBuf) {
-        match std::env::var_os("CONEFIELD_PICTURES") {
-            Some(p) => (None, p.into()),
-            None => {
-                let dir = tempfile::tempdir().unwrap();
-                let path = dir.path().to_path_buf();
-                (Some(dir), path)
-            }
-        }
     }
 
     #[test]
@@ -442,7 +430,7 @@ mod tests {
     fn a_clinical_volume_is_drawn() {
         let Some(path) = data("clinical/abdomen_ct_hu.nii.gz") else { return };
         let (_dir, folder) = folder();
-        let v = crate::read_volume(path).unwrap();
+        let v = conefield_io::read_volume(path).unwrap();
         let noisy = MiddleSlices::of(&v.clone().mapped(|x| x * 0.95 + 20.0));
         let v = MiddleSlices::of(&v);
         slices_png(folder.join("abdomen.png"), &[("CT (HU)", &v), ("changed", &noisy)], [-200.0, 300.0], Some(0))
