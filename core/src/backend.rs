@@ -1,7 +1,6 @@
 //! A backend compiles a pipeline and does its work: training steps, evaluation at points, rendering of rays.
 
 use crate::error::Result;
-use crate::occupancy::Occupancy;
 use crate::pipeline::{Model, Pipeline};
 use crate::stage::UnitRay;
 use crate::voxel::{VoxelProjector, VoxelView};
@@ -73,8 +72,6 @@ pub struct Work<'a> {
     pub points: &'a [([f32; 3], f32)],
     /// Blocks for the total-variation prior.
     pub tv: Option<&'a TvBlocks>,
-    /// Where rays take samples, if not everywhere.
-    pub occupancy: Option<&'a Occupancy>,
 }
 
 /// What a step found.

@@ -2,7 +2,7 @@
 //!
 //! - [`geometry`], [`scan`], [`parts`]: what was measured, in millimetres, and what comes out.
 //! - [`simd`], [`half`], [`dense`], [`trilinear`], [`stage`]: what a stage computes and how.
-//! - [`support`]: where the object can be; [`occupancy`]: where a field is known to be empty.
+//! - [`support`]: where the object can be.
 //! - [`wgsl`]: the same for a GPU.
 //! - [`arena`]: parameters, gradients and optimizer state under their names.
 //! - [`files`]: opening what a user or a description names.
@@ -20,7 +20,6 @@ pub mod files;
 pub mod geometry;
 pub mod half;
 pub mod host;
-pub mod occupancy;
 pub mod pages;
 pub mod parts;
 pub mod pipeline;

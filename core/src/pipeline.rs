@@ -4,7 +4,7 @@ use crate::arena::{Arena, Block, Layout};
 use crate::backend::{Backend, Executable};
 use crate::error::{Result, ensure};
 use crate::scene::Scene;
-use crate::spec::{OccupancyRule, Spec, Tables};
+use crate::spec::{Spec, Tables};
 use crate::stage::{Encoder, Field, Info, Lengths, Normalizer, Probe, Projector, Scope, Stage};
 use serde::{Deserialize, Serialize};
 use std::ops::Range;
@@ -71,11 +71,6 @@ impl Pipeline {
         let projector = spec.projector.as_ref().ok_or_else(|| need("projector"))?.build()?;
         let mut pipeline = Self::assemble(encoder, normalizers, field, projector);
         pipeline.tables = spec.precision.tables;
-        let occupancy = &spec.scene.occupancy;
-        occupancy.validate()?;
-        // What such a stage makes of a sample depends on those that would be left out.
-        let apart = *occupancy == OccupancyRule::Fixed || pipeline.scope() == Scope::Row;
-        ensure(apart, "spec", "scene.occupancy", "refined", "\"fixed\", as a stage looks along rays")?;
         // Of any scene: whether the encoder knows what the projector counts in.
         pipeline.projector.fitted(pipeline.lengths(1.0, 1.0))?;
         Ok(pipeline)

@@ -142,8 +142,6 @@ pub struct Scene {
     pub attenuation: AttenuationScale,
     /// Where in the volume the object can be.
     pub support: SupportRule,
-    /// Whether training takes samples in all of the support.
-    pub occupancy: OccupancyRule,
     /// Which of the encoder's channels are computed.
     pub levels: LevelRule,
     /// What lies beyond the volume. Of all solvers.
@@ -153,9 +151,8 @@ pub struct Scene {
 
 impl Default for Scene {
     fn default() -> Self {
-        let (support, occupancy, levels) = (SupportRule::Box, OccupancyRule::Fixed, LevelRule::All);
-        let surround = SurroundRule::None;
-        Self { fill: 1.0, attenuation: AttenuationScale::Scan, support, occupancy, levels, surround }
+        let (support, levels, surround) = (SupportRule::Box, LevelRule::All, SurroundRule::None);
+        Self { fill: 1.0, attenuation: AttenuationScale::Scan, support, levels, surround }
     }
 }
 
@@ -202,48 +199,6 @@ impl SurroundRule {
         ensure(margin > 0.0 && margin <= 4.0, "spec", &key("margin"), margin, "a number above 0 and at most 4")?;
         ensure((4..=256).contains(&cells), "spec", &key("cells"), cells, "4 to 256")?;
         ensure((1..=1000).contains(&passes), "spec", &key("passes"), passes, "1 to 1000")
-    }
-}
-
-/// Whether training takes samples in all of the support.
-#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize, JsonSchema)]
-#[serde(rename_all = "kebab-case")]
-pub enum OccupancyRule {
-    /// In all of it.
-    Fixed,
-    /// In cells where the field has been empty for a while only now and then: it counts as 0 there.
-    Refined(Refined),
-}
-
-/// When a cell counts as empty. The volume is cut into 64 cells along its longest side.
-#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize, JsonSchema)]
-#[serde(deny_unknown_fields, default)]
-pub struct Refined {
-    /// Steps before the first cell may be empty, and after a run went back to an earlier state.
-    pub after: u64,
-    /// Steps from one look at the field to the next.
-    pub every: u64,
-    /// Share of the attenuation that stages see as 1 below which a cell and its neighbours must have been.
-    pub below: f64,
-    /// One ray in so many takes its samples in empty cells as well.
-    pub probe: u32,
-}
-
-impl Default for Refined {
-    fn default() -> Self {
-        Self { after: 256, every: 16, below: 0.01, probe: 16 }
-    }
-}
-
-impl OccupancyRule {
-    /// Refuses settings that mean nothing.
-    pub fn validate(&self) -> Result<()> {
-        let Self::Refined(Refined { after, every, below, probe }) = *self else { return Ok(()) };
-        let key = |name: &str| format!("scene.occupancy.refined.{name}");
-        ensure(after > 0, "spec", &key("after"), after, "at least 1")?;
-        ensure(every > 0, "spec", &key("every"), every, "at least 1")?;
-        ensure(below > 0.0 && below < 1.0, "spec", &key("below"), below, "a number above 0 and below 1")?;
-        ensure(probe > 0, "spec", &key("probe"), probe, "at least 1")
     }
 }
 
