@@ -52,7 +52,7 @@ impl Training {
                 self.exe.profile();
             }
             let start = Instant::now();
-            let work = Work { step, seed: 0, loss: Loss::L1, rays: &rays, points: &[], tv: None, occupancy: None };
+            let work = Work { step, seed: 0, loss: Loss::L1, rays: &rays, points: &[], tv: None };
             self.exe.step(&mut self.model, &work)?;
             self.exe.update(&mut self.model, &Adam { lr: 1e-3, beta1: 0.9, beta2: 0.999, eps: 1e-8, step })?;
             if step > warm_up {

@@ -82,10 +82,7 @@ impl Runner {
     /// Seconds of one step.
     fn step(&mut self, rays: &[TrainRay], step: u64) -> Result<f64, Box<dyn Error>> {
         let start = Instant::now();
-        self.exe.step(
-            &mut self.model,
-            &Work { step, seed: 0, loss: Loss::L1, rays, points: &[], tv: None, occupancy: None },
-        )?;
+        self.exe.step(&mut self.model, &Work { step, seed: 0, loss: Loss::L1, rays, points: &[], tv: None })?;
         self.exe.update(&mut self.model, &Adam { lr: 1e-3, beta1: 0.9, beta2: 0.999, eps: 1e-8, step })?;
         Ok(start.elapsed().as_secs_f64())
     }

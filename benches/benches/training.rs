@@ -38,7 +38,7 @@ fn main() -> Result<(), Box<dyn Error>> {
     let (mut total, mut dense, mut scatter, mut adam) = (vec![], vec![], vec![], vec![]);
     for step in 1..=STEPS {
         let start = Instant::now();
-        let work = Work { step, seed: 0, loss: Loss::L1, rays: &rays, points: &[], tv: None, occupancy: None };
+        let work = Work { step, seed: 0, loss: Loss::L1, rays: &rays, points: &[], tv: None };
         let stats = exe.step(&mut model, &work)?;
         let updating = Instant::now();
         exe.update(&mut model, &Adam { lr: 1e-3, beta1: 0.9, beta2: 0.999, eps: 1e-8, step })?;

@@ -68,9 +68,6 @@ fn a_scan_adds_its_memory() {
     assert!(said.contains("ends after 3 records of 50 steps"), "{said}");
     let all = done(&["explain", "naf", "--scan", &scan]);
     assert!(all.contains("this scan: 4 views of 8 x 12, volume 16 x 16 x 16, 320 samples"), "{all}");
-    assert!(!all.contains("occupancy:"), "{all}");
-    let all = done(&["explain", "naf", "--scan", &scan, "--set", "scene.occupancy.refined.every=8"]);
-    assert!(all.contains("occupancy: from step 256 on looked for every 8 steps in 16 x 16 x 16 cells"), "{all}");
 }
 
 #[test]

@@ -1,11 +1,11 @@
 //! What a scan has need of: where its object can be, how fine its data are, how far apart samples stand.
 
-use crate::support::{carve, cells};
+use crate::support::carve;
 use conefield_core::error::Result;
 use conefield_core::pipeline::Pipeline;
 use conefield_core::scan::Scan;
 use conefield_core::scene::Scene;
-use conefield_core::spec::{self, LevelRule, OccupancyRule, Refined, SupportRule};
+use conefield_core::spec::{self, LevelRule, SupportRule};
 use conefield_core::support::Support;
 
 /// A scene, and what of a pipeline it has need of.
@@ -37,9 +37,6 @@ pub fn fit(scan: &Scan, settings: &spec::Scene, pipeline: &mut Pipeline) -> Resu
     if let Some(support) = support {
         scene = scene.within(support, settings);
     }
-    if let OccupancyRule::Refined(refined) = settings.occupancy {
-        found.push(format!("occupancy: {}", occupancy(&scene, refined)));
-    }
     pipeline.fit(&scene)?;
     let mut needed = None;
     if settings.levels == LevelRule::Needed {
@@ -48,15 +45,6 @@ pub fn fit(scan: &Scan, settings: &spec::Scene, pipeline: &mut Pipeline) -> Resu
         found.push(format!("levels: {}", levels(pipeline, needed.as_deref(), cells)?));
     }
     Ok(Fitted { scene, needed, found })
-}
-
-/// How the support is refined while the field trains.
-fn occupancy(scene: &Scene, Refined { after, every, below, probe }: Refined) -> String {
-    let [x, y, z] = cells(&scene.grid).shape;
-    format!(
-        "from step {after} on looked for every {every} steps in {x} x {y} x {z} cells; those below {below} of the \
-         attenuation scale are sampled by one ray in {probe}"
-    )
 }
 
 /// Which of the encoder's channels are needed to tell `cells` apart.

@@ -10,7 +10,6 @@ use crate::iterative::start_volume;
 use crate::patience::{Patience, Waited};
 use crate::pretrain::learn;
 use crate::rays::{Pixels, RaySource, Views};
-use crate::refine::{Refinement, Since};
 use crate::schedule::{Clock, Decay, Ends};
 use crate::surround::Within;
 use crate::watched;
@@ -248,9 +247,7 @@ impl Solver for Gradient {
         let steps = [self.steps, by_epochs].into_iter().flatten().min();
         let watcher = |d| DriftWatch::new(d, &scene, job.seed, steps_an_epoch, job.resume, &model);
         let mut drift = self.drift.as_ref().map(watcher).transpose()?;
-        let Start { standing, kept: Kept { mut window, since, .. } } = start;
-        let rule = &job.spec.scene.occupancy;
-        let mut refinement = Refinement::new(rule, &scene, job.seed, since.unwrap_or_default(), job.resume)?;
+        let Start { standing, kept: Kept { mut window, .. } } = start;
         let mut clock = Clock::new(Ends { steps, seconds: self.seconds }, job.limits, standing.seconds);
         let mut rays = Vec::with_capacity(self.rays);
         let mut tv = TvBlocks::default();
@@ -269,7 +266,6 @@ impl Solver for Gradient {
                     "window": window,
                     "guard": guard.watched(),
                     "patience": patience.waited(),
-                    "since": refinement.as_ref().map(Refinement::since),
                 });
                 let masks = model.masks().to_vec();
                 // The record of this step, if one is due, comes after the checkpoint.
@@ -282,7 +278,6 @@ impl Solver for Gradient {
                     tensors.extend(drift.iter().flat_map(|d| d.tensors(&model)));
                     tensors.extend(guard.tensors(model.pipeline.layout()));
                     tensors.extend(patience.tensors(model.pipeline.layout()));
-                    tensors.extend(refinement.iter().map(Refinement::tensor));
                     observer.checkpoint(&Checkpoint { tensors, standing })?;
                 }
                 clock.resume();
@@ -318,28 +313,19 @@ impl Solver for Gradient {
             let epoch = step as f64 / steps_an_epoch;
             window.events.extend(model.refresh(&scene, epoch, job.backend, &mut exe)?);
             patience.renew(&model);
-            if let Some(refinement) = &mut refinement
-                && let Some(said) = refinement.look(step, &model, exe.as_mut())?
-            {
-                window.tell(said, observer);
-            }
             source.draw(job.seed, step, self.rays, &mut rays);
             let tv = self.tv.as_ref().map(|prior| {
                 blocks(prior, &scene, job.seed, step, &mut tv);
                 &tv
             });
-            let occupancy = refinement.as_ref().and_then(Refinement::occupancy);
-            let work = Work { step, seed: job.seed, loss: self.loss.into(), rays: &rays, points: &[], tv, occupancy };
+            let work = Work { step, seed: job.seed, loss: self.loss.into(), rays: &rays, points: &[], tv };
             let start = Instant::now();
             let stats = exe.step(&mut model, &work)?;
             let back = guard.judge(&work, &stats, &mut model, exe.as_mut())?;
             step += 1;
             samples += stats.samples;
             match back {
-                Some(said) => {
-                    window.tell(said, observer);
-                    refinement.iter_mut().for_each(|r| r.forget(step));
-                }
+                Some(said) => window.tell(said, observer),
                 None => {
                     exe.update(&mut model, &guard.next(self.adam(step, epoch, share)))?;
                     window.add(stats.loss, stats.prior, stats.samples, start.elapsed().as_secs_f64());
@@ -444,8 +430,6 @@ struct Kept {
     window: Window,
     guard: Watched,
     patience: Waited,
-    #[serde(default)]
-    since: Option<Since>,
 }
 
 /// Sums since the last record.

@@ -2,8 +2,8 @@
 //!
 //! - [`gradient`] trains an attenuation field by stochastic gradients; [`pretrain`] trains one on a known volume, for
 //!   weights that other scans reuse.
-//! - [`fit`] finds out what a scan has need of, [`support`] where its object can be, [`refine`] where the field that is
-//!   trained has nothing in it, [`surround`] what lies beyond the volume.
+//! - [`fit`] finds out what a scan has need of, [`support`] where its object can be, [`surround`] what lies beyond the
+//!   volume.
 //! - [`drift`] measures how much of a field changes while it trains.
 //! - [`guard`] takes a run that goes astray back, [`patience`] ends one that no longer gets better.
 //! - [`fdk`] filters and back-projects.
@@ -19,7 +19,6 @@ pub mod iterative;
 pub mod patience;
 pub mod pretrain;
 pub mod rays;
-pub mod refine;
 pub mod schedule;
 pub mod sequence;
 mod shadow;

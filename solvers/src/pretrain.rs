@@ -83,7 +83,7 @@ pub fn pretrain(settings: &Gradient, job: &PretrainJob<'_>, observer: &mut dyn O
 
 /// Gradients of the L1 loss at known points; returns the loss.
 fn fit(exe: &mut dyn Executable, model: &mut Model, points: &[([f32; 3], f32)], step: u64, seed: u64) -> Result<f64> {
-    let work = Work { step, seed, loss: Loss::L1, rays: &[], points, tv: None, occupancy: None };
+    let work = Work { step, seed, loss: Loss::L1, rays: &[], points, tv: None };
     let stats = exe.step(model, &work)?;
     if !stats.loss.is_finite() {
         return Err(Error::Diverged { step, what: format!("the loss is {}", stats.loss) });

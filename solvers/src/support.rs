@@ -203,7 +203,7 @@ fn air(blocks: &[Array2<f32>], deviation: f32, top: f32) -> Option<f32> {
 }
 
 /// Cells of about the same side along every axis that fill the volume.
-pub(crate) fn cells(volume: &VoxelGrid) -> VoxelGrid {
+fn cells(volume: &VoxelGrid) -> VoxelGrid {
     let size = volume.size();
     let side = size.into_iter().fold(0.0, f64::max) / CELLS;
     let shape: [usize; 3] =
@@ -218,7 +218,7 @@ fn corners(grid: &VoxelGrid) -> [Vec3; 8] {
 }
 
 /// Cells and all their neighbours.
-pub(crate) fn widened(cells: &[bool], [nx, ny, nz]: [usize; 3]) -> Vec<bool> {
+fn widened(cells: &[bool], [nx, ny, nz]: [usize; 3]) -> Vec<bool> {
     let near = |i: usize, n: usize| i.saturating_sub(1)..(i + 2).min(n);
     (0..cells.len())
         .into_par_iter()

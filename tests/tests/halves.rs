@@ -88,7 +88,7 @@ fn bits(values: &[f32]) -> Vec<u32> {
 #[test]
 fn gradients_of_a_step_are_off_by_the_rounding_of_tables() {
     let (rays, devices) = (rays(), device::backends("steps in halves"));
-    let work = Work { step: 4, seed: 9, loss: Loss::L2, rays: &rays, points: &[], tv: None, occupancy: None };
+    let work = Work { step: 4, seed: 9, loss: Loss::L2, rays: &rays, points: &[], tv: None };
     for (tables, limit) in FORMATS {
         for (name, settings) in several(tables) {
             let pipeline = built(&settings);
@@ -207,7 +207,7 @@ fn the_copy_follows_updates_and_what_else_changes_the_masters() {
         let fresh = |model: &Model| Cpu::new().compile(&model.pipeline).unwrap().0.encode(model, &at).unwrap();
         let mut last = fresh(&model);
         for step in 1..=3 {
-            let work = Work { step, seed: 9, loss: Loss::L2, rays: &rays, points: &[], tv: None, occupancy: None };
+            let work = Work { step, seed: 9, loss: Loss::L2, rays: &rays, points: &[], tv: None };
             exe.step(&mut model, &work).unwrap();
             exe.update(&mut model, &Adam { lr: 1e-2, beta1: 0.9, beta2: 0.999, eps: 1e-8, step }).unwrap();
             let found = exe.encode(&model, &at).unwrap();

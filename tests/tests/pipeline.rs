@@ -114,7 +114,7 @@ fn gradients_of(settings: &Value, count: usize, edge: usize) {
         .collect();
     for loss in [Loss::L2, Loss::Huber { delta: 0.5 }] {
         let kernels = Kernels::new(&pipeline, |s| s.reference()).unwrap();
-        let work = Work { step: 4, seed: 9, loss, rays: &rays, points: &points, tv: Some(&tv), occupancy: None };
+        let work = Work { step: 4, seed: 9, loss, rays: &rays, points: &points, tv: Some(&tv) };
         let case = Case { pipeline: &pipeline, kernels, work };
         let (value, grads) = case.step(&params);
         assert!(value.is_finite() && grads.iter().filter(|g| **g != 0.0).count() > grads.len() / 2);

@@ -254,9 +254,6 @@ impl<R: Real> Slot<R> {
                     let before = self.samples.points.len();
                     let seed = mix(mix(work.seed, work.step), i as u64);
                     projector.sample(&work.rays[i].ray, Some(seed), &mut self.samples);
-                    if let Some(occupancy) = work.occupancy {
-                        occupancy.thin(seed, &mut self.samples, before);
-                    }
                     self.counts.push(self.samples.points.len() - before);
                 }
             }

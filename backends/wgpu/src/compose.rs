@@ -9,7 +9,6 @@
 use crate::device::Atomics;
 use crate::source::{Access, Source};
 use conefield_core::error::{Error, Result};
-use conefield_core::occupancy::PROBE;
 use conefield_core::pipeline::Pipeline;
 use conefield_core::precision::Tables;
 use conefield_core::stage::{GradKind, Info, Projector, Scope, Stage, titled};
@@ -593,8 +592,8 @@ fn outer(prefix: &str, m: usize, k: usize) -> String {
     )
 }
 
-/// Samples of rays; where cells are known to be empty, of those that are not.
-pub fn sample(projector: &dyn Projector, occupancy: bool) -> Result<Source> {
+/// Samples of rays.
+pub fn sample(projector: &dyn Projector) -> Result<Source> {
     let name = titled("projector", &projector.describe());
     let fragment = fragment_of(&name, projector.wgsl())?;
     let mut source = Source::default();
@@ -604,16 +603,6 @@ pub fn sample(projector: &dyn Projector, occupancy: bool) -> Result<Source> {
     source.bind("samples", Access::Write, "array<vec4<f32>>");
     source.add("random numbers", RANDOM);
     source.add(&name, &fragment.named("projector_"));
-    if occupancy {
-        source.bind("cells", Access::Uniform, "Cells");
-        source.bind("occupied", Access::Read, "array<u32>");
-        source.bind("left_out", Access::Write, "array<atomic<u32>>");
-        let (low, high) = (PROBE as u32, (PROBE >> 32) as u32);
-        source.add("probes", &format!("const PROBE = vec2<u32>({low}u, {high}u);"));
-        source.add("occupancy", include_str!("kernels/occupancy.wgsl"));
-    } else {
-        source.add("occupancy", "fn taken(ray: Ray, sample: vec4<f32>) -> vec4<f32> { return sample; }");
-    }
     source.add("sample", include_str!("kernels/sample.wgsl"));
     Ok(source)
 }

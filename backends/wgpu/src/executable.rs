@@ -10,7 +10,6 @@ use crate::wave::{self, GpuRay, MOST_GROUPS, Wave};
 use crate::{Gpu, Shared};
 use conefield_core::backend::{Adam, Executable, Loss, StepStats, TvBlocks, Work};
 use conefield_core::error::Result;
-use conefield_core::occupancy::Occupancy;
 use conefield_core::pipeline::Model;
 use conefield_core::stage::{Projector, UnitRay};
 use std::collections::HashMap;
@@ -49,18 +48,6 @@ pub(crate) struct Step {
     pub pad: [u32; 3],
 }
 
-/// `Cells` in `kernels/occupancy.wgsl`.
-#[repr(C)]
-#[derive(Debug, Clone, Copy, bytemuck::Pod, bytemuck::Zeroable)]
-struct Cells {
-    low: [f32; 3],
-    probe: u32,
-    per_side: [f32; 3],
-    pad: u32,
-    shape: [u32; 3],
-    pad2: u32,
-}
-
 /// `Rule` in `kernels/adam.wgsl`.
 #[repr(C)]
 #[derive(Debug, Clone, Copy, bytemuck::Pod, bytemuck::Zeroable)]
@@ -84,8 +71,7 @@ impl Kernels {
     /// Composes every kernel and refuses what is no valid WGSL or needs more than the device has.
     pub fn new(shared: &Shared, chain: &Chain, projector: &dyn Projector) -> Result<Self> {
         let mut sources = HashMap::from([
-            ("sample", compose::sample(projector, false)?),
-            (OCCUPIED, compose::sample(projector, true)?),
+            ("sample", compose::sample(projector)?),
             ("blocks", compose::blocks()),
             ("forward", chain.forward(true)),
             ("evaluate", chain.forward(false)),
@@ -331,17 +317,6 @@ impl Wgpu {
         self.write("rays", bytemuck::cast_slice(&wave.rays))
     }
 
-    /// Writes where samples are taken, and that none is left out so far.
-    fn occupy(&mut self, occupancy: &Occupancy) -> Result<()> {
-        let Occupancy { low, per_side, shape, ref bits, probe } = *occupancy;
-        self.reserve("cells", size_of::<Cells>() as u64, U::UNIFORM | U::COPY_DST)?;
-        self.reserve("occupied", 4 * bits.len().max(1) as u64, U::STORAGE | U::COPY_DST)?;
-        self.reserve("left_out", 4, U::STORAGE | U::COPY_DST | U::COPY_SRC)?;
-        self.write("cells", bytemuck::bytes_of(&Cells { low, probe, per_side, pad: 0, shape, pad2: 0 }))?;
-        self.write("occupied", bytemuck::cast_slice(bits))?;
-        self.write("left_out", &[0; 4])
-    }
-
     /// The kernels of one wave of a step.
     fn learn(&mut self, wave: &Wave, work: &Work<'_>, sums: u64) -> Result<()> {
         self.place(wave)?;
@@ -385,7 +360,7 @@ impl Wgpu {
         self.launch(
             &mut encoder,
             &[
-                (if work.occupancy.is_some() { OCCUPIED } else { "sample" }, groups(wave.ray_rows as usize)),
+                ("sample", groups(wave.ray_rows as usize)),
                 ("blocks", groups(block_rows)),
                 ("forward", groups(wave.rows as usize)),
                 ("loss of rays", wave.rays.len()),
@@ -415,9 +390,6 @@ fn penalty(loss: Loss) -> Step {
     Step { loss, delta, ..Step::default() }
 }
 
-/// The kernel that samples rays where cells are known to be empty.
-const OCCUPIED: &str = "sample where occupied";
-
 /// The number of the penalty that is the difference itself.
 const LINE: u32 = 3;
 
@@ -438,9 +410,7 @@ impl Executable for Wgpu {
         self.clean = false;
         let waves = wave::of_step(model.pipeline.projector.as_ref(), work, self.pace.size());
         let losses: usize = waves.iter().map(Wave::losses).sum();
-        // After the losses, how many samples were left out.
-        self.reserve("staging", 4 * losses as u64 + 4, U::MAP_READ | U::COPY_DST)?;
-        work.occupancy.map_or(Ok(()), |o| self.occupy(o))?;
+        self.reserve("staging", 4 * losses.max(1) as u64, U::MAP_READ | U::COPY_DST)?;
         let mut at = 0;
         for wave in &waves {
             self.learn(wave, work, at)?;
@@ -452,20 +422,11 @@ impl Executable for Wgpu {
             self.launch(&mut encoder, &[("merge", self.chain.dense.div_ceil(GROUP as usize))])?;
             self.gpu().queue.submit([encoder.finish()]);
         }
-        let mut found = at;
-        if work.occupancy.is_some() {
-            let mut encoder = self.encoder();
-            self.copy(&mut encoder, "left_out", 4, at)?;
-            self.gpu().queue.submit([encoder.finish()]);
-            found += 4;
-        }
         let mut stats = StepStats { samples: waves.iter().map(|w| u64::from(w.rows)).sum(), ..StepStats::default() };
         let [ray_scale, point_scale] = [work.rays.len(), work.points.len()].map(|n| 1.0 / n.max(1) as f64);
         let tv_scale = work.tv.map_or(0.0, tv_scale);
-        self.read(found, |bytes| {
-            let (losses, left_out) = bytes.split_at(4 * losses);
-            stats.samples -= bytemuck::cast_slice::<u8, u32>(left_out).iter().map(|&n| u64::from(n)).sum::<u64>();
-            let mut sums = bytemuck::cast_slice::<u8, f32>(losses).iter().map(|&l| f64::from(l));
+        self.read(at, |bytes| {
+            let mut sums = bytemuck::cast_slice::<u8, f32>(bytes).iter().map(|&l| f64::from(l));
             let mut next = |n: usize| sums.by_ref().take(n).sum::<f64>();
             for wave in &waves {
                 let (rays, points, blocks) =

@@ -77,7 +77,7 @@ impl Shared {
     pub fn samples(&self, projector: &dyn Projector, rays: &[(UnitRay, Option<u64>)]) -> Result<Vec<Samples>> {
         let gpu = &self.gpu;
         let mut all = vec![];
-        let source = compose::sample(projector, false)?;
+        let source = compose::sample(projector)?;
         for (ray, seed) in rays {
             let count = projector.max_samples(ray);
             let mut buffers = Buffers::default();

@@ -151,7 +151,7 @@ mod tests {
         let tv = TvBlocks { corners: vec![[0.0; 3]; 11], edge: 4, ..TvBlocks::default() };
         for most in [64, 100, 333, 100_000] {
             for tv in [None, Some(&tv)] {
-                let work = Work { step: 1, seed: 2, loss: Loss::L1, rays: &rays, points: &points, tv, occupancy: None };
+                let work = Work { step: 1, seed: 2, loss: Loss::L1, rays: &rays, points: &points, tv };
                 let waves = of_step(&Fixed(10), &work, most);
                 assert!(waves.iter().all(|w| w.rows <= most && w.rows > 0), "{most}");
                 assert_eq!(waves.iter().map(|w| w.rays.len()).sum::<usize>(), 37);
@@ -170,7 +170,7 @@ mod tests {
     fn what_is_larger_than_a_wave_gets_one_of_its_own() {
         let rays = vec![TrainRay { ray: ray(), target: 0.5 }; 3];
         let tv = TvBlocks { corners: vec![[0.0; 3]; 2], edge: 8, ..TvBlocks::default() };
-        let work = Work { step: 1, seed: 2, loss: Loss::L1, rays: &rays, points: &[], tv: Some(&tv), occupancy: None };
+        let work = Work { step: 1, seed: 2, loss: Loss::L1, rays: &rays, points: &[], tv: Some(&tv) };
         let rows: Vec<_> = of_step(&Fixed(100), &work, 64).iter().map(|w| w.rows).collect();
         assert_eq!(rows, [100, 100, 100, 512, 512]);
     }

@@ -69,24 +69,6 @@ pub fn cases() -> Vec<Case> {
             &["solver.drift.points", "1 to 65536"],
         ),
         refused(
-            "an occupancy by another name",
-            toml("extends = \"naf\"\n[scene]\noccupancy = \"refind\"\n"),
-            TOML,
-            &["spec.toml:3:13", "scene.occupancy"],
-        ),
-        refused(
-            "cells that are looked at never",
-            toml("extends = \"naf\"\n[scene]\noccupancy = { refined = { every = 0 } }\n"),
-            TOML,
-            &["scene.occupancy.refined.every", "at least 1"],
-        ),
-        refused(
-            "cells that are empty below -1",
-            toml("extends = \"naf\"\n[scene]\noccupancy = { refined = { below = -1.0 } }\n"),
-            TOML,
-            &["scene.occupancy.refined.below", "-1"],
-        ),
-        refused(
             "a surround by another name",
             toml("extends = \"naf\"\n[scene]\nsurround = \"coarsely\"\n"),
             TOML,

@@ -112,18 +112,6 @@ fn as_built_in() {
     assert!(volume.data == built_in.data, "the volumes differ");
 }
 
-/// Samples cannot be left out where a stage looks along rays: what it makes of the others depends on them.
-#[test]
-fn a_stage_that_looks_along_rays_wants_all_samples() {
-    let spec = |more: &str| {
-        let text = format!("{SPEC}\n[scene]\n{more}");
-        Pipeline::build(&conefield_core::spec::load::parse(&text, "plugins.toml", &[], &[]).unwrap().spec)
-    };
-    let e = spec("occupancy = { refined = {} }").err().unwrap().to_string();
-    assert!(e.contains("scene.occupancy") && e.contains("along rays"), "{e}");
-    assert!(spec("occupancy = \"fixed\"").is_ok());
-}
-
 #[test]
 fn killed_and_resumed() {
     let place = place();
@@ -260,7 +248,7 @@ fn points_off_any_ray_stand_alone() {
     let known: Vec<([f32; 3], f32)> = points.iter().map(|p| (*p, 0.3)).collect();
     let corners = points[..40].iter().map(|p| p.map(|x| 0.8 * x)).collect();
     let tv = TvBlocks { corners, spacing: [0.02; 3], edge: 4, weight: 0.1, smoothing: 1e-3 };
-    let work = Work { step: 1, seed: 2, loss: Loss::L2, rays: &[], points: &known, tv: Some(&tv), occupancy: None };
+    let work = Work { step: 1, seed: 2, loss: Loss::L2, rays: &[], points: &known, tv: Some(&tv) };
     let stats = exe.step(&mut plain, &work).unwrap();
     let found = smoothed_exe.step(&mut smoothed, &work).unwrap();
     assert_eq!((stats.loss.to_bits(), stats.prior.to_bits()), (found.loss.to_bits(), found.prior.to_bits()));

@@ -204,7 +204,7 @@ fn step(rays: usize, samples: usize, tables: Tables) -> [f64; 2] {
     let moved = |(i, p): (usize, &f32)| p + 0.4 * (unit(mix(5, i as u64)) - 0.5);
     let params: Vec<f32> = start.iter().enumerate().map(moved).collect();
     let exact: Vec<f64> = params.iter().map(|p| f64::from(*p)).collect();
-    let work = Work { step: 4, seed: 9, loss: Loss::L2, rays: &rays, points: &[], tv: None, occupancy: None };
+    let work = Work { step: 4, seed: 9, loss: Loss::L2, rays: &rays, points: &[], tv: None };
     let copy = Rounded::new(tables, &params);
     let single = Kernels::reading(&pipeline, copy.as_ref()).unwrap();
     let double = Kernels::new(&pipeline, |s| s.reference()).unwrap();

@@ -113,7 +113,7 @@ fn steps(bias: f32) -> f64 {
     model.arena.params[last] = bias;
     let (mut exe, _) = Cpu::new().compile(&model.pipeline).unwrap();
     let points: Vec<_> = (0..20_000).map(|i| ([0.3, 0.4, i as f32 / 2e4], 0.5)).collect();
-    let work = Work { step: 0, seed: 1, loss: Loss::L1, rays: &[], points: &points, tv: None, occupancy: None };
+    let work = Work { step: 0, seed: 1, loss: Loss::L1, rays: &[], points: &points, tv: None };
     let mut best = f64::INFINITY;
     for _ in 0..30 {
         let begun = Instant::now();
