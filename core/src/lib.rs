@@ -2,6 +2,7 @@
 //!
 //! - [`geometry`], [`orbit`], [`scan`], [`parts`]: what was measured, in millimetres, and what comes out.
 //! - [`simd`], [`half`], [`dense`], [`trilinear`], [`stage`]: what a stage computes and how.
+//! - [`by_row`]: stages that are written for one row at a time.
 //! - [`support`]: where the object can be; [`scene`]: between the world and what stages see.
 //! - [`wgsl`]: the same for a GPU.
 //! - [`arena`]: parameters, gradients and optimizer state under their names.
@@ -13,6 +14,7 @@
 
 pub mod arena;
 pub mod backend;
+pub mod by_row;
 pub mod checkpoint;
 pub mod dense;
 pub mod error;

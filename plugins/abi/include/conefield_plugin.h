@@ -1,4 +1,4 @@
-/* The contract between conefield and its plugins, version 1.0. Made from plugins/abi/src/lib.rs. */
+/* The contract between conefield and its plugins, version 2.0. Made from plugins/abi/src/lib.rs. */
 
 #ifndef CONEFIELD_PLUGIN_H
 #define CONEFIELD_PLUGIN_H
@@ -9,12 +9,12 @@
 /*
  Major version of this contract. A plugin of another one is refused.
  */
-#define CONEFIELD_ABI_MAJOR 1
+#define CONEFIELD_ABI_MAJOR 2
 
 /*
  Minor version: tables have grown so many times.
  */
-#define CONEFIELD_ABI_MINOR 1
+#define CONEFIELD_ABI_MINOR 0
 
 /*
  Points to features.
@@ -65,6 +65,16 @@
  Many parameters, few touched by a row: workers own the ranges of `partition`. Such a stage keeps no tape.
  */
 #define CONEFIELD_GRADS_SCATTER 2
+
+/*
+ Parameters are IEEE 754 `binary16`.
+ */
+#define CONEFIELD_F16 0
+
+/*
+ Parameters are `bfloat16`: the upper halves of floats.
+ */
+#define CONEFIELD_BF16 1
 
 /*
  `reduce` leaves out channels that come out.
@@ -165,6 +175,10 @@ typedef struct ConefieldInfo {
    1 if it has kernels in double precision.
    */
   uint32_t double_precision;
+  /*
+   1 if it has kernels that read parameters in halves.
+   */
+  uint32_t halves;
 } ConefieldInfo;
 
 /*
@@ -485,12 +499,12 @@ typedef struct ConefieldMap {
   ConefieldStatus (*wgsl)(const void *stage, struct ConefieldText *source);
   /*
    How many passes `forward` goes in, each over a table of its own; always the same for one stage. A host with many
-   tiles sends all of them through one pass before the next, while its table is in the cache. NULL: one. Since 1.1.
+   tiles sends all of them through one pass before the next, while its table is in the cache. NULL: one.
    */
   size_t (*passes)(const void *stage);
   /*
    Pass `pass` of `forward`, counted from 0; all in order leave the same bits as `forward`. What other passes write
-   stays. NULL where `passes` is. Since 1.1.
+   stays. NULL where `passes` is.
    */
   ConefieldStatus (*forward_pass)(const void *stage,
                                   size_t pass,
@@ -499,6 +513,49 @@ typedef struct ConefieldMap {
                                   struct ConefieldTileMut y,
                                   struct ConefieldTileMut tape,
                                   struct ConefieldText *error);
+  /*
+   `forward` on parameters of 16 bits in `format`, one of [`CONEFIELD_F16`] and [`CONEFIELD_BF16`]: what `forward` makes
+   of the same values. A host asks for it where a spec has tables in halves. NULL if there is none.
+   */
+  ConefieldStatus (*forward_halves)(const void *stage,
+                                    uint32_t format,
+                                    const uint16_t *params,
+                                    struct ConefieldTile x,
+                                    struct ConefieldTileMut y,
+                                    struct ConefieldTileMut tape,
+                                    struct ConefieldText *error);
+  /*
+   `forward_pass` on parameters of 16 bits, as `forward_halves`. NULL where `forward_pass` or `forward_halves` is.
+   */
+  ConefieldStatus (*forward_pass_halves)(const void *stage,
+                                         uint32_t format,
+                                         size_t pass,
+                                         const uint16_t *params,
+                                         struct ConefieldTile x,
+                                         struct ConefieldTileMut y,
+                                         struct ConefieldTileMut tape,
+                                         struct ConefieldText *error);
+  /*
+   `backward` on parameters of 16 bits, as `forward_halves`. Gradients are floats. NULL where `forward_halves` is.
+   */
+  ConefieldStatus (*backward_halves)(const void *stage,
+                                     uint32_t format,
+                                     const uint16_t *params,
+                                     struct ConefieldTile x,
+                                     struct ConefieldTileMut tape,
+                                     struct ConefieldTile dy,
+                                     struct ConefieldGrads grads,
+                                     struct ConefieldTileMut dx,
+                                     struct ConefieldText *error);
+  /*
+   Of an encoder: writes for each of its `count` channels how many cells along the unit cube's side the channel tells
+   apart, a finite number above 0. Projectors count in the finest cell, and channels finer than the data can be left
+   out. Returns [`CONEFIELD_UNSUPPORTED`] where that is not known. NULL: it is not known.
+   */
+  ConefieldStatus (*resolutions)(const void *stage,
+                                 double *cells,
+                                 size_t count,
+                                 struct ConefieldText *error);
 } ConefieldMap;
 
 /*
@@ -526,6 +583,20 @@ typedef struct ConefieldRay {
    */
   float per_mm;
 } ConefieldRay;
+
+/*
+ Lengths of a scene that a projector's settings may count in.
+ */
+typedef struct ConefieldLengths {
+  /*
+   The shortest side of a voxel, mm.
+   */
+  double voxel_mm;
+  /*
+   The side of the encoder's finest cell, mm; 0 where the encoder does not say how fine it is.
+   */
+  double cell_mm;
+} ConefieldLengths;
 
 /*
  Functions of a projector.
@@ -560,6 +631,14 @@ typedef struct ConefieldProjector {
    The exact adjoint of `integrate`: overwrites `dmu` with its derivatives times `dline`. NULL as `integrate`.
    */
   void (*adjoint)(const void *stage, const float *weights, double dline, double *dmu, size_t count);
+  /*
+   Makes the projector for a scene with these lengths, a new one, and sets `fitted` to it. A projector whose settings do
+   not count in them leaves `fitted` as it is. NULL: its settings do not.
+   */
+  ConefieldStatus (*fitted)(const void *stage,
+                            const struct ConefieldLengths *lengths,
+                            void **fitted,
+                            struct ConefieldText *error);
   /*
    WGSL of `sample`, of a projector that integrates as one without `integrate` does: a function `stage_sample`, as
    docs/plugins.md says. NULL: it runs on the CPU alone.
@@ -650,7 +729,7 @@ typedef struct ConefieldStage {
                             void **stage,
                             struct ConefieldText *error);
   /*
-   Frees what `create` or `reduce` made.
+   Frees what `create`, `reduce` or `fitted` made.
    */
   void (*destroy)(void *stage);
   /*

@@ -3,27 +3,27 @@
 //! A plugin is a shared library that exports [`conefield_plugin`](ConefieldEntry) and returns a table of what it
 //! brings. Rules that types cannot say:
 //!
-//! - **Versions.** `abi_major` must be the host's. Within a major version tables of functions only grow at their end, each
-//!   says its own `size`, and a function beyond it counts as NULL; so older plugins load into newer hosts and newer
-//!   plugins into older hosts. Everything else here keeps its layout.
+//! - **Versions.** `abi_major` must be the host's. Within a major version tables of functions only grow at their end. Each
+//!   table says its own `size`: a table that lacks a function of this version is refused, what it has beyond is not read.
+//!   Everything else here keeps its layout.
 //! - **Memory.** Nothing is handed over: the host frees what it made, the plugin frees what it made (`destroy`). What a
 //!   plugin points to in its tables lives as long as the library, which is never unloaded; what a stage points to lives
 //!   as long as the stage.
 //! - **Tiles** are channel-major: channel `c` of row `i` is `data[c * stride + i]`. A pointer may be NULL where there is
 //!   nothing (no channels, no parameters). Floats are aligned to their own size and no more.
 //! - **Threads.** A stage is called from many threads at once: `info`, `parameter`, `partition`, `describe`, `init`,
-//!   `forward`, `passes`, `forward_pass`, `backward`, `max_samples`, `sample`, `integrate`, `adjoint`, `apply` and `wgsl` must allow that. `create`,
-//!   `destroy`, `reduce`, `refresh` and `decided` of one stage are not called at the same time as anything else of that
-//!   stage, though from any thread.
+//!   `passes`, every `forward…` and `backward…`, `resolutions`, `max_samples`, `sample`, `integrate`, `adjoint`, `apply` and
+//!   `wgsl` must allow that. `create`, `destroy`, `reduce`, `fitted`, `refresh` and `decided` of one stage are not called at
+//!   the same time as anything else of that stage, though from any thread.
 //! - **Unwinding** must not leave the library: catch panics and exceptions, return [`CONEFIELD_PANICKED`].
 //! - **Same bits.** The result must not depend on threads, on time, or on how rows are dealt to tiles.
 
 use std::ffi::c_void;
 
 /// Major version of this contract. A plugin of another one is refused.
-pub const CONEFIELD_ABI_MAJOR: u32 = 1;
+pub const CONEFIELD_ABI_MAJOR: u32 = 2;
 /// Minor version: tables have grown so many times.
-pub const CONEFIELD_ABI_MINOR: u32 = 1;
+pub const CONEFIELD_ABI_MINOR: u32 = 0;
 
 /// What a function returns.
 pub type ConefieldStatus = i32;
@@ -60,6 +60,11 @@ pub const CONEFIELD_GRADS_NONE: u32 = 0;
 pub const CONEFIELD_GRADS_DENSE: u32 = 1;
 /// Many parameters, few touched by a row: workers own the ranges of `partition`. Such a stage keeps no tape.
 pub const CONEFIELD_GRADS_SCATTER: u32 = 2;
+
+/// Parameters are IEEE 754 `binary16`.
+pub const CONEFIELD_F16: u32 = 0;
+/// Parameters are `bfloat16`: the upper halves of floats.
+pub const CONEFIELD_BF16: u32 = 1;
 
 /// `reduce` leaves out channels that come out.
 pub const CONEFIELD_OUTPUTS: u32 = 0;
@@ -196,6 +201,8 @@ pub struct ConefieldInfo {
     pub coarse_to_fine: u32,
     /// 1 if it has kernels in double precision.
     pub double_precision: u32,
+    /// 1 if it has kernels that read parameters in halves.
+    pub halves: u32,
 }
 
 /// One named block of parameters. Blocks stand one after the other and cover all parameters.
@@ -369,10 +376,10 @@ pub struct ConefieldMap {
     /// it runs on the CPU alone.
     pub wgsl: Option<unsafe extern "C" fn(stage: *const c_void, source: *mut ConefieldText) -> ConefieldStatus>,
     /// How many passes `forward` goes in, each over a table of its own; always the same for one stage. A host with many
-    /// tiles sends all of them through one pass before the next, while its table is in the cache. NULL: one. Since 1.1.
+    /// tiles sends all of them through one pass before the next, while its table is in the cache. NULL: one.
     pub passes: Option<unsafe extern "C" fn(stage: *const c_void) -> usize>,
     /// Pass `pass` of `forward`, counted from 0; all in order leave the same bits as `forward`. What other passes write
-    /// stays. NULL where `passes` is. Since 1.1.
+    /// stays. NULL where `passes` is.
     pub forward_pass: Option<
         unsafe extern "C" fn(
             stage: *const c_void,
@@ -381,6 +388,57 @@ pub struct ConefieldMap {
             x: ConefieldTile,
             y: ConefieldTileMut,
             tape: ConefieldTileMut,
+            error: *mut ConefieldText,
+        ) -> ConefieldStatus,
+    >,
+    /// `forward` on parameters of 16 bits in `format`, one of [`CONEFIELD_F16`] and [`CONEFIELD_BF16`]: what `forward` makes
+    /// of the same values. A host asks for it where a spec has tables in halves. NULL if there is none.
+    pub forward_halves: Option<
+        unsafe extern "C" fn(
+            stage: *const c_void,
+            format: u32,
+            params: *const u16,
+            x: ConefieldTile,
+            y: ConefieldTileMut,
+            tape: ConefieldTileMut,
+            error: *mut ConefieldText,
+        ) -> ConefieldStatus,
+    >,
+    /// `forward_pass` on parameters of 16 bits, as `forward_halves`. NULL where `forward_pass` or `forward_halves` is.
+    pub forward_pass_halves: Option<
+        unsafe extern "C" fn(
+            stage: *const c_void,
+            format: u32,
+            pass: usize,
+            params: *const u16,
+            x: ConefieldTile,
+            y: ConefieldTileMut,
+            tape: ConefieldTileMut,
+            error: *mut ConefieldText,
+        ) -> ConefieldStatus,
+    >,
+    /// `backward` on parameters of 16 bits, as `forward_halves`. Gradients are floats. NULL where `forward_halves` is.
+    pub backward_halves: Option<
+        unsafe extern "C" fn(
+            stage: *const c_void,
+            format: u32,
+            params: *const u16,
+            x: ConefieldTile,
+            tape: ConefieldTileMut,
+            dy: ConefieldTile,
+            grads: ConefieldGrads,
+            dx: ConefieldTileMut,
+            error: *mut ConefieldText,
+        ) -> ConefieldStatus,
+    >,
+    /// Of an encoder: writes for each of its `count` channels how many cells along the unit cube's side the channel tells
+    /// apart, a finite number above 0. Projectors count in the finest cell, and channels finer than the data can be left
+    /// out. Returns [`CONEFIELD_UNSUPPORTED`] where that is not known. NULL: it is not known.
+    pub resolutions: Option<
+        unsafe extern "C" fn(
+            stage: *const c_void,
+            cells: *mut f64,
+            count: usize,
             error: *mut ConefieldText,
         ) -> ConefieldStatus,
     >,
@@ -400,6 +458,16 @@ pub struct ConefieldRay {
     pub published: [f32; 2],
     /// Cube sides a millimetre.
     pub per_mm: f32,
+}
+
+/// Lengths of a scene that a projector's settings may count in.
+#[repr(C)]
+#[derive(Debug, Clone, Copy)]
+pub struct ConefieldLengths {
+    /// The shortest side of a voxel, mm.
+    pub voxel_mm: f64,
+    /// The side of the encoder's finest cell, mm; 0 where the encoder does not say how fine it is.
+    pub cell_mm: f64,
 }
 
 /// Functions of a projector.
@@ -431,6 +499,16 @@ pub struct ConefieldProjector {
     /// The exact adjoint of `integrate`: overwrites `dmu` with its derivatives times `dline`. NULL as `integrate`.
     pub adjoint: Option<
         unsafe extern "C" fn(stage: *const c_void, weights: *const f32, dline: f64, dmu: *mut f64, count: usize),
+    >,
+    /// Makes the projector for a scene with these lengths, a new one, and sets `fitted` to it. A projector whose settings do
+    /// not count in them leaves `fitted` as it is. NULL: its settings do not.
+    pub fitted: Option<
+        unsafe extern "C" fn(
+            stage: *const c_void,
+            lengths: *const ConefieldLengths,
+            fitted: *mut *mut c_void,
+            error: *mut ConefieldText,
+        ) -> ConefieldStatus,
     >,
     /// WGSL of `sample`, of a projector that integrates as one without `integrate` does: a function `stage_sample`, as
     /// docs/plugins.md says. NULL: it runs on the CPU alone.
@@ -501,7 +579,7 @@ pub struct ConefieldStage {
             error: *mut ConefieldText,
         ) -> ConefieldStatus,
     >,
-    /// Frees what `create` or `reduce` made.
+    /// Frees what `create`, `reduce` or `fitted` made.
     pub destroy: Option<unsafe extern "C" fn(stage: *mut c_void)>,
     /// One line on a stage, such as `10 levels x 2`.
     pub describe: Option<unsafe extern "C" fn(stage: *const c_void, text: *mut ConefieldText) -> ConefieldStatus>,

@@ -18,7 +18,7 @@ fn the_header_is_current() {
         style: cbindgen::Style::Both,
         documentation_style: cbindgen::DocumentationStyle::C,
         header: Some(
-            "/* The contract between conefield and its plugins, version 1.0. Made from plugins/abi/src/lib.rs. */"
+            "/* The contract between conefield and its plugins, version 2.0. Made from plugins/abi/src/lib.rs. */"
                 .into(),
         ),
         trailer: Some(
@@ -57,7 +57,7 @@ fn the_header_is_current() {
 #[test]
 #[cfg(target_pointer_width = "64")]
 fn the_layout_is_pinned() {
-    assert_eq!((CONEFIELD_ABI_MAJOR, CONEFIELD_ABI_MINOR), (1, 1));
+    assert_eq!((CONEFIELD_ABI_MAJOR, CONEFIELD_ABI_MINOR), (2, 0));
     let sizes = [
         size_of::<ConefieldStr>(),
         size_of::<ConefieldText>(),
@@ -71,13 +71,14 @@ fn the_layout_is_pinned() {
         size_of::<ConefieldProbe>(),
         size_of::<ConefieldMap>(),
         size_of::<ConefieldRay>(),
+        size_of::<ConefieldLengths>(),
         size_of::<ConefieldProjector>(),
         size_of::<ConefieldBlock>(),
         size_of::<ConefieldInitializer>(),
         size_of::<ConefieldStage>(),
         size_of::<ConefieldPlugin>(),
     ];
-    assert_eq!(sizes, [16, 24, 32, 32, 24, 80, 32, 16, 40, 72, 120, 44, 48, 48, 16, 112, 88]);
+    assert_eq!(sizes, [16, 24, 32, 32, 24, 80, 32, 16, 40, 72, 152, 44, 16, 56, 48, 16, 112, 88]);
     let plugin = [
         offset_of!(ConefieldPlugin, size),
         offset_of!(ConefieldPlugin, abi_major),
@@ -120,8 +121,22 @@ fn the_layout_is_pinned() {
         offset_of!(ConefieldMap, wgsl),
         offset_of!(ConefieldMap, passes),
         offset_of!(ConefieldMap, forward_pass),
+        offset_of!(ConefieldMap, forward_halves),
+        offset_of!(ConefieldMap, forward_pass_halves),
+        offset_of!(ConefieldMap, backward_halves),
+        offset_of!(ConefieldMap, resolutions),
     ];
-    assert_eq!(map, [0, 8, 16, 24, 32, 40, 48, 56, 64, 72, 80, 88, 96, 104, 112]);
+    assert_eq!(map, [0, 8, 16, 24, 32, 40, 48, 56, 64, 72, 80, 88, 96, 104, 112, 120, 128, 136, 144]);
+    let projector = [
+        offset_of!(ConefieldProjector, size),
+        offset_of!(ConefieldProjector, max_samples),
+        offset_of!(ConefieldProjector, sample),
+        offset_of!(ConefieldProjector, integrate),
+        offset_of!(ConefieldProjector, adjoint),
+        offset_of!(ConefieldProjector, fitted),
+        offset_of!(ConefieldProjector, wgsl),
+    ];
+    assert_eq!(projector, [0, 8, 16, 24, 32, 40, 48]);
     let info = [
         offset_of!(ConefieldInfo, input),
         offset_of!(ConefieldInfo, output),
@@ -135,6 +150,7 @@ fn the_layout_is_pinned() {
         offset_of!(ConefieldInfo, identity),
         offset_of!(ConefieldInfo, coarse_to_fine),
         offset_of!(ConefieldInfo, double_precision),
+        offset_of!(ConefieldInfo, halves),
     ];
-    assert_eq!(info, [0, 8, 16, 24, 32, 40, 48, 56, 60, 64, 68, 72]);
+    assert_eq!(info, [0, 8, 16, 24, 32, 40, 48, 56, 60, 64, 68, 72, 76]);
 }

@@ -10,7 +10,7 @@ use conefield_plugin_abi::*;
 use serde_json::Value;
 use std::collections::BTreeMap;
 use std::ffi::c_void;
-use std::mem::{MaybeUninit, offset_of};
+use std::mem::offset_of;
 use std::path::{Path, PathBuf};
 use std::sync::{Arc, Mutex, PoisonError};
 use std::{fmt, ptr, slice};
@@ -103,7 +103,7 @@ impl Library {
             return Err(bad("ABI version", &format!("{major}.{minor}"), &expected));
         }
         // SAFETY: see the top of this file.
-        let t: ConefieldPlugin = unsafe { sized(plugin, size_of::<ConefieldPlugin>(), place, "plugin table")? };
+        let t: ConefieldPlugin = unsafe { sized(plugin, place, "plugin table")? };
         // SAFETY: as above.
         let (name, version, licence) = unsafe {
             (text(t.name, place, "name")?, text(t.version, place, "version")?, text(t.licence, place, "licence")?)
@@ -164,18 +164,14 @@ fn table_of(path: &Path, place: &str) -> Result<*const ConefieldPlugin> {
     Ok(table)
 }
 
-/// A table that says its size first. What an older plugin's lacks stays zero; what a newer one's has more is left.
-unsafe fn sized<T>(table: *const T, least: usize, place: &str, what: &str) -> Result<T> {
+/// A table that says its size first.
+unsafe fn sized<T>(table: *const T, place: &str, what: &str) -> Result<T> {
     ensure(!table.is_null() && table.is_aligned(), place, what, "nothing", "a table")?;
     // SAFETY: every table begins with its size.
-    let size = unsafe { table.cast::<usize>().read() };
+    let (size, least) = (unsafe { table.cast::<usize>().read() }, size_of::<T>());
     ensure(size >= least, place, what, format!("{size} bytes"), format!("at least {least}: the table is too short"))?;
-    let mut copy = MaybeUninit::<T>::zeroed();
-    // SAFETY: the table has `size` bytes, `T` is plain data for which zero means nothing or NULL.
-    unsafe {
-        ptr::copy_nonoverlapping(table.cast::<u8>(), copy.as_mut_ptr().cast(), size.min(size_of::<T>()));
-        Ok(copy.assume_init())
-    }
+    // SAFETY: the table has at least as many bytes as `T`, which is plain data.
+    Ok(unsafe { table.read() })
 }
 
 /// A text of a table.
@@ -213,7 +209,7 @@ impl Type {
         let (kind, functions) = unsafe {
             match t.kind {
                 CONEFIELD_ENCODER | CONEFIELD_NORMALIZER | CONEFIELD_FIELD => {
-                    let map = sized(t.map, offset_of!(ConefieldMap, forward_f64), place, &what)?;
+                    let map = sized(t.map, place, &what)?;
                     needed("info", map.info.is_some())?;
                     needed("forward", map.forward.is_some())?;
                     needed("backward", map.backward.is_some())?;
@@ -221,8 +217,7 @@ impl Type {
                     (kind, Functions::Map(map))
                 }
                 CONEFIELD_PROJECTOR => {
-                    let least = offset_of!(ConefieldProjector, integrate);
-                    let projector = sized(t.projector, least, place, &what)?;
+                    let projector = sized(t.projector, place, &what)?;
                     needed("max_samples", projector.max_samples.is_some())?;
                     needed("sample", projector.sample.is_some())?;
                     let both = projector.integrate.is_some() == projector.adjoint.is_some();
@@ -230,7 +225,7 @@ impl Type {
                     (Kind::Projector, Functions::Projector(projector))
                 }
                 CONEFIELD_INITIALIZER => {
-                    let initializer = sized(t.initializer, size_of::<ConefieldInitializer>(), place, &what)?;
+                    let initializer = sized(t.initializer, place, &what)?;
                     needed("apply", initializer.apply.is_some())?;
                     (Kind::Initializer, Functions::Initializer(initializer))
                 }
@@ -261,7 +256,7 @@ impl Type {
         let status =
             unsafe { (self.create)(self.context, ConefieldStr::of(&settings), width, &mut stage, error.room()) };
         if status != CONEFIELD_OK {
-            return Err(self.refusal(status, &error.text()));
+            return Err(self.refusal("create", status, &error.text()));
         }
         if stage.is_null() {
             return Err(self.failed("create", CONEFIELD_FAILED, "it made nothing"));
@@ -269,8 +264,8 @@ impl Type {
         Ok(Handle { ty: self.clone(), stage })
     }
 
-    /// What `create` refused, as an error about the spec.
-    fn refusal(&self, status: ConefieldStatus, text: &str) -> Error {
+    /// What `create` or `fitted` refused, as an error about the spec.
+    pub(crate) fn refusal(&self, call: &str, status: ConefieldStatus, text: &str) -> Error {
         let parts = text.split_once(": found ").and_then(|(field, rest)| {
             let (found, expected) = rest.rsplit_once(", expected ")?;
             Some((field, found, expected))
@@ -283,7 +278,7 @@ impl Type {
                 Error::invalid("spec", field, found, expected)
             }
             (CONEFIELD_INVALID, None) => Error::invalid("spec", self.kind.name(), text, "settings that make a stage"),
-            _ => self.failed("create", status, text),
+            _ => self.failed(call, status, text),
         }
     }
 
@@ -319,7 +314,7 @@ unsafe impl Sync for Handle {}
 
 impl Drop for Handle {
     fn drop(&mut self) {
-        // SAFETY: it was made by `create` or `reduce`, and nothing uses it any more.
+        // SAFETY: it was made by `create`, `reduce` or `fitted`, and nothing uses it any more.
         unsafe { (self.ty.destroy)(self.stage) };
     }
 }

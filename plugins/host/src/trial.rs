@@ -4,9 +4,10 @@
 
 use crate::library::Type;
 use conefield_core::error::{Error, Result};
+use conefield_core::half::{Half, round};
 use conefield_core::pages::Pages;
 use conefield_core::random::{mix, unit};
-use conefield_core::stage::{GradKind, Grads, Stage, TILE_ROWS, Tile, TileMut, UnitRay};
+use conefield_core::stage::{GradKind, Grads, Halves, Kernel, Reader, Stage, TILE_ROWS, Tile, TileMut, UnitRay};
 use std::ops::Range;
 use std::sync::mpsc;
 use std::thread;
@@ -16,7 +17,7 @@ use std::time::Duration;
 pub const LIMIT: Duration = Duration::from_secs(5);
 
 /// Numbers on either side of a buffer that nobody may write to: more than a tile of the widest common stages.
-const GUARD: usize = 1 << 14;
+pub(crate) const GUARD: usize = 1 << 14;
 /// A NaN that no arithmetic makes: the mark of what nobody has written to.
 pub(crate) const UNTOUCHED: u32 = 0x7fc5_a7e1;
 
@@ -97,7 +98,7 @@ pub(crate) fn map(ty: &Type, stage: &dyn Stage) -> Result<()> {
 
 /// The first complaint about a stage.
 fn try_map(stage: &dyn Stage) -> Result<Option<String>> {
-    let (info, kernel) = (stage.info(), stage.kernel());
+    let info = stage.info();
     let mut params = Guarded::zeroed(info.params);
     if info.params <= MANY {
         stage.init(1, params.inner());
@@ -106,6 +107,29 @@ fn try_map(stage: &dyn Stage) -> Result<Option<String>> {
             return Ok(Some(c));
         }
     }
+    if let Some(c) = try_kernel(stage, stage.kernel(), &mut params)? {
+        return Ok(Some(c));
+    }
+    let Some(Halves { f16, bf16 }) = stage.halves() else { return Ok(None) };
+    let complaint = match try_halves(stage, f16, &mut params)? {
+        None => try_halves(stage, bf16, &mut params)?,
+        some => some,
+    };
+    Ok(complaint.map(|c| format!("with parameters in halves, {c}")))
+}
+
+/// The first complaint about a kernel that reads halves.
+fn try_halves<H: Half>(stage: &dyn Stage, kernel: &dyn Kernel<f32, H>, params: &mut Guarded) -> Result<Option<String>> {
+    let mut halves = Pages::<H>::zeros(params.inner().len());
+    if halves.len() <= MANY {
+        round(params.inner(), &mut halves);
+    }
+    try_kernel(stage, &Reader { kernel, params: &halves }, params)
+}
+
+/// The first complaint about a kernel of a stage.
+fn try_kernel(stage: &dyn Stage, kernel: &dyn Kernel<f32>, params: &mut Guarded) -> Result<Option<String>> {
+    let info = stage.info();
     let range: Range<usize> = match info.grads {
         GradKind::Scatter => stage.partition().into_iter().min_by_key(Range::len).unwrap_or(0..info.params),
         _ => 0..info.params,

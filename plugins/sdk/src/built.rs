@@ -62,7 +62,8 @@ impl Built {
         Ok(Self::of(stage))
     }
 
-    fn of(stage: AnyStage) -> Self {
+    /// What the host holds of `stage`.
+    pub fn of(stage: AnyStage) -> Self {
         let map = stage.map().map(|s| {
             let i = s.info();
             let partition = if i.grads == GradKind::Scatter { s.partition() } else { vec![] };
@@ -71,6 +72,7 @@ impl Built {
             let mut info = info(&i, blocks.len(), partition.len());
             info.coarse_to_fine = coarse_to_fine.into();
             info.double_precision = s.reference().is_some().into();
+            info.halves = s.halves().is_some().into();
             MapInfo { info, blocks, partition }
         });
         Self { stage, map, kept: (vec![], vec![]) }
@@ -147,5 +149,6 @@ fn info(i: &Info, blocks: usize, partitions: usize) -> ConefieldInfo {
         identity: i.identity.into(),
         coarse_to_fine: 0,
         double_precision: 0,
+        halves: 0,
     }
 }

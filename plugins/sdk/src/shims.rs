@@ -2,16 +2,16 @@
 //! included, into a status and a text.
 
 // Pointers come from the host, by the rules of the contract (`conefield_plugin_abi`): they are valid for the lengths beside
-// them for the time of the call, do not overlap where one of them is written to, and `stage` is what `create` or `reduce`
-// made. Every block below that is unsafe relies on that alone.
+// them for the time of the call, do not overlap where one of them is written to, and `stage` is what `create`, `reduce` or
+// `fitted` made. Every block below that is unsafe relies on that alone.
 #![allow(unsafe_code)]
 
 use crate::built::{AnyStage, Built, MapInfo};
 use conefield_core::arena::{Arena, Block, Layout};
-use conefield_core::error::{Error, Result};
+use conefield_core::error::{Error, Result, ensure};
 use conefield_core::registry::StageType;
 use conefield_core::simd::Real;
-use conefield_core::stage::{Grads, Kernel, Probe, Projector, Samples, Stage, Tile, TileMut, UnitRay};
+use conefield_core::stage::{Grads, Halves, Kernel, Lengths, Probe, Projector, Samples, Stage, Tile, TileMut, UnitRay};
 use conefield_plugin_abi::*;
 use std::borrow::Cow;
 use std::cell::RefCell;
@@ -36,6 +36,10 @@ pub static MAP: ConefieldMap = ConefieldMap {
     wgsl: Some(wgsl),
     passes: Some(passes),
     forward_pass: Some(forward_pass),
+    forward_halves: Some(forward_halves),
+    forward_pass_halves: Some(forward_pass_halves),
+    backward_halves: Some(backward_halves),
+    resolutions: Some(resolutions),
 };
 
 /// Functions of every projector.
@@ -45,6 +49,7 @@ pub static PROJECTOR: ConefieldProjector = ConefieldProjector {
     sample: Some(sample),
     integrate: Some(integrate),
     adjoint: Some(adjoint),
+    fitted: Some(fitted),
     wgsl: Some(wgsl),
 };
 
@@ -264,11 +269,12 @@ macro_rules! strided {
 strided! { ConefieldTile f32 ConefieldTileMut f32 ConefieldTile64 f64 ConefieldTileMut64 f64 }
 
 /// `forward` of a kernel, or one pass of it.
-unsafe fn run_forward<R: Real>(
+unsafe fn run_forward<R: Real, P>(
+    kernel: &dyn Kernel<R, P>,
+    pass: Option<usize>,
     info: &ConefieldInfo,
-    params: *const R,
+    params: *const P,
     [x, y, tape]: [Strided<R>; 3],
-    forward: impl FnOnce(&[R], Tile<'_, R>, TileMut<'_, R>, TileMut<'_, R>),
 ) {
     let rows = x.rows;
     // SAFETY: see the top of this file.
@@ -276,16 +282,20 @@ unsafe fn run_forward<R: Real>(
         let (params, x) = (many(params, info.params), x.read());
         y.write(|y| {
             tape.write(|tape| {
-                forward(params, Tile::new(&x, rows), TileMut::new(y, rows), TileMut::new(tape, rows));
+                let (x, y, tape) = (Tile::new(&x, rows), TileMut::new(y, rows), TileMut::new(tape, rows));
+                match pass {
+                    Some(pass) => kernel.forward_pass(pass, params, x, y, tape),
+                    None => kernel.forward(params, x, y, tape),
+                }
             });
         });
     }
 }
 
-unsafe fn run_backward<R: Real>(
-    kernel: &dyn Kernel<R>,
+unsafe fn run_backward<R: Real, P>(
+    kernel: &dyn Kernel<R, P>,
     info: &ConefieldInfo,
-    params: *const R,
+    params: *const P,
     [x, tape, dy, dx]: [Strided<R>; 4],
     (grads, start, length): (*mut R, usize, usize),
 ) {
@@ -325,7 +335,7 @@ macro_rules! kernels {
                     let kernel: Option<&dyn Kernel<$real>> = $pick(stage);
                     let kernel = kernel.ok_or_else(|| Error::unsupported(stage.describe(), NO_DOUBLE))?;
                     let tiles = [x.into(), y.into(), tape.into()];
-                    run_forward(&known.info, params, tiles, |params, x, y, tape| kernel.forward(params, x, y, tape));
+                    run_forward(kernel, None, &known.info, params, tiles);
                     stage.fault()
                 }
             })
@@ -382,12 +392,124 @@ unsafe extern "C" fn forward_pass(
         // SAFETY: see the top of this file.
         unsafe {
             let (stage, known) = map(stage)?;
-            let (kernel, tiles) = (stage.kernel(), [x.into(), y.into(), tape.into()]);
-            run_forward(&known.info, params, tiles, |params, x, y, tape| {
-                kernel.forward_pass(pass, params, x, y, tape);
-            });
+            let tiles = [x.into(), y.into(), tape.into()];
+            run_forward(stage.kernel(), Some(pass), &known.info, params, tiles);
             stage.fault()
         }
+    })
+}
+
+fn halves(stage: &dyn Stage) -> Result<Halves<'_>> {
+    stage.halves().ok_or_else(|| Error::unsupported(stage.describe(), "it has no kernel that reads halves"))
+}
+
+/// Runs `$run` with the kernel that reads the parameters as they stand.
+macro_rules! in_halves {
+    ($stage:expr, $format:expr, |$kernel:ident| $run:expr) => {{
+        let halves = halves($stage)?;
+        match $format {
+            CONEFIELD_F16 => {
+                let $kernel = halves.f16;
+                $run
+            }
+            CONEFIELD_BF16 => {
+                let $kernel = halves.bf16;
+                $run
+            }
+            other => return Err(Error::unsupported("halves", format!("{other} is none of the known formats"))),
+        }
+    }};
+}
+
+/// `forward_halves`, or one pass of it.
+unsafe fn forward_of_halves(
+    stage: *const c_void,
+    format: u32,
+    pass: Option<usize>,
+    params: *const u16,
+    tiles: [Strided<f32>; 3],
+) -> Result<()> {
+    // SAFETY: see the top of this file.
+    unsafe {
+        let (stage, known) = map(stage)?;
+        in_halves!(stage, format, |kernel| run_forward(kernel, pass, &known.info, params.cast(), tiles));
+        stage.fault()
+    }
+}
+
+unsafe extern "C" fn forward_halves(
+    stage: *const c_void,
+    format: u32,
+    params: *const u16,
+    x: ConefieldTile,
+    y: ConefieldTileMut,
+    tape: ConefieldTileMut,
+    error: *mut ConefieldText,
+) -> ConefieldStatus {
+    // SAFETY: see the top of this file.
+    guard(error, || unsafe { forward_of_halves(stage, format, None, params, [x.into(), y.into(), tape.into()]) })
+}
+
+unsafe extern "C" fn forward_pass_halves(
+    stage: *const c_void,
+    format: u32,
+    pass: usize,
+    params: *const u16,
+    x: ConefieldTile,
+    y: ConefieldTileMut,
+    tape: ConefieldTileMut,
+    error: *mut ConefieldText,
+) -> ConefieldStatus {
+    // SAFETY: see the top of this file.
+    guard(error, || unsafe { forward_of_halves(stage, format, Some(pass), params, [x.into(), y.into(), tape.into()]) })
+}
+
+unsafe extern "C" fn backward_halves(
+    stage: *const c_void,
+    format: u32,
+    params: *const u16,
+    x: ConefieldTile,
+    tape: ConefieldTileMut,
+    dy: ConefieldTile,
+    grads: ConefieldGrads,
+    dx: ConefieldTileMut,
+    error: *mut ConefieldText,
+) -> ConefieldStatus {
+    guard(error, || {
+        // SAFETY: see the top of this file.
+        unsafe {
+            let (stage, known) = map(stage)?;
+            let tiles = [x.into(), tape.into(), dy.into(), dx.into()];
+            let to = (grads.data, grads.start, grads.length);
+            in_halves!(stage, format, |kernel| run_backward(kernel, &known.info, params.cast(), tiles, to));
+            stage.fault()
+        }
+    })
+}
+
+unsafe extern "C" fn resolutions(
+    stage: *const c_void,
+    cells: *mut f64,
+    count: usize,
+    error: *mut ConefieldText,
+) -> ConefieldStatus {
+    guard(error, || {
+        // SAFETY: see the top of this file.
+        let found = match unsafe { &built(stage).stage } {
+            AnyStage::Encoder(e) => e.resolutions(),
+            _ => None,
+        };
+        let found = found.ok_or_else(|| Error::unsupported("resolutions", "they are not known"))?;
+        ensure(
+            found.len() == count,
+            "encoder",
+            "resolutions",
+            found.len(),
+            format!("one for each of {count} channels"),
+        )?;
+        // SAFETY: see the top of this file; there is room for `count`.
+        unsafe { many_mut(cells, count).copy_from_slice(&found) };
+        Ok(())
     })
 }
 
@@ -577,6 +699,25 @@ unsafe extern "C" fn adjoint(stage: *const c_void, weights: *const f32, dline: f
         unsafe { projector(stage)?.adjoint(many(weights, count), dline, many_mut(dmu, count)) };
         Ok(())
     });
+}
+
+unsafe extern "C" fn fitted(
+    stage: *const c_void,
+    lengths: *const ConefieldLengths,
+    out: *mut *mut c_void,
+    error: *mut ConefieldText,
+) -> ConefieldStatus {
+    guard(error, || {
+        // SAFETY: see the top of this file.
+        let (stage, ConefieldLengths { voxel_mm, cell_mm }) = unsafe { (projector(stage)?, *lengths) };
+        let lengths = Lengths { voxel_mm, cell_mm: (cell_mm > 0.0).then_some(cell_mm) };
+        if let Some(fitted) = stage.fitted(lengths)? {
+            let built = Box::new(Built::of(AnyStage::Projector(fitted)));
+            // SAFETY: see the top of this file.
+            unsafe { *out = Box::into_raw(built).cast() };
+        }
+        Ok(())
+    })
 }
 
 unsafe extern "C" fn apply(

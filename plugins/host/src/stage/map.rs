@@ -4,11 +4,13 @@
 
 use super::{Fault, fragment};
 use crate::library::{Functions, Handle, Text, Type};
-use crate::trial;
+use crate::trial::{self, GUARD, UNTOUCHED};
 use conefield_core::error::{Error, Result, ensure};
+use conefield_core::half::{Bf16, F16};
+use conefield_core::registry::Kind;
 use conefield_core::stage::{
-    Encoder, Field, GradKind, Grads, Info, Kernel, Mask, Normalizer, Parameter, Probe, Reduced, Scope, Stage, Tile,
-    TileMut,
+    Encoder, Field, GradKind, Grads, Halves, Info, Kernel, Mask, Normalizer, Parameter, Probe, Reduced, Scope, Stage,
+    Tile, TileMut,
 };
 use conefield_core::wgsl::Fragment;
 use conefield_plugin_abi::*;
@@ -36,7 +38,9 @@ pub struct MapStage {
     info: Info,
     coarse_to_fine: bool,
     double: bool,
+    halves: bool,
     passes: usize,
+    resolutions: Option<Vec<f64>>,
     parameters: Vec<Parameter>,
     partition: Vec<Range<usize>>,
     describe: String,
@@ -74,6 +78,7 @@ impl MapStage {
             identity: 0,
             coarse_to_fine: 0,
             double_precision: 0,
+            halves: 0,
         };
         // SAFETY: the stage is alive, `i` is to be written.
         let status = map.info.map_or(CONEFIELD_FAILED, |info| unsafe { info(handle.stage, &mut i) });
@@ -118,14 +123,35 @@ impl MapStage {
         if double && (map.forward_f64.is_none() || map.backward_f64.is_none()) {
             return Err(wrong("it has no kernels in double precision, and says that it has"));
         }
+        let halves = i.halves != 0;
+        if halves && (map.forward_halves.is_none() || map.backward_halves.is_none()) {
+            return Err(wrong("it has no kernels that read halves, and says that it has"));
+        }
         // SAFETY: the stage is alive.
         let passes = map.passes.map_or(1, |f| unsafe { f(handle.stage) });
         if passes == 0 || passes > MOST_PASSES || (passes > 1 && map.forward_pass.is_none()) {
             let there = if map.forward_pass.is_some() { "a" } else { "no" };
             return Err(wrong(&format!("it goes forward in {passes} passes with {there} function forward_pass")));
         }
+        if halves && passes > 1 && map.forward_pass_halves.is_none() {
+            return Err(wrong(&format!("it goes forward in {passes} passes with no function forward_pass_halves")));
+        }
+        let resolutions = resolutions(&handle, &map, info.output)?;
         let fault = Fault::default();
-        Ok(Self { handle, map, info, coarse_to_fine, double, passes, parameters, partition, describe, fault })
+        Ok(Self {
+            handle,
+            map,
+            info,
+            coarse_to_fine,
+            double,
+            halves,
+            passes,
+            resolutions,
+            parameters,
+            partition,
+            describe,
+            fault,
+        })
     }
 
     /// The type that it is of.
@@ -163,6 +189,9 @@ impl MapStage {
         let wrong = |what: &str| ty.failed("reduce", CONEFIELD_FAILED, what);
         if r.stage.is_null() {
             return Err(wrong("it made nothing"));
+        }
+        if r.stage == self.handle.stage {
+            return Err(wrong("it handed itself back instead of a new stage"));
         }
         let smaller = Self::new(Handle { ty: self.handle.ty.clone(), stage: r.stage })?;
         if r.params_count > info.params || r.channels_count > info.input.max(info.output) {
@@ -255,13 +284,40 @@ fn partition(handle: &Handle, map: &ConefieldMap, i: &ConefieldInfo, grads: Grad
     if end == i.params { Ok(all) } else { Err(wrong(format!("ranges end at {end} of {}", i.params))) }
 }
 
+/// How many cells each of `count` channels tells apart, where the encoder says so.
+fn resolutions(handle: &Handle, map: &ConefieldMap, count: usize) -> Result<Option<Vec<f64>>> {
+    let Some(f) = map.resolutions.filter(|_| handle.ty.kind == Kind::Encoder) else { return Ok(None) };
+    let mark = f64::from_bits(UNTOUCHED.into());
+    let mut cells = vec![mark; count + GUARD];
+    let mut error = Text::new();
+    // SAFETY: the stage is alive, `cells` has room for more than `count`.
+    let status = unsafe { f(handle.stage, cells.as_mut_ptr(), count, error.room()) };
+    if status == CONEFIELD_UNSUPPORTED {
+        return Ok(None);
+    }
+    if status != CONEFIELD_OK {
+        return Err(handle.ty.failed("resolutions", status, &error.text()));
+    }
+    let wrong = |what: String| Err(handle.ty.failed("resolutions", CONEFIELD_FAILED, &what));
+    let untouched = |v: &f64| v.to_bits() == mark.to_bits();
+    if !cells[count..].iter().all(untouched) {
+        return wrong(format!("it writes past the {count} channels that there are"));
+    }
+    cells.truncate(count);
+    match cells.iter().position(|v| !(v.is_finite() && *v > 0.0) || untouched(v)) {
+        Some(c) if untouched(&cells[c]) => wrong(format!("channel {c} of {count} is left unwritten")),
+        Some(c) => wrong(format!("channel {c} of {count} tells {} cells apart", cells[c])),
+        None => Ok(Some(cells)),
+    }
+}
+
 /// Channel-major rows, as a library sees them.
 trait Across<T> {
     fn across(self, rows: usize) -> T;
 }
 
-macro_rules! kernel {
-    ($real:ty, $forward:ident $backward:ident, $tile:ident $tile_mut:ident $grads:ident, $($passes:item)*) => {
+macro_rules! across {
+    ($($real:ty, $tile:ident $tile_mut:ident;)*) => {$(
         impl Across<$tile> for &[$real] {
             fn across(self, rows: usize) -> $tile {
                 $tile { data: self.as_ptr(), channels: self.len() / rows, rows, stride: rows }
@@ -273,24 +329,44 @@ macro_rules! kernel {
                 $tile_mut { data: self.as_mut_ptr(), channels: self.len() / rows, rows, stride: rows }
             }
         }
+    )*};
+}
 
-        impl Kernel<$real> for MapStage {
-            fn forward(&self, params: &[$real], x: Tile<'_, $real>, y: TileMut<'_, $real>, tape: TileMut<'_, $real>) {
+across! {
+    f32, ConefieldTile ConefieldTileMut;
+    f64, ConefieldTile64 ConefieldTileMut64;
+}
+
+/// Calls a function of the library, which is told the format of halves where there is one.
+macro_rules! call {
+    ($f:ident, $stage:expr, ($($format:expr)?), $($rest:expr),*) => {
+        $f($stage, $($format,)? $($rest),*)
+    };
+}
+
+/// A kernel in `$real` on parameters that stand as `$param`, which the library's functions are told by `$format`.
+macro_rules! kernel {
+    (
+        $real:ty, $param:ty, $tile_mut:ident $grads:ident,
+        $forward:ident $backward:ident $format:tt $(passes: $forward_pass:ident)?
+    ) => {
+        impl Kernel<$real, $param> for MapStage {
+            fn forward(&self, params: &[$param], x: Tile<'_, $real>, y: TileMut<'_, $real>, tape: TileMut<'_, $real>) {
                 let rows = x.rows;
                 let mut error = Text::new();
                 // SAFETY: the stage is alive, and every pointer goes with the length of what it leads to.
                 let status = self.map.$forward.map_or(CONEFIELD_UNSUPPORTED, |f| unsafe {
                     let (x, out, tape) = (x.data.across(rows), y.data.across(rows), tape.data.across(rows));
-                    f(self.handle.stage, params.as_ptr(), x, out, tape, error.room())
+                    call!(f, self.handle.stage, $format, params.as_ptr().cast(), x, out, tape, error.room())
                 });
-                if !self.settle("forward", status, &error) {
+                if !self.settle(stringify!($forward), status, &error) {
                     y.data.fill(<$real>::NAN);
                 }
             }
 
             fn backward(
                 &self,
-                params: &[$real],
+                params: &[$param],
                 x: Tile<'_, $real>,
                 tape: TileMut<'_, $real>,
                 dy: Tile<'_, $real>,
@@ -306,43 +382,57 @@ macro_rules! kernel {
                     let dx = dx.as_mut().map_or(nowhere, |dx| dx.data.across(rows));
                     let (start, length) = (grads.range.start, grads.values.len());
                     let grads = $grads { data: grads.values.as_mut_ptr(), start, length };
-                    f(self.handle.stage, params.as_ptr(), x, tape, dy, grads, dx, error.room())
+                    call!(f, self.handle.stage, $format, params.as_ptr().cast(), x, tape, dy, grads, dx, error.room())
                 });
-                if !self.settle("backward", status, &error)
+                if !self.settle(stringify!($backward), status, &error)
                     && let Some(dx) = dx
                 {
                     dx.data.fill(<$real>::NAN);
                 }
             }
 
-            $($passes)*
+            $(
+                fn passes(&self) -> usize {
+                    self.passes
+                }
+
+                fn forward_pass(
+                    &self,
+                    pass: usize,
+                    params: &[$param],
+                    x: Tile<'_, $real>,
+                    y: TileMut<'_, $real>,
+                    tape: TileMut<'_, $real>,
+                ) {
+                    let Some(f) = self.map.$forward_pass.filter(|_| self.passes > 1) else {
+                        return self.forward(params, x, y, tape);
+                    };
+                    let rows = x.rows;
+                    let mut error = Text::new();
+                    // SAFETY: as for `forward`.
+                    let status = unsafe {
+                        let (x, out, tape) = (x.data.across(rows), y.data.across(rows), tape.data.across(rows));
+                        call!(f, self.handle.stage, $format, pass, params.as_ptr().cast(), x, out, tape, error.room())
+                    };
+                    if !self.settle(stringify!($forward_pass), status, &error) {
+                        y.data.fill(<$real>::NAN);
+                    }
+                }
+            )?
         }
     };
 }
 
+kernel! { f32, f32, ConefieldTileMut ConefieldGrads, forward backward () passes: forward_pass }
+kernel! { f64, f64, ConefieldTileMut64 ConefieldGrads64, forward_f64 backward_f64 () }
 kernel! {
-    f32, forward backward, ConefieldTile ConefieldTileMut ConefieldGrads,
-    fn passes(&self) -> usize {
-        self.passes
-    }
-
-    fn forward_pass(&self, pass: usize, params: &[f32], x: Tile<'_, f32>, y: TileMut<'_, f32>, tape: TileMut<'_, f32>) {
-        let Some(f) = self.map.forward_pass.filter(|_| self.passes > 1) else {
-            return self.forward(params, x, y, tape);
-        };
-        let rows = x.rows;
-        let mut error = Text::new();
-        // SAFETY: as for `forward`.
-        let status = unsafe {
-            let (x, out, tape) = (x.data.across(rows), y.data.across(rows), tape.data.across(rows));
-            f(self.handle.stage, pass, params.as_ptr(), x, out, tape, error.room())
-        };
-        if !self.settle("forward_pass", status, &error) {
-            y.data.fill(f32::NAN);
-        }
-    }
+    f32, F16, ConefieldTileMut ConefieldGrads,
+    forward_halves backward_halves (CONEFIELD_F16) passes: forward_pass_halves
 }
-kernel! { f64, forward_f64 backward_f64, ConefieldTile64 ConefieldTileMut64 ConefieldGrads64, }
+kernel! {
+    f32, Bf16, ConefieldTileMut ConefieldGrads,
+    forward_halves backward_halves (CONEFIELD_BF16) passes: forward_pass_halves
+}
 
 impl Stage for MapStage {
     fn info(&self) -> Info {
@@ -367,6 +457,10 @@ impl Stage for MapStage {
 
     fn reference(&self) -> Option<&dyn Kernel<f64>> {
         self.double.then_some(self as _)
+    }
+
+    fn halves(&self) -> Option<Halves<'_>> {
+        self.halves.then(|| Halves::of(self))
     }
 
     fn partition(&self) -> Vec<Range<usize>> {
@@ -394,6 +488,10 @@ impl Encoder for MapStage {
 
     fn coarse_to_fine(&self) -> bool {
         self.coarse_to_fine
+    }
+
+    fn resolutions(&self) -> Option<Vec<f64>> {
+        self.resolutions.clone()
     }
 }
 

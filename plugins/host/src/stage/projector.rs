@@ -6,7 +6,7 @@ use super::{Fault, fragment};
 use crate::library::{Functions, Handle, Text, Type};
 use crate::trial;
 use conefield_core::error::Result;
-use conefield_core::stage::{Projector, Samples, UnitRay};
+use conefield_core::stage::{Lengths, Projector, Samples, UnitRay};
 use conefield_core::wgsl::Fragment;
 use conefield_plugin_abi::*;
 use serde_json::Value;
@@ -27,20 +27,7 @@ pub struct ProjectorStage {
 /// Makes a projector and tries it out.
 pub(crate) fn build(ty: &Arc<Type>, settings: &Value) -> Result<ProjectorStage> {
     let (own, settings) = (ty.clone(), settings.clone());
-    trial::timed(ty, move || {
-        let handle = own.create(&settings, 0)?;
-        let Functions::Projector(functions) = own.functions else {
-            return Err(own.failed("create", CONEFIELD_FAILED, "it is no projector"));
-        };
-        let describe = handle.describe();
-        let stage = ProjectorStage { handle, functions, describe, fault: Fault::default() };
-        trial::projector(&own, |ray, seed, guard| {
-            let mut samples = Samples::default();
-            stage.sample_guarded(ray, seed, guard, &mut samples)?;
-            Ok(stage.integrate(&samples.weights, &vec![1.0; samples.weights.len()]))
-        })?;
-        Ok(stage)
-    })
+    trial::timed(ty, move || ProjectorStage::tried(own.create(&settings, 0)?))
 }
 
 fn raw(ray: &UnitRay) -> ConefieldRay {
@@ -49,6 +36,21 @@ fn raw(ray: &UnitRay) -> ConefieldRay {
 }
 
 impl ProjectorStage {
+    /// The projector behind `handle`, tried out.
+    fn tried(handle: Handle) -> Result<Self> {
+        let Functions::Projector(functions) = handle.ty.functions else {
+            return Err(handle.ty.failed("create", CONEFIELD_FAILED, "it is no projector"));
+        };
+        let describe = handle.describe();
+        let stage = Self { handle, functions, describe, fault: Fault::default() };
+        trial::projector(stage.ty(), |ray, seed, guard| {
+            let mut samples = Samples::default();
+            stage.sample_guarded(ray, seed, guard, &mut samples)?;
+            Ok(stage.integrate(&samples.weights, &vec![1.0; samples.weights.len()]))
+        })?;
+        Ok(stage)
+    }
+
     /// The type that it is of.
     fn ty(&self) -> &Type {
         &self.handle.ty
@@ -148,6 +150,29 @@ impl Projector for ProjectorStage {
             },
             None => dmu.iter_mut().zip(weights).for_each(|(d, &w)| *d = f64::from(w) * dline),
         }
+    }
+
+    fn fitted(&self, lengths: Lengths) -> Result<Option<Box<dyn Projector>>> {
+        let Some(fitted) = self.functions.fitted else { return Ok(None) };
+        let Lengths { voxel_mm, cell_mm } = lengths;
+        let lengths = ConefieldLengths { voxel_mm, cell_mm: cell_mm.unwrap_or(0.0) };
+        let mut stage = ptr::null_mut();
+        let mut error = Text::new();
+        // SAFETY: the stage is alive; everything handed over lives for the time of the call.
+        let status = unsafe { fitted(self.handle.stage, &lengths, &mut stage, error.room()) };
+        if status != CONEFIELD_OK {
+            return Err(self.ty().refusal("fitted", status, &error.text()));
+        }
+        if stage.is_null() {
+            return Ok(None);
+        }
+        if stage == self.handle.stage {
+            let what = "it handed itself back instead of a new stage";
+            return Err(self.ty().failed("fitted", CONEFIELD_FAILED, what));
+        }
+        let handle = Handle { ty: self.handle.ty.clone(), stage };
+        let ty = handle.ty.clone();
+        Ok(Some(Box::new(trial::timed(&ty, move || Self::tried(handle))?)))
     }
 
     fn fault(&self) -> Result<()> {

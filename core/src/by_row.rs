@@ -1,0 +1,241 @@
+//! Stages that are written for one row at a time: the short way to an encoder, a normalizer or a field.
+//!
+//! [`RowMap`] says what becomes of the channels of one row, and of their gradients. [`ByRow`] makes a whole [`Stage`] of
+//! it: it runs on tiles, is checked in double precision, reads parameters in halves, and leaves out channels for masks. A
+//! stage that must be as fast as it can be is written against [`Stage`] and [`Kernel`] instead.
+
+use crate::error::{Error, Result};
+use crate::half::Stored;
+use crate::simd::Real;
+use crate::stage::{
+    Encoder, Field, GradKind, Grads, Halves, Info, Kernel, Normalizer, Parameter, Reduced, Scope, Stage, Tile, TileMut,
+};
+use crate::wgsl::Fragment;
+use std::ops::Range;
+use std::sync::Arc;
+
+/// Up to so many parameters each worker sums gradients in a copy of its own. Of more, one worker sums all.
+const FEW: usize = 1 << 20;
+
+/// A map of the channels of one row. One source serves `f32`, `f64` and parameters in halves: `params[i].value()` is
+/// parameter `i`.
+pub trait RowMap: Send + Sync + 'static {
+    /// Channels in and channels out. An encoder has 3 in, a field 1 out.
+    fn widths(&self) -> [usize; 2];
+
+    /// Name and shape of each block of parameters, in order.
+    fn parameters(&self) -> Vec<(String, Vec<usize>)> {
+        vec![]
+    }
+
+    /// Fills `params` with first values, the same for the same `seed`.
+    fn init(&self, seed: u64, params: &mut [f32]) {
+        let _ = (seed, params);
+    }
+
+    /// Writes the channels that come out for those that go in. `y` is 0 before.
+    fn forward<R: Real>(&self, params: &[impl Stored<R>], x: &[R], y: &mut [R]);
+
+    /// Given `dy = ∂L/∂y`: adds `∂L/∂params` to `grads` and `∂L/∂x` to `dx`, which is 0 before.
+    fn backward<R: Real>(&self, params: &[impl Stored<R>], x: &[R], dy: &[R], grads: &mut Sums<'_, R>, dx: &mut [R]);
+
+    /// A line for `explain` that begins with the name of the type.
+    fn describe(&self) -> String;
+
+    /// Multiply-adds of a forward pass, for `explain`.
+    fn macs(&self) -> usize {
+        let [input, output] = self.widths();
+        input * output
+    }
+
+    /// As [`Encoder::coarse_to_fine`].
+    fn coarse_to_fine(&self) -> bool {
+        false
+    }
+
+    /// As [`Encoder::resolutions`].
+    fn resolutions(&self) -> Option<Vec<f64>> {
+        None
+    }
+
+    /// As [`Stage::wgsl`].
+    fn wgsl(&self) -> Option<Fragment> {
+        None
+    }
+}
+
+/// Sums of the gradients of parameters.
+pub struct Sums<'a, R>(Grads<'a, R>);
+
+impl<R: Real> Sums<'_, R> {
+    /// Adds `value` to the gradient of parameter `index`.
+    #[inline(always)]
+    pub fn add(&mut self, index: usize, value: R) {
+        // Others are summed by another worker.
+        if self.0.range.contains(&index) {
+            self.0.values[index - self.0.range.start] += value;
+        }
+    }
+}
+
+/// The stage of a [`RowMap`].
+pub struct ByRow<T> {
+    map: Arc<T>,
+    /// Which of the map's channels go in; those that do not are 0.
+    inputs: Vec<usize>,
+    /// Which of the map's channels come out.
+    outputs: Vec<usize>,
+}
+
+impl<T: RowMap> ByRow<T> {
+    /// The stage of `map`.
+    pub fn new(map: T) -> Self {
+        let [input, output] = map.widths();
+        Self { map: Arc::new(map), inputs: (0..input).collect(), outputs: (0..output).collect() }
+    }
+
+    /// The whole of parameters: a smaller stage keeps them all.
+    fn params(&self) -> Vec<Range<usize>> {
+        vec![0..self.info().params]
+    }
+
+    /// The stage that computes only the outputs `keep`.
+    fn without_outputs(&self, keep: &[usize]) -> (Self, Vec<Range<usize>>, Vec<usize>) {
+        let outputs = keep.iter().map(|&c| self.outputs[c]).collect();
+        let stage = Self { map: self.map.clone(), inputs: self.inputs.clone(), outputs };
+        (stage, self.params(), (0..self.inputs.len()).collect())
+    }
+
+    /// Row `i` of `from`, put at `places` of `to`.
+    #[inline(always)]
+    fn take<R: Real>(from: Tile<'_, R>, i: usize, places: &[usize], to: &mut [R]) {
+        for (c, &place) in places.iter().enumerate() {
+            to[place] = from.data[c * from.rows + i];
+        }
+    }
+}
+
+impl<T: RowMap, R: Real, P: Stored<R>> Kernel<R, P> for ByRow<T> {
+    fn forward(&self, params: &[P], x: Tile<'_, R>, y: TileMut<'_, R>, _: TileMut<'_, R>) {
+        let [mut row, mut out] = self.map.widths().map(|n| vec![R::ZERO; n]);
+        for i in 0..x.rows {
+            Self::take(x, i, &self.inputs, &mut row);
+            out.fill(R::ZERO);
+            self.map.forward(params, &row, &mut out);
+            for (c, &place) in self.outputs.iter().enumerate() {
+                y.data[c * y.rows + i] = out[place];
+            }
+        }
+    }
+
+    fn backward(
+        &self,
+        params: &[P],
+        x: Tile<'_, R>,
+        _: TileMut<'_, R>,
+        dy: Tile<'_, R>,
+        grads: Grads<'_, R>,
+        mut dx: Option<TileMut<'_, R>>,
+    ) {
+        let [mut row, mut d] = self.map.widths().map(|n| vec![R::ZERO; n]);
+        let (mut slope, mut grads) = (row.clone(), Sums(grads));
+        for i in 0..x.rows {
+            Self::take(x, i, &self.inputs, &mut row);
+            Self::take(dy, i, &self.outputs, &mut d);
+            slope.fill(R::ZERO);
+            self.map.backward(params, &row, &d, &mut grads, &mut slope);
+            if let Some(dx) = &mut dx {
+                for (c, &place) in self.inputs.iter().enumerate() {
+                    dx.data[c * dx.rows + i] = slope[place];
+                }
+            }
+        }
+    }
+}
+
+impl<T: RowMap> Stage for ByRow<T> {
+    fn info(&self) -> Info {
+        let params = self.parameters().last().map_or(0, |p| p.range().end);
+        let grads = match params {
+            0 => GradKind::None,
+            1..=FEW => GradKind::Dense,
+            _ => GradKind::Scatter,
+        };
+        let (input, output, macs) = (self.inputs.len(), self.outputs.len(), self.map.macs());
+        Info { input, output, params, tape: 0, scope: Scope::Row, grads, macs, identity: false }
+    }
+
+    fn parameters(&self) -> Vec<Parameter> {
+        let blocks = self.map.parameters().into_iter();
+        let place = |start: &mut usize, (name, shape): (String, Vec<usize>)| {
+            let parameter = Parameter { name, shape, start: *start };
+            *start = parameter.range().end;
+            Some(parameter)
+        };
+        blocks.scan(0, place).collect()
+    }
+
+    fn init(&self, seed: u64, params: &mut [f32]) {
+        self.map.init(seed, params);
+    }
+
+    fn kernel(&self) -> &dyn Kernel<f32> {
+        self
+    }
+
+    fn reference(&self) -> Option<&dyn Kernel<f64>> {
+        Some(self)
+    }
+
+    fn halves(&self) -> Option<Halves<'_>> {
+        Some(Halves::of(self))
+    }
+
+    /// Of the whole map: a smaller stage runs on the CPU.
+    fn wgsl(&self) -> Option<Fragment> {
+        let [input, output] = self.map.widths();
+        let whole = [self.inputs.len(), self.outputs.len()] == [input, output];
+        self.map.wgsl().filter(|_| whole)
+    }
+
+    fn describe(&self) -> String {
+        let [_, all] = self.map.widths();
+        let (what, kept) = (self.map.describe(), self.outputs.len());
+        if kept == all { what } else { format!("{what}, {kept} of {all} channels") }
+    }
+}
+
+impl<T: RowMap> Encoder for ByRow<T> {
+    fn keep_outputs(&self, keep: &[usize]) -> Result<Reduced<dyn Encoder>> {
+        let (stage, params, channels) = self.without_outputs(keep);
+        Ok(Reduced { stage: Box::new(stage), params, channels })
+    }
+
+    fn coarse_to_fine(&self) -> bool {
+        self.map.coarse_to_fine()
+    }
+
+    fn resolutions(&self) -> Option<Vec<f64>> {
+        let all = self.map.resolutions()?;
+        Some(self.outputs.iter().map(|&c| all[c]).collect())
+    }
+}
+
+impl<T: RowMap> Normalizer for ByRow<T> {
+    fn keep_inputs(&self, _: &[usize]) -> Result<Reduced<dyn Normalizer>> {
+        Err(Error::unsupported(self.describe(), "this normalizer cannot do without some of its inputs"))
+    }
+
+    fn keep_outputs(&self, keep: &[usize]) -> Result<Reduced<dyn Normalizer>> {
+        let (stage, params, channels) = self.without_outputs(keep);
+        Ok(Reduced { stage: Box::new(stage), params, channels })
+    }
+}
+
+impl<T: RowMap> Field for ByRow<T> {
+    fn keep_inputs(&self, keep: &[usize]) -> Result<Reduced<dyn Field>> {
+        let inputs = keep.iter().map(|&c| self.inputs[c]).collect();
+        let stage = Self { map: self.map.clone(), inputs, outputs: self.outputs.clone() };
+        Ok(Reduced { stage: Box::new(stage), params: self.params(), channels: (0..self.outputs.len()).collect() })
+    }
+}
