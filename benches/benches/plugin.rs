@@ -8,7 +8,7 @@ use conefield_benches::{rays, spread};
 use conefield_core::backend::{Adam, Backend, Executable, Loss, TrainRay, Work};
 use conefield_core::pipeline::{Model, Pipeline};
 use conefield_core::settings::{EncoderSpec, FieldSpec, NormalizerSpec, ProjectorSpec};
-use conefield_core::spec::{stage};
+use conefield_core::spec::stage;
 use conefield_core::stage::Encoder;
 use conefield_encoders::hash_grid::HashGrid;
 use conefield_fields::mlp::Mlp;

@@ -274,7 +274,8 @@ mod tests {
     #[test]
     fn only_what_fits_is_offered() {
         let plan = Fixed(1 << 22);
-        let tables = || [(18, 1 << 21), (17, 1 << 20)].map(|(b, n)| (b, Box::new(Fixed(n)) as Box<dyn Plan>)).into_iter();
+        let tables =
+            || [(18, 1 << 21), (17, 1 << 20)].map(|(b, n)| (b, Box::new(Fixed(n)) as Box<dyn Plan>)).into_iter();
         let found = run().smaller(&plan, 400 << 20, tables());
         assert_eq!(found, ["a run without --reference", "a volume of 256³ voxels"]);
         let alone = Run { reference: false, ..run() };

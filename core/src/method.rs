@@ -285,6 +285,11 @@ pub trait Plan: Send {
         None
     }
 
+    /// Whether [`Job::start`] means something to it.
+    fn starts_from_volume(&self) -> bool {
+        true
+    }
+
     /// Passes over the views that it makes at most, of an iterative method that counts them.
     fn passes(&self) -> Option<u64> {
         None

@@ -3,8 +3,8 @@
 use conefield_core::error::{Error, Result, ensure};
 use conefield_core::half::{Bf16, F16};
 use conefield_core::random::mix;
-use conefield_core::simd::Real;
 use conefield_core::settings::EncoderSpec;
+use conefield_core::simd::Real;
 use conefield_core::stage::{
     Encoder, GradKind, Grads, Halves, Info, Kernel, Parameter, Reduced, Scope, Stage, Tile, TileMut,
 };

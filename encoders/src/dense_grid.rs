@@ -9,8 +9,8 @@ use crate::levels::{LevelCode, by_channel, functions};
 use conefield_core::error::{Error, Result, ensure};
 use conefield_core::half::Stored;
 use conefield_core::random::{mix, unit};
-use conefield_core::simd::{Op, Real, Simd, run};
 use conefield_core::settings::EncoderSpec;
+use conefield_core::simd::{Op, Real, Simd, run};
 use conefield_core::stage::{
     Encoder, GradKind, Grads, Halves, Info, Kernel, Parameter, Reduced, Scope, Stage, Tile, TileMut,
 };

@@ -6,8 +6,8 @@
 //! coordinates (with `include_input`), then of every band `sin x, sin y, sin z, cos x, cos y, cos z`.
 
 use conefield_core::error::{Result, ensure};
-use conefield_core::simd::{Op, Real, Select, Simd, SimdBase, SimdFloat, V, load, run, store};
 use conefield_core::settings::EncoderSpec;
+use conefield_core::simd::{Op, Real, Select, Simd, SimdBase, SimdFloat, V, load, run, store};
 use conefield_core::stage::{Encoder, GradKind, Grads, Info, Kernel, Parameter, Reduced, Scope, Stage, Tile, TileMut};
 use conefield_core::wgsl::{Fragment, functions};
 use schemars::JsonSchema;

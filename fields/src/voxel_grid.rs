@@ -6,8 +6,8 @@
 use crate::mlp::{ACTIVATION, Activation, activate};
 use conefield_core::error::{Error, Result, ensure};
 use conefield_core::half::Stored;
-use conefield_core::simd::{Op, Real, Simd, run};
 use conefield_core::settings::FieldSpec;
+use conefield_core::simd::{Op, Real, Simd, run};
 use conefield_core::stage::{
     Field, GradKind, Grads, Halves, Info, Kernel, Parameter, Reduced, Scope, Stage, Tile, TileMut,
 };

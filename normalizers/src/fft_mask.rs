@@ -15,8 +15,8 @@
 
 use conefield_core::error::{Error, Result, ensure};
 use conefield_core::random::{mix, unit};
-use conefield_core::simd::Real;
 use conefield_core::settings::NormalizerSpec;
+use conefield_core::simd::Real;
 use conefield_core::stage::{
     GradKind, Grads, Info, Kernel, Mask, Normalizer, Parameter, Probe, Reduced, Scope as Reach, Stage, Tile, TileMut,
 };

@@ -8,8 +8,8 @@
 
 use conefield_core::dense::total;
 use conefield_core::error::{Result, ensure};
-use conefield_core::simd::{Op, Real, Select, Simd, SimdBase, SimdFloat, V, load, run, store};
 use conefield_core::settings::NormalizerSpec;
+use conefield_core::simd::{Op, Real, Select, Simd, SimdBase, SimdFloat, V, load, run, store};
 use conefield_core::stage::{
     GradKind, Grads, Info, Kernel, Normalizer, Parameter, Reduced, Scope, Stage, Tile, TileMut,
 };

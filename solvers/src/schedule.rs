@@ -46,7 +46,7 @@ impl Decay {
             Decay::Exponential(last) | Decay::Cosine(last) => [last, 1.0],
         };
         let good = all.iter().all(|x| x.is_finite() && *x > 0.0);
-        ensure(good, "spec", "solver.decay", format!("{self:?}"), "positive finite numbers")
+        ensure(good, "spec", "decay", format!("{self:?}"), "positive finite numbers")
     }
 }
 

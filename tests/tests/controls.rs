@@ -5,8 +5,8 @@ use conefield_conformance::{Options, check, check_encoder, check_initializer, ch
 use conefield_core::arena::{Arena, InitReport, Layout};
 use conefield_core::geometry::Geometry;
 use conefield_core::half::Stored;
-use conefield_core::simd::Real;
 use conefield_core::settings::Initializer;
+use conefield_core::simd::Real;
 use conefield_core::stage::{
     Encoder, GradKind, Grads, Halves, Info, Kernel, Parameter, Projector, Reduced, Samples, Scope, Stage, Tile,
     TileMut, UnitRay,

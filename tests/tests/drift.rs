@@ -9,9 +9,9 @@ use conefield_core::arena::Weights;
 use conefield_core::backend::Backend;
 use conefield_core::checkpoint::Resume;
 use conefield_core::host;
+use conefield_core::method::{DriftRecord, Job, Record};
 use conefield_core::pipeline::{Model, Pipeline};
 use conefield_core::scene::Scene;
-use conefield_core::method::{DriftRecord, Job, Record};
 use conefield_solvers::drift::{Drift, DriftWatch};
 use serde_json::{Value, json};
 

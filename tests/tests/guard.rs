@@ -9,8 +9,8 @@ use conefield_core::arena::{Arena, Weights};
 use conefield_core::backend::{Adam, Backend, Executable, Explain, StepStats, Work};
 use conefield_core::checkpoint::Resume;
 use conefield_core::error::{Error, Result};
-use conefield_core::pipeline::{Model, Pipeline};
 use conefield_core::method::{Job, Record, Solution};
+use conefield_core::pipeline::{Model, Pipeline};
 use conefield_core::stage::UnitRay;
 use serde_json::{Value, json};
 

@@ -10,12 +10,12 @@ use conefield_backend_cpu::step::Slots;
 use conefield_core::arena::Weights;
 use conefield_core::backend::{Adam, Backend, Loss, TrainRay, Work};
 use conefield_core::half::{Bf16, F16, Half, Stored};
+use conefield_core::method::{Job, Solver};
 use conefield_core::pipeline::{Model, Pipeline};
 use conefield_core::random::{mix, unit};
 use conefield_core::scene::Scene;
-use conefield_core::method::{Job, Solver};
-use conefield_core::settings::{EncoderSpec};
-use conefield_core::spec::{Tables};
+use conefield_core::settings::EncoderSpec;
+use conefield_core::spec::Tables;
 use conefield_core::stage::{Encoder, Info, Kernel, Parameter, Reduced, Stage};
 use serde_json::{Value, json};
 

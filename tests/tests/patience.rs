@@ -5,8 +5,8 @@ mod common;
 use common::{Stop, model, scan, spec};
 use conefield_backend_cpu::Cpu;
 use conefield_core::checkpoint::Resume;
-use conefield_core::scan::Scan;
 use conefield_core::method::{Best, Job, Limits, Record, Solution};
+use conefield_core::scan::Scan;
 use rand::{RngExt, SeedableRng};
 use serde_json::{Value, json};
 

@@ -9,11 +9,11 @@ use conefield_backend_cpu::rows::Kernels;
 use conefield_backend_cpu::step::Slots;
 use conefield_core::arena::Weights;
 use conefield_core::backend::{Loss, TrainRay, TvBlocks, Work};
+use conefield_core::method::{Limits, PretrainJob, Solution};
 use conefield_core::pipeline::{Model, Pipeline};
 use conefield_core::random::{mix, unit};
 use conefield_core::scan::{Scan, Volume};
 use conefield_core::scene::Scene;
-use conefield_core::method::{Limits, PretrainJob, Solution};
 use conefield_core::trained::TrainedField;
 use serde_json::{Value, json};
 

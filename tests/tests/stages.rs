@@ -9,7 +9,7 @@ use conefield_conformance::{
 use conefield_core::arena::Weights;
 use conefield_core::registry::{Kind, names};
 use conefield_core::settings::{EncoderSpec, FieldSpec, InitializerSpec, NormalizerSpec, ProjectorSpec};
-use conefield_core::spec::{Tables};
+use conefield_core::spec::Tables;
 use conefield_core::stage::Stage;
 use serde_json::{Value, json};
 

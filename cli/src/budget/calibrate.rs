@@ -4,9 +4,9 @@
 use crate::files;
 use conefield_core::backend::Backend;
 use conefield_core::geometry::VoxelGrid;
+use conefield_core::method::{Job, Limits, Observer, Plan, Record};
 use conefield_core::parts::Voxels;
 use conefield_core::scan::{Scan, Volume};
-use conefield_core::method::{Job, Limits, Observer, Plan, Record};
 use conefield_core::{Error, Result};
 use conefield_report::MiddleSlices;
 use ndarray::{Array3, s};

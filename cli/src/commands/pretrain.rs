@@ -9,8 +9,8 @@ use crate::{files, method, out, signals, specs};
 use clap::Args;
 use conefield_core::Result;
 use conefield_core::arena::Weights;
-use conefield_core::scan::Volume;
 use conefield_core::method::PretrainJob;
+use conefield_core::scan::Volume;
 use serde_json::json;
 use std::path::PathBuf;
 
@@ -69,12 +69,8 @@ impl PretrainArgs {
         self.memory(outline.parameters() as u64, outline.backend().scratch_bytes as u64)?;
         let read = |name: &String| self.values.apply(files::volume(name)?);
         let volumes: Vec<Volume> = self.volumes.iter().map(read).collect::<Result<_>>()?;
-        let job = PretrainJob {
-            volumes: &volumes,
-            backend: backend.as_ref(),
-            seed: self.seed,
-            limits: self.ends.limits(),
-        };
+        let job =
+            PretrainJob { volumes: &volumes, backend: backend.as_ref(), seed: self.seed, limits: self.ends.limits() };
         signals::listen()?;
         let mut progress = Progress::new("pretrain", None);
         let model = plan.pretrain(&job, &mut progress).map_err(|e| loaded.locate(e))?;

@@ -5,11 +5,11 @@ use crate::build::{cargo, example, library, sources};
 use crate::common::{conefield, done, json, refused, text};
 use conefield_backend_cpu::Cpu;
 use conefield_core::backend::{Backend, Loss, TvBlocks, Work};
+use conefield_core::method::{Job, Limits, Silent};
 use conefield_core::pipeline::{Model, Pipeline};
 use conefield_core::random::{mix, unit};
-use conefield_core::method::{Job, Limits, Silent};
-use conefield_core::spec::stage::read;
 use conefield_core::settings::{EncoderSpec, FieldSpec, NormalizerSpec, ProjectorSpec};
+use conefield_core::spec::stage::read;
 use conefield_core::stage::UnitRay;
 use std::path::{Path, PathBuf};
 

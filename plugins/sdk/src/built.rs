@@ -3,8 +3,8 @@
 use conefield_core::arena::Weights;
 use conefield_core::error::{Error, Result};
 use conefield_core::registry::{Kind, StageType};
-use conefield_core::spec::stage::read;
 use conefield_core::settings::{EncoderSpec, FieldSpec, Initializer, InitializerSpec, NormalizerSpec, ProjectorSpec};
+use conefield_core::spec::stage::read;
 use conefield_core::stage::{Encoder, Field, GradKind, Info, Normalizer, Parameter, Projector, Reduced, Scope, Stage};
 use conefield_plugin_abi::*;
 use serde_json::Value;

@@ -4,9 +4,9 @@
 use crate::kit::{Case, Heard, bodies, geometry, mean, psnr, volume};
 use conefield_core::Error;
 use conefield_core::geometry::VoxelGrid;
+use conefield_core::method::Limits;
 use conefield_core::random::{mix, unit};
 use conefield_core::scan::{Scan, Volume};
-use conefield_core::method::Limits;
 use conefield_projectors::simulate::{ellipsoids, scan_ellipsoids};
 
 /// Types with settings that suit 24 views.

@@ -3,8 +3,8 @@
 use crate::kit::{Case, Heard, bodies, geometry, psnr, spec, volume};
 use conefield_backend_cpu::Cpu;
 use conefield_core::Error;
-use conefield_core::scan::Scan;
 use conefield_core::method::{Limits, Reconstruction};
+use conefield_core::scan::Scan;
 use conefield_core::spec::Scene;
 use conefield_projectors::simulate::{ellipsoids, scan_ellipsoids};
 

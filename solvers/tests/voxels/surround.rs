@@ -3,8 +3,8 @@
 use crate::kit::{Case, Heard, mean, psnr, spec, view};
 use conefield_backend_cpu::Cpu;
 use conefield_core::geometry::{Geometry, VoxelGrid};
-use conefield_core::scan::Scan;
 use conefield_core::method::Job;
+use conefield_core::scan::Scan;
 use conefield_core::scene::SurroundRule;
 use conefield_projectors::simulate::{Ellipsoid, ellipsoids, scan_ellipsoids};
 use conefield_solvers::surround::told;

@@ -8,8 +8,8 @@ use conefield_conformance::{
     check_projector_wgsl, check_wgsl,
 };
 use conefield_core::arena::Weights;
-use conefield_core::registry::{self, Make, Origin};
 use conefield_core::precision::Tables;
+use conefield_core::registry::{self, Make, Origin};
 use conefield_core::stage::{Projector, Stage};
 use conefield_core::{Error, Result};
 use conefield_plugins::library::Type;
