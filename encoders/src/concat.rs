@@ -46,7 +46,7 @@ impl EncoderSpec for Concat {
 }
 
 #[derive(Clone)]
-struct Part {
+struct ConcatMember {
     stage: Arc<dyn Encoder>,
     info: Info,
     /// Its place in the settings, which names its parameters.
@@ -56,7 +56,7 @@ struct Part {
     tape: Range<usize>,
 }
 
-impl Part {
+impl ConcatMember {
     /// What reads its parameters in halves, if it has any.
     fn in_halves<P>(&self, pick: fn(Halves<'_>) -> &dyn Kernel<f32, P>) -> Option<Own<'_, f32, P>> {
         match self.info.params {
@@ -69,7 +69,7 @@ impl Part {
 /// The stage that [`Concat`] builds.
 #[derive(Clone)]
 pub struct ConcatStage {
-    parts: Vec<Part>,
+    parts: Vec<ConcatMember>,
     info: Info,
 }
 
@@ -90,7 +90,7 @@ impl ConcatStage {
         let mut parts = vec![];
         for (number, stage) in stages {
             let i = stage.info();
-            let part = Part {
+            let part = ConcatMember {
                 outputs: info.output..info.output + i.output,
                 params: info.params..info.params + i.params,
                 tape: info.tape..info.tape + i.tape,
@@ -160,7 +160,7 @@ impl<R: Real, P> Own<'_, R, P> {
 }
 
 /// The kernel of a part in one precision.
-type Pick<R, P> = fn(&Part) -> Option<Own<'_, R, P>>;
+type Pick<R, P> = fn(&ConcatMember) -> Option<Own<'_, R, P>>;
 
 fn channels<'a, R: Real>(data: &'a mut [R], range: &Range<usize>, rows: usize) -> TileMut<'a, R> {
     TileMut::new(&mut data[range.start * rows..range.end * rows], rows)
@@ -308,7 +308,7 @@ impl Stage for ConcatStage {
 
     /// The parts' names behind their place, e.g. `1.0.table`.
     fn parameters(&self) -> Vec<Parameter> {
-        let of = |p: &Part| {
+        let of = |p: &ConcatMember| {
             let (number, start) = (p.number, p.params.start);
             let named =
                 move |q: Parameter| Parameter { name: format!("{number}.{}", q.name), start: start + q.start, ..q };
@@ -336,7 +336,7 @@ impl Stage for ConcatStage {
     }
 
     fn partition(&self) -> Vec<Range<usize>> {
-        let of = |p: &Part| {
+        let of = |p: &ConcatMember| {
             let start = p.params.start;
             let ranges = match p.info.grads {
                 GradKind::None => vec![],

@@ -98,7 +98,7 @@ struct Description {
     #[serde(default)]
     layout: LayoutTable,
     #[serde(default)]
-    values: Values,
+    values: ValuesTable,
     volume: VoxelGrid,
 }
 
@@ -187,7 +187,7 @@ enum I0Text {
 
 #[derive(Deserialize, Default)]
 #[serde(deny_unknown_fields)]
-struct Values {
+struct ValuesTable {
     #[serde(default)]
     kind: ValueKind,
     i0: Option<I0Text>,

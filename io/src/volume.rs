@@ -222,7 +222,7 @@ mod tests {
     }
 
     /// Values made where they are asked for, of more voxels than a slab has.
-    struct Ramp {
+    struct RampVoxels {
         largest: usize,
         parts: usize,
     }
@@ -231,7 +231,7 @@ mod tests {
         (at[0] + 200 * at[1] + 40_000 * at[2]) as f32
     }
 
-    impl Voxels for Ramp {
+    impl Voxels for RampVoxels {
         fn grid(&self) -> VoxelGrid {
             VoxelGrid { shape: [200, 190, 180], spacing: [1.0; 3], center: [0.0; 3] }
         }
@@ -250,11 +250,11 @@ mod tests {
     #[test]
     fn every_format_is_written_slab_by_slab_to_the_bytes_of_the_whole() {
         let dir = tempfile::tempdir().unwrap();
-        let whole = Volume::collect(&mut Ramp { largest: 0, parts: 0 }).unwrap();
+        let whole = Volume::collect(&mut RampVoxels { largest: 0, parts: 0 }).unwrap();
         assert_eq!(whole.data[[199, 189, 179]], ramp([199, 189, 179]));
         for end in ["nii", "nii.gz", "mha", "npy"] {
             let [streamed, at_once] = ["streamed", "at_once"].map(|n| dir.path().join(format!("{n}.{end}")));
-            let mut voxels = Ramp { largest: 0, parts: 0 };
+            let mut voxels = RampVoxels { largest: 0, parts: 0 };
             write_voxels(&streamed, &mut voxels).unwrap();
             assert!(voxels.parts > 1 && voxels.largest <= 1 << 22, "{end}");
             assert!(read_volume(&streamed).unwrap().data == whole.data, "{end}");

@@ -153,7 +153,7 @@ struct Backward<'a, R> {
 
 /// What forward found about a vector of rows.
 #[derive(Clone, Copy)]
-struct Found<T> {
+struct RowMoments<T> {
     first: T,
     mean: T,
     root: T,
@@ -162,16 +162,16 @@ struct Found<T> {
 
 impl<R: Real> Backward<'_, R> {
     #[inline(always)]
-    fn found<S: Simd>(&self, s: S, i: usize) -> Found<V<S, R>> {
+    fn found<S: Simd>(&self, s: S, i: usize) -> RowMoments<V<S, R>> {
         let mean = load(s, self.tape.channel(0), i);
         let root = load(s, self.tape.channel(1), i);
         let scale = load(s, self.tape.channel(2), i);
-        Found { first: load(s, self.x.channel(0), i) * scale, mean, root, scale }
+        RowMoments { first: load(s, self.x.channel(0), i) * scale, mean, root, scale }
     }
 
     /// `(x − mean)/deviation` of input `c`, the rows from `i`.
     #[inline(always)]
-    fn normal<S: Simd>(&self, s: S, f: Found<V<S, R>>, c: usize, i: usize) -> V<S, R> {
+    fn normal<S: Simd>(&self, s: S, f: RowMoments<V<S, R>>, c: usize, i: usize) -> V<S, R> {
         ((load(s, self.x.channel(c), i) * f.scale - f.first) - f.mean) * f.root
     }
 }

@@ -49,7 +49,7 @@ pub struct EvaluateArgs {
 
 /// All that was asked for.
 #[derive(Serialize)]
-struct Report {
+struct Evaluation {
     #[serde(flatten)]
     scores: Option<Scores>,
     #[serde(skip_serializing_if = "Option::is_none")]
@@ -72,16 +72,16 @@ impl EvaluateArgs {
     }
 
     /// The agreement of two label maps.
-    fn label_maps(&self) -> Result<Report> {
+    fn label_maps(&self) -> Result<Evaluation> {
         let read =
             |path: &PathBuf| label_map(&path.display().to_string(), conefield_io::read_volume(path)?.data.view());
         let (volume, reference) = (read(&self.volume)?, read(&self.reference)?);
         same_shape(&self.volume.display().to_string(), volume.shape(), reference.shape())?;
-        Ok(Report { scores: None, dice: Some(dice(volume.view(), reference.view())?) })
+        Ok(Evaluation { scores: None, dice: Some(dice(volume.view(), reference.view())?) })
     }
 
     /// The scores of a volume, with the agreement of what the segmenter finds in it and in the reference.
-    fn volumes(&self) -> Result<Report> {
+    fn volumes(&self) -> Result<Evaluation> {
         let volume = conefield_io::read_volume(&self.volume)?;
         let reference = conefield_io::read_volume(&self.reference)?;
         let place = self.volume.display().to_string();
@@ -101,7 +101,7 @@ impl EvaluateArgs {
                 Some(dice(volume.view(), reference.view())?)
             }
         };
-        Ok(Report { scores: Some(scores), dice })
+        Ok(Evaluation { scores: Some(scores), dice })
     }
 
     /// `volume` as the segmenter is to see it.
