@@ -97,6 +97,16 @@ impl Error {
         Self::Io { path: path.as_ref().to_path_buf(), source }
     }
 
+    /// The same error with `key` before its field, where it is about a spec: a stage does not know where it stands there.
+    pub fn within(self, key: &str) -> Self {
+        match self {
+            Self::Invalid { place, field, found, expected } if place == "spec" => {
+                Self::Invalid { place, field: format!("{key}.{field}"), found, expected }
+            }
+            other => other,
+        }
+    }
+
     /// A thing that cannot be done, with the reason.
     pub fn unsupported(what: impl Into<String>, why: impl Into<String>) -> Self {
         Self::Unsupported { what: what.into(), why: why.into() }

@@ -2,6 +2,7 @@
 //!
 //! - [`geometry`], [`scan`], [`parts`]: what was measured, in millimetres, and what comes out.
 //! - [`simd`], [`half`], [`dense`], [`trilinear`], [`stage`]: what a stage computes and how.
+//! - [`loss`], [`prior`]: what training makes small.
 //! - [`support`]: where the object can be.
 //! - [`wgsl`]: the same for a GPU.
 //! - [`arena`]: parameters, gradients and optimizer state under their names.
@@ -20,9 +21,11 @@ pub mod files;
 pub mod geometry;
 pub mod half;
 pub mod host;
+pub mod loss;
 pub mod pages;
 pub mod parts;
 pub mod pipeline;
+pub mod prior;
 pub mod random;
 pub mod registry;
 pub mod scan;

@@ -5,7 +5,9 @@
 //! come from here.
 
 use crate::error::{Error, Result};
-use crate::spec::{EncoderSpec, FieldSpec, InitializerSpec, NormalizerSpec, ProjectorSpec, SolverSpec};
+use crate::spec::{
+    EncoderSpec, FieldSpec, InitializerSpec, LossSpec, NormalizerSpec, PriorSpec, ProjectorSpec, SolverSpec,
+};
 use schemars::Schema;
 use serde_json::Value;
 use std::fmt;
@@ -25,14 +27,26 @@ pub enum Kind {
     Projector,
     /// Where weights come from.
     Initializer,
+    /// Predicted against measured values.
+    Loss,
+    /// What a field is to be like, whatever was measured.
+    Prior,
     /// Scan to volume.
     Solver,
 }
 
 impl Kind {
     /// Every kind, in the order of a pipeline.
-    pub const ALL: [Self; 6] =
-        [Self::Encoder, Self::Normalizer, Self::Field, Self::Projector, Self::Initializer, Self::Solver];
+    pub const ALL: [Self; 8] = [
+        Self::Encoder,
+        Self::Normalizer,
+        Self::Field,
+        Self::Projector,
+        Self::Initializer,
+        Self::Loss,
+        Self::Prior,
+        Self::Solver,
+    ];
 
     /// What it is called in a spec.
     pub fn name(self) -> &'static str {
@@ -42,6 +56,8 @@ impl Kind {
             Self::Field => "field",
             Self::Projector => "projector",
             Self::Initializer => "initializer",
+            Self::Loss => "loss",
+            Self::Prior => "prior",
             Self::Solver => "solver",
         }
     }
@@ -105,6 +121,10 @@ pub enum Make {
     Projector(MakeFn<dyn ProjectorSpec>),
     /// Of an initializer.
     Initializer(MakeFn<dyn InitializerSpec>),
+    /// Of a loss.
+    Loss(MakeFn<dyn LossSpec>),
+    /// Of a prior.
+    Prior(MakeFn<dyn PriorSpec>),
     /// Of a solver.
     Solver(MakeFn<dyn SolverSpec>),
 }
@@ -117,6 +137,8 @@ impl Make {
             Self::Field(_) => Kind::Field,
             Self::Projector(_) => Kind::Projector,
             Self::Initializer(_) => Kind::Initializer,
+            Self::Loss(_) => Kind::Loss,
+            Self::Prior(_) => Kind::Prior,
             Self::Solver(_) => Kind::Solver,
         }
     }

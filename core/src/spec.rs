@@ -1,6 +1,7 @@
 //! What a user writes: a pipeline spec. TOML or JSON, the same types.
 //!
-//! Every stage is a table with a `type`; its other keys are that type's settings. [`crate::registry`] lists the
+//! Every stage is a table with a `type`; its other keys are that type's settings. The name of the type alone stands for
+//! its default settings. [`crate::registry`] lists the
 //! types; [`load`] reads files and says where a mistake stands.
 
 mod check;
@@ -12,6 +13,8 @@ mod tree;
 
 use crate::arena::{Arena, InitReport, Layout, Weights};
 use crate::error::{Error, Result, ensure};
+use crate::loss::Loss;
+use crate::prior::Prior;
 use crate::solver::Solver;
 use crate::stage::{Encoder, Field, Normalizer, Projector};
 use crate::voxel::VoxelProjector;
@@ -295,6 +298,20 @@ pub struct VolumeStart {
     pub path: String,
     /// Steps in which a field learns it; solvers on voxels take it as it is.
     pub steps: u64,
+}
+
+/// Settings of a loss.
+#[typetag::serde(tag = "type")]
+pub trait LossSpec: Send + Sync {
+    /// The loss, or why the settings make none.
+    fn build(&self) -> Result<Box<dyn Loss>>;
+}
+
+/// Settings of a prior of a field.
+#[typetag::serde(tag = "type")]
+pub trait PriorSpec: Send + Sync {
+    /// The prior, or why the settings make none.
+    fn build(&self) -> Result<Box<dyn Prior>>;
 }
 
 /// Settings of a solver.

@@ -48,18 +48,19 @@ fn stage(node: &Node, kind: Kind, path: &str) -> Result<()> {
     if node.kind == Is::Null {
         return Ok(());
     }
-    table(node, path)?;
     let known = names(kind);
     let types = || format!("a type: {}", listed(&known));
-    let Some(name) = node.get("type") else {
-        return Err(invalid(&node.at, &join(path, "type"), "nothing".into(), types()));
-    };
-    let Some(text) = name.text() else {
-        return Err(invalid(&name.at, &join(path, "type"), name.shown(), types()));
-    };
+    // The name of a type stands for its default settings.
+    let alone = node.text().is_some();
+    let at = if alone { path.into() } else { join(path, "type") };
+    let name = if alone { Some(node) } else { node.get("type") };
+    if !alone && !matches!(node.kind, Is::Table(_)) {
+        return Err(invalid(&node.at, path, node.shown(), format!("a table, or the name of {}", types())));
+    }
+    let Some(name) = name else { return Err(invalid(&node.at, &at, "nothing".into(), types())) };
+    let Some(text) = name.text() else { return Err(invalid(&name.at, &at, name.shown(), types())) };
     let Some(found) = find(kind, text) else {
-        let found = format!("no {} type {text:?}", kind.name());
-        return Err(invalid(&name.at, &join(path, "type"), found, suggest(text, &known)));
+        return Err(invalid(&name.at, &at, format!("no {} type {text:?}", kind.name()), suggest(text, &known)));
     };
     let schema = of_type(found);
     let cx = Context::new(&schema, Some(kind));
@@ -212,7 +213,7 @@ fn wanted(schema: &Value, cx: &Context<'_>) -> String {
     let schema = cx.resolve(schema);
     if let Some(kind) = schema[NESTED].as_str().and_then(Kind::named) {
         let article = if kind == Kind::Encoder || kind == Kind::Initializer { "an" } else { "a" };
-        return format!("a table with {article} {} type: {}", kind.name(), listed(&names(kind)));
+        return format!("a table with {article} {} type, or its name: {}", kind.name(), listed(&names(kind)));
     }
     let fixed = constants(schema, cx);
     let mut words: Vec<String> = fixed.iter().map(plain).collect();

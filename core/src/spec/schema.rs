@@ -57,23 +57,26 @@ pub fn pipeline() -> Value {
     for (name, schema) in tables() {
         defs.insert(name.into(), relocated(schema, name));
     }
-    for (_, kind) in STAGES {
+    for kind in Kind::ALL {
         let mut any = vec![];
+        // Types that have defaults for all their settings.
+        let mut alone = vec![];
         for t in stage_types().into_iter().filter(|t| t.kind == kind) {
-            let name = format!("{}.{}", kind.name(), t.name);
-            defs.insert(name.clone(), relocated(of_type(t), &name));
+            let (name, schema) = (format!("{}.{}", kind.name(), t.name), of_type(t));
+            if schema["required"].is_null() {
+                alone.push(t.name);
+            }
+            defs.insert(name.clone(), relocated(schema, &name));
             any.push(json!({ "$ref": format!("#/$defs/{name}") }));
         }
-        defs.insert(
-            kind.name().into(),
-            json!({ "type": "object", "properties": { "type": { "type": "string" } }, "anyOf": any }),
-        );
+        let table = json!({ "type": "object", "properties": { "type": { "type": "string" } }, "anyOf": any });
+        defs.insert(kind.name().into(), json!({ "anyOf": [{ "enum": alone }, table] }));
     }
     let stage = |kind: &str, doc: &str| json!({ "$ref": format!("#/$defs/{kind}"), "description": doc });
     json!({
         "$schema": "https://json-schema.org/draft/2020-12/schema",
         "title": "conefield pipeline",
-        "description": "A reconstruction pipeline. Every stage is a table with a `type`; its other keys are that type's settings. A file that `extends` another may leave out what it does not change.",
+        "description": "A reconstruction pipeline. Every stage is a table with a `type`; its other keys are that type's settings. The name of a type alone stands for its default settings. A file that `extends` another may leave out what it does not change.",
         "type": "object",
         "properties": {
             "$schema": { "type": "string", "description": "Where this schema is." },

@@ -1,13 +1,13 @@
-//! Stages as a spec writes them: a table with a `type`.
+//! Stages as a spec writes them: a table with a `type`, or the name of a type, which stands for its default settings.
 //!
 //! `typetag` reads the types that are linked in. Those of loaded libraries it cannot see, as every library has statics
 //! of its own; [`one`] and [`list`] look their names up at run time.
 
-use super::{EncoderSpec, FieldSpec, InitializerSpec, NormalizerSpec, ProjectorSpec, SolverSpec};
+use super::{EncoderSpec, FieldSpec, InitializerSpec, LossSpec, NormalizerSpec, PriorSpec, ProjectorSpec, SolverSpec};
 use crate::registry::{Kind, Make, MakeFn, Origin, find};
 use serde::Deserialize;
 use serde::de::{DeserializeOwned, Deserializer, Error};
-use serde_json::Value;
+use serde_json::{Value, json};
 
 /// The settings of one kind of stage.
 pub trait Settings {
@@ -39,6 +39,8 @@ settings! {
     Field FieldSpec
     Projector ProjectorSpec
     Initializer InitializerSpec
+    Loss LossSpec
+    Prior PriorSpec
     Solver SolverSpec
 }
 
@@ -47,6 +49,9 @@ pub fn read<T: Settings + ?Sized>(mut value: Value) -> Result<Box<T>, String>
 where
     Box<T>: DeserializeOwned,
 {
+    if let Value::String(name) = value {
+        value = json!({ "type": name });
+    }
     let found = value["type"].as_str().and_then(|name| find(T::KIND, name));
     if let Some(Origin::Loaded { make, .. }) = found.map(|t| &t.origin)
         && let Some(make) = T::made_by(make)
