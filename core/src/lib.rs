@@ -4,6 +4,7 @@
 //! - [`simd`], [`half`], [`dense`], [`trilinear`], [`stage`]: what a stage computes and how.
 //! - [`by_row`]: stages that are written for one row at a time.
 //! - [`support`]: where the object can be; [`scene`]: between the world and what stages see.
+//! - [`loss`], [`prior`]: what training makes small.
 //! - [`wgsl`]: the same for a GPU.
 //! - [`arena`]: parameters, gradients and optimizer state under their names.
 //! - [`files`]: opening what a user or a description names.
@@ -22,12 +23,14 @@ pub mod files;
 pub mod geometry;
 pub mod half;
 pub mod host;
+pub mod loss;
 pub mod method;
 pub mod orbit;
 pub mod pages;
 pub mod parts;
 pub mod pipeline;
 pub mod precision;
+pub mod prior;
 pub mod random;
 pub mod registry;
 pub mod scan;

@@ -5,60 +5,110 @@
 //! come from here.
 
 use crate::error::{Error, Result};
-use crate::settings::{EncoderSpec, FieldSpec, InitializerSpec, NormalizerSpec, ProjectorSpec, VoxelProjectorSpec};
+use crate::settings::{
+    EncoderSpec, FieldSpec, InitializerSpec, LossSpec, NormalizerSpec, PriorSpec, ProjectorSpec, VoxelProjectorSpec,
+};
 use schemars::Schema;
 use serde_json::Value;
 use std::fmt;
 use std::sync::{PoisonError, RwLock};
 
-/// What a spec names: a method, and the kinds of stage that methods put together.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, serde::Serialize)]
-#[serde(rename_all = "kebab-case")]
-pub enum Kind {
-    /// Scan to volume.
-    Method,
-    /// Points to features.
-    Encoder,
-    /// Features to features.
-    Normalizer,
-    /// Features to attenuation.
-    Field,
-    /// Rays to samples of a field.
-    Projector,
-    /// Voxels to line integrals.
-    VoxelProjector,
-    /// Where weights come from.
-    Initializer,
+/// What each kind is called in a spec, its settings, and what it is.
+macro_rules! kinds {
+    (
+        linked { $($(#[$linked_doc:meta])* $linked:ident $linked_name:literal,)* }
+        loadable { $($(#[$doc:meta])* $kind:ident $name:literal $spec:ident,)* }
+    ) => {
+        /// What a spec names: a method, and the kinds of stage that methods put together.
+        #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, serde::Serialize)]
+        #[serde(rename_all = "kebab-case")]
+        pub enum Kind {
+            $($(#[$linked_doc])* $linked,)*
+            $($(#[$doc])* $kind,)*
+        }
+
+        impl Kind {
+            /// Every kind: methods, then their stages in order.
+            pub const ALL: &'static [Self] = &[$(Self::$linked,)* $(Self::$kind,)*];
+
+            /// What it is called in a spec.
+            pub fn name(self) -> &'static str {
+                match self {
+                    $(Self::$linked => $linked_name,)*
+                    $(Self::$kind => $name,)*
+                }
+            }
+        }
+
+        /// [`MakeFn`] of each kind that a library can bring.
+        pub enum Make {
+            $($(#[$doc])* $kind(MakeFn<dyn $spec>),)*
+        }
+
+        impl Make {
+            fn kind(&self) -> Kind {
+                match self {
+                    $(Self::$kind(_) => Kind::$kind,)*
+                }
+            }
+        }
+
+        $(impl Settings for dyn $spec {
+            const KIND: Kind = Kind::$kind;
+
+            fn made_by(make: &Make) -> Option<&MakeFn<Self>> {
+                match make {
+                    Make::$kind(make) => Some(make),
+                    _ => None,
+                }
+            }
+        })*
+    };
+}
+
+kinds! {
+    linked {
+        /// Scan to volume.
+        Method "method",
+        /// What watches over training.
+        Callback "callback",
+    }
+    loadable {
+        /// Points to features.
+        Encoder "encoder" EncoderSpec,
+        /// Features to features.
+        Normalizer "normalizer" NormalizerSpec,
+        /// Features to attenuation.
+        Field "field" FieldSpec,
+        /// Rays to samples of a field.
+        Projector "projector" ProjectorSpec,
+        /// Where weights come from.
+        Initializer "initializer" InitializerSpec,
+        /// Predicted against measured values.
+        Loss "loss" LossSpec,
+        /// What a field is to be like, whatever was measured.
+        Prior "prior" PriorSpec,
+        /// Line integrals of voxels.
+        VoxelProjector "voxel-projector" VoxelProjectorSpec,
+    }
+}
+
+/// The settings of one kind of stage.
+pub trait Settings {
+    /// Which.
+    const KIND: Kind;
+
+    /// How a type of this kind from a library is made; nothing where libraries bring none.
+    fn made_by(make: &Make) -> Option<&MakeFn<Self>> {
+        let _ = make;
+        None
+    }
 }
 
 impl Kind {
-    /// Every kind: methods, then their stages in order.
-    pub const ALL: [Self; 7] = [
-        Self::Method,
-        Self::Encoder,
-        Self::Normalizer,
-        Self::Field,
-        Self::Projector,
-        Self::VoxelProjector,
-        Self::Initializer,
-    ];
-
-    /// What it is called in a spec.
-    pub fn name(self) -> &'static str {
-        match self {
-            Self::Method => "method",
-            Self::Encoder => "encoder",
-            Self::Normalizer => "normalizer",
-            Self::Field => "field",
-            Self::Projector => "projector",
-            Self::VoxelProjector => "voxel-projector",
-            Self::Initializer => "initializer",
-        }
-    }
-
     /// The kind called `name`.
     pub fn named(name: &str) -> Option<Self> {
-        Self::ALL.into_iter().find(|k| k.name() == name)
+        Self::ALL.iter().copied().find(|k| k.name() == name)
     }
 }
 
@@ -102,35 +152,6 @@ pub enum Origin {
 
 /// Makes a stage's settings from what a spec says beside its `type`.
 pub type MakeFn<T> = Box<dyn Fn(Value) -> Result<Box<T>> + Send + Sync>;
-
-/// [`MakeFn`] of each kind.
-pub enum Make {
-    /// Of an encoder.
-    Encoder(MakeFn<dyn EncoderSpec>),
-    /// Of a normalizer.
-    Normalizer(MakeFn<dyn NormalizerSpec>),
-    /// Of a field.
-    Field(MakeFn<dyn FieldSpec>),
-    /// Of a projector.
-    Projector(MakeFn<dyn ProjectorSpec>),
-    /// Of a projector of voxels.
-    VoxelProjector(MakeFn<dyn VoxelProjectorSpec>),
-    /// Of an initializer.
-    Initializer(MakeFn<dyn InitializerSpec>),
-}
-
-impl Make {
-    fn kind(&self) -> Kind {
-        match self {
-            Self::Encoder(_) => Kind::Encoder,
-            Self::Normalizer(_) => Kind::Normalizer,
-            Self::Field(_) => Kind::Field,
-            Self::Projector(_) => Kind::Projector,
-            Self::VoxelProjector(_) => Kind::VoxelProjector,
-            Self::Initializer(_) => Kind::Initializer,
-        }
-    }
-}
 
 impl StageType {
     /// JSON Schema of its settings, without `type`.

@@ -4,6 +4,8 @@
 
 use crate::arena::{Arena, InitReport, Layout, Weights};
 use crate::error::Result;
+use crate::loss::Loss;
+use crate::prior::Prior;
 use crate::stage::{Encoder, Field, Normalizer, Projector};
 use crate::voxel::VoxelProjector;
 
@@ -49,8 +51,28 @@ pub trait InitializerSpec: Send + Sync {
     fn build(&self, weights: &dyn Fn(&str) -> Result<Weights>) -> Result<Box<dyn Initializer>>;
 }
 
+/// Settings of a loss.
+#[typetag::serde(tag = "type")]
+pub trait LossSpec: Send + Sync {
+    /// The loss, or why the settings make none.
+    fn build(&self) -> Result<Box<dyn Loss>>;
+}
+
+/// Settings of a prior.
+#[typetag::serde(tag = "type")]
+pub trait PriorSpec: Send + Sync {
+    /// The prior, or why the settings make none.
+    fn build(&self) -> Result<Box<dyn Prior>>;
+}
+
 /// Brings named weights into the arena.
 pub trait Initializer: Send + Sync {
+    /// Refuses weights that do not fit.
+    fn check(&self, layout: &Layout) -> Result<()> {
+        let _ = layout;
+        Ok(())
+    }
+
     /// Fills what it fills (the stages' own random scheme has run before) and reports it.
     fn apply(&self, layout: &Layout, arena: &mut Arena) -> Result<InitReport>;
 

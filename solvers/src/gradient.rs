@@ -1,79 +1,38 @@
 //! Gradient training: an attenuation field whose Beer-Lambert line integrals match the measured ones.
 //!
-//! Every step draws rays, compares their integrals with the measurement (L1 in the published codes), optionally adds
-//! a total-variation prior on small random blocks of neighbouring points, and takes an Adam step.
+//! Every step draws rays, compares their integrals with the measurement by a loss (L1 in the published codes), adds
+//! the priors on small random blocks of neighbouring points, and takes an Adam step.
 
 use crate::drift::{Drift, DriftWatch};
 use crate::fit::{Fitted, fit};
 use crate::guard::{Guard, Watched, strayed};
+use crate::iterative::noise::{self, Noise};
 use crate::iterative::start_volume;
+use crate::losses::L1;
 use crate::patience::{Patience, Waited};
 use crate::pretrain::learn;
+use crate::priors::Places;
 use crate::rays::{Pixels, RaySource, Views};
 use crate::schedule::{Clock, Decay, Ends};
 use crate::surround::Within;
 use crate::watched;
-use conefield_core::backend::{Adam, Executable, Loss, TrainRay, TvBlocks, Work};
+use conefield_core::backend::{Adam, Executable, TrainRay, Work};
 use conefield_core::checkpoint::{Checkpoint, Resume, Standing, tensors};
 use conefield_core::error::{Error, Result, ensure};
+use conefield_core::loss::{Loss, NoiseModel};
 use conefield_core::pipeline::{Masked, Model, Pipeline};
-use conefield_core::random::stream;
+use conefield_core::prior::Prior;
 use conefield_core::scene::Scene;
 use conefield_core::solver::{DriftRecord, Job, Observer, PretrainJob, Reconstruction, Record, Solution, Solver};
-use conefield_core::spec::{SolverSpec, Spec};
+use conefield_core::spec::{LossSpec, PriorSpec, SolverSpec, Spec};
 use conefield_core::stage::{Projector, UnitRay};
 use conefield_core::trained::TrainedField;
-use rand::RngExt;
-use schemars::JsonSchema;
+use schemars::{JsonSchema, Schema, SchemaGenerator, json_schema};
 use serde::{Deserialize, Serialize};
 use std::time::Instant;
 
-/// Penalty of the difference between predicted and measured, in the scan's own scale.
-#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize, JsonSchema)]
-#[serde(rename_all = "kebab-case")]
-pub enum Penalty {
-    /// Absolute difference (published by NI-NeRF).
-    L1,
-    /// Half the square (published by NAF, up to the factor).
-    L2,
-    /// Half the square up to this difference, linear beyond it.
-    Huber(f64),
-}
-
-impl From<Penalty> for Loss {
-    fn from(p: Penalty) -> Self {
-        match p {
-            Penalty::L1 => Loss::L1,
-            Penalty::L2 => Loss::L2,
-            Penalty::Huber(delta) => Loss::Huber { delta },
-        }
-    }
-}
-
-/// Total variation of the field over small random blocks of neighbouring points.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
-#[serde(deny_unknown_fields, default)]
-pub struct TvPrior {
-    /// Weight against the mean penalty of a ray.
-    pub weight: f64,
-    /// Blocks a step.
-    pub blocks: usize,
-    /// Points along a block's edge.
-    pub edge: usize,
-    /// Distance of the points in voxels.
-    pub spacing: f64,
-    /// Differences below this (in the scale that stages see) count quadratically.
-    pub smoothing: f64,
-}
-
-impl Default for TvPrior {
-    fn default() -> Self {
-        Self { weight: 1e-3, blocks: 64, edge: 8, spacing: 1.0, smoothing: 1e-4 }
-    }
-}
-
 /// Settings of `gradient`.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
+#[derive(Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields, default)]
 pub struct Gradient {
     /// Ends after this many passes over the views.
@@ -94,8 +53,10 @@ pub struct Gradient {
     pub pixels: Pixels,
     /// Pixels by which the support is widened.
     pub margin: usize,
-    /// Penalty of the difference between predicted and measured.
-    pub loss: Penalty,
+    /// What a difference between predicted and measured costs.
+    #[serde(deserialize_with = "conefield_core::spec::stage::needed")]
+    #[schemars(schema_with = "loss")]
+    pub loss: Box<dyn LossSpec>,
     /// Learning rate.
     pub lr: f64,
     /// How it goes down.
@@ -104,8 +65,10 @@ pub struct Gradient {
     pub betas: [f64; 2],
     /// Adam's ε.
     pub eps: f64,
-    /// Total-variation prior, if any.
-    pub tv: Option<TvPrior>,
+    /// What the field is to be like, whatever was measured.
+    #[serde(deserialize_with = "conefield_core::spec::stage::list")]
+    #[schemars(schema_with = "list_of_priors")]
+    pub priors: Vec<Box<dyn PriorSpec>>,
     /// While a scan is reconstructed, logs how much normalizers and field change under the same features, if asked for.
     pub drift: Option<Drift>,
     /// Times that a run may go back to its last good state, with half the learning rate, when its loss runs away or is no
@@ -130,12 +93,12 @@ impl Default for Gradient {
             views: Views::All,
             pixels: Pixels::Support,
             margin: 8,
-            loss: Penalty::L1,
+            loss: Box::new(L1 {}),
             lr: 1e-3,
             decay: Decay::Exponential(0.1),
             betas: [0.9, 0.999],
             eps: 1e-8,
-            tv: None,
+            priors: vec![],
             drift: None,
             rollbacks: 8,
             report_every: 50,
@@ -143,6 +106,14 @@ impl Default for Gradient {
             pretrain_steps: 1000,
         }
     }
+}
+
+fn loss(_: &mut SchemaGenerator) -> Schema {
+    json_schema!({ "x-stage": "loss" })
+}
+
+fn list_of_priors(_: &mut SchemaGenerator) -> Schema {
+    json_schema!({ "type": "array", "items": { "x-stage": "prior" } })
 }
 
 conefield_core::stage_type!(Solver, "gradient", Gradient, "stochastic gradient training of an attenuation field");
@@ -173,29 +144,41 @@ impl SolverSpec for Gradient {
                 ensure(positive(x), place, &format!("solver.{name}"), x, "a positive finite number")?;
             }
         }
-        if let Penalty::Huber(delta) = self.loss {
-            ensure(positive(delta), place, "solver.loss", delta, "a positive finite number")?;
-        }
-        if let Some(tv) = &self.tv {
-            ensure((2..=32).contains(&tv.edge), place, "solver.tv.edge", tv.edge, "2 to 32")?;
-            ensure(tv.weight.is_finite() && tv.weight >= 0.0, place, "solver.tv.weight", tv.weight, "0 or more")?;
-            ensure(positive(tv.spacing), place, "solver.tv.spacing", tv.spacing, "a positive finite number")?;
-            ensure(positive(tv.smoothing), place, "solver.tv.smoothing", tv.smoothing, "a positive finite number")?;
-            ensure((1..=1 << 16).contains(&tv.blocks), place, "solver.tv.blocks", tv.blocks, "1 to 65536")?;
-        }
         let points = self.pretrain_points;
         ensure((1..=1 << 22).contains(&points), place, "solver.pretrain_points", points, "1 to 2^22")?;
         self.decay.validate()?;
         self.drift.as_ref().map_or(Ok(()), Drift::validate)?;
-        Ok(Box::new(self.clone()))
+        let loss = self.loss.build().map_err(|e| e.within("solver.loss"))?;
+        let prior = |(i, spec): (usize, &Box<dyn PriorSpec>)| {
+            let prior = spec.build().and_then(|p| p.blocks().validate().map(|()| p));
+            prior.map_err(|e| e.within(&format!("solver.priors.{i}")))
+        };
+        let priors = self.priors.iter().enumerate().map(prior).collect::<Result<_>>()?;
+        // Settings hold those of stages, which cannot be cloned: they are written and read.
+        let again = serde_json::to_value(self).and_then(serde_json::from_value);
+        let settings =
+            again.map_err(|e| Error::invalid(place, "solver", e, "settings that can be written and read"))?;
+        Ok(Box::new(Training { settings, loss, priors }))
     }
 }
+
+/// Steps whose rays a loss learns from at most, and rays of each.
+const DRAWS: u64 = 64;
+const DRAWN: usize = 1024;
 
 /// Rays of held-out views that are rendered for a record, at most.
 const HELD_OUT_RAYS: usize = 8192;
 
-impl Solver for Gradient {
+/// What [`Gradient`] builds.
+struct Training {
+    settings: Gradient,
+    loss: Box<dyn Loss>,
+    priors: Vec<Box<dyn Prior>>,
+}
+
+impl Solver for Training {
     fn solve(&self, job: &Job<'_>, observer: &mut dyn Observer) -> Result<Solution> {
+        let settings = &self.settings;
         job.scan.validate("scan")?;
         let mut pipeline = Pipeline::build(job.spec)?;
         let Fitted { scene, needed, found } = fit(job.scan, &job.spec.scene, &mut pipeline)?;
@@ -205,13 +188,24 @@ impl Solver for Gradient {
         let volume = job.spec.initializer.as_ref().map(|i| i.volume()).transpose()?.flatten();
         let fills_weights = job.spec.initializer.as_ref().filter(|_| volume.is_none());
         let initializer = fills_weights.map(|i| i.build(job.weights)).transpose()?;
-        let source =
-            RaySource::new(job.scan, &scene, pipeline.projector.as_ref(), self.views, self.pixels, self.margin)?;
+        let source = RaySource::new(
+            job.scan,
+            &scene,
+            pipeline.projector.as_ref(),
+            settings.views,
+            settings.pixels,
+            settings.margin,
+        )?;
         observer.note(&format!("{:.0}% of the pixels are trained on", 100.0 * source.share()));
         let mut model = Model::random(pipeline, job.seed);
-        let mut guard = Guard::new(self.rollbacks, self.loss.into(), job.scan, &scene);
-        let mut patience = Patience::new(self.patience);
-        if self.patience.is_some() && job.held_out.is_none() {
+        let fitted = self.fitted(job, &scene, &source);
+        let loss = fitted.as_deref().unwrap_or(self.loss.as_ref());
+        if fitted.is_some() {
+            observer.note(&format!("loss: {}", loss.describe()));
+        }
+        let mut guard = Guard::new(settings.rollbacks, loss, job.scan, &scene);
+        let mut patience = Patience::new(settings.patience);
+        if settings.patience.is_some() && job.held_out.is_none() {
             observer.note("solver.patience looks at views that are kept aside, and none are: it does not end this run");
         }
         let mut start = Start::default();
@@ -238,19 +232,19 @@ impl Solver for Gradient {
         observer.note(&explain.backend);
         if let (Some(from), None) = (&volume, job.resume) {
             let known = start_volume(job, &from.path)?;
-            learn(self, exe.as_mut(), &mut model, (&known, &scene), from.steps, job, observer)?;
+            learn(settings, exe.as_mut(), &mut model, (&known, &scene), from.steps, job, observer)?;
             observer.note(&format!("learned {} in {} steps", from.path, from.steps));
         }
         let watch = Watch::new(job, &scene, model.pipeline.projector.as_ref());
         let steps_an_epoch = source.steps_an_epoch() as f64;
-        let by_epochs = self.epochs.map(|e| (e * steps_an_epoch).ceil() as u64);
-        let steps = [self.steps, by_epochs].into_iter().flatten().min();
+        let by_epochs = settings.epochs.map(|e| (e * steps_an_epoch).ceil() as u64);
+        let steps = [settings.steps, by_epochs].into_iter().flatten().min();
         let watcher = |d| DriftWatch::new(d, &scene, job.seed, steps_an_epoch, job.resume, &model);
-        let mut drift = self.drift.as_ref().map(watcher).transpose()?;
+        let mut drift = settings.drift.as_ref().map(watcher).transpose()?;
         let Start { standing, kept: Kept { mut window, .. } } = start;
-        let mut clock = Clock::new(Ends { steps, seconds: self.seconds }, job.limits, standing.seconds);
-        let mut rays = Vec::with_capacity(self.rays);
-        let mut tv = TvBlocks::default();
+        let mut clock = Clock::new(Ends { steps, seconds: settings.seconds }, job.limits, standing.seconds);
+        let mut rays = Vec::with_capacity(settings.rays);
+        let mut places = Places::new(&self.priors);
         let (mut step, mut samples) = (standing.step, standing.samples);
         clock.resume();
         loop {
@@ -291,12 +285,12 @@ impl Solver for Gradient {
                 window.tell(said, observer);
             }
             let mut settled = false;
-            if step > 0 && (step % self.report_every == 0 || done) && window.steps > 0 {
+            if step > 0 && (step % settings.report_every == 0 || done) && window.steps > 0 {
                 clock.pause();
                 let record = window.record(
                     step,
                     clock.seconds(),
-                    guard.rate() * self.lr * self.decay.at(step as f64 / steps_an_epoch, share),
+                    guard.rate() * settings.lr * settings.decay.at(step as f64 / steps_an_epoch, share),
                 );
                 let mut record = watch.fill(record, &model, exe.as_mut())?;
                 settled = patience.judge(&record, &mut model, exe.as_mut())?;
@@ -313,12 +307,9 @@ impl Solver for Gradient {
             let epoch = step as f64 / steps_an_epoch;
             window.events.extend(model.refresh(&scene, epoch, job.backend, &mut exe)?);
             patience.renew(&model);
-            source.draw(job.seed, step, self.rays, &mut rays);
-            let tv = self.tv.as_ref().map(|prior| {
-                blocks(prior, &scene, job.seed, step, &mut tv);
-                &tv
-            });
-            let work = Work { step, seed: job.seed, loss: self.loss.into(), rays: &rays, points: &[], tv };
+            source.draw(job.seed, step, settings.rays, &mut rays);
+            let priors = places.draw(&scene, job.seed, step);
+            let work = Work { step, seed: job.seed, loss, rays: &rays, points: &[], priors: &priors };
             let start = Instant::now();
             let stats = exe.step(&mut model, &work)?;
             let back = guard.judge(&work, &stats, &mut model, exe.as_mut())?;
@@ -327,7 +318,7 @@ impl Solver for Gradient {
             match back {
                 Some(said) => window.tell(said, observer),
                 None => {
-                    exe.update(&mut model, &guard.next(self.adam(step, epoch, share)))?;
+                    exe.update(&mut model, &guard.next(settings.adam(step, epoch, share)))?;
                     window.add(stats.loss, stats.prior, stats.samples, start.elapsed().as_secs_f64());
                 }
             }
@@ -344,35 +335,60 @@ impl Solver for Gradient {
     }
 
     fn needs_held_out(&self) -> Option<&'static str> {
-        self.patience.map(|_| "solver.patience")
+        self.settings.patience.map(|_| "solver.patience")
     }
 
     fn pretrain(&self, job: &PretrainJob<'_>, observer: &mut dyn Observer) -> Result<Model> {
-        crate::pretrain::pretrain(self, job, observer)
+        crate::pretrain::pretrain(&self.settings, job, observer)
     }
 
     fn trains_field(&self, _: &Spec) -> Result<bool> {
         Ok(true)
     }
 
-    /// The list of the pixels that are trained on, at most all of them.
+    /// The list of the pixels that are trained on, at most all of them, and what a loss learns from.
     fn working_memory(&self, pixels: u64, _: u64) -> u64 {
-        size_of::<u32>() as u64 * pixels
+        let learning = if self.loss.needs_scan() { noise::memory(pixels) } else { 0 };
+        size_of::<u32>() as u64 * pixels + learning
     }
 
     /// Parameters and moments of the last good state, and parameters of the best one.
     fn memory_per_parameter(&self) -> u64 {
-        let good = if self.rollbacks > 0 { 3 } else { 0 };
-        size_of::<f32>() as u64 * (good + u64::from(self.patience.is_some()))
+        let good = if self.settings.rollbacks > 0 { 3 } else { 0 };
+        size_of::<f32>() as u64 * (good + u64::from(self.settings.patience.is_some()))
     }
 
     fn describe(&self) -> String {
-        let tv = self.tv.as_ref().map_or(String::new(), |t| format!(", total variation {}", t.weight));
-        let ends = self.patience.map_or(String::new(), |n| {
+        let priors: String = self.priors.iter().map(|p| format!(", {}", p.describe())).collect();
+        let ends = self.settings.patience.map_or(String::new(), |n| {
             let records = if n == 1 { "a record".into() } else { format!("{n} records") };
-            format!(", ends after {records} of {} steps without a smaller held-out error", self.report_every)
+            format!(", ends after {records} of {} steps without a smaller held-out error", self.settings.report_every)
         });
-        format!("gradient: {} rays a step, {:?}, Adam {}{tv}{ends}", self.rays, self.loss, self.lr).to_lowercase()
+        format!(
+            "gradient: {} rays a step, {}, Adam {}{priors}{ends}",
+            self.settings.rays,
+            self.loss.describe(),
+            self.settings.lr
+        )
+        .to_lowercase()
+    }
+}
+
+impl Training {
+    /// The loss for the job's scan, where it learns from one.
+    fn fitted(&self, job: &Job<'_>, scene: &Scene, source: &RaySource<'_>) -> Option<Box<dyn Loss>> {
+        if !self.loss.needs_scan() {
+            return None;
+        }
+        let noise = Noise::of(job.scan, true);
+        let (mut rays, mut measured) = (vec![], vec![]);
+        for step in 0..source.steps_an_epoch().min(DRAWS) {
+            source.draw(job.seed, step, DRAWN, &mut rays);
+            measured.extend(rays.iter().map(|r| f64::from(r.target)));
+        }
+        let line = scene.line_scale();
+        let noise = NoiseModel { sigma: noise.sigma / line, growth: noise.growth * line, measured: &measured };
+        self.loss.fitted(&noise)
     }
 }
 
@@ -387,25 +403,6 @@ impl Gradient {
             step,
         }
     }
-}
-
-/// Random blocks of neighbouring points inside the volume.
-fn blocks(prior: &TvPrior, scene: &Scene, seed: u64, step: u64, out: &mut TvBlocks) {
-    let mut rng = stream(seed ^ 0x7e57_b10c, step);
-    let voxel = scene.unit_spacing();
-    let spacing = voxel.map(|s| s * prior.spacing as f32);
-    let (lo, hi) = (scene.to_unit(scene.bounds[0]), scene.to_unit(scene.bounds[1]));
-    out.corners.clear();
-    for _ in 0..prior.blocks {
-        out.corners.push(std::array::from_fn(|k| {
-            let room = (hi[k] - lo[k] - spacing[k] * (prior.edge - 1) as f32).max(0.0);
-            lo[k] + room * rng.random::<f32>()
-        }));
-    }
-    out.spacing = spacing;
-    out.edge = prior.edge;
-    out.weight = prior.weight;
-    out.smoothing = prior.smoothing;
 }
 
 /// Where training begins.

@@ -9,9 +9,10 @@
 //! Adam's count of updates goes back with its moments, whose bias it corrects.
 
 use conefield_core::arena::{Arena, Layout};
-use conefield_core::backend::{Adam, Executable, Loss, StepStats, Work};
+use conefield_core::backend::{Adam, Executable, StepStats, Work};
 use conefield_core::checkpoint::{Resume, tensors_of};
 use conefield_core::error::{Error, Result};
+use conefield_core::loss::Loss;
 use conefield_core::pages::Pages;
 use conefield_core::pipeline::Model;
 use conefield_core::scan::Scan;
@@ -56,9 +57,9 @@ pub struct Watched {
 }
 
 /// Looks at every step between gradients and update.
-pub struct Guard {
+pub struct Guard<'a> {
     most: u64,
-    loss: Loss,
+    loss: &'a dyn Loss,
     /// A line integral as it was measured where there is an object, in the scale that stages see.
     measured: f64,
     watched: Watched,
@@ -71,10 +72,10 @@ struct Copy {
     masks: usize,
 }
 
-impl Guard {
+impl<'a> Guard<'a> {
     /// A guard that lets a run on `scan` go back `most` times; with 0 it keeps no copy, and only a number that is not finite
     /// ends the run.
-    pub fn new(most: u64, loss: Loss, scan: &Scan, scene: &Scene) -> Self {
+    pub fn new(most: u64, loss: &'a dyn Loss, scan: &Scan, scene: &Scene) -> Self {
         // The mean of what was measured, weighted with itself: air does not count, however much of it there is.
         let view = |v: ArrayView2<'_, f32>| {
             v.iter().fold([0.0; 2], |[s, t], p| [s + f64::from(*p).powi(2), t + f64::from(p.abs())])
@@ -103,7 +104,7 @@ impl Guard {
     }
 
     /// The copy, for a checkpoint.
-    pub fn tensors<'a>(&'a self, layout: &'a Layout) -> Vec<(String, &'a [usize], &'a [f32])> {
+    pub fn tensors<'b>(&'b self, layout: &'b Layout) -> Vec<(String, &'b [usize], &'b [f32])> {
         self.copy.iter().flat_map(|c| tensors_of(NAME, layout, c.parts.each_ref().map(|p| &**p))).collect()
     }
 
@@ -144,12 +145,12 @@ impl Guard {
         if self.most == 0 {
             return Ok(None);
         }
-        let empty: f64 = work.rays.iter().map(|r| self.loss.at(f64::from(r.target)).0).sum();
+        let empty: f64 = work.rays.iter().map(|r| self.loss.at(0.0, f64::from(r.target)).0).sum();
         let empty = empty / work.rays.len().max(1) as f64;
         self.watched.sum += stats.loss;
         self.watched.empty += empty;
         self.watched.steps += 1;
-        let level = *self.watched.level.get_or_insert(stats.loss.max(self.loss.at(self.measured).0));
+        let level = *self.watched.level.get_or_insert(stats.loss.max(self.loss.at(0.0, self.measured).0));
         let other = (stats.loss - empty).abs() > ALIVE * empty;
         self.watched.alive |= other;
         self.watched.dead = if other { 0 } else { self.watched.dead + 1 };
@@ -207,7 +208,8 @@ impl Guard {
 
     /// The loss of differences `factor` times as large as those of the loss `level`.
     fn beyond(&self, factor: f64, level: f64) -> f64 {
-        self.loss.at(1.0).0 / self.loss.at(1.0 / factor).0 * level.max(self.loss.at(SMALL * self.measured).0)
+        let of = |difference: f64| self.loss.at(difference, 0.0).0;
+        of(1.0) / of(1.0 / factor) * level.max(of(SMALL * self.measured))
     }
 
     /// Copies the state, which the step's loss has found good; one that is not finite is no good after all.

@@ -2,6 +2,7 @@
 //!
 //! - [`gradient`] trains an attenuation field by stochastic gradients; [`pretrain`] trains one on a known volume, for
 //!   weights that other scans reuse.
+//! - [`losses`] say what a difference costs, [`priors`] what the field is to be like.
 //! - [`fit`] finds out what a scan has need of, [`support`] where its object can be, [`surround`] what lies beyond the
 //!   volume.
 //! - [`drift`] measures how much of a field changes while it trains.
@@ -16,8 +17,10 @@ pub mod fit;
 pub mod gradient;
 pub mod guard;
 pub mod iterative;
+pub mod losses;
 pub mod patience;
 pub mod pretrain;
+pub mod priors;
 pub mod rays;
 pub mod schedule;
 pub mod sequence;

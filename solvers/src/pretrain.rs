@@ -3,9 +3,10 @@
 
 use crate::gradient::Gradient;
 use crate::guard::strayed;
+use crate::losses::L1;
 use crate::schedule::{Clock, Ends};
 use conefield_core::arena::Arena;
-use conefield_core::backend::{Executable, Loss, Work};
+use conefield_core::backend::{Executable, Work};
 use conefield_core::error::{Error, Result};
 use conefield_core::pipeline::{Model, Pipeline};
 use conefield_core::random::stream;
@@ -83,7 +84,7 @@ pub fn pretrain(settings: &Gradient, job: &PretrainJob<'_>, observer: &mut dyn O
 
 /// Gradients of the L1 loss at known points; returns the loss.
 fn fit(exe: &mut dyn Executable, model: &mut Model, points: &[([f32; 3], f32)], step: u64, seed: u64) -> Result<f64> {
-    let work = Work { step, seed, loss: Loss::L1, rays: &[], points, tv: None };
+    let work = Work { step, seed, loss: &L1 {}, rays: &[], points, priors: &[] };
     let stats = exe.step(model, &work)?;
     if !stats.loss.is_finite() {
         return Err(Error::Diverged { step, what: format!("the loss is {}", stats.loss) });

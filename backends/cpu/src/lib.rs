@@ -149,6 +149,7 @@ impl Executable for CpuExecutable {
             work,
         );
         model.pipeline.fault()?;
+        work.fault()?;
         Ok(stats)
     }
 

@@ -24,25 +24,20 @@ pub(super) fn spec(root: &Node) -> Result<()> {
 /// them.
 fn stage(node: &Node, kind: Kind, path: &str) -> Result<()> {
     let known = names(kind);
-    let named = |at: &At, path: &str, text: &str| {
-        find(kind, text).ok_or_else(|| {
-            let found = format!("no {} type {text:?}", kind.name());
-            invalid(at, path, found, suggest(text, &known))
-        })
-    };
-    if let Some(text) = node.text() {
-        let schema = of_type(named(&node.at, path, text)?);
-        return required(node, &schema, &Context::new(&schema, Some(kind)), path);
-    }
-    table(node, path)?;
     let types = || format!("a type: {}", listed(&known));
-    let Some(name) = node.get("type") else {
-        return Err(invalid(&node.at, &join(path, "type"), "nothing".into(), types()));
+    // The name of a type stands for its default settings.
+    let alone = node.text().is_some();
+    let at = if alone { path.into() } else { join(path, "type") };
+    let name = if alone { Some(node) } else { node.get("type") };
+    if !alone && !matches!(node.kind, Is::Table(_)) {
+        return Err(invalid(&node.at, path, node.shown(), format!("a table, or the name of {}", types())));
+    }
+    let Some(name) = name else { return Err(invalid(&node.at, &at, "nothing".into(), types())) };
+    let Some(text) = name.text() else { return Err(invalid(&name.at, &at, name.shown(), types())) };
+    let Some(found) = find(kind, text) else {
+        return Err(invalid(&name.at, &at, format!("no {} type {text:?}", kind.name()), suggest(text, &known)));
     };
-    let Some(text) = name.text() else {
-        return Err(invalid(&name.at, &join(path, "type"), name.shown(), types()));
-    };
-    let schema = of_type(named(&name.at, &join(path, "type"), text)?);
+    let schema = of_type(found);
     let cx = Context::new(&schema, Some(kind));
     one_of::check(node, &schema, &cx, path)?;
     object(node, &schema, &cx, path)
@@ -202,7 +197,7 @@ fn wanted(schema: &Value, cx: &Context<'_>) -> String {
     let schema = cx.resolve(schema);
     if let Some(kind) = schema[NESTED].as_str().and_then(Kind::named) {
         let article = if kind == Kind::Encoder || kind == Kind::Initializer { "an" } else { "a" };
-        return format!("{article} {} type, or a table with one: {}", kind.name(), listed(&names(kind)));
+        return format!("a table with {article} {} type, or its name: {}", kind.name(), listed(&names(kind)));
     }
     let fixed = constants(schema, cx);
     let mut words: Vec<String> = fixed.iter().map(plain).collect();

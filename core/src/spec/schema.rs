@@ -1,7 +1,7 @@
 //! JSON Schemas: of one stage type, and of a whole spec for editors.
 
 use super::PluginPaths;
-use crate::registry::{Kind, StageType, names, stage_types};
+use crate::registry::{Kind, StageType, stage_types};
 use serde_json::{Map, Value, json};
 
 /// Marks, in a settings schema, a value that is itself a stage: `#[schemars(extend("x-stage" = "encoder"))]` or a
@@ -42,15 +42,20 @@ pub(super) fn label() -> [(&'static str, Value); 3] {
 /// The JSON Schema of a spec file, for editors: every registered type with its settings.
 pub fn spec() -> Value {
     let mut defs = Map::new();
-    for kind in Kind::ALL {
+    for &kind in Kind::ALL {
         let mut any = vec![];
+        // Types that have defaults for all their settings.
+        let mut alone = vec![];
         for t in stage_types().into_iter().filter(|t| t.kind == kind) {
-            let name = format!("{}.{}", kind.name(), t.name);
-            defs.insert(name.clone(), relocated(of_type(t), &name));
+            let (name, schema) = (format!("{}.{}", kind.name(), t.name), of_type(t));
+            if schema["required"].is_null() {
+                alone.push(t.name);
+            }
+            defs.insert(name.clone(), relocated(schema, &name));
             any.push(json!({ "$ref": format!("#/$defs/{name}") }));
         }
-        any.push(json!({ "enum": names(kind), "description": "The type with its default settings." }));
-        defs.insert(kind.name().into(), json!({ "anyOf": any }));
+        let table = json!({ "type": "object", "properties": { "type": { "type": "string" } }, "anyOf": any });
+        defs.insert(kind.name().into(), json!({ "anyOf": [{ "enum": alone }, table] }));
     }
     let mut common = Map::new();
     common.insert("$schema".into(), json!({ "type": "string", "description": "Where this schema is." }));

@@ -1,55 +1,17 @@
 //! Stages as a spec writes them: a table with a `type`, or the name of a type whose settings all have their default.
 //!
 //! `typetag` reads the types that are linked in. Those of loaded libraries it cannot see, as every library has statics
-//! of its own; [`one`] and [`list`] look their names up at run time.
+//! of its own; [`needed`] and [`list`] look their names up at run time.
 
 use crate::method::Method;
-use crate::registry::{Kind, Make, MakeFn, Origin, find};
-use crate::settings::{EncoderSpec, FieldSpec, InitializerSpec, NormalizerSpec, ProjectorSpec, VoxelProjectorSpec};
+use crate::registry::{Kind, Origin, Settings, find};
 use serde::Deserialize;
 use serde::de::{DeserializeOwned, Deserializer, Error};
-use serde_json::Value;
-
-/// The settings of one kind of stage.
-pub trait Settings {
-    /// Which.
-    const KIND: Kind;
-
-    /// How a loaded type of this kind is made.
-    fn made_by(make: &Make) -> Option<&MakeFn<Self>>;
-}
-
-macro_rules! settings {
-    ($($kind:ident $spec:ident)*) => {$(
-        impl Settings for dyn $spec {
-            const KIND: Kind = Kind::$kind;
-
-            fn made_by(make: &Make) -> Option<&MakeFn<Self>> {
-                match make {
-                    Make::$kind(make) => Some(make),
-                    _ => None,
-                }
-            }
-        }
-    )*};
-}
-
-settings! {
-    Encoder EncoderSpec
-    Normalizer NormalizerSpec
-    Field FieldSpec
-    Projector ProjectorSpec
-    VoxelProjector VoxelProjectorSpec
-    Initializer InitializerSpec
-}
+use serde_json::{Value, json};
 
 /// Libraries bring stages, no methods.
 impl Settings for dyn Method {
     const KIND: Kind = Kind::Method;
-
-    fn made_by(_: &Make) -> Option<&MakeFn<Self>> {
-        None
-    }
 }
 
 /// The settings that `value` says.
@@ -58,7 +20,7 @@ where
     Box<T>: DeserializeOwned,
 {
     if value.is_string() {
-        value = serde_json::json!({ "type": value });
+        value = json!({ "type": value });
     }
     let found = value["type"].as_str().and_then(|name| find(T::KIND, name));
     if let Some(Origin::Loaded { make, .. }) = found.map(|t| &t.origin)
