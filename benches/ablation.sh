@@ -28,7 +28,7 @@ for volume in engine_256 head_256 chest_128; do
         shift
         echo "== $volume $name" | tee -a "$out/scores.txt"
         "$bin/conefield" -q reconstruct "$scan" --spec ni-naf -o "$out/$volume-$name" --force --seconds "${seconds}" \
-            --reference truth --set solver.report_every=25 --set solver.lr=5e-3 --set projector.samples=192 "$@" | tee -a "$out/scores.txt"
+            --reference truth --set training.report_every=25 --set optimizer.lr=5e-3 --set projector.samples=192 "$@" | tee -a "$out/scores.txt"
     }
     run naf --set "$none"
     run ln --set "$norm"

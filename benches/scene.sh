@@ -27,12 +27,12 @@ for volume in $volumes; do
         shift 4
         [[ " $wanted " == *" $name "* ]] || return 0
         "$bin/conefield" -q reconstruct "$scan" --spec benches/six-levels.toml -o "$out/$volume-$name" --force --reference truth \
-            --set solver.seconds="$time" --set solver.steps=1000000 --set scene.support="$support" \
+            --set training.seconds="$time" --set training.steps=1000000 --set scene.support="$support" \
             --set scene.levels="$levels" "$@" >/dev/null
         runs+=("$name=$out/$volume-$name")
     }
     # As published: as many samples on every ray.
-    count=(--set projector.samples=320 --set solver.rays=1024)
+    count=(--set projector.samples=320 --set training.rays=1024)
     run none "$(python3 -c "print($seconds * 10 / 3)")" box all "${count[@]}"
     run support "$seconds" carve all "${count[@]}"
     run levels "$seconds" box needed "${count[@]}"

@@ -134,7 +134,7 @@ fn table_picture_and_records_agree_and_resume_skips_what_is_done() {
         (&["--hold-out", "every:4", "--seed", "3"], "reference"),
         (&["--reference", "truth", "--hold-out", "every:4", "--seed", "3", "--at-most", "9s"], "limits"),
         (
-            &["--reference", "truth", "--hold-out", "every:4", "--seed", "3", "--set", "solver.nonnegative=false"],
+            &["--reference", "truth", "--hold-out", "every:4", "--seed", "3", "--set", "nonnegative=false"],
             "spec",
         ),
     ] {
@@ -270,6 +270,6 @@ fn a_cap_on_time_ends_what_a_budget_would_stretch() {
         let line = [&["reconstruct", &scan, "--spec", "sirt", "-o", &out, "--json"], more].concat();
         json(&line)["steps"].as_u64().unwrap()
     };
-    assert_eq!(run("whole", &["--at-most", "1h", "--set", "solver.stop.passes=5"]), 5);
+    assert_eq!(run("whole", &["--at-most", "1h", "--set", "stop.passes=5"]), 5);
     assert!(run("cut", &["--at-most", "1e-9s"]) < 2);
 }

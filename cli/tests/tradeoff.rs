@@ -12,11 +12,11 @@ const LEVERS: &str = r#"
 [[base]]
 spec = "fdk"
 [base.levers]
-solver.cutoff = [0.5]
+cutoff = [0.5]
 [[base]]
 spec = "os-sart"
 [base.levers]
-solver.subsets = [2, 4]
+subsets = [2, 4]
 [[base]]
 spec = "tiny.toml"
 "#;

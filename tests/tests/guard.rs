@@ -215,12 +215,12 @@ fn a_parameter_that_is_not_finite_goes_back_even_at_the_end() {
 fn a_run_that_cannot_be_saved_ends_in_words() {
     let e = run(&settings(300), Fault::Forever(40)).err().unwrap().to_string();
     assert!(e.starts_with("training diverged at step 48: the loss is") && e.contains("gone back 8 times"), "{e}");
-    assert!(e.contains("the prior inf") && e.contains("solver.lr"), "{e}");
+    assert!(e.contains("the prior inf") && e.contains("optimizer.lr"), "{e}");
     let mut off = settings(300);
     off["solver"]["rollbacks"] = json!(0);
     for fault in [Fault::Forever(40), Fault::Loss(40), Fault::Parameter(299)] {
         let e = run(&off, fault).err().unwrap().to_string();
-        assert!(e.starts_with("training diverged at step") && e.contains("solver.lr"), "{e}");
+        assert!(e.starts_with("training diverged at step") && e.contains("optimizer.lr"), "{e}");
     }
     // Nothing to go back to.
     let e = run(&settings(300), Fault::Loss(0)).err().unwrap().to_string();

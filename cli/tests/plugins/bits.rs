@@ -174,7 +174,7 @@ fn mapping_consistency() {
     let [siren, triplane] = &place.plugins;
     let weights = text(&place.dir.path().join("weights.safetensors"));
     let spec = text(&place.spec);
-    let small = ["--steps", "20", "--set", "solver.pretrain_points=200"];
+    let small = ["--steps", "20", "--set", "pretraining.points=200"];
     let pretrain =
         ["--plugin", siren, "--plugin", triplane, "pretrain", "phantom:head:16", "--spec", &spec, "-o", &weights];
     done(&[&pretrain[..], &small].concat());

@@ -103,7 +103,7 @@ fn a_pull_holds_to_the_start() {
 
     let alone = crate::kit::spec("[solver]\ntype = \"fista-tv\"\npull = 0.1\n").unwrap();
     let e = alone.solver.build().unwrap().trains_field(&alone).unwrap_err().to_string();
-    assert!(e.contains("solver.pull: found 0.1, expected 0, or an initializer"), "{e}");
+    assert!(e.contains("pull: found 0.1, expected 0, or an initializer"), "{e}");
 }
 
 const IDENTITY: &str = "type = \"identity\"";

@@ -238,7 +238,7 @@ mod tests {
         let dir = tempfile::tempdir().unwrap();
         let path = dir.path().join("levers.toml");
         std::fs::write(dir.path().join("mine.toml"), "extends = \"fast\"\nname = \"fast-1\"\n").unwrap();
-        let levers = "solver.rays = [64, 128, 256]\n";
+        let levers = "training.rays = [64, 128, 256]\n";
         let text = format!("[[base]]\nspec = \"fast\"\n[base.levers]\n{levers}[[base]]\nspec = \"mine.toml\"\n");
         std::fs::write(&path, text).unwrap();
         let all = Levers::read(&path).unwrap().candidates(4, 0).unwrap();
@@ -273,7 +273,7 @@ mod tests {
     fn a_product_is_used_up_without_repeating() {
         // The base itself has 10 subsets: 3 x 2 combinations, of which it is one.
         let levers = parse(
-            "[[base]]\nspec = 'os-sart'\n[base.levers]\nsolver.subsets = [5, 10, 25]\nsolver.relaxation = [0.4, 0.5]\n",
+            "[[base]]\nspec = 'os-sart'\n[base.levers]\nsubsets = [5, 10, 25]\nrelaxation = [0.4, 0.5]\n",
         );
         let all = levers.unwrap().candidates(100, 3).unwrap();
         let default = specs::read("os-sart", &[]).unwrap().tree["solver"].clone();
@@ -291,11 +291,11 @@ mod tests {
             parse(&format!("[[base]]\nspec = 'fdk'\n{text}\n")).unwrap().candidates(2, 0).unwrap()[1].sets.clone()
         };
         for text in [
-            "levers.solver.cutoff = [0.5]",
-            "[base.levers]\n'solver.cutoff' = [0.5]",
+            "levers.cutoff = [0.5]",
+            "[base.levers]\n'cutoff' = [0.5]",
             "[base.levers.solver]\ncutoff = [0.5]",
         ] {
-            assert_eq!(sets(text), ["solver.cutoff=0.5"], "{text}");
+            assert_eq!(sets(text), ["cutoff=0.5"], "{text}");
         }
     }
 
@@ -307,9 +307,9 @@ mod tests {
             ("[[base]]\nspec = 'fdk'\nlever = 3\n", "unknown field `lever`"),
             ("[[base]]\nspec = 'fdkk'\n", "base[0].spec: found \"fdkk\""),
             ("[[base]]\nspec = 'fdk'\n[[base]]\nspec = 'fdk'\n", "base[1].spec"),
-            ("[[base]]\nspec = 'fdk'\nlevers.solver.cutoff = 0.5\n", "base[0].levers.solver.cutoff: found 0.5"),
-            ("[[base]]\nspec = 'fdk'\nlevers.solver.cutoff = []\n", "at least one value"),
-            ("[[base]]\nspec = 'fdk'\nlevers.solver.cutof = [1]\n", "\"cutoff\""),
+            ("[[base]]\nspec = 'fdk'\nlevers.cutoff = 0.5\n", "base[0].levers.cutoff: found 0.5"),
+            ("[[base]]\nspec = 'fdk'\nlevers.cutoff = []\n", "at least one value"),
+            ("[[base]]\nspec = 'fdk'\nlevers.cutof = [1]\n", "\"cutoff\""),
             ("[[base]]\nspec = 'fast'\nlevers.encoder.levels = [4, -1]\n", "base[0].levers.encoder.levels: found -1"),
         ] {
             let e = parse(text).err().unwrap().to_string();

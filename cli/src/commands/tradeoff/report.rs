@@ -396,9 +396,9 @@ mod tests {
     fn every_kind_of_solver_ends_after_its_steps() {
         for (spec, sets, want) in [
             ("fdk", vec![], None),
-            ("os-sart", vec![], Some("solver.stop.passes=105")),
-            ("fast", vec![], Some("solver.steps=105")),
-            ("field-tv", vec!["solver.passes=5".to_owned()], Some("solver.first.steps=100")),
+            ("os-sart", vec![], Some("stop.passes=105")),
+            ("fast", vec![], Some("training.steps=105")),
+            ("field-tv", vec!["methods.1.stop.passes=5".to_owned()], Some("methods.0.training.steps=100")),
         ] {
             let loaded = specs::read(spec, &sets).unwrap();
             let set = end("solver", &loaded.tree["solver"], 105);
