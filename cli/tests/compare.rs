@@ -157,7 +157,7 @@ fn a_method_that_fails_leaves_the_others_their_rows() {
     let (dir, scan) = scan();
     let out = dir.path().join("out");
     let (spec, off) = (dir.path().join("wild.toml"), dir.path().join("off.toml"));
-    fs::write(&spec, "extends = \"fast\"\nname = \"wild\"\n[solver]\nlr = 1e30\n").unwrap();
+    fs::write(&spec, "extends = \"fast\"\nname = \"wild\"\n[optimizer]\nlr = 1e30\n").unwrap();
     // Found when it is read by the solver: a volume to start from that is not there.
     fs::write(&off, "extends = \"sirt\"\nname = \"off\"\n[initializer]\ntype = \"volume\"\npath = \"none.nii\"\n")
         .unwrap();

@@ -8,13 +8,20 @@ use conefield_backend_cpu::Cpu;
 use conefield_backend_cpu::rows::Kernels;
 use conefield_backend_cpu::step::Slots;
 use conefield_core::arena::Weights;
+<<<<<<< HEAD
 use conefield_core::backend::{Loss, TrainRay, TvBlocks, Work};
 use conefield_core::method::{Limits, PretrainJob, Solution};
+=======
+use conefield_core::backend::{BlockWork, TrainRay, Work};
+use conefield_core::loss::Loss;
+>>>>>>> losses
 use conefield_core::pipeline::{Model, Pipeline};
 use conefield_core::random::{mix, unit};
 use conefield_core::scan::{Scan, Volume};
 use conefield_core::scene::Scene;
 use conefield_core::trained::TrainedField;
+use conefield_solvers::losses::{Huber, L2};
+use conefield_solvers::priors::TotalVariation;
 use serde_json::{Value, json};
 
 fn settings() -> Value {
@@ -98,13 +105,15 @@ fn gradients_of(settings: &Value, count: usize, edge: usize) {
     assert!(missed <= count / 2, "{missed} of {count} rays miss the box");
     let place = |i: u64| std::array::from_fn(|k| 0.05 + 0.9 * unit(mix(i, k as u64)));
     let points: Vec<_> = (0..50).map(|i| (place(i), if i % 2 == 0 { 0.7 } else { 4.0 })).collect();
-    let tv = TvBlocks {
-        corners: (100..104).map(|i| place(i).map(|x: f32| 0.7 * x)).collect(),
-        spacing: [0.06, 0.05, 0.07].map(|x| 3.0 * x / edge as f32),
-        edge,
-        weight: 0.3,
-        smoothing: 1e-2,
-    };
+    let corners: Vec<_> = (100..105).map(|i| place(i).map(|x: f32| 0.7 * x)).collect();
+    let spacing = [0.06, 0.05, 0.07].map(|x| 3.0 * x / edge as f32);
+    let fine = TotalVariation { weight: 0.3, edge, smoothing: 1e-2, ..TotalVariation::default() };
+    // Points of one block fill no vector: rows after it are padding.
+    let coarse = TotalVariation { weight: 0.2, edge: 2, smoothing: 3e-2, ..TotalVariation::default() };
+    let priors = [
+        BlockWork { prior: &fine, corners: &corners[..4], spacing },
+        BlockWork { prior: &coarse, corners: &corners[4..], spacing: [0.1; 3] },
+    ];
     let params: Vec<f64> = Model::random(Pipeline::build(&spec(settings).unwrap()).unwrap(), 3)
         .arena
         .params
@@ -112,9 +121,10 @@ fn gradients_of(settings: &Value, count: usize, edge: usize) {
         .enumerate()
         .map(|(i, &p)| f64::from(p) + 0.4 * (f64::from(unit(mix(5, i as u64))) - 0.5))
         .collect();
-    for loss in [Loss::L2, Loss::Huber { delta: 0.5 }] {
+    let losses: [&dyn Loss; 2] = [&L2 {}, &Huber { delta: 0.5 }];
+    for loss in losses {
         let kernels = Kernels::new(&pipeline, |s| s.reference()).unwrap();
-        let work = Work { step: 4, seed: 9, loss, rays: &rays, points: &points, tv: Some(&tv) };
+        let work = Work { step: 4, seed: 9, loss, rays: &rays, points: &points, priors: &priors };
         let case = Case { pipeline: &pipeline, kernels, work };
         let (value, grads) = case.step(&params);
         assert!(value.is_finite() && grads.iter().filter(|g| **g != 0.0).count() > grads.len() / 2);
@@ -130,7 +140,8 @@ fn gradients_of(settings: &Value, count: usize, edge: usize) {
         let parts = [
             Work { rays: &[], ..case.work.clone() },
             Work { points: &[], ..case.work.clone() },
-            Work { tv: None, ..case.work.clone() },
+            Work { priors: &[], ..case.work.clone() },
+            Work { priors: &priors[..1], ..case.work.clone() },
         ];
         for work in parts {
             let kernels = Kernels::new(&pipeline, |s| s.reference()).unwrap();
@@ -182,7 +193,7 @@ fn the_number_of_threads_does_not_change_a_bit() {
     s["projector"]["samples"] = json!(48);
     s["solver"]["rays"] = json!(512);
     s["solver"]["steps"] = json!(10);
-    s["solver"]["tv"] = json!({"weight": 0.01, "blocks": 8, "edge": 4});
+    s["solver"]["priors"] = json!([{"type": "total-variation", "weight": 0.01, "blocks": 8, "edge": 4}]);
     let scan = scan();
     let run = |threads: usize, s: &Value| {
         let pool = rayon::ThreadPoolBuilder::new().num_threads(threads).build().unwrap();

@@ -3,13 +3,22 @@
 mod device;
 
 use conefield_conformance::{
-    Options, Report, check_encoder, check_field, check_initializer, check_normalizer, check_projector,
-    check_projector_wgsl, check_voxel_projector, check_wgsl,
+    Options, Report, check_encoder, check_field, check_initializer, check_loss, check_loss_wgsl, check_normalizer,
+    check_prior, check_prior_wgsl, check_projector, check_projector_wgsl, check_settings, check_voxel_projector,
+    check_wgsl, ready,
 };
 use conefield_core::arena::Weights;
+use conefield_core::loss::Loss;
 use conefield_core::registry::{Kind, names};
+<<<<<<< HEAD
 use conefield_core::settings::{EncoderSpec, FieldSpec, InitializerSpec, NormalizerSpec, ProjectorSpec};
 use conefield_core::spec::Tables;
+=======
+use conefield_core::spec::stage::read;
+use conefield_core::spec::{
+    EncoderSpec, FieldSpec, InitializerSpec, LossSpec, NormalizerSpec, PriorSpec, ProjectorSpec, Tables,
+};
+>>>>>>> losses
 use conefield_core::stage::Stage;
 use serde_json::{Value, json};
 
@@ -19,6 +28,7 @@ use conefield_fields as _;
 use conefield_initializers as _;
 use conefield_normalizers as _;
 use conefield_projectors as _;
+use conefield_solvers as _;
 
 fn expect(report: Report) {
     println!("{report}");
@@ -230,6 +240,59 @@ fn random_initializer() {
     expect(check_initializer(spec.build(&|_| Ok(Weights::default())).unwrap().as_ref()));
 }
 
+fn loss(loss: &dyn Loss) {
+    expect(check_loss(loss));
+    assert!(loss.wgsl().is_some(), "{} offers no WGSL", loss.describe());
+    if let Some(shared) = device::shared("the WGSL of a loss") {
+        expect(check_loss_wgsl(loss, &|l, pairs| shared.losses(l, pairs)));
+    }
+}
+
+/// Every registered loss by its defaults, and with `more` settings.
+#[test]
+fn losses() {
+    let more = [("huber", json!({"delta": 0.5})), ("huber", json!({"delta": 3.0}))];
+    let all = names(Kind::Loss).into_iter().map(|name| (name, json!({}))).chain(more);
+    for (name, settings) in all {
+        expect(check_settings::<dyn LossSpec>(name, &settings));
+        let mut table = settings;
+        table["type"] = json!(name);
+        let built = read::<dyn LossSpec>(table).unwrap().build().unwrap();
+        loss(built.as_ref());
+        if let Some(fitted) = ready(built.as_ref()) {
+            loss(fitted.as_ref());
+        }
+    }
+    let refused = read::<dyn LossSpec>(json!({"type": "huber", "delta": 0.0})).unwrap().build().err().unwrap();
+    assert!(refused.to_string().contains("delta"), "{refused}");
+}
+
+/// Every registered prior by its defaults, and with `more` settings.
+#[test]
+fn priors() {
+    let more = [
+        ("total-variation", json!({"edge": 2, "blocks": 3, "smoothing": 0.01})),
+        ("total-variation", json!({"edge": 5, "weight": 0.0, "spacing": 2.5, "smoothing": 0.3})),
+    ];
+    let all = names(Kind::Prior).into_iter().map(|name| (name, json!({}))).chain(more);
+    for (name, settings) in all {
+        expect(check_settings::<dyn PriorSpec>(name, &settings));
+        let mut table = settings;
+        table["type"] = json!(name);
+        let built = read::<dyn PriorSpec>(table).unwrap().build().unwrap();
+        expect(check_prior(built.as_ref()));
+        assert!(built.wgsl().is_some(), "{} offers no WGSL", built.describe());
+        if let Some(shared) = device::shared("the WGSL of a prior") {
+            expect(check_prior_wgsl(built.as_ref(), &|p, values| shared.penalty(p, values)));
+        }
+    }
+    for wrong in ["edge", "blocks", "spacing", "smoothing"] {
+        let settings = json!({"type": "total-variation", wrong: 0});
+        let refused = read::<dyn PriorSpec>(settings).unwrap().build().err().unwrap();
+        assert!(refused.to_string().contains(wrong), "{refused}");
+    }
+}
+
 /// A stage type that is not in this list has not been through the kit.
 #[test]
 fn every_registered_stage_has_a_run_here() {
@@ -237,5 +300,7 @@ fn every_registered_stage_has_a_run_here() {
     assert_eq!(names(Kind::Normalizer), ["fft-mask", "layer-norm"]);
     assert_eq!(names(Kind::Field), ["mlp", "voxel-grid"]);
     assert_eq!(names(Kind::Initializer), ["checkpoint", "mci", "random", "volume"]);
+    assert_eq!(names(Kind::Loss), ["huber", "l1", "l2", "noise-weighted"]);
+    assert_eq!(names(Kind::Prior), ["total-variation"]);
     assert_eq!(names(Kind::Projector), ["joseph", "ray-march", "siddon", "trilinear"]);
 }

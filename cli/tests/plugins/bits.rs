@@ -4,8 +4,12 @@
 use crate::build::{cargo, example, library, sources};
 use crate::common::{conefield, done, json, refused, text};
 use conefield_backend_cpu::Cpu;
+<<<<<<< HEAD
 use conefield_core::backend::{Backend, Loss, TvBlocks, Work};
 use conefield_core::method::{Job, Limits, Silent};
+=======
+use conefield_core::backend::{Backend, BlockWork, Work};
+>>>>>>> losses
 use conefield_core::pipeline::{Model, Pipeline};
 use conefield_core::random::{mix, unit};
 use conefield_core::settings::{EncoderSpec, FieldSpec, NormalizerSpec, ProjectorSpec};
@@ -20,6 +24,8 @@ use conefield_initializers as _;
 use conefield_normalizers as _;
 use conefield_projectors as _;
 use conefield_solvers as _;
+use conefield_solvers::losses::L2;
+use conefield_solvers::priors::TotalVariation;
 
 // The plugins' own files, built into this test.
 #[path = "../../../plugins/examples/triplane/src/planes.rs"]
@@ -52,11 +58,7 @@ type = "ray-march"
 samples = 24
 sampling = "stratified"
 
-[initializer]
-type = "random"
-
-[solver]
-type = "gradient"
+[training]
 rays = 48
 "#;
 
@@ -199,7 +201,7 @@ fn masks_of_plugins() {
         let lines = format!(
             "extends = 'ni-naf'\n[[normalizers]]\ntype = '{mask}'\nepoch = 3\nkeep = [0, 1, 3]\n[[normalizers]]\ntype = 'layer-norm'\n\
              [encoder]\ntype = '{encoder}'\nconvention = 'naf'\nfeatures = 2\ngrowth = 2.0\nlevels = 3\nlog2_table_size = 10\nbase_resolution = 16\n\
-             [projector]\nsamples = 16\n[solver]\nrays = 48\n"
+             [projector]\nsamples = 16\n[training]\nrays = 48\n"
         );
         std::fs::write(&spec, lines).unwrap();
         let run = place.dir.path().join(encoder);
@@ -246,9 +248,10 @@ fn points_off_any_ray_stand_alone() {
     assert!(values[0] == values[1], "values differ");
 
     let known: Vec<([f32; 3], f32)> = points.iter().map(|p| (*p, 0.3)).collect();
-    let corners = points[..40].iter().map(|p| p.map(|x| 0.8 * x)).collect();
-    let tv = TvBlocks { corners, spacing: [0.02; 3], edge: 4, weight: 0.1, smoothing: 1e-3 };
-    let work = Work { step: 1, seed: 2, loss: Loss::L2, rays: &[], points: &known, tv: Some(&tv) };
+    let corners: Vec<_> = points[..40].iter().map(|p| p.map(|x| 0.8 * x)).collect();
+    let prior = TotalVariation { weight: 0.1, edge: 4, smoothing: 1e-3, ..TotalVariation::default() };
+    let priors = [BlockWork { prior: &prior, corners: &corners, spacing: [0.02; 3] }];
+    let work = Work { step: 1, seed: 2, loss: &L2 {}, rays: &[], points: &known, priors: &priors };
     let stats = exe.step(&mut plain, &work).unwrap();
     let found = smoothed_exe.step(&mut smoothed, &work).unwrap();
     assert_eq!((stats.loss.to_bits(), stats.prior.to_bits()), (found.loss.to_bits(), found.prior.to_bits()));

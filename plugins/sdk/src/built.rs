@@ -57,7 +57,9 @@ impl Built {
                 let spec = read::<dyn InitializerSpec>(settings).map_err(refused)?;
                 AnyStage::Initializer(spec.build(&no_weights)?)
             }
-            Kind::Solver => return Err(Error::unsupported(t.name, "solvers cannot come from plugins")),
+            Kind::Loss | Kind::Prior | Kind::Solver => {
+                return Err(Error::unsupported(t.name, "losses, priors and solvers cannot come from plugins"));
+            }
         };
         Ok(Self::of(stage))
     }

@@ -255,7 +255,9 @@ impl Check {
                 let stage = make(settings.clone())?.build(&none)?;
                 add(None, check_initializer(stage.as_ref()));
             }
-            Make::Solver(_) => return Err(Error::unsupported(&t.name, "solvers cannot come from plugins")),
+            Make::Loss(_) | Make::Prior(_) | Make::Solver(_) => {
+                return Err(Error::unsupported(&t.name, "losses, priors and solvers cannot come from plugins"));
+            }
         }
         Ok(())
     }

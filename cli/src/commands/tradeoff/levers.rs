@@ -276,7 +276,7 @@ mod tests {
             "[[base]]\nspec = 'os-sart'\n[base.levers]\nsubsets = [5, 10, 25]\nrelaxation = [0.4, 0.5]\n",
         );
         let all = levers.unwrap().candidates(100, 3).unwrap();
-        let default = specs::read("os-sart", &[]).unwrap().tree["solver"].clone();
+        let default = specs::read("os-sart", &[]).unwrap().tree.clone();
         let own = [5, 10, 25].contains(&default["subsets"].as_i64().unwrap())
             && [0.4, 0.5].contains(&default["relaxation"].as_f64().unwrap());
         assert_eq!(all.len(), if own { 6 } else { 7 });
@@ -293,7 +293,7 @@ mod tests {
         for text in [
             "levers.cutoff = [0.5]",
             "[base.levers]\n'cutoff' = [0.5]",
-            "[base.levers.solver]\ncutoff = [0.5]",
+            "[base.levers]\ncutoff = [0.5]",
         ] {
             assert_eq!(sets(text), ["cutoff=0.5"], "{text}");
         }
