@@ -21,12 +21,7 @@ fn a_plan_names_every_part_and_the_record_holds_them_against_it() {
     for spec in ["fast", "sirt", "fdk", "field-tv"] {
         let run = dir.path().join(spec);
         let all = ["reconstruct", &scan, "--spec", spec, "-o", &text(&run), "--reference", "truth", "--json"];
-<<<<<<< HEAD
         let small = ["encoder.log2_table_size=10", "training.rays=64", "projector.samples=16", "priors.0.blocks=4"];
-=======
-        let small =
-            ["encoder.log2_table_size=10", "solver.rays=64", "projector.samples=16", "solver.priors.0.blocks=4"];
->>>>>>> losses
         // Of a sequence the field's settings stand one deeper.
         let deeper: Vec<String> = small.iter().map(|s| format!("methods.0.{s}")).collect();
         let small: Vec<&str> = match spec {

@@ -10,15 +10,10 @@ use conefield_conformance::{
 use conefield_core::arena::{Arena, InitReport, Layout};
 use conefield_core::geometry::Geometry;
 use conefield_core::half::Stored;
-<<<<<<< HEAD
-use conefield_core::settings::Initializer;
-use conefield_core::simd::Real;
-=======
 use conefield_core::loss::{Loss, NoiseModel};
 use conefield_core::prior::{Blocks, Prior};
+use conefield_core::settings::{Initializer, LossSpec};
 use conefield_core::simd::Real;
-use conefield_core::spec::{Initializer, LossSpec};
->>>>>>> losses
 use conefield_core::stage::{
     Encoder, GradKind, Grads, Halves, Info, Kernel, Parameter, Projector, Reduced, Samples, Scope, Stage, Tile,
     TileMut, UnitRay,

@@ -8,13 +8,9 @@ use conefield_backend_cpu::Cpu;
 use conefield_backend_cpu::rows::Kernels;
 use conefield_backend_cpu::step::Slots;
 use conefield_core::arena::Weights;
-<<<<<<< HEAD
-use conefield_core::backend::{Loss, TrainRay, TvBlocks, Work};
-use conefield_core::method::{Limits, PretrainJob, Solution};
-=======
 use conefield_core::backend::{BlockWork, TrainRay, Work};
 use conefield_core::loss::Loss;
->>>>>>> losses
+use conefield_core::method::{Limits, PretrainJob, Solution};
 use conefield_core::pipeline::{Model, Pipeline};
 use conefield_core::random::{mix, unit};
 use conefield_core::scan::{Scan, Volume};

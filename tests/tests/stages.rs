@@ -10,15 +10,11 @@ use conefield_conformance::{
 use conefield_core::arena::Weights;
 use conefield_core::loss::Loss;
 use conefield_core::registry::{Kind, names};
-<<<<<<< HEAD
-use conefield_core::settings::{EncoderSpec, FieldSpec, InitializerSpec, NormalizerSpec, ProjectorSpec};
-use conefield_core::spec::Tables;
-=======
-use conefield_core::spec::stage::read;
-use conefield_core::spec::{
-    EncoderSpec, FieldSpec, InitializerSpec, LossSpec, NormalizerSpec, PriorSpec, ProjectorSpec, Tables,
+use conefield_core::precision::Tables;
+use conefield_core::settings::{
+    EncoderSpec, FieldSpec, InitializerSpec, LossSpec, NormalizerSpec, PriorSpec, ProjectorSpec, VoxelProjectorSpec,
 };
->>>>>>> losses
+use conefield_core::spec::stage::read;
 use conefield_core::stage::Stage;
 use serde_json::{Value, json};
 

@@ -9,13 +9,9 @@ use conefield_backend_cpu::rows::Kernels;
 use conefield_backend_cpu::step::Slots;
 use conefield_core::Result;
 use conefield_core::arena::Weights;
-<<<<<<< HEAD
-use conefield_core::backend::{Adam, Backend, Loss, TrainRay, TvBlocks, Work};
-use conefield_core::method::{Job, Limits, PretrainJob, Record};
-=======
 use conefield_core::backend::{Adam, Backend, BlockWork, TrainRay, Work};
 use conefield_core::loss::Loss;
->>>>>>> losses
+use conefield_core::method::{Job, Limits, PretrainJob, Record};
 use conefield_core::pipeline::{Model, Pipeline};
 use conefield_core::precision::Tables;
 use conefield_core::random::{mix, unit};

@@ -9,13 +9,9 @@ use crate::source::Source;
 use crate::wave::GpuRay;
 use conefield_core::arena::Arena;
 use conefield_core::error::Result;
-<<<<<<< HEAD
-use conefield_core::precision::Tables;
-=======
 use conefield_core::loss::Loss;
+use conefield_core::precision::Tables;
 use conefield_core::prior::Prior;
-use conefield_core::spec::Tables;
->>>>>>> losses
 use conefield_core::stage::{Projector, Samples, Stage, UnitRay};
 use wgpu::BufferUsages as U;
 

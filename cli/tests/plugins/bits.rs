@@ -4,12 +4,8 @@
 use crate::build::{cargo, example, library, sources};
 use crate::common::{conefield, done, json, refused, text};
 use conefield_backend_cpu::Cpu;
-<<<<<<< HEAD
-use conefield_core::backend::{Backend, Loss, TvBlocks, Work};
-use conefield_core::method::{Job, Limits, Silent};
-=======
 use conefield_core::backend::{Backend, BlockWork, Work};
->>>>>>> losses
+use conefield_core::method::{Job, Limits, Silent};
 use conefield_core::pipeline::{Model, Pipeline};
 use conefield_core::random::{mix, unit};
 use conefield_core::settings::{EncoderSpec, FieldSpec, NormalizerSpec, ProjectorSpec};

@@ -17,12 +17,8 @@ use conefield_core::settings::{EncoderSpec, FieldSpec, NormalizerSpec};
 use conefield_core::simd::Real;
 use conefield_core::spec::Tables;
 use conefield_core::stage::{Grads, Kernel, Reader, Stage, Tile, TileMut};
-<<<<<<< HEAD
 use conefield_report::{CurveOptions, curves_png_with};
-=======
-use conefield_io::{CurveOptions, curves_png_with};
 use conefield_solvers::losses::L2;
->>>>>>> losses
 use serde_json::{Value, json};
 use std::ops::Range;
 
