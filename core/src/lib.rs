@@ -11,12 +11,16 @@
 //! - [`settings`], [`spec`], [`registry`]: what a user writes, and the types that it may name.
 //! - [`host`]: stages on the host, for what looks at a model beside training.
 //! - [`voxel`]: line integrals of voxel volumes.
+//! - [`basis`], [`data_term`], [`regularizer`]: what an iterative method is put together from; [`space`]: its arrays and
+//!   what they take.
 //! - [`pipeline`], [`backend`], [`trained`], [`method`]: from a method's stages to a volume.
 
 pub mod arena;
 pub mod backend;
+pub mod basis;
 pub mod by_row;
 pub mod checkpoint;
+pub mod data_term;
 pub mod dense;
 pub mod error;
 pub mod files;
@@ -33,10 +37,12 @@ pub mod precision;
 pub mod prior;
 pub mod random;
 pub mod registry;
+pub mod regularizer;
 pub mod scan;
 pub mod scene;
 pub mod settings;
 pub mod simd;
+pub mod space;
 pub mod spec;
 pub mod stage;
 pub mod support;

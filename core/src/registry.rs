@@ -4,10 +4,14 @@
 //! types of libraries that are loaded at run time come in by [`add`]. Editors' schemas and the lists in error messages
 //! come from here.
 
+use crate::basis::BasisSpec;
+use crate::data_term::DataTermSpec;
 use crate::error::{Error, Result};
+use crate::regularizer::RegularizerSpec;
 use crate::settings::{
-    EncoderSpec, FieldSpec, InitializerSpec, LossSpec, NormalizerSpec, PriorSpec, ProjectorSpec, VoxelProjectorSpec,
+    EncoderSpec, FieldSpec, InitializerSpec, LossSpec, NormalizerSpec, PriorSpec, ProjectorSpec,
 };
+use crate::voxel::VoxelProjectorSpec;
 use schemars::Schema;
 use serde_json::Value;
 use std::fmt;
@@ -88,8 +92,14 @@ kinds! {
         Loss "loss" LossSpec,
         /// What a field is to be like, whatever was measured.
         Prior "prior" PriorSpec,
-        /// Line integrals of voxels.
+        /// Line integrals of voxels, for iterative methods.
         VoxelProjector "voxel-projector" VoxelProjectorSpec,
+        /// Coefficients to voxels, for iterative methods.
+        Basis "basis" BasisSpec,
+        /// How far line integrals are from the measured ones, for iterative methods.
+        DataTerm "data-term" DataTermSpec,
+        /// Penalty of coefficients with its proximal map, for iterative methods.
+        Regularizer "regularizer" RegularizerSpec,
     }
 }
 

@@ -7,7 +7,6 @@ use crate::error::Result;
 use crate::loss::Loss;
 use crate::prior::Prior;
 use crate::stage::{Encoder, Field, Normalizer, Projector};
-use crate::voxel::VoxelProjector;
 
 /// Settings of an encoder.
 #[typetag::serde(tag = "type")]
@@ -35,13 +34,6 @@ pub trait FieldSpec: Send + Sync {
 pub trait ProjectorSpec: Send + Sync {
     /// The stage.
     fn build(&self) -> Result<Box<dyn Projector>>;
-}
-
-/// Settings of a projector of voxels.
-#[typetag::serde(tag = "type")]
-pub trait VoxelProjectorSpec: Send + Sync {
-    /// The stage.
-    fn build(&self) -> Result<Box<dyn VoxelProjector>>;
 }
 
 /// Settings of an initializer.

@@ -5,15 +5,18 @@
 //! stage is smooth: a row is taken only if differences over a step and over four steps agree, so that no cell boundary
 //! and no kink of an activation lies near.
 
+mod bases;
 mod behaviour;
 mod call;
 mod channels;
+mod data_terms;
 mod gradients;
 mod halves;
 mod losses;
 mod priors;
 mod rays;
 mod settings;
+mod regularizers;
 mod voxels;
 mod weights;
 mod wgsl;
@@ -27,6 +30,9 @@ pub use losses::{Compare, check_loss, check_loss_wgsl, ready};
 pub use priors::{Penalise, check_prior, check_prior_wgsl};
 pub use rays::check_projector;
 pub use settings::check_settings;
+pub use bases::check_basis;
+pub use data_terms::check_data_term;
+pub use regularizers::check_regularizer;
 pub use voxels::check_voxel_projector;
 pub use weights::check_initializer;
 pub use wgsl::{Pass, Sample, check_projector_wgsl, check_wgsl};

@@ -255,9 +255,7 @@ impl Check {
                 let stage = make(settings.clone())?.build(&none)?;
                 add(None, check_initializer(stage.as_ref()));
             }
-            Make::Loss(_) | Make::Prior(_) | Make::Solver(_) => {
-                return Err(Error::unsupported(&t.name, "losses, priors and solvers cannot come from plugins"));
-            }
+            _ => return Err(Error::unsupported(&t.name, format!("a {} cannot come from a plugin", t.kind))),
         }
         Ok(())
     }
