@@ -57,7 +57,9 @@ impl Built {
                 let spec = read::<dyn InitializerSpec>(settings).map_err(refused)?;
                 AnyStage::Initializer(spec.build(&no_weights)?)
             }
-            Kind::Solver => return Err(Error::unsupported(t.name, "solvers cannot come from plugins")),
+            Kind::Solver | Kind::Callback => {
+                return Err(Error::unsupported(t.name, format!("{} types cannot come from plugins", t.kind)));
+            }
         };
         Ok(Self::of(stage))
     }
