@@ -9,7 +9,7 @@ use crate::data_term::DataTermSpec;
 use crate::error::{Error, Result};
 use crate::regularizer::RegularizerSpec;
 use crate::settings::{
-    EncoderSpec, FieldSpec, InitializerSpec, LossSpec, NormalizerSpec, PriorSpec, ProjectorSpec,
+    EncoderSpec, FieldSpec, InitializerSpec, LineFieldSpec, LossSpec, NormalizerSpec, PriorSpec, ProjectorSpec,
 };
 use crate::voxel::VoxelProjectorSpec;
 use schemars::Schema;
@@ -76,6 +76,8 @@ kinds! {
         Method "method",
         /// What watches over training.
         Callback "callback",
+        /// Line integrals of rays, and attenuation at points.
+        LineField "line-field",
     }
     loadable {
         /// Points to features.
@@ -101,6 +103,10 @@ kinds! {
         /// Penalty of coefficients with its proximal map, for iterative methods.
         Regularizer "regularizer" RegularizerSpec,
     }
+}
+
+impl Settings for dyn LineFieldSpec {
+    const KIND: Kind = Kind::LineField;
 }
 
 /// The settings of one kind of stage.

@@ -2,9 +2,9 @@
 //! initialization. What the LayerNorm and the field learn there is reused for every other scan.
 
 use crate::gradient::Gradient;
-use crate::guard::strayed;
 use crate::losses::L1;
 use crate::schedule::{Clock, Ends};
+use crate::training::run::strayed;
 use conefield_core::arena::Arena;
 use conefield_core::backend::{Executable, Work};
 use conefield_core::error::{Error, Result};
