@@ -92,21 +92,6 @@ impl Error {
         Self::Invalid { place: place.into(), field: field.into(), found: found.to_string(), expected: expected.into() }
     }
 
-    /// The error of a stage that stands at `key`: a field of the spec gets `key.` before it.
-    pub fn within(self, key: &str) -> Self {
-        match self {
-            Self::Invalid { place, field, found, expected } if place == "spec" => {
-                Self::Invalid { place, field: format!("{key}.{field}"), found, expected }
-            }
-            other => other,
-        }
-    }
-
-    /// A system error at `path`.
-    pub fn io(path: impl AsRef<Path>, source: std::io::Error) -> Self {
-        Self::Io { path: path.as_ref().to_path_buf(), source }
-    }
-
     /// The same error for the owner of the stage that it is about: `key` goes before a field of a spec. A stage does not
     /// know where it stands.
     pub fn within(self, key: &str) -> Self {
@@ -117,6 +102,11 @@ impl Error {
             }
             other => other,
         }
+    }
+
+    /// A system error at `path`.
+    pub fn io(path: impl AsRef<Path>, source: std::io::Error) -> Self {
+        Self::Io { path: path.as_ref().to_path_buf(), source }
     }
 
     /// A thing that cannot be done, with the reason.

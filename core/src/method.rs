@@ -5,11 +5,13 @@ use crate::arena::Weights;
 use crate::backend::{Backend, Explain};
 use crate::checkpoint::{Checkpoint, Resume};
 use crate::error::{Error, Result};
-use crate::parts::Voxels;
+use crate::geometry::VoxelGrid;
+use crate::parts::{Part, Voxels};
 use crate::pipeline::{Model, Pipeline};
 use crate::scan::{Scan, ScanHeader, Volume};
 use crate::stage::{GradKind, Stage};
 use crate::trained::{Placement, TrainedField};
+use ndarray::Array3;
 use serde::{Deserialize, Serialize};
 use std::time::Instant;
 
@@ -145,6 +147,15 @@ pub trait Observer {
     /// Keeps a checkpoint: when one is due, and before an interrupted run ends.
     fn checkpoint(&mut self, checkpoint: &Checkpoint<'_>) -> Result<()> {
         let _ = checkpoint;
+        Ok(())
+    }
+    /// Whether it is time to call [`Observer::slices`].
+    fn slices_due(&self) -> bool {
+        false
+    }
+    /// Sees the three middle slices of what takes shape, each with the part of `grid` that it is, in 1/unit of the scan.
+    fn slices(&mut self, grid: VoxelGrid, slices: &[(Part, Array3<f32>)]) -> Result<()> {
+        let _ = (grid, slices);
         Ok(())
     }
 }

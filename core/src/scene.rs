@@ -37,10 +37,7 @@ impl Scene {
         let grid = scan.geometry.volume;
         let longest = grid.size().into_iter().fold(0.0, f64::max);
         let attenuation = match settings.attenuation {
-            AttenuationScale::Fixed(x) => {
-                ensure(x.is_finite() && x > 0.0, "spec", "scene.attenuation", x, "a positive finite number")?;
-                x / scan.unit.mm
-            }
+            AttenuationScale::Fixed(x) => x / scan.unit.mm,
             AttenuationScale::Scan => {
                 let top = top_projection(scan);
                 ensure(
@@ -58,8 +55,8 @@ impl Scene {
 
     /// The scene around `grid` in which `attenuation` (1/mm) counts as 1.
     pub fn with_attenuation(grid: VoxelGrid, settings: &SceneSettings, attenuation: f64) -> Result<Self> {
+        settings.validate()?;
         let fill = settings.fill;
-        ensure(fill > 0.0 && fill <= 1.0, "spec", "scene.fill", fill, "a number above 0 and at most 1")?;
         let size = grid.size();
         let longest = size.into_iter().fold(0.0, f64::max);
         let side = longest / fill;

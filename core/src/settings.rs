@@ -92,3 +92,8 @@ pub struct KnownVolume {
     /// Steps in which the field learns it.
     pub steps: u64,
 }
+
+impl KnownVolume {
+    /// Steps where settings say nothing.
+    pub const STEPS: u64 = 500;
+}

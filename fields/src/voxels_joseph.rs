@@ -6,10 +6,10 @@
 //! [`voxel_grid`](crate::voxel_grid), without an activation.
 
 use crate::mlp::Activation;
-use crate::voxel_grid::{Resolution, VoxelGrid, VoxelGridStage};
+use crate::voxel_grid::{Resolution, VoxelGridSettings, VoxelGridStage};
 use conefield_core::error::Result;
 use conefield_core::simd::Real;
-use conefield_core::spec::FieldSpec;
+use conefield_core::settings::LineFieldSpec;
 use conefield_core::stage::{Field, Grads, Info, Kernel, Lines, Parameter, Reduced, Stage, UnitRay};
 use conefield_core::wgsl::Fragment;
 use schemars::JsonSchema;
@@ -33,21 +33,17 @@ impl Default for VoxelsJoseph {
 }
 
 conefield_core::stage_type!(
-    Field,
+    LineField,
     "voxels-joseph",
     VoxelsJoseph,
     "voxels with line integrals by Joseph, without an encoder"
 );
 
 #[typetag::serde(name = "voxels-joseph")]
-impl FieldSpec for VoxelsJoseph {
-    fn build(&self, width: usize) -> Result<Box<dyn Field>> {
-        let grid = VoxelGrid { resolution: self.resolution, output: Activation::None, init: self.init };
-        Ok(Box::new(VoxelsJosephStage { grid: VoxelGridStage::new(&grid, width)? }))
-    }
-
-    fn stands_alone(&self) -> bool {
-        true
+impl LineFieldSpec for VoxelsJoseph {
+    fn build(&self) -> Result<Box<dyn Field>> {
+        let grid = VoxelGridSettings { resolution: self.resolution, output: Activation::None, init: self.init };
+        Ok(Box::new(VoxelsJosephStage { grid: VoxelGridStage::new(&grid, 3)? }))
     }
 }
 
@@ -216,7 +212,7 @@ mod tests {
     }
 
     fn line(side: [u32; 3], params: &[f64], ray: UnitRay) -> f64 {
-        let grid = VoxelGrid { resolution: Resolution::Axes(side), output: Activation::None, init: 0.0 };
+        let grid = VoxelGridSettings { resolution: Resolution::Axes(side), output: Activation::None, init: 0.0 };
         let stage = VoxelsJosephStage { grid: VoxelGridStage::new(&grid, 3).unwrap() };
         let mut out = [f64::NAN];
         stage.project(params, &[ray], &mut out);

@@ -19,7 +19,7 @@ pub struct FromVolume {
 }
 
 fn steps() -> u64 {
-    500
+    KnownVolume::STEPS
 }
 
 conefield_core::stage_type!(Initializer, "volume", FromVolume, "a known volume to start from");

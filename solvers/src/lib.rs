@@ -1,22 +1,26 @@
-//! Solvers: scan in, volume out.
+//! Methods: scan in, volume out.
 //!
-//! - [`gradient`] trains an attenuation field by stochastic gradients, [`training`] is its loop; [`pretrain`] trains one on a
-//!   known volume, for weights that other scans reuse.
+//! - [`neural_field`] and [`line_field`] train an attenuation field by stochastic gradients, [`training`] is their loop; [`pretrain`] trains one
+//!   on a known volume, for weights that other scans reuse. [`losses`] say what a difference costs, [`priors`] what the field
+//!   is to be like, [`optimizer`] how gradients change parameters.
 //! - [`fit`] finds out what a scan has need of, [`support`] where its object can be, [`surround`] what lies beyond the volume.
 //! - [`fdk`] filters and back-projects.
-//! - [`sequence`] lets one solver go on where another one ended.
 //! - [`iterative`] improves voxels pass by pass: SART, CGLS, ASD-POCS, FISTA.
+//! - [`chain`] runs methods one after the other.
 
+pub mod chain;
 pub mod fdk;
+pub mod field_plan;
 pub mod fit;
-pub mod gradient;
 pub mod iterative;
+pub mod line_field;
 pub mod losses;
+pub mod neural_field;
+pub mod optimizer;
 pub mod pretrain;
 pub mod priors;
 pub mod rays;
 pub mod schedule;
-pub mod sequence;
 mod shadow;
 pub mod support;
 pub mod surround;

@@ -5,7 +5,7 @@ use conefield_core::backend::TrainRay;
 use conefield_core::error::{Error, Result};
 use conefield_core::pipeline::Pipeline;
 use conefield_core::random::stream;
-use conefield_core::scan::Scan;
+use conefield_core::scan::{Scan, ScanHeader};
 use conefield_core::scene::Scene;
 use rand::RngExt;
 use rand::seq::SliceRandom;
@@ -49,6 +49,11 @@ pub struct RaySource<'a> {
 }
 
 impl<'a> RaySource<'a> {
+    /// Bytes of the list of pixels: at most all of them.
+    pub fn bytes(scan: &ScanHeader) -> u64 {
+        size_of::<u32>() as u64 * scan.pixels()
+    }
+
     /// Finds the usable pixels. `margin` widens the support by that many pixels.
     pub fn new(
         scan: &'a Scan,

@@ -1,7 +1,7 @@
 //! How the learning rate goes down, and when a run ends.
 
 use conefield_core::error::{Result, ensure};
-use conefield_core::solver::Limits;
+use conefield_core::method::Limits;
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 use std::f64::consts::PI;

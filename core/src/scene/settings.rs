@@ -29,6 +29,17 @@ impl Default for SceneSettings {
     }
 }
 
+impl SceneSettings {
+    /// Refuses settings that mean nothing.
+    pub fn validate(&self) -> Result<()> {
+        ensure(self.fill > 0.0 && self.fill <= 1.0, "spec", "scene.fill", self.fill, "a number above 0 and at most 1")?;
+        if let AttenuationScale::Fixed(x) = self.attenuation {
+            ensure(x.is_finite() && x > 0.0, "spec", "scene.attenuation", x, "a positive finite number")?;
+        }
+        self.surround.validate()
+    }
+}
+
 /// What lies beyond the volume.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(rename_all = "kebab-case")]

@@ -5,7 +5,6 @@ use super::walk::{SiddonWalk, TrilinearWalk};
 use super::{bundles, columns};
 use conefield_core::error::{Result, ensure};
 use conefield_core::geometry::Geometry;
-use conefield_core::settings::ProjectorSpec;
 use conefield_core::simd::Real;
 use conefield_core::scan::ScanHeader;
 use conefield_core::voxel::{VoxelOperator, VoxelProjector, VoxelProjectorSpec};

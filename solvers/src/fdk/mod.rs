@@ -9,15 +9,17 @@ pub mod weights;
 
 use crate::iterative::drive::finite;
 use crate::iterative::monitor::VolumeMonitor;
-use crate::surround::Within;
+use crate::surround::{self, Within};
 use conefield_core::Error;
 use conefield_core::backend::Backend;
 use conefield_core::error::{Result, ensure};
 use conefield_core::geometry::{Geometry, dot, norm, sub};
 use conefield_core::scan::{Scan, ScanHeader, Volume};
-use conefield_core::solver::{Job, Observer, Reconstruction, Record, Solution, Solver};
+use conefield_core::method::{
+    Context, Findings, Job, Line, Method, Needs, Observer, Outline, Plan, Reconstruction, Record, Solution,
+};
+use conefield_core::scene::SurroundRule;
 use conefield_core::space::Space;
-use conefield_core::spec::SolverSpec;
 use conefield_core::voxel::VoxelView;
 use conefield_projectors::voxel::Joseph;
 use conefield_projectors::voxel::backproject::backproject;
@@ -41,31 +43,51 @@ pub struct Fdk {
     pub cutoff: f64,
     /// Set negative attenuation to 0 in the end.
     pub nonnegative: bool,
+    /// How the scan is seen.
+    pub scene: FdkScene,
+}
+
+/// How FDK sees the scan.
+#[derive(Debug, Clone, Copy, Default, PartialEq, Serialize, Deserialize, JsonSchema)]
+#[serde(deny_unknown_fields, default)]
+pub struct FdkScene {
+    /// What lies beyond the volume.
+    #[serde(skip_serializing_if = "SurroundRule::is_none")]
+    pub surround: SurroundRule,
 }
 
 impl Default for Fdk {
     fn default() -> Self {
-        Self { window: Window::Ramp, cutoff: 1.0, nonnegative: false }
+        Self { window: Window::Ramp, cutoff: 1.0, nonnegative: false, scene: FdkScene::default() }
     }
 }
 
-conefield_core::stage_type!(Solver, "fdk", Fdk, "filtered back-projection");
+conefield_core::stage_type!(Method, "fdk", Fdk, "filtered back-projection");
 
 #[typetag::serde(name = "fdk")]
-impl SolverSpec for Fdk {
-    fn build(&self) -> Result<Box<dyn Solver>> {
+impl Method for Fdk {
+    fn plan(&self, _: &Context<'_>) -> Result<Box<dyn Plan>> {
         let c = self.cutoff;
-        let fits = ensure(c > 0.0 && c <= 1.0, "spec", "cutoff", c, "a number above 0 and at most 1");
-        fits.map_err(|e| e.within("solver"))?;
+        ensure(c > 0.0 && c <= 1.0, "spec", "cutoff", c, "a number above 0 and at most 1")?;
+        self.scene.surround.validate()?;
         Ok(Box::new(self.clone()))
     }
 }
 
-impl Solver for Fdk {
-    fn solve(&self, job: &Job<'_>, observer: &mut dyn Observer) -> Result<Solution> {
+impl Plan for Fdk {
+    fn outline(&self) -> Outline {
+        let what = format!("{:?} window to {} of the highest frequency", self.window, self.cutoff).to_lowercase();
+        Outline { method: Line::new("method", "fdk", &what), ..Outline::default() }
+    }
+
+    fn starts_from_volume(&self) -> bool {
+        false
+    }
+
+    fn run(&mut self, job: &Job<'_>, observer: &mut dyn Observer) -> Result<Solution> {
         let start = Instant::now();
         job.scan.validate("scan")?;
-        let within = Within::of(job, observer)?;
+        let within = Within::of(job, self.scene.surround, observer)?;
         let job = &Within::job(within.as_ref(), job);
         let orbit = FdkOrbit::of(&job.scan.geometry);
         check(&orbit, &job.scan.geometry)?;
@@ -93,22 +115,21 @@ impl Solver for Fdk {
         Ok(Solution { result, steps: 1, train_s, samples: 0, sampling_s: 0.0, rollbacks: 0, best: None })
     }
 
-    fn plan(&self, scan: &Scan) -> Vec<String> {
+    fn inspect(&self, scan: &Scan) -> Result<Findings> {
         let orbit = FdkOrbit::of(&scan.geometry);
-        check(&orbit, &scan.geometry).map_or_else(|e| vec![e.to_string()], |()| said(&orbit))
+        let mut lines = surround::found(scan, self.scene.surround)?;
+        lines.extend(check(&orbit, &scan.geometry).map_or_else(|e| vec![e.to_string()], |()| said(&orbit)));
+        Ok(Findings { lines, ..Findings::default() })
     }
 
     /// Without the columns that an offset detector lacks, which only the scan itself tells.
-    fn bytes(&self, header: &ScanHeader) -> u64 {
+    fn needs(&self, header: &ScanHeader) -> Needs {
         let space = Space::tally(*header);
         let at_once = views_at_once(header.detector, held(header));
         images(&space, header.detector, at_once);
         space.pass(column_major_bytes::<f32>(header.detector, at_once.min(header.views)));
-        space.bytes()
-    }
-
-    fn describe(&self) -> String {
-        format!("fdk: {:?} window to {} of the highest frequency", self.window, self.cutoff).to_lowercase()
+        let [surround, subtracted] = surround::bytes(self.scene.surround, header);
+        Needs { surround, subtracted, working: space.bytes(), volume: true, ..Needs::default() }
     }
 }
 

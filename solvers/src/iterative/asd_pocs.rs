@@ -5,14 +5,15 @@ use super::noise::{self, Noise};
 use super::norms::{change, distance, norm2};
 use super::order::{Order, Subsets, told};
 use super::sart::{Sweep, Updates};
+use super::plan::{Iterative, IterativePlan};
 use super::shared::Shared;
 use super::tv::{anisotropy, descend};
 use super::{Iteration, Pass, Problem, Stop, drive::drive, flat_mut};
 use conefield_core::error::{Result, ensure};
 use conefield_core::scan::{Scan, ScanHeader};
-use conefield_core::solver::{Job, Observer, Solution, Solver};
+use conefield_core::method::{Context, Job, Observer, Solution, Method, Plan};
 use conefield_core::space::Space;
-use conefield_core::spec::SolverSpec;
+use conefield_core::scene::VoxelScene;
 use conefield_core::voxel::VoxelProjectorSpec;
 use conefield_projectors::voxel::Joseph;
 use ndarray::Array3;
@@ -28,6 +29,8 @@ pub struct AsdPocs {
     #[serde(deserialize_with = "conefield_core::spec::stage::needed")]
     #[schemars(with = "serde_json::Value", extend("x-stage" = "voxel-projector"))]
     pub projector: Box<dyn VoxelProjectorSpec>,
+    /// How the scan is seen.
+    pub scene: VoxelScene,
     /// The file of a known volume to start from.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub start: Option<String>,
@@ -55,6 +58,7 @@ impl Default for AsdPocs {
     fn default() -> Self {
         Self {
             projector: Box::new(Joseph {}),
+            scene: VoxelScene::default(),
             start: None,
             stop: Stop::after(20),
             subsets: Subsets::Count(50),
@@ -69,17 +73,17 @@ impl Default for AsdPocs {
     }
 }
 
-conefield_core::stage_type!(Solver, "asd-pocs", AsdPocs, "data passes in turn with descent on total variation");
+conefield_core::stage_type!(Method, "asd-pocs", AsdPocs, "data passes in turn with descent on total variation");
 
 #[typetag::serde(name = "asd-pocs")]
-impl SolverSpec for AsdPocs {
-    fn build(&self) -> Result<Box<dyn Solver>> {
-        self.built().map_err(|e| e.within("solver"))
+impl Method for AsdPocs {
+    fn plan(&self, _: &Context<'_>) -> Result<Box<dyn Plan>> {
+        Ok(Box::new(IterativePlan(self.built()?)))
     }
 }
 
 impl AsdPocs {
-    fn built(&self) -> Result<Box<dyn Solver>> {
+    fn built(&self) -> Result<Built> {
         let &Self { subsets, relaxation, decay, .. } = self;
         let updates = Updates { subsets, relaxation, decay, order: Order::Golden, nonnegative: true };
         updates.validate()?;
@@ -88,13 +92,13 @@ impl AsdPocs {
         }
         ensure(self.tolerance >= 0.0, "spec", "tolerance", self.tolerance, "0 or more")?;
         let &Self { alpha, alpha_decay, ratio, descents, tolerance, .. } = self;
-        let shared = Shared::of(self.projector.as_ref(), &self.start, &self.stop)?;
-        Ok(Box::new(Built {
+        let shared = Shared::of(self.projector.as_ref(), self.scene, &self.start, &self.stop)?;
+        Ok(Built {
             shared,
             updates,
             descent: Descent { alpha, alpha_decay, ratio, count: descents },
             tolerance,
-        }))
+        })
     }
 }
 
@@ -115,7 +119,15 @@ struct Built {
     tolerance: f64,
 }
 
-impl Solver for Built {
+impl Iterative for Built {
+    fn kind(&self) -> &'static str {
+        "asd-pocs"
+    }
+
+    fn shared(&self) -> &Shared {
+        &self.shared
+    }
+
     fn solve(&self, job: &Job<'_>, observer: &mut dyn Observer) -> Result<Solution> {
         let begun = Instant::now();
         let opened = self.shared.open(&self.describe(), job, observer)?;
@@ -129,17 +141,9 @@ impl Solver for Built {
         drive(job, &self.shared.stop, begun, &problem, &space, &mut iterate, observer)
     }
 
-    fn plan(&self, scan: &Scan) -> Vec<String> {
+    fn found(&self, scan: &Scan) -> Vec<String> {
         let noise = Noise::of(scan, false).to_string();
         vec![told(&self.updates.subsets.of(scan.geometry.views.len())), noise]
-    }
-
-    fn stages(&self) -> Vec<(&'static str, String)> {
-        self.shared.stages()
-    }
-
-    fn needs_held_out(&self) -> Option<&'static str> {
-        self.shared.stop.needs_held_out()
     }
 
     fn bytes(&self, header: &ScanHeader) -> u64 {

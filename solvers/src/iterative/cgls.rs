@@ -3,13 +3,14 @@
 
 use super::norms::norm2;
 use super::order::Subsets;
+use super::plan::{Iterative, IterativePlan};
 use super::shared::Shared;
 use super::{Iteration, Pass, Problem, Stop, drive::drive, flat_mut};
 use conefield_core::error::Result;
 use conefield_core::scan::ScanHeader;
-use conefield_core::solver::{Job, Observer, Reconstruction, Solution, Solver};
+use conefield_core::method::{Context, Job, Observer, Reconstruction, Solution, Method, Plan};
 use conefield_core::space::Space;
-use conefield_core::spec::SolverSpec;
+use conefield_core::scene::VoxelScene;
 use conefield_core::voxel::VoxelProjectorSpec;
 use conefield_projectors::voxel::Joseph;
 use ndarray::{Array3, Zip};
@@ -25,6 +26,8 @@ pub struct Cgls {
     #[serde(deserialize_with = "conefield_core::spec::stage::needed")]
     #[schemars(with = "serde_json::Value", extend("x-stage" = "voxel-projector"))]
     pub projector: Box<dyn VoxelProjectorSpec>,
+    /// How the scan is seen.
+    pub scene: VoxelScene,
     /// The file of a known volume to start from.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub start: Option<String>,
@@ -36,17 +39,18 @@ pub struct Cgls {
 
 impl Default for Cgls {
     fn default() -> Self {
-        Self { projector: Box::new(Joseph {}), start: None, stop: Stop::after(15), nonnegative: true }
+        let (scene, stop) = (VoxelScene::default(), Stop::after(15));
+        Self { projector: Box::new(Joseph {}), scene, start: None, stop, nonnegative: true }
     }
 }
 
-conefield_core::stage_type!(Solver, "cgls", Cgls, "conjugate gradients for least squares");
+conefield_core::stage_type!(Method, "cgls", Cgls, "conjugate gradients for least squares");
 
 #[typetag::serde(name = "cgls")]
-impl SolverSpec for Cgls {
-    fn build(&self) -> Result<Box<dyn Solver>> {
-        let shared = Shared::of(self.projector.as_ref(), &self.start, &self.stop).map_err(|e| e.within("solver"))?;
-        Ok(Box::new(Built { shared, nonnegative: self.nonnegative }))
+impl Method for Cgls {
+    fn plan(&self, _: &Context<'_>) -> Result<Box<dyn Plan>> {
+        let shared = Shared::of(self.projector.as_ref(), self.scene, &self.start, &self.stop)?;
+        Ok(Box::new(IterativePlan(Built { shared, nonnegative: self.nonnegative })))
     }
 }
 
@@ -56,7 +60,15 @@ struct Built {
     nonnegative: bool,
 }
 
-impl Solver for Built {
+impl Iterative for Built {
+    fn kind(&self) -> &'static str {
+        "cgls"
+    }
+
+    fn shared(&self) -> &Shared {
+        &self.shared
+    }
+
     fn solve(&self, job: &Job<'_>, observer: &mut dyn Observer) -> Result<Solution> {
         let begun = Instant::now();
         let opened = self.shared.open(&self.describe(), job, observer)?;
@@ -70,14 +82,6 @@ impl Solver for Built {
             volume.data.par_mapv_inplace(|x| x.max(0.0));
         }
         Ok(solution)
-    }
-
-    fn stages(&self) -> Vec<(&'static str, String)> {
-        self.shared.stages()
-    }
-
-    fn needs_held_out(&self) -> Option<&'static str> {
-        self.shared.stop.needs_held_out()
     }
 
     fn bytes(&self, header: &ScanHeader) -> u64 {

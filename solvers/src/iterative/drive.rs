@@ -10,7 +10,7 @@ use conefield_core::Error;
 use conefield_core::checkpoint::{Checkpoint, Resume, Standing};
 use conefield_core::error::{Result, ensure};
 use conefield_core::scan::Volume;
-use conefield_core::solver::{Best, Job, Observer, Reconstruction, Record, Solution};
+use conefield_core::method::{Best, Job, Observer, Reconstruction, Record, Solution};
 use conefield_core::space::Space;
 use ndarray::Array3;
 use serde::{Deserialize, Serialize};

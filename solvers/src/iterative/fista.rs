@@ -17,6 +17,7 @@ use super::norms::{change, distance, norm2};
 use super::order::{Order, Subsets, split, told};
 use super::problem::images_mut;
 use super::regularizers::Nonnegative;
+use super::plan::{Iterative, IterativePlan};
 use super::shared::Shared;
 use super::{Iteration, Pass, Problem, Stop, drive::drive, flat, flat_mut};
 use conefield_core::Error;
@@ -27,9 +28,9 @@ use conefield_core::geometry::VoxelGrid;
 use conefield_core::random::stream;
 use conefield_core::regularizer::{Penalty, Regularizer, RegularizerSpec};
 use conefield_core::scan::{Scan, ScanHeader};
-use conefield_core::solver::{Job, Observer, Solution, Solver};
+use conefield_core::method::{Context, Line, Job, Observer, Solution, Method, Plan};
 use conefield_core::space::Space;
-use conefield_core::spec::SolverSpec;
+use conefield_core::scene::VoxelScene;
 use conefield_core::voxel::VoxelProjectorSpec;
 use conefield_projectors::voxel::Joseph;
 use ndarray::{Array3, Zip};
@@ -59,6 +60,8 @@ pub struct Fista {
     #[serde(deserialize_with = "conefield_core::spec::stage::needed")]
     #[schemars(with = "serde_json::Value", extend("x-stage" = "regularizer"))]
     pub prior: Box<dyn RegularizerSpec>,
+    /// How the scan is seen.
+    pub scene: VoxelScene,
     /// The file of a known volume to start from.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub start: Option<String>,
@@ -83,6 +86,7 @@ impl Default for Fista {
             basis: Box::new(Voxels {}),
             data: Box::new(NoiseWeighted {}),
             prior: Box::new(Nonnegative {}),
+            scene: VoxelScene::default(),
             start: None,
             stop: Stop { change: Some(1e-3), ..Stop::after(16) },
             air: true,
@@ -97,30 +101,41 @@ impl Default for Fista {
 /// 34.2, 34.5 and 34.7 dB after 15 passes.
 const MOMENTUM: f64 = 400.0;
 
-conefield_core::stage_type!(Solver, "fista", Fista, "ordered-subset FISTA with any basis, data term and prior");
+conefield_core::stage_type!(Method, "fista", Fista, "ordered-subset FISTA with any basis, data term and prior");
 
 #[typetag::serde(name = "fista")]
-impl SolverSpec for Fista {
-    fn build(&self) -> Result<Box<dyn Solver>> {
-        self.built().map_err(|e| e.within("solver"))
+impl Method for Fista {
+    fn plan(&self, _: &Context<'_>) -> Result<Box<dyn Plan>> {
+        Ok(Box::new(IterativePlan(self.built()?)))
     }
 }
 
 impl Fista {
-    fn built(&self) -> Result<Box<dyn Solver>> {
+    /// Bytes that it takes for a scan of this size, beside the volume that comes out.
+    pub(crate) fn bytes(&self, scan: &ScanHeader) -> u64 {
+        self.built().map_or(0, |built| Iterative::bytes(&built, scan))
+    }
+
+    /// Reconstructs without a plan.
+    pub(crate) fn solve(&self, job: &Job<'_>, observer: &mut dyn Observer) -> Result<Solution> {
+        self.built()?.solve(job, observer)
+    }
+
+    fn built(&self) -> Result<Built> {
         self.subsets.validate()?;
         let pull = self.pull;
         ensure(pull.is_finite() && pull >= 0.0, "spec", "pull", pull, "a finite number, 0 or more")?;
-        Ok(Box::new(Built {
-            shared: Shared::of(self.projector.as_ref(), &self.start, &self.stop)?,
+        Ok(Built {
+            shared: Shared::of(self.projector.as_ref(), self.scene, &self.start, &self.stop)?,
             basis: self.basis.build().map_err(|e| e.within("basis"))?,
             data: self.data.build().map_err(|e| e.within("data"))?,
             prior: self.prior.build().map_err(|e| e.within("prior"))?,
+            kinds: [self.basis.typetag_name(), self.data.typetag_name(), self.prior.typetag_name()],
             air: self.air,
             subsets: self.subsets,
             order: self.order,
             pull,
-        }))
+        })
     }
 }
 
@@ -130,18 +145,28 @@ struct Built {
     basis: Box<dyn Basis>,
     data: Box<dyn DataTerm>,
     prior: Box<dyn Regularizer>,
+    /// The types of the three.
+    kinds: [&'static str; 3],
     air: bool,
     subsets: Subsets,
     order: Order,
     pull: f64,
 }
 
-impl Solver for Built {
+impl Iterative for Built {
+    fn kind(&self) -> &'static str {
+        "fista"
+    }
+
+    fn shared(&self) -> &Shared {
+        &self.shared
+    }
+
     fn solve(&self, job: &Job<'_>, observer: &mut dyn Observer) -> Result<Solution> {
         let begun = Instant::now();
         if self.pull > 0.0 && !self.shared.has_start(job) {
             let expected = "0, or a volume to start from and to be held to";
-            return Err(Error::invalid("spec", "pull", self.pull, expected).within("solver"));
+            return Err(Error::invalid("spec", "pull", self.pull, expected));
         }
         let opened = self.shared.open(&self.describe(), job, observer)?;
         let job = &opened.job(job);
@@ -159,17 +184,17 @@ impl Solver for Built {
         drive(job, &self.shared.stop, begun, &problem, &space, &mut iterate, observer)
     }
 
-    fn plan(&self, scan: &Scan) -> Vec<String> {
+    fn found(&self, scan: &Scan) -> Vec<String> {
         vec![told(&self.subsets.of(scan.geometry.views.len())), self.data.of(scan).describe()]
     }
 
-    fn stages(&self) -> Vec<(&'static str, String)> {
-        let own = [("basis", self.basis.describe()), ("data", self.data.describe()), ("prior", self.prior.describe())];
-        self.shared.stages().into_iter().chain(own).collect()
-    }
-
-    fn needs_held_out(&self) -> Option<&'static str> {
-        self.shared.stop.needs_held_out()
+    fn stages(&self) -> Vec<Line> {
+        let [basis, data, prior] = self.kinds;
+        vec![
+            Line::new("basis", basis, &self.basis.describe()),
+            Line::new("data", data, &self.data.describe()),
+            Line::new("prior", prior, &self.prior.describe()),
+        ]
     }
 
     fn bytes(&self, header: &ScanHeader) -> u64 {

@@ -17,6 +17,7 @@ pub mod monitor;
 pub mod noise;
 pub mod norms;
 pub mod order;
+mod plan;
 pub mod problem;
 pub mod regularizers;
 pub mod sart;
@@ -25,17 +26,17 @@ pub mod stop;
 pub mod tv;
 
 use conefield_core::scan::ScanHeader;
-use conefield_core::spec::{Scene, SupportRule};
+use conefield_core::scene::SupportRule;
 use ndarray::Array3;
 
 pub use drive::{Iteration, Pass};
 pub use problem::Problem;
-pub use shared::start_volume;
+pub use shared::known_volume;
 pub use stop::Stop;
 
 /// Bytes of the mask that says where the object can be.
-pub fn mask_bytes(settings: &Scene, header: &ScanHeader) -> u64 {
-    match settings.support {
+pub fn mask_bytes(rule: SupportRule, header: &ScanHeader) -> u64 {
+    match rule {
         SupportRule::Box => 0,
         SupportRule::Carve => header.voxels(),
     }

@@ -5,13 +5,14 @@
 use super::norms::change;
 use super::order::{Order, Subsets, told};
 use super::problem::{images_mut, invert, room};
+use super::plan::{Iterative, IterativePlan};
 use super::shared::Shared;
 use super::{Iteration, Pass, Problem, Stop, drive::drive, flat_mut};
 use conefield_core::error::{Result, ensure};
 use conefield_core::scan::{Scan, ScanHeader};
-use conefield_core::solver::{Job, Observer, Solution, Solver};
+use conefield_core::method::{Context, Job, Observer, Solution, Method, Plan};
 use conefield_core::space::Space;
-use conefield_core::spec::SolverSpec;
+use conefield_core::scene::VoxelScene;
 use conefield_core::voxel::VoxelProjectorSpec;
 use conefield_projectors::voxel::Joseph;
 use ndarray::{Array3, Axis, Zip};
@@ -27,6 +28,8 @@ pub struct Sart {
     #[serde(deserialize_with = "conefield_core::spec::stage::needed")]
     #[schemars(with = "serde_json::Value", extend("x-stage" = "voxel-projector"))]
     pub projector: Box<dyn VoxelProjectorSpec>,
+    /// How the scan is seen.
+    pub scene: VoxelScene,
     /// The file of a known volume to start from.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub start: Option<String>,
@@ -48,6 +51,7 @@ impl Default for Sart {
     fn default() -> Self {
         Self {
             projector: Box::new(Joseph {}),
+            scene: VoxelScene::default(),
             start: None,
             stop: Stop::after(15),
             subsets: Subsets::VIEWS,
@@ -59,17 +63,17 @@ impl Default for Sart {
     }
 }
 
-conefield_core::stage_type!(Solver, "sart", Sart, "simultaneous algebraic reconstruction by subsets of the views");
+conefield_core::stage_type!(Method, "sart", Sart, "simultaneous algebraic reconstruction by subsets of the views");
 
 #[typetag::serde(name = "sart")]
-impl SolverSpec for Sart {
-    fn build(&self) -> Result<Box<dyn Solver>> {
-        self.built().map_err(|e| e.within("solver"))
+impl Method for Sart {
+    fn plan(&self, _: &Context<'_>) -> Result<Box<dyn Plan>> {
+        Ok(Box::new(IterativePlan(self.built()?)))
     }
 }
 
 impl Sart {
-    fn built(&self) -> Result<Box<dyn Solver>> {
+    fn built(&self) -> Result<Built> {
         let updates = Updates {
             subsets: self.subsets,
             relaxation: self.relaxation,
@@ -78,7 +82,7 @@ impl Sart {
             nonnegative: self.nonnegative,
         };
         updates.validate()?;
-        Ok(Box::new(Built { shared: Shared::of(self.projector.as_ref(), &self.start, &self.stop)?, updates }))
+        Ok(Built { shared: Shared::of(self.projector.as_ref(), self.scene, &self.start, &self.stop)?, updates })
     }
 }
 
@@ -115,7 +119,15 @@ impl Built {
     }
 }
 
-impl Solver for Built {
+impl Iterative for Built {
+    fn kind(&self) -> &'static str {
+        "sart"
+    }
+
+    fn shared(&self) -> &Shared {
+        &self.shared
+    }
+
     fn solve(&self, job: &Job<'_>, observer: &mut dyn Observer) -> Result<Solution> {
         let begun = Instant::now();
         let opened = self.shared.open(&self.describe(), job, observer)?;
@@ -127,16 +139,8 @@ impl Solver for Built {
         drive(job, &self.shared.stop, begun, &problem, &space, &mut iterate, observer)
     }
 
-    fn plan(&self, scan: &Scan) -> Vec<String> {
+    fn found(&self, scan: &Scan) -> Vec<String> {
         vec![told(&self.updates.subsets.of(scan.geometry.views.len()))]
-    }
-
-    fn stages(&self) -> Vec<(&'static str, String)> {
-        self.shared.stages()
-    }
-
-    fn needs_held_out(&self) -> Option<&'static str> {
-        self.shared.stop.needs_held_out()
     }
 
     fn bytes(&self, header: &ScanHeader) -> u64 {

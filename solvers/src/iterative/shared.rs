@@ -8,7 +8,9 @@ use crate::surround::Within;
 use conefield_core::Error;
 use conefield_core::error::{Result, ensure};
 use conefield_core::scan::Volume;
-use conefield_core::solver::{Job, Observer};
+use conefield_core::method::{Job, Observer};
+use conefield_core::settings::KnownVolume;
+use conefield_core::scene::VoxelScene;
 use conefield_core::space::Space;
 use conefield_core::voxel::{VoxelProjector, VoxelProjectorSpec};
 use ndarray::{Array3, Zip};
@@ -17,17 +19,27 @@ use std::sync::Arc;
 /// The settings that all iterative methods have, built.
 pub(super) struct Shared {
     pub(super) projector: Arc<dyn VoxelProjector>,
+    /// The name of its type.
+    pub(super) projector_kind: &'static str,
+    pub(super) scene: VoxelScene,
     /// The file of the volume to start from.
     start: Option<String>,
     pub(super) stop: Stop,
 }
 
 impl Shared {
-    /// Builds the settings at the keys `projector`, `start` and `stop` of a method.
-    pub(super) fn of(projector: &dyn VoxelProjectorSpec, start: &Option<String>, stop: &Stop) -> Result<Self> {
+    /// Builds the settings at the keys `projector`, `scene`, `start` and `stop` of a method.
+    pub(super) fn of(
+        projector: &dyn VoxelProjectorSpec,
+        scene: VoxelScene,
+        start: &Option<String>,
+        stop: &Stop,
+    ) -> Result<Self> {
         stop.validate()?;
+        scene.surround.validate()?;
+        let projector_kind = projector.typetag_name();
         let projector = projector.build().map_err(|e| e.within("projector"))?;
-        Ok(Self { projector: projector.into(), start: start.clone(), stop: stop.clone() })
+        Ok(Self { projector: projector.into(), projector_kind, scene, start: start.clone(), stop: stop.clone() })
     }
 
     /// Whether there is a volume to start from.
@@ -60,19 +72,14 @@ impl Shared {
         let projector = job.backend.place(Box::new(self.projector.clone()))?;
         observer.note(&format!("{method}; {}", projector.describe()));
         // By the views as they were measured: what is taken off them afterwards is known too coarsely to carve by.
-        let (support, said) = support(job.scan, &job.spec.scene);
+        let (support, said) = support(job.scan, self.scene.support);
         said.iter().for_each(|line| observer.note(line));
         let inside = support.map(|support| {
             let mut inside = Array3::from_elem(g.volume.shape, false);
             Zip::indexed(&mut inside).par_for_each(|(x, y, z), i| *i = support.holds(g.volume.voxel([x, y, z])));
             inside
         });
-        Ok(Opened { projector, inside, within: Within::of(job, observer)? })
-    }
-
-    /// The stages that all methods have, by key, in words.
-    pub(super) fn stages(&self) -> Vec<(&'static str, String)> {
-        vec![("projector", self.projector.describe())]
+        Ok(Opened { projector, inside, within: Within::of(job, self.scene.surround, observer)? })
     }
 
     /// Counts in a tally what the driver, and the projector of a subset, take beside the method's own arrays; returns all bytes without
@@ -107,8 +114,21 @@ impl Opened {
     }
 }
 
+/// The volume that a field begins with, in 1/mm, the steps in which it learns it, and where it comes from: what the job hands
+/// over, or the file that the initializer names.
+pub fn known_volume(job: &Job<'_>, named: Option<KnownVolume>) -> Result<Option<(Volume, u64, String)>> {
+    match (job.start, named) {
+        (Some(given), named) => {
+            let steps = named.map_or(KnownVolume::STEPS, |n| n.steps);
+            Ok(Some((in_mm(job, "start", given.clone())?, steps, "the volume of the method before".into())))
+        }
+        (None, Some(KnownVolume { path, steps })) => Ok(Some((start_volume(job, &path)?, steps, path))),
+        (None, None) => Ok(None),
+    }
+}
+
 /// Reads a volume that fits the scan, in 1/mm.
-pub fn start_volume(job: &Job<'_>, path: &str) -> Result<Volume> {
+fn start_volume(job: &Job<'_>, path: &str) -> Result<Volume> {
     in_mm(job, path, (job.volumes)(path)?)
 }
 

@@ -40,9 +40,4 @@ impl Stop {
         }
         ensure(self.patience != Some(0), "spec", "stop.patience", 0, "at least 1")
     }
-
-    /// See [`conefield_core::solver::Solver::needs_held_out`].
-    pub(crate) fn needs_held_out(&self) -> Option<&'static str> {
-        self.patience.map(|_| "solver.stop.patience")
-    }
 }

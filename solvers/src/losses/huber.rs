@@ -2,7 +2,7 @@
 
 use conefield_core::error::{Result, ensure};
 use conefield_core::loss::Loss;
-use conefield_core::spec::LossSpec;
+use conefield_core::settings::LossSpec;
 use conefield_core::wgsl::Fragment;
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};

@@ -2,7 +2,7 @@
 
 use conefield_core::error::{Result, ensure};
 use conefield_core::prior::{Blocks, Prior};
-use conefield_core::spec::PriorSpec;
+use conefield_core::settings::PriorSpec;
 use conefield_core::wgsl::Fragment;
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};

@@ -7,8 +7,8 @@ use conefield_core::checkpoint::Resume;
 use conefield_core::error::{Error, Result};
 use conefield_core::pipeline::Pipeline;
 use conefield_core::registry::Kind;
-use conefield_core::solver::Record;
-use conefield_core::spec::stage::Settings;
+use conefield_core::method::Record;
+use conefield_core::registry::Settings;
 use serde::Serialize;
 use serde::de::DeserializeOwned;
 use serde_json::Value;
@@ -46,7 +46,7 @@ pub enum Update {
 ///
 /// A loop goes: [`between_steps`](Self::between_steps), checkpoint, at the end of the run [`at_end`](Self::at_end), then
 /// [`at_record`](Self::at_record), [`before_step`](Self::before_step), [`after_gradients`](Self::after_gradients), update.
-pub trait Callback {
+pub trait Callback: Send {
     /// Its name: the key of its state in a checkpoint.
     fn name(&self) -> &'static str;
 

@@ -11,14 +11,25 @@ pub mod run;
 pub use callback::{Callback, CallbackSpec, Callbacks, Kept, State, Update};
 pub use run::Run;
 
-use conefield_core::backend::{Adam, Work};
+use conefield_core::backend::{Adam, BlockWork, TrainRay, Work};
+use conefield_core::loss::Loss;
 use conefield_core::error::{Error, Result};
 use std::time::Instant;
+
+/// What a step learns from, drawn at random.
+pub struct Draw<'a> {
+    /// The loss of rays and points.
+    pub loss: &'a dyn Loss,
+    /// Rays with measured line integrals.
+    pub rays: &'a [TrainRay],
+    /// Priors of the field.
+    pub priors: Vec<BlockWork<'a>>,
+}
 
 /// What is learned, and by which rule.
 pub trait Task {
     /// What step `step` (from 0) of a run with `seed` learns from.
-    fn draw(&mut self, seed: u64, step: u64) -> Work<'_>;
+    fn draw(&mut self, seed: u64, step: u64) -> Draw<'_>;
     /// Adam's settings for an update at `epoch` passes over the views and `share` of the run.
     fn adam(&self, epoch: f64, share: f64) -> Adam;
 }
@@ -60,7 +71,8 @@ pub fn train(run: &mut Run<'_>, task: &mut dyn Task, callbacks: &mut Callbacks) 
 /// One step: draw, gradients and, unless a callback refuses it, update.
 fn step(run: &mut Run<'_>, task: &mut dyn Task, callbacks: &mut Callbacks) -> Result<()> {
     let adam = task.adam(run.epoch(), run.clock.share(run.step));
-    let work = task.draw(run.job.seed, run.step);
+    let Draw { loss, rays, priors } = task.draw(run.job.seed, run.step);
+    let work = Work { step: run.step, seed: run.job.seed, loss, rays, points: &[], priors: &priors };
     let start = Instant::now();
     let stats = run.exe.step(&mut run.model, &work)?;
     let mut update = Update::Take;

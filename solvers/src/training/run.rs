@@ -2,16 +2,18 @@
 
 use crate::schedule::{Clock, Ends};
 use conefield_core::arena::Arena;
-use conefield_core::backend::{Executable, Loss, StepStats};
+use conefield_core::backend::{Executable, StepStats};
+use conefield_core::loss::Loss;
 use conefield_core::error::{Error, Result};
 use conefield_core::pipeline::Model;
 use conefield_core::scene::Scene;
-use conefield_core::solver::{Best, DriftRecord, Job, Observer, Record};
+use conefield_core::method::{Best, DriftRecord, Job, Observer, Record};
 use rayon::prelude::*;
 use serde::{Deserialize, Serialize};
+use std::sync::Arc;
 
 /// What may help where training diverges.
-pub const HINT: &str = "try a smaller solver.lr";
+pub const HINT: &str = "try a smaller optimizer.lr";
 
 /// A run of the training loop.
 pub struct Run<'a> {
@@ -27,8 +29,8 @@ pub struct Run<'a> {
     pub exe: Box<dyn Executable>,
     /// Counts training time.
     pub clock: Clock,
-    /// Penalty of the difference between predicted and measured.
-    pub loss: Loss,
+    /// What a difference between predicted and measured costs.
+    pub loss: Arc<dyn Loss>,
     /// Steps that make a pass over the views.
     pub steps_an_epoch: u64,
     /// Steps between two records.

@@ -12,7 +12,7 @@ use conefield_core::error::{Error, Result, ensure};
 use conefield_core::host;
 use conefield_core::random::stream;
 use conefield_core::scene::Scene;
-use conefield_core::solver::DriftRecord;
+use conefield_core::method::DriftRecord;
 use rand::RngExt;
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};

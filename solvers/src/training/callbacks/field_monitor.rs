@@ -7,7 +7,7 @@ use conefield_core::backend::TrainRay;
 use conefield_core::error::Result;
 use conefield_core::pipeline::Pipeline;
 use conefield_core::scene::Scene;
-use conefield_core::solver::{Job, Record};
+use conefield_core::method::{Job, Record};
 use conefield_core::stage::UnitRay;
 
 /// Rays of held-out views that are rendered for a record, at most.

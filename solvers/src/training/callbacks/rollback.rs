@@ -11,7 +11,8 @@
 use crate::training::run::{HINT, Run, strayed};
 use crate::training::{Callback, CallbackSpec, Kept, State, Update};
 use conefield_core::arena::{Arena, Layout};
-use conefield_core::backend::{Loss, StepStats, Work};
+use conefield_core::backend::{StepStats, Work};
+use conefield_core::loss::Loss;
 use conefield_core::checkpoint::tensors_of;
 use conefield_core::error::{Error, Result, ensure};
 use conefield_core::pages::Pages;
@@ -21,6 +22,7 @@ use ndarray::{ArrayView2, Axis};
 use rayon::prelude::*;
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
+use std::sync::Arc;
 
 /// Steps whose losses are judged together.
 const WINDOW: u64 = 25;
@@ -56,7 +58,7 @@ impl CallbackSpec for Rollback {
         ensure(self.times > 0, "spec", "times", 0, "at least 1; leave rollback out to never go back")?;
         Ok(Box::new(Guard {
             times: self.times,
-            loss: Loss::L1,
+            loss: None,
             measured: 0.0,
             watched: Watched::default(),
             copy: None,
@@ -91,7 +93,8 @@ struct Watched {
 /// The callback that [`Rollback`] builds.
 struct Guard {
     times: u64,
-    loss: Loss,
+    /// That of the run.
+    loss: Option<Arc<dyn Loss>>,
     /// A line integral as it was measured where there is an object, in the scale that stages see.
     measured: f64,
     watched: Watched,
@@ -105,7 +108,7 @@ impl Callback for Guard {
     }
 
     fn begin(&mut self, run: &mut Run<'_>) -> Result<()> {
-        (self.loss, self.measured) = (run.loss, measured(run.job.scan, run.scene));
+        (self.loss, self.measured) = (Some(run.loss.clone()), measured(run.job.scan, run.scene));
         Ok(())
     }
 
@@ -120,12 +123,12 @@ impl Callback for Guard {
             let what = format!("the loss is {}, the prior {}", stats.loss, stats.prior);
             return self.back(&what, run);
         }
-        let empty: f64 = work.rays.iter().map(|r| self.loss.at(f64::from(r.target)).0).sum();
+        let empty: f64 = work.rays.iter().map(|r| self.of(0.0, f64::from(r.target))).sum();
         let empty = empty / work.rays.len().max(1) as f64;
         self.watched.sum += stats.loss;
         self.watched.empty += empty;
         self.watched.steps += 1;
-        let level = *self.watched.level.get_or_insert(stats.loss.max(self.loss.at(self.measured).0));
+        let level = *self.watched.level.get_or_insert(stats.loss.max(self.of(0.0, self.measured)));
         let other = (stats.loss - empty).abs() > ALIVE * empty;
         self.watched.alive |= other;
         self.watched.dead = if other { 0 } else { self.watched.dead + 1 };
@@ -193,7 +196,7 @@ impl Guard {
         }
         let Watched { sum, empty, last, .. } = self.watched;
         let (found, empty) = (sum + last[0], empty + last[1]);
-        let text = "the field is no better than an empty volume; another solver.lr or more steps may help";
+        let text = "the field is no better than an empty volume; another optimizer.lr or more steps may help";
         (empty > 0.0 && found > 0.99 * empty).then(|| text.to_owned())
     }
 
@@ -206,9 +209,15 @@ impl Guard {
         away.then(|| format!("the loss ran away, from {level:.3e} to {mean:.3e}"))
     }
 
+    /// The loss of a prediction.
+    fn of(&self, predicted: f64, measured: f64) -> f64 {
+        self.loss.as_ref().map_or(0.0, |loss| loss.at(predicted, measured).0)
+    }
+
     /// The loss of differences `factor` times as large as those of the loss `level`.
     fn beyond(&self, factor: f64, level: f64) -> f64 {
-        self.loss.at(1.0).0 / self.loss.at(1.0 / factor).0 * level.max(self.loss.at(SMALL * self.measured).0)
+        let of = |difference: f64| self.of(difference, 0.0);
+        of(1.0) / of(1.0 / factor) * level.max(of(SMALL * self.measured))
     }
 
     /// Copies the state, which the step's loss has found good; one that is not finite is no good after all.
