@@ -186,7 +186,11 @@ fn a_checkpoint_of_other_callbacks_is_refused() {
         let e = resumed(settings, resume).unwrap_err().to_string();
         assert!(words.iter().all(|w| e.contains(w)), "{e}");
     };
-    refused(&with("/solver/callbacks", json!([{"type": "rollback"}])), &kept, &["kept: drift", "field-monitor, rollback"]);
+    refused(
+        &with("/solver/callbacks", json!([{"type": "rollback"}])),
+        &kept,
+        &["kept: drift", "field-monitor, rollback"],
+    );
     refused(&masked(), &kept, &["kept: fft-mask", "nothing"]);
     let mut more = kept.clone();
     more.weights.tensors.insert("drift.more".into(), (vec![1], vec![0.0]));

@@ -103,7 +103,8 @@ fn without_patience_nothing_changes() {
 fn a_run_resumes_to_the_same_best() {
     let (train, held) = scans(1.0);
     let mut masked = settings(4000, Some(4));
-    masked["solver"]["callbacks"] = json!([{"type": "patience", "records": 4}, {"type": "fft-mask", "keep": [0, 1, 2, 3, 4]}]);
+    masked["solver"]["callbacks"] =
+        json!([{"type": "patience", "records": 4}, {"type": "fft-mask", "keep": [0, 1, 2, 3, 4]}]);
     for (value, masks) in [(settings(4000, Some(4)), false), (masked, true)] {
         let (spec, backend) = (spec(&value).unwrap(), Cpu::new());
         let solver = spec.solver.build().unwrap();

@@ -89,10 +89,6 @@ impl Built {
                 let Reduced { stage, params, channels } = e.keep_outputs(keep)?;
                 of(params, channels, AnyStage::Encoder(stage))
             }
-            (AnyStage::Normalizer(n), CONEFIELD_OUTPUTS) => {
-                let Reduced { stage, params, channels } = n.keep_outputs(keep)?;
-                of(params, channels, AnyStage::Normalizer(stage))
-            }
             (AnyStage::Normalizer(n), CONEFIELD_INPUTS) => {
                 let Reduced { stage, params, channels } = n.keep_inputs(keep)?;
                 of(params, channels, AnyStage::Normalizer(stage))

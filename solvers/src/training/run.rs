@@ -83,7 +83,7 @@ impl<'a> Run<'a> {
             model,
             exe,
             clock: Clock::new(Ends::default(), job.limits, 0.0),
-            loss: Loss::L1,
+            loss: Arc::new(crate::losses::L1 {}),
             steps_an_epoch: 1,
             report_every: 1,
             step: 0,
