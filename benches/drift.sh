@@ -1,5 +1,5 @@
 #!/usr/bin/env bash
-# How much normalizers and field change under the same features (solver.drift), with and without LayerNorm and MCI:
+# How much normalizers and field change under the same features (callback drift), with and without LayerNorm and MCI:
 #   bash benches/drift.sh DATA_FOLDER OUT_FOLDER [STEPS [VOLUME]]
 # DATA_FOLDER holds volumes/*.nii.gz. MCI weights come from abdomen alone, for each way with normalizers of its own. Steps
 # (1000) end a run, so that the load of the machine does not matter. The learning rate stays as it is, or its fall would
@@ -31,7 +31,7 @@ run() {
     shift
     [[ -f $run/record.json ]] || "$bin/conefield" -q reconstruct "$scan" "${small[@]}" -o "$run" --force --steps "$steps" \
         --reference truth --set solver.report_every=25 --set solver.lr=5e-3 --set 'solver.decay="none"' \
-        --set solver.rays=512 --set projector.samples=96 --set 'solver.drift={every=1}' "$@"
+        --set solver.rays=512 --set projector.samples=96 --set 'solver.callbacks=[{type="rollback"},{type="drift",every=1}]' "$@"
 }
 run naf --set "$none"
 run mci --set "$none" --init "$out/abdomen-none.safetensors"

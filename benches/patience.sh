@@ -24,7 +24,7 @@ for volume in $volumes; do
     }
     run field-cosine "${field[@]}"
     run field-constant "${field[@]}" --set 'solver.decay="none"'
-    run field-patience "${field[@]}" --set 'solver.decay="none"' --set solver.patience=5
+    run field-patience "${field[@]}" --set 'solver.decay="none"' --set 'solver.callbacks=[{type="rollback"},{type="patience"}]'
     run sart-passes --spec sart --set 'solver.stop={passes=10}'
     run sart-patience --spec sart --set 'solver.stop={passes=10,patience=2}'
 done

@@ -22,7 +22,7 @@ fn arguments(scan: &Path, run: &Path, steps: u64, more: &[&str]) -> Vec<String> 
         ["reconstruct", &text(scan), "--spec", "ni-naf", "-o", &text(run)].map(Into::into).into();
     // The mask removes channels on the way: what it decided must come back too.
     all.extend(["--steps".into(), steps.to_string(), "--set".into(), "projector.samples=16".into()]);
-    all.extend(["--set".into(), "normalizers.0.epoch=3".into()]);
+    all.extend(["--set".into(), "solver.callbacks.1.epoch=3".into()]);
     for s in SETTINGS {
         all.extend(["--set".into(), s.into()]);
     }

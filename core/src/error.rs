@@ -92,6 +92,17 @@ impl Error {
         Self::Invalid { place: place.into(), field: field.into(), found: found.to_string(), expected: expected.into() }
     }
 
+    /// The error with `key.` before the field, where its place is the spec: for the owner of a stage, which knows under
+    /// which key the stage stands.
+    pub fn within(mut self, key: &str) -> Self {
+        if let Self::Invalid { place, field, .. } = &mut self
+            && place == "spec"
+        {
+            *field = format!("{key}.{field}");
+        }
+        self
+    }
+
     /// A system error at `path`.
     pub fn io(path: impl AsRef<Path>, source: std::io::Error) -> Self {
         Self::Io { path: path.as_ref().to_path_buf(), source }

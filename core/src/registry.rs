@@ -27,12 +27,21 @@ pub enum Kind {
     Initializer,
     /// Scan to volume.
     Solver,
+    /// What watches over training.
+    Callback,
 }
 
 impl Kind {
     /// Every kind, in the order of a pipeline.
-    pub const ALL: [Self; 6] =
-        [Self::Encoder, Self::Normalizer, Self::Field, Self::Projector, Self::Initializer, Self::Solver];
+    pub const ALL: [Self; 7] = [
+        Self::Encoder,
+        Self::Normalizer,
+        Self::Field,
+        Self::Projector,
+        Self::Initializer,
+        Self::Solver,
+        Self::Callback,
+    ];
 
     /// What it is called in a spec.
     pub fn name(self) -> &'static str {
@@ -43,6 +52,7 @@ impl Kind {
             Self::Projector => "projector",
             Self::Initializer => "initializer",
             Self::Solver => "solver",
+            Self::Callback => "callback",
         }
     }
 

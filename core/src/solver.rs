@@ -4,11 +4,13 @@ use crate::arena::Weights;
 use crate::backend::Backend;
 use crate::checkpoint::{Checkpoint, Resume};
 use crate::error::{Error, Result};
-use crate::parts::Voxels;
+use crate::geometry::VoxelGrid;
+use crate::parts::{Part, Voxels};
 use crate::pipeline::Model;
 use crate::scan::{Scan, Volume};
 use crate::spec::{Scene, Spec};
 use crate::trained::TrainedField;
+use ndarray::Array3;
 use serde::{Deserialize, Serialize};
 use std::time::Instant;
 
@@ -110,7 +112,7 @@ pub struct Record {
     /// PSNR against the reference over one voxel, drawn, of each block of 4³, dB.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub psnr: Option<f64>,
-    /// Drift found since the last record, of a spec with `solver.drift`.
+    /// Drift found since the last record, by the callback `drift`.
     #[serde(skip_serializing_if = "Vec::is_empty")]
     pub drift: Vec<DriftRecord>,
     /// What else happened since the last record, e.g. channels masked.
@@ -151,6 +153,15 @@ pub trait Observer {
     /// Keeps a checkpoint: when one is due, and before an interrupted run ends.
     fn checkpoint(&mut self, checkpoint: &Checkpoint<'_>) -> Result<()> {
         let _ = checkpoint;
+        Ok(())
+    }
+    /// Whether it is time to call [`Observer::slices`].
+    fn slices_due(&self) -> bool {
+        false
+    }
+    /// Sees the three middle slices of what takes shape, each with the part of `grid` that it is, in 1/unit of the scan.
+    fn slices(&mut self, grid: VoxelGrid, slices: &[(Part, Array3<f32>)]) -> Result<()> {
+        let _ = (grid, slices);
         Ok(())
     }
 }

@@ -300,6 +300,12 @@ pub trait NormalizerSpec: Send + Sync {
 pub trait FieldSpec: Send + Sync {
     /// The stage for features of `width` channels.
     fn build(&self, width: usize) -> Result<Box<dyn Field>>;
+
+    /// Whether the field reads positions and brings line integrals of its own ([`Field::lines`]): it needs no encoder, no
+    /// normalizers and no projector, and takes none.
+    fn stands_alone(&self) -> bool {
+        false
+    }
 }
 
 /// Settings of a projector: of one that samples rays for a field, of one that projects voxels, or of both.

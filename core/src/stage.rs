@@ -401,6 +401,28 @@ pub trait Field: Stage {
         let _ = keep;
         Err(Error::unsupported(self.describe(), "this field cannot do without some of its inputs"))
     }
+
+    /// Its own line integrals, of a field that stands alone ([`crate::spec::FieldSpec::stands_alone`]).
+    fn lines(&self) -> Option<&dyn Lines<f32>> {
+        None
+    }
+
+    /// The same formula in double precision, by which gradients are checked.
+    fn lines_reference(&self) -> Option<&dyn Lines<f64>> {
+        None
+    }
+}
+
+/// Line integrals that a field brings itself: no projector takes samples of it. In a closed form, or by a walk through
+/// voxels. The field reads positions; its [`Kernel`] gives its values at points, for priors and export.
+pub trait Lines<R: Real>: Send + Sync {
+    /// Overwrites `out` with the line integrals of `rays`, in cube sides. A ray that is not inside
+    /// ([`UnitRay::inside`]) has 0.
+    fn project(&self, params: &[R], rays: &[UnitRay], out: &mut [R]);
+
+    /// Given `dlines = ∂L/∂out`: *adds* `∂L/∂params` to `grads`. The order in which a parameter's gradient is summed must
+    /// not depend on `grads.range`: hosts hand each range of [`Stage::partition`] to a worker of its own.
+    fn backproject(&self, params: &[R], rays: &[UnitRay], dlines: &[R], grads: Grads<'_, R>);
 }
 
 /// A ray in the unit cube: `origin + t·direction`, where `t` counts cube sides.

@@ -2,8 +2,8 @@
 //! initialization. What the LayerNorm and the field learn there is reused for every other scan.
 
 use crate::gradient::Gradient;
-use crate::guard::strayed;
 use crate::schedule::{Clock, Ends};
+use crate::training::run::strayed;
 use conefield_core::arena::Arena;
 use conefield_core::backend::{Executable, Loss, Work};
 use conefield_core::error::{Error, Result};

@@ -5,10 +5,13 @@
 
 use conefield_core::checkpoint::Checkpoint;
 use conefield_core::error::{Error, Result, ensure};
+use conefield_core::geometry::VoxelGrid;
+use conefield_core::parts::Part;
 use conefield_core::pipeline::Model;
 use conefield_core::scan::Scan;
 use conefield_core::solver::{Job, Limits, Observer, PretrainJob, Reconstruction, Record, Solution, Solver, Successor};
 use conefield_core::spec::{InitializerSpec, Scene, SolverSpec, Spec, VolumeStart};
+use ndarray::Array3;
 use schemars::{JsonSchema, Schema, SchemaGenerator, json_schema};
 use serde::{Deserialize, Serialize};
 
@@ -205,6 +208,14 @@ impl Observer for First<'_> {
     fn checkpoint(&mut self, checkpoint: &Checkpoint<'_>) -> Result<()> {
         self.over = false;
         self.observer.checkpoint(checkpoint)
+    }
+
+    fn slices_due(&self) -> bool {
+        self.observer.slices_due()
+    }
+
+    fn slices(&mut self, grid: VoxelGrid, slices: &[(Part, Array3<f32>)]) -> Result<()> {
+        self.observer.slices(grid, slices)
     }
 }
 

@@ -149,7 +149,7 @@ fn events(records: &[Record]) -> Vec<(u64, String)> {
 #[test]
 fn what_never_diverges_keeps_its_bits() {
     let mut off = settings(130);
-    off["solver"]["rollbacks"] = json!(0);
+    off["solver"]["callbacks"] = json!([]);
     let plain = |s: &Value| solve(s, &scan(), &Weights::default()).unwrap();
     let ((a, on), (b, without)) = (plain(&settings(130)), plain(&off));
     assert_eq!(a.rollbacks, 0);
@@ -217,7 +217,7 @@ fn a_run_that_cannot_be_saved_ends_in_words() {
     assert!(e.starts_with("training diverged at step 48: the loss is") && e.contains("gone back 8 times"), "{e}");
     assert!(e.contains("the prior inf") && e.contains("solver.lr"), "{e}");
     let mut off = settings(300);
-    off["solver"]["rollbacks"] = json!(0);
+    off["solver"]["callbacks"] = json!([]);
     for fault in [Fault::Forever(40), Fault::Loss(40), Fault::Parameter(299)] {
         let e = run(&off, fault).err().unwrap().to_string();
         assert!(e.starts_with("training diverged at step") && e.contains("solver.lr"), "{e}");
@@ -234,7 +234,7 @@ fn a_run_that_went_back_resumes_to_the_same_bits() {
     let mut masked = settings(170);
     masked["encoder"]["levels"] = json!(6);
     let mask = json!({"type": "fft-mask", "keep": [0, 1, 2, 3, 5, 8]});
-    masked["normalizers"] = json!([mask, {"type": "layer-norm"}]);
+    masked["solver"]["callbacks"] = json!([{"type": "rollback"}, mask]);
     for (value, fault) in [
         (settings(170), Fault::Loss(130)),
         (settings(170), Fault::Uphill(60, 66)),

@@ -226,7 +226,7 @@ fn a_field_comes_back_from_its_weights() {
     let mut s = settings();
     let width = s["encoder"]["levels"].as_u64().unwrap() * s["encoder"]["features"].as_u64().unwrap_or(2);
     let kept: Vec<u64> = (0..width - 1).collect();
-    s["normalizers"] = json!([{"type": "fft-mask", "keep": kept}, {"type": "layer-norm"}]);
+    s["solver"]["callbacks"] = json!([{"type": "fft-mask", "keep": kept}]);
     let (solution, _) = solve(&s, &scan(), &Weights::default()).unwrap();
     let field = solution.result.field().unwrap();
     assert_eq!(field.placement().masks.len(), 1);
@@ -369,7 +369,7 @@ fn masked_channels_leave_the_work() {
     s["encoder"]["base_resolution"] = json!(2);
     // Fine levels hardly train in a pass and stay as random as they started.
     let mask = json!({"type": "fft-mask", "epoch": 1, "rule": "relative", "threshold": 0.72});
-    s["normalizers"] = json!([mask, {"type": "layer-norm"}]);
+    s["solver"]["callbacks"] = json!([{"type": "rollback"}, mask]);
     let whole = Pipeline::build(&spec(&s).unwrap()).unwrap();
     let (solution, records) = solve(&s, &scan(), &Weights::default()).unwrap();
     let model = model(solution);
@@ -407,14 +407,14 @@ fn channels_finer_than_the_data_leave_the_work() {
     let mut s = settings();
     s["encoder"] = json!({"type": "hash-grid", "levels": 6, "base_resolution": 2, "log2_table_size": 8});
     // A mask that has its own say afterwards.
-    s["normalizers"] = json!([{"type": "fft-mask", "epoch": 1, "keep": [0, 1, 2, 3, 4, 5, 6]}, {"type": "layer-norm"}]);
+    s["solver"]["callbacks"] = json!([{"type": "fft-mask", "keep": [0, 1, 2, 3, 4, 5, 6, 9]}]);
     s["scene"] = json!({"levels": "needed"});
     let (solution, records) = solve(&s, &scan(), &Weights::default()).unwrap();
     assert_eq!(records.iter().flat_map(|r| &r.events).count(), 1);
     let field = solution.result.field().unwrap();
     let masks = field.placement().masks;
-    let by: Vec<_> = masks.iter().map(|m| (m.normalizer, m.keep.len())).collect();
-    assert_eq!(by, [(None, 8), (Some(0), 7)]);
+    // The mask counts the channels of the whole encoder.
+    assert_eq!(masks, [(0..8).collect::<Vec<_>>(), (0..7).collect()]);
     let names: Vec<_> = field.model.pipeline.layout().blocks.iter().map(|b| b.name.as_str()).collect();
     assert!(names.contains(&"encoder.3.table") && !names.contains(&"encoder.4.table"), "{names:?}");
 
@@ -429,7 +429,7 @@ fn channels_finer_than_the_data_leave_the_work() {
 
     // A grid that is coarser than the data keeps all.
     s["encoder"]["levels"] = json!(3);
-    s["normalizers"] = json!([{"type": "layer-norm"}]);
+    s["solver"]["callbacks"] = json!([]);
     let (solution, _) = solve(&s, &scan(), &Weights::default()).unwrap();
     assert!(solution.result.field().unwrap().placement().masks.is_empty());
 }

@@ -18,6 +18,7 @@ use conefield_fields as _;
 use conefield_initializers as _;
 use conefield_normalizers as _;
 use conefield_projectors as _;
+use conefield_solvers as _;
 
 fn expect(report: Report) {
     println!("{report}");
@@ -154,13 +155,6 @@ fn layer_norm_of_one_channel() {
 }
 
 #[test]
-fn fft_mask() {
-    for width in [1, 20] {
-        normalizer(json!({"type": "fft-mask", "scope": "channel"}), width, &Options::features());
-    }
-}
-
-#[test]
 fn mlp() {
     for (settings, width) in [
         (json!({"type": "mlp"}), 20),
@@ -189,6 +183,30 @@ fn voxel_grid() {
         json!({"type": "voxel-grid", "resolution": 70, "output": "squareplus"}),
     ] {
         field(settings, 3, &Options { single: 4e-5, ..Options::encoder() });
+    }
+}
+
+#[test]
+fn voxels_joseph() {
+    for settings in [
+        json!({"type": "voxels-joseph", "resolution": 6}),
+        json!({"type": "voxels-joseph", "resolution": [5, 1, 9]}),
+        json!({"type": "voxels-joseph", "resolution": [1, 1, 1]}),
+        // More than one range of voxels.
+        json!({"type": "voxels-joseph", "resolution": [41, 37, 43]}),
+    ] {
+        field(settings, 3, &Options { single: 4e-5, ..Options::encoder() });
+    }
+}
+
+/// What a field says of itself as settings and as a stage agree.
+#[test]
+fn fields_that_stand_alone_bring_line_integrals() {
+    for name in names(Kind::Field) {
+        let spec: Box<dyn FieldSpec> = serde_json::from_value(json!({"type": name})).unwrap();
+        let stage = spec.build(3).unwrap();
+        assert_eq!(spec.stands_alone(), stage.lines().is_some(), "{name}");
+        assert_eq!(stage.lines().is_some(), stage.lines_reference().is_some(), "{name}");
     }
 }
 
@@ -233,8 +251,9 @@ fn random_initializer() {
 #[test]
 fn every_registered_stage_has_a_run_here() {
     assert_eq!(names(Kind::Encoder), ["concat", "dense-grid", "frequency", "hash-grid", "identity"]);
-    assert_eq!(names(Kind::Normalizer), ["fft-mask", "layer-norm"]);
-    assert_eq!(names(Kind::Field), ["mlp", "voxel-grid"]);
+    assert_eq!(names(Kind::Normalizer), ["layer-norm"]);
+    assert_eq!(names(Kind::Field), ["mlp", "voxel-grid", "voxels-joseph"]);
     assert_eq!(names(Kind::Initializer), ["checkpoint", "mci", "random", "volume"]);
     assert_eq!(names(Kind::Projector), ["joseph", "ray-march", "siddon", "trilinear"]);
+    assert_eq!(names(Kind::Callback), ["drift", "fft-mask", "patience", "rollback"]);
 }

@@ -216,7 +216,7 @@ fn masked_channels_leave_the_kernels() {
     s["encoder"]["levels"] = json!(6);
     s["encoder"]["base_resolution"] = json!(2);
     let mask = json!({"type": "fft-mask", "epoch": 1, "rule": "relative", "threshold": 0.72});
-    s["normalizers"] = json!([mask, {"type": "layer-norm"}]);
+    s["solver"]["callbacks"] = json!([{"type": "rollback"}, mask]);
     let (solution, records) = solve_on(&backend, &s, &scan(), &Weights::default()).unwrap();
     let events: Vec<&String> = records.iter().flat_map(|r| &r.events).collect();
     assert_eq!(events.len(), 1, "{events:?}");
@@ -401,7 +401,7 @@ fn stages_of_random_shapes_agree() {
             serde_json::from_value(json!({"type": "layer-norm"})).unwrap();
         let norm: Box<dyn Normalizer> = spec.build(width).unwrap();
         let keep: Vec<usize> = (0..width).filter(|c| *c == 0 || below(3) > 0).collect();
-        let stage = norm.keep_outputs(&keep).unwrap().stage;
+        let stage = norm.keep_inputs(&keep).unwrap().stage;
         let options =
             conefield_conformance::Options { params: Some(1.0), ..conefield_conformance::Options::features() };
         let report = conefield_conformance::check_wgsl(stage.as_ref(), &options, &pass);

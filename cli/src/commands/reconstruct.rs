@@ -5,9 +5,11 @@ use super::{backends::simd_level, evaluate, protocol::Protocol};
 use crate::budget::calibrate::Bench;
 use crate::budget::front::Front;
 use crate::budget::plan::Budget;
+use crate::live::Live;
 use crate::memory::{self, Memory};
 use crate::method::{Method, Parts};
 use crate::outgoing::{self, Written};
+use crate::parse;
 use crate::plugins;
 use crate::progress::{Keeper, Progress};
 use crate::run::RunFolder;
@@ -55,6 +57,9 @@ pub struct Reconstruct {
     /// What to start from: weights that "conefield pretrain" made, or a volume.
     #[arg(long, value_name = "FILE")]
     init: Option<PathBuf>,
+    /// Draw live.png, the middle slices of a field that trains, in RUN every so often, such as 5s.
+    #[arg(long, value_name = "SECONDS", value_parser = parse::seconds)]
+    live: Option<f64>,
     /// Print one JSON object: what record.json holds.
     #[arg(long)]
     json: bool,
@@ -149,6 +154,7 @@ impl Reconstruct {
             run: identity,
             last: Instant::now(),
         }));
+        progress = progress.showing(self.live.map(|seconds| Live::new(folder.file("live.png"), seconds)));
         let job = Job {
             held_out: held_scan.as_ref(),
             reference: reference.as_ref(),

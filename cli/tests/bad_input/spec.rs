@@ -58,15 +58,15 @@ pub fn cases() -> Vec<Case> {
         ),
         refused(
             "features evaluated again after no time",
-            toml("extends = \"naf\"\n[solver]\ndrift = { every = 0.0 }\n"),
+            toml("extends = \"naf\"\n[solver]\ncallbacks = [{ type = \"drift\", every = 0.0 }]\n"),
             TOML,
-            &["solver.drift.every", "positive"],
+            &["solver.callbacks.0.every", "positive"],
         ),
         refused(
             "no points to record features of",
-            toml("extends = \"naf\"\n[solver]\ndrift = { points = 0 }\n"),
+            toml("extends = \"naf\"\n[solver]\ncallbacks = [{ type = \"drift\", points = 0 }]\n"),
             TOML,
-            &["solver.drift.points", "1 to 65536"],
+            &["solver.callbacks.0.points", "1 to 65536"],
         ),
         refused(
             "an occupancy by another name",
@@ -125,9 +125,9 @@ pub fn cases() -> Vec<Case> {
         ),
         refused(
             "patience of no record",
-            toml("extends = \"naf\"\n[solver]\npatience = 0\n"),
+            toml("extends = \"naf\"\n[solver]\ncallbacks = [{ type = \"patience\", records = 0 }]\n"),
             TOML,
-            &["spec.toml:3:12", "solver.patience", "at least 1"],
+            &["spec.toml:3:", "solver.callbacks.0.records", "at least 1"],
         ),
         refused(
             "samples told in two ways",

@@ -14,8 +14,11 @@ pub trait Settings {
     /// Which.
     const KIND: Kind;
 
-    /// How a loaded type of this kind is made.
-    fn made_by(make: &Make) -> Option<&MakeFn<Self>>;
+    /// How a loaded type of this kind is made; `None` of a kind that libraries do not bring.
+    fn made_by(make: &Make) -> Option<&MakeFn<Self>> {
+        let _ = make;
+        None
+    }
 }
 
 macro_rules! settings {

@@ -39,8 +39,10 @@ fn make(ty: Arc<Type>) -> Make {
         Kind::Normalizer => Make::Normalizer(Box::new(move |v| Ok(Box::new(settings(v))))),
         Kind::Field => Make::Field(Box::new(move |v| Ok(Box::new(settings(v))))),
         Kind::Projector => Make::Projector(Box::new(move |v| Ok(Box::new(settings(v))))),
-        // A library's table has no solvers.
-        Kind::Initializer | Kind::Solver => Make::Initializer(Box::new(move |v| Ok(Box::new(settings(v))))),
+        // A library's table has no solvers and no callbacks.
+        Kind::Initializer | Kind::Solver | Kind::Callback => {
+            Make::Initializer(Box::new(move |v| Ok(Box::new(settings(v)))))
+        }
     }
 }
 

@@ -57,7 +57,9 @@ impl Built {
                 let spec = read::<dyn InitializerSpec>(settings).map_err(refused)?;
                 AnyStage::Initializer(spec.build(&no_weights)?)
             }
-            Kind::Solver => return Err(Error::unsupported(t.name, "solvers cannot come from plugins")),
+            Kind::Solver | Kind::Callback => {
+                return Err(Error::unsupported(t.name, format!("{} types cannot come from plugins", t.kind)));
+            }
         };
         Ok(Self::of(stage))
     }
@@ -86,10 +88,6 @@ impl Built {
             (AnyStage::Encoder(e), CONEFIELD_OUTPUTS) => {
                 let Reduced { stage, params, channels } = e.keep_outputs(keep)?;
                 of(params, channels, AnyStage::Encoder(stage))
-            }
-            (AnyStage::Normalizer(n), CONEFIELD_OUTPUTS) => {
-                let Reduced { stage, params, channels } = n.keep_outputs(keep)?;
-                of(params, channels, AnyStage::Normalizer(stage))
             }
             (AnyStage::Normalizer(n), CONEFIELD_INPUTS) => {
                 let Reduced { stage, params, channels } = n.keep_inputs(keep)?;

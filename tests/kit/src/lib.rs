@@ -10,6 +10,7 @@ mod call;
 mod channels;
 mod gradients;
 mod halves;
+mod lines;
 mod rays;
 mod voxels;
 mod weights;
@@ -150,14 +151,14 @@ pub fn check_encoder(stage: &dyn Encoder, options: &Options) -> Report {
 /// [`check`], and what a normalizer must keep to when channels are left out.
 pub fn check_normalizer(stage: &dyn Normalizer, options: &Options) -> Report {
     let mut report = check(stage, options);
-    report.add("keep outputs", || channels::normalizer_outputs(stage, options));
     report.add("keep inputs", || channels::normalizer_inputs(stage, options));
     report
 }
 
-/// [`check`], and what a field must keep to when channels are left out.
+/// [`check`], what a field must keep to when channels are left out, and its own line integrals.
 pub fn check_field(stage: &dyn Field, options: &Options) -> Report {
     let mut report = check(stage, options);
     report.add("keep inputs", || channels::field_inputs(stage, options));
+    lines::check(&mut report, stage, options);
     report
 }
