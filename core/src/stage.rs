@@ -353,45 +353,10 @@ pub struct Lengths {
     pub cell_mm: Option<f64>,
 }
 
-/// A look at the encoder between steps.
-pub trait Probe {
-    /// The encoder's features at `points` (unit cube), channel-major `[F][n]`, for the channels still computed.
-    fn encode(&mut self, points: &[[f32; 3]]) -> Result<Vec<f32>>;
-    /// Voxels along x, y, z of the volume to be exported.
-    fn shape(&self) -> [usize; 3];
-    /// The unit-cube position of a voxel's centre.
-    fn voxel(&self, index: [usize; 3]) -> [f32; 3];
-    /// Finished passes over all views.
-    fn epoch(&self) -> f64;
-    /// Whether channels stand in order from coarse to fine.
-    fn coarse_to_fine(&self) -> bool;
-}
-
-/// What a normalizer found between steps.
-#[derive(Debug, Clone, PartialEq)]
-pub struct Mask {
-    /// Channels that stay (of those still computed), ascending.
-    pub keep: Vec<usize>,
-    /// What was measured for each channel, for the log.
-    pub report: String,
-}
-
 /// Features `[n, F]` to features `[n, F]`.
 pub trait Normalizer: Stage {
-    /// Called before every step; `Some` removes channels for good.
-    fn refresh(&self, probe: &mut dyn Probe) -> Result<Option<Mask>> {
-        let _ = probe;
-        Ok(None)
-    }
-
-    /// Called when a resumed run removes channels as [`Normalizer::refresh`] once decided: it must not decide again.
-    fn decided(&self) {}
-
     /// The normalizer without the inputs that are not in `keep`: they are gone from its sums too.
     fn keep_inputs(&self, keep: &[usize]) -> Result<Reduced<dyn Normalizer>>;
-
-    /// The normalizer that computes only the outputs `keep`; it may still need every input.
-    fn keep_outputs(&self, keep: &[usize]) -> Result<Reduced<dyn Normalizer>>;
 }
 
 /// Features `[n, F]` to attenuation `[n, 1]`.
