@@ -1,5 +1,6 @@
 //! Between the files of `conefield-io` and what the subcommands work with.
 
+use conefield_backend_cpu::Cpu;
 use conefield_core::arena::Weights;
 use conefield_core::checkpoint::{Checkpoint, Resume};
 use conefield_core::pipeline::Model;

@@ -4,7 +4,7 @@ use crate::files;
 use conefield_core::Result;
 use conefield_core::geometry::VoxelGrid;
 use conefield_core::parts::Part;
-use conefield_io::MiddleSlices;
+use conefield_report::MiddleSlices;
 use ndarray::Array3;
 use std::path::PathBuf;
 use std::time::{Duration, Instant};

@@ -162,6 +162,11 @@ impl Run {
         self.with(plan.needs(&self.scan.header()))
     }
 
+    /// What reading scan and reference takes.
+    pub fn reading(&self) -> Memory {
+        self.with(Needs::default())
+    }
+
     fn with(&self, needs: Needs) -> Memory {
         let projections = 4 * self.scan.pixels;
         let voxels = 4 * self.scan.voxels;

@@ -19,11 +19,8 @@ pub const SHIPPED: &[Shipped] = &[
     Shipped { name: "field-tv", text: include_str!("../../specs/field-tv.toml") },
     Shipped { name: "accurate-tv", text: include_str!("../../specs/accurate-tv.toml") },
     Shipped { name: "fdk", text: include_str!("../../specs/fdk.toml") },
-    Shipped { name: "sart", text: include_str!("../../specs/sart.toml") },
     Shipped { name: "os-sart", text: include_str!("../../specs/os-sart.toml") },
     Shipped { name: "sirt", text: include_str!("../../specs/sirt.toml") },
-    Shipped { name: "cgls", text: include_str!("../../specs/cgls.toml") },
-    Shipped { name: "asd-pocs", text: include_str!("../../specs/asd-pocs.toml") },
     Shipped { name: "fista-tv", text: include_str!("../../specs/fista-tv.toml") },
 ];
 

@@ -133,10 +133,7 @@ fn table_picture_and_records_agree_and_resume_skips_what_is_done() {
         (&["--reference", "truth", "--seed", "3"], "held_out_views"),
         (&["--hold-out", "every:4", "--seed", "3"], "reference"),
         (&["--reference", "truth", "--hold-out", "every:4", "--seed", "3", "--at-most", "9s"], "limits"),
-        (
-            &["--reference", "truth", "--hold-out", "every:4", "--seed", "3", "--set", "nonnegative=false"],
-            "spec",
-        ),
+        (&["--reference", "truth", "--hold-out", "every:4", "--seed", "3", "--set", "nonnegative=false"], "spec"),
     ] {
         let line = arguments(&scan, "fdk", &out, &[more, &["--resume"]].concat());
         let said = refused(1, &words(&line));

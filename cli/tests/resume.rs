@@ -125,8 +125,12 @@ fn a_signal_ends_the_step_keeps_a_checkpoint_and_says_so() {
 fn interrupted_passes_lose_no_record() {
     let dir = tempfile::tempdir().unwrap();
     let scan = scan(dir.path());
-    let field =
-        ["projector.samples=16", "encoder.log2_table_size=10", "methods.0.training.rays=48", "methods.0.training.report_every=7"];
+    let field = [
+        "projector.samples=16",
+        "encoder.log2_table_size=10",
+        "methods.0.training.rays=48",
+        "methods.0.training.report_every=7",
+    ];
     let then = ["methods.1.stop.passes=600", "methods.1.stop={ passes = 600 }"];
     let sequence = [&field[..], &then].concat();
     for (spec, sets, after) in [("sirt", vec!["stop.passes=900"], 50), ("field-tv", sequence, 40)] {

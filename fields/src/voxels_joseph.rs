@@ -8,8 +8,8 @@
 use crate::mlp::Activation;
 use crate::voxel_grid::{Resolution, VoxelGridSettings, VoxelGridStage};
 use conefield_core::error::Result;
-use conefield_core::simd::Real;
 use conefield_core::settings::LineFieldSpec;
+use conefield_core::simd::Real;
 use conefield_core::stage::{Field, Grads, Info, Kernel, Lines, Parameter, Reduced, Stage, UnitRay};
 use conefield_core::wgsl::Fragment;
 use schemars::JsonSchema;

@@ -32,7 +32,12 @@ fn methods(_: &mut SchemaGenerator) -> Schema {
     stage::schema_of_list(Kind::Method)
 }
 
-conefield_core::stage_type!(Method, "chain", Chain, "methods one after the other, each from the volume of the one before");
+conefield_core::stage_type!(
+    Method,
+    "chain",
+    Chain,
+    "methods one after the other, each from the volume of the one before"
+);
 
 #[typetag::serde(name = "chain")]
 impl Method for Chain {
@@ -113,11 +118,7 @@ impl Plan for ChainPlan {
         self.links[0].pretrain(job, observer).map_err(|e| e.within(&at(0)))
     }
 
-    fn restore(
-        &self,
-        placement: &Placement,
-        load: &mut dyn FnMut(&mut Model) -> Result<()>,
-    ) -> Result<TrainedField> {
+    fn restore(&self, placement: &Placement, load: &mut dyn FnMut(&mut Model) -> Result<()>) -> Result<TrainedField> {
         self.links[0].restore(placement, load)
     }
 

@@ -4,8 +4,8 @@
 //! priors on small random blocks of neighbouring points, and takes an Adam step.
 
 use crate::fit::{Fitted, fit};
-use crate::iterative::noise::{self, Noise};
 use crate::iterative::known_volume;
+use crate::iterative::noise::{self, Noise};
 use crate::losses::L1;
 use crate::optimizer::Optimizer;
 use crate::pretrain::{Pretraining, learn, pretrain};
@@ -20,17 +20,14 @@ use conefield_core::backend::{Adam, Executable, TrainRay};
 use conefield_core::error::{Result, ensure};
 use conefield_core::loss::{Loss, NoiseModel};
 use conefield_core::method::{
-    Context, Findings, Job, Line, Needs, Observer, Outline, Plan, PretrainJob, Reconstruction, Solution,
-    StageLine,
+    Context, Findings, Job, Line, Needs, Observer, Outline, Plan, PretrainJob, Reconstruction, Solution, StageLine,
 };
 use conefield_core::pipeline::{Model, Pipeline};
 use conefield_core::prior::Prior;
 use conefield_core::registry::Kind;
 use conefield_core::scan::{Scan, ScanHeader};
 use conefield_core::scene::{Scene, SceneSettings};
-use conefield_core::settings::{
-    Initializer, InitializerSpec, LossSpec, PriorSpec,
-};
+use conefield_core::settings::{Initializer, InitializerSpec, LossSpec, PriorSpec};
 use conefield_core::spec::stage;
 use conefield_core::trained::{FieldVoxels, Placement, TrainedField};
 use conefield_initializers::random::Random;
@@ -336,11 +333,7 @@ impl Plan for FieldPlan {
         pretrain((self.pipeline.clone(), compiled), learning, &self.scene, job, observer)
     }
 
-    fn restore(
-        &self,
-        placement: &Placement,
-        load: &mut dyn FnMut(&mut Model) -> Result<()>,
-    ) -> Result<TrainedField> {
+    fn restore(&self, placement: &Placement, load: &mut dyn FnMut(&mut Model) -> Result<()>) -> Result<TrainedField> {
         TrainedField::restore(self.pipeline.clone(), &self.scene, placement, load)
     }
 

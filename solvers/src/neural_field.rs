@@ -1,6 +1,6 @@
 //! A neural attenuation field, trained so that its Beer-Lambert line integrals match the measured ones.
 
-use crate::field_plan::{Training, Trained, rollback, l1, random};
+use crate::field_plan::{Trained, Training, l1, random, rollback};
 use crate::optimizer::Optimizer;
 use crate::pretrain::Pretraining;
 use crate::training::CallbackSpec;

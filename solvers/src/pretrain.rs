@@ -1,18 +1,18 @@
 //! Pre-training on a known volume, voxel by voxel: `L = |μ(x) − voxel|`, NI-NeRF's mapping-consistency
 //! initialization. What the LayerNorm and the field learn there is reused for every other scan.
 
-use crate::optimizer::Optimizer;
 use crate::losses::L1;
+use crate::optimizer::Optimizer;
 use crate::schedule::{Clock, Ends};
 use crate::training::run::strayed;
 use conefield_core::arena::Arena;
 use conefield_core::backend::{Executable, Work};
 use conefield_core::error::{Error, Result, ensure};
+use conefield_core::method::{Job, Observer, PretrainJob, Record};
 use conefield_core::pipeline::{Model, Pipeline};
 use conefield_core::random::stream;
 use conefield_core::scan::Volume;
 use conefield_core::scene::{AttenuationScale, Scene, SceneSettings};
-use conefield_core::method::{Job, Observer, PretrainJob, Record};
 use ndarray::Axis;
 use rand::RngExt;
 use schemars::JsonSchema;

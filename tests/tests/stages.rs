@@ -255,7 +255,8 @@ fn data_terms() {
 
 #[test]
 fn regularizers() {
-    for spec in each::<dyn RegularizerSpec>(&[json!({"type": "total-variation", "weight": {"fixed": 0.1}, "inner": 1})]) {
+    for spec in each::<dyn RegularizerSpec>(&[json!({"type": "total-variation", "weight": {"fixed": 0.1}, "inner": 1})])
+    {
         expect(check_regularizer(spec.build().unwrap().as_ref()));
     }
 }

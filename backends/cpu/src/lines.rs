@@ -23,7 +23,7 @@ pub fn step(field: &dyn Field, lines: &dyn Lines<f32>, params: &[f32], grads: &m
     let scale = 1.0 / rays.len().max(1) as f64;
     let mut loss = 0.0;
     for (found, ray) in found.iter_mut().zip(work.rays) {
-        let (value, slope) = work.loss.at(f64::from(*found) - f64::from(ray.target));
+        let (value, slope) = work.loss.at(f64::from(*found), f64::from(ray.target));
         loss += value * scale;
         *found = (slope * scale) as f32;
     }

@@ -7,12 +7,13 @@ use super::trial::{Figures, LONGEST, Trial, TrialInput, read_json};
 use super::{EndOptions, General, backends::simd_level};
 use crate::backend::BackendChoice;
 use crate::memory::Memory;
-use crate::method::Parts;
+use crate::method;
 use crate::plugins::{self, Used};
 use crate::table::{SCORES, Table, score_cells};
 use crate::{files, out, run, signals, specs};
 use clap::Args;
 use conefield_core::error::ensure;
+use conefield_core::method::Plan;
 use conefield_core::spec::load::Loaded;
 use conefield_core::{Error, Result};
 use conefield_report::MiddleSlices;
@@ -66,6 +67,7 @@ struct Method {
     /// As it was asked for.
     spec: String,
     loaded: Loaded,
+    plan: Box<dyn Plan>,
     start: Start,
 }
 
@@ -124,7 +126,7 @@ impl CompareArgs {
         // Whatever is wrong with the input is told before anything is made.
         let mut methods = self.methods()?;
         let input = TrialInput::read(&self.scan, &self.protocol)?;
-        methods.iter().try_for_each(|m| specs::check_held_out(&m.loaded, &input.held))?;
+        methods.iter().try_for_each(|m| specs::check_held_out(&m.loaded, m.plan.as_ref(), &input.held))?;
         let old = self.look_into_folder()?;
         for method in &mut methods {
             method.start = self.start(method, &input)?;
@@ -164,7 +166,7 @@ impl CompareArgs {
         let backend = self.protocol.backend.open()?;
         for spec in &self.specs {
             let loaded = specs::read(spec, &self.protocol.sets)?;
-            Parts::of(&loaded, backend.as_ref())?.check_weights(&loaded)?;
+            let plan = method::plan(&loaded, backend.as_ref())?;
             let name = if loaded.spec.name.is_empty() { files::stem(spec) } else { loaded.spec.name.clone() };
             let begins = name.starts_with(|c: char| c.is_alphanumeric());
             let plain =
@@ -176,7 +178,7 @@ impl CompareArgs {
                 let found = format!("{name:?}, the name of {}", other.loaded.source);
                 return Err(Error::invalid(&loaded.source, "name", found, "a name of its own, for table and folder"));
             }
-            methods.push(Method { name, spec: spec.clone(), loaded, start: Start::Anew });
+            methods.push(Method { name, spec: spec.clone(), loaded, plan, start: Start::Anew });
         }
         Ok(methods)
     }

@@ -2,10 +2,9 @@
 
 use super::convert::refuse_existing;
 use super::evaluate::score;
-use super::reconstruct::mci;
 use crate::progress::Progress;
 use crate::table::{SCORES, Table, cells_of};
-use crate::{files, out, parse, signals, specs};
+use crate::{method, out, parse, signals, specs};
 use clap::Args;
 use conefield_backend_cpu::Cpu;
 use conefield_core::method::{Job, Limits};

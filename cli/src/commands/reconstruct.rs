@@ -24,7 +24,7 @@ use conefield_core::{Error, Result};
 use conefield_report::MiddleSlices;
 use std::collections::BTreeMap;
 use std::fs::File;
-use std::path::{Path, PathBuf};
+use std::path::PathBuf;
 use std::time::{Duration, Instant};
 use tracing::info;
 

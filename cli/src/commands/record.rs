@@ -1,7 +1,7 @@
 //! What a run leaves on record.
 
 use super::{EndOptions, evaluate};
-use crate::budget::plan::Plan;
+use crate::budget::plan::Schedule;
 use crate::memory::Memory;
 use crate::plugins::Used;
 use crate::{files, out};
@@ -25,7 +25,7 @@ pub struct RunRecord {
     pub budget_s: Option<f64>,
     /// What a budget came to.
     #[serde(skip_serializing_if = "Option::is_none")]
-    pub plan: Option<Plan>,
+    pub plan: Option<Schedule>,
     pub init: Option<String>,
     pub reference: Option<String>,
     /// Whose stages the spec names.

@@ -107,15 +107,9 @@ impl TrialInput {
             scan: conefield_io::scan_size(path)?,
             split: protocol.hold_out.is_some(),
             reference: protocol.reference.is_some(),
-            field: true,
-            parameters: 0,
-            kept: 0,
-            backend: 0,
-            solver: [0; 2],
-            surround: [0; 2],
             resume: false,
         };
-        all.memory().check(|_| vec![])?;
+        all.reading().check(|_| vec![])?;
         let scan = files::scan(path)?;
         let reference = protocol.reference(path, &scan)?;
         let record = ScanRecord::of(path, &scan)?;

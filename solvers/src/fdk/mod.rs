@@ -14,10 +14,10 @@ use conefield_core::Error;
 use conefield_core::backend::Backend;
 use conefield_core::error::{Result, ensure};
 use conefield_core::geometry::{Geometry, dot, norm, sub};
-use conefield_core::scan::{Scan, ScanHeader, Volume};
 use conefield_core::method::{
     Context, Findings, Job, Line, Method, Needs, Observer, Outline, Plan, Reconstruction, Record, Solution,
 };
+use conefield_core::scan::{Scan, ScanHeader, Volume};
 use conefield_core::scene::SurroundRule;
 use conefield_core::space::Space;
 use conefield_core::voxel::VoxelView;

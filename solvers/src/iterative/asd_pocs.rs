@@ -4,16 +4,16 @@
 use super::noise::{self, Noise};
 use super::norms::{change, distance, norm2};
 use super::order::{Order, Subsets, told};
-use super::sart::{Sweep, Updates};
 use super::plan::{Iterative, IterativePlan};
+use super::sart::{Sweep, Updates};
 use super::shared::Shared;
 use super::tv::{anisotropy, descend};
 use super::{Iteration, Pass, Problem, Stop, drive::drive, flat_mut};
 use conefield_core::error::{Result, ensure};
+use conefield_core::method::{Context, Job, Method, Observer, Plan, Solution};
 use conefield_core::scan::{Scan, ScanHeader};
-use conefield_core::method::{Context, Job, Observer, Solution, Method, Plan};
-use conefield_core::space::Space;
 use conefield_core::scene::VoxelScene;
+use conefield_core::space::Space;
 use conefield_core::voxel::VoxelProjectorSpec;
 use conefield_projectors::voxel::Joseph;
 use ndarray::Array3;
@@ -93,12 +93,7 @@ impl AsdPocs {
         ensure(self.tolerance >= 0.0, "spec", "tolerance", self.tolerance, "0 or more")?;
         let &Self { alpha, alpha_decay, ratio, descents, tolerance, .. } = self;
         let shared = Shared::of(self.projector.as_ref(), self.scene, &self.start, &self.stop)?;
-        Ok(Built {
-            shared,
-            updates,
-            descent: Descent { alpha, alpha_decay, ratio, count: descents },
-            tolerance,
-        })
+        Ok(Built { shared, updates, descent: Descent { alpha, alpha_decay, ratio, count: descents }, tolerance })
     }
 }
 

@@ -15,9 +15,9 @@ use super::data::NoiseWeighted;
 use super::model::Model;
 use super::norms::{change, distance, norm2};
 use super::order::{Order, Subsets, split, told};
+use super::plan::{Iterative, IterativePlan};
 use super::problem::images_mut;
 use super::regularizers::Nonnegative;
-use super::plan::{Iterative, IterativePlan};
 use super::shared::Shared;
 use super::{Iteration, Pass, Problem, Stop, drive::drive, flat, flat_mut};
 use conefield_core::Error;
@@ -25,12 +25,12 @@ use conefield_core::basis::{Basis, BasisSpec};
 use conefield_core::data_term::{DataTerm, DataTermSpec, Misfit};
 use conefield_core::error::{Result, ensure};
 use conefield_core::geometry::VoxelGrid;
+use conefield_core::method::{Context, Job, Line, Method, Observer, Plan, Solution};
 use conefield_core::random::stream;
 use conefield_core::regularizer::{Penalty, Regularizer, RegularizerSpec};
 use conefield_core::scan::{Scan, ScanHeader};
-use conefield_core::method::{Context, Line, Job, Observer, Solution, Method, Plan};
-use conefield_core::space::Space;
 use conefield_core::scene::VoxelScene;
+use conefield_core::space::Space;
 use conefield_core::voxel::VoxelProjectorSpec;
 use conefield_projectors::voxel::Joseph;
 use ndarray::{Array3, Zip};
@@ -316,7 +316,8 @@ impl<'a> Iterate<'a> {
         let views = problem.scan.geometry.views.len();
         let subsets = settings.subsets.of(views);
         let grid = arrays.model.grid();
-        let lambda = settings.prior.weight(&grid, &mut |k| k * data.noise() * arrays.noise_gain(problem, data.as_ref()));
+        let lambda =
+            settings.prior.weight(&grid, &mut |k| k * data.noise() * arrays.noise_gain(problem, data.as_ref()));
         let lipschitz = arrays.largest_eigenvalue(problem, data.as_ref(), &subsets);
         ensure(lipschitz > 0.0, "scan", "geometry", "rays that all miss the volume", "rays through the volume")?;
         Ok(Self {
@@ -378,8 +379,7 @@ impl Iteration for Iterate<'_> {
         let Arrays { penalty, x, before, towards, .. } = &self.arrays;
         let change = change(x, before);
         let prior = self.lambda * penalty.value(x.view());
-        let held =
-            |towards: &Array3<f32>| 0.5 * f64::from(self.pull) * self.lipschitz * distance(x, towards).powi(2);
+        let held = |towards: &Array3<f32>| 0.5 * f64::from(self.pull) * self.lipschitz * distance(x, towards).powi(2);
         let objective = misfit + prior + towards.as_ref().map_or(0.0, held);
         if objective > self.objective {
             self.subsets = (0.5 * self.subsets).ceil();

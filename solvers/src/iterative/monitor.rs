@@ -3,8 +3,8 @@
 use crate::watched;
 use conefield_core::error::Result;
 use conefield_core::geometry::Geometry;
-use conefield_core::scan::Scan;
 use conefield_core::method::Job;
+use conefield_core::scan::Scan;
 use conefield_core::voxel::VoxelOperator;
 use ndarray::Array3;
 

@@ -17,11 +17,8 @@ pub fn square_sum(x: &[f32]) -> f64 {
 /// Sum of the squares of `x − y`.
 pub fn difference_square_sum(x: &[f32], y: &[f32]) -> f64 {
     let square = |(a, b): (&f32, &f32)| (f64::from(*a) - f64::from(*b)).powi(2);
-    let parts: Vec<f64> = x
-        .par_chunks(PART)
-        .zip(y.par_chunks(PART))
-        .map(|(x, y)| x.iter().zip(y).map(square).sum::<f64>())
-        .collect();
+    let parts: Vec<f64> =
+        x.par_chunks(PART).zip(y.par_chunks(PART)).map(|(x, y)| x.iter().zip(y).map(square).sum::<f64>()).collect();
     parts.iter().sum()
 }
 

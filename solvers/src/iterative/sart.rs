@@ -4,15 +4,15 @@
 
 use super::norms::change;
 use super::order::{Order, Subsets, told};
-use super::problem::{images_mut, invert, room};
 use super::plan::{Iterative, IterativePlan};
+use super::problem::{images_mut, invert, room};
 use super::shared::Shared;
 use super::{Iteration, Pass, Problem, Stop, drive::drive, flat_mut};
 use conefield_core::error::{Result, ensure};
+use conefield_core::method::{Context, Job, Method, Observer, Plan, Solution};
 use conefield_core::scan::{Scan, ScanHeader};
-use conefield_core::method::{Context, Job, Observer, Solution, Method, Plan};
-use conefield_core::space::Space;
 use conefield_core::scene::VoxelScene;
+use conefield_core::space::Space;
 use conefield_core::voxel::VoxelProjectorSpec;
 use conefield_projectors::voxel::Joseph;
 use ndarray::{Array3, Axis, Zip};

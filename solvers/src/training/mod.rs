@@ -12,8 +12,8 @@ pub use callback::{Callback, CallbackSpec, Callbacks, Kept, State, Update};
 pub use run::Run;
 
 use conefield_core::backend::{Adam, BlockWork, TrainRay, Work};
-use conefield_core::loss::Loss;
 use conefield_core::error::{Error, Result};
+use conefield_core::loss::Loss;
 use std::time::Instant;
 
 /// What a step learns from, drawn at random.

@@ -3,11 +3,11 @@
 use crate::schedule::{Clock, Ends};
 use conefield_core::arena::Arena;
 use conefield_core::backend::{Executable, StepStats};
-use conefield_core::loss::Loss;
 use conefield_core::error::{Error, Result};
+use conefield_core::loss::Loss;
+use conefield_core::method::{Best, DriftRecord, Job, Observer, Record};
 use conefield_core::pipeline::Model;
 use conefield_core::scene::Scene;
-use conefield_core::method::{Best, DriftRecord, Job, Observer, Record};
 use rayon::prelude::*;
 use serde::{Deserialize, Serialize};
 use std::sync::Arc;

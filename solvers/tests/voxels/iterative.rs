@@ -124,7 +124,8 @@ fn air_is_taken_for_empty() {
     let mut scan = with_noise(scan_ellipsoids(&bodies(), g));
     scan.projections.mapv_inplace(|p| p.max(0.0));
     let haze = |air: bool| {
-        let text = spec("fista-tv", &format!("subsets = 6\nprior.weight = {{ fixed = 0.02 }}\nair = {air}\n{}", passes(8)));
+        let text =
+            spec("fista-tv", &format!("subsets = 6\nprior.weight = {{ fixed = 0.02 }}\nair = {air}\n{}", passes(8)));
         let (volume, heard) = Case::of(&scan).volume(&text);
         assert_eq!(heard.said("of the pixels are air"), air);
         mean(&volume, |x| x.iter().any(|x| x.abs() > 21.0))

@@ -54,7 +54,8 @@ fn builds(basis: &dyn Basis) -> Outcome {
         let positive = made.shape.iter().all(|n| *n > 0) && made.spacing.iter().all(|s| s.is_finite() && *s > 0.0);
         let other = VoxelGrid { spacing: grid.spacing.map(|s| 3.0 * s), center: [0.0; 3], ..grid };
         let shape = basis.on(&other).map(|b| b.coefficients().shape).ok();
-        (!positive || shape != Some(made.shape)).then(|| format!("for {grid:?}: {made:?}, with larger voxels {shape:?}"))
+        (!positive || shape != Some(made.shape))
+            .then(|| format!("for {grid:?}: {made:?}, with larger voxels {shape:?}"))
     });
     settle(complaint, "for every grid")
 }

@@ -45,7 +45,14 @@ fn scan() -> Scan {
     let projections = Array3::from_shape_fn((3, 24, 40), |(_, _, c)| {
         let p = 3.0 * (std::f32::consts::PI * c as f32 / 39.0).sin();
         // Twelve draws together are about normal.
-        let drawn: f32 = (0..12).map(|_| unit(mix(11, { i += 1; i })) - 0.5).sum();
+        let drawn: f32 = (0..12)
+            .map(|_| {
+                unit(mix(11, {
+                    i += 1;
+                    i
+                })) - 0.5
+            })
+            .sum();
         p + SIGMA * (0.5 * p).exp() * drawn
     });
     Scan { geometry, projections, unit: Unit::default(), provenance: Default::default() }
@@ -162,7 +169,8 @@ fn finite(term: &dyn DataTerm) -> Outcome {
             scan.geometry.detector = [rows, columns];
             scan.projections = Array3::from_elem((3, rows, columns), value);
             let of = term.of(&scan);
-            let mut all = [noise([3, rows, columns], 1), Array3::ones([3, rows, columns]), Array3::ones([3, rows, columns])];
+            let mut all =
+                [noise([3, rows, columns], 1), Array3::ones([3, rows, columns]), Array3::ones([3, rows, columns])];
             let [r, curve, spread] = &mut all;
             let found = of.differentiate(&ALL, r.view_mut());
             of.curve(&ALL, curve.view_mut());

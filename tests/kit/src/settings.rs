@@ -2,7 +2,8 @@
 
 use crate::Report;
 use crate::call::settle;
-use conefield_core::spec::stage::{Settings, read};
+use conefield_core::registry::Settings;
+use conefield_core::spec::stage::read;
 use serde::Serialize;
 use serde::de::DeserializeOwned;
 use serde_json::{Value, json};

@@ -272,9 +272,8 @@ mod tests {
     #[test]
     fn a_product_is_used_up_without_repeating() {
         // The base itself has 10 subsets: 3 x 2 combinations, of which it is one.
-        let levers = parse(
-            "[[base]]\nspec = 'os-sart'\n[base.levers]\nsubsets = [5, 10, 25]\nrelaxation = [0.4, 0.5]\n",
-        );
+        let levers =
+            parse("[[base]]\nspec = 'os-sart'\n[base.levers]\nsubsets = [5, 10, 25]\nrelaxation = [0.4, 0.5]\n");
         let all = levers.unwrap().candidates(100, 3).unwrap();
         let default = specs::read("os-sart", &[]).unwrap().tree.clone();
         let own = [5, 10, 25].contains(&default["subsets"].as_i64().unwrap())
@@ -290,11 +289,7 @@ mod tests {
         let sets = |text: &str| {
             parse(&format!("[[base]]\nspec = 'fdk'\n{text}\n")).unwrap().candidates(2, 0).unwrap()[1].sets.clone()
         };
-        for text in [
-            "levers.cutoff = [0.5]",
-            "[base.levers]\n'cutoff' = [0.5]",
-            "[base.levers]\ncutoff = [0.5]",
-        ] {
+        for text in ["levers.cutoff = [0.5]", "[base.levers]\n'cutoff' = [0.5]", "[base.levers]\ncutoff = [0.5]"] {
             assert_eq!(sets(text), ["cutoff=0.5"], "{text}");
         }
     }

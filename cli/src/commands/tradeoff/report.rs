@@ -161,7 +161,7 @@ impl TradeoffReport {
             );
             let mut sets = candidate.sets.clone();
             let steps = (point.steps.round() as u64).max(1);
-            sets.extend(end("solver", &base.tree["solver"], steps));
+            sets.extend(end(&base.tree, steps));
             for (key, value) in [("name", &point.name), ("description", &said)] {
                 sets.push(format!("{key}={}", toml::Value::String(value.clone())));
             }
@@ -377,15 +377,16 @@ fn ranking(search: &Search, trials: &[Over]) -> Vec<Ranking> {
     all
 }
 
-/// What makes the solver with these settings, at `path`, end after `steps` steps or passes. FDK has no number to set; of a
-/// sequence the second solver's passes are among them.
-fn end(path: &str, solver: &Value, steps: u64) -> Option<String> {
-    if let Some(first) = solver.get("first") {
-        let passes = solver["passes"].as_u64().unwrap_or(0);
-        return end(&format!("{path}.first"), first, steps.saturating_sub(passes).max(1));
+/// What makes a method with these settings end after `steps` steps or passes. FDK has no number to set. The passes of the
+/// later methods of a chain are among its steps.
+fn end(method: &Value, steps: u64) -> Option<String> {
+    if let Some([first, later @ ..]) = method["methods"].as_array().map(|all| &all[..]) {
+        let passes: u64 = later.iter().filter_map(|m| m["stop"]["passes"].as_u64()).sum();
+        return end(first, steps.saturating_sub(passes).max(1)).map(|set| format!("methods.0.{set}"));
     }
-    let key = [("stop", "stop.passes"), ("steps", "steps")].into_iter().find(|(key, _)| solver.get(key).is_some());
-    key.map(|(_, key)| format!("{path}.{key}={steps}"))
+    let keys = [("stop", "stop.passes"), ("training", "training.steps")];
+    let key = keys.into_iter().find(|(key, _)| method.get(key).is_some());
+    key.map(|(_, key)| format!("{key}={steps}"))
 }
 
 #[cfg(test)]
@@ -393,7 +394,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn every_kind_of_solver_ends_after_its_steps() {
+    fn every_method_ends_after_its_steps() {
         for (spec, sets, want) in [
             ("fdk", vec![], None),
             ("os-sart", vec![], Some("stop.passes=105")),
@@ -401,7 +402,7 @@ mod tests {
             ("field-tv", vec!["methods.1.stop.passes=5".to_owned()], Some("methods.0.training.steps=100")),
         ] {
             let loaded = specs::read(spec, &sets).unwrap();
-            let set = end("solver", &loaded.tree["solver"], 105);
+            let set = end(&loaded.tree, 105);
             assert_eq!(set.as_deref(), want, "{spec}");
             specs::read(spec, &set.into_iter().collect::<Vec<_>>()).unwrap();
         }

@@ -5,9 +5,9 @@ use crate::training::run::Run;
 use crate::watched;
 use conefield_core::backend::TrainRay;
 use conefield_core::error::Result;
+use conefield_core::method::{Job, Record};
 use conefield_core::pipeline::Pipeline;
 use conefield_core::scene::Scene;
-use conefield_core::method::{Job, Record};
 use conefield_core::stage::UnitRay;
 
 /// Rays of held-out views that are rendered for a record, at most.

@@ -5,8 +5,8 @@ use crate::training::{Callback, CallbackSpec, Kept, State};
 use conefield_core::arena::Layout;
 use conefield_core::checkpoint::tensors_of;
 use conefield_core::error::{Result, ensure};
-use conefield_core::pages::Pages;
 use conefield_core::method::{Best, Record};
+use conefield_core::pages::Pages;
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 

@@ -12,9 +12,9 @@ use crate::training::run::{HINT, Run, strayed};
 use crate::training::{Callback, CallbackSpec, Kept, State, Update};
 use conefield_core::arena::{Arena, Layout};
 use conefield_core::backend::{StepStats, Work};
-use conefield_core::loss::Loss;
 use conefield_core::checkpoint::tensors_of;
 use conefield_core::error::{Error, Result, ensure};
+use conefield_core::loss::Loss;
 use conefield_core::pages::Pages;
 use conefield_core::scan::Scan;
 use conefield_core::scene::Scene;
@@ -56,13 +56,7 @@ conefield_core::stage_type!(Callback, "rollback", Rollback, "takes a run whose l
 impl CallbackSpec for Rollback {
     fn build(&self) -> Result<Box<dyn Callback>> {
         ensure(self.times > 0, "spec", "times", 0, "at least 1; leave rollback out to never go back")?;
-        Ok(Box::new(Guard {
-            times: self.times,
-            loss: None,
-            measured: 0.0,
-            watched: Watched::default(),
-            copy: None,
-        }))
+        Ok(Box::new(Guard { times: self.times, loss: None, measured: 0.0, watched: Watched::default(), copy: None }))
     }
 
     fn copy(&self) -> Box<dyn CallbackSpec> {
