@@ -206,8 +206,13 @@ impl Iterative for Built {
         let grid = VoxelGrid { shape: header.volume, spacing: [1.0; 3], center: [0.0; 3] };
         // A basis that refuses the grid refuses the run, which then takes nothing.
         let _ = Arrays::new(self, &grid, &space, space.volume());
-        // Noise of all views is projected back at once.
-        self.shared.price(&space, Subsets::Count(1))
+        // To measure its noise, all views are projected back at once.
+        let all = self.shared.projector.scratch(header, header.views);
+        self.prior.weight(&grid, &mut |_| {
+            space.pass(all);
+            0.0
+        });
+        self.shared.price(&space, self.subsets)
     }
 
     fn describe(&self) -> String {

@@ -72,7 +72,7 @@ fn a_run_has_an_end() {
     for kind in ALL.into_iter().filter(|k| *k != "fdk") {
         for stop in ["{}", "{ patience = 3 }"] {
             let e = said(&solver(kind, &format!("stop = {stop}")));
-            assert!(e.contains("solver.stop: found no end, expected one of passes, seconds or change"), "{kind}: {e}");
+            assert!(e.contains("stop: found no end, expected one of passes, seconds or change"), "{kind}: {e}");
         }
         for (stop, field) in [
             ("{ seconds = 0.0 }", "seconds"),
@@ -82,7 +82,7 @@ fn a_run_has_an_end() {
             ("{ passes = -1 }", "passes"),
         ] {
             let e = said(&solver(kind, &format!("stop = {stop}")));
-            assert!(e.contains(&format!("solver.stop.{field}: found")), "{kind}, {stop}: {e}");
+            assert!(e.contains(&format!("stop.{field}: found")), "{kind}, {stop}: {e}");
         }
         // What is set is all that ends it: no number of passes comes with the time.
         let spec = spec(&solver(kind, "stop = { seconds = 60.0 }")).unwrap();

@@ -93,8 +93,8 @@ fn what_makes_no_sequence_is_refused() {
     for (text, says) in [
         (sequence(FIRST, GRADIENT, 4), "solver.then"),
         (sequence("type = \"sart\"\nsubsets = 0\n", THEN, 4), "solver.first.subsets"),
-        (sequence(FIRST, "type = \"fista\"\npull = -1.0\n", 4), "solver.then.pull"),
-        (sequence(FIRST, THEN, 0), "solver.passes"),
+        (sequence(FIRST, "type = \"fista\"\npull = -1.0\n", 4), "methods.1.pull"),
+        (sequence(FIRST, THEN, 0), "methods.1.stop.passes"),
         (nested, "a sequence in a sequence"),
     ] {
         let e = Case::of(&scan()).run(&text, &mut Heard::default()).err().unwrap().to_string();

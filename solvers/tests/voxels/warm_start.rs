@@ -108,7 +108,7 @@ fn a_pull_holds_to_the_start() {
     assert!(psnr(&free, &truth) > psnr(&case.volume(&spec(1.0)).0, &truth) + 3.0);
 
     let e = case.run(&held(0.1, ""), &mut Heard::default()).err().unwrap().to_string();
-    assert!(e.contains("solver.pull: found 0.1, expected 0, or a volume to start from"), "{e}");
+    assert!(e.contains("pull: found 0.1, expected 0, or a volume to start from"), "{e}");
 }
 
 /// A job may hand the volume over itself; it goes before the file.
