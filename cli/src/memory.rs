@@ -4,6 +4,7 @@
 //! whatever the input is, but for the program itself.
 
 use crate::out::bytes;
+use conefield_core::scan::ScanHeader;
 use conefield_core::solver::Solver;
 use conefield_core::trained::FieldVoxels;
 use conefield_core::{Error, Result};
@@ -166,8 +167,15 @@ pub struct Run {
 
 /// What `solver` works in for a scan of this size, by what it goes with.
 pub fn working(solver: &dyn Solver, scan: &ScanSize) -> [u64; 2] {
-    let pixels = solver.working_memory(scan.pixels, 0);
-    [pixels, solver.working_memory(scan.pixels, scan.voxels).saturating_sub(pixels)]
+    let header = header(scan);
+    let pixels = solver.bytes(&ScanHeader { volume: [0; 3], ..header });
+    [pixels, solver.bytes(&header).saturating_sub(pixels)]
+}
+
+/// Sizes of a scan of which only the numbers of pixels and voxels are known: one view that is a square, and a cube.
+pub fn header(scan: &ScanSize) -> ScanHeader {
+    let (side, edge) = ((scan.pixels as f64).sqrt().ceil() as usize, (scan.voxels as f64).cbrt().round() as usize);
+    ScanHeader { views: 1, detector: [side; 2], volume: [edge; 3] }
 }
 
 impl Run {

@@ -55,7 +55,7 @@ impl Parts {
     pub fn run(&self, scan: ScanSize) -> memory::Run {
         let mut solver = memory::working(self.solver.as_ref(), &scan);
         if self.pipeline.is_none() || self.solver.successor(&self.scene).is_some() {
-            solver[1] += iterative::memory(&self.scene, scan.voxels);
+            solver[1] += iterative::mask_bytes(&self.scene, &memory::header(&scan));
         }
         // Solvers of voxels work in that volume. It is there twice while a file's order is turned into the program's.
         if self.pipeline.is_some() && self.from_volume {
@@ -70,7 +70,7 @@ impl Parts {
             backend: self.compiled.scratch_bytes as u64,
             kept: self.solver.memory_per_parameter(),
             solver,
-            surround: surround::memory(self.scene.surround, scan.pixels),
+            surround: surround::bytes(self.scene.surround, &memory::header(&scan)),
             resume: false,
         }
     }

@@ -159,8 +159,7 @@ fn a_method_that_fails_leaves_the_others_their_rows() {
     let (spec, off) = (dir.path().join("wild.toml"), dir.path().join("off.toml"));
     fs::write(&spec, "extends = \"fast\"\nname = \"wild\"\n[solver]\nlr = 1e30\n").unwrap();
     // Found when it is read by the solver: a volume to start from that is not there.
-    fs::write(&off, "extends = \"sirt\"\nname = \"off\"\n[initializer]\ntype = \"volume\"\npath = \"none.nii\"\n")
-        .unwrap();
+    fs::write(&off, "extends = \"sirt\"\nname = \"off\"\n[solver]\nstart = \"none.nii\"\n").unwrap();
     let specs = format!("{},fdk,{}", text(&spec), text(&off));
     let line = arguments(&scan, &specs, &out, &["--reference", "truth"]);
     let output = conefield(&words(&line)).assert().code(1).get_output().clone();

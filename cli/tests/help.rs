@@ -61,7 +61,7 @@ fn lists_of_specs_and_stage_types_are_whole() {
     let types = conefield_core::registry::stage_types();
     assert!(types.len() > 20, "{}", types.len());
     for t in types {
-        let row = format!("\n| {} | `{}` | {} |\n", format!("{:?}", t.kind).to_lowercase(), t.name, t.doc);
+        let row = format!("\n| {} | `{}` | {} |\n", t.kind, t.name, t.doc);
         assert!(readme.contains(&row), "README.md lacks {row}");
     }
 }

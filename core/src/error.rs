@@ -92,6 +92,16 @@ impl Error {
         Self::Invalid { place: place.into(), field: field.into(), found: found.to_string(), expected: expected.into() }
     }
 
+    /// The error of a stage that stands at `key`: a field of the spec gets `key.` before it.
+    pub fn within(self, key: &str) -> Self {
+        match self {
+            Self::Invalid { place, field, found, expected } if place == "spec" => {
+                Self::Invalid { place, field: format!("{key}.{field}"), found, expected }
+            }
+            other => other,
+        }
+    }
+
     /// A system error at `path`.
     pub fn io(path: impl AsRef<Path>, source: std::io::Error) -> Self {
         Self::Io { path: path.as_ref().to_path_buf(), source }

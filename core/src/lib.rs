@@ -9,11 +9,15 @@
 //! - [`spec`], [`registry`]: what a user writes, and the stage types that it may name.
 //! - [`host`]: stages on the host, for what looks at a model beside training.
 //! - [`voxel`]: line integrals of voxel volumes.
+//! - [`basis`], [`data_term`], [`regularizer`]: what an iterative method is put together from; [`space`]: its arrays and
+//!   what they take.
 //! - [`pipeline`], [`backend`], [`solver`], [`trained`]: from a spec to a volume.
 
 pub mod arena;
 pub mod backend;
+pub mod basis;
 pub mod checkpoint;
+pub mod data_term;
 pub mod dense;
 pub mod error;
 pub mod files;
@@ -26,10 +30,12 @@ pub mod parts;
 pub mod pipeline;
 pub mod random;
 pub mod registry;
+pub mod regularizer;
 pub mod scan;
 pub mod scene;
 pub mod simd;
 pub mod solver;
+pub mod space;
 pub mod spec;
 pub mod stage;
 pub mod support;

@@ -4,8 +4,12 @@
 //! types of libraries that are loaded at run time come in by [`add`]. Editors' schemas and the lists in error messages
 //! come from here.
 
+use crate::basis::BasisSpec;
+use crate::data_term::DataTermSpec;
 use crate::error::{Error, Result};
+use crate::regularizer::RegularizerSpec;
 use crate::spec::{EncoderSpec, FieldSpec, InitializerSpec, NormalizerSpec, ProjectorSpec, SolverSpec};
+use crate::voxel::VoxelProjectorSpec;
 use schemars::Schema;
 use serde_json::Value;
 use std::fmt;
@@ -27,12 +31,30 @@ pub enum Kind {
     Initializer,
     /// Scan to volume.
     Solver,
+    /// Line integrals of voxels, for iterative methods.
+    VoxelProjector,
+    /// Coefficients to voxels, for iterative methods.
+    Basis,
+    /// How far line integrals are from the measured ones, for iterative methods.
+    DataTerm,
+    /// Penalty of coefficients with its proximal map, for iterative methods.
+    Regularizer,
 }
 
 impl Kind {
     /// Every kind, in the order of a pipeline.
-    pub const ALL: [Self; 6] =
-        [Self::Encoder, Self::Normalizer, Self::Field, Self::Projector, Self::Initializer, Self::Solver];
+    pub const ALL: [Self; 10] = [
+        Self::Encoder,
+        Self::Normalizer,
+        Self::Field,
+        Self::Projector,
+        Self::Initializer,
+        Self::Solver,
+        Self::VoxelProjector,
+        Self::Basis,
+        Self::DataTerm,
+        Self::Regularizer,
+    ];
 
     /// What it is called in a spec.
     pub fn name(self) -> &'static str {
@@ -43,6 +65,10 @@ impl Kind {
             Self::Projector => "projector",
             Self::Initializer => "initializer",
             Self::Solver => "solver",
+            Self::VoxelProjector => "voxel-projector",
+            Self::Basis => "basis",
+            Self::DataTerm => "data-term",
+            Self::Regularizer => "regularizer",
         }
     }
 
@@ -107,6 +133,14 @@ pub enum Make {
     Initializer(MakeFn<dyn InitializerSpec>),
     /// Of a solver.
     Solver(MakeFn<dyn SolverSpec>),
+    /// Of a projector of voxels.
+    VoxelProjector(MakeFn<dyn VoxelProjectorSpec>),
+    /// Of a basis.
+    Basis(MakeFn<dyn BasisSpec>),
+    /// Of a data term.
+    DataTerm(MakeFn<dyn DataTermSpec>),
+    /// Of a regularizer.
+    Regularizer(MakeFn<dyn RegularizerSpec>),
 }
 
 impl Make {
@@ -118,6 +152,10 @@ impl Make {
             Self::Projector(_) => Kind::Projector,
             Self::Initializer(_) => Kind::Initializer,
             Self::Solver(_) => Kind::Solver,
+            Self::VoxelProjector(_) => Kind::VoxelProjector,
+            Self::Basis(_) => Kind::Basis,
+            Self::DataTerm(_) => Kind::DataTerm,
+            Self::Regularizer(_) => Kind::Regularizer,
         }
     }
 }

@@ -35,7 +35,36 @@ pub struct Scan {
     pub provenance: serde_json::Value,
 }
 
+/// The sizes of a scan.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct ScanHeader {
+    /// Views.
+    pub views: usize,
+    /// Rows and columns of the detector.
+    pub detector: [usize; 2],
+    /// Voxels along x, y, z.
+    pub volume: [usize; 3],
+}
+
+impl ScanHeader {
+    /// Measured values, of all views.
+    pub fn pixels(&self) -> u64 {
+        self.detector.iter().fold(self.views as u64, |n, side| n.saturating_mul(*side as u64))
+    }
+
+    /// Voxels of the volume.
+    pub fn voxels(&self) -> u64 {
+        self.volume.iter().fold(1, |n: u64, side| n.saturating_mul(*side as u64))
+    }
+}
+
 impl Scan {
+    /// Its sizes.
+    pub fn header(&self) -> ScanHeader {
+        let g = &self.geometry;
+        ScanHeader { views: g.views.len(), detector: g.detector, volume: g.volume.shape }
+    }
+
     /// One view, `[row, column]`.
     pub fn view(&self, view: usize) -> ArrayView2<'_, f32> {
         self.projections.index_axis(ndarray::Axis(0), view)

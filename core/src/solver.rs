@@ -6,7 +6,7 @@ use crate::checkpoint::{Checkpoint, Resume};
 use crate::error::{Error, Result};
 use crate::parts::Voxels;
 use crate::pipeline::Model;
-use crate::scan::{Scan, Volume};
+use crate::scan::{Scan, ScanHeader, Volume};
 use crate::spec::{Scene, Spec};
 use crate::trained::TrainedField;
 use serde::{Deserialize, Serialize};
@@ -35,6 +35,8 @@ pub struct Job<'a> {
     pub weights: &'a dyn Fn(&str) -> Result<Weights>,
     /// Reads a volume that the spec names, in 1/unit of the scan.
     pub volumes: &'a dyn Fn(&str) -> Result<Volume>,
+    /// The volume that an iterative method starts from instead of the one that its settings name, in 1/unit of the scan.
+    pub start: Option<&'a Volume>,
     /// Where an earlier run of the same job stood, to go on from.
     pub resume: Option<&'a Resume>,
 }
@@ -54,6 +56,7 @@ impl<'a> Job<'a> {
             limits: Limits::default(),
             weights: &no_weights,
             volumes: &no_volumes,
+            start: None,
             resume: None,
         }
     }
@@ -242,10 +245,15 @@ pub trait Solver: Send + Sync {
         Err(Error::unsupported(self.describe(), "this solver has nothing to pre-train"))
     }
 
-    /// Whether it trains a field of the spec's stages; otherwise it makes voxels and needs none. Refuses a spec with
-    /// stages that it would pass over. Of a solver that does not say, the spec tells.
+    /// Whether it trains a field of the spec's stages. Refuses stages that do not make one.
     fn trains_field(&self, spec: &Spec) -> Result<bool> {
-        Ok(spec.encoder.is_some() || spec.field.is_some())
+        let _ = spec;
+        Ok(false)
+    }
+
+    /// The stages that it owns, by their keys, in words.
+    fn stages(&self) -> Vec<(&'static str, String)> {
+        vec![]
     }
 
     /// The setting that looks at views kept aside, if there is one: it is without effect in a job that has none.
@@ -259,10 +267,10 @@ pub trait Solver: Send + Sync {
         vec![]
     }
 
-    /// Bytes that it holds at most while it makes `voxels` of `pixels` measured values, beside scan, model, backend and the
-    /// volume that comes out: directions, residuals, lists of rays.
-    fn working_memory(&self, pixels: u64, voxels: u64) -> u64 {
-        let _ = (pixels, voxels);
+    /// Bytes that it holds at most while it works on a scan of these sizes, beside scan, model, backend and the volume that
+    /// comes out.
+    fn bytes(&self, header: &ScanHeader) -> u64 {
+        let _ = header;
         0
     }
 
@@ -287,7 +295,7 @@ pub struct Successor<'a> {
     pub first: &'a dyn Solver,
     /// The one that goes on.
     pub then: &'a dyn Solver,
-    /// What that one is given as its spec; its initializer brings the first one's volume, through [`Job::volumes`].
+    /// What that one is given as its spec; it starts from the first one's volume, [`Job::start`].
     pub spec: Spec,
     /// Its steps at most.
     pub passes: u64,

@@ -14,7 +14,6 @@ use crate::arena::{Arena, InitReport, Layout, Weights};
 use crate::error::{Error, Result, ensure};
 use crate::solver::Solver;
 use crate::stage::{Encoder, Field, Normalizer, Projector};
-use crate::voxel::VoxelProjector;
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
@@ -302,20 +301,11 @@ pub trait FieldSpec: Send + Sync {
     fn build(&self, width: usize) -> Result<Box<dyn Field>>;
 }
 
-/// Settings of a projector: of one that samples rays for a field, of one that projects voxels, or of both.
+/// Settings of a projector that samples rays for a field.
 #[typetag::serde(tag = "type")]
 pub trait ProjectorSpec: Send + Sync {
-    /// The stage that samples rays.
-    fn build(&self) -> Result<Box<dyn Projector>> {
-        let found = format!("{:?}, which projects voxels", self.typetag_name());
-        Err(Error::invalid("spec", "projector.type", found, "one that samples rays"))
-    }
-
-    /// The stage that projects voxels.
-    fn build_voxel(&self) -> Result<Box<dyn VoxelProjector>> {
-        let found = format!("{:?}, which samples rays", self.typetag_name());
-        Err(Error::invalid("spec", "projector.type", found, "one that projects voxels"))
-    }
+    /// The stage, or why the settings make none.
+    fn build(&self) -> Result<Box<dyn Projector>>;
 }
 
 /// Settings of an initializer.
@@ -338,7 +328,7 @@ pub trait InitializerSpec: Send + Sync {
 pub struct VolumeStart {
     /// Its file.
     pub path: String,
-    /// Steps in which a field learns it; solvers on voxels take it as it is.
+    /// Steps in which a field learns it.
     pub steps: u64,
 }
 

@@ -19,6 +19,7 @@ use conefield_core::checkpoint::{Checkpoint, Resume, Standing, tensors};
 use conefield_core::error::{Error, Result, ensure};
 use conefield_core::pipeline::{Masked, Model, Pipeline};
 use conefield_core::random::stream;
+use conefield_core::scan::ScanHeader;
 use conefield_core::scene::Scene;
 use conefield_core::solver::{DriftRecord, Job, Observer, PretrainJob, Reconstruction, Record, Solution, Solver};
 use conefield_core::spec::{SolverSpec, Spec};
@@ -370,8 +371,8 @@ impl Solver for Gradient {
     }
 
     /// The list of the pixels that are trained on, at most all of them.
-    fn working_memory(&self, pixels: u64, _: u64) -> u64 {
-        size_of::<u32>() as u64 * pixels
+    fn bytes(&self, header: &ScanHeader) -> u64 {
+        size_of::<u32>() as u64 * header.pixels()
     }
 
     /// Parameters and moments of the last good state, and parameters of the best one.

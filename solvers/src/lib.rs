@@ -8,7 +8,7 @@
 //! - [`guard`] takes a run that goes astray back, [`patience`] ends one that no longer gets better.
 //! - [`fdk`] filters and back-projects.
 //! - [`sequence`] lets one solver go on where another one ended.
-//! - [`iterative`] improves voxels pass by pass: SART and its kin, CGLS, ASD-POCS, FISTA with total variation.
+//! - [`iterative`] improves voxels pass by pass: SART, CGLS, ASD-POCS, FISTA.
 
 pub mod drift;
 pub mod fdk;

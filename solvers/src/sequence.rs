@@ -1,14 +1,14 @@
 //! Two solvers one after the other: the second, on voxels, starts from the volume of the first, and may be held to it.
 //!
 //! A field and total variation err in different places. A field that is trained first, and total variation that is held to its
-//! volume (`pull` of `fista-tv`), come closer than either alone.
+//! volume (`pull` of `fista`), come closer than either alone.
 
 use conefield_core::checkpoint::Checkpoint;
 use conefield_core::error::{Error, Result, ensure};
 use conefield_core::pipeline::Model;
-use conefield_core::scan::Scan;
+use conefield_core::scan::{Scan, ScanHeader};
 use conefield_core::solver::{Job, Limits, Observer, PretrainJob, Reconstruction, Record, Solution, Solver, Successor};
-use conefield_core::spec::{InitializerSpec, Scene, SolverSpec, Spec, VolumeStart};
+use conefield_core::spec::{Scene, SolverSpec, Spec};
 use schemars::{JsonSchema, Schema, SchemaGenerator, json_schema};
 use serde::{Deserialize, Serialize};
 
@@ -47,7 +47,7 @@ impl SolverSpec for Sequence {
         let then = self.then.build().map_err(|e| inside("then", e))?;
         let nested = first.successor(&Scene::default()).or(then.successor(&Scene::default())).is_some();
         ensure(!nested, "spec", "solver", "a sequence in a sequence", "two solvers that are none")?;
-        // The second sees a spec without a field's stages, whose initializer brings the first one's volume.
+        // The second sees a spec without a field's stages.
         let alone = spec_of(self.then.as_ref(), &Scene::default())?;
         if then.trains_field(&alone).map_err(|e| inside("then", e))? {
             let found = format!("{:?}, which trains a field", self.then.typetag_name());
@@ -80,18 +80,7 @@ fn copy(settings: &dyn SolverSpec) -> Result<Box<dyn SolverSpec>> {
 
 /// The spec that the second solver sees.
 fn spec_of(then: &dyn SolverSpec, scene: &Scene) -> Result<Spec> {
-    Ok(Spec { initializer: Some(Box::new(Handed)), ..Spec::voxels(copy(then)?, scene.clone()) })
-}
-
-/// Stands for the first solver's volume in the second one's spec. No user can name it: it is no registered type.
-#[derive(Serialize, Deserialize)]
-struct Handed;
-
-#[typetag::serde(name = "handed")]
-impl InitializerSpec for Handed {
-    fn volume(&self) -> Result<Option<VolumeStart>> {
-        Ok(Some(VolumeStart { path: "the first solver's volume".into(), steps: 0 }))
-    }
+    Ok(Spec::voxels(copy(then)?, scene.clone()))
 }
 
 /// What [`Sequence`] builds.
@@ -107,7 +96,6 @@ impl Solver for Turns {
         let first = self.first.solve(job, &mut First { observer: &mut *observer, over: false })?;
         let volume = first.result.volume(job.backend)?;
         let spec = spec_of(self.settings.as_ref(), &job.spec.scene)?;
-        let handed = |_: &str| Ok(volume.clone());
         let limits = Limits {
             steps: Some(self.passes),
             seconds: None,
@@ -115,7 +103,7 @@ impl Solver for Turns {
             deadline: job.limits.then,
             then: None,
         };
-        let next = Job { spec: &spec, limits, volumes: &handed, resume: None, ..*job };
+        let next = Job { spec: &spec, limits, start: Some(&volume), resume: None, ..*job };
         let mut then = Then { observer, steps: first.steps, seconds: first.train_s };
         let second = self.then.solve(&next, &mut then)?;
         let volume = second.result.volume(job.backend)?;
@@ -154,8 +142,8 @@ impl Solver for Turns {
     }
 
     /// The second also holds the volume that it began with and the one that it makes.
-    fn working_memory(&self, pixels: u64, voxels: u64) -> u64 {
-        self.first.working_memory(pixels, voxels).max(self.then.working_memory(pixels, voxels) + 8 * voxels)
+    fn bytes(&self, header: &ScanHeader) -> u64 {
+        self.first.bytes(header).max(self.then.bytes(header) + 8 * header.voxels())
     }
 
     fn memory_per_parameter(&self) -> u64 {

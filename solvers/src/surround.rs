@@ -7,13 +7,14 @@
 //! the volume nothing finer than these cells is modelled, once.
 
 use crate::iterative::Stop;
-use crate::iterative::fista_tv::FistaTv;
+use crate::iterative::fista::Fista;
+use crate::iterative::regularizers::TotalVariation;
 use crate::support::Blocks;
 use conefield_core::error::{Error, Result};
 use conefield_core::geometry::{Geometry, View, VoxelGrid, norm};
-use conefield_core::scan::{Scan, Unit};
-use conefield_core::solver::{Job, Observer, Record, Solver};
-use conefield_core::spec::{self, Spec, SurroundRule};
+use conefield_core::scan::{Scan, ScanHeader, Unit};
+use conefield_core::solver::{Job, Observer, Record};
+use conefield_core::spec::{self, SolverSpec, Spec, SurroundRule};
 use conefield_projectors::voxel::Joseph;
 use ndarray::{Array3, Axis, Zip, s};
 
@@ -75,13 +76,21 @@ pub fn told(scan: &Scan, settings: &spec::Scene) -> Result<Option<String>> {
     Ok(Some(Around::of(scan, settings)?.1))
 }
 
-/// Bytes that looking beyond the volume takes at most; and that what it leaves of a scan of so many `pixels` takes, until the
-/// volume is made.
-pub fn memory(rule: SurroundRule, pixels: u64) -> [u64; 2] {
+/// Bytes that looking beyond the volume takes at most; and that what it leaves of a scan of these sizes takes, until the
+/// volume is made. The coarse pixels are not counted: how many there are only the scan itself tells.
+pub fn bytes(rule: SurroundRule, header: &ScanHeader) -> [u64; 2] {
     let SurroundRule::Coarse(settings) = rule else { return [0; 2] };
-    let side = settings.cells as f64 * (1.0 + 2.0 * settings.margin) + 2.0;
-    let cells = (side.powi(3) as u64).min(MOST as u64);
-    [4 * cells + FistaTv::default().working_memory(0, cells), 4 * pixels]
+    let side = (settings.cells as f64 * (1.0 + 2.0 * settings.margin)) as usize + 2;
+    let side = side.min((MOST as f64).cbrt() as usize);
+    let cells = ScanHeader { views: 0, detector: [0; 2], volume: [side; 3] };
+    let finding = method(settings.passes).build().map_or(0, |method| method.bytes(&cells));
+    [4 * cells.voxels() + finding, 4 * header.pixels()]
+}
+
+/// What finds the cells.
+fn method(passes: u64) -> Fista {
+    let stop = Stop { passes: Some(passes), ..Stop::default() };
+    Fista { stop, prior: Box::new(TotalVariation::default()), ..Fista::default() }
 }
 
 /// Coarse cells over the volume and around it.
@@ -134,10 +143,9 @@ impl Around {
     /// What is in the cells beyond the volume, in 1/mm.
     fn find(&self, job: &Job<'_>, passes: u64, observer: &mut dyn Observer) -> Result<Array3<f32>> {
         let scan = coarse(job.scan, self.cells);
-        let solver = FistaTv { stop: Stop { passes: Some(passes), ..Stop::default() }, ..FistaTv::default() };
-        let spec = Spec::voxels(Box::new(solver.clone()), spec::Scene::default());
+        let spec = Spec::voxels(Box::new(method(passes)), spec::Scene::default());
         let alone = Job { seed: job.seed, ..Job::new(&scan, &spec, job.backend) };
-        let mut data = solver.solve(&alone, &mut Quiet(observer))?.result.volume(job.backend)?.data;
+        let mut data = spec.solver.build()?.solve(&alone, &mut Quiet(observer))?.result.volume(job.backend)?.data;
         let [x, y, z]: [_; 3] = std::array::from_fn(|k| self.margin[k]..self.cells.shape[k] - self.margin[k]);
         data.slice_mut(s![x, y, z]).fill(0.0);
         Ok(data)

@@ -1,11 +1,19 @@
 //! Negative controls: a small stage that passes the kit, and the same stage with one fault at a time, which must fail
 //! the property that the fault breaks. A kit that cannot fail proves nothing.
 
-use conefield_conformance::{Options, check, check_encoder, check_initializer, check_projector, check_voxel_projector};
+use conefield_conformance::{
+    Options, check, check_basis, check_data_term, check_encoder, check_initializer, check_projector, check_regularizer,
+    check_voxel_projector,
+};
 use conefield_core::arena::{Arena, InitReport, Layout};
-use conefield_core::geometry::Geometry;
+use conefield_core::basis::{Basis, BasisOperator, Expansion};
+use conefield_core::data_term::{DataTerm, Misfit};
+use conefield_core::geometry::{Geometry, VoxelGrid};
 use conefield_core::half::Stored;
+use conefield_core::regularizer::{Penalty, Regularizer};
+use conefield_core::scan::Scan;
 use conefield_core::simd::Real;
+use conefield_core::space::Space;
 use conefield_core::spec::Initializer;
 use conefield_core::stage::{
     Encoder, GradKind, Grads, Halves, Info, Kernel, Parameter, Projector, Reduced, Samples, Scope, Stage, Tile,
@@ -613,4 +621,304 @@ fn every_fault_of_an_initializer_fails_its_property() {
         let report = check_initializer(&toy(fault));
         assert!(report.failed().contains(&property), "{fault:?} passed {property:?}:\n{report}");
     }
+}
+
+/// What is wrong with a basis. It is that of voxels otherwise.
+#[derive(Debug, Clone, Copy, PartialEq)]
+enum BasisFault {
+    None,
+    /// It has no grid of voxels that it is made for.
+    Refuses,
+    /// The number of coefficients follows from the size of voxels.
+    CountsMillimetres,
+    /// The way back is a thousandth too long.
+    LongAdjoint,
+    /// Small voxels are rounded away in single precision.
+    CoarseSingle,
+    /// Voxels are squared.
+    Squares,
+    /// Voxels are added to what is there.
+    AddsVoxels,
+    /// So are coefficients.
+    AddsCoefficients,
+    /// Every coefficient counts against its voxel.
+    Negative,
+    /// It says that it is the identity and doubles everything.
+    Doubles,
+    /// The result depends on the number of threads.
+    Threads,
+}
+
+struct BasisOn(BasisFault, VoxelGrid);
+
+impl Basis for BasisFault {
+    fn on(&self, grid: &VoxelGrid) -> Result<Box<dyn Expansion>> {
+        match self {
+            Self::Refuses if grid.shape[0] == 1 => Err(Error::unsupported("toy", "a line of voxels")),
+            _ => Ok(Box::new(BasisOn(*self, *grid))),
+        }
+    }
+    fn describe(&self) -> String {
+        format!("toy: {self:?}")
+    }
+}
+
+impl Expansion for BasisOn {
+    fn coefficients(&self) -> VoxelGrid {
+        let mut grid = self.1;
+        if self.0 == BasisFault::CountsMillimetres {
+            grid.shape[0] = grid.size()[0].ceil() as usize;
+        }
+        grid
+    }
+    fn is_identity(&self) -> bool {
+        matches!(self.0, BasisFault::None | BasisFault::Doubles)
+    }
+    fn operator(&self) -> &dyn BasisOperator<f32> {
+        self
+    }
+    fn reference(&self) -> &dyn BasisOperator<f64> {
+        self
+    }
+}
+
+impl<R: Real> BasisOperator<R> for BasisOn {
+    fn expand(&self, coefficients: ArrayView3<'_, R>, mut voxels: ArrayViewMut3<'_, R>) {
+        let many = rayon::current_num_threads() == 3;
+        for (v, &c) in voxels.iter_mut().zip(&coefficients) {
+            *v = match self.0 {
+                BasisFault::AddsVoxels => *v + c,
+                BasisFault::Squares => c * c,
+                BasisFault::Negative => R::ZERO - c,
+                BasisFault::Doubles => c + c,
+                BasisFault::CoarseSingle if size_of::<R>() == 4 => R::of((c.f64() * 1e3).round() / 1e3),
+                BasisFault::Threads if many => c * R::of(1.0 + 1e-6),
+                _ => c,
+            };
+        }
+    }
+
+    fn adjoint(&self, voxels: ArrayView3<'_, R>, mut coefficients: ArrayViewMut3<'_, R>) {
+        for (c, &v) in coefficients.iter_mut().zip(&voxels) {
+            *c = match self.0 {
+                BasisFault::AddsCoefficients => *c + v,
+                BasisFault::LongAdjoint => v * R::of(1.001),
+                BasisFault::Negative => R::ZERO - v,
+                BasisFault::Doubles => v + v,
+                _ => v,
+            };
+        }
+    }
+}
+
+#[test]
+fn every_fault_of_a_basis_fails_its_property() {
+    let sound = check_basis(&BasisFault::None);
+    assert!(sound.passed(), "{sound}");
+    for (fault, property) in [
+        (BasisFault::Refuses, "builds"),
+        (BasisFault::CountsMillimetres, "builds"),
+        (BasisFault::LongAdjoint, "adjoint: double precision"),
+        (BasisFault::LongAdjoint, "adjoint: single precision"),
+        (BasisFault::CoarseSingle, "single precision"),
+        (BasisFault::Squares, "linear"),
+        (BasisFault::AddsVoxels, "overwrites"),
+        (BasisFault::AddsCoefficients, "overwrites"),
+        (BasisFault::Negative, "no negative entries"),
+        (BasisFault::Doubles, "identity"),
+        (BasisFault::Threads, "threads"),
+    ] {
+        let report = quietly(|| check_basis(&fault));
+        assert!(report.failed().contains(&property), "{fault:?} passed {property:?}:\n{report}");
+    }
+    assert_eq!(check_basis(&BasisFault::Doubles).failed(), ["identity"]);
+}
+
+/// What is wrong with a regularizer: `½‖x‖²` otherwise, whose proximal map is `max(0, v/(1 + τ))`.
+#[derive(Debug, Clone, Copy, PartialEq)]
+enum PriorFault {
+    None,
+    /// The map shrinks half as much as it should.
+    Halved,
+    /// The map grows.
+    Grows,
+    /// The penalty is concave.
+    Concave,
+    /// The penalty of nothing is not a number.
+    NotANumber,
+    /// Less weight with more noise.
+    LessWithNoise,
+    /// What is below 0 stays.
+    Negative,
+    /// A weight of 0 shrinks as well.
+    ShrinksAlways,
+    /// The map adds to what is there.
+    Adds,
+    /// The map of a call depends on how many came before, and that is no part of the state.
+    Forgets,
+    /// It has an array that it did not ask the space for.
+    Uncounted,
+    /// The result depends on the number of threads.
+    Threads,
+}
+
+struct PriorOn {
+    fault: PriorFault,
+    calls: u64,
+    state: Vec<f32>,
+}
+
+impl Regularizer for PriorFault {
+    fn on(&self, grid: &VoxelGrid, _: &Space) -> Box<dyn Penalty> {
+        let held = if *self == Self::Uncounted { grid.shape.iter().product() } else { 0 };
+        Box::new(PriorOn { fault: *self, calls: 0, state: vec![0.0; held] })
+    }
+    fn weight(&self, _: &VoxelGrid, noise: &mut dyn FnMut(f64) -> f64) -> f64 {
+        if *self == Self::LessWithNoise { 1.0 / (1.0 + noise(1.0)) } else { noise(1.0) }
+    }
+    fn describe(&self) -> String {
+        format!("toy: {self:?}")
+    }
+}
+
+impl Penalty for PriorOn {
+    fn value(&self, x: ArrayView3<'_, f32>) -> f64 {
+        let square: f64 = x.iter().map(|x| f64::from(*x).powi(2)).sum();
+        match self.fault {
+            PriorFault::Concave => square.sqrt().sqrt(),
+            PriorFault::NotANumber => square * square / square,
+            _ => 0.5 * square,
+        }
+    }
+
+    fn prox(&mut self, v: &[f32], tau: f32, u: &mut [f32]) {
+        self.calls += 1;
+        let shrink = match self.fault {
+            PriorFault::Halved => 1.0 + 0.5 * tau,
+            PriorFault::Grows => 0.8,
+            PriorFault::ShrinksAlways => 1.01 + tau,
+            PriorFault::Forgets => 1.0 + tau * (1.0 + 0.5 / self.calls as f32),
+            PriorFault::Threads if rayon::current_num_threads() == 3 => 1.0 + 1.01 * tau,
+            _ => 1.0 + tau,
+        };
+        for (u, v) in u.iter_mut().zip(v) {
+            let x = if self.fault == PriorFault::Negative { v / shrink } else { (v / shrink).max(0.0) };
+            *u = if self.fault == PriorFault::Adds { *u + x } else { x };
+        }
+    }
+
+    fn state(&mut self) -> Vec<(&'static str, &mut [f32])> {
+        vec![("state", &mut self.state)]
+    }
+}
+
+#[test]
+fn every_fault_of_a_regularizer_fails_its_property() {
+    let sound = check_regularizer(&PriorFault::None);
+    assert!(sound.passed(), "{sound}");
+    for (fault, property) in [
+        (PriorFault::Halved, "proximal map"),
+        (PriorFault::Grows, "nonexpansive"),
+        (PriorFault::Concave, "convex"),
+        (PriorFault::NotANumber, "value"),
+        (PriorFault::LessWithNoise, "weight"),
+        (PriorFault::Negative, "not negative"),
+        (PriorFault::ShrinksAlways, "weight of 0"),
+        (PriorFault::Adds, "overwrites"),
+        (PriorFault::Forgets, "state"),
+        (PriorFault::Uncounted, "tally"),
+        (PriorFault::Threads, "threads"),
+    ] {
+        let report = quietly(|| check_regularizer(&fault));
+        assert!(report.failed().contains(&property), "{fault:?} passed {property:?}:\n{report}");
+    }
+    assert_eq!(check_regularizer(&PriorFault::Uncounted).failed(), ["tally"]);
+}
+
+/// What is wrong with a data term: least squares otherwise.
+#[derive(Debug, Clone, Copy, PartialEq)]
+enum DataFault {
+    None,
+    /// The derivative is twice what it is.
+    Steep,
+    /// The bound of the curvature is a tenth too low.
+    LowBound,
+    /// It falls where residuals grow.
+    Upside,
+    /// A view counts more among others.
+    Neighbours,
+    /// Ten times the noise is found.
+    Loud,
+    /// Noise is spread as if it were not weighted.
+    Wide,
+    /// 0 over 0 on a scan of nothing.
+    NotANumber,
+    /// The result depends on the number of threads.
+    Threads,
+}
+
+struct DataOn<'a>(DataFault, &'a Scan);
+
+impl DataTerm for DataFault {
+    fn of<'a>(&self, scan: &'a Scan) -> Box<dyn Misfit + 'a> {
+        Box::new(DataOn(*self, scan))
+    }
+    fn describe(&self) -> String {
+        format!("toy: {self:?}")
+    }
+}
+
+impl Misfit for DataOn<'_> {
+    fn differentiate(&self, views: &[usize], mut residuals: ArrayViewMut3<'_, f32>) -> f64 {
+        let square: f64 = residuals.iter().map(|r| f64::from(*r).powi(2)).sum();
+        let factor = match self.0 {
+            DataFault::Steep => 2.0,
+            DataFault::Neighbours if views.len() > 1 => 1.001,
+            DataFault::NotANumber => self.1.projections[[0, 0, 0]] / self.1.projections[[0, 0, 0]],
+            DataFault::Threads if rayon::current_num_threads() == 3 => 1.0 + 1e-6,
+            DataFault::Upside => -1.0,
+            _ => 1.0,
+        };
+        residuals.mapv_inplace(|r| factor * r);
+        if self.0 == DataFault::Upside { -0.5 * square } else { 0.5 * square }
+    }
+    fn curve(&self, _: &[usize], mut values: ArrayViewMut3<'_, f32>) {
+        if self.0 == DataFault::LowBound {
+            values.mapv_inplace(|x| 0.9 * x);
+        }
+    }
+    fn spread(&self, _: &[usize], mut values: ArrayViewMut3<'_, f32>) {
+        match self.0 {
+            DataFault::LowBound => values.mapv_inplace(|x| 0.9f32.sqrt() * x),
+            DataFault::Wide => values.mapv_inplace(|x| 1.2 * x),
+            _ => {}
+        }
+    }
+    fn noise(&self) -> f64 {
+        if self.0 == DataFault::Loud { 0.2 } else { 0.02 }
+    }
+    fn describe(&self) -> String {
+        "toy".into()
+    }
+}
+
+#[test]
+fn every_fault_of_a_data_term_fails_its_property() {
+    let sound = check_data_term(&DataFault::None);
+    assert!(sound.passed(), "{sound}");
+    for (fault, properties) in [
+        (DataFault::Steep, &["finite differences"][..]),
+        (DataFault::LowBound, &["curvature"]),
+        (DataFault::Upside, &["curvature", "least where nothing is left"]),
+        (DataFault::Neighbours, &["views stand alone"]),
+        (DataFault::Loud, &["noise"]),
+        (DataFault::Wide, &["spread of noise"]),
+        (DataFault::NotANumber, &["finite"]),
+        (DataFault::Threads, &["threads"]),
+    ] {
+        let report = quietly(|| check_data_term(&fault));
+        let failed = report.failed();
+        assert!(properties.iter().all(|p| failed.contains(p)), "{fault:?} failed {failed:?}:\n{report}");
+    }
+    assert_eq!(check_data_term(&DataFault::LowBound).failed(), ["curvature"]);
 }

@@ -3,13 +3,19 @@
 mod device;
 
 use conefield_conformance::{
-    Options, Report, check_encoder, check_field, check_initializer, check_normalizer, check_projector,
-    check_projector_wgsl, check_voxel_projector, check_wgsl,
+    Options, Report, check_basis, check_data_term, check_encoder, check_field, check_initializer, check_normalizer,
+    check_projector, check_projector_wgsl, check_regularizer, check_voxel_projector, check_wgsl,
 };
 use conefield_core::arena::Weights;
+use conefield_core::basis::BasisSpec;
+use conefield_core::data_term::DataTermSpec;
 use conefield_core::registry::{Kind, names};
+use conefield_core::regularizer::RegularizerSpec;
+use conefield_core::spec::stage::{Settings, read};
 use conefield_core::spec::{EncoderSpec, FieldSpec, InitializerSpec, NormalizerSpec, ProjectorSpec, Tables};
 use conefield_core::stage::Stage;
+use conefield_core::voxel::VoxelProjectorSpec;
+use serde::de::DeserializeOwned;
 use serde_json::{Value, json};
 
 // Stage types register themselves where their crate is linked.
@@ -18,6 +24,7 @@ use conefield_fields as _;
 use conefield_initializers as _;
 use conefield_normalizers as _;
 use conefield_projectors as _;
+use conefield_solvers as _;
 
 fn expect(report: Report) {
     println!("{report}");
@@ -192,16 +199,43 @@ fn voxel_grid() {
     }
 }
 
+/// Every registered type of a kind with default settings, and others of them.
+fn each<T: Settings + ?Sized>(others: &[Value]) -> Vec<Box<T>>
+where
+    Box<T>: DeserializeOwned,
+{
+    let all = names(T::KIND);
+    assert!(!all.is_empty(), "no {}", T::KIND);
+    let settings = all.iter().map(|name| json!({ "type": name })).chain(others.iter().cloned());
+    settings.map(|s| read(s).unwrap()).collect()
+}
+
 #[test]
 fn voxel_projectors() {
-    for settings in [
-        json!({"type": "siddon"}),
-        json!({"type": "joseph"}),
-        json!({"type": "trilinear"}),
-        json!({"type": "trilinear", "samples_per_voxel": 5.0}),
-    ] {
-        let spec: Box<dyn ProjectorSpec> = serde_json::from_value(settings).unwrap();
-        expect(check_voxel_projector(spec.build_voxel().unwrap().as_ref()));
+    for spec in each::<dyn VoxelProjectorSpec>(&[json!({"type": "trilinear", "samples_per_voxel": 5.0})]) {
+        expect(check_voxel_projector(spec.build().unwrap().as_ref()));
+    }
+}
+
+#[test]
+fn bases() {
+    for spec in each::<dyn BasisSpec>(&[]) {
+        expect(check_basis(spec.build().unwrap().as_ref()));
+    }
+}
+
+#[test]
+fn data_terms() {
+    for spec in each::<dyn DataTermSpec>(&[]) {
+        expect(check_data_term(spec.build().unwrap().as_ref()));
+    }
+}
+
+#[test]
+fn regularizers() {
+    for spec in each::<dyn RegularizerSpec>(&[json!({"type": "total-variation", "weight": {"fixed": 0.1}, "inner": 1})])
+    {
+        expect(check_regularizer(spec.build().unwrap().as_ref()));
     }
 }
 
@@ -236,5 +270,5 @@ fn every_registered_stage_has_a_run_here() {
     assert_eq!(names(Kind::Normalizer), ["fft-mask", "layer-norm"]);
     assert_eq!(names(Kind::Field), ["mlp", "voxel-grid"]);
     assert_eq!(names(Kind::Initializer), ["checkpoint", "mci", "random", "volume"]);
-    assert_eq!(names(Kind::Projector), ["joseph", "ray-march", "siddon", "trilinear"]);
+    assert_eq!(names(Kind::Projector), ["ray-march"]);
 }

@@ -144,10 +144,12 @@ fn report(loaded: &Loaded, parts: Parts, scan: Option<ForScan>) -> Result<Report
         Plain { kind: kind.into(), what: without(kind, what) }
     };
     let parameters = pipeline.as_ref().map_or(0, |p| p.layout().len());
-    let projector = match (&pipeline, &loaded.spec.projector) {
-        (Some(p), _) => Some(p.projector.describe()),
-        (None, Some(p)) => Some(p.build_voxel().map_err(|e| loaded.locate(e))?.describe()),
-        (None, None) => None,
+    let projector = match &pipeline {
+        Some(p) => Some(plain("projector", p.projector.describe())),
+        None => solver.stages().into_iter().find(|s| s.0 == "projector").map(|(key, what)| {
+            let kind = tree["solver"][key]["type"].as_str().unwrap_or_default();
+            Plain { kind: kind.into(), what: without(kind, what) }
+        }),
     };
     // The weights that an initializer names are not read here: a spec is explained without them.
     let initializer = match &tree["initializer"] {
@@ -162,7 +164,7 @@ fn report(loaded: &Loaded, parts: Parts, scan: Option<ForScan>) -> Result<Report
         source: loaded.source.clone(),
         description: loaded.spec.description.clone(),
         stages,
-        projector: projector.map(|what| plain("projector", what)),
+        projector,
         initializer,
         solver: plain("solver", solver.describe()),
         parameters,

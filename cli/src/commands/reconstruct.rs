@@ -124,8 +124,8 @@ impl Reconstruct {
                 (method, Some(plan))
             }
             (Some(budget), None, Some(front)) => {
-                let more = self.all_sets();
-                let build = |spec: &str, sets: &[String]| self.method(spec, &[sets, &more].concat(), backend.as_ref());
+                let all = |spec: &str, sets: &[String]| [sets, &self.all_sets(spec)].concat();
+                let build = |spec: &str, sets: &[String]| self.method(spec, &all(spec, sets), backend.as_ref());
                 let (method, plan) = budget.choose(&bench, &front, build)?;
                 (method, Some(plan))
             }
@@ -231,7 +231,7 @@ impl Reconstruct {
     /// The spec that is asked for and what is set of it. A run that is resumed knows what it chose.
     fn asked(&self) -> Option<(String, Vec<String>)> {
         match &self.spec {
-            Some(spec) => Some((spec.clone(), self.all_sets())),
+            Some(spec) => Some((spec.clone(), self.all_sets(spec))),
             None => self.resume.then(|| (self.output.join("spec.toml").display().to_string(), vec![])),
         }
     }
@@ -281,10 +281,14 @@ impl Reconstruct {
     }
 
     /// `--set`s, with `--init` as the one that it stands for.
-    fn all_sets(&self) -> Vec<String> {
+    fn all_sets(&self, spec: &str) -> Vec<String> {
         let mut sets = self.protocol.sets.clone();
         if let Some(path) = &self.init {
-            sets.push(if conefield_io::is_volume(path) { initializer("volume", "path", path) } else { mci(path) });
+            sets.push(match conefield_io::is_volume(path) {
+                true if starts_from_a_volume(spec, &sets) => format!("solver.start={}", quoted(path)),
+                true => initializer("volume", "path", path),
+                false => mci(path),
+            });
         }
         sets
     }
@@ -323,8 +327,18 @@ pub fn mci(path: &Path) -> String {
 
 /// The setting of an initializer that reads the file `path`, under `key`.
 fn initializer(kind: &str, key: &str, path: &Path) -> String {
-    let path = toml::Value::String(path.display().to_string());
-    format!("initializer={{ type = \"{kind}\", {key} = {path} }}")
+    format!("initializer={{ type = \"{kind}\", {key} = {} }}", quoted(path))
+}
+
+/// A path as TOML writes it.
+fn quoted(path: &Path) -> toml::Value {
+    toml::Value::String(path.display().to_string())
+}
+
+/// Whether a spec's method takes a volume to start from as its own setting.
+fn starts_from_a_volume(spec: &str, sets: &[String]) -> bool {
+    let with = [sets, &["solver.start=\"\"".to_owned()]].concat();
+    specs::read(spec, &with).is_ok()
 }
 
 /// What weights say of where they come from.

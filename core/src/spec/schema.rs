@@ -57,7 +57,7 @@ pub fn pipeline() -> Value {
     for (name, schema) in tables() {
         defs.insert(name.into(), relocated(schema, name));
     }
-    for (_, kind) in STAGES {
+    for kind in Kind::ALL {
         let mut any = vec![];
         for t in stage_types().into_iter().filter(|t| t.kind == kind) {
             let name = format!("{}.{}", kind.name(), t.name);

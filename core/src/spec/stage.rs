@@ -4,7 +4,11 @@
 //! of its own; [`one`] and [`list`] look their names up at run time.
 
 use super::{EncoderSpec, FieldSpec, InitializerSpec, NormalizerSpec, ProjectorSpec, SolverSpec};
+use crate::basis::BasisSpec;
+use crate::data_term::DataTermSpec;
 use crate::registry::{Kind, Make, MakeFn, Origin, find};
+use crate::regularizer::RegularizerSpec;
+use crate::voxel::VoxelProjectorSpec;
 use serde::Deserialize;
 use serde::de::{DeserializeOwned, Deserializer, Error};
 use serde_json::Value;
@@ -40,6 +44,10 @@ settings! {
     Projector ProjectorSpec
     Initializer InitializerSpec
     Solver SolverSpec
+    VoxelProjector VoxelProjectorSpec
+    Basis BasisSpec
+    DataTerm DataTermSpec
+    Regularizer RegularizerSpec
 }
 
 /// The settings that `value` says.

@@ -39,8 +39,8 @@ fn make(ty: Arc<Type>) -> Make {
         Kind::Normalizer => Make::Normalizer(Box::new(move |v| Ok(Box::new(settings(v))))),
         Kind::Field => Make::Field(Box::new(move |v| Ok(Box::new(settings(v))))),
         Kind::Projector => Make::Projector(Box::new(move |v| Ok(Box::new(settings(v))))),
-        // A library's table has no solvers.
-        Kind::Initializer | Kind::Solver => Make::Initializer(Box::new(move |v| Ok(Box::new(settings(v))))),
+        // A library's table has stages of these five kinds.
+        _ => Make::Initializer(Box::new(move |v| Ok(Box::new(settings(v))))),
     }
 }
 

@@ -57,7 +57,7 @@ impl Built {
                 let spec = read::<dyn InitializerSpec>(settings).map_err(refused)?;
                 AnyStage::Initializer(spec.build(&no_weights)?)
             }
-            Kind::Solver => return Err(Error::unsupported(t.name, "solvers cannot come from plugins")),
+            other => return Err(Error::unsupported(t.name, format!("a {other} cannot come from a plugin"))),
         };
         Ok(Self::of(stage))
     }

@@ -41,7 +41,7 @@ const SURROUND: &str = "[scene]\nsurround = { coarse = { margin = 1.0, cells = 3
 
 fn solver(kind: &str) -> String {
     let stop = if kind == "fdk" { "" } else { "stop = { passes = 10 }\n" };
-    format!("[solver]\ntype = \"{kind}\"\n{stop}")
+    crate::kit::solver(kind, stop)
 }
 
 #[test]

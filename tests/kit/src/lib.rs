@@ -5,12 +5,15 @@
 //! stage is smooth: a row is taken only if differences over a step and over four steps agree, so that no cell boundary
 //! and no kink of an activation lies near.
 
+mod bases;
 mod behaviour;
 mod call;
 mod channels;
+mod data_terms;
 mod gradients;
 mod halves;
 mod rays;
+mod regularizers;
 mod voxels;
 mod weights;
 mod wgsl;
@@ -20,7 +23,10 @@ use std::fmt;
 use std::ops::Range;
 use std::panic::{AssertUnwindSafe, catch_unwind};
 
+pub use bases::check_basis;
+pub use data_terms::check_data_term;
 pub use rays::check_projector;
+pub use regularizers::check_regularizer;
 pub use voxels::check_voxel_projector;
 pub use weights::check_initializer;
 pub use wgsl::{Pass, Sample, check_projector_wgsl, check_wgsl};

@@ -28,6 +28,11 @@ fn method(name: &str) -> Value {
     match name {
         "field" => field(),
         "fdk" => json!({"solver": {"type": "fdk"}}),
+        "os-sart" => json!({"solver": {"type": "sart", "subsets": 10, "relaxation": 1.0, "stop": {"passes": 5}}}),
+        "sirt" => {
+            json!({"solver": {"type": "sart", "subsets": 1, "relaxation": 1.9, "decay": 1.0, "stop": {"passes": 5}}})
+        }
+        "fista-tv" => json!({"solver": {"type": "fista", "prior": {"type": "total-variation"}, "stop": {"passes": 5}}}),
         _ => json!({"solver": {"type": name, "stop": {"passes": 5}}}),
     }
 }

@@ -255,7 +255,7 @@ impl Check {
                 let stage = make(settings.clone())?.build(&none)?;
                 add(None, check_initializer(stage.as_ref()));
             }
-            Make::Solver(_) => return Err(Error::unsupported(&t.name, "solvers cannot come from plugins")),
+            _ => return Err(Error::unsupported(&t.name, format!("a {} cannot come from a plugin", t.kind))),
         }
         Ok(())
     }

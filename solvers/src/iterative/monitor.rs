@@ -7,17 +7,16 @@ use conefield_core::scan::Scan;
 use conefield_core::solver::Job;
 use conefield_core::voxel::VoxelOperator;
 use ndarray::Array3;
-use rayon::prelude::*;
 
 /// Looks at a job's reference and held-out views; never learns from them.
-pub struct Watch<'a> {
+pub struct VolumeMonitor<'a> {
     reference: Option<&'a Array3<f32>>,
     held_out: Option<&'a Scan>,
     peak: f64,
 }
 
-impl<'a> Watch<'a> {
-    /// What `job` lets be watched.
+impl<'a> VolumeMonitor<'a> {
+    /// For what `job` has to look at.
     pub fn new(job: &Job<'a>) -> Self {
         let shape = job.scan.geometry.volume.shape;
         let reference = job.reference.map(|r| &r.data).filter(|r| r.shape() == shape);
@@ -53,22 +52,4 @@ impl<'a> Watch<'a> {
         operator.fault()?;
         Ok(Some((square / scan.projections.len() as f64).sqrt() / f64::from(top).max(1e-300)))
     }
-}
-
-/// Sum of the squares of `x − y`, the same whatever the number of threads.
-pub fn difference_square_sum(x: &[f32], y: &[f32]) -> f64 {
-    let square = |(a, b): (&f32, &f32)| (f64::from(*a) - f64::from(*b)).powi(2);
-    let parts: Vec<f64> = x
-        .par_chunks(1 << 16)
-        .zip(y.par_chunks(1 << 16))
-        .map(|(x, y)| x.iter().zip(y).map(square).sum::<f64>())
-        .collect();
-    parts.iter().sum()
-}
-
-/// Sum of squares, the same whatever the number of threads.
-pub fn square_sum(x: &[f32]) -> f64 {
-    let parts: Vec<f64> =
-        x.par_chunks(1 << 16).map(|c| c.iter().map(|&v| f64::from(v) * f64::from(v)).sum::<f64>()).collect();
-    parts.iter().sum()
 }
