@@ -1,4 +1,4 @@
-//! The method's own experiments: drift, features as colours, label maps, an end by views kept aside.
+//! The method's own experiments: drift, features as colours, label maps, an end by views kept aside, live slices.
 
 mod common;
 use common::{done, json, refused, text};
@@ -65,6 +65,17 @@ fn the_state_of_the_best_record_comes_out_and_is_told() {
     let (steps, after) = (record["steps"].as_u64().unwrap(), best["step"].as_u64().unwrap() + 2);
     assert!(steps == after && steps < 60, "{all:?}");
     assert!(all.last().unwrap()["events"][0].as_str().unwrap().contains("stopping rule"));
+}
+
+#[test]
+fn live_slices_are_drawn_and_change_nothing() {
+    let (_first, plain) = run(&[]);
+    let (_second, watched) = run(&["--live", "0.001s"]);
+    assert!(!plain.join("live.png").exists());
+    let picture = image::open(watched.join("live.png")).unwrap();
+    assert!(picture.width() > 300 && picture.height() > 300);
+    let volume = |run: &Path| fs::read(run.join("volume.nii.gz")).unwrap();
+    assert!(volume(&plain) == volume(&watched));
 }
 
 #[test]

@@ -1,9 +1,9 @@
 //! Voxels whose line integrals are those of Joseph (IEEE Trans. Med. Imaging 1(3), 1982) instead of sums over samples.
 //!
 //! A ray goes from plane to plane of voxel centres across the axis along which it passes most of them. On each plane it
-//! takes the value between the four nearest centres, 0 beyond the rim, times the distance of the planes along the ray. A
-//! line integral is linear in the voxels, and its adjoint goes the same way. The values at points are those of
-//! [`voxel_grid`](crate::voxel_grid), without an activation.
+//! takes the value between the four nearest centres times the distance of the planes along the ray. A line integral is
+//! linear in the voxels, and its adjoint goes the same way. The values at points are those of
+//! [`voxel_grid`](crate::voxel_grid), without an activation; as there, half a voxel from the rim they no longer change.
 
 use crate::mlp::Activation;
 use crate::voxel_grid::{Resolution, VoxelGrid, VoxelGridStage};
@@ -96,7 +96,11 @@ impl Walk {
         let ends = [from, to].map(|t| p[across] + t * q[across]);
         let (mut low, mut high) = (ends[0].min(ends[1]), ends[0].max(ends[1]));
         // Planes on which the ray can reach the slab; some too many do no harm.
-        let within = [slab.start as f64 - 1.5, slab.end as f64 + 0.5];
+        let open = [slab.start == 0, slab.end == side[0]];
+        let within = [
+            if open[0] { f64::NEG_INFINITY } else { slab.start as f64 - 1.5 },
+            if open[1] { f64::INFINITY } else { slab.end as f64 + 0.5 },
+        ];
         if across == 0 {
             (low, high) = (low.max(within[0]), high.min(within[1]));
         } else if step[0].abs() > 1e-9 {
@@ -112,16 +116,14 @@ impl Walk {
         let strides = [side[1] * side[2], side[2], 1];
         let [a, b, c] = self.axes;
         for plane in self.planes.clone() {
-            let at: [f64; 2] = std::array::from_fn(|k| self.start[k] + self.step[k] * plane as f64);
-            let (low, rest) = (at.map(f64::floor), at.map(|x| x - x.floor()));
-            for (i, wi) in [(low[0], 1.0 - rest[0]), (low[0] + 1.0, rest[0])] {
-                for (j, wj) in [(low[1], 1.0 - rest[1]), (low[1] + 1.0, rest[1])] {
-                    let inside = i >= 0.0 && j >= 0.0 && i < side[b] as f64 && j < side[c] as f64;
-                    if inside && wi * wj > 0.0 {
-                        take(
-                            plane * strides[a] + i as usize * strides[b] + j as usize * strides[c],
-                            wi * wj * self.length,
-                        );
+            let at: [f64; 2] = std::array::from_fn(|k| {
+                (self.start[k] + self.step[k] * plane as f64).clamp(0.0, (side[self.axes[k + 1]] - 1) as f64)
+            });
+            let (low, rest) = (at.map(|x| x as usize), at.map(f64::fract));
+            for (i, wi) in [(low[0], 1.0 - rest[0]), (low[0] + 1, rest[0])] {
+                for (j, wj) in [(low[1], 1.0 - rest[1]), (low[1] + 1, rest[1])] {
+                    if wi * wj > 0.0 {
+                        take(plane * strides[a] + i * strides[b] + j * strides[c], wi * wj * self.length);
                     }
                 }
             }
@@ -229,11 +231,11 @@ mod tests {
         // Along z through the centres of x = 1 of 2, y = 0 of 3.
         let along = ray([0.75, 1.0 / 6.0, -1.0], [0.0, 0.0, 1.0]);
         assert!((line([2, 3, 4], &params, along) - (12.0 + 13.0 + 14.0 + 15.0) / 4.0).abs() < 1e-6);
-        // Between two columns it takes both by halves, and beyond the rim one by half.
+        // Between two columns it takes both by halves, at the rim one.
         let between = ray([0.5, 1.0 / 6.0, -1.0], [0.0, 0.0, 1.0]);
         assert!((line([2, 3, 4], &params, between) - (1.5 + 13.5) / 2.0).abs() < 1e-6);
         let rim = ray([1.0, 1.0 / 6.0, -1.0], [0.0, 0.0, 1.0]);
-        assert!((line([2, 3, 4], &params, rim) - 13.5 / 2.0).abs() < 1e-6);
+        assert!((line([2, 3, 4], &params, rim) - 13.5).abs() < 1e-6);
         // Backwards it is the same line.
         let back = ray([0.75, 1.0 / 6.0, 2.0], [0.0, 0.0, -1.0]);
         assert_eq!(line([2, 3, 4], &params, back), line([2, 3, 4], &params, along));

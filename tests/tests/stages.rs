@@ -189,9 +189,8 @@ fn voxel_grid() {
 #[test]
 fn voxels_joseph() {
     for settings in [
-        json!({"type": "voxels-joseph", "resolution": 6}),
-        json!({"type": "voxels-joseph", "resolution": [5, 1, 9]}),
-        json!({"type": "voxels-joseph", "resolution": [1, 1, 1]}),
+        json!({"type": "voxels-joseph", "resolution": 16}),
+        json!({"type": "voxels-joseph", "resolution": [12, 17, 9]}),
         // More than one range of voxels.
         json!({"type": "voxels-joseph", "resolution": [41, 37, 43]}),
     ] {
