@@ -648,6 +648,33 @@ mod tests {
     }
 
     #[test]
+    fn the_name_of_a_type_stands_for_its_default_settings() {
+        let alone = read("encoder = 'test-grid'\nsolver = 'test-solver'\n", &[]).unwrap();
+        let table = read("encoder.type = 'test-grid'\nsolver.type = 'test-solver'\n", &[]).unwrap();
+        assert_eq!(alone.tree, table.tree);
+        assert_eq!(alone.tree["encoder"]["levels"], 4);
+        let e = alone.locate(alone.spec.encoder.as_ref().unwrap().build().err().unwrap()).to_string();
+        assert!(e.starts_with("a.toml:1:11: encoder.levels"), "{e}");
+        // Over another type, by `--set`, and within a stage.
+        let base = "extends = 'plain'\n";
+        assert_eq!(read(base, &["encoder=test-grid"]).unwrap().tree["encoder"]["levels"], 4);
+        read(base, &["encoder={type='test-stack', below='test-grid'}"]).unwrap();
+        for (line, want) in [
+            (
+                "encoder = 'tets-grid'",
+                "a.toml:2:11: encoder: found no encoder type \"tets-grid\", expected \"test-grid\"",
+            ),
+            ("encoder = 'test-stack'", "a.toml:2:11: encoder.below: found nothing"),
+            ("encoder = 3", "a.toml:2:11: encoder: found 3, expected a table, or the name of a type: one of test-grid"),
+            ("normalizers = ['x']", "a.toml:2:16: normalizers.0: found no normalizer type \"x\""),
+            ("encoder = { type = 'test-stack', below = 'x' }", "encoder.below: found no encoder type \"x\""),
+        ] {
+            let e = refusal(&format!("{base}{line}\n"), &[]);
+            assert!(e.contains(want), "{line}\n{e}\n{want}");
+        }
+    }
+
+    #[test]
     fn sets_are_checked_like_files() {
         for (set, want) in [
             ("encoder.level=8", "--set encoder.level=8: encoder.level: found an unknown key"),
