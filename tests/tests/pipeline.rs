@@ -16,6 +16,7 @@ use conefield_core::scan::{Scan, Volume};
 use conefield_core::scene::Scene;
 use conefield_core::solver::{Limits, PretrainJob, Solution};
 use conefield_core::trained::TrainedField;
+use conefield_projectors::simulate::{Protocol, simulate};
 use conefield_solvers::losses::{Huber, L2};
 use conefield_solvers::priors::TotalVariation;
 use serde_json::{Value, json};
@@ -208,6 +209,29 @@ fn the_number_of_threads_does_not_change_a_bit() {
     // Negative control: bits that a hardly changed run does change.
     s["solver"]["lr"] = json!(0.020001);
     assert!(one != run(1, &s));
+}
+
+// ---- a loss that learns from the scan ----
+
+#[test]
+fn noise_weights_come_from_the_scan() {
+    let protocol: Protocol = serde_json::from_value(json!({
+        "dso": 500.0, "dsd": 750.0, "detector": [64, 64], "extent": {"side": [280.0, 280.0]},
+        "angles": {"even": {"views": 8}},
+    }))
+    .unwrap();
+    let scan = simulate(&truth(), &protocol.with_noise("tigre:1e3,0".parse().unwrap(), 5)).unwrap();
+    let run = |loss: &str| {
+        let mut s = settings();
+        s["solver"]["loss"] = json!(loss);
+        let (solution, records) = solve(&s, &scan, &Weights::default()).unwrap();
+        (model(solution).arena.params.to_vec(), records.last().unwrap().loss.unwrap())
+    };
+    let ([weighted, again], (plain, squares)) = ([(); 2].map(|()| run("noise-weighted")), run("l2"));
+    assert!(weighted == again, "the same weights every time");
+    assert!(weighted.0 != plain, "weights change the result");
+    // Their mean is 1: the loss stays what it was, but for how noise and weights go together.
+    assert!((0.3..1.0).contains(&(weighted.1 / squares)), "{} against {squares}", weighted.1);
 }
 
 // ---- export ----

@@ -69,6 +69,30 @@ pub fn cases() -> Vec<Case> {
             &["solver.drift.points", "1 to 65536"],
         ),
         refused(
+            "a misspelt loss",
+            toml("extends = \"naf\"\n[solver]\nloss = \"hubr\"\n"),
+            TOML,
+            &["spec.toml:3:8", "solver.loss", "no loss type", "\"huber\""],
+        ),
+        refused(
+            "a loss that is linear from 0 on",
+            toml("extends = \"naf\"\n[solver]\nloss = { type = \"huber\", delta = 0.0 }\n"),
+            TOML,
+            &["spec.toml:3:33", "solver.loss.delta", "positive"],
+        ),
+        refused(
+            "a prior on blocks of one point",
+            toml("extends = \"naf\"\n[[solver.priors]]\ntype = \"total-variation\"\nedge = 1\n"),
+            TOML,
+            &["spec.toml:4:8", "solver.priors.0.edge", "2 to 32"],
+        ),
+        refused(
+            "a prior that is no list",
+            toml("extends = \"naf\"\n[solver]\npriors = \"total-variation\"\n"),
+            TOML,
+            &["spec.toml:3:10", "solver.priors", "a list, each a table with a prior type, or its name"],
+        ),
+        refused(
             "a surround by another name",
             toml("extends = \"naf\"\n[scene]\nsurround = \"coarsely\"\n"),
             TOML,

@@ -536,7 +536,7 @@ mod tests {
             ),
             (
                 "type = 'test-stack'",
-                "a.toml:2:1: encoder.below: found nothing, expected a table with an encoder type: one of",
+                "a.toml:2:1: encoder.below: found nothing, expected a table with an encoder type, or its name: one of",
             ),
             ("type = 'test-stack'\nbelow = { type = 'test-grid', level = 2 }", "a.toml:4:31: encoder.below.level"),
         ] {
@@ -556,6 +556,33 @@ mod tests {
         );
         let e = refusal("{\n\"solver\": {\"type\": \"test-solver\",\n \"step\": 3}}", &[]);
         assert!(e.starts_with("a.toml:3:2: solver.step: found an unknown key, expected \"steps\""), "{e}");
+    }
+
+    #[test]
+    fn the_name_of_a_type_stands_for_its_default_settings() {
+        let alone = read("encoder = 'test-grid'\nsolver = 'test-solver'\n", &[]).unwrap();
+        let table = read("encoder.type = 'test-grid'\nsolver.type = 'test-solver'\n", &[]).unwrap();
+        assert_eq!(alone.tree, table.tree);
+        assert_eq!(alone.tree["encoder"]["levels"], 4);
+        let e = alone.locate(alone.spec.encoder.as_ref().unwrap().build().err().unwrap()).to_string();
+        assert!(e.starts_with("a.toml:1:11: encoder.levels"), "{e}");
+        // Over another type, by `--set`, and within a stage.
+        let base = "extends = 'plain'\n";
+        assert_eq!(read(base, &["encoder=test-grid"]).unwrap().tree["encoder"]["levels"], 4);
+        read(base, &["encoder={type='test-stack', below='test-grid'}"]).unwrap();
+        for (line, want) in [
+            (
+                "encoder = 'tets-grid'",
+                "a.toml:2:11: encoder: found no encoder type \"tets-grid\", expected \"test-grid\"",
+            ),
+            ("encoder = 'test-stack'", "a.toml:2:11: encoder.below: found nothing"),
+            ("encoder = 3", "a.toml:2:11: encoder: found 3, expected a table, or the name of a type: one of test-grid"),
+            ("normalizers = ['x']", "a.toml:2:16: normalizers.0: found no normalizer type \"x\""),
+            ("encoder = { type = 'test-stack', below = 'x' }", "encoder.below: found no encoder type \"x\""),
+        ] {
+            let e = refusal(&format!("{base}{line}\n"), &[]);
+            assert!(e.contains(want), "{line}\n{e}\n{want}");
+        }
     }
 
     #[test]
