@@ -9,7 +9,7 @@ use conefield_core::arena::Arena;
 use conefield_core::backend::{Backend, Explain};
 use conefield_core::pipeline::Pipeline;
 use conefield_core::solver::Solver;
-use conefield_core::spec::Scene;
+use conefield_core::spec::SceneSettings;
 use conefield_core::spec::load::Loaded;
 use conefield_io::ScanSize;
 use conefield_solvers::{iterative, surround};
@@ -35,7 +35,7 @@ pub struct Parts {
     pub pipeline: Option<Pipeline>,
     /// What the backend made of it; empty without a pipeline.
     pub compiled: Explain,
-    scene: Scene,
+    scene: SceneSettings,
     /// Whether a volume is read to start from.
     from_volume: bool,
 }

@@ -30,7 +30,7 @@ pub struct Scene {
 
 impl Scene {
     /// The scene of `scan` under the spec's settings.
-    pub fn new(scan: &Scan, settings: &spec::Scene) -> Result<Self> {
+    pub fn new(scan: &Scan, settings: &spec::SceneSettings) -> Result<Self> {
         let grid = scan.geometry.volume;
         let longest = grid.size().into_iter().fold(0.0, f64::max);
         let attenuation = match settings.attenuation {
@@ -54,7 +54,7 @@ impl Scene {
     }
 
     /// The scene around `grid` in which `attenuation` (1/mm) counts as 1.
-    pub fn with_attenuation(grid: VoxelGrid, settings: &spec::Scene, attenuation: f64) -> Result<Self> {
+    pub fn with_attenuation(grid: VoxelGrid, settings: &spec::SceneSettings, attenuation: f64) -> Result<Self> {
         let fill = settings.fill;
         ensure(fill > 0.0 && fill <= 1.0, "spec", "scene.fill", fill, "a number above 0 and at most 1")?;
         let size = grid.size();
@@ -73,7 +73,7 @@ impl Scene {
     }
 
     /// The scene with the unit cube around `support` instead of the whole volume.
-    pub fn within(mut self, support: Support, settings: &spec::Scene) -> Self {
+    pub fn within(mut self, support: Support, settings: &spec::SceneSettings) -> Self {
         let (box_, all) = (support.bounds(), self.grid.bounds());
         self.bounds =
             [std::array::from_fn(|k| box_[0][k].max(all[0][k])), std::array::from_fn(|k| box_[1][k].min(all[1][k]))];

@@ -7,7 +7,7 @@ use crate::error::{Error, Result};
 use crate::parts::Voxels;
 use crate::pipeline::Model;
 use crate::scan::{Scan, Volume};
-use crate::spec::{Scene, Spec};
+use crate::spec::{SceneSettings, Spec};
 use crate::trained::TrainedField;
 use serde::{Deserialize, Serialize};
 use std::time::Instant;
@@ -272,7 +272,7 @@ pub trait Solver: Send + Sync {
     }
 
     /// Of a solver that lets another one go on where the first ended: the two. `scene` is that of the spec.
-    fn successor(&self, scene: &Scene) -> Option<Successor<'_>> {
+    fn successor(&self, scene: &SceneSettings) -> Option<Successor<'_>> {
         let _ = scene;
         None
     }

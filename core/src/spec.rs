@@ -30,10 +30,10 @@ pub struct Spec {
     pub description: String,
     /// How the scan is mapped to what stages see.
     #[serde(default)]
-    pub scene: Scene,
+    pub scene: SceneSettings,
     /// Libraries with stages that the spec names.
-    #[serde(default, skip_serializing_if = "Plugins::is_empty")]
-    pub plugins: Plugins,
+    #[serde(default, skip_serializing_if = "PluginPaths::is_empty")]
+    pub plugins: PluginPaths,
     /// In which precision a field computes.
     #[serde(default, skip_serializing_if = "Precision::is_single")]
     pub precision: Precision,
@@ -59,12 +59,12 @@ pub struct Spec {
 
 impl Spec {
     /// A spec of nothing but a solver on voxels.
-    pub fn voxels(solver: Box<dyn SolverSpec>, scene: Scene) -> Self {
+    pub fn voxels(solver: Box<dyn SolverSpec>, scene: SceneSettings) -> Self {
         Self {
             name: String::new(),
             description: String::new(),
             scene,
-            plugins: Plugins::default(),
+            plugins: PluginPaths::default(),
             precision: Precision::default(),
             encoder: None,
             normalizers: vec![],
@@ -79,13 +79,13 @@ impl Spec {
 /// Libraries with stages that a spec names. A spec alone never makes the program load one: its user allows it.
 #[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields, default)]
-pub struct Plugins {
+pub struct PluginPaths {
     /// The files of the libraries, relative to the spec's own. Loaded only where the user says so, with
     /// `--allow-plugins-from-spec`, or names the same file with `--plugin`.
     pub paths: Vec<String>,
 }
 
-impl Plugins {
+impl PluginPaths {
     /// Whether none is named.
     pub fn is_empty(&self) -> bool {
         self.paths.is_empty()
@@ -134,7 +134,7 @@ impl std::fmt::Display for Tables {
 /// How the scan is mapped to the unit cube and to attenuations of order one.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields, default)]
-pub struct Scene {
+pub struct SceneSettings {
     /// Share of the unit cube's side that the longest side of the volume fills, in (0, 1]. Published codes leave
     /// most of the cube empty; 1 spends every cell on the volume.
     pub fill: f64,
@@ -151,7 +151,7 @@ pub struct Scene {
     pub surround: SurroundRule,
 }
 
-impl Default for Scene {
+impl Default for SceneSettings {
     fn default() -> Self {
         let (support, occupancy, levels) = (SupportRule::Box, OccupancyRule::Fixed, LevelRule::All);
         let surround = SurroundRule::None;

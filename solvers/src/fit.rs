@@ -19,7 +19,7 @@ pub struct Fitted {
 }
 
 /// Where the object can be, if the settings have it looked for, and what was found.
-pub fn support(scan: &Scan, settings: &spec::Scene) -> (Option<Support>, Option<String>) {
+pub fn support(scan: &Scan, settings: &spec::SceneSettings) -> (Option<Support>, Option<String>) {
     match settings.support {
         SupportRule::Box => (None, None),
         SupportRule::Carve => {
@@ -30,7 +30,7 @@ pub fn support(scan: &Scan, settings: &spec::Scene) -> (Option<Support>, Option<
 }
 
 /// The scene of a scan under a spec's settings. Makes `pipeline` count in its lengths.
-pub fn fit(scan: &Scan, settings: &spec::Scene, pipeline: &mut Pipeline) -> Result<Fitted> {
+pub fn fit(scan: &Scan, settings: &spec::SceneSettings, pipeline: &mut Pipeline) -> Result<Fitted> {
     let mut scene = Scene::new(scan, settings)?;
     let (support, said) = support(scan, settings);
     let mut found: Vec<String> = said.into_iter().collect();

@@ -8,7 +8,7 @@ use conefield_core::error::{Error, Result, ensure};
 use conefield_core::pipeline::Model;
 use conefield_core::scan::Scan;
 use conefield_core::solver::{Job, Limits, Observer, PretrainJob, Reconstruction, Record, Solution, Solver, Successor};
-use conefield_core::spec::{InitializerSpec, Scene, SolverSpec, Spec, VolumeStart};
+use conefield_core::spec::{InitializerSpec, SceneSettings, SolverSpec, Spec, VolumeStart};
 use schemars::{JsonSchema, Schema, SchemaGenerator, json_schema};
 use serde::{Deserialize, Serialize};
 
@@ -45,10 +45,10 @@ impl SolverSpec for Sequence {
         ensure(self.passes > 0, "spec", "solver.passes", 0, "at least 1")?;
         let first = self.first.build().map_err(|e| inside("first", e))?;
         let then = self.then.build().map_err(|e| inside("then", e))?;
-        let nested = first.successor(&Scene::default()).or(then.successor(&Scene::default())).is_some();
+        let nested = first.successor(&SceneSettings::default()).or(then.successor(&SceneSettings::default())).is_some();
         ensure(!nested, "spec", "solver", "a sequence in a sequence", "two solvers that are none")?;
         // The second sees a spec without a field's stages, whose initializer brings the first one's volume.
-        let alone = spec_of(self.then.as_ref(), &Scene::default())?;
+        let alone = spec_of(self.then.as_ref(), &SceneSettings::default())?;
         if then.trains_field(&alone).map_err(|e| inside("then", e))? {
             let found = format!("{:?}, which trains a field", self.then.typetag_name());
             return Err(Error::invalid("spec", "solver.then.type", found, "a solver on voxels"));
@@ -79,7 +79,7 @@ fn copy(settings: &dyn SolverSpec) -> Result<Box<dyn SolverSpec>> {
 }
 
 /// The spec that the second solver sees.
-fn spec_of(then: &dyn SolverSpec, scene: &Scene) -> Result<Spec> {
+fn spec_of(then: &dyn SolverSpec, scene: &SceneSettings) -> Result<Spec> {
     Ok(Spec { initializer: Some(Box::new(Handed)), ..Spec::voxels(copy(then)?, scene.clone()) })
 }
 
@@ -162,7 +162,7 @@ impl Solver for Turns {
         self.first.memory_per_parameter()
     }
 
-    fn successor(&self, scene: &Scene) -> Option<Successor<'_>> {
+    fn successor(&self, scene: &SceneSettings) -> Option<Successor<'_>> {
         let spec = spec_of(self.settings.as_ref(), scene).ok()?;
         Some(Successor { first: self.first.as_ref(), then: self.then.as_ref(), spec, passes: self.passes })
     }

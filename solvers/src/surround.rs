@@ -70,7 +70,7 @@ pub fn subtracted(job: &Job<'_>, observer: &mut dyn Observer) -> Result<Option<S
 }
 
 /// What a spec's surround comes to for this scan, in words; `None` where it asks for none.
-pub fn told(scan: &Scan, settings: &spec::Scene) -> Result<Option<String>> {
+pub fn told(scan: &Scan, settings: &spec::SceneSettings) -> Result<Option<String>> {
     let SurroundRule::Coarse(settings) = settings.surround else { return Ok(None) };
     Ok(Some(Around::of(scan, settings)?.1))
 }
@@ -135,7 +135,7 @@ impl Around {
     fn find(&self, job: &Job<'_>, passes: u64, observer: &mut dyn Observer) -> Result<Array3<f32>> {
         let scan = coarse(job.scan, self.cells);
         let solver = FistaTv { stop: Stop { passes: Some(passes), ..Stop::default() }, ..FistaTv::default() };
-        let spec = Spec::voxels(Box::new(solver.clone()), spec::Scene::default());
+        let spec = Spec::voxels(Box::new(solver.clone()), spec::SceneSettings::default());
         let alone = Job { seed: job.seed, ..Job::new(&scan, &spec, job.backend) };
         let mut data = solver.solve(&alone, &mut Quiet(observer))?.result.volume(job.backend)?.data;
         let [x, y, z]: [_; 3] = std::array::from_fn(|k| self.margin[k]..self.cells.shape[k] - self.margin[k]);

@@ -61,7 +61,7 @@ fn filled(settings: &Value) -> Model {
 
 fn rays() -> Vec<TrainRay> {
     let scan = scan();
-    let scene = Scene::new(&scan, &conefield_core::spec::Scene::default()).unwrap();
+    let scene = Scene::new(&scan, &conefield_core::spec::SceneSettings::default()).unwrap();
     let ray = |i: usize| scene.pixel_ray(&scan.geometry, i % 8, (i * 5) % 16, (i * 7) % 16);
     (0..40).map(|i| TrainRay { ray: ray(i), target: if i % 2 == 0 { 0.5 } else { 3.0 } }).collect()
 }

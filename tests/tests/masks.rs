@@ -72,7 +72,7 @@ fn points() -> Vec<[f32; 3]> {
 
 fn refresh(model: &mut Model, epoch: f64) -> Result<Vec<String>> {
     let grid = VoxelGrid { shape: [16, 12, 8], spacing: [1.0; 3], center: [0.0; 3] };
-    let scene = Scene::with_attenuation(grid, &conefield_core::spec::Scene::default(), 1.0)?;
+    let scene = Scene::with_attenuation(grid, &conefield_core::spec::SceneSettings::default(), 1.0)?;
     let backend = Cpu::new();
     let mut exe = backend.compile(&model.pipeline)?.0;
     model.refresh(&scene, epoch, &backend, &mut exe)

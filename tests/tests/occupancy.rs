@@ -79,7 +79,7 @@ fn full(p: [f32; 3]) -> bool {
 }
 
 fn rays(scan: &Scan) -> Vec<TrainRay> {
-    let scene = Scene::new(scan, &conefield_core::spec::Scene::default()).unwrap();
+    let scene = Scene::new(scan, &conefield_core::spec::SceneSettings::default()).unwrap();
     let ray = |i: usize| scene.pixel_ray(&scan.geometry, i % 8, (i * 5) % 16, (i * 7) % 16);
     (0..90).map(|i| TrainRay { ray: ray(i), target: if i % 2 == 0 { 0.5 } else { 3.0 } }).collect()
 }

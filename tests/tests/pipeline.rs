@@ -86,7 +86,7 @@ fn sample(pipeline: &Pipeline, grads: &[f64]) -> Vec<Vec<usize>> {
 fn gradients_of(settings: &Value, count: usize, edge: usize) {
     let pipeline = Pipeline::build(&spec(settings).unwrap()).unwrap();
     let scan = scan();
-    let scene = Scene::new(&scan, &conefield_core::spec::Scene::default()).unwrap();
+    let scene = Scene::new(&scan, &conefield_core::spec::SceneSettings::default()).unwrap();
     let mut rays = vec![];
     for i in 0..count {
         let ray = scene.pixel_ray(&scan.geometry, i % 8, (i * 5) % 16, (i * 7) % 16);

@@ -53,7 +53,7 @@ fn steps_agree(settings: &Value) {
     let devices = device::backends("whole steps");
     let pipeline = Pipeline::build(&spec(settings).unwrap()).unwrap();
     let scan = scan();
-    let scene = Scene::new(&scan, &conefield_core::spec::Scene::default()).unwrap();
+    let scene = Scene::new(&scan, &conefield_core::spec::SceneSettings::default()).unwrap();
     let rays: Vec<TrainRay> = (0..40)
         .map(|i| {
             let ray = scene.pixel_ray(&scan.geometry, i % 8, (i * 5) % 16, (i * 7) % 16);
@@ -156,7 +156,7 @@ fn a_step_is_that_of_the_cpu_without_parameters_in_the_encoder() {
 #[test]
 fn what_is_asked_of_a_trained_model_is_that_of_the_cpu() {
     let scan = scan();
-    let scene = Scene::new(&scan, &conefield_core::spec::Scene::default()).unwrap();
+    let scene = Scene::new(&scan, &conefield_core::spec::SceneSettings::default()).unwrap();
     let rays: Vec<TrainRay> = (0..64)
         .map(|i| TrainRay { ray: scene.pixel_ray(&scan.geometry, i % 8, (i * 5) % 16, (i * 7) % 16), target: 0.7 })
         .collect();

@@ -1,6 +1,6 @@
 //! JSON Schemas: of one stage type, and of a whole spec for editors.
 
-use super::{Plugins, Precision, Scene};
+use super::{PluginPaths, Precision, SceneSettings};
 use crate::registry::{Kind, StageType, stage_types};
 use serde_json::{Map, Value, json};
 
@@ -45,8 +45,8 @@ pub(super) fn tables() -> [(&'static str, Value); 3] {
         schema
     };
     [
-        ("scene", of(schemars::schema_for!(Scene))),
-        ("plugins", of(schemars::schema_for!(Plugins))),
+        ("scene", of(schemars::schema_for!(SceneSettings))),
+        ("plugins", of(schemars::schema_for!(PluginPaths))),
         ("precision", of(schemars::schema_for!(Precision))),
     ]
 }

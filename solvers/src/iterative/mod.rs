@@ -20,7 +20,7 @@ use conefield_core::checkpoint::{Checkpoint, Resume, Standing};
 use conefield_core::error::{Result, ensure};
 use conefield_core::scan::{Scan, Volume};
 use conefield_core::solver::{Best, Job, Observer, Reconstruction, Record, Solution};
-use conefield_core::spec::{Scene, Spec, SupportRule, VolumeStart};
+use conefield_core::spec::{SceneSettings, Spec, SupportRule, VolumeStart};
 use conefield_core::voxel::{VoxelOperator, VoxelProjector};
 use ndarray::{Array2, Array3, Axis, Zip};
 use rayon::prelude::*;
@@ -200,7 +200,7 @@ pub trait Method {
 }
 
 /// Bytes that knowing where the object can be takes, of a volume of so many `voxels`.
-pub fn memory(settings: &Scene, voxels: u64) -> u64 {
+pub fn memory(settings: &SceneSettings, voxels: u64) -> u64 {
     match settings.support {
         SupportRule::Box => 0,
         SupportRule::Carve => voxels,

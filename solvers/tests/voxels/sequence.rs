@@ -5,7 +5,7 @@ use conefield_backend_cpu::Cpu;
 use conefield_core::Error;
 use conefield_core::scan::Scan;
 use conefield_core::solver::{Limits, Reconstruction};
-use conefield_core::spec::Scene;
+use conefield_core::spec::SceneSettings;
 use conefield_projectors::simulate::{ellipsoids, scan_ellipsoids};
 
 const FIRST: &str = "type = \"os-sart\"\nsubsets = 4\nstop = { passes = 3 }\n";
@@ -117,7 +117,7 @@ fn limits_are_the_firsts_and_what_is_told_is_of_both() {
     let solver = spec(&text).unwrap().solver.build().unwrap();
     let said = solver.describe();
     assert!(said.contains("os-sart: 4 subsets") && said.contains("then at most 4 passes of fista-tv"), "{said}");
-    let next = solver.successor(&Scene::default()).unwrap();
+    let next = solver.successor(&SceneSettings::default()).unwrap();
     assert_eq!((next.passes, next.spec.initializer.is_some()), (4, true));
-    assert!(next.first.successor(&Scene::default()).is_none());
+    assert!(next.first.successor(&SceneSettings::default()).is_none());
 }

@@ -192,7 +192,7 @@ fn step(rays: usize, samples: usize, tables: Tables) -> [f64; 2] {
     value["projector"]["samples"] = json!(samples);
     let pipeline = Pipeline::build(&spec(&value).unwrap()).unwrap();
     let scan = scan();
-    let scene = Scene::new(&scan, &conefield_core::spec::Scene::default()).unwrap();
+    let scene = Scene::new(&scan, &conefield_core::spec::SceneSettings::default()).unwrap();
     let rays: Vec<TrainRay> = (0..rays)
         .map(|i| {
             let ray = scene.pixel_ray(&scan.geometry, i % 8, 4 + (i * 5) % 8, 4 + (i * 3) % 8);
