@@ -59,8 +59,7 @@ fn mlp() -> Value {
 fn pipeline(encoder: &Value, [normalizers, masks]: &[Value; 2], field: &Value, projector: &Value) -> Value {
     json!({
         "encoder": encoder, "normalizers": normalizers, "field": field, "projector": projector,
-        "solver": {"type": "gradient", "steps": 30, "rays": 96, "lr": 0.02, "loss": "l2", "report_every": 5,
-                   "callbacks": masks},
+        "type": "neural-field", "loss": "l2", "callbacks": masks, "training": {"steps": 30, "rays": 96, "report_every": 5}, "optimizer": {"lr": 0.02},
     })
 }
 
@@ -72,7 +71,7 @@ fn learns(name: &str, spec: &Value) -> usize {
     assert!(last < 0.5 * first, "{name}: the loss went from {first} to {last}");
     assert!(volume(&solution).data.iter().all(|x| x.is_finite()), "{name}");
     // A mask in the chain was decided on the way.
-    let masks = spec["solver"]["callbacks"].as_array().unwrap().len();
+    let masks = spec["callbacks"].as_array().unwrap().len();
     let events: Vec<_> = records.iter().flat_map(|r| &r.events).collect();
     assert_eq!(events.len(), masks, "{name}: {events:?}");
     solution.result.field().unwrap().model.pipeline.field.info().input
@@ -101,7 +100,7 @@ fn voxels_behind_positions_learn() {
     for (p, projector) in projectors().iter().enumerate() {
         let mut spec = pipeline(&json!({"type": "identity"}), &[json!([]), json!([])], &grid, projector);
         // Every voxel moves by about the rate a step, from softplus(−2) on.
-        spec["solver"]["lr"] = json!(0.1);
+        spec["optimizer"]["lr"] = json!(0.1);
         learns(&format!("voxels, projector {p}"), &spec);
     }
 }

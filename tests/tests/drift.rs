@@ -23,8 +23,7 @@ fn settings() -> Value {
         "normalizers": [{"type": "layer-norm"}],
         "field": {"type": "mlp", "width": 12, "depth": 3, "skips": [1], "output": "none"},
         "projector": {"type": "ray-march", "samples": 20},
-        "solver": {"type": "gradient", "steps": 40, "rays": 64, "lr": 0.02, "report_every": 5,
-                   "callbacks": [{"type": "rollback"}, {"type": "drift", "every": 1.5, "points": 300}]},
+        "type": "neural-field", "callbacks": [{"type": "rollback"}, {"type": "drift", "every": 1.5, "points": 300}], "training": {"steps": 40, "rays": 64, "report_every": 5}, "optimizer": {"lr": 0.02},
     })
 }
 
@@ -38,7 +37,7 @@ fn with(path: &str, value: Value) -> Value {
 fn masked() -> Value {
     let mut all = settings();
     let mask = json!({"type": "fft-mask", "epoch": 2, "threshold": 1e-6});
-    all["solver"]["callbacks"].as_array_mut().unwrap().push(mask);
+    all["callbacks"].as_array_mut().unwrap().push(mask);
     all
 }
 
@@ -52,7 +51,7 @@ fn events(records: &[Record]) -> Vec<String> {
 
 #[test]
 fn stages_on_the_host_compute_what_the_backend_does() {
-    let model = Model::random(Pipeline::build(&spec(&settings()).unwrap()).unwrap(), 3);
+    let model = Model::random(common::pipeline(&spec(&settings()).unwrap()), 3);
     let (mut exe, _) = Cpu::new().compile(&model.pipeline).unwrap();
     // More than a tile of rows, and not a whole number of tiles.
     let points: Vec<[f32; 3]> = (0..300).map(|i| [0.1, 0.37, 0.73].map(|k| (i as f32 * k).fract())).collect();
@@ -74,9 +73,9 @@ fn stages_on_the_host_compute_what_the_backend_does() {
 fn a_field_that_moves_by_a_known_amount_drifts_by_it() {
     let (scan, spec, cpu) = (scan(), spec(&settings()).unwrap(), Cpu::new());
     let scene = Scene::new(&scan, &spec.scene).unwrap();
-    let model = Model::random(Pipeline::build(&spec).unwrap(), 3);
+    let model = Model::random(common::pipeline(&spec), 3);
     let exe = cpu.compile(&model.pipeline).unwrap().0;
-    let job = Job { seed: 3, ..Job::new(&scan, &spec, &cpu) };
+    let job = Job { seed: 3, ..Job::new(&scan, &cpu) };
     let mut heard = Heard::default();
     let mut run = Run::new(&job, &scene, &mut heard, model, exe);
     run.steps_an_epoch = 4;
@@ -117,11 +116,11 @@ fn drift_is_logged_where_it_is_asked_for_and_changes_nothing() {
     assert_eq!(steps, [[0, 12], [12, 24], [24, 36]]);
     assert!(found.iter().all(|d| d.mean_l1 > 0.0 && d.mean_l1.is_finite()), "{found:?}");
     assert!((found[1].epoch - 3.0).abs() < 1e-12);
-    let (plain, without) = solve(&with("/solver/callbacks", json!([{"type": "rollback"}])), &scan, &none).unwrap();
+    let (plain, without) = solve(&with("/callbacks", json!([{"type": "rollback"}])), &scan, &none).unwrap();
     assert!(drift(&without).is_empty() && !serde_json::to_string(&without[0]).unwrap().contains("drift"));
     assert_eq!(model(solution).arena.params, model(plain).arena.params);
     // A rate too small to change a number leaves nothing to see.
-    let (_, still) = solve(&with("/solver/lr", json!(1e-30)), &scan, &none).unwrap();
+    let (_, still) = solve(&with("/optimizer/lr", json!(1e-30)), &scan, &none).unwrap();
     assert!(drift(&still).iter().all(|d| d.mean_l1 == 0.0) && drift(&still).len() == 3);
 }
 
@@ -138,7 +137,7 @@ fn an_interval_in_which_channels_are_masked_has_no_drift() {
 fn stopped(value: &Value, at: u64) -> Stop {
     let (scan, spec, cpu) = (scan(), spec(value).unwrap(), Cpu::new());
     let mut stop = Stop::at(at);
-    let job = Job { seed: 7, ..Job::new(&scan, &spec, &cpu) };
+    let job = Job { seed: 7, ..Job::new(&scan, &cpu) };
     assert!(spec.solver.build().unwrap().solve(&job, &mut stop).is_err());
     stop
 }
@@ -146,7 +145,7 @@ fn stopped(value: &Value, at: u64) -> Stop {
 fn resumed(value: &Value, resume: &Resume) -> Result<Vec<Record>> {
     let (scan, spec, cpu) = (scan(), spec(value).unwrap(), Cpu::new());
     let mut heard = Heard::default();
-    let job = Job { seed: 7, resume: Some(resume), ..Job::new(&scan, &spec, &cpu) };
+    let job = Job { seed: 7, resume: Some(resume), ..Job::new(&scan, &cpu) };
     spec.solver.build().unwrap().solve(&job, &mut heard)?;
     Ok(heard.0)
 }
@@ -187,7 +186,7 @@ fn a_checkpoint_of_other_callbacks_is_refused() {
         assert!(words.iter().all(|w| e.contains(w)), "{e}");
     };
     refused(
-        &with("/solver/callbacks", json!([{"type": "rollback"}])),
+        &with("/callbacks", json!([{"type": "rollback"}])),
         &kept,
         &["kept: drift", "field-monitor, rollback"],
     );
@@ -211,7 +210,7 @@ fn times_and_sizes_that_are_none_are_refused() {
         (json!({"epochs": 3}), "epochs"),
     ] {
         drift["type"] = json!("drift");
-        let said = match spec(&with("/solver/callbacks", json!([drift]))) {
+        let said = match spec(&with("/callbacks", json!([drift]))) {
             Ok(spec) => spec.solver.build().err().map(|e| e.to_string()),
             Err(e) => Some(e.to_string()),
         };

@@ -20,7 +20,7 @@ fn settings(steps: u64) -> Value {
         "normalizers": [{"type": "layer-norm"}],
         "field": {"type": "mlp", "width": 8, "depth": 3, "skips": [1]},
         "projector": {"type": "ray-march", "samples": 20},
-        "solver": {"type": "gradient", "steps": steps, "rays": 64, "lr": 0.01, "report_every": 5},
+        "type": "neural-field", "training": {"steps": steps, "rays": 64, "report_every": 5}, "optimizer": {"lr": 0.01},
     })
 }
 
@@ -149,7 +149,7 @@ fn events(records: &[Record]) -> Vec<(u64, String)> {
 #[test]
 fn what_never_diverges_keeps_its_bits() {
     let mut off = settings(130);
-    off["solver"]["callbacks"] = json!([]);
+    off["callbacks"] = json!([]);
     let plain = |s: &Value| solve(s, &scan(), &Weights::default()).unwrap();
     let ((a, on), (b, without)) = (plain(&settings(130)), plain(&off));
     assert_eq!(a.rollbacks, 0);
@@ -180,9 +180,9 @@ fn a_loss_that_is_not_finite_goes_back_at_once() {
 #[test]
 fn parameters_and_moments_come_back() {
     let mut long = settings(131);
-    long["solver"]["decay"] = json!("none");
+    long["optimizer"]["decay"] = json!("none");
     let mut short = long.clone();
-    short["solver"]["steps"] = json!(124);
+    short["training"]["steps"] = json!(124);
     let back = run(&long, Fault::Loss(130)).unwrap().0;
     assert_eq!(back.rollbacks, 1);
     assert!(outcome(back) == outcome(run(&short, Fault::None).unwrap().0));
@@ -217,7 +217,7 @@ fn a_run_that_cannot_be_saved_ends_in_words() {
     assert!(e.starts_with("training diverged at step 48: the loss is") && e.contains("gone back 8 times"), "{e}");
     assert!(e.contains("the prior inf") && e.contains("optimizer.lr"), "{e}");
     let mut off = settings(300);
-    off["solver"]["callbacks"] = json!([]);
+    off["callbacks"] = json!([]);
     for fault in [Fault::Forever(40), Fault::Loss(40), Fault::Parameter(299)] {
         let e = run(&off, fault).err().unwrap().to_string();
         assert!(e.starts_with("training diverged at step") && e.contains("optimizer.lr"), "{e}");
@@ -234,7 +234,7 @@ fn a_run_that_went_back_resumes_to_the_same_bits() {
     let mut masked = settings(170);
     masked["encoder"]["levels"] = json!(6);
     let mask = json!({"type": "fft-mask", "keep": [0, 1, 2, 3, 5, 8]});
-    masked["solver"]["callbacks"] = json!([{"type": "rollback"}, mask]);
+    masked["callbacks"] = json!([{"type": "rollback"}, mask]);
     for (value, fault) in [
         (settings(170), Fault::Loss(130)),
         (settings(170), Fault::Uphill(60, 66)),
@@ -245,7 +245,7 @@ fn a_run_that_went_back_resumes_to_the_same_bits() {
         let (solver, backend) = (spec.solver.build().unwrap(), Faulty { fault, device: None });
         let solve = |resume: Option<&Resume>, at| {
             let mut stop = Stop::at(at);
-            let result = solver.solve(&Job { seed: 7, resume, ..Job::new(&scan, &spec, &backend) }, &mut stop);
+            let result = solver.solve(&Job { seed: 7, resume, ..Job::new(&scan, &backend) }, &mut stop);
             let result = result.map(|s| (s.rollbacks, outcome(s))).map_err(|e| e.to_string());
             (result, stop)
         };
@@ -269,8 +269,8 @@ fn a_device_goes_back_too() {
     if let Some((name, device)) = device::backends("rollbacks").into_iter().next() {
         let after = |steps: u64, fault| {
             let mut value = settings(steps);
-            value["solver"]["decay"] = json!("none");
-            value["solver"]["rays"] = json!(8);
+            value["optimizer"]["decay"] = json!("none");
+            value["training"]["rays"] = json!(8);
             value["projector"]["samples"] = json!(4);
             let backend = Faulty { fault, device: Some(&device) };
             let (solution, _) = solve_on(&backend, &value, &scan(), &Weights::default()).unwrap();

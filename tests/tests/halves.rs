@@ -30,7 +30,7 @@ fn settings(tables: Tables) -> Value {
         "normalizers": [{"type": "layer-norm"}],
         "field": {"type": "mlp", "width": 8, "depth": 3, "skips": [1]},
         "projector": {"type": "ray-march", "samples": 20, "sampling": "stratified"},
-        "solver": {"type": "gradient", "steps": 40, "rays": 128, "lr": 0.02, "loss": "l2", "report_every": 5},
+        "type": "neural-field", "loss": "l2", "training": {"steps": 40, "rays": 128, "report_every": 5}, "optimizer": {"lr": 0.02},
     })
 }
 
@@ -49,7 +49,7 @@ fn several(tables: Tables) -> Vec<(&'static str, Value)> {
 }
 
 fn built(settings: &Value) -> Pipeline {
-    Pipeline::build(&spec(settings).unwrap()).unwrap()
+    common::pipeline(&spec(settings).unwrap())
 }
 
 /// A model whose parameters are of order one.
@@ -174,9 +174,9 @@ fn what_goes_on_from_a_checkpoint_or_from_weights_has_the_same_bits() {
         let solver: Box<dyn Solver> = spec.solver.build().unwrap();
         let (whole, _) = solve(&settings(tables), &scan, &Weights::default()).unwrap();
         let mut stop = Stop::at(20);
-        assert!(solver.solve(&Job { seed: 7, ..Job::new(&scan, &spec, &cpu) }, &mut stop).is_err());
+        assert!(solver.solve(&Job { seed: 7, ..Job::new(&scan, &cpu) }, &mut stop).is_err());
         let resume = stop.kept.unwrap();
-        let job = Job { seed: 7, resume: Some(&resume), ..Job::new(&scan, &spec, &cpu) };
+        let job = Job { seed: 7, resume: Some(&resume), ..Job::new(&scan, &cpu) };
         let gone_on = solver.solve(&job, &mut Heard::default()).unwrap();
         let (a, b) = (volume(&whole), volume(&gone_on));
         assert!(a.data.iter().zip(&b.data).all(|(a, b)| a.to_bits() == b.to_bits()), "{tables}");

@@ -10,14 +10,13 @@ use conefield_core::backend::{Backend, Executable, TrainRay, Work};
 use conefield_core::checkpoint::Resume;
 use conefield_core::pipeline::{Model, Pipeline};
 use conefield_core::scene::Scene;
-use conefield_core::solver::Job;
+use conefield_core::method::Job;
 use serde_json::{Value, json};
 
 fn settings() -> Value {
     json!({
         "field": {"type": "voxels-joseph", "resolution": 16},
-        "solver": {"type": "gradient", "steps": 300, "rays": 256, "lr": 0.02, "loss": "l2", "pixels": "all",
-                   "report_every": 25},
+        "type": "neural-field", "loss": "l2", "training": {"steps": 300, "rays": 256, "pixels": "all", "report_every": 25}, "optimizer": {"lr": 0.02},
     })
 }
 
@@ -37,12 +36,12 @@ fn a_phantom_is_reconstructed() {
     assert!(loss(records.len() - 1) < 0.05 * loss(0), "{records:?}");
     // A prior on blocks of points works on such a field, too: in a field without details it leaves fewer of them.
     let mut smooth = settings();
-    smooth["solver"]["tv"] = json!({"weight": 3.0, "blocks": 8, "edge": 4});
+    smooth["tv"] = json!({"weight": 3.0, "blocks": 8, "edge": 4});
     let (other, records) = psnr(&smooth, &Cpu::new());
     assert!(records.iter().all(|r| r.prior.is_some()) && other < found - 3.0, "{other} dB");
 }
 
-fn bits(solution: conefield_core::solver::Solution) -> Vec<u32> {
+fn bits(solution: conefield_core::method::Solution) -> Vec<u32> {
     let arena = model(solution).arena;
     [&arena.params, &arena.first, &arena.second].into_iter().flat_map(|p| p.iter().map(|x| x.to_bits())).collect()
 }
@@ -50,17 +49,17 @@ fn bits(solution: conefield_core::solver::Solution) -> Vec<u32> {
 #[test]
 fn threads_change_no_bit() {
     let mut s = settings();
-    s["solver"]["steps"] = json!(20);
+    s["training"]["steps"] = json!(20);
     // Several ranges of voxels.
     s["field"]["resolution"] = json!(40);
-    s["solver"]["tv"] = json!({"weight": 0.01, "blocks": 4, "edge": 4});
+    s["tv"] = json!({"weight": 0.01, "blocks": 4, "edge": 4});
     let run = |threads: usize, s: &Value| {
         let pool = rayon::ThreadPoolBuilder::new().num_threads(threads).build().unwrap();
         pool.install(|| bits(solve(s, &scan(), &Weights::default()).unwrap().0))
     };
     let one = run(1, &s);
     assert!(one == run(2, &s) && one == run(3, &s));
-    s["solver"]["lr"] = json!(0.020001);
+    s["optimizer"]["lr"] = json!(0.020001);
     assert!(one != run(1, &s));
 }
 
@@ -70,7 +69,7 @@ fn an_interrupted_run_goes_on_to_the_same_bits() {
     let solver = spec.solver.build().unwrap();
     let solve = |resume: Option<&Resume>, at| {
         let mut stop = Stop::at(at);
-        let job = Job { seed: 7, resume, ..Job::new(&scan, &spec, &cpu) };
+        let job = Job { seed: 7, resume, ..Job::new(&scan, &cpu) };
         (solver.solve(&job, &mut stop).map(bits).map_err(|e| e.to_string()), stop)
     };
     let whole = solve(None, u64::MAX).0;
@@ -84,7 +83,7 @@ fn an_interrupted_run_goes_on_to_the_same_bits() {
 fn a_step_s_gradients_are_those_of_its_loss() {
     let (scan, spec) = (scan(), spec(&settings()).unwrap());
     let scene = Scene::new(&scan, &spec.scene).unwrap();
-    let mut model = Model::random(Pipeline::build(&spec).unwrap(), 3);
+    let mut model = Model::random(common::pipeline(&spec), 3);
     model.arena.params.iter_mut().enumerate().for_each(|(i, p)| *p = (i as f32 * 0.37).sin().abs());
     let mut exe = Cpu::new().compile(&model.pipeline).unwrap().0;
     let ray = |i: usize| TrainRay { ray: scene.pixel_ray(&scan.geometry, i % 8, 4 + i % 7, 5 + i % 5), target: 0.2 };
@@ -129,7 +128,7 @@ fn what_such_a_field_has_no_use_for_is_refused() {
 #[test]
 fn a_device_refuses_it_in_words() {
     for (name, backend) in device::backends("a field with line integrals of its own") {
-        let pipeline = Pipeline::build(&spec(&settings()).unwrap()).unwrap();
+        let pipeline = common::pipeline(&spec(&settings()).unwrap());
         let e = backend.compile(&pipeline).err().unwrap().to_string();
         assert!(e.contains("voxels-joseph") && e.contains("--backend cpu"), "{name}: {e}");
     }

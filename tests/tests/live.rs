@@ -7,7 +7,7 @@ use conefield_backend_cpu::Cpu;
 use conefield_core::Result;
 use conefield_core::geometry::VoxelGrid;
 use conefield_core::parts::Part;
-use conefield_core::solver::{Job, Observer, Record};
+use conefield_core::method::{Job, Observer, Record};
 use ndarray::{Array3, s};
 use serde_json::json;
 
@@ -45,14 +45,13 @@ fn slices_are_those_of_the_field_and_change_nothing() {
         "normalizers": [{"type": "layer-norm"}],
         "field": {"type": "mlp", "width": 8, "depth": 3, "skips": [1]},
         "projector": {"type": "ray-march", "samples": 20},
-        "solver": {"type": "gradient", "steps": 40, "rays": 64, "lr": 0.01, "report_every": 5,
-                   "callbacks": [{"type": "rollback"}, {"type": "fft-mask", "epoch": 2, "threshold": 1e-6}]},
+        "type": "neural-field", "callbacks": [{"type": "rollback"}, {"type": "fft-mask", "epoch": 2, "threshold": 1e-6}], "training": {"steps": 40, "rays": 64, "report_every": 5}, "optimizer": {"lr": 0.01},
     });
     let (scan, spec, cpu) = (scan(), spec(&value).unwrap(), Cpu::new());
     let solver = spec.solver.build().unwrap();
     let run = |every: u64| {
         let mut seen = Slices { every, step: 0, last: vec![], times: 0, losses: vec![] };
-        let job = Job { seed: 7, ..Job::new(&scan, &spec, &cpu) };
+        let job = Job { seed: 7, ..Job::new(&scan, &cpu) };
         (solver.solve(&job, &mut seen).unwrap(), seen)
     };
     let ((plain, without), (watched, with)) = (run(u64::MAX), run(1));

@@ -25,18 +25,17 @@ fn settings(steps: u64, patience: Option<u64>) -> Value {
         "normalizers": [{"type": "layer-norm"}],
         "field": {"type": "mlp", "width": 16, "depth": 3, "skips": [1]},
         "projector": {"type": "ray-march", "samples": 20},
-        "solver": {"type": "gradient", "steps": steps, "rays": 64, "lr": 0.01, "decay": "none", "pixels": "all",
-                   "report_every": 20},
+        "type": "neural-field", "training": {"steps": steps, "rays": 64, "pixels": "all", "report_every": 20}, "optimizer": {"lr": 0.01, "decay": "none"},
     });
     if let Some(n) = patience {
-        value["solver"]["callbacks"] = json!([{"type": "rollback"}, {"type": "patience", "records": n}]);
+        value["callbacks"] = json!([{"type": "rollback"}, {"type": "patience", "records": n}]);
     }
     value
 }
 
 fn solve(value: &Value, (train, held): &(Scan, Scan), limits: Limits) -> (Solution, Vec<Record>) {
     let (spec, backend) = (spec(value).unwrap(), Cpu::new());
-    let job = Job { seed: 7, held_out: Some(held), limits, ..Job::new(train, &spec, &backend) };
+    let job = Job { seed: 7, held_out: Some(held), limits, ..Job::new(train, &backend) };
     let mut heard = Stop::at(u64::MAX);
     let solution = spec.solver.build().unwrap().solve(&job, &mut heard).unwrap();
     (solution, heard.heard)
@@ -103,14 +102,14 @@ fn without_patience_nothing_changes() {
 fn a_run_resumes_to_the_same_best() {
     let (train, held) = scans(1.0);
     let mut masked = settings(4000, Some(4));
-    masked["solver"]["callbacks"] =
+    masked["callbacks"] =
         json!([{"type": "patience", "records": 4}, {"type": "fft-mask", "keep": [0, 1, 2, 3, 4]}]);
     for (value, masks) in [(settings(4000, Some(4)), false), (masked, true)] {
         let (spec, backend) = (spec(&value).unwrap(), Cpu::new());
         let solver = spec.solver.build().unwrap();
         let solve = |resume: Option<&Resume>, at| {
             let mut stop = Stop::at(at);
-            let job = Job { seed: 7, held_out: Some(&held), resume, ..Job::new(&train, &spec, &backend) };
+            let job = Job { seed: 7, held_out: Some(&held), resume, ..Job::new(&train, &backend) };
             let result = solver.solve(&job, &mut stop).map(|s| (s.steps, s.best, params(s))).map_err(|e| e.to_string());
             (result, stop)
         };

@@ -27,7 +27,7 @@ fn settings() -> Value {
         "normalizers": [{"type": "layer-norm"}],
         "field": {"type": "mlp", "width": 12, "depth": 3, "skips": [1]},
         "projector": {"type": "ray-march", "samples": 20, "sampling": "uniform"},
-        "solver": {"type": "gradient", "steps": 40, "rays": 128, "lr": 0.02, "loss": "l2", "report_every": 5},
+        "type": "neural-field", "loss": "l2", "training": {"steps": 40, "rays": 128, "report_every": 5}, "optimizer": {"lr": 0.02},
     })
 }
 
@@ -88,7 +88,7 @@ fn sample(pipeline: &Pipeline, grads: &[f64]) -> Vec<Vec<usize>> {
 
 /// Of a step of `count` rays, 50 points and 4 blocks of `edge`³.
 fn gradients_of(settings: &Value, count: usize, edge: usize) {
-    let pipeline = Pipeline::build(&spec(settings).unwrap()).unwrap();
+    let pipeline = common::pipeline(&spec(settings).unwrap());
     let scan = scan();
     let scene = Scene::new(&scan, &conefield_core::scene::SceneSettings::default()).unwrap();
     let mut rays = vec![];
@@ -111,7 +111,7 @@ fn gradients_of(settings: &Value, count: usize, edge: usize) {
         BlockWork { prior: &fine, corners: &corners[..4], spacing },
         BlockWork { prior: &coarse, corners: &corners[4..], spacing: [0.1; 3] },
     ];
-    let params: Vec<f64> = Model::random(Pipeline::build(&spec(settings).unwrap()).unwrap(), 3)
+    let params: Vec<f64> = Model::random(common::pipeline(&spec(settings).unwrap()), 3)
         .arena
         .params
         .iter()
@@ -188,9 +188,9 @@ fn the_number_of_threads_does_not_change_a_bit() {
     s["projector"]["sampling"] = json!("stratified");
     // 25 000 rows a step: every slot has several groups.
     s["projector"]["samples"] = json!(48);
-    s["solver"]["rays"] = json!(512);
-    s["solver"]["steps"] = json!(10);
-    s["solver"]["priors"] = json!([{"type": "total-variation", "weight": 0.01, "blocks": 8, "edge": 4}]);
+    s["training"]["rays"] = json!(512);
+    s["training"]["steps"] = json!(10);
+    s["priors"] = json!([{"type": "total-variation", "weight": 0.01, "blocks": 8, "edge": 4}]);
     let scan = scan();
     let run = |threads: usize, s: &Value| {
         let pool = rayon::ThreadPoolBuilder::new().num_threads(threads).build().unwrap();
@@ -207,7 +207,7 @@ fn the_number_of_threads_does_not_change_a_bit() {
     assert!(one == run(2, &s), "two threads");
     assert!(one == run(3, &s), "three threads");
     // Negative control: bits that a hardly changed run does change.
-    s["solver"]["lr"] = json!(0.020001);
+    s["optimizer"]["lr"] = json!(0.020001);
     assert!(one != run(1, &s));
 }
 
@@ -223,7 +223,7 @@ fn noise_weights_come_from_the_scan() {
     let scan = simulate(&truth(), &protocol.with_noise("tigre:1e3,0".parse().unwrap(), 5)).unwrap();
     let run = |loss: &str| {
         let mut s = settings();
-        s["solver"]["loss"] = json!(loss);
+        s["loss"] = json!(loss);
         let (solution, records) = solve(&s, &scan, &Weights::default()).unwrap();
         (model(solution).arena.params.to_vec(), records.last().unwrap().loss.unwrap())
     };
@@ -257,7 +257,7 @@ fn a_field_comes_back_from_its_weights() {
     let mut s = settings();
     let width = s["encoder"]["levels"].as_u64().unwrap() * s["encoder"]["features"].as_u64().unwrap_or(2);
     let kept: Vec<u64> = (0..width - 1).collect();
-    s["solver"]["callbacks"] = json!([{"type": "fft-mask", "keep": kept}]);
+    s["callbacks"] = json!([{"type": "fft-mask", "keep": kept}]);
     let (solution, _) = solve(&s, &scan(), &Weights::default()).unwrap();
     let field = solution.result.field().unwrap();
     assert_eq!(field.placement().masks.len(), 1);
@@ -354,14 +354,14 @@ fn parts(model: &Model) -> (Vec<u32>, Vec<u32>) {
 #[test]
 fn weights_behind_the_encoder_go_to_another_scan() {
     let mut s = settings();
-    s["solver"]["pretrain_points"] = json!(512);
+    s["pretraining"]["points"] = json!(512);
     let (trained, losses) = pretrained(&s);
     assert!(losses.last().unwrap() < &(0.9 * losses[0]), "{losses:?}");
     let weights = Weights::from_arena(trained.pipeline.layout(), &trained.arena.params, |_| true);
 
     let run = |s: &Value, steps: u64| -> conefield_core::Result<(Solution, Vec<f64>)> {
         let mut s = s.clone();
-        s["solver"]["steps"] = json!(steps);
+        s["training"]["steps"] = json!(steps);
         let (solution, records) = solve(&s, &scan(), &weights)?;
         Ok((solution, records.iter().map(|r| r.loss.unwrap()).collect()))
     };
@@ -400,8 +400,8 @@ fn masked_channels_leave_the_work() {
     s["encoder"]["base_resolution"] = json!(2);
     // Fine levels hardly train in a pass and stay as random as they started.
     let mask = json!({"type": "fft-mask", "epoch": 1, "rule": "relative", "threshold": 0.72});
-    s["solver"]["callbacks"] = json!([{"type": "rollback"}, mask]);
-    let whole = Pipeline::build(&spec(&s).unwrap()).unwrap();
+    s["callbacks"] = json!([{"type": "rollback"}, mask]);
+    let whole = common::pipeline(&spec(&s).unwrap());
     let (solution, records) = solve(&s, &scan(), &Weights::default()).unwrap();
     let model = model(solution);
     let p = &model.pipeline;
@@ -438,7 +438,7 @@ fn channels_finer_than_the_data_leave_the_work() {
     let mut s = settings();
     s["encoder"] = json!({"type": "hash-grid", "levels": 6, "base_resolution": 2, "log2_table_size": 8});
     // A mask that has its own say afterwards.
-    s["solver"]["callbacks"] = json!([{"type": "fft-mask", "keep": [0, 1, 2, 3, 4, 5, 6, 9]}]);
+    s["callbacks"] = json!([{"type": "fft-mask", "keep": [0, 1, 2, 3, 4, 5, 6, 9]}]);
     s["scene"] = json!({"levels": "needed"});
     let (solution, records) = solve(&s, &scan(), &Weights::default()).unwrap();
     assert_eq!(records.iter().flat_map(|r| &r.events).count(), 1);
@@ -460,7 +460,7 @@ fn channels_finer_than_the_data_leave_the_work() {
 
     // A grid that is coarser than the data keeps all.
     s["encoder"]["levels"] = json!(3);
-    s["solver"]["callbacks"] = json!([]);
+    s["callbacks"] = json!([]);
     let (solution, _) = solve(&s, &scan(), &Weights::default()).unwrap();
     assert!(solution.result.field().unwrap().placement().masks.is_empty());
 }

@@ -4,7 +4,7 @@ use conefield_backend_cpu::Cpu;
 use conefield_core::geometry::{Geometry, Millimetres, Radians, View, VoxelGrid};
 use conefield_core::random::{mix, unit};
 use conefield_core::scan::{Scan, Unit};
-use conefield_core::solver::{Job, Silent};
+use conefield_core::method::{Job, Silent};
 use conefield_core::spec::load::parse;
 use conefield_solvers as _;
 use ndarray::Array3;
@@ -54,7 +54,7 @@ fn the_tally_is_what_a_run_takes() {
     ] {
         let spec = parse(&format!("[solver]\n{text}"), "test.toml", &[], &[]).unwrap().spec;
         let solver = spec.solver.build().unwrap();
-        let job = Job::new(&scan, &spec, &backend);
+        let job = Job::new(&scan, &backend);
         // Threads and tables that stay are made in the first run.
         solver.solve(&job, &mut Silent).unwrap();
         let before = ALLOCATOR.current_usage();

@@ -28,7 +28,7 @@ fn settings() -> Value {
         "normalizers": [{"type": "layer-norm"}],
         "field": {"type": "mlp", "width": 8, "depth": 3, "skips": [1]},
         "projector": {"type": "ray-march", "samples": 20, "sampling": "stratified"},
-        "solver": {"type": "gradient", "steps": 40, "rays": 128, "lr": 0.02, "loss": "l2", "report_every": 5},
+        "type": "neural-field", "loss": "l2", "training": {"steps": 40, "rays": 128, "report_every": 5}, "optimizer": {"lr": 0.02},
     })
 }
 
@@ -53,7 +53,7 @@ fn worst(pipeline: &Pipeline, found: &[f32], exact: &[f64]) -> f64 {
 fn steps_agree(settings: &Value) {
     let limit = 2e-5;
     let devices = device::backends("whole steps");
-    let pipeline = Pipeline::build(&spec(settings).unwrap()).unwrap();
+    let pipeline = common::pipeline(&spec(settings).unwrap());
     let scan = scan();
     let scene = Scene::new(&scan, &conefield_core::scene::SceneSettings::default()).unwrap();
     let rays: Vec<TrainRay> = (0..40)
@@ -71,7 +71,7 @@ fn steps_agree(settings: &Value) {
         BlockWork { prior: &coarse, corners: &corners[5..], spacing: [0.1; 3] },
     ];
     let filled = || {
-        let mut model = Model::random(Pipeline::build(&spec(settings).unwrap()).unwrap(), 3);
+        let mut model = Model::random(common::pipeline(&spec(settings).unwrap()), 3);
         for (i, p) in model.arena.params.iter_mut().enumerate() {
             *p += 0.4 * (unit(mix(5, i as u64)) - 0.5);
         }
@@ -160,7 +160,7 @@ fn what_is_asked_of_a_trained_model_is_that_of_the_cpu() {
         .collect();
     let points: Vec<[f32; 3]> = (0..5000).map(place).collect();
     let run = |backend: &dyn Backend| {
-        let mut model = Model::random(Pipeline::build(&spec(&settings()).unwrap()).unwrap(), 3);
+        let mut model = Model::random(common::pipeline(&spec(&settings()).unwrap()), 3);
         let mut exe = backend.compile(&model.pipeline).unwrap().0;
         for step in 1..=10 {
             let work = Work { step, seed: 9, loss: &L2 {}, rays: &rays, points: &[], priors: &[] };
@@ -195,7 +195,7 @@ fn what_is_asked_of_a_trained_model_is_that_of_the_cpu() {
 #[test]
 fn a_run_with_held_out_views_and_a_prior_ends_where_the_cpu_does() {
     let mut s = settings();
-    s["solver"]["priors"] = json!([{"type": "total-variation", "weight": 0.01, "blocks": 4, "edge": 4}]);
+    s["priors"] = json!([{"type": "total-variation", "weight": 0.01, "blocks": 4, "edge": 4}]);
     let (want, records) = psnr(&s, &Cpu::new());
     for (name, backend) in device::backends("a run").into_iter().take(1) {
         let (found, on_device) = psnr(&s, &backend);
@@ -214,7 +214,7 @@ fn masked_channels_leave_the_kernels() {
     s["encoder"]["levels"] = json!(6);
     s["encoder"]["base_resolution"] = json!(2);
     let mask = json!({"type": "fft-mask", "epoch": 1, "rule": "relative", "threshold": 0.72});
-    s["solver"]["callbacks"] = json!([{"type": "rollback"}, mask]);
+    s["callbacks"] = json!([{"type": "rollback"}, mask]);
     let (solution, records) = solve_on(&backend, &s, &scan(), &Weights::default()).unwrap();
     let events: Vec<&String> = records.iter().flat_map(|r| &r.events).collect();
     assert_eq!(events.len(), 1, "{events:?}");
@@ -228,7 +228,7 @@ fn masked_channels_leave_the_kernels() {
 #[test]
 fn pretraining_on_several_volumes_is_that_of_the_cpu() {
     let mut s = settings();
-    s["solver"]["pretrain_points"] = json!(512);
+    s["pretraining"]["points"] = json!(512);
     let spec = spec(&s).unwrap();
     let volumes = [truth(), truth().mapped(|x| 3.0 * x)];
     let run = |backend: &dyn Backend| {
@@ -259,12 +259,12 @@ fn a_run_begun_on_one_backend_goes_on_on_the_other() {
     let pairs: [[&dyn Backend; 2]; 3] = [[&cpu, &device], [&device, &cpu], [&device, &device]];
     for [first, second] in pairs {
         let mut stop = Stop::at(20);
-        let stopped = solver.solve(&Job { seed: 7, ..Job::new(&scan, &spec, first) }, &mut stop);
+        let stopped = solver.solve(&Job { seed: 7, ..Job::new(&scan, first) }, &mut stop);
         assert!(stopped.is_err());
         let resume = stop.kept.unwrap();
         assert_eq!(resume.standing.step, 20);
         let mut heard = Heard::default();
-        let job = Job { seed: 7, resume: Some(&resume), ..Job::new(&scan, &spec, second) };
+        let job = Job { seed: 7, resume: Some(&resume), ..Job::new(&scan, second) };
         solver.solve(&job, &mut heard).unwrap();
         let loss = heard.0.last().unwrap().loss.unwrap();
         assert!((loss - whole).abs() < 0.03 * whole, "{} then {}: {loss}, {whole}", first.name(), second.name());
@@ -312,7 +312,7 @@ impl Field for Changed {
 }
 
 fn changed(change: fn(String) -> Option<String>, scope: Scope) -> Pipeline {
-    let built = Pipeline::build(&spec(&settings()).unwrap()).unwrap();
+    let built = common::pipeline(&spec(&settings()).unwrap());
     let Pipeline { encoder, normalizers, field, projector, .. } = built;
     Pipeline::assemble(encoder, normalizers, Box::new(Changed { inner: field, change, scope }), projector)
 }

@@ -649,8 +649,8 @@ mod tests {
 
     #[test]
     fn the_name_of_a_type_stands_for_its_default_settings() {
-        let alone = read("encoder = 'test-grid'\nsolver = 'test-solver'\n", &[]).unwrap();
-        let table = read("encoder.type = 'test-grid'\nsolver.type = 'test-solver'\n", &[]).unwrap();
+        let alone = read("type = 'test-field'\nencoder = 'test-grid'\n", &[]).unwrap();
+        let table = read("type = 'test-field'\nencoder.type = 'test-grid'\n", &[]).unwrap();
         assert_eq!(alone.tree, table.tree);
         assert_eq!(alone.tree["encoder"]["levels"], 4);
         let e = alone.locate(alone.spec.encoder.as_ref().unwrap().build().err().unwrap()).to_string();
@@ -716,7 +716,7 @@ mod tests {
         assert_eq!(said(&format!("{base}steps = 3\n"), &[]).0, "steps");
         assert_eq!(said(&format!("{base}steps = 3\n"), &["passes=4"]).0, "passes");
         assert_eq!(said(&format!("{base}steps = 3\n"), &["seconds=4"]).0, "seconds");
-        assert_eq!(said("{\"extends\": \"timed\", \"solver\": {\"passes\": null}}", &[]).0, "seconds");
+        assert_eq!(said("{\"extends\": \"timed\", \"passes\": null}", &[]).0, "seconds");
         for set in ["pace.fast=0.5", "pace={fast=0.5}"] {
             assert_eq!(said(base, &[set]).1, "{\"fast\":0.5}", "{set}");
         }

@@ -86,7 +86,7 @@ fn a_run_has_an_end() {
         }
         // What is set is all that ends it: no number of passes comes with the time.
         let spec = spec(&solver(kind, "stop = { seconds = 60.0 }")).unwrap();
-        let stop = serde_json::to_value(&spec).unwrap()["solver"]["stop"].clone();
+        let stop = serde_json::to_value(&spec).unwrap()["stop"].clone();
         assert_eq!(stop, serde_json::json!({ "seconds": 60.0 }), "{kind}");
     }
 }

@@ -5,8 +5,8 @@ use conefield_core::Result;
 use conefield_core::arena::Weights;
 use conefield_core::backend::Backend;
 use conefield_core::checkpoint::{Checkpoint, Resume};
-use conefield_core::method::{Job, Observer, Reconstruction, Record, Solution};
-use conefield_core::pipeline::Model;
+use conefield_core::method::{Context, Job, Observer, Plan, Reconstruction, Record, Solution};
+use conefield_core::pipeline::{Model, Pipeline};
 use conefield_core::scan::{Scan, Volume};
 use conefield_core::spec::{Spec, load};
 use conefield_projectors::simulate::{Protocol, simulate};
@@ -46,6 +46,18 @@ pub fn scan() -> Scan {
 /// The spec that `value` says, read as a file of it would be.
 pub fn spec(value: &Value) -> Result<Spec> {
     Ok(load::parse(&value.to_string(), "test.json", &[], &[])?.spec)
+}
+
+/// The plan of `spec`, which reads `weights` where it names any.
+#[allow(dead_code)]
+pub fn plan(spec: &Spec, backend: &dyn Backend, weights: &Weights) -> Result<Box<dyn Plan>> {
+    spec.method.plan(&Context { backend, weights: &|_| Ok(weights.clone()) })
+}
+
+/// The stages of the field of `spec`.
+#[allow(dead_code)]
+pub fn pipeline(spec: &Spec) -> Pipeline {
+    plan(spec, &Cpu::new(), &Weights::default()).unwrap().pipeline().unwrap().clone()
 }
 
 /// Keeps what a run says.
@@ -113,9 +125,9 @@ pub fn solve_on(
     weights: &Weights,
 ) -> Result<(Solution, Vec<Record>)> {
     let spec = spec(value)?;
-    let job = Job { seed: 7, weights: &|_| Ok(weights.clone()), ..Job::new(scan, &spec, backend) };
+    let job = Job { seed: 7, ..Job::new(scan, backend) };
     let mut heard = Heard::default();
-    let solution = spec.solver.build()?.solve(&job, &mut heard)?;
+    let solution = plan(&spec, backend, weights)?.run(&job, &mut heard)?;
     Ok((solution, heard.0))
 }
 

@@ -192,7 +192,7 @@ fn halves() -> Vec<(String, String, Errors, f64)> {
 fn step(rays: usize, samples: usize, tables: Tables) -> [f64; 2] {
     let mut value = crate::scans::field();
     value["projector"]["samples"] = json!(samples);
-    let pipeline = Pipeline::build(&spec(&value).unwrap()).unwrap();
+    let pipeline = common::pipeline(&spec(&value).unwrap());
     let scan = scan();
     let scene = Scene::new(&scan, &conefield_core::scene::SceneSettings::default()).unwrap();
     let rays: Vec<TrainRay> = (0..rays)
@@ -201,7 +201,7 @@ fn step(rays: usize, samples: usize, tables: Tables) -> [f64; 2] {
             TrainRay { ray, target: 0.05 + 0.2 * unit(mix(4, i as u64)) }
         })
         .collect();
-    let start = Model::random(Pipeline::build(&spec(&value).unwrap()).unwrap(), 3).arena.params;
+    let start = Model::random(common::pipeline(&spec(&value).unwrap()), 3).arena.params;
     let moved = |(i, p): (usize, &f32)| p + 0.4 * (unit(mix(5, i as u64)) - 0.5);
     let params: Vec<f32> = start.iter().enumerate().map(moved).collect();
     let exact: Vec<f64> = params.iter().map(|p| f64::from(*p)).collect();

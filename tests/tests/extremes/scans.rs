@@ -17,7 +17,7 @@ pub fn field() -> Value {
         "normalizers": [{"type": "layer-norm"}],
         "field": {"type": "mlp", "width": 12, "depth": 3, "skips": [1]},
         "projector": {"type": "ray-march", "samples": 20, "sampling": "uniform"},
-        "solver": {"type": "gradient", "steps": 300, "rays": 64, "lr": 0.01},
+        "type": "neural-field", "training": {"steps": 300, "rays": 64}, "optimizer": {"lr": 0.01},
     })
 }
 
@@ -27,13 +27,13 @@ const CLASSICAL: [&str; 7] = ["fdk", "sart", "os-sart", "sirt", "cgls", "asd-poc
 fn method(name: &str) -> Value {
     match name {
         "field" => field(),
-        "fdk" => json!({"solver": {"type": "fdk"}}),
-        "os-sart" => json!({"solver": {"type": "sart", "subsets": 10, "relaxation": 1.0, "stop": {"passes": 5}}}),
+        "fdk" => json!({"type": "fdk"}),
+        "os-sart" => json!({"type": "sart", "subsets": 10, "relaxation": 1.0, "stop": {"passes": 5}}),
         "sirt" => {
-            json!({"solver": {"type": "sart", "subsets": 1, "relaxation": 1.9, "decay": 1.0, "stop": {"passes": 5}}})
+            json!({"type": "sart", "subsets": 1, "relaxation": 1.9, "decay": 1.0, "stop": {"passes": 5}})
         }
-        "fista-tv" => json!({"solver": {"type": "fista", "prior": {"type": "total-variation"}, "stop": {"passes": 5}}}),
-        _ => json!({"solver": {"type": name, "stop": {"passes": 5}}}),
+        "fista-tv" => json!({"type": "fista", "prior": {"type": "total-variation"}, "stop": {"passes": 5}}),
+        _ => json!({"type": name, "stop": {"passes": 5}}),
     }
 }
 

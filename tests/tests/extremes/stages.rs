@@ -46,8 +46,8 @@ pub fn sizes() -> Vec<Case> {
     for width in [1, 2, 512] {
         let set = move |v: &mut Value| {
             v["field"]["width"] = json!(width);
-            v["solver"]["steps"] = json!(if width > 100 { 4 } else { 300 });
-            v["solver"]["lr"] = json!(1e-2);
+            v["training"]["steps"] = json!(if width > 100 { 4 } else { 300 });
+            v["optimizer"]["lr"] = json!(1e-2);
         };
         let case = Case::right(format!("MLP of width {width}"), "finite, or said to be for nothing", move || with(set));
         all.push(case.ends(Ends::Any));
@@ -75,7 +75,7 @@ pub fn large() -> Vec<Case> {
     let set = |v: &mut Value| {
         v["encoder"] =
             json!({"type": "hash-grid", "levels": 1, "features": 1, "base_resolution": 1024, "log2_table_size": 24});
-        v["solver"]["steps"] = json!(5);
+        v["training"]["steps"] = json!(5);
     };
     vec![Case::right("tables of 2^24", "finite, or said to be for nothing", move || with(set)).ends(Ends::Any)]
 }
@@ -85,7 +85,7 @@ pub fn samples() -> Vec<Case> {
     for n in [1, 2, 8192] {
         let set = move |v: &mut Value| {
             v["projector"]["samples"] = json!(n);
-            v["solver"]["steps"] = json!(if n > 1000 { 3 } else { 120 });
+            v["training"]["steps"] = json!(if n > 1000 { 3 } else { 120 });
         };
         let what = if n == 1 { "1 sample a ray".to_owned() } else { format!("{n} samples a ray") };
         all.push(Case::right(what, "finite, or said to be for nothing", move || with(set)).ends(Ends::Any));
@@ -97,8 +97,8 @@ pub fn samples() -> Vec<Case> {
     for step in [1e-12, 1e12] {
         let set = move |v: &mut Value| {
             v["projector"] = json!({"type": "ray-march", "step_mm": step});
-            v["solver"]["steps"] = json!(1);
-            v["solver"]["rays"] = json!(2);
+            v["training"]["steps"] = json!(1);
+            v["training"]["rays"] = json!(2);
         };
         all.push(
             Case::right(format!("a sample every {step:e} mm"), "bounded in number, finite", move || with(set))
@@ -141,7 +141,7 @@ pub fn layer_norm() -> Vec<Case> {
 pub fn masks() -> Vec<Case> {
     let masked = |mask: Value| {
         move |v: &mut Value| {
-            v["solver"]["callbacks"] = json!([{"type": "rollback"}, mask]);
+            v["callbacks"] = json!([{"type": "rollback"}, mask]);
         }
     };
     let all = json!({"type": "fft-mask", "epoch": 0, "threshold": 1e-9, "scope": "channel"});

@@ -14,8 +14,8 @@ use std::time::Instant;
 pub fn rates() -> Vec<Case> {
     let case = |lr: f64, ends: Ends| {
         let set = move |v: &mut Value| {
-            v["solver"]["lr"] = json!(lr);
-            v["solver"]["steps"] = json!(300);
+            v["optimizer"]["lr"] = json!(lr);
+            v["training"]["steps"] = json!(300);
         };
         let expected = match ends {
             Ends::Refused(_) => "refused after 8 rollbacks",
@@ -49,8 +49,7 @@ pub fn long() -> Vec<Case> {
                 "normalizers": [{"type": "layer-norm"}],
                 "field": {"type": "mlp", "width": 4, "depth": 2, "skips": []},
                 "projector": {"type": "ray-march", "samples": 4},
-                "solver": {"type": "gradient", "steps": steps, "rays": 8, "lr": 2e-3, "decay": "none",
-                           "report_every": steps / 10},
+                "type": "neural-field", "training": {"steps": steps, "rays": 8, "report_every": steps / 10}, "optimizer": {"lr": 2e-3, "decay": "none"},
             });
             solve(&value, &scan(), &Weights::default())
         };
@@ -95,7 +94,7 @@ fn tiny(output: &str) -> Value {
 
 /// A million updates, the first of them with gradients of 1, the others with `gradient`; and the seconds that they took.
 fn updates(gradient: f32) -> (Model, f64) {
-    let pipeline = Pipeline::build(&crate::common::spec(&tiny("softplus")).unwrap()).unwrap();
+    let pipeline = common::pipeline(&crate::common::spec(&tiny("softplus")).unwrap());
     let mut model = Model::random(pipeline, 1);
     let (mut exe, _) = Cpu::new().compile(&model.pipeline).unwrap();
     let begun = Instant::now();
@@ -108,7 +107,7 @@ fn updates(gradient: f32) -> (Model, f64) {
 
 /// Seconds of some steps of a field whose last bias is `bias`.
 fn steps(bias: f32) -> f64 {
-    let pipeline = Pipeline::build(&crate::common::spec(&tiny("softplus")).unwrap()).unwrap();
+    let pipeline = common::pipeline(&crate::common::spec(&tiny("softplus")).unwrap());
     let mut model = Model::random(pipeline, 1);
     let last = model.arena.params.len() - 1;
     model.arena.params[last] = bias;
