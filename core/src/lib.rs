@@ -2,7 +2,7 @@
 //!
 //! - [`geometry`], [`scan`], [`parts`]: what was measured, in millimetres, and what comes out.
 //! - [`simd`], [`half`], [`dense`], [`trilinear`], [`stage`]: what a stage computes and how.
-//! - [`by_row`]: stages that are written for one row at a time.
+//! - [`by_row`]: stages that are written for one row at a time; [`prelude`]: what their authors need.
 //! - [`support`]: where the object can be; [`occupancy`]: where a field is known to be empty.
 //! - [`wgsl`]: the same for a GPU.
 //! - [`arena`]: parameters, gradients and optimizer state under their names.
@@ -26,6 +26,7 @@ pub mod occupancy;
 pub mod pages;
 pub mod parts;
 pub mod pipeline;
+pub mod prelude;
 pub mod random;
 pub mod registry;
 pub mod scan;
