@@ -4,8 +4,8 @@
 //! brings. Rules that types cannot say:
 //!
 //! - **Versions.** `abi_major` must be the host's. Within a major version tables of functions only grow at their end. Each
-//!   table says its own `size`: a table that lacks a function of this version is refused, what it has beyond is not read.
-//!   Everything else here keeps its layout.
+//!   table says its own `size`: a table shorter than that of the first minor version is refused, a later function that a
+//!   table does not reach counts as NULL, and what a table has beyond is not read. Everything else here keeps its layout.
 //! - **Memory.** Nothing is handed over: the host frees what it made, the plugin frees what it made (`destroy`). What a
 //!   plugin points to in its tables lives as long as the library, which is never unloaded; what a stage points to lives
 //!   as long as the stage.

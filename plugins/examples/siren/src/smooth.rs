@@ -30,7 +30,7 @@ impl Default for RaySmooth {
 impl NormalizerSpec for RaySmooth {
     fn build(&self, width: usize) -> Result<Box<dyn Normalizer>> {
         let good = (0.0..1.0).contains(&self.strength);
-        ensure(good, "spec", "normalizers.strength", self.strength, "0 to below 1")?;
+        ensure(good, "spec", "strength", self.strength, "0 to below 1")?;
         Ok(Box::new(RaySmoothStage { width, strength: self.strength }))
     }
 }
