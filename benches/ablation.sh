@@ -16,7 +16,7 @@ bin=${CARGO_TARGET_DIR:-target}/release
 mkdir -p "$out"
 none='normalizers=[]'
 norm='normalizers=[{type="layer-norm"}]'
-mask='normalizers=[{type="fft-mask"},{type="layer-norm"}]'
+whole='solver.callbacks=[{type="rollback"}]'
 weights=$out/abdomen.safetensors
 [[ -f $weights ]] || "$bin/conefield" -q pretrain "$data/volumes/abdomen_128.nii.gz" --spec ni-naf --set "$norm" -o "$weights"
 : >"$out/scores.txt"
@@ -28,12 +28,12 @@ for volume in engine_256 head_256 chest_128; do
         shift
         echo "== $volume $name" | tee -a "$out/scores.txt"
         "$bin/conefield" -q reconstruct "$scan" --spec ni-naf -o "$out/$volume-$name" --force --seconds "${seconds}" \
-            --reference truth --set solver.report_every=25 --set solver.lr=5e-3 --set projector.samples=192 "$@" | tee -a "$out/scores.txt"
+            --reference truth --set training.report_every=25 --set optimizer.lr=5e-3 --set projector.samples=192 "$@" | tee -a "$out/scores.txt"
     }
-    run naf --set "$none"
-    run ln --set "$norm"
-    run ln-mci --set "$norm" --init "$weights"
-    run ln-mci-mask --set "$mask" --init "$weights"
+    run naf --set "$none" --set "$whole"
+    run ln --set "$norm" --set "$whole"
+    run ln-mci --set "$norm" --set "$whole" --init "$weights"
+    run ln-mci-mask --set "$norm" --init "$weights"
     "$bin/curves" "$out/$volume.png" "$volume, 50 noisy views" "NAF=$out/$volume-naf" "NAF+LN=$out/$volume-ln" \
         "NAF+LN+MCI=$out/$volume-ln-mci" "NAF+LN+MCI+mask=$out/$volume-ln-mci-mask"
 done

@@ -1,5 +1,5 @@
 #!/usr/bin/env bash
-# How much normalizers and field change under the same features (solver.drift), with and without LayerNorm and MCI:
+# How much normalizers and field change under the same features (the callback drift), with and without LayerNorm and MCI:
 #   bash benches/drift.sh DATA_FOLDER OUT_FOLDER [STEPS [VOLUME]]
 # DATA_FOLDER holds volumes/*.nii.gz. MCI weights come from abdomen alone, for each way with normalizers of its own. Steps
 # (1000) end a run, so that the load of the machine does not matter. The learning rate stays as it is, or its fall would
@@ -24,14 +24,14 @@ small=(--spec ni-naf --set encoder.log2_table_size=17)
 for way in none norm; do
     weights=$out/abdomen-$way.safetensors
     [[ -f $weights ]] || "$bin/conefield" -q pretrain "$data/volumes/abdomen_128.nii.gz" "${small[@]}" --set "${!way}" \
-        --set solver.pretrain_points=16384 -o "$weights" --steps 400
+        --set pretraining.points=16384 -o "$weights" --steps 400
 done
 run() {
     local run=$out/$volume-$1
     shift
     [[ -f $run/record.json ]] || "$bin/conefield" -q reconstruct "$scan" "${small[@]}" -o "$run" --force --steps "$steps" \
-        --reference truth --set solver.report_every=25 --set solver.lr=5e-3 --set 'solver.decay="none"' \
-        --set solver.rays=512 --set projector.samples=96 --set 'solver.drift={every=1}' "$@"
+        --reference truth --set training.report_every=25 --set optimizer.lr=5e-3 --set 'optimizer.decay="none"' \
+        --set training.rays=512 --set projector.samples=96 --set 'callbacks.1={type="drift",every=1}' "$@"
 }
 run naf --set "$none"
 run mci --set "$none" --init "$out/abdomen-none.safetensors"

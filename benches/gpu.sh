@@ -29,12 +29,12 @@ if [[ -n $data ]]; then
     small=()
     budget=300s
     if [[ $software == True ]]; then
-        small=(--set solver.rays=64 --set projector.samples=64)
+        small=(--set training.rays=64 --set projector.samples=64)
         budget=60s
     fi
     for spec in ni-naf balanced; do
         "$bin" -q reconstruct "$out/scan" --spec "$spec" -o "$out/$spec" --force --backend "wgpu:$adapter" --seconds "$budget" \
-            --reference truth --set solver.report_every=25 "${small[@]}"
+            --reference truth --set training.report_every=25 "${small[@]}"
         python3 - "$out/$spec/metrics.jsonl" "$spec" <<'PY'
 import json, sys
 records = [json.loads(line) for line in open(sys.argv[1])]

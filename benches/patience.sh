@@ -13,7 +13,7 @@ volumes=${4:-engine_256 teapot_256 head_256 chest_128 abdomen_128}
 cargo build --release --quiet -p conefield
 bin=${CARGO_TARGET_DIR:-target}/release/conefield
 mkdir -p "$out"
-field=(--spec balanced --set solver.seconds="$seconds" --set solver.steps=1000000)
+field=(--spec balanced --set training.seconds="$seconds" --set training.steps=1000000)
 for volume in $volumes; do
     scan=$out/$volume
     published_scan "$data" "$volume" "$scan"
@@ -23,10 +23,10 @@ for volume in $volumes; do
         "$bin" -q reconstruct "$scan" -o "$out/$volume-$name" --force --reference truth --hold-out every:10 "$@" >/dev/null
     }
     run field-cosine "${field[@]}"
-    run field-constant "${field[@]}" --set 'solver.decay="none"'
-    run field-patience "${field[@]}" --set 'solver.decay="none"' --set solver.patience=5
-    run sart-passes --spec sart --set 'solver.stop={passes=10}'
-    run sart-patience --spec sart --set 'solver.stop={passes=10,patience=2}'
+    run field-constant "${field[@]}" --set 'optimizer.decay="none"'
+    run field-patience "${field[@]}" --set 'optimizer.decay="none"' --set 'callbacks.1={type="patience",records=5}'
+    run sart-passes --spec sart --set 'stop={passes=10}'
+    run sart-patience --spec sart --set 'stop={passes=10,patience=2}'
 done
 python3 - "$out" $volumes <<'PY' | tee "$out/patience.md"
 import json, sys

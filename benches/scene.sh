@@ -2,7 +2,7 @@
 # What modelling only what a scan has need of is worth: a field of six levels (benches/six-levels.toml) with each rule alone
 # and all for SECONDS (60), and with none, as published, for 10/3 as long:
 #   bash benches/scene.sh DATA_FOLDER OUT_FOLDER [SECONDS [VOLUMES [RUNS]]]
-# RUNS ("none support levels channels samples occupancy six-levels all") may name fewer.
+# RUNS ("none support levels channels samples six-levels all") may name fewer.
 # DATA_FOLDER holds volumes/*.nii.gz. OUT_FOLDER/scene.md has a table a volume: what each ends with, and after how many seconds
 # it was where the run with none of the rules ended.
 set -euo pipefail
@@ -12,7 +12,7 @@ data=$1
 out=$2
 seconds=${3:-60}
 volumes=${4:-engine_256 teapot_256 head_256 chest_128 abdomen_128}
-wanted=${5:-none support levels channels samples occupancy six-levels all}
+wanted=${5:-none support levels channels samples six-levels all}
 cargo build --release --quiet -p conefield
 cargo build --release --quiet -p conefield-benches --bin reach
 bin=${CARGO_TARGET_DIR:-target}/release
@@ -27,18 +27,17 @@ for volume in $volumes; do
         shift 4
         [[ " $wanted " == *" $name "* ]] || return 0
         "$bin/conefield" -q reconstruct "$scan" --spec benches/six-levels.toml -o "$out/$volume-$name" --force --reference truth \
-            --set solver.seconds="$time" --set solver.steps=1000000 --set scene.support="$support" \
+            --set training.seconds="$time" --set training.steps=1000000 --set scene.support="$support" \
             --set scene.levels="$levels" "$@" >/dev/null
         runs+=("$name=$out/$volume-$name")
     }
     # As published: as many samples on every ray.
-    count=(--set projector.samples=320 --set solver.rays=1024)
+    count=(--set projector.samples=320 --set training.rays=1024)
     run none "$(python3 -c "print($seconds * 10 / 3)")" box all "${count[@]}"
     run support "$seconds" carve all "${count[@]}"
     run levels "$seconds" box needed "${count[@]}"
-    run channels "$seconds" box all "${count[@]}" --set 'normalizers=[{ type = "fft-mask", rule = "relative", epoch = 2.0 }, { type = "layer-norm" }]'
+    run channels "$seconds" box all "${count[@]}" --set 'solver.callbacks=[{ type = "rollback" }, { type = "fft-mask", rule = "relative", epoch = 2.0 }]'
     run samples "$seconds" box all
-    run occupancy "$seconds" carve all --set 'scene.occupancy={ refined = {} }'
     run six-levels "$seconds" carve all
     run all "$seconds" carve needed
     printf '\n`%s`\n\n' "$volume" >>"$out/scene.md"

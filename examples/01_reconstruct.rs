@@ -2,7 +2,7 @@
 //! changed, solve, score.
 
 use conefield_backend_cpu::Cpu;
-use conefield_core::solver::{Job, Limits, Silent};
+use conefield_core::method::{Job, Limits, Silent};
 use conefield_projectors::simulate::{Protocol, phantom, simulate};
 use std::error::Error;
 

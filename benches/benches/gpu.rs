@@ -7,9 +7,9 @@
 
 use conefield_backend_wgpu::{Limits, Wgpu};
 use conefield_benches::{rays, spread};
-use conefield_core::backend::{Adam, Backend, Executable, Loss, Work};
+use conefield_core::backend::{Adam, Backend, Executable, Work};
 use conefield_core::pipeline::{Model, Pipeline};
-use conefield_core::spec::{EncoderSpec, FieldSpec, NormalizerSpec, ProjectorSpec};
+use conefield_core::settings::{EncoderSpec, FieldSpec, NormalizerSpec, ProjectorSpec};
 use conefield_encoders::hash_grid::HashGrid;
 use conefield_fields::mlp::Mlp;
 use conefield_normalizers::layer_norm::LayerNorm;
@@ -17,6 +17,7 @@ use conefield_projectors::ray_march::{RayMarch, Sampling};
 use conefield_projectors::simulate::{Protocol, phantom, simulate};
 use conefield_projectors::voxel::Joseph;
 use conefield_projectors::voxel::layout::Pinhole;
+use conefield_solvers::losses::L1;
 use ndarray::Array3;
 use std::error::Error;
 use std::time::Instant;
@@ -52,7 +53,7 @@ impl Training {
                 self.exe.profile();
             }
             let start = Instant::now();
-            let work = Work { step, seed: 0, loss: Loss::L1, rays: &rays, points: &[], tv: None, occupancy: None };
+            let work = Work { step, seed: 0, loss: &L1 {}, rays: &rays, points: &[], priors: &[] };
             self.exe.step(&mut self.model, &work)?;
             self.exe.update(&mut self.model, &Adam { lr: 1e-3, beta1: 0.9, beta2: 0.999, eps: 1e-8, step })?;
             if step > warm_up {

@@ -5,15 +5,17 @@
 
 use conefield_backend_cpu::Cpu;
 use conefield_benches::{rays, spread};
-use conefield_core::backend::{Adam, Backend, Executable, Loss, TrainRay, Work};
+use conefield_core::backend::{Adam, Backend, Executable, TrainRay, Work};
 use conefield_core::pipeline::{Model, Pipeline};
-use conefield_core::spec::{EncoderSpec, FieldSpec, NormalizerSpec, ProjectorSpec, stage};
+use conefield_core::settings::{EncoderSpec, FieldSpec, NormalizerSpec, ProjectorSpec};
+use conefield_core::spec::stage;
 use conefield_core::stage::Encoder;
 use conefield_encoders::hash_grid::HashGrid;
 use conefield_fields::mlp::Mlp;
 use conefield_normalizers::layer_norm::LayerNorm;
 use conefield_plugins::{Place, Plugins};
 use conefield_projectors::ray_march::{RayMarch, Sampling};
+use conefield_solvers::losses::L1;
 use std::error::Error;
 use std::path::{Path, PathBuf};
 use std::process::Command;
@@ -81,10 +83,7 @@ impl Runner {
     /// Seconds of one step.
     fn step(&mut self, rays: &[TrainRay], step: u64) -> Result<f64, Box<dyn Error>> {
         let start = Instant::now();
-        self.exe.step(
-            &mut self.model,
-            &Work { step, seed: 0, loss: Loss::L1, rays, points: &[], tv: None, occupancy: None },
-        )?;
+        self.exe.step(&mut self.model, &Work { step, seed: 0, loss: &L1 {}, rays, points: &[], priors: &[] })?;
         self.exe.update(&mut self.model, &Adam { lr: 1e-3, beta1: 0.9, beta2: 0.999, eps: 1e-8, step })?;
         Ok(start.elapsed().as_secs_f64())
     }

@@ -8,13 +8,14 @@
 
 use conefield_backend_cpu::Cpu;
 use conefield_benches::{multiply_adds, random_reads, rays, spread};
-use conefield_core::backend::{Adam, Backend, Loss, Work};
+use conefield_core::backend::{Adam, Backend, Work};
 use conefield_core::pipeline::{Model, Pipeline};
-use conefield_core::spec::{EncoderSpec, FieldSpec, NormalizerSpec, ProjectorSpec};
+use conefield_core::settings::{EncoderSpec, FieldSpec, NormalizerSpec, ProjectorSpec};
 use conefield_encoders::hash_grid::HashGrid;
 use conefield_fields::mlp::Mlp;
 use conefield_normalizers::layer_norm::LayerNorm;
 use conefield_projectors::ray_march::{RayMarch, Sampling};
+use conefield_solvers::losses::L1;
 use std::error::Error;
 use std::time::Instant;
 
@@ -38,7 +39,7 @@ fn main() -> Result<(), Box<dyn Error>> {
     let (mut total, mut dense, mut scatter, mut adam) = (vec![], vec![], vec![], vec![]);
     for step in 1..=STEPS {
         let start = Instant::now();
-        let work = Work { step, seed: 0, loss: Loss::L1, rays: &rays, points: &[], tv: None, occupancy: None };
+        let work = Work { step, seed: 0, loss: &L1 {}, rays: &rays, points: &[], priors: &[] };
         let stats = exe.step(&mut model, &work)?;
         let updating = Instant::now();
         exe.update(&mut model, &Adam { lr: 1e-3, beta1: 0.9, beta2: 0.999, eps: 1e-8, step })?;

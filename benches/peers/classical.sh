@@ -23,6 +23,6 @@ for _ in $(seq "${3:-2}"); do
     "$venv/bin/python" benches/peers/rtk.py "$scan" "$volume"
 done
 for window in ramp hann; do
-    "$bin" -q reconstruct "$scan" --spec fdk --set "solver.window=$window" --set solver.nonnegative=false -o "$out/fdk-$window" \
+    "$bin" -q reconstruct "$scan" --spec fdk --set "window=$window" --set nonnegative=false -o "$out/fdk-$window" \
         --force --reference truth
 done

@@ -1,7 +1,7 @@
 //! Speed of conefield, measured in `benches/`, and what the machine allows at most, measured in the same run.
 
 use conefield_core::backend::TrainRay;
-use conefield_core::dense::{Weights, affine};
+use conefield_core::dense::{WeightMatrix, affine};
 use conefield_core::pages::Pages;
 use conefield_core::random::{mix, unit};
 use conefield_core::simd::{Op, Simd, run};
@@ -37,7 +37,7 @@ pub fn multiply_adds() -> f64 {
         type Out = ();
         #[inline(always)]
         fn call<S: Simd>(self, s: S) {
-            affine(s, Weights { data: self.0, ld: 64, column: 0 }, None, self.1, self.2, 64);
+            affine(s, WeightMatrix { data: self.0, ld: 64, column: 0 }, None, self.1, self.2, 64);
         }
     }
     let rounds = 4000;

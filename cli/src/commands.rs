@@ -23,7 +23,7 @@ mod trial;
 
 use clap::{ArgAction, Args, Subcommand};
 use conefield_core::Result;
-use conefield_core::solver::Limits;
+use conefield_core::method::Limits;
 use serde::{Deserialize, Serialize};
 use std::ffi::OsString;
 use std::path::PathBuf;
@@ -31,22 +31,22 @@ use std::path::PathBuf;
 /// What to do; the help of each is that of its arguments.
 #[derive(Subcommand)]
 pub enum Command {
-    Simulate(simulate::Simulate),
-    Import(import::Import),
-    Reconstruct(reconstruct::Reconstruct),
-    Compare(compare::Compare),
-    Tradeoff(tradeoff::Tradeoff),
-    Pretrain(pretrain::Pretrain),
-    Evaluate(evaluate::Evaluate),
-    Export(export::Export),
-    Features(features::Features),
-    Explain(explain::Explain),
-    Info(info::Info),
-    Convert(convert::Convert),
-    Backends(backends::Backends),
-    Plugins(plugins::Plugins),
+    Simulate(simulate::SimulateArgs),
+    Import(import::ImportArgs),
+    Reconstruct(reconstruct::ReconstructArgs),
+    Compare(compare::CompareArgs),
+    Tradeoff(tradeoff::TradeoffArgs),
+    Pretrain(pretrain::PretrainArgs),
+    Evaluate(evaluate::EvaluateArgs),
+    Export(export::ExportArgs),
+    Features(features::FeaturesArgs),
+    Explain(explain::ExplainArgs),
+    Info(info::InfoArgs),
+    Convert(convert::ConvertArgs),
+    Backends(backends::BackendsArgs),
+    Plugins(plugins::PluginsArgs),
     Schema(schema::SchemaArgs),
-    Demo(demo::Demo),
+    Demo(demo::DemoArgs),
 }
 
 /// Runs a subcommand.
@@ -118,7 +118,7 @@ impl General {
 
 /// When training ends, whichever comes first.
 #[derive(Debug, Clone, Args, Serialize, Deserialize)]
-pub struct Ends {
+pub struct EndOptions {
     /// Stop training after this time, such as 600s or 10m: of training alone, not of what comes before and after.
     #[arg(long, value_name = "TIME", value_parser = crate::parse::seconds)]
     pub seconds: Option<f64>,
@@ -132,7 +132,7 @@ pub struct Ends {
     pub at_most: Option<f64>,
 }
 
-impl Ends {
+impl EndOptions {
     /// As limits of a job.
     pub fn limits(&self) -> Limits {
         Limits { steps: self.steps, seconds: self.seconds, at_most: self.at_most, ..Limits::default() }

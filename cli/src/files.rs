@@ -1,14 +1,16 @@
 //! Between the files of `conefield-io` and what the subcommands work with.
 
+use conefield_backend_cpu::Cpu;
 use conefield_core::arena::Weights;
 use conefield_core::checkpoint::{Checkpoint, Resume};
 use conefield_core::pipeline::Model;
 use conefield_core::scan::{Scan, Volume};
 use conefield_core::trained::TrainedField;
 use conefield_core::{Error, Result};
-use conefield_io::MiddleSlices;
-use conefield_io::survey::{Survey, survey};
+use conefield_diagnosis::{Survey, survey};
+pub use conefield_io::read_weights;
 use conefield_projectors::simulate::{PhantomKind, phantom_of};
+use conefield_report::MiddleSlices;
 use std::collections::BTreeMap;
 use std::path::Path;
 
@@ -62,12 +64,6 @@ pub fn warn_of(path: &Path, survey: &Survey) {
     }
 }
 
-/// Reads weights.
-pub fn read_weights(path: impl AsRef<Path>) -> Result<Weights> {
-    let file = conefield_io::read_weights(path)?;
-    Ok(Weights { tensors: file.tensors, notes: file.metadata })
-}
-
 /// Writes weights with their notes.
 pub fn write_weights(path: impl AsRef<Path>, weights: &Weights) -> Result<()> {
     let tensors: Vec<_> = weights.tensors.iter().map(|(name, (shape, values))| (name, shape, &values[..])).collect();
@@ -96,10 +92,11 @@ pub fn read_field(path: &Path) -> Result<TrainedField> {
         let expected = "weights that a run of \"conefield reconstruct\" left";
         weights.notes.get(key).ok_or_else(|| Error::invalid(&place, key, "no such note", expected))
     };
-    let spec = crate::specs::reread(note("spec")?, &format!("{place}: spec.toml"))?.spec;
+    let loaded = crate::specs::reread(note("spec")?, &format!("{place}: spec.toml"))?;
+    let plan = crate::method::plan_without_files(&loaded, &Cpu::new())?;
     let placement = serde_json::from_str(note(PLACEMENT)?)
         .map_err(|e| Error::invalid(&place, PLACEMENT, e, "what conefield writes there"))?;
-    TrainedField::restore(&spec, &placement, |model| {
+    plan.restore(&placement, &mut |model| {
         weights.load(&place, model.pipeline.layout(), &mut model.arena.params, |_| true).map(drop)
     })
 }
@@ -124,8 +121,8 @@ pub fn read_checkpoint(path: &Path, run: &BTreeMap<String, String>) -> Result<Re
         return Err(Error::invalid(place, "--resume", "no checkpoint", expected));
     }
     let mut file = conefield_io::read_checkpoint(path)?;
-    let standing = file.metadata.remove(STANDING).unwrap_or_default();
-    same_run(&place, &file.metadata, run)?;
+    let standing = file.notes.remove(STANDING).unwrap_or_default();
+    same_run(&place, &file.notes, run)?;
     let standing = serde_json::from_str(&standing)
         .map_err(|e| Error::invalid(&place, STANDING, e, "what conefield writes there"))?;
     Ok(Resume { place, standing, weights: Weights { tensors: file.tensors, ..Weights::default() } })
@@ -149,8 +146,8 @@ pub fn same_run(place: &str, then: &BTreeMap<String, String>, now: &BTreeMap<Str
 /// Draws the middle slices of a result, with those of `reference` and their difference where there is one.
 pub fn picture(path: impl AsRef<Path>, reference: Option<&MiddleSlices>, result: &MiddleSlices) -> Result<()> {
     match reference {
-        Some(r) => conefield_io::slices_png(path, &[("reference", r), ("result", result)], r.window(), Some(0)),
-        None => conefield_io::slices_png(path, &[("result", result)], result.window(), None),
+        Some(r) => conefield_report::slices_png(path, &[("reference", r), ("result", result)], r.window(), Some(0)),
+        None => conefield_report::slices_png(path, &[("result", result)], result.window(), None),
     }
 }
 

@@ -4,6 +4,7 @@ mod backend;
 mod budget;
 mod commands;
 mod files;
+mod live;
 mod memory;
 mod method;
 mod out;

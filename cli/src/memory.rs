@@ -4,8 +4,7 @@
 //! whatever the input is, but for the program itself.
 
 use crate::out::bytes;
-use conefield_core::solver::Solver;
-use conefield_core::trained::FieldVoxels;
+use conefield_core::method::{Needs, Plan};
 use conefield_core::{Error, Result};
 use conefield_io::{SLAB_BYTES, ScanSize};
 use serde::Serialize;
@@ -139,7 +138,7 @@ impl Memory {
     }
 }
 
-/// What a reconstruction works on.
+/// What a run holds beside what its method needs.
 #[derive(Debug, Clone, Copy)]
 pub struct Run {
     /// The scan.
@@ -148,96 +147,78 @@ pub struct Run {
     pub split: bool,
     /// Whether there is a reference.
     pub reference: bool,
-    /// Whether the solver trains a field; another one makes the whole volume.
-    pub field: bool,
-    /// Parameters.
-    pub parameters: u64,
-    /// Bytes that the solver keeps for each of them.
-    pub kept: u64,
-    /// Bytes that the backend works in.
-    pub backend: u64,
-    /// Bytes that the solver works in: what goes with the measured values and what with the voxels.
-    pub solver: [u64; 2],
-    /// Bytes of looking beyond the volume, and of the scan without what was found there.
-    pub surround: [u64; 2],
     /// Whether it goes on from a checkpoint.
     pub resume: bool,
 }
 
-/// What `solver` works in for a scan of this size, by what it goes with.
-pub fn working(solver: &dyn Solver, scan: &ScanSize) -> [u64; 2] {
-    let pixels = solver.working_memory(scan.pixels, 0);
-    [pixels, solver.working_memory(scan.pixels, scan.voxels).saturating_sub(pixels)]
-}
-
 impl Run {
-    /// What it takes.
-    pub fn memory(&self) -> Memory {
+    /// A run on a scan of this size, without reference, held-out views and checkpoint.
+    pub fn on(scan: ScanSize) -> Self {
+        Self { scan, split: false, reference: false, resume: false }
+    }
+
+    /// What it takes to run `plan`.
+    pub fn memory(&self, plan: &dyn Plan) -> Memory {
+        self.with(plan.needs(&self.scan.header()))
+    }
+
+    /// What reading scan and reference takes.
+    pub fn reading(&self) -> Memory {
+        self.with(Needs::default())
+    }
+
+    fn with(&self, needs: Needs) -> Memory {
         let projections = 4 * self.scan.pixels;
         let voxels = 4 * self.scan.voxels;
         let reference = if self.reference { voxels } else { 0 };
-        let volume = if self.reference || !self.field { voxels } else { 0 };
-        let half = 8 * self.parameters;
-        let kept = self.kept * self.parameters;
-        let solver: u64 = self.solver.iter().sum();
-        // A solver of voxels works on the volume that comes out.
-        let iterate = if self.field { 0 } else { voxels };
-        // Parameters and moments from the file, the last good ones too, and one of them again on its way into the model;
-        // or iterates.
-        let checkpoint = match (self.resume, self.field) {
-            (true, true) => 2 * half + kept,
-            (true, false) => solver + iterate,
-            _ => 0,
-        };
+        let iterate = if needs.volume { voxels } else { 0 };
+        let checkpoint = if self.resume { needs.resume } else { 0 };
         let reading = Memory { scan: projections + self.scan.reading, ..Memory::default() };
         // A file's order of voxels is turned into the program's.
         let comparing = Memory { scan: projections, reference: 2 * reference, ..Memory::default() };
         let splitting = Memory { scan: if self.split { 2 * projections } else { 0 }, reference, ..Memory::default() };
-        let surrounding = Memory { scan: projections, reference, buffers: self.surround[0], ..Memory::default() };
+        let surrounding = Memory { scan: projections, reference, buffers: needs.surround, ..Memory::default() };
         let solving = Memory {
-            scan: projections + self.surround[1],
+            scan: projections + needs.subtracted,
             volume: iterate,
             reference,
-            model: half,
-            optimizer: half + kept,
-            buffers: self.backend + solver + checkpoint,
+            model: needs.model,
+            optimizer: needs.optimizer,
+            buffers: needs.backend + needs.working + checkpoint,
             ..Memory::default()
         };
-        let evaluating = if self.field { self.backend + FieldVoxels::BYTES } else { 0 };
-        let buffers = evaluating + SLAB_BYTES + checkpoint;
+        // A result is held whole to be scored.
+        let volume = if self.reference { voxels } else { iterate };
+        let buffers = needs.evaluating + SLAB_BYTES + checkpoint;
         let exporting = Memory { scan: projections, volume, buffers, ..solving };
         Memory::most(&[reading, comparing, splitting, surrounding, solving, exporting])
     }
 
-    /// What would fit into `available` bytes, one thing smaller at a time; `tables` gives the number of parameters with
-    /// tables of so many bits, from the largest that is smaller than now.
-    pub fn smaller(&self, available: u64, tables: impl Iterator<Item = (u32, u64)>) -> Vec<String> {
-        let fits = |run: &Run| run.memory().total <= available;
+    /// What would fit into `available` bytes, one thing smaller at a time; `tables` gives plans with tables of so many bits,
+    /// from the largest that is smaller than now.
+    pub fn smaller(
+        &self,
+        plan: &dyn Plan,
+        available: u64,
+        tables: impl Iterator<Item = (u32, Box<dyn Plan>)>,
+    ) -> Vec<String> {
+        let fits = |run: &Run, plan: &dyn Plan| run.memory(plan).total <= available;
         let mut found = vec![];
         let reference = Run { reference: false, ..*self };
-        if self.reference && fits(&reference) {
+        if self.reference && fits(&reference, plan) {
             found.push("a run without --reference".to_owned());
         }
-        let halved = |n: u64, k: u32| Run {
-            scan: ScanSize { voxels: n >> (3 * k), ..self.scan },
-            solver: [self.solver[0], self.solver[1] >> (3 * k)],
-            ..*self
-        };
+        let halved = |k: u32| Run { scan: ScanSize { voxels: self.scan.voxels >> (3 * k), ..self.scan }, ..*self };
         let side = |n: u64| (n as f64).cbrt().round() as u64;
-        if let Some(run) = (1..8).map(|k| halved(self.scan.voxels, k)).find(fits) {
+        if let Some(run) = (1..8).map(halved).find(|run| fits(run, plan)) {
             found.push(format!("a volume of {}³ voxels", side(run.scan.voxels)));
         }
-        let mut tables = tables.map(|(bits, parameters)| (bits, Run { parameters, ..*self }));
-        if let Some((bits, _)) = tables.find(|(_, run)| fits(run)) {
+        let mut tables = tables;
+        if let Some((bits, _)) = tables.find(|(_, plan)| fits(self, plan.as_ref())) {
             found.push(format!("tables of 2^{bits}"));
         }
-        let binned = |k: u32| Run {
-            scan: ScanSize { pixels: self.scan.pixels >> (2 * k), ..self.scan },
-            solver: [self.solver[0] >> (2 * k), self.solver[1]],
-            surround: [self.surround[0], self.surround[1] >> (2 * k)],
-            ..*self
-        };
-        if let Some(k) = (1..5).find(|k| fits(&binned(*k))) {
+        let binned = |k: u32| Run { scan: ScanSize { pixels: self.scan.pixels >> (2 * k), ..self.scan }, ..*self };
+        if let Some(k) = (1..5).find(|k| fits(&binned(*k), plan)) {
             found.push(format!("a detector of 1/{} of the rows and columns", 1 << k));
         }
         found
@@ -247,42 +228,65 @@ impl Run {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use conefield_core::method::{Findings, Job, Observer, Outline, Solution};
+    use conefield_core::scan::{Scan, ScanHeader};
 
     fn run() -> Run {
-        Run {
-            scan: ScanSize { pixels: 1 << 20, voxels: 512 * 512 * 512, test_pixels: 0, reading: 0 },
-            split: false,
-            reference: true,
-            field: true,
-            parameters: 1 << 22,
-            kept: 12,
+        let scan = ScanSize { pixels: 1 << 20, voxels: 512 * 512 * 512, test_pixels: 0, reading: 0 };
+        Run { reference: true, ..Run::on(scan) }
+    }
+
+    fn needs(parameters: u64) -> Needs {
+        Needs {
+            model: 8 * parameters,
+            optimizer: 20 * parameters,
             backend: 1 << 20,
-            solver: [4 << 20, 0],
-            surround: [0; 2],
-            resume: false,
+            working: 4 << 20,
+            evaluating: 24 << 20,
+            ..Needs::default()
+        }
+    }
+
+    /// Needs the same for every scan.
+    struct Fixed(u64);
+
+    impl Plan for Fixed {
+        fn outline(&self) -> Outline {
+            Outline::default()
+        }
+        fn needs(&self, _: &ScanHeader) -> Needs {
+            needs(self.0)
+        }
+        fn inspect(&self, _: &Scan) -> Result<Findings> {
+            Ok(Findings::default())
+        }
+        fn run(&mut self, _: &Job<'_>, _: &mut dyn Observer) -> Result<Solution> {
+            Err(Error::unsupported("a test", "it runs nothing"))
         }
     }
 
     #[test]
     fn the_moment_that_takes_most_is_told() {
-        let m = run().memory();
+        let m = run().memory(&Fixed(1 << 22));
         assert_eq!((m.reference, m.volume), (512 << 20, 512 << 20));
         assert_eq!((m.model, m.optimizer), (32 << 20, 80 << 20));
         assert_eq!(m.total, m.scan + m.volume + m.reference + m.model + m.optimizer + m.buffers);
-        let alone = Run { reference: false, ..run() }.memory();
+        let alone = Run { reference: false, ..run() }.memory(&Fixed(1 << 22));
         assert_eq!((alone.reference, alone.volume), (0, 0));
         assert!(m.line().contains("reference 512 MiB") && !alone.line().contains("reference"), "{}", m.line());
     }
 
     #[test]
     fn only_what_fits_is_offered() {
-        let tables = || [(18, 1 << 21), (17, 1 << 20)].into_iter();
-        let found = run().smaller(400 << 20, tables());
+        let plan = Fixed(1 << 22);
+        let tables =
+            || [(18, 1 << 21), (17, 1 << 20)].map(|(b, n)| (b, Box::new(Fixed(n)) as Box<dyn Plan>)).into_iter();
+        let found = run().smaller(&plan, 400 << 20, tables());
         assert_eq!(found, ["a run without --reference", "a volume of 256³ voxels"]);
         let alone = Run { reference: false, ..run() };
-        let found = alone.smaller(alone.memory().total - (70 << 20), tables());
+        let found = alone.smaller(&plan, alone.memory(&plan).total - (70 << 20), tables());
         assert_eq!(found, ["tables of 2^17"]);
-        assert!(run().smaller(1 << 20, tables()).is_empty());
+        assert!(run().smaller(&plan, 1 << 20, tables()).is_empty());
     }
 
     #[test]

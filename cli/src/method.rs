@@ -1,121 +1,82 @@
-//! A spec with what it builds.
+//! A spec with its plan and what that takes.
 
-use crate::budget::front::Kind;
+use crate::budget::front::Unknowns;
 use crate::files;
 use crate::memory::{self, Memory};
 use crate::specs;
 use conefield_core::Result;
-use conefield_core::arena::Arena;
-use conefield_core::backend::{Backend, Explain};
-use conefield_core::pipeline::Pipeline;
-use conefield_core::solver::Solver;
-use conefield_core::spec::Scene;
+use conefield_core::backend::Backend;
+use conefield_core::method::{Context, Plan};
 use conefield_core::spec::load::Loaded;
-use conefield_io::ScanSize;
-use conefield_solvers::{iterative, surround};
+use serde_json::Value;
+use std::path::Path;
 
-/// A spec, what it builds and what that takes.
-pub struct Method {
+/// A spec that is built and priced.
+pub struct Planned {
     pub loaded: Loaded,
-    pub parts: Parts,
+    pub plan: Box<dyn Plan>,
     pub memory: Memory,
 }
 
-impl Method {
-    /// What it works on.
-    pub fn kind(&self) -> Kind {
-        if self.parts.pipeline.is_some() { Kind::Field } else { Kind::Voxels }
+impl Planned {
+    /// What it solves for.
+    pub fn unknowns(&self) -> Unknowns {
+        unknowns(self.plan.as_ref())
     }
 }
 
-/// What a spec builds.
-pub struct Parts {
-    pub solver: Box<dyn Solver>,
-    /// Of specs that train a field.
-    pub pipeline: Option<Pipeline>,
-    /// What the backend made of it; empty without a pipeline.
-    pub compiled: Explain,
-    scene: Scene,
-    /// Whether a volume is read to start from.
-    from_volume: bool,
+/// What a method solves for; a chain, what its first method does.
+pub fn unknowns(plan: &dyn Plan) -> Unknowns {
+    if plan.pipeline().is_some() { Unknowns::Field } else { Unknowns::Voxels }
 }
 
-impl Parts {
-    /// Builds a spec for `backend`.
-    pub fn of(loaded: &Loaded, backend: &dyn Backend) -> Result<Self> {
-        let solver = loaded.spec.solver.build().map_err(|e| loaded.locate(e))?;
-        let pipeline = specs::pipeline(loaded, solver.as_ref())?;
-        let compiled = pipeline.as_ref().map(|p| backend.compile(p)).transpose()?.map(|c| c.1).unwrap_or_default();
-        let start = loaded.spec.initializer.as_ref().map(|i| i.volume()).transpose();
-        let from_volume = start.map_err(|e| loaded.locate(e))?.flatten().is_some();
-        Ok(Self { solver, pipeline, compiled, scene: loaded.spec.scene.clone(), from_volume })
-    }
-
-    /// A run of it on a scan of this size, without reference, held-out views and checkpoint.
-    pub fn run(&self, scan: ScanSize) -> memory::Run {
-        let mut solver = memory::working(self.solver.as_ref(), &scan);
-        if self.pipeline.is_none() || self.solver.successor(&self.scene).is_some() {
-            solver[1] += iterative::memory(&self.scene, scan.voxels);
-        }
-        // Solvers of voxels work in that volume. It is there twice while a file's order is turned into the program's.
-        if self.pipeline.is_some() && self.from_volume {
-            solver[1] += 8 * scan.voxels;
-        }
-        memory::Run {
-            scan,
-            split: false,
-            reference: false,
-            field: self.pipeline.is_some(),
-            parameters: self.pipeline.as_ref().map_or(0, |p| p.layout().len() as u64),
-            backend: self.compiled.scratch_bytes as u64,
-            kept: self.solver.memory_per_parameter(),
-            solver,
-            surround: surround::memory(self.scene.surround, scan.pixels),
-            resume: false,
-        }
-    }
-
-    /// Refuses weights to start from that cannot be read or do not fit.
-    pub fn check_weights(&self, loaded: &Loaded) -> Result<()> {
-        if let Some(i) = &loaded.spec.initializer
-            && i.volume().map_err(|e| loaded.locate(e))?.is_none()
-        {
-            let initializer = i.build(&|path| files::read_weights(path)).map_err(|e| loaded.locate(e))?;
-            if let Some(layout) = self.pipeline.as_ref().map(|p| p.layout()) {
-                initializer.apply(layout, &mut Arena::new(layout.len()))?;
-            }
-        }
-        Ok(())
-    }
+/// Builds a spec for `backend`: every stage once. Refusals name the line of the spec.
+pub fn plan(loaded: &Loaded, backend: &dyn Backend) -> Result<Box<dyn Plan>> {
+    let context = Context { backend, weights: &|path| files::read_weights(path) };
+    loaded.spec.method.plan(&context).map_err(|e| loaded.locate(e))
 }
 
-#[cfg(test)]
-mod tests {
-    use super::*;
-    use conefield_backend_cpu::Cpu;
+/// Builds a spec without reading the weights that it names.
+pub fn plan_without_files(loaded: &Loaded, backend: &dyn Backend) -> Result<Box<dyn Plan>> {
+    let context = Context { backend, weights: &|_| Ok(Default::default()) };
+    loaded.spec.method.plan(&context).map_err(|e| loaded.locate(e))
+}
 
-    #[test]
-    fn a_mask_of_voxels_is_reckoned_where_a_solver_of_voxels_has_one() {
-        let scan = ScanSize { pixels: 1 << 16, voxels: 1 << 18, test_pixels: 0, reading: 0 };
-        let takes = |spec: &str, support: &str| {
-            let loaded = specs::read(spec, &[format!("scene.support={support}")]).unwrap();
-            let [_, voxels] = Parts::of(&loaded, &Cpu::new()).unwrap().run(scan).solver;
-            voxels
-        };
-        for (spec, mask) in [("fista-tv", 1 << 18), ("field-tv", 1 << 18), ("fast", 0)] {
-            assert_eq!(takes(spec, "carve"), takes(spec, "box") + mask, "{spec}");
-        }
+/// Reads and builds a spec, and refuses what does not fit into memory. `run` says what else a run holds.
+pub fn planned(spec: &str, sets: &[String], backend: &dyn Backend, run: &memory::Run) -> Result<Planned> {
+    let loaded = specs::read(spec, sets)?;
+    let plan = plan(&loaded, backend)?;
+    let tables = smaller_tables(&loaded);
+    let smaller = tables.iter().filter_map(|(bits, set)| {
+        let loaded = specs::read(spec, &[sets, std::slice::from_ref(set)].concat()).ok()?;
+        Some((*bits, plan_without_files(&loaded, backend).ok()?))
+    });
+    let memory = run.memory(plan.as_ref());
+    memory.check(|available| run.smaller(plan.as_ref(), available, smaller))?;
+    Ok(Planned { loaded, plan, memory })
+}
+
+/// Settings that make the tables of a hash grid smaller, from the largest that is smaller than now.
+fn smaller_tables(loaded: &Loaded) -> Vec<(u32, String)> {
+    let paths = ["encoder", "methods.0.encoder"];
+    let found = paths.into_iter().find_map(|path| {
+        let pointer = format!("/{}/log2_table_size", path.replace('.', "/"));
+        Some((path, loaded.tree.pointer(&pointer)?.as_u64()?))
+    });
+    let Some((path, bits)) = found else { return vec![] };
+    (10..bits as u32).rev().map(|bits| (bits, format!("{path}.log2_table_size={bits}"))).collect()
+}
+
+/// The setting that starts the method `tree` from the file `path`: weights or a volume. Of a chain its first method starts
+/// from it.
+pub fn init(tree: &Value, path: &Path) -> String {
+    if let Some(first) = tree["methods"].get(0) {
+        return format!("methods.0.{}", init(first, path));
     }
-
-    #[test]
-    fn a_volume_that_a_field_learns_first_is_reckoned() {
-        let scan = ScanSize { pixels: 1 << 16, voxels: 1 << 18, test_pixels: 0, reading: 0 };
-        let takes = |sets: &[String]| {
-            let loaded = specs::read("fast", sets).unwrap();
-            let [_, voxels] = Parts::of(&loaded, &Cpu::new()).unwrap().run(scan).solver;
-            voxels
-        };
-        let from = "initializer={ type = \"volume\", path = \"some.nii.gz\" }".to_owned();
-        assert_eq!(takes(&[from]), takes(&[]) + (8 << 18));
+    let file = toml::Value::String(path.display().to_string());
+    match conefield_io::is_volume(path) {
+        false => format!("initializer={{ type = \"mci\", weights = {file} }}"),
+        true if tree.get("initializer").is_some() => format!("initializer={{ type = \"volume\", path = {file} }}"),
+        true => format!("start={file}"),
     }
 }

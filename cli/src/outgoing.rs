@@ -7,13 +7,13 @@ use conefield_core::geometry::VoxelGrid;
 use conefield_core::parts::{Part, Voxels};
 use conefield_core::scan::{Affine, Volume};
 use conefield_core::{Error, Result};
-use conefield_io::MiddleSlices;
+use conefield_report::MiddleSlices;
 use ndarray::{Array3, ArrayViewMut3};
 use std::path::Path;
 use std::time::Instant;
 
 /// What is kept of voxels that were written.
-pub struct Written {
+pub struct WrittenVolume {
     /// The middle slices.
     pub slices: MiddleSlices,
     /// All of them, if that was asked for.
@@ -21,7 +21,7 @@ pub struct Written {
 }
 
 /// Writes `voxels` to `path`, with `affine` if they have none of their own, and keeps all of them with `keep`.
-pub fn write(path: &Path, voxels: &mut dyn Voxels, affine: Option<Affine>, keep: bool) -> Result<Written> {
+pub fn write(path: &Path, voxels: &mut dyn Voxels, affine: Option<Affine>, keep: bool) -> Result<WrittenVolume> {
     let grid = voxels.grid();
     let affine = voxels.affine().or(affine);
     let mut outgoing = Outgoing {
@@ -35,7 +35,7 @@ pub fn write(path: &Path, voxels: &mut dyn Voxels, affine: Option<Affine>, keep:
         done: 0,
     };
     conefield_io::write_voxels(path, &mut outgoing)?;
-    Ok(Written { slices: outgoing.slices, whole: outgoing.whole })
+    Ok(WrittenVolume { slices: outgoing.slices, whole: outgoing.whole })
 }
 
 struct Outgoing<'a> {

@@ -2,7 +2,7 @@
 
 use conefield_core::scan::Volume;
 use conefield_io::I0;
-use conefield_projectors::simulate::{HuMapping, Noise};
+use conefield_projectors::simulate::{DetectorNoise, HuMapping};
 use std::collections::BTreeSet;
 use std::fmt::Display;
 use std::path::PathBuf;
@@ -76,7 +76,7 @@ fn positive(text: &str, what: impl Display) -> Result<f64, String> {
 }
 
 /// `none`, `tigre:I0,SIGMA` or `poisson:I0`.
-pub fn noise(text: &str) -> Result<Noise, String> {
+pub fn noise(text: &str) -> Result<DetectorNoise, String> {
     text.parse().map_err(|e: conefield_core::Error| e.to_string())
 }
 
@@ -129,7 +129,7 @@ pub fn hold_out(text: &str) -> Result<HoldOut, String> {
 
 /// Where the source stands.
 #[derive(Debug, Clone, PartialEq)]
-pub enum Angles {
+pub enum AnglesOption {
     /// Evenly from `start` over `range` degrees, the end left out.
     Even { start: f64, range: f64 },
     /// Degrees, one a line.
@@ -137,13 +137,13 @@ pub enum Angles {
 }
 
 /// `START:RANGE` in degrees or a file.
-pub fn angles(text: &str) -> Result<Angles, String> {
+pub fn angles(text: &str) -> Result<AnglesOption, String> {
     match pair::<f64>(text, ':', "") {
         Ok([start, range]) if start.is_finite() && range.is_finite() && range != 0.0 => {
-            Ok(Angles::Even { start, range })
+            Ok(AnglesOption::Even { start, range })
         }
         Ok(_) => Err("expected START:RANGE in degrees, such as 0:360, with a range other than 0".into()),
-        Err(_) => Ok(Angles::File(text.into())),
+        Err(_) => Ok(AnglesOption::File(text.into())),
     }
 }
 
@@ -227,8 +227,8 @@ mod tests {
         }
         assert_eq!(detector("64x96"), Ok([64, 96]));
         assert!(detector("64").is_err() && detector("0x4").is_err() && detector("4x-1").is_err());
-        assert_eq!(noise("tigre:1e4,10"), Ok(Noise::Tigre { i0: 1e4, sigma: 10.0 }));
-        assert_eq!(noise("poisson:1e5"), Ok(Noise::Poisson { i0: 1e5 }));
+        assert_eq!(noise("tigre:1e4,10"), Ok(DetectorNoise::Tigre { i0: 1e4, sigma: 10.0 }));
+        assert_eq!(noise("poisson:1e5"), Ok(DetectorNoise::Poisson { i0: 1e5 }));
         assert!(noise("poisson:0").is_err() && noise("tigre:1e4").is_err() && noise("salt").is_err());
         assert_eq!((i0("air"), i0("2e4")), (Ok(I0::Air), Ok(I0::Number(2e4))));
         assert!(i0("0").is_err() && i0("water").is_err());
@@ -240,8 +240,8 @@ mod tests {
         assert_eq!(share("1"), Ok(1.0));
         assert!(share("0").is_err() && share("1.01").is_err() && share("nan").is_err());
         assert!(hold_out("every:1").is_err() && hold_out("a").is_err());
-        assert_eq!(angles("0:360"), Ok(Angles::Even { start: 0.0, range: 360.0 }));
-        assert_eq!(angles("a.txt"), Ok(Angles::File("a.txt".into())));
+        assert_eq!(angles("0:360"), Ok(AnglesOption::Even { start: 0.0, range: 360.0 }));
+        assert_eq!(angles("a.txt"), Ok(AnglesOption::File("a.txt".into())));
         assert!(angles("0:0").is_err());
         assert_eq!(values("hu:0.02"), Ok(Values::Hu(HuMapping::Mu { mu_water: 0.02 })));
         assert_eq!(values("clip:-1000,2000"), Ok(Values::Hu(HuMapping::Clip { low: -1000.0, high: 2000.0 })));

@@ -1,10 +1,14 @@
 //! Progress and log, both on standard error.
 
+use crate::live::Live;
 use crate::{files, signals};
 use conefield_core::Result;
 use conefield_core::checkpoint::Checkpoint;
-use conefield_core::solver::{Observer, Record};
+use conefield_core::geometry::VoxelGrid;
+use conefield_core::method::{Observer, Record};
+use conefield_core::parts::Part;
 use indicatif::{MultiProgress, ProgressBar, ProgressDrawTarget, ProgressStyle};
+use ndarray::Array3;
 use std::collections::BTreeMap;
 use std::fs::File;
 use std::io::{self, IsTerminal, Write};
@@ -62,6 +66,7 @@ pub struct Progress {
     records: Vec<Record>,
     log: Option<(PathBuf, File)>,
     keeper: Option<Keeper>,
+    live: Option<Live>,
 }
 
 /// Where checkpoints go, how often, and what they say of the run.
@@ -92,12 +97,19 @@ impl Progress {
             records: vec![],
             log,
             keeper: None,
+            live: None,
         }
     }
 
     /// With checkpoints.
     pub fn keeping(mut self, keeper: Option<Keeper>) -> Self {
         self.keeper = keeper;
+        self
+    }
+
+    /// With live pictures.
+    pub fn showing(mut self, live: Option<Live>) -> Self {
+        self.live = live;
         self
     }
 
@@ -183,6 +195,14 @@ impl Observer for Progress {
         keeper.last = Instant::now();
         debug!("checkpoint after step {}", checkpoint.standing.step);
         Ok(())
+    }
+
+    fn slices_due(&self) -> bool {
+        self.live.as_ref().is_some_and(Live::due)
+    }
+
+    fn slices(&mut self, grid: VoxelGrid, slices: &[(Part, Array3<f32>)]) -> Result<()> {
+        self.live.as_mut().map_or(Ok(()), |live| live.draw(grid, slices))
     }
 }
 

@@ -1,8 +1,8 @@
 //! The specs that come with the program, and the weights that the demonstration uses.
 
 use crate::plugins;
-use conefield_core::pipeline::Pipeline;
-use conefield_core::solver::Solver;
+use conefield_core::method::Plan;
+use conefield_core::registry;
 use conefield_core::spec::load::{Draft, Loaded, Shipped};
 use conefield_core::{Error, Result};
 
@@ -19,17 +19,17 @@ pub const SHIPPED: &[Shipped] = &[
     Shipped { name: "field-tv", text: include_str!("../../specs/field-tv.toml") },
     Shipped { name: "accurate-tv", text: include_str!("../../specs/accurate-tv.toml") },
     Shipped { name: "fdk", text: include_str!("../../specs/fdk.toml") },
-    Shipped { name: "sart", text: include_str!("../../specs/sart.toml") },
     Shipped { name: "os-sart", text: include_str!("../../specs/os-sart.toml") },
     Shipped { name: "sirt", text: include_str!("../../specs/sirt.toml") },
-    Shipped { name: "cgls", text: include_str!("../../specs/cgls.toml") },
-    Shipped { name: "asd-pocs", text: include_str!("../../specs/asd-pocs.toml") },
     Shipped { name: "fista-tv", text: include_str!("../../specs/fista-tv.toml") },
 ];
 
 /// What a help text says of a spec: the names of all that are shipped.
 pub fn help() -> String {
-    let names: Vec<&str> = SHIPPED.iter().map(|s| s.name).collect();
+    let mut names: Vec<&str> = SHIPPED.iter().map(|s| s.name).collect();
+    // Methods that need no setting.
+    names.extend(registry::names(registry::Kind::Method).into_iter().filter(|t| read(t, &[]).is_ok()));
+    names.dedup();
     format!("A shipped spec ({}) or a file", names.join(", "))
 }
 
@@ -55,22 +55,9 @@ pub fn fast_weights() -> Option<&'static [u8]> {
     None
 }
 
-/// Builds the pipeline of `loaded` where its solver trains a field. Refuses stages that the solver would pass over.
-pub fn pipeline(loaded: &Loaded, solver: &dyn Solver) -> Result<Option<Pipeline>> {
-    loaded.spec.scene.surround.validate().map_err(|e| loaded.locate(e))?;
-    let field = solver.trains_field(&loaded.spec).map_err(|e| loaded.locate(e))?;
-    field.then(|| build(loaded)).transpose()
-}
-
-/// Builds the pipeline of `loaded`; refusals name the line of the spec.
-pub fn build(loaded: &Loaded) -> Result<Pipeline> {
-    Pipeline::build(&loaded.spec).map_err(|e: Error| loaded.locate(e))
-}
-
 /// Refuses a setting that looks at views kept aside where `held`, the views that are, has none.
-pub fn check_held_out(loaded: &Loaded, held: &[usize]) -> Result<()> {
-    let solver = loaded.spec.solver.build().map_err(|e| loaded.locate(e))?;
-    match solver.needs_held_out() {
+pub fn check_held_out(loaded: &Loaded, plan: &dyn Plan, held: &[usize]) -> Result<()> {
+    match plan.needs_held_out() {
         Some(setting) if held.is_empty() => {
             let expected = "views to look at, such as --hold-out every:10";
             Err(loaded.locate(Error::invalid("spec", setting, "no views kept aside", expected)))
@@ -82,6 +69,8 @@ pub fn check_held_out(loaded: &Loaded, held: &[usize]) -> Result<()> {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::method;
+    use conefield_backend_cpu::Cpu;
 
     #[test]
     fn every_shipped_spec_builds() {
@@ -89,18 +78,19 @@ mod tests {
             let loaded = read(s.name, &[]).unwrap();
             assert_eq!(loaded.spec.name, s.name);
             assert!(!loaded.spec.description.is_empty());
-            let solver = loaded.spec.solver.build().unwrap();
-            assert_eq!(pipeline(&loaded, solver.as_ref()).unwrap().is_some(), loaded.spec.encoder.is_some());
+            let outline = method::plan(&loaded, &Cpu::new()).unwrap().outline();
+            assert!(!outline.method.kind.is_empty(), "{}", s.name);
         }
     }
 
-    /// A table cannot be extended from under another key, so sequences repeat the settings of the field they begin with.
     #[test]
-    fn sequences_begin_as_their_fields_do() {
-        for (sequence, field) in [("field-tv", "balanced"), ("accurate-tv", "accurate")] {
-            let [whole, alone] = [sequence, field].map(|name| read(name, &[]).unwrap().tree["solver"].clone());
-            assert_eq!(whole["first"], alone, "{sequence}");
+    fn a_method_is_named_by_its_type_alone() {
+        for name in ["sart", "cgls", "asd-pocs", "fista"] {
+            let loaded = read(name, &[]).unwrap();
+            assert_eq!((&loaded.spec.name[..], &loaded.source[..]), (name, &*format!("{name} (shipped)")));
+            method::plan(&loaded, &Cpu::new()).unwrap();
         }
+        assert!(read("neural-field", &[]).err().unwrap().to_string().contains("encoder"));
     }
 
     #[test]

@@ -77,7 +77,7 @@ fn ni_naf_ends_where_the_cpu_ends() {
     let dir = tempfile::tempdir().unwrap();
     let scan = scan(dir.path(), 64, 25);
     let run = |backend: &str| {
-        let settings = ["--steps=500", "--set=solver.rays=64", "--set=projector.samples=48"];
+        let settings = ["--steps=500", "--set=training.rays=64", "--set=projector.samples=48"];
         let tables = ["--set=encoder.log2_table_size=14", "--backend", backend];
         let record = reconstruct(&scan, &dir.path().join(backend), &[&settings[..], &tables].concat());
         assert!(record["backend"]["backend"].as_str().unwrap().starts_with(backend));
@@ -94,7 +94,7 @@ fn ni_naf_ends_where_the_cpu_ends() {
 const TINY: [&str; 5] = [
     "--set=encoder.levels=2",
     "--set=encoder.log2_table_size=10",
-    "--set=solver.rays=48",
+    "--set=training.rays=48",
     "--set=projector.samples=16",
     "--set=field.width=8",
 ];

@@ -21,9 +21,9 @@ fn a_plan_names_every_part_and_the_record_holds_them_against_it() {
     for spec in ["fast", "sirt", "fdk", "field-tv"] {
         let run = dir.path().join(spec);
         let all = ["reconstruct", &scan, "--spec", spec, "-o", &text(&run), "--reference", "truth", "--json"];
-        let small = ["encoder.log2_table_size=10", "solver.rays=64", "projector.samples=16", "solver.tv.blocks=4"];
+        let small = ["encoder.log2_table_size=10", "training.rays=64", "projector.samples=16", "priors.0.blocks=4"];
         // Of a sequence the field's settings stand one deeper.
-        let deeper: Vec<String> = small.iter().map(|s| s.replace("solver.", "solver.first.")).collect();
+        let deeper: Vec<String> = small.iter().map(|s| format!("methods.0.{s}")).collect();
         let small: Vec<&str> = match spec {
             "fast" => small.to_vec(),
             "field-tv" => deeper.iter().map(String::as_str).collect(),
@@ -88,7 +88,7 @@ fn an_interrupted_run_goes_on_with_what_it_chose() {
     fs::write(
         &front,
         "made = \"test\"\n[[scans]]\nname = \"a\"\nviews = 12\ndetector = [16, 16]\nvolume = [16, 16, 16]\n\
-         [[points]]\nname = \"p\"\nkind = \"voxels\"\nspec = \"sirt\"\nsets = [\"solver.relaxation=1.5\"]\nbudget_s = 1.0\n\
+         [[points]]\nname = \"p\"\nkind = \"voxels\"\nspec = \"sirt\"\nsets = [\"relaxation=1.5\"]\nbudget_s = 1.0\n\
          [[points.runs]]\nsteps = 10\ntrain_s = 0.1\ntotal_s = 0.2\npsnr = 20.0\n",
     )
     .unwrap();

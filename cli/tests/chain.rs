@@ -155,15 +155,15 @@ fn a_volume_starts_another_run() {
     };
     run("sirt", "first", &[]);
     let volume = place("first/volume.nii.gz");
-    let record = run("fista-tv", "held", &["--init", &volume, "--set", "solver.pull=1e6"]);
+    let record = run("fista-tv", "held", &["--init", &volume, "--set", "pull=1e6"]);
     assert_eq!(record["init"], volume.as_str());
     let scores = json(&["evaluate", &place("held/volume.nii.gz"), &volume, "--json"]);
     assert!(scores["psnr"].as_f64().unwrap() > 40.0, "{scores}");
     let spec = fs::read_to_string(dir.path().join("held/spec.toml")).unwrap();
     assert!(spec.contains("type = \"volume\""), "{spec}");
-    let alone = ["reconstruct", &scan, "--spec", "fista-tv", "-o", &place("alone"), "--set", "solver.pull=0.1"];
+    let alone = ["reconstruct", &scan, "--spec", "fista-tv", "-o", &place("alone"), "--set", "pull=0.1"];
     let said = common::refused(1, &alone);
-    assert!(said.contains("solver.pull"), "{said}");
+    assert!(said.contains("pull"), "{said}");
 }
 
 #[test]

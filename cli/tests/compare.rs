@@ -133,10 +133,7 @@ fn table_picture_and_records_agree_and_resume_skips_what_is_done() {
         (&["--reference", "truth", "--seed", "3"], "held_out_views"),
         (&["--hold-out", "every:4", "--seed", "3"], "reference"),
         (&["--reference", "truth", "--hold-out", "every:4", "--seed", "3", "--at-most", "9s"], "limits"),
-        (
-            &["--reference", "truth", "--hold-out", "every:4", "--seed", "3", "--set", "solver.nonnegative=false"],
-            "spec",
-        ),
+        (&["--reference", "truth", "--hold-out", "every:4", "--seed", "3", "--set", "nonnegative=false"], "spec"),
     ] {
         let line = arguments(&scan, "fdk", &out, &[more, &["--resume"]].concat());
         let said = refused(1, &words(&line));
@@ -157,7 +154,7 @@ fn a_method_that_fails_leaves_the_others_their_rows() {
     let (dir, scan) = scan();
     let out = dir.path().join("out");
     let (spec, off) = (dir.path().join("wild.toml"), dir.path().join("off.toml"));
-    fs::write(&spec, "extends = \"fast\"\nname = \"wild\"\n[solver]\nlr = 1e30\n").unwrap();
+    fs::write(&spec, "extends = \"fast\"\nname = \"wild\"\n[optimizer]\nlr = 1e30\n").unwrap();
     // Found when it is read by the solver: a volume to start from that is not there.
     fs::write(&off, "extends = \"sirt\"\nname = \"off\"\n[initializer]\ntype = \"volume\"\npath = \"none.nii\"\n")
         .unwrap();
@@ -270,6 +267,6 @@ fn a_cap_on_time_ends_what_a_budget_would_stretch() {
         let line = [&["reconstruct", &scan, "--spec", "sirt", "-o", &out, "--json"], more].concat();
         json(&line)["steps"].as_u64().unwrap()
     };
-    assert_eq!(run("whole", &["--at-most", "1h", "--set", "solver.stop.passes=5"]), 5);
+    assert_eq!(run("whole", &["--at-most", "1h", "--set", "stop.passes=5"]), 5);
     assert!(run("cut", &["--at-most", "1e-9s"]) < 2);
 }

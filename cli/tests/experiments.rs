@@ -30,7 +30,8 @@ fn records(run: &Path) -> Vec<Value> {
 fn drift_stands_in_the_metrics_where_it_is_asked_for() {
     let (_first, plain) = run(&[]);
     assert!(records(&plain).iter().all(|r| r.get("drift").is_none()));
-    let (_second, run) = run(&["--set", "solver.drift={every=2, points=200}", "--set", "solver.report_every=20"]);
+    let (_second, run) =
+        run(&["--set", "callbacks.1={type='drift', every=2, points=200}", "--set", "training.report_every=20"]);
     let all: Vec<Value> = records(&run).iter().filter_map(|r| r["drift"].as_array().cloned()).flatten().collect();
     assert_eq!(all.iter().map(|d| d["step"].as_u64().unwrap()).collect::<Vec<_>>(), [16, 32, 48]);
     assert!(all.iter().all(|d| d["mean_l1"].as_f64().unwrap() > 0.0), "{all:?}");
@@ -43,8 +44,15 @@ fn drift_stands_in_the_metrics_where_it_is_asked_for() {
 #[test]
 fn the_state_of_the_best_record_comes_out_and_is_told() {
     // Every step is looked at, and steps are so long that not each is better than the one before.
-    let more = ["--hold-out", "every:4", "--set", "solver.patience=2", "--set", "solver.report_every=1"];
-    let (_dir, run) = run(&[&more[..], &["--set", "solver.decay=none", "--set", "solver.lr=0.1"]].concat());
+    let more = [
+        "--hold-out",
+        "every:4",
+        "--set",
+        "callbacks.1={type='patience', records=2}",
+        "--set",
+        "training.report_every=1",
+    ];
+    let (_dir, run) = run(&[&more[..], &["--set", "optimizer.decay=none", "--set", "optimizer.lr=0.1"]].concat());
     let (all, record) = (records(&run), fs::read_to_string(run.join("record.json")).unwrap());
     let record: Value = serde_json::from_str(&record).unwrap();
     let error = |r: &Value| r["held_out"].as_f64().unwrap();

@@ -38,11 +38,11 @@ fn sets_and_json() {
 /// A key that excludes another one takes its place in nested stages, too.
 #[test]
 fn the_uppermost_layer_decides_in_stages_of_stages() {
-    let said = done(&["explain", "field-tv", "--set", "solver.first.decay={ exponential = 0.1 }"]);
+    let said = done(&["explain", "field-tv", "--set", "methods.0.optimizer.decay={ exponential = 0.1 }"]);
     assert!(said.contains("field-tv"), "{said}");
     let dir = tempdir().unwrap();
     let path = dir.path().join("mine.toml");
-    std::fs::write(&path, "extends = \"field-tv\"\nname = \"mine\"\n[solver.first]\ndecay = { exponential = 0.1 }\n")
+    std::fs::write(&path, "extends = \"field-tv\"\nname = \"mine\"\n[[methods]]\nextends = \"balanced\"\noptimizer.decay = { exponential = 0.1 }\n[[methods]]\nextends = \"fista-tv\"\n")
         .unwrap();
     done(&["explain", &text(&path)]);
 }
@@ -62,15 +62,12 @@ fn a_scan_adds_its_memory() {
     assert_eq!(m["volume"], 0);
     assert_eq!(e["scan"]["samples_per_ray"], 320);
     // Training that ends by views kept aside keeps the parameters that predicted them best.
-    let e = json(&["explain", "naf", "--scan", &scan, "--set", "solver.patience=3", "--json"]);
+    let e = json(&["explain", "naf", "--scan", &scan, "--set", "callbacks.1={type='patience',records=3}", "--json"]);
     assert_eq!(e["scan"]["memory"]["optimizer"].as_u64().unwrap(), all / 2 + 16 * all / 16);
     let said = e["solver"]["what"].as_str().unwrap();
     assert!(said.contains("ends after 3 records of 50 steps"), "{said}");
     let all = done(&["explain", "naf", "--scan", &scan]);
     assert!(all.contains("this scan: 4 views of 8 x 12, volume 16 x 16 x 16, 320 samples"), "{all}");
-    assert!(!all.contains("occupancy:"), "{all}");
-    let all = done(&["explain", "naf", "--scan", &scan, "--set", "scene.occupancy.refined.every=8"]);
-    assert!(all.contains("occupancy: from step 256 on looked for every 8 steps in 16 x 16 x 16 cells"), "{all}");
 }
 
 #[test]
@@ -118,7 +115,7 @@ fn solvers_on_voxels_are_told_without_a_field() {
     for absent in ["encoder", "parameters", "backend", "projector"] {
         assert!(!all.contains(absent), "{absent:?} is in: {all}");
     }
-    let all = done(&["explain", "os-sart", "--set", "solver.subsets=4"]);
+    let all = done(&["explain", "os-sart", "--set", "subsets=4"]);
     assert_eq!(line(&all, "projector"), "projector joseph bilinear from plane to plane");
     assert!(line(&all, "solver").starts_with("solver os-sart 4 subsets, relaxation 1 times 0.9"), "{all}");
     for spec in ["sart", "sirt", "cgls", "asd-pocs", "fista-tv"] {
@@ -136,14 +133,14 @@ fn what_a_solver_on_voxels_does_with_a_scan_is_told() {
     let scan = text(&dir.path().join("scan"));
     done(&["simulate", "phantom:head:16", "-o", &scan, "--views", "6", "--detector", "8x12"]);
     let with = |spec: &str, set: &str| done(&["explain", spec, "--scan", &scan, "--set", set]);
-    let all = with("fdk", "solver.cutoff=0.5");
+    let all = with("fdk", "cutoff=0.5");
     assert!(line(&all, "solver").contains("hann window to 0.5"), "{all}");
     assert!(all.contains("this scan: 6 views of 8 x 12, volume 16 x 16 x 16\n"), "{all}");
     assert!(all.contains("full turn: every ray counts half"), "{all}");
     assert!(all.contains("memory for this scan: ") && all.contains("volume 16.0 KiB"), "{all}");
     assert!(with("sart", "name=\"x\"").contains("  6 subsets of 1 view\n"));
-    assert!(with("os-sart", "solver.subsets=4").contains("  4 subsets of 1 or 2 views\n"));
-    assert!(with("asd-pocs", "solver.subsets=2").contains("  noise of "));
+    assert!(with("os-sart", "subsets=4").contains("  4 subsets of 1 or 2 views\n"));
+    assert!(with("asd-pocs", "subsets=2").contains("  noise of "));
     let e = json(&["explain", "sart", "--scan", &scan, "--json"]);
     assert_eq!(e["stages"], serde_json::json!([]));
     assert_eq!(e["scan"]["plan"][0], "6 subsets of 1 view");

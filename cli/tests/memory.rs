@@ -49,7 +49,7 @@ fn measured(scan: &Path, run: &Path, spec: &str, sets: &[&str]) -> [u64; 2] {
 fn the_estimate_is_near_the_measured_peak() {
     let dir = tempfile::tempdir().unwrap();
     let large = scan(dir.path(), 60, 768);
-    let pixels = measured(&large, &dir.path().join("a"), "fast", &["solver.pixels=all", "encoder.levels=2"]);
+    let pixels = measured(&large, &dir.path().join("a"), "fast", &["training.pixels=all", "encoder.levels=2"]);
     let dir = tempfile::tempdir().unwrap();
     let small = scan(dir.path(), 4, 32);
     let sets = ["encoder.log2_table_size=21", "encoder.base_resolution=128", "encoder.levels=6"];
@@ -113,13 +113,13 @@ fn the_estimate_is_near_the_peak_of_solvers_on_voxels() {
         println!("  {:.3} of projections and volume, beside {} MiB", more as f64 / held as f64, least / MIB);
         assert!(more as f64 <= 1.1 * held as f64, "{more} bytes more for {held}");
     }
-    let nonnegative = ["solver.nonnegative=true"];
+    let nonnegative = ["nonnegative=true"];
     run("cgls", 60, 512, 64, &nonnegative);
     run("cgls", 16, 128, 224, &[]);
     run("sirt", 30, 320, 144, &[]);
-    run("os-sart", 40, 320, 128, &["solver.stop.change=0.001", "solver.subsets=5"]);
+    run("os-sart", 40, 320, 128, &["stop.change=0.001", "subsets=5"]);
     run("fista-tv", 16, 256, 144, &[]);
-    run("asd-pocs", 16, 256, 160, &["solver.descents=1", "solver.subsets=4"]);
+    run("asd-pocs", 16, 256, 160, &["descents=1", "subsets=4"]);
 }
 
 #[test]

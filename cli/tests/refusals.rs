@@ -60,7 +60,7 @@ fn unknown_keys_and_types_are_told_with_line_and_nearest_name() {
     );
     refused_spec(&format!("{base}convention = \"naff\"\n"), "encoder.convention: found \"naff\", expected \"naf\"");
     refused_spec("extends = \"naf\"\nfeild = 3\n", "mine.toml:2:1: feild: found an unknown key, expected \"field\"");
-    refused_spec("extends = \"naf\"\n[solver]\ntype = \"gradeint\"\n", "expected \"gradient\"");
+    refused_spec("type = \"neural-feild\"\n", "expected \"neural-field\"");
     refused_spec("name = \n", "mine.toml:1:");
 }
 

@@ -8,7 +8,7 @@ use std::process::{Child, Command, Stdio};
 use std::time::{Duration, Instant};
 
 const SETTINGS: [&str; 4] =
-    ["encoder.levels=2", "encoder.log2_table_size=10", "solver.rays=48", "solver.report_every=7"];
+    ["encoder.levels=2", "encoder.log2_table_size=10", "training.rays=48", "training.report_every=7"];
 
 /// A scan of 8 views, made once a test.
 fn scan(dir: &Path) -> PathBuf {
@@ -22,7 +22,7 @@ fn arguments(scan: &Path, run: &Path, steps: u64, more: &[&str]) -> Vec<String> 
         ["reconstruct", &text(scan), "--spec", "ni-naf", "-o", &text(run)].map(Into::into).into();
     // The mask removes channels on the way: what it decided must come back too.
     all.extend(["--steps".into(), steps.to_string(), "--set".into(), "projector.samples=16".into()]);
-    all.extend(["--set".into(), "normalizers.0.epoch=3".into()]);
+    all.extend(["--set".into(), "solver.callbacks.1.epoch=3".into()]);
     for s in SETTINGS {
         all.extend(["--set".into(), s.into()]);
     }
@@ -125,11 +125,15 @@ fn a_signal_ends_the_step_keeps_a_checkpoint_and_says_so() {
 fn interrupted_passes_lose_no_record() {
     let dir = tempfile::tempdir().unwrap();
     let scan = scan(dir.path());
-    let field =
-        ["projector.samples=16", "encoder.log2_table_size=10", "solver.first.rays=48", "solver.first.report_every=7"];
-    let then = ["solver.passes=600", "solver.then.stop={ passes = 600 }"];
+    let field = [
+        "projector.samples=16",
+        "encoder.log2_table_size=10",
+        "methods.0.training.rays=48",
+        "methods.0.training.report_every=7",
+    ];
+    let then = ["methods.1.stop.passes=600", "methods.1.stop={ passes = 600 }"];
     let sequence = [&field[..], &then].concat();
-    for (spec, sets, after) in [("sirt", vec!["solver.stop.passes=900"], 50), ("field-tv", sequence, 40)] {
+    for (spec, sets, after) in [("sirt", vec!["stop.passes=900"], 50), ("field-tv", sequence, 40)] {
         let arguments = |run: &Path, more: &[&str]| -> Vec<String> {
             let mut all = vec!["reconstruct", scan.to_str().unwrap(), "--spec", spec, "-o", run.to_str().unwrap()];
             all.extend(sets.iter().flat_map(|s| ["--set", *s]));
@@ -173,7 +177,7 @@ fn another_run_s_checkpoint_and_none_are_refused_in_words() {
     child.wait().unwrap();
     let said = resume(100_000, &["--seed", "1"]);
     assert!(said.contains("seed") && said.contains("found 1"), "{said}");
-    let said = resume(100_000, &["--set", "solver.lr=0.5"]);
+    let said = resume(100_000, &["--set", "optimizer.lr=0.5"]);
     assert!(said.contains("spec") && said.contains("lr = 0.5"), "{said}");
     let said = resume(9, &[]);
     assert!(said.contains("limits"), "{said}");

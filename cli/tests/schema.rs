@@ -6,11 +6,11 @@ use serde_json::Value;
 
 #[test]
 fn the_file_in_specs_is_current() {
-    let path = concat!(env!("CARGO_MANIFEST_DIR"), "/../specs/schema/pipeline.schema.json");
+    let path = concat!(env!("CARGO_MANIFEST_DIR"), "/../specs/schema/spec.schema.json");
     let file = std::fs::read_to_string(path).unwrap_or_default();
     assert!(
         file == done(&["schema"]),
-        "write it anew: cargo run --release -p conefield -- schema > specs/schema/pipeline.schema.json"
+        "write it anew: cargo run --release -p conefield -- schema > specs/schema/spec.schema.json"
     );
 }
 

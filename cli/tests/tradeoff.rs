@@ -12,15 +12,15 @@ const LEVERS: &str = r#"
 [[base]]
 spec = "fdk"
 [base.levers]
-solver.cutoff = [0.5]
+cutoff = [0.5]
 [[base]]
 spec = "os-sart"
 [base.levers]
-solver.subsets = [2, 4]
+subsets = [2, 4]
 [[base]]
 spec = "tiny.toml"
 "#;
-const TINY: &str = "extends = \"fast\"\nname = \"tiny\"\n[encoder]\nlevels = 3\nlog2_table_size = 10\n[projector]\nsamples = 24\n[solver]\nrays = 64\ntv = { weight = 0.02, blocks = 4 }\n";
+const TINY: &str = "extends = \"fast\"\nname = \"tiny\"\n[encoder]\nlevels = 3\nlog2_table_size = 10\n[projector]\nsamples = 24\n[solver]\nrays = 64\npriors = [{ type = \"total-variation\", weight = 0.02, blocks = 4 }]\n";
 
 /// A small scan and levers in a folder of their own.
 fn made() -> (TempDir, PathBuf, PathBuf) {

@@ -1,8 +1,9 @@
 //! A backend compiles a pipeline and does its work: training steps, evaluation at points, rendering of rays.
 
 use crate::error::Result;
-use crate::occupancy::Occupancy;
+use crate::loss::Loss;
 use crate::pipeline::{Model, Pipeline};
+use crate::prior::Prior;
 use crate::stage::UnitRay;
 use crate::voxel::{VoxelProjector, VoxelView};
 use ndarray::{ArrayView3, ArrayViewMut3};
@@ -17,72 +18,56 @@ pub struct TrainRay {
     pub target: f32,
 }
 
-/// Penalty of the difference between predicted and measured.
-#[derive(Debug, Clone, Copy, PartialEq)]
-pub enum Loss {
-    /// `|d|`
-    L1,
-    /// `d²/2`
-    L2,
-    /// `d²/2` up to `delta`, then `delta·(|d| − delta/2)`.
-    Huber {
-        /// Where it becomes linear.
-        delta: f64,
-    },
+/// The blocks on which a step looks at a prior.
+#[derive(Clone, Copy)]
+pub struct BlockWork<'a> {
+    /// The prior. It says how many points a block has.
+    pub prior: &'a dyn Prior,
+    /// Lowest corner of each block in the unit cube.
+    pub corners: &'a [[f32; 3]],
+    /// Distance of neighbouring points along each axis, in cube sides.
+    pub spacing: [f32; 3],
 }
 
-impl Loss {
-    /// Value and derivative at `d`.
-    pub fn at(&self, d: f64) -> (f64, f64) {
-        match *self {
-            Loss::L1 => (d.abs(), if d == 0.0 { 0.0 } else { d.signum() }),
-            Loss::L2 => (0.5 * d * d, d),
-            Loss::Huber { delta } if d.abs() <= delta => (0.5 * d * d, d),
-            Loss::Huber { delta } => (delta * (d.abs() - 0.5 * delta), delta * d.signum()),
-        }
+impl BlockWork<'_> {
+    /// What the penalty of a block counts by: the prior is a mean over blocks and points.
+    pub fn scale(&self) -> f64 {
+        let blocks = self.prior.blocks();
+        blocks.weight / (self.corners.len() * blocks.points()).max(1) as f64
     }
 }
 
-/// Isotropic total variation of the field over small blocks of neighbouring points.
-#[derive(Debug, Clone, Default, PartialEq)]
-pub struct TvBlocks {
-    /// Lowest corner of each block in the unit cube.
-    pub corners: Vec<[f32; 3]>,
-    /// Distance of neighbouring points along each axis, in cube sides.
-    pub spacing: [f32; 3],
-    /// Points along a block's edge, at least 2.
-    pub edge: usize,
-    /// Weight of the mean over points in the loss.
-    pub weight: f64,
-    /// The variation below which the penalty is quadratic, so that it has a derivative at 0.
-    pub smoothing: f64,
-}
-
 /// What a step learns from. Each part's loss is a mean over its entries; parts add.
-#[derive(Debug, Clone)]
+#[derive(Clone)]
 pub struct Work<'a> {
     /// Which step this is; decides random sample positions together with `seed`.
     pub step: u64,
     /// Seed of the run.
     pub seed: u64,
-    /// Penalty for rays and points.
-    pub loss: Loss,
+    /// The loss of rays and points.
+    pub loss: &'a dyn Loss,
     /// Rays with measured line integrals.
     pub rays: &'a [TrainRay],
     /// Points of the unit cube with known attenuation.
     pub points: &'a [([f32; 3], f32)],
-    /// Blocks for the total-variation prior.
-    pub tv: Option<&'a TvBlocks>,
-    /// Where rays take samples, if not everywhere.
-    pub occupancy: Option<&'a Occupancy>,
+    /// Priors of the field.
+    pub priors: &'a [BlockWork<'a>],
+}
+
+impl Work<'_> {
+    /// An error of the loss or a prior in the calls so far.
+    pub fn fault(&self) -> Result<()> {
+        self.loss.fault()?;
+        self.priors.iter().try_for_each(|p| p.prior.fault())
+    }
 }
 
 /// What a step found.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Serialize)]
 pub struct StepStats {
-    /// Mean penalty of rays and of points.
+    /// Mean loss of rays and of points.
     pub loss: f64,
-    /// Weighted total variation.
+    /// Weighted sum of the priors.
     pub prior: f64,
     /// Samples evaluated.
     pub samples: u64,

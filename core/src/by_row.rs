@@ -225,11 +225,6 @@ impl<T: RowMap> Normalizer for ByRow<T> {
     fn keep_inputs(&self, _: &[usize]) -> Result<Reduced<dyn Normalizer>> {
         Err(Error::unsupported(self.describe(), "this normalizer cannot do without some of its inputs"))
     }
-
-    fn keep_outputs(&self, keep: &[usize]) -> Result<Reduced<dyn Normalizer>> {
-        let (stage, params, channels) = self.without_outputs(keep);
-        Ok(Reduced { stage: Box::new(stage), params, channels })
-    }
 }
 
 impl<T: RowMap> Field for ByRow<T> {

@@ -2,7 +2,7 @@
 
 use crate::arena::{Arena, Layout, Weights};
 use crate::error::{Error, Result};
-use crate::pipeline::{Masked, Model};
+use crate::pipeline::Model;
 use serde::{Deserialize, Serialize};
 
 /// What a run knows beside the arena. Everything random follows from the seed and the step.
@@ -17,8 +17,8 @@ pub struct Standing {
     pub samples: u64,
     /// Seconds of training so far.
     pub seconds: f64,
-    /// What normalizers masked, in order.
-    pub masks: Vec<Masked>,
+    /// The encoder's channels that stayed each time some were removed, in order; see [`Model::masks`].
+    pub masks: Vec<Vec<usize>>,
     /// What the solver keeps for itself, such as sums that are not reported yet.
     pub solver: serde_json::Value,
 }
@@ -70,8 +70,8 @@ impl Resume {
     /// Brings a model that was built from the same spec to where the run stood: masked channels leave it again, and
     /// parameters and moments are replaced. Refuses a checkpoint that does not fit.
     pub fn restore(&self, model: &mut Model) -> Result<()> {
-        for masked in &self.standing.masks {
-            model.mask(masked)?;
+        for keep in &self.standing.masks {
+            model.mask(keep.clone())?;
         }
         let Arena { params, first, second, .. } = &mut model.arena;
         self.load("", model.pipeline.layout(), [params, first, second])

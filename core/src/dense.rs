@@ -8,7 +8,7 @@ use crate::simd::{Real, Simd, SimdBase, SimdFloat, V, load, store};
 
 /// Which part of a weight matrix a product uses.
 #[derive(Clone, Copy)]
-pub struct Weights<'a, R> {
+pub struct WeightMatrix<'a, R> {
     /// `[m][ld]`, row-major.
     pub data: &'a [R],
     /// Columns of the whole matrix.
@@ -30,13 +30,13 @@ pub enum Output {
 
 /// `y = W[:, column..column + k]·x + bias`, or `y += …` without a bias.
 #[inline(always)]
-pub fn affine<S: Simd, R: Real>(s: S, w: Weights<'_, R>, bias: Option<&[R]>, x: &[R], y: &mut [R], n: usize) {
+pub fn affine<S: Simd, R: Real>(s: S, w: WeightMatrix<'_, R>, bias: Option<&[R]>, x: &[R], y: &mut [R], n: usize) {
     let (k, m) = (x.len() / n, y.len() / n);
     let len = V::<S, R>::LEN;
     let mut o = 0;
     while o < m {
         let (high, rows) = (m - o, &w.data[o * w.ld..]);
-        let w = Weights { data: rows, ..w };
+        let w = WeightMatrix { data: rows, ..w };
         let (bias, y) = (bias.map(|b| &b[o..]), &mut y[o * n..]);
         let mut i = 0;
         o += if high >= 8 {
@@ -67,7 +67,7 @@ pub fn affine<S: Simd, R: Real>(s: S, w: Weights<'_, R>, bias: Option<&[R]>, x: 
 #[inline(always)]
 fn affine_block<S: Simd, R: Real, const M: usize, const C: usize, const FULL: bool>(
     s: S,
-    w: Weights<'_, R>,
+    w: WeightMatrix<'_, R>,
     bias: Option<&[R]>,
     x: &[R],
     y: &mut [R],
@@ -123,13 +123,13 @@ fn write<S: Simd, R: Real, const FULL: bool>(v: V<S, R>, y: &mut [R], i: usize, 
 
 /// `dx = W[:, column..column + k]ᵀ·dy`, set, added or multiplied into `dx`.
 #[inline(always)]
-pub fn affine_input<S: Simd, R: Real>(s: S, w: Weights<'_, R>, dy: &[R], dx: &mut [R], out: Output, n: usize) {
+pub fn affine_input<S: Simd, R: Real>(s: S, w: WeightMatrix<'_, R>, dy: &[R], dx: &mut [R], out: Output, n: usize) {
     let (k, m) = (dx.len() / n, dy.len() / n);
     let len = V::<S, R>::LEN;
     let mut c = 0;
     while c < k {
         let broad = k - c;
-        let w = Weights { column: w.column + c, ..w };
+        let w = WeightMatrix { column: w.column + c, ..w };
         let dx = &mut dx[c * n..];
         let mut i = 0;
         c += if broad >= 8 {
@@ -159,7 +159,7 @@ pub fn affine_input<S: Simd, R: Real>(s: S, w: Weights<'_, R>, dy: &[R], dx: &mu
 #[inline(always)]
 fn input_block<S: Simd, R: Real, const K: usize, const C: usize, const FULL: bool>(
     s: S,
-    w: Weights<'_, R>,
+    w: WeightMatrix<'_, R>,
     dy: &[R],
     dx: &mut [R],
     out: Output,
@@ -349,7 +349,7 @@ mod tests {
             let bias: Vec<R> = (0..m).map(|i| R::of(i as f64)).collect();
             let (mut y, mut dx) = (vec![R::ZERO; dy.len()], vec![R::ONE; x.len()]);
             let (mut dw, mut db) = (vec![R::ONE; w.len()], vec![R::ZERO; m]);
-            let weights = Weights { data: w, ld, column };
+            let weights = WeightMatrix { data: w, ld, column };
             affine(s, weights, Some(&bias), x, &mut y, n);
             affine_input(s, weights, dy, &mut dx, Output::Add, n);
             affine_weights(s, dy, x, &mut dw, ld, column, Some(&mut db), n);

@@ -92,6 +92,18 @@ impl Error {
         Self::Invalid { place: place.into(), field: field.into(), found: found.to_string(), expected: expected.into() }
     }
 
+    /// The same error for the owner of the stage that it is about: `key` goes before a field of a spec. A stage does not
+    /// know where it stands.
+    pub fn within(self, key: &str) -> Self {
+        match self {
+            Self::Invalid { place, field, found, expected } if place == "spec" => {
+                let field = if field.is_empty() { key.to_owned() } else { format!("{key}.{field}") };
+                Self::Invalid { place, field, found, expected }
+            }
+            other => other,
+        }
+    }
+
     /// A system error at `path`.
     pub fn io(path: impl AsRef<Path>, source: std::io::Error) -> Self {
         Self::Io { path: path.as_ref().to_path_buf(), source }

@@ -1,38 +1,49 @@
 //! The contracts that conefield's stages, backends and solvers meet at.
 //!
-//! - [`geometry`], [`scan`], [`parts`]: what was measured, in millimetres, and what comes out.
+//! - [`geometry`], [`orbit`], [`scan`], [`parts`]: what was measured, in millimetres, and what comes out.
 //! - [`simd`], [`half`], [`dense`], [`trilinear`], [`stage`]: what a stage computes and how.
 //! - [`by_row`]: stages that are written for one row at a time; [`prelude`]: what their authors need.
-//! - [`support`]: where the object can be; [`occupancy`]: where a field is known to be empty.
+//! - [`support`]: where the object can be; [`scene`]: between the world and what stages see.
+//! - [`loss`], [`prior`]: what training makes small.
 //! - [`wgsl`]: the same for a GPU.
 //! - [`arena`]: parameters, gradients and optimizer state under their names.
 //! - [`files`]: opening what a user or a description names.
-//! - [`spec`], [`registry`]: what a user writes, and the stage types that it may name.
+//! - [`settings`], [`spec`], [`registry`]: what a user writes, and the types that it may name.
 //! - [`host`]: stages on the host, for what looks at a model beside training.
 //! - [`voxel`]: line integrals of voxel volumes.
-//! - [`pipeline`], [`backend`], [`solver`], [`trained`]: from a spec to a volume.
+//! - [`basis`], [`data_term`], [`regularizer`]: what an iterative method is put together from; [`space`]: its arrays and
+//!   what they take.
+//! - [`pipeline`], [`backend`], [`trained`], [`method`]: from a method's stages to a volume.
 
 pub mod arena;
 pub mod backend;
+pub mod basis;
 pub mod by_row;
 pub mod checkpoint;
+pub mod data_term;
 pub mod dense;
 pub mod error;
 pub mod files;
 pub mod geometry;
 pub mod half;
 pub mod host;
-pub mod occupancy;
+pub mod loss;
+pub mod method;
+pub mod orbit;
 pub mod pages;
 pub mod parts;
 pub mod pipeline;
+pub mod precision;
 pub mod prelude;
+pub mod prior;
 pub mod random;
 pub mod registry;
+pub mod regularizer;
 pub mod scan;
 pub mod scene;
+pub mod settings;
 pub mod simd;
-pub mod solver;
+pub mod space;
 pub mod spec;
 pub mod stage;
 pub mod support;

@@ -1,24 +1,28 @@
 //! A pipeline: encoder, normalizers and field, built and checked, with the layout of their parameters.
 
 use crate::arena::{Arena, Block, Layout};
-use crate::backend::{Backend, Executable};
 use crate::error::{Result, ensure};
+use crate::precision::Tables;
 use crate::scene::Scene;
-use crate::spec::{OccupancyRule, Spec, Tables};
-use crate::stage::{Encoder, Field, Info, Lengths, Normalizer, Probe, Projector, Scope, Stage};
-use serde::{Deserialize, Serialize};
+use crate::simd::Real;
+use crate::stage::{
+    Encoder, Field, GradKind, Grads, Info, Kernel, Lengths, Normalizer, Parameter, Projector, Samples, Scope, Stage,
+    Tile, TileMut, UnitRay,
+};
 use std::ops::Range;
+use std::sync::Arc;
 
-/// The built stages of a spec, in order, with the arena's layout.
+/// The built stages of a field, in order, with the arena's layout. A copy shares the stages.
+#[derive(Clone)]
 pub struct Pipeline {
     /// Points to features.
-    pub encoder: Box<dyn Encoder>,
+    pub encoder: Arc<dyn Encoder>,
     /// Features to features.
-    pub normalizers: Vec<Box<dyn Normalizer>>,
+    pub normalizers: Vec<Arc<dyn Normalizer>>,
     /// Features to attenuation.
-    pub field: Box<dyn Field>,
+    pub field: Arc<dyn Field>,
     /// Rays to samples.
-    pub projector: Box<dyn Projector>,
+    pub projector: Arc<dyn Projector>,
     /// How tables of features are read.
     pub tables: Tables,
     layout: Layout,
@@ -31,67 +35,45 @@ pub struct Model {
     pub pipeline: Pipeline,
     /// Their parameters and what training needs beside them.
     pub arena: Arena,
-    masks: Vec<Masked>,
-}
-
-/// Channels that were removed for good.
-#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
-#[serde(deny_unknown_fields)]
-pub struct Masked {
-    /// Which normalizer removed some of its own, counted from 0; none where the scene has no need of some of the encoder's.
-    #[serde(default, skip_serializing_if = "Option::is_none")]
-    pub normalizer: Option<usize>,
-    /// Channels that stayed, of those computed until then; ascending.
-    pub keep: Vec<usize>,
+    masks: Vec<Vec<usize>>,
 }
 
 impl Pipeline {
-    /// Builds every stage of `spec` and refuses combinations that do not fit, before any parameter is allocated.
-    pub fn build(spec: &Spec) -> Result<Self> {
-        let need = |what: &str| crate::Error::invalid("spec", what, "nothing", format!("a table [{what}] with a type"));
-        let encoder = spec.encoder.as_ref().ok_or_else(|| need("encoder"))?.build()?;
+    /// Puts stages together. Refuses those that do not fit, before any parameter is allocated; the error names the key of
+    /// the stage.
+    pub fn new(
+        encoder: Box<dyn Encoder>,
+        normalizers: Vec<Box<dyn Normalizer>>,
+        field: Box<dyn Field>,
+        projector: Box<dyn Projector>,
+    ) -> Result<Self> {
         let mut width = check("encoder", encoder.as_ref(), 3)?;
-        let scope = encoder.info().scope;
         ensure(
-            scope == Scope::Row,
+            encoder.info().scope == Scope::Row,
             "spec",
             "encoder",
             "one whose rows look at each other",
             "an encoder that treats each point alone",
         )?;
-        let mut normalizers = vec![];
-        for (i, n) in spec.normalizers.iter().enumerate() {
-            let n = n.build(width)?;
-            width = check(&format!("normalizers[{i}]"), n.as_ref(), width)?;
-            normalizers.push(n);
+        for (i, n) in normalizers.iter().enumerate() {
+            width = check(&format!("normalizers.{i}"), n.as_ref(), width)?;
         }
-        let field = spec.field.as_ref().ok_or_else(|| need("field"))?.build(width)?;
         let out = check("field", field.as_ref(), width)?;
         ensure(out == 1, "spec", "field", format!("{out} channels out"), "1, the attenuation")?;
-        let projector = spec.projector.as_ref().ok_or_else(|| need("projector"))?.build()?;
-        let mut pipeline = Self::assemble(encoder, normalizers, field, projector);
-        pipeline.tables = spec.precision.tables;
-        let occupancy = &spec.scene.occupancy;
-        occupancy.validate()?;
-        // What such a stage makes of a sample depends on those that would be left out.
-        let apart = *occupancy == OccupancyRule::Fixed || pipeline.scope() == Scope::Row;
-        ensure(apart, "spec", "scene.occupancy", "refined", "\"fixed\", as a stage looks along rays")?;
+        let (tables, layout) = (Tables::default(), Layout::default());
+        let (encoder, field, projector) = (Arc::from(encoder), Arc::from(field), Arc::from(projector));
+        let normalizers = normalizers.into_iter().map(Arc::from).collect();
+        let mut pipeline = Self { encoder, normalizers, field, projector, tables, layout, ranges: vec![] };
+        pipeline.lay_out();
         // Of any scene: whether the encoder knows what the projector counts in.
-        pipeline.projector.fitted(pipeline.lengths(1.0, 1.0))?;
+        pipeline.fitted(pipeline.lengths(1.0, 1.0))?;
         Ok(pipeline)
     }
 
-    /// Puts built stages together; their widths must fit.
-    pub fn assemble(
-        encoder: Box<dyn Encoder>,
-        normalizers: Vec<Box<dyn Normalizer>>,
-        field: Box<dyn Field>,
-        projector: Box<dyn Projector>,
-    ) -> Self {
-        let (tables, layout) = (Tables::default(), Layout::default());
-        let mut p = Self { encoder, normalizers, field, projector, tables, layout, ranges: vec![] };
-        p.lay_out();
-        p
+    /// A field that brings line integrals of its own ([`Field::lines`]): it reads positions.
+    pub fn alone(field: Box<dyn Field>) -> Result<Self> {
+        ensure(field.lines().is_some(), "spec", "field", "none", "line integrals of the field's own")?;
+        Self::new(Box::new(Positions), vec![], field, Box::new(NoSamples))
     }
 
     fn lay_out(&mut self) {
@@ -151,6 +133,11 @@ impl Pipeline {
         self.projector.fault()
     }
 
+    /// Whether `ray` meets anything of the scene.
+    pub fn sees(&self, ray: &UnitRay) -> bool {
+        if self.field.lines().is_some() { ray.inside[1] > ray.inside[0] } else { self.projector.max_samples(ray) > 0 }
+    }
+
     /// Multiply-adds a sample, forward.
     pub fn macs(&self) -> usize {
         self.stages().iter().map(|(_, s)| s.info().macs).sum()
@@ -166,12 +153,18 @@ impl Pipeline {
         (keep.len() < all.len()).then_some(keep)
     }
 
-    /// Takes a scene's lengths for the measure of what counts in them.
-    pub fn fit(&mut self, scene: &Scene) -> Result<()> {
-        if let Some(fitted) = self.projector.fitted(self.lengths(scene.voxel_mm(), scene.side))? {
-            self.projector = fitted;
+    /// Takes a scene's lengths for the measure of what counts in them. Returns whether that changed a stage.
+    pub fn fit(&mut self, scene: &Scene) -> Result<bool> {
+        let fitted = self.fitted(self.lengths(scene.voxel_mm(), scene.side))?;
+        let changed = fitted.is_some();
+        if let Some(projector) = fitted {
+            self.projector = Arc::from(projector);
         }
-        Ok(())
+        Ok(changed)
+    }
+
+    fn fitted(&self, lengths: Lengths) -> Result<Option<Box<dyn Projector>>> {
+        self.projector.fitted(lengths).map_err(|e| e.within("projector"))
     }
 
     /// What settings may count in, of a unit cube with a side of `side` mm.
@@ -180,33 +173,25 @@ impl Pipeline {
         Lengths { voxel_mm, cell_mm: finest.filter(|n| *n > 1.0).map(|n| side / n) }
     }
 
-    /// Removes the channels that normalizer `at` masked: stages before it compute only what is still read, stages
-    /// after it become narrower, and parameters that nothing reads leave the arena.
-    fn apply_mask(&mut self, at: usize, masked: &[usize], arena: &mut Arena) -> Result<()> {
-        let old = self.ranges.clone();
-        let mut kept: Vec<Vec<Range<usize>>> = vec![vec![]; old.len()];
+    /// Leaves of the encoder's channels only `masked`: it no longer computes the others, the stages after it become
+    /// narrower, and parameters that nothing reads leave the arena.
+    fn apply_mask(&mut self, masked: &[usize], arena: &mut Arena) -> Result<()> {
+        let encoder = self.encoder.keep_outputs(masked)?;
+        let mut kept = vec![encoder.params];
         let mut keep = masked.to_vec();
-        for i in at..self.normalizers.len() {
-            let r = self.normalizers[i].keep_inputs(&keep)?;
-            self.normalizers[i] = r.stage;
-            kept[1 + i] = r.params;
+        let mut normalizers = vec![];
+        for n in &self.normalizers {
+            let r = n.keep_inputs(&keep)?;
+            normalizers.push(Arc::from(r.stage));
+            kept.push(r.params);
             keep = r.channels;
         }
-        let r = self.field.keep_inputs(&keep)?;
-        self.field = r.stage;
-        kept[1 + self.normalizers.len()] = r.params;
-        let mut needed = masked.to_vec();
-        for i in (0..at).rev() {
-            let r = self.normalizers[i].keep_outputs(&needed)?;
-            self.normalizers[i] = r.stage;
-            kept[1 + i] = r.params;
-            needed = r.channels;
-        }
-        let r = self.encoder.keep_outputs(&needed)?;
-        self.encoder = r.stage;
-        kept[0] = r.params;
+        let field = self.field.keep_inputs(&keep)?;
+        kept.push(field.params);
+        (self.encoder, self.normalizers, self.field) = (Arc::from(encoder.stage), normalizers, Arc::from(field.stage));
+        let all = kept.iter().zip(&self.ranges);
         let ranges: Vec<_> =
-            kept.iter().zip(&old).flat_map(|(k, o)| k.iter().map(|r| o.start + r.start..o.start + r.end)).collect();
+            all.flat_map(|(k, whole)| k.iter().map(|r| whole.start + r.start..whole.start + r.end)).collect();
         arena.retain(&ranges);
         self.lay_out();
         debug_assert_eq!(arena.params.len(), self.layout.len());
@@ -227,84 +212,85 @@ impl Model {
         Self { pipeline, arena, masks: vec![] }
     }
 
-    /// Lets every normalizer look at the encoder, through `exe`, after `epoch` passes over the views. What was masked
-    /// is gone from pipeline and arena when this returns, and `exe` is compiled again for what is left. Returns what
-    /// normalizers had to say, for the log.
-    pub fn refresh(
-        &mut self,
-        scene: &Scene,
-        epoch: f64,
-        backend: &dyn Backend,
-        exe: &mut Box<dyn Executable>,
-    ) -> Result<Vec<String>> {
-        let mut reports = vec![];
-        for i in 0..self.pipeline.normalizers.len() {
-            let mut look = Look { model: self, scene, epoch, exe: exe.as_mut() };
-            let mask = self.pipeline.normalizers[i].refresh(&mut look)?;
-            if let Some(mask) = mask {
-                exe.fetch(self)?;
-                self.pipeline.apply_mask(i, &mask.keep, &mut self.arena)?;
-                self.masks.push(Masked { normalizer: Some(i), keep: mask.keep });
-                reports.push(mask.report);
-                *exe = backend.compile(&self.pipeline)?.0;
-            }
-        }
-        Ok(reports)
-    }
-
-    /// What normalizers have masked so far, in order.
-    pub fn masks(&self) -> &[Masked] {
+    /// The encoder's channels that stayed each time some were removed: of those that it computed until then, ascending.
+    pub fn masks(&self) -> &[Vec<usize>] {
         &self.masks
     }
 
-    /// Removes channels as was decided before: by the scene, or by a normalizer, which will not decide again.
-    pub fn mask(&mut self, masked: &Masked) -> Result<()> {
-        let Masked { normalizer, keep } = masked;
-        let all = &self.pipeline.normalizers;
-        let stage = normalizer.map(|at| all.get(at));
-        let width = match stage {
-            None => self.pipeline.encoder.info().output,
-            Some(n) => n.map_or(0, |n| n.info().input),
-        };
-        let ascending = keep.windows(2).all(|w| w[0] < w[1]) && keep.last().is_some_and(|&k| k < width);
-        ensure(
-            ascending,
-            "checkpoint",
-            "masks",
-            format!("{} keeps {keep:?}", normalizer.map_or("the scene".into(), |at| format!("normalizer {at}"))),
-            format!("one of {} normalizers and ascending channels of those that it reads", all.len()),
-        )?;
-        if let Some(n) = stage.flatten() {
-            n.decided();
-        }
-        self.pipeline.apply_mask(normalizer.unwrap_or(0), keep, &mut self.arena)?;
-        self.masks.push(masked.clone());
+    /// Removes all of the encoder's channels but `keep` for good.
+    pub fn mask(&mut self, keep: Vec<usize>) -> Result<()> {
+        let width = self.pipeline.encoder.info().output;
+        let ascending = keep.is_sorted_by(|a, b| a < b) && keep.last().is_some_and(|&k| k < width);
+        let expected = format!("some of channels 0 to {}, ascending", width - 1);
+        ensure(ascending, "model", "channels to keep", format!("{keep:?}"), expected)?;
+        self.pipeline.apply_mask(&keep, &mut self.arena)?;
+        self.masks.push(keep);
         Ok(())
     }
 }
 
-struct Look<'a> {
-    model: &'a Model,
-    scene: &'a Scene,
-    epoch: f64,
-    exe: &'a mut dyn Executable,
+/// Stands where a field needs no encoder: positions are its features.
+struct Positions;
+
+impl<R: Real> Kernel<R> for Positions {
+    fn forward(&self, _: &[R], x: Tile<'_, R>, y: TileMut<'_, R>, _: TileMut<'_, R>) {
+        y.data.copy_from_slice(x.data);
+    }
+
+    fn backward(
+        &self,
+        _: &[R],
+        _: Tile<'_, R>,
+        _: TileMut<'_, R>,
+        dy: Tile<'_, R>,
+        _: Grads<'_, R>,
+        dx: Option<TileMut<'_, R>>,
+    ) {
+        if let Some(dx) = dx {
+            dx.data.copy_from_slice(dy.data);
+        }
+    }
 }
 
-impl Probe for Look<'_> {
-    fn encode(&mut self, points: &[[f32; 3]]) -> Result<Vec<f32>> {
-        self.exe.encode(self.model, points)
+impl Stage for Positions {
+    fn info(&self) -> Info {
+        let (scope, grads) = (Scope::Row, GradKind::None);
+        Info { input: 3, output: 3, params: 0, tape: 0, scope, grads, macs: 0, identity: true }
     }
-    fn shape(&self) -> [usize; 3] {
-        self.scene.grid.shape
+
+    fn parameters(&self) -> Vec<Parameter> {
+        vec![]
     }
-    fn voxel(&self, index: [usize; 3]) -> [f32; 3] {
-        self.scene.voxel(index)
+
+    fn init(&self, _: u64, _: &mut [f32]) {}
+
+    fn kernel(&self) -> &dyn Kernel<f32> {
+        self
     }
-    fn epoch(&self) -> f64 {
-        self.epoch
+
+    fn reference(&self) -> Option<&dyn Kernel<f64>> {
+        Some(self)
     }
-    fn coarse_to_fine(&self) -> bool {
-        self.model.pipeline.encoder.coarse_to_fine()
+
+    fn describe(&self) -> String {
+        "none: the field reads positions".into()
+    }
+}
+
+impl Encoder for Positions {}
+
+/// Stands where a field needs no projector.
+struct NoSamples;
+
+impl Projector for NoSamples {
+    fn max_samples(&self, _: &UnitRay) -> usize {
+        0
+    }
+
+    fn sample(&self, _: &UnitRay, _: Option<u64>, _: &mut Samples) {}
+
+    fn describe(&self) -> String {
+        "none: the field brings line integrals of its own".into()
     }
 }
 

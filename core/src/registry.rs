@@ -4,51 +4,127 @@
 //! types of libraries that are loaded at run time come in by [`add`]. Editors' schemas and the lists in error messages
 //! come from here.
 
+use crate::basis::BasisSpec;
+use crate::data_term::DataTermSpec;
 use crate::error::{Error, Result};
-use crate::spec::{EncoderSpec, FieldSpec, InitializerSpec, NormalizerSpec, ProjectorSpec, SolverSpec};
+use crate::regularizer::RegularizerSpec;
+use crate::settings::{
+    EncoderSpec, FieldSpec, InitializerSpec, LineFieldSpec, LossSpec, NormalizerSpec, PriorSpec, ProjectorSpec,
+};
+use crate::voxel::VoxelProjectorSpec;
 use schemars::Schema;
 use serde_json::Value;
 use std::fmt;
 use std::sync::{PoisonError, RwLock};
 
-/// The kinds of stage that a spec puts together.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, serde::Serialize)]
-#[serde(rename_all = "kebab-case")]
-pub enum Kind {
-    /// Points to features.
-    Encoder,
-    /// Features to features.
-    Normalizer,
-    /// Features to attenuation.
-    Field,
-    /// Rays to samples.
-    Projector,
-    /// Where weights come from.
-    Initializer,
-    /// Scan to volume.
-    Solver,
+/// What each kind is called in a spec, its settings, and what it is.
+macro_rules! kinds {
+    (
+        linked { $($(#[$linked_doc:meta])* $linked:ident $linked_name:literal,)* }
+        loadable { $($(#[$doc:meta])* $kind:ident $name:literal $spec:ident,)* }
+    ) => {
+        /// What a spec names: a method, and the kinds of stage that methods put together.
+        #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, serde::Serialize)]
+        #[serde(rename_all = "kebab-case")]
+        pub enum Kind {
+            $($(#[$linked_doc])* $linked,)*
+            $($(#[$doc])* $kind,)*
+        }
+
+        impl Kind {
+            /// Every kind: methods, then their stages in order.
+            pub const ALL: &'static [Self] = &[$(Self::$linked,)* $(Self::$kind,)*];
+
+            /// What it is called in a spec.
+            pub fn name(self) -> &'static str {
+                match self {
+                    $(Self::$linked => $linked_name,)*
+                    $(Self::$kind => $name,)*
+                }
+            }
+        }
+
+        /// [`MakeFn`] of each kind that a library can bring.
+        pub enum Make {
+            $($(#[$doc])* $kind(MakeFn<dyn $spec>),)*
+        }
+
+        impl Make {
+            fn kind(&self) -> Kind {
+                match self {
+                    $(Self::$kind(_) => Kind::$kind,)*
+                }
+            }
+        }
+
+        $(impl Settings for dyn $spec {
+            const KIND: Kind = Kind::$kind;
+
+            fn made_by(make: &Make) -> Option<&MakeFn<Self>> {
+                match make {
+                    Make::$kind(make) => Some(make),
+                    _ => None,
+                }
+            }
+        })*
+    };
+}
+
+kinds! {
+    linked {
+        /// Scan to volume.
+        Method "method",
+        /// What watches over training.
+        Callback "callback",
+        /// Line integrals of rays, and attenuation at points.
+        LineField "line-field",
+    }
+    loadable {
+        /// Points to features.
+        Encoder "encoder" EncoderSpec,
+        /// Features to features.
+        Normalizer "normalizer" NormalizerSpec,
+        /// Features to attenuation.
+        Field "field" FieldSpec,
+        /// Rays to samples of a field.
+        Projector "projector" ProjectorSpec,
+        /// Where weights come from.
+        Initializer "initializer" InitializerSpec,
+        /// Predicted against measured values.
+        Loss "loss" LossSpec,
+        /// What a field is to be like, whatever was measured.
+        Prior "prior" PriorSpec,
+        /// Line integrals of voxels, for iterative methods.
+        VoxelProjector "voxel-projector" VoxelProjectorSpec,
+        /// Coefficients to voxels, for iterative methods.
+        Basis "basis" BasisSpec,
+        /// How far line integrals are from the measured ones, for iterative methods.
+        DataTerm "data-term" DataTermSpec,
+        /// Penalty of coefficients with its proximal map, for iterative methods.
+        Regularizer "regularizer" RegularizerSpec,
+    }
+}
+
+impl Settings for dyn LineFieldSpec {
+    const KIND: Kind = Kind::LineField;
+}
+
+/// The settings of one kind of stage.
+pub trait Settings {
+    /// Which.
+    const KIND: Kind;
+
+    /// How a type of this kind from a library is made; nothing where libraries bring none.
+    fn made_by(make: &Make) -> Option<&MakeFn<Self>> {
+        let _ = make;
+        None
+    }
 }
 
 impl Kind {
-    /// Every kind, in the order of a pipeline.
-    pub const ALL: [Self; 6] =
-        [Self::Encoder, Self::Normalizer, Self::Field, Self::Projector, Self::Initializer, Self::Solver];
-
-    /// What it is called in a spec.
-    pub fn name(self) -> &'static str {
-        match self {
-            Self::Encoder => "encoder",
-            Self::Normalizer => "normalizer",
-            Self::Field => "field",
-            Self::Projector => "projector",
-            Self::Initializer => "initializer",
-            Self::Solver => "solver",
-        }
-    }
-
     /// The kind called `name`.
     pub fn named(name: &str) -> Option<Self> {
-        Self::ALL.into_iter().find(|k| k.name() == name)
+        Self::ALL.iter().copied().find(|k| k.name() == name)
     }
 }
 
@@ -92,35 +168,6 @@ pub enum Origin {
 
 /// Makes a stage's settings from what a spec says beside its `type`.
 pub type MakeFn<T> = Box<dyn Fn(Value) -> Result<Box<T>> + Send + Sync>;
-
-/// [`MakeFn`] of each kind.
-pub enum Make {
-    /// Of an encoder.
-    Encoder(MakeFn<dyn EncoderSpec>),
-    /// Of a normalizer.
-    Normalizer(MakeFn<dyn NormalizerSpec>),
-    /// Of a field.
-    Field(MakeFn<dyn FieldSpec>),
-    /// Of a projector.
-    Projector(MakeFn<dyn ProjectorSpec>),
-    /// Of an initializer.
-    Initializer(MakeFn<dyn InitializerSpec>),
-    /// Of a solver.
-    Solver(MakeFn<dyn SolverSpec>),
-}
-
-impl Make {
-    fn kind(&self) -> Kind {
-        match self {
-            Self::Encoder(_) => Kind::Encoder,
-            Self::Normalizer(_) => Kind::Normalizer,
-            Self::Field(_) => Kind::Field,
-            Self::Projector(_) => Kind::Projector,
-            Self::Initializer(_) => Kind::Initializer,
-            Self::Solver(_) => Kind::Solver,
-        }
-    }
-}
 
 impl StageType {
     /// JSON Schema of its settings, without `type`.

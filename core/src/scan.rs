@@ -22,6 +22,29 @@ impl Default for Unit {
     }
 }
 
+/// The size of a scan, which its files tell before anything large is read.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize)]
+pub struct ScanHeader {
+    /// Views.
+    pub views: usize,
+    /// Rows and columns of the detector.
+    pub detector: [usize; 2],
+    /// Voxels along x, y and z of the volume to reconstruct.
+    pub volume: [usize; 3],
+}
+
+impl ScanHeader {
+    /// Measured values.
+    pub fn pixels(&self) -> u64 {
+        [self.views, self.detector[0], self.detector[1]].iter().fold(1, |n, &k| n.saturating_mul(k as u64))
+    }
+
+    /// Voxels.
+    pub fn voxels(&self) -> u64 {
+        self.volume.iter().fold(1, |n, &k| n.saturating_mul(k as u64))
+    }
+}
+
 /// Measured line integrals `A = -ln(I/I0)` with the geometry they were taken in.
 #[derive(Debug, Clone)]
 pub struct Scan {
@@ -36,6 +59,12 @@ pub struct Scan {
 }
 
 impl Scan {
+    /// Its size.
+    pub fn header(&self) -> ScanHeader {
+        let g = &self.geometry;
+        ScanHeader { views: g.views.len(), detector: g.detector, volume: g.volume.shape }
+    }
+
     /// One view, `[row, column]`.
     pub fn view(&self, view: usize) -> ArrayView2<'_, f32> {
         self.projections.index_axis(ndarray::Axis(0), view)

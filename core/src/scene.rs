@@ -3,10 +3,13 @@
 use crate::error::{Result, ensure};
 use crate::geometry::{Geometry, Ray, Vec3, View, VoxelGrid, dot, norm, sub};
 use crate::scan::Scan;
-use crate::spec;
 use crate::stage::UnitRay;
 use crate::support::Support;
 use std::sync::Arc;
+
+mod settings;
+
+pub use settings::{AttenuationScale, CoarseSurround, LevelRule, SceneSettings, SupportRule, SurroundRule, VoxelScene};
 
 /// Maps lengths to cube sides and attenuation to order one, by the scan alone.
 #[derive(Debug, Clone, PartialEq)]
@@ -30,15 +33,12 @@ pub struct Scene {
 
 impl Scene {
     /// The scene of `scan` under the spec's settings.
-    pub fn new(scan: &Scan, settings: &spec::Scene) -> Result<Self> {
+    pub fn new(scan: &Scan, settings: &SceneSettings) -> Result<Self> {
         let grid = scan.geometry.volume;
         let longest = grid.size().into_iter().fold(0.0, f64::max);
         let attenuation = match settings.attenuation {
-            spec::AttenuationScale::Fixed(x) => {
-                ensure(x.is_finite() && x > 0.0, "spec", "scene.attenuation", x, "a positive finite number")?;
-                x / scan.unit.mm
-            }
-            spec::AttenuationScale::Scan => {
+            AttenuationScale::Fixed(x) => x / scan.unit.mm,
+            AttenuationScale::Scan => {
                 let top = top_projection(scan);
                 ensure(
                     top > 0.0,
@@ -54,9 +54,9 @@ impl Scene {
     }
 
     /// The scene around `grid` in which `attenuation` (1/mm) counts as 1.
-    pub fn with_attenuation(grid: VoxelGrid, settings: &spec::Scene, attenuation: f64) -> Result<Self> {
+    pub fn with_attenuation(grid: VoxelGrid, settings: &SceneSettings, attenuation: f64) -> Result<Self> {
+        settings.validate()?;
         let fill = settings.fill;
-        ensure(fill > 0.0 && fill <= 1.0, "spec", "scene.fill", fill, "a number above 0 and at most 1")?;
         let size = grid.size();
         let longest = size.into_iter().fold(0.0, f64::max);
         let side = longest / fill;
@@ -73,7 +73,7 @@ impl Scene {
     }
 
     /// The scene with the unit cube around `support` instead of the whole volume.
-    pub fn within(mut self, support: Support, settings: &spec::Scene) -> Self {
+    pub fn within(mut self, support: Support, settings: &SceneSettings) -> Self {
         let (box_, all) = (support.bounds(), self.grid.bounds());
         self.bounds =
             [std::array::from_fn(|k| box_[0][k].max(all[0][k])), std::array::from_fn(|k| box_[1][k].min(all[1][k]))];

@@ -287,7 +287,7 @@ pub trait Stage: Send + Sync {
     }
 
     /// The arithmetic that reads parameters in halves, or `None` where they are read as they are. Hosts want it of
-    /// [`GradKind::Scatter`] stages where a spec asks for it ([`crate::spec::Precision`]).
+    /// [`GradKind::Scatter`] stages where a spec asks for it ([`crate::precision::Precision`]).
     fn halves(&self) -> Option<Halves<'_>> {
         None
     }
@@ -353,45 +353,10 @@ pub struct Lengths {
     pub cell_mm: Option<f64>,
 }
 
-/// A look at the encoder between steps.
-pub trait Probe {
-    /// The encoder's features at `points` (unit cube), channel-major `[F][n]`, for the channels still computed.
-    fn encode(&mut self, points: &[[f32; 3]]) -> Result<Vec<f32>>;
-    /// Voxels along x, y, z of the volume to be exported.
-    fn shape(&self) -> [usize; 3];
-    /// The unit-cube position of a voxel's centre.
-    fn voxel(&self, index: [usize; 3]) -> [f32; 3];
-    /// Finished passes over all views.
-    fn epoch(&self) -> f64;
-    /// Whether channels stand in order from coarse to fine.
-    fn coarse_to_fine(&self) -> bool;
-}
-
-/// What a normalizer found between steps.
-#[derive(Debug, Clone, PartialEq)]
-pub struct Mask {
-    /// Channels that stay (of those still computed), ascending.
-    pub keep: Vec<usize>,
-    /// What was measured for each channel, for the log.
-    pub report: String,
-}
-
 /// Features `[n, F]` to features `[n, F]`.
 pub trait Normalizer: Stage {
-    /// Called before every step; `Some` removes channels for good.
-    fn refresh(&self, probe: &mut dyn Probe) -> Result<Option<Mask>> {
-        let _ = probe;
-        Ok(None)
-    }
-
-    /// Called when a resumed run removes channels as [`Normalizer::refresh`] once decided: it must not decide again.
-    fn decided(&self) {}
-
     /// The normalizer without the inputs that are not in `keep`: they are gone from its sums too.
     fn keep_inputs(&self, keep: &[usize]) -> Result<Reduced<dyn Normalizer>>;
-
-    /// The normalizer that computes only the outputs `keep`; it may still need every input.
-    fn keep_outputs(&self, keep: &[usize]) -> Result<Reduced<dyn Normalizer>>;
 }
 
 /// Features `[n, F]` to attenuation `[n, 1]`.
@@ -401,6 +366,28 @@ pub trait Field: Stage {
         let _ = keep;
         Err(Error::unsupported(self.describe(), "this field cannot do without some of its inputs"))
     }
+
+    /// Its own line integrals, of a field that stands alone ([`crate::spec::FieldSpec::stands_alone`]).
+    fn lines(&self) -> Option<&dyn Lines<f32>> {
+        None
+    }
+
+    /// The same formula in double precision, by which gradients are checked.
+    fn lines_reference(&self) -> Option<&dyn Lines<f64>> {
+        None
+    }
+}
+
+/// Line integrals that a field brings itself: no projector takes samples of it. In a closed form, or by a walk through
+/// voxels. The field reads positions; its [`Kernel`] gives its values at points, for priors and export.
+pub trait Lines<R: Real>: Send + Sync {
+    /// Overwrites `out` with the line integrals of `rays`, in cube sides. A ray that is not inside
+    /// ([`UnitRay::inside`]) has 0.
+    fn project(&self, params: &[R], rays: &[UnitRay], out: &mut [R]);
+
+    /// Given `dlines = ∂L/∂out`: *adds* `∂L/∂params` to `grads`. The order in which a parameter's gradient is summed must
+    /// not depend on `grads.range`: hosts hand each range of [`Stage::partition`] to a worker of its own.
+    fn backproject(&self, params: &[R], rays: &[UnitRay], dlines: &[R], grads: Grads<'_, R>);
 }
 
 /// A ray in the unit cube: `origin + t·direction`, where `t` counts cube sides.

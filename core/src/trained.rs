@@ -4,10 +4,9 @@ use crate::backend::{Backend, Executable};
 use crate::error::{Error, Result};
 use crate::geometry::VoxelGrid;
 use crate::parts::{Part, Voxels};
-use crate::pipeline::{Masked, Model, Pipeline};
+use crate::pipeline::{Model, Pipeline};
 use crate::scan::Affine;
-use crate::scene::Scene;
-use crate::spec::Spec;
+use crate::scene::{Scene, SceneSettings};
 use crate::support::Support;
 use ndarray::ArrayViewMut3;
 use serde::{Deserialize, Serialize};
@@ -35,8 +34,8 @@ pub struct Placement {
     pub attenuation: f64,
     /// Millimetres a unit of the scan.
     pub unit_mm: f64,
-    /// Channels that normalizers removed, in order.
-    pub masks: Vec<Masked>,
+    /// The encoder's channels that stayed each time some were removed, in order.
+    pub masks: Vec<Vec<usize>>,
     /// Where in the volume the object can be, if that was found out.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub support: Option<Support>,
@@ -54,18 +53,22 @@ impl TrainedField {
         }
     }
 
-    /// The field of `spec` where `placement` says, with the parameters that `load` puts into its model.
-    pub fn restore(spec: &Spec, placement: &Placement, load: impl FnOnce(&mut Model) -> Result<()>) -> Result<Self> {
+    /// The field of these stages where `placement` says, with the parameters that `load` puts into its model.
+    pub fn restore(
+        mut pipeline: Pipeline,
+        settings: &SceneSettings,
+        placement: &Placement,
+        load: &mut dyn FnMut(&mut Model) -> Result<()>,
+    ) -> Result<Self> {
         placement.grid.validate("placement")?;
-        let mut scene = Scene::with_attenuation(placement.grid, &spec.scene, placement.attenuation)?;
+        let mut scene = Scene::with_attenuation(placement.grid, settings, placement.attenuation)?;
         if let Some(support) = placement.support.clone() {
-            scene = scene.within(support, &spec.scene);
+            scene = scene.within(support, settings);
         }
-        let mut pipeline = Pipeline::build(spec)?;
         pipeline.fit(&scene)?;
         let mut model = Model::random(pipeline, 0);
-        for masked in &placement.masks {
-            model.mask(masked)?;
+        for keep in &placement.masks {
+            model.mask(keep.clone())?;
         }
         load(&mut model)?;
         Ok(Self { model, scene, unit_mm: placement.unit_mm })
@@ -74,21 +77,15 @@ impl TrainedField {
     /// Its values at the voxels of `grid`, in 1/unit of the scan.
     pub fn voxels(&self, backend: &dyn Backend, grid: VoxelGrid) -> Result<FieldVoxels<'_>> {
         let (exe, _) = backend.compile(&self.model.pipeline)?;
-        let scale = (self.scene.attenuation * self.unit_mm) as f32;
-        Ok(FieldVoxels { field: self, grid, exe, scale, points: vec![], places: vec![], values: vec![] })
+        Ok(FieldVoxels { model: &self.model, exe, sampler: Sampler::new(&self.scene, self.unit_mm, grid) })
     }
 }
 
 /// A field's values at the voxels of a grid, evaluated where they are asked for; 0 where the object cannot be.
 pub struct FieldVoxels<'a> {
-    field: &'a TrainedField,
-    grid: VoxelGrid,
+    model: &'a Model,
     exe: Box<dyn Executable>,
-    scale: f32,
-    points: Vec<[f32; 3]>,
-    /// Which of the voxels at hand the points are.
-    places: Vec<usize>,
-    values: Vec<f32>,
+    sampler: Sampler<'a>,
 }
 
 impl FieldVoxels<'_> {
@@ -98,7 +95,7 @@ impl FieldVoxels<'_> {
 
 impl Voxels for FieldVoxels<'_> {
     fn grid(&self) -> VoxelGrid {
-        self.grid
+        self.sampler.grid
     }
 
     fn affine(&self) -> Option<Affine> {
@@ -106,20 +103,56 @@ impl Voxels for FieldVoxels<'_> {
     }
 
     fn fill(&mut self, part: &Part, mut out: ArrayViewMut3<'_, f32>) -> Result<()> {
-        let Self { field, grid, exe, scale, points, places, values } = self;
-        let [xs, ys, zs] = part;
+        self.sampler.fill(self.model, self.exe.as_mut(), part, out.view_mut())?;
+        match out.indexed_iter().find(|(_, m)| !m.is_finite()) {
+            None => Ok(()),
+            Some(((x, y, z), value)) => {
+                let voxel = [part[0].start + x, part[1].start + y, part[2].start + z];
+                let (field, expected) = (format!("voxel {voxel:?}"), "a finite number; a smaller solver.lr may help");
+                Err(Error::invalid("the trained field", field, value, expected))
+            }
+        }
+    }
+}
+
+/// Samples a model at the voxels of a grid.
+pub struct Sampler<'a> {
+    scene: &'a Scene,
+    grid: VoxelGrid,
+    scale: f32,
+    points: Vec<[f32; 3]>,
+    /// Which of the voxels at hand the points are.
+    places: Vec<usize>,
+    values: Vec<f32>,
+}
+
+impl<'a> Sampler<'a> {
+    /// For the voxels of `grid` and a model in `scene`, of a scan with `unit_mm` millimetres a unit.
+    pub fn new(scene: &'a Scene, unit_mm: f64, grid: VoxelGrid) -> Self {
+        let scale = (scene.attenuation * unit_mm) as f32;
+        Self { scene, grid, scale, points: vec![], places: vec![], values: vec![] }
+    }
+
+    /// The values of `part`, in 1/unit of the scan; 0 where the object cannot be.
+    pub fn fill(
+        &mut self,
+        model: &Model,
+        exe: &mut dyn Executable,
+        [xs, ys, zs]: &Part,
+        mut out: ArrayViewMut3<'_, f32>,
+    ) -> Result<()> {
+        let Self { scene, grid, scale, points, places, values } = self;
         // In the order in which `out` is gone through.
         let mut voxels = xs.clone().flat_map(|x| ys.clone().flat_map(move |y| zs.clone().map(move |z| [x, y, z])));
         let mut out = out.iter_mut();
-        let mut at = 0;
         loop {
             points.clear();
             places.clear();
             let mut taken = 0;
             for (i, voxel) in voxels.by_ref().take(POINTS).enumerate() {
                 let p = grid.voxel(voxel);
-                if field.scene.holds(p) {
-                    points.push(field.scene.to_unit(p));
+                if scene.holds(p) {
+                    points.push(scene.to_unit(p));
                     places.push(i);
                 }
                 taken = i + 1;
@@ -128,20 +161,11 @@ impl Voxels for FieldVoxels<'_> {
                 return Ok(());
             }
             values.resize(points.len(), 0.0);
-            exe.evaluate(&field.model, points, values)?;
-            values.iter_mut().for_each(|m| *m *= *scale);
+            exe.evaluate(model, points, values)?;
             let mut known = places.iter().zip(values.iter()).peekable();
             for (i, out) in out.by_ref().take(taken).enumerate() {
-                *out = known.next_if(|(at, _)| **at == i).map_or(0.0, |(_, value)| *value);
+                *out = known.next_if(|(at, _)| **at == i).map_or(0.0, |(_, value)| value * *scale);
             }
-            if let Some(i) = values.iter().position(|m| !m.is_finite()) {
-                let value = values[i];
-                let (i, [ny, nz]) = (at + places[i], [ys.len(), zs.len()]);
-                let voxel = [xs.start + i / (ny * nz), ys.start + i / nz % ny, zs.start + i % nz];
-                let (field, expected) = (format!("voxel {voxel:?}"), "a finite number; a smaller solver.lr may help");
-                return Err(Error::invalid("the trained field", field, value, expected));
-            }
-            at += taken;
         }
     }
 }

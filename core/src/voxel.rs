@@ -2,9 +2,18 @@
 
 use crate::error::Result;
 use crate::geometry::Geometry;
+use crate::scan::ScanHeader;
 use crate::simd::Real;
 use crate::wgsl::Fragment;
 use ndarray::{ArrayView3, ArrayViewMut3};
+use std::sync::Arc;
+
+/// Settings of a projector of voxel volumes.
+#[typetag::serde(tag = "type")]
+pub trait VoxelProjectorSpec: Send + Sync {
+    /// The projector, or why the settings make none.
+    fn build(&self) -> Result<Box<dyn VoxelProjector>>;
+}
 
 /// A projector of voxel volumes, in single precision for work and in double precision to be checked by.
 pub trait VoxelProjector: Send + Sync {
@@ -19,8 +28,33 @@ pub trait VoxelProjector: Send + Sync {
         None
     }
 
+    /// Bytes that either direction takes while it works on `views` views of a scan of these sizes, on the CPU.
+    fn scratch(&self, header: &ScanHeader, views: usize) -> u64 {
+        let _ = (header, views);
+        0
+    }
+
     /// A line for `explain`.
     fn describe(&self) -> String;
+}
+
+/// The same projector, held by several.
+impl VoxelProjector for Arc<dyn VoxelProjector> {
+    fn operator(&self) -> &dyn VoxelOperator<f32> {
+        self.as_ref().operator()
+    }
+    fn reference(&self) -> &dyn VoxelOperator<f64> {
+        self.as_ref().reference()
+    }
+    fn wgsl(&self) -> Option<Fragment> {
+        self.as_ref().wgsl()
+    }
+    fn scratch(&self, header: &ScanHeader, views: usize) -> u64 {
+        self.as_ref().scratch(header, views)
+    }
+    fn describe(&self) -> String {
+        self.as_ref().describe()
+    }
 }
 
 /// The system matrix `A` of a geometry: `(Aμ)_i = Σ_j a_ij μ_j`, where `a_ij` is the length in mm over which voxel

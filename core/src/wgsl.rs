@@ -34,7 +34,26 @@
 //! sample `i` of `ray.count` on a ray: its position in the unit cube and its weight. `ray.count` is what
 //! [`Projector::max_samples`](crate::stage::Projector::max_samples) says; samples beyond what the ray has weigh 0. The
 //! line integral is the sum of weight times attenuation. [`RAY`] defines `Ray`, [`RANDOM`] random numbers.
-
+//!
+//! A loss ([`Loss`](crate::loss::Loss)) defines
+//!
+//! ```wgsl
+//! fn stage_at(predicted: f32, measured: f32) -> vec2<f32>                // the loss and its derivative by `predicted`
+//! ```
+//!
+//! A prior ([`Prior`](crate::prior::Prior)) defines
+//!
+//! ```wgsl
+//! fn stage_at(p: u32) -> vec2<f32>
+//! ```
+//!
+//! the share of point `p` in the penalty of a block (all shares add up to it), and the derivative of the whole penalty by
+//! the value of point `p`. The host defines for it
+//!
+//! ```wgsl
+//! const stage_edge: u32;                                                 // points along the block's edge
+//! fn stage_value(p: u32) -> f32                                          // the field at point p, z fastest
+//! ```
 //!
 //! A projector of voxels defines
 //!

@@ -3,8 +3,8 @@
 use conefield_core::error::{Error, Result, ensure};
 use conefield_core::half::{Bf16, F16};
 use conefield_core::random::mix;
+use conefield_core::settings::EncoderSpec;
 use conefield_core::simd::Real;
-use conefield_core::spec::EncoderSpec;
 use conefield_core::stage::{
     Encoder, GradKind, Grads, Halves, Info, Kernel, Parameter, Reduced, Scope, Stage, Tile, TileMut,
 };
@@ -36,28 +36,17 @@ impl EncoderSpec for Concat {
     fn build(&self) -> Result<Box<dyn Encoder>> {
         let mut parts = vec![];
         for (i, e) in self.encoders.iter().enumerate() {
-            let part = e.build().map_err(|e| inside(i, e))?;
+            let part = e.build().map_err(|e| e.within(&format!("encoders.{i}")))?;
             let input = part.info().input;
-            ensure(input == 3, "spec", &format!("encoder.encoders.{i}"), format!("{input} channels in"), "3")?;
+            ensure(input == 3, "spec", &format!("encoders.{i}"), format!("{input} channels in"), "3")?;
             parts.push((i, Arc::from(part)));
         }
         Ok(Box::new(ConcatStage::new(parts)?))
     }
 }
 
-/// The error of part `i` with the way to it.
-fn inside(i: usize, error: Error) -> Error {
-    match error {
-        Error::Invalid { place, field, found, expected } => {
-            let rest = field.strip_prefix("encoder.").unwrap_or(&field);
-            Error::Invalid { place, field: format!("encoder.encoders.{i}.{rest}"), found, expected }
-        }
-        other => other,
-    }
-}
-
 #[derive(Clone)]
-struct Part {
+struct ConcatMember {
     stage: Arc<dyn Encoder>,
     info: Info,
     /// Its place in the settings, which names its parameters.
@@ -67,7 +56,7 @@ struct Part {
     tape: Range<usize>,
 }
 
-impl Part {
+impl ConcatMember {
     /// What reads its parameters in halves, if it has any.
     fn in_halves<P>(&self, pick: fn(Halves<'_>) -> &dyn Kernel<f32, P>) -> Option<Own<'_, f32, P>> {
         match self.info.params {
@@ -80,14 +69,14 @@ impl Part {
 /// The stage that [`Concat`] builds.
 #[derive(Clone)]
 pub struct ConcatStage {
-    parts: Vec<Part>,
+    parts: Vec<ConcatMember>,
     info: Info,
 }
 
 impl ConcatStage {
     /// Puts parts, each with its place in the settings, side by side.
     fn new(stages: Vec<(usize, Arc<dyn Encoder>)>) -> Result<Self> {
-        ensure(!stages.is_empty(), "spec", "encoder.encoders", "none", "at least one encoder")?;
+        ensure(!stages.is_empty(), "spec", "encoders", "none", "at least one encoder")?;
         let mut info = Info {
             input: 3,
             output: 0,
@@ -101,7 +90,7 @@ impl ConcatStage {
         let mut parts = vec![];
         for (number, stage) in stages {
             let i = stage.info();
-            let part = Part {
+            let part = ConcatMember {
                 outputs: info.output..info.output + i.output,
                 params: info.params..info.params + i.params,
                 tape: info.tape..info.tape + i.tape,
@@ -123,7 +112,7 @@ impl ConcatStage {
         }
         if info.grads == GradKind::Scatter && info.tape > 0 {
             return Err(Error::unsupported(
-                "encoder.encoders",
+                "concat: encoders",
                 "an encoder that keeps a tape beside one whose gradients are scattered; use them in separate specs",
             ));
         }
@@ -171,7 +160,7 @@ impl<R: Real, P> Own<'_, R, P> {
 }
 
 /// The kernel of a part in one precision.
-type Pick<R, P> = fn(&Part) -> Option<Own<'_, R, P>>;
+type Pick<R, P> = fn(&ConcatMember) -> Option<Own<'_, R, P>>;
 
 fn channels<'a, R: Real>(data: &'a mut [R], range: &Range<usize>, rows: usize) -> TileMut<'a, R> {
     TileMut::new(&mut data[range.start * rows..range.end * rows], rows)
@@ -319,7 +308,7 @@ impl Stage for ConcatStage {
 
     /// The parts' names behind their place, e.g. `1.0.table`.
     fn parameters(&self) -> Vec<Parameter> {
-        let of = |p: &Part| {
+        let of = |p: &ConcatMember| {
             let (number, start) = (p.number, p.params.start);
             let named =
                 move |q: Parameter| Parameter { name: format!("{number}.{}", q.name), start: start + q.start, ..q };
@@ -347,7 +336,7 @@ impl Stage for ConcatStage {
     }
 
     fn partition(&self) -> Vec<Range<usize>> {
-        let of = |p: &Part| {
+        let of = |p: &ConcatMember| {
             let start = p.params.start;
             let ranges = match p.info.grads {
                 GradKind::None => vec![],

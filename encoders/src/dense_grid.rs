@@ -9,8 +9,8 @@ use crate::levels::{LevelCode, by_channel, functions};
 use conefield_core::error::{Error, Result, ensure};
 use conefield_core::half::Stored;
 use conefield_core::random::{mix, unit};
+use conefield_core::settings::EncoderSpec;
 use conefield_core::simd::{Op, Real, Simd, run};
-use conefield_core::spec::EncoderSpec;
 use conefield_core::stage::{
     Encoder, GradKind, Grads, Halves, Info, Kernel, Parameter, Reduced, Scope, Stage, Tile, TileMut,
 };
@@ -82,13 +82,13 @@ impl DenseGridStage {
     /// The stage, or which setting is out of range.
     pub fn new(settings: &DenseGrid) -> Result<Self> {
         let s = settings;
-        ensure((1..=32).contains(&s.levels), "spec", "encoder.levels", s.levels, "1 to 32")?;
-        ensure([1, 2, 4, 8].contains(&s.features), "spec", "encoder.features", s.features, "1, 2, 4 or 8")?;
+        ensure((1..=32).contains(&s.levels), "spec", "levels", s.levels, "1 to 32")?;
+        ensure([1, 2, 4, 8].contains(&s.features), "spec", "features", s.features, "1, 2, 4 or 8")?;
         let base = s.base_resolution;
-        ensure((1..=1 << 20).contains(&base), "spec", "encoder.base_resolution", base, "1 to 2^20 cells a side")?;
-        ensure((1.0..=16.0).contains(&s.growth), "spec", "encoder.growth", s.growth, "1 to 16")?;
+        ensure((1..=1 << 20).contains(&base), "spec", "base_resolution", base, "1 to 2^20 cells a side")?;
+        ensure((1.0..=16.0).contains(&s.growth), "spec", "growth", s.growth, "1 to 16")?;
         let range = s.init_range;
-        ensure(range.is_finite() && range >= 0.0, "spec", "encoder.init_range", range, "a finite number, 0 or more")?;
+        ensure(range.is_finite() && range >= 0.0, "spec", "init_range", range, "a finite number, 0 or more")?;
         let mut levels = vec![];
         let mut total = 0u64;
         for l in 0..s.levels {
@@ -103,7 +103,7 @@ impl DenseGridStage {
             let Some(count) = count else {
                 return Err(Error::invalid(
                     "spec",
-                    "encoder.levels",
+                    "levels",
                     format!(
                         "more than 2^31 parameters with level {l}: ({resolution:.0} + 1)^3 vertices of {} features",
                         s.features
@@ -412,7 +412,7 @@ mod tests {
             DenseGrid { levels: 32, growth: 16.0, base_resolution: 1 << 20, ..DenseGrid::default() },
         ] {
             let e = DenseGridStage::new(&s).unwrap_err().to_string();
-            assert!(e.contains("encoder.levels") && e.contains("2^31") && e.contains("hash-grid"), "{e}");
+            assert!(e.contains("levels") && e.contains("2^31") && e.contains("hash-grid"), "{e}");
         }
     }
 }

@@ -6,8 +6,8 @@
 //! coordinates (with `include_input`), then of every band `sin x, sin y, sin z, cos x, cos y, cos z`.
 
 use conefield_core::error::{Result, ensure};
+use conefield_core::settings::EncoderSpec;
 use conefield_core::simd::{Op, Real, Select, Simd, SimdBase, SimdFloat, V, load, run, store};
-use conefield_core::spec::EncoderSpec;
 use conefield_core::stage::{Encoder, GradKind, Grads, Info, Kernel, Parameter, Reduced, Scope, Stage, Tile, TileMut};
 use conefield_core::wgsl::{Fragment, functions};
 use schemars::JsonSchema;
@@ -78,9 +78,9 @@ impl FrequencyStage {
     /// The stage, or which setting is out of range.
     pub fn new(settings: &Frequency) -> Result<Self> {
         let s = settings;
-        ensure((1..=64).contains(&s.bands), "spec", "encoder.bands", s.bands, "1 to 64")?;
+        ensure((1..=64).contains(&s.bands), "spec", "bands", s.bands, "1 to 64")?;
         let max = s.max_frequency;
-        ensure((1.0..=1e6).contains(&max), "spec", "encoder.max_frequency", max, "1 to 1e6 periods a cube side")?;
+        ensure((1.0..=1e6).contains(&max), "spec", "max_frequency", max, "1 to 1e6 periods a cube side")?;
         let first = if s.include_input { 3 } else { 0 };
         let mut waves = vec![];
         for k in 0..s.bands {
@@ -358,9 +358,9 @@ mod tests {
     #[test]
     fn settings_out_of_range_are_refused() {
         for (bad, field) in [
-            (Frequency { bands: 0, ..Frequency::default() }, "encoder.bands"),
-            (Frequency { max_frequency: f64::NAN, ..Frequency::default() }, "encoder.max_frequency"),
-            (Frequency { max_frequency: 0.5, ..Frequency::default() }, "encoder.max_frequency"),
+            (Frequency { bands: 0, ..Frequency::default() }, "bands"),
+            (Frequency { max_frequency: f64::NAN, ..Frequency::default() }, "max_frequency"),
+            (Frequency { max_frequency: 0.5, ..Frequency::default() }, "max_frequency"),
         ] {
             let e = FrequencyStage::new(&bad).unwrap_err().to_string();
             assert!(e.contains(field), "{e}");

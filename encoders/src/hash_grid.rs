@@ -8,8 +8,8 @@ use crate::levels::{LevelCode, by_channel, functions};
 use conefield_core::error::{Result, ensure};
 use conefield_core::half::Stored;
 use conefield_core::random::{mix, unit};
+use conefield_core::settings::EncoderSpec;
 use conefield_core::simd::{Op, Real, Simd, SimdBase, SimdFloat, V, load, run, store};
-use conefield_core::spec::EncoderSpec;
 use conefield_core::stage::{
     Encoder, GradKind, Grads, Halves, Info, Kernel, Parameter, Reduced, Scope, Stage, Tile, TileMut,
 };
@@ -115,9 +115,7 @@ impl HashGridStage {
     /// The stage, or which setting is out of range.
     pub fn new(settings: &HashGrid) -> Result<Self> {
         let s = settings;
-        let bad = |field: &str, found: String, expected: &str| {
-            ensure(false, "spec", &format!("encoder.{field}"), found, expected)
-        };
+        let bad = |field: &str, found: String, expected: &str| ensure(false, "spec", field, found, expected);
         if !(1..=32).contains(&s.levels) {
             bad("levels", s.levels.to_string(), "1 to 32")?;
         }
@@ -678,7 +676,7 @@ mod tests {
     #[test]
     fn a_level_past_single_precision_is_refused() {
         let e = HashGridStage::new(&HashGrid { levels: 32, ..HashGrid::default() }).unwrap_err().to_string();
-        assert!(e.contains("encoder.levels") && e.contains("2^23"), "{e}");
+        assert!(e.contains("levels") && e.contains("2^23"), "{e}");
     }
 
     #[test]

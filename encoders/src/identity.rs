@@ -1,8 +1,8 @@
 //! The position itself: points `[n, 3]` to `[n, 3]`, for fields that keep their own grid and for [`crate::concat`].
 
 use conefield_core::error::{Result, ensure};
+use conefield_core::settings::EncoderSpec;
 use conefield_core::simd::Real;
-use conefield_core::spec::EncoderSpec;
 use conefield_core::stage::{Encoder, GradKind, Grads, Info, Kernel, Parameter, Reduced, Scope, Stage, Tile, TileMut};
 use conefield_core::wgsl::{Fragment, functions};
 use schemars::JsonSchema;

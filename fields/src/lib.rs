@@ -1,4 +1,5 @@
-//! Attenuation fields: MLP, voxel grid
+//! Attenuation fields: MLP, voxel grid, voxels with line integrals of their own
 
 pub mod mlp;
 pub mod voxel_grid;
+pub mod voxels_joseph;

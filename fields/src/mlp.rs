@@ -5,11 +5,11 @@
 
 mod wgsl;
 
-use conefield_core::dense::{Output as Into, Weights, affine, affine_input, affine_weights};
+use conefield_core::dense::{Output as Into, WeightMatrix, affine, affine_input, affine_weights};
 use conefield_core::error::{Result, ensure};
 use conefield_core::random::{mix, unit};
+use conefield_core::settings::FieldSpec;
 use conefield_core::simd::{Op, Real, Select, Simd, SimdBase, SimdFloat, V, load, run, store};
-use conefield_core::spec::FieldSpec;
 use conefield_core::stage::{Field, GradKind, Grads, Info, Kernel, Parameter, Reduced, Scope, Stage, Tile, TileMut};
 use conefield_core::wgsl::Fragment;
 use schemars::JsonSchema;
@@ -213,10 +213,10 @@ impl MlpStage {
     pub fn new(settings: &Mlp, input: usize) -> Result<Self> {
         let s = settings;
         let depth = s.depth;
-        ensure((1..=64).contains(&depth), "spec", "field.depth", depth, "1 to 64 linear layers")?;
-        ensure((1..=1024).contains(&s.width), "spec", "field.width", s.width, "1 to 1024 channels")?;
+        ensure((1..=64).contains(&depth), "spec", "depth", depth, "1 to 64 linear layers")?;
+        ensure((1..=1024).contains(&s.width), "spec", "width", s.width, "1 to 1024 channels")?;
         for &k in &s.skips {
-            ensure(k > 0 && k < depth, "spec", "field.skips", k, format!("layers 1 to {}", depth - 1))?;
+            ensure(k > 0 && k < depth, "spec", "skips", k, format!("layers 1 to {}", depth - 1))?;
         }
         let mut layers = vec![];
         let mut start = 0;
@@ -273,7 +273,7 @@ impl<R: Real> Op for Forward<'_, R> {
             let until = stage.slope(i).end;
             let (before, both) = split(tape.data, from..until, n);
             let (h, z) = if last { (&mut y.data[..], both) } else { both.split_at_mut(layer.output * n) };
-            let weights = |column| Weights { data: &params[layer.weights()], ld: layer.ld(), column };
+            let weights = |column| WeightMatrix { data: &params[layer.weights()], ld: layer.ld(), column };
             let input =
                 if i == 0 { x.data } else { &before[stage.hidden(i - 1).start * n..stage.hidden(i - 1).end * n] };
             affine(s, weights(layer.skip), Some(&params[layer.bias()]), input, z, n);
@@ -346,7 +346,7 @@ impl<R: Real> Op for Backward<'_, R> {
         }
         let mut fresh = true;
         for (i, layer) in stage.layers.iter().enumerate().rev() {
-            let weights = |column| Weights { data: &params[layer.weights()], ld: layer.ld(), column };
+            let weights = |column| WeightMatrix { data: &params[layer.weights()], ld: layer.ld(), column };
             let (before, dz) = tape.data.split_at_mut(stage.slope(i).start * n);
             let dz = &dz[..layer.output * n];
             let input =

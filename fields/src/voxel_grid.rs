@@ -6,8 +6,8 @@
 use crate::mlp::{ACTIVATION, Activation, activate};
 use conefield_core::error::{Error, Result, ensure};
 use conefield_core::half::Stored;
+use conefield_core::settings::FieldSpec;
 use conefield_core::simd::{Op, Real, Simd, run};
-use conefield_core::spec::FieldSpec;
 use conefield_core::stage::{
     Field, GradKind, Grads, Halves, Info, Kernel, Parameter, Reduced, Scope, Stage, Tile, TileMut,
 };
@@ -30,7 +30,7 @@ pub enum Resolution {
 /// Settings of `voxel-grid`.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields, default)]
-pub struct VoxelGrid {
+pub struct VoxelGridSettings {
     /// Voxels along the unit cube's sides: one number, or three for x, y, z.
     pub resolution: Resolution,
     /// What follows the interpolation.
@@ -39,17 +39,17 @@ pub struct VoxelGrid {
     pub init: f64,
 }
 
-impl Default for VoxelGrid {
+impl Default for VoxelGridSettings {
     /// Softplus of −2 is 0.13: a thin cloud, from which every voxel can grow or vanish.
     fn default() -> Self {
         Self { resolution: Resolution::Cube(128), output: Activation::Softplus, init: -2.0 }
     }
 }
 
-conefield_core::stage_type!(Field, "voxel-grid", VoxelGrid, "a grid of voxels, read by position");
+conefield_core::stage_type!(Field, "voxel-grid", VoxelGridSettings, "a grid of voxels, read by position");
 
 #[typetag::serde(name = "voxel-grid")]
-impl FieldSpec for VoxelGrid {
+impl FieldSpec for VoxelGridSettings {
     fn build(&self, width: usize) -> Result<Box<dyn Field>> {
         Ok(Box::new(VoxelGridStage::new(self, width)?))
     }
@@ -61,7 +61,7 @@ const MOST: u64 = 1 << 31;
 /// A range of voxels that one worker sums has at least this many.
 const SLAB: usize = 1 << 18;
 
-/// The stage that [`VoxelGrid`] builds.
+/// The stage that [`VoxelGridSettings`] builds.
 #[derive(Debug, Clone, PartialEq)]
 pub struct VoxelGridStage {
     grid: Grid,
@@ -71,7 +71,7 @@ pub struct VoxelGridStage {
 
 impl VoxelGridStage {
     /// The stage, or which setting is out of range. `width` must be 3: the positions.
-    pub fn new(settings: &VoxelGrid, width: usize) -> Result<Self> {
+    pub fn new(settings: &VoxelGridSettings, width: usize) -> Result<Self> {
         let expected = "3, the position: use encoder type \"identity\" and no normalizer that changes it";
         ensure(width == 3, "spec", "field", format!("{width} channels for a voxel-grid"), expected)?;
         let axes = match settings.resolution {
@@ -82,12 +82,22 @@ impl VoxelGridStage {
         ensure(
             axes.iter().all(|n| (1..=1 << 20).contains(n)) && voxels.is_some_and(|v| v <= MOST),
             "spec",
-            "field.resolution",
+            "resolution",
             format!("{axes:?}"),
             "1 to 2^20 voxels a side and at most 2^31 together",
         )?;
-        ensure(settings.init.is_finite(), "spec", "field.init", settings.init, "a finite number")?;
+        ensure(settings.init.is_finite(), "spec", "init", settings.init, "a finite number")?;
         Ok(Self { grid: Grid::centres(axes.map(|n| n as usize)), output: settings.output, init: settings.init as f32 })
+    }
+
+    /// Voxels along x, y, z.
+    pub fn side(&self) -> [usize; 3] {
+        self.grid.side()
+    }
+
+    /// Disjoint ranges of voxels, of about `most` each or more.
+    pub fn slabs(&self, most: usize) -> Vec<Range<usize>> {
+        self.grid.slabs(most)
     }
 }
 
@@ -260,8 +270,11 @@ mod tests {
 
     #[test]
     fn values_stand_at_voxel_centres() {
-        let settings =
-            VoxelGrid { resolution: Resolution::Axes([4, 2, 1]), output: Activation::Relu, ..VoxelGrid::default() };
+        let settings = VoxelGridSettings {
+            resolution: Resolution::Axes([4, 2, 1]),
+            output: Activation::Relu,
+            ..VoxelGridSettings::default()
+        };
         let stage = VoxelGridStage::new(&settings, 3).unwrap();
         let params: Vec<f64> = (0..8).map(|v| f64::from(v) - 1.0).collect();
         let at = |x: [f64; 3]| {
@@ -281,11 +294,13 @@ mod tests {
 
     #[test]
     fn what_does_not_fit_is_refused_with_words() {
-        let e = VoxelGridStage::new(&VoxelGrid::default(), 20).unwrap_err().to_string();
+        let e = VoxelGridStage::new(&VoxelGridSettings::default(), 20).unwrap_err().to_string();
         assert!(e.contains("20 channels") && e.contains("identity"), "{e}");
         for resolution in [Resolution::Cube(0), Resolution::Axes([1 << 20; 3]), Resolution::Cube(2048)] {
-            let e = VoxelGridStage::new(&VoxelGrid { resolution, ..VoxelGrid::default() }, 3).unwrap_err().to_string();
-            assert!(e.contains("field.resolution") && e.contains("2^31"), "{e}");
+            let e = VoxelGridStage::new(&VoxelGridSettings { resolution, ..VoxelGridSettings::default() }, 3)
+                .unwrap_err()
+                .to_string();
+            assert!(e.contains("resolution") && e.contains("2^31"), "{e}");
         }
     }
 }

@@ -2,29 +2,29 @@
 
 use conefield_core::arena::{Arena, InitReport, Layout, Weights};
 use conefield_core::error::{Result, ensure};
-use conefield_core::spec::{Initializer, InitializerSpec};
+use conefield_core::settings::{Initializer, InitializerSpec};
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
 /// Settings of `checkpoint`.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields)]
-pub struct Checkpoint {
+pub struct CheckpointSettings {
     /// The weights file. It must hold every weight of the pipeline, in the same shape.
     pub weights: String,
 }
 
-conefield_core::stage_type!(Initializer, "checkpoint", Checkpoint, "every weight from a file");
+conefield_core::stage_type!(Initializer, "checkpoint", CheckpointSettings, "every weight from a file");
 
 #[typetag::serde(name = "checkpoint")]
-impl InitializerSpec for Checkpoint {
+impl InitializerSpec for CheckpointSettings {
     fn build(&self, weights: &dyn Fn(&str) -> Result<Weights>) -> Result<Box<dyn Initializer>> {
-        ensure(!self.weights.is_empty(), "spec", "initializer.weights", "no name", "a weights file")?;
+        ensure(!self.weights.is_empty(), "spec", "weights", "no name", "a weights file")?;
         Ok(Box::new(CheckpointInitializer { path: self.weights.clone(), weights: weights(&self.weights)? }))
     }
 }
 
-/// The initializer that [`Checkpoint`] builds.
+/// The initializer that [`CheckpointSettings`] builds.
 #[derive(Debug, Clone, PartialEq)]
 pub struct CheckpointInitializer {
     path: String,
@@ -52,12 +52,12 @@ mod tests {
         let block = Block { name: "encoder.0.table".into(), shape: vec![2], range: 0..2 };
         let layout = Layout { blocks: vec![block] };
         let weights = Weights::from_arena(&layout, &[1.0, 2.0], |_| true);
-        let settings = Checkpoint { weights: "w".into() };
+        let settings = CheckpointSettings { weights: "w".into() };
         let mut arena = Arena::new(2);
         let built = settings.build(&|_| Ok(weights.clone())).unwrap();
         assert_eq!(built.apply(&layout, &mut arena).unwrap().loaded, ["encoder.0.table"]);
         assert_eq!(*arena.params, [1.0, 2.0]);
         assert!(settings.build(&|p| Err(Error::invalid(p, "file", "nothing", "weights"))).is_err());
-        assert!(Checkpoint { weights: String::new() }.build(&|_| Ok(Weights::default())).is_err());
+        assert!(CheckpointSettings { weights: String::new() }.build(&|_| Ok(Weights::default())).is_err());
     }
 }

@@ -6,7 +6,7 @@
 
 use conefield_core::arena::{Arena, InitReport, Layout, Weights};
 use conefield_core::error::{Error, Result, ensure};
-use conefield_core::spec::{Initializer, InitializerSpec};
+use conefield_core::settings::{Initializer, InitializerSpec};
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
@@ -23,7 +23,7 @@ conefield_core::stage_type!(Initializer, "mci", Mci, "normalizers and field from
 #[typetag::serde(name = "mci")]
 impl InitializerSpec for Mci {
     fn build(&self, weights: &dyn Fn(&str) -> Result<Weights>) -> Result<Box<dyn Initializer>> {
-        ensure(!self.weights.is_empty(), "spec", "initializer.weights", "no name", "a weights file")?;
+        ensure(!self.weights.is_empty(), "spec", "weights", "no name", "a weights file")?;
         Ok(Box::new(MciInitializer { path: self.weights.clone(), weights: weights(&self.weights)? }))
     }
 }

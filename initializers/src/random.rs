@@ -2,7 +2,7 @@
 
 use conefield_core::arena::{Arena, InitReport, Layout, Weights};
 use conefield_core::error::Result;
-use conefield_core::spec::{Initializer, InitializerSpec};
+use conefield_core::settings::{Initializer, InitializerSpec};
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 

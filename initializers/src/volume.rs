@@ -1,10 +1,9 @@
-//! A known volume to start from: another solver's result, an earlier scan of the same object.
-//!
-//! Solvers on voxels take it as their first iterate. A field is trained on it voxel by voxel for some steps before it
-//! sees the scan.
+//! A known volume to start from: another method's result, an earlier scan of the same object. The field is trained on it
+//! voxel by voxel for some steps before it sees the scan.
 
+use conefield_core::arena::{Arena, InitReport, Layout, Weights};
 use conefield_core::error::{Result, ensure};
-use conefield_core::spec::{InitializerSpec, VolumeStart};
+use conefield_core::settings::{Initializer, InitializerSpec, KnownVolume};
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
@@ -20,15 +19,30 @@ pub struct FromVolume {
 }
 
 fn steps() -> u64 {
-    500
+    KnownVolume::STEPS
 }
 
 conefield_core::stage_type!(Initializer, "volume", FromVolume, "a known volume to start from");
 
 #[typetag::serde(name = "volume")]
 impl InitializerSpec for FromVolume {
-    fn volume(&self) -> Result<Option<VolumeStart>> {
-        ensure(!self.path.is_empty(), "spec", "initializer.path", "no name", "a volume file")?;
-        Ok(Some(VolumeStart { path: self.path.clone(), steps: self.steps }))
+    fn build(&self, _: &dyn Fn(&str) -> Result<Weights>) -> Result<Box<dyn Initializer>> {
+        ensure(!self.path.is_empty(), "spec", "path", "no name", "a volume file")?;
+        Ok(Box::new(self.clone()))
+    }
+}
+
+impl Initializer for FromVolume {
+    fn apply(&self, layout: &Layout, _: &mut Arena) -> Result<InitReport> {
+        let fresh = layout.blocks.iter().map(|b| (b.name.clone(), "random, then learned".into())).collect();
+        Ok(InitReport { fresh, ..InitReport::default() })
+    }
+
+    fn volume(&self) -> Option<KnownVolume> {
+        Some(KnownVolume { path: self.path.clone(), steps: self.steps })
+    }
+
+    fn describe(&self) -> String {
+        format!("volume: {} learned in {} steps", self.path, self.steps)
     }
 }

@@ -1,6 +1,7 @@
 //! Checkpoints: safetensors with a format version and a checksum of the values.
 
-use crate::weights::{Weights, read_weights, write_weights};
+use crate::weights::{read_weights, write_weights};
+use conefield_core::arena::Weights;
 use conefield_core::{Error, Result};
 use flate2::Crc;
 use std::collections::BTreeMap;
@@ -33,7 +34,7 @@ pub fn read_checkpoint(path: impl AsRef<Path>) -> Result<Weights> {
     let mut file = read_weights(path)?;
     let found = checksum(file.tensors.values().map(|(_, values)| &values[..]));
     for (key, expected) in [("format", FORMAT), ("format_version", VERSION), ("crc32", &found)] {
-        let said = file.metadata.remove(key);
+        let said = file.notes.remove(key);
         if said.as_deref() != Some(expected) {
             let said = said.map_or("nothing".into(), |s| format!("\"{s}\""));
             return Err(Error::invalid(path.display().to_string(), key, said, format!("\"{expected}\"")));
@@ -69,7 +70,7 @@ mod tests {
         let tensors = [("b", [2], &[1.0f32, 2.0][..]), ("a", [3], &[0.5, -1.0, 4.0][..])];
         write_checkpoint(&path, &tensors, &text).unwrap();
         let back = read_checkpoint(&path).unwrap();
-        assert_eq!((back.metadata, back.tensors["a"].1[2]), (text.clone(), 4.0));
+        assert_eq!((back.notes, back.tensors["a"].1[2]), (text.clone(), 4.0));
         let good = std::fs::read(&path).unwrap();
         let refused = |bytes: &[u8], word: &str| {
             std::fs::write(&path, bytes).unwrap();

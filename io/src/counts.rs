@@ -4,12 +4,14 @@
 //! dark value `d` to what it counts and each pixel answers by its own factor, which the flat field `f` (a view
 //! without object) holds: `A = −ln((I − d)/(f − d))`.
 
-use crate::bad_pixels::{Filling, from_fields, outliers};
-use crate::border::{median, pieces, quantile};
+use crate::filling::Filling;
 use conefield_core::error::ensure;
 use conefield_core::{Error, Result};
+use conefield_diagnosis::bad_pixels::{from_fields, outliers};
+use conefield_diagnosis::border::border_medians;
+use conefield_diagnosis::quantiles::{median, quantile};
 use ndarray::parallel::prelude::*;
-use ndarray::{Array2, Array3, Axis, Zip};
+use ndarray::{Array2, Array3, ArrayView2, Axis, Zip};
 use serde::Serialize;
 
 /// With more bad pixels than this share the fields are wrong, not the detector.
@@ -73,51 +75,21 @@ pub fn line_integrals(
     let mut values = counts;
     let (views, rows, columns) = values.dim();
     let pixels = rows * columns;
-    ensure(
-        views > 0 && pixels > 0,
-        place,
-        "counts",
-        format!("{:?}", values.shape()),
-        "at least one pixel of one view",
-    )?;
-    if let Some((at, x)) = values.indexed_iter().find(|(_, x)| !x.is_finite()) {
-        return Err(Error::invalid(place, format!("counts[{}, {}, {}]", at.0, at.1, at.2), x, "a finite number"));
-    }
+    check_counts(place, &values)?;
     let dark = correction.dark.as_ref();
     if let Some(d) = dark {
         check_field(place, "dark", d, [rows, columns])?;
         values.axis_iter_mut(Axis(0)).into_par_iter().for_each(|mut v| v -= d);
     }
-    let response = match &correction.open {
-        OpenBeam::Flat(flat) => {
-            check_field(place, "flat", flat, [rows, columns])?;
-            Some(dark.map_or_else(|| flat.clone(), |d| flat - d))
-        }
-        _ => None,
-    };
-    let dark_level = dark.map_or(0.0, middle);
-    // One number a view; ones where the flat field holds a number a pixel.
-    let mut open = match &correction.open {
-        OpenBeam::Flat(_) => vec![1.0; views],
-        OpenBeam::Number(x) => {
-            let above = (x - f64::from(dark_level)) as f32;
-            let expected = "a finite number above the dark value";
-            ensure(x.is_finite() && above > 0.0, place, "i0", x, expected)?;
-            vec![above; views]
-        }
-        OpenBeam::Air => vec![0.0; views],
-    };
+    let response = response(place, correction, [rows, columns])?;
+    let mut open = open_beam(place, correction, views)?;
     let typical = response.as_ref().map(middle).or(open.first().copied().filter(|x| *x > 0.0));
     let known = from_fields(response.as_ref().map(|r| r.view()), dark.map(|d| d.view()), typical.unwrap_or(f32::MAX));
     let mut bad = Array2::from_elem((rows, columns), false);
     known.iter().for_each(|&at| bad[at] = true);
     refuse_bad(place, known.len(), pixels)?;
     if correction.open == OpenBeam::Air {
-        for (v, (view, open)) in values.axis_iter(Axis(0)).zip(&mut open).enumerate() {
-            *open = quantile(&pieces(view, |r, c| !bad[[r, c]]), 0.85).unwrap_or(0.0);
-            let expected = "light at the border: with nothing there, give I0 as a number or a flat field";
-            ensure(*open > 0.0, place, &format!("air of view {v}"), format!("{open} counts above dark"), expected)?;
-        }
+        open = open_beam_of_air(place, &values, &bad)?;
     }
     let (low, mid, high) = spread(response.as_ref().map_or_else(|| open.clone(), |r| good(r, &bad)));
     let floor = correction.floor.map_or_else(|| (1e-4 * mid).min(1.0), |f| f as f32);
@@ -133,20 +105,7 @@ pub fn line_integrals(
     staying.iter().for_each(|&at| bad[at] = true);
     let count = known.len() + staying.len();
     refuse_bad(place, count, pixels)?;
-    let clamped: usize = values
-        .axis_iter(Axis(0))
-        .into_par_iter()
-        .zip(&open)
-        .map(|(view, &open)| {
-            let mut n = 0usize;
-            // Only what was clamped comes out as exactly this.
-            Zip::from(&view)
-                .and(&response)
-                .and(&bad)
-                .for_each(|&x, &r, &b| n += usize::from(!b && x == (open * r / floor).ln()));
-            n
-        })
-        .sum();
+    let clamped = clamped(&values, &open, &response, &bad, floor);
     let clamped = clamped as f64 / (views as f64 * (pixels - count).max(1) as f64);
     if clamped > MOST_CLAMPED {
         let found = format!("{:.1} % of them at or below {floor} above dark", 100.0 * clamped);
@@ -163,17 +122,79 @@ pub fn line_integrals(
         bad_by_outliers: staying.len(),
         bad: count as f64 / pixels as f64,
     };
-    tracing::info!(
-        "{place}: open beam {mid:.4}; {:.3} % of the values at or below the floor of {floor}; {count} bad pixels \
-         ({} by flat and dark, {} as outliers)",
-        100.0 * clamped,
-        known.len(),
-        staying.len()
-    );
-    if clamped > 0.001 {
-        tracing::warn!("{place}: {:.2} % of the values have no light left and are clamped", 100.0 * clamped);
-    }
+    report.log(place);
     Ok((values, report))
+}
+
+impl CountsReport {
+    fn log(&self, place: &str) {
+        let Self { open_beam, floor, clamped, bad_by_fields, bad_by_outliers, .. } = self;
+        tracing::info!(
+            "{place}: open beam {:.4}; {:.3} % of the values at or below the floor of {}; {} bad pixels \
+             ({bad_by_fields} by flat and dark, {bad_by_outliers} as outliers)",
+            open_beam[1],
+            100.0 * clamped,
+            *floor as f32,
+            bad_by_fields + bad_by_outliers,
+        );
+        if *clamped > 0.001 {
+            tracing::warn!("{place}: {:.2} % of the values have no light left and are clamped", 100.0 * clamped);
+        }
+    }
+}
+
+fn check_counts(place: &str, counts: &Array3<f32>) -> Result<()> {
+    ensure(!counts.is_empty(), place, "counts", format!("{:?}", counts.shape()), "at least one pixel of one view")?;
+    match counts.indexed_iter().find(|(_, x)| !x.is_finite()) {
+        Some(((v, r, c), x)) => Err(Error::invalid(place, format!("counts[{v}, {r}, {c}]"), x, "a finite number")),
+        None => Ok(()),
+    }
+}
+
+/// The flat field above dark, `[row, column]`, if there is one.
+fn response(place: &str, correction: &Correction, detector: [usize; 2]) -> Result<Option<Array2<f32>>> {
+    let OpenBeam::Flat(flat) = &correction.open else { return Ok(None) };
+    check_field(place, "flat", flat, detector)?;
+    Ok(Some(correction.dark.as_ref().map_or_else(|| flat.clone(), |d| flat - d)))
+}
+
+/// The open beam above dark, one number a view: 1 where the flat field holds a number a pixel, 0 where only the border
+/// tells.
+fn open_beam(place: &str, correction: &Correction, views: usize) -> Result<Vec<f32>> {
+    match &correction.open {
+        OpenBeam::Flat(_) => Ok(vec![1.0; views]),
+        OpenBeam::Number(x) => {
+            let above = (x - f64::from(correction.dark.as_ref().map_or(0.0, middle))) as f32;
+            ensure(x.is_finite() && above > 0.0, place, "i0", x, "a finite number above the dark value")?;
+            Ok(vec![above; views])
+        }
+        OpenBeam::Air => Ok(vec![0.0; views]),
+    }
+}
+
+/// What the border of each view shows, `bad` pixels left out.
+fn open_beam_of_air(place: &str, values: &Array3<f32>, bad: &Array2<bool>) -> Result<Vec<f32>> {
+    let expected = "light at the border: with nothing there, give I0 as a number or a flat field";
+    let of_view = |(v, view): (usize, ArrayView2<f32>)| {
+        let open = quantile(&border_medians(view, |r, c| !bad[[r, c]]), 0.85).unwrap_or(0.0);
+        ensure(open > 0.0, place, &format!("air of view {v}"), format!("{open} counts above dark"), expected)?;
+        Ok(open)
+    };
+    values.axis_iter(Axis(0)).enumerate().map(of_view).collect()
+}
+
+/// How many line integrals come from counts at or below `floor`, `bad` pixels left out.
+fn clamped(values: &Array3<f32>, open: &[f32], response: &Array2<f32>, bad: &Array2<bool>, floor: f32) -> usize {
+    let of_view = |(view, &open): (ArrayView2<f32>, &f32)| {
+        let mut n = 0usize;
+        // Only what was clamped comes out as exactly this.
+        Zip::from(&view)
+            .and(response)
+            .and(bad)
+            .for_each(|&x, &r, &b| n += usize::from(!b && x == (open * r / floor).ln()));
+        n
+    };
+    values.axis_iter(Axis(0)).into_par_iter().zip(open).map(of_view).sum()
 }
 
 fn check_field(place: &str, field: &str, image: &Array2<f32>, want: [usize; 2]) -> Result<()> {

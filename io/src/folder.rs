@@ -42,9 +42,9 @@ pub(crate) fn within(folder: &Path, place: &str, field: &str, name: &str) -> Res
 
 /// The files that a description has named so far. Few bytes that name one large file many times would fill memory.
 #[derive(Default)]
-pub(crate) struct Named(HashSet<(PathBuf, Option<String>)>);
+pub(crate) struct NamedFiles(HashSet<(PathBuf, Option<String>)>);
 
-impl Named {
+impl NamedFiles {
     /// Refuses `part` (the array of an archive, say) of `path` if it was named before.
     pub fn once(&mut self, place: &str, field: &str, path: &Path, part: Option<&str>) -> Result<()> {
         let real = path.canonicalize().map_err(|e| Error::io(path, e))?;

@@ -1,6 +1,6 @@
 //! A file, packed or not, that is read front to back and never trusted about its length.
 
-use crate::number::{Number, Order};
+use crate::number::{ByteOrder, Number};
 use conefield_core::{Error, Result, files};
 use flate2::bufread::{MultiGzDecoder, ZlibDecoder};
 use std::io::{BufRead, BufReader, ErrorKind, Read};
@@ -129,7 +129,7 @@ impl Input {
         field: &str,
         count: usize,
         number: Number,
-        order: Order,
+        order: ByteOrder,
         map: impl Fn(f64) -> f32 + Copy,
     ) -> Result<Vec<f32>> {
         let want = (count as u64)

@@ -7,8 +7,6 @@
 //! - Projections as scanners give them: [`read_scanner`] (a description in TOML; TIFF, NumPy, RTK's XML geometry).
 //! - Sizes, before memory is taken: [`scan_size`], [`volume_voxels`].
 //! - Weights: [`read_weights`], [`write_weights`]; checkpoints: [`read_checkpoint`], [`write_checkpoint`] (safetensors).
-//! - Pictures: [`slices_png`], [`compare_png`], [`features_png`], [`curves_png`], [`survey::survey_png`].
-//! - What a scan's geometry means and what in it will trouble a reconstruction: [`survey`].
 //!
 //! Readers tell a format from what a file holds, check a header before they take memory for what it claims, and
 //! refuse with the file, the field, what was found and what was expected. Lengths are converted once, here: inside
@@ -19,15 +17,11 @@
 
 mod affine;
 mod atomic;
-mod bad_pixels;
-mod border;
-mod canvas;
-mod check;
 mod checkpoint;
 mod counts;
-mod curves;
 mod dicom;
 mod file_order;
+mod filling;
 mod folder;
 mod input;
 mod metaimage;
@@ -46,9 +40,7 @@ mod scan;
 mod scan_folder;
 mod scanner;
 mod size;
-mod slices;
 mod stack;
-pub mod survey;
 mod text;
 mod tiff;
 mod unit;
@@ -59,13 +51,10 @@ mod weights;
 mod testing;
 
 pub use atomic::{is_unfinished, write_atomic, write_folder_atomic, write_text_atomic};
-pub use check::{LineIntegralCheck, check_line_integrals};
 pub use checkpoint::{read_checkpoint, write_checkpoint};
 pub use counts::{Correction, CountsReport, OpenBeam, line_integrals};
-pub use curves::{Corner, CurveOptions, Panel, curves_png, curves_png_with, panels_png};
 pub use file_order::{PACKED_BYTES, SLAB_BYTES};
 pub use naf::{read_naf, write_naf};
-pub use orbit::Orbit;
 pub use r2::{read_r2, write_r2};
 pub use rtk::{read_rtk_geometry, write_rtk_geometry};
 pub use rtk_folder::write_rtk;
@@ -73,6 +62,5 @@ pub use scan::{DataSet, read_data_set, read_scan, read_truth};
 pub use scan_folder::write_scan;
 pub use scanner::{I0, ImportOptions, Imported, read_scanner};
 pub use size::{ScanSize, scan_size, volume_voxels};
-pub use slices::{MiddleSlices, compare_png, features_png, slices_png};
 pub use volume::{is_volume, packed_bytes, read_volume, write_volume, write_voxels};
-pub use weights::{Weights, read_weights, write_weights};
+pub use weights::{read_weights, write_weights};

@@ -5,7 +5,7 @@ use crate::affine::{self, Affine};
 use crate::file_order::{self, FileOrder, PACKED_BYTES};
 use crate::folder;
 use crate::input::Input;
-use crate::number::{Number, Order};
+use crate::number::{ByteOrder, Number};
 use conefield_core::geometry::{VoxelGrid, norm};
 use conefield_core::parts::Voxels;
 use conefield_core::scan::Volume;
@@ -169,7 +169,7 @@ impl Header {
         })
     }
 
-    fn order(&self) -> Result<Order> {
+    fn order(&self) -> Result<ByteOrder> {
         let names = ["BinaryDataByteOrderMSB", "ElementByteOrderMSB"];
         let big = match (self.flag(names[0])?, self.flag(names[1])?) {
             (Some(a), Some(b)) if a != b => {
@@ -177,7 +177,7 @@ impl Header {
             }
             (a, b) => a.or(b).unwrap_or(false),
         };
-        Ok(if big { Order::Big } else { Order::Little })
+        Ok(if big { ByteOrder::Big } else { ByteOrder::Little })
     }
 
     /// Millimetres a unit of length.

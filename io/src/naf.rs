@@ -6,13 +6,14 @@
 //! see [`read_naf`].
 
 use crate::input::read_bytes;
-use crate::orbit::Orbit;
+use crate::orbit::common_orbit;
 use crate::pickle::{self, Item, Out, Pickle};
 use crate::scan::DataSet;
 use crate::unit::{self, Reading, Units};
 use crate::{rays, write_atomic};
 use conefield_core::error::ensure;
 use conefield_core::geometry::{Geometry, VoxelGrid};
+use conefield_core::orbit::CircularOrbit;
 use conefield_core::scan::{Scan, Unit, Volume};
 use conefield_core::{Error, Result};
 use ndarray::{Array3, Ix3};
@@ -178,9 +179,9 @@ impl Description {
         })
     }
 
-    fn orbit(&self, angles: Vec<f64>) -> Orbit {
+    fn orbit(&self, angles: Vec<f64>) -> CircularOrbit {
         let offset = [-self.offset[0], self.offset[1]];
-        Orbit { dso: self.dso, dsd: self.dsd, pixel: self.pixel, offset, angles }
+        CircularOrbit { dso: self.dso, dsd: self.dsd, pixel: self.pixel, offset, angles }
     }
 
     /// Geometry and projections of `train` or `val`. Shapes are compared before a number is decoded.
@@ -308,7 +309,7 @@ fn stated_unit(place: &str, top: &Item) -> Result<Option<Unit>> {
 pub fn write_naf(path: impl AsRef<Path>, train: &Scan, test: Option<&Scan>, volume: Option<&Volume>) -> Result<()> {
     let path = path.as_ref();
     let place = path.display().to_string();
-    let (orbit, test_orbit) = Orbit::common(&place, "NAF's format", train, test)?;
+    let (orbit, test_orbit) = common_orbit(&place, "NAF's format", train, test)?;
     let (g, grid) = (&train.geometry, &train.geometry.volume);
     if let Some(v) = volume {
         let (found, expected) = (format!("{:?}", v.data.shape()), format!("{:?}", grid.shape));
@@ -387,7 +388,7 @@ mod tests {
     /// A scan that its volume explains, with the offset that the standard one lacks the size for.
     fn consistent(unit: Unit) -> (Scan, Volume) {
         let mut s = scan();
-        let mut orbit = Orbit::fit(&s.geometry.views).unwrap();
+        let mut orbit = CircularOrbit::fit(&s.geometry.views).unwrap();
         orbit.offset = [0.25, -1.5];
         s.geometry.views = orbit.views();
         s.unit = unit;
@@ -452,11 +453,11 @@ mod tests {
         let volume = naf.volume.as_ref().unwrap();
         let right = rays::agreement(&naf.train, &volume.data).unwrap();
         assert!((right.ratio - 1.0).abs() < 0.02 && right.residual < 0.03, "{right:?}");
-        let orbit = Orbit::fit(&g.views).unwrap();
+        let orbit = CircularOrbit::fit(&g.views).unwrap();
         assert!((orbit.offset[1] - 30.0).abs() < 1e-9 && orbit.offset[0] == 0.0, "{orbit:?}");
         for offset in [[30.0, 0.0], [-30.0, 0.0], [0.0, -30.0], [0.0, 0.0]] {
             let mut moved = naf.train.clone();
-            moved.geometry.views = Orbit { offset, ..orbit.clone() }.views();
+            moved.geometry.views = CircularOrbit { offset, ..orbit.clone() }.views();
             let wrong = rays::agreement(&moved, &volume.data).unwrap();
             assert!(wrong.residual > 3.0 * right.residual, "{offset:?}: {wrong:?}, {right:?}");
         }
@@ -517,7 +518,7 @@ mod tests {
         let path = dir.path().join("a.pickle");
         let (s, volume) = consistent(Unit::default());
         let mut swapped = s.clone();
-        let mut orbit = Orbit::fit(&s.geometry.views).unwrap();
+        let mut orbit = CircularOrbit::fit(&s.geometry.views).unwrap();
         // The file's [v, u] is [-offset[0], offset[1]].
         orbit.offset = [-orbit.offset[1], -orbit.offset[0]];
         swapped.geometry.views = orbit.views();

@@ -6,7 +6,7 @@
 use crate::affine::{self, Affine};
 use crate::file_order::{self, FileOrder};
 use crate::input::Input;
-use crate::number::{Number, Order};
+use crate::number::{ByteOrder, Number};
 use conefield_core::geometry::VoxelGrid;
 use conefield_core::parts::Voxels;
 use conefield_core::scan::Volume;
@@ -52,8 +52,8 @@ pub(crate) fn read_from(input: &mut Input, head: &[u8]) -> Result<Volume> {
     grid.validate(&input.place())?;
     let count = grid.len().unwrap_or(0);
     let order = match header.endianness {
-        Endianness::Little => Order::Little,
-        Endianness::Big => Order::Big,
+        Endianness::Little => ByteOrder::Little,
+        Endianness::Big => ByteOrder::Big,
     };
     input.skip(offset - HEADER as u64, "vox_offset")?;
     let values = input.numbers("data", count, number, order, |x| (slope * x + inter) as f32)?;

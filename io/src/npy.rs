@@ -2,7 +2,7 @@
 
 use crate::file_order::{self, FileOrder};
 use crate::input::Input;
-use crate::number::{self, Number, Order};
+use crate::number::{self, ByteOrder, Number};
 use conefield_core::parts::Voxels;
 use conefield_core::{Error, Result};
 use ndarray::{Array, ArrayD, Dimension, IxDyn, ShapeBuilder};
@@ -19,7 +19,7 @@ const LONGEST_HEADER: usize = 1 << 16;
 #[derive(Debug, PartialEq)]
 struct Header {
     number: Number,
-    order: Order,
+    order: ByteOrder,
     fortran: bool,
     shape: Vec<usize>,
 }
@@ -124,9 +124,9 @@ fn read_header(input: &mut Input, start: Vec<u8>) -> Result<Header> {
     parser
         .dict(|key, value| {
             match (key, value) {
-                ("descr", Value::Text(t)) => descr = Some(t),
-                ("fortran_order", Value::Bool(b)) => fortran = Some(b),
-                ("shape", Value::Tuple(s)) => shape = Some(s),
+                ("descr", Literal::Text(t)) => descr = Some(t),
+                ("fortran_order", Literal::Bool(b)) => fortran = Some(b),
+                ("shape", Literal::Tuple(s)) => shape = Some(s),
                 _ => return None,
             }
             Some(())
@@ -149,13 +149,13 @@ fn read_header(input: &mut Input, start: Vec<u8>) -> Result<Header> {
 }
 
 /// How NumPy's name for a type of real numbers, e.g. `<f4`, has them stored; `None` for any other.
-pub(crate) fn element(descr: &str) -> Option<(Number, Order)> {
+pub(crate) fn element(descr: &str) -> Option<(Number, ByteOrder)> {
     let (order, kind) = match descr.chars().next()? {
-        '<' => (Order::Little, &descr[1..]),
-        '>' => (Order::Big, &descr[1..]),
-        '|' => (Order::Little, &descr[1..]),
-        '=' => (if cfg!(target_endian = "big") { Order::Big } else { Order::Little }, &descr[1..]),
-        _ => (Order::Little, descr),
+        '<' => (ByteOrder::Little, &descr[1..]),
+        '>' => (ByteOrder::Big, &descr[1..]),
+        '|' => (ByteOrder::Little, &descr[1..]),
+        '=' => (if cfg!(target_endian = "big") { ByteOrder::Big } else { ByteOrder::Little }, &descr[1..]),
+        _ => (ByteOrder::Little, descr),
     };
     let number = match kind {
         "b1" => Number::Bool,
@@ -179,7 +179,7 @@ fn shape_text(shape: &[usize]) -> String {
 }
 
 /// The three kinds of value that stand in a header.
-enum Value {
+enum Literal {
     Text(String),
     Bool(bool),
     Tuple(Vec<usize>),
@@ -196,7 +196,7 @@ impl Python<'_> {
         Some(())
     }
 
-    fn dict(&mut self, mut entry: impl FnMut(&str, Value) -> Option<()>) -> Option<()> {
+    fn dict(&mut self, mut entry: impl FnMut(&str, Literal) -> Option<()>) -> Option<()> {
         self.eat("{")?;
         loop {
             if self.eat("}").is_some() {
@@ -222,20 +222,20 @@ impl Python<'_> {
         Some(inner[..end].to_string())
     }
 
-    fn value(&mut self) -> Option<Value> {
+    fn value(&mut self) -> Option<Literal> {
         if self.eat("True").is_some() {
-            return Some(Value::Bool(true));
+            return Some(Literal::Bool(true));
         }
         if self.eat("False").is_some() {
-            return Some(Value::Bool(false));
+            return Some(Literal::Bool(false));
         }
         if self.eat("(").is_none() {
-            return self.text().map(Value::Text);
+            return self.text().map(Literal::Text);
         }
         let mut shape = Vec::new();
         loop {
             if self.eat(")").is_some() {
-                return Some(Value::Tuple(shape));
+                return Some(Literal::Tuple(shape));
             }
             self.rest = self.rest.trim_start();
             let end = self.rest.find(|c: char| !c.is_ascii_digit())?;
@@ -245,7 +245,7 @@ impl Python<'_> {
             let _ = self.eat("L");
             if self.eat(",").is_none() {
                 self.eat(")")?;
-                return Some(Value::Tuple(shape));
+                return Some(Literal::Tuple(shape));
             }
         }
     }

@@ -20,7 +20,7 @@ pub(crate) enum Number {
 
 /// Which end of a number comes first.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub(crate) enum Order {
+pub(crate) enum ByteOrder {
     Little,
     Big,
 }
@@ -37,13 +37,13 @@ impl Number {
     }
 
     /// Appends the numbers in `raw` (whole numbers only) to `out`, through `map`.
-    pub fn decode<T>(self, order: Order, raw: &[u8], out: &mut Vec<T>, map: impl Fn(f64) -> T) {
+    pub fn decode<T>(self, order: ByteOrder, raw: &[u8], out: &mut Vec<T>, map: impl Fn(f64) -> T) {
         macro_rules! each {
             ($t:ty) => {{
                 let (raw, _) = raw.as_chunks::<{ size_of::<$t>() }>();
                 match order {
-                    Order::Little => out.extend(raw.iter().map(|b| map(<$t>::from_le_bytes(*b) as f64))),
-                    Order::Big => out.extend(raw.iter().map(|b| map(<$t>::from_be_bytes(*b) as f64))),
+                    ByteOrder::Little => out.extend(raw.iter().map(|b| map(<$t>::from_le_bytes(*b) as f64))),
+                    ByteOrder::Big => out.extend(raw.iter().map(|b| map(<$t>::from_be_bytes(*b) as f64))),
                 }
             }};
         }
@@ -81,10 +81,10 @@ mod tests {
     #[test]
     fn both_byte_orders_are_read() {
         let mut out = Vec::new();
-        Number::I16.decode(Order::Little, &(-2i16).to_le_bytes(), &mut out, |x| x as f32);
-        Number::I16.decode(Order::Big, &(-2i16).to_be_bytes(), &mut out, |x| x as f32);
-        Number::F64.decode(Order::Big, &1.5f64.to_be_bytes(), &mut out, |x| x as f32);
-        Number::U64.decode(Order::Little, &u64::MAX.to_le_bytes(), &mut out, |x| x as f32);
+        Number::I16.decode(ByteOrder::Little, &(-2i16).to_le_bytes(), &mut out, |x| x as f32);
+        Number::I16.decode(ByteOrder::Big, &(-2i16).to_be_bytes(), &mut out, |x| x as f32);
+        Number::F64.decode(ByteOrder::Big, &1.5f64.to_be_bytes(), &mut out, |x| x as f32);
+        Number::U64.decode(ByteOrder::Little, &u64::MAX.to_le_bytes(), &mut out, |x| x as f32);
         assert_eq!(out, [-2.0, -2.0, 1.5, u64::MAX as f32]);
     }
 }

@@ -121,119 +121,177 @@ impl<'a> Machine<'_, 'a> {
     }
 
     fn step(&mut self, code: u8) -> Result<()> {
+        let done = self.scalar(code)?
+            || self.sequence(code)?
+            || self.dict(code)?
+            || self.rearrange(code)?
+            || self.memory(code)?
+            || self.object(code)?;
+        if done { Ok(()) } else { Err(self.refused(code)) }
+    }
+
+    /// Makes a value that holds no others. Like the functions below: whether the opcode is one of its own.
+    fn scalar(&mut self, code: u8) -> Result<bool> {
         match code {
-            op::PROTO => self.protocol(),
-            op::FRAME => {
-                let length = self.count::<8>()?;
-                self.within(length)
-            }
-            op::NONE => self.push(Value::None),
-            op::NEWTRUE => self.push(Value::Bool(true)),
-            op::NEWFALSE => self.push(Value::Bool(false)),
+            op::NONE => self.push(Value::None)?,
+            op::NEWTRUE => self.push(Value::Bool(true))?,
+            op::NEWFALSE => self.push(Value::Bool(false))?,
             op::BININT => {
                 let x = i32::from_le_bytes(self.array()?);
-                self.push(Value::Int(x.into()))
+                self.push(Value::Int(x.into()))?;
             }
             op::BININT1 => {
                 let x = self.byte()?;
-                self.push(Value::Int(x.into()))
+                self.push(Value::Int(x.into()))?;
             }
             op::BININT2 => {
                 let x = u16::from_le_bytes(self.array()?);
-                self.push(Value::Int(x.into()))
+                self.push(Value::Int(x.into()))?;
             }
-            op::LONG1 => self.integer::<1>(),
-            op::LONG4 => self.integer::<4>(),
+            op::LONG1 => self.integer::<1>()?,
+            op::LONG4 => self.integer::<4>()?,
             op::BINFLOAT => {
                 let x = f64::from_be_bytes(self.array()?);
-                self.push(Value::Float(x))
+                self.push(Value::Float(x))?;
             }
-            op::SHORT_BINUNICODE => self.text::<1>(),
-            op::BINUNICODE => self.text::<4>(),
-            op::BINUNICODE8 => self.text::<8>(),
-            op::SHORT_BINBYTES | op::SHORT_BINSTRING => self.binary::<1>(),
-            op::BINBYTES | op::BINSTRING => self.binary::<4>(),
-            op::BINBYTES8 | op::BYTEARRAY8 => self.binary::<8>(),
-            op::EMPTY_TUPLE => self.make(Node::Tuple(Vec::new())),
-            op::TUPLE1 => self.tuple(1),
-            op::TUPLE2 => self.tuple(2),
-            op::TUPLE3 => self.tuple(3),
+            op::SHORT_BINUNICODE => self.text::<1>()?,
+            op::BINUNICODE => self.text::<4>()?,
+            op::BINUNICODE8 => self.text::<8>()?,
+            op::SHORT_BINBYTES | op::SHORT_BINSTRING => self.binary::<1>()?,
+            op::BINBYTES | op::BINSTRING => self.binary::<4>()?,
+            op::BINBYTES8 | op::BYTEARRAY8 => self.binary::<8>()?,
+            _ => return Ok(false),
+        }
+        Ok(true)
+    }
+
+    /// Makes or fills a tuple or list.
+    fn sequence(&mut self, code: u8) -> Result<bool> {
+        match code {
+            op::EMPTY_TUPLE => self.make(Node::Tuple(Vec::new()))?,
+            op::TUPLE1 => self.tuple(1)?,
+            op::TUPLE2 => self.tuple(2)?,
+            op::TUPLE3 => self.tuple(3)?,
             op::TUPLE => {
                 let items = self.above_mark()?;
-                self.make(Node::Tuple(items))
+                self.make(Node::Tuple(items))?;
             }
-            op::EMPTY_LIST => self.make(Node::List(Vec::new())),
+            op::EMPTY_LIST => self.make(Node::List(Vec::new()))?,
             op::LIST => {
                 let items = self.above_mark()?;
-                self.make(Node::List(items))
+                self.make(Node::List(items))?;
             }
             op::APPEND => {
                 let item = self.pop()?;
-                self.append(vec![item])
+                self.append(vec![item])?;
             }
             op::APPENDS => {
                 let items = self.above_mark()?;
-                self.append(items)
+                self.append(items)?;
             }
-            op::EMPTY_DICT => self.make(Node::Dict(Vec::new())),
+            _ => return Ok(false),
+        }
+        Ok(true)
+    }
+
+    /// Makes or fills a dict.
+    fn dict(&mut self, code: u8) -> Result<bool> {
+        match code {
+            op::EMPTY_DICT => self.make(Node::Dict(Vec::new()))?,
             op::DICT => {
                 let items = self.above_mark()?;
                 self.make(Node::Dict(Vec::new()))?;
-                self.set_items(items)
+                self.set_items(items)?;
             }
             op::SETITEM => {
                 let value = self.pop()?;
                 let key = self.pop()?;
-                self.set_items(vec![key, value])
+                self.set_items(vec![key, value])?;
             }
             op::SETITEMS => {
                 let items = self.above_mark()?;
-                self.set_items(items)
+                self.set_items(items)?;
+            }
+            _ => return Ok(false),
+        }
+        Ok(true)
+    }
+
+    /// Changes the stack alone, or nothing.
+    fn rearrange(&mut self, code: u8) -> Result<bool> {
+        match code {
+            op::PROTO => self.protocol()?,
+            op::FRAME => {
+                let length = self.count::<8>()?;
+                self.within(length)?;
             }
             op::MARK => {
                 self.count_value()?;
                 self.marks.push(self.stack.len());
-                Ok(())
             }
-            op::POP => self.pop_or_mark(),
-            op::POP_MARK => self.above_mark().map(|_| ()),
+            op::POP => self.pop_or_mark()?,
+            op::POP_MARK => drop(self.above_mark()?),
             op::DUP => {
                 let value = self.peek()?;
-                self.push(value)
+                self.push(value)?;
             }
+            _ => return Ok(false),
+        }
+        Ok(true)
+    }
+
+    /// Remembers a value or recalls one.
+    fn memory(&mut self, code: u8) -> Result<bool> {
+        match code {
             op::MEMOIZE => {
                 let index = self.memo.len() as u32;
-                self.remember(index)
+                self.remember(index)?;
             }
             op::BINPUT => {
                 let index = self.byte()?;
-                self.remember(index.into())
+                self.remember(index.into())?;
             }
             op::LONG_BINPUT => {
                 let index = u32::from_le_bytes(self.array()?);
-                self.remember(index)
+                self.remember(index)?;
             }
             op::BINGET => {
                 let index = self.byte()?;
-                self.recall(index.into())
+                self.recall(index.into())?;
             }
             op::LONG_BINGET => {
                 let index = u32::from_le_bytes(self.array()?);
-                self.recall(index)
+                self.recall(index)?;
             }
+            _ => return Ok(false),
+        }
+        Ok(true)
+    }
+
+    /// Makes one of the few objects that are let through.
+    fn object(&mut self, code: u8) -> Result<bool> {
+        match code {
             op::GLOBAL => {
                 let (module, name) = (self.line()?, self.line()?);
-                self.global(module, name)
+                self.global(module, name)?;
             }
             op::STACK_GLOBAL => {
                 let (name, module) = (self.pop()?, self.pop()?);
                 match (self.heap.text(module), self.heap.text(name)) {
-                    (Some(module), Some(name)) => self.global(module, name),
-                    _ => Err(self.wrong(self.heap.kind(name), "a module and a name")),
+                    (Some(module), Some(name)) => self.global(module, name)?,
+                    _ => return Err(self.wrong(self.heap.kind(name), "a module and a name")),
                 }
             }
-            op::REDUCE => self.reduce(),
-            op::BUILD => self.build(),
+            op::REDUCE => self.reduce()?,
+            op::BUILD => self.build()?,
+            _ => return Ok(false),
+        }
+        Ok(true)
+    }
+
+    /// Why an opcode is not taken.
+    fn refused(&self, code: u8) -> Error {
+        match code {
             op::PERSID
             | op::BINPERSID
             | op::EXT1
@@ -245,13 +303,13 @@ impl<'a> Machine<'_, 'a> {
             | op::OBJ
             | op::NEXT_BUFFER
             | op::READONLY_BUFFER => {
-                Err(self.wrong("an opcode that refers to something outside or makes an object", "data only"))
+                self.wrong("an opcode that refers to something outside or makes an object", "data only")
             }
-            op::EMPTY_SET | op::ADDITEMS | op::FROZENSET => Err(self.wrong("a set", "a list, tuple or dict")),
+            op::EMPTY_SET | op::ADDITEMS | op::FROZENSET => self.wrong("a set", "a list, tuple or dict"),
             op::INT | op::LONG | op::FLOAT | op::STRING | op::UNICODE | op::GET | op::PUT => {
-                Err(self.wrong("an opcode of protocol 0", "protocol 2 or later: write the file with Python 3"))
+                self.wrong("an opcode of protocol 0", "protocol 2 or later: write the file with Python 3")
             }
-            other => Err(self.wrong(format!("0x{other:02x}"), "an opcode of protocols 2 to 5")),
+            other => self.wrong(format!("0x{other:02x}"), "an opcode of protocols 2 to 5"),
         }
     }
 

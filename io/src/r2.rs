@@ -6,7 +6,7 @@
 //! file, whatever their unit is.
 
 use crate::input::LONGEST_TEXT;
-use crate::orbit::Orbit;
+use crate::orbit::common_orbit;
 use crate::scan::DataSet;
 use crate::text::{Notation, parse};
 use crate::unit::{self, Reading, Units};
@@ -14,6 +14,7 @@ use crate::{ScanSize, folder, npy, rays, write_atomic, write_folder_atomic, writ
 use conefield_core::error::ensure;
 use conefield_core::files::read_text;
 use conefield_core::geometry::{Geometry, VoxelGrid};
+use conefield_core::orbit::CircularOrbit;
 use conefield_core::scan::{Scan, Unit, Volume};
 use conefield_core::{Error, Result};
 use ndarray::{Array2, Array3, Axis, Ix2, Ix3};
@@ -89,7 +90,7 @@ fn read(folder: &Path, with_test: bool) -> Result<DataSet> {
     let pixel = each(&place, ["Detector", "[v, u]"], s.nDetector, s.sDetector, s.dDetector)?;
     let spacing = each(&place, ["Voxel", "[x, y, z]"], s.nVoxel, s.sVoxel, s.dVoxel)?;
     let grid = VoxelGrid { shape: s.nVoxel, spacing, center: s.offOrigin };
-    let orbit = |frames: &[Frame]| Orbit {
+    let orbit = |frames: &[Frame]| CircularOrbit {
         dso: s.DSO,
         dsd: s.DSD,
         pixel,
@@ -190,7 +191,7 @@ fn each<const N: usize>(
 
 fn projections(folder: &Path, place: &str, field: &str, frames: &[Frame], shape: [usize; 2]) -> Result<Array3<f32>> {
     let mut all: Vec<f32> = Vec::new();
-    let mut named = folder::Named::default();
+    let mut named = folder::NamedFiles::default();
     for (i, frame) in frames.iter().enumerate() {
         let field = format!("{field}[{i}].file_path");
         let path = folder::inside(folder, place, &field, &frame.file_path)?;
@@ -223,7 +224,7 @@ fn volume(folder: &Path, place: &str, name: &str, shape: [usize; 3]) -> Result<A
 pub fn write_r2(folder: impl AsRef<Path>, train: &Scan, test: Option<&Scan>, volume: Option<&Volume>) -> Result<()> {
     let folder = folder.as_ref();
     let place = folder.display().to_string();
-    let (orbit, test_orbit) = Orbit::common(&place, "R2-Gaussian's format", train, test)?;
+    let (orbit, test_orbit) = common_orbit(&place, "R2-Gaussian's format", train, test)?;
     if let Some(v) = volume {
         let (found, expected) = (format!("{:?}", v.data.shape()), format!("{:?}", train.geometry.volume.shape));
         ensure(v.data.shape() == train.geometry.volume.shape, &place, "shape of the volume", found, expected)?;
@@ -367,7 +368,7 @@ mod tests {
         let mut s = scan();
         s.unit = Unit { name: "r2".into(), mm: 1.0 };
         // Without its offset the small detector sees the volume.
-        let mut orbit = Orbit::fit(&s.geometry.views).unwrap();
+        let mut orbit = CircularOrbit::fit(&s.geometry.views).unwrap();
         orbit.offset = [0.25, -0.5];
         s.geometry.views = orbit.views();
         let data = Array3::from_shape_fn((5, 6, 7), |(x, y, z)| 0.01 + 0.001 * (x + y * z) as f32);

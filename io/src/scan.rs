@@ -21,7 +21,7 @@ pub struct DataSet {
 }
 
 /// A scan on disk.
-pub(crate) enum Found {
+pub(crate) enum ScanFile {
     /// conefield's own folder, with its description.
     Own(PathBuf),
     /// R2-Gaussian's folder.
@@ -38,19 +38,19 @@ pub(crate) enum Found {
 /// as well.
 pub fn read_scan(path: impl AsRef<Path>) -> Result<Scan> {
     match find(path.as_ref())? {
-        Found::Own(file) => scan_folder::read(&file),
-        Found::R2(folder) => r2::read_train(&folder).map(|r| r.train),
-        Found::Naf(file) => naf::read_train(&file),
-        Found::Scanner(file) => scanner::read_scanner(&file, &ImportOptions::default()).map(|i| i.scan),
+        ScanFile::Own(file) => scan_folder::read(&file),
+        ScanFile::R2(folder) => r2::read_train(&folder).map(|r| r.train),
+        ScanFile::Naf(file) => naf::read_train(&file),
+        ScanFile::Scanner(file) => scanner::read_scanner(&file, &ImportOptions::default()).map(|i| i.scan),
     }
 }
 
 /// Reads all that the scan's file or folder holds: training views, test views and volume.
 pub fn read_data_set(path: impl AsRef<Path>) -> Result<DataSet> {
     match find(path.as_ref())? {
-        Found::R2(folder) => r2::read_r2(&folder),
-        Found::Naf(file) => naf::read_naf(&file),
-        Found::Own(_) | Found::Scanner(_) => {
+        ScanFile::R2(folder) => r2::read_r2(&folder),
+        ScanFile::Naf(file) => naf::read_naf(&file),
+        ScanFile::Own(_) | ScanFile::Scanner(_) => {
             Ok(DataSet { train: read_scan(&path)?, test: None, volume: read_truth(&path)? })
         }
     }
@@ -59,30 +59,30 @@ pub fn read_data_set(path: impl AsRef<Path>) -> Result<DataSet> {
 /// Reads the volume that a scan was simulated from, if it carries one. Values are in `1/unit` of the scan.
 pub fn read_truth(path: impl AsRef<Path>) -> Result<Option<Volume>> {
     match find(path.as_ref())? {
-        Found::Own(file) => scan_folder::read_truth(&file),
-        Found::R2(folder) => r2::read_train(&folder).map(|r| r.volume),
-        Found::Naf(file) => naf::read_truth(&file),
-        Found::Scanner(_) => Ok(None),
+        ScanFile::Own(file) => scan_folder::read_truth(&file),
+        ScanFile::R2(folder) => r2::read_train(&folder).map(|r| r.volume),
+        ScanFile::Naf(file) => naf::read_truth(&file),
+        ScanFile::Scanner(_) => Ok(None),
     }
 }
 
-pub(crate) fn find(path: &Path) -> Result<Found> {
+pub(crate) fn find(path: &Path) -> Result<ScanFile> {
     let place = path.display().to_string();
     let understood = "a folder with scan.toml or scan.json (conefield), scanner.toml (a scanner's images) or \
                       meta_data.json (R2-Gaussian), or a pickle (NAF)";
     let info = path.metadata().map_err(|e| Error::io(path, e))?;
     if !info.is_dir() {
         if pickle::is_pickle(path)? {
-            return Ok(Found::Naf(path.to_path_buf()));
+            return Ok(ScanFile::Naf(path.to_path_buf()));
         }
         let folder = path.parent().filter(|p| !p.as_os_str().is_empty()).unwrap_or(Path::new("."));
         return match (path.file_name().and_then(|n| n.to_str()), path.extension().and_then(|e| e.to_str())) {
-            (Some("scan.toml" | "scan.json"), _) => Ok(Found::Own(path.to_path_buf())),
-            (Some(r2::META), _) => Ok(Found::R2(folder.to_path_buf())),
+            (Some("scan.toml" | "scan.json"), _) => Ok(ScanFile::Own(path.to_path_buf())),
+            (Some(r2::META), _) => Ok(ScanFile::R2(folder.to_path_buf())),
             (_, Some("toml" | "json")) => match format_of(path).as_deref() {
-                Some(scan_folder::FORMAT) => Ok(Found::Own(path.to_path_buf())),
+                Some(scan_folder::FORMAT) => Ok(ScanFile::Own(path.to_path_buf())),
                 // Its reader says what it misses in a description.
-                _ => Ok(Found::Scanner(path.to_path_buf())),
+                _ => Ok(ScanFile::Scanner(path.to_path_buf())),
             },
             _ => Err(Error::invalid(place, "scan", "a file of another kind", understood)),
         };
@@ -90,10 +90,10 @@ pub(crate) fn find(path: &Path) -> Result<Found> {
     let has = |name: &str| path.join(name).is_file();
     match (has("scan.toml"), has("scan.json"), has(r2::META)) {
         (true, true, _) => Err(Error::invalid(place, "scan", "both scan.toml and scan.json", "one of them")),
-        (true, ..) => Ok(Found::Own(path.join("scan.toml"))),
-        (_, true, _) => Ok(Found::Own(path.join("scan.json"))),
-        (.., true) => Ok(Found::R2(path.to_path_buf())),
-        _ if has(SCANNER) => Ok(Found::Scanner(path.join(SCANNER))),
+        (true, ..) => Ok(ScanFile::Own(path.join("scan.toml"))),
+        (_, true, _) => Ok(ScanFile::Own(path.join("scan.json"))),
+        (.., true) => Ok(ScanFile::R2(path.to_path_buf())),
+        _ if has(SCANNER) => Ok(ScanFile::Scanner(path.join(SCANNER))),
         _ => Err(Error::invalid(place, "scan", "none of the files that describe one", understood)),
     }
 }

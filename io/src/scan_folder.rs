@@ -22,11 +22,11 @@
 //! ```
 
 use crate::folder;
-use crate::orbit::Orbit;
 use crate::text::described;
 use crate::{ScanSize, npy, read_volume, write_atomic, write_folder_atomic, write_text_atomic, write_volume};
 use conefield_core::error::ensure;
 use conefield_core::geometry::{Geometry, View, VoxelGrid};
+use conefield_core::orbit::CircularOrbit;
 use conefield_core::scan::{Scan, Unit, Volume};
 use conefield_core::{Error, Result};
 use ndarray::Ix3;
@@ -126,7 +126,7 @@ fn views(place: &str, d: &mut Description) -> Result<Vec<View>> {
     if let Some((i, a)) = angles.iter().enumerate().find(|(_, a)| !a.is_finite()) {
         return Err(Error::invalid(place, format!("orbit.angles[{i}]"), a, "a finite angle in radians"));
     }
-    let orbit = Orbit { dso: table.dso, dsd: table.dsd, pixel: table.pixel, offset: table.offset, angles };
+    let orbit = CircularOrbit { dso: table.dso, dsd: table.dsd, pixel: table.pixel, offset: table.offset, angles };
     Ok(orbit.views())
 }
 
@@ -193,7 +193,7 @@ pub fn write_scan(folder: impl AsRef<Path>, scan: &Scan, truth: Option<&Volume>)
     let known = |n: &str| ["scan.toml", "scan.json", PROJECTIONS, TRUTH].contains(&n);
     folder::may_replace(folder, "conefield scan", known, &["scan.toml", "scan.json"])?;
     let g = &scan.geometry;
-    let orbit = Orbit::fit(&g.views).map(|o| OrbitTable {
+    let orbit = CircularOrbit::fit(&g.views).map(|o| OrbitTable {
         dso: o.dso,
         dsd: o.dsd,
         pixel: o.pixel,

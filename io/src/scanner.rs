@@ -39,15 +39,14 @@
 //! next column (u) and to the next row (v), all in mm here. `[rtk]` has `file`, `pixel` and `offset`; see
 //! [`read_rtk_geometry`]. All lengths are mm; angles are degrees, as their keys say.
 
-use crate::check::{LineIntegralCheck, check_line_integrals};
 use crate::counts::{Correction, CountsReport, OpenBeam, line_integrals};
-use crate::orbit::Orbit;
 use crate::rtk::read_rtk_geometry;
-use crate::stack::{self, Layout, Names, StackAxis};
+use crate::stack::{self, Names, StackAxis, StackLayout};
 use crate::text::described;
 use crate::{ScanSize, folder, scan_folder};
 use conefield_core::error::ensure;
 use conefield_core::geometry::{Geometry, View, VoxelGrid};
+use conefield_core::orbit::CircularOrbit;
 use conefield_core::scan::{Scan, Unit};
 use conefield_core::{Error, Result};
 use ndarray::{Array3, Axis};
@@ -83,8 +82,6 @@ pub struct Imported {
     pub scan: Scan,
     /// What the conversion from counts met; `None` if the files hold line integrals.
     pub counts: Option<CountsReport>,
-    /// Whether the result looks like line integrals.
-    pub check: LineIntegralCheck,
 }
 
 #[derive(Deserialize)]
@@ -101,7 +98,7 @@ struct Description {
     #[serde(default)]
     layout: LayoutTable,
     #[serde(default)]
-    values: Values,
+    values: ValuesTable,
     volume: VoxelGrid,
 }
 
@@ -175,7 +172,7 @@ impl Default for LayoutTable {
 
 #[derive(Deserialize, Clone, Copy, Default, PartialEq)]
 #[serde(rename_all = "kebab-case")]
-enum Kind {
+enum ValueKind {
     #[default]
     Counts,
     LineIntegrals,
@@ -190,9 +187,9 @@ enum I0Text {
 
 #[derive(Deserialize, Default)]
 #[serde(deny_unknown_fields)]
-struct Values {
+struct ValuesTable {
     #[serde(default)]
-    kind: Kind,
+    kind: ValueKind,
     i0: Option<I0Text>,
     floor: Option<f64>,
     flat_includes_dark: Option<bool>,
@@ -217,7 +214,7 @@ pub fn read_scanner(path: impl AsRef<Path>, options: &ImportOptions) -> Result<I
     let views = views(folder, &place, &d, count)?;
     let geometry = Geometry { detector: [rows, columns], views, volume: d.volume };
     geometry.validate(&place)?;
-    let (projections, counts) = if d.values.kind == Kind::LineIntegrals {
+    let (projections, counts) = if d.values.kind == ValueKind::LineIntegrals {
         (values, None)
     } else {
         let open = match i0 {
@@ -240,7 +237,6 @@ pub fn read_scanner(path: impl AsRef<Path>, options: &ImportOptions) -> Result<I
         (a, Some(report))
     };
     let (geometry, projections) = rows_down(geometry, projections);
-    let check = check_line_integrals(projections.view());
     let provenance = json!({
         "format": "scanner",
         "file": path.file_name().map(|n| n.to_string_lossy()),
@@ -249,7 +245,7 @@ pub fn read_scanner(path: impl AsRef<Path>, options: &ImportOptions) -> Result<I
     });
     let scan = Scan { geometry, projections, unit: Unit::default(), provenance };
     scan.validate(&place)?;
-    Ok(Imported { scan, counts, check })
+    Ok(Imported { scan, counts })
 }
 
 /// The size of the scan that the description `path` leads to. Arranging the values and converting counts take copies.
@@ -271,7 +267,7 @@ pub(crate) fn size(path: &Path) -> Result<ScanSize> {
 /// knows only those can then take the scan. RTK's rows run up.
 fn rows_down(mut geometry: Geometry, mut projections: Array3<f32>) -> (Geometry, Array3<f32>) {
     let turned: Vec<View> = geometry.views.iter().map(|w| View { v: w.v.map(|x| 0.0 - x), ..*w }).collect();
-    if Orbit::fit(&turned).is_some() {
+    if CircularOrbit::fit(&turned).is_some() {
         geometry.views = turned;
         projections.invert_axis(Axis(1));
         projections = projections.as_standard_layout().into_owned();
@@ -279,11 +275,11 @@ fn rows_down(mut geometry: Geometry, mut projections: Array3<f32>) -> (Geometry,
     (geometry, projections)
 }
 
-fn layout(place: &str, table: &LayoutTable) -> Result<Layout> {
+fn layout(place: &str, table: &LayoutTable) -> Result<StackLayout> {
     let all = [StackAxis::View, StackAxis::Row, StackAxis::Column];
     let expected = "each of \"view\", \"row\" and \"column\" once";
     ensure(all.iter().all(|a| table.axes.contains(a)), place, "layout.axes", format!("{:?}", table.axes), expected)?;
-    Ok(Layout { axes: table.axes, flip_rows: table.flip_rows, flip_columns: table.flip_columns })
+    Ok(StackLayout { axes: table.axes, flip_rows: table.flip_rows, flip_columns: table.flip_columns })
 }
 
 /// The one number of the open beam, or `None` if the flat field says it. Refuses what contradicts.
@@ -302,7 +298,7 @@ fn i0(place: &str, d: &Description, options: &ImportOptions) -> Result<Option<I0
         let found = "a value without both files.flat and files.dark";
         return Err(Error::invalid(place, "values.flat_includes_dark", found, "both files, or no such value"));
     }
-    if d.values.kind == Kind::LineIntegrals {
+    if d.values.kind == ValueKind::LineIntegrals {
         let field = match (flat, d.files.dark.is_some(), said.or(options.i0), options.floor.or(d.values.floor)) {
             (true, ..) => "files.flat",
             (_, true, ..) => "files.dark",
@@ -336,7 +332,7 @@ fn views(folder: &Path, place: &str, d: &Description, count: usize) -> Result<Ve
             }
             lengths(place, "circle", c.pixel, c.offset)?;
             let (pixel, offset) = ([c.pixel.v, c.pixel.u], [c.offset.v, c.offset.u]);
-            Ok(Orbit { dso: c.dso, dsd: c.dsd, pixel, offset, angles }.views())
+            Ok(CircularOrbit { dso: c.dso, dsd: c.dsd, pixel, offset, angles }.views())
         }
         (None, Some(v), None) => {
             fits("vectors.cone_vec", v.cone_vec.len())?;

@@ -1,9 +1,10 @@
 //! How large scans and volumes are, read from their headers before memory is taken for them.
 
-use crate::scan::{self, Found};
-use crate::volume::{self, Opened};
+use crate::scan::{self, ScanFile};
+use crate::volume::{self, VolumeFile};
 use crate::{dicom, metaimage, nifti, npy, r2, scan_folder, scanner};
 use conefield_core::error::ensure;
+use conefield_core::scan::ScanHeader;
 use conefield_core::{Error, Result};
 use std::path::Path;
 
@@ -21,19 +22,26 @@ pub struct ScanSize {
     pub reading: u64,
 }
 
+impl ScanSize {
+    /// As many values in one view and one row, as not every file tells more of them before it is read.
+    pub fn header(&self) -> ScanHeader {
+        ScanHeader { views: 1, detector: [1, self.pixels as usize], volume: [self.voxels as usize, 1, 1] }
+    }
+}
+
 /// The size of a scan, from what describes it; its projections are not read. A pickle (NAF) tells its sizes only when
 /// it is read: all of the file is taken for 32-bit projections, and for voxels as well. Of a scanner's images only
 /// NumPy's and MetaImage's headers are read; other files are taken for one byte a value.
 pub fn scan_size(path: impl AsRef<Path>) -> Result<ScanSize> {
     let path = path.as_ref();
     let size = match scan::find(path)? {
-        Found::Own(file) => scan_folder::size(&file)?,
-        Found::R2(folder) => r2::size(&folder)?,
-        Found::Naf(file) => {
+        ScanFile::Own(file) => scan_folder::size(&file)?,
+        ScanFile::R2(folder) => r2::size(&folder)?,
+        ScanFile::Naf(file) => {
             let bytes = file_bytes(&file)?;
             ScanSize { pixels: bytes / 4, voxels: bytes / 4, test_pixels: 0, reading: bytes }
         }
-        Found::Scanner(file) => scanner::size(&file)?,
+        ScanFile::Scanner(file) => scanner::size(&file)?,
     };
     let all =
         [("pixels of all views", size.pixels), ("pixels of test views", size.test_pixels), ("voxels", size.voxels)];
@@ -48,13 +56,13 @@ pub fn scan_size(path: impl AsRef<Path>) -> Result<ScanSize> {
 pub fn volume_voxels(path: impl AsRef<Path>) -> Result<u64> {
     let path = path.as_ref();
     let shape = match volume::open(path)? {
-        Opened::Series => {
+        VolumeFile::Series => {
             let files = dicom::files(path)?;
             return files.iter().map(|f| file_bytes(f)).sum::<Result<u64>>().map(|bytes| bytes / 2);
         }
-        Opened::Npy(mut input, head) => npy::shape(&mut input, head)?,
-        Opened::MetaImage => metaimage::shape(path)?.to_vec(),
-        Opened::Nifti(input, head) => nifti::shape_of(&input, &head)?.to_vec(),
+        VolumeFile::Npy(mut input, head) => npy::shape(&mut input, head)?,
+        VolumeFile::MetaImage => metaimage::shape(path)?.to_vec(),
+        VolumeFile::Nifti(input, head) => nifti::shape_of(&input, &head)?.to_vec(),
     };
     let voxels = shape.iter().fold(1, |n: u64, &s| n.saturating_mul(s as u64));
     must_exist(path, "voxels", voxels)?;

@@ -22,7 +22,7 @@ pub(crate) enum StackAxis {
 
 /// How a file's arrays lie.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub(crate) struct Layout {
+pub(crate) struct StackLayout {
     /// What the three axes of a stack mean; an image has two of them, in the same order.
     pub axes: [StackAxis; 3],
     /// Whether the first row is the lowest along v.
@@ -30,7 +30,7 @@ pub(crate) struct Layout {
     pub flip_columns: bool,
 }
 
-impl Layout {
+impl StackLayout {
     /// Brings the file's array of three axes into the order `[view, row, column]`.
     fn arrange(&self, a: Array3<f32>) -> Array3<f32> {
         let at = |axis| self.axes.iter().position(|&x| x == axis).unwrap_or(0);
@@ -59,7 +59,7 @@ pub(crate) enum Names {
 }
 
 /// A file and, for `.npz`, the array in it.
-struct Source {
+struct StackFile {
     path: PathBuf,
     array: Option<String>,
 }
@@ -68,9 +68,9 @@ struct Source {
 ///
 /// Names are relative to `folder` and stay in it; a folder stands for its TIFF files, or its `.npy` files if it has
 /// none, in the order of the numbers in their names.
-pub(crate) fn read(folder: &Path, place: &str, field: &str, names: &Names, layout: Layout) -> Result<Array3<f32>> {
+pub(crate) fn read(folder: &Path, place: &str, field: &str, names: &Names, layout: StackLayout) -> Result<Array3<f32>> {
     let sources = sources(folder, place, field, names)?;
-    let mut named = folder::Named::default();
+    let mut named = folder::NamedFiles::default();
     sources.iter().try_for_each(|s| named.once(place, field, &s.path, s.array.as_deref()))?;
     let mut all: Option<(Vec<f32>, [usize; 2], usize)> = None;
     let single = sources.len() == 1;
@@ -102,7 +102,7 @@ pub(crate) fn read(folder: &Path, place: &str, field: &str, names: &Names, layou
 pub(crate) fn values(folder: &Path, place: &str, field: &str, names: &Names) -> Result<u64> {
     let product = |all: &[usize]| all.iter().fold(1u64, |n, &s| n.saturating_mul(s as u64));
     let mut sum = 0u64;
-    for Source { path, .. } in sources(folder, place, field, names)? {
+    for StackFile { path, .. } in sources(folder, place, field, names)? {
         let mut input = Input::open(&path)?;
         let head = input.take(8)?;
         sum = sum.saturating_add(if head.starts_with(npy::MAGIC) {
@@ -129,14 +129,14 @@ pub(crate) fn read_field(
     place: &str,
     field: &str,
     names: &Names,
-    layout: Layout,
+    layout: StackLayout,
 ) -> Result<Array2<f32>> {
     let stack = read(folder, place, field, names, layout)?;
     stack.mean_axis(Axis(0)).ok_or_else(|| Error::invalid(place, field, "no image", "at least one"))
 }
 
 /// The file's array with three axes in its own order; an image gets an axis of one view at `views`.
-fn raw(source: &Source, views: usize) -> Result<Array3<f32>> {
+fn raw(source: &StackFile, views: usize) -> Result<Array3<f32>> {
     let path = &source.path;
     let place = path.display().to_string();
     let three = |a: ArrayD<f32>| {
@@ -174,7 +174,7 @@ fn raw(source: &Source, views: usize) -> Result<Array3<f32>> {
     Err(Error::invalid(place, "format", format!("{head:02x?} at the start"), expected))
 }
 
-fn sources(folder: &Path, place: &str, field: &str, names: &Names) -> Result<Vec<Source>> {
+fn sources(folder: &Path, place: &str, field: &str, names: &Names) -> Result<Vec<StackFile>> {
     match names {
         Names::One(name) => source(folder, place, field, name),
         Names::Many(names) if names.is_empty() => Err(Error::invalid(place, field, "an empty list", "file names")),
@@ -188,14 +188,14 @@ fn sources(folder: &Path, place: &str, field: &str, names: &Names) -> Result<Vec
     }
 }
 
-fn source(folder: &Path, place: &str, field: &str, name: &str) -> Result<Vec<Source>> {
+fn source(folder: &Path, place: &str, field: &str, name: &str) -> Result<Vec<StackFile>> {
     let (file, array) = match name.split_once(".npz:") {
         Some((stem, array)) => (format!("{stem}.npz"), Some(array.to_string())),
         None => (name.to_string(), None),
     };
     let path = folder::within(folder, place, field, &file)?;
     if path.is_file() {
-        return Ok(vec![Source { path, array }]);
+        return Ok(vec![StackFile { path, array }]);
     }
     let io = |e| Error::io(&path, e);
     let mut found: Vec<String> = Vec::new();
@@ -217,7 +217,7 @@ fn source(folder: &Path, place: &str, field: &str, name: &str) -> Result<Vec<Sou
     chosen.sort_by_cached_key(|n| natural(n));
     let inside = chosen.iter().map(|n| {
         let path = folder::inside(folder, place, field, &format!("{}/{n}", file.trim_end_matches('/')))?;
-        Ok(Source { path, array: None })
+        Ok(StackFile { path, array: None })
     });
     inside.collect()
 }
@@ -244,8 +244,11 @@ mod tests {
     use super::*;
     use crate::testing::npy_bytes;
 
-    const PLAIN: Layout =
-        Layout { axes: [StackAxis::View, StackAxis::Row, StackAxis::Column], flip_rows: false, flip_columns: false };
+    const PLAIN: StackLayout = StackLayout {
+        axes: [StackAxis::View, StackAxis::Row, StackAxis::Column],
+        flip_rows: false,
+        flip_columns: false,
+    };
 
     #[test]
     fn names_sort_by_their_numbers() {
@@ -260,7 +263,7 @@ mod tests {
         let want = Array3::from_shape_fn((2, 3, 4), |(v, r, c)| (100 * v + 10 * r + c) as f32);
         for axes in [[View, Row, Column], [View, Column, Row], [Row, View, Column], [Column, Row, View]] {
             for (flip_rows, flip_columns) in [(false, false), (true, false), (false, true), (true, true)] {
-                let layout = Layout { axes, flip_rows, flip_columns };
+                let layout = StackLayout { axes, flip_rows, flip_columns };
                 let mut a = want.clone();
                 if flip_rows {
                     a.invert_axis(Axis(1));

@@ -21,15 +21,15 @@ use std::path::Path;
 pub fn read_volume(path: impl AsRef<Path>) -> Result<Volume> {
     let path = path.as_ref();
     match open(path)? {
-        Opened::Series => dicom::read(path),
-        Opened::Npy(mut input, head) => from_numpy(path, npy::read_from(&mut input, head, &["x", "y", "z"])?),
-        Opened::MetaImage => metaimage::read(path),
-        Opened::Nifti(mut input, head) => nifti::read_from(&mut input, &head),
+        VolumeFile::Series => dicom::read(path),
+        VolumeFile::Npy(mut input, head) => from_numpy(path, npy::read_from(&mut input, head, &["x", "y", "z"])?),
+        VolumeFile::MetaImage => metaimage::read(path),
+        VolumeFile::Nifti(mut input, head) => nifti::read_from(&mut input, &head),
     }
 }
 
 /// A volume's format, with the file where it stands and what was read of it to tell.
-pub(crate) enum Opened {
+pub(crate) enum VolumeFile {
     /// A folder.
     Series,
     /// Eight bytes are read.
@@ -41,14 +41,14 @@ pub(crate) enum Opened {
 }
 
 /// Tells the format of a volume by what it holds.
-pub(crate) fn open(path: &Path) -> Result<Opened> {
+pub(crate) fn open(path: &Path) -> Result<VolumeFile> {
     if path.is_dir() {
-        return Ok(Opened::Series);
+        return Ok(VolumeFile::Series);
     }
     let mut input = Input::open(path)?;
     let mut head = input.take(8)?;
     if head.starts_with(npy::MAGIC) {
-        return Ok(Opened::Npy(input, head));
+        return Ok(VolumeFile::Npy(input, head));
     }
     head.extend(input.take(nifti::HEADER - head.len())?);
     if nifti::is_second_version(&head) {
@@ -64,7 +64,7 @@ pub(crate) fn open(path: &Path) -> Result<Opened> {
             let what = format!("{}: a MetaImage inside gzip", path.display());
             return Err(Error::unsupported(what, "unpack it first; MetaImage has a compression of its own"));
         }
-        return Ok(Opened::MetaImage);
+        return Ok(VolumeFile::MetaImage);
     }
     if !nifti::is_header(&head) {
         let mark = head.get(344..348).map_or_else(
@@ -72,7 +72,7 @@ pub(crate) fn open(path: &Path) -> Result<Opened> {
             |m| format!("{:02x?} at byte 344 and {:02x?} at the start", m, &head[..6]),
         );
         let hint = match format_of(path) {
-            Some(Format::Npy) => "a NumPy array (93 4e 55 4d 50 59 at the start); a NIfTI-1 header is read too",
+            Some(VolumeFormat::Npy) => "a NumPy array (93 4e 55 4d 50 59 at the start); a NIfTI-1 header is read too",
             _ => {
                 "a NIfTI-1 header (6e 2b 31 00 at byte 344), a NumPy array (93 4e 55 4d 50 59 at the start) or a \
                  MetaImage header (NDims = 3)"
@@ -80,7 +80,7 @@ pub(crate) fn open(path: &Path) -> Result<Opened> {
         };
         return Err(input.invalid("format", mark, hint));
     }
-    Ok(Opened::Nifti(input, head))
+    Ok(VolumeFile::Nifti(input, head))
 }
 
 /// Whether the file, or the folder with DICOM files in it, looks like a volume; its data is not read. True as well of
@@ -126,14 +126,14 @@ pub fn write_voxels(path: impl AsRef<Path>, voxels: &mut dyn Voxels) -> Result<(
     let format = wanted(path)?;
     voxels.grid().validate(&path.display().to_string())?;
     write_atomic(path, |w| match format {
-        Format::Nifti => nifti::write(w, path, voxels),
-        Format::NiftiGz => {
+        VolumeFormat::Nifti => nifti::write(w, path, voxels),
+        VolumeFormat::NiftiGz => {
             let mut packed = GzBuilder::new().write(w, Compression::fast());
             nifti::write(&mut packed, path, voxels)?;
             packed.finish().and_then(|w| w.flush()).map_err(|e| Error::io(path, e))
         }
-        Format::Npy => npy::write_voxels(w, path, voxels),
-        Format::MetaImage => metaimage::write(w, path, voxels),
+        VolumeFormat::Npy => npy::write_voxels(w, path, voxels),
+        VolumeFormat::MetaImage => metaimage::write(w, path, voxels),
     })
 }
 
@@ -171,12 +171,12 @@ pub(crate) fn from_numpy(path: &Path, array: ndarray::ArrayD<f32>) -> Result<Vol
 }
 
 /// The format that a name asks for; one that asks for none is refused.
-fn wanted(path: &Path) -> Result<Format> {
+fn wanted(path: &Path) -> Result<VolumeFormat> {
     let (place, expected) = (path.display().to_string(), "an end of .nii, .nii.gz, .mha or .npy");
     format_of(path).ok_or_else(|| Error::invalid(place, "file name", file_name(path), expected))
 }
 
-enum Format {
+enum VolumeFormat {
     Nifti,
     NiftiGz,
     Npy,
@@ -187,16 +187,16 @@ fn file_name(path: &Path) -> String {
     path.file_name().map(|n| n.to_string_lossy().into_owned()).unwrap_or_default()
 }
 
-fn format_of(path: &Path) -> Option<Format> {
+fn format_of(path: &Path) -> Option<VolumeFormat> {
     let name = file_name(path).to_ascii_lowercase();
     if name.ends_with(".nii.gz") {
-        Some(Format::NiftiGz)
+        Some(VolumeFormat::NiftiGz)
     } else if name.ends_with(".nii") {
-        Some(Format::Nifti)
+        Some(VolumeFormat::Nifti)
     } else if name.ends_with(".npy") {
-        Some(Format::Npy)
+        Some(VolumeFormat::Npy)
     } else if name.ends_with(".mha") {
-        Some(Format::MetaImage)
+        Some(VolumeFormat::MetaImage)
     } else {
         None
     }
@@ -222,7 +222,7 @@ mod tests {
     }
 
     /// Values made where they are asked for, of more voxels than a slab has.
-    struct Ramp {
+    struct RampVoxels {
         largest: usize,
         parts: usize,
     }
@@ -231,7 +231,7 @@ mod tests {
         (at[0] + 200 * at[1] + 40_000 * at[2]) as f32
     }
 
-    impl Voxels for Ramp {
+    impl Voxels for RampVoxels {
         fn grid(&self) -> VoxelGrid {
             VoxelGrid { shape: [200, 190, 180], spacing: [1.0; 3], center: [0.0; 3] }
         }
@@ -250,11 +250,11 @@ mod tests {
     #[test]
     fn every_format_is_written_slab_by_slab_to_the_bytes_of_the_whole() {
         let dir = tempfile::tempdir().unwrap();
-        let whole = Volume::collect(&mut Ramp { largest: 0, parts: 0 }).unwrap();
+        let whole = Volume::collect(&mut RampVoxels { largest: 0, parts: 0 }).unwrap();
         assert_eq!(whole.data[[199, 189, 179]], ramp([199, 189, 179]));
         for end in ["nii", "nii.gz", "mha", "npy"] {
             let [streamed, at_once] = ["streamed", "at_once"].map(|n| dir.path().join(format!("{n}.{end}")));
-            let mut voxels = Ramp { largest: 0, parts: 0 };
+            let mut voxels = RampVoxels { largest: 0, parts: 0 };
             write_voxels(&streamed, &mut voxels).unwrap();
             assert!(voxels.parts > 1 && voxels.largest <= 1 << 22, "{end}");
             assert!(read_volume(&streamed).unwrap().data == whole.data, "{end}");

@@ -4,6 +4,7 @@
 //! fixed order, so that the same weights give the same bytes.
 
 use crate::{number, write_atomic};
+use conefield_core::arena::Weights;
 use conefield_core::{Error, Result, files};
 use safetensors::{Dtype, SafeTensors};
 use serde_json::{Map, Value, json};
@@ -17,26 +18,17 @@ const METADATA: &str = "__metadata__";
 /// Longest header that the reading crate accepts.
 const LONGEST_HEADER: u64 = 100_000_000;
 
-/// Named tensors with free text about them.
-#[derive(Debug, Clone, Default, PartialEq)]
-pub struct Weights {
-    /// Shape and values, in C order, by name.
-    pub tensors: BTreeMap<String, (Vec<usize>, Vec<f32>)>,
-    /// Free text by key.
-    pub metadata: BTreeMap<String, String>,
-}
-
 /// Writes named `f32` tensors (name, shape, values in C order) and free text.
 pub fn write_weights(
     path: impl AsRef<Path>,
     tensors: &[(impl AsRef<str>, impl AsRef<[usize]>, &[f32])],
-    metadata: &BTreeMap<String, String>,
+    notes: &BTreeMap<String, String>,
 ) -> Result<()> {
     let path = path.as_ref();
     let place = path.display().to_string();
     let mut header = Map::new();
-    if !metadata.is_empty() {
-        header.insert(METADATA.into(), json!(metadata));
+    if !notes.is_empty() {
+        header.insert(METADATA.into(), json!(notes));
     }
     let mut names = BTreeSet::new();
     let mut at = 0usize;
@@ -89,7 +81,7 @@ pub fn read_weights(path: impl AsRef<Path>) -> Result<Weights> {
     file.take(size - 8).read_to_end(&mut raw).map_err(io)?;
     let broken = |e| Error::invalid(&place, "header", e, "a whole safetensors file");
     let (_, info) = SafeTensors::read_metadata(&raw).map_err(broken)?;
-    let metadata = info.metadata().iter().flatten().map(|(k, v)| (k.clone(), v.clone())).collect();
+    let notes = info.metadata().iter().flatten().map(|(k, v)| (k.clone(), v.clone())).collect();
     let views = SafeTensors::deserialize(&raw).map_err(broken)?;
     let mut tensors = BTreeMap::new();
     for (name, view) in views.iter() {
@@ -106,7 +98,7 @@ pub fn read_weights(path: impl AsRef<Path>) -> Result<Weights> {
         let values = values.iter().map(|b| f32::from_le_bytes(*b)).collect();
         tensors.insert(name.to_string(), (view.shape().to_vec(), values));
     }
-    Ok(Weights { tensors, metadata })
+    Ok(Weights { tensors, notes })
 }
 
 #[cfg(test)]
@@ -115,16 +107,16 @@ mod tests {
     use std::fs;
 
     fn sample(path: &Path) -> Weights {
-        let metadata: BTreeMap<_, _> = (0..20).map(|i| (format!("key {i}"), format!("value {i}"))).collect();
+        let notes: BTreeMap<_, _> = (0..20).map(|i| (format!("key {i}"), format!("value {i}"))).collect();
         let table: Vec<f32> = (0..40000).map(|i| i as f32 * 0.5).collect();
         let tensors = [
             ("mlp.0.weight", vec![2, 3], &[1.0f32, -2.0, 3.5, 0.0, 1e-38, 7.0][..]),
             ("encoder.table", vec![40000], table.as_slice()),
             ("empty", vec![0, 4], &[]),
         ];
-        write_weights(path, &tensors, &metadata).unwrap();
+        write_weights(path, &tensors, &notes).unwrap();
         let tensors = tensors.into_iter().map(|(n, s, v)| (n.to_string(), (s, v.to_vec()))).collect();
-        Weights { tensors, metadata }
+        Weights { tensors, notes }
     }
 
     #[test]

@@ -9,7 +9,7 @@
 //! | [`ssim_skimage`] | uniform 7×7 in each slice | where the window fits | sample (N − 1) | slices, then axes |
 
 use crate::check;
-use crate::window::{FIELDS, Window, products};
+use crate::window::{FIELDS, SsimWindow, products};
 use conefield_core::error::{Result, ensure};
 use ndarray::{Array3, ArrayView2, ArrayView3, Axis, Slice, s};
 use rayon::prelude::*;
@@ -37,7 +37,7 @@ pub fn ssim_skimage(result: ArrayView3<f32>, reference: ArrayView3<f32>, peak: f
 
 /// [`ssim_2d`] of a pair that has been checked.
 pub(crate) fn gaussian_slices(result: ArrayView3<f32>, reference: ArrayView3<f32>, peak: f64) -> Result<f64> {
-    let window = Window::gaussian();
+    let window = SsimWindow::gaussian();
     let mean = over_axes(result, reference, |x, y| {
         y.iter().any(|&v| v > 0.0).then(|| slice_ssim(x, y, &window, window.len() / 2, peak))
     });
@@ -47,7 +47,7 @@ pub(crate) fn gaussian_slices(result: ArrayView3<f32>, reference: ArrayView3<f32
 
 /// [`ssim_skimage`] of a pair that has been checked.
 pub(crate) fn uniform_slices(result: ArrayView3<f32>, reference: ArrayView3<f32>, peak: f64) -> Result<f64> {
-    let window = Window::uniform();
+    let window = SsimWindow::uniform();
     check::window("ssim_skimage", result.shape(), window.len())?;
     Ok(over_axes(result, reference, |x, y| Some(slice_ssim(x, y, &window, 0, peak))).unwrap_or(0.0))
 }
@@ -101,7 +101,7 @@ fn slices(volume: ArrayView3<f32>, axis: usize, range: std::ops::Range<usize>) -
 }
 
 /// Mean of the SSIM map of one slice, `pad` zeros added on every side.
-fn slice_ssim(x: ArrayView2<f32>, y: ArrayView2<f32>, window: &Window, pad: usize, peak: f64) -> f64 {
+fn slice_ssim(x: ArrayView2<f32>, y: ArrayView2<f32>, window: &SsimWindow, pad: usize, peak: f64) -> f64 {
     let (rows, columns) = x.dim();
     let (border, wide) = (window.len() - 1, columns + 2 * pad);
     let (high, out) = (rows + 2 * pad, wide - border);
@@ -131,7 +131,7 @@ fn slice_ssim(x: ArrayView2<f32>, y: ArrayView2<f32>, window: &Window, pad: usiz
 pub(crate) fn gaussian_volume(result: ArrayView3<f32>, reference: ArrayView3<f32>, peak: f64) -> Result<f64> {
     // A tile keeps a ring of 11 windowed planes of `TILE[1] × nz`: a few megabytes, however large the volume is.
     const TILE: [usize; 2] = [64, 64];
-    let window = Window::gaussian();
+    let window = SsimWindow::gaussian();
     check::window("ssim_3d", result.shape(), window.len())?;
     let (nx, ny, nz) = result.dim();
     let border = window.len() - 1;
@@ -150,7 +150,7 @@ pub(crate) fn gaussian_volume(result: ArrayView3<f32>, reference: ArrayView3<f32
 }
 
 /// Sum of the SSIM map over the places of a 3D window inside the tile.
-fn tile_sum(result: ArrayView3<f32>, reference: ArrayView3<f32>, window: &Window, peak: f64) -> f64 {
+fn tile_sum(result: ArrayView3<f32>, reference: ArrayView3<f32>, window: &SsimWindow, peak: f64) -> f64 {
     let (nx, ny, nz) = result.dim();
     let (size, border) = (window.len(), window.len() - 1);
     let (high, out) = (ny - border, nz - border);

@@ -9,13 +9,13 @@ use ndarray::ArrayView1;
 pub(crate) const FIELDS: usize = 4;
 
 /// A window of odd size, the same along every axis, whose weights add up to one.
-pub(crate) struct Window {
+pub(crate) struct SsimWindow {
     weights: Vec<f64>,
     /// What turns a windowed `E[xy] − E[x]E[y]` into the covariance that the metric asks for.
     covariance: f64,
 }
 
-impl Window {
+impl SsimWindow {
     /// Gaussian of 11 samples with σ = 1.5; covariances stay biased, as in the code that introduced it.
     pub(crate) fn gaussian() -> Self {
         let raw: Vec<f64> = (-5i32..=5).map(|i| (-f64::from(i * i) / (2.0 * 1.5 * 1.5)).exp()).collect();

@@ -8,15 +8,14 @@
 
 use conefield_core::dense::total;
 use conefield_core::error::{Result, ensure};
+use conefield_core::settings::NormalizerSpec;
 use conefield_core::simd::{Op, Real, Select, Simd, SimdBase, SimdFloat, V, load, run, store};
-use conefield_core::spec::NormalizerSpec;
 use conefield_core::stage::{
     GradKind, Grads, Info, Kernel, Normalizer, Parameter, Reduced, Scope, Stage, Tile, TileMut,
 };
 use conefield_core::wgsl::Fragment;
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
-use std::ops::Range;
 
 /// Settings of `layer-norm`.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
@@ -47,9 +46,7 @@ impl NormalizerSpec for LayerNorm {
 #[derive(Debug, Clone, PartialEq)]
 pub struct LayerNormStage {
     settings: LayerNorm,
-    input: usize,
-    /// The input channel of each output.
-    outputs: Vec<usize>,
+    width: usize,
 }
 
 /// Tape: mean of the (scaled) differences to the first channel, reciprocal deviation, scale.
@@ -59,30 +56,19 @@ impl LayerNormStage {
     /// The stage for `width` channels, or which setting is out of range.
     pub fn new(settings: &LayerNorm, width: usize) -> Result<Self> {
         let eps = settings.eps;
-        ensure((1e-30..=1.0).contains(&eps), "spec", "normalizers.eps", eps, "1e-30 to 1")?;
+        ensure((1e-30..=1.0).contains(&eps), "spec", "eps", eps, "1e-30 to 1")?;
         ensure(width > 0, "layer-norm", "channels", width, "at least one")?;
-        Ok(Self { settings: settings.clone(), input: width, outputs: (0..width).collect() })
+        Ok(Self { settings: settings.clone(), width })
     }
 
-    /// `γ` of output `o`, and `β` of it `outputs.len()` further.
-    fn gamma<R: Real>(&self, params: &[R], o: usize) -> R {
-        if self.settings.affine { params[o] } else { R::ONE }
+    /// `γ` of channel `c`, and `β` of it `width` further.
+    fn gamma<R: Real>(&self, params: &[R], c: usize) -> R {
+        if self.settings.affine { params[c] } else { R::ONE }
     }
 
-    fn beta<R: Real>(&self, params: &[R], o: usize) -> R {
-        if self.settings.affine { params[self.outputs.len() + o] } else { R::ZERO }
+    fn beta<R: Real>(&self, params: &[R], c: usize) -> R {
+        if self.settings.affine { params[self.width + c] } else { R::ZERO }
     }
-
-    /// What of `γ` and `β` outputs `kept` (ascending) have.
-    fn params_of(&self, kept: &[usize]) -> Vec<Range<usize>> {
-        let n = self.outputs.len();
-        let both = kept.iter().copied().chain(kept.iter().map(|o| n + o));
-        if self.settings.affine { both.map(|p| p..p + 1).collect() } else { vec![] }
-    }
-}
-
-fn list(numbers: &[usize]) -> String {
-    numbers.iter().map(usize::to_string).collect::<Vec<_>>().join(", ")
 }
 
 /// Above the first number a row is scaled by the second. A variance counts as at least the third, so that it has a
@@ -106,7 +92,7 @@ impl<R: Real> Op for Forward<'_, R> {
     fn call<S: Simd>(mut self, s: S) {
         let number = |v: R| V::<S, R>::splat(s, v);
         let [limit, small, least] = huge::<R>();
-        let share = number(R::of(1.0 / self.stage.input as f64));
+        let share = number(R::of(1.0 / self.stage.width as f64));
         let eps = number(R::of(self.stage.settings.eps));
         let mut i = 0;
         while i < self.x.rows {
@@ -128,10 +114,10 @@ impl<R: Real> Op for Forward<'_, R> {
             }
             let variance = variance.mul_add(share, (eps * scale * scale).max(number(least)));
             let root = number(R::ONE) / variance.sqrt();
-            for (o, &c) in self.stage.outputs.iter().enumerate() {
+            for c in 0..self.stage.width {
                 let d = (load(s, self.x.channel(c), i) * scale - first) - mean;
-                let (gamma, beta) = (self.stage.gamma(self.params, o), self.stage.beta(self.params, o));
-                store::<S, R>((d * root).mul_add(number(gamma), number(beta)), self.y.channel(o), i);
+                let (gamma, beta) = (self.stage.gamma(self.params, c), self.stage.beta(self.params, c));
+                store::<S, R>((d * root).mul_add(number(gamma), number(beta)), self.y.channel(c), i);
             }
             for (c, v) in [mean, root, scale].into_iter().enumerate() {
                 store::<S, R>(v, self.tape.channel(c), i);
@@ -153,7 +139,7 @@ struct Backward<'a, R> {
 
 /// What forward found about a vector of rows.
 #[derive(Clone, Copy)]
-struct Found<T> {
+struct RowMoments<T> {
     first: T,
     mean: T,
     root: T,
@@ -162,16 +148,16 @@ struct Found<T> {
 
 impl<R: Real> Backward<'_, R> {
     #[inline(always)]
-    fn found<S: Simd>(&self, s: S, i: usize) -> Found<V<S, R>> {
+    fn found<S: Simd>(&self, s: S, i: usize) -> RowMoments<V<S, R>> {
         let mean = load(s, self.tape.channel(0), i);
         let root = load(s, self.tape.channel(1), i);
         let scale = load(s, self.tape.channel(2), i);
-        Found { first: load(s, self.x.channel(0), i) * scale, mean, root, scale }
+        RowMoments { first: load(s, self.x.channel(0), i) * scale, mean, root, scale }
     }
 
     /// `(x − mean)/deviation` of input `c`, the rows from `i`.
     #[inline(always)]
-    fn normal<S: Simd>(&self, s: S, f: Found<V<S, R>>, c: usize, i: usize) -> V<S, R> {
+    fn normal<S: Simd>(&self, s: S, f: RowMoments<V<S, R>>, c: usize, i: usize) -> V<S, R> {
         ((load(s, self.x.channel(c), i) * f.scale - f.first) - f.mean) * f.root
     }
 }
@@ -183,44 +169,38 @@ impl<R: Real> Op for Backward<'_, R> {
         let (n, stage) = (self.x.rows, self.stage);
         let zero = V::<S, R>::splat(s, R::ZERO);
         if stage.settings.affine {
-            let outputs = stage.outputs.len();
             let range = self.grads.range.clone();
-            for (o, &c) in stage.outputs.iter().enumerate() {
-                if range.contains(&o) {
+            for c in 0..stage.width {
+                if range.contains(&c) {
                     let mut sum = zero;
                     let mut i = 0;
                     while i < n {
-                        sum = self.normal(s, self.found(s, i), c, i).mul_add(load(s, self.dy.channel(o), i), sum);
+                        sum = self.normal(s, self.found(s, i), c, i).mul_add(load(s, self.dy.channel(c), i), sum);
                         i += V::<S, R>::LEN;
                     }
-                    self.grads.values[o - range.start] += sum.as_slice().iter().copied().sum::<R>();
+                    self.grads.values[c - range.start] += sum.as_slice().iter().copied().sum::<R>();
                 }
-                if range.contains(&(outputs + o)) {
-                    self.grads.values[outputs + o - range.start] += total(s, self.dy.channel(o));
+                if range.contains(&(stage.width + c)) {
+                    self.grads.values[stage.width + c - range.start] += total(s, self.dy.channel(c));
                 }
             }
         }
         let Some(mut dx) = self.dx.take() else { return };
-        let share = V::<S, R>::splat(s, R::of(1.0 / stage.input as f64));
+        let share = V::<S, R>::splat(s, R::of(1.0 / stage.width as f64));
         let mut i = 0;
         while i < n {
-            // With g = γ·dy: dx = (g − mean(g) − x̂·mean(g·x̂))/deviation, means over all inputs.
+            // With g = γ·dy: dx = (g − mean(g) − x̂·mean(g·x̂))/deviation, means over all channels.
             let found = self.found(s, i);
             let (mut mean, mut along) = (zero, zero);
-            for (o, &c) in stage.outputs.iter().enumerate() {
-                let g = load(s, self.dy.channel(o), i) * stage.gamma(self.params, o);
+            for c in 0..stage.width {
+                let g = load(s, self.dy.channel(c), i) * stage.gamma(self.params, c);
                 mean += g;
                 along = g.mul_add(self.normal(s, found, c, i), along);
             }
             let (mean, along) = (mean * share, along * share);
             let back = found.root * found.scale;
-            let mut o = 0;
-            for c in 0..stage.input {
-                let mut g = zero;
-                if stage.outputs.get(o) == Some(&c) {
-                    g = load(s, self.dy.channel(o), i) * stage.gamma(self.params, o);
-                    o += 1;
-                }
+            for c in 0..stage.width {
+                let g = load(s, self.dy.channel(c), i) * stage.gamma(self.params, c);
                 let d = (g - mean - self.normal(s, found, c, i) * along) * back;
                 store::<S, R>(d, dx.channel(c), i);
             }
@@ -250,28 +230,27 @@ impl<R: Real> Kernel<R> for LayerNormStage {
 
 impl Stage for LayerNormStage {
     fn info(&self) -> Info {
-        let output = self.outputs.len();
         Info {
-            input: self.input,
-            output,
-            params: if self.settings.affine { 2 * output } else { 0 },
+            input: self.width,
+            output: self.width,
+            params: if self.settings.affine { 2 * self.width } else { 0 },
             tape: TAPE,
             scope: Scope::Row,
             grads: if self.settings.affine { GradKind::Dense } else { GradKind::None },
-            macs: 3 * self.input + output,
+            macs: 4 * self.width,
             identity: false,
         }
     }
 
     fn parameters(&self) -> Vec<Parameter> {
-        let n = self.outputs.len();
+        let n = self.width;
         let block = |name: &str, start| Parameter { name: name.into(), shape: vec![n], start };
         if self.settings.affine { vec![block("weight", 0), block("bias", n)] } else { vec![] }
     }
 
     fn init(&self, _: u64, params: &mut [f32]) {
         if self.settings.affine {
-            let (gamma, beta) = params.split_at_mut(self.outputs.len());
+            let (gamma, beta) = params.split_at_mut(self.width);
             gamma.fill(1.0);
             beta.fill(0.0);
         }
@@ -286,14 +265,12 @@ impl Stage for LayerNormStage {
     }
 
     fn wgsl(&self) -> Option<Fragment> {
-        let (input, n, eps, affine) = (self.input, self.outputs.len(), self.settings.eps as f32, self.settings.affine);
-        let whole = self.outputs.iter().copied().eq(0..input);
-        let of = if whole { "o".into() } else { format!("array<u32, {n}>({})[o]", list(&self.outputs)) };
+        let (n, eps, affine) = (self.width, self.settings.eps as f32, self.settings.affine);
         // Parameters that every row touches are summed over rows.
         let sums = if affine {
             format!(
                 "    var normal: array<f32, {n}>;
-    for (var o = 0u; o < {n}u; o++) {{ normal[o] = stage_normal(x, r, stage_input_of(o)) * (*dy)[o]; }}
+    for (var o = 0u; o < {n}u; o++) {{ normal[o] = stage_normal(x, r, o) * (*dy)[o]; }}
     stage_sum_{n}(0u, &normal);
     stage_sum_{n}({n}u, dy);
 "
@@ -302,12 +279,10 @@ impl Stage for LayerNormStage {
             String::new()
         };
         let settings = format!(
-            "const stage_INPUT = {input}u;
-const stage_OUTPUT = {n}u;
+            "const stage_WIDTH = {n}u;
 const stage_EPS = {eps:?};
 const stage_AFFINE = {affine};
-fn stage_input_of(o: u32) -> u32 {{ return {of}; }}
-fn stage_gradients(x: ptr<function, array<f32, {input}>>, r: stage_Row, dy: ptr<function, array<f32, {n}>>) {{
+fn stage_gradients(x: ptr<function, array<f32, {n}>>, r: stage_Row, dy: ptr<function, array<f32, {n}>>) {{
 {sums}}}
 "
         );
@@ -315,28 +290,18 @@ fn stage_gradients(x: ptr<function, array<f32, {input}>>, r: stage_Row, dy: ptr<
     }
 
     fn describe(&self) -> String {
-        let of = if self.outputs.len() == self.input { String::new() } else { format!(" of {}", self.input) };
         let affine = if self.settings.affine { "with" } else { "without" };
-        format!("layer-norm: {}{of} channels, eps {}, {affine} scale and shift", self.outputs.len(), self.settings.eps)
+        format!("layer-norm: {} channels, eps {}, {affine} scale and shift", self.width, self.settings.eps)
     }
 }
 
 impl Normalizer for LayerNormStage {
     fn keep_inputs(&self, keep: &[usize]) -> Result<Reduced<dyn Normalizer>> {
-        // Outputs stay where their input stays.
-        let channels: Vec<usize> = (0..self.outputs.len()).filter(|&o| keep.contains(&self.outputs[o])).collect();
-        ensure(!channels.is_empty(), "layer-norm", "channels", "none kept", "at least one")?;
-        let place = |c: usize| keep.iter().position(|&k| k == c);
-        let outputs = channels.iter().filter_map(|&o| place(self.outputs[o])).collect();
-        let stage = Self { settings: self.settings.clone(), input: keep.len(), outputs };
-        Ok(Reduced { stage: Box::new(stage), params: self.params_of(&channels), channels })
-    }
-
-    fn keep_outputs(&self, keep: &[usize]) -> Result<Reduced<dyn Normalizer>> {
         ensure(!keep.is_empty(), "layer-norm", "channels", "none kept", "at least one")?;
-        let outputs = keep.iter().map(|&o| self.outputs[o]).collect();
-        let stage = Self { settings: self.settings.clone(), input: self.input, outputs };
-        Ok(Reduced { stage: Box::new(stage), params: self.params_of(keep), channels: (0..self.input).collect() })
+        let both = keep.iter().copied().chain(keep.iter().map(|c| self.width + c));
+        let params = if self.settings.affine { both.map(|p| p..p + 1).collect() } else { vec![] };
+        let stage = Self { settings: self.settings.clone(), width: keep.len() };
+        Ok(Reduced { stage: Box::new(stage), params, channels: (0..keep.len()).collect() })
     }
 }
 
@@ -345,7 +310,7 @@ mod tests {
     use super::*;
 
     fn apply<R: Real>(stage: &LayerNormStage, params: &[R], x: &[R], n: usize) -> Vec<R> {
-        let mut y = vec![R::ZERO; stage.outputs.len() * n];
+        let mut y = vec![R::ZERO; stage.width * n];
         let mut tape = vec![R::ZERO; TAPE * n];
         stage.forward(params, Tile::new(x, n), TileMut::new(&mut y, n), TileMut::new(&mut tape, n));
         y
@@ -388,19 +353,14 @@ mod tests {
     }
 
     #[test]
-    fn dropped_outputs_keep_the_statistics_and_dropped_inputs_shrink_them() {
-        let stage = LayerNormStage::new(&LayerNorm { affine: false, ..LayerNorm::default() }, 4).unwrap();
-        let x = [1.0, 5.0, -2.0, 0.5f64];
-        let all = apply(&stage, &[], &x, 1);
-        let r = stage.keep_outputs(&[1, 3]).unwrap();
-        assert_eq!((r.channels, r.stage.info().input, r.stage.info().output), (vec![0, 1, 2, 3], 4, 2));
-        let dropped = LayerNormStage { outputs: vec![1, 3], ..stage.clone() };
-        assert_eq!(apply(&dropped, &[], &x, 1), [all[1], all[3]]);
-        let r = dropped.keep_inputs(&[0, 3]).unwrap();
-        assert_eq!((r.channels, r.stage.info().input, r.stage.info().output), (vec![1], 2, 1));
-        let mut y = [0.0; 1];
-        let k = r.stage.reference().unwrap();
-        k.forward(&[], Tile::new(&[1.0, 0.5], 1), TileMut::new(&mut y, 1), TileMut::new(&mut [0.0; 3], 1));
-        assert!((y[0] + 0.25 / (0.0625f64 + 1e-5).sqrt()).abs() < 1e-12, "{y:?}");
+    fn dropped_inputs_leave_the_statistics() {
+        let stage = LayerNormStage::new(&LayerNorm::default(), 4).unwrap();
+        let r = stage.keep_inputs(&[0, 3]).unwrap();
+        assert_eq!((r.stage.info().input, r.stage.info().output, r.channels), (2, 2, vec![0, 1]));
+        assert_eq!(r.params, [0..1, 3..4, 4..5, 7..8]);
+        let small = LayerNormStage::new(&LayerNorm { affine: false, ..LayerNorm::default() }, 2).unwrap();
+        let y = apply(&small, &[], &[1.0, 0.5], 1);
+        assert!((y[1] + 0.25 / (0.0625f64 + 1e-5).sqrt()).abs() < 1e-12, "{y:?}");
+        assert!(stage.keep_inputs(&[]).is_err());
     }
 }

@@ -1,4 +1,3 @@
-//! Normalizers between encoder and field: LayerNorm, FFT channel mask
+//! Normalizers between encoder and field: LayerNorm
 
-pub mod fft_mask;
 pub mod layer_norm;

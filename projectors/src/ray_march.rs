@@ -6,7 +6,7 @@
 
 use conefield_core::error::{Error, Result, ensure};
 use conefield_core::random::{mix, unit};
-use conefield_core::spec::ProjectorSpec;
+use conefield_core::settings::ProjectorSpec;
 use conefield_core::stage::{Lengths, Projector, Samples, UnitRay};
 use conefield_core::wgsl::Fragment;
 use schemars::JsonSchema;
@@ -74,7 +74,7 @@ const MOST_SAMPLES: usize = 65_536;
 impl ProjectorSpec for RayMarch {
     fn build(&self) -> Result<Box<dyn Projector>> {
         let n = self.count();
-        ensure((1..=MOST_SAMPLES).contains(&n), "spec", "projector.samples", n, "1 to 65536")?;
+        ensure((1..=MOST_SAMPLES).contains(&n), "spec", "samples", n, "1 to 65536")?;
         let positive = |step: Option<f64>| step.is_none_or(|s| s.is_finite() && s > 0.0);
         let shown = |step: Option<f64>| step.map_or(String::new(), |s| s.to_string());
         let steps = [
@@ -84,7 +84,7 @@ impl ProjectorSpec for RayMarch {
         ];
         for (name, step, unit) in steps {
             let expected = format!("a positive number of {unit}");
-            ensure(positive(step), "spec", &format!("projector.{name}"), shown(step), expected)?;
+            ensure(positive(step), "spec", name, shown(step), expected)?;
         }
         let said =
             self.samples.map(|_| "samples").into_iter().chain(steps.iter().filter(|s| s.1.is_some()).map(|s| s.0));
@@ -141,7 +141,7 @@ impl Projector for RayMarch {
             (_, Some(n)) => {
                 let unknown = || {
                     let found = "an encoder that does not say how fine it is";
-                    Error::invalid("spec", "projector.step_cells", found, "samples, step_mm or step_voxels with it")
+                    Error::invalid("spec", "step_cells", found, "samples, step_mm or step_voxels with it")
                 };
                 n * lengths.cell_mm.ok_or_else(unknown)?
             }
@@ -241,7 +241,7 @@ mod tests {
         assert!(fitted(&cells, lengths).unwrap().unwrap().contains("every 1.6 mm"));
         assert!(fitted(&RayMarch::default(), lengths).unwrap().is_none());
         let e = fitted(&cells, Lengths { cell_mm: None, ..lengths }).unwrap_err().to_string();
-        assert!(e.contains("projector.step_cells") && e.contains("does not say how fine"), "{e}");
+        assert!(e.contains("step_cells") && e.contains("does not say how fine"), "{e}");
         assert!(RayMarch { step_cells: Some(-1.0), ..RayMarch::default() }.build().is_err());
         assert_eq!(cells.describe(), "ray-march: a sample every 2 of the encoder's finest cells, stratified, clipped");
     }

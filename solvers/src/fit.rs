@@ -1,11 +1,10 @@
 //! What a scan has need of: where its object can be, how fine its data are, how far apart samples stand.
 
-use crate::support::{carve, cells};
+use crate::support::carve;
 use conefield_core::error::Result;
 use conefield_core::pipeline::Pipeline;
 use conefield_core::scan::Scan;
-use conefield_core::scene::Scene;
-use conefield_core::spec::{self, LevelRule, OccupancyRule, Refined, SupportRule};
+use conefield_core::scene::{LevelRule, Scene, SceneSettings, SupportRule};
 use conefield_core::support::Support;
 
 /// A scene, and what of a pipeline it has need of.
@@ -16,11 +15,13 @@ pub struct Fitted {
     pub needed: Option<Vec<usize>>,
     /// What was found, for people.
     pub found: Vec<String>,
+    /// Whether a stage is another one for this scene.
+    pub changed: bool,
 }
 
 /// Where the object can be, if the settings have it looked for, and what was found.
-pub fn support(scan: &Scan, settings: &spec::Scene) -> (Option<Support>, Option<String>) {
-    match settings.support {
+pub fn support(scan: &Scan, rule: SupportRule) -> (Option<Support>, Option<String>) {
+    match rule {
         SupportRule::Box => (None, None),
         SupportRule::Carve => {
             let carved = carve(scan);
@@ -30,33 +31,21 @@ pub fn support(scan: &Scan, settings: &spec::Scene) -> (Option<Support>, Option<
 }
 
 /// The scene of a scan under a spec's settings. Makes `pipeline` count in its lengths.
-pub fn fit(scan: &Scan, settings: &spec::Scene, pipeline: &mut Pipeline) -> Result<Fitted> {
+pub fn fit(scan: &Scan, settings: &SceneSettings, pipeline: &mut Pipeline) -> Result<Fitted> {
     let mut scene = Scene::new(scan, settings)?;
-    let (support, said) = support(scan, settings);
+    let (support, said) = support(scan, settings.support);
     let mut found: Vec<String> = said.into_iter().collect();
     if let Some(support) = support {
         scene = scene.within(support, settings);
     }
-    if let OccupancyRule::Refined(refined) = settings.occupancy {
-        found.push(format!("occupancy: {}", occupancy(&scene, refined)));
-    }
-    pipeline.fit(&scene)?;
+    let changed = pipeline.fit(&scene)?;
     let mut needed = None;
     if settings.levels == LevelRule::Needed {
         let cells = scene.cells(&scan.geometry);
         needed = pipeline.needed(cells);
         found.push(format!("levels: {}", levels(pipeline, needed.as_deref(), cells)?));
     }
-    Ok(Fitted { scene, needed, found })
-}
-
-/// How the support is refined while the field trains.
-fn occupancy(scene: &Scene, Refined { after, every, below, probe }: Refined) -> String {
-    let [x, y, z] = cells(&scene.grid).shape;
-    format!(
-        "from step {after} on looked for every {every} steps in {x} x {y} x {z} cells; those below {below} of the \
-         attenuation scale are sampled by one ray in {probe}"
-    )
+    Ok(Fitted { scene, needed, found, changed })
 }
 
 /// Which of the encoder's channels are needed to tell `cells` apart.

@@ -1,28 +1,28 @@
-//! Solvers: scan in, volume out.
+//! Methods: scan in, volume out.
 //!
-//! - [`gradient`] trains an attenuation field by stochastic gradients; [`pretrain`] trains one on a known volume, for
-//!   weights that other scans reuse.
-//! - [`fit`] finds out what a scan has need of, [`support`] where its object can be, [`refine`] where the field that is
-//!   trained has nothing in it, [`surround`] what lies beyond the volume.
-//! - [`drift`] measures how much of a field changes while it trains.
-//! - [`guard`] takes a run that goes astray back, [`patience`] ends one that no longer gets better.
+//! - [`neural_field`] and [`line_field`] train an attenuation field by stochastic gradients, [`training`] is their loop; [`pretrain`] trains one
+//!   on a known volume, for weights that other scans reuse. [`losses`] say what a difference costs, [`priors`] what the field
+//!   is to be like, [`optimizer`] how gradients change parameters.
+//! - [`fit`] finds out what a scan has need of, [`support`] where its object can be, [`surround`] what lies beyond the volume.
 //! - [`fdk`] filters and back-projects.
-//! - [`sequence`] lets one solver go on where another one ended.
-//! - [`iterative`] improves voxels pass by pass: SART and its kin, CGLS, ASD-POCS, FISTA with total variation.
+//! - [`iterative`] improves voxels pass by pass: SART, CGLS, ASD-POCS, FISTA.
+//! - [`chain`] runs methods one after the other.
 
-pub mod drift;
+pub mod chain;
 pub mod fdk;
+pub mod field_plan;
 pub mod fit;
-pub mod gradient;
-pub mod guard;
 pub mod iterative;
-pub mod patience;
+pub mod line_field;
+pub mod losses;
+pub mod neural_field;
+pub mod optimizer;
 pub mod pretrain;
+pub mod priors;
 pub mod rays;
-pub mod refine;
 pub mod schedule;
-pub mod sequence;
 mod shadow;
 pub mod support;
 pub mod surround;
+pub mod training;
 mod watched;

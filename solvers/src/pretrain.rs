@@ -1,40 +1,69 @@
 //! Pre-training on a known volume, voxel by voxel: `L = |μ(x) − voxel|`, NI-NeRF's mapping-consistency
 //! initialization. What the LayerNorm and the field learn there is reused for every other scan.
 
-use crate::gradient::Gradient;
-use crate::guard::strayed;
+use crate::losses::L1;
+use crate::optimizer::Optimizer;
 use crate::schedule::{Clock, Ends};
+use crate::training::run::strayed;
 use conefield_core::arena::Arena;
-use conefield_core::backend::{Executable, Loss, Work};
-use conefield_core::error::{Error, Result};
+use conefield_core::backend::{Executable, Work};
+use conefield_core::error::{Error, Result, ensure};
+use conefield_core::method::{Job, Observer, PretrainJob, Record};
 use conefield_core::pipeline::{Model, Pipeline};
 use conefield_core::random::stream;
 use conefield_core::scan::Volume;
-use conefield_core::scene::Scene;
-use conefield_core::solver::{Job, Observer, PretrainJob, Record};
-use conefield_core::spec::AttenuationScale;
+use conefield_core::scene::{AttenuationScale, Scene, SceneSettings};
 use ndarray::Axis;
 use rand::RngExt;
+use schemars::JsonSchema;
+use serde::{Deserialize, Serialize};
 use std::time::Instant;
 
 /// Steps on one volume before the next has its turn.
 const TURN: u64 = 25;
 
-/// Trains the field of `job.spec` on its volumes, in turn. Each volume has an encoder of its own; everything behind
-/// the encoder is shared.
-pub fn pretrain(settings: &Gradient, job: &PretrainJob<'_>, observer: &mut dyn Observer) -> Result<Model> {
-    let scenes: Vec<Scene> = job.volumes.iter().map(|v| scene(v, job)).collect::<Result<_>>()?;
+/// How a field learns known volumes.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
+#[serde(deny_unknown_fields, default)]
+pub struct Pretraining {
+    /// Points a step.
+    pub points: usize,
+    /// Steps of `conefield pretrain`.
+    pub steps: u64,
+}
+
+impl Default for Pretraining {
+    fn default() -> Self {
+        Self { points: 65_536, steps: 1000 }
+    }
+}
+
+impl Pretraining {
+    /// Refuses numbers that cannot be used.
+    pub fn validate(&self) -> Result<()> {
+        ensure((1..=1 << 22).contains(&self.points), "spec", "points", self.points, "1 to 2^22")
+    }
+}
+
+/// Trains a field on the volumes of `job`, in turn. Each volume has an encoder of its own; everything behind the encoder is
+/// shared. The loop keeps a record every so many steps.
+pub fn pretrain(
+    (pipeline, mut exe): (Pipeline, Box<dyn Executable>),
+    (optimizer, settings, report_every): (&Optimizer, &Pretraining, u64),
+    seen: &SceneSettings,
+    job: &PretrainJob<'_>,
+    observer: &mut dyn Observer,
+) -> Result<Model> {
+    let scenes: Vec<Scene> = job.volumes.iter().map(|v| scene(v, seen)).collect::<Result<_>>()?;
     if scenes.is_empty() {
         return Err(Error::invalid("pretrain", "volumes", 0, "at least one volume"));
     }
-    let mut model = Model::random(Pipeline::build(job.spec)?, job.seed);
+    let mut model = Model::random(pipeline, job.seed);
     let shared_from = model.pipeline.ranges()[0].end;
-    let (mut exe, explain) = job.backend.compile(&model.pipeline)?;
-    observer.note(&explain.backend);
     let mut waiting: Vec<Arena> = vec![model.arena.clone(); scenes.len() - 1];
-    let ends = Ends { steps: Some(settings.pretrain_steps), seconds: None };
+    let ends = Ends { steps: Some(settings.steps), seconds: None };
     let mut clock = Clock::new(ends, job.limits, 0.0);
-    let mut points = Vec::with_capacity(settings.pretrain_points);
+    let mut points = Vec::with_capacity(settings.points);
     let (mut step, mut loss, mut since) = (0u64, 0.0, 0u64);
     let mut at = 0;
     clock.resume();
@@ -53,17 +82,17 @@ pub fn pretrain(settings: &Gradient, job: &PretrainJob<'_>, observer: &mut dyn O
             waiting.push(std::mem::replace(&mut model.arena, next));
             at = (at + 1) % scenes.len();
         }
-        draw(&job.volumes[at], &scenes[at], job.seed, step, settings.pretrain_points, &mut points);
+        draw(&job.volumes[at], &scenes[at], job.seed, step, settings.points, &mut points);
         let found = fit(exe.as_mut(), &mut model, &points, step, job.seed)?;
         step += 1;
         let share = clock.share(step);
-        let adam = settings.adam(step, 0.0, share);
+        let adam = optimizer.adam(step, 0.0, share);
         exe.update(&mut model, &adam)?;
         (loss, since) = (loss + found, since + 1);
         let share = clock.done(step);
         observer.progress(step, share, clock.seconds() * (1.0 - share).max(0.0) / share.max(1e-9));
-        if step.is_multiple_of(settings.report_every) || share >= 1.0 {
-            let samples_per_s = Some((step * settings.pretrain_points as u64) as f64 / clock.seconds());
+        if step.is_multiple_of(report_every) || share >= 1.0 {
+            let samples_per_s = Some((step * settings.points as u64) as f64 / clock.seconds());
             let record = Record {
                 step,
                 seconds: clock.seconds(),
@@ -83,7 +112,7 @@ pub fn pretrain(settings: &Gradient, job: &PretrainJob<'_>, observer: &mut dyn O
 
 /// Gradients of the L1 loss at known points; returns the loss.
 fn fit(exe: &mut dyn Executable, model: &mut Model, points: &[([f32; 3], f32)], step: u64, seed: u64) -> Result<f64> {
-    let work = Work { step, seed, loss: Loss::L1, rays: &[], points, tv: None, occupancy: None };
+    let work = Work { step, seed, loss: &L1 {}, rays: &[], points, priors: &[] };
     let stats = exe.step(model, &work)?;
     if !stats.loss.is_finite() {
         return Err(Error::Diverged { step, what: format!("the loss is {}", stats.loss) });
@@ -94,7 +123,7 @@ fn fit(exe: &mut dyn Executable, model: &mut Model, points: &[([f32; 3], f32)], 
 /// Brings all of `model` close to `volume`, in 1/mm, within the scene of a scan: a warm start, which a deadline of the job
 /// cuts short. The optimizer's moments are 0 afterwards.
 pub fn learn(
-    settings: &Gradient,
+    (optimizer, settings): (&Optimizer, &Pretraining),
     exe: &mut dyn Executable,
     model: &mut Model,
     (volume, scene): (&Volume, &Scene),
@@ -102,7 +131,7 @@ pub fn learn(
     job: &Job<'_>,
     observer: &dyn Observer,
 ) -> Result<()> {
-    let mut points = Vec::with_capacity(settings.pretrain_points);
+    let mut points = Vec::with_capacity(settings.points);
     for step in 0..steps {
         if observer.cancelled() {
             return Err(Error::Interrupted { step: 0 });
@@ -110,9 +139,9 @@ pub fn learn(
         if job.limits.deadline.is_some_and(|end| Instant::now() >= end) {
             break;
         }
-        draw(volume, scene, job.seed, step, settings.pretrain_points, &mut points);
+        draw(volume, scene, job.seed, step, settings.points, &mut points);
         fit(exe, model, &points, step, job.seed)?;
-        exe.update(model, &settings.adam(step + 1, 0.0, (step + 1) as f64 / steps as f64))?;
+        exe.update(model, &optimizer.adam(step + 1, 0.0, (step + 1) as f64 / steps as f64))?;
     }
     exe.fetch(model)?;
     exe.renew();
@@ -123,9 +152,9 @@ pub fn learn(
 
 /// The scene that a scan of `volume` would have: its attenuation scale comes from the sums along x and y, which are
 /// what rays of a scan would measure.
-fn scene(volume: &Volume, job: &PretrainJob<'_>) -> Result<Scene> {
+fn scene(volume: &Volume, settings: &SceneSettings) -> Result<Scene> {
     volume.grid.validate("volume")?;
-    let attenuation = match job.spec.scene.attenuation {
+    let attenuation = match settings.attenuation {
         AttenuationScale::Fixed(x) => x,
         AttenuationScale::Scan => {
             let mut sums: Vec<f64> = vec![];
@@ -142,7 +171,7 @@ fn scene(volume: &Volume, job: &PretrainJob<'_>) -> Result<Scene> {
     if !(attenuation.is_finite() && attenuation > 0.0) {
         return Err(Error::invalid("volume", "values", "no attenuation", "a volume of an object that absorbs"));
     }
-    Scene::with_attenuation(volume.grid, &job.spec.scene, attenuation)
+    Scene::with_attenuation(volume.grid, settings, attenuation)
 }
 
 /// Random voxel centres with their values.

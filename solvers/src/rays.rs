@@ -3,10 +3,10 @@
 use crate::shadow::{air_level, shadow};
 use conefield_core::backend::TrainRay;
 use conefield_core::error::{Error, Result};
+use conefield_core::pipeline::Pipeline;
 use conefield_core::random::stream;
-use conefield_core::scan::Scan;
+use conefield_core::scan::{Scan, ScanHeader};
 use conefield_core::scene::Scene;
-use conefield_core::stage::Projector;
 use rand::RngExt;
 use rand::seq::SliceRandom;
 use rayon::prelude::*;
@@ -33,7 +33,7 @@ pub enum Pixels {
     /// Those that the object's shadow covers, with a margin: decided from smoothed neighbourhoods, so that the
     /// noise of a pixel does not decide about itself.
     Support,
-    /// Every pixel whose ray the projector samples.
+    /// Every pixel whose ray meets the scene.
     All,
 }
 
@@ -49,11 +49,16 @@ pub struct RaySource<'a> {
 }
 
 impl<'a> RaySource<'a> {
+    /// Bytes of the list of pixels: at most all of them.
+    pub fn bytes(scan: &ScanHeader) -> u64 {
+        size_of::<u32>() as u64 * scan.pixels()
+    }
+
     /// Finds the usable pixels. `margin` widens the support by that many pixels.
     pub fn new(
         scan: &'a Scan,
         scene: &'a Scene,
-        projector: &dyn Projector,
+        pipeline: &Pipeline,
         views: Views,
         which: Pixels,
         margin: usize,
@@ -73,7 +78,7 @@ impl<'a> RaySource<'a> {
                             (_, Some(s)) => s[[row, column]],
                             _ => true,
                         };
-                        counts && projector.max_samples(&scene.pixel_ray(&scan.geometry, v, row, column)) > 0
+                        counts && pipeline.sees(&scene.pixel_ray(&scan.geometry, v, row, column))
                     })
                     .collect()
             })

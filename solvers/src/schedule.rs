@@ -1,7 +1,7 @@
 //! How the learning rate goes down, and when a run ends.
 
 use conefield_core::error::{Result, ensure};
-use conefield_core::solver::Limits;
+use conefield_core::method::Limits;
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 use std::f64::consts::PI;
@@ -46,7 +46,7 @@ impl Decay {
             Decay::Exponential(last) | Decay::Cosine(last) => [last, 1.0],
         };
         let good = all.iter().all(|x| x.is_finite() && *x > 0.0);
-        ensure(good, "spec", "solver.decay", format!("{self:?}"), "positive finite numbers")
+        ensure(good, "spec", "decay", format!("{self:?}"), "positive finite numbers")
     }
 }
 

@@ -27,7 +27,7 @@ const SHARE: f64 = 0.15;
 const VIEWS: usize = 2;
 
 /// What carving came to.
-pub struct Found {
+pub struct CarvedSupport {
     /// The cells that are left, if any could be left out.
     pub support: Option<Support>,
     /// In words.
@@ -73,9 +73,9 @@ impl Blocks {
 }
 
 /// Carves the volume of a scan.
-pub fn carve(scan: &Scan) -> Found {
+pub fn carve(scan: &Scan) -> CarvedSupport {
     let g = &scan.geometry;
-    let nothing = |why: &str| Found { support: None, said: format!("the whole volume, {why}") };
+    let nothing = |why: &str| CarvedSupport { support: None, said: format!("the whole volume, {why}") };
     let blocks = Blocks::of(scan);
     let &Blocks { size, deviation, top, air, .. } = &blocks;
     let Some(air) = air else { return nothing("as no view shows air") };
@@ -83,7 +83,7 @@ pub fn carve(scan: &Scan) -> Found {
     let cells = cells(&g.volume);
     // Half a cell's diagonal on the detector, in blocks, where it is magnified most.
     let half = 0.5 * cells.spacing.iter().map(|s| s * s).sum::<f64>().sqrt();
-    let views: Vec<View> = blocks
+    let views: Vec<ViewShadow> = blocks
         .means
         .par_iter()
         .enumerate()
@@ -100,7 +100,7 @@ pub fn carve(scan: &Scan) -> Found {
             let wide = box_filter(object.mapv(|o| f32::from(u8::from(o))), 1 + reach.ceil() as usize, |window| {
                 window.iter().copied().fold(0.0, f32::max)
             });
-            Some(View { pinhole, object: wide.mapv(|x| x > 0.0) })
+            Some(ViewShadow { pinhole, object: wide.mapv(|x| x > 0.0) })
         })
         .collect();
     if views.len() < VIEWS {
@@ -128,18 +128,18 @@ pub fn carve(scan: &Scan) -> Found {
                 100.0 * box_ / all,
                 g.views.len()
             );
-            Found { support: Some(support), said }
+            CarvedSupport { support: Some(support), said }
         }
     }
 }
 
 /// A view's object, widened by a cell's shadow.
-struct View {
+struct ViewShadow {
     pinhole: Pinhole,
     object: Array2<bool>,
 }
 
-impl View {
+impl ViewShadow {
     /// Whether the view shows air at `p`; `None` where it does not see it.
     fn air(&self, p: Vec3, [rows, columns]: [usize; 2], size: usize) -> Option<bool> {
         let ([row, column], depth) = self.pinhole.project(p);
@@ -203,7 +203,7 @@ fn air(blocks: &[Array2<f32>], deviation: f32, top: f32) -> Option<f32> {
 }
 
 /// Cells of about the same side along every axis that fill the volume.
-pub(crate) fn cells(volume: &VoxelGrid) -> VoxelGrid {
+fn cells(volume: &VoxelGrid) -> VoxelGrid {
     let size = volume.size();
     let side = size.into_iter().fold(0.0, f64::max) / CELLS;
     let shape: [usize; 3] =
@@ -218,7 +218,7 @@ fn corners(grid: &VoxelGrid) -> [Vec3; 8] {
 }
 
 /// Cells and all their neighbours.
-pub(crate) fn widened(cells: &[bool], [nx, ny, nz]: [usize; 3]) -> Vec<bool> {
+fn widened(cells: &[bool], [nx, ny, nz]: [usize; 3]) -> Vec<bool> {
     let near = |i: usize, n: usize| i.saturating_sub(1)..(i + 2).min(n);
     (0..cells.len())
         .into_par_iter()

@@ -7,13 +7,14 @@
 //! the volume nothing finer than these cells is modelled, once.
 
 use crate::iterative::Stop;
-use crate::iterative::fista_tv::FistaTv;
+use crate::iterative::fista::Fista;
+use crate::iterative::regularizers::TotalVariation;
 use crate::support::Blocks;
 use conefield_core::error::{Error, Result};
 use conefield_core::geometry::{Geometry, View, VoxelGrid, norm};
-use conefield_core::scan::{Scan, Unit};
-use conefield_core::solver::{Job, Observer, Record, Solver};
-use conefield_core::spec::{self, Spec, SurroundRule};
+use conefield_core::method::{Job, Observer, Record};
+use conefield_core::scan::{Scan, ScanHeader, Unit};
+use conefield_core::scene::{CoarseSurround, SurroundRule};
 use conefield_projectors::voxel::Joseph;
 use ndarray::{Array3, Axis, Zip, s};
 
@@ -32,9 +33,8 @@ pub(crate) struct Within {
 
 impl Within {
     /// Looks beyond the volume where the spec asks for it; `None` where there is nothing to look for.
-    pub(crate) fn of(job: &Job<'_>, observer: &mut dyn Observer) -> Result<Option<Self>> {
-        let SurroundRule::Coarse(settings) = job.spec.scene.surround else { return Ok(None) };
-        job.spec.scene.surround.validate()?;
+    pub(crate) fn of(job: &Job<'_>, rule: SurroundRule, observer: &mut dyn Observer) -> Result<Option<Self>> {
+        let SurroundRule::Coarse(settings) = rule else { return Ok(None) };
         let (around, said) = Around::of(job.scan, settings)?;
         observer.note(&format!("surround: {said}"));
         let Some(around) = around else { return Ok(None) };
@@ -65,23 +65,31 @@ impl Within {
 
 /// The scan of `job` without what lies beyond the volume, as its solver sees it; `None` where the spec does not ask for it or
 /// nothing is there to look for.
-pub fn subtracted(job: &Job<'_>, observer: &mut dyn Observer) -> Result<Option<Scan>> {
-    Ok(Within::of(job, observer)?.map(|within| within.scan))
+pub fn subtracted(job: &Job<'_>, rule: SurroundRule, observer: &mut dyn Observer) -> Result<Option<Scan>> {
+    Ok(Within::of(job, rule, observer)?.map(|within| within.scan))
 }
 
-/// What a spec's surround comes to for this scan, in words; `None` where it asks for none.
-pub fn told(scan: &Scan, settings: &spec::Scene) -> Result<Option<String>> {
-    let SurroundRule::Coarse(settings) = settings.surround else { return Ok(None) };
-    Ok(Some(Around::of(scan, settings)?.1))
+/// What lies beyond the volume of this scan, in words; nothing where the rule asks for nothing.
+pub fn found(scan: &Scan, rule: SurroundRule) -> Result<Vec<String>> {
+    let SurroundRule::Coarse(settings) = rule else { return Ok(vec![]) };
+    Ok(vec![format!("surround: {}", Around::of(scan, settings)?.1)])
 }
 
-/// Bytes that looking beyond the volume takes at most; and that what it leaves of a scan of so many `pixels` takes, until the
-/// volume is made.
-pub fn memory(rule: SurroundRule, pixels: u64) -> [u64; 2] {
+/// Bytes that looking beyond the volume takes at most; and that what it leaves of a scan of these sizes takes, until the
+/// volume is made. The coarse pixels are not counted: how many there are only the scan itself tells.
+pub fn bytes(rule: SurroundRule, header: &ScanHeader) -> [u64; 2] {
     let SurroundRule::Coarse(settings) = rule else { return [0; 2] };
-    let side = settings.cells as f64 * (1.0 + 2.0 * settings.margin) + 2.0;
-    let cells = (side.powi(3) as u64).min(MOST as u64);
-    [4 * cells + FistaTv::default().working_memory(0, cells), 4 * pixels]
+    let side = (settings.cells as f64 * (1.0 + 2.0 * settings.margin)) as usize + 2;
+    let side = side.min((MOST as f64).cbrt() as usize);
+    let cells = ScanHeader { views: 0, detector: [0; 2], volume: [side; 3] };
+    let finding = method(settings.passes).bytes(&cells);
+    [4 * cells.voxels() + finding, 4 * header.pixels()]
+}
+
+/// What finds the cells.
+fn method(passes: u64) -> Fista {
+    let stop = Stop { passes: Some(passes), ..Stop::default() };
+    Fista { stop, prior: Box::new(TotalVariation::default()), ..Fista::default() }
 }
 
 /// Coarse cells over the volume and around it.
@@ -93,7 +101,7 @@ struct Around {
 
 impl Around {
     /// Of a scan whose object reaches the sides of views, and what was found in words.
-    fn of(scan: &Scan, settings: spec::Surround) -> Result<(Option<Self>, String)> {
+    fn of(scan: &Scan, settings: CoarseSurround) -> Result<(Option<Self>, String)> {
         let (g, blocks) = (&scan.geometry, Blocks::of(scan));
         let n = g.views.len();
         let cut: Vec<[bool; 2]> = (0..n).map(|v| [blocks.cut(v, 0), blocks.cut(v, 1)]).collect();
@@ -134,10 +142,8 @@ impl Around {
     /// What is in the cells beyond the volume, in 1/mm.
     fn find(&self, job: &Job<'_>, passes: u64, observer: &mut dyn Observer) -> Result<Array3<f32>> {
         let scan = coarse(job.scan, self.cells);
-        let solver = FistaTv { stop: Stop { passes: Some(passes), ..Stop::default() }, ..FistaTv::default() };
-        let spec = Spec::voxels(Box::new(solver.clone()), spec::Scene::default());
-        let alone = Job { seed: job.seed, ..Job::new(&scan, &spec, job.backend) };
-        let mut data = solver.solve(&alone, &mut Quiet(observer))?.result.volume(job.backend)?.data;
+        let alone = Job { seed: job.seed, ..Job::new(&scan, job.backend) };
+        let mut data = method(passes).solve(&alone, &mut Quiet(observer))?.result.volume(job.backend)?.data;
         let [x, y, z]: [_; 3] = std::array::from_fn(|k| self.margin[k]..self.cells.shape[k] - self.margin[k]);
         data.slice_mut(s![x, y, z]).fill(0.0);
         Ok(data)
@@ -167,7 +173,7 @@ impl Around {
 
 /// Cells that fill the volume exactly, and as many more of them along the axes `along` as `margin` of its longest side has
 /// room for; how many more.
-fn grid(volume: &VoxelGrid, settings: spec::Surround, along: [bool; 3], margin: f64) -> (VoxelGrid, [usize; 3]) {
+fn grid(volume: &VoxelGrid, settings: CoarseSurround, along: [bool; 3], margin: f64) -> (VoxelGrid, [usize; 3]) {
     let size = volume.size();
     let longest = size.into_iter().fold(0.0, f64::max);
     let inside: [usize; 3] =

@@ -2,7 +2,7 @@
 
 use conefield_core::scan::{Scan, Volume};
 use conefield_core::support::Support;
-use conefield_projectors::simulate::{Extent, Noise, Protocol, simulate};
+use conefield_projectors::simulate::{DetectorExtent, DetectorNoise, Protocol, simulate};
 use conefield_solvers::support::carve;
 use ndarray::Array3;
 
@@ -18,12 +18,12 @@ fn volume(more: impl Fn([usize; 3]) -> Option<f32>) -> Volume {
     Volume::centered(data, [2.0 / N as f64; 3])
 }
 
-fn scan(volume: &Volume, views: usize, noise: Noise) -> Scan {
+fn scan(volume: &Volume, views: usize, noise: DetectorNoise) -> Scan {
     let protocol = Protocol::r2(&volume.grid).with_detector([128, 128]).with_views(views).with_noise(noise, 3);
     simulate(volume, &protocol).unwrap()
 }
 
-fn noisy() -> Noise {
+fn noisy() -> DetectorNoise {
     "tigre:1e4,10".parse().unwrap()
 }
 
@@ -35,7 +35,7 @@ fn lost(volume: &Volume, support: &Support) -> usize {
 }
 
 /// Carves a scan of `volume` and finds everything that is real still there. Returns the share that is left.
-fn keeps(name: &str, volume: &Volume, views: usize, noise: Noise) -> f64 {
+fn keeps(name: &str, volume: &Volume, views: usize, noise: DetectorNoise) -> f64 {
     let found = carve(&scan(volume, views, noise));
     println!("{name}: {}", found.said);
     let Some(support) = found.support else { return 1.0 };
@@ -46,12 +46,12 @@ fn keeps(name: &str, volume: &Volume, views: usize, noise: Noise) -> f64 {
 #[test]
 fn air_is_left_out_and_the_object_is_not() {
     let body = volume(|_| None);
-    let share = keeps("body", &body, 50, Noise::None);
+    let share = keeps("body", &body, 50, DetectorNoise::None);
     assert!(share < 0.35, "{share}");
     let share = keeps("body, noise", &body, 50, noisy());
     assert!(share < 0.4, "{share}");
     // The box is that of the body, not of the volume.
-    let support = carve(&scan(&body, 50, Noise::None)).support.unwrap();
+    let support = carve(&scan(&body, 50, DetectorNoise::None)).support.unwrap();
     let [low, high] = support.bounds();
     assert!((0..3).all(|k| high[k] - low[k] < 1.7), "{low:?} {high:?}");
 }
@@ -59,17 +59,17 @@ fn air_is_left_out_and_the_object_is_not() {
 #[test]
 fn thin_and_faint_things_stay() {
     let wire = volume(|[x, y, _]| (x == 43 && y == 6).then_some(0.6));
-    keeps("wire beside the body", &wire, 50, Noise::None);
+    keeps("wire beside the body", &wire, 50, DetectorNoise::None);
     keeps("wire beside the body, noise", &wire, 50, noisy());
     let slanted = volume(|[x, y, z]| (x == 40 && y + z == 50).then_some(0.8));
     keeps("slanted wire, noise", &slanted, 50, noisy());
     let voxel = volume(|at| (at == [47, 24, 40]).then_some(8.0));
-    keeps("bright voxel at the rim", &voxel, 50, Noise::None);
+    keeps("bright voxel at the rim", &voxel, 50, DetectorNoise::None);
     keeps("bright voxel at the rim, noise", &voxel, 50, noisy());
     // Four voxels a side of a tenth of the body's attenuation, in the air beside it.
     let faint =
         volume(|[x, y, z]| ((40..44).contains(&x) && (8..12).contains(&y) && (30..34).contains(&z)).then_some(0.1));
-    keeps("faint block", &faint, 50, Noise::None);
+    keeps("faint block", &faint, 50, DetectorNoise::None);
     // Some 30 photons through the body, 300 beside it.
     keeps("body, 10 views, heavy noise", &volume(|_| None), 10, "poisson:300".parse().unwrap());
 }
@@ -79,10 +79,11 @@ fn few_views_and_cut_off_objects_carve_little_or_nothing() {
     for views in [1, 2, 3, 4] {
         keeps(&format!("{views} views"), &volume(|_| None), views, noisy());
     }
-    assert!(carve(&scan(&volume(|_| None), 1, Noise::None)).support.is_none());
+    assert!(carve(&scan(&volume(|_| None), 1, DetectorNoise::None)).support.is_none());
     // The detector is too narrow: what it shows beside the object, if anything, is not air that one can trust.
     let body = volume(|_| None);
-    let narrow = |grid, side| Protocol { extent: Extent::Side(side), ..Protocol::r2(grid).with_detector([64, 64]) };
+    let narrow =
+        |grid, side| Protocol { extent: DetectorExtent::Side(side), ..Protocol::r2(grid).with_detector([64, 64]) };
     let protocol = narrow(&body.grid, [4.0, 0.9]);
     let found = carve(&simulate(&body, &protocol).unwrap());
     assert!(found.support.is_none() && found.said.contains("sides of the views"), "{}", found.said);
@@ -93,14 +94,14 @@ fn few_views_and_cut_off_objects_carve_little_or_nothing() {
     assert!(found.support.is_none(), "{}", found.said);
     // A scan of air.
     let nothing = Volume::centered(Array3::zeros((N, N, N)), [2.0 / N as f64; 3]);
-    assert!(carve(&scan(&nothing, 20, Noise::None)).support.is_none());
+    assert!(carve(&scan(&nothing, 20, DetectorNoise::None)).support.is_none());
 }
 
 /// Negative control: a threshold that is met by chance alone would lose a wire. Here the wire is hidden on purpose.
 #[test]
 fn a_wire_that_no_view_shows_is_lost() {
     let wire = volume(|[x, y, _]| (x == 43 && y == 6).then_some(0.6));
-    let blind = scan(&volume(|_| None), 50, Noise::None);
+    let blind = scan(&volume(|_| None), 50, DetectorNoise::None);
     let support = carve(&blind).support.unwrap();
     assert!(lost(&wire, &support) > 0);
 }

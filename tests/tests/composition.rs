@@ -23,18 +23,19 @@ fn encoders() -> Vec<(&'static str, Value, usize, bool)> {
     ]
 }
 
-fn chains(width: usize, ordered: bool) -> Vec<Value> {
+/// Normalizers and masks.
+fn chains(width: usize, ordered: bool) -> Vec<[Value; 2]> {
     // 8 views, all of them an epoch: measured at step 16. These encoders are coarse, most channels stay.
     let measured = json!({"type": "fft-mask", "epoch": 2, "scope": if ordered { "finer" } else { "channel" }});
     let given = json!({"type": "fft-mask", "keep": kept(width)});
     let norm = json!({"type": "layer-norm"});
     vec![
-        json!([]),
-        json!([norm]),
-        json!([measured, norm]),
-        json!([norm, measured]),
-        json!([given, norm]),
-        json!([norm, given]),
+        [json!([]), json!([])],
+        [json!([norm]), json!([])],
+        [json!([]), json!([measured])],
+        [json!([norm]), json!([measured])],
+        [json!([]), json!([given])],
+        [json!([norm]), json!([given])],
     ]
 }
 
@@ -55,10 +56,11 @@ fn mlp() -> Value {
     json!({"type": "mlp", "width": 16, "depth": 3, "skips": [1]})
 }
 
-fn pipeline(encoder: &Value, normalizers: &Value, field: &Value, projector: &Value) -> Value {
+fn pipeline(encoder: &Value, [normalizers, masks]: &[Value; 2], field: &Value, projector: &Value) -> Value {
     json!({
         "encoder": encoder, "normalizers": normalizers, "field": field, "projector": projector,
-        "solver": {"type": "gradient", "steps": 30, "rays": 96, "lr": 0.02, "loss": "l2", "report_every": 5},
+        "solver": {"type": "gradient", "steps": 30, "rays": 96, "lr": 0.02, "loss": "l2", "report_every": 5,
+                   "callbacks": masks},
     })
 }
 
@@ -70,7 +72,7 @@ fn learns(name: &str, spec: &Value) -> usize {
     assert!(last < 0.5 * first, "{name}: the loss went from {first} to {last}");
     assert!(volume(&solution).data.iter().all(|x| x.is_finite()), "{name}");
     // A mask in the chain was decided on the way.
-    let masks = spec["normalizers"].as_array().unwrap().iter().filter(|n| n["type"] == "fft-mask").count();
+    let masks = spec["solver"]["callbacks"].as_array().unwrap().len();
     let events: Vec<_> = records.iter().flat_map(|r| &r.events).collect();
     assert_eq!(events.len(), masks, "{name}: {events:?}");
     solution.result.field().unwrap().model.pipeline.field.info().input
@@ -97,7 +99,7 @@ fn every_combination_that_fits_learns() {
 fn voxels_behind_positions_learn() {
     let grid = json!({"type": "voxel-grid", "resolution": 16});
     for (p, projector) in projectors().iter().enumerate() {
-        let mut spec = pipeline(&json!({"type": "identity"}), &json!([]), &grid, projector);
+        let mut spec = pipeline(&json!({"type": "identity"}), &[json!([]), json!([])], &grid, projector);
         // Every voxel moves by about the rate a step, from softplus(−2) on.
         spec["solver"]["lr"] = json!(0.1);
         learns(&format!("voxels, projector {p}"), &spec);
@@ -118,7 +120,7 @@ fn refused(what: &str, spec: &Value, words: &[&str]) {
 #[test]
 fn what_does_not_fit_is_refused_in_words() {
     let hash = json!({"type": "hash-grid", "levels": 4, "base_resolution": 3, "log2_table_size": 9});
-    let none = json!([]);
+    let none = [json!([]), json!([])];
     let march = &projectors()[0];
     let good = pipeline(&hash, &none, &mlp(), march);
     let with = |change: &dyn Fn(&mut Value)| {
@@ -129,7 +131,7 @@ fn what_does_not_fit_is_refused_in_words() {
 
     let voxels = json!({"type": "voxel-grid", "resolution": 16});
     refused("voxels behind features", &pipeline(&hash, &none, &voxels, march), &["8 channels", "identity"]);
-    let drops = json!([{"type": "fft-mask", "keep": [0, 2]}]);
+    let drops = [json!([]), json!([{"type": "fft-mask", "keep": [0, 2]}])];
     let spec = pipeline(&json!({"type": "identity"}), &drops, &voxels, march);
     refused("voxels without a coordinate", &spec, &["voxel-grid", "all three coordinates"]);
     for stage in ["encoder", "field", "projector"] {
@@ -158,7 +160,7 @@ fn what_does_not_fit_is_refused_in_words() {
 #[test]
 fn finer_channels_without_an_order_are_refused() {
     for (name, encoder, _, ordered) in encoders() {
-        let mask = json!([{"type": "fft-mask", "epoch": 1, "scope": "finer"}]);
+        let mask = [json!([]), json!([{"type": "fft-mask", "epoch": 1, "scope": "finer"}])];
         let spec = pipeline(&encoder, &mask, &mlp(), &projectors()[0]);
         if ordered {
             learns(name, &spec);

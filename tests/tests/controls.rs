@@ -1,17 +1,25 @@
 //! Negative controls: a small stage that passes the kit, and the same stage with one fault at a time, which must fail
 //! the property that the fault breaks. A kit that cannot fail proves nothing.
 
-use conefield_conformance::{Options, check, check_encoder, check_initializer, check_projector, check_voxel_projector};
+mod device;
+
+use conefield_conformance::{
+    Options, check, check_encoder, check_initializer, check_loss, check_loss_wgsl, check_prior, check_prior_wgsl,
+    check_projector, check_settings, check_voxel_projector,
+};
 use conefield_core::arena::{Arena, InitReport, Layout};
 use conefield_core::geometry::Geometry;
 use conefield_core::half::Stored;
+use conefield_core::loss::{Loss, NoiseModel};
+use conefield_core::prior::{Blocks, Prior};
+use conefield_core::settings::{Initializer, LossSpec};
 use conefield_core::simd::Real;
-use conefield_core::spec::Initializer;
 use conefield_core::stage::{
     Encoder, GradKind, Grads, Halves, Info, Kernel, Lengths, Parameter, Projector, Reduced, Samples, Scope, Stage,
     Tile, TileMut, UnitRay,
 };
 use conefield_core::voxel::{VoxelOperator, VoxelProjector};
+use conefield_core::wgsl::Fragment;
 use conefield_core::{Error, Result};
 use conefield_projectors::voxel::{Joseph, Siddon};
 use ndarray::{ArrayView3, ArrayViewMut3};
@@ -681,4 +689,259 @@ fn every_fault_of_an_initializer_fails_its_property() {
         let report = check_initializer(&toy(fault));
         assert!(report.failed().contains(&property), "{fault:?} passed {property:?}:\n{report}");
     }
+}
+
+/// What is wrong with a loss.
+#[derive(Debug, Clone, Copy, PartialEq)]
+enum LossFault {
+    None,
+    /// The derivative is 1 % too large.
+    Derivative,
+    /// The derivative has the wrong sign.
+    Away,
+    /// It is not 0 where both values agree.
+    Offset,
+    /// Squares overflow.
+    Overflows,
+    /// A NaN is taken for 0.
+    HidesNan,
+    /// The result depends on the call.
+    Remembers,
+    /// It learns and does not say that it needs a scan.
+    Secret,
+    /// It says that it needs a scan and learns nothing.
+    Idle,
+    /// What it learned is ten times as large.
+    Grows,
+    /// It says that something went wrong.
+    Reports,
+    /// It panics.
+    Panics,
+}
+
+/// `s·d²/2`.
+struct ToyLoss {
+    fault: LossFault,
+    scale: f64,
+    calls: AtomicU32,
+}
+
+impl ToyLoss {
+    fn new(fault: LossFault) -> Self {
+        Self { fault, scale: 1.0, calls: AtomicU32::new(0) }
+    }
+}
+
+impl Loss for ToyLoss {
+    fn at(&self, predicted: f64, measured: f64) -> (f64, f64) {
+        let calls = self.calls.fetch_add(1, Ordering::Relaxed);
+        let d = self.scale * (predicted - measured);
+        let (value, slope) = (0.5 * d * d / self.scale, d);
+        match self.fault {
+            LossFault::Derivative => (value, 1.01 * slope),
+            LossFault::Away => (value, -slope),
+            LossFault::Offset => (value + 1e-3, slope),
+            LossFault::Overflows => (value * value.powi(4) / value.powi(4), slope),
+            LossFault::HidesNan if predicted.is_nan() => (0.0, 0.0),
+            LossFault::Remembers => (value * (1.0 + f64::from(calls % 7) * 1e-12), slope),
+            LossFault::Panics => panic!("as ordered"),
+            _ => (value, slope),
+        }
+    }
+
+    fn wgsl(&self) -> Option<Fragment> {
+        let slope = if self.fault == LossFault::Derivative { "1.01 * d" } else { "d" };
+        Some(Fragment::new(&[&format!(
+            "fn stage_at(predicted: f32, measured: f32) -> vec2<f32> {{
+    let d = predicted - measured;
+    return vec2<f32>(0.5 * d * d, {slope});
+}}
+"
+        )]))
+    }
+
+    fn needs_scan(&self) -> bool {
+        matches!(self.fault, LossFault::Idle | LossFault::Grows)
+    }
+
+    fn fitted(&self, _: &NoiseModel<'_>) -> Option<Box<dyn Loss>> {
+        let learns = matches!(self.fault, LossFault::Secret | LossFault::Grows);
+        learns.then(|| Box::new(Self { scale: 10.0, ..Self::new(LossFault::None) }) as Box<dyn Loss>)
+    }
+
+    fn fault(&self) -> Result<()> {
+        if self.fault == LossFault::Reports { Err(Error::unsupported("toy", "as ordered")) } else { Ok(()) }
+    }
+
+    fn describe(&self) -> String {
+        format!("toy loss: {:?}", self.fault)
+    }
+}
+
+#[test]
+fn every_fault_of_a_loss_fails_its_property() {
+    let sound = check_loss(&ToyLoss::new(LossFault::None));
+    assert!(sound.passed(), "{sound}");
+    for (fault, property) in [
+        (LossFault::Derivative, "finite differences"),
+        (LossFault::Away, "least where values agree"),
+        (LossFault::Offset, "least where values agree"),
+        (LossFault::Overflows, "extremes"),
+        (LossFault::HidesNan, "poison"),
+        (LossFault::Remembers, "repeatable"),
+        (LossFault::Secret, "learns from a scan"),
+        (LossFault::Idle, "learns from a scan"),
+        (LossFault::Grows, "learns from a scan"),
+        (LossFault::Reports, "no fault"),
+        (LossFault::Panics, "finite differences"),
+    ] {
+        let report = quietly(|| check_loss(&ToyLoss::new(fault)));
+        assert!(report.failed().contains(&property), "{fault:?} passed {property:?}:\n{report}");
+    }
+    assert_eq!(check_loss(&ToyLoss::new(LossFault::Derivative)).failed(), ["finite differences"]);
+}
+
+/// What is wrong with a prior.
+#[derive(Debug, Clone, Copy, PartialEq)]
+enum PriorFault {
+    None,
+    /// One derivative is missing.
+    Forgotten,
+    /// Gradients replace what is there.
+    Overwrites,
+    /// The scale is left out.
+    Unscaled,
+    /// The penalty is scaled too.
+    ScalesPenalty,
+    /// One number past the end of the gradient.
+    WritesOutside,
+    /// Cubes overflow.
+    Overflows,
+    /// A NaN is passed over.
+    HidesNan,
+    /// The result depends on the call.
+    Remembers,
+    /// Blocks of one point.
+    NoBlocks,
+    /// It says that something went wrong.
+    Reports,
+}
+
+/// `Σ v²/2`.
+struct ToyPrior {
+    fault: PriorFault,
+    calls: AtomicU32,
+}
+
+impl Prior for ToyPrior {
+    fn blocks(&self) -> Blocks {
+        let edge = if self.fault == PriorFault::NoBlocks { 1 } else { 3 };
+        Blocks { edge, count: 2, spacing: 1.0, weight: 1.0 }
+    }
+
+    fn block(&self, values: &[f64], scale: f64, gradient: &mut [f64]) -> f64 {
+        let calls = self.calls.fetch_add(1, Ordering::Relaxed);
+        let mut sum = 0.0;
+        for (i, (v, g)) in values.iter().zip(gradient.iter_mut()).enumerate() {
+            if self.fault == PriorFault::HidesNan && v.is_nan() || self.fault == PriorFault::Forgotten && i == 13 {
+                sum += if v.is_nan() { 0.0 } else { 0.5 * v * v };
+                continue;
+            }
+            sum += match self.fault {
+                PriorFault::Overflows => 0.5 * v * v * (v.powi(12) + 1.0) / (v.powi(12) + 1.0),
+                PriorFault::ScalesPenalty => 0.5 * v * v * scale,
+                PriorFault::Remembers => 0.5 * v * v * (1.0 + f64::from(calls % 7) * 1e-12),
+                _ => 0.5 * v * v,
+            };
+            let slope = if self.fault == PriorFault::Unscaled { *v } else { scale * v };
+            *g = if self.fault == PriorFault::Overwrites { slope } else { *g + slope };
+        }
+        if self.fault == PriorFault::WritesOutside {
+            poke(gradient, values.len() as isize);
+        }
+        sum
+    }
+
+    fn wgsl(&self) -> Option<Fragment> {
+        let slope = if self.fault == PriorFault::Forgotten { "select(v, 0.0, p == 13u)" } else { "v" };
+        Some(Fragment::new(&[&format!(
+            "fn stage_at(p: u32) -> vec2<f32> {{
+    let v = stage_value(p);
+    return vec2<f32>(0.5 * v * v, {slope});
+}}
+"
+        )]))
+    }
+
+    fn fault(&self) -> Result<()> {
+        if self.fault == PriorFault::Reports { Err(Error::unsupported("toy", "as ordered")) } else { Ok(()) }
+    }
+
+    fn describe(&self) -> String {
+        format!("toy prior: {:?}", self.fault)
+    }
+}
+
+#[test]
+fn every_fault_of_a_prior_fails_its_property() {
+    let toy = |fault| ToyPrior { fault, calls: AtomicU32::new(0) };
+    let sound = check_prior(&toy(PriorFault::None));
+    assert!(sound.passed(), "{sound}");
+    for (fault, property) in [
+        (PriorFault::Forgotten, "finite differences"),
+        (PriorFault::Overwrites, "gradients add"),
+        (PriorFault::Unscaled, "scale"),
+        (PriorFault::ScalesPenalty, "scale"),
+        (PriorFault::WritesOutside, "guards"),
+        (PriorFault::Overflows, "extremes"),
+        (PriorFault::HidesNan, "poison"),
+        (PriorFault::Remembers, "repeatable"),
+        (PriorFault::NoBlocks, "blocks"),
+        (PriorFault::Reports, "no fault"),
+    ] {
+        let report = quietly(|| check_prior(&toy(fault)));
+        assert!(report.failed().contains(&property), "{fault:?} passed {property:?}:\n{report}");
+    }
+    assert_eq!(check_prior(&toy(PriorFault::Forgotten)).failed(), ["finite differences"]);
+}
+
+/// A formula for a device that is not the one for the CPU is found out.
+#[test]
+fn wgsl_with_another_derivative_fails() {
+    let Some(shared) = device::shared("the WGSL of toys") else { return };
+    let prior = |fault| ToyPrior { fault, calls: AtomicU32::new(0) };
+    let on_cpu = |fault| if fault { LossFault::Derivative } else { LossFault::None };
+    for (wrong, other) in [(false, false), (false, true), (true, false)] {
+        // The CPU's formula is the first one's, the device's the second one's.
+        let report = check_loss_wgsl(&ToyLoss::new(on_cpu(wrong)), &|_, pairs| {
+            shared.losses(&ToyLoss::new(on_cpu(other)), pairs)
+        });
+        assert_eq!(report.passed(), wrong == other, "{report}");
+    }
+    for other in [PriorFault::None, PriorFault::Forgotten] {
+        let report = check_prior_wgsl(&prior(PriorFault::None), &|_, values| shared.penalty(&prior(other), values));
+        assert_eq!(report.passed(), other == PriorFault::None, "{report}");
+    }
+}
+
+/// Settings that lose a number when they are read.
+#[derive(serde::Serialize, serde::Deserialize)]
+struct Lossy {
+    #[serde(skip_deserializing)]
+    lost: f64,
+}
+
+#[typetag::serde(name = "test-lossy")]
+impl LossSpec for Lossy {
+    fn build(&self) -> Result<Box<dyn Loss>> {
+        Ok(Box::new(ToyLoss::new(LossFault::None)))
+    }
+}
+
+#[test]
+fn settings_that_get_lost_are_found_out() {
+    let report = check_settings::<dyn LossSpec>("test-lossy", &serde_json::json!({"lost": 2.0}));
+    assert_eq!(report.failed(), ["save and load"], "{report}");
+    let report = check_settings::<dyn LossSpec>("test-none", &serde_json::json!({}));
+    assert_eq!(report.failed(), ["save and load", "a name alone"], "{report}");
 }

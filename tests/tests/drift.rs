@@ -1,4 +1,4 @@
-//! The drift that `solver.drift` logs: what it measures, and what it leaves alone.
+//! The drift that the callback `drift` logs: what it measures, and what it leaves alone.
 
 mod common;
 
@@ -9,10 +9,11 @@ use conefield_core::arena::Weights;
 use conefield_core::backend::Backend;
 use conefield_core::checkpoint::Resume;
 use conefield_core::host;
+use conefield_core::method::{DriftRecord, Job, Record};
 use conefield_core::pipeline::{Model, Pipeline};
 use conefield_core::scene::Scene;
-use conefield_core::solver::{DriftRecord, Job, Record};
-use conefield_solvers::drift::{Drift, DriftWatch};
+use conefield_solvers::training::callbacks::Drift;
+use conefield_solvers::training::{CallbackSpec, Run};
 use serde_json::{Value, json};
 
 /// 40 steps over 8 views: 5 epochs.
@@ -23,13 +24,21 @@ fn settings() -> Value {
         "field": {"type": "mlp", "width": 12, "depth": 3, "skips": [1], "output": "none"},
         "projector": {"type": "ray-march", "samples": 20},
         "solver": {"type": "gradient", "steps": 40, "rays": 64, "lr": 0.02, "report_every": 5,
-                   "drift": {"every": 1.5, "points": 300}},
+                   "callbacks": [{"type": "rollback"}, {"type": "drift", "every": 1.5, "points": 300}]},
     })
 }
 
 fn with(path: &str, value: Value) -> Value {
     let mut all = settings();
     *all.pointer_mut(path).unwrap() = value;
+    all
+}
+
+/// With a mask after two epochs.
+fn masked() -> Value {
+    let mut all = settings();
+    let mask = json!({"type": "fft-mask", "epoch": 2, "threshold": 1e-6});
+    all["solver"]["callbacks"].as_array_mut().unwrap().push(mask);
     all
 }
 
@@ -63,35 +72,39 @@ fn stages_on_the_host_compute_what_the_backend_does() {
 
 #[test]
 fn a_field_that_moves_by_a_known_amount_drifts_by_it() {
-    let (scan, spec) = (scan(), spec(&settings()).unwrap());
+    let (scan, spec, cpu) = (scan(), spec(&settings()).unwrap(), Cpu::new());
     let scene = Scene::new(&scan, &spec.scene).unwrap();
-    let mut model = Model::random(Pipeline::build(&spec).unwrap(), 3);
-    let (mut exe, _) = Cpu::new().compile(&model.pipeline).unwrap();
-    let watch = Drift { every: 2.0, points: 500 };
-    let mut watch = DriftWatch::new(&watch, &scene, 3, 4.0, None, &model).unwrap();
-    let mut events = vec![];
-    let mut look = |step: u64, model: &mut Model| {
-        assert!(watch.due(step) && !watch.due(step + 1));
-        let found = watch.look(step, model, exe.as_mut(), &mut events).unwrap();
-        assert!(!watch.due(step));
-        found
+    let model = Model::random(Pipeline::build(&spec).unwrap(), 3);
+    let exe = cpu.compile(&model.pipeline).unwrap().0;
+    let job = Job { seed: 3, ..Job::new(&scan, &spec, &cpu) };
+    let mut heard = Heard::default();
+    let mut run = Run::new(&job, &scene, &mut heard, model, exe);
+    run.steps_an_epoch = 4;
+    let mut callback = Drift { every: 2.0, points: 500 }.build().unwrap();
+    callback.begin(&mut run).unwrap();
+    let mut look = |step: u64, run: &mut Run<'_>| {
+        for step in [step, step, step + 1] {
+            run.step = step;
+            callback.between_steps(run).unwrap();
+        }
+        std::mem::take(&mut run.tally.window.drift)
     };
-    assert_eq!(look(0, &mut model), None);
+    assert_eq!(look(0, &mut run), []);
     // The last bias alone adds to every attenuation.
-    let last = model.arena.params.len() - 1;
-    model.arena.params[last] += 0.25;
-    let found = look(8, &mut model).unwrap();
-    assert!((found.mean_l1 - 0.25).abs() < 1e-6, "{found:?}");
-    assert_eq!((found.from_step, found.step, found.epoch), (0, 8, 2.0));
+    let last = run.model.arena.params.len() - 1;
+    run.model.arena.params[last] += 0.25;
+    let found = look(8, &mut run);
+    assert!(found.len() == 1 && (found[0].mean_l1 - 0.25).abs() < 1e-6, "{found:?}");
+    assert_eq!((found[0].from_step, found[0].step, found[0].epoch), (0, 8, 2.0));
     // Against the last recording, not the first.
-    assert_eq!(look(16, &mut model).unwrap().mean_l1, 0.0);
+    assert_eq!(look(16, &mut run)[0].mean_l1, 0.0);
     // The encoder is not within what is evaluated again; a LayerNorm is.
-    let ranges = model.pipeline.ranges().to_vec();
-    model.arena.params[ranges[0].clone()].iter_mut().for_each(|p| *p = 1.0 - *p);
-    assert_eq!(look(24, &mut model).unwrap().mean_l1, 0.0);
-    model.arena.params[ranges[1].clone()].iter_mut().for_each(|p| *p += 0.5);
-    assert!(look(32, &mut model).unwrap().mean_l1 > 1e-3);
-    assert!(events.is_empty());
+    let ranges = run.model.pipeline.ranges().to_vec();
+    run.model.arena.params[ranges[0].clone()].iter_mut().for_each(|p| *p = 1.0 - *p);
+    assert_eq!(look(24, &mut run)[0].mean_l1, 0.0);
+    run.model.arena.params[ranges[1].clone()].iter_mut().for_each(|p| *p += 0.5);
+    assert!(look(32, &mut run)[0].mean_l1 > 1e-3);
+    assert!(run.tally.window.events.is_empty());
 }
 
 #[test]
@@ -104,7 +117,7 @@ fn drift_is_logged_where_it_is_asked_for_and_changes_nothing() {
     assert_eq!(steps, [[0, 12], [12, 24], [24, 36]]);
     assert!(found.iter().all(|d| d.mean_l1 > 0.0 && d.mean_l1.is_finite()), "{found:?}");
     assert!((found[1].epoch - 3.0).abs() < 1e-12);
-    let (plain, without) = solve(&with("/solver/drift", Value::Null), &scan, &none).unwrap();
+    let (plain, without) = solve(&with("/solver/callbacks", json!([{"type": "rollback"}])), &scan, &none).unwrap();
     assert!(drift(&without).is_empty() && !serde_json::to_string(&without[0]).unwrap().contains("drift"));
     assert_eq!(model(solution).arena.params, model(plain).arena.params);
     // A rate too small to change a number leaves nothing to see.
@@ -114,8 +127,7 @@ fn drift_is_logged_where_it_is_asked_for_and_changes_nothing() {
 
 #[test]
 fn an_interval_in_which_channels_are_masked_has_no_drift() {
-    let masked = json!([{"type": "fft-mask", "epoch": 2, "threshold": 1e-6}, {"type": "layer-norm"}]);
-    let (solution, records) = solve(&with("/normalizers", masked), &scan(), &Weights::default()).unwrap();
+    let (solution, records) = solve(&masked(), &scan(), &Weights::default()).unwrap();
     assert_eq!(model(solution).masks().len(), 1, "nothing was masked");
     let steps: Vec<u64> = drift(&records).iter().map(|d| d.step).collect();
     assert_eq!(steps, [12, 36]);
@@ -141,8 +153,7 @@ fn resumed(value: &Value, resume: &Resume) -> Result<Vec<Record>> {
 
 #[test]
 fn a_resumed_run_finds_the_same_drift_to_the_bit() {
-    let masks = json!([{"type": "fft-mask", "epoch": 2, "threshold": 1e-6}, {"type": "layer-norm"}]);
-    for settings in [settings(), with("/normalizers", masks)] {
+    for settings in [settings(), masked()] {
         let whole = solve(&settings, &scan(), &Weights::default()).unwrap().1;
         // Between two looks, at one, after a mask that spoilt the recording, and before any.
         for at in [5, 12, 14, 18, 24] {
@@ -167,16 +178,40 @@ fn a_recording_of_another_shape_is_refused() {
     refused(&resume, &["drift.features", "[300, 6]", "[6, 300]"]);
 }
 
+/// State that is missing or that nothing takes is refused with the name of whose it is.
+#[test]
+fn a_checkpoint_of_other_callbacks_is_refused() {
+    let kept = stopped(&settings(), 14).kept.unwrap();
+    let refused = |settings: &Value, resume: &Resume, words: &[&str]| {
+        let e = resumed(settings, resume).unwrap_err().to_string();
+        assert!(words.iter().all(|w| e.contains(w)), "{e}");
+    };
+    refused(
+        &with("/solver/callbacks", json!([{"type": "rollback"}])),
+        &kept,
+        &["kept: drift", "field-monitor, rollback"],
+    );
+    refused(&masked(), &kept, &["kept: fft-mask", "nothing"]);
+    let mut more = kept.clone();
+    more.weights.tensors.insert("drift.more".into(), (vec![1], vec![0.0]));
+    refused(&settings(), &more, &["kept: drift.more", "only what this run keeps"]);
+    let mut other = kept.clone();
+    other.standing.solver["callbacks"]["rollback"] = json!({"level": 1.0});
+    refused(&settings(), &other, &["kept: rollback", "missing field"]);
+    assert!(resumed(&settings(), &kept).is_ok());
+}
+
 #[test]
 fn times_and_sizes_that_are_none_are_refused() {
-    for (drift, word) in [
-        (json!({"every": 0.0}), "solver.drift.every"),
-        (json!({"every": -1.0}), "solver.drift.every"),
-        (json!({"points": 0}), "solver.drift.points"),
+    for (mut drift, word) in [
+        (json!({"every": 0.0}), "solver.callbacks.0.every"),
+        (json!({"every": -1.0}), "solver.callbacks.0.every"),
+        (json!({"points": 0}), "solver.callbacks.0.points"),
         (json!({"points": 65537}), "65536"),
         (json!({"epochs": 3}), "epochs"),
     ] {
-        let said = match spec(&with("/solver/drift", drift)) {
+        drift["type"] = json!("drift");
+        let said = match spec(&with("/solver/callbacks", json!([drift]))) {
             Ok(spec) => spec.solver.build().err().map(|e| e.to_string()),
             Err(e) => Some(e.to_string()),
         };

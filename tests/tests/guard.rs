@@ -9,8 +9,8 @@ use conefield_core::arena::{Arena, Weights};
 use conefield_core::backend::{Adam, Backend, Executable, Explain, StepStats, Work};
 use conefield_core::checkpoint::Resume;
 use conefield_core::error::{Error, Result};
+use conefield_core::method::{Job, Record, Solution};
 use conefield_core::pipeline::{Model, Pipeline};
-use conefield_core::solver::{Job, Record, Solution};
 use conefield_core::stage::UnitRay;
 use serde_json::{Value, json};
 
@@ -149,7 +149,7 @@ fn events(records: &[Record]) -> Vec<(u64, String)> {
 #[test]
 fn what_never_diverges_keeps_its_bits() {
     let mut off = settings(130);
-    off["solver"]["rollbacks"] = json!(0);
+    off["solver"]["callbacks"] = json!([]);
     let plain = |s: &Value| solve(s, &scan(), &Weights::default()).unwrap();
     let ((a, on), (b, without)) = (plain(&settings(130)), plain(&off));
     assert_eq!(a.rollbacks, 0);
@@ -215,12 +215,12 @@ fn a_parameter_that_is_not_finite_goes_back_even_at_the_end() {
 fn a_run_that_cannot_be_saved_ends_in_words() {
     let e = run(&settings(300), Fault::Forever(40)).err().unwrap().to_string();
     assert!(e.starts_with("training diverged at step 48: the loss is") && e.contains("gone back 8 times"), "{e}");
-    assert!(e.contains("the prior inf") && e.contains("solver.lr"), "{e}");
+    assert!(e.contains("the prior inf") && e.contains("optimizer.lr"), "{e}");
     let mut off = settings(300);
-    off["solver"]["rollbacks"] = json!(0);
+    off["solver"]["callbacks"] = json!([]);
     for fault in [Fault::Forever(40), Fault::Loss(40), Fault::Parameter(299)] {
         let e = run(&off, fault).err().unwrap().to_string();
-        assert!(e.starts_with("training diverged at step") && e.contains("solver.lr"), "{e}");
+        assert!(e.starts_with("training diverged at step") && e.contains("optimizer.lr"), "{e}");
     }
     // Nothing to go back to.
     let e = run(&settings(300), Fault::Loss(0)).err().unwrap().to_string();
@@ -234,7 +234,7 @@ fn a_run_that_went_back_resumes_to_the_same_bits() {
     let mut masked = settings(170);
     masked["encoder"]["levels"] = json!(6);
     let mask = json!({"type": "fft-mask", "keep": [0, 1, 2, 3, 5, 8]});
-    masked["normalizers"] = json!([mask, {"type": "layer-norm"}]);
+    masked["solver"]["callbacks"] = json!([{"type": "rollback"}, mask]);
     for (value, fault) in [
         (settings(170), Fault::Loss(130)),
         (settings(170), Fault::Uphill(60, 66)),

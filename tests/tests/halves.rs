@@ -8,14 +8,16 @@ use conefield_backend_cpu::Cpu;
 use conefield_backend_cpu::rows::Kernels;
 use conefield_backend_cpu::step::Slots;
 use conefield_core::arena::Weights;
-use conefield_core::backend::{Adam, Backend, Loss, TrainRay, Work};
+use conefield_core::backend::{Adam, Backend, TrainRay, Work};
 use conefield_core::half::{Bf16, F16, Half, Stored};
+use conefield_core::method::{Job, Solver};
 use conefield_core::pipeline::{Model, Pipeline};
 use conefield_core::random::{mix, unit};
 use conefield_core::scene::Scene;
-use conefield_core::solver::{Job, Solver};
-use conefield_core::spec::{EncoderSpec, Tables};
+use conefield_core::settings::EncoderSpec;
+use conefield_core::spec::Tables;
 use conefield_core::stage::{Encoder, Info, Kernel, Parameter, Reduced, Stage};
+use conefield_solvers::losses::L2;
 use serde_json::{Value, json};
 
 /// Formats with the largest error of gradients of a whole step against double precision, as a share of the largest.
@@ -61,7 +63,7 @@ fn filled(settings: &Value) -> Model {
 
 fn rays() -> Vec<TrainRay> {
     let scan = scan();
-    let scene = Scene::new(&scan, &conefield_core::spec::Scene::default()).unwrap();
+    let scene = Scene::new(&scan, &conefield_core::scene::SceneSettings::default()).unwrap();
     let ray = |i: usize| scene.pixel_ray(&scan.geometry, i % 8, (i * 5) % 16, (i * 7) % 16);
     (0..40).map(|i| TrainRay { ray: ray(i), target: if i % 2 == 0 { 0.5 } else { 3.0 } }).collect()
 }
@@ -87,7 +89,7 @@ fn bits(values: &[f32]) -> Vec<u32> {
 #[test]
 fn gradients_of_a_step_are_off_by_the_rounding_of_tables() {
     let (rays, devices) = (rays(), device::backends("steps in halves"));
-    let work = Work { step: 4, seed: 9, loss: Loss::L2, rays: &rays, points: &[], tv: None, occupancy: None };
+    let work = Work { step: 4, seed: 9, loss: &L2 {}, rays: &rays, points: &[], priors: &[] };
     for (tables, limit) in FORMATS {
         for (name, settings) in several(tables) {
             let pipeline = built(&settings);
@@ -206,7 +208,7 @@ fn the_copy_follows_updates_and_what_else_changes_the_masters() {
         let fresh = |model: &Model| Cpu::new().compile(&model.pipeline).unwrap().0.encode(model, &at).unwrap();
         let mut last = fresh(&model);
         for step in 1..=3 {
-            let work = Work { step, seed: 9, loss: Loss::L2, rays: &rays, points: &[], tv: None, occupancy: None };
+            let work = Work { step, seed: 9, loss: &L2 {}, rays: &rays, points: &[], priors: &[] };
             exe.step(&mut model, &work).unwrap();
             exe.update(&mut model, &Adam { lr: 1e-2, beta1: 0.9, beta2: 0.999, eps: 1e-8, step }).unwrap();
             let found = exe.encode(&model, &at).unwrap();

@@ -1,6 +1,6 @@
 //! Every reader takes damaged input without a panic, a hoard of memory or a hang. See `docs/bad-inputs.md`.
 
-use conefield_tests::hostile::watch::{Bounds, Fault, Meter};
+use conefield_tests::hostile::watch::{Bounds, Meter, ReaderFault};
 use conefield_tests::hostile::{PARSERS, Parser, find};
 use peak_alloc::PeakAlloc;
 use std::path::Path;
@@ -77,11 +77,11 @@ fn controls(faults: &mut Vec<String>) {
         Ok(())
     });
     let quick = Bounds { time: Duration::from_millis(1), ..BOUNDS };
-    type Is = fn(&Fault) -> bool;
+    type Is = fn(&ReaderFault) -> bool;
     let told: [(&str, Parser, Bounds, Is); 3] = [
-        ("a panic", panics, BOUNDS, |f| *f == Fault::Panic("on purpose".into())),
-        ("a hoard", hoards, BOUNDS, |f| matches!(f, Fault::Memory(n) if *n >= 17 << 20)),
-        ("a hang", hangs, quick, |f| matches!(f, Fault::Time(_))),
+        ("a panic", panics, BOUNDS, |f| *f == ReaderFault::Panic("on purpose".into())),
+        ("a hoard", hoards, BOUNDS, |f| matches!(f, ReaderFault::Memory(n) if *n >= 17 << 20)),
+        ("a hang", hangs, quick, |f| matches!(f, ReaderFault::Time(_))),
     ];
     for (what, parser, bounds, is) in told {
         let seen = parser.run(folder().path(), 100, bounds, METER);

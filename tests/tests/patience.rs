@@ -5,8 +5,8 @@ mod common;
 use common::{Stop, model, scan, spec};
 use conefield_backend_cpu::Cpu;
 use conefield_core::checkpoint::Resume;
+use conefield_core::method::{Best, Job, Limits, Record, Solution};
 use conefield_core::scan::Scan;
-use conefield_core::solver::{Best, Job, Limits, Record, Solution};
 use rand::{RngExt, SeedableRng};
 use serde_json::{Value, json};
 
@@ -29,7 +29,7 @@ fn settings(steps: u64, patience: Option<u64>) -> Value {
                    "report_every": 20},
     });
     if let Some(n) = patience {
-        value["solver"]["patience"] = json!(n);
+        value["solver"]["callbacks"] = json!([{"type": "rollback"}, {"type": "patience", "records": n}]);
     }
     value
 }
@@ -103,7 +103,8 @@ fn without_patience_nothing_changes() {
 fn a_run_resumes_to_the_same_best() {
     let (train, held) = scans(1.0);
     let mut masked = settings(4000, Some(4));
-    masked["normalizers"] = json!([{"type": "fft-mask", "epoch": 2, "keep": [0, 1, 2, 3, 4]}, {"type": "layer-norm"}]);
+    masked["solver"]["callbacks"] =
+        json!([{"type": "patience", "records": 4}, {"type": "fft-mask", "keep": [0, 1, 2, 3, 4]}]);
     for (value, masks) in [(settings(4000, Some(4)), false), (masked, true)] {
         let (spec, backend) = (spec(&value).unwrap(), Cpu::new());
         let solver = spec.solver.build().unwrap();
@@ -133,10 +134,10 @@ fn a_run_resumes_to_the_same_best() {
 fn what_it_needs_is_told() {
     let built = |patience| spec(&settings(9, patience)).unwrap().solver.build().unwrap();
     let (with, without) = (built(Some(3)), built(None));
-    assert_eq!((with.needs_held_out(), without.needs_held_out()), (Some("solver.patience"), None));
+    assert_eq!((with.needs_held_out(), without.needs_held_out()), (Some("solver.callbacks"), None));
     assert_eq!(with.memory_per_parameter() - without.memory_per_parameter(), 4);
-    let said = "ends after 3 records of 20 steps without a smaller held-out error";
+    let said = "ends after 3 records without a smaller held-out error";
     assert!(with.describe().ends_with(said) && !without.describe().contains("held-out"), "{}", with.describe());
     let e = spec(&settings(9, Some(0))).unwrap().solver.build().err().unwrap().to_string();
-    assert!(e.contains("solver.patience: found 0, expected at least 1"), "{e}");
+    assert!(e.contains("solver.callbacks.1.records: found 0, expected at least 1"), "{e}");
 }

@@ -8,13 +8,16 @@ use conefield_backend_cpu::Cpu;
 use conefield_backend_cpu::rows::Kernels;
 use conefield_backend_cpu::step::Slots;
 use conefield_core::arena::Weights;
-use conefield_core::backend::{Loss, TrainRay, TvBlocks, Work};
+use conefield_core::backend::{BlockWork, TrainRay, Work};
+use conefield_core::loss::Loss;
+use conefield_core::method::{Limits, PretrainJob, Solution};
 use conefield_core::pipeline::{Model, Pipeline};
 use conefield_core::random::{mix, unit};
 use conefield_core::scan::{Scan, Volume};
 use conefield_core::scene::Scene;
-use conefield_core::solver::{Limits, PretrainJob, Solution};
 use conefield_core::trained::TrainedField;
+use conefield_solvers::losses::{Huber, L2};
+use conefield_solvers::priors::TotalVariation;
 use serde_json::{Value, json};
 
 fn settings() -> Value {
@@ -86,7 +89,7 @@ fn sample(pipeline: &Pipeline, grads: &[f64]) -> Vec<Vec<usize>> {
 fn gradients_of(settings: &Value, count: usize, edge: usize) {
     let pipeline = Pipeline::build(&spec(settings).unwrap()).unwrap();
     let scan = scan();
-    let scene = Scene::new(&scan, &conefield_core::spec::Scene::default()).unwrap();
+    let scene = Scene::new(&scan, &conefield_core::scene::SceneSettings::default()).unwrap();
     let mut rays = vec![];
     for i in 0..count {
         let ray = scene.pixel_ray(&scan.geometry, i % 8, (i * 5) % 16, (i * 7) % 16);
@@ -98,13 +101,15 @@ fn gradients_of(settings: &Value, count: usize, edge: usize) {
     assert!(missed <= count / 2, "{missed} of {count} rays miss the box");
     let place = |i: u64| std::array::from_fn(|k| 0.05 + 0.9 * unit(mix(i, k as u64)));
     let points: Vec<_> = (0..50).map(|i| (place(i), if i % 2 == 0 { 0.7 } else { 4.0 })).collect();
-    let tv = TvBlocks {
-        corners: (100..104).map(|i| place(i).map(|x: f32| 0.7 * x)).collect(),
-        spacing: [0.06, 0.05, 0.07].map(|x| 3.0 * x / edge as f32),
-        edge,
-        weight: 0.3,
-        smoothing: 1e-2,
-    };
+    let corners: Vec<_> = (100..105).map(|i| place(i).map(|x: f32| 0.7 * x)).collect();
+    let spacing = [0.06, 0.05, 0.07].map(|x| 3.0 * x / edge as f32);
+    let fine = TotalVariation { weight: 0.3, edge, smoothing: 1e-2, ..TotalVariation::default() };
+    // Points of one block fill no vector: rows after it are padding.
+    let coarse = TotalVariation { weight: 0.2, edge: 2, smoothing: 3e-2, ..TotalVariation::default() };
+    let priors = [
+        BlockWork { prior: &fine, corners: &corners[..4], spacing },
+        BlockWork { prior: &coarse, corners: &corners[4..], spacing: [0.1; 3] },
+    ];
     let params: Vec<f64> = Model::random(Pipeline::build(&spec(settings).unwrap()).unwrap(), 3)
         .arena
         .params
@@ -112,9 +117,10 @@ fn gradients_of(settings: &Value, count: usize, edge: usize) {
         .enumerate()
         .map(|(i, &p)| f64::from(p) + 0.4 * (f64::from(unit(mix(5, i as u64))) - 0.5))
         .collect();
-    for loss in [Loss::L2, Loss::Huber { delta: 0.5 }] {
+    let losses: [&dyn Loss; 2] = [&L2 {}, &Huber { delta: 0.5 }];
+    for loss in losses {
         let kernels = Kernels::new(&pipeline, |s| s.reference()).unwrap();
-        let work = Work { step: 4, seed: 9, loss, rays: &rays, points: &points, tv: Some(&tv), occupancy: None };
+        let work = Work { step: 4, seed: 9, loss, rays: &rays, points: &points, priors: &priors };
         let case = Case { pipeline: &pipeline, kernels, work };
         let (value, grads) = case.step(&params);
         assert!(value.is_finite() && grads.iter().filter(|g| **g != 0.0).count() > grads.len() / 2);
@@ -130,7 +136,8 @@ fn gradients_of(settings: &Value, count: usize, edge: usize) {
         let parts = [
             Work { rays: &[], ..case.work.clone() },
             Work { points: &[], ..case.work.clone() },
-            Work { tv: None, ..case.work.clone() },
+            Work { priors: &[], ..case.work.clone() },
+            Work { priors: &priors[..1], ..case.work.clone() },
         ];
         for work in parts {
             let kernels = Kernels::new(&pipeline, |s| s.reference()).unwrap();
@@ -182,7 +189,7 @@ fn the_number_of_threads_does_not_change_a_bit() {
     s["projector"]["samples"] = json!(48);
     s["solver"]["rays"] = json!(512);
     s["solver"]["steps"] = json!(10);
-    s["solver"]["tv"] = json!({"weight": 0.01, "blocks": 8, "edge": 4});
+    s["solver"]["priors"] = json!([{"type": "total-variation", "weight": 0.01, "blocks": 8, "edge": 4}]);
     let scan = scan();
     let run = |threads: usize, s: &Value| {
         let pool = rayon::ThreadPoolBuilder::new().num_threads(threads).build().unwrap();
@@ -226,7 +233,7 @@ fn a_field_comes_back_from_its_weights() {
     let mut s = settings();
     let width = s["encoder"]["levels"].as_u64().unwrap() * s["encoder"]["features"].as_u64().unwrap_or(2);
     let kept: Vec<u64> = (0..width - 1).collect();
-    s["normalizers"] = json!([{"type": "fft-mask", "keep": kept}, {"type": "layer-norm"}]);
+    s["solver"]["callbacks"] = json!([{"type": "fft-mask", "keep": kept}]);
     let (solution, _) = solve(&s, &scan(), &Weights::default()).unwrap();
     let field = solution.result.field().unwrap();
     assert_eq!(field.placement().masks.len(), 1);
@@ -369,7 +376,7 @@ fn masked_channels_leave_the_work() {
     s["encoder"]["base_resolution"] = json!(2);
     // Fine levels hardly train in a pass and stay as random as they started.
     let mask = json!({"type": "fft-mask", "epoch": 1, "rule": "relative", "threshold": 0.72});
-    s["normalizers"] = json!([mask, {"type": "layer-norm"}]);
+    s["solver"]["callbacks"] = json!([{"type": "rollback"}, mask]);
     let whole = Pipeline::build(&spec(&s).unwrap()).unwrap();
     let (solution, records) = solve(&s, &scan(), &Weights::default()).unwrap();
     let model = model(solution);
@@ -407,14 +414,14 @@ fn channels_finer_than_the_data_leave_the_work() {
     let mut s = settings();
     s["encoder"] = json!({"type": "hash-grid", "levels": 6, "base_resolution": 2, "log2_table_size": 8});
     // A mask that has its own say afterwards.
-    s["normalizers"] = json!([{"type": "fft-mask", "epoch": 1, "keep": [0, 1, 2, 3, 4, 5, 6]}, {"type": "layer-norm"}]);
+    s["solver"]["callbacks"] = json!([{"type": "fft-mask", "keep": [0, 1, 2, 3, 4, 5, 6, 9]}]);
     s["scene"] = json!({"levels": "needed"});
     let (solution, records) = solve(&s, &scan(), &Weights::default()).unwrap();
     assert_eq!(records.iter().flat_map(|r| &r.events).count(), 1);
     let field = solution.result.field().unwrap();
     let masks = field.placement().masks;
-    let by: Vec<_> = masks.iter().map(|m| (m.normalizer, m.keep.len())).collect();
-    assert_eq!(by, [(None, 8), (Some(0), 7)]);
+    // The mask counts the channels of the whole encoder.
+    assert_eq!(masks, [(0..8).collect::<Vec<_>>(), (0..7).collect()]);
     let names: Vec<_> = field.model.pipeline.layout().blocks.iter().map(|b| b.name.as_str()).collect();
     assert!(names.contains(&"encoder.3.table") && !names.contains(&"encoder.4.table"), "{names:?}");
 
@@ -429,7 +436,7 @@ fn channels_finer_than_the_data_leave_the_work() {
 
     // A grid that is coarser than the data keeps all.
     s["encoder"]["levels"] = json!(3);
-    s["normalizers"] = json!([{"type": "layer-norm"}]);
+    s["solver"]["callbacks"] = json!([]);
     let (solution, _) = solve(&s, &scan(), &Weights::default()).unwrap();
     assert!(solution.result.field().unwrap().placement().masks.is_empty());
 }

@@ -3,13 +3,24 @@
 mod device;
 
 use conefield_conformance::{
-    Options, Report, check_encoder, check_field, check_initializer, check_normalizer, check_projector,
-    check_projector_wgsl, check_voxel_projector, check_wgsl,
+    Options, Report, check_basis, check_data_term, check_encoder, check_field, check_initializer, check_loss,
+    check_loss_wgsl, check_normalizer, check_prior, check_prior_wgsl, check_projector, check_projector_wgsl,
+    check_regularizer, check_settings, check_voxel_projector, check_wgsl, ready,
 };
 use conefield_core::arena::Weights;
-use conefield_core::registry::{Kind, names};
-use conefield_core::spec::{EncoderSpec, FieldSpec, InitializerSpec, NormalizerSpec, ProjectorSpec, Tables};
+use conefield_core::basis::BasisSpec;
+use conefield_core::data_term::DataTermSpec;
+use conefield_core::loss::Loss;
+use conefield_core::precision::Tables;
+use conefield_core::registry::{Kind, Settings, names};
+use conefield_core::regularizer::RegularizerSpec;
+use conefield_core::settings::{
+    EncoderSpec, FieldSpec, InitializerSpec, LossSpec, NormalizerSpec, PriorSpec, ProjectorSpec,
+};
+use conefield_core::spec::stage::read;
 use conefield_core::stage::Stage;
+use conefield_core::voxel::VoxelProjectorSpec;
+use serde::de::DeserializeOwned;
 use serde_json::{Value, json};
 
 // Stage types register themselves where their crate is linked.
@@ -18,6 +29,7 @@ use conefield_fields as _;
 use conefield_initializers as _;
 use conefield_normalizers as _;
 use conefield_projectors as _;
+use conefield_solvers as _;
 
 fn expect(report: Report) {
     println!("{report}");
@@ -154,13 +166,6 @@ fn layer_norm_of_one_channel() {
 }
 
 #[test]
-fn fft_mask() {
-    for width in [1, 20] {
-        normalizer(json!({"type": "fft-mask", "scope": "channel"}), width, &Options::features());
-    }
-}
-
-#[test]
 fn mlp() {
     for (settings, width) in [
         (json!({"type": "mlp"}), 20),
@@ -192,16 +197,67 @@ fn voxel_grid() {
     }
 }
 
+/// Every registered type of a kind with default settings, and others of them.
+fn each<T: Settings + ?Sized>(others: &[Value]) -> Vec<Box<T>>
+where
+    Box<T>: DeserializeOwned,
+{
+    let all = names(T::KIND);
+    assert!(!all.is_empty(), "no {}", T::KIND);
+    let settings = all.iter().map(|name| json!({ "type": name })).chain(others.iter().cloned());
+    settings.map(|s| read(s).unwrap()).collect()
+}
+
+#[test]
+fn voxels_joseph() {
+    for settings in [
+        json!({"type": "voxels-joseph", "resolution": 6}),
+        json!({"type": "voxels-joseph", "resolution": [5, 1, 9]}),
+        json!({"type": "voxels-joseph", "resolution": [1, 1, 1]}),
+        // More than one range of voxels.
+        json!({"type": "voxels-joseph", "resolution": [41, 37, 43]}),
+    ] {
+        field(settings, 3, &Options { single: 4e-5, ..Options::encoder() });
+    }
+}
+
+/// What a field says of itself as settings and as a stage agree.
+#[test]
+fn fields_that_stand_alone_bring_line_integrals() {
+    for name in names(Kind::Field) {
+        let spec: Box<dyn FieldSpec> = serde_json::from_value(json!({"type": name})).unwrap();
+        let stage = spec.build(3).unwrap();
+        assert_eq!(spec.stands_alone(), stage.lines().is_some(), "{name}");
+        assert_eq!(stage.lines().is_some(), stage.lines_reference().is_some(), "{name}");
+    }
+}
+
 #[test]
 fn voxel_projectors() {
-    for settings in [
-        json!({"type": "siddon"}),
-        json!({"type": "joseph"}),
-        json!({"type": "trilinear"}),
-        json!({"type": "trilinear", "samples_per_voxel": 5.0}),
-    ] {
-        let spec: Box<dyn ProjectorSpec> = serde_json::from_value(settings).unwrap();
-        expect(check_voxel_projector(spec.build_voxel().unwrap().as_ref()));
+    for spec in each::<dyn VoxelProjectorSpec>(&[json!({"type": "trilinear", "samples_per_voxel": 5.0})]) {
+        expect(check_voxel_projector(spec.build().unwrap().as_ref()));
+    }
+}
+
+#[test]
+fn bases() {
+    for spec in each::<dyn BasisSpec>(&[]) {
+        expect(check_basis(spec.build().unwrap().as_ref()));
+    }
+}
+
+#[test]
+fn data_terms() {
+    for spec in each::<dyn DataTermSpec>(&[]) {
+        expect(check_data_term(spec.build().unwrap().as_ref()));
+    }
+}
+
+#[test]
+fn regularizers() {
+    for spec in each::<dyn RegularizerSpec>(&[json!({"type": "total-variation", "weight": {"fixed": 0.1}, "inner": 1})])
+    {
+        expect(check_regularizer(spec.build().unwrap().as_ref()));
     }
 }
 
@@ -229,12 +285,68 @@ fn random_initializer() {
     expect(check_initializer(spec.build(&|_| Ok(Weights::default())).unwrap().as_ref()));
 }
 
+fn loss(loss: &dyn Loss) {
+    expect(check_loss(loss));
+    assert!(loss.wgsl().is_some(), "{} offers no WGSL", loss.describe());
+    if let Some(shared) = device::shared("the WGSL of a loss") {
+        expect(check_loss_wgsl(loss, &|l, pairs| shared.losses(l, pairs)));
+    }
+}
+
+/// Every registered loss by its defaults, and with `more` settings.
+#[test]
+fn losses() {
+    let more = [("huber", json!({"delta": 0.5})), ("huber", json!({"delta": 3.0}))];
+    let all = names(Kind::Loss).into_iter().map(|name| (name, json!({}))).chain(more);
+    for (name, settings) in all {
+        expect(check_settings::<dyn LossSpec>(name, &settings));
+        let mut table = settings;
+        table["type"] = json!(name);
+        let built = read::<dyn LossSpec>(table).unwrap().build().unwrap();
+        loss(built.as_ref());
+        if let Some(fitted) = ready(built.as_ref()) {
+            loss(fitted.as_ref());
+        }
+    }
+    let refused = read::<dyn LossSpec>(json!({"type": "huber", "delta": 0.0})).unwrap().build().err().unwrap();
+    assert!(refused.to_string().contains("delta"), "{refused}");
+}
+
+/// Every registered prior by its defaults, and with `more` settings.
+#[test]
+fn priors() {
+    let more = [
+        ("total-variation", json!({"edge": 2, "blocks": 3, "smoothing": 0.01})),
+        ("total-variation", json!({"edge": 5, "weight": 0.0, "spacing": 2.5, "smoothing": 0.3})),
+    ];
+    let all = names(Kind::Prior).into_iter().map(|name| (name, json!({}))).chain(more);
+    for (name, settings) in all {
+        expect(check_settings::<dyn PriorSpec>(name, &settings));
+        let mut table = settings;
+        table["type"] = json!(name);
+        let built = read::<dyn PriorSpec>(table).unwrap().build().unwrap();
+        expect(check_prior(built.as_ref()));
+        assert!(built.wgsl().is_some(), "{} offers no WGSL", built.describe());
+        if let Some(shared) = device::shared("the WGSL of a prior") {
+            expect(check_prior_wgsl(built.as_ref(), &|p, values| shared.penalty(p, values)));
+        }
+    }
+    for wrong in ["edge", "blocks", "spacing", "smoothing"] {
+        let settings = json!({"type": "total-variation", wrong: 0});
+        let refused = read::<dyn PriorSpec>(settings).unwrap().build().err().unwrap();
+        assert!(refused.to_string().contains(wrong), "{refused}");
+    }
+}
+
 /// A stage type that is not in this list has not been through the kit.
 #[test]
 fn every_registered_stage_has_a_run_here() {
     assert_eq!(names(Kind::Encoder), ["concat", "dense-grid", "frequency", "hash-grid", "identity"]);
-    assert_eq!(names(Kind::Normalizer), ["fft-mask", "layer-norm"]);
-    assert_eq!(names(Kind::Field), ["mlp", "voxel-grid"]);
+    assert_eq!(names(Kind::Normalizer), ["layer-norm"]);
+    assert_eq!(names(Kind::Field), ["mlp", "voxel-grid", "voxels-joseph"]);
     assert_eq!(names(Kind::Initializer), ["checkpoint", "mci", "random", "volume"]);
-    assert_eq!(names(Kind::Projector), ["joseph", "ray-march", "siddon", "trilinear"]);
+    assert_eq!(names(Kind::Loss), ["huber", "l1", "l2", "noise-weighted"]);
+    assert_eq!(names(Kind::Prior), ["total-variation"]);
+    assert_eq!(names(Kind::Projector), ["ray-march"]);
+    assert_eq!(names(Kind::Callback), ["drift", "fft-mask", "patience", "rollback"]);
 }

@@ -9,15 +9,17 @@ use conefield_backend_cpu::rows::Kernels;
 use conefield_backend_cpu::step::Slots;
 use conefield_core::Result;
 use conefield_core::arena::Weights;
-use conefield_core::backend::{Adam, Backend, Loss, TrainRay, TvBlocks, Work};
-use conefield_core::occupancy::Occupancy;
+use conefield_core::backend::{Adam, Backend, BlockWork, TrainRay, Work};
+use conefield_core::loss::Loss;
+use conefield_core::method::{Job, Limits, PretrainJob, Record};
 use conefield_core::pipeline::{Model, Pipeline};
+use conefield_core::precision::Tables;
 use conefield_core::random::{mix, unit};
 use conefield_core::scene::Scene;
-use conefield_core::solver::{Job, Limits, PretrainJob, Record};
-use conefield_core::spec::Tables;
 use conefield_core::stage::{Encoder, Field, Info, Kernel, Normalizer, Parameter, Projector, Reduced, Scope, Stage};
 use conefield_core::wgsl::Fragment;
+use conefield_solvers::losses::{Huber, L1, L2};
+use conefield_solvers::priors::TotalVariation;
 use serde_json::{Value, json};
 
 fn settings() -> Value {
@@ -53,7 +55,7 @@ fn steps_agree(settings: &Value) {
     let devices = device::backends("whole steps");
     let pipeline = Pipeline::build(&spec(settings).unwrap()).unwrap();
     let scan = scan();
-    let scene = Scene::new(&scan, &conefield_core::spec::Scene::default()).unwrap();
+    let scene = Scene::new(&scan, &conefield_core::scene::SceneSettings::default()).unwrap();
     let rays: Vec<TrainRay> = (0..40)
         .map(|i| {
             let ray = scene.pixel_ray(&scan.geometry, i % 8, (i * 5) % 16, (i * 7) % 16);
@@ -61,13 +63,13 @@ fn steps_agree(settings: &Value) {
         })
         .collect();
     let points: Vec<_> = (0..150).map(|i| (place(i), if i % 2 == 0 { 0.7 } else { 4.0 })).collect();
-    let tv = TvBlocks {
-        corners: (200..205).map(|i| place(i).map(|x: f32| 0.7 * x)).collect(),
-        spacing: [0.06, 0.05, 0.07],
-        edge: 5,
-        weight: 0.3,
-        smoothing: 1e-2,
-    };
+    let corners: Vec<_> = (200..208).map(|i| place(i).map(|x: f32| 0.7 * x)).collect();
+    let fine = TotalVariation { weight: 0.3, edge: 5, smoothing: 1e-2, ..TotalVariation::default() };
+    let coarse = TotalVariation { weight: 0.2, edge: 4, smoothing: 3e-2, ..TotalVariation::default() };
+    let priors = [
+        BlockWork { prior: &fine, corners: &corners[..5], spacing: [0.06, 0.05, 0.07] },
+        BlockWork { prior: &coarse, corners: &corners[5..], spacing: [0.1; 3] },
+    ];
     let filled = || {
         let mut model = Model::random(Pipeline::build(&spec(settings).unwrap()).unwrap(), 3);
         for (i, p) in model.arena.params.iter_mut().enumerate() {
@@ -76,12 +78,10 @@ fn steps_agree(settings: &Value) {
         model
     };
     let params: Vec<f64> = filled().arena.params.iter().map(|&p| f64::from(p)).collect();
-    // Slabs across x, every other one empty, and one ray in five that takes all its samples.
-    let slabs: Vec<bool> = (0..700).map(|i| i / 100 % 2 == 0).collect();
-    let slabs = Occupancy::new([[0.1; 3], [0.9; 3]], [7, 10, 10], &slabs, 5);
-    let cases = [(Loss::L1, None), (Loss::L2, None), (Loss::Huber { delta: 0.5 }, None), (Loss::L2, Some(&slabs))];
-    for (loss, occupancy) in cases {
-        let work = Work { step: 4, seed: 9, loss, rays: &rays, points: &points, tv: Some(&tv), occupancy };
+    let losses: [&dyn Loss; 3] = [&L1 {}, &L2 {}, &Huber { delta: 0.5 }];
+    for loss in losses {
+        let told = loss.describe();
+        let work = Work { step: 4, seed: 9, loss, rays: &rays, points: &points, priors: &priors };
         let kernels = Kernels::new(&pipeline, |s| s.reference()).unwrap();
         let mut exact = vec![0.0; params.len()];
         let projector = pipeline.projector.as_ref();
@@ -97,14 +97,12 @@ fn steps_agree(settings: &Value) {
         for (name, backend) in &devices {
             let (stats, grads) = on(backend);
             let (e, on_cpu) = (worst(&pipeline, &grads, &exact), worst(&pipeline, &cpu, &exact));
-            println!("{loss:?}, {name}: gradients {e:.1e} (CPU {on_cpu:.1e}), loss {} and {}", stats.loss, want.loss);
-            assert!(e < limit, "{loss:?}, {name}: {e:e}");
+            println!("{told}, {name}: gradients {e:.1e} (CPU {on_cpu:.1e}), loss {} and {}", stats.loss, want.loss);
+            assert!(e < limit, "{told}, {name}: {e:e}");
             assert!((stats.loss - want.loss).abs() < 1e-5 * want.loss, "{} {}", stats.loss, want.loss);
             assert!((stats.prior - want.prior).abs() < 1e-5 * want.prior, "{} {}", stats.prior, want.prior);
-            let all = 20 * 40 - missed(&pipeline, &rays) + 150 + 5 * 125;
-            assert_eq!(stats.samples, want.samples, "{name}");
-            // Negative control: where slabs are empty some samples were left out, otherwise none.
-            assert!(if occupancy.is_some() { all - want.samples > 20 } else { all == want.samples }, "{name}");
+            let all = 20 * 40 - missed(&pipeline, &rays) + 150 + 5 * 125 + 3 * 64;
+            assert_eq!([stats.samples, want.samples], [all; 2], "{name}");
             // Negative control: a percent of one block's largest gradient.
             let mut wrong = grads.clone();
             let block = &pipeline.layout().blocks[0];
@@ -156,7 +154,7 @@ fn a_step_is_that_of_the_cpu_without_parameters_in_the_encoder() {
 #[test]
 fn what_is_asked_of_a_trained_model_is_that_of_the_cpu() {
     let scan = scan();
-    let scene = Scene::new(&scan, &conefield_core::spec::Scene::default()).unwrap();
+    let scene = Scene::new(&scan, &conefield_core::scene::SceneSettings::default()).unwrap();
     let rays: Vec<TrainRay> = (0..64)
         .map(|i| TrainRay { ray: scene.pixel_ray(&scan.geometry, i % 8, (i * 5) % 16, (i * 7) % 16), target: 0.7 })
         .collect();
@@ -165,7 +163,7 @@ fn what_is_asked_of_a_trained_model_is_that_of_the_cpu() {
         let mut model = Model::random(Pipeline::build(&spec(&settings()).unwrap()).unwrap(), 3);
         let mut exe = backend.compile(&model.pipeline).unwrap().0;
         for step in 1..=10 {
-            let work = Work { step, seed: 9, loss: Loss::L2, rays: &rays, points: &[], tv: None, occupancy: None };
+            let work = Work { step, seed: 9, loss: &L2 {}, rays: &rays, points: &[], priors: &[] };
             exe.step(&mut model, &work).unwrap();
             exe.update(&mut model, &Adam { lr: 1e-2, beta1: 0.9, beta2: 0.999, eps: 1e-8, step }).unwrap();
         }
@@ -197,7 +195,7 @@ fn what_is_asked_of_a_trained_model_is_that_of_the_cpu() {
 #[test]
 fn a_run_with_held_out_views_and_a_prior_ends_where_the_cpu_does() {
     let mut s = settings();
-    s["solver"]["tv"] = json!({"weight": 0.01, "blocks": 4, "edge": 4});
+    s["solver"]["priors"] = json!([{"type": "total-variation", "weight": 0.01, "blocks": 4, "edge": 4}]);
     let (want, records) = psnr(&s, &Cpu::new());
     for (name, backend) in device::backends("a run").into_iter().take(1) {
         let (found, on_device) = psnr(&s, &backend);
@@ -216,7 +214,7 @@ fn masked_channels_leave_the_kernels() {
     s["encoder"]["levels"] = json!(6);
     s["encoder"]["base_resolution"] = json!(2);
     let mask = json!({"type": "fft-mask", "epoch": 1, "rule": "relative", "threshold": 0.72});
-    s["normalizers"] = json!([mask, {"type": "layer-norm"}]);
+    s["solver"]["callbacks"] = json!([{"type": "rollback"}, mask]);
     let (solution, records) = solve_on(&backend, &s, &scan(), &Weights::default()).unwrap();
     let events: Vec<&String> = records.iter().flat_map(|r| &r.events).collect();
     assert_eq!(events.len(), 1, "{events:?}");
@@ -348,7 +346,7 @@ fn a_perturbed_constant_fails_the_parity_check() {
     let options = conefield_conformance::Options::features();
     let check = |change: fn(String) -> Option<String>| {
         let settings = json!({"type": "mlp", "width": 5, "depth": 2, "skips": []});
-        let spec: Box<dyn conefield_core::spec::FieldSpec> = serde_json::from_value(settings).unwrap();
+        let spec: Box<dyn conefield_core::settings::FieldSpec> = serde_json::from_value(settings).unwrap();
         let stage = Changed { inner: spec.build(3).unwrap(), change, scope: Scope::Row };
         conefield_conformance::check_wgsl(&stage, &options, &|s, p, x, dy, rows| {
             shared.pass(s, Tables::F32, p, x, dy, rows)
@@ -383,7 +381,7 @@ fn stages_of_random_shapes_agree() {
             "levels": 1 + below(4), "features": 1 << below(3), "base_resolution": 2 + below(5),
             "growth": 1.0 + below(10) as f64 / 10.0,
         });
-        let spec: Box<dyn conefield_core::spec::EncoderSpec> = serde_json::from_value(grid.clone()).unwrap();
+        let spec: Box<dyn conefield_core::settings::EncoderSpec> = serde_json::from_value(grid.clone()).unwrap();
         let whole: Box<dyn Encoder> = spec.build().unwrap();
         let keep: Vec<usize> = (0..whole.info().output).filter(|_| below(3) > 0).collect();
         let stage = if keep.is_empty() { whole } else { whole.keep_outputs(&keep).unwrap().stage };
@@ -397,11 +395,11 @@ fn stages_of_random_shapes_agree() {
     }
     for _ in 0..3 {
         let width = 2 + below(36) as usize;
-        let spec: Box<dyn conefield_core::spec::NormalizerSpec> =
+        let spec: Box<dyn conefield_core::settings::NormalizerSpec> =
             serde_json::from_value(json!({"type": "layer-norm"})).unwrap();
         let norm: Box<dyn Normalizer> = spec.build(width).unwrap();
         let keep: Vec<usize> = (0..width).filter(|c| *c == 0 || below(3) > 0).collect();
-        let stage = norm.keep_outputs(&keep).unwrap().stage;
+        let stage = norm.keep_inputs(&keep).unwrap().stage;
         let options =
             conefield_conformance::Options { params: Some(1.0), ..conefield_conformance::Options::features() };
         let report = conefield_conformance::check_wgsl(stage.as_ref(), &options, &pass);
@@ -413,7 +411,7 @@ fn stages_of_random_shapes_agree() {
         let activation = ["relu", "leaky-relu", "gelu", "squareplus", "softplus", "sigmoid"][below(6) as usize];
         let mlp =
             json!({"type": "mlp", "width": 1 + below(11), "depth": depth, "skips": skips, "activation": activation});
-        let spec: Box<dyn conefield_core::spec::FieldSpec> = serde_json::from_value(mlp.clone()).unwrap();
+        let spec: Box<dyn conefield_core::settings::FieldSpec> = serde_json::from_value(mlp.clone()).unwrap();
         let stage = spec.build(1 + below(9) as usize).unwrap();
         let options = conefield_conformance::Options { single: 5e-5, ..conefield_conformance::Options::features() };
         let report = conefield_conformance::check_wgsl(stage.as_ref(), &options, &pass);
@@ -444,7 +442,7 @@ fn samples_are_random_in_the_same_way() {
             Some(Fragment { source: self.0.wgsl()?.source.replace("0.5", "0.49") })
         }
     }
-    let spec: Box<dyn conefield_core::spec::ProjectorSpec> =
+    let spec: Box<dyn conefield_core::settings::ProjectorSpec> =
         serde_json::from_value(json!({"type": "ray-march", "samples": 77})).unwrap();
     let run = |p: &dyn Projector| conefield_conformance::check_projector_wgsl(p, &|p, rays| shared.samples(p, rays));
     assert!(run(spec.build().unwrap().as_ref()).passed());

@@ -9,8 +9,7 @@ use conefield_core::arena::Weights;
 use conefield_core::backend::Backend;
 use conefield_core::geometry::Geometry;
 use conefield_core::random::{mix, unit};
-use conefield_core::spec::ProjectorSpec;
-use conefield_core::voxel::{VoxelOperator, VoxelProjector};
+use conefield_core::voxel::{VoxelOperator, VoxelProjector, VoxelProjectorSpec};
 use conefield_core::wgsl::Fragment;
 use ndarray::Array3;
 use serde_json::{Value, json};
@@ -47,7 +46,7 @@ fn off(found: &Array3<f32>, exact: &Array3<f64>) -> f64 {
 const LIMIT: f64 = 5e-5;
 
 fn projector(settings: Value) -> Box<dyn VoxelProjector> {
-    serde_json::from_value::<Box<dyn ProjectorSpec>>(settings).unwrap().build_voxel().unwrap()
+    serde_json::from_value::<Box<dyn VoxelProjectorSpec>>(settings).unwrap().build().unwrap()
 }
 
 fn all() -> Vec<Value> {
@@ -132,7 +131,7 @@ fn classical_solvers_end_where_the_cpu_does() {
         json!({"type": "fdk"}),
         json!({"type": "sart", "stop": {"passes": 3}}),
         json!({"type": "cgls", "stop": {"passes": 5}}),
-        json!({"type": "fista-tv", "stop": {"passes": 5}}),
+        json!({"type": "fista", "prior": {"type": "total-variation"}, "stop": {"passes": 5}}),
     ];
     for (name, backend) in device::backends("classical solvers") {
         for solver in &solvers {

@@ -86,7 +86,7 @@ impl<H: Half> Op for Block<'_, H> {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use conefield_core::spec::Tables;
+    use conefield_core::precision::Tables;
 
     #[test]
     fn follows_the_algorithm_in_double_precision() {

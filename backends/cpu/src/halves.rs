@@ -2,8 +2,8 @@
 
 use conefield_core::half::{Bf16, F16, Half, round};
 use conefield_core::pages::Pages;
+use conefield_core::precision::Tables;
 use conefield_core::simd::{Op, Simd, run};
-use conefield_core::spec::Tables;
 use conefield_core::stage::{Halves, Kernel, Reader, Stage};
 use rayon::prelude::*;
 use std::ops::Range;

@@ -6,19 +6,20 @@
 //! tile is in the cache ([`rows`]). Dense stages sum their gradients in copies of their own, one a slot, merged in order.
 //! Stages with scattered parameters get the rows of the wave a second time, each worker with a range of parameters of its
 //! own ([`step`]). Where tables are read in halves, these are a copy of the parameters ([`halves`]) that each update makes
-//! anew ([`adam`]). The number of slots and the order of every sum depend on the plan alone: the same bits come out
+//! anew ([`adam`]). A field that brings line integrals of its own goes another way ([`lines`]). The number of slots and the order of every sum depend on the plan alone: the same bits come out
 //! on any number of threads.
 
 pub mod adam;
 pub mod halves;
+pub mod lines;
 pub mod rows;
 pub mod step;
 
 use conefield_core::backend::{Adam, Backend, Executable, Explain, StepStats, Work};
 use conefield_core::error::{Error, Result};
 use conefield_core::pipeline::{Model, Pipeline};
+use conefield_core::precision::Tables;
 use conefield_core::simd;
-use conefield_core::spec::Tables;
 use conefield_core::stage::{GradKind, Samples, TILE_ROWS, UnitRay, titled};
 use halves::Rounded;
 use rayon::prelude::*;
@@ -141,14 +142,27 @@ impl Executable for CpuExecutable {
             model.arena.grads.fill(0.0);
         }
         self.clean = false;
-        let stats = self.slots.get_or_insert_with(|| Slots::new(&kernels)).step(
-            &kernels,
-            model.pipeline.projector.as_ref(),
-            &model.arena.params,
-            &mut model.arena.grads,
-            work,
-        );
-        model.pipeline.fault()?;
+        let pipeline = &model.pipeline;
+        let lines = pipeline.field.lines();
+        let sampled = Work { rays: if lines.is_some() { &[] } else { work.rays }, ..work.clone() };
+        let mut stats = StepStats::default();
+        if lines.is_none() || !work.points.is_empty() || !work.priors.is_empty() {
+            stats = self.slots.get_or_insert_with(|| Slots::new(&kernels)).step(
+                &kernels,
+                pipeline.projector.as_ref(),
+                &model.arena.params,
+                &mut model.arena.grads,
+                &sampled,
+            );
+        }
+        if let Some(lines) = lines {
+            // Such a field stands alone: the arena is its own.
+            let (params, grads) = (&model.arena.params, &mut model.arena.grads);
+            stats.loss += lines::step(pipeline.field.as_ref(), lines, params, grads, work);
+            stats.samples += work.rays.len() as u64;
+        }
+        pipeline.fault()?;
+        work.fault()?;
         Ok(stats)
     }
 
@@ -182,6 +196,10 @@ impl Executable for CpuExecutable {
     }
 
     fn render(&mut self, model: &Model, rays: &[UnitRay], out: &mut [f32]) -> Result<()> {
+        if let Some(lines) = model.pipeline.field.lines() {
+            lines::project(lines, &model.arena.params, rays, out);
+            return model.pipeline.fault();
+        }
         let kernels = self.kernels(model)?;
         let projector = model.pipeline.projector.as_ref();
         let longest = rays.iter().map(|ray| projector.max_samples(ray)).max().unwrap_or(0);

@@ -1,7 +1,7 @@
 //! One training step: losses and their gradients over rays, points and blocks.
 
 use crate::rows::{Belong, DenseGrads, Encoded, Kernels, Log, Scratch, even_tiles};
-use conefield_core::backend::{StepStats, TvBlocks, Work};
+use conefield_core::backend::{BlockWork, StepStats, Work};
 use conefield_core::random::mix;
 use conefield_core::simd::Real;
 use conefield_core::stage::{Grads, Projector, Samples, Tile, TileMut};
@@ -27,7 +27,8 @@ const DENSE_BYTES: usize = 128 << 20;
 enum Group {
     Rays(Range<usize>),
     Points(Range<usize>),
-    Tv(Range<usize>),
+    /// Blocks of the prior with this number.
+    Blocks(usize, Range<usize>),
 }
 
 /// What belongs to one slot.
@@ -187,12 +188,12 @@ fn waves<R: Real>(kernels: &Kernels<'_, R>, projector: &dyn Projector, work: &Wo
         let end = (start + GROUP_ROWS).min(work.points.len());
         groups.push((Group::Points(start..end), end - start));
     }
-    if let Some(tv) = work.tv {
-        let block = tv.edge.pow(3);
-        let each = (GROUP_ROWS / block).max(1);
-        for start in (0..tv.corners.len()).step_by(each) {
-            let end = (start + each).min(tv.corners.len());
-            groups.push((Group::Tv(start..end), (end - start) * block));
+    for (number, BlockWork { prior, corners, .. }) in work.priors.iter().enumerate() {
+        let points = prior.blocks().points();
+        let each = (GROUP_ROWS / points).max(1);
+        for start in (0..corners.len()).step_by(each) {
+            let end = (start + each).min(corners.len());
+            groups.push((Group::Blocks(number, start..end), (end - start) * points));
         }
     }
     let most = wave_rows(kernels);
@@ -254,16 +255,13 @@ impl<R: Real> Slot<R> {
                     let before = self.samples.points.len();
                     let seed = mix(mix(work.seed, work.step), i as u64);
                     projector.sample(&work.rays[i].ray, Some(seed), &mut self.samples);
-                    if let Some(occupancy) = work.occupancy {
-                        occupancy.thin(seed, &mut self.samples, before);
-                    }
                     self.counts.push(self.samples.points.len() - before);
                 }
             }
             Group::Points(range) => points.extend(work.points[range.clone()].iter().map(|p| p.0)),
-            Group::Tv(range) => {
-                for corner in work.tv.iter().flat_map(|tv| &tv.corners[range.clone()]) {
-                    block_points(work.tv, *corner, points);
+            Group::Blocks(prior, range) => {
+                for i in range.clone() {
+                    block_points(&work.priors[*prior], i, points);
                 }
             }
         }
@@ -302,7 +300,7 @@ impl<R: Real> Slot<R> {
         }
         let belong = match group {
             Group::Rays(_) => Belong::ToRays,
-            Group::Points(_) | Group::Tv(_) => Belong::Nowhere,
+            Group::Points(_) | Group::Blocks(..) => Belong::Nowhere,
         };
         // A ray or block of more rows than a group has goes through in parts: what a worker holds does not grow with it.
         let parts: Vec<(usize, Vec<usize>)> = match (group, kernels.mixes_rays()) {
@@ -321,15 +319,18 @@ impl<R: Real> Slot<R> {
             Group::Points(range) => {
                 let scale = 1.0 / work.points.len() as f64;
                 for (i, (_, target)) in work.points[range.clone()].iter().enumerate() {
-                    let (loss, slope) = work.loss.at(self.mu[i] - f64::from(*target));
+                    let (loss, slope) = work.loss.at(self.mu[i], f64::from(*target));
                     self.loss += loss * scale;
                     self.dmu[i] = slope * scale;
                 }
             }
-            Group::Tv(range) => {
-                for (tv, i) in work.tv.iter().flat_map(|tv| (0..range.len()).map(move |i| (tv, i))) {
-                    let at = i * tv.edge.pow(3)..(i + 1) * tv.edge.pow(3);
-                    self.prior += total_variation(tv, &self.mu[at.clone()], &mut self.dmu[at]);
+            Group::Blocks(number, range) => {
+                let work = &work.priors[*number];
+                let (points, scale) = (work.prior.blocks().points(), work.scale());
+                let blocks = self.mu.chunks_exact(points).zip(self.dmu.chunks_exact_mut(points));
+                // What follows the last block is padding.
+                for (mu, dmu) in blocks.take(range.len()) {
+                    self.prior += scale * work.prior.block(mu, scale, dmu);
                 }
             }
         }
@@ -359,7 +360,7 @@ impl<R: Real> Slot<R> {
             let rows = at..at + n;
             let weights = &self.samples.weights[first..][rows.clone()];
             let line = projector.integrate(weights, &self.mu[rows.clone()]);
-            let (loss, slope) = work.loss.at(line - f64::from(work.rays[i].target));
+            let (loss, slope) = work.loss.at(line, f64::from(work.rays[i].target));
             self.loss += loss * scale;
             projector.adjoint(weights, slope * scale, &mut self.dmu[rows]);
             at += n;
@@ -367,39 +368,15 @@ impl<R: Real> Slot<R> {
     }
 }
 
-fn block_points(tv: Option<&TvBlocks>, corner: [f32; 3], out: &mut Vec<[f32; 3]>) {
-    let Some(tv) = tv else { return };
-    for x in 0..tv.edge {
-        for y in 0..tv.edge {
-            for z in 0..tv.edge {
+/// Appends the points of block `i`, z fastest.
+fn block_points(work: &BlockWork<'_>, i: usize, out: &mut Vec<[f32; 3]>) {
+    let (corner, edge) = (work.corners[i], work.prior.blocks().edge);
+    for x in 0..edge {
+        for y in 0..edge {
+            for z in 0..edge {
                 let i = [x, y, z];
-                out.push(std::array::from_fn(|k| corner[k] + i[k] as f32 * tv.spacing[k]));
+                out.push(std::array::from_fn(|k| corner[k] + i[k] as f32 * work.spacing[k]));
             }
         }
     }
-}
-
-/// Weighted isotropic total variation of one block by forward differences, its mean over points and blocks; adds
-/// its gradient to `dmu`.
-fn total_variation(tv: &TvBlocks, mu: &[f64], dmu: &mut [f64]) -> f64 {
-    let e = tv.edge;
-    let strides = [e * e, e, 1];
-    let scale = tv.weight / (tv.corners.len() * mu.len()) as f64;
-    let mut sum = 0.0;
-    for i in 0..mu.len() {
-        let index = [i / (e * e), i / e % e, i % e];
-        let d: [f64; 3] = std::array::from_fn(|k| if index[k] + 1 < e { mu[i + strides[k]] - mu[i] } else { 0.0 });
-        let size = (d[0] * d[0] + d[1] * d[1] + d[2] * d[2] + tv.smoothing * tv.smoothing).sqrt();
-        sum += size - tv.smoothing;
-        if size > 0.0 {
-            for k in 0..3 {
-                if index[k] + 1 < e {
-                    let g = scale * d[k] / size;
-                    dmu[i + strides[k]] += g;
-                    dmu[i] -= g;
-                }
-            }
-        }
-    }
-    sum * scale
 }

@@ -9,9 +9,10 @@
 use crate::device::Atomics;
 use crate::source::{Access, Source};
 use conefield_core::error::{Error, Result};
-use conefield_core::occupancy::PROBE;
+use conefield_core::loss::Loss;
 use conefield_core::pipeline::Pipeline;
-use conefield_core::spec::Tables;
+use conefield_core::precision::Tables;
+use conefield_core::prior::Prior;
 use conefield_core::stage::{GradKind, Info, Projector, Scope, Stage, titled};
 use conefield_core::wgsl::{Fragment, RANDOM, RAY, Sum};
 use std::fmt::Write;
@@ -593,8 +594,8 @@ fn outer(prefix: &str, m: usize, k: usize) -> String {
     )
 }
 
-/// Samples of rays; where cells are known to be empty, of those that are not.
-pub fn sample(projector: &dyn Projector, occupancy: bool) -> Result<Source> {
+/// Samples of rays.
+pub fn sample(projector: &dyn Projector) -> Result<Source> {
     let name = titled("projector", &projector.describe());
     let fragment = fragment_of(&name, projector.wgsl())?;
     let mut source = Source::default();
@@ -604,16 +605,6 @@ pub fn sample(projector: &dyn Projector, occupancy: bool) -> Result<Source> {
     source.bind("samples", Access::Write, "array<vec4<f32>>");
     source.add("random numbers", RANDOM);
     source.add(&name, &fragment.named("projector_"));
-    if occupancy {
-        source.bind("cells", Access::Uniform, "Cells");
-        source.bind("occupied", Access::Read, "array<u32>");
-        source.bind("left_out", Access::Write, "array<atomic<u32>>");
-        let (low, high) = (PROBE as u32, (PROBE >> 32) as u32);
-        source.add("probes", &format!("const PROBE = vec2<u32>({low}u, {high}u);"));
-        source.add("occupancy", include_str!("kernels/occupancy.wgsl"));
-    } else {
-        source.add("occupancy", "fn taken(ray: Ray, sample: vec4<f32>) -> vec4<f32> { return sample; }");
-    }
     source.add("sample", include_str!("kernels/sample.wgsl"));
     Ok(source)
 }
@@ -628,41 +619,57 @@ pub fn blocks() -> Source {
     source
 }
 
-/// Which rows a loss is of.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub enum Part {
-    /// Samples of rays.
-    Rays,
-    /// Known points.
-    Points,
-    /// Blocks for total variation.
-    Blocks,
+/// The line integrals themselves, from which nothing learns.
+pub fn lines() -> Source {
+    of_rays("fn loss_at(predicted: f32, measured: f32) -> vec2<f32> { return vec2<f32>(predicted, 0.0); }")
 }
 
-/// The loss of a part and its derivative by μ.
-pub fn loss(part: Part) -> Source {
+/// The loss of rays and its derivative by μ.
+pub fn loss_of_rays(loss: &dyn Loss) -> Result<Source> {
+    Ok(of_rays(&loss_at(loss)?))
+}
+
+/// The loss of known points and its derivative by μ.
+pub fn loss_of_points(loss: &dyn Loss) -> Result<Source> {
+    let mut source = derivatives();
+    source.add("loss", &loss_at(loss)?);
+    source.bind("targets", Access::Read, "array<f32>");
+    source.add("loss of points", include_str!("kernels/points.wgsl"));
+    Ok(source)
+}
+
+/// The penalty of a prior's blocks and its derivative by μ.
+pub fn penalty_of_blocks(prior: &dyn Prior) -> Result<Source> {
+    let name = titled("prior", &prior.describe());
+    let mut source = derivatives();
+    source.add("blocks", &format!("const prior_edge = {}u;", prior.blocks().edge));
+    source.add(&name, &fragment_of(&name, prior.wgsl())?.named("prior_"));
+    source.add("penalty of blocks", include_str!("kernels/block_penalty.wgsl"));
+    Ok(source)
+}
+
+fn of_rays(loss: &str) -> Source {
+    let mut source = derivatives();
+    source.add("loss", loss);
+    source.add("rays", RAY);
+    source.bind("rays", Access::Read, "array<Ray>");
+    source.bind("samples", Access::Read, "array<vec4<f32>>");
+    source.add("loss of rays", include_str!("kernels/rays.wgsl"));
+    source
+}
+
+fn loss_at(loss: &dyn Loss) -> Result<String> {
+    Ok(fragment_of(&titled("loss", &loss.describe()), loss.wgsl())?.named("loss_"))
+}
+
+/// What every kernel has that makes derivatives by μ.
+fn derivatives() -> Source {
     let mut source = Source::default();
     Chain::step(&mut source);
     source.bind("mu", Access::Read, "array<f32>");
     source.bind("dmu", Access::Write, "array<f32>");
     source.bind("losses", Access::Write, "array<f32>");
     source.add("total", include_str!("kernels/total.wgsl"));
-    if part != Part::Blocks {
-        source.add("penalty", include_str!("kernels/penalty.wgsl"));
-    }
-    match part {
-        Part::Rays => {
-            source.add("rays", RAY);
-            source.bind("rays", Access::Read, "array<Ray>");
-            source.bind("samples", Access::Read, "array<vec4<f32>>");
-            source.add("loss of rays", include_str!("kernels/rays.wgsl"));
-        }
-        Part::Points => {
-            source.bind("targets", Access::Read, "array<f32>");
-            source.add("loss of points", include_str!("kernels/points.wgsl"));
-        }
-        Part::Blocks => source.add("loss of blocks", include_str!("kernels/tv.wgsl")),
-    }
     source
 }
 

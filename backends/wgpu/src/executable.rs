@@ -1,18 +1,18 @@
 //! A pipeline at work on a device: steps, updates, evaluation.
 
 use crate::arena;
-use crate::compose::{self, Chain, GROUP, Part};
+use crate::compose::{self, Chain, GROUP};
 use crate::kernel::{Buffers, Kernel, fits};
 use crate::pace::Pace;
 use crate::profile::Profile;
 use crate::source::Source;
 use crate::wave::{self, GpuRay, MOST_GROUPS, Wave};
 use crate::{Gpu, Shared};
-use conefield_core::backend::{Adam, Executable, Loss, StepStats, TvBlocks, Work};
+use conefield_core::backend::{Adam, BlockWork, Executable, StepStats, Work};
 use conefield_core::error::Result;
-use conefield_core::occupancy::Occupancy;
 use conefield_core::pipeline::Model;
 use conefield_core::stage::{Projector, UnitRay};
+use conefield_core::wgsl::Fragment;
 use std::collections::HashMap;
 use std::sync::Arc;
 use std::time::Instant;
@@ -39,26 +39,12 @@ pub(crate) struct Step {
     pub edge: u32,
     pub stride: u32,
     pub training: u32,
-    pub loss: u32,
-    pub delta: f32,
     pub ray_scale: f32,
     pub point_scale: f32,
+    pub block_scale: f32,
+    pub pad: u32,
     pub spacing: [f32; 3],
-    pub smoothing: f32,
-    pub tv_scale: f32,
-    pub pad: [u32; 3],
-}
-
-/// `Cells` in `kernels/occupancy.wgsl`.
-#[repr(C)]
-#[derive(Debug, Clone, Copy, bytemuck::Pod, bytemuck::Zeroable)]
-struct Cells {
-    low: [f32; 3],
-    probe: u32,
-    per_side: [f32; 3],
-    pad: u32,
-    shape: [u32; 3],
-    pad2: u32,
+    pub pad2: u32,
 }
 
 /// `Rule` in `kernels/adam.wgsl`.
@@ -75,37 +61,43 @@ struct Rule {
     eps: f32,
 }
 
-/// The kernels of a pipeline, composed and checked; compiled when they are first used.
+/// The kernels of a pipeline, composed and checked; compiled when they are first used. Those of the loss and the priors
+/// come with the first step that has them.
 pub struct Kernels {
-    sources: HashMap<&'static str, Source>,
+    sources: HashMap<String, Source>,
 }
 
 impl Kernels {
     /// Composes every kernel and refuses what is no valid WGSL or needs more than the device has.
     pub fn new(shared: &Shared, chain: &Chain, projector: &dyn Projector) -> Result<Self> {
-        let mut sources = HashMap::from([
-            ("sample", compose::sample(projector, false)?),
-            (OCCUPIED, compose::sample(projector, true)?),
+        let mut kernels = Self { sources: HashMap::new() };
+        let sources = [
+            ("sample", compose::sample(projector)?),
             ("blocks", compose::blocks()),
             ("forward", chain.forward(true)),
             ("evaluate", chain.forward(false)),
             ("encode", chain.encode()),
-            ("loss of rays", compose::loss(Part::Rays)),
-            ("loss of points", compose::loss(Part::Points)),
-            ("loss of blocks", compose::loss(Part::Blocks)),
+            ("lines", compose::lines()),
             ("adam", compose::adam()),
-        ]);
+        ];
+        for (label, source) in sources {
+            kernels.add(shared, label, source)?;
+        }
         if chain.learns() {
-            sources.insert("backward", chain.backward());
+            kernels.add(shared, "backward", chain.backward())?;
         }
         if chain.dense > 0 {
-            sources.insert("merge", chain.merge());
+            kernels.add(shared, "merge", chain.merge())?;
         }
-        for (label, source) in &sources {
-            source.validate()?;
-            fits(&shared.gpu, label, source)?;
-        }
-        Ok(Self { sources })
+        Ok(kernels)
+    }
+
+    /// Adds a kernel, in place of one that had the label.
+    fn add(&mut self, shared: &Shared, label: &str, source: Source) -> Result<()> {
+        source.validate()?;
+        fits(&shared.gpu, label, &source)?;
+        self.sources.insert(label.into(), source);
+        Ok(())
     }
 }
 
@@ -114,8 +106,10 @@ pub struct Wgpu {
     shared: Arc<Shared>,
     chain: Chain,
     kernels: Kernels,
-    compiled: HashMap<&'static str, Arc<Kernel>>,
-    bound: HashMap<&'static str, wgpu::BindGroup>,
+    compiled: HashMap<String, Arc<Kernel>>,
+    bound: HashMap<String, wgpu::BindGroup>,
+    /// The WGSL of the loss and of the priors whose kernels there are, with the edges of blocks.
+    learned: Vec<(Option<Fragment>, usize)>,
     buffers: Buffers,
     /// The arena is on the device.
     loaded: bool,
@@ -136,6 +130,7 @@ impl Wgpu {
             kernels,
             compiled: HashMap::new(),
             bound: HashMap::new(),
+            learned: vec![],
             buffers: Buffers::default(),
             loaded: false,
             clean: false,
@@ -217,29 +212,52 @@ impl Wgpu {
     }
 
     /// The kernel called `label`, compiled.
-    fn kernel(&mut self, label: &'static str) -> Result<Arc<Kernel>> {
+    fn kernel(&mut self, label: &str) -> Result<Arc<Kernel>> {
         if let Some(kernel) = self.compiled.get(label) {
             return Ok(kernel.clone());
         }
         let source = self.kernels.sources.get(label);
         let source = source.ok_or_else(|| self.gpu().error(format!("no kernel {label}")))?;
         let kernel = self.shared.kernels.get(&self.shared.gpu, label, source)?;
-        self.compiled.insert(label, kernel.clone());
+        self.compiled.insert(label.into(), kernel.clone());
         Ok(kernel)
     }
 
     /// The same with its buffers.
-    fn ready(&mut self, label: &'static str) -> Result<(Arc<Kernel>, wgpu::BindGroup)> {
+    fn ready(&mut self, label: &str) -> Result<(Arc<Kernel>, wgpu::BindGroup)> {
         let kernel = self.kernel(label)?;
         if !self.bound.contains_key(label) {
             let group = kernel.bind(&self.shared.gpu, &self.buffers)?;
-            self.bound.insert(label, group);
+            self.bound.insert(label.into(), group);
         }
         Ok((kernel, self.bound[label].clone()))
     }
 
+    /// Composes the kernels of the work's loss and priors, unless they are those of the step before.
+    fn learn_by(&mut self, work: &Work<'_>) -> Result<()> {
+        let mut fragments = vec![(work.loss.wgsl(), 0)];
+        fragments.extend(work.priors.iter().map(|p| (p.prior.wgsl(), p.prior.blocks().edge)));
+        if self.learned == fragments {
+            return Ok(());
+        }
+        let mut sources = vec![
+            (OF_RAYS.to_owned(), compose::loss_of_rays(work.loss)?),
+            (OF_POINTS.to_owned(), compose::loss_of_points(work.loss)?),
+        ];
+        for (i, p) in work.priors.iter().enumerate() {
+            sources.push((of_blocks(i), compose::penalty_of_blocks(p.prior)?));
+        }
+        for (label, source) in sources {
+            self.compiled.remove(&label);
+            self.bound.remove(&label);
+            self.kernels.add(&self.shared, &label, source)?;
+        }
+        self.learned = fragments;
+        Ok(())
+    }
+
     /// Launches kernels one after the other, each with its number of groups.
-    fn launch(&mut self, encoder: &mut wgpu::CommandEncoder, launches: &[(&'static str, usize)]) -> Result<()> {
+    fn launch(&mut self, encoder: &mut wgpu::CommandEncoder, launches: &[(&str, usize)]) -> Result<()> {
         for &(label, groups) in launches.iter().filter(|(_, groups)| *groups > 0) {
             let (kernel, bound) = self.ready(label)?;
             let timestamp_writes = self.profile.as_mut().and_then(|p| p.around(label));
@@ -284,7 +302,7 @@ impl Wgpu {
     fn in_pieces(
         &mut self,
         points: &[[f32; 3]],
-        label: &'static str,
+        label: &str,
         result: &str,
         width: usize,
         mut take: impl FnMut(usize, &[f32], usize),
@@ -331,17 +349,6 @@ impl Wgpu {
         self.write("rays", bytemuck::cast_slice(&wave.rays))
     }
 
-    /// Writes where samples are taken, and that none is left out so far.
-    fn occupy(&mut self, occupancy: &Occupancy) -> Result<()> {
-        let Occupancy { low, per_side, shape, ref bits, probe } = *occupancy;
-        self.reserve("cells", size_of::<Cells>() as u64, U::UNIFORM | U::COPY_DST)?;
-        self.reserve("occupied", 4 * bits.len().max(1) as u64, U::STORAGE | U::COPY_DST)?;
-        self.reserve("left_out", 4, U::STORAGE | U::COPY_DST | U::COPY_SRC)?;
-        self.write("cells", bytemuck::bytes_of(&Cells { low, probe, per_side, pad: 0, shape, pad2: 0 }))?;
-        self.write("occupied", bytemuck::cast_slice(bits))?;
-        self.write("left_out", &[0; 4])
-    }
-
     /// The kernels of one wave of a step.
     fn learn(&mut self, wave: &Wave, work: &Work<'_>, sums: u64) -> Result<()> {
         self.place(wave)?;
@@ -354,7 +361,7 @@ impl Wgpu {
             training: 1,
             ray_scale: 1.0 / work.rays.len().max(1) as f32,
             point_scale: 1.0 / work.points.len().max(1) as f32,
-            ..penalty(work.loss)
+            ..Step::default()
         };
         if !wave.points.is_empty() {
             let points = &work.points[wave.points.clone()];
@@ -365,18 +372,17 @@ impl Wgpu {
             self.write("targets", bytemuck::cast_slice(&targets))?;
         }
         let mut block_rows = 0;
-        if let (Some(tv), false) = (work.tv, wave.blocks.is_empty()) {
+        if let (Some(work), false) = (work.priors.get(wave.prior), wave.blocks.is_empty()) {
             let corners: Vec<[f32; 4]> =
-                tv.corners[wave.blocks.clone()].iter().map(|c| [c[0], c[1], c[2], 0.0]).collect();
+                work.corners[wave.blocks.clone()].iter().map(|c| [c[0], c[1], c[2], 0.0]).collect();
             self.reserve("corners", 16 * corners.len() as u64, U::STORAGE | U::COPY_DST)?;
             self.write("corners", bytemuck::cast_slice(&corners))?;
-            let points = tv.edge.pow(3);
+            let blocks = work.prior.blocks();
             step.blocks = wave.blocks.len() as u32;
-            step.edge = tv.edge as u32;
-            step.spacing = tv.spacing;
-            step.smoothing = tv.smoothing as f32;
-            step.tv_scale = tv_scale(tv) as f32;
-            block_rows = wave.blocks.len() * points;
+            step.edge = blocks.edge as u32;
+            step.spacing = work.spacing;
+            step.block_scale = work.scale() as f32;
+            block_rows = wave.blocks.len() * blocks.points();
         }
         self.write("step", bytemuck::bytes_of(&step))?;
         let groups = |rows: usize| rows.div_ceil(GROUP as usize);
@@ -385,12 +391,12 @@ impl Wgpu {
         self.launch(
             &mut encoder,
             &[
-                (if work.occupancy.is_some() { OCCUPIED } else { "sample" }, groups(wave.ray_rows as usize)),
+                ("sample", groups(wave.ray_rows as usize)),
                 ("blocks", groups(block_rows)),
                 ("forward", groups(wave.rows as usize)),
-                ("loss of rays", wave.rays.len()),
-                ("loss of points", groups(wave.points.len())),
-                ("loss of blocks", wave.blocks.len()),
+                (OF_RAYS, wave.rays.len()),
+                (OF_POINTS, groups(wave.points.len())),
+                (&of_blocks(wave.prior), wave.blocks.len()),
                 ("backward", backward),
             ],
         )?;
@@ -400,29 +406,17 @@ impl Wgpu {
     }
 }
 
-/// What a point's variation counts by.
-fn tv_scale(tv: &TvBlocks) -> f64 {
-    tv.weight / (tv.corners.len() * tv.edge.pow(3)).max(1) as f64
+/// Labels of the kernels that make derivatives by μ.
+const OF_RAYS: &str = "loss of rays";
+const OF_POINTS: &str = "loss of points";
+
+fn of_blocks(prior: usize) -> String {
+    format!("penalty of blocks {prior}")
 }
-
-/// The penalty, as kernels know it.
-fn penalty(loss: Loss) -> Step {
-    let (loss, delta) = match loss {
-        Loss::L1 => (0, 0.0),
-        Loss::L2 => (1, 0.0),
-        Loss::Huber { delta } => (2, delta as f32),
-    };
-    Step { loss, delta, ..Step::default() }
-}
-
-/// The kernel that samples rays where cells are known to be empty.
-const OCCUPIED: &str = "sample where occupied";
-
-/// The number of the penalty that is the difference itself.
-const LINE: u32 = 3;
 
 impl Executable for Wgpu {
     fn step(&mut self, model: &mut Model, work: &Work<'_>) -> Result<StepStats> {
+        self.learn_by(work)?;
         self.load(model)?;
         let started = Instant::now();
         if !self.clean || self.chain.dense > 0 {
@@ -438,9 +432,7 @@ impl Executable for Wgpu {
         self.clean = false;
         let waves = wave::of_step(model.pipeline.projector.as_ref(), work, self.pace.size());
         let losses: usize = waves.iter().map(Wave::losses).sum();
-        // After the losses, how many samples were left out.
-        self.reserve("staging", 4 * losses as u64 + 4, U::MAP_READ | U::COPY_DST)?;
-        work.occupancy.map_or(Ok(()), |o| self.occupy(o))?;
+        self.reserve("staging", 4 * losses.max(1) as u64, U::MAP_READ | U::COPY_DST)?;
         let mut at = 0;
         for wave in &waves {
             self.learn(wave, work, at)?;
@@ -452,26 +444,16 @@ impl Executable for Wgpu {
             self.launch(&mut encoder, &[("merge", self.chain.dense.div_ceil(GROUP as usize))])?;
             self.gpu().queue.submit([encoder.finish()]);
         }
-        let mut found = at;
-        if work.occupancy.is_some() {
-            let mut encoder = self.encoder();
-            self.copy(&mut encoder, "left_out", 4, at)?;
-            self.gpu().queue.submit([encoder.finish()]);
-            found += 4;
-        }
         let mut stats = StepStats { samples: waves.iter().map(|w| u64::from(w.rows)).sum(), ..StepStats::default() };
         let [ray_scale, point_scale] = [work.rays.len(), work.points.len()].map(|n| 1.0 / n.max(1) as f64);
-        let tv_scale = work.tv.map_or(0.0, tv_scale);
-        self.read(found, |bytes| {
-            let (losses, left_out) = bytes.split_at(4 * losses);
-            stats.samples -= bytemuck::cast_slice::<u8, u32>(left_out).iter().map(|&n| u64::from(n)).sum::<u64>();
-            let mut sums = bytemuck::cast_slice::<u8, f32>(losses).iter().map(|&l| f64::from(l));
+        self.read(at, |bytes| {
+            let mut sums = bytemuck::cast_slice::<u8, f32>(bytes).iter().map(|&l| f64::from(l));
             let mut next = |n: usize| sums.by_ref().take(n).sum::<f64>();
             for wave in &waves {
                 let (rays, points, blocks) =
                     (next(wave.rays.len()), next(wave.points.len().div_ceil(GROUP as usize)), next(wave.blocks.len()));
                 stats.loss += rays * ray_scale + points * point_scale;
-                stats.prior += blocks * tv_scale;
+                stats.prior += blocks * work.priors.get(wave.prior).map_or(0.0, BlockWork::scale);
             }
         })?;
         self.collect()?;
@@ -552,11 +534,11 @@ impl Executable for Wgpu {
             let bytes = 4 * wave.rays.len() as u64;
             self.reserve("staging", bytes, U::MAP_READ | U::COPY_DST)?;
             let (rows, rays) = (wave.rows, wave.rays.len() as u32);
-            let step = Step { rows, ray_rows: rows, rays, stride: self.room, loss: LINE, ..Step::default() };
+            let step = Step { rows, ray_rows: rows, rays, stride: self.room, ..Step::default() };
             self.write("step", bytemuck::bytes_of(&step))?;
             let groups = wave.rows.div_ceil(GROUP) as usize;
             let mut encoder = self.encoder();
-            self.launch(&mut encoder, &[("sample", groups), ("evaluate", groups), ("loss of rays", wave.rays.len())])?;
+            self.launch(&mut encoder, &[("sample", groups), ("evaluate", groups), ("lines", wave.rays.len())])?;
             self.copy(&mut encoder, "losses", bytes, 0)?;
             self.gpu().queue.submit([encoder.finish()]);
             self.read(bytes, |found| {

@@ -29,7 +29,7 @@ pub mod wave;
 
 use compose::{Chain, Target};
 use conefield_core::backend::{Backend, Executable, Explain};
-use conefield_core::error::Result;
+use conefield_core::error::{Error, Result};
 use conefield_core::pipeline::Pipeline;
 use conefield_core::stage::{GradKind, titled};
 use conefield_core::voxel::{VoxelProjector, VoxelView};
@@ -101,6 +101,11 @@ impl Backend for Wgpu {
     }
 
     fn compile(&self, pipeline: &Pipeline) -> Result<(Box<dyn Executable>, Explain)> {
+        if pipeline.field.lines().is_some() {
+            let what = titled("field", &pipeline.field.describe());
+            let why = "it brings line integrals of its own, which only the CPU computes; use --backend cpu";
+            return Err(Error::unsupported(format!("{what} on the wgpu backend"), why));
+        }
         let shared = &self.shared;
         let chain = Chain::new(pipeline, shared.target())?;
         let kernels = Kernels::new(shared, &chain, pipeline.projector.as_ref())?;

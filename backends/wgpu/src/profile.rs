@@ -12,8 +12,8 @@ pub struct Profile {
     queries: wgpu::QuerySet,
     resolved: wgpu::Buffer,
     staging: wgpu::Buffer,
-    waiting: Vec<&'static str>,
-    seconds: BTreeMap<&'static str, f64>,
+    waiting: Vec<String>,
+    seconds: BTreeMap<String, f64>,
 }
 
 impl Profile {
@@ -42,12 +42,12 @@ impl Profile {
 
     /// Timestamps for the pass of `label`. At most 512 between two calls of [`Profile::collect`]; further ones
     /// are not timed.
-    pub fn around(&mut self, label: &'static str) -> Option<wgpu::ComputePassTimestampWrites<'_>> {
+    pub fn around(&mut self, label: &str) -> Option<wgpu::ComputePassTimestampWrites<'_>> {
         let at = self.waiting.len() as u32;
         if at == LAUNCHES {
             return None;
         }
-        self.waiting.push(label);
+        self.waiting.push(label.into());
         Some(wgpu::ComputePassTimestampWrites {
             query_set: &self.queries,
             beginning_of_pass_write_index: Some(2 * at),
@@ -77,6 +77,6 @@ impl Profile {
 
     /// Seconds of each kernel since this was last asked.
     pub fn take(&mut self) -> Vec<(String, f64)> {
-        std::mem::take(&mut self.seconds).into_iter().map(|(k, s)| (k.to_owned(), s)).collect()
+        std::mem::take(&mut self.seconds).into_iter().collect()
     }
 }

@@ -1,14 +1,17 @@
-//! One stage alone on a device, by which its WGSL is compared with its Rust.
+//! One stage, projector, loss or prior alone on a device, to compare its WGSL with its Rust.
 
 use crate::Shared;
 use crate::arena;
 use crate::compose::{self, Chain, GROUP};
 use crate::executable::Step;
 use crate::kernel::Buffers;
+use crate::source::Source;
 use crate::wave::GpuRay;
 use conefield_core::arena::Arena;
 use conefield_core::error::Result;
-use conefield_core::spec::Tables;
+use conefield_core::loss::Loss;
+use conefield_core::precision::Tables;
+use conefield_core::prior::Prior;
 use conefield_core::stage::{Projector, Samples, Stage, UnitRay};
 use wgpu::BufferUsages as U;
 
@@ -60,24 +63,16 @@ impl Shared {
             run("merge", &chain.merge(), step, chain.dense.div_ceil(GROUP as usize))?;
         }
         arena::download(gpu, &buffers, &chain, &mut arena, target.segment)?;
-        let read = |name: &str, n: usize| -> Result<Vec<f32>> {
-            let bytes = 4 * n as u64;
-            let staging = gpu.buffer("staging", bytes, U::MAP_READ | U::COPY_DST)?;
-            let mut encoder = gpu.device.create_command_encoder(&Default::default());
-            buffers.get(name).inspect(|b| encoder.copy_buffer_to_buffer(b, 0, &staging, 0, bytes));
-            gpu.queue.submit([encoder.finish()]);
-            let mut out = vec![0.0; n];
-            gpu.read(&staging, bytes, |found| out.copy_from_slice(bytemuck::cast_slice(found)))?;
-            Ok(out)
-        };
-        Ok([read("y", info.output * rows)?, arena.grads.to_vec(), read("dx", info.input * rows)?])
+        let [y, dx] =
+            [("y", info.output * rows), ("dx", info.input * rows)].map(|(name, n)| self.fetch(&buffers, name, n));
+        Ok([y?, arena.grads.to_vec(), dx?])
     }
 
     /// The samples of `rays`, each with its seed where positions are random.
     pub fn samples(&self, projector: &dyn Projector, rays: &[(UnitRay, Option<u64>)]) -> Result<Vec<Samples>> {
         let gpu = &self.gpu;
         let mut all = vec![];
-        let source = compose::sample(projector, false)?;
+        let source = compose::sample(projector)?;
         for (ray, seed) in rays {
             let count = projector.max_samples(ray);
             let mut buffers = Buffers::default();
@@ -112,5 +107,70 @@ impl Shared {
             all.push(samples);
         }
         Ok(all)
+    }
+
+    /// A loss and its derivative at pairs of a predicted and a measured value.
+    pub fn losses(&self, loss: &dyn Loss, pairs: &[[f32; 2]]) -> Result<Vec<[f32; 2]>> {
+        // A kernel adds up the losses of 64 points: each pair stands for as many.
+        let each = GROUP as usize;
+        let of = |k: usize| pairs.iter().flat_map(|p| vec![p[k]; each]).collect::<Vec<f32>>();
+        let rows = (each * pairs.len()) as u32;
+        let step = Step { rows, point_rows: rows, point_scale: 1.0, ..Step::default() };
+        let source = compose::loss_of_points(loss)?;
+        let inputs = [("mu", of(0)), ("targets", of(1))];
+        let [sums, slopes] = self.derivatives("loss of points", &source, step, &inputs, pairs.len())?;
+        Ok(sums.iter().zip(slopes.iter().step_by(each)).map(|(sum, slope)| [sum / each as f32, *slope]).collect())
+    }
+
+    /// A prior's penalty of one block with these values, and its derivative by each of them.
+    pub fn penalty(&self, prior: &dyn Prior, values: &[f32]) -> Result<(f32, Vec<f32>)> {
+        let rows = values.len() as u32;
+        let step = Step { rows, blocks: 1, edge: prior.blocks().edge as u32, block_scale: 1.0, ..Step::default() };
+        let source = compose::penalty_of_blocks(prior)?;
+        let inputs = [("mu", values.to_vec())];
+        let [sum, slopes] = self.derivatives("penalty of blocks", &source, step, &inputs, 1)?;
+        Ok((sum[0], slopes))
+    }
+
+    /// Runs a kernel that makes derivatives by μ, a group for each of the `losses`. Returns these and the derivatives.
+    fn derivatives(
+        &self,
+        label: &str,
+        source: &Source,
+        step: Step,
+        inputs: &[(&str, Vec<f32>)],
+        losses: usize,
+    ) -> Result<[Vec<f32>; 2]> {
+        let gpu = &self.gpu;
+        let mut buffers = Buffers::default();
+        buffers.reserve(gpu, "step", size_of::<Step>() as u64, U::UNIFORM | U::COPY_DST)?;
+        buffers.get("step").inspect(|b| gpu.queue.write_buffer(b, 0, bytemuck::bytes_of(&step)));
+        for (name, values) in inputs {
+            buffers.reserve(gpu, name, 4 * values.len() as u64, U::STORAGE | U::COPY_DST)?;
+            buffers.get(name).inspect(|b| gpu.queue.write_buffer(b, 0, bytemuck::cast_slice(values)));
+        }
+        let outputs = [("losses", losses), ("dmu", step.rows as usize)];
+        for (name, count) in outputs {
+            buffers.reserve(gpu, name, 4 * count as u64, U::STORAGE | U::COPY_SRC)?;
+        }
+        let kernel = self.kernels.get(gpu, label, source)?;
+        let bound = kernel.bind(gpu, &buffers)?;
+        let mut encoder = gpu.device.create_command_encoder(&Default::default());
+        kernel.launch(&mut encoder.begin_compute_pass(&Default::default()), &bound, losses as u32);
+        gpu.queue.submit([encoder.finish()]);
+        let [losses, slopes] = outputs.map(|(name, count)| self.fetch(&buffers, name, count));
+        Ok([losses?, slopes?])
+    }
+
+    /// The first `count` numbers of a buffer.
+    fn fetch(&self, buffers: &Buffers, name: &str, count: usize) -> Result<Vec<f32>> {
+        let (gpu, bytes) = (&self.gpu, 4 * count as u64);
+        let staging = gpu.buffer("staging", bytes, U::MAP_READ | U::COPY_DST)?;
+        let mut encoder = gpu.device.create_command_encoder(&Default::default());
+        buffers.get(name).inspect(|b| encoder.copy_buffer_to_buffer(b, 0, &staging, 0, bytes));
+        gpu.queue.submit([encoder.finish()]);
+        let mut out = vec![0.0; count];
+        gpu.read(&staging, bytes, |found| out.copy_from_slice(bytemuck::cast_slice(found)))?;
+        Ok(out)
     }
 }

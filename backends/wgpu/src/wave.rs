@@ -1,7 +1,7 @@
 //! A step's work cut into waves of bounded size, so that no launch holds a device for long.
 
 use crate::compose::GROUP;
-use conefield_core::backend::{TrainRay, Work};
+use conefield_core::backend::{BlockWork, TrainRay, Work};
 use conefield_core::random::mix;
 use conefield_core::stage::{Projector, UnitRay};
 use std::ops::Range;
@@ -41,7 +41,9 @@ pub struct Wave {
     pub ray_rows: u32,
     /// Which of the points.
     pub points: Range<usize>,
-    /// Which of the blocks.
+    /// The number of the prior that blocks are of, and which of them.
+    pub prior: usize,
+    /// See `prior`.
     pub blocks: Range<usize>,
     /// All rows.
     pub rows: u32,
@@ -94,10 +96,21 @@ pub fn of_step(projector: &dyn Projector, work: &Work<'_>, most: u32) -> Vec<Wav
         }
         at = end;
     }
-    let Some(tv) = work.tv else { return waves };
-    let each = tv.edge.pow(3) as u32;
+    for (prior, blocks) in work.priors.iter().enumerate() {
+        place_blocks(&mut waves, prior, blocks, most);
+    }
+    waves
+}
+
+/// Adds blocks to the last wave and to further ones. The blocks of a wave are of one prior.
+fn place_blocks(waves: &mut Vec<Wave>, prior: usize, blocks: &BlockWork<'_>, most: u32) {
+    let each = blocks.prior.blocks().points() as u32;
+    let count = blocks.corners.len();
     let mut at = 0;
-    while at < tv.corners.len() {
+    if waves.last().is_some_and(|w| !w.blocks.is_empty()) {
+        waves.push(Wave::default());
+    }
+    while at < count {
         let empty = waves.last().is_none_or(|w| w.rows == 0);
         let room = waves.last().map_or(0, |w| most.saturating_sub(w.rows) / each) as usize;
         let room = if empty { room.max(1) } else { room }.min(MOST_GROUPS);
@@ -105,17 +118,16 @@ pub fn of_step(projector: &dyn Projector, work: &Work<'_>, most: u32) -> Vec<Wav
             waves.push(Wave::default());
             continue;
         }
-        let end = (at + room).min(tv.corners.len());
+        let end = (at + room).min(count);
         if let Some(wave) = waves.last_mut() {
-            wave.blocks = at..end;
+            (wave.prior, wave.blocks) = (prior, at..end);
             wave.rows += (end - at) as u32 * each;
         }
         at = end;
-        if at < tv.corners.len() {
+        if at < count {
             waves.push(Wave::default());
         }
     }
-    waves
 }
 
 /// The waves in which rays are rendered.
@@ -126,8 +138,35 @@ pub fn of_rays(projector: &dyn Projector, rays: &[UnitRay], most: u32) -> Vec<Wa
 #[cfg(test)]
 mod tests {
     use super::*;
-    use conefield_core::backend::{Loss, TvBlocks};
+    use conefield_core::loss::Loss;
+    use conefield_core::prior::{Blocks, Prior};
     use conefield_core::stage::Samples;
+
+    /// A loss, and a prior with blocks of this edge, that nothing asks for values.
+    struct Named(usize);
+    impl Loss for Named {
+        fn at(&self, _: f64, _: f64) -> (f64, f64) {
+            (0.0, 0.0)
+        }
+        fn describe(&self) -> String {
+            "named".into()
+        }
+    }
+    impl Prior for Named {
+        fn blocks(&self) -> Blocks {
+            Blocks { edge: self.0, count: 1, spacing: 1.0, weight: 1.0 }
+        }
+        fn block(&self, _: &[f64], _: f64, _: &mut [f64]) -> f64 {
+            0.0
+        }
+        fn describe(&self) -> String {
+            "named".into()
+        }
+    }
+
+    fn work<'a>(rays: &'a [TrainRay], points: &'a [([f32; 3], f32)], priors: &'a [BlockWork<'a>]) -> Work<'a> {
+        Work { step: 1, seed: 2, loss: &Named(0), rays, points, priors }
+    }
 
     struct Fixed(usize);
     impl Projector for Fixed {
@@ -148,17 +187,21 @@ mod tests {
     fn every_row_is_in_one_wave_and_none_is_too_large() {
         let rays = vec![TrainRay { ray: ray(), target: 0.5 }; 37];
         let points = vec![([0.5; 3], 0.5); 500];
-        let tv = TvBlocks { corners: vec![[0.0; 3]; 11], edge: 4, ..TvBlocks::default() };
+        let corners = [[0.0; 3]; 11];
+        let of = |edge: &'static Named| BlockWork { prior: edge, corners: &corners, spacing: [0.1; 3] };
+        let two = [of(&Named(4)), of(&Named(3))];
         for most in [64, 100, 333, 100_000] {
-            for tv in [None, Some(&tv)] {
-                let work = Work { step: 1, seed: 2, loss: Loss::L1, rays: &rays, points: &points, tv, occupancy: None };
-                let waves = of_step(&Fixed(10), &work, most);
+            for priors in [&two[..0], &two[..1], &two] {
+                let waves = of_step(&Fixed(10), &work(&rays, &points, priors), most);
                 assert!(waves.iter().all(|w| w.rows <= most && w.rows > 0), "{most}");
                 assert_eq!(waves.iter().map(|w| w.rays.len()).sum::<usize>(), 37);
                 assert_eq!(waves.iter().map(|w| w.points.len()).sum::<usize>(), 500);
-                assert_eq!(waves.iter().map(|w| w.blocks.len()).sum::<usize>(), tv.map_or(0, |t| t.corners.len()));
+                for prior in 0..priors.len() {
+                    let own = waves.iter().filter(|w| w.prior == prior);
+                    assert_eq!(own.map(|w| w.blocks.len()).sum::<usize>(), 11);
+                }
                 let rows: u32 = waves.iter().map(|w| w.rows).sum();
-                assert_eq!(rows, 370 + 500 + 64 * tv.map_or(0, |t| t.corners.len() as u32));
+                assert_eq!(rows, 370 + 500 + 11 * [0, 64, 64 + 27][priors.len()]);
                 for w in &waves {
                     assert!(w.rays.iter().enumerate().all(|(i, r)| r.first == 10 * i as u32));
                 }
@@ -169,9 +212,9 @@ mod tests {
     #[test]
     fn what_is_larger_than_a_wave_gets_one_of_its_own() {
         let rays = vec![TrainRay { ray: ray(), target: 0.5 }; 3];
-        let tv = TvBlocks { corners: vec![[0.0; 3]; 2], edge: 8, ..TvBlocks::default() };
-        let work = Work { step: 1, seed: 2, loss: Loss::L1, rays: &rays, points: &[], tv: Some(&tv), occupancy: None };
-        let rows: Vec<_> = of_step(&Fixed(100), &work, 64).iter().map(|w| w.rows).collect();
+        let corners = [[0.0; 3]; 2];
+        let priors = [BlockWork { prior: &Named(8), corners: &corners, spacing: [0.1; 3] }];
+        let rows: Vec<_> = of_step(&Fixed(100), &work(&rays, &[], &priors), 64).iter().map(|w| w.rows).collect();
         assert_eq!(rows, [100, 100, 100, 512, 512]);
     }
 }

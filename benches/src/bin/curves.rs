@@ -2,7 +2,7 @@
 //! `curves [--drift] OUT.png TITLE NAME=RUN_FOLDER...`.
 
 use conefield_benches::{metrics, quality};
-use conefield_io::{CurveOptions, curves_png_with};
+use conefield_report::{CurveOptions, curves_png_with};
 use serde_json::Value;
 use std::error::Error;
 

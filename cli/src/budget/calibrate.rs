@@ -2,16 +2,13 @@
 //! scan, or real passes over a coarser one, and what comes after the training.
 
 use crate::files;
-use crate::method::Parts;
 use conefield_core::backend::Backend;
 use conefield_core::geometry::VoxelGrid;
+use conefield_core::method::{Job, Limits, Observer, Plan, Record};
 use conefield_core::parts::Voxels;
 use conefield_core::scan::{Scan, Volume};
-use conefield_core::solver::{Job, Limits, Observer, Record, Solver};
-use conefield_core::spec::Spec;
-use conefield_core::spec::load::Loaded;
 use conefield_core::{Error, Result};
-use conefield_io::MiddleSlices;
+use conefield_report::MiddleSlices;
 use ndarray::{Array3, s};
 use serde::Serialize;
 use std::time::Instant;
@@ -64,33 +61,34 @@ impl Costs {
     }
 }
 
-/// Measures what `loaded` takes, in about `seconds`.
-pub fn calibrate(bench: &Bench<'_>, loaded: &Loaded, parts: &Parts, seconds: f64) -> Result<Costs> {
+/// Measures what a plan takes, in about `seconds`.
+pub fn calibrate(bench: &Bench<'_>, plan: &mut dyn Plan, seconds: f64) -> Result<Costs> {
     // Passes have all of it: one coarse scan alone cannot tell what goes with the work, and they would seem three times too dear.
-    let begins = |solver: &dyn Solver, share: f64| match &parts.pipeline {
-        Some(_) => field(bench, &loaded.spec, solver, share * seconds),
-        None => voxels(bench, &loaded.spec, solver, seconds),
+    let begins = |plan: &mut dyn Plan, share: f64| match plan.pipeline() {
+        Some(_) => field(bench, plan, share * seconds),
+        None => voxels(bench, plan, seconds),
     };
-    let solved = match parts.solver.successor(&loaded.spec.scene) {
-        None => begins(parts.solver.as_ref(), 0.5)?,
-        Some(next) => {
-            let first = begins(next.first, 0.25)?;
-            let then = voxels(bench, &next.spec, next.then, seconds)?;
-            // The first one's voxels are evaluated for the second one to start from.
-            let before = first.export_s + then.prepare_s;
-            Costs {
-                then_s: before + next.passes as f64 * then.step_s,
-                then_least_s: before + then.step_s,
-                export_s: then.export_s,
-                ..first
+    let solved = match plan.links() {
+        [] => begins(plan, 0.5)?,
+        [first, later @ ..] => {
+            let mut costs = begins(first.as_mut(), 0.25)?;
+            for link in later {
+                let next = voxels(bench, link.as_mut(), seconds)?;
+                // The voxels that it starts from are evaluated first.
+                let before = costs.export_s + next.prepare_s;
+                let passes = link.passes().unwrap_or(1) as f64;
+                costs.then_s += before + passes * next.step_s;
+                costs.then_least_s += before + next.step_s;
+                costs.export_s = next.export_s;
             }
+            costs
         }
     };
     Ok(Costs { picture_s: picture(bench)?, score_s: score(bench)?, ..solved })
 }
 
 /// Steps on some of the views, then some layers of the field.
-fn field(bench: &Bench<'_>, spec: &Spec, solver: &dyn Solver, seconds: f64) -> Result<Costs> {
+fn field(bench: &Bench<'_>, plan: &mut dyn Plan, seconds: f64) -> Result<Costs> {
     let n = bench.scan.geometry.views.len();
     let every = n.div_ceil(VIEWS);
     let others: Vec<usize> = (0..n).filter(|v| v % every != 0).collect();
@@ -98,7 +96,7 @@ fn field(bench: &Bench<'_>, spec: &Spec, solver: &dyn Solver, seconds: f64) -> R
     let mut laps = Laps::default();
     let limits = Limits { at_most: Some(seconds), ..Limits::default() };
     let begin = Instant::now();
-    let solution = solver.solve(&job(bench, spec, &scan, limits), &mut laps)?;
+    let solution = plan.run(&job(bench, &scan, limits), &mut laps)?;
     // What comes before the first step goes through all pixels of all views.
     let fewer = n as f64 / scan.geometry.views.len() as f64;
     let prepare_s = fewer * (begin.elapsed().as_secs_f64() - solution.train_s).max(0.0);
@@ -115,7 +113,7 @@ fn field(bench: &Bench<'_>, spec: &Spec, solver: &dyn Solver, seconds: f64) -> R
 
 /// Two passes on a coarser detector and volume, then on a finer one while time lets: all views and all that is done with them
 /// stay in proportion.
-fn voxels(bench: &Bench<'_>, spec: &Spec, solver: &dyn Solver, seconds: f64) -> Result<Costs> {
+fn voxels(bench: &Bench<'_>, plan: &mut dyn Plan, seconds: f64) -> Result<Costs> {
     let mut factor = COARSEST;
     let mut coarser = None;
     loop {
@@ -126,7 +124,7 @@ fn voxels(bench: &Bench<'_>, spec: &Spec, solver: &dyn Solver, seconds: f64) -> 
         // A volume to start from takes as long as an empty one.
         let grid = scan.geometry.volume;
         let empty = |_: &str| Ok(Volume { data: Array3::zeros(grid.shape), grid, affine: None });
-        let solution = solver.solve(&Job { volumes: &empty, ..job(bench, spec, &scan, limits) }, &mut laps)?;
+        let solution = plan.run(&Job { volumes: &empty, ..job(bench, &scan, limits) }, &mut laps)?;
         let took = begin.elapsed().as_secs_f64();
         let step_s = match (solution.steps, laps.typical()) {
             (2.., Some(lap)) => lap,
@@ -167,14 +165,8 @@ impl Passes {
     }
 }
 
-fn job<'a>(bench: &'a Bench<'_>, spec: &'a Spec, scan: &'a Scan, limits: Limits) -> Job<'a> {
-    Job {
-        seed: bench.seed,
-        limits,
-        weights: &|path| files::read_weights(path),
-        volumes: &files::volume,
-        ..Job::new(scan, spec, bench.backend)
-    }
+fn job<'a>(bench: &'a Bench<'_>, scan: &'a Scan, limits: Limits) -> Job<'a> {
+    Job { seed: bench.seed, limits, volumes: &files::volume, ..Job::new(scan, bench.backend) }
 }
 
 /// The same scan with pixels and voxels `factor` times as large, as far as that leaves some, and the share of the work that is
@@ -269,7 +261,7 @@ impl Observer for Laps {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::specs;
+    use crate::{method, specs};
     use conefield_backend_cpu::Cpu;
     use conefield_projectors::simulate::{PhantomKind, Protocol, phantom_of, simulate};
 
@@ -334,8 +326,8 @@ mod tests {
         let bench = Bench { scan: &scan, reference: Some(&truth), peak: 1.0, backend: &backend, seed: 0 };
         for spec in ["fast", "fdk", "sart", "cgls", "fista-tv", "asd-pocs"] {
             let loaded = specs::read(spec, &[]).unwrap();
-            let parts = Parts::of(&loaded, &backend).unwrap();
-            let costs = calibrate(&bench, &loaded, &parts, 0.05).unwrap();
+            let mut plan = method::plan(&loaded, &backend).unwrap();
+            let costs = calibrate(&bench, plan.as_mut(), 0.05).unwrap();
             let all = [costs.step_s, costs.export_s, costs.picture_s, costs.score_s];
             assert!(all.iter().all(|s| *s > 0.0 && s.is_finite()) && costs.prepare_s >= 0.0, "{spec}: {costs:?}");
         }

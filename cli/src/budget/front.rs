@@ -15,14 +15,14 @@ const LONGEST: u64 = 4 << 20;
 /// What a method works on. The two are searched apart: fields need longer before they show what they can.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Serialize, Deserialize)]
 #[serde(rename_all = "kebab-case")]
-pub enum Kind {
+pub enum Unknowns {
     /// It trains a field.
     Field,
     /// It makes voxels.
     Voxels,
 }
 
-impl Kind {
+impl Unknowns {
     /// What its steps are called.
     pub fn steps(self) -> &'static str {
         match self {
@@ -59,7 +59,7 @@ pub struct Tuned {
 #[serde(deny_unknown_fields)]
 pub struct Point {
     pub name: String,
-    pub kind: Kind,
+    pub kind: Unknowns,
     /// The spec that it starts from, and what is changed of it, as `--set` has it.
     pub spec: String,
     #[serde(default)]
@@ -164,8 +164,8 @@ impl Front {
         for (run, scan) in point.runs.iter().zip(&self.scans) {
             let then = Size::new(scan.views, scan.detector, scan.volume);
             let larger = match point.kind {
-                Kind::Field => 1.0,
-                Kind::Voxels => size.projecting() / then.projecting(),
+                Unknowns::Field => 1.0,
+                Unknowns::Voxels => size.projecting() / then.projecting(),
             };
             sum.steps += run.steps as f64 / n;
             sum.step_s += run.train_s / run.steps as f64 * larger / n;
@@ -196,16 +196,16 @@ impl Point {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::specs;
+    use crate::{method, specs};
+    use conefield_backend_cpu::Cpu;
 
     #[test]
     fn the_shipped_front_loads_and_its_specs_build() {
         let front = Front::shipped().unwrap();
         for point in &front.points {
             let loaded = specs::read(&point.spec, &point.sets).unwrap();
-            let solver = loaded.spec.solver.build().unwrap();
-            let field = specs::pipeline(&loaded, solver.as_ref()).unwrap().is_some();
-            assert_eq!(field, point.kind == Kind::Field, "{}", point.name);
+            let plan = method::plan(&loaded, &Cpu::new()).unwrap();
+            assert_eq!(method::unknowns(plan.as_ref()), point.kind, "{}", point.name);
             assert!(point.accuracy().is_finite() && !point.told(&front).contains("NaN"));
         }
     }

@@ -2,8 +2,8 @@
 
 use super::TOO_SHORT;
 use super::calibrate::{Bench, Costs, calibrate};
-use super::front::{Expected, Front, Kind, Size};
-use crate::method::Method;
+use super::front::{Expected, Front, Size, Unknowns};
+use crate::method::Planned;
 use crate::out;
 use conefield_core::{Error, Result};
 use serde::Serialize;
@@ -35,7 +35,7 @@ pub struct Budget {
 
 /// What is going to be done, for people and for the record.
 #[derive(Debug, Clone, Serialize)]
-pub struct Plan {
+pub struct Schedule {
     /// The point of the front, where the method was chosen.
     pub point: Option<String>,
     pub why: String,
@@ -53,7 +53,7 @@ pub struct Plan {
     /// Seconds of training that are planned.
     pub train_s: f64,
     #[serde(skip)]
-    kind: Kind,
+    kind: Unknowns,
     /// When training is to be over.
     #[serde(skip)]
     pub deadline: Instant,
@@ -69,9 +69,9 @@ impl Budget {
     }
 
     /// Plans `method`, which was asked for.
-    pub fn plan(&self, bench: &Bench<'_>, method: &Method) -> Result<Plan> {
+    pub fn plan(&self, bench: &Bench<'_>, method: &mut Planned) -> Result<Schedule> {
         let start = Instant::now();
-        let costs = calibrate(bench, &method.loaded, &method.parts, self.measuring())?;
+        let costs = calibrate(bench, method.plan.as_mut(), self.measuring())?;
         self.settle(None, "the spec that was asked for".into(), vec![], method, costs, start)
     }
 
@@ -80,18 +80,18 @@ impl Budget {
         &self,
         bench: &Bench<'_>,
         front: &Front,
-        build: impl Fn(&str, &[String]) -> Result<Method>,
-    ) -> Result<(Method, Plan)> {
+        build: impl Fn(&str, &[String]) -> Result<Planned>,
+    ) -> Result<(Planned, Schedule)> {
         let start = Instant::now();
         let g = &bench.scan.geometry;
         let size = Size::new(g.views.len(), g.detector, g.volume.shape);
         let mut points: Vec<_> = front.points.iter().collect();
         points.sort_by(|a, b| b.accuracy().total_cmp(&a.accuracy()));
-        let expected: Vec<(Kind, Expected)> = points.iter().map(|p| (p.kind, front.expected(p, size))).collect();
+        let expected: Vec<(Unknowns, Expected)> = points.iter().map(|p| (p.kind, front.expected(p, size))).collect();
         let built = RefCell::new(vec![]);
         let measure = |i: usize| {
-            let method = build(&points[i].spec, &points[i].sets)?;
-            let costs = calibrate(bench, &method.loaded, &method.parts, self.measuring() / 2.0)?;
+            let mut method = build(&points[i].spec, &points[i].sets)?;
+            let costs = calibrate(bench, method.plan.as_mut(), self.measuring() / 2.0)?;
             built.borrow_mut().push((i, method));
             Ok(costs)
         };
@@ -119,11 +119,11 @@ impl Budget {
         point: Option<String>,
         why: String,
         passed_over: Vec<String>,
-        method: &Method,
+        method: &Planned,
         costs: Costs,
         start: Instant,
-    ) -> Result<Plan> {
-        let kind = method.kind();
+    ) -> Result<Schedule> {
+        let kind = method.unknowns();
         let left = self.left();
         // Of little time half is the training's, as far as what follows it can do with less.
         let room = 0.5 * (left - costs.prepare_s - (costs.after_s() - costs.then_s));
@@ -135,8 +135,8 @@ impl Budget {
         if train_s < least && self.spent == 0.0 {
             let needed = (load_s + self.spent + costs.prepare_s + least + costs.after_s()) / AIM;
             let first = match kind {
-                Kind::Field => format!("{STEPS} steps"),
-                Kind::Voxels => "one pass".into(),
+                Unknowns::Field => format!("{STEPS} steps"),
+                Unknowns::Voxels => "one pass".into(),
             };
             let expected = format!(
                 "at least {} here and now: {} until the plan was made, {} to prepare and for {first} of {}, {} to write and compare",
@@ -148,7 +148,7 @@ impl Budget {
             );
             return Err(Error::invalid(TOO_SHORT.trim_end_matches(": "), "time", time(self.seconds), expected));
         }
-        Ok(Plan {
+        Ok(Schedule {
             point,
             why,
             passed_over,
@@ -170,10 +170,10 @@ fn within(seconds: f64) -> Instant {
 }
 
 /// Steps or passes without which nothing comes of a method.
-fn least(kind: Kind) -> f64 {
+fn least(kind: Unknowns) -> f64 {
     match kind {
-        Kind::Field => STEPS,
-        Kind::Voxels => 1.0,
+        Unknowns::Field => STEPS,
+        Unknowns::Voxels => 1.0,
     }
 }
 
@@ -182,9 +182,9 @@ fn time(seconds: f64) -> String {
     if seconds < 10.0 { format!("{seconds:.2} s") } else { out::duration(seconds) }
 }
 
-impl Plan {
+impl Schedule {
     /// In words.
-    pub fn lines(&self, method: &Method) -> Vec<String> {
+    pub fn lines(&self, method: &Planned) -> Vec<String> {
         let named = match &self.point {
             Some(point) => format!("{point} (spec {})", method.loaded.spec.name),
             None => format!("spec {}", method.loaded.spec.name),
@@ -223,14 +223,14 @@ struct Choice {
 /// front's own machine at first; `measure` finds out what it takes here, which also tells how much faster or slower
 /// others of its kind will be.
 fn pick(
-    points: &[(Kind, Expected)],
+    points: &[(Unknowns, Expected)],
     left: impl Fn() -> f64,
     mut measure: impl FnMut(usize) -> Result<Costs>,
 ) -> Result<Choice> {
     let mut known: Vec<Option<Result<Costs, String>>> = points.iter().map(|_| None).collect();
     // Of fields and of voxels; what is known of one kind is the best guess for the other.
     let mut slower: [Option<f64>; 2] = [None; 2];
-    let of = |kind: Kind| kind as usize;
+    let of = |kind: Unknowns| kind as usize;
     while known.iter().flatten().filter(|k| k.is_ok()).count() < MEASURED {
         let needed = |i: usize| {
             let (kind, e) = points[i];
@@ -297,13 +297,13 @@ mod tests {
     use super::*;
 
     /// Two fields and two methods on voxels, the best first; seconds on the front's machine 100, 40, 20 and 2.
-    fn points() -> Vec<(Kind, Expected)> {
+    fn points() -> Vec<(Unknowns, Expected)> {
         let point = |kind, steps, step_s| (kind, Expected { steps, step_s, beside_s: 0.0 });
         vec![
-            point(Kind::Field, 1000.0, 0.1),
-            point(Kind::Voxels, 20.0, 2.0),
-            point(Kind::Field, 400.0, 0.05),
-            point(Kind::Voxels, 1.0, 2.0),
+            point(Unknowns::Field, 1000.0, 0.1),
+            point(Unknowns::Voxels, 20.0, 2.0),
+            point(Unknowns::Field, 400.0, 0.05),
+            point(Unknowns::Voxels, 1.0, 2.0),
         ]
     }
 

@@ -8,13 +8,13 @@ use serde_json::json;
 
 /// List what can do the computing here.
 #[derive(Args)]
-pub struct Backends {
+pub struct BackendsArgs {
     /// Print one JSON object.
     #[arg(long)]
     json: bool,
 }
 
-impl Backends {
+impl BackendsArgs {
     pub fn run(self) -> Result<()> {
         let (level, threads) = (simd_level(), rayon::current_num_threads());
         let adapters = adapters();

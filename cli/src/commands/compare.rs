@@ -1,21 +1,22 @@
 //! `conefield compare`
 
-use super::protocol::Protocol;
+use super::protocol::RunProtocol;
 use super::reconstruct::{budget, identity};
 use super::record::ScanRecord;
-use super::trial::{Figures, Input, LONGEST, Trial, read_json};
-use super::{Ends, General, backends::simd_level};
+use super::trial::{Figures, LONGEST, Trial, TrialInput, read_json};
+use super::{EndOptions, General, backends::simd_level};
 use crate::backend::BackendChoice;
 use crate::memory::Memory;
-use crate::method::Parts;
+use crate::method;
 use crate::plugins::{self, Used};
 use crate::table::{SCORES, Table, score_cells};
 use crate::{files, out, run, signals, specs};
 use clap::Args;
 use conefield_core::error::ensure;
+use conefield_core::method::Plan;
 use conefield_core::spec::load::Loaded;
 use conefield_core::{Error, Result};
-use conefield_io::MiddleSlices;
+use conefield_report::MiddleSlices;
 use serde::{Deserialize, Serialize};
 use serde_json::Value;
 use std::collections::BTreeMap;
@@ -31,7 +32,7 @@ use tracing::info;
 /// others still run. Every --set holds for every spec. Ctrl-C ends the run under way after its step; the same command
 /// with --resume goes on and leaves alone what is done.
 #[derive(Args)]
-pub struct Compare {
+pub struct CompareArgs {
     /// The scan.
     scan: PathBuf,
     #[arg(long, required = true, value_name = "SPEC,SPEC", value_delimiter = ',', help = help())]
@@ -46,7 +47,7 @@ pub struct Compare {
     #[arg(long, conflicts_with = "force")]
     resume: bool,
     #[command(flatten)]
-    protocol: Protocol,
+    protocol: RunProtocol,
     /// Print one JSON object: what table.json holds.
     #[arg(long)]
     json: bool,
@@ -66,6 +67,7 @@ struct Method {
     /// As it was asked for.
     spec: String,
     loaded: Loaded,
+    plan: Box<dyn Plan>,
     start: Start,
 }
 
@@ -98,7 +100,7 @@ struct Shared<'a> {
     reference: Option<String>,
     peak: f64,
     seed: u64,
-    limits: &'a Ends,
+    limits: &'a EndOptions,
     budget_s: Option<f64>,
     sets: &'a [String],
     backend: BackendChoice,
@@ -119,12 +121,12 @@ struct Entry {
     figures: Option<Figures>,
 }
 
-impl Compare {
+impl CompareArgs {
     pub fn run(self, general: &General) -> Result<()> {
         // Whatever is wrong with the input is told before anything is made.
         let mut methods = self.methods()?;
-        let input = Input::read(&self.scan, &self.protocol)?;
-        methods.iter().try_for_each(|m| specs::check_held_out(&m.loaded, &input.held))?;
+        let input = TrialInput::read(&self.scan, &self.protocol)?;
+        methods.iter().try_for_each(|m| specs::check_held_out(&m.loaded, m.plan.as_ref(), &input.held))?;
         let old = self.look_into_folder()?;
         for method in &mut methods {
             method.start = self.start(method, &input)?;
@@ -136,7 +138,7 @@ impl Compare {
             let part = format!("{} ({} of {})", method.name, i + 1, methods.len());
             entries.push(self.entry(method, part, general)?);
         }
-        let Input { scan, held, reference } = input;
+        let TrialInput { scan, held, reference } = input;
         let report = Report { protocol: self.shared(scan, held, general), methods: entries };
         let table = table(&report);
         conefield_io::write_text_atomic(self.output.join("table.json"), &out::to_json(&report)?)?;
@@ -164,7 +166,7 @@ impl Compare {
         let backend = self.protocol.backend.open()?;
         for spec in &self.specs {
             let loaded = specs::read(spec, &self.protocol.sets)?;
-            Parts::of(&loaded, backend.as_ref())?.check_weights(&loaded)?;
+            let plan = method::plan(&loaded, backend.as_ref())?;
             let name = if loaded.spec.name.is_empty() { files::stem(spec) } else { loaded.spec.name.clone() };
             let begins = name.starts_with(|c: char| c.is_alphanumeric());
             let plain =
@@ -176,7 +178,7 @@ impl Compare {
                 let found = format!("{name:?}, the name of {}", other.loaded.source);
                 return Err(Error::invalid(&loaded.source, "name", found, "a name of its own, for table and folder"));
             }
-            methods.push(Method { name, spec: spec.clone(), loaded, start: Start::Anew });
+            methods.push(Method { name, spec: spec.clone(), loaded, plan, start: Start::Anew });
         }
         Ok(methods)
     }
@@ -223,7 +225,7 @@ impl Compare {
     }
 
     /// How the run of `method` starts. Refuses to go on with another one's.
-    fn start(&self, method: &Method, input: &Input) -> Result<Start> {
+    fn start(&self, method: &Method, input: &TrialInput) -> Result<Start> {
         let folder = self.output.join(&method.name);
         if !self.resume || !folder.exists() {
             return Ok(Start::Anew);
@@ -321,8 +323,8 @@ impl Compare {
                 let _ = fs::remove_file(&path);
                 return Ok(String::new());
             }
-            (Some(r), _) => conefield_io::compare_png(&path, ("reference", r), &panels, r.window())?,
-            (None, Some((_, first))) => conefield_io::slices_png(&path, &panels, first.window(), None)?,
+            (Some(r), _) => conefield_report::compare_png(&path, ("reference", r), &panels, r.window())?,
+            (None, Some((_, first))) => conefield_report::slices_png(&path, &panels, first.window(), None)?,
         }
         Ok(format!("picture: {}\n", path.display()))
     }
@@ -345,7 +347,7 @@ fn recorded(folder: &Path) -> Result<BTreeMap<String, String>> {
         seed: u64,
         scan: KnownScan,
         held_out_views: Vec<usize>,
-        limits: Ends,
+        limits: EndOptions,
         #[serde(default)]
         budget_s: Option<f64>,
         reference: Value,

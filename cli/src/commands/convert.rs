@@ -5,8 +5,8 @@ use crate::parse::{self, Values};
 use crate::{files, out};
 use clap::{Args, ValueEnum};
 use conefield_core::{Error, Result};
+use conefield_diagnosis::survey;
 use conefield_io::DataSet;
-use conefield_io::survey::survey;
 use std::path::PathBuf;
 
 /// Rewrite a volume or a scan in another format.
@@ -14,7 +14,7 @@ use std::path::PathBuf;
 /// Volumes: NIfTI (.nii, .nii.gz), MetaImage (.mha) and NumPy (.npy), by the name of OUT; IN may also be a .mhd or the
 /// folder of a DICOM series. Scans: as --to says; test views are kept where the format has a place for them (r2, naf).
 #[derive(Args)]
-pub struct Convert {
+pub struct ConvertArgs {
     /// A volume or a scan.
     #[arg(value_name = "IN")]
     input: PathBuf,
@@ -45,7 +45,7 @@ enum ScanFormat {
     Rtk,
 }
 
-impl Convert {
+impl ConvertArgs {
     pub fn run(self) -> Result<()> {
         std::fs::metadata(&self.input).map_err(|e| Error::io(&self.input, e))?;
         refuse_existing(&self.output, self.force)?;

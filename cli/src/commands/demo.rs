@@ -2,18 +2,17 @@
 
 use super::convert::refuse_existing;
 use super::evaluate::score;
-use super::reconstruct::mci;
 use crate::progress::Progress;
 use crate::table::{SCORES, Table, cells_of};
-use crate::{files, out, parse, signals, specs};
+use crate::{method, out, parse, signals, specs};
 use clap::Args;
 use conefield_backend_cpu::Cpu;
+use conefield_core::method::{Job, Limits};
 use conefield_core::scan::{Scan, Volume};
-use conefield_core::solver::{Job, Limits};
 use conefield_core::{Error, Result};
-use conefield_io::MiddleSlices;
 use conefield_metrics::Scores;
-use conefield_projectors::simulate::{Noise, Protocol, phantom, simulate};
+use conefield_projectors::simulate::{DetectorNoise, Protocol, phantom, simulate};
+use conefield_report::MiddleSlices;
 use serde::Serialize;
 use serde_json::json;
 use std::path::PathBuf;
@@ -25,7 +24,7 @@ use tracing::info;
 /// A head-like phantom is scanned with the published noise. The spec "fast", started from pre-trained weights (MCI),
 /// then competes with the same field without LayerNorm and MCI, each given the same time.
 #[derive(Args)]
-pub struct Demo {
+pub struct DemoArgs {
     /// The folder for scan, volumes and picture.
     #[arg(short, long = "output", value_name = "FOLDER", default_value = "conefield-demo")]
     output: PathBuf,
@@ -61,14 +60,14 @@ struct Entry {
     volume: Volume,
 }
 
-impl Demo {
+impl DemoArgs {
     pub fn run(self) -> Result<()> {
         let folder = &self.output;
         refuse_existing(folder, self.force)?;
         std::fs::create_dir_all(folder).map_err(|e| Error::io(folder, e))?;
         let size = usize::from(self.size);
         let truth = phantom(size);
-        let noise = Noise::Tigre { i0: 1e4, sigma: 10.0 };
+        let noise = DetectorNoise::Tigre { i0: 1e4, sigma: 10.0 };
         let protocol = Protocol::r2(&truth.grid)
             .with_detector([size; 2])
             .with_views(self.views.into())
@@ -84,7 +83,7 @@ impl Demo {
             Some(raw) => {
                 let path = folder.join("fast.safetensors");
                 conefield_io::write_atomic(&path, |w| w.write_all(raw).map_err(|e| Error::io(&path, e)))?;
-                with.push(mci(&path));
+                with.push(method::init(&specs::read("fast", &[])?.tree, &path));
                 name = "fast (LN, MCI)";
             }
             None => info!("this build comes without pre-trained weights: MCI is left out"),
@@ -100,7 +99,7 @@ impl Demo {
         let results = [(&captions[0][..], &slices[0]), (&captions[1][..], &slices[1])];
         let picture = folder.join("compare.png");
         let truth = MiddleSlices::of(&truth);
-        conefield_io::compare_png(&picture, ("phantom", &truth), &results, truth.window())?;
+        conefield_report::compare_png(&picture, ("phantom", &truth), &results, truth.window())?;
         if self.json {
             return out::json(&json!({ "folder": folder, "picture": picture, "results": entries }));
         }
@@ -116,15 +115,14 @@ impl Demo {
 
     fn compete(&self, name: &'static str, sets: &[String], scan: &Scan, truth: &Volume) -> Result<Entry> {
         let loaded = specs::read("fast", sets)?;
-        let solver = loaded.spec.solver.build()?;
         let backend = Cpu::new();
+        let mut plan = method::plan(&loaded, &backend)?;
         let job = Job {
             seed: self.seed,
             limits: Limits { seconds: Some(self.seconds), ..Limits::default() },
-            weights: &|path| files::read_weights(path),
-            ..Job::new(scan, &loaded.spec, &backend)
+            ..Job::new(scan, &backend)
         };
-        let solution = solver.solve(&job, &mut Progress::new(name, None))?;
+        let solution = plan.run(&job, &mut Progress::new(name, None))?;
         let start = Instant::now();
         let volume = solution.result.volume(&backend)?;
         let export_s = start.elapsed().as_secs_f64();

@@ -7,8 +7,8 @@ use clap::Args;
 use conefield_core::Result;
 use conefield_core::error::ensure;
 use conefield_core::scan::Volume;
-use conefield_io::MiddleSlices;
 use conefield_metrics::{Dice, Scores, dice, label_map};
+use conefield_report::MiddleSlices;
 use serde::Serialize;
 use std::path::PathBuf;
 
@@ -20,7 +20,7 @@ use std::path::PathBuf;
 /// Dice is 2|A∩B|/(|A|+|B|) over the voxels of a label. Label 0 is background. A label that only one map has scores 0
 /// and counts in the mean like any other.
 #[derive(Args)]
-pub struct Evaluate {
+pub struct EvaluateArgs {
     /// The volume to score.
     volume: PathBuf,
     /// What it should be.
@@ -49,14 +49,14 @@ pub struct Evaluate {
 
 /// All that was asked for.
 #[derive(Serialize)]
-struct Report {
+struct Evaluation {
     #[serde(flatten)]
     scores: Option<Scores>,
     #[serde(skip_serializing_if = "Option::is_none")]
     dice: Option<Dice>,
 }
 
-impl Evaluate {
+impl EvaluateArgs {
     pub fn run(self) -> Result<()> {
         let voxels = [&self.volume, &self.reference].map(conefield_io::volume_voxels);
         let [volume, reference] = voxels;
@@ -72,16 +72,16 @@ impl Evaluate {
     }
 
     /// The agreement of two label maps.
-    fn label_maps(&self) -> Result<Report> {
+    fn label_maps(&self) -> Result<Evaluation> {
         let read =
             |path: &PathBuf| label_map(&path.display().to_string(), conefield_io::read_volume(path)?.data.view());
         let (volume, reference) = (read(&self.volume)?, read(&self.reference)?);
         same_shape(&self.volume.display().to_string(), volume.shape(), reference.shape())?;
-        Ok(Report { scores: None, dice: Some(dice(volume.view(), reference.view())?) })
+        Ok(Evaluation { scores: None, dice: Some(dice(volume.view(), reference.view())?) })
     }
 
     /// The scores of a volume, with the agreement of what the segmenter finds in it and in the reference.
-    fn volumes(&self) -> Result<Report> {
+    fn volumes(&self) -> Result<Evaluation> {
         let volume = conefield_io::read_volume(&self.volume)?;
         let reference = conefield_io::read_volume(&self.reference)?;
         let place = self.volume.display().to_string();
@@ -101,7 +101,7 @@ impl Evaluate {
                 Some(dice(volume.view(), reference.view())?)
             }
         };
-        Ok(Report { scores: Some(scores), dice })
+        Ok(Evaluation { scores: Some(scores), dice })
     }
 
     /// `volume` as the segmenter is to see it.

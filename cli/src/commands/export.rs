@@ -16,7 +16,7 @@ use std::time::Instant;
 /// The voxels fill the box that the run reconstructed. They are written as they are evaluated, slab by slab: a volume
 /// may be larger than memory.
 #[derive(Args)]
-pub struct Export {
+pub struct ExportArgs {
     #[command(flatten)]
     trained: Trained,
     /// The volume to write: .nii, .nii.gz, .mha or .npy.
@@ -30,7 +30,7 @@ pub struct Export {
     json: bool,
 }
 
-impl Export {
+impl ExportArgs {
     pub fn run(self) -> Result<()> {
         refuse_existing(&self.output, self.force)?;
         let buffers = FieldVoxels::BYTES + SLAB_BYTES + PACKED_BYTES;

@@ -1,7 +1,7 @@
 //! `conefield features`
 
 use super::convert::refuse_existing;
-use super::trained::{Opened, Trained};
+use super::trained::{OpenedField, Trained};
 use crate::out;
 use crate::pca::Pca;
 use crate::statistics::pearson;
@@ -11,7 +11,7 @@ use conefield_core::geometry::VoxelGrid;
 use conefield_core::host;
 use conefield_core::parts::Part;
 use conefield_core::trained::TrainedField;
-use conefield_io::MiddleSlices;
+use conefield_report::MiddleSlices;
 use ndarray::Array3;
 use serde_json::json;
 use std::path::PathBuf;
@@ -22,7 +22,7 @@ use std::path::PathBuf;
 /// the three middle slices where the object can be; each runs from its 1st to its 99th percentile. Their signs mean
 /// nothing. The reconstruction stands beside them.
 #[derive(Args)]
-pub struct Features {
+pub struct FeaturesArgs {
     #[command(flatten)]
     trained: Trained,
     /// The picture to write (PNG).
@@ -49,7 +49,7 @@ enum After {
 /// Components that are drawn, one a colour.
 const DRAWN: usize = 3;
 
-impl Features {
+impl FeaturesArgs {
     pub fn run(self) -> Result<()> {
         refuse_existing(&self.output, self.force)?;
         let opened = self.trained.open(0)?;
@@ -57,7 +57,7 @@ impl Features {
         let count: u64 = planes.iter().map(|p| p.iter().map(|r| r.len() as u64).product::<u64>()).sum();
         let width = opened.field.model.pipeline.encoder.info().output as u64;
         opened.memory(count * (4 * 3 * width + 64))?;
-        let Opened { file, field: TrainedField { model, scene, unit_mm }, grid, .. } = opened;
+        let OpenedField { file, field: TrainedField { model, scene, unit_mm }, grid, .. } = opened;
         let voxels: Vec<[usize; 3]> = planes.iter().flat_map(indices).collect();
         let held: Vec<bool> = voxels.iter().map(|v| scene.holds(grid.voxel(*v))).collect();
         let points: Vec<[f32; 3]> =
@@ -93,7 +93,11 @@ impl Features {
         colours.resize_with(DRAWN, || slices(&vec![0.0; n], f32::NAN));
         let scale = (scene.attenuation * unit_mm) as f32;
         attenuation.iter_mut().for_each(|x| *x *= scale);
-        conefield_io::features_png(&self.output, &slices(&attenuation, 0.0), [&colours[0], &colours[1], &colours[2]])?;
+        conefield_report::features_png(
+            &self.output,
+            &slices(&attenuation, 0.0),
+            [&colours[0], &colours[1], &colours[2]],
+        )?;
         let shares = &explained[..drawn.len()];
         if self.json {
             return out::json(&json!({

@@ -4,7 +4,7 @@ use super::{convert::refuse_existing, info};
 use crate::{out, parse};
 use clap::Args;
 use conefield_core::Result;
-use conefield_io::survey::survey;
+use conefield_diagnosis::survey;
 use conefield_io::{I0, ImportOptions, Imported};
 use serde_json::{Value, json};
 use std::path::PathBuf;
@@ -14,7 +14,7 @@ use std::path::PathBuf;
 /// SCANNER.toml names the files with the projections (TIFF, .npy, .npz, .mha), says in mm where source and detector stood
 /// and how arrays lie; docs/geometry.md has all keys. Raw counts become line integrals; dead and hot pixels are interpolated.
 #[derive(Args)]
-pub struct Import {
+pub struct ImportArgs {
     /// The description of the scanner.
     #[arg(value_name = "SCANNER.toml")]
     scanner: PathBuf,
@@ -37,7 +37,7 @@ pub struct Import {
     json: bool,
 }
 
-impl Import {
+impl ImportArgs {
     pub fn run(self) -> Result<()> {
         refuse_existing(&self.output, self.force)?;
         let options = ImportOptions { i0: self.i0, floor: self.floor };
@@ -50,12 +50,13 @@ impl Import {
     /// The geometry in mm and what the values are like.
     fn understood(&self, imported: &Imported) -> Value {
         let views = &imported.scan.geometry.views;
-        let mut found = info::facts(&imported.scan, &survey(&imported.scan));
+        let survey = survey(&imported.scan);
+        let mut found = info::facts(&imported.scan, &survey);
         found["scan"] = json!(self.output);
         found["first_view"] = json!(views[0]);
         found["last_view"] = json!(views[views.len() - 1]);
         found["counts"] = json!(imported.counts);
-        found["line_integrals"] = json!(imported.check);
+        found["line_integrals"] = json!(survey.check);
         found
     }
 }

@@ -5,8 +5,9 @@ use clap::Args;
 use conefield_core::geometry::{Geometry, VoxelGrid};
 use conefield_core::scan::{Scan, Volume};
 use conefield_core::{Error, Result};
-use conefield_io::MiddleSlices;
-use conefield_io::survey::{Survey, setup, survey, survey_png};
+use conefield_diagnosis::{Survey, setup, survey};
+use conefield_report::MiddleSlices;
+use conefield_report::survey_png;
 use ndarray::ArrayView3;
 use serde_json::{Value, json};
 use std::path::{Path, PathBuf};
@@ -17,7 +18,7 @@ use std::path::{Path, PathBuf};
 /// volume the views see, what is missing, and warnings of what will trouble a reconstruction. SCANNER.toml and RTK's XML
 /// geometry are understood, too.
 #[derive(Args)]
-pub struct Info {
+pub struct InfoArgs {
     /// A scan, a volume or a weights file.
     file: PathBuf,
     /// Also draw source path, detector and volume, with the share of views that see each point of it; of a volume, its
@@ -29,7 +30,7 @@ pub struct Info {
     json: bool,
 }
 
-impl Info {
+impl InfoArgs {
     pub fn run(self) -> Result<()> {
         let path = &self.file;
         std::fs::metadata(path).map_err(|e| Error::io(path, e))?;

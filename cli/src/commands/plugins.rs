@@ -9,13 +9,13 @@ use conefield_core::Result;
 
 /// Stages from shared libraries: list them, check them, begin one.
 #[derive(Args)]
-pub struct Plugins {
+pub struct PluginsArgs {
     #[command(subcommand)]
-    command: Command,
+    command: PluginsCommand,
 }
 
 #[derive(Subcommand)]
-enum Command {
+enum PluginsCommand {
     /// List the plugins that are found, with their stages, or why one was refused.
     List(list::List),
     /// Run the conformance kit on every stage of a plugin.
@@ -24,12 +24,12 @@ enum Command {
     New(new::New),
 }
 
-impl Plugins {
+impl PluginsArgs {
     pub fn run(self) -> Result<()> {
         match self.command {
-            Command::List(c) => c.run(),
-            Command::Check(c) => c.run(),
-            Command::New(c) => c.run(),
+            PluginsCommand::List(c) => c.run(),
+            PluginsCommand::Check(c) => c.run(),
+            PluginsCommand::New(c) => c.run(),
         }
     }
 }

@@ -1,16 +1,16 @@
 //! `conefield pretrain`
 
-use super::{Ends, reconstruct::notes};
+use super::{EndOptions, reconstruct::notes};
 use crate::backend::{self, BackendChoice};
 use crate::memory::Memory;
 use crate::parse::{self, Values};
 use crate::progress::Progress;
-use crate::{files, out, signals, specs};
+use crate::{files, method, out, signals, specs};
 use clap::Args;
 use conefield_core::Result;
 use conefield_core::arena::Weights;
+use conefield_core::method::PretrainJob;
 use conefield_core::scan::Volume;
-use conefield_core::solver::PretrainJob;
 use serde_json::json;
 use std::path::PathBuf;
 
@@ -18,7 +18,7 @@ use std::path::PathBuf;
 ///
 /// The weights file holds normalizers and field; the encoder stays with the volume that it was trained on.
 #[derive(Args)]
-pub struct Pretrain {
+pub struct PretrainArgs {
     /// The known volumes: files, or phantoms as "conefield simulate" has them.
     #[arg(required = true, value_name = "VOLUME")]
     volumes: Vec<String>,
@@ -34,7 +34,7 @@ pub struct Pretrain {
     #[arg(long, default_value = "as-is", value_parser = parse::values)]
     values: Values,
     #[command(flatten)]
-    ends: Ends,
+    ends: EndOptions,
     #[arg(long, value_name = "BACKEND", default_value_t, help = backend::HELP)]
     backend: BackendChoice,
     /// Seed of everything random.
@@ -45,7 +45,7 @@ pub struct Pretrain {
     json: bool,
 }
 
-impl Pretrain {
+impl PretrainArgs {
     /// Refuses what does not fit: every volume has parameters and moments of its own.
     fn memory(&self, parameters: u64, backend: u64) -> Result<()> {
         let voxels: Vec<u64> = self.volumes.iter().map(|v| files::voxels(v)).collect::<Result<_>>()?;
@@ -63,23 +63,17 @@ impl Pretrain {
 
     pub fn run(self) -> Result<()> {
         let loaded = specs::read(&self.spec, &self.sets)?;
-        let solver = loaded.spec.solver.build().map_err(|e| loaded.locate(e))?;
         let backend = self.backend.open()?;
-        let pipeline = specs::build(&loaded)?;
-        let (_, compiled) = backend.compile(&pipeline)?;
-        self.memory(pipeline.layout().len() as u64, compiled.scratch_bytes as u64)?;
+        let mut plan = method::plan(&loaded, backend.as_ref())?;
+        let outline = plan.outline();
+        self.memory(outline.parameters() as u64, outline.backend().scratch_bytes as u64)?;
         let read = |name: &String| self.values.apply(files::volume(name)?);
         let volumes: Vec<Volume> = self.volumes.iter().map(read).collect::<Result<_>>()?;
-        let job = PretrainJob {
-            volumes: &volumes,
-            spec: &loaded.spec,
-            backend: backend.as_ref(),
-            seed: self.seed,
-            limits: self.ends.limits(),
-        };
+        let job =
+            PretrainJob { volumes: &volumes, backend: backend.as_ref(), seed: self.seed, limits: self.ends.limits() };
         signals::listen()?;
         let mut progress = Progress::new("pretrain", None);
-        let model = solver.pretrain(&job, &mut progress).map_err(|e| loaded.locate(e))?;
+        let model = plan.pretrain(&job, &mut progress).map_err(|e| loaded.locate(e))?;
         let last = progress.records().last().cloned().unwrap_or_default();
         drop(progress);
         let keep = |name: &str| !name.starts_with("encoder.");

@@ -1,6 +1,6 @@
 //! What a reconstruction is asked for beside scan and spec: the same for every method that is compared.
 
-use super::Ends;
+use super::EndOptions;
 use crate::backend::{self, BackendChoice};
 use crate::parse::{self, HoldOut};
 use clap::Args;
@@ -12,7 +12,7 @@ use std::path::{Path, PathBuf};
 
 /// The options that `reconstruct` and `compare` share.
 #[derive(Debug, Clone, Args)]
-pub struct Protocol {
+pub struct RunProtocol {
     /// Time between two checkpoints, which --resume starts from.
     #[arg(long, value_name = "TIME", default_value = "60s", value_parser = parse::seconds)]
     pub checkpoint_every: f64,
@@ -20,7 +20,7 @@ pub struct Protocol {
     #[arg(long = "set", value_name = "KEY=VALUE")]
     pub sets: Vec<String>,
     #[command(flatten)]
-    pub ends: Ends,
+    pub ends: EndOptions,
     /// Plan training so that the whole run, from start to last file, takes this time, such as 60s or 10m.
     #[arg(long, value_name = "TIME", value_parser = parse::seconds, conflicts_with_all = ["steps", "seconds", "at_most"])]
     pub budget: Option<f64>,
@@ -40,7 +40,7 @@ pub struct Protocol {
     pub seed: u64,
 }
 
-impl Protocol {
+impl RunProtocol {
     /// The reference, if there is one, as large as `scan` asks for.
     pub fn reference(&self, scan_path: &Path, scan: &Scan) -> Result<Option<Volume>> {
         let Some(path) = &self.reference else { return Ok(None) };
@@ -105,7 +105,7 @@ mod tests {
     #[derive(Parser)]
     struct Line {
         #[command(flatten)]
-        protocol: Protocol,
+        protocol: RunProtocol,
     }
 
     #[test]

@@ -1,13 +1,15 @@
 //! `conefield reconstruct`
 
-use super::record::{Record, ScanRecord, summary};
-use super::{backends::simd_level, evaluate, protocol::Protocol};
+use super::record::{RunRecord, ScanRecord, summary};
+use super::{backends::simd_level, evaluate, protocol::RunProtocol};
 use crate::budget::calibrate::Bench;
 use crate::budget::front::Front;
 use crate::budget::plan::Budget;
-use crate::memory::{self, Memory};
-use crate::method::{Method, Parts};
-use crate::outgoing::{self, Written};
+use crate::live::Live;
+use crate::memory;
+use crate::method::{self, Planned};
+use crate::outgoing::{self, WrittenVolume};
+use crate::parse;
 use crate::plugins;
 use crate::progress::{Keeper, Progress};
 use crate::run::RunFolder;
@@ -15,14 +17,14 @@ use crate::{files, out, signals, specs};
 use clap::Args;
 use conefield_core::backend::Backend;
 use conefield_core::checkpoint::Resume;
+use conefield_core::method::{Job, Limits};
 use conefield_core::scan::Scan;
-use conefield_core::solver::{Job, Limits};
 use conefield_core::spec::load::{Loaded, to_toml};
 use conefield_core::{Error, Result};
-use conefield_io::MiddleSlices;
+use conefield_report::MiddleSlices;
 use std::collections::BTreeMap;
 use std::fs::File;
-use std::path::{Path, PathBuf};
+use std::path::PathBuf;
 use std::time::{Duration, Instant};
 use tracing::info;
 
@@ -33,7 +35,7 @@ use tracing::info;
 /// whole command is planned to take so long; it first measures what this machine can do, for one to three seconds, or less
 /// of a short budget.
 #[derive(Args)]
-pub struct Reconstruct {
+pub struct ReconstructArgs {
     /// The scan.
     scan: PathBuf,
     #[arg(long, required_unless_present = "budget", help = spec_help())]
@@ -51,10 +53,13 @@ pub struct Reconstruct {
     #[arg(long, conflicts_with = "force")]
     resume: bool,
     #[command(flatten)]
-    protocol: Protocol,
+    protocol: RunProtocol,
     /// What to start from: weights that "conefield pretrain" made, or a volume.
     #[arg(long, value_name = "FILE")]
     init: Option<PathBuf>,
+    /// Draw live.png, the middle slices of a field that trains, in RUN every so often, such as 5s.
+    #[arg(long, value_name = "SECONDS", value_parser = parse::seconds)]
+    live: Option<f64>,
     /// Print one JSON object: what record.json holds.
     #[arg(long)]
     json: bool,
@@ -71,7 +76,7 @@ fn spec_help() -> String {
 /// What an error that goes to standard output begins with.
 pub const FAILED: &str = "failed: ";
 
-impl Reconstruct {
+impl ReconstructArgs {
     pub fn run(self) -> Result<()> {
         if !self.as_part {
             return self.reconstruct();
@@ -99,11 +104,11 @@ impl Reconstruct {
         let reference = protocol.reference(&self.scan, &whole)?;
         let held = protocol.held_out(whole.geometry.views.len())?;
         let scan_record = ScanRecord::of(&self.scan, &whole)?;
-        asked.iter().try_for_each(|m| specs::check_held_out(&m.loaded, &held))?;
+        asked.iter().try_for_each(|m| specs::check_held_out(&m.loaded, m.plan.as_ref(), &held))?;
         let (scan, held_scan) = if held.is_empty() { (whole, None) } else { split(whole, &held)? };
         let load_s = begin.elapsed().as_secs_f64();
 
-        let identity = |m: &Method| identity(&m.loaded, protocol, &held, &scan_record);
+        let identity = |m: &Planned| identity(&m.loaded, protocol, &held, &scan_record);
         let resumed = match &asked {
             Some(method) if self.resume => Some(self.reopen(&identity(method)?)?),
             _ => None,
@@ -117,27 +122,28 @@ impl Reconstruct {
             seed: protocol.seed,
         };
         let budget = protocol.budget.map(|seconds| Budget { begin, seconds, spent });
-        let (method, plan) = match (budget, asked, front) {
+        let (method, schedule) = match (budget, asked, front) {
             (None, Some(method), _) => (method, None),
-            (Some(budget), Some(method), _) => {
-                let plan = budget.plan(&bench, &method)?;
-                (method, Some(plan))
+            (Some(budget), Some(mut method), _) => {
+                let schedule = budget.plan(&bench, &mut method)?;
+                (method, Some(schedule))
             }
             (Some(budget), None, Some(front)) => {
-                let more = self.all_sets();
-                let build = |spec: &str, sets: &[String]| self.method(spec, &[sets, &more].concat(), backend.as_ref());
-                let (method, plan) = budget.choose(&bench, &front, build)?;
-                (method, Some(plan))
+                let more = &protocol.sets;
+                let build = |spec: &str, sets: &[String]| self.method(spec, &[sets, more].concat(), backend.as_ref());
+                let (method, schedule) = budget.choose(&bench, &front, build)?;
+                (method, Some(schedule))
             }
             _ => {
                 return Err(Error::invalid("reconstruct", "--spec", "nothing", "a spec, or --budget to choose one by"));
             }
         };
-        specs::check_held_out(&method.loaded, &held)?;
-        plan.iter().flat_map(|p| p.lines(&method)).for_each(|line| info!("{line}"));
+        specs::check_held_out(&method.loaded, method.plan.as_ref(), &held)?;
+        schedule.iter().flat_map(|s| s.lines(&method)).for_each(|line| info!("{line}"));
         info!("memory: {}", method.memory.line());
         let identity = identity(&method)?;
-        let Method { loaded, parts: Parts { solver, compiled, .. }, memory } = method;
+        let Planned { loaded, mut plan, memory } = method;
+        let outline = plan.outline();
         let (folder, metrics, resume) = match resumed {
             Some((folder, metrics, resume)) => (folder, metrics, Some(resume)),
             None => self.create(&loaded)?,
@@ -149,23 +155,23 @@ impl Reconstruct {
             run: identity,
             last: Instant::now(),
         }));
+        progress = progress.showing(self.live.map(|seconds| Live::new(folder.file("live.png"), seconds)));
         let job = Job {
             held_out: held_scan.as_ref(),
             reference: reference.as_ref(),
             peak: protocol.peak,
             seed: protocol.seed,
             limits: Limits {
-                deadline: plan.as_ref().map(|p| p.deadline),
-                then: plan.as_ref().and_then(|p| p.then),
+                deadline: schedule.as_ref().map(|s| s.deadline),
+                then: schedule.as_ref().and_then(|s| s.then),
                 ..protocol.ends.limits()
             },
-            weights: &|path| files::read_weights(path),
             volumes: &files::volume,
             resume: resume.as_ref(),
-            ..Job::new(&scan, &loaded.spec, backend.as_ref())
+            ..Job::new(&scan, backend.as_ref())
         };
         let start = Instant::now();
-        let solution = solver.solve(&job, &mut progress).map_err(|e| loaded.locate(e))?;
+        let solution = plan.run(&job, &mut progress).map_err(|e| loaded.locate(e))?;
         let prepare_s = (start.elapsed().as_secs_f64() + spent - solution.train_s).max(0.0);
         let last = progress.records().last().cloned();
         drop(progress);
@@ -178,7 +184,7 @@ impl Reconstruct {
         }
         let mut voxels = solution.result.voxels(backend.as_ref())?;
         let affine = reference.as_ref().and_then(|r| r.affine);
-        let Written { slices, whole } = outgoing::write(&place, voxels.as_mut(), affine, reference.is_some())?;
+        let WrittenVolume { slices, whole } = outgoing::write(&place, voxels.as_mut(), affine, reference.is_some())?;
         let export_s = start.elapsed().as_secs_f64();
         let start = Instant::now();
         let middle = reference.as_ref().map(MiddleSlices::of);
@@ -188,7 +194,7 @@ impl Reconstruct {
         let score = |(volume, r)| evaluate::score(&place.display().to_string(), volume, r, protocol.peak);
         let scores = whole.as_ref().zip(reference.as_ref()).map(score).transpose()?;
         let score_s = start.elapsed().as_secs_f64();
-        let record = Record {
+        let record = RunRecord {
             version: env!("CARGO_PKG_VERSION"),
             spec: loaded.spec.name.clone(),
             seed: protocol.seed,
@@ -196,11 +202,11 @@ impl Reconstruct {
             held_out_views: held,
             limits: protocol.ends.clone(),
             budget_s: protocol.budget,
-            plan,
+            plan: schedule,
             init: self.init.as_ref().map(|p| p.display().to_string()),
             reference: protocol.reference.as_ref().map(|p| p.display().to_string()),
             plugins: plugins::used(&loaded.tree),
-            backend: compiled,
+            backend: outline.backend(),
             simd: simd_level(),
             threads: rayon::current_num_threads(),
             memory,
@@ -231,37 +237,25 @@ impl Reconstruct {
     /// The spec that is asked for and what is set of it. A run that is resumed knows what it chose.
     fn asked(&self) -> Option<(String, Vec<String>)> {
         match &self.spec {
-            Some(spec) => Some((spec.clone(), self.all_sets())),
+            Some(spec) => Some((spec.clone(), self.protocol.sets.clone())),
             None => self.resume.then(|| (self.output.join("spec.toml").display().to_string(), vec![])),
         }
     }
 
-    /// Reads and builds a spec. One that does not fit into memory is refused.
-    fn method(&self, spec: &str, sets: &[String], backend: &dyn Backend) -> Result<Method> {
-        let loaded = specs::read(spec, sets)?;
-        let parts = Parts::of(&loaded, backend)?;
-        let memory = self.memory(spec, sets, &loaded, &parts)?;
-        parts.check_weights(&loaded)?;
-        Ok(Method { loaded, parts, memory })
-    }
-
-    /// What the run takes; one that does not fit is refused.
-    fn memory(&self, spec: &str, sets: &[String], loaded: &Loaded, parts: &Parts) -> Result<Memory> {
+    /// Reads, builds and prices a spec. One that does not fit into memory is refused.
+    fn method(&self, spec: &str, sets: &[String], backend: &dyn Backend) -> Result<Planned> {
         let run = memory::Run {
+            scan: conefield_io::scan_size(&self.scan)?,
             split: self.protocol.hold_out.is_some(),
             reference: self.protocol.reference.is_some(),
             resume: self.resume,
-            ..parts.run(conefield_io::scan_size(&self.scan)?)
         };
-        let tables = loaded.tree["encoder"]["log2_table_size"].as_u64().unwrap_or(0);
-        let smaller = (10..tables as u32).rev().filter_map(|bits| {
-            let set = format!("encoder.log2_table_size={bits}");
-            let loaded = specs::read(spec, &[sets, &[set]].concat()).ok()?;
-            Some((bits, specs::build(&loaded).ok()?.layout().len() as u64))
-        });
-        let memory = run.memory();
-        memory.check(|available| run.smaller(available, smaller))?;
-        Ok(memory)
+        let mut sets = sets.to_vec();
+        // A run that is resumed without a spec has it in its own.
+        if let Some(path) = self.init.as_ref().filter(|_| self.spec.is_some() || !self.resume) {
+            sets.push(method::init(&specs::read(spec, &sets)?.tree, path));
+        }
+        method::planned(spec, &sets, backend, &run)
     }
 
     /// The folder of an interrupted run, its file for metrics, and where to go on from.
@@ -279,15 +273,6 @@ impl Reconstruct {
         let metrics = folder.metrics()?;
         Ok((folder, metrics, None))
     }
-
-    /// `--set`s, with `--init` as the one that it stands for.
-    fn all_sets(&self) -> Vec<String> {
-        let mut sets = self.protocol.sets.clone();
-        if let Some(path) = &self.init {
-            sets.push(if conefield_io::is_volume(path) { initializer("volume", "path", path) } else { mci(path) });
-        }
-        sets
-    }
 }
 
 pub fn split(scan: Scan, held: &[usize]) -> Result<(Scan, Option<Scan>)> {
@@ -298,7 +283,7 @@ pub fn split(scan: Scan, held: &[usize]) -> Result<(Scan, Option<Scan>)> {
 /// What must be the same for a run to be resumed, or to be taken for done.
 pub fn identity(
     loaded: &Loaded,
-    protocol: &Protocol,
+    protocol: &RunProtocol,
     held: &[usize],
     scan: &ScanRecord,
 ) -> Result<BTreeMap<String, String>> {
@@ -314,17 +299,6 @@ pub fn identity(
 /// A budget as [`identity`] has it.
 pub fn budget(seconds: Option<f64>) -> String {
     seconds.map_or("none".into(), |s| s.to_string())
-}
-
-/// The setting that starts from the weights in `path`.
-pub fn mci(path: &Path) -> String {
-    initializer("mci", "weights", path)
-}
-
-/// The setting of an initializer that reads the file `path`, under `key`.
-fn initializer(kind: &str, key: &str, path: &Path) -> String {
-    let path = toml::Value::String(path.display().to_string());
-    format!("initializer={{ type = \"{kind}\", {key} = {path} }}")
 }
 
 /// What weights say of where they come from.

@@ -1,7 +1,7 @@
 //! What a run leaves on record.
 
-use super::{Ends, evaluate};
-use crate::budget::plan::Plan;
+use super::{EndOptions, evaluate};
+use crate::budget::plan::Schedule;
 use crate::memory::Memory;
 use crate::plugins::Used;
 use crate::{files, out};
@@ -14,18 +14,18 @@ use std::path::Path;
 
 /// What is needed to repeat a run, and what came out.
 #[derive(Debug, Serialize)]
-pub struct Record {
+pub struct RunRecord {
     pub version: &'static str,
     pub spec: String,
     pub seed: u64,
     pub scan: ScanRecord,
     pub held_out_views: Vec<usize>,
-    pub limits: Ends,
+    pub limits: EndOptions,
     #[serde(skip_serializing_if = "Option::is_none")]
     pub budget_s: Option<f64>,
     /// What a budget came to.
     #[serde(skip_serializing_if = "Option::is_none")]
-    pub plan: Option<Plan>,
+    pub plan: Option<Schedule>,
     pub init: Option<String>,
     pub reference: Option<String>,
     /// Whose stages the spec names.
@@ -109,7 +109,7 @@ fn checksum(bytes: impl Iterator<Item = u8>) -> String {
 }
 
 /// The record for people.
-pub fn summary(r: &Record, output: &Path) -> String {
+pub fn summary(r: &RunRecord, output: &Path) -> String {
     let [x, y, z] = r.scan.volume;
     let speed = r.samples_per_s.map(|s| format!(" ({:.2} M samples/s)", s / 1e6)).unwrap_or_default();
     let mut lines = vec![format!(

@@ -10,6 +10,6 @@ pub struct SchemaArgs {}
 
 impl SchemaArgs {
     pub fn run(self) -> Result<()> {
-        out::json(&schema::pipeline())
+        out::json(&schema::spec())
     }
 }

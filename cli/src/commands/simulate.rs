@@ -2,13 +2,13 @@
 
 use super::convert::refuse_existing;
 use crate::memory::Memory;
-use crate::parse::{self, Angles as AnglesArg, Values};
+use crate::parse::{self, AnglesOption, Values};
 use crate::{files, out};
 use clap::Args;
 use conefield_core::files::{read_text, toml_line};
 use conefield_core::scan::Volume;
 use conefield_core::{Error, Result};
-use conefield_projectors::simulate::{Angles, HuMapping, Noise, Protocol, downsample, simulate};
+use conefield_projectors::simulate::{Angles, DetectorNoise, HuMapping, Protocol, downsample, simulate};
 use serde_json::json;
 use std::path::{Path, PathBuf};
 
@@ -20,7 +20,7 @@ const LONGEST: u64 = 16 << 20;
 /// Projections are line integrals of the volume's trilinear interpolation along a circular orbit. The scan keeps the
 /// volume as its truth.
 #[derive(Args)]
-pub struct Simulate {
+pub struct SimulateArgs {
     /// The volume: a file, or one that the program makes: phantom:head, phantom:abdomen or phantom:random:SEED, each also
     /// with :SIZE (8 to 1024 voxels a side) [default: 128].
     volume: String,
@@ -42,11 +42,11 @@ pub struct Simulate {
     offset: Option<[f64; 2]>,
     /// Angles in degrees: evenly from START over RANGE, or a file with one a line.
     #[arg(long, value_name = "START:RANGE|FILE", value_parser = parse::angles, allow_hyphen_values = true)]
-    angles: Option<AnglesArg>,
+    angles: Option<AnglesOption>,
     /// Noise: none, tigre:I0,SIGMA such as tigre:1e4,10 (the published one), or poisson:I0 [default: the protocol's;
     /// r2: none].
     #[arg(long, value_parser = parse::noise)]
-    noise: Option<Noise>,
+    noise: Option<DetectorNoise>,
     /// Average blocks of N x N x N voxels first.
     #[arg(long, value_name = "N", default_value_t = 1, value_parser = clap::value_parser!(u16).range(1..))]
     downsample: u16,
@@ -65,7 +65,7 @@ pub struct Simulate {
     json: bool,
 }
 
-impl Simulate {
+impl SimulateArgs {
     pub fn run(self) -> Result<()> {
         refuse_existing(&self.output, self.force)?;
         let before = files::voxels(&self.volume)?;
@@ -142,14 +142,14 @@ impl Simulate {
             p.offset = mm.map(|x| x / p.unit.mm);
         }
         match &self.angles {
-            Some(AnglesArg::File(path)) => {
+            Some(AnglesOption::File(path)) => {
                 if self.views.is_some() {
                     let expected = "--views or --angles FILE, which says how many there are";
                     return Err(Error::invalid("command line", "--views", "both", expected));
                 }
                 p.angles = Angles::ListDeg(read_angles(path)?);
             }
-            Some(AnglesArg::Even { start, range }) => {
+            Some(AnglesOption::Even { start, range }) => {
                 let views = self.views.map_or(p.angles.radians().len(), |n| n as usize);
                 p.angles = Angles::Even { views, start_deg: *start, arc_deg: *range };
             }

@@ -5,10 +5,10 @@ mod levers;
 mod pareto;
 mod report;
 
-use super::protocol::Protocol;
+use super::protocol::RunProtocol;
 use super::record::ScanRecord;
-use super::trial::{Figures, Input, Trial, read_json};
-use super::{Ends, General, backends::simd_level};
+use super::trial::{Figures, Trial, TrialInput, read_json};
+use super::{EndOptions, General, backends::simd_level};
 use crate::backend::{self, BackendChoice};
 use crate::budget::TOO_SHORT;
 use crate::parse::{self, HoldOut};
@@ -17,9 +17,9 @@ use crate::{out, signals};
 use clap::Args;
 use conefield_core::error::ensure;
 use conefield_core::{Error, Result};
-use halving::{Outcome, go_on, to_come};
+use halving::{TrialOutcome, go_on, to_come};
 use levers::{Candidate, Levers};
-use report::Report;
+use report::TradeoffReport;
 use serde::{Deserialize, Serialize};
 use serde_json::Value;
 use std::fs;
@@ -35,7 +35,7 @@ use tracing::info;
 /// every point that no other one beats in time, memory and accuracy. Ctrl-C ends the trial under way; the same command
 /// with --resume goes on and repeats no finished trial.
 #[derive(Args)]
-pub struct Tradeoff {
+pub struct TradeoffArgs {
     /// The scans to be good on; what is told is the mean over them.
     #[arg(required_unless_present = "show_levers", value_name = "SCAN")]
     scans: Vec<PathBuf>,
@@ -143,7 +143,7 @@ struct Rung {
     kept: Vec<String>,
 }
 
-impl Tradeoff {
+impl TradeoffArgs {
     pub fn run(self, general: &General) -> Result<()> {
         if self.show_levers {
             return out::say(levers::SHIPPED.trim_end());
@@ -155,7 +155,7 @@ impl Tradeoff {
         let mut over = self.open(output, &search)?;
         signals::listen()?;
         let rungs = self.climb(output, &search, &mut over, general)?;
-        let report = Report::new(search, rungs, over)?;
+        let report = TradeoffReport::new(search, rungs, over)?;
         report.write(output)?;
         if self.json { out::json(&report) } else { out::say(&report.text(output)) }
     }
@@ -176,7 +176,7 @@ impl Tradeoff {
         for (i, scan) in self.scans.iter().enumerate() {
             let again = self.scans[..i].contains(scan);
             ensure(!again, "tradeoff", "SCAN", scan.display(), "every scan once")?;
-            let input = Input::read(scan, &self.protocol(references.get(i), 1.0, &[]))?;
+            let input = TrialInput::read(scan, &self.protocol(references.get(i), 1.0, &[]))?;
             ensure(all > 0 || !input.held.is_empty(), "tradeoff", "--hold-out", "no view", "at least one")?;
             scans.push(input.scan);
         }
@@ -197,11 +197,11 @@ impl Tradeoff {
         })
     }
 
-    fn protocol(&self, reference: Option<&PathBuf>, budget: f64, sets: &[String]) -> Protocol {
-        Protocol {
+    fn protocol(&self, reference: Option<&PathBuf>, budget: f64, sets: &[String]) -> RunProtocol {
+        RunProtocol {
             checkpoint_every: NEVER,
             sets: sets.to_vec(),
-            ends: Ends { steps: None, seconds: None, at_most: None },
+            ends: EndOptions { steps: None, seconds: None, at_most: None },
             budget: Some(budget),
             backend: self.backend,
             reference: reference.cloned(),
@@ -306,7 +306,7 @@ impl Tradeoff {
 
     /// Seconds that the search takes from here at most: trial `c` on `scan` of budget `r` is next.
     fn left(&self, search: &Search, going: &[&Candidate], r: usize, c: usize, scan: usize) -> f64 {
-        let fields = going.iter().filter(|c| c.kind == crate::budget::front::Kind::Field).count();
+        let fields = going.iter().filter(|c| c.kind == crate::budget::front::Unknowns::Field).count();
         let rungs = search.budgets_s.len() - r;
         let later = to_come(fields, going.len() - fields, rungs, search.keep);
         let all = later.iter().zip(&search.budgets_s[r..]).map(|(n, budget)| *n as f64 * budget).sum::<f64>();
@@ -372,13 +372,13 @@ fn accuracy(search: &Search, figures: &Figures) -> Option<f64> {
 }
 
 /// What a candidate came to under a budget on all scans together.
-fn outcome(search: &Search, over: &[Over], candidate: &Candidate, budget: f64) -> Outcome {
+fn outcome(search: &Search, over: &[Over], candidate: &Candidate, budget: f64) -> TrialOutcome {
     let here: Vec<&Over> = over.iter().filter(|o| o.budget_s == budget && o.candidate == candidate.name).collect();
     if here.iter().any(|o| o.status == Status::TooShort) {
-        return Outcome::TooShort;
+        return TrialOutcome::TooShort;
     }
     let accuracies = here.iter().map(|o| o.figures.as_ref().and_then(|f| accuracy(search, f)));
-    mean(accuracies).map_or(Outcome::Failed, Outcome::Accuracy)
+    mean(accuracies).map_or(TrialOutcome::Failed, TrialOutcome::Accuracy)
 }
 
 /// A value in few words.

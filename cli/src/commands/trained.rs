@@ -22,7 +22,7 @@ pub struct Trained {
 }
 
 /// Its field.
-pub struct Opened {
+pub struct OpenedField {
     pub file: PathBuf,
     pub field: TrainedField,
     /// The voxels that are asked for.
@@ -32,18 +32,18 @@ pub struct Opened {
 
 impl Trained {
     /// Reads the field, if it fits into memory with `buffers` bytes beside it.
-    pub fn open(&self, buffers: u64) -> Result<Opened> {
+    pub fn open(&self, buffers: u64) -> Result<OpenedField> {
         let file = if self.run.is_dir() { self.run.join("weights.safetensors") } else { self.run.clone() };
         let bytes = file.metadata().map_err(|e| Error::io(&file, e))?.len();
         memory(bytes, buffers)?;
         let field = files::read_field(&file)?;
         let trained = field.scene.grid;
         let grid = self.voxels.map_or(trained, |n| trained.with_longest(n.into()));
-        Ok(Opened { file, field, grid, bytes })
+        Ok(OpenedField { file, field, grid, bytes })
     }
 }
 
-impl Opened {
+impl OpenedField {
     /// What the field takes with `buffers` bytes beside it; refused where that does not fit.
     pub fn memory(&self, buffers: u64) -> Result<Memory> {
         memory(self.bytes, buffers)

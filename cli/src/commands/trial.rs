@@ -1,13 +1,13 @@
 //! `conefield reconstruct` as a process of its own: what comparisons and searches are made of.
 
 use super::General;
-use super::protocol::{Protocol, word};
+use super::protocol::{RunProtocol, word};
 use super::reconstruct::{FAILED, split};
 use super::record::ScanRecord;
 use crate::memory::Run;
 use crate::{files, signals};
 use conefield_core::{Error, Result};
-use conefield_io::MiddleSlices;
+use conefield_report::MiddleSlices;
 use serde::{Deserialize, Serialize};
 use serde_json::Value;
 use std::io::Read;
@@ -27,13 +27,13 @@ pub struct Trial<'a> {
     pub spec: &'a str,
     /// The run's folder.
     pub output: &'a Path,
-    pub protocol: &'a Protocol,
+    pub protocol: &'a RunProtocol,
     /// Further options.
     pub more: &'a [&'a str],
 }
 
 /// What is known of the input once all of it was looked at.
-pub struct Input {
+pub struct TrialInput {
     pub scan: ScanRecord,
     pub held: Vec<usize>,
     pub reference: Option<MiddleSlices>,
@@ -100,22 +100,16 @@ impl Trial<'_> {
     }
 }
 
-impl Input {
+impl TrialInput {
     /// Reads scan and reference, to refuse what does not fit; of both only little is kept.
-    pub fn read(path: &Path, protocol: &Protocol) -> Result<Self> {
+    pub fn read(path: &Path, protocol: &RunProtocol) -> Result<Self> {
         let all = Run {
             scan: conefield_io::scan_size(path)?,
             split: protocol.hold_out.is_some(),
             reference: protocol.reference.is_some(),
-            field: true,
-            parameters: 0,
-            kept: 0,
-            backend: 0,
-            solver: [0; 2],
-            surround: [0; 2],
             resume: false,
         };
-        all.memory().check(|_| vec![])?;
+        all.reading().check(|_| vec![])?;
         let scan = files::scan(path)?;
         let reference = protocol.reference(path, &scan)?;
         let record = ScanRecord::of(path, &scan)?;

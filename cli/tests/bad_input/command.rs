@@ -173,14 +173,14 @@ pub fn cases() -> Vec<Case> {
         refused(
             "patience without views kept aside",
             scan_toml,
-            "reconstruct scan --spec fast -o run --set solver.patience=3",
-            &["--set solver.patience=3", "no views kept aside", "--hold-out every:10"],
+            "reconstruct scan --spec fast -o run --set callbacks.1={type='patience',records=3}",
+            &["--set callbacks.1={type='patience',records=3}", "no views kept aside", "--hold-out every:10"],
         ),
         refused(
             "patience of voxels without views kept aside",
             scan_toml,
-            "compare scan --specs sirt -o all --set solver.stop={passes=5,patience=3}",
-            &["solver.stop.patience", "no views kept aside", "--hold-out every:10"],
+            "compare scan --specs sirt -o all --set stop={passes=5,patience=3}",
+            &["stop.patience", "no views kept aside", "--hold-out every:10"],
         ),
         refused(
             "a view that is not there, kept aside",

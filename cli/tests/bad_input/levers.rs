@@ -25,9 +25,9 @@ pub fn cases() -> Vec<Case> {
         refused("a base that is no spec", levers("[[base]]\nspec = 'fkd'\n"), SEARCH, &["base[0].spec", "\"fkd\""]),
         refused(
             "a lever that is no list",
-            levers("[[base]]\nspec = 'fdk'\nlevers.solver.cutoff = 0.5\n"),
+            levers("[[base]]\nspec = 'fdk'\nlevers.cutoff = 0.5\n"),
             SEARCH,
-            &["levers.toml: base[0].levers.solver.cutoff", "a list"],
+            &["levers.toml: base[0].levers.cutoff", "a list"],
         ),
         refused(
             "a lever that does not exist",
@@ -37,9 +37,9 @@ pub fn cases() -> Vec<Case> {
         ),
         refused(
             "one value among several that does not fit",
-            levers("[[base]]\nspec = 'fdk'\nlevers.solver.cutoff = [0.5, 7.0]\n"),
+            levers("[[base]]\nspec = 'fdk'\nlevers.cutoff = [0.5, 7.0]\n"),
             SEARCH,
-            &["base[0].levers.solver.cutoff", "7.0"],
+            &["base[0].levers.cutoff", "7.0"],
         ),
         refused("budgets that fall", |_| {}, "tradeoff scan -o out --budgets 9s,3s", &["--budgets", "rise"]),
         refused(

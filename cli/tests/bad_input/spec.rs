@@ -16,7 +16,7 @@ fn json(text: &'static str) -> impl Fn(&Path) + Sync + Send {
 
 pub fn cases() -> Vec<Case> {
     vec![
-        refused("empty", toml(""), TOML, &["spec.toml:1:1", "solver"]),
+        refused("empty", toml(""), TOML, &["spec.toml:1:1", "type"]),
         refused("no UTF-8", |d| put(d.join("spec.toml"), b"name = \"\xff\xfe\""), TOML, &["spec.toml", "UTF-8"]),
         refused("no TOML", toml("[encoder\n"), TOML, &["spec.toml:1:"]),
         refused("JSON cut in the middle", json("{\"extends\": \"naf\", \"encoder\": {\"lev"), JSON, &["spec.json:1:"]),
@@ -58,33 +58,15 @@ pub fn cases() -> Vec<Case> {
         ),
         refused(
             "features evaluated again after no time",
-            toml("extends = \"naf\"\n[solver]\ndrift = { every = 0.0 }\n"),
+            toml("extends = \"naf\"\ncallbacks = [{ type = \"drift\", every = 0.0 }]\n"),
             TOML,
-            &["solver.drift.every", "positive"],
+            &["callbacks.0.every", "positive"],
         ),
         refused(
             "no points to record features of",
-            toml("extends = \"naf\"\n[solver]\ndrift = { points = 0 }\n"),
+            toml("extends = \"naf\"\ncallbacks = [{ type = \"drift\", points = 0 }]\n"),
             TOML,
-            &["solver.drift.points", "1 to 65536"],
-        ),
-        refused(
-            "an occupancy by another name",
-            toml("extends = \"naf\"\n[scene]\noccupancy = \"refind\"\n"),
-            TOML,
-            &["spec.toml:3:13", "scene.occupancy"],
-        ),
-        refused(
-            "cells that are looked at never",
-            toml("extends = \"naf\"\n[scene]\noccupancy = { refined = { every = 0 } }\n"),
-            TOML,
-            &["scene.occupancy.refined.every", "at least 1"],
-        ),
-        refused(
-            "cells that are empty below -1",
-            toml("extends = \"naf\"\n[scene]\noccupancy = { refined = { below = -1.0 } }\n"),
-            TOML,
-            &["scene.occupancy.refined.below", "-1"],
+            &["callbacks.0.points", "1 to 65536"],
         ),
         refused(
             "a surround by another name",
@@ -99,7 +81,7 @@ pub fn cases() -> Vec<Case> {
             &["scene.surround.coarse.cells", "4 to 256"],
         ),
         refused(
-            "a surround that goes nowhere, of a solver on voxels",
+            "a surround that goes nowhere, of fdk",
             toml("extends = \"fdk\"\n[scene]\nsurround = { coarse = { margin = -1.0 } }\n"),
             TOML,
             &["scene.surround.coarse.margin", "-1"],
@@ -125,9 +107,9 @@ pub fn cases() -> Vec<Case> {
         ),
         refused(
             "patience of no record",
-            toml("extends = \"naf\"\n[solver]\npatience = 0\n"),
+            toml("extends = \"naf\"\ncallbacks = [{ type = \"patience\", records = 0 }]\n"),
             TOML,
-            &["spec.toml:3:12", "solver.patience", "at least 1"],
+            &["spec.toml:2:", "callbacks.0.records", "at least 1"],
         ),
         refused(
             "samples told in two ways",
@@ -137,7 +119,7 @@ pub fn cases() -> Vec<Case> {
         ),
         refused(
             "a batch of 2^62 rays",
-            toml("extends = \"naf\"\n[solver]\nrays = 4611686018427387904\n"),
+            toml("extends = \"naf\"\n[training]\nrays = 4611686018427387904\n"),
             TOML,
             &["spec.toml:3:", "4611686018427387904"],
         ),

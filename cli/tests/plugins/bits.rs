@@ -4,12 +4,12 @@
 use crate::build::{cargo, example, library, sources};
 use crate::common::{conefield, done, json, refused, text};
 use conefield_backend_cpu::Cpu;
-use conefield_core::backend::{Backend, Loss, TvBlocks, Work};
+use conefield_core::backend::{Backend, BlockWork, Work};
+use conefield_core::method::{Job, Limits, Silent};
 use conefield_core::pipeline::{Model, Pipeline};
 use conefield_core::random::{mix, unit};
-use conefield_core::solver::{Job, Limits, Silent};
+use conefield_core::settings::{EncoderSpec, FieldSpec, NormalizerSpec, ProjectorSpec};
 use conefield_core::spec::stage::read;
-use conefield_core::spec::{EncoderSpec, FieldSpec, NormalizerSpec, ProjectorSpec};
 use conefield_core::stage::UnitRay;
 use std::path::{Path, PathBuf};
 
@@ -20,6 +20,8 @@ use conefield_initializers as _;
 use conefield_normalizers as _;
 use conefield_projectors as _;
 use conefield_solvers as _;
+use conefield_solvers::losses::L2;
+use conefield_solvers::priors::TotalVariation;
 
 // The plugins' own files, built into this test.
 #[path = "../../../plugins/examples/triplane/src/planes.rs"]
@@ -53,11 +55,7 @@ type = "ray-march"
 samples = 24
 sampling = "stratified"
 
-[initializer]
-type = "random"
-
-[solver]
-type = "gradient"
+[training]
 rays = 48
 "#;
 
@@ -111,18 +109,6 @@ fn as_built_in() {
     let volume = conefield_io::read_volume(Path::new(&run).join("volume.nii.gz")).unwrap();
     let built_in = solution.result.volume(&Cpu::new()).unwrap();
     assert!(volume.data == built_in.data, "the volumes differ");
-}
-
-/// Samples cannot be left out where a stage looks along rays: what it makes of the others depends on them.
-#[test]
-fn a_stage_that_looks_along_rays_wants_all_samples() {
-    let spec = |more: &str| {
-        let text = format!("{SPEC}\n[scene]\n{more}");
-        Pipeline::build(&conefield_core::spec::load::parse(&text, "plugins.toml", &[], &[]).unwrap().spec)
-    };
-    let e = spec("occupancy = { refined = {} }").err().unwrap().to_string();
-    assert!(e.contains("scene.occupancy") && e.contains("along rays"), "{e}");
-    assert!(spec("occupancy = \"fixed\"").is_ok());
 }
 
 #[test]
@@ -187,7 +173,7 @@ fn mapping_consistency() {
     let [siren, triplane] = &place.plugins;
     let weights = text(&place.dir.path().join("weights.safetensors"));
     let spec = text(&place.spec);
-    let small = ["--steps", "20", "--set", "solver.pretrain_points=200"];
+    let small = ["--steps", "20", "--set", "pretraining.points=200"];
     let pretrain =
         ["--plugin", siren, "--plugin", triplane, "pretrain", "phantom:head:16", "--spec", &spec, "-o", &weights];
     done(&[&pretrain[..], &small].concat());
@@ -201,18 +187,18 @@ fn mapping_consistency() {
     assert!(!output.status.success() && e.contains("field.0.weight"), "{e}");
 }
 
-/// Masks that a plugin's normalizer decides on remove channels of a plugin's encoder, as built-in ones do.
+/// A mask removes channels of a plugin's encoder, as of a built-in one.
 #[test]
 fn masks_of_plugins() {
     let place = place();
     cargo(&sources().join("plugins/tests"), &["build", "--release", "--locked", "-p", "rehashed"]);
     let plugin = text(&library("rehashed"));
-    let runs = [("hash-grid", "fft-mask"), ("rehashed", "remask")].map(|(encoder, mask)| {
+    let runs = ["hash-grid", "rehashed"].map(|encoder| {
         let spec = text(&place.dir.path().join(format!("{encoder}.toml")));
         let lines = format!(
-            "extends = 'ni-naf'\n[[normalizers]]\ntype = '{mask}'\nepoch = 3\nkeep = [0, 1, 3]\n[[normalizers]]\ntype = 'layer-norm'\n\
+            "extends = 'ni-naf'\ncallbacks = [{{ type = 'fft-mask', keep = [0, 1, 3] }}]\n\
              [encoder]\ntype = '{encoder}'\nconvention = 'naf'\nfeatures = 2\ngrowth = 2.0\nlevels = 3\nlog2_table_size = 10\nbase_resolution = 16\n\
-             [projector]\nsamples = 16\n[solver]\nrays = 48\n"
+             [projector]\nsamples = 16\n[training]\nrays = 48\n"
         );
         std::fs::write(&spec, lines).unwrap();
         let run = place.dir.path().join(encoder);
@@ -259,9 +245,10 @@ fn points_off_any_ray_stand_alone() {
     assert!(values[0] == values[1], "values differ");
 
     let known: Vec<([f32; 3], f32)> = points.iter().map(|p| (*p, 0.3)).collect();
-    let corners = points[..40].iter().map(|p| p.map(|x| 0.8 * x)).collect();
-    let tv = TvBlocks { corners, spacing: [0.02; 3], edge: 4, weight: 0.1, smoothing: 1e-3 };
-    let work = Work { step: 1, seed: 2, loss: Loss::L2, rays: &[], points: &known, tv: Some(&tv), occupancy: None };
+    let corners: Vec<_> = points[..40].iter().map(|p| p.map(|x| 0.8 * x)).collect();
+    let prior = TotalVariation { weight: 0.1, edge: 4, smoothing: 1e-3, ..TotalVariation::default() };
+    let priors = [BlockWork { prior: &prior, corners: &corners, spacing: [0.02; 3] }];
+    let work = Work { step: 1, seed: 2, loss: &L2 {}, rays: &[], points: &known, priors: &priors };
     let stats = exe.step(&mut plain, &work).unwrap();
     let found = smoothed_exe.step(&mut smoothed, &work).unwrap();
     assert_eq!((stats.loss.to_bits(), stats.prior.to_bits()), (found.loss.to_bits(), found.prior.to_bits()));

@@ -31,7 +31,7 @@ fn every_example_is_checked_and_reconstructs() {
         let run = text(&dir.path().join(sets[0]));
         let mut args = vec!["--plugin", &library, "reconstruct", &scan, "--spec", "fast", "-o", &run, "--json"];
         args.extend(["--reference", "truth", "--steps", "150", "--set", "projector.samples=48"]);
-        args.extend(["--set", "solver.rays=256"]);
+        args.extend(["--set", "training.rays=256"]);
         for set in sets {
             args.extend(["--set", set]);
         }

@@ -212,7 +212,7 @@ fn every_fault_is_found_and_none_takes_the_process_down() {
     let reconstruct = |library: &str, number: usize, spec: &[&str], hide: &[&Path]| {
         let run = text(&dir.path().join(format!("run-{number}")));
         let mut args = vec!["--plugin", library, "reconstruct", &scan, "--spec", "fast", "-o", &run, "--steps", "300"];
-        args.extend(["--set", "solver.rays=16"]);
+        args.extend(["--set", "training.rays=16"]);
         args.extend(spec);
         let found = said(&args, hide);
         // What has failed leaves no volume.

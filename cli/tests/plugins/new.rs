@@ -21,7 +21,7 @@ fn use_it(folder: &Path, library: &Path, scan: &Path) -> serde_json::Value {
     assert_eq!(report["passed"], true, "{report:#}");
     let spec = text(&folder.join("spec.toml"));
     let run = text(&folder.join("run"));
-    let small = ["--steps", "12", "--set", "solver.rays=32", "--json"];
+    let small = ["--steps", "12", "--set", "training.rays=32", "--json"];
     json(&[&["--plugin", &library, "reconstruct", &text(scan), "--spec", &spec, "-o", &run][..], &small].concat())
 }
 

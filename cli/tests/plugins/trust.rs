@@ -59,7 +59,7 @@ fn the_resolved_spec_names_the_library_wherever_it_is_read() {
     let (spec, scan, out) = (text(&spec(dir.path())), text(&dir.path().join("scan")), text(&dir.path().join("run")));
     let simulate = ["simulate", "phantom:head:16", "-o", &scan, "--views", "6", "--detector", "16x16"];
     assert!(run(&mut conefield(&simulate)).0);
-    let steps = ["--steps", "3", "--set", "solver.rays=16"];
+    let steps = ["--steps", "3", "--set", "training.rays=16"];
     let reconstruct = ["--allow-plugins-from-spec", "reconstruct", &scan, "--spec", &spec, "-o", &out];
     let (fine, _, err) = run(&mut conefield(&[&reconstruct[..], &steps].concat()));
     assert!(fine, "{err}");

@@ -1,65 +1,41 @@
 //! Checks a spec as written against what the registered stage types know, so that a mistake is told with its line,
 //! its path and the nearest valid name.
 
+use super::LABEL;
 use super::one_of;
-use super::schema::{NESTED, STAGES, of_type, tables};
+use super::schema::{NESTED, label, of_type};
 use super::tree::{At, Kind as Is, Node};
 use crate::error::{Error, Result};
 use crate::registry::{Kind, find, names};
 use serde_json::Value;
 
-/// Keys of a spec beside its stages.
-const TEXTS: [&str; 2] = ["name", "description"];
-
 /// Refuses unknown keys, unknown types and values of another type than their setting has.
 pub(super) fn spec(root: &Node) -> Result<()> {
     table(root, "spec")?;
-    let tables = tables();
-    for e in root.entries() {
-        let key = e.key.as_str();
-        if TEXTS.contains(&key) {
-            setting(&e.value, &serde_json::json!({ "type": "string" }), &Context::new(&Value::Null, None), key)?;
-        } else if let Some((_, schema)) = tables.iter().find(|t| t.0 == key) {
-            setting(&e.value, schema, &Context::new(schema, None), key)?;
-        } else if key == "normalizers" {
-            let Is::Array(items) = &e.value.kind else {
-                return Err(invalid(&e.value.at, key, e.value.shown(), "a list of tables, [[normalizers]]".into()));
-            };
-            for (i, n) in items.iter().enumerate() {
-                stage(n, Kind::Normalizer, &format!("{key}.{i}"))?;
-            }
-        } else if let Some((_, kind)) = STAGES.iter().find(|s| s.0 == key) {
-            stage(&e.value, *kind, key)?;
-        } else {
-            let known: Vec<&str> =
-                TEXTS.into_iter().chain(["scene", "plugins", "precision"]).chain(STAGES.iter().map(|s| s.0)).collect();
-            return Err(unknown(&e.at, key, key, &known));
+    for (key, schema) in label() {
+        if let Some(value) = root.get(key) {
+            setting(value, &schema, &Context::new(&schema, None), key)?;
         }
     }
-    if root.get("solver").is_none() {
-        let want = format!("a table [solver] with a type: {}", listed(&names(Kind::Solver)));
-        return Err(invalid(&root.at, "solver", "nothing".into(), want));
-    }
-    Ok(())
+    stage(root, Kind::Method, "")
 }
 
-/// Checks a stage: its type, then its settings.
+/// Checks a stage: its type, then its settings. At the top of a spec, where `path` is empty, the spec's own keys stand beside
+/// them.
 fn stage(node: &Node, kind: Kind, path: &str) -> Result<()> {
-    if node.kind == Is::Null {
-        return Ok(());
-    }
-    table(node, path)?;
     let known = names(kind);
     let types = || format!("a type: {}", listed(&known));
-    let Some(name) = node.get("type") else {
-        return Err(invalid(&node.at, &join(path, "type"), "nothing".into(), types()));
-    };
-    let Some(text) = name.text() else {
-        return Err(invalid(&name.at, &join(path, "type"), name.shown(), types()));
-    };
+    // The name of a type stands for its default settings.
+    let alone = node.text().is_some();
+    let at = if alone { path.into() } else { join(path, "type") };
+    let name = if alone { Some(node) } else { node.get("type") };
+    if !alone && !matches!(node.kind, Is::Table(_)) {
+        return Err(invalid(&node.at, path, node.shown(), format!("a table, or the name of {}", types())));
+    }
+    let Some(name) = name else { return Err(invalid(&node.at, &at, "nothing".into(), types())) };
+    let Some(text) = name.text() else { return Err(invalid(&name.at, &at, name.shown(), types())) };
     let Some(found) = find(kind, text) else {
-        let found = format!("no {} type {text:?}", kind.name());
-        return Err(invalid(&name.at, &join(path, "type"), found, suggest(text, &known)));
+        return Err(invalid(&name.at, &at, format!("no {} type {text:?}", kind.name()), suggest(text, &known)));
     };
     let schema = of_type(found);
     let cx = Context::new(&schema, Some(kind));
@@ -148,17 +124,26 @@ fn setting(node: &Node, schema: &Value, cx: &Context<'_>, path: &str) -> Result<
 fn object(node: &Node, schema: &Value, cx: &Context<'_>, path: &str) -> Result<()> {
     let empty = serde_json::Map::new();
     let properties = schema["properties"].as_object().unwrap_or(&empty);
-    for e in node.entries() {
+    let label: &[&str] = if path.is_empty() { &LABEL } else { &[] };
+    for e in node.entries().iter().filter(|e| !label.contains(&&*e.key)) {
         let at = join(path, &e.key);
         match properties.get(&e.key) {
             Some(s) => setting(&e.value, s, cx, &at)?,
             None if schema["additionalProperties"] == Value::Bool(false) => {
-                let known: Vec<&str> = properties.keys().map(String::as_str).filter(|k| *k != "type").collect();
+                let own = properties.keys().map(String::as_str).filter(|k| *k != "type");
+                let known: Vec<&str> = label.iter().copied().chain(own).collect();
                 return Err(unknown(&e.at, &at, &e.key, &known));
             }
             None => {}
         }
     }
+    required(node, schema, cx, path)
+}
+
+/// Refuses a table that lacks a key which has no default.
+fn required(node: &Node, schema: &Value, cx: &Context<'_>, path: &str) -> Result<()> {
+    let empty = serde_json::Map::new();
+    let properties = schema["properties"].as_object().unwrap_or(&empty);
     for key in schema["required"].as_array().into_iter().flatten().filter_map(Value::as_str) {
         if node.get(key).is_none() {
             let want = properties.get(key).map_or("a value".into(), |s| wanted(cx.resolve(s), cx));
@@ -212,7 +197,7 @@ fn wanted(schema: &Value, cx: &Context<'_>) -> String {
     let schema = cx.resolve(schema);
     if let Some(kind) = schema[NESTED].as_str().and_then(Kind::named) {
         let article = if kind == Kind::Encoder || kind == Kind::Initializer { "an" } else { "a" };
-        return format!("a table with {article} {} type: {}", kind.name(), listed(&names(kind)));
+        return format!("a table with {article} {} type, or its name: {}", kind.name(), listed(&names(kind)));
     }
     let fixed = constants(schema, cx);
     let mut words: Vec<String> = fixed.iter().map(plain).collect();
@@ -276,7 +261,7 @@ fn table(node: &Node, path: &str) -> Result<()> {
 }
 
 pub(super) fn join(path: &str, key: &str) -> String {
-    format!("{path}.{key}")
+    if path.is_empty() { key.into() } else { format!("{path}.{key}") }
 }
 
 pub(super) fn invalid(at: &At, path: &str, found: String, expected: String) -> Error {

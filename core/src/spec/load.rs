@@ -5,9 +5,9 @@
 //! then becomes a [`Spec`].
 
 use super::tree::{At, Entry, Kind, Node, parse_json, parse_toml};
-use super::{Spec, check, one_of};
-use crate::error::{Error, Result};
-use crate::files;
+use super::{LABEL, Spec, check, one_of};
+use crate::error::{Error, Result, ensure};
+use crate::{files, registry};
 use serde_json::Value;
 use std::path::{Path, PathBuf};
 
@@ -67,7 +67,7 @@ impl Draft {
 
     fn layered(layer: Layer, sets: &[String], shipped: &[Shipped]) -> Result<Self> {
         let source = layer.label();
-        let mut written = layer.resolve(shipped, &mut vec![])?;
+        let mut written = layer.resolve(shipped, &[])?;
         let mut sets = sets.iter().map(|s| Set::parse(s)).collect::<Result<Vec<_>>>()?;
         // A type clears the keys of the old one, so it goes before the keys beside it, whatever the order on the line.
         sets.sort_by_key(|s| (s.path.len(), s.path.last().is_some_and(|k| k != "type")));
@@ -99,6 +99,10 @@ impl Draft {
     }
 }
 
+/// Specs on the way from one to the last that it extends, at most.
+const DEEPEST: usize = 32;
+/// The methods of a chain.
+const METHODS: &str = "methods";
 /// Where a spec names plugins.
 const PLUGINS: &str = "plugins";
 const PATHS: &str = "paths";
@@ -107,41 +111,36 @@ const PATHS: &str = "paths";
 /// a JSON spec that clears a setting whose default is something cannot be said in it.
 pub fn to_toml(spec: &Spec) -> Result<String> {
     let failed = |e: &dyn std::fmt::Display| Error::unsupported("writing the spec as TOML", e.to_string());
-    let text = toml::to_string_pretty(spec).map_err(|e| failed(&e))?;
-    let back: Spec = toml::from_str(&text).map_err(|e| failed(&e.message()))?;
     let tree = |s: &Spec| serde_json::to_value(s).map_err(|e| failed(&e));
-    if tree(spec)? != tree(&back)? {
+    let whole = tree(spec)?;
+    let text = toml::to_string_pretty(&without_nulls(whole.clone())).map_err(|e| failed(&e))?;
+    let back: Spec = toml::from_str(&text).map_err(|e| failed(&e.message()))?;
+    if whole != tree(&back)? {
         return Err(failed(&"a setting is null whose default is not; give it a value"));
     }
     Ok(text)
+}
+
+fn without_nulls(value: Value) -> Value {
+    match value {
+        Value::Object(map) => {
+            map.into_iter().filter(|(_, v)| !v.is_null()).map(|(k, v)| (k, without_nulls(v))).collect()
+        }
+        Value::Array(items) => items.into_iter().map(without_nulls).collect(),
+        other => other,
+    }
 }
 
 impl Loaded {
     /// The same error, with the line of the spec that it is about.
     pub fn locate(&self, error: Error) -> Error {
         let Error::Invalid { place, field, found, expected } = error else { return error };
-        let path = match place.as_str() {
-            "spec" => self.indexed(steps(&field), &found),
-            _ => return Error::Invalid { place, field, found, expected },
-        };
+        if place != "spec" {
+            return Error::Invalid { place, field, found, expected };
+        }
+        let path = steps(&field);
         let at = &self.written.nearest(&path.iter().map(String::as_str).collect::<Vec<_>>()).at;
         Error::Invalid { place: at.to_string(), field: path.join("."), found, expected }
-    }
-
-    /// A normalizer does not know which of the list it is: puts its index into a path that says `normalizers.eps`.
-    fn indexed(&self, mut path: Vec<String>, found: &str) -> Vec<String> {
-        let Some(Kind::Array(list)) = self.written.get("normalizers").map(|n| &n.kind) else { return path };
-        if let [first, key, ..] = &path[..]
-            && first == "normalizers"
-            && key.parse::<usize>().is_err()
-        {
-            let says = |n: &Node| n.get(key).is_some_and(|v| v.to_json().to_string().trim_matches('"') == found);
-            let index = list.iter().position(says).or_else(|| list.iter().position(|n| n.get(key).is_some()));
-            if let Some(index) = index {
-                path.insert(1, index.to_string());
-            }
-        }
-        path
     }
 }
 
@@ -152,8 +151,10 @@ fn steps(path: &str) -> Vec<String> {
 
 /// `one of a, b` of the shipped names, the nearest first where one is near.
 fn names(what: &str, shipped: &[Shipped]) -> String {
-    let known: Vec<&str> = shipped.iter().map(|s| s.name).collect();
-    format!("the name of a shipped spec: {}", check::suggest(what, &known))
+    let mut known: Vec<&str> = shipped.iter().map(|s| s.name).collect();
+    let types = registry::names(registry::Kind::Method);
+    known.extend(types.into_iter().filter(|t| !shipped.iter().any(|s| s.name == *t)));
+    format!("the name of a shipped spec or of a method: {}", check::suggest(what, &known))
 }
 
 /// Where a layer comes from.
@@ -187,6 +188,10 @@ impl Layer {
         if let Some(s) = shipped.iter().find(|s| s.name == what) {
             return Ok(Self { origin: Origin::Shipped(s.name), text: s.text.into() });
         }
+        if let Some(t) = registry::find(registry::Kind::Method, what) {
+            let text = format!("type = {name:?}\nname = {name:?}\ndescription = {:?}\n", t.doc, name = t.name);
+            return Ok(Self { origin: Origin::Shipped(t.name), text });
+        }
         let path = folder.map_or_else(|| PathBuf::from(what), |f| f.join(what));
         match files::read_text(&path, LONGEST) {
             Ok(text) => Ok(Self { origin: Origin::File(path), text }),
@@ -204,7 +209,7 @@ impl Layer {
     }
 
     /// The tree of this layer over those that it extends. `above` are the layers that led here.
-    fn resolve(self, shipped: &[Shipped], above: &mut Vec<Origin>) -> Result<Node> {
+    fn resolve(self, shipped: &[Shipped], above: &[Origin]) -> Result<Node> {
         let label = self.label();
         let is_json = match &self.origin {
             Origin::File(p) if p.extension().is_some_and(|e| e.eq_ignore_ascii_case("json")) => true,
@@ -219,7 +224,16 @@ impl Layer {
         if let Origin::File(path) = &self.origin {
             anchor_plugins(&mut node, path);
         }
-        let Some(extends) = node.take("extends") else { return Ok(node) };
+        let above = [above, std::slice::from_ref(&self.origin)].concat();
+        self.extend_methods(&mut node, shipped, &above)?;
+        let Some(mut tree) = self.base(&mut node, shipped, &above)? else { return Ok(node) };
+        tree.merge(node);
+        Ok(tree)
+    }
+
+    /// The tree that `node`, a table of this layer, extends.
+    fn base(&self, node: &mut Node, shipped: &[Shipped], above: &[Origin]) -> Result<Option<Node>> {
+        let Some(extends) = node.take("extends") else { return Ok(None) };
         let at = extends.value.at.to_string();
         let Some(what) = extends.value.text() else {
             let found = extends.value.shown();
@@ -236,13 +250,29 @@ impl Layer {
             }
             Unfound::Unreadable(e) => Error::invalid(&at, "extends", e, "a spec that can be read"),
         })?;
-        above.push(self.origin.clone());
         if above.iter().any(|o| same(o, &base.origin)) {
             return Err(Error::invalid(at, "extends", format!("{what:?}, which extends this one"), "no circle"));
         }
-        let mut tree = base.resolve(shipped, above)?;
-        tree.merge(node);
-        Ok(tree)
+        ensure(above.len() < DEEPEST, &at, "extends", format!("{DEEPEST} specs on the way"), "fewer")?;
+        base.resolve(shipped, above).map(Some)
+    }
+
+    /// Puts what the methods of a chain extend under them. Of the specs that they name only the method counts, and the
+    /// plugins that it needs.
+    fn extend_methods(&self, node: &mut Node, shipped: &[Shipped], above: &[Origin]) -> Result<()> {
+        let Some(Kind::Array(methods)) = node.get_mut(METHODS).map(|m| &mut m.kind) else { return Ok(()) };
+        let mut plugins = vec![];
+        for method in methods {
+            let Some(mut tree) = self.base(method, shipped, above)? else { continue };
+            LABEL.iter().for_each(|key| {
+                let taken = tree.take(key).filter(|_| *key == PLUGINS);
+                plugins.extend(taken.and_then(|mut p| p.value.take(PATHS)).map(|p| p.value));
+            });
+            tree.merge(std::mem::replace(method, Node::empty_table(method.at.clone())));
+            *method = tree;
+        }
+        plugins.into_iter().for_each(|paths| node.push_all(&[PLUGINS, PATHS], paths));
+        Ok(())
     }
 }
 
@@ -321,7 +351,7 @@ impl Set {
                     // A type that changes leaves nothing of the old settings.
                     let retyped = |e: &Entry| e.key == "type" && e.value.text() != value.text();
                     if i + 1 == path.len() && step == "type" && entries.iter().any(retyped) {
-                        entries.clear();
+                        entries.retain(|e| LABEL.contains(&&*e.key));
                     }
                     let found = entries.iter().position(|e| e.key == *step);
                     let index = found.unwrap_or_else(|| {
@@ -335,6 +365,9 @@ impl Set {
                     let entry = &mut entries[index];
                     entry.at = at.clone();
                     node = &mut entry.value;
+                    if i + 1 < path.len() {
+                        node.spell_out();
+                    }
                 }
                 _ => {
                     let above = path[..i].join(".");
@@ -378,7 +411,10 @@ fn at_everywhere(mut node: Node, at: &At) -> Node {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::spec::{EncoderSpec, SolverSpec};
+    use crate::method::{Context, Method, Plan};
+    use crate::registry::Kind as Of;
+    use crate::settings::{EncoderSpec, NormalizerSpec};
+    use crate::spec::stage;
     use schemars::JsonSchema;
     use serde::{Deserialize, Serialize};
 
@@ -410,7 +446,7 @@ mod tests {
     #[typetag::serde(name = "test-grid")]
     impl EncoderSpec for TestGrid {
         fn build(&self) -> Result<Box<dyn crate::stage::Encoder>> {
-            Err(Error::invalid("spec", "encoder.levels", self.levels, "another number"))
+            Err(Error::invalid("spec", "levels", self.levels, "another number"))
         }
     }
 
@@ -447,45 +483,98 @@ mod tests {
         pace: Option<Pace>,
     }
 
-    crate::stage_type!(Solver, "test-clock", TestClock, "for tests");
+    crate::stage_type!(Method, "test-clock", TestClock, "for tests");
     #[typetag::serde(name = "test-clock")]
-    impl SolverSpec for TestClock {
-        fn build(&self) -> Result<Box<dyn crate::solver::Solver>> {
+    impl Method for TestClock {
+        fn plan(&self, _: &Context<'_>) -> Result<Box<dyn Plan>> {
             Err(Error::unsupported("test-clock", "for tests"))
         }
     }
 
     #[derive(Serialize, Deserialize, JsonSchema)]
-    #[serde(deny_unknown_fields, default)]
-    struct TestSolver {
+    #[serde(deny_unknown_fields)]
+    struct TestField {
+        #[serde(deserialize_with = "stage::needed")]
+        #[schemars(schema_with = "encoder")]
+        encoder: Box<dyn EncoderSpec>,
+        #[serde(default, deserialize_with = "stage::list")]
+        #[schemars(schema_with = "normalizers")]
+        normalizers: Vec<Box<dyn NormalizerSpec>>,
+        #[serde(default = "ten")]
         steps: u64,
     }
 
-    impl Default for TestSolver {
-        fn default() -> Self {
-            Self { steps: 10 }
+    fn encoder(_: &mut schemars::SchemaGenerator) -> schemars::Schema {
+        stage::schema_of(Of::Encoder)
+    }
+
+    fn normalizers(_: &mut schemars::SchemaGenerator) -> schemars::Schema {
+        stage::schema_of_list(Of::Normalizer)
+    }
+
+    fn ten() -> u64 {
+        10
+    }
+
+    crate::stage_type!(Method, "test-field", TestField, "for tests");
+    #[typetag::serde(name = "test-field")]
+    impl Method for TestField {
+        fn plan(&self, _: &Context<'_>) -> Result<Box<dyn Plan>> {
+            self.encoder.build().map_err(|e| e.within("encoder"))?;
+            Err(Error::unsupported("test-field", "for tests"))
         }
     }
 
-    crate::stage_type!(Solver, "test-solver", TestSolver, "for tests");
-    #[typetag::serde(name = "test-solver")]
-    impl SolverSpec for TestSolver {
-        fn build(&self) -> Result<Box<dyn crate::solver::Solver>> {
-            Err(Error::unsupported("test-solver", "for tests"))
+    #[derive(Serialize, Deserialize, JsonSchema)]
+    #[serde(deny_unknown_fields)]
+    struct TestChain {
+        #[serde(deserialize_with = "stage::list")]
+        #[schemars(schema_with = "methods")]
+        methods: Vec<Box<dyn Method>>,
+    }
+
+    fn methods(_: &mut schemars::SchemaGenerator) -> schemars::Schema {
+        stage::schema_of_list(Of::Method)
+    }
+
+    crate::stage_type!(Method, "test-chain", TestChain, "for tests");
+    #[typetag::serde(name = "test-chain")]
+    impl Method for TestChain {
+        fn plan(&self, _: &Context<'_>) -> Result<Box<dyn Plan>> {
+            Err(Error::unsupported("test-chain", "for tests"))
         }
     }
 
     const SHIPPED: &[Shipped] = &[
         Shipped {
             name: "plain",
-            text: "name = 'plain'\n[encoder]\ntype = 'test-grid'\nlevels = 3\n[solver]\ntype = 'test-solver'\n",
+            text: "type = 'test-field'\nname = 'plain'\n[encoder]\ntype = 'test-grid'\nlevels = 3\n",
         },
         Shipped { name: "curved", text: "extends = 'plain'\nname = 'curved'\n[encoder]\nway = 'round'\n" },
-        Shipped { name: "timed", text: "[solver]\ntype = 'test-clock'\nseconds = 9\npace = { slow = { by = 2 } }\n" },
+        Shipped { name: "timed", text: "type = 'test-clock'\nseconds = 9\npace = { slow = { by = 2 } }\n" },
     ];
 
     fn read(text: &str, sets: &[&str]) -> Result<Loaded> {
         parse(text, "a.toml", &sets.iter().map(|s| s.to_string()).collect::<Vec<_>>(), SHIPPED)
+    }
+
+    fn plan(loaded: &Loaded) -> Result<Box<dyn Plan>> {
+        loaded.spec.method.plan(&Context::new(&Nothing))
+    }
+
+    /// A backend that nothing gets as far as.
+    struct Nothing;
+
+    impl crate::backend::Backend for Nothing {
+        fn name(&self) -> &'static str {
+            "nothing"
+        }
+        fn compile(
+            &self,
+            _: &crate::pipeline::Pipeline,
+        ) -> Result<(Box<dyn crate::backend::Executable>, crate::backend::Explain)> {
+            Err(Error::unsupported("nothing", "for tests"))
+        }
     }
 
     fn refusal(text: &str, sets: &[&str]) -> String {
@@ -500,7 +589,7 @@ mod tests {
         assert_eq!(e["growth"], 3.0);
         assert_eq!(e["way"], "round");
         assert_eq!(l.tree["name"], "mine");
-        assert_eq!(l.tree["solver"]["steps"], 10, "defaults are written");
+        assert_eq!(l.tree["steps"], 10, "defaults are written");
     }
 
     #[test]
@@ -536,7 +625,7 @@ mod tests {
             ),
             (
                 "type = 'test-stack'",
-                "a.toml:2:1: encoder.below: found nothing, expected a table with an encoder type: one of",
+                "a.toml:2:1: encoder.below: found nothing, expected an encoder type, or a table with one: one of",
             ),
             ("type = 'test-stack'\nbelow = { type = 'test-grid', level = 2 }", "a.toml:4:31: encoder.below.level"),
         ] {
@@ -546,7 +635,7 @@ mod tests {
         let e = refusal("extends = 'plain'\n\nencodr = 3\n", &[]);
         assert!(e.starts_with("a.toml:3:1: encodr: found an unknown key, expected \"encoder\""), "{e}");
         let e = refusal("name = 'x'\n", &[]);
-        assert!(e.contains("solver: found nothing") && e.contains("test-solver"), "{e}");
+        assert!(e.contains("type: found nothing") && e.contains("test-field"), "{e}");
         let e = refusal("extends = 'plian'\n", &[]);
         assert!(
             e.starts_with("a.toml:1:11: extends")
@@ -554,8 +643,8 @@ mod tests {
                 && e.contains("\"plain\""),
             "{e}"
         );
-        let e = refusal("{\n\"solver\": {\"type\": \"test-solver\",\n \"step\": 3}}", &[]);
-        assert!(e.starts_with("a.toml:3:2: solver.step: found an unknown key, expected \"steps\""), "{e}");
+        let e = refusal("{\n\"type\": \"test-clock\",\n \"step\": 3}", &[]);
+        assert!(e.starts_with("a.toml:3:2: step: found an unknown key, expected \"steps\""), "{e}");
     }
 
     #[test]
@@ -569,10 +658,10 @@ mod tests {
             ("encoder.levels.deep=3", "a key below encoder.levels, which is 3"),
             ("normalizers.0.type=nothing", "no normalizer type"),
             ("normalizers.0=3", "normalizers.0: found 3, expected a table"),
-            ("name=1\nsolver=2", "name"),
+            ("name=1\nsteps=2", "name"),
         ] {
             match read("extends = 'plain'", &[set]) {
-                Ok(l) => assert_eq!(l.tree["name"], "1\nsolver=2", "{set}"),
+                Ok(l) => assert_eq!(l.tree["name"], "1\nsteps=2", "{set}"),
                 Err(e) => assert!(e.to_string().contains(want), "{set}: {e}"),
             }
         }
@@ -591,33 +680,33 @@ mod tests {
     #[test]
     fn what_an_upper_layer_says_takes_the_place_of_another_way_to_say_it() {
         let said = |text: &str, sets: &[&str]| {
-            let solver = read(text, sets).unwrap().tree["solver"].clone();
+            let solver = read(text, sets).unwrap().tree.clone();
             let keys = ["steps", "seconds", "passes"].iter().filter(|k| !solver[**k].is_null());
             (keys.copied().collect::<Vec<_>>().join(" "), solver["pace"].to_string())
         };
         let base = "extends = 'timed'\n";
         assert_eq!(said(base, &[]), ("seconds".into(), "{\"slow\":{\"by\":2.0}}".into()));
-        assert_eq!(said(&format!("{base}solver.steps = 3\n"), &[]).0, "steps");
-        assert_eq!(said(&format!("{base}solver.steps = 3\n"), &["solver.passes=4"]).0, "passes");
-        assert_eq!(said(&format!("{base}solver.steps = 3\n"), &["solver.seconds=4"]).0, "seconds");
+        assert_eq!(said(&format!("{base}steps = 3\n"), &[]).0, "steps");
+        assert_eq!(said(&format!("{base}steps = 3\n"), &["passes=4"]).0, "passes");
+        assert_eq!(said(&format!("{base}steps = 3\n"), &["seconds=4"]).0, "seconds");
         assert_eq!(said("{\"extends\": \"timed\", \"solver\": {\"passes\": null}}", &[]).0, "seconds");
-        for set in ["solver.pace.fast=0.5", "solver.pace={fast=0.5}"] {
+        for set in ["pace.fast=0.5", "pace={fast=0.5}"] {
             assert_eq!(said(base, &[set]).1, "{\"fast\":0.5}", "{set}");
         }
-        assert_eq!(said(base, &["solver.pace.slow.by=3"]).1, "{\"slow\":{\"by\":3.0}}");
+        assert_eq!(said(base, &["pace.slow.by=3"]).1, "{\"slow\":{\"by\":3.0}}");
         // Two ways in one layer are a mistake.
-        let e = refusal(&format!("{base}[solver]\nsteps = 3\npasses = 4\n"), &[]);
-        assert!(e.starts_with("a.toml:4:1: solver.passes: found steps beside it, expected one of steps, "), "{e}");
-        let e = refusal(base, &["solver.steps=3", "solver.passes=4"]);
-        assert!(e.starts_with("--set solver.passes=4: solver.passes: found steps beside it"), "{e}");
-        let e = refusal(base, &["solver.pace={fast=1,slow={by=2}}"]);
-        assert!(e.contains("solver.pace"), "{e}");
+        let e = refusal(&format!("{base}steps = 3\npasses = 4\n"), &[]);
+        assert!(e.starts_with("a.toml:3:1: passes: found steps beside it, expected one of steps, "), "{e}");
+        let e = refusal(base, &["steps=3", "passes=4"]);
+        assert!(e.starts_with("--set passes=4: passes: found steps beside it"), "{e}");
+        let e = refusal(base, &["pace={fast=1,slow={by=2}}"]);
+        assert!(e.contains("pace"), "{e}");
     }
 
     #[test]
     fn errors_of_a_stage_get_their_line() {
         let l = read("extends = 'plain'\n[encoder]\ngrowth = 2\nlevels = 9\n", &[]).unwrap();
-        let e = l.locate(l.spec.encoder.as_ref().unwrap().build().err().unwrap()).to_string();
+        let e = l.locate(plan(&l).err().unwrap()).to_string();
         assert_eq!(e, "a.toml:4:10: encoder.levels: found 9, expected another number");
     }
 
@@ -639,5 +728,39 @@ mod tests {
             e.contains("neither a shipped spec nor a file") && e.contains("\"plain\" (of plain, curved, timed)"),
             "{e}"
         );
+    }
+
+    #[test]
+    fn a_type_alone_is_a_spec_and_a_stage() {
+        let l = load("test-clock", &["seconds=3".into()], SHIPPED).unwrap();
+        assert_eq!(
+            (&l.tree["type"], &l.tree["name"], &l.tree["seconds"]),
+            (&"test-clock".into(), &"test-clock".into(), &3.0.into())
+        );
+        let l = read("type = 'test-field'\nencoder = 'test-grid'\n", &["encoder.levels=8"]).unwrap();
+        assert_eq!((&l.tree["encoder"]["type"], &l.tree["encoder"]["levels"]), (&"test-grid".into(), &8.into()));
+        let l = read("extends = 'plain'\nencoder = 'test-grid'\n", &[]).unwrap();
+        assert_eq!(l.tree["encoder"]["levels"], 4, "the default, not what the lower layer says");
+        let e = refusal("type = 'test-field'\nencoder = 'tets-grid'\n", &[]);
+        assert!(
+            e.starts_with("a.toml:2:11: encoder: found no encoder type \"tets-grid\", expected \"test-grid\""),
+            "{e}"
+        );
+        let e = refusal("type = 'test-field'\nencoder = 'test-stack'\n", &[]);
+        assert!(e.contains("encoder.below: found nothing"), "{e}");
+    }
+
+    #[test]
+    fn methods_of_a_chain_extend_other_specs() {
+        let text = "type = 'test-chain'\n[[methods]]\nextends = 'curved'\nencoder.growth = 3\n[[methods]]\nextends = 'timed'\n";
+        let l = read(text, &["methods.0.encoder.levels=8", "methods.1.steps=5"]).unwrap();
+        let [first, second] = [0, 1].map(|i| l.tree["methods"][i].clone());
+        assert_eq!((&first["encoder"]["levels"], &first["encoder"]["way"]), (&8.into(), &"round".into()));
+        assert!(first.get("name").is_none() && first["encoder"]["growth"] == 3.0);
+        assert_eq!((&second["steps"], &second["seconds"]), (&5.into(), &Value::Null));
+        let e = refusal("type = 'test-chain'\n[[methods]]\nextends = 'curved'\nencoder.grow = 3\n", &[]);
+        assert!(e.starts_with("a.toml:4:9: methods.0.encoder.grow: found an unknown key"), "{e}");
+        let again = read(&to_toml(&l.spec).unwrap(), &[]).unwrap();
+        assert_eq!(again.tree, l.tree);
     }
 }

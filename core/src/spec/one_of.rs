@@ -2,7 +2,7 @@
 //! one layer that says two is refused.
 
 use super::check::{Context, invalid, join, listed};
-use super::schema::{NESTED, ONE_OF, STAGES, of_type};
+use super::schema::{NESTED, ONE_OF, of_type};
 use super::tree::{Entry, Kind as Is, Node};
 use crate::error::Result;
 use crate::registry::{Kind, find};
@@ -10,13 +10,7 @@ use serde_json::Value;
 
 /// Leaves in the stages of `root`, of keys that exclude each other, those of the uppermost layer.
 pub(super) fn settle(root: &mut Node) {
-    for (key, kind) in STAGES {
-        let Some(node) = root.get_mut(key) else { continue };
-        match &mut node.kind {
-            Is::Array(items) => items.iter_mut().for_each(|n| stage(n, kind)),
-            _ => stage(node, kind),
-        }
-    }
+    stage(root, Kind::Method);
 }
 
 fn stage(node: &mut Node, kind: Kind) {

@@ -1,6 +1,6 @@
 //! JSON Schemas: of one stage type, and of a whole spec for editors.
 
-use super::{Plugins, Precision, Scene};
+use super::PluginPaths;
 use crate::registry::{Kind, StageType, stage_types};
 use serde_json::{Map, Value, json};
 
@@ -11,16 +11,6 @@ pub const NESTED: &str = "x-stage";
 /// Marks, in a settings schema, groups of keys of which a table has only one:
 /// `#[schemars(extend("x-one-of" = [["steps", "seconds"]]))]`.
 pub const ONE_OF: &str = "x-one-of";
-
-/// The keys of a spec that hold a stage, with the kind that stands there. `normalizers` is a list.
-pub(super) const STAGES: [(&str, Kind); 6] = [
-    ("encoder", Kind::Encoder),
-    ("normalizers", Kind::Normalizer),
-    ("field", Kind::Field),
-    ("projector", Kind::Projector),
-    ("initializer", Kind::Initializer),
-    ("solver", Kind::Solver),
-];
 
 /// The settings schema of a stage type, with its `type` key.
 pub(super) fn of_type(stage: &StageType) -> Value {
@@ -35,67 +25,68 @@ pub(super) fn of_type(stage: &StageType) -> Value {
     schema
 }
 
-/// The keys of a spec that hold settings of no stage, with their schemas.
-pub(super) fn tables() -> [(&'static str, Value); 3] {
-    let of = |schema: schemars::Schema| {
-        let mut schema = schema.to_value();
-        if let Value::Object(s) = &mut schema {
-            s.remove("$schema");
-        }
-        schema
-    };
+/// The schemas of the keys that every spec has beside those of its method.
+pub(super) fn label() -> [(&'static str, Value); 3] {
+    let mut plugins = schemars::schema_for!(PluginPaths).to_value();
+    if let Value::Object(s) = &mut plugins {
+        s.remove("$schema");
+        s.insert("description".into(), "Libraries with stages that the spec names.".into());
+    }
     [
-        ("scene", of(schemars::schema_for!(Scene))),
-        ("plugins", of(schemars::schema_for!(Plugins))),
-        ("precision", of(schemars::schema_for!(Precision))),
+        ("name", json!({ "type": "string", "description": "Short name, shown in tables." })),
+        ("description", json!({ "type": "string", "description": "What it is for, in a sentence." })),
+        ("plugins", plugins),
     ]
 }
 
-/// The JSON Schema of a spec file, for editors: every registered stage type with its settings.
-pub fn pipeline() -> Value {
+/// The JSON Schema of a spec file, for editors: every registered type with its settings.
+pub fn spec() -> Value {
     let mut defs = Map::new();
-    for (name, schema) in tables() {
-        defs.insert(name.into(), relocated(schema, name));
-    }
-    for (_, kind) in STAGES {
+    for &kind in Kind::ALL {
         let mut any = vec![];
+        // Types that have defaults for all their settings.
+        let mut alone = vec![];
         for t in stage_types().into_iter().filter(|t| t.kind == kind) {
-            let name = format!("{}.{}", kind.name(), t.name);
-            defs.insert(name.clone(), relocated(of_type(t), &name));
+            let (name, schema) = (format!("{}.{}", kind.name(), t.name), of_type(t));
+            if schema["required"].is_null() {
+                alone.push(t.name);
+            }
+            defs.insert(name.clone(), relocated(schema, &name));
             any.push(json!({ "$ref": format!("#/$defs/{name}") }));
         }
-        defs.insert(
-            kind.name().into(),
-            json!({ "type": "object", "properties": { "type": { "type": "string" } }, "anyOf": any }),
-        );
+        let table = json!({ "type": "object", "properties": { "type": { "type": "string" } }, "anyOf": any });
+        defs.insert(kind.name().into(), json!({ "anyOf": [{ "enum": alone }, table] }));
     }
-    let stage = |kind: &str, doc: &str| json!({ "$ref": format!("#/$defs/{kind}"), "description": doc });
+    let mut common = Map::new();
+    common.insert("$schema".into(), json!({ "type": "string", "description": "Where this schema is." }));
+    common.insert(
+        "extends".into(),
+        json!({ "type": "string", "description": "A shipped spec, or a file relative to this one, that this one changes." }),
+    );
+    for (key, schema) in label() {
+        common.insert(key.into(), relocated(schema, key));
+    }
+    // What a spec says beside its type goes with the type, or with that of the spec that it extends.
+    let methods = stage_types().into_iter().filter(|t| t.kind == Kind::Method);
+    let methods: Vec<Value> = methods
+        .map(|t| {
+            let mut schema = relocated(of_type(t), &format!("method.{}", t.name));
+            if let Some(p) = schema["properties"].as_object_mut() {
+                p.extend(common.clone());
+            }
+            if let Some(s) = schema.as_object_mut() {
+                s.remove("$defs");
+                s.remove("required");
+            }
+            schema
+        })
+        .collect();
     json!({
         "$schema": "https://json-schema.org/draft/2020-12/schema",
-        "title": "conefield pipeline",
-        "description": "A reconstruction pipeline. Every stage is a table with a `type`; its other keys are that type's settings. A file that `extends` another may leave out what it does not change.",
+        "title": "conefield spec",
+        "description": "A reconstruction method. `type` names it; the other keys are its settings. Every stage is a table with a `type`; its other keys are that type's settings. A stage with default settings may be the name of its type. A file that `extends` another may leave out what it does not change.",
         "type": "object",
-        "properties": {
-            "$schema": { "type": "string", "description": "Where this schema is." },
-            "extends": { "type": "string", "description": "A shipped spec, or a file relative to this one, that this one changes." },
-            "name": { "type": "string", "description": "Short name, shown in tables." },
-            "description": { "type": "string", "description": "What it is for, in a sentence." },
-            "scene": stage("scene", "How the scan is mapped to what stages see."),
-            "plugins": stage("plugins", "Libraries with stages that the spec names."),
-            "precision": stage("precision", "In which precision a field computes."),
-            "encoder": stage("encoder", "Points to features."),
-            "normalizers": {
-                "description": "Features to features, in order.",
-                "type": "array",
-                "items": { "$ref": "#/$defs/normalizer" },
-            },
-            "field": stage("field", "Features to attenuation."),
-            "projector": stage("projector", "Rays to samples."),
-            "initializer": stage("initializer", "Where weights come from."),
-            "solver": stage("solver", "Scan to volume."),
-        },
-        "additionalProperties": false,
-        "anyOf": [{ "required": ["extends"] }, { "required": ["solver"] }],
+        "allOf": [{ "anyOf": methods }, { "anyOf": [{ "required": ["extends"] }, { "required": ["type"] }] }],
         "$defs": defs,
     })
 }

@@ -1,45 +1,17 @@
-//! Stages as a spec writes them: a table with a `type`.
+//! Stages as a spec writes them: a table with a `type`, or the name of a type whose settings all have their default.
 //!
 //! `typetag` reads the types that are linked in. Those of loaded libraries it cannot see, as every library has statics
-//! of its own; [`one`] and [`list`] look their names up at run time.
+//! of its own; [`needed`] and [`list`] look their names up at run time.
 
-use super::{EncoderSpec, FieldSpec, InitializerSpec, NormalizerSpec, ProjectorSpec, SolverSpec};
-use crate::registry::{Kind, Make, MakeFn, Origin, find};
+use crate::method::Method;
+use crate::registry::{Kind, Origin, Settings, find};
 use serde::Deserialize;
 use serde::de::{DeserializeOwned, Deserializer, Error};
-use serde_json::Value;
+use serde_json::{Value, json};
 
-/// The settings of one kind of stage.
-pub trait Settings {
-    /// Which.
-    const KIND: Kind;
-
-    /// How a loaded type of this kind is made.
-    fn made_by(make: &Make) -> Option<&MakeFn<Self>>;
-}
-
-macro_rules! settings {
-    ($($kind:ident $spec:ident)*) => {$(
-        impl Settings for dyn $spec {
-            const KIND: Kind = Kind::$kind;
-
-            fn made_by(make: &Make) -> Option<&MakeFn<Self>> {
-                match make {
-                    Make::$kind(make) => Some(make),
-                    _ => None,
-                }
-            }
-        }
-    )*};
-}
-
-settings! {
-    Encoder EncoderSpec
-    Normalizer NormalizerSpec
-    Field FieldSpec
-    Projector ProjectorSpec
-    Initializer InitializerSpec
-    Solver SolverSpec
+/// Libraries bring stages, no methods.
+impl Settings for dyn Method {
+    const KIND: Kind = Kind::Method;
 }
 
 /// The settings that `value` says.
@@ -47,6 +19,9 @@ pub fn read<T: Settings + ?Sized>(mut value: Value) -> Result<Box<T>, String>
 where
     Box<T>: DeserializeOwned,
 {
+    if value.is_string() {
+        value = json!({ "type": value });
+    }
     let found = value["type"].as_str().and_then(|name| find(T::KIND, name));
     if let Some(Origin::Loaded { make, .. }) = found.map(|t| &t.origin)
         && let Some(make) = T::made_by(make)
@@ -58,15 +33,6 @@ where
         "." => e.inner().to_string(),
         path => format!("{path}: {}", e.inner()),
     })
-}
-
-/// For `#[serde(deserialize_with = …)]`: a stage that may be left out.
-pub fn one<'de, T: Settings + ?Sized, D: Deserializer<'de>>(from: D) -> Result<Option<Box<T>>, D::Error>
-where
-    Box<T>: DeserializeOwned,
-{
-    let value = Option::<Value>::deserialize(from)?.filter(|v| !v.is_null());
-    value.map(read).transpose().map_err(D::Error::custom)
 }
 
 /// For `#[serde(deserialize_with = …)]`: a stage.
@@ -84,4 +50,14 @@ where
 {
     let all = Vec::<Value>::deserialize(from)?.into_iter().enumerate();
     all.map(|(i, v)| read(v).map_err(|e| D::Error::custom(format!("{i}: {e}")))).collect()
+}
+
+/// The schema of a setting that is a stage: `#[schemars(schema_with = "…")]`.
+pub fn schema_of(kind: Kind) -> schemars::Schema {
+    schemars::json_schema!({ "x-stage": kind.name() })
+}
+
+/// The schema of a setting that is a list of stages.
+pub fn schema_of_list(kind: Kind) -> schemars::Schema {
+    schemars::json_schema!({ "type": "array", "items": { "x-stage": kind.name() } })
 }

@@ -153,9 +153,41 @@ impl Node {
         node
     }
 
+    /// Writes a stage that is only named as a table with that type.
+    pub(super) fn spell_out(&mut self) {
+        if let Kind::String(_) = self.kind {
+            let at = self.at.clone();
+            let value = std::mem::replace(self, Self::empty_table(at.clone()));
+            self.kind = Kind::Table(vec![Entry { key: "type".into(), at, value }]);
+        }
+    }
+
+    /// Appends the items of a list to that at `path`, which is made where it is not there.
+    pub(super) fn push_all(&mut self, path: &[&str], items: Node) {
+        let at = items.at.clone();
+        match (path, &mut self.kind, items.kind) {
+            ([key, rest @ ..], Kind::Table(entries), kind) => {
+                let found = entries.iter().position(|e| e.key == *key);
+                let i = found.unwrap_or_else(|| {
+                    let fresh = if rest.is_empty() { Kind::Array(vec![]) } else { Kind::Table(vec![]) };
+                    let value = Node { at: at.clone(), kind: fresh };
+                    entries.push(Entry { key: (*key).into(), at: at.clone(), value });
+                    entries.len() - 1
+                });
+                entries[i].value.push_all(rest, Node { at, kind });
+            }
+            ([], Kind::Array(all), Kind::Array(items)) => all.extend(items),
+            _ => {}
+        }
+    }
+
     /// Lays `over` on top: tables merge, everything else is replaced. A table of another `type` replaces too, as
-    /// the keys of one type mean nothing to another.
+    /// the keys of one type mean nothing to another. A table without a `type` over a stage that is only named changes
+    /// settings of that stage.
     pub(super) fn merge(&mut self, over: Node) {
+        if matches!(over.kind, Kind::Table(_)) && over.get("type").is_none() {
+            self.spell_out();
+        }
         let retyped = match (self.get("type"), over.get("type")) {
             (Some(a), Some(b)) => a.text() != b.text(),
             _ => false,

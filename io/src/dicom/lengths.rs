@@ -27,7 +27,7 @@ const UNDEFINED: u32 = u32::MAX;
 
 /// What a file has for pixels.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub(super) enum Pixels {
+pub(super) enum PixelStorage {
     None,
     /// This many bytes as they are.
     Plain(u64),
@@ -35,7 +35,7 @@ pub(super) enum Pixels {
     Packed(u64),
 }
 
-impl Pixels {
+impl PixelStorage {
     /// Refuses a picture of `count` values of `size` bytes that cannot come from this many.
     pub fn must_hold(self, place: &str, count: u64, size: u64) -> Result<()> {
         let want = count * size;
@@ -69,7 +69,7 @@ enum Level {
     Pieces,
 }
 
-struct Walk {
+struct ElementWalk {
     place: String,
     reader: BufReader<File>,
     at: u64,
@@ -79,17 +79,17 @@ struct Walk {
 
 /// Walks along `path`, which carries DICOM's mark, up to the end of its pixels: what they are, and the byte behind
 /// them, after which nothing has been looked at.
-pub(super) fn check(path: &Path) -> Result<(Pixels, u64)> {
+pub(super) fn check(path: &Path) -> Result<(PixelStorage, u64)> {
     let io = |e| Error::io(path, e);
     let (file, size) = files::open(path)?;
     let mut reader = BufReader::new(file);
     reader.seek(SeekFrom::Start(132)).map_err(io)?;
     let coding = Coding { explicit: true, big: false };
-    Walk { place: path.display().to_string(), reader, at: 132, size, coding }.run()
+    ElementWalk { place: path.display().to_string(), reader, at: 132, size, coding }.run()
 }
 
-impl Walk {
-    fn run(mut self) -> Result<(Pixels, u64)> {
+impl ElementWalk {
+    fn run(mut self) -> Result<(PixelStorage, u64)> {
         let mut stack: Vec<Level> = Vec::new();
         let mut syntax = None;
         // The description of the file is explicit and little-endian whatever the rest is.
@@ -100,76 +100,107 @@ impl Walk {
                 stack.pop();
             }
             if self.at == self.size {
-                return Ok((Pixels::None, self.at));
+                return Ok((PixelStorage::None, self.at));
             }
-            if self.at > LONGEST_HEADER {
-                let found = format!("no PixelData in {LONGEST_HEADER} bytes");
-                return Err(self.invalid("elements", found, "a shorter header"));
-            }
-            if stack.len() > DEEPEST {
-                let found = format!("more than {DEEPEST} levels at byte {}", self.at);
-                return Err(self.invalid("sequences", found, "fewer levels"));
-            }
+            self.refuse_endless(stack.len())?;
             if !in_rest && self.peek_group()? != 2 {
                 in_rest = true;
-                // `dicom-object` trusts this length: what it took for a part of the description would go unchecked.
-                if self.at != description_end {
-                    let expected = format!("{}, where other elements begin", self.at);
-                    return Err(self.invalid(
-                        "FileMetaInformationGroupLength",
-                        format!("an end at byte {description_end}"),
-                        &expected,
-                    ));
-                }
+                self.refuse_other_end(description_end)?;
                 self.coding = coding(&self.place, syntax.as_deref())?;
             }
             let tag = self.tag()?;
             if tag.group() == 0xfffe {
-                let length = self.u32()?;
-                match (tag, stack.last()) {
-                    (ITEM, Some(Level::Pieces)) => self.skip(tag, length)?,
-                    (ITEM, _) if length == UNDEFINED => stack.push(Level::Delimited(self.coding)),
-                    (ITEM, _) => stack.push(Level::Until(self.end(tag, length)?)),
-                    (ITEM_END | SEQUENCE_END, Some(Level::Delimited(before))) => {
-                        self.coding = *before;
-                        stack.pop();
-                    }
-                    (SEQUENCE_END, Some(Level::Pieces)) => {
-                        stack.pop();
-                    }
-                    // Behind an item or sequence of known length a delimiter means nothing.
-                    (ITEM_END | SEQUENCE_END, Some(Level::Until(_))) => {}
-                    _ => return Err(self.invalid("elements", format!("{tag} at byte {}", self.at), "an element")),
-                }
+                self.delimiter(tag, &mut stack)?;
                 continue;
             }
             let (kind, length) = self.kind_and_length(tag)?;
-            let (sequence, unknown) = (self.coding.explicit && kind == VR::SQ, self.coding.explicit && kind == VR::UN);
             if tag == PIXELS && stack.is_empty() {
                 return match length {
                     UNDEFINED => self.pieces(),
-                    n => self.end(tag, n).map(|end| (Pixels::Plain(u64::from(n)), end)),
+                    n => self.end(tag, n).map(|end| (PixelStorage::Plain(u64::from(n)), end)),
                 };
             }
+            let sequence = self.coding.explicit && kind == VR::SQ;
             if length == UNDEFINED {
-                let implicit = !self.coding.explicit;
-                stack.push(if sequence || unknown || implicit { Level::Delimited(self.coding) } else { Level::Pieces });
-                // Inside an unknown element of unknown length no kinds are given, by the standard.
-                if unknown {
-                    self.coding.explicit = false;
-                }
+                stack.push(self.undefined(kind));
             } else if sequence || (!self.coding.explicit && self.starts_with_item(length)?) {
                 stack.push(Level::Until(self.end(tag, length)?));
             } else if tag == SYNTAX {
-                self.end(tag, length)?;
-                let mut text = vec![0; length.min(64) as usize];
-                self.read(&mut text)?;
-                self.skip(tag, length - text.len() as u32)?;
-                syntax = Some(String::from_utf8_lossy(&text).trim_end_matches(['\0', ' ']).to_owned());
+                syntax = Some(self.syntax(length)?);
             } else {
                 self.skip(tag, length)?;
             }
         }
+    }
+
+    fn refuse_endless(&self, levels: usize) -> Result<()> {
+        if self.at > LONGEST_HEADER {
+            let found = format!("no PixelData in {LONGEST_HEADER} bytes");
+            return Err(self.invalid("elements", found, "a shorter header"));
+        }
+        if levels > DEEPEST {
+            let found = format!("more than {DEEPEST} levels at byte {}", self.at);
+            return Err(self.invalid("sequences", found, "fewer levels"));
+        }
+        Ok(())
+    }
+
+    /// Refuses a description that ends elsewhere than it says. `dicom-object` trusts that length: what it took for a
+    /// part of the description would go unchecked.
+    fn refuse_other_end(&self, description_end: u64) -> Result<()> {
+        if self.at == description_end {
+            return Ok(());
+        }
+        let found = format!("an end at byte {description_end}");
+        let expected = format!("{}, where other elements begin", self.at);
+        Err(self.invalid("FileMetaInformationGroupLength", found, &expected))
+    }
+
+    /// The start or end of an item or sequence.
+    fn delimiter(&mut self, tag: Tag, stack: &mut Vec<Level>) -> Result<()> {
+        let length = self.u32()?;
+        match (tag, stack.last()) {
+            (ITEM, Some(Level::Pieces)) => self.skip(tag, length)?,
+            (ITEM, _) if length == UNDEFINED => stack.push(Level::Delimited(self.coding)),
+            (ITEM, _) => stack.push(Level::Until(self.end(tag, length)?)),
+            (ITEM_END | SEQUENCE_END, Some(Level::Delimited(before))) => {
+                self.coding = *before;
+                stack.pop();
+            }
+            (SEQUENCE_END, Some(Level::Pieces)) => {
+                stack.pop();
+            }
+            // Behind an item or sequence of known length a delimiter means nothing.
+            (ITEM_END | SEQUENCE_END, Some(Level::Until(_))) => {}
+            _ => return Err(self.invalid("elements", format!("{tag} at byte {}", self.at), "an element")),
+        }
+        Ok(())
+    }
+
+    /// What an element of undefined length opens.
+    fn undefined(&mut self, kind: VR) -> Level {
+        if !self.coding.explicit {
+            return Level::Delimited(self.coding);
+        }
+        match kind {
+            VR::SQ => Level::Delimited(self.coding),
+            VR::UN => {
+                let level = Level::Delimited(self.coding);
+                // Inside an unknown element of undefined length no kinds are given, by the standard.
+                self.coding.explicit = false;
+                level
+            }
+            _ => Level::Pieces,
+        }
+    }
+
+    /// The transfer syntax that the rest of the file is in.
+    fn syntax(&mut self, length: u32) -> Result<String> {
+        self.end(SYNTAX, length)?;
+        let mut text = vec![0; length.min(64) as usize];
+        self.read(&mut text)?;
+        self.skip(SYNTAX, length - text.len() as u32)?;
+        Ok(String::from_utf8_lossy(&text).trim_end_matches(['\0', ' ']).to_owned())
     }
 
     /// Where the file's description ends, as its first element says.
@@ -191,7 +222,7 @@ impl Walk {
     }
 
     /// The pieces of a compressed picture, up to their delimiter or the end of the file.
-    fn pieces(mut self) -> Result<(Pixels, u64)> {
+    fn pieces(mut self) -> Result<(PixelStorage, u64)> {
         let start = self.at;
         while self.at < self.size {
             let tag = self.tag()?;
@@ -208,7 +239,7 @@ impl Walk {
                 }
             }
         }
-        Ok((Pixels::Packed(self.at - start), self.at))
+        Ok((PixelStorage::Packed(self.at - start), self.at))
     }
 
     /// The kind of an element's values and its length, which must be one of whole values.

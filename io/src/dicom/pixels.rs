@@ -8,7 +8,7 @@ use jpeg_decoder::Decoder;
 
 /// How values are stored.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub(super) struct Format {
+pub(super) struct PixelFormat {
     pub rows: usize,
     pub columns: usize,
     /// Bytes a value: 1, 2 or 4.
@@ -19,7 +19,7 @@ pub(super) struct Format {
     pub signed: bool,
 }
 
-impl Format {
+impl PixelFormat {
     pub fn count(&self) -> usize {
         self.rows * self.columns
     }
@@ -69,7 +69,7 @@ pub(super) fn values(
     place: &str,
     object: &DefaultDicomObject,
     element: &InMemElement,
-    format: &Format,
+    format: &PixelFormat,
 ) -> Result<Vec<i64>> {
     let fail = |found: String, expected: String| Error::invalid(place, "PixelData", found, expected);
     let bits = match packing(place, object.meta().transfer_syntax())? {
@@ -90,7 +90,7 @@ pub(super) fn values(
     Ok(bits.into_iter().map(|b| format.number(b)).collect())
 }
 
-fn plain(element: &InMemElement, format: &Format) -> Result<Vec<u32>, String> {
+fn plain(element: &InMemElement, format: &PixelFormat) -> Result<Vec<u32>, String> {
     let count = format.count();
     let value = element.value().primitive().ok_or("a compressed picture in an uncompressed file")?;
     // Words come in the machine's order already; what is read as bytes is little-endian.
@@ -112,7 +112,7 @@ fn plain(element: &InMemElement, format: &Format) -> Result<Vec<u32>, String> {
 }
 
 /// DICOM's run-length coding: for each byte of a value, the highest first, one run of PackBits.
-fn run_length(bytes: &[u8], format: &Format) -> Result<Vec<u32>, String> {
+fn run_length(bytes: &[u8], format: &PixelFormat) -> Result<Vec<u32>, String> {
     let word = |k: usize| bytes.get(4 * k..4 * k + 4).map(|b| b.iter().rev().fold(0, |w, b| w << 8 | usize::from(*b)));
     let header = || format!("{} bytes without a run-length header", bytes.len());
     let segments = word(0).ok_or_else(header)?;
@@ -171,7 +171,7 @@ impl Iterator for Runs<'_> {
 }
 
 /// JPEG of one channel; the picture's own size is compared before memory is taken for it.
-fn jpeg(bytes: &[u8], format: &Format) -> Result<Vec<u32>, String> {
+fn jpeg(bytes: &[u8], format: &PixelFormat) -> Result<Vec<u32>, String> {
     let (precision, rows, columns, channels) = frame(bytes).ok_or("no JPEG picture")?;
     if (rows, columns, channels) != (format.rows, format.columns, 1) {
         return Err(format!("a JPEG picture of {rows} rows, {columns} columns and {channels} channels"));
@@ -211,7 +211,7 @@ fn frame(bytes: &[u8]) -> Option<(u8, usize, usize, u8)> {
 mod tests {
     use super::*;
 
-    const TWO: Format = Format { rows: 2, columns: 3, bytes: 2, stored: 12, high: 11, signed: true };
+    const TWO: PixelFormat = PixelFormat { rows: 2, columns: 3, bytes: 2, stored: 12, high: 11, signed: true };
 
     fn segments(parts: &[&[u8]]) -> Vec<u8> {
         let mut out = (parts.len() as u32).to_le_bytes().to_vec();
@@ -227,11 +227,11 @@ mod tests {
     #[test]
     fn bits_that_count_become_numbers() {
         assert_eq!([0x7ff, 0x800, 0xffff, 0xf001].map(|b| TWO.number(b)), [2047, -2048, -1, 1]);
-        let upper = Format { high: 15, signed: false, ..TWO };
+        let upper = PixelFormat { high: 15, signed: false, ..TWO };
         assert_eq!(upper.number(0xabcd), 0xabc);
-        let all = Format { bytes: 4, stored: 32, high: 31, ..TWO };
-        assert_eq!([all.number(u32::MAX), Format { signed: false, ..all }.number(u32::MAX)], [-1, 0xffff_ffff]);
-        let bit = Format { bytes: 1, stored: 1, high: 0, signed: false, ..TWO };
+        let all = PixelFormat { bytes: 4, stored: 32, high: 31, ..TWO };
+        assert_eq!([all.number(u32::MAX), PixelFormat { signed: false, ..all }.number(u32::MAX)], [-1, 0xffff_ffff]);
+        let bit = PixelFormat { bytes: 1, stored: 1, high: 0, signed: false, ..TWO };
         assert_eq!(bit.number(3), 1);
     }
 
@@ -282,7 +282,7 @@ mod tests {
 
     #[test]
     fn lossless_jpeg_is_read() {
-        let all = Format { stored: 16, high: 15, ..TWO };
+        let all = PixelFormat { stored: 16, high: 15, ..TWO };
         let found: Vec<i64> = jpeg(&JPEG, &all).unwrap().into_iter().map(|b| all.number(b)).collect();
         assert_eq!(found, [100, 101, 99, -5, 2047, -2048]);
     }

@@ -1,7 +1,7 @@
 //! What a volume needs of one file of a series.
 
-use super::lengths::{self, Pixels};
-use super::pixels::{self, Format};
+use super::lengths::{self, PixelStorage};
+use super::pixels::{self, PixelFormat};
 use conefield_core::geometry::{dot, norm};
 use conefield_core::{Error, Result, files};
 use dicom_object::{DefaultDicomObject, OpenFileOptions, Tag};
@@ -9,27 +9,27 @@ use std::io::Read;
 use std::path::{Path, PathBuf};
 
 /// An element with the name that errors give it.
-type Field = (Tag, &'static str);
+type Attribute = (Tag, &'static str);
 
-const PIXEL_DATA: Field = (Tag(0x7fe0, 0x0010), "PixelData");
-const SERIES: Field = (Tag(0x0020, 0x000e), "SeriesInstanceUID");
-const SERIES_NAME: Field = (Tag(0x0008, 0x103e), "SeriesDescription");
-const MODALITY: Field = (Tag(0x0008, 0x0060), "Modality");
-const ORIENTATION: Field = (Tag(0x0020, 0x0037), "ImageOrientationPatient");
-const POSITION: Field = (Tag(0x0020, 0x0032), "ImagePositionPatient");
-const SPACING: Field = (Tag(0x0028, 0x0030), "PixelSpacing");
-const THICKNESS: Field = (Tag(0x0018, 0x0050), "SliceThickness");
-const BETWEEN: Field = (Tag(0x0018, 0x0088), "SpacingBetweenSlices");
-const SLOPE: Field = (Tag(0x0028, 0x1053), "RescaleSlope");
-const INTERCEPT: Field = (Tag(0x0028, 0x1052), "RescaleIntercept");
-const ROWS: Field = (Tag(0x0028, 0x0010), "Rows");
-const COLUMNS: Field = (Tag(0x0028, 0x0011), "Columns");
-const SAMPLES: Field = (Tag(0x0028, 0x0002), "SamplesPerPixel");
-const FRAMES: Field = (Tag(0x0028, 0x0008), "NumberOfFrames");
-const ALLOCATED: Field = (Tag(0x0028, 0x0100), "BitsAllocated");
-const STORED: Field = (Tag(0x0028, 0x0101), "BitsStored");
-const HIGH: Field = (Tag(0x0028, 0x0102), "HighBit");
-const SIGN: Field = (Tag(0x0028, 0x0103), "PixelRepresentation");
+const PIXEL_DATA: Attribute = (Tag(0x7fe0, 0x0010), "PixelData");
+const SERIES: Attribute = (Tag(0x0020, 0x000e), "SeriesInstanceUID");
+const SERIES_NAME: Attribute = (Tag(0x0008, 0x103e), "SeriesDescription");
+const MODALITY: Attribute = (Tag(0x0008, 0x0060), "Modality");
+const ORIENTATION: Attribute = (Tag(0x0020, 0x0037), "ImageOrientationPatient");
+const POSITION: Attribute = (Tag(0x0020, 0x0032), "ImagePositionPatient");
+const SPACING: Attribute = (Tag(0x0028, 0x0030), "PixelSpacing");
+const THICKNESS: Attribute = (Tag(0x0018, 0x0050), "SliceThickness");
+const BETWEEN: Attribute = (Tag(0x0018, 0x0088), "SpacingBetweenSlices");
+const SLOPE: Attribute = (Tag(0x0028, 0x1053), "RescaleSlope");
+const INTERCEPT: Attribute = (Tag(0x0028, 0x1052), "RescaleIntercept");
+const ROWS: Attribute = (Tag(0x0028, 0x0010), "Rows");
+const COLUMNS: Attribute = (Tag(0x0028, 0x0011), "Columns");
+const SAMPLES: Attribute = (Tag(0x0028, 0x0002), "SamplesPerPixel");
+const FRAMES: Attribute = (Tag(0x0028, 0x0008), "NumberOfFrames");
+const ALLOCATED: Attribute = (Tag(0x0028, 0x0100), "BitsAllocated");
+const STORED: Attribute = (Tag(0x0028, 0x0101), "BitsStored");
+const HIGH: Attribute = (Tag(0x0028, 0x0102), "HighBit");
+const SIGN: Attribute = (Tag(0x0028, 0x0103), "PixelRepresentation");
 
 /// One slice without its values; lengths in mm, directions LPS.
 #[derive(Debug)]
@@ -51,7 +51,7 @@ pub(super) struct Slice {
     rescale: [f64; 2],
     pub rows: usize,
     pub columns: usize,
-    format: Format,
+    format: PixelFormat,
 }
 
 /// An open file's elements.
@@ -61,17 +61,17 @@ struct Elements<'a> {
 }
 
 impl Elements<'_> {
-    fn invalid(&self, field: Field, found: impl ToString, expected: &str) -> Error {
+    fn invalid(&self, field: Attribute, found: impl ToString, expected: &str) -> Error {
         Error::invalid(self.place, field.1, found, expected)
     }
 
-    fn text(&self, field: Field) -> Option<String> {
+    fn text(&self, field: Attribute) -> Option<String> {
         let text = self.object.get(field.0)?.to_str().ok()?;
         Some(text.trim_end_matches(['\0', ' ']).trim_start().to_owned()).filter(|t| !t.is_empty())
     }
 
     /// `N` finite numbers, or `None` without such an element.
-    fn numbers<const N: usize>(&self, field: Field) -> Result<Option<[f64; N]>> {
+    fn numbers<const N: usize>(&self, field: Attribute) -> Result<Option<[f64; N]>> {
         let Some(element) = self.object.get(field.0).filter(|e| e.value().multiplicity() > 0) else { return Ok(None) };
         let expected = || format!("{N} finite numbers");
         let all = element.to_multi_float64().map_err(|e| self.invalid(field, e, &expected()))?;
@@ -82,17 +82,23 @@ impl Elements<'_> {
         }
     }
 
-    fn required<const N: usize>(&self, field: Field) -> Result<[f64; N]> {
+    fn required<const N: usize>(&self, field: Attribute) -> Result<[f64; N]> {
         self.numbers(field)?.ok_or_else(|| self.invalid(field, "no such element", &format!("{N} numbers")))
     }
 
-    fn whole(&self, field: Field) -> Result<Option<i64>> {
+    fn whole(&self, field: Attribute) -> Result<Option<i64>> {
         let Some(element) = self.object.get(field.0).filter(|e| e.value().multiplicity() > 0) else { return Ok(None) };
         element.to_int().map(Some).map_err(|e| self.invalid(field, e, "a whole number"))
     }
 
     /// A whole number that `fits`, or `default` without such an element.
-    fn within(&self, field: Field, default: Option<i64>, fits: impl Fn(i64) -> bool, expected: &str) -> Result<i64> {
+    fn within(
+        &self,
+        field: Attribute,
+        default: Option<i64>,
+        fits: impl Fn(i64) -> bool,
+        expected: &str,
+    ) -> Result<i64> {
         match self.whole(field)?.or(default) {
             Some(n) if fits(n) => Ok(n),
             Some(n) => Err(self.invalid(field, n, expected)),
@@ -100,7 +106,7 @@ impl Elements<'_> {
         }
     }
 
-    fn format(&self) -> Result<Format> {
+    fn format(&self) -> Result<PixelFormat> {
         let side = |field| self.within(field, None, |n| (1..=65535).contains(&n), "1 to 65535");
         let (rows, columns) = (side(ROWS)?, side(COLUMNS)?);
         self.within(SAMPLES, Some(1), |n| n == 1, "1: one number a pixel")?;
@@ -110,7 +116,7 @@ impl Elements<'_> {
         let in_range = |n| (stored - 1..allocated).contains(&n);
         let high = self.within(HIGH, Some(stored - 1), in_range, "BitsStored - 1 to BitsAllocated - 1")?;
         let sign = self.within(SIGN, Some(0), |n| n == 0 || n == 1, "0 (unsigned) or 1 (signed)")?;
-        Ok(Format {
+        Ok(PixelFormat {
             rows: rows as usize,
             columns: columns as usize,
             bytes: allocated as usize / 8,
@@ -140,7 +146,7 @@ impl Slice {
     pub fn read(path: &Path) -> Result<Option<Self>> {
         let place = path.display().to_string();
         let (pixels, end) = lengths::check(path)?;
-        if pixels == Pixels::None {
+        if pixels == PixelStorage::None {
             tracing::warn!("{place}: left out, there is no picture in it");
             return Ok(None);
         }
@@ -184,7 +190,7 @@ impl Slice {
 
     /// Refuses a slice of another size, pixel size or orientation than `first`.
     pub fn must_fit(&self, first: &Self) -> Result<()> {
-        let refuse = |field: Field, found: String, want: String| {
+        let refuse = |field: Attribute, found: String, want: String| {
             let expected = format!("{want}, as in {}", first.name());
             Err(Error::invalid(self.path.display().to_string(), field.1, found, expected))
         };

@@ -2,7 +2,7 @@
 
 use super::value::{Heap, Node, Refusal, Value};
 use crate::npy::element;
-use crate::number::{Number, Order};
+use crate::number::{ByteOrder, Number};
 
 /// More axes than a scan or volume has.
 const MOST_AXES: usize = 8;
@@ -55,7 +55,7 @@ impl Global {
 #[derive(Debug, Clone, Copy)]
 pub(super) struct Dtype {
     number: Number,
-    order: Order,
+    order: ByteOrder,
 }
 
 impl Dtype {
@@ -82,8 +82,8 @@ impl Dtype {
             return Err(Refusal::new("a dtype with fields or a subarray", "a dtype of plain numbers"));
         }
         let order = match heap.text(*order) {
-            Some("<") => Order::Little,
-            Some(">") => Order::Big,
+            Some("<") => ByteOrder::Little,
+            Some(">") => ByteOrder::Big,
             Some("|" | "=") => self.order,
             _ => return Err(wrong()),
         };

@@ -7,7 +7,7 @@ use conefield_core::{Error, Result};
 use std::collections::HashSet;
 use std::io::{Read, Seek, SeekFrom};
 
-struct Walk<'a, R> {
+struct EntryWalk<'a, R> {
     reader: &'a mut R,
     little: bool,
     big_tiff: bool,
@@ -20,7 +20,7 @@ pub(super) fn check(place: &str, reader: &mut (impl Read + Seek), size: u64) -> 
         return Ok(());
     }
     let little = mark[0] == b'I';
-    let mut walk = Walk { reader, little, big_tiff: mark[if little { 2 } else { 3 }] == 43 };
+    let mut walk = EntryWalk { reader, little, big_tiff: mark[if little { 2 } else { 3 }] == 43 };
     let mut page = 0;
     let mut seen = HashSet::new();
     let mut next = walk.first();
@@ -34,7 +34,7 @@ pub(super) fn check(place: &str, reader: &mut (impl Read + Seek), size: u64) -> 
     Ok(())
 }
 
-impl<R: Read + Seek> Walk<'_, R> {
+impl<R: Read + Seek> EntryWalk<'_, R> {
     /// Where the first directory stands.
     fn first(&mut self) -> Option<u64> {
         if self.big_tiff {

@@ -364,40 +364,6 @@ typedef struct ConefieldReduced {
 } ConefieldReduced;
 
 /*
- What a normalizer may look at between steps.
- */
-typedef struct ConefieldProbe {
-  /*
-   To be handed to the functions below.
-   */
-  void *context;
-  /*
-   The encoder's features, `[width][count]`, at `count` points `x, y, z` of the unit cube.
-   */
-  ConefieldStatus (*encode)(void *context, const float *points, size_t count, float *features);
-  /*
-   The unit-cube position of the centre of voxel `x, y, z`.
-   */
-  void (*voxel)(void *context, size_t x, size_t y, size_t z, float *position);
-  /*
-   Channels still computed.
-   */
-  size_t width;
-  /*
-   Voxels of the volume to be exported along x, y, z.
-   */
-  size_t shape[3];
-  /*
-   Finished passes over all views.
-   */
-  double epoch;
-  /*
-   1 if channels stand in order from coarse to fine.
-   */
-  uint32_t coarse_to_fine;
-} ConefieldProbe;
-
-/*
  Functions of an encoder, a normalizer or a field. `stage` is what `create` made.
  */
 typedef struct ConefieldMap {
@@ -468,8 +434,8 @@ typedef struct ConefieldMap {
    */
   ConefieldStatus (*partition)(const void *stage, size_t index, struct ConefieldRange *range);
   /*
-   Makes the stage that computes only the outputs `keep` (`side` is [`CONEFIELD_OUTPUTS`]) or does without the inputs
-   that are not in `keep` ([`CONEFIELD_INPUTS`]); `keep` ascends. NULL: it cannot, and masks that need it are refused.
+   Makes of an encoder the one that computes only the outputs `keep` (`side` is [`CONEFIELD_OUTPUTS`]), of a normalizer or
+   a field the one without the inputs that are not in `keep` ([`CONEFIELD_INPUTS`]); `keep` ascends. NULL: it cannot, and masks that need it are refused.
    */
   ConefieldStatus (*reduce)(const void *stage,
                             uint32_t side,
@@ -477,21 +443,6 @@ typedef struct ConefieldMap {
                             size_t keep_count,
                             struct ConefieldReduced *reduced,
                             struct ConefieldText *error);
-  /*
-   Of a normalizer, before every step. To remove channels for good: writes those that stay, ascending, to `keep` (room
-   for `probe.width`), sets `keep_count`, and says in `report` what was measured. Otherwise sets `keep_count` to
-   `SIZE_MAX`. NULL: it never removes any.
-   */
-  ConefieldStatus (*refresh)(const void *stage,
-                             const struct ConefieldProbe *probe,
-                             size_t *keep,
-                             size_t *keep_count,
-                             struct ConefieldText *report,
-                             struct ConefieldText *error);
-  /*
-   Of a normalizer: a resumed run removes channels as `refresh` once decided, it must not decide again. May be NULL.
-   */
-  void (*decided)(const void *stage);
   /*
    WGSL of the same formula: functions `stage_forward` and `stage_backward` of a row, as docs/plugins.md says. NULL:
    it runs on the CPU alone.

@@ -13,7 +13,7 @@
 //!   nothing (no channels, no parameters). Floats are aligned to their own size and no more.
 //! - **Threads.** A stage is called from many threads at once: `info`, `parameter`, `partition`, `describe`, `init`,
 //!   `passes`, every `forward…` and `backward…`, `resolutions`, `max_samples`, `sample`, `integrate`, `adjoint`, `apply` and
-//!   `wgsl` must allow that. `create`, `destroy`, `reduce`, `fitted`, `refresh` and `decided` of one stage are not called at
+//!   `wgsl` must allow that. `create`, `destroy`, `reduce` and `fitted` of one stage are not called at
 //!   the same time as anything else of that stage, though from any thread.
 //! - **Unwinding** must not leave the library: catch panics and exceptions, return [`CONEFIELD_PANICKED`].
 //! - **Same bits.** The result must not depend on threads, on time, or on how rows are dealt to tiles.
@@ -243,33 +243,6 @@ pub struct ConefieldReduced {
     pub channels_count: usize,
 }
 
-/// What a normalizer may look at between steps.
-#[repr(C)]
-#[derive(Debug, Clone, Copy)]
-pub struct ConefieldProbe {
-    /// To be handed to the functions below.
-    pub context: *mut c_void,
-    /// The encoder's features, `[width][count]`, at `count` points `x, y, z` of the unit cube.
-    pub encode: Option<
-        unsafe extern "C" fn(
-            context: *mut c_void,
-            points: *const f32,
-            count: usize,
-            features: *mut f32,
-        ) -> ConefieldStatus,
-    >,
-    /// The unit-cube position of the centre of voxel `x, y, z`.
-    pub voxel: Option<unsafe extern "C" fn(context: *mut c_void, x: usize, y: usize, z: usize, position: *mut f32)>,
-    /// Channels still computed.
-    pub width: usize,
-    /// Voxels of the volume to be exported along x, y, z.
-    pub shape: [usize; 3],
-    /// Finished passes over all views.
-    pub epoch: f64,
-    /// 1 if channels stand in order from coarse to fine.
-    pub coarse_to_fine: u32,
-}
-
 /// Functions of an encoder, a normalizer or a field. `stage` is what `create` made.
 #[repr(C)]
 #[derive(Debug, Clone, Copy)]
@@ -345,8 +318,8 @@ pub struct ConefieldMap {
     /// Range `index` of the parameters that a worker may own; ranges are disjoint, ascending and cover all. NULL: one range.
     pub partition:
         Option<unsafe extern "C" fn(stage: *const c_void, index: usize, range: *mut ConefieldRange) -> ConefieldStatus>,
-    /// Makes the stage that computes only the outputs `keep` (`side` is [`CONEFIELD_OUTPUTS`]) or does without the inputs
-    /// that are not in `keep` ([`CONEFIELD_INPUTS`]); `keep` ascends. NULL: it cannot, and masks that need it are refused.
+    /// Makes of an encoder the one that computes only the outputs `keep` (`side` is [`CONEFIELD_OUTPUTS`]), of a normalizer or
+    /// a field the one without the inputs that are not in `keep` ([`CONEFIELD_INPUTS`]); `keep` ascends. NULL: it cannot, and masks that need it are refused.
     pub reduce: Option<
         unsafe extern "C" fn(
             stage: *const c_void,
@@ -357,21 +330,6 @@ pub struct ConefieldMap {
             error: *mut ConefieldText,
         ) -> ConefieldStatus,
     >,
-    /// Of a normalizer, before every step. To remove channels for good: writes those that stay, ascending, to `keep` (room
-    /// for `probe.width`), sets `keep_count`, and says in `report` what was measured. Otherwise sets `keep_count` to
-    /// `SIZE_MAX`. NULL: it never removes any.
-    pub refresh: Option<
-        unsafe extern "C" fn(
-            stage: *const c_void,
-            probe: *const ConefieldProbe,
-            keep: *mut usize,
-            keep_count: *mut usize,
-            report: *mut ConefieldText,
-            error: *mut ConefieldText,
-        ) -> ConefieldStatus,
-    >,
-    /// Of a normalizer: a resumed run removes channels as `refresh` once decided, it must not decide again. May be NULL.
-    pub decided: Option<unsafe extern "C" fn(stage: *const c_void)>,
     /// WGSL of the same formula: functions `stage_forward` and `stage_backward` of a row, as docs/plugins.md says. NULL:
     /// it runs on the CPU alone.
     pub wgsl: Option<unsafe extern "C" fn(stage: *const c_void, source: *mut ConefieldText) -> ConefieldStatus>,

@@ -68,7 +68,6 @@ fn the_layout_is_pinned() {
         size_of::<ConefieldParameter>(),
         size_of::<ConefieldRange>(),
         size_of::<ConefieldReduced>(),
-        size_of::<ConefieldProbe>(),
         size_of::<ConefieldMap>(),
         size_of::<ConefieldRay>(),
         size_of::<ConefieldLengths>(),
@@ -78,7 +77,7 @@ fn the_layout_is_pinned() {
         size_of::<ConefieldStage>(),
         size_of::<ConefieldPlugin>(),
     ];
-    assert_eq!(sizes, [16, 24, 32, 32, 24, 80, 32, 16, 40, 72, 152, 44, 16, 56, 48, 16, 112, 88]);
+    assert_eq!(sizes, [16, 24, 32, 32, 24, 80, 32, 16, 40, 136, 44, 16, 56, 48, 16, 112, 88]);
     let plugin = [
         offset_of!(ConefieldPlugin, size),
         offset_of!(ConefieldPlugin, abi_major),
@@ -116,8 +115,6 @@ fn the_layout_is_pinned() {
         offset_of!(ConefieldMap, backward_f64),
         offset_of!(ConefieldMap, partition),
         offset_of!(ConefieldMap, reduce),
-        offset_of!(ConefieldMap, refresh),
-        offset_of!(ConefieldMap, decided),
         offset_of!(ConefieldMap, wgsl),
         offset_of!(ConefieldMap, passes),
         offset_of!(ConefieldMap, forward_pass),
@@ -126,7 +123,7 @@ fn the_layout_is_pinned() {
         offset_of!(ConefieldMap, backward_halves),
         offset_of!(ConefieldMap, resolutions),
     ];
-    assert_eq!(map, [0, 8, 16, 24, 32, 40, 48, 56, 64, 72, 80, 88, 96, 104, 112, 120, 128, 136, 144]);
+    assert_eq!(map, [0, 8, 16, 24, 32, 40, 48, 56, 64, 72, 80, 88, 96, 104, 112, 120, 128]);
     let projector = [
         offset_of!(ConefieldProjector, size),
         offset_of!(ConefieldProjector, max_samples),

@@ -5,7 +5,7 @@ use crate::stage::{initializer, map, projector};
 use conefield_core::arena::Weights;
 use conefield_core::error::Result;
 use conefield_core::registry::{self, Kind, Make, NewType};
-use conefield_core::spec::{EncoderSpec, FieldSpec, Initializer, InitializerSpec, NormalizerSpec, ProjectorSpec};
+use conefield_core::settings::{EncoderSpec, FieldSpec, Initializer, InitializerSpec, NormalizerSpec, ProjectorSpec};
 use conefield_core::stage::{Encoder, Field, Normalizer, Projector};
 use serde::{Serialize, Serializer};
 use serde_json::Value;
@@ -39,8 +39,8 @@ fn make(ty: Arc<Type>) -> Make {
         Kind::Normalizer => Make::Normalizer(Box::new(move |v| Ok(Box::new(settings(v))))),
         Kind::Field => Make::Field(Box::new(move |v| Ok(Box::new(settings(v))))),
         Kind::Projector => Make::Projector(Box::new(move |v| Ok(Box::new(settings(v))))),
-        // A library's table has no solvers.
-        Kind::Initializer | Kind::Solver => Make::Initializer(Box::new(move |v| Ok(Box::new(settings(v))))),
+        // A library's table has stages of these five kinds.
+        _ => Make::Initializer(Box::new(move |v| Ok(Box::new(settings(v))))),
     }
 }
 

@@ -3,8 +3,8 @@
 use conefield_core::arena::Weights;
 use conefield_core::error::{Error, Result};
 use conefield_core::registry::{Kind, StageType};
+use conefield_core::settings::{EncoderSpec, FieldSpec, Initializer, InitializerSpec, NormalizerSpec, ProjectorSpec};
 use conefield_core::spec::stage::read;
-use conefield_core::spec::{EncoderSpec, FieldSpec, Initializer, InitializerSpec, NormalizerSpec, ProjectorSpec};
 use conefield_core::stage::{Encoder, Field, GradKind, Info, Normalizer, Parameter, Projector, Reduced, Scope, Stage};
 use conefield_plugin_abi::*;
 use serde_json::Value;
@@ -57,7 +57,7 @@ impl Built {
                 let spec = read::<dyn InitializerSpec>(settings).map_err(refused)?;
                 AnyStage::Initializer(spec.build(&no_weights)?)
             }
-            Kind::Solver => return Err(Error::unsupported(t.name, "solvers cannot come from plugins")),
+            other => return Err(Error::unsupported(t.name, format!("a {other} cannot come from a plugin"))),
         };
         Ok(Self::of(stage))
     }
@@ -88,10 +88,6 @@ impl Built {
             (AnyStage::Encoder(e), CONEFIELD_OUTPUTS) => {
                 let Reduced { stage, params, channels } = e.keep_outputs(keep)?;
                 of(params, channels, AnyStage::Encoder(stage))
-            }
-            (AnyStage::Normalizer(n), CONEFIELD_OUTPUTS) => {
-                let Reduced { stage, params, channels } = n.keep_outputs(keep)?;
-                of(params, channels, AnyStage::Normalizer(stage))
             }
             (AnyStage::Normalizer(n), CONEFIELD_INPUTS) => {
                 let Reduced { stage, params, channels } = n.keep_inputs(keep)?;

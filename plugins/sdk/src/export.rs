@@ -76,7 +76,7 @@ fn stage(t: &'static StageType) -> Option<ConefieldStage> {
         Kind::Field => (stage.kind, stage.map) = (CONEFIELD_FIELD, &shims::MAP),
         Kind::Projector => (stage.kind, stage.projector) = (CONEFIELD_PROJECTOR, &shims::PROJECTOR),
         Kind::Initializer => (stage.kind, stage.initializer) = (CONEFIELD_INITIALIZER, &shims::INITIALIZER),
-        Kind::Solver => return None,
+        _ => return None,
     }
     Some(stage)
 }

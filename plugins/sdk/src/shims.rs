@@ -11,7 +11,7 @@ use conefield_core::arena::{Arena, Block, Layout};
 use conefield_core::error::{Error, Result, ensure};
 use conefield_core::registry::StageType;
 use conefield_core::simd::Real;
-use conefield_core::stage::{Grads, Halves, Kernel, Lengths, Probe, Projector, Samples, Stage, Tile, TileMut, UnitRay};
+use conefield_core::stage::{Grads, Halves, Kernel, Lengths, Projector, Samples, Stage, Tile, TileMut, UnitRay};
 use conefield_plugin_abi::*;
 use std::borrow::Cow;
 use std::cell::RefCell;
@@ -31,8 +31,6 @@ pub static MAP: ConefieldMap = ConefieldMap {
     backward_f64: Some(backward_f64),
     partition: Some(partition),
     reduce: Some(reduce),
-    refresh: Some(refresh),
-    decided: Some(decided),
     wgsl: Some(wgsl),
     passes: Some(passes),
     forward_pass: Some(forward_pass),
@@ -539,82 +537,6 @@ unsafe extern "C" fn reduce(
     })
 }
 
-/// The host's encoder, to be looked at.
-struct Look<'a>(&'a ConefieldProbe);
-
-impl Probe for Look<'_> {
-    fn encode(&mut self, points: &[[f32; 3]]) -> Result<Vec<f32>> {
-        let failed = || Error::unsupported("the encoder", "it could not be looked at");
-        let encode = self.0.encode.ok_or_else(failed)?;
-        let mut features = vec![0.0; self.0.width * points.len()];
-        // SAFETY: see the top of this file; there is room for every feature.
-        let status = unsafe { encode(self.0.context, points.as_ptr().cast(), points.len(), features.as_mut_ptr()) };
-        if status == CONEFIELD_OK { Ok(features) } else { Err(failed()) }
-    }
-
-    fn shape(&self) -> [usize; 3] {
-        self.0.shape
-    }
-
-    fn voxel(&self, [x, y, z]: [usize; 3]) -> [f32; 3] {
-        let mut position = [0.0; 3];
-        if let Some(voxel) = self.0.voxel {
-            // SAFETY: see the top of this file.
-            unsafe { voxel(self.0.context, x, y, z, position.as_mut_ptr()) };
-        }
-        position
-    }
-
-    fn epoch(&self) -> f64 {
-        self.0.epoch
-    }
-
-    fn coarse_to_fine(&self) -> bool {
-        self.0.coarse_to_fine != 0
-    }
-}
-
-unsafe extern "C" fn refresh(
-    stage: *const c_void,
-    probe: *const ConefieldProbe,
-    keep: *mut usize,
-    keep_count: *mut usize,
-    report: *mut ConefieldText,
-    error: *mut ConefieldText,
-) -> ConefieldStatus {
-    guard(error, || {
-        // SAFETY: see the top of this file.
-        let (stage, probe) = unsafe { (&built(stage).stage, &*probe) };
-        let mask = match stage {
-            AnyStage::Normalizer(n) => n.refresh(&mut Look(probe))?,
-            _ => None,
-        };
-        let mut count = usize::MAX;
-        if let Some(mask) = mask {
-            if mask.keep.len() > probe.width {
-                return Err(Error::unsupported("the mask", "it keeps more channels than there are"));
-            }
-            // SAFETY: see the top of this file; there is room for `probe.width`.
-            unsafe { many_mut(keep, mask.keep.len()).copy_from_slice(&mask.keep) };
-            count = mask.keep.len();
-            write(report, &mask.report);
-        }
-        // SAFETY: see the top of this file.
-        unsafe { *keep_count = count };
-        Ok(())
-    })
-}
-
-unsafe extern "C" fn decided(stage: *const c_void) {
-    guard(ptr::null_mut(), || {
-        // SAFETY: see the top of this file.
-        if let AnyStage::Normalizer(n) = unsafe { &built(stage).stage } {
-            n.decided();
-        }
-        Ok(())
-    });
-}
-
 unsafe extern "C" fn wgsl(stage: *const c_void, source: *mut ConefieldText) -> ConefieldStatus {
     guard(source, || {
         // SAFETY: see the top of this file.
@@ -758,7 +680,7 @@ unsafe extern "C" fn apply(
 mod tests {
     use super::*;
     use conefield_core::registry::{Kind, find};
-    use conefield_core::spec::EncoderSpec;
+    use conefield_core::settings::EncoderSpec;
     use conefield_core::stage::{Encoder, GradKind, Info, Parameter, Scope};
     use schemars::JsonSchema;
     use serde::{Deserialize, Serialize};

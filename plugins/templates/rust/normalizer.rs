@@ -117,24 +117,14 @@ impl Stage for Affine {
     }
 }
 
-impl Affine {
+impl Normalizer for Affine {
     /// Channels stand alone: without some, the rest is a smaller stage of the same kind.
-    fn keep(&self, keep: &[usize]) -> Reduced<dyn Normalizer> {
+    fn keep_inputs(&self, keep: &[usize]) -> Result<Reduced<dyn Normalizer>> {
         let part = |start: usize| keep.iter().map(move |&c| start + c..start + c + 1);
-        Reduced {
+        Ok(Reduced {
             stage: Box::new(Self { width: keep.len(), scale: self.scale }),
             params: part(0).chain(part(self.width)).collect(),
             channels: keep.to_vec(),
-        }
-    }
-}
-
-impl Normalizer for Affine {
-    fn keep_inputs(&self, keep: &[usize]) -> Result<Reduced<dyn Normalizer>> {
-        Ok(self.keep(keep))
-    }
-
-    fn keep_outputs(&self, keep: &[usize]) -> Result<Reduced<dyn Normalizer>> {
-        Ok(self.keep(keep))
+        })
     }
 }

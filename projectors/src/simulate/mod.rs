@@ -5,7 +5,7 @@
 //! - [`downsample`], [`HuMapping`]: from a clinical volume to the one that is to be scanned.
 //! - [`Protocol`]: where source and detector stand, how many views, which noise.
 //! - [`project`]: line integrals of the trilinear interpolation of a volume.
-//! - [`Noise`]: counting statistics.
+//! - [`DetectorNoise`]: counting statistics.
 //! - [`simulate`]: all of it, with a record of how the scan came about.
 
 mod abdomen;
@@ -22,11 +22,11 @@ mod shape;
 mod tests;
 
 pub use ellipsoids::{Ellipsoid, ellipsoids, scan_ellipsoids};
-pub use noise::{MIN_COUNT, Noise};
+pub use noise::{DetectorNoise, MIN_COUNT};
 pub use phantom::{PhantomKind, phantom, phantom_of};
 pub use prepare::{HuMapping, downsample};
 pub use project::project;
-pub use protocol::{Angles, Extent, Protocol};
+pub use protocol::{Angles, DetectorExtent, Protocol};
 
 use conefield_core::Result;
 use conefield_core::geometry::Geometry;

@@ -17,7 +17,7 @@ pub const MIN_COUNT: f64 = 0.5;
 /// Noise of a detector. Written `none`, `tigre:1e4,10` or `poisson:1e5`, in files as on the command line.
 #[derive(Debug, Clone, Copy, PartialEq, Default, Serialize, Deserialize)]
 #[serde(try_from = "String", into = "String")]
-pub enum Noise {
+pub enum DetectorNoise {
     /// Exact line integrals.
     #[default]
     None,
@@ -38,7 +38,7 @@ pub enum Noise {
     },
 }
 
-impl Noise {
+impl DetectorNoise {
     /// Adds the noise to `[view, row, column]` line integrals. Each view draws from its own stream of the generator,
     /// so that neither threads nor the other views change it.
     pub fn add(&self, projections: &mut Array3<f32>, seed: u64) {
@@ -102,7 +102,7 @@ impl Detector {
     }
 }
 
-impl fmt::Display for Noise {
+impl fmt::Display for DetectorNoise {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         match self {
             Self::None => write!(f, "none"),
@@ -112,7 +112,7 @@ impl fmt::Display for Noise {
     }
 }
 
-impl FromStr for Noise {
+impl FromStr for DetectorNoise {
     type Err = Error;
 
     fn from_str(text: &str) -> Result<Self> {
@@ -139,7 +139,7 @@ impl FromStr for Noise {
     }
 }
 
-impl TryFrom<String> for Noise {
+impl TryFrom<String> for DetectorNoise {
     type Error = Error;
 
     fn try_from(text: String) -> Result<Self> {
@@ -147,8 +147,8 @@ impl TryFrom<String> for Noise {
     }
 }
 
-impl From<Noise> for String {
-    fn from(noise: Noise) -> Self {
+impl From<DetectorNoise> for String {
+    fn from(noise: DetectorNoise) -> Self {
         noise.to_string()
     }
 }

@@ -1,6 +1,6 @@
 //! The settings of a scan that is to be simulated.
 
-use super::noise::Noise;
+use super::noise::DetectorNoise;
 use conefield_core::error::{Result, ensure};
 use conefield_core::geometry::{Geometry, Millimetres, Radians, View, VoxelGrid};
 use conefield_core::scan::Unit;
@@ -23,7 +23,7 @@ pub struct Protocol {
     /// Detector rows and columns.
     pub detector: [usize; 2],
     /// How large the detector is.
-    pub extent: Extent,
+    pub extent: DetectorExtent,
     /// Shift of the detector along its rows' direction v and its columns' direction u.
     #[serde(default)]
     pub offset: [f64; 2],
@@ -31,7 +31,7 @@ pub struct Protocol {
     pub angles: Angles,
     /// What the detector adds.
     #[serde(default)]
-    pub noise: Noise,
+    pub noise: DetectorNoise,
     /// Seed of the noise.
     #[serde(default)]
     pub seed: u64,
@@ -47,7 +47,7 @@ fn two() -> f64 {
 /// Size of the detector, along v (rows) and u (columns).
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
-pub enum Extent {
+pub enum DetectorExtent {
     /// Of one pixel.
     Pixel([f64; 2]),
     /// Of the whole detector.
@@ -100,10 +100,10 @@ impl Protocol {
             dso: 5.0,
             dsd: 7.0,
             detector: [512, 512],
-            extent: Extent::Side([4.0, 4.0]),
+            extent: DetectorExtent::Side([4.0, 4.0]),
             offset: [0.0; 2],
             angles: Angles::Even { views: 50, start_deg: 0.0, arc_deg: 360.0 },
-            noise: Noise::None,
+            noise: DetectorNoise::None,
             seed: 0,
             samples_per_voxel: two(),
         }
@@ -111,7 +111,7 @@ impl Protocol {
 
     /// The same with `rows × columns` pixels on a detector of the same size.
     pub fn with_detector(mut self, detector: [usize; 2]) -> Self {
-        self.extent = Extent::Side(self.side());
+        self.extent = DetectorExtent::Side(self.side());
         self.detector = detector;
         self
     }
@@ -123,7 +123,7 @@ impl Protocol {
     }
 
     /// The same with noise.
-    pub fn with_noise(mut self, noise: Noise, seed: u64) -> Self {
+    pub fn with_noise(mut self, noise: DetectorNoise, seed: u64) -> Self {
         (self.noise, self.seed) = (noise, seed);
         self
     }
@@ -131,8 +131,8 @@ impl Protocol {
     /// Size of the whole detector along v and u, in units.
     pub fn side(&self) -> [f64; 2] {
         match self.extent {
-            Extent::Pixel(p) => std::array::from_fn(|k| p[k] * self.detector[k] as f64),
-            Extent::Side(s) => s,
+            DetectorExtent::Pixel(p) => std::array::from_fn(|k| p[k] * self.detector[k] as f64),
+            DetectorExtent::Side(s) => s,
         }
     }
 

@@ -125,7 +125,7 @@ fn projection_is_the_same_on_any_number_of_threads() {
     let protocol = Protocol::r2(&volume.grid)
         .with_detector([50, 34])
         .with_views(6)
-        .with_noise(Noise::Tigre { i0: 1e4, sigma: 10.0 }, 5);
+        .with_noise(DetectorNoise::Tigre { i0: 1e4, sigma: 10.0 }, 5);
     let one = on(1, || simulate(&volume, &protocol).unwrap());
     let three = on(3, || simulate(&volume, &protocol).unwrap());
     assert_eq!(one.projections, three.projections);
@@ -135,7 +135,7 @@ fn projection_is_the_same_on_any_number_of_threads() {
         "another seed"
     );
     // A view's noise is its own: the same view of a scan with more views has it too.
-    let noise = Noise::Poisson { i0: 1e3 };
+    let noise = DetectorNoise::Poisson { i0: 1e3 };
     let mut few = Array3::from_elem((2, 8, 8), 0.5f32);
     let mut many = Array3::from_elem((5, 8, 8), 0.5f32);
     noise.add(&mut few, 1);
@@ -164,7 +164,7 @@ fn phantoms_are_the_same_on_any_number_of_threads() {
 }
 
 /// Mean and variance of the counts that a constant line integral leaves behind.
-fn counts(noise: Noise, value: f32, scale: f64, i0: f64) -> (f64, f64) {
+fn counts(noise: DetectorNoise, value: f32, scale: f64, i0: f64) -> (f64, f64) {
     let mut pixels = Array3::from_elem((2, 300, 300), value);
     noise.add(&mut pixels, 3);
     let counts: Vec<f64> = pixels.iter().map(|&a| i0 * (-f64::from(a) / scale).exp()).collect();
@@ -178,12 +178,12 @@ fn noise_has_the_statistics_of_its_photons() {
     // The standard errors of mean and variance over 180 000 pixels are below 0.003 and 0.004 of the values.
     let (i0, a) = (1e4, 1.5f32);
     let expected = i0 * (-1.5f64).exp();
-    let (mean, variance) = counts(Noise::Poisson { i0 }, a, 1.0, i0);
+    let (mean, variance) = counts(DetectorNoise::Poisson { i0 }, a, 1.0, i0);
     assert!((mean / expected - 1.0).abs() < 2e-4, "{mean} {expected}");
     assert!((variance / expected - 1.0).abs() < 0.02, "{variance} {expected}");
     // The largest value is the scale: I = i0/e; read-out noise adds its variance.
     let expected = i0 * (-1f64).exp();
-    let (mean, variance) = counts(Noise::Tigre { i0, sigma: 30.0 }, 7.0, 7.0, i0);
+    let (mean, variance) = counts(DetectorNoise::Tigre { i0, sigma: 30.0 }, 7.0, 7.0, i0);
     assert!((mean / expected - 1.0).abs() < 2e-4, "{mean} {expected}");
     assert!((variance / (expected + 900.0) - 1.0).abs() < 0.02, "{variance}");
 }
@@ -191,34 +191,34 @@ fn noise_has_the_statistics_of_its_photons() {
 #[test]
 fn noise_stays_finite_where_no_photon_arrives() {
     let mut dark = Array3::from_elem((1, 20, 20), 60f32);
-    Noise::Poisson { i0: 100.0 }.add(&mut dark, 0);
+    DetectorNoise::Poisson { i0: 100.0 }.add(&mut dark, 0);
     let floor = -(MIN_COUNT / 100.0).ln() as f32;
     assert!(dark.iter().all(|a| (a - floor).abs() < 1e-5));
     let mut noisy = Array3::from_elem((1, 50, 50), 1f32);
     noisy[[0, 0, 0]] = 0.0;
-    Noise::Tigre { i0: 2.0, sigma: 5.0 }.add(&mut noisy, 0);
+    DetectorNoise::Tigre { i0: 2.0, sigma: 5.0 }.add(&mut noisy, 0);
     assert!(noisy.iter().all(|a| a.is_finite() && *a >= 0.0));
     let mut empty = Array3::<f32>::zeros((1, 4, 4));
-    Noise::Tigre { i0: 1e4, sigma: 10.0 }.add(&mut empty, 0);
+    DetectorNoise::Tigre { i0: 1e4, sigma: 10.0 }.add(&mut empty, 0);
     assert!(empty.iter().all(|a| *a == 0.0));
 }
 
 #[test]
 fn noise_is_written_as_it_is_read() {
     for (text, noise) in [
-        ("none", Noise::None),
-        ("tigre:1e4,10", Noise::Tigre { i0: 1e4, sigma: 10.0 }),
-        (" poisson:1e5", Noise::Poisson { i0: 1e5 }),
+        ("none", DetectorNoise::None),
+        ("tigre:1e4,10", DetectorNoise::Tigre { i0: 1e4, sigma: 10.0 }),
+        (" poisson:1e5", DetectorNoise::Poisson { i0: 1e5 }),
     ] {
-        assert_eq!(text.parse::<Noise>().unwrap(), noise);
-        assert_eq!(noise.to_string().parse::<Noise>().unwrap(), noise);
+        assert_eq!(text.parse::<DetectorNoise>().unwrap(), noise);
+        assert_eq!(noise.to_string().parse::<DetectorNoise>().unwrap(), noise);
     }
     for text in ["", "tiger:1e4,10", "tigre", "tigre:1e4", "tigre:1e4,ten", "poisson:", "none:3"] {
-        let e = text.parse::<Noise>().unwrap_err().to_string();
+        let e = text.parse::<DetectorNoise>().unwrap_err().to_string();
         assert!(e.contains(&format!("`{text}`")) && e.contains("tigre:1e4,10"), "{e}");
     }
     for text in ["poisson:0", "poisson:NaN", "poisson:-5", "tigre:1e30,1", "tigre:1e4,-1", "tigre:1e4,inf"] {
-        let e = text.parse::<Noise>().unwrap_err().to_string();
+        let e = text.parse::<DetectorNoise>().unwrap_err().to_string();
         assert!(e.contains("noise") && e.contains("number"), "{e}");
     }
 }
@@ -301,7 +301,7 @@ fn a_protocol_is_read_from_a_file_and_refused_in_words() {
                 angles.even = { views = 25 }\nnoise = \"poisson:1e5\"\n";
     let protocol: Protocol = toml::from_str(text).unwrap();
     assert_eq!(protocol.side(), [192.0, 128.0]);
-    assert_eq!(protocol.noise, Noise::Poisson { i0: 1e5 });
+    assert_eq!(protocol.noise, DetectorNoise::Poisson { i0: 1e5 });
     assert_eq!(protocol.geometry(&grid(8)).unwrap().views.len(), 25);
     let json = serde_json::to_string(&protocol).unwrap();
     assert_eq!(serde_json::from_str::<Protocol>(&json).unwrap(), protocol);
@@ -319,7 +319,7 @@ fn a_protocol_is_read_from_a_file_and_refused_in_words() {
     refused(&|p| p.dso = 0.5, "inside the volume");
     refused(&|p| p.unit.mm = 0.0, "unit.mm");
     refused(&|p| p.detector = [0, 3], "detector");
-    refused(&|p| p.extent = Extent::Side([1.0, f64::NAN]), "extent");
+    refused(&|p| p.extent = DetectorExtent::Side([1.0, f64::NAN]), "extent");
     refused(&|p| p.angles = Angles::ListDeg(vec![]), "at least one view");
     refused(&|p| p.angles = Angles::Even { views: usize::MAX, start_deg: 0.0, arc_deg: 360.0 }, "views");
     refused(&|p| p.offset = [f64::INFINITY, 0.0], "offset");
@@ -359,10 +359,10 @@ fn an_exact_scan_is_reproduced_and_its_mirror_is_not() {
         dso: metres(&scanner["DSO"]),
         dsd: metres(&scanner["DSD"]),
         detector: [96, 96],
-        extent: Extent::Side(two(&scanner["sDetector"])),
+        extent: DetectorExtent::Side(two(&scanner["sDetector"])),
         offset: [0.0; 2],
         angles: Angles::ListDeg(views.iter().map(|v| sign * v["angle"].as_f64().unwrap().to_degrees()).collect()),
-        noise: Noise::None,
+        noise: DetectorNoise::None,
         seed: 0,
         samples_per_voxel: 2.0,
     };

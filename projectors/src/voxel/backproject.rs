@@ -27,7 +27,7 @@ pub fn backproject<R: Real>(
         views.iter().map(|&v| (Pinhole::of(geometry, v), Lines::of(geometry, v))).collect();
     volume.axis_chunks_iter_mut(Axis(0), TILE).into_par_iter().enumerate().for_each(|(n, mut planes)| {
         for (i, (pinhole, lines)) in all.iter().enumerate() {
-            let view = View { geometry, pixels, index: i, scale: scales[i] };
+            let view = ViewPixels { geometry, pixels, index: i, scale: scales[i] };
             match lines {
                 Some(lines) => run(ByLine { view, lines, first: n * TILE, planes: planes.view_mut() }),
                 None => view.by_voxel(pinhole, n * TILE, planes.view_mut()),
@@ -36,7 +36,7 @@ pub fn backproject<R: Real>(
     });
 }
 
-struct View<'a, R> {
+struct ViewPixels<'a, R> {
     geometry: &'a Geometry,
     pixels: &'a ColumnMajor<R>,
     index: usize,
@@ -81,7 +81,7 @@ impl Lines {
 }
 
 struct ByLine<'a, R> {
-    view: View<'a, R>,
+    view: ViewPixels<'a, R>,
     lines: &'a Lines,
     first: usize,
     planes: ArrayViewMut3<'a, R>,
@@ -138,7 +138,7 @@ impl<R: Real> Op for ByLine<'_, R> {
     }
 }
 
-impl<R: Real> View<'_, R> {
+impl<R: Real> ViewPixels<'_, R> {
     /// Voxel by voxel, for tilted views.
     fn by_voxel(&self, pinhole: &Pinhole, first: usize, mut planes: ArrayViewMut3<'_, R>) {
         let [rows, columns] = self.geometry.detector;

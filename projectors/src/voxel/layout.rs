@@ -134,9 +134,14 @@ impl<R: Real> ColumnMajor<R> {
 }
 
 /// How many views to hold column by column at once: a few MiB, which stay in the last cache.
-pub fn batch<R>(geometry: &Geometry) -> usize {
-    let view = (geometry.detector[0] + BEFORE + AFTER) * geometry.detector[1] * size_of::<R>();
+pub fn batch<R>([rows, columns]: [usize; 2]) -> usize {
+    let view = (rows + BEFORE + AFTER) * columns * size_of::<R>();
     ((12 << 20) / view.max(1)).clamp(1, 64)
+}
+
+/// Bytes of [`ColumnMajor`] for `views` views.
+pub fn column_major_bytes<R>([rows, columns]: [usize; 2], views: usize) -> u64 {
+    (views * columns * (BEFORE + rows + AFTER) * size_of::<R>()) as u64
 }
 
 /// Detector coordinates of world positions for a view, tilted or not: `u`, `v` in pixels and the depth.

@@ -5,9 +5,9 @@ use super::walk::{SiddonWalk, TrilinearWalk};
 use super::{bundles, columns};
 use conefield_core::error::{Result, ensure};
 use conefield_core::geometry::Geometry;
+use conefield_core::scan::ScanHeader;
 use conefield_core::simd::Real;
-use conefield_core::spec::ProjectorSpec;
-use conefield_core::voxel::{VoxelOperator, VoxelProjector};
+use conefield_core::voxel::{VoxelOperator, VoxelProjector, VoxelProjectorSpec};
 use conefield_core::wgsl::Fragment;
 use ndarray::{ArrayView3, ArrayViewMut3, Axis};
 use schemars::JsonSchema;
@@ -37,29 +37,29 @@ impl Default for Trilinear {
     }
 }
 
-conefield_core::stage_type!(Projector, "siddon", Siddon, "exact path lengths through voxels");
-conefield_core::stage_type!(Projector, "joseph", Joseph, "bilinear interpolation from plane to plane of voxels");
-conefield_core::stage_type!(Projector, "trilinear", Trilinear, "trilinear samples of voxels at equal steps");
+conefield_core::stage_type!(VoxelProjector, "siddon", Siddon, "exact path lengths through voxels");
+conefield_core::stage_type!(VoxelProjector, "joseph", Joseph, "bilinear interpolation from plane to plane of voxels");
+conefield_core::stage_type!(VoxelProjector, "trilinear", Trilinear, "trilinear samples of voxels at equal steps");
 
 #[typetag::serde(name = "siddon")]
-impl ProjectorSpec for Siddon {
-    fn build_voxel(&self) -> Result<Box<dyn VoxelProjector>> {
+impl VoxelProjectorSpec for Siddon {
+    fn build(&self) -> Result<Box<dyn VoxelProjector>> {
         Ok(Box::new(*self))
     }
 }
 
 #[typetag::serde(name = "joseph")]
-impl ProjectorSpec for Joseph {
-    fn build_voxel(&self) -> Result<Box<dyn VoxelProjector>> {
+impl VoxelProjectorSpec for Joseph {
+    fn build(&self) -> Result<Box<dyn VoxelProjector>> {
         Ok(Box::new(*self))
     }
 }
 
 #[typetag::serde(name = "trilinear")]
-impl ProjectorSpec for Trilinear {
-    fn build_voxel(&self) -> Result<Box<dyn VoxelProjector>> {
+impl VoxelProjectorSpec for Trilinear {
+    fn build(&self) -> Result<Box<dyn VoxelProjector>> {
         let n = self.samples_per_voxel;
-        ensure((0.5..=64.0).contains(&n), "spec", "projector.samples_per_voxel", n, "0.5 to 64")?;
+        ensure((0.5..=64.0).contains(&n), "spec", "samples_per_voxel", n, "0.5 to 64")?;
         Ok(Box::new(*self))
     }
 }
@@ -88,6 +88,9 @@ impl VoxelProjector for Joseph {
     }
     fn wgsl(&self) -> Option<Fragment> {
         Some(Fragment::new(&[include_str!("walk.wgsl"), include_str!("joseph.wgsl")]))
+    }
+    fn scratch(&self, header: &ScanHeader, views: usize) -> u64 {
+        columns::scratch(header, views)
     }
     fn describe(&self) -> String {
         "joseph: bilinear from plane to plane".into()

@@ -7,26 +7,31 @@
 pub mod filter;
 pub mod weights;
 
-use crate::iterative::watch::Watch;
-use crate::iterative::{finite, voxels_only};
-use crate::surround::Within;
+use crate::iterative::drive::finite;
+use crate::iterative::monitor::VolumeMonitor;
+use crate::surround::{self, Within};
 use conefield_core::Error;
+use conefield_core::backend::Backend;
 use conefield_core::error::{Result, ensure};
 use conefield_core::geometry::{Geometry, dot, norm, sub};
-use conefield_core::scan::{Scan, Volume};
-use conefield_core::solver::{Job, Observer, Reconstruction, Record, Solution, Solver};
-use conefield_core::spec::{SolverSpec, Spec};
+use conefield_core::method::{
+    Context, Findings, Job, Line, Method, Needs, Observer, Outline, Plan, Reconstruction, Record, Solution,
+};
+use conefield_core::scan::{Scan, ScanHeader, Volume};
+use conefield_core::scene::SurroundRule;
+use conefield_core::space::Space;
 use conefield_core::voxel::VoxelView;
 use conefield_projectors::voxel::Joseph;
 use conefield_projectors::voxel::backproject::backproject;
-use conefield_projectors::voxel::layout::{AFTER, BEFORE, ColumnMajor, Pinhole};
+use conefield_projectors::voxel::layout::{ColumnMajor, Pinhole, column_major_bytes};
 use filter::{Ramp, Window};
-use ndarray::{Array3, Axis};
+use ndarray::{Array3, ArrayViewMut3, Axis, s};
 use rayon::prelude::*;
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
+use std::ops::Range;
 use std::time::Instant;
-use weights::{Coverage, Orbit, place};
+use weights::{Coverage, FdkOrbit, place};
 
 /// Settings of `fdk`.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
@@ -38,122 +43,178 @@ pub struct Fdk {
     pub cutoff: f64,
     /// Set negative attenuation to 0 in the end.
     pub nonnegative: bool,
+    /// How the scan is seen.
+    pub scene: FdkScene,
+}
+
+/// How FDK sees the scan.
+#[derive(Debug, Clone, Copy, Default, PartialEq, Serialize, Deserialize, JsonSchema)]
+#[serde(deny_unknown_fields, default)]
+pub struct FdkScene {
+    /// What lies beyond the volume.
+    #[serde(skip_serializing_if = "SurroundRule::is_none")]
+    pub surround: SurroundRule,
 }
 
 impl Default for Fdk {
     fn default() -> Self {
-        Self { window: Window::Ramp, cutoff: 1.0, nonnegative: false }
+        Self { window: Window::Ramp, cutoff: 1.0, nonnegative: false, scene: FdkScene::default() }
     }
 }
 
-conefield_core::stage_type!(Solver, "fdk", Fdk, "filtered back-projection");
+conefield_core::stage_type!(Method, "fdk", Fdk, "filtered back-projection");
 
 #[typetag::serde(name = "fdk")]
-impl SolverSpec for Fdk {
-    fn build(&self) -> Result<Box<dyn Solver>> {
+impl Method for Fdk {
+    fn plan(&self, _: &Context<'_>) -> Result<Box<dyn Plan>> {
         let c = self.cutoff;
-        ensure(c > 0.0 && c <= 1.0, "spec", "solver.cutoff", c, "a number above 0 and at most 1")?;
+        ensure(c > 0.0 && c <= 1.0, "spec", "cutoff", c, "a number above 0 and at most 1")?;
+        self.scene.surround.validate()?;
         Ok(Box::new(self.clone()))
     }
 }
 
-impl Solver for Fdk {
-    fn solve(&self, job: &Job<'_>, observer: &mut dyn Observer) -> Result<Solution> {
+impl Plan for Fdk {
+    fn outline(&self) -> Outline {
+        let what = format!("{:?} window to {} of the highest frequency", self.window, self.cutoff).to_lowercase();
+        Outline { method: Line::new("method", "fdk", &what), ..Outline::default() }
+    }
+
+    fn starts_from_volume(&self) -> bool {
+        false
+    }
+
+    fn run(&mut self, job: &Job<'_>, observer: &mut dyn Observer) -> Result<Solution> {
         let start = Instant::now();
         job.scan.validate("scan")?;
-        alone(job.spec)?;
-        let within = Within::of(job, observer)?;
+        let within = Within::of(job, self.scene.surround, observer)?;
         let job = &Within::job(within.as_ref(), job);
-        let scan = job.scan;
-        let orbit = Orbit::of(&scan.geometry);
-        check(&orbit, &scan.geometry)?;
+        let orbit = FdkOrbit::of(&job.scan.geometry);
+        check(&orbit, &job.scan.geometry)?;
         said(&orbit).iter().for_each(|line| observer.note(line));
-        let (g, measured) = orbit.symmetric(&scan.geometry);
-        let g = &g;
-        let [rows, columns] = g.detector;
-        let all: Vec<usize> = (0..g.views.len()).collect();
-        let mut volume = Array3::<f32>::zeros(g.volume.shape);
-        let mut done = 0;
-        let values = scan.projections.len() + volume.len();
-        for part in all.chunks(views_at_once(g, held(values as u64))) {
-            if observer.cancelled() {
-                return Err(Error::Interrupted { step: done as u64 });
-            }
-            let mut images = Array3::<f32>::zeros((part.len(), rows, columns));
-            let views = scan.projections.slice_axis(Axis(0), (done..done + part.len()).into());
-            images.slice_axis_mut(Axis(2), measured.clone().into()).assign(&views);
-            let scales: Vec<f64> = part.iter().map(|&v| orbit.steps[v] * orbit.radius[v].powi(2)).collect();
-            images.axis_iter_mut(Axis(0)).into_par_iter().zip(part).for_each(|(mut image, &view)| {
-                let v = &g.views[view];
-                let (normal, distance) = v.normal();
-                let radius = orbit.radius[view];
-                let ramp = Ramp::new(columns, norm(v.u) * radius / distance, self.window, self.cutoff);
-                let counts: Vec<f64> =
-                    (0..columns).map(|c| orbit.weight(view, place(g, view, c as f64, radius))).collect();
-                let pixels = image.as_slice_mut().unwrap_or_else(|| unreachable!("this array was made here"));
-                pixels.par_chunks_mut(16 * columns).enumerate().for_each(|(n, strip)| {
-                    for (r, line) in strip.chunks_mut(columns).enumerate() {
-                        for (c, x) in line.iter_mut().enumerate() {
-                            let d = sub(v.pixel(g.detector, (16 * n + r) as f64, c as f64), v.source);
-                            *x *= (counts[c] * dot(normal, d) / norm(d)) as f32;
-                        }
-                    }
-                    ramp.filter(strip, columns);
-                });
-            });
-            let seen = part.iter().zip(&scales).map(|(&v, &scale)| Pinhole::of(g, v).voxels(&g.volume, scale));
-            let seen: Vec<VoxelView> = seen.collect();
-            if !job.backend.backproject(&seen, images.view(), volume.view_mut())? {
-                let pixels = ColumnMajor::new(g, part, images.view(), |_, _, _, x| x);
-                drop(images);
-                backproject(g, part, &pixels, &scales, volume.view_mut());
-            }
-            done += part.len();
-            let share = done as f64 / all.len() as f64;
-            let spent = start.elapsed().as_secs_f64();
-            observer.progress(done as u64, share, spent * (1.0 - share) / share);
-        }
+        let (geometry, measured) = orbit.symmetric(&job.scan.geometry);
+        let (scan, backend) = (job.scan, job.backend);
+        let run = Backprojection { settings: self, scan, backend, orbit: &orbit, geometry: &geometry, measured };
+        let mut volume = run.all(start, observer)?;
         let floor = if self.nonnegative { 0.0 } else { f32::NEG_INFINITY };
         // A comparison, not a maximum, which would turn NaN into the floor.
         volume.par_mapv_inplace(|x| if x < floor { floor } else { x });
         finite(&volume, 1)?;
         let train_s = start.elapsed().as_secs_f64();
-        let mm = scan.unit.mm as f32;
-        let watch = Watch::new(job);
-        let psnr = watch.psnr(&volume, mm);
+        let mm = job.scan.unit.mm as f32;
+        let monitor = VolumeMonitor::new(job);
+        let psnr = monitor.psnr(&volume, mm);
         let held_out = match job.held_out {
-            Some(_) => watch.held_out(job.backend.place(Box::new(Joseph {}))?.operator(), &volume)?,
+            Some(_) => monitor.held_out(job.backend.place(Box::new(Joseph {}))?.operator(), &volume)?,
             None => None,
         };
         observer.record(&Record { step: 1, seconds: train_s, psnr, held_out, ..Record::default() });
         volume.par_mapv_inplace(|x| x * mm);
-        let volume = Volume { data: volume, grid: g.volume, affine: None };
+        let volume = Volume { data: volume, grid: geometry.volume, affine: None };
         let result = Reconstruction::Volume(volume);
         Ok(Solution { result, steps: 1, train_s, samples: 0, sampling_s: 0.0, rollbacks: 0, best: None })
     }
 
-    fn trains_field(&self, spec: &Spec) -> Result<bool> {
-        alone(spec)?;
-        Ok(false)
+    fn inspect(&self, scan: &Scan) -> Result<Findings> {
+        let orbit = FdkOrbit::of(&scan.geometry);
+        let mut lines = surround::found(scan, self.scene.surround)?;
+        lines.extend(check(&orbit, &scan.geometry).map_or_else(|e| vec![e.to_string()], |()| said(&orbit)));
+        Ok(Findings { lines, ..Findings::default() })
     }
 
-    fn plan(&self, scan: &Scan) -> Vec<String> {
-        let orbit = Orbit::of(&scan.geometry);
-        check(&orbit, &scan.geometry).map_or_else(|e| vec![e.to_string()], |()| said(&orbit))
+    /// Without the columns that an offset detector lacks, which only the scan itself tells.
+    fn needs(&self, header: &ScanHeader) -> Needs {
+        let space = Space::tally(*header);
+        let at_once = views_at_once(header.detector, held(header));
+        images(&space, header.detector, at_once);
+        space.pass(column_major_bytes::<f32>(header.detector, at_once.min(header.views)));
+        let [surround, subtracted] = surround::bytes(self.scene.surround, header);
+        Needs { surround, subtracted, working: space.bytes(), volume: true, ..Needs::default() }
+    }
+}
+
+/// Room for the filtered images of `views` views at most.
+fn images(space: &Space, [rows, columns]: [usize; 2], views: usize) -> Array3<f32> {
+    space.array([views.min(space.header().views), rows, columns])
+}
+
+/// The filtered back-projection of one scan.
+struct Backprojection<'a> {
+    settings: &'a Fdk,
+    scan: &'a Scan,
+    backend: &'a dyn Backend,
+    orbit: &'a FdkOrbit,
+    /// With the columns that an offset detector lacks.
+    geometry: &'a Geometry,
+    /// The columns that were measured.
+    measured: Range<usize>,
+}
+
+impl Backprojection<'_> {
+    /// The volume of all views, some at a time. They are told as they are done, from `start`.
+    fn all(&self, start: Instant, observer: &mut dyn Observer) -> Result<Array3<f32>> {
+        let space = Space::new(self.scan.header());
+        let mut volume = space.volume();
+        let at_once = views_at_once(self.geometry.detector, held(space.header()));
+        let mut images = images(&space, self.geometry.detector, at_once);
+        let all: Vec<usize> = (0..self.geometry.views.len()).collect();
+        let mut done = 0;
+        for views in all.chunks(at_once) {
+            if observer.cancelled() {
+                return Err(Error::Interrupted { step: done as u64 });
+            }
+            self.some(views, images.slice_mut(s![..views.len(), .., ..]), &mut volume)?;
+            done += views.len();
+            let share = done as f64 / all.len() as f64;
+            let spent = start.elapsed().as_secs_f64();
+            observer.progress(done as u64, share, spent * (1.0 - share) / share);
+        }
+        Ok(volume)
     }
 
-    /// The views at hand, filtered and then once more column by column.
-    fn working_memory(&self, pixels: u64, voxels: u64) -> u64 {
-        2 * held(pixels.saturating_add(voxels))
+    /// Adds some views, which follow each other, to `volume`; `images` is room for theirs.
+    fn some(&self, views: &[usize], mut images: ArrayViewMut3<'_, f32>, volume: &mut Array3<f32>) -> Result<()> {
+        let g = self.geometry;
+        let measured = self.scan.projections.slice_axis(Axis(0), (views[0]..views[0] + views.len()).into());
+        images.fill(0.0);
+        images.slice_axis_mut(Axis(2), self.measured.clone().into()).assign(&measured);
+        images.axis_iter_mut(Axis(0)).into_par_iter().zip(views).for_each(|(mut image, &view)| {
+            let pixels = image.as_slice_mut().unwrap_or_else(|| unreachable!("images follow each other"));
+            self.filter(view, pixels);
+        });
+        let scales: Vec<f64> = views.iter().map(|&v| self.orbit.steps[v] * self.orbit.radius[v].powi(2)).collect();
+        let seen = views.iter().zip(&scales).map(|(&v, &scale)| Pinhole::of(g, v).voxels(&g.volume, scale));
+        let seen: Vec<VoxelView> = seen.collect();
+        if !self.backend.backproject(&seen, images.view(), volume.view_mut())? {
+            let pixels = ColumnMajor::new(g, views, images.view(), |_, _, _, x| x);
+            backproject(g, views, &pixels, &scales, volume.view_mut());
+        }
+        Ok(())
     }
 
-    fn describe(&self) -> String {
-        format!("fdk: {:?} window to {} of the highest frequency", self.window, self.cutoff).to_lowercase()
+    /// Weighs and filters the image of a view.
+    fn filter(&self, view: usize, pixels: &mut [f32]) {
+        let (g, v) = (self.geometry, &self.geometry.views[view]);
+        let columns = g.detector[1];
+        let (normal, distance) = v.normal();
+        let radius = self.orbit.radius[view];
+        let ramp = Ramp::new(columns, norm(v.u) * radius / distance, self.settings.window, self.settings.cutoff);
+        let count = |c| self.orbit.weight(view, place(g, view, c as f64, radius));
+        let counts: Vec<f64> = (0..columns).map(count).collect();
+        pixels.par_chunks_mut(16 * columns).enumerate().for_each(|(n, strip)| {
+            for (r, line) in strip.chunks_mut(columns).enumerate() {
+                for (c, x) in line.iter_mut().enumerate() {
+                    let d = sub(v.pixel(g.detector, (16 * n + r) as f64, c as f64), v.source);
+                    *x *= (counts[c] * dot(normal, d) / norm(d)) as f32;
+                }
+            }
+            ramp.filter(strip, columns);
+        });
     }
 }
 
 /// What is told of an orbit.
-fn said(orbit: &Orbit) -> Vec<String> {
+fn said(orbit: &FdkOrbit) -> Vec<String> {
     let mut lines = vec![orbit.describe()];
     if orbit.coverage == Coverage::Limited {
         lines.push("expect streaks along the missing directions; an iterative solver suits this scan better".into());
@@ -161,30 +222,15 @@ fn said(orbit: &Orbit) -> Vec<String> {
     lines
 }
 
-/// Bytes of views to hold at once beside a scan and a volume of `values` numbers: a 32nd of theirs, but at least one MiB
-/// and no more than stays in the last cache.
-fn held(values: u64) -> u64 {
-    (values / 8).clamp(1 << 20, 12 << 20)
+/// Bytes of views to hold at once: a 32nd of what scan and volume take, but at least one MiB and no more than stays in the
+/// last cache.
+fn held(header: &ScanHeader) -> u64 {
+    (header.pixels().saturating_add(header.voxels()) / 8).clamp(1 << 20, 12 << 20)
 }
 
 /// How many views take up `bytes`.
-fn views_at_once(geometry: &Geometry, bytes: u64) -> usize {
-    let of_one = ((geometry.detector[0] + BEFORE + AFTER) * geometry.detector[1] * size_of::<f32>()).max(1);
-    (bytes as usize / of_one).clamp(1, 64)
-}
-
-/// Refuses stages that would be passed over: FDK back-projects in its own way and starts from nothing.
-fn alone(spec: &Spec) -> Result<()> {
-    voxels_only(spec)?;
-    let named = [
-        ("projector.type", spec.projector.as_ref().map(|p| p.typetag_name())),
-        ("initializer.type", spec.initializer.as_ref().map(|i| i.typetag_name())),
-    ];
-    for (field, name) in named {
-        let found = name.map_or(String::new(), |n| format!("{n:?}"));
-        ensure(name.is_none(), "spec", field, found, "none: fdk back-projects in its own way and starts from nothing")?;
-    }
-    Ok(())
+fn views_at_once(detector: [usize; 2], bytes: u64) -> usize {
+    (bytes / column_major_bytes::<f32>(detector, 1).max(1)).clamp(1, 64) as usize
 }
 
 /// Sources may lie along z by this share of the circle's radius, and rows of the detector rise by it: what calibrated scans
@@ -192,7 +238,7 @@ fn alone(spec: &Spec) -> Result<()> {
 const TILT: f64 = 0.05;
 
 /// FDK is for circles around z, whose rows of the detector lie across z.
-fn check(orbit: &Orbit, geometry: &Geometry) -> Result<()> {
+fn check(orbit: &FdkOrbit, geometry: &Geometry) -> Result<()> {
     let span = |values: &mut dyn Iterator<Item = f64>| {
         values.fold((f64::INFINITY, f64::NEG_INFINITY), |(l, h), r| (l.min(r), h.max(r)))
     };

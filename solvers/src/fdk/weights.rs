@@ -44,7 +44,7 @@ const ASIDE: f64 = 0.1;
 
 /// The orbit of a scan as FDK sees it.
 #[derive(Debug, Clone)]
-pub struct Orbit {
+pub struct FdkOrbit {
     /// What it is.
     pub coverage: Coverage,
     /// The arc that is covered, rad.
@@ -63,7 +63,7 @@ pub struct Orbit {
     sense: f64,
 }
 
-impl Orbit {
+impl FdkOrbit {
     /// Reads the orbit of `geometry` around the axis x = y = 0.
     pub fn of(geometry: &Geometry) -> Self {
         let views = &geometry.views;
@@ -219,29 +219,29 @@ mod tests {
     #[test]
     fn orbits_are_told_apart() {
         let turn = |n: usize, arc: f64| (0..n).map(move |i| 0.3 + arc * i as f64 / n as f64);
-        assert_eq!(Orbit::of(&scan(turn(50, TAU), 0.0)).coverage, Coverage::Full);
-        assert_eq!(Orbit::of(&scan(turn(3, TAU), 0.0)).coverage, Coverage::Full);
-        assert!(matches!(Orbit::of(&scan(turn(100, 3.6), 0.0)).coverage, Coverage::Short { .. }));
-        assert!(matches!(Orbit::of(&scan(turn(100, 3.6), 4.0)).coverage, Coverage::Short { .. }));
-        assert_eq!(Orbit::of(&scan(turn(100, 2.9), 0.0)).coverage, Coverage::Limited);
-        assert_eq!(Orbit::of(&scan(turn(100, 3.6), 45.0)).coverage, Coverage::Limited);
-        let Coverage::Offset { overlap, sign } = Orbit::of(&scan(turn(50, TAU), 45.0)).coverage else {
+        assert_eq!(FdkOrbit::of(&scan(turn(50, TAU), 0.0)).coverage, Coverage::Full);
+        assert_eq!(FdkOrbit::of(&scan(turn(3, TAU), 0.0)).coverage, Coverage::Full);
+        assert!(matches!(FdkOrbit::of(&scan(turn(100, 3.6), 0.0)).coverage, Coverage::Short { .. }));
+        assert!(matches!(FdkOrbit::of(&scan(turn(100, 3.6), 4.0)).coverage, Coverage::Short { .. }));
+        assert_eq!(FdkOrbit::of(&scan(turn(100, 2.9), 0.0)).coverage, Coverage::Limited);
+        assert_eq!(FdkOrbit::of(&scan(turn(100, 3.6), 45.0)).coverage, Coverage::Limited);
+        let Coverage::Offset { overlap, sign } = FdkOrbit::of(&scan(turn(50, TAU), 45.0)).coverage else {
             panic!("an offset was not seen")
         };
         assert!((overlap - (100.0 - 45.0) / 1.5).abs() < 1e-9 && sign == 1.0);
-        assert_eq!(Orbit::of(&scan(turn(50, TAU).map(|a| -a), -45.0)).coverage, {
+        assert_eq!(FdkOrbit::of(&scan(turn(50, TAU).map(|a| -a), -45.0)).coverage, {
             Coverage::Offset { overlap, sign: -1.0 }
         });
         // One missing view does not end an orbit.
         let missing = (0..50).filter(|i| *i != 7).map(|i| TAU * i as f64 / 50.0);
-        assert_eq!(Orbit::of(&scan(missing, 0.0)).coverage, Coverage::Full);
+        assert_eq!(FdkOrbit::of(&scan(missing, 0.0)).coverage, Coverage::Full);
     }
 
     #[test]
     fn an_offset_detector_is_widened_where_it_is_short() {
         for offset in [45.0, -45.0] {
             let g = scan((0..9).map(|i| 0.7 * f64::from(i)), offset);
-            let (wide, measured) = Orbit::of(&g).symmetric(&g);
+            let (wide, measured) = FdkOrbit::of(&g).symmetric(&g);
             assert_eq!(wide.detector, [10, 290]);
             assert_eq!(measured, if offset > 0.0 { 90..290 } else { 0..200 });
             for (a, b) in g.views.iter().zip(&wide.views) {
@@ -255,15 +255,15 @@ mod tests {
             assert!((ends[0] + ends[1]).abs() < 1e-9, "{ends:?}");
         }
         let g = scan((0..9).map(|i| 0.7 * f64::from(i)), 0.0);
-        assert_eq!(Orbit::of(&g).symmetric(&g), (g.clone(), 0..200));
+        assert_eq!(FdkOrbit::of(&g).symmetric(&g), (g.clone(), 0..200));
     }
 
     #[test]
     fn steps_add_up_to_the_arc() {
         let uneven = [0.1, 0.2, 0.9, 1.4, 2.0, 2.2, 3.0, 3.9, 4.4, 5.0, 5.6, 6.1];
-        let o = Orbit::of(&scan(uneven.into_iter(), 0.0));
+        let o = FdkOrbit::of(&scan(uneven.into_iter(), 0.0));
         assert!((o.steps.iter().sum::<f64>() - TAU).abs() < 1e-12);
-        let o = Orbit::of(&scan((0..40).map(|i| 0.1 * f64::from(i)), 0.0));
+        let o = FdkOrbit::of(&scan((0..40).map(|i| 0.1 * f64::from(i)), 0.0));
         assert!((o.steps.iter().sum::<f64>() - 4.0).abs() < 1e-12 && (o.arc - 4.0).abs() < 1e-12);
     }
 
@@ -281,7 +281,7 @@ mod tests {
                 assert!((sum - 1.0).abs() < 1e-9, "beta {beta} gamma {gamma}: {sum}");
             }
         }
-        let o = Orbit::of(&scan((0..50).map(|i| TAU * f64::from(i) / 50.0), 45.0));
+        let o = FdkOrbit::of(&scan((0..50).map(|i| TAU * f64::from(i) / 50.0), 45.0));
         for u in [-60.0, -30.0, -3.0, 0.0, 12.0, 36.0, 50.0] {
             assert!((o.weight(0, u) + o.weight(0, -u) - 1.0).abs() < 1e-12, "u {u}");
         }

@@ -1,28 +1,43 @@
 //! ASD-POCS (Sidky and Pan, Phys. Med. Biol. 53(17), 2008): a pass of ordered-subset SART towards the data, then steps
 //! of steepest descent on total variation, whose length is tied to what the data pass changed.
 
-use super::algebraic::{Algebraic, Sweep};
 use super::noise::{self, Noise};
-use super::order::{Order, subsets, told};
+use super::norms::{change, distance, norm2};
+use super::order::{Order, Subsets, told};
+use super::plan::{Iterative, IterativePlan};
+use super::sart::{Sweep, Updates};
+use super::shared::Shared;
 use super::tv::{anisotropy, descend};
-use super::{Method, Opened, Pass, Problem, Stop, change, distance, drive, flat_mut, norm2, refuse_others};
+use super::{Iteration, Pass, Problem, Stop, drive::drive, flat_mut};
 use conefield_core::error::{Result, ensure};
-use conefield_core::scan::Scan;
-use conefield_core::solver::{Job, Observer, Solution, Solver};
-use conefield_core::spec::{SolverSpec, Spec};
+use conefield_core::method::{Context, Job, Method, Observer, Plan, Solution};
+use conefield_core::scan::{Scan, ScanHeader};
+use conefield_core::scene::VoxelScene;
+use conefield_core::space::Space;
+use conefield_core::voxel::VoxelProjectorSpec;
+use conefield_projectors::voxel::Joseph;
 use ndarray::Array3;
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 use std::time::Instant;
 
 /// Settings of `asd-pocs`.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
+#[derive(Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields, default)]
 pub struct AsdPocs {
+    /// Line integrals of voxels.
+    #[serde(deserialize_with = "conefield_core::spec::stage::needed")]
+    #[schemars(with = "serde_json::Value", extend("x-stage" = "voxel-projector"))]
+    pub projector: Box<dyn VoxelProjectorSpec>,
+    /// How the scan is seen.
+    pub scene: VoxelScene,
+    /// The file of a known volume to start from.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub start: Option<String>,
     /// When it ends.
     pub stop: Stop,
-    /// Subsets of the views.
-    pub subsets: usize,
+    /// Subsets of the views: a number, or "views" for a view at a time.
+    pub subsets: Subsets,
     /// Relaxation of the data passes.
     pub relaxation: f64,
     /// What the relaxation is multiplied with after each pass.
@@ -42,8 +57,11 @@ pub struct AsdPocs {
 impl Default for AsdPocs {
     fn default() -> Self {
         Self {
-            stop: Stop { passes: Some(20), ..Stop::default() },
-            subsets: 50,
+            projector: Box::new(Joseph {}),
+            scene: VoxelScene::default(),
+            start: None,
+            stop: Stop::after(20),
+            subsets: Subsets::Count(50),
             relaxation: 1.0,
             decay: 0.97,
             alpha: 0.05,
@@ -55,122 +73,147 @@ impl Default for AsdPocs {
     }
 }
 
-conefield_core::stage_type!(Solver, "asd-pocs", AsdPocs, "data passes in turn with descent on total variation");
+conefield_core::stage_type!(Method, "asd-pocs", AsdPocs, "data passes in turn with descent on total variation");
 
 #[typetag::serde(name = "asd-pocs")]
-impl SolverSpec for AsdPocs {
-    fn build(&self) -> Result<Box<dyn Solver>> {
-        self.data().validate()?;
-        ensure(self.subsets > 0, "spec", "solver.subsets", 0, "at least 1")?;
-        for (name, x) in [("alpha", self.alpha), ("alpha_decay", self.alpha_decay), ("ratio", self.ratio)] {
-            ensure(x.is_finite() && x > 0.0, "spec", &format!("solver.{name}"), x, "a positive finite number")?;
-        }
-        ensure(self.tolerance >= 0.0, "spec", "solver.tolerance", self.tolerance, "0 or more")?;
-        Ok(Box::new(self.clone()))
+impl Method for AsdPocs {
+    fn plan(&self, _: &Context<'_>) -> Result<Box<dyn Plan>> {
+        Ok(Box::new(IterativePlan(self.built()?)))
     }
 }
 
 impl AsdPocs {
-    fn data(&self) -> Algebraic {
-        Algebraic {
-            name: "asd-pocs",
-            subsets: self.subsets,
-            stop: self.stop.clone(),
-            relaxation: self.relaxation,
-            decay: self.decay,
-            order: Order::Golden,
-            nonnegative: true,
+    fn built(&self) -> Result<Built> {
+        let &Self { subsets, relaxation, decay, .. } = self;
+        let updates = Updates { subsets, relaxation, decay, order: Order::Golden, nonnegative: true };
+        updates.validate()?;
+        for (name, x) in [("alpha", self.alpha), ("alpha_decay", self.alpha_decay), ("ratio", self.ratio)] {
+            ensure(x.is_finite() && x > 0.0, "spec", name, x, "a positive finite number")?;
         }
+        ensure(self.tolerance >= 0.0, "spec", "tolerance", self.tolerance, "0 or more")?;
+        let &Self { alpha, alpha_decay, ratio, descents, tolerance, .. } = self;
+        let shared = Shared::of(self.projector.as_ref(), self.scene, &self.start, &self.stop)?;
+        Ok(Built { shared, updates, descent: Descent { alpha, alpha_decay, ratio, count: descents }, tolerance })
     }
 }
 
-impl Solver for AsdPocs {
+/// The steps of descent on total variation after a data pass.
+#[derive(Debug, Clone, Copy)]
+struct Descent {
+    alpha: f64,
+    alpha_decay: f64,
+    ratio: f64,
+    count: usize,
+}
+
+/// What [`AsdPocs`] builds.
+struct Built {
+    shared: Shared,
+    updates: Updates,
+    descent: Descent,
+    tolerance: f64,
+}
+
+impl Iterative for Built {
+    fn kind(&self) -> &'static str {
+        "asd-pocs"
+    }
+
+    fn shared(&self) -> &Shared {
+        &self.shared
+    }
+
     fn solve(&self, job: &Job<'_>, observer: &mut dyn Observer) -> Result<Solution> {
         let begun = Instant::now();
-        let opened = Opened::of(&self.describe(), job, observer)?;
+        let opened = self.shared.open(&self.describe(), job, observer)?;
         let job = &opened.job(job);
         let problem = opened.problem(job);
         let sigma = Noise::of(job.scan, false).sigma;
-        let mut iterate = Iterate {
-            settings: self.clone(),
-            sweep: Sweep::new(&self.data(), &problem, problem.start(job)?),
-            target: self.tolerance * sigma * (job.scan.projections.len() as f64).sqrt(),
-            length: 0.0,
-            work: problem.zeros(),
-        };
-        drive(job, &self.stop, begun, &problem, &mut iterate, observer)
+        let space = Space::new(job.scan.header());
+        let mut iterate = Iterate::new(self, &space, self.shared.start(job, &problem, &space)?);
+        iterate.target = self.tolerance * sigma * (job.scan.projections.len() as f64).sqrt();
+        iterate.sweep.prepare(&problem);
+        drive(job, &self.shared.stop, begun, &problem, &space, &mut iterate, observer)
     }
 
-    fn trains_field(&self, spec: &Spec) -> Result<bool> {
-        refuse_others(spec)?;
-        Ok(false)
-    }
-
-    fn plan(&self, scan: &Scan) -> Vec<String> {
+    fn found(&self, scan: &Scan) -> Vec<String> {
         let noise = Noise::of(scan, false).to_string();
-        vec![told(&subsets(scan.geometry.views.len(), self.subsets)), noise]
+        vec![told(&self.updates.subsets.of(scan.geometry.views.len())), noise]
     }
 
-    fn needs_held_out(&self) -> Option<&'static str> {
-        self.stop.needs_held_out()
-    }
-
-    /// Beside a sweep's there are the volume before it and the descent's direction; after it, one more copy instead of
-    /// inverse column sums. The noise is read from differences of all pixels before that.
-    fn working_memory(&self, pixels: u64, voxels: u64) -> u64 {
-        let sweeping = Sweep::memory(self.subsets, pixels, voxels) + 2 * 4 * voxels;
-        sweeping.max(noise::memory(pixels)) + self.stop.kept(voxels)
+    fn bytes(&self, header: &ScanHeader) -> u64 {
+        let space = Space::tally(*header);
+        space.pass(noise::scratch(header));
+        Iterate::new(self, &space, space.volume());
+        self.shared.price(&space, self.updates.subsets)
     }
 
     fn describe(&self) -> String {
-        format!("asd-pocs: {} subsets, {} descents a pass, alpha {}", self.subsets, self.descents, self.alpha)
+        let Descent { alpha, count, .. } = self.descent;
+        format!("asd-pocs: {}, {count} descents a pass, alpha {alpha}", self.updates.subsets)
     }
 }
 
 struct Iterate {
-    settings: AsdPocs,
+    descent: Descent,
     sweep: Sweep,
     /// The residual's norm that noise alone explains.
     target: f64,
     /// Length of a descent step.
     length: f64,
-    work: Array3<f32>,
+    /// The volume before a pass.
+    before: Array3<f32>,
+    /// The volume after the data pass.
+    fitted: Array3<f32>,
 }
 
-impl Method for Iterate {
-    fn pass(&mut self, problem: &Problem<'_>, pass: u64) -> Result<Pass> {
-        let s = &self.settings;
-        let grid = &problem.scan.geometry.volume;
-        let before = self.sweep.x.clone();
-        let residual = self.sweep.sweep(problem, pass);
-        let data = distance(&self.sweep.x, &before);
-        if pass == 0 {
-            self.length = s.alpha * data / s.descents.max(1) as f64;
+impl Iterate {
+    fn new(built: &Built, space: &Space, x: Array3<f32>) -> Self {
+        Self {
+            descent: built.descent,
+            sweep: Sweep::new(built.updates, space, x),
+            target: 0.0,
+            length: 0.0,
+            before: space.volume(),
+            fitted: space.volume(),
         }
-        let fitted = self.sweep.x.clone();
-        let mean = (norm2(&fitted) / fitted.len() as f64).sqrt();
-        for _ in 0..s.descents {
-            let x = flat_mut(&mut self.sweep.x);
-            descend(x, grid.shape, anisotropy(grid), self.length, 1e-3 * mean as f32, flat_mut(&mut self.work));
+    }
+}
+
+impl Iteration for Iterate {
+    fn pass(&mut self, problem: &Problem<'_>, pass: u64) -> Result<Pass> {
+        let Descent { alpha, alpha_decay, ratio, count } = self.descent;
+        let grid = &problem.scan.geometry.volume;
+        self.before.assign(&self.sweep.x);
+        let residual = self.sweep.sweep(problem, pass);
+        let data = distance(&self.sweep.x, &self.before);
+        if pass == 0 {
+            self.length = alpha * data / count.max(1) as f64;
+        }
+        self.fitted.assign(&self.sweep.x);
+        let mean = (norm2(&self.fitted) / self.fitted.len() as f64).sqrt();
+        for _ in 0..count {
+            let (x, work) = (flat_mut(&mut self.sweep.x), flat_mut(&mut self.sweep.work));
+            descend(x, grid.shape, anisotropy(grid), self.length, 1e-3 * mean as f32, work);
             problem.outside(&mut self.sweep.x, 0.0);
         }
-        let prior = distance(&self.sweep.x, &fitted);
-        if prior > s.ratio * data && residual.sqrt() > self.target {
-            self.length *= s.alpha_decay;
+        let prior = distance(&self.sweep.x, &self.fitted);
+        if prior > ratio * data && residual.sqrt() > self.target {
+            self.length *= alpha_decay;
         }
-        Ok(Pass { residual, change: Some(change(&self.sweep.x, &before)), prior: None })
+        Ok(Pass { residual, change: Some(change(&self.sweep.x, &self.before)), prior: None })
     }
 
-    fn volume(&self) -> &Array3<f32> {
+    fn volume(&mut self, _: &Problem<'_>) -> &Array3<f32> {
         &self.sweep.x
     }
 
-    fn take(&mut self) -> Array3<f32> {
+    fn take(&mut self, _: &Problem<'_>) -> Array3<f32> {
         std::mem::take(&mut self.sweep.x)
     }
 
-    fn state(&mut self) -> Vec<(&'static str, &mut [f32])> {
-        vec![("x", flat_mut(&mut self.sweep.x))]
+    fn state(&mut self) -> Vec<(String, &mut [f32])> {
+        vec![("x".into(), flat_mut(&mut self.sweep.x))]
     }
 
     fn numbers(&mut self) -> Vec<&mut f64> {

@@ -1,19 +1,36 @@
 //! Conjugate gradients on the normal equations `AᵀA·x = Aᵀp` (Hestenes and Stiefel 1952; Björck, Numerical Methods for
 //! Least Squares Problems, algorithm 7.4.1). Early passes find what is smooth; noise comes with more of them.
 
-use super::{Method, Opened, Pass, Problem, Stop, drive, flat_mut, norm2, projecting, refuse_others};
+use super::norms::norm2;
+use super::order::Subsets;
+use super::plan::{Iterative, IterativePlan};
+use super::shared::Shared;
+use super::{Iteration, Pass, Problem, Stop, drive::drive, flat_mut};
 use conefield_core::error::Result;
-use conefield_core::solver::{Job, Observer, Reconstruction, Solution, Solver};
-use conefield_core::spec::{SolverSpec, Spec};
+use conefield_core::method::{Context, Job, Method, Observer, Plan, Reconstruction, Solution};
+use conefield_core::scan::ScanHeader;
+use conefield_core::scene::VoxelScene;
+use conefield_core::space::Space;
+use conefield_core::voxel::VoxelProjectorSpec;
+use conefield_projectors::voxel::Joseph;
 use ndarray::{Array3, Zip};
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 use std::time::Instant;
 
 /// Settings of `cgls`.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
+#[derive(Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields, default)]
 pub struct Cgls {
+    /// Line integrals of voxels.
+    #[serde(deserialize_with = "conefield_core::spec::stage::needed")]
+    #[schemars(with = "serde_json::Value", extend("x-stage" = "voxel-projector"))]
+    pub projector: Box<dyn VoxelProjectorSpec>,
+    /// How the scan is seen.
+    pub scene: VoxelScene,
+    /// The file of a known volume to start from.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub start: Option<String>,
     /// When it ends.
     pub stop: Stop,
     /// Set negative attenuation to 0 in the end.
@@ -22,46 +39,55 @@ pub struct Cgls {
 
 impl Default for Cgls {
     fn default() -> Self {
-        Self { stop: Stop { passes: Some(15), ..Stop::default() }, nonnegative: true }
+        let (scene, stop) = (VoxelScene::default(), Stop::after(15));
+        Self { projector: Box::new(Joseph {}), scene, start: None, stop, nonnegative: true }
     }
 }
 
-conefield_core::stage_type!(Solver, "cgls", Cgls, "conjugate gradients for least squares");
+conefield_core::stage_type!(Method, "cgls", Cgls, "conjugate gradients for least squares");
 
 #[typetag::serde(name = "cgls")]
-impl SolverSpec for Cgls {
-    fn build(&self) -> Result<Box<dyn Solver>> {
-        self.stop.validate()?;
-        Ok(Box::new(self.clone()))
+impl Method for Cgls {
+    fn plan(&self, _: &Context<'_>) -> Result<Box<dyn Plan>> {
+        let shared = Shared::of(self.projector.as_ref(), self.scene, &self.start, &self.stop)?;
+        Ok(Box::new(IterativePlan(Built { shared, nonnegative: self.nonnegative })))
     }
 }
 
-impl Solver for Cgls {
+/// What [`Cgls`] builds.
+struct Built {
+    shared: Shared,
+    nonnegative: bool,
+}
+
+impl Iterative for Built {
+    fn kind(&self) -> &'static str {
+        "cgls"
+    }
+
+    fn shared(&self) -> &Shared {
+        &self.shared
+    }
+
     fn solve(&self, job: &Job<'_>, observer: &mut dyn Observer) -> Result<Solution> {
         let begun = Instant::now();
-        let opened = Opened::of(&self.describe(), job, observer)?;
+        let opened = self.shared.open(&self.describe(), job, observer)?;
         let job = &opened.job(job);
         let problem = opened.problem(job);
-        let mut iterate = Iterate::new(&problem, problem.start(job)?);
-        let mut solution = drive(job, &self.stop, begun, &problem, &mut iterate, observer)?;
+        let space = Space::new(job.scan.header());
+        let mut iterate = Iterate::new(&space, self.shared.start(job, &problem, &space)?);
+        iterate.prepare(&problem);
+        let mut solution = drive(job, &self.shared.stop, begun, &problem, &space, &mut iterate, observer)?;
         if let (true, Reconstruction::Volume(volume)) = (self.nonnegative, &mut solution.result) {
             volume.data.par_mapv_inplace(|x| x.max(0.0));
         }
         Ok(solution)
     }
 
-    fn trains_field(&self, spec: &Spec) -> Result<bool> {
-        refuse_others(spec)?;
-        Ok(false)
-    }
-
-    fn needs_held_out(&self) -> Option<&'static str> {
-        self.stop.needs_held_out()
-    }
-
-    /// Direction and gradient, the residual and the direction's projections.
-    fn working_memory(&self, pixels: u64, voxels: u64) -> u64 {
-        2 * 4 * (pixels + voxels) + projecting(pixels) + self.stop.kept(voxels)
+    fn bytes(&self, header: &ScanHeader) -> u64 {
+        let space = Space::tally(*header);
+        Iterate::new(&space, space.volume());
+        self.shared.price(&space, Subsets::Count(1))
     }
 
     fn describe(&self) -> String {
@@ -75,6 +101,8 @@ struct Iterate {
     residual: Array3<f32>,
     /// The search direction.
     direction: Array3<f32>,
+    /// `A·direction`.
+    ahead: Array3<f32>,
     /// `Aᵀ·residual`.
     gradient: Array3<f32>,
     /// `‖gradient‖²`.
@@ -82,26 +110,38 @@ struct Iterate {
 }
 
 impl Iterate {
-    fn new(problem: &Problem<'_>, x: Array3<f32>) -> Self {
-        let residual = problem.residual(&problem.views(), &x);
-        let mut gradient = problem.zeros();
-        problem.back(&problem.views(), &residual, &mut gradient);
-        let gamma = norm2(&gradient);
-        Self { x, residual, direction: gradient.clone(), gradient, gamma }
+    fn new(space: &Space, x: Array3<f32>) -> Self {
+        let views = space.header().views;
+        Self {
+            x,
+            residual: space.projections(views),
+            direction: space.volume(),
+            ahead: space.projections(views),
+            gradient: space.volume(),
+            gamma: 0.0,
+        }
+    }
+
+    fn prepare(&mut self, problem: &Problem<'_>) {
+        let views = problem.views();
+        problem.residual(&views, &self.x, &mut self.residual);
+        problem.back(&views, &self.residual, &mut self.gradient);
+        self.direction.assign(&self.gradient);
+        self.gamma = norm2(&self.gradient);
     }
 }
 
-impl Method for Iterate {
+impl Iteration for Iterate {
     fn pass(&mut self, problem: &Problem<'_>, _: u64) -> Result<Pass> {
         let views = problem.views();
-        let ahead = problem.forward(&views, &self.direction);
-        let square = norm2(&ahead);
+        problem.forward(&views, &self.direction, &mut self.ahead);
+        let square = norm2(&self.ahead);
         if square == 0.0 {
             return Ok(Pass { residual: norm2(&self.residual), change: Some(0.0), prior: None });
         }
         let alpha = (self.gamma / square) as f32;
         Zip::from(&mut self.x).and(&self.direction).par_for_each(|x, d| *x += alpha * d);
-        Zip::from(&mut self.residual).and(&ahead).par_for_each(|r, q| *r -= alpha * q);
+        Zip::from(&mut self.residual).and(&self.ahead).par_for_each(|r, q| *r -= alpha * q);
         problem.back(&views, &self.residual, &mut self.gradient);
         let gamma = norm2(&self.gradient);
         let beta = (gamma / self.gamma) as f32;
@@ -111,19 +151,19 @@ impl Method for Iterate {
         Ok(Pass { residual: norm2(&self.residual), change: Some(change), prior: None })
     }
 
-    fn volume(&self) -> &Array3<f32> {
+    fn volume(&mut self, _: &Problem<'_>) -> &Array3<f32> {
         &self.x
     }
 
-    fn take(&mut self) -> Array3<f32> {
+    fn take(&mut self, _: &Problem<'_>) -> Array3<f32> {
         std::mem::take(&mut self.x)
     }
 
-    fn state(&mut self) -> Vec<(&'static str, &mut [f32])> {
+    fn state(&mut self) -> Vec<(String, &mut [f32])> {
         vec![
-            ("x", flat_mut(&mut self.x)),
-            ("residual", flat_mut(&mut self.residual)),
-            ("direction", flat_mut(&mut self.direction)),
+            ("x".into(), flat_mut(&mut self.x)),
+            ("residual".into(), flat_mut(&mut self.residual)),
+            ("direction".into(), flat_mut(&mut self.direction)),
         ]
     }
 

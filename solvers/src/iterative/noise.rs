@@ -1,8 +1,8 @@
 //! The noise of a scan, from the scan alone.
 
-use super::Problem;
-use conefield_core::scan::Scan;
-use ndarray::{Array3, Axis};
+use conefield_core::data_term::Misfit;
+use conefield_core::scan::{Scan, ScanHeader};
+use ndarray::{ArrayViewMut3, Axis};
 use rayon::prelude::*;
 
 /// Pixels looked at, about.
@@ -54,18 +54,25 @@ impl Noise {
             .collect();
         line(&points)
     }
+}
 
-    /// Multiplies values of `views` with `exp(−power·growth·p)`, at most 1: with a power of 1 the weights of a
-    /// likelihood, inverse variances up to a factor. Returns `Σ w·y²`.
-    pub fn weigh(&self, power: f64, problem: &Problem<'_>, views: &[usize], y: &mut Array3<f32>) -> f64 {
-        let rate = (power * self.growth) as f32;
+/// Weighted least squares, the weights `exp(−growth·p)` and at most 1: inverse variances up to a factor.
+pub(super) struct Weights<'a> {
+    pub(super) noise: Noise,
+    pub(super) scan: &'a Scan,
+}
+
+impl Weights<'_> {
+    /// Multiplies values of `views` with powers of the weights. Returns `Σ w·y²`.
+    fn weigh(&self, power: f64, views: &[usize], mut y: ArrayViewMut3<'_, f32>) -> f64 {
+        let rate = (power * self.noise.growth) as f32;
         let sums: Vec<f64> = y
             .axis_iter_mut(Axis(0))
             .into_par_iter()
             .zip(views)
             .map(|(mut image, &view)| {
                 let mut sum = 0.0;
-                image.zip_mut_with(&problem.scan.view(view), |y, p| {
+                image.zip_mut_with(&self.scan.view(view), |y, p| {
                     let weighted = if rate > 0.0 { *y * (-rate * p.max(0.0)).exp() } else { *y };
                     sum += f64::from(weighted) * f64::from(*y);
                     *y = weighted;
@@ -77,9 +84,32 @@ impl Noise {
     }
 }
 
+impl Misfit for Weights<'_> {
+    fn differentiate(&self, views: &[usize], residuals: ArrayViewMut3<'_, f32>) -> f64 {
+        0.5 * self.weigh(1.0, views, residuals)
+    }
+
+    fn curve(&self, views: &[usize], values: ArrayViewMut3<'_, f32>) {
+        self.weigh(1.0, views, values);
+    }
+
+    /// Noise of the variance `sigma²/w` has the standard deviation `sigma·√w` once it is weighted.
+    fn spread(&self, views: &[usize], values: ArrayViewMut3<'_, f32>) {
+        self.weigh(0.5, views, values);
+    }
+
+    fn noise(&self) -> f64 {
+        self.noise.sigma
+    }
+
+    fn describe(&self) -> String {
+        self.noise.to_string()
+    }
+}
+
 /// Bytes that [`Noise::of`] takes: pairs of numbers, in lists and then in one.
-pub fn memory(pixels: u64) -> u64 {
-    2 * 8 * pixels.min(2 * LOOKED_AT as u64)
+pub fn scratch(header: &ScanHeader) -> u64 {
+    2 * 8 * header.pixels().min(2 * LOOKED_AT as u64)
 }
 
 /// Levels and absolute second differences of pixels within the object.
@@ -123,6 +153,7 @@ mod tests {
     use conefield_core::geometry::{Geometry, Millimetres, Radians, View, VoxelGrid};
     use conefield_core::random::stream;
     use conefield_core::scan::Unit;
+    use ndarray::Array3;
     use rand_distr::{Distribution, Normal};
 
     /// A hill of line integrals up to 3 with noise of the standard deviation `sigma(p)`.

@@ -1,9 +1,61 @@
 //! Subsets of the views and the order in which they are taken.
 
+use conefield_core::error::{Result, ensure};
 use conefield_core::random::stream;
 use rand::seq::SliceRandom;
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
+
+/// How many subsets the views are split into.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
+#[serde(untagged)]
+pub enum Subsets {
+    /// So many: 1 takes all views at once.
+    Count(usize),
+    /// As many as there are views.
+    Each(Each),
+}
+
+/// One subset for each of them.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
+#[serde(rename_all = "kebab-case")]
+pub enum Each {
+    /// A view at a time.
+    Views,
+}
+
+impl Subsets {
+    /// A view at a time.
+    pub const VIEWS: Self = Self::Each(Each::Views);
+
+    /// Refuses 0. It stands at the key `subsets` of its method.
+    pub fn validate(self) -> Result<()> {
+        ensure(self != Self::Count(0), "spec", "subsets", 0, "at least 1, or \"views\"")
+    }
+
+    /// How many subsets `views` views make.
+    pub fn count(self, views: usize) -> usize {
+        match self {
+            Self::Count(n) => n.clamp(1, views.max(1)),
+            Self::Each(Each::Views) => views.max(1),
+        }
+    }
+
+    /// The subsets of `views` views.
+    pub fn of(self, views: usize) -> Vec<Vec<usize>> {
+        split(views, self.count(views))
+    }
+}
+
+impl std::fmt::Display for Subsets {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        match self {
+            Self::Count(1) => f.write_str("all views at once"),
+            Self::Count(n) => write!(f, "{n} subsets"),
+            Self::Each(Each::Views) => f.write_str("a view at a time"),
+        }
+    }
+}
 
 /// The order of subsets within a pass.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
@@ -17,9 +69,8 @@ pub enum Order {
     Golden,
 }
 
-/// Splits `views` views into `subsets` groups of every `subsets`th view, as equal in size as can be.
-pub fn subsets(views: usize, subsets: usize) -> Vec<Vec<usize>> {
-    let n = subsets.clamp(1, views.max(1));
+/// Splits `views` views into `n` groups of every `n`th view, as equal in size as can be.
+pub fn split(views: usize, n: usize) -> Vec<Vec<usize>> {
     (0..n).map(|s| (s..views).step_by(n).collect()).collect()
 }
 
@@ -82,11 +133,22 @@ mod tests {
 
     #[test]
     fn subsets_cover_all_views() {
-        let s = subsets(11, 3);
+        let s = Subsets::Count(3).of(11);
         assert_eq!(s, [vec![0, 3, 6, 9], vec![1, 4, 7, 10], vec![2, 5, 8]]);
-        assert_eq!(subsets(4, 9).len(), 4);
+        assert_eq!(Subsets::Count(9).of(4).len(), 4);
+        assert_eq!(Subsets::VIEWS.of(4), Subsets::Count(4).of(4));
         assert_eq!(told(&s), "3 subsets of 3 or 4 views");
-        assert_eq!(told(&subsets(4, 9)), "4 subsets of 1 view");
-        assert_eq!(told(&subsets(4, 1)), "1 subset of 4 views");
+        assert_eq!(told(&Subsets::VIEWS.of(4)), "4 subsets of 1 view");
+        assert_eq!(told(&Subsets::Count(1).of(4)), "1 subset of 4 views");
+    }
+
+    #[test]
+    fn a_number_or_views_can_be_written() {
+        for (text, subsets) in [("7", Subsets::Count(7)), ("\"views\"", Subsets::VIEWS)] {
+            assert_eq!(serde_json::from_str::<Subsets>(text).unwrap(), subsets);
+            assert_eq!(serde_json::to_string(&subsets).unwrap(), text);
+        }
+        assert!(serde_json::from_str::<Subsets>("\"view\"").is_err());
+        assert!(Subsets::Count(0).validate().is_err() && Subsets::VIEWS.validate().is_ok());
     }
 }

@@ -1,9 +1,11 @@
 //! Total variation of a volume: `Σ_j √(Σ_k (g_k·(x_{j+k} − x_j))²)` over voxels j and axes k, where differences across
 //! voxels of different sides count by `g_k = h/h_k` with h the sides' geometric mean. At the far faces differences are 0.
 
+use super::{flat, flat_mut};
 use conefield_core::geometry::VoxelGrid;
 use conefield_core::simd::{Op, Simd, SimdBase, SimdFloat, load, run, store};
-use ndarray::Array3;
+use conefield_core::space::Space;
+use ndarray::{Array3, ArrayView3};
 use rayon::prelude::*;
 
 /// Differences count by these, along x, y, z.
@@ -13,8 +15,8 @@ pub fn anisotropy(grid: &VoxelGrid) -> [f32; 3] {
 }
 
 /// The total variation of `x` itself.
-pub fn total_variation(x: &Array3<f32>, g: [f32; 3]) -> f64 {
-    let [nx, ny, nz] = shape(x);
+pub fn total_variation(x: ArrayView3<'_, f32>, g: [f32; 3]) -> f64 {
+    let (nx, ny, nz) = x.dim();
     let planes: Vec<f64> = (0..nx)
         .into_par_iter()
         .map(|i| {
@@ -37,11 +39,6 @@ pub fn total_variation(x: &Array3<f32>, g: [f32; 3]) -> f64 {
     planes.iter().sum()
 }
 
-fn shape(x: &Array3<f32>) -> [usize; 3] {
-    let (a, b, c) = x.dim();
-    [a, b, c]
-}
-
 /// The proximal map of total variation with `x ≥ 0`, by gradient steps on its dual, which starts where it ended before.
 ///
 /// `argmin_{u ≥ 0} ½‖u − v‖² + τ·TV(u)`, with `u = max(0, v − τ·∇ᵀp)` and `|p_j| ≤ 1` (Beck and Teboulle, IEEE Trans. Image
@@ -50,20 +47,18 @@ pub struct TvProx {
     shape: [usize; 3],
     g: [f32; 3],
     /// The dual variable along x, y and z.
-    dual: [Vec<f32>; 3],
+    dual: [Array3<f32>; 3],
 }
 
 impl TvProx {
     /// For volumes of `shape`, from a dual of 0.
-    pub fn new(shape: [usize; 3], g: [f32; 3]) -> Self {
-        let zeros = || vec![0.0; shape.iter().product()];
-        Self { shape, g, dual: [zeros(), zeros(), zeros()] }
+    pub fn new(shape: [usize; 3], g: [f32; 3], space: &Space) -> Self {
+        Self { shape, g, dual: std::array::from_fn(|_| space.array(shape)) }
     }
 
-    /// Names and values of the dual, for a checkpoint.
-    pub fn state(&mut self) -> [&mut Vec<f32>; 3] {
-        let [a, b, c] = &mut self.dual;
-        [a, b, c]
+    /// The dual along x, y and z, for a checkpoint.
+    pub fn state(&mut self) -> [&mut [f32]; 3] {
+        self.dual.each_mut().map(flat_mut)
     }
 
     /// Overwrites `u` with the proximal map of `v` after `steps` dual steps. Without a weight only what is below 0 goes.
@@ -82,7 +77,7 @@ impl TvProx {
     fn primal(&self, v: &[f32], tau: f32, u: &mut [f32]) {
         let [_, ny, nz] = self.shape;
         let plane = ny * nz;
-        let [px, py, pz] = &self.dual;
+        let [px, py, pz] = self.dual.each_ref().map(flat);
         u.par_chunks_mut(plane).enumerate().for_each(|(i, u)| {
             let at = i * plane;
             let before = (i > 0).then(|| &px[at - plane..at]);
@@ -103,7 +98,7 @@ impl TvProx {
         let plane = ny * nz;
         let bound = 4.0 * self.g.iter().map(|g| g * g).sum::<f32>();
         let scale = self.g.map(|g| g / (bound * tau));
-        let [px, py, pz] = &mut self.dual;
+        let [px, py, pz] = self.dual.each_mut().map(flat_mut);
         px.par_chunks_mut(plane).zip(py.par_chunks_mut(plane)).zip(pz.par_chunks_mut(plane)).enumerate().for_each(
             |(i, ((px, py), pz))| {
                 let at = i * plane;
@@ -270,6 +265,11 @@ fn slope(x: &[f32], shape: [usize; 3], g: [f32; 3], unit: f32, at: [usize; 3]) -
 mod tests {
     use super::*;
     use conefield_core::random::{mix, unit};
+    use conefield_core::scan::ScanHeader;
+
+    fn prox(shape: [usize; 3], g: [f32; 3]) -> TvProx {
+        TvProx::new(shape, g, &Space::new(ScanHeader { views: 0, detector: [0; 2], volume: shape }))
+    }
 
     fn noisy(shape: [usize; 3]) -> Array3<f32> {
         let mut i = 0;
@@ -285,13 +285,13 @@ mod tests {
         let shape = [9, 8, 19];
         let (g, tau) = ([1.0, 0.7, 1.3], 0.15f32);
         let v = noisy(shape);
-        let mut prox = TvProx::new(shape, g);
+        let mut prox = prox(shape, g);
         let mut u = Array3::zeros(shape);
         let gap = |u: &Array3<f32>| {
             // P(u) = ½‖u − v‖² + τTV(u); D(p) = ½‖v‖² − ½‖max(0, v − τ∇ᵀp)‖², and u is that maximum.
             let half = |a: f64| 0.5 * a;
             let distance: f64 = u.iter().zip(&v).map(|(a, b)| f64::from(a - b).powi(2)).sum();
-            let primal = half(distance) + f64::from(tau) * total_variation(u, g);
+            let primal = half(distance) + f64::from(tau) * total_variation(u.view(), g);
             let square = |x: &Array3<f32>| x.iter().map(|&a| f64::from(a).powi(2)).sum::<f64>();
             let dual = half(square(&v)) - half(square(u));
             (primal - dual) / primal
@@ -302,7 +302,7 @@ mod tests {
             gaps.push(gap(&u));
         }
         assert!(gaps[2] < 2e-3 && gaps[2] > -1e-5 && gaps[0] > gaps[1] && gaps[1] > gaps[2], "{gaps:?}");
-        assert!(total_variation(&u, g) < 0.5 * total_variation(&v, g));
+        assert!(total_variation(u.view(), g) < 0.5 * total_variation(v.view(), g));
     }
 
     /// Attenuation of a micrometre's object in 1/mm is large: without a weight nothing may be divided by next to nothing.
@@ -311,7 +311,7 @@ mod tests {
         let v: Vec<f32> = noisy([9, 8, 19]).iter().map(|x| 1e4 * (x - 0.5)).collect();
         for tau in [0.0, 1e-45] {
             let mut u = vec![f32::NAN; v.len()];
-            TvProx::new([9, 8, 19], [1.0; 3]).apply(&v, tau, 4, &mut u);
+            prox([9, 8, 19], [1.0; 3]).apply(&v, tau, 4, &mut u);
             assert!(u.iter().zip(&v).all(|(u, v)| *u == v.max(0.0)), "{tau}");
         }
     }

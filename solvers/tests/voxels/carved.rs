@@ -1,25 +1,24 @@
 //! Solvers on voxels that know where the object can be.
 
-use crate::kit::{Case, bodies, geometry, psnr};
+use crate::kit::{Case, bodies, geometry, psnr, solver};
 use conefield_core::scan::Volume;
-use conefield_projectors::simulate::{Noise, ellipsoids, scan_ellipsoids};
+use conefield_projectors::simulate::{DetectorNoise, ellipsoids, scan_ellipsoids};
 use conefield_solvers::support::carve;
 
 /// Volumes of a noisy scan: without, with the support, and what the support is.
 fn solved(kind: &str, start: Option<&Volume>) -> [Volume; 2] {
     let scan = noisy();
-    let initializer = start.map_or("", |_| "[initializer]\ntype = \"volume\"\npath = \"earlier.nii\"\n");
+    let start_line = start.map_or("", |_| "start = \"earlier.nii\"\n");
     ["box", "carve"].map(|support| {
-        let text = format!(
-            "[scene]\nsupport = \"{support}\"\n{initializer}[solver]\ntype = \"{kind}\"\nstop = {{ passes = 6 }}\n"
-        );
+        let solver = solver(kind, &format!("{start_line}stop = {{ passes = 6 }}"));
+        let text = format!("[scene]\nsupport = \"{support}\"\n{solver}");
         Case { file: start, ..Case::of(&scan) }.volume(&text).0
     })
 }
 
 fn noisy() -> conefield_core::scan::Scan {
     let mut scan = scan_ellipsoids(&bodies(), geometry(24));
-    let noise: Noise = "poisson:1e4".parse().unwrap();
+    let noise: DetectorNoise = "poisson:1e4".parse().unwrap();
     noise.add(&mut scan.projections, 5);
     scan
 }

@@ -7,7 +7,7 @@ use crate::kit::{Case, Heard, mean, view};
 use conefield_core::geometry::{Geometry, VoxelGrid};
 use conefield_core::scan::{Scan, Unit, Volume};
 use conefield_projectors::simulate::{Ellipsoid, scan_ellipsoids};
-use conefield_solvers::fdk::weights::{Coverage, Orbit, place};
+use conefield_solvers::fdk::weights::{Coverage, FdkOrbit, place};
 use std::f64::consts::{PI, TAU};
 
 /// Half width of the field of view at the axis, mm.
@@ -171,7 +171,7 @@ fn units_rows_and_signs_are_kept() {
 /// The scan as it would be without the weights of rays that are measured twice: FDK counts every ray half.
 fn unweighted(scan: &Scan) -> Scan {
     let mut scan = scan.clone();
-    let orbit = Orbit::of(&scan.geometry);
+    let orbit = FdkOrbit::of(&scan.geometry);
     for ((view, _, column), p) in scan.projections.indexed_iter_mut() {
         let radius = orbit.radius[view];
         let weight = orbit.weight(view, place(&scan.geometry, view, column as f64, radius));
@@ -206,7 +206,7 @@ fn what_cannot_be_completed_is_said() {
     let part = Orbiting { arc: 2.5, ..CENTRED };
     for orbit in [part, CENTRED.short(0.0).aside(5.2, true), CENTRED.short(1.0).aside(5.2, false)] {
         let orbit = Orbiting { views: 90, ..orbit };
-        assert_eq!(Orbit::of(&geometry(orbit)).coverage, Coverage::Limited, "{orbit:?}");
+        assert_eq!(FdkOrbit::of(&geometry(orbit)).coverage, Coverage::Limited, "{orbit:?}");
         let (volume, heard) = fdk(&scan(orbit), "");
         assert!(heard.said("expect streaks") && heard.said("iterative"), "{:?}", heard.notes);
         assert!(volume.data.iter().all(|x| x.is_finite()));

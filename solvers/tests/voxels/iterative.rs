@@ -1,12 +1,12 @@
 //! Every iterative solver on a small scan in closed form: what it reaches, what ends it, and that nothing but the job
 //! decides about its bits.
 
-use crate::kit::{Case, Heard, bodies, geometry, mean, psnr, volume};
+use crate::kit::{Case, Heard, bodies, geometry, mean, psnr, solver as spec, volume};
 use conefield_core::Error;
 use conefield_core::geometry::VoxelGrid;
+use conefield_core::method::Limits;
 use conefield_core::random::{mix, unit};
 use conefield_core::scan::{Scan, Volume};
-use conefield_core::solver::Limits;
 use conefield_projectors::simulate::{ellipsoids, scan_ellipsoids};
 
 /// Types with settings that suit 24 views.
@@ -16,12 +16,8 @@ const ALL: [(&str, &str); 6] = [
     ("sirt", ""),
     ("cgls", ""),
     ("asd-pocs", "subsets = 6"),
-    ("fista-tv", "subsets = 6\nweight = { fixed = 0.1 }"),
+    ("fista-tv", "subsets = 6\nprior.weight = { fixed = 0.1 }"),
 ];
-
-fn spec(kind: &str, settings: &str) -> String {
-    format!("[projector]\ntype = \"joseph\"\n[solver]\ntype = \"{kind}\"\n{settings}\n")
-}
 
 fn passes(n: u64) -> String {
     format!("stop = {{ passes = {n} }}")
@@ -95,7 +91,7 @@ fn fewer_views_than_fdk_needs_are_enough() {
         ("sirt", String::new(), 33.0),
         ("cgls", passes(6), 31.2),
         ("asd-pocs", "subsets = 5".into(), 38.0),
-        ("fista-tv", "subsets = 5\nweight = { fixed = 0.1 }".into(), 38.0),
+        ("fista-tv", "subsets = 5\nprior.weight = { fixed = 0.1 }".into(), 38.0),
     ] {
         let found = of(&spec(kind, &settings));
         println!("{kind}: {found:.1} dB");
@@ -128,7 +124,8 @@ fn air_is_taken_for_empty() {
     let mut scan = with_noise(scan_ellipsoids(&bodies(), g));
     scan.projections.mapv_inplace(|p| p.max(0.0));
     let haze = |air: bool| {
-        let text = spec("fista-tv", &format!("subsets = 6\nweight = {{ fixed = 0.02 }}\nair = {air}\n{}", passes(8)));
+        let text =
+            spec("fista-tv", &format!("subsets = 6\nprior.weight = {{ fixed = 0.02 }}\nair = {air}\n{}", passes(8)));
         let (volume, heard) = Case::of(&scan).volume(&text);
         assert_eq!(heard.said("of the pixels are air"), air);
         mean(&volume, |x| x.iter().any(|x| x.abs() > 21.0))
@@ -161,9 +158,9 @@ fn relaxation_decays_from_pass_to_pass() {
     let scan = scan();
     for kind in ["sart", "os-sart"] {
         let of = |settings: &str, file: Option<&Volume>| {
-            let start = if file.is_some() { "[initializer]\ntype = \"volume\"\npath = \"x\"\n" } else { "" };
-            let solver = spec(kind, &format!("order = \"sequential\"\ndecay = 0.5\n{settings}"));
-            Case { file, ..Case::of(&scan) }.volume(&format!("{start}{solver}")).0
+            let start = if file.is_some() { "start = \"x\"\n" } else { "" };
+            let text = spec(kind, &format!("{start}order = \"sequential\"\ndecay = 0.5\n{settings}"));
+            Case { file, ..Case::of(&scan) }.volume(&text).0
         };
         let first = of("relaxation = 0.6\nstop = { passes = 1 }", None);
         let second = of("relaxation = 0.3\nstop = { passes = 1 }", Some(&first));
@@ -181,14 +178,10 @@ fn any_number_of_threads_gives_the_same_bits() {
         let stop = if kind == "fdk" { String::new() } else { passes(3) };
         let on = |threads: usize| {
             let pool = rayon::ThreadPoolBuilder::new().num_threads(threads).build().unwrap();
-            pool.install(|| Case::of(&scan).volume(&spec_of(kind, &format!("{settings}\n{stop}"))).0)
+            pool.install(|| Case::of(&scan).volume(&spec(kind, &format!("{settings}\n{stop}"))).0)
         };
         same_bits(&on(1), &on(3), kind);
     }
-}
-
-fn spec_of(kind: &str, settings: &str) -> String {
-    if kind == "fdk" { format!("[solver]\ntype = \"fdk\"\n{settings}") } else { spec(kind, settings) }
 }
 
 #[test]
@@ -261,7 +254,7 @@ fn passes_time_or_a_small_change_end_a_run() {
         let n = heard.records.len();
         println!("{kind}: {n} passes to a change of 3 %");
         assert!(n > 1 && n < 200, "{kind}: {n} passes");
-        let events = |r: &conefield_core::solver::Record| r.events.iter().any(|e| e.contains("stopping rule"));
+        let events = |r: &conefield_core::method::Record| r.events.iter().any(|e| e.contains("stopping rule"));
         assert!(events(&heard.records[n - 1]) && !heard.records[..n - 1].iter().any(events), "{kind}");
     }
 }
@@ -289,10 +282,10 @@ fn patience_ends_a_run_at_the_best_volume() {
 #[test]
 fn every_projector_serves_and_the_unit_is_the_scan_s() {
     let (mut scan, truth) = (scan(), truth());
-    let of = |scan: &Scan, head: &str| Case::of(scan).volume(&format!("{head}[solver]\ntype = \"cgls\"\n")).0;
+    let of = |scan: &Scan, settings: &str| Case::of(scan).volume(&spec("cgls", settings)).0;
     let plain = of(&scan, "");
     for kind in ["siddon", "joseph", "trilinear"] {
-        let found = of(&scan, &format!("[projector]\ntype = \"{kind}\"\n"));
+        let found = of(&scan, &format!("projector.type = \"{kind}\""));
         assert!(psnr(&found, &truth) > 27.0, "{kind}: {:.1} dB", psnr(&found, &truth));
         assert_eq!(found.data == plain.data, kind == "joseph", "{kind}: Joseph's is taken where none is named");
     }

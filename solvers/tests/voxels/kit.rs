@@ -4,8 +4,8 @@ use conefield_backend_cpu::Cpu;
 use conefield_core::arena::Weights;
 use conefield_core::checkpoint::{Checkpoint, Resume};
 use conefield_core::geometry::{Geometry, Millimetres, Radians, View, VoxelGrid};
+use conefield_core::method::{Job, Limits, Observer, Reconstruction, Record, Solution};
 use conefield_core::scan::{Scan, Volume};
-use conefield_core::solver::{Job, Limits, Observer, Reconstruction, Record, Solution};
 use conefield_core::spec::Spec;
 use conefield_core::spec::load::parse;
 use conefield_core::{Error, Result};
@@ -30,12 +30,14 @@ pub struct Case<'a> {
     pub limits: Limits,
     /// What stands in every volume file that the spec names.
     pub file: Option<&'a Volume>,
+    /// What the job itself starts from.
+    pub start: Option<&'a Volume>,
     pub resume: Option<&'a Resume>,
 }
 
 impl<'a> Case<'a> {
     pub fn of(scan: &'a Scan) -> Self {
-        Self { scan, held_out: None, reference: None, limits: Limits::default(), file: None, resume: None }
+        Self { scan, held_out: None, reference: None, limits: Limits::default(), file: None, start: None, resume: None }
     }
 
     /// Runs the solver of the spec `text`.
@@ -48,6 +50,7 @@ impl<'a> Case<'a> {
             seed: 3,
             limits: self.limits,
             volumes: &|path| self.file.cloned().ok_or_else(|| Error::invalid(path, "file", "nothing", "a volume")),
+            start: self.start,
             resume: self.resume,
             ..Job::new(self.scan, &spec, &backend)
         };
@@ -64,6 +67,25 @@ impl<'a> Case<'a> {
 
 pub fn spec(text: &str) -> Result<Spec> {
     parse(text, "test.toml", &[], &[]).map(|l| l.spec)
+}
+
+/// The table `[solver]` of a shipped method, or of a type, with `settings` instead of its own.
+pub fn solver(name: &str, settings: &str) -> String {
+    format!("[solver]\n{}", method(name, settings))
+}
+
+/// The settings of [`solver`].
+pub fn method(name: &str, settings: &str) -> String {
+    let (kind, own) = match name {
+        "os-sart" => ("sart", &["subsets = 10", "relaxation = 1.0", "stop = { passes = 20 }"][..]),
+        "sirt" => ("sart", &["subsets = 1", "relaxation = 1.9", "decay = 1.0", "stop = { passes = 60 }"][..]),
+        "fista-tv" => ("fista", &["prior.type = \"total-variation\""][..]),
+        _ => (name, &[][..]),
+    };
+    let key = |line: &str| line.split('=').next().unwrap_or_default().trim().to_owned();
+    let own = own.iter().filter(|own| settings.lines().all(|line| key(line) != key(own)));
+    let own: String = own.map(|line| format!("{line}\n")).collect();
+    format!("type = \"{kind}\"\n{own}{settings}\n")
 }
 
 pub fn volume(solution: Solution) -> Volume {

@@ -1,5 +1,6 @@
 //! Solvers on voxels, held against ellipsoids whose scans are known in closed form.
 
+mod bases;
 mod carved;
 mod fdk;
 mod iterative;

@@ -3,13 +3,13 @@
 use crate::kit::{Case, Heard, bodies, geometry, psnr, spec, volume};
 use conefield_backend_cpu::Cpu;
 use conefield_core::Error;
+use conefield_core::method::{Limits, Reconstruction};
 use conefield_core::scan::Scan;
-use conefield_core::solver::{Limits, Reconstruction};
 use conefield_core::spec::Scene;
 use conefield_projectors::simulate::{ellipsoids, scan_ellipsoids};
 
-const FIRST: &str = "type = \"os-sart\"\nsubsets = 4\nstop = { passes = 3 }\n";
-const THEN: &str = "type = \"fista-tv\"\nsubsets = 4\npull = 0.05\n";
+const FIRST: &str = "type = \"sart\"\nsubsets = 4\nrelaxation = 1.0\nstop = { passes = 3 }\n";
+const THEN: &str = "type = \"fista\"\nprior.type = \"total-variation\"\nsubsets = 4\npull = 0.05\n";
 
 fn sequence(first: &str, then: &str, passes: u64) -> String {
     format!("[solver]\ntype = \"sequence\"\npasses = {passes}\n[solver.first]\n{first}[solver.then]\n{then}")
@@ -25,10 +25,9 @@ fn the_second_goes_on_where_the_first_ended() {
     let (both, heard) = Case::of(&scan).volume(&sequence(FIRST, THEN, 4));
     // By hand: the first one's volume as the second one's file.
     let (first, _) = Case::of(&scan).volume(&format!("[solver]\n{FIRST}"));
-    let start = "[initializer]\ntype = \"volume\"\npath = \"first.nii\"\n";
     let limits = Limits { steps: Some(4), ..Limits::default() };
     let by_hand = Case { file: Some(&first), limits, ..Case::of(&scan) };
-    let (second, _) = by_hand.volume(&format!("{start}[solver]\n{THEN}"));
+    let (second, _) = by_hand.volume(&format!("[solver]\nstart = \"first.nii\"\n{THEN}"));
     assert_eq!(both.data, second.data);
     assert_ne!(both.data, first.data);
     // One list of records, whose steps and seconds go on.
@@ -93,17 +92,14 @@ fn what_makes_no_sequence_is_refused() {
     );
     for (text, says) in [
         (sequence(FIRST, GRADIENT, 4), "solver.then"),
-        (sequence("type = \"os-sart\"\nsubsets = 0\n", THEN, 4), "solver.first.subsets"),
-        (sequence(FIRST, "type = \"fista-tv\"\npull = -1.0\n", 4), "solver.then.pull"),
+        (sequence("type = \"sart\"\nsubsets = 0\n", THEN, 4), "solver.first.subsets"),
+        (sequence(FIRST, "type = \"fista\"\npull = -1.0\n", 4), "solver.then.pull"),
         (sequence(FIRST, THEN, 0), "solver.passes"),
         (nested, "a sequence in a sequence"),
     ] {
         let e = Case::of(&scan()).run(&text, &mut Heard::default()).err().unwrap().to_string();
         assert!(e.contains(says), "{e}");
     }
-    // What stands for the first one's volume is nothing that a spec can name.
-    let named = format!("[initializer]\ntype = \"handed\"\n[solver]\n{THEN}");
-    assert!(spec(&named).err().unwrap().to_string().contains("handed"));
 }
 
 #[test]
@@ -116,8 +112,8 @@ fn limits_are_the_firsts_and_what_is_told_is_of_both() {
     assert_eq!(volume(solution).data.dim(), (24, 24, 24));
     let solver = spec(&text).unwrap().solver.build().unwrap();
     let said = solver.describe();
-    assert!(said.contains("os-sart: 4 subsets") && said.contains("then at most 4 passes of fista-tv"), "{said}");
+    assert!(said.contains("sart: 4 subsets") && said.contains("then at most 4 passes of fista"), "{said}");
     let next = solver.successor(&Scene::default()).unwrap();
-    assert_eq!((next.passes, next.spec.initializer.is_some()), (4, true));
+    assert_eq!(next.passes, 4);
     assert!(next.first.successor(&Scene::default()).is_none());
 }

@@ -3,9 +3,9 @@
 use crate::kit::{Case, Heard, mean, psnr, spec, view};
 use conefield_backend_cpu::Cpu;
 use conefield_core::geometry::{Geometry, VoxelGrid};
+use conefield_core::method::Job;
 use conefield_core::scan::Scan;
-use conefield_core::solver::Job;
-use conefield_core::spec::SurroundRule;
+use conefield_core::scene::SurroundRule;
 use conefield_projectors::simulate::{Ellipsoid, ellipsoids, scan_ellipsoids};
 use conefield_solvers::surround::told;
 
@@ -41,7 +41,7 @@ const SURROUND: &str = "[scene]\nsurround = { coarse = { margin = 1.0, cells = 3
 
 fn solver(kind: &str) -> String {
     let stop = if kind == "fdk" { "" } else { "stop = { passes = 10 }\n" };
-    format!("[solver]\ntype = \"{kind}\"\n{stop}")
+    crate::kit::solver(kind, stop)
 }
 
 #[test]

@@ -6,6 +6,7 @@ use conefield_core::voxel::VoxelOperator;
 use conefield_projectors::simulate::{ellipsoids, scan_ellipsoids};
 use conefield_projectors::voxel::Joseph;
 
+/// What a field starts from.
 const START: &str = "[initializer]\ntype = \"volume\"\npath = \"earlier.nii\"\n";
 
 const ALL: [&str; 6] = ["sart", "os-sart", "sirt", "cgls", "asd-pocs", "fista-tv"];
@@ -23,10 +24,15 @@ fn scan_of(volume: &Volume) -> Scan {
     scan
 }
 
-fn solver(kind: &str) -> String {
-    let weight = if kind == "fista-tv" { "weight = { fixed = 0.0 }\n" } else { "" };
+fn solver(kind: &str, more: &str) -> String {
+    let weight = if kind == "fista-tv" { "prior.weight = { fixed = 0.0 }\n" } else { "" };
     let descents = if kind == "asd-pocs" { "descents = 0\n" } else { "" };
-    format!("[solver]\ntype = \"{kind}\"\nstop = {{ passes = 1 }}\n{weight}{descents}")
+    crate::kit::solver(kind, &format!("stop = {{ passes = 1 }}\n{weight}{descents}{more}"))
+}
+
+/// A solver on voxels that starts from the file.
+fn warm(kind: &str) -> String {
+    solver(kind, "start = \"earlier.nii\"\n")
 }
 
 #[test]
@@ -34,9 +40,9 @@ fn the_truth_leaves_no_residual_and_stays() {
     let truth = truth();
     let scan = scan_of(&truth);
     for kind in ALL {
-        let (cold, first) = Case::of(&scan).volume(&solver(kind));
+        let (cold, first) = Case::of(&scan).volume(&solver(kind, ""));
         let case = Case { file: Some(&truth), ..Case::of(&scan) };
-        let (warm, heard) = case.volume(&format!("{START}{}", solver(kind)));
+        let (warm, heard) = case.volume(&warm(kind));
         let (warm_loss, cold_loss) = (heard.losses()[0], first.losses()[0]);
         println!("{kind}: residual {warm_loss:.1e} instead of {cold_loss:.1e}");
         assert!(warm_loss < 1e-5 * cold_loss.max(0.1), "{kind}: {warm_loss:e} and {cold_loss:e}");
@@ -53,9 +59,9 @@ fn the_start_is_what_the_file_holds() {
     let tenfold = truth.clone().mapped(|x| 10.0 * x);
     for kind in ALL {
         // No pass is made: what comes out is what stood in the file.
-        let limits = conefield_core::solver::Limits { steps: Some(0), ..Default::default() };
+        let limits = conefield_core::method::Limits { steps: Some(0), ..Default::default() };
         let case = Case { file: Some(&tenfold), limits, ..Case::of(&scan) };
-        let (volume, heard) = case.volume(&format!("{START}{}", solver(kind)));
+        let (volume, heard) = case.volume(&warm(kind));
         assert!(heard.records.is_empty(), "{kind}");
         let apart = volume.data.iter().zip(&tenfold.data).fold(0.0f32, |m, (a, b)| m.max((a - b).abs()));
         assert!(apart < 1e-7, "{kind}: {apart}");
@@ -69,31 +75,31 @@ fn volumes_that_do_not_fit_are_refused() {
     let other = Volume::centered(ndarray::Array3::zeros((24, 23, 24)), [2.0; 3]);
     let mut holed = truth.clone();
     holed.data[[1, 2, 3]] = f32::NAN;
-    let field = field(IDENTITY, GRID, 1);
-    for solver in ALL.map(solver).iter().chain([&field]) {
+    let field = format!("{START}{}", field(IDENTITY, GRID, 1));
+    for text in ALL.map(warm).iter().chain([&field]) {
         for (file, want) in [
             (&other, "earlier.nii: shape: found [24, 23, 24], expected [24, 24, 24]"),
             (&holed, "earlier.nii: voxel (1, 2, 3): found NaN"),
         ] {
             let case = Case { file: Some(file), ..Case::of(&scan) };
-            let e = case.run(&format!("{START}{solver}"), &mut Heard::default()).err().unwrap().to_string();
+            let e = case.run(text, &mut Heard::default()).err().unwrap().to_string();
             assert!(e.contains(want), "{e}");
         }
     }
 }
 
-/// FISTA-TV with a pull ends between what the scan says and what it is held to, the nearer to that the stronger the pull.
+/// FISTA with a pull ends between what the scan says and what it is held to, the nearer to that the stronger the pull.
 #[test]
 fn a_pull_holds_to_the_start() {
     let truth = truth();
     let scan = scan_of(&truth);
     let start = truth.clone().mapped(|x| 0.9 * x + 1e-3);
     let case = Case { file: Some(&start), ..Case::of(&scan) };
-    let spec = |pull: f64| {
-        format!(
-            "{START}[solver]\ntype = \"fista-tv\"\nstop = {{ passes = 6 }}\nweight = {{ fixed = 0.0 }}\npull = {pull:?}\n"
-        )
+    let held = |pull: f64, start: &str| {
+        let settings = format!("{start}stop = {{ passes = 6 }}\nprior.weight = {{ fixed = 0.0 }}\npull = {pull:?}\n");
+        crate::kit::solver("fista-tv", &settings)
     };
+    let spec = |pull: f64| held(pull, "start = \"earlier.nii\"\n");
     let free = case.volume(&spec(0.0)).0;
     let apart: Vec<f64> =
         [1e-2, 1.0, 1e4].iter().map(|&p| psnr(&case.volume(&spec(p)).0, &start) - psnr(&free, &start)).collect();
@@ -101,9 +107,26 @@ fn a_pull_holds_to_the_start() {
     // Without a pull it goes to the truth, held a little it stays behind.
     assert!(psnr(&free, &truth) > psnr(&case.volume(&spec(1.0)).0, &truth) + 3.0);
 
-    let alone = crate::kit::spec("[solver]\ntype = \"fista-tv\"\npull = 0.1\n").unwrap();
-    let e = alone.solver.build().unwrap().trains_field(&alone).unwrap_err().to_string();
-    assert!(e.contains("solver.pull: found 0.1, expected 0, or an initializer"), "{e}");
+    let e = case.run(&held(0.1, ""), &mut Heard::default()).err().unwrap().to_string();
+    assert!(e.contains("solver.pull: found 0.1, expected 0, or a volume to start from"), "{e}");
+}
+
+/// A job may hand the volume over itself; it goes before the file.
+#[test]
+fn a_volume_that_is_handed_over_is_the_start() {
+    let truth = truth();
+    let scan = scan_of(&truth);
+    let other = truth.clone().mapped(|x| 0.5 * x);
+    for kind in ALL {
+        let text = warm(kind);
+        let (by_file, _) = Case { file: Some(&truth), ..Case::of(&scan) }.volume(&text);
+        let (handed, _) = Case { file: Some(&other), start: Some(&truth), ..Case::of(&scan) }.volume(&text);
+        assert!(by_file.data == handed.data, "{kind}");
+    }
+    let small = Volume::centered(ndarray::Array3::zeros((2, 3, 4)), [2.0; 3]);
+    let case = Case { start: Some(&small), ..Case::of(&scan) };
+    let e = case.run(&solver("sirt", ""), &mut Heard::default()).err().unwrap().to_string();
+    assert!(e.contains("start: shape: found [2, 3, 4], expected [24, 24, 24]"), "{e}");
 }
 
 const IDENTITY: &str = "type = \"identity\"";

@@ -149,15 +149,6 @@ pub fn resolutions(stage: &dyn Encoder) -> Outcome {
     Outcome::Passed(format!("{low} to {high} cells along the cube's side"))
 }
 
-/// A normalizer without some outputs: the others keep their bits.
-pub fn normalizer_outputs(stage: &dyn Normalizer, options: &Options) -> Outcome {
-    each(stage.info().output, |keep| {
-        let r = stage.keep_outputs(keep)?;
-        Ok(same_outputs(stage, r.stage.as_ref(), &r.params, &r.channels, keep, options)
-            .or_else(|| whole(r.stage.as_ref(), options)))
-    })
-}
-
 /// A normalizer without some inputs is a smaller stage of the same kind.
 pub fn normalizer_inputs(stage: &dyn Normalizer, options: &Options) -> Outcome {
     let info = stage.info();

@@ -32,7 +32,7 @@ fn loss<R: Real>(k: &dyn Kernel<R>, info: &Info, params: &[R], x: &[R], dy: &[R]
 }
 
 /// Derivative of `f` at 0 by central differences over two steps (Richardson): the error is of fourth order.
-fn slope(h: f64, mut f: impl FnMut(f64) -> f64) -> f64 {
+pub fn slope(h: f64, mut f: impl FnMut(f64) -> f64) -> f64 {
     let mut central = |h: f64| (f(h) - f(-h)) / (2.0 * h);
     let (wide, narrow) = (central(h), central(0.5 * h));
     (4.0 * narrow - wide) / 3.0

@@ -5,12 +5,19 @@
 //! stage is smooth: a row is taken only if differences over a step and over four steps agree, so that no cell boundary
 //! and no kink of an activation lies near.
 
+mod bases;
 mod behaviour;
 mod call;
 mod channels;
+mod data_terms;
 mod gradients;
 mod halves;
+mod lines;
+mod losses;
+mod priors;
 mod rays;
+mod regularizers;
+mod settings;
 mod voxels;
 mod weights;
 mod wgsl;
@@ -20,7 +27,13 @@ use std::fmt;
 use std::ops::Range;
 use std::panic::{AssertUnwindSafe, catch_unwind};
 
+pub use bases::check_basis;
+pub use data_terms::check_data_term;
+pub use losses::{Compare, check_loss, check_loss_wgsl, ready};
+pub use priors::{Penalise, check_prior, check_prior_wgsl};
 pub use rays::check_projector;
+pub use regularizers::check_regularizer;
+pub use settings::check_settings;
 pub use voxels::check_voxel_projector;
 pub use weights::check_initializer;
 pub use wgsl::{Pass, Sample, check_projector_wgsl, check_wgsl};
@@ -152,14 +165,14 @@ pub fn check_encoder(stage: &dyn Encoder, options: &Options) -> Report {
 /// [`check`], and what a normalizer must keep to when channels are left out.
 pub fn check_normalizer(stage: &dyn Normalizer, options: &Options) -> Report {
     let mut report = check(stage, options);
-    report.add("keep outputs", || channels::normalizer_outputs(stage, options));
     report.add("keep inputs", || channels::normalizer_inputs(stage, options));
     report
 }
 
-/// [`check`], and what a field must keep to when channels are left out.
+/// [`check`], what a field must keep to when channels are left out, and its own line integrals.
 pub fn check_field(stage: &dyn Field, options: &Options) -> Report {
     let mut report = check(stage, options);
     report.add("keep inputs", || channels::field_inputs(stage, options));
+    lines::check(&mut report, stage, options);
     report
 }

@@ -37,7 +37,7 @@ pub fn check_voxel_projector(projector: &dyn VoxelProjector) -> Report {
     report
 }
 
-fn view(angle: f64, distances: [f64; 2], pixel: [f64; 2], offset: [f64; 2]) -> View {
+pub(crate) fn view(angle: f64, distances: [f64; 2], pixel: [f64; 2], offset: [f64; 2]) -> View {
     let mm = Millimetres;
     View::circular(Radians(angle), mm(distances[0]), mm(distances[1]), pixel.map(mm), offset.map(mm))
 }
@@ -86,7 +86,7 @@ fn all_views(g: &Geometry) -> Vec<usize> {
 }
 
 /// Numbers in [-0.5, 0.5).
-fn noise<R: Real>(shape: [usize; 3], seed: u64) -> Array3<R> {
+pub(crate) fn noise<R: Real>(shape: [usize; 3], seed: u64) -> Array3<R> {
     let mut i = 0;
     Array3::from_shape_simple_fn(shape, || {
         i += 1;
@@ -110,21 +110,21 @@ fn back<R: Real>(op: &dyn VoxelOperator<R>, g: &Geometry, views: &[usize], y: &A
     out
 }
 
-fn dot<R: Real>(a: &Array3<R>, b: &Array3<R>) -> f64 {
+pub(crate) fn dot<R: Real>(a: &Array3<R>, b: &Array3<R>) -> f64 {
     Zip::from(a).and(b).fold(0.0, |sum, x, y| sum + x.f64() * y.f64())
 }
 
-fn flat<R: Real>(x: &Array3<R>) -> Vec<R> {
+pub(crate) fn flat<R: Real>(x: &Array3<R>) -> Vec<R> {
     x.iter().copied().collect()
 }
 
 /// Whether `x` is above `most` or not a number.
-fn above(x: f64, most: f64) -> bool {
+pub(crate) fn above(x: f64, most: f64) -> bool {
     x.is_nan() || x > most
 }
 
 /// `Some(complaint)` where the relative error of `a` against `b` is above `most` or not a number.
-fn apart<A: Real, B: Real>(what: &str, a: &Array3<A>, b: &Array3<B>, most: f64) -> Option<String> {
+pub(crate) fn apart<A: Real, B: Real>(what: &str, a: &Array3<A>, b: &Array3<B>, most: f64) -> Option<String> {
     let e = error(&flat(a), &flat(b));
     above(e, most).then(|| format!("{what}: off by {e:.1e}, at most {most:.0e}"))
 }

@@ -4,7 +4,7 @@ use crate::Report;
 use crate::call::{Draw, differing, settle};
 use conefield_core::arena::{Arena, Block, InitReport, Layout};
 use conefield_core::error::Result;
-use conefield_core::spec::Initializer;
+use conefield_core::settings::Initializer;
 
 /// Runs every property that an initializer must have, on the layout of a small pipeline.
 pub fn check_initializer(initializer: &dyn Initializer) -> Report {

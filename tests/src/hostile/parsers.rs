@@ -82,7 +82,7 @@ fn scan(path: &Path) -> Result<()> {
     let _ = conefield_io::scan_size(path);
     let truth = conefield_io::read_truth(path);
     let scan = conefield_io::read_scan(path)?;
-    conefield_io::check_line_integrals(scan.projections.view());
+    conefield_diagnosis::check_line_integrals(scan.projections.view());
     truth.map(drop)
 }
 

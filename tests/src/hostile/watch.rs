@@ -30,7 +30,7 @@ pub struct Meter {
 
 /// What a reader did that none may do.
 #[derive(Debug, Clone, PartialEq)]
-pub enum Fault {
+pub enum ReaderFault {
     /// It panicked with these words.
     Panic(String),
     /// It took this many bytes.
@@ -39,7 +39,7 @@ pub enum Fault {
     Time(Duration),
 }
 
-impl fmt::Display for Fault {
+impl fmt::Display for ReaderFault {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         match self {
             Self::Panic(words) => write!(f, "panicked: {words}"),
@@ -61,11 +61,11 @@ pub struct Seen {
     /// The longest time.
     pub longest: Duration,
     /// Each fault with the number of its mutation.
-    pub faults: Vec<(u64, Fault)>,
+    pub faults: Vec<(u64, ReaderFault)>,
 }
 
 /// Runs `read` and tells whether it accepted its input, and what it took; or the panic.
-pub fn once<E>(meter: Meter, read: impl FnOnce() -> Result<(), E>) -> Result<(bool, usize, Duration), Fault> {
+pub fn once<E>(meter: Meter, read: impl FnOnce() -> Result<(), E>) -> Result<(bool, usize, Duration), ReaderFault> {
     (meter.reset)();
     let before = (meter.current)();
     let start = Instant::now();
@@ -76,7 +76,7 @@ pub fn once<E>(meter: Meter, read: impl FnOnce() -> Result<(), E>) -> Result<(bo
         Err(words) => {
             let text = words.downcast_ref::<String>().cloned();
             let text = text.or_else(|| words.downcast_ref::<&str>().map(|s| (*s).to_owned()));
-            Err(Fault::Panic(text.unwrap_or_else(|| "something that is no text".into())))
+            Err(ReaderFault::Panic(text.unwrap_or_else(|| "something that is no text".into())))
         }
     }
 }
@@ -113,8 +113,8 @@ impl Parser {
                     seen.accepted += u64::from(accepted);
                     seen.most_bytes = seen.most_bytes.max(bytes);
                     seen.longest = seen.longest.max(time);
-                    let hoard = (bytes > bounds.bytes).then_some(Fault::Memory(bytes));
-                    hoard.or((time > bounds.time).then_some(Fault::Time(time)))
+                    let hoard = (bytes > bounds.bytes).then_some(ReaderFault::Memory(bytes));
+                    hoard.or((time > bounds.time).then_some(ReaderFault::Time(time)))
                 }
             };
             seen.faults.extend(fault.map(|f| (number, f)));

@@ -8,15 +8,17 @@ use crate::page;
 use conefield_backend_cpu::halves::Rounded;
 use conefield_backend_cpu::rows::Kernels;
 use conefield_backend_cpu::step::Slots;
-use conefield_core::backend::{Loss, TrainRay, Work};
+use conefield_core::backend::{TrainRay, Work};
 use conefield_core::half::{Half, round};
 use conefield_core::pipeline::{Model, Pipeline};
 use conefield_core::random::{mix, unit};
 use conefield_core::scene::Scene;
+use conefield_core::settings::{EncoderSpec, FieldSpec, NormalizerSpec};
 use conefield_core::simd::Real;
-use conefield_core::spec::{EncoderSpec, FieldSpec, NormalizerSpec, Tables};
+use conefield_core::spec::Tables;
 use conefield_core::stage::{Grads, Kernel, Reader, Stage, Tile, TileMut};
-use conefield_io::{CurveOptions, curves_png_with};
+use conefield_report::{CurveOptions, curves_png_with};
+use conefield_solvers::losses::L2;
 use serde_json::{Value, json};
 use std::ops::Range;
 
@@ -192,7 +194,7 @@ fn step(rays: usize, samples: usize, tables: Tables) -> [f64; 2] {
     value["projector"]["samples"] = json!(samples);
     let pipeline = Pipeline::build(&spec(&value).unwrap()).unwrap();
     let scan = scan();
-    let scene = Scene::new(&scan, &conefield_core::spec::Scene::default()).unwrap();
+    let scene = Scene::new(&scan, &conefield_core::scene::SceneSettings::default()).unwrap();
     let rays: Vec<TrainRay> = (0..rays)
         .map(|i| {
             let ray = scene.pixel_ray(&scan.geometry, i % 8, 4 + (i * 5) % 8, 4 + (i * 3) % 8);
@@ -203,7 +205,7 @@ fn step(rays: usize, samples: usize, tables: Tables) -> [f64; 2] {
     let moved = |(i, p): (usize, &f32)| p + 0.4 * (unit(mix(5, i as u64)) - 0.5);
     let params: Vec<f32> = start.iter().enumerate().map(moved).collect();
     let exact: Vec<f64> = params.iter().map(|p| f64::from(*p)).collect();
-    let work = Work { step: 4, seed: 9, loss: Loss::L2, rays: &rays, points: &[], tv: None, occupancy: None };
+    let work = Work { step: 4, seed: 9, loss: &L2 {}, rays: &rays, points: &[], priors: &[] };
     let copy = Rounded::new(tables, &params);
     let single = Kernels::reading(&pipeline, copy.as_ref()).unwrap();
     let double = Kernels::new(&pipeline, |s| s.reference()).unwrap();

@@ -3,7 +3,7 @@
 use crate::case::{Case, Ends, Seen};
 use crate::growth::{Pair, apart};
 use crate::scans::with;
-use conefield_core::spec::{EncoderSpec, NormalizerSpec};
+use conefield_core::settings::{EncoderSpec, NormalizerSpec};
 use conefield_core::stage::Normalizer;
 use serde_json::{Value, json};
 
@@ -141,7 +141,7 @@ pub fn layer_norm() -> Vec<Case> {
 pub fn masks() -> Vec<Case> {
     let masked = |mask: Value| {
         move |v: &mut Value| {
-            v["normalizers"] = json!([mask, {"type": "layer-norm"}]);
+            v["solver"]["callbacks"] = json!([{"type": "rollback"}, mask]);
         }
     };
     let all = json!({"type": "fft-mask", "epoch": 0, "threshold": 1e-9, "scope": "channel"});
@@ -152,7 +152,7 @@ pub fn masks() -> Vec<Case> {
         Case::right("the first and all finer count as noise", "the first stays, trains on", move || {
             with(masked(finer))
         }),
-        Case::refused("no channel is to be kept", &["normalizers.keep", "[]"], move || with(masked(none))),
+        Case::refused("no channel is to be kept", &["callbacks.1.keep", "[]"], move || with(masked(none))),
     ]
 }
 

@@ -5,8 +5,9 @@ use crate::common::{model, scan, solve};
 use crate::scans::with;
 use conefield_backend_cpu::Cpu;
 use conefield_core::arena::Weights;
-use conefield_core::backend::{Adam, Backend, Loss, Work};
+use conefield_core::backend::{Adam, Backend, Work};
 use conefield_core::pipeline::{Model, Pipeline};
+use conefield_solvers::losses::L1;
 use serde_json::{Value, json};
 use std::time::Instant;
 
@@ -30,8 +31,8 @@ pub fn rates() -> Vec<Case> {
         case(1e-2, Ends::Right),
         case(1.0, Ends::Recovered),
         case(10.0, Ends::Warned),
-        case(1e2, Ends::Refused(&["training diverged", "gone back 8 times", "solver.lr"])),
-        case(1e30, Ends::Refused(&["training diverged", "gone back 8 times", "solver.lr"])),
+        case(1e2, Ends::Refused(&["training diverged", "gone back 8 times", "optimizer.lr"])),
+        case(1e30, Ends::Refused(&["training diverged", "gone back 8 times", "optimizer.lr"])),
     ]
 }
 
@@ -113,7 +114,7 @@ fn steps(bias: f32) -> f64 {
     model.arena.params[last] = bias;
     let (mut exe, _) = Cpu::new().compile(&model.pipeline).unwrap();
     let points: Vec<_> = (0..20_000).map(|i| ([0.3, 0.4, i as f32 / 2e4], 0.5)).collect();
-    let work = Work { step: 0, seed: 1, loss: Loss::L1, rays: &[], points: &points, tv: None, occupancy: None };
+    let work = Work { step: 0, seed: 1, loss: &L1 {}, rays: &[], points: &points, priors: &[] };
     let mut best = f64::INFINITY;
     for _ in 0..30 {
         let begun = Instant::now();

@@ -1,4 +1,4 @@
-// Beer-Lambert line integrals, their penalty, and its derivative by every sample: a group a ray.
+// Beer-Lambert line integrals, their loss, and its derivative by every sample: a group a ray.
 @compute @workgroup_size(64)
 fn main(@builtin(workgroup_id) group: vec3<u32>, @builtin(local_invocation_index) lane: u32) {
     let first = rays[group.x].first;
@@ -7,7 +7,7 @@ fn main(@builtin(workgroup_id) group: vec3<u32>, @builtin(local_invocation_index
     for (var i = lane; i < count; i += 64u) {
         sum += samples[first + i].w * mu[first + i];
     }
-    let found = penalty(total(lane, sum) - rays[group.x].measured);
+    let found = loss_at(total(lane, sum), rays[group.x].measured);
     if lane == 0u {
         losses[group.x] = found.x;
     }

@@ -1,4 +1,4 @@
-// Samples of all rays: a row each; one that is not taken weighs 0.
+// Samples of all rays: a row each.
 @compute @workgroup_size(64)
 fn main(@builtin(global_invocation_id) id: vec3<u32>, @builtin(num_workgroups) groups: vec3<u32>) {
     for (var row = id.x; row < step.ray_rows; row += groups.x * 64u) {
@@ -13,6 +13,6 @@ fn main(@builtin(global_invocation_id) id: vec3<u32>, @builtin(num_workgroups) g
                 high = middle;
             }
         }
-        samples[row] = taken(rays[low], projector_sample(rays[low], row - rays[low].first, step.training != 0u));
+        samples[row] = projector_sample(rays[low], row - rays[low].first, step.training != 0u);
     }
 }

@@ -11,13 +11,10 @@ struct Step {
     stride: u32,
     // Whether random positions are random.
     training: u32,
-    // Which penalty; see `penalty`.
-    loss: u32,
-    delta: f32,
+    // What the loss of a ray, the loss of a point and the penalty of a block count by.
     ray_scale: f32,
     point_scale: f32,
+    block_scale: f32,
     // Distance of neighbouring points in a block.
     spacing: vec3<f32>,
-    smoothing: f32,
-    tv_scale: f32,
 }

@@ -8,8 +8,8 @@ use conefield_conformance::{
     check_projector_wgsl, check_wgsl,
 };
 use conefield_core::arena::Weights;
+use conefield_core::precision::Tables;
 use conefield_core::registry::{self, Make, Origin};
-use conefield_core::spec::Tables;
 use conefield_core::stage::{Projector, Stage};
 use conefield_core::{Error, Result};
 use conefield_plugins::library::Type;
@@ -255,7 +255,7 @@ impl Check {
                 let stage = make(settings.clone())?.build(&none)?;
                 add(None, check_initializer(stage.as_ref()));
             }
-            Make::Solver(_) => return Err(Error::unsupported(&t.name, "solvers cannot come from plugins")),
+            _ => return Err(Error::unsupported(&t.name, format!("a {} cannot come from a plugin", t.kind))),
         }
         Ok(())
     }

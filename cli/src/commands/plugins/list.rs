@@ -16,36 +16,36 @@ pub struct List {
 }
 
 #[derive(Serialize)]
-struct Row {
+struct ListedFile {
     path: String,
     place: Place,
     #[serde(skip_serializing_if = "Option::is_none")]
-    plugin: Option<Loaded>,
+    plugin: Option<ListedPlugin>,
     /// Why it was refused.
     #[serde(skip_serializing_if = "Option::is_none")]
     refused: Option<String>,
 }
 
 #[derive(Serialize)]
-struct Loaded {
+struct ListedPlugin {
     name: String,
     version: String,
     licence: String,
     abi: String,
-    stages: Vec<Stage>,
+    stages: Vec<ListedStage>,
 }
 
 #[derive(Serialize)]
-struct Stage {
+struct ListedStage {
     kind: String,
     #[serde(rename = "type")]
     name: String,
     doc: String,
 }
 
-impl Row {
+impl ListedFile {
     fn of(found: &Found) -> Self {
-        let plugin = found.library.as_ref().ok().map(|l| Loaded {
+        let plugin = found.library.as_ref().ok().map(|l| ListedPlugin {
             name: l.name.clone(),
             version: l.version.clone(),
             licence: l.licence.clone(),
@@ -53,7 +53,7 @@ impl Row {
             stages: l
                 .types
                 .iter()
-                .map(|t| Stage { kind: t.kind.to_string(), name: t.name.clone(), doc: t.doc.clone() })
+                .map(|t| ListedStage { kind: t.kind.to_string(), name: t.name.clone(), doc: t.doc.clone() })
                 .collect(),
         });
         Self {
@@ -80,7 +80,7 @@ impl Row {
 
 impl List {
     pub fn run(self) -> Result<()> {
-        let rows: Vec<Row> = plugins::with(|p| p.found.iter().map(Row::of).collect());
+        let rows: Vec<ListedFile> = plugins::with(|p| p.found.iter().map(ListedFile::of).collect());
         if self.json {
             return out::json(&serde_json::json!({ "plugins": rows }));
         }
@@ -88,6 +88,6 @@ impl List {
             let folder = user_folder().map_or("no folder of this user".into(), |f| f.display().to_string());
             return out::say(&format!("no plugins: none by --plugin or {PATH_VARIABLE}, none in {folder}"));
         }
-        out::say(&rows.iter().flat_map(Row::lines).collect::<Vec<_>>().join("\n"))
+        out::say(&rows.iter().flat_map(ListedFile::lines).collect::<Vec<_>>().join("\n"))
     }
 }

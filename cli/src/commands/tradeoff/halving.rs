@@ -1,11 +1,11 @@
 //! Successive halving (Jamieson and Talwalkar, AISTATS 2016): many candidates get little time, the best share of them
 //! more. Fields and methods on voxels are ranked apart.
 
-use crate::budget::front::Kind;
+use crate::budget::front::Unknowns;
 
 /// What a candidate came to under a budget.
 #[derive(Debug, Clone, Copy, PartialEq)]
-pub enum Outcome {
+pub enum TrialOutcome {
     /// Higher is better.
     Accuracy(f64),
     /// The budget was too short to do anything: that says nothing of the candidate.
@@ -21,17 +21,17 @@ pub fn kept(n: usize, keep: f64) -> usize {
 
 /// Which go on to the next budget, in the order given: of each kind the best share of those that were judged, and all
 /// that could not be.
-pub fn go_on(tried: &[(Kind, Outcome)], keep: f64) -> Vec<usize> {
+pub fn go_on(tried: &[(Unknowns, TrialOutcome)], keep: f64) -> Vec<usize> {
     let mut all = vec![];
-    for kind in [Kind::Field, Kind::Voxels] {
+    for kind in [Unknowns::Field, Unknowns::Voxels] {
         let of_kind = tried.iter().enumerate().filter(|(_, (k, _))| *k == kind);
         let mut judged = 0;
         let mut ranked: Vec<(usize, f64)> = vec![];
         for (i, (_, outcome)) in of_kind {
-            judged += usize::from(*outcome != Outcome::TooShort);
+            judged += usize::from(*outcome != TrialOutcome::TooShort);
             match outcome {
-                Outcome::Accuracy(a) if !a.is_nan() => ranked.push((i, *a)),
-                Outcome::TooShort => all.push(i),
+                TrialOutcome::Accuracy(a) if !a.is_nan() => ranked.push((i, *a)),
+                TrialOutcome::TooShort => all.push(i),
                 _ => {}
             }
         }
@@ -54,13 +54,13 @@ mod tests {
     use super::*;
     use proptest::prelude::*;
 
-    fn outcomes() -> impl Strategy<Value = Vec<(Kind, Outcome)>> {
-        let kind = prop_oneof![Just(Kind::Field), Just(Kind::Voxels)];
+    fn outcomes() -> impl Strategy<Value = Vec<(Unknowns, TrialOutcome)>> {
+        let kind = prop_oneof![Just(Unknowns::Field), Just(Unknowns::Voxels)];
         // Few values, so that some are equal.
         let outcome = prop_oneof![
-            4 => (0..6).prop_map(|a| Outcome::Accuracy(f64::from(a))),
-            1 => Just(Outcome::TooShort),
-            1 => Just(Outcome::Failed),
+            4 => (0..6).prop_map(|a| TrialOutcome::Accuracy(f64::from(a))),
+            1 => Just(TrialOutcome::TooShort),
+            1 => Just(TrialOutcome::Failed),
         ];
         prop::collection::vec((kind, outcome), 0..40)
     }
@@ -70,11 +70,11 @@ mod tests {
         fn the_best_share_of_each_kind_goes_on(tried in outcomes(), keep in 0.05f64..=1.0) {
             let on = go_on(&tried, keep);
             prop_assert!(on.windows(2).all(|w| w[0] < w[1]));
-            for kind in [Kind::Field, Kind::Voxels] {
+            for kind in [Unknowns::Field, Unknowns::Voxels] {
                 let of = |i: &usize| tried[*i].0 == kind;
-                let accuracy = |i: &usize| match tried[*i].1 { Outcome::Accuracy(a) => Some(a), _ => None };
+                let accuracy = |i: &usize| match tried[*i].1 { TrialOutcome::Accuracy(a) => Some(a), _ => None };
                 let all: Vec<usize> = (0..tried.len()).filter(of).collect();
-                let judged = all.iter().filter(|i| tried[**i].1 != Outcome::TooShort).count();
+                let judged = all.iter().filter(|i| tried[**i].1 != TrialOutcome::TooShort).count();
                 let good = all.iter().filter_map(accuracy).count();
                 let here: Vec<usize> = on.iter().copied().filter(of).collect();
                 let went: Vec<f64> = here.iter().filter_map(accuracy).collect();
@@ -85,9 +85,9 @@ mod tests {
                     prop_assert!(a <= worst);
                 }
                 for i in all {
-                    let unjudged = tried[i].1 == Outcome::TooShort;
+                    let unjudged = tried[i].1 == TrialOutcome::TooShort;
                     prop_assert!(!unjudged || here.contains(&i));
-                    prop_assert!(tried[i].1 != Outcome::Failed || !here.contains(&i));
+                    prop_assert!(tried[i].1 != TrialOutcome::Failed || !here.contains(&i));
                 }
             }
         }

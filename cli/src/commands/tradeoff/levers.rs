@@ -1,8 +1,9 @@
 //! What may be turned, and the candidates that come of it: every base as it is, and seeded draws from the product of
 //! its levers' values.
 
-use crate::budget::front::Kind;
-use crate::{files, specs};
+use crate::budget::front::Unknowns;
+use crate::{files, method, specs};
+use conefield_backend_cpu::Cpu;
 use conefield_core::error::{Error, Result, ensure};
 use conefield_core::files::toml_line;
 use conefield_core::random::mix;
@@ -43,7 +44,7 @@ struct Base {
     name: String,
     /// As `--spec` has it.
     spec: String,
-    kind: Kind,
+    kind: Unknowns,
     /// The spec without its name and description, to tell whether two are the same.
     tree: Value,
     levers: Vec<Lever>,
@@ -64,7 +65,7 @@ pub struct Candidate {
     /// As `--spec` has it, and what `--set` changes of it.
     pub spec: String,
     pub sets: Vec<String>,
-    pub kind: Kind,
+    pub kind: Unknowns,
 }
 
 impl Levers {
@@ -171,7 +172,7 @@ impl Base {
             levers.push(Lever { key, values });
             Ok(())
         })?;
-        let mut base = Self { name, spec, kind: Kind::Voxels, tree: Value::Null, levers };
+        let mut base = Self { name, spec, kind: Unknowns::Voxels, tree: Value::Null, levers };
         (base.tree, base.kind) = base.built(&[]).map_err(refused)?;
         for lever in &base.levers {
             for value in &lever.values {
@@ -191,15 +192,14 @@ impl Base {
     }
 
     /// The base with `sets`, built for trial.
-    fn built(&self, sets: &[String]) -> Result<(Value, Kind)> {
+    fn built(&self, sets: &[String]) -> Result<(Value, Unknowns)> {
         let loaded = specs::read(&self.spec, sets)?;
-        let solver = loaded.spec.solver.build().map_err(|e| loaded.locate(e))?;
-        let field = specs::pipeline(&loaded, solver.as_ref())?.is_some();
+        let plan = method::plan_without_files(&loaded, &Cpu::new())?;
         let mut tree = loaded.tree;
         for key in ["name", "description"] {
             tree[key] = Value::Null;
         }
-        Ok((tree, if field { Kind::Field } else { Kind::Voxels }))
+        Ok((tree, method::unknowns(plan.as_ref())))
     }
 
     fn candidate(&self, number: usize, sets: Vec<String>) -> Candidate {
@@ -238,7 +238,7 @@ mod tests {
         let dir = tempfile::tempdir().unwrap();
         let path = dir.path().join("levers.toml");
         std::fs::write(dir.path().join("mine.toml"), "extends = \"fast\"\nname = \"fast-1\"\n").unwrap();
-        let levers = "solver.rays = [64, 128, 256]\n";
+        let levers = "training.rays = [64, 128, 256]\n";
         let text = format!("[[base]]\nspec = \"fast\"\n[base.levers]\n{levers}[[base]]\nspec = \"mine.toml\"\n");
         std::fs::write(&path, text).unwrap();
         let all = Levers::read(&path).unwrap().candidates(4, 0).unwrap();
@@ -251,7 +251,7 @@ mod tests {
         let levers = Levers::shipped().unwrap();
         let all = levers.candidates(30, 0).unwrap();
         assert_eq!(all.len(), 30);
-        assert!(all.iter().any(|c| c.kind == Kind::Field) && all.iter().any(|c| c.kind == Kind::Voxels));
+        assert!(all.iter().any(|c| c.kind == Unknowns::Field) && all.iter().any(|c| c.kind == Unknowns::Voxels));
         for (i, c) in all.iter().enumerate() {
             assert!(all[..i].iter().all(|o| o.name != c.name && (o.base != c.base || o.sets != c.sets)), "{}", c.name);
         }
@@ -272,11 +272,10 @@ mod tests {
     #[test]
     fn a_product_is_used_up_without_repeating() {
         // The base itself has 10 subsets: 3 x 2 combinations, of which it is one.
-        let levers = parse(
-            "[[base]]\nspec = 'os-sart'\n[base.levers]\nsolver.subsets = [5, 10, 25]\nsolver.relaxation = [0.4, 0.5]\n",
-        );
+        let levers =
+            parse("[[base]]\nspec = 'os-sart'\n[base.levers]\nsubsets = [5, 10, 25]\nrelaxation = [0.4, 0.5]\n");
         let all = levers.unwrap().candidates(100, 3).unwrap();
-        let default = specs::read("os-sart", &[]).unwrap().tree["solver"].clone();
+        let default = specs::read("os-sart", &[]).unwrap().tree.clone();
         let own = [5, 10, 25].contains(&default["subsets"].as_i64().unwrap())
             && [0.4, 0.5].contains(&default["relaxation"].as_f64().unwrap());
         assert_eq!(all.len(), if own { 6 } else { 7 });
@@ -290,12 +289,8 @@ mod tests {
         let sets = |text: &str| {
             parse(&format!("[[base]]\nspec = 'fdk'\n{text}\n")).unwrap().candidates(2, 0).unwrap()[1].sets.clone()
         };
-        for text in [
-            "levers.solver.cutoff = [0.5]",
-            "[base.levers]\n'solver.cutoff' = [0.5]",
-            "[base.levers.solver]\ncutoff = [0.5]",
-        ] {
-            assert_eq!(sets(text), ["solver.cutoff=0.5"], "{text}");
+        for text in ["levers.cutoff = [0.5]", "[base.levers]\n'cutoff' = [0.5]", "[base.levers]\ncutoff = [0.5]"] {
+            assert_eq!(sets(text), ["cutoff=0.5"], "{text}");
         }
     }
 
@@ -307,9 +302,9 @@ mod tests {
             ("[[base]]\nspec = 'fdk'\nlever = 3\n", "unknown field `lever`"),
             ("[[base]]\nspec = 'fdkk'\n", "base[0].spec: found \"fdkk\""),
             ("[[base]]\nspec = 'fdk'\n[[base]]\nspec = 'fdk'\n", "base[1].spec"),
-            ("[[base]]\nspec = 'fdk'\nlevers.solver.cutoff = 0.5\n", "base[0].levers.solver.cutoff: found 0.5"),
-            ("[[base]]\nspec = 'fdk'\nlevers.solver.cutoff = []\n", "at least one value"),
-            ("[[base]]\nspec = 'fdk'\nlevers.solver.cutof = [1]\n", "\"cutoff\""),
+            ("[[base]]\nspec = 'fdk'\nlevers.cutoff = 0.5\n", "base[0].levers.cutoff: found 0.5"),
+            ("[[base]]\nspec = 'fdk'\nlevers.cutoff = []\n", "at least one value"),
+            ("[[base]]\nspec = 'fdk'\nlevers.cutof = [1]\n", "\"cutoff\""),
             ("[[base]]\nspec = 'fast'\nlevers.encoder.levels = [4, -1]\n", "base[0].levers.encoder.levels: found -1"),
         ] {
             let e = parse(text).err().unwrap().to_string();

@@ -2,7 +2,7 @@
 
 /// What something takes and reaches.
 #[derive(Debug, Clone, Copy, PartialEq)]
-pub struct Standing {
+pub struct Performance {
     /// Fewer is better.
     pub seconds: f64,
     /// Fewer is better.
@@ -14,7 +14,7 @@ pub struct Standing {
 /// Times and sizes that differ by less than about this share count as equal: a repetition would differ by as much.
 const GRAIN: f64 = 0.1;
 
-impl Standing {
+impl Performance {
     /// Time and memory in grains.
     fn coarse(&self) -> [f64; 2] {
         [self.seconds, self.bytes].map(|x| (x.max(1e-9).ln() / (1.0 + GRAIN).ln()).round())
@@ -34,8 +34,8 @@ impl Standing {
 }
 
 /// The indices of those that no other one beats, by rising time.
-pub fn front(all: &[Standing]) -> Vec<usize> {
-    let good = |s: &Standing| s.seconds.is_finite() && s.bytes.is_finite() && !s.accuracy.is_nan();
+pub fn front(all: &[Performance]) -> Vec<usize> {
+    let good = |s: &Performance| s.seconds.is_finite() && s.bytes.is_finite() && !s.accuracy.is_nan();
     let free = |i: &usize| good(&all[*i]) && !all.iter().any(|o| good(o) && o.beats(&all[*i]));
     let mut found: Vec<usize> = (0..all.len()).filter(free).collect();
     found.sort_by(|a, b| all[*a].seconds.total_cmp(&all[*b].seconds));
@@ -47,8 +47,8 @@ mod tests {
     use super::*;
     use proptest::prelude::*;
 
-    fn some() -> impl Strategy<Value = Vec<Standing>> {
-        let one = (1.0f64..100.0, 1e6f64..1e9, 0u32..40).prop_map(|(seconds, bytes, a)| Standing {
+    fn some() -> impl Strategy<Value = Vec<Performance>> {
+        let one = (1.0f64..100.0, 1e6f64..1e9, 0u32..40).prop_map(|(seconds, bytes, a)| Performance {
             seconds,
             bytes,
             accuracy: f64::from(a),
@@ -57,7 +57,7 @@ mod tests {
     }
 
     /// In the plain sense, without grains.
-    fn dominates(a: &Standing, b: &Standing) -> bool {
+    fn dominates(a: &Performance, b: &Performance) -> bool {
         let no_worse = a.seconds <= b.seconds && a.bytes <= b.bytes && a.accuracy >= b.accuracy;
         no_worse && a != b
     }
@@ -91,7 +91,7 @@ mod tests {
 
     #[test]
     fn what_measurement_cannot_tell_apart_is_decided_by_accuracy() {
-        let s = |seconds, bytes, accuracy| Standing { seconds, bytes, accuracy };
+        let s = |seconds, bytes, accuracy| Performance { seconds, bytes, accuracy };
         let all =
             [s(60.0, 1e8, 30.0), s(59.0, 1e8, 29.0), s(10.0, 1e8, 20.0), s(70.0, 5e7, 25.0), s(9.0, 2e8, f64::NAN)];
         assert_eq!(front(&all), [2, 0, 3]);

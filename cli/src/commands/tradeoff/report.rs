@@ -1,8 +1,8 @@
 //! What a search came to: the front as table, figure and JSON, its specs, and how well held-out views rank.
 
-use super::pareto::{Standing, front};
+use super::pareto::{Performance, front};
 use super::{FILES, FOLDERS, Over, Rung, Search, Status, accuracy};
-use crate::budget::front::{Front, Kind, Point, Reached, Tuned};
+use crate::budget::front::{Front, Point, Reached, Tuned, Unknowns};
 use crate::commands::trial::Figures;
 use crate::out;
 use crate::specs;
@@ -10,7 +10,7 @@ use crate::statistics::{mean, spearman};
 use crate::table::Table;
 use conefield_core::spec::load::to_toml;
 use conefield_core::{Error, Result};
-use conefield_io::{CurveOptions, Panel, panels_png};
+use conefield_report::{CurveOptions, Panel, panels_png};
 use serde::Serialize;
 use serde_json::Value;
 use std::fs;
@@ -18,7 +18,7 @@ use std::path::Path;
 
 /// All that `tradeoff.json` says.
 #[derive(Serialize)]
-pub struct Report {
+pub struct TradeoffReport {
     search: Search,
     rungs: Vec<Rung>,
     trials: Vec<Over>,
@@ -48,7 +48,7 @@ struct Ranking {
 struct Mean {
     name: String,
     candidate: String,
-    kind: Kind,
+    kind: Unknowns,
     budget_s: f64,
     steps: f64,
     train_s: f64,
@@ -58,7 +58,7 @@ struct Mean {
     ssim_2d: Option<f64>,
     held_out: Option<f64>,
     #[serde(skip)]
-    standing: Standing,
+    standing: Performance,
     #[serde(skip)]
     runs: Vec<Figures>,
 }
@@ -67,26 +67,26 @@ struct Mean {
 #[derive(Serialize)]
 struct Best {
     budget_s: f64,
-    kind: Kind,
+    kind: Unknowns,
     point: String,
 }
 
-impl Report {
+impl TradeoffReport {
     pub fn new(search: Search, rungs: Vec<Rung>, trials: Vec<Over>) -> Result<Self> {
         let points = points(&search, &trials);
         if points.is_empty() {
             let why = trials.iter().find_map(|t| t.error.clone()).unwrap_or_else(|| "there is none".into());
             return Err(Error::unsupported("tradeoff", format!("no trial came to a result; the first: {why}")));
         }
-        let of = |kind: Option<Kind>| {
+        let of = |kind: Option<Unknowns>| {
             let some: Vec<&Mean> = points.iter().filter(|p| kind.is_none_or(|k| k == p.kind)).collect();
-            let all: Vec<Standing> = some.iter().map(|p| p.standing).collect();
+            let all: Vec<Performance> = some.iter().map(|p| p.standing).collect();
             front(&all).into_iter().map(|i| some[i].name.clone()).collect::<Vec<_>>()
         };
-        let (all, fields, voxels) = (of(None), of(Some(Kind::Field)), of(Some(Kind::Voxels)));
+        let (all, fields, voxels) = (of(None), of(Some(Unknowns::Field)), of(Some(Unknowns::Voxels)));
         let mut best = vec![];
         for &budget_s in &search.budgets_s {
-            for kind in [Kind::Field, Kind::Voxels] {
+            for kind in [Unknowns::Field, Unknowns::Voxels] {
                 let here = points.iter().filter(|p| p.budget_s == budget_s && p.kind == kind);
                 let most = here.max_by(|a, b| a.standing.accuracy.total_cmp(&b.standing.accuracy));
                 best.extend(most.map(|p| Best { budget_s, kind, point: p.name.clone() }));
@@ -161,7 +161,7 @@ impl Report {
             );
             let mut sets = candidate.sets.clone();
             let steps = (point.steps.round() as u64).max(1);
-            sets.extend(end("solver", &base.tree["solver"], steps));
+            sets.extend(end(&base.tree, steps));
             for (key, value) in [("name", &point.name), ("description", &said)] {
                 sets.push(format!("{key}={}", toml::Value::String(value.clone())));
             }
@@ -288,8 +288,8 @@ impl Report {
             }
         }
         let base_of = |p: &Mean| self.candidate(p).map_or("", |c| &c.base[..]).to_owned();
-        let series = |x: fn(&Mean) -> f64, alone: fn(Standing) -> Standing| {
-            let standings: Vec<Standing> = self.points.iter().map(|p| alone(p.standing)).collect();
+        let series = |x: fn(&Mean) -> f64, alone: fn(Performance) -> Performance| {
+            let standings: Vec<Performance> = self.points.iter().map(|p| alone(p.standing)).collect();
             let line = front(&standings).into_iter().map(|i| &self.points[i]);
             let mut line: Vec<(f64, f64)> = line.map(|p| (x(p), value(p))).collect();
             line.sort_by(|a, b| a.0.total_cmp(&b.0));
@@ -302,8 +302,8 @@ impl Report {
             }
             all
         };
-        let over_time = series(|p| p.total_s, |s| Standing { bytes: 1.0, ..s });
-        let over_memory = series(|p| p.standing.bytes / f64::from(1 << 20), |s| Standing { seconds: 1.0, ..s });
+        let over_time = series(|p| p.total_s, |s| Performance { bytes: 1.0, ..s });
+        let over_memory = series(|p| p.standing.bytes / f64::from(1 << 20), |s| Performance { seconds: 1.0, ..s });
         // A logarithmic axis of less than a decade would have no figures.
         let options = |series: &[(String, Vec<(f64, f64)>)]| {
             let all = || series.iter().flat_map(|(_, s)| s).map(|p| p.0).filter(|x| x.is_finite());
@@ -350,7 +350,7 @@ fn points(search: &Search, trials: &[Over]) -> Vec<Mean> {
                 psnr: mean(&Figures::psnr),
                 ssim_2d: mean(&|f| f.score("ssim_2d")),
                 held_out: mean(&|f| f.held_out),
-                standing: Standing { seconds: total_s, bytes, accuracy },
+                standing: Performance { seconds: total_s, bytes, accuracy },
                 runs,
             });
         }
@@ -377,15 +377,16 @@ fn ranking(search: &Search, trials: &[Over]) -> Vec<Ranking> {
     all
 }
 
-/// What makes the solver with these settings, at `path`, end after `steps` steps or passes. FDK has no number to set; of a
-/// sequence the second solver's passes are among them.
-fn end(path: &str, solver: &Value, steps: u64) -> Option<String> {
-    if let Some(first) = solver.get("first") {
-        let passes = solver["passes"].as_u64().unwrap_or(0);
-        return end(&format!("{path}.first"), first, steps.saturating_sub(passes).max(1));
+/// What makes a method with these settings end after `steps` steps or passes. FDK has no number to set. The passes of the
+/// later methods of a chain are among its steps.
+fn end(method: &Value, steps: u64) -> Option<String> {
+    if let Some([first, later @ ..]) = method["methods"].as_array().map(|all| &all[..]) {
+        let passes: u64 = later.iter().filter_map(|m| m["stop"]["passes"].as_u64()).sum();
+        return end(first, steps.saturating_sub(passes).max(1)).map(|set| format!("methods.0.{set}"));
     }
-    let key = [("stop", "stop.passes"), ("steps", "steps")].into_iter().find(|(key, _)| solver.get(key).is_some());
-    key.map(|(_, key)| format!("{path}.{key}={steps}"))
+    let keys = [("stop", "stop.passes"), ("training", "training.steps")];
+    let key = keys.into_iter().find(|(key, _)| method.get(key).is_some());
+    key.map(|(_, key)| format!("{key}={steps}"))
 }
 
 #[cfg(test)]
@@ -393,15 +394,15 @@ mod tests {
     use super::*;
 
     #[test]
-    fn every_kind_of_solver_ends_after_its_steps() {
+    fn every_method_ends_after_its_steps() {
         for (spec, sets, want) in [
             ("fdk", vec![], None),
-            ("os-sart", vec![], Some("solver.stop.passes=105")),
-            ("fast", vec![], Some("solver.steps=105")),
-            ("field-tv", vec!["solver.passes=5".to_owned()], Some("solver.first.steps=100")),
+            ("os-sart", vec![], Some("stop.passes=105")),
+            ("fast", vec![], Some("training.steps=105")),
+            ("field-tv", vec!["methods.1.stop.passes=5".to_owned()], Some("methods.0.training.steps=100")),
         ] {
             let loaded = specs::read(spec, &sets).unwrap();
-            let set = end("solver", &loaded.tree["solver"], 105);
+            let set = end(&loaded.tree, 105);
             assert_eq!(set.as_deref(), want, "{spec}");
             specs::read(spec, &set.into_iter().collect::<Vec<_>>()).unwrap();
         }

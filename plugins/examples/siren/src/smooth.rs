@@ -110,19 +110,9 @@ impl Stage for RaySmoothStage {
     }
 }
 
-impl RaySmoothStage {
-    fn keep(&self, keep: &[usize]) -> Reduced<dyn Normalizer> {
-        let stage = Self { width: keep.len(), strength: self.strength };
-        Reduced { stage: Box::new(stage), params: vec![], channels: keep.to_vec() }
-    }
-}
-
 impl Normalizer for RaySmoothStage {
     fn keep_inputs(&self, keep: &[usize]) -> Result<Reduced<dyn Normalizer>> {
-        Ok(self.keep(keep))
-    }
-
-    fn keep_outputs(&self, keep: &[usize]) -> Result<Reduced<dyn Normalizer>> {
-        Ok(self.keep(keep))
+        let stage = Self { width: keep.len(), strength: self.strength };
+        Ok(Reduced { stage: Box::new(stage), params: vec![], channels: keep.to_vec() })
     }
 }

@@ -6,7 +6,7 @@ use crate::library::{Functions, Handle, Text, Type};
 use crate::trial::{UNTOUCHED, timed};
 use conefield_core::arena::{Arena, InitReport, Layout};
 use conefield_core::error::Result;
-use conefield_core::spec::Initializer;
+use conefield_core::settings::Initializer;
 use conefield_plugin_abi::*;
 use serde_json::Value;
 use std::sync::Arc;

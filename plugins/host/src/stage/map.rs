@@ -9,16 +9,13 @@ use conefield_core::error::{Error, Result, ensure};
 use conefield_core::half::{Bf16, F16};
 use conefield_core::registry::Kind;
 use conefield_core::stage::{
-    Encoder, Field, GradKind, Grads, Halves, Info, Kernel, Mask, Normalizer, Parameter, Probe, Reduced, Scope, Stage,
-    Tile, TileMut,
+    Encoder, Field, GradKind, Grads, Halves, Info, Kernel, Normalizer, Parameter, Reduced, Scope, Stage, Tile, TileMut,
 };
 use conefield_core::wgsl::Fragment;
 use conefield_plugin_abi::*;
 use serde_json::Value;
 use std::collections::BTreeSet;
-use std::ffi::c_void;
 use std::ops::Range;
-use std::panic::{AssertUnwindSafe, catch_unwind};
 use std::sync::Arc;
 use std::{ptr, slice};
 
@@ -27,9 +24,6 @@ const MOST: usize = 1 << 40;
 
 /// Most passes that a stage may go forward in: a host does something for each.
 const MOST_PASSES: usize = 1 << 16;
-
-/// Bytes of what a normalizer says of a mask: a few for each of many channels.
-const LONGEST_REPORT: usize = 1 << 16;
 
 /// An encoder, a normalizer or a field of a library.
 pub struct MapStage {
@@ -503,105 +497,8 @@ impl Field for MapStage {
 }
 
 impl Normalizer for MapStage {
-    fn refresh(&self, probe: &mut dyn Probe) -> Result<Option<Mask>> {
-        let Some(refresh) = self.map.refresh else { return Ok(None) };
-        let width = self.info.input;
-        let (shape, epoch, coarse) = (probe.shape(), probe.epoch(), probe.coarse_to_fine());
-        let mut look = Look { probe, width, error: None };
-        let seen = ConefieldProbe {
-            context: ptr::from_mut(&mut look).cast(),
-            encode: Some(encode),
-            voxel: Some(voxel),
-            width,
-            shape,
-            epoch,
-            coarse_to_fine: coarse.into(),
-        };
-        let (mut keep, mut count) = (vec![0usize; width], usize::MAX);
-        let mut error = Text::new();
-        let mut report = vec![0u8; LONGEST_REPORT];
-        let mut room = ConefieldText { data: report.as_mut_ptr(), capacity: report.len(), length: 0 };
-        // SAFETY: the stage is alive; everything handed over lives for the time of the call, and `keep` has room for
-        // `width`.
-        let status =
-            unsafe { refresh(self.handle.stage, &seen, keep.as_mut_ptr(), &mut count, &mut room, error.room()) };
-        if let Some(e) = look.error {
-            return Err(e);
-        }
-        if status != CONEFIELD_OK {
-            return Err(self.ty().failed("refresh", status, &error.text()));
-        }
-        if count == usize::MAX {
-            return Ok(None);
-        }
-        keep.truncate(count);
-        let sound = count >= 1 && count <= width && keep.is_sorted_by(|a, b| a < b) && keep[count - 1] < width;
-        if !sound {
-            let what = format!("it keeps {count} channels {keep:?} of {width}");
-            return Err(self.ty().failed("refresh", CONEFIELD_FAILED, &what));
-        }
-        report.truncate(room.length);
-        Ok(Some(Mask { keep, report: String::from_utf8_lossy(&report).into_owned() }))
-    }
-
-    fn decided(&self) {
-        if let Some(decided) = self.map.decided {
-            // SAFETY: the stage is alive.
-            unsafe { decided(self.handle.stage) };
-        }
-    }
-
     fn keep_inputs(&self, keep: &[usize]) -> Result<Reduced<dyn Normalizer>> {
         let (stage, params, channels) = self.reduce(CONEFIELD_INPUTS, keep)?;
         Ok(Reduced { stage: Box::new(stage), params, channels })
-    }
-
-    fn keep_outputs(&self, keep: &[usize]) -> Result<Reduced<dyn Normalizer>> {
-        let (stage, params, channels) = self.reduce(CONEFIELD_OUTPUTS, keep)?;
-        Ok(Reduced { stage: Box::new(stage), params, channels })
-    }
-}
-
-/// A probe that a library looks through.
-struct Look<'a> {
-    probe: &'a mut dyn Probe,
-    width: usize,
-    error: Option<Error>,
-}
-
-unsafe extern "C" fn encode(
-    context: *mut c_void,
-    points: *const f32,
-    count: usize,
-    features: *mut f32,
-) -> ConefieldStatus {
-    // SAFETY: `context` is the `Look` of the refresh that is under way, and it has no other user.
-    let look = unsafe { &mut *context.cast::<Look<'_>>() };
-    let done = catch_unwind(AssertUnwindSafe(|| {
-        // SAFETY: the plugin says that there are `count` points.
-        let points = unsafe { many(points.cast::<[f32; 3]>(), count) };
-        let found = look.probe.encode(points)?;
-        let fits = found.len() == look.width * points.len();
-        ensure(fits, "plugin", "probe", found.len(), format!("{} features", look.width * points.len()))?;
-        // SAFETY: the plugin says that there is room for `width` features of every point.
-        unsafe { ptr::copy_nonoverlapping(found.as_ptr(), features, found.len()) };
-        Ok(())
-    }));
-    match done {
-        Ok(Ok(())) => CONEFIELD_OK,
-        Ok(Err(e)) => {
-            look.error = Some(e);
-            CONEFIELD_FAILED
-        }
-        Err(_) => CONEFIELD_PANICKED,
-    }
-}
-
-unsafe extern "C" fn voxel(context: *mut c_void, x: usize, y: usize, z: usize, position: *mut f32) {
-    // SAFETY: as in `encode`.
-    let look = unsafe { &mut *context.cast::<Look<'_>>() };
-    if let Ok(at) = catch_unwind(AssertUnwindSafe(|| look.probe.voxel([x, y, z]))) {
-        // SAFETY: there is room for three numbers.
-        unsafe { ptr::copy_nonoverlapping(at.as_ptr(), position, 3) };
     }
 }

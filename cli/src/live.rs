@@ -1,0 +1,38 @@
+//! `live.png`: the middle slices of a field while it trains.
+
+use crate::files;
+use conefield_core::Result;
+use conefield_core::geometry::VoxelGrid;
+use conefield_core::parts::Part;
+use conefield_report::MiddleSlices;
+use ndarray::Array3;
+use std::path::PathBuf;
+use std::time::{Duration, Instant};
+
+/// The picture, and how often it is drawn.
+pub struct Live {
+    path: PathBuf,
+    every: Duration,
+    last: Instant,
+}
+
+impl Live {
+    /// Draws `path` every `seconds` seconds.
+    pub fn new(path: PathBuf, seconds: f64) -> Self {
+        Self { path, every: Duration::from_secs_f64(seconds), last: Instant::now() }
+    }
+
+    /// Whether it is time for the next picture.
+    pub fn due(&self) -> bool {
+        self.last.elapsed() >= self.every
+    }
+
+    /// Draws `slices` of `grid`. The picture replaces the last one at once.
+    pub fn draw(&mut self, grid: VoxelGrid, slices: &[(Part, Array3<f32>)]) -> Result<()> {
+        let mut middle = MiddleSlices::new(grid);
+        slices.iter().for_each(|(part, values)| middle.gather(part, values.view()));
+        files::picture(&self.path, None, &middle)?;
+        self.last = Instant::now();
+        Ok(())
+    }
+}

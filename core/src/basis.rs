@@ -1,0 +1,50 @@
+//! What a volume is made of: coefficients, and the linear map that expands them to voxels.
+
+use crate::error::Result;
+use crate::geometry::VoxelGrid;
+use crate::simd::Real;
+use ndarray::{ArrayView3, ArrayViewMut3};
+
+/// Settings of a basis.
+#[typetag::serde(tag = "type")]
+pub trait BasisSpec: Send + Sync {
+    /// The basis, or why the settings make none.
+    fn build(&self) -> Result<Box<dyn Basis>>;
+}
+
+/// A basis of volumes on any grid of voxels.
+pub trait Basis: Send + Sync {
+    /// The basis for the voxels of `grid`. The number of coefficients follows from the grid's shape alone, so that memory
+    /// can be told before a scan is read.
+    fn on(&self, grid: &VoxelGrid) -> Result<Box<dyn Expansion>>;
+
+    /// A line for `explain`.
+    fn describe(&self) -> String;
+}
+
+/// The basis of one grid of voxels: a matrix `B` without negative entries, so that coefficients of 0 and more give voxels of
+/// 0 and more.
+pub trait Expansion: Send + Sync {
+    /// Where the coefficients stand. A prior acts on this grid, with its spacing.
+    fn coefficients(&self) -> VoxelGrid;
+
+    /// Whether coefficients are the voxels themselves. A method then expands nothing and copies nothing.
+    fn is_identity(&self) -> bool {
+        false
+    }
+
+    /// The operator that works.
+    fn operator(&self) -> &dyn BasisOperator<f32>;
+
+    /// The same formula in double precision.
+    fn reference(&self) -> &dyn BasisOperator<f64>;
+}
+
+/// The matrix `B` and its adjoint. Neither direction depends on the number of threads.
+pub trait BasisOperator<R: Real>: Send + Sync {
+    /// Overwrites `voxels` with `B·coefficients`.
+    fn expand(&self, coefficients: ArrayView3<'_, R>, voxels: ArrayViewMut3<'_, R>);
+
+    /// Overwrites `coefficients` with `Bᵀ·voxels`.
+    fn adjoint(&self, voxels: ArrayView3<'_, R>, coefficients: ArrayViewMut3<'_, R>);
+}

@@ -1,0 +1,45 @@
+//! How far line integrals are from the measured ones.
+
+use crate::error::Result;
+use crate::scan::{Scan, ScanHeader};
+use ndarray::ArrayViewMut3;
+
+/// Settings of a data term.
+#[typetag::serde(tag = "type")]
+pub trait DataTermSpec: Send + Sync {
+    /// The data term, or why the settings make none.
+    fn build(&self) -> Result<Box<dyn DataTerm>>;
+}
+
+/// A convex function of the residuals `r = p − A·x`, pixel by pixel, for any scan.
+pub trait DataTerm: Send + Sync {
+    /// The function for the values of `scan`.
+    fn of<'a>(&self, scan: &'a Scan) -> Box<dyn Misfit + 'a>;
+
+    /// Bytes that [`DataTerm::of`] takes for a moment.
+    fn scratch(&self, header: &ScanHeader) -> u64 {
+        let _ = header;
+        0
+    }
+
+    /// A line for `explain`.
+    fn describe(&self) -> String;
+}
+
+/// A data term `Σ φ_i(r_i)` of one scan. All arrays are `[view, row, column]` of the views `views`.
+pub trait Misfit: Send + Sync {
+    /// Overwrites the residuals with the derivatives `φ'_i(r_i)`. Returns `Σ φ_i(r_i)`.
+    fn differentiate(&self, views: &[usize], residuals: ArrayViewMut3<'_, f32>) -> f64;
+
+    /// Multiplies each value by an upper bound of `φ''_i`: what the step of a gradient method follows from.
+    fn curve(&self, views: &[usize], values: ArrayViewMut3<'_, f32>);
+
+    /// Multiplies each value by the standard deviation that noise gives `φ'_i`, in units of [`Misfit::noise`].
+    fn spread(&self, views: &[usize], values: ArrayViewMut3<'_, f32>);
+
+    /// Standard deviation of the noise of line integrals near 0, from the scan.
+    fn noise(&self) -> f64;
+
+    /// What was found in the scan.
+    fn describe(&self) -> String;
+}

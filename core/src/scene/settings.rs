@@ -1,0 +1,138 @@
+//! What a spec says of the scene.
+
+use crate::error::{Result, ensure};
+use schemars::JsonSchema;
+use serde::{Deserialize, Serialize};
+
+/// How the scan is mapped to the unit cube and to attenuations of order one.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
+#[serde(deny_unknown_fields, default)]
+pub struct SceneSettings {
+    /// Share of the unit cube's side that the longest side of the volume fills, in (0, 1]. Published codes leave
+    /// most of the cube empty; 1 spends every cell on the volume.
+    pub fill: f64,
+    /// The attenuation that stages see as 1.
+    pub attenuation: AttenuationScale,
+    /// Where in the volume the object can be.
+    pub support: SupportRule,
+    /// Which of the encoder's channels are computed.
+    pub levels: LevelRule,
+    /// What lies beyond the volume.
+    #[serde(skip_serializing_if = "SurroundRule::is_none")]
+    pub surround: SurroundRule,
+}
+
+impl Default for SceneSettings {
+    fn default() -> Self {
+        let (support, levels, surround) = (SupportRule::Box, LevelRule::All, SurroundRule::None);
+        Self { fill: 1.0, attenuation: AttenuationScale::Scan, support, levels, surround }
+    }
+}
+
+impl SceneSettings {
+    /// Refuses settings that mean nothing.
+    pub fn validate(&self) -> Result<()> {
+        ensure(self.fill > 0.0 && self.fill <= 1.0, "spec", "scene.fill", self.fill, "a number above 0 and at most 1")?;
+        if let AttenuationScale::Fixed(x) = self.attenuation {
+            ensure(x.is_finite() && x > 0.0, "spec", "scene.attenuation", x, "a positive finite number")?;
+        }
+        self.surround.validate()
+    }
+}
+
+/// What lies beyond the volume.
+#[derive(Debug, Clone, Copy, Default, PartialEq, Serialize, Deserialize, JsonSchema)]
+#[serde(rename_all = "kebab-case")]
+pub enum SurroundRule {
+    /// Nothing.
+    #[default]
+    None,
+    /// What coarse cells show, where the object reaches the sides of views: total variation makes them of the whole
+    /// field of view first, and their line integrals are taken off the measured ones.
+    Coarse(CoarseSurround),
+}
+
+/// How far and how finely the space beyond the volume is looked at.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize, JsonSchema)]
+#[serde(deny_unknown_fields, default)]
+pub struct CoarseSurround {
+    /// How far cells go beyond the volume on every side, as a share of its longest side; less where a source stands closer.
+    pub margin: f64,
+    /// Cells along the volume's longest side.
+    pub cells: usize,
+    /// Passes over the views.
+    pub passes: u64,
+}
+
+impl Default for CoarseSurround {
+    fn default() -> Self {
+        Self { margin: 0.75, cells: 64, passes: 16 }
+    }
+}
+
+impl SurroundRule {
+    /// Whether there is none.
+    pub fn is_none(&self) -> bool {
+        *self == Self::None
+    }
+
+    /// Refuses settings that mean nothing.
+    pub fn validate(&self) -> Result<()> {
+        let Self::Coarse(CoarseSurround { margin, cells, passes }) = *self else { return Ok(()) };
+        let key = |name: &str| format!("scene.surround.coarse.{name}");
+        ensure(margin > 0.0 && margin <= 4.0, "spec", &key("margin"), margin, "a number above 0 and at most 4")?;
+        ensure((4..=256).contains(&cells), "spec", &key("cells"), cells, "4 to 256")?;
+        ensure((1..=1000).contains(&passes), "spec", &key("passes"), passes, "1 to 1000")
+    }
+}
+
+/// Which of the encoder's channels are computed.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
+#[serde(rename_all = "kebab-case")]
+pub enum LevelRule {
+    /// All.
+    All,
+    /// None that is finer than the data: than a voxel to export, or than what a pixel sees at the distance of the volume's
+    /// centre. The coarsest that suffice stay.
+    Needed,
+}
+
+/// Where in the volume the object can be.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
+#[serde(rename_all = "kebab-case")]
+pub enum SupportRule {
+    /// Anywhere.
+    Box,
+    /// Where no view shows air: a cell that several views see nothing but air through is left out, the unit cube is
+    /// fitted to the rest, and rays are sampled between the first and the last cell that is left; iterative methods
+    /// keep the others at 0. Views whose sides the object reaches say nothing.
+    Carve,
+}
+
+/// The attenuation that stages see as 1.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize, JsonSchema)]
+#[serde(rename_all = "kebab-case")]
+pub enum AttenuationScale {
+    /// Four times the mean attenuation of the most absorbing rays over the volume's longest side: from the scan
+    /// alone, so that the result does not depend on units.
+    Scan,
+    /// A value in the scan's own unit (1/unit).
+    Fixed(f64),
+}
+
+/// How an iterative method sees the scan.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize, JsonSchema)]
+#[serde(deny_unknown_fields, default)]
+pub struct VoxelScene {
+    /// Where in the volume the object can be.
+    pub support: SupportRule,
+    /// What lies beyond the volume.
+    #[serde(skip_serializing_if = "SurroundRule::is_none")]
+    pub surround: SurroundRule,
+}
+
+impl Default for VoxelScene {
+    fn default() -> Self {
+        Self { support: SupportRule::Box, surround: SurroundRule::None }
+    }
+}

@@ -1,0 +1,109 @@
+//! The arrays of a method, and what they take.
+//!
+//! A constructor asks a [`Space`] for its arrays. One kind of space allocates them. The other, a tally, gives empty arrays
+//! and adds up their bytes: the same code that allocates gives the price.
+
+use crate::scan::ScanHeader;
+use ndarray::Array3;
+use std::cell::Cell;
+
+/// Makes arrays for a scan of known sizes, or only counts them.
+pub struct Space {
+    header: ScanHeader,
+    tally: bool,
+    /// Bytes held now.
+    held: Cell<u64>,
+    /// The most that were held at once.
+    most: Cell<u64>,
+}
+
+impl Space {
+    /// A space that allocates.
+    pub fn new(header: ScanHeader) -> Self {
+        Self { header, tally: false, held: Cell::new(0), most: Cell::new(0) }
+    }
+
+    /// A space that gives empty arrays and counts what they would take.
+    pub fn tally(header: ScanHeader) -> Self {
+        Self { tally: true, ..Self::new(header) }
+    }
+
+    /// The sizes of the scan.
+    pub fn header(&self) -> &ScanHeader {
+        &self.header
+    }
+
+    /// Zeros, one for each voxel.
+    pub fn volume(&self) -> Array3<f32> {
+        self.array(self.header.volume)
+    }
+
+    /// Zeros, one for each pixel of `views` views.
+    pub fn projections(&self, views: usize) -> Array3<f32> {
+        let [rows, columns] = self.header.detector;
+        self.array([views, rows, columns])
+    }
+
+    /// Zeros.
+    pub fn array(&self, shape: [usize; 3]) -> Array3<f32> {
+        self.hold(shape.iter().fold(size_of::<f32>() as u64, |n, side| n.saturating_mul(*side as u64)));
+        Array3::zeros(if self.tally { [0; 3] } else { shape })
+    }
+
+    /// Counts bytes that are held from now on.
+    pub fn hold(&self, bytes: u64) {
+        let held = self.held.get().saturating_add(bytes);
+        self.held.set(held);
+        self.most.set(self.most.get().max(held));
+    }
+
+    /// Counts bytes that are held for a moment.
+    pub fn pass(&self, bytes: u64) {
+        self.briefly(|space| space.hold(bytes));
+    }
+
+    /// Counts what `make` takes as given back when it returns.
+    pub fn briefly<T>(&self, make: impl FnOnce(&Self) -> T) -> T {
+        let held = self.held.get();
+        let made = make(self);
+        self.held.set(held);
+        made
+    }
+
+    /// The most bytes that were held at once.
+    pub fn bytes(&self) -> u64 {
+        self.most.get()
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    const HEADER: ScanHeader = ScanHeader { views: 7, detector: [3, 5], volume: [2, 3, 4] };
+
+    #[test]
+    fn both_kinds_count_the_same() {
+        for space in [Space::new(HEADER), Space::tally(HEADER)] {
+            let volume = space.volume();
+            assert_eq!(space.bytes(), 96);
+            let views = space.briefly(|space| space.projections(2));
+            assert_eq!(space.bytes(), 96 + 120);
+            space.pass(10);
+            assert_eq!(space.bytes(), 96 + 120);
+            space.hold(100);
+            space.pass(30);
+            assert_eq!(space.bytes(), 96 + 100 + 30);
+            let made = [volume.len(), views.len()];
+            assert_eq!(made, if space.tally { [0, 0] } else { [24, 30] });
+        }
+    }
+
+    #[test]
+    fn sizes_that_no_memory_holds_are_told_without_overflow() {
+        let space = Space::tally(ScanHeader { volume: [usize::MAX; 3], ..HEADER });
+        space.volume();
+        space.volume();
+        assert_eq!(space.bytes(), u64::MAX);
+    }
+}

@@ -1,0 +1,87 @@
+//! Where on the circle the views stand: the arc, its gaps, and angles that are degrees by mistake.
+
+use conefield_core::geometry::View;
+use serde::Serialize;
+use std::f64::consts::TAU;
+
+/// An opening this wide, in degrees, is the end of a short scan and no gap.
+const OPENING: f64 = 60.0;
+
+/// The views' directions from the axis, in degrees.
+#[derive(Debug, Clone, PartialEq, Serialize)]
+pub struct ScanArc {
+    /// Of the first view, from +x towards +y.
+    pub first_deg: f64,
+    /// From the first view to the second, by the shorter way; positive from +x towards +y.
+    pub step_deg: f64,
+    /// What the views cover, each with the mean distance between two.
+    pub covered_deg: f64,
+    /// Whether they go all round: no opening of 60° or more that is wider than three times any other gap.
+    pub full_circle: bool,
+    /// The largest distance between neighbours along the arc, and where it starts.
+    pub largest_gap_deg: f64,
+    /// Where it starts.
+    pub largest_gap_at_deg: f64,
+    /// The mean distance between neighbours along the arc.
+    pub mean_gap_deg: f64,
+    /// Whether the steps are those of degrees that were taken for radians.
+    pub like_degrees: bool,
+}
+
+/// Looks where `views` stand.
+pub(crate) fn scan_arc(views: &[View]) -> ScanArc {
+    let turns: Vec<f64> = views.iter().map(|v| v.source[1].atan2(v.source[0]).rem_euclid(TAU)).collect();
+    let mut sorted: Vec<f64> = turns.iter().map(|a| a.to_degrees()).collect();
+    sorted.sort_unstable_by(f64::total_cmp);
+    let n = sorted.len();
+    // Distance to the next view and where it starts, widest first.
+    let mut gaps: Vec<[f64; 2]> = (0..n)
+        .map(|i| {
+            if i + 1 < n { [sorted[i + 1] - sorted[i], sorted[i]] } else { [sorted[0] + 360.0 - sorted[i], sorted[i]] }
+        })
+        .collect();
+    gaps.sort_unstable_by(|a, b| b[0].total_cmp(&a[0]));
+    let wide = |i: usize| gaps.get(i).map_or(0.0, |g| g[0]);
+    // The views of a short scan stand close to each other, or are too few to tell.
+    let full_circle = wide(0) < OPENING || (n > 2 && wide(0) <= 3.0 * wide(1));
+    let within = if full_circle { &gaps[..] } else { gaps.get(1..).unwrap_or_default() };
+    let sum: f64 = within.iter().map(|g| g[0]).sum();
+    let mean = if within.is_empty() { 0.0 } else { sum / within.len() as f64 };
+    let largest = within.first().copied().unwrap_or_default();
+    let step = match turns[..] {
+        [a, b, ..] => (b - a + TAU / 2.0).rem_euclid(TAU) - TAU / 2.0,
+        _ => 0.0,
+    };
+    ScanArc {
+        first_deg: turns.first().copied().unwrap_or(0.0).to_degrees(),
+        step_deg: step.to_degrees(),
+        covered_deg: if full_circle { 360.0 } else { sum + mean },
+        full_circle,
+        largest_gap_deg: largest[0],
+        largest_gap_at_deg: largest[1],
+        mean_gap_deg: mean,
+        like_degrees: steps_of_degrees(&turns),
+    }
+}
+
+/// Whether the even steps between angles in radians (whole turns taken off) are those of 180, 360 or 720 degrees
+/// divided evenly and then not converted.
+fn steps_of_degrees(turns: &[f64]) -> bool {
+    let n = turns.len();
+    if n < 4 {
+        return false;
+    }
+    let step = (turns[1] - turns[0]).rem_euclid(TAU);
+    let apart = |a: f64, b: f64| ((a - b + TAU / 2.0).rem_euclid(TAU) - TAU / 2.0).abs();
+    if turns.windows(2).any(|w| apart(w[1] - w[0], step) > 1e-4) {
+        return false;
+    }
+    // Steps of the golden angle are even too, and come near 360 by chance.
+    let golden = std::f64::consts::PI * (3.0 - 5f64.sqrt());
+    if apart(step, golden) < 1e-4 || apart(step, -golden) < 1e-4 {
+        return false;
+    }
+    let candidates = [step, TAU - step].into_iter().flat_map(|s| (0..120).map(move |k| s + TAU * f64::from(k)));
+    let whole = |total: f64| [180.0, 360.0, 720.0].iter().any(|w| (total / w - 1.0).abs() < 2e-4);
+    candidates.into_iter().any(|s| whole(s * n as f64) || whole(s * (n - 1) as f64))
+}

@@ -1,0 +1,75 @@
+//! Which part of the volume the views see.
+
+use crate::setup::Setup;
+use crate::shadow::Shadow;
+use conefield_core::geometry::{Geometry, Vec3};
+use rayon::prelude::*;
+use serde::Serialize;
+
+/// Points along each side of the volume that are looked at, and views.
+const POINTS: usize = 32;
+const VIEWS: usize = 360;
+
+/// Shares of the volume's voxels by the share of views that see them, from an even sample.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize)]
+pub struct VolumeCoverage {
+    /// The share of views that is enough: all, or half if the detector stands aside on a full circle.
+    pub needed: f64,
+    /// Voxels that enough views see.
+    pub complete: f64,
+    /// Voxels that no view sees.
+    pub unseen: f64,
+    /// The mean over voxels of the share of views.
+    pub mean: f64,
+    /// The share of views that see the voxel that the fewest see.
+    pub least: f64,
+}
+
+/// The shadows of evenly chosen views.
+fn shadows(geometry: &Geometry) -> Vec<Shadow> {
+    geometry.views.iter().step_by(geometry.views.len().div_ceil(VIEWS).max(1)).map(Shadow::of).collect()
+}
+
+/// The share of `shadows` in which `point` falls on a detector of `[rows, columns]`.
+fn share(shadows: &[Shadow], detector: [usize; 2], point: Vec3) -> f64 {
+    let [rows, columns] = detector.map(|n| n as f64 / 2.0);
+    let sees = |s: &&Shadow| s.of_point(point).is_some_and(|f| f.row.abs() <= rows && f.column.abs() <= columns);
+    shadows.iter().filter(sees).count() as f64 / shadows.len().max(1) as f64
+}
+
+/// The share of the views of `geometry` (of evenly chosen ones where there are many) on whose detector each of
+/// `points` (mm) falls.
+pub fn share_of_views(geometry: &Geometry, points: &[Vec3]) -> Vec<f64> {
+    let shadows = shadows(geometry);
+    points.par_iter().map(|p| share(&shadows, geometry.detector, *p)).collect()
+}
+
+/// Looks how many of the views see each part of the volume.
+pub(crate) fn volume_coverage(geometry: &Geometry, setup: &Setup) -> VolumeCoverage {
+    let needed = if setup.half_is_enough() { 0.5 } else { 1.0 };
+    let grid = &geometry.volume;
+    let along = |k: usize| {
+        let n = grid.shape[k];
+        let m = n.min(POINTS);
+        (0..m).map(move |i| (2 * i + 1) * n / (2 * m))
+    };
+    let mut points = Vec::new();
+    for x in along(0) {
+        for y in along(1) {
+            points.extend(along(2).map(|z| grid.voxel([x, y, z])));
+        }
+    }
+    let shares = share_of_views(geometry, &points);
+    let part =
+        |test: &dyn Fn(f64) -> bool| shares.iter().filter(|s| test(**s)).count() as f64 / shares.len().max(1) as f64;
+    // Whether just half or one view less is an affair of rounding.
+    let views = geometry.views.len().clamp(2, VIEWS) as f64;
+    let enough = if needed < 1.0 { needed - 1.01 / views } else { needed };
+    VolumeCoverage {
+        needed,
+        complete: part(&|s| s >= enough),
+        unseen: part(&|s| s == 0.0),
+        mean: shares.iter().sum::<f64>() / shares.len().max(1) as f64,
+        least: shares.iter().copied().fold(1.0, f64::min),
+    }
+}

@@ -1,0 +1,24 @@
+//! Medians and quantiles of values.
+
+/// The middle value, or `None` of nothing. Of an even number the upper one of the two.
+pub fn median(values: &mut [f32]) -> Option<f32> {
+    let middle = values.len() / 2;
+    (!values.is_empty()).then(|| *values.select_nth_unstable_by(middle, f32::total_cmp).1)
+}
+
+/// The value below which `share` of the `sorted` ones lie.
+pub fn quantile(sorted: &[f32], share: f64) -> Option<f32> {
+    let last = sorted.len().checked_sub(1)?;
+    sorted.get((share * last as f64).round() as usize).copied()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn nothing_has_no_median_and_no_quantile() {
+        assert_eq!((median(&mut []), quantile(&[], 0.5)), (None, None));
+        assert_eq!((median(&mut [3.0, 1.0, 2.0, 4.0]), quantile(&[1.0, 2.0, 5.0], 0.5)), (Some(3.0), Some(2.0)));
+    }
+}

@@ -1,0 +1,44 @@
+//! All that a scan's diagnosis finds.
+
+use crate::coverage::{VolumeCoverage, volume_coverage};
+use crate::line_integrals::{LineIntegralCheck, check_line_integrals};
+use crate::setup::{Setup, setup};
+use crate::truncation::{Truncation, truncation};
+use crate::warnings::{Warning, warnings};
+use conefield_core::scan::Scan;
+use serde::Serialize;
+
+/// All that [`survey`] finds.
+#[derive(Debug, Clone, Serialize)]
+pub struct Survey {
+    /// Lengths and angles.
+    pub setup: Setup,
+    /// Which part of the volume the views see.
+    pub coverage: VolumeCoverage,
+    /// Whether the object reaches past the detector's sides.
+    pub truncation: Truncation,
+    /// Whether the projections look like line integrals.
+    pub check: LineIntegralCheck,
+    /// The order of magnitude of the attenuation in 1/mm: the highest line integrals (but for a thousandth) over the
+    /// volume's longer side across the axis.
+    pub attenuation_per_mm: f64,
+    /// What will trouble a reconstruction; empty if nothing will.
+    pub warnings: Vec<Warning>,
+}
+
+/// Surveys `scan`. Values and geometry are taken to be finite and to fit each other ([`Scan::validate`]).
+pub fn survey(scan: &Scan) -> Survey {
+    let g = &scan.geometry;
+    let setup = setup(g);
+    let coverage = volume_coverage(g, &setup);
+    let check = check_line_integrals(scan.projections.view());
+    let truncation = truncation(scan.projections.view(), &setup, &check);
+    let size = g.volume.size();
+    let attenuation_per_mm = f64::from(check.typical_range[1]) / size[0].max(size[1]);
+    let mut survey = Survey { setup, coverage, truncation, check, attenuation_per_mm, warnings: Vec::new() };
+    survey.warnings = warnings(scan, &survey);
+    survey
+}
+
+#[cfg(test)]
+mod tests;

@@ -1,0 +1,194 @@
+//! A clean scan gives no warning, and each fault gives its own.
+
+use super::*;
+use crate::WarningKind;
+use crate::arc::scan_arc;
+use conefield_core::geometry::{Geometry, Millimetres, Radians, View, VoxelGrid};
+use conefield_core::scan::Unit;
+use ndarray::Array3;
+use std::f64::consts::TAU;
+
+/// A cylinder of water about the axis (or about `at`), seen by `views` on a circle.
+struct Setting {
+    angles: Vec<f64>,
+    dso: f64,
+    dsd: f64,
+    pixel: [f64; 2],
+    offset: [f64; 2],
+    detector: [usize; 2],
+    volume: VoxelGrid,
+    radius: f64,
+    mu: f64,
+}
+
+fn even(n: usize, range: f64) -> Vec<f64> {
+    (0..n).map(|i| range * i as f64 / n as f64).collect()
+}
+
+/// Rows and columns, pixels and voxels all differ.
+fn clean() -> Setting {
+    Setting {
+        angles: even(60, TAU),
+        dso: 500.0,
+        dsd: 800.0,
+        pixel: [2.0, 1.6],
+        offset: [0.0, 0.0],
+        detector: [40, 100],
+        volume: VoxelGrid { shape: [48, 48, 24], spacing: [1.2, 1.2, 1.5], center: [0.0; 3] },
+        radius: 24.0,
+        mu: 0.02,
+    }
+}
+
+impl Setting {
+    fn scan(&self) -> Scan {
+        let mm = |x: [f64; 2]| x.map(Millimetres);
+        let view = |a: &f64| {
+            View::circular(Radians(*a), Millimetres(self.dso), Millimetres(self.dsd), mm(self.pixel), mm(self.offset))
+        };
+        let geometry =
+            Geometry { detector: self.detector, views: self.angles.iter().map(view).collect(), volume: self.volume };
+        let shape = [geometry.views.len(), self.detector[0], self.detector[1]];
+        let half = self.volume.size()[2] / 2.0;
+        let projections = Array3::from_shape_fn(shape, |(view, row, column)| {
+            let ray = geometry.ray(view, row, column);
+            let (o, d) = (ray.origin, ray.direction);
+            let a = d[0] * d[0] + d[1] * d[1];
+            let b = o[0] * d[0] + o[1] * d[1];
+            let under = b * b - a * (o[0] * o[0] + o[1] * o[1] - self.radius * self.radius);
+            // Inside the cylinder's height, as far as the middle of the chord tells.
+            let z = o[2] - b / a * d[2];
+            if under > 0.0 && z.abs() < half { (self.mu * 2.0 * under.sqrt() / a) as f32 } else { 0.0 }
+        });
+        Scan { geometry, projections, unit: Unit::default(), provenance: serde_json::Value::Null }
+    }
+
+    fn kinds(&self) -> Vec<WarningKind> {
+        survey(&self.scan()).warnings.iter().map(|w| w.kind).collect()
+    }
+
+    /// The only warning, of the given kind, that says all of `words`.
+    fn warns(&self, kind: WarningKind, words: &[&str]) {
+        let found = survey(&self.scan()).warnings;
+        let text: Vec<String> = found.iter().map(ToString::to_string).collect();
+        assert!(found.len() == 1 && found[0].kind == kind, "{kind:?}: {text:?}");
+        assert!(words.iter().all(|w| text[0].contains(w)), "{words:?}: {text:?}");
+    }
+}
+
+#[test]
+fn a_clean_scan_gives_no_warning_and_the_right_figures() {
+    let s = survey(&clean().scan());
+    assert!(s.warnings.is_empty(), "{:?}", s.warnings);
+    let g = &s.setup;
+    assert!(g.circle && g.angles.full_circle && !g.half_is_enough());
+    for (found, want) in [
+        (g.source_to_axis_mm, 500.0),
+        (g.source_to_detector_mm, 800.0),
+        (g.magnification, 1.6),
+        (g.pixel_mm[0], 2.0),
+        (g.pixel_mm[1], 1.6),
+        (g.detector_mm[0], 80.0),
+        (g.detector_mm[1], 160.0),
+        (g.supported_voxel_mm[0], 1.0),
+        (g.supported_voxel_mm[2], 1.25),
+        // The ray to the detector's side, 80 mm aside after 800 mm, passes the axis at this distance.
+        (g.field_of_view.radius_mm, 500.0 * (0.1f64).atan().sin()),
+        (g.field_of_view.height_mm, 50.0),
+        (g.angles.mean_gap_deg, 6.0),
+        (g.angles.largest_gap_deg, 6.0),
+        (g.angles.step_deg, 6.0),
+    ] {
+        assert!((found - want).abs() < 1e-6, "{found} is not {want}: {g:?}");
+    }
+    assert_eq!((s.coverage.complete, s.coverage.unseen, s.coverage.least), (1.0, 0.0, 1.0));
+    assert_eq!(s.truncation.views, 0.0);
+}
+
+#[test]
+fn scans_that_are_unusual_but_whole_give_no_warning() {
+    // Half the detector aside, with a full circle; a short scan of 180° and more; irregular angles; noise.
+    let offset = Setting { offset: [0.0, 30.0], detector: [40, 80], ..clean() };
+    assert_eq!(offset.kinds(), []);
+    assert!(survey(&offset.scan()).setup.half_is_enough());
+    let other_side = Setting { offset: [0.0, -30.0], detector: [40, 80], ..clean() };
+    assert_eq!(other_side.kinds(), []);
+    assert_eq!(Setting { angles: even(60, 3.5), ..clean() }.kinds(), []);
+    let jittered = (0..60).map(|i| TAU * (f64::from(i) + 0.4 * f64::from(i * 7 % 5) / 5.0) / 60.0).collect();
+    assert_eq!(Setting { angles: jittered, ..clean() }.kinds(), []);
+    for n in [150, 151] {
+        let golden = (0..n).map(|i| f64::from(i) * 2.399_963_229_728_653).collect();
+        assert_eq!(Setting { angles: golden, ..clean() }.kinds(), [], "golden angle, {n}");
+    }
+    for n in 4..400 {
+        assert!(!scan_arc(&Setting { angles: even(n, TAU), ..clean() }.views()).like_degrees, "{n}");
+    }
+    let mut noisy = clean().scan();
+    let noise = |i: usize| 0.04 * (((i * 7919) % 101) as f32 / 50.0 - 1.0);
+    noisy.projections.iter_mut().enumerate().for_each(|(i, x)| *x += noise(i));
+    assert_eq!(survey(&noisy).warnings, []);
+}
+
+impl Setting {
+    fn views(&self) -> Vec<View> {
+        let mm = |x: [f64; 2]| x.map(Millimetres);
+        let view = |a: &f64| {
+            View::circular(Radians(*a), Millimetres(self.dso), Millimetres(self.dsd), mm(self.pixel), mm(self.offset))
+        };
+        self.angles.iter().map(view).collect()
+    }
+}
+
+#[test]
+fn each_fault_gives_its_own_warning() {
+    use WarningKind as W;
+    // As wide as the field of view and wider.
+    Setting { radius: 60.0, ..clean() }.warns(W::Truncated, &["100.0 % of the views", "mm at the axis", "air"]);
+    let tall = VoxelGrid { shape: [48, 48, 48], spacing: [1.2, 1.2, 1.5], center: [0.0; 3] };
+    Setting { volume: tall, radius: 10.0, ..clean() }.warns(W::Coverage, &["72.0 mm", "height 50.0 mm", "smaller"]);
+    let aside = VoxelGrid { center: [30.0, 0.0, 0.0], ..clean().volume };
+    Setting { volume: aside, ..clean() }.warns(W::Coverage, &["radius 49.8 mm"]);
+    Setting { offset: [0.0, 75.0], ..clean() }.warns(W::Offset, &["75.00 mm", "nearly", "5.00 mm"]);
+    let off = Setting { offset: [0.0, 100.0], ..clean() };
+    let said = survey(&off.scan()).warnings;
+    assert!(said.iter().any(|w| w.kind == W::Offset && w.advice.contains("no ray crosses the axis")), "{said:?}");
+    Setting { angles: even(60, 2.5), ..clean() }.warns(W::Arc, &["143.2°", "180°"]);
+    let half = Setting { offset: [0.0, 30.0], detector: [40, 80], angles: even(60, 3.6), ..clean() };
+    assert!(half.kinds().contains(&W::Arc), "{:?}", half.kinds());
+    let mut gap = even(60, TAU);
+    gap.drain(20..25);
+    Setting { angles: gap, ..clean() }.warns(W::Gap, &["114.0° and 150.0°", "36.0°"]);
+    for (n, range) in [(50, 360.0), (60, 180.0), (360, 360.0), (720, 360.0)] {
+        Setting { angles: even(n, range), ..clean() }.warns(W::Degrees, &["convert"]);
+    }
+    Setting { volume: VoxelGrid { shape: [160, 160, 80], spacing: [0.36, 0.36, 0.45], ..clean().volume }, ..clean() }
+        .warns(W::VoxelSize, &["finer", "[58, 58, 29]"]);
+    Setting { volume: VoxelGrid { shape: [16, 16, 8], spacing: [3.6, 3.6, 4.5], ..clean().volume }, ..clean() }
+        .warns(W::VoxelSize, &["lost", "[58, 58, 29]"]);
+    Setting { mu: 2e-5, ..clean() }.warns(W::Scale, &["/mm", "water"]);
+}
+
+#[test]
+fn metres_taken_for_millimetres_are_told_unless_the_unit_has_no_size() {
+    let mut scan = clean().scan();
+    scan.geometry = scan.geometry.scaled(1e-3);
+    let said = survey(&scan).warnings;
+    assert_eq!(said.iter().map(|w| w.kind).collect::<Vec<_>>(), [WarningKind::Scale; 2], "{said:?}");
+    assert!(said[0].to_string().contains("not metres"), "{said:?}");
+    scan.unit.name = "cube half side".into();
+    assert_eq!(survey(&scan).warnings, []);
+}
+
+#[test]
+fn values_that_are_no_line_integrals_are_told_once() {
+    let mut scan = clean().scan();
+    scan.projections.mapv_inplace(|a| 20000.0 * (-a).exp());
+    let said = survey(&scan).warnings;
+    assert_eq!(said.iter().map(|w| w.kind).collect::<Vec<_>>(), [WarningKind::Values], "{said:?}");
+}
+
+#[test]
+fn one_view_and_one_pixel_are_no_trouble() {
+    let one = Setting { angles: vec![0.3], detector: [1, 1], ..clean() };
+    assert!(survey(&one.scan()).setup.angles.covered_deg.is_finite());
+}

@@ -1,0 +1,265 @@
+//! What will trouble a reconstruction, with figures and a way out.
+
+use crate::survey::Survey;
+use conefield_core::scan::Scan;
+use serde::Serialize;
+use std::fmt;
+
+/// What a warning is about.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize)]
+#[serde(rename_all = "kebab-case")]
+pub enum WarningKind {
+    /// Projections that do not look like line integrals.
+    Values,
+    /// An object that reaches past the detector's sides.
+    Truncated,
+    /// A volume that not all views see.
+    Coverage,
+    /// A detector on which the axis does not fall, or hardly.
+    Offset,
+    /// An arc that is too short.
+    Arc,
+    /// A gap between views.
+    Gap,
+    /// Angles that are degrees and were taken for radians.
+    Degrees,
+    /// Lengths or attenuation of an unusual size.
+    Scale,
+    /// Voxels that do not fit the detector's resolution.
+    VoxelSize,
+}
+
+/// One thing that will trouble a reconstruction.
+#[derive(Debug, Clone, PartialEq, Eq, Serialize)]
+pub struct Warning {
+    /// What it is about.
+    pub kind: WarningKind,
+    /// What was found, with figures.
+    pub found: String,
+    /// What to do about it; empty if `found` says that too.
+    pub advice: String,
+}
+
+impl fmt::Display for Warning {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        match self.advice.as_str() {
+            "" => write!(f, "{}", self.found),
+            advice => write!(f, "{}: {advice}", self.found),
+        }
+    }
+}
+
+/// Distances in mm, and attenuations in 1/mm, between which scanners and what they scan lie.
+const DISTANCES: [f64; 2] = [10.0, 5000.0];
+const ATTENUATIONS: [f64; 2] = [1e-4, 1.0];
+/// Overlap past the axis below this share of the detector is too small.
+const OVERLAP: f64 = 0.05;
+/// A gap this many times the mean one.
+const GAP: f64 = 3.0;
+/// Units that have a size in the world, as data sets call them.
+const UNITS: [&str; 6] = ["mm", "cm", "m", "um", "µm", "dm"];
+
+/// Whether lengths are millimetres, and not those of a unit cube or the like.
+fn has_size(scan: &Scan) -> bool {
+    UNITS.contains(&scan.unit.name.as_str())
+}
+
+fn percent(x: f64) -> String {
+    match 100.0 * x {
+        p if p > 0.0 && p < 0.1 => "under 0.1 %".into(),
+        p if p < 100.0 && p > 99.9 => "over 99.9 %".into(),
+        p => format!("{p:.1} %"),
+    }
+}
+
+/// Everything that is wrong with `scan`.
+pub(crate) fn warnings(scan: &Scan, s: &Survey) -> Vec<Warning> {
+    let mut all = Vec::new();
+    let mut warn = |kind, found: String, advice: String| all.push(Warning { kind, found, advice });
+    for complaint in &s.check.complaints {
+        warn(WarningKind::Values, complaint.clone(), String::new());
+    }
+    truncated(s, &mut warn);
+    covered(scan, s, &mut warn);
+    offset(s, &mut warn);
+    angles(scan, s, &mut warn);
+    scale(scan, s, &mut warn);
+    voxels(scan, s, &mut warn);
+    all
+}
+
+type Warn<'a> = &'a mut dyn FnMut(WarningKind, String, String);
+
+fn truncated(s: &Survey, warn: Warn) {
+    let t = &s.truncation;
+    // Values that are no line integrals are not near zero anywhere.
+    if t.views <= 0.02 || !s.check.complaints.is_empty() {
+        return;
+    }
+    warn(
+        WarningKind::Truncated,
+        format!(
+            "the object reaches past the detector's side in {} of the views, on {} of the rows ({:.1} mm at the axis): \
+             line integrals of {:.3} there, above {:.3} which counts as air",
+            percent(t.views),
+            percent(t.rows),
+            t.height_mm,
+            t.level,
+            t.threshold
+        ),
+        "make the volume as large as the whole object, not only as the field of view, and do not trust values near \
+         the rim of the field of view"
+            .into(),
+    );
+}
+
+fn covered(scan: &Scan, s: &Survey, warn: Warn) {
+    let (c, fov) = (&s.coverage, &s.setup.field_of_view);
+    if c.complete >= 0.995 {
+        return;
+    }
+    let size = scan.geometry.volume.size();
+    let radius = if c.needed < 1.0 { fov.one_sided_radius_mm } else { fov.radius_mm };
+    let none = if c.unseen > 0.0 { format!(", no view sees {}", percent(c.unseen)) } else { String::new() };
+    let enough = if c.needed < 1.0 { "half the views" } else { "all views" };
+    warn(
+        WarningKind::Coverage,
+        format!(
+            "{enough} see {} of the volume{none}, and the worst voxel is seen by {} of the views; the volume is {:.1} x \
+             {:.1} x {:.1} mm and the field of view a cylinder of radius {radius:.1} mm and height {:.1} mm",
+            percent(c.complete),
+            percent(c.least),
+            size[0],
+            size[1],
+            size[2],
+            fov.height_mm
+        ),
+        "make the volume smaller, or trust what lies outside less; --png of info shows where".into(),
+    );
+}
+
+fn offset(s: &Survey, warn: Warn) {
+    let g = &s.setup;
+    let (overlap, half) = (g.overlap_mm(), g.detector_mm[1] / 2.0);
+    let found = format!(
+        "the detector stands {:.2} mm aside along u, which is {} its half width of {half:.2} mm",
+        g.offset_mm[1].abs(),
+        if overlap < 0.0 { "more than" } else { "nearly" },
+    );
+    if overlap < 0.0 {
+        let advice = "no ray crosses the axis: check the offset's sign and unit, and that it is that of the centre";
+        warn(WarningKind::Offset, found, advice.into());
+    } else if overlap < OVERLAP * 2.0 * half {
+        warn(
+            WarningKind::Offset,
+            format!("{found}: {overlap:.2} mm reach past the axis"),
+            format!("opposite views hardly overlap; {:.1} mm or more would tie them together", OVERLAP * 2.0 * half),
+        );
+    }
+}
+
+fn angles(scan: &Scan, s: &Survey, warn: Warn) {
+    let a = &s.setup.angles;
+    if a.like_degrees {
+        warn(
+            WarningKind::Degrees,
+            format!(
+                "views follow each other in steps of {:.4} rad, which divide 180, 360 or 720 evenly",
+                a.step_deg.to_radians()
+            ),
+            "the angles look like degrees that were taken for radians: convert them".into(),
+        );
+        return;
+    }
+    let size = scan.geometry.volume.size();
+    // What is to be reconstructed, as far as the detector sees it.
+    let radius = s.setup.field_of_view.one_sided_radius_mm.min(size[0].hypot(size[1]) / 2.0);
+    let fan = 2.0 * (radius / s.setup.source_to_axis_mm.max(radius)).asin().to_degrees();
+    let aside = s.setup.offset_mm[1].abs() > 0.1 * s.setup.detector_mm[1];
+    let (least, why) = match aside {
+        true => (360.0, "a full circle, since the detector stands aside".to_owned()),
+        false => (180.0 + fan, format!("180° and the fan angle of {fan:.1}°")),
+    };
+    if !a.full_circle && a.covered_deg < least - a.mean_gap_deg.max(0.1) {
+        warn(
+            WarningKind::Arc,
+            format!("the views cover an arc of {:.1}°, less than {why}", a.covered_deg),
+            format!(
+                "edges along the missing directions will be blurred; take views over {least:.0}°, or check the range of \
+                 the angles"
+            ),
+        );
+    }
+    if scan.geometry.views.len() > 4 && a.largest_gap_deg > GAP * a.mean_gap_deg {
+        warn(
+            WarningKind::Gap,
+            format!(
+                "no view between {:.1}° and {:.1}°: {:.1}°, {:.1} times the mean distance of {:.2}°",
+                a.largest_gap_at_deg,
+                a.largest_gap_at_deg + a.largest_gap_deg,
+                a.largest_gap_deg,
+                a.largest_gap_deg / a.mean_gap_deg,
+                a.mean_gap_deg
+            ),
+            "check that no views are missing and that angles belong to their projections".into(),
+        );
+    }
+}
+
+fn scale(scan: &Scan, s: &Survey, warn: Warn) {
+    if !has_size(scan) {
+        return;
+    }
+    let dso = s.setup.source_to_axis_mm;
+    if !(DISTANCES[0]..=DISTANCES[1]).contains(&dso) {
+        let likely = if dso < DISTANCES[0] { "metres" } else { "micrometres" };
+        warn(
+            WarningKind::Scale,
+            format!("the source is {dso:.4} mm from the axis; scanners have {} to {} mm", DISTANCES[0], DISTANCES[1]),
+            format!("check that the lengths are mm and not {likely}"),
+        );
+    }
+    let mu = s.attenuation_per_mm;
+    if s.check.complaints.is_empty() && mu > 0.0 && !(ATTENUATIONS[0]..=ATTENUATIONS[1]).contains(&mu) {
+        warn(
+            WarningKind::Scale,
+            format!(
+                "line integrals up to {:.3} over a volume of {:.3} mm are an attenuation of about {mu:.1e} /mm; \
+                 scanned things have {:.0e} to {} /mm (water 0.02)",
+                s.check.typical_range[1],
+                scan.geometry.volume.size()[0].max(scan.geometry.volume.size()[1]),
+                ATTENUATIONS[0],
+                ATTENUATIONS[1]
+            ),
+            "check the unit of the lengths, or of the values".into(),
+        );
+    }
+}
+
+fn voxels(scan: &Scan, s: &Survey, warn: Warn) {
+    let grid = &scan.geometry.volume;
+    let supported = s.setup.supported_voxel_mm;
+    let ratios: [f64; 3] = std::array::from_fn(|k| grid.spacing[k] / supported[k]);
+    if ratios.iter().any(|r| !r.is_finite()) {
+        return;
+    }
+    let list = |v: [f64; 3]| format!("{:.4} x {:.4} x {:.4} mm", v[0], v[1], v[2]);
+    let (fine, coarse) = (ratios.iter().any(|r| *r < 0.499), ratios.iter().all(|r| *r > 2.001));
+    if !fine && !coarse {
+        return;
+    }
+    let size = grid.size();
+    let fitting: Vec<String> =
+        (0..3).map(|k| format!("{}", (size[k] / supported[k]).round().max(1.0) as usize)).collect();
+    let found = format!(
+        "voxels of {} where a pixel over the magnification of {:.3} is {}",
+        list(grid.spacing),
+        s.setup.magnification,
+        list(supported)
+    );
+    let shape = format!("a shape of [{}] has voxels of that size", fitting.join(", "));
+    match fine {
+        true => warn(WarningKind::VoxelSize, found, format!("finer than the detector sees; {shape}")),
+        false => warn(WarningKind::VoxelSize, found, format!("details that the detector sees are lost; {shape}")),
+    }
+}

@@ -1,0 +1,192 @@
+//! A picture to draw on: rectangles, text in DejaVu Sans, and colours for values.
+
+use ab_glyph::{Font, FontRef, PxScale, ScaleFont, point};
+use conefield_core::{Error, Result};
+use conefield_io::write_atomic;
+use image::{ExtendedColorType, ImageEncoder, Rgb, RgbImage};
+use std::path::Path;
+
+/// Where a text starts, along its line.
+#[derive(Debug, Clone, Copy)]
+pub(crate) enum Align {
+    Left,
+    Middle,
+    Right,
+}
+
+/// Pixels and the font to write on them.
+pub(crate) struct Canvas {
+    pub image: RgbImage,
+    font: FontRef<'static>,
+}
+
+impl Canvas {
+    /// A picture of one colour.
+    pub fn new(width: u32, height: u32, colour: Rgb<u8>) -> Result<Self> {
+        let font = FontRef::try_from_slice(dejavu::sans::regular())
+            .map_err(|e| Error::invalid("the embedded font", "DejaVu Sans", e, "a font"))?;
+        Ok(Self { image: RgbImage::from_pixel(width, height, colour), font })
+    }
+
+    /// Width of `text` at `size` pixels a line.
+    pub fn text_width(&self, text: &str, size: f32) -> f32 {
+        let font = self.font.as_scaled(PxScale::from(size));
+        let mut last = None;
+        let mut x = 0.0;
+        for c in text.chars() {
+            let id = font.glyph_id(c);
+            x += last.map_or(0.0, |l| font.kern(l, id)) + font.h_advance(id);
+            last = Some(id);
+        }
+        x
+    }
+
+    /// `text`, cut with an ellipsis so that it is at most `width` wide.
+    pub fn shortened(&self, text: &str, size: f32, width: f32) -> String {
+        if self.text_width(text, size) <= width {
+            return text.to_string();
+        }
+        let mut chars: Vec<char> = text.chars().collect();
+        while chars.pop().is_some() {
+            let short: String = chars.iter().chain(&['…']).collect();
+            if self.text_width(&short, size) <= width {
+                return short;
+            }
+        }
+        String::new()
+    }
+
+    /// Writes one line of text; `y` is its top.
+    pub fn text(&mut self, at: (f32, f32), align: Align, size: f32, colour: Rgb<u8>, text: &str) {
+        let width = self.text_width(text, size);
+        let mut x = match align {
+            Align::Left => at.0,
+            Align::Middle => at.0 - width / 2.0,
+            Align::Right => at.0 - width,
+        };
+        let font = self.font.clone();
+        let font = font.as_scaled(PxScale::from(size));
+        let y = at.1 + font.ascent();
+        let mut last = None;
+        for c in text.chars() {
+            let id = font.glyph_id(c);
+            x += last.map_or(0.0, |l| font.kern(l, id));
+            last = Some(id);
+            let glyph = id.with_scale_and_position(PxScale::from(size), point(x, y));
+            x += font.h_advance(id);
+            let Some(outline) = font.outline_glyph(glyph) else { continue };
+            let corner = outline.px_bounds().min;
+            outline.draw(|dx, dy, cover| {
+                let (px, py) = (corner.x + dx as f32, corner.y + dy as f32);
+                if px < 0.0 || py < 0.0 {
+                    return;
+                }
+                if let Some(p) = self.image.get_pixel_mut_checked(px as u32, py as u32) {
+                    for k in 0..3 {
+                        let (a, b) = (f32::from(p.0[k]), f32::from(colour.0[k]));
+                        p.0[k] = (a + (b - a) * cover.clamp(0.0, 1.0)).round() as u8;
+                    }
+                }
+            });
+        }
+    }
+
+    /// Fills a rectangle; what lies outside the picture is left away.
+    pub fn fill(&mut self, x: u32, y: u32, width: u32, height: u32, mut colour: impl FnMut(u32, u32) -> Rgb<u8>) {
+        for dy in 0..height.min(self.image.height().saturating_sub(y)) {
+            for dx in 0..width.min(self.image.width().saturating_sub(x)) {
+                self.image.put_pixel(x + dx, y + dy, colour(dx, dy));
+            }
+        }
+    }
+
+    /// Writes the picture as PNG.
+    pub fn write_png(&self, path: &Path) -> Result<()> {
+        write_png(path, self.image.width(), self.image.height(), self.image.as_raw())
+    }
+}
+
+/// Writes 8-bit RGB pixels as PNG.
+pub(crate) fn write_png(path: &Path, width: u32, height: u32, rgb: &[u8]) -> Result<()> {
+    write_atomic(path, |w| {
+        image::codecs::png::PngEncoder::new(w).write_image(rgb, width, height, ExtendedColorType::Rgb8).map_err(|e| {
+            match e {
+                image::ImageError::IoError(e) => Error::io(path, e),
+                e => Error::invalid(path.display().to_string(), "picture", e, "pixels that PNG can hold"),
+            }
+        })
+    })
+}
+
+/// Black at 0, white at 1.
+pub(crate) fn grey(x: f32) -> Rgb<u8> {
+    Rgb([(x.clamp(0.0, 1.0) * 255.0).round() as u8; 3])
+}
+
+/// Blue at −1, white at 0, red at 1, so that no difference and the sign of one are plain to see.
+pub(crate) fn diverging(x: f32) -> Rgb<u8> {
+    const ENDS: [[f32; 3]; 5] =
+        [[10.0, 40.0, 110.0], [67.0, 140.0, 195.0], [250.0, 250.0, 250.0], [225.0, 110.0, 80.0], [110.0, 5.0, 30.0]];
+    between(&ENDS, (x.clamp(-1.0, 1.0) + 1.0) / 2.0)
+}
+
+/// From dark violet at 0 over blue and green to yellow at 1, as light as the value is high (after viridis).
+pub(crate) fn sequential(x: f32) -> Rgb<u8> {
+    const ENDS: [[f32; 3]; 5] =
+        [[68.0, 1.0, 84.0], [59.0, 82.0, 139.0], [33.0, 145.0, 140.0], [94.0, 201.0, 98.0], [253.0, 231.0, 37.0]];
+    between(&ENDS, x.clamp(0.0, 1.0))
+}
+
+/// The colour at `x`, from 0 to 1, among colours at equal distances.
+fn between(ends: &[[f32; 3]; 5], x: f32) -> Rgb<u8> {
+    let at = x * 4.0;
+    let low = (at as usize).min(3);
+    let part = at - low as f32;
+    Rgb(std::array::from_fn(|k| (ends[low][k] + (ends[low + 1][k] - ends[low][k]) * part).round() as u8))
+}
+
+/// A number in as few characters as tell it from its neighbours.
+pub(crate) fn number(x: f64) -> String {
+    let size = x.abs();
+    if x == 0.0 {
+        "0".into()
+    } else if !(1e-3..1e5).contains(&size) {
+        format!("{x:.1e}").replace('-', "−")
+    } else {
+        let digits = (2 - size.log10().floor() as i32).clamp(0, 6) as usize;
+        let text = format!("{x:.digits$}");
+        let text = if text.contains('.') { text.trim_end_matches('0').trim_end_matches('.') } else { &text };
+        text.replace('-', "−")
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn colours_are_symmetric_about_white() {
+        assert_eq!(diverging(0.0), Rgb([250; 3]));
+        assert_eq!((diverging(-9.0), diverging(9.0)), (Rgb([10, 40, 110]), Rgb([110, 5, 30])));
+        assert_eq!((sequential(-1.0), sequential(2.0)), (Rgb([68, 1, 84]), Rgb([253, 231, 37])));
+        assert_eq!((grey(-1.0), grey(2.0), grey(f32::NAN)), (Rgb([0; 3]), Rgb([255; 3]), Rgb([0; 3])));
+    }
+
+    #[test]
+    fn numbers_are_short() {
+        for (x, want) in
+            [(0.0, "0"), (1.0, "1"), (-0.05, "−0.05"), (1234.0, "1234"), (0.0333, "0.0333"), (1e-5, "1.0e−5")]
+        {
+            assert_eq!(number(x), want);
+        }
+    }
+
+    #[test]
+    fn text_is_drawn_and_cut() {
+        let mut c = Canvas::new(200, 30, Rgb([255; 3])).unwrap();
+        c.text((-20.0, 2.0), Align::Left, 20.0, Rgb([0; 3]), "outside µ −1.5 and further than the picture is wide");
+        assert!(c.image.pixels().any(|p| p.0[0] < 60));
+        let short = c.shortened("a very long caption", 20.0, 60.0);
+        assert!(short.ends_with('…') && c.text_width(&short, 20.0) <= 60.0, "{short}");
+    }
+}

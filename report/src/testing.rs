@@ -1,0 +1,28 @@
+//! What several modules' tests share.
+
+use std::path::PathBuf;
+
+/// A file of the shared data, or `None` with a note on why the test has nothing to do.
+pub(crate) fn data(name: &str) -> Option<PathBuf> {
+    let root = std::env::var_os("CONEFIELD_DATA")
+        .map(PathBuf::from)
+        .unwrap_or_else(|| PathBuf::from(env!("CARGO_MANIFEST_DIR")).join("../../shared/data"));
+    let path = root.join(name);
+    if path.exists() {
+        return Some(path);
+    }
+    eprintln!("skipped: {} is not there; CONEFIELD_DATA names the folder of the shared data", path.display());
+    None
+}
+
+/// Where pictures go to be looked at, if CONEFIELD_PICTURES names a folder.
+pub(crate) fn folder() -> (Option<tempfile::TempDir>, PathBuf) {
+    match std::env::var_os("CONEFIELD_PICTURES") {
+        Some(p) => (None, p.into()),
+        None => {
+            let dir = tempfile::tempdir().unwrap();
+            let path = dir.path().to_path_buf();
+            (Some(dir), path)
+        }
+    }
+}

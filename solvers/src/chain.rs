@@ -1,0 +1,226 @@
+//! Methods one after the other, each from the volume of the one before.
+//!
+//! A field and total variation err in different places. A field that is trained first, and total variation that is held to its
+//! volume (`pull` of `fista`), come closer than either alone.
+
+use conefield_core::checkpoint::Checkpoint;
+use conefield_core::error::{Result, ensure};
+use conefield_core::method::{
+    Context, Findings, Job, Limits, Line, Method, Needs, Observer, Outline, Plan, PretrainJob, Reconstruction, Record,
+    Solution,
+};
+use conefield_core::pipeline::{Model, Pipeline};
+use conefield_core::registry::Kind;
+use conefield_core::scan::{Scan, ScanHeader};
+use conefield_core::spec::stage;
+use conefield_core::trained::{Placement, TrainedField};
+use schemars::{JsonSchema, Schema, SchemaGenerator};
+use serde::{Deserialize, Serialize};
+
+/// Settings of `chain`.
+#[derive(Serialize, Deserialize, JsonSchema)]
+#[serde(deny_unknown_fields)]
+pub struct Chain {
+    /// The methods, in order. An entry may say `extends`. The command line's limits of steps and seconds are those of the
+    /// first.
+    #[serde(deserialize_with = "stage::list")]
+    #[schemars(schema_with = "methods")]
+    pub methods: Vec<Box<dyn Method>>,
+}
+
+fn methods(_: &mut SchemaGenerator) -> Schema {
+    stage::schema_of_list(Kind::Method)
+}
+
+conefield_core::stage_type!(
+    Method,
+    "chain",
+    Chain,
+    "methods one after the other, each from the volume of the one before"
+);
+
+#[typetag::serde(name = "chain")]
+impl Method for Chain {
+    fn plan(&self, context: &Context<'_>) -> Result<Box<dyn Plan>> {
+        ensure(self.methods.len() > 1, "spec", "methods", self.methods.len(), "at least 2 methods")?;
+        let mut links = vec![];
+        for (i, method) in self.methods.iter().enumerate() {
+            let mut link = method.plan(context).map_err(|e| e.within(&at(i)))?;
+            ensure(link.links().is_empty(), "spec", &at(i), "a chain in a chain", "a method that is none")?;
+            let starts = i == 0 || link.starts_from_volume();
+            ensure(starts, "spec", &at(i), method.typetag_name(), "a method that starts from a volume")?;
+            links.push(link);
+        }
+        Ok(Box::new(ChainPlan { links }))
+    }
+}
+
+/// The key of a link.
+fn at(i: usize) -> String {
+    format!("methods.{i}")
+}
+
+/// The plan of [`Chain`].
+struct ChainPlan {
+    /// At least two.
+    links: Vec<Box<dyn Plan>>,
+}
+
+impl Plan for ChainPlan {
+    fn outline(&self) -> Outline {
+        let links: Vec<Outline> = self.links.iter().map(|l| l.outline()).collect();
+        let kinds: Vec<&str> = links.iter().map(|l| &l.method.kind[..]).collect();
+        Outline { method: Line::new("method", "chain", &kinds.join(", then ")), links, ..Outline::default() }
+    }
+
+    /// The links run one after the other; later ones also hold the volume that they start from.
+    fn needs(&self, scan: &ScanHeader) -> Needs {
+        let volume = 4 * scan.voxels();
+        let later = |l: &dyn Plan| {
+            let needs = l.needs(scan);
+            Needs { working: needs.working + volume, ..needs }
+        };
+        let first = self.links[0].needs(scan);
+        self.links[1..].iter().map(|l| later(l.as_ref())).fold(first, Needs::most)
+    }
+
+    fn inspect(&self, scan: &Scan) -> Result<Findings> {
+        let mut all = Findings::default();
+        for (i, link) in self.links.iter().enumerate() {
+            let found = link.inspect(scan).map_err(|e| e.within(&at(i)))?;
+            let new: Vec<String> = found.lines.into_iter().filter(|line| !all.lines.contains(line)).collect();
+            all.lines.extend(new);
+            all.attenuation = all.attenuation.or(found.attenuation);
+            all.samples = all.samples.or(found.samples);
+        }
+        Ok(all)
+    }
+
+    fn run(&mut self, job: &Job<'_>, observer: &mut dyn Observer) -> Result<Solution> {
+        let first = self.links[0].run(job, &mut FirstObserver { observer: &mut *observer, over: false });
+        let mut done = first.map_err(|e| e.within(&at(0)))?;
+        for (i, link) in self.links.iter_mut().enumerate().skip(1) {
+            let start = done.result.volume(job.backend)?;
+            let limits = Limits {
+                at_most: job.limits.at_most.map(|all| (all - done.train_s).max(0.0)),
+                deadline: job.limits.then,
+                ..Limits::default()
+            };
+            let next = Job { start: Some(&start), limits, resume: None, ..*job };
+            let mut heard = LaterObserver { observer: &mut *observer, steps: done.steps, seconds: done.train_s };
+            let solution = link.run(&next, &mut heard).map_err(|e| e.within(&at(i)))?;
+            done = joined(done, solution, job)?;
+        }
+        Ok(done)
+    }
+
+    fn pretrain(&mut self, job: &PretrainJob<'_>, observer: &mut dyn Observer) -> Result<Model> {
+        self.links[0].pretrain(job, observer).map_err(|e| e.within(&at(0)))
+    }
+
+    fn restore(&self, placement: &Placement, load: &mut dyn FnMut(&mut Model) -> Result<()>) -> Result<TrainedField> {
+        self.links[0].restore(placement, load)
+    }
+
+    fn pipeline(&self) -> Option<&Pipeline> {
+        self.links[0].pipeline()
+    }
+
+    fn needs_held_out(&self) -> Option<String> {
+        let mut all = self.links.iter().enumerate();
+        all.find_map(|(i, l)| l.needs_held_out().map(|setting| format!("{}.{setting}", at(i))))
+    }
+
+    fn links(&mut self) -> &mut [Box<dyn Plan>] {
+        &mut self.links
+    }
+}
+
+/// What two methods made, the second from the volume of the first.
+fn joined(first: Solution, second: Solution, job: &Job<'_>) -> Result<Solution> {
+    let result = match (first.result, second.result) {
+        (_, field @ Reconstruction::Field(_)) => field,
+        (Reconstruction::Field(field), later) => {
+            Reconstruction::Refined { field: Box::new(field), volume: later.volume(job.backend)? }
+        }
+        (Reconstruction::Refined { field, .. }, later) => {
+            Reconstruction::Refined { field, volume: later.volume(job.backend)? }
+        }
+        (Reconstruction::Volume(_), later) => later,
+    };
+    let best = second.best.map(|mut best| {
+        best.step += first.steps;
+        best
+    });
+    Ok(Solution {
+        result,
+        steps: first.steps + second.steps,
+        train_s: first.train_s + second.train_s,
+        samples: first.samples + second.samples,
+        sampling_s: first.sampling_s + second.sampling_s,
+        rollbacks: first.rollbacks + second.rollbacks,
+        best,
+    })
+}
+
+/// Hears of the first method. A checkpoint is due when steps or time end it: a run that is interrupted later starts from that.
+/// (A field that held-out views end goes on from its last checkpoint instead, to the same end.)
+struct FirstObserver<'a> {
+    observer: &'a mut dyn Observer,
+    over: bool,
+}
+
+impl Observer for FirstObserver<'_> {
+    fn progress(&mut self, step: u64, share: f64, seconds_left: f64) {
+        self.over = share >= 1.0;
+        self.observer.progress(step, share, seconds_left);
+    }
+
+    fn record(&mut self, record: &Record) {
+        self.observer.record(record);
+    }
+
+    fn note(&mut self, text: &str) {
+        self.observer.note(text);
+    }
+
+    fn cancelled(&self) -> bool {
+        self.observer.cancelled()
+    }
+
+    fn checkpoint_due(&self) -> bool {
+        self.over || self.observer.checkpoint_due()
+    }
+
+    fn checkpoint(&mut self, checkpoint: &Checkpoint<'_>) -> Result<()> {
+        self.over = false;
+        self.observer.checkpoint(checkpoint)
+    }
+}
+
+/// Hears of a later method, whose passes count on from the steps before. It keeps no checkpoints: it begins anew from the last
+/// one of the first method.
+struct LaterObserver<'a> {
+    observer: &'a mut dyn Observer,
+    steps: u64,
+    seconds: f64,
+}
+
+impl Observer for LaterObserver<'_> {
+    fn progress(&mut self, step: u64, share: f64, seconds_left: f64) {
+        self.observer.progress(self.steps + step, share, seconds_left);
+    }
+
+    fn record(&mut self, record: &Record) {
+        let (step, seconds) = (self.steps + record.step, self.seconds + record.seconds);
+        self.observer.record(&Record { step, seconds, ..record.clone() });
+    }
+
+    fn note(&mut self, text: &str) {
+        self.observer.note(text);
+    }
+
+    fn cancelled(&self) -> bool {
+        self.observer.cancelled()
+    }
+}

@@ -1,0 +1,434 @@
+//! The plan of methods that train a field by stochastic gradients.
+//!
+//! Every step draws rays, compares their integrals with the measurement by a loss (L1 in the published codes), adds the
+//! priors on small random blocks of neighbouring points, and takes an Adam step.
+
+use crate::fit::{Fitted, fit};
+use crate::iterative::known_volume;
+use crate::iterative::noise::{self, Noise};
+use crate::losses::L1;
+use crate::optimizer::Optimizer;
+use crate::pretrain::{Pretraining, learn, pretrain};
+use crate::priors::Places;
+use crate::rays::{Pixels, RaySource, Views};
+use crate::schedule::{Clock, Ends};
+use crate::surround::{self, Within};
+use crate::training::callbacks::{FieldMonitor, LiveSlices, Rollback};
+use crate::training::run::Tally;
+use crate::training::{Callback, CallbackSpec, Callbacks, Draw, Run, Task, checkpoint, train};
+use conefield_core::backend::{Adam, Executable, TrainRay};
+use conefield_core::error::{Result, ensure};
+use conefield_core::loss::{Loss, NoiseModel};
+use conefield_core::method::{
+    Context, Findings, Job, Line, Needs, Observer, Outline, Plan, PretrainJob, Reconstruction, Solution, StageLine,
+};
+use conefield_core::pipeline::{Model, Pipeline};
+use conefield_core::prior::Prior;
+use conefield_core::registry::Kind;
+use conefield_core::scan::{Scan, ScanHeader};
+use conefield_core::scene::{Scene, SceneSettings};
+use conefield_core::settings::{Initializer, InitializerSpec, LossSpec, PriorSpec};
+use conefield_core::spec::stage;
+use conefield_core::trained::{FieldVoxels, Placement, TrainedField};
+use conefield_initializers::random::Random;
+use schemars::{JsonSchema, Schema, SchemaGenerator};
+use serde::{Deserialize, Serialize};
+use std::sync::Arc;
+
+/// What is trained, and how: the settings that such methods share.
+pub(crate) struct Trained<'a> {
+    /// The name of the method.
+    pub(crate) kind: &'static str,
+    pub(crate) scene: &'a SceneSettings,
+    pub(crate) initializer: &'a dyn InitializerSpec,
+    pub(crate) loss: &'a dyn LossSpec,
+    pub(crate) priors: &'a [Box<dyn PriorSpec>],
+    pub(crate) optimizer: &'a Optimizer,
+    pub(crate) training: &'a Training,
+    pub(crate) pretraining: &'a Pretraining,
+    pub(crate) callbacks: &'a [Box<dyn CallbackSpec>],
+}
+
+impl Trained<'_> {
+    /// Builds what is left to build, and compiles `pipeline`. `stages` are the lines of its stages, `beside` of others.
+    pub(crate) fn plan(
+        &self,
+        pipeline: Pipeline,
+        stages: Vec<StageLine>,
+        mut beside: Vec<Line>,
+        context: &Context<'_>,
+    ) -> Result<Box<dyn Plan>> {
+        self.scene.validate()?;
+        self.optimizer.validate().map_err(|e| e.within("optimizer"))?;
+        self.training.validate().map_err(|e| e.within("training"))?;
+        self.pretraining.validate().map_err(|e| e.within("pretraining"))?;
+        let callbacks = build_callbacks(self.callbacks)?;
+        for (i, callback) in callbacks.iter().enumerate() {
+            callback.check(&pipeline).map_err(|e| e.within(&format!("callbacks.{i}")))?;
+        }
+        let loss = self.loss.build().map_err(|e| e.within("loss"))?;
+        let prior = |(i, spec): (usize, &Box<dyn PriorSpec>)| {
+            let prior = spec.build().and_then(|p| p.blocks().validate().map(|()| p));
+            prior.map_err(|e| e.within(&format!("priors.{i}")))
+        };
+        let priors: Vec<Box<dyn Prior>> = self.priors.iter().enumerate().map(prior).collect::<Result<_>>()?;
+        let initializer = self.initializer.build(context.weights).map_err(|e| e.within("initializer"))?;
+        initializer.check(pipeline.layout()).map_err(|e| e.within("initializer"))?;
+        let (exe, compiled) = context.backend.compile(&pipeline)?;
+        beside.push(Line::new("initializer", self.initializer.typetag_name(), &initializer.describe()));
+        beside.push(Line::new("loss", self.loss.typetag_name(), &loss.describe()));
+        for (i, (p, spec)) in priors.iter().zip(self.priors).enumerate() {
+            beside.push(Line::new(&format!("priors.{i}"), spec.typetag_name(), &p.describe()));
+        }
+        for (i, (c, spec)) in callbacks.iter().zip(self.callbacks).enumerate() {
+            let said = c.describe().unwrap_or_default();
+            beside.push(Line::new(&format!("callbacks.{i}"), spec.typetag_name(), &said));
+        }
+        let what = format!("{} rays a step, Adam {}", self.training.rays, self.optimizer.lr);
+        let method = Line::new("method", self.kind, &what);
+        Ok(Box::new(FieldPlan {
+            scene: self.scene.clone(),
+            optimizer: self.optimizer.clone(),
+            training: self.training.clone(),
+            pretraining: self.pretraining.clone(),
+            callback_settings: self.callbacks.to_vec(),
+            pipeline,
+            initializer,
+            loss: Arc::from(loss),
+            priors,
+            callbacks: Some(callbacks),
+            compiled: Some(exe),
+            outline: Outline { method, stages, beside, compiled: Some(compiled), links: vec![] },
+        }))
+    }
+}
+
+/// What a step learns from, and when training ends.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
+#[serde(deny_unknown_fields, default)]
+pub struct Training {
+    /// Ends after this many passes over the views.
+    pub epochs: Option<f64>,
+    /// Ends after this many steps.
+    pub steps: Option<u64>,
+    /// Ends after this many seconds of training. Which limit comes first ends the run.
+    pub seconds: Option<f64>,
+    /// Rays a step.
+    pub rays: usize,
+    /// Where a step takes its rays from.
+    pub views: Views,
+    /// Which pixels count.
+    pub pixels: Pixels,
+    /// Pixels by which the support is widened.
+    pub margin: usize,
+    /// Steps between two records of the metrics.
+    pub report_every: u64,
+}
+
+impl Default for Training {
+    fn default() -> Self {
+        Self {
+            epochs: None,
+            steps: Some(1500),
+            seconds: None,
+            rays: 1024,
+            views: Views::All,
+            pixels: Pixels::Support,
+            margin: 8,
+            report_every: 50,
+        }
+    }
+}
+
+impl Training {
+    /// Refuses numbers that cannot be used, and a run without an end.
+    pub fn validate(&self) -> Result<()> {
+        ensure((1..=1 << 20).contains(&self.rays), "spec", "rays", self.rays, "1 to 2^20")?;
+        ensure(self.report_every > 0, "spec", "report_every", 0, "at least 1")?;
+        let ends = self.epochs.is_some() || self.steps.is_some() || self.seconds.is_some();
+        ensure(ends, "spec", "", "no end", "one of epochs, steps or seconds")?;
+        for (name, end) in [("epochs", self.epochs), ("seconds", self.seconds)] {
+            if let Some(x) = end {
+                ensure(x.is_finite() && x > 0.0, "spec", name, x, "a positive finite number")?;
+            }
+        }
+        Ok(())
+    }
+}
+
+/// The default initializer.
+pub(crate) fn random() -> Box<dyn InitializerSpec> {
+    Box::new(Random {})
+}
+
+/// The default loss.
+pub(crate) fn l1() -> Box<dyn LossSpec> {
+    Box::new(L1 {})
+}
+
+/// The default callbacks.
+pub(crate) fn rollback() -> Vec<Box<dyn CallbackSpec>> {
+    vec![Box::new(Rollback::default())]
+}
+
+pub(crate) fn initializer(_: &mut SchemaGenerator) -> Schema {
+    stage::schema_of(Kind::Initializer)
+}
+
+pub(crate) fn loss(_: &mut SchemaGenerator) -> Schema {
+    stage::schema_of(Kind::Loss)
+}
+
+pub(crate) fn priors(_: &mut SchemaGenerator) -> Schema {
+    stage::schema_of_list(Kind::Prior)
+}
+
+pub(crate) fn callbacks(_: &mut SchemaGenerator) -> Schema {
+    stage::schema_of_list(Kind::Callback)
+}
+
+/// The callbacks that settings name, each once.
+fn build_callbacks(settings: &[Box<dyn CallbackSpec>]) -> Result<Vec<Box<dyn Callback>>> {
+    let mut all: Vec<Box<dyn Callback>> = vec![];
+    for (i, spec) in settings.iter().enumerate() {
+        let key = format!("callbacks.{i}");
+        let callback = spec.build().map_err(|e| e.within(&key))?;
+        let twin = all.iter().any(|c| c.name() == callback.name());
+        ensure(!twin, "spec", &key, format!("another {:?}", callback.name()), "each callback once")?;
+        all.push(callback);
+    }
+    Ok(all)
+}
+
+/// Steps whose rays a loss learns from at most, and rays of each.
+const DRAWS: u64 = 64;
+const DRAWN: usize = 1024;
+
+/// The plan of a field that is trained.
+struct FieldPlan {
+    scene: SceneSettings,
+    optimizer: Optimizer,
+    training: Training,
+    pretraining: Pretraining,
+    callback_settings: Vec<Box<dyn CallbackSpec>>,
+    pipeline: Pipeline,
+    initializer: Box<dyn Initializer>,
+    loss: Arc<dyn Loss>,
+    priors: Vec<Box<dyn Prior>>,
+    /// Of the first run. Another one makes its own, as callbacks keep a state.
+    callbacks: Option<Vec<Box<dyn Callback>>>,
+    /// Of the first run, unless the scan changes the stages.
+    compiled: Option<Box<dyn Executable>>,
+    outline: Outline,
+}
+
+impl Plan for FieldPlan {
+    fn outline(&self) -> Outline {
+        self.outline.clone()
+    }
+
+    fn needs(&self, scan: &ScanHeader) -> Needs {
+        let n = self.pipeline.layout().len() as u64;
+        let kept: u64 = self.callbacks.iter().flatten().map(|c| c.bytes(n)).sum();
+        let backend = self.outline.backend().scratch_bytes as u64;
+        let learning = if self.loss.needs_scan() { noise::scratch(scan) } else { 0 };
+        let known = if self.initializer.volume().is_some() { 8 * scan.voxels() } else { 0 };
+        let [surround, subtracted] = surround::bytes(self.scene.surround, scan);
+        Needs {
+            surround,
+            subtracted,
+            model: 8 * n,
+            optimizer: 8 * n + kept,
+            backend,
+            working: RaySource::bytes(scan) + learning + known,
+            // Parameters and moments from the file, those that callbacks keep too, and one of them again on its way into the
+            // model.
+            resume: 16 * n + kept,
+            volume: false,
+            evaluating: backend + FieldVoxels::BYTES,
+        }
+    }
+
+    fn inspect(&self, scan: &Scan) -> Result<Findings> {
+        let mut pipeline = self.pipeline.clone();
+        let fitted = fit(scan, &self.scene, &mut pipeline)?;
+        let (scene, g) = (fitted.scene, &scan.geometry);
+        let mut lines = surround::found(scan, self.scene.surround)?;
+        lines.extend(fitted.found);
+        let middle = scene.pixel_ray(g, 0, g.detector[0] / 2, g.detector[1] / 2);
+        Ok(Findings {
+            lines,
+            attenuation: Some(scene.attenuation * scan.unit.mm),
+            samples: Some(pipeline.projector.max_samples(&middle)),
+        })
+    }
+
+    fn run(&mut self, job: &Job<'_>, observer: &mut dyn Observer) -> Result<Solution> {
+        job.scan.validate("scan")?;
+        let mut pipeline = self.pipeline.clone();
+        let Fitted { scene, needed, found, changed } = fit(job.scan, &self.scene, &mut pipeline)?;
+        found.iter().for_each(|line| observer.note(line));
+        let within = Within::of(job, self.scene.surround, observer)?;
+        let job = &Within::job(within.as_ref(), job);
+        let Training { views, pixels, margin, .. } = self.training;
+        let source = RaySource::new(job.scan, &scene, &pipeline, views, pixels, margin)?;
+        observer.note(&format!("{:.0}% of the pixels are trained on", 100.0 * source.share()));
+        let fitted = self.fitted_loss(job, &scene, &source);
+        if let Some(loss) = &fitted {
+            observer.note(&format!("loss: {}", loss.describe()));
+        }
+        let mut callbacks = match self.callbacks.take() {
+            Some(callbacks) => callbacks,
+            None => build_callbacks(&self.callback_settings)?,
+        };
+        callbacks.insert(0, Box::new(FieldMonitor::new(job, &scene, &pipeline)));
+        callbacks.push(Box::new(LiveSlices));
+        let mut callbacks = Callbacks(callbacks);
+        let compiled = self.compiled.take().filter(|_| !changed && needed.is_none());
+        let loss = fitted.unwrap_or_else(|| self.loss.clone());
+        let begun = self.begin(job, &scene, (pipeline, needed, compiled), observer)?;
+        let mut run = Run {
+            job,
+            scene: &scene,
+            observer,
+            model: begun.0,
+            exe: begun.1,
+            clock: self.clock(job, source.steps_an_epoch()),
+            loss: loss.clone(),
+            steps_an_epoch: source.steps_an_epoch(),
+            report_every: self.training.report_every,
+            step: 0,
+            samples: 0,
+            tally: Tally::default(),
+            settled: false,
+            best: None,
+        };
+        if let Some(resume) = job.resume {
+            checkpoint::restore(&mut run, &mut callbacks, resume)?;
+            run.observer.note(&format!("resumed after step {}", run.step));
+        }
+        let mut task = Rays {
+            optimizer: &self.optimizer,
+            count: self.training.rays,
+            source,
+            scene: &scene,
+            loss: loss.as_ref(),
+            rays: vec![],
+            places: Places::new(&self.priors),
+        };
+        train(&mut run, &mut task, &mut callbacks)?;
+        let Run { model, clock, step, samples, tally, best, .. } = run;
+        let (train_s, rollbacks) = (clock.seconds(), tally.rollbacks);
+        let result = Reconstruction::Field(TrainedField { model, scene: scene.clone(), unit_mm: job.scan.unit.mm });
+        Ok(Solution { result, steps: step, train_s, samples, sampling_s: train_s, rollbacks, best })
+    }
+
+    fn pretrain(&mut self, job: &PretrainJob<'_>, observer: &mut dyn Observer) -> Result<Model> {
+        let compiled = match self.compiled.take() {
+            Some(exe) => exe,
+            None => job.backend.compile(&self.pipeline)?.0,
+        };
+        observer.note(&self.outline.backend().backend);
+        let learning = (&self.optimizer, &self.pretraining, self.training.report_every);
+        pretrain((self.pipeline.clone(), compiled), learning, &self.scene, job, observer)
+    }
+
+    fn restore(&self, placement: &Placement, load: &mut dyn FnMut(&mut Model) -> Result<()>) -> Result<TrainedField> {
+        TrainedField::restore(self.pipeline.clone(), &self.scene, placement, load)
+    }
+
+    fn pipeline(&self) -> Option<&Pipeline> {
+        Some(&self.pipeline)
+    }
+
+    fn needs_held_out(&self) -> Option<String> {
+        let at = self.callbacks.iter().flatten().position(|c| c.needs_held_out())?;
+        Some(format!("callbacks.{at}"))
+    }
+}
+
+impl FieldPlan {
+    /// The loss that learns from the scan, if it does.
+    fn fitted_loss(&self, job: &Job<'_>, scene: &Scene, source: &RaySource<'_>) -> Option<Arc<dyn Loss>> {
+        if !self.loss.needs_scan() {
+            return None;
+        }
+        let noise = Noise::of(job.scan, true);
+        let (mut rays, mut measured) = (vec![], vec![]);
+        for step in 0..source.steps_an_epoch().min(DRAWS) {
+            source.draw(job.seed, step, DRAWN, &mut rays);
+            measured.extend(rays.iter().map(|r| f64::from(r.target)));
+        }
+        let line = scene.line_scale();
+        let noise = NoiseModel { sigma: noise.sigma / line, growth: noise.growth * line, measured: &measured };
+        self.loss.fitted(&noise).map(Arc::from)
+    }
+
+    fn clock(&self, job: &Job<'_>, steps_an_epoch: u64) -> Clock {
+        let Training { epochs, steps, seconds, .. } = self.training;
+        let by_epochs = epochs.map(|e| (e * steps_an_epoch as f64).ceil() as u64);
+        let steps = [steps, by_epochs].into_iter().flatten().min();
+        let spent = job.resume.map_or(0.0, |r| r.standing.seconds);
+        Clock::new(Ends { steps, seconds }, job.limits, spent)
+    }
+
+    /// The model as it begins, or as a checkpoint has it, and what computes it. `needed` are the encoder's channels that the
+    /// scan needs, if it does not need all; `compiled` is what was compiled, if it still fits.
+    fn begin(
+        &self,
+        job: &Job<'_>,
+        scene: &Scene,
+        (pipeline, needed, compiled): (Pipeline, Option<Vec<usize>>, Option<Box<dyn Executable>>),
+        observer: &mut dyn Observer,
+    ) -> Result<(Model, Box<dyn Executable>)> {
+        let mut model = Model::random(pipeline, job.seed);
+        if let Some(resume) = job.resume {
+            resume.restore(&mut model)?;
+        } else {
+            let report = self.initializer.apply(model.pipeline.layout(), &mut model.arena)?;
+            let (loaded, all) = (report.loaded.len(), report.loaded.len() + report.fresh.len());
+            if loaded > 0 {
+                observer.note(&format!("loaded {loaded} of {all} tensors"));
+            }
+            if let Some(keep) = needed {
+                model.mask(keep)?;
+            }
+        }
+        let mut exe = match compiled.filter(|_| model.masks().is_empty()) {
+            Some(exe) => exe,
+            None => job.backend.compile(&model.pipeline)?.0,
+        };
+        observer.note(&self.outline.backend().backend);
+        if job.resume.is_none()
+            && let Some((volume, steps, from)) = known_volume(job, self.initializer.volume())?
+        {
+            let learning = (&self.optimizer, &self.pretraining);
+            learn(learning, exe.as_mut(), &mut model, (&volume, scene), steps, job, observer)?;
+            observer.note(&format!("learned {from} in {steps} steps"));
+        }
+        Ok((model, exe))
+    }
+}
+
+/// Learns from the rays of a scan.
+struct Rays<'a> {
+    optimizer: &'a Optimizer,
+    count: usize,
+    source: RaySource<'a>,
+    scene: &'a Scene,
+    loss: &'a dyn Loss,
+    rays: Vec<TrainRay>,
+    places: Places<'a>,
+}
+
+impl Task for Rays<'_> {
+    fn draw(&mut self, seed: u64, step: u64) -> Draw<'_> {
+        let Self { count, source, scene, loss, rays, places, .. } = self;
+        source.draw(seed, step, *count, rays);
+        Draw { loss: *loss, rays, priors: places.draw(scene, seed, step) }
+    }
+
+    fn adam(&self, epoch: f64, share: f64) -> Adam {
+        self.optimizer.adam(1, epoch, share)
+    }
+}

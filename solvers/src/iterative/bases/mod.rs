@@ -1,0 +1,5 @@
+//! Bases that a method may name.
+
+pub mod voxels;
+
+pub use voxels::Voxels;

@@ -1,0 +1,61 @@
+//! The basis of voxels: coefficients are the voxels themselves.
+
+use conefield_core::basis::{Basis, BasisOperator, BasisSpec, Expansion};
+use conefield_core::error::Result;
+use conefield_core::geometry::VoxelGrid;
+use conefield_core::simd::Real;
+use ndarray::{ArrayView3, ArrayViewMut3};
+use schemars::JsonSchema;
+use serde::{Deserialize, Serialize};
+
+/// Settings of `voxels`.
+#[derive(Debug, Clone, Copy, Default, PartialEq, Serialize, Deserialize, JsonSchema)]
+#[serde(deny_unknown_fields, default)]
+pub struct Voxels {}
+
+conefield_core::stage_type!(Basis, "voxels", Voxels, "the voxels themselves");
+
+#[typetag::serde(name = "voxels")]
+impl BasisSpec for Voxels {
+    fn build(&self) -> Result<Box<dyn Basis>> {
+        Ok(Box::new(*self))
+    }
+}
+
+impl Basis for Voxels {
+    fn on(&self, grid: &VoxelGrid) -> Result<Box<dyn Expansion>> {
+        Ok(Box::new(Identity { grid: *grid }))
+    }
+
+    fn describe(&self) -> String {
+        "voxels: a coefficient each".into()
+    }
+}
+
+struct Identity {
+    grid: VoxelGrid,
+}
+
+impl Expansion for Identity {
+    fn coefficients(&self) -> VoxelGrid {
+        self.grid
+    }
+    fn is_identity(&self) -> bool {
+        true
+    }
+    fn operator(&self) -> &dyn BasisOperator<f32> {
+        self
+    }
+    fn reference(&self) -> &dyn BasisOperator<f64> {
+        self
+    }
+}
+
+impl<R: Real> BasisOperator<R> for Identity {
+    fn expand(&self, coefficients: ArrayView3<'_, R>, mut voxels: ArrayViewMut3<'_, R>) {
+        voxels.assign(&coefficients);
+    }
+    fn adjoint(&self, voxels: ArrayView3<'_, R>, mut coefficients: ArrayViewMut3<'_, R>) {
+        coefficients.assign(&voxels);
+    }
+}

@@ -1,0 +1,36 @@
+//! Least squares: `½Σ r²`.
+
+use crate::iterative::noise::{self, Noise, Weights};
+use conefield_core::data_term::{DataTerm, DataTermSpec, Misfit};
+use conefield_core::error::Result;
+use conefield_core::scan::{Scan, ScanHeader};
+use schemars::JsonSchema;
+use serde::{Deserialize, Serialize};
+
+/// Settings of `least-squares`.
+#[derive(Debug, Clone, Copy, Default, PartialEq, Serialize, Deserialize, JsonSchema)]
+#[serde(deny_unknown_fields, default)]
+pub struct LeastSquares {}
+
+conefield_core::stage_type!(DataTerm, "least-squares", LeastSquares, "squares of residuals, all of the same weight");
+
+#[typetag::serde(name = "least-squares")]
+impl DataTermSpec for LeastSquares {
+    fn build(&self) -> Result<Box<dyn DataTerm>> {
+        Ok(Box::new(*self))
+    }
+}
+
+impl DataTerm for LeastSquares {
+    fn of<'a>(&self, scan: &'a Scan) -> Box<dyn Misfit + 'a> {
+        Box::new(Weights { noise: Noise::of(scan, false), scan })
+    }
+
+    fn scratch(&self, header: &ScanHeader) -> u64 {
+        noise::scratch(header)
+    }
+
+    fn describe(&self) -> String {
+        "least-squares: all values of the same weight".into()
+    }
+}

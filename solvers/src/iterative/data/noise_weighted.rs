@@ -1,0 +1,42 @@
+//! Penalised weighted least squares: `½Σ w·r²`, the weights w inverse variances of the measured values up to a factor
+//! (Fessler, IEEE Trans. Image Process. 3(4), 1994), from the noise that [`Noise`] finds in the scan.
+
+use crate::iterative::noise::{self, Noise, Weights};
+use conefield_core::data_term::{DataTerm, DataTermSpec, Misfit};
+use conefield_core::error::Result;
+use conefield_core::scan::{Scan, ScanHeader};
+use schemars::JsonSchema;
+use serde::{Deserialize, Serialize};
+
+/// Settings of `noise-weighted`.
+#[derive(Debug, Clone, Copy, Default, PartialEq, Serialize, Deserialize, JsonSchema)]
+#[serde(deny_unknown_fields, default)]
+pub struct NoiseWeighted {}
+
+conefield_core::stage_type!(
+    DataTerm,
+    "noise-weighted",
+    NoiseWeighted,
+    "squares of residuals, weighted by how little noise the scan has there"
+);
+
+#[typetag::serde(name = "noise-weighted")]
+impl DataTermSpec for NoiseWeighted {
+    fn build(&self) -> Result<Box<dyn DataTerm>> {
+        Ok(Box::new(*self))
+    }
+}
+
+impl DataTerm for NoiseWeighted {
+    fn of<'a>(&self, scan: &'a Scan) -> Box<dyn Misfit + 'a> {
+        Box::new(Weights { noise: Noise::of(scan, true), scan })
+    }
+
+    fn scratch(&self, header: &ScanHeader) -> u64 {
+        noise::scratch(header)
+    }
+
+    fn describe(&self) -> String {
+        "noise-weighted: less weight where the scan has more noise".into()
+    }
+}

@@ -1,0 +1,283 @@
+//! The passes of a run: reports, checkpoints, and what ends it.
+
+use super::flat_mut;
+use super::monitor::VolumeMonitor;
+use super::norms::square_sum;
+use super::problem::Problem;
+use super::stop::Stop;
+use crate::schedule::{Clock, Ends};
+use conefield_core::Error;
+use conefield_core::checkpoint::{Checkpoint, Resume, Standing};
+use conefield_core::error::{Result, ensure};
+use conefield_core::method::{Best, Job, Observer, Reconstruction, Record, Solution};
+use conefield_core::scan::Volume;
+use conefield_core::space::Space;
+use ndarray::Array3;
+use serde::{Deserialize, Serialize};
+use std::time::Instant;
+
+/// What a pass came to.
+#[derive(Debug, Clone, Copy, Default)]
+pub struct Pass {
+    /// `‖p − A·x‖²` of the volumes that the pass met, each view once.
+    pub residual: f64,
+    /// Root mean square change of the volume over its root mean square, where the method knows it.
+    pub change: Option<f64>,
+    /// The value of the prior, where there is one.
+    pub prior: Option<f64>,
+}
+
+/// What changes from pass to pass.
+pub trait Iteration {
+    /// Goes through all views once. `pass` counts from 0.
+    fn pass(&mut self, problem: &Problem<'_>, pass: u64) -> Result<Pass>;
+
+    /// The volume as it stands, in 1/mm.
+    fn volume(&mut self, problem: &Problem<'_>) -> &Array3<f32>;
+
+    /// The volume, which the method needs no more.
+    fn take(&mut self, problem: &Problem<'_>) -> Array3<f32>;
+
+    /// All that the next pass depends on, by name, for checkpoints.
+    fn state(&mut self) -> Vec<(String, &mut [f32])>;
+
+    /// Numbers that belong to the state.
+    fn numbers(&mut self) -> Vec<&mut f64> {
+        vec![]
+    }
+}
+
+/// Where the driver stands beside the method.
+#[derive(Debug, Default, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+struct Kept {
+    numbers: Vec<f64>,
+    best: Option<f64>,
+    since_best: u64,
+    /// Whether the stopping rule is met.
+    settled: bool,
+}
+
+/// Room for the volume that `patience` keeps.
+pub(super) fn best(stop: &Stop, space: &Space) -> Option<Array3<f32>> {
+    stop.patience.map(|_| space.volume())
+}
+
+/// Runs `method` on `job` until `stop` or the job's limits end it. What was computed since `begun` counts as its time.
+pub(super) fn drive(
+    job: &Job<'_>,
+    stop: &Stop,
+    begun: Instant,
+    problem: &Problem<'_>,
+    space: &Space,
+    method: &mut dyn Iteration,
+    observer: &mut dyn Observer,
+) -> Result<Solution> {
+    let mut run = Run::begin(job, stop, begun, problem, best(stop, space), method, observer)?;
+    loop {
+        let cancelled = observer.cancelled();
+        if run.step > run.started && (cancelled || observer.checkpoint_due()) {
+            run.checkpoint(method, observer)?;
+        }
+        if cancelled {
+            return Err(Error::Interrupted { step: run.step });
+        }
+        if run.over {
+            return run.finish(method);
+        }
+        run.pass(method, observer)?;
+    }
+}
+
+/// A run between two passes.
+struct Run<'a> {
+    job: &'a Job<'a>,
+    stop: &'a Stop,
+    problem: &'a Problem<'a>,
+    monitor: VolumeMonitor<'a>,
+    clock: Clock,
+    kept: Kept,
+    /// The volume that predicted held-out views best, as [`Kept::best`] has it.
+    best: Option<Array3<f32>>,
+    /// The step from which this process goes on.
+    started: u64,
+    step: u64,
+    /// The last pass' residual, and that of an empty volume.
+    residual: Option<f64>,
+    empty: f64,
+    over: bool,
+}
+
+impl<'a> Run<'a> {
+    fn begin(
+        job: &'a Job<'a>,
+        stop: &'a Stop,
+        begun: Instant,
+        problem: &'a Problem<'a>,
+        mut best: Option<Array3<f32>>,
+        method: &mut dyn Iteration,
+        observer: &mut dyn Observer,
+    ) -> Result<Self> {
+        let (mut kept, mut step, mut seconds) = (Kept::default(), 0, 0.0);
+        if let Some(resume) = job.resume {
+            kept = restore(resume, method, best.as_mut())?;
+            (step, seconds) = (resume.standing.step, resume.standing.seconds);
+            observer.note(&format!("resumed after pass {step}"));
+        }
+        if stop.patience.is_some() && job.held_out.is_none() {
+            observer.note("stop.patience looks at views that are kept aside, and none are: it does not end this run");
+        }
+        let ends = Ends { steps: stop.passes, seconds: stop.seconds };
+        let mut clock = Clock::new(ends, job.limits, seconds + begun.elapsed().as_secs_f64());
+        clock.resume();
+        let monitor = VolumeMonitor::new(job);
+        let empty = problem.scan.projections.as_slice().map_or(f64::MAX, square_sum);
+        let (started, residual, over) = (step, None, false);
+        let mut run = Self { job, stop, problem, monitor, clock, kept, best, started, step, residual, empty, over };
+        // Time alone does not end a run that has made nothing yet.
+        let share = if step == 0 { run.clock.share_of_steps(step) } else { run.clock.done(step) };
+        run.over = share >= 1.0 || run.kept.settled || (step > 0 && !run.clock.allows(0.0));
+        if run.over {
+            observer.progress(step, 1.0, 0.0);
+        }
+        Ok(run)
+    }
+
+    /// One pass, its record and its progress.
+    fn pass(&mut self, method: &mut dyn Iteration, observer: &mut dyn Observer) -> Result<()> {
+        let begun = Instant::now();
+        let pass = method.pass(self.problem, self.step)?;
+        self.problem.operator.fault()?;
+        self.step += 1;
+        self.check(&pass)?;
+        self.clock.pause();
+        let record = self.look(&pass, method)?;
+        observer.record(&record);
+        self.clock.resume();
+        let share = self.clock.done(self.step);
+        self.over = share >= 1.0 || self.kept.settled || !self.clock.allows(begun.elapsed().as_secs_f64());
+        let left = self.clock.seconds() * (1.0 - share).max(0.0) / share.max(1e-9);
+        let (share, left) = if self.over { (1.0, 0.0) } else { (share, left) };
+        observer.progress(self.step, share, left);
+        Ok(())
+    }
+
+    /// Refuses a residual ten times that of an empty volume, and growing: that is no reconstruction.
+    fn check(&mut self, pass: &Pass) -> Result<()> {
+        let away = pass.residual > 100.0 * self.empty && self.residual.is_some_and(|last| pass.residual > last);
+        if away || !pass.residual.is_finite() {
+            let times = (pass.residual / self.empty).sqrt();
+            let what = format!("the residual is {times:.3e} times that of an empty volume; try a smaller relaxation");
+            return Err(Error::Diverged { step: self.step, what });
+        }
+        self.residual = Some(pass.residual);
+        Ok(())
+    }
+
+    /// Looks at the volume after a pass, keeps the best one, and sees whether a stopping rule is met.
+    fn look(&mut self, pass: &Pass, method: &mut dyn Iteration) -> Result<Record> {
+        let pixels = self.job.scan.projections.len() as f64;
+        let volume = method.volume(self.problem);
+        let held_out = self.monitor.held_out(self.problem.operator, volume)?;
+        let psnr = self.monitor.psnr(volume, self.job.scan.unit.mm as f32);
+        let mut record = Record {
+            step: self.step,
+            seconds: self.clock.seconds(),
+            loss: Some((pass.residual / pixels).sqrt()),
+            prior: pass.prior,
+            change: pass.change,
+            held_out,
+            psnr,
+            ..Record::default()
+        };
+        let kept = &mut self.kept;
+        if let (Some(patience), Some(error), Some(best)) = (self.stop.patience, held_out, &mut self.best) {
+            if kept.best.is_none_or(|b| error < b) {
+                kept.best = Some(error);
+                kept.since_best = 0;
+                best.assign(volume);
+            } else {
+                kept.since_best += 1;
+                kept.settled |= kept.since_best >= patience;
+            }
+        }
+        if let (Some(limit), Some(change)) = (self.stop.change, pass.change) {
+            kept.settled |= change < limit;
+        }
+        if kept.settled {
+            record.events.push("the stopping rule is met".into());
+        }
+        Ok(record)
+    }
+
+    fn checkpoint(&mut self, method: &mut dyn Iteration, observer: &mut dyn Observer) -> Result<()> {
+        self.clock.pause();
+        self.kept.numbers = method.numbers().iter().map(|x| **x).collect();
+        let (step, seconds) = (self.step, self.clock.seconds());
+        let solver = serde_json::json!(self.kept);
+        let standing = Standing { step, recorded: step, seconds, solver, ..Standing::default() };
+        let mut state = method.state();
+        if let (Some(best), Some(_)) = (&mut self.best, self.kept.best) {
+            state.push((BEST.into(), flat_mut(best)));
+        }
+        let sizes: Vec<[usize; 1]> = state.iter().map(|(_, x)| [x.len()]).collect();
+        let tensors = state.iter().zip(&sizes).map(|((n, x), size)| (n.clone(), &size[..], &**x)).collect();
+        observer.checkpoint(&Checkpoint { tensors, standing })?;
+        self.clock.resume();
+        Ok(())
+    }
+
+    fn finish(mut self, method: &mut dyn Iteration) -> Result<Solution> {
+        self.clock.pause();
+        let Self { kept, step, job, .. } = self;
+        let best = self.best.filter(|_| kept.best.is_some());
+        let mut data = best.unwrap_or_else(|| method.take(self.problem));
+        let mm = job.scan.unit.mm as f32;
+        data.par_mapv_inplace(|x| x * mm);
+        finite(&data, step)?;
+        let volume = Volume { data, grid: job.scan.geometry.volume, affine: None };
+        Ok(Solution {
+            result: Reconstruction::Volume(volume),
+            steps: step,
+            train_s: self.clock.seconds(),
+            samples: 0,
+            sampling_s: 0.0,
+            rollbacks: 0,
+            best: kept.best.map(|held_out| Best { step: step - kept.since_best, held_out }),
+        })
+    }
+}
+
+/// The best volume in a checkpoint.
+const BEST: &str = "best";
+
+/// Refuses a volume with a number that is not finite.
+pub(crate) fn finite(volume: &Array3<f32>, step: u64) -> Result<()> {
+    match volume.indexed_iter().find(|(_, x)| !x.is_finite()) {
+        Some((at, x)) => Err(Error::Diverged { step, what: format!("voxel {at:?} is {x}") }),
+        None => Ok(()),
+    }
+}
+
+/// Brings method, best volume and driver to where a checkpoint stands.
+fn restore(resume: &Resume, method: &mut dyn Iteration, best: Option<&mut Array3<f32>>) -> Result<Kept> {
+    let kept: std::result::Result<Kept, _> = serde_json::from_value(resume.standing.solver.clone());
+    let kept = kept.map_err(|e| Error::invalid(&resume.place, "solver", e, "what this method keeps"))?;
+    let best = best.filter(|_| kept.best.is_some()).map(|best| (BEST.to_owned(), flat_mut(best)));
+    for (name, values) in method.state().into_iter().chain(best) {
+        let found = resume.weights.tensors.get(&name).map(|t| &t.1);
+        let fits = found.filter(|t| t.len() == values.len());
+        let said = found.map_or("nothing".into(), |t| format!("{} numbers", t.len()));
+        let fits = fits.ok_or_else(|| {
+            Error::invalid(&resume.place, name, said, format!("{} numbers, as this run needs", values.len()))
+        })?;
+        values.copy_from_slice(fits);
+    }
+    let numbers = method.numbers();
+    let (found, want) = (kept.numbers.len(), numbers.len());
+    ensure(found == want, &resume.place, "solver.numbers", found, format!("{want} numbers"))?;
+    for (number, saved) in numbers.into_iter().zip(&kept.numbers) {
+        *number = *saved;
+    }
+    Ok(kept)
+}

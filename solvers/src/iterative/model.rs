@@ -1,0 +1,124 @@
+//! A problem as a basis sees it: line integrals of coefficients.
+
+use super::norms::norm2;
+use super::problem::Problem;
+use conefield_core::basis::Expansion;
+use conefield_core::geometry::VoxelGrid;
+use conefield_core::space::Space;
+use ndarray::{Array3, Zip};
+
+/// Steps in which coefficients are fitted to a volume.
+const FIT: usize = 20;
+
+/// The matrix `A·B` of a problem's projector A and a basis B. Where coefficients are the voxels, none is copied.
+pub(super) struct Model {
+    expansion: Box<dyn Expansion>,
+    /// The voxels of coefficients, unless they are the voxels.
+    voxels: Option<Array3<f32>>,
+    /// The coefficients of voxels in which the object can be, unless all are.
+    inside: Option<Array3<bool>>,
+}
+
+impl Model {
+    /// The model with its arrays, and the coefficients of the volume `start`, which it takes.
+    pub(super) fn new(expansion: Box<dyn Expansion>, space: &Space, start: Array3<f32>) -> (Self, Array3<f32>) {
+        if expansion.is_identity() {
+            return (Self { expansion, voxels: None, inside: None }, start);
+        }
+        let x = space.array(expansion.coefficients().shape);
+        let mut model = Self { expansion, voxels: Some(start), inside: None };
+        let x = space.briefly(|space| model.fit(x, space));
+        (model, x)
+    }
+
+    /// Finds out which coefficients can be other than 0.
+    pub(super) fn prepare(&mut self, problem: &Problem<'_>, work: &mut Array3<f32>) {
+        if let (Some(voxels), Some(_)) = (&mut self.voxels, problem.inside) {
+            problem.ones(voxels);
+            self.expansion.operator().adjoint(voxels.view(), work.view_mut());
+            self.inside = Some(work.mapv(|reached| reached > 0.0));
+        }
+    }
+
+    /// Where the coefficients stand.
+    pub(super) fn grid(&self) -> VoxelGrid {
+        self.expansion.coefficients()
+    }
+
+    /// The volume of coefficients, in which no voxel is that the object cannot be in.
+    pub(super) fn volume<'a>(&'a mut self, problem: &Problem<'_>, x: &'a Array3<f32>) -> &'a Array3<f32> {
+        let Some(voxels) = &mut self.voxels else { return x };
+        self.expansion.operator().expand(x.view(), voxels.view_mut());
+        problem.outside(voxels, 0.0);
+        voxels
+    }
+
+    /// The volume of coefficients that are needed no more.
+    pub(super) fn take(&mut self, problem: &Problem<'_>, x: Array3<f32>) -> Array3<f32> {
+        self.volume(problem, &x);
+        self.voxels.take().unwrap_or(x)
+    }
+
+    /// As [`Problem::forward`].
+    pub(super) fn forward(&mut self, problem: &Problem<'_>, views: &[usize], x: &Array3<f32>, out: &mut Array3<f32>) {
+        problem.forward(views, self.volume(problem, x), out);
+    }
+
+    /// As [`Problem::residual`].
+    pub(super) fn residual(
+        &mut self,
+        problem: &Problem<'_>,
+        views: &[usize],
+        x: &Array3<f32>,
+        out: &mut Array3<f32>,
+    ) -> f64 {
+        problem.residual(views, self.volume(problem, x), out)
+    }
+
+    /// As [`Problem::back`].
+    pub(super) fn back(&mut self, problem: &Problem<'_>, views: &[usize], y: &Array3<f32>, out: &mut Array3<f32>) {
+        let Some(voxels) = &mut self.voxels else { return problem.back(views, y, out) };
+        problem.back(views, y, voxels);
+        self.expansion.operator().adjoint(voxels.view(), out.view_mut());
+    }
+
+    /// As [`Problem::outside`].
+    pub(super) fn outside(&self, problem: &Problem<'_>, x: &mut Array3<f32>, value: f32) {
+        match (&self.voxels, &self.inside) {
+            (None, _) => problem.outside(x, value),
+            (_, Some(inside)) => Zip::from(x).and(inside).par_for_each(|x, i| *x = if *i { *x } else { value }),
+            _ => {}
+        }
+    }
+
+    /// The coefficients, `x` at first 0, whose volume is nearest to the one in `voxels`: some steps of conjugate gradients.
+    fn fit(&mut self, mut x: Array3<f32>, space: &Space) -> Array3<f32> {
+        let Some(residual) = &mut self.voxels else { return x };
+        let operator = self.expansion.operator();
+        let shape = self.expansion.coefficients().shape;
+        let (mut gradient, mut direction) = (space.array(shape), space.array(shape));
+        let mut ahead = space.volume();
+        if residual.iter().all(|x| *x == 0.0) {
+            return x;
+        }
+        operator.adjoint(residual.view(), gradient.view_mut());
+        direction.assign(&gradient);
+        let mut gamma = norm2(&gradient);
+        let enough = 1e-12 * gamma;
+        for _ in 0..FIT {
+            operator.expand(direction.view(), ahead.view_mut());
+            let square = norm2(&ahead);
+            if gamma <= enough || square == 0.0 {
+                break;
+            }
+            let alpha = (gamma / square) as f32;
+            x.scaled_add(alpha, &direction);
+            residual.scaled_add(-alpha, &ahead);
+            operator.adjoint(residual.view(), gradient.view_mut());
+            let beta = (norm2(&gradient) / gamma) as f32;
+            gamma = norm2(&gradient);
+            Zip::from(&mut direction).and(&gradient).par_for_each(|d, g| *d = g + beta * *d);
+        }
+        x
+    }
+}

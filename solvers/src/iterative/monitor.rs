@@ -1,0 +1,55 @@
+//! What is looked at while a voxel volume takes shape: PSNR against a reference, the error of held-out views.
+
+use crate::watched;
+use conefield_core::error::Result;
+use conefield_core::geometry::Geometry;
+use conefield_core::method::Job;
+use conefield_core::scan::Scan;
+use conefield_core::voxel::VoxelOperator;
+use ndarray::Array3;
+
+/// Looks at a job's reference and held-out views; never learns from them.
+pub struct VolumeMonitor<'a> {
+    reference: Option<&'a Array3<f32>>,
+    held_out: Option<&'a Scan>,
+    peak: f64,
+}
+
+impl<'a> VolumeMonitor<'a> {
+    /// For what `job` has to look at.
+    pub fn new(job: &Job<'a>) -> Self {
+        let shape = job.scan.geometry.volume.shape;
+        let reference = job.reference.map(|r| &r.data).filter(|r| r.shape() == shape);
+        Self { reference, held_out: job.held_out, peak: job.peak }
+    }
+
+    /// PSNR in dB of `scale·volume` over the voxels of `watched`.
+    pub fn psnr(&self, volume: &Array3<f32>, scale: f32) -> Option<f64> {
+        let reference = self.reference?;
+        let (mut sum, mut n) = (0.0, 0usize);
+        for voxel in watched::voxels(volume.dim().into()) {
+            sum += (f64::from(volume[voxel] * scale) - f64::from(reference[voxel])).powi(2);
+            n += 1;
+        }
+        let mse = sum / n as f64;
+        Some(10.0 * (self.peak * self.peak / mse.max(1e-300)).log10())
+    }
+
+    /// Root mean square error of the held-out views' line integrals over their largest value.
+    pub fn held_out(&self, operator: &dyn VoxelOperator<f32>, volume: &Array3<f32>) -> Result<Option<f64>> {
+        let Some(scan) = self.held_out else { return Ok(None) };
+        let geometry: &Geometry = &scan.geometry;
+        let [rows, columns] = geometry.detector;
+        let mut found = Array3::zeros((1, rows, columns));
+        let (mut square, mut top) = (0.0, 0.0f32);
+        for view in 0..geometry.views.len() {
+            operator.forward(geometry, &[view], volume.view(), found.view_mut());
+            for (a, &b) in found.iter().zip(scan.view(view)) {
+                square += f64::from(a - b).powi(2);
+                top = top.max(b);
+            }
+        }
+        operator.fault()?;
+        Ok(Some((square / scan.projections.len() as f64).sqrt() / f64::from(top).max(1e-300)))
+    }
+}

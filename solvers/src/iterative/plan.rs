@@ -1,0 +1,77 @@
+//! What the planned iterative methods have in common.
+
+use super::mask_bytes;
+use super::shared::Shared;
+use crate::fit::support;
+use crate::surround;
+use conefield_core::error::Result;
+use conefield_core::method::{Findings, Job, Line, Needs, Observer, Outline, Plan, Solution};
+use conefield_core::scan::{Scan, ScanHeader};
+
+/// An iterative method that is built and checked.
+pub(super) trait Iterative: Send + Sync {
+    /// The name of its type.
+    fn kind(&self) -> &'static str;
+
+    /// Its projector, scene, start and end.
+    fn shared(&self) -> &Shared;
+
+    /// Its own stages: key, type, settings in words.
+    fn stages(&self) -> Vec<Line> {
+        vec![]
+    }
+
+    /// What it finds out about a scan, a line each.
+    fn found(&self, scan: &Scan) -> Vec<String> {
+        let _ = scan;
+        vec![]
+    }
+
+    /// Bytes of all its arrays but the volume that comes out.
+    fn bytes(&self, scan: &ScanHeader) -> u64;
+
+    /// Its settings in words.
+    fn describe(&self) -> String;
+
+    /// Reconstructs.
+    fn solve(&self, job: &Job<'_>, observer: &mut dyn Observer) -> Result<Solution>;
+}
+
+/// The plan of an iterative method.
+pub(super) struct IterativePlan<T>(pub(super) T);
+
+impl<T: Iterative> Plan for IterativePlan<T> {
+    fn outline(&self) -> Outline {
+        let shared = self.0.shared();
+        let projector = Line::new("projector", shared.projector_kind, &shared.projector.describe());
+        let beside = [vec![projector], self.0.stages()].concat();
+        Outline { method: Line::new("method", self.0.kind(), &self.0.describe()), beside, ..Outline::default() }
+    }
+
+    fn needs(&self, scan: &ScanHeader) -> Needs {
+        let shared = self.0.shared();
+        let working = self.0.bytes(scan) + mask_bytes(shared.scene.support, scan);
+        let [surround, subtracted] = surround::bytes(shared.scene.surround, scan);
+        Needs { surround, subtracted, working, resume: working + 4 * scan.voxels(), volume: true, ..Needs::default() }
+    }
+
+    fn inspect(&self, scan: &Scan) -> Result<Findings> {
+        let scene = self.0.shared().scene;
+        let mut lines = surround::found(scan, scene.surround)?;
+        lines.extend(support(scan, scene.support).1);
+        lines.extend(self.0.found(scan));
+        Ok(Findings { lines, ..Findings::default() })
+    }
+
+    fn run(&mut self, job: &Job<'_>, observer: &mut dyn Observer) -> Result<Solution> {
+        self.0.solve(job, observer)
+    }
+
+    fn needs_held_out(&self) -> Option<String> {
+        self.0.shared().stop.patience.map(|_| "stop.patience".into())
+    }
+
+    fn passes(&self) -> Option<u64> {
+        self.0.shared().stop.passes
+    }
+}

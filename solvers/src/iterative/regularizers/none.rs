@@ -1,0 +1,48 @@
+//! No prior but that attenuation is not negative.
+
+use conefield_core::error::Result;
+use conefield_core::geometry::VoxelGrid;
+use conefield_core::regularizer::{Penalty, Regularizer, RegularizerSpec};
+use conefield_core::space::Space;
+use ndarray::ArrayView3;
+use rayon::prelude::*;
+use schemars::JsonSchema;
+use serde::{Deserialize, Serialize};
+
+/// Settings of `none`.
+#[derive(Debug, Clone, Copy, Default, PartialEq, Serialize, Deserialize, JsonSchema)]
+#[serde(deny_unknown_fields, default)]
+pub struct Nonnegative {}
+
+conefield_core::stage_type!(Regularizer, "none", Nonnegative, "no prior but that attenuation is not negative");
+
+#[typetag::serde(name = "none")]
+impl RegularizerSpec for Nonnegative {
+    fn build(&self) -> Result<Box<dyn Regularizer>> {
+        Ok(Box::new(*self))
+    }
+}
+
+impl Regularizer for Nonnegative {
+    fn on(&self, _: &VoxelGrid, _: &Space) -> Box<dyn Penalty> {
+        Box::new(*self)
+    }
+
+    fn weight(&self, _: &VoxelGrid, _: &mut dyn FnMut(f64) -> f64) -> f64 {
+        0.0
+    }
+
+    fn describe(&self) -> String {
+        "none: attenuation of 0 and more".into()
+    }
+}
+
+impl Penalty for Nonnegative {
+    fn value(&self, _: ArrayView3<'_, f32>) -> f64 {
+        0.0
+    }
+
+    fn prox(&mut self, v: &[f32], _: f32, u: &mut [f32]) {
+        u.par_iter_mut().zip(v).for_each(|(u, v)| *u = v.max(0.0));
+    }
+}

@@ -1,0 +1,145 @@
+//! What every iterative method is given: a projector, a volume to start from, an end.
+
+use super::order::Subsets;
+use super::problem::Problem;
+use super::stop::Stop;
+use crate::fit::support;
+use crate::surround::Within;
+use conefield_core::Error;
+use conefield_core::error::{Result, ensure};
+use conefield_core::method::{Job, Observer};
+use conefield_core::scan::Volume;
+use conefield_core::scene::VoxelScene;
+use conefield_core::settings::KnownVolume;
+use conefield_core::space::Space;
+use conefield_core::voxel::{VoxelProjector, VoxelProjectorSpec};
+use ndarray::{Array3, Zip};
+use std::sync::Arc;
+
+/// The settings that all iterative methods have, built.
+pub(super) struct Shared {
+    pub(super) projector: Arc<dyn VoxelProjector>,
+    /// The name of its type.
+    pub(super) projector_kind: &'static str,
+    pub(super) scene: VoxelScene,
+    /// The file of the volume to start from.
+    start: Option<String>,
+    pub(super) stop: Stop,
+}
+
+impl Shared {
+    /// Builds the settings at the keys `projector`, `scene`, `start` and `stop` of a method.
+    pub(super) fn of(
+        projector: &dyn VoxelProjectorSpec,
+        scene: VoxelScene,
+        start: &Option<String>,
+        stop: &Stop,
+    ) -> Result<Self> {
+        stop.validate()?;
+        scene.surround.validate()?;
+        let projector_kind = projector.typetag_name();
+        let projector = projector.build().map_err(|e| e.within("projector"))?;
+        Ok(Self { projector: projector.into(), projector_kind, scene, start: start.clone(), stop: stop.clone() })
+    }
+
+    /// Whether there is a volume to start from.
+    pub(super) fn has_start(&self, job: &Job<'_>) -> bool {
+        job.start.is_some() || self.start.is_some()
+    }
+
+    /// The volume to start from, in 1/mm; 0 where none is known.
+    pub(super) fn start(&self, job: &Job<'_>, problem: &Problem<'_>, space: &Space) -> Result<Array3<f32>> {
+        let volume = match (job.start, &self.start) {
+            (Some(given), _) => in_mm(job, "start", given.clone())?,
+            (None, Some(path)) => start_volume(job, path)?,
+            (None, None) => return Ok(space.volume()),
+        };
+        space.hold(4 * space.header().voxels());
+        let data = volume.data;
+        let mut x = if data.is_standard_layout() { data } else { data.as_standard_layout().into_owned() };
+        problem.outside(&mut x, 0.0);
+        Ok(x)
+    }
+
+    /// Refuses a scan that makes no sense, tells `method` and its projector, and finds out where the object is.
+    pub(super) fn open(&self, method: &str, job: &Job<'_>, observer: &mut dyn Observer) -> Result<Opened> {
+        job.scan.validate("scan")?;
+        let g = &job.scan.geometry;
+        let (bounds, [rows, columns]) = (g.volume.bounds(), g.detector);
+        let meets = |v, p: usize| g.ray(v, p / columns, p % columns).clip(bounds).is_some();
+        let met = (0..g.views.len()).any(|v| (0..rows * columns).any(|p| meets(v, p)));
+        ensure(met, "scan", "geometry", "rays that all miss the volume", "rays through the volume")?;
+        let projector = job.backend.place(Box::new(self.projector.clone()))?;
+        observer.note(&format!("{method}; {}", projector.describe()));
+        // By the views as they were measured: what is taken off them afterwards is known too coarsely to carve by.
+        let (support, said) = support(job.scan, self.scene.support);
+        said.iter().for_each(|line| observer.note(line));
+        let inside = support.map(|support| {
+            let mut inside = Array3::from_elem(g.volume.shape, false);
+            Zip::indexed(&mut inside).par_for_each(|(x, y, z), i| *i = support.holds(g.volume.voxel([x, y, z])));
+            inside
+        });
+        Ok(Opened { projector, inside, within: Within::of(job, self.scene.surround, observer)? })
+    }
+
+    /// Counts in a tally what the driver, and the projector of a subset, take beside the method's own arrays; returns all bytes without
+    /// the volume that comes out.
+    pub(super) fn price(&self, space: &Space, subsets: Subsets) -> u64 {
+        super::drive::best(&self.stop, space);
+        let header = space.header();
+        space.pass(self.projector.scratch(header, header.views.div_ceil(subsets.count(header.views))));
+        space.bytes().saturating_sub(4 * space.header().voxels())
+    }
+}
+
+/// What a job on voxels begins with.
+pub(super) struct Opened {
+    projector: Box<dyn VoxelProjector>,
+    /// The voxels that the object can be in, where that is known.
+    inside: Option<Array3<bool>>,
+    /// The scan without what lies beyond the volume.
+    within: Option<Within>,
+}
+
+impl Opened {
+    /// The job on what is inside the volume.
+    pub(super) fn job<'a>(&'a self, job: &Job<'a>) -> Job<'a> {
+        Within::job(self.within.as_ref(), job)
+    }
+
+    /// Its problem, with every pixel as it was measured.
+    pub(super) fn problem<'a>(&'a self, job: &Job<'a>) -> Problem<'a> {
+        let (operator, inside) = (self.projector.operator(), self.inside.as_ref());
+        Problem { scan: job.scan, operator, seed: job.seed, inside, shadow: None }
+    }
+}
+
+/// The volume that a field begins with, in 1/mm, the steps in which it learns it, and where it comes from: what the job hands
+/// over, or the file that the initializer names.
+pub fn known_volume(job: &Job<'_>, named: Option<KnownVolume>) -> Result<Option<(Volume, u64, String)>> {
+    match (job.start, named) {
+        (Some(given), named) => {
+            let steps = named.map_or(KnownVolume::STEPS, |n| n.steps);
+            Ok(Some((in_mm(job, "start", given.clone())?, steps, "the volume of the method before".into())))
+        }
+        (None, Some(KnownVolume { path, steps })) => Ok(Some((start_volume(job, &path)?, steps, path))),
+        (None, None) => Ok(None),
+    }
+}
+
+/// Reads a volume that fits the scan, in 1/mm.
+fn start_volume(job: &Job<'_>, path: &str) -> Result<Volume> {
+    in_mm(job, path, (job.volumes)(path)?)
+}
+
+/// A volume in 1/unit of the scan, in 1/mm. Refuses one that does not fit the scan.
+fn in_mm(job: &Job<'_>, place: &str, volume: Volume) -> Result<Volume> {
+    let shape = job.scan.geometry.volume.shape;
+    let found = format!("{:?}", volume.data.shape());
+    ensure(volume.data.shape() == shape, place, "shape", found, format!("{shape:?}, the voxels of the scan"))?;
+    if let Some((at, x)) = volume.data.indexed_iter().find(|(_, x)| !x.is_finite()) {
+        return Err(Error::invalid(place, format!("voxel {at:?}"), x, "a finite attenuation"));
+    }
+    let mm = job.scan.unit.mm as f32;
+    Ok(Volume { grid: job.scan.geometry.volume, ..volume.mapped(|x| x / mm) })
+}

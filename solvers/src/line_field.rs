@@ -1,0 +1,80 @@
+//! A field that brings line integrals of its own, trained so that they match the measured ones.
+
+use crate::field_plan::{Trained, Training, l1, random, rollback};
+use crate::optimizer::Optimizer;
+use crate::pretrain::Pretraining;
+use crate::training::CallbackSpec;
+use conefield_core::error::Result;
+use conefield_core::method::{Context, Method, Plan, StageLine};
+use conefield_core::pipeline::Pipeline;
+use conefield_core::registry::Kind;
+use conefield_core::scene::SceneSettings;
+use conefield_core::settings::{InitializerSpec, LineFieldSpec, LossSpec, PriorSpec};
+use conefield_core::spec::stage;
+use schemars::{JsonSchema, Schema, SchemaGenerator};
+use serde::{Deserialize, Serialize};
+
+/// Settings of `line-field`.
+#[derive(Serialize, Deserialize, JsonSchema)]
+#[serde(deny_unknown_fields)]
+pub struct LineField {
+    /// How the scan is mapped to what the field sees.
+    #[serde(default)]
+    pub scene: SceneSettings,
+    /// Line integrals of rays, and attenuation at points.
+    #[serde(deserialize_with = "stage::needed")]
+    #[schemars(schema_with = "field")]
+    pub field: Box<dyn LineFieldSpec>,
+    /// Where weights come from.
+    #[serde(default = "random", deserialize_with = "stage::needed")]
+    #[schemars(schema_with = "crate::field_plan::initializer")]
+    pub initializer: Box<dyn InitializerSpec>,
+    /// What a difference between predicted and measured line integrals costs.
+    #[serde(default = "l1", deserialize_with = "stage::needed")]
+    #[schemars(schema_with = "crate::field_plan::loss")]
+    pub loss: Box<dyn LossSpec>,
+    /// What the field is to be like, whatever was measured.
+    #[serde(default, deserialize_with = "stage::list")]
+    #[schemars(schema_with = "crate::field_plan::priors")]
+    pub priors: Vec<Box<dyn PriorSpec>>,
+    /// How gradients change parameters.
+    #[serde(default)]
+    pub optimizer: Optimizer,
+    /// What a step learns from, and when training ends.
+    #[serde(default)]
+    pub training: Training,
+    /// How `conefield pretrain` and a known volume teach the field.
+    #[serde(default)]
+    pub pretraining: Pretraining,
+    /// What watches over training.
+    #[serde(default = "rollback", deserialize_with = "stage::list")]
+    #[schemars(schema_with = "crate::field_plan::callbacks")]
+    pub callbacks: Vec<Box<dyn CallbackSpec>>,
+}
+
+fn field(_: &mut SchemaGenerator) -> Schema {
+    stage::schema_of(Kind::LineField)
+}
+
+conefield_core::stage_type!(Method, "line-field", LineField, "a field with line integrals of its own, trained on rays");
+
+#[typetag::serde(name = "line-field")]
+impl Method for LineField {
+    fn plan(&self, context: &Context<'_>) -> Result<Box<dyn Plan>> {
+        let field = self.field.build().map_err(|e| e.within("field"))?;
+        let pipeline = Pipeline::alone(field)?;
+        let stages = vec![StageLine::new("field", self.field.typetag_name(), pipeline.field.as_ref())];
+        let trained = Trained {
+            kind: self.typetag_name(),
+            scene: &self.scene,
+            initializer: self.initializer.as_ref(),
+            loss: self.loss.as_ref(),
+            priors: &self.priors,
+            optimizer: &self.optimizer,
+            training: &self.training,
+            pretraining: &self.pretraining,
+            callbacks: &self.callbacks,
+        };
+        trained.plan(pipeline, stages, vec![], context)
+    }
+}

@@ -1,0 +1,61 @@
+//! Half the squared difference where it is small, linear where it is large.
+
+use conefield_core::error::{Result, ensure};
+use conefield_core::loss::Loss;
+use conefield_core::settings::LossSpec;
+use conefield_core::wgsl::Fragment;
+use schemars::JsonSchema;
+use serde::{Deserialize, Serialize};
+
+/// Settings of `huber`.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize, JsonSchema)]
+#[serde(deny_unknown_fields, default)]
+pub struct Huber {
+    /// The difference from which the loss is linear, in the scale that stages see: there the most absorbing rays measure
+    /// about 0.25.
+    pub delta: f64,
+}
+
+impl Default for Huber {
+    fn default() -> Self {
+        Self { delta: 0.01 }
+    }
+}
+
+conefield_core::stage_type!(Loss, "huber", Huber, "half the squared difference, linear where it is large");
+
+#[typetag::serde(name = "huber")]
+impl LossSpec for Huber {
+    fn build(&self) -> Result<Box<dyn Loss>> {
+        let usable = self.delta.is_finite() && self.delta > 0.0;
+        ensure(usable, "spec", "delta", self.delta, "a positive finite number")?;
+        Ok(Box::new(*self))
+    }
+}
+
+impl Loss for Huber {
+    fn at(&self, predicted: f64, measured: f64) -> (f64, f64) {
+        let (d, delta) = (predicted - measured, self.delta);
+        if d.abs() <= delta { (0.5 * d * d, d) } else { (delta * (d.abs() - 0.5 * delta), delta * d.signum()) }
+    }
+
+    fn wgsl(&self) -> Option<Fragment> {
+        let delta = self.delta as f32;
+        Some(Fragment::new(&[&format!(
+            "const stage_delta = f32({delta:?});
+
+fn stage_at(predicted: f32, measured: f32) -> vec2<f32> {{
+    let d = predicted - measured;
+    if abs(d) <= stage_delta {{
+        return vec2<f32>(0.5 * d * d, d);
+    }}
+    return vec2<f32>(stage_delta * (abs(d) - 0.5 * stage_delta), stage_delta * sign(d));
+}}
+"
+        )]))
+    }
+
+    fn describe(&self) -> String {
+        format!("huber up to {}", self.delta)
+    }
+}

@@ -1,0 +1,133 @@
+//! A neural attenuation field, trained so that its Beer-Lambert line integrals match the measured ones.
+
+use crate::field_plan::{Trained, Training, l1, random, rollback};
+use crate::optimizer::Optimizer;
+use crate::pretrain::Pretraining;
+use crate::training::CallbackSpec;
+use conefield_core::error::Result;
+use conefield_core::method::{Context, Line, Method, Plan, StageLine};
+use conefield_core::pipeline::Pipeline;
+use conefield_core::precision::Precision;
+use conefield_core::registry::Kind;
+use conefield_core::scene::SceneSettings;
+use conefield_core::settings::{
+    EncoderSpec, FieldSpec, InitializerSpec, LossSpec, NormalizerSpec, PriorSpec, ProjectorSpec,
+};
+use conefield_core::spec::stage;
+use schemars::{JsonSchema, Schema, SchemaGenerator};
+use serde::{Deserialize, Serialize};
+
+/// Settings of `neural-field`.
+#[derive(Serialize, Deserialize, JsonSchema)]
+#[serde(deny_unknown_fields)]
+pub struct NeuralField {
+    /// How the scan is mapped to what stages see.
+    #[serde(default)]
+    pub scene: SceneSettings,
+    /// In which precision the field computes.
+    #[serde(default, skip_serializing_if = "Precision::is_single")]
+    pub precision: Precision,
+    /// Points to features.
+    #[serde(deserialize_with = "stage::needed")]
+    #[schemars(schema_with = "encoder")]
+    pub encoder: Box<dyn EncoderSpec>,
+    /// Features to features, in order.
+    #[serde(default, deserialize_with = "stage::list")]
+    #[schemars(schema_with = "normalizers")]
+    pub normalizers: Vec<Box<dyn NormalizerSpec>>,
+    /// Features to attenuation.
+    #[serde(deserialize_with = "stage::needed")]
+    #[schemars(schema_with = "field")]
+    pub field: Box<dyn FieldSpec>,
+    /// Rays to samples.
+    #[serde(deserialize_with = "stage::needed")]
+    #[schemars(schema_with = "projector")]
+    pub projector: Box<dyn ProjectorSpec>,
+    /// Where weights come from.
+    #[serde(default = "random", deserialize_with = "stage::needed")]
+    #[schemars(schema_with = "crate::field_plan::initializer")]
+    pub initializer: Box<dyn InitializerSpec>,
+    /// What a difference between predicted and measured line integrals costs.
+    #[serde(default = "l1", deserialize_with = "stage::needed")]
+    #[schemars(schema_with = "crate::field_plan::loss")]
+    pub loss: Box<dyn LossSpec>,
+    /// What the field is to be like, whatever was measured.
+    #[serde(default, deserialize_with = "stage::list")]
+    #[schemars(schema_with = "crate::field_plan::priors")]
+    pub priors: Vec<Box<dyn PriorSpec>>,
+    /// How gradients change parameters.
+    #[serde(default)]
+    pub optimizer: Optimizer,
+    /// What a step learns from, and when training ends.
+    #[serde(default)]
+    pub training: Training,
+    /// How `conefield pretrain` and a known volume teach the field.
+    #[serde(default)]
+    pub pretraining: Pretraining,
+    /// What watches over training.
+    #[serde(default = "rollback", deserialize_with = "stage::list")]
+    #[schemars(schema_with = "crate::field_plan::callbacks")]
+    pub callbacks: Vec<Box<dyn CallbackSpec>>,
+}
+
+fn encoder(_: &mut SchemaGenerator) -> Schema {
+    stage::schema_of(Kind::Encoder)
+}
+
+fn normalizers(_: &mut SchemaGenerator) -> Schema {
+    stage::schema_of_list(Kind::Normalizer)
+}
+
+fn field(_: &mut SchemaGenerator) -> Schema {
+    stage::schema_of(Kind::Field)
+}
+
+fn projector(_: &mut SchemaGenerator) -> Schema {
+    stage::schema_of(Kind::Projector)
+}
+
+conefield_core::stage_type!(Method, "neural-field", NeuralField, "a neural attenuation field, trained on rays");
+
+#[typetag::serde(name = "neural-field")]
+impl Method for NeuralField {
+    fn plan(&self, context: &Context<'_>) -> Result<Box<dyn Plan>> {
+        let pipeline = self.pipeline()?;
+        let mut stages = vec![StageLine::new("encoder", self.encoder.typetag_name(), pipeline.encoder.as_ref())];
+        for (i, (n, spec)) in pipeline.normalizers.iter().zip(&self.normalizers).enumerate() {
+            stages.push(StageLine::new(&format!("normalizers.{i}"), spec.typetag_name(), n.as_ref()));
+        }
+        stages.push(StageLine::new("field", self.field.typetag_name(), pipeline.field.as_ref()));
+        let projector = Line::new("projector", self.projector.typetag_name(), &pipeline.projector.describe());
+        let trained = Trained {
+            kind: self.typetag_name(),
+            scene: &self.scene,
+            initializer: self.initializer.as_ref(),
+            loss: self.loss.as_ref(),
+            priors: &self.priors,
+            optimizer: &self.optimizer,
+            training: &self.training,
+            pretraining: &self.pretraining,
+            callbacks: &self.callbacks,
+        };
+        trained.plan(pipeline, stages, vec![projector], context)
+    }
+}
+
+impl NeuralField {
+    /// The stages, built and put together.
+    fn pipeline(&self) -> Result<Pipeline> {
+        let encoder = self.encoder.build().map_err(|e| e.within("encoder"))?;
+        let mut width = encoder.info().output;
+        let mut normalizers = vec![];
+        for (i, n) in self.normalizers.iter().enumerate() {
+            let n = n.build(width).map_err(|e| e.within(&format!("normalizers.{i}")))?;
+            width = n.info().output;
+            normalizers.push(n);
+        }
+        let field = self.field.build(width).map_err(|e| e.within("field"))?;
+        let projector = self.projector.build().map_err(|e| e.within("projector"))?;
+        let mut pipeline = Pipeline::new(encoder, normalizers, field, projector)?;
+        pipeline.tables = self.precision.tables;
+        Ok(pipeline)
+    }
+}

@@ -1,0 +1,172 @@
+//! How much normalizers and field change under the same features: NI-NeRF's measure of stability.
+//!
+//! Every so often the encoder's features of a fixed batch of points are recorded with the attenuation that normalizers
+//! and field make of them. The next time these recorded features go through normalizers and field as they are by then,
+//! and the mean absolute difference to the recorded attenuation is the drift (L1, in the scale that stages see). A
+//! LayerNorm is within what is evaluated again: features are recorded as they leave the encoder, before it.
+
+use crate::training::run::{HINT, Run};
+use crate::training::{Callback, CallbackSpec, Kept, State};
+use conefield_core::arena::Layout;
+use conefield_core::error::{Error, Result, ensure};
+use conefield_core::host;
+use conefield_core::method::DriftRecord;
+use conefield_core::random::stream;
+use conefield_core::scene::Scene;
+use rand::RngExt;
+use schemars::JsonSchema;
+use serde::{Deserialize, Serialize};
+
+/// Its name in specs and checkpoints, and its tensors there.
+const NAME: &str = "drift";
+const FEATURES: &str = "drift.features";
+const ATTENUATION: &str = "drift.attenuation";
+
+/// Settings of `drift`.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
+#[serde(deny_unknown_fields, default)]
+pub struct Drift {
+    /// Epochs from recording features to evaluating them again (published: 100).
+    pub every: f64,
+    /// Points of the batch.
+    pub points: usize,
+}
+
+impl Default for Drift {
+    fn default() -> Self {
+        Self { every: 10.0, points: 4096 }
+    }
+}
+
+conefield_core::stage_type!(Callback, "drift", Drift, "logs how much a field changes under the same features");
+
+#[typetag::serde(name = "drift")]
+impl CallbackSpec for Drift {
+    fn build(&self) -> Result<Box<dyn Callback>> {
+        let every = self.every.is_finite() && self.every > 0.0;
+        ensure(every, "spec", "every", self.every, "a positive finite number of epochs")?;
+        ensure((1..=1 << 16).contains(&self.points), "spec", "points", self.points, "1 to 65536")?;
+        Ok(Box::new(Watch { settings: self.clone(), every: 1, points: vec![], looked: None, recorded: None }))
+    }
+
+    fn copy(&self) -> Box<dyn CallbackSpec> {
+        Box::new(self.clone())
+    }
+}
+
+/// The callback that [`Drift`] builds.
+struct Watch {
+    settings: Drift,
+    /// Steps between two looks.
+    every: u64,
+    points: Vec<[f32; 3]>,
+    /// The step before which it was last looked.
+    looked: Option<u64>,
+    recorded: Option<Recorded>,
+}
+
+/// Features with what was made of them.
+struct Recorded {
+    /// Channels and points.
+    shape: [usize; 2],
+    features: Vec<f32>,
+    attenuation: Vec<f32>,
+}
+
+/// What is known beside the recording.
+#[derive(Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+struct Looked {
+    step: Option<u64>,
+    recorded: bool,
+}
+
+impl Callback for Watch {
+    fn name(&self) -> &'static str {
+        NAME
+    }
+
+    /// Draws points where the object can be.
+    fn begin(&mut self, run: &mut Run<'_>) -> Result<()> {
+        self.every = (self.settings.every * run.steps_an_epoch as f64).round().max(1.0) as u64;
+        self.points = points(run.scene, run.job.seed, self.settings.points);
+        Ok(())
+    }
+
+    fn between_steps(&mut self, run: &mut Run<'_>) -> Result<()> {
+        if !run.step.is_multiple_of(self.every) || self.looked == Some(run.step) {
+            return Ok(());
+        }
+        run.clock.pause();
+        self.look(run)?;
+        run.clock.resume();
+        Ok(())
+    }
+
+    fn masked(&mut self) {
+        self.recorded = None;
+    }
+
+    fn state<'a>(&'a self, _: &'a Layout) -> Result<State<'a>> {
+        let of = |r: &'a Recorded| {
+            [(FEATURES.into(), &r.shape[..], &r.features[..]), (ATTENUATION.into(), &r.shape[1..], &r.attenuation[..])]
+        };
+        let looked = Looked { step: self.looked, recorded: self.recorded.is_some() };
+        State::new(NAME, &looked, self.recorded.iter().flat_map(of).collect())
+    }
+
+    fn restore(&mut self, kept: &Kept<'_>, run: &Run<'_>) -> Result<()> {
+        let Looked { step, recorded } = kept.value()?;
+        self.looked = step;
+        if recorded {
+            let shape = [run.model.pipeline.encoder.info().output, self.settings.points];
+            let features = kept.tensor(FEATURES, &shape)?;
+            let attenuation = kept.tensor(ATTENUATION, &shape[1..])?;
+            self.recorded = Some(Recorded { shape, features, attenuation });
+        }
+        Ok(())
+    }
+}
+
+impl Watch {
+    /// Evaluates what was recorded again and records anew. Channels that were masked since then are gone from the
+    /// stages, which can make nothing of the features any more: there is no drift then, and the record says so.
+    fn look(&mut self, run: &mut Run<'_>) -> Result<()> {
+        run.exe.fetch(&mut run.model)?;
+        let (step, n, from) = (run.step, self.points.len(), self.looked.unwrap_or(0));
+        if let Some(then) = &self.recorded {
+            let now = host::attenuation(&run.model, &then.features, n)?;
+            let sum: f64 = now.iter().zip(&then.attenuation).map(|(a, b)| (f64::from(*a) - f64::from(*b)).abs()).sum();
+            let mean_l1 = sum / n as f64;
+            if !mean_l1.is_finite() {
+                let what = format!("the field at recorded features has moved by {mean_l1}; {HINT}");
+                return Err(Error::Diverged { step, what });
+            }
+            let found = DriftRecord { from_step: from, step, epoch: run.epoch(), mean_l1 };
+            run.tally.window.drift.push(found);
+        } else if self.looked.is_some() {
+            let said = format!("no drift from step {from} to {step}: channels were masked in between");
+            run.tally.window.events.push(said);
+        }
+        let features = run.exe.encode(&run.model, &self.points)?;
+        let attenuation = host::attenuation(&run.model, &features, n)?;
+        self.recorded = Some(Recorded { shape: [features.len() / n, n], features, attenuation });
+        self.looked = Some(step);
+        Ok(())
+    }
+}
+
+/// Random points of the volume where the object can be.
+fn points(scene: &Scene, seed: u64, count: usize) -> Vec<[f32; 3]> {
+    let mut rng = stream(seed ^ 0x6472_6966_7421, 0);
+    let [low, high] = scene.bounds;
+    let mut draw = || std::array::from_fn(|k| low[k] + (high[k] - low[k]) * rng.random::<f64>());
+    (0..count)
+        .map(|_| {
+            // A support that is a tiny part of its box must not hold us up.
+            let first = draw();
+            let held = std::iter::once(first).chain((0..1000).map(|_| draw())).find(|p| scene.holds(*p));
+            scene.to_unit(held.unwrap_or(first))
+        })
+        .collect()
+}

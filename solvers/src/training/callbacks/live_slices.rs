@@ -1,0 +1,40 @@
+//! Hands out the middle slices of the field while it trains, whenever the observer wants them.
+
+use crate::training::Callback;
+use crate::training::run::Run;
+use conefield_core::error::Result;
+use conefield_core::parts::Part;
+use conefield_core::trained::Sampler;
+use ndarray::Array3;
+
+/// Evaluates the field on the three middle slices of its grid. The run is none the wiser.
+#[derive(Default)]
+pub struct LiveSlices;
+
+impl Callback for LiveSlices {
+    fn name(&self) -> &'static str {
+        "live-slices"
+    }
+
+    fn between_steps(&mut self, run: &mut Run<'_>) -> Result<()> {
+        if !run.observer.slices_due() {
+            return Ok(());
+        }
+        run.clock.pause();
+        let grid = run.scene.grid;
+        let mut sampler = Sampler::new(run.scene, run.job.scan.unit.mm, grid);
+        let mut slices = vec![];
+        for axis in 0..3 {
+            let part: Part = std::array::from_fn(|k| {
+                let n = grid.shape[k];
+                if k == axis { n / 2..n / 2 + 1 } else { 0..n }
+            });
+            let mut values = Array3::zeros(part.each_ref().map(|r| r.len()));
+            sampler.fill(&run.model, run.exe.as_mut(), &part, values.view_mut())?;
+            slices.push((part, values));
+        }
+        run.observer.slices(grid, &slices)?;
+        run.clock.resume();
+        Ok(())
+    }
+}

@@ -1,0 +1,15 @@
+//! The callbacks: those that a spec names, and those that every run has.
+
+pub mod drift;
+pub mod fft_mask;
+pub mod field_monitor;
+pub mod live_slices;
+pub mod patience;
+pub mod rollback;
+
+pub use drift::Drift;
+pub use fft_mask::FftMask;
+pub use field_monitor::FieldMonitor;
+pub use live_slices::LiveSlices;
+pub use patience::Patience;
+pub use rollback::Rollback;

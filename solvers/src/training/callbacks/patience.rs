@@ -1,0 +1,147 @@
+//! Ends training when views that are kept aside are no longer predicted better, and keeps the state that predicted them best.
+
+use crate::training::run::{Run, strayed};
+use crate::training::{Callback, CallbackSpec, Kept, State};
+use conefield_core::arena::Layout;
+use conefield_core::checkpoint::tensors_of;
+use conefield_core::error::{Result, ensure};
+use conefield_core::method::{Best, Record};
+use conefield_core::pages::Pages;
+use schemars::JsonSchema;
+use serde::{Deserialize, Serialize};
+
+/// Its name in specs and checkpoints, and what its tensors begin with.
+const NAME: &str = "patience";
+const PREFIX: &str = "patience.";
+
+/// Settings of `patience`.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
+#[serde(deny_unknown_fields, default)]
+pub struct Patience {
+    /// Ends the run when the held-out views' error has not fallen for this many records; the best of them is kept. A
+    /// learning rate that goes down does so until the end that is set: what it still brings may come late.
+    pub records: u64,
+}
+
+impl Default for Patience {
+    fn default() -> Self {
+        Self { records: 5 }
+    }
+}
+
+conefield_core::stage_type!(Callback, "patience", Patience, "ends a run that no longer predicts held-out views better");
+
+#[typetag::serde(name = "patience")]
+impl CallbackSpec for Patience {
+    fn build(&self) -> Result<Box<dyn Callback>> {
+        ensure(self.records > 0, "spec", "records", 0, "at least 1")?;
+        Ok(Box::new(Waiting { records: self.records, waited: Waited::default(), copy: None }))
+    }
+
+    fn copy(&self) -> Box<dyn CallbackSpec> {
+        Box::new(self.clone())
+    }
+}
+
+/// What is known beside the best state.
+#[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+struct Waited {
+    /// The best record so far; starts anew when channels leave the work.
+    best: Option<Best>,
+    /// Records since.
+    since: u64,
+}
+
+/// The callback that [`Patience`] builds.
+struct Waiting {
+    records: u64,
+    waited: Waited,
+    /// Parameters that predicted best.
+    copy: Option<Pages>,
+}
+
+impl Callback for Waiting {
+    fn name(&self) -> &'static str {
+        NAME
+    }
+
+    fn begin(&mut self, run: &mut Run<'_>) -> Result<()> {
+        if run.job.held_out.is_none() {
+            run.observer.note("patience looks at views that are kept aside, and none are: it does not end this run");
+        }
+        Ok(())
+    }
+
+    fn masked(&mut self) {
+        (self.waited, self.copy) = (Waited::default(), None);
+    }
+
+    /// Ends the run when too many records have passed without a better one.
+    fn at_record(&mut self, record: &mut Record, run: &mut Run<'_>) -> Result<()> {
+        let Some(held_out) = record.held_out else { return Ok(()) };
+        let better = held_out.is_finite() && self.waited.best.is_none_or(|b| held_out < b.held_out);
+        if better && self.keep(run)? {
+            self.waited = Waited { best: Some(Best { step: record.step, held_out }), since: 0 };
+        } else if self.waited.best.is_some() {
+            self.waited.since += 1;
+        }
+        run.settled |= self.waited.since >= self.records;
+        Ok(())
+    }
+
+    /// Brings the best state back.
+    fn finish(&mut self, run: &mut Run<'_>) -> Result<()> {
+        if let (Some(copy), Some(best)) = (&self.copy, self.waited.best) {
+            run.model.arena.params.copy_from_slice(copy);
+            run.best = Some(best);
+        }
+        Ok(())
+    }
+
+    fn state<'a>(&'a self, layout: &'a Layout) -> Result<State<'a>> {
+        let tensors = self.copy.iter().flat_map(|copy| tensors_of(PREFIX, layout, [&**copy])).collect();
+        State::new(NAME, &self.waited, tensors)
+    }
+
+    fn restore(&mut self, kept: &Kept<'_>, run: &Run<'_>) -> Result<()> {
+        self.waited = kept.value()?;
+        if self.waited.best.is_some() {
+            let layout = run.model.pipeline.layout();
+            let mut params = Pages::zeros(layout.len());
+            kept.parts(layout, [&mut *params])?;
+            self.copy = Some(params);
+        }
+        Ok(())
+    }
+
+    fn needs_held_out(&self) -> bool {
+        true
+    }
+
+    /// Parameters.
+    fn bytes(&self, parameters: u64) -> u64 {
+        size_of::<f32>() as u64 * parameters
+    }
+
+    fn describe(&self) -> Option<String> {
+        let records = if self.records == 1 { "a record".into() } else { format!("{} records", self.records) };
+        Some(format!("ends after {records} without a smaller held-out error"))
+    }
+}
+
+impl Waiting {
+    /// Copies the parameters, unless the state is not finite, which is yet to be found out.
+    fn keep(&mut self, run: &mut Run<'_>) -> Result<bool> {
+        run.exe.fetch(&mut run.model)?;
+        if strayed(&run.model.arena).is_some() {
+            return Ok(false);
+        }
+        let params = &run.model.arena.params;
+        match &mut self.copy {
+            Some(copy) => copy.copy_from_slice(params),
+            None => self.copy = Some(params.clone()),
+        }
+        Ok(true)
+    }
+}

@@ -1,0 +1,265 @@
+//! Watches over training. A run that leaves the finite numbers, or whose loss runs away, goes back to its last good state
+//! and on from there with half the learning rate.
+//!
+//! Losses are judged in windows of 25 steps, so that a run is found out within 50. It has run away where a window's mean
+//! is that of differences ten times as large as in the best window so far. Before the first window that is what an empty
+//! volume has, or the first loss; and differences below a hundredth of what was measured count as that, since a loss next
+//! to nothing may well jump. It has died where a field that was not empty gives the loss of an empty volume for 25 steps on
+//! end: too long a step has taken it to where no gradient comes back from. Steps go on counting: the run still ends, and
+//! meets other rays than those that led astray. Adam's count of updates goes back with its moments, whose bias it corrects.
+
+use crate::training::run::{HINT, Run, strayed};
+use crate::training::{Callback, CallbackSpec, Kept, State, Update};
+use conefield_core::arena::{Arena, Layout};
+use conefield_core::backend::{StepStats, Work};
+use conefield_core::checkpoint::tensors_of;
+use conefield_core::error::{Error, Result, ensure};
+use conefield_core::loss::Loss;
+use conefield_core::pages::Pages;
+use conefield_core::scan::Scan;
+use conefield_core::scene::Scene;
+use ndarray::{ArrayView2, Axis};
+use rayon::prelude::*;
+use schemars::JsonSchema;
+use serde::{Deserialize, Serialize};
+use std::sync::Arc;
+
+/// Steps whose losses are judged together.
+const WINDOW: u64 = 25;
+/// Steps between two copies of the state, at least.
+const EVERY: u64 = 100;
+/// Share of what was measured below which differences count as that share.
+const SMALL: f64 = 0.01;
+/// Share by which a field's loss differs from that of an empty volume, if it is none.
+const ALIVE: f64 = 1e-3;
+/// Its name in specs and checkpoints, and what its tensors begin with.
+const NAME: &str = "rollback";
+const PREFIX: &str = "rollback.";
+
+/// Settings of `rollback`.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
+#[serde(deny_unknown_fields, default)]
+pub struct Rollback {
+    /// Times that a run may go back to its last good state, with half the learning rate.
+    pub times: u64,
+}
+
+impl Default for Rollback {
+    fn default() -> Self {
+        Self { times: 8 }
+    }
+}
+
+conefield_core::stage_type!(Callback, "rollback", Rollback, "takes a run whose loss runs away back to a good state");
+
+#[typetag::serde(name = "rollback")]
+impl CallbackSpec for Rollback {
+    fn build(&self) -> Result<Box<dyn Callback>> {
+        ensure(self.times > 0, "spec", "times", 0, "at least 1; leave rollback out to never go back")?;
+        Ok(Box::new(Guard { times: self.times, loss: None, measured: 0.0, watched: Watched::default(), copy: None }))
+    }
+
+    fn copy(&self) -> Box<dyn CallbackSpec> {
+        Box::new(self.clone())
+    }
+}
+
+/// What is known beside the copy.
+#[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+struct Watched {
+    /// The lowest mean of a window so far; starts anew when channels leave the work.
+    level: Option<f64>,
+    /// Losses of the window that is not over, and of an empty volume there.
+    sum: f64,
+    empty: f64,
+    steps: u64,
+    /// Both sums of the window before.
+    last: [f64; 2],
+    /// Whether the field has ever been other than empty.
+    alive: bool,
+    /// Steps on end in which it was not.
+    dead: u64,
+    /// Step and updates of the copy.
+    kept: Option<[u64; 2]>,
+}
+
+/// The callback that [`Rollback`] builds.
+struct Guard {
+    times: u64,
+    /// That of the run.
+    loss: Option<Arc<dyn Loss>>,
+    /// A line integral as it was measured where there is an object, in the scale that stages see.
+    measured: f64,
+    watched: Watched,
+    /// Parameters and moments under which a loss was fine.
+    copy: Option<[Pages; 3]>,
+}
+
+impl Callback for Guard {
+    fn name(&self) -> &'static str {
+        NAME
+    }
+
+    fn begin(&mut self, run: &mut Run<'_>) -> Result<()> {
+        (self.loss, self.measured) = (Some(run.loss.clone()), measured(run.job.scan, run.scene));
+        Ok(())
+    }
+
+    fn masked(&mut self) {
+        (self.watched.level, self.copy) = (None, None);
+        (self.watched.sum, self.watched.empty, self.watched.steps) = (0.0, 0.0, 0);
+    }
+
+    /// Judges the gradients of a step by their loss. Where the run goes back, the gradients are gone.
+    fn after_gradients(&mut self, work: &Work<'_>, stats: &StepStats, run: &mut Run<'_>) -> Result<Update> {
+        if !(stats.loss.is_finite() && stats.prior.is_finite()) {
+            let what = format!("the loss is {}, the prior {}", stats.loss, stats.prior);
+            return self.back(&what, run);
+        }
+        let empty: f64 = work.rays.iter().map(|r| self.of(0.0, f64::from(r.target))).sum();
+        let empty = empty / work.rays.len().max(1) as f64;
+        self.watched.sum += stats.loss;
+        self.watched.empty += empty;
+        self.watched.steps += 1;
+        let level = *self.watched.level.get_or_insert(stats.loss.max(self.of(0.0, self.measured)));
+        let other = (stats.loss - empty).abs() > ALIVE * empty;
+        self.watched.alive |= other;
+        self.watched.dead = if other { 0 } else { self.watched.dead + 1 };
+        if self.copy.is_none() {
+            return self.keep(run);
+        }
+        if let Some(what) = self.ran_away() {
+            return self.back(&what, run);
+        }
+        if self.watched.alive && self.watched.dead >= WINDOW {
+            return self.back("the field died, its loss is that of an empty volume", run);
+        }
+        if self.watched.steps < WINDOW {
+            return Ok(Update::Take);
+        }
+        let mean = self.watched.sum / WINDOW as f64;
+        self.watched.level = Some(level.min(mean));
+        self.watched.last = [self.watched.sum, self.watched.empty];
+        (self.watched.sum, self.watched.empty, self.watched.steps) = (0.0, 0.0, 0);
+        let calm = mean <= self.beyond(2.0, level);
+        let due = self.watched.kept.is_none_or(|[at, _]| run.step >= at + EVERY);
+        if calm && due { self.keep(run) } else { Ok(Update::Take) }
+    }
+
+    /// Judges what no further step would look at; and says so where all of the run was for nothing.
+    fn at_end(&mut self, run: &mut Run<'_>) -> Result<()> {
+        let away = self.ran_away();
+        run.exe.fetch(&mut run.model)?;
+        if let Some(what) = away.or_else(|| strayed(&run.model.arena)) {
+            self.back(&what, run)?;
+        } else if let Some(said) = self.in_vain(run.step) {
+            run.tell(said);
+        }
+        Ok(())
+    }
+
+    fn state<'a>(&'a self, layout: &'a Layout) -> Result<State<'a>> {
+        let parts = self.copy.iter().map(|copy| copy.each_ref().map(|p| &**p));
+        let tensors = parts.flat_map(|parts| tensors_of(PREFIX, layout, parts)).collect();
+        State::new(NAME, &self.watched, tensors)
+    }
+
+    fn restore(&mut self, kept: &Kept<'_>, run: &Run<'_>) -> Result<()> {
+        self.watched = kept.value()?;
+        if self.watched.kept.is_some() {
+            let layout = run.model.pipeline.layout();
+            let mut copy = [(); 3].map(|()| Pages::zeros(layout.len()));
+            kept.parts(layout, copy.each_mut().map(|p| &mut **p))?;
+            self.copy = Some(copy);
+        }
+        Ok(())
+    }
+
+    /// Parameters and both moments.
+    fn bytes(&self, parameters: u64) -> u64 {
+        3 * size_of::<f32>() as u64 * parameters
+    }
+}
+
+impl Guard {
+    /// That the last steps are no better than an empty volume, if so. The first ones seldom are, whatever comes of them.
+    fn in_vain(&self, step: u64) -> Option<String> {
+        if step < 4 * WINDOW {
+            return None;
+        }
+        let Watched { sum, empty, last, .. } = self.watched;
+        let (found, empty) = (sum + last[0], empty + last[1]);
+        let text = "the field is no better than an empty volume; another optimizer.lr or more steps may help";
+        (empty > 0.0 && found > 0.99 * empty).then(|| text.to_owned())
+    }
+
+    /// How the window's losses show that the run has run away. Steps that the window still lacks count 0.
+    fn ran_away(&self) -> Option<String> {
+        let Watched { level, sum, steps, .. } = self.watched;
+        let level = level?;
+        let away = sum / WINDOW as f64 > self.beyond(10.0, level);
+        let mean = sum / steps.max(1) as f64;
+        away.then(|| format!("the loss ran away, from {level:.3e} to {mean:.3e}"))
+    }
+
+    /// The loss of a prediction.
+    fn of(&self, predicted: f64, measured: f64) -> f64 {
+        self.loss.as_ref().map_or(0.0, |loss| loss.at(predicted, measured).0)
+    }
+
+    /// The loss of differences `factor` times as large as those of the loss `level`.
+    fn beyond(&self, factor: f64, level: f64) -> f64 {
+        let of = |difference: f64| self.of(difference, 0.0);
+        of(1.0) / of(1.0 / factor) * level.max(of(SMALL * self.measured))
+    }
+
+    /// Copies the state, which the step's loss has found good; one that is not finite is no good after all.
+    fn keep(&mut self, run: &mut Run<'_>) -> Result<Update> {
+        run.exe.fetch(&mut run.model)?;
+        if let Some(what) = strayed(&run.model.arena) {
+            return self.back(&what, run);
+        }
+        let Arena { params, first, second, .. } = &run.model.arena;
+        match &mut self.copy {
+            Some(copy) => copy.iter_mut().zip([params, first, second]).for_each(|(c, p)| c.copy_from_slice(p)),
+            None => self.copy = Some([params, first, second].map(Pages::clone)),
+        }
+        self.watched.kept = Some([run.step, run.tally.updates]);
+        Ok(Update::Take)
+    }
+
+    /// Brings the last good state back and says so, or gives up.
+    fn back(&mut self, what: &str, run: &mut Run<'_>) -> Result<Update> {
+        let step = run.step;
+        let (Some(copy), Some([at, updates])) = (&self.copy, self.watched.kept) else {
+            return Err(Error::Diverged { step, what: format!("{what}; {HINT}") });
+        };
+        if run.tally.rollbacks >= self.times {
+            let what = format!("{what}, after it had gone back {} times with half the rate each time", self.times);
+            return Err(Error::Diverged { step, what: format!("{what}; {HINT}") });
+        }
+        let Arena { params, grads, first, second } = &mut run.model.arena;
+        [params, first, second].into_iter().zip(copy).for_each(|(p, c)| p.copy_from_slice(c));
+        grads.fill(0.0);
+        run.exe.renew();
+        run.tally.updates = updates;
+        run.tally.rollbacks += 1;
+        run.tally.rate *= 0.5;
+        self.watched = Watched { sum: 0.0, empty: 0.0, steps: 0, dead: 0, ..self.watched.clone() };
+        let rate = run.tally.rate;
+        run.tell(format!("step {step}: {what}; back to where step {at} was, learning rate times {rate}"));
+        Ok(Update::Leave)
+    }
+}
+
+/// The mean of what `scan` measured, weighted with itself: air does not count, however much of it there is. In the scale that
+/// stages see.
+fn measured(scan: &Scan, scene: &Scene) -> f64 {
+    let view = |v: ArrayView2<'_, f32>| {
+        v.iter().fold([0.0; 2], |[s, t], p| [s + f64::from(*p).powi(2), t + f64::from(p.abs())])
+    };
+    let sums: Vec<[f64; 2]> = scan.projections.axis_iter(Axis(0)).into_par_iter().map(view).collect();
+    let [squares, sum] = sums.iter().fold([0.0; 2], |[s, t], [u, v]| [s + u, t + v]);
+    squares / sum.max(f64::MIN_POSITIVE) / scene.line_scale()
+}

@@ -1,0 +1,117 @@
+//! The training loop: draw what a step learns from, take its gradients, update the parameters.
+//!
+//! [`callbacks`] do all that goes on beside: they look at gradients before the update, at the model between steps and at
+//! every record. A spec chooses some of them; [`checkpoint`] keeps the state of all.
+
+pub mod callback;
+pub mod callbacks;
+pub mod checkpoint;
+pub mod run;
+
+pub use callback::{Callback, CallbackSpec, Callbacks, Kept, State, Update};
+pub use run::Run;
+
+use conefield_core::backend::{Adam, BlockWork, TrainRay, Work};
+use conefield_core::error::{Error, Result};
+use conefield_core::loss::Loss;
+use std::time::Instant;
+
+/// What a step learns from, drawn at random.
+pub struct Draw<'a> {
+    /// The loss of rays and points.
+    pub loss: &'a dyn Loss,
+    /// Rays with measured line integrals.
+    pub rays: &'a [TrainRay],
+    /// Priors of the field.
+    pub priors: Vec<BlockWork<'a>>,
+}
+
+/// What is learned, and by which rule.
+pub trait Task {
+    /// What step `step` (from 0) of a run with `seed` learns from.
+    fn draw(&mut self, seed: u64, step: u64) -> Draw<'_>;
+    /// Adam's settings for an update at `epoch` passes over the views and `share` of the run.
+    fn adam(&self, epoch: f64, share: f64) -> Adam;
+}
+
+/// Trains to the end of the run. The model of `run` is then what came out.
+pub fn train(run: &mut Run<'_>, task: &mut dyn Task, callbacks: &mut Callbacks) -> Result<()> {
+    callbacks.each(|c| c.begin(run))?;
+    run.clock.resume();
+    loop {
+        callbacks.each(|c| c.between_steps(run))?;
+        checkpoint::keep(run, callbacks)?;
+        let over = run.clock.done(run.step) >= 1.0;
+        if over {
+            callbacks.each(|c| c.at_end(run))?;
+            run.check_finite()?;
+        }
+        record(run, task, callbacks, over)?;
+        if over || run.settled {
+            break;
+        }
+        let masks = run.model.masks().len();
+        callbacks.each(|c| c.before_step(run))?;
+        if run.model.masks().len() > masks {
+            callbacks.each(|c| {
+                c.masked();
+                Ok(())
+            })?;
+        }
+        step(run, task, callbacks)?;
+        let share = run.clock.done(run.step);
+        let left = run.clock.seconds() * (1.0 - share).max(0.0) / share.max(1e-9);
+        run.observer.progress(run.step, share, left);
+    }
+    run.clock.pause();
+    run.exe.fetch(&mut run.model)?;
+    callbacks.each(|c| c.finish(run))
+}
+
+/// One step: draw, gradients and, unless a callback refuses it, update.
+fn step(run: &mut Run<'_>, task: &mut dyn Task, callbacks: &mut Callbacks) -> Result<()> {
+    let adam = task.adam(run.epoch(), run.clock.share(run.step));
+    let Draw { loss, rays, priors } = task.draw(run.job.seed, run.step);
+    let work = Work { step: run.step, seed: run.job.seed, loss, rays, points: &[], priors: &priors };
+    let start = Instant::now();
+    let stats = run.exe.step(&mut run.model, &work)?;
+    let mut update = Update::Take;
+    callbacks.each(|c| {
+        if update == Update::Take {
+            update = c.after_gradients(&work, &stats, run)?;
+        }
+        Ok(())
+    })?;
+    if update == Update::Take && !(stats.loss.is_finite() && stats.prior.is_finite()) {
+        let what = format!("the loss is {}, the prior {}; {}", stats.loss, stats.prior, run::HINT);
+        return Err(Error::Diverged { step: run.step, what });
+    }
+    run.step += 1;
+    run.samples += stats.samples;
+    if update == Update::Take {
+        run.tally.updates += 1;
+        let adam = Adam { lr: adam.lr * run.tally.rate, step: run.tally.updates, ..adam };
+        run.exe.update(&mut run.model, &adam)?;
+        run.tally.window.add(&stats, start.elapsed().as_secs_f64());
+    }
+    Ok(())
+}
+
+/// Records the steps since the last record, if a record is due.
+fn record(run: &mut Run<'_>, task: &dyn Task, callbacks: &mut Callbacks, over: bool) -> Result<()> {
+    let due = run.step > 0 && (run.step.is_multiple_of(run.report_every) || over);
+    if !due || run.tally.window.steps == 0 {
+        return Ok(());
+    }
+    run.clock.pause();
+    let lr = run.tally.rate * task.adam(run.epoch(), run.clock.share(run.step)).lr;
+    let mut record = run.tally.window.record(run.step, run.clock.seconds(), lr);
+    callbacks.each(|c| c.at_record(&mut record, run))?;
+    if run.settled {
+        record.events.push("the stopping rule is met".into());
+    }
+    run.observer.record(&record);
+    run.tally.window = run::Window::default();
+    run.clock.resume();
+    Ok(())
+}

@@ -1,0 +1,176 @@
+//! A run: all that the training loop and its callbacks work on.
+
+use crate::schedule::{Clock, Ends};
+use conefield_core::arena::Arena;
+use conefield_core::backend::{Executable, StepStats};
+use conefield_core::error::{Error, Result};
+use conefield_core::loss::Loss;
+use conefield_core::method::{Best, DriftRecord, Job, Observer, Record};
+use conefield_core::pipeline::Model;
+use conefield_core::scene::Scene;
+use rayon::prelude::*;
+use serde::{Deserialize, Serialize};
+use std::sync::Arc;
+
+/// What may help where training diverges.
+pub const HINT: &str = "try a smaller optimizer.lr";
+
+/// A run of the training loop.
+pub struct Run<'a> {
+    /// The job.
+    pub job: &'a Job<'a>,
+    /// Between the world and what stages see.
+    pub scene: &'a Scene,
+    /// Hears of the run.
+    pub observer: &'a mut dyn Observer,
+    /// Stages and parameters. The parameters may be elsewhere: [`Executable::fetch`] brings them.
+    pub model: Model,
+    /// Does the work.
+    pub exe: Box<dyn Executable>,
+    /// Counts training time.
+    pub clock: Clock,
+    /// What a difference between predicted and measured costs.
+    pub loss: Arc<dyn Loss>,
+    /// Steps that make a pass over the views.
+    pub steps_an_epoch: u64,
+    /// Steps between two records.
+    pub report_every: u64,
+    /// Finished steps.
+    pub step: u64,
+    /// Training samples so far.
+    pub samples: u64,
+    /// What else the run has counted.
+    pub tally: Tally,
+    /// Whether the run ends with the record at hand.
+    pub settled: bool,
+    /// The record whose state came out, where a callback chose one.
+    pub best: Option<Best>,
+}
+
+/// What a run counts beside its steps. A checkpoint keeps it.
+#[derive(Debug, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct Tally {
+    /// Sums since the last record.
+    pub window: Window,
+    /// Updates that parameters and moments have seen.
+    pub updates: u64,
+    /// What the learning rate is multiplied with.
+    pub rate: f64,
+    /// Times that the run went back to an earlier state.
+    pub rollbacks: u64,
+}
+
+impl Default for Tally {
+    fn default() -> Self {
+        Self { window: Window::default(), updates: 0, rate: 1.0, rollbacks: 0 }
+    }
+}
+
+impl<'a> Run<'a> {
+    /// A run of `job` before its first step, with every limit and setting to be set.
+    pub fn new(
+        job: &'a Job<'a>,
+        scene: &'a Scene,
+        observer: &'a mut dyn Observer,
+        model: Model,
+        exe: Box<dyn Executable>,
+    ) -> Self {
+        Self {
+            job,
+            scene,
+            observer,
+            model,
+            exe,
+            clock: Clock::new(Ends::default(), job.limits, 0.0),
+            loss: Arc::new(crate::losses::L1 {}),
+            steps_an_epoch: 1,
+            report_every: 1,
+            step: 0,
+            samples: 0,
+            tally: Tally::default(),
+            settled: false,
+            best: None,
+        }
+    }
+
+    /// Finished passes over the views.
+    pub fn epoch(&self) -> f64 {
+        self.step as f64 / self.steps_an_epoch as f64
+    }
+
+    /// Says what happened, now and in the next record.
+    pub fn tell(&mut self, said: String) {
+        self.observer.note(&said);
+        self.tally.window.events.push(said);
+    }
+
+    /// Removes all channels of the encoder but `keep` for good.
+    pub fn mask(&mut self, keep: Vec<usize>) -> Result<()> {
+        self.exe.fetch(&mut self.model)?;
+        self.model.mask(keep)?;
+        self.exe = self.job.backend.compile(&self.model.pipeline)?.0;
+        Ok(())
+    }
+
+    /// Fetches the parameters and refuses a state that is not finite.
+    pub fn check_finite(&mut self) -> Result<()> {
+        self.exe.fetch(&mut self.model)?;
+        match strayed(&self.model.arena) {
+            Some(what) => Err(Error::Diverged { step: self.step, what: format!("{what}; {HINT}") }),
+            None => Ok(()),
+        }
+    }
+}
+
+/// Sums since the last record.
+#[derive(Debug, Default, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct Window {
+    /// Steps that were updated with.
+    pub steps: u64,
+    loss: f64,
+    prior: f64,
+    samples: u64,
+    seconds: f64,
+    /// Drift that was found.
+    pub drift: Vec<DriftRecord>,
+    /// What else happened.
+    pub events: Vec<String>,
+}
+
+impl Window {
+    /// Adds a step.
+    pub fn add(&mut self, stats: &StepStats, seconds: f64) {
+        self.steps += 1;
+        self.loss += stats.loss;
+        self.prior += stats.prior;
+        self.samples += stats.samples;
+        self.seconds += seconds;
+    }
+
+    /// The record of these steps.
+    pub fn record(&mut self, step: u64, seconds: f64, lr: f64) -> Record {
+        let n = self.steps as f64;
+        Record {
+            step,
+            seconds,
+            loss: Some(self.loss / n),
+            prior: (self.prior > 0.0).then_some(self.prior / n),
+            lr: Some(lr),
+            samples_per_s: Some(self.samples as f64 / self.seconds.max(1e-12)),
+            drift: std::mem::take(&mut self.drift),
+            events: std::mem::take(&mut self.events),
+            ..Record::default()
+        }
+    }
+}
+
+/// How parameters or moments show that they are no longer finite.
+pub fn strayed(arena: &Arena) -> Option<String> {
+    let parts = [("parameter", &arena.params), ("first moment", &arena.first), ("second moment", &arena.second)];
+    parts.into_iter().find_map(|(name, part)| {
+        let (i, x) = part.par_iter().enumerate().find_first(|(_, x)| !x.is_finite())?;
+        Some(format!("{name} {i} is {x}"))
+    })
+}

@@ -1,0 +1,178 @@
+//! What a basis must keep to: a linear map without negative entries, and its exact adjoint.
+
+use crate::call::{differing, settle};
+use crate::voxels::{above, apart, dot, flat, noise};
+use crate::{Outcome, Report};
+use conefield_core::basis::{Basis, BasisOperator, Expansion};
+use conefield_core::geometry::VoxelGrid;
+use conefield_core::simd::Real;
+use ndarray::Array3;
+use rayon::ThreadPoolBuilder;
+
+/// Largest mismatch of `<Bx, y>` and `<x, Bᵀy>` over `‖Bx‖·‖y‖`, in double and in single precision.
+const ADJOINT: [f64; 2] = [1e-12, 1e-5];
+/// Largest error of single against double precision, as a share of the largest number.
+const SINGLE: f64 = 1e-5;
+
+/// Runs every property that a basis must have.
+pub fn check_basis(basis: &dyn Basis) -> Report {
+    let mut report = Report { stage: basis.describe(), entries: vec![] };
+    report.add("builds", || builds(basis));
+    let made: Result<Vec<_>, _> = grids().iter().map(|grid| basis.on(grid).map(|b| (*grid, b))).collect();
+    let Ok(all) = made else { return report };
+    report.add("adjoint: double precision", || adjoint(&all, |b| b.reference(), ADJOINT[0]));
+    report.add("adjoint: single precision", || adjoint(&all, |b| b.operator(), ADJOINT[1]));
+    report.add("single precision", || single_precision(&all));
+    report.add("linear", || linear(&all));
+    report.add("overwrites", || overwrites(&all));
+    report.add("no negative entries", || no_negative_entries(&all));
+    report.add("identity", || identity(&all));
+    report.add("threads", || threads(&all));
+    report
+}
+
+type Made = [(VoxelGrid, Box<dyn Expansion>)];
+
+/// Voxels that are no cubes, sides that are odd, lines and planes of voxels.
+fn grids() -> Vec<VoxelGrid> {
+    let grid = |shape, spacing| VoxelGrid { shape, spacing, center: [1.0, -2.0, 3.0] };
+    vec![
+        grid([8, 6, 10], [1.0; 3]),
+        grid([7, 5, 9], [1.5, 0.7, 2.0]),
+        grid([1, 12, 1], [1.0; 3]),
+        grid([11, 1, 4], [0.5; 3]),
+    ]
+}
+
+/// It is made for every grid, and the number of coefficients follows from the grid's shape alone.
+fn builds(basis: &dyn Basis) -> Outcome {
+    let complaint = grids().into_iter().find_map(|grid| {
+        let made = match basis.on(&grid) {
+            Ok(made) => made.coefficients(),
+            Err(e) => return Some(format!("for {grid:?}: {e}")),
+        };
+        let positive = made.shape.iter().all(|n| *n > 0) && made.spacing.iter().all(|s| s.is_finite() && *s > 0.0);
+        let other = VoxelGrid { spacing: grid.spacing.map(|s| 3.0 * s), center: [0.0; 3], ..grid };
+        let shape = basis.on(&other).map(|b| b.coefficients().shape).ok();
+        (!positive || shape != Some(made.shape))
+            .then(|| format!("for {grid:?}: {made:?}, with larger voxels {shape:?}"))
+    });
+    settle(complaint, "for every grid")
+}
+
+fn expand<R: Real>(of: &dyn BasisOperator<R>, voxels: [usize; 3], x: &Array3<R>) -> Array3<R> {
+    let mut out = Array3::from_elem(voxels, R::ZERO);
+    of.expand(x.view(), out.view_mut());
+    out
+}
+
+fn back<R: Real>(of: &dyn BasisOperator<R>, coefficients: [usize; 3], y: &Array3<R>) -> Array3<R> {
+    let mut out = Array3::from_elem(coefficients, R::ZERO);
+    of.adjoint(y.view(), out.view_mut());
+    out
+}
+
+fn adjoint<R: Real>(all: &Made, of: impl Fn(&dyn Expansion) -> &dyn BasisOperator<R>, most: f64) -> Outcome {
+    let mut worst = 0.0f64;
+    let mut complaint = None;
+    for (grid, basis) in all {
+        let (op, shape) = (of(basis.as_ref()), basis.coefficients().shape);
+        let (x, y) = (noise::<R>(shape, 7), noise::<R>(grid.shape, 107));
+        let (bx, bty) = (expand(op, grid.shape, &x), back(op, shape, &y));
+        let off = (dot(&bx, &y) - dot(&x, &bty)).abs() / (dot(&bx, &bx) * dot(&y, &y)).sqrt();
+        worst = worst.max(off);
+        if above(off, most) {
+            complaint = complaint.or(Some(format!("{:?}: <Bx, y> and <x, Bᵀy> differ by {off:.1e}", grid.shape)));
+        }
+    }
+    settle(complaint, &format!("off by {worst:.1e} at most"))
+}
+
+fn single_precision(all: &Made) -> Outcome {
+    let wide = |a: &Array3<f32>| a.mapv(f64::from);
+    let complaint = all.iter().find_map(|(grid, basis)| {
+        let shape = basis.coefficients().shape;
+        let (x, y) = (noise::<f32>(shape, 3), noise::<f32>(grid.shape, 4));
+        let voxels = expand(basis.operator(), grid.shape, &x);
+        let coefficients = back(basis.operator(), shape, &y);
+        apart("voxels", &voxels, &expand(basis.reference(), grid.shape, &wide(&x)), SINGLE)
+            .or_else(|| apart("coefficients", &coefficients, &back(basis.reference(), shape, &wide(&y)), SINGLE))
+    });
+    settle(complaint, &format!("within {SINGLE:.0e} of double precision"))
+}
+
+fn linear(all: &Made) -> Outcome {
+    let mixed = |a: &Array3<f64>, b: &Array3<f64>| 2.5 * a - 0.75 * b;
+    let complaint = all.iter().find_map(|(grid, basis)| {
+        let shape = basis.coefficients().shape;
+        let [x, y] = [1, 2].map(|s| noise::<f64>(shape, s));
+        let [a, b, both] = [&x, &y, &mixed(&x, &y)].map(|c| expand(basis.reference(), grid.shape, c));
+        apart("voxels of a sum", &both, &mixed(&a, &b), 1e-12)
+    });
+    settle(complaint, "sums and multiples go through")
+}
+
+/// Both directions, over NaN as over 0.
+fn overwrites(all: &Made) -> Outcome {
+    let complaint = all.iter().find_map(|(grid, basis)| {
+        let (op, shape) = (basis.operator(), basis.coefficients().shape);
+        let (x, y) = (noise::<f32>(shape, 5), noise::<f32>(grid.shape, 6));
+        let mut voxels = Array3::from_elem(grid.shape, f32::NAN);
+        op.expand(x.view(), voxels.view_mut());
+        let mut coefficients = Array3::from_elem(shape, f32::NAN);
+        op.adjoint(y.view(), coefficients.view_mut());
+        differing("voxel", &flat(&voxels), &flat(&expand(op, grid.shape, &x)))
+            .or_else(|| differing("coefficient", &flat(&coefficients), &flat(&back(op, shape, &y))))
+    });
+    settle(complaint, "over NaN as over 0")
+}
+
+fn no_negative_entries(all: &Made) -> Outcome {
+    let mut coefficients = 0;
+    let complaint = all.iter().find_map(|(grid, basis)| {
+        let shape = basis.coefficients().shape;
+        let one = |i: usize| {
+            let mut x = Array3::zeros(shape);
+            x.as_slice_mut()?[i] = 1.0;
+            let least = expand(basis.reference(), grid.shape, &x).into_iter().fold(f64::INFINITY, f64::min);
+            (least.is_nan() || least < 0.0).then(|| format!("{:?}: coefficient {i} gives {least:e}", grid.shape))
+        };
+        let count = shape.iter().product::<usize>();
+        coefficients += count;
+        (0..count).find_map(one)
+    });
+    settle(complaint, &format!("in {coefficients} columns"))
+}
+
+/// What says that it is the identity is.
+fn identity(all: &Made) -> Outcome {
+    if !all.iter().any(|(_, basis)| basis.is_identity()) {
+        return Outcome::Skipped("it is none".into());
+    }
+    let complaint = all.iter().find_map(|(grid, basis)| {
+        let x = noise::<f32>(grid.shape, 9);
+        if basis.coefficients() != *grid {
+            return Some(format!("its coefficients stand at {:?}", basis.coefficients()));
+        }
+        differing("voxel", &flat(&expand(basis.operator(), grid.shape, &x)), &flat(&x))
+            .or_else(|| differing("coefficient", &flat(&back(basis.operator(), grid.shape, &x)), &flat(&x)))
+    });
+    settle(complaint, "coefficients are the voxels")
+}
+
+fn threads(all: &Made) -> Outcome {
+    let both = || -> Vec<f32> {
+        let of = |(grid, basis): &(VoxelGrid, Box<dyn Expansion>)| {
+            let shape = basis.coefficients().shape;
+            let (x, y) = (noise::<f32>(shape, 1), noise::<f32>(grid.shape, 2));
+            [flat(&expand(basis.operator(), grid.shape, &x)), flat(&back(basis.operator(), shape, &y))].concat()
+        };
+        all.iter().flat_map(of).collect()
+    };
+    let want = both();
+    let complaint = [1, 3].into_iter().find_map(|n| {
+        let pool = ThreadPoolBuilder::new().num_threads(n).build().ok()?;
+        differing(&format!("{n} threads, number"), &pool.install(both), &want)
+    });
+    settle(complaint, "1 and 3 threads")
+}

@@ -1,0 +1,168 @@
+//! What a loss must keep to: a derivative that is that of its value, least where both values agree, numbers at the edge.
+
+use crate::call::{Draw, settle, within};
+use crate::gradients::slope;
+use crate::{Outcome, Report};
+use conefield_core::error::Result;
+use conefield_core::loss::{Loss, NoiseModel};
+
+/// Runs a loss's WGSL at pairs of a predicted and a measured value. Returns the loss and its derivative for each.
+pub type Compare<'a> = dyn Fn(&dyn Loss, &[[f32; 2]]) -> Result<Vec<[f32; 2]>> + 'a;
+
+/// Largest relative error of the derivative against differences.
+const TOLERANCE: f64 = 1e-6;
+/// Largest relative error of the WGSL in single precision.
+const SINGLE: f64 = 1e-5;
+
+/// Runs every property that a loss must have.
+pub fn check_loss(loss: &dyn Loss) -> Report {
+    let mut report = Report { stage: loss.describe(), entries: vec![] };
+    report.add("finite differences", || derivative(loss));
+    report.add("least where values agree", || least(loss));
+    report.add("extremes", || extremes(loss));
+    report.add("poison", || poison(loss));
+    report.add("repeatable", || {
+        let changed = pairs().into_iter().find(|&[p, m]| bits(loss.at(p, m)) != bits(loss.at(p, m)));
+        settle(changed.map(|[p, m]| format!("predicted {p}, measured {m}: another value")), "the same bits twice")
+    });
+    report.add("learns from a scan", || learns(loss));
+    report.add("no fault", || settle(loss.fault().err().map(|e| e.to_string()), "none was reported"));
+    report
+}
+
+/// Runs every property that a loss's WGSL must have.
+pub fn check_loss_wgsl(loss: &dyn Loss, run: &Compare<'_>) -> Report {
+    let mut report = Report { stage: loss.describe(), entries: vec![] };
+    report.add("WGSL parity", || parity(loss, run));
+    report
+}
+
+/// What a scan might show a loss.
+const SHOWN: NoiseModel<'static> = NoiseModel { sigma: 0.01, growth: 0.7, measured: &[0.0, 0.1, 0.5, 1.0, 2.0] };
+
+/// The loss that training would use: one that learns from a scan has seen one.
+pub fn ready(loss: &dyn Loss) -> Option<Box<dyn Loss>> {
+    loss.fitted(&SHOWN)
+}
+
+/// Predicted and measured values, exact in single precision: around each other and far apart, of every sign.
+fn pairs() -> Vec<[f64; 2]> {
+    let mut draw = Draw::new(3, 1);
+    let mut pairs = vec![];
+    for scale in [1e-3, 1e-2, 0.1, 1.0, 10.0] {
+        for _ in 0..40 {
+            let measured = draw.from(&(-0.5..3.0));
+            pairs.push([f64::from((measured + draw.from(&(-scale..scale))) as f32), measured]);
+        }
+    }
+    pairs
+}
+
+fn bits((a, b): (f64, f64)) -> [u64; 2] {
+    [a.to_bits(), b.to_bits()]
+}
+
+fn derivative(loss: &dyn Loss) -> Outcome {
+    let (mut worst, mut seen) = (0.0f64, 0);
+    for [predicted, measured] in pairs() {
+        let at = |d: f64| loss.at(predicted + d, measured).0;
+        // Where it is smooth, differences over a step and over four agree.
+        let h = 1e-6;
+        let [near, far] = [h, 4.0 * h].map(|h| (at(h) - at(-h)) / (2.0 * h));
+        if (near - far).abs() > 1e-3 * near.abs().max(1e-3) {
+            continue;
+        }
+        seen += 1;
+        let (found, want) = (loss.at(predicted, measured).1, slope(h, at));
+        // Differences of a loss next to nothing are rounded.
+        let e = (found - want).abs() / (found.abs().max(want.abs()) + 1e-4);
+        if e.is_nan() || e > TOLERANCE {
+            let at = format!("predicted {predicted}, measured {measured}");
+            return Outcome::Failed(format!("{at}: derivative {found:e}, differences {want:e}"));
+        }
+        worst = worst.max(e);
+    }
+    if seen < 100 {
+        Outcome::Failed(format!("smooth at {seen} of 200 places"))
+    } else {
+        within("derivative", worst, TOLERANCE)
+    }
+}
+
+fn least(loss: &dyn Loss) -> Outcome {
+    for [predicted, measured] in pairs() {
+        let (none, slope) = loss.at(measured, measured);
+        if none != 0.0 || slope != 0.0 {
+            return Outcome::Failed(format!("{none:e} and the derivative {slope:e} where both are {measured}"));
+        }
+        let (value, slope) = loss.at(predicted, measured);
+        let d = predicted - measured;
+        if value < 0.0 || value.is_nan() || slope * d < 0.0 || slope.is_nan() {
+            let what = format!("predicted {predicted}, measured {measured}");
+            return Outcome::Failed(format!("{what}: loss {value:e}, derivative {slope:e}"));
+        }
+    }
+    Outcome::Passed("0 there, and nowhere a way down that leads away".into())
+}
+
+fn extremes(loss: &dyn Loss) -> Outcome {
+    let values = [0.0, -0.0, 1e-40, -1e-40, 1.0, -1.0, 1e30, -1e30];
+    for [p, m] in values.into_iter().flat_map(|p| values.map(|m| [p, m])) {
+        let (value, slope) = loss.at(p, m);
+        if !(value.is_finite() && slope.is_finite()) {
+            return Outcome::Failed(format!("predicted {p:e}, measured {m:e}: loss {value}, derivative {slope}"));
+        }
+    }
+    Outcome::Passed("0, denormal, ±1e30 give finite numbers".into())
+}
+
+/// A run is judged by its loss: a number that is none must show there.
+fn poison(loss: &dyn Loss) -> Outcome {
+    let hidden = [f64::NAN, f64::INFINITY, f64::NEG_INFINITY].into_iter().find(|&p| loss.at(p, 0.5).0.is_finite());
+    settle(hidden.map(|p| format!("predicted {p}: loss {}", loss.at(p, 0.5).0)), "NaN and infinities stay visible")
+}
+
+/// One that learns gives a loss that keeps to all the rest and is of the same order.
+fn learns(loss: &dyn Loss) -> Outcome {
+    let Some(fitted) = ready(loss) else {
+        return if loss.needs_scan() {
+            Outcome::Failed("it needs a scan, and learns nothing from one".into())
+        } else {
+            Outcome::Skipped("it learns nothing".into())
+        };
+    };
+    if !loss.needs_scan() {
+        return Outcome::Failed("it learns from a scan and does not say that it needs one".into());
+    }
+    for property in [derivative, least, extremes, poison] {
+        if let Outcome::Failed(what) = property(fitted.as_ref()) {
+            return Outcome::Failed(format!("after it learned: {what}"));
+        }
+    }
+    let mean = |l: &dyn Loss| SHOWN.measured.iter().map(|&m| l.at(m + 0.1, m).1).sum::<f64>();
+    let ratio = mean(fitted.as_ref()) / mean(loss);
+    settle(
+        (!(0.5..=2.0).contains(&ratio)).then(|| format!("its derivatives are {ratio:.2e} times what they were")),
+        &format!("{}; derivatives {ratio:.2} times what they were", fitted.describe()),
+    )
+}
+
+fn parity(loss: &dyn Loss, run: &Compare<'_>) -> Outcome {
+    if loss.wgsl().is_none() {
+        return Outcome::Skipped("it offers none".into());
+    }
+    let pairs: Vec<[f32; 2]> = pairs().into_iter().map(|p| p.map(|v| v as f32)).collect();
+    let found = match run(loss, &pairs) {
+        Ok(found) => found,
+        Err(e) => return Outcome::Failed(e.to_string()),
+    };
+    let mut worst = 0.0f64;
+    for (&[p, m], found) in pairs.iter().zip(&found) {
+        let (value, slope) = loss.at(f64::from(p), f64::from(m));
+        for (found, want) in found.iter().zip([value, slope]) {
+            let e = (f64::from(*found) - want).abs() / (want.abs() + 1e-6);
+            worst = if e.is_nan() { f64::INFINITY } else { worst.max(e) };
+        }
+    }
+    within(&format!("{} pairs", pairs.len()), worst, SINGLE)
+}

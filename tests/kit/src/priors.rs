@@ -1,0 +1,149 @@
+//! What a prior of a field must keep to: a gradient that is that of its penalty, sums that add, numbers at the edge.
+
+use crate::call::{Draw, Guarded, error, settle, within};
+use crate::gradients::slope;
+use crate::{Outcome, Report};
+use conefield_core::error::Result;
+use conefield_core::prior::Prior;
+
+/// Runs a prior's WGSL on the values of one block. Returns the penalty and its derivatives.
+pub type Penalise<'a> = dyn Fn(&dyn Prior, &[f32]) -> Result<(f32, Vec<f32>)> + 'a;
+
+/// Largest error of the gradient against differences, as a share of the largest derivative.
+const TOLERANCE: f64 = 1e-6;
+/// Largest error of the WGSL in single precision, as a share of the penalty or the largest derivative.
+const SINGLE: f64 = 2e-5;
+/// Values that are differenced one by one, at most.
+const SINGLES: usize = 200;
+
+/// Runs every property that a prior must have.
+pub fn check_prior(prior: &dyn Prior) -> Report {
+    let mut report = Report { stage: prior.describe(), entries: vec![] };
+    report.add("blocks", || {
+        let blocks = prior.blocks();
+        let refused = blocks.validate().err().map(|e| e.to_string());
+        settle(refused, &format!("{} blocks of {}³ points", blocks.count, blocks.edge))
+    });
+    report.add("finite differences", || gradient(prior));
+    report.add("gradients add", || adds(prior));
+    report.add("scale", || scale(prior));
+    report.add("guards", || guards(prior));
+    report.add("extremes", || extremes(prior));
+    report.add("poison", || poison(prior));
+    report.add("repeatable", || {
+        let values = drawn(prior);
+        let [a, b] = [(); 2].map(|()| run(prior, &values, 1.0));
+        let bits = |(value, slopes): &(f64, Vec<f64>)| (value.to_bits(), slopes.iter().map(|s| s.to_bits()).collect());
+        let same: bool = bits(&a) == (bits(&b) as (u64, Vec<u64>));
+        settle((!same).then(|| "other numbers the second time".into()), "the same bits twice")
+    });
+    report.add("no fault", || settle(prior.fault().err().map(|e| e.to_string()), "none was reported"));
+    report
+}
+
+/// Runs every property that a prior's WGSL must have.
+pub fn check_prior_wgsl(prior: &dyn Prior, device: &Penalise<'_>) -> Report {
+    let mut report = Report { stage: prior.describe(), entries: vec![] };
+    report.add("WGSL parity", || parity(prior, device));
+    report
+}
+
+/// Values of a block, exact in single precision.
+fn drawn(prior: &dyn Prior) -> Vec<f64> {
+    Draw::new(4, 1).many(&(0.0..1.0), prior.blocks().points())
+}
+
+/// Penalty and `scale` times its gradient.
+fn run(prior: &dyn Prior, values: &[f64], scale: f64) -> (f64, Vec<f64>) {
+    let mut gradient = Guarded::new(values.len(), 0.0);
+    let value = prior.block(values, scale, gradient.inner());
+    (value, gradient.into_inner())
+}
+
+fn gradient(prior: &dyn Prior) -> Outcome {
+    let mut values = drawn(prior);
+    let (value, found) = run(prior, &values, 1.0);
+    if value < 0.0 || !value.is_finite() {
+        return Outcome::Failed(format!("the penalty is {value}"));
+    }
+    let largest = found.iter().fold(1e-9, |m: f64, g| m.max(g.abs()));
+    let mut worst = 0.0f64;
+    for i in (0..values.len()).step_by(values.len().div_ceil(SINGLES)) {
+        let keep = values[i];
+        let want = slope(1e-5, |d| {
+            values[i] = keep + d;
+            run(prior, &values, 1.0).0
+        });
+        values[i] = keep;
+        let e = (found[i] - want).abs() / largest;
+        if e.is_nan() || e > TOLERANCE {
+            return Outcome::Failed(format!("point {i}: gradient {:e}, differences {want:e}", found[i]));
+        }
+        worst = worst.max(e);
+    }
+    within("gradient", worst, TOLERANCE)
+}
+
+fn adds(prior: &dyn Prior) -> Outcome {
+    let values = drawn(prior);
+    let (_, clean) = run(prior, &values, 1.0);
+    let mut added = vec![3.0; values.len()];
+    prior.block(&values, 1.0, &mut added);
+    let want: Vec<f64> = clean.iter().map(|g| 3.0 + g).collect();
+    within("on top of 3", error(&added, &want), 1e-12)
+}
+
+/// The gradient is multiplied with the scale, the penalty is not.
+fn scale(prior: &dyn Prior) -> Outcome {
+    let values = drawn(prior);
+    let ((plain, slopes), (value, scaled)) = (run(prior, &values, 1.0), run(prior, &values, 0.25));
+    let want: Vec<f64> = slopes.iter().map(|g| 0.25 * g).collect();
+    within("a quarter", error(&scaled, &want).max((value - plain).abs() / plain.abs().max(1e-30)), 1e-12)
+}
+
+fn guards(prior: &dyn Prior) -> Outcome {
+    let values = drawn(prior);
+    let mut gradient = Guarded::new(values.len(), 0.0);
+    prior.block(&values, 1.0, gradient.inner());
+    settle(gradient.broken("gradient"), "on either side of the gradient")
+}
+
+fn extremes(prior: &dyn Prior) -> Outcome {
+    let values = drawn(prior);
+    for v in [0.0, -0.0, 1e-40, 1.0, -1.0, 1e30, -1e30] {
+        let flat = vec![v; values.len()];
+        let mixed: Vec<f64> = values.iter().enumerate().map(|(i, x)| if i % 3 == 0 { v } else { *x }).collect();
+        for block in [flat, mixed] {
+            let (value, slopes) = run(prior, &block, 1.0);
+            if !value.is_finite() || slopes.iter().any(|g| !g.is_finite()) {
+                return Outcome::Failed(format!("values of {v:e}: penalty {value}, or a derivative, is not finite"));
+            }
+        }
+    }
+    Outcome::Passed("0, denormal, ±1e30 give finite numbers".into())
+}
+
+/// A run is judged by its sums: a number that is none must show there.
+fn poison(prior: &dyn Prior) -> Outcome {
+    let mut values = drawn(prior);
+    let middle = values.len() / 2;
+    values[middle] = f64::NAN;
+    let (value, _) = run(prior, &values, 1.0);
+    settle(value.is_finite().then(|| format!("the penalty is {value} where a value is NaN")), "NaN stays visible")
+}
+
+fn parity(prior: &dyn Prior, device: &Penalise<'_>) -> Outcome {
+    if prior.wgsl().is_none() {
+        return Outcome::Skipped("it offers none".into());
+    }
+    let values = drawn(prior);
+    let (value, slopes) = run(prior, &values, 1.0);
+    let single: Vec<f32> = values.iter().map(|&v| v as f32).collect();
+    match device(prior, &single) {
+        Ok((found, found_slopes)) => {
+            let e = error(&[found], &[value]).max(error(&found_slopes, &slopes));
+            within("penalty and derivatives", e, SINGLE)
+        }
+        Err(e) => Outcome::Failed(e.to_string()),
+    }
+}

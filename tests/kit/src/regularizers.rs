@@ -1,0 +1,261 @@
+//! What a regularizer must keep to: a convex penalty, and the proximal map that belongs to it.
+
+use crate::call::{differing, settle};
+use crate::{Outcome, Report};
+use conefield_core::geometry::VoxelGrid;
+use conefield_core::random::{mix, unit};
+use conefield_core::regularizer::{Penalty, Regularizer};
+use conefield_core::scan::ScanHeader;
+use conefield_core::space::Space;
+use ndarray::ArrayView3;
+use rayon::ThreadPoolBuilder;
+
+/// Calls after which a proximal map that comes nearer with each has to be there.
+const CALLS: usize = 400;
+/// What a search may still gain on the proximal map's objective, as a share of what the map gained on the start.
+const GAIN: f64 = 1e-3;
+/// Weights that are tried.
+const TAUS: [f32; 3] = [0.01, 0.1, 1.0];
+
+/// Runs every property that a regularizer must have.
+pub fn check_regularizer(regularizer: &dyn Regularizer) -> Report {
+    let mut report = Report { stage: regularizer.describe(), entries: vec![] };
+    report.add("value", || value(regularizer));
+    report.add("convex", || convex(regularizer));
+    report.add("weight", || weight(regularizer));
+    report.add("proximal map", || proximal(regularizer));
+    report.add("nonexpansive", || nonexpansive(regularizer));
+    report.add("not negative", || not_negative(regularizer));
+    report.add("weight of 0", || no_weight(regularizer));
+    report.add("overwrites", || overwrites(regularizer));
+    report.add("state", || state(regularizer));
+    report.add("tally", || tally(regularizer));
+    report.add("threads", || threads(regularizer));
+    report
+}
+
+/// Few voxels, of unequal sides; a line and a plane.
+fn grids() -> Vec<VoxelGrid> {
+    let grid = |shape, spacing| VoxelGrid { shape, spacing, center: [0.0; 3] };
+    vec![grid([3, 2, 4], [1.0, 0.7, 1.6]), grid([1, 1, 5], [1.0; 3]), grid([3, 4, 1], [0.5, 1.0, 2.0])]
+}
+
+/// Numbers in [-0.4, 1).
+fn noise(grid: &VoxelGrid, seed: u64) -> Vec<f32> {
+    (0..grid.shape.iter().product::<usize>() as u64).map(|i| 1.4 * unit(mix(seed, i)) - 0.4).collect()
+}
+
+fn header(grid: &VoxelGrid) -> ScanHeader {
+    ScanHeader { views: 0, detector: [0; 2], volume: grid.shape }
+}
+
+fn on(regularizer: &dyn Regularizer, grid: &VoxelGrid) -> Box<dyn Penalty> {
+    regularizer.on(grid, &Space::new(header(grid)))
+}
+
+fn value_of(penalty: &dyn Penalty, grid: &VoxelGrid, x: &[f32]) -> f64 {
+    ArrayView3::from_shape(grid.shape, x).map_or(f64::NAN, |x| penalty.value(x))
+}
+
+/// The proximal map after many calls.
+fn prox(penalty: &mut dyn Penalty, v: &[f32], tau: f32) -> Vec<f32> {
+    let mut u = vec![0.0; v.len()];
+    (0..CALLS).for_each(|_| penalty.prox(v, tau, &mut u));
+    u
+}
+
+/// `½‖u − v‖² + τ·R(u)`.
+fn objective(penalty: &dyn Penalty, grid: &VoxelGrid, v: &[f32], tau: f32, u: &[f32]) -> f64 {
+    let square: f64 = u.iter().zip(v).map(|(u, v)| f64::from(u - v).powi(2)).sum();
+    0.5 * square + f64::from(tau) * value_of(penalty, grid, u)
+}
+
+fn value(regularizer: &dyn Regularizer) -> Outcome {
+    let complaint = grids().iter().find_map(|grid| {
+        let penalty = on(regularizer, grid);
+        [0.0, 1e-30, 1.0, 1e6].into_iter().find_map(|scale| {
+            let x: Vec<f32> = noise(grid, 1).iter().map(|x| scale * x).collect();
+            let value = value_of(penalty.as_ref(), grid, &x);
+            (!value.is_finite() || value < 0.0).then(|| format!("{:?} times {scale:e}: {value:e}", grid.shape))
+        })
+    });
+    settle(complaint, "finite, 0 or more")
+}
+
+fn convex(regularizer: &dyn Regularizer) -> Outcome {
+    let complaint = grids().iter().find_map(|grid| {
+        let penalty = on(regularizer, grid);
+        (0..20).find_map(|seed| {
+            let (a, b) = (noise(grid, seed), noise(grid, seed + 100));
+            let middle: Vec<f32> = a.iter().zip(&b).map(|(a, b)| 0.5 * (a + b)).collect();
+            let [a, b, middle] = [&a, &b, &middle].map(|x| value_of(penalty.as_ref(), grid, x));
+            let most = 0.5 * (a + b);
+            (middle > most + 1e-5 * most.abs()).then(|| format!("{middle} between {a} and {b}"))
+        })
+    });
+    settle(complaint, "between any two")
+}
+
+fn weight(regularizer: &dyn Regularizer) -> Outcome {
+    let complaint = grids().iter().find_map(|grid| {
+        let of = |noise: f64| regularizer.weight(grid, &mut |k| k * noise);
+        let [none, some, more] = [0.0, 0.01, 0.02].map(of);
+        let fine = [none, some, more].iter().all(|w| w.is_finite() && *w >= 0.0) && none <= some && some <= more;
+        (!fine).then(|| format!("{none}, {some}, {more} with no, some and twice the noise"))
+    });
+    settle(complaint, "finite, 0 or more, not less with more noise")
+}
+
+/// No other coefficients have less of the objective: a search that starts where the map ends gains next to nothing.
+fn proximal(regularizer: &dyn Regularizer) -> Outcome {
+    let mut worst = 0.0f64;
+    let mut complaint = None;
+    for grid in grids() {
+        for tau in TAUS {
+            let v = noise(&grid, 3);
+            let mut penalty = on(regularizer, &grid);
+            let u = prox(penalty.as_mut(), &v, tau);
+            let of = |x: &[f32]| objective(penalty.as_ref(), &grid, &v, tau, x);
+            let clipped: Vec<f32> = v.iter().map(|v| v.max(0.0)).collect();
+            let (found, start) = (of(&u), of(&clipped));
+            let least = search(&of, u).min(search(&of, clipped));
+            let gain = (found - least) / start.max(1e-30);
+            worst = worst.max(gain);
+            if gain.is_nan() || gain > GAIN {
+                let what = format!("{:?}, weight {tau}: objective {found:.5}, a search finds {least:.5}", grid.shape);
+                complaint = complaint.or(Some(what));
+            }
+        }
+    }
+    settle(complaint, &format!("a search gains {worst:.1e} of the objective at most"))
+}
+
+/// The least that steps along single coefficients, along all of them, and in drawn directions come to.
+fn search(of: &dyn Fn(&[f32]) -> f64, mut x: Vec<f32>) -> f64 {
+    let mut least = of(&x);
+    let mut seed = 0;
+    for step in [0.3f32, 0.1, 0.03, 0.01, 3e-3, 1e-3] {
+        for _ in 0..40 {
+            let before = least;
+            let n = x.len();
+            for direction in 0..2 * n + 20 {
+                seed += 1;
+                let drawn = |i: usize| unit(mix(seed, i as u64)) - 0.5;
+                let along = |i: usize| match direction {
+                    d if d < 2 * n => f32::from(u8::from(i == d / 2)) * (1.0 - 2.0 * (d % 2) as f32),
+                    d if d < 2 * n + 2 => 1.0 - 2.0 * (d % 2) as f32,
+                    _ => drawn(i),
+                };
+                let other: Vec<f32> = x.iter().enumerate().map(|(i, x)| (x + step * along(i)).max(0.0)).collect();
+                let value = of(&other);
+                if value < least {
+                    (least, x) = (value, other);
+                }
+            }
+            if before - least < 1e-9 {
+                break;
+            }
+        }
+    }
+    least
+}
+
+fn nonexpansive(regularizer: &dyn Regularizer) -> Outcome {
+    let distance = |a: &[f32], b: &[f32]| a.iter().zip(b).map(|(a, b)| f64::from(a - b).powi(2)).sum::<f64>().sqrt();
+    let complaint = grids().iter().find_map(|grid| {
+        (0..4).find_map(|seed| {
+            let (a, b) = (noise(grid, seed), noise(grid, seed + 50));
+            let [u, w] = [&a, &b].map(|v| prox(on(regularizer, grid).as_mut(), v, 0.2));
+            let (before, after) = (distance(&a, &b), distance(&u, &w));
+            (after.is_nan() || after > 1.002 * before).then(|| format!("{before:.4} apart become {after:.4}"))
+        })
+    });
+    settle(complaint, "nothing comes further apart")
+}
+
+fn not_negative(regularizer: &dyn Regularizer) -> Outcome {
+    let complaint = grids().iter().find_map(|grid| {
+        TAUS.into_iter().find_map(|tau| {
+            let mut u = vec![0.0; noise(grid, 4).len()];
+            // From the first call on.
+            on(regularizer, grid).prox(&noise(grid, 4), tau, &mut u);
+            let bad = u.iter().find(|u| !u.is_finite() || **u < 0.0)?;
+            Some(format!("{:?}, weight {tau}: {bad}", grid.shape))
+        })
+    });
+    settle(complaint, "from the first call on")
+}
+
+fn no_weight(regularizer: &dyn Regularizer) -> Outcome {
+    let complaint = grids().iter().find_map(|grid| {
+        let v = noise(grid, 5);
+        let mut u = vec![0.0; v.len()];
+        on(regularizer, grid).prox(&v, 0.0, &mut u);
+        differing("coefficient", &u, &v.iter().map(|v| v.max(0.0)).collect::<Vec<_>>())
+    });
+    settle(complaint, "only what is below 0 goes")
+}
+
+fn overwrites(regularizer: &dyn Regularizer) -> Outcome {
+    let complaint = grids().iter().find_map(|grid| {
+        let v = noise(grid, 6);
+        let [mut clean, mut over] = [0.0, f32::NAN].map(|x| vec![x; v.len()]);
+        on(regularizer, grid).prox(&v, 0.1, &mut clean);
+        on(regularizer, grid).prox(&v, 0.1, &mut over);
+        differing("coefficient", &over, &clean)
+    });
+    settle(complaint, "over NaN as over 0")
+}
+
+/// What [`Penalty::state`] names is all that a call depends on.
+fn state(regularizer: &dyn Regularizer) -> Outcome {
+    let complaint = grids().iter().find_map(|grid| {
+        let v = noise(grid, 7);
+        let [mut first, mut second] = [on(regularizer, grid), on(regularizer, grid)];
+        let [mut a, mut b] = [vec![0.0; v.len()], vec![0.0; v.len()]];
+        (0..5).for_each(|_| first.prox(&v, 0.1, &mut a));
+        let (from, to) = (first.state(), second.state());
+        let mut names: Vec<&str> = from.iter().map(|s| s.0).collect();
+        names.sort_unstable();
+        names.dedup();
+        if names.len() != from.len() {
+            return Some("two of a name".into());
+        }
+        for ((_, from), (_, to)) in from.into_iter().zip(to) {
+            to.copy_from_slice(from);
+        }
+        first.prox(&v, 0.1, &mut a);
+        second.prox(&v, 0.1, &mut b);
+        differing("coefficient after the state was handed over", &b, &a)
+    });
+    settle(complaint, "handed over, it goes on to the same bits")
+}
+
+/// A tally counts what is allocated.
+fn tally(regularizer: &dyn Regularizer) -> Outcome {
+    let complaint = grids().iter().find_map(|grid| {
+        let [real, tally] = [Space::new(header(grid)), Space::tally(header(grid))].map(|space| {
+            regularizer.on(grid, &space);
+            space.bytes()
+        });
+        let state = on(regularizer, grid).state().iter().map(|s| 4 * s.1.len() as u64).sum::<u64>();
+        (real != tally || tally < state).then(|| format!("{tally} bytes, {real} allocated, {state} of state"))
+    });
+    settle(complaint, "counts what is allocated")
+}
+
+fn threads(regularizer: &dyn Regularizer) -> Outcome {
+    let grid = VoxelGrid { shape: [13, 9, 21], spacing: [1.0, 0.7, 1.3], center: [0.0; 3] };
+    let run = || {
+        let (mut penalty, v) = (on(regularizer, &grid), noise(&grid, 8));
+        let mut u = vec![0.0; v.len()];
+        (0..5).for_each(|_| penalty.prox(&v, 0.1, &mut u));
+        u
+    };
+    let want = run();
+    let complaint = [1, 3].into_iter().find_map(|n| {
+        let pool = ThreadPoolBuilder::new().num_threads(n).build().ok()?;
+        differing(&format!("{n} threads, coefficient"), &pool.install(run), &want)
+    });
+    settle(complaint, "1 and 3 threads")
+}

@@ -1,0 +1,44 @@
+//! What the settings of a stage must keep to: written and read again they are the same.
+
+use crate::Report;
+use crate::call::settle;
+use conefield_core::registry::Settings;
+use conefield_core::spec::stage::read;
+use serde::Serialize;
+use serde::de::DeserializeOwned;
+use serde_json::{Value, json};
+
+/// Writes and reads the settings of the type called `name`: all defaults, which its name alone stands for, and `settings`.
+pub fn check_settings<T>(name: &str, settings: &Value) -> Report
+where
+    T: Settings + Serialize + ?Sized,
+    Box<T>: DeserializeOwned,
+{
+    let mut report = Report { stage: format!("settings of {} {name:?}", T::KIND), entries: vec![] };
+    let written = |value: Value| -> Result<Value, String> {
+        let settings: Box<T> = read(value)?;
+        serde_json::to_value(&settings).map_err(|e| e.to_string())
+    };
+    report.add("save and load", || {
+        let mut table = settings.clone();
+        table["type"] = json!(name);
+        let twice = written(table.clone()).and_then(|once| Ok((once.clone(), written(once)?)));
+        let complaint = match twice {
+            Err(e) => Some(e),
+            Ok((once, twice)) if once != twice => Some(format!("{once}, read again {twice}")),
+            Ok((once, _)) => {
+                let lost = table.as_object().into_iter().flatten().find(|(key, value)| once[key.as_str()] != **value);
+                lost.map(|(key, value)| format!("{key} = {value} is written as {}", once[key.as_str()]))
+            }
+        };
+        settle(complaint, "what was set is written and read again")
+    });
+    report.add("a name alone", || {
+        let complaint = match (written(json!(name)), written(json!({ "type": name }))) {
+            (Ok(a), Ok(b)) if a == b => None,
+            (a, b) => Some(format!("{a:?} against {b:?}")),
+        };
+        settle(complaint, "stands for the default settings")
+    });
+    report
+}

@@ -1,0 +1,69 @@
+//! Slices of a field while it trains.
+
+mod common;
+
+use common::{model, scan, spec, volume};
+use conefield_backend_cpu::Cpu;
+use conefield_core::Result;
+use conefield_core::geometry::VoxelGrid;
+use conefield_core::parts::Part;
+use conefield_core::solver::{Job, Observer, Record};
+use ndarray::{Array3, s};
+use serde_json::json;
+
+/// Takes slices after every so many steps.
+struct Slices {
+    every: u64,
+    step: u64,
+    last: Vec<(Part, Array3<f32>)>,
+    times: u64,
+    losses: Vec<Option<f64>>,
+}
+
+impl Observer for Slices {
+    fn progress(&mut self, step: u64, _: f64, _: f64) {
+        self.step = step;
+    }
+    fn record(&mut self, record: &Record) {
+        self.losses.push(record.loss);
+    }
+    fn note(&mut self, _: &str) {}
+    fn slices_due(&self) -> bool {
+        self.step.is_multiple_of(self.every)
+    }
+    fn slices(&mut self, grid: VoxelGrid, slices: &[(Part, Array3<f32>)]) -> Result<()> {
+        assert_eq!((grid.shape, slices.len()), ([16; 3], 3));
+        (self.last, self.times) = (slices.to_vec(), self.times + 1);
+        Ok(())
+    }
+}
+
+#[test]
+fn slices_are_those_of_the_field_and_change_nothing() {
+    let value = json!({
+        "encoder": {"type": "hash-grid", "levels": 3, "base_resolution": 3, "log2_table_size": 8},
+        "normalizers": [{"type": "layer-norm"}],
+        "field": {"type": "mlp", "width": 8, "depth": 3, "skips": [1]},
+        "projector": {"type": "ray-march", "samples": 20},
+        "solver": {"type": "gradient", "steps": 40, "rays": 64, "lr": 0.01, "report_every": 5,
+                   "callbacks": [{"type": "rollback"}, {"type": "fft-mask", "epoch": 2, "threshold": 1e-6}]},
+    });
+    let (scan, spec, cpu) = (scan(), spec(&value).unwrap(), Cpu::new());
+    let solver = spec.solver.build().unwrap();
+    let run = |every: u64| {
+        let mut seen = Slices { every, step: 0, last: vec![], times: 0, losses: vec![] };
+        let job = Job { seed: 7, ..Job::new(&scan, &spec, &cpu) };
+        (solver.solve(&job, &mut seen).unwrap(), seen)
+    };
+    let ((plain, without), (watched, with)) = (run(u64::MAX), run(1));
+    assert_eq!((without.times, with.times), (1, 41));
+    assert_eq!(with.losses, without.losses);
+    let whole = volume(&watched);
+    for (part, values) in &with.last {
+        let [x, y, z] = part.clone();
+        assert_eq!(whole.data.slice(s![x, y, z]), values.view());
+    }
+    let thick = |k: usize| with.last[k].0.each_ref().map(|r| (r.start, r.len()));
+    assert_eq!(thick(1), [(0, 16), (8, 1), (0, 16)]);
+    assert!(model(plain).arena.params == model(watched).arena.params);
+}
