@@ -3,8 +3,8 @@
 
 use conefield_backend_cpu::Cpu;
 use conefield_conformance::{Options, check_encoder};
+use conefield_core::method::{Context, Job, Limits, Silent};
 use conefield_core::prelude::*;
-use conefield_core::solver::{Job, Limits, Silent};
 use conefield_projectors::simulate::{Protocol, phantom, simulate};
 
 stage_type!(Encoder, "waves", Waves, "waves of learned directions");
@@ -90,9 +90,9 @@ fn main() -> Result<(), Box<dyn std::error::Error>> {
     let set = ["encoder.type=waves", "encoder.waves=48", "field.width=16"].map(String::from);
     let loaded = conefield::specs::read("fast", &set)?;
     let backend = Cpu::new();
+    let mut plan = loaded.spec.method.plan(&Context::new(&backend))?;
     let limits = Limits { steps: Some(200), ..Limits::default() };
-    let job = Job { limits, ..Job::new(&scan, &loaded.spec, &backend) };
-    let solution = loaded.spec.solver.build()?.solve(&job, &mut Silent)?;
+    let solution = plan.run(&Job { limits, ..Job::new(&scan, &backend) }, &mut Silent)?;
     let volume = solution.result.volume(&backend)?;
     let psnr = conefield_metrics::psnr(volume.data.view(), truth.data.view(), 1.0)?;
     println!("{} steps in {:.1} s: {psnr:.2} dB", solution.steps, solution.train_s);

@@ -131,6 +131,45 @@ const RAY_FAULTS: &[Fault] = &[
     fault("a fitted projector whose lengths are 10 % too long", &["FAULT=FITS_LONGER"], ["", "fitted to a scene", ""]),
 ];
 
+/// Faults of losses: `faulty_loss.c`.
+const LOSS_FAULTS: &[Fault] = &[
+    refused("a loss without its function", &["FAULT=NO_AT"], "no function at"),
+    untried("a negative loss", &["FAULT=NEGATIVE"], "refused: predicted -0.25, measured -0.5: loss -0.03125"),
+    untried("a loss that is NaN", &["FAULT=NOT_A_NUMBER"], "refused: predicted -0.5, measured -0.5: loss NaN"),
+    untried(
+        "a loss that writes past its slopes",
+        &["FAULT=PAST_SLOPES"],
+        "it writes outside the 16 numbers of its slopes",
+    ),
+    untried("a loss that fails", &["FAULT=FAILS"], "at failed: no more numbers"),
+    fault("a slope that is 10 % too large", &["FAULT=WRONG_SLOPE"], ["", "finite differences", ""]),
+    fault(
+        "a loss for a scan that is the old one",
+        &["FAULT=FITS_ITSELF"],
+        ["", "learns from a scan", "fitted failed: it handed itself back instead of a new stage"],
+    ),
+    fault(
+        "a loss that cannot learn from a scan",
+        &["FAULT=FITS_NOT"],
+        ["", "learns from a scan", "fitted failed: no scan suits it"],
+    ),
+];
+
+/// Faults of priors: `faulty_prior.c`.
+const PRIOR_FAULTS: &[Fault] = &[
+    untried("blocks of one point", &["FAULT=FLAT_BLOCKS"], "edge: found 1, expected 2 to 32"),
+    untried("a negative penalty", &["FAULT=NEGATIVE"], "refused: the penalty of a block is -"),
+    untried("a penalty that is NaN", &["FAULT=NOT_A_NUMBER"], "refused: the penalty of a block is NaN"),
+    untried(
+        "a prior that writes before its gradient",
+        &["FAULT=BEFORE_GRADIENT"],
+        "it writes outside the 64 numbers of its gradient",
+    ),
+    untried("a prior that fails", &["FAULT=FAILS"], "block failed: no more numbers"),
+    fault("a prior's gradient that is 10 % too large", &["FAULT=WRONG_GRADIENT"], ["", "finite differences", ""]),
+    fault("a prior's gradient that overwrites", &["FAULT=OVERWRITES"], ["", "gradients add", ""]),
+];
+
 /// No process survives this.
 const ABORTED: &str = "(the process is gone)";
 
@@ -224,7 +263,11 @@ fn every_fault_is_found_and_none_takes_the_process_down() {
     let encoder = &["--set", "encoder.type=faulty", "--set", "projector.samples=16"][..];
     let rays = &["--set", "projector.type=faulty"][..];
     let encoders = FAULTS.iter().map(|f| (f, "faulty.c", encoder));
-    let all = encoders.chain(RAY_FAULTS.iter().map(|f| (f, "faulty_rays.c", rays)));
+    let (loss, prior) = (&["--set", "loss.type=faulty"][..], &["--set", "priors.0.type=faulty"][..]);
+    let all = encoders
+        .chain(RAY_FAULTS.iter().map(|f| (f, "faulty_rays.c", rays)))
+        .chain(LOSS_FAULTS.iter().map(|f| (f, "faulty_loss.c", loss)))
+        .chain(PRIOR_FAULTS.iter().map(|f| (f, "faulty_prior.c", prior)));
     for (i, (fault, source, set)) in all.enumerate() {
         let library = dir.path().join("faulty.so");
         cc(&sources().join("plugins/tests").join(source), fault.defines, &library);

@@ -5,7 +5,7 @@ use crate::common::{done, json, refused, text};
 use std::path::{Path, PathBuf};
 use std::process::Command;
 
-const KINDS: [&str; 5] = ["encoder", "normalizer", "field", "projector", "initializer"];
+const KINDS: [&str; 7] = ["encoder", "normalizer", "field", "projector", "initializer", "loss", "prior"];
 
 /// A scan small enough for seconds.
 fn scan(dir: &Path) -> PathBuf {

@@ -20,7 +20,7 @@ mod export;
 mod shims;
 
 pub use conefield_core::{
-    Error, Result, arena, by_row, error, half, prelude, random, simd, spec, stage, stage_type, wgsl,
+    Error, Result, arena, by_row, error, half, loss, prelude, prior, random, settings, simd, stage, stage_type, wgsl,
 };
 pub use conefield_plugin_abi as abi;
 pub use export::Plugin;

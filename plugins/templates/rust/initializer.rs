@@ -6,7 +6,7 @@
 use conefield_plugin::arena::{Arena, InitReport, Layout, Weights};
 use conefield_plugin::error::{Result, ensure};
 use conefield_plugin::random::{mix, unit};
-use conefield_plugin::spec::{Initializer, InitializerSpec};
+use conefield_plugin::settings::{Initializer, InitializerSpec};
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 

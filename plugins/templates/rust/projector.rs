@@ -5,7 +5,7 @@
 
 use conefield_plugin::error::{Result, ensure};
 use conefield_plugin::random::{mix, unit};
-use conefield_plugin::spec::ProjectorSpec;
+use conefield_plugin::settings::ProjectorSpec;
 use conefield_plugin::stage::{Projector, Samples, UnitRay};
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};

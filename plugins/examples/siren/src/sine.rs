@@ -4,8 +4,8 @@
 
 use conefield_plugin::error::{Result, ensure};
 use conefield_plugin::random::{mix, unit};
+use conefield_plugin::settings::FieldSpec;
 use conefield_plugin::simd::Real;
-use conefield_plugin::spec::FieldSpec;
 use conefield_plugin::stage::{Field, GradKind, Grads, Info, Kernel, Parameter, Scope, Stage, Tile, TileMut};
 use conefield_plugin::wgsl::Fragment;
 use schemars::JsonSchema;

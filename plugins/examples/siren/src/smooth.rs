@@ -2,8 +2,8 @@
 //! of one sample and stays as it is.
 
 use conefield_plugin::error::{Result, ensure};
+use conefield_plugin::settings::NormalizerSpec;
 use conefield_plugin::simd::Real;
-use conefield_plugin::spec::NormalizerSpec;
 use conefield_plugin::stage::{
     GradKind, Grads, Info, Kernel, Normalizer, Parameter, Reduced, Scope, Stage, Tile, TileMut,
 };

@@ -5,8 +5,8 @@
 use conefield_plugin::error::{Result, ensure};
 use conefield_plugin::half::Stored;
 use conefield_plugin::random::{mix, unit};
+use conefield_plugin::settings::EncoderSpec;
 use conefield_plugin::simd::Real;
-use conefield_plugin::spec::EncoderSpec;
 use conefield_plugin::stage::{
     Encoder, GradKind, Grads, Halves, Info, Kernel, Parameter, Reduced, Scope, Stage, Tile, TileMut,
 };

@@ -1,7 +1,7 @@
 //! The stage through conefield's conformance kit.
 
 use conefield_conformance::{Options, check_encoder};
-use conefield_plugin::spec::EncoderSpec;
+use conefield_plugin::settings::EncoderSpec;
 use triplane::planes::Triplane;
 
 #[test]
