@@ -2,7 +2,7 @@
 //! changed, solve, score.
 
 use conefield_backend_cpu::Cpu;
-use conefield_core::method::{Job, Limits, Silent};
+use conefield_core::method::{Context, Job, Limits, Silent};
 use conefield_projectors::simulate::{Protocol, phantom, simulate};
 use std::error::Error;
 
@@ -12,11 +12,10 @@ fn main() -> Result<(), Box<dyn Error>> {
     let scan = simulate(&truth, &protocol)?;
 
     let loaded = conefield::specs::read("fast", &["field.width=16".into()])?;
-    let solver = loaded.spec.solver.build()?;
     let backend = Cpu::new();
+    let mut plan = loaded.spec.method.plan(&Context::new(&backend))?;
     let limits = Limits { steps: Some(200), ..Limits::default() };
-    let job = Job { limits, ..Job::new(&scan, &loaded.spec, &backend) };
-    let solution = solver.solve(&job, &mut Silent)?;
+    let solution = plan.run(&Job { limits, ..Job::new(&scan, &backend) }, &mut Silent)?;
     let volume = solution.result.volume(&backend)?;
     let psnr = conefield_metrics::psnr(volume.data.view(), truth.data.view(), 1.0)?;
     println!("{} steps in {:.1} s: {psnr:.2} dB", solution.steps, solution.train_s);

@@ -2,7 +2,7 @@
 //!
 //! - [`geometry`], [`orbit`], [`scan`], [`parts`]: what was measured, in millimetres, and what comes out.
 //! - [`simd`], [`half`], [`dense`], [`trilinear`], [`stage`]: what a stage computes and how.
-//! - [`by_row`]: stages that are written for one row at a time.
+//! - [`by_row`]: stages that are written for one row at a time; [`prelude`]: what their authors need.
 //! - [`support`]: where the object can be; [`scene`]: between the world and what stages see.
 //! - [`loss`], [`prior`]: what training makes small.
 //! - [`wgsl`]: the same for a GPU.
@@ -34,6 +34,7 @@ pub mod pages;
 pub mod parts;
 pub mod pipeline;
 pub mod precision;
+pub mod prelude;
 pub mod prior;
 pub mod random;
 pub mod registry;

@@ -1,5 +1,6 @@
-/* Plugins that do one thing wrong each, chosen by -DFAULT=… or by another NAME, SCHEMA or ENTRY: what the host and the conformance kit must find. Without a
- * fault it is a sound encoder: y = a * x, each coordinate times a number that is learned. */
+/* Encoders that do one thing wrong each, chosen by -DFAULT=… or by another NAME, SCHEMA or ENTRY: what the host and the
+ * conformance kit must find. Without a fault it is a sound encoder: y = a * x, each coordinate times a number that is
+ * learned. */
 #define _POSIX_C_SOURCE 199309L
 #include "conefield_plugin.h"
 
@@ -25,6 +26,13 @@ enum Fault {
     NO_FORWARD_PASS,
     WRONG_PASSES,
     REDUCES_NOTHING,
+    FEW_RESOLUTIONS,
+    MORE_RESOLUTIONS,
+    NAN_RESOLUTION,
+    NEGATIVE_RESOLUTION,
+    NO_HALVES,
+    NAN_HALVES,
+    WRONG_HALVES,
     BEFORE_GRADIENTS,
     WRONG_GRADIENT,
     WRONG_INPUT_GRADIENT,
@@ -86,6 +94,7 @@ static ConefieldStatus info(const void *stage, struct ConefieldInfo *out) {
         .blocks = FAULT == TWIN_BLOCKS ? 3 : 1,
         .macs = 3,
         .grads = CONEFIELD_GRADS_DENSE,
+        .halves = FAULT == NO_HALVES || FAULT == NAN_HALVES || FAULT == WRONG_HALVES,
     };
     return CONEFIELD_OK;
 }
@@ -155,6 +164,36 @@ static ConefieldStatus backward(const void *stage, const float *params, struct C
     return CONEFIELD_OK;
 }
 
+/* Takes every parameter for 1, or every result for NaN. */
+static ConefieldStatus forward_halves(const void *stage, uint32_t format, const uint16_t *params, struct ConefieldTile x,
+                                      struct ConefieldTileMut y, struct ConefieldTileMut tape,
+                                      struct ConefieldText *error) {
+    (void)format, (void)params;
+    static const float ones[] = {1.0f, 1.0f, 1.0f};
+    ConefieldStatus status = forward(stage, ones, x, y, tape, error);
+    if (FAULT == NAN_HALVES) y.data[0] = NAN;
+    return status;
+}
+
+static ConefieldStatus backward_halves(const void *stage, uint32_t format, const uint16_t *params, struct ConefieldTile x,
+                                       struct ConefieldTileMut tape, struct ConefieldTile dy, struct ConefieldGrads grads,
+                                       struct ConefieldTileMut dx, struct ConefieldText *error) {
+    (void)format, (void)params;
+    static const float ones[] = {1.0f, 1.0f, 1.0f};
+    return backward(stage, ones, x, tape, dy, grads, dx, error);
+}
+
+/* Every channel tells 8 cells apart. */
+static ConefieldStatus resolutions(const void *stage, double *cells, size_t count, struct ConefieldText *error) {
+    (void)stage, (void)error;
+    if (FAULT == FEW_RESOLUTIONS) count -= 1;
+    if (FAULT == MORE_RESOLUTIONS) count += 1;
+    for (size_t c = 0; c < count; c++) cells[c] = 8.0;
+    if (FAULT == NAN_RESOLUTION) cells[1] = NAN;
+    if (FAULT == NEGATIVE_RESOLUTION) cells[1] = -8.0;
+    return CONEFIELD_OK;
+}
+
 /* Says that it leaves out channels, and hands itself back. */
 static ConefieldStatus reduce(const void *stage, uint32_t side, const size_t *keep, size_t count,
                               struct ConefieldReduced *out, struct ConefieldText *error) {
@@ -176,6 +215,9 @@ static const struct ConefieldMap MAP = {
     .reduce = FAULT == REDUCES_NOTHING ? reduce : NULL,
     .passes = passes,
     .forward_pass = FAULT == NO_FORWARD_PASS ? NULL : forward_pass,
+    .forward_halves = FAULT == NO_HALVES ? NULL : forward_halves,
+    .backward_halves = backward_halves,
+    .resolutions = resolutions,
 };
 
 static const struct ConefieldStage STAGES[] = {{

@@ -20,8 +20,8 @@ use conefield_core::settings::{Initializer, LossSpec};
 use conefield_core::simd::Real;
 use conefield_core::space::Space;
 use conefield_core::stage::{
-    Encoder, GradKind, Grads, Halves, Info, Kernel, Parameter, Projector, Reduced, Samples, Scope, Stage, Tile,
-    TileMut, UnitRay,
+    Encoder, GradKind, Grads, Halves, Info, Kernel, Lengths, Parameter, Projector, Reduced, Samples, Scope, Stage,
+    Tile, TileMut, UnitRay,
 };
 use conefield_core::voxel::{VoxelOperator, VoxelProjector};
 use conefield_core::wgsl::Fragment;
@@ -86,6 +86,20 @@ enum Fault {
     WrongChannel,
     /// A smaller stage keeps too many parameters.
     TooManyKept,
+    /// Passes leave another number than forward.
+    Pass,
+    /// The same of what reads halves.
+    HalvesPass,
+    /// A channel has no resolution.
+    FewResolutions,
+    /// A resolution is NaN.
+    NanResolution,
+    /// A resolution is negative.
+    NegativeResolution,
+    /// Channels are said to stand from coarse to fine, and do not.
+    FallingResolutions,
+    /// A smaller stage has the resolutions of other channels.
+    OtherResolutions,
 }
 
 /// `y_c = w_c·x_c + w_c²` on the channels in `channels`.
@@ -129,6 +143,13 @@ impl<R: Real, P: Stored<R>> Kernel<R, P> for Toy {
         if self.fault == Fault::WritesOutside {
             let end = y.data.len();
             poke(y.data, end as isize);
+        }
+    }
+
+    fn forward_pass(&self, _: usize, params: &[P], x: Tile<'_, R>, y: TileMut<'_, R>, tape: TileMut<'_, R>) {
+        self.forward(params, x, TileMut::new(&mut *y.data, y.rows), tape);
+        if self.fault == (if size_of::<P>() == 2 { Fault::HalvesPass } else { Fault::Pass }) {
+            y.data[0] += R::ONE;
         }
     }
 
@@ -250,6 +271,23 @@ impl Encoder for Toy {
         let stage = Toy { fault: self.fault, channels, double: self.double, calls: AtomicU32::new(0) };
         Ok(Reduced { stage: Box::new(stage), params, channels: vec![0, 1, 2] })
     }
+
+    fn coarse_to_fine(&self) -> bool {
+        self.fault == Fault::FallingResolutions
+    }
+
+    fn resolutions(&self) -> Option<Vec<f64>> {
+        let mut cells: Vec<f64> = self.channels.iter().map(|&c| 4.0 * (c + 1) as f64).collect();
+        match self.fault {
+            Fault::FewResolutions => _ = cells.pop(),
+            Fault::NanResolution => cells[0] = f64::NAN,
+            Fault::NegativeResolution => cells[0] = -4.0,
+            Fault::FallingResolutions => cells.reverse(),
+            Fault::OtherResolutions => (0..cells.len()).for_each(|c| cells[c] = 4.0 * (c + 1) as f64),
+            _ => {}
+        }
+        Some(cells)
+    }
 }
 
 /// Quiets the panics that a fault causes on purpose.
@@ -290,6 +328,13 @@ fn every_fault_fails_its_property_and_the_sound_stage_none() {
         (Fault::Panics, "finite differences: inputs"),
         (Fault::WrongChannel, "keep outputs"),
         (Fault::TooManyKept, "keep outputs"),
+        (Fault::Pass, "passes"),
+        (Fault::HalvesPass, "halves: passes"),
+        (Fault::FewResolutions, "resolutions"),
+        (Fault::NanResolution, "resolutions"),
+        (Fault::NegativeResolution, "resolutions"),
+        (Fault::FallingResolutions, "resolutions"),
+        (Fault::OtherResolutions, "resolutions"),
     ];
     let sound = check_encoder(&Toy::new(Fault::None), &Options::encoder());
     assert!(sound.passed(), "{sound}");
@@ -479,17 +524,24 @@ enum RayFault {
     AddsAdjoint,
     /// It says that something went wrong.
     Reports,
+    /// The projector for a scene is unsound.
+    FitsUnsound,
+    /// The projector for a scene is another one each time.
+    FitsAnew,
+    /// There is no projector for a scene.
+    FitsNot,
 }
 
 struct ToyRays {
     fault: RayFault,
+    samples: usize,
     calls: AtomicU32,
 }
 
 impl Projector for ToyRays {
     fn max_samples(&self, ray: &UnitRay) -> usize {
         let hit = ray.inside[1] > ray.inside[0] || self.fault == RayFault::SeesAir;
-        if hit { 10 } else { 0 }
+        if hit { self.samples } else { 0 }
     }
 
     fn sample(&self, ray: &UnitRay, _: Option<u64>, out: &mut Samples) {
@@ -518,6 +570,19 @@ impl Projector for ToyRays {
         }
     }
 
+    fn fitted(&self, _: Lengths) -> Result<Option<Box<dyn Projector>>> {
+        let made = self.calls.fetch_add(1, Ordering::Relaxed);
+        let fitted = |samples, fault| -> Result<Option<Box<dyn Projector>>> {
+            Ok(Some(Box::new(Self { fault, samples, calls: AtomicU32::new(0) })))
+        };
+        match self.fault {
+            RayFault::FitsUnsound => fitted(10, RayFault::LostWeight),
+            RayFault::FitsAnew => fitted(10 + made as usize, RayFault::None),
+            RayFault::FitsNot => Err(Error::unsupported("toy", "as ordered")),
+            _ => fitted(20, RayFault::None),
+        }
+    }
+
     fn adjoint(&self, weights: &[f32], dline: f64, dmu: &mut [f64]) {
         let scale = if self.fault == RayFault::LongAdjoint { 1.01 } else { 1.0 };
         for (d, &w) in dmu.iter_mut().zip(weights) {
@@ -537,7 +602,7 @@ impl Projector for ToyRays {
 
 #[test]
 fn every_fault_of_a_ray_projector_fails_its_property() {
-    let toy = |fault| ToyRays { fault, calls: AtomicU32::new(0) };
+    let toy = |fault| ToyRays { fault, samples: 10, calls: AtomicU32::new(0) };
     let sound = check_projector(&toy(RayFault::None));
     assert!(sound.passed(), "{sound}");
     for (fault, property) in [
@@ -552,6 +617,9 @@ fn every_fault_of_a_ray_projector_fails_its_property() {
         (RayFault::LongAdjoint, "adjoint"),
         (RayFault::AddsAdjoint, "adjoint overwrites"),
         (RayFault::Reports, "no fault"),
+        (RayFault::FitsUnsound, "fitted to a scene"),
+        (RayFault::FitsAnew, "fitted to a scene"),
+        (RayFault::FitsNot, "fitted to a scene"),
     ] {
         let report = quietly(|| check_projector(&toy(fault)));
         assert!(report.failed().contains(&property), "{fault:?} passed {property:?}:\n{report}");

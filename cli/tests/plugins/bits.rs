@@ -36,6 +36,7 @@ name = "of plugins"
 
 [encoder]
 type = "triplane"
+levels = 1
 resolution = 12
 features = 3
 

@@ -21,7 +21,7 @@ fn every_example_is_checked_and_reconstructs() {
     for (library, sets) in [
         (example("siren"), &["field.type=siren"][..]),
         (example("siren"), &["normalizers.0.type=ray-smooth"]),
-        (example("triplane"), &["encoder.type=triplane", "encoder.resolution=24"]),
+        (example("triplane"), &["encoder.type=triplane", "encoder.levels=1", "encoder.resolution=24"]),
         (dense, &["encoder.type=one-grid"]),
     ] {
         let library = text(&library);
@@ -40,4 +40,44 @@ fn every_example_is_checked_and_reconstructs() {
         // A volume of zeros has 13.1 dB.
         assert!(psnr > 14.1, "{sets:?}: {psnr} dB");
     }
+}
+
+/// The shipped specs that train a field.
+const NEURAL: [&str; 10] =
+    ["naf", "ni-naf", "ni-naf-published", "nerf", "dense", "fast", "balanced", "accurate", "field-tv", "accurate-tv"];
+
+/// A plugin's encoder stands in for the built-in one in every spec that has one, with all that specs ask of an encoder.
+#[test]
+fn the_planes_run_in_every_shipped_spec() {
+    let dir = tempfile::tempdir().unwrap();
+    let library = text(&example("triplane"));
+    let scan = text(&dir.path().join("scan"));
+    done(&["simulate", "phantom:head:16", "-o", &scan, "--views", "6", "--detector", "16x16"]);
+    let run = |name: &str, spec: &str, sets: &[&str]| {
+        let run = text(&dir.path().join(name));
+        let mut args = vec!["--plugin", &library, "reconstruct", &scan, "--spec", spec, "-o", &run, "--json"];
+        args.extend(["--backend", "cpu", "--reference", "truth", "--steps", "4", "--set", "encoder.type=triplane"]);
+        for set in sets {
+            args.extend(["--set", set]);
+        }
+        let record = json(&args);
+        let psnr = record["scores"]["psnr"].as_f64();
+        assert!(psnr.is_some_and(f64::is_finite), "{name}: {record:#}");
+        dir.path().join(name)
+    };
+    for spec in NEURAL {
+        run(spec, spec, &[]);
+    }
+    for tables in ["f16", "bf16"] {
+        run(tables, "balanced", &[&format!("precision.tables={tables}")]);
+    }
+    let weights = |run: &std::path::Path| {
+        let weights = conefield_io::read_weights(run.join("weights.safetensors")).unwrap();
+        weights.tensors.into_keys().filter(|name| name.starts_with("encoder.")).collect::<Vec<_>>()
+    };
+    // 16 voxels a side need no level of 64 nodes, and none of 32.
+    let needed = weights(&run("needed", "balanced", &["scene.levels=needed"]));
+    assert_eq!(needed.len(), 6, "{needed:?}");
+    let masked = weights(&run("masked", "ni-naf", &["normalizers.0.keep=[0,1,2,12]"]));
+    assert_eq!(masked, ["encoder.0.0.line", "encoder.0.0.plane", "encoder.1.0.line", "encoder.1.0.plane"]);
 }

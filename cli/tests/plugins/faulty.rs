@@ -43,7 +43,7 @@ const FAULTS: &[Fault] = &[
         &["ENTRY=another_name"],
         "a library without the function conefield_plugin",
     ),
-    refused("another version of the contract", &["FAULT=WRONG_ABI"], "ABI version: found 2.1, expected 1.x"),
+    refused("another version of the contract", &["FAULT=WRONG_ABI"], "ABI version: found 3.0, expected 2.x"),
     refused("a table that is too short", &["FAULT=SHORT_TABLE"], "the table is too short"),
     refused("functions that are too few", &["FAULT=SHORT_FUNCTIONS"], "the table is too short"),
     refused("a function that must be there is NULL", &["FAULT=NO_FORWARD"], "no function forward"),
@@ -81,10 +81,93 @@ const FAULTS: &[Fault] = &[
         ["", "finite differences: inputs", ""],
     ),
     fault("keeps all channels where some are to go", &["FAULT=REDUCES_NOTHING"], ["", "keep outputs", ""]),
+    untried("too few resolutions", &["FAULT=FEW_RESOLUTIONS"], "resolutions failed: channel 2 of 3 is left unwritten"),
+    untried(
+        "more resolutions than channels",
+        &["FAULT=MORE_RESOLUTIONS"],
+        "resolutions failed: it writes past the 3 channels that there are",
+    ),
+    untried(
+        "a resolution that is NaN",
+        &["FAULT=NAN_RESOLUTION"],
+        "resolutions failed: channel 1 of 3 tells NaN cells apart",
+    ),
+    untried(
+        "a negative resolution",
+        &["FAULT=NEGATIVE_RESOLUTION"],
+        "resolutions failed: channel 1 of 3 tells -8 cells apart",
+    ),
+    untried(
+        "reads halves without a function for them",
+        &["FAULT=NO_HALVES"],
+        "it has no kernels that read halves, and says that it has",
+    ),
+    untried(
+        "returns NaN with parameters in halves",
+        &["FAULT=NAN_HALVES"],
+        "with parameters in halves, number 0 of 3 of its output is NaN",
+    ),
+    fault("reads halves as other numbers", &["FAULT=WRONG_HALVES"], ["", "halves: outputs", ""]),
     fault("results that depend on earlier calls", &["FAULT=REMEMBERS"], ["", "tile sizes: outputs", ""]),
     fault("returns NaN after a hundred calls", &["FAULT=NOT_A_NUMBER_LATER"], ["", "extremes", "training diverged"]),
     fault("fails after a hundred calls", &["FAULT=FAILS_LATER"], ["", "no fault", "forward failed: no more numbers"]),
     fault("calls abort", &["FAULT=ABORTS"], ["", "took the checking process down (signal 6)", ABORTED]),
+];
+
+/// Faults of projectors that are fitted to a scene: `faulty_rays.c`.
+const RAY_FAULTS: &[Fault] = &[
+    fault("a projector that is fitted", &["FAULT=NONE"], ["", "", ""]),
+    fault(
+        "a projector that cannot be fitted",
+        &["FAULT=FITS_NOT"],
+        ["", "fitted to a scene", "fitted failed: no scene suits it"],
+    ),
+    fault(
+        "a fitted projector that is the old one",
+        &["FAULT=FITS_ITSELF"],
+        ["", "fitted to a scene", "fitted failed: it handed itself back instead of a new stage"],
+    ),
+    fault("a fitted projector that returns NaN", &["FAULT=FITS_NAN"], ["", "fitted to a scene", "sample 0 is at"]),
+    fault("a fitted projector whose lengths are 10 % too long", &["FAULT=FITS_LONGER"], ["", "fitted to a scene", ""]),
+];
+
+/// Faults of losses: `faulty_loss.c`.
+const LOSS_FAULTS: &[Fault] = &[
+    refused("a loss without its function", &["FAULT=NO_AT"], "no function at"),
+    untried("a negative loss", &["FAULT=NEGATIVE"], "refused: predicted -0.25, measured -0.5: loss -0.03125"),
+    untried("a loss that is NaN", &["FAULT=NOT_A_NUMBER"], "refused: predicted -0.5, measured -0.5: loss NaN"),
+    untried(
+        "a loss that writes past its slopes",
+        &["FAULT=PAST_SLOPES"],
+        "it writes outside the 16 numbers of its slopes",
+    ),
+    untried("a loss that fails", &["FAULT=FAILS"], "at failed: no more numbers"),
+    fault("a slope that is 10 % too large", &["FAULT=WRONG_SLOPE"], ["", "finite differences", ""]),
+    fault(
+        "a loss for a scan that is the old one",
+        &["FAULT=FITS_ITSELF"],
+        ["", "learns from a scan", "fitted failed: it handed itself back instead of a new stage"],
+    ),
+    fault(
+        "a loss that cannot learn from a scan",
+        &["FAULT=FITS_NOT"],
+        ["", "learns from a scan", "fitted failed: no scan suits it"],
+    ),
+];
+
+/// Faults of priors: `faulty_prior.c`.
+const PRIOR_FAULTS: &[Fault] = &[
+    untried("blocks of one point", &["FAULT=FLAT_BLOCKS"], "edge: found 1, expected 2 to 32"),
+    untried("a negative penalty", &["FAULT=NEGATIVE"], "refused: the penalty of a block is -"),
+    untried("a penalty that is NaN", &["FAULT=NOT_A_NUMBER"], "refused: the penalty of a block is NaN"),
+    untried(
+        "a prior that writes before its gradient",
+        &["FAULT=BEFORE_GRADIENT"],
+        "it writes outside the 64 numbers of its gradient",
+    ),
+    untried("a prior that fails", &["FAULT=FAILS"], "block failed: no more numbers"),
+    fault("a prior's gradient that is 10 % too large", &["FAULT=WRONG_GRADIENT"], ["", "finite differences", ""]),
+    fault("a prior's gradient that overwrites", &["FAULT=OVERWRITES"], ["", "gradients add", ""]),
 ];
 
 /// No process survives this.
@@ -168,7 +251,7 @@ fn every_fault_is_found_and_none_takes_the_process_down() {
     let reconstruct = |library: &str, number: usize, spec: &[&str], hide: &[&Path]| {
         let run = text(&dir.path().join(format!("run-{number}")));
         let mut args = vec!["--plugin", library, "reconstruct", &scan, "--spec", "fast", "-o", &run, "--steps", "300"];
-        args.extend(["--set", "training.rays=16", "--set", "projector.samples=16"]);
+        args.extend(["--set", "training.rays=16"]);
         args.extend(spec);
         let found = said(&args, hide);
         // What has failed leaves no volume.
@@ -177,13 +260,21 @@ fn every_fault_is_found_and_none_takes_the_process_down() {
         found
     };
     let here = [dir.path()];
-    for (i, fault) in FAULTS.iter().enumerate() {
+    let encoder = &["--set", "encoder.type=faulty", "--set", "projector.samples=16"][..];
+    let rays = &["--set", "projector.type=faulty"][..];
+    let encoders = FAULTS.iter().map(|f| (f, "faulty.c", encoder));
+    let (loss, prior) = (&["--set", "loss.type=faulty"][..], &["--set", "priors.0.type=faulty"][..]);
+    let all = encoders
+        .chain(RAY_FAULTS.iter().map(|f| (f, "faulty_rays.c", rays)))
+        .chain(LOSS_FAULTS.iter().map(|f| (f, "faulty_loss.c", loss)))
+        .chain(PRIOR_FAULTS.iter().map(|f| (f, "faulty_prior.c", prior)));
+    for (i, (fault, source, set)) in all.enumerate() {
         let library = dir.path().join("faulty.so");
-        cc(&sources().join("plugins/tests/faulty.c"), fault.defines, &library);
+        cc(&sources().join("plugins/tests").join(source), fault.defines, &library);
         let library = text(&library);
         let list = refusal(&library, &here);
         let check = said(&["plugins", "check", &library], &here);
-        let run = reconstruct(&library, i, &["--set", "encoder.type=faulty"], &here);
+        let run = reconstruct(&library, i, set, &here);
         fits(fault.what, "list", &list, fault.list);
         fits(fault.what, "check", &check, fault.check);
         fits(fault.what, "reconstruct", &run, fault.reconstruct);
@@ -197,7 +288,8 @@ fn every_fault_is_found_and_none_takes_the_process_down() {
         let settings = format!("{{\"when\": \"{when}\"}}");
         let checked = said(&["plugins", "check", &library, "--settings", &settings], &[folder]);
         let when = format!("encoder.when={when}");
-        let ran = reconstruct(&library, 100 + i, &["--set", "encoder.type=panics", "--set", &when], &[folder]);
+        let set = ["--set", "encoder.type=panics", "--set", &when, "--set", "projector.samples=16"];
+        let ran = reconstruct(&library, 100 + i, &set, &[folder]);
         fits(what, "check", &checked, check);
         fits(what, "reconstruct", &ran, run);
         rows.push(Row::of(what, ["", &checked, &ran], ["", check, run]));

@@ -5,7 +5,7 @@ use crate::common::{done, json, refused, text};
 use std::path::{Path, PathBuf};
 use std::process::Command;
 
-const KINDS: [&str; 5] = ["encoder", "normalizer", "field", "projector", "initializer"];
+const KINDS: [&str; 7] = ["encoder", "normalizer", "field", "projector", "initializer", "loss", "prior"];
 
 /// A scan small enough for seconds.
 fn scan(dir: &Path) -> PathBuf {
@@ -78,4 +78,21 @@ fn names_and_folders_are_checked() {
     let e = refused(1, &["plugins", "new", "mine", "--kind", "encoder", "--into", &into, "--sources", &into]);
     assert!(e.contains("--sources"), "{e}");
     assert!(!dir.path().join("mine").exists());
+}
+
+/// The page shows what `plugins new` makes, and what it makes is short.
+#[test]
+fn the_page_shows_the_encoder_that_is_made() {
+    let read = |path: &str| std::fs::read_to_string(sources().join(path)).unwrap();
+    let made = read("plugins/templates/rust/encoder.rs").replace("@name@", "waves");
+    let page = read("docs/plugins.md");
+    let shown = page.split_once("```rust\n").and_then(|(_, rest)| rest.split_once("```")).map(|(code, _)| code);
+    assert_eq!(shown, Some(&made[..]));
+    let example = read("examples/02_an_encoder.rs");
+    let own = example.split("fn main()").next().and_then(|text| text.split_once("stage_type!")).unwrap().1;
+    for (what, text) in [("plugin", &made[..]), ("example", own)] {
+        let code = |line: &&str| !line.trim().is_empty() && !line.trim().starts_with("//");
+        let lines = text.lines().filter(code).count();
+        assert!(lines <= 60, "{what}: {lines} lines of code");
+    }
 }

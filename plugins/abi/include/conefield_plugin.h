@@ -42,6 +42,16 @@
 #define CONEFIELD_INITIALIZER 4
 
 /*
+ Compares predicted with measured values.
+ */
+#define CONEFIELD_LOSS 5
+
+/*
+ Judges a field by small blocks of neighbouring points.
+ */
+#define CONEFIELD_PRIOR 6
+
+/*
  A row looks at itself alone.
  */
 #define CONEFIELD_SCOPE_ROW 0
@@ -645,6 +655,116 @@ typedef struct ConefieldInitializer {
 } ConefieldInitializer;
 
 /*
+ The noise of a scan, in the scale that stages see: a line integral `p` has the variance `sigma² · exp(growth · p)`.
+ */
+typedef struct ConefieldNoise {
+  /*
+   Standard deviation where nothing is in the way.
+   */
+  double sigma;
+  /*
+   How the variance grows with the line integral, 0 or more.
+   */
+  double growth;
+  /*
+   Measured line integrals, drawn as training draws them.
+   */
+  const double *measured;
+  /*
+   How many.
+   */
+  size_t count;
+} ConefieldNoise;
+
+/*
+ Functions of a loss.
+ */
+typedef struct ConefieldLoss {
+  /*
+   Bytes of this table.
+   */
+  size_t size;
+  /*
+   Compares `count` predicted values with the measured ones: the loss of each pair to `loss`, its derivative by the
+   predicted value to `slope`. A loss is 0 where both agree, never negative, and NaN where a value is NaN.
+   */
+  ConefieldStatus (*at)(const void *stage,
+                        const double *predicted,
+                        const double *measured,
+                        size_t count,
+                        double *loss,
+                        double *slope,
+                        struct ConefieldText *error);
+  /*
+   1 if it learns from the scan: training then uses what `fitted` makes. NULL: it does not.
+   */
+  uint32_t (*needs_scan)(const void *stage);
+  /*
+   Makes the loss for a scan with this noise, a new one, and sets `fitted` to it; one that learns nothing leaves `fitted`
+   as it is. NULL where `needs_scan` is.
+   */
+  ConefieldStatus (*fitted)(const void *stage,
+                            const struct ConefieldNoise *noise,
+                            void **fitted,
+                            struct ConefieldText *error);
+  /*
+   WGSL of `at`: a function `stage_at`, as docs/plugins.md says. NULL: it runs on the CPU alone.
+   */
+  ConefieldStatus (*wgsl)(const void *stage, struct ConefieldText *source);
+} ConefieldLoss;
+
+/*
+ Where a prior looks, and how much it counts.
+ */
+typedef struct ConefieldBlocks {
+  /*
+   Points along a block's edge, 2 to 32.
+   */
+  size_t edge;
+  /*
+   Blocks a step.
+   */
+  size_t count;
+  /*
+   Distance of neighbouring points in voxels.
+   */
+  double spacing;
+  /*
+   Weight of the mean over all points against the mean loss of a ray.
+   */
+  double weight;
+} ConefieldBlocks;
+
+/*
+ Functions of a prior.
+ */
+typedef struct ConefieldPrior {
+  /*
+   Bytes of this table.
+   */
+  size_t size;
+  /*
+   Its blocks; always the same for one stage.
+   */
+  ConefieldStatus (*blocks)(const void *stage, struct ConefieldBlocks *blocks);
+  /*
+   The penalty of one block, not negative, to `penalty`. `values` are those of its `count = edge³` points, z fastest.
+   Adds `scale` times the derivative by each of them to `gradient`. A penalty is NaN where a value is NaN.
+   */
+  ConefieldStatus (*block)(const void *stage,
+                           const double *values,
+                           size_t count,
+                           double scale,
+                           double *gradient,
+                           double *penalty,
+                           struct ConefieldText *error);
+  /*
+   WGSL of `block`: a function `stage_at`, as docs/plugins.md says. NULL: it runs on the CPU alone.
+   */
+  ConefieldStatus (*wgsl)(const void *stage, struct ConefieldText *source);
+} ConefieldPrior;
+
+/*
  A stage type that a plugin brings.
  */
 typedef struct ConefieldStage {
@@ -699,6 +819,14 @@ typedef struct ConefieldStage {
    Of an initializer; otherwise NULL.
    */
   const struct ConefieldInitializer *initializer;
+  /*
+   Of a loss; otherwise NULL.
+   */
+  const struct ConefieldLoss *loss;
+  /*
+   Of a prior; otherwise NULL.
+   */
+  const struct ConefieldPrior *prior;
 } ConefieldStage;
 
 /*

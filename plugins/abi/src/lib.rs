@@ -4,16 +4,16 @@
 //! brings. Rules that types cannot say:
 //!
 //! - **Versions.** `abi_major` must be the host's. Within a major version tables of functions only grow at their end. Each
-//!   table says its own `size`: a table that lacks a function of this version is refused, what it has beyond is not read.
-//!   Everything else here keeps its layout.
+//!   table says its own `size`: a table shorter than that of the first minor version is refused, a later function that a
+//!   table does not reach counts as NULL, and what a table has beyond is not read. Everything else here keeps its layout.
 //! - **Memory.** Nothing is handed over: the host frees what it made, the plugin frees what it made (`destroy`). What a
 //!   plugin points to in its tables lives as long as the library, which is never unloaded; what a stage points to lives
 //!   as long as the stage.
 //! - **Tiles** are channel-major: channel `c` of row `i` is `data[c * stride + i]`. A pointer may be NULL where there is
 //!   nothing (no channels, no parameters). Floats are aligned to their own size and no more.
 //! - **Threads.** A stage is called from many threads at once: `info`, `parameter`, `partition`, `describe`, `init`,
-//!   `passes`, every `forward…` and `backward…`, `resolutions`, `max_samples`, `sample`, `integrate`, `adjoint`, `apply` and
-//!   `wgsl` must allow that. `create`, `destroy`, `reduce` and `fitted` of one stage are not called at
+//!   `passes`, every `forward…` and `backward…`, `resolutions`, `max_samples`, `sample`, `integrate`, `adjoint`, `apply`,
+//!   `at`, `needs_scan`, `blocks`, `block` and `wgsl` must allow that. `create`, `destroy`, `reduce` and `fitted` of one stage are not called at
 //!   the same time as anything else of that stage, though from any thread.
 //! - **Unwinding** must not leave the library: catch panics and exceptions, return [`CONEFIELD_PANICKED`].
 //! - **Same bits.** The result must not depend on threads, on time, or on how rows are dealt to tiles.
@@ -48,6 +48,10 @@ pub const CONEFIELD_FIELD: u32 = 2;
 pub const CONEFIELD_PROJECTOR: u32 = 3;
 /// Fills weights.
 pub const CONEFIELD_INITIALIZER: u32 = 4;
+/// Compares predicted with measured values.
+pub const CONEFIELD_LOSS: u32 = 5;
+/// Judges a field by small blocks of neighbouring points.
+pub const CONEFIELD_PRIOR: u32 = 6;
 
 /// A row looks at itself alone.
 pub const CONEFIELD_SCOPE_ROW: u32 = 0;
@@ -510,6 +514,94 @@ pub struct ConefieldInitializer {
     >,
 }
 
+/// The noise of a scan, in the scale that stages see: a line integral `p` has the variance `sigma² · exp(growth · p)`.
+#[repr(C)]
+#[derive(Debug, Clone, Copy)]
+pub struct ConefieldNoise {
+    /// Standard deviation where nothing is in the way.
+    pub sigma: f64,
+    /// How the variance grows with the line integral, 0 or more.
+    pub growth: f64,
+    /// Measured line integrals, drawn as training draws them.
+    pub measured: *const f64,
+    /// How many.
+    pub count: usize,
+}
+
+/// Functions of a loss.
+#[repr(C)]
+#[derive(Debug, Clone, Copy)]
+pub struct ConefieldLoss {
+    /// Bytes of this table.
+    pub size: usize,
+    /// Compares `count` predicted values with the measured ones: the loss of each pair to `loss`, its derivative by the
+    /// predicted value to `slope`. A loss is 0 where both agree, never negative, and NaN where a value is NaN.
+    pub at: Option<
+        unsafe extern "C" fn(
+            stage: *const c_void,
+            predicted: *const f64,
+            measured: *const f64,
+            count: usize,
+            loss: *mut f64,
+            slope: *mut f64,
+            error: *mut ConefieldText,
+        ) -> ConefieldStatus,
+    >,
+    /// 1 if it learns from the scan: training then uses what `fitted` makes. NULL: it does not.
+    pub needs_scan: Option<unsafe extern "C" fn(stage: *const c_void) -> u32>,
+    /// Makes the loss for a scan with this noise, a new one, and sets `fitted` to it; one that learns nothing leaves `fitted`
+    /// as it is. NULL where `needs_scan` is.
+    pub fitted: Option<
+        unsafe extern "C" fn(
+            stage: *const c_void,
+            noise: *const ConefieldNoise,
+            fitted: *mut *mut c_void,
+            error: *mut ConefieldText,
+        ) -> ConefieldStatus,
+    >,
+    /// WGSL of `at`: a function `stage_at`, as docs/plugins.md says. NULL: it runs on the CPU alone.
+    pub wgsl: Option<unsafe extern "C" fn(stage: *const c_void, source: *mut ConefieldText) -> ConefieldStatus>,
+}
+
+/// Where a prior looks, and how much it counts.
+#[repr(C)]
+#[derive(Debug, Clone, Copy)]
+pub struct ConefieldBlocks {
+    /// Points along a block's edge, 2 to 32.
+    pub edge: usize,
+    /// Blocks a step.
+    pub count: usize,
+    /// Distance of neighbouring points in voxels.
+    pub spacing: f64,
+    /// Weight of the mean over all points against the mean loss of a ray.
+    pub weight: f64,
+}
+
+/// Functions of a prior.
+#[repr(C)]
+#[derive(Debug, Clone, Copy)]
+pub struct ConefieldPrior {
+    /// Bytes of this table.
+    pub size: usize,
+    /// Its blocks; always the same for one stage.
+    pub blocks: Option<unsafe extern "C" fn(stage: *const c_void, blocks: *mut ConefieldBlocks) -> ConefieldStatus>,
+    /// The penalty of one block, not negative, to `penalty`. `values` are those of its `count = edge³` points, z fastest.
+    /// Adds `scale` times the derivative by each of them to `gradient`. A penalty is NaN where a value is NaN.
+    pub block: Option<
+        unsafe extern "C" fn(
+            stage: *const c_void,
+            values: *const f64,
+            count: usize,
+            scale: f64,
+            gradient: *mut f64,
+            penalty: *mut f64,
+            error: *mut ConefieldText,
+        ) -> ConefieldStatus,
+    >,
+    /// WGSL of `block`: a function `stage_at`, as docs/plugins.md says. NULL: it runs on the CPU alone.
+    pub wgsl: Option<unsafe extern "C" fn(stage: *const c_void, source: *mut ConefieldText) -> ConefieldStatus>,
+}
+
 /// A stage type that a plugin brings.
 #[repr(C)]
 #[derive(Debug, Clone, Copy)]
@@ -547,6 +639,10 @@ pub struct ConefieldStage {
     pub projector: *const ConefieldProjector,
     /// Of an initializer; otherwise NULL.
     pub initializer: *const ConefieldInitializer,
+    /// Of a loss; otherwise NULL.
+    pub loss: *const ConefieldLoss,
+    /// Of a prior; otherwise NULL.
+    pub prior: *const ConefieldPrior,
 }
 
 /// What a plugin is and brings.

@@ -32,6 +32,8 @@ fn the_header_is_current() {
                 "ConefieldMap",
                 "ConefieldProjector",
                 "ConefieldInitializer",
+                "ConefieldLoss",
+                "ConefieldPrior",
                 "ConefieldStage",
             ]
             .map(String::from)
@@ -74,10 +76,14 @@ fn the_layout_is_pinned() {
         size_of::<ConefieldProjector>(),
         size_of::<ConefieldBlock>(),
         size_of::<ConefieldInitializer>(),
+        size_of::<ConefieldNoise>(),
+        size_of::<ConefieldLoss>(),
+        size_of::<ConefieldBlocks>(),
+        size_of::<ConefieldPrior>(),
         size_of::<ConefieldStage>(),
         size_of::<ConefieldPlugin>(),
     ];
-    assert_eq!(sizes, [16, 24, 32, 32, 24, 80, 32, 16, 40, 136, 44, 16, 56, 48, 16, 112, 88]);
+    assert_eq!(sizes, [16, 24, 32, 32, 24, 80, 32, 16, 40, 136, 44, 16, 56, 48, 16, 32, 40, 32, 32, 128, 88]);
     let plugin = [
         offset_of!(ConefieldPlugin, size),
         offset_of!(ConefieldPlugin, abi_major),
@@ -102,8 +108,10 @@ fn the_layout_is_pinned() {
         offset_of!(ConefieldStage, map),
         offset_of!(ConefieldStage, projector),
         offset_of!(ConefieldStage, initializer),
+        offset_of!(ConefieldStage, loss),
+        offset_of!(ConefieldStage, prior),
     ];
-    assert_eq!(stage, [0, 8, 24, 40, 56, 64, 72, 80, 88, 96, 104]);
+    assert_eq!(stage, [0, 8, 24, 40, 56, 64, 72, 80, 88, 96, 104, 112, 120]);
     let map = [
         offset_of!(ConefieldMap, size),
         offset_of!(ConefieldMap, info),

@@ -70,6 +70,8 @@ pub(crate) enum Functions {
     Map(ConefieldMap),
     Projector(ConefieldProjector),
     Initializer(ConefieldInitializer),
+    Loss(ConefieldLoss),
+    Prior(ConefieldPrior),
 }
 
 impl Library {
@@ -229,7 +231,18 @@ impl Type {
                     needed("apply", initializer.apply.is_some())?;
                     (Kind::Initializer, Functions::Initializer(initializer))
                 }
-                other => return Err(Error::invalid(place, &at, format!("kind {other}"), "0 to 4")),
+                CONEFIELD_LOSS => {
+                    let loss = sized(t.loss, place, &what)?;
+                    needed("at", loss.at.is_some())?;
+                    (Kind::Loss, Functions::Loss(loss))
+                }
+                CONEFIELD_PRIOR => {
+                    let prior = sized(t.prior, place, &what)?;
+                    needed("blocks", prior.blocks.is_some())?;
+                    needed("block", prior.block.is_some())?;
+                    (Kind::Prior, Functions::Prior(prior))
+                }
+                other => return Err(Error::invalid(place, &at, format!("kind {other}"), "0 to 6")),
             }
         };
         Ok(Self {
@@ -246,8 +259,7 @@ impl Type {
         })
     }
 
-    /// Makes a stage from settings, without their type, for `width` channels in. A refusal names the setting under the
-    /// stage's kind, as built-in stages do.
+    /// Makes a stage from settings, without their type, for `width` channels in. A refusal names the setting.
     pub(crate) fn create(self: &Arc<Self>, settings: &Value, width: usize) -> Result<Handle> {
         let settings = settings.to_string();
         let mut stage = ptr::null_mut();
@@ -264,20 +276,15 @@ impl Type {
         Ok(Handle { ty: self.clone(), stage })
     }
 
-    /// What `create` or `fitted` refused, as an error about the spec.
+    /// What `create` or `fitted` refused, as an error about the stage's settings: its owner says where they stand.
     pub(crate) fn refusal(&self, call: &str, status: ConefieldStatus, text: &str) -> Error {
         let parts = text.split_once(": found ").and_then(|(field, rest)| {
             let (found, expected) = rest.rsplit_once(", expected ")?;
             Some((field, found, expected))
         });
         match (status, parts) {
-            (CONEFIELD_INVALID, Some((field, found, expected))) => {
-                let kind = if self.kind == Kind::Normalizer { "normalizers" } else { self.kind.name() };
-                let inside = field == kind || field.starts_with(&format!("{kind}."));
-                let field = if inside { field.into() } else { format!("{kind}.{field}") };
-                Error::invalid("spec", field, found, expected)
-            }
-            (CONEFIELD_INVALID, None) => Error::invalid("spec", self.kind.name(), text, "settings that make a stage"),
+            (CONEFIELD_INVALID, Some((field, found, expected))) => Error::invalid("spec", field, found, expected),
+            (CONEFIELD_INVALID, None) => Error::invalid("spec", "", text, "settings that make a stage"),
             _ => self.failed(call, status, text),
         }
     }
@@ -320,6 +327,15 @@ impl Drop for Handle {
 }
 
 impl Handle {
+    /// What `call` made of this stage: a new one, or nothing.
+    pub fn made(&self, stage: *mut c_void, call: &str) -> Result<Option<Self>> {
+        if stage == self.stage {
+            let what = "it handed itself back instead of a new stage";
+            return Err(self.ty.failed(call, CONEFIELD_FAILED, what));
+        }
+        Ok((!stage.is_null()).then(|| Self { ty: self.ty.clone(), stage }))
+    }
+
     /// The stage in its own words.
     pub fn describe(&self) -> String {
         let mut text = Text::new();

@@ -1,11 +1,15 @@
 //! A library's types as settings that a spec may hold.
 
 use crate::library::{Library, Type};
-use crate::stage::{initializer, map, projector};
+use crate::stage::{initializer, loss, map, prior, projector};
 use conefield_core::arena::Weights;
 use conefield_core::error::Result;
+use conefield_core::loss::Loss;
+use conefield_core::prior::Prior;
 use conefield_core::registry::{self, Kind, Make, NewType};
-use conefield_core::settings::{EncoderSpec, FieldSpec, Initializer, InitializerSpec, NormalizerSpec, ProjectorSpec};
+use conefield_core::settings::{
+    EncoderSpec, FieldSpec, Initializer, InitializerSpec, LossSpec, NormalizerSpec, PriorSpec, ProjectorSpec,
+};
 use conefield_core::stage::{Encoder, Field, Normalizer, Projector};
 use serde::{Serialize, Serializer};
 use serde_json::Value;
@@ -39,7 +43,9 @@ fn make(ty: Arc<Type>) -> Make {
         Kind::Normalizer => Make::Normalizer(Box::new(move |v| Ok(Box::new(settings(v))))),
         Kind::Field => Make::Field(Box::new(move |v| Ok(Box::new(settings(v))))),
         Kind::Projector => Make::Projector(Box::new(move |v| Ok(Box::new(settings(v))))),
-        // A library's table has stages of these five kinds.
+        Kind::Loss => Make::Loss(Box::new(move |v| Ok(Box::new(settings(v))))),
+        Kind::Prior => Make::Prior(Box::new(move |v| Ok(Box::new(settings(v))))),
+        // A library's table has stages of these seven kinds.
         _ => Make::Initializer(Box::new(move |v| Ok(Box::new(settings(v))))),
     }
 }
@@ -104,6 +110,22 @@ impl FieldSpec for Loaded {
 impl ProjectorSpec for Loaded {
     fn build(&self) -> Result<Box<dyn Projector>> {
         Ok(Box::new(projector::build(&self.ty, &self.settings)?))
+    }
+
+    named!();
+}
+
+impl LossSpec for Loaded {
+    fn build(&self) -> Result<Box<dyn Loss>> {
+        Ok(Box::new(loss::build(&self.ty, &self.settings)?))
+    }
+
+    named!();
+}
+
+impl PriorSpec for Loaded {
+    fn build(&self) -> Result<Box<dyn Prior>> {
+        Ok(Box::new(prior::build(&self.ty, &self.settings)?))
     }
 
     named!();

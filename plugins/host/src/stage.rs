@@ -3,7 +3,9 @@
 #![allow(unsafe_code)]
 
 pub mod initializer;
+pub mod loss;
 pub mod map;
+pub mod prior;
 pub mod projector;
 
 use crate::library::{Handle, whole_text};

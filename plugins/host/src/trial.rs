@@ -216,3 +216,62 @@ pub(crate) fn projector(ty: &Type, cast: impl Fn(&UnitRay, Option<u64>, usize) -
     }
     Ok(())
 }
+
+/// Numbers on either side of the few that a loss or a prior writes.
+const EDGE: usize = 256;
+
+/// Room for `n` numbers in double precision between guard zones.
+fn room(n: usize) -> Vec<f64> {
+    vec![f64::from_bits(UNTOUCHED.into()); n + 2 * EDGE]
+}
+
+/// What is wrong with the zones of `room`.
+fn spilt(room: &[f64], what: &str) -> Option<String> {
+    let mut zones = room[..EDGE].iter().chain(&room[room.len() - EDGE..]);
+    let broken = zones.any(|v| v.to_bits() != u64::from(UNTOUCHED));
+    broken.then(|| format!("it writes outside the {} numbers of its {what}", room.len() - 2 * EDGE))
+}
+
+/// Tries a loss of type `ty`: `at` compares pairs of a predicted and a measured value.
+pub(crate) fn loss(ty: &Type, at: impl Fn(&[f64], &[f64], [&mut [f64]; 2]) -> Result<()>) -> Result<()> {
+    let values: Vec<f64> = (0..16).map(|i| 0.25 * f64::from(i) - 0.5).collect();
+    for shift in [0.0, 0.25, -1.0] {
+        let predicted: Vec<f64> = values.iter().map(|v| v + shift).collect();
+        let [mut loss, mut slope] = [room(values.len()), room(values.len())];
+        let inside = EDGE..EDGE + values.len();
+        at(&predicted, &values, [&mut loss[inside.clone()], &mut slope[inside.clone()]])?;
+        let complaint = spilt(&loss, "losses").or_else(|| spilt(&slope, "slopes"));
+        let complaint = complaint.or_else(|| {
+            let all = inside.map(|i| (loss[i], slope[i]));
+            let unwritten = |v: f64| v.to_bits() == u64::from(UNTOUCHED);
+            let bad = all
+                .enumerate()
+                .find(|(_, (l, s))| !(l.is_finite() && *l >= 0.0 && s.is_finite()) || unwritten(*l) || unwritten(*s));
+            let (i, (loss, slope)) = bad?;
+            let [p, m] = [predicted[i], values[i]];
+            Some(if unwritten(loss) || unwritten(slope) {
+                format!("predicted {p}, measured {m}: a number is left unwritten")
+            } else {
+                format!("predicted {p}, measured {m}: loss {loss}, slope {slope}")
+            })
+        });
+        if let Some(complaint) = complaint {
+            return Err(refused(ty, &complaint));
+        }
+    }
+    Ok(())
+}
+
+/// Tries a prior of type `ty` on a block of `points`: `block` adds to the gradient and gives the penalty.
+pub(crate) fn prior(ty: &Type, points: usize, block: impl Fn(&[f64], &mut [f64]) -> Result<f64>) -> Result<()> {
+    let values: Vec<f64> = (0..points).map(|i| f64::from(unit(mix(5, i as u64)))).collect();
+    let mut gradient = room(points);
+    gradient[EDGE..EDGE + points].fill(0.0);
+    let penalty = block(&values, &mut gradient[EDGE..EDGE + points])?;
+    let complaint = spilt(&gradient, "gradient").or_else(|| {
+        let wild = gradient[EDGE..EDGE + points].iter().position(|g| !g.is_finite());
+        let wild = wild.map(|i| format!("derivative {i} of {points} is {}", gradient[EDGE + i]));
+        (!(penalty.is_finite() && penalty >= 0.0)).then(|| format!("the penalty of a block is {penalty}")).or(wild)
+    });
+    complaint.map_or(Ok(()), |c| Err(refused(ty, &c)))
+}

@@ -2,8 +2,12 @@
 
 use conefield_core::arena::Weights;
 use conefield_core::error::{Error, Result};
+use conefield_core::loss::Loss;
+use conefield_core::prior::Prior;
 use conefield_core::registry::{Kind, StageType};
-use conefield_core::settings::{EncoderSpec, FieldSpec, Initializer, InitializerSpec, NormalizerSpec, ProjectorSpec};
+use conefield_core::settings::{
+    EncoderSpec, FieldSpec, Initializer, InitializerSpec, LossSpec, NormalizerSpec, PriorSpec, ProjectorSpec,
+};
 use conefield_core::spec::stage::read;
 use conefield_core::stage::{Encoder, Field, GradKind, Info, Normalizer, Parameter, Projector, Reduced, Scope, Stage};
 use conefield_plugin_abi::*;
@@ -26,6 +30,8 @@ pub enum AnyStage {
     Field(Box<dyn Field>),
     Projector(Box<dyn Projector>),
     Initializer(Box<dyn Initializer>),
+    Loss(Box<dyn Loss>),
+    Prior(Box<dyn Prior>),
 }
 
 /// What the host asks of a map again and again.
@@ -39,10 +45,10 @@ impl Built {
     /// The stage that `settings`, without their type, make of `t`.
     pub fn new(t: &StageType, mut settings: Value, width: usize) -> Result<Self> {
         let Some(keys) = settings.as_object_mut() else {
-            return Err(Error::invalid("spec", t.kind.name(), &settings, "a table of settings"));
+            return Err(Error::invalid("spec", "", &settings, "a table of settings"));
         };
         keys.insert("type".into(), t.name.into());
-        let refused = |e: String| Error::invalid("spec", t.kind.name(), e, "settings of this type");
+        let refused = |e: String| Error::invalid("spec", "", e, "settings of this type");
         let no_weights = |path: &str| -> Result<Weights> {
             Err(Error::unsupported(path, "a plugin's initializer reads its own files"))
         };
@@ -57,6 +63,8 @@ impl Built {
                 let spec = read::<dyn InitializerSpec>(settings).map_err(refused)?;
                 AnyStage::Initializer(spec.build(&no_weights)?)
             }
+            Kind::Loss => AnyStage::Loss(read::<dyn LossSpec>(settings).map_err(refused)?.build()?),
+            Kind::Prior => AnyStage::Prior(read::<dyn PriorSpec>(settings).map_err(refused)?.build()?),
             other => return Err(Error::unsupported(t.name, format!("a {other} cannot come from a plugin"))),
         };
         Ok(Self::of(stage))
@@ -109,7 +117,7 @@ impl AnyStage {
             Self::Encoder(s) => Some(s.as_ref()),
             Self::Normalizer(s) => Some(s.as_ref()),
             Self::Field(s) => Some(s.as_ref()),
-            Self::Projector(_) | Self::Initializer(_) => None,
+            Self::Projector(_) | Self::Initializer(_) | Self::Loss(_) | Self::Prior(_) => None,
         }
     }
 
@@ -117,6 +125,8 @@ impl AnyStage {
         match self {
             Self::Projector(p) => p.describe(),
             Self::Initializer(i) => i.describe(),
+            Self::Loss(l) => l.describe(),
+            Self::Prior(p) => p.describe(),
             Self::Encoder(s) => s.describe(),
             Self::Normalizer(s) => s.describe(),
             Self::Field(s) => s.describe(),

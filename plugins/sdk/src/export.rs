@@ -69,6 +69,8 @@ fn stage(t: &'static StageType) -> Option<ConefieldStage> {
         map: ptr::null(),
         projector: ptr::null(),
         initializer: ptr::null(),
+        loss: ptr::null(),
+        prior: ptr::null(),
     };
     match t.kind {
         Kind::Encoder => (stage.kind, stage.map) = (CONEFIELD_ENCODER, &shims::MAP),
@@ -76,6 +78,8 @@ fn stage(t: &'static StageType) -> Option<ConefieldStage> {
         Kind::Field => (stage.kind, stage.map) = (CONEFIELD_FIELD, &shims::MAP),
         Kind::Projector => (stage.kind, stage.projector) = (CONEFIELD_PROJECTOR, &shims::PROJECTOR),
         Kind::Initializer => (stage.kind, stage.initializer) = (CONEFIELD_INITIALIZER, &shims::INITIALIZER),
+        Kind::Loss => (stage.kind, stage.loss) = (CONEFIELD_LOSS, &shims::LOSS),
+        Kind::Prior => (stage.kind, stage.prior) = (CONEFIELD_PRIOR, &shims::PRIOR),
         _ => return None,
     }
     Some(stage)

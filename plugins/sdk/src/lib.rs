@@ -19,7 +19,9 @@ mod built;
 mod export;
 mod shims;
 
-pub use conefield_core::{Error, Result, arena, error, random, simd, spec, stage, stage_type, wgsl};
+pub use conefield_core::{
+    Error, Result, arena, by_row, error, half, loss, prelude, prior, random, settings, simd, stage, stage_type, wgsl,
+};
 pub use conefield_plugin_abi as abi;
 pub use export::Plugin;
 

@@ -9,6 +9,8 @@
 use crate::built::{AnyStage, Built, MapInfo};
 use conefield_core::arena::{Arena, Block, Layout};
 use conefield_core::error::{Error, Result, ensure};
+use conefield_core::loss::{Loss, NoiseModel};
+use conefield_core::prior::{Blocks, Prior};
 use conefield_core::registry::StageType;
 use conefield_core::simd::Real;
 use conefield_core::stage::{Grads, Halves, Kernel, Lengths, Projector, Samples, Stage, Tile, TileMut, UnitRay};
@@ -50,6 +52,19 @@ pub static PROJECTOR: ConefieldProjector = ConefieldProjector {
     fitted: Some(fitted),
     wgsl: Some(wgsl),
 };
+
+/// Functions of every loss.
+pub static LOSS: ConefieldLoss = ConefieldLoss {
+    size: size_of::<ConefieldLoss>(),
+    at: Some(at),
+    needs_scan: Some(needs_scan),
+    fitted: Some(fitted_loss),
+    wgsl: Some(wgsl),
+};
+
+/// Functions of every prior.
+pub static PRIOR: ConefieldPrior =
+    ConefieldPrior { size: size_of::<ConefieldPrior>(), blocks: Some(blocks), block: Some(block), wgsl: Some(wgsl) };
 
 /// Functions of every initializer.
 pub static INITIALIZER: ConefieldInitializer =
@@ -142,7 +157,7 @@ pub unsafe extern "C" fn create(
     guard(error, || {
         // SAFETY: see the top of this file; `context` is what the table says, a static.
         let (t, settings) = unsafe { (&*context.cast::<StageType>(), text(settings)?) };
-        let settings = serde_json::from_str(settings).map_err(|e| Error::invalid("spec", t.kind.name(), e, "JSON"))?;
+        let settings = serde_json::from_str(settings).map_err(|e| Error::invalid("spec", "", e, "JSON"))?;
         let built = Box::new(Built::new(t, settings, width)?);
         // SAFETY: see the top of this file.
         unsafe { *stage = Box::into_raw(built).cast() };
@@ -542,6 +557,8 @@ unsafe extern "C" fn wgsl(stage: *const c_void, source: *mut ConefieldText) -> C
         // SAFETY: see the top of this file.
         let fragment = match unsafe { &built(stage).stage } {
             AnyStage::Projector(p) => p.wgsl(),
+            AnyStage::Loss(l) => l.wgsl(),
+            AnyStage::Prior(p) => p.wgsl(),
             other => other.map().and_then(|s| s.wgsl()),
         };
         let fragment = fragment.ok_or_else(|| Error::unsupported("this stage", "it has no WGSL"))?;
@@ -639,6 +656,106 @@ unsafe extern "C" fn fitted(
             unsafe { *out = Box::into_raw(built).cast() };
         }
         Ok(())
+    })
+}
+
+unsafe fn loss<'a>(stage: *const c_void) -> Result<&'a dyn Loss> {
+    // SAFETY: see the top of this file.
+    match unsafe { &built(stage).stage } {
+        AnyStage::Loss(l) => Ok(l.as_ref()),
+        _ => Err(Error::unsupported("this stage", "it is no loss")),
+    }
+}
+
+unsafe extern "C" fn at(
+    stage: *const c_void,
+    predicted: *const f64,
+    measured: *const f64,
+    count: usize,
+    out: *mut f64,
+    slope: *mut f64,
+    error: *mut ConefieldText,
+) -> ConefieldStatus {
+    guard(error, || {
+        // SAFETY: see the top of this file.
+        let stage = unsafe { loss(stage)? };
+        // SAFETY: see the top of this file; every pointer has `count` numbers or room for them.
+        let (from, to) = unsafe {
+            let (predicted, measured) = (many(predicted, count), many(measured, count));
+            (predicted.iter().zip(measured), many_mut(out, count).iter_mut().zip(many_mut(slope, count)))
+        };
+        for ((&predicted, &measured), (loss, slope)) in from.zip(to) {
+            (*loss, *slope) = stage.at(predicted, measured);
+        }
+        stage.fault()
+    })
+}
+
+unsafe extern "C" fn needs_scan(stage: *const c_void) -> u32 {
+    let mut needs = false;
+    guard(ptr::null_mut(), || {
+        // SAFETY: see the top of this file.
+        needs = unsafe { loss(stage)? }.needs_scan();
+        Ok(())
+    });
+    needs.into()
+}
+
+unsafe extern "C" fn fitted_loss(
+    stage: *const c_void,
+    noise: *const ConefieldNoise,
+    out: *mut *mut c_void,
+    error: *mut ConefieldText,
+) -> ConefieldStatus {
+    guard(error, || {
+        // SAFETY: see the top of this file.
+        let (stage, measured, sigma, growth) = unsafe {
+            let ConefieldNoise { sigma, growth, measured, count } = *noise;
+            (loss(stage)?, many(measured, count), sigma, growth)
+        };
+        if let Some(fitted) = stage.fitted(&NoiseModel { sigma, growth, measured }) {
+            let built = Box::new(Built::of(AnyStage::Loss(fitted)));
+            // SAFETY: see the top of this file.
+            unsafe { *out = Box::into_raw(built).cast() };
+        }
+        stage.fault()
+    })
+}
+
+unsafe fn prior<'a>(stage: *const c_void) -> Result<&'a dyn Prior> {
+    // SAFETY: see the top of this file.
+    match unsafe { &built(stage).stage } {
+        AnyStage::Prior(p) => Ok(p.as_ref()),
+        _ => Err(Error::unsupported("this stage", "it is no prior")),
+    }
+}
+
+unsafe extern "C" fn blocks(stage: *const c_void, out: *mut ConefieldBlocks) -> ConefieldStatus {
+    guard(ptr::null_mut(), || {
+        // SAFETY: see the top of this file.
+        let Blocks { edge, count, spacing, weight } = unsafe { prior(stage)? }.blocks();
+        // SAFETY: see the top of this file.
+        unsafe { *out = ConefieldBlocks { edge, count, spacing, weight } };
+        Ok(())
+    })
+}
+
+unsafe extern "C" fn block(
+    stage: *const c_void,
+    values: *const f64,
+    count: usize,
+    scale: f64,
+    gradient: *mut f64,
+    penalty: *mut f64,
+    error: *mut ConefieldText,
+) -> ConefieldStatus {
+    guard(error, || {
+        // SAFETY: see the top of this file.
+        unsafe {
+            let stage = prior(stage)?;
+            *penalty = stage.block(many(values, count), scale, many_mut(gradient, count));
+            stage.fault()
+        }
     })
 }
 

@@ -1,19 +1,20 @@
 //! The stage through conefield's conformance kit.
 
-use @crate@::Settings;
+use @crate@::Waves;
 use conefield_conformance::{Options, check_encoder};
-use conefield_plugin::spec::EncoderSpec;
+use conefield_plugin::prelude::*;
 
 #[test]
 fn it_conforms() {
-    for bands in [1, 6] {
-        let report = check_encoder(Settings { bands }.build().unwrap().as_ref(), &Options::encoder());
+    for waves in [1, 6] {
+        let stage = Waves { waves, ..Waves::default() }.build().unwrap();
+        let report = check_encoder(stage.as_ref(), &Options::encoder());
         assert!(report.passed(), "{report}");
     }
 }
 
 #[test]
-fn no_bands_are_refused_by_name() {
-    let e = Settings { bands: 0 }.build().err().unwrap().to_string();
-    assert!(e.contains("encoder.bands: found 0"), "{e}");
+fn no_waves_are_refused_by_name() {
+    let e = Waves { waves: 0, ..Waves::default() }.build().err().unwrap().to_string();
+    assert!(e.contains("waves: found 0"), "{e}");
 }

@@ -1,18 +1,9 @@
-//! A field for conefield: features `[n, F]` to attenuation `[n, 1]`.
-//!
-//! This start is a weighted sum through a softplus, which is never negative: `y = ln(1 + exp(w·x + b))`. Its backward pass
-//! is written by hand; `cargo test` compares it with finite differences.
+//! A field for conefield: features `[n, F]` to attenuation `[n, 1]`, `y = ln(1 + exp(w·x + b))`, which is never negative.
 
-use conefield_plugin::error::Result;
-use conefield_plugin::random::{mix, unit};
-use conefield_plugin::simd::Real;
-use conefield_plugin::spec::FieldSpec;
-use conefield_plugin::stage::{Field, GradKind, Grads, Info, Kernel, Parameter, Reduced, Scope, Stage, Tile, TileMut};
-use schemars::JsonSchema;
-use serde::{Deserialize, Serialize};
+use conefield_plugin::prelude::*;
 
 conefield_plugin::export!();
-conefield_plugin::stage_type!(Field, "@name@", Settings, "a weighted sum through a softplus");
+stage_type!(Field, "@name@", Settings, "a weighted sum through a softplus");
 
 /// What a spec may set.
 #[derive(Debug, Clone, Serialize, Deserialize, JsonSchema)]
@@ -31,7 +22,7 @@ impl Default for Settings {
 #[typetag::serde(name = "@name@")]
 impl FieldSpec for Settings {
     fn build(&self, width: usize) -> Result<Box<dyn Field>> {
-        Ok(Box::new(Sum { width, bias: self.bias }))
+        Ok(Box::new(ByRow::new(Sum { width, bias: self.bias })))
     }
 }
 
@@ -40,71 +31,20 @@ struct Sum {
     bias: f32,
 }
 
-// One source for the single precision that trains and the double precision that checks it.
-impl<R: Real> Kernel<R> for Sum {
-    /// Leaves the slope of the softplus for `backward`.
-    fn forward(&self, params: &[R], x: Tile<'_, R>, mut y: TileMut<'_, R>, mut tape: TileMut<'_, R>) {
-        let y = y.channel(0);
-        y.fill(params[self.width]);
-        for c in 0..self.width {
-            for (y, &x) in y.iter_mut().zip(x.channel(c)) {
-                *y += params[c] * x;
-            }
-        }
-        for (y, slope) in y.iter_mut().zip(tape.channel(0)) {
-            *slope = R::of(1.0 / (1.0 + (-y.f64()).exp()));
-            *y = y.softplus();
-        }
-    }
-
-    fn backward(
-        &self,
-        params: &[R],
-        x: Tile<'_, R>,
-        mut tape: TileMut<'_, R>,
-        dy: Tile<'_, R>,
-        grads: Grads<'_, R>,
-        mut dx: Option<TileMut<'_, R>>,
-    ) {
-        // From here on the gradient of the sum itself.
-        let dsum = tape.channel(0);
-        for (slope, &dy) in dsum.iter_mut().zip(dy.channel(0)) {
-            *slope *= dy;
-        }
-        let mut add = |at: usize, sum: R| {
-            if grads.range.contains(&at) {
-                grads.values[at - grads.range.start] += sum;
-            }
-        };
-        for c in 0..self.width {
-            add(c, x.channel(c).iter().zip(&*dsum).map(|(&x, &d)| x * d).sum());
-            if let Some(dx) = &mut dx {
-                for (dx, &d) in dx.channel(c).iter_mut().zip(&*dsum) {
-                    *dx = params[c] * d;
-                }
-            }
-        }
-        add(self.width, dsum.iter().copied().sum());
+impl Sum {
+    fn sum<R: Real>(&self, params: &[impl Stored<R>], x: &[R]) -> R {
+        let weighted: R = x.iter().zip(params).map(|(&x, w)| w.value() * x).sum();
+        weighted + params[self.width].value()
     }
 }
 
-impl Stage for Sum {
-    fn info(&self) -> Info {
-        Info {
-            input: self.width,
-            output: 1,
-            params: self.width + 1,
-            tape: 1,
-            scope: Scope::Row,
-            grads: GradKind::Dense,
-            macs: self.width,
-            identity: false,
-        }
+impl RowMap for Sum {
+    fn widths(&self) -> [usize; 2] {
+        [self.width, 1]
     }
 
-    fn parameters(&self) -> Vec<Parameter> {
-        let block = |name: &str, n, start| Parameter { name: name.into(), shape: vec![n], start };
-        vec![block("weight", self.width, 0), block("bias", 1, self.width)]
+    fn parameters(&self) -> Vec<(String, Vec<usize>)> {
+        vec![("weight".into(), vec![self.width]), ("bias".into(), vec![1])]
     }
 
     fn init(&self, seed: u64, params: &mut [f32]) {
@@ -115,26 +55,21 @@ impl Stage for Sum {
         params[self.width] = self.bias;
     }
 
-    fn kernel(&self) -> &dyn Kernel<f32> {
-        self
+    fn forward<R: Real>(&self, params: &[impl Stored<R>], x: &[R], y: &mut [R]) {
+        y[0] = self.sum(params, x).softplus();
     }
 
-    fn reference(&self) -> Option<&dyn Kernel<f64>> {
-        Some(self)
+    fn backward<R: Real>(&self, params: &[impl Stored<R>], x: &[R], dy: &[R], grads: &mut Sums<'_, R>, dx: &mut [R]) {
+        let slope = R::of(1.0 / (1.0 + (-self.sum(params, x).f64()).exp()));
+        let d = dy[0] * slope;
+        for c in 0..self.width {
+            grads.add(c, d * x[c]);
+            dx[c] += d * params[c].value();
+        }
+        grads.add(self.width, d);
     }
 
     fn describe(&self) -> String {
         format!("@name@: softplus of a sum of {} channels", self.width)
-    }
-}
-
-impl Field for Sum {
-    /// Without some inputs it is a shorter sum.
-    fn keep_inputs(&self, keep: &[usize]) -> Result<Reduced<dyn Field>> {
-        Ok(Reduced {
-            stage: Box::new(Self { width: keep.len(), bias: self.bias }),
-            params: keep.iter().copied().chain([self.width]).map(|c| c..c + 1).collect(),
-            channels: vec![0],
-        })
     }
 }

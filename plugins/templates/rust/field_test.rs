@@ -2,7 +2,7 @@
 
 use @crate@::Settings;
 use conefield_conformance::{Options, check_field};
-use conefield_plugin::spec::FieldSpec;
+use conefield_plugin::settings::FieldSpec;
 
 #[test]
 fn it_conforms() {

@@ -6,7 +6,7 @@
 use conefield_plugin::arena::{Arena, InitReport, Layout, Weights};
 use conefield_plugin::error::{Result, ensure};
 use conefield_plugin::random::{mix, unit};
-use conefield_plugin::spec::{Initializer, InitializerSpec};
+use conefield_plugin::settings::{Initializer, InitializerSpec};
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
@@ -33,7 +33,7 @@ impl Default for Settings {
 impl InitializerSpec for Settings {
     fn build(&self, _: &dyn Fn(&str) -> Result<Weights>) -> Result<Box<dyn Initializer>> {
         let good = self.bound.is_finite() && self.bound >= 0.0;
-        ensure(good, "spec", "initializer.bound", self.bound, "a finite number of at least 0")?;
+        ensure(good, "spec", "bound", self.bound, "a finite number of at least 0")?;
         Ok(Box::new(self.clone()))
     }
 }

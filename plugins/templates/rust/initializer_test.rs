@@ -3,7 +3,7 @@
 use @crate@::Settings;
 use conefield_conformance::check_initializer;
 use conefield_plugin::arena::Weights;
-use conefield_plugin::spec::InitializerSpec;
+use conefield_plugin::settings::InitializerSpec;
 
 #[test]
 fn it_conforms() {

@@ -5,7 +5,7 @@
 
 use conefield_plugin::error::Result;
 use conefield_plugin::simd::Real;
-use conefield_plugin::spec::NormalizerSpec;
+use conefield_plugin::settings::NormalizerSpec;
 use conefield_plugin::stage::{
     GradKind, Grads, Info, Kernel, Normalizer, Parameter, Reduced, Scope, Stage, Tile, TileMut,
 };

@@ -2,7 +2,7 @@
 
 use @crate@::Settings;
 use conefield_conformance::{Options, check_normalizer};
-use conefield_plugin::spec::NormalizerSpec;
+use conefield_plugin::settings::NormalizerSpec;
 
 #[test]
 fn it_conforms() {

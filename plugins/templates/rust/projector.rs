@@ -5,7 +5,7 @@
 
 use conefield_plugin::error::{Result, ensure};
 use conefield_plugin::random::{mix, unit};
-use conefield_plugin::spec::ProjectorSpec;
+use conefield_plugin::settings::ProjectorSpec;
 use conefield_plugin::stage::{Projector, Samples, UnitRay};
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
@@ -32,7 +32,7 @@ impl Default for Settings {
 #[typetag::serde(name = "@name@")]
 impl ProjectorSpec for Settings {
     fn build(&self) -> Result<Box<dyn Projector>> {
-        ensure((1..=65_536).contains(&self.samples), "spec", "projector.samples", self.samples, "1 to 65536")?;
+        ensure((1..=65_536).contains(&self.samples), "spec", "samples", self.samples, "1 to 65536")?;
         Ok(Box::new(self.clone()))
     }
 }

@@ -2,7 +2,7 @@
 
 use @crate@::Settings;
 use conefield_conformance::check_projector;
-use conefield_plugin::spec::ProjectorSpec;
+use conefield_plugin::settings::ProjectorSpec;
 
 #[test]
 fn it_conforms() {

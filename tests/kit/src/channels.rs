@@ -120,6 +120,35 @@ pub fn encoder_outputs(stage: &dyn Encoder, options: &Options) -> Outcome {
     })
 }
 
+/// How fine channels are: one number each, that of the same channel in a smaller encoder.
+pub fn resolutions(stage: &dyn Encoder) -> Outcome {
+    let Some(cells) = stage.resolutions() else {
+        return Outcome::Skipped("it does not say how fine its channels are".into());
+    };
+    let n = stage.info().output;
+    if cells.len() != n {
+        return Outcome::Failed(format!("{} numbers for {n} channels", cells.len()));
+    }
+    if let Some(c) = cells.iter().position(|v| !(v.is_finite() && *v > 0.0)) {
+        return Outcome::Failed(format!("channel {c} tells {} cells apart", cells[c]));
+    }
+    if stage.coarse_to_fine() && !cells.is_sorted() {
+        return Outcome::Failed(format!("channels stand from coarse to fine, their cells do not: {cells:?}"));
+    }
+    for keep in choices(n) {
+        // Whether it can leave out channels is another property.
+        let Ok(smaller) = stage.keep_outputs(&keep) else { continue };
+        let want: Vec<f64> = keep.iter().map(|&c| cells[c]).collect();
+        let found = smaller.stage.resolutions();
+        if found.as_ref() != Some(&want) {
+            return Outcome::Failed(format!("keeping {keep:?}: {found:?} instead of {want:?}"));
+        }
+    }
+    let range = [f64::INFINITY, 0.0];
+    let [low, high] = cells.iter().fold(range, |[a, b], &v| [a.min(v), b.max(v)]);
+    Outcome::Passed(format!("{low} to {high} cells along the cube's side"))
+}
+
 /// A normalizer without some inputs is a smaller stage of the same kind.
 pub fn normalizer_inputs(stage: &dyn Normalizer, options: &Options) -> Outcome {
     let info = stage.info();

@@ -1,6 +1,6 @@
 //! Parameters that are read in halves: the same arithmetic, of rounded numbers.
 
-use crate::call::{data, error, forward, gradients as backward, params};
+use crate::call::{data, differing, error, forward, forward_in_passes, gradients as backward, params, settle};
 use crate::{Options, Outcome};
 use conefield_core::half::{Half, round};
 use conefield_core::stage::{Halves, Kernel, Reader, Stage};
@@ -37,10 +37,33 @@ pub fn gradients(stage: &dyn Stage, options: &Options) -> Outcome {
     compared(stage, options, off)
 }
 
-fn compared(stage: &dyn Stage, options: &Options, off: Off) -> Outcome {
-    let Some(Halves { f16, bf16 }) = stage.halves() else {
-        return Outcome::Skipped("it reads parameters as they are".into());
+/// All passes in order leave what forward leaves.
+pub fn passes(stage: &dyn Stage, options: &Options) -> Outcome {
+    let Some(Halves { f16, bf16 }) = stage.halves() else { return not_read() };
+    let (info, n) = (stage.info(), 37);
+    let (x, _) = data::<f32>(&info, options, n);
+    let differs = |name: &str, k: &dyn Kernel<f32>| {
+        let (whole, parts) = (forward(k, &info, &[], &x, n), forward_in_passes(k, &info, &[], &x, n));
+        differing(&format!("{name} in passes, output"), &parts[0], &whole[0])
     };
+    let exact = params(stage, options);
+    let complaint = differs("f16", &Reader { kernel: f16, params: &rounded(&exact) });
+    let complaint = complaint.or_else(|| differs("bf16", &Reader { kernel: bf16, params: &rounded(&exact) }));
+    settle(complaint, &format!("{}, together the bits of forward", f16.passes()))
+}
+
+fn rounded<H: Half>(exact: &[f32]) -> Vec<H> {
+    let mut halves = vec![H::default(); exact.len()];
+    round(exact, &mut halves);
+    halves
+}
+
+fn not_read() -> Outcome {
+    Outcome::Skipped("it reads parameters as they are".into())
+}
+
+fn compared(stage: &dyn Stage, options: &Options, off: Off) -> Outcome {
+    let Some(Halves { f16, bf16 }) = stage.halves() else { return not_read() };
     let (mut words, mut fine) = (vec![], true);
     for (name, [same, rounding], bits) in
         [("f16", of(stage, f16, options, off), 11), ("bf16", of(stage, bf16, options, off), 8)]
@@ -55,8 +78,7 @@ fn compared(stage: &dyn Stage, options: &Options, off: Off) -> Outcome {
 
 fn of<H: Half>(stage: &dyn Stage, kernel: &dyn Kernel<f32, H>, options: &Options, off: Off) -> [f64; 2] {
     let exact: Vec<f32> = params(stage, options);
-    let mut halves = vec![H::default(); exact.len()];
-    round(&exact, &mut halves);
+    let halves: Vec<H> = rounded(&exact);
     let rounded: Vec<f32> = halves.iter().map(|h| h.value()).collect();
     off(stage, &Reader { kernel, params: &halves }, options, [&exact, &rounded])
 }

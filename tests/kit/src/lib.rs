@@ -136,6 +136,7 @@ pub fn check(stage: &dyn Stage, options: &Options) -> Report {
     report.add("single precision: gradients", || gradients::single_gradients(stage, options));
     report.add("halves: outputs", || halves::outputs(stage, options));
     report.add("halves: gradients", || halves::gradients(stage, options));
+    report.add("halves: passes", || halves::passes(stage, options));
     report.add("tile sizes: outputs", || behaviour::tile_outputs(stage, options));
     report.add("passes", || behaviour::passes(stage, options));
     report.add("tile sizes: gradients", || behaviour::tile_gradients(stage, options));
@@ -153,9 +154,10 @@ pub fn check(stage: &dyn Stage, options: &Options) -> Report {
     report
 }
 
-/// [`check`], and what an encoder must keep to when channels are left out.
+/// [`check`], and what an encoder must keep to when it says how fine it is and when channels are left out.
 pub fn check_encoder(stage: &dyn Encoder, options: &Options) -> Report {
     let mut report = check(stage, options);
+    report.add("resolutions", || channels::resolutions(stage));
     report.add("keep outputs", || channels::encoder_outputs(stage, options));
     report
 }

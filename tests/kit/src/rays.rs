@@ -2,13 +2,19 @@
 
 use crate::call::{Draw, settle};
 use crate::{Outcome, Report};
-use conefield_core::stage::{Projector, Samples, UnitRay};
+use conefield_core::stage::{Lengths, Projector, Samples, UnitRay};
 
 /// Largest mismatch of `<Aμ, y>` and `<μ, Aᵀy>` over their size.
 const ADJOINT: f64 = 1e-12;
 
-/// Runs every property that a projector of rays must have.
+/// Runs every property that a projector of rays must have, as it is and fitted to a scene.
 pub fn check_projector(projector: &dyn Projector) -> Report {
+    let mut report = as_it_is(projector);
+    report.add("fitted to a scene", || fitted(projector));
+    report
+}
+
+fn as_it_is(projector: &dyn Projector) -> Report {
     let mut report = Report { stage: projector.describe(), entries: vec![] };
     report.add("samples are bounded", || bounded(projector));
     report.add("samples are finite", || finite(projector));
@@ -22,6 +28,26 @@ pub fn check_projector(projector: &dyn Projector) -> Report {
     report.add("threads", || threads(projector));
     report.add("no fault", || settle(projector.fault().err().map(|e| e.to_string()), "none was reported"));
     report
+}
+
+/// A projector that is made for a scene has every property, and is the same each time.
+fn fitted(p: &dyn Projector) -> Outcome {
+    let lengths = Lengths { voxel_mm: 2.0, cell_mm: Some(3.0) };
+    let (one, other) = match (p.fitted(lengths), p.fitted(lengths)) {
+        (Ok(Some(one)), Ok(Some(other))) => (one, other),
+        (Ok(None), Ok(None)) => return Outcome::Skipped("its settings count in no lengths of a scene".into()),
+        (Err(e), _) | (_, Err(e)) => return Outcome::Failed(e.to_string()),
+        _ => return Outcome::Failed("there is one for a scene at times".into()),
+    };
+    let report = as_it_is(one.as_ref());
+    if !report.passed() {
+        return Outcome::Failed(format!("the fitted projector fails {:?}:\n{report}", report.failed()));
+    }
+    let differs = rays().iter().any(|r| {
+        let [a, b] = [&one, &other].map(|p| samples(p.as_ref(), r, Some(1)));
+        a.points != b.points || a.weights != b.weights
+    });
+    settle(differs.then(|| "made twice for one scene, it gives two results".into()), &one.describe())
 }
 
 /// Rays through the unit cube in many directions, some along axes, with box and published range in agreement.

@@ -4,8 +4,8 @@ use crate::{out, parse, plugins};
 use clap::Args;
 use conefield_backend_wgpu::{Shared, Wgpu};
 use conefield_conformance::{
-    Options, Outcome, Report, check_encoder, check_field, check_initializer, check_normalizer, check_projector,
-    check_projector_wgsl, check_wgsl,
+    Options, Outcome, Report, check_encoder, check_field, check_initializer, check_loss, check_loss_wgsl,
+    check_normalizer, check_prior, check_prior_wgsl, check_projector, check_projector_wgsl, check_wgsl,
 };
 use conefield_core::arena::Weights;
 use conefield_core::precision::Tables;
@@ -254,6 +254,26 @@ impl Check {
                     |path: &str| -> Result<Weights> { Err(Error::unsupported(path, "no weights are read here")) };
                 let stage = make(settings.clone())?.build(&none)?;
                 add(None, check_initializer(stage.as_ref()));
+            }
+            Make::Loss(make) => {
+                let stage = make(settings.clone())?.build()?;
+                let report = check_loss(stage.as_ref());
+                add(
+                    None,
+                    device.beside(report, stage.wgsl().is_some(), |shared| {
+                        check_loss_wgsl(stage.as_ref(), &|l, pairs| shared.losses(l, pairs))
+                    }),
+                );
+            }
+            Make::Prior(make) => {
+                let stage = make(settings.clone())?.build()?;
+                let report = check_prior(stage.as_ref());
+                add(
+                    None,
+                    device.beside(report, stage.wgsl().is_some(), |shared| {
+                        check_prior_wgsl(stage.as_ref(), &|p, values| shared.penalty(p, values))
+                    }),
+                );
             }
             _ => return Err(Error::unsupported(&t.name, format!("a {} cannot come from a plugin", t.kind))),
         }

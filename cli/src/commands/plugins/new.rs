@@ -34,6 +34,8 @@ enum StageKind {
     Field,
     Projector,
     Initializer,
+    Loss,
+    Prior,
 }
 
 #[derive(Debug, Clone, Copy, PartialEq, Eq, ValueEnum)]
@@ -69,6 +71,8 @@ impl StageKind {
             Self::Field => Kind::Field,
             Self::Projector => Kind::Projector,
             Self::Initializer => Kind::Initializer,
+            Self::Loss => Kind::Loss,
+            Self::Prior => Kind::Prior,
         }
     }
 
@@ -80,6 +84,8 @@ impl StageKind {
             Self::Field => [template!("rust/field.rs"), template!("rust/field_test.rs")],
             Self::Projector => [template!("rust/projector.rs"), template!("rust/projector_test.rs")],
             Self::Initializer => [template!("rust/initializer.rs"), template!("rust/initializer_test.rs")],
+            Self::Loss => [template!("rust/loss.rs"), template!("rust/loss_test.rs")],
+            Self::Prior => [template!("rust/prior.rs"), template!("rust/prior_test.rs")],
         }
     }
 
@@ -91,6 +97,8 @@ impl StageKind {
             Self::Field => template!("c/field.c"),
             Self::Projector => template!("c/projector.c"),
             Self::Initializer => template!("c/initializer.c"),
+            Self::Loss => template!("c/loss.c"),
+            Self::Prior => template!("c/prior.c"),
         }
     }
 }
@@ -160,7 +168,10 @@ impl New {
     /// A small pipeline with the new stage in it.
     fn spec(&self) -> String {
         let (name, kind) = (&self.name, self.kind.kind());
-        let table = if kind == Kind::Normalizer { "[[normalizers]]".into() } else { format!("[{kind}]") };
+        let table = match kind {
+            Kind::Normalizer | Kind::Prior => format!("[[{kind}s]]"),
+            _ => format!("[{kind}]"),
+        };
         format!(
             "# The small spec that ships with conefield, with the stage of this plugin.\nextends = \"fast\"\nname = \
              \"{name}\"\ndescription = \"The spec fast with the {kind} of the plugin {name}.\"\n\n{table}\ntype = \"{name}\"\n"

@@ -4,8 +4,8 @@
 
 use conefield_plugin::error::{Result, ensure};
 use conefield_plugin::random::{mix, unit};
+use conefield_plugin::settings::FieldSpec;
 use conefield_plugin::simd::Real;
-use conefield_plugin::spec::FieldSpec;
 use conefield_plugin::stage::{Field, GradKind, Grads, Info, Kernel, Parameter, Scope, Stage, Tile, TileMut};
 use conefield_plugin::wgsl::Fragment;
 use schemars::JsonSchema;
@@ -35,10 +35,10 @@ impl Default for Siren {
 #[typetag::serde(name = "siren")]
 impl FieldSpec for Siren {
     fn build(&self, width: usize) -> Result<Box<dyn Field>> {
-        ensure((1..=1024).contains(&self.width), "spec", "field.width", self.width, "1 to 1024")?;
-        ensure((1..=16).contains(&self.depth), "spec", "field.depth", self.depth, "1 to 16")?;
+        ensure((1..=1024).contains(&self.width), "spec", "width", self.width, "1 to 1024")?;
+        ensure((1..=16).contains(&self.depth), "spec", "depth", self.depth, "1 to 16")?;
         let good = self.omega.is_finite() && self.omega > 0.0 && self.omega <= 1000.0;
-        ensure(good, "spec", "field.omega", self.omega, "above 0 and at most 1000")?;
+        ensure(good, "spec", "omega", self.omega, "above 0 and at most 1000")?;
         Ok(Box::new(SirenField::new(self.clone(), width)))
     }
 }

@@ -2,8 +2,8 @@
 //! of one sample and stays as it is.
 
 use conefield_plugin::error::{Result, ensure};
+use conefield_plugin::settings::NormalizerSpec;
 use conefield_plugin::simd::Real;
-use conefield_plugin::spec::NormalizerSpec;
 use conefield_plugin::stage::{
     GradKind, Grads, Info, Kernel, Normalizer, Parameter, Reduced, Scope, Stage, Tile, TileMut,
 };
@@ -30,7 +30,7 @@ impl Default for RaySmooth {
 impl NormalizerSpec for RaySmooth {
     fn build(&self, width: usize) -> Result<Box<dyn Normalizer>> {
         let good = (0.0..1.0).contains(&self.strength);
-        ensure(good, "spec", "normalizers.strength", self.strength, "0 to below 1")?;
+        ensure(good, "spec", "strength", self.strength, "0 to below 1")?;
         Ok(Box::new(RaySmoothStage { width, strength: self.strength }))
     }
 }

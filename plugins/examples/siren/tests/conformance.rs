@@ -1,7 +1,7 @@
 //! Both stages through conefield's conformance kit.
 
 use conefield_conformance::{Options, check_field, check_normalizer};
-use conefield_plugin::spec::{FieldSpec, NormalizerSpec};
+use conefield_plugin::settings::{FieldSpec, NormalizerSpec};
 use siren::sine::Siren;
 use siren::smooth::RaySmooth;
 

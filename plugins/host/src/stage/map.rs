@@ -47,7 +47,7 @@ pub(crate) fn build(ty: &Arc<Type>, settings: &Value, width: usize) -> Result<Ma
     trial::timed(ty, move || {
         let stage = MapStage::new(own.create(&settings, width)?)?;
         let found = format!("{width} channels for a stage that takes {}", stage.info.input);
-        ensure(stage.info.input == width, "spec", own.kind.name(), found, "as many as it was made for")?;
+        ensure(stage.info.input == width, "spec", "", found, "as many as it was made for")?;
         trial::map(&own, &stage)?;
         Ok(stage)
     })
@@ -181,13 +181,8 @@ impl MapStage {
             return Err(ty.failed("reduce", status, &error.text()));
         }
         let wrong = |what: &str| ty.failed("reduce", CONEFIELD_FAILED, what);
-        if r.stage.is_null() {
-            return Err(wrong("it made nothing"));
-        }
-        if r.stage == self.handle.stage {
-            return Err(wrong("it handed itself back instead of a new stage"));
-        }
-        let smaller = Self::new(Handle { ty: self.handle.ty.clone(), stage: r.stage })?;
+        let handle = self.handle.made(r.stage, "reduce")?.ok_or_else(|| wrong("it made nothing"))?;
+        let smaller = Self::new(handle)?;
         if r.params_count > info.params || r.channels_count > info.input.max(info.output) {
             return Err(wrong("it keeps more than there is"));
         }

@@ -163,14 +163,7 @@ impl Projector for ProjectorStage {
         if status != CONEFIELD_OK {
             return Err(self.ty().refusal("fitted", status, &error.text()));
         }
-        if stage.is_null() {
-            return Ok(None);
-        }
-        if stage == self.handle.stage {
-            let what = "it handed itself back instead of a new stage";
-            return Err(self.ty().failed("fitted", CONEFIELD_FAILED, what));
-        }
-        let handle = Handle { ty: self.handle.ty.clone(), stage };
+        let Some(handle) = self.handle.made(stage, "fitted")? else { return Ok(None) };
         let ty = handle.ty.clone();
         Ok(Some(Box::new(trial::timed(&ty, move || Self::tried(handle))?)))
     }

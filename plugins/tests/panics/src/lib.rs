@@ -1,7 +1,7 @@
 //! An encoder that panics when it is told to: none of it may take the host down.
 
 use conefield_plugin::error::Result;
-use conefield_plugin::spec::EncoderSpec;
+use conefield_plugin::settings::EncoderSpec;
 use conefield_plugin::stage::{Encoder, GradKind, Grads, Info, Kernel, Parameter, Scope, Stage, Tile, TileMut};
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};

@@ -2,7 +2,7 @@
 
 use conefield_encoders::hash_grid::HashGrid;
 use conefield_plugin::error::Result;
-use conefield_plugin::spec::EncoderSpec;
+use conefield_plugin::settings::EncoderSpec;
 use conefield_plugin::stage::Encoder;
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};

@@ -1,0 +1,100 @@
+//! An encoder of your own in the tree: settings, forward, backward and registration, then a reconstruction with it. The
+//! same lines make a plugin: docs/plugins.md.
+
+use conefield_backend_cpu::Cpu;
+use conefield_conformance::{Options, check_encoder};
+use conefield_core::method::{Context, Job, Limits, Silent};
+use conefield_core::prelude::*;
+use conefield_projectors::simulate::{Protocol, phantom, simulate};
+
+stage_type!(Encoder, "waves", Waves, "waves of learned directions");
+
+/// `y = sin(d·x + p)` with directions `d` and phases `p` that are learned.
+#[derive(Debug, Clone, Serialize, Deserialize, JsonSchema)]
+#[serde(deny_unknown_fields, default)]
+struct Waves {
+    /// Channels, a wave each.
+    waves: usize,
+    /// Radians along the cube's side that a wave starts with, at most.
+    frequency: f32,
+}
+
+impl Default for Waves {
+    fn default() -> Self {
+        Self { waves: 32, frequency: 20.0 }
+    }
+}
+
+#[typetag::serde(name = "waves")]
+impl EncoderSpec for Waves {
+    fn build(&self) -> Result<Box<dyn Encoder>> {
+        ensure((1..=4096).contains(&self.waves), "spec", "waves", self.waves, "1 to 4096")?;
+        Ok(Box::new(ByRow::new(self.clone())))
+    }
+}
+
+impl Waves {
+    /// The angle of wave `c`, whose parameters are its direction and its phase.
+    fn angle<R: Real>(params: &[impl Stored<R>], x: &[R], c: usize) -> R {
+        let [a, b, d, phase] = [0, 1, 2, 3].map(|k| params[4 * c + k].value());
+        a * x[0] + b * x[1] + d * x[2] + phase
+    }
+}
+
+impl RowMap for Waves {
+    fn widths(&self) -> [usize; 2] {
+        [3, self.waves]
+    }
+
+    fn parameters(&self) -> Vec<(String, Vec<usize>)> {
+        vec![("wave".into(), vec![self.waves, 4])]
+    }
+
+    fn init(&self, seed: u64, params: &mut [f32]) {
+        for (i, p) in params.iter_mut().enumerate() {
+            *p = self.frequency * (2.0 * unit(mix(seed, i as u64)) - 1.0);
+        }
+    }
+
+    fn forward<R: Real>(&self, params: &[impl Stored<R>], x: &[R], y: &mut [R]) {
+        for (c, y) in y.iter_mut().enumerate() {
+            *y = Self::angle(params, x, c).sin_cos().0;
+        }
+    }
+
+    fn backward<R: Real>(&self, params: &[impl Stored<R>], x: &[R], dy: &[R], grads: &mut Sums<'_, R>, dx: &mut [R]) {
+        for (c, &dy) in dy.iter().enumerate() {
+            let slope = dy * Self::angle(params, x, c).sin_cos().1;
+            for k in 0..3 {
+                grads.add(4 * c + k, slope * x[k]);
+                dx[k] += slope * params[4 * c + k].value();
+            }
+            grads.add(4 * c + 3, slope);
+        }
+    }
+
+    fn describe(&self) -> String {
+        format!("waves: {} waves", self.waves)
+    }
+}
+
+fn main() -> Result<(), Box<dyn std::error::Error>> {
+    // The conformance kit compares the gradients with finite differences, and more.
+    let report = check_encoder(Waves::default().build()?.as_ref(), &Options::encoder());
+    assert!(report.passed(), "{report}");
+
+    let truth = phantom(48);
+    let protocol = Protocol::r2(&truth.grid).with_detector([48, 48]).with_views(30);
+    let scan = simulate(&truth, &protocol)?;
+
+    let set = ["encoder.type=waves", "encoder.waves=48", "field.width=16"].map(String::from);
+    let loaded = conefield::specs::read("fast", &set)?;
+    let backend = Cpu::new();
+    let mut plan = loaded.spec.method.plan(&Context::new(&backend))?;
+    let limits = Limits { steps: Some(200), ..Limits::default() };
+    let solution = plan.run(&Job { limits, ..Job::new(&scan, &backend) }, &mut Silent)?;
+    let volume = solution.result.volume(&backend)?;
+    let psnr = conefield_metrics::psnr(volume.data.view(), truth.data.view(), 1.0)?;
+    println!("{} steps in {:.1} s: {psnr:.2} dB", solution.steps, solution.train_s);
+    Ok(())
+}

@@ -1,0 +1,77 @@
+/* A prior for conefield in C: half the squared differences of neighbouring points, in small blocks placed at random. */
+@head@
+
+static ConefieldStatus create(const void *context, struct ConefieldStr settings, size_t width, void **stage,
+                              struct ConefieldText *error) {
+    (void)context;
+    (void)width; /* 0, of a prior */
+    (void)error;
+    struct ConefieldBlocks *b = malloc(sizeof *b);
+    if (b == NULL) return CONEFIELD_FAILED;
+    /* The host refuses blocks that cannot be. */
+    *b = (struct ConefieldBlocks){.edge = (size_t)number(settings, "edge"), .count = (size_t)number(settings, "blocks"),
+                                  .spacing = number(settings, "spacing"), .weight = number(settings, "weight")};
+    *stage = b;
+    return CONEFIELD_OK;
+}
+
+static void destroy(void *stage) {
+    free(stage);
+}
+
+static ConefieldStatus describe(const void *stage, struct ConefieldText *text) {
+    char line[80];
+    snprintf(line, sizeof line, "squared differences, weight %g", ((const struct ConefieldBlocks *)stage)->weight);
+    say(text, line);
+    return CONEFIELD_OK;
+}
+
+static ConefieldStatus blocks(const void *stage, struct ConefieldBlocks *out) {
+    *out = *(const struct ConefieldBlocks *)stage;
+    return CONEFIELD_OK;
+}
+
+/* The penalty. `scale` times its derivatives go on top of `gradient`. */
+static ConefieldStatus block(const void *stage, const double *values, size_t count, double scale, double *gradient,
+                             double *penalty, struct ConefieldText *error) {
+    (void)error;
+    size_t edge = ((const struct ConefieldBlocks *)stage)->edge;
+    const size_t steps[] = {edge * edge, edge, 1};
+    double sum = 0;
+    for (size_t axis = 0; axis < 3; axis++) {
+        size_t step = steps[axis];
+        for (size_t i = 0; i < count; i++) {
+            if (i / step % edge + 1 == edge) continue;
+            double d = values[i + step] - values[i];
+            sum += 0.5 * d * d;
+            gradient[i + step] += scale * d;
+            gradient[i] -= scale * d;
+        }
+    }
+    *penalty = sum;
+    return CONEFIELD_OK;
+}
+
+static const struct ConefieldPrior PRIOR = {
+    .size = sizeof PRIOR,
+    .blocks = blocks,
+    .block = block,
+};
+
+static const struct ConefieldStage STAGES[] = {{
+    .kind = CONEFIELD_PRIOR,
+    .name = TEXT("@name@"),
+    .doc = TEXT("squared differences of neighbouring points"),
+    .schema = TEXT(
+        "{\"type\":\"object\",\"properties\":{"
+        "\"weight\":{\"type\":\"number\",\"minimum\":0,\"default\":0.1,\"description\":\"Weight against the mean loss of a ray.\"},"
+        "\"blocks\":{\"type\":\"integer\",\"minimum\":1,\"default\":32,\"description\":\"Blocks a step.\"},"
+        "\"edge\":{\"type\":\"integer\",\"minimum\":2,\"maximum\":32,\"default\":8,\"description\":\"Points along a block's edge.\"},"
+        "\"spacing\":{\"type\":\"number\",\"default\":1.0,\"description\":\"Distance of the points in voxels.\"}}}"),
+    .create = create,
+    .destroy = destroy,
+    .describe = describe,
+    .prior = &PRIOR,
+}};
+
+@plugin@

@@ -1,0 +1,54 @@
+//! A loss for conefield: `sqrt(d² + s²) − s` of the difference `d`, an absolute value that is rounded near 0.
+
+use conefield_plugin::prelude::*;
+
+conefield_plugin::export!();
+stage_type!(Loss, "@name@", Settings, "the absolute difference, rounded near 0");
+
+/// What a spec may set.
+#[derive(Debug, Clone, Serialize, Deserialize, JsonSchema)]
+#[serde(deny_unknown_fields, default)]
+pub struct Settings {
+    /// Differences well below this count by their square.
+    pub scale: f64,
+}
+
+impl Default for Settings {
+    fn default() -> Self {
+        Self { scale: 0.01 }
+    }
+}
+
+#[typetag::serde(name = "@name@")]
+impl LossSpec for Settings {
+    fn build(&self) -> Result<Box<dyn Loss>> {
+        let good = self.scale.is_finite() && self.scale > 0.0;
+        ensure(good, "spec", "scale", self.scale, "a positive finite number")?;
+        Ok(Box::new(self.clone()))
+    }
+}
+
+impl Loss for Settings {
+    /// The loss and its derivative by `predicted`.
+    fn at(&self, predicted: f64, measured: f64) -> (f64, f64) {
+        let d = predicted - measured;
+        let size = d.hypot(self.scale);
+        (d * (d / (size + self.scale)), d / size)
+    }
+
+    /// The same for a GPU; without it the loss runs on the CPU alone.
+    fn wgsl(&self) -> Option<Fragment> {
+        let scale = format!("const stage_scale = f32({:?});\n", self.scale as f32);
+        let at = "fn stage_at(predicted: f32, measured: f32) -> vec2<f32> {
+    let d = predicted - measured;
+    let size = sqrt(d * d + stage_scale * stage_scale);
+    return vec2<f32>(d * (d / (size + stage_scale)), d / size);
+}
+";
+        Some(Fragment::new(&[&scale, at]))
+    }
+
+    fn describe(&self) -> String {
+        format!("@name@: rounded below {}", self.scale)
+    }
+}

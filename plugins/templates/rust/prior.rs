@@ -1,0 +1,58 @@
+//! A prior for conefield: half the squared differences of neighbouring points, in small blocks placed at random.
+
+use conefield_plugin::prelude::*;
+
+conefield_plugin::export!();
+stage_type!(Prior, "@name@", Settings, "squared differences of neighbouring points");
+
+/// What a spec may set.
+#[derive(Debug, Clone, Serialize, Deserialize, JsonSchema)]
+#[serde(deny_unknown_fields, default)]
+pub struct Settings {
+    /// Weight against the mean loss of a ray.
+    pub weight: f64,
+    /// Blocks a step.
+    pub blocks: usize,
+    /// Points along a block's edge.
+    pub edge: usize,
+    /// Distance of the points in voxels.
+    pub spacing: f64,
+}
+
+impl Default for Settings {
+    fn default() -> Self {
+        Self { weight: 0.1, blocks: 32, edge: 8, spacing: 1.0 }
+    }
+}
+
+#[typetag::serde(name = "@name@")]
+impl PriorSpec for Settings {
+    fn build(&self) -> Result<Box<dyn Prior>> {
+        Prior::blocks(self).validate()?;
+        Ok(Box::new(self.clone()))
+    }
+}
+
+impl Prior for Settings {
+    fn blocks(&self) -> Blocks {
+        Blocks { edge: self.edge, count: self.blocks, spacing: self.spacing, weight: self.weight }
+    }
+
+    /// The penalty. `scale` times its derivatives go on top of `gradient`.
+    fn block(&self, values: &[f64], scale: f64, gradient: &mut [f64]) -> f64 {
+        let mut sum = 0.0;
+        for step in [self.edge * self.edge, self.edge, 1] {
+            for i in (0..values.len()).filter(|i| i / step % self.edge + 1 < self.edge) {
+                let d = values[i + step] - values[i];
+                sum += 0.5 * d * d;
+                gradient[i + step] += scale * d;
+                gradient[i] -= scale * d;
+            }
+        }
+        sum
+    }
+
+    fn describe(&self) -> String {
+        format!("@name@: squared differences, weight {}", self.weight)
+    }
+}

@@ -1,0 +1,104 @@
+//! Stages that are written for one row at a time, as encoder, normalizer and field.
+
+use conefield_conformance::{Options, check_encoder, check_field, check_normalizer};
+use conefield_core::by_row::{ByRow, RowMap, Sums};
+use conefield_core::half::Stored;
+use conefield_core::simd::Real;
+use conefield_core::stage::{Encoder, Field, GradKind, Grads, Kernel, Normalizer, Stage, Tile, TileMut};
+
+/// `y_c = w_c·sin(x_a)·x_b + v`, where `a` and `b` are channels beside each other.
+struct Products {
+    input: usize,
+    output: usize,
+}
+
+impl Products {
+    fn pair(&self, c: usize) -> [usize; 2] {
+        [c % self.input, (c + 1) % self.input]
+    }
+}
+
+impl RowMap for Products {
+    fn widths(&self) -> [usize; 2] {
+        [self.input, self.output]
+    }
+
+    fn parameters(&self) -> Vec<(String, Vec<usize>)> {
+        vec![("factor".into(), vec![self.output]), ("shift".into(), vec![1])]
+    }
+
+    fn init(&self, seed: u64, params: &mut [f32]) {
+        params.fill(0.5 + (seed % 3) as f32);
+    }
+
+    fn forward<R: Real>(&self, params: &[impl Stored<R>], x: &[R], y: &mut [R]) {
+        for (c, y) in y.iter_mut().enumerate() {
+            let [a, b] = self.pair(c);
+            *y += params[c].value() * x[a].sin_cos().0 * x[b] + params[self.output].value();
+        }
+    }
+
+    fn backward<R: Real>(&self, params: &[impl Stored<R>], x: &[R], dy: &[R], grads: &mut Sums<'_, R>, dx: &mut [R]) {
+        for (c, &dy) in dy.iter().enumerate() {
+            let [a, b] = self.pair(c);
+            let (w, (sin, cos)) = (params[c].value(), x[a].sin_cos());
+            grads.add(c, dy * sin * x[b]);
+            grads.add(self.output, dy);
+            dx[a] += dy * w * cos * x[b];
+            dx[b] += dy * w * sin;
+        }
+    }
+
+    fn describe(&self) -> String {
+        "products: of channels beside each other".into()
+    }
+
+    fn resolutions(&self) -> Option<Vec<f64>> {
+        Some((0..self.output).map(|c| (c + 1) as f64).collect())
+    }
+}
+
+fn products(input: usize, output: usize) -> ByRow<Products> {
+    ByRow::new(Products { input, output })
+}
+
+#[test]
+fn it_conforms_as_every_kind() {
+    let report = check_encoder(&products(3, 5), &Options::encoder());
+    assert!(report.passed(), "{report}");
+    let report = check_normalizer(&products(4, 4), &Options::features());
+    assert!(report.passed(), "{report}");
+    let report = check_field(&products(4, 1), &Options::features());
+    assert!(report.passed(), "{report}");
+}
+
+#[test]
+fn channels_are_left_out() {
+    let small = Encoder::keep_outputs(&products(3, 5), &[1, 4]).unwrap();
+    assert_eq!(small.stage.info().output, 2);
+    assert_eq!(small.stage.resolutions(), Some(vec![2.0, 5.0]));
+    assert!(small.stage.describe().contains("2 of 5 channels"), "{}", small.stage.describe());
+    assert_eq!(Field::keep_inputs(&products(4, 1), &[0, 3]).unwrap().stage.info().input, 2);
+    // What a normalizer does without an input, only its author knows.
+    assert!(Normalizer::keep_inputs(&products(4, 4), &[0]).is_err());
+}
+
+/// Many parameters are summed by one worker, in the order of the rows, and only those that it is asked for.
+#[test]
+fn many_parameters_are_scattered() {
+    let many = products(3, 1 << 20);
+    assert_eq!(many.info().grads, GradKind::Scatter);
+    assert_eq!(products(3, 5).info().grads, GradKind::Dense);
+    let (small, mut grads) = (products(3, 5), [7.0f32; 2]);
+    let (params, x, dy) = ([1.0f32; 6], [1.0f32, 2.0, 3.0], [1.0f32; 5]);
+    small.backward(
+        &params,
+        Tile::new(&x, 1),
+        TileMut::new(&mut [], 1),
+        Tile::new(&dy, 1),
+        Grads { values: &mut grads, range: 1..3 },
+        None,
+    );
+    let want = [7.0 + 2.0f32.sin() * 3.0, 7.0 + 3.0f32.sin() * 1.0];
+    assert_eq!(grads, want);
+}
