@@ -13,7 +13,7 @@ mod parse;
 mod pca;
 mod plugins;
 mod progress;
-mod run;
+mod run_folder;
 mod segmenter;
 mod signals;
 pub mod specs;
@@ -28,6 +28,7 @@ use {
 
 use clap::Parser;
 use conefield_core::Error;
+use std::ffi::OsString;
 use std::process::ExitCode;
 
 /// Reconstructs CT volumes from few cone-beam X-ray views with neural attenuation fields.
@@ -40,9 +41,14 @@ struct Cli {
     general: commands::General,
 }
 
-/// Runs the command line. Exit status: 0 done, 1 failed, 2 wrong use, 130 or 143 interrupted.
+/// Runs the command line of this process.
 pub fn main() -> ExitCode {
-    let cli = Cli::parse();
+    run(std::env::args_os())
+}
+
+/// Runs a command line, the program's name first. Exit status: 0 done, 1 failed, 2 wrong use, 130 or 143 interrupted.
+pub fn run(args: impl IntoIterator<Item = OsString>) -> ExitCode {
+    let cli = Cli::parse_from(args);
     let general = cli.general;
     progress::start_log(general.verbose, general.quiet);
     if let Some(bytes) = general.memory {

@@ -12,7 +12,7 @@ use crate::outgoing::{self, WrittenVolume};
 use crate::parse;
 use crate::plugins;
 use crate::progress::{Keeper, Progress};
-use crate::run::RunFolder;
+use crate::run_folder::RunFolder;
 use crate::{files, out, signals, specs};
 use clap::Args;
 use conefield_core::backend::Backend;

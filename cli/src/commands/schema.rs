@@ -1,15 +1,36 @@
 //! `conefield schema`
 
-use crate::out;
+use crate::{out, specs};
 use clap::Args;
+use conefield_core::registry::{Kind, Origin, stage_types};
 use conefield_core::{Result, spec::schema};
 
 /// Print the JSON Schema of spec files, for editors.
 #[derive(Args)]
-pub struct SchemaArgs {}
+pub struct SchemaArgs {
+    /// Print lists of the shipped specs and of all types instead, as tables in Markdown.
+    #[arg(long)]
+    tables: bool,
+}
 
 impl SchemaArgs {
     pub fn run(self) -> Result<()> {
-        out::json(&schema::spec())
+        if self.tables { out::say(&tables()?) } else { out::json(&schema::spec()) }
     }
+}
+
+/// The shipped specs, then every type that comes with the program.
+fn tables() -> Result<String> {
+    let mut lines = vec!["| spec | what |".to_owned(), "| --- | --- |".into()];
+    for s in specs::SHIPPED {
+        lines.push(format!("| `{}` | {} |", s.name, specs::read(s.name, &[])?.spec.description));
+    }
+    lines.extend([String::new(), "| kind | type | what |".into(), "| --- | --- | --- |".into()]);
+    for &kind in Kind::ALL {
+        let of_kind = stage_types().into_iter().filter(|t| t.kind == kind);
+        for t in of_kind.filter(|t| matches!(t.origin, Origin::Linked { .. })) {
+            lines.push(format!("| {kind} | `{}` | {} |", t.name, t.doc));
+        }
+    }
+    Ok(lines.join("\n"))
 }
