@@ -154,6 +154,8 @@ pub enum Origin {
         package: &'static str,
         /// JSON Schema of its settings, without `type`.
         schema: fn() -> Schema,
+        /// Settings in JSON, without `type`, by which it is tried.
+        example: &'static str,
     },
     /// It came with a library at run time.
     Loaded {
@@ -176,6 +178,16 @@ impl StageType {
             Origin::Linked { schema, .. } => schema().to_value(),
             Origin::Loaded { schema, .. } => schema.clone(),
         }
+    }
+
+    /// A spec's table with settings by which it is tried: those of its registration, or its defaults.
+    pub fn example(&self) -> Value {
+        let mut table = match &self.origin {
+            Origin::Linked { example, .. } => serde_json::from_str(example).unwrap_or_else(|_| serde_json::json!({})),
+            Origin::Loaded { .. } => serde_json::json!({}),
+        };
+        table["type"] = self.name.into();
+        table
     }
 
     /// Who brings it.
@@ -259,10 +271,14 @@ pub use inventory;
 #[doc(hidden)]
 pub use schemars;
 
-/// Registers a settings type under the name that specs use. The type implements `JsonSchema`.
+/// Registers a settings type under the name that specs use. The type implements `JsonSchema`. Where default settings are
+/// missing or make a large stage, `example = "{ … }"` gives settings in JSON that the conformance kit tries.
 #[macro_export]
 macro_rules! stage_type {
-    ($kind:ident, $name:literal, $settings:ty, $doc:literal) => {
+    ($kind:ident, $name:literal, $settings:ty, $doc:literal $(,)?) => {
+        $crate::stage_type!($kind, $name, $settings, $doc, example = "{}");
+    };
+    ($kind:ident, $name:literal, $settings:ty, $doc:literal, example = $example:literal $(,)?) => {
         $crate::registry::inventory::submit! {
             $crate::registry::StageType {
                 kind: $crate::registry::Kind::$kind,
@@ -271,6 +287,7 @@ macro_rules! stage_type {
                 origin: $crate::registry::Origin::Linked {
                     package: env!("CARGO_PKG_NAME"),
                     schema: || $crate::registry::schemars::schema_for!($settings),
+                    example: $example,
                 },
             }
         }

@@ -29,7 +29,13 @@ fn list_of_encoders(_: &mut SchemaGenerator) -> Schema {
     json_schema!({ "type": "array", "items": { "x-stage": "encoder" }, "minItems": 1 })
 }
 
-conefield_core::stage_type!(Encoder, "concat", Concat, "several encoders side by side");
+conefield_core::stage_type!(
+    Encoder,
+    "concat",
+    Concat,
+    "several encoders side by side",
+    example = r#"{"encoders": ["identity", {"type": "frequency", "bands": 2, "max_frequency": 2.0}]}"#
+);
 
 #[typetag::serde(name = "concat")]
 impl EncoderSpec for Concat {

@@ -42,7 +42,13 @@ impl Default for DenseGrid {
     }
 }
 
-conefield_core::stage_type!(Encoder, "dense-grid", DenseGrid, "multi-resolution grid without hashing");
+conefield_core::stage_type!(
+    Encoder,
+    "dense-grid",
+    DenseGrid,
+    "multi-resolution grid without hashing",
+    example = r#"{"levels": 3, "base_resolution": 4}"#
+);
 
 #[typetag::serde(name = "dense-grid")]
 impl EncoderSpec for DenseGrid {

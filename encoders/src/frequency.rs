@@ -46,7 +46,13 @@ impl Default for Frequency {
     }
 }
 
-conefield_core::stage_type!(Encoder, "frequency", Frequency, "sines and cosines of the position");
+conefield_core::stage_type!(
+    Encoder,
+    "frequency",
+    Frequency,
+    "sines and cosines of the position",
+    example = r#"{"bands": 4, "max_frequency": 8.0}"#
+);
 
 #[typetag::serde(name = "frequency")]
 impl EncoderSpec for Frequency {

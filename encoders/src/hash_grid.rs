@@ -71,7 +71,13 @@ impl Default for HashGrid {
     }
 }
 
-conefield_core::stage_type!(Encoder, "hash-grid", HashGrid, "multi-resolution hash grid");
+conefield_core::stage_type!(
+    Encoder,
+    "hash-grid",
+    HashGrid,
+    "multi-resolution hash grid",
+    example = r#"{"levels": 3, "log2_table_size": 8, "base_resolution": 4}"#
+);
 
 #[typetag::serde(name = "hash-grid")]
 impl EncoderSpec for HashGrid {

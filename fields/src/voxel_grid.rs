@@ -46,7 +46,13 @@ impl Default for VoxelGridSettings {
     }
 }
 
-conefield_core::stage_type!(Field, "voxel-grid", VoxelGridSettings, "a grid of voxels, read by position");
+conefield_core::stage_type!(
+    Field,
+    "voxel-grid",
+    VoxelGridSettings,
+    "a grid of voxels, read by position",
+    example = r#"{"resolution": 6}"#
+);
 
 #[typetag::serde(name = "voxel-grid")]
 impl FieldSpec for VoxelGridSettings {

@@ -36,7 +36,8 @@ conefield_core::stage_type!(
     LineField,
     "voxels-joseph",
     VoxelsJoseph,
-    "voxels with line integrals by Joseph, without an encoder"
+    "voxels with line integrals by Joseph, without an encoder",
+    example = r#"{"resolution": [12, 17, 9]}"#
 );
 
 #[typetag::serde(name = "voxels-joseph")]

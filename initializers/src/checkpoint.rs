@@ -14,7 +14,13 @@ pub struct CheckpointSettings {
     pub weights: String,
 }
 
-conefield_core::stage_type!(Initializer, "checkpoint", CheckpointSettings, "every weight from a file");
+conefield_core::stage_type!(
+    Initializer,
+    "checkpoint",
+    CheckpointSettings,
+    "every weight from a file",
+    example = r#"{"weights": "weights.safetensors"}"#
+);
 
 #[typetag::serde(name = "checkpoint")]
 impl InitializerSpec for CheckpointSettings {

@@ -18,7 +18,13 @@ pub struct Mci {
     pub weights: String,
 }
 
-conefield_core::stage_type!(Initializer, "mci", Mci, "normalizers and field from a trained model, a fresh encoder");
+conefield_core::stage_type!(
+    Initializer,
+    "mci",
+    Mci,
+    "normalizers and field from a trained model, a fresh encoder",
+    example = r#"{"weights": "weights.safetensors"}"#
+);
 
 #[typetag::serde(name = "mci")]
 impl InitializerSpec for Mci {

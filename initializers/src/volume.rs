@@ -22,7 +22,13 @@ fn steps() -> u64 {
     KnownVolume::STEPS
 }
 
-conefield_core::stage_type!(Initializer, "volume", FromVolume, "a known volume to start from");
+conefield_core::stage_type!(
+    Initializer,
+    "volume",
+    FromVolume,
+    "a known volume that the field learns first",
+    example = r#"{"path": "volume.nii.gz"}"#
+);
 
 #[typetag::serde(name = "volume")]
 impl InitializerSpec for FromVolume {
