@@ -15,8 +15,8 @@ cargo build --release --quiet -p conefield-benches --bin curves
 bin=${CARGO_TARGET_DIR:-target}/release
 mkdir -p "$out"
 none='normalizers=[]'
-norm='normalizers=[{type="layer-norm"}]'
-whole='solver.callbacks=[{type="rollback"}]'
+norm='normalizers=["layer-norm"]'
+whole='callbacks=["rollback"]'
 weights=$out/abdomen.safetensors
 [[ -f $weights ]] || "$bin/conefield" -q pretrain "$data/volumes/abdomen_128.nii.gz" --spec ni-naf --set "$norm" -o "$weights"
 : >"$out/scores.txt"

@@ -19,7 +19,7 @@ mkdir -p "$out"
 scan=$out/$volume
 published_scan "$data" "$volume" "$scan"
 none='normalizers=[]'
-norm='normalizers=[{type="layer-norm"}]'
+norm='normalizers=["layer-norm"]'
 small=(--spec ni-naf --set encoder.log2_table_size=17)
 for way in none norm; do
     weights=$out/abdomen-$way.safetensors

@@ -36,7 +36,7 @@ for volume in $volumes; do
     run none "$(python3 -c "print($seconds * 10 / 3)")" box all "${count[@]}"
     run support "$seconds" carve all "${count[@]}"
     run levels "$seconds" box needed "${count[@]}"
-    run channels "$seconds" box all "${count[@]}" --set 'solver.callbacks=[{ type = "rollback" }, { type = "fft-mask", rule = "relative", epoch = 2.0 }]'
+    run channels "$seconds" box all "${count[@]}" --set 'callbacks=["rollback", { type = "fft-mask", rule = "relative", epoch = 2.0 }]'
     run samples "$seconds" box all
     run six-levels "$seconds" carve all
     run all "$seconds" carve needed
