@@ -1,4 +1,4 @@
-//! The contracts that conefield's stages, backends and solvers meet at.
+//! The contracts that conefield's stages, backends and methods meet at.
 //!
 //! - [`geometry`], [`orbit`], [`scan`], [`parts`]: what was measured, in millimetres, and what comes out.
 //! - [`simd`], [`half`], [`dense`], [`trilinear`], [`stage`]: what a stage computes and how.
@@ -8,12 +8,13 @@
 //! - [`wgsl`]: the same for a GPU.
 //! - [`arena`]: parameters, gradients and optimizer state under their names.
 //! - [`files`]: opening what a user or a description names.
-//! - [`settings`], [`spec`], [`registry`]: what a user writes, and the types that it may name.
+//! - [`settings`], [`precision`], [`spec`], [`registry`]: what a user writes, and the types that it may name.
 //! - [`host`]: stages on the host, for what looks at a model beside training.
 //! - [`voxel`]: line integrals of voxel volumes.
 //! - [`basis`], [`data_term`], [`regularizer`]: what an iterative method is put together from; [`space`]: its arrays and
 //!   what they take.
-//! - [`pipeline`], [`backend`], [`trained`], [`method`]: from a method's stages to a volume.
+//! - [`method`]: what a spec names, its plan and its run; [`pipeline`], [`backend`], [`trained`]: a field from its stages to a
+//!   volume; [`checkpoint`]: where a run stands.
 
 pub mod arena;
 pub mod backend;

@@ -1,4 +1,4 @@
-//! Position encoders: hash grid, dense grid, frequency, concat
+//! Position encoders: hash grid, dense grid, frequency, identity, concat.
 
 pub mod concat;
 pub mod dense_grid;

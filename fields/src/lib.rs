@@ -1,4 +1,4 @@
-//! Attenuation fields: MLP, voxel grid, voxels with line integrals of their own
+//! Attenuation fields: MLP, voxel grid, voxels with line integrals of their own.
 
 pub mod mlp;
 pub mod voxel_grid;

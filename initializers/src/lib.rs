@@ -1,4 +1,4 @@
-//! Initializers: random, mapping-consistency (MCI), checkpoint, a known volume
+//! What the parameters of a field start from: random numbers, a trained model (MCI), a checkpoint, a known volume.
 
 pub mod checkpoint;
 pub mod mci;

@@ -1,3 +1,3 @@
-//! Normalizers between encoder and field: LayerNorm
+//! Normalizers between encoder and field: LayerNorm.
 
 pub mod layer_norm;

@@ -1,8 +1,8 @@
 //! Methods: scan in, volume out.
 //!
-//! - [`neural_field`] and [`line_field`] train an attenuation field by stochastic gradients, [`training`] is their loop; [`pretrain`] trains one
-//!   on a known volume, for weights that other scans reuse. [`losses`] say what a difference costs, [`priors`] what the field
-//!   is to be like, [`optimizer`] how gradients change parameters.
+//! - [`neural_field`] and [`line_field`] train an attenuation field by stochastic gradients. [`training`] is their loop, with
+//!   its callbacks; [`pretrain`] trains a field on known volumes, for weights that other scans reuse. [`losses`] say what a
+//!   difference costs, [`priors`] what the field is to be like, [`optimizer`] how gradients change parameters.
 //! - [`fit`] finds out what a scan has need of, [`support`] where its object can be, [`surround`] what lies beyond the volume.
 //! - [`fdk`] filters and back-projects.
 //! - [`iterative`] improves voxels pass by pass: SART, CGLS, ASD-POCS, FISTA.

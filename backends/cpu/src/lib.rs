@@ -6,8 +6,8 @@
 //! tile is in the cache ([`rows`]). Dense stages sum their gradients in copies of their own, one a slot, merged in order.
 //! Stages with scattered parameters get the rows of the wave a second time, each worker with a range of parameters of its
 //! own ([`step`]). Where tables are read in halves, these are a copy of the parameters ([`halves`]) that each update makes
-//! anew ([`adam`]). A field that brings line integrals of its own goes another way ([`lines`]). The number of slots and the order of every sum depend on the plan alone: the same bits come out
-//! on any number of threads.
+//! anew ([`adam`]). A field that brings line integrals of its own goes another way ([`lines`]). The number of slots and the
+//! order of every sum depend on the plan alone: the same bits come out on any number of threads.
 
 pub mod adam;
 pub mod halves;

@@ -13,7 +13,8 @@
 //! ```
 //!
 //! `conefield plugins new NAME --kind encoder --lang rust` makes such a crate. A panic in a stage becomes an error of the
-//! run; keep `panic = "unwind"`, which is Cargo's default. Solvers cannot be exported.
+//! run; keep `panic = "unwind"`, which is Cargo's default. Methods, callbacks and
+//! the pieces of iterative methods cannot be exported.
 
 mod built;
 mod export;
