@@ -10,7 +10,8 @@ use conefield_core::{Error, Result};
 use conefield_diagnosis::{Survey, survey};
 pub use conefield_io::read_weights;
 use conefield_projectors::simulate::{PhantomKind, phantom_of};
-use conefield_report::MiddleSlices;
+pub use conefield_report::result_png as picture;
+pub use conefield_report::text::stem;
 use std::collections::BTreeMap;
 use std::path::Path;
 
@@ -42,11 +43,6 @@ fn phantom(name: &str) -> Result<Option<(PhantomKind, usize)>> {
         Ok(size @ 8..=1024) => Ok(Some((kind, size))),
         _ => Err(Error::invalid(name, "size", size, "a number of voxels from 8 to 1024")),
     }
-}
-
-/// The name of a file or folder, without what it ends with.
-pub fn stem(path: &str) -> String {
-    Path::new(path).file_stem().map(|s| s.to_string_lossy().into_owned()).unwrap_or_default()
 }
 
 /// Reads a scan, checks it and warns of what will trouble a reconstruction.
@@ -141,14 +137,6 @@ pub fn same_run(place: &str, then: &BTreeMap<String, String>, now: &BTreeMap<Str
         }
     }
     Ok(())
-}
-
-/// Draws the middle slices of a result, with those of `reference` and their difference where there is one.
-pub fn picture(path: impl AsRef<Path>, reference: Option<&MiddleSlices>, result: &MiddleSlices) -> Result<()> {
-    match reference {
-        Some(r) => conefield_report::slices_png(path, &[("reference", r), ("result", result)], r.window(), Some(0)),
-        None => conefield_report::slices_png(path, &[("result", result)], result.window(), None),
-    }
 }
 
 #[cfg(test)]

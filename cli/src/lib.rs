@@ -1,7 +1,6 @@
 //! The `conefield` command, one module a subcommand, and the specs that come with it.
 
 mod backend;
-mod budget;
 mod commands;
 mod files;
 mod live;
@@ -17,7 +16,6 @@ mod run_folder;
 mod segmenter;
 mod signals;
 pub mod specs;
-mod statistics;
 mod table;
 
 // Stage types register themselves when their crate is linked.

@@ -1,6 +1,5 @@
 //! A spec with its plan and what that takes.
 
-use crate::budget::front::Unknowns;
 use crate::files;
 use crate::memory::{self, Memory};
 use crate::specs;
@@ -8,6 +7,7 @@ use conefield_core::Result;
 use conefield_core::backend::Backend;
 use conefield_core::method::{Context, Plan};
 use conefield_core::spec::load::Loaded;
+use conefield_tradeoff::schedule::Runnable;
 use serde_json::Value;
 use std::path::Path;
 
@@ -18,16 +18,14 @@ pub struct Planned {
     pub memory: Memory,
 }
 
-impl Planned {
-    /// What it solves for.
-    pub fn unknowns(&self) -> Unknowns {
-        unknowns(self.plan.as_ref())
+impl Runnable for Planned {
+    fn name(&self) -> &str {
+        &self.loaded.spec.name
     }
-}
 
-/// What a method solves for; a chain, what its first method does.
-pub fn unknowns(plan: &dyn Plan) -> Unknowns {
-    if plan.pipeline().is_some() { Unknowns::Field } else { Unknowns::Voxels }
+    fn plan(&mut self) -> &mut dyn Plan {
+        self.plan.as_mut()
+    }
 }
 
 /// Builds a spec for `backend`: every stage once. Refusals name the line of the spec.
@@ -78,5 +76,48 @@ pub fn init(tree: &Value, path: &Path) -> String {
         false => format!("initializer={{ type = \"mci\", weights = {file} }}"),
         true if tree.get("initializer").is_some() => format!("initializer={{ type = \"volume\", path = {file} }}"),
         true => format!("start={file}"),
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use conefield_backend_cpu::Cpu;
+    use conefield_projectors::simulate::{PhantomKind, Protocol, phantom_of, simulate};
+    use conefield_tradeoff::calibrate::{Bench, calibrate};
+    use conefield_tradeoff::front::{Front, Unknowns};
+
+    #[test]
+    fn the_shipped_front_loads_and_its_specs_build() {
+        let front = Front::shipped().unwrap();
+        for point in &front.points {
+            let loaded = specs::read(&point.spec, &point.sets).unwrap();
+            let plan = plan(&loaded, &Cpu::new()).unwrap();
+            assert_eq!(Unknowns::of(plan.as_ref()), point.kind, "{}", point.name);
+            assert!(point.accuracy().is_finite() && !point.told(&front).contains("NaN"));
+        }
+    }
+
+    #[test]
+    fn every_kind_of_solver_is_measured() {
+        let truth = phantom_of(PhantomKind::Head, 24);
+        let scan = simulate(&truth, &Protocol::r2(&truth.grid).with_detector([24, 24]).with_views(12)).unwrap();
+        let backend = Cpu::new();
+        let bench = Bench {
+            scan: &scan,
+            reference: Some(&truth),
+            peak: 1.0,
+            backend: &backend,
+            seed: 0,
+            volumes: &files::volume,
+            cancelled: &|| false,
+        };
+        for spec in ["fast", "fdk", "sart", "cgls", "fista-tv", "asd-pocs"] {
+            let loaded = specs::read(spec, &[]).unwrap();
+            let mut plan = plan(&loaded, &backend).unwrap();
+            let costs = calibrate(&bench, plan.as_mut(), 0.05).unwrap();
+            let all = [costs.step_s, costs.export_s, costs.picture_s, costs.score_s];
+            assert!(all.iter().all(|s| *s > 0.0 && s.is_finite()) && costs.prepare_s >= 0.0, "{spec}: {costs:?}");
+        }
     }
 }

@@ -1,49 +1,7 @@
-//! Tables of figures: once for the terminal, once in Markdown.
+//! The cells of scores.
 
-use crate::out;
 use conefield_metrics::Scores;
-
-/// Columns with a heading each, the first a name and the others figures, and sentences below.
-#[derive(Debug, Default)]
-pub struct Table {
-    /// The headings, then a line each.
-    pub rows: Vec<Vec<String>>,
-    /// What the cells have no room for.
-    pub notes: Vec<String>,
-}
-
-impl Table {
-    /// For a terminal.
-    pub fn text(&self) -> String {
-        let right: Vec<usize> = (1..self.columns()).collect();
-        let mut text = out::table(&self.rows, &right);
-        if !self.notes.is_empty() {
-            text += &format!("\n\n{}", self.notes.join("\n"));
-        }
-        text
-    }
-
-    /// The same cells in Markdown.
-    pub fn markdown(&self) -> String {
-        let line = |cells: &[String]| {
-            let cells: Vec<String> = cells.iter().map(|c| c.replace('|', "\\|")).collect();
-            format!("| {} |\n", cells.join(" | "))
-        };
-        let mut rows = self.rows.iter();
-        let mut text = rows.next().map(|heads| line(heads)).unwrap_or_default();
-        let rule: Vec<&str> = (0..self.columns()).map(|c| if c == 0 { "---" } else { "---:" }).collect();
-        text += &format!("| {} |\n", rule.join(" | "));
-        text.extend(rows.map(|row| line(row)));
-        for note in &self.notes {
-            text += &format!("\n{note}\n");
-        }
-        text
-    }
-
-    fn columns(&self) -> usize {
-        self.rows.first().map_or(0, Vec::len)
-    }
-}
+pub use conefield_report::Table;
 
 /// The headings of [`score_cells`].
 pub const SCORES: [&str; 4] = ["PSNR dB", "ssim_2d", "ssim_3d", "ssim_skimage"];
@@ -64,11 +22,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn both_forms_have_the_same_cells() {
-        let row = |cells: [&str; 2]| cells.map(str::to_owned).to_vec();
-        let table = Table { rows: vec![row(["", "dB"]), row(["a|b", "3.10"])], notes: vec!["c: why".into()] };
-        assert_eq!(table.text(), "       dB\na|b  3.10\n\nc: why");
-        assert_eq!(table.markdown(), "|  | dB |\n| --- | ---: |\n| a\\|b | 3.10 |\n\nc: why\n");
+    fn a_score_that_is_not_defined_is_a_dash() {
         assert_eq!(score_cells(f64::INFINITY, [Some(1.0), None, None]), ["inf", "1.0000", "-", "-"]);
     }
 }

@@ -61,7 +61,8 @@ fn explain_and_reconstruct_build_each_stage_once() {
     let dir = tempfile::tempdir().unwrap();
     let at = |name: &str| dir.path().join(name).display().to_string();
     let (scan, spec) = (at("scan"), at("spec.toml"));
-    let field = "type = 'neural-field'\nname = 'counted'\nencoder = 'counted'\nfield = 'counted'\nprojector = 'counted'\n";
+    let field =
+        "type = 'neural-field'\nname = 'counted'\nencoder = 'counted'\nfield = 'counted'\nprojector = 'counted'\n";
     std::fs::write(&spec, format!("{field}[training]\nsteps = 3\nrays = 16\n")).unwrap();
     built(&["simulate", "phantom:head:16", "-o", &scan, "--views", "6", "--detector", "16x16"]);
     assert_eq!(built(&["explain", &spec]), [1; 3]);
@@ -71,7 +72,9 @@ fn explain_and_reconstruct_build_each_stage_once() {
     // A budget measures the plan that it then runs.
     assert_eq!(built(&["reconstruct", &scan, "--spec", &spec, "-o", &at("timed"), "--budget", "6s"]), [1; 3]);
     let chain = at("chain.toml");
-    let text = format!("type = 'chain'\nname = 'two'\n[[methods]]\nextends = '{spec}'\n[[methods]]\ntype = 'sart'\nstop.passes = 1\n");
+    let text = format!(
+        "type = 'chain'\nname = 'two'\n[[methods]]\nextends = '{spec}'\n[[methods]]\ntype = 'sart'\nstop.passes = 1\n"
+    );
     std::fs::write(&chain, text).unwrap();
     assert_eq!(built(&["reconstruct", &scan, "--spec", &chain, "-o", &at("both")]), [1; 3]);
 }

@@ -1,8 +1,9 @@
-//! Pictures of results, as PNG.
+//! Pictures of results, as PNG, and figures in words and tables.
 //!
 //! - [`slices_png`], [`compare_png`], [`features_png`]: the middle slices of volumes.
 //! - [`curves_png`], [`panels_png`]: line plots.
 //! - [`survey_png`]: a scan's geometry.
+//! - [`Table`] and [`text`]: figures for people to read.
 //!
 //! The font is part of the program: a picture does not depend on what the system has.
 
@@ -10,10 +11,13 @@ mod canvas;
 mod curves;
 mod slices;
 mod survey;
+mod table;
+pub mod text;
 
 #[cfg(test)]
 mod testing;
 
 pub use curves::{Corner, CurveOptions, Panel, curves_png, curves_png_with, panels_png};
-pub use slices::{MiddleSlices, compare_png, features_png, slices_png};
+pub use slices::{MiddleSlices, compare_png, features_png, result_png, slices_png};
 pub use survey::survey_png;
+pub use table::Table;

@@ -92,6 +92,14 @@ struct Row<'a> {
     cells: Vec<Cell<'a>>,
 }
 
+/// Draws the middle slices of a result, with those of `reference` and their difference where there is one.
+pub fn result_png(path: impl AsRef<Path>, reference: Option<&MiddleSlices>, result: &MiddleSlices) -> Result<()> {
+    match reference {
+        Some(r) => slices_png(path, &[("reference", r), ("result", result)], r.window(), Some(0)),
+        None => slices_png(path, &[("result", result)], result.window(), None),
+    }
+}
+
 /// Draws the three middle slices (axial, coronal, sagittal) of every panel side by side, grey from `window[0]` to
 /// `window[1]`.
 ///

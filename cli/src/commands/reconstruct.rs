@@ -2,9 +2,6 @@
 
 use super::record::{RunRecord, ScanRecord, summary};
 use super::{backends::simd_level, evaluate, protocol::RunProtocol};
-use crate::budget::calibrate::Bench;
-use crate::budget::front::Front;
-use crate::budget::plan::Budget;
 use crate::live::Live;
 use crate::memory;
 use crate::method::{self, Planned};
@@ -22,6 +19,9 @@ use conefield_core::scan::Scan;
 use conefield_core::spec::load::{Loaded, to_toml};
 use conefield_core::{Error, Result};
 use conefield_report::MiddleSlices;
+use conefield_tradeoff::calibrate::Bench;
+use conefield_tradeoff::front::Front;
+use conefield_tradeoff::schedule::Budget;
 use std::collections::BTreeMap;
 use std::fs::File;
 use std::path::PathBuf;
@@ -120,6 +120,8 @@ impl ReconstructArgs {
             peak: protocol.peak,
             backend: backend.as_ref(),
             seed: protocol.seed,
+            volumes: &files::volume,
+            cancelled: &|| signals::caught().is_some(),
         };
         let budget = protocol.budget.map(|seconds| Budget { begin, seconds, spent });
         let (method, schedule) = match (budget, asked, front) {
@@ -139,7 +141,7 @@ impl ReconstructArgs {
             }
         };
         specs::check_held_out(&method.loaded, method.plan.as_ref(), &held)?;
-        schedule.iter().flat_map(|s| s.lines(&method)).for_each(|line| info!("{line}"));
+        schedule.iter().flat_map(|s| s.lines(&method.loaded.spec.name)).for_each(|line| info!("{line}"));
         info!("memory: {}", method.memory.line());
         let identity = identity(&method)?;
         let Planned { loaded, mut plan, memory } = method;

@@ -1,7 +1,6 @@
 //! What a run leaves on record.
 
 use super::{EndOptions, evaluate};
-use crate::budget::plan::Schedule;
 use crate::memory::Memory;
 use crate::plugins::Used;
 use crate::{files, out};
@@ -9,6 +8,7 @@ use conefield_core::Result;
 use conefield_core::backend::Explain;
 use conefield_core::scan::Scan;
 use conefield_metrics::Scores;
+use conefield_tradeoff::schedule::Schedule;
 use serde::Serialize;
 use std::path::Path;
 

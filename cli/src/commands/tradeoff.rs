@@ -10,13 +10,14 @@ use super::record::ScanRecord;
 use super::trial::{Figures, Trial, TrialInput, read_json};
 use super::{EndOptions, General, backends::simd_level};
 use crate::backend::{self, BackendChoice};
-use crate::budget::TOO_SHORT;
 use crate::parse::{self, HoldOut};
-use crate::statistics::mean;
 use crate::{out, signals};
 use clap::Args;
 use conefield_core::error::ensure;
 use conefield_core::{Error, Result};
+use conefield_tradeoff::front::Unknowns;
+use conefield_tradeoff::schedule::TOO_SHORT;
+use conefield_tradeoff::statistics::mean;
 use halving::{TrialOutcome, go_on, to_come};
 use levers::{Candidate, Levers};
 use report::TradeoffReport;
@@ -306,7 +307,7 @@ impl TradeoffArgs {
 
     /// Seconds that the search takes from here at most: trial `c` on `scan` of budget `r` is next.
     fn left(&self, search: &Search, going: &[&Candidate], r: usize, c: usize, scan: usize) -> f64 {
-        let fields = going.iter().filter(|c| c.kind == crate::budget::front::Unknowns::Field).count();
+        let fields = going.iter().filter(|c| c.kind == Unknowns::Field).count();
         let rungs = search.budgets_s.len() - r;
         let later = to_come(fields, going.len() - fields, rungs, search.keep);
         let all = later.iter().zip(&search.budgets_s[r..]).map(|(n, budget)| *n as f64 * budget).sum::<f64>();

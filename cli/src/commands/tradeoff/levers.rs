@@ -1,12 +1,12 @@
 //! What may be turned, and the candidates that come of it: every base as it is, and seeded draws from the product of
 //! its levers' values.
 
-use crate::budget::front::Unknowns;
 use crate::{files, method, specs};
 use conefield_backend_cpu::Cpu;
 use conefield_core::error::{Error, Result, ensure};
 use conefield_core::files::toml_line;
 use conefield_core::random::mix;
+use conefield_tradeoff::front::Unknowns;
 use serde::{Deserialize, Serialize};
 use serde_json::Value;
 use std::path::Path;
@@ -199,7 +199,7 @@ impl Base {
         for key in ["name", "description"] {
             tree[key] = Value::Null;
         }
-        Ok((tree, method::unknowns(plan.as_ref())))
+        Ok((tree, Unknowns::of(plan.as_ref())))
     }
 
     fn candidate(&self, number: usize, sets: Vec<String>) -> Candidate {

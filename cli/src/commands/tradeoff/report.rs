@@ -2,15 +2,15 @@
 
 use super::pareto::{Performance, front};
 use super::{FILES, FOLDERS, Over, Rung, Search, Status, accuracy};
-use crate::budget::front::{Front, Point, Reached, Tuned, Unknowns};
 use crate::commands::trial::Figures;
 use crate::out;
 use crate::specs;
-use crate::statistics::{mean, spearman};
 use crate::table::Table;
 use conefield_core::spec::load::to_toml;
 use conefield_core::{Error, Result};
 use conefield_report::{CurveOptions, Panel, panels_png};
+use conefield_tradeoff::front::{Front, Point, Reached, Tuned, Unknowns};
+use conefield_tradeoff::statistics::{mean, spearman};
 use serde::Serialize;
 use serde_json::Value;
 use std::fs;

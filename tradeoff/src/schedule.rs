@@ -1,15 +1,16 @@
 //! What to do with a budget: the method, if that is left open, and when training must end.
 
-use super::TOO_SHORT;
-use super::calibrate::{Bench, Costs, calibrate};
-use super::front::{Expected, Front, Size, Unknowns};
-use crate::method::Planned;
-use crate::out;
+use crate::calibrate::{Bench, Costs, calibrate};
+use crate::front::{Expected, Front, Size, Unknowns};
+use conefield_core::method::Plan;
 use conefield_core::{Error, Result};
+use conefield_report::text::{duration, number};
 use serde::Serialize;
 use std::cell::RefCell;
 use std::time::{Duration, Instant};
 
+/// How a refusal begins where the time is too short for anything: such a run says nothing of its method.
+pub const TOO_SHORT: &str = "the budget: ";
 /// Share of the budget that is planned for: what cannot be foreseen has the rest.
 const AIM: f64 = 0.98;
 /// Share of a point's steps from which there is time enough for it.
@@ -21,6 +22,14 @@ const MEASURED: usize = 3;
 const CALIBRATION: [(f64, f64); 2] = [(1.0, 0.1), (3.0, 0.04)];
 /// Steps without which a field is nothing.
 const STEPS: f64 = 10.0;
+
+/// A method that is built, with all that its user needs beside.
+pub trait Runnable {
+    /// The name of its spec.
+    fn name(&self) -> &str;
+    /// What runs.
+    fn plan(&mut self) -> &mut dyn Plan;
+}
 
 /// The time that there is.
 #[derive(Debug, Clone, Copy)]
@@ -38,6 +47,7 @@ pub struct Budget {
 pub struct Schedule {
     /// The point of the front, where the method was chosen.
     pub point: Option<String>,
+    /// What speaks for the method.
     pub why: String,
     /// What other methods would have taken.
     #[serde(skip_serializing_if = "Vec::is_empty")]
@@ -69,19 +79,19 @@ impl Budget {
     }
 
     /// Plans `method`, which was asked for.
-    pub fn plan(&self, bench: &Bench<'_>, method: &mut Planned) -> Result<Schedule> {
+    pub fn plan(&self, bench: &Bench<'_>, method: &mut impl Runnable) -> Result<Schedule> {
         let start = Instant::now();
-        let costs = calibrate(bench, method.plan.as_mut(), self.measuring())?;
+        let costs = calibrate(bench, method.plan(), self.measuring())?;
         self.settle(None, "the spec that was asked for".into(), vec![], method, costs, start)
     }
 
     /// The best method of `front` that fits, made by `build` from a spec and what is set of it, and its plan.
-    pub fn choose(
+    pub fn choose<R: Runnable>(
         &self,
         bench: &Bench<'_>,
         front: &Front,
-        build: impl Fn(&str, &[String]) -> Result<Planned>,
-    ) -> Result<(Planned, Schedule)> {
+        build: impl Fn(&str, &[String]) -> Result<R>,
+    ) -> Result<(R, Schedule)> {
         let start = Instant::now();
         let g = &bench.scan.geometry;
         let size = Size::new(g.views.len(), g.detector, g.volume.shape);
@@ -91,20 +101,21 @@ impl Budget {
         let built = RefCell::new(vec![]);
         let measure = |i: usize| {
             let mut method = build(&points[i].spec, &points[i].sets)?;
-            let costs = calibrate(bench, method.plan.as_mut(), self.measuring() / 2.0)?;
+            let costs = calibrate(bench, method.plan(), self.measuring() / 2.0)?;
             built.borrow_mut().push((i, method));
             Ok(costs)
         };
         let Choice { point: at, costs, fits, passed_over } = pick(&expected, || self.left(), measure)?;
         let method = built.take().into_iter().find(|(i, _)| *i == at).map(|(_, m)| m);
-        let method = method.ok_or_else(|| Error::unsupported("the budget", "no method of the front was measured"))?;
+        let mut method =
+            method.ok_or_else(|| Error::unsupported("the budget", "no method of the front was measured"))?;
         let point = points[at];
         let why = match fits {
             true => format!("the best of the front that fits ({})", point.told(front)),
             false => format!("no method of the front fits whole, this one takes least ({})", point.told(front)),
         };
         let passed_over = passed_over.into_iter().map(|(i, why)| format!("{}: {why}", points[i].name)).collect();
-        let plan = self.settle(Some(point.name.clone()), why, passed_over, &method, costs, start)?;
+        let plan = self.settle(Some(point.name.clone()), why, passed_over, &mut method, costs, start)?;
         Ok((method, plan))
     }
 
@@ -119,11 +130,11 @@ impl Budget {
         point: Option<String>,
         why: String,
         passed_over: Vec<String>,
-        method: &Planned,
+        method: &mut impl Runnable,
         costs: Costs,
         start: Instant,
     ) -> Result<Schedule> {
-        let kind = method.unknowns();
+        let kind = Unknowns::of(method.plan());
         let left = self.left();
         // Of little time half is the training's, as far as what follows it can do with less.
         let room = 0.5 * (left - costs.prepare_s - (costs.after_s() - costs.then_s));
@@ -143,7 +154,7 @@ impl Budget {
                 time(needed.max(self.seconds * 1.01)),
                 time(load_s + self.spent),
                 time(costs.prepare_s + least),
-                method.loaded.spec.name,
+                method.name(),
                 time(costs.after_s()),
             );
             return Err(Error::invalid(TOO_SHORT.trim_end_matches(": "), "time", time(self.seconds), expected));
@@ -179,15 +190,15 @@ fn least(kind: Unknowns) -> f64 {
 
 /// A time of which tenths matter where it is short.
 fn time(seconds: f64) -> String {
-    if seconds < 10.0 { format!("{seconds:.2} s") } else { out::duration(seconds) }
+    if seconds < 10.0 { format!("{seconds:.2} s") } else { duration(seconds) }
 }
 
 impl Schedule {
-    /// In words.
-    pub fn lines(&self, method: &Planned) -> Vec<String> {
+    /// In words; `spec` is the name of the method's.
+    pub fn lines(&self, spec: &str) -> Vec<String> {
         let named = match &self.point {
-            Some(point) => format!("{point} (spec {})", method.loaded.spec.name),
-            None => format!("spec {}", method.loaded.spec.name),
+            Some(point) => format!("{point} (spec {spec})"),
+            None => format!("spec {spec}"),
         };
         let (e, steps) = (&self.expected, self.kind.steps());
         let mut lines = vec![format!("planned: {named}, {}", self.why)];
@@ -200,7 +211,7 @@ impl Schedule {
             time(self.load_s),
             time(e.prepare_s),
             time(self.train_s),
-            out::number(self.steps),
+            number(self.steps),
             time(e.step_s),
             time(e.after_s() - e.then_s),
         ));

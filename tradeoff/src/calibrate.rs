@@ -1,14 +1,13 @@
 //! What the parts of a run take on this machine, measured for a second or a few: real training steps on some views of the
 //! scan, or real passes over a coarser one, and what comes after the training.
 
-use crate::files;
 use conefield_core::backend::Backend;
 use conefield_core::geometry::VoxelGrid;
 use conefield_core::method::{Job, Limits, Observer, Plan, Record};
 use conefield_core::parts::Voxels;
 use conefield_core::scan::{Scan, Volume};
 use conefield_core::{Error, Result};
-use conefield_report::MiddleSlices;
+use conefield_report::{MiddleSlices, result_png};
 use ndarray::{Array3, s};
 use serde::Serialize;
 use std::time::Instant;
@@ -29,11 +28,20 @@ const GROWTH: f64 = 5.0;
 
 /// What is measured on.
 pub struct Bench<'a> {
+    /// The scan to be reconstructed.
     pub scan: &'a Scan,
+    /// What the result will be compared with.
     pub reference: Option<&'a Volume>,
+    /// The data range of that comparison.
     pub peak: f64,
+    /// Where it is computed.
     pub backend: &'a dyn Backend,
+    /// Seed of everything random.
     pub seed: u64,
+    /// The volume that a method names, to start from.
+    pub volumes: &'a dyn Fn(&str) -> Result<Volume>,
+    /// Whether to end after the step under way.
+    pub cancelled: &'a dyn Fn() -> bool,
 }
 
 /// Seconds that the parts of a run take here.
@@ -43,8 +51,9 @@ pub struct Costs {
     pub prepare_s: f64,
     /// A step or pass.
     pub step_s: f64,
-    /// Of a solver that goes on after the training: all that it would do, and the least that makes sense.
+    /// All that a solver would do that goes on after the training.
     pub then_s: f64,
+    /// The least of it that makes sense.
     pub then_least_s: f64,
     /// Writing weights, and evaluating, packing and writing voxels.
     pub export_s: f64,
@@ -93,7 +102,7 @@ fn field(bench: &Bench<'_>, plan: &mut dyn Plan, seconds: f64) -> Result<Costs> 
     let every = n.div_ceil(VIEWS);
     let others: Vec<usize> = (0..n).filter(|v| v % every != 0).collect();
     let scan = bench.scan.split(&others)?.0;
-    let mut laps = Laps::default();
+    let mut laps = Laps::new(bench.cancelled);
     let limits = Limits { at_most: Some(seconds), ..Limits::default() };
     let begin = Instant::now();
     let solution = plan.run(&job(bench, &scan, limits), &mut laps)?;
@@ -118,7 +127,7 @@ fn voxels(bench: &Bench<'_>, plan: &mut dyn Plan, seconds: f64) -> Result<Costs>
     let mut coarser = None;
     loop {
         let (scan, share) = coarse(bench.scan, factor);
-        let mut laps = Laps::default();
+        let mut laps = Laps::new(bench.cancelled);
         let limits = Limits { steps: Some(2), ..Limits::default() };
         let begin = Instant::now();
         // A volume to start from takes as long as an empty one.
@@ -166,7 +175,7 @@ impl Passes {
 }
 
 fn job<'a>(bench: &'a Bench<'_>, scan: &'a Scan, limits: Limits) -> Job<'a> {
-    Job { seed: bench.seed, limits, volumes: &files::volume, ..Job::new(scan, bench.backend) }
+    Job { seed: bench.seed, limits, volumes: bench.volumes, ..Job::new(scan, bench.backend) }
 }
 
 /// The same scan with pixels and voxels `factor` times as large, as far as that leaves some, and the share of the work that is
@@ -205,7 +214,7 @@ fn picture(bench: &Bench<'_>) -> Result<f64> {
     let reference = bench.reference.map(MiddleSlices::of);
     let folder = tempfile::tempdir().map_err(|e| Error::io(std::env::temp_dir(), e))?;
     let begin = Instant::now();
-    files::picture(folder.path().join("slices.png"), reference.as_ref(), &result)?;
+    result_png(folder.path().join("slices.png"), reference.as_ref(), &result)?;
     Ok(begin.elapsed().as_secs_f64())
 }
 
@@ -224,13 +233,17 @@ fn score(bench: &Bench<'_>) -> Result<f64> {
 }
 
 /// When each step was done first.
-#[derive(Default)]
-struct Laps {
+struct Laps<'a> {
     steps: u64,
     done: Vec<Instant>,
+    cancelled: &'a dyn Fn() -> bool,
 }
 
-impl Laps {
+impl<'a> Laps<'a> {
+    fn new(cancelled: &'a dyn Fn() -> bool) -> Self {
+        Self { steps: 0, done: vec![], cancelled }
+    }
+
     /// The median of the later half: the first steps touch memory for the first time.
     fn typical(&self) -> Option<f64> {
         let all: Vec<f64> = self.done.windows(2).map(|w| (w[1] - w[0]).as_secs_f64()).collect();
@@ -240,7 +253,7 @@ impl Laps {
     }
 }
 
-impl Observer for Laps {
+impl Observer for Laps<'_> {
     /// A solver that is over says so of its last step once more.
     fn progress(&mut self, step: u64, _: f64, _: f64) {
         if step > self.steps {
@@ -254,15 +267,13 @@ impl Observer for Laps {
     fn note(&mut self, _: &str) {}
 
     fn cancelled(&self) -> bool {
-        crate::signals::caught().is_some()
+        (self.cancelled)()
     }
 }
 
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::{method, specs};
-    use conefield_backend_cpu::Cpu;
     use conefield_projectors::simulate::{PhantomKind, Protocol, phantom_of, simulate};
 
     #[test]
@@ -307,7 +318,7 @@ mod tests {
 
     #[test]
     fn a_step_that_is_told_of_twice_is_one() {
-        let mut laps = Laps::default();
+        let mut laps = Laps::new(&|| false);
         let pause = std::time::Duration::from_millis(20);
         for step in [1, 2, 2] {
             std::thread::sleep(pause);
@@ -316,20 +327,5 @@ mod tests {
         laps.progress(2, 1.0, 0.0);
         assert_eq!(laps.done.len(), 2);
         assert!(laps.typical().unwrap() >= pause.as_secs_f64());
-    }
-
-    #[test]
-    fn every_kind_of_solver_is_measured() {
-        let truth = phantom_of(PhantomKind::Head, 24);
-        let scan = simulate(&truth, &Protocol::r2(&truth.grid).with_detector([24, 24]).with_views(12)).unwrap();
-        let backend = Cpu::new();
-        let bench = Bench { scan: &scan, reference: Some(&truth), peak: 1.0, backend: &backend, seed: 0 };
-        for spec in ["fast", "fdk", "sart", "cgls", "fista-tv", "asd-pocs"] {
-            let loaded = specs::read(spec, &[]).unwrap();
-            let mut plan = method::plan(&loaded, &backend).unwrap();
-            let costs = calibrate(&bench, plan.as_mut(), 0.05).unwrap();
-            let all = [costs.step_s, costs.export_s, costs.picture_s, costs.score_s];
-            assert!(all.iter().all(|s| *s > 0.0 && s.is_finite()) && costs.prepare_s >= 0.0, "{spec}: {costs:?}");
-        }
     }
 }
