@@ -214,8 +214,8 @@ impl<'a> Run<'a> {
         self.clock.pause();
         self.kept.numbers = method.numbers().iter().map(|x| **x).collect();
         let (step, seconds) = (self.step, self.clock.seconds());
-        let method = serde_json::json!(self.kept);
-        let standing = Standing { step, recorded: step, seconds, method, ..Standing::default() };
+        let kept = serde_json::json!(self.kept);
+        let standing = Standing { step, recorded: step, seconds, method: kept, ..Standing::default() };
         let mut state = method.state();
         if let (Some(best), Some(_)) = (&mut self.best, self.kept.best) {
             state.push((BEST.into(), flat_mut(best)));
