@@ -115,7 +115,7 @@ pub trait Backend: Send + Sync {
     }
     /// Adds to each voxel of `volume` `Σ s/U²·p(row, column)` over the views whose pixels are `images`
     /// (`[view, row, column]`), bilinear between pixels and 0 outside the detector. Returns whether it did: a backend
-    /// without a device leaves it to the solver.
+    /// without a device leaves it to the method.
     fn backproject(
         &self,
         _views: &[VoxelView],

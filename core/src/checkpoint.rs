@@ -19,8 +19,8 @@ pub struct Standing {
     pub seconds: f64,
     /// The encoder's channels that stayed each time some were removed, in order; see [`Model::masks`].
     pub masks: Vec<Vec<usize>>,
-    /// What the solver keeps for itself, such as sums that are not reported yet.
-    pub solver: serde_json::Value,
+    /// What the method keeps for itself, such as sums that are not reported yet.
+    pub method: serde_json::Value,
 }
 
 /// A run between two steps, to be written.

@@ -1,4 +1,4 @@
-//! Line integrals of a voxel volume, as classical solvers need them: a linear operator and its exact adjoint.
+//! Line integrals of a voxel volume, as iterative methods need them: a linear operator and its exact adjoint.
 
 use crate::error::Result;
 use crate::geometry::Geometry;

@@ -84,6 +84,9 @@ impl Trained<'_> {
             let said = c.describe().unwrap_or_default();
             beside.push(Line::new(&format!("callbacks.{i}"), spec.typetag_name(), &said));
         }
+        let parameters = pipeline.layout().len() as u64;
+        let kept = callbacks.iter().map(|c| c.bytes(parameters)).sum();
+        let held_out = callbacks.iter().position(|c| c.needs_held_out()).map(|i| format!("callbacks.{i}"));
         let what = format!("{} rays a step, Adam {}", self.training.rays, self.optimizer.lr);
         let method = Line::new("method", self.kind, &what);
         Ok(Box::new(FieldPlan {
@@ -97,6 +100,8 @@ impl Trained<'_> {
             loss: Arc::from(loss),
             priors,
             callbacks: Some(callbacks),
+            kept,
+            held_out,
             compiled: Some(exe),
             outline: Outline { method, stages, beside, compiled: Some(compiled), links: vec![] },
         }))
@@ -217,6 +222,10 @@ struct FieldPlan {
     priors: Vec<Box<dyn Prior>>,
     /// Of the first run. Another one makes its own, as callbacks keep a state.
     callbacks: Option<Vec<Box<dyn Callback>>>,
+    /// Bytes that callbacks keep.
+    kept: u64,
+    /// The key of the callback that looks at views kept aside.
+    held_out: Option<String>,
     /// Of the first run, unless the scan changes the stages.
     compiled: Option<Box<dyn Executable>>,
     outline: Outline,
@@ -229,7 +238,7 @@ impl Plan for FieldPlan {
 
     fn needs(&self, scan: &ScanHeader) -> Needs {
         let n = self.pipeline.layout().len() as u64;
-        let kept: u64 = self.callbacks.iter().flatten().map(|c| c.bytes(n)).sum();
+        let kept = self.kept;
         let backend = self.outline.backend().scratch_bytes as u64;
         let learning = if self.loss.needs_scan() { noise::scratch(scan) } else { 0 };
         let known = if self.initializer.volume().is_some() { 8 * scan.voxels() } else { 0 };
@@ -342,8 +351,7 @@ impl Plan for FieldPlan {
     }
 
     fn needs_held_out(&self) -> Option<String> {
-        let at = self.callbacks.iter().flatten().position(|c| c.needs_held_out())?;
-        Some(format!("callbacks.{at}"))
+        self.held_out.clone()
     }
 }
 

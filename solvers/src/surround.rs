@@ -2,7 +2,7 @@
 //! is reconstructed, and that ends up as a bright rim inside.
 //!
 //! Total variation on coarse cells, over the volume and a margin around it, first finds about what there is outside. Its line
-//! integrals are taken off the measured ones, and every solver works on the rest as if the body ended at the volume's sides
+//! integrals are taken off the measured ones, and every method works on the rest as if the body ended at the volume's sides
 //! (the idea of region-of-interest reconstruction by subtraction: Ziegler, Nielsen and Grass, Med. Phys. 35(4), 2008). Outside
 //! the volume nothing finer than these cells is modelled, once.
 
@@ -63,7 +63,7 @@ impl Within {
     }
 }
 
-/// The scan of `job` without what lies beyond the volume, as its solver sees it; `None` where the spec does not ask for it or
+/// The scan of `job` without what lies beyond the volume, as its method sees it; `None` where the spec does not ask for it or
 /// nothing is there to look for.
 pub fn subtracted(job: &Job<'_>, rule: SurroundRule, observer: &mut dyn Observer) -> Result<Option<Scan>> {
     Ok(Within::of(job, rule, observer)?.map(|within| within.scan))

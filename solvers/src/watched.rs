@@ -6,7 +6,7 @@ use conefield_core::random::mix;
 const EDGE: usize = 4;
 
 /// One voxel of each block of 4³, drawn: every voxel as likely as any other, where every 4th one along an axis would give
-/// some slices four times their weight and others none. The same ones in every run and for every solver, so that records
+/// some slices four times their weight and others none. The same ones in every run and for every method, so that records
 /// compare.
 pub fn voxels(shape: [usize; 3]) -> impl Iterator<Item = [usize; 3]> {
     let edge = shape.map(|n| n.clamp(1, EDGE));

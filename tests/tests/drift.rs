@@ -2,7 +2,7 @@
 
 mod common;
 
-use common::{Heard, Stop, model, scan, solve, spec};
+use common::{Heard, Stop, model, plan, scan, solve, spec};
 use conefield_backend_cpu::Cpu;
 use conefield_core::Result;
 use conefield_core::arena::Weights;
@@ -10,8 +10,8 @@ use conefield_core::backend::Backend;
 use conefield_core::checkpoint::Resume;
 use conefield_core::host;
 use conefield_core::method::{DriftRecord, Job, Record};
-use conefield_core::pipeline::{Model, Pipeline};
-use conefield_core::scene::Scene;
+use conefield_core::pipeline::Model;
+use conefield_core::scene::{Scene, SceneSettings};
 use conefield_solvers::training::callbacks::Drift;
 use conefield_solvers::training::{CallbackSpec, Run};
 use serde_json::{Value, json};
@@ -72,7 +72,7 @@ fn stages_on_the_host_compute_what_the_backend_does() {
 #[test]
 fn a_field_that_moves_by_a_known_amount_drifts_by_it() {
     let (scan, spec, cpu) = (scan(), spec(&settings()).unwrap(), Cpu::new());
-    let scene = Scene::new(&scan, &spec.scene).unwrap();
+    let scene = Scene::new(&scan, &SceneSettings::default()).unwrap();
     let model = Model::random(common::pipeline(&spec), 3);
     let exe = cpu.compile(&model.pipeline).unwrap().0;
     let job = Job { seed: 3, ..Job::new(&scan, &cpu) };
@@ -138,7 +138,7 @@ fn stopped(value: &Value, at: u64) -> Stop {
     let (scan, spec, cpu) = (scan(), spec(value).unwrap(), Cpu::new());
     let mut stop = Stop::at(at);
     let job = Job { seed: 7, ..Job::new(&scan, &cpu) };
-    assert!(spec.solver.build().unwrap().solve(&job, &mut stop).is_err());
+    assert!(plan(&spec, &cpu, &Weights::default()).unwrap().run(&job, &mut stop).is_err());
     stop
 }
 
@@ -146,7 +146,7 @@ fn resumed(value: &Value, resume: &Resume) -> Result<Vec<Record>> {
     let (scan, spec, cpu) = (scan(), spec(value).unwrap(), Cpu::new());
     let mut heard = Heard::default();
     let job = Job { seed: 7, resume: Some(resume), ..Job::new(&scan, &cpu) };
-    spec.solver.build().unwrap().solve(&job, &mut heard)?;
+    plan(&spec, &cpu, &Weights::default())?.run(&job, &mut heard)?;
     Ok(heard.0)
 }
 
@@ -185,17 +185,13 @@ fn a_checkpoint_of_other_callbacks_is_refused() {
         let e = resumed(settings, resume).unwrap_err().to_string();
         assert!(words.iter().all(|w| e.contains(w)), "{e}");
     };
-    refused(
-        &with("/callbacks", json!([{"type": "rollback"}])),
-        &kept,
-        &["kept: drift", "field-monitor, rollback"],
-    );
+    refused(&with("/callbacks", json!([{"type": "rollback"}])), &kept, &["kept: drift", "field-monitor, rollback"]);
     refused(&masked(), &kept, &["kept: fft-mask", "nothing"]);
     let mut more = kept.clone();
     more.weights.tensors.insert("drift.more".into(), (vec![1], vec![0.0]));
     refused(&settings(), &more, &["kept: drift.more", "only what this run keeps"]);
     let mut other = kept.clone();
-    other.standing.solver["callbacks"]["rollback"] = json!({"level": 1.0});
+    other.standing.method["callbacks"]["rollback"] = json!({"level": 1.0});
     refused(&settings(), &other, &["kept: rollback", "missing field"]);
     assert!(resumed(&settings(), &kept).is_ok());
 }
@@ -203,15 +199,15 @@ fn a_checkpoint_of_other_callbacks_is_refused() {
 #[test]
 fn times_and_sizes_that_are_none_are_refused() {
     for (mut drift, word) in [
-        (json!({"every": 0.0}), "solver.callbacks.0.every"),
-        (json!({"every": -1.0}), "solver.callbacks.0.every"),
-        (json!({"points": 0}), "solver.callbacks.0.points"),
+        (json!({"every": 0.0}), "callbacks.0.every"),
+        (json!({"every": -1.0}), "callbacks.0.every"),
+        (json!({"points": 0}), "callbacks.0.points"),
         (json!({"points": 65537}), "65536"),
         (json!({"epochs": 3}), "epochs"),
     ] {
         drift["type"] = json!("drift");
         let said = match spec(&with("/callbacks", json!([drift]))) {
-            Ok(spec) => spec.solver.build().err().map(|e| e.to_string()),
+            Ok(spec) => plan(&spec, &Cpu::new(), &Weights::default()).err().map(|e| e.to_string()),
             Err(e) => Some(e.to_string()),
         };
         assert!(said.as_ref().is_some_and(|s| s.contains(word)), "{said:?}");

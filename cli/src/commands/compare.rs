@@ -10,7 +10,7 @@ use crate::memory::Memory;
 use crate::method;
 use crate::plugins::{self, Used};
 use crate::table::{SCORES, Table, score_cells};
-use crate::{files, out, run, signals, specs};
+use crate::{files, out, run_folder, signals, specs};
 use clap::Args;
 use conefield_core::error::ensure;
 use conefield_core::method::Plan;
@@ -334,7 +334,7 @@ impl CompareArgs {
 fn is_run(folder: &Path) -> bool {
     let known = |e: fs::DirEntry| {
         let name = e.file_name();
-        run::FILES.iter().any(|f| name == *f) || conefield_io::is_unfinished(&name)
+        run_folder::FILES.iter().any(|f| name == *f) || conefield_io::is_unfinished(&name)
     };
     fs::read_dir(folder).is_ok_and(|entries| entries.into_iter().all(|e| e.is_ok_and(known)))
 }

@@ -707,9 +707,9 @@ mod tests {
     #[test]
     fn what_an_upper_layer_says_takes_the_place_of_another_way_to_say_it() {
         let said = |text: &str, sets: &[&str]| {
-            let solver = read(text, sets).unwrap().tree.clone();
-            let keys = ["steps", "seconds", "passes"].iter().filter(|k| !solver[**k].is_null());
-            (keys.copied().collect::<Vec<_>>().join(" "), solver["pace"].to_string())
+            let method = read(text, sets).unwrap().tree.clone();
+            let keys = ["steps", "seconds", "passes"].iter().filter(|k| !method[**k].is_null());
+            (keys.copied().collect::<Vec<_>>().join(" "), method["pace"].to_string())
         };
         let base = "extends = 'timed'\n";
         assert_eq!(said(base, &[]), ("seconds".into(), "{\"slow\":{\"by\":2.0}}".into()));

@@ -214,8 +214,8 @@ impl<'a> Run<'a> {
         self.clock.pause();
         self.kept.numbers = method.numbers().iter().map(|x| **x).collect();
         let (step, seconds) = (self.step, self.clock.seconds());
-        let solver = serde_json::json!(self.kept);
-        let standing = Standing { step, recorded: step, seconds, solver, ..Standing::default() };
+        let kept = serde_json::json!(self.kept);
+        let standing = Standing { step, recorded: step, seconds, method: kept, ..Standing::default() };
         let mut state = method.state();
         if let (Some(best), Some(_)) = (&mut self.best, self.kept.best) {
             state.push((BEST.into(), flat_mut(best)));
@@ -261,8 +261,8 @@ pub(crate) fn finite(volume: &Array3<f32>, step: u64) -> Result<()> {
 
 /// Brings method, best volume and driver to where a checkpoint stands.
 fn restore(resume: &Resume, method: &mut dyn Iteration, best: Option<&mut Array3<f32>>) -> Result<Kept> {
-    let kept: std::result::Result<Kept, _> = serde_json::from_value(resume.standing.solver.clone());
-    let kept = kept.map_err(|e| Error::invalid(&resume.place, "solver", e, "what this method keeps"))?;
+    let kept: std::result::Result<Kept, _> = serde_json::from_value(resume.standing.method.clone());
+    let kept = kept.map_err(|e| Error::invalid(&resume.place, "method", e, "what this method keeps"))?;
     let best = best.filter(|_| kept.best.is_some()).map(|best| (BEST.to_owned(), flat_mut(best)));
     for (name, values) in method.state().into_iter().chain(best) {
         let found = resume.weights.tensors.get(&name).map(|t| &t.1);
@@ -275,7 +275,7 @@ fn restore(resume: &Resume, method: &mut dyn Iteration, best: Option<&mut Array3
     }
     let numbers = method.numbers();
     let (found, want) = (kept.numbers.len(), numbers.len());
-    ensure(found == want, &resume.place, "solver.numbers", found, format!("{want} numbers"))?;
+    ensure(found == want, &resume.place, "method.numbers", found, format!("{want} numbers"))?;
     for (number, saved) in numbers.into_iter().zip(&kept.numbers) {
         *number = *saved;
     }

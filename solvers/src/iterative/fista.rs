@@ -241,7 +241,7 @@ struct Arrays {
 
 impl Arrays {
     fn new(settings: &Built, grid: &VoxelGrid, space: &Space, start: Array3<f32>) -> Result<Self> {
-        let expansion = settings.basis.on(grid).map_err(|e| e.within("solver.basis"))?;
+        let expansion = settings.basis.on(grid).map_err(|e| e.within("basis"))?;
         let (model, x) = Model::new(expansion, space, start);
         let grid = model.grid();
         let coefficients = || space.array(grid.shape);

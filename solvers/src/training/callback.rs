@@ -124,7 +124,7 @@ pub trait Callback: Send {
         0
     }
 
-    /// What it adds to a solver's description.
+    /// Its settings in words.
     fn describe(&self) -> Option<String> {
         None
     }

@@ -34,7 +34,7 @@ pub fn keep(run: &mut Run<'_>, callbacks: &Callbacks) -> Result<()> {
                 values.insert(callback.name().to_owned(), state.value);
                 tensors.extend(state.tensors);
             }
-            let solver = serde_json::to_value(Whole { run: &run.tally, callbacks: values });
+            let method = serde_json::to_value(Whole { run: &run.tally, callbacks: values });
             let standing = Standing {
                 step: run.step,
                 // The record of this step, if one is due, comes after the checkpoint.
@@ -42,7 +42,7 @@ pub fn keep(run: &mut Run<'_>, callbacks: &Callbacks) -> Result<()> {
                 samples: run.samples,
                 seconds: run.clock.seconds(),
                 masks: run.model.masks().to_vec(),
-                solver: solver.map_err(|e| Error::unsupported("checkpoint", e.to_string()))?,
+                method: method.map_err(|e| Error::unsupported("checkpoint", e.to_string()))?,
             };
             run.observer.checkpoint(&Checkpoint { tensors, standing })?;
         }
@@ -54,8 +54,8 @@ pub fn keep(run: &mut Run<'_>, callbacks: &Callbacks) -> Result<()> {
 /// Brings a run, whose model is restored, and its callbacks to where `resume` stood. Refuses a state that is missing, and one
 /// that no part of the run keeps.
 pub fn restore(run: &mut Run<'_>, callbacks: &mut Callbacks, resume: &Resume) -> Result<()> {
-    let whole: Whole<Tally> = Whole::deserialize(&resume.standing.solver)
-        .map_err(|e| Error::invalid(&resume.place, "solver", e, "what training keeps"))?;
+    let whole: Whole<Tally> = Whole::deserialize(&resume.standing.method)
+        .map_err(|e| Error::invalid(&resume.place, "method", e, "what training keeps"))?;
     (run.step, run.samples, run.tally) = (resume.standing.step, resume.standing.samples, whole.run);
     let mut known: BTreeSet<String> = tensors(&run.model).into_iter().map(|t| t.0).collect();
     for callback in &mut callbacks.0 {

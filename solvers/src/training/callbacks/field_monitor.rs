@@ -48,7 +48,7 @@ impl FieldMonitor {
         if let Some(scan) = job.held_out {
             let [rows, columns] = scan.geometry.detector;
             let every = (scan.projections.len() / HELD_OUT_RAYS).max(1) | 1;
-            // Over all pixels, as solvers on voxels have it: errors of either kind compare.
+            // Over all pixels, as iterative methods have it: errors of either kind compare.
             top = scan.projections.iter().map(|p| f64::from(scene.line_to_unit(*p))).fold(0.0, f64::max);
             for i in (0..scan.projections.len()).step_by(every) {
                 let at = [i / (rows * columns), i / columns % rows, i % columns];
