@@ -3,10 +3,12 @@
 use crate::files;
 use crate::memory::{self, Memory};
 use crate::specs;
+use conefield_backend_cpu::Cpu;
 use conefield_core::Result;
 use conefield_core::backend::Backend;
 use conefield_core::method::{Context, Plan};
 use conefield_core::spec::load::Loaded;
+use conefield_tradeoff::levers::Specs;
 use conefield_tradeoff::schedule::Runnable;
 use serde_json::Value;
 use std::path::Path;
@@ -25,6 +27,23 @@ impl Runnable for Planned {
 
     fn plan(&mut self) -> &mut dyn Plan {
         self.plan.as_mut()
+    }
+}
+
+/// Specs as the command line names them: those that are shipped, types and files.
+pub struct Known;
+
+impl Specs for Known {
+    fn is_shipped(&self, name: &str) -> bool {
+        specs::SHIPPED.iter().any(|s| s.name == name)
+    }
+
+    fn read(&self, what: &str, sets: &[String]) -> Result<Loaded> {
+        specs::read(what, sets)
+    }
+
+    fn build(&self, loaded: &Loaded) -> Result<Box<dyn Plan>> {
+        plan_without_files(loaded, &Cpu::new())
     }
 }
 
@@ -82,7 +101,6 @@ pub fn init(tree: &Value, path: &Path) -> String {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use conefield_backend_cpu::Cpu;
     use conefield_projectors::simulate::{PhantomKind, Protocol, phantom_of, simulate};
     use conefield_tradeoff::calibrate::{Bench, calibrate};
     use conefield_tradeoff::front::{Front, Unknowns};

@@ -2,6 +2,7 @@
 
 use conefield_core::{Error, Result};
 pub use conefield_report::text::{bytes, duration, number, table};
+pub use conefield_tradeoff::json::to_json;
 use serde::Serialize;
 use std::io::{ErrorKind, Write};
 
@@ -16,9 +17,4 @@ pub fn say(text: &str) -> Result<()> {
 /// Prints one JSON object.
 pub fn json(value: &impl Serialize) -> Result<()> {
     say(&to_json(value)?)
-}
-
-/// `value` as JSON for people to read, too.
-pub fn to_json(value: &impl Serialize) -> Result<String> {
-    serde_json::to_string_pretty(value).map_err(|e| Error::unsupported("writing JSON", e.to_string()))
 }

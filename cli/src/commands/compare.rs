@@ -2,8 +2,7 @@
 
 use super::protocol::RunProtocol;
 use super::reconstruct::{budget, identity};
-use super::record::ScanRecord;
-use super::trial::{Figures, LONGEST, Trial, TrialInput, read_json};
+use super::trial::{self, Trial};
 use super::{EndOptions, General, backends::simd_level};
 use crate::backend::BackendChoice;
 use crate::memory::Memory;
@@ -17,6 +16,8 @@ use conefield_core::method::Plan;
 use conefield_core::spec::load::Loaded;
 use conefield_core::{Error, Result};
 use conefield_report::MiddleSlices;
+use conefield_tradeoff::json::{LONGEST, read_json};
+use conefield_tradeoff::trial::{Figures, ScanRecord, TrialInput};
 use serde::{Deserialize, Serialize};
 use serde_json::Value;
 use std::collections::BTreeMap;
@@ -125,7 +126,7 @@ impl CompareArgs {
     pub fn run(self, general: &General) -> Result<()> {
         // Whatever is wrong with the input is told before anything is made.
         let mut methods = self.methods()?;
-        let input = TrialInput::read(&self.scan, &self.protocol)?;
+        let input = trial::input(&self.scan, &self.protocol)?;
         methods.iter().try_for_each(|m| specs::check_held_out(&m.loaded, m.plan.as_ref(), &input.held))?;
         let old = self.look_into_folder()?;
         for method in &mut methods {

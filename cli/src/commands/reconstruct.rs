@@ -1,6 +1,6 @@
 //! `conefield reconstruct`
 
-use super::record::{RunRecord, ScanRecord, summary};
+use super::record::{RunRecord, summary};
 use super::{backends::simd_level, evaluate, protocol::RunProtocol};
 use crate::live::Live;
 use crate::memory;
@@ -22,6 +22,7 @@ use conefield_report::MiddleSlices;
 use conefield_tradeoff::calibrate::Bench;
 use conefield_tradeoff::front::Front;
 use conefield_tradeoff::schedule::Budget;
+use conefield_tradeoff::trial::ScanRecord;
 use std::collections::BTreeMap;
 use std::fs::File;
 use std::path::PathBuf;
@@ -277,7 +278,7 @@ impl ReconstructArgs {
     }
 }
 
-pub fn split(scan: Scan, held: &[usize]) -> Result<(Scan, Option<Scan>)> {
+fn split(scan: Scan, held: &[usize]) -> Result<(Scan, Option<Scan>)> {
     let (train, held) = scan.split(held)?;
     Ok((train, Some(held)))
 }

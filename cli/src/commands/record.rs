@@ -2,13 +2,12 @@
 
 use super::{EndOptions, evaluate};
 use crate::memory::Memory;
+use crate::out;
 use crate::plugins::Used;
-use crate::{files, out};
-use conefield_core::Result;
 use conefield_core::backend::Explain;
-use conefield_core::scan::Scan;
 use conefield_metrics::Scores;
 use conefield_tradeoff::schedule::Schedule;
+use conefield_tradeoff::trial::ScanRecord;
 use serde::Serialize;
 use std::path::Path;
 
@@ -62,50 +61,6 @@ pub struct RunRecord {
     pub best_step: Option<u64>,
     pub peak: f64,
     pub scores: Option<Scores>,
-}
-
-/// Which scan it was.
-#[derive(Debug, Serialize)]
-pub struct ScanRecord {
-    pub path: String,
-    pub views: usize,
-    pub detector: [usize; 2],
-    pub volume: [usize; 3],
-    pub projections_fnv1a64: String,
-    /// Of where everything stood, and of the unit.
-    pub geometry_fnv1a64: String,
-}
-
-impl ScanRecord {
-    /// The whole scan that was read from `path`.
-    pub fn of(path: &Path, scan: &Scan) -> Result<Self> {
-        let placed = out::to_json(&(&scan.geometry, &scan.unit))?;
-        Ok(Self {
-            path: path.display().to_string(),
-            views: scan.geometry.views.len(),
-            detector: scan.geometry.detector,
-            volume: scan.geometry.volume.shape,
-            projections_fnv1a64: checksum(scan.projections.iter().flat_map(|x| x.to_le_bytes())),
-            geometry_fnv1a64: checksum(placed.into_bytes().into_iter()),
-        })
-    }
-
-    /// The name of its file or folder.
-    pub fn name(&self) -> String {
-        files::stem(&self.path)
-    }
-
-    /// In words.
-    pub fn line(&self) -> String {
-        let (views, [rows, columns], [x, y, z]) = (self.views, self.detector, self.volume);
-        format!("{}: {views} views of {rows} x {columns} pixels, {x} x {y} x {z} voxels", self.path)
-    }
-}
-
-/// FNV-1a, to recognise a scan by.
-fn checksum(bytes: impl Iterator<Item = u8>) -> String {
-    let hash = bytes.fold(0xcbf2_9ce4_8422_2325u64, |h, b| (h ^ u64::from(b)).wrapping_mul(0x0100_0000_01b3));
-    format!("{hash:016x}")
 }
 
 /// The record for people.

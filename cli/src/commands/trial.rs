@@ -2,21 +2,16 @@
 
 use super::General;
 use super::protocol::{RunProtocol, word};
-use super::reconstruct::{FAILED, split};
-use super::record::ScanRecord;
+use super::reconstruct::FAILED;
 use crate::memory::Run;
 use crate::{files, signals};
 use conefield_core::{Error, Result};
-use conefield_report::MiddleSlices;
-use serde::{Deserialize, Serialize};
-use serde_json::Value;
+use conefield_tradeoff::trial::TrialInput;
 use std::io::Read;
 use std::path::Path;
 use std::process::{Command, ExitStatus, Stdio};
 use std::time::Duration;
 
-/// Longest record, table or spec that is read back, in bytes.
-pub const LONGEST: u64 = 16 << 20;
 /// Between two looks at a run's process.
 const LOOK: Duration = Duration::from_millis(20);
 
@@ -30,31 +25,6 @@ pub struct Trial<'a> {
     pub protocol: &'a RunProtocol,
     /// Further options.
     pub more: &'a [&'a str],
-}
-
-/// What is known of the input once all of it was looked at.
-pub struct TrialInput {
-    pub scan: ScanRecord,
-    pub held: Vec<usize>,
-    pub reference: Option<MiddleSlices>,
-}
-
-/// What a table takes from a run's `record.json`, under the names that it has there.
-#[derive(Debug, Clone, Serialize, Deserialize)]
-pub struct Figures {
-    pub steps: u64,
-    pub train_s: f64,
-    pub export_s: f64,
-    pub total_s: f64,
-    pub peak_bytes: Option<u64>,
-    pub threads: usize,
-    pub parameters: usize,
-    pub samples: u64,
-    pub samples_per_s: Option<f64>,
-    pub loss: Option<f64>,
-    pub held_out: Option<f64>,
-    /// Kept as it stands, with the reasons for what is missing.
-    pub scores: Option<Value>,
 }
 
 impl Trial<'_> {
@@ -100,49 +70,19 @@ impl Trial<'_> {
     }
 }
 
-impl TrialInput {
-    /// Reads scan and reference, to refuse what does not fit; of both only little is kept.
-    pub fn read(path: &Path, protocol: &RunProtocol) -> Result<Self> {
-        let all = Run {
-            scan: conefield_io::scan_size(path)?,
-            split: protocol.hold_out.is_some(),
-            reference: protocol.reference.is_some(),
-            resume: false,
-        };
-        all.reading().check(|_| vec![])?;
-        let scan = files::scan(path)?;
-        let reference = protocol.reference(path, &scan)?;
-        let record = ScanRecord::of(path, &scan)?;
-        let held = protocol.held_out(scan.geometry.views.len())?;
-        if !held.is_empty() {
-            split(scan, &held)?;
-        }
-        Ok(Self { scan: record, held, reference: reference.as_ref().map(MiddleSlices::of) })
-    }
-}
-
-impl Figures {
-    /// Of the finished run in `folder`.
-    pub fn of_run(folder: &Path) -> Result<Self> {
-        read_json(&folder.join("record.json"))
-    }
-
-    /// dB; infinite, which JSON has no number for, where the result is the reference.
-    pub fn psnr(&self) -> Option<f64> {
-        self.scores.as_ref().map(|s| s["psnr"].as_f64().unwrap_or(f64::INFINITY))
-    }
-
-    /// One of the scores, where it is defined.
-    pub fn score(&self, name: &str) -> Option<f64> {
-        self.scores.as_ref().and_then(|s| s[name].as_f64())
-    }
-}
-
-/// Reads what this program wrote.
-pub fn read_json<T: serde::de::DeserializeOwned>(path: &Path) -> Result<T> {
-    let text = conefield_core::files::read_text(path, LONGEST)?;
-    let expected = "what conefield writes there; --force starts anew";
-    serde_json::from_str(&text).map_err(|e| Error::invalid(path.display().to_string(), "JSON", e, expected))
+/// Reads scan and reference, to refuse what does not fit; of both only little is kept.
+pub fn input(path: &Path, protocol: &RunProtocol) -> Result<TrialInput> {
+    let all = Run {
+        scan: conefield_io::scan_size(path)?,
+        split: protocol.hold_out.is_some(),
+        reference: protocol.reference.is_some(),
+        resume: false,
+    };
+    all.reading().check(|_| vec![])?;
+    let scan = files::scan(path)?;
+    let reference = protocol.reference(path, &scan)?;
+    let held = protocol.held_out(scan.geometry.views.len())?;
+    TrialInput::of(path, scan, reference.as_ref(), held)
 }
 
 /// What ended a process: its exit status above 128, as shells have it, or the signal itself.

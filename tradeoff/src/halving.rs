@@ -1,7 +1,7 @@
 //! Successive halving (Jamieson and Talwalkar, AISTATS 2016): many candidates get little time, the best share of them
 //! more. Fields and methods on voxels are ranked apart.
 
-use conefield_tradeoff::front::Unknowns;
+use crate::front::Unknowns;
 
 /// What a candidate came to under a budget.
 #[derive(Debug, Clone, Copy, PartialEq)]

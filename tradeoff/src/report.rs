@@ -1,16 +1,16 @@
 //! What a search came to: the front as table, figure and JSON, its specs, and how well held-out views rank.
 
-use super::pareto::{Performance, front};
-use super::{FILES, FOLDERS, Over, Rung, Search, Status, accuracy};
-use crate::commands::trial::Figures;
-use crate::out;
-use crate::specs;
-use crate::table::Table;
+use crate::front::{Front, Point, Reached, Tuned, Unknowns};
+use crate::json::to_json;
+use crate::levers::{Candidate, Specs};
+use crate::pareto::{Performance, front};
+use crate::search::{FILES, FOLDERS, Over, Rung, Search, Status};
+use crate::statistics::{mean, spearman};
+use crate::trial::Figures;
 use conefield_core::spec::load::to_toml;
 use conefield_core::{Error, Result};
-use conefield_report::{CurveOptions, Panel, panels_png};
-use conefield_tradeoff::front::{Front, Point, Reached, Tuned, Unknowns};
-use conefield_tradeoff::statistics::{mean, spearman};
+use conefield_report::text::{bytes, duration, number};
+use conefield_report::{CurveOptions, Panel, Table, panels_png};
 use serde::Serialize;
 use serde_json::Value;
 use std::fs;
@@ -72,6 +72,7 @@ struct Best {
 }
 
 impl TradeoffReport {
+    /// What comes of the trials; without a result of any there is nothing to tell.
     pub fn new(search: Search, rungs: Vec<Rung>, trials: Vec<Over>) -> Result<Self> {
         let points = points(&search, &trials);
         if points.is_empty() {
@@ -108,13 +109,13 @@ impl TradeoffReport {
 
     /// Writes everything but the trials themselves. The state comes last: as long as it lacks a front, `--resume` makes
     /// one.
-    pub fn write(&self, folder: &Path) -> Result<()> {
+    pub fn write(&self, folder: &Path, specs: &dyn Specs) -> Result<()> {
         let [state, table, figure, file] = FILES.map(|f| folder.join(f));
-        self.write_specs(&folder.join(FOLDERS[0]))?;
+        self.write_specs(&folder.join(FOLDERS[0]), specs)?;
         conefield_io::write_text_atomic(&file, &self.front_file()?)?;
         self.draw(&figure)?;
         conefield_io::write_text_atomic(&table, &self.table().markdown())?;
-        conefield_io::write_text_atomic(&state, &out::to_json(self)?)
+        conefield_io::write_text_atomic(&state, &to_json(self)?)
     }
 
     /// For people.
@@ -137,25 +138,25 @@ impl TradeoffReport {
         self.points.iter().filter(named).collect()
     }
 
-    fn candidate(&self, point: &Mean) -> Result<&super::Candidate> {
+    fn candidate(&self, point: &Mean) -> Result<&Candidate> {
         let found = self.search.candidates.iter().find(|c| c.name == point.candidate);
         found.ok_or_else(|| Error::unsupported("tradeoff", format!("no candidate {}", point.candidate)))
     }
 
     /// A spec a point, whole, that ends after as many steps or passes as the trial had.
-    fn write_specs(&self, folder: &Path) -> Result<()> {
+    fn write_specs(&self, folder: &Path, specs: &dyn Specs) -> Result<()> {
         match fs::remove_dir_all(folder) {
             Err(e) if e.kind() != std::io::ErrorKind::NotFound => return Err(Error::io(folder, e)),
             _ => fs::create_dir_all(folder).map_err(|e| Error::io(folder, e))?,
         }
         for point in self.chosen() {
             let candidate = self.candidate(point)?;
-            let base = specs::read(&candidate.spec, &candidate.sets)?;
+            let base = specs.read(&candidate.spec, &candidate.sets)?;
             let scans: Vec<String> = self.search.scans.iter().map(|s| s.name()).collect();
             let said = format!(
                 "{} in {} on {}, with {} threads.",
                 self.reached(point),
-                out::duration(point.total_s),
+                duration(point.total_s),
                 scans.join(", "),
                 self.search.threads
             );
@@ -165,7 +166,7 @@ impl TradeoffReport {
             for (key, value) in [("name", &point.name), ("description", &said)] {
                 sets.push(format!("{key}={}", toml::Value::String(value.clone())));
             }
-            let text = to_toml(&specs::read(&candidate.spec, &sets)?.spec)?;
+            let text = to_toml(&specs.read(&candidate.spec, &sets)?.spec)?;
             conefield_io::write_text_atomic(folder.join(format!("{}.toml", point.name)), &text)?;
         }
         Ok(())
@@ -226,13 +227,13 @@ impl TradeoffReport {
         for name in &self.front {
             let Some(p) = self.points.iter().find(|p| p.name == *name) else { continue };
             let figure = |x: Option<f64>, digits: usize| x.map_or("-".into(), |x| format!("{x:.digits$}"));
-            let mut row = vec![p.candidate.clone(), out::duration(p.budget_s)];
+            let mut row = vec![p.candidate.clone(), duration(p.budget_s)];
             if self.by_reference() {
                 row.extend([figure(p.psnr, 2), figure(p.ssim_2d, 4)]);
             }
-            row.extend([figure(p.held_out, 5), out::number(p.steps.round() as u64)]);
+            row.extend([figure(p.held_out, 5), number(p.steps.round() as u64)]);
             row.extend([format!("{:.2}", p.train_s), format!("{:.2}", p.total_s)]);
-            row.push(p.peak_bytes.map_or("-".into(), out::bytes));
+            row.push(p.peak_bytes.map_or("-".into(), bytes));
             rows.push(row);
         }
         Table { rows, notes: self.notes() }
@@ -251,7 +252,7 @@ impl TradeoffReport {
             let short = self.count(rung.budget_s, Status::TooShort);
             let failed = self.count(rung.budget_s, Status::Failed);
             let mut line =
-                format!("{}: {} tried, {} went on", out::duration(rung.budget_s), rung.tried.len(), rung.kept.len());
+                format!("{}: {} tried, {} went on", duration(rung.budget_s), rung.tried.len(), rung.kept.len());
             for (n, what) in [(short, "had too little time"), (failed, "failed")] {
                 if n > 0 {
                     line += &format!(", {n} trials {what}");
@@ -263,7 +264,7 @@ impl TradeoffReport {
             let found = r.spearman.map_or("not defined".into(), |x| format!("{x:.2}"));
             notes.push(format!(
                 "held-out error against PSNR at {} on {}: Spearman's rank correlation {found} over {} trials",
-                out::duration(r.budget_s),
+                duration(r.budget_s),
                 r.scan,
                 r.trials
             ));
@@ -334,7 +335,7 @@ fn points(search: &Search, trials: &[Over]) -> Vec<Mean> {
                 (0..search.scans.len()).map(|s| here(s).and_then(|t| t.figures.clone())).collect();
             let Some(runs) = runs.filter(|r| !r.is_empty()) else { continue };
             let mean = |of: &dyn Fn(&Figures) -> Option<f64>| mean(runs.iter().map(of));
-            let Some(accuracy) = mean(&|f| accuracy(search, f)) else { continue };
+            let Some(accuracy) = mean(&|f| search.accuracy(f)) else { continue };
             let peak_bytes: Option<u64> = runs.iter().map(|f| f.peak_bytes).max().flatten();
             let total_s = mean(&|f| Some(f.total_s)).unwrap_or(f64::NAN);
             let bytes = peak_bytes.unwrap_or(1) as f64;
@@ -379,7 +380,7 @@ fn ranking(search: &Search, trials: &[Over]) -> Vec<Ranking> {
 
 /// What makes a method with these settings end after `steps` steps or passes. FDK has no number to set. The passes of the
 /// later methods of a chain are among its steps.
-fn end(method: &Value, steps: u64) -> Option<String> {
+pub fn end(method: &Value, steps: u64) -> Option<String> {
     if let Some([first, later @ ..]) = method["methods"].as_array().map(|all| &all[..]) {
         let passes: u64 = later.iter().filter_map(|m| m["stop"]["passes"].as_u64()).sum();
         return end(first, steps.saturating_sub(passes).max(1)).map(|set| format!("methods.0.{set}"));
@@ -387,24 +388,4 @@ fn end(method: &Value, steps: u64) -> Option<String> {
     let keys = [("stop", "stop.passes"), ("training", "training.steps")];
     let key = keys.into_iter().find(|(key, _)| method.get(key).is_some());
     key.map(|(_, key)| format!("{key}={steps}"))
-}
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-
-    #[test]
-    fn every_method_ends_after_its_steps() {
-        for (spec, sets, want) in [
-            ("fdk", vec![], None),
-            ("os-sart", vec![], Some("stop.passes=105")),
-            ("fast", vec![], Some("training.steps=105")),
-            ("field-tv", vec!["methods.1.stop.passes=5".to_owned()], Some("methods.0.training.steps=100")),
-        ] {
-            let loaded = specs::read(spec, &sets).unwrap();
-            let set = end(&loaded.tree, 105);
-            assert_eq!(set.as_deref(), want, "{spec}");
-            specs::read(spec, &set.into_iter().collect::<Vec<_>>()).unwrap();
-        }
-    }
 }

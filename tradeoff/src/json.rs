@@ -1,0 +1,21 @@
+//! JSON as this program writes and reads it.
+
+use conefield_core::{Error, Result};
+use serde::Serialize;
+use serde::de::DeserializeOwned;
+use std::path::Path;
+
+/// Longest record, table or spec that is read back, in bytes.
+pub const LONGEST: u64 = 16 << 20;
+
+/// `value` as JSON for people to read, too.
+pub fn to_json(value: &impl Serialize) -> Result<String> {
+    serde_json::to_string_pretty(value).map_err(|e| Error::unsupported("writing JSON", e.to_string()))
+}
+
+/// Reads what this program wrote.
+pub fn read_json<T: DeserializeOwned>(path: &Path) -> Result<T> {
+    let text = conefield_core::files::read_text(path, LONGEST)?;
+    let expected = "what conefield writes there; --force starts anew";
+    serde_json::from_str(&text).map_err(|e| Error::invalid(path.display().to_string(), "JSON", e, expected))
+}

@@ -1,0 +1,287 @@
+//! The search itself: every candidate under the smallest budget, the best share of them under the next one, and so on.
+//! What is done stands in the search's folder, where it can be gone on with.
+
+use crate::front::Unknowns;
+use crate::halving::{TrialOutcome, go_on, to_come};
+use crate::json::{read_json, to_json};
+use crate::levers::Candidate;
+use crate::schedule::TOO_SHORT;
+use crate::statistics::mean;
+use crate::trial::{Figures, ScanRecord};
+use conefield_core::error::ensure;
+use conefield_core::{Error, Result};
+use conefield_report::text::duration;
+use serde::{Deserialize, Serialize};
+use serde_json::Value;
+use std::fs;
+use std::io::ErrorKind;
+use std::path::{Path, PathBuf};
+use tracing::info;
+
+/// What a search leaves in its folder: files, then folders.
+pub(crate) const FILES: [&str; 4] = ["tradeoff.json", "tradeoff.md", "front.png", "front.toml"];
+pub(crate) const FOLDERS: [&str; 2] = ["front", "trials"];
+/// Of a trial's files, what only its own result needs.
+const HEAVY: [&str; 3] = ["volume.nii.gz", "weights.safetensors", "checkpoint.safetensors"];
+
+/// What decides about every trial: a search may go on only where all of it is as it was.
+#[derive(Debug, Serialize)]
+pub struct Search {
+    /// Of the program.
+    pub version: &'static str,
+    /// The scans to be good on.
+    pub scans: Vec<ScanRecord>,
+    /// The volumes sought, one a scan; none where views kept aside rank.
+    pub references: Vec<PathBuf>,
+    /// Views to keep aside, as the command line has it.
+    pub hold_out: Option<String>,
+    /// The data range for PSNR and SSIM.
+    pub peak: f64,
+    /// Seed of everything random.
+    pub seed: u64,
+    /// Seconds that a whole run may take, from the least.
+    pub budgets_s: Vec<f64>,
+    /// Share that goes on to the next budget.
+    pub keep: f64,
+    /// What is tried under the first budget.
+    pub candidates: Vec<Candidate>,
+    /// As the command line has it.
+    pub backend: String,
+    /// Which SIMD instructions there are.
+    pub simd: String,
+    /// Threads of a run.
+    pub threads: usize,
+    /// Bytes that a run may hold, where that was set.
+    pub memory_limit: Option<u64>,
+}
+
+/// A trial that is over.
+#[derive(Debug, Clone, Serialize, Deserialize)]
+pub struct Over {
+    /// Seconds that it had.
+    pub budget_s: f64,
+    /// The candidate's name.
+    pub candidate: String,
+    /// Which of the scans.
+    pub scan: usize,
+    /// How it ended.
+    pub status: Status,
+    /// What went wrong.
+    pub error: Option<String>,
+    /// What it took and reached.
+    #[serde(flatten)]
+    pub figures: Option<Figures>,
+}
+
+/// How a trial ended.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "kebab-case")]
+pub enum Status {
+    /// It has a result.
+    Done,
+    /// The budget was too short to do anything.
+    TooShort,
+    /// It has none.
+    Failed,
+}
+
+/// What happened under a budget.
+#[derive(Debug, Serialize)]
+pub struct Rung {
+    /// Seconds that every trial had.
+    pub budget_s: f64,
+    /// Names of the candidates.
+    pub tried: Vec<String>,
+    /// Those that went on.
+    pub kept: Vec<String>,
+}
+
+/// A trial that is to be made.
+#[derive(Debug)]
+pub struct Due<'a> {
+    /// The method.
+    pub candidate: &'a Candidate,
+    /// Seconds that it has.
+    pub budget_s: f64,
+    /// Which of the scans.
+    pub scan: usize,
+    /// The folder for its run, where an interrupted trial may have left something.
+    pub output: PathBuf,
+    /// In words, to say what an interruption interrupted.
+    pub part: String,
+}
+
+/// What to do about an earlier search in the folder.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Earlier {
+    /// Refuse to begin.
+    Refuse,
+    /// Remove it with all its trials.
+    Replace,
+    /// Go on with it.
+    Resume,
+}
+
+impl Search {
+    /// Opens the folder of a search; where one is resumed, what it got done.
+    pub fn open(&self, folder: &Path, earlier: Earlier) -> Result<Vec<Over>> {
+        let place = folder.display().to_string();
+        let old = entries(folder)?;
+        let expected = "a new or empty folder, --resume to go on or --force to replace it";
+        let state = folder.join(FILES[0]);
+        ensure(old.is_empty() || earlier != Earlier::Refuse, &place, "output", "an earlier search", expected)?;
+        if earlier == Earlier::Replace {
+            // Only what bears a search's mark goes with all that is in it.
+            let marked = old.is_empty() || state.is_file();
+            ensure(marked, &place, "output", "a folder without tradeoff.json", "an earlier search to replace")?;
+            for (path, is_dir) in old {
+                let gone = if is_dir { fs::remove_dir_all(&path) } else { fs::remove_file(&path) };
+                gone.map_err(|e| Error::io(&path, e))?;
+            }
+        }
+        fs::create_dir_all(folder).map_err(|e| Error::io(folder, e))?;
+        if earlier == Earlier::Resume && state.is_file() { self.done(&state) } else { Ok(vec![]) }
+    }
+
+    /// What the search whose state this is got done; one that was another is refused.
+    fn done(&self, state: &Path) -> Result<Vec<Over>> {
+        #[derive(Deserialize)]
+        struct Then {
+            search: Value,
+            trials: Vec<Over>,
+        }
+        let then: Then = read_json(state)?;
+        let now = serde_json::to_value(self).map_err(|e| Error::unsupported("the search", e.to_string()))?;
+        for (key, now) in now.as_object().into_iter().flatten() {
+            let then = &then.search[key];
+            let expected = format!("{} as in the earlier search; --force starts anew", short(then));
+            ensure(then == now, &state.display().to_string(), &format!("--resume: {key}"), short(now), expected)?;
+        }
+        Ok(then.trials)
+    }
+
+    /// All trials, budget by budget, but for those in `over`, which has them all in the end. `run` makes one and tells
+    /// what went wrong with it, if anything did; an error of its own ends the search, which can be resumed.
+    pub fn climb(
+        &self,
+        folder: &Path,
+        over: &mut Vec<Over>,
+        run: &mut dyn FnMut(&Due<'_>) -> Result<Option<String>>,
+    ) -> Result<Vec<Rung>> {
+        let mut rungs: Vec<Rung> = vec![];
+        let mut going: Vec<&Candidate> = self.candidates.iter().collect();
+        for (r, &budget_s) in self.budgets_s.iter().enumerate() {
+            let mut tried = vec![];
+            for (c, &candidate) in going.iter().enumerate() {
+                for scan in 0..self.scans.len() {
+                    let same = |o: &Over| o.budget_s == budget_s && o.candidate == candidate.name && o.scan == scan;
+                    if over.iter().any(same) {
+                        continue;
+                    }
+                    let left = self.left(&going, r, c, scan);
+                    let (on, of) = (self.scans[scan].name(), going.len());
+                    let name = &candidate.name;
+                    let part = format!("{name} on {on}, {} of {of} at {}", c + 1, duration(budget_s));
+                    info!("{part}: at most {} left", duration(left));
+                    let output = folder.join(FOLDERS[1]).join(format!("{budget_s}s")).join(format!("{name}_{scan}"));
+                    over.push(settle(&Due { candidate, budget_s, scan, output, part }, run)?);
+                    self.write_state(folder, &rungs, over)?;
+                }
+                tried.push((candidate.kind, self.outcome(over, candidate, budget_s)));
+            }
+            let last = r + 1 == self.budgets_s.len();
+            let on = if last { vec![] } else { go_on(&tried, self.keep) };
+            let name = |c: &&Candidate| c.name.clone();
+            let kept: Vec<&Candidate> = on.iter().map(|i| going[*i]).collect();
+            let (tried, names) = (going.iter().map(name).collect(), kept.iter().map(name).collect());
+            rungs.push(Rung { budget_s, tried, kept: names });
+            going = kept;
+        }
+        Ok(rungs)
+    }
+
+    /// Seconds that the search takes from here at most: trial `c` on `scan` of budget `r` is next.
+    fn left(&self, going: &[&Candidate], r: usize, c: usize, scan: usize) -> f64 {
+        let fields = going.iter().filter(|c| c.kind == Unknowns::Field).count();
+        let rungs = self.budgets_s.len() - r;
+        let later = to_come(fields, going.len() - fields, rungs, self.keep);
+        let all = later.iter().zip(&self.budgets_s[r..]).map(|(n, budget)| *n as f64 * budget).sum::<f64>();
+        let scans = self.scans.len() as f64;
+        scans * all - (c as f64 * scans + scan as f64) * self.budgets_s[r]
+    }
+
+    /// Keeps what is done so far where it can be gone on with.
+    fn write_state(&self, folder: &Path, rungs: &[Rung], trials: &[Over]) -> Result<()> {
+        #[derive(Serialize)]
+        struct State<'a> {
+            search: &'a Search,
+            rungs: &'a [Rung],
+            trials: &'a [Over],
+        }
+        conefield_io::write_text_atomic(folder.join(FILES[0]), &to_json(&State { search: self, rungs, trials })?)
+    }
+
+    /// How accurate `figures` are, higher is better: PSNR where there is a reference, else the held-out error with its
+    /// sign turned.
+    pub(crate) fn accuracy(&self, figures: &Figures) -> Option<f64> {
+        if self.references.is_empty() { figures.held_out.map(|e| -e) } else { figures.psnr() }
+    }
+
+    /// What a candidate came to under a budget on all scans together.
+    fn outcome(&self, over: &[Over], candidate: &Candidate, budget: f64) -> TrialOutcome {
+        let here: Vec<&Over> = over.iter().filter(|o| o.budget_s == budget && o.candidate == candidate.name).collect();
+        if here.iter().any(|o| o.status == Status::TooShort) {
+            return TrialOutcome::TooShort;
+        }
+        let accuracies = here.iter().map(|o| o.figures.as_ref().and_then(|f| self.accuracy(f)));
+        mean(accuracies).map_or(TrialOutcome::Failed, TrialOutcome::Accuracy)
+    }
+}
+
+/// What lies in the folder, and which of it are folders. A folder with anything in it that no search leaves is refused.
+fn entries(folder: &Path) -> Result<Vec<(PathBuf, bool)>> {
+    let entries = match fs::read_dir(folder) {
+        Err(e) if e.kind() == ErrorKind::NotFound => return Ok(vec![]),
+        entries => entries.map_err(|e| Error::io(folder, e))?,
+    };
+    let mut old = vec![];
+    for entry in entries {
+        let entry = entry.map_err(|e| Error::io(folder, e))?;
+        let (name, is_dir) = (entry.file_name(), entry.path().is_dir());
+        let known = if is_dir {
+            FOLDERS.iter().any(|f| name == *f)
+        } else {
+            FILES.iter().any(|f| name == *f) || conefield_io::is_unfinished(&name)
+        };
+        let found = format!("a folder with {} in it", name.to_string_lossy());
+        ensure(known, &folder.display().to_string(), "output", found, "a new or empty folder")?;
+        old.push((entry.path(), is_dir));
+    }
+    Ok(old)
+}
+
+/// Makes a trial, reads what it came to and leaves of its files what is worth keeping.
+fn settle(due: &Due<'_>, run: &mut dyn FnMut(&Due<'_>) -> Result<Option<String>>) -> Result<Over> {
+    let error = run(due)?;
+    let figures = if error.is_none() { Some(Figures::of_run(&due.output)?) } else { None };
+    for file in HEAVY {
+        let path = due.output.join(file);
+        match fs::remove_file(&path) {
+            Err(e) if e.kind() != ErrorKind::NotFound => return Err(Error::io(&path, e)),
+            _ => {}
+        }
+    }
+    let status = match &error {
+        None => Status::Done,
+        Some(e) if e.starts_with(TOO_SHORT) => Status::TooShort,
+        Some(_) => Status::Failed,
+    };
+    let (budget_s, candidate, scan) = (due.budget_s, due.candidate.name.clone(), due.scan);
+    Ok(Over { budget_s, candidate, scan, status, error, figures })
+}
+
+/// A value in few words.
+fn short(value: &Value) -> String {
+    let text = value.to_string();
+    if text.chars().count() <= 80 { text } else { text.chars().take(77).chain("...".chars()).collect() }
+}
