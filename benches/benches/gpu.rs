@@ -29,7 +29,7 @@ fn pipeline() -> Result<Pipeline, Box<dyn Error>> {
     let width = encoder.info().output;
     let march = RayMarch { samples: Some(SAMPLES), sampling: Sampling::Uniform, ..RayMarch::default() };
     let norm = LayerNorm::default().build(width)?;
-    Ok(Pipeline::assemble(encoder, vec![norm], Mlp::default().build(width)?, march.build()?))
+    Ok(Pipeline::new(encoder, vec![norm], Mlp::default().build(width)?, march.build()?)?)
 }
 
 struct Training {

@@ -75,7 +75,7 @@ impl Runner {
         let width = encoder.info().output;
         let norm = LayerNorm::default().build(width)?;
         let march = RayMarch { samples: Some(SAMPLES), sampling: Sampling::Uniform, ..RayMarch::default() };
-        let pipeline = Pipeline::assemble(encoder, vec![norm], Mlp::default().build(width)?, march.build()?);
+        let pipeline = Pipeline::new(encoder, vec![norm], Mlp::default().build(width)?, march.build()?)?;
         let (exe, _) = Cpu::new().compile(&pipeline)?;
         Ok(Self { model: Model::random(pipeline, 1), exe })
     }

@@ -7,7 +7,7 @@ use conefield_backend_cpu::Cpu;
 use conefield_benches::{bandwidth, multiply_adds, times};
 use conefield_core::Result;
 use conefield_core::geometry::{Geometry, Millimetres, Radians, View, VoxelGrid, norm};
-use conefield_core::method::{Job, Silent};
+use conefield_core::method::{Context, Job, Silent};
 use conefield_core::scan::{Scan, Unit};
 use conefield_core::spec::load::parse;
 use conefield_core::voxel::VoxelOperator;
@@ -84,12 +84,12 @@ fn geometry() -> Geometry {
 
 /// The whole solver, filters and all.
 fn fdk(scan: &Scan) -> Result<[f64; 3]> {
-    let spec = parse("name = \"fdk\"\n[solver]\ntype = \"fdk\"\n", "bench", &[], &[])?.spec;
-    let solver = spec.solver.build()?;
+    let spec = parse("name = \"fdk\"\ntype = \"fdk\"\n", "bench", &[], &[])?.spec;
     let backend = Cpu::new();
-    let job = Job::new(scan, &spec, &backend);
+    let mut plan = spec.method.plan(&Context::new(&backend))?;
+    let job = Job::new(scan, &backend);
     let mut failed = None;
-    let spent = times(RUNS, || failed = solver.solve(&job, &mut Silent).err());
+    let spent = times(RUNS, || failed = plan.run(&job, &mut Silent).err());
     failed.map_or(Ok(spent), Err)
 }
 

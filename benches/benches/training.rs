@@ -30,7 +30,7 @@ fn main() -> Result<(), Box<dyn Error>> {
     let norm = LayerNorm::default().build(width)?;
     let field = Mlp::default().build(width)?;
     let march = RayMarch { samples: Some(SAMPLES), sampling: Sampling::Uniform, ..RayMarch::default() };
-    let pipeline = Pipeline::assemble(encoder, vec![norm], field, march.build()?);
+    let pipeline = Pipeline::new(encoder, vec![norm], field, march.build()?)?;
     let (mut exe, explain) = Cpu::new().compile(&pipeline)?;
     println!("backend              {}", explain.backend);
     let macs = pipeline.macs();

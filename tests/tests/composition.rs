@@ -137,7 +137,11 @@ fn what_does_not_fit_is_refused_in_words() {
         let spec = with(&|v| drop(v.as_object_mut().unwrap().remove(stage)));
         refused(stage, &spec, &[stage, "nothing", "with a type"]);
     }
-    refused("no solver", &with(&|v| drop(v.as_object_mut().unwrap().remove("solver"))), &["solver", "gradient"]);
+    refused(
+        "no method",
+        &with(&|v| drop(v.as_object_mut().unwrap().remove("type"))),
+        &["type", "nothing", "neural-field"],
+    );
     refused("skip at the end", &with(&|v| v["field"]["skips"] = json!([3])), &["field.skips", "3", "1 to 2"]);
     refused("skip at the start", &with(&|v| v["field"]["skips"] = json!([0])), &["field.skips", "0", "1 to 2"]);
     for encoder in ["hash-grid", "dense-grid"] {

@@ -780,92 +780,6 @@ impl Loss for ToyLoss {
 
     fn describe(&self) -> String {
         format!("toy loss: {:?}", self.fault)
-
-/// What is wrong with a basis. It is that of voxels otherwise.
-#[derive(Debug, Clone, Copy, PartialEq)]
-enum BasisFault {
-    None,
-    /// It has no grid of voxels that it is made for.
-    Refuses,
-    /// The number of coefficients follows from the size of voxels.
-    CountsMillimetres,
-    /// The way back is a thousandth too long.
-    LongAdjoint,
-    /// Small voxels are rounded away in single precision.
-    CoarseSingle,
-    /// Voxels are squared.
-    Squares,
-    /// Voxels are added to what is there.
-    AddsVoxels,
-    /// So are coefficients.
-    AddsCoefficients,
-    /// Every coefficient counts against its voxel.
-    Negative,
-    /// It says that it is the identity and doubles everything.
-    Doubles,
-    /// The result depends on the number of threads.
-    Threads,
-}
-
-struct BasisOn(BasisFault, VoxelGrid);
-
-impl Basis for BasisFault {
-    fn on(&self, grid: &VoxelGrid) -> Result<Box<dyn Expansion>> {
-        match self {
-            Self::Refuses if grid.shape[0] == 1 => Err(Error::unsupported("toy", "a line of voxels")),
-            _ => Ok(Box::new(BasisOn(*self, *grid))),
-        }
-    }
-    fn describe(&self) -> String {
-        format!("toy: {self:?}")
-    }
-}
-
-impl Expansion for BasisOn {
-    fn coefficients(&self) -> VoxelGrid {
-        let mut grid = self.1;
-        if self.0 == BasisFault::CountsMillimetres {
-            grid.shape[0] = grid.size()[0].ceil() as usize;
-        }
-        grid
-    }
-    fn is_identity(&self) -> bool {
-        matches!(self.0, BasisFault::None | BasisFault::Doubles)
-    }
-    fn operator(&self) -> &dyn BasisOperator<f32> {
-        self
-    }
-    fn reference(&self) -> &dyn BasisOperator<f64> {
-        self
-    }
-}
-
-impl<R: Real> BasisOperator<R> for BasisOn {
-    fn expand(&self, coefficients: ArrayView3<'_, R>, mut voxels: ArrayViewMut3<'_, R>) {
-        let many = rayon::current_num_threads() == 3;
-        for (v, &c) in voxels.iter_mut().zip(&coefficients) {
-            *v = match self.0 {
-                BasisFault::AddsVoxels => *v + c,
-                BasisFault::Squares => c * c,
-                BasisFault::Negative => R::ZERO - c,
-                BasisFault::Doubles => c + c,
-                BasisFault::CoarseSingle if size_of::<R>() == 4 => R::of((c.f64() * 1e3).round() / 1e3),
-                BasisFault::Threads if many => c * R::of(1.0 + 1e-6),
-                _ => c,
-            };
-        }
-    }
-
-    fn adjoint(&self, voxels: ArrayView3<'_, R>, mut coefficients: ArrayViewMut3<'_, R>) {
-        for (c, &v) in coefficients.iter_mut().zip(&voxels) {
-            *c = match self.0 {
-                BasisFault::AddsCoefficients => *c + v,
-                BasisFault::LongAdjoint => v * R::of(1.001),
-                BasisFault::Negative => R::ZERO - v,
-                BasisFault::Doubles => v + v,
-                _ => v,
-            };
-        }
     }
 }
 
@@ -970,104 +884,6 @@ impl Prior for ToyPrior {
 
     fn describe(&self) -> String {
         format!("toy prior: {:?}", self.fault)
-
-fn every_fault_of_a_basis_fails_its_property() {
-    let sound = check_basis(&BasisFault::None);
-    assert!(sound.passed(), "{sound}");
-    for (fault, property) in [
-        (BasisFault::Refuses, "builds"),
-        (BasisFault::CountsMillimetres, "builds"),
-        (BasisFault::LongAdjoint, "adjoint: double precision"),
-        (BasisFault::LongAdjoint, "adjoint: single precision"),
-        (BasisFault::CoarseSingle, "single precision"),
-        (BasisFault::Squares, "linear"),
-        (BasisFault::AddsVoxels, "overwrites"),
-        (BasisFault::AddsCoefficients, "overwrites"),
-        (BasisFault::Negative, "no negative entries"),
-        (BasisFault::Doubles, "identity"),
-        (BasisFault::Threads, "threads"),
-    ] {
-        let report = quietly(|| check_basis(&fault));
-        assert!(report.failed().contains(&property), "{fault:?} passed {property:?}:\n{report}");
-    }
-    assert_eq!(check_basis(&BasisFault::Doubles).failed(), ["identity"]);
-}
-
-/// What is wrong with a regularizer: `½‖x‖²` otherwise, whose proximal map is `max(0, v/(1 + τ))`.
-#[derive(Debug, Clone, Copy, PartialEq)]
-enum PriorFault {
-    None,
-    /// The map shrinks half as much as it should.
-    Halved,
-    /// The map grows.
-    Grows,
-    /// The penalty is concave.
-    Concave,
-    /// The penalty of nothing is not a number.
-    NotANumber,
-    /// Less weight with more noise.
-    LessWithNoise,
-    /// What is below 0 stays.
-    Negative,
-    /// A weight of 0 shrinks as well.
-    ShrinksAlways,
-    /// The map adds to what is there.
-    Adds,
-    /// The map of a call depends on how many came before, and that is no part of the state.
-    Forgets,
-    /// It has an array that it did not ask the space for.
-    Uncounted,
-    /// The result depends on the number of threads.
-    Threads,
-}
-
-struct PriorOn {
-    fault: PriorFault,
-    calls: u64,
-    state: Vec<f32>,
-}
-
-impl Regularizer for PriorFault {
-    fn on(&self, grid: &VoxelGrid, _: &Space) -> Box<dyn Penalty> {
-        let held = if *self == Self::Uncounted { grid.shape.iter().product() } else { 0 };
-        Box::new(PriorOn { fault: *self, calls: 0, state: vec![0.0; held] })
-    }
-    fn weight(&self, _: &VoxelGrid, noise: &mut dyn FnMut(f64) -> f64) -> f64 {
-        if *self == Self::LessWithNoise { 1.0 / (1.0 + noise(1.0)) } else { noise(1.0) }
-    }
-    fn describe(&self) -> String {
-        format!("toy: {self:?}")
-    }
-}
-
-impl Penalty for PriorOn {
-    fn value(&self, x: ArrayView3<'_, f32>) -> f64 {
-        let square: f64 = x.iter().map(|x| f64::from(*x).powi(2)).sum();
-        match self.fault {
-            PriorFault::Concave => square.sqrt().sqrt(),
-            PriorFault::NotANumber => square * square / square,
-            _ => 0.5 * square,
-        }
-    }
-
-    fn prox(&mut self, v: &[f32], tau: f32, u: &mut [f32]) {
-        self.calls += 1;
-        let shrink = match self.fault {
-            PriorFault::Halved => 1.0 + 0.5 * tau,
-            PriorFault::Grows => 0.8,
-            PriorFault::ShrinksAlways => 1.01 + tau,
-            PriorFault::Forgets => 1.0 + tau * (1.0 + 0.5 / self.calls as f32),
-            PriorFault::Threads if rayon::current_num_threads() == 3 => 1.0 + 1.01 * tau,
-            _ => 1.0 + tau,
-        };
-        for (u, v) in u.iter_mut().zip(v) {
-            let x = if self.fault == PriorFault::Negative { v / shrink } else { (v / shrink).max(0.0) };
-            *u = if self.fault == PriorFault::Adds { *u + x } else { x };
-        }
-    }
-
-    fn state(&mut self) -> Vec<(&'static str, &mut [f32])> {
-        vec![("state", &mut self.state)]
     }
 }
 
@@ -1124,27 +940,227 @@ struct Lossy {
 impl LossSpec for Lossy {
     fn build(&self) -> Result<Box<dyn Loss>> {
         Ok(Box::new(ToyLoss::new(LossFault::None)))
+    }
+}
 
-fn every_fault_of_a_regularizer_fails_its_property() {
-    let sound = check_regularizer(&PriorFault::None);
+#[test]
+fn settings_that_get_lost_are_found_out() {
+    let report = check_settings::<dyn LossSpec>("test-lossy", &serde_json::json!({"lost": 2.0}));
+    assert_eq!(report.failed(), ["save and load"], "{report}");
+    let report = check_settings::<dyn LossSpec>("test-none", &serde_json::json!({}));
+    assert_eq!(report.failed(), ["save and load", "a name alone"], "{report}");
+}
+
+/// What is wrong with a basis. It is that of voxels otherwise.
+#[derive(Debug, Clone, Copy, PartialEq)]
+enum BasisFault {
+    None,
+    /// It has no grid of voxels that it is made for.
+    Refuses,
+    /// The number of coefficients follows from the size of voxels.
+    CountsMillimetres,
+    /// The way back is a thousandth too long.
+    LongAdjoint,
+    /// Small voxels are rounded away in single precision.
+    CoarseSingle,
+    /// Voxels are squared.
+    Squares,
+    /// Voxels are added to what is there.
+    AddsVoxels,
+    /// So are coefficients.
+    AddsCoefficients,
+    /// Every coefficient counts against its voxel.
+    Negative,
+    /// It says that it is the identity and doubles everything.
+    Doubles,
+    /// The result depends on the number of threads.
+    Threads,
+}
+
+struct BasisOn(BasisFault, VoxelGrid);
+
+impl Basis for BasisFault {
+    fn on(&self, grid: &VoxelGrid) -> Result<Box<dyn Expansion>> {
+        match self {
+            Self::Refuses if grid.shape[0] == 1 => Err(Error::unsupported("toy", "a line of voxels")),
+            _ => Ok(Box::new(BasisOn(*self, *grid))),
+        }
+    }
+    fn describe(&self) -> String {
+        format!("toy: {self:?}")
+    }
+}
+
+impl Expansion for BasisOn {
+    fn coefficients(&self) -> VoxelGrid {
+        let mut grid = self.1;
+        if self.0 == BasisFault::CountsMillimetres {
+            grid.shape[0] = grid.size()[0].ceil() as usize;
+        }
+        grid
+    }
+    fn is_identity(&self) -> bool {
+        matches!(self.0, BasisFault::None | BasisFault::Doubles)
+    }
+    fn operator(&self) -> &dyn BasisOperator<f32> {
+        self
+    }
+    fn reference(&self) -> &dyn BasisOperator<f64> {
+        self
+    }
+}
+
+impl<R: Real> BasisOperator<R> for BasisOn {
+    fn expand(&self, coefficients: ArrayView3<'_, R>, mut voxels: ArrayViewMut3<'_, R>) {
+        let many = rayon::current_num_threads() == 3;
+        for (v, &c) in voxels.iter_mut().zip(&coefficients) {
+            *v = match self.0 {
+                BasisFault::AddsVoxels => *v + c,
+                BasisFault::Squares => c * c,
+                BasisFault::Negative => R::ZERO - c,
+                BasisFault::Doubles => c + c,
+                BasisFault::CoarseSingle if size_of::<R>() == 4 => R::of((c.f64() * 1e3).round() / 1e3),
+                BasisFault::Threads if many => c * R::of(1.0 + 1e-6),
+                _ => c,
+            };
+        }
+    }
+
+    fn adjoint(&self, voxels: ArrayView3<'_, R>, mut coefficients: ArrayViewMut3<'_, R>) {
+        for (c, &v) in coefficients.iter_mut().zip(&voxels) {
+            *c = match self.0 {
+                BasisFault::AddsCoefficients => *c + v,
+                BasisFault::LongAdjoint => v * R::of(1.001),
+                BasisFault::Negative => R::ZERO - v,
+                BasisFault::Doubles => v + v,
+                _ => v,
+            };
+        }
+    }
+}
+
+#[test]
+fn every_fault_of_a_basis_fails_its_property() {
+    let sound = check_basis(&BasisFault::None);
     assert!(sound.passed(), "{sound}");
     for (fault, property) in [
-        (PriorFault::Halved, "proximal map"),
-        (PriorFault::Grows, "nonexpansive"),
-        (PriorFault::Concave, "convex"),
-        (PriorFault::NotANumber, "value"),
-        (PriorFault::LessWithNoise, "weight"),
-        (PriorFault::Negative, "not negative"),
-        (PriorFault::ShrinksAlways, "weight of 0"),
-        (PriorFault::Adds, "overwrites"),
-        (PriorFault::Forgets, "state"),
-        (PriorFault::Uncounted, "tally"),
-        (PriorFault::Threads, "threads"),
+        (BasisFault::Refuses, "builds"),
+        (BasisFault::CountsMillimetres, "builds"),
+        (BasisFault::LongAdjoint, "adjoint: double precision"),
+        (BasisFault::LongAdjoint, "adjoint: single precision"),
+        (BasisFault::CoarseSingle, "single precision"),
+        (BasisFault::Squares, "linear"),
+        (BasisFault::AddsVoxels, "overwrites"),
+        (BasisFault::AddsCoefficients, "overwrites"),
+        (BasisFault::Negative, "no negative entries"),
+        (BasisFault::Doubles, "identity"),
+        (BasisFault::Threads, "threads"),
+    ] {
+        let report = quietly(|| check_basis(&fault));
+        assert!(report.failed().contains(&property), "{fault:?} passed {property:?}:\n{report}");
+    }
+    assert_eq!(check_basis(&BasisFault::Doubles).failed(), ["identity"]);
+}
+
+/// What is wrong with a regularizer: `½‖x‖²` otherwise, whose proximal map is `max(0, v/(1 + τ))`.
+#[derive(Debug, Clone, Copy, PartialEq)]
+enum RegularizerFault {
+    None,
+    /// The map shrinks half as much as it should.
+    Halved,
+    /// The map grows.
+    Grows,
+    /// The penalty is concave.
+    Concave,
+    /// The penalty of nothing is not a number.
+    NotANumber,
+    /// Less weight with more noise.
+    LessWithNoise,
+    /// What is below 0 stays.
+    Negative,
+    /// A weight of 0 shrinks as well.
+    ShrinksAlways,
+    /// The map adds to what is there.
+    Adds,
+    /// The map of a call depends on how many came before, and that is no part of the state.
+    Forgets,
+    /// It has an array that it did not ask the space for.
+    Uncounted,
+    /// The result depends on the number of threads.
+    Threads,
+}
+
+struct PenaltyOn {
+    fault: RegularizerFault,
+    calls: u64,
+    state: Vec<f32>,
+}
+
+impl Regularizer for RegularizerFault {
+    fn on(&self, grid: &VoxelGrid, _: &Space) -> Box<dyn Penalty> {
+        let held = if *self == Self::Uncounted { grid.shape.iter().product() } else { 0 };
+        Box::new(PenaltyOn { fault: *self, calls: 0, state: vec![0.0; held] })
+    }
+    fn weight(&self, _: &VoxelGrid, noise: &mut dyn FnMut(f64) -> f64) -> f64 {
+        if *self == Self::LessWithNoise { 1.0 / (1.0 + noise(1.0)) } else { noise(1.0) }
+    }
+    fn describe(&self) -> String {
+        format!("toy: {self:?}")
+    }
+}
+
+impl Penalty for PenaltyOn {
+    fn value(&self, x: ArrayView3<'_, f32>) -> f64 {
+        let square: f64 = x.iter().map(|x| f64::from(*x).powi(2)).sum();
+        match self.fault {
+            RegularizerFault::Concave => square.sqrt().sqrt(),
+            RegularizerFault::NotANumber => square * square / square,
+            _ => 0.5 * square,
+        }
+    }
+
+    fn prox(&mut self, v: &[f32], tau: f32, u: &mut [f32]) {
+        self.calls += 1;
+        let shrink = match self.fault {
+            RegularizerFault::Halved => 1.0 + 0.5 * tau,
+            RegularizerFault::Grows => 0.8,
+            RegularizerFault::ShrinksAlways => 1.01 + tau,
+            RegularizerFault::Forgets => 1.0 + tau * (1.0 + 0.5 / self.calls as f32),
+            RegularizerFault::Threads if rayon::current_num_threads() == 3 => 1.0 + 1.01 * tau,
+            _ => 1.0 + tau,
+        };
+        for (u, v) in u.iter_mut().zip(v) {
+            let x = if self.fault == RegularizerFault::Negative { v / shrink } else { (v / shrink).max(0.0) };
+            *u = if self.fault == RegularizerFault::Adds { *u + x } else { x };
+        }
+    }
+
+    fn state(&mut self) -> Vec<(&'static str, &mut [f32])> {
+        vec![("state", &mut self.state)]
+    }
+}
+
+#[test]
+fn every_fault_of_a_regularizer_fails_its_property() {
+    let sound = check_regularizer(&RegularizerFault::None);
+    assert!(sound.passed(), "{sound}");
+    for (fault, property) in [
+        (RegularizerFault::Halved, "proximal map"),
+        (RegularizerFault::Grows, "nonexpansive"),
+        (RegularizerFault::Concave, "convex"),
+        (RegularizerFault::NotANumber, "value"),
+        (RegularizerFault::LessWithNoise, "weight"),
+        (RegularizerFault::Negative, "not negative"),
+        (RegularizerFault::ShrinksAlways, "weight of 0"),
+        (RegularizerFault::Adds, "overwrites"),
+        (RegularizerFault::Forgets, "state"),
+        (RegularizerFault::Uncounted, "tally"),
+        (RegularizerFault::Threads, "threads"),
     ] {
         let report = quietly(|| check_regularizer(&fault));
         assert!(report.failed().contains(&property), "{fault:?} passed {property:?}:\n{report}");
     }
-    assert_eq!(check_regularizer(&PriorFault::Uncounted).failed(), ["tally"]);
+    assert_eq!(check_regularizer(&RegularizerFault::Uncounted).failed(), ["tally"]);
 }
 
 /// What is wrong with a data term: least squares otherwise.
@@ -1215,12 +1231,6 @@ impl Misfit for DataOn<'_> {
 }
 
 #[test]
-fn settings_that_get_lost_are_found_out() {
-    let report = check_settings::<dyn LossSpec>("test-lossy", &serde_json::json!({"lost": 2.0}));
-    assert_eq!(report.failed(), ["save and load"], "{report}");
-    let report = check_settings::<dyn LossSpec>("test-none", &serde_json::json!({}));
-    assert_eq!(report.failed(), ["save and load", "a name alone"], "{report}");
-
 fn every_fault_of_a_data_term_fails_its_property() {
     let sound = check_data_term(&DataFault::None);
     assert!(sound.passed(), "{sound}");

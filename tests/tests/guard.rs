@@ -3,7 +3,7 @@
 mod common;
 mod device;
 
-use common::{Stop, model, scan, solve, solve_on, spec};
+use common::{Stop, model, plan, scan, solve, solve_on, spec};
 use conefield_backend_cpu::Cpu;
 use conefield_core::arena::{Arena, Weights};
 use conefield_core::backend::{Adam, Backend, Executable, Explain, StepStats, Work};
@@ -242,10 +242,11 @@ fn a_run_that_went_back_resumes_to_the_same_bits() {
         (masked, Fault::Loss(118)),
     ] {
         let (scan, spec) = (scan(), spec(&value).unwrap());
-        let (solver, backend) = (spec.solver.build().unwrap(), Faulty { fault, device: None });
-        let solve = |resume: Option<&Resume>, at| {
+        let backend = Faulty { fault, device: None };
+        let mut plan = plan(&spec, &backend, &Weights::default()).unwrap();
+        let mut solve = |resume: Option<&Resume>, at| {
             let mut stop = Stop::at(at);
-            let result = solver.solve(&Job { seed: 7, resume, ..Job::new(&scan, &backend) }, &mut stop);
+            let result = plan.run(&Job { seed: 7, resume, ..Job::new(&scan, &backend) }, &mut stop);
             let result = result.map(|s| (s.rollbacks, outcome(s))).map_err(|e| e.to_string());
             (result, stop)
         };

@@ -3,22 +3,23 @@
 mod common;
 mod device;
 
-use common::{Heard, Stop, model, psnr, scan, solve, spec, volume};
+use common::{Heard, Stop, model, plan, psnr, scan, solve, spec, volume};
 use conefield_backend_cpu::Cpu;
 use conefield_backend_cpu::rows::Kernels;
 use conefield_backend_cpu::step::Slots;
 use conefield_core::arena::Weights;
 use conefield_core::backend::{Adam, Backend, TrainRay, Work};
 use conefield_core::half::{Bf16, F16, Half, Stored};
-use conefield_core::method::{Job, Solver};
+use conefield_core::method::Job;
 use conefield_core::pipeline::{Model, Pipeline};
+use conefield_core::precision::Tables;
 use conefield_core::random::{mix, unit};
 use conefield_core::scene::Scene;
 use conefield_core::settings::EncoderSpec;
-use conefield_core::spec::Tables;
 use conefield_core::stage::{Encoder, Info, Kernel, Parameter, Reduced, Stage};
 use conefield_solvers::losses::L2;
 use serde_json::{Value, json};
+use std::sync::Arc;
 
 /// Formats with the largest error of gradients of a whole step against double precision, as a share of the largest.
 const FORMATS: [(Tables, f64); 2] = [(Tables::F16, 4e-4), (Tables::Bf16, 4e-3)];
@@ -171,13 +172,13 @@ fn a_run_in_halves_ends_near_one_in_f32() {
 fn what_goes_on_from_a_checkpoint_or_from_weights_has_the_same_bits() {
     for (tables, _) in FORMATS {
         let (scan, spec, cpu) = (scan(), spec(&settings(tables)).unwrap(), Cpu::new());
-        let solver: Box<dyn Solver> = spec.solver.build().unwrap();
+        let mut plan = plan(&spec, &cpu, &Weights::default()).unwrap();
         let (whole, _) = solve(&settings(tables), &scan, &Weights::default()).unwrap();
         let mut stop = Stop::at(20);
-        assert!(solver.solve(&Job { seed: 7, ..Job::new(&scan, &cpu) }, &mut stop).is_err());
+        assert!(plan.run(&Job { seed: 7, ..Job::new(&scan, &cpu) }, &mut stop).is_err());
         let resume = stop.kept.unwrap();
         let job = Job { seed: 7, resume: Some(&resume), ..Job::new(&scan, &cpu) };
-        let gone_on = solver.solve(&job, &mut Heard::default()).unwrap();
+        let gone_on = plan.run(&job, &mut Heard::default()).unwrap();
         let (a, b) = (volume(&whole), volume(&gone_on));
         assert!(a.data.iter().zip(&b.data).all(|(a, b)| a.to_bits() == b.to_bits()), "{tables}");
         let (whole, gone_on) = (model(whole), model(gone_on));
@@ -254,7 +255,7 @@ fn tables_beyond_a_format_end_at_its_largest_number() {
 // ---- refusals ----
 
 /// An encoder that reads its parameters as they are, as a plugin's does.
-struct Plain(Box<dyn Encoder>);
+struct Plain(Arc<dyn Encoder>);
 
 impl Stage for Plain {
     fn info(&self) -> Info {
@@ -282,9 +283,8 @@ impl Encoder for Plain {
 #[test]
 fn a_stage_that_cannot_read_halves_is_refused_in_words() {
     let pipeline = |tables| {
-        let Pipeline { encoder, normalizers, field, projector, .. } = built(&settings(tables));
-        let mut pipeline = Pipeline::assemble(Box::new(Plain(encoder)), normalizers, field, projector);
-        pipeline.tables = tables;
+        let mut pipeline = built(&settings(tables));
+        pipeline.encoder = Arc::new(Plain(pipeline.encoder));
         pipeline
     };
     assert!(Cpu::new().compile(&pipeline(Tables::F32)).is_ok());

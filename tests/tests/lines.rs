@@ -3,20 +3,21 @@
 mod common;
 mod device;
 
-use common::{Stop, model, psnr, scan, solve, spec, truth};
+use common::{Stop, model, plan, psnr, scan, solve, spec, truth};
 use conefield_backend_cpu::Cpu;
 use conefield_core::arena::Weights;
 use conefield_core::backend::{Backend, Executable, TrainRay, Work};
 use conefield_core::checkpoint::Resume;
-use conefield_core::pipeline::{Model, Pipeline};
-use conefield_core::scene::Scene;
 use conefield_core::method::Job;
+use conefield_core::pipeline::Model;
+use conefield_core::scene::{Scene, SceneSettings};
+use conefield_solvers::losses::L2;
 use serde_json::{Value, json};
 
 fn settings() -> Value {
     json!({
         "field": {"type": "voxels-joseph", "resolution": 16},
-        "type": "neural-field", "loss": "l2", "training": {"steps": 300, "rays": 256, "pixels": "all", "report_every": 25}, "optimizer": {"lr": 0.02},
+        "type": "line-field", "loss": "l2", "training": {"steps": 300, "rays": 256, "pixels": "all", "report_every": 25}, "optimizer": {"lr": 0.02},
     })
 }
 
@@ -36,7 +37,7 @@ fn a_phantom_is_reconstructed() {
     assert!(loss(records.len() - 1) < 0.05 * loss(0), "{records:?}");
     // A prior on blocks of points works on such a field, too: in a field without details it leaves fewer of them.
     let mut smooth = settings();
-    smooth["tv"] = json!({"weight": 3.0, "blocks": 8, "edge": 4});
+    smooth["priors"] = json!([{"type": "total-variation", "weight": 3.0, "blocks": 8, "edge": 4}]);
     let (other, records) = psnr(&smooth, &Cpu::new());
     assert!(records.iter().all(|r| r.prior.is_some()) && other < found - 3.0, "{other} dB");
 }
@@ -52,7 +53,7 @@ fn threads_change_no_bit() {
     s["training"]["steps"] = json!(20);
     // Several ranges of voxels.
     s["field"]["resolution"] = json!(40);
-    s["tv"] = json!({"weight": 0.01, "blocks": 4, "edge": 4});
+    s["priors"] = json!([{"type": "total-variation", "weight": 0.01, "blocks": 4, "edge": 4}]);
     let run = |threads: usize, s: &Value| {
         let pool = rayon::ThreadPoolBuilder::new().num_threads(threads).build().unwrap();
         pool.install(|| bits(solve(s, &scan(), &Weights::default()).unwrap().0))
@@ -66,11 +67,11 @@ fn threads_change_no_bit() {
 #[test]
 fn an_interrupted_run_goes_on_to_the_same_bits() {
     let (scan, spec, cpu) = (scan(), spec(&settings()).unwrap(), Cpu::new());
-    let solver = spec.solver.build().unwrap();
-    let solve = |resume: Option<&Resume>, at| {
+    let mut plan = plan(&spec, &cpu, &Weights::default()).unwrap();
+    let mut solve = |resume: Option<&Resume>, at| {
         let mut stop = Stop::at(at);
         let job = Job { seed: 7, resume, ..Job::new(&scan, &cpu) };
-        (solver.solve(&job, &mut stop).map(bits).map_err(|e| e.to_string()), stop)
+        (plan.run(&job, &mut stop).map(bits).map_err(|e| e.to_string()), stop)
     };
     let whole = solve(None, u64::MAX).0;
     let (stopped, first) = solve(None, 130);
@@ -82,14 +83,13 @@ fn an_interrupted_run_goes_on_to_the_same_bits() {
 #[test]
 fn a_step_s_gradients_are_those_of_its_loss() {
     let (scan, spec) = (scan(), spec(&settings()).unwrap());
-    let scene = Scene::new(&scan, &spec.scene).unwrap();
+    let scene = Scene::new(&scan, &SceneSettings::default()).unwrap();
     let mut model = Model::random(common::pipeline(&spec), 3);
     model.arena.params.iter_mut().enumerate().for_each(|(i, p)| *p = (i as f32 * 0.37).sin().abs());
     let mut exe = Cpu::new().compile(&model.pipeline).unwrap().0;
     let ray = |i: usize| TrainRay { ray: scene.pixel_ray(&scan.geometry, i % 8, 4 + i % 7, 5 + i % 5), target: 0.2 };
     let rays: Vec<TrainRay> = (0..60).map(ray).collect();
-    let loss = conefield_core::backend::Loss::L2;
-    let work = Work { step: 0, seed: 0, loss, rays: &rays, points: &[], tv: None, occupancy: None };
+    let work = Work { step: 0, seed: 0, loss: &L2 {}, rays: &rays, points: &[], priors: &[] };
     let found = exe.step(&mut model, &work).unwrap();
     assert_eq!(found.samples, 60);
     let grads = model.arena.grads.to_vec();

@@ -2,12 +2,13 @@
 
 mod common;
 
-use common::{model, scan, spec, volume};
+use common::{model, plan, scan, spec, volume};
 use conefield_backend_cpu::Cpu;
 use conefield_core::Result;
+use conefield_core::arena::Weights;
 use conefield_core::geometry::VoxelGrid;
-use conefield_core::parts::Part;
 use conefield_core::method::{Job, Observer, Record};
+use conefield_core::parts::Part;
 use ndarray::{Array3, s};
 use serde_json::json;
 
@@ -48,11 +49,11 @@ fn slices_are_those_of_the_field_and_change_nothing() {
         "type": "neural-field", "callbacks": [{"type": "rollback"}, {"type": "fft-mask", "epoch": 2, "threshold": 1e-6}], "training": {"steps": 40, "rays": 64, "report_every": 5}, "optimizer": {"lr": 0.01},
     });
     let (scan, spec, cpu) = (scan(), spec(&value).unwrap(), Cpu::new());
-    let solver = spec.solver.build().unwrap();
-    let run = |every: u64| {
+    let mut plan = plan(&spec, &cpu, &Weights::default()).unwrap();
+    let mut run = |every: u64| {
         let mut seen = Slices { every, step: 0, last: vec![], times: 0, losses: vec![] };
         let job = Job { seed: 7, ..Job::new(&scan, &cpu) };
-        (solver.solve(&job, &mut seen).unwrap(), seen)
+        (plan.run(&job, &mut seen).unwrap(), seen)
     };
     let ((plain, without), (watched, with)) = (run(u64::MAX), run(1));
     assert_eq!((without.times, with.times), (1, 41));

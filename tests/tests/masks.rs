@@ -31,7 +31,7 @@ fn model(encoder: Value, normalizers: &[Value]) -> Model {
     }
     let field = json!({"type": "mlp", "width": 8});
     let field = serde_json::from_value::<Box<dyn FieldSpec>>(field).unwrap().build(width).unwrap();
-    let mut model = Model::random(Pipeline::assemble(encoder, built, field, Box::new(Nothing)), 5);
+    let mut model = Model::random(Pipeline::new(encoder, built, field, Box::new(Nothing)).unwrap(), 5);
     for (i, p) in model.arena.params.iter_mut().enumerate() {
         *p += (i as f32).sin() * 0.2;
     }

@@ -2,8 +2,9 @@
 
 mod common;
 
-use common::{Stop, model, scan, spec};
+use common::{Stop, model, plan, scan, spec};
 use conefield_backend_cpu::Cpu;
+use conefield_core::arena::Weights;
 use conefield_core::checkpoint::Resume;
 use conefield_core::method::{Best, Job, Limits, Record, Solution};
 use conefield_core::scan::Scan;
@@ -37,7 +38,7 @@ fn solve(value: &Value, (train, held): &(Scan, Scan), limits: Limits) -> (Soluti
     let (spec, backend) = (spec(value).unwrap(), Cpu::new());
     let job = Job { seed: 7, held_out: Some(held), limits, ..Job::new(train, &backend) };
     let mut heard = Stop::at(u64::MAX);
-    let solution = spec.solver.build().unwrap().solve(&job, &mut heard).unwrap();
+    let solution = plan(&spec, &backend, &Weights::default()).unwrap().run(&job, &mut heard).unwrap();
     (solution, heard.heard)
 }
 
@@ -102,15 +103,14 @@ fn without_patience_nothing_changes() {
 fn a_run_resumes_to_the_same_best() {
     let (train, held) = scans(1.0);
     let mut masked = settings(4000, Some(4));
-    masked["callbacks"] =
-        json!([{"type": "patience", "records": 4}, {"type": "fft-mask", "keep": [0, 1, 2, 3, 4]}]);
+    masked["callbacks"] = json!([{"type": "patience", "records": 4}, {"type": "fft-mask", "keep": [0, 1, 2, 3, 4]}]);
     for (value, masks) in [(settings(4000, Some(4)), false), (masked, true)] {
         let (spec, backend) = (spec(&value).unwrap(), Cpu::new());
-        let solver = spec.solver.build().unwrap();
-        let solve = |resume: Option<&Resume>, at| {
+        let mut plan = plan(&spec, &backend, &Weights::default()).unwrap();
+        let mut solve = |resume: Option<&Resume>, at| {
             let mut stop = Stop::at(at);
             let job = Job { seed: 7, held_out: Some(&held), resume, ..Job::new(&train, &backend) };
-            let result = solver.solve(&job, &mut stop).map(|s| (s.steps, s.best, params(s))).map_err(|e| e.to_string());
+            let result = plan.run(&job, &mut stop).map(|s| (s.steps, s.best, params(s))).map_err(|e| e.to_string());
             (result, stop)
         };
         let (whole, heard) = solve(None, u64::MAX);
@@ -131,12 +131,16 @@ fn a_run_resumes_to_the_same_best() {
 
 #[test]
 fn what_it_needs_is_told() {
-    let built = |patience| spec(&settings(9, patience)).unwrap().solver.build().unwrap();
-    let (with, without) = (built(Some(3)), built(None));
-    assert_eq!((with.needs_held_out(), without.needs_held_out()), (Some("solver.callbacks"), None));
-    assert_eq!(with.memory_per_parameter() - without.memory_per_parameter(), 4);
+    let planned = |patience| plan(&spec(&settings(9, patience)).unwrap(), &Cpu::new(), &Weights::default());
+    let (with, without) = (planned(Some(3)).unwrap(), planned(None).unwrap());
+    assert_eq!((with.needs_held_out(), without.needs_held_out()), (Some("callbacks.1".into()), None));
+    let (header, parameters) = (scan().header(), with.outline().parameters() as u64);
+    assert_eq!(with.needs(&header).optimizer - without.needs(&header).optimizer, 4 * parameters);
     let said = "ends after 3 records without a smaller held-out error";
-    assert!(with.describe().ends_with(said) && !without.describe().contains("held-out"), "{}", with.describe());
-    let e = spec(&settings(9, Some(0))).unwrap().solver.build().err().unwrap().to_string();
-    assert!(e.contains("solver.callbacks.1.records: found 0, expected at least 1"), "{e}");
+    let (with, without) = (with.outline(), without.outline());
+    let last = with.beside.last().unwrap();
+    assert!(last.stage == "callbacks.1" && last.what.ends_with(said), "{last:?}");
+    assert!(without.beside.iter().all(|l| !l.what.contains("held-out")), "{:?}", without.beside);
+    let e = planned(Some(0)).err().unwrap().to_string();
+    assert!(e.contains("callbacks.1.records: found 0, expected at least 1"), "{e}");
 }

@@ -3,10 +3,11 @@
 
 mod common;
 
-use common::{Heard, model, scan, solve, spec, truth, volume};
+use common::{Heard, model, plan, scan, solve, spec, truth, volume};
 use conefield_backend_cpu::Cpu;
 use conefield_backend_cpu::rows::Kernels;
 use conefield_backend_cpu::step::Slots;
+use conefield_core::Result;
 use conefield_core::arena::Weights;
 use conefield_core::backend::{BlockWork, TrainRay, Work};
 use conefield_core::loss::Loss;
@@ -15,7 +16,7 @@ use conefield_core::pipeline::{Model, Pipeline};
 use conefield_core::random::{mix, unit};
 use conefield_core::scan::{Scan, Volume};
 use conefield_core::scene::Scene;
-use conefield_core::trained::TrainedField;
+use conefield_core::trained::{Placement, TrainedField};
 use conefield_projectors::simulate::{Protocol, simulate};
 use conefield_solvers::losses::{Huber, L2};
 use conefield_solvers::priors::TotalVariation;
@@ -236,6 +237,14 @@ fn noise_weights_come_from_the_scan() {
 
 // ---- export ----
 
+fn restored(
+    value: &Value,
+    placement: &Placement,
+    load: &mut dyn FnMut(&mut Model) -> Result<()>,
+) -> Result<TrainedField> {
+    plan(&spec(value)?, &Cpu::new(), &Weights::default())?.restore(placement, load)
+}
+
 #[test]
 fn a_field_evaluated_part_by_part_is_the_same_to_the_bit() {
     let (solution, _) = solve(&settings(), &scan(), &Weights::default()).unwrap();
@@ -263,7 +272,7 @@ fn a_field_comes_back_from_its_weights() {
     assert_eq!(field.placement().masks.len(), 1);
     let weights = Weights::from_arena(field.model.pipeline.layout(), &field.model.arena.params, |_| true);
     let placement = serde_json::from_str(&serde_json::to_string(&field.placement()).unwrap()).unwrap();
-    let again = TrainedField::restore(&spec(&s).unwrap(), &placement, |model| {
+    let again = restored(&s, &placement, &mut |model| {
         weights.load("test", model.pipeline.layout(), &mut model.arena.params, |_| true).map(drop)
     })
     .unwrap();
@@ -336,13 +345,12 @@ fn pretrained(s: &Value) -> (Model, Vec<f64>) {
     let volumes = [truth(), truth().mapped(|x| 3.0 * x)];
     let job = PretrainJob {
         volumes: &volumes,
-        spec: &spec,
         backend: &Cpu::new(),
         seed: 21,
         limits: Limits { steps: Some(60), ..Limits::default() },
     };
     let mut heard = Heard::default();
-    let model = spec.solver.build().unwrap().pretrain(&job, &mut heard).unwrap();
+    let model = plan(&spec, &Cpu::new(), &Weights::default()).unwrap().pretrain(&job, &mut heard).unwrap();
     (model, heard.0.iter().map(|r| r.loss.unwrap()).collect())
 }
 
@@ -359,7 +367,7 @@ fn weights_behind_the_encoder_go_to_another_scan() {
     assert!(losses.last().unwrap() < &(0.9 * losses[0]), "{losses:?}");
     let weights = Weights::from_arena(trained.pipeline.layout(), &trained.arena.params, |_| true);
 
-    let run = |s: &Value, steps: u64| -> conefield_core::Result<(Solution, Vec<f64>)> {
+    let run = |s: &Value, steps: u64| -> Result<(Solution, Vec<f64>)> {
         let mut s = s.clone();
         s["training"]["steps"] = json!(steps);
         let (solution, records) = solve(&s, &scan(), &weights)?;
@@ -451,7 +459,7 @@ fn channels_finer_than_the_data_leave_the_work() {
 
     // It comes back from its weights.
     let weights = Weights::from_arena(field.model.pipeline.layout(), &field.model.arena.params, |_| true);
-    let again = TrainedField::restore(&spec(&s).unwrap(), &field.placement(), |model| {
+    let again = restored(&s, &field.placement(), &mut |model| {
         weights.load("test", model.pipeline.layout(), &mut model.arena.params, |_| true).map(drop)
     })
     .unwrap();

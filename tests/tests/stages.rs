@@ -15,10 +15,10 @@ use conefield_core::precision::Tables;
 use conefield_core::registry::{Kind, Settings, names};
 use conefield_core::regularizer::RegularizerSpec;
 use conefield_core::settings::{
-    EncoderSpec, FieldSpec, InitializerSpec, LossSpec, NormalizerSpec, PriorSpec, ProjectorSpec,
+    EncoderSpec, FieldSpec, InitializerSpec, LineFieldSpec, LossSpec, NormalizerSpec, PriorSpec, ProjectorSpec,
 };
 use conefield_core::spec::stage::read;
-use conefield_core::stage::Stage;
+use conefield_core::stage::{Field, Stage};
 use conefield_core::voxel::VoxelProjectorSpec;
 use serde::de::DeserializeOwned;
 use serde_json::{Value, json};
@@ -61,6 +61,13 @@ fn normalizer(settings: Value, width: usize, options: &Options) {
 fn field(settings: Value, width: usize, options: &Options) {
     let spec: Box<dyn FieldSpec> = serde_json::from_value(settings).unwrap();
     let stage = spec.build(width).unwrap();
+    expect(check_field(stage.as_ref(), options));
+    on_a_device(stage.as_ref(), options);
+}
+
+fn line_field(settings: Value, options: &Options) {
+    let spec: Box<dyn LineFieldSpec> = serde_json::from_value(settings).unwrap();
+    let stage = spec.build().unwrap();
     expect(check_field(stage.as_ref(), options));
     on_a_device(stage.as_ref(), options);
 }
@@ -142,7 +149,7 @@ fn concat_says_where_a_mistake_stands() {
     ]});
     let spec: Box<dyn EncoderSpec> = serde_json::from_value(settings).unwrap();
     let e = spec.build().err().unwrap().to_string();
-    assert!(e.contains("encoder.encoders.1.encoders.0.bands"), "{e}");
+    assert!(e.contains("encoders.1.encoders.0.bands"), "{e}");
     let none: Box<dyn EncoderSpec> = serde_json::from_value(json!({"type": "concat", "encoders": []})).unwrap();
     assert!(none.build().err().unwrap().to_string().contains("at least one"));
 }
@@ -216,18 +223,19 @@ fn voxels_joseph() {
         // More than one range of voxels.
         json!({"type": "voxels-joseph", "resolution": [41, 37, 43]}),
     ] {
-        field(settings, 3, &Options { single: 4e-5, ..Options::encoder() });
+        line_field(settings, &Options { single: 4e-5, ..Options::encoder() });
     }
 }
 
-/// What a field says of itself as settings and as a stage agree.
+/// Line fields do, in both precisions; fields that a projector samples do not.
 #[test]
-fn fields_that_stand_alone_bring_line_integrals() {
-    for name in names(Kind::Field) {
-        let spec: Box<dyn FieldSpec> = serde_json::from_value(json!({"type": name})).unwrap();
-        let stage = spec.build(3).unwrap();
-        assert_eq!(spec.stands_alone(), stage.lines().is_some(), "{name}");
-        assert_eq!(stage.lines().is_some(), stage.lines_reference().is_some(), "{name}");
+fn line_fields_alone_bring_line_integrals() {
+    let lines = |stage: &dyn Field| [stage.lines().is_some(), stage.lines_reference().is_some()];
+    for spec in each::<dyn FieldSpec>(&[]) {
+        assert_eq!(lines(spec.build(3).unwrap().as_ref()), [false; 2], "{}", spec.typetag_name());
+    }
+    for spec in each::<dyn LineFieldSpec>(&[]) {
+        assert_eq!(lines(spec.build().unwrap().as_ref()), [true; 2], "{}", spec.typetag_name());
     }
 }
 
@@ -342,7 +350,8 @@ fn priors() {
 fn every_registered_stage_has_a_run_here() {
     assert_eq!(names(Kind::Encoder), ["concat", "dense-grid", "frequency", "hash-grid", "identity"]);
     assert_eq!(names(Kind::Normalizer), ["layer-norm"]);
-    assert_eq!(names(Kind::Field), ["mlp", "voxel-grid", "voxels-joseph"]);
+    assert_eq!(names(Kind::Field), ["mlp", "voxel-grid"]);
+    assert_eq!(names(Kind::LineField), ["voxels-joseph"]);
     assert_eq!(names(Kind::Initializer), ["checkpoint", "mci", "random", "volume"]);
     assert_eq!(names(Kind::Loss), ["huber", "l1", "l2", "noise-weighted"]);
     assert_eq!(names(Kind::Prior), ["total-variation"]);

@@ -2,9 +2,9 @@
 
 use conefield_backend_cpu::Cpu;
 use conefield_core::geometry::{Geometry, Millimetres, Radians, View, VoxelGrid};
+use conefield_core::method::{Context, Job, Silent};
 use conefield_core::random::{mix, unit};
 use conefield_core::scan::{Scan, Unit};
-use conefield_core::method::{Job, Silent};
 use conefield_core::spec::load::parse;
 use conefield_solvers as _;
 use ndarray::Array3;
@@ -52,16 +52,16 @@ fn the_tally_is_what_a_run_takes() {
         with(tv),
         with(&format!("{tv}subsets = 1\nair = false\ndata.type = \"least-squares\"\n")),
     ] {
-        let spec = parse(&format!("[solver]\n{text}"), "test.toml", &[], &[]).unwrap().spec;
-        let solver = spec.solver.build().unwrap();
+        let spec = parse(&text, "test.toml", &[], &[]).unwrap().spec;
+        let mut plan = spec.method.plan(&Context::new(&backend)).unwrap();
         let job = Job::new(&scan, &backend);
         // Threads and tables that stay are made in the first run.
-        solver.solve(&job, &mut Silent).unwrap();
+        plan.run(&job, &mut Silent).unwrap();
         let before = ALLOCATOR.current_usage();
         ALLOCATOR.reset_peak_usage();
-        solver.solve(&job, &mut Silent).unwrap();
+        plan.run(&job, &mut Silent).unwrap();
         let taken = (ALLOCATOR.peak_usage() - before) as f64;
-        let told = (solver.bytes(&scan.header()) + volume) as f64;
+        let told = (plan.needs(&scan.header()).working + volume) as f64;
         println!("{}: {:.2} MiB told, {:.2} MiB taken", text.replace('\n', ", "), told / 1048576.0, taken / 1048576.0);
         assert!((0.9..1.1).contains(&(told / taken)), "{text}: {told} bytes told, {taken} taken");
         // Two volumes more or less would be seen.

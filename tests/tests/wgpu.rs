@@ -3,7 +3,7 @@
 mod common;
 mod device;
 
-use common::{Heard, Stop, model, psnr, scan, solve, solve_on, spec, truth};
+use common::{Heard, Stop, model, plan, psnr, scan, solve, solve_on, spec, truth};
 use conefield_backend_cpu::Cpu;
 use conefield_backend_cpu::rows::Kernels;
 use conefield_backend_cpu::step::Slots;
@@ -21,6 +21,7 @@ use conefield_core::wgsl::Fragment;
 use conefield_solvers::losses::{Huber, L1, L2};
 use conefield_solvers::priors::TotalVariation;
 use serde_json::{Value, json};
+use std::sync::Arc;
 
 fn settings() -> Value {
     json!({
@@ -233,9 +234,9 @@ fn pretraining_on_several_volumes_is_that_of_the_cpu() {
     let volumes = [truth(), truth().mapped(|x| 3.0 * x)];
     let run = |backend: &dyn Backend| {
         let limits = Limits { steps: Some(60), ..Limits::default() };
-        let job = PretrainJob { volumes: &volumes, spec: &spec, backend, seed: 21, limits };
+        let job = PretrainJob { volumes: &volumes, backend, seed: 21, limits };
         let mut heard = Heard::default();
-        let model = spec.solver.build().unwrap().pretrain(&job, &mut heard).unwrap();
+        let model = plan(&spec, backend, &Weights::default()).unwrap().pretrain(&job, &mut heard).unwrap();
         let losses: Vec<f64> = heard.0.iter().map(|r| r.loss.unwrap()).collect();
         (losses, model.arena.params.to_vec())
     };
@@ -253,19 +254,19 @@ fn pretraining_on_several_volumes_is_that_of_the_cpu() {
 fn a_run_begun_on_one_backend_goes_on_on_the_other() {
     let Some((_, device)) = device::backends("checkpoints").into_iter().next() else { return };
     let (scan, spec) = (scan(), spec(&settings()).unwrap());
-    let solver = spec.solver.build().unwrap();
     let whole = psnr(&settings(), &Cpu::new()).1.last().unwrap().loss.unwrap();
     let cpu = Cpu::new();
     let pairs: [[&dyn Backend; 2]; 3] = [[&cpu, &device], [&device, &cpu], [&device, &device]];
     for [first, second] in pairs {
         let mut stop = Stop::at(20);
-        let stopped = solver.solve(&Job { seed: 7, ..Job::new(&scan, first) }, &mut stop);
+        let planned = |backend| plan(&spec, backend, &Weights::default()).unwrap();
+        let stopped = planned(first).run(&Job { seed: 7, ..Job::new(&scan, first) }, &mut stop);
         assert!(stopped.is_err());
         let resume = stop.kept.unwrap();
         assert_eq!(resume.standing.step, 20);
         let mut heard = Heard::default();
         let job = Job { seed: 7, resume: Some(&resume), ..Job::new(&scan, second) };
-        solver.solve(&job, &mut heard).unwrap();
+        planned(second).run(&job, &mut heard).unwrap();
         let loss = heard.0.last().unwrap().loss.unwrap();
         assert!((loss - whole).abs() < 0.03 * whole, "{} then {}: {loss}, {whole}", first.name(), second.name());
         assert_eq!(heard.0.last().unwrap().step, 40);
@@ -276,7 +277,7 @@ fn a_run_begun_on_one_backend_goes_on_on_the_other() {
 
 /// A field whose WGSL is another's, changed.
 struct Changed {
-    inner: Box<dyn Field>,
+    inner: Arc<dyn Field>,
     change: fn(String) -> Option<String>,
     scope: Scope,
 }
@@ -312,9 +313,9 @@ impl Field for Changed {
 }
 
 fn changed(change: fn(String) -> Option<String>, scope: Scope) -> Pipeline {
-    let built = common::pipeline(&spec(&settings()).unwrap());
-    let Pipeline { encoder, normalizers, field, projector, .. } = built;
-    Pipeline::assemble(encoder, normalizers, Box::new(Changed { inner: field, change, scope }), projector)
+    let mut pipeline = common::pipeline(&spec(&settings()).unwrap());
+    pipeline.field = Arc::new(Changed { inner: pipeline.field, change, scope });
+    pipeline
 }
 
 #[test]
@@ -347,7 +348,7 @@ fn a_perturbed_constant_fails_the_parity_check() {
     let check = |change: fn(String) -> Option<String>| {
         let settings = json!({"type": "mlp", "width": 5, "depth": 2, "skips": []});
         let spec: Box<dyn conefield_core::settings::FieldSpec> = serde_json::from_value(settings).unwrap();
-        let stage = Changed { inner: spec.build(3).unwrap(), change, scope: Scope::Row };
+        let stage = Changed { inner: Arc::from(spec.build(3).unwrap()), change, scope: Scope::Row };
         conefield_conformance::check_wgsl(&stage, &options, &|s, p, x, dy, rows| {
             shared.pass(s, Tables::F32, p, x, dy, rows)
         })

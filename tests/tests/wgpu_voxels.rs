@@ -1,4 +1,4 @@
-//! Projection of voxel volumes on a device against double precision, and classical solvers there against the CPU.
+//! Projection of voxel volumes on a device against double precision, and classical methods there against the CPU.
 
 mod common;
 mod device;
@@ -116,9 +116,8 @@ fn a_perturbed_walk_is_found_and_what_cannot_run_is_refused() {
     assert!(e.contains("projector (changed") && e.contains("line"), "{e}");
 }
 
-fn psnr(solver: &Value, backend: &dyn Backend) -> f64 {
-    let spec = json!({ "solver": solver });
-    let (solution, _) = solve_on(backend, &spec, &scan(), &Weights::default()).unwrap();
+fn psnr(spec: &Value, backend: &dyn Backend) -> f64 {
+    let (solution, _) = solve_on(backend, spec, &scan(), &Weights::default()).unwrap();
     let (found, truth) = (solution.result.volume(backend).unwrap(), truth());
     let square = |(a, b): (&f32, &f32)| (f64::from(*a) - f64::from(*b)).powi(2);
     let mse = found.data.iter().zip(&truth.data).map(square).sum::<f64>() / truth.data.len() as f64;
@@ -126,18 +125,18 @@ fn psnr(solver: &Value, backend: &dyn Backend) -> f64 {
 }
 
 #[test]
-fn classical_solvers_end_where_the_cpu_does() {
-    let solvers = [
+fn classical_methods_end_where_the_cpu_does() {
+    let methods = [
         json!({"type": "fdk"}),
         json!({"type": "sart", "stop": {"passes": 3}}),
         json!({"type": "cgls", "stop": {"passes": 5}}),
         json!({"type": "fista", "prior": {"type": "total-variation"}, "stop": {"passes": 5}}),
     ];
-    for (name, backend) in device::backends("classical solvers") {
-        for solver in &solvers {
-            let (cpu, found) = (psnr(solver, &Cpu::new()), psnr(solver, &backend));
-            println!("{}, {name}: {found:.4} dB, CPU {cpu:.4} dB", solver["type"]);
-            assert!((cpu - found).abs() < 0.01 && cpu > 8.0, "{solver}, {name}: {found} dB, CPU {cpu} dB");
+    for (name, backend) in device::backends("classical methods") {
+        for method in &methods {
+            let (cpu, found) = (psnr(method, &Cpu::new()), psnr(method, &backend));
+            println!("{}, {name}: {found:.4} dB, CPU {cpu:.4} dB", method["type"]);
+            assert!((cpu - found).abs() < 0.01 && cpu > 8.0, "{method}, {name}: {found} dB, CPU {cpu} dB");
         }
     }
 }

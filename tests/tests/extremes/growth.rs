@@ -3,19 +3,19 @@
 //! Both get the same numbers, exact in single precision: what is left is the rounding of the work itself, and of tables
 //! where these are read in halves.
 
-use crate::common::{scan, spec};
+use crate::common::{self, scan, spec};
 use crate::page;
 use conefield_backend_cpu::halves::Rounded;
 use conefield_backend_cpu::rows::Kernels;
 use conefield_backend_cpu::step::Slots;
 use conefield_core::backend::{TrainRay, Work};
 use conefield_core::half::{Half, round};
-use conefield_core::pipeline::{Model, Pipeline};
+use conefield_core::pipeline::Model;
+use conefield_core::precision::Tables;
 use conefield_core::random::{mix, unit};
 use conefield_core::scene::Scene;
 use conefield_core::settings::{EncoderSpec, FieldSpec, NormalizerSpec};
 use conefield_core::simd::Real;
-use conefield_core::spec::Tables;
 use conefield_core::stage::{Grads, Kernel, Reader, Stage, Tile, TileMut};
 use conefield_report::{CurveOptions, curves_png_with};
 use conefield_solvers::losses::L2;

@@ -1,12 +1,12 @@
 //! Training at the edge: learning rates, and very long runs.
 
 use crate::case::{Case, Ends, Seen};
-use crate::common::{model, scan, solve};
+use crate::common::{self, model, scan, solve, spec};
 use crate::scans::with;
 use conefield_backend_cpu::Cpu;
 use conefield_core::arena::Weights;
 use conefield_core::backend::{Adam, Backend, Work};
-use conefield_core::pipeline::{Model, Pipeline};
+use conefield_core::pipeline::Model;
 use conefield_solvers::losses::L1;
 use serde_json::{Value, json};
 use std::time::Instant;
@@ -94,7 +94,7 @@ fn tiny(output: &str) -> Value {
 
 /// A million updates, the first of them with gradients of 1, the others with `gradient`; and the seconds that they took.
 fn updates(gradient: f32) -> (Model, f64) {
-    let pipeline = common::pipeline(&crate::common::spec(&tiny("softplus")).unwrap());
+    let pipeline = common::pipeline(&spec(&tiny("softplus")).unwrap());
     let mut model = Model::random(pipeline, 1);
     let (mut exe, _) = Cpu::new().compile(&model.pipeline).unwrap();
     let begun = Instant::now();
@@ -107,7 +107,7 @@ fn updates(gradient: f32) -> (Model, f64) {
 
 /// Seconds of some steps of a field whose last bias is `bias`.
 fn steps(bias: f32) -> f64 {
-    let pipeline = common::pipeline(&crate::common::spec(&tiny("softplus")).unwrap());
+    let pipeline = common::pipeline(&spec(&tiny("softplus")).unwrap());
     let mut model = Model::random(pipeline, 1);
     let last = model.arena.params.len() - 1;
     model.arena.params[last] = bias;
