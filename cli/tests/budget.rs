@@ -22,7 +22,7 @@ fn a_plan_names_every_part_and_the_record_holds_them_against_it() {
         let run = dir.path().join(spec);
         let all = ["reconstruct", &scan, "--spec", spec, "-o", &text(&run), "--reference", "truth", "--json"];
         let small = ["encoder.log2_table_size=10", "training.rays=64", "projector.samples=16", "priors.0.blocks=4"];
-        // Of a sequence the field's settings stand one deeper.
+        // Of a chain the field's settings stand one deeper.
         let deeper: Vec<String> = small.iter().map(|s| format!("methods.0.{s}")).collect();
         let small: Vec<&str> = match spec {
             "fast" => small.to_vec(),
@@ -111,6 +111,6 @@ fn an_interrupted_run_goes_on_with_what_it_chose() {
     assert!(said.contains("--resume: budget"), "{said}");
     let record = json(&[&line[..6], &["--resume", "--json"]].concat());
     let spec = fs::read_to_string(out.join("spec.toml")).unwrap();
-    assert!(spec.contains("type = \"sirt\"") && spec.contains("relaxation = 1.5"), "{spec}");
+    assert!(spec.contains("type = \"sart\"") && spec.contains("relaxation = 1.5"), "{spec}");
     assert!(record["steps"].as_u64().unwrap() > 1 && !out.join("checkpoint.safetensors").exists());
 }

@@ -124,10 +124,11 @@ fn threads_do_not_change_a_bit() {
 fn every_shipped_spec_reconstructs() {
     let (dir, scan) = scan();
     let single = ["naf", "ni-naf", "ni-naf-published", "nerf", "dense", "accurate", "balanced", "fast"];
-    // The passes of a second solver count on from there.
-    let sequences = [("field-tv", 4), ("accurate-tv", 6)];
-    for (spec, passes) in single.map(|spec| (spec, 0)).into_iter().chain(sequences) {
+    // The passes of a second method count on from there.
+    let chains = [("field-tv", 4), ("accurate-tv", 6)];
+    for (spec, passes) in single.map(|spec| (spec, 0)).into_iter().chain(chains) {
         let run = text(&dir.path().join(spec));
+        let samples = format!("{}projector.samples=16", if passes > 0 { "methods.0." } else { "" });
         let record = json(&[
             "reconstruct",
             &text(&scan),
@@ -139,7 +140,7 @@ fn every_shipped_spec_reconstructs() {
             "--steps",
             "2",
             "--set",
-            "projector.samples=16",
+            &samples,
         ]);
         assert_eq!(record["steps"], 2 + passes, "{spec}");
     }

@@ -155,8 +155,8 @@ fn a_method_that_fails_leaves_the_others_their_rows() {
     let out = dir.path().join("out");
     let (spec, off) = (dir.path().join("wild.toml"), dir.path().join("off.toml"));
     fs::write(&spec, "extends = \"fast\"\nname = \"wild\"\n[optimizer]\nlr = 1e30\n").unwrap();
-    // Found when it is read by the solver: a volume to start from that is not there.
-    fs::write(&off, "extends = \"sirt\"\nname = \"off\"\n[solver]\nstart = \"none.nii\"\n").unwrap();
+    // Found when it is read by the method: a volume to start from that is not there.
+    fs::write(&off, "extends = \"sirt\"\nname = \"off\"\nstart = \"none.nii\"\n").unwrap();
     let specs = format!("{},fdk,{}", text(&spec), text(&off));
     let line = arguments(&scan, &specs, &out, &["--reference", "truth"]);
     let output = conefield(&words(&line)).assert().code(1).get_output().clone();

@@ -17,10 +17,10 @@ fn stages_are_told_with_widths_and_parameters() {
     assert!(line(&all, "encoder").starts_with("encoder hash-grid 3 -> 32 "), "{all}");
     assert!(line(&all, "field").starts_with("field mlp 32 -> 1 4 225 16.5 KiB 4 128 dense "), "{all}");
     assert!(line(&all, "projector").starts_with("projector ray-march "), "{all}");
-    assert!(line(&all, "solver").starts_with("solver gradient "), "{all}");
+    assert!(line(&all, "method").starts_with("method neural-field "), "{all}");
     let all = done(&["explain", "ni-naf"]);
-    assert!(line(&all, "normalizers.0").starts_with("normalizers.0 fft-mask 20 -> 20 0 "), "{all}");
-    assert!(line(&all, "normalizers.1").starts_with("normalizers.1 layer-norm 20 -> 20 40 "), "{all}");
+    assert!(line(&all, "callbacks.1").starts_with("callbacks.1 fft-mask "), "{all}");
+    assert!(line(&all, "normalizers.0").starts_with("normalizers.0 layer-norm 20 -> 20 40 "), "{all}");
 }
 
 #[test]
@@ -32,7 +32,7 @@ fn sets_and_json() {
     let sum: u64 = e["stages"].as_array().unwrap().iter().map(|s| s["parameters"].as_u64().unwrap()).sum();
     assert_eq!(e["parameters"], sum);
     assert_eq!(e["model_bytes"], 16 * sum);
-    assert!(e["backend"]["backend"].as_str().unwrap().starts_with("cpu"));
+    assert!(e["compiled"]["backend"].as_str().unwrap().starts_with("cpu"));
 }
 
 /// A key that excludes another one takes its place in nested stages, too.
@@ -60,7 +60,7 @@ fn a_scan_adds_its_memory() {
     assert_eq!([&m["model"], &m["optimizer"]].map(|n| n.as_u64().unwrap()), [all / 2, all / 2 + 12 * all / 16]);
     // The volume is written as it is evaluated.
     assert_eq!(m["volume"], 0);
-    assert_eq!(e["scan"]["samples_per_ray"], 320);
+    assert_eq!(e["scan"]["samples"], 320);
     // Training that ends by views kept aside keeps the parameters that predicted them best.
     let e = json(&["explain", "naf", "--scan", &scan, "--set", "callbacks.1={type='patience',records=3}", "--json"]);
     assert_eq!(e["scan"]["memory"]["optimizer"].as_u64().unwrap(), all / 2 + 16 * all / 16);
@@ -98,7 +98,7 @@ fn what_lies_beyond_the_volume_is_told_and_taken_off() {
 }
 
 #[test]
-fn carving_serves_solvers_on_voxels() {
+fn carving_serves_methods_on_voxels() {
     let dir = tempdir().unwrap();
     let scan = text(&dir.path().join("scan"));
     done(&["simulate", "phantom:head:16", "-o", &scan, "--views", "12", "--detector", "64x64"]);
@@ -108,33 +108,33 @@ fn carving_serves_solvers_on_voxels() {
 }
 
 #[test]
-fn solvers_on_voxels_are_told_without_a_field() {
+fn methods_on_voxels_are_told_without_a_field() {
     let all = done(&["explain", "fdk"]);
     assert!(all.starts_with("fdk (shipped)\n"), "{all}");
-    assert_eq!(line(&all, "solver"), "solver fdk hann window to 1 of the highest frequency");
+    assert_eq!(line(&all, "method"), "method fdk hann window to 1 of the highest frequency");
     for absent in ["encoder", "parameters", "backend", "projector"] {
         assert!(!all.contains(absent), "{absent:?} is in: {all}");
     }
     let all = done(&["explain", "os-sart", "--set", "subsets=4"]);
     assert_eq!(line(&all, "projector"), "projector joseph bilinear from plane to plane");
-    assert!(line(&all, "solver").starts_with("solver sart 4 subsets, relaxation 1 times 0.9"), "{all}");
+    assert!(line(&all, "method").starts_with("method sart 4 subsets, relaxation 1 times 0.9"), "{all}");
     for (spec, kind) in
         [("sart", "sart"), ("sirt", "sart"), ("cgls", "cgls"), ("asd-pocs", "asd-pocs"), ("fista-tv", "fista")]
     {
-        assert!(line(&done(&["explain", spec]), "solver").starts_with(&format!("solver {kind} ")), "{spec}");
+        assert!(line(&done(&["explain", spec]), "method").starts_with(&format!("method {kind} ")), "{spec}");
     }
-    let said = refused(1, &["explain", "sart", "--set", "solver.projector.type=ray-march"]);
+    let said = refused(1, &["explain", "sart", "--set", "projector.type=ray-march"]);
     assert!(said.contains("no voxel-projector type \"ray-march\""), "{said}");
 }
 
 #[test]
-fn what_a_solver_on_voxels_does_with_a_scan_is_told() {
+fn what_a_method_on_voxels_does_with_a_scan_is_told() {
     let dir = tempdir().unwrap();
     let scan = text(&dir.path().join("scan"));
     done(&["simulate", "phantom:head:16", "-o", &scan, "--views", "6", "--detector", "8x12"]);
     let with = |spec: &str, set: &str| done(&["explain", spec, "--scan", &scan, "--set", set]);
     let all = with("fdk", "cutoff=0.5");
-    assert!(line(&all, "solver").contains("hann window to 0.5"), "{all}");
+    assert!(line(&all, "method").contains("hann window to 0.5"), "{all}");
     assert!(all.contains("this scan: 6 views of 8 x 12, volume 16 x 16 x 16\n"), "{all}");
     assert!(all.contains("full turn: every ray counts half"), "{all}");
     assert!(all.contains("memory for this scan: ") && all.contains("volume 16.0 KiB"), "{all}");
@@ -143,8 +143,8 @@ fn what_a_solver_on_voxels_does_with_a_scan_is_told() {
     assert!(with("asd-pocs", "subsets=2").contains("  noise of "));
     let e = json(&["explain", "sart", "--scan", &scan, "--json"]);
     assert_eq!(e["stages"], serde_json::json!([]));
-    assert_eq!(e["scan"]["plan"][0], "6 subsets of 1 view");
-    assert!(e["backend"].is_null() && e["scan"]["samples_per_ray"].is_null());
+    assert_eq!(e["scan"]["lines"][0], "6 subsets of 1 view");
+    assert!(e["compiled"].is_null() && e["scan"]["samples"].is_null());
     let m = &e["scan"]["memory"];
     assert_eq!(
         [&m["scan"], &m["volume"], &m["model"]].map(|n| n.as_u64().unwrap()),

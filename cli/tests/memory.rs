@@ -86,10 +86,10 @@ fn the_estimate_is_near_the_peak_of_a_look_beyond_the_volume() {
     assert!((0.8..1.35).contains(&(estimate as f64 / peak as f64)), "{estimate} and {peak}");
 }
 
-/// Of solvers on voxels as well, where the scan, the volume or both take most; FDK takes little but these two.
+/// Of methods on voxels as well, where the scan, the volume or both take most; FDK takes little but these two.
 #[test]
 #[cfg_attr(not(target_os = "linux"), ignore = "the peak is read from /proc")]
-fn the_estimate_is_near_the_peak_of_solvers_on_voxels() {
+fn the_estimate_is_near_the_peak_of_methods_on_voxels() {
     let run = |spec: &str, views: usize, side: usize, voxels: usize, sets: &[&str]| {
         let dir = tempfile::tempdir().unwrap();
         let scan = scan_of(dir.path(), views, side, voxels);

@@ -22,7 +22,7 @@ fn arguments(scan: &Path, run: &Path, steps: u64, more: &[&str]) -> Vec<String> 
         ["reconstruct", &text(scan), "--spec", "ni-naf", "-o", &text(run)].map(Into::into).into();
     // The mask removes channels on the way: what it decided must come back too.
     all.extend(["--steps".into(), steps.to_string(), "--set".into(), "projector.samples=16".into()]);
-    all.extend(["--set".into(), "solver.callbacks.1.epoch=3".into()]);
+    all.extend(["--set".into(), "callbacks.1.epoch=3".into()]);
     for s in SETTINGS {
         all.extend(["--set".into(), s.into()]);
     }
@@ -126,14 +126,14 @@ fn interrupted_passes_lose_no_record() {
     let dir = tempfile::tempdir().unwrap();
     let scan = scan(dir.path());
     let field = [
-        "projector.samples=16",
-        "encoder.log2_table_size=10",
+        "methods.0.projector.samples=16",
+        "methods.0.encoder.log2_table_size=10",
         "methods.0.training.rays=48",
         "methods.0.training.report_every=7",
     ];
     let then = ["methods.1.stop.passes=600", "methods.1.stop={ passes = 600 }"];
-    let sequence = [&field[..], &then].concat();
-    for (spec, sets, after) in [("sirt", vec!["stop.passes=900"], 50), ("field-tv", sequence, 40)] {
+    let chain = [&field[..], &then].concat();
+    for (spec, sets, after) in [("sirt", vec!["stop.passes=900"], 50), ("field-tv", chain, 40)] {
         let arguments = |run: &Path, more: &[&str]| -> Vec<String> {
             let mut all = vec!["reconstruct", scan.to_str().unwrap(), "--spec", spec, "-o", run.to_str().unwrap()];
             all.extend(sets.iter().flat_map(|s| ["--set", *s]));

@@ -20,7 +20,7 @@ subsets = [2, 4]
 [[base]]
 spec = "tiny.toml"
 "#;
-const TINY: &str = "extends = \"fast\"\nname = \"tiny\"\n[encoder]\nlevels = 3\nlog2_table_size = 10\n[projector]\nsamples = 24\n[solver]\nrays = 64\npriors = [{ type = \"total-variation\", weight = 0.02, blocks = 4 }]\n";
+const TINY: &str = "extends = \"fast\"\nname = \"tiny\"\n[encoder]\nlevels = 3\nlog2_table_size = 10\n[projector]\nsamples = 24\n[training]\nrays = 64\n[[priors]]\ntype = \"total-variation\"\nweight = 0.02\nblocks = 4\n";
 
 /// A small scan and levers in a folder of their own.
 fn made() -> (TempDir, PathBuf, PathBuf) {

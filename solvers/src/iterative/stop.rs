@@ -38,6 +38,7 @@ impl Stop {
                 ensure(x.is_finite() && x > 0.0, "spec", &field, x, "a positive finite number")?;
             }
         }
+        ensure(self.passes != Some(0), "spec", "stop.passes", 0, "at least 1")?;
         ensure(self.patience != Some(0), "spec", "stop.patience", 0, "at least 1")
     }
 }

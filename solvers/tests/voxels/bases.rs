@@ -94,7 +94,7 @@ fn scan() -> (Scan, Volume) {
     // Noise, so that the solution is not what the scan was made of.
     scan.projections.mapv_inplace(|p| {
         i += 1;
-        p + 0.02 * (unit(mix(7, i)) - 0.5)
+        p + 0.04 * (unit(mix(7, i)) - 0.5)
     });
     (scan, truth)
 }

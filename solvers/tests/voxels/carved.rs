@@ -1,6 +1,6 @@
-//! Solvers on voxels that know where the object can be.
+//! Methods on voxels that know where the object can be.
 
-use crate::kit::{Case, bodies, geometry, psnr, solver};
+use crate::kit::{Case, bodies, geometry, method, psnr};
 use conefield_core::scan::Volume;
 use conefield_projectors::simulate::{DetectorNoise, ellipsoids, scan_ellipsoids};
 use conefield_solvers::support::carve;
@@ -10,8 +10,7 @@ fn solved(kind: &str, start: Option<&Volume>) -> [Volume; 2] {
     let scan = noisy();
     let start_line = start.map_or("", |_| "start = \"earlier.nii\"\n");
     ["box", "carve"].map(|support| {
-        let solver = solver(kind, &format!("{start_line}stop = {{ passes = 6 }}"));
-        let text = format!("[scene]\nsupport = \"{support}\"\n{solver}");
+        let text = method(kind, &format!("{start_line}scene.support = \"{support}\"\nstop = {{ passes = 6 }}"));
         Case { file: start, ..Case::of(&scan) }.volume(&text).0
     })
 }

@@ -95,7 +95,7 @@ fn off(volume: &Volume) -> f64 {
 }
 
 fn fdk(scan: &Scan, settings: &str) -> (Volume, Heard) {
-    Case::of(scan).volume(&format!("[solver]\ntype = \"fdk\"\n{settings}"))
+    Case::of(scan).volume(&format!("type = \"fdk\"\n{settings}"))
 }
 
 #[test]

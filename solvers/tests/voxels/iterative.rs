@@ -1,7 +1,7 @@
-//! Every iterative solver on a small scan in closed form: what it reaches, what ends it, and that nothing but the job
+//! Every iterative method on a small scan in closed form: what it reaches, what ends it, and that nothing but the job
 //! decides about its bits.
 
-use crate::kit::{Case, Heard, bodies, geometry, mean, psnr, solver as spec, volume};
+use crate::kit::{Case, Heard, bodies, geometry, mean, method as spec, psnr, volume};
 use conefield_core::Error;
 use conefield_core::geometry::VoxelGrid;
 use conefield_core::method::Limits;
@@ -68,7 +68,7 @@ fn residuals_fall() {
     }
 }
 
-/// What few views leave to FDK in streaks, iterative solvers find; total variation finds most. The voxels are finer than
+/// What few views leave to FDK in streaks, iterative methods find; total variation finds most. The voxels are finer than
 /// elsewhere here: how they round the bodies' edges off is part of every error.
 #[test]
 fn fewer_views_than_fdk_needs_are_enough() {
@@ -80,7 +80,7 @@ fn fewer_views_than_fdk_needs_are_enough() {
     let scan = scan_ellipsoids(&bodies(), g);
     let of = |spec: &str| psnr(&Case::of(&scan).volume(spec).0, &truth);
     for window in ["ramp", "hann"] {
-        let fdk = of(&format!("[solver]\ntype = \"fdk\"\nnonnegative = true\nwindow = \"{window}\""));
+        let fdk = of(&format!("type = \"fdk\"\nnonnegative = true\nwindow = \"{window}\""));
         println!("fdk, {window}: {fdk:.1} dB");
         assert!(fdk < 30.9, "FDK reaches {fdk:.1} dB");
     }

@@ -4,7 +4,7 @@ use conefield_backend_cpu::Cpu;
 use conefield_core::arena::Weights;
 use conefield_core::checkpoint::{Checkpoint, Resume};
 use conefield_core::geometry::{Geometry, Millimetres, Radians, View, VoxelGrid};
-use conefield_core::method::{Job, Limits, Observer, Reconstruction, Record, Solution};
+use conefield_core::method::{Context, Job, Limits, Observer, Reconstruction, Record, Solution};
 use conefield_core::scan::{Scan, Volume};
 use conefield_core::spec::Spec;
 use conefield_core::spec::load::parse;
@@ -40,7 +40,7 @@ impl<'a> Case<'a> {
         Self { scan, held_out: None, reference: None, limits: Limits::default(), file: None, start: None, resume: None }
     }
 
-    /// Runs the solver of the spec `text`.
+    /// Runs the method of the spec `text`.
     pub fn run(&self, text: &str, heard: &mut Heard) -> Result<Solution> {
         let spec = spec(text)?;
         let backend = Cpu::new();
@@ -52,9 +52,9 @@ impl<'a> Case<'a> {
             volumes: &|path| self.file.cloned().ok_or_else(|| Error::invalid(path, "file", "nothing", "a volume")),
             start: self.start,
             resume: self.resume,
-            ..Job::new(self.scan, &spec, &backend)
+            ..Job::new(self.scan, &backend)
         };
-        spec.solver.build()?.solve(&job, heard)
+        spec.method.plan(&Context::new(&backend))?.run(&job, heard)
     }
 
     /// The volume that comes out and what was heard.
@@ -69,12 +69,7 @@ pub fn spec(text: &str) -> Result<Spec> {
     parse(text, "test.toml", &[], &[]).map(|l| l.spec)
 }
 
-/// The table `[solver]` of a shipped method, or of a type, with `settings` instead of its own.
-pub fn solver(name: &str, settings: &str) -> String {
-    format!("[solver]\n{}", method(name, settings))
-}
-
-/// The settings of [`solver`].
+/// A spec like the shipped one of this name, or of a type, with `settings` instead of its own.
 pub fn method(name: &str, settings: &str) -> String {
     let (kind, own) = match name {
         "os-sart" => ("sart", &["subsets = 10", "relaxation = 1.0", "stop = { passes = 20 }"][..]),
@@ -91,7 +86,7 @@ pub fn method(name: &str, settings: &str) -> String {
 pub fn volume(solution: Solution) -> Volume {
     match solution.result {
         Reconstruction::Volume(v) => v,
-        _ => panic!("a field came out of a solver on voxels"),
+        _ => panic!("a field came out of a method on voxels"),
     }
 }
 

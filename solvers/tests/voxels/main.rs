@@ -1,11 +1,11 @@
-//! Solvers on voxels, held against ellipsoids whose scans are known in closed form.
+//! Methods on voxels, held against ellipsoids whose scans are known in closed form.
 
 mod bases;
 mod carved;
+mod chain;
 mod fdk;
 mod iterative;
 mod kit;
 mod refusals;
-mod sequence;
 mod surround;
 mod warm_start;

@@ -1,6 +1,6 @@
-//! Specs that solvers on voxels refuse, and that the message names the field.
+//! Specs that methods on voxels refuse, and that the message names the field.
 
-use crate::kit::{Case, Heard, bodies, geometry, solver, spec};
+use crate::kit::{Case, Heard, bodies, geometry, method, spec};
 use conefield_core::geometry::View;
 use conefield_projectors::simulate::scan_ellipsoids;
 
@@ -18,32 +18,32 @@ fn said(text: &str) -> String {
 #[test]
 fn stages_of_other_kinds_have_no_place() {
     for kind in ALL.into_iter().filter(|k| *k != "fdk") {
-        let e = said(&solver(kind, "projector.type = \"ray-march\""));
-        assert!(e.contains("solver.projector.type: found no voxel-projector type \"ray-march\""), "{kind}: {e}");
-        let e = said(&solver(kind, "projector = \"joseph\""));
-        assert!(e.contains("solver.projector: found \"joseph\", expected a table"), "{kind}: {e}");
-        let e = said(&solver(kind, "projector.steps = 3"));
-        assert!(e.contains("solver.projector.type: found nothing"), "{kind}: {e}");
-        let e = said(&solver(kind, "start = 3"));
-        assert!(e.contains("solver.start: found 3, expected a text"), "{kind}: {e}");
+        let e = said(&method(kind, "projector.type = \"ray-march\""));
+        assert!(e.contains("projector.type: found no voxel-projector type \"ray-march\""), "{kind}: {e}");
+        let e = said(&method(kind, "projector = 3"));
+        assert!(e.contains("projector: found 3, expected a table"), "{kind}: {e}");
+        let e = said(&method(kind, "projector.steps = 3"));
+        assert!(e.contains("projector.type: found nothing"), "{kind}: {e}");
+        let e = said(&method(kind, "start = 3"));
+        assert!(e.contains("start: found 3, expected a text"), "{kind}: {e}");
     }
     // FDK back-projects in its own way and starts from nothing.
     for setting in ["projector.type = \"joseph\"", "start = \"x.nii\""] {
-        let e = said(&solver("fdk", setting));
+        let e = said(&method("fdk", setting));
         assert!(e.contains("an unknown key"), "{e}");
     }
     for (setting, says) in [
-        ("basis.type = \"waves\"", "solver.basis.type: found no basis type \"waves\""),
-        ("data.type = \"huber\"", "solver.data.type: found no data-term type \"huber\""),
+        ("basis.type = \"waves\"", "basis.type: found no basis type \"waves\""),
+        ("data.type = \"huber\"", "data.type: found no data-term type \"huber\""),
         ("prior.type = \"totl-variation\"", "expected \"total-variation\""),
-        ("prior.weight = 3.0", "solver.prior.type: found nothing"),
+        ("prior.weight = 3.0", "prior.type: found nothing"),
     ] {
-        let e = said(&solver("fista", setting));
+        let e = said(&method("fista", setting));
         assert!(e.contains(says), "{setting}: {e}");
     }
     // A field cannot be rendered by what projects voxels.
-    let field = "[encoder]\ntype = \"identity\"\n[field]\ntype = \"voxel-grid\"\n[projector]\ntype = \"joseph\"\n";
-    let e = said(&format!("{field}[solver]\ntype = \"gradient\"\n"));
+    let field = "encoder = \"identity\"\nfield = \"voxel-grid\"\nprojector.type = \"joseph\"\n";
+    let e = said(&method("neural-field", field));
     assert!(e.contains("projector.type: found no projector type \"joseph\""), "{e}");
 }
 
@@ -53,7 +53,7 @@ fn fdk_refuses_what_is_no_circle() {
         let mut geometry = geometry(8);
         geometry.views.iter_mut().enumerate().for_each(|(i, v)| change(i, v));
         let scan = scan_ellipsoids(&bodies(), geometry);
-        Case::of(&scan).run("[solver]\ntype = \"fdk\"\n", &mut Heard::default()).err().map(|e| e.to_string())
+        Case::of(&scan).run("type = \"fdk\"\n", &mut Heard::default()).err().map(|e| e.to_string())
     };
     assert_eq!(refused(&|_, _| ()), None);
     // A calibrated scan is tilted by a fraction of a degree.
@@ -71,7 +71,7 @@ fn fdk_refuses_what_is_no_circle() {
 fn a_run_has_an_end() {
     for kind in ALL.into_iter().filter(|k| *k != "fdk") {
         for stop in ["{}", "{ patience = 3 }"] {
-            let e = said(&solver(kind, &format!("stop = {stop}")));
+            let e = said(&method(kind, &format!("stop = {stop}")));
             assert!(e.contains("stop: found no end, expected one of passes, seconds or change"), "{kind}: {e}");
         }
         for (stop, field) in [
@@ -80,12 +80,13 @@ fn a_run_has_an_end() {
             ("{ change = 0.0 }", "change"),
             ("{ passes = 3, patience = 0 }", "patience"),
             ("{ passes = -1 }", "passes"),
+            ("{ passes = 0 }", "passes"),
         ] {
-            let e = said(&solver(kind, &format!("stop = {stop}")));
+            let e = said(&method(kind, &format!("stop = {stop}")));
             assert!(e.contains(&format!("stop.{field}: found")), "{kind}, {stop}: {e}");
         }
         // What is set is all that ends it: no number of passes comes with the time.
-        let spec = spec(&solver(kind, "stop = { seconds = 60.0 }")).unwrap();
+        let spec = spec(&method(kind, "stop = { seconds = 60.0 }")).unwrap();
         let stop = serde_json::to_value(&spec).unwrap()["stop"].clone();
         assert_eq!(stop, serde_json::json!({ "seconds": 60.0 }), "{kind}");
     }
@@ -118,12 +119,12 @@ fn settings_out_of_range_are_named() {
         ("fista-tv", "prior.weight = { noise = -1.0 }", "prior.weight"),
         ("fista-tv", "prior.weight = 3.0", "prior.weight"),
     ] {
-        let e = said(&solver(kind, setting));
-        assert!(e.contains(&format!("solver.{field}")), "{kind}, {setting}: {e}");
+        let e = said(&method(kind, setting));
+        assert!(e.contains(&format!(": {field}: found")), "{kind}, {setting}: {e}");
     }
-    let e = said(&solver("sart", "projector = { type = \"trilinear\", samples_per_voxel = 0.1 }"));
-    assert!(e.contains("solver.projector.samples_per_voxel: found 0.1"), "{e}");
-    let e = said("[solver]\ntype = \"fdk\"\nwindow = \"han\"\n");
+    let e = said(&method("sart", "projector = { type = \"trilinear\", samples_per_voxel = 0.1 }"));
+    assert!(e.contains("projector.samples_per_voxel: found 0.1"), "{e}");
+    let e = said("type = \"fdk\"\nwindow = \"han\"\n");
     assert!(e.contains("hann"), "the nearest name is offered: {e}");
 }
 
@@ -134,6 +135,6 @@ fn fdk_refuses_other_orbits() {
     for (i, v) in scan.geometry.views.iter_mut().enumerate() {
         v.source = v.source.map(|x| x * (1.0 + 0.05 * i as f64));
     }
-    let e = Case::of(&scan).run("[solver]\ntype = \"fdk\"\n", &mut Heard::default()).err().unwrap().to_string();
+    let e = Case::of(&scan).run("type = \"fdk\"\n", &mut Heard::default()).err().unwrap().to_string();
     assert!(e.contains("scan: views: found sources") && e.contains("a circular orbit"), "{e}");
 }

@@ -1,13 +1,13 @@
 //! A body that goes on beyond the volume and the detector: what lies outside is found on coarse cells and taken off.
 
-use crate::kit::{Case, Heard, mean, psnr, spec, view};
+use crate::kit::{Case, Heard, mean, psnr, view};
 use conefield_backend_cpu::Cpu;
 use conefield_core::geometry::{Geometry, VoxelGrid};
 use conefield_core::method::Job;
 use conefield_core::scan::Scan;
-use conefield_core::scene::SurroundRule;
+use conefield_core::scene::{CoarseSurround, SurroundRule};
 use conefield_projectors::simulate::{Ellipsoid, ellipsoids, scan_ellipsoids};
-use conefield_solvers::surround::told;
+use conefield_solvers::surround::found;
 
 /// A body of ± 55 by 45 by 40 mm with things in it, within ± 20 mm of the middle and outside.
 fn bodies() -> Vec<Ellipsoid> {
@@ -37,20 +37,23 @@ fn scan() -> Scan {
 }
 
 /// As far as the body goes.
-const SURROUND: &str = "[scene]\nsurround = { coarse = { margin = 1.0, cells = 32 } }\n";
+const RULE: SurroundRule = SurroundRule::Coarse(CoarseSurround { margin: 1.0, cells: 32, passes: 16 });
+/// The same in a spec.
+const SURROUND: &str = "scene.surround = { coarse = { margin = 1.0, cells = 32 } }\n";
 
-fn solver(kind: &str) -> String {
+/// A method of ten passes with the setting `surround`, if any.
+fn method(kind: &str, surround: &str) -> String {
     let stop = if kind == "fdk" { "" } else { "stop = { passes = 10 }\n" };
-    crate::kit::solver(kind, stop)
+    crate::kit::method(kind, &format!("{surround}{stop}"))
 }
 
 #[test]
-fn every_solver_loses_the_rim_that_the_outside_leaves() {
+fn every_method_loses_the_rim_that_the_outside_leaves() {
     let (scan, truth) = (scan(), ellipsoids(&bodies(), &geometry(false).volume));
     let rim = |p: [f64; 3]| (17.0..19.0).contains(&p[0].hypot(p[1])) && p[2].abs() < 15.0;
     for kind in ["fdk", "os-sart", "cgls", "asd-pocs", "fista-tv"] {
-        let (without, _) = Case::of(&scan).volume(&solver(kind));
-        let (with, heard) = Case::of(&scan).volume(&format!("{SURROUND}{}", solver(kind)));
+        let (without, _) = Case::of(&scan).volume(&method(kind, ""));
+        let (with, heard) = Case::of(&scan).volume(&method(kind, SURROUND));
         assert!(heard.said("beyond the volume"), "{:?}", heard.notes);
         let error = |v| (mean(v, rim) - mean(&truth, rim)).abs() / mean(&truth, rim);
         let (before, after) = (psnr(&without, &truth), psnr(&with, &truth));
@@ -67,9 +70,8 @@ fn every_solver_loses_the_rim_that_the_outside_leaves() {
 #[test]
 fn what_is_left_is_the_inside() {
     let scan = scan();
-    let spec = spec(&format!("{SURROUND}{}", solver("sirt"))).unwrap();
     let backend = Cpu::new();
-    let left = conefield_solvers::surround::subtracted(&Job::new(&scan, &spec, &backend), &mut Heard::default());
+    let left = conefield_solvers::surround::subtracted(&Job::new(&scan, &backend), RULE, &mut Heard::default());
     let left = left.unwrap().unwrap();
     // In closed form: the chords less those beyond the box.
     let inside = conefield_projectors::simulate::project(
@@ -90,28 +92,29 @@ fn what_is_left_is_the_inside() {
 #[test]
 fn a_scan_that_shows_all_of_the_object_is_left_alone() {
     let scan = scan_ellipsoids(&bodies(), geometry(true));
-    let (without, _) = Case::of(&scan).volume(&solver("os-sart"));
-    let (with, heard) = Case::of(&scan).volume(&format!("{SURROUND}{}", solver("os-sart")));
+    let (without, _) = Case::of(&scan).volume(&method("os-sart", ""));
+    let (with, heard) = Case::of(&scan).volume(&method("os-sart", SURROUND));
     assert!(heard.said("surround: nothing, as the object reaches the sides of no view"), "{:?}", heard.notes);
     assert_eq!(with.data, without.data);
 }
 
 #[test]
 fn what_would_be_looked_at_is_told_before() {
-    let settings = |text: &str| spec(&format!("[scene]\n{text}\n{}", solver("sirt"))).unwrap().scene;
-    assert_eq!(told(&scan(), &settings("surround = \"none\"")).unwrap(), None);
-    let said = |scan: &Scan, text: &str| told(scan, &settings(text)).unwrap().unwrap();
-    let all = said(&scan(), "surround = { coarse = { cells = 20, margin = 0.5 } }");
+    let near = SurroundRule::Coarse(CoarseSurround { cells: 20, margin: 0.5, ..CoarseSurround::default() });
+    let far = SurroundRule::Coarse(CoarseSurround { cells: 20, margin: 2.0, ..CoarseSurround::default() });
+    assert!(found(&scan(), SurroundRule::None).unwrap().is_empty());
+    let said = |scan: &Scan, rule: SurroundRule| found(scan, rule).unwrap().concat();
+    let all = said(&scan(), near);
     assert!(all.contains("40 of 40 views: 40 x 40 x 40 cells of 2.000 mm"), "{all}");
     // Only as far as sources and detectors leave room.
     let mut close = scan();
     close.geometry.views.iter_mut().for_each(|v| v.source = v.source.map(|x| x * 0.13));
-    let all = said(&close, "surround = { coarse = { cells = 20, margin = 2.0 } }");
+    let all = said(&close, far);
     let side: usize = all.split(" views: ").nth(1).unwrap().split(' ').next().unwrap().parse().unwrap();
     assert!((22..46).contains(&side), "{all}");
     // A body that is only longer than the detector is looked for above and below.
     let long = [Ellipsoid { center: [0.0; 3], axes: [15.0, 15.0, 60.0], value: 0.02 }];
-    let all = said(&scan_ellipsoids(&long, geometry(false)), "surround = { coarse = { cells = 20, margin = 0.5 } }");
+    let all = said(&scan_ellipsoids(&long, geometry(false)), near);
     assert!(all.contains("20 x 20 x 40 cells"), "{all}");
 }
 
@@ -120,13 +123,12 @@ fn settings_that_mean_nothing_are_refused() {
     for (text, says) in
         [("margin = 0.0", "margin"), ("margin = 5.0", "at most 4"), ("cells = 2", "4 to 256"), ("passes = 0", "passes")]
     {
-        let text = format!("[scene]\nsurround = {{ coarse = {{ {text} }} }}\n{}", solver("sirt"));
+        let text = method("sirt", &format!("scene.surround = {{ coarse = {{ {text} }} }}\n"));
         let e = Case::of(&scan()).run(&text, &mut Heard::default()).err().unwrap().to_string();
         assert!(e.contains("scene.surround.coarse") && e.contains(says), "{e}");
     }
-    let many = "[scene]\nsurround = { coarse = { cells = 256, margin = 4.0 } }\n";
-    let e =
-        Case::of(&scan()).run(&format!("{many}{}", solver("sirt")), &mut Heard::default()).err().unwrap().to_string();
+    let many = method("sirt", "scene.surround = { coarse = { cells = 256, margin = 4.0 } }\n");
+    let e = Case::of(&scan()).run(&many, &mut Heard::default()).err().unwrap().to_string();
     assert!(e.contains("cells in all, expected at most 16777216"), "{e}");
     assert_eq!(SurroundRule::default(), SurroundRule::None);
 }

@@ -1,4 +1,4 @@
-//! A known volume to start from: taken as it is by solvers on voxels, learned first by fields.
+//! A known volume to start from: taken as it is by methods on voxels, learned first by fields.
 
 use crate::kit::{Case, Heard, bodies, geometry, psnr};
 use conefield_core::scan::{Scan, Unit, Volume};
@@ -24,15 +24,15 @@ fn scan_of(volume: &Volume) -> Scan {
     scan
 }
 
-fn solver(kind: &str, more: &str) -> String {
+fn method(kind: &str, more: &str) -> String {
     let weight = if kind == "fista-tv" { "prior.weight = { fixed = 0.0 }\n" } else { "" };
     let descents = if kind == "asd-pocs" { "descents = 0\n" } else { "" };
-    crate::kit::solver(kind, &format!("stop = {{ passes = 1 }}\n{weight}{descents}{more}"))
+    crate::kit::method(kind, &format!("stop = {{ passes = 1 }}\n{weight}{descents}{more}"))
 }
 
-/// A solver on voxels that starts from the file.
+/// A method on voxels that starts from the file.
 fn warm(kind: &str) -> String {
-    solver(kind, "start = \"earlier.nii\"\n")
+    method(kind, "start = \"earlier.nii\"\n")
 }
 
 #[test]
@@ -40,7 +40,7 @@ fn the_truth_leaves_no_residual_and_stays() {
     let truth = truth();
     let scan = scan_of(&truth);
     for kind in ALL {
-        let (cold, first) = Case::of(&scan).volume(&solver(kind, ""));
+        let (cold, first) = Case::of(&scan).volume(&method(kind, ""));
         let case = Case { file: Some(&truth), ..Case::of(&scan) };
         let (warm, heard) = case.volume(&warm(kind));
         let (warm_loss, cold_loss) = (heard.losses()[0], first.losses()[0]);
@@ -75,7 +75,7 @@ fn volumes_that_do_not_fit_are_refused() {
     let other = Volume::centered(ndarray::Array3::zeros((24, 23, 24)), [2.0; 3]);
     let mut holed = truth.clone();
     holed.data[[1, 2, 3]] = f32::NAN;
-    let field = format!("{START}{}", field(IDENTITY, GRID, 1));
+    let field = format!("{}{START}", field(IDENTITY, GRID, 1));
     for text in ALL.map(warm).iter().chain([&field]) {
         for (file, want) in [
             (&other, "earlier.nii: shape: found [24, 23, 24], expected [24, 24, 24]"),
@@ -97,7 +97,7 @@ fn a_pull_holds_to_the_start() {
     let case = Case { file: Some(&start), ..Case::of(&scan) };
     let held = |pull: f64, start: &str| {
         let settings = format!("{start}stop = {{ passes = 6 }}\nprior.weight = {{ fixed = 0.0 }}\npull = {pull:?}\n");
-        crate::kit::solver("fista-tv", &settings)
+        crate::kit::method("fista-tv", &settings)
     };
     let spec = |pull: f64| held(pull, "start = \"earlier.nii\"\n");
     let free = case.volume(&spec(0.0)).0;
@@ -125,7 +125,7 @@ fn a_volume_that_is_handed_over_is_the_start() {
     }
     let small = Volume::centered(ndarray::Array3::zeros((2, 3, 4)), [2.0; 3]);
     let case = Case { start: Some(&small), ..Case::of(&scan) };
-    let e = case.run(&solver("sirt", ""), &mut Heard::default()).err().unwrap().to_string();
+    let e = case.run(&method("sirt", ""), &mut Heard::default()).err().unwrap().to_string();
     assert!(e.contains("start: shape: found [2, 3, 4], expected [24, 24, 24]"), "{e}");
 }
 
@@ -137,9 +137,9 @@ const MLP: &str = "type = \"mlp\"\nwidth = 16\ndepth = 3\nskips = []\noutput = \
 /// A field that is trained for a few steps, each of them told.
 fn field(encoder: &str, field: &str, steps: usize) -> String {
     format!(
-        "[encoder]\n{encoder}\n[field]\n{field}\n[projector]\ntype = \"ray-march\"\nsamples = 48\n[solver]\n\
-         type = \"gradient\"\nsteps = {steps}\nreport_every = 1\nrays = 64\nlr = 0.03\npretrain_points = 4096\n\
-         pixels = \"all\"\n"
+        "type = \"neural-field\"\nprojector = {{ type = \"ray-march\", samples = 48 }}\noptimizer.lr = 0.03\n\
+         pretraining.points = 4096\n[encoder]\n{encoder}\n[field]\n{field}\n[training]\nsteps = {steps}\n\
+         report_every = 1\nrays = 64\npixels = \"all\"\n"
     )
 }
 
@@ -151,7 +151,7 @@ fn fields_learn_it_before_they_see_the_scan() {
         let first = |head: &str, file: Option<&Volume>| {
             let case = Case { file, reference: Some(&truth), ..Case::of(&scan) };
             let mut heard = Heard::default();
-            case.run(&format!("{head}{}", field(encoder, net, 1)), &mut heard).unwrap();
+            case.run(&format!("{}{head}", field(encoder, net, 1)), &mut heard).unwrap();
             (heard.records[0].psnr.unwrap(), heard)
         };
         let (random, _) = first("", None);
@@ -167,7 +167,7 @@ fn fields_learn_it_before_they_see_the_scan() {
 fn learning_a_volume_can_be_stopped() {
     let truth = truth();
     let scan = scan_of(&truth);
-    let text = format!("{START}steps = 1000000\n{}", field(IDENTITY, GRID, 1));
+    let text = format!("{}{START}steps = 1000000\n", field(IDENTITY, GRID, 1));
     let mut heard = Heard::interrupting_after(0);
     let stopped = Case { file: Some(&truth), ..Case::of(&scan) }.run(&text, &mut heard);
     assert!(matches!(stopped.err().unwrap(), conefield_core::Error::Interrupted { step: 0 }));

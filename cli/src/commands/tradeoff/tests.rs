@@ -1,6 +1,7 @@
 //! Levers and reports with the specs that come with the program.
 
 use super::*;
+use crate::specs;
 use conefield_tradeoff::front::Unknowns;
 use conefield_tradeoff::report::end;
 
