@@ -24,13 +24,18 @@ pub const SHIPPED: &[Shipped] = &[
     Shipped { name: "fista-tv", text: include_str!("../../specs/fista-tv.toml") },
 ];
 
-/// What a help text says of a spec: the names of all that are shipped.
-pub fn help() -> String {
+/// Every name that stands for a spec: of those that are shipped, and of methods that need no setting.
+pub fn names() -> Vec<&'static str> {
     let mut names: Vec<&str> = SHIPPED.iter().map(|s| s.name).collect();
-    // Methods that need no setting.
-    names.extend(registry::names(registry::Kind::Method).into_iter().filter(|t| read(t, &[]).is_ok()));
-    names.dedup();
-    format!("A shipped spec ({}) or a file", names.join(", "))
+    let methods = registry::names(registry::Kind::Method).into_iter();
+    let alone: Vec<&str> = methods.filter(|t| !names.contains(t) && read(t, &[]).is_ok()).collect();
+    names.extend(alone);
+    names
+}
+
+/// What a help text says of a spec.
+pub fn help() -> String {
+    format!("A shipped spec ({}) or a file", names().join(", "))
 }
 
 /// Reads a spec by its shipped name or from a file, with `sets` on top.
