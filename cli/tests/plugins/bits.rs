@@ -5,7 +5,7 @@ use crate::build::{cargo, example, library, sources};
 use crate::common::{conefield, done, json, refused, text};
 use conefield_backend_cpu::Cpu;
 use conefield_core::backend::{Backend, BlockWork, Work};
-use conefield_core::method::{Job, Limits, Silent};
+use conefield_core::method::{Context, Job, Limits, Silent};
 use conefield_core::pipeline::{Model, Pipeline};
 use conefield_core::random::{mix, unit};
 use conefield_core::settings::{EncoderSpec, FieldSpec, NormalizerSpec, ProjectorSpec};
@@ -32,6 +32,7 @@ mod sine;
 mod smooth;
 
 const SPEC: &str = r#"
+type = "neural-field"
 name = "of plugins"
 
 [encoder]
@@ -94,8 +95,8 @@ fn as_built_in() {
     let scan = conefield_io::read_scan(&place.scan).unwrap();
     let spec = conefield_core::spec::load::parse(SPEC, "plugins.toml", &[], &[]).unwrap().spec;
     let (backend, limits) = (Cpu::new(), Limits { steps: Some(60), ..Limits::default() });
-    let job = Job { seed: 7, limits, ..Job::new(&scan, &spec, &backend) };
-    let solution = spec.solver.build().unwrap().solve(&job, &mut Silent).unwrap();
+    let job = Job { seed: 7, limits, ..Job::new(&scan, &backend) };
+    let solution = spec.method.plan(&Context::new(&backend)).unwrap().run(&job, &mut Silent).unwrap();
     let field = solution.result.field().unwrap();
     let weights = conefield_io::read_weights(Path::new(&run).join("weights.safetensors")).unwrap();
     let blocks = &field.model.pipeline.layout().blocks;
@@ -227,7 +228,7 @@ fn points_off_any_ray_stand_alone() {
         let field = serde_json::json!({"type": "mlp", "width": 8});
         let field = read::<dyn FieldSpec>(field).unwrap().build(width).unwrap();
         let march = read::<dyn ProjectorSpec>(serde_json::json!({"type": "ray-march", "samples": 20})).unwrap();
-        let model = Model::random(Pipeline::assemble(encoder, normalizers, field, march.build().unwrap()), 3);
+        let model = Model::random(Pipeline::new(encoder, normalizers, field, march.build().unwrap()).unwrap(), 3);
         let exe = Cpu::new().compile(&model.pipeline).unwrap().0;
         (model, exe)
     };

@@ -1,7 +1,9 @@
 //! The readers, one entry a format: the one list that the mutation test and the fuzz targets share.
 
 use super::seeds;
+use conefield_backend_cpu::Cpu;
 use conefield_core::Result;
+use conefield_core::method::Context;
 use conefield_core::spec::load;
 use std::path::Path;
 
@@ -93,6 +95,5 @@ fn scanner(folder: &Path) -> Result<()> {
 
 fn spec(path: &Path) -> Result<()> {
     let loaded = load::load(&path.display().to_string(), &[], &[])?;
-    // Wide layers and large tables are settings that a user may want; here they would only take time.
-    loaded.spec.solver.build().map_err(|e| loaded.locate(e)).map(drop)
+    loaded.spec.method.plan(&Context::new(&Cpu::new())).map_err(|e| loaded.locate(e)).map(drop)
 }
