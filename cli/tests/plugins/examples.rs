@@ -78,6 +78,6 @@ fn the_planes_run_in_every_shipped_spec() {
     // 16 voxels a side need no level of 64 nodes, and none of 32.
     let needed = weights(&run("needed", "balanced", &["scene.levels=needed"]));
     assert_eq!(needed.len(), 6, "{needed:?}");
-    let masked = weights(&run("masked", "ni-naf", &["normalizers.0.keep=[0,1,2,12]"]));
+    let masked = weights(&run("masked", "ni-naf", &["callbacks=[{type=\"fft-mask\",keep=[0,1,2,12]}]"]));
     assert_eq!(masked, ["encoder.0.0.line", "encoder.0.0.plane", "encoder.1.0.line", "encoder.1.0.plane"]);
 }

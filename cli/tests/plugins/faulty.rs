@@ -125,7 +125,7 @@ const RAY_FAULTS: &[Fault] = &[
     fault(
         "a fitted projector that is the old one",
         &["FAULT=FITS_ITSELF"],
-        ["", "fitted to a scene", "fitted failed: it handed itself back instead of a new stage"],
+        ["", "fitted to a scene", "fitted: found the old stage, expected a new one"],
     ),
     fault("a fitted projector that returns NaN", &["FAULT=FITS_NAN"], ["", "fitted to a scene", "sample 0 is at"]),
     fault("a fitted projector whose lengths are 10 % too long", &["FAULT=FITS_LONGER"], ["", "fitted to a scene", ""]),
@@ -146,7 +146,7 @@ const LOSS_FAULTS: &[Fault] = &[
     fault(
         "a loss for a scan that is the old one",
         &["FAULT=FITS_ITSELF"],
-        ["", "learns from a scan", "fitted failed: it handed itself back instead of a new stage"],
+        ["", "learns from a scan", "fitted: found the old stage, expected a new one"],
     ),
     fault(
         "a loss that cannot learn from a scan",

@@ -329,10 +329,7 @@ impl Drop for Handle {
 impl Handle {
     /// What `call` made of this stage: a new one, or nothing.
     pub fn made(&self, stage: *mut c_void, call: &str) -> Result<Option<Self>> {
-        if stage == self.stage {
-            let what = "it handed itself back instead of a new stage";
-            return Err(self.ty.failed(call, CONEFIELD_FAILED, what));
-        }
+        ensure(stage != self.stage, &self.ty.words(), call, "the old stage", "a new one")?;
         Ok((!stage.is_null()).then(|| Self { ty: self.ty.clone(), stage }))
     }
 

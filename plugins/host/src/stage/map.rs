@@ -181,7 +181,8 @@ impl MapStage {
             return Err(ty.failed("reduce", status, &error.text()));
         }
         let wrong = |what: &str| ty.failed("reduce", CONEFIELD_FAILED, what);
-        let handle = self.handle.made(r.stage, "reduce")?.ok_or_else(|| wrong("it made nothing"))?;
+        let nothing = || Error::invalid(ty.words(), "reduce", "nothing", "a new stage");
+        let handle = self.handle.made(r.stage, "reduce")?.ok_or_else(nothing)?;
         let smaller = Self::new(handle)?;
         if r.params_count > info.params || r.channels_count > info.input.max(info.output) {
             return Err(wrong("it keeps more than there is"));
