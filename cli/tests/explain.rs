@@ -62,10 +62,12 @@ fn a_scan_adds_its_memory() {
     assert_eq!(m["volume"], 0);
     assert_eq!(e["scan"]["samples"], 320);
     // Training that ends by views kept aside keeps the parameters that predicted them best.
-    let e = json(&["explain", "naf", "--scan", &scan, "--set", "callbacks.1={type='patience',records=3}", "--json"]);
+    let patient = "callbacks=['rollback', {type='patience', records=3}]";
+    let e = json(&["explain", "naf", "--scan", &scan, "--set", patient, "--json"]);
     assert_eq!(e["scan"]["memory"]["optimizer"].as_u64().unwrap(), all / 2 + 16 * all / 16);
-    let said = e["solver"]["what"].as_str().unwrap();
-    assert!(said.contains("ends after 3 records of 50 steps"), "{said}");
+    let beside = e["beside"].as_array().unwrap();
+    let said = beside.iter().find(|l| l["stage"] == "callbacks.1").unwrap()["what"].as_str().unwrap();
+    assert!(said.contains("ends after 3 records"), "{said}");
     let all = done(&["explain", "naf", "--scan", &scan]);
     assert!(all.contains("this scan: 4 views of 8 x 12, volume 16 x 16 x 16, 320 samples"), "{all}");
 }

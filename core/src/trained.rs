@@ -108,7 +108,8 @@ impl Voxels for FieldVoxels<'_> {
             None => Ok(()),
             Some(((x, y, z), value)) => {
                 let voxel = [part[0].start + x, part[1].start + y, part[2].start + z];
-                let (field, expected) = (format!("voxel {voxel:?}"), "a finite number; a smaller optimizer.lr may help");
+                let (field, expected) =
+                    (format!("voxel {voxel:?}"), "a finite number; a smaller optimizer.lr may help");
                 Err(Error::invalid("the trained field", field, value, expected))
             }
         }

@@ -135,7 +135,7 @@ fn what_does_not_fit_is_refused_in_words() {
     refused("voxels without a coordinate", &spec, &["voxel-grid", "all three coordinates"]);
     for stage in ["encoder", "field", "projector"] {
         let spec = with(&|v| drop(v.as_object_mut().unwrap().remove(stage)));
-        refused(stage, &spec, &[stage, "nothing", "with a type"]);
+        refused(stage, &spec, &[stage, "nothing", &format!("{stage} type")]);
     }
     refused(
         "no method",

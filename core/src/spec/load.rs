@@ -625,7 +625,7 @@ mod tests {
             ),
             (
                 "type = 'test-stack'",
-                "a.toml:2:1: encoder.below: found nothing, expected an encoder type, or a table with one: one of",
+                "a.toml:2:1: encoder.below: found nothing, expected a table with an encoder type, or its name: one of",
             ),
             ("type = 'test-stack'\nbelow = { type = 'test-grid', level = 2 }", "a.toml:4:31: encoder.below.level"),
         ] {
@@ -653,8 +653,8 @@ mod tests {
         let table = read("type = 'test-field'\nencoder.type = 'test-grid'\n", &[]).unwrap();
         assert_eq!(alone.tree, table.tree);
         assert_eq!(alone.tree["encoder"]["levels"], 4);
-        let e = alone.locate(alone.spec.encoder.as_ref().unwrap().build().err().unwrap()).to_string();
-        assert!(e.starts_with("a.toml:1:11: encoder.levels"), "{e}");
+        let e = alone.locate(plan(&alone).err().unwrap()).to_string();
+        assert!(e.starts_with("a.toml:2:11: encoder.levels"), "{e}");
         // Over another type, by `--set`, and within a stage.
         let base = "extends = 'plain'\n";
         assert_eq!(read(base, &["encoder=test-grid"]).unwrap().tree["encoder"]["levels"], 4);
@@ -752,7 +752,8 @@ mod tests {
     fn an_unknown_name_lists_what_there_is() {
         let e = load("plan", &[], SHIPPED).err().unwrap().to_string();
         assert!(
-            e.contains("neither a shipped spec nor a file") && e.contains("\"plain\" (of plain, curved, timed)"),
+            e.contains("neither a shipped spec nor a file")
+                && e.contains("\"plain\" (of plain, curved, timed, test-chain"),
             "{e}"
         );
     }

@@ -168,7 +168,8 @@ impl Iterative for Built {
             let expected = "0, or a volume to start from and to be held to";
             return Err(Error::invalid("spec", "pull", self.pull, expected));
         }
-        let opened = self.shared.open(&self.describe(), job, observer)?;
+        let stages = [self.data.describe(), self.prior.describe(), self.basis.describe()].join("; ");
+        let opened = self.shared.open(&format!("{}; {stages}", self.describe()), job, observer)?;
         let job = &opened.job(job);
         let mut problem = opened.problem(job);
         if self.air {
@@ -216,9 +217,8 @@ impl Iterative for Built {
     }
 
     fn describe(&self) -> String {
-        let of = [self.data.describe(), self.prior.describe(), self.basis.describe()].join("; ");
         let held = if self.pull > 0.0 { format!(", held to a volume by {}", self.pull) } else { String::new() };
-        format!("fista: {}{held}; {of}", self.subsets)
+        format!("fista: {}{held}", self.subsets)
     }
 }
 
