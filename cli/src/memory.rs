@@ -232,7 +232,7 @@ mod tests {
     use conefield_core::scan::{Scan, ScanHeader};
 
     fn run() -> Run {
-        let scan = ScanSize { pixels: 1 << 20, voxels: 512 * 512 * 512, test_pixels: 0, reading: 0 };
+        let scan = ScanSize { pixels: 1 << 20, voxels: 512 * 512 * 512, test_pixels: 0, reading: 0, views: 1 };
         Run { reference: true, ..Run::on(scan) }
     }
 

@@ -49,14 +49,13 @@ impl Specs for Known {
 
 /// Builds a spec for `backend`: every stage once. Refusals name the line of the spec.
 pub fn plan(loaded: &Loaded, backend: &dyn Backend) -> Result<Box<dyn Plan>> {
-    let context = Context { backend, weights: &|path| files::read_weights(path) };
+    let context = Context { weights: &|path| files::read_weights(path), ..Context::new(backend) };
     loaded.spec.method.plan(&context).map_err(|e| loaded.locate(e))
 }
 
 /// Builds a spec without reading the weights that it names.
 pub fn plan_without_files(loaded: &Loaded, backend: &dyn Backend) -> Result<Box<dyn Plan>> {
-    let context = Context { backend, weights: &|_| Ok(Default::default()) };
-    loaded.spec.method.plan(&context).map_err(|e| loaded.locate(e))
+    loaded.spec.method.plan(&Context::without_weights(backend)).map_err(|e| loaded.locate(e))
 }
 
 /// Reads and builds a spec, and refuses what does not fit into memory. `run` says what else a run holds.

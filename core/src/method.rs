@@ -243,12 +243,23 @@ pub struct Context<'a> {
     pub backend: &'a dyn Backend,
     /// Reads a weights file that the spec names.
     pub weights: &'a dyn Fn(&str) -> Result<Weights>,
+    /// Whether weights are read: a spec is explained, and a field restored, without those that it starts from.
+    pub reads_weights: bool,
 }
 
 impl<'a> Context<'a> {
+    /// A context whose plans start from no weights: they are for looking at.
+    pub fn without_weights(backend: &'a dyn Backend) -> Self {
+        Self { reads_weights: false, ..Self::new(backend) }
+    }
+
     /// A context without files.
     pub fn new(backend: &'a dyn Backend) -> Self {
-        Self { backend, weights: &|path| Err(Error::unsupported(path, "no weights are read here")) }
+        Self {
+            backend,
+            weights: &|path| Err(Error::unsupported(path, "no weights are read here")),
+            reads_weights: true,
+        }
     }
 }
 

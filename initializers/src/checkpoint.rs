@@ -38,6 +38,10 @@ pub struct CheckpointInitializer {
 }
 
 impl Initializer for CheckpointInitializer {
+    fn check(&self, layout: &Layout) -> Result<()> {
+        self.apply(layout, &mut Arena::new(layout.len())).map(drop)
+    }
+
     fn apply(&self, layout: &Layout, arena: &mut Arena) -> Result<InitReport> {
         self.weights.load(&self.path, layout, &mut arena.params, |_| true)
     }

@@ -42,6 +42,10 @@ pub struct MciInitializer {
 }
 
 impl Initializer for MciInitializer {
+    fn check(&self, layout: &Layout) -> Result<()> {
+        self.apply(layout, &mut Arena::new(layout.len())).map(drop)
+    }
+
     fn apply(&self, layout: &Layout, arena: &mut Arena) -> Result<InitReport> {
         let take = |name: &str| !name.starts_with("encoder.");
         if !layout.blocks.iter().any(|b| take(&b.name)) {

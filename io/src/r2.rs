@@ -128,7 +128,8 @@ pub(crate) fn size(folder: &Path) -> Result<ScanSize> {
     let (pixels, test_pixels) = (pixels_of(&meta.proj_train), pixels_of(&meta.proj_test));
     let voxels = product(&meta.scanner.nVoxel);
     let volume = if meta.vol.is_some() { voxels } else { 0 };
-    Ok(ScanSize { pixels, voxels, test_pixels, reading: pixels.max(volume).saturating_mul(4) })
+    let (reading, views) = (pixels.max(volume).saturating_mul(4), meta.proj_train.len());
+    Ok(ScanSize { pixels, voxels, test_pixels, reading, views })
 }
 
 /// What the numbers of a folder that does not name its unit can mean.

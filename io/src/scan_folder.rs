@@ -161,9 +161,10 @@ pub(crate) fn size(file: &Path) -> Result<ScanSize> {
     let place = file.display().to_string();
     let mut d = describe(file)?;
     d.volume.validate(&place)?;
-    let pixels = [views(&place, &mut d)?.len(), d.detector.rows, d.detector.columns];
+    let views = views(&place, &mut d)?.len();
+    let pixels = [views, d.detector.rows, d.detector.columns];
     let pixels = pixels.iter().fold(1u64, |n, &s| n.saturating_mul(s as u64));
-    Ok(ScanSize { pixels, voxels: d.volume.len().unwrap_or(0) as u64, test_pixels: 0, reading: 0 })
+    Ok(ScanSize { pixels, voxels: d.volume.len().unwrap_or(0) as u64, test_pixels: 0, reading: 0, views })
 }
 
 /// Reads the volume that the scan of `file` was simulated from.

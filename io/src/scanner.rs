@@ -260,6 +260,7 @@ pub(crate) fn size(path: &Path) -> Result<ScanSize> {
         voxels: d.volume.len().unwrap_or(0) as u64,
         test_pixels: 0,
         reading: pixels.saturating_mul(8),
+        views: 1,
     })
 }
 

@@ -20,12 +20,19 @@ pub struct ScanSize {
     pub test_pixels: u64,
     /// Bytes that reading takes beside the projections.
     pub reading: u64,
+    /// Views; 1 where a file does not tell before it is read.
+    pub views: usize,
 }
 
 impl ScanSize {
-    /// As many values in one view and one row, as not every file tells more of them before it is read.
+    /// At least as many values, in square views and a cube: not every file tells more of them before it is read.
     pub fn header(&self) -> ScanHeader {
-        ScanHeader { views: 1, detector: [1, self.pixels as usize], volume: [self.voxels as usize, 1, 1] }
+        let views = self.views.max(1);
+        let rows = (self.pixels as f64 / views as f64).sqrt().ceil().max(1.0) as usize;
+        let columns = (self.pixels as usize).div_ceil(views).div_ceil(rows).max(1);
+        let side = (self.voxels as f64).cbrt().ceil().max(1.0) as usize;
+        let layers = (self.voxels as usize).div_ceil(side.saturating_mul(side)).max(1);
+        ScanHeader { views, detector: [rows, columns], volume: [side, side, layers] }
     }
 }
 
@@ -39,7 +46,7 @@ pub fn scan_size(path: impl AsRef<Path>) -> Result<ScanSize> {
         ScanFile::R2(folder) => r2::size(&folder)?,
         ScanFile::Naf(file) => {
             let bytes = file_bytes(&file)?;
-            ScanSize { pixels: bytes / 4, voxels: bytes / 4, test_pixels: 0, reading: bytes }
+            ScanSize { pixels: bytes / 4, voxels: bytes / 4, test_pixels: 0, reading: bytes, views: 1 }
         }
         ScanFile::Scanner(file) => scanner::size(&file)?,
     };
@@ -111,12 +118,12 @@ mod tests {
         let s = scan();
         let (pixels, voxels) = (s.projections.len() as u64, s.geometry.volume.len().unwrap() as u64);
         crate::write_scan(at("own"), &s, None).unwrap();
-        assert_eq!(scan_size(at("own")).unwrap(), ScanSize { pixels, voxels, test_pixels: 0, reading: 0 });
+        assert_eq!(scan_size(at("own")).unwrap(), ScanSize { pixels, voxels, test_pixels: 0, reading: 0, views: 7 });
         crate::write_r2(at("r2"), &s, Some(&s), None).unwrap();
-        let want = ScanSize { pixels, voxels, test_pixels: pixels, reading: 4 * pixels };
+        let want = ScanSize { pixels, voxels, test_pixels: pixels, reading: 4 * pixels, views: 7 };
         assert_eq!(scan_size(at("r2")).unwrap(), want);
         crate::write_rtk(at("rtk"), &s).unwrap();
-        assert_eq!(scan_size(at("rtk")).unwrap(), ScanSize { test_pixels: 0, reading: 8 * pixels, ..want });
+        assert_eq!(scan_size(at("rtk")).unwrap(), ScanSize { test_pixels: 0, reading: 8 * pixels, views: 1, ..want });
         crate::write_naf(at("naf.pickle"), &s, None, None).unwrap();
         let naf = scan_size(at("naf.pickle")).unwrap();
         assert!(naf.pixels >= pixels && naf.reading >= 4 * pixels, "{naf:?}");

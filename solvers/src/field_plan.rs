@@ -16,6 +16,7 @@ use crate::surround::{self, Within};
 use crate::training::callbacks::{FieldMonitor, LiveSlices, Rollback};
 use crate::training::run::Tally;
 use crate::training::{Callback, CallbackSpec, Callbacks, Draw, Run, Task, checkpoint, train};
+use conefield_core::arena::Weights;
 use conefield_core::backend::{Adam, Executable, TrainRay};
 use conefield_core::error::{Result, ensure};
 use conefield_core::loss::{Loss, NoiseModel};
@@ -72,8 +73,12 @@ impl Trained<'_> {
             prior.map_err(|e| e.within(&format!("priors.{i}")))
         };
         let priors: Vec<Box<dyn Prior>> = self.priors.iter().enumerate().map(prior).collect::<Result<_>>()?;
-        let initializer = self.initializer.build(context.weights).map_err(|e| e.within("initializer"))?;
-        initializer.check(pipeline.layout()).map_err(|e| e.within("initializer"))?;
+        let none = |_: &str| Ok(Weights::default());
+        let read: &dyn Fn(&str) -> Result<Weights> = if context.reads_weights { context.weights } else { &none };
+        let initializer = self.initializer.build(read).map_err(|e| e.within("initializer"))?;
+        if context.reads_weights {
+            initializer.check(pipeline.layout()).map_err(|e| e.within("initializer"))?;
+        }
         let (exe, compiled) = context.backend.compile(&pipeline)?;
         beside.push(Line::new("initializer", self.initializer.typetag_name(), &initializer.describe()));
         beside.push(Line::new("loss", self.loss.typetag_name(), &loss.describe()));

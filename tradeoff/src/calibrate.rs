@@ -132,8 +132,8 @@ fn voxels(bench: &Bench<'_>, plan: &mut dyn Plan, seconds: f64) -> Result<Costs>
         let begin = Instant::now();
         // A volume to start from takes as long as an empty one.
         let grid = scan.geometry.volume;
-        let empty = |_: &str| Ok(Volume { data: Array3::zeros(grid.shape), grid, affine: None });
-        let solution = plan.run(&Job { volumes: &empty, ..job(bench, &scan, limits) }, &mut laps)?;
+        let empty = Volume { data: Array3::zeros(grid.shape), grid, affine: None };
+        let solution = plan.run(&Job { start: Some(&empty), ..job(bench, &scan, limits) }, &mut laps)?;
         let took = begin.elapsed().as_secs_f64();
         let step_s = match (solution.steps, laps.typical()) {
             (2.., Some(lap)) => lap,

@@ -173,8 +173,8 @@ pub fn cases() -> Vec<Case> {
         refused(
             "patience without views kept aside",
             scan_toml,
-            "reconstruct scan --spec fast -o run --set callbacks.1={type='patience',records=3}",
-            &["--set callbacks.1={type='patience',records=3}", "no views kept aside", "--hold-out every:10"],
+            "reconstruct scan --spec fast -o run --set callbacks.1.type=patience",
+            &["--set callbacks.1.type=patience", "no views kept aside", "--hold-out every:10"],
         ),
         refused(
             "patience of voxels without views kept aside",

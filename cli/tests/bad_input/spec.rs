@@ -78,7 +78,7 @@ pub fn cases() -> Vec<Case> {
             "a loss that is linear from 0 on",
             toml("extends = \"naf\"\n\nloss = { type = \"huber\", delta = 0.0 }\n"),
             TOML,
-            &["spec.toml:3:33", "loss.delta", "positive"],
+            &["spec.toml:3:34", "loss.delta", "positive"],
         ),
         refused(
             "a prior on blocks of one point",
@@ -170,9 +170,14 @@ pub fn cases() -> Vec<Case> {
         ),
         refused(
             "20 000 unknown keys",
-            |d| put(d.join("spec.toml"), (0..20_000).map(|i| format!("k{i}=1\n")).collect::<String>()),
+            |d| {
+                put(
+                    d.join("spec.toml"),
+                    "type=\"fdk\"\n".to_owned() + &(0..20_000).map(|i| format!("k{i}=1\n")).collect::<String>(),
+                )
+            },
             TOML,
-            &["spec.toml:1:1", "k0"],
+            &["spec.toml:2:1", "k0"],
         ),
         refused(
             "a text of 300 kB",

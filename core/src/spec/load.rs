@@ -346,6 +346,9 @@ impl Set {
                         items.push(Node::empty_table(at.clone()));
                     }
                     node = &mut items[index];
+                    if i + 1 < path.len() {
+                        node.spell_out();
+                    }
                 }
                 Kind::Table(entries) => {
                     // A type that changes leaves nothing of the old settings.

@@ -51,7 +51,7 @@ pub fn spec(value: &Value) -> Result<Spec> {
 /// The plan of `spec`, which reads `weights` where it names any.
 #[allow(dead_code)]
 pub fn plan(spec: &Spec, backend: &dyn Backend, weights: &Weights) -> Result<Box<dyn Plan>> {
-    spec.method.plan(&Context { backend, weights: &|_| Ok(weights.clone()) })
+    spec.method.plan(&Context { weights: &|_| Ok(weights.clone()), ..Context::new(backend) })
 }
 
 /// The stages of the field of `spec`.
