@@ -87,10 +87,10 @@ fn gradient(prior: &dyn Prior) -> Outcome {
 fn adds(prior: &dyn Prior) -> Outcome {
     let values = drawn(prior);
     let (_, clean) = run(prior, &values, 1.0);
-    let mut added = vec![3.0; values.len()];
-    prior.block(&values, 1.0, &mut added);
+    let mut added = Guarded::new(values.len(), 3.0);
+    prior.block(&values, 1.0, added.inner());
     let want: Vec<f64> = clean.iter().map(|g| 3.0 + g).collect();
-    within("on top of 3", error(&added, &want), 1e-12)
+    within("on top of 3", error(&added.into_inner(), &want), 1e-12)
 }
 
 /// The gradient is multiplied with the scale, the penalty is not.
