@@ -68,11 +68,11 @@ impl Trained<'_> {
             callback.check(&pipeline).map_err(|e| e.within(&format!("callbacks.{i}")))?;
         }
         let loss = self.loss.build().map_err(|e| e.within("loss"))?;
-        let prior = |(i, spec): (usize, &Box<dyn PriorSpec>)| {
+        let mut priors = vec![];
+        for (i, spec) in self.priors.iter().enumerate() {
             let prior = spec.build().and_then(|p| p.blocks().validate().map(|()| p));
-            prior.map_err(|e| e.within(&format!("priors.{i}")))
-        };
-        let priors: Vec<Box<dyn Prior>> = self.priors.iter().enumerate().map(prior).collect::<Result<_>>()?;
+            priors.push(prior.map_err(|e| e.within(&format!("priors.{i}")))?);
+        }
         let none = |_: &str| Ok(Weights::default());
         let read: &dyn Fn(&str) -> Result<Weights> = if context.reads_weights { context.weights } else { &none };
         let initializer = self.initializer.build(read).map_err(|e| e.within("initializer"))?;

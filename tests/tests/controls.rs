@@ -1202,7 +1202,7 @@ impl Misfit for DataOn<'_> {
         let factor = match self.0 {
             DataFault::Steep => 2.0,
             DataFault::Neighbours if views.len() > 1 => 1.001,
-            DataFault::NotANumber => self.1.projections[[0, 0, 0]] / self.1.projections[[0, 0, 0]],
+            DataFault::NotANumber => self.1.projections[[0, 0, 0]] * f32::NAN,
             DataFault::Threads if rayon::current_num_threads() == 3 => 1.0 + 1e-6,
             DataFault::Upside => -1.0,
             _ => 1.0,
