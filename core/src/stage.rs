@@ -367,7 +367,7 @@ pub trait Field: Stage {
         Err(Error::unsupported(self.describe(), "this field cannot do without some of its inputs"))
     }
 
-    /// Its own line integrals, of a field that stands alone ([`crate::spec::FieldSpec::stands_alone`]).
+    /// Its own line integrals, of a field that brings them ([`crate::settings::LineFieldSpec`]).
     fn lines(&self) -> Option<&dyn Lines<f32>> {
         None
     }
