@@ -9,7 +9,7 @@ use conefield_core::stage::{
     Encoder, GradKind, Grads, Halves, Info, Kernel, Parameter, Reduced, Scope, Stage, Tile, TileMut,
 };
 use conefield_core::wgsl::{Fragment, Sum, functions};
-use schemars::{JsonSchema, Schema, SchemaGenerator, json_schema};
+use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 use std::fmt::Write;
 use std::ops::Range;
@@ -21,12 +21,8 @@ use std::sync::Arc;
 pub struct Concat {
     /// The parts, in the order of their channels: any encoders, this one included.
     #[serde(deserialize_with = "conefield_core::spec::stage::list")]
-    #[schemars(schema_with = "list_of_encoders")]
+    #[schemars(schema_with = "conefield_core::spec::stage::schema_of_list::<dyn EncoderSpec>", extend("minItems" = 1))]
     pub encoders: Vec<Box<dyn EncoderSpec>>,
-}
-
-fn list_of_encoders(_: &mut SchemaGenerator) -> Schema {
-    json_schema!({ "type": "array", "items": { "x-stage": "encoder" }, "minItems": 1 })
 }
 
 conefield_core::stage_type!(

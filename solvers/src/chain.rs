@@ -10,11 +10,10 @@ use conefield_core::method::{
     Solution,
 };
 use conefield_core::pipeline::{Model, Pipeline};
-use conefield_core::registry::Kind;
 use conefield_core::scan::{Scan, ScanHeader};
 use conefield_core::spec::stage;
 use conefield_core::trained::{Placement, TrainedField};
-use schemars::{JsonSchema, Schema, SchemaGenerator};
+use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
 /// Settings of `chain`.
@@ -24,12 +23,8 @@ pub struct Chain {
     /// The methods, in order. An entry may say `extends`. The command line's limits of steps and seconds are those of the
     /// first.
     #[serde(deserialize_with = "stage::list")]
-    #[schemars(schema_with = "methods")]
+    #[schemars(schema_with = "stage::schema_of_list::<dyn Method>")]
     pub methods: Vec<Box<dyn Method>>,
-}
-
-fn methods(_: &mut SchemaGenerator) -> Schema {
-    stage::schema_of_list(Kind::Method)
 }
 
 conefield_core::stage_type!(

@@ -25,14 +25,12 @@ use conefield_core::method::{
 };
 use conefield_core::pipeline::{Model, Pipeline};
 use conefield_core::prior::Prior;
-use conefield_core::registry::Kind;
 use conefield_core::scan::{Scan, ScanHeader};
 use conefield_core::scene::{Scene, SceneSettings};
 use conefield_core::settings::{Initializer, InitializerSpec, LossSpec, PriorSpec};
-use conefield_core::spec::stage;
 use conefield_core::trained::{FieldVoxels, Placement, TrainedField};
 use conefield_initializers::random::Random;
-use schemars::{JsonSchema, Schema, SchemaGenerator};
+use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 use std::sync::Arc;
 
@@ -179,22 +177,6 @@ pub(crate) fn l1() -> Box<dyn LossSpec> {
 /// The default callbacks.
 pub(crate) fn rollback() -> Vec<Box<dyn CallbackSpec>> {
     vec![Box::new(Rollback::default())]
-}
-
-pub(crate) fn initializer(_: &mut SchemaGenerator) -> Schema {
-    stage::schema_of(Kind::Initializer)
-}
-
-pub(crate) fn loss(_: &mut SchemaGenerator) -> Schema {
-    stage::schema_of(Kind::Loss)
-}
-
-pub(crate) fn priors(_: &mut SchemaGenerator) -> Schema {
-    stage::schema_of_list(Kind::Prior)
-}
-
-pub(crate) fn callbacks(_: &mut SchemaGenerator) -> Schema {
-    stage::schema_of_list(Kind::Callback)
 }
 
 /// The callbacks that settings name, each once.

@@ -7,11 +7,10 @@ use crate::training::CallbackSpec;
 use conefield_core::error::Result;
 use conefield_core::method::{Context, Method, Plan, StageLine};
 use conefield_core::pipeline::Pipeline;
-use conefield_core::registry::Kind;
 use conefield_core::scene::SceneSettings;
 use conefield_core::settings::{InitializerSpec, LineFieldSpec, LossSpec, PriorSpec};
 use conefield_core::spec::stage;
-use schemars::{JsonSchema, Schema, SchemaGenerator};
+use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
 /// Settings of `line-field`.
@@ -23,19 +22,19 @@ pub struct LineField {
     pub scene: SceneSettings,
     /// Line integrals of rays, and attenuation at points.
     #[serde(deserialize_with = "stage::needed")]
-    #[schemars(schema_with = "field")]
+    #[schemars(schema_with = "stage::schema::<dyn LineFieldSpec>")]
     pub field: Box<dyn LineFieldSpec>,
     /// Where weights come from.
     #[serde(default = "random", deserialize_with = "stage::needed")]
-    #[schemars(schema_with = "crate::field_plan::initializer")]
+    #[schemars(schema_with = "stage::schema::<dyn InitializerSpec>")]
     pub initializer: Box<dyn InitializerSpec>,
     /// What a difference between predicted and measured line integrals costs.
     #[serde(default = "l1", deserialize_with = "stage::needed")]
-    #[schemars(schema_with = "crate::field_plan::loss")]
+    #[schemars(schema_with = "stage::schema::<dyn LossSpec>")]
     pub loss: Box<dyn LossSpec>,
     /// What the field is to be like, whatever was measured.
     #[serde(default, deserialize_with = "stage::list")]
-    #[schemars(schema_with = "crate::field_plan::priors")]
+    #[schemars(schema_with = "stage::schema_of_list::<dyn PriorSpec>")]
     pub priors: Vec<Box<dyn PriorSpec>>,
     /// How gradients change parameters.
     #[serde(default)]
@@ -48,12 +47,8 @@ pub struct LineField {
     pub pretraining: Pretraining,
     /// What watches over training.
     #[serde(default = "rollback", deserialize_with = "stage::list")]
-    #[schemars(schema_with = "crate::field_plan::callbacks")]
+    #[schemars(schema_with = "stage::schema_of_list::<dyn CallbackSpec>")]
     pub callbacks: Vec<Box<dyn CallbackSpec>>,
-}
-
-fn field(_: &mut SchemaGenerator) -> Schema {
-    stage::schema_of(Kind::LineField)
 }
 
 conefield_core::stage_type!(Method, "line-field", LineField, "a field with line integrals of its own, trained on rays");

@@ -8,13 +8,12 @@ use conefield_core::error::Result;
 use conefield_core::method::{Context, Line, Method, Plan, StageLine};
 use conefield_core::pipeline::Pipeline;
 use conefield_core::precision::Precision;
-use conefield_core::registry::Kind;
 use conefield_core::scene::SceneSettings;
 use conefield_core::settings::{
     EncoderSpec, FieldSpec, InitializerSpec, LossSpec, NormalizerSpec, PriorSpec, ProjectorSpec,
 };
 use conefield_core::spec::stage;
-use schemars::{JsonSchema, Schema, SchemaGenerator};
+use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
 /// Settings of `neural-field`.
@@ -29,31 +28,31 @@ pub struct NeuralField {
     pub precision: Precision,
     /// Points to features.
     #[serde(deserialize_with = "stage::needed")]
-    #[schemars(schema_with = "encoder")]
+    #[schemars(schema_with = "stage::schema::<dyn EncoderSpec>")]
     pub encoder: Box<dyn EncoderSpec>,
     /// Features to features, in order.
     #[serde(default, deserialize_with = "stage::list")]
-    #[schemars(schema_with = "normalizers")]
+    #[schemars(schema_with = "stage::schema_of_list::<dyn NormalizerSpec>")]
     pub normalizers: Vec<Box<dyn NormalizerSpec>>,
     /// Features to attenuation.
     #[serde(deserialize_with = "stage::needed")]
-    #[schemars(schema_with = "field")]
+    #[schemars(schema_with = "stage::schema::<dyn FieldSpec>")]
     pub field: Box<dyn FieldSpec>,
     /// Rays to samples.
     #[serde(deserialize_with = "stage::needed")]
-    #[schemars(schema_with = "projector")]
+    #[schemars(schema_with = "stage::schema::<dyn ProjectorSpec>")]
     pub projector: Box<dyn ProjectorSpec>,
     /// Where weights come from.
     #[serde(default = "random", deserialize_with = "stage::needed")]
-    #[schemars(schema_with = "crate::field_plan::initializer")]
+    #[schemars(schema_with = "stage::schema::<dyn InitializerSpec>")]
     pub initializer: Box<dyn InitializerSpec>,
     /// What a difference between predicted and measured line integrals costs.
     #[serde(default = "l1", deserialize_with = "stage::needed")]
-    #[schemars(schema_with = "crate::field_plan::loss")]
+    #[schemars(schema_with = "stage::schema::<dyn LossSpec>")]
     pub loss: Box<dyn LossSpec>,
     /// What the field is to be like, whatever was measured.
     #[serde(default, deserialize_with = "stage::list")]
-    #[schemars(schema_with = "crate::field_plan::priors")]
+    #[schemars(schema_with = "stage::schema_of_list::<dyn PriorSpec>")]
     pub priors: Vec<Box<dyn PriorSpec>>,
     /// How gradients change parameters.
     #[serde(default)]
@@ -66,24 +65,8 @@ pub struct NeuralField {
     pub pretraining: Pretraining,
     /// What watches over training.
     #[serde(default = "rollback", deserialize_with = "stage::list")]
-    #[schemars(schema_with = "crate::field_plan::callbacks")]
+    #[schemars(schema_with = "stage::schema_of_list::<dyn CallbackSpec>")]
     pub callbacks: Vec<Box<dyn CallbackSpec>>,
-}
-
-fn encoder(_: &mut SchemaGenerator) -> Schema {
-    stage::schema_of(Kind::Encoder)
-}
-
-fn normalizers(_: &mut SchemaGenerator) -> Schema {
-    stage::schema_of_list(Kind::Normalizer)
-}
-
-fn field(_: &mut SchemaGenerator) -> Schema {
-    stage::schema_of(Kind::Field)
-}
-
-fn projector(_: &mut SchemaGenerator) -> Schema {
-    stage::schema_of(Kind::Projector)
 }
 
 conefield_core::stage_type!(Method, "neural-field", NeuralField, "a neural attenuation field, trained on rays");

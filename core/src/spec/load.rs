@@ -415,7 +415,6 @@ fn at_everywhere(mut node: Node, at: &At) -> Node {
 mod tests {
     use super::*;
     use crate::method::{Context, Method, Plan};
-    use crate::registry::Kind as Of;
     use crate::settings::{EncoderSpec, NormalizerSpec};
     use crate::spec::stage;
     use schemars::JsonSchema;
@@ -498,21 +497,13 @@ mod tests {
     #[serde(deny_unknown_fields)]
     struct TestField {
         #[serde(deserialize_with = "stage::needed")]
-        #[schemars(schema_with = "encoder")]
+        #[schemars(schema_with = "stage::schema::<dyn EncoderSpec>")]
         encoder: Box<dyn EncoderSpec>,
         #[serde(default, deserialize_with = "stage::list")]
-        #[schemars(schema_with = "normalizers")]
+        #[schemars(schema_with = "stage::schema_of_list::<dyn NormalizerSpec>")]
         normalizers: Vec<Box<dyn NormalizerSpec>>,
         #[serde(default = "ten")]
         steps: u64,
-    }
-
-    fn encoder(_: &mut schemars::SchemaGenerator) -> schemars::Schema {
-        stage::schema_of(Of::Encoder)
-    }
-
-    fn normalizers(_: &mut schemars::SchemaGenerator) -> schemars::Schema {
-        stage::schema_of_list(Of::Normalizer)
     }
 
     fn ten() -> u64 {
@@ -532,12 +523,8 @@ mod tests {
     #[serde(deny_unknown_fields)]
     struct TestChain {
         #[serde(deserialize_with = "stage::list")]
-        #[schemars(schema_with = "methods")]
+        #[schemars(schema_with = "stage::schema_of_list::<dyn Method>")]
         methods: Vec<Box<dyn Method>>,
-    }
-
-    fn methods(_: &mut schemars::SchemaGenerator) -> schemars::Schema {
-        stage::schema_of_list(Of::Method)
     }
 
     crate::stage_type!(Method, "test-chain", TestChain, "for tests");

@@ -4,8 +4,8 @@ use super::PluginPaths;
 use crate::registry::{Kind, StageType, stage_types};
 use serde_json::{Map, Value, json};
 
-/// Marks, in a settings schema, a value that is itself a stage: `#[schemars(extend("x-stage" = "encoder"))]` or a
-/// `schema_with` function that returns `{"x-stage": "encoder"}`.
+/// Marks, in a settings schema, a value that is itself a stage: `{"x-stage": "encoder"}`, which [`super::stage::schema`]
+/// writes.
 pub const NESTED: &str = "x-stage";
 
 /// Marks, in a settings schema, groups of keys of which a table has only one:

@@ -3,8 +3,10 @@
 //! `typetag` reads the types that are linked in. Those of loaded libraries it cannot see, as every library has statics
 //! of its own; [`needed`] and [`list`] look their names up at run time.
 
+use super::schema::NESTED;
 use crate::method::Method;
 use crate::registry::{Kind, Origin, Settings, find};
+use schemars::{Schema, SchemaGenerator, json_schema};
 use serde::Deserialize;
 use serde::de::{DeserializeOwned, Deserializer, Error};
 use serde_json::{Value, json};
@@ -52,12 +54,12 @@ where
     all.map(|(i, v)| read(v).map_err(|e| D::Error::custom(format!("{i}: {e}")))).collect()
 }
 
-/// The schema of a setting that is a stage: `#[schemars(schema_with = "…")]`.
-pub fn schema_of(kind: Kind) -> schemars::Schema {
-    schemars::json_schema!({ "x-stage": kind.name() })
+/// For `#[schemars(schema_with = …)]`: the schema of a setting that is a stage.
+pub fn schema<T: Settings + ?Sized>(_: &mut SchemaGenerator) -> Schema {
+    json_schema!({ NESTED: T::KIND.name() })
 }
 
-/// The schema of a setting that is a list of stages.
-pub fn schema_of_list(kind: Kind) -> schemars::Schema {
-    schemars::json_schema!({ "type": "array", "items": { "x-stage": kind.name() } })
+/// For `#[schemars(schema_with = …)]`: the schema of a setting that is a list of stages.
+pub fn schema_of_list<T: Settings + ?Sized>(_: &mut SchemaGenerator) -> Schema {
+    json_schema!({ "type": "array", "items": { NESTED: T::KIND.name() } })
 }

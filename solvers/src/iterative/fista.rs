@@ -31,6 +31,7 @@ use conefield_core::regularizer::{Penalty, Regularizer, RegularizerSpec};
 use conefield_core::scan::{Scan, ScanHeader};
 use conefield_core::scene::VoxelScene;
 use conefield_core::space::Space;
+use conefield_core::spec::stage;
 use conefield_core::voxel::VoxelProjectorSpec;
 use conefield_projectors::voxel::Joseph;
 use ndarray::{Array3, Zip};
@@ -45,20 +46,20 @@ use std::time::Instant;
 #[serde(deny_unknown_fields, default)]
 pub struct Fista {
     /// Line integrals of voxels.
-    #[serde(deserialize_with = "conefield_core::spec::stage::needed")]
-    #[schemars(with = "serde_json::Value", extend("x-stage" = "voxel-projector"))]
+    #[serde(deserialize_with = "stage::needed")]
+    #[schemars(schema_with = "stage::schema::<dyn VoxelProjectorSpec>")]
     pub projector: Box<dyn VoxelProjectorSpec>,
     /// What the volume is made of.
-    #[serde(deserialize_with = "conefield_core::spec::stage::needed")]
-    #[schemars(with = "serde_json::Value", extend("x-stage" = "basis"))]
+    #[serde(deserialize_with = "stage::needed")]
+    #[schemars(schema_with = "stage::schema::<dyn BasisSpec>")]
     pub basis: Box<dyn BasisSpec>,
     /// How far line integrals are from the measured ones.
-    #[serde(deserialize_with = "conefield_core::spec::stage::needed")]
-    #[schemars(with = "serde_json::Value", extend("x-stage" = "data-term"))]
+    #[serde(deserialize_with = "stage::needed")]
+    #[schemars(schema_with = "stage::schema::<dyn DataTermSpec>")]
     pub data: Box<dyn DataTermSpec>,
     /// What is known of the volume before the scan.
-    #[serde(deserialize_with = "conefield_core::spec::stage::needed")]
-    #[schemars(with = "serde_json::Value", extend("x-stage" = "regularizer"))]
+    #[serde(deserialize_with = "stage::needed")]
+    #[schemars(schema_with = "stage::schema::<dyn RegularizerSpec>")]
     pub prior: Box<dyn RegularizerSpec>,
     /// How the scan is seen.
     pub scene: VoxelScene,

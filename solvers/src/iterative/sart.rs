@@ -13,6 +13,7 @@ use conefield_core::method::{Context, Job, Method, Observer, Plan, Solution};
 use conefield_core::scan::{Scan, ScanHeader};
 use conefield_core::scene::VoxelScene;
 use conefield_core::space::Space;
+use conefield_core::spec::stage;
 use conefield_core::voxel::VoxelProjectorSpec;
 use conefield_projectors::voxel::Joseph;
 use ndarray::{Array3, Axis, Zip};
@@ -25,8 +26,8 @@ use std::time::Instant;
 #[serde(deny_unknown_fields, default)]
 pub struct Sart {
     /// Line integrals of voxels.
-    #[serde(deserialize_with = "conefield_core::spec::stage::needed")]
-    #[schemars(with = "serde_json::Value", extend("x-stage" = "voxel-projector"))]
+    #[serde(deserialize_with = "stage::needed")]
+    #[schemars(schema_with = "stage::schema::<dyn VoxelProjectorSpec>")]
     pub projector: Box<dyn VoxelProjectorSpec>,
     /// How the scan is seen.
     pub scene: VoxelScene,
