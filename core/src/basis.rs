@@ -22,15 +22,21 @@ pub trait Basis: Send + Sync {
     fn describe(&self) -> String;
 }
 
-/// The basis of one grid of voxels: a matrix `B` without negative entries, so that coefficients of 0 and more give voxels of
-/// 0 and more.
+/// The basis of one grid of voxels: a matrix `B`. Its entries are not negative, so that coefficients of 0 and more give voxels
+/// of 0 and more, unless coefficients are samples.
 pub trait Expansion: Send + Sync {
     /// Where the coefficients stand. A prior acts on this grid, with its spacing.
     fn coefficients(&self) -> VoxelGrid;
 
-    /// Whether coefficients are the voxels themselves. A method then expands nothing and copies nothing.
-    fn is_identity(&self) -> bool {
+    /// Whether coefficients are the volume's values where they stand, on a grid that fills the same box. A projector then
+    /// takes them for voxels of that grid, and only the volume that comes out is expanded, with what falls below 0 set to 0.
+    fn are_samples(&self) -> bool {
         false
+    }
+
+    /// Bytes that either direction of the operator takes while it works.
+    fn scratch(&self) -> u64 {
+        0
     }
 
     /// The operator that works.

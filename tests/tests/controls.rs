@@ -999,7 +999,7 @@ impl Expansion for BasisOn {
         }
         grid
     }
-    fn is_identity(&self) -> bool {
+    fn are_samples(&self) -> bool {
         matches!(self.0, BasisFault::None | BasisFault::Doubles)
     }
     fn operator(&self) -> &dyn BasisOperator<f32> {

@@ -12,7 +12,7 @@
 
 use super::bases::Voxels;
 use super::data::NoiseWeighted;
-use super::model::Model;
+use super::model::{Model, projected};
 use super::norms::{change, distance, norm2};
 use super::order::{Order, Subsets, split, told};
 use super::plan::{Iterative, IterativePlan};
@@ -21,7 +21,7 @@ use super::regularizers::Nonnegative;
 use super::shared::Shared;
 use super::{Iteration, Pass, Problem, Stop, drive::drive, flat, flat_mut};
 use conefield_core::Error;
-use conefield_core::basis::{Basis, BasisSpec};
+use conefield_core::basis::{Basis, BasisSpec, Expansion};
 use conefield_core::data_term::{DataTerm, DataTermSpec, Misfit};
 use conefield_core::error::{Result, ensure};
 use conefield_core::geometry::VoxelGrid;
@@ -71,6 +71,8 @@ pub struct Fista {
     /// Take pixels that the object's shadow leaves out for 0, whatever noise they hold. Where negative values were cut off,
     /// noise has a mean above 0, which puts a haze around the object.
     pub air: bool,
+    /// Take means of so many rows and columns of the detector for a pixel.
+    pub bin: usize,
     /// Subsets of the views: a number, or "views" for a view at a time.
     pub subsets: Subsets,
     /// The order of the subsets.
@@ -91,6 +93,7 @@ impl Default for Fista {
             start: None,
             stop: Stop { change: Some(1e-3), ..Stop::after(16) },
             air: true,
+            bin: 1,
             subsets: Subsets::Count(10),
             order: Order::Golden,
             pull: 0.0,
@@ -126,6 +129,7 @@ impl Fista {
         self.subsets.validate()?;
         let pull = self.pull;
         ensure(pull.is_finite() && pull >= 0.0, "spec", "pull", pull, "a finite number, 0 or more")?;
+        ensure((1..=64).contains(&self.bin), "spec", "bin", self.bin, "1 to 64")?;
         Ok(Built {
             shared: Shared::of(self.projector.as_ref(), self.scene, &self.start, &self.stop)?,
             basis: self.basis.build().map_err(|e| e.within("basis"))?,
@@ -133,6 +137,7 @@ impl Fista {
             prior: self.prior.build().map_err(|e| e.within("prior"))?,
             kinds: [self.basis.typetag_name(), self.data.typetag_name(), self.prior.typetag_name()],
             air: self.air,
+            bin: self.bin,
             subsets: self.subsets,
             order: self.order,
             pull,
@@ -149,9 +154,17 @@ struct Built {
     /// The types of the three.
     kinds: [&'static str; 3],
     air: bool,
+    bin: usize,
     subsets: Subsets,
     order: Order,
     pull: f64,
+}
+
+impl Built {
+    /// The scan's size as it is worked on, and the pixels that a detector needs for that.
+    fn seen(&self, header: ScanHeader) -> ScanHeader {
+        ScanHeader { detector: header.detector.map(|n| n / self.bin), ..header }
+    }
 }
 
 impl Iterative for Built {
@@ -170,17 +183,29 @@ impl Iterative for Built {
             return Err(Error::invalid("spec", "pull", self.pull, expected));
         }
         let stages = [self.data.describe(), self.prior.describe(), self.basis.describe()].join("; ");
-        let opened = self.shared.open(&format!("{}; {stages}", self.describe()), job, observer)?;
+        let voxels = job.scan.geometry.volume;
+        let expansion = self.basis.on(&voxels).map_err(|e| e.within("basis"))?;
+        let shortest = job.scan.geometry.detector[0].min(job.scan.geometry.detector[1]);
+        ensure(
+            self.bin <= shortest,
+            "spec",
+            "bin",
+            self.bin,
+            format!("at most {shortest}, the detector's shorter side"),
+        )?;
+        let grid = projected(expansion.as_ref(), voxels);
+        let opened = self.shared.open_on(grid, self.bin, &format!("{}; {stages}", self.describe()), job, observer)?;
         let job = &opened.job(job);
         let mut problem = opened.problem(job);
         if self.air {
             problem.clear_air();
             observer.note(&format!("{:.0} % of the pixels are air", 100.0 * problem.air_share()));
         }
-        let data = self.data.of(job.scan);
-        let space = Space::new(job.scan.header());
-        let start = self.shared.start(job, &problem, &space)?;
-        let arrays = Arrays::new(self, &job.scan.geometry.volume, &space, start)?;
+        let data = self.data.of(problem.scan);
+        let space = Space::new(self.seen(job.scan.header()));
+        let start = self.shared.known(job, &space)?;
+        let mut arrays = Arrays::new(self, expansion, &voxels, &space, start);
+        arrays.begin(&problem);
         let mut iterate = Iterate::new(self, &problem, data, arrays)?;
         observer.note(&iterate.told());
         drive(job, &self.shared.stop, begun, &problem, &space, &mut iterate, observer)
@@ -200,14 +225,20 @@ impl Iterative for Built {
     }
 
     fn bytes(&self, header: &ScanHeader) -> u64 {
+        let header = &self.seen(*header);
         let space = Space::tally(*header);
         if self.air {
             space.hold(Problem::air_bytes(header));
         }
+        if self.bin > 1 {
+            space.hold(4 * header.pixels());
+        }
         space.pass(self.data.scratch(header));
         let grid = VoxelGrid { shape: header.volume, spacing: [1.0; 3], center: [0.0; 3] };
         // A basis that refuses the grid refuses the run, which then takes nothing.
-        let _ = Arrays::new(self, &grid, &space, space.volume());
+        if let Ok(expansion) = self.basis.on(&grid) {
+            Arrays::new(self, expansion, &grid, &space, space.volume());
+        }
         // To measure its noise, all views are projected back at once.
         let all = self.shared.projector.scratch(header, header.views);
         self.prior.weight(&grid, &mut |_| {
@@ -241,12 +272,18 @@ struct Arrays {
 }
 
 impl Arrays {
-    fn new(settings: &Built, grid: &VoxelGrid, space: &Space, start: Array3<f32>) -> Result<Self> {
-        let expansion = settings.basis.on(grid).map_err(|e| e.within("basis"))?;
-        let (model, x) = Model::new(expansion, space, start);
+    /// For a volume on the grid `voxels` that is at first `start`.
+    fn new(
+        settings: &Built,
+        expansion: Box<dyn Expansion>,
+        voxels: &VoxelGrid,
+        space: &Space,
+        start: Array3<f32>,
+    ) -> Self {
+        let (model, x) = Model::new(expansion, voxels, space, start);
         let grid = model.grid();
         let coefficients = || space.array(grid.shape);
-        let mut all = Self {
+        Self {
             model,
             penalty: settings.prior.on(&grid, space),
             x,
@@ -256,11 +293,16 @@ impl Arrays {
             before: coefficients(),
             towards: (settings.pull > 0.0).then(coefficients),
             pixels: space.projections(space.header().views),
-        };
-        for copy in [Some(&mut all.ahead), all.towards.as_mut()].into_iter().flatten() {
-            copy.assign(&all.x);
         }
-        Ok(all)
+    }
+
+    /// Leaves nothing where the object cannot be, and starts from what is left.
+    fn begin(&mut self, problem: &Problem<'_>) {
+        self.model.prepare(problem, &mut self.gradient);
+        self.model.outside(problem, &mut self.x, 0.0);
+        for copy in [Some(&mut self.ahead), self.towards.as_mut()].into_iter().flatten() {
+            copy.assign(&self.x);
+        }
     }
 
     /// Root mean square of `(A·B)ᵀ·n` over the coefficients that rays meet, for noise n as `data` spreads it.
@@ -318,7 +360,6 @@ struct Iterate<'a> {
 
 impl<'a> Iterate<'a> {
     fn new(settings: &Built, problem: &Problem<'_>, data: Box<dyn Misfit + 'a>, mut arrays: Arrays) -> Result<Self> {
-        arrays.model.prepare(problem, &mut arrays.gradient);
         let views = problem.scan.geometry.views.len();
         let subsets = settings.subsets.of(views);
         let grid = arrays.model.grid();

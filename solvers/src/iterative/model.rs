@@ -10,22 +10,34 @@ use ndarray::{Array3, Zip};
 /// Steps in which coefficients are fitted to a volume.
 const FIT: usize = 20;
 
-/// The matrix `A·B` of a problem's projector A and a basis B. Where coefficients are the voxels, none is copied.
+/// The matrix `A·B` of a problem's projector A and a basis B; `A` alone, on the grid of the coefficients, where these are
+/// samples. Where coefficients are the voxels, none is copied.
 pub(super) struct Model {
     expansion: Box<dyn Expansion>,
     /// The voxels of coefficients, unless they are the voxels.
     voxels: Option<Array3<f32>>,
-    /// The coefficients of voxels in which the object can be, unless all are.
+    /// The coefficients of voxels in which the object can be, unless all are or the problem's mask is theirs.
     inside: Option<Array3<bool>>,
 }
 
+/// The grid that a problem's projector works on: that of the coefficients where they are samples, else `voxels`.
+pub(super) fn projected(expansion: &dyn Expansion, voxels: VoxelGrid) -> VoxelGrid {
+    if expansion.are_samples() { expansion.coefficients() } else { voxels }
+}
+
 impl Model {
-    /// The model with its arrays, and the coefficients of the volume `start`, which it takes.
-    pub(super) fn new(expansion: Box<dyn Expansion>, space: &Space, start: Array3<f32>) -> (Self, Array3<f32>) {
-        if expansion.is_identity() {
+    /// The model with its arrays, and the coefficients of the volume `start` on the grid `voxels`, which it takes.
+    pub(super) fn new(
+        expansion: Box<dyn Expansion>,
+        voxels: &VoxelGrid,
+        space: &Space,
+        start: Array3<f32>,
+    ) -> (Self, Array3<f32>) {
+        if expansion.coefficients() == *voxels && expansion.are_samples() {
             return (Self { expansion, voxels: None, inside: None }, start);
         }
         let x = space.array(expansion.coefficients().shape);
+        space.pass(expansion.scratch());
         let mut model = Self { expansion, voxels: Some(start), inside: None };
         let x = space.briefly(|space| model.fit(x, space));
         (model, x)
@@ -33,6 +45,9 @@ impl Model {
 
     /// Finds out which coefficients can be other than 0.
     pub(super) fn prepare(&mut self, problem: &Problem<'_>, work: &mut Array3<f32>) {
+        if self.expansion.are_samples() {
+            return;
+        }
         if let (Some(voxels), Some(_)) = (&mut self.voxels, problem.inside) {
             problem.ones(voxels);
             self.expansion.operator().adjoint(voxels.view(), work.view_mut());
@@ -45,12 +60,21 @@ impl Model {
         self.expansion.coefficients()
     }
 
-    /// The volume of coefficients, in which no voxel is that the object cannot be in.
+    /// The volume of coefficients: 0 where samples overshoot below it, and in voxels that the object cannot be in.
     pub(super) fn volume<'a>(&'a mut self, problem: &Problem<'_>, x: &'a Array3<f32>) -> &'a Array3<f32> {
         let Some(voxels) = &mut self.voxels else { return x };
         self.expansion.operator().expand(x.view(), voxels.view_mut());
-        problem.outside(voxels, 0.0);
+        if self.expansion.are_samples() {
+            voxels.par_mapv_inplace(|x| x.max(0.0));
+        } else {
+            problem.outside(voxels, 0.0);
+        }
         voxels
+    }
+
+    /// What the problem's projector projects.
+    fn projected<'a>(&'a mut self, problem: &Problem<'_>, x: &'a Array3<f32>) -> &'a Array3<f32> {
+        if self.expansion.are_samples() { x } else { self.volume(problem, x) }
     }
 
     /// The volume of coefficients that are needed no more.
@@ -61,7 +85,7 @@ impl Model {
 
     /// As [`Problem::forward`].
     pub(super) fn forward(&mut self, problem: &Problem<'_>, views: &[usize], x: &Array3<f32>, out: &mut Array3<f32>) {
-        problem.forward(views, self.volume(problem, x), out);
+        problem.forward(views, self.projected(problem, x), out);
     }
 
     /// As [`Problem::residual`].
@@ -72,22 +96,24 @@ impl Model {
         x: &Array3<f32>,
         out: &mut Array3<f32>,
     ) -> f64 {
-        problem.residual(views, self.volume(problem, x), out)
+        problem.residual(views, self.projected(problem, x), out)
     }
 
     /// As [`Problem::back`].
     pub(super) fn back(&mut self, problem: &Problem<'_>, views: &[usize], y: &Array3<f32>, out: &mut Array3<f32>) {
-        let Some(voxels) = &mut self.voxels else { return problem.back(views, y, out) };
+        let Some(voxels) = self.voxels.as_mut().filter(|_| !self.expansion.are_samples()) else {
+            return problem.back(views, y, out);
+        };
         problem.back(views, y, voxels);
         self.expansion.operator().adjoint(voxels.view(), out.view_mut());
     }
 
     /// As [`Problem::outside`].
     pub(super) fn outside(&self, problem: &Problem<'_>, x: &mut Array3<f32>, value: f32) {
-        match (&self.voxels, &self.inside) {
-            (None, _) => problem.outside(x, value),
-            (_, Some(inside)) => Zip::from(x).and(inside).par_for_each(|x, i| *x = if *i { *x } else { value }),
-            _ => {}
+        match &self.inside {
+            _ if self.expansion.are_samples() => problem.outside(x, value),
+            Some(inside) => Zip::from(x).and(inside).par_for_each(|x, i| *x = if *i { *x } else { value }),
+            None => {}
         }
     }
 
@@ -104,7 +130,7 @@ impl Model {
         operator.adjoint(residual.view(), gradient.view_mut());
         direction.assign(&gradient);
         let mut gamma = norm2(&gradient);
-        let enough = 1e-12 * gamma;
+        let enough = 1e-6 * gamma;
         for _ in 0..FIT {
             operator.expand(direction.view(), ahead.view_mut());
             let square = norm2(&ahead);

@@ -2,6 +2,7 @@
 
 use super::norms::square_sum;
 use crate::shadow::{air_level, shadow};
+use conefield_core::geometry::Geometry;
 use conefield_core::scan::{Scan, ScanHeader};
 use conefield_core::space::Space;
 use conefield_core::voxel::VoxelOperator;
@@ -16,6 +17,8 @@ const MARGIN: usize = 4;
 pub struct Problem<'a> {
     /// What was measured.
     pub scan: &'a Scan,
+    /// Its geometry, with the grid of the unknowns as its volume.
+    pub geometry: &'a Geometry,
     /// The system matrix.
     pub operator: &'a dyn VoxelOperator<f32>,
     /// Seed of everything random.
@@ -48,7 +51,7 @@ impl Problem<'_> {
 
     /// Overwrites the first images of `out` with `A·x` for some views.
     pub fn forward(&self, views: &[usize], x: &Array3<f32>, out: &mut Array3<f32>) {
-        self.operator.forward(&self.scan.geometry, views, x.view(), images_mut(out, views.len()));
+        self.operator.forward(self.geometry, views, x.view(), images_mut(out, views.len()));
     }
 
     /// Overwrites the first images of `out` with `p − A·x` for some views, with p 0 in air if that is asked for. Returns
@@ -71,7 +74,7 @@ impl Problem<'_> {
     /// be, so that what starts at 0 there stays.
     pub fn back(&self, views: &[usize], y: &Array3<f32>, out: &mut Array3<f32>) {
         out.fill(0.0);
-        self.operator.adjoint(&self.scan.geometry, views, images(y, views.len()), out.view_mut());
+        self.operator.adjoint(self.geometry, views, images(y, views.len()), out.view_mut());
         self.outside(out, 0.0);
     }
 
@@ -90,7 +93,7 @@ impl Problem<'_> {
 
     /// Every view.
     pub fn views(&self) -> Vec<usize> {
-        (0..self.scan.geometry.views.len()).collect()
+        (0..self.geometry.views.len()).collect()
     }
 }
 

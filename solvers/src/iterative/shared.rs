@@ -7,8 +7,9 @@ use crate::fit::support;
 use crate::surround::Within;
 use conefield_core::Error;
 use conefield_core::error::{Result, ensure};
+use conefield_core::geometry::{Geometry, VoxelGrid};
 use conefield_core::method::{Job, Observer};
-use conefield_core::scan::Volume;
+use conefield_core::scan::{Scan, Volume};
 use conefield_core::scene::VoxelScene;
 use conefield_core::settings::KnownVolume;
 use conefield_core::space::Space;
@@ -47,8 +48,15 @@ impl Shared {
         job.start.is_some() || self.start.is_some()
     }
 
-    /// The volume to start from, in 1/mm; 0 where none is known.
+    /// The volume to start from, in 1/mm; 0 where none is known and where no object can be.
     pub(super) fn start(&self, job: &Job<'_>, problem: &Problem<'_>, space: &Space) -> Result<Array3<f32>> {
+        let mut x = self.known(job, space)?;
+        problem.outside(&mut x, 0.0);
+        Ok(x)
+    }
+
+    /// The volume that is known, in 1/mm; 0 where none is.
+    pub(super) fn known(&self, job: &Job<'_>, space: &Space) -> Result<Array3<f32>> {
         let volume = match (job.start, &self.start) {
             (Some(given), _) => in_mm(job, "start", given.clone())?,
             (None, Some(path)) => start_volume(job, path)?,
@@ -56,13 +64,23 @@ impl Shared {
         };
         space.hold(4 * space.header().voxels());
         let data = volume.data;
-        let mut x = if data.is_standard_layout() { data } else { data.as_standard_layout().into_owned() };
-        problem.outside(&mut x, 0.0);
-        Ok(x)
+        Ok(if data.is_standard_layout() { data } else { data.as_standard_layout().into_owned() })
     }
 
     /// Refuses a scan that makes no sense, tells `method` and its projector, and finds out where the object is.
     pub(super) fn open(&self, method: &str, job: &Job<'_>, observer: &mut dyn Observer) -> Result<Opened> {
+        self.open_on(job.scan.geometry.volume, 1, method, job, observer)
+    }
+
+    /// As [`Shared::open`], with `grid` as the grid of the unknowns and means of `bin` × `bin` pixels as pixels.
+    pub(super) fn open_on(
+        &self,
+        grid: VoxelGrid,
+        bin: usize,
+        method: &str,
+        job: &Job<'_>,
+        observer: &mut dyn Observer,
+    ) -> Result<Opened> {
         job.scan.validate("scan")?;
         let g = &job.scan.geometry;
         let (bounds, [rows, columns]) = (g.volume.bounds(), g.detector);
@@ -75,11 +93,15 @@ impl Shared {
         let (support, said) = support(job.scan, self.scene.support);
         said.iter().for_each(|line| observer.note(line));
         let inside = support.map(|support| {
-            let mut inside = Array3::from_elem(g.volume.shape, false);
-            Zip::indexed(&mut inside).par_for_each(|(x, y, z), i| *i = support.holds(g.volume.voxel([x, y, z])));
+            let mut inside = Array3::from_elem(grid.shape, false);
+            Zip::indexed(&mut inside).par_for_each(|(x, y, z), i| *i = support.holds(grid.voxel([x, y, z])));
             inside
         });
-        Ok(Opened { projector, inside, within: Within::of(job, self.scene.surround, observer)? })
+        let within = Within::of(job, self.scene.surround, observer)?;
+        let binned = (bin > 1).then(|| Within::job(within.as_ref(), job).scan.binned(bin));
+        let seen = binned.as_ref().map_or(g, |scan| &scan.geometry);
+        let geometry = Geometry { volume: grid, ..seen.clone() };
+        Ok(Opened { projector, inside, within, binned, geometry })
     }
 
     /// Counts in a tally what the driver, and the projector of a subset, take beside the method's own arrays; returns all bytes without
@@ -99,6 +121,10 @@ pub(super) struct Opened {
     inside: Option<Array3<bool>>,
     /// The scan without what lies beyond the volume.
     within: Option<Within>,
+    /// The scan with larger pixels, if these are asked for.
+    binned: Option<Scan>,
+    /// The geometry of the scan that is worked on, with the grid of the unknowns.
+    geometry: Geometry,
 }
 
 impl Opened {
@@ -107,10 +133,11 @@ impl Opened {
         Within::job(self.within.as_ref(), job)
     }
 
-    /// Its problem, with every pixel as it was measured.
+    /// Its problem, with every pixel as it was measured or binned.
     pub(super) fn problem<'a>(&'a self, job: &Job<'a>) -> Problem<'a> {
         let (operator, inside) = (self.projector.operator(), self.inside.as_ref());
-        Problem { scan: job.scan, operator, seed: job.seed, inside, shadow: None }
+        let scan = self.binned.as_ref().unwrap_or(job.scan);
+        Problem { scan, geometry: &self.geometry, operator, seed: job.seed, inside, shadow: None }
     }
 }
 

@@ -26,7 +26,7 @@ pub fn check_basis(basis: &dyn Basis) -> Report {
     report.add("linear", || linear(&all));
     report.add("overwrites", || overwrites(&all));
     report.add("no negative entries", || no_negative_entries(&all));
-    report.add("identity", || identity(&all));
+    report.add("samples", || samples(&all));
     report.add("threads", || threads(&all));
     report
 }
@@ -129,6 +129,9 @@ fn overwrites(all: &Made) -> Outcome {
 
 fn no_negative_entries(all: &Made) -> Outcome {
     let mut coefficients = 0;
+    if all.iter().any(|(_, basis)| basis.are_samples()) {
+        return Outcome::Skipped("coefficients are samples".into());
+    }
     let complaint = all.iter().find_map(|(grid, basis)| {
         let shape = basis.coefficients().shape;
         let one = |i: usize| {
@@ -146,20 +149,27 @@ fn no_negative_entries(all: &Made) -> Outcome {
     settle(complaint, &format!("in {coefficients} columns"))
 }
 
-/// What says that it is the identity is.
-fn identity(all: &Made) -> Outcome {
-    if !all.iter().any(|(_, basis)| basis.is_identity()) {
-        return Outcome::Skipped("it is none".into());
+/// What says that its coefficients are samples fills the same box, keeps constants, and changes nothing where the grids are
+/// the same.
+fn samples(all: &Made) -> Outcome {
+    if !all.iter().any(|(_, basis)| basis.are_samples()) {
+        return Outcome::Skipped("coefficients are none".into());
     }
     let complaint = all.iter().find_map(|(grid, basis)| {
-        let x = noise::<f32>(grid.shape, 9);
-        if basis.coefficients() != *grid {
-            return Some(format!("its coefficients stand at {:?}", basis.coefficients()));
+        let at = basis.coefficients();
+        let far = |(a, b): (&[f64; 3], &[f64; 3])| (0..3).any(|k| (a[k] - b[k]).abs() > 1e-9 * grid.size()[k]);
+        if at.bounds().iter().zip(&grid.bounds()).any(far) {
+            return Some(format!("its samples fill {:?}, the voxels {:?}", at.bounds(), grid.bounds()));
         }
-        differing("voxel", &flat(&expand(basis.operator(), grid.shape, &x)), &flat(&x))
-            .or_else(|| differing("coefficient", &flat(&back(basis.operator(), grid.shape, &x)), &flat(&x)))
+        let [one, ones] = [at.shape, grid.shape].map(Array3::<f64>::ones);
+        let constant = apart("voxels of a constant", &expand(basis.reference(), grid.shape, &one), &ones, 1e-6);
+        let same = (at.shape == grid.shape).then(|| {
+            let x = noise::<f64>(grid.shape, 9);
+            apart("voxels", &expand(basis.reference(), grid.shape, &x), &x, 1e-6)
+        });
+        constant.or(same.flatten())
     });
-    settle(complaint, "coefficients are the voxels")
+    settle(complaint, "coefficients are values of the volume")
 }
 
 fn threads(all: &Made) -> Outcome {

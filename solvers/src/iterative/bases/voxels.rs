@@ -40,7 +40,7 @@ impl Expansion for Identity {
     fn coefficients(&self) -> VoxelGrid {
         self.grid
     }
-    fn is_identity(&self) -> bool {
+    fn are_samples(&self) -> bool {
         true
     }
     fn operator(&self) -> &dyn BasisOperator<f32> {
