@@ -53,6 +53,9 @@ pub trait Real:
     /// from one lane to the next. Where they lie within four vectors of each other, and `line` goes on for as many
     /// from the first, registers are shuffled instead of reading memory lane by lane.
     fn neighbours<S: Simd, const K: usize>(s: S, line: &[Self], at: V<S, Self>) -> [V<S, Self>; K];
+    /// `K` neighbours of every lane within the first two vectors of `line`: `line[at]`, `line[at + 1]`, … The lanes of `at`
+    /// are whole numbers, of which none reaches beyond.
+    fn window<S: Simd, const K: usize>(s: S, line: &[Self], at: V<S, Self>) -> [V<S, Self>; K];
     /// Whether neither infinite nor NaN.
     fn finite(self) -> bool;
     /// Exponential of every lane.
@@ -104,18 +107,13 @@ impl Real for f32 {
         let base = first as usize;
         let span = (last - first) as usize + K;
         let register = |k: usize| S::f32s::from_slice(s, &line[base + k * len..base + (k + 1) * len]);
-        // The four bytes of every lane's number.
         let lane = at - first;
+        if span <= 2 * len && base + 2 * len <= line.len() {
+            return Self::window(s, &line[base..], lane);
+        }
+        // The four bytes of every lane's number.
         let number: S::u32s = lane.to_int();
         let mut bytes = number * 0x0404_0404 + 0x0302_0100;
-        if span <= 2 * len && base + 2 * len <= line.len() {
-            let (low, high) = (register(0), register(1));
-            return std::array::from_fn(|_| {
-                let taken = low.concat_swizzle_dyn(high, bytes.to_bytes());
-                bytes += 0x0404_0404;
-                taken
-            });
-        }
         if span <= 4 * len && base + 4 * len <= line.len() {
             let near = [register(0), register(1)];
             let far = [register(2), register(3)];
@@ -129,6 +127,19 @@ impl Real for f32 {
             });
         }
         one_by_one(s, line, at)
+    }
+    #[inline(always)]
+    fn window<S: Simd, const K: usize>(s: S, line: &[Self], at: V<S, Self>) -> [V<S, Self>; K] {
+        let len = S::f32s::LEN;
+        let (low, high) = (S::f32s::from_slice(s, &line[..len]), S::f32s::from_slice(s, &line[len..2 * len]));
+        let number: S::u32s = at.to_int();
+        // The four bytes of every lane's number.
+        let mut bytes = number * 0x0404_0404 + 0x0302_0100;
+        std::array::from_fn(|_| {
+            let taken = low.concat_swizzle_dyn(high, bytes.to_bytes());
+            bytes += 0x0404_0404;
+            taken
+        })
     }
     #[inline(always)]
     fn finite(self) -> bool {
@@ -225,6 +236,10 @@ impl Real for f64 {
     }
     #[inline(always)]
     fn neighbours<S: Simd, const K: usize>(s: S, line: &[Self], at: V<S, Self>) -> [V<S, Self>; K] {
+        one_by_one(s, line, at)
+    }
+    #[inline(always)]
+    fn window<S: Simd, const K: usize>(s: S, line: &[Self], at: V<S, Self>) -> [V<S, Self>; K] {
         one_by_one(s, line, at)
     }
     #[inline(always)]

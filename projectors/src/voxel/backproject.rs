@@ -2,17 +2,22 @@
 //!
 //! Every voxel receives `Σ_i s_i/U_i²·p_i(u, v)`: `U_i` is its depth in view `i`, `p_i` is read by bilinear
 //! interpolation where the ray through the voxel's centre meets the detector, and outside the detector nothing is
-//! added. In an upright view all voxels of a line along z share column and depth, and rows are linear in z.
+//! added. The voxels of a line along z stand in a row on the detector, and read columns of pixels as [`readers`] has it.
+//!
+//! [`readers`]: super::readers
 
-use super::columns::{Meeting, mix, read};
-use super::layout::{AFTER, BEFORE, ColumnMajor, Pinhole, Upright};
-use conefield_core::geometry::{Geometry, Vec3, VoxelGrid, dot, sub};
-use conefield_core::simd::{Op, Real, Simd, run};
+use super::layout::{ColumnMajor, Pinhole};
+use super::readers::{Among, PAD, Path, places, read};
+use conefield_core::geometry::Geometry;
+use conefield_core::simd::{Op, Real, Simd, SimdBase, SimdFloat, V, load, run, store};
+use conefield_core::voxel::VoxelView;
 use ndarray::{ArrayViewMut3, Axis};
 use rayon::prelude::*;
 
 /// Planes of voxels that one task owns.
 const TILE: usize = 4;
+/// A line of voxels changes columns by at most this share of what it rises along the rows; steeper ones go voxel by voxel.
+const SLANT: f64 = 0.5;
 
 /// Adds the views `views` of `geometry`, whose pixels are `pixels` and whose scales `s_i` are `scales` in mm², to
 /// `volume`.
@@ -23,129 +28,135 @@ pub fn backproject<R: Real>(
     scales: &[f64],
     mut volume: ArrayViewMut3<'_, R>,
 ) {
-    let all: Vec<(Pinhole, Option<Lines>)> =
-        views.iter().map(|&v| (Pinhole::of(geometry, v), Lines::of(geometry, v))).collect();
-    volume.axis_chunks_iter_mut(Axis(0), TILE).into_par_iter().enumerate().for_each(|(n, mut planes)| {
-        for (i, (pinhole, lines)) in all.iter().enumerate() {
-            let view = ViewPixels { geometry, pixels, index: i, scale: scales[i] };
-            match lines {
-                Some(lines) => run(ByLine { view, lines, first: n * TILE, planes: planes.view_mut() }),
-                None => view.by_voxel(pinhole, n * TILE, planes.view_mut()),
-            }
-        }
+    let seen = |(&v, &scale): (&usize, &f64)| Pinhole::of(geometry, v).voxels(&geometry.volume, scale);
+    let all: Vec<VoxelView> = views.iter().zip(scales).map(seen).collect();
+    let zeros = vec![R::ZERO; geometry.detector[0] + 2 * PAD];
+    volume.axis_chunks_iter_mut(Axis(0), TILE).into_par_iter().enumerate().for_each(|(n, planes)| {
+        run(Planes { detector: geometry.detector, pixels, zeros: &zeros, views: &all, first: n * TILE, planes });
     });
 }
 
-struct ViewPixels<'a, R> {
-    geometry: &'a Geometry,
+/// Some planes of voxels, in all views.
+struct Planes<'a, R> {
+    detector: [usize; 2],
     pixels: &'a ColumnMajor<R>,
-    index: usize,
-    scale: f64,
-}
-
-/// Column, depth and rows of the voxel lines along z in an upright view: numerators linear in x and y.
-struct Lines {
-    /// `depth = d[0] + d[1]·x + d[2]·y`, in mm for x and y in voxels.
-    depth: Vec3,
-    /// The column times depth, likewise.
-    column: Vec3,
-    /// Source to detector, mm.
-    distance: f64,
-    /// From the source to the lowest voxel's centre and from voxel to voxel, mm.
-    rise: [f64; 2],
-    /// From the source to the lowest row and from row to row, mm.
-    rows: [f64; 2],
-}
-
-impl Lines {
-    fn of(geometry: &Geometry, view: usize) -> Option<Self> {
-        let upright = Upright::of(geometry, view)?;
-        let w = &geometry.views[view];
-        let grid: &VoxelGrid = &geometry.volume;
-        let (normal, distance) = w.normal();
-        let corner = sub(grid.voxel([0; 3]), w.source);
-        let linear = |axis: Vec3| [dot(axis, corner), axis[0] * grid.spacing[0], axis[1] * grid.spacing[1]];
-        let depth = linear(normal);
-        // The column is (hit − first)·u/|u|², where hit = d·distance/depth.
-        let square = dot(w.u, w.u);
-        let along = linear(w.u.map(|x| x * distance / square));
-        let offset = dot(upright.first, w.u) / square;
-        Some(Self {
-            depth,
-            column: std::array::from_fn(|k| along[k] - offset * depth[k]),
-            distance,
-            rise: [corner[2], grid.spacing[2]],
-            rows: [upright.first[2], upright.v],
-        })
-    }
-}
-
-struct ByLine<'a, R> {
-    view: ViewPixels<'a, R>,
-    lines: &'a Lines,
+    /// A column of pixels outside the detector.
+    zeros: &'a [R],
+    views: &'a [VoxelView],
     first: usize,
     planes: ArrayViewMut3<'a, R>,
 }
 
-impl<R: Real> Op for ByLine<'_, R> {
+impl<R: Real> Op for Planes<'_, R> {
     type Out = ();
     #[inline(always)]
-    fn call<S: Simd>(mut self, s: S) {
-        let (count, ny, nz) = self.planes.dim();
-        let [rows, columns] = self.view.geometry.detector;
-        let mut line = vec![R::ZERO; rows + 2 + AFTER];
-        let l = self.lines;
-        for y in 0..ny {
-            for x in 0..count {
-                let at = |n: &Vec3| n[0] + n[1] * (self.first + x) as f64 + n[2] * y as f64;
-                let depth = at(&l.depth);
-                if depth <= 0.0 {
-                    continue;
-                }
-                let column = at(&l.column) / depth;
-                if column <= -1.0 || column >= columns as f64 {
-                    continue;
-                }
-                let left = column.floor();
-                let share = column - left;
-                let weight = self.view.scale / (depth * depth);
-                let low = if left < 0.0 { (0, 0.0) } else { (left as usize, (1.0 - share) * weight) };
-                let up = (left + 1.0) as usize;
-                let high = if up >= columns { (columns - 1, 0.0) } else { (up, share * weight) };
-                // Rows of the lowest voxel and from voxel to voxel.
-                let magnified = l.distance / depth;
-                let step = l.rise[1] * magnified / l.rows[1];
-                let lowest = (l.rise[0] * magnified - l.rows[0]) / l.rows[1];
-                let first = ((-1.0 - lowest) / step).ceil().max(0.0);
-                let last = ((rows as f64 - lowest) / step).floor().min(nz as f64 - 1.0);
-                if last < first {
-                    continue;
-                }
-                // The rows that are read, and one more for rounding.
-                let from = (lowest + first * step).floor().max(0.0) as usize;
-                let to = ((lowest + last * step).floor() as usize + 3).min(rows);
-                let [a, b] = [low.0, high.0].map(|c| &self.view.pixels.column(self.view.index, c)[BEFORE..][from..to]);
-                mix(s, a, b, [R::of(low.1), R::of(high.1)], &mut line);
-                let (first, last) = (first as usize, last as usize);
-                let start = R::of(lowest + first as f64 * step - from as f64 + 1.0);
-                let m = Meeting { first, count: last - first + 1, start, step: R::of(step) };
-                let mut plane = self.planes.index_axis_mut(Axis(0), x);
-                if let Some(voxels) = plane.index_axis_mut(Axis(0), y).into_slice() {
-                    read(s, &line, &m, to - from, &mut voxels[first..=last]);
+    fn call<S: Simd>(self, s: S) {
+        let Self { detector, pixels, zeros, views, first, mut planes } = self;
+        let nz = planes.dim().2;
+        let mut q = vec![R::ZERO; nz + V::<S, R>::LEN];
+        for (index, view) in views.iter().enumerate() {
+            let image = Image { view, detector, pixels, index, zeros };
+            for (x, mut plane) in planes.outer_iter_mut().enumerate() {
+                for (y, line) in plane.outer_iter_mut().enumerate() {
+                    let Some(voxels) = line.into_slice() else { continue };
+                    match Line::of(&image, [first + x, y], nz) {
+                        Some(line) => image.add(s, &line, &mut q, voxels),
+                        None => image.add_one_by_one([first + x, y], voxels),
+                    }
                 }
             }
         }
     }
 }
 
-impl<R: Real> ViewPixels<'_, R> {
-    /// Voxel by voxel, for tilted views.
-    fn by_voxel(&self, pinhole: &Pinhole, first: usize, mut planes: ArrayViewMut3<'_, R>) {
-        let [rows, columns] = self.geometry.detector;
-        for ((x, y, z), voxel) in planes.indexed_iter_mut() {
-            let ([row, column], depth) = pinhole.project(self.geometry.volume.voxel([first + x, y, z]));
-            if depth > 0.0 && row > -1.0 && column > -1.0 && row < rows as f64 && column < columns as f64 {
-                *voxel += R::of(self.scale / (depth * depth) * self.bilinear(row, column));
+/// A line of voxels along z on the detector of a view.
+struct Line {
+    /// The voxel from which q counts, and the bend of q.
+    middle: f64,
+    bend: f64,
+    /// Columns across, rows from below along them.
+    path: Path<f64>,
+    /// What the middle voxel is given of a pixel.
+    weight: f64,
+}
+
+impl Line {
+    /// The line of `nz` voxels at `x` and `y`; `None` if it does not run along the columns, upwards and in front of the
+    /// source.
+    fn of<R: Real>(image: &Image<'_, R>, [x, y]: [usize; 2], nz: usize) -> Option<Self> {
+        let view = image.view;
+        let middle = (nz / 2) as f64;
+        let at = |n: &[f64; 4]| n[0] + n[1] * x as f64 + n[2] * y as f64 + n[3] * middle;
+        let (depth, deeper) = (at(&view.depth), view.depth[3]);
+        let ends = [depth - deeper * middle, depth + deeper * (nz as f64 - 1.0 - middle)];
+        let reach = 1.0 / depth;
+        // (a + b·ρ)/(depth + c·ρ) = a/depth + drift·q.
+        let place = |n: &[f64; 4]| {
+            let middle = at(n) * reach;
+            [middle, (n[3] - deeper * middle) * reach]
+        };
+        let (mut along, across) = (place(&view.row), place(&view.column));
+        if image.pixels.downwards(image.index) {
+            along = [image.detector[0] as f64 - 1.0 - along[0], -along[1]];
+        }
+        let fits = ends[0] > 0.0 && ends[1] > 0.0 && along[1] > 0.0 && across[1].abs() <= SLANT * along[1];
+        let weight = view.scale * reach * reach;
+        fits.then_some(Self { middle, bend: deeper * reach, path: Path { across, along }, weight })
+    }
+}
+
+/// The pixels of a view.
+struct Image<'a, R> {
+    view: &'a VoxelView,
+    detector: [usize; 2],
+    pixels: &'a ColumnMajor<R>,
+    /// Which of `pixels` it is.
+    index: usize,
+    zeros: &'a [R],
+}
+
+impl<R: Real> Image<'_, R> {
+    /// Adds to `voxels` what they read on their line; `q` is room for where they stand.
+    #[inline(always)]
+    fn add<S: Simd>(&self, s: S, line: &Line, q: &mut [R], voxels: &mut [R]) {
+        let len = V::<S, R>::LEN;
+        let [rows, columns] = self.detector;
+        let among = Among {
+            lines: R::of(columns as f64),
+            numbers: R::of(rows as f64),
+            span: [R::of(-1.0), R::of(rows as f64)],
+        };
+        places(s, 0.0, [line.middle, line.bend], [0.0, voxels.len() as f64 - 1.0], q);
+        let path = line.path.narrow();
+        let column = |c: isize| match usize::try_from(c) {
+            Ok(c) if c < columns => self.pixels.column(self.index, c),
+            _ => self.zeros,
+        };
+        let weight = V::<S, R>::splat(s, R::of(line.weight));
+        let (bend, one) = (V::<S, R>::splat(s, R::of(-line.bend)), V::<S, R>::splat(s, R::ONE));
+        let mut i = 0;
+        while i < voxels.len() {
+            let ends = [q[i], q[i + len - 1]];
+            let q = V::<S, R>::from_slice(s, &q[i..i + len]);
+            if let Some(found) = read(s, &path, &among, q, ends, column) {
+                // The middle's depth over the voxel's is 1/(1 + bend·ρ) = 1 − bend·q.
+                let nearer = q.mul_add(bend, one);
+                let sum = (found * weight).mul_add(nearer * nearer, load(s, voxels, i));
+                store::<S, R>(sum, voxels, i);
+            }
+            i += len;
+        }
+    }
+
+    /// The same voxel by voxel, wherever they lie.
+    fn add_one_by_one(&self, [x, y]: [usize; 2], voxels: &mut [R]) {
+        let [rows, columns] = self.detector.map(|n| n as f64);
+        for (z, voxel) in voxels.iter_mut().enumerate() {
+            let at = |n: &[f64; 4]| n[0] + n[1] * x as f64 + n[2] * y as f64 + n[3] * z as f64;
+            let depth = at(&self.view.depth);
+            let [row, column] = [at(&self.view.row) / depth, at(&self.view.column) / depth];
+            if depth > 0.0 && row > -1.0 && column > -1.0 && row < rows && column < columns {
+                *voxel += R::of(self.view.scale / (depth * depth) * self.bilinear(row, column));
             }
         }
     }

@@ -1,12 +1,15 @@
-//! Joseph's projector for upright views, a detector column at a time.
+//! Joseph's projector, a detector column at a time.
 //!
-//! All rays of a column share their way in x and y; they differ in z alone, and z is linear in the row. In each plane of
-//! voxels across the column's main direction the two lines of voxels beside the way are mixed into one, and that line
-//! is read at equal distances, one a row. Both run along z, where voxels are neighbours in memory. The adjoint goes
-//! the same way back: rows are gathered into a line with the same hat-shaped weights, and the line is shared out.
+//! The rays of a detector column lie in one plane, and where that meets a plane of voxels they stand in a row ([`readers`]
+//! has the formula). Columns that run along z, or nearly so as those of calibrated scans do, then read lines of voxels along
+//! z upwards, a vector of rows at a time. The adjoint goes the same way back: every voxel of a line gathers from the rows
+//! that are less than a voxel away, with the same hat-shaped weights.
+//!
+//! [`readers`]: super::readers
 
-use super::layout::{AFTER, BEFORE, ColumnMajor, Upright, batch, column_major_bytes, main_axis};
-use conefield_core::geometry::{Geometry, Vec3, VoxelGrid};
+use super::layout::{ColumnMajor, batch, column_major_bytes, main_axis, to_voxels};
+use super::readers::{Among, PAD, Path, places, read};
+use conefield_core::geometry::{Geometry, Vec3, dot, sub};
 use conefield_core::scan::ScanHeader;
 use conefield_core::simd::{Op, Real, Simd, SimdBase, SimdFloat, V, load, run, store};
 use ndarray::{ArrayView3, ArrayViewMut2, ArrayViewMut3, Axis};
@@ -15,116 +18,159 @@ use std::ops::Range;
 
 /// Columns that one task of [`forward`] projects.
 const STRIP: usize = 32;
-/// Planes that a strip goes through before it turns to the next: what they hold near the strip stays in cache.
-const PLANES: usize = 16;
+/// Planes that a strip goes through at once: what they hold near the strip stays in cache.
+const PLANES: usize = 8;
 /// Planes that one task of [`adjoint`] owns.
 const TILE: usize = 4;
-/// Rows that share a voxel at most for [`gather`]; beyond that [`scatter`] is used.
+/// Rows that share a voxel at most for [`Adjoint::gather`]; beyond that [`Adjoint::scatter`] is used.
 const TAPS: usize = 8;
+/// A column changes lines by at most this share of what it rises along z.
+const SLANT: f64 = 0.5;
 
-/// A view that this module projects: upright, and no ray so steep that z would be its main axis.
-pub fn fits(geometry: &Geometry, view: usize) -> Option<Upright> {
-    let upright = Upright::of(geometry, view)?;
-    let [rows, columns] = geometry.detector;
-    let spacing = geometry.volume.spacing;
-    let highest = upright.first[2] + upright.v * (rows as f64 - 1.0);
-    let steepest = upright.first[2].abs().max(highest.abs()) / spacing[2];
-    let flat = (0..columns).all(|c| {
-        let d = upright.lowest(c);
-        steepest <= (d[0] / spacing[0]).abs().max((d[1] / spacing[1]).abs())
-    });
-    flat.then_some(upright)
+/// Rays of a detector column that have one main axis, x or y, and one direction along it.
+#[derive(Debug, Clone)]
+pub struct Column {
+    /// Its number on the detector.
+    number: usize,
+    /// Its rows, counted from below.
+    rows: Range<usize>,
+    /// The axis whose planes are visited; the other one is `1 - main`.
+    main: usize,
+    /// The source in voxels.
+    source: Vec3,
+    /// The row from which q counts, and the bend of q: see [`places`].
+    middle: f64,
+    bend: f64,
+    /// The ray of that row: its way per plane along the other axis and z, in voxels.
+    slope: [f64; 2],
+    /// What that changes by with q.
+    drift: [f64; 2],
+    /// Whether planes are met upwards.
+    up: bool,
+    /// Square of the distance from source to pixel in mm², over that in planes squared: a polynomial in ρ.
+    length: [f64; 3],
 }
 
-/// The rays of one detector column.
-struct Column {
-    source: Vec3,
-    /// From the source to the lowest pixel, in voxels.
-    ahead: Vec3,
-    /// From row to row, in voxels along z.
-    v: f64,
-    /// The axis, x or y, whose planes are visited; the other one is `1 - main`.
-    main: usize,
-    /// Square of the pixels' distance from the source within x and y, mm².
-    flat: f64,
-    /// mm along z from the source to the lowest row, and from row to row.
-    rise: [f64; 2],
+/// The columns of a view that this module projects: no ray is so steep that z would be its main axis, and columns run along
+/// z rather than across.
+pub fn of(geometry: &Geometry, view: usize) -> Option<Vec<Column>> {
+    let (w, grid) = (&geometry.views[view], &geometry.volume);
+    let [rows, columns] = geometry.detector;
+    let downwards = w.v[2] < 0.0;
+    let v = if downwards { w.v.map(|x| -x) } else { w.v };
+    let lowest = if downwards { rows as f64 - 1.0 } else { 0.0 };
+    let voxels = |d: Vec3| -> Vec3 { std::array::from_fn(|k| d[k] / grid.spacing[k]) };
+    let source = to_voxels(grid, w.source);
+    let mut all = Vec::with_capacity(columns);
+    for number in 0..columns {
+        let first = sub(w.pixel(geometry.detector, lowest, number as f64), w.source);
+        let ray = |row: usize| -> Vec3 { std::array::from_fn(|k| first[k] + row as f64 * v[k]) };
+        let heading = |row: usize| {
+            let ahead = voxels(ray(row));
+            let main = main_axis(ahead);
+            (main, ahead[main] > 0.0)
+        };
+        for (rows, (main, up)) in runs(rows, &heading) {
+            if main == 2 {
+                return None;
+            }
+            let middle = (rows.start + rows.end) / 2;
+            let d = ray(middle);
+            let (ahead, step) = (voxels(d), voxels(v));
+            let a = ahead[main];
+            let across = [1 - main, 2];
+            let drift = across.map(|k| (step[k] * a - step[main] * ahead[k]) / (a * a));
+            // Against the direction of the planes, z falls with the row where they are met downwards.
+            let rise = if up { drift[1] } else { -drift[1] };
+            if rise <= 0.0 || drift[0].abs() > SLANT * rise {
+                return None;
+            }
+            all.push(Column {
+                number,
+                rows,
+                main,
+                source,
+                middle: middle as f64,
+                bend: step[main] / a,
+                slope: across.map(|k| ahead[k] / a),
+                drift,
+                up,
+                length: [dot(d, d), 2.0 * dot(d, v), dot(v, v)].map(|x| x / (a * a)),
+            });
+        }
+    }
+    Some(all)
+}
+
+/// Runs of rows of one heading. Those with the same at both ends have it between them: rays that have it are a convex cone.
+fn runs<H: PartialEq + Copy>(rows: usize, heading: &impl Fn(usize) -> H) -> Vec<(Range<usize>, H)> {
+    fn split<H: PartialEq + Copy>(
+        (low, high): (usize, usize),
+        ends: [H; 2],
+        heading: &impl Fn(usize) -> H,
+        all: &mut Vec<(Range<usize>, H)>,
+    ) {
+        if ends[0] == ends[1] || high - low == 1 {
+            // The last row belongs to what follows.
+            match all.last_mut() {
+                Some((range, h)) if *h == ends[0] => range.end = high,
+                _ => all.push((low..high, ends[0])),
+            }
+            return;
+        }
+        let middle = (low + high) / 2;
+        let h = heading(middle);
+        split((low, middle), [ends[0], h], heading, all);
+        split((middle, high), [h, ends[1]], heading, all);
+    }
+    let Some(last) = rows.checked_sub(1) else { return vec![] };
+    let ends = [heading(0), heading(last)];
+    let mut all = vec![];
+    if last > 0 {
+        split((0, last), ends, heading, &mut all);
+    }
+    match all.last_mut() {
+        Some((range, h)) if *h == ends[1] => range.end = rows,
+        _ => all.push((last..rows, ends[1])),
+    }
+    all
 }
 
 impl Column {
-    fn new(view: &Upright, grid: &VoxelGrid, column: usize) -> Self {
-        let d = view.lowest(column);
-        let ahead: Vec3 = std::array::from_fn(|k| d[k] / grid.spacing[k]);
-        Self {
-            source: view.source,
-            ahead,
-            v: view.v / grid.spacing[2],
-            main: main_axis([ahead[0], ahead[1], 0.0]),
-            flat: d[0] * d[0] + d[1] * d[1],
-            rise: [d[2], view.v],
-        }
-    }
-
-    /// Length in mm of the ray of `row` (from below) between two planes.
-    fn step(&self, row: usize) -> f64 {
-        let z = self.rise[0] + row as f64 * self.rise[1];
-        (self.flat + z * z).sqrt() / self.ahead[self.main].abs()
-    }
-
-    /// How the column's rows meet plane `plane`, of which the voxels `z` along z count, and the two lines of voxels
-    /// beside the way with their shares; `None` where the column misses them.
-    fn meet<R: Real>(
-        &self,
-        plane: usize,
-        rows: usize,
-        others: usize,
-        z: &Range<usize>,
-    ) -> Option<(Meeting<R>, Lines<R>)> {
-        let t = (plane as f64 - self.source[self.main]) / self.ahead[self.main];
-        if t <= 0.0 {
+    /// Where its rays meet plane `plane`, if that lies before the source.
+    fn meet(&self, plane: usize) -> Option<Path<f64>> {
+        let away = plane as f64 - self.source[self.main];
+        if away == 0.0 || (away > 0.0) != self.up {
             return None;
         }
-        let other = self.source[1 - self.main] + t * self.ahead[1 - self.main];
-        if other <= -1.0 || other >= others as f64 {
-            return None;
-        }
-        let below = other.floor();
-        let share = other - below;
-        // Neighbours outside count nothing; the one inside is then named twice.
-        let low = if below < 0.0 { (0, 0.0) } else { (below as usize, 1.0 - share) };
-        let up = below as isize + 1;
-        let high = if up as usize >= others { (others - 1, 0.0) } else { (up as usize, share) };
-        // Positions count from the zero below the first voxel of `z`.
-        let lowest = self.source[2] + t * self.ahead[2] - z.start as f64 + 1.0;
-        let step = t * self.v;
-        let first = (-lowest / step).ceil().max(0.0);
-        let last = ((z.len() as f64 + 1.0 - lowest) / step).floor().min(rows as f64 - 1.0);
-        if last < first {
-            return None;
-        }
-        let rows = Meeting {
-            first: first as usize,
-            count: (last - first) as usize + 1,
-            start: R::of(lowest + first * step),
-            step: R::of(step),
-        };
-        Some((rows, [(low.0, R::of(low.1)), (high.0, R::of(high.1))]))
+        let of = |k: usize, axis: usize| [self.source[axis] + away * self.slope[k], away * self.drift[k]];
+        Some(Path { across: of(0, 1 - self.main), along: of(1, 2) })
     }
-}
 
-/// Two lines of voxels, counted across the main axis, with their shares.
-type Lines<R> = [(usize, R); 2];
+    /// `q` of the first and the last row.
+    fn ends(&self) -> [f64; 2] {
+        [self.rows.start, self.rows.end - 1].map(|row| {
+            let r = row as f64 - self.middle;
+            r / (1.0 + self.bend * r)
+        })
+    }
 
-/// Where equally distant readers stand along a line of numbers that has a zero before its first.
-pub(super) struct Meeting<R> {
-    /// The first reader that stands within the line.
-    pub first: usize,
-    /// Readers from there on.
-    pub count: usize,
-    /// Where the first of them stands, counted from the zero.
-    pub start: R,
-    /// Distance of the readers.
-    pub step: R,
+    /// `q` of the rows from `from` on, which may be below 0.
+    #[inline(always)]
+    fn places<S: Simd, R: Real>(&self, s: S, from: f64, q: &mut [R]) {
+        let valid = [self.rows.start as f64, self.rows.end as f64 - 1.0];
+        places(s, from, [self.middle, self.bend], valid, q);
+    }
+
+    /// Multiplies a number for each row with the length in mm of that row's ray between two planes.
+    #[inline(always)]
+    fn lengthen<R: Real>(&self, numbers: &mut [R]) {
+        let [a, b, c] = self.length;
+        for (i, x) in numbers.iter_mut().enumerate() {
+            let r = (self.rows.start + i) as f64 - self.middle;
+            *x = *x * R::of((a + r * (b + r * c)).sqrt() / (1.0 + self.bend * r));
+        }
+    }
 }
 
 /// For every line of voxels along z where it holds anything but zero.
@@ -139,91 +185,6 @@ fn occupied<R: Real>(volume: &[R], lines: usize, nz: usize) -> Vec<Range<usize>>
     all
 }
 
-/// Line integrals of `volume` for views that [`fits`] took.
-pub fn forward<R: Real>(
-    geometry: &Geometry,
-    views: &[Upright],
-    volume: ArrayView3<'_, R>,
-    projections: Vec<ArrayViewMut2<'_, R>>,
-) {
-    let volume = volume.as_standard_layout();
-    let Some(voxels) = volume.as_slice() else { return };
-    let [nx, ny, nz] = geometry.volume.shape;
-    let occupied = occupied(voxels, nx * ny, nz);
-    let rows = geometry.detector[0];
-    projections.into_par_iter().zip(views).for_each(|(mut out, view)| {
-        out.axis_chunks_iter_mut(Axis(1), STRIP).into_par_iter().enumerate().for_each(|(n, mut out)| {
-            let columns: Vec<Column> =
-                (0..out.shape()[1]).map(|c| Column::new(view, &geometry.volume, n * STRIP + c)).collect();
-            let stride = rows + AFTER;
-            let mut sums = vec![R::ZERO; columns.len() * stride];
-            run(Forward {
-                shape: geometry.volume.shape,
-                voxels,
-                occupied: &occupied,
-                columns: &columns,
-                rows,
-                sums: &mut sums,
-            });
-            for row in 0..rows {
-                let mut line = out.row_mut(view.row(row, rows));
-                for ((out, c), sums) in line.iter_mut().zip(&columns).zip(sums.chunks(stride)) {
-                    *out = sums[row] * R::of(c.step(row));
-                }
-            }
-        });
-    });
-}
-
-/// Sums of a strip of columns over all planes, without the length of a step.
-struct Forward<'a, R> {
-    shape: [usize; 3],
-    voxels: &'a [R],
-    occupied: &'a [Range<usize>],
-    columns: &'a [Column],
-    rows: usize,
-    /// `[column][rows + AFTER]`.
-    sums: &'a mut [R],
-}
-
-impl<R: Real> Op for Forward<'_, R> {
-    type Out = ();
-    #[inline(always)]
-    fn call<S: Simd>(self, s: S) {
-        let [_, ny, nz] = self.shape;
-        let stride = self.rows + AFTER;
-        let mut line = vec![R::ZERO; nz + 2 + AFTER];
-        // Sums of a few planes, added up in turn: two short sums round less than one long one.
-        let mut part = vec![R::ZERO; stride];
-        for main in 0..2 {
-            let at = |plane: usize, other: usize| if main == 0 { plane * ny + other } else { other * ny + plane };
-            for from in (0..self.shape[main]).step_by(PLANES) {
-                let planes = from..(from + PLANES).min(self.shape[main]);
-                for (c, sums) in self.columns.iter().zip(self.sums.chunks_mut(stride)).filter(|(c, _)| c.main == main) {
-                    let mut touched = 0..0;
-                    for plane in planes.clone() {
-                        let others = self.shape[1 - main];
-                        let Some((_, lines)) = c.meet::<R>(plane, self.rows, others, &(0..nz)) else { continue };
-                        let [a, b] = lines.map(|(other, _)| at(plane, other));
-                        let z = union(&self.occupied[a], &self.occupied[b]);
-                        if z.is_empty() {
-                            continue;
-                        }
-                        let Some((m, _)) = c.meet::<R>(plane, self.rows, others, &z) else { continue };
-                        let [a, b] = [a, b].map(|l| &self.voxels[l * nz..][z.clone()]);
-                        mix(s, a, b, lines.map(|l| l.1), &mut line);
-                        read(s, &line, &m, z.len(), &mut part[m.first..]);
-                        touched = union(&touched, &(m.first..m.first + m.count));
-                    }
-                    for (sum, x) in sums[touched.clone()].iter_mut().zip(&mut part[touched]) {
-                        *sum += std::mem::take(x);
-                    }
-                }
-            }
-        }
-    }
-}
-
 fn union(a: &Range<usize>, b: &Range<usize>) -> Range<usize> {
     match (a.is_empty(), b.is_empty()) {
         (true, _) => b.clone(),
@@ -232,49 +193,168 @@ fn union(a: &Range<usize>, b: &Range<usize>) -> Range<usize> {
     }
 }
 
-/// `line[1..] = shares[0]·a + shares[1]·b`, with a zero before and two after it; what lies beyond is never selected.
-#[inline(always)]
-pub(super) fn mix<S: Simd, R: Real>(s: S, a: &[R], b: &[R], shares: [R; 2], line: &mut [R]) {
-    let len = V::<S, R>::LEN;
-    let [wa, wb] = shares.map(|w| V::<S, R>::splat(s, w));
-    let mut i = 0;
-    while i < a.len() {
-        (load(s, a, i) * wa + load(s, b, i) * wb).store_slice(&mut line[1 + i..1 + i + len]);
-        i += len;
-    }
-    line[1 + a.len()..3 + a.len()].fill(R::ZERO);
+/// Line integrals of `volume` for views of which [`of`] gave the columns.
+pub fn forward<R: Real>(
+    geometry: &Geometry,
+    views: &[(usize, Vec<Column>)],
+    volume: ArrayView3<'_, R>,
+    projections: Vec<ArrayViewMut2<'_, R>>,
+) {
+    let volume = volume.as_standard_layout();
+    let Some(voxels) = volume.as_slice() else { return };
+    let shape = geometry.volume.shape;
+    let [nx, ny, nz] = shape;
+    let occupied = occupied(voxels, nx * ny, nz);
+    let rows = geometry.detector[0];
+    projections.into_par_iter().zip(views).for_each(|(mut out, (view, columns))| {
+        let downwards = geometry.views[*view].v[2] < 0.0;
+        out.axis_chunks_iter_mut(Axis(1), STRIP).into_par_iter().enumerate().for_each(|(n, mut out)| {
+            let first = n * STRIP;
+            let at = |number: usize| columns.partition_point(|c| c.number < number);
+            let columns = &columns[at(first)..at(first + STRIP)];
+            let mut sums = vec![R::ZERO; out.ncols() * rows];
+            run(Forward { shape, voxels, occupied: &occupied, columns, first, rows, sums: &mut sums });
+            for row in 0..rows {
+                let mut line = out.row_mut(if downwards { rows - 1 - row } else { row });
+                line.iter_mut().zip(sums.chunks(rows)).for_each(|(out, sums)| *out = sums[row]);
+            }
+        });
+    });
 }
 
-/// Adds what the readers `m` find in a line of `numbers` numbers to `sums`.
-#[inline(always)]
-pub(super) fn read<S: Simd, R: Real>(s: S, line: &[R], m: &Meeting<R>, numbers: usize, sums: &mut [R]) {
-    let len = V::<S, R>::LEN;
-    let lanes = V::<S, R>::from_fn(s, |i| R::of(i as f64));
-    let (step, start) = (V::<S, R>::splat(s, m.step), V::<S, R>::splat(s, m.start));
-    let (zero, end) = (V::<S, R>::splat(s, R::ZERO), V::<S, R>::splat(s, R::of(numbers as f64 + 1.0)));
-    let mut i = 0;
-    while i < m.count {
-        let row = lanes + V::<S, R>::splat(s, R::of(i as f64));
-        let z = row.mul_add(step, start).max(zero).min(end);
-        let cell = z.floor();
-        let [a, b] = R::neighbours::<S, 2>(s, line, cell);
-        let sum = (z - cell).mul_add(b - a, a) + load(s, sums, i);
-        store::<S, R>(sum, sums, i);
-        i += len;
+/// Line integrals of a strip of columns.
+struct Forward<'a, R> {
+    shape: [usize; 3],
+    voxels: &'a [R],
+    occupied: &'a [Range<usize>],
+    columns: &'a [Column],
+    /// The first column.
+    first: usize,
+    rows: usize,
+    /// `[column][rows]`, from below.
+    sums: &'a mut [R],
+}
+
+/// The lines of a plane of voxels that a strip may read, on a [`Forward`]'s shelf.
+struct Plane<R> {
+    number: usize,
+    /// Where on the shelf line −1 would stand.
+    start: isize,
+    among: Among<R>,
+}
+
+impl<R: Real> Op for Forward<'_, R> {
+    type Out = ();
+    #[inline(always)]
+    fn call<S: Simd>(self, s: S) {
+        let len = V::<S, R>::LEN;
+        let stride = self.shape[2] + 2 * PAD;
+        let room = self.rows + len;
+        let mut q = vec![R::ZERO; self.columns.len() * room];
+        for (c, q) in self.columns.iter().zip(q.chunks_mut(room)) {
+            c.places(s, c.rows.start as f64, q);
+        }
+        let mut shelf = vec![];
+        for main in 0..2 {
+            for from in (0..self.shape[main]).step_by(PLANES) {
+                let planes = self.planes(main, from..(from + PLANES).min(self.shape[main]), &mut shelf);
+                if planes.is_empty() {
+                    continue;
+                }
+                let columns = self.columns.iter().zip(q.chunks(room)).filter(|(c, _)| c.main == main);
+                for (c, q) in columns {
+                    let mut paths: [Option<(Path<R>, &Plane<R>)>; PLANES] = [const { None }; PLANES];
+                    for (path, plane) in paths.iter_mut().zip(&planes) {
+                        *path = c.meet(plane.number).map(|path| (path.narrow(), plane));
+                    }
+                    let sums = &mut self.sums[(c.number - self.first) * self.rows..][c.rows.clone()];
+                    let mut i = 0;
+                    while i < sums.len() {
+                        let ends = [q[i], q[i + len - 1]];
+                        let q = V::<S, R>::from_slice(s, &q[i..i + len]);
+                        // Sums of a few planes, added up in turn: two short sums round less than one long one.
+                        let mut part = V::<S, R>::splat(s, R::ZERO);
+                        for (path, plane) in paths.iter().flatten() {
+                            let line =
+                                |l: isize| &shelf[(plane.start + (l + 1) * stride as isize) as usize..][..stride];
+                            if let Some(found) = read(s, path, &plane.among, q, ends, line) {
+                                part += found;
+                            }
+                        }
+                        store::<S, R>(load(s, sums, i) + part, sums, i);
+                        i += len;
+                    }
+                }
+            }
+        }
+        for c in self.columns {
+            c.lengthen(&mut self.sums[(c.number - self.first) * self.rows..][c.rows.clone()]);
+        }
+    }
+}
+
+impl<R: Real> Forward<'_, R> {
+    /// Puts the lines of the planes `planes` that the strip may read side by side, between zeros: from afar they would share
+    /// few places in the cache. Planes without any are left out.
+    fn planes(&self, main: usize, planes: Range<usize>, shelf: &mut Vec<R>) -> Vec<Plane<R>> {
+        let [_, ny, nz] = self.shape;
+        let (others, stride) = (self.shape[1 - main] as f64, nz + 2 * PAD);
+        shelf.clear();
+        let mut all = vec![];
+        for number in planes {
+            let (mut low, mut high) = (f64::INFINITY, f64::NEG_INFINITY);
+            for c in self.columns.iter().filter(|c| c.main == main) {
+                let Some(path) = c.meet(number) else { continue };
+                for at in c.ends().map(|q| path.across(q)) {
+                    (low, high) = (low.min(at), high.max(at));
+                }
+            }
+            // A line more on either side, for rounding.
+            let (low, high) = ((low - 1.0).floor().max(-1.0), (high + 2.0).floor().min(others));
+            if low > high {
+                continue;
+            }
+            let (low, high) = (low as isize, high as isize);
+            let at = |other: isize| {
+                let other = other as usize;
+                if main == 0 { number * ny + other } else { other * ny + number }
+            };
+            let inside = low.max(0)..(high + 1).min(others as isize);
+            let z = inside.clone().fold(0..0, |z, other| union(&z, &self.occupied[at(other)]));
+            if z.is_empty() {
+                continue;
+            }
+            let start = shelf.len() as isize - (low + 1) * stride as isize;
+            for other in low..=high {
+                let begin = shelf.len();
+                shelf.resize(begin + stride, R::ZERO);
+                if inside.contains(&other) {
+                    let line = &self.voxels[at(other) * nz..][z.clone()];
+                    shelf[begin + PAD + z.start..][..z.len()].copy_from_slice(line);
+                }
+            }
+            let span = [R::of(z.start as f64 - 1.0), R::of(z.end as f64)];
+            let among = Among { lines: R::of(others), numbers: R::of(nz as f64), span };
+            all.push(Plane { number, start, among });
+        }
+        all
     }
 }
 
 /// Bytes that [`adjoint`] takes in single precision for `views` views; [`forward`] takes less.
 pub fn scratch(header: &ScanHeader, views: usize) -> u64 {
-    let views = views.min(batch::<f32>(header.detector));
-    column_major_bytes::<f32>(header.detector, views) + (views * header.detector[1] * size_of::<Column>()) as u64
+    let [nx, ny, nz] = header.volume;
+    let [rows, columns] = header.detector;
+    let at_once = views.min(batch::<f32>(header.detector));
+    let tile = TILE * (nx.max(ny) + 2) * (nz + 2 * PAD) + 3 * (rows + 2 * PAD);
+    let tiles = rayon::current_num_threads().min(nx.max(ny).div_ceil(TILE)) * tile * size_of::<f32>();
+    column_major_bytes::<f32>(header.detector, at_once) + (views * columns * size_of::<Column>() + tiles) as u64
 }
 
-/// Adds the adjoint of [`forward`] to `volume`. `views` are the uprights of `indices`.
+/// Adds the adjoint of [`forward`] to `volume`. `projections` holds an image for each of `views`.
 pub fn adjoint<R: Real>(
     geometry: &Geometry,
-    views: &[Upright],
-    indices: &[usize],
+    views: &[(usize, &[Column])],
     projections: ArrayView3<'_, R>,
     volume: &mut ArrayViewMut3<'_, R>,
 ) {
@@ -282,27 +362,38 @@ pub fn adjoint<R: Real>(
     for from in (0..views.len()).step_by(size) {
         let part = from..(from + size).min(views.len());
         let views = &views[part.clone()];
-        let columns: Vec<Vec<Column>> = views
-            .iter()
-            .map(|v| (0..geometry.detector[1]).map(|c| Column::new(v, &geometry.volume, c)).collect())
-            .collect();
-        let rows = geometry.detector[0];
-        let pixels = ColumnMajor::new(
-            geometry,
-            &indices[part.clone()],
-            projections.slice_axis(Axis(0), part.into()),
-            |n, row, column, x| x * R::of(columns[n][column].step(views[n].row(row, rows))),
-        );
-        for main in 0..2 {
-            let mut order = [main, 1 - main, 2];
-            if main == 0 {
-                order = [0, 1, 2];
+        let numbers: Vec<usize> = views.iter().map(|v| v.0).collect();
+        let images = projections.slice_axis(Axis(0), part.into());
+        let mut pixels = ColumnMajor::new(geometry, &numbers, images, |_, _, _, x| x);
+        pixels.views_mut().zip(views).for_each(|(mut view, (_, columns))| {
+            for c in *columns {
+                run(Lengthen(c, view.rows(c.number, c.rows.clone())));
             }
-            let mut turned = volume.view_mut().permuted_axes(order);
-            turned.axis_chunks_iter_mut(Axis(0), TILE).into_par_iter().enumerate().for_each(|(n, planes)| {
-                run(Adjoint { main, first: n * TILE, planes, columns: &columns, pixels: &pixels, rows });
+        });
+        for main in 0..2 {
+            let mut turned = volume.view_mut().permuted_axes([main, 1 - main, 2]);
+            turned.axis_chunks_iter_mut(Axis(0), TILE).into_par_iter().enumerate().for_each(|(n, mut planes)| {
+                let (count, lines, nz) = planes.dim();
+                let stride = nz + 2 * PAD;
+                let mut gathered = vec![R::ZERO; count * (lines + 2) * stride];
+                run(Adjoint { main, first: n * TILE, lines, nz, gathered: &mut gathered, views, pixels: &pixels });
+                for (mut plane, found) in planes.outer_iter_mut().zip(gathered.chunks((lines + 2) * stride)) {
+                    for (mut line, found) in plane.outer_iter_mut().zip(found.chunks(stride).skip(1)) {
+                        line.iter_mut().zip(&found[PAD..]).for_each(|(voxel, x)| *voxel += *x);
+                    }
+                }
             });
         }
+    }
+}
+
+struct Lengthen<'a, R>(&'a Column, &'a mut [R]);
+
+impl<R: Real> Op for Lengthen<'_, R> {
+    type Out = ();
+    #[inline(always)]
+    fn call<S: Simd>(self, _: S) {
+        self.0.lengthen(self.1);
     }
 }
 
@@ -311,34 +402,52 @@ struct Adjoint<'a, R> {
     main: usize,
     /// The first plane.
     first: usize,
-    /// `[plane, other, z]`.
-    planes: ArrayViewMut3<'a, R>,
-    columns: &'a [Vec<Column>],
+    /// Lines of a plane and numbers of a line.
+    lines: usize,
+    nz: usize,
+    /// `[plane][1 + lines + 1][PAD + nz + PAD]`: the lines before the first and after the last are not looked at.
+    gathered: &'a mut [R],
+    views: &'a [(usize, &'a [Column])],
     pixels: &'a ColumnMajor<R>,
-    rows: usize,
 }
 
 impl<R: Real> Op for Adjoint<'_, R> {
     type Out = ();
     #[inline(always)]
-    fn call<S: Simd>(mut self, s: S) {
-        let (count, others, nz) = self.planes.dim();
-        let mut line = vec![R::ZERO; nz + 2 + AFTER];
-        for (view, columns) in self.columns.iter().enumerate() {
-            for (c, column) in columns.iter().enumerate().filter(|(_, c)| c.main == self.main) {
-                let pixels = self.pixels.column(view, c);
+    fn call<S: Simd>(self, s: S) {
+        let (stride, lines) = (self.nz + 2 * PAD, self.lines + 2);
+        let count = self.gathered.len() / (lines * stride);
+        let (mut alone, mut q) = (vec![], vec![]);
+        for (view, (_, columns)) in self.views.iter().enumerate() {
+            for c in columns.iter().filter(|c| c.main == self.main) {
+                let mut pixels = self.pixels.column(view, c.number);
+                let rows = pixels.len() - 2 * PAD;
+                if c.rows != (0..rows) {
+                    // The others have another main axis.
+                    alone.clear();
+                    alone.resize(pixels.len(), R::ZERO);
+                    let own = PAD + c.rows.start..PAD + c.rows.end;
+                    alone[own.clone()].copy_from_slice(&pixels[own]);
+                    pixels = &alone;
+                }
+                let mut placed = false;
                 for p in 0..count {
-                    let found = column.meet::<R>(self.first + p, self.rows, others, &(0..nz));
-                    let Some((m, lines)) = found else { continue };
-                    let z = spread(s, pixels, &m, nz, &mut line);
-                    let mut plane = self.planes.index_axis_mut(Axis(0), p);
-                    for (other, share) in lines {
-                        if share == R::ZERO {
-                            continue;
-                        }
-                        if let Some(voxels) = plane.index_axis_mut(Axis(0), other).into_slice() {
-                            add(s, &line[1..], share, &mut voxels[..z.end], z.start);
-                        }
+                    let Some(path) = c.meet(self.first + p) else { continue };
+                    let Some(hit) = Hit::of(c, path, self.lines, self.nz) else { continue };
+                    if !placed {
+                        q.resize(pixels.len(), R::ZERO);
+                        c.places(s, -(PAD as f64), &mut q);
+                        placed = true;
+                    }
+                    let plane = &mut self.gathered[p * lines * stride..(p + 1) * lines * stride];
+                    let from = [pixels, &q];
+                    match hit.taps {
+                        0..=2 => hit.gather::<S, R, 2>(s, from, plane, stride),
+                        3 => hit.gather::<S, R, 3>(s, from, plane, stride),
+                        4 => hit.gather::<S, R, 4>(s, from, plane, stride),
+                        5..=6 => hit.gather::<S, R, 6>(s, from, plane, stride),
+                        7..=TAPS => hit.gather::<S, R, TAPS>(s, from, plane, stride),
+                        _ => hit.scatter(from, plane, stride),
                     }
                 }
             }
@@ -346,73 +455,152 @@ impl<R: Real> Op for Adjoint<'_, R> {
     }
 }
 
-/// `voxels[from..] += share·line[from..]`.
-#[inline(always)]
-fn add<S: Simd, R: Real>(s: S, line: &[R], share: R, voxels: &mut [R], from: usize) {
-    let share = V::<S, R>::splat(s, share);
-    let mut i = from;
-    while i < voxels.len() {
-        let sum = V::<S, R>::from_slice(s, &line[i..i + V::<S, R>::LEN]).mul_add(share, load(s, voxels, i));
-        store::<S, R>(sum, voxels, i);
-        i += V::<S, R>::LEN;
-    }
+/// Where a column meets a plane of voxels.
+struct Hit<'a> {
+    column: &'a Column,
+    path: Path<f64>,
+    /// Lines of the plane.
+    lines: f64,
+    numbers: usize,
+    /// Voxels along z that its rows touch.
+    z: Range<usize>,
+    /// q per voxel along z.
+    per_z: f64,
+    /// Rows by which those that share a voxel are at most away from it.
+    reach: f64,
+    /// Rows that share a voxel at most.
+    taps: usize,
 }
 
-/// The adjoint of [`read`]: what each voxel of the line is given, in `line[1..]`, and which voxels those are.
-#[inline(always)]
-fn spread<S: Simd, R: Real>(s: S, pixels: &[R], m: &Meeting<R>, nz: usize, line: &mut [R]) -> Range<usize> {
-    let start = m.start.f64();
-    let end = start + (m.count - 1) as f64 * m.step.f64();
-    // Voxel z stands at z + 1.
-    let z = ((start - 1.0).ceil().max(1.0) as usize - 1)..((end + 1.0).floor().min(nz as f64) as usize);
-    match (2.0 / m.step.f64()).ceil() as usize {
-        0..=2 => gather::<S, R, 2>(s, pixels, m, &z, line),
-        3 => gather::<S, R, 3>(s, pixels, m, &z, line),
-        4 => gather::<S, R, 4>(s, pixels, m, &z, line),
-        5..=6 => gather::<S, R, 6>(s, pixels, m, &z, line),
-        7..=TAPS => gather::<S, R, TAPS>(s, pixels, m, &z, line),
-        _ => scatter(pixels, m, line),
-    }
-    z
-}
-
-/// Every voxel sums over the rows that are less than a voxel away: at most `K` of them.
-#[inline(always)]
-fn gather<S: Simd, R: Real, const K: usize>(s: S, pixels: &[R], m: &Meeting<R>, z: &Range<usize>, line: &mut [R]) {
-    let number = |x: f64| V::<S, R>::splat(s, R::of(x));
-    let lanes = V::<S, R>::from_fn(s, |i| R::of(i as f64));
-    let (step, start) = (V::<S, R>::splat(s, m.step), V::<S, R>::splat(s, m.start));
-    let reach = number(1.0 / m.step.f64());
-    let (zero, one) = (number(0.0), number(1.0));
-    // Rows count from `first`; in `pixels` that one stands here. Past the last row are zeros.
-    let offset = (BEFORE + m.first) as f64;
-    let most = number((pixels.len() - AFTER) as f64);
-    let mut i = z.start;
-    while i < z.end {
-        let place = lanes + number(i as f64 + 1.0);
-        let at = (((place - start) * reach - reach).floor() + number(offset + 1.0)).max(zero).min(most);
-        let mut row = at - number(offset);
-        let mut sum = zero;
-        for x in R::neighbours::<S, K>(s, pixels, at) {
-            let weight = (one - (row.mul_add(step, start) - place).abs()).max(zero);
-            sum = weight.mul_add(x, sum);
-            row += one;
+impl<'a> Hit<'a> {
+    fn of(column: &'a Column, path: Path<f64>, lines: usize, numbers: usize) -> Option<Self> {
+        let lines = lines as f64;
+        let ends = column.ends();
+        let [a, b] = ends.map(|q| path.across(q));
+        let [low, high] = ends.map(|q| path.along(q));
+        if a.max(b) <= -1.0 || a.min(b) >= lines || high <= -1.0 || low >= numbers as f64 {
+            return None;
         }
-        sum.store_slice(&mut line[1 + i..1 + i + V::<S, R>::LEN]);
-        i += V::<S, R>::LEN;
+        let z = (low - 1.0).ceil().max(0.0) as usize..((high + 1.0).floor().min(numbers as f64 - 1.0) as usize + 1);
+        // Rows lie closest where q rises least; within a vector they are taken to lie at equal distances, which they do
+        // but for `bow`.
+        let half = 0.5 * column.rows.len() as f64 + 1.0;
+        let per_z = 1.0 / path.along[1];
+        let reach = (1.0 + column.bend.abs() * half).powi(2) * per_z;
+        let bow = column.bend.abs() * (16.0 * reach).powi(2) / 4.0;
+        let reach = reach + bow + 1e-3;
+        let taps = (2.0 * reach).ceil() as usize;
+        (!z.is_empty()).then_some(Self { column, path, lines, numbers, z, per_z, reach, taps })
+    }
+
+    /// The row that would meet place `z` along the lines.
+    fn row(&self, z: f64) -> f64 {
+        let q = (z - self.path.along[0]) * self.per_z;
+        self.column.middle + q / (1.0 - self.column.bend * q)
+    }
+
+    /// Every voxel sums over the rows that are less than a voxel away: at most `K` of them. `from` are pixels and their q.
+    #[inline(always)]
+    fn gather<S: Simd, R: Real, const K: usize>(&self, s: S, [pixels, q]: [&[R]; 2], plane: &mut [R], stride: usize) {
+        let len = V::<S, R>::LEN;
+        let number = |x: f64| V::<S, R>::splat(s, R::of(x));
+        let lanes = V::<S, R>::from_fn(s, |i| R::of(i as f64));
+        let (zero, one) = (number(0.0), number(1.0));
+        let Path { across, along } = self.path;
+        let per_z = across[1] * self.per_z;
+        let (rise, slant) = (number(along[1]), number(per_z));
+        let whole = self.lines;
+        let mut row = self.row(self.z.start as f64);
+        let mut z = self.z.start;
+        while z < self.z.end {
+            let next = (z + len).min(self.z.end);
+            let after = self.row(next as f64);
+            let apart = (after - row) / (next - z) as f64;
+            // Beside the rows that touch this vector: across which lines they go.
+            let y = across[0] + per_z * (z as f64 - along[0]);
+            let (a, b) = (y - per_z, y + per_z * len as f64);
+            let (low, high) = (a.min(b).floor(), a.max(b).floor());
+            let from = row - self.reach;
+            row = after;
+            let start = z;
+            z += len;
+            if high < -1.0 || low >= whole {
+                continue;
+            }
+            let base = from.floor();
+            let first = (base + 1.0 + PAD as f64).max(0.0) as usize;
+            let at = lanes.mul_add(number(apart), number(from - base));
+            let near = apart * (len - 1) as f64 + 1.0 + K as f64 <= 2.0 * len as f64 - 0.5;
+            let take = |x: &[R]| -> [V<S, R>; K] {
+                if near {
+                    R::window::<S, K>(s, &x[first..first + 2 * len], at.floor())
+                } else {
+                    let most = number((x.len() - K - 1) as f64);
+                    R::neighbours::<S, K>(s, x, (at.floor() + number(first as f64)).min(most))
+                }
+            };
+            let (pixels, q) = (take(pixels), take(q));
+            let up = number(along[0] - start as f64) - lanes;
+            let mut shares = [zero; K];
+            let mut away = [zero; K];
+            let (mut sum, mut moment) = (zero, zero);
+            for k in 0..K {
+                let d = q[k].mul_add(rise, up);
+                let share = (one - d.abs()).max(zero) * pixels[k];
+                sum += share;
+                moment = share.mul_add(d, moment);
+                (shares[k], away[k]) = (share, d);
+            }
+            // Where the column is at each voxel's own z, in lines from `low`.
+            let y = lanes.mul_add(slant, number(y - low));
+            let to = |l: f64| (l + 1.0) as usize * stride + PAD + start;
+            if low == high && low >= -1.0 {
+                // All between the same two lines: the upper one's share is linear.
+                let upper = y.mul_add(sum, moment * slant);
+                add::<S, R>(s, plane, to(low), sum - upper);
+                add::<S, R>(s, plane, to(low + 1.0), upper);
+                continue;
+            }
+            let mut l = low.max(-1.0);
+            while l <= (high + 1.0).min(whole) {
+                let off = y - number(l - low);
+                let mut sum = zero;
+                for k in 0..K {
+                    let off = away[k].mul_add(slant, off);
+                    sum = (one - off.abs()).max(zero).mul_add(shares[k], sum);
+                }
+                add::<S, R>(s, plane, to(l), sum);
+                l += 1.0;
+            }
+        }
+    }
+
+    /// Every row gives to the voxels beside it: for detectors with many rows a voxel.
+    #[inline(always)]
+    fn scatter<R: Real>(&self, [pixels, q]: [&[R]; 2], plane: &mut [R], stride: usize) {
+        let path: Path<R> = self.path.narrow();
+        let rows = PAD + self.column.rows.start..PAD + self.column.rows.end;
+        for (&pixel, &q) in pixels[rows.clone()].iter().zip(&q[rows]) {
+            let (y, z) = (path.across(q), path.along(q));
+            let (line, cell) = (y.floor(), z.floor());
+            let inside = |x: R, n: f64| x >= R::of(-1.0) && x < R::of(n);
+            if !inside(line, self.lines) || !inside(cell, self.numbers as f64) {
+                continue;
+            }
+            let at = (line.int() + 1) as usize * stride + (cell.int() + PAD as i64) as usize;
+            let (low, high) = ((line + R::ONE - y) * pixel, (y - line) * pixel);
+            let shares = [cell + R::ONE - z, z - cell];
+            for (k, share) in shares.into_iter().enumerate() {
+                plane[at + k] += low * share;
+                plane[at + k + stride] += high * share;
+            }
+        }
     }
 }
 
-/// Every row gives to the two voxels beside it: for detectors with many rows a voxel.
+/// Adds `x` to the numbers from `at` on.
 #[inline(always)]
-fn scatter<R: Real>(pixels: &[R], m: &Meeting<R>, line: &mut [R]) {
-    line.fill(R::ZERO);
-    for i in 0..m.count {
-        let z = R::of(i as f64) * m.step + m.start;
-        let cell = z.floor();
-        let at = cell.int().max(0) as usize;
-        let x = pixels[BEFORE + m.first + i];
-        line[at] += (cell + R::ONE - z) * x;
-        line[at + 1] += (z - cell) * x;
-    }
+fn add<S: Simd, R: Real>(s: S, numbers: &mut [R], at: usize, x: V<S, R>) {
+    let numbers = &mut numbers[at..at + V::<S, R>::LEN];
+    (V::<S, R>::from_slice(s, numbers) + x).store_slice(numbers);
 }

@@ -1,10 +1,12 @@
 //! Geometry in voxels, and projections that lie column by column.
 
-use conefield_core::geometry::{Geometry, Vec3, VoxelGrid, cross, dot, norm, sub};
+use super::readers::PAD;
+use conefield_core::geometry::{Geometry, Vec3, VoxelGrid, cross, dot, sub};
 use conefield_core::simd::Real;
 use conefield_core::voxel::VoxelView;
 use ndarray::{ArrayView3, Axis};
 use rayon::prelude::*;
+use std::ops::Range;
 
 /// A world position in voxels: whole numbers are voxel centres.
 pub fn to_voxels(grid: &VoxelGrid, p: Vec3) -> Vec3 {
@@ -24,61 +26,10 @@ pub fn main_axis(ahead: Vec3) -> usize {
     }
 }
 
-/// A view whose detector rows are stacked along z: neither `u` nor the detector's normal has a part along z.
-#[derive(Debug, Clone, Copy)]
-pub struct Upright {
-    /// The source in voxels.
-    pub source: Vec3,
-    /// From the source to the lowest row's first column, in mm.
-    pub first: Vec3,
-    /// From column to column, in mm along x and y.
-    pub u: [f64; 2],
-    /// From row to row upwards, in mm along z; above 0.
-    pub v: f64,
-    /// Whether rows of the projections run downwards, so that the lowest is the last.
-    pub downwards: bool,
-}
-
-impl Upright {
-    /// View `view` of `geometry`, unless it is tilted.
-    pub fn of(geometry: &Geometry, view: usize) -> Option<Self> {
-        let w = &geometry.views[view];
-        let small = 1e-9;
-        let tilted = w.u[2].abs() > small * norm(w.u) || w.v[0].hypot(w.v[1]) > small * norm(w.v);
-        if tilted {
-            return None;
-        }
-        let downwards = w.v[2] < 0.0;
-        let lowest = if downwards { geometry.detector[0] as f64 - 1.0 } else { 0.0 };
-        Some(Self {
-            source: to_voxels(&geometry.volume, w.source),
-            first: sub(w.pixel(geometry.detector, lowest, 0.0), w.source),
-            u: [w.u[0], w.u[1]],
-            v: w.v[2].abs(),
-            downwards,
-        })
-    }
-
-    /// From the source to the lowest pixel of column `column`, in mm.
-    pub fn lowest(&self, column: usize) -> Vec3 {
-        let c = column as f64;
-        [self.first[0] + c * self.u[0], self.first[1] + c * self.u[1], self.first[2]]
-    }
-
-    /// The row of the projections that is `row`th from below.
-    pub fn row(&self, row: usize, rows: usize) -> usize {
-        if self.downwards { rows - 1 - row } else { row }
-    }
-}
-
-/// Zeros before the first row of a column, which a reader may touch.
-pub const BEFORE: usize = 16;
-/// Zeros after the last row of a column: as many as vectors read at most beyond it.
-pub const AFTER: usize = 80;
-
-/// Some views with the pixels of a detector column side by side, from below, between zeros.
+/// Some views with the pixels of a detector column side by side, from below, between
+/// [`PAD`] zeros.
 pub struct ColumnMajor<R> {
-    /// `[view][column][BEFORE + rows + AFTER]`.
+    /// `[view][column][PAD + rows + PAD]`.
     data: Vec<R>,
     rows: usize,
     columns: usize,
@@ -96,7 +47,7 @@ impl<R: Real> ColumnMajor<R> {
         value: impl Fn(usize, usize, usize, R) -> R + Sync,
     ) -> Self {
         let [rows, columns] = geometry.detector;
-        let stride = BEFORE + rows + AFTER;
+        let stride = rows + 2 * PAD;
         let mut data = vec![R::ZERO; views.len() * columns * stride];
         let downwards: Vec<bool> = views.iter().map(|&v| geometry.views[v].v[2] < 0.0).collect();
         data.par_chunks_mut(columns * stride).zip(&downwards).enumerate().for_each(|(n, (out, &downwards))| {
@@ -107,7 +58,7 @@ impl<R: Real> ColumnMajor<R> {
                 for row in 0..rows {
                     let from_below = if downwards { rows - 1 - row } else { row };
                     for column in left..(left + STRIP).min(columns) {
-                        out[column * stride + BEFORE + from_below] = value(n, row, column, view[[row, column]]);
+                        out[column * stride + PAD + from_below] = value(n, row, column, view[[row, column]]);
                     }
                 }
             }
@@ -115,11 +66,22 @@ impl<R: Real> ColumnMajor<R> {
         Self { data, rows, columns, downwards }
     }
 
-    /// A column with its zeros; row 0 stands at [`BEFORE`].
+    /// A column with its zeros; row 0 stands at [`PAD`].
     pub fn column(&self, view: usize, column: usize) -> &[R] {
-        let stride = BEFORE + self.rows + AFTER;
+        let stride = self.rows + 2 * PAD;
         let at = (view * self.columns + column) * stride;
         &self.data[at..at + stride]
+    }
+
+    /// Every view, to be changed.
+    pub fn views_mut(&mut self) -> impl IndexedParallelIterator<Item = ViewColumns<'_, R>> {
+        let (rows, stride) = (self.rows, self.rows + 2 * PAD);
+        self.data.par_chunks_mut((self.columns * stride).max(1)).map(move |data| ViewColumns { data, rows })
+    }
+
+    /// Whether the first row of a view's projections is its highest.
+    pub fn downwards(&self, view: usize) -> bool {
+        self.downwards[view]
     }
 
     /// The pixel at a row (as in the projections) and column; 0 outside the detector.
@@ -129,19 +91,33 @@ impl<R: Real> ColumnMajor<R> {
             return R::ZERO;
         }
         let from_below = if self.downwards[view] { self.rows - 1 - row } else { row };
-        self.column(view, column)[BEFORE + from_below]
+        self.column(view, column)[PAD + from_below]
+    }
+}
+
+/// The columns of a view, to be changed.
+pub struct ViewColumns<'a, R> {
+    data: &'a mut [R],
+    rows: usize,
+}
+
+impl<R> ViewColumns<'_, R> {
+    /// Some rows of a column, from below.
+    pub fn rows(&mut self, column: usize, rows: Range<usize>) -> &mut [R] {
+        let start = column * (self.rows + 2 * PAD) + PAD;
+        &mut self.data[start + rows.start..start + rows.end]
     }
 }
 
 /// How many views to hold column by column at once: a few MiB, which stay in the last cache.
 pub fn batch<R>([rows, columns]: [usize; 2]) -> usize {
-    let view = (rows + BEFORE + AFTER) * columns * size_of::<R>();
+    let view = (rows + 2 * PAD) * columns * size_of::<R>();
     ((12 << 20) / view.max(1)).clamp(1, 64)
 }
 
 /// Bytes of [`ColumnMajor`] for `views` views.
 pub fn column_major_bytes<R>([rows, columns]: [usize; 2], views: usize) -> u64 {
-    (views * columns * (BEFORE + rows + AFTER) * size_of::<R>()) as u64
+    (views * columns * (rows + 2 * PAD) * size_of::<R>()) as u64
 }
 
 /// Detector coordinates of world positions for a view, tilted or not: `u`, `v` in pixels and the depth.

@@ -136,12 +136,12 @@ impl<R: Real> VoxelOperator<R> for Trilinear {
 /// Views that go column by column run so, the others bundle by bundle.
 impl<R: Real> VoxelOperator<R> for Joseph {
     fn forward(&self, geometry: &Geometry, views: &[usize], volume: ArrayView3<'_, R>, mut out: ArrayViewMut3<'_, R>) {
-        let (mut upright, mut others) = ((vec![], vec![]), (vec![], vec![]));
+        let (mut fitting, mut others) = ((vec![], vec![]), (vec![], vec![]));
         for (&v, image) in views.iter().zip(out.outer_iter_mut()) {
-            match columns::fits(geometry, v) {
-                Some(u) => {
-                    upright.0.push(u);
-                    upright.1.push(image);
+            match columns::of(geometry, v) {
+                Some(columns) => {
+                    fitting.0.push((v, columns));
+                    fitting.1.push(image);
                 }
                 None => {
                     others.0.push(v);
@@ -150,8 +150,8 @@ impl<R: Real> VoxelOperator<R> for Joseph {
             }
         }
         // Most scans have views of one kind only, and nothing is to be prepared for the other.
-        if !upright.0.is_empty() {
-            columns::forward(geometry, &upright.0, volume, upright.1);
+        if !fitting.0.is_empty() {
+            columns::forward(geometry, &fitting.0, volume, fitting.1);
         }
         if !others.0.is_empty() {
             bundles::forward(geometry, &others.0, volume, others.1);
@@ -159,17 +159,17 @@ impl<R: Real> VoxelOperator<R> for Joseph {
     }
 
     fn adjoint(&self, geometry: &Geometry, views: &[usize], p: ArrayView3<'_, R>, mut volume: ArrayViewMut3<'_, R>) {
-        let fitting: Vec<_> = views.iter().map(|&v| columns::fits(geometry, v)).collect();
+        let all: Vec<_> = views.iter().map(|&v| (v, columns::of(geometry, v))).collect();
         // Runs of views of the same kind, in order.
         let mut from = 0;
-        for run in fitting.chunk_by(|a, b| a.is_some() == b.is_some()) {
+        for run in all.chunk_by(|a, b| a.1.is_some() == b.1.is_some()) {
             let part = from..from + run.len();
             let images = p.slice_axis(Axis(0), part.clone().into());
-            let upright: Vec<_> = run.iter().flatten().copied().collect();
-            if upright.is_empty() {
+            let fitting: Vec<_> = run.iter().filter_map(|(v, columns)| Some((*v, columns.as_deref()?))).collect();
+            if fitting.is_empty() {
                 bundles::adjoint(geometry, &views[part.clone()], images, &mut volume);
             } else {
-                columns::adjoint(geometry, &upright, &views[part.clone()], images, &mut volume);
+                columns::adjoint(geometry, &fitting, images, &mut volume);
             }
             from = part.end;
         }

@@ -1,12 +1,13 @@
 //! Total variation of a volume: `Σ_j √(Σ_k (g_k·(x_{j+k} − x_j))²)` over voxels j and axes k, where differences across
 //! voxels of different sides count by `g_k = h/h_k` with h the sides' geometric mean. At the far faces differences are 0.
 
-use super::{flat, flat_mut};
+use super::flat_mut;
 use conefield_core::geometry::VoxelGrid;
 use conefield_core::simd::{Op, Simd, SimdBase, SimdFloat, load, run, store};
 use conefield_core::space::Space;
 use ndarray::{Array3, ArrayView3};
 use rayon::prelude::*;
+use std::ops::Range;
 
 /// Differences count by these, along x, y, z.
 pub fn anisotropy(grid: &VoxelGrid) -> [f32; 3] {
@@ -43,6 +44,8 @@ pub fn total_variation(x: ArrayView3<'_, f32>, g: [f32; 3]) -> f64 {
 ///
 /// `argmin_{u ≥ 0} ½‖u − v‖² + τ·TV(u)`, with `u = max(0, v − τ·∇ᵀp)` and `|p_j| ≤ 1` (Beck and Teboulle, IEEE Trans. Image
 /// Process. 18(11), 2009; without their momentum, which a warm start does not need).
+///
+/// All steps go through the volume in one sweep ([`sweep`]), so that memory is read and written once for all of them.
 pub struct TvProx {
     shape: [usize; 3],
     g: [f32; 3],
@@ -53,6 +56,11 @@ pub struct TvProx {
 impl TvProx {
     /// For volumes of `shape`, from a dual of 0.
     pub fn new(shape: [usize; 3], g: [f32; 3], space: &Space) -> Self {
+        let split = Split::new(shape[0], REACH, rayon::current_num_threads());
+        space.briefly(|space| {
+            let planes = (split.slabs - 1) * 3 * split.halo() + split.slabs * split.reach;
+            space.hold((planes * shape[1] * (shape[2] + 1) * size_of::<f32>()) as u64);
+        });
         Self { shape, g, dual: std::array::from_fn(|_| space.array(shape)) }
     }
 
@@ -66,139 +74,253 @@ impl TvProx {
         if tau < f32::MIN_POSITIVE {
             return u.par_iter_mut().zip(v).for_each(|(u, v)| *u = v.max(0.0));
         }
-        for _ in 0..steps {
-            self.primal(v, tau, u);
-            self.ascend(u, tau);
+        let mut left = steps;
+        loop {
+            let split = Split::new(self.shape[0], left, rayon::current_num_threads());
+            left -= split.reach;
+            self.steps(v, tau, split, u);
+            if left == 0 {
+                return;
+            }
         }
-        self.primal(v, tau, u);
     }
 
-    /// `u = max(0, v − τ·∇ᵀp)`.
-    fn primal(&self, v: &[f32], tau: f32, u: &mut [f32]) {
-        let [_, ny, nz] = self.shape;
-        let plane = ny * nz;
-        let [px, py, pz] = self.dual.each_ref().map(flat);
-        u.par_chunks_mut(plane).enumerate().for_each(|(i, u)| {
-            let at = i * plane;
-            let before = (i > 0).then(|| &px[at - plane..at]);
-            run(Primal {
-                v: &v[at..at + plane],
-                before,
-                p: [&px[at..at + plane], &py[at..at + plane], &pz[at..at + plane]],
-                scale: self.g.map(|g| g * tau),
-                nz,
-                u,
-            });
-        });
-    }
-
-    /// `p ← p + ∇u/(L·τ)`, then back into the unit ball; L bounds `‖∇‖²`.
-    fn ascend(&mut self, u: &[f32], tau: f32) {
+    /// Some steps in one sweep. The slabs of `split` run side by side; near their ends each works on a copy of what belongs
+    /// to its neighbour, so that every number is computed from the same ones whatever the split.
+    fn steps(&mut self, v: &[f32], tau: f32, split: Split, u: &mut [f32]) {
         let [nx, ny, nz] = self.shape;
         let plane = ny * nz;
-        let bound = 4.0 * self.g.iter().map(|g| g * g).sum::<f32>();
-        let scale = self.g.map(|g| g / (bound * tau));
-        let [px, py, pz] = self.dual.each_mut().map(flat_mut);
-        px.par_chunks_mut(plane).zip(py.par_chunks_mut(plane)).zip(pz.par_chunks_mut(plane)).enumerate().for_each(
-            |(i, ((px, py), pz))| {
-                let at = i * plane;
-                let after = (i + 1 < nx).then(|| &u[at + plane..at + 2 * plane]);
-                run(Ascend { u: &u[at..at + plane], after, p: [px, py, pz], scale, nz });
-            },
-        );
+        let bounds = split.bounds(nx);
+        let dual = self.dual.each_mut().map(flat_mut);
+        // Around every inner bound, what the slab above copies of the one below, and the other way round.
+        let mut halos: Vec<[Vec<f32>; 3]> = bounds[1..bounds.len() - 1]
+            .iter()
+            .map(|&b| {
+                let near = (b - split.below()) * plane..(b + split.reach) * plane;
+                dual.each_ref().map(|p| p[near.clone()].to_vec())
+            })
+            .collect();
+        let mut copies = halos.iter_mut().map(|halo| {
+            let mut low = Planes::default();
+            let mut high = Planes::default();
+            for (k, p) in halo.each_mut().into_iter().enumerate() {
+                let (below, above) = p.split_at_mut(split.below() * plane);
+                (low.0[k], high.0[k]) = (below.chunks_mut(plane).collect(), above.chunks_mut(plane).collect());
+            }
+            (low, high)
+        });
+        let mut own = dual.map(|p| p.chunks_mut(plane));
+        let mut rest = u;
+        let mut slabs = vec![];
+        let mut low = Planes::default();
+        for range in bounds.windows(2).map(|b| b[0]..b[1]) {
+            let (next, high) = copies.next().unwrap_or_default();
+            let mut planes = std::mem::replace(&mut low, next);
+            let copied = planes.0[0].len();
+            for ((all, own), high) in planes.0.iter_mut().zip(&mut own).zip(high.0) {
+                all.extend(own.take(range.len()).chain(high));
+            }
+            let (here, after) = rest.split_at_mut(range.len() * plane);
+            rest = after;
+            let first = range.start - copied;
+            let v = &v[first * plane..(first + planes.0[0].len()) * plane];
+            slabs.push(Sweep { planes, own: copied..copied + range.len(), v, u: here, line: nz, steps: split.reach });
+        }
+        let scale = Scale::new(self.g, tau);
+        slabs.into_par_iter().for_each(|slab| run(Sweeping(slab, scale)));
     }
 }
 
-/// One plane of [`TvProx::primal`].
-struct Primal<'a> {
+/// Dual steps of one sweep at most: what they hold of the volume stays in the last cache.
+const REACH: usize = 4;
+
+/// Into how many slabs along x the volume is split, and how many steps a sweep makes.
+#[derive(Debug, Clone, Copy)]
+struct Split {
+    slabs: usize,
+    reach: usize,
+}
+
+impl Split {
+    /// For `planes` planes and `threads` threads: no slab is less than twice as thick as what it computes beside itself.
+    fn new(planes: usize, steps: usize, threads: usize) -> Self {
+        let reach = steps.min((planes / threads.max(1) / 4).clamp(1, REACH));
+        let mut split = Self { slabs: 1, reach };
+        split.slabs = threads.min(planes / (2 * split.halo())).max(1);
+        split
+    }
+
+    /// Planes that a step reaches below: one a step, and the dual's before the first.
+    fn below(self) -> usize {
+        self.reach + 1
+    }
+
+    fn halo(self) -> usize {
+        self.below() + self.reach
+    }
+
+    /// Where slabs begin, and the last one's end.
+    fn bounds(self, planes: usize) -> Vec<usize> {
+        (0..=self.slabs).map(|n| n * planes / self.slabs).collect()
+    }
+}
+
+/// What differences are multiplied with.
+#[derive(Clone, Copy)]
+struct Scale {
+    /// For the primal: `g·τ`.
+    down: [f32; 3],
+    /// For a step of the dual: `g/(L·τ)`, L a bound of `‖∇‖²`.
+    up: [f32; 3],
+}
+
+impl Scale {
+    fn new(g: [f32; 3], tau: f32) -> Self {
+        let bound = 4.0 * g.iter().map(|g| g * g).sum::<f32>();
+        Self { down: g.map(|g| g * tau), up: g.map(|g| g / (bound * tau)) }
+    }
+}
+
+/// Planes of the dual along x, y and z.
+#[derive(Default)]
+struct Planes<'a>([Vec<&'a mut [f32]>; 3]);
+
+/// Dual steps and then the primal on a slab of planes, of which `own` are to be right in the end. At the slab's ends
+/// differences count as 0: where the volume goes on there, that is wrong, and spreads by a plane with every step.
+struct Sweep<'a> {
+    planes: Planes<'a>,
+    own: Range<usize>,
     v: &'a [f32],
-    /// The dual along x one plane before.
-    before: Option<&'a [f32]>,
-    p: [&'a [f32]; 3],
-    scale: [f32; 3],
-    nz: usize,
+    /// The proximal map, of `own`.
     u: &'a mut [f32],
+    /// Numbers of a line along z.
+    line: usize,
+    steps: usize,
 }
 
-impl Op for Primal<'_> {
+struct Sweeping<'a>(Sweep<'a>, Scale);
+
+impl Op for Sweeping<'_> {
     type Out = ();
     #[inline(always)]
     fn call<S: Simd>(self, s: S) {
-        let len = S::f32s::LEN;
-        let nz = self.nz;
-        let scale = self.scale.map(|x| S::f32s::splat(s, x));
-        let zero = S::f32s::splat(s, 0.0);
-        let mut line = vec![0.0; nz + 1 + len];
-        for (j, u) in self.u.chunks_mut(nz).enumerate() {
-            let row = |x| -> &[f32] {
-                let x: &[f32] = x;
-                &x[j * nz..(j + 1) * nz]
-            };
-            let (v, px, py, pz) = (row(self.v), row(self.p[0]), row(self.p[1]), row(self.p[2]));
-            let bx = self.before.map(row);
-            let by = (j > 0).then(|| &self.p[1][(j - 1) * nz..j * nz]);
-            // The dual along z one voxel on, so that the voxel before is read at the same index.
-            line[1..=nz].copy_from_slice(pz);
-            let mut k = 0;
-            while k < nz {
-                let behind = |b: Option<&[f32]>| b.map_or(zero, |b| load(s, b, k));
-                let dx = behind(bx) - load(s, px, k);
-                let dy = behind(by) - load(s, py, k);
-                let dz = S::f32s::from_slice(s, &line[k..k + len]) - load(s, pz, k);
-                let turn = dx * scale[0] + dy * scale[1] + dz * scale[2];
-                store::<S, f32>((load(s, v, k) - turn).max(zero), u, k);
-                k += len;
+        self.0.sweep(s, self.1);
+    }
+}
+
+impl Sweep<'_> {
+    /// Step k follows step k − 1 a plane behind, line by line: when the primal of a line is known, the dual of the line
+    /// one plane before can go on, whose primal the next step then takes. So of every step one plane is kept.
+    #[inline(always)]
+    fn sweep<S: Simd>(mut self, s: S, scale: Scale) {
+        let nz = self.line;
+        let plane = self.planes.0[0].first().map_or(0, |p| p.len());
+        let (ny, count) = (plane / nz, self.planes.0[0].len());
+        // The primal of every step, with each line's last number twice: no difference across the far face.
+        let stride = nz + 1;
+        let mut kept = vec![0.0f32; self.steps * ny * stride];
+        let mut fresh = vec![0.0f32; stride];
+        for front in 0..count + self.steps {
+            for j in 0..ny {
+                for step in 0..=self.steps.min(front) {
+                    let i = front - step;
+                    let known = i < count;
+                    if known && step == self.steps {
+                        if self.own.contains(&i) {
+                            let at = (i - self.own.start) * plane + j * nz;
+                            let line = &mut self.u[at..at + nz];
+                            primal(s, self.planes.beside(i, j, nz), &self.v[i * plane + j * nz..][..nz], scale.down, line);
+                        }
+                        continue;
+                    }
+                    if known {
+                        let v = &self.v[i * plane + j * nz..][..nz];
+                        primal(s, self.planes.beside(i, j, nz), v, scale.down, &mut fresh[..nz]);
+                        fresh[nz] = fresh[nz - 1];
+                    }
+                    if step == self.steps {
+                        continue;
+                    }
+                    let kept = &mut kept[step * ny * stride..(step + 1) * ny * stride];
+                    if i > 0 && i <= count {
+                        let (u, next) = kept[j * stride..].split_at(stride);
+                        let next = (j + 1 < ny).then(|| &next[..nz]);
+                        let after = known.then_some(&fresh[..nz]);
+                        ascend(s, u, [after, next], scale.up, self.planes.line(i - 1, j, nz));
+                    }
+                    if known {
+                        kept[j * stride..(j + 1) * stride].copy_from_slice(&fresh);
+                    }
+                }
             }
         }
     }
 }
 
-/// One plane of [`TvProx::ascend`].
-struct Ascend<'a> {
-    u: &'a [f32],
-    /// The next plane.
-    after: Option<&'a [f32]>,
-    p: [&'a mut [f32]; 3],
-    scale: [f32; 3],
-    nz: usize,
+/// The dual at a line, and along x and y at the lines before.
+struct Beside<'a> {
+    p: [&'a [f32]; 3],
+    before: [Option<&'a [f32]>; 2],
 }
 
-impl Op for Ascend<'_> {
-    type Out = ();
-    #[inline(always)]
-    fn call<S: Simd>(self, s: S) {
-        let len = S::f32s::LEN;
-        let nz = self.nz;
-        let ny = self.u.len() / nz;
-        let scale = self.scale.map(|x| S::f32s::splat(s, x));
-        let (zero, one) = (S::f32s::splat(s, 0.0), S::f32s::splat(s, 1.0));
-        let mut line = vec![0.0; nz + 1 + len];
-        let [px, py, pz] = self.p;
-        for j in 0..ny {
-            let at = j * nz..(j + 1) * nz;
-            let u = &self.u[at.clone()];
-            let nx = self.after.map(|a| &a[at.clone()]);
-            let ny = (j + 1 < ny).then(|| &self.u[at.end..at.end + nz]);
-            line[..nz].copy_from_slice(u);
-            // No difference across the far face.
-            line[nz] = u[nz - 1];
-            let (px, py, pz) = (&mut px[at.clone()], &mut py[at.clone()], &mut pz[at]);
-            let mut k = 0;
-            while k < nz {
-                let here = load(s, u, k);
-                let ahead = |b: Option<&[f32]>| b.map_or(zero, |b| load(s, b, k) - here);
-                let x = ahead(nx).mul_add(scale[0], load(s, px, k));
-                let y = ahead(ny).mul_add(scale[1], load(s, py, k));
-                let dz = S::f32s::from_slice(s, &line[k + 1..k + 1 + len]) - here;
-                let z = dz.mul_add(scale[2], load(s, pz, k));
-                let length = x.mul_add(x, y.mul_add(y, z * z)).sqrt();
-                let shrink = one / length.max(one);
-                store::<S, f32>(x * shrink, px, k);
-                store::<S, f32>(y * shrink, py, k);
-                store::<S, f32>(z * shrink, pz, k);
-                k += len;
-            }
+impl Planes<'_> {
+    fn beside(&self, i: usize, j: usize, nz: usize) -> Beside<'_> {
+        let row = |k: usize, i: usize, j: usize| &self.0[k][i][j * nz..(j + 1) * nz];
+        Beside {
+            p: [row(0, i, j), row(1, i, j), row(2, i, j)],
+            before: [(i > 0).then(|| row(0, i - 1, j)), (j > 0).then(|| row(1, i, j - 1))],
         }
+    }
+
+    fn line(&mut self, i: usize, j: usize, nz: usize) -> [&mut [f32]; 3] {
+        self.0.each_mut().map(|p| &mut p[i][j * nz..(j + 1) * nz])
+    }
+}
+
+/// `u = max(0, v − τ·∇ᵀp)` along a line.
+#[inline(always)]
+fn primal<S: Simd>(s: S, Beside { p: [px, py, pz], before }: Beside<'_>, v: &[f32], scale: [f32; 3], u: &mut [f32]) {
+    let len = S::f32s::LEN;
+    let scale = scale.map(|x| S::f32s::splat(s, x));
+    let zero = S::f32s::splat(s, 0.0);
+    // Before the first voxel along z there is no difference.
+    let mut first = [0.0; 32];
+    let head = pz.len().min(len);
+    first[1..=head].copy_from_slice(&pz[..head]);
+    let [bx, by] = before;
+    let mut k = 0;
+    while k < u.len() {
+        let behind = |b: Option<&[f32]>| b.map_or(zero, |b| load(s, b, k));
+        let bz = if k == 0 { S::f32s::from_slice(s, &first[..len]) } else { load(s, pz, k - 1) };
+        let dx = behind(bx) - load(s, px, k);
+        let dy = behind(by) - load(s, py, k);
+        let dz = bz - load(s, pz, k);
+        let turn = dx * scale[0] + dy * scale[1] + dz * scale[2];
+        store::<S, f32>((load(s, v, k) - turn).max(zero), u, k);
+        k += len;
+    }
+}
+
+/// `p ← p + ∇u/(L·τ)` along a line, then back into the unit ball. `u` has its last number twice; `after` are the next lines
+/// along x and y.
+#[inline(always)]
+fn ascend<S: Simd>(s: S, u: &[f32], after: [Option<&[f32]>; 2], scale: [f32; 3], [px, py, pz]: [&mut [f32]; 3]) {
+    let len = S::f32s::LEN;
+    let scale = scale.map(|x| S::f32s::splat(s, x));
+    let (zero, one) = (S::f32s::splat(s, 0.0), S::f32s::splat(s, 1.0));
+    let mut k = 0;
+    while k < px.len() {
+        let here = load(s, u, k);
+        let ahead = |b: Option<&[f32]>| b.map_or(zero, |b| load(s, b, k) - here);
+        let x = ahead(after[0]).mul_add(scale[0], load(s, px, k));
+        let y = ahead(after[1]).mul_add(scale[1], load(s, py, k));
+        let z = (load(s, u, k + 1) - here).mul_add(scale[2], load(s, pz, k));
+        let length = x.mul_add(x, y.mul_add(y, z * z)).sqrt();
+        let shrink = one / length.max(one);
+        store::<S, f32>(x * shrink, px, k);
+        store::<S, f32>(y * shrink, py, k);
+        store::<S, f32>(z * shrink, pz, k);
+        k += len;
     }
 }
 
@@ -303,6 +425,89 @@ mod tests {
         }
         assert!(gaps[2] < 2e-3 && gaps[2] > -1e-5 && gaps[0] > gaps[1] && gaps[1] > gaps[2], "{gaps:?}");
         assert!(total_variation(u.view(), g) < 0.5 * total_variation(v.view(), g));
+    }
+
+    /// The same steps one after another, voxel by voxel.
+    fn plain(dual: &mut [Array3<f32>; 3], v: &Array3<f32>, g: [f32; 3], tau: f32, steps: usize) -> Array3<f32> {
+        let shape: [usize; 3] = v.dim().into();
+        let moved = |at: [usize; 3], k: usize, by: isize| {
+            let mut to = at;
+            to[k] = to[k].wrapping_add_signed(by);
+            to
+        };
+        let primal = |dual: &[Array3<f32>; 3]| {
+            Array3::from_shape_fn(shape, |(x, y, z)| {
+                let at = [x, y, z];
+                let behind = |k: usize| if at[k] > 0 { dual[k][moved(at, k, -1)] } else { 0.0 };
+                let turn: f32 = (0..3).map(|k| (behind(k) - dual[k][at]) * g[k] * tau).sum();
+                (v[at] - turn).max(0.0)
+            })
+        };
+        let bound = 4.0 * g.iter().map(|g| g * g).sum::<f32>();
+        for _ in 0..steps {
+            let u = primal(dual);
+            for ((x, y, z), &here) in u.indexed_iter() {
+                let at = [x, y, z];
+                let ahead = |k: usize| if at[k] + 1 < shape[k] { u[moved(at, k, 1)] - here } else { 0.0 };
+                let p: [f32; 3] = std::array::from_fn(|k| dual[k][at] + ahead(k) * g[k] / (bound * tau));
+                let length = p.iter().map(|p| p * p).sum::<f32>().sqrt().max(1.0);
+                (0..3).for_each(|k| dual[k][at] = p[k] / length);
+            }
+        }
+        primal(dual)
+    }
+
+    /// Tiny volumes, lines shorter and longer than a vector, more steps than a sweep makes, slabs with and without
+    /// neighbours: a sweep is what its steps are one by one, and the number of threads changes no bit.
+    #[test]
+    fn a_sweep_is_its_steps_one_by_one_on_any_number_of_threads() {
+        let (g, tau) = ([1.0, 0.7, 1.3], 0.15f32);
+        for (shape, steps) in [
+            ([1, 1, 1], 3),
+            ([2, 1, 17], 4),
+            ([3, 5, 16], 1),
+            ([1, 9, 33], 2),
+            ([41, 4, 7], 4),
+            ([64, 3, 35], 11),
+            ([97, 2, 5], 5),
+        ] {
+            let v = noisy(shape);
+            let on = |threads: usize| {
+                let pool = rayon::ThreadPoolBuilder::new().num_threads(threads).build().unwrap();
+                pool.install(|| {
+                    let (mut prox, mut u) = (prox(shape, g), Array3::from_elem(shape, f32::NAN));
+                    for _ in 0..2 {
+                        prox.apply(v.as_slice().unwrap(), tau, steps, u.as_slice_mut().unwrap());
+                    }
+                    (u, prox.dual)
+                })
+            };
+            let (u, dual) = on(1);
+            let mut slow = std::array::from_fn(|_| Array3::zeros(shape));
+            plain(&mut slow, &v, g, tau, steps);
+            let want = plain(&mut slow, &v, g, tau, steps);
+            let near = |a: &Array3<f32>, b: &Array3<f32>| a.iter().zip(b).all(|(a, b)| (a - b).abs() < 1e-5);
+            assert!(near(&u, &want) && (0..3).all(|k| near(&dual[k], &slow[k])), "{shape:?}");
+            for threads in [2, 3, 8] {
+                assert!(on(threads) == (u.clone(), dual.clone()), "{shape:?} on {threads} threads");
+            }
+        }
+    }
+
+    #[test]
+    fn slabs_are_thick_enough_for_what_they_copy() {
+        for planes in [1, 7, 64, 256, 1000] {
+            for threads in [1, 2, 16, 200] {
+                for steps in [0, 1, 4, 100] {
+                    let split = Split::new(planes, steps, threads);
+                    let bounds = split.bounds(planes);
+                    assert!(split.reach <= steps && (steps == 0 || split.reach > 0), "{split:?}");
+                    assert_eq!((bounds[0], bounds[split.slabs]), (0, planes));
+                    let thin = bounds.windows(2).any(|b| b[1] - b[0] < split.halo());
+                    assert!(split.slabs == 1 || !thin, "{split:?} of {planes}");
+                }
+            }
+        }
     }
 
     /// Attenuation of a micrometre's object in 1/mm is large: without a weight nothing may be divided by next to nothing.
