@@ -1,5 +1,6 @@
-//! Speed of the voxel projectors and of FDK on 50 views of 512² pixels and 256³ voxels: Joseph forward and its adjoint, upright
-//! and with a tilted detector, and the voxel-driven back-projection, against what the machine allows in the same run.
+//! Speed of what iterates and of FDK on 50 views of 512² pixels and 256³ voxels: Joseph forward and its adjoint and the
+//! voxel-driven back-projection, upright and with a tilted detector, and total variation, against what the machine allows in
+//! the same run.
 //!
 //! `cargo bench -p conefield-benches --bench projectors`; `benches/peers/classical.sh` puts RTK beside it.
 
@@ -8,16 +9,19 @@ use conefield_benches::{bandwidth, multiply_adds, times};
 use conefield_core::Result;
 use conefield_core::geometry::{Geometry, Millimetres, Radians, View, VoxelGrid, norm};
 use conefield_core::method::{Context, Job, Silent};
-use conefield_core::scan::{Scan, Unit};
+use conefield_core::scan::{Scan, ScanHeader, Unit};
+use conefield_core::space::Space;
 use conefield_core::spec::load::parse;
 use conefield_core::voxel::VoxelOperator;
 use conefield_projectors::voxel::Joseph;
 use conefield_projectors::voxel::backproject::backproject;
 use conefield_projectors::voxel::layout::ColumnMajor;
-use conefield_solvers as _;
+use conefield_solvers::iterative::tv::{TvProx, total_variation};
 use ndarray::Array3;
 
 const RUNS: usize = 5;
+/// Dual steps of a proximal map.
+const STEPS: usize = 4;
 
 /// What a machine does at most in a second.
 struct Limit {
@@ -45,13 +49,21 @@ fn main() -> Result<()> {
     let tilted = times(RUNS, || Joseph {}.forward(&turned, &views, volume.view(), projections.view_mut()));
     let tilted_back = times(RUNS, || Joseph {}.adjoint(&turned, &views, projections.view(), back.view_mut()));
     let scales = vec![1.0; views.len()];
-    let driven = times(RUNS, || {
-        for part in views.chunks(8) {
-            let images = projections.slice(ndarray::s![part[0]..part[0] + part.len(), .., ..]);
-            let pixels = ColumnMajor::new(&geometry, part, images, |_, _, _, x| x);
-            backproject(&geometry, part, &pixels, &scales, back.view_mut());
-        }
-    });
+    let mut drive = |geometry: &Geometry| {
+        times(RUNS, || {
+            for part in views.chunks(8) {
+                let images = projections.slice(ndarray::s![part[0]..part[0] + part.len(), .., ..]);
+                let pixels = ColumnMajor::new(geometry, part, images, |_, _, _, x| x);
+                backproject(geometry, part, &pixels, &scales[part[0]..], back.view_mut());
+            }
+        })
+    };
+    let (driven, driven_tilted) = (drive(&geometry), drive(&turned));
+    let header = ScanHeader { views: 0, detector: [0; 2], volume: geometry.volume.shape };
+    let mut prox = TvProx::new(geometry.volume.shape, [1.0; 3], &Space::new(header));
+    let (noisy, mut smooth) = (volume.as_slice().unwrap_or_default(), vec![0.0; volume.len()]);
+    let dual = times(RUNS, || prox.apply(noisy, 0.1, STEPS, &mut smooth));
+    let value = times(RUNS, || assert!(total_variation(volume.view(), [1.0; 3]) > 0.0));
     let scan = Scan { geometry, projections, unit: Unit::default(), provenance: serde_json::Value::Null };
     let fdk = fdk(&scan)?;
     let limit = Limit { multiply_adds: multiply_adds(), bytes: bandwidth() };
@@ -61,13 +73,17 @@ fn main() -> Result<()> {
         limit.bytes / 1e9
     );
     // A volume is read (and written) once for a batch of views, not once a view.
-    let volume = 4.0 * volume.len() as f64;
+    let (voxels, volume) = (volume.len() as f64, 4.0 * volume.len() as f64);
     report("joseph forward", forward, samples, volume, &limit);
     report("joseph adjoint", adjoint, samples, 2.0 * volume, &limit);
     report("tilted forward", tilted, samples, volume, &limit);
     report("tilted adjoint", tilted_back, samples, 2.0 * volume, &limit);
     report("voxel-driven back", driven, updates, 2.0 * volume * views.len().div_ceil(8) as f64, &limit);
+    report("tilted back", driven_tilted, updates, 2.0 * volume * views.len().div_ceil(8) as f64, &limit);
     report("fdk", fdk, updates, 2.0 * volume * views.len().div_ceil(8) as f64, &limit);
+    // The dual is read and written, the volume is read, its proximal map is written. A step is 16 multiply-adds a voxel.
+    report("tv, 4 dual steps", dual, 4.0 * STEPS as f64 * voxels, 8.0 * volume, &limit);
+    report("tv, its value", value, 2.0 * voxels, volume, &limit);
     Ok(())
 }
 

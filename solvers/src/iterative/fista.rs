@@ -4,7 +4,8 @@
 //!
 //! With n subsets the step is `1/L`, L an upper bound of the largest eigenvalue of every `n·(A_s·B)ᵀW(A_s·B)`, W the largest
 //! curvature of the data term: for a matrix M without negative entries `max_j (M·v)_j/v_j` is one for any positive v (Collatz
-//! and Wielandt), and power iterations make it tight.
+//! and Wielandt), a tight one where v is near to the eigenvector. `M_1·1` of the first subset is, for all of them: line
+//! integrals of ones hardly depend on the views. So each subset takes one projection and its adjoint.
 //!
 //! Subsets and unbounded momentum do not go together: what one subset's gradient lacks of the others' is amplified, and
 //! the iterates run away. FISTA's t is therefore bounded, and after a pass whose objective is above the last one's two
@@ -16,7 +17,7 @@ use super::model::{Model, projected};
 use super::norms::{change, distance, norm2};
 use super::order::{Order, Subsets, split, told};
 use super::plan::{Iterative, IterativePlan};
-use super::problem::images_mut;
+use super::problem::{images_mut, room};
 use super::regularizers::Nonnegative;
 use super::shared::Shared;
 use super::{Iteration, Pass, Problem, Stop, drive::drive, flat, flat_mut};
@@ -34,7 +35,7 @@ use conefield_core::space::Space;
 use conefield_core::spec::stage;
 use conefield_core::voxel::VoxelProjectorSpec;
 use conefield_projectors::voxel::Joseph;
-use ndarray::{Array3, Zip};
+use ndarray::{Array3, Axis, Zip};
 use rand::RngExt;
 use rayon::prelude::*;
 use schemars::JsonSchema;
@@ -239,12 +240,6 @@ impl Iterative for Built {
         if let Ok(expansion) = self.basis.on(&grid) {
             Arrays::new(self, expansion, &grid, &space, space.volume());
         }
-        // To measure its noise, all views are projected back at once.
-        let all = self.shared.projector.scratch(header, header.views);
-        self.prior.weight(&grid, &mut |_| {
-            space.pass(all);
-            0.0
-        });
         self.shared.price(&space, self.subsets)
     }
 
@@ -267,9 +262,12 @@ struct Arrays {
     before: Array3<f32>,
     /// What the coefficients are held to, if there is a pull.
     towards: Option<Array3<f32>>,
-    /// The pixels of a subset, which may come to be all views.
+    /// The pixels of a subset. Where subsets have become one, its views come a part after another.
     pixels: Array3<f32>,
 }
+
+/// What [`Arrays::part_by_part`] is to be given: images of some views, to be projected back.
+type Images<'a> = &'a mut dyn FnMut(&mut Model, &[usize], &mut Array3<f32>);
 
 impl Arrays {
     /// For a volume on the grid `voxels` that is at first `start`.
@@ -292,7 +290,7 @@ impl Arrays {
             fresh: coefficients(),
             before: coefficients(),
             towards: (settings.pull > 0.0).then(coefficients),
-            pixels: space.projections(space.header().views),
+            pixels: room(space, settings.subsets.count(space.header().views)),
         }
     }
 
@@ -305,39 +303,68 @@ impl Arrays {
         }
     }
 
+    /// Overwrites `gradient` with the adjoint of the images that `images` makes of `views`, as many at a time as there is room
+    /// for. Takes `fresh` for work.
+    fn part_by_part(&mut self, problem: &Problem<'_>, views: &[usize], images: Images<'_>) {
+        let Self { model, gradient, fresh, pixels, .. } = self;
+        for (n, part) in views.chunks(pixels.len_of(Axis(0)).max(1)).enumerate() {
+            images(model, part, pixels);
+            if n == 0 {
+                model.back(problem, part, pixels, gradient);
+            } else {
+                model.back(problem, part, pixels, fresh);
+                Zip::from(&mut *gradient).and(&*fresh).par_for_each(|sum, x| *sum += x);
+            }
+        }
+    }
+
     /// Root mean square of `(A·B)ᵀ·n` over the coefficients that rays meet, for noise n as `data` spreads it.
     fn noise_gain(&mut self, problem: &Problem<'_>, data: &dyn Misfit) -> f64 {
         let mut rng = stream(problem.seed ^ 0x0000_7e57_0015_e000, 0);
-        self.pixels.iter_mut().for_each(|sign| *sign = if rng.random::<bool>() { 1.0 } else { -1.0 });
-        let views = problem.views();
-        data.spread(&views, self.pixels.view_mut());
-        self.model.back(problem, &views, &self.pixels, &mut self.gradient);
+        self.part_by_part(problem, &problem.views(), &mut |_, views, pixels| {
+            let mut signs = images_mut(pixels, views.len());
+            signs.iter_mut().for_each(|sign| *sign = if rng.random::<bool>() { 1.0 } else { -1.0 });
+            data.spread(views, signs);
+        });
         let met = self.gradient.iter().filter(|x| **x != 0.0).count();
         (norm2(&self.gradient) / met.max(1) as f64).sqrt()
     }
 
-    /// An upper bound of the largest eigenvalue of `n·(A_s·B)ᵀW(A_s·B)` over n subsets, W the curvature of `data`.
+    /// An upper bound of the largest eigenvalue of `n·(A_s·B)ᵀW(A_s·B)` over n subsets, W the curvature of `data`. Takes `before`
+    /// for work.
     fn largest_eigenvalue(&mut self, problem: &Problem<'_>, data: &dyn Misfit, subsets: &[Vec<usize>]) -> f64 {
-        let (model, v, next) = (&mut self.model, &mut self.fresh, &mut self.gradient);
+        self.before.fill(1.0);
+        self.model.outside(problem, &mut self.before, 0.0);
+        let Some(first) = subsets.first() else { return 0.0 };
+        self.curved(problem, data, first);
+        let top = flat(&self.gradient).par_iter().copied().reduce(|| 0.0, f32::max);
+        // Nowhere near 0 but where no coefficient is: what a subset hardly meets another one may.
+        Zip::from(&mut self.before)
+            .and(&self.gradient)
+            .par_for_each(|v, n| *v *= (n / top.max(f32::MIN_POSITIVE)).max(FLOOR));
         let mut worst = 0.0f64;
         for views in subsets {
-            v.fill(1.0);
-            model.outside(problem, v, 0.0);
-            let mut bound = f64::INFINITY;
-            for _ in 0..2 {
-                model.forward(problem, views, v, &mut self.pixels);
-                data.curve(views, images_mut(&mut self.pixels, views.len()));
-                model.back(problem, views, &self.pixels, next);
-                let top = flat(next).par_iter().copied().reduce(|| 0.0, f32::max);
-                let ratio = |(a, b): (&f32, &f32)| if *b > 1e-6 { f64::from(a / b) } else { 0.0 };
-                bound = bound.min(flat(next).par_iter().zip(flat(v)).map(ratio).reduce(|| 0.0, f64::max));
-                Zip::from(&mut *v).and(&*next).par_for_each(|v, n| *v = n / top.max(f32::MIN_POSITIVE));
-            }
+            self.curved(problem, data, views);
+            let ratio = |(a, b): (&f32, &f32)| if *b > 0.0 { f64::from(a / b) } else { 0.0 };
+            let bound = flat(&self.gradient).par_iter().zip(flat(&self.before)).map(ratio).reduce(|| 0.0, f64::max);
             worst = worst.max(bound);
         }
         subsets.len() as f64 * worst
     }
+
+    /// Overwrites `gradient` with `(A_s·B)ᵀW(A_s·B)·v`, v in `before`.
+    fn curved(&mut self, problem: &Problem<'_>, data: &dyn Misfit, views: &[usize]) {
+        let v = std::mem::take(&mut self.before);
+        self.part_by_part(problem, views, &mut |model, views, pixels| {
+            model.forward(problem, views, &v, pixels);
+            data.curve(views, images_mut(pixels, views.len()));
+        });
+        self.before = v;
+    }
 }
+
+/// The least number of the vector that bounds the largest eigenvalue, its largest being 1.
+const FLOOR: f32 = 0.05;
 
 struct Iterate<'a> {
     arrays: Arrays,
@@ -348,8 +375,9 @@ struct Iterate<'a> {
     order: Order,
     /// λ in mm.
     lambda: f64,
-    /// L, with what the pull adds.
+    /// L, with what the pull adds: times this.
     lipschitz: f64,
+    pulled: f64,
     /// The share of a step that goes to what the coefficients are held to.
     pull: f32,
     /// FISTA's t.
@@ -375,6 +403,7 @@ impl<'a> Iterate<'a> {
             order: settings.order,
             lambda,
             lipschitz: lipschitz * (1.0 + settings.pull),
+            pulled: 1.0 + settings.pull,
             pull: (settings.pull / (1.0 + settings.pull)) as f32,
             t: 1.0,
             objective: f64::INFINITY,
@@ -389,10 +418,15 @@ impl<'a> Iterate<'a> {
 
     /// One subset: a step along its gradient and the prior's proximal map. Returns `‖p − A·x‖²` and the data term.
     fn update(&mut self, problem: &Problem<'_>, views: &[usize]) -> [f64; 2] {
-        let Arrays { model, penalty, x, ahead, gradient, fresh, towards, pixels, .. } = &mut self.arrays;
-        let residual = model.residual(problem, views, ahead, pixels);
-        let misfit = self.data.differentiate(views, images_mut(pixels, views.len()));
-        model.back(problem, views, pixels, gradient);
+        let (mut residual, mut misfit) = (0.0, 0.0);
+        let ahead = std::mem::take(&mut self.arrays.ahead);
+        let data = self.data.as_ref();
+        self.arrays.part_by_part(problem, views, &mut |model, views, pixels| {
+            residual += model.residual(problem, views, &ahead, pixels);
+            misfit += data.differentiate(views, images_mut(pixels, views.len()));
+        });
+        self.arrays.ahead = ahead;
+        let Arrays { model, penalty, x, ahead, gradient, fresh, towards, .. } = &mut self.arrays;
         let step = (self.subsets / self.lipschitz) as f32;
         Zip::from(&mut *gradient).and(&*ahead).par_for_each(|g, z| *g = z + step * *g);
         if let Some(towards) = towards {
@@ -429,7 +463,13 @@ impl Iteration for Iterate<'_> {
         let held = |towards: &Array3<f32>| 0.5 * f64::from(self.pull) * self.lipschitz * distance(x, towards).powi(2);
         let objective = misfit + prior + towards.as_ref().map_or(0.0, held);
         if objective > self.objective {
-            self.subsets = (0.5 * self.subsets).ceil();
+            let fewer = (0.5 * self.subsets).ceil();
+            // Of unions of the subsets before, their bound is one too.
+            if self.subsets % fewer != 0.0 {
+                let fewer = split(self.views, fewer as usize);
+                self.lipschitz = self.pulled * self.arrays.largest_eigenvalue(problem, self.data.as_ref(), &fewer);
+            }
+            self.subsets = fewer;
         }
         self.objective = objective;
         Ok(Pass { residual, change: Some(change), prior: Some(prior) })
@@ -452,6 +492,6 @@ impl Iteration for Iterate<'_> {
     }
 
     fn numbers(&mut self) -> Vec<&mut f64> {
-        vec![&mut self.t, &mut self.subsets, &mut self.objective]
+        vec![&mut self.t, &mut self.subsets, &mut self.objective, &mut self.lipschitz]
     }
 }
