@@ -24,6 +24,7 @@ mod file_order;
 mod filling;
 mod folder;
 mod input;
+mod memory;
 mod metaimage;
 mod naf;
 mod nifti;

@@ -287,9 +287,12 @@ impl Arrays {
                 data.curve(views, images_mut(&mut self.pixels, views.len()));
                 model.back(problem, views, &self.pixels, next);
                 let top = flat(next).par_iter().copied().reduce(|| 0.0, f32::max);
-                let ratio = |(a, b): (&f32, &f32)| if *b > 1e-6 { f64::from(a / b) } else { 0.0 };
+                // Outside the volume that rays see, and there alone, v is 0.
+                let ratio = |(a, b): (&f32, &f32)| if *b > 0.0 { f64::from(a / b) } else { 0.0 };
                 bound = bound.min(flat(next).par_iter().zip(flat(v)).map(ratio).reduce(|| 0.0, f64::max));
-                Zip::from(&mut *v).and(&*next).par_for_each(|v, n| *v = n / top.max(f32::MIN_POSITIVE));
+                // The bound holds for any v above 0: where rays hardly pass it is kept from vanishing.
+                Zip::from(&mut *v).and(&*next).par_for_each(|v, n| *v = (n / top.max(f32::MIN_POSITIVE)).max(1e-6));
+                model.outside(problem, v, 0.0);
             }
             worst = worst.max(bound);
         }
@@ -308,6 +311,8 @@ struct Iterate<'a> {
     lambda: f64,
     /// L, with what the pull adds.
     lipschitz: f64,
+    /// What the pull makes of L.
+    held: f64,
     /// The share of a step that goes to what the coefficients are held to.
     pull: f32,
     /// FISTA's t.
@@ -334,6 +339,7 @@ impl<'a> Iterate<'a> {
             order: settings.order,
             lambda,
             lipschitz: lipschitz * (1.0 + settings.pull),
+            held: 1.0 + settings.pull,
             pull: (settings.pull / (1.0 + settings.pull)) as f32,
             t: 1.0,
             objective: f64::INFINITY,
@@ -388,7 +394,14 @@ impl Iteration for Iterate<'_> {
         let held = |towards: &Array3<f32>| 0.5 * f64::from(self.pull) * self.lipschitz * distance(x, towards).powi(2);
         let objective = misfit + prior + towards.as_ref().map_or(0.0, held);
         if objective > self.objective {
+            let even = self.subsets % 2.0 == 0.0;
             self.subsets = (0.5 * self.subsets).ceil();
+            // What bounds each of n subsets bounds their unions; an odd number is split anew.
+            if !even {
+                let subsets = split(self.views, self.subsets as usize);
+                let bound = self.arrays.largest_eigenvalue(problem, self.data.as_ref(), &subsets);
+                self.lipschitz = self.lipschitz.max(bound * self.held);
+            }
         }
         self.objective = objective;
         Ok(Pass { residual, change: Some(change), prior: Some(prior) })
@@ -411,6 +424,6 @@ impl Iteration for Iterate<'_> {
     }
 
     fn numbers(&mut self) -> Vec<&mut f64> {
-        vec![&mut self.t, &mut self.subsets, &mut self.objective]
+        vec![&mut self.t, &mut self.subsets, &mut self.objective, &mut self.lipschitz]
     }
 }
