@@ -25,18 +25,26 @@ fn every_shipped_field_makes_a_volume() {
         // A chain's field is that of a spec of its own.
         json(&["explain", name, "--json"])["stages"].as_array().is_some_and(|stages| !stages.is_empty())
     };
-    let missing: Vec<&str> = SHIPPED
-        .iter()
-        .map(|s| s.name)
-        .filter(|n| neural(n) && !RUNS.iter().any(|(name, ..)| name == n))
-        .collect();
+    let missing: Vec<&str> =
+        SHIPPED.iter().map(|s| s.name).filter(|n| neural(n) && !RUNS.iter().any(|(name, ..)| name == n)).collect();
     assert!(missing.is_empty(), "no run of {missing:?}");
     let mut faults = vec![];
     for (name, steps, rays, least) in RUNS {
         let rays = format!("training.rays={rays}");
         let record = json(&[
-            "reconstruct", &at("scan"), "--spec", name, "-o", &at(name), "--reference", "truth", "--steps",
-            &steps.to_string(), "--set", &rays, "--json",
+            "reconstruct",
+            &at("scan"),
+            "--spec",
+            name,
+            "-o",
+            &at(name),
+            "--reference",
+            "truth",
+            "--steps",
+            &steps.to_string(),
+            "--set",
+            &rays,
+            "--json",
         ]);
         let psnr = record["scores"]["psnr"].as_f64().unwrap();
         println!("{name}: {psnr:.2} dB, {:.1} s", record["total_s"].as_f64().unwrap());

@@ -1,7 +1,7 @@
 //! A trained field, whose values can be had at the voxels of any grid.
 
-use crate::backend::{Backend, Executable};
 use crate::allowance;
+use crate::backend::{Backend, Executable};
 use crate::error::{Error, Result, ensure};
 use crate::geometry::VoxelGrid;
 use crate::parts::{Part, Voxels};

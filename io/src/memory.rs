@@ -11,9 +11,9 @@ pub(crate) fn grow<T>(values: &mut Vec<T>, more: usize, most: usize, place: &str
     }
     let capacity = (2 * values.len()).min(most).max(values.len() + more);
     allowance::memory(place, field, (capacity as u64).saturating_mul(size_of::<T>() as u64))?;
-    values.try_reserve_exact(capacity - values.len()).map_err(|_| {
-        Error::invalid(place, field, format!("{capacity} values"), "an array that fits in memory")
-    })
+    values
+        .try_reserve_exact(capacity - values.len())
+        .map_err(|_| Error::invalid(place, field, format!("{capacity} values"), "an array that fits in memory"))
 }
 
 /// `array` in C order, for which its values are there twice for a moment.

@@ -65,9 +65,7 @@ fn open(path: &Path, name: Option<&str>) -> Result<Input> {
     let name = PathBuf::from(&place);
     match method {
         CompressionMethod::Stored => Ok(Input::within(name, Checked::new(raw, checksum), size)),
-        CompressionMethod::Deflated => {
-            Ok(Input::within(name, Checked::new(DeflateDecoder::new(raw), checksum), size))
-        }
+        CompressionMethod::Deflated => Ok(Input::within(name, Checked::new(DeflateDecoder::new(raw), checksum), size)),
         other => Err(Error::unsupported(place, format!("it is packed as {other}; stored and deflated are read"))),
     }
 }

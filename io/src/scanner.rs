@@ -266,11 +266,7 @@ pub(crate) fn size(path: &Path) -> Result<ScanSize> {
 
 /// Turns the rows round where that makes the views one of this program's own circles, on which rows run down: what
 /// knows only those can then take the scan. RTK's rows run up.
-fn rows_down(
-    place: &str,
-    mut geometry: Geometry,
-    mut projections: Array3<f32>,
-) -> Result<(Geometry, Array3<f32>)> {
+fn rows_down(place: &str, mut geometry: Geometry, mut projections: Array3<f32>) -> Result<(Geometry, Array3<f32>)> {
     let turned: Vec<View> = geometry.views.iter().map(|w| View { v: w.v.map(|x| 0.0 - x), ..*w }).collect();
     if CircularOrbit::fit(&turned).is_some() {
         geometry.views = turned;

@@ -58,6 +58,15 @@ pub fn scan_size(path: impl AsRef<Path>) -> Result<ScanSize> {
     Ok(size)
 }
 
+/// The size of the scan that a scanner's description makes.
+pub fn scanner_size(path: impl AsRef<Path>) -> Result<ScanSize> {
+    let path = path.as_ref();
+    let size = scanner::size(path)?;
+    must_exist(path, "pixels of all views", size.pixels)?;
+    must_exist(path, "voxels", size.voxels)?;
+    Ok(size)
+}
+
 /// Number of voxels of a volume, from its header; of a DICOM series from those of its slices.
 pub fn volume_voxels(path: impl AsRef<Path>) -> Result<u64> {
     let path = path.as_ref();

@@ -272,7 +272,7 @@ mod tests {
                     a.invert_axis(Axis(2));
                 }
                 let order = axes.map(|x| x as usize);
-                assert_eq!(layout.arrange(a.permuted_axes(order)), want, "{layout:?}");
+                assert_eq!(layout.arrange("a", a.permuted_axes(order)).unwrap(), want, "{layout:?}");
             }
         }
     }

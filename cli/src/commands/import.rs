@@ -41,7 +41,7 @@ pub struct ImportArgs {
 impl ImportArgs {
     pub fn run(self) -> Result<()> {
         refuse_existing(&self.output, self.force)?;
-        Memory::of_views(&conefield_io::scan_size(&self.scanner)?).check(|_| vec![])?;
+        Memory::of_views(&conefield_io::scanner_size(&self.scanner)?).check(|_| vec![])?;
         let options = ImportOptions { i0: self.i0, floor: self.floor };
         let imported = conefield_io::read_scanner(&self.scanner, &options)?;
         conefield_io::write_scan(&self.output, &imported.scan, None)?;

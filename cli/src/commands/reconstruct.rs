@@ -257,6 +257,9 @@ impl ReconstructArgs {
         let mut sets = sets.to_vec();
         // A run that is resumed without a spec has it in its own.
         if let Some(path) = self.init.as_ref().filter(|_| self.spec.is_some() || !self.resume) {
+            if conefield_io::is_volume(path) {
+                memory::Memory::of_volumes(&[conefield_io::volume_voxels(path)?]).check(|_| vec![])?;
+            }
             sets.push(method::init(&specs::read(spec, &sets)?.tree, path));
         }
         method::planned(spec, &sets, backend, &run)

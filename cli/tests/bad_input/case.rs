@@ -10,6 +10,8 @@ use std::time::{Duration, Instant, SystemTime};
 const MEMORY_KIB: u64 = 1 << 20;
 /// What `--memory` is, where a case does not say otherwise.
 const USUAL: &str = "1GiB";
+/// More than any header claims, so that a reader comes to look at what a file holds.
+pub const AMPLE: Option<&str> = Some("1000TiB");
 /// Processor seconds that it gets.
 const SECONDS: u64 = 20;
 /// When it is killed, if it only waits.
@@ -67,9 +69,8 @@ impl Case {
         let program = assert_cmd::cargo::cargo_bin("conefield");
         // Two threads, as each takes address space of its own.
         let memory = self.memory.map_or(String::new(), |m| format!("--memory {m} "));
-        let limited = format!(
-            "ulimit -v {MEMORY_KIB}; ulimit -t {SECONDS}; ulimit -c 0; exec \"$0\" --threads 2 {memory}\"$@\""
-        );
+        let limited =
+            format!("ulimit -v {MEMORY_KIB}; ulimit -t {SECONDS}; ulimit -c 0; exec \"$0\" --threads 2 {memory}\"$@\"");
         let mut command = Command::new("sh");
         let words: Vec<String> = match self.args.contains('\'') {
             true => shlex::split(self.args).unwrap(),
@@ -87,7 +88,12 @@ impl Case {
                 Some(USUAL) => format!("conefield {}", self.args),
                 _ => format!("conefield {memory}{}", self.args),
             },
-            message: message(&said, &String::from_utf8_lossy(&output.stdout), self.end, self.says),
+            message: without_figures(message(
+                &said,
+                &String::from_utf8_lossy(&output.stdout),
+                self.end,
+                self.says,
+            )),
             status: output.status.code(),
             faults: vec![],
         };
@@ -142,6 +148,16 @@ fn message(said: &str, printed: &str, end: End, says: &[&str]) -> String {
             lines.find(|l| warns(l) && says.iter().all(|w| l.contains(w))).unwrap_or_default().to_owned()
         }
     }
+}
+
+/// The message without sizes that differ from machine to machine: of what there is, and of what the program holds.
+fn without_figures(text: String) -> String {
+    let marks = [" are available", " that are held", " in all, as --memory"];
+    marks.iter().fold(text, |text, mark| {
+        let Some(at) = text.find(mark) else { return text };
+        let before = text[..at].rsplitn(3, ' ').nth(2).unwrap_or_default();
+        format!("{before} …{}", &text[at..])
+    })
 }
 
 /// Everything below `folder`: length and time of change by path.

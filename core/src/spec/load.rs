@@ -6,8 +6,8 @@
 
 use super::tree::{At, Entry, Kind, Node, parse_json, parse_toml};
 use super::{LABEL, Spec, check, one_of};
-use crate::error::{Error, Result, ensure};
 use crate::allowance::Work;
+use crate::error::{Error, Result, ensure};
 use crate::{files, registry};
 use serde_json::Value;
 use std::path::{Path, PathBuf};
@@ -236,13 +236,7 @@ impl Layer {
     }
 
     /// The tree that `node`, a table of this layer, extends.
-    fn base(
-        &self,
-        node: &mut Node,
-        shipped: &[Shipped],
-        above: &[Origin],
-        work: &mut Work,
-    ) -> Result<Option<Node>> {
+    fn base(&self, node: &mut Node, shipped: &[Shipped], above: &[Origin], work: &mut Work) -> Result<Option<Node>> {
         let Some(extends) = node.take("extends") else { return Ok(None) };
         let at = extends.value.at.to_string();
         let Some(what) = extends.value.text() else {
@@ -269,13 +263,7 @@ impl Layer {
 
     /// Puts what the methods of a chain extend under them. Of the specs that they name only the method counts, and the
     /// plugins that it needs.
-    fn extend_methods(
-        &self,
-        node: &mut Node,
-        shipped: &[Shipped],
-        above: &[Origin],
-        work: &mut Work,
-    ) -> Result<()> {
+    fn extend_methods(&self, node: &mut Node, shipped: &[Shipped], above: &[Origin], work: &mut Work) -> Result<()> {
         let Some(Kind::Array(methods)) = node.get_mut(METHODS).map(|m| &mut m.kind) else { return Ok(()) };
         let mut plugins = vec![];
         for method in methods {

@@ -160,7 +160,9 @@ impl FdkOrbit {
         match self.coverage {
             Coverage::Full => format!("full turn: every ray counts half ({arc})"),
             Coverage::Offset { overlap: 0.0, .. } => {
-                format!("detector wholly on one side of the axis: every ray counts whole, those near the axis are missing ({arc})")
+                format!(
+                    "detector wholly on one side of the axis: every ray counts whole, those near the axis are missing ({arc})"
+                )
             }
             Coverage::Offset { overlap, .. } => {
                 format!("offset detector: Wang's weights over {:.1} mm either side of the axis ({arc})", overlap)

@@ -67,8 +67,7 @@ pub fn dicom_of_zeros(dir: &Path, side: u16) {
         }
         // Two bytes for 128 zeros.
         let runs = [129u8, 0].repeat((usize::from(side) * usize::from(side)).div_ceil(128));
-        let mut bytes =
-            [2u32, 64, 64 + runs.len() as u32].iter().flat_map(|x| x.to_le_bytes()).collect::<Vec<u8>>();
+        let mut bytes = [2u32, 64, 64 + runs.len() as u32].iter().flat_map(|x| x.to_le_bytes()).collect::<Vec<u8>>();
         bytes.resize(64, 0);
         bytes.extend(runs.repeat(2));
         o.put(DataElement::new(PIXELS, VR::OB, PixelFragmentSequence::new_fragments(vec![bytes])));
