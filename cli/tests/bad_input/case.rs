@@ -88,12 +88,7 @@ impl Case {
                 Some(USUAL) => format!("conefield {}", self.args),
                 _ => format!("conefield {memory}{}", self.args),
             },
-            message: without_figures(message(
-                &said,
-                &String::from_utf8_lossy(&output.stdout),
-                self.end,
-                self.says,
-            )),
+            message: without_figures(message(&said, &String::from_utf8_lossy(&output.stdout), self.end, self.says)),
             status: output.status.code(),
             faults: vec![],
         };

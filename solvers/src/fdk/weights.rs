@@ -96,7 +96,8 @@ impl FdkOrbit {
         let both = low < 0.0 && high > 0.0;
         let aside = (low + high).abs();
         let coverage = if full && aside > 1.5 * pitch {
-            let overlap = if both { narrow } else { 0.0 };
+            // A border on the axis itself is there but for rounding.
+            let overlap = if both && narrow > 1e-6 * pitch { narrow } else { 0.0 };
             Coverage::Offset { overlap, sign: if high > -low { 1.0 } else { -1.0 } }
         } else if full {
             Coverage::Full
