@@ -81,7 +81,7 @@ pub struct General {
     #[arg(short, long, global = true, conflicts_with = "verbose", help_heading = "General options")]
     pub quiet: bool,
     /// Worker threads [default: one a core].
-    #[arg(long, global = true, value_name = "N", help_heading = "General options", value_parser = clap::value_parser!(u16).range(1..))]
+    #[arg(long, global = true, value_name = "N", help_heading = "General options", value_parser = clap::value_parser!(u16).range(1..=1024))]
     pub threads: Option<u16>,
     /// Memory that a command may take, such as 8GiB [default: what is available]. One that needs more is refused.
     #[arg(long, global = true, value_name = "SIZE", help_heading = "General options", value_parser = crate::parse::bytes)]

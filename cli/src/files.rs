@@ -5,7 +5,7 @@ use conefield_core::arena::Weights;
 use conefield_core::checkpoint::{Checkpoint, Resume};
 use conefield_core::pipeline::Model;
 use conefield_core::scan::{Scan, Volume};
-use conefield_core::trained::TrainedField;
+use conefield_core::trained::{Placement, TrainedField};
 use conefield_core::{Error, Result};
 use conefield_diagnosis::{Survey, survey};
 pub use conefield_io::read_weights;
@@ -90,8 +90,13 @@ pub fn read_field(path: &Path) -> Result<TrainedField> {
     };
     let loaded = crate::specs::reread(note("spec")?, &format!("{place}: spec.toml"))?;
     let plan = crate::method::plan_without_files(&loaded, &Cpu::new())?;
-    let placement = serde_json::from_str(note(PLACEMENT)?)
+    let placement: Placement = serde_json::from_str(note(PLACEMENT)?)
         .map_err(|e| Error::invalid(&place, PLACEMENT, e, "what conefield writes there"))?;
+    placement.validate(&place)?;
+    // The notes say how large the network is: the tensors must be, before memory is taken for it. A mask leaves less of it.
+    if let Some(pipeline) = plan.pipeline().filter(|_| placement.masks.is_empty()) {
+        weights.check(&place, pipeline.layout(), |_| true)?;
+    }
     plan.restore(&placement, &mut |model| {
         weights.load(&place, model.pipeline.layout(), &mut model.arena.params, |_| true).map(drop)
     })

@@ -39,8 +39,9 @@ struct Cli {
     general: commands::General,
 }
 
-/// Runs the command line of this process.
-pub fn main() -> ExitCode {
+/// Runs the command line of this process, whose allocator tells how many bytes are `held`.
+pub fn main(held: fn() -> u64) -> ExitCode {
+    memory::count(held);
     run(std::env::args_os())
 }
 
@@ -49,9 +50,7 @@ pub fn run(args: impl IntoIterator<Item = OsString>) -> ExitCode {
     let cli = Cli::parse_from(args);
     let general = cli.general;
     progress::start_log(general.verbose, general.quiet);
-    if let Some(bytes) = general.memory {
-        memory::set_budget(bytes);
-    }
+    memory::set_budget(general.memory);
     if let Some(n) = general.threads
         && let Err(e) = rayon::ThreadPoolBuilder::new().num_threads(n.into()).build_global()
     {

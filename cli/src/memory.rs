@@ -5,7 +5,7 @@
 
 use crate::out::bytes;
 use conefield_core::method::{Needs, Plan};
-use conefield_core::{Error, Result};
+use conefield_core::{Error, Result, allowance};
 use conefield_io::{SLAB_BYTES, ScanSize};
 use serde::Serialize;
 use std::sync::OnceLock;
@@ -17,9 +17,23 @@ const PROGRAM: u64 = 24 << 20;
 /// What `--memory` allows.
 static BUDGET: OnceLock<u64> = OnceLock::new();
 
-/// Sets what commands may take, instead of what the system has.
-pub fn set_budget(bytes: u64) {
-    let _ = BUDGET.set(bytes);
+/// What tells how many bytes the process holds, where its allocator counts them.
+static HELD: OnceLock<fn() -> u64> = OnceLock::new();
+
+/// Lets readers draw from the allowance of memory.
+pub fn count(held: fn() -> u64) {
+    let _ = HELD.set(held);
+}
+
+/// Sets what commands may take; without `bytes`, what the system has. Readers are kept within it as they allocate.
+pub fn set_budget(bytes: Option<u64>) {
+    if let Some(bytes) = bytes {
+        let _ = BUDGET.set(bytes);
+    }
+    if let Some(held) = HELD.get() {
+        let most = bytes.unwrap_or(u64::MAX).min(available());
+        allowance::set_memory(most, *held);
+    }
 }
 
 /// Bytes by what holds them, at the moment that takes most.
@@ -101,7 +115,19 @@ fn available() -> u64 {
         system.process(pid)?.cgroup_limits()
     });
     // The group's free memory lacks what the system caches for it and gives back when asked.
-    limits.map_or(machine, |l| machine.min(l.total_memory.saturating_sub(l.rss)))
+    limits.map_or(machine, |l| machine.min(l.total_memory.saturating_sub(l.rss))).min(addresses())
+}
+
+/// What is left of the address space where it is limited. An eighth is kept for threads and for what the allocator takes
+/// around what it hands out.
+fn addresses() -> u64 {
+    let kib = |text: &str| text.trim().strip_suffix("kB").and_then(|n| n.trim().parse::<u64>().ok());
+    let used = std::fs::read_to_string("/proc/self/status").ok();
+    let used = used.and_then(|s| kib(s.lines().find_map(|l| l.strip_prefix("VmSize:"))?)).unwrap_or(0) << 10;
+    let limits = std::fs::read_to_string("/proc/self/limits").unwrap_or_default();
+    let limit = limits.lines().find_map(|l| l.strip_prefix("Max address space"));
+    let soft = limit.and_then(|l| l.split_whitespace().next()?.parse::<u64>().ok());
+    soft.map_or(u64::MAX, |most| most.saturating_sub(used) / 8 * 7)
 }
 
 /// The most that this process has held so far, where the system tells.

@@ -12,6 +12,11 @@ use ndarray::{Array3, ArrayViewMut3};
 use std::path::Path;
 use std::time::Instant;
 
+/// Writes `voxels` to `path` and keeps none.
+pub fn write_only(path: &Path, voxels: &mut dyn Voxels) -> Result<()> {
+    conefield_io::write_voxels(path, &mut Outgoing::new(path, voxels))
+}
+
 /// What is kept of voxels that were written.
 pub struct WrittenVolume {
     /// The middle slices.
@@ -24,29 +29,35 @@ pub struct WrittenVolume {
 pub fn write(path: &Path, voxels: &mut dyn Voxels, affine: Option<Affine>, keep: bool) -> Result<WrittenVolume> {
     let grid = voxels.grid();
     let affine = voxels.affine().or(affine);
-    let mut outgoing = Outgoing {
-        slices: MiddleSlices::new(grid),
-        whole: keep.then(|| Volume { data: Array3::zeros(grid.shape), grid, affine }),
-        affine,
-        voxels,
-        place: path.display().to_string(),
-        progress: Progress::new("export", None),
-        start: Instant::now(),
-        done: 0,
-    };
+    let whole = keep.then(|| Volume { data: Array3::zeros(grid.shape), grid, affine });
+    let kept = WrittenVolume { slices: MiddleSlices::new(grid), whole };
+    let mut outgoing = Outgoing { kept: Some(kept), affine, ..Outgoing::new(path, voxels) };
     conefield_io::write_voxels(path, &mut outgoing)?;
-    Ok(WrittenVolume { slices: outgoing.slices, whole: outgoing.whole })
+    outgoing.kept.ok_or_else(|| Error::unsupported("writing a volume", "nothing of it was kept"))
 }
 
 struct Outgoing<'a> {
     voxels: &'a mut dyn Voxels,
     affine: Option<Affine>,
-    slices: MiddleSlices,
-    whole: Option<Volume>,
+    kept: Option<WrittenVolume>,
     place: String,
     progress: Progress,
     start: Instant,
     done: usize,
+}
+
+impl<'a> Outgoing<'a> {
+    fn new(path: &Path, voxels: &'a mut dyn Voxels) -> Self {
+        Self {
+            affine: voxels.affine(),
+            kept: None,
+            voxels,
+            place: path.display().to_string(),
+            progress: Progress::new("export", None),
+            start: Instant::now(),
+            done: 0,
+        }
+    }
 }
 
 impl Voxels for Outgoing<'_> {
@@ -63,10 +74,12 @@ impl Voxels for Outgoing<'_> {
             return Err(Error::Cancelled { place: self.place.clone() });
         }
         self.voxels.fill(part, out.view_mut())?;
-        self.slices.gather(part, out.view());
-        if let Some(whole) = &mut self.whole {
-            let [x, y, z] = part.clone();
-            whole.data.slice_mut(ndarray::s![x, y, z]).assign(&out);
+        if let Some(kept) = &mut self.kept {
+            kept.slices.gather(part, out.view());
+            if let Some(whole) = &mut kept.whole {
+                let [x, y, z] = part.clone();
+                whole.data.slice_mut(ndarray::s![x, y, z]).assign(&out);
+            }
         }
         self.done += out.len();
         let share = self.done as f64 / self.voxels.grid().len().unwrap_or(usize::MAX) as f64;

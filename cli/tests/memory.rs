@@ -166,6 +166,32 @@ fn what_does_not_fit_is_refused_with_figures_before_anything_is_made() {
     assert!(said.contains(" views") && said.contains("a detector of 512x512 would fit"), "{said}");
 }
 
+/// A layer of 576 MB is written by its rows. The file runs into its limit, which is told.
+#[test]
+#[cfg(target_os = "linux")]
+fn an_export_of_large_layers_stays_within_its_memory() {
+    let dir = tempfile::tempdir().unwrap();
+    scan(dir.path(), 4, 32);
+    let sets = ["--set", "encoder.levels=2", "--set", "field.width=8", "--set", "field.depth=2", "--steps", "2"];
+    let (scan, run) = (text(&dir.path().join("scan")), text(&dir.path().join("run")));
+    done(&[&["reconstruct", &scan, "--spec", "fast", "-o", &run, "--set", "field.skips=[]"], &sets[..]].concat());
+    // A gigabyte of address space, files of at most 20 MB.
+    let limited = "ulimit -v 1048576; ulimit -f 20000; trap '' XFSZ; exec \"$0\" \"$@\"";
+    let program = assert_cmd::cargo::cargo_bin("conefield");
+    for name in ["x.npy", "x.nii"] {
+        let output = assert_cmd::Command::new("sh")
+            .args(["-c", limited])
+            .arg(&program)
+            .args(["--quiet", "--threads", "2", "--memory", "200MiB", "export", &run, "--voxels", "12000", "-o"])
+            .arg(dir.path().join(name))
+            .output()
+            .unwrap();
+        let said = String::from_utf8_lossy(&output.stderr);
+        assert_eq!(output.status.code(), Some(1), "{name}: {said}");
+        assert!(said.contains(name) && said.to_lowercase().contains("too large"), "{name}: {said}");
+    }
+}
+
 /// A volume is written in less memory than half of it takes.
 #[test]
 #[cfg_attr(not(target_os = "linux"), ignore = "the peak is read from /proc")]

@@ -106,8 +106,7 @@ impl Weights {
         Self { tensors, notes: BTreeMap::new() }
     }
 
-    /// Copies every block for which `take` holds into `params`. Refuses, before anything is written, a block that
-    /// is missing here, has another shape, or holds a number that is not finite.
+    /// Copies every block for which `take` holds into `params`, if [`Weights::check`] finds nothing wrong.
     pub fn load(
         &self,
         place: &str,
@@ -115,6 +114,16 @@ impl Weights {
         params: &mut [f32],
         take: impl Fn(&str) -> bool,
     ) -> Result<InitReport> {
+        let report = self.check(place, layout, &take)?;
+        for b in layout.blocks.iter().filter(|b| take(&b.name)) {
+            params[b.range.clone()].copy_from_slice(&self.tensors[&b.name].1);
+        }
+        Ok(report)
+    }
+
+    /// What [`Weights::load`] would do, without an array of parameters. Refuses a block for which `take` holds that is
+    /// missing here, has another shape, or holds a number that is not finite.
+    pub fn check(&self, place: &str, layout: &Layout, take: impl Fn(&str) -> bool) -> Result<InitReport> {
         let mut report = InitReport::default();
         for b in &layout.blocks {
             if !take(&b.name) {
@@ -140,9 +149,6 @@ impl Weights {
         for name in self.tensors.keys().filter(|n| !report.loaded.contains(n)) {
             let why = if layout.find(name).is_some() { "not asked for" } else { "not in this pipeline" };
             report.unused.push((name.clone(), why.into()));
-        }
-        for b in layout.blocks.iter().filter(|b| take(&b.name)) {
-            params[b.range.clone()].copy_from_slice(&self.tensors[&b.name].1);
         }
         Ok(report)
     }

@@ -26,6 +26,7 @@ pub fn read_text(path: &Path, most: u64) -> Result<String> {
     if size > most {
         return Err(invalid("file size", format!("{size} bytes"), format!("at most {most} bytes")));
     }
+    crate::allowance::memory(&path.display().to_string(), "file size", size)?;
     let mut raw = Vec::new();
     file.take(most).read_to_end(&mut raw).map_err(|e| Error::io(path, e))?;
     String::from_utf8(raw)

@@ -7,7 +7,7 @@
 //! - [`loss`], [`prior`]: what training makes small.
 //! - [`wgsl`]: the same for a GPU.
 //! - [`arena`]: parameters, gradients and optimizer state under their names.
-//! - [`files`]: opening what a user or a description names.
+//! - [`files`]: opening what a user or a description names; [`allowance`]: the memory and work that reading it may take.
 //! - [`settings`], [`precision`], [`spec`], [`registry`]: what a user writes, and the types that it may name.
 //! - [`host`]: stages on the host, for what looks at a model beside training.
 //! - [`voxel`]: line integrals of voxel volumes.
@@ -16,6 +16,7 @@
 //! - [`method`]: what a spec names, its plan and its run; [`pipeline`], [`backend`], [`trained`]: a field from its stages to a
 //!   volume; [`checkpoint`]: where a run stands.
 
+pub mod allowance;
 pub mod arena;
 pub mod backend;
 pub mod basis;

@@ -58,6 +58,9 @@ pub struct Scan {
     pub provenance: serde_json::Value,
 }
 
+/// Largest line integral: squares of it, summed over a scan, stay far below the end of single precision.
+const MOST: f32 = 1e15;
+
 impl Scan {
     /// Its size.
     pub fn header(&self) -> ScanHeader {
@@ -96,6 +99,11 @@ impl Scan {
                 x,
                 "a finite line integral",
             ));
+        }
+        if let Some((at, x)) = self.projections.indexed_iter().find(|(_, x)| x.abs() > MOST) {
+            let field = format!("projections[{}, {}, {}]", at.0, at.1, at.2);
+            let expected = format!("a line integral of at most {MOST:e}, past which single precision overflows");
+            return Err(crate::Error::invalid(place, field, format!("{x:e}"), expected));
         }
         Ok(())
     }

@@ -1,7 +1,8 @@
 //! A trained field, whose values can be had at the voxels of any grid.
 
+use crate::allowance;
 use crate::backend::{Backend, Executable};
-use crate::error::{Error, Result};
+use crate::error::{Error, Result, ensure};
 use crate::geometry::VoxelGrid;
 use crate::parts::{Part, Voxels};
 use crate::pipeline::{Model, Pipeline};
@@ -41,6 +42,18 @@ pub struct Placement {
     pub support: Option<Support>,
 }
 
+impl Placement {
+    /// Refuses numbers that no run leaves; `place` is the file that holds it.
+    pub fn validate(&self, place: &str) -> Result<()> {
+        self.grid.validate(&format!("{place}: placement"))?;
+        for (field, x) in [("attenuation", self.attenuation), ("unit_mm", self.unit_mm)] {
+            let good = x.is_finite() && x > 0.0;
+            ensure(good, place, &format!("placement.{field}"), x, "a finite number above 0")?;
+        }
+        Ok(())
+    }
+}
+
 impl TrainedField {
     /// What is to be kept.
     pub fn placement(&self) -> Placement {
@@ -60,7 +73,10 @@ impl TrainedField {
         placement: &Placement,
         load: &mut dyn FnMut(&mut Model) -> Result<()>,
     ) -> Result<Self> {
-        placement.grid.validate("placement")?;
+        placement.validate("weights")?;
+        let parameters = pipeline.layout().len() as u64;
+        // Parameters, gradients and both moments.
+        allowance::memory("weights", "parameters", parameters.saturating_mul(16))?;
         let mut scene = Scene::with_attenuation(placement.grid, settings, placement.attenuation)?;
         if let Some(support) = placement.support.clone() {
             scene = scene.within(support, settings);

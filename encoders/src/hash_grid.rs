@@ -448,6 +448,11 @@ impl<R: Real, P: Stored<R>> Backward<'_, R, P> {
                             (0..F).map(|f| entry[f].value() * dy[i][f]).sum()
                         });
                         for d in 0..3 {
+                            // Beyond the rim a position counts as on it, whichever it is.
+                            let x = self.x.channel(d)[at + i];
+                            if !(x <= R::ONE && x * R::of(level.scale) + R::of(0.5) >= R::ZERO) {
+                                continue;
+                            }
                             let mut slope = R::ZERO;
                             for c in 0..8 {
                                 let mut w = if c >> d & 1 == 1 { R::of(level.scale) } else { R::of(-level.scale) };
@@ -677,6 +682,25 @@ mod tests {
                 assert!((total - 1.0).abs() < 1e-6);
             }
         }
+    }
+
+    /// Where a position is clamped, moving it changes nothing: its gradient is 0, and the others' is not.
+    #[test]
+    fn clamped_positions_have_no_gradient() {
+        let stage = HashGridStage::new(&HashGrid { levels: 2, ..HashGrid::default() }).unwrap();
+        let info = stage.info();
+        let mut params = vec![0.0f64; info.params];
+        params.iter_mut().enumerate().for_each(|(i, p)| *p = ((i * 7919) % 101) as f64 / 101.0);
+        // Channel by channel: x clamped below, y inside, z clamped above; then all inside.
+        let (x, rows) = ([-0.3, 0.4, 0.45, 0.7, 1.4, 0.9], 2);
+        let dy = vec![1.0; info.output * rows];
+        let (mut grads, mut dx) = (vec![0.0; info.params], vec![0.0; 3 * rows]);
+        let into = Grads { values: &mut grads, range: 0..info.params };
+        let kernel: &dyn Kernel<f64> = &stage;
+        let (tape, into_x) = (TileMut::new(&mut [], rows), Some(TileMut::new(&mut dx, rows)));
+        kernel.backward(&params, Tile::new(&x, rows), tape, Tile::new(&dy, rows), into, into_x);
+        assert_eq!([dx[0], dx[4]], [0.0, 0.0]);
+        assert!([dx[1], dx[2], dx[3], dx[5]].iter().all(|g| *g != 0.0), "{dx:?}");
     }
 
     #[test]

@@ -72,5 +72,7 @@ fn stage_level_backward(x: vec3<f32>, level: stage_Level, dy: ptr<function, arra
             slope += along * sign * vec3<f32>(w.y * w.z, w.x * w.z, w.x * w.y);
         }
     }
-    return slope * level.scale;
+    // Beyond the rim a position counts as on it, whichever it is.
+    let inside = (x <= vec3<f32>(1.0)) & (x * level.scale + 0.5 >= vec3<f32>(0.0));
+    return select(vec3<f32>(0.0), slope * level.scale, inside);
 }

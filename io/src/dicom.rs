@@ -14,7 +14,7 @@ mod tests;
 use crate::affine;
 use conefield_core::geometry::{VoxelGrid, cross, dot, norm, sub};
 use conefield_core::scan::Volume;
-use conefield_core::{Error, Result, files};
+use conefield_core::{Error, Result, allowance, files};
 use ndarray::{Array3, s};
 use slice::Slice;
 use std::collections::BTreeMap;
@@ -36,6 +36,17 @@ pub(crate) fn is_series(folder: &Path) -> bool {
 /// x runs along the rows of a slice, y down its columns, z along the normal of both. Values are rescaled (Hounsfield
 /// units in a CT), padding as well. The affine is RAS, in mm; `grid.center` is `[0, 0, 0]`.
 pub(crate) fn read(folder: &Path) -> Result<Volume> {
+    let place = folder.display().to_string();
+    assemble(&place, slices(folder)?)
+}
+
+/// How many voxels [`read`] gives, from the headers of the slices.
+pub(crate) fn voxels(folder: &Path) -> Result<u64> {
+    Ok(slices(folder)?.iter().map(|s| s.rows as u64 * s.columns as u64).sum())
+}
+
+/// The slices of the one series of `folder`, without their values.
+fn slices(folder: &Path) -> Result<Vec<Slice>> {
     let mut series: BTreeMap<String, Vec<Slice>> = BTreeMap::new();
     let mut others = 0;
     for path in files(folder)? {
@@ -56,7 +67,7 @@ pub(crate) fn read(folder: &Path) -> Result<Volume> {
         let found = format!("none among {others} files (subfolders are not searched)");
         return Err(Error::invalid(place, "DICOM slices", found, "the files of one series"));
     };
-    assemble(&place, slices)
+    Ok(slices)
 }
 
 /// The regular files of `folder` by name.
@@ -106,6 +117,7 @@ fn assemble(place: &str, mut slices: Vec<Slice>) -> Result<Volume> {
     if !affine::is_regular(&lps) {
         return Err(Error::invalid(place, "ImagePositionPatient", format!("{lps:?}"), "three independent voxel axes"));
     }
+    allowance::numbers(place, "voxels", grid.len().unwrap_or(usize::MAX))?;
     let mut data = Array3::zeros(grid.shape);
     for (z, slice) in slices.iter().enumerate() {
         let values = slice.values()?;

@@ -3,6 +3,7 @@
 
 use crate::affine::Affine;
 use crate::input::Input;
+use crate::memory;
 use crate::number;
 use conefield_core::geometry::VoxelGrid;
 use conefield_core::parts::Voxels;
@@ -24,7 +25,7 @@ pub(crate) fn read(input: &Input, grid: VoxelGrid, affine: Affine, values: Vec<f
     let [nx, ny, nz] = grid.shape;
     let data = Array3::from_shape_vec((nx, ny, nz).f(), values)
         .map_err(|e| input.invalid("data", e, "as many values as voxels"))?;
-    let data = data.as_standard_layout().into_owned();
+    let data = memory::in_order(&input.place(), "data", data)?;
     if let Some((at, x)) = data.indexed_iter().find(|(_, x)| !x.is_finite()) {
         return Err(input.invalid(format!("voxel [{}, {}, {}]", at.0, at.1, at.2), x, "a finite number"));
     }
@@ -48,12 +49,16 @@ pub(crate) fn write(w: &mut dyn Write, path: &Path, voxels: &mut dyn Voxels, ord
         FileOrder::XFastest => 2,
         FileOrder::ZFastest => 0,
     };
-    let layer = shape.iter().product::<usize>() / shape[axis];
-    let thick = (SLAB / layer).clamp(1, shape[axis]);
-    let mut values = vec![0.0; thick * layer];
-    for from in (0..shape[axis]).step_by(thick) {
+    // Whole layers where one fits, else rows of one.
+    let (row, rows) = (shape[2 - axis], shape[1]);
+    let broad = (SLAB / row).clamp(1, rows);
+    let thick = (SLAB / (row * rows)).clamp(1, shape[axis]);
+    let mut values = vec![0.0; thick * broad * row];
+    let layers = (0..shape[axis]).step_by(thick);
+    for (from, along) in layers.flat_map(|from| (0..rows).step_by(broad).map(move |along| (from, along))) {
         let mut part = shape.map(|n| 0..n);
         part[axis] = from..(from + thick).min(shape[axis]);
+        part[1] = along..(along + broad).min(rows);
         let size = part.each_ref().map(|r| r.len());
         let values = &mut values[..size.iter().product()];
         let layout = size.set_f(order == FileOrder::XFastest);
@@ -62,8 +67,8 @@ pub(crate) fn write(w: &mut dyn Write, path: &Path, voxels: &mut dyn Voxels, ord
         voxels.fill(&part, slab)?;
         if let Some(i) = values.iter().position(|x| !x.is_finite()) {
             let at = match order {
-                FileOrder::XFastest => [i % size[0], i / size[0] % size[1], from + i / (size[0] * size[1])],
-                FileOrder::ZFastest => [from + i / (size[1] * size[2]), i / size[2] % size[1], i % size[2]],
+                FileOrder::XFastest => [i % size[0], along + i / size[0] % size[1], from + i / (size[0] * size[1])],
+                FileOrder::ZFastest => [from + i / (size[1] * size[2]), along + i / size[2] % size[1], i % size[2]],
             };
             let place = path.display().to_string();
             return Err(Error::invalid(place, format!("voxel {at:?}"), values[i], "a finite number"));

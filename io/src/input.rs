@@ -1,7 +1,8 @@
 //! A file, packed or not, that is read front to back and never trusted about its length.
 
+use crate::memory;
 use crate::number::{ByteOrder, Number};
-use conefield_core::{Error, Result, files};
+use conefield_core::{Error, Result, allowance, files};
 use flate2::bufread::{MultiGzDecoder, ZlibDecoder};
 use std::io::{BufRead, BufReader, ErrorKind, Read};
 use std::path::{Path, PathBuf};
@@ -151,16 +152,14 @@ impl Input {
             }
         }
         let mut out: Vec<f32> = Vec::new();
-        let refuse = |s: &Self| s.invalid(field, format!("{count} values"), "an array that fits in memory");
-        // A plain file has just been measured; a packed one must prove its claim piece by piece.
-        if self.packed.is_none() {
-            out.try_reserve_exact(count).map_err(|_| refuse(self))?;
-        }
+        // A plain file has just been measured; a packed one must prove its claim piece by piece. Each growth draws from
+        // the allowance, so that it does not matter what was claimed.
         let mut left = count;
         while left > 0 {
             let n = left.min(CHUNK);
             let raw = self.exactly(n * number.bytes(), field)?;
-            out.try_reserve(n).map_err(|_| refuse(self))?;
+            let more = if self.packed.is_none() { left } else { n };
+            memory::grow(&mut out, more, count, &self.place(), field)?;
             number.decode(order, &raw, &mut out, map);
             left -= n;
         }
@@ -188,6 +187,7 @@ impl Input {
 /// All of a regular file.
 pub(crate) fn read_bytes(path: &Path) -> Result<Vec<u8>> {
     let (file, size) = files::open(path)?;
+    allowance::memory(&path.display().to_string(), "file size", size)?;
     let mut bytes = Vec::new();
     if !usize::try_from(size).is_ok_and(|n| bytes.try_reserve_exact(n).is_ok()) {
         let place = path.display().to_string();

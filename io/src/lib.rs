@@ -5,7 +5,7 @@
 //!   (R2-Gaussian's folder), [`read_naf`], [`write_naf`] (NAF's file), [`write_rtk`] (for RTK); [`read_data_set`] also
 //!   reads test views.
 //! - Projections as scanners give them: [`read_scanner`] (a description in TOML; TIFF, NumPy, RTK's XML geometry).
-//! - Sizes, before memory is taken: [`scan_size`], [`volume_voxels`].
+//! - Sizes, before memory is taken: [`scan_size`], [`scanner_size`], [`volume_voxels`].
 //! - Weights: [`read_weights`], [`write_weights`]; checkpoints: [`read_checkpoint`], [`write_checkpoint`] (safetensors).
 //!
 //! Readers tell a format from what a file holds, check a header before they take memory for what it claims, and
@@ -24,6 +24,7 @@ mod file_order;
 mod filling;
 mod folder;
 mod input;
+mod memory;
 mod metaimage;
 mod naf;
 mod nifti;
@@ -61,6 +62,6 @@ pub use rtk_folder::write_rtk;
 pub use scan::{DataSet, read_data_set, read_scan, read_truth};
 pub use scan_folder::write_scan;
 pub use scanner::{I0, ImportOptions, Imported, read_scanner};
-pub use size::{ScanSize, scan_size, volume_voxels};
+pub use size::{ScanSize, scan_size, scanner_size, volume_voxels};
 pub use volume::{is_volume, packed_bytes, read_volume, write_volume, write_voxels};
 pub use weights::{read_weights, write_weights};

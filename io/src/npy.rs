@@ -2,6 +2,7 @@
 
 use crate::file_order::{self, FileOrder};
 use crate::input::Input;
+use crate::memory;
 use crate::number::{self, ByteOrder, Number};
 use conefield_core::parts::Voxels;
 use conefield_core::{Error, Result};
@@ -56,7 +57,7 @@ pub(crate) fn read_one_of(input: &mut Input, start: Vec<u8>, sets: &[&[&str]]) -
     let values = input.numbers("data", count, header.number, header.order, |x| x as f32)?;
     let array = ArrayD::from_shape_vec(IxDyn(&header.shape).set_f(header.fortran), values)
         .map_err(|e| input.invalid("shape", e, expected()))?;
-    let array = if array.is_standard_layout() { array } else { array.as_standard_layout().into_owned() };
+    let array = memory::in_order(&input.place(), "data", array)?;
     if let Some((at, x)) = array.indexed_iter().find(|(_, x)| !x.is_finite()) {
         return Err(input.invalid(format!("data{:?}", at.slice()), x, "a finite number"));
     }

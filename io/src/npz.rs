@@ -15,6 +15,15 @@ pub(crate) const MAGIC: &[u8] = b"PK\x03\x04";
 
 /// Reads the array `name` of the archive (the only one if `None`) with any of the sets of axes, as [`npy::read`] does.
 pub(crate) fn read(path: &Path, name: Option<&str>, sets: &[&[&str]]) -> Result<ArrayD<f32>> {
+    npy::read_one_of(&mut open(path, name)?, Vec::new(), sets)
+}
+
+/// The shape of the array `name`, from its header.
+pub(crate) fn shape(path: &Path, name: Option<&str>) -> Result<Vec<usize>> {
+    npy::shape(&mut open(path, name)?, Vec::new())
+}
+
+fn open(path: &Path, name: Option<&str>) -> Result<Input> {
     let place = path.display().to_string();
     let io = |e| Error::io(path, e);
     let broken = |e: zip::result::ZipError| match e {
@@ -54,14 +63,11 @@ pub(crate) fn read(path: &Path, name: Option<&str>, sets: &[&[&str]]) -> Result<
     file.seek(SeekFrom::Start(start)).map_err(io)?;
     let raw = file.take(packed);
     let name = PathBuf::from(&place);
-    let mut input = match method {
-        CompressionMethod::Stored => Input::within(name, Checked::new(raw, checksum), size),
-        CompressionMethod::Deflated => Input::within(name, Checked::new(DeflateDecoder::new(raw), checksum), size),
-        other => {
-            return Err(Error::unsupported(place, format!("it is packed as {other}; stored and deflated are read")));
-        }
-    };
-    npy::read_one_of(&mut input, Vec::new(), sets)
+    match method {
+        CompressionMethod::Stored => Ok(Input::within(name, Checked::new(raw, checksum), size)),
+        CompressionMethod::Deflated => Ok(Input::within(name, Checked::new(DeflateDecoder::new(raw), checksum), size)),
+        other => Err(Error::unsupported(place, format!("it is packed as {other}; stored and deflated are read"))),
+    }
 }
 
 /// Compares the checksum where the data ends.

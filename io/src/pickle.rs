@@ -29,6 +29,9 @@ const MOST_VALUES: usize = 1 << 22;
 /// Most values that it may number to use again.
 const MOST_MEMO: usize = 1 << 20;
 
+/// Most keys of a dict, which are looked for one after the other.
+const MOST_KEYS: usize = 1 << 10;
+
 /// Longest integer, in bytes.
 const LONGEST_INTEGER: usize = 16;
 
@@ -486,6 +489,10 @@ impl<'a> Machine<'_, 'a> {
         }
         let dict = self.peek()?;
         match self.node_mut(dict) {
+            Some(Node::Dict(all)) if all.len() + pairs.len() > MOST_KEYS => {
+                let found = format!("a dict of {} keys or more", all.len() + pairs.len());
+                Err(self.wrong(found, format!("at most {MOST_KEYS}: a scan has a dozen")))
+            }
             Some(Node::Dict(all)) => {
                 all.extend(pairs.iter().map(|[k, v]| (*k, *v)));
                 Ok(())

@@ -10,7 +10,7 @@ use crate::orbit::common_orbit;
 use crate::scan::DataSet;
 use crate::text::{Notation, parse};
 use crate::unit::{self, Reading, Units};
-use crate::{ScanSize, folder, npy, rays, write_atomic, write_folder_atomic, write_text_atomic};
+use crate::{ScanSize, folder, memory, npy, rays, write_atomic, write_folder_atomic, write_text_atomic};
 use conefield_core::error::ensure;
 use conefield_core::files::read_text;
 use conefield_core::geometry::{Geometry, VoxelGrid};
@@ -202,6 +202,7 @@ fn projections(folder: &Path, place: &str, field: &str, frames: &[Frame], shape:
             .map_err(|e| Error::invalid(path.display().to_string(), "shape", e, "two axes"))?;
         let (found, expected) = (format!("{:?}", image.shape()), format!("{shape:?}, as scanner.nDetector says"));
         ensure(image.shape() == shape, &path.display().to_string(), "shape", found, expected)?;
+        memory::grow(&mut all, image.len(), usize::MAX, place, &field)?;
         all.extend(image.iter());
     }
     Array3::from_shape_vec((frames.len(), shape[0], shape[1]), all)

@@ -14,7 +14,7 @@ use crate::write_text_atomic;
 use conefield_core::error::ensure;
 use conefield_core::files::read_text;
 use conefield_core::geometry::{Vec3, View, cross, dot, norm, sub};
-use conefield_core::{Error, Result};
+use conefield_core::{Error, Result, allowance};
 use roxmltree::{Document, Node, ParsingOptions};
 use std::path::Path;
 
@@ -22,6 +22,8 @@ const ROOT: &str = "RTKThreeDCircularGeometry";
 /// Longest file, in bytes, and most of what the parser counts as nodes: fifty thousand views.
 const LONGEST: u64 = 64 << 20;
 const MOST_NODES: u32 = 4_000_000;
+/// Bytes that a byte of the text becomes at most: a node takes about a hundred, and four bytes of text make one.
+const NODE_BYTES: u64 = 24;
 
 /// RTK's nine numbers of one projection, lengths in mm, angles in degrees.
 #[derive(Debug, Clone, Copy, PartialEq, Default)]
@@ -146,6 +148,7 @@ pub fn read_rtk_geometry(path: impl AsRef<Path>, pixel: [f64; 2], offset: [f64; 
     let path = path.as_ref();
     let place = path.display().to_string();
     let text = read_text(path, LONGEST)?;
+    allowance::memory(&place, "XML", (text.len() as u64).saturating_mul(NODE_BYTES))?;
     // RTK writes a document type without content; entities are limited by the parser.
     let options = ParsingOptions { allow_dtd: true, nodes_limit: MOST_NODES, ..ParsingOptions::default() };
     let document =
@@ -159,23 +162,24 @@ pub fn read_rtk_geometry(path: impl AsRef<Path>, pixel: [f64; 2], offset: [f64; 
     let mut views = Vec::new();
     for node in root.children().filter(Node::is_element) {
         if node.tag_name().name() != "Projection" {
-            set(&place, &document, node, &mut state)?;
+            set(&place, node, &mut state)?;
             continue;
         }
         let mut matrix = None;
         for inner in node.children().filter(Node::is_element) {
             match inner.tag_name().name() {
                 "Matrix" => matrix = Some(inner),
-                _ => set(&place, &document, inner, &mut state)?,
+                _ => set(&place, inner, &mut state)?,
             }
         }
-        let here = format!("{place}: line {}", document.text_pos_at(node.range().start).row);
         for (field, x) in [("SourceToIsocenterDistance", state.sid), ("SourceToDetectorDistance", state.sdd)] {
-            let expected = "a distance other than 0 (parallel beams are not read)";
-            ensure(x != 0.0, &here, field, x, expected)?;
+            if x == 0.0 {
+                let expected = "a distance other than 0 (parallel beams are not read)";
+                return Err(Error::invalid(line_of(&place, node), field, x, expected));
+            }
         }
         if let Some(m) = matrix {
-            check_matrix(&format!("{place}: line {}", document.text_pos_at(m.range().start).row), m, &state)?;
+            check_matrix(&place, m, &state)?;
         }
         views.push(state.view(pixel, offset));
     }
@@ -183,27 +187,30 @@ pub fn read_rtk_geometry(path: impl AsRef<Path>, pixel: [f64; 2], offset: [f64; 
     Ok(views)
 }
 
-fn number(place: &str, document: &Document, node: Node) -> Result<f64> {
+/// The place with the line of `node`, for errors alone: to find it, the text is read from its start.
+fn line_of(place: &str, node: Node) -> String {
+    format!("{place}: line {}", node.document().text_pos_at(node.range().start).row)
+}
+
+fn number(place: &str, node: Node) -> Result<f64> {
     let text = node.text().unwrap_or_default().trim();
     let found = text.parse::<f64>().ok().filter(|x| x.is_finite());
     found.ok_or_else(|| {
-        let line = document.text_pos_at(node.range().start).row;
         let shown: String = text.chars().take(60).collect();
-        Error::invalid(format!("{place}: line {line}"), node.tag_name().name(), format!("\"{shown}\""), "a number")
+        Error::invalid(line_of(place, node), node.tag_name().name(), format!("\"{shown}\""), "a number")
     })
 }
 
-fn set(place: &str, document: &Document, node: Node, state: &mut Projection) -> Result<()> {
+fn set(place: &str, node: Node, state: &mut Projection) -> Result<()> {
     let name = node.tag_name().name();
     if let Some(field) = state.field(name) {
-        *field = number(place, document, node)?;
-    } else if name == "RadiusCylindricalDetector" && number(place, document, node)? != 0.0 {
+        *field = number(place, node)?;
+    } else if name == "RadiusCylindricalDetector" && number(place, node)? != 0.0 {
         let what = format!("{place}: {name}");
         return Err(Error::unsupported(what, "only flat detectors are read"));
     } else if !name.starts_with("Collimation") && name != "RadiusCylindricalDetector" {
-        let line = document.text_pos_at(node.range().start).row;
         let expected = "the elements of RTK's ThreeDCircularProjectionGeometry";
-        return Err(Error::invalid(format!("{place}: line {line}"), "element", format!("<{name}>"), expected));
+        return Err(Error::invalid(line_of(place, node), "element", format!("<{name}>"), expected));
     }
     Ok(())
 }
@@ -218,7 +225,7 @@ fn check_matrix(place: &str, node: Node, projection: &Projection) -> Result<()> 
         return Ok(());
     }
     let expected = format!("{want:.6?}, which the other numbers give");
-    Err(Error::invalid(place, "Matrix", format!("{found:.6?}"), expected))
+    Err(Error::invalid(line_of(place, node), "Matrix", format!("{found:.6?}"), expected))
 }
 
 /// Writes `views` as RTK's geometry file, version 3, in mm.

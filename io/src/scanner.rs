@@ -43,7 +43,7 @@ use crate::counts::{Correction, CountsReport, OpenBeam, line_integrals};
 use crate::rtk::read_rtk_geometry;
 use crate::stack::{self, Names, StackAxis, StackLayout};
 use crate::text::described;
-use crate::{ScanSize, folder, scan_folder};
+use crate::{ScanSize, folder, memory, scan_folder};
 use conefield_core::error::ensure;
 use conefield_core::geometry::{Geometry, View, VoxelGrid};
 use conefield_core::orbit::CircularOrbit;
@@ -236,7 +236,7 @@ pub fn read_scanner(path: impl AsRef<Path>, options: &ImportOptions) -> Result<I
         let (a, report) = line_integrals(values, &correction, &place)?;
         (a, Some(report))
     };
-    let (geometry, projections) = rows_down(geometry, projections);
+    let (geometry, projections) = rows_down(&place, geometry, projections)?;
     let provenance = json!({
         "format": "scanner",
         "file": path.file_name().map(|n| n.to_string_lossy()),
@@ -266,14 +266,14 @@ pub(crate) fn size(path: &Path) -> Result<ScanSize> {
 
 /// Turns the rows round where that makes the views one of this program's own circles, on which rows run down: what
 /// knows only those can then take the scan. RTK's rows run up.
-fn rows_down(mut geometry: Geometry, mut projections: Array3<f32>) -> (Geometry, Array3<f32>) {
+fn rows_down(place: &str, mut geometry: Geometry, mut projections: Array3<f32>) -> Result<(Geometry, Array3<f32>)> {
     let turned: Vec<View> = geometry.views.iter().map(|w| View { v: w.v.map(|x| 0.0 - x), ..*w }).collect();
     if CircularOrbit::fit(&turned).is_some() {
         geometry.views = turned;
         projections.invert_axis(Axis(1));
-        projections = projections.as_standard_layout().into_owned();
+        projections = memory::in_order(place, "files.projections", projections)?;
     }
-    (geometry, projections)
+    Ok((geometry, projections))
 }
 
 fn layout(place: &str, table: &LayoutTable) -> Result<StackLayout> {

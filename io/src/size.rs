@@ -37,8 +37,8 @@ impl ScanSize {
 }
 
 /// The size of a scan, from what describes it; its projections are not read. A pickle (NAF) tells its sizes only when
-/// it is read: all of the file is taken for 32-bit projections, and for voxels as well. Of a scanner's images only
-/// NumPy's and MetaImage's headers are read; other files are taken for one byte a value.
+/// it is read: all of the file is taken for 32-bit projections, and for voxels as well. Of a scanner's images the
+/// headers are read.
 pub fn scan_size(path: impl AsRef<Path>) -> Result<ScanSize> {
     let path = path.as_ref();
     let size = match scan::find(path)? {
@@ -58,15 +58,20 @@ pub fn scan_size(path: impl AsRef<Path>) -> Result<ScanSize> {
     Ok(size)
 }
 
-/// Number of voxels of a volume, from its header. Of a DICOM series, whose sizes stand in every slice, as many as its
-/// files have pairs of bytes.
+/// The size of the scan that a scanner's description makes.
+pub fn scanner_size(path: impl AsRef<Path>) -> Result<ScanSize> {
+    let path = path.as_ref();
+    let size = scanner::size(path)?;
+    must_exist(path, "pixels of all views", size.pixels)?;
+    must_exist(path, "voxels", size.voxels)?;
+    Ok(size)
+}
+
+/// Number of voxels of a volume, from its header; of a DICOM series from those of its slices.
 pub fn volume_voxels(path: impl AsRef<Path>) -> Result<u64> {
     let path = path.as_ref();
     let shape = match volume::open(path)? {
-        VolumeFile::Series => {
-            let files = dicom::files(path)?;
-            return files.iter().map(|f| file_bytes(f)).sum::<Result<u64>>().map(|bytes| bytes / 2);
-        }
+        VolumeFile::Series => return dicom::voxels(path),
         VolumeFile::Npy(mut input, head) => npy::shape(&mut input, head)?,
         VolumeFile::MetaImage => metaimage::shape(path)?.to_vec(),
         VolumeFile::Nifti(input, head) => nifti::shape_of(&input, &head)?.to_vec(),

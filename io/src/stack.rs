@@ -1,8 +1,7 @@
 //! Stacks of projections and single fields, from TIFF, `.npy`, `.npz` and MetaImage, brought into the order `[view, row, column]`.
 
 use crate::input::Input;
-use crate::size::file_bytes;
-use crate::{folder, metaimage, npy, npz, tiff};
+use crate::{folder, memory, metaimage, npy, npz, tiff};
 use conefield_core::{Error, Result};
 use ndarray::{Array2, Array3, ArrayD, Axis, Ix3};
 use serde::{Deserialize, Serialize};
@@ -32,7 +31,7 @@ pub(crate) struct StackLayout {
 
 impl StackLayout {
     /// Brings the file's array of three axes into the order `[view, row, column]`.
-    fn arrange(&self, a: Array3<f32>) -> Array3<f32> {
+    fn arrange(&self, place: &str, a: Array3<f32>) -> Result<Array3<f32>> {
         let at = |axis| self.axes.iter().position(|&x| x == axis).unwrap_or(0);
         let mut a = a.permuted_axes([at(StackAxis::View), at(StackAxis::Row), at(StackAxis::Column)]);
         if self.flip_rows {
@@ -41,7 +40,7 @@ impl StackLayout {
         if self.flip_columns {
             a.invert_axis(Axis(2));
         }
-        if a.is_standard_layout() { a } else { a.as_standard_layout().into_owned() }
+        memory::in_order(place, "image", a)
     }
 
     /// Where the axis of views stands.
@@ -75,7 +74,7 @@ pub(crate) fn read(folder: &Path, place: &str, field: &str, names: &Names, layou
     let mut all: Option<(Vec<f32>, [usize; 2], usize)> = None;
     let single = sources.len() == 1;
     for source in &sources {
-        let stack = layout.arrange(raw(source, layout.views())?);
+        let stack = layout.arrange(&source.path.display().to_string(), raw(source, layout.views())?)?;
         if single {
             return Ok(stack);
         }
@@ -86,9 +85,7 @@ pub(crate) fn read(folder: &Path, place: &str, field: &str, names: &Names, layou
             let expected = format!("{} x {} (rows x columns), as in {}", size[0], size[1], sources[0].path.display());
             return Err(Error::invalid(source.path.display().to_string(), "image", found, expected));
         }
-        values.try_reserve(stack.len()).map_err(|_| {
-            Error::invalid(place, field, format!("{} images", sources.len()), "images that fit in memory together")
-        })?;
+        memory::grow(values, stack.len(), usize::MAX, place, field)?;
         values.extend(stack.iter());
         *count += views;
     }
@@ -97,20 +94,23 @@ pub(crate) fn read(folder: &Path, place: &str, field: &str, names: &Names, layou
         .map_err(|e| Error::invalid(place, field, e, "one image a view"))
 }
 
-/// How many values [`read`] gives, from the headers of NumPy's and MetaImage's files; of others as many as they have
-/// bytes.
+/// How many values [`read`] gives, from the headers of its files.
 pub(crate) fn values(folder: &Path, place: &str, field: &str, names: &Names) -> Result<u64> {
     let product = |all: &[usize]| all.iter().fold(1u64, |n, &s| n.saturating_mul(s as u64));
     let mut sum = 0u64;
-    for StackFile { path, .. } in sources(folder, place, field, names)? {
+    for StackFile { path, array } in sources(folder, place, field, names)? {
         let mut input = Input::open(&path)?;
         let head = input.take(8)?;
-        sum = sum.saturating_add(if head.starts_with(npy::MAGIC) {
+        sum = sum.saturating_add(if head.starts_with(npz::MAGIC) {
+            product(&npz::shape(&path, array.as_deref())?)
+        } else if tiff::is_tiff(&head) {
+            tiff::values(&path)?
+        } else if head.starts_with(npy::MAGIC) {
             product(&npy::shape(&mut input, head)?)
         } else if is_metaimage(&mut input, &head)? {
             product(&metaimage::shape(&path)?)
         } else {
-            file_bytes(&path)?
+            0
         });
     }
     Ok(sum)
@@ -272,7 +272,7 @@ mod tests {
                     a.invert_axis(Axis(2));
                 }
                 let order = axes.map(|x| x as usize);
-                assert_eq!(layout.arrange(a.permuted_axes(order)), want, "{layout:?}");
+                assert_eq!(layout.arrange("a", a.permuted_axes(order)).unwrap(), want, "{layout:?}");
             }
         }
     }

@@ -3,8 +3,10 @@
 mod entries;
 
 use crate::input::must_unpack;
-use conefield_core::{Error, Result, files};
+use crate::memory;
+use conefield_core::{Error, Result, allowance, files};
 use ndarray::Array3;
+use std::fs::File;
 use std::io::{BufReader, ErrorKind, Seek};
 use std::path::Path;
 use tiff::decoder::{Decoder, DecodingResult, Limits};
@@ -15,25 +17,61 @@ pub(crate) fn is_tiff(head: &[u8]) -> bool {
     [b"II*\0", b"MM\0*", b"II+\0", b"MM\0+"].iter().any(|m| head.starts_with(*m))
 }
 
+/// How many values all pages have, from their directories.
+pub(crate) fn values(path: &Path) -> Result<u64> {
+    let mut sum = 0u64;
+    pages(path, |_, page| {
+        sum = sum.saturating_add(page.pixels);
+        Ok(())
+    })?;
+    Ok(sum)
+}
+
 /// Reads all pages as `[page, row, column]`; they must be of one size.
 ///
 /// 8 to 64 bits a pixel, integers or floats, converted to `f32`; other colours, sizes that the file cannot hold,
 /// values that are not finite and damaged files are refused.
 pub(crate) fn read(path: &Path) -> Result<Array3<f32>> {
     let place = path.display().to_string();
+    let mut values = Vec::<f32>::new();
+    let (pages, [rows, columns]) = pages(path, |decoder, page| {
+        let count = usize::try_from(page.pixels).unwrap_or(usize::MAX);
+        memory::grow(&mut values, count, usize::MAX, &place, "pages")?;
+        // The page as it is stored, and what its pieces are unpacked to.
+        allowance::memory(&place, "page", page.bytes.saturating_mul(2))?;
+        append(&mut values, decoder.read_image().map_err(|e| broken(&place, &e))?);
+        Ok(())
+    })?;
+    let all = Array3::from_shape_vec((pages, rows, columns), values)
+        .map_err(|e| Error::invalid(&place, "TIFF", e, format!("{rows} x {columns} values a page")))?;
+    match all.indexed_iter().find(|(_, x)| !x.is_finite()) {
+        Some(((p, r, c), x)) => {
+            Err(Error::invalid(place, format!("page {p}, row {r}, column {c}"), x, "a finite number"))
+        }
+        None => Ok(all),
+    }
+}
+
+/// What a page's directory claims.
+struct Page {
+    pixels: u64,
+    /// Bytes that they take unpacked.
+    bytes: u64,
+}
+
+/// Goes through the pages without unpacking them; their number, rows and columns.
+fn pages(
+    path: &Path,
+    mut each: impl FnMut(&mut Decoder<BufReader<File>>, Page) -> Result<()>,
+) -> Result<(usize, [usize; 2])> {
+    let place = path.display().to_string();
     let (file, packed) = files::open(path)?;
-    let broken = |e: TiffError| {
-        let found = match &e {
-            TiffError::IoError(e) if e.kind() == ErrorKind::UnexpectedEof => "the end of the file".to_owned(),
-            other => other.to_string(),
-        };
-        Error::invalid(&place, "TIFF", found, "a whole TIFF image")
-    };
+    let broken = |e: TiffError| broken(&place, &e);
     let mut reader = BufReader::new(file);
     entries::check(&place, &mut reader, packed)?;
     reader.rewind().map_err(|e| Error::io(path, e))?;
     let mut decoder = Decoder::new(reader).map_err(broken)?;
-    let (mut values, mut size, mut pages, mut claimed) = (Vec::<f32>::new(), None, 0usize, [0u64; 2]);
+    let (mut size, mut pages, mut claimed) = (None, 0usize, [0u64; 2]);
     loop {
         let (width, height) = decoder.dimensions().map_err(broken)?;
         let bits = match decoder.colortype().map_err(broken)? {
@@ -61,7 +99,7 @@ pub(crate) fn read(path: &Path) -> Result<Array3<f32>> {
         limits.decoding_buffer_size = usize::try_from(most).unwrap_or(usize::MAX);
         (limits.ifd_value_size, limits.intermediate_buffer_size) = [limits.decoding_buffer_size; 2].into();
         decoder = decoder.with_limits(limits);
-        append(&mut values, decoder.read_image().map_err(broken)?);
+        each(&mut decoder, Page { pixels, bytes })?;
         pages += 1;
         if !decoder.more_images() {
             break;
@@ -69,15 +107,15 @@ pub(crate) fn read(path: &Path) -> Result<Array3<f32>> {
         decoder.next_image().map_err(broken)?;
     }
     let (height, width) = size.unwrap_or_default();
-    let (rows, columns) = (height as usize, width as usize);
-    let all = Array3::from_shape_vec((pages, rows, columns), values)
-        .map_err(|e| Error::invalid(&place, "TIFF", e, format!("{rows} x {columns} values a page")))?;
-    match all.indexed_iter().find(|(_, x)| !x.is_finite()) {
-        Some(((p, r, c), x)) => {
-            Err(Error::invalid(place, format!("page {p}, row {r}, column {c}"), x, "a finite number"))
-        }
-        None => Ok(all),
-    }
+    Ok((pages, [height as usize, width as usize]))
+}
+
+fn broken(place: &str, e: &TiffError) -> Error {
+    let found = match e {
+        TiffError::IoError(e) if e.kind() == ErrorKind::UnexpectedEof => "the end of the file".to_owned(),
+        other => other.to_string(),
+    };
+    Error::invalid(place, "TIFF", found, "a whole TIFF image")
 }
 
 fn append(out: &mut Vec<f32>, image: DecodingResult) {

@@ -119,7 +119,7 @@ pub fn write_volume(path: impl AsRef<Path>, mut volume: &Volume) -> Result<()> {
     write_voxels(path, &mut volume)
 }
 
-/// Writes voxels as [`write_volume`] does, slab by slab: no more than 16 MiB of them (or one layer) are in memory at
+/// Writes voxels as [`write_volume`] does, slab by slab: no more than 16 MiB of them (or one row) are in memory at
 /// once, and for `.mha` 32 MiB of what they are packed to; the rest of that waits in a file without a name beside it.
 pub fn write_voxels(path: impl AsRef<Path>, voxels: &mut dyn Voxels) -> Result<()> {
     let path = path.as_ref();

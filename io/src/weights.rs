@@ -5,7 +5,7 @@
 
 use crate::{number, write_atomic};
 use conefield_core::arena::Weights;
-use conefield_core::{Error, Result, files};
+use conefield_core::{Error, Result, allowance, files};
 use safetensors::{Dtype, SafeTensors};
 use serde_json::{Map, Value, json};
 use std::collections::{BTreeMap, BTreeSet};
@@ -15,8 +15,11 @@ use std::path::Path;
 /// The header's entry for free text.
 const METADATA: &str = "__metadata__";
 
-/// Longest header that the reading crate accepts.
-const LONGEST_HEADER: u64 = 100_000_000;
+/// Longest header that is read: a hundred thousand tensors.
+const LONGEST_HEADER: u64 = 16 << 20;
+
+/// Bytes that a byte of a header becomes at most while it is parsed.
+const HEADER_WORDS: u64 = 16;
 
 /// Writes named `f32` tensors (name, shape, values in C order) and free text.
 pub fn write_weights(
@@ -76,6 +79,9 @@ pub fn read_weights(path: impl AsRef<Path>) -> Result<Weights> {
     let mut raw = Vec::new();
     let too_large = || Error::invalid(&place, "file size", format!("{size} bytes"), "a file that fits in memory");
     let whole = usize::try_from(size).map_err(|_| too_large())?;
+    // The values stand in the file and in their tensors for a moment; of a header, what is parsed is larger than its text.
+    let words = header.saturating_mul(HEADER_WORDS);
+    allowance::memory(&place, "file size", size.saturating_mul(2).saturating_add(words))?;
     raw.try_reserve_exact(whole).map_err(|_| too_large())?;
     raw.extend(length);
     file.take(size - 8).read_to_end(&mut raw).map_err(io)?;

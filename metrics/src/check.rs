@@ -43,3 +43,13 @@ pub(crate) fn window(metric: &str, shape: &[usize], window: usize) -> Result<()>
         format!("at least {window} voxels an axis, the size of the window"),
     )
 }
+
+/// Largest value, in units of the data range, whose square leaves the constants of an SSIM their digits.
+const SSIM_REACH: f64 = 1e4;
+
+/// Refuses, in the name of `metric`, values so far beyond the data range that rounding would decide.
+pub(crate) fn reach(metric: &str, result: ArrayView3<f32>, reference: ArrayView3<f32>, peak: f64) -> Result<()> {
+    let top = [result, reference].iter().flatten().fold(0.0f32, |m, x| m.max(x.abs()));
+    let found = format!("values to {top:e} for a data range of {peak}");
+    ensure(f64::from(top) <= SSIM_REACH * peak, metric, "values", found, format!("at most {SSIM_REACH:e} times it"))
+}

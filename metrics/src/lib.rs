@@ -5,16 +5,19 @@
 //! function here ([`ssim_2d`], [`ssim_3d`], [`ssim_skimage`]) and [`evaluate`] reports all of them, so that a number
 //! is always named. Every sum is kept in `f64`; results do not depend on the number of threads.
 //!
-//! Volumes are `[x, y, z]`. `peak` is the data range: 1 for volumes in `[0, 1]`, and what all published figures use.
+//! Volumes are `[x, y, z]`. `peak` is the data range: 1 for volumes in `[0, 1]`, which all published figures use;
+//! [`peak_of`] derives it from a reference.
 
 mod check;
 mod dice;
 mod error;
+mod peak;
 mod score;
 mod ssim;
 mod window;
 
 pub use dice::{Dice, LabelDice, dice, label_map};
 pub use error::{Axis, WorstSlice, psnr, rmse, worst_slices};
+pub use peak::{other_unit, peak_of};
 pub use score::{Scores, evaluate};
 pub use ssim::{ssim_2d, ssim_3d, ssim_skimage};

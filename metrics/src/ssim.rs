@@ -37,6 +37,7 @@ pub fn ssim_skimage(result: ArrayView3<f32>, reference: ArrayView3<f32>, peak: f
 
 /// [`ssim_2d`] of a pair that has been checked.
 pub(crate) fn gaussian_slices(result: ArrayView3<f32>, reference: ArrayView3<f32>, peak: f64) -> Result<f64> {
+    check::reach("ssim_2d", result, reference, peak)?;
     let window = SsimWindow::gaussian();
     let mean = over_axes(result, reference, |x, y| {
         y.iter().any(|&v| v > 0.0).then(|| slice_ssim(x, y, &window, window.len() / 2, peak))
@@ -47,6 +48,7 @@ pub(crate) fn gaussian_slices(result: ArrayView3<f32>, reference: ArrayView3<f32
 
 /// [`ssim_skimage`] of a pair that has been checked.
 pub(crate) fn uniform_slices(result: ArrayView3<f32>, reference: ArrayView3<f32>, peak: f64) -> Result<f64> {
+    check::reach("ssim_skimage", result, reference, peak)?;
     let window = SsimWindow::uniform();
     check::window("ssim_skimage", result.shape(), window.len())?;
     Ok(over_axes(result, reference, |x, y| Some(slice_ssim(x, y, &window, 0, peak))).unwrap_or(0.0))
@@ -129,6 +131,7 @@ fn slice_ssim(x: ArrayView2<f32>, y: ArrayView2<f32>, window: &SsimWindow, pad: 
 
 /// [`ssim_3d`] of a pair that has been checked.
 pub(crate) fn gaussian_volume(result: ArrayView3<f32>, reference: ArrayView3<f32>, peak: f64) -> Result<f64> {
+    check::reach("ssim_3d", result, reference, peak)?;
     // A tile keeps a ring of 11 windowed planes of `TILE[1] × nz`: a few megabytes, however large the volume is.
     const TILE: [usize; 2] = [64, 64];
     let window = SsimWindow::gaussian();

@@ -155,6 +155,7 @@ impl Training {
         ensure(self.report_every > 0, "spec", "report_every", 0, "at least 1")?;
         let ends = self.epochs.is_some() || self.steps.is_some() || self.seconds.is_some();
         ensure(ends, "spec", "", "no end", "one of epochs, steps or seconds")?;
+        ensure(self.steps != Some(0), "spec", "steps", 0, "at least 1: no step leaves the field as it was drawn")?;
         for (name, end) in [("epochs", self.epochs), ("seconds", self.seconds)] {
             if let Some(x) = end {
                 ensure(x.is_finite() && x > 0.0, "spec", name, x, "a positive finite number")?;

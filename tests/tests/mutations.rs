@@ -1,9 +1,9 @@
 //! Every reader takes damaged input without a panic, a hoard of memory or a hang. See `docs/bad-inputs.md`.
 
-use conefield_tests::hostile::watch::{Bounds, Meter, ReaderFault};
+use conefield_tests::hostile::watch::{Bounds, Meter, ReaderFault, once};
 use conefield_tests::hostile::{PARSERS, Parser, find};
 use peak_alloc::PeakAlloc;
-use std::path::Path;
+use std::path::{Path, PathBuf};
 use std::time::Duration;
 
 #[global_allocator]
@@ -25,39 +25,91 @@ fn folder() -> tempfile::TempDir {
     tempfile::tempdir_in(parent).unwrap()
 }
 
+/// A number from the environment.
+fn number(name: &str, otherwise: u64) -> u64 {
+    std::env::var(name).map_or(otherwise, |n| n.parse().unwrap())
+}
+
+/// What earlier hunts found for `parser`, unpacked, in the order of the files' names.
+fn corpus(parser: &Parser) -> Vec<Vec<u8>> {
+    let folder = Path::new(env!("CARGO_MANIFEST_DIR")).join("corpus").join(parser.name);
+    let Ok(entries) = std::fs::read_dir(folder) else { return vec![] };
+    let mut files: Vec<_> = entries.map(|e| e.unwrap().path()).collect();
+    files.sort();
+    files.iter().map(|f| std::fs::read(f).unwrap()).collect()
+}
+
 /// The only test of this program: the allocator counts for the whole process.
+///
+/// `CONEFIELD_MUTATIONS=N` makes N mutations a reader, `CONEFIELD_FROM=N` begins with another number than 0, so that a long
+/// hunt can go on in pieces; `CONEFIELD_KEEP=DIR` keeps the smallest inputs that ended in a way of their own.
 #[test]
 fn no_mutation_makes_a_reader_panic_hoard_or_hang() {
-    let count = std::env::var("CONEFIELD_MUTATIONS").map_or(COUNT, |n| n.parse().unwrap());
+    let (from, count) = (number("CONEFIELD_FROM", 0), number("CONEFIELD_MUTATIONS", COUNT));
+    let keep = std::env::var_os("CONEFIELD_KEEP").map(PathBuf::from);
     let quiet = std::panic::take_hook();
     std::panic::set_hook(Box::new(|_| {}));
     let mut faults = Vec::new();
-    let mut total = 0;
+    let (mut total, mut replayed) = (0, 0);
     for parser in PARSERS {
         let dir = folder();
+        let corpus = corpus(parser);
+        replayed += corpus.len();
+        let (_, file) = parser.prepare(dir.path());
+        for (i, input) in corpus.iter().enumerate() {
+            std::fs::write(&file, (parser.pack)(input.clone())).unwrap();
+            match once(METER, || (parser.read)(dir.path())) {
+                Err(fault) => faults.push(format!("{}: {fault}, input {i} of the corpus", parser.name)),
+                Ok((_, bytes, time)) if bytes > BOUNDS.bytes || time > BOUNDS.time => {
+                    faults.push(format!("{}: {bytes} bytes, {time:?}, input {i} of the corpus", parser.name));
+                }
+                Ok(_) => {}
+            }
+        }
+        drop(dir);
+        let dir = folder();
         let start = std::time::Instant::now();
-        let seen = parser.run(dir.path(), count, BOUNDS, METER);
+        let seen = parser.run(dir.path(), from..from + count, &corpus, BOUNDS, METER);
         total += seen.count;
         println!(
-            "{:18} {} mutations, {} accepted, most {} kB, longest {:?}, {:.1?}",
+            "{:18} {} mutations, {} accepted, {} found, most {} kB, longest {:?}, {:.1?}",
             parser.name,
             seen.count,
             seen.accepted,
+            seen.found.len(),
             seen.most_bytes / 1000,
             seen.longest,
             start.elapsed()
         );
-        let (seed, _) = parser.prepare(folder().path());
-        for (number, fault) in seen.faults.iter().take(5) {
+        for (number, fault, input) in seen.faults.iter().take(5) {
             let kept = Path::new(env!("CARGO_TARGET_TMPDIR")).join(format!("{}-{number}", parser.name));
-            std::fs::write(&kept, parser.damaged(&seed, *number)).unwrap();
-            faults.push(format!("{}: {fault} (the file is kept as {})", parser.name, kept.display()));
+            std::fs::write(&kept, input).unwrap();
+            faults.push(format!("{}: {fault} (the input is kept, unpacked, as {})", parser.name, kept.display()));
+        }
+        if let Some(keep) = &keep {
+            let to = keep.join(parser.name);
+            std::fs::create_dir_all(&to).unwrap();
+            let mut found = seen.found;
+            found.sort_by_key(Vec::len);
+            for input in found.iter().take(KEPT) {
+                std::fs::write(to.join(format!("{:016x}", fnv(input))), input).unwrap();
+            }
         }
     }
     controls(&mut faults);
     std::panic::set_hook(quiet);
+    println!("{total} mutations, {replayed} inputs of the corpus");
     assert!(faults.is_empty(), "{}", faults.join("\n"));
     assert!(total >= 200_000 || std::env::var_os("CONEFIELD_MUTATIONS").is_some());
+    assert!(replayed > 0 || keep.is_some(), "the corpus is gone");
+}
+
+/// Inputs of a reader that are kept of a hunt.
+const KEPT: usize = 8;
+
+/// FNV-1a, to name an input by what it holds.
+fn fnv(bytes: &[u8]) -> u64 {
+    bytes.iter().fold(0xcbf2_9ce4_8422_2325, |h, b| (h ^ u64::from(*b)).wrapping_mul(0x0100_0000_01b3))
 }
 
 /// Readers that do what none may do are told.
@@ -84,8 +136,8 @@ fn controls(faults: &mut Vec<String>) {
         ("a hang", hangs, quick, |f| matches!(f, ReaderFault::Time(_))),
     ];
     for (what, parser, bounds, is) in told {
-        let seen = parser.run(folder().path(), 100, bounds, METER);
-        if !seen.faults.iter().any(|(_, f)| is(f)) {
+        let seen = parser.run(folder().path(), 0..100, &[], bounds, METER);
+        if !seen.faults.iter().any(|(_, f, _)| is(f)) {
             faults.push(format!("the harness does not tell {what}"));
         }
     }

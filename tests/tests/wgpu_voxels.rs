@@ -121,6 +121,10 @@ fn psnr(spec: &Value, backend: &dyn Backend) -> f64 {
     let (found, truth) = (solution.result.volume(backend).unwrap(), truth());
     let square = |(a, b): (&f32, &f32)| (f64::from(*a) - f64::from(*b)).powi(2);
     let mse = found.data.iter().zip(&truth.data).map(square).sum::<f64>() / truth.data.len() as f64;
+    decibels(mse)
+}
+
+fn decibels(mse: f64) -> f64 {
     10.0 * (0.02f64.powi(2) / mse).log10()
 }
 
@@ -132,11 +136,18 @@ fn classical_methods_end_where_the_cpu_does() {
         json!({"type": "cgls", "stop": {"passes": 5}}),
         json!({"type": "fista", "prior": {"type": "total-variation"}, "stop": {"passes": 5}}),
     ];
+    // On the CPU, wherever this runs: a method that makes next to nothing would agree with anything.
+    let empty = decibels(truth().data.iter().map(|x| f64::from(*x).powi(2)).sum::<f64>() / truth().data.len() as f64);
+    let on_cpu: Vec<f64> = methods.iter().map(|m| psnr(m, &Cpu::new())).collect();
+    for (method, cpu) in methods.iter().zip(&on_cpu) {
+        println!("{}: {cpu:.4} dB, an empty volume {empty:.4} dB", method["type"]);
+        assert!(*cpu > empty + 3.0, "{method}: {cpu} dB, an empty volume {empty} dB");
+    }
     for (name, backend) in device::backends("classical methods") {
-        for method in &methods {
-            let (cpu, found) = (psnr(method, &Cpu::new()), psnr(method, &backend));
+        for (method, cpu) in methods.iter().zip(&on_cpu) {
+            let found = psnr(method, &backend);
             println!("{}, {name}: {found:.4} dB, CPU {cpu:.4} dB", method["type"]);
-            assert!((cpu - found).abs() < 0.01 && cpu > 8.0, "{method}, {name}: {found} dB, CPU {cpu} dB");
+            assert!((cpu - found).abs() < 0.01, "{method}, {name}: {found} dB, CPU {cpu} dB");
         }
     }
 }

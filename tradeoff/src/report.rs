@@ -244,7 +244,11 @@ impl TradeoffReport {
         let mut notes: Vec<String> = s.scans.iter().map(|scan| scan.line()).collect();
         if self.by_reference() {
             let names: Vec<String> = s.references.iter().map(|r| r.display().to_string()).collect();
-            notes.push(format!("reference {}, peak {}", names.join(", "), s.peak));
+            notes.push(format!(
+                "reference {}, peak {}",
+                names.join(", "),
+                s.peak.map_or("of its values".to_owned(), |p| p.to_string())
+            ));
         }
         notes.extend(s.hold_out.as_ref().map(|h| format!("views held out: {h}")));
         notes.push(format!("seed {}, {} threads, conefield {}", s.seed, s.threads, s.version));

@@ -36,7 +36,7 @@ pub struct Search {
     /// Views to keep aside, as the command line has it.
     pub hold_out: Option<String>,
     /// The data range for PSNR and SSIM.
-    pub peak: f64,
+    pub peak: Option<f64>,
     /// Seed of everything random.
     pub seed: u64,
     /// Seconds that a whole run may take, from the least.

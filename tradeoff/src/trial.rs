@@ -66,17 +66,19 @@ pub struct TrialInput {
     pub held: Vec<usize>,
     /// What is known of the volume sought.
     pub reference: Option<MiddleSlices>,
+    /// The data range that scores refer to.
+    pub peak: f64,
 }
 
 impl TrialInput {
     /// Of the scan that was read from `path`; little of it is kept. Views to keep aside that leave none to work with are
     /// refused.
-    pub fn of(path: &Path, scan: Scan, reference: Option<&Volume>, held: Vec<usize>) -> Result<Self> {
+    pub fn of(path: &Path, scan: Scan, reference: Option<&Volume>, peak: f64, held: Vec<usize>) -> Result<Self> {
         let record = ScanRecord::of(path, &scan)?;
         if !held.is_empty() {
             scan.split(&held)?;
         }
-        Ok(Self { scan: record, held, reference: reference.map(MiddleSlices::of) })
+        Ok(Self { scan: record, held, reference: reference.map(MiddleSlices::of), peak })
     }
 }
 

@@ -139,8 +139,8 @@ impl CompareArgs {
             let part = format!("{} ({} of {})", method.name, i + 1, methods.len());
             entries.push(self.entry(method, part, general)?);
         }
-        let TrialInput { scan, held, reference } = input;
-        let report = Report { protocol: self.shared(scan, held, general), methods: entries };
+        let TrialInput { scan, held, reference, peak } = input;
+        let report = Report { protocol: self.shared(scan, held, peak, general), methods: entries };
         let table = table(&report);
         conefield_io::write_text_atomic(self.output.join("table.json"), &out::to_json(&report)?)?;
         conefield_io::write_text_atomic(self.output.join("table.md"), &table.markdown())?;
@@ -236,7 +236,7 @@ impl CompareArgs {
             ["record.json", "checkpoint.safetensors", "volume.nii.gz"].map(|f| folder.join(f));
         if record.exists() && volume.exists() {
             now.insert("reference".into(), Value::from(self.reference()).to_string());
-            now.insert("peak".into(), self.protocol.peak.to_string());
+            now.insert("peak".into(), input.peak.to_string());
             files::same_run(&record.display().to_string(), &recorded(&folder)?, &now)?;
             return Ok(Start::Done);
         }
@@ -285,13 +285,13 @@ impl CompareArgs {
         self.protocol.reference.as_ref().map(|r| r.display().to_string())
     }
 
-    fn shared(&self, scan: ScanRecord, held_out_views: Vec<usize>, general: &General) -> Shared<'_> {
+    fn shared(&self, scan: ScanRecord, held_out_views: Vec<usize>, peak: f64, general: &General) -> Shared<'_> {
         Shared {
             version: env!("CARGO_PKG_VERSION"),
             scan,
             held_out_views,
             reference: self.reference(),
-            peak: self.protocol.peak,
+            peak,
             seed: self.protocol.seed,
             limits: &self.protocol.ends,
             budget_s: self.protocol.budget,

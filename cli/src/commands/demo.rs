@@ -4,12 +4,13 @@ use super::convert::refuse_existing;
 use super::evaluate::score;
 use crate::progress::Progress;
 use crate::table::{SCORES, Table, cells_of};
-use crate::{method, out, parse, signals, specs};
+use crate::{memory, method, out, parse, signals, specs};
 use clap::Args;
 use conefield_backend_cpu::Cpu;
 use conefield_core::method::{Job, Limits};
 use conefield_core::scan::{Scan, Volume};
 use conefield_core::{Error, Result};
+use conefield_io::ScanSize;
 use conefield_metrics::Scores;
 use conefield_projectors::simulate::{DetectorNoise, Protocol, phantom, simulate};
 use conefield_report::MiddleSlices;
@@ -64,6 +65,7 @@ impl DemoArgs {
     pub fn run(self) -> Result<()> {
         let folder = &self.output;
         refuse_existing(folder, self.force)?;
+        self.reckon()?;
         std::fs::create_dir_all(folder).map_err(|e| Error::io(folder, e))?;
         let size = usize::from(self.size);
         let truth = phantom(size);
@@ -111,6 +113,16 @@ impl DemoArgs {
         }
         out::say(&Table { rows, notes: vec![] }.text())?;
         out::say(&format!("\npicture: {}\nscan and volumes beside it", picture.display()))
+    }
+
+    /// Refuses what does not fit into memory: the scan, both volumes and the larger of the two methods.
+    fn reckon(&self) -> Result<()> {
+        let (side, views) = (u64::from(self.size), usize::from(self.views));
+        let (pixels, voxels) = (side * side * u64::from(self.views), side.pow(3));
+        // What is simulated from and the first of the two results are held beside the run's own.
+        let size = ScanSize { pixels, voxels, test_pixels: 0, reading: 8 * voxels, views };
+        let run = memory::Run { reference: true, ..memory::Run::on(size) };
+        method::planned("fast", &[], &Cpu::new(), &run).map(drop)
     }
 
     fn compete(&self, name: &'static str, sets: &[String], scan: &Scan, truth: &Volume) -> Result<Entry> {

@@ -25,9 +25,9 @@ pub struct EvaluateArgs {
     volume: PathBuf,
     /// What it should be.
     reference: PathBuf,
-    /// The data range.
-    #[arg(long, default_value = "1", value_parser = parse::above_zero)]
-    peak: f64,
+    /// The data range [default: 1 for a reference in [0, 1], else the range of its values].
+    #[arg(long, value_parser = parse::above_zero)]
+    peak: Option<f64>,
     /// Also draw the middle slices of reference, volume and difference.
     #[arg(long, value_name = "FILE")]
     png: Option<PathBuf>,
@@ -52,6 +52,9 @@ pub struct EvaluateArgs {
 struct Evaluation {
     #[serde(flatten)]
     scores: Option<Scores>,
+    /// The data range that the scores refer to.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    peak: Option<f64>,
     #[serde(skip_serializing_if = "Option::is_none")]
     dice: Option<Dice>,
 }
@@ -67,7 +70,8 @@ impl EvaluateArgs {
         if self.json {
             return out::json(&report);
         }
-        let parts = [report.scores.as_ref().map(lines), report.dice.as_ref().map(dice_lines)];
+        let range = |scores: &Scores| format!("{}\npeak          {}", lines(scores), report.peak.unwrap_or(1.0));
+        let parts = [report.scores.as_ref().map(range), report.dice.as_ref().map(dice_lines)];
         out::say(&parts.into_iter().flatten().collect::<Vec<_>>().join("\n\n"))
     }
 
@@ -77,7 +81,7 @@ impl EvaluateArgs {
             |path: &PathBuf| label_map(&path.display().to_string(), conefield_io::read_volume(path)?.data.view());
         let (volume, reference) = (read(&self.volume)?, read(&self.reference)?);
         same_shape(&self.volume.display().to_string(), volume.shape(), reference.shape())?;
-        Ok(Evaluation { scores: None, dice: Some(dice(volume.view(), reference.view())?) })
+        Ok(Evaluation { scores: None, peak: None, dice: Some(dice(volume.view(), reference.view())?) })
     }
 
     /// The scores of a volume, with the agreement of what the segmenter finds in it and in the reference.
@@ -85,7 +89,8 @@ impl EvaluateArgs {
         let volume = conefield_io::read_volume(&self.volume)?;
         let reference = conefield_io::read_volume(&self.reference)?;
         let place = self.volume.display().to_string();
-        let scores = score(&place, &volume, &reference, self.peak)?;
+        let peak = peak(self.peak, &reference);
+        let scores = score(&place, &volume, &reference, peak)?;
         if let Some(png) = &self.png {
             files::picture(png, Some(&MiddleSlices::of(&reference)), &MiddleSlices::of(&volume))?;
         }
@@ -101,7 +106,7 @@ impl EvaluateArgs {
                 Some(dice(volume.view(), reference.view())?)
             }
         };
-        Ok(Evaluation { scores: Some(scores), dice })
+        Ok(Evaluation { scores: Some(scores), peak: Some(peak), dice })
     }
 
     /// `volume` as the segmenter is to see it.
@@ -118,9 +123,26 @@ fn same_shape(place: &str, found: &[usize], expected: &[usize]) -> Result<()> {
     ensure(found == expected, place, "shape", format!("{found:?}"), format!("{expected:?}, the reference's shape"))
 }
 
+/// The data range that scores against `reference` refer to: `given`, or what the reference says.
+pub fn peak(given: Option<f64>, reference: &Volume) -> f64 {
+    given.unwrap_or_else(|| {
+        let found = conefield_metrics::peak_of(reference.data.view());
+        if found != 1.0 {
+            tracing::info!("peak {found}, the range of the reference's values; --peak sets another");
+        }
+        found
+    })
+}
+
 /// Scores `volume`, called `place` in errors.
 pub fn score(place: &str, volume: &Volume, reference: &Volume, peak: f64) -> Result<Scores> {
     same_shape(place, volume.data.shape(), reference.data.shape())?;
+    if let Some(factor) = conefield_metrics::other_unit(volume.data.view(), reference.data.view()) {
+        tracing::warn!(
+            "{place}: it is like the reference if it is multiplied by {factor:.4}: are both in one unit? The scores take \
+             them as they are"
+        );
+    }
     conefield_metrics::evaluate(volume.data.view(), reference.data.view(), peak)
 }
 

@@ -40,7 +40,7 @@ impl ExportArgs {
         signals::listen()?;
         let start = Instant::now();
         let mut voxels = opened.field.voxels(backend.as_ref(), grid)?;
-        outgoing::write(&self.output, &mut voxels, None, false)?;
+        outgoing::write_only(&self.output, &mut voxels)?;
         let export_s = start.elapsed().as_secs_f64();
         if self.json {
             return out::json(&json!({

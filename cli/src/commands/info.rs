@@ -1,5 +1,6 @@
 //! `conefield info`
 
+use crate::memory::Memory;
 use crate::{files, out};
 use clap::Args;
 use conefield_core::geometry::{Geometry, VoxelGrid};
@@ -83,6 +84,7 @@ fn statistics(values: ArrayView3<'_, f32>) -> Value {
 }
 
 fn volume(path: &Path, png: Option<&Path>) -> Result<Value> {
+    Memory::of_volumes(&[conefield_io::volume_voxels(path)?]).check(|_| vec![])?;
     let v = conefield_io::read_volume(path)?;
     if let Some(png) = png {
         files::picture(png, None, &MiddleSlices::of(&v))?;
@@ -145,6 +147,7 @@ pub fn facts(s: &Scan, survey: &Survey) -> Value {
 }
 
 fn scan(path: &Path, png: Option<&Path>) -> Result<Value> {
+    Memory::of_data_set(&conefield_io::scan_size(path)?).check(|_| vec![])?;
     let data = conefield_io::read_data_set(path)?;
     let s = &data.train;
     s.validate(&path.display().to_string())?;

@@ -1,6 +1,6 @@
 //! What a reconstruction is asked for beside scan and spec: the same for every method that is compared.
 
-use super::EndOptions;
+use super::{EndOptions, evaluate};
 use crate::backend::{self, BackendChoice};
 use crate::parse::{self, HoldOut};
 use clap::Args;
@@ -29,9 +29,9 @@ pub struct RunProtocol {
     /// The volume sought, to compare with: a file, or "truth" for the one that the scan comes with.
     #[arg(long, value_name = "VOLUME")]
     pub reference: Option<PathBuf>,
-    /// The data range for PSNR and SSIM.
-    #[arg(long, default_value = "1", value_parser = parse::above_zero)]
-    pub peak: f64,
+    /// The data range for PSNR and SSIM [default: 1 for a reference in [0, 1], else the range of its values].
+    #[arg(long, value_parser = parse::above_zero)]
+    pub peak: Option<f64>,
     /// Views to keep aside and predict, such as 3,17 or every:10.
     #[arg(long, value_name = "VIEWS", value_parser = parse::hold_out)]
     pub hold_out: Option<HoldOut>,
@@ -60,6 +60,11 @@ impl RunProtocol {
         Ok(Some(volume))
     }
 
+    /// The data range that scores refer to.
+    pub fn peak(&self, reference: Option<&Volume>) -> f64 {
+        reference.map_or(self.peak.unwrap_or(1.0), |r| evaluate::peak(self.peak, r))
+    }
+
     /// Indices of the views that are kept aside, of `n`. Refuses a choice that keeps none aside.
     pub fn held_out(&self, n: usize) -> Result<Vec<usize>> {
         let Some(choice) = &self.hold_out else { return Ok(vec![]) };
@@ -79,7 +84,7 @@ impl RunProtocol {
             ("--steps", ends.steps.map(|n| n.to_string())),
             ("--at-most", ends.at_most.map(|t| t.to_string())),
             ("--backend", Some(backend.to_string())),
-            ("--peak", Some(peak.to_string())),
+            ("--peak", peak.map(|p| p.to_string())),
             ("--hold-out", hold_out.as_ref().map(HoldOut::to_string)),
             ("--seed", Some(seed.to_string())),
         ];

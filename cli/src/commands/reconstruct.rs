@@ -103,6 +103,7 @@ impl ReconstructArgs {
         };
         let whole = files::scan(&self.scan)?;
         let reference = protocol.reference(&self.scan, &whole)?;
+        let peak = protocol.peak(reference.as_ref());
         let held = protocol.held_out(whole.geometry.views.len())?;
         let scan_record = ScanRecord::of(&self.scan, &whole)?;
         asked.iter().try_for_each(|m| specs::check_held_out(&m.loaded, m.plan.as_ref(), &held))?;
@@ -118,7 +119,7 @@ impl ReconstructArgs {
         let bench = Bench {
             scan: &scan,
             reference: reference.as_ref(),
-            peak: protocol.peak,
+            peak,
             backend: backend.as_ref(),
             seed: protocol.seed,
             volumes: &files::volume,
@@ -162,7 +163,7 @@ impl ReconstructArgs {
         let job = Job {
             held_out: held_scan.as_ref(),
             reference: reference.as_ref(),
-            peak: protocol.peak,
+            peak,
             seed: protocol.seed,
             limits: Limits {
                 deadline: schedule.as_ref().map(|s| s.deadline),
@@ -194,7 +195,7 @@ impl ReconstructArgs {
         files::picture(folder.file("slices.png"), middle.as_ref(), &slices)?;
         let picture_s = start.elapsed().as_secs_f64();
         let start = Instant::now();
-        let score = |(volume, r)| evaluate::score(&place.display().to_string(), volume, r, protocol.peak);
+        let score = |(volume, r)| evaluate::score(&place.display().to_string(), volume, r, peak);
         let scores = whole.as_ref().zip(reference.as_ref()).map(score).transpose()?;
         let score_s = start.elapsed().as_secs_f64();
         let record = RunRecord {
@@ -229,7 +230,7 @@ impl ReconstructArgs {
             loss: last.as_ref().and_then(|r| r.loss),
             held_out: solution.best.map(|b| b.held_out).or(last.as_ref().and_then(|r| r.held_out)),
             best_step: solution.best.map(|b| b.step),
-            peak: protocol.peak,
+            peak,
             scores,
         };
         conefield_io::write_text_atomic(folder.file("record.json"), &out::to_json(&record)?)?;
@@ -256,6 +257,9 @@ impl ReconstructArgs {
         let mut sets = sets.to_vec();
         // A run that is resumed without a spec has it in its own.
         if let Some(path) = self.init.as_ref().filter(|_| self.spec.is_some() || !self.resume) {
+            if conefield_io::is_volume(path) {
+                memory::Memory::of_volumes(&[conefield_io::volume_voxels(path)?]).check(|_| vec![])?;
+            }
             sets.push(method::init(&specs::read(spec, &sets)?.tree, path));
         }
         method::planned(spec, &sets, backend, &run)

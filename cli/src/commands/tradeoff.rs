@@ -55,9 +55,9 @@ pub struct TradeoffArgs {
     /// the scans come with.
     #[arg(long, value_name = "VOLUME")]
     reference: Vec<PathBuf>,
-    /// The data range for PSNR and SSIM.
-    #[arg(long, default_value = "1", value_parser = parse::above_zero)]
-    peak: f64,
+    /// The data range for PSNR and SSIM [default: 1 for a reference in [0, 1], else the range of its values].
+    #[arg(long, value_parser = parse::above_zero)]
+    peak: Option<f64>,
     /// Views to keep aside and predict, such as 3,17 or every:10; with a reference also none.
     #[arg(long, value_name = "VIEWS", default_value = "every:10", value_parser = parse::hold_out_or_none)]
     hold_out: parse::HoldOutOrNone,

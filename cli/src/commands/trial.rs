@@ -82,7 +82,8 @@ pub fn input(path: &Path, protocol: &RunProtocol) -> Result<TrialInput> {
     let scan = files::scan(path)?;
     let reference = protocol.reference(path, &scan)?;
     let held = protocol.held_out(scan.geometry.views.len())?;
-    TrialInput::of(path, scan, reference.as_ref(), held)
+    let peak = protocol.peak(reference.as_ref());
+    TrialInput::of(path, scan, reference.as_ref(), peak, held)
 }
 
 /// What ended a process: its exit status above 128, as shells have it, or the signal itself.

@@ -8,6 +8,10 @@ use std::time::{Duration, Instant, SystemTime};
 
 /// Address space that the command gets, in KiB: what it takes for a small input is far below.
 const MEMORY_KIB: u64 = 1 << 20;
+/// What `--memory` is, where a case does not say otherwise.
+const USUAL: &str = "1GiB";
+/// More than any header claims, so that a reader comes to look at what a file holds.
+pub const AMPLE: Option<&str> = Some("1000TiB");
 /// Processor seconds that it gets.
 const SECONDS: u64 = 20;
 /// When it is killed, if it only waits.
@@ -31,6 +35,8 @@ pub struct Case {
     args: &'static str,
     end: End,
     says: &'static [&'static str],
+    /// What `--memory` is, if it is given.
+    memory: Option<&'static str>,
 }
 
 /// An input that must be refused: what it is, how it is made in an empty folder, the command's words (split at spaces,
@@ -41,13 +47,18 @@ pub fn refused(
     args: &'static str,
     says: &'static [&'static str],
 ) -> Case {
-    Case { what, make: Box::new(make), args, end: End::Refused, says }
+    Case { what, make: Box::new(make), args, end: End::Refused, says, memory: Some(USUAL) }
 }
 
 impl Case {
     /// The same with another end.
     pub fn ends(self, end: End) -> Self {
         Self { end, ..self }
+    }
+
+    /// The same with another `--memory`, or none, so that the limit of address space is all that there is.
+    pub fn memory(self, memory: Option<&'static str>) -> Self {
+        Self { memory, ..self }
     }
 
     /// Runs the command under limits.
@@ -57,9 +68,9 @@ impl Case {
         let before = standing(dir.path());
         let program = assert_cmd::cargo::cargo_bin("conefield");
         // Two threads, as each takes address space of its own.
-        let limited = format!(
-            "ulimit -v {MEMORY_KIB}; ulimit -t {SECONDS}; ulimit -c 0; exec \"$0\" --threads 2 --memory 1GiB \"$@\""
-        );
+        let memory = self.memory.map_or(String::new(), |m| format!("--memory {m} "));
+        let limited =
+            format!("ulimit -v {MEMORY_KIB}; ulimit -t {SECONDS}; ulimit -c 0; exec \"$0\" --threads 2 {memory}\"$@\"");
         let mut command = Command::new("sh");
         let words: Vec<String> = match self.args.contains('\'') {
             true => shlex::split(self.args).unwrap(),
@@ -73,8 +84,11 @@ impl Case {
         let after = standing(dir.path());
         let mut outcome = Outcome {
             what: self.what,
-            command: format!("conefield {}", self.args),
-            message: message(&said, &String::from_utf8_lossy(&output.stdout), self.end, self.says),
+            command: match self.memory {
+                Some(USUAL) => format!("conefield {}", self.args),
+                _ => format!("conefield {memory}{}", self.args),
+            },
+            message: without_figures(message(&said, &String::from_utf8_lossy(&output.stdout), self.end, self.says)),
             status: output.status.code(),
             faults: vec![],
         };
@@ -129,6 +143,16 @@ fn message(said: &str, printed: &str, end: End, says: &[&str]) -> String {
             lines.find(|l| warns(l) && says.iter().all(|w| l.contains(w))).unwrap_or_default().to_owned()
         }
     }
+}
+
+/// The message without sizes that differ from machine to machine: of what there is, and of what the program holds.
+fn without_figures(text: String) -> String {
+    let marks = [" are available", " that are held", " in all, as --memory"];
+    marks.iter().fold(text, |text, mark| {
+        let Some(at) = text.find(mark) else { return text };
+        let before = text[..at].rsplitn(3, ' ').nth(2).unwrap_or_default();
+        format!("{before} …{}", &text[at..])
+    })
 }
 
 /// Everything below `folder`: length and time of change by path.

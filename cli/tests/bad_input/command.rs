@@ -27,6 +27,7 @@ pub fn cases() -> Vec<Case> {
         wrong("no command", "--quiet", &[]),
         wrong("an unknown command", "recontsruct scan", &["recontsruct"]),
         wrong("no threads", "backends --threads 0", &["--threads"]),
+        wrong("5000 threads", "backends --threads 5000", &["--threads", "1024"]),
         wrong("a detector of one number", "simulate phantom:head:16 -o scan --detector 64", &["ROWSxCOLS"]),
         wrong("a detector without rows", "simulate phantom:head:16 -o scan --detector 0x64", &["both above 0"]),
         wrong("no views", "simulate phantom:head:16 -o scan --views 0", &["--views"]),
@@ -187,6 +188,12 @@ pub fn cases() -> Vec<Case> {
             scan_toml,
             "reconstruct scan --spec fast -o run --hold-out 3",
             &["found 3", "below 3"],
+        ),
+        refused(
+            "no step",
+            scan_toml,
+            "reconstruct scan --spec fast -o run --set training.steps=0",
+            &["training.steps", "at least 1"],
         ),
         refused(
             "all views kept aside",

@@ -18,6 +18,7 @@ mod page;
 mod r2;
 mod scan_folder;
 mod scanner;
+mod small;
 mod spec;
 mod tiff;
 mod weights;
@@ -40,6 +41,7 @@ fn every_bad_input_ends_as_the_page_says() {
         ("Weights and checkpoints", weights::cases()),
         ("Pipeline specs", spec::cases()),
         ("Levers and fronts", levers::cases()),
+        ("Small files that claim or unpack to much", small::cases()),
         ("Values on the command line", command::cases()),
     ];
     let count: usize = sections.iter().map(|(_, cases)| cases.len()).sum();

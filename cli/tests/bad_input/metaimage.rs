@@ -1,6 +1,6 @@
 //! MetaImage: one file or two.
 
-use crate::case::{Case, changed, cut, cut_end, put, refused, replaced};
+use crate::case::{AMPLE, Case, changed, cut, cut_end, put, refused, replaced};
 use conefield_tests::hostile::seeds::{metaimage, metaimage_header, metaimage_lines, zlib};
 use std::path::Path;
 
@@ -79,13 +79,15 @@ pub fn cases() -> Vec<Case> {
             |d| packed(d, "40000 40000 40000\n", 24),
             INFO,
             &["claims 64000000000000 bytes"],
-        ),
+        )
+        .memory(AMPLE),
         refused(
             "zlib bomb: 300 MB of zeros in 300 kB",
             |d| packed(d, "1000 1000 300\n", 300_000_000),
             INFO,
             &["100 times"],
-        ),
+        )
+        .memory(AMPLE),
         refused("zlib with less than it says", |d| packed(d, "4 3 2\n", 23), INFO, &["end of the file after 23 bytes"]),
         refused(
             "lines without an end, 1 MB",

@@ -1,6 +1,6 @@
 //! NIfTI, packed or not.
 
-use crate::case::{Case, End, at, changed, cut, cut_end, put, refused};
+use crate::case::{AMPLE, Case, End, at, changed, cut, cut_end, put, refused};
 use conefield_tests::hostile::seeds::{gzip, nifti, nifti_gz};
 use std::fs::{self, File};
 use std::path::Path;
@@ -41,7 +41,8 @@ pub fn cases() -> Vec<Case> {
             changed(nifti, "a.nii", at(42, [255, 127, 255, 127, 255, 127])),
             INFO,
             &["96 bytes", "140724603846652 bytes"],
-        ),
+        )
+        .memory(AMPLE),
         refused(
             "a series of volumes",
             changed(nifti, "a.nii", at(40, [4, 0, 4, 0, 3, 0, 2, 0, 9, 0])),
@@ -128,13 +129,15 @@ pub fn cases() -> Vec<Case> {
             |d| put(d.join("a.nii.gz"), gzip(header(d, [32767; 3]))),
             INFO_GZ,
             &["claims 140724603846652 bytes", "unpack to"],
-        ),
+        )
+        .memory(AMPLE),
         refused(
             "gzip bomb: 400 MB of zeros as the header says, in 400 kB",
             |d| bomb(d, [1000, 1000, 400], 400_000_000),
             INFO_GZ,
             &["400000000 bytes", "100 times"],
-        ),
+        )
+        .memory(AMPLE),
         refused(
             "gzip bomb: 300 MB behind a volume of 24 bytes",
             |d| bomb(d, [4, 3, 2], 300_000_000),
@@ -156,8 +159,9 @@ pub fn cases() -> Vec<Case> {
                 File::options().append(true).open(d.join("a.nii")).unwrap().set_len(352 + 1_000_000_000_000).unwrap();
             },
             INFO,
-            &["fits in memory"],
-        ),
+            &["--memory"],
+        )
+        .memory(AMPLE),
         refused(
             "a named pipe, which no one writes to",
             |d| assert!(std::process::Command::new("mkfifo").arg(d.join("a.nii")).status().unwrap().success()),

@@ -52,7 +52,7 @@ pub fn cases() -> Vec<Case> {
             "a detector with a product past 2^64",
             meta("\"nDetector\": [\n      4", "\"nDetector\": [\n      9223372036854775807"),
             INFO,
-            &["detector", "addressed"],
+            &["18446744073709551615", "no machine"],
         ),
         refused(
             "voxels with a product past 2^64, before anything is read",

@@ -61,7 +61,7 @@ pub fn cases() -> Vec<Case> {
             "rows with a product past 2^64",
             toml("rows = 4", "rows = 9223372036854775807"),
             INFO,
-            &["detector", "addressed"],
+            &["18446744073709551615", "no machine"],
         ),
         refused("a volume of NaN", toml("spacing = [0.5", "spacing = [nan"), INFO, &["volume.spacing", "NaN"]),
         refused("a unit of zero", toml("mm = 1.0", "mm = 0.0"), INFO, &["unit.mm", "found 0"]),

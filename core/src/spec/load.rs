@@ -6,6 +6,7 @@
 
 use super::tree::{At, Entry, Kind, Node, parse_json, parse_toml};
 use super::{LABEL, Spec, check, one_of};
+use crate::allowance::Work;
 use crate::error::{Error, Result, ensure};
 use crate::{files, registry};
 use serde_json::Value;
@@ -67,7 +68,7 @@ impl Draft {
 
     fn layered(layer: Layer, sets: &[String], shipped: &[Shipped]) -> Result<Self> {
         let source = layer.label();
-        let mut written = layer.resolve(shipped, &[])?;
+        let mut written = layer.resolve(shipped, &[], &mut Work::new(MOST_LAYERS))?;
         let mut sets = sets.iter().map(|s| Set::parse(s)).collect::<Result<Vec<_>>>()?;
         // A type clears the keys of the old one, so it goes before the keys beside it, whatever the order on the line.
         sets.sort_by_key(|s| (s.path.len(), s.path.last().is_some_and(|k| k != "type")));
@@ -101,6 +102,8 @@ impl Draft {
 
 /// Specs on the way from one to the last that it extends, at most.
 const DEEPEST: usize = 32;
+/// Specs that one is put together from, at most: each method of a chain may extend others.
+const MOST_LAYERS: u64 = 256;
 /// The methods of a chain.
 const METHODS: &str = "methods";
 /// Where a spec names plugins.
@@ -209,8 +212,9 @@ impl Layer {
     }
 
     /// The tree of this layer over those that it extends. `above` are the layers that led here.
-    fn resolve(self, shipped: &[Shipped], above: &[Origin]) -> Result<Node> {
+    fn resolve(self, shipped: &[Shipped], above: &[Origin], work: &mut Work) -> Result<Node> {
         let label = self.label();
+        work.spend(&label, "extends: specs that are read", 1)?;
         let is_json = match &self.origin {
             Origin::File(p) if p.extension().is_some_and(|e| e.eq_ignore_ascii_case("json")) => true,
             Origin::File(p) if p.extension().is_some_and(|e| e.eq_ignore_ascii_case("toml")) => false,
@@ -225,14 +229,14 @@ impl Layer {
             anchor_plugins(&mut node, path);
         }
         let above = [above, std::slice::from_ref(&self.origin)].concat();
-        self.extend_methods(&mut node, shipped, &above)?;
-        let Some(mut tree) = self.base(&mut node, shipped, &above)? else { return Ok(node) };
+        self.extend_methods(&mut node, shipped, &above, work)?;
+        let Some(mut tree) = self.base(&mut node, shipped, &above, work)? else { return Ok(node) };
         tree.merge(node);
         Ok(tree)
     }
 
     /// The tree that `node`, a table of this layer, extends.
-    fn base(&self, node: &mut Node, shipped: &[Shipped], above: &[Origin]) -> Result<Option<Node>> {
+    fn base(&self, node: &mut Node, shipped: &[Shipped], above: &[Origin], work: &mut Work) -> Result<Option<Node>> {
         let Some(extends) = node.take("extends") else { return Ok(None) };
         let at = extends.value.at.to_string();
         let Some(what) = extends.value.text() else {
@@ -254,16 +258,16 @@ impl Layer {
             return Err(Error::invalid(at, "extends", format!("{what:?}, which extends this one"), "no circle"));
         }
         ensure(above.len() < DEEPEST, &at, "extends", format!("{DEEPEST} specs on the way"), "fewer")?;
-        base.resolve(shipped, above).map(Some)
+        base.resolve(shipped, above, work).map(Some)
     }
 
     /// Puts what the methods of a chain extend under them. Of the specs that they name only the method counts, and the
     /// plugins that it needs.
-    fn extend_methods(&self, node: &mut Node, shipped: &[Shipped], above: &[Origin]) -> Result<()> {
+    fn extend_methods(&self, node: &mut Node, shipped: &[Shipped], above: &[Origin], work: &mut Work) -> Result<()> {
         let Some(Kind::Array(methods)) = node.get_mut(METHODS).map(|m| &mut m.kind) else { return Ok(()) };
         let mut plugins = vec![];
         for method in methods {
-            let Some(mut tree) = self.base(method, shipped, above)? else { continue };
+            let Some(mut tree) = self.base(method, shipped, above, work)? else { continue };
             LABEL.iter().for_each(|key| {
                 let taken = tree.take(key).filter(|_| *key == PLUGINS);
                 plugins.extend(taken.and_then(|mut p| p.value.take(PATHS)).map(|p| p.value));

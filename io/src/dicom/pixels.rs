@@ -1,6 +1,6 @@
 //! The stored values of one slice.
 
-use conefield_core::{Error, Result};
+use conefield_core::{Error, Result, allowance};
 use dicom_core::PrimitiveValue;
 use dicom_object::DefaultDicomObject;
 use dicom_object::mem::InMemElement;
@@ -64,14 +64,18 @@ fn unsupported(place: &str, uid: &str) -> Error {
     )
 }
 
-/// The values of `object`'s picture, row after row, before they are rescaled.
+/// The values of `object`'s picture, row after row, each through `rescale`.
 pub(super) fn values(
     place: &str,
     object: &DefaultDicomObject,
     element: &InMemElement,
     format: &PixelFormat,
-) -> Result<Vec<i64>> {
+    rescale: impl Fn(i64) -> f32,
+) -> Result<Vec<f32>> {
     let fail = |found: String, expected: String| Error::invalid(place, "PixelData", found, expected);
+    // The pieces joined, stored values and those that are given out, and what a JPEG decoder makes before.
+    let held = element.fragments().map_or(0, |all| all.iter().map(|f| f.len() as u64).sum());
+    allowance::memory(place, "PixelData", (format.count() as u64).saturating_mul(12).saturating_add(held))?;
     let bits = match packing(place, object.meta().transfer_syntax())? {
         Packing::Plain => plain(element, format),
         packed => {
@@ -87,7 +91,7 @@ pub(super) fn values(
         let expected = format!("{} ({} rows of {})", format.count(), format.rows, format.columns);
         return Err(fail(format!("{} values", bits.len()), expected));
     }
-    Ok(bits.into_iter().map(|b| format.number(b)).collect())
+    Ok(bits.into_iter().map(|b| rescale(format.number(b))).collect())
 }
 
 fn plain(element: &InMemElement, format: &PixelFormat) -> Result<Vec<u32>, String> {

@@ -3,7 +3,7 @@
 use super::lengths::{self, PixelStorage};
 use super::pixels::{self, PixelFormat};
 use conefield_core::geometry::{dot, norm};
-use conefield_core::{Error, Result, files};
+use conefield_core::{Error, Result, allowance, files};
 use dicom_object::{DefaultDicomObject, OpenFileOptions, Tag};
 use std::io::Read;
 use std::path::{Path, PathBuf};
@@ -219,12 +219,14 @@ impl Slice {
     /// The rescaled values, row after row.
     pub fn values(&self) -> Result<Vec<f32>> {
         let place = self.path.display().to_string();
+        // The library keeps the pieces that it reads and hands out copies.
+        allowance::memory(&place, "PixelData", self.end.saturating_mul(2))?;
         let object = open(&self.path, self.end, OpenFileOptions::new().read_to(PIXEL_DATA.0))?;
         let element = object.get(PIXEL_DATA.0);
         let element = element.ok_or_else(|| Error::invalid(&place, PIXEL_DATA.1, "no such element", "a picture"))?;
-        let values = pixels::values(&place, &object, element, &self.format)?;
         let [slope, intercept] = self.rescale;
-        let rescaled: Vec<f32> = values.into_iter().map(|v| (slope * v as f64 + intercept) as f32).collect();
+        let rescale = |v| (slope * v as f64 + intercept) as f32;
+        let rescaled = pixels::values(&place, &object, element, &self.format, rescale)?;
         if rescaled.iter().any(|x| !x.is_finite()) {
             let expected = "a factor that keeps values in the range of 32-bit floats";
             return Err(Error::invalid(place, SLOPE.1, slope, expected));

@@ -4,7 +4,8 @@
 //! once, a structure that holds itself cannot leak, and nothing is freed by recursion.
 
 use super::numpy::{Array, Dtype, Global};
-use conefield_core::{Error, Result};
+use crate::memory;
+use conefield_core::{Error, Result, allowance};
 use ndarray::{ArrayD, Dimension, IxDyn};
 
 /// Nesting past this is no data set.
@@ -288,11 +289,12 @@ impl<'p, 'a> Item<'p, 'a> {
         if array.shape() != shape {
             return Err(self.other(expected()));
         }
+        allowance::numbers(&self.pickle.place, self.key(), array.count())?;
         let values = array.floats(&self.pickle.heap);
         let values = values.ok_or_else(|| self.invalid(format!("{} values", array.count()), "what fits in memory"))?;
         let values = ArrayD::from_shape_vec(IxDyn(array.stored()), values).map_err(|e| self.invalid(e, expected()))?;
         let values = values.permuted_axes(IxDyn(array.axes()));
-        let values = if values.is_standard_layout() { values } else { values.as_standard_layout().into_owned() };
+        let values = memory::in_order(&self.pickle.place, self.key(), values)?;
         match values.indexed_iter().find(|(_, x)| !x.is_finite()) {
             Some((at, x)) => {
                 Err(Error::invalid(&self.pickle.place, format!("{}{:?}", self.key(), at.slice()), x, "a finite number"))

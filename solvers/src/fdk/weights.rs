@@ -5,7 +5,7 @@
 //!   least π plus the fan by widening the fan (Silver, Med. Phys. 27(4), 2000).
 //! - A detector shifted sideways measures, over a full turn, the middle twice and the wide side once: Wang's weights
 //!   (Med. Phys. 29(7), 2002). Rows go on with zeros on the shorter side: filtered, they are not 0 there, and voxels on
-//!   that side need them.
+//!   that side need them. One wholly on one side measures every line once, and none near the axis: each counts whole.
 //!
 //! What the orbit asks for is found from the views alone.
 
@@ -21,7 +21,7 @@ pub enum Coverage {
     /// A full turn with a detector that reaches further on one side: `overlap` mm on the virtual detector at the axis
     /// are seen from both sides, `sign` is the side of u that reaches further.
     Offset {
-        /// Half width of what is measured twice, mm at the axis.
+        /// Half width of what is measured twice, mm at the axis; 0 where the detector lies wholly on one side.
         overlap: f64,
         /// 1 where u reaches further, −1 where −u does.
         sign: f64,
@@ -93,8 +93,12 @@ impl FdkOrbit {
         let fan = (low.abs() / mean).atan() + (high.abs() / mean).atan();
         let pitch = norm(views[0].u) * radius[0] / views[0].normal().1;
         let (narrow, wide) = (low.abs().min(high), low.abs().max(high));
-        let coverage = if full && wide - narrow > 1.5 * pitch && low < 0.0 && high > 0.0 {
-            Coverage::Offset { overlap: narrow, sign: if high > -low { 1.0 } else { -1.0 } }
+        let both = low < 0.0 && high > 0.0;
+        let aside = (low + high).abs();
+        let coverage = if full && aside > 1.5 * pitch {
+            // A border on the axis itself is there but for rounding.
+            let overlap = if both && narrow > 1e-6 * pitch { narrow } else { 0.0 };
+            Coverage::Offset { overlap, sign: if high > -low { 1.0 } else { -1.0 } }
         } else if full {
             Coverage::Full
         } else if arc >= PI + fan - rest && wide - narrow < ASIDE * (wide + narrow) {
@@ -105,7 +109,7 @@ impl FdkOrbit {
         };
         let v = &views[0];
         let sense = (v.source[0] * v.u[1] - v.source[1] * v.u[0]).signum();
-        Self { coverage, arc, fan, angles, steps, radius, aside: wide - narrow, sense }
+        Self { coverage, arc, fan, angles, steps, radius, aside, sense }
     }
 
     /// `geometry` with as many columns added to the shorter side of an offset detector as the longer one has more, and
@@ -156,6 +160,11 @@ impl FdkOrbit {
         let arc = format!("{:.1} of 360 degrees, fan {:.1}", degrees(self.arc), degrees(self.fan));
         match self.coverage {
             Coverage::Full => format!("full turn: every ray counts half ({arc})"),
+            Coverage::Offset { overlap: 0.0, .. } => {
+                format!(
+                    "detector wholly on one side of the axis: every ray counts whole, those near the axis are missing ({arc})"
+                )
+            }
             Coverage::Offset { overlap, .. } => {
                 format!("offset detector: Wang's weights over {:.1} mm either side of the axis ({arc})", overlap)
             }
@@ -229,6 +238,19 @@ mod tests {
             panic!("an offset was not seen")
         };
         assert!((overlap - (100.0 - 45.0) / 1.5).abs() < 1e-9 && sign == 1.0);
+        // From the axis outwards, and from beyond it: no line is measured twice.
+        for offset in [100.0, 120.0, -120.0] {
+            let one_sided = scan(turn(50, TAU), offset);
+            let orbit = FdkOrbit::of(&one_sided);
+            assert_eq!(orbit.coverage, Coverage::Offset { overlap: 0.0, sign: offset.signum() });
+            let ends = edges(&one_sided, 0, 500.0);
+            for u in [ends[0] + 0.1, 0.5 * (ends[0] + ends[1]), ends[1] - 0.1] {
+                assert_eq!(orbit.weight(0, u), 1.0, "offset {offset}, u {u}");
+            }
+            let (wide, _) = orbit.symmetric(&one_sided);
+            let ends = edges(&wide, 0, 500.0);
+            assert!((ends[0] + ends[1]).abs() < 1e-9, "{ends:?}");
+        }
         assert_eq!(FdkOrbit::of(&scan(turn(50, TAU).map(|a| -a), -45.0)).coverage, {
             Coverage::Offset { overlap, sign: -1.0 }
         });

@@ -375,8 +375,9 @@ struct Iterate<'a> {
     order: Order,
     /// λ in mm.
     lambda: f64,
-    /// L, with what the pull adds: times this.
+    /// L, with what the pull adds.
     lipschitz: f64,
+    /// How many times L the pull makes of it.
     pulled: f64,
     /// The share of a step that goes to what the coefficients are held to.
     pull: f32,

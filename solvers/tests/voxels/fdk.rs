@@ -123,6 +123,17 @@ fn means_are_right_for_every_orbit_magnification_and_detector() {
     println!("the worst mean is off by {:.3} %", 100.0 * worst);
 }
 
+/// A detector from the axis outwards measures every line once: to count it half would make a volume half as dense.
+#[test]
+fn a_detector_on_one_side_of_the_axis_counts_whole() {
+    for along_u in [true, false] {
+        let (volume, heard) = fdk(&scan(CENTRED.aside(0.0, along_u)), "");
+        println!("{:?}: {:?}", means(&volume), heard.notes);
+        assert!(!heard.said("counts half"), "{:?}", heard.notes);
+        assert!(off(&volume) < 0.05, "{:?}", means(&volume));
+    }
+}
+
 #[test]
 fn the_scale_does_not_depend_on_the_number_of_views() {
     let of = |views| fdk(&scan(Orbiting { views, ..CENTRED }), "");

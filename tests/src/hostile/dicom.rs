@@ -59,6 +59,21 @@ pub fn dicom_implicit(dir: &Path) {
     series(dir, IMPLICIT, |_| {});
 }
 
+/// The folder `series`, with run lengths that stand for nothing but zeros, `side` rows and columns of them a slice.
+pub fn dicom_of_zeros(dir: &Path, side: u16) {
+    series(dir, RUN_LENGTH, |o| {
+        for element in [0x10, 0x11] {
+            o.put(DataElement::new(Tag(0x0028, element), VR::US, PrimitiveValue::from(side)));
+        }
+        // Two bytes for 128 zeros.
+        let runs = [129u8, 0].repeat((usize::from(side) * usize::from(side)).div_ceil(128));
+        let mut bytes = [2u32, 64, 64 + runs.len() as u32].iter().flat_map(|x| x.to_le_bytes()).collect::<Vec<u8>>();
+        bytes.resize(64, 0);
+        bytes.extend(runs.repeat(2));
+        o.put(DataElement::new(PIXELS, VR::OB, PixelFragmentSequence::new_fragments(vec![bytes])));
+    });
+}
+
 /// The folder `series`, with run lengths.
 pub fn dicom_run_length(dir: &Path) {
     series(dir, RUN_LENGTH, |o| {

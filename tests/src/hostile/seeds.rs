@@ -13,7 +13,7 @@ use std::io::{Cursor, Read, Write};
 use std::path::Path;
 use tiff::encoder::{Compression as TiffCompression, TiffEncoder, colortype::Gray16};
 
-pub use super::dicom::{dicom, dicom_implicit, dicom_run_length};
+pub use super::dicom::{dicom, dicom_implicit, dicom_of_zeros, dicom_run_length};
 
 /// Views, rows and columns of every scan here.
 pub const SHAPE: [usize; 3] = [3, 4, 5];
@@ -164,6 +164,17 @@ pub fn tiff_bytes(packing: TiffCompression) -> Vec<u8> {
         w.write_image::<Gray16>(SHAPE[2] as u32, SHAPE[1] as u32, view).expect("memory");
     }
     file.into_inner()
+}
+
+/// `scanner.toml`, `counts.tif` packed by deflate: three pages of `side` rows and columns of zeros.
+pub fn scanner_tiff_of_zeros(dir: &Path, side: u32) {
+    let file = File::create(dir.join("counts.tif")).expect("a file of the test's own folder");
+    let packing = TiffCompression::Deflate(Default::default());
+    let mut w = TiffEncoder::new(file).expect("a file").with_compression(packing);
+    for _ in 0..SHAPE[0] {
+        w.write_image::<Gray16>(side, side, &vec![0; (side * side) as usize]).expect("a file");
+    }
+    put(&dir.join("scanner.toml"), scanner_toml("counts.tif", CIRCLE).as_bytes());
 }
 
 fn scanner_tiff_of(dir: &Path, packing: TiffCompression) {

@@ -2,8 +2,10 @@
 
 use super::Parser;
 use super::mutate::mutated;
+use std::collections::HashSet;
 use std::fmt;
 use std::fs;
+use std::ops::Range;
 use std::panic::{AssertUnwindSafe, catch_unwind};
 use std::path::{Path, PathBuf};
 use std::time::{Duration, Instant};
@@ -60,25 +62,45 @@ pub struct Seen {
     pub most_bytes: usize,
     /// The longest time.
     pub longest: Duration,
-    /// Each fault with the number of its mutation.
-    pub faults: Vec<(u64, ReaderFault)>,
+    /// Each fault with the number of its mutation and the input.
+    pub faults: Vec<(u64, ReaderFault, Vec<u8>)>,
+    /// Inputs that ended in another way than those before them, unpacked. They are damaged further in turn.
+    pub found: Vec<Vec<u8>>,
 }
 
-/// Runs `read` and tells whether it accepted its input, and what it took; or the panic.
-pub fn once<E>(meter: Meter, read: impl FnOnce() -> Result<(), E>) -> Result<(bool, usize, Duration), ReaderFault> {
+/// Inputs that are damaged further, at most, and how much longer than the seed they may be.
+const MOST_FOUND: usize = 256;
+const LONGER: usize = 1024;
+
+/// How an input ended: accepted, or refused with which words.
+pub type End = Option<String>;
+
+/// Runs `read` and tells how its input ended, and what that took; or the panic.
+pub fn once<E: fmt::Display>(
+    meter: Meter,
+    read: impl FnOnce() -> Result<(), E>,
+) -> Result<(End, usize, Duration), ReaderFault> {
     (meter.reset)();
     let before = (meter.current)();
     let start = Instant::now();
-    let found = catch_unwind(AssertUnwindSafe(|| read().is_ok()));
+    let found = catch_unwind(AssertUnwindSafe(|| read().err().map(|e| e.to_string())));
     let (time, bytes) = (start.elapsed(), (meter.peak)().saturating_sub(before));
     match found {
-        Ok(accepted) => Ok((accepted, bytes, time)),
+        Ok(end) => Ok((end, bytes, time)),
         Err(words) => {
             let text = words.downcast_ref::<String>().cloned();
             let text = text.or_else(|| words.downcast_ref::<&str>().map(|s| (*s).to_owned()));
             Err(ReaderFault::Panic(text.unwrap_or_else(|| "something that is no text".into())))
         }
     }
+}
+
+/// A refusal without what it found, which differs from input to input, and without numbers.
+fn shape(said: &str) -> String {
+    let (before, after) = said.split_once(": found ").unwrap_or((said, ""));
+    let after = after.rsplit_once(", expected ").map_or("", |(_, expected)| expected);
+    let letters = |text: &str| text.chars().filter(|c| !c.is_ascii_digit()).take(80).collect::<String>();
+    letters(before) + &letters(after)
 }
 
 impl Parser {
@@ -90,34 +112,55 @@ impl Parser {
         ((self.unpack)(packed), file)
     }
 
-    /// The file's content with mutation `number` of the unpacked `seed`.
-    pub fn damaged(&self, seed: &[u8], number: u64) -> Vec<u8> {
+    /// Mutation `number` of one of the unpacked inputs `pool`.
+    fn damaged(&self, pool: &[Vec<u8>], number: u64) -> Vec<u8> {
         // So that no two readers get the same damage.
-        let salt = self.name.bytes().fold(0u64, |h, b| h.wrapping_mul(31).wrapping_add(b.into())) << 32;
-        (self.pack)(mutated(seed, salt | number, std::str::from_utf8(seed).is_ok()))
+        let salt = self.name.bytes().fold(0u64, |h, b| h.wrapping_mul(31).wrapping_add(b.into())) << 40;
+        let number = salt | number;
+        // The seed itself every second time.
+        let which = number.wrapping_mul(0x9E37_79B9_7F4A_7C15) >> 32;
+        let from = &pool[if which.is_multiple_of(2) { 0 } else { (which / 2) as usize % pool.len() }];
+        mutated(from, number, std::str::from_utf8(from).is_ok())
     }
 
-    /// Feeds the reader `count` mutations of its seed, which it must accept as it is. `dir` is an empty folder, best
-    /// one in memory.
-    pub fn run(&self, dir: &Path, count: u64, bounds: Bounds, meter: Meter) -> Seen {
+    /// Feeds the reader mutations with these numbers of its seed, which it must accept as it is, of `corpus` and of what
+    /// it ends differently on. `dir` is an empty folder, best one in memory. The same arguments give the same inputs.
+    pub fn run(&self, dir: &Path, numbers: Range<u64>, corpus: &[Vec<u8>], bounds: Bounds, meter: Meter) -> Seen {
         let (seed, file) = self.prepare(dir);
         if let Err(e) = (self.read)(dir) {
             panic!("{}: the seed itself is refused: {e}", self.name);
         }
-        let mut seen = Seen { count, ..Seen::default() };
-        for number in 0..count {
-            fs::write(&file, self.damaged(&seed, number)).expect("the seed's own file");
+        let longest = 2 * seed.len() + LONGER;
+        let mut pool = vec![seed];
+        pool.extend(corpus.iter().cloned());
+        let mut shapes = HashSet::new();
+        let mut seen = Seen { count: numbers.end - numbers.start, ..Seen::default() };
+        // What is known comes first, so that only what is new counts as found.
+        for input in corpus {
+            fs::write(&file, (self.pack)(input.clone())).expect("the seed's own file");
+            if let Ok((end, ..)) = once(meter, || (self.read)(dir)) {
+                shapes.insert(end.as_deref().map(shape));
+            }
+        }
+        for number in numbers {
+            let input = self.damaged(&pool, number);
+            fs::write(&file, (self.pack)(input.clone())).expect("the seed's own file");
             let fault = match once(meter, || (self.read)(dir)) {
                 Err(fault) => Some(fault),
-                Ok((accepted, bytes, time)) => {
-                    seen.accepted += u64::from(accepted);
+                Ok((end, bytes, time)) => {
+                    seen.accepted += u64::from(end.is_none());
                     seen.most_bytes = seen.most_bytes.max(bytes);
                     seen.longest = seen.longest.max(time);
+                    let room = pool.len() < MOST_FOUND && input.len() <= longest;
+                    if room && shapes.insert(end.as_deref().map(shape)) {
+                        pool.push(input.clone());
+                        seen.found.push(input.clone());
+                    }
                     let hoard = (bytes > bounds.bytes).then_some(ReaderFault::Memory(bytes));
                     hoard.or((time > bounds.time).then_some(ReaderFault::Time(time)))
                 }
             };
-            seen.faults.extend(fault.map(|f| (number, f)));
+            seen.faults.extend(fault.map(|f| (number, f, input)));
         }
         seen
     }

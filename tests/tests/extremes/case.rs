@@ -38,6 +38,8 @@ pub struct Seen {
     pub rollbacks: u64,
     /// Whether training said that all of it was for nothing.
     pub warned: bool,
+    /// Whether an empty volume is nearer to the object.
+    pub worse: bool,
 }
 
 /// A case.
@@ -89,6 +91,7 @@ impl Case {
             (Ok(Ok(Ok(seen))), ends) => {
                 let went_back = seen.rollbacks > 0;
                 let ended = match (went_back, seen.warned) {
+                    (false, false) if seen.worse => "finite",
                     (false, false) => "right",
                     (true, false) => "recovered",
                     (false, true) => "warned",
@@ -99,6 +102,9 @@ impl Case {
                     Ends::Right if went_back => Some(format!("went back {} times", seen.rollbacks)),
                     Ends::Recovered if !went_back => Some("did not go back".into()),
                     Ends::Recovered | Ends::Right if seen.warned => Some("no better than an empty volume".into()),
+                    Ends::Right if seen.worse && self.expected.ends_with("better than nothing") => {
+                        Some(format!("an empty volume is nearer ({})", seen.figure))
+                    }
                     Ends::Warned if !seen.warned => Some("nothing was said".into()),
                     _ => seen.wrong.clone().map(|w| format!("{w} ({})", seen.figure)),
                 };

@@ -68,7 +68,8 @@ fn seen(name: &str, scan: &Scan, truth: &Volume, limit: f64) -> Result<Seen> {
     let e = error(&volume, truth, 1.0);
     let finite = volume.data.iter().all(|x| x.is_finite());
     let wrong = (!finite || e.is_nan() || e > limit).then(|| format!("error {e:.3}, finite {finite}"));
-    Ok(Seen { figure: format!("{:.2} dB", psnr(&volume, truth, 1.0)), wrong, rollbacks, ..Seen::default() })
+    let worse = e >= 1.0 && truth.data.iter().any(|x| *x != 0.0);
+    Ok(Seen { figure: format!("{:.2} dB", psnr(&volume, truth, 1.0)), wrong, rollbacks, worse, ..Seen::default() })
 }
 
 /// A case for each of `methods`; `limit` is of the error over that of an empty volume.
@@ -303,5 +304,5 @@ pub fn with(set: impl FnOnce(&mut Value)) -> Result<Seen> {
     let reference = records.first().and_then(|r| r.loss).map(|l| format!("first loss {l:.2e}")).unwrap_or_default();
     let figure = format!("{:.2} dB, loss {loss:.2e}", psnr(&found, &truth(), 1.0));
     let warned = records.iter().flat_map(|r| &r.events).any(|e| e.contains("no better than an empty volume"));
-    Ok(Seen { figure, reference, wrong, rollbacks: solution.rollbacks, warned })
+    Ok(Seen { figure, reference, wrong, rollbacks: solution.rollbacks, warned, worse: e >= 1.0 })
 }

@@ -1,0 +1,55 @@
+//! Shipped neural specs make a volume that is worth something on the CPU: a head of 64³ voxels from 20 views, few steps on
+//! smaller tables and fewer samples than the specs ask for.
+
+mod common;
+use common::{done, json, text};
+use conefield::specs::SHIPPED;
+
+/// A volume of zeros has this PSNR.
+const EMPTY: f64 = 13.04;
+
+const FEW: &[&str] = &["training.rays=256"];
+const SMALL: &[&str] =
+    &["training.rays=128", "projector.samples=64", "optimizer.lr=1e-2", "encoder.log2_table_size=14"];
+const DENSE: &[&str] = &["training.rays=128", "projector.samples=64", "optimizer.lr=1e-2"];
+/// Its wide network takes many minutes for a volume better than an empty one.
+const TOO_SLOW: &str = "nerf";
+
+/// Steps, settings, and the least PSNR in dB, at least one below what was measured.
+const RUNS: [(&str, u32, &[&str], f64); 7] = [
+    ("fast", 150, FEW, 20.0),
+    ("balanced", 150, FEW, 17.5),
+    ("accurate", 150, FEW, 17.5),
+    ("ni-naf", 300, SMALL, 20.5),
+    ("ni-naf-published", 300, SMALL, 22.5),
+    ("naf", 300, SMALL, 18.5),
+    ("dense", 300, DENSE, 20.5),
+];
+
+#[test]
+fn every_shipped_field_makes_a_volume() {
+    let dir = tempfile::tempdir().unwrap();
+    let at = |name: &str| text(&dir.path().join(name));
+    done(&["simulate", "phantom:head:64", "-o", &at("scan"), "--views", "20", "--detector", "64x64"]);
+    // A chain's field is that of a spec of its own.
+    let has_field =
+        |name: &str| json(&["explain", name, "--json"])["stages"].as_array().is_some_and(|stages| !stages.is_empty());
+    let untried = |name: &&str| *name != TOO_SLOW && has_field(name) && !RUNS.iter().any(|(run, ..)| run == name);
+    let missing: Vec<&str> = SHIPPED.iter().map(|s| s.name).filter(untried).collect();
+    assert!(missing.is_empty(), "no run of {missing:?}");
+    let mut faults = vec![];
+    for (name, steps, sets, least) in RUNS {
+        assert!(least > EMPTY + 1.0, "{name}: a volume of zeros would pass");
+        let (scan, run, steps) = (at("scan"), at(name), steps.to_string());
+        let mut args = vec!["reconstruct", &scan, "--spec", name, "-o", &run, "--reference", "truth", "--json"];
+        args.extend(["--steps", &steps]);
+        args.extend(sets.iter().flat_map(|set| ["--set", set]));
+        let record = json(&args);
+        let psnr = record["scores"]["psnr"].as_f64().unwrap();
+        println!("{name}: {psnr:.2} dB, {:.1} s", record["total_s"].as_f64().unwrap());
+        if psnr < least {
+            faults.push(format!("{name}: {psnr:.2} dB, less than {least}"));
+        }
+    }
+    assert!(faults.is_empty(), "{}", faults.join("\n"));
+}

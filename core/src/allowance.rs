@@ -1,0 +1,84 @@
+//! What reading may take: one allowance of memory for the whole process, one of work for each input.
+//!
+//! A reader draws from them as it allocates and as it goes on, not from what a header or a packed size claims. What is
+//! drawn of memory need not be given back: what the process holds is counted where it is allocated.
+
+use crate::error::{Error, Result};
+use std::sync::OnceLock;
+
+/// Bytes that the process may hold, and what tells how many it does.
+static MEMORY: OnceLock<(u64, fn() -> u64)> = OnceLock::new();
+
+/// Lets the process hold `most` bytes; `held` tells how many it holds now. Once: a second call changes nothing. Without
+/// one there is no limit.
+pub fn set_memory(most: u64, held: fn() -> u64) {
+    let _ = MEMORY.set((most, held));
+}
+
+/// Asks for `bytes` more, before they are allocated for `field` of the file `place`. A look, not a reservation: one
+/// thread reads.
+pub fn memory(place: &str, field: &str, bytes: u64) -> Result<()> {
+    let Some((most, held)) = MEMORY.get() else { return Ok(()) };
+    let held = held();
+    if held.saturating_add(bytes) <= *most {
+        return Ok(());
+    }
+    let mib = |n: u64| format!("{} MiB", n.div_ceil(1 << 20));
+    let found = format!("{} more to read it, beside {} that are held", mib(bytes), mib(held));
+    Err(Error::invalid(place, field, found, format!("at most {} in all, as --memory or the system allows", mib(*most))))
+}
+
+/// The same for `count` numbers of 32 bits.
+pub fn numbers(place: &str, field: &str, count: usize) -> Result<()> {
+    memory(place, field, (count as u64).saturating_mul(4))
+}
+
+/// The work that one input may make: bytes, items, steps, in units that take about as long as each other.
+#[derive(Debug)]
+pub struct Work {
+    most: u64,
+    left: u64,
+}
+
+impl Work {
+    /// `most` units.
+    pub fn new(most: u64) -> Self {
+        Self { most, left: most }
+    }
+
+    /// Takes `units` of `what`.
+    pub fn spend(&mut self, place: &str, what: &str, units: u64) -> Result<()> {
+        let Some(left) = self.left.checked_sub(units) else {
+            let expected = format!("at most {} in all, which no honest file comes near", self.most);
+            return Err(Error::invalid(place, what, format!("more than {}", self.most), expected));
+        };
+        self.left = left;
+        Ok(())
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn what_is_spent_is_gone() {
+        let mut work = Work::new(10);
+        work.spend("a", "steps", 4).unwrap();
+        work.spend("a", "steps", 6).unwrap();
+        let e = work.spend("a.toml", "steps", 1).unwrap_err().to_string();
+        assert!(e.contains("a.toml") && e.contains("steps") && e.contains("10"), "{e}");
+    }
+
+    #[test]
+    fn memory_is_asked_for_beside_what_is_held() {
+        // No other test of this crate's library reads a file of a gigabyte.
+        memory("a", "data", u64::MAX).unwrap();
+        set_memory(3 << 30, || 2 << 30);
+        memory("a", "data", 1 << 30).unwrap();
+        let e = numbers("a.nii", "data", (1 << 28) + 1).unwrap_err().to_string();
+        for want in ["a.nii", "data", "1025 MiB", "2048 MiB", "3072 MiB", "--memory"] {
+            assert!(e.contains(want), "{want}: {e}");
+        }
+    }
+}

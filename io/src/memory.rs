@@ -1,0 +1,26 @@
+//! Memory for numbers, drawn from the allowance of the process before it is taken.
+
+use conefield_core::{Error, Result, allowance};
+use ndarray::{Array, Dimension};
+
+/// Makes room in `values` for `more` of `field` of the file `place`. A list that grows without a known end, with `most`
+/// beyond what is needed, is doubled, so that it is copied seldom.
+pub(crate) fn grow<T>(values: &mut Vec<T>, more: usize, most: usize, place: &str, field: &str) -> Result<()> {
+    if values.capacity() - values.len() >= more {
+        return Ok(());
+    }
+    let capacity = (2 * values.len()).min(most).max(values.len() + more);
+    allowance::memory(place, field, (capacity as u64).saturating_mul(size_of::<T>() as u64))?;
+    values
+        .try_reserve_exact(capacity - values.len())
+        .map_err(|_| Error::invalid(place, field, format!("{capacity} values"), "an array that fits in memory"))
+}
+
+/// `array` in C order, for which its values are there twice for a moment.
+pub(crate) fn in_order<D: Dimension>(place: &str, field: &str, array: Array<f32, D>) -> Result<Array<f32, D>> {
+    if array.is_standard_layout() {
+        return Ok(array);
+    }
+    allowance::numbers(place, field, array.len())?;
+    Ok(array.as_standard_layout().into_owned())
+}
