@@ -50,8 +50,18 @@ fn writers(dir: &Path) -> Vec<(Vec<String>, &'static str)> {
     all.push((words(&["convert", &at("scan"), "--to", "naf", "--force"]), "out.pickle"));
     all.push((words(&["convert", &at("scan"), "--to", "r2", "--force"]), "out.r2"));
     all.push((words(&["convert", &at("scan"), "--to", "conefield", "--force"]), "out.scan"));
-    let weights =
-        ["pretrain", "phantom:head:16", "--spec", "naf", "--steps", "1", "--set", "encoder.log2_table_size=12", "-o"];
+    let weights = [
+        "pretrain",
+        "phantom:head:16",
+        "--spec",
+        "naf",
+        "--steps",
+        "1",
+        "--set",
+        "encoder.log2_table_size=12",
+        "--force",
+        "-o",
+    ];
     all.push((words(&weights), "out.safetensors"));
     all.push((words(&["evaluate", &at("v.npy"), &at("v.npy"), "--png"]), "out.png"));
     all

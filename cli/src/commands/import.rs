@@ -1,6 +1,7 @@
 //! `conefield import`
 
-use super::{convert::refuse_existing, info};
+use super::info;
+use crate::boundary::{Inputs, refuse_existing};
 use crate::{out, parse};
 use clap::Args;
 use conefield_core::Result;
@@ -40,6 +41,7 @@ pub struct ImportArgs {
 impl ImportArgs {
     pub fn run(self) -> Result<()> {
         refuse_existing(&self.output, self.force)?;
+        Inputs::default().and_description(&self.scanner).spare_folder(&self.output)?;
         let options = ImportOptions { i0: self.i0, floor: self.floor };
         let imported = conefield_io::read_scanner(&self.scanner, &options)?;
         conefield_io::write_scan(&self.output, &imported.scan, None)?;

@@ -9,6 +9,7 @@ use super::{LABEL, Spec, check, one_of};
 use crate::error::{Error, Result, ensure};
 use crate::{files, registry};
 use serde_json::Value;
+use std::collections::BTreeSet;
 use std::path::{Path, PathBuf};
 
 /// Longest spec, in bytes; those that come with the program are a hundredth of this.
@@ -132,6 +133,13 @@ fn without_nulls(value: Value) -> Value {
 }
 
 impl Loaded {
+    /// Files and shipped specs that something in this one comes from, as they were named.
+    pub fn sources(&self) -> BTreeSet<String> {
+        let mut all = BTreeSet::from([self.source.clone()]);
+        self.written.sources(&mut all);
+        all
+    }
+
     /// The same error, with the line of the spec that it is about.
     pub fn locate(&self, error: Error) -> Error {
         let Error::Invalid { place, field, found, expected } = error else { return error };
