@@ -82,6 +82,10 @@ impl Lease {
     /// Takes the folder at `path`, which need not be there. Refused while another process has it. What a killed process
     /// left is settled first.
     pub fn take(path: &Path, contents: Contents) -> Result<Self> {
+        // Through a link: it stays one, and what it leads to is replaced where that lies.
+        let plain: PathBuf = path.components().collect();
+        let path = if plain.is_symlink() { plain.canonicalize().map_err(|e| Error::io(path, e))? } else { plain };
+        let path = path.as_path();
         let locks = own(path)?;
         let mut lease = Self { path: path.to_path_buf(), contents, locks, writing: false, made: false };
         lease.settle()?;
@@ -115,6 +119,11 @@ impl Lease {
         } else if self.progressed() == Progressed::Nothing {
             self.clear(&self.path)?;
         } else {
+            if self.path.file_name().is_none() {
+                let found = "a folder without a name of its own";
+                let expected = "the name that it has in the folder above";
+                return Err(Error::invalid(self.path.display().to_string(), "output", found, expected));
+            }
             let aside = aside(&self.path);
             let slot = aside.join(waiting(&aside)?.len().to_string());
             fs::create_dir_all(&slot).map_err(at)?;
