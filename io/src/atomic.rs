@@ -106,9 +106,10 @@ pub fn write_atomic(path: impl AsRef<Path>, fill: impl FnOnce(&mut dyn Write) ->
     options.permissions(<fs::Permissions as std::os::unix::fs::PermissionsExt>::from_mode(0o666));
     let (file, _lock, _noted) =
         begin(&folder, || options.tempfile_in(&folder), |f| f.path()).map_err(|e| at(without_path(e)))?;
-    let mut writer = BufWriter::with_capacity(1 << 20, file);
+    // The file itself: errors of its guard speak of the temporary name.
+    let mut writer = BufWriter::with_capacity(1 << 20, file.as_file());
     fill(&mut writer)?;
-    let file = writer.into_inner().map_err(|e| at(e.into_error()))?;
+    writer.into_inner().map_err(|e| at(e.into_error()))?;
     file.as_file().sync_all().map_err(at)?;
     file.persist(path).map_err(|e| at(e.error))?;
     sync_folder(&folder);
