@@ -77,6 +77,11 @@ impl RunFolder {
         self.0.replace()
     }
 
+    /// Goes on with the run that is there.
+    pub fn go_on(&self) {
+        self.0.go_on();
+    }
+
     /// The path of one of [`FILES`].
     pub fn file(&self, name: &str) -> PathBuf {
         debug_assert!(FILES.contains(&name));

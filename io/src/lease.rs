@@ -4,7 +4,7 @@
 //! It comes back if the command ends without a result of its own, and goes when the new one is complete. A process that is
 //! killed leaves both; the next command on that folder does what is due.
 
-use crate::atomic::{exchange, parent, sync_folder};
+use crate::atomic::{exchange, parent, sweep, sync_folder};
 use crate::lock::{self, Held};
 use conefield_core::{Error, Result};
 use std::ffi::{OsStr, OsString};
@@ -92,9 +92,6 @@ impl Lease {
         // What is put back has a lock of its own.
         let more = own_again(&lease)?;
         lease.locks.extend(more);
-        if path.is_dir() {
-            crate::atomic::sweep(path);
-        }
         Ok(lease)
     }
 
@@ -139,6 +136,11 @@ impl Lease {
         }
         self.writing = true;
         Ok(())
+    }
+
+    /// Goes on with what is there: what a killed process was writing in it goes.
+    pub fn go_on(&self) {
+        sweep(&self.path);
     }
 
     /// The work is done: what it replaced goes.

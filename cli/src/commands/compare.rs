@@ -130,15 +130,17 @@ impl CompareArgs {
         let mut methods = self.methods()?;
         let input = trial::input(&self.scan, &self.protocol)?;
         methods.iter().try_for_each(|m| specs::check_held_out(&m.loaded, m.plan.as_ref(), &input.held))?;
-        self.spare_inputs(&methods)?;
         let mut lease = Lease::take(&self.output, CONTENTS)?;
         self.look_into_folder()?;
+        self.spare_inputs(&methods)?;
         for method in &mut methods {
             method.start = self.start(method, &input)?;
         }
         signals::listen()?;
         if !self.resume || !self.output.exists() {
             lease.replace()?;
+        } else {
+            lease.go_on();
         }
         let mut entries = vec![];
         for (i, method) in methods.iter().enumerate() {

@@ -296,6 +296,7 @@ impl ReconstructArgs {
     /// The file for metrics of an interrupted run, and where to go on from.
     fn reopen(&self, folder: &RunFolder, identity: &BTreeMap<String, String>) -> Result<((PathBuf, File), Resume)> {
         let resume = files::read_checkpoint(&folder.file("checkpoint.safetensors"), identity)?;
+        folder.go_on();
         let metrics = folder.metrics_until(resume.standing.recorded)?;
         Ok((metrics, resume))
     }

@@ -108,6 +108,8 @@ impl TradeoffArgs {
         signals::listen()?;
         if earlier != Earlier::Resume || !output.exists() {
             lease.replace()?;
+        } else {
+            lease.go_on();
         }
         let rungs = search.climb(output, &mut over, &mut |due| self.trial(&search, due, general))?;
         let report = TradeoffReport::new(search, rungs, over)?;
