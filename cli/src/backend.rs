@@ -14,13 +14,13 @@ use std::str::FromStr;
 use std::sync::OnceLock;
 
 /// What `--help` says of `--backend`.
-pub const HELP: &str = "Which backend: auto, cpu, wgpu, or wgpu:N with the number of an adapter; +subgroups after wgpu adds up \
+pub const HELP: &str = "Which backend: auto (the CPU; it says where a GPU could be asked for), cpu, wgpu, or wgpu:N with the number of an adapter; +subgroups after wgpu adds up \
                         gradients of tables in subgroups first";
 
 /// What `--backend` says.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
 pub enum BackendChoice {
-    /// The fastest here that can run the spec.
+    /// The CPU, until a GPU has been measured.
     #[default]
     Auto,
     /// Rayon and SIMD.
@@ -84,27 +84,27 @@ impl BackendChoice {
     }
 }
 
-/// A GPU where there is one that can run the pipeline, else the CPU.
+/// The CPU, with a word about a GPU that could be asked for: none has been measured yet, so that nobody knows which of the
+/// two is faster.
 #[derive(Default)]
 struct Auto {
     cpu: Cpu,
-    /// Opened when it is first asked for; why there is none otherwise.
-    gpu: OnceLock<Result<Wgpu, String>>,
+    /// What there is to ask for, looked up when that is first told.
+    gpu: OnceLock<Option<String>>,
 }
 
 impl Auto {
-    fn gpu(&self) -> Result<&Wgpu, String> {
-        let open = || {
+    fn note(&self) -> String {
+        let look = || {
             // Asking for adapters loads drivers: not worth it where the system shows no GPU.
-            if !shows_gpu() {
-                return Err("no GPU was found".to_owned());
-            }
-            // A CPU that acts as a GPU is slower than the CPU backend.
-            let best = adapters().into_iter().filter(|a| !a.software).max_by_key(|a| a.rank());
-            let best = best.ok_or("no GPU was found")?;
-            Wgpu::open(Some(best.index)).map_err(|e| e.to_string())
+            let adapters = if shows_gpu() { adapters() } else { vec![] };
+            let best = adapters.into_iter().filter(|a| !a.software).max_by_key(|a| a.rank())?;
+            Some(format!("there is a GPU, {best}: --backend wgpu:{} asks for it", best.index))
         };
-        self.gpu.get_or_init(open).as_ref().map_err(Clone::clone)
+        match self.gpu.get_or_init(look) {
+            None => "chosen by --backend auto: no GPU was found".to_owned(),
+            Some(gpu) => format!("chosen by --backend auto, which takes the CPU until a GPU was measured; {gpu}"),
+        }
     }
 }
 
@@ -119,26 +119,13 @@ impl Backend for Auto {
     }
 
     fn compile(&self, pipeline: &Pipeline) -> Result<(Box<dyn Executable>, Explain)> {
-        let why = match self.gpu() {
-            Err(why) => why,
-            Ok(gpu) => match gpu.compile(pipeline) {
-                Ok((exe, mut explain)) => {
-                    explain.notes.insert(0, "chosen by --backend auto: a GPU that can run every stage".into());
-                    return Ok((exe, explain));
-                }
-                Err(e) => e.to_string(),
-            },
-        };
         let (exe, mut explain) = self.cpu.compile(pipeline)?;
-        explain.notes.insert(0, format!("chosen by --backend auto: {why}"));
+        explain.notes.insert(0, self.note());
         Ok((exe, explain))
     }
 
     fn place(&self, projector: Box<dyn VoxelProjector>) -> Result<Box<dyn VoxelProjector>> {
-        match self.gpu() {
-            Ok(gpu) if projector.wgsl().is_some() => gpu.place(projector),
-            _ => Ok(projector),
-        }
+        self.cpu.place(projector)
     }
 
     fn backproject(
@@ -147,7 +134,7 @@ impl Backend for Auto {
         images: ArrayView3<'_, f32>,
         volume: ArrayViewMut3<'_, f32>,
     ) -> Result<bool> {
-        self.gpu().map_or(Ok(false), |gpu| gpu.backproject(views, images, volume))
+        self.cpu.backproject(views, images, volume)
     }
 }
 

@@ -2,7 +2,8 @@
 
 use conefield_backend_cpu::Cpu;
 use conefield_core::arena::Weights;
-use conefield_core::checkpoint::{Checkpoint, Resume};
+use conefield_core::checkpoint::{Checkpoint, Resume, Standing};
+use conefield_core::error::ensure;
 use conefield_core::pipeline::Model;
 use conefield_core::scan::{Scan, Volume};
 use conefield_core::trained::{Placement, TrainedField};
@@ -102,6 +103,9 @@ pub fn read_field(path: &Path) -> Result<TrainedField> {
     })
 }
 
+/// No run takes so many steps: counting on from here is exact in any number that counts them.
+const MOST_STEPS: u64 = 1 << 48;
+
 /// The entry of a checkpoint's text that says where the run stands; the others say which run it is.
 const STANDING: &str = "standing";
 
@@ -124,8 +128,12 @@ pub fn read_checkpoint(path: &Path, run: &BTreeMap<String, String>) -> Result<Re
     let mut file = conefield_io::read_checkpoint(path)?;
     let standing = file.notes.remove(STANDING).unwrap_or_default();
     same_run(&place, &file.notes, run)?;
-    let standing = serde_json::from_str(&standing)
+    let standing: Standing = serde_json::from_str(&standing)
         .map_err(|e| Error::invalid(&place, STANDING, e, "what conefield writes there"))?;
+    let Standing { step, recorded, seconds, .. } = standing;
+    ensure(step <= MOST_STEPS, &place, "step", step, format!("at most {MOST_STEPS}"))?;
+    ensure(recorded <= step, &place, "recorded", recorded, format!("at most {step}, the steps that are done"))?;
+    ensure(seconds.is_finite() && seconds >= 0.0, &place, "seconds", seconds, "a number of seconds")?;
     Ok(Resume { place, standing, weights: Weights { tensors: file.tensors, ..Weights::default() } })
 }
 

@@ -1,9 +1,11 @@
 //! The `conefield` command, one module a subcommand, and the specs that come with it.
 
 mod backend;
+mod boundary;
 mod commands;
 mod files;
 mod live;
+mod log;
 mod memory;
 mod method;
 mod out;
@@ -49,22 +51,32 @@ pub fn main(held: fn() -> u64) -> ExitCode {
 pub fn run(args: impl IntoIterator<Item = OsString>) -> ExitCode {
     let cli = Cli::parse_from(args);
     let general = cli.general;
-    progress::start_log(general.verbose, general.quiet);
+    if !general.quiet {
+        progress::show_bars();
+    }
+    log::start(general.verbose, general.quiet);
+    if let Err(e) = signals::watch() {
+        log::error(&e.to_string());
+        return ExitCode::FAILURE;
+    }
     memory::set_budget(general.memory);
     if let Some(n) = general.threads
         && let Err(e) = rayon::ThreadPoolBuilder::new().num_threads(n.into()).build_global()
     {
-        eprintln!("error: {n} threads: {e}");
+        log::error(&format!("{n} threads: {e}"));
         return ExitCode::FAILURE;
     }
-    plugins::search(&general.plugins, general.allow_plugins_from_spec);
+    // What is checked is entered in a process of its own, and alone.
+    if !matches!(&cli.command, commands::Command::Plugins(p) if p.is_check()) {
+        plugins::search(&general.plugins, general.allow_plugins_from_spec);
+    }
     // What is refused is what `plugins` is there to show.
     let listed = matches!(cli.command, commands::Command::Plugins(_));
     let settled = if listed { Ok(()) } else { plugins::settle() };
     match settled.and_then(|()| commands::run(cli.command, &general)) {
         Ok(()) => ExitCode::SUCCESS,
         Err(e) => {
-            eprintln!("error: {e}");
+            log::error(&e.to_string());
             match (&e, signals::caught()) {
                 (
                     Error::Interrupted { .. } | Error::Stopped { .. } | Error::Cancelled { .. } | Error::Aborted { .. },

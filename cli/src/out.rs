@@ -4,17 +4,84 @@ use conefield_core::{Error, Result};
 pub use conefield_report::text::{bytes, duration, number, table};
 pub use conefield_tradeoff::json::to_json;
 use serde::Serialize;
+use std::fmt::Write as _;
 use std::io::{ErrorKind, Write};
+
+/// Characters of a line of the log, or of an error, that are still shown.
+pub const LONGEST_LINE: usize = 4000;
 
 /// Prints `text` and a line end. A reader that has gone away (`| head`) is no failure.
 pub fn say(text: &str) -> Result<()> {
+    print(&plain(text))
+}
+
+/// Prints one JSON object.
+pub fn json(value: &impl Serialize) -> Result<()> {
+    // JSON leaves these characters as they are, but reads them escaped as well.
+    let text = to_json(value)?;
+    print(&escaped(&text, |c| c.is_control() && c != '\n', |c, out| write!(out, "\\u{:04x}", c as u32)))
+}
+
+fn print(text: &str) -> Result<()> {
     match writeln!(std::io::stdout(), "{text}") {
         Err(e) if e.kind() != ErrorKind::BrokenPipe => Err(Error::io("standard output", e)),
         _ => Ok(()),
     }
 }
 
-/// Prints one JSON object.
-pub fn json(value: &impl Serialize) -> Result<()> {
-    say(&to_json(value)?)
+/// `text` without anything that a terminal obeys but ends of lines.
+fn plain(text: &str) -> String {
+    escaped(text, |c| obeyed(c) && c != '\n', |c, out| write!(out, "{}", c.escape_default()))
+}
+
+/// `text` in one line of at most `most` characters, without anything that a terminal obeys. Of a longer one the middle is
+/// left out: where a message begins and what it expects at its end both stay.
+pub fn plain_line(text: &str, most: usize) -> String {
+    let count = text.chars().count();
+    if count <= most {
+        return escaped(text, obeyed, |c, out| write!(out, "{}", c.escape_default()));
+    }
+    let byte = |n: usize| text.char_indices().nth(n).map_or(text.len(), |(at, _)| at);
+    let (begin, end) = (&text[..byte(most / 2)], &text[byte(count - most / 2)..]);
+    let (begin, end) = (plain_line(begin, most), plain_line(end, most));
+    format!("{begin}… ({} characters left out) …{end}", count - 2 * (most / 2))
+}
+
+/// What a terminal does not show but does: control characters, and those that turn the direction of writing.
+fn obeyed(c: char) -> bool {
+    c.is_control()
+        || matches!(c, '\u{200e}' | '\u{200f}' | '\u{2028}' | '\u{2029}' | '\u{202a}'..='\u{202e}' | '\u{2066}'..='\u{2069}')
+}
+
+fn escaped(text: &str, bad: impl Fn(char) -> bool, escape: impl Fn(char, &mut String) -> std::fmt::Result) -> String {
+    let mut out = String::with_capacity(text.len());
+    for c in text.chars() {
+        if bad(c) {
+            // Writing to a text does not fail.
+            let _ = escape(c, &mut out);
+        } else {
+            out.push(c);
+        }
+    }
+    out
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn what_a_terminal_obeys_is_shown_instead() {
+        let bad = "a\u{1b}[2Jb\nerror: c\u{9b}d\u{202e}e";
+        assert_eq!(plain_line(bad, 100), "a\\u{1b}[2Jb\\nerror: c\\u{9b}d\\u{202e}e");
+        assert_eq!(plain("a\tb\nc"), "a\\tb\nc");
+        assert_eq!(plain_line("äöü", 100), "äöü");
+    }
+
+    #[test]
+    fn of_a_long_line_the_middle_is_left_out() {
+        let cut = plain_line(&format!("begin {} end", "é".repeat(10_000)), 100);
+        assert!(cut.starts_with("begin é") && cut.ends_with("é end"), "{cut}");
+        assert!(cut.contains("(9910 characters left out)") && cut.chars().count() < 140, "{cut}");
+    }
 }

@@ -1,4 +1,4 @@
-//! Progress and log, both on standard error.
+//! Progress on standard error: bars on a terminal, else lines of the log.
 
 use crate::live::Live;
 use crate::{files, signals};
@@ -16,7 +16,6 @@ use std::path::PathBuf;
 use std::sync::LazyLock;
 use std::time::{Duration, Instant};
 use tracing::{debug, info, warn};
-use tracing_subscriber::EnvFilter;
 
 /// The bars on the terminal; the log is written between two drawings of them.
 static BARS: LazyLock<MultiProgress> = LazyLock::new(|| MultiProgress::with_draw_target(ProgressDrawTarget::hidden()));
@@ -24,37 +23,16 @@ static BARS: LazyLock<MultiProgress> = LazyLock::new(|| MultiProgress::with_draw
 /// Without a terminal, how often progress is told.
 const EVERY: Duration = Duration::from_secs(5);
 
-/// Starts the log: warnings and news, more with `verbose`, errors only when `quiet`.
-pub fn start_log(verbose: u8, quiet: bool) {
-    if !quiet && io::stderr().is_terminal() {
+/// Lets bars be drawn, if there is a terminal to draw them on.
+pub fn show_bars() {
+    if io::stderr().is_terminal() {
         BARS.set_draw_target(ProgressDrawTarget::stderr());
     }
-    let level = match (quiet, verbose) {
-        (true, _) => "error",
-        (_, 0) => "info",
-        (_, 1) => "debug",
-        _ => "trace",
-    };
-    let _ = tracing_subscriber::fmt()
-        .with_env_filter(EnvFilter::new(level))
-        .with_writer(|| BetweenBars)
-        .with_ansi(io::stderr().is_terminal())
-        .with_target(false)
-        .without_time()
-        .try_init();
 }
 
-/// Standard error, written while no bar is drawn.
-struct BetweenBars;
-
-impl Write for BetweenBars {
-    fn write(&mut self, text: &[u8]) -> io::Result<usize> {
-        BARS.suspend(|| io::stderr().write(text))
-    }
-
-    fn flush(&mut self) -> io::Result<()> {
-        io::stderr().flush()
-    }
+/// Does something while no bar is drawn.
+pub fn between_bars(f: impl FnOnce()) {
+    BARS.suspend(f);
 }
 
 /// Shows a solver's progress and writes its records.

@@ -1,7 +1,9 @@
 //! The folder of a run: `metrics.jsonl`, `spec.toml`, `live.png` if asked for, while it lasts `checkpoint.safetensors`, at the end
 //! `volume.nii.gz`, `weights.safetensors`, `slices.png` and, last and only of a finished run, `record.json`.
 
+use conefield_core::error::ensure;
 use conefield_core::{Error, Result};
+use conefield_io::{Contents, Lease, Progressed};
 use std::fs::{self, File};
 use std::io::ErrorKind;
 use std::path::{Path, PathBuf};
@@ -18,54 +20,72 @@ pub const FILES: [&str; 8] = [
     "checkpoint.safetensors",
 ];
 
-/// A folder that belongs to this run alone.
-pub struct RunFolder {
-    path: PathBuf,
+/// What such a folder holds.
+pub const CONTENTS: Contents = Contents { known, progressed };
+
+/// Whether a run may have left this.
+pub fn known(path: &Path) -> bool {
+    let name = path.file_name().unwrap_or_default();
+    FILES.iter().any(|f| name == *f) || conefield_io::is_unfinished(name)
 }
 
+/// How far the run in `folder` came.
+pub fn progressed(folder: &Path) -> Progressed {
+    let has = |name: &str| folder.join(name).exists();
+    if has("record.json") {
+        Progressed::Complete
+    } else if ["checkpoint.safetensors", "volume.nii.gz", "weights.safetensors"].into_iter().any(has) {
+        Progressed::Begun
+    } else {
+        Progressed::Nothing
+    }
+}
+
+/// A folder that belongs to this run alone.
+pub struct RunFolder(Lease);
+
 impl RunFolder {
-    /// Makes the folder, or takes an empty one. Of a folder with files in it only those of an earlier run go, and
-    /// only with `force`.
-    pub fn create(path: &Path, force: bool) -> Result<Self> {
-        let io = |e| Error::io(path, e);
-        fs::create_dir_all(path).map_err(io)?;
-        let mut found = vec![];
-        for entry in fs::read_dir(path).map_err(io)? {
-            let name = entry.map_err(io)?.file_name();
-            if !conefield_io::is_unfinished(&name) {
-                found.push(name.to_string_lossy().into_owned());
-            }
-        }
-        found.sort();
+    /// Takes the folder, which need not be there yet. Nothing changes in it.
+    pub fn take(path: &Path) -> Result<Self> {
+        Lease::take(path, CONTENTS).map(Self)
+    }
+
+    /// Refuses a folder that holds something else than a run, and a run that came to something unless `force`.
+    pub fn may_begin(&self, force: bool) -> Result<()> {
+        let path = self.0.path();
         let place = path.display().to_string();
-        if let Some(other) = found.iter().find(|f| !FILES.contains(&f.as_str())) {
+        let entries = match fs::read_dir(path) {
+            Err(e) if e.kind() == ErrorKind::NotFound => return Ok(()),
+            entries => entries.map_err(|e| Error::io(path, e))?,
+        };
+        let mut strange = vec![];
+        for entry in entries {
+            let path = entry.map_err(|e| Error::io(path, e))?.path();
+            strange
+                .extend((!known(&path)).then(|| path.file_name().unwrap_or_default().to_string_lossy().into_owned()));
+        }
+        if let Some(other) = strange.iter().min() {
             let found = format!("a folder with {other} in it");
             return Err(Error::invalid(place, "output", found, "a new or empty folder"));
         }
-        if !found.is_empty() && !force {
-            let found = "an earlier run";
-            return Err(Error::invalid(place, "output", found, "a new or empty folder, or --force to replace the run"));
-        }
-        // Not before: in a folder that is refused, another command may be about to finish such a file.
-        sweep(path)?;
-        for old in found {
-            fs::remove_file(path.join(&old)).map_err(|e| Error::io(path.join(&old), e))?;
-        }
-        Ok(Self { path: path.to_path_buf() })
+        let expected = "a new or empty folder, or --force to replace the run";
+        ensure(force || self.0.progressed() == Progressed::Nothing, &place, "output", "an earlier run", expected)
     }
 
-    /// The folder of a run that was interrupted.
-    pub fn reopen(path: &Path) -> Result<Self> {
-        if path.is_dir() {
-            sweep(path)?;
-        }
-        Ok(Self { path: path.to_path_buf() })
+    /// Begins a run in the folder, which is empty then; an earlier run waits until this one is complete.
+    pub fn begin(&mut self) -> Result<()> {
+        self.0.replace()
+    }
+
+    /// Goes on with the run that is there.
+    pub fn go_on(&self) {
+        self.0.go_on();
     }
 
     /// The path of one of [`FILES`].
     pub fn file(&self, name: &str) -> PathBuf {
         debug_assert!(FILES.contains(&name));
-        self.path.join(name)
+        self.0.path().join(name)
     }
 
     /// Opens `metrics.jsonl`, which grows a line at a time.
@@ -91,24 +111,12 @@ impl RunFolder {
         Ok((path, file))
     }
 
-    /// Removes the checkpoint of a finished run.
-    pub fn finish(&self) -> Result<()> {
+    /// The run is done: its checkpoint goes, and what it replaced.
+    pub fn finish(self) -> Result<()> {
         let path = self.file("checkpoint.safetensors");
         match fs::remove_file(&path) {
             Err(e) if e.kind() != ErrorKind::NotFound => Err(Error::io(&path, e)),
-            _ => Ok(()),
+            _ => self.0.complete(),
         }
     }
-}
-
-/// Removes what a killed run was about to write: files that never got their final name.
-fn sweep(folder: &Path) -> Result<()> {
-    let io = |e| Error::io(folder, e);
-    for entry in fs::read_dir(folder).map_err(io)? {
-        let entry = entry.map_err(io)?;
-        if conefield_io::is_unfinished(&entry.file_name()) && entry.path().is_file() {
-            fs::remove_file(entry.path()).map_err(|e| Error::io(entry.path(), e))?;
-        }
-    }
-    Ok(())
 }

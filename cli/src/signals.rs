@@ -1,27 +1,53 @@
-//! Ctrl-C and termination: the first asks a run to end after its step, a second one ends the program at once.
+//! Ctrl-C, termination and a terminal that is closed. A command that listens ends after its step at the first signal and at
+//! once at the second; any other ends at once. Unfinished files go before that.
 
 use conefield_core::{Error, Result};
 use signal_hook::consts::{SIGINT, SIGTERM};
-use signal_hook::flag;
+use signal_hook::iterator::Signals;
 use std::io;
 use std::path::Path;
-use std::sync::atomic::{AtomicBool, AtomicUsize, Ordering};
-use std::sync::{Arc, OnceLock};
+use std::sync::atomic::{AtomicBool, AtomicU8, Ordering};
 
-static CAUGHT: OnceLock<Arc<AtomicUsize>> = OnceLock::new();
+/// The first signal that came; 0 before that.
+static CAUGHT: AtomicU8 = AtomicU8::new(0);
+/// Whether the command looks at [`caught`].
+static LISTENING: AtomicBool = AtomicBool::new(false);
 
-/// Starts to listen. Until then a signal ends the program as the system has it.
-pub fn listen() -> Result<()> {
-    let caught = CAUGHT.get_or_init(Arc::default);
-    let again = Arc::new(AtomicBool::new(false));
-    for signal in [SIGINT, SIGTERM] {
-        // Actions run in the order of their registration: the first signal still finds `again` down.
-        flag::register_conditional_shutdown(signal, 128 + signal, again.clone())
-            .and_then(|_| flag::register_usize(signal, caught.clone(), signal as usize))
-            .and_then(|_| flag::register(signal, again.clone()))
-            .map_err(|e| Error::io(Path::new("signal handlers"), e))?;
-    }
+/// Starts to watch for signals.
+pub fn watch() -> Result<()> {
+    let mut wanted = vec![SIGINT, SIGTERM];
+    wanted.extend(hangup());
+    let mut signals = Signals::new(wanted).map_err(|e| Error::io(Path::new("signal handlers"), e))?;
+    std::thread::spawn(move || {
+        for signal in signals.forever() {
+            let first = CAUGHT.compare_exchange(0, signal as u8, Ordering::Relaxed, Ordering::Relaxed).is_ok();
+            if !(first && LISTENING.load(Ordering::Relaxed)) {
+                conefield_io::discard_unfinished();
+                std::process::exit(128 + signal);
+            }
+        }
+    });
     Ok(())
+}
+
+/// From here on the command looks at [`caught`] and ends by itself.
+pub fn listen() -> Result<()> {
+    LISTENING.store(true, Ordering::Relaxed);
+    Ok(())
+}
+
+/// The signal of a terminal that is closed, unless whoever started the program wants it ignored, as `nohup` does.
+fn hangup() -> Option<i32> {
+    #[cfg(target_os = "linux")]
+    {
+        let status = std::fs::read_to_string("/proc/self/status").ok()?;
+        let ignored = status.lines().find_map(|l| l.strip_prefix("SigIgn:"))?;
+        let ignored = u64::from_str_radix(ignored.trim(), 16).ok()?;
+        let hangup = signal_hook::consts::SIGHUP;
+        (ignored & (1 << (hangup - 1)) == 0).then_some(hangup)
+    }
+    #[cfg(not(target_os = "linux"))]
+    None
 }
 
 /// Takes the end of standard input for a termination: whoever started this run holds the other end.
@@ -34,12 +60,10 @@ pub fn follow_input() {
 
 /// Goes on as if this signal had come, unless one has.
 pub fn note(signal: u8) {
-    let caught = CAUGHT.get_or_init(Arc::default);
-    let _ = caught.compare_exchange(0, signal.into(), Ordering::Relaxed, Ordering::Relaxed);
+    let _ = CAUGHT.compare_exchange(0, signal, Ordering::Relaxed, Ordering::Relaxed);
 }
 
 /// The signal that came, if any did.
 pub fn caught() -> Option<u8> {
-    let signal = CAUGHT.get()?.load(Ordering::Relaxed);
-    u8::try_from(signal).ok().filter(|s| *s > 0)
+    Some(CAUGHT.load(Ordering::Relaxed)).filter(|s| *s > 0)
 }

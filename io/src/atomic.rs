@@ -1,17 +1,91 @@
 //! Writing so that the final name never holds half a file.
 
+use crate::lease;
+use crate::lock::{self, Held};
 use conefield_core::{Error, Result};
+use std::collections::BTreeSet;
 use std::ffi::OsStr;
 use std::fs::{self, File};
 use std::io::{BufWriter, Write};
 use std::path::{Path, PathBuf};
+use std::sync::{Mutex, PoisonError};
 
 /// How the names of unfinished files begin and end.
 const UNFINISHED: [&str; 2] = [".conefield-", ".tmp"];
 
-/// Whether a file of this name is one that [`write_atomic`] had begun when its process was killed.
+/// What this process is writing under temporary names. Who holds the lock keeps others from beginning.
+static OPEN: Mutex<BTreeSet<PathBuf>> = Mutex::new(BTreeSet::new());
+
+/// Whether a file or folder of this name is one that [`write_atomic`] or [`write_folder_atomic`] had begun when its
+/// process was killed.
 pub fn is_unfinished(name: &OsStr) -> bool {
     name.to_str().is_some_and(|n| n.starts_with(UNFINISHED[0]) && n.ends_with(UNFINISHED[1]))
+}
+
+/// Removes what other processes had begun in `folder` when they were killed. What a living one writes is locked and stays.
+pub fn sweep(folder: &Path) {
+    for entry in fs::read_dir(folder).into_iter().flatten().flatten() {
+        let path = entry.path();
+        let Ok(kind) = entry.file_type() else { continue };
+        if !is_unfinished(&entry.file_name()) || !(kind.is_file() || kind.is_dir()) {
+            continue;
+        }
+        // Held until it is gone: a process that has just made it sees that and makes another.
+        if let Held::Ours(_lock) = lock::hold(&path) {
+            let gone = if kind.is_dir() { fs::remove_dir_all(&path) } else { fs::remove_file(&path) };
+            if let Err(e) = gone {
+                tracing::debug!("{}: {e}", path.display());
+            }
+        }
+    }
+}
+
+/// As [`sweep`], once a folder.
+fn sweep_once(folder: &Path) {
+    static SWEPT: Mutex<BTreeSet<PathBuf>> = Mutex::new(BTreeSet::new());
+    if SWEPT.lock().unwrap_or_else(PoisonError::into_inner).insert(folder.to_path_buf()) {
+        sweep(folder);
+    }
+}
+
+/// For the last moment of a process that a signal ends: removes what it is writing, and lets nothing new begin.
+pub fn discard_unfinished() {
+    let open = OPEN.lock().unwrap_or_else(PoisonError::into_inner);
+    for path in open.iter() {
+        let _ = if path.is_dir() { fs::remove_dir_all(path) } else { fs::remove_file(path) };
+    }
+    std::mem::forget(open);
+}
+
+/// A temporary name in [`OPEN`].
+struct Noted(PathBuf);
+
+impl Drop for Noted {
+    fn drop(&mut self) {
+        OPEN.lock().unwrap_or_else(PoisonError::into_inner).remove(&self.0);
+    }
+}
+
+/// Makes something under a temporary name in `folder` and locks it, so that no other process takes it for left behind.
+fn begin<T>(
+    folder: &Path,
+    mut make: impl FnMut() -> std::io::Result<T>,
+    path: impl Fn(&T) -> &Path,
+) -> std::io::Result<(T, Option<File>, Noted)> {
+    sweep_once(folder);
+    loop {
+        let mut open = OPEN.lock().unwrap_or_else(PoisonError::into_inner);
+        let made = make()?;
+        open.insert(path(&made).to_path_buf());
+        drop(open);
+        let noted = Noted(path(&made).to_path_buf());
+        // Another process that swept the folder between the two lines has removed it.
+        match lock::hold(path(&made)) {
+            Held::Ours(lock) => return Ok((made, Some(lock), noted)),
+            Held::Unknown if path(&made).exists() => return Ok((made, None, noted)),
+            Held::Unknown | Held::Theirs => {}
+        }
+    }
 }
 
 /// Writes a file through `fill`: into a temporary file in the same folder, flushed and synced, then renamed.
@@ -30,10 +104,12 @@ pub fn write_atomic(path: impl AsRef<Path>, fill: impl FnOnce(&mut dyn Write) ->
     // Without this the file would be private to its owner, unlike any other that the user makes.
     #[cfg(unix)]
     options.permissions(<fs::Permissions as std::os::unix::fs::PermissionsExt>::from_mode(0o666));
-    let file = options.tempfile_in(&folder).map_err(|e| at(without_path(e)))?;
-    let mut writer = BufWriter::with_capacity(1 << 20, file);
+    let (file, _lock, _noted) =
+        begin(&folder, || options.tempfile_in(&folder), |f| f.path()).map_err(|e| at(without_path(e)))?;
+    // The file itself: errors of its guard speak of the temporary name.
+    let mut writer = BufWriter::with_capacity(1 << 20, file.as_file());
     fill(&mut writer)?;
-    let file = writer.into_inner().map_err(|e| at(e.into_error()))?;
+    writer.into_inner().map_err(|e| at(e.into_error()))?;
     file.as_file().sync_all().map_err(at)?;
     file.persist(path).map_err(|e| at(e.error))?;
     sync_folder(&folder);
@@ -46,7 +122,7 @@ pub fn write_text_atomic(path: impl AsRef<Path>, text: &str) -> Result<()> {
     write_atomic(path, |w| w.write_all(text.as_bytes()).map_err(|e| Error::io(path, e)))
 }
 
-/// Fills a temporary folder beside `folder` and renames it into place; what stood there before goes away only then.
+/// Fills a temporary folder beside `folder` and exchanges the two in one step; what stood there before goes away only then.
 ///
 /// Whether an earlier folder may be replaced at all is for the caller to check.
 pub fn write_folder_atomic(folder: impl AsRef<Path>, fill: impl FnOnce(&Path) -> Result<()>) -> Result<()> {
@@ -56,37 +132,61 @@ pub fn write_folder_atomic(folder: impl AsRef<Path>, fill: impl FnOnce(&Path) ->
     if folder.file_name().is_none() {
         return Err(Error::invalid(folder.display().to_string(), "folder", "no name of its own", "a folder to create"));
     }
-    let temporary = |suffix: &str| {
-        let mut options = tempfile::Builder::new();
-        options.prefix(UNFINISHED[0]).suffix(suffix);
-        #[cfg(unix)]
-        options.permissions(<fs::Permissions as std::os::unix::fs::PermissionsExt>::from_mode(0o777));
-        options.tempdir_in(&beside).map_err(|e| at(without_path(e)))
-    };
-    let new = temporary(".tmp")?;
-    fill(new.path())?;
+    lease::put_back_missing(folder)?;
+    let mut options = tempfile::Builder::new();
+    options.prefix(UNFINISHED[0]).suffix(UNFINISHED[1]);
+    #[cfg(unix)]
+    options.permissions(<fs::Permissions as std::os::unix::fs::PermissionsExt>::from_mode(0o777));
+    let (new, _lock, _noted) =
+        begin(&beside, || options.tempdir_in(&beside), |d| d.path()).map_err(|e| at(without_path(e)))?;
+    fill(new.path()).map_err(|e| renamed(e, new.path(), folder))?;
     sync_folder(new.path());
-    // rename() replaces only empty folders, so an earlier one steps aside first and comes back if that was in vain.
-    let mut aside = None;
-    if folder.symlink_metadata().is_ok() {
-        let old = temporary(".old.tmp")?;
-        fs::rename(folder, old.path().join("old")).map_err(at)?;
-        aside = Some(old);
+    if folder.symlink_metadata().is_err() {
+        fs::rename(new.path(), folder).map_err(at)?;
+        // The temporary name is gone: nothing is left for the guard to remove.
+        let _ = new.keep();
+    } else if exchange(new.path(), folder).map_err(at)? {
+        // The temporary name is that of the earlier folder now, which the guard removes.
+    } else {
+        lease::replace_in_two_steps(new.path(), folder)?;
+        let _ = new.keep();
     }
-    if let Err(e) = fs::rename(new.path(), folder) {
-        if let Some(old) = aside {
-            let kept = old.path().join("old");
-            if let Err(back) = fs::rename(&kept, folder) {
-                tracing::error!("{}: could not be put back: {back}; it is at {}", folder.display(), kept.display());
-                let _ = old.keep();
-            }
-        }
-        return Err(at(e));
-    }
-    // The temporary name is gone with the rename: nothing is left for the guard to remove.
-    let _ = new.keep();
     sync_folder(&beside);
     Ok(())
+}
+
+/// Exchanges what two names stand for, in one step; false where the system cannot do that.
+pub(crate) fn exchange(a: &Path, b: &Path) -> std::io::Result<bool> {
+    #[cfg(any(target_os = "linux", target_os = "android", target_vendor = "apple"))]
+    {
+        use rustix::fs::{CWD, RenameFlags, renameat_with};
+        use rustix::io::Errno;
+        match renameat_with(CWD, a, CWD, b, RenameFlags::EXCHANGE) {
+            Ok(()) => Ok(true),
+            Err(Errno::NOSYS | Errno::INVAL | Errno::NOTSUP | Errno::PERM) => Ok(false),
+            Err(e) => Err(e.into()),
+        }
+    }
+    #[cfg(not(any(target_os = "linux", target_os = "android", target_vendor = "apple")))]
+    {
+        let _ = (a, b);
+        Ok(false)
+    }
+}
+
+/// An error about a file in the temporary folder `from`, told with the name that the folder would have had.
+fn renamed(e: Error, from: &Path, to: &Path) -> Error {
+    match e {
+        Error::Io { path, source } => {
+            let path = path.strip_prefix(from).map_or(path.clone(), |rest| to.join(rest));
+            Error::Io { path, source }
+        }
+        Error::Invalid { place, field, found, expected } => {
+            let place = place.replace(&from.display().to_string(), &to.display().to_string());
+            Error::Invalid { place, field, found, expected }
+        }
+        other => other,
+    }
 }
 
 /// The system's own words: `tempfile` adds the temporary name, which means nothing to a user.
@@ -99,7 +199,7 @@ fn without_path(e: std::io::Error) -> std::io::Error {
 }
 
 /// The folder that holds `path`.
-fn parent(path: &Path) -> PathBuf {
+pub(crate) fn parent(path: &Path) -> PathBuf {
     match path.parent() {
         Some(p) if !p.as_os_str().is_empty() => p.to_path_buf(),
         _ => PathBuf::from("."),
@@ -107,7 +207,7 @@ fn parent(path: &Path) -> PathBuf {
 }
 
 /// Makes a rename last through a power cut where the system can do that; the data itself is synced already.
-fn sync_folder(folder: &Path) {
+pub(crate) fn sync_folder(folder: &Path) {
     if cfg!(unix)
         && let Ok(f) = File::open(folder)
     {

@@ -1,4 +1,4 @@
-//! Checkpoints: safetensors with a format version and a checksum of the values.
+//! Checkpoints: safetensors with a format version and a checksum of all that they hold: text, names, shapes and values.
 
 use crate::weights::{read_weights, write_weights};
 use conefield_core::arena::Weights;
@@ -10,7 +10,9 @@ use std::path::Path;
 /// What a checkpoint calls itself.
 const FORMAT: &str = "conefield-checkpoint";
 /// Changes whenever an older reader would misread a newer file.
-const VERSION: &str = "1";
+const VERSION: &str = "2";
+/// Where the checksum stands.
+const SUM: &str = "crc32";
 
 /// Writes a checkpoint: named `f32` tensors (name, shape, values in C order) and free text. An earlier one of that
 /// name stays whole until the new one is on the disk.
@@ -20,11 +22,12 @@ pub fn write_checkpoint(
     text: &BTreeMap<String, String>,
 ) -> Result<()> {
     let mut text = text.clone();
+    text.extend([("format", FORMAT), ("format_version", VERSION)].map(|(k, v)| (k.to_owned(), v.to_owned())));
     // The file holds tensors in the order of their names.
-    let mut order: Vec<_> = tensors.iter().map(|(name, _, values)| (name.as_ref(), *values)).collect();
-    order.sort_unstable_by_key(|(name, _)| *name);
-    let sum = checksum(order.into_iter().map(|(_, values)| values));
-    text.extend([("format", FORMAT.to_owned()), ("format_version", VERSION.to_owned()), ("crc32", sum)].map(owned));
+    let mut order: Vec<_> = tensors.iter().map(|(name, shape, v)| (name.as_ref(), shape.as_ref(), *v)).collect();
+    order.sort_unstable_by_key(|(name, ..)| *name);
+    let sum = checksum(&text, order.into_iter());
+    text.insert(SUM.to_owned(), sum);
     write_weights(path, tensors, &text)
 }
 
@@ -32,28 +35,45 @@ pub fn write_checkpoint(
 pub fn read_checkpoint(path: impl AsRef<Path>) -> Result<Weights> {
     let path = path.as_ref();
     let mut file = read_weights(path)?;
-    let found = checksum(file.tensors.values().map(|(_, values)| &values[..]));
-    for (key, expected) in [("format", FORMAT), ("format_version", VERSION), ("crc32", &found)] {
-        let said = file.notes.remove(key);
-        if said.as_deref() != Some(expected) {
-            let said = said.map_or("nothing".into(), |s| format!("\"{s}\""));
-            return Err(Error::invalid(path.display().to_string(), key, said, format!("\"{expected}\"")));
+    let expect = |key: &str, said: Option<String>, expected: &str| {
+        if said.as_deref() == Some(expected) {
+            return Ok(());
         }
+        let said = said.map_or("nothing".into(), |s| format!("\"{s}\""));
+        Err(Error::invalid(path.display().to_string(), key, said, format!("\"{expected}\"")))
+    };
+    let said = file.notes.remove(SUM);
+    for (key, expected) in [("format", FORMAT), ("format_version", VERSION)] {
+        expect(key, file.notes.get(key).cloned(), expected)?;
     }
+    let tensors = file.tensors.iter().map(|(name, (shape, values))| (&name[..], &shape[..], &values[..]));
+    expect(SUM, said, &checksum(&file.notes, tensors))?;
+    file.notes.retain(|key, _| !["format", "format_version"].contains(&&key[..]));
     Ok(file)
 }
 
-fn owned((key, value): (&str, String)) -> (String, String) {
-    (key.to_owned(), value)
-}
-
-fn checksum<'a>(values: impl Iterator<Item = &'a [f32]>) -> String {
+/// Over every text and tensor, each after its length: nothing can move from one into the next.
+fn checksum<'a>(
+    text: &BTreeMap<String, String>,
+    tensors: impl Iterator<Item = (&'a str, &'a [usize], &'a [f32])>,
+) -> String {
     let mut crc = Crc::new();
+    let word = |crc: &mut Crc, bytes: &[u8]| {
+        crc.update(&(bytes.len() as u64).to_le_bytes());
+        crc.update(bytes);
+    };
+    for part in text.iter().flat_map(|(key, value)| [key, value]) {
+        word(&mut crc, part.as_bytes());
+    }
     let mut raw = Vec::with_capacity(1 << 16);
-    for part in values.flat_map(|v| v.chunks(1 << 14)) {
-        raw.clear();
-        raw.extend(part.iter().flat_map(|x| x.to_le_bytes()));
-        crc.update(&raw);
+    for (name, shape, values) in tensors {
+        word(&mut crc, name.as_bytes());
+        word(&mut crc, &shape.iter().flat_map(|n| (*n as u64).to_le_bytes()).collect::<Vec<_>>());
+        for part in values.chunks(1 << 14) {
+            raw.clear();
+            raw.extend(part.iter().flat_map(|x| x.to_le_bytes()));
+            crc.update(&raw);
+        }
     }
     format!("{:08x}", crc.sum())
 }
@@ -80,8 +100,10 @@ mod tests {
         let last = good.len() - 1;
         refused(&[&good[..last], &[good[last] ^ 1]].concat(), "crc32");
         refused(&good[..last], "header");
-        let at = good.windows(20).position(|w| w == b"\"format_version\":\"1\"").unwrap();
-        refused(&[&good[..at + 18], b"2", &good[at + 19..]].concat(), "format_version");
+        let at = good.windows(10).position(|w| w == b"\"step\":\"7\"").unwrap();
+        refused(&[&good[..at + 8], b"5", &good[at + 9..]].concat(), "crc32");
+        let at = good.windows(20).position(|w| w == b"\"format_version\":\"2\"").unwrap();
+        refused(&[&good[..at + 18], b"3", &good[at + 19..]].concat(), "format_version");
         write_weights(&path, &tensors, &text).unwrap();
         assert!(read_checkpoint(&path).unwrap_err().to_string().contains("format"));
     }

@@ -13,7 +13,8 @@
 //! the program they are millimetres. Voxel values stay in `1/unit` of the scan they belong to.
 //!
 //! Writers put everything beside its final name, sync it and rename it ([`write_atomic`]), so that a half-written
-//! file never stands under the name that was asked for.
+//! file never stands under the name that was asked for. A folder that grows while a command works is a [`Lease`]: locked,
+//! and what stood there before waits until the new work is complete.
 
 mod affine;
 mod atomic;
@@ -24,6 +25,8 @@ mod file_order;
 mod filling;
 mod folder;
 mod input;
+mod lease;
+mod lock;
 mod memory;
 mod metaimage;
 mod naf;
@@ -51,10 +54,11 @@ mod weights;
 #[cfg(test)]
 mod testing;
 
-pub use atomic::{is_unfinished, write_atomic, write_folder_atomic, write_text_atomic};
+pub use atomic::{discard_unfinished, is_unfinished, write_atomic, write_folder_atomic, write_text_atomic};
 pub use checkpoint::{read_checkpoint, write_checkpoint};
 pub use counts::{Correction, CountsReport, OpenBeam, line_integrals};
 pub use file_order::{PACKED_BYTES, SLAB_BYTES};
+pub use lease::{Contents, Lease, Progressed, is_aside};
 pub use naf::{read_naf, write_naf};
 pub use r2::{read_r2, write_r2};
 pub use rtk::{read_rtk_geometry, write_rtk_geometry};
@@ -63,5 +67,5 @@ pub use scan::{DataSet, read_data_set, read_scan, read_truth};
 pub use scan_folder::write_scan;
 pub use scanner::{I0, ImportOptions, Imported, read_scanner};
 pub use size::{ScanSize, scan_size, scanner_size, volume_voxels};
-pub use volume::{is_volume, packed_bytes, read_volume, write_volume, write_voxels};
+pub use volume::{check_shape, is_volume, packed_bytes, read_volume, write_volume, write_voxels};
 pub use weights::{read_weights, write_weights};

@@ -7,6 +7,7 @@ use crate::affine::{self, Affine};
 use crate::file_order::{self, FileOrder};
 use crate::input::Input;
 use crate::number::{ByteOrder, Number};
+use conefield_core::error::ensure;
 use conefield_core::geometry::VoxelGrid;
 use conefield_core::parts::Voxels;
 use conefield_core::scan::Volume;
@@ -204,14 +205,17 @@ fn quaternion(header: &NiftiHeader) -> [[f64; 4]; 3] {
     std::array::from_fn(|i| [r[i][0] * s[0], r[i][1] * s[1], r[i][2] * s[2], t[i]])
 }
 
+/// Refuses more voxels on an axis than the header can say.
+pub(crate) fn check_shape(place: &str, shape: [usize; 3]) -> Result<()> {
+    let expected = "at most 32767 voxels an axis, which is all that NIfTI-1 can say (write .npy)";
+    ensure(shape.iter().all(|&n| n <= i16::MAX as usize), place, "shape", format!("{shape:?}"), expected)
+}
+
 /// Writes `voxels` as `f32` with an sform: their own affine, or one that puts the grid's centre at `grid.center`.
 pub(crate) fn write(w: &mut dyn Write, path: &Path, voxels: &mut dyn Voxels) -> Result<()> {
     let grid = voxels.grid();
     let place = path.display().to_string();
-    if grid.shape.iter().any(|&n| n > i16::MAX as usize) {
-        let expected = "at most 32767 voxels an axis, which is all that NIfTI-1 can say (write .npy)";
-        return Err(Error::invalid(place, "shape", format!("{:?}", grid.shape), expected));
-    }
+    check_shape(&place, grid.shape)?;
     // 1: the scanner's own coordinates; 2: some others.
     let (affine, own) = affine::of(voxels, &place);
     let code = if own { 1i16 } else { 2 };

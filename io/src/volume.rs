@@ -106,6 +106,15 @@ pub fn is_volume(path: impl AsRef<Path>) -> bool {
     })
 }
 
+/// Refuses a name or a number of voxels that [`write_voxels`] would refuse, before they are made.
+pub fn check_shape(path: impl AsRef<Path>, shape: [usize; 3]) -> Result<()> {
+    let path = path.as_ref();
+    match wanted(path)? {
+        VolumeFormat::Nifti | VolumeFormat::NiftiGz => nifti::check_shape(&path.display().to_string(), shape),
+        VolumeFormat::MetaImage | VolumeFormat::Npy => Ok(()),
+    }
+}
+
 /// Writes a volume as its name asks: `.nii`, `.nii.gz` (both `f32` with an sform in mm), `.mha` (`f32`, zlib, with the
 /// same axes as directions and voxel sizes) or `.npy` (`f32`, C order, without voxel sizes).
 ///

@@ -10,6 +10,7 @@ use crate::statistics::mean;
 use crate::trial::{Figures, ScanRecord};
 use conefield_core::error::ensure;
 use conefield_core::{Error, Result};
+use conefield_io::{Contents, Progressed};
 use conefield_report::text::duration;
 use serde::{Deserialize, Serialize};
 use serde_json::Value;
@@ -123,8 +124,9 @@ pub enum Earlier {
 }
 
 impl Search {
-    /// Opens the folder of a search; where one is resumed, what it got done.
-    pub fn open(&self, folder: &Path, earlier: Earlier) -> Result<Vec<Over>> {
+    /// Refuses a folder that is none of a search, or holds one with which nothing is to happen; what a search that is resumed
+    /// got done.
+    pub fn look(&self, folder: &Path, earlier: Earlier) -> Result<Vec<Over>> {
         let place = folder.display().to_string();
         let old = entries(folder)?;
         let expected = "a new or empty folder, --resume to go on or --force to replace it";
@@ -134,12 +136,7 @@ impl Search {
             // Only what bears a search's mark goes with all that is in it.
             let marked = old.is_empty() || state.is_file();
             ensure(marked, &place, "output", "a folder without tradeoff.json", "an earlier search to replace")?;
-            for (path, is_dir) in old {
-                let gone = if is_dir { fs::remove_dir_all(&path) } else { fs::remove_file(&path) };
-                gone.map_err(|e| Error::io(&path, e))?;
-            }
         }
-        fs::create_dir_all(folder).map_err(|e| Error::io(folder, e))?;
         if earlier == Earlier::Resume && state.is_file() { self.done(&state) } else { Ok(vec![]) }
     }
 
@@ -238,8 +235,27 @@ impl Search {
     }
 }
 
-/// What lies in the folder, and which of it are folders. A folder with anything in it that no search leaves is refused.
-fn entries(folder: &Path) -> Result<Vec<(PathBuf, bool)>> {
+/// What the folder of a search holds.
+pub const CONTENTS: Contents = Contents { known, progressed };
+
+/// Whether a search may have left this.
+fn known(path: &Path) -> bool {
+    let name = path.file_name().unwrap_or_default();
+    let names = if path.is_dir() { &FOLDERS[..] } else { &FILES[..] };
+    names.iter().any(|f| name == *f) || conefield_io::is_unfinished(name)
+}
+
+/// How far the search in `folder` came: its state is written after every trial, the table at the end.
+fn progressed(folder: &Path) -> Progressed {
+    match FILES[..2].iter().rev().position(|f| folder.join(f).exists()) {
+        Some(0) => Progressed::Complete,
+        Some(_) => Progressed::Begun,
+        None => Progressed::Nothing,
+    }
+}
+
+/// What lies in the folder. A folder with anything in it that no search leaves is refused.
+fn entries(folder: &Path) -> Result<Vec<PathBuf>> {
     let entries = match fs::read_dir(folder) {
         Err(e) if e.kind() == ErrorKind::NotFound => return Ok(vec![]),
         entries => entries.map_err(|e| Error::io(folder, e))?,
@@ -247,15 +263,9 @@ fn entries(folder: &Path) -> Result<Vec<(PathBuf, bool)>> {
     let mut old = vec![];
     for entry in entries {
         let entry = entry.map_err(|e| Error::io(folder, e))?;
-        let (name, is_dir) = (entry.file_name(), entry.path().is_dir());
-        let known = if is_dir {
-            FOLDERS.iter().any(|f| name == *f)
-        } else {
-            FILES.iter().any(|f| name == *f) || conefield_io::is_unfinished(&name)
-        };
-        let found = format!("a folder with {} in it", name.to_string_lossy());
-        ensure(known, &folder.display().to_string(), "output", found, "a new or empty folder")?;
-        old.push((entry.path(), is_dir));
+        let found = format!("a folder with {} in it", entry.file_name().to_string_lossy());
+        ensure(known(&entry.path()), &folder.display().to_string(), "output", found, "a new or empty folder")?;
+        old.push(entry.path());
     }
     Ok(old)
 }

@@ -5,6 +5,7 @@ use super::reconstruct::{budget, identity};
 use super::trial::{self, Trial};
 use super::{EndOptions, General, backends::simd_level};
 use crate::backend::BackendChoice;
+use crate::boundary::Inputs;
 use crate::memory::Memory;
 use crate::method;
 use crate::plugins::{self, Used};
@@ -15,6 +16,7 @@ use conefield_core::error::ensure;
 use conefield_core::method::Plan;
 use conefield_core::spec::load::Loaded;
 use conefield_core::{Error, Result};
+use conefield_io::{Contents, Lease, Progressed};
 use conefield_report::MiddleSlices;
 use conefield_tradeoff::json::{LONGEST, read_json};
 use conefield_tradeoff::trial::{Figures, ScanRecord, TrialInput};
@@ -128,16 +130,28 @@ impl CompareArgs {
         let mut methods = self.methods()?;
         let input = trial::input(&self.scan, &self.protocol)?;
         methods.iter().try_for_each(|m| specs::check_held_out(&m.loaded, m.plan.as_ref(), &input.held))?;
-        let old = self.look_into_folder()?;
+        let mut lease = Lease::take(&self.output, CONTENTS)?;
+        self.look_into_folder()?;
+        self.spare_inputs(&methods)?;
         for method in &mut methods {
             method.start = self.start(method, &input)?;
         }
-        self.open_folder(old)?;
         signals::listen()?;
+        if !self.resume || !self.output.exists() {
+            lease.replace()?;
+        } else {
+            lease.go_on();
+        }
         let mut entries = vec![];
         for (i, method) in methods.iter().enumerate() {
             let part = format!("{} ({} of {})", method.name, i + 1, methods.len());
             entries.push(self.entry(method, part, general)?);
+        }
+        // Without any result there is no comparison: an earlier one stays.
+        if entries.iter().all(|e| e.figures.is_none()) {
+            let why: Vec<String> =
+                entries.iter().map(|e| format!("{}: {}", e.name, e.error.as_deref().unwrap_or("no result"))).collect();
+            return Err(Error::unsupported("compare: every method failed", why.join("; ")));
         }
         let TrialInput { scan, held, reference, peak } = input;
         let report = Report { protocol: self.shared(scan, held, peak, general), methods: entries };
@@ -145,6 +159,7 @@ impl CompareArgs {
         conefield_io::write_text_atomic(self.output.join("table.json"), &out::to_json(&report)?)?;
         conefield_io::write_text_atomic(self.output.join("table.md"), &table.markdown())?;
         let picture = self.draw(&report.methods, reference.as_ref())?;
+        lease.complete()?;
         if self.json {
             out::json(&report)?;
         } else {
@@ -184,45 +199,28 @@ impl CompareArgs {
         Ok(methods)
     }
 
-    /// What an earlier comparison left in the folder: files, and folders of runs. Refuses anything else, and an
-    /// earlier comparison where nothing says what to do with it.
-    fn look_into_folder(&self) -> Result<(Vec<PathBuf>, Vec<PathBuf>)> {
+    /// Refuses to replace what is read.
+    fn spare_inputs(&self, methods: &[Method]) -> Result<()> {
+        let inputs = Inputs::of([&self.scan]).and(&self.protocol.reference);
+        methods.iter().fold(inputs, |inputs, m| inputs.and_spec(&m.loaded)).spare_folder(&self.output)
+    }
+
+    /// Refuses a folder with anything in it that no comparison leaves, and an earlier comparison where nothing says what to
+    /// do with it.
+    fn look_into_folder(&self) -> Result<()> {
         let place = self.output.display().to_string();
-        let (mut old, mut runs) = (vec![], vec![]);
         let entries = match fs::read_dir(&self.output) {
-            Err(e) if e.kind() == ErrorKind::NotFound => return Ok((old, runs)),
+            Err(e) if e.kind() == ErrorKind::NotFound => return Ok(()),
             entries => entries.map_err(|e| Error::io(&self.output, e))?,
         };
         for entry in entries {
             let entry = entry.map_err(|e| Error::io(&self.output, e))?;
-            let (name, path) = (entry.file_name(), entry.path());
-            let known = FILES.iter().any(|f| name == *f) || conefield_io::is_unfinished(&name);
-            match entry.file_type() {
-                Ok(t) if t.is_file() && known => old.push(path),
-                Ok(t) if t.is_dir() && is_run(&path) => runs.push(path),
-                _ => {
-                    let found = format!("a folder with {} in it", name.to_string_lossy());
-                    return Err(Error::invalid(place, "output", found, "a new or empty folder"));
-                }
-            }
+            let found = format!("a folder with {} in it", entry.file_name().to_string_lossy());
+            ensure(known(&entry.path()), &place, "output", found, "a new or empty folder")?;
         }
         let expected = "a new or empty folder, --resume to go on or --force to replace it";
-        let free = self.force || self.resume || (old.is_empty() && runs.is_empty());
-        ensure(free, &place, "output", "an earlier comparison", expected)?;
-        Ok((old, runs))
-    }
-
-    /// Makes the folder; with `--force` without what stood in it.
-    fn open_folder(&self, (mut old, runs): (Vec<PathBuf>, Vec<PathBuf>)) -> Result<()> {
-        if self.force {
-            for run in &runs {
-                let entries = fs::read_dir(run).map_err(|e| Error::io(run, e))?;
-                old.extend(entries.filter_map(|e| e.ok()).map(|e| e.path()));
-            }
-            old.iter().try_for_each(|f| fs::remove_file(f).map_err(|e| Error::io(f, e)))?;
-            runs.iter().try_for_each(|f| fs::remove_dir(f).map_err(|e| Error::io(f, e)))?;
-        }
-        fs::create_dir_all(&self.output).map_err(|e| Error::io(&self.output, e))
+        let free = self.force || self.resume || progressed(&self.output) == Progressed::Nothing;
+        ensure(free, &place, "output", "an earlier comparison", expected)
     }
 
     /// How the run of `method` starts. Refuses to go on with another one's.
@@ -331,13 +329,25 @@ impl CompareArgs {
     }
 }
 
-/// Whether a folder holds nothing but what a run leaves.
-fn is_run(folder: &Path) -> bool {
-    let known = |e: fs::DirEntry| {
-        let name = e.file_name();
-        run_folder::FILES.iter().any(|f| name == *f) || conefield_io::is_unfinished(&name)
-    };
-    fs::read_dir(folder).is_ok_and(|entries| entries.into_iter().all(|e| e.is_ok_and(known)))
+/// What the folder of a comparison holds.
+const CONTENTS: Contents = Contents { known, progressed };
+
+/// Whether a comparison may have left this: a file of its own, or the folder of a run.
+fn known(path: &Path) -> bool {
+    let name = path.file_name().unwrap_or_default();
+    let own = FILES.iter().any(|f| name == *f) || conefield_io::is_unfinished(name) || conefield_io::is_aside(name);
+    let run = || fs::read_dir(path).is_ok_and(|all| all.flatten().all(|e| run_folder::known(&e.path())));
+    if path.is_dir() { conefield_io::is_aside(name) || conefield_io::is_unfinished(name) || run() } else { own }
+}
+
+/// How far the comparison in `folder` came.
+fn progressed(folder: &Path) -> Progressed {
+    if folder.join("table.json").exists() {
+        return Progressed::Complete;
+    }
+    let runs = fs::read_dir(folder).into_iter().flatten().flatten();
+    let any = runs.map(|e| run_folder::progressed(&e.path())).any(|p| p != Progressed::Nothing);
+    if any { Progressed::Begun } else { Progressed::Nothing }
 }
 
 /// Which run a finished one was, as [`identity`] has it, and what it was compared with.

@@ -1,5 +1,6 @@
 //! `conefield convert`
 
+use crate::boundary::{Inputs, refuse_existing};
 use crate::memory::Memory;
 use crate::parse::{self, Values};
 use crate::{files, out};
@@ -49,10 +50,15 @@ impl ConvertArgs {
     pub fn run(self) -> Result<()> {
         std::fs::metadata(&self.input).map_err(|e| Error::io(&self.input, e))?;
         refuse_existing(&self.output, self.force)?;
+        let inputs = Inputs::of([&self.input]);
+        inputs.spare_file(&self.output)?;
+        inputs.spare_folder(&self.output)?;
         if conefield_io::is_volume(&self.input) {
             let voxels = conefield_io::volume_voxels(&self.input)?;
             Memory::of_volumes(&[voxels]).check(|_| vec![])?;
-            let volume = self.values.apply(conefield_io::read_volume(&self.input)?)?;
+            let volume = conefield_io::read_volume(&self.input)?;
+            conefield_io::check_shape(&self.output, volume.grid.shape)?;
+            let volume = self.values.apply(volume)?;
             conefield_io::write_volume(&self.output, &volume)?;
         } else {
             Memory::of_data_set(&conefield_io::scan_size(&self.input)?).check(|_| vec![])?;
@@ -81,14 +87,4 @@ impl ConvertArgs {
             lost("the true volume is left out, for which RTK has no place".into());
         }
     }
-}
-
-/// Refuses to write over something unless `force`.
-pub fn refuse_existing(path: &std::path::Path, force: bool) -> Result<()> {
-    let empty = std::fs::read_dir(path).is_ok_and(|mut d| d.next().is_none());
-    if !force && !empty && path.symlink_metadata().is_ok() {
-        let found = "something of that name";
-        return Err(Error::invalid(path.display().to_string(), "output", found, "a new name, or --force"));
-    }
-    Ok(())
 }

@@ -1,7 +1,7 @@
 //! `conefield demo`
 
-use super::convert::refuse_existing;
 use super::evaluate::score;
+use crate::boundary::refuse_existing;
 use crate::progress::Progress;
 use crate::table::{SCORES, Table, cells_of};
 use crate::{memory, method, out, parse, signals, specs};

@@ -1,5 +1,6 @@
 //! `conefield evaluate`
 
+use crate::boundary::{self, Inputs};
 use crate::memory::Memory;
 use crate::segmenter::Segmenter;
 use crate::{files, out, parse, signals};
@@ -61,6 +62,7 @@ struct Evaluation {
 
 impl EvaluateArgs {
     pub fn run(self) -> Result<()> {
+        boundary::picture(self.png.as_deref(), &Inputs::of([&self.volume, &self.reference]))?;
         let voxels = [&self.volume, &self.reference].map(conefield_io::volume_voxels);
         let [volume, reference] = voxels;
         let (volume, reference) = (volume?, reference?);

@@ -1,7 +1,7 @@
 //! `conefield export`
 
-use super::convert::refuse_existing;
 use super::trained::Trained;
+use crate::boundary::{Inputs, refuse_existing};
 use crate::{memory, out, outgoing, signals};
 use clap::Args;
 use conefield_core::Result;
@@ -36,6 +36,8 @@ impl ExportArgs {
         let buffers = FieldVoxels::BYTES + SLAB_BYTES + PACKED_BYTES;
         let opened = self.trained.open(buffers)?;
         let (memory, grid) = (opened.memory(buffers)?, opened.grid);
+        Inputs::of([&opened.file]).spare_file(&self.output)?;
+        conefield_io::check_shape(&self.output, grid.shape)?;
         let backend = self.trained.backend.open()?;
         signals::listen()?;
         let start = Instant::now();

@@ -1,7 +1,7 @@
 //! `conefield features`
 
-use super::convert::refuse_existing;
 use super::trained::{OpenedField, Trained};
+use crate::boundary::{self, Inputs, refuse_existing};
 use crate::out;
 use crate::pca::Pca;
 use clap::{Args, ValueEnum};
@@ -53,6 +53,7 @@ impl FeaturesArgs {
     pub fn run(self) -> Result<()> {
         refuse_existing(&self.output, self.force)?;
         let opened = self.trained.open(0)?;
+        boundary::picture(Some(&self.output), &Inputs::of([&opened.file]))?;
         let planes = planes(&opened.grid);
         let count: u64 = planes.iter().map(|p| p.iter().map(|r| r.len() as u64).product::<u64>()).sum();
         let width = opened.field.model.pipeline.encoder.info().output as u64;

@@ -1,6 +1,7 @@
 //! `conefield import`
 
-use super::{convert::refuse_existing, info};
+use super::info;
+use crate::boundary::{Inputs, refuse_existing};
 use crate::memory::Memory;
 use crate::{out, parse};
 use clap::Args;
@@ -41,6 +42,7 @@ pub struct ImportArgs {
 impl ImportArgs {
     pub fn run(self) -> Result<()> {
         refuse_existing(&self.output, self.force)?;
+        Inputs::default().and_description(&self.scanner).spare_folder(&self.output)?;
         Memory::of_views(&conefield_io::scanner_size(&self.scanner)?).check(|_| vec![])?;
         let options = ImportOptions { i0: self.i0, floor: self.floor };
         let imported = conefield_io::read_scanner(&self.scanner, &options)?;

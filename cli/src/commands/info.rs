@@ -1,26 +1,30 @@
 //! `conefield info`
 
+use crate::boundary::{self, Inputs};
 use crate::memory::Memory;
-use crate::{files, out};
+use crate::{files, out, run_folder};
 use clap::Args;
+use conefield_core::files::read_text;
 use conefield_core::geometry::{Geometry, VoxelGrid};
 use conefield_core::scan::{Scan, Volume};
 use conefield_core::{Error, Result};
 use conefield_diagnosis::{Survey, setup, survey};
+use conefield_io::Progressed;
 use conefield_report::MiddleSlices;
 use conefield_report::survey_png;
+use conefield_tradeoff::json::{LONGEST, read_json};
 use ndarray::ArrayView3;
 use serde_json::{Value, json};
 use std::path::{Path, PathBuf};
 
-/// Say what a scan, volume or weights file holds.
+/// Say what a scan, volume, run or weights file holds.
 ///
 /// Of a scan: lengths in mm, magnification, the voxels that the detector supports, the field of view, which part of the
 /// volume the views see, what is missing, and warnings of what will trouble a reconstruction. SCANNER.toml and RTK's XML
-/// geometry are understood, too.
+/// geometry are understood, too. Of the folder of a run: what it was, how far it came, and its scores.
 #[derive(Args)]
 pub struct InfoArgs {
-    /// A scan, a volume or a weights file.
+    /// A scan, a volume, the folder of a run or a weights file.
     file: PathBuf,
     /// Also draw source path, detector and volume, with the share of views that see each point of it; of a volume, its
     /// middle slices.
@@ -36,6 +40,7 @@ impl InfoArgs {
         let path = &self.file;
         std::fs::metadata(path).map_err(|e| Error::io(path, e))?;
         let png = self.png.as_deref();
+        boundary::picture(png, &Inputs::of([path]))?;
         let ends = |end: &str| path.extension().is_some_and(|e| e.eq_ignore_ascii_case(end));
         let found = if ends("safetensors") {
             no_picture(path, png)?;
@@ -43,6 +48,9 @@ impl InfoArgs {
         } else if ends("xml") {
             no_picture(path, png)?;
             geometry(path)?
+        } else if is_run(path) {
+            no_picture(path, png)?;
+            run(path)?
         } else if conefield_io::is_volume(path) {
             volume(path, png)?
         } else {
@@ -53,6 +61,45 @@ impl InfoArgs {
         }
         out::say(&(lines(&found) + &warnings(&found)))
     }
+}
+
+/// Whether this is the folder of a run: its files tell, and nothing else has them.
+fn is_run(path: &Path) -> bool {
+    let has = |name: &str| path.join(name).is_file();
+    has("record.json") || (has("spec.toml") && has("metrics.jsonl"))
+}
+
+/// What a run was, how far it came and what its folder holds.
+fn run(path: &Path) -> Result<Value> {
+    let files: Vec<&str> = run_folder::FILES.into_iter().filter(|f| path.join(f).exists()).collect();
+    let standing = match run_folder::progressed(path) {
+        Progressed::Complete => "complete",
+        Progressed::Begun if path.join("checkpoint.safetensors").exists() => {
+            "interrupted: the same command with --resume goes on"
+        }
+        Progressed::Begun => "interrupted before its record was written",
+        Progressed::Nothing => "interrupted before its first checkpoint",
+    };
+    let record = path.join("record.json");
+    let mut found = json!({ "kind": "run", "standing": standing, "files": files });
+    if record.exists() {
+        let mut record: Value = read_json(&record)?;
+        // What a machine reads stands in the file itself.
+        if let Some(map) = record.as_object_mut() {
+            ["memory", "backend", "plan"].iter().for_each(|key| drop(map.remove(*key)));
+        }
+        found["record"] = record;
+    } else if let Some(last) = last_record(&path.join("metrics.jsonl"))? {
+        found["last_record"] = last;
+    }
+    found["spec"] = json!(read_text(&path.join("spec.toml"), LONGEST).unwrap_or_default());
+    Ok(found)
+}
+
+/// The last whole line of a run's metrics.
+fn last_record(path: &Path) -> Result<Option<Value>> {
+    let text = read_text(path, LONGEST)?;
+    Ok(text.lines().rev().find_map(|l| serde_json::from_str(l).ok()))
 }
 
 /// The warnings for people, a paragraph each.

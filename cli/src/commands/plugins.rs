@@ -25,6 +25,11 @@ enum PluginsCommand {
 }
 
 impl PluginsArgs {
+    /// Whether a plugin is to be checked.
+    pub fn is_check(&self) -> bool {
+        matches!(self.command, PluginsCommand::Check(_))
+    }
+
     pub fn run(self) -> Result<()> {
         match self.command {
             PluginsCommand::List(c) => c.run(),

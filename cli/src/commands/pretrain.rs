@@ -2,6 +2,7 @@
 
 use super::{EndOptions, reconstruct::notes};
 use crate::backend::{self, BackendChoice};
+use crate::boundary::{self, Inputs, refuse_existing};
 use crate::memory::Memory;
 use crate::parse::{self, Values};
 use crate::progress::Progress;
@@ -40,6 +41,9 @@ pub struct PretrainArgs {
     /// Seed of everything random.
     #[arg(long, default_value_t = 0)]
     seed: u64,
+    /// Replace WEIGHTS.
+    #[arg(long)]
+    force: bool,
     /// Print one JSON object.
     #[arg(long)]
     json: bool,
@@ -62,7 +66,10 @@ impl PretrainArgs {
     }
 
     pub fn run(self) -> Result<()> {
+        boundary::ends(&self.output, "safetensors")?;
+        refuse_existing(&self.output, self.force)?;
         let loaded = specs::read(&self.spec, &self.sets)?;
+        Inputs::of(&self.volumes).and_spec(&loaded).spare_file(&self.output)?;
         let backend = self.backend.open()?;
         let mut plan = method::plan(&loaded, backend.as_ref())?;
         let outline = plan.outline();

@@ -2,6 +2,7 @@
 
 use super::record::{RunRecord, summary};
 use super::{backends::simd_level, evaluate, protocol::RunProtocol};
+use crate::boundary::{self, Inputs};
 use crate::live::Live;
 use crate::memory;
 use crate::method::{self, Planned};
@@ -11,7 +12,8 @@ use crate::plugins;
 use crate::progress::{Keeper, Progress};
 use crate::run_folder::RunFolder;
 use crate::{files, out, signals, specs};
-use clap::Args;
+use clap::error::ErrorKind;
+use clap::{Args, CommandFactory};
 use conefield_core::backend::Backend;
 use conefield_core::checkpoint::Resume;
 use conefield_core::method::{Job, Limits};
@@ -39,7 +41,7 @@ use tracing::info;
 pub struct ReconstructArgs {
     /// The scan.
     scan: PathBuf,
-    #[arg(long, required_unless_present = "budget", help = spec_help())]
+    #[arg(long, help = spec_help())]
     spec: Option<String>,
     /// Choose from this front instead of the shipped one, where --budget chooses the spec.
     #[arg(long, value_name = "FILE", conflicts_with = "spec", requires = "budget")]
@@ -79,20 +81,41 @@ pub const FAILED: &str = "failed: ";
 
 impl ReconstructArgs {
     pub fn run(self) -> Result<()> {
+        if self.spec.is_none() && self.protocol.budget.is_none() {
+            Self::without_a_spec();
+        }
         if !self.as_part {
             return self.reconstruct();
         }
         signals::follow_input();
         let done = self.reconstruct();
         if let Err(e) = &done {
-            out::say(&format!("{FAILED}{e}"))?;
+            out::say(&format!("{FAILED}{}", out::plain_line(&e.to_string(), out::LONGEST_LINE)))?;
         }
         done
+    }
+
+    /// Ends the command as wrong use that says what to do.
+    fn without_a_spec() -> ! {
+        let mut whole = crate::Cli::command();
+        whole.build();
+        let name = "reconstruct";
+        let command = whole.find_subcommand_mut(name).map(std::mem::take).unwrap_or(clap::Command::new(name));
+        let what = "what to reconstruct with is not said\n\n  --budget 60s     the best method for a minute, all in all, on \
+                    this machine\n  --spec fista-tv  total variation\n  --spec balanced  a neural field, for one to five \
+                    minutes; conefield explain SPEC says what a spec does";
+        command.bin_name("conefield reconstruct").error(ErrorKind::MissingRequiredArgument, what).exit()
     }
 
     fn reconstruct(&self) -> Result<()> {
         let begin = Instant::now();
         let protocol = &self.protocol;
+        let mut folder = RunFolder::take(&self.output)?;
+        if !self.resume {
+            folder.may_begin(self.force)?;
+        }
+        // Before a spec is read: it is text, and a name that is none would come back as another one.
+        self.init.as_deref().map(boundary::text).transpose()?;
         let backend = protocol.backend.open()?;
         // What is wrong with a spec, or weights that cannot be read or do not fit, is told before anything is made.
         let asked = self.asked().map(|(spec, sets)| self.method(&spec, &sets, backend.as_ref())).transpose()?;
@@ -101,7 +124,11 @@ impl ReconstructArgs {
             (None, Some(path)) => Some(Front::read(path)?),
             (None, None) => Some(Front::shipped()?),
         };
+        let inputs = Inputs::of([&self.scan]).and(&self.front).and(&self.init).and(&protocol.reference);
+        let inputs = asked.iter().filter(|_| !self.resume).fold(inputs, |inputs, m| inputs.and_spec(&m.loaded));
+        inputs.spare_folder(&self.output)?;
         let whole = files::scan(&self.scan)?;
+        conefield_io::check_shape(folder.file("volume.nii.gz"), whole.geometry.volume.shape)?;
         let reference = protocol.reference(&self.scan, &whole)?;
         let peak = protocol.peak(reference.as_ref());
         let held = protocol.held_out(whole.geometry.views.len())?;
@@ -112,10 +139,10 @@ impl ReconstructArgs {
 
         let identity = |m: &Planned| identity(&m.loaded, protocol, &held, &scan_record);
         let resumed = match &asked {
-            Some(method) if self.resume => Some(self.reopen(&identity(method)?)?),
+            Some(method) if self.resume => Some(self.reopen(&folder, &identity(method)?)?),
             _ => None,
         };
-        let spent = resumed.as_ref().map_or(0.0, |(_, _, r)| r.standing.seconds);
+        let spent = resumed.as_ref().map_or(0.0, |(_, r)| r.standing.seconds);
         let bench = Bench {
             scan: &scan,
             reference: reference.as_ref(),
@@ -148,11 +175,16 @@ impl ReconstructArgs {
         let identity = identity(&method)?;
         let Planned { loaded, mut plan, memory } = method;
         let outline = plan.outline();
-        let (folder, metrics, resume) = match resumed {
-            Some((folder, metrics, resume)) => (folder, metrics, Some(resume)),
-            None => self.create(&loaded)?,
-        };
         signals::listen()?;
+        let (metrics, resume) = match resumed {
+            Some((metrics, resume)) => (metrics, Some(resume)),
+            None => {
+                inputs.and_spec(&loaded).spare_folder(&self.output)?;
+                folder.begin()?;
+                conefield_io::write_text_atomic(folder.file("spec.toml"), &to_toml(&loaded.spec)?)?;
+                (folder.metrics()?, None)
+            }
+        };
         let mut progress = Progress::new("reconstruct", Some(metrics)).keeping(Some(Keeper {
             path: folder.file("checkpoint.safetensors"),
             every: Duration::from_secs_f64(protocol.checkpoint_every),
@@ -265,20 +297,12 @@ impl ReconstructArgs {
         method::planned(spec, &sets, backend, &run)
     }
 
-    /// The folder of an interrupted run, its file for metrics, and where to go on from.
-    fn reopen(&self, identity: &BTreeMap<String, String>) -> Result<(RunFolder, (PathBuf, File), Resume)> {
-        let folder = RunFolder::reopen(&self.output)?;
+    /// The file for metrics of an interrupted run, and where to go on from.
+    fn reopen(&self, folder: &RunFolder, identity: &BTreeMap<String, String>) -> Result<((PathBuf, File), Resume)> {
         let resume = files::read_checkpoint(&folder.file("checkpoint.safetensors"), identity)?;
+        folder.go_on();
         let metrics = folder.metrics_until(resume.standing.recorded)?;
-        Ok((folder, metrics, resume))
-    }
-
-    /// A new folder with its spec.
-    fn create(&self, loaded: &Loaded) -> Result<(RunFolder, (PathBuf, File), Option<Resume>)> {
-        let folder = RunFolder::create(&self.output, self.force)?;
-        conefield_io::write_text_atomic(folder.file("spec.toml"), &to_toml(&loaded.spec)?)?;
-        let metrics = folder.metrics()?;
-        Ok((folder, metrics, None))
+        Ok((metrics, resume))
     }
 }
 

@@ -1,6 +1,6 @@
 //! `conefield simulate`
 
-use super::convert::refuse_existing;
+use crate::boundary::{Inputs, refuse_existing};
 use crate::memory::Memory;
 use crate::parse::{self, AnglesOption, Values};
 use crate::{files, out};
@@ -68,6 +68,11 @@ pub struct SimulateArgs {
 impl SimulateArgs {
     pub fn run(self) -> Result<()> {
         refuse_existing(&self.output, self.force)?;
+        let angles = match &self.angles {
+            Some(AnglesOption::File(path)) => Some(path),
+            _ => None,
+        };
+        Inputs::of([&self.volume, &self.protocol]).and(angles).spare_folder(&self.output)?;
         let before = files::voxels(&self.volume)?;
         Memory::of_volumes(&[before]).check(|_| vec![])?;
         let mut volume = self.values.apply(files::volume(&self.volume)?)?;

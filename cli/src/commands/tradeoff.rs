@@ -7,15 +7,17 @@ use super::protocol::RunProtocol;
 use super::trial::{self, Trial};
 use super::{EndOptions, General, backends::simd_level};
 use crate::backend::{self, BackendChoice};
+use crate::boundary::Inputs;
 use crate::method::Known;
 use crate::parse::{self, HoldOut};
 use crate::{out, signals};
 use clap::Args;
 use conefield_core::error::ensure;
 use conefield_core::{Error, Result};
+use conefield_io::Lease;
 use conefield_tradeoff::levers::{self, Candidate, Levers};
 use conefield_tradeoff::report::TradeoffReport;
-use conefield_tradeoff::search::{Due, Earlier, Search};
+use conefield_tradeoff::search::{CONTENTS, Due, Earlier, Search};
 use std::path::{Path, PathBuf};
 
 /// Search what to spend time and memory on: accuracy against both, measured.
@@ -98,11 +100,21 @@ impl TradeoffArgs {
             (_, true) => Earlier::Resume,
             _ => Earlier::Refuse,
         };
-        let mut over = search.open(output, earlier)?;
+        let named = self.reference.iter().filter(|r| *r != Path::new("truth"));
+        let inputs = Inputs::of(&self.scans).and(named).and(&self.levers);
+        inputs.spare_folder(output)?;
+        let mut lease = Lease::take(output, CONTENTS)?;
+        let mut over = search.look(output, earlier)?;
         signals::listen()?;
+        if earlier != Earlier::Resume || !output.exists() {
+            lease.replace()?;
+        } else {
+            lease.go_on();
+        }
         let rungs = search.climb(output, &mut over, &mut |due| self.trial(&search, due, general))?;
         let report = TradeoffReport::new(search, rungs, over)?;
         report.write(output, &Known)?;
+        lease.complete()?;
         if self.json { out::json(&report) } else { out::say(&report.text(output)) }
     }
 

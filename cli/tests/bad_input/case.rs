@@ -138,9 +138,12 @@ fn message(said: &str, printed: &str, end: End, says: &[&str]) -> String {
     match end {
         End::Refused | End::WrongUse => said.lines().find(|l| l.starts_with("error: ")).unwrap_or(said).to_owned(),
         End::Warned => {
-            let mut lines = said.lines().chain(printed.lines()).map(str::trim_start);
-            let warns = |l: &&str| l.starts_with("WARN") || l.starts_with("warning: ");
-            lines.find(|l| warns(l) && says.iter().all(|w| l.contains(w))).unwrap_or_default().to_owned()
+            // The log says when.
+            let untimed = |l: &'_ str| l.split_once("Z  WARN ").map(|(_, rest)| format!("WARN {rest}"));
+            let mut lines =
+                said.lines().chain(printed.lines()).map(|l| untimed(l).unwrap_or(l.trim_start().to_owned()));
+            let warns = |l: &String| l.starts_with("WARN") || l.starts_with("warning: ");
+            lines.find(|l| warns(l) && says.iter().all(|w| l.contains(w))).unwrap_or_default()
         }
     }
 }

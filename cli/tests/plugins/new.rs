@@ -72,6 +72,12 @@ fn names_and_folders_are_checked() {
         let e = refused(1, &["plugins", "new", "--kind", "encoder", "--into", &into, "--", name]);
         assert!(e.contains("lower-case letters"), "{e}");
     }
+    for lang in ["rust", "c"] {
+        for (name, why) in [("fn", "no word of Rust"), ("self", "no word of Rust"), ("hash-grid", "conefield itself")] {
+            let e = refused(1, &["plugins", "new", name, "--kind", "encoder", "--lang", lang, "--into", &into]);
+            assert!(e.contains(why) && !dir.path().join(name).exists(), "{e}");
+        }
+    }
     std::fs::create_dir(dir.path().join("taken")).unwrap();
     let e = refused(1, &["plugins", "new", "taken", "--kind", "encoder", "--into", &into]);
     assert!(e.contains("something that is there"), "{e}");

@@ -112,3 +112,46 @@ fn plugins_are_found_where_they_are_looked_for() {
     let (fine, _, err) = run(&mut conefield(&["--plugin", "nowhere.so", "explain", "fast"]));
     assert!(!fine && err.contains("nowhere.so"), "{err}");
 }
+
+#[test]
+fn a_copy_that_broke_off_is_refused_and_ends_nothing() {
+    let dir = tempfile::tempdir().unwrap();
+    let home = dir.path().join("home");
+    let folder = home.join("conefield/plugins");
+    std::fs::create_dir_all(&folder).unwrap();
+    let whole = std::fs::read(dense(dir.path())).unwrap();
+    for share in 1..16 {
+        std::fs::write(folder.join("dense.so"), &whole[..whole.len() * share / 16]).unwrap();
+        let found = list(conefield(&["plugins", "list", "--json"]).env("XDG_DATA_HOME", &home));
+        let why = found["plugins"][0]["refused"].as_str().unwrap_or_else(|| panic!("{share}: {found}"));
+        assert!(why.contains("dense.so") && why.contains("whole"), "{why}");
+        let (fine, _, err) = run(conefield(&["explain", "fast"]).env("XDG_DATA_HOME", &home));
+        assert!(fine, "{share}: {err}");
+    }
+}
+
+#[test]
+fn a_plugin_that_never_comes_back_does_not_hang_its_check() {
+    let dir = tempfile::tempdir().unwrap();
+    let (source, library) = (dir.path().join("hangs.c"), dir.path().join("hangs.so"));
+    std::fs::write(&source, "#include <unistd.h>\nconst void *conefield_plugin(void) { for (;;) sleep(1); }\n")
+        .unwrap();
+    cc(&source, &[], &library);
+    let begin = std::time::Instant::now();
+    let (fine, _, err) = run(&mut conefield(&["plugins", "check", &text(&library)]));
+    assert!(!fine && err.contains("its entry function has not come back after 10"), "{err}");
+    assert!(begin.elapsed().as_secs() < 60, "{:?}", begin.elapsed());
+}
+
+#[test]
+fn a_home_that_is_relative_brings_no_code() {
+    let dir = tempfile::tempdir().unwrap();
+    let folder = dir.path().join(".local/share/conefield/plugins");
+    std::fs::create_dir_all(&folder).unwrap();
+    dense(&folder);
+    let mut command = conefield(&["plugins", "list", "--json"]);
+    command.env_remove("XDG_DATA_HOME").env("HOME", ".").current_dir(dir.path());
+    assert_eq!(list(&mut command)["plugins"].as_array().unwrap().len(), 0);
+    let found = list(command.env("HOME", dir.path()));
+    assert_eq!(found["plugins"].as_array().unwrap().len(), 1, "{found}");
+}

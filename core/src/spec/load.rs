@@ -10,6 +10,7 @@ use crate::allowance::Work;
 use crate::error::{Error, Result, ensure};
 use crate::{files, registry};
 use serde_json::Value;
+use std::collections::BTreeSet;
 use std::path::{Path, PathBuf};
 
 /// Longest spec, in bytes; those that come with the program are a hundredth of this.
@@ -135,6 +136,13 @@ fn without_nulls(value: Value) -> Value {
 }
 
 impl Loaded {
+    /// Files and shipped specs that something in this one comes from, as they were named.
+    pub fn sources(&self) -> BTreeSet<String> {
+        let mut all = BTreeSet::from([self.source.clone()]);
+        self.written.sources(&mut all);
+        all
+    }
+
     /// The same error, with the line of the spec that it is about.
     pub fn locate(&self, error: Error) -> Error {
         let Error::Invalid { place, field, found, expected } = error else { return error };

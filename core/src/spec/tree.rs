@@ -2,7 +2,7 @@
 
 use crate::error::{Error, Result};
 use serde_json::{Number, Value};
-use std::collections::HashSet;
+use std::collections::{BTreeSet, HashSet};
 use std::fmt;
 use std::sync::Arc;
 use toml::de::{DeTable, DeValue};
@@ -72,6 +72,18 @@ impl fmt::Display for At {
 pub(super) struct Node {
     pub(super) at: At,
     pub(super) kind: Kind,
+}
+
+impl Node {
+    /// Adds the names of all sources that something here comes from.
+    pub(super) fn sources(&self, all: &mut BTreeSet<String>) {
+        all.insert(self.at.source.name.clone());
+        match &self.kind {
+            Kind::Array(items) => items.iter().for_each(|i| i.sources(all)),
+            Kind::Table(entries) => entries.iter().for_each(|e| e.value.sources(all)),
+            _ => {}
+        }
+    }
 }
 
 /// What a value is.

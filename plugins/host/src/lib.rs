@@ -9,6 +9,7 @@
 //! constructors, which the system runs before anything can be checked, do harm. A library is code, and loading it is
 //! running it: only files that the user names, or puts where plugins are looked for, are ever loaded.
 
+mod examine;
 pub mod library;
 pub mod search;
 pub mod spec;

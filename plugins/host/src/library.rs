@@ -4,6 +4,7 @@
 // one that does not; lengths, versions, numbers and texts are checked before they are used.
 #![allow(unsafe_code)]
 
+use crate::examine;
 use conefield_core::error::{Error, Result, ensure};
 use conefield_core::registry::Kind;
 use conefield_plugin_abi::*;
@@ -80,6 +81,7 @@ impl Library {
         let real = path.canonicalize().map_err(|e| Error::io(path, e))?;
         let place = path.display().to_string();
         ensure(real.is_file(), &place, "plugin", "no file", "a shared library")?;
+        examine::whole(&real, &place)?;
         let plugin = table_of(&real, &place)?;
         // SAFETY: the library says that this is its table, which lives as long as it does.
         unsafe { Self::read(&real, &place, plugin) }

@@ -56,7 +56,8 @@ pub struct Plugins {
 
 /// The folder in which a user's plugins are looked for: `conefield/plugins` in the system's folder for data.
 pub fn user_folder() -> Option<PathBuf> {
-    dirs::data_dir().map(|d| d.join("conefield").join("plugins"))
+    // A home that is a relative name would be one folder here and another there: whoever owns the current one could bring code.
+    dirs::data_dir().filter(|d| d.is_absolute()).map(|d| d.join("conefield").join("plugins"))
 }
 
 impl Plugins {

@@ -51,7 +51,13 @@ pub struct Check {
     /// Check in this process.
     #[arg(long, hide = true)]
     here: bool,
+    /// Load it in this process, and no more.
+    #[arg(long, hide = true)]
+    enter: bool,
 }
+
+/// Seconds in which a library must be loaded: its constructors and its entry function have nothing to do that takes time.
+const ENTERED: f64 = 10.0;
 
 fn settings(text: &str) -> std::result::Result<Value, String> {
     let value: Value = serde_json::from_str(text).map_err(|e| e.to_string())?;
@@ -93,15 +99,26 @@ struct Property {
 
 impl Check {
     pub fn run(self) -> Result<()> {
-        if self.here { self.check() } else { self.apart() }
+        if self.enter {
+            return plugins::with(|plugins| plugins.load(self.library.clone(), Place::Named));
+        }
+        if self.here {
+            return self.check();
+        }
+        let late =
+            format!("its entry function has not come back after {}", out::duration(ENTERED.min(self.time_limit)));
+        self.apart("--enter", ENTERED.min(self.time_limit), late)?;
+        let late = format!("not done after {}, ended; --time-limit allows more", out::duration(self.time_limit));
+        self.apart("--here", self.time_limit, late)
     }
 
-    /// Runs the check in a child process, whose end, whatever it is, can be told.
-    fn apart(&self) -> Result<()> {
+    /// Runs a part of the check in a child process, whose end, whatever it is, can be told; `late` if it takes longer than
+    /// `limit` seconds.
+    fn apart(&self, part: &str, limit: f64, late: String) -> Result<()> {
         let program = std::env::current_exe().map_err(|e| Error::io("conefield", e))?;
         let io = |e| Error::io(&program, e);
         let mut command = Command::new(&program);
-        command.args(std::env::args_os().skip(1)).arg("--here");
+        command.args(std::env::args_os().skip(1)).arg(part);
         let mut child = command.stdin(Stdio::null()).stderr(Stdio::piped()).spawn().map_err(io)?;
         let errors = child.stderr.take();
         let said = thread::spawn(move || {
@@ -115,11 +132,10 @@ impl Check {
             if let Some(status) = child.try_wait().map_err(io)? {
                 break status;
             }
-            if begin.elapsed().as_secs_f64() > self.time_limit {
+            if begin.elapsed().as_secs_f64() > limit {
                 let _ = child.kill();
                 let _ = child.wait();
-                let why = format!("not done after {}, ended; --time-limit allows more", out::duration(self.time_limit));
-                return Err(Error::unsupported(place, why));
+                return Err(Error::unsupported(place, late));
             }
             thread::sleep(Duration::from_millis(20));
         };

@@ -2,7 +2,7 @@
 
 use crate::out;
 use clap::{Args, ValueEnum};
-use conefield_core::registry::Kind;
+use conefield_core::registry::{self, Kind};
 use conefield_core::{Error, Result};
 use std::fs;
 use std::path::{Path, PathBuf};
@@ -43,6 +43,72 @@ enum Language {
     Rust,
     C,
 }
+
+/// Names that a crate or its types cannot have: Rust's keywords, and the crates that every crate can name.
+const RESERVED: [&str; 62] = [
+    "abstract",
+    "alloc",
+    "as",
+    "async",
+    "await",
+    "become",
+    "box",
+    "break",
+    "const",
+    "continue",
+    "core",
+    "crate",
+    "do",
+    "dyn",
+    "else",
+    "enum",
+    "extern",
+    "false",
+    "final",
+    "fn",
+    "for",
+    "gen",
+    "if",
+    "impl",
+    "in",
+    "let",
+    "loop",
+    "macro",
+    "match",
+    "mod",
+    "move",
+    "mut",
+    "override",
+    "priv",
+    "proc-macro",
+    "pub",
+    "ref",
+    "return",
+    "self",
+    "static",
+    "std",
+    "struct",
+    "super",
+    "test",
+    "trait",
+    "true",
+    "try",
+    "type",
+    "typeof",
+    "unsafe",
+    "unsized",
+    "use",
+    "virtual",
+    "where",
+    "while",
+    "yield",
+    "conefield-plugin",
+    "conefield-conformance",
+    "build",
+    "deps",
+    "examples",
+    "incremental",
+];
 
 macro_rules! template {
     ($name:literal) => {
@@ -113,6 +179,14 @@ impl New {
         if !good {
             let expected = "2 to 40 lower-case letters, digits and hyphens, a letter first";
             return Err(Error::invalid("plugins new", "NAME", format!("{:?}", self.name), expected));
+        }
+        if RESERVED.contains(&&self.name[..]) {
+            let expected = "a name that is no word of Rust or of its standard library";
+            return Err(Error::invalid("plugins new", "NAME", format!("{:?}", self.name), expected));
+        }
+        if let Some(taken) = registry::find(self.kind.kind(), &self.name) {
+            let found = format!("{:?}, the {} of {}", self.name, taken.kind, taken.owner());
+            return Err(Error::invalid("plugins new", "NAME", found, "a name that no stage has yet"));
         }
         let folder = self.into.join(&self.name);
         if folder.exists() {

@@ -1,0 +1,70 @@
+//! The log on standard error. What it is told may come from files: a line of it is one line, of a bounded length, without
+//! anything that a terminal would obey. Where nobody reads it any more, the work goes on.
+
+use crate::out::{LONGEST_LINE, plain_line};
+use crate::progress;
+use std::fmt;
+use std::io::{self, IsTerminal, Write};
+use tracing::field::Field;
+use tracing::warn;
+use tracing_subscriber::EnvFilter;
+use tracing_subscriber::field::MakeExt as _;
+use tracing_subscriber::fmt::format;
+use tracing_subscriber::fmt::format::Writer;
+
+/// The variable that says what the log tells, where neither --verbose nor --quiet does.
+const VARIABLE: &str = "RUST_LOG";
+
+/// Starts the log: warnings and news, more with `verbose`, errors only when `quiet`, else what `RUST_LOG` asks for.
+pub fn start(verbose: u8, quiet: bool) {
+    let level = match (quiet, verbose) {
+        (true, _) => "error",
+        (_, 0) => "info",
+        (_, 1) => "debug",
+        _ => "trace",
+    };
+    let asked = std::env::var(VARIABLE).ok().filter(|a| !a.is_empty() && !quiet && verbose == 0);
+    let filter = asked.as_deref().map(EnvFilter::try_new);
+    let _ = tracing_subscriber::fmt()
+        .with_env_filter(match &filter {
+            Some(Ok(_)) => EnvFilter::new(asked.as_deref().unwrap_or(level)),
+            _ => EnvFilter::new(level),
+        })
+        .fmt_fields(format::debug_fn(field).delimited(", "))
+        .with_writer(|| Stderr)
+        .log_internal_errors(false)
+        .with_ansi(io::stderr().is_terminal())
+        .with_target(false)
+        .try_init();
+    if let Some(Err(e)) = filter {
+        warn!("{VARIABLE}: {e}; the log tells what it tells without it");
+    }
+}
+
+/// One field of an event; the message has no name.
+fn field(writer: &mut Writer<'_>, field: &Field, value: &dyn fmt::Debug) -> fmt::Result {
+    let text = plain_line(&format!("{value:?}"), LONGEST_LINE);
+    if field.name() == "message" { write!(writer, "{text}") } else { write!(writer, "{}={text}", field.name()) }
+}
+
+/// Tells the error that ends the command.
+pub fn error(text: &str) {
+    let _ = writeln!(Stderr, "error: {}", plain_line(text, LONGEST_LINE));
+}
+
+/// Standard error, written while no bar is drawn. That it is closed or full is no reason to end a work.
+struct Stderr;
+
+impl Write for Stderr {
+    fn write(&mut self, text: &[u8]) -> io::Result<usize> {
+        progress::between_bars(|| {
+            let _ = io::stderr().write_all(text);
+        });
+        Ok(text.len())
+    }
+
+    fn flush(&mut self) -> io::Result<()> {
+        let _ = io::stderr().flush();
+        Ok(())
+    }
+}

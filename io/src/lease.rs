@@ -1,0 +1,294 @@
+//! A folder that one command writes at a time, and that may take the place of an earlier one.
+//!
+//! The earlier folder steps aside, under a hidden name beside it, when the command has found nothing wrong with its input.
+//! It comes back if the command ends without a result of its own, and goes when the new one is complete. A process that is
+//! killed leaves both; the next command on that folder does what is due.
+
+use crate::atomic::{exchange, parent, sweep, sync_folder};
+use crate::lock::{self, Held};
+use conefield_core::{Error, Result};
+use std::ffi::{OsStr, OsString};
+use std::fs::{self, File};
+use std::io::ErrorKind;
+use std::path::{Path, PathBuf};
+
+/// How far the work in a folder came.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Progressed {
+    /// Nothing in it is a result, or can be gone on from.
+    Nothing,
+    /// A part of the result, or a checkpoint.
+    Begun,
+    /// All of it.
+    Complete,
+}
+
+/// What a kind of folder holds.
+#[derive(Debug, Clone, Copy)]
+pub struct Contents {
+    /// What its commands write, by name. Nothing else is ever removed.
+    pub known: fn(&Path) -> bool,
+    /// How far it came.
+    pub progressed: fn(&Path) -> Progressed,
+}
+
+/// A folder that this process alone writes.
+pub struct Lease {
+    path: PathBuf,
+    contents: Contents,
+    locks: Vec<File>,
+    /// Whether this process has begun to write.
+    writing: bool,
+    /// Whether it made the folder.
+    made: bool,
+}
+
+const ASIDE: [&str; 2] = [".conefield-", ".old"];
+
+/// Whether this is the name under which earlier folders wait.
+pub fn is_aside(name: &OsStr) -> bool {
+    name.to_str().is_some_and(|n| n.starts_with(ASIDE[0]) && n.ends_with(ASIDE[1]))
+}
+
+/// Where what stood under `folder` waits, the earliest as `0`.
+fn aside(folder: &Path) -> PathBuf {
+    let mut name = OsString::from(ASIDE[0]);
+    name.push(folder.file_name().unwrap_or_default());
+    name.push(ASIDE[1]);
+    parent(folder).join(name)
+}
+
+/// Folders in `aside`, the latest last. One that a killed process had only just made is empty and goes.
+fn waiting(aside: &Path) -> Result<Vec<PathBuf>> {
+    let entries = match fs::read_dir(aside) {
+        Err(e) if e.kind() == ErrorKind::NotFound => return Ok(vec![]),
+        entries => entries.map_err(|e| Error::io(aside, e))?,
+    };
+    let mut all = vec![];
+    for entry in entries {
+        let entry = entry.map_err(|e| Error::io(aside, e))?;
+        if fs::remove_dir(entry.path()).is_ok() {
+            continue;
+        }
+        if let Some(n) = entry.file_name().to_str().and_then(|n| n.parse::<u64>().ok()) {
+            all.push((n, entry.path()));
+        }
+    }
+    all.sort();
+    Ok(all.into_iter().map(|(_, path)| path).collect())
+}
+
+impl Lease {
+    /// Takes the folder at `path`, which need not be there. Refused while another process has it. What a killed process
+    /// left is settled first.
+    pub fn take(path: &Path, contents: Contents) -> Result<Self> {
+        // Through a link: it stays one, and what it leads to is replaced where that lies.
+        let plain: PathBuf = path.components().collect();
+        let path = if plain.is_symlink() { plain.canonicalize().map_err(|e| Error::io(path, e))? } else { plain };
+        let path = path.as_path();
+        let locks = own(path)?;
+        let mut lease = Self { path: path.to_path_buf(), contents, locks, writing: false, made: false };
+        lease.settle()?;
+        // What is put back has a lock of its own.
+        let more = own_again(&lease)?;
+        lease.locks.extend(more);
+        Ok(lease)
+    }
+
+    /// The folder.
+    pub fn path(&self) -> &Path {
+        &self.path
+    }
+
+    /// How far what stands there came.
+    pub fn progressed(&self) -> Progressed {
+        (self.contents.progressed)(&self.path)
+    }
+
+    /// Makes the folder, empty: what is in it steps aside until [`Lease::complete`]. Files of a work that came to nothing go.
+    pub fn replace(&mut self) -> Result<()> {
+        let at = |e| Error::io(&self.path, e);
+        fs::create_dir_all(parent(&self.path)).map_err(at)?;
+        if !self.path.is_dir() {
+            fs::create_dir(&self.path).map_err(at)?;
+            self.locks = own(&self.path)?;
+            self.made = true;
+        } else if self.progressed() == Progressed::Nothing {
+            self.clear(&self.path)?;
+        } else {
+            if self.path.file_name().is_none() {
+                let found = "a folder without a name of its own";
+                let expected = "the name that it has in the folder above";
+                return Err(Error::invalid(self.path.display().to_string(), "output", found, expected));
+            }
+            let aside = aside(&self.path);
+            let slot = aside.join(waiting(&aside)?.len().to_string());
+            fs::create_dir_all(&slot).map_err(at)?;
+            let new = own(&slot)?;
+            if !exchange(&slot, &self.path).map_err(at)? {
+                let beside = aside.join("new");
+                fs::rename(&slot, &beside).map_err(at)?;
+                fs::rename(&self.path, &slot).map_err(at)?;
+                fs::rename(&beside, &self.path).map_err(at)?;
+            }
+            sync_folder(&parent(&self.path));
+            self.locks.extend(new);
+        }
+        self.writing = true;
+        Ok(())
+    }
+
+    /// Goes on with what is there: what a killed process was writing in it goes.
+    pub fn go_on(&self) {
+        sweep(&self.path);
+    }
+
+    /// The work is done: what it replaced goes.
+    pub fn complete(mut self) -> Result<()> {
+        self.writing = false;
+        self.settle()
+    }
+
+    /// Does what is due: an earlier folder comes back where there is nothing new, and goes where the new one is complete.
+    fn settle(&self) -> Result<()> {
+        let aside = aside(&self.path);
+        let mut all = waiting(&aside)?;
+        let gone = |path: &Path| match fs::remove_dir_all(path) {
+            Err(e) if e.kind() != ErrorKind::NotFound => Err(Error::io(path, e)),
+            _ => Ok(()),
+        };
+        let progressed = if self.path.is_dir() { self.progressed() } else { Progressed::Nothing };
+        match (progressed, all.pop()) {
+            (Progressed::Complete, _) | (Progressed::Nothing, None) => gone(&aside),
+            (Progressed::Begun, None) => {
+                let _ = fs::remove_dir(&aside);
+                Ok(())
+            }
+            (Progressed::Begun, Some(_)) => Ok(()),
+            (Progressed::Nothing, Some(earlier)) => {
+                put_back(&earlier, &self.path)?;
+                if earlier.is_dir() {
+                    self.clear(&earlier)?;
+                }
+                // What another one put there stays where it can be found.
+                let _ = fs::remove_dir(&earlier).and_then(|()| fs::remove_dir(&aside));
+                sync_folder(&parent(&self.path));
+                Ok(())
+            }
+        }
+    }
+
+    /// Removes the known files of a work that came to nothing.
+    fn clear(&self, folder: &Path) -> Result<()> {
+        for entry in fs::read_dir(folder).map_err(|e| Error::io(folder, e))? {
+            let path = entry.map_err(|e| Error::io(folder, e))?.path();
+            if (self.contents.known)(&path) {
+                let gone = if path.is_dir() { fs::remove_dir_all(&path) } else { fs::remove_file(&path) };
+                gone.map_err(|e| Error::io(&path, e))?;
+            }
+        }
+        Ok(())
+    }
+}
+
+impl Drop for Lease {
+    /// The work ended early.
+    fn drop(&mut self) {
+        if !self.writing {
+            return;
+        }
+        let aside = aside(&self.path);
+        let settled = self.settle().and_then(|()| {
+            if self.progressed() == Progressed::Nothing {
+                self.clear(&self.path)?;
+                if self.made {
+                    let _ = fs::remove_dir(&self.path);
+                }
+            }
+            Ok(())
+        });
+        match settled {
+            Err(e) => tracing::error!("{e}"),
+            Ok(()) if aside.is_dir() => tracing::info!(
+                "{}: what stood here before waits in {} until the work is complete",
+                self.path.display(),
+                aside.display()
+            ),
+            Ok(()) => {}
+        }
+    }
+}
+
+/// The lock on a folder, if it is there.
+fn own(path: &Path) -> Result<Vec<File>> {
+    loop {
+        if !path.is_dir() {
+            return Ok(vec![]);
+        }
+        match lock::hold(path) {
+            Held::Ours(lock) => return Ok(vec![lock]),
+            Held::Theirs => {
+                let expected = "a folder that no other command writes, or to wait until that one is done";
+                let found = "a folder that another conefield is writing";
+                return Err(Error::invalid(path.display().to_string(), "output", found, expected));
+            }
+            // Where it cannot be locked at all, that stays so; where it has just changed its name, a second look helps.
+            Held::Unknown if File::open(path).is_ok_and(|f| f.try_lock().is_ok()) => {}
+            Held::Unknown => return Ok(vec![]),
+        }
+    }
+}
+
+/// The lock on what stands at the lease's path, unless it has that one.
+fn own_again(lease: &Lease) -> Result<Vec<File>> {
+    let same = |lock: &File| {
+        let a = lock.try_clone().and_then(same_file::Handle::from_file);
+        a.ok().zip(same_file::Handle::from_path(&lease.path).ok()).is_some_and(|(a, b)| a == b)
+    };
+    if lease.locks.iter().any(same) { Ok(vec![]) } else { own(&lease.path) }
+}
+
+/// Puts `earlier` back to `path`, where at most a work stands that came to nothing: that is at `earlier` afterwards.
+fn put_back(earlier: &Path, path: &Path) -> Result<()> {
+    let at = |e| Error::io(path, e);
+    if path.symlink_metadata().is_err() {
+        return fs::rename(earlier, path).map_err(at);
+    }
+    if exchange(earlier, path).map_err(at)? {
+        return Ok(());
+    }
+    let between = parent(earlier).join("new");
+    fs::rename(path, &between).map_err(at)?;
+    fs::rename(earlier, path).map_err(at)?;
+    fs::rename(&between, earlier).map_err(at)
+}
+
+/// Where two names cannot be exchanged in one step: `folder` steps aside, `new` takes its name.
+pub(crate) fn replace_in_two_steps(new: &Path, folder: &Path) -> Result<()> {
+    let at = |e| Error::io(folder, e);
+    let aside = aside(folder);
+    let slot = aside.join(waiting(&aside)?.len().to_string());
+    fs::create_dir_all(&aside).map_err(at)?;
+    fs::rename(folder, &slot).map_err(at)?;
+    if let Err(e) = fs::rename(new, folder) {
+        put_back(&slot, folder)?;
+        return Err(at(e));
+    }
+    fs::remove_dir_all(&aside).map_err(at)
+}
+
+/// Puts a folder back that a process which was killed between the two steps left aside.
+pub(crate) fn put_back_missing(folder: &Path) -> Result<()> {
+    if folder.symlink_metadata().is_ok() {
+        return Ok(());
+    }
+    let aside = aside(folder);
+    match waiting(&aside)?.pop() {
+        None => Ok(()),
+        Some(earlier) => {
+            put_back(&earlier, folder)?;
+            let _ = fs::remove_dir(&aside);
+            Ok(())
+        }
+    }
+}
