@@ -168,7 +168,7 @@ impl Column {
         let [a, b, c] = self.length;
         for (i, x) in numbers.iter_mut().enumerate() {
             let r = (self.rows.start + i) as f64 - self.middle;
-            *x = *x * R::of((a + r * (b + r * c)).sqrt() / (1.0 + self.bend * r));
+            *x *= R::of((a + r * (b + r * c)).sqrt() / (1.0 + self.bend * r));
         }
     }
 }

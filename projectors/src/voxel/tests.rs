@@ -253,7 +253,7 @@ fn tilted_columns_agree_with_rays_and_are_adjoint() {
 #[test]
 fn a_column_across_the_diagonal_is_split() {
     let mut g = turned(crooked(true), 8.0);
-    g.views = vec![g.views[2].clone()];
+    g.views = vec![g.views[2]];
     let columns = columns::of(&g, 0).unwrap();
     assert!(columns.len() > g.detector[1], "{} of {}", columns.len(), g.detector[1]);
     assert!(off_the_rays(&g)[0] < 1e-10);
