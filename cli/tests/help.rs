@@ -69,7 +69,7 @@ fn version_is_told() {
 #[test]
 fn wrong_use_exits_with_2() {
     for (args, want) in [
-        (&["reconstruct"][..], "--spec <SPEC>"),
+        (&["reconstruct"][..], "<SCAN>"),
         (&["recontruct"], "reconstruct"),
         (&["simulate", "v", "-o", "s", "--noise", "salt"], "poisson"),
         (&["simulate", "v", "-o", "s", "--detector", "12"], "ROWSxCOLS"),
@@ -82,7 +82,7 @@ fn wrong_use_exits_with_2() {
         (&["reconstruct", "s", "--spec", "naf", "-o", "r", "--hold-out", "x"], "every:10"),
         (&["reconstruct", "s", "--spec", "naf", "-o", "r", "--backend", "abacus"], "cpu"),
         (&["compare", "s", "-o", "r"], "--specs <SPEC,SPEC>"),
-        (&["reconstruct", "s", "-o", "r"], "--spec <SPEC>"),
+        (&["reconstruct", "s", "-o", "r"], "--spec fista-tv"),
         (&["reconstruct", "s", "-o", "r", "--budget", "9s", "--steps", "3"], "--steps"),
         (&["reconstruct", "s", "-o", "r", "--budget", "9s", "--front", "f", "--spec", "naf"], "--front"),
         (&["tradeoff", "-o", "r"], "<SCAN>"),

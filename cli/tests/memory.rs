@@ -150,7 +150,7 @@ fn what_does_not_fit_is_refused_with_figures_before_anything_is_made() {
     let out = text(&dir.path().join("other"));
     for args in [
         &["simulate", "phantom:head:256", "-o", &out][..],
-        &["pretrain", "phantom:head:256", "--spec", "fast", "-o", &out],
+        &["pretrain", "phantom:head:256", "--spec", "fast", "-o", &format!("{out}.safetensors")],
         &["reconstruct", &scan, "--spec", "fast", "-o", &out, "--reference", "truth"],
         &["convert", &scan, &out],
         &["explain", "fast", "--scan", &scan],

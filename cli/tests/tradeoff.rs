@@ -188,7 +188,7 @@ fn a_search_that_was_interrupted_repeats_no_finished_trial() {
     assert_eq!(again, found);
     let all = line(&scan, &levers, dir.path(), &["--force"]);
     let said = refused(1, &words(&all));
-    assert!(said.contains("in it, expected a new or empty folder") && scan.join("scan.toml").exists(), "{said}");
+    assert!(said.contains("in it, which this command reads") && scan.join("scan.toml").exists(), "{said}");
 }
 
 #[test]

@@ -119,12 +119,14 @@ impl Real for f32 {
             let far = [register(2), register(3)];
             // Numbers of the far two registers count from their own first; those of the near two then mean nothing.
             let start = S::u32s::splat(s, 0x0101_0101 * (8 * len) as u32);
-            return std::array::from_fn(|k| {
+            let mut all = [lane; K];
+            for (k, taken) in all.iter_mut().enumerate() {
                 let a = near[0].concat_swizzle_dyn(near[1], bytes.to_bytes());
                 let b = far[0].concat_swizzle_dyn(far[1], (bytes - start).to_bytes());
                 bytes += 0x0404_0404;
-                lane.simd_ge(S::f32s::splat(s, (2 * len - k) as f32)).select(b, a)
-            });
+                *taken = lane.simd_ge(S::f32s::splat(s, (2 * len - k) as f32)).select(b, a);
+            }
+            return all;
         }
         one_by_one(s, line, at)
     }
@@ -135,11 +137,13 @@ impl Real for f32 {
         let number: S::u32s = at.to_int();
         // The four bytes of every lane's number.
         let mut bytes = number * 0x0404_0404 + 0x0302_0100;
-        std::array::from_fn(|_| {
-            let taken = low.concat_swizzle_dyn(high, bytes.to_bytes());
+        // A loop, as a closure need not be inlined into what is compiled for an instruction set.
+        let mut all = [low; K];
+        for taken in &mut all {
+            *taken = low.concat_swizzle_dyn(high, bytes.to_bytes());
             bytes += 0x0404_0404;
-            taken
-        })
+        }
+        all
     }
     #[inline(always)]
     fn finite(self) -> bool {

@@ -1,7 +1,8 @@
 //! Methods one after the other, each from the volume of the one before.
 //!
 //! A field and total variation err in different places. A field that is trained first, and total variation that is held to its
-//! volume (`pull` of `fista`), come closer than either alone.
+//! volume (`pull` of `fista`), come closer than either alone. So do the errors of one prior on grids of different spacing:
+//! the mean of their volumes comes closer than each of them.
 
 use conefield_core::checkpoint::Checkpoint;
 use conefield_core::error::{Result, ensure};
@@ -10,9 +11,10 @@ use conefield_core::method::{
     Solution,
 };
 use conefield_core::pipeline::{Model, Pipeline};
-use conefield_core::scan::{Scan, ScanHeader};
+use conefield_core::scan::{Scan, ScanHeader, Volume};
 use conefield_core::spec::stage;
 use conefield_core::trained::{Placement, TrainedField};
+use ndarray::{Array3, Zip};
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
@@ -25,6 +27,13 @@ pub struct Chain {
     #[serde(deserialize_with = "stage::list")]
     #[schemars(schema_with = "stage::schema_of_list::<dyn Method>")]
     pub methods: Vec<Box<dyn Method>>,
+    /// What comes out is the mean of the volumes of so many methods, counted from the last: 1 is the last one's alone.
+    #[serde(default = "one")]
+    pub mean: usize,
+}
+
+fn one() -> usize {
+    1
 }
 
 conefield_core::stage_type!(
@@ -37,7 +46,15 @@ conefield_core::stage_type!(
 #[typetag::serde(name = "chain")]
 impl Method for Chain {
     fn plan(&self, context: &Context<'_>) -> Result<Box<dyn Plan>> {
-        ensure(self.methods.len() > 1, "spec", "methods", self.methods.len(), "at least 2 methods")?;
+        let count = self.methods.len();
+        ensure(count > 1, "spec", "methods", count, "at least 2 methods")?;
+        ensure(
+            (1..=count).contains(&self.mean),
+            "spec",
+            "mean",
+            self.mean,
+            format!("1 to {count}, the number of methods"),
+        )?;
         let mut links = vec![];
         for (i, method) in self.methods.iter().enumerate() {
             let mut link = method.plan(context).map_err(|e| e.within(&at(i)))?;
@@ -46,7 +63,7 @@ impl Method for Chain {
             ensure(starts, "spec", &at(i), method.typetag_name(), "a method that starts from a volume")?;
             links.push(link);
         }
-        Ok(Box::new(ChainPlan { links }))
+        Ok(Box::new(ChainPlan { links, mean: self.mean }))
     }
 }
 
@@ -59,18 +76,36 @@ fn at(i: usize) -> String {
 struct ChainPlan {
     /// At least two.
     links: Vec<Box<dyn Plan>>,
+    /// Of how many last links' volumes the mean comes out.
+    mean: usize,
+}
+
+impl ChainPlan {
+    /// Adds the volume of link `i` to the sum of those that the mean is of.
+    fn add(&self, sum: &mut Option<Array3<f32>>, i: usize, solution: &Solution, job: &Job<'_>) -> Result<()> {
+        if self.mean > 1 && i + self.mean >= self.links.len() {
+            let volume = solution.result.volume(job.backend)?;
+            match sum {
+                Some(sum) => Zip::from(sum).and(&volume.data).par_for_each(|sum, x| *sum += x),
+                None => *sum = Some(volume.data),
+            }
+        }
+        Ok(())
+    }
 }
 
 impl Plan for ChainPlan {
     fn outline(&self) -> Outline {
         let links: Vec<Outline> = self.links.iter().map(|l| l.outline()).collect();
         let kinds: Vec<&str> = links.iter().map(|l| &l.method.kind[..]).collect();
-        Outline { method: Line::new("method", "chain", &kinds.join(", then ")), links, ..Outline::default() }
+        let mean = if self.mean > 1 { format!("; the mean of the last {} volumes", self.mean) } else { String::new() };
+        let told = format!("{}{mean}", kinds.join(", then "));
+        Outline { method: Line::new("method", "chain", &told), links, ..Outline::default() }
     }
 
-    /// The links run one after the other; later ones also hold the volume that they start from.
+    /// The links run one after the other; later ones also hold the volume that they start from, and the sum of those before.
     fn needs(&self, scan: &ScanHeader) -> Needs {
-        let volume = 4 * scan.voxels();
+        let volume = 4 * scan.voxels() * if self.mean > 1 { 2 } else { 1 };
         let later = |l: &dyn Plan| {
             let needs = l.needs(scan);
             Needs { working: needs.working + volume, ..needs }
@@ -94,7 +129,9 @@ impl Plan for ChainPlan {
     fn run(&mut self, job: &Job<'_>, observer: &mut dyn Observer) -> Result<Solution> {
         let first = self.links[0].run(job, &mut FirstObserver { observer: &mut *observer, over: false });
         let mut done = first.map_err(|e| e.within(&at(0)))?;
-        for (i, link) in self.links.iter_mut().enumerate().skip(1) {
+        let mut sum = None;
+        self.add(&mut sum, 0, &done, job)?;
+        for i in 1..self.links.len() {
             let start = done.result.volume(job.backend)?;
             let limits = Limits {
                 at_most: job.limits.at_most.map(|all| (all - done.train_s).max(0.0)),
@@ -103,8 +140,18 @@ impl Plan for ChainPlan {
             };
             let next = Job { start: Some(&start), limits, resume: None, ..*job };
             let mut heard = LaterObserver { observer: &mut *observer, steps: done.steps, seconds: done.train_s };
-            let solution = link.run(&next, &mut heard).map_err(|e| e.within(&at(i)))?;
+            let solution = self.links[i].run(&next, &mut heard).map_err(|e| e.within(&at(i)))?;
+            self.add(&mut sum, i, &solution, job)?;
             done = joined(done, solution, job)?;
+        }
+        if let Some(sum) = sum {
+            let data = sum / self.mean as f32;
+            let volume = Volume { data, grid: job.scan.geometry.volume, affine: None };
+            done.result = match done.result {
+                Reconstruction::Volume(_) => Reconstruction::Volume(volume),
+                Reconstruction::Field(field) => Reconstruction::Refined { field: Box::new(field), volume },
+                Reconstruction::Refined { field, .. } => Reconstruction::Refined { field, volume },
+            };
         }
         Ok(done)
     }

@@ -971,7 +971,7 @@ enum BasisFault {
     AddsCoefficients,
     /// Every coefficient counts against its voxel.
     Negative,
-    /// It says that it is the identity and doubles everything.
+    /// It says that its coefficients are samples and doubles everything.
     Doubles,
     /// The result depends on the number of threads.
     Threads,
@@ -1053,13 +1053,13 @@ fn every_fault_of_a_basis_fails_its_property() {
         (BasisFault::AddsVoxels, "overwrites"),
         (BasisFault::AddsCoefficients, "overwrites"),
         (BasisFault::Negative, "no negative entries"),
-        (BasisFault::Doubles, "identity"),
+        (BasisFault::Doubles, "samples"),
         (BasisFault::Threads, "threads"),
     ] {
         let report = quietly(|| check_basis(&fault));
         assert!(report.failed().contains(&property), "{fault:?} passed {property:?}:\n{report}");
     }
-    assert_eq!(check_basis(&BasisFault::Doubles).failed(), ["identity"]);
+    assert_eq!(check_basis(&BasisFault::Doubles).failed(), ["samples"]);
 }
 
 /// What is wrong with a regularizer: `½‖x‖²` otherwise, whose proximal map is `max(0, v/(1 + τ))`.

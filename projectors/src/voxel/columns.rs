@@ -531,15 +531,14 @@ impl<'a> Hit<'a> {
             let first = (base + 1.0 + PAD as f64).max(0.0) as usize;
             let at = lanes.mul_add(number(apart), number(from - base));
             let near = apart * (len - 1) as f64 + 1.0 + K as f64 <= 2.0 * len as f64 - 0.5;
-            let take = |x: &[R]| -> [V<S, R>; K] {
-                if near {
-                    R::window::<S, K>(s, &x[first..first + 2 * len], at.floor())
-                } else {
-                    let most = number((x.len() - K - 1) as f64);
-                    R::neighbours::<S, K>(s, x, (at.floor() + number(first as f64)).min(most))
-                }
+            let (pixels, q) = if near {
+                let from = first..first + 2 * len;
+                (R::window::<S, K>(s, &pixels[from.clone()], at.floor()), R::window::<S, K>(s, &q[from], at.floor()))
+            } else {
+                let most = number((pixels.len() - K - 1) as f64);
+                let at = (at.floor() + number(first as f64)).min(most);
+                (R::neighbours::<S, K>(s, pixels, at), R::neighbours::<S, K>(s, q, at))
             };
-            let (pixels, q) = (take(pixels), take(q));
             let up = number(along[0] - start as f64) - lanes;
             let mut shares = [zero; K];
             let mut away = [zero; K];

@@ -85,19 +85,11 @@ pub(super) fn read<'a, S: Simd, R: Real>(
     let cell = z.floor();
     let share = z - cell;
     let at = if narrow { (base.int() + PAD as i64) as usize } else { 0 };
-    let found = |l: isize| {
-        let line = line(l);
-        let [a, b] = if narrow {
-            R::window::<S, 2>(s, &line[at..at + 2 * len], cell)
-        } else {
-            R::neighbours::<S, 2>(s, line, cell)
-        };
-        share.mul_add(b - a, a)
-    };
+    let at = narrow.then_some(at);
     let y = q.mul_add(number(path.across[1]), number(path.across[0] - low));
     let l = low.int() as isize;
     if whole && low == high {
-        let (a, b) = (found(l), found(l + 1));
+        let (a, b) = (between::<S, R>(s, line(l), at, cell, share), between::<S, R>(s, line(l + 1), at, cell, share));
         return Some(y.mul_add(b - a, a));
     }
     // Between more than two lines: each counts by its distance.
@@ -105,10 +97,22 @@ pub(super) fn read<'a, S: Simd, R: Real>(
     let mut sum = zero;
     let mut away = y;
     for l in l..=high.int() as isize + 1 {
-        sum = (one - away.abs()).max(zero).mul_add(found(l), sum);
+        let found = between::<S, R>(s, line(l), at, cell, share);
+        sum = (one - away.abs()).max(zero).mul_add(found, sum);
         away -= one;
     }
     Some(sum)
+}
+
+/// What readers find on one line: a `share` of the way from number `cell` to the next one, counted from `at` where all are near.
+/// (No closure: whether one is inlined into code for an instruction set is the compiler's choice.)
+#[inline(always)]
+fn between<S: Simd, R: Real>(s: S, line: &[R], at: Option<usize>, cell: V<S, R>, share: V<S, R>) -> V<S, R> {
+    let [a, b] = match at {
+        Some(at) => R::window::<S, 2>(s, &line[at..at + 2 * V::<S, R>::LEN], cell),
+        None => R::neighbours::<S, 2>(s, line, cell),
+    };
+    share.mul_add(b - a, a)
 }
 
 /// `q` of readers from `from` on, of which the numbers `valid` count: `ρ/(1 + bend·ρ)` with ρ the distance from `middle`.

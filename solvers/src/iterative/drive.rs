@@ -177,9 +177,13 @@ impl<'a> Run<'a> {
     /// Looks at the volume after a pass, keeps the best one, and sees whether a stopping rule is met.
     fn look(&mut self, pass: &Pass, method: &mut dyn Iteration) -> Result<Record> {
         let pixels = self.job.scan.projections.len() as f64;
-        let volume = method.volume(self.problem);
-        let held_out = self.monitor.held_out(self.problem.operator, volume)?;
-        let psnr = self.monitor.psnr(volume, self.job.scan.unit.mm as f32);
+        // A method may have to make its volume first.
+        let volume = if self.monitor.looks() { Some(method.volume(self.problem)) } else { None };
+        let (mut held_out, mut psnr) = (None, None);
+        if let Some(volume) = volume {
+            held_out = self.monitor.held_out(self.problem.operator, volume)?;
+            psnr = self.monitor.psnr(volume, self.job.scan.unit.mm as f32);
+        }
         let mut record = Record {
             step: self.step,
             seconds: self.clock.seconds(),
@@ -191,7 +195,9 @@ impl<'a> Run<'a> {
             ..Record::default()
         };
         let kept = &mut self.kept;
-        if let (Some(patience), Some(error), Some(best)) = (self.stop.patience, held_out, &mut self.best) {
+        if let (Some(patience), Some(error), Some(best), Some(volume)) =
+            (self.stop.patience, held_out, &mut self.best, volume)
+        {
             if kept.best.is_none_or(|b| error < b) {
                 kept.best = Some(error);
                 kept.since_best = 0;

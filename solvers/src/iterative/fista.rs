@@ -2,10 +2,9 @@
 //! SIAM J. Imaging Sci. 2(1), 2009; ordered subsets with momentum as in Kim, Ramani and Fessler, IEEE Trans. Med. Imaging
 //! 34(1), 2015).
 //!
-//! With n subsets the step is `1/L`, L an upper bound of the largest eigenvalue of every `n·(A_s·B)ᵀW(A_s·B)`, W the largest
-//! curvature of the data term: for a matrix M without negative entries `max_j (M·v)_j/v_j` is one for any positive v (Collatz
-//! and Wielandt), a tight one where v is near to the eigenvector. `M_1·1` of the first subset is, for all of them: line
-//! integrals of ones hardly depend on the views. So each subset takes one projection and its adjoint.
+//! With n subsets the step is `1/L`, L a little above the largest eigenvalue of every `n·(A_s·B)ᵀW(A_s·B)`, W the largest
+//! curvature of the data term: some steps of the power iteration, each on another subset. Line integrals of a smooth volume
+//! hardly depend on the views, so few subsets stand for all.
 //!
 //! Subsets and unbounded momentum do not go together: what one subset's gradient lacks of the others' is amplified, and
 //! the iterates run away. FISTA's t is therefore bounded, and after a pass whose objective is above the last one's two
@@ -37,7 +36,6 @@ use conefield_core::voxel::VoxelProjectorSpec;
 use conefield_projectors::voxel::Joseph;
 use ndarray::{Array3, Axis, Zip};
 use rand::RngExt;
-use rayon::prelude::*;
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 use std::time::Instant;
@@ -318,38 +316,39 @@ impl Arrays {
         }
     }
 
-    /// Root mean square of `(A·B)ᵀ·n` over the coefficients that rays meet, for noise n as `data` spreads it.
-    fn noise_gain(&mut self, problem: &Problem<'_>, data: &dyn Misfit) -> f64 {
+    /// Root mean square of `(A·B)ᵀ·n` over the coefficients that rays meet, for noise n as `data` spreads it: that of `views`
+    /// stands for all of them.
+    fn noise_gain(&mut self, problem: &Problem<'_>, data: &dyn Misfit, views: &[usize]) -> f64 {
         let mut rng = stream(problem.seed ^ 0x0000_7e57_0015_e000, 0);
-        self.part_by_part(problem, &problem.views(), &mut |_, views, pixels| {
+        self.part_by_part(problem, views, &mut |_, views, pixels| {
             let mut signs = images_mut(pixels, views.len());
             signs.iter_mut().for_each(|sign| *sign = if rng.random::<bool>() { 1.0 } else { -1.0 });
             data.spread(views, signs);
         });
         let met = self.gradient.iter().filter(|x| **x != 0.0).count();
-        (norm2(&self.gradient) / met.max(1) as f64).sqrt()
+        let all = problem.geometry.views.len() as f64 / views.len().max(1) as f64;
+        (all * norm2(&self.gradient) / met.max(1) as f64).sqrt()
     }
 
-    /// An upper bound of the largest eigenvalue of `n·(A_s·B)ᵀW(A_s·B)` over n subsets, W the curvature of `data`. Takes `before`
+    /// A number above the largest eigenvalue of `n·(A_s·B)ᵀW(A_s·B)` over n subsets, W the curvature of `data`. Takes `before`
     /// for work.
     fn largest_eigenvalue(&mut self, problem: &Problem<'_>, data: &dyn Misfit, subsets: &[Vec<usize>]) -> f64 {
+        let Some(first) = subsets.first() else { return 0.0 };
         self.before.fill(1.0);
         self.model.outside(problem, &mut self.before, 0.0);
-        let Some(first) = subsets.first() else { return 0.0 };
         self.curved(problem, data, first);
-        let top = flat(&self.gradient).par_iter().copied().reduce(|| 0.0, f32::max);
-        // Nowhere near 0 but where no coefficient is: what a subset hardly meets another one may.
-        Zip::from(&mut self.before)
-            .and(&self.gradient)
-            .par_for_each(|v, n| *v *= (n / top.max(f32::MIN_POSITIVE)).max(FLOOR));
         let mut worst = 0.0f64;
-        for views in subsets {
-            self.curved(problem, data, views);
-            let ratio = |(a, b): (&f32, &f32)| if *b > 0.0 { f64::from(a / b) } else { 0.0 };
-            let bound = flat(&self.gradient).par_iter().zip(flat(&self.before)).map(ratio).reduce(|| 0.0, f64::max);
-            worst = worst.max(bound);
+        for probe in 0..PROBES {
+            let size = norm2(&self.gradient).sqrt();
+            if size == 0.0 {
+                return 0.0;
+            }
+            Zip::from(&mut self.before).and(&self.gradient).par_for_each(|v, g| *v = (f64::from(*g) / size) as f32);
+            self.model.outside(problem, &mut self.before, 0.0);
+            self.curved(problem, data, &subsets[probe * subsets.len() / PROBES]);
+            worst = worst.max(norm2(&self.gradient).sqrt());
         }
-        subsets.len() as f64 * worst
+        SAFETY * subsets.len() as f64 * worst
     }
 
     /// Overwrites `gradient` with `(A_s·B)ᵀW(A_s·B)·v`, v in `before`.
@@ -363,8 +362,9 @@ impl Arrays {
     }
 }
 
-/// The least number of the vector that bounds the largest eigenvalue, its largest being 1.
-const FLOOR: f32 = 0.05;
+/// Subsets on which the largest eigenvalue is looked for, and how much larger than found it is taken to be.
+const PROBES: usize = 3;
+const SAFETY: f64 = 1.15;
 
 struct Iterate<'a> {
     arrays: Arrays,
@@ -392,8 +392,9 @@ impl<'a> Iterate<'a> {
         let views = problem.scan.geometry.views.len();
         let subsets = settings.subsets.of(views);
         let grid = arrays.model.grid();
-        let lambda =
-            settings.prior.weight(&grid, &mut |k| k * data.noise() * arrays.noise_gain(problem, data.as_ref()));
+        let lambda = settings
+            .prior
+            .weight(&grid, &mut |k| k * data.noise() * arrays.noise_gain(problem, data.as_ref(), &subsets[0]));
         let lipschitz = arrays.largest_eigenvalue(problem, data.as_ref(), &subsets);
         ensure(lipschitz > 0.0, "scan", "geometry", "rays that all miss the volume", "rays through the volume")?;
         Ok(Self {

@@ -130,7 +130,7 @@ impl Model {
         operator.adjoint(residual.view(), gradient.view_mut());
         direction.assign(&gradient);
         let mut gamma = norm2(&gradient);
-        let enough = 1e-6 * gamma;
+        let enough = 1e-4 * gamma;
         for _ in 0..FIT {
             operator.expand(direction.view(), ahead.view_mut());
             let square = norm2(&ahead);

@@ -23,6 +23,11 @@ impl<'a> VolumeMonitor<'a> {
         Self { reference, held_out: job.held_out, peak: job.peak }
     }
 
+    /// Whether there is anything to look at.
+    pub fn looks(&self) -> bool {
+        self.reference.is_some() || self.held_out.is_some()
+    }
+
     /// PSNR in dB of `scale·volume` over the voxels of `watched`.
     pub fn psnr(&self, volume: &Array3<f32>, scale: f32) -> Option<f64> {
         let reference = self.reference?;

@@ -189,7 +189,13 @@ impl Sweep {
     /// Makes the sums that do not change.
     pub(super) fn prepare(&mut self, problem: &Problem<'_>) {
         problem.ones(&mut self.work);
-        problem.forward(&problem.views(), &self.work, &mut self.rows);
+        // A subset at a time, as in every pass.
+        for views in &self.subsets {
+            problem.forward(views, &self.work, &mut self.pixels);
+            for (image, &v) in self.pixels.outer_iter().zip(views) {
+                self.rows.index_axis_mut(Axis(0), v).assign(&image);
+            }
+        }
         invert(&mut self.rows);
         if let [all] = &self.subsets[..] {
             column_sums(problem, all, &mut self.pixels, &mut self.columns);

@@ -57,8 +57,7 @@ impl Op for Variation<'_> {
             let mut part = zero;
             for k in (0..nz).step_by(len) {
                 let here = load(s, x, k);
-                let ahead = |b: Option<&[f32]>| b.map_or(zero, |b| load(s, b, k) - here);
-                let (a, b) = (ahead(after) * g[0], ahead(next) * g[1]);
+                let (a, b) = (ahead(s, after, k, here) * g[0], ahead(s, next, k, here) * g[1]);
                 let c = (load(s, &line, k + 1) - here) * g[2];
                 part += (a * a + b * b + c * c).sqrt();
             }
@@ -311,6 +310,24 @@ impl Planes<'_> {
     }
 }
 
+/// A vector of a line, and of one that is not there zeros.
+#[inline(always)]
+fn behind<S: Simd>(s: S, line: Option<&[f32]>, k: usize) -> S::f32s {
+    match line {
+        Some(line) => load(s, line, k),
+        None => S::f32s::splat(s, 0.0),
+    }
+}
+
+/// The difference to a vector of the next line; 0 where there is none.
+#[inline(always)]
+fn ahead<S: Simd>(s: S, next: Option<&[f32]>, k: usize, here: S::f32s) -> S::f32s {
+    match next {
+        Some(next) => load(s, next, k) - here,
+        None => S::f32s::splat(s, 0.0),
+    }
+}
+
 /// `u = max(0, v − τ·∇ᵀp)` along a line.
 #[inline(always)]
 fn primal<S: Simd>(s: S, Beside { p: [px, py, pz], before }: Beside<'_>, v: &[f32], scale: [f32; 3], u: &mut [f32]) {
@@ -324,10 +341,9 @@ fn primal<S: Simd>(s: S, Beside { p: [px, py, pz], before }: Beside<'_>, v: &[f3
     let [bx, by] = before;
     let mut k = 0;
     while k < u.len() {
-        let behind = |b: Option<&[f32]>| b.map_or(zero, |b| load(s, b, k));
         let bz = if k == 0 { S::f32s::from_slice(s, &first[..len]) } else { load(s, pz, k - 1) };
-        let dx = behind(bx) - load(s, px, k);
-        let dy = behind(by) - load(s, py, k);
+        let dx = behind(s, bx, k) - load(s, px, k);
+        let dy = behind(s, by, k) - load(s, py, k);
         let dz = bz - load(s, pz, k);
         let turn = dx * scale[0] + dy * scale[1] + dz * scale[2];
         store::<S, f32>((load(s, v, k) - turn).max(zero), u, k);
@@ -341,13 +357,12 @@ fn primal<S: Simd>(s: S, Beside { p: [px, py, pz], before }: Beside<'_>, v: &[f3
 fn ascend<S: Simd>(s: S, u: &[f32], after: [Option<&[f32]>; 2], scale: [f32; 3], [px, py, pz]: [&mut [f32]; 3]) {
     let len = S::f32s::LEN;
     let scale = scale.map(|x| S::f32s::splat(s, x));
-    let (zero, one) = (S::f32s::splat(s, 0.0), S::f32s::splat(s, 1.0));
+    let one = S::f32s::splat(s, 1.0);
     let mut k = 0;
     while k < px.len() {
         let here = load(s, u, k);
-        let ahead = |b: Option<&[f32]>| b.map_or(zero, |b| load(s, b, k) - here);
-        let x = ahead(after[0]).mul_add(scale[0], load(s, px, k));
-        let y = ahead(after[1]).mul_add(scale[1], load(s, py, k));
+        let x = ahead(s, after[0], k, here).mul_add(scale[0], load(s, px, k));
+        let y = ahead(s, after[1], k, here).mul_add(scale[1], load(s, py, k));
         let z = (load(s, u, k + 1) - here).mul_add(scale[2], load(s, pz, k));
         let length = x.mul_add(x, y.mul_add(y, z * z)).sqrt();
         let shrink = one / length.max(one);
