@@ -8,7 +8,7 @@
 //! [`readers`]: super::readers
 
 use super::layout::{ColumnMajor, batch, column_major_bytes, main_axis, to_voxels};
-use super::readers::{Among, PAD, Path, places, read};
+use super::readers::{Among, PAD, Path, mix, places, read, read_on};
 use conefield_core::geometry::{Geometry, Vec3, dot, sub};
 use conefield_core::scan::ScanHeader;
 use conefield_core::simd::{Op, Real, Simd, SimdBase, SimdFloat, V, load, run, store};
@@ -147,6 +147,11 @@ impl Column {
         Some(Path { across: of(0, 1 - self.main), along: of(1, 2) })
     }
 
+    /// Whether it runs along z, at equal distances in every plane.
+    fn is_upright(&self) -> bool {
+        self.bend == 0.0 && self.drift[0] == 0.0
+    }
+
     /// `q` of the first and the last row.
     fn ends(&self) -> [f64; 2] {
         [self.rows.start, self.rows.end - 1].map(|row| {
@@ -243,6 +248,14 @@ struct Plane<R> {
     among: Among<R>,
 }
 
+impl<R> Plane<R> {
+    /// Line `l`, from −1 to the number of lines.
+    #[inline(always)]
+    fn line<'a>(&self, shelf: &'a [R], l: isize, stride: usize) -> &'a [R] {
+        &shelf[(self.start + (l + 1) * stride as isize) as usize..][..stride]
+    }
+}
+
 impl<R: Real> Op for Forward<'_, R> {
     type Out = ();
     #[inline(always)]
@@ -255,6 +268,7 @@ impl<R: Real> Op for Forward<'_, R> {
             c.places(s, c.rows.start as f64, q);
         }
         let mut shelf = vec![];
+        let mut mixed = vec![R::ZERO; PLANES * stride];
         for main in 0..2 {
             for from in (0..self.shape[main]).step_by(PLANES) {
                 let planes = self.planes(main, from..(from + PLANES).min(self.shape[main]), &mut shelf);
@@ -267,6 +281,22 @@ impl<R: Real> Op for Forward<'_, R> {
                     for (path, plane) in paths.iter_mut().zip(&planes) {
                         *path = c.meet(plane.number).map(|path| (path.narrow(), plane));
                     }
+                    // All rows of an upright column are between the same two lines: those are mixed once.
+                    let upright = c.is_upright();
+                    if upright {
+                        for (path, mixed) in paths.iter_mut().zip(mixed.chunks_mut(stride)) {
+                            *path = path.take().filter(|(path, plane)| {
+                                let y = path.across[0];
+                                let meets = y > R::of(-1.0) && y < plane.among.lines;
+                                if meets {
+                                    let low = y.floor();
+                                    let [a, b] = [0, 1].map(|k| plane.line(&shelf, low.int() as isize + k, stride));
+                                    mix(s, a, b, y - low, mixed);
+                                }
+                                meets
+                            });
+                        }
+                    }
                     let sums = &mut self.sums[(c.number - self.first) * self.rows..][c.rows.clone()];
                     let mut i = 0;
                     while i < sums.len() {
@@ -274,10 +304,14 @@ impl<R: Real> Op for Forward<'_, R> {
                         let q = V::<S, R>::from_slice(s, &q[i..i + len]);
                         // Sums of a few planes, added up in turn: two short sums round less than one long one.
                         let mut part = V::<S, R>::splat(s, R::ZERO);
-                        for (path, plane) in paths.iter().flatten() {
-                            let line =
-                                |l: isize| &shelf[(plane.start + (l + 1) * stride as isize) as usize..][..stride];
-                            if let Some(found) = read(s, path, &plane.among, q, ends, line) {
+                        for (path, mixed) in paths.iter().zip(mixed.chunks(stride)) {
+                            let Some((path, plane)) = path else { continue };
+                            let found = if upright {
+                                read_on(s, path, &plane.among, q, ends, mixed)
+                            } else {
+                                read(s, path, &plane.among, q, ends, |l| plane.line(&shelf, l, stride))
+                            };
+                            if let Some(found) = found {
                                 part += found;
                             }
                         }
@@ -441,12 +475,17 @@ impl<R: Real> Op for Adjoint<'_, R> {
                     }
                     let plane = &mut self.gathered[p * lines * stride..(p + 1) * lines * stride];
                     let from = [pixels, &q];
-                    match hit.taps {
-                        0..=2 => hit.gather::<S, R, 2>(s, from, plane, stride),
-                        3 => hit.gather::<S, R, 3>(s, from, plane, stride),
-                        4 => hit.gather::<S, R, 4>(s, from, plane, stride),
-                        5..=6 => hit.gather::<S, R, 6>(s, from, plane, stride),
-                        7..=TAPS => hit.gather::<S, R, TAPS>(s, from, plane, stride),
+                    match (hit.taps, c.is_upright()) {
+                        (0..=2, true) => hit.gather_upright::<S, R, 2>(s, pixels, plane, stride),
+                        (3, true) => hit.gather_upright::<S, R, 3>(s, pixels, plane, stride),
+                        (4, true) => hit.gather_upright::<S, R, 4>(s, pixels, plane, stride),
+                        (5..=6, true) => hit.gather_upright::<S, R, 6>(s, pixels, plane, stride),
+                        (7..=TAPS, true) => hit.gather_upright::<S, R, TAPS>(s, pixels, plane, stride),
+                        (0..=2, _) => hit.gather::<S, R, 2>(s, from, plane, stride),
+                        (3, _) => hit.gather::<S, R, 3>(s, from, plane, stride),
+                        (4, _) => hit.gather::<S, R, 4>(s, from, plane, stride),
+                        (5..=6, _) => hit.gather::<S, R, 6>(s, from, plane, stride),
+                        (7..=TAPS, _) => hit.gather::<S, R, TAPS>(s, from, plane, stride),
                         _ => hit.scatter(from, plane, stride),
                     }
                 }
@@ -571,6 +610,49 @@ impl<'a> Hit<'a> {
                 add::<S, R>(s, plane, to(l), sum);
                 l += 1.0;
             }
+        }
+    }
+
+    /// [`Hit::gather`] for an upright column: its rows are at equal distances, between the same two lines.
+    #[inline(always)]
+    fn gather_upright<S: Simd, R: Real, const K: usize>(&self, s: S, pixels: &[R], plane: &mut [R], stride: usize) {
+        let len = V::<S, R>::LEN;
+        let number = |x: f64| V::<S, R>::splat(s, R::of(x));
+        let lanes = V::<S, R>::from_fn(s, |i| R::of(i as f64));
+        let (zero, one) = (number(0.0), number(1.0));
+        let y = self.path.across[0];
+        let low = y.floor();
+        if low < -1.0 || low >= self.lines {
+            return;
+        }
+        let (upper, lower) = (number(y - low), number(1.0 - (y - low)));
+        let rise = number(self.path.along[1]);
+        let near = self.per_z * (len - 1) as f64 + 1.0 + K as f64 <= 2.0 * len as f64 - 0.5;
+        let apart = lanes * number(self.per_z);
+        let mut to = (low + 1.0) as usize * stride + PAD + self.z.start;
+        for z in self.z.clone().step_by(len) {
+            let from = self.column.middle + (z as f64 - self.path.along[0]) * self.per_z - self.reach;
+            let base = from.floor();
+            let first = (base + 1.0 + PAD as f64).max(0.0) as usize;
+            let cell = (apart + number(from - base)).floor();
+            let pixels = if near {
+                R::window::<S, K>(s, &pixels[first..first + 2 * len], cell)
+            } else {
+                let most = number((pixels.len() - K - 1) as f64);
+                R::neighbours::<S, K>(s, pixels, (cell + number(first as f64)).min(most))
+            };
+            // How far the first of those rows is from each voxel, in voxels.
+            let q = base + 1.0 - self.column.middle;
+            let mut d =
+                cell.mul_add(rise, number(q.mul_add(self.path.along[1], self.path.along[0] - z as f64)) - lanes);
+            let mut sum = zero;
+            for x in pixels {
+                sum = (one - d.abs()).max(zero).mul_add(x, sum);
+                d += rise;
+            }
+            add::<S, R>(s, plane, to, lower * sum);
+            add::<S, R>(s, plane, to + stride, upper * sum);
+            to += len;
         }
     }
 

@@ -5,7 +5,7 @@
 //! both coordinates of a place are linear in q. One coordinate counts lines, the other numbers within them. Readers go
 //! upwards within lines, so a vector of them reads two vectors of neighbours and shuffles; they change lines slowly.
 
-use conefield_core::simd::{Real, Simd, SimdBase, SimdFloat, V};
+use conefield_core::simd::{Real, Simd, SimdBase, SimdFloat, V, load, store};
 
 /// Zeros before the first and after the last number of a line: vectors read up to so many beyond it.
 pub const PAD: usize = 32;
@@ -56,36 +56,17 @@ pub(super) fn read<'a, S: Simd, R: Real>(
     ends: [R; 2],
     line: impl Fn(isize) -> &'a [R],
 ) -> Option<V<S, R>> {
-    let len = V::<S, R>::LEN;
     let number = |x: R| V::<S, R>::splat(s, x);
-    let [first, last] = ends.map(|q| path.along(q));
-    if last <= among.span[0] || first >= among.span[1] {
-        return None;
-    }
     let [a, b] = ends.map(|q| path.across(q));
     let (low, high) = if a < b { (a, b) } else { (b, a) };
     let below = R::of(-1.0);
     if high <= below || low >= among.lines {
         return None;
     }
+    let (at, cell, share) = stand::<S, R>(s, path, among, q, ends)?;
     let whole = low >= below && high < among.lines;
     let low = if low < below { below } else { low.floor() };
     let high = if high < among.lines { high.floor() } else { among.lines - R::ONE };
-    // A little below the first reader, so that rounding puts none before it.
-    let base = (first - R::of(1.0 / 64.0)).floor();
-    let narrow = last - base <= R::of(2.0 * len as f64 - 2.5);
-    let z = if narrow {
-        q.mul_add(number(path.along[1]), number(path.along[0] - base))
-    } else {
-        let far = number(among.numbers + R::of(PAD as f64));
-        (q.mul_add(number(path.along[1]), number(path.along[0] + R::of(PAD as f64))))
-            .max(number(R::of(PAD as f64 - 1.0)))
-            .min(far)
-    };
-    let cell = z.floor();
-    let share = z - cell;
-    let at = if narrow { (base.int() + PAD as i64) as usize } else { 0 };
-    let at = narrow.then_some(at);
     let y = q.mul_add(number(path.across[1]), number(path.across[0] - low));
     let l = low.int() as isize;
     if whole && low == high {
@@ -102,6 +83,60 @@ pub(super) fn read<'a, S: Simd, R: Real>(
         away -= one;
     }
     Some(sum)
+}
+
+/// What readers at `q`, whose first and last are `ends`, find on a line that stands where they all do; `None` if that is 0.
+#[inline(always)]
+pub(super) fn read_on<S: Simd, R: Real>(
+    s: S,
+    path: &Path<R>,
+    among: &Among<R>,
+    q: V<S, R>,
+    ends: [R; 2],
+    line: &[R],
+) -> Option<V<S, R>> {
+    let (at, cell, share) = stand::<S, R>(s, path, among, q, ends)?;
+    Some(between::<S, R>(s, line, at, cell, share))
+}
+
+/// Where readers stand along the lines, for [`between`]; `None` where all lines are zero.
+#[inline(always)]
+fn stand<S: Simd, R: Real>(
+    s: S,
+    path: &Path<R>,
+    among: &Among<R>,
+    q: V<S, R>,
+    ends: [R; 2],
+) -> Option<(Option<usize>, V<S, R>, V<S, R>)> {
+    let len = V::<S, R>::LEN;
+    let number = |x: R| V::<S, R>::splat(s, x);
+    let [first, last] = ends.map(|q| path.along(q));
+    if last <= among.span[0] || first >= among.span[1] {
+        return None;
+    }
+    // A little below the first reader, so that rounding puts none before it.
+    let base = (first - R::of(1.0 / 64.0)).floor();
+    if last - base <= R::of(2.0 * len as f64 - 2.5) {
+        let z = q.mul_add(number(path.along[1]), number(path.along[0] - base));
+        let cell = z.floor();
+        return Some((Some((base.int() + PAD as i64) as usize), cell, z - cell));
+    }
+    let far = number(among.numbers + R::of(PAD as f64));
+    let z = (q.mul_add(number(path.along[1]), number(path.along[0] + R::of(PAD as f64))))
+        .max(number(R::of(PAD as f64 - 1.0)))
+        .min(far);
+    let cell = z.floor();
+    Some((None, cell, z - cell))
+}
+
+/// `line = (1 − share)·a + share·b`.
+#[inline(always)]
+pub(super) fn mix<S: Simd, R: Real>(s: S, a: &[R], b: &[R], share: R, line: &mut [R]) {
+    let share = V::<S, R>::splat(s, share);
+    for i in (0..line.len()).step_by(V::<S, R>::LEN) {
+        let a = load::<S, R>(s, a, i);
+        store::<S, R>(share.mul_add(load::<S, R>(s, b, i) - a, a), line, i);
+    }
 }
 
 /// What readers find on one line: a `share` of the way from number `cell` to the next one, counted from `at` where all are near.
@@ -126,6 +161,6 @@ pub(super) fn places<S: Simd, R: Real>(s: S, from: f64, [middle, bend]: [f64; 2]
     for i in (0..q.len()).step_by(len) {
         let r = (lanes + number(from + i as f64 - middle)).max(low).min(high);
         let place = if bend == 0.0 { r } else { r / r.mul_add(number(bend), number(1.0)) };
-        conefield_core::simd::store::<S, R>(place, q, i);
+        store::<S, R>(place, q, i);
     }
 }
