@@ -22,6 +22,7 @@ pub const SHIPPED: &[Shipped] = &[
     Shipped { name: "os-sart", text: include_str!("../../specs/os-sart.toml") },
     Shipped { name: "sirt", text: include_str!("../../specs/sirt.toml") },
     Shipped { name: "fista-tv", text: include_str!("../../specs/fista-tv.toml") },
+    Shipped { name: "smooth-tv", text: include_str!("../../specs/smooth-tv.toml") },
 ];
 
 /// Every name that stands for a spec: of those that are shipped, and of methods that need no setting.

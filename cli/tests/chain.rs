@@ -257,12 +257,12 @@ fn simulation_takes_noise_offset_and_angles() {
 }
 
 #[test]
-fn the_demonstration_compares_two_ways() {
+fn the_demonstration_compares_three_ways() {
     let dir = tempdir().unwrap();
     let out = text(&dir.path().join("demo"));
     let found = json(&["demo", "-o", &out, "--seconds", "1s", "--size", "24", "--views", "8", "--json"]);
     let results = found["results"].as_array().unwrap();
-    assert_eq!(results.len(), 2);
+    assert_eq!(results.len(), 3);
     assert!(results.iter().all(|r| r["scores"]["psnr"].as_f64().is_some_and(f64::is_finite)));
     assert!(dir.path().join("demo/compare.png").is_file());
 }

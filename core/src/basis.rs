@@ -14,9 +14,9 @@ pub trait BasisSpec: Send + Sync {
 
 /// A basis of volumes on any grid of voxels.
 pub trait Basis: Send + Sync {
-    /// The basis for the voxels of `grid` and a scan of `pixels` pixels. The number of coefficients follows from the grid's
-    /// shape and from `pixels` alone, so that memory can be told before a scan is read.
-    fn on(&self, grid: &VoxelGrid, pixels: u64) -> Result<Box<dyn Expansion>>;
+    /// The basis for the voxels of `grid`. The number of coefficients follows from the grid's shape alone, so that memory
+    /// can be told before a scan is read.
+    fn on(&self, grid: &VoxelGrid) -> Result<Box<dyn Expansion>>;
 
     /// A line for `explain`.
     fn describe(&self) -> String;

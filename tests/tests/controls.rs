@@ -980,7 +980,7 @@ enum BasisFault {
 struct BasisOn(BasisFault, VoxelGrid);
 
 impl Basis for BasisFault {
-    fn on(&self, grid: &VoxelGrid, _: u64) -> Result<Box<dyn Expansion>> {
+    fn on(&self, grid: &VoxelGrid) -> Result<Box<dyn Expansion>> {
         match self {
             Self::Refuses if grid.shape[0] == 1 => Err(Error::unsupported("toy", "a line of voxels")),
             _ => Ok(Box::new(BasisOn(*self, *grid))),

@@ -20,16 +20,17 @@ use std::path::PathBuf;
 use std::time::Instant;
 use tracing::info;
 
-/// Simulate a small scan, reconstruct it in two ways and compare.
+/// Simulate a small scan, reconstruct it in three ways and compare.
 ///
-/// A head-like phantom is scanned with the published noise. The spec "fast", started from pre-trained weights (MCI),
-/// then competes with the same field without LayerNorm and MCI, each given the same time.
+/// A head-like phantom is scanned with the published noise. Total variation on a smooth volume (the spec "smooth-tv")
+/// then competes with a field (the spec "fast", started from pre-trained weights: MCI), and with the same field without
+/// LayerNorm and MCI, given the same time.
 #[derive(Args)]
 pub struct DemoArgs {
     /// The folder for scan, volumes and picture.
     #[arg(short, long = "output", value_name = "FOLDER", default_value = "conefield-demo")]
     output: PathBuf,
-    /// Stop the training of each of the two after this time.
+    /// Stop the training of either field after this time.
     #[arg(long, value_name = "TIME", default_value = "60s", value_parser = parse::seconds)]
     seconds: f64,
     /// Voxels along a side of the volume.
@@ -49,7 +50,11 @@ pub struct DemoArgs {
     json: bool,
 }
 
-/// One of the two competitors and what became of it.
+/// The specs that compete.
+const VOXELS: &str = "smooth-tv";
+const FIELD: &str = "fast";
+
+/// One of the competitors and what became of it.
 #[derive(Serialize)]
 struct Entry {
     name: &'static str,
@@ -85,20 +90,23 @@ impl DemoArgs {
             Some(raw) => {
                 let path = folder.join("fast.safetensors");
                 conefield_io::write_atomic(&path, |w| w.write_all(raw).map_err(|e| Error::io(&path, e)))?;
-                with.push(method::init(&specs::read("fast", &[])?.tree, &path));
+                with.push(method::init(&specs::read(FIELD, &[])?.tree, &path));
                 name = "fast (LN, MCI)";
             }
             None => info!("this build comes without pre-trained weights: MCI is left out"),
         }
         let without = vec!["normalizers=[]".to_owned(), "initializer.type=random".to_owned()];
-        let entries =
-            [self.compete(name, &with, &scan, &truth)?, self.compete("without LN, MCI", &without, &scan, &truth)?];
-        for (entry, file) in entries.iter().zip(["fast.nii.gz", "without.nii.gz"]) {
+        let entries = [
+            self.compete(VOXELS, (VOXELS, &[]), &scan, &truth)?,
+            self.compete(name, (FIELD, &with), &scan, &truth)?,
+            self.compete("without LN, MCI", (FIELD, &without), &scan, &truth)?,
+        ];
+        for (entry, file) in entries.iter().zip(["smooth-tv.nii.gz", "fast.nii.gz", "without.nii.gz"]) {
             conefield_io::write_volume(folder.join(file), &entry.volume)?;
         }
         let captions = entries.each_ref().map(|e| format!("{} {:.2} dB", e.name, e.scores.psnr));
         let slices = entries.each_ref().map(|e| MiddleSlices::of(&e.volume));
-        let results = [(&captions[0][..], &slices[0]), (&captions[1][..], &slices[1])];
+        let results: Vec<_> = captions.iter().map(|c| &c[..]).zip(&slices).collect();
         let picture = folder.join("compare.png");
         let truth = MiddleSlices::of(&truth);
         conefield_report::compare_png(&picture, ("phantom", &truth), &results, truth.window())?;
@@ -115,18 +123,24 @@ impl DemoArgs {
         out::say(&format!("\npicture: {}\nscan and volumes beside it", picture.display()))
     }
 
-    /// Refuses what does not fit into memory: the scan, both volumes and the larger of the two methods.
+    /// Refuses what does not fit into memory: the scan, the volumes and the largest of the methods.
     fn reckon(&self) -> Result<()> {
         let (side, views) = (u64::from(self.size), usize::from(self.views));
         let (pixels, voxels) = (side * side * u64::from(self.views), side.pow(3));
-        // What is simulated from and the first of the two results are held beside the run's own.
-        let size = ScanSize { pixels, voxels, test_pixels: 0, reading: 8 * voxels, views };
+        // What is simulated from and the first two results are held beside the run's own.
+        let size = ScanSize { pixels, voxels, test_pixels: 0, reading: 12 * voxels, views };
         let run = memory::Run { reference: true, ..memory::Run::on(size) };
-        method::planned("fast", &[], &Cpu::new(), &run).map(drop)
+        [VOXELS, FIELD].iter().try_for_each(|spec| method::planned(spec, &[], &Cpu::new(), &run).map(drop))
     }
 
-    fn compete(&self, name: &'static str, sets: &[String], scan: &Scan, truth: &Volume) -> Result<Entry> {
-        let loaded = specs::read("fast", sets)?;
+    fn compete(
+        &self,
+        name: &'static str,
+        (spec, sets): (&str, &[String]),
+        scan: &Scan,
+        truth: &Volume,
+    ) -> Result<Entry> {
+        let loaded = specs::read(spec, sets)?;
         let backend = Cpu::new();
         let mut plan = method::plan(&loaded, &backend)?;
         let job = Job {

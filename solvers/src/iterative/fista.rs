@@ -183,7 +183,7 @@ impl Iterative for Built {
         }
         let stages = [self.data.describe(), self.prior.describe(), self.basis.describe()].join("; ");
         let voxels = job.scan.geometry.volume;
-        let expansion = self.basis.on(&voxels, job.scan.header().pixels()).map_err(|e| e.within("basis"))?;
+        let expansion = self.basis.on(&voxels).map_err(|e| e.within("basis"))?;
         let shortest = job.scan.geometry.detector[0].min(job.scan.geometry.detector[1]);
         ensure(
             self.bin <= shortest,
@@ -224,7 +224,6 @@ impl Iterative for Built {
     }
 
     fn bytes(&self, header: &ScanHeader) -> u64 {
-        let pixels = header.pixels();
         let header = &self.seen(*header);
         let space = Space::tally(*header);
         if self.air {
@@ -236,7 +235,7 @@ impl Iterative for Built {
         space.pass(self.data.scratch(header));
         let grid = VoxelGrid { shape: header.volume, spacing: [1.0; 3], center: [0.0; 3] };
         // A basis that refuses the grid refuses the run, which then takes nothing.
-        if let Ok(expansion) = self.basis.on(&grid, pixels) {
+        if let Ok(expansion) = self.basis.on(&grid) {
             Arrays::new(self, expansion, &grid, &space, space.volume());
         }
         self.shared.price(&space, self.subsets)

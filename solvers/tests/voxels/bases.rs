@@ -30,7 +30,7 @@ impl BasisSpec for Blocks {
 }
 
 impl Basis for Blocks {
-    fn on(&self, grid: &VoxelGrid, _: u64) -> Result<Box<dyn Expansion>> {
+    fn on(&self, grid: &VoxelGrid) -> Result<Box<dyn Expansion>> {
         Ok(Box::new(On { grid: *grid }))
     }
     fn describe(&self) -> String {

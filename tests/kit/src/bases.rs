@@ -18,7 +18,7 @@ const SINGLE: f64 = 1e-5;
 pub fn check_basis(basis: &dyn Basis) -> Report {
     let mut report = Report { stage: basis.describe(), entries: vec![] };
     report.add("builds", || builds(basis));
-    let made: Result<Vec<_>, _> = grids().iter().map(|grid| basis.on(grid, PIXELS).map(|b| (*grid, b))).collect();
+    let made: Result<Vec<_>, _> = grids().iter().map(|grid| basis.on(grid).map(|b| (*grid, b))).collect();
     let Ok(all) = made else { return report };
     report.add("adjoint: double precision", || adjoint(&all, |b| b.reference(), ADJOINT[0]));
     report.add("adjoint: single precision", || adjoint(&all, |b| b.operator(), ADJOINT[1]));
@@ -32,9 +32,6 @@ pub fn check_basis(basis: &dyn Basis) -> Report {
 }
 
 type Made = [(VoxelGrid, Box<dyn Expansion>)];
-
-/// Pixels of the scan that the bases are for: one that resolves less than the voxels.
-const PIXELS: u64 = 100;
 
 /// Voxels that are no cubes, sides that are odd, lines and planes of voxels.
 fn grids() -> Vec<VoxelGrid> {
@@ -50,13 +47,13 @@ fn grids() -> Vec<VoxelGrid> {
 /// It is made for every grid, and the number of coefficients follows from the grid's shape alone.
 fn builds(basis: &dyn Basis) -> Outcome {
     let complaint = grids().into_iter().find_map(|grid| {
-        let made = match basis.on(&grid, PIXELS) {
+        let made = match basis.on(&grid) {
             Ok(made) => made.coefficients(),
             Err(e) => return Some(format!("for {grid:?}: {e}")),
         };
         let positive = made.shape.iter().all(|n| *n > 0) && made.spacing.iter().all(|s| s.is_finite() && *s > 0.0);
         let other = VoxelGrid { spacing: grid.spacing.map(|s| 3.0 * s), center: [0.0; 3], ..grid };
-        let shape = basis.on(&other, PIXELS).map(|b| b.coefficients().shape).ok();
+        let shape = basis.on(&other).map(|b| b.coefficients().shape).ok();
         (!positive || shape != Some(made.shape))
             .then(|| format!("for {grid:?}: {made:?}, with larger voxels {shape:?}"))
     });

@@ -18,40 +18,17 @@ use serde::{Deserialize, Serialize};
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields, default)]
 pub struct Cubic {
-    /// The distance of the samples in units, 0.5 to 64. It is adjusted so that a whole number of samples fills the volume.
+    /// The distance of the samples in voxels, 0.5 to 64. It is adjusted so that a whole number of samples fills the volume.
     pub spacing: f64,
-    /// What the distance is counted in.
-    pub unit: Unit,
-}
-
-/// What the distance of samples is counted in.
-#[derive(Debug, Clone, Copy, Default, PartialEq, Serialize, Deserialize, JsonSchema)]
-#[serde(rename_all = "kebab-case")]
-pub enum Unit {
-    /// The side of a voxel.
-    #[default]
-    Voxel,
-    /// What the scan resolves: the side of a cell if the volume had two cells for every three pixels of all views, but at
-    /// least a voxel.
-    Resolved,
-}
-
-/// Pixels of all views for every cell of [`Unit::Resolved`].
-const PIXELS_A_CELL: f64 = 1.5;
-
-impl Unit {
-    /// In voxels, for a volume of `voxels` voxels and a scan of `pixels` pixels.
-    fn voxels(self, voxels: usize, pixels: u64) -> f64 {
-        match self {
-            Self::Voxel => 1.0,
-            Self::Resolved => (PIXELS_A_CELL * voxels as f64 / (pixels as f64).max(1.0)).cbrt().max(1.0),
-        }
-    }
+    /// At most so many samples along the longest side, 2 or more: larger volumes have them further apart. What few views can
+    /// tell depends more on this number than on how fine the voxels are.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub samples: Option<u32>,
 }
 
 impl Default for Cubic {
     fn default() -> Self {
-        Self { spacing: 2.0, unit: Unit::Voxel }
+        Self { spacing: 2.0, samples: None }
     }
 }
 
@@ -60,14 +37,17 @@ conefield_core::stage_type!(Basis, "cubic", Cubic, "samples of a cubic spline on
 #[typetag::serde(name = "cubic")]
 impl BasisSpec for Cubic {
     fn build(&self) -> Result<Box<dyn Basis>> {
-        ensure((0.5..=64.0).contains(&self.spacing), "spec", "spacing", self.spacing, "0.5 to 64")?;
+        ensure((0.5..=64.0).contains(&self.spacing), "spec", "spacing", self.spacing, "0.5 to 64 voxels")?;
+        let few = self.samples.filter(|n| *n < 2);
+        ensure(few.is_none(), "spec", "samples", few.unwrap_or_default(), "2 or more")?;
         Ok(Box::new(*self))
     }
 }
 
 impl Basis for Cubic {
-    fn on(&self, grid: &VoxelGrid, pixels: u64) -> Result<Box<dyn Expansion>> {
-        let spacing = self.spacing * self.unit.voxels(grid.shape.iter().product(), pixels);
+    fn on(&self, grid: &VoxelGrid) -> Result<Box<dyn Expansion>> {
+        let longest = grid.shape.into_iter().max().unwrap_or(1) as f64;
+        let spacing = self.samples.map_or(self.spacing, |n| self.spacing.max(longest / f64::from(n)));
         let shape = grid.shape.map(|n| ((n as f64 / spacing).round() as usize).max(1));
         let spacing = std::array::from_fn(|k| grid.spacing[k] * grid.shape[k] as f64 / shape[k] as f64);
         let axes = std::array::from_fn(|k| Axis::new(shape[k], grid.shape[k]));
@@ -75,11 +55,8 @@ impl Basis for Cubic {
     }
 
     fn describe(&self) -> String {
-        let unit = match self.unit {
-            Unit::Voxel => "voxels",
-            Unit::Resolved => "times what the scan resolves",
-        };
-        format!("cubic: samples of a cubic spline {} {unit} apart", self.spacing)
+        let most = self.samples.map(|n| format!(", at most {n} along a side")).unwrap_or_default();
+        format!("cubic: samples of a cubic spline {} voxels apart{most}", self.spacing)
     }
 }
 
@@ -254,8 +231,7 @@ mod tests {
     use ndarray::Array3;
 
     fn spline(shape: [usize; 3], spacing: f64) -> Box<dyn Expansion> {
-        let grid = VoxelGrid { shape, spacing: [1.0; 3], center: [0.0; 3] };
-        Cubic { spacing, unit: Unit::Voxel }.on(&grid, 1).unwrap()
+        Cubic { spacing, samples: None }.on(&VoxelGrid { shape, spacing: [1.0; 3], center: [0.0; 3] }).unwrap()
     }
 
     fn expand(of: &dyn Expansion, shape: [usize; 3], x: &Array3<f64>) -> Array3<f64> {
@@ -300,22 +276,22 @@ mod tests {
         assert!(voxels.iter().zip(&x).all(|(a, b)| (a - b).abs() < 1e-8));
     }
 
-    /// Fewer pixels, fewer samples; never more than voxels.
     #[test]
-    fn samples_are_as_many_as_the_scan_resolves() {
-        let grid = VoxelGrid { shape: [64; 3], spacing: [0.5; 3], center: [0.0; 3] };
-        let cubic = Cubic { spacing: 1.0, unit: Unit::Resolved };
-        let side = |pixels: usize| cubic.on(&grid, pixels as u64).unwrap().coefficients();
-        assert_eq!(side(50 * 256 * 256).shape, [64; 3]);
-        assert_eq!(side(3 * 32 * 32 * 32 / 2).shape, [32; 3]);
-        assert_eq!(side(3 * 32 * 32 * 32 / 2).spacing, [1.0; 3]);
-        assert_eq!(side(0).shape, [1; 3]);
+    fn larger_volumes_have_samples_further_apart() {
+        let shape = |shape| {
+            let grid = VoxelGrid { shape, spacing: [0.5; 3], center: [0.0; 3] };
+            Cubic { spacing: 1.0, samples: Some(20) }.on(&grid).unwrap().coefficients().shape
+        };
+        assert_eq!(shape([16, 10, 12]), [16, 10, 12]);
+        assert_eq!(shape([40, 20, 30]), [20, 10, 15]);
+        let e = BasisSpec::build(&Cubic { spacing: 1.0, samples: Some(1) }).err().unwrap().to_string();
+        assert!(e.contains("samples") && e.contains("2 or more"), "{e}");
     }
 
     #[test]
     fn spacings_out_of_range_are_refused() {
         for spacing in [0.0, -1.0, f64::NAN, f64::INFINITY, 0.4, 65.0] {
-            let e = BasisSpec::build(&Cubic { spacing, unit: Unit::Voxel }).err().unwrap().to_string();
+            let e = BasisSpec::build(&Cubic { spacing, samples: None }).err().unwrap().to_string();
             assert!(e.contains("spacing") && e.contains("0.5 to 64"), "{e}");
         }
     }

@@ -23,7 +23,7 @@ impl BasisSpec for Voxels {
 }
 
 impl Basis for Voxels {
-    fn on(&self, grid: &VoxelGrid, _: u64) -> Result<Box<dyn Expansion>> {
+    fn on(&self, grid: &VoxelGrid) -> Result<Box<dyn Expansion>> {
         Ok(Box::new(Identity { grid: *grid }))
     }
 
