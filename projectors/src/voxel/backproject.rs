@@ -2,9 +2,7 @@
 //!
 //! Every voxel receives `Σ_i s_i/U_i²·p_i(u, v)`: `U_i` is its depth in view `i`, `p_i` is read by bilinear
 //! interpolation where the ray through the voxel's centre meets the detector, and outside the detector nothing is
-//! added. The voxels of a line along z stand in a row on the detector, and read columns of pixels as [`readers`] has it.
-//!
-//! [`readers`]: super::readers
+//! added. The voxels of a line along z stand in a row on the detector, and read columns of pixels as `readers` has it.
 
 use super::layout::{ColumnMajor, Pinhole};
 use super::readers::{Among, PAD, Path, places, read};

@@ -1,11 +1,9 @@
 //! Joseph's projector, a detector column at a time.
 //!
-//! The rays of a detector column lie in one plane, and where that meets a plane of voxels they stand in a row ([`readers`]
+//! The rays of a detector column lie in one plane, and where that meets a plane of voxels they stand in a row (`readers`
 //! has the formula). Columns that run along z, or nearly so as those of calibrated scans do, then read lines of voxels along
 //! z upwards, a vector of rows at a time. The adjoint goes the same way back: every voxel of a line gathers from the rows
 //! that are less than a voxel away, with the same hat-shaped weights.
-//!
-//! [`readers`]: super::readers
 
 use super::layout::{ColumnMajor, batch, column_major_bytes, main_axis, to_voxels};
 use super::readers::{Among, PAD, Path, mix, places, read, read_on};

@@ -27,7 +27,7 @@ pub fn main_axis(ahead: Vec3) -> usize {
 }
 
 /// Some views with the pixels of a detector column side by side, from below, between
-/// [`PAD`] zeros.
+/// `PAD` zeros.
 pub struct ColumnMajor<R> {
     /// `[view][column][PAD + rows + PAD]`.
     data: Vec<R>,
@@ -66,7 +66,7 @@ impl<R: Real> ColumnMajor<R> {
         Self { data, rows, columns, downwards }
     }
 
-    /// A column with its zeros; row 0 stands at [`PAD`].
+    /// A column with its zeros; row 0 stands at `PAD`.
     pub fn column(&self, view: usize, column: usize) -> &[R] {
         let stride = self.rows + 2 * PAD;
         let at = (view * self.columns + column) * stride;

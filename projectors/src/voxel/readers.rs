@@ -63,14 +63,14 @@ pub(super) fn read<'a, S: Simd, R: Real>(
     if high <= below || low >= among.lines {
         return None;
     }
-    let (at, cell, share) = stand::<S, R>(s, path, among, q, ends)?;
+    let stand = stand::<S, R>(s, path, among, q, ends)?;
     let whole = low >= below && high < among.lines;
     let low = if low < below { below } else { low.floor() };
     let high = if high < among.lines { high.floor() } else { among.lines - R::ONE };
     let y = q.mul_add(number(path.across[1]), number(path.across[0] - low));
     let l = low.int() as isize;
     if whole && low == high {
-        let (a, b) = (between::<S, R>(s, line(l), at, cell, share), between::<S, R>(s, line(l + 1), at, cell, share));
+        let (a, b) = (between(s, line(l), &stand), between(s, line(l + 1), &stand));
         return Some(y.mul_add(b - a, a));
     }
     // Between more than two lines: each counts by its distance.
@@ -78,7 +78,7 @@ pub(super) fn read<'a, S: Simd, R: Real>(
     let mut sum = zero;
     let mut away = y;
     for l in l..=high.int() as isize + 1 {
-        let found = between::<S, R>(s, line(l), at, cell, share);
+        let found = between(s, line(l), &stand);
         sum = (one - away.abs()).max(zero).mul_add(found, sum);
         away -= one;
     }
@@ -95,19 +95,20 @@ pub(super) fn read_on<S: Simd, R: Real>(
     ends: [R; 2],
     line: &[R],
 ) -> Option<V<S, R>> {
-    let (at, cell, share) = stand::<S, R>(s, path, among, q, ends)?;
-    Some(between::<S, R>(s, line, at, cell, share))
+    Some(between(s, line, &stand(s, path, among, q, ends)?))
 }
 
-/// Where readers stand along the lines, for [`between`]; `None` where all lines are zero.
+/// Where readers stand along the lines: a `share` of the way from number `cell` to the next one, counted from `from` where
+/// all are near.
+struct Stand<S: Simd, R: Real> {
+    from: Option<usize>,
+    cell: V<S, R>,
+    share: V<S, R>,
+}
+
+/// Where readers stand along the lines; `None` where all lines are zero.
 #[inline(always)]
-fn stand<S: Simd, R: Real>(
-    s: S,
-    path: &Path<R>,
-    among: &Among<R>,
-    q: V<S, R>,
-    ends: [R; 2],
-) -> Option<(Option<usize>, V<S, R>, V<S, R>)> {
+fn stand<S: Simd, R: Real>(s: S, path: &Path<R>, among: &Among<R>, q: V<S, R>, ends: [R; 2]) -> Option<Stand<S, R>> {
     let len = V::<S, R>::LEN;
     let number = |x: R| V::<S, R>::splat(s, x);
     let [first, last] = ends.map(|q| path.along(q));
@@ -119,14 +120,14 @@ fn stand<S: Simd, R: Real>(
     if last - base <= R::of(2.0 * len as f64 - 2.5) {
         let z = q.mul_add(number(path.along[1]), number(path.along[0] - base));
         let cell = z.floor();
-        return Some((Some((base.int() + PAD as i64) as usize), cell, z - cell));
+        return Some(Stand { from: Some((base.int() + PAD as i64) as usize), cell, share: z - cell });
     }
     let far = number(among.numbers + R::of(PAD as f64));
     let z = (q.mul_add(number(path.along[1]), number(path.along[0] + R::of(PAD as f64))))
         .max(number(R::of(PAD as f64 - 1.0)))
         .min(far);
     let cell = z.floor();
-    Some((None, cell, z - cell))
+    Some(Stand { from: None, cell, share: z - cell })
 }
 
 /// `line = (1 − share)·a + share·b`.
@@ -139,15 +140,15 @@ pub(super) fn mix<S: Simd, R: Real>(s: S, a: &[R], b: &[R], share: R, line: &mut
     }
 }
 
-/// What readers find on one line: a `share` of the way from number `cell` to the next one, counted from `at` where all are near.
+/// What readers find on one line.
 /// (No closure: whether one is inlined into code for an instruction set is the compiler's choice.)
 #[inline(always)]
-fn between<S: Simd, R: Real>(s: S, line: &[R], at: Option<usize>, cell: V<S, R>, share: V<S, R>) -> V<S, R> {
-    let [a, b] = match at {
-        Some(at) => R::window::<S, 2>(s, &line[at..at + 2 * V::<S, R>::LEN], cell),
-        None => R::neighbours::<S, 2>(s, line, cell),
+fn between<S: Simd, R: Real>(s: S, line: &[R], stand: &Stand<S, R>) -> V<S, R> {
+    let [a, b] = match stand.from {
+        Some(at) => R::window::<S, 2>(s, &line[at..at + 2 * V::<S, R>::LEN], stand.cell),
+        None => R::neighbours::<S, 2>(s, line, stand.cell),
     };
-    share.mul_add(b - a, a)
+    stand.share.mul_add(b - a, a)
 }
 
 /// `q` of readers from `from` on, of which the numbers `valid` count: `ρ/(1 + bend·ρ)` with ρ the distance from `middle`.

@@ -72,7 +72,7 @@ impl Op for Variation<'_> {
 /// `argmin_{u ≥ 0} ½‖u − v‖² + τ·TV(u)`, with `u = max(0, v − τ·∇ᵀp)` and `|p_j| ≤ 1` (Beck and Teboulle, IEEE Trans. Image
 /// Process. 18(11), 2009; without their momentum, which a warm start does not need).
 ///
-/// All steps go through the volume in one sweep ([`sweep`]), so that memory is read and written once for all of them.
+/// All steps go through the volume in one sweep (`Sweep::sweep`), so that memory is read and written once for all of them.
 pub struct TvProx {
     shape: [usize; 3],
     g: [f32; 3],
