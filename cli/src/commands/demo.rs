@@ -145,7 +145,8 @@ impl DemoArgs {
         let mut plan = method::plan(&loaded, &backend)?;
         let job = Job {
             seed: self.seed,
-            limits: Limits { seconds: Some(self.seconds), ..Limits::default() },
+            // Passes over the views end by themselves, in seconds.
+            limits: Limits { seconds: (spec == FIELD).then_some(self.seconds), ..Limits::default() },
             ..Job::new(scan, &backend)
         };
         let solution = plan.run(&job, &mut Progress::new(name, None))?;
