@@ -317,6 +317,12 @@ pub trait Plan: Send {
         None
     }
 
+    /// What a pass over a scan of this size takes, in samples along rays: passes over two sizes of a scan take times that are
+    /// about in proportion.
+    fn work(&self, scan: &ScanHeader) -> f64 {
+        scan.samples()
+    }
+
     /// The plans of a chain, in order; nothing of any other method.
     fn links(&mut self) -> &mut [Box<dyn Plan>] {
         &mut []

@@ -43,6 +43,12 @@ impl ScanHeader {
     pub fn voxels(&self) -> u64 {
         self.volume.iter().fold(1, |n, &k| n.saturating_mul(k as u64))
     }
+
+    /// Samples along the rays of all pixels, a voxel of the longest side apart.
+    pub fn samples(&self) -> f64 {
+        let longest = self.volume.into_iter().max().unwrap_or(0);
+        self.pixels() as f64 * longest as f64
+    }
 }
 
 /// Measured line integrals `A = -ln(I/I0)` with the geometry they were taken in.

@@ -4,7 +4,7 @@
 //! token `S`; [`run`] picks the best instruction set of the machine at run time.
 
 use fearless_simd::Bytes;
-pub use fearless_simd::{Level, Select, Simd, SimdBase, SimdFloat, SimdFloatElement};
+pub use fearless_simd::{Level, Select, Simd, SimdBase, SimdFloat, SimdFloatElement, SimdMask};
 use std::fmt::{Debug, Display};
 use std::iter::Sum;
 use std::ops::{Add, AddAssign, Div, Mul, MulAssign, Sub, SubAssign};

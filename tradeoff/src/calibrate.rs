@@ -126,7 +126,8 @@ fn voxels(bench: &Bench<'_>, plan: &mut dyn Plan, seconds: f64) -> Result<Costs>
     let mut factor = COARSEST;
     let mut coarser = None;
     loop {
-        let (scan, share) = coarse(bench.scan, factor);
+        let scan = coarse(bench.scan, factor);
+        let share = plan.work(&scan.header()) / plan.work(&bench.scan.header());
         let mut laps = Laps::new(bench.cancelled);
         let limits = Limits { steps: Some(2), ..Limits::default() };
         let begin = Instant::now();
@@ -178,18 +179,15 @@ fn job<'a>(bench: &'a Bench<'_>, scan: &'a Scan, limits: Limits) -> Job<'a> {
     Job { seed: bench.seed, limits, volumes: bench.volumes, ..Job::new(scan, bench.backend) }
 }
 
-/// The same scan with pixels and voxels `factor` times as large, as far as that leaves some, and the share of the work that is
-/// left: rays times the voxels on the way of one.
-fn coarse(scan: &Scan, factor: usize) -> (Scan, f64) {
+/// The same scan with pixels and voxels `factor` times as large, as far as that leaves some.
+fn coarse(scan: &Scan, factor: usize) -> Scan {
     let ([rows, columns], volume) = (scan.geometry.detector, scan.geometry.volume);
     let longest = volume.shape.into_iter().max().unwrap_or(1);
     let factor = factor.min(rows.min(columns).min(longest) / FEWEST).max(1);
     let mut coarse = scan.binned(factor);
     let (shape, size) = (volume.shape.map(|n| (n / factor).max(1)), volume.size());
     coarse.geometry.volume = VoxelGrid { shape, spacing: std::array::from_fn(|k| size[k] / shape[k] as f64), ..volume };
-    let [few, narrow] = coarse.geometry.detector;
-    let share = (few * narrow) as f64 / (rows * columns) as f64 * (longest / factor) as f64 / longest as f64;
-    (coarse, share)
+    coarse
 }
 
 /// The same box in fewer layers along z: at most about so many voxels.
@@ -277,11 +275,11 @@ mod tests {
     use conefield_projectors::simulate::{PhantomKind, Protocol, phantom_of, simulate};
 
     #[test]
-    fn a_coarse_scan_is_of_the_same_box_and_has_its_share_of_the_work() {
+    fn a_coarse_scan_is_of_the_same_box() {
         let truth = phantom_of(PhantomKind::Head, 32);
         let scan = simulate(&truth, &Protocol::r2(&truth.grid).with_detector([48, 64]).with_views(3)).unwrap();
-        let (half, share) = coarse(&scan, 2);
-        assert_eq!((half.geometry.detector, half.geometry.volume.shape, share), ([24, 32], [16; 3], 1.0 / 8.0));
+        let half = coarse(&scan, 2);
+        assert_eq!((half.geometry.detector, half.geometry.volume.shape), ([24, 32], [16; 3]));
         assert_eq!(half.geometry.volume.size(), scan.geometry.volume.size());
         let mean = |s: &Scan| s.projections.mean().unwrap();
         assert!((mean(&half) - mean(&scan)).abs() < 1e-5 * mean(&scan));
@@ -289,9 +287,9 @@ mod tests {
         let (a, b) = (corner(&half, -0.5, -0.5), corner(&scan, -0.5, -0.5));
         assert!(a.iter().zip(b).all(|(a, b)| (a - b).abs() < 1e-9), "{a:?} {b:?}");
         half.validate("coarse").unwrap();
-        let (least, _) = coarse(&scan, 64);
+        let least = coarse(&scan, 64);
         assert_eq!(least.geometry.volume.shape, [8; 3]);
-        assert_eq!(coarse(&scan, 1).0.projections, scan.projections);
+        assert_eq!(coarse(&scan, 1).projections, scan.projections);
     }
 
     #[test]

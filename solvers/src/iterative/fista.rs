@@ -160,9 +160,15 @@ struct Built {
 }
 
 impl Built {
-    /// The scan's size as it is worked on, and the pixels that a detector needs for that.
-    fn seen(&self, header: ScanHeader) -> ScanHeader {
+    /// The scan's size with the pixels that are left of its detector.
+    fn binned(&self, header: ScanHeader) -> ScanHeader {
         ScanHeader { detector: header.detector.map(|n| n / self.bin), ..header }
+    }
+
+    /// The basis on voxels of any size; none that refuses such a grid.
+    fn expansion(&self, volume: [usize; 3]) -> Option<(Box<dyn Expansion>, VoxelGrid)> {
+        let grid = VoxelGrid { shape: volume, spacing: [1.0; 3], center: [0.0; 3] };
+        Some((self.basis.on(&grid).ok()?, grid))
     }
 }
 
@@ -201,7 +207,7 @@ impl Iterative for Built {
             observer.note(&format!("{:.0} % of the pixels are air", 100.0 * problem.air_share()));
         }
         let data = self.data.of(problem.scan);
-        let space = Space::new(self.seen(job.scan.header()));
+        let space = Space::new(self.binned(job.scan.header()));
         let start = self.shared.known(job, &space)?;
         let mut arrays = Arrays::new(self, expansion, &voxels, &space, start);
         arrays.begin(&problem);
@@ -223,8 +229,13 @@ impl Iterative for Built {
         ]
     }
 
+    fn seen(&self, header: &ScanHeader) -> ScanHeader {
+        let volume = self.expansion(header.volume).map_or(header.volume, |(e, grid)| projected(e.as_ref(), grid).shape);
+        ScanHeader { volume, ..self.binned(*header) }
+    }
+
     fn bytes(&self, header: &ScanHeader) -> u64 {
-        let header = &self.seen(*header);
+        let header = &self.binned(*header);
         let space = Space::tally(*header);
         if self.air {
             space.hold(Problem::air_bytes(header));
@@ -233,9 +244,8 @@ impl Iterative for Built {
             space.hold(4 * header.pixels());
         }
         space.pass(self.data.scratch(header));
-        let grid = VoxelGrid { shape: header.volume, spacing: [1.0; 3], center: [0.0; 3] };
         // A basis that refuses the grid refuses the run, which then takes nothing.
-        if let Ok(expansion) = self.basis.on(&grid) {
+        if let Some((expansion, grid)) = self.expansion(header.volume) {
             Arrays::new(self, expansion, &grid, &space, space.volume());
         }
         self.shared.price(&space, self.subsets)

@@ -27,6 +27,11 @@ pub(super) trait Iterative: Send + Sync {
         vec![]
     }
 
+    /// A scan of this size as it is worked on: its detector, and its unknowns in the place of voxels.
+    fn seen(&self, scan: &ScanHeader) -> ScanHeader {
+        *scan
+    }
+
     /// Bytes of all its arrays but the volume that comes out.
     fn bytes(&self, scan: &ScanHeader) -> u64;
 
@@ -36,6 +41,10 @@ pub(super) trait Iterative: Send + Sync {
     /// Reconstructs.
     fn solve(&self, job: &Job<'_>, observer: &mut dyn Observer) -> Result<Solution>;
 }
+
+/// Samples along rays, projected and back, that take as long as all else that a pass does with an unknown. On 50 views of 512²
+/// and 256³ voxels, ten subsets with total variation spend as long on the one as on the other.
+const SAMPLES: f64 = 200.0;
 
 /// The plan of an iterative method.
 pub(super) struct IterativePlan<T>(pub(super) T);
@@ -73,5 +82,10 @@ impl<T: Iterative> Plan for IterativePlan<T> {
 
     fn passes(&self) -> Option<u64> {
         self.0.shared().stop.passes
+    }
+
+    fn work(&self, scan: &ScanHeader) -> f64 {
+        let seen = self.0.seen(scan);
+        seen.samples() + SAMPLES * seen.voxels() as f64
     }
 }

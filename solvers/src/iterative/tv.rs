@@ -3,7 +3,7 @@
 
 use super::flat_mut;
 use conefield_core::geometry::VoxelGrid;
-use conefield_core::simd::{Op, Simd, SimdBase, SimdFloat, load, run, store};
+use conefield_core::simd::{Op, Simd, SimdBase, SimdFloat, SimdMask, load, run, store};
 use conefield_core::space::Space;
 use ndarray::{Array3, ArrayView3};
 use rayon::prelude::*;
@@ -86,7 +86,7 @@ impl TvProx {
         let split = Split::new(shape[0], REACH, rayon::current_num_threads());
         space.briefly(|space| {
             let planes = (split.slabs - 1) * 3 * split.halo() + split.slabs * split.reach;
-            space.hold((planes * shape[1] * (shape[2] + 1) * size_of::<f32>()) as u64);
+            space.hold((planes * (shape[1] + 1) * (shape[2] + 1) * size_of::<f32>()) as u64);
         });
         Self { shape, g, dual: std::array::from_fn(|_| space.array(shape)) }
     }
@@ -243,10 +243,11 @@ impl Sweep<'_> {
         let nz = self.line;
         let plane = self.planes.0[0].first().map_or(0, |p| p.len());
         let (ny, count) = (plane / nz, self.planes.0[0].len());
-        // The primal of every step, with each line's last number twice: no difference across the far face.
+        // The primal of every step, with each line's last number twice: no difference across the far face. A line takes the
+        // place of one that is a plane and a line older, which no dual needs any more.
         let stride = nz + 1;
-        let mut kept = vec![0.0f32; self.steps * ny * stride];
-        let mut fresh = vec![0.0f32; stride];
+        let ring = ny + 1;
+        let mut kept = vec![0.0f32; self.steps * ring * stride];
         for front in 0..count + self.steps {
             for j in 0..ny {
                 for step in 0..=self.steps.min(front) {
@@ -266,23 +267,22 @@ impl Sweep<'_> {
                         }
                         continue;
                     }
-                    if known {
-                        let v = &self.v[i * plane + j * nz..][..nz];
-                        primal(s, self.planes.beside(i, j, nz), v, scale.down, &mut fresh[..nz]);
-                        fresh[nz] = fresh[nz - 1];
-                    }
                     if step == self.steps {
                         continue;
                     }
-                    let kept = &mut kept[step * ny * stride..(step + 1) * ny * stride];
-                    if i > 0 && i <= count {
-                        let (u, next) = kept[j * stride..].split_at(stride);
-                        let next = (j + 1 < ny).then(|| &next[..nz]);
-                        let after = known.then_some(&fresh[..nz]);
-                        ascend(s, u, [after, next], scale.up, self.planes.line(i - 1, j, nz));
-                    }
+                    let kept = &mut kept[step * ring * stride..(step + 1) * ring * stride];
+                    let at = |i: usize, j: usize| (i * ny + j) % ring * stride;
                     if known {
-                        kept[j * stride..(j + 1) * stride].copy_from_slice(&fresh);
+                        let v = &self.v[i * plane + j * nz..][..nz];
+                        let fresh = &mut kept[at(i, j)..][..stride];
+                        primal(s, self.planes.beside(i, j, nz), v, scale.down, &mut fresh[..nz]);
+                        fresh[nz] = fresh[nz - 1];
+                    }
+                    if i > 0 && i <= count {
+                        let next = (j + 1 < ny).then(|| &kept[at(i - 1, j + 1)..][..nz]);
+                        let after = known.then(|| &kept[at(i, j)..][..nz]);
+                        let u = &kept[at(i - 1, j)..][..stride];
+                        ascend(s, u, [after, next], scale.up, self.planes.line(i - 1, j, nz));
                     }
                 }
             }
@@ -364,11 +364,17 @@ fn ascend<S: Simd>(s: S, u: &[f32], after: [Option<&[f32]>; 2], scale: [f32; 3],
         let x = ahead(s, after[0], k, here).mul_add(scale[0], load(s, px, k));
         let y = ahead(s, after[1], k, here).mul_add(scale[1], load(s, py, k));
         let z = (load(s, u, k + 1) - here).mul_add(scale[2], load(s, pz, k));
-        let length = x.mul_add(x, y.mul_add(y, z * z)).sqrt();
-        let shrink = one / length.max(one);
-        store::<S, f32>(x * shrink, px, k);
-        store::<S, f32>(y * shrink, py, k);
-        store::<S, f32>(z * shrink, pz, k);
+        let square = x.mul_add(x, y.mul_add(y, z * z));
+        // Flat parts stay in the ball: there neither the root nor the quotient is needed.
+        let [x, y, z] = if square.simd_le(one).all_true() {
+            [x, y, z]
+        } else {
+            let shrink = one / square.sqrt().max(one);
+            [x * shrink, y * shrink, z * shrink]
+        };
+        store::<S, f32>(x, px, k);
+        store::<S, f32>(y, py, k);
+        store::<S, f32>(z, pz, k);
         k += len;
     }
 }
