@@ -66,22 +66,7 @@ struct Taps {
     rows: Vec<Vec<(usize, f64)>>,
 }
 
-/// Weights of P⁻¹ below this share of the largest are left out: far below single precision.
-const NEGLIGIBLE: f64 = 1e-10;
-
 impl Taps {
-    /// Samples to the spline's coefficients: P⁻¹, a row of which falls by 0.27 from entry to entry.
-    fn prefilter(samples: usize) -> Self {
-        let column = |i| {
-            let mut x = vec![0.0; samples];
-            x[i] = 1.0;
-            solve(&mut x);
-            x.iter().copied().enumerate().filter(|(_, w)| w.abs() > NEGLIGIBLE).collect()
-        };
-        // P is symmetric, so that a row is a column.
-        Self { inputs: samples, rows: (0..samples).map(column).collect() }
-    }
-
     /// The spline's coefficients to its values at the centres of `voxels` voxels.
     fn evaluate(samples: usize, voxels: usize) -> Self {
         let row = |i| {
@@ -115,19 +100,25 @@ impl Taps {
         Self { inputs: self.rows.len(), rows }
     }
 
-    /// Applies the matrix along one axis of `x`, of which each entry is a run of `inner` numbers.
-    fn apply<R: Real>(&self, x: &[R], inner: usize) -> Vec<R> {
+    /// Applies the matrix along one axis of `x`, of which each entry is a run of `inner` numbers. Overwrites `y`.
+    fn apply<R: Real>(&self, x: &[R], inner: usize, y: &mut [R]) {
         let (inputs, outputs) = (self.inputs, self.rows.len());
-        let mut y = vec![R::ZERO; x.len() / inputs * outputs];
+        if inner == 1 {
+            return y.par_chunks_mut(outputs).zip(x.par_chunks(inputs)).with_min_len(64).for_each(|(y, x)| {
+                for (y, row) in y.iter_mut().zip(&self.rows) {
+                    *y = row.iter().fold(R::ZERO, |sum, &(input, weight)| sum + R::of(weight) * x[input]);
+                }
+            });
+        }
         y.par_chunks_mut(inner).with_min_len(4096usize.div_ceil(inner)).enumerate().for_each(|(at, y)| {
             let (outer, output) = (at / outputs, at % outputs);
+            y.fill(R::ZERO);
             for &(input, weight) in &self.rows[output] {
                 let weight = R::of(weight);
                 let from = (outer * inputs + input) * inner;
                 y.iter_mut().zip(&x[from..from + inner]).for_each(|(y, x)| *y += weight * *x);
             }
         });
-        y
     }
 }
 
@@ -137,36 +128,88 @@ fn mirrored(i: isize, n: usize) -> usize {
     turn.min(2 * n - 1 - turn)
 }
 
-/// Solves `P·y = x` in place (Thomas' algorithm). Mirrored sides add 1/6 to the first and the last diagonal entry.
-fn solve(x: &mut [f64]) {
-    let n = x.len();
-    let diagonal = |i| (4.0 + f64::from(u8::from(i == 0)) + f64::from(u8::from(i + 1 == n))) / 6.0;
-    let mut upper = vec![0.0; n];
-    let mut last = [0.0; 2];
-    for i in 0..n {
-        let pivot = diagonal(i) - last[0] / 6.0;
-        upper[i] = 1.0 / 6.0 / pivot;
-        x[i] = (x[i] - last[1] / 6.0) / pivot;
-        last = [upper[i], x[i]];
+/// P⁻¹ along one axis, which is its own adjoint: Thomas' algorithm. Mirrored sides add 1/6 to the first and the last diagonal
+/// entry of P.
+struct Prefilter {
+    /// One over the pivot of every entry.
+    pivots: Vec<f64>,
+}
+
+impl Prefilter {
+    fn new(samples: usize) -> Self {
+        let mut upper = 0.0;
+        let pivots = (0..samples).map(|i| {
+            let diagonal = (4.0 + f64::from(u8::from(i == 0)) + f64::from(u8::from(i + 1 == samples))) / 6.0;
+            let pivot = 1.0 / (diagonal - upper / 6.0);
+            upper = pivot / 6.0;
+            pivot
+        });
+        Self { pivots: pivots.collect() }
     }
-    for i in (0..n - 1).rev() {
-        x[i] -= upper[i] * x[i + 1];
+
+    /// Applies it in place along one axis of `x`, of which each entry is a run of `inner` numbers.
+    fn apply<R: Real>(&self, x: &mut [R], inner: usize) {
+        let n = self.pivots.len();
+        if inner == 1 {
+            return x.par_chunks_mut(n).with_min_len(64).for_each(|line| self.solve(line));
+        }
+        if x.len() > n * inner {
+            return x.par_chunks_mut(n * inner).for_each(|x| self.solve_rows(x.chunks_mut(inner).collect()));
+        }
+        // Along the first axis, some columns at a time.
+        let mut parts: Vec<Vec<&mut [R]>> = (0..inner.div_ceil(COLUMNS)).map(|_| Vec::with_capacity(n)).collect();
+        for row in x.chunks_mut(inner) {
+            row.chunks_mut(COLUMNS).zip(&mut parts).for_each(|(part, parts)| parts.push(part));
+        }
+        parts.into_par_iter().for_each(|part| self.solve_rows(part));
+    }
+
+    /// `P·y = x` in place.
+    fn solve<R: Real>(&self, x: &mut [R]) {
+        let (sixth, mut last) = (R::of(1.0 / 6.0), R::ZERO);
+        for (x, &pivot) in x.iter_mut().zip(&self.pivots) {
+            last = (*x - last * sixth) * R::of(pivot);
+            *x = last;
+        }
+        for (x, &pivot) in x.iter_mut().zip(&self.pivots).rev().skip(1) {
+            last = *x - R::of(pivot / 6.0) * last;
+            *x = last;
+        }
+    }
+
+    /// The same for many right-hand sides: row i has the i-th number of each.
+    fn solve_rows<R: Real>(&self, mut rows: Vec<&mut [R]>) {
+        let sixth = R::of(1.0 / 6.0);
+        for (i, &pivot) in self.pivots.iter().enumerate() {
+            let (before, here) = rows.split_at_mut(i);
+            let (here, pivot) = (&mut here[0], R::of(pivot));
+            match before.last() {
+                None => here.iter_mut().for_each(|x| *x = *x * pivot),
+                Some(last) => here.iter_mut().zip(&**last).for_each(|(x, last)| *x = (*x - *last * sixth) * pivot),
+            }
+        }
+        for i in (1..rows.len()).rev() {
+            let (before, after) = rows.split_at_mut(i);
+            let upper = R::of(self.pivots[i - 1] / 6.0);
+            before[i - 1].iter_mut().zip(&*after[0]).for_each(|(x, next)| *x -= upper * *next);
+        }
     }
 }
 
-/// What is done along one axis, and its adjoint.
+/// Columns that are solved together.
+const COLUMNS: usize = 1024;
+
+/// What is done along one axis: samples to the spline's coefficients, and these to its values and back.
 struct Axis {
-    prefilter: [Taps; 2],
+    prefilter: Prefilter,
     evaluate: [Taps; 2],
 }
 
 impl Axis {
     fn new(samples: usize, voxels: usize) -> Self {
-        let both = |taps: Taps| {
-            let transposed = taps.transposed();
-            [taps, transposed]
-        };
-        Self { prefilter: both(Taps::prefilter(samples)), evaluate: both(Taps::evaluate(samples, voxels)) }
+        let evaluate = Taps::evaluate(samples, voxels);
+        let transposed = evaluate.transposed();
+        Self { prefilter: Prefilter::new(samples), evaluate: [evaluate, transposed] }
     }
 }
 
@@ -201,27 +244,50 @@ impl Expansion for Spline {
 
 impl<R: Real> BasisOperator<R> for Spline {
     fn expand(&self, coefficients: ArrayView3<'_, R>, mut voxels: ArrayViewMut3<'_, R>) {
-        let (s, v) = (self.samples.shape, self.voxels);
-        let mut x: Vec<R> = coefficients.iter().copied().collect();
-        for (axis, inner) in self.axes.iter().zip([s[1] * s[2], s[2], 1]) {
-            x = axis.prefilter[0].apply(&x, inner);
+        let ([sx, sy, _], [vx, vy, vz]) = (self.samples.shape, self.voxels);
+        let [x, y, z] = &self.axes;
+        let mut own: Vec<R> = coefficients.iter().copied().collect();
+        self.prefilter(&mut own);
+        let mut z_done = vec![R::ZERO; sx * sy * vz];
+        z.evaluate[0].apply(&own, 1, &mut z_done);
+        drop(own);
+        let mut y_done = vec![R::ZERO; sx * vy * vz];
+        y.evaluate[0].apply(&z_done, vz, &mut y_done);
+        drop(z_done);
+        let last = |voxels: &mut [R]| x.evaluate[0].apply(&y_done, vy * vz, voxels);
+        match voxels.as_slice_mut() {
+            Some(voxels) => last(voxels),
+            None => {
+                let mut all = vec![R::ZERO; vx * vy * vz];
+                last(&mut all);
+                voxels.iter_mut().zip(all).for_each(|(voxel, x)| *voxel = x);
+            }
         }
-        for (axis, inner) in self.axes.iter().zip([v[1] * v[2], v[2], 1]).rev() {
-            x = axis.evaluate[0].apply(&x, inner);
-        }
-        voxels.iter_mut().zip(x).for_each(|(voxel, x)| *voxel = x);
     }
 
     fn adjoint(&self, voxels: ArrayView3<'_, R>, mut coefficients: ArrayViewMut3<'_, R>) {
-        let (s, v) = (self.samples.shape, self.voxels);
-        let mut x: Vec<R> = voxels.iter().copied().collect();
-        for (axis, inner) in self.axes.iter().zip([v[1] * v[2], v[2], 1]) {
-            x = axis.evaluate[1].apply(&x, inner);
+        let [[sx, sy, sz], [_, vy, vz]] = [self.samples.shape, self.voxels];
+        let [x, y, z] = &self.axes;
+        let all = voxels.as_standard_layout();
+        let mut x_done = vec![R::ZERO; sx * vy * vz];
+        x.evaluate[1].apply(all.as_slice().unwrap_or_default(), vy * vz, &mut x_done);
+        let mut y_done = vec![R::ZERO; sx * sy * vz];
+        y.evaluate[1].apply(&x_done, vz, &mut y_done);
+        drop(x_done);
+        let mut own = vec![R::ZERO; sx * sy * sz];
+        z.evaluate[1].apply(&y_done, 1, &mut own);
+        self.prefilter(&mut own);
+        coefficients.iter_mut().zip(own).for_each(|(coefficient, x)| *coefficient = x);
+    }
+}
+
+impl Spline {
+    /// Samples to the spline's coefficients, and the adjoint.
+    fn prefilter<R: Real>(&self, x: &mut [R]) {
+        let [_, sy, sz] = self.samples.shape;
+        for (axis, inner) in self.axes.iter().zip([sy * sz, sz, 1]) {
+            axis.prefilter.apply(x, inner);
         }
-        for (axis, inner) in self.axes.iter().zip([s[1] * s[2], s[2], 1]).rev() {
-            x = axis.prefilter[1].apply(&x, inner);
-        }
-        coefficients.iter_mut().zip(x).for_each(|(coefficient, x)| *coefficient = x);
     }
 }
 
