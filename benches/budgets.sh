@@ -40,7 +40,8 @@ record = pathlib.Path(run) / "record.json"
 told = {"seconds": float(end) - float(begin)}
 if record.exists():
     record = json.loads(record.read_text())
-    told |= {"spec": record["spec"].get("name"), **{key: record["scores"][key] for key in ("psnr", "ssim_2d")}}
+    point = (record.get("plan") or {}).get("point") or record["spec"]
+    told |= {"point": point, **{key: record["scores"][key] for key in ("psnr", "ssim_2d")}}
 pathlib.Path(run + ".json").write_text(json.dumps(told))
 PY
                 rm -rf "$run"
@@ -66,7 +67,7 @@ for volume in volumes:
                 continue
             of = lambda key: [run[key] for run in runs]
             spread = max(of("psnr")) - min(of("psnr"))
-            names = sorted(set(of("spec"))) if method == "best" else []
+            names = sorted(set(of("point"))) if method == "best" else []
             cells.append(f"{statistics.mean(of('psnr')):.2f} dB ± {spread / 2:.2f}, {statistics.mean(of('ssim_2d')):.3f}, "
                          f"{max(of('seconds')):.0f} s" + "".join(f", {name}" for name in names))
         print(f"| {volume} | {method} | " + " | ".join(cells) + " |")

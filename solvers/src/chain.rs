@@ -68,12 +68,12 @@ impl Method for Chain {
     }
 }
 
-/// What limits the next of `left` links after `spent` seconds. Only the last one goes on until the deadline, past its own
-/// number of passes; one before it leaves as much to each of the others as it takes at most.
-fn later(limits: &Limits, spent: f64, left: usize) -> Limits {
+/// What limits the next of `left` links after `spent` seconds: its own end, and time. The last one has `passes` and ends before
+/// the deadline; one before it leaves as much to each of the others as it takes at most.
+fn later(limits: &Limits, spent: f64, left: usize, passes: Option<u64>) -> Limits {
     let most = limits.at_most.map(|all| (all - spent).max(0.0));
     if left == 1 {
-        return Limits { at_most: most, deadline: limits.then, ..Limits::default() };
+        return Limits { steps: passes, at_most: most, deadline: limits.then, ..Limits::default() };
     }
     let part = limits.then.map(|end| end.saturating_duration_since(Instant::now()).as_secs_f64() / left as f64);
     let at_most = most.into_iter().chain(part).reduce(f64::min);
@@ -146,7 +146,7 @@ impl Plan for ChainPlan {
         self.add(&mut sum, 0, &done, job)?;
         for i in 1..self.links.len() {
             let start = done.result.volume(job.backend)?;
-            let limits = later(&job.limits, done.train_s, self.links.len() - i);
+            let limits = later(&job.limits, done.train_s, self.links.len() - i, self.links[i].passes());
             let next = Job { start: Some(&start), limits, resume: None, ..*job };
             let mut heard = LaterObserver { observer: &mut *observer, steps: done.steps, seconds: done.train_s };
             let solution = self.links[i].run(&next, &mut heard).map_err(|e| e.within(&at(i)))?;
@@ -285,12 +285,12 @@ mod tests {
     fn links_before_the_last_leave_time_for_it() {
         let end = Instant::now() + Duration::from_secs(60);
         let all = Limits { at_most: Some(100.0), then: Some(end), ..Limits::default() };
-        let middle = later(&all, 10.0, 3);
+        let middle = later(&all, 10.0, 3, Some(4));
         assert_eq!(middle.deadline, None);
         assert!(middle.at_most.is_some_and(|s| (19.0..=20.0).contains(&s)), "{middle:?}");
-        assert_eq!(later(&all, 95.0, 2).at_most, Some(5.0));
-        let last = later(&all, 10.0, 1);
-        assert_eq!((last.deadline, last.at_most), (Some(end), Some(90.0)));
-        assert_eq!(later(&Limits::default(), 10.0, 2), Limits::default());
+        assert_eq!(later(&all, 95.0, 2, Some(4)).at_most, Some(5.0));
+        let last = later(&all, 10.0, 1, Some(4));
+        assert_eq!((last.deadline, last.at_most, last.steps), (Some(end), Some(90.0), Some(4)));
+        assert_eq!(later(&Limits::default(), 10.0, 2, None), Limits::default());
     }
 }

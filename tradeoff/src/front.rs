@@ -12,6 +12,8 @@ use std::path::Path;
 const SHIPPED: &str = include_str!("../../specs/tradeoff/front.toml");
 /// Longest front file, in bytes.
 const LONGEST: u64 = 4 << 20;
+/// How many times as far in size as the nearest scan one may be to count as near.
+const NEAR: f64 = 2.0;
 
 /// What a method works on. The two are searched apart: fields need longer before they show what they can.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Serialize, Deserialize)]
@@ -177,6 +179,20 @@ impl Front {
         Ok(front)
     }
 
+    /// The front of those of its scans whose volumes are nearest in size to a scan's: what is best depends on that.
+    pub fn near(&self, size: Size) -> Self {
+        let apart = |scan: &Tuned| (Size::new(scan.views, scan.detector, scan.volume).voxels / size.voxels).ln().abs();
+        let least = self.scans.iter().map(apart).fold(f64::INFINITY, f64::min);
+        let kept: Vec<bool> = self.scans.iter().map(|scan| apart(scan) < least + NEAR.ln()).collect();
+        let chosen = |i: &usize| kept[*i];
+        let mut near = self.clone();
+        near.scans = (0..kept.len()).filter(chosen).map(|i| self.scans[i].clone()).collect();
+        for (point, all) in near.points.iter_mut().zip(&self.points) {
+            point.runs = (0..kept.len()).filter(chosen).map(|i| all.runs[i].clone()).collect();
+        }
+        near
+    }
+
     /// What `point` is expected to take of a scan of this size. A step of a field costs the same whatever the scan.
     pub fn expected(&self, point: &Point, size: Size) -> Expected {
         let mut sum = Expected { steps: 0.0, step_s: 0.0, beside_s: 0.0 };
@@ -216,6 +232,26 @@ impl Point {
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn the_best_of_near_scans_counts() {
+        let scan = |name: &str, n: usize| {
+            format!("[[scans]]\nname = \"{name}\"\nviews = 10\ndetector = [10, 10]\nvolume = [{n}, {n}, {n}]\n")
+        };
+        let run = |psnr: f64| format!("[[points.runs]]\nsteps = 4\ntrain_s = 2.0\ntotal_s = 3.0\npsnr = {psnr}\n");
+        let text = format!(
+            "made = \"test\"\n{}{}{}[[points]]\nname = \"p\"\nkind = \"voxels\"\nspec = \"fdk\"\nbudget_s = 9.0\n{}{}{}",
+            scan("small", 16),
+            scan("large", 64),
+            scan("other", 72),
+            run(20.0),
+            run(30.0),
+            run(32.0)
+        );
+        let front = Front::parse(&text, "a").unwrap();
+        let accuracy = |n: usize| front.near(Size::new(10, [10, 10], [n; 3])).points[0].accuracy();
+        assert_eq!([accuracy(8), accuracy(16), accuracy(68), accuracy(512)], [20.0, 20.0, 31.0, 31.0]);
+    }
 
     #[test]
     fn a_scan_of_another_size_costs_voxels_in_proportion_and_fields_nothing_more() {

@@ -95,6 +95,7 @@ impl Budget {
         let start = Instant::now();
         let g = &bench.scan.geometry;
         let size = Size::new(g.views.len(), g.detector, g.volume.shape);
+        let front = &front.near(size);
         let mut points: Vec<_> = front.points.iter().collect();
         points.sort_by(|a, b| b.accuracy().total_cmp(&a.accuracy()));
         let expected: Vec<(Unknowns, Expected)> = points.iter().map(|p| (p.kind, front.expected(p, size))).collect();

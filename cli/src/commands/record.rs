@@ -63,6 +63,9 @@ pub struct RunRecord {
     pub scores: Option<Scores>,
 }
 
+/// Share of a budget below which it is not used up.
+const USED: f64 = 0.8;
+
 /// The record for people.
 pub fn summary(r: &RunRecord, output: &Path) -> String {
     let [x, y, z] = r.scan.volume;
@@ -75,7 +78,8 @@ pub fn summary(r: &RunRecord, output: &Path) -> String {
         out::duration(r.export_s),
     )];
     if let Some(budget) = r.budget_s {
-        lines.push(format!("{} in all, of a budget of {}", out::duration(r.total_s), out::duration(budget)));
+        let why = if r.total_s < USED * budget { ": the method came to its own end" } else { "" };
+        lines.push(format!("{} in all, of a budget of {}{why}", out::duration(r.total_s), out::duration(budget)));
     }
     if r.rollbacks > 0 {
         let times = if r.rollbacks == 1 { "once".into() } else { format!("{} times", r.rollbacks) };
