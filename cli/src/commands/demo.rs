@@ -76,7 +76,8 @@ impl DemoArgs {
         let truth = phantom(size);
         let noise = DetectorNoise::Tigre { i0: 1e4, sigma: 10.0 };
         let protocol = Protocol::r2(&truth.grid)
-            .with_detector([size; 2])
+            // As published: twice as many pixels as voxels along a side.
+            .with_detector([2 * size; 2])
             .with_views(self.views.into())
             .with_noise(noise, self.seed);
         let scan = simulate(&truth, &protocol)?;
@@ -126,7 +127,7 @@ impl DemoArgs {
     /// Refuses what does not fit into memory: the scan, the volumes and the largest of the methods.
     fn reckon(&self) -> Result<()> {
         let (side, views) = (u64::from(self.size), usize::from(self.views));
-        let (pixels, voxels) = (side * side * u64::from(self.views), side.pow(3));
+        let (pixels, voxels) = (4 * side * side * u64::from(self.views), side.pow(3));
         // What is simulated from and the first two results are held beside the run's own.
         let size = ScanSize { pixels, voxels, test_pixels: 0, reading: 12 * voxels, views };
         let run = memory::Run { reference: true, ..memory::Run::on(size) };

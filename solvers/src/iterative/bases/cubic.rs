@@ -184,7 +184,7 @@ impl Prefilter {
             let (before, here) = rows.split_at_mut(i);
             let (here, pivot) = (&mut here[0], R::of(pivot));
             match before.last() {
-                None => here.iter_mut().for_each(|x| *x = *x * pivot),
+                None => here.iter_mut().for_each(|x| *x *= pivot),
                 Some(last) => here.iter_mut().zip(&**last).for_each(|(x, last)| *x = (*x - *last * sixth) * pivot),
             }
         }
