@@ -404,3 +404,27 @@ fn the_log_has_times_and_hears_its_variable() {
     let output = shell("RUST_LOG=error \"$0\" \"$@\"", &fast(&scan, &text(&run), &["--force"]));
     assert!(output.status.success() && output.stderr.is_empty(), "{}", String::from_utf8_lossy(&output.stderr));
 }
+
+#[test]
+fn what_a_killed_comparison_had_started_is_waited_for() {
+    let (dir, scan) = with_scan();
+    let all = dir.path().join("all");
+    // Steps of a second, so that the run outlives its comparison.
+    let sets = ["--set", "training.rays=20000", "--set", "projector.samples=800", "--steps", "3"];
+    let begin = ["compare", &scan, "--specs", "fast", "-o", &text(&all), "--checkpoint-every", "0.05s"];
+    let args = [&begin[..], &sets].concat();
+    let mut child = Command::new(assert_cmd::cargo::cargo_bin("conefield"))
+        .args(&args)
+        .stdout(Stdio::null())
+        .stderr(Stdio::null())
+        .spawn()
+        .unwrap();
+    wait_for(&all.join("fast/spec.toml"));
+    kill(&child, "KILL");
+    child.wait().unwrap();
+    let folder = fs::File::open(all.join("fast")).unwrap();
+    assert!(folder.try_lock().is_err(), "the run is over already: nothing to wait for");
+    drop(folder);
+    done(&[&args[..], &["--resume"]].concat());
+    assert!(all.join("table.json").exists() && all.join("fast/record.json").exists());
+}

@@ -11,6 +11,14 @@ use std::ffi::{OsStr, OsString};
 use std::fs::{self, File};
 use std::io::ErrorKind;
 use std::path::{Path, PathBuf};
+use std::time::{Duration, Instant};
+
+/// Between two looks at a folder that another process writes.
+const LOOK: Duration = Duration::from_millis(20);
+/// How long a part of a killed process's work may take to end: a pass over a large volume.
+const ENDING: Duration = Duration::from_secs(120);
+/// How deep the folders of parts lie: those of a search are in one for each budget.
+const PARTS_WITHIN: usize = 3;
 
 /// How far the work in a folder came.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -80,13 +88,14 @@ fn waiting(aside: &Path) -> Result<Vec<PathBuf>> {
 
 impl Lease {
     /// Takes the folder at `path`, which need not be there. Refused while another process has it. What a killed process
-    /// left is settled first.
+    /// left is settled first, once the processes that it had started for parts of its work have ended.
     pub fn take(path: &Path, contents: Contents) -> Result<Self> {
         // Through a link: it stays one, and what it leads to is replaced where that lies.
         let plain: PathBuf = path.components().collect();
         let path = if plain.is_symlink() { plain.canonicalize().map_err(|e| Error::io(path, e))? } else { plain };
         let path = path.as_path();
         let locks = own(path)?;
+        await_parts(path, contents)?;
         let mut lease = Self { path: path.to_path_buf(), contents, locks, writing: false, made: false };
         lease.settle()?;
         // What is put back has a lock of its own.
@@ -227,16 +236,54 @@ fn own(path: &Path) -> Result<Vec<File>> {
         }
         match lock::hold(path) {
             Held::Ours(lock) => return Ok(vec![lock]),
-            Held::Theirs => {
-                let expected = "a folder that no other command writes, or to wait until that one is done";
-                let found = "a folder that another conefield is writing";
-                return Err(Error::invalid(path.display().to_string(), "output", found, expected));
-            }
+            Held::Theirs => return Err(taken(path)),
             // Where it cannot be locked at all, that stays so; where it has just changed its name, a second look helps.
             Held::Unknown if File::open(path).is_ok_and(|f| f.try_lock().is_ok()) => {}
             Held::Unknown => return Ok(vec![]),
         }
     }
+}
+
+fn taken(path: &Path) -> Error {
+    let expected = "a folder that no other command writes, or to wait until that one is done";
+    Error::invalid(path.display().to_string(), "output", "a folder that another conefield is writing", expected)
+}
+
+/// Waits until no process writes a folder within `path`. A command that works in parts starts a process for each and holds
+/// the lock of the whole: where that was free, who writes a part has lost whom it worked for, and ends after its step.
+fn await_parts(path: &Path, contents: Contents) -> Result<()> {
+    let mut parts = vec![];
+    folders(path, PARTS_WITHIN, contents.known, &mut parts)?;
+    let begin = Instant::now();
+    for part in parts {
+        let mut told = false;
+        while matches!(lock::hold(&part), Held::Theirs) {
+            if !told {
+                tracing::info!("{}: waiting until another conefield, which is writing it, ends", part.display());
+                told = true;
+            }
+            if begin.elapsed() > ENDING {
+                return Err(taken(&part));
+            }
+            std::thread::sleep(LOOK);
+        }
+    }
+    Ok(())
+}
+
+/// Folders within `path` that are `wanted`, and those within them down to `depth`.
+fn folders(path: &Path, depth: usize, wanted: fn(&Path) -> bool, found: &mut Vec<PathBuf>) -> Result<()> {
+    if depth == 0 || !path.is_dir() {
+        return Ok(());
+    }
+    for entry in fs::read_dir(path).map_err(|e| Error::io(path, e))? {
+        let entry = entry.map_err(|e| Error::io(path, e))?;
+        if entry.file_type().is_ok_and(|t| t.is_dir()) && wanted(&entry.path()) {
+            folders(&entry.path(), depth - 1, |_| true, found)?;
+            found.push(entry.path());
+        }
+    }
+    Ok(())
 }
 
 /// The lock on what stands at the lease's path, unless it has that one.

@@ -1,6 +1,6 @@
 //! `conefield reconstruct`
 
-use super::record::{RunRecord, summary};
+use super::record::{RunRecord, Written, summary};
 use super::{backends::simd_level, evaluate, protocol::RunProtocol};
 use crate::boundary::{self, Inputs};
 use crate::live::Live;
@@ -16,14 +16,14 @@ use clap::error::ErrorKind;
 use clap::{Args, CommandFactory};
 use conefield_core::backend::Backend;
 use conefield_core::checkpoint::Resume;
-use conefield_core::method::{Job, Limits};
-use conefield_core::scan::Scan;
+use conefield_core::method::{Job, Limits, Solution};
+use conefield_core::scan::{Scan, Volume};
 use conefield_core::spec::load::{Loaded, to_toml};
 use conefield_core::{Error, Result};
 use conefield_report::MiddleSlices;
 use conefield_tradeoff::calibrate::Bench;
 use conefield_tradeoff::front::Front;
-use conefield_tradeoff::schedule::Budget;
+use conefield_tradeoff::schedule::{Budget, Schedule};
 use conefield_tradeoff::trial::ScanRecord;
 use std::collections::BTreeMap;
 use std::fs::File;
@@ -109,14 +109,13 @@ impl ReconstructArgs {
 
     fn reconstruct(&self) -> Result<()> {
         let begin = Instant::now();
-        let protocol = &self.protocol;
         let mut folder = RunFolder::take(&self.output)?;
         if !self.resume {
             folder.may_begin(self.force)?;
         }
         // Before a spec is read: it is text, and a name that is none would come back as another one.
         self.init.as_deref().map(boundary::text).transpose()?;
-        let backend = protocol.backend.open()?;
+        let backend = self.protocol.backend.open()?;
         // What is wrong with a spec, or weights that cannot be read or do not fit, is told before anything is made.
         let asked = self.asked().map(|(spec, sets)| self.method(&spec, &sets, backend.as_ref())).transpose()?;
         let front = match (&asked, &self.front) {
@@ -124,58 +123,21 @@ impl ReconstructArgs {
             (None, Some(path)) => Some(Front::read(path)?),
             (None, None) => Some(Front::shipped()?),
         };
-        let inputs = Inputs::of([&self.scan]).and(&self.front).and(&self.init).and(&protocol.reference);
+        let inputs = Inputs::of([&self.scan]).and(&self.front).and(&self.init).and(&self.protocol.reference);
         let inputs = asked.iter().filter(|_| !self.resume).fold(inputs, |inputs, m| inputs.and_spec(&m.loaded));
         inputs.spare_folder(&self.output)?;
-        let whole = files::scan(&self.scan)?;
-        conefield_io::check_shape(folder.file("volume.nii.gz"), whole.geometry.volume.shape)?;
-        let reference = protocol.reference(&self.scan, &whole)?;
-        let peak = protocol.peak(reference.as_ref());
-        let held = protocol.held_out(whole.geometry.views.len())?;
-        let scan_record = ScanRecord::of(&self.scan, &whole)?;
-        asked.iter().try_for_each(|m| specs::check_held_out(&m.loaded, m.plan.as_ref(), &held))?;
-        let (scan, held_scan) = if held.is_empty() { (whole, None) } else { split(whole, &held)? };
-        let load_s = begin.elapsed().as_secs_f64();
+        let input = self.input(&folder, begin)?;
+        asked.iter().try_for_each(|m| specs::check_held_out(&m.loaded, m.plan.as_ref(), &input.held))?;
 
-        let identity = |m: &Planned| identity(&m.loaded, protocol, &held, &scan_record);
-        let resumed = match &asked {
-            Some(method) if self.resume => Some(self.reopen(&folder, &identity(method)?)?),
-            _ => None,
-        };
+        let chosen = self.choose(&folder, &input, asked.ok_or(front), backend.as_ref(), begin)?;
+        let Chosen { method: Planned { loaded, mut plan, memory }, schedule, resumed } = chosen;
         let spent = resumed.as_ref().map_or(0.0, |(_, r)| r.standing.seconds);
-        let bench = Bench {
-            scan: &scan,
-            reference: reference.as_ref(),
-            peak,
-            backend: backend.as_ref(),
-            seed: protocol.seed,
-            volumes: &files::volume,
-            cancelled: &|| signals::caught().is_some(),
-        };
-        let budget = protocol.budget.map(|seconds| Budget { begin, seconds, spent });
-        let (method, schedule) = match (budget, asked, front) {
-            (None, Some(method), _) => (method, None),
-            (Some(budget), Some(mut method), _) => {
-                let schedule = budget.plan(&bench, &mut method)?;
-                (method, Some(schedule))
-            }
-            (Some(budget), None, Some(front)) => {
-                let more = &protocol.sets;
-                let build = |spec: &str, sets: &[String]| self.method(spec, &[sets, more].concat(), backend.as_ref());
-                let (method, schedule) = budget.choose(&bench, &front, build)?;
-                (method, Some(schedule))
-            }
-            _ => {
-                return Err(Error::invalid("reconstruct", "--spec", "nothing", "a spec, or --budget to choose one by"));
-            }
-        };
-        specs::check_held_out(&method.loaded, method.plan.as_ref(), &held)?;
-        schedule.iter().flat_map(|s| s.lines(&method.loaded.spec.name)).for_each(|line| info!("{line}"));
-        info!("memory: {}", method.memory.line());
-        let identity = identity(&method)?;
-        let Planned { loaded, mut plan, memory } = method;
+        let identity = identity(&loaded, &self.protocol, &input.held, &input.record)?;
         let outline = plan.outline();
         signals::listen()?;
+        if signals::caught().is_some() {
+            return Err(Error::Aborted { part: "preparation".into() });
+        }
         let (metrics, resume) = match resumed {
             Some((metrics, resume)) => (metrics, Some(resume)),
             None => {
@@ -185,77 +147,40 @@ impl ReconstructArgs {
                 (folder.metrics()?, None)
             }
         };
-        let mut progress = Progress::new("reconstruct", Some(metrics)).keeping(Some(Keeper {
-            path: folder.file("checkpoint.safetensors"),
-            every: Duration::from_secs_f64(protocol.checkpoint_every),
-            run: identity,
-            last: Instant::now(),
-        }));
-        progress = progress.showing(self.live.map(|seconds| Live::new(folder.file("live.png"), seconds)));
-        let job = Job {
-            held_out: held_scan.as_ref(),
-            reference: reference.as_ref(),
-            peak,
-            seed: protocol.seed,
-            limits: Limits {
-                deadline: schedule.as_ref().map(|s| s.deadline),
-                then: schedule.as_ref().and_then(|s| s.then),
-                ..protocol.ends.limits()
-            },
-            volumes: &files::volume,
-            resume: resume.as_ref(),
-            ..Job::new(&scan, backend.as_ref())
-        };
+        let mut progress = self.progress(&folder, metrics, identity);
+        let job = self.job(&input, schedule.as_ref(), resume.as_ref(), backend.as_ref());
         let start = Instant::now();
-        let solution = plan.run(&job, &mut progress).map_err(|e| loaded.locate(e))?;
+        let mut solution = plan.run(&job, &mut progress).map_err(|e| loaded.locate(e))?;
         let prepare_s = (start.elapsed().as_secs_f64() + spent - solution.train_s).max(0.0);
         let last = progress.records().last().cloned();
         drop(progress);
 
-        let place = folder.file("volume.nii.gz");
-        let field = solution.result.field();
-        let start = Instant::now();
-        if let Some(field) = field {
-            files::write_field(folder.file("weights.safetensors"), field, notes(&loaded, protocol.seed)?)?;
-        }
-        let mut voxels = solution.result.voxels(backend.as_ref())?;
-        let affine = reference.as_ref().and_then(|r| r.affine);
-        let WrittenVolume { slices, whole } = outgoing::write(&place, voxels.as_mut(), affine, reference.is_some())?;
-        let export_s = start.elapsed().as_secs_f64();
-        let start = Instant::now();
-        let middle = reference.as_ref().map(MiddleSlices::of);
-        files::picture(folder.file("slices.png"), middle.as_ref(), &slices)?;
-        let picture_s = start.elapsed().as_secs_f64();
-        let start = Instant::now();
-        let score = |(volume, r)| evaluate::score(&place.display().to_string(), volume, r, peak);
-        let scores = whole.as_ref().zip(reference.as_ref()).map(score).transpose()?;
-        let score_s = start.elapsed().as_secs_f64();
+        let written = self.write(&folder, &input, &mut solution, &loaded, backend.as_ref())?;
+        let Input { held, peak, record: scan, load_s, .. } = input;
+        let path = |p: &PathBuf| p.display().to_string();
         let record = RunRecord {
             version: env!("CARGO_PKG_VERSION"),
             spec: loaded.spec.name.clone(),
-            seed: protocol.seed,
-            scan: scan_record,
+            seed: self.protocol.seed,
+            scan,
             held_out_views: held,
-            limits: protocol.ends.clone(),
-            budget_s: protocol.budget,
+            limits: self.protocol.ends.clone(),
+            budget_s: self.protocol.budget,
             plan: schedule,
-            init: self.init.as_ref().map(|p| p.display().to_string()),
-            reference: protocol.reference.as_ref().map(|p| p.display().to_string()),
+            init: self.init.as_ref().map(path),
+            reference: self.protocol.reference.as_ref().map(path),
             plugins: plugins::used(&loaded.tree),
             backend: outline.backend(),
             simd: simd_level(),
             threads: rayon::current_num_threads(),
             memory,
             peak_bytes: memory::peak(),
-            parameters: field.map_or(0, |f| f.model.pipeline.layout().len()),
             steps: solution.steps,
             rollbacks: solution.rollbacks,
             load_s,
             prepare_s,
             train_s: solution.train_s,
-            export_s,
-            picture_s,
-            score_s,
+            written,
             total_s: begin.elapsed().as_secs_f64() + spent,
             samples: solution.samples,
             samples_per_s: (solution.sampling_s > 0.0).then(|| solution.samples as f64 / solution.sampling_s),
@@ -263,11 +188,142 @@ impl ReconstructArgs {
             held_out: solution.best.map(|b| b.held_out).or(last.as_ref().and_then(|r| r.held_out)),
             best_step: solution.best.map(|b| b.step),
             peak,
-            scores,
         };
         conefield_io::write_text_atomic(folder.file("record.json"), &out::to_json(&record)?)?;
         folder.finish()?;
         if self.json { out::json(&record) } else { out::say(&summary(&record, &self.output)) }
+    }
+
+    /// Reads all that there is to read.
+    fn input(&self, folder: &RunFolder, begin: Instant) -> Result<Input> {
+        let whole = files::scan(&self.scan)?;
+        conefield_io::check_shape(folder.file("volume.nii.gz"), whole.geometry.volume.shape)?;
+        let reference = self.protocol.reference(&self.scan, &whole)?;
+        let peak = self.protocol.peak(reference.as_ref());
+        let held = self.protocol.held_out(whole.geometry.views.len())?;
+        let record = ScanRecord::of(&self.scan, &whole)?;
+        let (scan, aside) = if held.is_empty() {
+            (whole, None)
+        } else {
+            let (scan, aside) = whole.split(&held)?;
+            (scan, Some(aside))
+        };
+        Ok(Input { scan, aside, held, reference, peak, record, load_s: begin.elapsed().as_secs_f64() })
+    }
+
+    /// Settles what will run: the method that is asked for or, within a budget, one of the front's.
+    fn choose(
+        &self,
+        folder: &RunFolder,
+        input: &Input,
+        asked: std::result::Result<Planned, Option<Front>>,
+        backend: &dyn Backend,
+        begin: Instant,
+    ) -> Result<Chosen> {
+        let protocol = &self.protocol;
+        let resumed = match &asked {
+            Ok(m) if self.resume => {
+                Some(self.reopen(folder, &identity(&m.loaded, protocol, &input.held, &input.record)?)?)
+            }
+            _ => None,
+        };
+        let spent = resumed.as_ref().map_or(0.0, |(_, r)| r.standing.seconds);
+        let bench = Bench {
+            scan: &input.scan,
+            reference: input.reference.as_ref(),
+            peak: input.peak,
+            backend,
+            seed: protocol.seed,
+            volumes: &files::volume,
+            cancelled: &|| signals::caught().is_some(),
+        };
+        let budget = protocol.budget.map(|seconds| Budget { begin, seconds, spent });
+        let (method, schedule) = match (budget, asked) {
+            (None, Ok(method)) => (method, None),
+            (Some(budget), Ok(mut method)) => {
+                let schedule = budget.plan(&bench, &mut method)?;
+                (method, Some(schedule))
+            }
+            (Some(budget), Err(Some(front))) => {
+                let more = &protocol.sets;
+                let build = |spec: &str, sets: &[String]| self.method(spec, &[sets, more].concat(), backend);
+                let (method, schedule) = budget.choose(&bench, &front, build)?;
+                (method, Some(schedule))
+            }
+            _ => {
+                return Err(Error::invalid("reconstruct", "--spec", "nothing", "a spec, or --budget to choose one by"));
+            }
+        };
+        specs::check_held_out(&method.loaded, method.plan.as_ref(), &input.held)?;
+        schedule.iter().flat_map(|s| s.lines(&method.loaded.spec.name)).for_each(|line| info!("{line}"));
+        info!("memory: {}", method.memory.line());
+        Ok(Chosen { method, schedule, resumed })
+    }
+
+    /// What is shown and kept while it runs.
+    fn progress(&self, folder: &RunFolder, metrics: (PathBuf, File), run: BTreeMap<String, String>) -> Progress {
+        let keeper = Keeper {
+            path: folder.file("checkpoint.safetensors"),
+            every: Duration::from_secs_f64(self.protocol.checkpoint_every),
+            run,
+            last: Instant::now(),
+        };
+        Progress::new("reconstruct", Some(metrics))
+            .keeping(Some(keeper))
+            .showing(self.live.map(|seconds| Live::new(folder.file("live.png"), seconds)))
+    }
+
+    fn job<'a>(
+        &self,
+        input: &'a Input,
+        schedule: Option<&Schedule>,
+        resume: Option<&'a Resume>,
+        backend: &'a dyn Backend,
+    ) -> Job<'a> {
+        Job {
+            held_out: input.aside.as_ref(),
+            reference: input.reference.as_ref(),
+            peak: input.peak,
+            seed: self.protocol.seed,
+            limits: Limits {
+                deadline: schedule.map(|s| s.deadline),
+                then: schedule.and_then(|s| s.then),
+                ..self.protocol.ends.limits()
+            },
+            volumes: &files::volume,
+            resume,
+            ..Job::new(&input.scan, backend)
+        }
+    }
+
+    /// Writes what came out, and scores it.
+    fn write(
+        &self,
+        folder: &RunFolder,
+        input: &Input,
+        solution: &mut Solution,
+        loaded: &Loaded,
+        backend: &dyn Backend,
+    ) -> Result<Written> {
+        let reference = input.reference.as_ref();
+        let place = folder.file("volume.nii.gz");
+        let start = Instant::now();
+        let field = solution.result.field();
+        let parameters = field.map_or(0, |f| f.model.pipeline.layout().len());
+        if let Some(field) = field {
+            files::write_field(folder.file("weights.safetensors"), field, notes(loaded, self.protocol.seed)?)?;
+        }
+        let mut voxels = solution.result.voxels(backend)?;
+        let affine = reference.and_then(|r| r.affine);
+        let WrittenVolume { slices, whole } = outgoing::write(&place, voxels.as_mut(), affine, reference.is_some())?;
+        let export_s = start.elapsed().as_secs_f64();
+        let start = Instant::now();
+        files::picture(folder.file("slices.png"), reference.map(MiddleSlices::of).as_ref(), &slices)?;
+        let picture_s = start.elapsed().as_secs_f64();
+        let start = Instant::now();
+        let score = |(volume, r)| evaluate::score(&place.display().to_string(), volume, r, input.peak);
+        let scores = whole.as_ref().zip(reference).map(score).transpose()?;
+        Ok(Written { parameters, export_s, picture_s, score_s: start.elapsed().as_secs_f64(), scores })
     }
 
     /// The spec that is asked for and what is set of it. A run that is resumed knows what it chose.
@@ -306,9 +362,28 @@ impl ReconstructArgs {
     }
 }
 
-fn split(scan: Scan, held: &[usize]) -> Result<(Scan, Option<Scan>)> {
-    let (train, held) = scan.split(held)?;
-    Ok((train, Some(held)))
+/// What a run reads.
+struct Input {
+    /// The views to learn from.
+    scan: Scan,
+    /// Those that are kept aside.
+    aside: Option<Scan>,
+    /// Their numbers.
+    held: Vec<usize>,
+    reference: Option<Volume>,
+    /// The data range of scores.
+    peak: f64,
+    record: ScanRecord,
+    load_s: f64,
+}
+
+/// What will run.
+struct Chosen {
+    method: Planned,
+    /// What a budget came to.
+    schedule: Option<Schedule>,
+    /// The file for metrics of an interrupted run, and where to go on from.
+    resumed: Option<((PathBuf, File), Resume)>,
 }
 
 /// What must be the same for a run to be resumed, or to be taken for done.

@@ -35,7 +35,6 @@ pub struct RunRecord {
     pub threads: usize,
     pub memory: Memory,
     pub peak_bytes: Option<u64>,
-    pub parameters: usize,
     pub steps: u64,
     /// Times that training ran away and went back.
     pub rollbacks: u64,
@@ -44,10 +43,8 @@ pub struct RunRecord {
     /// What solving took beside training: before the first step, and to look at the metrics.
     pub prepare_s: f64,
     pub train_s: f64,
-    /// Writing weights and voxels.
-    pub export_s: f64,
-    pub picture_s: f64,
-    pub score_s: f64,
+    #[serde(flatten)]
+    pub written: Written,
     /// From the start of the command to this record. Of what came before a --resume, the training alone.
     pub total_s: f64,
     pub samples: u64,
@@ -60,6 +57,17 @@ pub struct RunRecord {
     #[serde(skip_serializing_if = "Option::is_none")]
     pub best_step: Option<u64>,
     pub peak: f64,
+}
+
+/// What was written, and how long that took.
+#[derive(Debug, Serialize)]
+pub struct Written {
+    /// Of a field.
+    pub parameters: usize,
+    /// Writing weights and voxels.
+    pub export_s: f64,
+    pub picture_s: f64,
+    pub score_s: f64,
     pub scores: Option<Scores>,
 }
 
@@ -75,7 +83,7 @@ pub fn summary(r: &RunRecord, output: &Path) -> String {
         r.scan.views - r.held_out_views.len(),
         if r.steps == 1 { "1 step".into() } else { format!("{} steps", r.steps) },
         out::duration(r.train_s),
-        out::duration(r.export_s),
+        out::duration(r.written.export_s),
     )];
     if let Some(budget) = r.budget_s {
         let why = if r.total_s < USED * budget { ": the method came to its own end" } else { "" };
@@ -92,7 +100,7 @@ pub fn summary(r: &RunRecord, output: &Path) -> String {
         let views = r.held_out_views.len();
         lines.push(format!("held-out error  {h:.5} of the largest line integral ({views} views){best}"));
     }
-    if let Some(s) = &r.scores {
+    if let Some(s) = &r.written.scores {
         lines.push(evaluate::lines(s));
     }
     lines.push(format!("results in {}", output.display()));
