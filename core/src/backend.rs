@@ -132,6 +132,10 @@ pub trait Backend: Send + Sync {
 /// Parameters, gradients and moments may live on a device: the first call takes the arena of its model there, later
 /// ones change that copy. [`Executable::fetch`] brings it back, [`Executable::renew`] takes another arena there.
 pub trait Executable: Send {
+    /// Refuses a loss, or a prior, that cannot run here: told when a plan is made, before the first step.
+    fn admits(&self, _loss: &dyn Loss, _priors: &[Box<dyn Prior>]) -> Result<()> {
+        Ok(())
+    }
     /// Gradients of `work`'s loss, written over the arena's gradients.
     fn step(&mut self, model: &mut Model, work: &Work<'_>) -> Result<StepStats>;
     /// One Adam step with the arena's gradients.

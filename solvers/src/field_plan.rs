@@ -78,6 +78,7 @@ impl Trained<'_> {
             initializer.check(pipeline.layout()).map_err(|e| e.within("initializer"))?;
         }
         let (exe, compiled) = context.backend.compile(&pipeline)?;
+        exe.admits(loss.as_ref(), &priors)?;
         beside.push(Line::new("initializer", self.initializer.typetag_name(), &initializer.describe()));
         beside.push(Line::new("loss", self.loss.typetag_name(), &loss.describe()));
         for (i, (p, spec)) in priors.iter().zip(self.priors).enumerate() {

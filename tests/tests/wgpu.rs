@@ -14,6 +14,7 @@ use conefield_core::loss::Loss;
 use conefield_core::method::{Job, Limits, PretrainJob, Record};
 use conefield_core::pipeline::{Model, Pipeline};
 use conefield_core::precision::Tables;
+use conefield_core::prior::Prior;
 use conefield_core::random::{mix, unit};
 use conefield_core::scene::Scene;
 use conefield_core::stage::{Encoder, Field, Info, Kernel, Normalizer, Parameter, Projector, Reduced, Scope, Stage};
@@ -312,6 +313,19 @@ impl Field for Changed {
     }
 }
 
+/// A loss without WGSL.
+struct OnTheCpu;
+
+impl Loss for OnTheCpu {
+    fn at(&self, predicted: f64, measured: f64) -> (f64, f64) {
+        let d = predicted - measured;
+        (d.abs().powi(3), 3.0 * d * d.abs())
+    }
+    fn describe(&self) -> String {
+        "cubes: for a test".into()
+    }
+}
+
 fn changed(change: fn(String) -> Option<String>, scope: Scope) -> Pipeline {
     let mut pipeline = common::pipeline(&spec(&settings()).unwrap());
     pipeline.field = Arc::new(Changed { inner: pipeline.field, change, scope });
@@ -333,7 +347,11 @@ fn what_cannot_run_on_a_device_is_refused_in_words() {
     refused(broken, Scope::Row, &["field (changed)", "line", "return nothing;"]);
     let narrow = |s: String| Some(s.replacen("fn stage_backward", "fn stage_back", 1));
     refused(narrow, Scope::Row, &["backward"]);
-    assert!(backend.compile(&changed(Some, Scope::Row)).is_ok());
+    let (exe, _) = backend.compile(&changed(Some, Scope::Row)).unwrap();
+    let blocks: [Box<dyn Prior>; 1] = [Box::new(TotalVariation::default())];
+    assert!(exe.admits(&L2 {}, &blocks).is_ok());
+    let e = exe.admits(&OnTheCpu, &blocks).err().unwrap().to_string();
+    assert!(["loss (cubes)", "no WGSL", "--backend cpu"].iter().all(|w| e.contains(w)), "{e}");
     let e = conefield_backend_wgpu::Wgpu::open(Some(99)).err().unwrap().to_string();
     assert!(e.contains("99") && e.contains("conefield backends"), "{e}");
 }

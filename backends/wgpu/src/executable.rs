@@ -10,7 +10,9 @@ use crate::wave::{self, GpuRay, MOST_GROUPS, Wave};
 use crate::{Gpu, Shared};
 use conefield_core::backend::{Adam, BlockWork, Executable, StepStats, Work};
 use conefield_core::error::Result;
+use conefield_core::loss::Loss;
 use conefield_core::pipeline::Model;
+use conefield_core::prior::Prior;
 use conefield_core::stage::{Projector, UnitRay};
 use conefield_core::wgsl::Fragment;
 use std::collections::HashMap;
@@ -240,14 +242,7 @@ impl Wgpu {
         if self.learned == fragments {
             return Ok(());
         }
-        let mut sources = vec![
-            (OF_RAYS.to_owned(), compose::loss_of_rays(work.loss)?),
-            (OF_POINTS.to_owned(), compose::loss_of_points(work.loss)?),
-        ];
-        for (i, p) in work.priors.iter().enumerate() {
-            sources.push((of_blocks(i), compose::penalty_of_blocks(p.prior)?));
-        }
-        for (label, source) in sources {
+        for (label, source) in sources(work.loss, work.priors.iter().map(|p| p.prior))? {
             self.compiled.remove(&label);
             self.bound.remove(&label);
             self.kernels.add(&self.shared, &label, source)?;
@@ -410,11 +405,27 @@ impl Wgpu {
 const OF_RAYS: &str = "loss of rays";
 const OF_POINTS: &str = "loss of points";
 
+/// The kernels that learning takes, by their labels.
+fn sources<'a>(loss: &dyn Loss, priors: impl Iterator<Item = &'a dyn Prior>) -> Result<Vec<(String, Source)>> {
+    let mut all = vec![
+        (OF_RAYS.to_owned(), compose::loss_of_rays(loss)?),
+        (OF_POINTS.to_owned(), compose::loss_of_points(loss)?),
+    ];
+    for (i, prior) in priors.enumerate() {
+        all.push((of_blocks(i), compose::penalty_of_blocks(prior)?));
+    }
+    Ok(all)
+}
+
 fn of_blocks(prior: usize) -> String {
     format!("penalty of blocks {prior}")
 }
 
 impl Executable for Wgpu {
+    fn admits(&self, loss: &dyn Loss, priors: &[Box<dyn Prior>]) -> Result<()> {
+        sources(loss, priors.iter().map(|p| p.as_ref())).map(drop)
+    }
+
     fn step(&mut self, model: &mut Model, work: &Work<'_>) -> Result<StepStats> {
         self.learn_by(work)?;
         self.load(model)?;
