@@ -188,6 +188,42 @@ fn mapping_consistency() {
     assert!(!output.status.success() && e.contains("field.0.weight"), "{e}");
 }
 
+/// What built-in initializers have, plugins' have too: weights that the host reads, a look at them before the run, a known volume.
+#[test]
+fn initializers_of_plugins() {
+    let place = place();
+    cargo(&sources().join("plugins/tests"), &["build", "--release", "--locked", "-p", "rehashed"]);
+    let plugin = text(&library("rehashed"));
+    let [scan, weights] = [&place.scan, &place.dir.path().join("weights.safetensors")].map(|p| text(p));
+    let small = ["--set", "encoder.log2_table_size=10", "--set", "pretraining.points=200", "--steps", "20"];
+    done(&[&["pretrain", "phantom:head:16", "--spec", "fast", "-o", &weights][..], &small].concat());
+    let truth = text(&place.scan.join("truth.nii.gz"));
+    let sets = ["--set", "encoder.log2_table_size=10", "--set", "training.rays=48", "--set", "projector.samples=16"];
+    let args = |command: &'static str, initializer: &str| {
+        let start = ["--plugin", &plugin, command].map(String::from);
+        let end = ["--spec", "fast", "--steps", "5", "--set"].map(String::from);
+        [&start[..], &[scan.clone()], &end, &[format!("initializer={initializer}")], &sets.map(String::from)].concat()
+    };
+    for settings in [format!("weights={weights:?}"), format!("path={truth:?}, steps=4")] {
+        let kind = if settings.starts_with('w') { "mci" } else { "volume" };
+        let of = ["", "again-"].map(|prefix| {
+            let run = place.dir.path().join(format!("{prefix}{kind}"));
+            let mut args = args("reconstruct", &format!("{{type=\"{prefix}{kind}\", {settings}}}"));
+            args.extend(["-o".into(), text(&run)]);
+            done(&args.iter().map(String::as_str).collect::<Vec<_>>());
+            conefield_io::read_weights(run.join("weights.safetensors")).unwrap().tensors
+        });
+        assert!(of[0] == of[1], "{kind}: the weights differ");
+    }
+    // What does not fit is refused before there is a run.
+    let run = text(&place.dir.path().join("other"));
+    let mut other = args("reconstruct", &format!("{{type=\"again-mci\", weights={weights:?}}}"));
+    other.extend(["-o", &run, "--set", "field.width=13"].map(String::from));
+    let said = refused(1, &other.iter().map(String::as_str).collect::<Vec<_>>());
+    assert!(said.contains("field.0.weight") && said.contains("initializer"), "{said}");
+    assert!(!Path::new(&run).exists(), "a run was begun");
+}
+
 /// A mask removes channels of a plugin's encoder, as of a built-in one.
 #[test]
 fn masks_of_plugins() {

@@ -14,7 +14,7 @@
 /*
  Minor version: tables have grown so many times.
  */
-#define CONEFIELD_ABI_MINOR 0
+#define CONEFIELD_ABI_MINOR 1
 
 /*
  Points to features.
@@ -634,7 +634,33 @@ typedef struct ConefieldBlock {
 } ConefieldBlock;
 
 /*
- Functions of an initializer.
+ A tensor of a weights file.
+ */
+typedef struct ConefieldTensor {
+  /*
+   Its name.
+   */
+  struct ConefieldStr name;
+  /*
+   Its shape, row-major.
+   */
+  const size_t *shape;
+  /*
+   Numbers in `shape`.
+   */
+  size_t dimensions;
+  /*
+   Its numbers.
+   */
+  const float *values;
+  /*
+   How many these are.
+   */
+  size_t length;
+} ConefieldTensor;
+
+/*
+ Functions of an initializer. What is optional may be NULL.
  */
 typedef struct ConefieldInitializer {
   /*
@@ -652,6 +678,31 @@ typedef struct ConefieldInitializer {
                            size_t length,
                            uint8_t *filled,
                            struct ConefieldText *error);
+  /*
+   Optional, since 2.1. Refuses parameters that it does not fit, before a run begins.
+   */
+  ConefieldStatus (*check)(const void *stage,
+                           const struct ConefieldBlock *blocks,
+                           size_t block_count,
+                           struct ConefieldText *error);
+  /*
+   Optional, since 2.1. The weights file that the settings name; [`CONEFIELD_UNSUPPORTED`] where they name none. The host
+   reads it and goes on with the stage that `with_weights` makes of it.
+   */
+  ConefieldStatus (*weights)(const void *stage, struct ConefieldStr *path);
+  /*
+   Since 2.1, needed beside `weights`. Makes a stage that has these weights. They live for the time of the call.
+   */
+  ConefieldStatus (*with_weights)(const void *stage,
+                                  const struct ConefieldTensor *tensors,
+                                  size_t count,
+                                  void **out,
+                                  struct ConefieldText *error);
+  /*
+   Optional, since 2.1. The file of a known volume that the field learns in so many `steps` once weights are filled;
+   [`CONEFIELD_UNSUPPORTED`] where there is none.
+   */
+  ConefieldStatus (*volume)(const void *stage, struct ConefieldStr *path, uint64_t *steps);
 } ConefieldInitializer;
 
 /*

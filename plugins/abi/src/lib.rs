@@ -13,8 +13,9 @@
 //!   nothing (no channels, no parameters). Floats are aligned to their own size and no more.
 //! - **Threads.** A stage is called from many threads at once: `info`, `parameter`, `partition`, `describe`, `init`,
 //!   `passes`, every `forward…` and `backward…`, `resolutions`, `max_samples`, `sample`, `integrate`, `adjoint`, `apply`,
-//!   `at`, `needs_scan`, `blocks`, `block` and `wgsl` must allow that. `create`, `destroy`, `reduce` and `fitted` of one stage are not called at
-//!   the same time as anything else of that stage, though from any thread.
+//!   `at`, `needs_scan`, `blocks`, `block` and `wgsl` must allow that. `create`, `destroy`, `reduce`, `fitted`, `weights`,
+//!   `with_weights`, `check` and `volume` of one stage are not called at the same time as anything else of that stage, though from any
+//!   thread.
 //! - **Unwinding** must not leave the library: catch panics and exceptions, return [`CONEFIELD_PANICKED`].
 //! - **Same bits.** The result must not depend on threads, on time, or on how rows are dealt to tiles.
 
@@ -23,7 +24,7 @@ use std::ffi::c_void;
 /// Major version of this contract. A plugin of another one is refused.
 pub const CONEFIELD_ABI_MAJOR: u32 = 2;
 /// Minor version: tables have grown so many times.
-pub const CONEFIELD_ABI_MINOR: u32 = 0;
+pub const CONEFIELD_ABI_MINOR: u32 = 1;
 
 /// What a function returns.
 pub type ConefieldStatus = i32;
@@ -493,7 +494,23 @@ pub struct ConefieldBlock {
     pub length: usize,
 }
 
-/// Functions of an initializer.
+/// A tensor of a weights file.
+#[repr(C)]
+#[derive(Debug, Clone, Copy)]
+pub struct ConefieldTensor {
+    /// Its name.
+    pub name: ConefieldStr,
+    /// Its shape, row-major.
+    pub shape: *const usize,
+    /// Numbers in `shape`.
+    pub dimensions: usize,
+    /// Its numbers.
+    pub values: *const f32,
+    /// How many these are.
+    pub length: usize,
+}
+
+/// Functions of an initializer. What is optional may be NULL.
 #[repr(C)]
 #[derive(Debug, Clone, Copy)]
 pub struct ConefieldInitializer {
@@ -512,6 +529,32 @@ pub struct ConefieldInitializer {
             error: *mut ConefieldText,
         ) -> ConefieldStatus,
     >,
+    /// Optional, since 2.1. Refuses parameters that it does not fit, before a run begins.
+    pub check: Option<
+        unsafe extern "C" fn(
+            stage: *const c_void,
+            blocks: *const ConefieldBlock,
+            block_count: usize,
+            error: *mut ConefieldText,
+        ) -> ConefieldStatus,
+    >,
+    /// Optional, since 2.1. The weights file that the settings name; [`CONEFIELD_UNSUPPORTED`] where they name none. The host
+    /// reads it and goes on with the stage that `with_weights` makes of it.
+    pub weights: Option<unsafe extern "C" fn(stage: *const c_void, path: *mut ConefieldStr) -> ConefieldStatus>,
+    /// Since 2.1, needed beside `weights`. Makes a stage that has these weights. They live for the time of the call.
+    pub with_weights: Option<
+        unsafe extern "C" fn(
+            stage: *const c_void,
+            tensors: *const ConefieldTensor,
+            count: usize,
+            out: *mut *mut c_void,
+            error: *mut ConefieldText,
+        ) -> ConefieldStatus,
+    >,
+    /// Optional, since 2.1. The file of a known volume that the field learns in so many `steps` once weights are filled;
+    /// [`CONEFIELD_UNSUPPORTED`] where there is none.
+    pub volume:
+        Option<unsafe extern "C" fn(stage: *const c_void, path: *mut ConefieldStr, steps: *mut u64) -> ConefieldStatus>,
 }
 
 /// The noise of a scan, in the scale that stages see: a line integral `p` has the variance `sigma² · exp(growth · p)`.

@@ -59,7 +59,7 @@ fn the_header_is_current() {
 #[test]
 #[cfg(target_pointer_width = "64")]
 fn the_layout_is_pinned() {
-    assert_eq!((CONEFIELD_ABI_MAJOR, CONEFIELD_ABI_MINOR), (2, 0));
+    assert_eq!((CONEFIELD_ABI_MAJOR, CONEFIELD_ABI_MINOR), (2, 1));
     let sizes = [
         size_of::<ConefieldStr>(),
         size_of::<ConefieldText>(),
@@ -75,6 +75,7 @@ fn the_layout_is_pinned() {
         size_of::<ConefieldLengths>(),
         size_of::<ConefieldProjector>(),
         size_of::<ConefieldBlock>(),
+        size_of::<ConefieldTensor>(),
         size_of::<ConefieldInitializer>(),
         size_of::<ConefieldNoise>(),
         size_of::<ConefieldLoss>(),
@@ -83,7 +84,7 @@ fn the_layout_is_pinned() {
         size_of::<ConefieldStage>(),
         size_of::<ConefieldPlugin>(),
     ];
-    assert_eq!(sizes, [16, 24, 32, 32, 24, 80, 32, 16, 40, 136, 44, 16, 56, 48, 16, 32, 40, 32, 32, 128, 88]);
+    assert_eq!(sizes, [16, 24, 32, 32, 24, 80, 32, 16, 40, 136, 44, 16, 56, 48, 48, 48, 32, 40, 32, 32, 128, 88]);
     let plugin = [
         offset_of!(ConefieldPlugin, size),
         offset_of!(ConefieldPlugin, abi_major),

@@ -11,7 +11,7 @@ use conefield_plugin_abi::*;
 use serde_json::Value;
 use std::collections::BTreeMap;
 use std::ffi::c_void;
-use std::mem::offset_of;
+use std::mem::{MaybeUninit, offset_of};
 use std::path::{Path, PathBuf};
 use std::sync::{Arc, Mutex, PoisonError};
 use std::{fmt, ptr, slice};
@@ -107,7 +107,7 @@ impl Library {
             return Err(bad("ABI version", &format!("{major}.{minor}"), &expected));
         }
         // SAFETY: see the top of this file.
-        let t: ConefieldPlugin = unsafe { sized(plugin, place, "plugin table")? };
+        let t: ConefieldPlugin = unsafe { sized(plugin, place, "plugin table", size_of::<ConefieldPlugin>())? };
         // SAFETY: as above.
         let (name, version, licence) = unsafe {
             (text(t.name, place, "name")?, text(t.version, place, "version")?, text(t.licence, place, "licence")?)
@@ -169,17 +169,23 @@ fn table_of(path: &Path, place: &str) -> Result<*const ConefieldPlugin> {
 }
 
 /// A table that says its size first.
-unsafe fn sized<T>(table: *const T, place: &str, what: &str) -> Result<T> {
+///
+/// It has at least the first `least` bytes: what the first minor version had. Functions that it does not reach are NULL.
+unsafe fn sized<T>(table: *const T, place: &str, what: &str, least: usize) -> Result<T> {
     ensure(!table.is_null() && table.is_aligned(), place, what, "nothing", "a table")?;
     // SAFETY: every table begins with its size.
-    let (size, least) = (unsafe { table.cast::<usize>().read() }, size_of::<T>());
+    let size = unsafe { table.cast::<usize>().read() };
     ensure(size >= least, place, what, format!("{size} bytes"), format!("at least {least}: the table is too short"))?;
-    // SAFETY: the table has at least as many bytes as `T`, which is plain data.
-    Ok(unsafe { table.read() })
+    let mut own = MaybeUninit::<T>::zeroed();
+    // SAFETY: the table has as many bytes as are copied. `T` is plain data, in which zeros stand for NULL.
+    Ok(unsafe {
+        ptr::copy_nonoverlapping(table.cast::<u8>(), own.as_mut_ptr().cast(), size.min(size_of::<T>()));
+        own.assume_init()
+    })
 }
 
 /// A text of a table.
-unsafe fn text(s: ConefieldStr, place: &str, what: &str) -> Result<String> {
+pub(crate) unsafe fn text(s: ConefieldStr, place: &str, what: &str) -> Result<String> {
     let fits = s.length <= LONGEST_TEXT && (s.length == 0 || !s.data.is_null());
     ensure(fits, place, what, format!("a text of {} bytes", s.length), "at most 1 MiB at some address")?;
     // SAFETY: the table says so.
@@ -213,7 +219,7 @@ impl Type {
         let (kind, functions) = unsafe {
             match t.kind {
                 CONEFIELD_ENCODER | CONEFIELD_NORMALIZER | CONEFIELD_FIELD => {
-                    let map = sized(t.map, place, &what)?;
+                    let map = sized(t.map, place, &what, size_of::<ConefieldMap>())?;
                     needed("info", map.info.is_some())?;
                     needed("forward", map.forward.is_some())?;
                     needed("backward", map.backward.is_some())?;
@@ -221,7 +227,7 @@ impl Type {
                     (kind, Functions::Map(map))
                 }
                 CONEFIELD_PROJECTOR => {
-                    let projector = sized(t.projector, place, &what)?;
+                    let projector = sized(t.projector, place, &what, size_of::<ConefieldProjector>())?;
                     needed("max_samples", projector.max_samples.is_some())?;
                     needed("sample", projector.sample.is_some())?;
                     let both = projector.integrate.is_some() == projector.adjoint.is_some();
@@ -229,17 +235,18 @@ impl Type {
                     (Kind::Projector, Functions::Projector(projector))
                 }
                 CONEFIELD_INITIALIZER => {
-                    let initializer = sized(t.initializer, place, &what)?;
+                    let initializer = sized(t.initializer, place, &what, offset_of!(ConefieldInitializer, check))?;
                     needed("apply", initializer.apply.is_some())?;
+                    needed("with_weights", initializer.weights.is_none() || initializer.with_weights.is_some())?;
                     (Kind::Initializer, Functions::Initializer(initializer))
                 }
                 CONEFIELD_LOSS => {
-                    let loss = sized(t.loss, place, &what)?;
+                    let loss = sized(t.loss, place, &what, size_of::<ConefieldLoss>())?;
                     needed("at", loss.at.is_some())?;
                     (Kind::Loss, Functions::Loss(loss))
                 }
                 CONEFIELD_PRIOR => {
-                    let prior = sized(t.prior, place, &what)?;
+                    let prior = sized(t.prior, place, &what, size_of::<ConefieldPrior>())?;
                     needed("blocks", prior.blocks.is_some())?;
                     needed("block", prior.block.is_some())?;
                     (Kind::Prior, Functions::Prior(prior))

@@ -132,8 +132,8 @@ impl PriorSpec for Loaded {
 }
 
 impl InitializerSpec for Loaded {
-    fn build(&self, _: &dyn Fn(&str) -> Result<Weights>) -> Result<Box<dyn Initializer>> {
-        Ok(Box::new(initializer::build(&self.ty, &self.settings)?))
+    fn build(&self, weights: &dyn Fn(&str) -> Result<Weights>) -> Result<Box<dyn Initializer>> {
+        Ok(Box::new(initializer::build(&self.ty, &self.settings, weights)?))
     }
 
     named!();

@@ -6,12 +6,14 @@ use conefield_core::loss::Loss;
 use conefield_core::prior::Prior;
 use conefield_core::registry::{Kind, StageType};
 use conefield_core::settings::{
-    EncoderSpec, FieldSpec, Initializer, InitializerSpec, LossSpec, NormalizerSpec, PriorSpec, ProjectorSpec,
+    EncoderSpec, FieldSpec, Initializer, InitializerSpec, KnownVolume, LossSpec, NormalizerSpec, PriorSpec,
+    ProjectorSpec,
 };
 use conefield_core::spec::stage::read;
 use conefield_core::stage::{Encoder, Field, GradKind, Info, Normalizer, Parameter, Projector, Reduced, Scope, Stage};
 use conefield_plugin_abi::*;
 use serde_json::Value;
+use std::cell::RefCell;
 use std::ops::Range;
 
 /// What the host holds.
@@ -19,6 +21,8 @@ pub struct Built {
     pub stage: AnyStage,
     /// Of an encoder, a normalizer or a field.
     pub map: Option<MapInfo>,
+    /// The known volume of an initializer.
+    pub volume: Option<KnownVolume>,
     /// What a smaller stage kept of the one that it was made from.
     pub kept: (Vec<ConefieldRange>, Vec<usize>),
 }
@@ -30,8 +34,40 @@ pub enum AnyStage {
     Field(Box<dyn Field>),
     Projector(Box<dyn Projector>),
     Initializer(Box<dyn Initializer>),
+    /// An initializer before its weights were read.
+    Waiting(Waiting),
     Loss(Box<dyn Loss>),
     Prior(Box<dyn Prior>),
+}
+
+/// Settings of an initializer that name a weights file.
+pub struct Waiting {
+    spec: Box<dyn InitializerSpec>,
+    pub path: String,
+}
+
+impl Waiting {
+    /// The initializer, or what waits for the file that it asks for.
+    fn build(spec: Box<dyn InitializerSpec>) -> Result<AnyStage> {
+        let asked = RefCell::new(None);
+        let built = spec.build(&|path| {
+            asked.replace(Some(path.to_owned()));
+            Err(Error::unsupported(path, "it is not read yet"))
+        });
+        match asked.into_inner() {
+            Some(path) => Ok(AnyStage::Waiting(Self { spec, path })),
+            None => built.map(AnyStage::Initializer),
+        }
+    }
+
+    /// The initializer with what stands in the file.
+    pub fn with(&self, weights: &Weights) -> Result<AnyStage> {
+        let only = |path: &str| {
+            let why = || Error::unsupported(path, "an initializer from a plugin has one weights file");
+            (path == self.path).then(|| weights.clone()).ok_or_else(why)
+        };
+        self.spec.build(&only).map(AnyStage::Initializer)
+    }
 }
 
 /// What the host asks of a map again and again.
@@ -49,9 +85,6 @@ impl Built {
         };
         keys.insert("type".into(), t.name.into());
         let refused = |e: String| Error::invalid("spec", "", e, "settings of this type");
-        let no_weights = |path: &str| -> Result<Weights> {
-            Err(Error::unsupported(path, "a plugin's initializer reads its own files"))
-        };
         let stage = match t.kind {
             Kind::Encoder => AnyStage::Encoder(read::<dyn EncoderSpec>(settings).map_err(refused)?.build()?),
             Kind::Normalizer => {
@@ -59,10 +92,7 @@ impl Built {
             }
             Kind::Field => AnyStage::Field(read::<dyn FieldSpec>(settings).map_err(refused)?.build(width)?),
             Kind::Projector => AnyStage::Projector(read::<dyn ProjectorSpec>(settings).map_err(refused)?.build()?),
-            Kind::Initializer => {
-                let spec = read::<dyn InitializerSpec>(settings).map_err(refused)?;
-                AnyStage::Initializer(spec.build(&no_weights)?)
-            }
+            Kind::Initializer => Waiting::build(read::<dyn InitializerSpec>(settings).map_err(refused)?)?,
             Kind::Loss => AnyStage::Loss(read::<dyn LossSpec>(settings).map_err(refused)?.build()?),
             Kind::Prior => AnyStage::Prior(read::<dyn PriorSpec>(settings).map_err(refused)?.build()?),
             other => return Err(Error::unsupported(t.name, format!("a {other} cannot come from a plugin"))),
@@ -83,7 +113,8 @@ impl Built {
             info.halves = s.halves().is_some().into();
             MapInfo { info, blocks, partition }
         });
-        Self { stage, map, kept: (vec![], vec![]) }
+        let volume = if let AnyStage::Initializer(i) = &stage { i.volume() } else { None };
+        Self { stage, map, volume, kept: (vec![], vec![]) }
     }
 
     /// The stage without some of its channels.
@@ -117,7 +148,7 @@ impl AnyStage {
             Self::Encoder(s) => Some(s.as_ref()),
             Self::Normalizer(s) => Some(s.as_ref()),
             Self::Field(s) => Some(s.as_ref()),
-            Self::Projector(_) | Self::Initializer(_) | Self::Loss(_) | Self::Prior(_) => None,
+            Self::Projector(_) | Self::Initializer(_) | Self::Waiting(_) | Self::Loss(_) | Self::Prior(_) => None,
         }
     }
 
@@ -125,6 +156,7 @@ impl AnyStage {
         match self {
             Self::Projector(p) => p.describe(),
             Self::Initializer(i) => i.describe(),
+            Self::Waiting(w) => format!("waits for {}", w.path),
             Self::Loss(l) => l.describe(),
             Self::Prior(p) => p.describe(),
             Self::Encoder(s) => s.describe(),

@@ -2,16 +2,17 @@
 //! included, into a status and a text.
 
 // Pointers come from the host, by the rules of the contract (`conefield_plugin_abi`): they are valid for the lengths beside
-// them for the time of the call, do not overlap where one of them is written to, and `stage` is what `create`, `reduce` or
-// `fitted` made. Every block below that is unsafe relies on that alone.
+// them for the time of the call, do not overlap where one of them is written to, and `stage` is what `create`, `reduce`,
+// `fitted` or `with_weights` made. Every block below that is unsafe relies on that alone.
 #![allow(unsafe_code)]
 
 use crate::built::{AnyStage, Built, MapInfo};
-use conefield_core::arena::{Arena, Block, Layout};
+use conefield_core::arena::{Arena, Block, Layout, Weights};
 use conefield_core::error::{Error, Result, ensure};
 use conefield_core::loss::{Loss, NoiseModel};
 use conefield_core::prior::{Blocks, Prior};
 use conefield_core::registry::StageType;
+use conefield_core::settings::Initializer;
 use conefield_core::simd::Real;
 use conefield_core::stage::{Grads, Halves, Kernel, Lengths, Projector, Samples, Stage, Tile, TileMut, UnitRay};
 use conefield_plugin_abi::*;
@@ -67,8 +68,14 @@ pub static PRIOR: ConefieldPrior =
     ConefieldPrior { size: size_of::<ConefieldPrior>(), blocks: Some(blocks), block: Some(block), wgsl: Some(wgsl) };
 
 /// Functions of every initializer.
-pub static INITIALIZER: ConefieldInitializer =
-    ConefieldInitializer { size: size_of::<ConefieldInitializer>(), apply: Some(apply) };
+pub static INITIALIZER: ConefieldInitializer = ConefieldInitializer {
+    size: size_of::<ConefieldInitializer>(),
+    apply: Some(apply),
+    check: Some(check),
+    weights: Some(weights),
+    with_weights: Some(with_weights),
+    volume: Some(volume),
+};
 
 /// Runs `f`; what goes wrong becomes a status, its text goes to `error`.
 fn guard(error: *mut ConefieldText, f: impl FnOnce() -> Result<()>) -> ConefieldStatus {
@@ -759,6 +766,25 @@ unsafe extern "C" fn block(
     })
 }
 
+unsafe fn initializer<'a>(stage: *const c_void) -> Result<&'a dyn Initializer> {
+    // SAFETY: see the top of this file.
+    match unsafe { &built(stage).stage } {
+        AnyStage::Initializer(i) => Ok(i.as_ref()),
+        AnyStage::Waiting(w) => Err(Error::unsupported(&w.path, "the weights were not handed over")),
+        _ => Err(Error::unsupported("this stage", "it is no initializer")),
+    }
+}
+
+unsafe fn layout(blocks: *const ConefieldBlock, count: usize) -> Result<Layout> {
+    let block = |b: &ConefieldBlock| -> Result<Block> {
+        // SAFETY: see the top of this file.
+        let (name, shape) = unsafe { (text(b.name)?, many(b.shape, b.dimensions)) };
+        Ok(Block { name: name.into(), shape: shape.to_vec(), range: b.start..b.start + b.length })
+    };
+    // SAFETY: see the top of this file.
+    Ok(Layout { blocks: unsafe { many(blocks, count) }.iter().map(block).collect::<Result<_>>()? })
+}
+
 unsafe extern "C" fn apply(
     stage: *const c_void,
     blocks: *const ConefieldBlock,
@@ -770,16 +796,7 @@ unsafe extern "C" fn apply(
 ) -> ConefieldStatus {
     guard(error, || {
         // SAFETY: see the top of this file.
-        let (stage, blocks) = unsafe { (&built(stage).stage, many(blocks, block_count)) };
-        let AnyStage::Initializer(initializer) = stage else {
-            return Err(Error::unsupported("this stage", "it is no initializer"));
-        };
-        let block = |b: &ConefieldBlock| -> Result<Block> {
-            // SAFETY: see the top of this file.
-            let (name, shape) = unsafe { (text(b.name)?, many(b.shape, b.dimensions)) };
-            Ok(Block { name: name.into(), shape: shape.to_vec(), range: b.start..b.start + b.length })
-        };
-        let layout = Layout { blocks: blocks.iter().map(block).collect::<Result<_>>()? };
+        let (initializer, layout) = unsafe { (initializer(stage)?, layout(blocks, block_count)?) };
         // SAFETY: see the top of this file.
         let (params, filled) = unsafe { (many_mut(params, length), many_mut(filled, block_count)) };
         let mut arena = Arena::new(length);
@@ -791,6 +808,67 @@ unsafe extern "C" fn apply(
         }
         Ok(())
     })
+}
+
+unsafe extern "C" fn check(
+    stage: *const c_void,
+    blocks: *const ConefieldBlock,
+    block_count: usize,
+    error: *mut ConefieldText,
+) -> ConefieldStatus {
+    // SAFETY: see the top of this file.
+    guard(error, || unsafe { initializer(stage)?.check(&layout(blocks, block_count)?) })
+}
+
+unsafe extern "C" fn weights(stage: *const c_void, path: *mut ConefieldStr) -> ConefieldStatus {
+    // SAFETY: see the top of this file.
+    match unsafe { &built(stage).stage } {
+        AnyStage::Waiting(w) => {
+            // SAFETY: see the top of this file; the stage keeps the text.
+            unsafe { *path = ConefieldStr::of(&w.path) };
+            CONEFIELD_OK
+        }
+        _ => CONEFIELD_UNSUPPORTED,
+    }
+}
+
+unsafe extern "C" fn with_weights(
+    stage: *const c_void,
+    tensors: *const ConefieldTensor,
+    count: usize,
+    out: *mut *mut c_void,
+    error: *mut ConefieldText,
+) -> ConefieldStatus {
+    guard(error, || {
+        // SAFETY: see the top of this file.
+        let (stage, tensors) = unsafe { (&built(stage).stage, many(tensors, count)) };
+        let AnyStage::Waiting(waiting) = stage else {
+            return Err(Error::unsupported("this stage", "it names no weights file"));
+        };
+        let tensor = |t: &ConefieldTensor| -> Result<(String, (Vec<usize>, Vec<f32>))> {
+            // SAFETY: see the top of this file.
+            let (name, shape, values) =
+                unsafe { (text(t.name)?, many(t.shape, t.dimensions), many(t.values, t.length)) };
+            Ok((name.into(), (shape.to_vec(), values.to_vec())))
+        };
+        let tensors = tensors.iter().map(tensor).collect::<Result<_>>()?;
+        let built = Box::new(Built::of(waiting.with(&Weights { tensors, ..Weights::default() })?));
+        // SAFETY: see the top of this file.
+        unsafe { *out = Box::into_raw(built).cast() };
+        Ok(())
+    })
+}
+
+unsafe extern "C" fn volume(stage: *const c_void, path: *mut ConefieldStr, steps: *mut u64) -> ConefieldStatus {
+    // SAFETY: see the top of this file.
+    match unsafe { &built(stage).volume } {
+        Some(known) => {
+            // SAFETY: see the top of this file; the stage keeps the text.
+            unsafe { (*path, *steps) = (ConefieldStr::of(&known.path), known.steps) };
+            CONEFIELD_OK
+        }
+        None => CONEFIELD_UNSUPPORTED,
+    }
 }
 
 #[cfg(test)]

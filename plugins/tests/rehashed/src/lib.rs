@@ -1,4 +1,7 @@
-//! The built-in hash grid once more, as a plugin: what the way through the contract costs, and that masks reach it.
+//! The built-in hash grid once more, as a plugin: what the way through the contract costs, and that masks reach it. And two
+//! initializers: what the contract has for them.
+
+mod started;
 
 use conefield_encoders::hash_grid::HashGrid;
 use conefield_plugin::error::Result;

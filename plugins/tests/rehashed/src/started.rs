@@ -1,0 +1,31 @@
+//! The built-in initializers `mci` and `volume` as a plugin's: one has weights read by the host, the other a known volume.
+
+use conefield_initializers::mci::Mci;
+use conefield_initializers::volume::FromVolume;
+use conefield_plugin::arena::Weights;
+use conefield_plugin::error::Result;
+use conefield_plugin::settings::{Initializer, InitializerSpec};
+use schemars::JsonSchema;
+use serde::{Deserialize, Serialize};
+
+macro_rules! stands_for {
+    ($($name:literal $own:ident $other:ident;)*) => {$(
+        conefield_plugin::stage_type!(Initializer, $name, $own, "as the built-in one does it");
+
+        #[derive(Serialize, Deserialize, JsonSchema)]
+        #[serde(transparent)]
+        struct $own($other);
+
+        #[typetag::serde(name = $name)]
+        impl InitializerSpec for $own {
+            fn build(&self, weights: &dyn Fn(&str) -> Result<Weights>) -> Result<Box<dyn Initializer>> {
+                self.0.build(weights)
+            }
+        }
+    )*};
+}
+
+stands_for! {
+    "again-mci" AgainMci Mci;
+    "again-volume" AgainVolume FromVolume;
+}
