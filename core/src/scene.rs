@@ -36,20 +36,12 @@ impl Scene {
     pub fn new(scan: &Scan, settings: &SceneSettings) -> Result<Self> {
         let grid = scan.geometry.volume;
         let longest = grid.size().into_iter().fold(0.0, f64::max);
-        let attenuation = match settings.attenuation {
-            AttenuationScale::Fixed(x) => x / scan.unit.mm,
-            AttenuationScale::Scan => {
-                let top = top_projection(scan);
-                ensure(
-                    top > 0.0,
-                    "scan",
-                    "projections",
-                    "no positive line integral",
-                    "line integrals of an object, positive where it absorbs",
-                )?;
-                4.0 * top / longest
-            }
-        };
+        let attenuation = settings.attenuation.of(scan.unit.mm, || {
+            let top = top_projection(scan);
+            let expected = "line integrals of an object, positive where it absorbs";
+            ensure(top > 0.0, "scan", "projections", "no positive line integral", expected)?;
+            Ok(4.0 * top / longest)
+        })?;
         Self::with_attenuation(grid, settings, attenuation)
     }
 

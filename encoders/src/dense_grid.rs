@@ -8,7 +8,6 @@
 use crate::levels::{LevelCode, by_channel, functions};
 use conefield_core::error::{Error, Result, ensure};
 use conefield_core::half::Stored;
-use conefield_core::random::{mix, unit};
 use conefield_core::settings::EncoderSpec;
 use conefield_core::simd::{Op, Real, Simd, run};
 use conefield_core::stage::{
@@ -32,13 +31,11 @@ pub struct DenseGrid {
     pub base_resolution: u32,
     /// Resolution of a level over that of the level before, at least 1. Resolutions are rounded to whole cells.
     pub growth: f64,
-    /// Features start uniform in ± this.
-    pub init_range: f64,
 }
 
 impl Default for DenseGrid {
     fn default() -> Self {
-        Self { levels: 4, features: 2, base_resolution: 16, growth: 2.0, init_range: 1e-4 }
+        Self { levels: 4, features: 2, base_resolution: 16, growth: 2.0 }
     }
 }
 
@@ -81,7 +78,6 @@ pub struct DenseGridStage {
     levels: Vec<Level>,
     params: usize,
     outputs: usize,
-    init_range: f64,
 }
 
 impl DenseGridStage {
@@ -93,8 +89,6 @@ impl DenseGridStage {
         let base = s.base_resolution;
         ensure((1..=1 << 20).contains(&base), "spec", "base_resolution", base, "1 to 2^20 cells a side")?;
         ensure((1.0..=16.0).contains(&s.growth), "spec", "growth", s.growth, "1 to 16")?;
-        let range = s.init_range;
-        ensure(range.is_finite() && range >= 0.0, "spec", "init_range", range, "a finite number, 0 or more")?;
         let mut levels = vec![];
         let mut total = 0u64;
         for l in 0..s.levels {
@@ -125,13 +119,7 @@ impl DenseGridStage {
             });
             total = count;
         }
-        Ok(Self {
-            features: s.features,
-            levels,
-            params: total as usize,
-            outputs: s.levels * s.features,
-            init_range: range,
-        })
+        Ok(Self { features: s.features, levels, params: total as usize, outputs: s.levels * s.features })
     }
 
     fn params_of(&self, level: &Level) -> Range<usize> {
@@ -300,10 +288,7 @@ impl Stage for DenseGridStage {
     }
 
     fn init(&self, seed: u64, params: &mut [f32]) {
-        let range = self.init_range as f32;
-        for (i, p) in params.iter_mut().enumerate() {
-            *p = (2.0 * unit(mix(seed, i as u64)) - 1.0) * range;
-        }
+        crate::levels::start(seed, params);
     }
 
     fn kernel(&self) -> &dyn Kernel<f32> {

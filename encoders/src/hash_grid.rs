@@ -7,7 +7,6 @@
 use crate::levels::{LevelCode, by_channel, functions};
 use conefield_core::error::{Result, ensure};
 use conefield_core::half::Stored;
-use conefield_core::random::{mix, unit};
 use conefield_core::settings::EncoderSpec;
 use conefield_core::simd::{Op, Real, Simd, SimdBase, SimdFloat, V, load, run, store};
 use conefield_core::stage::{
@@ -53,8 +52,6 @@ pub struct HashGrid {
     pub growth: f64,
     /// Largest table, as a power of two.
     pub log2_table_size: u32,
-    /// Features start uniform in ± this.
-    pub init_range: f64,
 }
 
 impl Default for HashGrid {
@@ -66,7 +63,6 @@ impl Default for HashGrid {
             base_resolution: 16,
             growth: 2.0,
             log2_table_size: 19,
-            init_range: 1e-4,
         }
     }
 }
@@ -136,9 +132,6 @@ impl HashGridStage {
         }
         if !(4..=28).contains(&s.log2_table_size) {
             bad("log2_table_size", s.log2_table_size.to_string(), "4 to 28")?;
-        }
-        if !(s.init_range.is_finite() && s.init_range >= 0.0) {
-            bad("init_range", s.init_range.to_string(), "a finite number, 0 or more")?;
         }
         let table = 1u64 << s.log2_table_size;
         let mut levels = Vec::with_capacity(s.levels);
@@ -538,10 +531,7 @@ impl Stage for HashGridStage {
     }
 
     fn init(&self, seed: u64, params: &mut [f32]) {
-        let range = self.settings.init_range as f32;
-        for (i, p) in params.iter_mut().enumerate() {
-            *p = (2.0 * unit(mix(seed, i as u64)) - 1.0) * range;
-        }
+        crate::levels::start(seed, params);
     }
 
     fn kernel(&self) -> &dyn Kernel<f32> {

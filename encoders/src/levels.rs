@@ -1,8 +1,19 @@
-//! What encoders of several levels, each with features of its own, share: which level a channel comes from, and WGSL: calls of `stage_level_forward` and
-//! `stage_level_backward`, level by level, with the levels' settings written into them.
+//! What encoders of several levels, each with features of its own, share: how features start, which level a channel comes from,
+//! and WGSL: calls of `stage_level_forward` and `stage_level_backward`, level by level, with the levels' settings written into them.
 
+use conefield_core::random::{mix, unit};
 use conefield_core::wgsl;
 use std::fmt::Write;
+
+/// Features start uniform in ± this (Müller et al. 2022, section 4).
+const START: f32 = 1e-4;
+
+/// Fills features as they start.
+pub fn start(seed: u64, params: &mut [f32]) {
+    for (i, p) in params.iter_mut().enumerate() {
+        *p = (2.0 * unit(mix(seed, i as u64)) - 1.0) * START;
+    }
+}
 
 /// Of each of `width` channels the cells along a side of the level that it comes from; levels are given with their output
 /// channels.

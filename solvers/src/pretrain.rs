@@ -12,7 +12,7 @@ use conefield_core::method::{Job, Observer, PretrainJob, Record};
 use conefield_core::pipeline::{Model, Pipeline};
 use conefield_core::random::stream;
 use conefield_core::scan::Volume;
-use conefield_core::scene::{AttenuationScale, Scene, SceneSettings};
+use conefield_core::scene::{Scene, SceneSettings};
 use ndarray::Axis;
 use rand::RngExt;
 use schemars::JsonSchema;
@@ -154,20 +154,17 @@ pub fn learn(
 /// what rays of a scan would measure.
 fn scene(volume: &Volume, settings: &SceneSettings) -> Result<Scene> {
     volume.grid.validate("volume")?;
-    let attenuation = match settings.attenuation {
-        AttenuationScale::Fixed(x) => x,
-        AttenuationScale::Scan => {
-            let mut sums: Vec<f64> = vec![];
-            for axis in 0..2 {
-                let spacing = volume.grid.spacing[axis];
-                sums.extend(volume.data.sum_axis(Axis(axis)).iter().map(|&s| f64::from(s) * spacing));
-            }
-            let k = ((sums.len() as f64 * 0.995) as usize).min(sums.len() - 1);
-            let (_, top, _) = sums.select_nth_unstable_by(k, f64::total_cmp);
-            let longest = volume.grid.size().into_iter().fold(0.0, f64::max);
-            4.0 * *top / longest
+    let attenuation = settings.attenuation.of(1.0, || {
+        let mut sums: Vec<f64> = vec![];
+        for axis in 0..2 {
+            let spacing = volume.grid.spacing[axis];
+            sums.extend(volume.data.sum_axis(Axis(axis)).iter().map(|&s| f64::from(s) * spacing));
         }
-    };
+        let k = ((sums.len() as f64 * 0.995) as usize).min(sums.len() - 1);
+        let (_, top, _) = sums.select_nth_unstable_by(k, f64::total_cmp);
+        let longest = volume.grid.size().into_iter().fold(0.0, f64::max);
+        Ok(4.0 * *top / longest)
+    })?;
     if !(attenuation.is_finite() && attenuation > 0.0) {
         return Err(Error::invalid("volume", "values", "no attenuation", "a volume of an object that absorbs"));
     }

@@ -94,6 +94,20 @@ fn every_combination_that_fits_learns() {
     }
 }
 
+/// A mask for which a run is too short says so in the last record.
+#[test]
+fn a_mask_that_is_never_decided_is_told() {
+    let (_, encoder, ..) = encoders().remove(0);
+    let mask = json!([{"type": "fft-mask", "epoch": 1000}]);
+    let spec = pipeline(&encoder, &[json!([]), mask], &mlp(), &projectors()[0]);
+    let (_, records) = solve(&spec, &scan(), &Weights::default()).unwrap();
+    let (last, before) = records.split_last().unwrap();
+    assert!(before.iter().all(|r| r.events.is_empty()));
+    assert_eq!(last.events.len(), 1);
+    let words = ["fft-mask: no channel was looked at", "ends after 3.75 epochs", "waits for 1000"];
+    assert!(words.iter().all(|w| last.events[0].contains(w)), "{:?}", last.events);
+}
+
 #[test]
 fn voxels_behind_positions_learn() {
     let grid = json!({"type": "voxel-grid", "resolution": 16});

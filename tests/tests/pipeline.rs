@@ -302,6 +302,8 @@ fn psnr(volume: &Volume, scale: f64) -> f64 {
 fn units_do_not_change_the_volume() {
     let mut s = settings();
     s["training"]["steps"] = json!(200);
+    // Half of what the scan takes by itself: also of the scan alone.
+    s["scene"] = json!({"attenuation": {"relative": 0.5}});
     let base = scan();
     let run = |scan: &Scan| volume(&solve(&s, scan, &Weights::default()).unwrap().0);
     let expected = psnr(&run(&base), 1.0);

@@ -33,7 +33,7 @@ impl SceneSettings {
     /// Refuses settings that mean nothing.
     pub fn validate(&self) -> Result<()> {
         ensure(self.fill > 0.0 && self.fill <= 1.0, "spec", "scene.fill", self.fill, "a number above 0 and at most 1")?;
-        if let AttenuationScale::Fixed(x) = self.attenuation {
+        if let AttenuationScale::Fixed(x) | AttenuationScale::Relative(x) = self.attenuation {
             ensure(x.is_finite() && x > 0.0, "spec", "scene.attenuation", x, "a positive finite number")?;
         }
         self.surround.validate()
@@ -116,8 +116,21 @@ pub enum AttenuationScale {
     /// Four times the mean attenuation of the most absorbing rays over the volume's longest side: from the scan
     /// alone, so that the result does not depend on units.
     Scan,
+    /// This many times that.
+    Relative(f64),
     /// A value in the scan's own unit (1/unit).
     Fixed(f64),
+}
+
+impl AttenuationScale {
+    /// In 1/mm, for a scan in units of `mm` millimetres that takes `scan` by itself.
+    pub fn of(self, mm: f64, scan: impl FnOnce() -> Result<f64>) -> Result<f64> {
+        Ok(match self {
+            Self::Scan => scan()?,
+            Self::Relative(times) => times * scan()?,
+            Self::Fixed(x) => x / mm,
+        })
+    }
 }
 
 /// How an iterative method sees the scan.

@@ -176,6 +176,17 @@ impl Callback for Masker {
         Ok(())
     }
 
+    fn at_end(&mut self, run: &mut Run<'_>) -> Result<()> {
+        if !self.done {
+            let (ended, epoch) = (run.epoch(), self.settings.epoch);
+            let report = format!(
+                "fft-mask: no channel was looked at: the run ends after {ended:.2} epochs, it waits for {epoch}"
+            );
+            run.tally.window.events.push(report);
+        }
+        Ok(())
+    }
+
     fn state<'a>(&'a self, _: &'a Layout) -> Result<State<'a>> {
         State::new(NAME, &self.done, vec![])
     }
