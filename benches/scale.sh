@@ -1,0 +1,45 @@
+#!/usr/bin/env bash
+# The attenuation that stages see as 1, as a share of what the scan takes by itself:
+#   bash benches/scale.sh DATA_FOLDER OUT_FOLDER [SPEC [STEPS [SHARES [SEEDS [VOLUMES]]]]]
+# SPEC (balanced) makes STEPS (800) on 50 noisy views of each of VOLUMES, for each of SHARES ("1 0.5 0.25 0.12"); each of SEEDS ("0") is
+# another noise and another start. Prints mean and half the range of PSNR, and the mean of ssim_2d. Steps are counted, not timed:
+# other work on the machine changes nothing.
+set -euo pipefail
+cd "$(dirname "$0")/.."
+data=$1
+out=$2
+spec=${3:-balanced}
+steps=${4:-800}
+shares=${5:-1 0.5 0.25 0.12}
+seeds=${6:-0}
+volumes=${7:-engine_256 head_256 teapot_256 chest_128 abdomen_128}
+cargo build --release --quiet -p conefield
+bin=${CARGO_TARGET_DIR:-target}/release/conefield
+mkdir -p "$out"
+for volume in $volumes; do
+    for seed in $seeds; do
+        scan=$out/$volume-$seed
+        [[ -d $scan ]] || "$bin" -q simulate "$data/volumes/$volume.nii.gz" -o "$scan" --protocol r2 --views 50 \
+            --noise tigre:1e4,10 --seed "$seed" >/dev/null
+        for share in $shares; do
+            told=$out/$spec-$steps-$volume-$seed-$share.json
+            [[ -f $told ]] && continue
+            "$bin" -q reconstruct "$scan" -o "$out/run" --force --reference truth --spec "$spec" --steps "$steps" --seed "$seed" \
+                --set "scene.attenuation={ relative = $share }" >/dev/null
+            cp "$out/run/record.json" "$told"
+        done
+    done
+done
+python3 - "$out/$spec-$steps" "$volumes" "$seeds" "$shares" <<'PY'
+import json, statistics, sys
+start, *lists = sys.argv[1:]
+volumes, seeds, shares = (x.split() for x in lists)
+print("| | " + " | ".join(shares) + " |\n|---" + "|---" * len(shares) + "|")
+for volume in volumes:
+    cells = []
+    for share in shares:
+        scores = [json.load(open(f"{start}-{volume}-{seed}-{share}.json"))["scores"] for seed in seeds]
+        psnr = [s["psnr"] for s in scores]
+        cells.append(f"{statistics.mean(psnr):.2f} ± {(max(psnr) - min(psnr)) / 2:.2f}, {statistics.mean(s['ssim_2d'] for s in scores):.3f}")
+    print(f"| {volume} | " + " | ".join(cells) + " |")
+PY
