@@ -113,8 +113,8 @@ pub enum SupportRule {
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(rename_all = "kebab-case")]
 pub enum AttenuationScale {
-    /// Four times the mean attenuation of the most absorbing rays over the volume's longest side: from the scan
-    /// alone, so that the result does not depend on units.
+    /// The mean attenuation of the most absorbing rays over the volume's longest side: from the scan alone, so that the
+    /// result does not depend on units.
     Scan,
     /// This many times that.
     Relative(f64),
