@@ -94,7 +94,10 @@ impl Trained<'_> {
         let what = format!("{} rays a step, Adam {}", self.training.rays, self.optimizer.lr);
         let method = Line::new("method", self.kind, &what);
         Ok(Box::new(FieldPlan {
-            scene: self.scene.clone(),
+            scene: SceneSettings {
+                attenuation: self.scene.attenuation.for_field(pipeline.field.bounded()),
+                ..self.scene.clone()
+            },
             optimizer: self.optimizer.clone(),
             training: self.training.clone(),
             pretraining: self.pretraining.clone(),

@@ -219,7 +219,7 @@ impl Type {
         let (kind, functions) = unsafe {
             match t.kind {
                 CONEFIELD_ENCODER | CONEFIELD_NORMALIZER | CONEFIELD_FIELD => {
-                    let map = sized(t.map, place, &what, size_of::<ConefieldMap>())?;
+                    let map = sized(t.map, place, &what, offset_of!(ConefieldMap, bounded))?;
                     needed("info", map.info.is_some())?;
                     needed("forward", map.forward.is_some())?;
                     needed("backward", map.backward.is_some())?;
@@ -394,4 +394,31 @@ pub(crate) fn whole_text(
         return if status == CONEFIELD_OK { Ok(text) } else { Err((status, text)) };
     }
     Err((CONEFIELD_FAILED, "its text changes in length".into()))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    unsafe extern "C" fn volume(_: *const c_void, _: *mut ConefieldStr, _: *mut u64) -> ConefieldStatus {
+        CONEFIELD_OK
+    }
+
+    #[test]
+    fn what_a_table_of_an_earlier_version_does_not_reach_is_null() {
+        let first = offset_of!(ConefieldInitializer, check);
+        let table = |size| ConefieldInitializer {
+            size,
+            apply: None,
+            check: None,
+            weights: None,
+            with_weights: None,
+            volume: Some(volume),
+        };
+        // SAFETY: the tables are whole, whatever they say.
+        let read = |size| unsafe { sized(&table(size), "p", "table", first) };
+        assert!(read(size_of::<ConefieldInitializer>()).unwrap().volume.is_some());
+        assert!(read(first).unwrap().volume.is_none());
+        assert!(read(first - 1).is_err_and(|e| e.to_string().contains("too short")));
+    }
 }
