@@ -40,7 +40,7 @@ impl Scene {
             let top = top_projection(scan);
             let expected = "line integrals of an object, positive where it absorbs";
             ensure(top > 0.0, "scan", "projections", "no positive line integral", expected)?;
-            Ok(top / longest)
+            Ok(4.0 * top / longest)
         })?;
         Self::with_attenuation(grid, settings, attenuation)
     }

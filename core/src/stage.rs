@@ -367,11 +367,6 @@ pub trait Field: Stage {
         Err(Error::unsupported(self.describe(), "this field cannot do without some of its inputs"))
     }
 
-    /// Whether its values cannot exceed 1: the scene then makes what it counts as 1 larger.
-    fn bounded(&self) -> bool {
-        false
-    }
-
     /// Its own line integrals, of a field that brings them ([`crate::settings::LineFieldSpec`]).
     fn lines(&self) -> Option<&dyn Lines<f32>> {
         None

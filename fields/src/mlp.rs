@@ -460,10 +460,6 @@ impl Stage for MlpStage {
 }
 
 impl Field for MlpStage {
-    fn bounded(&self) -> bool {
-        self.settings.output == Activation::Sigmoid
-    }
-
     fn keep_inputs(&self, keep: &[usize]) -> Result<Reduced<dyn Field>> {
         let stage = Self::new(&self.settings, keep.len())?;
         let mut params: Vec<Range<usize>> = vec![];

@@ -262,10 +262,6 @@ fn stage_output(x: f32) -> vec2<f32> {{ return {}(x); }}
 }
 
 impl Field for VoxelGridStage {
-    fn bounded(&self) -> bool {
-        self.output == Activation::Sigmoid
-    }
-
     fn keep_inputs(&self, keep: &[usize]) -> Result<Reduced<dyn Field>> {
         if keep != [0, 1, 2] {
             return Err(Error::unsupported("voxel-grid", "it needs all three coordinates; leave out masks before it"));

@@ -192,10 +192,6 @@ impl Stage for VoxelsJosephStage {
 }
 
 impl Field for VoxelsJosephStage {
-    fn bounded(&self) -> bool {
-        self.grid.bounded()
-    }
-
     fn keep_inputs(&self, keep: &[usize]) -> Result<Reduced<dyn Field>> {
         let Reduced { params, channels, .. } = self.grid.keep_inputs(keep)?;
         Ok(Reduced { stage: Box::new(self.clone()), params, channels })

@@ -94,10 +94,7 @@ impl Trained<'_> {
         let what = format!("{} rays a step, Adam {}", self.training.rays, self.optimizer.lr);
         let method = Line::new("method", self.kind, &what);
         Ok(Box::new(FieldPlan {
-            scene: SceneSettings {
-                attenuation: self.scene.attenuation.for_field(pipeline.field.bounded()),
-                ..self.scene.clone()
-            },
+            scene: self.scene.clone(),
             optimizer: self.optimizer.clone(),
             training: self.training.clone(),
             pretraining: self.pretraining.clone(),

@@ -163,7 +163,7 @@ fn scene(volume: &Volume, settings: &SceneSettings) -> Result<Scene> {
         let k = ((sums.len() as f64 * 0.995) as usize).min(sums.len() - 1);
         let (_, top, _) = sums.select_nth_unstable_by(k, f64::total_cmp);
         let longest = volume.grid.size().into_iter().fold(0.0, f64::max);
-        Ok(*top / longest)
+        Ok(4.0 * *top / longest)
     })?;
     if !(attenuation.is_finite() && attenuation > 0.0) {
         return Err(Error::invalid("volume", "values", "no attenuation", "a volume of an object that absorbs"));

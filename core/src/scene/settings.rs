@@ -109,28 +109,20 @@ pub enum SupportRule {
     Carve,
 }
 
-/// What a bounded field may reach, in means of the most absorbing rays.
-const ROOM: f64 = 4.0;
-
 /// The attenuation that stages see as 1.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(rename_all = "kebab-case")]
 pub enum AttenuationScale {
-    /// The mean attenuation of the most absorbing rays over the volume's longest side: from the scan alone, so that the
-    /// result does not depend on units. Four times that for a field whose values cannot exceed 1.
+    /// Four times the mean attenuation of the most absorbing rays over the volume's longest side: from the scan
+    /// alone, so that the result does not depend on units, and large enough for a field whose values cannot exceed 1.
     Scan,
-    /// This many times that mean.
+    /// This many times that.
     Relative(f64),
     /// A value in the scan's own unit (1/unit).
     Fixed(f64),
 }
 
 impl AttenuationScale {
-    /// The same for a field that is `bounded`: a part of the object may absorb more than the mean along any ray.
-    pub fn for_field(self, bounded: bool) -> Self {
-        if bounded && self == Self::Scan { Self::Relative(ROOM) } else { self }
-    }
-
     /// In 1/mm, for a scan in units of `mm` millimetres that takes `scan` by itself.
     pub fn of(self, mm: f64, scan: impl FnOnce() -> Result<f64>) -> Result<f64> {
         Ok(match self {

@@ -12,7 +12,7 @@
 //! - **Tiles** are channel-major: channel `c` of row `i` is `data[c * stride + i]`. A pointer may be NULL where there is
 //!   nothing (no channels, no parameters). Floats are aligned to their own size and no more.
 //! - **Threads.** A stage is called from many threads at once: `info`, `parameter`, `partition`, `describe`, `init`,
-//!   `passes`, every `forward…` and `backward…`, `resolutions`, `bounded`, `max_samples`, `sample`, `integrate`, `adjoint`, `apply`,
+//!   `passes`, every `forward…` and `backward…`, `resolutions`, `max_samples`, `sample`, `integrate`, `adjoint`, `apply`,
 //!   `at`, `needs_scan`, `blocks`, `block` and `wgsl` must allow that. `create`, `destroy`, `reduce`, `fitted`, `weights`,
 //!   `with_weights`, `check` and `volume` of one stage are not called at the same time as anything else of that stage, though from any
 //!   thread.
@@ -405,8 +405,6 @@ pub struct ConefieldMap {
             error: *mut ConefieldText,
         ) -> ConefieldStatus,
     >,
-    /// Of a field, optional, since 2.1: not 0 if its values cannot exceed 1. The scene then makes what counts as 1 larger.
-    pub bounded: Option<unsafe extern "C" fn(stage: *const c_void) -> u32>,
 }
 
 /// A ray in the unit cube: `origin + t * direction`, where `t` counts cube sides.

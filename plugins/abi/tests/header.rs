@@ -84,7 +84,7 @@ fn the_layout_is_pinned() {
         size_of::<ConefieldStage>(),
         size_of::<ConefieldPlugin>(),
     ];
-    assert_eq!(sizes, [16, 24, 32, 32, 24, 80, 32, 16, 40, 144, 44, 16, 56, 48, 48, 48, 32, 40, 32, 32, 128, 88]);
+    assert_eq!(sizes, [16, 24, 32, 32, 24, 80, 32, 16, 40, 136, 44, 16, 56, 48, 48, 48, 32, 40, 32, 32, 128, 88]);
     let plugin = [
         offset_of!(ConefieldPlugin, size),
         offset_of!(ConefieldPlugin, abi_major),

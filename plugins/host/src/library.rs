@@ -219,7 +219,7 @@ impl Type {
         let (kind, functions) = unsafe {
             match t.kind {
                 CONEFIELD_ENCODER | CONEFIELD_NORMALIZER | CONEFIELD_FIELD => {
-                    let map = sized(t.map, place, &what, offset_of!(ConefieldMap, bounded))?;
+                    let map = sized(t.map, place, &what, size_of::<ConefieldMap>())?;
                     needed("info", map.info.is_some())?;
                     needed("forward", map.forward.is_some())?;
                     needed("backward", map.backward.is_some())?;

@@ -41,7 +41,6 @@ pub static MAP: ConefieldMap = ConefieldMap {
     forward_pass_halves: Some(forward_pass_halves),
     backward_halves: Some(backward_halves),
     resolutions: Some(resolutions),
-    bounded: Some(bounded),
 };
 
 /// Functions of every projector.
@@ -506,11 +505,6 @@ unsafe extern "C" fn backward_halves(
             stage.fault()
         }
     })
-}
-
-unsafe extern "C" fn bounded(stage: *const c_void) -> u32 {
-    // SAFETY: see the top of this file.
-    matches!(unsafe { &built(stage).stage }, AnyStage::Field(f) if f.bounded()).into()
 }
 
 unsafe extern "C" fn resolutions(

@@ -486,11 +486,6 @@ impl Encoder for MapStage {
 }
 
 impl Field for MapStage {
-    fn bounded(&self) -> bool {
-        // SAFETY: the stage is alive.
-        self.map.bounded.is_some_and(|f| unsafe { f(self.handle.stage) } != 0)
-    }
-
     fn keep_inputs(&self, keep: &[usize]) -> Result<Reduced<dyn Field>> {
         let (stage, params, channels) = self.reduce(CONEFIELD_INPUTS, keep)?;
         Ok(Reduced { stage: Box::new(stage), params, channels })
