@@ -375,14 +375,8 @@ mod tests {
 
     #[test]
     fn vertices_have_the_stated_shape_and_place() {
-        let stage = DenseGridStage::new(&DenseGrid {
-            levels: 2,
-            features: 1,
-            base_resolution: 2,
-            growth: 1.5,
-            ..DenseGrid::default()
-        })
-        .unwrap();
+        let stage =
+            DenseGridStage::new(&DenseGrid { levels: 2, features: 1, base_resolution: 2, growth: 1.5 }).unwrap();
         let names: Vec<_> = stage.parameters().into_iter().map(|p| (p.name, p.shape)).collect();
         assert_eq!(names, [("0.table".into(), vec![3, 3, 3, 1]), ("1.table".into(), vec![4, 4, 4, 1])]);
         // Each vertex of level 0 holds 100·i + 10·j + k, which is linear, so that interpolation is exact.

@@ -202,7 +202,14 @@ fn initializers_of_plugins() {
     let args = |command: &'static str, initializer: &str| {
         let start = ["--plugin", &plugin, command].map(String::from);
         let end = ["--spec", "fast", "--steps", "5", "--set"].map(String::from);
-        [&start[..], &[scan.clone()], &end, &[format!("initializer={initializer}")], &sets.map(String::from)].concat()
+        [
+            &start[..],
+            std::slice::from_ref(&scan),
+            &end,
+            &[format!("initializer={initializer}")],
+            &sets.map(String::from),
+        ]
+        .concat()
     };
     for settings in [format!("weights={weights:?}"), format!("path={truth:?}, steps=4")] {
         let kind = if settings.starts_with('w') { "mci" } else { "volume" };

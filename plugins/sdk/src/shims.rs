@@ -845,14 +845,14 @@ unsafe extern "C" fn with_weights(
         let AnyStage::Waiting(waiting) = stage else {
             return Err(Error::unsupported("this stage", "it names no weights file"));
         };
-        let tensor = |t: &ConefieldTensor| -> Result<(String, (Vec<usize>, Vec<f32>))> {
+        let mut weights = Weights::default();
+        for t in tensors {
             // SAFETY: see the top of this file.
             let (name, shape, values) =
                 unsafe { (text(t.name)?, many(t.shape, t.dimensions), many(t.values, t.length)) };
-            Ok((name.into(), (shape.to_vec(), values.to_vec())))
-        };
-        let tensors = tensors.iter().map(tensor).collect::<Result<_>>()?;
-        let built = Box::new(Built::of(waiting.with(&Weights { tensors, ..Weights::default() })?));
+            weights.tensors.insert(name.into(), (shape.to_vec(), values.to_vec()));
+        }
+        let built = Box::new(Built::of(waiting.with(&weights)?));
         // SAFETY: see the top of this file.
         unsafe { *out = Box::into_raw(built).cast() };
         Ok(())
