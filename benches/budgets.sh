@@ -7,6 +7,7 @@
 # Nothing else may run on the machine.
 set -euo pipefail
 cd "$(dirname "$0")/.."
+source benches/common.sh
 data=$1
 out=$2
 budgets=${3:-5s 10s 20s 60s 180s}
@@ -20,8 +21,7 @@ mkdir -p "$out"
 for volume in $volumes; do
     for seed in $seeds; do
         scan=$out/$volume-$views-$seed
-        [[ -d $scan ]] || "$bin" -q simulate "$data/volumes/$volume.nii.gz" -o "$scan" --protocol r2 --views "$views" \
-            --noise tigre:1e4,10 --seed "$seed"
+        published_scan "$data" "$volume" "$scan" "$views" "$seed"
         for method in $methods; do
             spec=()
             [[ $method == best ]] || spec=(--spec "$method")

@@ -6,6 +6,7 @@
 # other work on the machine changes nothing.
 set -euo pipefail
 cd "$(dirname "$0")/.."
+source benches/common.sh
 data=$1
 out=$2
 spec=${3:-balanced}
@@ -19,8 +20,7 @@ mkdir -p "$out"
 for volume in $volumes; do
     for seed in $seeds; do
         scan=$out/$volume-$seed
-        [[ -d $scan ]] || "$bin" -q simulate "$data/volumes/$volume.nii.gz" -o "$scan" --protocol r2 --views 50 \
-            --noise tigre:1e4,10 --seed "$seed" >/dev/null
+        published_scan "$data" "$volume" "$scan" 50 "$seed"
         for share in $shares; do
             told=$out/$spec-$steps-$volume-$seed-$share.json
             [[ -f $told ]] && continue
@@ -30,16 +30,4 @@ for volume in $volumes; do
         done
     done
 done
-python3 - "$out/$spec-$steps" "$volumes" "$seeds" "$shares" <<'PY'
-import json, statistics, sys
-start, *lists = sys.argv[1:]
-volumes, seeds, shares = (x.split() for x in lists)
-print("| | " + " | ".join(shares) + " |\n|---" + "|---" * len(shares) + "|")
-for volume in volumes:
-    cells = []
-    for share in shares:
-        scores = [json.load(open(f"{start}-{volume}-{seed}-{share}.json"))["scores"] for seed in seeds]
-        psnr = [s["psnr"] for s in scores]
-        cells.append(f"{statistics.mean(psnr):.2f} ± {(max(psnr) - min(psnr)) / 2:.2f}, {statistics.mean(s['ssim_2d'] for s in scores):.3f}")
-    print(f"| {volume} | " + " | ".join(cells) + " |")
-PY
+python3 benches/spread.py "$out/$spec-$steps-{row}-{seed}-{column}.json" "$volumes" "$shares" "$seeds"

@@ -5,6 +5,7 @@
 # command. Prints mean and half the range of PSNR. Nothing else may run on the machine.
 set -euo pipefail
 cd "$(dirname "$0")/.."
+source benches/common.sh
 data=$1
 out=$2
 budget=${3:-30s}
@@ -18,8 +19,7 @@ plugin=${CARGO_TARGET_DIR:-plugins/examples/target}/release/libtriplane.so
 mkdir -p "$out"
 for seed in $seeds; do
     scan=$out/$volume-$seed
-    [[ -d $scan ]] || "$bin" -q simulate "$data/volumes/$volume.nii.gz" -o "$scan" --protocol r2 --views 50 \
-        --noise tigre:1e4,10 --seed "$seed"
+    published_scan "$data" "$volume" "$scan" 50 "$seed"
     for spec in $specs; do
         key=encoder.type
         [[ $spec == *-tv ]] && key=methods.0.encoder.type
@@ -34,16 +34,4 @@ for seed in $seeds; do
         done
     done
 done
-python3 - "$out" "$seeds" $specs <<'PY'
-import json, statistics, sys
-out, seeds, *specs = sys.argv[1:]
-print("| | hash grid | tri-plane |\n|---|---|---|")
-for spec in specs:
-    cells = []
-    for encoder in ("hash-grid", "triplane"):
-        runs = [json.load(open(f"{out}/{spec}-{encoder}-{seed}.json")) for seed in seeds.split()]
-        psnr = [run["scores"]["psnr"] for run in runs]
-        ssim = statistics.mean(run["scores"]["ssim_2d"] for run in runs)
-        cells.append(f"{statistics.mean(psnr):.2f} dB ± {(max(psnr) - min(psnr)) / 2:.2f}, {ssim:.3f}, {max(run['total_s'] for run in runs):.0f} s")
-    print(f"| {spec} | " + " | ".join(cells) + " |")
-PY
+python3 benches/spread.py "$out/{row}-{column}-{seed}.json" "$specs" "hash-grid triplane" "$seeds"

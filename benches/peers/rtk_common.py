@@ -35,9 +35,9 @@ class Scan:
         """A volume [x, y, z] in RTK's axes (x, z, y): its y is the axis of rotation."""
         return image(np.transpose(array, (1, 2, 0)), [self.spacing[0], self.spacing[2], self.spacing[1]])
 
-    def forward(self, volume, kind=rtk.JosephForwardProjectionImageFilter):
-        """RTK's line integrals of an image that `volume` made, as RTK has them."""
-        f = kind[Image, Image].New()
+    def forward(self, volume):
+        """RTK's line integrals (Joseph) of an image that `volume` made, as RTK has them."""
+        f = rtk.JosephForwardProjectionImageFilter[Image, Image].New()
         f.SetInput(0, self.stack(np.zeros_like(self.projections)))
         f.SetInput(1, volume)
         f.SetGeometry(self.geometry)
