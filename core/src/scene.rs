@@ -36,11 +36,11 @@ impl Scene {
     pub fn new(scan: &Scan, settings: &SceneSettings) -> Result<Self> {
         let grid = scan.geometry.volume;
         let longest = grid.size().into_iter().fold(0.0, f64::max);
-        let attenuation = settings.attenuation.of(scan.unit.mm, || {
+        let attenuation = settings.attenuation.of(scan.unit.mm, longest, || {
             let top = top_projection(scan);
             let expected = "line integrals of an object, positive where it absorbs";
             ensure(top > 0.0, "scan", "projections", "no positive line integral", expected)?;
-            Ok(4.0 * top / longest)
+            Ok(top)
         })?;
         Self::with_attenuation(grid, settings, attenuation)
     }

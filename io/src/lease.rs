@@ -273,10 +273,15 @@ fn await_parts(path: &Path, contents: Contents) -> Result<()> {
 
 /// Folders within `path` that are `wanted`, and those within them down to `depth`.
 fn folders(path: &Path, depth: usize, wanted: fn(&Path) -> bool, found: &mut Vec<PathBuf>) -> Result<()> {
-    if depth == 0 || !path.is_dir() {
+    if depth == 0 {
         return Ok(());
     }
-    for entry in fs::read_dir(path).map_err(|e| Error::io(path, e))? {
+    let entries = match fs::read_dir(path) {
+        // It is no folder, or whoever wrote it has just removed it.
+        Err(e) if [ErrorKind::NotFound, ErrorKind::NotADirectory].contains(&e.kind()) => return Ok(()),
+        entries => entries.map_err(|e| Error::io(path, e))?,
+    };
+    for entry in entries {
         let entry = entry.map_err(|e| Error::io(path, e))?;
         if entry.file_type().is_ok_and(|t| t.is_dir()) && wanted(&entry.path()) {
             folders(&entry.path(), depth - 1, |_| true, found)?;

@@ -154,7 +154,8 @@ pub fn learn(
 /// what rays of a scan would measure.
 fn scene(volume: &Volume, settings: &SceneSettings) -> Result<Scene> {
     volume.grid.validate("volume")?;
-    let attenuation = settings.attenuation.of(1.0, || {
+    let longest = volume.grid.size().into_iter().fold(0.0, f64::max);
+    let attenuation = settings.attenuation.of(1.0, longest, || {
         let mut sums: Vec<f64> = vec![];
         for axis in 0..2 {
             let spacing = volume.grid.spacing[axis];
@@ -162,8 +163,7 @@ fn scene(volume: &Volume, settings: &SceneSettings) -> Result<Scene> {
         }
         let k = ((sums.len() as f64 * 0.995) as usize).min(sums.len() - 1);
         let (_, top, _) = sums.select_nth_unstable_by(k, f64::total_cmp);
-        let longest = volume.grid.size().into_iter().fold(0.0, f64::max);
-        Ok(4.0 * *top / longest)
+        Ok(*top)
     })?;
     if !(attenuation.is_finite() && attenuation > 0.0) {
         return Err(Error::invalid("volume", "values", "no attenuation", "a volume of an object that absorbs"));

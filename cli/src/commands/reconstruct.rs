@@ -117,24 +117,28 @@ impl ReconstructArgs {
         self.init.as_deref().map(boundary::text).transpose()?;
         let backend = self.protocol.backend.open()?;
         // What is wrong with a spec, or weights that cannot be read or do not fit, is told before anything is made.
-        let asked = self.asked().map(|(spec, sets)| self.method(&spec, &sets, backend.as_ref())).transpose()?;
-        let front = match (&asked, &self.front) {
-            (Some(_), _) => None,
-            (None, Some(path)) => Some(Front::read(path)?),
-            (None, None) => Some(Front::shipped()?),
+        let wish = match (self.asked(), &self.front) {
+            (Some((spec, sets)), _) => Wish::Method(self.method(&spec, &sets, backend.as_ref())?),
+            (None, Some(path)) => Wish::OneOf(Front::read(path)?),
+            (None, None) => Wish::OneOf(Front::shipped()?),
         };
         let inputs = Inputs::of([&self.scan]).and(&self.front).and(&self.init).and(&self.protocol.reference);
-        let inputs = asked.iter().filter(|_| !self.resume).fold(inputs, |inputs, m| inputs.and_spec(&m.loaded));
+        let inputs = match &wish {
+            Wish::Method(m) if !self.resume => inputs.and_spec(&m.loaded),
+            _ => inputs,
+        };
         inputs.spare_folder(&self.output)?;
         let input = self.input(&folder, begin)?;
-        asked.iter().try_for_each(|m| specs::check_held_out(&m.loaded, m.plan.as_ref(), &input.held))?;
+        if let Wish::Method(m) = &wish {
+            specs::check_held_out(&m.loaded, m.plan.as_ref(), &input.held)?;
+        }
 
-        let chosen = self.choose(&folder, &input, asked.ok_or(front), backend.as_ref(), begin)?;
-        let Chosen { method: Planned { loaded, mut plan, memory }, schedule, resumed } = chosen;
-        let spent = resumed.as_ref().map_or(0.0, |(_, r)| r.standing.seconds);
+        let chosen = self.choose(&folder, &input, wish, backend.as_ref(), begin)?;
+        let Chosen { method: Planned { loaded, mut plan, memory }, schedule, resumed, spent } = chosen;
         let identity = identity(&loaded, &self.protocol, &input.held, &input.record)?;
         let outline = plan.outline();
         signals::listen()?;
+        // Whoever started this run as a part has ended: nothing of it has been written yet.
         if signals::caught().is_some() {
             return Err(Error::Aborted { part: "preparation".into() });
         }
@@ -216,13 +220,13 @@ impl ReconstructArgs {
         &self,
         folder: &RunFolder,
         input: &Input,
-        asked: std::result::Result<Planned, Option<Front>>,
+        wish: Wish,
         backend: &dyn Backend,
         begin: Instant,
     ) -> Result<Chosen> {
         let protocol = &self.protocol;
-        let resumed = match &asked {
-            Ok(m) if self.resume => {
+        let resumed = match &wish {
+            Wish::Method(m) if self.resume => {
                 Some(self.reopen(folder, &identity(&m.loaded, protocol, &input.held, &input.record)?)?)
             }
             _ => None,
@@ -238,26 +242,26 @@ impl ReconstructArgs {
             cancelled: &|| signals::caught().is_some(),
         };
         let budget = protocol.budget.map(|seconds| Budget { begin, seconds, spent });
-        let (method, schedule) = match (budget, asked) {
-            (None, Ok(method)) => (method, None),
-            (Some(budget), Ok(mut method)) => {
+        let (method, schedule) = match (budget, wish) {
+            (None, Wish::Method(method)) => (method, None),
+            (Some(budget), Wish::Method(mut method)) => {
                 let schedule = budget.plan(&bench, &mut method)?;
                 (method, Some(schedule))
             }
-            (Some(budget), Err(Some(front))) => {
+            (Some(budget), Wish::OneOf(front)) => {
                 let more = &protocol.sets;
                 let build = |spec: &str, sets: &[String]| self.method(spec, &[sets, more].concat(), backend);
                 let (method, schedule) = budget.choose(&bench, &front, build)?;
                 (method, Some(schedule))
             }
-            _ => {
+            (None, Wish::OneOf(_)) => {
                 return Err(Error::invalid("reconstruct", "--spec", "nothing", "a spec, or --budget to choose one by"));
             }
         };
         specs::check_held_out(&method.loaded, method.plan.as_ref(), &input.held)?;
         schedule.iter().flat_map(|s| s.lines(&method.loaded.spec.name)).for_each(|line| info!("{line}"));
         info!("memory: {}", method.memory.line());
-        Ok(Chosen { method, schedule, resumed })
+        Ok(Chosen { method, schedule, resumed, spent })
     }
 
     /// What is shown and kept while it runs.
@@ -377,6 +381,13 @@ struct Input {
     load_s: f64,
 }
 
+/// What is asked for.
+enum Wish {
+    Method(Planned),
+    /// The best of these for a budget.
+    OneOf(Front),
+}
+
 /// What will run.
 struct Chosen {
     method: Planned,
@@ -384,6 +395,8 @@ struct Chosen {
     schedule: Option<Schedule>,
     /// The file for metrics of an interrupted run, and where to go on from.
     resumed: Option<((PathBuf, File), Resume)>,
+    /// Seconds of training before that.
+    spent: f64,
 }
 
 /// What must be the same for a run to be resumed, or to be taken for done.

@@ -123,11 +123,12 @@ pub enum AttenuationScale {
 }
 
 impl AttenuationScale {
-    /// In 1/mm, for a scan in units of `mm` millimetres that takes `scan` by itself.
-    pub fn of(self, mm: f64, scan: impl FnOnce() -> Result<f64>) -> Result<f64> {
+    /// In 1/mm, for a scan in units of `mm` millimetres and a volume whose longest side is `longest` mm. `top` gives the line
+    /// integral of the most absorbing rays.
+    pub fn of(self, mm: f64, longest: f64, top: impl FnOnce() -> Result<f64>) -> Result<f64> {
         Ok(match self {
-            Self::Scan => scan()?,
-            Self::Relative(times) => times * scan()?,
+            Self::Scan => 4.0 * top()? / longest,
+            Self::Relative(times) => times * Self::Scan.of(mm, longest, top)?,
             Self::Fixed(x) => x / mm,
         })
     }

@@ -40,7 +40,10 @@ pub(crate) fn build(
     })?;
     let read = path.map(|p| weights(&p)).transpose()?;
     timed(ty, move || {
-        let handle = read.map_or(Ok(None), |w| with_weights(&handle, &functions, &w).map(Some))?.unwrap_or(handle);
+        let handle = match read {
+            Some(weights) => with_weights(&handle, &functions, &weights)?,
+            None => handle,
+        };
         let mut steps = 0;
         let path = named(&handle, "volume", |path| {
             // SAFETY: the stage is alive, `path` and `steps` are to be written.
