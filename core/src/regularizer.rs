@@ -4,6 +4,7 @@ use crate::error::Result;
 use crate::geometry::VoxelGrid;
 use crate::space::Space;
 use ndarray::ArrayView3;
+use rayon::prelude::*;
 
 /// Settings of a regularizer.
 #[typetag::serde(tag = "type")]
@@ -34,8 +35,152 @@ pub trait Penalty: Send {
     /// lie as the grid's coefficients in standard order. The result does not depend on the number of threads.
     fn prox(&mut self, v: &[f32], tau: f32, u: &mut [f32]);
 
+    /// All that `update` says, with [`Penalty::prox`] for `tau`. A penalty whose proximal map goes through the volume once can
+    /// do the rest on the way.
+    fn update(&mut self, update: Update<'_>, tau: f32) {
+        update.around(|v, u| self.prox(v, tau, u));
+    }
+
     /// What the next call starts from, by name, for checkpoints.
     fn state(&mut self) -> Vec<(&'static str, &mut [f32])> {
         vec![]
+    }
+}
+
+/// An update of a proximal gradient method with momentum. `v = ahead + step·gradient`, pulled and masked, is what the proximal
+/// map is taken of; its result `u` is the new `x`, and `u + momentum·(u − x)` the new `ahead`. All slices are of one length.
+pub struct Update<'a> {
+    /// Against the gradient of the data term at `ahead`; afterwards it may be anything.
+    pub gradient: &'a mut [f32],
+    /// Where the gradient was taken; afterwards where the next one is to be.
+    pub ahead: &'a mut [f32],
+    /// The coefficients.
+    pub x: &'a mut [f32],
+    /// How far to go along `gradient`.
+    pub step: f32,
+    /// How far to go on beyond the new coefficients.
+    pub momentum: f32,
+    /// What the coefficients are held to, and the share of the way there.
+    pub towards: Option<(&'a [f32], f32)>,
+    /// Which coefficients can be other than 0, if not all.
+    pub inside: Option<&'a [bool]>,
+}
+
+/// Numbers that one task of [`Update::step`] and [`Update::momentum`] goes through: few enough for the first-level cache.
+const PART: usize = 1 << 12;
+
+impl<'a> Update<'a> {
+    /// Overwrites `v` with what the proximal map is to be of, from number `at` on.
+    #[inline(always)]
+    pub fn read(&self, at: usize, v: &mut [f32]) {
+        let part = at..at + v.len();
+        let ahead = &self.ahead[part.clone()];
+        for ((v, z), g) in v.iter_mut().zip(ahead).zip(&self.gradient[part.clone()]) {
+            *v = z + self.step * g;
+        }
+        if let Some((towards, share)) = self.towards {
+            for ((v, z), to) in v.iter_mut().zip(ahead).zip(&towards[part.clone()]) {
+                *v += share * (to - z);
+            }
+        }
+        if let Some(inside) = self.inside {
+            // What is far below 0 stays at 0, whatever its neighbours are.
+            v.iter_mut().zip(&inside[part]).for_each(|(v, inside)| *v = if *inside { *v } else { f32::MIN });
+        }
+    }
+
+    /// Takes the proximal map `u` from number `at` on.
+    #[inline(always)]
+    pub fn write(&mut self, at: usize, u: &[f32]) {
+        let part = at..at + u.len();
+        for ((z, x), u) in self.ahead[part.clone()].iter_mut().zip(&mut self.x[part]).zip(u) {
+            *z = u + self.momentum * (u - *x);
+            *x = *u;
+        }
+    }
+
+    /// The first `at` numbers, and the others.
+    pub fn split(self, at: usize) -> [Self; 2] {
+        let (gradient, ahead) = (self.gradient.split_at_mut(at), self.ahead.split_at_mut(at));
+        let x = self.x.split_at_mut(at);
+        let both = |(towards, share): (&'a [f32], f32)| {
+            let (a, b) = towards.split_at(at);
+            ((a, share), (b, share))
+        };
+        let towards = self.towards.map(both).unzip();
+        let inside = self.inside.map(|inside| inside.split_at(at)).unzip();
+        [
+            Self { gradient: gradient.0, ahead: ahead.0, x: x.0, towards: towards.0, inside: inside.0, ..self },
+            Self { gradient: gradient.1, ahead: ahead.1, x: x.1, towards: towards.1, inside: inside.1, ..self },
+        ]
+    }
+
+    /// The whole update around a proximal map that overwrites its second argument: one pass over memory before, one after.
+    pub fn around(mut self, prox: impl FnOnce(&[f32], &mut [f32])) {
+        self.step();
+        prox(self.gradient, self.ahead);
+        self.momentum();
+    }
+
+    /// Puts what the proximal map is to be of into `gradient`.
+    fn step(&mut self) {
+        self.parts().into_par_iter().for_each(|part| {
+            let mut v = [0.0; PART];
+            let v = &mut v[..part.x.len()];
+            part.read(0, v);
+            part.gradient.copy_from_slice(v);
+        });
+    }
+
+    /// Takes the proximal map from `ahead`.
+    fn momentum(&mut self) {
+        self.parts().into_par_iter().for_each(|mut part| {
+            let mut u = [0.0; PART];
+            let u = &mut u[..part.x.len()];
+            u.copy_from_slice(part.ahead);
+            part.write(0, u);
+        });
+    }
+
+    /// Parts that threads work on side by side.
+    fn parts(&mut self) -> Vec<Update<'_>> {
+        let mut rest = Update { gradient: self.gradient, ahead: self.ahead, x: self.x, ..*self };
+        let mut parts = vec![];
+        while rest.x.len() > PART {
+            let [part, others] = rest.split(PART);
+            parts.push(part);
+            rest = others;
+        }
+        parts.push(rest);
+        parts
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn an_update_steps_pulls_masks_maps_and_goes_on() {
+        let n = 2 * PART + 7;
+        let fill = |a: f32| (0..n).map(|i| a + (i % 13) as f32).collect::<Vec<f32>>();
+        let (g, z, old, to) = (fill(-3.0), fill(1.0), fill(2.0), fill(-5.0));
+        let inside: Vec<bool> = (0..n).map(|i| i % 5 != 0).collect();
+        let (mut gradient, mut ahead, mut x) = (g.clone(), z.clone(), old.clone());
+        let update = Update {
+            gradient: &mut gradient,
+            ahead: &mut ahead,
+            x: &mut x,
+            step: 0.5,
+            momentum: 0.25,
+            towards: Some((&to, 0.125)),
+            inside: Some(&inside),
+        };
+        update.around(|v, u| u.iter_mut().zip(v).for_each(|(u, v)| *u = v.max(0.0)));
+        for i in 0..n {
+            let v = z[i] + 0.5 * g[i] + 0.125 * (to[i] - z[i]);
+            let u = if inside[i] { v.max(0.0) } else { 0.0 };
+            assert_eq!([x[i], ahead[i]], [u, u + 0.25 * (u - old[i])], "{i}");
+        }
     }
 }

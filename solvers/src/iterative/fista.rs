@@ -27,7 +27,7 @@ use conefield_core::error::{Result, ensure};
 use conefield_core::geometry::VoxelGrid;
 use conefield_core::method::{Context, Job, Line, Method, Observer, Plan, Solution};
 use conefield_core::random::stream;
-use conefield_core::regularizer::{Penalty, Regularizer, RegularizerSpec};
+use conefield_core::regularizer::{Penalty, Regularizer, RegularizerSpec, Update};
 use conefield_core::scan::{Scan, ScanHeader};
 use conefield_core::scene::VoxelScene;
 use conefield_core::space::Space;
@@ -265,7 +265,6 @@ struct Arrays {
     /// Where the next gradient is taken.
     ahead: Array3<f32>,
     gradient: Array3<f32>,
-    fresh: Array3<f32>,
     /// The coefficients before a pass.
     before: Array3<f32>,
     /// What the coefficients are held to, if there is a pull.
@@ -295,7 +294,6 @@ impl Arrays {
             x,
             ahead: coefficients(),
             gradient: coefficients(),
-            fresh: coefficients(),
             before: coefficients(),
             towards: (settings.pull > 0.0).then(coefficients),
             pixels: room(space, settings.subsets.count(space.header().views)),
@@ -312,18 +310,15 @@ impl Arrays {
     }
 
     /// Overwrites `gradient` with the adjoint of the images that `images` makes of `views`, as many at a time as there is room
-    /// for. Takes `fresh` for work.
+    /// for.
     fn part_by_part(&mut self, problem: &Problem<'_>, views: &[usize], images: Images<'_>) {
-        let Self { model, gradient, fresh, pixels, .. } = self;
-        for (n, part) in views.chunks(pixels.len_of(Axis(0)).max(1)).enumerate() {
+        let Self { model, gradient, pixels, .. } = self;
+        gradient.par_mapv_inplace(|_| 0.0);
+        for part in views.chunks(pixels.len_of(Axis(0)).max(1)) {
             images(model, part, pixels);
-            if n == 0 {
-                model.back(problem, part, pixels, gradient);
-            } else {
-                model.back(problem, part, pixels, fresh);
-                Zip::from(&mut *gradient).and(&*fresh).par_for_each(|sum, x| *sum += x);
-            }
+            model.back(problem, part, pixels, gradient);
         }
+        model.outside(problem, gradient, 0.0);
     }
 
     /// Root mean square of `(A·B)ᵀ·n` over the coefficients that rays meet, for noise n as `data` spreads it: that of `views`
@@ -438,30 +433,27 @@ impl<'a> Iterate<'a> {
             misfit += data.differentiate(views, images_mut(pixels, views.len()));
         });
         self.arrays.ahead = ahead;
-        let Arrays { model, penalty, x, ahead, gradient, fresh, towards, .. } = &mut self.arrays;
-        let step = (self.subsets / self.lipschitz) as f32;
-        Zip::from(&mut *gradient).and(&*ahead).par_for_each(|g, z| *g = z + step * *g);
-        if let Some(towards) = towards {
-            let pull = self.pull;
-            let toward = |g: &mut f32, z: &f32, to: &f32| *g += pull * (to - z);
-            Zip::from(&mut *gradient).and(&*ahead).and(&*towards).par_for_each(toward);
-        }
-        // What is far below 0 stays at 0, whatever its neighbours are.
-        model.outside(problem, gradient, f32::MIN);
-        let tau = (self.lambda / self.lipschitz) as f32;
-        penalty.prox(flat(gradient), tau, flat_mut(fresh));
         let t = 0.5 * (1.0 + (1.0 + 4.0 * self.t * self.t).sqrt());
         let momentum = ((self.t - 1.0) / t) as f32;
         self.t = t.min((MOMENTUM / self.subsets).max(1.0));
-        Zip::from(ahead).and(&*fresh).and(&*x).par_for_each(|z, new, old| *z = new + momentum * (new - old));
-        std::mem::swap(x, fresh);
+        let Arrays { model, penalty, x, ahead, gradient, towards, .. } = &mut self.arrays;
+        let update = Update {
+            gradient: flat_mut(gradient),
+            ahead: flat_mut(ahead),
+            x: flat_mut(x),
+            step: (self.subsets / self.lipschitz) as f32,
+            momentum,
+            towards: towards.as_ref().map(|towards| (flat(towards), self.pull)),
+            inside: model.inside(problem),
+        };
+        penalty.update(update, (self.lambda / self.lipschitz) as f32);
         [residual, misfit]
     }
 }
 
 impl Iteration for Iterate<'_> {
     fn pass(&mut self, problem: &Problem<'_>, pass: u64) -> Result<Pass> {
-        self.arrays.before.assign(&self.arrays.x);
+        Zip::from(&mut self.arrays.before).and(&self.arrays.x).par_for_each(|before, x| *before = *x);
         let (mut residual, mut misfit) = (0.0, 0.0);
         let subsets = split(self.views, self.subsets as usize);
         for s in self.order.of(subsets.len(), problem.seed, pass) {

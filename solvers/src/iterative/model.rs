@@ -1,11 +1,13 @@
 //! A problem as a basis sees it: line integrals of coefficients.
 
+use super::flat_mut;
 use super::norms::norm2;
 use super::problem::Problem;
 use conefield_core::basis::Expansion;
 use conefield_core::geometry::VoxelGrid;
 use conefield_core::space::Space;
 use ndarray::{Array3, Zip};
+use rayon::prelude::*;
 
 /// Steps in which coefficients are fitted to a volume.
 const FIT: usize = 20;
@@ -18,6 +20,8 @@ pub(super) struct Model {
     voxels: Option<Array3<f32>>,
     /// The coefficients of voxels in which the object can be, unless all are or the problem's mask is theirs.
     inside: Option<Array3<bool>>,
+    /// Room for the coefficients' adjoint, unless the voxels' is theirs.
+    adjoint: Option<Array3<f32>>,
 }
 
 /// The grid that a problem's projector works on: that of the coefficients where they are samples, else `voxels`.
@@ -34,11 +38,12 @@ impl Model {
         start: Array3<f32>,
     ) -> (Self, Array3<f32>) {
         if expansion.coefficients() == *voxels && expansion.are_samples() {
-            return (Self { expansion, voxels: None, inside: None }, start);
+            return (Self { expansion, voxels: None, inside: None, adjoint: None }, start);
         }
-        let x = space.array(expansion.coefficients().shape);
+        let coefficients = || space.array(expansion.coefficients().shape);
+        let (x, adjoint) = (coefficients(), (!expansion.are_samples()).then(coefficients));
         space.pass(expansion.scratch());
-        let mut model = Self { expansion, voxels: Some(start), inside: None };
+        let mut model = Self { expansion, voxels: Some(start), inside: None, adjoint };
         let x = space.briefly(|space| model.fit(x, space));
         (model, x)
     }
@@ -99,21 +104,27 @@ impl Model {
         problem.residual(views, self.projected(problem, x), out)
     }
 
-    /// As [`Problem::back`].
+    /// Adds `(A·B)ᵀ·y` for some views to `out`.
     pub(super) fn back(&mut self, problem: &Problem<'_>, views: &[usize], y: &Array3<f32>, out: &mut Array3<f32>) {
-        let Some(voxels) = self.voxels.as_mut().filter(|_| !self.expansion.are_samples()) else {
-            return problem.back(views, y, out);
+        let (Some(voxels), Some(adjoint)) = (&mut self.voxels, &mut self.adjoint) else {
+            return problem.add_back(views, y, out);
         };
         problem.back(views, y, voxels);
-        self.expansion.operator().adjoint(voxels.view(), out.view_mut());
+        self.expansion.operator().adjoint(voxels.view(), adjoint.view_mut());
+        Zip::from(out).and(&*adjoint).par_for_each(|sum, x| *sum += x);
     }
 
-    /// As [`Problem::outside`].
+    /// Which coefficients can be other than 0, if not all.
+    pub(super) fn inside<'a>(&'a self, problem: &'a Problem<'_>) -> Option<&'a [bool]> {
+        let inside = if self.expansion.are_samples() { problem.inside } else { self.inside.as_ref() };
+        inside.map(|inside| inside.as_slice().unwrap_or_else(|| unreachable!("masks are contiguous")))
+    }
+
+    /// Sets coefficients that are to stay 0 to `value`.
     pub(super) fn outside(&self, problem: &Problem<'_>, x: &mut Array3<f32>, value: f32) {
-        match &self.inside {
-            _ if self.expansion.are_samples() => problem.outside(x, value),
-            Some(inside) => Zip::from(x).and(inside).par_for_each(|x, i| *x = if *i { *x } else { value }),
-            None => {}
+        if let Some(inside) = self.inside(problem) {
+            let all = flat_mut(x).par_iter_mut().zip(inside);
+            all.for_each(|(x, inside)| *x = if *inside { *x } else { value });
         }
     }
 

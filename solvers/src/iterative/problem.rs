@@ -59,12 +59,12 @@ impl Problem<'_> {
     pub fn residual(&self, views: &[usize], x: &Array3<f32>, out: &mut Array3<f32>) -> f64 {
         self.forward(views, x, out);
         for (mut image, &v) in out.axis_iter_mut(Axis(0)).zip(views) {
+            let both = Zip::from(&mut image).and(self.scan.view(v));
             match &self.shadow {
-                None => image.zip_mut_with(&self.scan.view(v), |a, p| *a = p - *a),
-                Some(shadow) => Zip::from(&mut image)
-                    .and(self.scan.view(v))
-                    .and(&shadow[v])
-                    .for_each(|a, p, inside| *a = if *inside { p - *a } else { -*a }),
+                None => both.par_for_each(|a, p| *a = p - *a),
+                Some(shadow) => {
+                    both.and(&shadow[v]).par_for_each(|a, p, inside| *a = if *inside { p - *a } else { -*a });
+                }
             }
         }
         pixel_norm2(out, views.len())
@@ -73,9 +73,14 @@ impl Problem<'_> {
     /// Overwrites `out` with `Aᵀ·y` for some views, of which `y` begins with an image each. `out` is 0 where no object can
     /// be, so that what starts at 0 there stays.
     pub fn back(&self, views: &[usize], y: &Array3<f32>, out: &mut Array3<f32>) {
-        out.fill(0.0);
-        self.operator.adjoint(self.geometry, views, images(y, views.len()), out.view_mut());
+        out.par_mapv_inplace(|_| 0.0);
+        self.add_back(views, y, out);
         self.outside(out, 0.0);
+    }
+
+    /// Adds `Aᵀ·y` for some views to `out`, of which `y` begins with an image each.
+    pub(super) fn add_back(&self, views: &[usize], y: &Array3<f32>, out: &mut Array3<f32>) {
+        self.operator.adjoint(self.geometry, views, images(y, views.len()), out.view_mut());
     }
 
     /// Sets the voxels in which no object can be to `value`.

@@ -3,6 +3,7 @@
 
 use super::flat_mut;
 use conefield_core::geometry::VoxelGrid;
+use conefield_core::regularizer::Update;
 use conefield_core::simd::{Op, Simd, SimdBase, SimdFloat, SimdMask, load, run, store};
 use conefield_core::space::Space;
 use ndarray::{Array3, ArrayView3};
@@ -48,16 +49,16 @@ impl Op for Variation<'_> {
         let mut line = vec![0.0; nz + 1];
         let mut sum = 0.0;
         for (j, x) in self.x.chunks(nz).enumerate() {
-            let after = self.after.map(|a| &a[j * nz..(j + 1) * nz]);
-            let next = self.x.get((j + 1) * nz..(j + 2) * nz);
-            // No difference across the far face.
+            // No difference across the far faces.
+            let after = self.after.map_or(x, |a| &a[j * nz..(j + 1) * nz]);
+            let next = self.x.get((j + 1) * nz..(j + 2) * nz).unwrap_or(x);
             line[..nz].copy_from_slice(x);
             line[nz] = x[nz - 1];
             // A line is short enough for single precision.
             let mut part = zero;
             for k in (0..nz).step_by(len) {
                 let here = load(s, x, k);
-                let (a, b) = (ahead(s, after, k, here) * g[0], ahead(s, next, k, here) * g[1]);
+                let (a, b) = ((load(s, after, k) - here) * g[0], (load(s, next, k) - here) * g[1]);
                 let c = (load(s, &line, k + 1) - here) * g[2];
                 part += (a * a + b * b + c * c).sqrt();
             }
@@ -85,7 +86,7 @@ impl TvProx {
     pub fn new(shape: [usize; 3], g: [f32; 3], space: &Space) -> Self {
         let split = Split::new(shape[0], REACH, rayon::current_num_threads());
         space.briefly(|space| {
-            let planes = (split.slabs - 1) * 3 * split.halo() + split.slabs * split.reach;
+            let planes = (split.slabs - 1) * 4 * split.halo() + split.slabs * 2 * split.reach;
             space.hold((planes * (shape[1] + 1) * (shape[2] + 1) * size_of::<f32>()) as u64);
         });
         Self { shape, g, dual: std::array::from_fn(|_| space.array(shape)) }
@@ -105,53 +106,66 @@ impl TvProx {
         loop {
             let split = Split::new(self.shape[0], left, rayon::current_num_threads());
             left -= split.reach;
-            self.steps(v, tau, split, u);
+            self.steps(Map { v, u }, tau, split);
             if left == 0 {
                 return;
             }
         }
     }
 
+    /// A whole update, as [`Penalty::update`] has it, in one sweep; gives back one whose `steps` take more than that.
+    pub fn update<'a>(&mut self, update: Update<'a>, tau: f32, steps: usize) -> Option<Update<'a>> {
+        let split = Split::new(self.shape[0], steps, rayon::current_num_threads());
+        if tau < f32::MIN_POSITIVE || split.reach < steps {
+            return Some(update);
+        }
+        self.steps(update, tau, split);
+        None
+    }
+
     /// Some steps in one sweep. The slabs of `split` run side by side; near their ends each works on a copy of what belongs
     /// to its neighbour, so that every number is computed from the same ones whatever the split.
-    fn steps(&mut self, v: &[f32], tau: f32, split: Split, u: &mut [f32]) {
+    fn steps(&mut self, lines: impl Lines, tau: f32, split: Split) {
         let [nx, ny, nz] = self.shape;
         let plane = ny * nz;
         let bounds = split.bounds(nx);
         let dual = self.dual.each_mut().map(flat_mut);
         // Around every inner bound, what the slab above copies of the one below, and the other way round.
-        let mut halos: Vec<[Vec<f32>; 3]> = bounds[1..bounds.len() - 1]
+        let mut halos: Vec<([Vec<f32>; 3], Vec<f32>)> = bounds[1..bounds.len() - 1]
             .iter()
             .map(|&b| {
                 let near = (b - split.below()) * plane..(b + split.reach) * plane;
-                dual.each_ref().map(|p| p[near.clone()].to_vec())
+                let mut v = vec![0.0; near.len()];
+                lines.read(near.start, &mut v);
+                (dual.each_ref().map(|p| p[near.clone()].to_vec()), v)
             })
             .collect();
-        let mut copies = halos.iter_mut().map(|halo| {
+        let mut copies = halos.iter_mut().map(|(halo, v)| {
             let mut low = Planes::default();
             let mut high = Planes::default();
             for (k, p) in halo.each_mut().into_iter().enumerate() {
                 let (below, above) = p.split_at_mut(split.below() * plane);
                 (low.0[k], high.0[k]) = (below.chunks_mut(plane).collect(), above.chunks_mut(plane).collect());
             }
-            (low, high)
+            let v = v.split_at(split.below() * plane);
+            ((low, v.0), (high, v.1))
         });
         let mut own = dual.map(|p| p.chunks_mut(plane));
-        let mut rest = u;
+        let mut rest = lines;
         let mut slabs = vec![];
-        let mut low = Planes::default();
+        let (mut low, mut low_v): (_, &[f32]) = Default::default();
         for range in bounds.windows(2).map(|b| b[0]..b[1]) {
-            let (next, high) = copies.next().unwrap_or_default();
+            let ((next, next_v), (high, high_v)) = copies.next().unwrap_or_default();
             let mut planes = std::mem::replace(&mut low, next);
+            let v = [std::mem::replace(&mut low_v, next_v), high_v];
             let copied = planes.0[0].len();
             for ((all, own), high) in planes.0.iter_mut().zip(&mut own).zip(high.0) {
                 all.extend(own.take(range.len()).chain(high));
             }
-            let (here, after) = rest.split_at_mut(range.len() * plane);
-            rest = after;
-            let first = range.start - copied;
-            let v = &v[first * plane..(first + planes.0[0].len()) * plane];
-            slabs.push(Sweep { planes, own: copied..copied + range.len(), v, u: here, line: nz, steps: split.reach });
+            let [lines, others] = rest.split(range.len() * plane);
+            rest = others;
+            let own = copied..copied + range.len();
+            slabs.push(Sweep { planes, own, lines, v, line: nz, steps: split.reach });
         }
         let scale = Scale::new(self.g, tau);
         slabs.into_par_iter().for_each(|slab| run(Sweeping(slab, scale)));
@@ -212,22 +226,68 @@ impl Scale {
 #[derive(Default)]
 struct Planes<'a>([Vec<&'a mut [f32]>; 3]);
 
+/// What a sweep takes the proximal map of, and what becomes of the map, line by line. A line that was written is not read again.
+trait Lines: Send + Sized {
+    /// Overwrites `v` with the numbers from `at` on.
+    fn read(&self, at: usize, v: &mut [f32]);
+    /// Takes the proximal map `u` from number `at` on.
+    fn write(&mut self, at: usize, u: &[f32]);
+    /// The first `at` numbers, and the others.
+    fn split(self, at: usize) -> [Self; 2];
+}
+
+impl Lines for Update<'_> {
+    #[inline(always)]
+    fn read(&self, at: usize, v: &mut [f32]) {
+        self.read(at, v);
+    }
+    #[inline(always)]
+    fn write(&mut self, at: usize, u: &[f32]) {
+        self.write(at, u);
+    }
+    fn split(self, at: usize) -> [Self; 2] {
+        self.split(at)
+    }
+}
+
+/// The proximal map alone.
+struct Map<'a> {
+    v: &'a [f32],
+    u: &'a mut [f32],
+}
+
+impl Lines for Map<'_> {
+    #[inline(always)]
+    fn read(&self, at: usize, v: &mut [f32]) {
+        v.copy_from_slice(&self.v[at..at + v.len()]);
+    }
+    #[inline(always)]
+    fn write(&mut self, at: usize, u: &[f32]) {
+        self.u[at..at + u.len()].copy_from_slice(u);
+    }
+    fn split(self, at: usize) -> [Self; 2] {
+        let (v, u) = (self.v.split_at(at), self.u.split_at_mut(at));
+        [Self { v: v.0, u: u.0 }, Self { v: v.1, u: u.1 }]
+    }
+}
+
 /// Dual steps and then the primal on a slab of planes, of which `own` are to be right in the end. At the slab's ends
 /// differences count as 0: where the volume goes on there, that is wrong, and spreads by a plane with every step.
-struct Sweep<'a> {
+struct Sweep<'a, L> {
     planes: Planes<'a>,
     own: Range<usize>,
-    v: &'a [f32],
-    /// The proximal map, of `own`.
-    u: &'a mut [f32],
+    /// The lines of `own`.
+    lines: L,
+    /// What the map is of below and above `own`.
+    v: [&'a [f32]; 2],
     /// Numbers of a line along z.
     line: usize,
     steps: usize,
 }
 
-struct Sweeping<'a>(Sweep<'a>, Scale);
+struct Sweeping<'a, L>(Sweep<'a, L>, Scale);
 
-impl Op for Sweeping<'_> {
+impl<L: Lines> Op for Sweeping<'_, L> {
     type Out = ();
     #[inline(always)]
     fn call<S: Simd>(self, s: S) {
@@ -235,7 +295,7 @@ impl Op for Sweeping<'_> {
     }
 }
 
-impl Sweep<'_> {
+impl<L: Lines> Sweep<'_, L> {
     /// Step k follows step k − 1 a plane behind, line by line: when the primal of a line is known, the dual of the line
     /// one plane before can go on, whose primal the next step then takes. So of every step one plane is kept.
     #[inline(always)]
@@ -248,60 +308,69 @@ impl Sweep<'_> {
         let stride = nz + 1;
         let ring = ny + 1;
         let mut kept = vec![0.0f32; self.steps * ring * stride];
+        // What the map is of, from the line that the last step is at to the one that the first is at.
+        let reach = self.steps * ny + 1;
+        let mut given = vec![0.0f32; reach * nz];
+        let given_at = |i: usize, j: usize| (i * ny + j) % reach * nz;
+        let (zeros, mut map) = (vec![0.0f32; nz], vec![0.0f32; nz]);
         for front in 0..count + self.steps {
             for j in 0..ny {
-                for step in 0..=self.steps.min(front) {
+                if front < count {
+                    self.give(front, j, &mut given[given_at(front, j)..][..nz]);
+                }
+                for step in 0..self.steps.min(front + 1) {
                     let i = front - step;
                     let known = i < count;
-                    if known && step == self.steps {
-                        if self.own.contains(&i) {
-                            let at = (i - self.own.start) * plane + j * nz;
-                            let line = &mut self.u[at..at + nz];
-                            primal(
-                                s,
-                                self.planes.beside(i, j, nz),
-                                &self.v[i * plane + j * nz..][..nz],
-                                scale.down,
-                                line,
-                            );
-                        }
-                        continue;
-                    }
-                    if step == self.steps {
-                        continue;
-                    }
                     let kept = &mut kept[step * ring * stride..(step + 1) * ring * stride];
                     let at = |i: usize, j: usize| (i * ny + j) % ring * stride;
                     if known {
-                        let v = &self.v[i * plane + j * nz..][..nz];
+                        let v = &given[given_at(i, j)..][..nz];
                         let fresh = &mut kept[at(i, j)..][..stride];
-                        primal(s, self.planes.beside(i, j, nz), v, scale.down, &mut fresh[..nz]);
+                        primal(s, self.planes.beside(i, j, &zeros), v, scale.down, &mut fresh[..nz]);
                         fresh[nz] = fresh[nz - 1];
                     }
                     if i > 0 && i <= count {
-                        let next = (j + 1 < ny).then(|| &kept[at(i - 1, j + 1)..][..nz]);
-                        let after = known.then(|| &kept[at(i, j)..][..nz]);
                         let u = &kept[at(i - 1, j)..][..stride];
+                        let after = if known { &kept[at(i, j)..][..nz] } else { u };
+                        let next = if j + 1 < ny { &kept[at(i - 1, j + 1)..][..nz] } else { u };
                         ascend(s, u, [after, next], scale.up, self.planes.line(i - 1, j, nz));
                     }
                 }
+                let Some(i) = front.checked_sub(self.steps).filter(|i| self.own.contains(i)) else { continue };
+                primal(s, self.planes.beside(i, j, &zeros), &given[given_at(i, j)..][..nz], scale.down, &mut map);
+                self.lines.write((i - self.own.start) * plane + j * nz, &map);
             }
+        }
+    }
+
+    /// Overwrites `v` with line `j` of plane `i` of what the map is of.
+    #[inline(always)]
+    fn give(&self, i: usize, j: usize, v: &mut [f32]) {
+        let (nz, plane) = (self.line, self.planes.0[0][i].len());
+        let [low, high] = self.v;
+        if i < self.own.start {
+            v.copy_from_slice(&low[i * plane + j * nz..][..nz]);
+        } else if i < self.own.end {
+            self.lines.read((i - self.own.start) * plane + j * nz, v);
+        } else {
+            v.copy_from_slice(&high[(i - self.own.end) * plane + j * nz..][..nz]);
         }
     }
 }
 
-/// The dual at a line, and along x and y at the lines before.
+/// The dual at a line, and along x and y at the lines before: zeros where there are none.
 struct Beside<'a> {
     p: [&'a [f32]; 3],
-    before: [Option<&'a [f32]>; 2],
+    before: [&'a [f32]; 2],
 }
 
 impl Planes<'_> {
-    fn beside(&self, i: usize, j: usize, nz: usize) -> Beside<'_> {
+    fn beside<'a>(&'a self, i: usize, j: usize, zeros: &'a [f32]) -> Beside<'a> {
+        let nz = zeros.len();
         let row = |k: usize, i: usize, j: usize| &self.0[k][i][j * nz..(j + 1) * nz];
         Beside {
             p: [row(0, i, j), row(1, i, j), row(2, i, j)],
-            before: [(i > 0).then(|| row(0, i - 1, j)), (j > 0).then(|| row(1, i, j - 1))],
+            before: [if i > 0 { row(0, i - 1, j) } else { zeros }, if j > 0 { row(1, i, j - 1) } else { zeros }],
         }
     }
 
@@ -310,73 +379,88 @@ impl Planes<'_> {
     }
 }
 
-/// A vector of a line, and of one that is not there zeros.
+/// A whole vector of a line. Loops over these leave the end of a line to [`load`] and [`store`], whose ways out of line make
+/// the compiler put every vector on the stack.
 #[inline(always)]
-fn behind<S: Simd>(s: S, line: Option<&[f32]>, k: usize) -> S::f32s {
-    match line {
-        Some(line) => load(s, line, k),
-        None => S::f32s::splat(s, 0.0),
-    }
-}
-
-/// The difference to a vector of the next line; 0 where there is none.
-#[inline(always)]
-fn ahead<S: Simd>(s: S, next: Option<&[f32]>, k: usize, here: S::f32s) -> S::f32s {
-    match next {
-        Some(next) => load(s, next, k) - here,
-        None => S::f32s::splat(s, 0.0),
-    }
+fn whole<S: Simd>(s: S, line: &[f32], k: usize) -> S::f32s {
+    S::f32s::from_slice(s, &line[k..k + S::f32s::LEN])
 }
 
 /// `u = max(0, v − τ·∇ᵀp)` along a line.
 #[inline(always)]
 fn primal<S: Simd>(s: S, Beside { p: [px, py, pz], before }: Beside<'_>, v: &[f32], scale: [f32; 3], u: &mut [f32]) {
-    let len = S::f32s::LEN;
+    let (n, len) = (u.len(), S::f32s::LEN);
     let scale = scale.map(|x| S::f32s::splat(s, x));
-    let zero = S::f32s::splat(s, 0.0);
+    let [bx, by] = before;
     // Before the first voxel along z there is no difference.
     let mut first = [0.0; 32];
-    let head = pz.len().min(len);
+    let head = n.min(len);
     first[1..=head].copy_from_slice(&pz[..head]);
-    let [bx, by] = before;
+    let first = &first[..len];
     let mut k = 0;
-    while k < u.len() {
-        let bz = if k == 0 { S::f32s::from_slice(s, &first[..len]) } else { load(s, pz, k - 1) };
-        let dx = behind(s, bx, k) - load(s, px, k);
-        let dy = behind(s, by, k) - load(s, py, k);
-        let dz = bz - load(s, pz, k);
-        let turn = dx * scale[0] + dy * scale[1] + dz * scale[2];
-        store::<S, f32>((load(s, v, k) - turn).max(zero), u, k);
+    while k + len <= n {
+        let bz = if k == 0 { first } else { &pz[k - 1..k - 1 + len] };
+        let p = [whole(s, px, k), whole(s, py, k), whole(s, pz, k)];
+        let behind = [whole(s, bx, k), whole(s, by, k), whole(s, bz, 0)];
+        descent(s, behind, p, whole(s, v, k), scale).store_slice(&mut u[k..k + len]);
         k += len;
+    }
+    if k < n {
+        let bz = if k == 0 { whole(s, first, 0) } else { load(s, pz, k - 1) };
+        let p = [load(s, px, k), load(s, py, k), load(s, pz, k)];
+        let behind = [load(s, bx, k), load(s, by, k), bz];
+        store::<S, f32>(descent(s, behind, p, load(s, v, k), scale), u, k);
     }
 }
 
-/// `p ← p + ∇u/(L·τ)` along a line, then back into the unit ball. `u` has its last number twice; `after` are the next lines
-/// along x and y.
+/// The primal of a vector of voxels.
 #[inline(always)]
-fn ascend<S: Simd>(s: S, u: &[f32], after: [Option<&[f32]>; 2], scale: [f32; 3], [px, py, pz]: [&mut [f32]; 3]) {
-    let len = S::f32s::LEN;
+fn descent<S: Simd>(s: S, behind: [S::f32s; 3], p: [S::f32s; 3], v: S::f32s, scale: [S::f32s; 3]) -> S::f32s {
+    let [x, y, z] = [behind[0] - p[0], behind[1] - p[1], behind[2] - p[2]];
+    let turn = x * scale[0] + y * scale[1] + z * scale[2];
+    (v - turn).max(S::f32s::splat(s, 0.0))
+}
+
+/// `p ← p + ∇u/(L·τ)` along a line, then back into the unit ball. `u` has its last number twice; `after` are the next lines
+/// along x and y, and `u` itself where there is none.
+#[inline(always)]
+fn ascend<S: Simd>(s: S, u: &[f32], after: [&[f32]; 2], scale: [f32; 3], [px, py, pz]: [&mut [f32]; 3]) {
+    let (n, len) = (px.len(), S::f32s::LEN);
     let scale = scale.map(|x| S::f32s::splat(s, x));
-    let one = S::f32s::splat(s, 1.0);
     let mut k = 0;
-    while k < px.len() {
-        let here = load(s, u, k);
-        let x = ahead(s, after[0], k, here).mul_add(scale[0], load(s, px, k));
-        let y = ahead(s, after[1], k, here).mul_add(scale[1], load(s, py, k));
-        let z = (load(s, u, k + 1) - here).mul_add(scale[2], load(s, pz, k));
-        let square = x.mul_add(x, y.mul_add(y, z * z));
-        // Flat parts stay in the ball: there neither the root nor the quotient is needed.
-        let [x, y, z] = if square.simd_le(one).all_true() {
-            [x, y, z]
-        } else {
-            let shrink = one / square.sqrt().max(one);
-            [x * shrink, y * shrink, z * shrink]
-        };
+    while k + len <= n {
+        let p = [whole(s, px, k), whole(s, py, k), whole(s, pz, k)];
+        let next = [whole(s, after[0], k), whole(s, after[1], k), whole(s, u, k + 1)];
+        let [x, y, z] = ascent(s, whole(s, u, k), next, p, scale);
+        x.store_slice(&mut px[k..k + len]);
+        y.store_slice(&mut py[k..k + len]);
+        z.store_slice(&mut pz[k..k + len]);
+        k += len;
+    }
+    if k < n {
+        let p = [load(s, px, k), load(s, py, k), load(s, pz, k)];
+        let next = [load(s, after[0], k), load(s, after[1], k), load(s, u, k + 1)];
+        let [x, y, z] = ascent(s, load(s, u, k), next, p, scale);
         store::<S, f32>(x, px, k);
         store::<S, f32>(y, py, k);
         store::<S, f32>(z, pz, k);
-        k += len;
     }
+}
+
+/// The dual of a vector of voxels after a step.
+#[inline(always)]
+fn ascent<S: Simd>(s: S, here: S::f32s, next: [S::f32s; 3], p: [S::f32s; 3], scale: [S::f32s; 3]) -> [S::f32s; 3] {
+    let one = S::f32s::splat(s, 1.0);
+    let x = (next[0] - here).mul_add(scale[0], p[0]);
+    let y = (next[1] - here).mul_add(scale[1], p[1]);
+    let z = (next[2] - here).mul_add(scale[2], p[2]);
+    let square = x.mul_add(x, y.mul_add(y, z * z));
+    // Flat parts stay in the ball: there neither the root nor the quotient is needed.
+    if square.simd_le(one).all_true() {
+        return [x, y, z];
+    }
+    let shrink = one / square.sqrt().max(one);
+    [x * shrink, y * shrink, z * shrink]
 }
 
 /// Adds `−step·∇TV/‖∇TV‖` of the smoothed total variation to `x`: a step of ASD-POCS. `work` is scratch of `x`'s length.
@@ -545,6 +629,53 @@ mod tests {
             assert!(near(&u, &want) && (0..3).all(|k| near(&dual[k], &slow[k])), "{shape:?}");
             for threads in [2, 3, 8] {
                 assert!(on(threads) == (u.clone(), dual.clone()), "{shape:?} on {threads} threads");
+            }
+        }
+    }
+
+    /// With and without a pull and a mask, on any number of threads: the same bits as step, proximal map and momentum one after
+    /// another.
+    #[test]
+    fn an_update_in_one_sweep_is_its_parts_one_after_another() {
+        let (g, tau) = ([1.0, 0.7, 1.3], 0.15f32);
+        for (shape, steps) in [([1, 1, 1], 1), ([3, 5, 16], 1), ([41, 4, 7], 4), ([64, 3, 35], 4), ([97, 2, 5], 5)] {
+            let number = |seed: u64| {
+                let mut i = 0;
+                Array3::from_shape_simple_fn(shape, || {
+                    i += 1;
+                    unit(mix(seed, i)) - 0.3
+                })
+            };
+            let (towards, inside) = (number(5), number(6).mapv(|x| x > -0.2));
+            for (pulled, masked) in [(false, false), (true, true)] {
+                let run = |threads: usize, swept: bool| {
+                    let pool = rayon::ThreadPoolBuilder::new().num_threads(threads).build().unwrap();
+                    pool.install(|| {
+                        let mut prox = prox(shape, g);
+                        let (mut ahead, mut x) = (number(1), number(2));
+                        for seed in [3, 4] {
+                            let update = Update {
+                                gradient: flat_mut(&mut number(seed)),
+                                ahead: flat_mut(&mut ahead),
+                                x: flat_mut(&mut x),
+                                step: 0.7,
+                                momentum: 0.4,
+                                towards: pulled.then_some((towards.as_slice().unwrap(), 0.2)),
+                                inside: masked.then_some(inside.as_slice().unwrap()),
+                            };
+                            let left = if swept { prox.update(update, tau, steps) } else { Some(update) };
+                            if let Some(update) = left {
+                                update.around(|v, u| prox.apply(v, tau, steps, u));
+                            }
+                        }
+                        (ahead, x, prox.dual)
+                    })
+                };
+                let want = run(1, false);
+                assert!(want.1.iter().any(|x| *x > 0.0));
+                for threads in [1, 2, 3, 8] {
+                    assert!(run(threads, true) == want, "{shape:?} on {threads} threads");
+                }
             }
         }
     }

@@ -3,7 +3,7 @@
 use crate::iterative::tv::{TvProx, anisotropy, total_variation};
 use conefield_core::error::{Result, ensure};
 use conefield_core::geometry::VoxelGrid;
-use conefield_core::regularizer::{Penalty, Regularizer, RegularizerSpec};
+use conefield_core::regularizer::{Penalty, Regularizer, RegularizerSpec, Update};
 use conefield_core::space::Space;
 use ndarray::ArrayView3;
 use schemars::JsonSchema;
@@ -83,6 +83,12 @@ impl Penalty for On {
 
     fn prox(&mut self, v: &[f32], tau: f32, u: &mut [f32]) {
         self.prox.apply(v, tau, self.inner, u);
+    }
+
+    fn update(&mut self, update: Update<'_>, tau: f32) {
+        if let Some(update) = self.prox.update(update, tau, self.inner) {
+            update.around(|v, u| self.prox.apply(v, tau, self.inner, u));
+        }
     }
 
     fn state(&mut self) -> Vec<(&'static str, &mut [f32])> {
