@@ -47,6 +47,8 @@ pub trait Real:
     fn floor(self) -> Self;
     /// As a signed whole number, towards zero, saturating.
     fn int(self) -> i64;
+    /// As a whole number of 0 or more, towards zero, saturating.
+    fn count(self) -> u32;
     /// The whole part of every lane, which is at least 0 and below 2³¹, into `out`; as many as fit.
     fn cells<S: Simd>(s: S, x: V<S, Self>, out: &mut [u32]);
     /// `K` neighbours of every lane: `line[at]`, `line[at + 1]`, … The lanes of `at` are whole numbers that do not fall
@@ -89,6 +91,10 @@ impl Real for f32 {
     #[inline(always)]
     fn int(self) -> i64 {
         self as i64
+    }
+    #[inline(always)]
+    fn count(self) -> u32 {
+        self as u32
     }
     #[inline(always)]
     fn cells<S: Simd>(_: S, x: V<S, Self>, out: &mut [u32]) {
@@ -134,11 +140,19 @@ impl Real for f32 {
     fn window<S: Simd, const K: usize>(s: S, line: &[Self], at: V<S, Self>) -> [V<S, Self>; K] {
         let len = S::f32s::LEN;
         let (low, high) = (S::f32s::from_slice(s, &line[..len]), S::f32s::from_slice(s, &line[len..2 * len]));
-        let number: S::u32s = at.to_int();
+        let mut number: S::u32s = at.to_int();
+        let mut all = [low; K];
+        #[cfg(target_arch = "x86_64")]
+        if let Level::Avx512(avx512) = s.level() {
+            for taken in &mut all {
+                *taken = wide::take::<S>(s, avx512, low, high, number);
+                number += 1;
+            }
+            return all;
+        }
         // The four bytes of every lane's number.
         let mut bytes = number * 0x0404_0404 + 0x0302_0100;
         // A loop, as a closure need not be inlined into what is compiled for an instruction set.
-        let mut all = [low; K];
         for taken in &mut all {
             *taken = low.concat_swizzle_dyn(high, bytes.to_bytes());
             bytes += 0x0404_0404;
@@ -233,6 +247,10 @@ impl Real for f64 {
         self as i64
     }
     #[inline(always)]
+    fn count(self) -> u32 {
+        self as u32
+    }
+    #[inline(always)]
     fn cells<S: Simd>(_: S, x: V<S, Self>, out: &mut [u32]) {
         for (o, x) in out.iter_mut().zip(x.as_slice()) {
             *o = *x as u32;
@@ -277,11 +295,46 @@ impl Real for f64 {
     }
 }
 
-/// [`Real::neighbours`] by reading memory.
+/// What AVX-512 does in one instruction and vectors of bytes in three.
+#[cfg(target_arch = "x86_64")]
+// The macro calls instructions of a set that its token proves to be there.
+#[allow(unsafe_code)]
+mod wide {
+    use super::{Simd, SimdBase};
+    use fearless_simd::x86::Avx512;
+    use fearless_simd::{SimdFrom, f32x16, kernel, u32x16};
+    use std::arch::x86_64::{__m512, __m512i, _mm512_permutex2var_ps};
+
+    kernel!(
+        #[inline(always)]
+        fn permute(token: Avx512, low: __m512, number: __m512i, high: __m512) -> __m512 {
+            let _ = token;
+            _mm512_permutex2var_ps(low, number, high)
+        }
+    );
+
+    /// The number that each lane of `number` counts, of those in `low` and then in `high`.
+    #[inline(always)]
+    pub(super) fn take<S: Simd>(s: S, avx512: Avx512, low: S::f32s, high: S::f32s, number: S::u32s) -> S::f32s {
+        let [low, high] = [low, high].map(|x| f32x16::from_slice(avx512, x.as_slice()).into());
+        let number = u32x16::from_slice(avx512, number.as_slice()).into();
+        S::f32s::from_slice(s, f32x16::simd_from(avx512, permute(avx512, low, number, high)).as_slice())
+    }
+}
+
+/// [`Real::neighbours`] by reading memory. Loops, as a call, though it be rare, makes the compiler keep all vectors around it
+/// in memory.
 #[inline(always)]
 fn one_by_one<S: Simd, R: Real, const K: usize>(s: S, line: &[R], at: V<S, R>) -> [V<S, R>; K] {
-    let at = at.as_slice();
-    std::array::from_fn(|k| V::<S, R>::from_fn(s, |lane| line[at[lane].int() as usize + k]))
+    let mut all = [at; K];
+    for (k, taken) in all.iter_mut().enumerate() {
+        let mut numbers = [R::ZERO; WIDEST];
+        for (number, at) in numbers.iter_mut().zip(at.as_slice()) {
+            *number = line[at.count() as usize + k];
+        }
+        *taken = V::<S, R>::from_slice(s, &numbers[..V::<S, R>::LEN]);
+    }
+    all
 }
 
 /// A piece of work that is compiled for every instruction set. `call` must be `#[inline(always)]`.
@@ -333,7 +386,7 @@ pub fn level_name() -> &'static str {
 }
 
 /// Lanes of the widest vector there is.
-const WIDEST: usize = 16;
+pub const WIDEST: usize = 16;
 
 /// Up to a vector's worth of `x` from `at`; lanes past the end are 0.
 #[inline(always)]

@@ -5,9 +5,9 @@
 //! added. The voxels of a line along z stand in a row on the detector, and read columns of pixels as `readers` has it.
 
 use super::layout::{ColumnMajor, Pinhole};
-use super::readers::{Among, PAD, Path, places, read};
+use super::readers::{Among, Ends, PAD, Path, Stands, places, read};
 use conefield_core::geometry::Geometry;
-use conefield_core::simd::{Op, Real, Simd, SimdBase, SimdFloat, V, load, run, store};
+use conefield_core::simd::{Op, Real, Simd, SimdBase, SimdFloat, V, WIDEST, run};
 use conefield_core::voxel::VoxelView;
 use ndarray::{ArrayViewMut3, Axis};
 use rayon::prelude::*;
@@ -51,14 +51,15 @@ impl<R: Real> Op for Planes<'_, R> {
     fn call<S: Simd>(self, s: S) {
         let Self { detector, pixels, zeros, views, first, mut planes } = self;
         let nz = planes.dim().2;
-        let mut q = vec![R::ZERO; nz + V::<S, R>::LEN];
+        let mut q = vec![R::ZERO; nz.next_multiple_of(V::<S, R>::LEN)];
+        let mut stands = Stands::new(q.len() / V::<S, R>::LEN);
         for (index, view) in views.iter().enumerate() {
             let image = Image { view, detector, pixels, index, zeros };
             for (x, mut plane) in planes.outer_iter_mut().enumerate() {
                 for (y, line) in plane.outer_iter_mut().enumerate() {
                     let Some(voxels) = line.into_slice() else { continue };
                     match Line::of(&image, [first + x, y], nz) {
-                        Some(line) => image.add(s, &line, &mut q, voxels),
+                        Some(line) => image.add(s, &line, &mut q, &mut stands, voxels),
                         None => image.add_one_by_one([first + x, y], voxels),
                     }
                 }
@@ -114,9 +115,9 @@ struct Image<'a, R> {
 }
 
 impl<R: Real> Image<'_, R> {
-    /// Adds to `voxels` what they read on their line; `q` is room for where they stand.
+    /// Adds to `voxels` what they read on their line; `q` and `stands` are room for where they stand.
     #[inline(always)]
-    fn add<S: Simd>(&self, s: S, line: &Line, q: &mut [R], voxels: &mut [R]) {
+    fn add<S: Simd>(&self, s: S, line: &Line, q: &mut [R], stands: &mut Stands<R>, voxels: &mut [R]) {
         let len = V::<S, R>::LEN;
         let [rows, columns] = self.detector;
         let among = Among {
@@ -126,24 +127,27 @@ impl<R: Real> Image<'_, R> {
         };
         places(s, 0.0, [line.middle, line.bend], [0.0, voxels.len() as f64 - 1.0], q);
         let path = line.path.narrow();
-        let column = |c: isize| match usize::try_from(c) {
-            Ok(c) if c < columns => self.pixels.column(self.index, c),
+        stands.place(&path, &among, &Ends::of(q, len), len);
+        let column = |c: usize| match c.checked_sub(1) {
+            Some(c) if c < columns => self.pixels.column(self.index, c),
             _ => self.zeros,
         };
         let weight = V::<S, R>::splat(s, R::of(line.weight));
         let (bend, one) = (V::<S, R>::splat(s, R::of(-line.bend)), V::<S, R>::splat(s, R::ONE));
-        let mut i = 0;
-        while i < voxels.len() {
-            let ends = [q[i], q[i + len - 1]];
-            let q = V::<S, R>::from_slice(s, &q[i..i + len]);
-            if let Some(found) = read(s, &path, &among, q, ends, column) {
-                // The middle's depth over the voxel's is 1/(1 + bend·ρ) = 1 − bend·q.
-                let nearer = q.mul_add(bend, one);
-                let sum = (found * weight).mul_add(nearer * nearer, load(s, voxels, i));
-                store::<S, R>(sum, voxels, i);
-            }
-            i += len;
+        // The end of a line that is no whole vector is worked on beside it.
+        let (whole, rest) = voxels.split_at_mut(voxels.len() - voxels.len() % len);
+        let mut tail = [R::ZERO; WIDEST];
+        tail[..rest.len()].copy_from_slice(rest);
+        for (i, q) in q.chunks_exact(len).enumerate() {
+            let q = V::<S, R>::from_slice(s, q);
+            let Some(found) = read(s, &path, &among, stands, i, q, column) else { continue };
+            let voxels = if i * len < whole.len() { &mut whole[i * len..(i + 1) * len] } else { &mut tail[..len] };
+            // The middle's depth over the voxel's is 1/(1 + bend·ρ) = 1 − bend·q.
+            let nearer = q.mul_add(bend, one);
+            let sum = (found * weight).mul_add(nearer * nearer, V::<S, R>::from_slice(s, voxels));
+            sum.store_slice(voxels);
         }
+        rest.copy_from_slice(&tail[..rest.len()]);
     }
 
     /// The same voxel by voxel, wherever they lie.

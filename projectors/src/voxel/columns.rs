@@ -6,10 +6,10 @@
 //! that are less than a voxel away, with the same hat-shaped weights.
 
 use super::layout::{ColumnMajor, batch, column_major_bytes, main_axis, to_voxels};
-use super::readers::{Among, PAD, Path, mix, places, read, read_on};
+use super::readers::{Among, Ends, PAD, Path, Stands, mix, places, read, read_on};
 use conefield_core::geometry::{Geometry, Vec3, dot, sub};
 use conefield_core::scan::ScanHeader;
-use conefield_core::simd::{Op, Real, Simd, SimdBase, SimdFloat, V, load, run, store};
+use conefield_core::simd::{Op, Real, Simd, SimdBase, SimdFloat, V, WIDEST, run};
 use ndarray::{ArrayView3, ArrayViewMut2, ArrayViewMut3, Axis};
 use rayon::prelude::*;
 use std::ops::Range;
@@ -150,9 +150,9 @@ impl Column {
         self.bend == 0.0 && self.drift[0] == 0.0
     }
 
-    /// `q` of the first and the last row.
-    fn ends(&self) -> [f64; 2] {
-        [self.rows.start, self.rows.end - 1].map(|row| {
+    /// `q` of the first and the last of `rows`.
+    fn ends(&self, rows: Range<usize>) -> [f64; 2] {
+        [rows.start, rows.end - 1].map(|row| {
             let r = row as f64 - self.middle;
             r / (1.0 + self.bend * r)
         })
@@ -176,16 +176,10 @@ impl Column {
     }
 }
 
-/// For every line of voxels along z where it holds anything but zero.
-fn occupied<R: Real>(volume: &[R], lines: usize, nz: usize) -> Vec<Range<usize>> {
-    let mut all = vec![0..0; lines];
-    all.par_iter_mut().zip(volume.par_chunks(nz)).for_each(|(range, line)| {
-        if let Some(first) = line.iter().position(|x| *x != R::ZERO) {
-            let last = line.iter().rposition(|x| *x != R::ZERO).unwrap_or(first);
-            *range = first..last + 1;
-        }
-    });
-    all
+/// Where a line holds anything but zero.
+fn occupied<R: Real>(line: &[R]) -> Range<usize> {
+    let Some(first) = line.iter().position(|x| *x != R::ZERO) else { return 0..0 };
+    first..line.iter().rposition(|x| *x != R::ZERO).unwrap_or(first) + 1
 }
 
 fn union(a: &Range<usize>, b: &Range<usize>) -> Range<usize> {
@@ -207,7 +201,8 @@ pub fn forward<R: Real>(
     let Some(voxels) = volume.as_slice() else { return };
     let shape = geometry.volume.shape;
     let [nx, ny, nz] = shape;
-    let occupied = occupied(voxels, nx * ny, nz);
+    let mut lines = vec![0..0; nx * ny];
+    lines.par_iter_mut().zip(voxels.par_chunks(nz)).for_each(|(range, line)| *range = occupied(line));
     let rows = geometry.detector[0];
     projections.into_par_iter().zip(views).for_each(|(mut out, (view, columns))| {
         let downwards = geometry.views[*view].v[2] < 0.0;
@@ -215,11 +210,13 @@ pub fn forward<R: Real>(
             let first = n * STRIP;
             let at = |number: usize| columns.partition_point(|c| c.number < number);
             let columns = &columns[at(first)..at(first + STRIP)];
-            let mut sums = vec![R::ZERO; out.ncols() * rows];
-            run(Forward { shape, voxels, occupied: &occupied, columns, first, rows, sums: &mut sums });
+            // Not a power of two apart: rows of many columns would share few places in the cache.
+            let apart = rows.next_multiple_of(WIDEST) + WIDEST;
+            let mut sums = vec![R::ZERO; out.ncols() * apart];
+            run(Forward { shape, voxels, occupied: &lines, columns, first, apart, sums: &mut sums });
             for row in 0..rows {
                 let mut line = out.row_mut(if downwards { rows - 1 - row } else { row });
-                line.iter_mut().zip(sums.chunks(rows)).for_each(|(out, sums)| *out = sums[row]);
+                line.iter_mut().zip(sums.chunks(apart)).for_each(|(out, sums)| *out = sums[row]);
             }
         });
     });
@@ -233,7 +230,8 @@ struct Forward<'a, R> {
     columns: &'a [Column],
     /// The first column.
     first: usize,
-    rows: usize,
+    /// Numbers from column to column of `sums`.
+    apart: usize,
     /// `[column][rows]`, from below.
     sums: &'a mut [R],
 }
@@ -247,10 +245,10 @@ struct Plane<R> {
 }
 
 impl<R> Plane<R> {
-    /// Line `l`, from −1 to the number of lines.
+    /// Line `l`, counted from line −1.
     #[inline(always)]
-    fn line<'a>(&self, shelf: &'a [R], l: isize, stride: usize) -> &'a [R] {
-        &shelf[(self.start + (l + 1) * stride as isize) as usize..][..stride]
+    fn line<'a>(&self, shelf: &'a [R], l: usize, stride: usize) -> &'a [R] {
+        &shelf[(self.start + (l * stride) as isize) as usize..][..stride]
     }
 }
 
@@ -259,85 +257,98 @@ impl<R: Real> Op for Forward<'_, R> {
     #[inline(always)]
     fn call<S: Simd>(self, s: S) {
         let len = V::<S, R>::LEN;
-        let stride = self.shape[2] + 2 * PAD;
-        let room = self.rows + len;
-        let mut q = vec![R::ZERO; self.columns.len() * room];
-        for (c, q) in self.columns.iter().zip(q.chunks_mut(room)) {
-            c.places(s, c.rows.start as f64, q);
-        }
+        let stride = stride(self.shape[2]);
+        let vectors = self.apart / len;
+        let readers: Vec<(Vec<R>, Ends<R>)> = self.columns.iter().map(|c| self.readers(s, c)).collect();
         let mut shelf = vec![];
         let mut mixed = vec![R::ZERO; PLANES * stride];
+        let mut stands: [_; PLANES] = std::array::from_fn(|_| Stands::new(vectors));
+        let mut parts = vec![R::ZERO; vectors * len];
         for main in 0..2 {
             for from in (0..self.shape[main]).step_by(PLANES) {
                 let planes = self.planes(main, from..(from + PLANES).min(self.shape[main]), &mut shelf);
                 if planes.is_empty() {
                     continue;
                 }
-                let columns = self.columns.iter().zip(q.chunks(room)).filter(|(c, _)| c.main == main);
-                for (c, q) in columns {
-                    let mut paths: [Option<(Path<R>, &Plane<R>)>; PLANES] = [const { None }; PLANES];
-                    for (path, plane) in paths.iter_mut().zip(&planes) {
-                        *path = c.meet(plane.number).map(|path| (path.narrow(), plane));
-                    }
+                for (c, (q, ends)) in self.columns.iter().zip(&readers).filter(|(c, _)| c.main == main) {
                     // All rows of an upright column are between the same two lines: those are mixed once.
                     let upright = c.is_upright();
-                    if upright {
-                        for (path, mixed) in paths.iter_mut().zip(mixed.chunks_mut(stride)) {
-                            *path = path.take().filter(|(path, plane)| {
-                                let y = path.across[0];
-                                let meets = y > R::of(-1.0) && y < plane.among.lines;
-                                if meets {
-                                    let low = y.floor();
-                                    let [a, b] = [0, 1].map(|k| plane.line(&shelf, low.int() as isize + k, stride));
-                                    mix(s, a, b, y - low, mixed);
-                                }
-                                meets
-                            });
+                    let mut met: [Option<(Path<R>, &Plane<R>)>; PLANES] = [const { None }; PLANES];
+                    let mut count = 0;
+                    for plane in &planes {
+                        let Some(path) = c.meet(plane.number).map(|path| path.narrow::<R>()) else { continue };
+                        if upright {
+                            let y = path.across[0];
+                            if y <= R::of(-1.0) || y >= plane.among.lines {
+                                continue;
+                            }
+                            let low = y.floor();
+                            let first = (low + R::ONE).count() as usize;
+                            let [a, b] = [first, first + 1].map(|l| &plane.line(&shelf, l, stride)[PAD..]);
+                            mix(s, a, b, y - low, &mut mixed[count * stride..][PAD..stride - PAD]);
+                            stands[count].place_along(&path, &plane.among, ends, len);
+                        } else {
+                            stands[count].place(&path, &plane.among, ends, len);
                         }
+                        met[count] = Some((path, plane));
+                        count += 1;
                     }
-                    let sums = &mut self.sums[(c.number - self.first) * self.rows..][c.rows.clone()];
-                    let mut i = 0;
-                    while i < sums.len() {
-                        let ends = [q[i], q[i + len - 1]];
-                        let q = V::<S, R>::from_slice(s, &q[i..i + len]);
-                        // Sums of a few planes, added up in turn: two short sums round less than one long one.
+                    // Sums of a few planes, added up in turn: two short sums round less than one long one.
+                    for (i, (q, sums)) in q.chunks_exact(len).zip(parts.chunks_exact_mut(len)).enumerate() {
+                        let q = V::<S, R>::from_slice(s, q);
                         let mut part = V::<S, R>::splat(s, R::ZERO);
-                        for (path, mixed) in paths.iter().zip(mixed.chunks(stride)) {
-                            let Some((path, plane)) = path else { continue };
+                        for ((met, stands), mixed) in met.iter().zip(&stands).zip(mixed.chunks(stride)) {
+                            let Some((path, plane)) = met else { break };
                             let found = if upright {
-                                read_on(s, path, &plane.among, q, ends, mixed)
+                                read_on(s, path, &plane.among, stands, i, q, mixed)
                             } else {
-                                read(s, path, &plane.among, q, ends, |l| plane.line(&shelf, l, stride))
+                                read(s, path, &plane.among, stands, i, q, |l| plane.line(&shelf, l, stride))
                             };
                             if let Some(found) = found {
                                 part += found;
                             }
                         }
-                        store::<S, R>(load(s, sums, i) + part, sums, i);
-                        i += len;
+                        part.store_slice(sums);
                     }
+                    let sums = &mut self.sums[(c.number - self.first) * self.apart..][c.rows.clone()];
+                    sums.iter_mut().zip(&parts).for_each(|(sum, part)| *sum += *part);
                 }
             }
         }
         for c in self.columns {
-            c.lengthen(&mut self.sums[(c.number - self.first) * self.rows..][c.rows.clone()]);
+            c.lengthen(&mut self.sums[(c.number - self.first) * self.apart..][c.rows.clone()]);
         }
     }
 }
 
+/// Numbers of a line of `nz` between zeros: whole vectors.
+fn stride(nz: usize) -> usize {
+    nz.next_multiple_of(WIDEST) + 2 * PAD
+}
+
 impl<R: Real> Forward<'_, R> {
+    /// q of the rows of a column, and of the ends of its vectors.
+    #[inline(always)]
+    fn readers<S: Simd>(&self, s: S, c: &Column) -> (Vec<R>, Ends<R>) {
+        let len = V::<S, R>::LEN;
+        let mut q = vec![R::ZERO; c.rows.len().next_multiple_of(len)];
+        c.places(s, c.rows.start as f64, &mut q);
+        let ends = Ends::of(&q, len);
+        (q, ends)
+    }
+
     /// Puts the lines of the planes `planes` that the strip may read side by side, between zeros: from afar they would share
     /// few places in the cache. Planes without any are left out.
     fn planes(&self, main: usize, planes: Range<usize>, shelf: &mut Vec<R>) -> Vec<Plane<R>> {
         let [_, ny, nz] = self.shape;
-        let (others, stride) = (self.shape[1 - main] as f64, nz + 2 * PAD);
+        let (others, stride) = (self.shape[1 - main] as f64, stride(nz));
         shelf.clear();
         let mut all = vec![];
         for number in planes {
             let (mut low, mut high) = (f64::INFINITY, f64::NEG_INFINITY);
             for c in self.columns.iter().filter(|c| c.main == main) {
                 let Some(path) = c.meet(number) else { continue };
-                for at in c.ends().map(|q| path.across(q)) {
+                for at in c.ends(c.rows.clone()).map(|q| path.across(q)) {
                     (low, high) = (low.min(at), high.max(at));
                 }
             }
@@ -380,7 +391,8 @@ pub fn scratch(header: &ScanHeader, views: usize) -> u64 {
     let at_once = views.min(batch::<f32>(header.detector));
     let tile = TILE * (nx.max(ny) + 2) * (nz + 2 * PAD) + 3 * (rows + 2 * PAD);
     let tiles = rayon::current_num_threads().min(nx.max(ny).div_ceil(TILE)) * tile * size_of::<f32>();
-    column_major_bytes::<f32>(header.detector, at_once) + (views * columns * size_of::<Column>() + tiles) as u64
+    column_major_bytes::<f32>(header.detector, at_once)
+        + (views * columns * (size_of::<Column>() + size_of::<Range<usize>>()) + tiles) as u64
 }
 
 /// Adds the adjoint of [`forward`] to `volume`. `projections` holds an image for each of `views`.
@@ -397,21 +409,33 @@ pub fn adjoint<R: Real>(
         let numbers: Vec<usize> = views.iter().map(|v| v.0).collect();
         let images = projections.slice_axis(Axis(0), part.into());
         let mut pixels = ColumnMajor::new(geometry, &numbers, images, |_, _, _, x| x);
-        pixels.views_mut().zip(views).for_each(|(mut view, (_, columns))| {
-            for c in *columns {
-                run(Lengthen(c, view.rows(c.number, c.rows.clone())));
-            }
+        // Rows of each column that hold anything but zero: what an empty volume makes of air is not gathered.
+        let lengthened = pixels.views_mut().zip(views).map(|(mut view, (_, columns))| {
+            let rows = |c: &Column| {
+                let pixels = view.rows(c.number, c.rows.clone());
+                run(Lengthen(c, pixels));
+                let found = occupied(pixels);
+                c.rows.start + found.start..c.rows.start + found.end
+            };
+            columns.iter().map(rows).collect()
         });
+        let occupied: Vec<Vec<Range<usize>>> = lengthened.collect();
         for main in 0..2 {
             let mut turned = volume.view_mut().permuted_axes([main, 1 - main, 2]);
             turned.axis_chunks_iter_mut(Axis(0), TILE).into_par_iter().enumerate().for_each(|(n, mut planes)| {
                 let (count, lines, nz) = planes.dim();
                 let stride = nz + 2 * PAD;
                 let mut gathered = vec![R::ZERO; count * (lines + 2) * stride];
-                run(Adjoint { main, first: n * TILE, lines, nz, gathered: &mut gathered, views, pixels: &pixels });
+                let first = n * TILE;
+                let (occupied, pixels) = (&occupied, &pixels);
+                run(Adjoint { main, first, lines, nz, gathered: &mut gathered, views, occupied, pixels });
                 for (mut plane, found) in planes.outer_iter_mut().zip(gathered.chunks((lines + 2) * stride)) {
                     for (mut line, found) in plane.outer_iter_mut().zip(found.chunks(stride).skip(1)) {
-                        line.iter_mut().zip(&found[PAD..]).for_each(|(voxel, x)| *voxel += *x);
+                        let found = &found[PAD..];
+                        match line.as_slice_mut() {
+                            Some(line) => line.iter_mut().zip(found).for_each(|(voxel, x)| *voxel += *x),
+                            None => line.iter_mut().zip(found).for_each(|(voxel, x)| *voxel += *x),
+                        }
                     }
                 }
             });
@@ -440,6 +464,8 @@ struct Adjoint<'a, R> {
     /// `[plane][1 + lines + 1][PAD + nz + PAD]`: the lines before the first and after the last are not looked at.
     gathered: &'a mut [R],
     views: &'a [(usize, &'a [Column])],
+    /// The rows of each column that hold anything.
+    occupied: &'a [Vec<Range<usize>>],
     pixels: &'a ColumnMajor<R>,
 }
 
@@ -450,8 +476,12 @@ impl<R: Real> Op for Adjoint<'_, R> {
         let (stride, lines) = (self.nz + 2 * PAD, self.lines + 2);
         let count = self.gathered.len() / (lines * stride);
         let (mut alone, mut q) = (vec![], vec![]);
-        for (view, (_, columns)) in self.views.iter().enumerate() {
-            for c in columns.iter().filter(|c| c.main == self.main) {
+        let mut windows = Windows::default();
+        for (view, ((_, columns), occupied)) in self.views.iter().zip(self.occupied).enumerate() {
+            for (c, occupied) in columns.iter().zip(occupied).filter(|(c, _)| c.main == self.main) {
+                if occupied.is_empty() {
+                    continue;
+                }
                 let mut pixels = self.pixels.column(view, c.number);
                 let rows = pixels.len() - 2 * PAD;
                 if c.rows != (0..rows) {
@@ -462,11 +492,12 @@ impl<R: Real> Op for Adjoint<'_, R> {
                     alone[own.clone()].copy_from_slice(&pixels[own]);
                     pixels = &alone;
                 }
+                let ends = c.ends(occupied.clone());
                 let mut placed = false;
                 for p in 0..count {
                     let Some(path) = c.meet(self.first + p) else { continue };
-                    let Some(hit) = Hit::of(c, path, self.lines, self.nz) else { continue };
-                    if !placed {
+                    let Some(hit) = Hit::of(c, ends, path, self.lines, self.nz) else { continue };
+                    if !placed && !c.is_upright() {
                         q.resize(pixels.len(), R::ZERO);
                         c.places(s, -(PAD as f64), &mut q);
                         placed = true;
@@ -474,20 +505,60 @@ impl<R: Real> Op for Adjoint<'_, R> {
                     let plane = &mut self.gathered[p * lines * stride..(p + 1) * lines * stride];
                     let from = [pixels, &q];
                     match (hit.taps, c.is_upright()) {
-                        (0..=2, true) => hit.gather_upright::<S, R, 2>(s, pixels, plane, stride),
-                        (3, true) => hit.gather_upright::<S, R, 3>(s, pixels, plane, stride),
-                        (4, true) => hit.gather_upright::<S, R, 4>(s, pixels, plane, stride),
-                        (5..=6, true) => hit.gather_upright::<S, R, 6>(s, pixels, plane, stride),
-                        (7..=TAPS, true) => hit.gather_upright::<S, R, TAPS>(s, pixels, plane, stride),
-                        (0..=2, _) => hit.gather::<S, R, 2>(s, from, plane, stride),
-                        (3, _) => hit.gather::<S, R, 3>(s, from, plane, stride),
-                        (4, _) => hit.gather::<S, R, 4>(s, from, plane, stride),
-                        (5..=6, _) => hit.gather::<S, R, 6>(s, from, plane, stride),
-                        (7..=TAPS, _) => hit.gather::<S, R, TAPS>(s, from, plane, stride),
-                        _ => hit.scatter(from, plane, stride),
+                        (0..=2, true) => hit.gather_upright::<S, R, 2>(s, pixels, plane, stride, &mut windows),
+                        (3, true) => hit.gather_upright::<S, R, 3>(s, pixels, plane, stride, &mut windows),
+                        (4, true) => hit.gather_upright::<S, R, 4>(s, pixels, plane, stride, &mut windows),
+                        (5..=6, true) => hit.gather_upright::<S, R, 6>(s, pixels, plane, stride, &mut windows),
+                        (7..=TAPS, true) => hit.gather_upright::<S, R, TAPS>(s, pixels, plane, stride, &mut windows),
+                        (0..=2, _) => hit.gather::<S, R, 2>(s, from, plane, stride, &mut windows),
+                        (3, _) => hit.gather::<S, R, 3>(s, from, plane, stride, &mut windows),
+                        (4, _) => hit.gather::<S, R, 4>(s, from, plane, stride, &mut windows),
+                        (5..=6, _) => hit.gather::<S, R, 6>(s, from, plane, stride, &mut windows),
+                        (7..=TAPS, _) => hit.gather::<S, R, TAPS>(s, from, plane, stride, &mut windows),
+                        _ => {
+                            q.resize(pixels.len(), R::ZERO);
+                            c.places(s, -(PAD as f64), &mut q);
+                            hit.scatter([pixels, &q], plane, stride);
+                        }
                     }
                 }
             }
+        }
+    }
+}
+
+/// What vectors of voxels on one line gather from: the same for all voxels of a vector, and found for many vectors at a time.
+#[derive(Default)]
+struct Windows<R> {
+    /// The first row that may share a voxel of the vector, in a column between zeros.
+    first: Vec<u32>,
+    /// How far the first voxel's first such row is from there, and a row more: what lanes begin to count from.
+    from: Vec<R>,
+    /// Rows from voxel to voxel.
+    apart: Vec<R>,
+    /// How far the first voxel is from where q is 0, in voxels; of an upright column how far that row is from the voxel.
+    off: Vec<R>,
+    /// The first line, counted from line −1, and one after the last; or [`Windows::NONE`], or [`Windows::PAIR`].
+    low: Vec<u32>,
+    until: Vec<u32>,
+    /// How far the first voxel's place is from the first line, in lines.
+    across: Vec<R>,
+}
+
+impl<R: Real> Windows<R> {
+    /// Between no lines. One after the last is 2 or more otherwise.
+    const NONE: u32 = 1;
+    /// Between the same two lines.
+    const PAIR: u32 = 0;
+
+    /// Room for `n` vectors.
+    #[inline(always)]
+    fn resize(&mut self, n: usize) {
+        for numbers in [&mut self.first, &mut self.low, &mut self.until] {
+            numbers.resize(n, 0);
+        }
+        for numbers in [&mut self.from, &mut self.apart, &mut self.off, &mut self.across] {
+            numbers.resize(n, R::ZERO);
         }
     }
 }
@@ -510,9 +581,8 @@ struct Hit<'a> {
 }
 
 impl<'a> Hit<'a> {
-    fn of(column: &'a Column, path: Path<f64>, lines: usize, numbers: usize) -> Option<Self> {
+    fn of(column: &'a Column, ends: [f64; 2], path: Path<f64>, lines: usize, numbers: usize) -> Option<Self> {
         let lines = lines as f64;
-        let ends = column.ends();
         let [a, b] = ends.map(|q| path.across(q));
         let [low, high] = ends.map(|q| path.along(q));
         if a.max(b) <= -1.0 || a.min(b) >= lines || high <= -1.0 || low >= numbers as f64 {
@@ -536,47 +606,94 @@ impl<'a> Hit<'a> {
         self.column.middle + q / (1.0 - self.column.bend * q)
     }
 
+    /// What the vectors of voxels of an upright column gather from.
+    #[inline(always)]
+    fn windows_upright<R: Real>(&self, n: usize, len: usize, windows: &mut Windows<R>) {
+        windows.resize(n);
+        let Windows { first, from, off, .. } = windows;
+        let (first, starts, off) = (&mut first[..n], &mut from[..n], &mut off[..n]);
+        for i in 0..n {
+            let z = (self.z.start + i * len) as f64;
+            let from = self.column.middle + (z - self.path.along[0]) * self.per_z - self.reach;
+            let base = from.floor();
+            first[i] = (base + (1.0 + PAD as f64)).count();
+            starts[i] = R::of(from - base);
+            let q = base + 1.0 - self.column.middle;
+            off[i] = R::of(q.mul_add(self.path.along[1], self.path.along[0] - z));
+        }
+    }
+
+    /// What the vectors of voxels of any column gather from.
+    #[inline(always)]
+    fn windows<R: Real>(&self, n: usize, len: usize, windows: &mut Windows<R>) {
+        windows.resize(n);
+        let Windows { first, from, apart, off, low, until, across } = windows;
+        let (first, starts, apart, off) = (&mut first[..n], &mut from[..n], &mut apart[..n], &mut off[..n]);
+        let (low, until, across) = (&mut low[..n], &mut until[..n], &mut across[..n]);
+        let per_z = self.path.across[1] * self.per_z;
+        for i in 0..n {
+            let z = self.z.start + i * len;
+            let next = (z + len).min(self.z.end);
+            let (row, after) = (self.row(z as f64), self.row(next as f64));
+            let from = row - self.reach;
+            let base = from.floor();
+            first[i] = (base + (1.0 + PAD as f64)).count();
+            starts[i] = R::of(from - base);
+            apart[i] = R::of((after - row) / (next - z) as f64);
+            off[i] = R::of(self.path.along[0] - z as f64);
+            // Beside the rows that touch this vector: across which lines they go.
+            let y = self.path.across[0] + per_z * (z as f64 - self.path.along[0]);
+            let (a, b) = (y - per_z, y + per_z * len as f64);
+            let (lowest, highest) = (a.min(b).floor(), a.max(b).floor());
+            let line = lowest.max(-1.0);
+            low[i] = (line + 1.0).count();
+            until[i] = if highest < -1.0 || lowest >= self.lines {
+                Windows::<R>::NONE
+            } else if lowest == highest && lowest >= -1.0 {
+                Windows::<R>::PAIR
+            } else {
+                ((highest + 1.0).min(self.lines) + 2.0).count()
+            };
+            across[i] = R::of(y - line);
+        }
+    }
+
     /// Every voxel sums over the rows that are less than a voxel away: at most `K` of them. `from` are pixels and their q.
     #[inline(always)]
-    fn gather<S: Simd, R: Real, const K: usize>(&self, s: S, [pixels, q]: [&[R]; 2], plane: &mut [R], stride: usize) {
+    fn gather<S: Simd, R: Real, const K: usize>(
+        &self,
+        s: S,
+        [pixels, q]: [&[R]; 2],
+        plane: &mut [R],
+        stride: usize,
+        windows: &mut Windows<R>,
+    ) {
         let len = V::<S, R>::LEN;
-        let number = |x: f64| V::<S, R>::splat(s, R::of(x));
+        let number = |x: R| V::<S, R>::splat(s, x);
         let lanes = V::<S, R>::from_fn(s, |i| R::of(i as f64));
-        let (zero, one) = (number(0.0), number(1.0));
-        let Path { across, along } = self.path;
-        let per_z = across[1] * self.per_z;
-        let (rise, slant) = (number(along[1]), number(per_z));
-        let whole = self.lines;
-        let mut row = self.row(self.z.start as f64);
-        let mut z = self.z.start;
-        while z < self.z.end {
-            let next = (z + len).min(self.z.end);
-            let after = self.row(next as f64);
-            let apart = (after - row) / (next - z) as f64;
-            // Beside the rows that touch this vector: across which lines they go.
-            let y = across[0] + per_z * (z as f64 - along[0]);
-            let (a, b) = (y - per_z, y + per_z * len as f64);
-            let (low, high) = (a.min(b).floor(), a.max(b).floor());
-            let from = row - self.reach;
-            row = after;
-            let start = z;
-            z += len;
-            if high < -1.0 || low >= whole {
+        let (zero, one) = (number(R::ZERO), number(R::ONE));
+        let rise = number(R::of(self.path.along[1]));
+        let slant = number(R::of(self.path.across[1] * self.per_z));
+        let near = R::of((2 * len) as f64 - 1.5 - K as f64);
+        let most = number(R::of((pixels.len() - K - 1) as f64));
+        let vectors = self.z.len().div_ceil(len);
+        self.windows(vectors, len, windows);
+        for i in 0..vectors {
+            let (low, until) = (windows.low[i] as usize, windows.until[i]);
+            if until == Windows::<R>::NONE {
                 continue;
             }
-            let base = from.floor();
-            let first = (base + 1.0 + PAD as f64).max(0.0) as usize;
-            let at = lanes.mul_add(number(apart), number(from - base));
-            let near = apart * (len - 1) as f64 + 1.0 + K as f64 <= 2.0 * len as f64 - 0.5;
-            let (pixels, q) = if near {
+            let apart = windows.apart[i];
+            let at = lanes.mul_add(number(apart), number(windows.from[i])).floor();
+            let first = windows.first[i] as usize;
+            let (pixels, q) = if apart * R::of((len - 1) as f64) <= near {
                 let from = first..first + 2 * len;
-                (R::window::<S, K>(s, &pixels[from.clone()], at.floor()), R::window::<S, K>(s, &q[from], at.floor()))
+                (R::window::<S, K>(s, &pixels[from.clone()], at), R::window::<S, K>(s, &q[from], at))
             } else {
-                let most = number((pixels.len() - K - 1) as f64);
-                let at = (at.floor() + number(first as f64)).min(most);
+                let at = (at + number(R::of(first as f64))).min(most);
                 (R::neighbours::<S, K>(s, pixels, at), R::neighbours::<S, K>(s, q, at))
             };
-            let up = number(along[0] - start as f64) - lanes;
+            let up = number(windows.off[i]) - lanes;
             let mut shares = [zero; K];
             let mut away = [zero; K];
             let (mut sum, mut moment) = (zero, zero);
@@ -588,32 +705,38 @@ impl<'a> Hit<'a> {
                 (shares[k], away[k]) = (share, d);
             }
             // Where the column is at each voxel's own z, in lines from `low`.
-            let y = lanes.mul_add(slant, number(y - low));
-            let to = |l: f64| (l + 1.0) as usize * stride + PAD + start;
-            if low == high && low >= -1.0 {
+            let y = lanes.mul_add(slant, number(windows.across[i]));
+            let to = PAD + self.z.start + i * len;
+            if until == Windows::<R>::PAIR {
                 // All between the same two lines: the upper one's share is linear.
                 let upper = y.mul_add(sum, moment * slant);
-                add::<S, R>(s, plane, to(low), sum - upper);
-                add::<S, R>(s, plane, to(low + 1.0), upper);
+                add::<S, R>(s, plane, low * stride + to, sum - upper);
+                add::<S, R>(s, plane, (low + 1) * stride + to, upper);
                 continue;
             }
-            let mut l = low.max(-1.0);
-            while l <= (high + 1.0).min(whole) {
-                let off = y - number(l - low);
+            let mut off = y;
+            for l in low..until as usize {
                 let mut sum = zero;
                 for k in 0..K {
                     let off = away[k].mul_add(slant, off);
                     sum = (one - off.abs()).max(zero).mul_add(shares[k], sum);
                 }
-                add::<S, R>(s, plane, to(l), sum);
-                l += 1.0;
+                add::<S, R>(s, plane, l * stride + to, sum);
+                off -= one;
             }
         }
     }
 
     /// [`Hit::gather`] for an upright column: its rows are at equal distances, between the same two lines.
     #[inline(always)]
-    fn gather_upright<S: Simd, R: Real, const K: usize>(&self, s: S, pixels: &[R], plane: &mut [R], stride: usize) {
+    fn gather_upright<S: Simd, R: Real, const K: usize>(
+        &self,
+        s: S,
+        pixels: &[R],
+        plane: &mut [R],
+        stride: usize,
+        windows: &mut Windows<R>,
+    ) {
         let len = V::<S, R>::LEN;
         let number = |x: f64| V::<S, R>::splat(s, R::of(x));
         let lanes = V::<S, R>::from_fn(s, |i| R::of(i as f64));
@@ -626,31 +749,29 @@ impl<'a> Hit<'a> {
         let (upper, lower) = (number(y - low), number(1.0 - (y - low)));
         let rise = number(self.path.along[1]);
         let near = self.per_z * (len - 1) as f64 + 1.0 + K as f64 <= 2.0 * len as f64 - 0.5;
+        let most = number((pixels.len() - K - 1) as f64);
         let apart = lanes * number(self.per_z);
-        let mut to = (low + 1.0) as usize * stride + PAD + self.z.start;
-        for z in self.z.clone().step_by(len) {
-            let from = self.column.middle + (z as f64 - self.path.along[0]) * self.per_z - self.reach;
-            let base = from.floor();
-            let first = (base + 1.0 + PAD as f64).max(0.0) as usize;
-            let cell = (apart + number(from - base)).floor();
+        let vectors = self.z.len().div_ceil(len);
+        self.windows_upright(vectors, len, windows);
+        let (below, above) = plane[(low + 1.0).count() as usize * stride..].split_at_mut(stride);
+        let (below, above) = (&mut below[PAD + self.z.start..], &mut above[PAD + self.z.start..]);
+        for i in 0..vectors {
+            let cell = (apart + V::<S, R>::splat(s, windows.from[i])).floor();
+            let first = windows.first[i] as usize;
             let pixels = if near {
                 R::window::<S, K>(s, &pixels[first..first + 2 * len], cell)
             } else {
-                let most = number((pixels.len() - K - 1) as f64);
                 R::neighbours::<S, K>(s, pixels, (cell + number(first as f64)).min(most))
             };
             // How far the first of those rows is from each voxel, in voxels.
-            let q = base + 1.0 - self.column.middle;
-            let mut d =
-                cell.mul_add(rise, number(q.mul_add(self.path.along[1], self.path.along[0] - z as f64)) - lanes);
+            let mut d = cell.mul_add(rise, V::<S, R>::splat(s, windows.off[i]) - lanes);
             let mut sum = zero;
             for x in pixels {
                 sum = (one - d.abs()).max(zero).mul_add(x, sum);
                 d += rise;
             }
-            add::<S, R>(s, plane, to, lower * sum);
-            add::<S, R>(s, plane, to + stride, upper * sum);
-            to += len;
+            add::<S, R>(s, below, i * len, lower * sum);
+            add::<S, R>(s, above, i * len, upper * sum);
         }
     }
 

@@ -5,7 +5,7 @@
 //! both coordinates of a place are linear in q. One coordinate counts lines, the other numbers within them. Readers go
 //! upwards within lines, so a vector of them reads two vectors of neighbours and shuffles; they change lines slowly.
 
-use conefield_core::simd::{Real, Simd, SimdBase, SimdFloat, V, load, store};
+use conefield_core::simd::{Real, Simd, SimdBase, SimdFloat, V, store};
 
 /// Zeros before the first and after the last number of a line: vectors read up to so many beyond it.
 pub const PAD: usize = 32;
@@ -45,39 +45,117 @@ pub(super) struct Among<R> {
     pub span: [R; 2],
 }
 
-/// What readers at `q`, whose first and last are `ends`, find by bilinear interpolation; `None` if that is 0. `line` gives a
-/// line between [`PAD`] zeros, from −1 to the number of lines.
+/// `q` of the first and the last reader of every vector.
+pub(super) struct Ends<R> {
+    first: Vec<R>,
+    last: Vec<R>,
+}
+
+impl<R: Real> Ends<R> {
+    /// Of readers at `q`, in vectors of `len`.
+    pub fn of(q: &[R], len: usize) -> Self {
+        Self {
+            first: q.chunks_exact(len).map(|q| q[0]).collect(),
+            last: q.chunks_exact(len).map(|q| q[len - 1]).collect(),
+        }
+    }
+}
+
+/// Where every vector of readers stands on the lines of one path. What is the same for all readers of a vector is found here
+/// for many vectors at a time, which the compiler makes vectors of again; next to the readers themselves it took most of the
+/// time.
+pub(super) struct Stands<R> {
+    /// Where on a line the numbers that a vector reads begin; or [`NOWHERE`], or [`FAR`].
+    from: Vec<u32>,
+    /// What to add to `per·q` for a reader's place from there on.
+    along: Vec<R>,
+    /// The first line, counted from line −1, and one after the last; 0 for a vector that stands between two lines.
+    low: Vec<u32>,
+    until: Vec<u32>,
+    /// What to add to `per·q` for a reader's distance from the first line.
+    across: Vec<R>,
+}
+
+/// Readers of a vector find nothing but 0. No window begins here, as readers before the first number are within a vector of it.
+const NOWHERE: u32 = 0;
+/// Readers of a vector stand too far apart for a window. None begins here either.
+const FAR: u32 = 1;
+
+impl<R: Real> Stands<R> {
+    /// For so many vectors at most.
+    pub fn new(vectors: usize) -> Self {
+        let zeros = || vec![R::ZERO; vectors];
+        let numbers = || vec![0; vectors];
+        Self { from: numbers(), along: zeros(), low: numbers(), until: numbers(), across: zeros() }
+    }
+
+    /// Of vectors of `len` readers.
+    #[inline(always)]
+    pub fn place(&mut self, path: &Path<R>, among: &Among<R>, ends: &Ends<R>, len: usize) {
+        self.place_along(path, among, ends, len);
+        let below = R::of(-1.0);
+        let n = ends.first.len();
+        let (first, last) = (&ends.first[..n], &ends.last[..n]);
+        let (from, low, until) = (&mut self.from[..n], &mut self.low[..n], &mut self.until[..n]);
+        let across = &mut self.across[..n];
+        for i in 0..n {
+            let (a, b) = (path.across(first[i]), path.across(last[i]));
+            let (lowest, highest) = if a < b { (a, b) } else { (b, a) };
+            let nowhere = highest <= below || lowest >= among.lines;
+            from[i] = if nowhere { NOWHERE } else { from[i] };
+            let (at, to) = (lowest.floor(), highest.floor());
+            let whole = lowest >= below && highest < among.lines && at == to;
+            let at = if lowest < below { below } else { at };
+            let to = if highest < among.lines { to } else { among.lines - R::ONE };
+            low[i] = (at + R::ONE).count();
+            until[i] = if whole { 0 } else { (to + R::of(3.0)).count() };
+            across[i] = path.across[0] - at;
+        }
+    }
+
+    /// Of vectors of `len` readers, on a line that stands where they all do.
+    #[inline(always)]
+    pub fn place_along(&mut self, path: &Path<R>, among: &Among<R>, ends: &Ends<R>, len: usize) {
+        let n = ends.first.len();
+        let (first, last) = (&ends.first[..n], &ends.last[..n]);
+        let (from, along) = (&mut self.from[..n], &mut self.along[..n]);
+        let most = R::of(2.0 * len as f64 - 2.5);
+        for i in 0..n {
+            let (first, last) = (path.along(first[i]), path.along(last[i]));
+            // A little below the first reader, so that rounding puts none before it.
+            let base = (first - R::of(1.0 / 64.0)).floor();
+            let window = if last - base <= most { (base + R::of(PAD as f64)).count() } else { FAR };
+            from[i] = if last <= among.span[0] || first >= among.span[1] { NOWHERE } else { window };
+            along[i] = path.along[0] - base;
+        }
+    }
+}
+
+/// What the readers of vector `i`, at `q`, find by bilinear interpolation; `None` if that is 0. `line` gives a line between
+/// [`PAD`] zeros, counted from line −1.
 #[inline(always)]
 pub(super) fn read<'a, S: Simd, R: Real>(
     s: S,
     path: &Path<R>,
     among: &Among<R>,
+    stands: &Stands<R>,
+    i: usize,
     q: V<S, R>,
-    ends: [R; 2],
-    line: impl Fn(isize) -> &'a [R],
+    line: impl Fn(usize) -> &'a [R],
 ) -> Option<V<S, R>> {
     let number = |x: R| V::<S, R>::splat(s, x);
-    let [a, b] = ends.map(|q| path.across(q));
-    let (low, high) = if a < b { (a, b) } else { (b, a) };
-    let below = R::of(-1.0);
-    if high <= below || low >= among.lines {
-        return None;
-    }
-    let stand = stand::<S, R>(s, path, among, q, ends)?;
-    let whole = low >= below && high < among.lines;
-    let low = if low < below { below } else { low.floor() };
-    let high = if high < among.lines { high.floor() } else { among.lines - R::ONE };
-    let y = q.mul_add(number(path.across[1]), number(path.across[0] - low));
-    let l = low.int() as isize;
-    if whole && low == high {
-        let (a, b) = (between(s, line(l), &stand), between(s, line(l + 1), &stand));
+    let stand = stand::<S, R>(s, path, among, stands, i, q)?;
+    let y = q.mul_add(number(path.across[1]), number(stands.across[i]));
+    let (low, until) = (stands.low[i] as usize, stands.until[i] as usize);
+    if until == 0 {
+        let (a, b) = (between(s, line(low), &stand), between(s, line(low + 1), &stand));
         return Some(y.mul_add(b - a, a));
     }
     // Between more than two lines: each counts by its distance.
     let (zero, one) = (number(R::ZERO), number(R::ONE));
     let mut sum = zero;
     let mut away = y;
-    for l in l..=high.int() as isize + 1 {
+    for l in low..until {
         let found = between(s, line(l), &stand);
         sum = (one - away.abs()).max(zero).mul_add(found, sum);
         away -= one;
@@ -85,17 +163,18 @@ pub(super) fn read<'a, S: Simd, R: Real>(
     Some(sum)
 }
 
-/// What readers at `q`, whose first and last are `ends`, find on a line that stands where they all do; `None` if that is 0.
+/// What the readers of vector `i`, at `q`, find on a line that stands where they all do; `None` if that is 0.
 #[inline(always)]
 pub(super) fn read_on<S: Simd, R: Real>(
     s: S,
     path: &Path<R>,
     among: &Among<R>,
+    stands: &Stands<R>,
+    i: usize,
     q: V<S, R>,
-    ends: [R; 2],
     line: &[R],
 ) -> Option<V<S, R>> {
-    Some(between(s, line, &stand(s, path, among, q, ends)?))
+    Some(between(s, line, &stand(s, path, among, stands, i, q)?))
 }
 
 /// Where readers stand along the lines: a `share` of the way from number `cell` to the next one, counted from `from` where
@@ -106,37 +185,43 @@ struct Stand<S: Simd, R: Real> {
     share: V<S, R>,
 }
 
-/// Where readers stand along the lines; `None` where all lines are zero.
+/// Where the readers of vector `i` stand along the lines; `None` where all lines are zero.
 #[inline(always)]
-fn stand<S: Simd, R: Real>(s: S, path: &Path<R>, among: &Among<R>, q: V<S, R>, ends: [R; 2]) -> Option<Stand<S, R>> {
-    let len = V::<S, R>::LEN;
+fn stand<S: Simd, R: Real>(
+    s: S,
+    path: &Path<R>,
+    among: &Among<R>,
+    stands: &Stands<R>,
+    i: usize,
+    q: V<S, R>,
+) -> Option<Stand<S, R>> {
     let number = |x: R| V::<S, R>::splat(s, x);
-    let [first, last] = ends.map(|q| path.along(q));
-    if last <= among.span[0] || first >= among.span[1] {
-        return None;
+    let per = number(path.along[1]);
+    match stands.from[i] {
+        NOWHERE => None,
+        FAR => {
+            let far = number(among.numbers + R::of(PAD as f64));
+            let z =
+                q.mul_add(per, number(path.along[0] + R::of(PAD as f64))).max(number(R::of(PAD as f64 - 1.0))).min(far);
+            let cell = z.floor();
+            Some(Stand { from: None, cell, share: z - cell })
+        }
+        from => {
+            let z = q.mul_add(per, number(stands.along[i]));
+            let cell = z.floor();
+            Some(Stand { from: Some(from as usize), cell, share: z - cell })
+        }
     }
-    // A little below the first reader, so that rounding puts none before it.
-    let base = (first - R::of(1.0 / 64.0)).floor();
-    if last - base <= R::of(2.0 * len as f64 - 2.5) {
-        let z = q.mul_add(number(path.along[1]), number(path.along[0] - base));
-        let cell = z.floor();
-        return Some(Stand { from: Some((base.int() + PAD as i64) as usize), cell, share: z - cell });
-    }
-    let far = number(among.numbers + R::of(PAD as f64));
-    let z = (q.mul_add(number(path.along[1]), number(path.along[0] + R::of(PAD as f64))))
-        .max(number(R::of(PAD as f64 - 1.0)))
-        .min(far);
-    let cell = z.floor();
-    Some(Stand { from: None, cell, share: z - cell })
 }
 
-/// `line = (1 − share)·a + share·b`.
+/// `line = (1 − share)·a + share·b`, all of whole vectors.
 #[inline(always)]
 pub(super) fn mix<S: Simd, R: Real>(s: S, a: &[R], b: &[R], share: R, line: &mut [R]) {
+    let len = V::<S, R>::LEN;
     let share = V::<S, R>::splat(s, share);
-    for i in (0..line.len()).step_by(V::<S, R>::LEN) {
-        let a = load::<S, R>(s, a, i);
-        store::<S, R>(share.mul_add(load::<S, R>(s, b, i) - a, a), line, i);
+    for ((a, b), line) in a.chunks_exact(len).zip(b.chunks_exact(len)).zip(line.chunks_exact_mut(len)) {
+        let (a, b) = (V::<S, R>::from_slice(s, a), V::<S, R>::from_slice(s, b));
+        share.mul_add(b - a, a).store_slice(line);
     }
 }
 

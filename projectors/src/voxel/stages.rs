@@ -10,6 +10,7 @@ use conefield_core::simd::Real;
 use conefield_core::voxel::{VoxelOperator, VoxelProjector, VoxelProjectorSpec};
 use conefield_core::wgsl::Fragment;
 use ndarray::{ArrayView3, ArrayViewMut3, Axis};
+use rayon::prelude::*;
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
@@ -137,8 +138,9 @@ impl<R: Real> VoxelOperator<R> for Trilinear {
 impl<R: Real> VoxelOperator<R> for Joseph {
     fn forward(&self, geometry: &Geometry, views: &[usize], volume: ArrayView3<'_, R>, mut out: ArrayViewMut3<'_, R>) {
         let (mut fitting, mut others) = ((vec![], vec![]), (vec![], vec![]));
-        for (&v, image) in views.iter().zip(out.outer_iter_mut()) {
-            match columns::of(geometry, v) {
+        let all: Vec<_> = views.par_iter().map(|&v| columns::of(geometry, v)).collect();
+        for ((&v, columns), image) in views.iter().zip(all).zip(out.outer_iter_mut()) {
+            match columns {
                 Some(columns) => {
                     fitting.0.push((v, columns));
                     fitting.1.push(image);
@@ -159,7 +161,7 @@ impl<R: Real> VoxelOperator<R> for Joseph {
     }
 
     fn adjoint(&self, geometry: &Geometry, views: &[usize], p: ArrayView3<'_, R>, mut volume: ArrayViewMut3<'_, R>) {
-        let all: Vec<_> = views.iter().map(|&v| (v, columns::of(geometry, v))).collect();
+        let all: Vec<_> = views.par_iter().map(|&v| (v, columns::of(geometry, v))).collect();
         // Runs of views of the same kind, in order.
         let mut from = 0;
         for run in all.chunk_by(|a, b| a.1.is_some() == b.1.is_some()) {
