@@ -3,7 +3,7 @@
 use crate::error::Result;
 use crate::geometry::VoxelGrid;
 use crate::space::Space;
-use ndarray::ArrayView3;
+use ndarray::{Array3, ArrayView3};
 use rayon::prelude::*;
 
 /// Settings of a regularizer.
@@ -30,6 +30,13 @@ pub trait Regularizer: Send + Sync {
 pub trait Penalty: Send {
     /// `R(x)`, without weight.
     fn value(&self, x: ArrayView3<'_, f32>) -> f64;
+
+    /// Fits the penalty to the coefficients `x`, for one that follows what it finds. Called before each pass; what it leaves follows
+    /// from `x` alone. Returns the new `R(x)` if it changed.
+    fn adapt(&mut self, x: &Array3<f32>) -> Option<f64> {
+        let _ = x;
+        None
+    }
 
     /// Overwrites `u` with `argmin_{u ≥ 0} ½‖u − v‖² + tau·R(u)`, or comes nearer to it with each call for the same `v`. Both
     /// lie as the grid's coefficients in standard order. The result does not depend on the number of threads.

@@ -388,8 +388,9 @@ struct Iterate<'a> {
     pull: f32,
     /// FISTA's t.
     t: f64,
-    /// The last pass' objective.
+    /// The last pass' objective, and what of it is not the prior's.
     objective: f64,
+    misfit: f64,
 }
 
 impl<'a> Iterate<'a> {
@@ -414,6 +415,7 @@ impl<'a> Iterate<'a> {
             pull: (settings.pull / (1.0 + settings.pull)) as f32,
             t: 1.0,
             objective: f64::INFINITY,
+            misfit: f64::INFINITY,
         })
     }
 
@@ -454,6 +456,10 @@ impl<'a> Iterate<'a> {
 impl Iteration for Iterate<'_> {
     fn pass(&mut self, problem: &Problem<'_>, pass: u64) -> Result<Pass> {
         Zip::from(&mut self.arrays.before).and(&self.arrays.x).par_for_each(|before, x| *before = *x);
+        // Another penalty is neither progress nor relapse.
+        if let Some(value) = self.arrays.penalty.adapt(&self.arrays.x) {
+            self.objective = self.misfit + self.lambda * value;
+        }
         let (mut residual, mut misfit) = (0.0, 0.0);
         let subsets = split(self.views, self.subsets as usize);
         for s in self.order.of(subsets.len(), problem.seed, pass) {
@@ -465,7 +471,8 @@ impl Iteration for Iterate<'_> {
         let change = change(x, before);
         let prior = self.lambda * penalty.value(x.view());
         let held = |towards: &Array3<f32>| 0.5 * f64::from(self.pull) * self.lipschitz * distance(x, towards).powi(2);
-        let objective = misfit + prior + towards.as_ref().map_or(0.0, held);
+        self.misfit = misfit + towards.as_ref().map_or(0.0, held);
+        let objective = self.misfit + prior;
         if objective > self.objective {
             let fewer = (0.5 * self.subsets).ceil();
             // Of unions of the subsets before, their bound is one too.
@@ -496,6 +503,6 @@ impl Iteration for Iterate<'_> {
     }
 
     fn numbers(&mut self) -> Vec<&mut f64> {
-        vec![&mut self.t, &mut self.subsets, &mut self.objective, &mut self.lipschitz]
+        vec![&mut self.t, &mut self.subsets, &mut self.objective, &mut self.misfit, &mut self.lipschitz]
     }
 }

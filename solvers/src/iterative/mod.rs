@@ -11,6 +11,7 @@ pub mod bases;
 pub mod cgls;
 pub mod data;
 pub mod drive;
+mod edges;
 pub mod fista;
 mod model;
 pub mod monitor;

@@ -1,6 +1,10 @@
 //! Total variation of a volume: `Σ_j √(Σ_k (g_k·(x_{j+k} − x_j))²)` over voxels j and axes k, where differences across
 //! voxels of different sides count by `g_k = h/h_k` with h the sides' geometric mean. At the far faces differences are 0.
+//!
+//! With [`Edges`] it is directional: `Σ_j |D_j·∇x_j|` with `D = I − n·nᵀ`, which counts slopes across edges less than those
+//! along them (Ehrhardt and Betcke, SIAM J. Imaging Sci. 9(3), 2016, whose edges come from another image).
 
+use super::edges::Edges;
 use super::flat_mut;
 use conefield_core::geometry::VoxelGrid;
 use conefield_core::regularizer::Update;
@@ -17,7 +21,7 @@ pub fn anisotropy(grid: &VoxelGrid) -> [f32; 3] {
 }
 
 /// The total variation of `x` itself, which lies in standard order.
-pub fn total_variation(x: ArrayView3<'_, f32>, g: [f32; 3]) -> f64 {
+pub fn total_variation(x: ArrayView3<'_, f32>, g: [f32; 3], edges: Option<&Edges>) -> f64 {
     let (_, ny, nz) = x.dim();
     let plane = ny * nz;
     let x = x.as_standard_layout();
@@ -25,7 +29,10 @@ pub fn total_variation(x: ArrayView3<'_, f32>, g: [f32; 3]) -> f64 {
     let planes: Vec<f64> = all
         .par_chunks(plane.max(1))
         .enumerate()
-        .map(|(i, x)| run(Variation { x, after: all.get((i + 1) * plane..(i + 2) * plane), g, nz }))
+        .map(|(i, x)| {
+            let n = edges.map(|edges| edges.vectors().map(|n| &n[i * plane..(i + 1) * plane]));
+            run(Variation { x, after: all.get((i + 1) * plane..(i + 2) * plane), n, g, nz })
+        })
         .collect();
     planes.iter().sum()
 }
@@ -35,6 +42,8 @@ struct Variation<'a> {
     x: &'a [f32],
     /// The next plane.
     after: Option<&'a [f32]>,
+    /// The plane's edges.
+    n: Option<[&'a [f32]; 3]>,
     g: [f32; 3],
     nz: usize,
 }
@@ -60,7 +69,14 @@ impl Op for Variation<'_> {
                 let here = load(s, x, k);
                 let (a, b) = ((load(s, after, k) - here) * g[0], (load(s, next, k) - here) * g[1]);
                 let c = (load(s, &line, k + 1) - here) * g[2];
-                part += (a * a + b * b + c * c).sqrt();
+                let mut square = a * a + b * b + c * c;
+                if let Some(n) = self.n {
+                    // |D·d|² = |d|² − (2 − |n|²)·(n·d)²
+                    let n = n.map(|n| load(s, &n[j * nz..(j + 1) * nz], k));
+                    let inner = dot(n, [a, b, c]);
+                    square = (square - (S::f32s::splat(s, 2.0) - dot(n, n)) * inner * inner).max(zero);
+                }
+                part += square.sqrt();
             }
             sum += part.as_slice().iter().map(|x| f64::from(*x)).sum::<f64>();
         }
@@ -77,8 +93,10 @@ impl Op for Variation<'_> {
 pub struct TvProx {
     shape: [usize; 3],
     g: [f32; 3],
-    /// The dual variable along x, y and z.
+    /// The dual variable along x, y and z; with edges it is `D·p`.
     dual: [Array3<f32>; 3],
+    /// Edges across which slopes count less.
+    edges: Option<Edges>,
 }
 
 impl TvProx {
@@ -89,7 +107,23 @@ impl TvProx {
             let planes = (split.slabs - 1) * 4 * split.halo() + split.slabs * 2 * split.reach;
             space.hold((planes * (shape[1] + 1) * (shape[2] + 1) * size_of::<f32>()) as u64);
         });
-        Self { shape, g, dual: std::array::from_fn(|_| space.array(shape)) }
+        Self { shape, g, dual: std::array::from_fn(|_| space.array(shape)), edges: None }
+    }
+
+    /// Counts slopes across `edges` less from now on. They are none at first.
+    pub fn with_edges(self, edges: Edges) -> Self {
+        Self { edges: Some(edges), ..self }
+    }
+
+    /// Finds the edges of `x`, if they matter. Returns the total variation of `x` if that changes it.
+    pub fn adapt(&mut self, x: &Array3<f32>) -> Option<f64> {
+        self.edges.as_mut()?.find(x, self.g);
+        Some(self.value(x.view()))
+    }
+
+    /// The total variation of `x`.
+    pub fn value(&self, x: ArrayView3<'_, f32>) -> f64 {
+        total_variation(x, self.g, self.edges.as_ref())
     }
 
     /// The dual along x, y and z, for a checkpoint.
@@ -129,6 +163,7 @@ impl TvProx {
         let [nx, ny, nz] = self.shape;
         let plane = ny * nz;
         let bounds = split.bounds(nx);
+        let edges = self.edges.as_ref().map(Edges::vectors);
         let dual = self.dual.each_mut().map(flat_mut);
         // Around every inner bound, what the slab above copies of the one below, and the other way round.
         let mut halos: Vec<([Vec<f32>; 3], Vec<f32>)> = bounds[1..bounds.len() - 1]
@@ -165,7 +200,9 @@ impl TvProx {
             let [lines, others] = rest.split(range.len() * plane);
             rest = others;
             let own = copied..copied + range.len();
-            slabs.push(Sweep { planes, own, lines, v, line: nz, steps: split.reach });
+            let first = (range.start - copied) * plane;
+            let edges = edges.map(|n| n.map(|n| &n[first..first + planes.0[0].len() * plane]));
+            slabs.push(Sweep { planes, own, lines, v, edges, line: nz, steps: split.reach });
         }
         let scale = Scale::new(self.g, tau);
         slabs.into_par_iter().for_each(|slab| run(Sweeping(slab, scale)));
@@ -280,6 +317,8 @@ struct Sweep<'a, L> {
     lines: L,
     /// What the map is of below and above `own`.
     v: [&'a [f32]; 2],
+    /// The edges of all planes.
+    edges: Option<[&'a [f32]; 3]>,
     /// Numbers of a line along z.
     line: usize,
     steps: usize,
@@ -333,7 +372,9 @@ impl<L: Lines> Sweep<'_, L> {
                         let u = &kept[at(i - 1, j)..][..stride];
                         let after = if known { &kept[at(i, j)..][..nz] } else { u };
                         let next = if j + 1 < ny { &kept[at(i - 1, j + 1)..][..nz] } else { u };
-                        ascend(s, u, [after, next], scale.up, self.planes.line(i - 1, j, nz));
+                        let at = (i - 1) * plane + j * nz;
+                        let n = self.edges.map(|n| n.map(|n| &n[at..at + nz]));
+                        ascend(s, u, [after, next], n, scale.up, self.planes.line(i - 1, j, nz));
                     }
                 }
                 let Some(i) = front.checked_sub(self.steps).filter(|i| self.own.contains(i)) else { continue };
@@ -421,46 +462,74 @@ fn descent<S: Simd>(s: S, behind: [S::f32s; 3], p: [S::f32s; 3], v: S::f32s, sca
     (v - turn).max(S::f32s::splat(s, 0.0))
 }
 
-/// `p ← p + ∇u/(L·τ)` along a line, then back into the unit ball. `u` has its last number twice; `after` are the next lines
-/// along x and y, and `u` itself where there is none.
+/// `p ← p + D·∇u/(L·τ)` along a line, then back into the unit ball. `u` has its last number twice; `after` are the next lines
+/// along x and y, and `u` itself where there is none; `n` are the edges, if `D` is not 1.
 #[inline(always)]
-fn ascend<S: Simd>(s: S, u: &[f32], after: [&[f32]; 2], scale: [f32; 3], [px, py, pz]: [&mut [f32]; 3]) {
-    let (n, len) = (px.len(), S::f32s::LEN);
+fn ascend<S: Simd>(
+    s: S,
+    u: &[f32],
+    after: [&[f32]; 2],
+    n: Option<[&[f32]; 3]>,
+    scale: [f32; 3],
+    [px, py, pz]: [&mut [f32]; 3],
+) {
+    let (count, len) = (px.len(), S::f32s::LEN);
     let scale = scale.map(|x| S::f32s::splat(s, x));
     let mut k = 0;
-    while k + len <= n {
+    while k + len <= count {
         let p = [whole(s, px, k), whole(s, py, k), whole(s, pz, k)];
         let next = [whole(s, after[0], k), whole(s, after[1], k), whole(s, u, k + 1)];
-        let [x, y, z] = ascent(s, whole(s, u, k), next, p, scale);
+        let n = n.map(|n| n.map(|n| whole(s, n, k)));
+        let [x, y, z] = ascent(s, whole(s, u, k), next, p, n, scale);
         x.store_slice(&mut px[k..k + len]);
         y.store_slice(&mut py[k..k + len]);
         z.store_slice(&mut pz[k..k + len]);
         k += len;
     }
-    if k < n {
+    if k < count {
         let p = [load(s, px, k), load(s, py, k), load(s, pz, k)];
         let next = [load(s, after[0], k), load(s, after[1], k), load(s, u, k + 1)];
-        let [x, y, z] = ascent(s, load(s, u, k), next, p, scale);
+        let n = n.map(|n| n.map(|n| load(s, n, k)));
+        let [x, y, z] = ascent(s, load(s, u, k), next, p, n, scale);
         store::<S, f32>(x, px, k);
         store::<S, f32>(y, py, k);
         store::<S, f32>(z, pz, k);
     }
 }
 
-/// The dual of a vector of voxels after a step.
+/// The dual of a vector of voxels after a step. With edges it is kept as `w = D·p`, so that the primal needs no edges; then
+/// `p = D⁻¹·w = w + n·(n·w)/(1 − |n|²)`.
 #[inline(always)]
-fn ascent<S: Simd>(s: S, here: S::f32s, next: [S::f32s; 3], p: [S::f32s; 3], scale: [S::f32s; 3]) -> [S::f32s; 3] {
+fn ascent<S: Simd>(
+    s: S,
+    here: S::f32s,
+    next: [S::f32s; 3],
+    p: [S::f32s; 3],
+    n: Option<[S::f32s; 3]>,
+    scale: [S::f32s; 3],
+) -> [S::f32s; 3] {
     let one = S::f32s::splat(s, 1.0);
-    let x = (next[0] - here).mul_add(scale[0], p[0]);
-    let y = (next[1] - here).mul_add(scale[1], p[1]);
-    let z = (next[2] - here).mul_add(scale[2], p[2]);
-    let square = x.mul_add(x, y.mul_add(y, z * z));
-    // Flat parts stay in the ball: there neither the root nor the quotient is needed.
-    if square.simd_le(one).all_true() {
-        return [x, y, z];
-    }
-    let shrink = one / square.sqrt().max(one);
-    [x * shrink, y * shrink, z * shrink]
+    let Some(n) = n else {
+        let [x, y, z]: [S::f32s; 3] = std::array::from_fn(|k| (next[k] - here).mul_add(scale[k], p[k]));
+        let square = x.mul_add(x, y.mul_add(y, z * z));
+        // Flat parts stay in the ball: there neither the root nor the quotient is needed.
+        if square.simd_le(one).all_true() {
+            return [x, y, z];
+        }
+        let shrink = one / square.sqrt().max(one);
+        return [x * shrink, y * shrink, z * shrink];
+    };
+    let d: [S::f32s; 3] = std::array::from_fn(|k| (next[k] - here) * scale[k]);
+    let along = dot(n, p) / (one - dot(n, n)) - dot(n, d);
+    let p: [S::f32s; 3] = std::array::from_fn(|k| n[k].mul_add(along, p[k] + d[k]));
+    let shrink = one / dot(p, p).sqrt().max(one);
+    let inner = dot(n, p);
+    std::array::from_fn(|k| (p[k] - n[k] * inner) * shrink)
+}
+
+#[inline(always)]
+fn dot<T: Copy + std::ops::Add<Output = T> + std::ops::Mul<Output = T>>(a: [T; 3], b: [T; 3]) -> T {
+    a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
 }
 
 /// Adds `−step·∇TV/‖∇TV‖` of the smoothed total variation to `x`: a step of ASD-POCS. `work` is scratch of `x`'s length.
@@ -532,6 +601,14 @@ mod tests {
         TvProx::new(shape, g, &Space::new(ScanHeader { views: 0, detector: [0; 2], volume: shape }))
     }
 
+    /// The prior that follows the edges of `x`.
+    fn with_edges(shape: [usize; 3], g: [f32; 3], x: &Array3<f32>) -> TvProx {
+        let space = Space::new(ScanHeader { views: 0, detector: [0; 2], volume: shape });
+        let mut prox = prox(shape, g).with_edges(Edges::new(shape, 0.9, 0.7, &space));
+        assert!(prox.adapt(x).is_some());
+        prox
+    }
+
     fn noisy(shape: [usize; 3]) -> Array3<f32> {
         let mut i = 0;
         Array3::from_shape_fn(shape, |(x, _, _)| {
@@ -546,29 +623,45 @@ mod tests {
         let shape = [9, 8, 19];
         let (g, tau) = ([1.0, 0.7, 1.3], 0.15f32);
         let v = noisy(shape);
-        let mut prox = prox(shape, g);
-        let mut u = Array3::zeros(shape);
-        let gap = |u: &Array3<f32>| {
-            // P(u) = ½‖u − v‖² + τTV(u); D(p) = ½‖v‖² − ½‖max(0, v − τ∇ᵀp)‖², and u is that maximum.
-            let half = |a: f64| 0.5 * a;
-            let distance: f64 = u.iter().zip(&v).map(|(a, b)| f64::from(a - b).powi(2)).sum();
-            let primal = half(distance) + f64::from(tau) * total_variation(u.view(), g);
-            let square = |x: &Array3<f32>| x.iter().map(|&a| f64::from(a).powi(2)).sum::<f64>();
-            let dual = half(square(&v)) - half(square(u));
-            (primal - dual) / primal
-        };
-        let mut gaps = vec![];
-        for steps in [5, 20, 400] {
-            prox.apply(v.as_slice().unwrap(), tau, steps, u.as_slice_mut().unwrap());
-            gaps.push(gap(&u));
+        for directional in [false, true] {
+            let mut prox = if directional { with_edges(shape, g, &v) } else { prox(shape, g) };
+            let mut u = Array3::zeros(shape);
+            let gap = |prox: &TvProx, u: &Array3<f32>| {
+                // P(u) = ½‖u − v‖² + τTV(u); D(p) = ½‖v‖² − ½‖max(0, v − τ∇ᵀp)‖², and u is that maximum.
+                let half = |a: f64| 0.5 * a;
+                let distance: f64 = u.iter().zip(&v).map(|(a, b)| f64::from(a - b).powi(2)).sum();
+                let primal = half(distance) + f64::from(tau) * prox.value(u.view());
+                let square = |x: &Array3<f32>| x.iter().map(|&a| f64::from(a).powi(2)).sum::<f64>();
+                let dual = half(square(&v)) - half(square(u));
+                (primal - dual) / primal
+            };
+            let mut gaps = vec![];
+            for steps in [5, 20, 400] {
+                prox.apply(v.as_slice().unwrap(), tau, steps, u.as_slice_mut().unwrap());
+                gaps.push(gap(&prox, &u));
+            }
+            assert!(gaps[2] < 2e-3 && gaps[2] > -1e-5 && gaps[0] > gaps[1] && gaps[1] > gaps[2], "{gaps:?}");
+            assert!(prox.value(u.view()) < 0.5 * prox.value(v.view()));
         }
-        assert!(gaps[2] < 2e-3 && gaps[2] > -1e-5 && gaps[0] > gaps[1] && gaps[1] > gaps[2], "{gaps:?}");
-        assert!(total_variation(u.view(), g) < 0.5 * total_variation(v.view(), g));
     }
 
-    /// The same steps one after another, voxel by voxel.
-    fn plain(dual: &mut [Array3<f32>; 3], v: &Array3<f32>, g: [f32; 3], tau: f32, steps: usize) -> Array3<f32> {
-        let shape: [usize; 3] = v.dim().into();
+    /// A step between two faces costs less than without edges, a step of the same size on one voxel does not.
+    #[test]
+    fn slopes_across_an_edge_count_less() {
+        let (shape, g) = ([12, 9, 10], [1.0; 3]);
+        let step = Array3::from_shape_fn(shape, |(x, _, _)| f32::from(u8::from(x >= 6)));
+        let prox = with_edges(shape, g, &step);
+        let plain = total_variation(step.view(), g, None);
+        assert!(prox.value(step.view()) < 0.3 * plain, "{} and {plain}", prox.value(step.view()));
+        let along = Array3::from_shape_fn(shape, |(_, y, _)| f32::from(u8::from(y >= 4)));
+        let plain = total_variation(along.view(), g, None);
+        assert!((prox.value(along.view()) - plain).abs() < 1e-3 * plain);
+    }
+
+    /// The same steps one after another, voxel by voxel; `dual` is `D·p`.
+    fn plain(prox: &mut TvProx, v: &Array3<f32>, tau: f32, steps: usize) -> Array3<f32> {
+        let TvProx { shape, g, dual, edges } = prox;
+        let (shape, g) = (*shape, *g);
         let moved = |at: [usize; 3], k: usize, by: isize| {
             let mut to = at;
             to[k] = to[k].wrapping_add_signed(by);
@@ -585,12 +678,18 @@ mod tests {
         let bound = 4.0 * g.iter().map(|g| g * g).sum::<f32>();
         for _ in 0..steps {
             let u = primal(dual);
-            for ((x, y, z), &here) in u.indexed_iter() {
+            for (index, ((x, y, z), &here)) in u.indexed_iter().enumerate() {
                 let at = [x, y, z];
                 let ahead = |k: usize| if at[k] + 1 < shape[k] { u[moved(at, k, 1)] - here } else { 0.0 };
-                let p: [f32; 3] = std::array::from_fn(|k| dual[k][at] + ahead(k) * g[k] / (bound * tau));
-                let length = p.iter().map(|p| p * p).sum::<f32>().sqrt().max(1.0);
-                (0..3).for_each(|k| dual[k][at] = p[k] / length);
+                let n = edges.as_ref().map_or([0.0; 3], |edges| edges.vectors().map(|n| n[index]));
+                let directed = |d: [f32; 3]| std::array::from_fn::<f32, 3, _>(|k| d[k] - n[k] * dot(n, d));
+                let slope = directed(std::array::from_fn(|k| ahead(k) * g[k] / (bound * tau)));
+                let w: [f32; 3] = std::array::from_fn(|k| dual[k][at]);
+                // D⁻¹ = 1 + n·nᵀ/(1 − |n|²)
+                let p: [f32; 3] = std::array::from_fn(|k| w[k] + n[k] * dot(n, w) / (1.0 - dot(n, n)) + slope[k]);
+                let length = dot(p, p).sqrt().max(1.0);
+                let w = directed(p.map(|p| p / length));
+                (0..3).for_each(|k| dual[k][at] = w[k]);
             }
         }
         primal(dual)
@@ -611,24 +710,27 @@ mod tests {
             ([97, 2, 5], 5),
         ] {
             let v = noisy(shape);
-            let on = |threads: usize| {
-                let pool = rayon::ThreadPoolBuilder::new().num_threads(threads).build().unwrap();
-                pool.install(|| {
-                    let (mut prox, mut u) = (prox(shape, g), Array3::from_elem(shape, f32::NAN));
-                    for _ in 0..2 {
-                        prox.apply(v.as_slice().unwrap(), tau, steps, u.as_slice_mut().unwrap());
-                    }
-                    (u, prox.dual)
-                })
-            };
-            let (u, dual) = on(1);
-            let mut slow = std::array::from_fn(|_| Array3::zeros(shape));
-            plain(&mut slow, &v, g, tau, steps);
-            let want = plain(&mut slow, &v, g, tau, steps);
-            let near = |a: &Array3<f32>, b: &Array3<f32>| a.iter().zip(b).all(|(a, b)| (a - b).abs() < 1e-5);
-            assert!(near(&u, &want) && (0..3).all(|k| near(&dual[k], &slow[k])), "{shape:?}");
-            for threads in [2, 3, 8] {
-                assert!(on(threads) == (u.clone(), dual.clone()), "{shape:?} on {threads} threads");
+            for directional in [false, true] {
+                let made = || if directional { with_edges(shape, g, &v) } else { prox(shape, g) };
+                let on = |threads: usize| {
+                    let pool = rayon::ThreadPoolBuilder::new().num_threads(threads).build().unwrap();
+                    pool.install(|| {
+                        let (mut prox, mut u) = (made(), Array3::from_elem(shape, f32::NAN));
+                        for _ in 0..2 {
+                            prox.apply(v.as_slice().unwrap(), tau, steps, u.as_slice_mut().unwrap());
+                        }
+                        (u, prox.dual)
+                    })
+                };
+                let (u, dual) = on(1);
+                let mut slow = made();
+                plain(&mut slow, &v, tau, steps);
+                let want = plain(&mut slow, &v, tau, steps);
+                let near = |a: &Array3<f32>, b: &Array3<f32>| a.iter().zip(b).all(|(a, b)| (a - b).abs() < 1e-5);
+                assert!(near(&u, &want) && (0..3).all(|k| near(&dual[k], &slow.dual[k])), "{shape:?}");
+                for threads in [2, 3, 8] {
+                    assert!(on(threads) == (u.clone(), dual.clone()), "{shape:?} on {threads} threads");
+                }
             }
         }
     }
@@ -690,7 +792,7 @@ mod tests {
                 let squares = ahead.iter().zip(g).map(|(a, g)| a.map_or(0.0, |a| f64::from(g * (a - here)).powi(2)));
                 want += squares.sum::<f64>().sqrt();
             }
-            let found = total_variation(x.view(), g);
+            let found = total_variation(x.view(), g, None);
             assert!((found - want).abs() <= 1e-5 * want, "{shape:?}: {found} and {want}");
         }
     }

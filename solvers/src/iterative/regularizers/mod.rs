@@ -1,7 +1,9 @@
 //! Regularizers that a method may name.
 
+pub mod directional_total_variation;
 pub mod none;
 pub mod total_variation;
 
+pub use directional_total_variation::DirectionalTotalVariation;
 pub use none::Nonnegative;
 pub use total_variation::TotalVariation;

@@ -1,13 +1,14 @@
 //! Total variation: attenuation is flat but for a few edges.
 
-use crate::iterative::tv::{TvProx, anisotropy, total_variation};
+use crate::iterative::tv::{TvProx, anisotropy};
 use conefield_core::error::{Result, ensure};
 use conefield_core::geometry::VoxelGrid;
 use conefield_core::regularizer::{Penalty, Regularizer, RegularizerSpec, Update};
 use conefield_core::space::Space;
-use ndarray::ArrayView3;
+use ndarray::{Array3, ArrayView3};
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
+use std::fmt::{Display, Formatter};
 
 /// Settings of `total-variation`.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize, JsonSchema)]
@@ -29,6 +30,33 @@ pub enum Weight {
     Noise(f64),
 }
 
+impl Weight {
+    /// The weight λ of a total variation on `grid`. Attenuation a voxel is x̂ = x·h and lengths in voxels are Â = A/h, so that
+    /// λ̂·TV(x̂) = λ̂·h·TV(x).
+    pub(super) fn lambda(self, grid: &VoxelGrid, noise: &mut dyn FnMut(f64) -> f64) -> f64 {
+        match self {
+            Self::Fixed(w) => w * grid.spacing.iter().product::<f64>().cbrt(),
+            Self::Noise(k) => noise(k),
+        }
+    }
+}
+
+impl Display for Weight {
+    fn fmt(&self, f: &mut Formatter<'_>) -> std::fmt::Result {
+        match self {
+            Self::Fixed(w) => write!(f, "{w}"),
+            Self::Noise(k) => write!(f, "{k} times the noise"),
+        }
+    }
+}
+
+/// Refuses a weight and a number of dual steps that make no prior.
+pub(super) fn validate(weight: Weight, inner: usize) -> Result<()> {
+    ensure((1..=1000).contains(&inner), "spec", "inner", inner, "1 to 1000")?;
+    let (Weight::Fixed(w) | Weight::Noise(w)) = weight;
+    ensure(w.is_finite() && w >= 0.0, "spec", "weight", w, "a finite number, 0 or more")
+}
+
 impl Default for TotalVariation {
     fn default() -> Self {
         Self { weight: Weight::Noise(1.2), inner: 4 }
@@ -40,45 +68,38 @@ conefield_core::stage_type!(Regularizer, "total-variation", TotalVariation, "fla
 #[typetag::serde(name = "total-variation")]
 impl RegularizerSpec for TotalVariation {
     fn build(&self) -> Result<Box<dyn Regularizer>> {
-        ensure((1..=1000).contains(&self.inner), "spec", "inner", self.inner, "1 to 1000")?;
-        let (Weight::Fixed(w) | Weight::Noise(w)) = self.weight;
-        ensure(w.is_finite() && w >= 0.0, "spec", "weight", w, "a finite number, 0 or more")?;
+        validate(self.weight, self.inner)?;
         Ok(Box::new(*self))
     }
 }
 
 impl Regularizer for TotalVariation {
     fn on(&self, grid: &VoxelGrid, space: &Space) -> Box<dyn Penalty> {
-        Box::new(On { prox: TvProx::new(grid.shape, anisotropy(grid), space), g: anisotropy(grid), inner: self.inner })
+        Box::new(On { prox: TvProx::new(grid.shape, anisotropy(grid), space), inner: self.inner })
     }
 
-    /// Attenuation a voxel is x̂ = x·h and lengths in voxels are Â = A/h, so that λ̂·TV(x̂) = λ̂·h·TV(x).
     fn weight(&self, grid: &VoxelGrid, noise: &mut dyn FnMut(f64) -> f64) -> f64 {
-        match self.weight {
-            Weight::Fixed(w) => w * grid.spacing.iter().product::<f64>().cbrt(),
-            Weight::Noise(k) => noise(k),
-        }
+        self.weight.lambda(grid, noise)
     }
 
     fn describe(&self) -> String {
-        let weight = match self.weight {
-            Weight::Fixed(w) => format!("weight {w}"),
-            Weight::Noise(k) => format!("weight {k} times the noise"),
-        };
-        format!("total-variation: {weight}, {} dual steps an update", self.inner)
+        format!("total-variation: weight {}, {} dual steps an update", self.weight, self.inner)
     }
 }
 
 /// Total variation on one grid.
-struct On {
-    prox: TvProx,
-    g: [f32; 3],
-    inner: usize,
+pub(super) struct On {
+    pub(super) prox: TvProx,
+    pub(super) inner: usize,
 }
 
 impl Penalty for On {
     fn value(&self, x: ArrayView3<'_, f32>) -> f64 {
-        total_variation(x, self.g)
+        self.prox.value(x)
+    }
+
+    fn adapt(&mut self, x: &Array3<f32>) -> Option<f64> {
+        self.prox.adapt(x)
     }
 
     fn prox(&mut self, v: &[f32], tau: f32, u: &mut [f32]) {

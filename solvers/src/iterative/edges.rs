@@ -1,0 +1,157 @@
+//! Where a volume has edges, and which way they face.
+
+use super::flat_mut;
+use conefield_core::space::Space;
+use ndarray::Array3;
+use rayon::prelude::*;
+
+/// A vector `n` for each voxel: across the edge there, with a length between 0 (no edge) and 1 (a clear one).
+///
+/// `n = √γ·s/√(|s|² + η²)`, where the slope s is a central difference, smoothed by 1-2-1 along the other two axes (Sobel), and η
+/// is a multiple of the root mean square of all |s|.
+pub struct Edges {
+    n: [Array3<f32>; 3],
+    /// γ, below 1.
+    strength: f32,
+    /// η over the root mean square of the slopes.
+    scale: f64,
+}
+
+impl Edges {
+    /// No edges yet.
+    pub fn new(shape: [usize; 3], strength: f32, scale: f64, space: &Space) -> Self {
+        Self { n: std::array::from_fn(|_| space.array(shape)), strength, scale }
+    }
+
+    /// Along x, y and z.
+    pub fn vectors(&self) -> [&[f32]; 3] {
+        self.n.each_ref().map(super::flat)
+    }
+
+    /// Finds the edges of `x`, whose differences count by `g` along x, y, z. The result does not depend on the number of threads.
+    pub fn find(&mut self, x: &Array3<f32>, g: [f32; 3]) {
+        let (nx, ny, nz) = x.dim();
+        let plane = ny * nz;
+        if plane == 0 {
+            return;
+        }
+        let all = super::flat(x);
+        let at = |i: usize| &all[i * plane..(i + 1) * plane];
+        let [a, b, c] = self.n.each_mut().map(flat_mut);
+        let planes = a.par_chunks_mut(plane).zip(b.par_chunks_mut(plane)).zip(c.par_chunks_mut(plane));
+        let squares: Vec<f64> = planes
+            .enumerate()
+            .map(|(i, ((a, b), c))| {
+                let around = [at(i.saturating_sub(1)), at(i), at((i + 1).min(nx - 1))];
+                slopes(around, nz, g, [&mut *a, &mut *b, &mut *c]);
+                let square = |((a, b), c): ((&f32, &f32), &f32)| f64::from(a * a + b * b + c * c);
+                a.iter().zip(&*b).zip(&*c).map(square).sum::<f64>()
+            })
+            .collect();
+        let mean = squares.iter().sum::<f64>() / x.len() as f64;
+        let eta2 = (mean * self.scale * self.scale) as f32;
+        let strength = self.strength;
+        let planes = a.par_chunks_mut(plane).zip(b.par_chunks_mut(plane)).zip(c.par_chunks_mut(plane));
+        planes.for_each(|((a, b), c)| {
+            for ((a, b), c) in a.iter_mut().zip(b).zip(c) {
+                let square = *a * *a + *b * *b + *c * *c;
+                // A slope of 0 has no direction, whatever η is.
+                let factor = if square > 0.0 { (strength / (square + eta2)).sqrt() } else { 0.0 };
+                [*a, *b, *c] = [*a * factor, *b * factor, *c * factor];
+            }
+        });
+    }
+}
+
+/// The slopes of the middle one of three planes; what lies outside the volume is as its nearest voxel.
+fn slopes(around: [&[f32]; 3], nz: usize, g: [f32; 3], out: [&mut [f32]; 3]) {
+    let [before, here, after] = around;
+    let ny = here.len() / nz;
+    let mut across = vec![0.0; here.len()];
+    let mut smooth = vec![0.0; here.len()];
+    for (k, (across, smooth)) in across.iter_mut().zip(&mut smooth).enumerate() {
+        *across = 0.5 * g[0] * (after[k] - before[k]);
+        *smooth = 0.25 * (before[k] + after[k]) + 0.5 * here[k];
+    }
+    // Each along z, one line of three after the other.
+    let mut lines = [[0; 3]; 3].map(|line| line.map(|_| vec![0.0; nz]));
+    let [a, b, c] = out;
+    for j in 0..ny {
+        for (lines, j) in lines.iter_mut().zip([j.saturating_sub(1), j, (j + 1).min(ny - 1)]) {
+            let part = j * nz..(j + 1) * nz;
+            let [x, y, z] = lines;
+            smoothed(&across[part.clone()], x);
+            smoothed(&smooth[part.clone()], y);
+            differences(&smooth[part], z);
+        }
+        let [low, mid, high] = &lines;
+        for k in 0..nz {
+            let to = j * nz + k;
+            a[to] = 0.25 * (low[0][k] + high[0][k]) + 0.5 * mid[0][k];
+            b[to] = 0.5 * g[1] * (high[1][k] - low[1][k]);
+            c[to] = g[2] * (0.25 * (low[2][k] + high[2][k]) + 0.5 * mid[2][k]);
+        }
+    }
+}
+
+/// A line smoothed by 1-2-1.
+fn smoothed(line: &[f32], out: &mut [f32]) {
+    let last = line.len() - 1;
+    for (k, out) in out.iter_mut().enumerate() {
+        *out = 0.25 * (line[k.saturating_sub(1)] + line[(k + 1).min(last)]) + 0.5 * line[k];
+    }
+}
+
+/// Central differences of a line.
+fn differences(line: &[f32], out: &mut [f32]) {
+    let last = line.len() - 1;
+    for (k, out) in out.iter_mut().enumerate() {
+        *out = 0.5 * (line[(k + 1).min(last)] - line[k.saturating_sub(1)]);
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use conefield_core::scan::ScanHeader;
+
+    fn edges(x: &Array3<f32>, g: [f32; 3], scale: f64) -> Edges {
+        let shape = x.dim().into();
+        let space = Space::new(ScanHeader { views: 0, detector: [0; 2], volume: shape });
+        let mut edges = Edges::new(shape, 0.81, scale, &space);
+        edges.find(x, g);
+        edges
+    }
+
+    #[test]
+    fn a_slanted_face_is_found_with_its_direction() {
+        let ramp = Array3::from_shape_fn([7, 6, 9], |(x, y, z)| 2.0 * x as f32 - y as f32 + 0.5 * z as f32);
+        let found = edges(&ramp, [1.0, 1.0, 2.0], 1e-4);
+        // Along (2, -1, 0.5·2), of length 0.9.
+        let want = [2.0f32, -1.0, 1.0].map(|x| 0.9 * x / 6f32.sqrt());
+        for (n, want) in found.n.iter().zip(want) {
+            assert!((n[[3, 3, 4]] - want).abs() < 1e-4, "{} and {want}", n[[3, 3, 4]]);
+        }
+    }
+
+    #[test]
+    fn what_is_flat_has_no_edges_and_weak_slopes_count_little() {
+        let flat = edges(&Array3::from_elem([3, 1, 4], 0.7), [1.0; 3], 1.0);
+        assert!(flat.n.iter().all(|n| n.iter().all(|x| *x == 0.0)));
+        let mut step = Array3::from_shape_fn([16, 8, 8], |(x, _, _)| f32::from(u8::from(x >= 8)));
+        step.slice_mut(ndarray::s![3.., .., ..]).mapv_inplace(|x| x + 0.01);
+        let found = edges(&step, [1.0; 3], 1.0);
+        assert!(found.n[0][[8, 4, 4]] > 0.6 && found.n[0][[3, 4, 4]] < 0.03, "{}", found.n[0]);
+        assert!(found.n[0].iter().all(|x| x.abs() <= 0.9));
+    }
+
+    #[test]
+    fn threads_change_no_bit() {
+        let x = Array3::from_shape_fn([23, 5, 7], |(x, y, z)| ((x * 31 + y * 17 + z * 7) % 11) as f32);
+        let on = |threads| {
+            let pool = rayon::ThreadPoolBuilder::new().num_threads(threads).build().unwrap();
+            pool.install(|| edges(&x, [1.0, 0.7, 1.3], 0.7).n)
+        };
+        assert!(on(1) == on(5));
+    }
+}
