@@ -76,14 +76,14 @@ fn chains_of_three() -> [String; 4] {
     [voxels, mean, field_first, field_between]
 }
 
-/// Whichever method is interrupted, between any two records: it goes on where it stood.
+/// Whichever method is interrupted, within it or at its end: it goes on where it stood.
 #[test]
 fn an_interruption_of_any_goes_on_to_the_same_bits() {
     let scan = scan();
     for text in [chain(FIRST, THEN, 4), chain(FIELD, THEN, 4)].into_iter().chain(chains_of_three()) {
         let mut whole = Heard::default();
         let want = Case::of(&scan).run(&text, &mut whole).unwrap();
-        for after in 1..whole.records.len() {
+        for after in (1..whole.records.len()).step_by(2) {
             let mut heard = Heard::interrupting_after(after);
             let stopped = Case::of(&scan).run(&text, &mut heard);
             let stopped_at = heard.records.last().unwrap().step;

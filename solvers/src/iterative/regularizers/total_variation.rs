@@ -48,16 +48,17 @@ impl RegularizerSpec for TotalVariation {
 }
 
 impl Regularizer for TotalVariation {
-    fn on(&self, grid: &VoxelGrid, space: &Space) -> Box<dyn Penalty> {
-        Box::new(On { prox: TvProx::new(grid.shape, anisotropy(grid), space), g: anisotropy(grid), inner: self.inner })
+    fn on(&self, grid: &VoxelGrid, space: &Space) -> Result<Box<dyn Penalty>> {
+        let g = anisotropy(grid);
+        Ok(Box::new(On { prox: TvProx::new(grid.shape, g, space), g, inner: self.inner }))
     }
 
     /// Attenuation a voxel is x̂ = x·h and lengths in voxels are Â = A/h, so that λ̂·TV(x̂) = λ̂·h·TV(x).
-    fn weight(&self, grid: &VoxelGrid, noise: &mut dyn FnMut(f64) -> f64) -> f64 {
-        match self.weight {
+    fn weight(&self, grid: &VoxelGrid, noise: &mut dyn FnMut(f64) -> f64) -> Result<f64> {
+        Ok(match self.weight {
             Weight::Fixed(w) => w * grid.spacing.iter().product::<f64>().cbrt(),
             Weight::Noise(k) => noise(k),
-        }
+        })
     }
 
     fn describe(&self) -> String {
@@ -85,7 +86,7 @@ impl Penalty for On {
         self.prox.apply(v, tau, self.inner, u);
     }
 
-    fn state(&mut self) -> Vec<(&'static str, &mut [f32])> {
+    fn state(&mut self) -> Vec<(&str, &mut [f32])> {
         let [x, y, z] = self.prox.state();
         vec![("dual.x", x), ("dual.y", y), ("dual.z", z)]
     }
