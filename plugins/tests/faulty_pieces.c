@@ -129,8 +129,8 @@ static ConefieldStatus prox(void *penalty, const float *v, size_t n, float tau, 
     struct Stage *p = penalty;
     if (FAULT == R_FAILS || later(R_LATER)) return fails(error, "no more numbers");
     float by = FAULT == R_HALVED ? 1 + 0.5f * tau : 1 + tau;
-    /* The first call is a little off. */
-    if (p->state == 0) by *= 1.001f;
+    /* The first call is a little off, and that is no part of the state. */
+    if (FAULT == R_FORGETS && p->state == 0) by *= 1.01f;
     p->state = 1;
     for (size_t i = 0; i < n; i++) u[i] = v[i] > 0 || FAULT == R_BELOW ? v[i] / by : 0;
     if (FAULT == R_NOT_A_NUMBER) u[0] = NAN;
@@ -145,8 +145,14 @@ static ConefieldStatus state(void *penalty, size_t index, struct ConefieldState 
     return CONEFIELD_OK;
 }
 
+static uint64_t bytes(const void *stage, const struct ConefieldGrid *grid) {
+    (void)stage, (void)grid;
+    return sizeof(struct Stage);
+}
+
 static const struct ConefieldRegularizer REGULARIZER = {
     .size = sizeof REGULARIZER,
+    .bytes = bytes,
     .on = on,
     .weight = weight,
     .value = value,
