@@ -134,7 +134,7 @@ pub fn read_checkpoint(path: &Path, run: &BTreeMap<String, String>) -> Result<Re
     ensure(step <= MOST_STEPS, &place, "step", step, format!("at most {MOST_STEPS}"))?;
     ensure(recorded <= step, &place, "recorded", recorded, format!("at most {step}, the steps that are done"))?;
     ensure(seconds.is_finite() && seconds >= 0.0, &place, "seconds", seconds, "a number of seconds")?;
-    Ok(Resume { place, standing, weights: Weights { tensors: file.tensors, ..Weights::default() } })
+    Ok(Resume::new(place, standing, Weights { tensors: file.tensors, ..Weights::default() }))
 }
 
 /// Refuses to go on with a run that was another one than `now`; `place` is the file that tells of it.

@@ -120,40 +120,78 @@ fn a_signal_ends_the_step_keeps_a_checkpoint_and_says_so() {
     }
 }
 
-/// Passes over voxels too, in a run of their own and after a field's training: no record is lost and none comes twice.
+/// Three methods, whose last two volumes make the mean: a field of 140 steps with 20 records, and 300 passes twice.
+const THREE: &str = r#"
+type = "chain"
+name = "three"
+mean = 2
+
+[[methods]]
+extends = "fast"
+encoder = { levels = 2, log2_table_size = 10 }
+projector.samples = 16
+training = { steps = 140, rays = 48, report_every = 7 }
+
+[[methods]]
+type = "fista"
+prior = "total-variation"
+subsets = 2
+stop = { passes = 300 }
+
+[[methods]]
+type = "fista"
+prior = "total-variation"
+basis = { type = "cubic", samples = 12 }
+subsets = 2
+pull = 0.01
+stop = { passes = 300 }
+"#;
+
+/// Passes over voxels too, in a run of their own and in each method of a chain: no record is lost and none comes twice.
 #[test]
 fn interrupted_passes_lose_no_record() {
     let dir = tempfile::tempdir().unwrap();
     let scan = scan(dir.path());
-    let field = [
-        "methods.0.projector.samples=16",
-        "methods.0.encoder.log2_table_size=10",
-        "methods.0.training.rays=48",
-        "methods.0.training.report_every=7",
-    ];
-    let then = ["methods.1.stop.passes=600", "methods.1.stop={ passes = 600 }"];
-    let chain = [&field[..], &then].concat();
-    for (spec, sets, after) in [("sirt", vec!["stop.passes=900"], 50), ("field-tv", chain, 40)] {
+    let three = dir.path().join("three.toml");
+    std::fs::write(&three, THREE).unwrap();
+    for (name, spec, passes, afters) in
+        [("sirt", "sirt", Some("stop.passes=900"), &[50][..]), ("three", three.to_str().unwrap(), None, &[9, 40, 340])]
+    {
         let arguments = |run: &Path, more: &[&str]| -> Vec<String> {
             let mut all = vec!["reconstruct", scan.to_str().unwrap(), "--spec", spec, "-o", run.to_str().unwrap()];
-            all.extend(sets.iter().flat_map(|s| ["--set", *s]));
-            all.extend(if spec == "field-tv" { &["--steps", "140"][..] } else { &[] });
+            all.extend(passes.iter().flat_map(|s| ["--set", *s]));
             [&all[..], more].concat().into_iter().map(str::to_owned).collect()
         };
-        let (whole, run) = (dir.path().join(format!("{spec}-whole")), dir.path().join(spec));
+        let whole = dir.path().join(format!("{name}-whole"));
         finish(&arguments(&whole, &[]));
-        let mut child = start(&arguments(&run, &["--checkpoint-every", "1h"]));
-        let lines = || std::fs::read_to_string(run.join("metrics.jsonl")).map_or(0, |text| text.lines().count());
-        while lines() < after && child.try_wait().unwrap().is_none() {
-            std::thread::sleep(Duration::from_millis(1));
+        for &after in afters {
+            let run = dir.path().join(format!("{name}-{after}"));
+            let mut child = start(&arguments(&run, &["--checkpoint-every", "1h"]));
+            let lines = || std::fs::read_to_string(run.join("metrics.jsonl")).map_or(0, |text| text.lines().count());
+            while lines() < after && child.try_wait().unwrap().is_none() {
+                std::thread::sleep(Duration::from_millis(1));
+            }
+            let kill = Command::new("sh").arg("-c").arg(format!("kill -INT {}", child.id())).status().unwrap();
+            assert!(kill.success(), "{name} was over before it could be interrupted");
+            assert_eq!(child.wait().unwrap().code(), Some(130), "{name}");
+            let before = lines();
+            finish(&arguments(&run, &["--resume"]));
+            let files = ["volume.nii.gz", "weights.safetensors"].into_iter().filter(|file| whole.join(file).exists());
+            for file in files {
+                let read = |run: &Path| std::fs::read(run.join(file)).unwrap();
+                assert!(read(&whole) == read(&run), "{name} after {after} records: {file} differs");
+            }
+            assert_eq!(losses(&whole), losses(&run), "{name} after {after} records");
+            // It went on where it stood: what was there already was not made again.
+            assert!(before >= after && lines() > before, "{before} records, then {}", lines());
+            let record = |run: &Path| -> serde_json::Value {
+                serde_json::from_str(&std::fs::read_to_string(run.join("record.json")).unwrap()).unwrap()
+            };
+            let [whole, run] = [&whole, &run].map(|run| record(run));
+            for key in ["steps", "samples"] {
+                assert_eq!(whole[key], run[key], "{name}: {key}");
+            }
         }
-        let kill = Command::new("sh").arg("-c").arg(format!("kill -INT {}", child.id())).status().unwrap();
-        assert!(kill.success(), "{spec} was over before it could be interrupted");
-        assert_eq!(child.wait().unwrap().code(), Some(130), "{spec}");
-        finish(&arguments(&run, &["--resume"]));
-        let read = |run: &Path| std::fs::read(run.join("volume.nii.gz")).unwrap();
-        assert!(read(&whole) == read(&run), "{spec}: the volumes differ");
-        assert_eq!(losses(&whole), losses(&run), "{spec}");
     }
 }
 

@@ -42,8 +42,15 @@ pub trait Expansion: Send + Sync {
     /// The operator that works.
     fn operator(&self) -> &dyn BasisOperator<f32>;
 
-    /// The same formula in double precision.
-    fn reference(&self) -> &dyn BasisOperator<f64>;
+    /// The same formula in double precision, by which it is checked.
+    fn reference(&self) -> Option<&dyn BasisOperator<f64>> {
+        None
+    }
+
+    /// What the operator could not do since this was last asked, as [`crate::stage::Stage::fault`].
+    fn fault(&self) -> Result<()> {
+        Ok(())
+    }
 }
 
 /// The matrix `B` and its adjoint. Neither direction depends on the number of threads.

@@ -4,6 +4,7 @@ use crate::arena::{Arena, Layout, Weights};
 use crate::error::{Error, Result};
 use crate::pipeline::Model;
 use serde::{Deserialize, Serialize};
+use std::sync::Arc;
 
 /// What a run knows beside the arena. Everything random follows from the seed and the step.
 #[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize)]
@@ -55,18 +56,52 @@ pub fn tensors_of<'a, const N: usize>(
     all
 }
 
-/// A checkpoint read back.
+/// A checkpoint read back, or the part of it that one method of a chain wrote.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Resume {
     /// The file, for messages.
     pub place: String,
-    /// All but the arena.
+    /// All but the tensors.
     pub standing: Standing,
-    /// Its [`Checkpoint::tensors`].
-    pub weights: Weights,
+    /// The tensors of the whole file.
+    pub weights: Arc<Weights>,
+    /// What the names of this part's tensors begin with.
+    prefix: String,
 }
 
 impl Resume {
+    /// What stands in the file `place`.
+    pub fn new(place: String, standing: Standing, weights: Weights) -> Self {
+        Self { place, standing, weights: Arc::new(weights), prefix: String::new() }
+    }
+
+    /// The part whose tensors have `prefix` before their names, with a standing of its own.
+    pub fn part(&self, prefix: &str, standing: Standing) -> Self {
+        let prefix = format!("{}{prefix}", self.prefix);
+        Self { place: self.place.clone(), standing, weights: self.weights.clone(), prefix }
+    }
+
+    /// Names of its [`Checkpoint::tensors`].
+    pub fn names(&self) -> impl Iterator<Item = &str> {
+        self.weights.tensors.keys().filter_map(|name| name.strip_prefix(&self.prefix))
+    }
+
+    /// Shape and values of one of its tensors.
+    pub fn tensor(&self, name: &str) -> Option<&(Vec<usize>, Vec<f32>)> {
+        self.weights.tensors.get(&format!("{}{name}", self.prefix))
+    }
+
+    /// The values of one of its tensors, which is to have this shape.
+    pub fn shaped(&self, name: &str, shape: &[usize]) -> Result<&[f32]> {
+        match self.tensor(name) {
+            Some((found, values)) if found == shape => Ok(values),
+            other => {
+                let found = other.map_or("nothing".into(), |(shape, _)| format!("shape {shape:?}"));
+                Err(Error::invalid(&self.place, name, found, format!("a tensor of shape {shape:?}")))
+            }
+        }
+    }
+
     /// Brings a model that was built from the same spec to where the run stood: masked channels leave it again, and
     /// parameters and moments are replaced. Refuses a checkpoint that does not fit.
     pub fn restore(&self, model: &mut Model) -> Result<()> {
@@ -80,7 +115,7 @@ impl Resume {
     /// What [`tensors_of`] gave of `layout` under `prefix`.
     pub fn load<const N: usize>(&self, prefix: &str, layout: &Layout, parts: [&mut [f32]; N]) -> Result<()> {
         for (part, values) in PARTS.into_iter().zip(parts) {
-            let prefix = format!("{prefix}{part}.");
+            let prefix = format!("{}{prefix}{part}.", self.prefix);
             let own =
                 |(k, v): (&String, &(Vec<usize>, Vec<f32>))| Some((k.strip_prefix(&prefix)?.to_owned(), v.clone()));
             let tensors = self.weights.tensors.iter().filter_map(own).collect();

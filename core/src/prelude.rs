@@ -1,17 +1,23 @@
 //! What the author of a stage needs: `use conefield_core::prelude::*;`.
 
-pub use crate::by_row::{ByRow, RowMap, Sums};
+pub use crate::basis::{Basis, BasisOperator, BasisSpec, Expansion};
+pub use crate::by_row::{ByRay, ByRow, RayMap, RowMap, Sums};
+pub use crate::data_term::{DataTerm, DataTermSpec, Misfit};
 pub use crate::error::{Error, Result, ensure};
+pub use crate::geometry::VoxelGrid;
 pub use crate::half::Stored;
 pub use crate::loss::{Loss, NoiseModel};
 pub use crate::prior::{Blocks, Prior};
 pub use crate::random::{mix, unit};
+pub use crate::regularizer::{Penalty, Regularizer, RegularizerSpec};
 pub use crate::settings::{
-    EncoderSpec, FieldSpec, InitializerSpec, LossSpec, NormalizerSpec, PriorSpec, ProjectorSpec,
+    EncoderSpec, FieldSpec, InitializerSpec, LineFieldSpec, LossSpec, NormalizerSpec, PriorSpec, ProjectorSpec,
 };
 pub use crate::simd::Real;
-pub use crate::stage::{Encoder, Field, Normalizer, Projector, Samples, Stage, UnitRay};
+pub use crate::space::Space;
+pub use crate::stage::{Encoder, Field, Grads, Lines, Normalizer, Projector, Samples, Stage, UnitRay};
 pub use crate::stage_type;
 pub use crate::wgsl::Fragment;
+pub use ndarray::{ArrayView3, ArrayViewMut3};
 pub use schemars::JsonSchema;
 pub use serde::{Deserialize, Serialize};

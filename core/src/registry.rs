@@ -76,10 +76,10 @@ kinds! {
         Method "method",
         /// What watches over training.
         Callback "callback",
-        /// Line integrals of rays, and attenuation at points.
-        LineField "line-field",
     }
     loadable {
+        /// Line integrals of rays, and attenuation at points.
+        LineField "line-field" LineFieldSpec,
         /// Points to features.
         Encoder "encoder" EncoderSpec,
         /// Features to features.
@@ -103,10 +103,6 @@ kinds! {
         /// Penalty of coefficients with its proximal map, for iterative methods.
         Regularizer "regularizer" RegularizerSpec,
     }
-}
-
-impl Settings for dyn LineFieldSpec {
-    const KIND: Kind = Kind::LineField;
 }
 
 /// The settings of one kind of stage.

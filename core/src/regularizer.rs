@@ -16,11 +16,11 @@ pub trait RegularizerSpec: Send + Sync {
 /// A convex penalty of coefficients on any grid.
 pub trait Regularizer: Send + Sync {
     /// The penalty on `grid`, with its arrays from `space`.
-    fn on(&self, grid: &VoxelGrid, space: &Space) -> Box<dyn Penalty>;
+    fn on(&self, grid: &VoxelGrid, space: &Space) -> Result<Box<dyn Penalty>>;
 
     /// The weight λ for attenuation in 1/mm and lengths in mm. `noise(k)` measures what the scan's noise comes to in the
     /// gradient of the data term: k times its root mean square over the coefficients. That takes a back-projection.
-    fn weight(&self, grid: &VoxelGrid, noise: &mut dyn FnMut(f64) -> f64) -> f64;
+    fn weight(&self, grid: &VoxelGrid, noise: &mut dyn FnMut(f64) -> f64) -> Result<f64>;
 
     /// A line for `explain`.
     fn describe(&self) -> String;
@@ -49,8 +49,13 @@ pub trait Penalty: Send {
     }
 
     /// What the next call starts from, by name, for checkpoints.
-    fn state(&mut self) -> Vec<(&'static str, &mut [f32])> {
+    fn state(&mut self) -> Vec<(&str, &mut [f32])> {
         vec![]
+    }
+
+    /// What it could not do since this was last asked, as [`crate::stage::Stage::fault`].
+    fn fault(&self) -> Result<()> {
+        Ok(())
     }
 }
 

@@ -28,6 +28,11 @@ impl Space {
         Self { tally: true, ..Self::new(header) }
     }
 
+    /// Whether it only counts: its arrays are empty.
+    pub fn is_tally(&self) -> bool {
+        self.tally
+    }
+
     /// The sizes of the scan.
     pub fn header(&self) -> &ScanHeader {
         &self.header

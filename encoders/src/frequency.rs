@@ -3,7 +3,7 @@
 //!
 //! Band `k` of coordinate `x` is `sin(2π·f_k·x)` and `cos(2π·f_k·x)`, where `f_k` counts periods a cube side. NeRF's
 //! `sin(2ᵏ·π·p)` on `p = 2x − 1` has `f_k = 2ᵏ`, up to a phase. Channels stand from low to high frequency: the
-//! coordinates (with `include_input`), then of every band `sin x, sin y, sin z, cos x, cos y, cos z`.
+//! coordinates, then of every band `sin x, sin y, sin z, cos x, cos y, cos z`.
 
 use conefield_core::error::{Result, ensure};
 use conefield_core::settings::EncoderSpec;
@@ -36,13 +36,11 @@ pub struct Frequency {
     /// The highest, in periods a cube side. The default of 10 bands up to 512 has NeRF's octaves 2⁰ to 2⁹. A single
     /// band has this frequency.
     pub max_frequency: f64,
-    /// Whether the coordinates themselves come first.
-    pub include_input: bool,
 }
 
 impl Default for Frequency {
     fn default() -> Self {
-        Self { bands: 10, spacing: Spacing::Log, max_frequency: 512.0, include_input: true }
+        Self { bands: 10, spacing: Spacing::Log, max_frequency: 512.0 }
     }
 }
 
@@ -87,7 +85,6 @@ impl FrequencyStage {
         ensure((1..=64).contains(&s.bands), "spec", "bands", s.bands, "1 to 64")?;
         let max = s.max_frequency;
         ensure((1.0..=1e6).contains(&max), "spec", "max_frequency", max, "1 to 1e6 periods a cube side")?;
-        let first = if s.include_input { 3 } else { 0 };
         let mut waves = vec![];
         for k in 0..s.bands {
             let t = if s.bands == 1 { 1.0 } else { k as f64 / (s.bands - 1) as f64 };
@@ -98,15 +95,15 @@ impl FrequencyStage {
             // Rounded once, so that single and double precision mean the same waves.
             let frequency = f64::from(exact as f32);
             for axis in 0..3 {
-                let c = first + 6 * k + axis;
+                let c = 3 + 6 * k + axis;
                 waves.push(Wave { axis, frequency, sin: Some(c), cos: Some(c + 3) });
             }
         }
         Ok(Self {
             settings: s.clone(),
-            inputs: (0..first).map(|axis| (axis, axis)).collect(),
+            inputs: (0..3).map(|axis| (axis, axis)).collect(),
             waves,
-            outputs: first + 6 * s.bands,
+            outputs: 3 + 6 * s.bands,
         })
     }
 }

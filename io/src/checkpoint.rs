@@ -10,7 +10,7 @@ use std::path::Path;
 /// What a checkpoint calls itself.
 const FORMAT: &str = "conefield-checkpoint";
 /// Changes whenever an older reader would misread a newer file.
-const VERSION: &str = "2";
+const VERSION: &str = "3";
 /// Where the checksum stands.
 const SUM: &str = "crc32";
 
@@ -102,8 +102,8 @@ mod tests {
         refused(&good[..last], "header");
         let at = good.windows(10).position(|w| w == b"\"step\":\"7\"").unwrap();
         refused(&[&good[..at + 8], b"5", &good[at + 9..]].concat(), "crc32");
-        let at = good.windows(20).position(|w| w == b"\"format_version\":\"2\"").unwrap();
-        refused(&[&good[..at + 18], b"3", &good[at + 19..]].concat(), "format_version");
+        let at = good.windows(20).position(|w| w == b"\"format_version\":\"3\"").unwrap();
+        refused(&[&good[..at + 18], b"2", &good[at + 19..]].concat(), "format_version");
         write_weights(&path, &tensors, &text).unwrap();
         assert!(read_checkpoint(&path).unwrap_err().to_string().contains("format"));
     }

@@ -4,17 +4,21 @@
 //! volume (`pull` of `fista`), come closer than either alone. So do the errors of one prior on grids of different spacing:
 //! the mean of their volumes comes closer than each of them.
 
+mod made;
+
 use conefield_core::checkpoint::Checkpoint;
-use conefield_core::error::{Result, ensure};
+use conefield_core::error::{Error, Result, ensure};
+use conefield_core::geometry::VoxelGrid;
 use conefield_core::method::{
-    Context, Findings, Job, Limits, Line, Method, Needs, Observer, Outline, Plan, PretrainJob, Reconstruction, Record,
-    Solution,
+    Context, Findings, Job, Limits, Line, Method, Needs, Observer, Outline, Plan, PretrainJob, Record, Solution,
 };
+use conefield_core::parts::Part;
 use conefield_core::pipeline::{Model, Pipeline};
-use conefield_core::scan::{Scan, ScanHeader, Volume};
+use conefield_core::scan::{Scan, ScanHeader};
 use conefield_core::spec::stage;
 use conefield_core::trained::{Placement, TrainedField};
-use ndarray::{Array3, Zip};
+use made::Made;
+use ndarray::Array3;
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 use std::time::Instant;
@@ -94,16 +98,15 @@ struct ChainPlan {
 }
 
 impl ChainPlan {
-    /// Adds the volume of link `i` to the sum of those that the mean is of.
-    fn add(&self, sum: &mut Option<Array3<f32>>, i: usize, solution: &Solution, job: &Job<'_>) -> Result<()> {
-        if self.mean > 1 && i + self.mean >= self.links.len() {
-            let volume = solution.result.volume(job.backend)?;
-            match sum {
-                Some(sum) => Zip::from(sum).and(&volume.data).par_for_each(|sum, x| *sum += x),
-                None => *sum = Some(volume.data),
-            }
-        }
-        Ok(())
+    /// Whether the volume of link `i` is one of those that the mean is of.
+    fn counts(&self, i: usize) -> bool {
+        self.mean > 1 && i + self.mean >= self.links.len()
+    }
+
+    /// The link whose field comes out: the last one that trains one.
+    fn trains(&self) -> &dyn Plan {
+        let last = self.links.iter().rfind(|l| l.pipeline().is_some());
+        last.unwrap_or(&self.links[0]).as_ref()
     }
 }
 
@@ -116,15 +119,19 @@ impl Plan for ChainPlan {
         Outline { method: Line::new("method", "chain", &told), links, ..Outline::default() }
     }
 
-    /// The links run one after the other; later ones also hold the volume that they start from, and the sum of those before.
+    /// The links run one after the other. Later ones also hold the volume that they start from and the sum of those before; a
+    /// checkpoint has both, and the parameters of a field that was trained.
     fn needs(&self, scan: &ScanHeader) -> Needs {
-        let volume = 4 * scan.voxels() * if self.mean > 1 { 2 } else { 1 };
-        let later = |l: &dyn Plan| {
-            let needs = l.needs(scan);
-            Needs { working: needs.working + volume, ..needs }
-        };
-        let first = self.links[0].needs(scan);
-        self.links[1..].iter().map(|l| later(l.as_ref())).fold(first, Needs::most)
+        let volumes = 4 * scan.voxels() * if self.mean > 1 { 2 } else { 1 };
+        let mut parameters = 0;
+        let mut all = self.links[0].needs(scan);
+        for (link, before) in self.links[1..].iter().zip(&self.links) {
+            parameters = before.pipeline().map_or(parameters, |p| 4 * p.layout().len() as u64);
+            let needs = link.needs(scan);
+            let (working, resume) = (needs.working + volumes, needs.resume + volumes + parameters);
+            all = all.most(Needs { working, resume, ..needs });
+        }
+        all
     }
 
     fn inspect(&self, scan: &Scan) -> Result<Findings> {
@@ -140,29 +147,30 @@ impl Plan for ChainPlan {
     }
 
     fn run(&mut self, job: &Job<'_>, observer: &mut dyn Observer) -> Result<Solution> {
-        let first = self.links[0].run(job, &mut FirstObserver { observer: &mut *observer, over: false });
-        let mut done = first.map_err(|e| e.within(&at(0)))?;
-        let mut sum = None;
-        self.add(&mut sum, 0, &done, job)?;
-        for i in 1..self.links.len() {
-            let start = done.result.volume(job.backend)?;
-            let limits = later(&job.limits, done.train_s, self.links.len() - i, self.links[i].passes());
-            let next = Job { start: Some(&start), limits, resume: None, ..*job };
-            let mut heard = LaterObserver { observer: &mut *observer, steps: done.steps, seconds: done.train_s };
-            let solution = self.links[i].run(&next, &mut heard).map_err(|e| e.within(&at(i)))?;
-            self.add(&mut sum, i, &solution, job)?;
-            done = joined(done, solution, job)?;
-        }
-        if let Some(sum) = sum {
-            let data = sum / self.mean as f32;
-            let volume = Volume { data, grid: job.scan.geometry.volume, affine: None };
-            done.result = match done.result {
-                Reconstruction::Volume(_) => Reconstruction::Volume(volume),
-                Reconstruction::Field(field) => Reconstruction::Refined { field: Box::new(field), volume },
-                Reconstruction::Refined { field, .. } => Reconstruction::Refined { field, volume },
+        let (mut made, mut kept) = match job.resume {
+            Some(resume) => Made::resumed(resume, &self.links, job)?,
+            None => (Made::default(), None),
+        };
+        let count = self.links.len();
+        for i in made.links..count {
+            let limits = match i {
+                0 => job.limits,
+                _ => later(&job.limits, made.counts.train_s, count - i, self.links[i].passes()),
             };
+            let resume = kept.take();
+            let link = Job { start: made.start().or(job.start), limits, resume: resume.as_ref(), ..*job };
+            let mut heard = LinkObserver { observer: &mut *observer, made: &made };
+            let solution = self.links[i].run(&link, &mut heard).map_err(|e| match e {
+                Error::Interrupted { step } => Error::Interrupted { step: made.counts.steps + step },
+                e => e.within(&at(i)),
+            })?;
+            made.add(solution, self.counts(i), i + 1 < count, job)?;
+            if i + 1 < count {
+                // The next one begins here, should it be interrupted before it keeps a checkpoint itself.
+                observer.checkpoint(&made.checkpoint(None)?)?;
+            }
         }
-        Ok(done)
+        made.solution(self.mean)
     }
 
     fn pretrain(&mut self, job: &PretrainJob<'_>, observer: &mut dyn Observer) -> Result<Model> {
@@ -170,11 +178,11 @@ impl Plan for ChainPlan {
     }
 
     fn restore(&self, placement: &Placement, load: &mut dyn FnMut(&mut Model) -> Result<()>) -> Result<TrainedField> {
-        self.links[0].restore(placement, load)
+        self.trains().restore(placement, load)
     }
 
     fn pipeline(&self) -> Option<&Pipeline> {
-        self.links[0].pipeline()
+        self.trains().pipeline()
     }
 
     fn needs_held_out(&self) -> Option<String> {
@@ -187,48 +195,20 @@ impl Plan for ChainPlan {
     }
 }
 
-/// What two methods made, the second from the volume of the first.
-fn joined(first: Solution, second: Solution, job: &Job<'_>) -> Result<Solution> {
-    let result = match (first.result, second.result) {
-        (_, field @ Reconstruction::Field(_)) => field,
-        (Reconstruction::Field(field), later) => {
-            Reconstruction::Refined { field: Box::new(field), volume: later.volume(job.backend)? }
-        }
-        (Reconstruction::Refined { field, .. }, later) => {
-            Reconstruction::Refined { field, volume: later.volume(job.backend)? }
-        }
-        (Reconstruction::Volume(_), later) => later,
-    };
-    let best = second.best.map(|mut best| {
-        best.step += first.steps;
-        best
-    });
-    Ok(Solution {
-        result,
-        steps: first.steps + second.steps,
-        train_s: first.train_s + second.train_s,
-        samples: first.samples + second.samples,
-        sampling_s: first.sampling_s + second.sampling_s,
-        rollbacks: first.rollbacks + second.rollbacks,
-        best,
-    })
-}
-
-/// Hears of the first method. A checkpoint is due when steps or time end it: a run that is interrupted later starts from that.
-/// (A field that held-out views end goes on from its last checkpoint instead, to the same end.)
-struct FirstObserver<'a> {
+/// Hears of a link. Its steps and seconds count on from those before, and its checkpoints hold what was made before.
+struct LinkObserver<'a> {
     observer: &'a mut dyn Observer,
-    over: bool,
+    made: &'a Made,
 }
 
-impl Observer for FirstObserver<'_> {
+impl Observer for LinkObserver<'_> {
     fn progress(&mut self, step: u64, share: f64, seconds_left: f64) {
-        self.over = share >= 1.0;
-        self.observer.progress(step, share, seconds_left);
+        self.observer.progress(self.made.counts.steps + step, share, seconds_left);
     }
 
     fn record(&mut self, record: &Record) {
-        self.observer.record(record);
+        let (step, seconds) = (self.made.counts.steps + record.step, self.made.counts.train_s + record.seconds);
+        self.observer.record(&Record { step, seconds, ..record.clone() });
     }
 
     fn note(&mut self, text: &str) {
@@ -240,39 +220,19 @@ impl Observer for FirstObserver<'_> {
     }
 
     fn checkpoint_due(&self) -> bool {
-        self.over || self.observer.checkpoint_due()
+        self.observer.checkpoint_due()
     }
 
     fn checkpoint(&mut self, checkpoint: &Checkpoint<'_>) -> Result<()> {
-        self.over = false;
-        self.observer.checkpoint(checkpoint)
-    }
-}
-
-/// Hears of a later method, whose passes count on from the steps before. It keeps no checkpoints: it begins anew from the last
-/// one of the first method.
-struct LaterObserver<'a> {
-    observer: &'a mut dyn Observer,
-    steps: u64,
-    seconds: f64,
-}
-
-impl Observer for LaterObserver<'_> {
-    fn progress(&mut self, step: u64, share: f64, seconds_left: f64) {
-        self.observer.progress(self.steps + step, share, seconds_left);
+        self.observer.checkpoint(&self.made.checkpoint(Some(checkpoint))?)
     }
 
-    fn record(&mut self, record: &Record) {
-        let (step, seconds) = (self.steps + record.step, self.seconds + record.seconds);
-        self.observer.record(&Record { step, seconds, ..record.clone() });
+    fn slices_due(&self) -> bool {
+        self.observer.slices_due()
     }
 
-    fn note(&mut self, text: &str) {
-        self.observer.note(text);
-    }
-
-    fn cancelled(&self) -> bool {
-        self.observer.cancelled()
+    fn slices(&mut self, grid: VoxelGrid, slices: &[(Part, Array3<f32>)]) -> Result<()> {
+        self.observer.slices(grid, slices)
     }
 }
 

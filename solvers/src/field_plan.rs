@@ -350,7 +350,7 @@ impl FieldPlan {
         if !self.loss.needs_scan() {
             return None;
         }
-        let noise = Noise::of(job.scan, true);
+        let noise = Noise::of(job.scan.projections.view(), true);
         let (mut rays, mut measured) = (vec![], vec![]);
         for step in 0..source.steps_an_epoch().min(DRAWS) {
             source.draw(job.seed, step, DRAWN, &mut rays);

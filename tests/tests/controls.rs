@@ -15,7 +15,6 @@ use conefield_core::half::Stored;
 use conefield_core::loss::{Loss, NoiseModel};
 use conefield_core::prior::{Blocks, Prior};
 use conefield_core::regularizer::{Penalty, Regularizer};
-use conefield_core::scan::Scan;
 use conefield_core::settings::{Initializer, LossSpec};
 use conefield_core::simd::Real;
 use conefield_core::space::Space;
@@ -29,7 +28,7 @@ use conefield_core::{Error, Result};
 use conefield_projectors::voxel::{Joseph, Siddon};
 use ndarray::{ArrayView3, ArrayViewMut3};
 use std::ops::Range;
-use std::sync::atomic::{AtomicU32, Ordering};
+use std::sync::atomic::{AtomicU32, AtomicU64, Ordering};
 
 #[derive(Debug, Clone, Copy, PartialEq)]
 enum Fault {
@@ -975,6 +974,8 @@ enum BasisFault {
     Doubles,
     /// The result depends on the number of threads.
     Threads,
+    /// It has a fault to report.
+    Fails,
 }
 
 struct BasisOn(BasisFault, VoxelGrid);
@@ -1005,8 +1006,11 @@ impl Expansion for BasisOn {
     fn operator(&self) -> &dyn BasisOperator<f32> {
         self
     }
-    fn reference(&self) -> &dyn BasisOperator<f64> {
-        self
+    fn reference(&self) -> Option<&dyn BasisOperator<f64>> {
+        Some(self)
+    }
+    fn fault(&self) -> Result<()> {
+        if self.0 == BasisFault::Fails { Err(Error::unsupported("toy", "no more numbers")) } else { Ok(()) }
     }
 }
 
@@ -1055,6 +1059,7 @@ fn every_fault_of_a_basis_fails_its_property() {
         (BasisFault::Negative, "no negative entries"),
         (BasisFault::Doubles, "samples"),
         (BasisFault::Threads, "threads"),
+        (BasisFault::Fails, "no fault"),
     ] {
         let report = quietly(|| check_basis(&fault));
         assert!(report.failed().contains(&property), "{fault:?} passed {property:?}:\n{report}");
@@ -1088,6 +1093,8 @@ enum RegularizerFault {
     Uncounted,
     /// The result depends on the number of threads.
     Threads,
+    /// It has a fault to report after a call.
+    Fails,
 }
 
 struct PenaltyOn {
@@ -1097,12 +1104,12 @@ struct PenaltyOn {
 }
 
 impl Regularizer for RegularizerFault {
-    fn on(&self, grid: &VoxelGrid, _: &Space) -> Box<dyn Penalty> {
+    fn on(&self, grid: &VoxelGrid, _: &Space) -> Result<Box<dyn Penalty>> {
         let held = if *self == Self::Uncounted { grid.shape.iter().product() } else { 0 };
-        Box::new(PenaltyOn { fault: *self, calls: 0, state: vec![0.0; held] })
+        Ok(Box::new(PenaltyOn { fault: *self, calls: 0, state: vec![0.0; held] }))
     }
-    fn weight(&self, _: &VoxelGrid, noise: &mut dyn FnMut(f64) -> f64) -> f64 {
-        if *self == Self::LessWithNoise { 1.0 / (1.0 + noise(1.0)) } else { noise(1.0) }
+    fn weight(&self, _: &VoxelGrid, noise: &mut dyn FnMut(f64) -> f64) -> Result<f64> {
+        Ok(if *self == Self::LessWithNoise { 1.0 / (1.0 + noise(1.0)) } else { noise(1.0) })
     }
     fn describe(&self) -> String {
         format!("toy: {self:?}")
@@ -1135,8 +1142,12 @@ impl Penalty for PenaltyOn {
         }
     }
 
-    fn state(&mut self) -> Vec<(&'static str, &mut [f32])> {
+    fn state(&mut self) -> Vec<(&str, &mut [f32])> {
         vec![("state", &mut self.state)]
+    }
+    fn fault(&self) -> Result<()> {
+        let fails = self.fault == RegularizerFault::Fails && self.calls > 0;
+        if fails { Err(Error::unsupported("toy", "no more numbers")) } else { Ok(()) }
     }
 }
 
@@ -1156,6 +1167,7 @@ fn every_fault_of_a_regularizer_fails_its_property() {
         (RegularizerFault::Forgets, "state"),
         (RegularizerFault::Uncounted, "tally"),
         (RegularizerFault::Threads, "threads"),
+        (RegularizerFault::Fails, "no fault"),
     ] {
         let report = quietly(|| check_regularizer(&fault));
         assert!(report.failed().contains(&property), "{fault:?} passed {property:?}:\n{report}");
@@ -1173,7 +1185,7 @@ enum DataFault {
     LowBound,
     /// It falls where residuals grow.
     Upside,
-    /// A view counts more among others.
+    /// A view counts more after others.
     Neighbours,
     /// Ten times the noise is found.
     Loud,
@@ -1183,47 +1195,64 @@ enum DataFault {
     NotANumber,
     /// The result depends on the number of threads.
     Threads,
+    /// It refuses a scan.
+    LearnsNothing,
+    /// It has a fault to report.
+    Fails,
 }
 
-struct DataOn<'a>(DataFault, &'a Scan);
+struct DataOn {
+    fault: DataFault,
+    /// What was measured first.
+    first: f32,
+    /// Views that were asked for.
+    asked: AtomicU64,
+}
 
 impl DataTerm for DataFault {
-    fn of<'a>(&self, scan: &'a Scan) -> Box<dyn Misfit + 'a> {
-        Box::new(DataOn(*self, scan))
+    fn of(&self, measured: ArrayView3<'_, f32>) -> Result<Box<dyn Misfit>> {
+        if *self == Self::LearnsNothing {
+            return Err(Error::unsupported("toy", "no scan suits it"));
+        }
+        Ok(Box::new(DataOn { fault: *self, first: measured[[0, 0, 0]], asked: AtomicU64::new(0) }))
     }
     fn describe(&self) -> String {
         format!("toy: {self:?}")
     }
 }
 
-impl Misfit for DataOn<'_> {
-    fn differentiate(&self, views: &[usize], mut residuals: ArrayViewMut3<'_, f32>) -> f64 {
+impl Misfit for DataOn {
+    fn differentiate(&self, _: usize, _: &[f32], residuals: &mut [f32]) -> f64 {
         let square: f64 = residuals.iter().map(|r| f64::from(*r).powi(2)).sum();
-        let factor = match self.0 {
+        let asked = self.asked.fetch_add(1, Ordering::Relaxed);
+        let factor = match self.fault {
             DataFault::Steep => 2.0,
-            DataFault::Neighbours if views.len() > 1 => 1.001,
-            DataFault::NotANumber => self.1.projections[[0, 0, 0]] * f32::NAN,
+            DataFault::Neighbours if asked % 3 == 1 => 1.001,
+            DataFault::NotANumber => self.first * f32::NAN,
             DataFault::Threads if rayon::current_num_threads() == 3 => 1.0 + 1e-6,
             DataFault::Upside => -1.0,
             _ => 1.0,
         };
-        residuals.mapv_inplace(|r| factor * r);
-        if self.0 == DataFault::Upside { -0.5 * square } else { 0.5 * square }
+        residuals.iter_mut().for_each(|r| *r *= factor);
+        if self.fault == DataFault::Upside { -0.5 * square } else { 0.5 * square }
     }
-    fn curve(&self, _: &[usize], mut values: ArrayViewMut3<'_, f32>) {
-        if self.0 == DataFault::LowBound {
-            values.mapv_inplace(|x| 0.9 * x);
+    fn curve(&self, _: usize, _: &[f32], values: &mut [f32]) {
+        if self.fault == DataFault::LowBound {
+            values.iter_mut().for_each(|x| *x *= 0.9);
         }
     }
-    fn spread(&self, _: &[usize], mut values: ArrayViewMut3<'_, f32>) {
-        match self.0 {
-            DataFault::LowBound => values.mapv_inplace(|x| 0.9f32.sqrt() * x),
-            DataFault::Wide => values.mapv_inplace(|x| 1.2 * x),
+    fn spread(&self, _: usize, _: &[f32], values: &mut [f32]) {
+        match self.fault {
+            DataFault::LowBound => values.iter_mut().for_each(|x| *x *= 0.9f32.sqrt()),
+            DataFault::Wide => values.iter_mut().for_each(|x| *x *= 1.2),
             _ => {}
         }
     }
+    fn fault(&self) -> Result<()> {
+        if self.fault == DataFault::Fails { Err(Error::unsupported("toy", "no more numbers")) } else { Ok(()) }
+    }
     fn noise(&self) -> f64 {
-        if self.0 == DataFault::Loud { 0.2 } else { 0.02 }
+        if self.fault == DataFault::Loud { 0.2 } else { 0.02 }
     }
     fn describe(&self) -> String {
         "toy".into()
@@ -1243,6 +1272,8 @@ fn every_fault_of_a_data_term_fails_its_property() {
         (DataFault::Wide, &["spread of noise"]),
         (DataFault::NotANumber, &["finite"]),
         (DataFault::Threads, &["threads"]),
+        (DataFault::LearnsNothing, &["learns from a scan"]),
+        (DataFault::Fails, &["no fault"]),
     ] {
         let report = quietly(|| check_data_term(&fault));
         let failed = report.failed();

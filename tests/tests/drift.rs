@@ -15,6 +15,7 @@ use conefield_core::scene::{Scene, SceneSettings};
 use conefield_solvers::training::callbacks::Drift;
 use conefield_solvers::training::{CallbackSpec, Run};
 use serde_json::{Value, json};
+use std::sync::Arc;
 
 /// 40 steps over 8 views: 5 epochs.
 fn settings() -> Value {
@@ -167,13 +168,13 @@ fn a_resumed_run_finds_the_same_drift_to_the_bit() {
 #[test]
 fn a_recording_of_another_shape_is_refused() {
     let mut resume = stopped(&settings(), 14).kept.unwrap();
-    let features = resume.weights.tensors.remove("drift.features").unwrap();
+    let features = Arc::make_mut(&mut resume.weights).tensors.remove("drift.features").unwrap();
     let refused = |resume: &Resume, words: &[&str]| {
         let e = resumed(&settings(), resume).unwrap_err().to_string();
         assert!(words.iter().all(|w| e.contains(w)), "{e}");
     };
     refused(&resume, &["kept", "drift.features", "nothing", "[6, 300]"]);
-    resume.weights.tensors.insert("drift.features".into(), (vec![300, 6], features.1));
+    Arc::make_mut(&mut resume.weights).tensors.insert("drift.features".into(), (vec![300, 6], features.1));
     refused(&resume, &["drift.features", "[300, 6]", "[6, 300]"]);
 }
 
@@ -188,7 +189,7 @@ fn a_checkpoint_of_other_callbacks_is_refused() {
     refused(&with("/callbacks", json!([{"type": "rollback"}])), &kept, &["kept: drift", "field-monitor, rollback"]);
     refused(&masked(), &kept, &["kept: fft-mask", "nothing"]);
     let mut more = kept.clone();
-    more.weights.tensors.insert("drift.more".into(), (vec![1], vec![0.0]));
+    Arc::make_mut(&mut more.weights).tensors.insert("drift.more".into(), (vec![1], vec![0.0]));
     refused(&settings(), &more, &["kept: drift.more", "only what this run keeps"]);
     let mut other = kept.clone();
     other.standing.method["callbacks"]["rollback"] = json!({"level": 1.0});

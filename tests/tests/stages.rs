@@ -84,7 +84,7 @@ fn frequency() {
     for (settings, single) in [
         (json!({"type": "frequency"}), 2e-6),
         (json!({"type": "frequency", "bands": 1, "max_frequency": 3.0}), 2e-6),
-        (json!({"type": "frequency", "bands": 5, "include_input": false, "max_frequency": 40.0}), 2e-5),
+        (json!({"type": "frequency", "bands": 5, "max_frequency": 40.0}), 2e-5),
         // A product f·x is rounded to 2⁻²⁴ of up to f turns.
         (json!({"type": "frequency", "bands": 7, "spacing": "linear", "max_frequency": 100.0}), 5e-5),
     ] {

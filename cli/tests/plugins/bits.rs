@@ -24,6 +24,8 @@ use conefield_solvers::losses::L2;
 use conefield_solvers::priors::TotalVariation;
 
 // The plugins' own files, built into this test.
+#[path = "../../../plugins/examples/huber/src/huber.rs"]
+mod huber;
 #[path = "../../../plugins/examples/triplane/src/planes.rs"]
 mod planes;
 #[path = "../../../plugins/examples/siren/src/sine.rs"]
@@ -110,6 +112,47 @@ fn as_built_in() {
     let volume = conefield_io::read_volume(Path::new(&run).join("volume.nii.gz")).unwrap();
     let built_in = solution.result.volume(&Cpu::new()).unwrap();
     assert!(volume.data == built_in.data, "the volumes differ");
+}
+
+/// A regularizer of a plugin has the weight, the penalty and the map of one that is built in, and what it keeps goes into
+/// checkpoints.
+#[test]
+fn a_regularizer_as_built_in() {
+    const SPEC: &str = "type = 'fista'\nprior = 'huber'\nsubsets = 2\nstop = { passes = 400 }\n";
+    let dir = tempfile::tempdir().unwrap();
+    let (scan, spec) = (dir.path().join("scan"), dir.path().join("huber.toml"));
+    done(&["simulate", "phantom:head:16", "-o", &text(&scan), "--views", "8", "--detector", "16x16"]);
+    std::fs::write(&spec, SPEC).unwrap();
+    let library = text(&example("huber"));
+    let (scan_at, spec_at, [whole, broken]) =
+        (text(&scan), text(&spec), ["whole", "broken"].map(|run| text(&dir.path().join(run))));
+    let args = |run| ["--plugin", &library, "reconstruct", &scan_at, "--spec", &spec_at, "-o", run];
+    done(&args(&whole));
+    let read = |run: &str| conefield_io::read_volume(Path::new(run).join("volume.nii.gz")).unwrap().data;
+
+    let scan = conefield_io::read_scan(&scan).unwrap();
+    let spec = conefield_core::spec::load::parse(SPEC, "huber.toml", &[], &[]).unwrap().spec;
+    let backend = Cpu::new();
+    let job = Job::new(&scan, &backend);
+    let solution = spec.method.plan(&Context::new(&backend)).unwrap().run(&job, &mut Silent).unwrap();
+    assert!(read(&whole) == solution.result.volume(&backend).unwrap().data, "the volumes differ");
+
+    let mut child = std::process::Command::new(assert_cmd::cargo::cargo_bin("conefield"))
+        .arg("--quiet")
+        .args([&args(&broken)[..], &["--checkpoint-every", "0.01s"]].concat())
+        .spawn()
+        .unwrap();
+    let checkpoint = Path::new(&broken).join("checkpoint.safetensors");
+    while !checkpoint.exists() && child.try_wait().unwrap().is_none() {
+        std::thread::sleep(std::time::Duration::from_millis(1));
+    }
+    child.kill().unwrap();
+    child.wait().unwrap();
+    assert!(checkpoint.exists(), "it was over before it could be killed");
+    let kept = conefield_io::read_checkpoint(&checkpoint).unwrap();
+    assert!(["prior.dual.x", "prior.dual.y", "prior.dual.z"].iter().all(|name| kept.tensors.contains_key(*name)));
+    done(&[&args(&broken)[..], &["--resume"]].concat());
+    assert!(read(&whole) == read(&broken), "the volumes differ after a kill");
 }
 
 #[test]

@@ -42,6 +42,28 @@ fn every_example_is_checked_and_reconstructs() {
     }
 }
 
+/// The regularizer runs in `fista`, and is nearer to the truth than no prior.
+#[test]
+fn huber_denoises() {
+    let dir = tempfile::tempdir().unwrap();
+    let library = text(&example("huber"));
+    let report = json(&["plugins", "check", &library, "--json"]);
+    assert_eq!(report["passed"], true, "{report:#}");
+    let scan = text(&dir.path().join("scan"));
+    let noise = ["--noise", "poisson:1e3"];
+    done(&[&["simulate", "phantom:head:32", "-o", &scan, "--views", "16", "--detector", "32x32"][..], &noise].concat());
+    let psnr = |prior: &str| {
+        let run = text(&dir.path().join(prior));
+        let prior = format!("prior={prior}");
+        let args = ["--plugin", &library, "reconstruct", &scan, "--spec", "fista", "-o", &run, "--json"];
+        let args = [&args[..], &["--reference", "truth", "--set", &prior]].concat();
+        json(&args)["scores"]["psnr"].as_f64().unwrap()
+    };
+    let [none, huber] = ["none", "huber"].map(psnr);
+    println!("huber: {huber:.2} dB, without a prior {none:.2} dB");
+    assert!(huber > none + 1.0, "{huber} dB, without a prior {none} dB");
+}
+
 /// The shipped specs that train a field and stop there.
 const FIELDS: [&str; 8] = ["naf", "ni-naf", "ni-naf-published", "nerf", "dense", "fast", "balanced", "accurate"];
 /// Those that go on from its volume.

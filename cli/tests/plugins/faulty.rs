@@ -139,7 +139,7 @@ const LOSS_FAULTS: &[Fault] = &[
     untried(
         "a loss that writes past its slopes",
         &["FAULT=PAST_SLOPES"],
-        "it writes outside the 16 numbers of its slopes",
+        "it writes outside its slopes: 1 past 16 numbers",
     ),
     untried("a loss that fails", &["FAULT=FAILS"], "at failed: no more numbers"),
     fault("a slope that is 10 % too large", &["FAULT=WRONG_SLOPE"], ["", "finite differences", ""]),
@@ -163,11 +163,120 @@ const PRIOR_FAULTS: &[Fault] = &[
     untried(
         "a prior that writes before its gradient",
         &["FAULT=BEFORE_GRADIENT"],
-        "it writes outside the 64 numbers of its gradient",
+        "it writes outside its gradient: 1 before 64 numbers",
     ),
     untried("a prior that fails", &["FAULT=FAILS"], "block failed: no more numbers"),
     fault("a prior's gradient that is 10 % too large", &["FAULT=WRONG_GRADIENT"], ["", "finite differences", ""]),
     fault("a prior's gradient that overwrites", &["FAULT=OVERWRITES"], ["", "gradients add", ""]),
+];
+
+/// Faults of pieces of iterative methods and of line fields: `faulty_pieces.c`, and what a spec has of it.
+const PIECE_FAULTS: &[(&str, &[Fault])] = &[
+    (
+        "prior.type=faulty",
+        &[
+            fault("sound pieces of methods", &["FAULT=NONE"], ["", "", ""]),
+            refused("a regularizer without its proximal map", &["FAULT=R_NO_PROX"], "no function prox"),
+            untried("a negative penalty of a regularizer", &["FAULT=R_NEGATIVE"], "refused: the penalty is -"),
+            untried(
+                "a proximal map that is NaN",
+                &["FAULT=R_NOT_A_NUMBER"],
+                "refused: number 0 of 120 of its coefficients is NaN",
+            ),
+            untried(
+                "a proximal map that writes past its coefficients",
+                &["FAULT=R_PAST"],
+                "it writes outside its coefficients: 1 past 120 numbers",
+            ),
+            untried("a proximal map below 0", &["FAULT=R_BELOW"], "refused: its proximal map gives -"),
+            untried("a proximal map that fails", &["FAULT=R_FAILS"], "prox failed: no more numbers"),
+            untried("a regularizer for no grid", &["FAULT=R_NO_GRID"], "on failed: no such grid"),
+            untried(
+                "a penalty that is the regularizer",
+                &["FAULT=R_ITSELF"],
+                "on: found the old stage, expected a new one",
+            ),
+            untried("two states of one name", &["FAULT=R_TWIN_STATE"], "two entries are called \"calls\""),
+            untried("a weight that is NaN", &["FAULT=R_WEIGHT"], "weight: found NaN, expected a finite number"),
+            fault("a proximal map that shrinks half as much", &["FAULT=R_HALVED"], ["", "proximal map", ""]),
+            fault("a state that is not told", &["FAULT=R_FORGETS"], ["", "state", ""]),
+            fault(
+                "a proximal map that fails later",
+                &["FAULT=R_LATER"],
+                ["", "no fault", "prox failed: no more numbers"],
+            ),
+        ],
+    ),
+    (
+        "data.type=faulty",
+        &[
+            refused("a data term for no scan", &["FAULT=D_NO_OF"], "no function of"),
+            untried("a negative misfit", &["FAULT=D_NEGATIVE"], "refused: the misfit is -"),
+            untried("a derivative that is NaN", &["FAULT=D_NOT_A_NUMBER"], "number 0 of 42 of its derivatives is NaN"),
+            untried(
+                "a data term that writes past its values",
+                &["FAULT=D_PAST"],
+                "it writes outside its curvatures: 1 past 42 numbers",
+            ),
+            untried("noise that is NaN", &["FAULT=D_NOISE"], "refused: the noise that it finds is NaN"),
+            untried("a data term that refuses a scan", &["FAULT=D_NO_SCAN"], "of failed: no such scan"),
+            fault("a derivative that is 10 % too large", &["FAULT=D_STEEP"], ["", "finite differences", ""]),
+            fault("a bound of the curvature that is too low", &["FAULT=D_LOW_BOUND"], ["", "curvature", ""]),
+            fault(
+                "a data term that fails later",
+                &["FAULT=D_LATER"],
+                ["", "no fault", "differentiate failed: no more numbers"],
+            ),
+        ],
+    ),
+    (
+        "basis.type=faulty",
+        &[
+            untried(
+                "no coefficients",
+                &["FAULT=B_NO_COEFFICIENTS"],
+                "info failed: coefficients: volume.shape: found [0, 4, 6]",
+            ),
+            untried(
+                "a basis that writes past its voxels",
+                &["FAULT=B_PAST"],
+                "it writes outside its voxels: 1 past 120 numbers",
+            ),
+            untried(
+                "a voxel that is left unwritten",
+                &["FAULT=B_UNWRITTEN"],
+                "number 119 of 120 of its voxels is left unwritten",
+            ),
+            untried("a basis that fails", &["FAULT=B_FAILS"], "expand failed: no more numbers"),
+            fault("an adjoint that is 1 % too long", &["FAULT=B_LONG_ADJOINT"], ["", "adjoint: single precision", ""]),
+            fault("a basis that fails later", &["FAULT=B_LATER"], ["", "no fault", "expand failed: no more numbers"]),
+        ],
+    ),
+    (
+        "field.type=faulty",
+        &[
+            untried(
+                "a line field without line integrals",
+                &["FAULT=L_NO_LINES"],
+                "it has no line integrals of its own",
+            ),
+            untried(
+                "a line field that writes past its line integrals",
+                &["FAULT=L_PAST"],
+                "it writes outside its line integrals: 1 past 4 numbers",
+            ),
+            untried(
+                "a line integral of a ray that is not inside",
+                &["FAULT=L_MISSED"],
+                "refused: a ray that is not inside has a line integral",
+            ),
+            fault(
+                "an adjoint of line integrals that is 10 % too long",
+                &["FAULT=L_LONG_ADJOINT"],
+                ["", "lines: finite differences", ""],
+            ),
+        ],
+    ),
 ];
 
 /// No process survives this.
@@ -250,8 +359,7 @@ fn every_fault_is_found_and_none_takes_the_process_down() {
     let mut rows = vec![];
     let reconstruct = |library: &str, number: usize, spec: &[&str], hide: &[&Path]| {
         let run = text(&dir.path().join(format!("run-{number}")));
-        let mut args = vec!["--plugin", library, "reconstruct", &scan, "--spec", "fast", "-o", &run, "--steps", "300"];
-        args.extend(["--set", "training.rays=16"]);
+        let mut args = vec!["--plugin", library, "reconstruct", &scan, "-o", &run];
         args.extend(spec);
         let found = said(&args, hide);
         // What has failed leaves no volume.
@@ -260,21 +368,37 @@ fn every_fault_is_found_and_none_takes_the_process_down() {
         found
     };
     let here = [dir.path()];
-    let encoder = &["--set", "encoder.type=faulty", "--set", "projector.samples=16"][..];
-    let rays = &["--set", "projector.type=faulty"][..];
-    let encoders = FAULTS.iter().map(|f| (f, "faulty.c", encoder));
-    let (loss, prior) = (&["--set", "loss.type=faulty"][..], &["--set", "priors.0.type=faulty"][..]);
-    let all = encoders
-        .chain(RAY_FAULTS.iter().map(|f| (f, "faulty_rays.c", rays)))
-        .chain(LOSS_FAULTS.iter().map(|f| (f, "faulty_loss.c", loss)))
-        .chain(PRIOR_FAULTS.iter().map(|f| (f, "faulty_prior.c", prior)));
+    let fast = ["--spec", "fast", "--steps", "300", "--set", "training.rays=16", "--set"];
+    let of_fast = |sets: &[&'static str]| [&fast[..], sets].concat();
+    let encoder = of_fast(&["encoder.type=faulty", "--set", "projector.samples=16"]);
+    let [rays, loss, prior] =
+        ["projector.type=faulty", "loss.type=faulty", "priors.0.type=faulty"].map(|set| of_fast(&[set]));
+    let lines = dir.path().join("lines.toml");
+    std::fs::write(&lines, "type = 'line-field'\nfield = 'voxels-joseph'\ntraining = { steps = 20, rays = 16 }\n")
+        .unwrap();
+    let lines = text(&lines);
+    let of_piece = |set: &'static str| -> Vec<&str> {
+        match set.starts_with("field") {
+            true => vec!["--spec", &lines, "--set", set],
+            false => vec!["--spec", "fista", "--steps", "40", "--set", set],
+        }
+    };
+    let pieces =
+        PIECE_FAULTS.iter().flat_map(|(set, faults)| faults.iter().map(|f| (f, "faulty_pieces.c", of_piece(set))));
+    let all = FAULTS
+        .iter()
+        .map(|f| (f, "faulty.c", encoder.clone()))
+        .chain(RAY_FAULTS.iter().map(|f| (f, "faulty_rays.c", rays.clone())))
+        .chain(LOSS_FAULTS.iter().map(|f| (f, "faulty_loss.c", loss.clone())))
+        .chain(PRIOR_FAULTS.iter().map(|f| (f, "faulty_prior.c", prior.clone())))
+        .chain(pieces);
     for (i, (fault, source, set)) in all.enumerate() {
         let library = dir.path().join("faulty.so");
         cc(&sources().join("plugins/tests").join(source), fault.defines, &library);
         let library = text(&library);
         let list = refusal(&library, &here);
         let check = said(&["plugins", "check", &library], &here);
-        let run = reconstruct(&library, i, set, &here);
+        let run = reconstruct(&library, i, &set, &here);
         fits(fault.what, "list", &list, fault.list);
         fits(fault.what, "check", &check, fault.check);
         fits(fault.what, "reconstruct", &run, fault.reconstruct);
@@ -288,8 +412,8 @@ fn every_fault_is_found_and_none_takes_the_process_down() {
         let settings = format!("{{\"when\": \"{when}\"}}");
         let checked = said(&["plugins", "check", &library, "--settings", &settings], &[folder]);
         let when = format!("encoder.when={when}");
-        let set = ["--set", "encoder.type=panics", "--set", &when, "--set", "projector.samples=16"];
-        let ran = reconstruct(&library, 100 + i, &set, &[folder]);
+        let set = [&fast[..], &["encoder.type=panics", "--set", &when, "--set", "projector.samples=16"]].concat();
+        let ran = reconstruct(&library, 200 + i, &set, &[folder]);
         fits(what, "check", &checked, check);
         fits(what, "reconstruct", &ran, run);
         rows.push(Row::of(what, ["", &checked, &ran], ["", check, run]));

@@ -5,7 +5,22 @@ use crate::common::{done, json, refused, text};
 use std::path::{Path, PathBuf};
 use std::process::Command;
 
-const KINDS: [&str; 7] = ["encoder", "normalizer", "field", "projector", "initializer", "loss", "prior"];
+const KINDS: [&str; 11] = [
+    "encoder",
+    "normalizer",
+    "field",
+    "line-field",
+    "projector",
+    "initializer",
+    "loss",
+    "prior",
+    "regularizer",
+    "data-term",
+    "basis",
+];
+
+/// Kinds that iterative methods are put together from.
+const PIECES: [&str; 3] = ["regularizer", "data-term", "basis"];
 
 /// A scan small enough for seconds.
 fn scan(dir: &Path) -> PathBuf {
@@ -15,13 +30,14 @@ fn scan(dir: &Path) -> PathBuf {
 }
 
 /// A check and a short run of the plugin in `folder`, built to `library`; the run's record.
-fn use_it(folder: &Path, library: &Path, scan: &Path) -> serde_json::Value {
+fn use_it(kind: &str, folder: &Path, library: &Path, scan: &Path) -> serde_json::Value {
     let library = text(library);
     let report = json(&["plugins", "check", &library, "--json"]);
     assert_eq!(report["passed"], true, "{report:#}");
     let spec = text(&folder.join("spec.toml"));
     let run = text(&folder.join("run"));
-    let small = ["--steps", "12", "--set", "training.rays=32", "--json"];
+    let small = if PIECES.contains(&kind) { "stop={ passes = 12 }" } else { "training.rays=32" };
+    let small = ["--steps", "12", "--set", small, "--json"];
     json(&[&["--plugin", &library, "reconstruct", &text(scan), "--spec", &spec, "-o", &run][..], &small].concat())
 }
 
@@ -41,7 +57,7 @@ fn in_rust() {
         if kind == "encoder" {
             cargo(&folder, &["test", "--release"]);
         }
-        let record = use_it(&folder, &library(&name), &scan);
+        let record = use_it(kind, &folder, &library(&name), &scan);
         assert_eq!(record["plugins"][0]["name"], name.as_str());
         assert_eq!(record["plugins"][0]["version"], "0.1.0");
         assert_eq!(record["steps"], 12);
@@ -59,7 +75,7 @@ fn in_c() {
         let made =
             Command::new("make").current_dir(&folder).env("CFLAGS", "-O2 -Wall -Wextra -Werror").output().unwrap();
         assert!(made.status.success(), "{}", String::from_utf8_lossy(&made.stderr));
-        let record = use_it(&folder, &folder.join(format!("{name}.so")), &scan);
+        let record = use_it(kind, &folder, &folder.join(format!("{name}.so")), &scan);
         assert_eq!(record["plugins"][0]["name"], name.as_str());
     }
 }

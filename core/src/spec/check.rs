@@ -4,7 +4,7 @@
 use super::LABEL;
 use super::one_of;
 use super::schema::{NESTED, label, of_type};
-use super::tree::{At, Kind as Is, Node};
+use super::tree::{At, Is, Node};
 use crate::error::{Error, Result};
 use crate::registry::{Kind, find, names};
 use serde_json::Value;

@@ -4,7 +4,7 @@
 //! lays single values over that; the result is checked against the settings of the registered stage types and only
 //! then becomes a [`Spec`].
 
-use super::tree::{At, Entry, Kind, Node, parse_json, parse_toml};
+use super::tree::{At, Entry, Is, Node, parse_json, parse_toml};
 use super::{LABEL, Spec, check, one_of};
 use crate::allowance::Work;
 use crate::error::{Error, Result, ensure};
@@ -82,7 +82,7 @@ impl Draft {
     /// The plugins that it names, each with where it stands.
     pub fn plugins(&self) -> Vec<(String, PathBuf)> {
         let paths = self.written.get(PLUGINS).and_then(|p| p.get(PATHS)).map(|p| &p.kind);
-        let Some(Kind::Array(paths)) = paths else { return vec![] };
+        let Some(Is::Array(paths)) = paths else { return vec![] };
         paths.iter().filter_map(|p| Some((p.at.to_string(), PathBuf::from(p.text()?)))).collect()
     }
 
@@ -272,7 +272,7 @@ impl Layer {
     /// Puts what the methods of a chain extend under them. Of the specs that they name only the method counts, and the
     /// plugins that it needs.
     fn extend_methods(&self, node: &mut Node, shipped: &[Shipped], above: &[Origin], work: &mut Work) -> Result<()> {
-        let Some(Kind::Array(methods)) = node.get_mut(METHODS).map(|m| &mut m.kind) else { return Ok(()) };
+        let Some(Is::Array(methods)) = node.get_mut(METHODS).map(|m| &mut m.kind) else { return Ok(()) };
         let mut plugins = vec![];
         for method in methods {
             let Some(mut tree) = self.base(method, shipped, above, work)? else { continue };
@@ -291,11 +291,11 @@ impl Layer {
 /// Makes the plugin paths of a spec file, which are relative to it, absolute: they outlive the file's place in layers.
 fn anchor_plugins(node: &mut Node, file: &Path) {
     let folder = file.parent().unwrap_or(Path::new(""));
-    let Some(Kind::Array(paths)) = node.get_mut(PLUGINS).and_then(|p| p.get_mut(PATHS)).map(|p| &mut p.kind) else {
+    let Some(Is::Array(paths)) = node.get_mut(PLUGINS).and_then(|p| p.get_mut(PATHS)).map(|p| &mut p.kind) else {
         return;
     };
     for path in paths {
-        if let Kind::String(path) = &mut path.kind
+        if let Is::String(path) = &mut path.kind
             && let Ok(absolute) = std::path::absolute(folder.join(&*path))
         {
             *path = absolute.display().to_string();
@@ -333,7 +333,7 @@ impl Set {
         let parsed = parse_toml("", &format!("value = {value}"), 0).ok().filter(|n| n.entries().len() == 1);
         let kind = match parsed.and_then(|mut n| n.take("value")) {
             Some(e) => e.value.kind,
-            None => Kind::String(value.to_owned()),
+            None => Is::String(value.to_owned()),
         };
         let value = at_everywhere(Node { at: at.clone(), kind }, &at);
         Ok(Self { path: path.split('.').map(str::to_owned).collect(), value, at })
@@ -347,7 +347,7 @@ impl Set {
             let so_far = path[..=i].join(".");
             let shown = node.shown();
             match &mut node.kind {
-                Kind::Array(items) => {
+                Is::Array(items) => {
                     let n = items.len();
                     let index = step.parse::<usize>().ok().filter(|k| *k <= n).ok_or_else(|| {
                         let range =
@@ -362,7 +362,7 @@ impl Set {
                         node.spell_out();
                     }
                 }
-                Kind::Table(entries) => {
+                Is::Table(entries) => {
                     // A type that changes leaves nothing of the old settings.
                     let retyped = |e: &Entry| e.key == "type" && e.value.text() != value.text();
                     if i + 1 == path.len() && step == "type" && entries.iter().any(retyped) {
@@ -372,7 +372,7 @@ impl Set {
                     let index = found.unwrap_or_else(|| {
                         // A number after the key makes it a list.
                         let list = path.get(i + 1).is_some_and(|next| next.parse::<usize>().is_ok());
-                        let kind = if list { Kind::Array(vec![]) } else { Kind::Table(vec![]) };
+                        let kind = if list { Is::Array(vec![]) } else { Is::Table(vec![]) };
                         let fresh = Node { at: at.clone(), kind };
                         entries.push(Entry { key: step.clone(), at: at.clone(), value: fresh });
                         entries.len() - 1
@@ -396,7 +396,7 @@ impl Set {
             }
         }
         match value.kind {
-            Kind::Table(_) => node.merge(value),
+            Is::Table(_) => node.merge(value),
             _ => *node = value,
         }
         Ok(())
@@ -407,12 +407,12 @@ impl Set {
 fn at_everywhere(mut node: Node, at: &At) -> Node {
     node.at = at.clone();
     match &mut node.kind {
-        Kind::Array(items) => {
+        Is::Array(items) => {
             for item in items {
                 *item = at_everywhere(std::mem::replace(item, Node::empty_table(at.clone())), at);
             }
         }
-        Kind::Table(entries) => {
+        Is::Table(entries) => {
             for e in entries {
                 e.at = at.clone();
                 e.value = at_everywhere(std::mem::replace(&mut e.value, Node::empty_table(at.clone())), at);

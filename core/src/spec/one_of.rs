@@ -3,7 +3,7 @@
 
 use super::check::{Context, invalid, join, listed};
 use super::schema::{NESTED, ONE_OF, of_type};
-use super::tree::{Entry, Kind as Is, Node};
+use super::tree::{Entry, Is, Node};
 use crate::error::Result;
 use crate::registry::{Kind, find};
 use serde_json::Value;

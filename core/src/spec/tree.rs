@@ -71,7 +71,7 @@ impl fmt::Display for At {
 #[derive(Debug, Clone, PartialEq)]
 pub(super) struct Node {
     pub(super) at: At,
-    pub(super) kind: Kind,
+    pub(super) kind: Is,
 }
 
 impl Node {
@@ -79,8 +79,8 @@ impl Node {
     pub(super) fn sources(&self, all: &mut BTreeSet<String>) {
         all.insert(self.at.source.name.clone());
         match &self.kind {
-            Kind::Array(items) => items.iter().for_each(|i| i.sources(all)),
-            Kind::Table(entries) => entries.iter().for_each(|e| e.value.sources(all)),
+            Is::Array(items) => items.iter().for_each(|i| i.sources(all)),
+            Is::Table(entries) => entries.iter().for_each(|e| e.value.sources(all)),
             _ => {}
         }
     }
@@ -88,7 +88,7 @@ impl Node {
 
 /// What a value is.
 #[derive(Debug, Clone, PartialEq)]
-pub(super) enum Kind {
+pub(super) enum Is {
     Null,
     Bool(bool),
     Number(Number),
@@ -109,7 +109,7 @@ pub(super) struct Entry {
 impl Node {
     /// A table without entries.
     pub(super) fn empty_table(at: At) -> Self {
-        Self { at, kind: Kind::Table(vec![]) }
+        Self { at, kind: Is::Table(vec![]) }
     }
 
     /// The value of `key`, if this is a table that has it.
@@ -120,7 +120,7 @@ impl Node {
     /// The value of `key`, to be changed.
     pub(super) fn get_mut(&mut self, key: &str) -> Option<&mut Node> {
         match &mut self.kind {
-            Kind::Table(entries) => entries.iter_mut().find(|e| e.key == key).map(|e| &mut e.value),
+            Is::Table(entries) => entries.iter_mut().find(|e| e.key == key).map(|e| &mut e.value),
             _ => None,
         }
     }
@@ -128,7 +128,7 @@ impl Node {
     /// The entries of a table; none of anything else.
     pub(super) fn entries(&self) -> &[Entry] {
         match &self.kind {
-            Kind::Table(entries) => entries,
+            Is::Table(entries) => entries,
             _ => &[],
         }
     }
@@ -136,7 +136,7 @@ impl Node {
     /// Takes `key` out of a table.
     pub(super) fn take(&mut self, key: &str) -> Option<Entry> {
         match &mut self.kind {
-            Kind::Table(entries) => entries.iter().position(|e| e.key == key).map(|i| entries.remove(i)),
+            Is::Table(entries) => entries.iter().position(|e| e.key == key).map(|i| entries.remove(i)),
             _ => None,
         }
     }
@@ -144,7 +144,7 @@ impl Node {
     /// The text of a string.
     pub(super) fn text(&self) -> Option<&str> {
         match &self.kind {
-            Kind::String(s) => Some(s),
+            Is::String(s) => Some(s),
             _ => None,
         }
     }
@@ -154,7 +154,7 @@ impl Node {
         let mut node = self;
         for step in path {
             let next = match &node.kind {
-                Kind::Array(items) => step.parse::<usize>().ok().and_then(|i| items.get(i)),
+                Is::Array(items) => step.parse::<usize>().ok().and_then(|i| items.get(i)),
                 _ => node.get(step),
             };
             match next {
@@ -167,10 +167,10 @@ impl Node {
 
     /// Writes a stage that is only named as a table with that type.
     pub(super) fn spell_out(&mut self) {
-        if let Kind::String(_) = self.kind {
+        if let Is::String(_) = self.kind {
             let at = self.at.clone();
             let value = std::mem::replace(self, Self::empty_table(at.clone()));
-            self.kind = Kind::Table(vec![Entry { key: "type".into(), at, value }]);
+            self.kind = Is::Table(vec![Entry { key: "type".into(), at, value }]);
         }
     }
 
@@ -178,17 +178,17 @@ impl Node {
     pub(super) fn push_all(&mut self, path: &[&str], items: Node) {
         let at = items.at.clone();
         match (path, &mut self.kind, items.kind) {
-            ([key, rest @ ..], Kind::Table(entries), kind) => {
+            ([key, rest @ ..], Is::Table(entries), kind) => {
                 let found = entries.iter().position(|e| e.key == *key);
                 let i = found.unwrap_or_else(|| {
-                    let fresh = if rest.is_empty() { Kind::Array(vec![]) } else { Kind::Table(vec![]) };
+                    let fresh = if rest.is_empty() { Is::Array(vec![]) } else { Is::Table(vec![]) };
                     let value = Node { at: at.clone(), kind: fresh };
                     entries.push(Entry { key: (*key).into(), at: at.clone(), value });
                     entries.len() - 1
                 });
                 entries[i].value.push_all(rest, Node { at, kind });
             }
-            ([], Kind::Array(all), Kind::Array(items)) => all.extend(items),
+            ([], Is::Array(all), Is::Array(items)) => all.extend(items),
             _ => {}
         }
     }
@@ -197,7 +197,7 @@ impl Node {
     /// the keys of one type mean nothing to another. A table without a `type` over a stage that is only named changes
     /// settings of that stage.
     pub(super) fn merge(&mut self, over: Node) {
-        if matches!(over.kind, Kind::Table(_)) && over.get("type").is_none() {
+        if matches!(over.kind, Is::Table(_)) && over.get("type").is_none() {
             self.spell_out();
         }
         let retyped = match (self.get("type"), over.get("type")) {
@@ -205,7 +205,7 @@ impl Node {
             _ => false,
         };
         match (&mut self.kind, over.kind) {
-            (Kind::Table(base), Kind::Table(over_entries)) if !retyped => {
+            (Is::Table(base), Is::Table(over_entries)) if !retyped => {
                 for e in over_entries {
                     match base.iter_mut().find(|b| b.key == e.key) {
                         Some(b) => {
@@ -224,21 +224,21 @@ impl Node {
     /// As a JSON value.
     pub(super) fn to_json(&self) -> Value {
         match &self.kind {
-            Kind::Null => Value::Null,
-            Kind::Bool(b) => Value::Bool(*b),
-            Kind::Number(n) => Value::Number(n.clone()),
-            Kind::String(s) => Value::String(s.clone()),
-            Kind::Array(items) => Value::Array(items.iter().map(Node::to_json).collect()),
-            Kind::Table(entries) => Value::Object(entries.iter().map(|e| (e.key.clone(), e.value.to_json())).collect()),
+            Is::Null => Value::Null,
+            Is::Bool(b) => Value::Bool(*b),
+            Is::Number(n) => Value::Number(n.clone()),
+            Is::String(s) => Value::String(s.clone()),
+            Is::Array(items) => Value::Array(items.iter().map(Node::to_json).collect()),
+            Is::Table(entries) => Value::Object(entries.iter().map(|e| (e.key.clone(), e.value.to_json())).collect()),
         }
     }
 
     /// For an error message: the value, or what it is where it is long.
     pub(super) fn shown(&self) -> String {
         match &self.kind {
-            Kind::Array(items) => format!("a list of {}", items.len()),
-            Kind::Table(_) => "a table".into(),
-            Kind::String(s) => format!("the text {s:?}"),
+            Is::Array(items) => format!("a list of {}", items.len()),
+            Is::Table(_) => "a table".into(),
+            Is::String(s) => format!("the text {s:?}"),
             _ => self.to_json().to_string(),
         }
     }
@@ -263,25 +263,25 @@ fn toml_table(source: &Arc<Source>, table: &DeTable<'_>, at: At) -> Result<Node>
             value: toml_value(source, value.get_ref(), At::byte(source, value.span().start))?,
         });
     }
-    Ok(Node { at, kind: Kind::Table(entries) })
+    Ok(Node { at, kind: Is::Table(entries) })
 }
 
 fn toml_value(source: &Arc<Source>, value: &DeValue<'_>, at: At) -> Result<Node> {
     let refuse = |found: &dyn fmt::Display, expected: &str| Error::invalid(at.to_string(), "value", found, expected);
     let kind = match value {
-        DeValue::String(s) => Kind::String(s.to_string()),
-        DeValue::Boolean(b) => Kind::Bool(*b),
+        DeValue::String(s) => Is::String(s.to_string()),
+        DeValue::Boolean(b) => Is::Bool(*b),
         DeValue::Integer(i) => {
             let n = i64::from_str_radix(i.as_str(), i.radix()).map(Number::from);
             let n = n.or_else(|_| u64::from_str_radix(i.as_str(), i.radix()).map(Number::from));
-            Kind::Number(n.map_err(|_| refuse(i, "a whole number of at most 64 bits"))?)
+            Is::Number(n.map_err(|_| refuse(i, "a whole number of at most 64 bits"))?)
         }
         DeValue::Float(f) => {
             let n = f.as_str().parse().ok().and_then(Number::from_f64);
-            Kind::Number(n.ok_or_else(|| refuse(f, "a finite number"))?)
+            Is::Number(n.ok_or_else(|| refuse(f, "a finite number"))?)
         }
         DeValue::Datetime(d) => return Err(refuse(d, "a number, a text, a list or a table; no setting is a date")),
-        DeValue::Array(items) => Kind::Array(
+        DeValue::Array(items) => Is::Array(
             items
                 .iter()
                 .map(|v| toml_value(source, v.get_ref(), At::byte(source, v.span().start)))
@@ -367,7 +367,7 @@ impl Json<'_> {
                     self.eat(b':');
                     entries.push(Entry { key, at, value: self.value()? });
                 }
-                Kind::Table(entries)
+                Is::Table(entries)
             }
             b'[' => {
                 self.at += 1;
@@ -376,16 +376,16 @@ impl Json<'_> {
                     self.eat(b',');
                     items.push(self.value()?);
                 }
-                Kind::Array(items)
+                Is::Array(items)
             }
-            b'"' => Kind::String(self.string()?),
+            b'"' => Is::String(self.string()?),
             _ => {
                 let rest = &self.text.as_bytes()[self.at..];
                 let len = rest.iter().take_while(|b| !b",]}".contains(b) && !b.is_ascii_whitespace()).count();
                 match self.scalar(len)? {
-                    Value::Bool(b) => Kind::Bool(b),
-                    Value::Number(n) => Kind::Number(n),
-                    _ => Kind::Null,
+                    Value::Bool(b) => Is::Bool(b),
+                    Value::Number(n) => Is::Number(n),
+                    _ => Is::Null,
                 }
             }
         };

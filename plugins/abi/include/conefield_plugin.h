@@ -1,4 +1,4 @@
-/* The contract between conefield and its plugins, version 2.0. Made from plugins/abi/src/lib.rs. */
+/* The contract between conefield and its plugins, version 2.2. Made from plugins/abi/src/lib.rs. */
 
 #ifndef CONEFIELD_PLUGIN_H
 #define CONEFIELD_PLUGIN_H
@@ -14,7 +14,7 @@
 /*
  Minor version: tables have grown so many times.
  */
-#define CONEFIELD_ABI_MINOR 1
+#define CONEFIELD_ABI_MINOR 2
 
 /*
  Points to features.
@@ -50,6 +50,26 @@
  Judges a field by small blocks of neighbouring points.
  */
 #define CONEFIELD_PRIOR 6
+
+/*
+ Penalty of coefficients with its proximal map, for iterative methods. Since 2.2.
+ */
+#define CONEFIELD_REGULARIZER 7
+
+/*
+ How far line integrals are from the measured ones, for iterative methods. Since 2.2.
+ */
+#define CONEFIELD_DATA_TERM 8
+
+/*
+ Coefficients to voxels, for iterative methods. Since 2.2.
+ */
+#define CONEFIELD_BASIS 9
+
+/*
+ A field that brings line integrals of its own. Since 2.2.
+ */
+#define CONEFIELD_LINE_FIELD 10
 
 /*
  A row looks at itself alone.
@@ -374,7 +394,33 @@ typedef struct ConefieldReduced {
 } ConefieldReduced;
 
 /*
- Functions of an encoder, a normalizer or a field. `stage` is what `create` made.
+ A ray in the unit cube: `origin + t * direction`, where `t` counts cube sides.
+ */
+typedef struct ConefieldRay {
+  /*
+   Start.
+   */
+  float origin[3];
+  /*
+   Unit vector.
+   */
+  float direction[3];
+  /*
+   Entry into and exit from the reconstruction box; equal where the ray misses it.
+   */
+  float inside[2];
+  /*
+   Beginning and end of the published sampling range (near, far).
+   */
+  float published[2];
+  /*
+   Cube sides a millimetre.
+   */
+  float per_mm;
+} ConefieldRay;
+
+/*
+ Functions of an encoder, a normalizer, a field or a line field. `stage` is what `create` made.
  */
 typedef struct ConefieldMap {
   /*
@@ -517,33 +563,47 @@ typedef struct ConefieldMap {
                                  double *cells,
                                  size_t count,
                                  struct ConefieldText *error);
+  /*
+   Of a line field, since 2.2: overwrites `out` with the line integrals of `count` rays, in cube sides. A ray that is not
+   inside has 0. NULL elsewhere.
+   */
+  ConefieldStatus (*project)(const void *stage,
+                             const float *params,
+                             const struct ConefieldRay *rays,
+                             size_t count,
+                             float *out,
+                             struct ConefieldText *error);
+  /*
+   The adjoint of `project`: given `dlines` = ∂L/∂out, adds ∂L/∂params to `grads`. The order in which one parameter's
+   gradient is summed must not depend on the range in `grads`. NULL where `project` is.
+   */
+  ConefieldStatus (*backproject)(const void *stage,
+                                 const float *params,
+                                 const struct ConefieldRay *rays,
+                                 size_t count,
+                                 const float *dlines,
+                                 struct ConefieldGrads grads,
+                                 struct ConefieldText *error);
+  /*
+   `project` in double precision, by which gradients are checked. Needed of a line field.
+   */
+  ConefieldStatus (*project_f64)(const void *stage,
+                                 const double *params,
+                                 const struct ConefieldRay *rays,
+                                 size_t count,
+                                 double *out,
+                                 struct ConefieldText *error);
+  /*
+   `backproject` in double precision. Needed of a line field.
+   */
+  ConefieldStatus (*backproject_f64)(const void *stage,
+                                     const double *params,
+                                     const struct ConefieldRay *rays,
+                                     size_t count,
+                                     const double *dlines,
+                                     struct ConefieldGrads64 grads,
+                                     struct ConefieldText *error);
 } ConefieldMap;
-
-/*
- A ray in the unit cube: `origin + t * direction`, where `t` counts cube sides.
- */
-typedef struct ConefieldRay {
-  /*
-   Start.
-   */
-  float origin[3];
-  /*
-   Unit vector.
-   */
-  float direction[3];
-  /*
-   Entry into and exit from the reconstruction box; equal where the ray misses it.
-   */
-  float inside[2];
-  /*
-   Beginning and end of the published sampling range (near, far).
-   */
-  float published[2];
-  /*
-   Cube sides a millimetre.
-   */
-  float per_mm;
-} ConefieldRay;
 
 /*
  Lengths of a scene that a projector's settings may count in.
@@ -816,6 +876,226 @@ typedef struct ConefieldPrior {
 } ConefieldPrior;
 
 /*
+ A grid of voxels or of coefficients. Numbers on it stand x by x, then y by y, z fastest.
+ */
+typedef struct ConefieldGrid {
+  /*
+   How many along x, y and z.
+   */
+  size_t shape[3];
+  /*
+   Distances of neighbours, mm.
+   */
+  double spacing[3];
+  /*
+   The middle of the grid, mm.
+   */
+  double center[3];
+} ConefieldGrid;
+
+/*
+ Named numbers that a penalty keeps from call to call.
+ */
+typedef struct ConefieldState {
+  /*
+   Their name, such as `dual`; valid as long as the penalty lives.
+   */
+  struct ConefieldStr name;
+  /*
+   The first of them.
+   */
+  float *data;
+  /*
+   How many.
+   */
+  size_t length;
+} ConefieldState;
+
+/*
+ Functions of a regularizer: a convex penalty R of coefficients, for any grid. What `on` makes is a stage of its own, which
+ `destroy` frees; `value`, `prox` and `state` get it.
+ */
+typedef struct ConefieldRegularizer {
+  /*
+   Bytes of this table.
+   */
+  size_t size;
+  /*
+   Bytes that the penalty on `grid` holds. NULL: next to none.
+   */
+  uint64_t (*bytes)(const void *stage, const struct ConefieldGrid *grid);
+  /*
+   Makes the penalty on `grid`.
+   */
+  ConefieldStatus (*on)(const void *stage,
+                        const struct ConefieldGrid *grid,
+                        void **penalty,
+                        struct ConefieldText *error);
+  /*
+   The weight λ, 0 or more, for attenuation in 1/mm and lengths in mm. `noise(context, k)` measures k times what the scan's
+   noise comes to in the gradient of the data term; it takes a back-projection.
+   */
+  ConefieldStatus (*weight)(const void *stage,
+                            const struct ConefieldGrid *grid,
+                            double (*noise)(void *context, double k),
+                            void *context,
+                            double *weight,
+                            struct ConefieldText *error);
+  /*
+   R(x), 0 or more, of the `count` coefficients of the grid.
+   */
+  ConefieldStatus (*value)(const void *penalty,
+                           const float *x,
+                           size_t count,
+                           double *value,
+                           struct ConefieldText *error);
+  /*
+   Overwrites `u` with the coefficients ≥ 0 that have the least `½‖u − v‖² + tau·R(u)`, or comes nearer to them with each
+   call for the same `v`.
+   */
+  ConefieldStatus (*prox)(void *penalty,
+                          const float *v,
+                          size_t count,
+                          float tau,
+                          float *u,
+                          struct ConefieldText *error);
+  /*
+   Entry `index` of what the next `prox` starts from, which goes into checkpoints; [`CONEFIELD_UNSUPPORTED`] past the last.
+   NULL: every call starts afresh.
+   */
+  ConefieldStatus (*state)(void *penalty, size_t index, struct ConefieldState *state);
+} ConefieldRegularizer;
+
+/*
+ Functions of a data term `Σ φ(r)` of residuals `r = measured − predicted`. What `of` makes of a scan is a stage of its own,
+ which `destroy` frees; all but `bytes` and `of` get it. They are asked for an image at a time: `count` pixels of the view
+ `view`, whose line integrals `measured` were found, row by row.
+ */
+typedef struct ConefieldDataTerm {
+  /*
+   Bytes of this table.
+   */
+  size_t size;
+  /*
+   Bytes that it holds for a scan of `shape`: views, rows, columns; and those that `of` takes for a moment. NULL: next to
+   none.
+   */
+  void (*bytes)(const void *stage, const size_t *shape, uint64_t *held, uint64_t *brief);
+  /*
+   Makes the data term of the line integrals `measured`, which are only looked at.
+   */
+  ConefieldStatus (*of)(const void *stage,
+                        const float *measured,
+                        const size_t *shape,
+                        void **misfit,
+                        struct ConefieldText *error);
+  /*
+   Standard deviation of the noise of line integrals near 0.
+   */
+  double (*noise)(const void *misfit);
+  /*
+   Overwrites residuals with the derivatives φ'(r), and `sum` with the sum of all φ(r).
+   */
+  ConefieldStatus (*differentiate)(const void *misfit,
+                                   size_t view,
+                                   const float *measured,
+                                   size_t count,
+                                   float *residuals,
+                                   double *sum,
+                                   struct ConefieldText *error);
+  /*
+   Multiplies each value by an upper bound of φ''.
+   */
+  ConefieldStatus (*curve)(const void *misfit,
+                           size_t view,
+                           const float *measured,
+                           size_t count,
+                           float *values,
+                           struct ConefieldText *error);
+  /*
+   Multiplies each value by the standard deviation that noise gives φ', in units of `noise`.
+   */
+  ConefieldStatus (*spread)(const void *misfit,
+                            size_t view,
+                            const float *measured,
+                            size_t count,
+                            float *values,
+                            struct ConefieldText *error);
+} ConefieldDataTerm;
+
+/*
+ A basis on one grid of voxels.
+ */
+typedef struct ConefieldExpansion {
+  /*
+   Where the coefficients stand.
+   */
+  struct ConefieldGrid coefficients;
+  /*
+   Bytes that either direction takes while it works.
+   */
+  uint64_t scratch;
+  /*
+   1 if coefficients are the volume's values where they stand, on a grid that fills the same box.
+   */
+  uint32_t samples;
+  /*
+   1 if it works in double precision too.
+   */
+  uint32_t double_precision;
+} ConefieldExpansion;
+
+/*
+ Functions of a basis: a matrix B from coefficients to voxels. Its entries are not negative, unless coefficients are samples.
+ What `on` makes is a stage of its own, which `destroy` frees; all others get it.
+ */
+typedef struct ConefieldBasis {
+  /*
+   Bytes of this table.
+   */
+  size_t size;
+  /*
+   Makes the basis for the voxels of a grid. The number of coefficients follows from the grid's shape alone.
+   */
+  ConefieldStatus (*on)(const void *stage,
+                        const struct ConefieldGrid *voxels,
+                        void **expansion,
+                        struct ConefieldText *error);
+  /*
+   What it is like there; always the same.
+   */
+  ConefieldStatus (*info)(const void *expansion, struct ConefieldExpansion *info);
+  /*
+   Overwrites `voxels` with `B·coefficients`.
+   */
+  ConefieldStatus (*expand)(const void *expansion,
+                            const float *coefficients,
+                            float *voxels,
+                            struct ConefieldText *error);
+  /*
+   Overwrites `coefficients` with `Bᵀ·voxels`, the exact adjoint.
+   */
+  ConefieldStatus (*adjoint)(const void *expansion,
+                             const float *voxels,
+                             float *coefficients,
+                             struct ConefieldText *error);
+  /*
+   `expand` in double precision, by which it is checked. NULL: there is none.
+   */
+  ConefieldStatus (*expand_f64)(const void *expansion,
+                                const double *coefficients,
+                                double *voxels,
+                                struct ConefieldText *error);
+  /*
+   `adjoint` in double precision. NULL where `expand_f64` is.
+   */
+  ConefieldStatus (*adjoint_f64)(const void *expansion,
+                                 const double *voxels,
+                                 double *coefficients,
+                                 struct ConefieldText *error);
+} ConefieldBasis;
+
+/*
  A stage type that a plugin brings.
  */
 typedef struct ConefieldStage {
@@ -851,7 +1131,7 @@ typedef struct ConefieldStage {
                             void **stage,
                             struct ConefieldText *error);
   /*
-   Frees what `create`, `reduce` or `fitted` made.
+   Frees what `create` or another function of the stage made: every stage that was handed over, once.
    */
   void (*destroy)(void *stage);
   /*
@@ -859,7 +1139,7 @@ typedef struct ConefieldStage {
    */
   ConefieldStatus (*describe)(const void *stage, struct ConefieldText *text);
   /*
-   Of an encoder, a normalizer or a field; otherwise NULL.
+   Of an encoder, a normalizer, a field or a line field; otherwise NULL.
    */
   const struct ConefieldMap *map;
   /*
@@ -878,6 +1158,18 @@ typedef struct ConefieldStage {
    Of a prior; otherwise NULL.
    */
   const struct ConefieldPrior *prior;
+  /*
+   Of a regularizer; otherwise NULL. Since 2.2, as the rest.
+   */
+  const struct ConefieldRegularizer *regularizer;
+  /*
+   Of a data term; otherwise NULL.
+   */
+  const struct ConefieldDataTerm *data_term;
+  /*
+   Of a basis; otherwise NULL.
+   */
+  const struct ConefieldBasis *basis;
 } ConefieldStage;
 
 /*

@@ -3,7 +3,7 @@
 //! A plugin is a shared library that exports [`conefield_plugin`](ConefieldEntry) and returns a table of what it
 //! brings. Rules that types cannot say:
 //!
-//! - **Versions.** `abi_major` must be the host's. Within a major version tables of functions only grow at their end. Each
+//! - **Versions.** `abi_major` must be the host's. Within a major version tables only grow at their end. Each
 //!   table says its own `size`: a table shorter than that of the first minor version is refused, a later function that a
 //!   table does not reach counts as NULL, and what a table has beyond is not read. Everything else here keeps its layout.
 //! - **Memory.** Nothing is handed over: the host frees what it made, the plugin frees what it made (`destroy`). What a
@@ -11,11 +11,9 @@
 //!   as long as the stage.
 //! - **Tiles** are channel-major: channel `c` of row `i` is `data[c * stride + i]`. A pointer may be NULL where there is
 //!   nothing (no channels, no parameters). Floats are aligned to their own size and no more.
-//! - **Threads.** A stage is called from many threads at once: `info`, `parameter`, `partition`, `describe`, `init`,
-//!   `passes`, every `forward…` and `backward…`, `resolutions`, `max_samples`, `sample`, `integrate`, `adjoint`, `apply`,
-//!   `at`, `needs_scan`, `blocks`, `block` and `wgsl` must allow that. `create`, `destroy`, `reduce`, `fitted`, `weights`,
-//!   `with_weights`, `check` and `volume` of one stage are not called at the same time as anything else of that stage, though from any
-//!   thread.
+//! - **Threads.** A stage is called from many threads at once, and every function that takes it as `const` must allow that.
+//!   Only `create`, `destroy`, `reduce`, `fitted`, `weights`, `with_weights`, `check`, `volume`, `on`, `of`, `prox` and `state`
+//!   of one stage are not called at the same time as anything else of that stage, though from any thread.
 //! - **Unwinding** must not leave the library: catch panics and exceptions, return [`CONEFIELD_PANICKED`].
 //! - **Same bits.** The result must not depend on threads, on time, or on how rows are dealt to tiles.
 
@@ -24,7 +22,7 @@ use std::ffi::c_void;
 /// Major version of this contract. A plugin of another one is refused.
 pub const CONEFIELD_ABI_MAJOR: u32 = 2;
 /// Minor version: tables have grown so many times.
-pub const CONEFIELD_ABI_MINOR: u32 = 1;
+pub const CONEFIELD_ABI_MINOR: u32 = 2;
 
 /// What a function returns.
 pub type ConefieldStatus = i32;
@@ -53,6 +51,14 @@ pub const CONEFIELD_INITIALIZER: u32 = 4;
 pub const CONEFIELD_LOSS: u32 = 5;
 /// Judges a field by small blocks of neighbouring points.
 pub const CONEFIELD_PRIOR: u32 = 6;
+/// Penalty of coefficients with its proximal map, for iterative methods. Since 2.2.
+pub const CONEFIELD_REGULARIZER: u32 = 7;
+/// How far line integrals are from the measured ones, for iterative methods. Since 2.2.
+pub const CONEFIELD_DATA_TERM: u32 = 8;
+/// Coefficients to voxels, for iterative methods. Since 2.2.
+pub const CONEFIELD_BASIS: u32 = 9;
+/// A field that brings line integrals of its own. Since 2.2.
+pub const CONEFIELD_LINE_FIELD: u32 = 10;
 
 /// A row looks at itself alone.
 pub const CONEFIELD_SCOPE_ROW: u32 = 0;
@@ -248,7 +254,7 @@ pub struct ConefieldReduced {
     pub channels_count: usize,
 }
 
-/// Functions of an encoder, a normalizer or a field. `stage` is what `create` made.
+/// Functions of an encoder, a normalizer, a field or a line field. `stage` is what `create` made.
 #[repr(C)]
 #[derive(Debug, Clone, Copy)]
 pub struct ConefieldMap {
@@ -402,6 +408,54 @@ pub struct ConefieldMap {
             stage: *const c_void,
             cells: *mut f64,
             count: usize,
+            error: *mut ConefieldText,
+        ) -> ConefieldStatus,
+    >,
+    /// Of a line field, since 2.2: overwrites `out` with the line integrals of `count` rays, in cube sides. A ray that is not
+    /// inside has 0. NULL elsewhere.
+    pub project: Option<
+        unsafe extern "C" fn(
+            stage: *const c_void,
+            params: *const f32,
+            rays: *const ConefieldRay,
+            count: usize,
+            out: *mut f32,
+            error: *mut ConefieldText,
+        ) -> ConefieldStatus,
+    >,
+    /// The adjoint of `project`: given `dlines` = ∂L/∂out, adds ∂L/∂params to `grads`. The order in which one parameter's
+    /// gradient is summed must not depend on the range in `grads`. NULL where `project` is.
+    pub backproject: Option<
+        unsafe extern "C" fn(
+            stage: *const c_void,
+            params: *const f32,
+            rays: *const ConefieldRay,
+            count: usize,
+            dlines: *const f32,
+            grads: ConefieldGrads,
+            error: *mut ConefieldText,
+        ) -> ConefieldStatus,
+    >,
+    /// `project` in double precision, by which gradients are checked. Needed of a line field.
+    pub project_f64: Option<
+        unsafe extern "C" fn(
+            stage: *const c_void,
+            params: *const f64,
+            rays: *const ConefieldRay,
+            count: usize,
+            out: *mut f64,
+            error: *mut ConefieldText,
+        ) -> ConefieldStatus,
+    >,
+    /// `backproject` in double precision. Needed of a line field.
+    pub backproject_f64: Option<
+        unsafe extern "C" fn(
+            stage: *const c_void,
+            params: *const f64,
+            rays: *const ConefieldRay,
+            count: usize,
+            dlines: *const f64,
+            grads: ConefieldGrads64,
             error: *mut ConefieldText,
         ) -> ConefieldStatus,
     >,
@@ -645,6 +699,217 @@ pub struct ConefieldPrior {
     pub wgsl: Option<unsafe extern "C" fn(stage: *const c_void, source: *mut ConefieldText) -> ConefieldStatus>,
 }
 
+/// A grid of voxels or of coefficients. Numbers on it stand x by x, then y by y, z fastest.
+#[repr(C)]
+#[derive(Debug, Clone, Copy)]
+pub struct ConefieldGrid {
+    /// How many along x, y and z.
+    pub shape: [usize; 3],
+    /// Distances of neighbours, mm.
+    pub spacing: [f64; 3],
+    /// The middle of the grid, mm.
+    pub center: [f64; 3],
+}
+
+/// Named numbers that a penalty keeps from call to call.
+#[repr(C)]
+#[derive(Debug, Clone, Copy)]
+pub struct ConefieldState {
+    /// Their name, such as `dual`; valid as long as the penalty lives.
+    pub name: ConefieldStr,
+    /// The first of them.
+    pub data: *mut f32,
+    /// How many.
+    pub length: usize,
+}
+
+/// Functions of a regularizer: a convex penalty R of coefficients, for any grid. What `on` makes is a stage of its own, which
+/// `destroy` frees; `value`, `prox` and `state` get it.
+#[repr(C)]
+#[derive(Debug, Clone, Copy)]
+pub struct ConefieldRegularizer {
+    /// Bytes of this table.
+    pub size: usize,
+    /// Bytes that the penalty on `grid` holds. NULL: next to none.
+    pub bytes: Option<unsafe extern "C" fn(stage: *const c_void, grid: *const ConefieldGrid) -> u64>,
+    /// Makes the penalty on `grid`.
+    pub on: Option<
+        unsafe extern "C" fn(
+            stage: *const c_void,
+            grid: *const ConefieldGrid,
+            penalty: *mut *mut c_void,
+            error: *mut ConefieldText,
+        ) -> ConefieldStatus,
+    >,
+    /// The weight λ, 0 or more, for attenuation in 1/mm and lengths in mm. `noise(context, k)` measures k times what the scan's
+    /// noise comes to in the gradient of the data term; it takes a back-projection.
+    pub weight: Option<
+        unsafe extern "C" fn(
+            stage: *const c_void,
+            grid: *const ConefieldGrid,
+            noise: Option<unsafe extern "C" fn(context: *mut c_void, k: f64) -> f64>,
+            context: *mut c_void,
+            weight: *mut f64,
+            error: *mut ConefieldText,
+        ) -> ConefieldStatus,
+    >,
+    /// R(x), 0 or more, of the `count` coefficients of the grid.
+    pub value: Option<
+        unsafe extern "C" fn(
+            penalty: *const c_void,
+            x: *const f32,
+            count: usize,
+            value: *mut f64,
+            error: *mut ConefieldText,
+        ) -> ConefieldStatus,
+    >,
+    /// Overwrites `u` with the coefficients ≥ 0 that have the least `½‖u − v‖² + tau·R(u)`, or comes nearer to them with each
+    /// call for the same `v`.
+    pub prox: Option<
+        unsafe extern "C" fn(
+            penalty: *mut c_void,
+            v: *const f32,
+            count: usize,
+            tau: f32,
+            u: *mut f32,
+            error: *mut ConefieldText,
+        ) -> ConefieldStatus,
+    >,
+    /// Entry `index` of what the next `prox` starts from, which goes into checkpoints; [`CONEFIELD_UNSUPPORTED`] past the last.
+    /// NULL: every call starts afresh.
+    pub state:
+        Option<unsafe extern "C" fn(penalty: *mut c_void, index: usize, state: *mut ConefieldState) -> ConefieldStatus>,
+}
+
+/// Functions of a data term `Σ φ(r)` of residuals `r = measured − predicted`. What `of` makes of a scan is a stage of its own,
+/// which `destroy` frees; all but `bytes` and `of` get it. They are asked for an image at a time: `count` pixels of the view
+/// `view`, whose line integrals `measured` were found, row by row.
+#[repr(C)]
+#[derive(Debug, Clone, Copy)]
+pub struct ConefieldDataTerm {
+    /// Bytes of this table.
+    pub size: usize,
+    /// Bytes that it holds for a scan of `shape`: views, rows, columns; and those that `of` takes for a moment. NULL: next to
+    /// none.
+    pub bytes: Option<unsafe extern "C" fn(stage: *const c_void, shape: *const usize, held: *mut u64, brief: *mut u64)>,
+    /// Makes the data term of the line integrals `measured`, which are only looked at.
+    pub of: Option<
+        unsafe extern "C" fn(
+            stage: *const c_void,
+            measured: *const f32,
+            shape: *const usize,
+            misfit: *mut *mut c_void,
+            error: *mut ConefieldText,
+        ) -> ConefieldStatus,
+    >,
+    /// Standard deviation of the noise of line integrals near 0.
+    pub noise: Option<unsafe extern "C" fn(misfit: *const c_void) -> f64>,
+    /// Overwrites residuals with the derivatives φ'(r), and `sum` with the sum of all φ(r).
+    pub differentiate: Option<
+        unsafe extern "C" fn(
+            misfit: *const c_void,
+            view: usize,
+            measured: *const f32,
+            count: usize,
+            residuals: *mut f32,
+            sum: *mut f64,
+            error: *mut ConefieldText,
+        ) -> ConefieldStatus,
+    >,
+    /// Multiplies each value by an upper bound of φ''.
+    pub curve: Option<
+        unsafe extern "C" fn(
+            misfit: *const c_void,
+            view: usize,
+            measured: *const f32,
+            count: usize,
+            values: *mut f32,
+            error: *mut ConefieldText,
+        ) -> ConefieldStatus,
+    >,
+    /// Multiplies each value by the standard deviation that noise gives φ', in units of `noise`.
+    pub spread: Option<
+        unsafe extern "C" fn(
+            misfit: *const c_void,
+            view: usize,
+            measured: *const f32,
+            count: usize,
+            values: *mut f32,
+            error: *mut ConefieldText,
+        ) -> ConefieldStatus,
+    >,
+}
+
+/// A basis on one grid of voxels.
+#[repr(C)]
+#[derive(Debug, Clone, Copy)]
+pub struct ConefieldExpansion {
+    /// Where the coefficients stand.
+    pub coefficients: ConefieldGrid,
+    /// Bytes that either direction takes while it works.
+    pub scratch: u64,
+    /// 1 if coefficients are the volume's values where they stand, on a grid that fills the same box.
+    pub samples: u32,
+    /// 1 if it works in double precision too.
+    pub double_precision: u32,
+}
+
+/// Functions of a basis: a matrix B from coefficients to voxels. Its entries are not negative, unless coefficients are samples.
+/// What `on` makes is a stage of its own, which `destroy` frees; all others get it.
+#[repr(C)]
+#[derive(Debug, Clone, Copy)]
+pub struct ConefieldBasis {
+    /// Bytes of this table.
+    pub size: usize,
+    /// Makes the basis for the voxels of a grid. The number of coefficients follows from the grid's shape alone.
+    pub on: Option<
+        unsafe extern "C" fn(
+            stage: *const c_void,
+            voxels: *const ConefieldGrid,
+            expansion: *mut *mut c_void,
+            error: *mut ConefieldText,
+        ) -> ConefieldStatus,
+    >,
+    /// What it is like there; always the same.
+    pub info: Option<unsafe extern "C" fn(expansion: *const c_void, info: *mut ConefieldExpansion) -> ConefieldStatus>,
+    /// Overwrites `voxels` with `B·coefficients`.
+    pub expand: Option<
+        unsafe extern "C" fn(
+            expansion: *const c_void,
+            coefficients: *const f32,
+            voxels: *mut f32,
+            error: *mut ConefieldText,
+        ) -> ConefieldStatus,
+    >,
+    /// Overwrites `coefficients` with `Bᵀ·voxels`, the exact adjoint.
+    pub adjoint: Option<
+        unsafe extern "C" fn(
+            expansion: *const c_void,
+            voxels: *const f32,
+            coefficients: *mut f32,
+            error: *mut ConefieldText,
+        ) -> ConefieldStatus,
+    >,
+    /// `expand` in double precision, by which it is checked. NULL: there is none.
+    pub expand_f64: Option<
+        unsafe extern "C" fn(
+            expansion: *const c_void,
+            coefficients: *const f64,
+            voxels: *mut f64,
+            error: *mut ConefieldText,
+        ) -> ConefieldStatus,
+    >,
+    /// `adjoint` in double precision. NULL where `expand_f64` is.
+    pub adjoint_f64: Option<
+        unsafe extern "C" fn(
+            expansion: *const c_void,
+            voxels: *const f64,
+            coefficients: *mut f64,
+            error: *mut ConefieldText,
+        ) -> ConefieldStatus,
+    >,
+}
+
 /// A stage type that a plugin brings.
 #[repr(C)]
 #[derive(Debug, Clone, Copy)]
@@ -672,11 +937,11 @@ pub struct ConefieldStage {
             error: *mut ConefieldText,
         ) -> ConefieldStatus,
     >,
-    /// Frees what `create`, `reduce` or `fitted` made.
+    /// Frees what `create` or another function of the stage made: every stage that was handed over, once.
     pub destroy: Option<unsafe extern "C" fn(stage: *mut c_void)>,
     /// One line on a stage, such as `10 levels x 2`.
     pub describe: Option<unsafe extern "C" fn(stage: *const c_void, text: *mut ConefieldText) -> ConefieldStatus>,
-    /// Of an encoder, a normalizer or a field; otherwise NULL.
+    /// Of an encoder, a normalizer, a field or a line field; otherwise NULL.
     pub map: *const ConefieldMap,
     /// Of a projector; otherwise NULL.
     pub projector: *const ConefieldProjector,
@@ -686,6 +951,12 @@ pub struct ConefieldStage {
     pub loss: *const ConefieldLoss,
     /// Of a prior; otherwise NULL.
     pub prior: *const ConefieldPrior,
+    /// Of a regularizer; otherwise NULL. Since 2.2, as the rest.
+    pub regularizer: *const ConefieldRegularizer,
+    /// Of a data term; otherwise NULL.
+    pub data_term: *const ConefieldDataTerm,
+    /// Of a basis; otherwise NULL.
+    pub basis: *const ConefieldBasis,
 }
 
 /// What a plugin is and brings.

@@ -18,7 +18,7 @@ fn the_header_is_current() {
         style: cbindgen::Style::Both,
         documentation_style: cbindgen::DocumentationStyle::C,
         header: Some(
-            "/* The contract between conefield and its plugins, version 2.0. Made from plugins/abi/src/lib.rs. */"
+            "/* The contract between conefield and its plugins, version 2.2. Made from plugins/abi/src/lib.rs. */"
                 .into(),
         ),
         trailer: Some(
@@ -34,6 +34,9 @@ fn the_header_is_current() {
                 "ConefieldInitializer",
                 "ConefieldLoss",
                 "ConefieldPrior",
+                "ConefieldRegularizer",
+                "ConefieldDataTerm",
+                "ConefieldBasis",
                 "ConefieldStage",
             ]
             .map(String::from)
@@ -59,7 +62,7 @@ fn the_header_is_current() {
 #[test]
 #[cfg(target_pointer_width = "64")]
 fn the_layout_is_pinned() {
-    assert_eq!((CONEFIELD_ABI_MAJOR, CONEFIELD_ABI_MINOR), (2, 1));
+    assert_eq!((CONEFIELD_ABI_MAJOR, CONEFIELD_ABI_MINOR), (2, 2));
     let sizes = [
         size_of::<ConefieldStr>(),
         size_of::<ConefieldText>(),
@@ -81,10 +84,18 @@ fn the_layout_is_pinned() {
         size_of::<ConefieldLoss>(),
         size_of::<ConefieldBlocks>(),
         size_of::<ConefieldPrior>(),
+        size_of::<ConefieldGrid>(),
+        size_of::<ConefieldState>(),
+        size_of::<ConefieldRegularizer>(),
+        size_of::<ConefieldDataTerm>(),
+        size_of::<ConefieldExpansion>(),
+        size_of::<ConefieldBasis>(),
         size_of::<ConefieldStage>(),
         size_of::<ConefieldPlugin>(),
     ];
-    assert_eq!(sizes, [16, 24, 32, 32, 24, 80, 32, 16, 40, 136, 44, 16, 56, 48, 48, 48, 32, 40, 32, 32, 128, 88]);
+    let first = [16, 24, 32, 32, 24, 80, 32, 16, 40, 168, 44, 16, 56, 48, 48, 48, 32, 40, 32, 32];
+    assert_eq!(sizes[..20], first);
+    assert_eq!(sizes[20..], [72, 32, 56, 56, 88, 56, 152, 88]);
     let plugin = [
         offset_of!(ConefieldPlugin, size),
         offset_of!(ConefieldPlugin, abi_major),
@@ -111,8 +122,11 @@ fn the_layout_is_pinned() {
         offset_of!(ConefieldStage, initializer),
         offset_of!(ConefieldStage, loss),
         offset_of!(ConefieldStage, prior),
+        offset_of!(ConefieldStage, regularizer),
+        offset_of!(ConefieldStage, data_term),
+        offset_of!(ConefieldStage, basis),
     ];
-    assert_eq!(stage, [0, 8, 24, 40, 56, 64, 72, 80, 88, 96, 104, 112, 120]);
+    assert_eq!(stage, [0, 8, 24, 40, 56, 64, 72, 80, 88, 96, 104, 112, 120, 128, 136, 144]);
     let map = [
         offset_of!(ConefieldMap, size),
         offset_of!(ConefieldMap, info),
@@ -131,8 +145,13 @@ fn the_layout_is_pinned() {
         offset_of!(ConefieldMap, forward_pass_halves),
         offset_of!(ConefieldMap, backward_halves),
         offset_of!(ConefieldMap, resolutions),
+        offset_of!(ConefieldMap, project),
+        offset_of!(ConefieldMap, backproject),
+        offset_of!(ConefieldMap, project_f64),
+        offset_of!(ConefieldMap, backproject_f64),
     ];
-    assert_eq!(map, [0, 8, 16, 24, 32, 40, 48, 56, 64, 72, 80, 88, 96, 104, 112, 120, 128]);
+    let at: Vec<usize> = (0..21).map(|i| 8 * i).collect();
+    assert_eq!(map[..], at);
     let projector = [
         offset_of!(ConefieldProjector, size),
         offset_of!(ConefieldProjector, max_samples),
@@ -159,4 +178,48 @@ fn the_layout_is_pinned() {
         offset_of!(ConefieldInfo, halves),
     ];
     assert_eq!(info, [0, 8, 16, 24, 32, 40, 48, 56, 60, 64, 68, 72, 76]);
+}
+
+/// What the kinds since 2.2 have.
+#[test]
+#[cfg(target_pointer_width = "64")]
+fn the_layout_of_pieces_of_iterative_methods_is_pinned() {
+    let regularizer = [
+        offset_of!(ConefieldRegularizer, size),
+        offset_of!(ConefieldRegularizer, bytes),
+        offset_of!(ConefieldRegularizer, on),
+        offset_of!(ConefieldRegularizer, weight),
+        offset_of!(ConefieldRegularizer, value),
+        offset_of!(ConefieldRegularizer, prox),
+        offset_of!(ConefieldRegularizer, state),
+    ];
+    let data_term = [
+        offset_of!(ConefieldDataTerm, size),
+        offset_of!(ConefieldDataTerm, bytes),
+        offset_of!(ConefieldDataTerm, of),
+        offset_of!(ConefieldDataTerm, noise),
+        offset_of!(ConefieldDataTerm, differentiate),
+        offset_of!(ConefieldDataTerm, curve),
+        offset_of!(ConefieldDataTerm, spread),
+    ];
+    let basis = [
+        offset_of!(ConefieldBasis, size),
+        offset_of!(ConefieldBasis, on),
+        offset_of!(ConefieldBasis, info),
+        offset_of!(ConefieldBasis, expand),
+        offset_of!(ConefieldBasis, adjoint),
+        offset_of!(ConefieldBasis, expand_f64),
+        offset_of!(ConefieldBasis, adjoint_f64),
+    ];
+    assert_eq!([regularizer, data_term, basis], [[0, 8, 16, 24, 32, 40, 48]; 3]);
+    let grid =
+        [offset_of!(ConefieldGrid, shape), offset_of!(ConefieldGrid, spacing), offset_of!(ConefieldGrid, center)];
+    assert_eq!(grid, [0, 24, 48]);
+    let expansion = [
+        offset_of!(ConefieldExpansion, coefficients),
+        offset_of!(ConefieldExpansion, scratch),
+        offset_of!(ConefieldExpansion, samples),
+        offset_of!(ConefieldExpansion, double_precision),
+    ];
+    assert_eq!(expansion, [0, 72, 80, 84]);
 }

@@ -18,6 +18,8 @@ use std::{fmt, ptr, slice};
 
 /// Longest text that a table may hold.
 const LONGEST_TEXT: usize = 1 << 20;
+/// Bytes of a stage's table in the first minor version.
+const FIRST_STAGE: usize = offset_of!(ConefieldStage, regularizer);
 /// Most stages that a library may bring.
 const MOST_STAGES: usize = 1024;
 
@@ -65,14 +67,81 @@ unsafe impl Send for Type {}
 // SAFETY: as above; nothing here changes.
 unsafe impl Sync for Type {}
 
-/// What can be asked of a stage.
-#[derive(Clone, Copy)]
-pub(crate) enum Functions {
-    Map(ConefieldMap),
-    Projector(ConefieldProjector),
-    Initializer(ConefieldInitializer),
-    Loss(ConefieldLoss),
-    Prior(ConefieldPrior),
+/// The tables of functions: which kinds have them, where the stage's table points to them, how much of them the first minor
+/// version had, and which functions must be there.
+macro_rules! tables {
+    ($($functions:ident($table:ident) $($code:ident $kind:ident)+: $field:ident, from $least:expr, needs [$($needed:ident)*];)*) => {
+        /// What can be asked of a stage.
+        #[derive(Clone, Copy)]
+        pub(crate) enum Functions {
+            $($functions($table),)*
+        }
+
+        $(impl FunctionsOf for $table {
+            fn of(functions: Functions) -> Option<Self> {
+                match functions {
+                    Functions::$functions(table) => Some(table),
+                    _ => None,
+                }
+            }
+        })*
+
+        impl Functions {
+            /// The kind of the stage `t` and its functions; `at` is the stage in words.
+            unsafe fn read(t: &ConefieldStage, place: &str, at: &str) -> Result<(Kind, Self)> {
+                $(
+                    let kind = match t.kind {
+                        $($code => Some(Kind::$kind),)+
+                        _ => None,
+                    };
+                    if let Some(kind) = kind {
+                        // SAFETY: see the top of this file.
+                        let table = unsafe { sized(t.$field, place, &format!("{at}: functions"), $least)? };
+                        $(ensure(table.$needed.is_some(), place, at, concat!("no function ", stringify!($needed)), "one")?;)*
+                        return Ok((kind, Self::$functions(table)));
+                    }
+                )*
+                Err(Error::invalid(place, at, format!("kind {}", t.kind), "0 to 10"))
+            }
+        }
+    };
+}
+
+/// The functions of one kind of stage.
+pub(crate) trait FunctionsOf: Copy {
+    /// These functions, if they are of that kind.
+    fn of(functions: Functions) -> Option<Self>;
+}
+
+tables! {
+    Map(ConefieldMap)
+        CONEFIELD_ENCODER Encoder CONEFIELD_NORMALIZER Normalizer CONEFIELD_FIELD Field CONEFIELD_LINE_FIELD LineField:
+        map, from offset_of!(ConefieldMap, project), needs [info forward backward];
+    Projector(ConefieldProjector) CONEFIELD_PROJECTOR Projector:
+        projector, from size_of::<ConefieldProjector>(), needs [max_samples sample];
+    Initializer(ConefieldInitializer) CONEFIELD_INITIALIZER Initializer:
+        initializer, from offset_of!(ConefieldInitializer, check), needs [apply];
+    Loss(ConefieldLoss) CONEFIELD_LOSS Loss: loss, from size_of::<ConefieldLoss>(), needs [at];
+    Prior(ConefieldPrior) CONEFIELD_PRIOR Prior: prior, from size_of::<ConefieldPrior>(), needs [blocks block];
+    Regularizer(ConefieldRegularizer) CONEFIELD_REGULARIZER Regularizer:
+        regularizer, from size_of::<ConefieldRegularizer>(), needs [on weight value prox];
+    DataTerm(ConefieldDataTerm) CONEFIELD_DATA_TERM DataTerm:
+        data_term, from size_of::<ConefieldDataTerm>(), needs [of noise differentiate curve spread];
+    Basis(ConefieldBasis) CONEFIELD_BASIS Basis:
+        basis, from size_of::<ConefieldBasis>(), needs [on info expand adjoint];
+}
+
+/// What functions need of each other, beyond those that must be there.
+fn consistent(functions: &Functions) -> Result<(), (&'static str, &'static str)> {
+    match functions {
+        Functions::Projector(p) if p.integrate.is_some() != p.adjoint.is_some() => {
+            Err(("one of integrate and adjoint", "both or none"))
+        }
+        Functions::Initializer(i) if i.weights.is_some() && i.with_weights.is_none() => {
+            Err(("no function with_weights", "one"))
+        }
+        _ => Ok(()),
+    }
 }
 
 impl Library {
@@ -115,18 +184,18 @@ impl Library {
         ensure(!name.is_empty(), place, "name", "nothing", "the plugin's name")?;
         ensure((1..=MOST_STAGES).contains(&t.stage_count), place, "stages", t.stage_count, "1 to 1024")?;
         ensure(
-            t.stage_size >= size_of::<ConefieldStage>() && t.stage_size.is_multiple_of(align_of::<ConefieldStage>()),
+            t.stage_size >= FIRST_STAGE && t.stage_size.is_multiple_of(align_of::<ConefieldStage>()),
             place,
             "stage table",
             format!("{} bytes a stage", t.stage_size),
-            format!("at least {}", size_of::<ConefieldStage>()),
+            format!("at least {FIRST_STAGE}"),
         )?;
         ensure(!t.stages.is_null() && t.stages.is_aligned(), place, "stages", "nothing", "a table")?;
         let owner = format!("{name} {version} ({})", path.display());
         let mut types = vec![];
         for i in 0..t.stage_count {
             // SAFETY: see the top of this file.
-            let stage = unsafe { t.stages.byte_add(i * t.stage_size).read() };
+            let stage = unsafe { grown(t.stages.byte_add(i * t.stage_size), t.stage_size) };
             // SAFETY: as above.
             types.push(Arc::new(unsafe { Type::read(&stage, place, i, &owner)? }));
         }
@@ -176,12 +245,18 @@ unsafe fn sized<T>(table: *const T, place: &str, what: &str, least: usize) -> Re
     // SAFETY: every table begins with its size.
     let size = unsafe { table.cast::<usize>().read() };
     ensure(size >= least, place, what, format!("{size} bytes"), format!("at least {least}: the table is too short"))?;
+    // SAFETY: the table says that it is so long.
+    Ok(unsafe { grown(table, size) })
+}
+
+/// A table of `size` bytes, of which a later version may have more.
+unsafe fn grown<T>(table: *const T, size: usize) -> T {
     let mut own = MaybeUninit::<T>::zeroed();
     // SAFETY: the table has as many bytes as are copied. `T` is plain data, in which zeros stand for NULL.
-    Ok(unsafe {
+    unsafe {
         ptr::copy_nonoverlapping(table.cast::<u8>(), own.as_mut_ptr().cast(), size.min(size_of::<T>()));
         own.assume_init()
-    })
+    }
 }
 
 /// A text of a table.
@@ -212,48 +287,10 @@ impl Type {
         };
         // A setting that the schema does not know is a mistake, whether it says so or not.
         keys.entry("additionalProperties").or_insert(Value::Bool(false));
-        let missing = |what: &str| Error::invalid(place, &at, format!("no function {what}"), "one");
-        let needed = |what: &str, there: bool| if there { Ok(()) } else { Err(missing(what)) };
-        let what = format!("{at}: functions");
         // SAFETY: see the top of this file.
-        let (kind, functions) = unsafe {
-            match t.kind {
-                CONEFIELD_ENCODER | CONEFIELD_NORMALIZER | CONEFIELD_FIELD => {
-                    let map = sized(t.map, place, &what, size_of::<ConefieldMap>())?;
-                    needed("info", map.info.is_some())?;
-                    needed("forward", map.forward.is_some())?;
-                    needed("backward", map.backward.is_some())?;
-                    let kind = [Kind::Encoder, Kind::Normalizer, Kind::Field][t.kind as usize];
-                    (kind, Functions::Map(map))
-                }
-                CONEFIELD_PROJECTOR => {
-                    let projector = sized(t.projector, place, &what, size_of::<ConefieldProjector>())?;
-                    needed("max_samples", projector.max_samples.is_some())?;
-                    needed("sample", projector.sample.is_some())?;
-                    let both = projector.integrate.is_some() == projector.adjoint.is_some();
-                    ensure(both, place, &at, "one of integrate and adjoint", "both or none")?;
-                    (Kind::Projector, Functions::Projector(projector))
-                }
-                CONEFIELD_INITIALIZER => {
-                    let initializer = sized(t.initializer, place, &what, offset_of!(ConefieldInitializer, check))?;
-                    needed("apply", initializer.apply.is_some())?;
-                    needed("with_weights", initializer.weights.is_none() || initializer.with_weights.is_some())?;
-                    (Kind::Initializer, Functions::Initializer(initializer))
-                }
-                CONEFIELD_LOSS => {
-                    let loss = sized(t.loss, place, &what, size_of::<ConefieldLoss>())?;
-                    needed("at", loss.at.is_some())?;
-                    (Kind::Loss, Functions::Loss(loss))
-                }
-                CONEFIELD_PRIOR => {
-                    let prior = sized(t.prior, place, &what, size_of::<ConefieldPrior>())?;
-                    needed("blocks", prior.blocks.is_some())?;
-                    needed("block", prior.block.is_some())?;
-                    (Kind::Prior, Functions::Prior(prior))
-                }
-                other => return Err(Error::invalid(place, &at, format!("kind {other}"), "0 to 6")),
-            }
-        };
+        let (kind, functions) = unsafe { Functions::read(t, place, &at)? };
+        consistent(&functions).map_err(|(found, expected)| Error::invalid(place, &at, found, expected))?;
+        let missing = |what: &str| Error::invalid(place, &at, format!("no function {what}"), "one");
         Ok(Self {
             kind,
             name,
@@ -330,7 +367,7 @@ unsafe impl Sync for Handle {}
 
 impl Drop for Handle {
     fn drop(&mut self) {
-        // SAFETY: it was made by `create`, `reduce` or `fitted`, and nothing uses it any more.
+        // SAFETY: the library handed it over, and nothing uses it any more.
         unsafe { (self.ty.destroy)(self.stage) };
     }
 }

@@ -1,14 +1,25 @@
 //! A library's types as settings that a spec may hold.
 
 use crate::library::{Library, Type};
-use crate::stage::{initializer, loss, map, prior, projector};
+use crate::stage::basis::BasisStage;
+use crate::stage::data_term::DataTermStage;
+use crate::stage::loss::LossStage;
+use crate::stage::map::MapStage;
+use crate::stage::prior::PriorStage;
+use crate::stage::projector::ProjectorStage;
+use crate::stage::regularizer::RegularizerStage;
+use crate::stage::{build, initializer};
 use conefield_core::arena::Weights;
-use conefield_core::error::Result;
+use conefield_core::basis::{Basis, BasisSpec};
+use conefield_core::data_term::{DataTerm, DataTermSpec};
+use conefield_core::error::{Error, Result};
 use conefield_core::loss::Loss;
 use conefield_core::prior::Prior;
 use conefield_core::registry::{self, Kind, Make, NewType};
+use conefield_core::regularizer::{Regularizer, RegularizerSpec};
 use conefield_core::settings::{
-    EncoderSpec, FieldSpec, Initializer, InitializerSpec, LossSpec, NormalizerSpec, PriorSpec, ProjectorSpec,
+    EncoderSpec, FieldSpec, Initializer, InitializerSpec, LineFieldSpec, LossSpec, NormalizerSpec, PriorSpec,
+    ProjectorSpec,
 };
 use conefield_core::stage::{Encoder, Field, Normalizer, Projector};
 use serde::{Serialize, Serializer};
@@ -17,13 +28,11 @@ use std::sync::Arc;
 
 /// Registers every type of `library`: all of them, or none if a name is taken.
 pub fn register(library: &Library) -> Result<()> {
-    let new = |t: &Arc<Type>| NewType {
-        name: t.name.clone(),
-        doc: t.doc.clone(),
-        schema: t.schema.clone(),
-        make: make(t.clone()),
+    let new = |t: &Arc<Type>| {
+        let (name, doc, schema) = (t.name.clone(), t.doc.clone(), t.schema.clone());
+        Ok(NewType { name, doc, schema, make: make(t.clone())? })
     };
-    registry::add(&library.owner(), library.types.iter().map(new).collect())
+    registry::add(&library.owner(), library.types.iter().map(new).collect::<Result<_>>()?)
 }
 
 /// Settings of a stage of a library, with every default written.
@@ -32,22 +41,6 @@ struct Loaded {
     /// The type's name, for as long as the program runs.
     name: &'static str,
     settings: Value,
-}
-
-fn make(ty: Arc<Type>) -> Make {
-    let name: &'static str = ty.name.clone().leak();
-    let kind = ty.kind;
-    let settings = move |written: Value| Loaded { settings: with_defaults(&ty.schema, written), name, ty: ty.clone() };
-    match kind {
-        Kind::Encoder => Make::Encoder(Box::new(move |v| Ok(Box::new(settings(v))))),
-        Kind::Normalizer => Make::Normalizer(Box::new(move |v| Ok(Box::new(settings(v))))),
-        Kind::Field => Make::Field(Box::new(move |v| Ok(Box::new(settings(v))))),
-        Kind::Projector => Make::Projector(Box::new(move |v| Ok(Box::new(settings(v))))),
-        Kind::Loss => Make::Loss(Box::new(move |v| Ok(Box::new(settings(v))))),
-        Kind::Prior => Make::Prior(Box::new(move |v| Ok(Box::new(settings(v))))),
-        // A library's table has stages of these seven kinds.
-        _ => Make::Initializer(Box::new(move |v| Ok(Box::new(settings(v))))),
-    }
 }
 
 /// `written` with the defaults of `schema` for what it leaves out.
@@ -71,70 +64,54 @@ impl Serialize for Loaded {
     }
 }
 
-// `#[typetag::serde]` gives a type one name; here it is the loaded type's. Its two methods are therefore written out. To
-// read settings back, the registry is asked (`conefield_core::spec::stage`).
-macro_rules! named {
-    () => {
-        fn typetag_name(&self) -> &'static str {
-            self.name
+/// What makes settings of each kind, and what they build.
+macro_rules! kinds {
+    ($($kind:ident $spec:ident ($self:ident $(, $argument:ident: $type:ty)?) -> $stage:ty { $build:expr })*) => {
+        fn make(ty: Arc<Type>) -> Result<Make> {
+            let name: &'static str = ty.name.clone().leak();
+            let kind = ty.kind;
+            let settings =
+                move |written: Value| Loaded { settings: with_defaults(&ty.schema, written), name, ty: ty.clone() };
+            Ok(match kind {
+                $(Kind::$kind => Make::$kind(Box::new(move |v| Ok(Box::new(settings(v))))),)*
+                other => return Err(Error::unsupported(name, format!("a {other} cannot come from a plugin"))),
+            })
         }
 
-        fn typetag_deserialize(&self) {}
+        $(impl $spec for Loaded {
+            fn build(&$self $(, $argument: $type)?) -> Result<Box<$stage>> {
+                Ok(Box::new($build?))
+            }
+
+            // `#[typetag::serde]` gives a type one name; here it is the loaded type's. Its two methods are therefore written
+            // out. To read settings back, the registry is asked (`conefield_core::spec::stage`).
+            fn typetag_name(&self) -> &'static str {
+                self.name
+            }
+
+            fn typetag_deserialize(&self) {}
+        })*
     };
 }
 
-impl EncoderSpec for Loaded {
-    fn build(&self) -> Result<Box<dyn Encoder>> {
-        Ok(Box::new(map::build(&self.ty, &self.settings, 3)?))
+kinds! {
+    Encoder EncoderSpec(self) -> dyn Encoder { self.map(3) }
+    Normalizer NormalizerSpec(self, width: usize) -> dyn Normalizer { self.map(width) }
+    Field FieldSpec(self, width: usize) -> dyn Field { self.map(width) }
+    LineField LineFieldSpec(self) -> dyn Field { self.map(3) }
+    Projector ProjectorSpec(self) -> dyn Projector { build(&self.ty, &self.settings, 0, ProjectorStage::tried) }
+    Loss LossSpec(self) -> dyn Loss { build(&self.ty, &self.settings, 0, LossStage::tried) }
+    Prior PriorSpec(self) -> dyn Prior { build(&self.ty, &self.settings, 0, PriorStage::tried) }
+    Regularizer RegularizerSpec(self) -> dyn Regularizer { build(&self.ty, &self.settings, 0, RegularizerStage::tried) }
+    DataTerm DataTermSpec(self) -> dyn DataTerm { build(&self.ty, &self.settings, 0, DataTermStage::tried) }
+    Basis BasisSpec(self) -> dyn Basis { build(&self.ty, &self.settings, 0, BasisStage::tried) }
+    Initializer InitializerSpec(self, weights: &dyn Fn(&str) -> Result<Weights>) -> dyn Initializer {
+        initializer::build(&self.ty, &self.settings, weights)
     }
-
-    named!();
 }
 
-impl NormalizerSpec for Loaded {
-    fn build(&self, width: usize) -> Result<Box<dyn Normalizer>> {
-        Ok(Box::new(map::build(&self.ty, &self.settings, width)?))
+impl Loaded {
+    fn map(&self, width: usize) -> Result<MapStage> {
+        build(&self.ty, &self.settings, width, move |handle| MapStage::tried(handle, width))
     }
-
-    named!();
-}
-
-impl FieldSpec for Loaded {
-    fn build(&self, width: usize) -> Result<Box<dyn Field>> {
-        Ok(Box::new(map::build(&self.ty, &self.settings, width)?))
-    }
-
-    named!();
-}
-
-impl ProjectorSpec for Loaded {
-    fn build(&self) -> Result<Box<dyn Projector>> {
-        Ok(Box::new(projector::build(&self.ty, &self.settings)?))
-    }
-
-    named!();
-}
-
-impl LossSpec for Loaded {
-    fn build(&self) -> Result<Box<dyn Loss>> {
-        Ok(Box::new(loss::build(&self.ty, &self.settings)?))
-    }
-
-    named!();
-}
-
-impl PriorSpec for Loaded {
-    fn build(&self) -> Result<Box<dyn Prior>> {
-        Ok(Box::new(prior::build(&self.ty, &self.settings)?))
-    }
-
-    named!();
-}
-
-impl InitializerSpec for Loaded {
-    fn build(&self, weights: &dyn Fn(&str) -> Result<Weights>) -> Result<Box<dyn Initializer>> {
-        Ok(Box::new(initializer::build(&self.ty, &self.settings, weights)?))
-    }
-
-    named!();
 }

@@ -3,11 +3,16 @@
 //! refused here. Whether gradients are right only the conformance kit can say.
 
 use crate::library::Type;
+use bytemuck::Pod;
+use conefield_core::basis::{BasisOperator, Expansion};
+use conefield_core::data_term::Misfit;
 use conefield_core::error::{Error, Result};
 use conefield_core::half::{Half, round};
 use conefield_core::pages::Pages;
 use conefield_core::random::{mix, unit};
-use conefield_core::stage::{GradKind, Grads, Halves, Kernel, Reader, Stage, TILE_ROWS, Tile, TileMut, UnitRay};
+use conefield_core::simd::Real;
+use conefield_core::stage::{GradKind, Grads, Halves, Kernel, Lines, Reader, Stage, TILE_ROWS, Tile, TileMut, UnitRay};
+use ndarray::{Array3, ArrayView3, ArrayViewMut3};
 use std::ops::Range;
 use std::sync::mpsc;
 use std::thread;
@@ -18,24 +23,55 @@ pub const LIMIT: Duration = Duration::from_secs(5);
 
 /// Numbers on either side of a buffer that nobody may write to: more than a tile of the widest common stages.
 pub(crate) const GUARD: usize = 1 << 14;
-/// A NaN that no arithmetic makes: the mark of what nobody has written to.
+/// NaNs that no arithmetic makes: the marks of what nobody has written to.
 pub(crate) const UNTOUCHED: u32 = 0x7fc5_a7e1;
+pub(crate) const UNTOUCHED_64: u64 = 0x7ff8_5a7e_1c5a_7e1c;
 
 /// Stages of more parameters are not initialised for their trial; that takes long, and the run does it anyway.
 const MANY: usize = 1 << 20;
 
+/// Numbers with a mark of their own.
+trait Marked: Real + Pod {
+    const MARK: Self;
+
+    fn is_mark(self) -> bool;
+}
+
+impl Marked for f32 {
+    const MARK: Self = f32::from_bits(UNTOUCHED);
+
+    fn is_mark(self) -> bool {
+        self.to_bits() == UNTOUCHED
+    }
+}
+
+impl Marked for f64 {
+    const MARK: Self = f64::from_bits(UNTOUCHED_64);
+
+    fn is_mark(self) -> bool {
+        self.to_bits() == UNTOUCHED_64
+    }
+}
+
 /// A buffer between guard zones. What is only zeroed takes no memory until it is written to: a trial comes before what a run
 /// would take is reckoned.
-struct Guarded(Pages);
+struct Guarded<R: Marked>(Pages<R>);
 
-impl Guarded {
+impl<R: Marked> Guarded<R> {
     fn new(n: usize) -> Self {
         let mut g = Self::zeroed(n);
-        g.inner().fill(f32::from_bits(UNTOUCHED));
+        g.inner().fill(R::MARK);
         g
     }
 
-    fn inner(&mut self) -> &mut [f32] {
+    /// Numbers to be read or changed.
+    fn of(values: &[R]) -> Self {
+        let mut g = Self::zeroed(values.len());
+        g.inner().copy_from_slice(values);
+        g
+    }
+
+    fn inner(&mut self) -> &mut [R] {
         let n = self.0.len();
         &mut self.0[GUARD..n - GUARD]
     }
@@ -43,7 +79,7 @@ impl Guarded {
     fn zeroed(n: usize) -> Self {
         let mut pages = Pages::zeros(n + 2 * GUARD);
         for zone in [0..GUARD, GUARD + n..n + 2 * GUARD] {
-            pages[zone].fill(f32::from_bits(UNTOUCHED));
+            pages[zone].fill(R::MARK);
         }
         Self(pages)
     }
@@ -52,7 +88,7 @@ impl Guarded {
     fn broken(&self, what: &str) -> Option<String> {
         let n = self.0.len();
         let outside = (0..GUARD).chain(n - GUARD..n);
-        let at = outside.into_iter().find(|&i| self.0[i].to_bits() != UNTOUCHED)?;
+        let at = outside.into_iter().find(|&i| !self.0[i].is_mark())?;
         let place =
             if at < GUARD { format!("{} before", GUARD - at) } else { format!("{} past", at - (n - GUARD) + 1) };
         Some(format!("it writes outside its {what}: {place} {} numbers", n - 2 * GUARD))
@@ -61,13 +97,14 @@ impl Guarded {
     /// What is wrong with what was written.
     fn unsound(&mut self, what: &str) -> Option<String> {
         let n = self.inner().len();
-        let all = self.inner().iter().enumerate();
-        all.filter(|(_, v)| !v.is_finite())
-            .map(|(i, v)| {
-                let how = if v.to_bits() == UNTOUCHED { "is left unwritten".into() } else { format!("is {v}") };
-                format!("number {i} of {n} of its {what} {how}")
-            })
-            .next()
+        let (i, v) = self.inner().iter().enumerate().find(|(_, v)| !v.f64().is_finite())?;
+        let how = if v.is_mark() { "is left unwritten".into() } else { format!("is {}", v.f64()) };
+        Some(format!("number {i} of {n} of its {what} {how}"))
+    }
+
+    /// What is wrong with the zones or with what was written.
+    fn complaint(&mut self, what: &str) -> Option<String> {
+        self.broken(what).or_else(|| self.unsound(what))
     }
 }
 
@@ -91,9 +128,14 @@ fn refused(ty: &Type, what: &str) -> Error {
     Error::unsupported(ty.words(), format!("refused: {what}"))
 }
 
+/// Refuses what there is a complaint about.
+fn settled(ty: &Type, complaint: Option<String>) -> Result<()> {
+    complaint.map_or(Ok(()), |complaint| Err(refused(ty, &complaint)))
+}
+
 /// Tries an encoder, a normalizer or a field of type `ty`.
 pub(crate) fn map(ty: &Type, stage: &dyn Stage) -> Result<()> {
-    try_map(stage)?.map_or(Ok(()), |complaint| Err(refused(ty, &complaint)))
+    settled(ty, try_map(stage)?)
 }
 
 /// The first complaint about a stage.
@@ -119,7 +161,11 @@ fn try_map(stage: &dyn Stage) -> Result<Option<String>> {
 }
 
 /// The first complaint about a kernel that reads halves.
-fn try_halves<H: Half>(stage: &dyn Stage, kernel: &dyn Kernel<f32, H>, params: &mut Guarded) -> Result<Option<String>> {
+fn try_halves<H: Half>(
+    stage: &dyn Stage,
+    kernel: &dyn Kernel<f32, H>,
+    params: &mut Guarded<f32>,
+) -> Result<Option<String>> {
     let mut halves = Pages::<H>::zeros(params.inner().len());
     if halves.len() <= MANY {
         round(params.inner(), &mut halves);
@@ -128,7 +174,7 @@ fn try_halves<H: Half>(stage: &dyn Stage, kernel: &dyn Kernel<f32, H>, params: &
 }
 
 /// The first complaint about a kernel of a stage.
-fn try_kernel(stage: &dyn Stage, kernel: &dyn Kernel<f32>, params: &mut Guarded) -> Result<Option<String>> {
+fn try_kernel(stage: &dyn Stage, kernel: &dyn Kernel<f32>, params: &mut Guarded<f32>) -> Result<Option<String>> {
     let info = stage.info();
     let range: Range<usize> = match info.grads {
         GradKind::Scatter => stage.partition().into_iter().min_by_key(Range::len).unwrap_or(0..info.params),
@@ -190,9 +236,8 @@ fn try_kernel(stage: &dyn Stage, kernel: &dyn Kernel<f32>, params: &mut Guarded)
     Ok(None)
 }
 
-/// Tries a projector of type `ty`: `cast` samples a ray, with that many untouchable numbers behind the samples, and gives
-/// the line integral of ones.
-pub(crate) fn projector(ty: &Type, cast: impl Fn(&UnitRay, Option<u64>, usize) -> Result<f64>) -> Result<()> {
+/// Rays along an axis, across the cube, the other way, and past it.
+fn rays() -> [UnitRay; 4] {
     let ray = |origin, direction: [f32; 3], inside| UnitRay {
         origin,
         direction,
@@ -201,12 +246,18 @@ pub(crate) fn projector(ty: &Type, cast: impl Fn(&UnitRay, Option<u64>, usize) -
         per_mm: 0.01,
     };
     let third = (1.0f32 / 3.0).sqrt();
-    for ray in [
+    [
         ray([-1.0, 0.5, 0.5], [1.0, 0.0, 0.0], [1.0, 2.0]),
         ray([-third; 3], [third; 3], [1.0, 1.0 + 1.0 / third]),
         ray([0.5, 2.0, 0.25], [0.0, -1.0, 0.0], [1.0, 2.0]),
         ray([-1.0, 5.0, 0.5], [1.0, 0.0, 0.0], [0.0, 0.0]),
-    ] {
+    ]
+}
+
+/// Tries a projector of type `ty`: `cast` samples a ray, with that many untouchable numbers behind the samples, and gives
+/// the line integral of ones.
+pub(crate) fn projector(ty: &Type, cast: impl Fn(&UnitRay, Option<u64>, usize) -> Result<f64>) -> Result<()> {
+    for ray in rays() {
         for seed in [None, Some(3)] {
             let line = cast(&ray, seed, GUARD)?;
             if !line.is_finite() {
@@ -217,19 +268,19 @@ pub(crate) fn projector(ty: &Type, cast: impl Fn(&UnitRay, Option<u64>, usize) -
     Ok(())
 }
 
-/// Numbers on either side of the few that a loss or a prior writes.
-const EDGE: usize = 256;
-
-/// Room for `n` numbers in double precision between guard zones.
-fn room(n: usize) -> Vec<f64> {
-    vec![f64::from_bits(UNTOUCHED.into()); n + 2 * EDGE]
-}
-
-/// What is wrong with the zones of `room`.
-fn spilt(room: &[f64], what: &str) -> Option<String> {
-    let mut zones = room[..EDGE].iter().chain(&room[room.len() - EDGE..]);
-    let broken = zones.any(|v| v.to_bits() != u64::from(UNTOUCHED));
-    broken.then(|| format!("it writes outside the {} numbers of its {what}", room.len() - 2 * EDGE))
+/// Tries the line integrals of a line field of type `ty`.
+pub(crate) fn lines(ty: &Type, stage: &dyn Stage, lines: &dyn Lines<f32>) -> Result<()> {
+    let info = stage.info();
+    let range = stage.partition().into_iter().min_by_key(Range::len).unwrap_or(0..info.params);
+    let mut params = Guarded::zeroed(info.params);
+    let (rays, mut out, mut grads) = (rays(), Guarded::new(4), Guarded::zeroed(range.len()));
+    lines.project(params.inner(), &rays, out.inner());
+    lines.backproject(params.inner(), &rays, &[1.0; 4], Grads { values: grads.inner(), range });
+    stage.fault()?;
+    let complaint = out.complaint("line integrals").or_else(|| grads.complaint("gradients of line integrals"));
+    let missed = out.inner()[3] != 0.0;
+    let complaint = complaint.or_else(|| params.broken("parameters"));
+    settled(ty, complaint.or_else(|| missed.then(|| "a ray that is not inside has a line integral".into())))
 }
 
 /// Tries a loss of type `ty`: `at` compares pairs of a predicted and a measured value.
@@ -237,41 +288,105 @@ pub(crate) fn loss(ty: &Type, at: impl Fn(&[f64], &[f64], [&mut [f64]; 2]) -> Re
     let values: Vec<f64> = (0..16).map(|i| 0.25 * f64::from(i) - 0.5).collect();
     for shift in [0.0, 0.25, -1.0] {
         let predicted: Vec<f64> = values.iter().map(|v| v + shift).collect();
-        let [mut loss, mut slope] = [room(values.len()), room(values.len())];
-        let inside = EDGE..EDGE + values.len();
-        at(&predicted, &values, [&mut loss[inside.clone()], &mut slope[inside.clone()]])?;
-        let complaint = spilt(&loss, "losses").or_else(|| spilt(&slope, "slopes"));
-        let complaint = complaint.or_else(|| {
-            let all = inside.map(|i| (loss[i], slope[i]));
-            let unwritten = |v: f64| v.to_bits() == u64::from(UNTOUCHED);
-            let bad = all
-                .enumerate()
-                .find(|(_, (l, s))| !(l.is_finite() && *l >= 0.0 && s.is_finite()) || unwritten(*l) || unwritten(*s));
-            let (i, (loss, slope)) = bad?;
-            let [p, m] = [predicted[i], values[i]];
-            Some(if unwritten(loss) || unwritten(slope) {
-                format!("predicted {p}, measured {m}: a number is left unwritten")
-            } else {
-                format!("predicted {p}, measured {m}: loss {loss}, slope {slope}")
-            })
-        });
-        if let Some(complaint) = complaint {
-            return Err(refused(ty, &complaint));
+        let [mut loss, mut slope] = [0; 2].map(|_| Guarded::<f64>::new(values.len()));
+        at(&predicted, &values, [loss.inner(), slope.inner()])?;
+        settled(ty, loss.broken("losses").or_else(|| slope.broken("slopes")))?;
+        for (i, (loss, slope)) in loss.inner().iter().zip(slope.inner()).enumerate() {
+            let pair = format!("predicted {}, measured {}", predicted[i], values[i]);
+            if loss.is_mark() || slope.is_mark() {
+                return Err(refused(ty, &format!("{pair}: a number is left unwritten")));
+            }
+            if !(loss.is_finite() && *loss >= 0.0 && slope.is_finite()) {
+                return Err(refused(ty, &format!("{pair}: loss {loss}, slope {slope}")));
+            }
         }
     }
     Ok(())
 }
 
+/// `n` numbers in [0, 1).
+fn drawn(n: usize) -> impl Iterator<Item = f32> {
+    (0..n).map(|i| unit(mix(5, i as u64)))
+}
+
+/// What is wrong with a number that is to be finite, 0 or more.
+fn below_zero(what: &str, value: f64) -> Option<String> {
+    (!(value.is_finite() && value >= 0.0)).then(|| format!("{what} is {value}"))
+}
+
 /// Tries a prior of type `ty` on a block of `points`: `block` adds to the gradient and gives the penalty.
 pub(crate) fn prior(ty: &Type, points: usize, block: impl Fn(&[f64], &mut [f64]) -> Result<f64>) -> Result<()> {
-    let values: Vec<f64> = (0..points).map(|i| f64::from(unit(mix(5, i as u64)))).collect();
-    let mut gradient = room(points);
-    gradient[EDGE..EDGE + points].fill(0.0);
-    let penalty = block(&values, &mut gradient[EDGE..EDGE + points])?;
-    let complaint = spilt(&gradient, "gradient").or_else(|| {
-        let wild = gradient[EDGE..EDGE + points].iter().position(|g| !g.is_finite());
-        let wild = wild.map(|i| format!("derivative {i} of {points} is {}", gradient[EDGE + i]));
-        (!(penalty.is_finite() && penalty >= 0.0)).then(|| format!("the penalty of a block is {penalty}")).or(wild)
-    });
-    complaint.map_or(Ok(()), |c| Err(refused(ty, &c)))
+    let values: Vec<f64> = drawn(points).map(f64::from).collect();
+    let mut gradient = Guarded::zeroed(points);
+    let penalty = block(&values, gradient.inner())?;
+    let complaint = gradient.broken("gradient").or_else(|| below_zero("the penalty of a block", penalty));
+    settled(ty, complaint.or_else(|| gradient.unsound("gradient")))
+}
+
+/// Tries a regularizer of type `ty` on `count` coefficients: `prox` writes what its proximal map makes of some, and gives their
+/// penalty.
+pub(crate) fn regularizer(
+    ty: &Type,
+    count: usize,
+    mut prox: impl FnMut(&[f32], *mut f32) -> Result<f64>,
+) -> Result<()> {
+    let mut v = Guarded::of(&drawn(count).map(|x| x - 0.3).collect::<Vec<f32>>());
+    for _ in 0..2 {
+        let mut u = Guarded::<f32>::new(count);
+        let value = prox(v.inner(), u.inner().as_mut_ptr())?;
+        let complaint = u.complaint("coefficients").or_else(|| v.broken("input"));
+        let complaint = complaint.or_else(|| below_zero("the penalty", value));
+        let negative = u.inner().iter().find(|u| **u < 0.0).map(|u| format!("its proximal map gives {u}"));
+        settled(ty, complaint.or(negative))?;
+    }
+    Ok(())
+}
+
+/// Tries a data term of type `ty`: `of` makes it for a scan.
+pub(crate) fn data_term<M: Misfit>(ty: &Type, of: impl Fn(ArrayView3<'_, f32>) -> Result<M>) -> Result<()> {
+    let shape = [2, 6, 7];
+    let scan = Array3::from_shape_vec(shape, drawn(2 * 6 * 7).map(|x| 2.0 * x).collect());
+    let scan = scan.unwrap_or_else(|_| Array3::zeros(shape));
+    let misfit = of(scan.view())?;
+    settled(ty, below_zero("the noise that it finds", misfit.noise()))?;
+    for (view, measured) in scan.outer_iter().enumerate() {
+        let measured: Vec<f32> = measured.iter().copied().collect();
+        let [mut residuals, mut curve, mut spread] = [0.5f32, 1.0, 1.0].map(|x| Guarded::of(&vec![x; measured.len()]));
+        let sum = misfit.differentiate(view, &measured, residuals.inner());
+        misfit.curve(view, &measured, curve.inner());
+        misfit.spread(view, &measured, spread.inner());
+        misfit.fault()?;
+        let complaint = residuals.complaint("derivatives").or_else(|| curve.complaint("curvatures"));
+        let complaint = complaint.or_else(|| spread.complaint("spread of noise"));
+        settled(ty, complaint.or_else(|| below_zero("the misfit", sum)))?;
+    }
+    Ok(())
+}
+
+/// Tries a basis of type `ty` on a grid of `voxels`.
+pub(crate) fn basis(ty: &Type, voxels: [usize; 3], basis: &dyn Expansion) -> Result<()> {
+    let mut complaint = try_operator(basis.operator(), voxels, basis.coefficients().shape);
+    if let (None, Some(reference)) = (&complaint, basis.reference()) {
+        complaint = try_operator(reference, voxels, basis.coefficients().shape);
+    }
+    basis.fault()?;
+    settled(ty, complaint)
+}
+
+/// The first complaint about one of the two operators of a basis.
+fn try_operator<R: Marked>(of: &dyn BasisOperator<R>, voxels: [usize; 3], coefficients: [usize; 3]) -> Option<String> {
+    let count = |shape: [usize; 3]| shape.iter().product::<usize>();
+    let try_one = |what: &str, shapes: [[usize; 3]; 2], back: bool| {
+        let [mut from, mut to] = shapes.map(|shape| Guarded::<R>::new(count(shape)));
+        from.inner().iter_mut().zip(drawn(count(shapes[0]))).for_each(|(x, drawn)| *x = R::of(drawn.into()));
+        let x = ArrayView3::from_shape(shapes[0], &*from.inner()).ok()?;
+        let y = ArrayViewMut3::from_shape(shapes[1], to.inner()).ok()?;
+        if back {
+            of.adjoint(x, y)
+        } else {
+            of.expand(x, y)
+        }
+        to.complaint(what).or_else(|| from.broken("input"))
+    };
+    try_one("voxels", [coefficients, voxels], false).or_else(|| try_one("coefficients", [voxels, coefficients], true))
 }

@@ -1,13 +1,16 @@
 //! A stage behind the pointer that the host holds.
 
 use conefield_core::arena::Weights;
+use conefield_core::basis::{Basis, BasisSpec, Expansion};
+use conefield_core::data_term::{DataTerm, DataTermSpec, Misfit};
 use conefield_core::error::{Error, Result};
 use conefield_core::loss::Loss;
 use conefield_core::prior::Prior;
 use conefield_core::registry::{Kind, StageType};
+use conefield_core::regularizer::{Penalty, Regularizer, RegularizerSpec};
 use conefield_core::settings::{
-    EncoderSpec, FieldSpec, Initializer, InitializerSpec, KnownVolume, LossSpec, NormalizerSpec, PriorSpec,
-    ProjectorSpec,
+    EncoderSpec, FieldSpec, Initializer, InitializerSpec, KnownVolume, LineFieldSpec, LossSpec, NormalizerSpec,
+    PriorSpec, ProjectorSpec,
 };
 use conefield_core::spec::stage::read;
 use conefield_core::stage::{Encoder, Field, GradKind, Info, Normalizer, Parameter, Projector, Reduced, Scope, Stage};
@@ -20,24 +23,55 @@ use std::ops::Range;
 pub struct Built {
     pub stage: AnyStage,
     /// Of an encoder, a normalizer or a field.
-    pub map: Option<MapInfo>,
+    map: Option<MapInfo>,
     /// The known volume of an initializer.
     pub volume: Option<KnownVolume>,
     /// What a smaller stage kept of the one that it was made from.
     pub kept: (Vec<ConefieldRange>, Vec<usize>),
+    /// The shape of the grid that a penalty or an expansion was made for.
+    pub shape: [usize; 3],
 }
 
-/// A stage of any kind.
-pub enum AnyStage {
-    Encoder(Box<dyn Encoder>),
-    Normalizer(Box<dyn Normalizer>),
-    Field(Box<dyn Field>),
-    Projector(Box<dyn Projector>),
-    Initializer(Box<dyn Initializer>),
-    /// An initializer before its weights were read.
-    Waiting(Waiting),
-    Loss(Box<dyn Loss>),
-    Prior(Box<dyn Prior>),
+macro_rules! any_stage {
+    ($($kind:ident $($name:ident)?: $stage:ty,)*) => {
+        /// A stage of any kind, or a part that one made for a grid or a scan.
+        pub enum AnyStage {
+            $($kind(Box<$stage>),)*
+            /// An initializer before its weights were read.
+            Waiting(Waiting),
+        }
+
+        $(impl From<Box<$stage>> for AnyStage {
+            fn from(stage: Box<$stage>) -> Self {
+                Self::$kind(stage)
+            }
+        })*
+
+        impl Built {
+            $($(pub fn $name(&self) -> Result<&$stage> {
+                match &self.stage {
+                    AnyStage::$kind(stage) => Ok(stage.as_ref()),
+                    other => Err(other.is_no(stringify!($name))),
+                }
+            })?)*
+        }
+    };
+}
+
+any_stage! {
+    Encoder encoder: dyn Encoder,
+    Normalizer: dyn Normalizer,
+    Field field: dyn Field,
+    Projector projector: dyn Projector,
+    Initializer initializer: dyn Initializer,
+    Loss loss: dyn Loss,
+    Prior prior: dyn Prior,
+    Regularizer regularizer: dyn Regularizer,
+    Penalty penalty: dyn Penalty,
+    DataTerm data_term: dyn DataTerm,
+    Misfit misfit: dyn Misfit,
+    Basis basis: dyn Basis,
+    Expansion expansion: dyn Expansion,
 }
 
 /// Settings of an initializer that name a weights file.
@@ -85,57 +119,76 @@ impl Built {
         };
         keys.insert("type".into(), t.name.into());
         let refused = |e: String| Error::invalid("spec", "", e, "settings of this type");
-        let stage = match t.kind {
-            Kind::Encoder => AnyStage::Encoder(read::<dyn EncoderSpec>(settings).map_err(refused)?.build()?),
-            Kind::Normalizer => {
-                AnyStage::Normalizer(read::<dyn NormalizerSpec>(settings).map_err(refused)?.build(width)?)
-            }
-            Kind::Field => AnyStage::Field(read::<dyn FieldSpec>(settings).map_err(refused)?.build(width)?),
-            Kind::Projector => AnyStage::Projector(read::<dyn ProjectorSpec>(settings).map_err(refused)?.build()?),
+        macro_rules! built {
+            ($spec:ident $($width:ident)?) => {
+                AnyStage::from(read::<dyn $spec>(settings).map_err(refused)?.build($($width)?)?)
+            };
+        }
+        Ok(Self::of(match t.kind {
+            Kind::Encoder => built!(EncoderSpec),
+            Kind::Normalizer => built!(NormalizerSpec width),
+            Kind::Field => built!(FieldSpec width),
+            Kind::LineField => built!(LineFieldSpec),
+            Kind::Projector => built!(ProjectorSpec),
             Kind::Initializer => Waiting::build(read::<dyn InitializerSpec>(settings).map_err(refused)?)?,
-            Kind::Loss => AnyStage::Loss(read::<dyn LossSpec>(settings).map_err(refused)?.build()?),
-            Kind::Prior => AnyStage::Prior(read::<dyn PriorSpec>(settings).map_err(refused)?.build()?),
+            Kind::Loss => built!(LossSpec),
+            Kind::Prior => built!(PriorSpec),
+            Kind::Regularizer => built!(RegularizerSpec),
+            Kind::DataTerm => built!(DataTermSpec),
+            Kind::Basis => built!(BasisSpec),
             other => return Err(Error::unsupported(t.name, format!("a {other} cannot come from a plugin"))),
-        };
-        Ok(Self::of(stage))
+        }))
     }
 
     /// What the host holds of `stage`.
-    pub fn of(stage: AnyStage) -> Self {
+    pub fn of(stage: impl Into<AnyStage>) -> Self {
+        let stage = stage.into();
         let map = stage.map().map(|s| {
             let i = s.info();
             let partition = if i.grads == GradKind::Scatter { s.partition() } else { vec![] };
-            let coarse_to_fine = matches!(&stage, AnyStage::Encoder(e) if e.coarse_to_fine());
             let blocks = s.parameters();
             let mut info = info(&i, blocks.len(), partition.len());
-            info.coarse_to_fine = coarse_to_fine.into();
+            info.coarse_to_fine = matches!(&stage, AnyStage::Encoder(e) if e.coarse_to_fine()).into();
             info.double_precision = s.reference().is_some().into();
             info.halves = s.halves().is_some().into();
             MapInfo { info, blocks, partition }
         });
         let volume = if let AnyStage::Initializer(i) = &stage { i.volume() } else { None };
-        Self { stage, map, volume, kept: (vec![], vec![]) }
+        Self { stage, map, volume, kept: (vec![], vec![]), shape: [0; 3] }
+    }
+
+    /// The stage as such, of any kind.
+    pub fn any(&self) -> Result<&Self> {
+        Ok(self)
+    }
+
+    /// As a map of rows, with what is known of it.
+    pub fn map(&self) -> Result<(&dyn Stage, &MapInfo)> {
+        self.stage.map().zip(self.map.as_ref()).ok_or_else(|| self.stage.is_no("encoder, normalizer or field"))
+    }
+
+    /// As a penalty, to be changed.
+    pub fn penalty_mut(&mut self) -> Result<&mut dyn Penalty> {
+        match &mut self.stage {
+            AnyStage::Penalty(penalty) => Ok(penalty.as_mut()),
+            other => Err(other.is_no("penalty")),
+        }
     }
 
     /// The stage without some of its channels.
     pub fn reduced(&self, side: u32, keep: &[usize]) -> Result<Self> {
-        let of = |params: Vec<Range<usize>>, channels, stage| Self {
-            kept: (params.iter().map(|r| ConefieldRange { start: r.start, end: r.end }).collect(), channels),
-            ..Self::of(stage)
-        };
+        fn of<S: ?Sized>(reduced: Reduced<S>) -> Built
+        where
+            AnyStage: From<Box<S>>,
+        {
+            let Reduced { stage, params, channels } = reduced;
+            let params = params.iter().map(|r| ConefieldRange { start: r.start, end: r.end }).collect();
+            Built { kept: (params, channels), ..Built::of(stage) }
+        }
         Ok(match (&self.stage, side) {
-            (AnyStage::Encoder(e), CONEFIELD_OUTPUTS) => {
-                let Reduced { stage, params, channels } = e.keep_outputs(keep)?;
-                of(params, channels, AnyStage::Encoder(stage))
-            }
-            (AnyStage::Normalizer(n), CONEFIELD_INPUTS) => {
-                let Reduced { stage, params, channels } = n.keep_inputs(keep)?;
-                of(params, channels, AnyStage::Normalizer(stage))
-            }
-            (AnyStage::Field(f), CONEFIELD_INPUTS) => {
-                let Reduced { stage, params, channels } = f.keep_inputs(keep)?;
-                of(params, channels, AnyStage::Field(stage))
-            }
+            (AnyStage::Encoder(e), CONEFIELD_OUTPUTS) => of(e.keep_outputs(keep)?),
+            (AnyStage::Normalizer(n), CONEFIELD_INPUTS) => of(n.keep_inputs(keep)?),
+            (AnyStage::Field(f), CONEFIELD_INPUTS) => of(f.keep_inputs(keep)?),
             _ => return Err(Error::unsupported("this stage", "channels cannot be left out on that side")),
         })
     }
@@ -143,25 +196,38 @@ impl Built {
 
 impl AnyStage {
     /// As an encoder, a normalizer or a field.
-    pub fn map(&self) -> Option<&dyn Stage> {
+    fn map(&self) -> Option<&dyn Stage> {
         match self {
             Self::Encoder(s) => Some(s.as_ref()),
             Self::Normalizer(s) => Some(s.as_ref()),
             Self::Field(s) => Some(s.as_ref()),
-            Self::Projector(_) | Self::Initializer(_) | Self::Waiting(_) | Self::Loss(_) | Self::Prior(_) => None,
+            _ => None,
         }
     }
 
     pub fn describe(&self) -> String {
         match self {
-            Self::Projector(p) => p.describe(),
-            Self::Initializer(i) => i.describe(),
-            Self::Waiting(w) => format!("waits for {}", w.path),
-            Self::Loss(l) => l.describe(),
-            Self::Prior(p) => p.describe(),
             Self::Encoder(s) => s.describe(),
             Self::Normalizer(s) => s.describe(),
             Self::Field(s) => s.describe(),
+            Self::Projector(s) => s.describe(),
+            Self::Initializer(s) => s.describe(),
+            Self::Loss(s) => s.describe(),
+            Self::Prior(s) => s.describe(),
+            Self::Regularizer(s) => s.describe(),
+            Self::DataTerm(s) => s.describe(),
+            Self::Misfit(s) => s.describe(),
+            Self::Basis(s) => s.describe(),
+            Self::Waiting(w) => format!("waits for {}", w.path),
+            Self::Penalty(_) | Self::Expansion(_) => String::new(),
+        }
+    }
+
+    /// It was asked for as another kind of stage than it is.
+    fn is_no(&self, kind: &str) -> Error {
+        match self {
+            Self::Waiting(w) => Error::unsupported(&w.path, "the weights were not handed over"),
+            _ => Error::unsupported("this stage", format!("it is no {kind}")),
         }
     }
 }

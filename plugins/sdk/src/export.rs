@@ -71,6 +71,9 @@ fn stage(t: &'static StageType) -> Option<ConefieldStage> {
         initializer: ptr::null(),
         loss: ptr::null(),
         prior: ptr::null(),
+        regularizer: ptr::null(),
+        data_term: ptr::null(),
+        basis: ptr::null(),
     };
     match t.kind {
         Kind::Encoder => (stage.kind, stage.map) = (CONEFIELD_ENCODER, &shims::MAP),
@@ -80,7 +83,11 @@ fn stage(t: &'static StageType) -> Option<ConefieldStage> {
         Kind::Initializer => (stage.kind, stage.initializer) = (CONEFIELD_INITIALIZER, &shims::INITIALIZER),
         Kind::Loss => (stage.kind, stage.loss) = (CONEFIELD_LOSS, &shims::LOSS),
         Kind::Prior => (stage.kind, stage.prior) = (CONEFIELD_PRIOR, &shims::PRIOR),
-        _ => return None,
+        Kind::LineField => (stage.kind, stage.map) = (CONEFIELD_LINE_FIELD, &shims::MAP),
+        Kind::Regularizer => (stage.kind, stage.regularizer) = (CONEFIELD_REGULARIZER, &shims::REGULARIZER),
+        Kind::DataTerm => (stage.kind, stage.data_term) = (CONEFIELD_DATA_TERM, &shims::DATA_TERM),
+        Kind::Basis => (stage.kind, stage.basis) = (CONEFIELD_BASIS, &shims::BASIS),
+        Kind::Method | Kind::Callback | Kind::VoxelProjector => return None,
     }
     Some(stage)
 }

@@ -13,15 +13,15 @@
 //! ```
 //!
 //! `conefield plugins new NAME --kind encoder --lang rust` makes such a crate. A panic in a stage becomes an error of the
-//! run; keep `panic = "unwind"`, which is Cargo's default. Methods, callbacks and
-//! the pieces of iterative methods cannot be exported.
+//! run; keep `panic = "unwind"`, which is Cargo's default. Methods, callbacks and projectors of voxels cannot be exported.
 
 mod built;
 mod export;
 mod shims;
 
 pub use conefield_core::{
-    Error, Result, arena, by_row, error, half, loss, prelude, prior, random, settings, simd, stage, stage_type, wgsl,
+    Error, Result, arena, basis, by_row, data_term, error, geometry, half, loss, prelude, prior, random, regularizer,
+    scan, settings, simd, space, stage, stage_type, wgsl,
 };
 pub use conefield_plugin_abi as abi;
 pub use export::Plugin;

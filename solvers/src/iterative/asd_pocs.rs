@@ -9,7 +9,7 @@ use super::sart::{Sweep, Updates};
 use super::shared::Shared;
 use super::tv::{anisotropy, descend};
 use super::{Iteration, Pass, Problem, Stop, drive::drive, flat_mut};
-use conefield_core::error::{Result, ensure};
+use conefield_core::error::Result;
 use conefield_core::method::{Context, Job, Method, Observer, Plan, Solution};
 use conefield_core::scan::{Scan, ScanHeader};
 use conefield_core::scene::VoxelScene;
@@ -39,20 +39,8 @@ pub struct AsdPocs {
     pub stop: Stop,
     /// Subsets of the views: a number, or "views" for a view at a time.
     pub subsets: Subsets,
-    /// Relaxation of the data passes.
-    pub relaxation: f64,
-    /// What the relaxation is multiplied with after each pass.
-    pub decay: f64,
-    /// Length of the first descent steps against what the first data pass changed.
-    pub alpha: f64,
-    /// What the descent steps are multiplied with when they change more than `ratio` of the data pass.
-    pub alpha_decay: f64,
-    /// See `alpha_decay`.
-    pub ratio: f64,
     /// Descent steps a pass.
     pub descents: usize,
-    /// Residual, in standard deviations of the scan's noise, down to which descent steps are shortened.
-    pub tolerance: f64,
 }
 
 impl Default for AsdPocs {
@@ -63,16 +51,20 @@ impl Default for AsdPocs {
             start: None,
             stop: Stop::after(20),
             subsets: Subsets::Count(50),
-            relaxation: 1.0,
-            decay: 0.97,
-            alpha: 0.05,
-            alpha_decay: 0.95,
-            ratio: 0.95,
             descents: 20,
-            tolerance: 1.0,
         }
     }
 }
+
+/// Relaxation of the data passes, and what it is multiplied with after each.
+const RELAXATION: f64 = 1.0;
+const DECAY: f64 = 0.97;
+/// Length of the first descent steps against what the first data pass changed.
+const ALPHA: f64 = 0.05;
+/// What the descent steps are multiplied with while they change more than [`RATIO`] of the data pass and the residual is above
+/// what the scan's noise explains.
+const ALPHA_DECAY: f64 = 0.95;
+const RATIO: f64 = 0.95;
 
 conefield_core::stage_type!(Method, "asd-pocs", AsdPocs, "data passes in turn with descent on total variation");
 
@@ -85,34 +77,19 @@ impl Method for AsdPocs {
 
 impl AsdPocs {
     fn built(&self) -> Result<Built> {
-        let &Self { subsets, relaxation, decay, .. } = self;
-        let updates = Updates { subsets, relaxation, decay, order: Order::Golden, nonnegative: true };
+        let (subsets, order) = (self.subsets, Order::Golden);
+        let updates = Updates { subsets, relaxation: RELAXATION, decay: DECAY, order, nonnegative: true };
         updates.validate()?;
-        for (name, x) in [("alpha", self.alpha), ("alpha_decay", self.alpha_decay), ("ratio", self.ratio)] {
-            ensure(x.is_finite() && x > 0.0, "spec", name, x, "a positive finite number")?;
-        }
-        ensure(self.tolerance >= 0.0, "spec", "tolerance", self.tolerance, "0 or more")?;
-        let &Self { alpha, alpha_decay, ratio, descents, tolerance, .. } = self;
         let shared = Shared::of(self.projector.as_ref(), self.scene, &self.start, &self.stop)?;
-        Ok(Built { shared, updates, descent: Descent { alpha, alpha_decay, ratio, count: descents }, tolerance })
+        Ok(Built { shared, updates, descents: self.descents })
     }
-}
-
-/// The steps of descent on total variation after a data pass.
-#[derive(Debug, Clone, Copy)]
-struct Descent {
-    alpha: f64,
-    alpha_decay: f64,
-    ratio: f64,
-    count: usize,
 }
 
 /// What [`AsdPocs`] builds.
 struct Built {
     shared: Shared,
     updates: Updates,
-    descent: Descent,
-    tolerance: f64,
+    descents: usize,
 }
 
 impl Iterative for Built {
@@ -129,16 +106,16 @@ impl Iterative for Built {
         let opened = self.shared.open(&self.describe(), job, observer)?;
         let job = &opened.job(job);
         let problem = opened.problem(job);
-        let sigma = Noise::of(job.scan, false).sigma;
+        let sigma = Noise::of(job.scan.projections.view(), false).sigma;
         let space = Space::new(job.scan.header());
         let mut iterate = Iterate::new(self, &space, self.shared.start(job, &problem, &space)?);
-        iterate.target = self.tolerance * sigma * (job.scan.projections.len() as f64).sqrt();
+        iterate.target = sigma * (job.scan.projections.len() as f64).sqrt();
         iterate.sweep.prepare(&problem);
         drive(job, &self.shared.stop, begun, &problem, &space, &mut iterate, observer)
     }
 
     fn found(&self, scan: &Scan) -> Vec<String> {
-        let noise = Noise::of(scan, false).to_string();
+        let noise = Noise::of(scan.projections.view(), false).to_string();
         vec![told(&self.updates.subsets.of(scan.geometry.views.len())), noise]
     }
 
@@ -150,13 +127,12 @@ impl Iterative for Built {
     }
 
     fn describe(&self) -> String {
-        let Descent { alpha, count, .. } = self.descent;
-        format!("asd-pocs: {}, {count} descents a pass, alpha {alpha}", self.updates.subsets)
+        format!("asd-pocs: {}, {} descents a pass", self.updates.subsets, self.descents)
     }
 }
 
 struct Iterate {
-    descent: Descent,
+    descents: usize,
     sweep: Sweep,
     /// The residual's norm that noise alone explains.
     target: f64,
@@ -171,7 +147,7 @@ struct Iterate {
 impl Iterate {
     fn new(built: &Built, space: &Space, x: Array3<f32>) -> Self {
         Self {
-            descent: built.descent,
+            descents: built.descents,
             sweep: Sweep::new(built.updates, space, x),
             target: 0.0,
             length: 0.0,
@@ -183,24 +159,23 @@ impl Iterate {
 
 impl Iteration for Iterate {
     fn pass(&mut self, problem: &Problem<'_>, pass: u64) -> Result<Pass> {
-        let Descent { alpha, alpha_decay, ratio, count } = self.descent;
         let grid = &problem.scan.geometry.volume;
         self.before.assign(&self.sweep.x);
         let residual = self.sweep.sweep(problem, pass);
         let data = distance(&self.sweep.x, &self.before);
         if pass == 0 {
-            self.length = alpha * data / count.max(1) as f64;
+            self.length = ALPHA * data / self.descents.max(1) as f64;
         }
         self.fitted.assign(&self.sweep.x);
         let mean = (norm2(&self.fitted) / self.fitted.len() as f64).sqrt();
-        for _ in 0..count {
+        for _ in 0..self.descents {
             let (x, work) = (flat_mut(&mut self.sweep.x), flat_mut(&mut self.sweep.work));
             descend(x, grid.shape, anisotropy(grid), self.length, 1e-3 * mean as f32, work);
             problem.outside(&mut self.sweep.x, 0.0);
         }
         let prior = distance(&self.sweep.x, &self.fitted);
-        if prior > ratio * data && residual.sqrt() > self.target {
-            self.length *= alpha_decay;
+        if prior > RATIO * data && residual.sqrt() > self.target {
+            self.length *= ALPHA_DECAY;
         }
         Ok(Pass { residual, change: Some(change(&self.sweep.x, &self.before)), prior: None })
     }

@@ -41,6 +41,11 @@ pub trait Iteration {
     /// All that the next pass depends on, by name, for checkpoints.
     fn state(&mut self) -> Vec<(String, &mut [f32])>;
 
+    /// What a stage could not do since this was last asked.
+    fn fault(&self) -> Result<()> {
+        Ok(())
+    }
+
     /// Numbers that belong to the state.
     fn numbers(&mut self) -> Vec<&mut f64> {
         vec![]
@@ -148,6 +153,7 @@ impl<'a> Run<'a> {
         let begun = Instant::now();
         let pass = method.pass(self.problem, self.step)?;
         self.problem.operator.fault()?;
+        method.fault()?;
         self.step += 1;
         self.check(&pass)?;
         self.clock.pause();
@@ -238,6 +244,7 @@ impl<'a> Run<'a> {
         let Self { kept, step, job, .. } = self;
         let best = self.best.filter(|_| kept.best.is_some());
         let mut data = best.unwrap_or_else(|| method.take(self.problem));
+        method.fault()?;
         let mm = job.scan.unit.mm as f32;
         data.par_mapv_inplace(|x| x * mm);
         finite(&data, step)?;
@@ -271,7 +278,7 @@ fn restore(resume: &Resume, method: &mut dyn Iteration, best: Option<&mut Array3
     let kept = kept.map_err(|e| Error::invalid(&resume.place, "method", e, "what this method keeps"))?;
     let best = best.filter(|_| kept.best.is_some()).map(|best| (BEST.to_owned(), flat_mut(best)));
     for (name, values) in method.state().into_iter().chain(best) {
-        let found = resume.weights.tensors.get(&name).map(|t| &t.1);
+        let found = resume.tensor(&name).map(|t| &t.1);
         let fits = found.filter(|t| t.len() == values.len());
         let said = found.map_or("nothing".into(), |t| format!("{} numbers", t.len()));
         let fits = fits.ok_or_else(|| {

@@ -206,10 +206,10 @@ impl Iterative for Built {
             problem.clear_air();
             observer.note(&format!("{:.0} % of the pixels are air", 100.0 * problem.air_share()));
         }
-        let data = self.data.of(problem.scan);
+        let data = self.data.of(problem.scan.projections.view()).map_err(|e| e.within("data"))?;
         let space = Space::new(self.binned(job.scan.header()));
         let start = self.shared.known(job, &space)?;
-        let mut arrays = Arrays::new(self, expansion, &voxels, &space, start);
+        let mut arrays = Arrays::new(self, expansion, &voxels, &space, start)?;
         arrays.begin(&problem);
         let mut iterate = Iterate::new(self, &problem, data, arrays)?;
         observer.note(&iterate.told());
@@ -217,7 +217,8 @@ impl Iterative for Built {
     }
 
     fn found(&self, scan: &Scan) -> Vec<String> {
-        vec![told(&self.subsets.of(scan.geometry.views.len())), self.data.of(scan).describe()]
+        let noise = self.data.of(scan.projections.view());
+        vec![told(&self.subsets.of(scan.geometry.views.len())), noise.map_or_else(|e| e.to_string(), |n| n.describe())]
     }
 
     fn stages(&self) -> Vec<Line> {
@@ -243,10 +244,11 @@ impl Iterative for Built {
         if self.bin > 1 {
             space.hold(4 * header.pixels());
         }
+        space.hold(self.data.held(header));
         space.pass(self.data.scratch(header));
-        // A basis that refuses the grid refuses the run, which then takes nothing.
+        // A stage that refuses the grid refuses the run, which then takes nothing.
         if let Some((expansion, grid)) = self.expansion(header.volume) {
-            Arrays::new(self, expansion, &grid, &space, space.volume());
+            let _ = Arrays::new(self, expansion, &grid, &space, space.volume());
         }
         self.shared.price(&space, self.subsets)
     }
@@ -284,20 +286,20 @@ impl Arrays {
         voxels: &VoxelGrid,
         space: &Space,
         start: Array3<f32>,
-    ) -> Self {
+    ) -> Result<Self> {
         let (model, x) = Model::new(expansion, voxels, space, start);
         let grid = model.grid();
         let coefficients = || space.array(grid.shape);
-        Self {
+        Ok(Self {
             model,
-            penalty: settings.prior.on(&grid, space),
+            penalty: settings.prior.on(&grid, space).map_err(|e| e.within("prior"))?,
             x,
             ahead: coefficients(),
             gradient: coefficients(),
             before: coefficients(),
             towards: (settings.pull > 0.0).then(coefficients),
             pixels: room(space, settings.subsets.count(space.header().views)),
-        }
+        })
     }
 
     /// Leaves nothing where the object cannot be, and starts from what is left.
@@ -328,7 +330,10 @@ impl Arrays {
         self.part_by_part(problem, views, &mut |_, views, pixels| {
             let mut signs = images_mut(pixels, views.len());
             signs.iter_mut().for_each(|sign| *sign = if rng.random::<bool>() { 1.0 } else { -1.0 });
-            data.spread(views, signs);
+            problem.each_image(views, pixels, |view, measured, signs| {
+                data.spread(view, measured, signs);
+                0.0
+            });
         });
         let met = self.gradient.iter().filter(|x| **x != 0.0).count();
         let all = problem.geometry.views.len() as f64 / views.len().max(1) as f64;
@@ -361,7 +366,10 @@ impl Arrays {
         let v = std::mem::take(&mut self.before);
         self.part_by_part(problem, views, &mut |model, views, pixels| {
             model.forward(problem, views, &v, pixels);
-            data.curve(views, images_mut(pixels, views.len()));
+            problem.each_image(views, pixels, |view, measured, values| {
+                data.curve(view, measured, values);
+                0.0
+            });
         });
         self.before = v;
     }
@@ -371,9 +379,9 @@ impl Arrays {
 const PROBES: usize = 3;
 const SAFETY: f64 = 1.15;
 
-struct Iterate<'a> {
+struct Iterate {
     arrays: Arrays,
-    data: Box<dyn Misfit + 'a>,
+    data: Box<dyn Misfit>,
     views: usize,
     /// How many subsets there are now.
     subsets: f64,
@@ -393,15 +401,18 @@ struct Iterate<'a> {
     misfit: f64,
 }
 
-impl<'a> Iterate<'a> {
-    fn new(settings: &Built, problem: &Problem<'_>, data: Box<dyn Misfit + 'a>, mut arrays: Arrays) -> Result<Self> {
+impl Iterate {
+    fn new(settings: &Built, problem: &Problem<'_>, data: Box<dyn Misfit>, mut arrays: Arrays) -> Result<Self> {
         let views = problem.scan.geometry.views.len();
         let subsets = settings.subsets.of(views);
         let grid = arrays.model.grid();
         let lambda = settings
             .prior
-            .weight(&grid, &mut |k| k * data.noise() * arrays.noise_gain(problem, data.as_ref(), &subsets[0]));
+            .weight(&grid, &mut |k| k * data.noise() * arrays.noise_gain(problem, data.as_ref(), &subsets[0]))
+            .map_err(|e| e.within("prior"))?;
         let lipschitz = arrays.largest_eigenvalue(problem, data.as_ref(), &subsets);
+        arrays.model.fault()?;
+        data.fault()?;
         ensure(lipschitz > 0.0, "scan", "geometry", "rays that all miss the volume", "rays through the volume")?;
         Ok(Self {
             arrays,
@@ -432,7 +443,7 @@ impl<'a> Iterate<'a> {
         let data = self.data.as_ref();
         self.arrays.part_by_part(problem, views, &mut |model, views, pixels| {
             residual += model.residual(problem, views, &ahead, pixels);
-            misfit += data.differentiate(views, images_mut(pixels, views.len()));
+            misfit += problem.each_image(views, pixels, |view, measured, r| data.differentiate(view, measured, r));
         });
         self.arrays.ahead = ahead;
         let t = 0.5 * (1.0 + (1.0 + 4.0 * self.t * self.t).sqrt());
@@ -453,7 +464,7 @@ impl<'a> Iterate<'a> {
     }
 }
 
-impl Iteration for Iterate<'_> {
+impl Iteration for Iterate {
     fn pass(&mut self, problem: &Problem<'_>, pass: u64) -> Result<Pass> {
         Zip::from(&mut self.arrays.before).and(&self.arrays.x).par_for_each(|before, x| *before = *x);
         // Another penalty is neither progress nor relapse.
@@ -493,6 +504,12 @@ impl Iteration for Iterate<'_> {
     fn take(&mut self, problem: &Problem<'_>) -> Array3<f32> {
         let x = std::mem::take(&mut self.arrays.x);
         self.arrays.model.take(problem, x)
+    }
+
+    fn fault(&self) -> Result<()> {
+        self.arrays.model.fault()?;
+        self.arrays.penalty.fault()?;
+        self.data.fault()
     }
 
     fn state(&mut self) -> Vec<(String, &mut [f32])> {

@@ -4,6 +4,7 @@ use super::flat_mut;
 use super::norms::norm2;
 use super::problem::Problem;
 use conefield_core::basis::Expansion;
+use conefield_core::error::Result;
 use conefield_core::geometry::VoxelGrid;
 use conefield_core::space::Space;
 use ndarray::{Array3, Zip};
@@ -58,6 +59,11 @@ impl Model {
             self.expansion.operator().adjoint(voxels.view(), work.view_mut());
             self.inside = Some(work.mapv(|reached| reached > 0.0));
         }
+    }
+
+    /// What the basis could not do since this was last asked.
+    pub(super) fn fault(&self) -> Result<()> {
+        self.expansion.fault()
     }
 
     /// Where the coefficients stand.

@@ -1,8 +1,8 @@
 //! The noise of a scan, from the scan alone.
 
 use conefield_core::data_term::Misfit;
-use conefield_core::scan::{Scan, ScanHeader};
-use ndarray::{ArrayViewMut3, Axis};
+use conefield_core::scan::ScanHeader;
+use ndarray::{ArrayView3, Axis};
 use rayon::prelude::*;
 
 /// Pixels looked at, about.
@@ -35,8 +35,8 @@ impl Noise {
     /// absolute values is hardly moved by edges. For white noise `p[-1] − 2p[0] + p[1]` has the variance 6σ². Noise that
     /// is correlated between pixels is underestimated. `growing` also fits how it grows from group to group, a line
     /// through the logarithms of the variances.
-    pub fn of(scan: &Scan, growing: bool) -> Self {
-        let mut all = differences(scan);
+    pub fn of(measured: ArrayView3<'_, f32>, growing: bool) -> Self {
+        let mut all = differences(measured);
         if all.is_empty() {
             return Self { sigma: 0.0, growth: 0.0 };
         }
@@ -56,54 +56,42 @@ impl Noise {
     }
 }
 
-/// Weighted least squares, the weights `exp(−growth·p)` and at most 1: inverse variances up to a factor.
-pub(super) struct Weights<'a> {
-    pub(super) noise: Noise,
-    pub(super) scan: &'a Scan,
-}
-
-impl Weights<'_> {
-    /// Multiplies values of `views` with powers of the weights. Returns `Σ w·y²`.
-    fn weigh(&self, power: f64, views: &[usize], mut y: ArrayViewMut3<'_, f32>) -> f64 {
-        let rate = (power * self.noise.growth) as f32;
-        let sums: Vec<f64> = y
-            .axis_iter_mut(Axis(0))
-            .into_par_iter()
-            .zip(views)
-            .map(|(mut image, &view)| {
-                let mut sum = 0.0;
-                image.zip_mut_with(&self.scan.view(view), |y, p| {
-                    let weighted = if rate > 0.0 { *y * (-rate * p.max(0.0)).exp() } else { *y };
-                    sum += f64::from(weighted) * f64::from(*y);
-                    *y = weighted;
-                });
-                sum
-            })
-            .collect();
-        sums.iter().sum()
+impl Noise {
+    /// Multiplies values with powers of the weights `exp(−growth·p)`, at most 1: inverse variances up to a factor. Returns
+    /// `Σ w·y²`.
+    fn weigh(&self, power: f64, measured: &[f32], y: &mut [f32]) -> f64 {
+        let rate = (power * self.growth) as f32;
+        let mut sum = 0.0;
+        for (y, p) in y.iter_mut().zip(measured) {
+            let weighted = if rate > 0.0 { *y * (-rate * p.max(0.0)).exp() } else { *y };
+            sum += f64::from(weighted) * f64::from(*y);
+            *y = weighted;
+        }
+        sum
     }
 }
 
-impl Misfit for Weights<'_> {
-    fn differentiate(&self, views: &[usize], residuals: ArrayViewMut3<'_, f32>) -> f64 {
-        0.5 * self.weigh(1.0, views, residuals)
+/// Weighted least squares. Where the noise does not grow, all weights are 1.
+impl Misfit for Noise {
+    fn differentiate(&self, _: usize, measured: &[f32], residuals: &mut [f32]) -> f64 {
+        0.5 * self.weigh(1.0, measured, residuals)
     }
 
-    fn curve(&self, views: &[usize], values: ArrayViewMut3<'_, f32>) {
-        self.weigh(1.0, views, values);
+    fn curve(&self, _: usize, measured: &[f32], values: &mut [f32]) {
+        self.weigh(1.0, measured, values);
     }
 
     /// Noise of the variance `sigma²/w` has the standard deviation `sigma·√w` once it is weighted.
-    fn spread(&self, views: &[usize], values: ArrayViewMut3<'_, f32>) {
-        self.weigh(0.5, views, values);
+    fn spread(&self, _: usize, measured: &[f32], values: &mut [f32]) {
+        self.weigh(0.5, measured, values);
     }
 
     fn noise(&self) -> f64 {
-        self.noise.sigma
+        self.sigma
     }
 
     fn describe(&self) -> String {
-        self.noise.to_string()
+        self.to_string()
     }
 }
 
@@ -113,11 +101,11 @@ pub fn scratch(header: &ScanHeader) -> u64 {
 }
 
 /// Levels and absolute second differences of pixels within the object.
-fn differences(scan: &Scan) -> Vec<(f32, f32)> {
-    let top = scan.projections.iter().fold(0.0f32, |m, &x| m.max(x));
+fn differences(measured: ArrayView3<'_, f32>) -> Vec<(f32, f32)> {
+    let top = measured.iter().fold(0.0f32, |m, &x| m.max(x));
     // Outside the object negative noise is often cut off.
     let least = 0.1 * top;
-    let every = scan.projections.len().div_ceil(LOOKED_AT).max(1);
+    let every = measured.len().div_ceil(LOOKED_AT).max(1);
     let view = |(n, view): (usize, ndarray::ArrayView2<'_, f32>)| {
         let mut found = vec![];
         for row in view.rows() {
@@ -130,7 +118,7 @@ fn differences(scan: &Scan) -> Vec<(f32, f32)> {
         }
         found
     };
-    scan.projections.axis_iter(Axis(0)).into_par_iter().enumerate().flat_map_iter(view).collect()
+    measured.axis_iter(Axis(0)).into_par_iter().enumerate().flat_map_iter(view).collect()
 }
 
 /// The line of least squares through `ln σ²` over the level; level if it would fall.
@@ -150,18 +138,12 @@ fn line(points: &[[f64; 2]]) -> Noise {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use conefield_core::geometry::{Geometry, Millimetres, Radians, View, VoxelGrid};
     use conefield_core::random::stream;
-    use conefield_core::scan::Unit;
     use ndarray::Array3;
     use rand_distr::{Distribution, Normal};
 
     /// A hill of line integrals up to 3 with noise of the standard deviation `sigma(p)`.
-    fn scan(sigma: impl Fn(f64) -> f64) -> Scan {
-        let mm = Millimetres;
-        let view = View::circular(Radians(0.0), mm(300.0), mm(400.0), [mm(1.0); 2], [mm(0.0); 2]);
-        let volume = VoxelGrid { shape: [8; 3], spacing: [1.0; 3], center: [0.0; 3] };
-        let geometry = Geometry { detector: [128, 256], views: vec![view; 4], volume };
+    fn hill(sigma: impl Fn(f64) -> f64) -> Array3<f32> {
         let mut rng = stream(5, 0);
         let normal = Normal::new(0.0, 1.0).unwrap();
         let mut projections = Array3::zeros((4, 128, 256));
@@ -169,27 +151,27 @@ mod tests {
             let p = 3.0 * (std::f64::consts::PI * c as f64 / 255.0).sin();
             *x = (p + sigma(p) * normal.sample(&mut rng)) as f32;
         }
-        Scan { geometry, projections, unit: Unit { name: "mm".into(), mm: 1.0 }, provenance: serde_json::Value::Null }
+        projections
     }
 
     #[test]
     fn the_law_of_the_noise_is_found() {
-        let found = Noise::of(&scan(|p| 0.01 * (0.5 * p).exp()), true);
+        let found = Noise::of(hill(|p| 0.01 * (0.5 * p).exp()).view(), true);
         assert!((found.sigma / 0.01 - 1.0).abs() < 0.1 && (found.growth - 1.0).abs() < 0.05, "{found:?}");
-        let found = Noise::of(&scan(|_| 0.02), true);
+        let found = Noise::of(hill(|_| 0.02).view(), true);
         assert!((found.sigma / 0.02 - 1.0).abs() < 0.1 && found.growth < 0.05, "{found:?}");
-        let found = Noise::of(&scan(|_| 0.02), false);
+        let found = Noise::of(hill(|_| 0.02).view(), false);
         assert!((found.sigma / 0.02 - 1.0).abs() < 0.05 && found.growth == 0.0, "{found:?}");
     }
 
     #[test]
     fn without_noise_little_is_found() {
-        let found = Noise::of(&scan(|_| 0.0), true);
+        let found = Noise::of(hill(|_| 0.0).view(), true);
         assert!(found.sigma < 1e-3, "{found:?}");
-        let mut flat = scan(|_| 0.0);
-        flat.projections.fill(0.0);
-        assert_eq!(Noise::of(&flat, true), Noise { sigma: 0.0, growth: 0.0 });
-        flat.projections.fill(1.0);
-        assert_eq!(Noise::of(&flat, true), Noise { sigma: 0.0, growth: 0.0 });
+        let mut flat = hill(|_| 0.0);
+        flat.fill(0.0);
+        assert_eq!(Noise::of(flat.view(), true), Noise { sigma: 0.0, growth: 0.0 });
+        flat.fill(1.0);
+        assert_eq!(Noise::of(flat.view(), true), Noise { sigma: 0.0, growth: 0.0 });
     }
 }

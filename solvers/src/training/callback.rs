@@ -166,13 +166,7 @@ impl Kept<'_> {
 
     /// One of its tensors, of this shape.
     pub fn tensor(&self, name: &str, shape: &[usize]) -> Result<Vec<f32>> {
-        match self.resume.weights.tensors.get(name) {
-            Some((found, values)) if found == shape => Ok(values.clone()),
-            other => {
-                let found = other.map_or("nothing".into(), |(shape, _)| format!("shape {shape:?}"));
-                Err(Error::invalid(&self.resume.place, name, found, format!("a tensor of shape {shape:?}")))
-            }
-        }
+        self.resume.shaped(name, shape).map(<[f32]>::to_vec)
     }
 
     /// The parts of an arena that [`tensors_of`](conefield_core::checkpoint::tensors_of) named after the callback.

@@ -71,7 +71,7 @@ pub fn restore(run: &mut Run<'_>, callbacks: &mut Callbacks, resume: &Resume) ->
         let expected = format!("the callbacks of this run: {}", names.join(", "));
         return Err(Error::invalid(&resume.place, other, "the state of a callback that does not run", expected));
     }
-    match resume.weights.tensors.keys().find(|k| !known.contains(*k)) {
+    match resume.names().find(|k| !known.contains(*k)) {
         Some(other) => Err(Error::invalid(&resume.place, other, "a tensor", "only what this run keeps")),
         None => Ok(()),
     }

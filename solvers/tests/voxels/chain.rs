@@ -1,11 +1,13 @@
-//! Two methods one after the other.
+//! Methods one after the other.
 
 use crate::kit::{Case, Heard, bodies, geometry, psnr, spec, volume};
 use conefield_backend_cpu::Cpu;
 use conefield_core::Error;
-use conefield_core::method::{Context, Limits, Reconstruction};
+use conefield_core::checkpoint::Resume;
+use conefield_core::method::{Context, Limits, Reconstruction, Solution};
 use conefield_core::scan::Scan;
 use conefield_projectors::simulate::{ellipsoids, scan_ellipsoids};
+use std::sync::Arc;
 
 const FIRST: &str = "type = \"sart\"\nsubsets = 4\nrelaxation = 1.0\nstop = { passes = 3 }\n";
 const THEN: &str = "type = \"fista\"\nprior = \"total-variation\"\nsubsets = 4\npull = 0.05\n";
@@ -37,7 +39,7 @@ fn the_second_goes_on_where_the_first_ended() {
 
 /// A field on which little is worth learning, in seconds.
 const FIELD: &str = "type = \"neural-field\"\nencoder = \"identity\"\nfield = { type = \"voxel-grid\", resolution = 24 }\n\
-    projector = { type = \"ray-march\", samples = 48 }\ntraining = { steps = 60, rays = 256 }\noptimizer.lr = 0.05\n";
+    projector = { type = \"ray-march\", samples = 48 }\ntraining = { steps = 60, rays = 256, report_every = 25 }\noptimizer.lr = 0.05\n";
 
 #[test]
 fn a_field_is_refined_and_kept() {
@@ -62,23 +64,83 @@ fn spec_field(scan: &Scan) -> conefield_core::trained::TrainedField {
     }
 }
 
-/// It is begun anew from where the first one ended, to the same bits.
+/// A third method, after [`THEN`].
+const LAST: &str = "[[methods]]\nstop = { passes = 3 }\ntype = \"fista\"\nprior = \"total-variation\"\nbasis = { type = \"cubic\", samples = 16 }\n";
+
+/// Chains of three: on voxels, with a mean of two, and with a field first and in the middle.
+fn chains_of_three() -> [String; 4] {
+    let voxels = format!("{}{LAST}", chain(FIRST, THEN, 4));
+    let mean = voxels.replacen("type = \"chain\"\n", "type = \"chain\"\nmean = 2\n", 1);
+    let field_first = format!("{}{LAST}", chain(FIELD, THEN, 4)).replacen("chain\"\n", "chain\"\nmean = 3\n", 1);
+    let field_between = format!("type = \"chain\"\n[[methods]]\n{FIRST}[[methods]]\n{FIELD}{LAST}");
+    [voxels, mean, field_first, field_between]
+}
+
+/// Whichever method is interrupted, within it or at its end: it goes on where it stood.
 #[test]
-fn an_interruption_of_either_goes_on_to_the_same_bits() {
+fn an_interruption_of_any_goes_on_to_the_same_bits() {
     let scan = scan();
-    for text in [chain(FIRST, THEN, 4), chain(FIELD, THEN, 4)] {
+    for text in [chain(FIRST, THEN, 4), chain(FIELD, THEN, 4)].into_iter().chain(chains_of_three()) {
         let mut whole = Heard::default();
-        let want = Case::of(&scan).run(&text, &mut whole).unwrap().result.volume(&Cpu::new()).unwrap();
-        for after in [1, whole.records.len() - 2] {
+        let want = Case::of(&scan).run(&text, &mut whole).unwrap();
+        for after in (1..whole.records.len()).step_by(2) {
             let mut heard = Heard::interrupting_after(after);
             let stopped = Case::of(&scan).run(&text, &mut heard);
-            assert!(matches!(stopped.err().unwrap(), Error::Interrupted { .. }));
-            let kept = heard.kept.unwrap();
+            let stopped_at = heard.records.last().unwrap().step;
+            match stopped.err().unwrap() {
+                // A field looks for the next step's end first.
+                Error::Interrupted { step } => assert!(step == stopped_at || step == stopped_at + 1, "{step}"),
+                e => panic!("{e}"),
+            }
+            let kept = heard.kept.take().unwrap();
+            let (step, recorded) = (kept.standing.step, kept.standing.recorded);
+            assert!(step >= stopped_at && recorded <= step, "after record {after}: {step} and {recorded}");
             let resumed = Case { resume: Some(&kept), ..Case::of(&scan) };
-            let got = resumed.run(&text, &mut Heard::default()).unwrap();
-            assert_eq!(got.result.volume(&Cpu::new()).unwrap().data, want.data, "after record {after}");
+            let mut rest = Heard::default();
+            let got = resumed.run(&text, &mut rest).unwrap();
+            let volume = |s: &Solution| s.result.volume(&Cpu::new()).unwrap().data;
+            assert_eq!(volume(&got), volume(&want), "after record {after}");
+            let weights = |s: &Solution| s.result.field().map(|f| f.model.arena.params.to_vec());
+            assert_eq!(weights(&got), weights(&want), "after record {after}");
+            assert_eq!((got.steps, got.samples), (want.steps, want.samples), "after record {after}");
+            assert!(got.train_s >= kept.standing.seconds, "{} after {}", got.train_s, kept.standing.seconds);
+            // No record is lost and none comes twice, none is of a method that was done.
+            heard.records.retain(|r| r.step <= recorded);
+            let told: Vec<_> = [&heard, &rest].iter().flat_map(|h| &h.records).map(|r| (r.step, r.loss)).collect();
+            assert_eq!(
+                told,
+                whole.records.iter().map(|r| (r.step, r.loss)).collect::<Vec<_>>(),
+                "after record {after}"
+            );
         }
     }
+}
+
+#[test]
+fn a_checkpoint_that_does_not_fit_the_chain_is_refused() {
+    let scan = scan();
+    let [text, ..] = chains_of_three();
+    let mut heard = Heard::interrupting_after(5);
+    Case::of(&scan).run(&text, &mut heard).err().unwrap();
+    let kept = heard.kept.unwrap();
+    let refused = |kept: &Resume, text: &str, says: &str| {
+        let e = Case { resume: Some(kept), ..Case::of(&scan) }.run(text, &mut Heard::default());
+        let e = e.err().unwrap().to_string();
+        assert!(e.contains(says), "{e}");
+    };
+    let mut short = kept.clone();
+    Arc::make_mut(&mut short.weights).tensors.get_mut("chain.start").unwrap().0 = vec![23, 24, 24];
+    refused(&short, &text, "chain.start: found shape [23, 24, 24], expected a tensor of shape [24, 24, 24]");
+    let mut none = kept.clone();
+    Arc::make_mut(&mut none.weights).tensors.remove("link.x");
+    refused(&none, &text, "checkpoint: x: found nothing");
+    let mut far = kept.clone();
+    far.standing.method["links"] = 3.into();
+    refused(&far, &text, "method.links: found 3, expected fewer than 3");
+    refused(&kept, FIRST, "method: ");
+    let mut alone = Heard::interrupting_after(1);
+    Case::of(&scan).run(FIRST, &mut alone).err().unwrap();
+    refused(&alone.kept.unwrap(), &text, "what a chain keeps");
 }
 
 #[test]

@@ -8,6 +8,7 @@ use conefield_core::method::Limits;
 use conefield_core::random::{mix, unit};
 use conefield_core::scan::{Scan, Volume};
 use conefield_projectors::simulate::{ellipsoids, scan_ellipsoids};
+use std::sync::Arc;
 
 /// Types with settings that suit 24 views.
 const ALL: [(&str, &str); 6] = [
@@ -216,11 +217,11 @@ fn a_checkpoint_of_another_volume_is_refused() {
         let mut first = Heard::interrupting_after(1);
         Case::of(&scan).run(&text, &mut first).err().unwrap();
         let mut kept = first.kept.take().unwrap();
-        kept.weights.tensors.get_mut("x").unwrap().1.pop();
+        Arc::make_mut(&mut kept.weights).tensors.get_mut("x").unwrap().1.pop();
         let e = Case { resume: Some(&kept), ..Case::of(&scan) }.run(&text, &mut Heard::default()).err().unwrap();
         let e = e.to_string();
         assert!(e.contains("checkpoint: x: found 13823 numbers, expected 13824 numbers"), "{kind}: {e}");
-        kept.weights.tensors.remove("x");
+        Arc::make_mut(&mut kept.weights).tensors.remove("x");
         let e = Case { resume: Some(&kept), ..Case::of(&scan) }.run(&text, &mut Heard::default()).err().unwrap();
         assert!(e.to_string().contains("found nothing"), "{kind}: {e}");
     }

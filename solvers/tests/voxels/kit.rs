@@ -131,7 +131,7 @@ impl Observer for Heard {
         let standing = serde_json::from_str(&serde_json::to_string(&c.standing).unwrap()).unwrap();
         let tensors = c.tensors.iter().map(|(n, shape, x)| (n.clone(), (shape.to_vec(), x.to_vec()))).collect();
         let weights = Weights { tensors, ..Weights::default() };
-        self.kept = Some(Resume { place: "checkpoint".into(), standing, weights });
+        self.kept = Some(Resume::new("checkpoint".into(), standing, weights));
         Ok(())
     }
 }

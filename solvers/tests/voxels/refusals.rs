@@ -111,8 +111,6 @@ fn settings_out_of_range_are_named() {
         ("cgls", "relaxation = 1.0", "relaxation"),
         ("asd-pocs", "subsets = 0", "subsets"),
         ("asd-pocs", "alpha = 0.0", "alpha"),
-        ("asd-pocs", "alpha_decay = 0.0", "alpha_decay"),
-        ("asd-pocs", "ratio = -1.0", "ratio"),
         ("asd-pocs", "tolerance = -1.0", "tolerance"),
         ("fista-tv", "subsets = 0", "subsets"),
         ("fista-tv", "prior.inner = 0", "prior.inner"),

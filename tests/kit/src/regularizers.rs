@@ -31,6 +31,7 @@ pub fn check_regularizer(regularizer: &dyn Regularizer) -> Report {
     report.add("state", || state(regularizer));
     report.add("tally", || tally(regularizer));
     report.add("threads", || threads(regularizer));
+    report.add("no fault", || no_fault(regularizer));
     report
 }
 
@@ -50,7 +51,7 @@ fn header(grid: &VoxelGrid) -> ScanHeader {
 }
 
 fn on(regularizer: &dyn Regularizer, grid: &VoxelGrid) -> Box<dyn Penalty> {
-    regularizer.on(grid, &Space::new(header(grid)))
+    regularizer.on(grid, &Space::new(header(grid))).unwrap_or_else(|e| panic!("{e}"))
 }
 
 fn value_of(penalty: &dyn Penalty, grid: &VoxelGrid, x: &[f32]) -> f64 {
@@ -101,7 +102,7 @@ fn convex(regularizer: &dyn Regularizer) -> Outcome {
 
 fn weight(regularizer: &dyn Regularizer) -> Outcome {
     let complaint = grids().iter().find_map(|grid| {
-        let of = |noise: f64| regularizer.weight(grid, &mut |k| k * noise);
+        let of = |noise: f64| regularizer.weight(grid, &mut |k| k * noise).unwrap_or(f64::NAN);
         let [none, some, more] = [0.0, 0.01, 0.02].map(of);
         let fine = [none, some, more].iter().all(|w| w.is_finite() && *w >= 0.0) && none <= some && some <= more;
         (!fine).then(|| format!("{none}, {some}, {more} with no, some and twice the noise"))
@@ -238,8 +239,8 @@ fn state(regularizer: &dyn Regularizer) -> Outcome {
 fn tally(regularizer: &dyn Regularizer) -> Outcome {
     let complaint = grids().iter().find_map(|grid| {
         let [real, tally] = [Space::new(header(grid)), Space::tally(header(grid))].map(|space| {
-            regularizer.on(grid, &space);
-            space.bytes()
+            // What it holds is counted as long as it is there.
+            regularizer.on(grid, &space).map_or(u64::MAX, |_| space.bytes())
         });
         let state = on(regularizer, grid).state().iter().map(|s| 4 * s.1.len() as u64).sum::<u64>();
         (real != tally || tally < state).then(|| format!("{tally} bytes, {real} allocated, {state} of state"))
@@ -261,4 +262,15 @@ fn threads(regularizer: &dyn Regularizer) -> Outcome {
         differing(&format!("{n} threads, coefficient"), &pool.install(run), &want)
     });
     settle(complaint, "1 and 3 threads")
+}
+
+/// Whatever was asked of it.
+fn no_fault(regularizer: &dyn Regularizer) -> Outcome {
+    let complaint = grids().iter().find_map(|grid| {
+        let (mut penalty, v) = (on(regularizer, grid), noise(grid, 10));
+        let u = prox(penalty.as_mut(), &v, 0.1);
+        value_of(penalty.as_ref(), grid, &u);
+        penalty.fault().err().map(|e| e.to_string())
+    });
+    settle(complaint, "none was reported")
 }

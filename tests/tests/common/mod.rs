@@ -106,7 +106,7 @@ impl Observer for Stop {
         let tensors = c.tensors.iter().map(|(n, s, v)| (n.clone(), (s.to_vec(), v.to_vec()))).collect();
         let weights = Weights { tensors, ..Weights::default() };
         let standing = serde_json::from_str(&serde_json::to_string(&c.standing).unwrap()).unwrap();
-        self.kept = Some(Resume { place: "kept".into(), standing, weights });
+        self.kept = Some(Resume::new("kept".into(), standing, weights));
         Ok(())
     }
 }

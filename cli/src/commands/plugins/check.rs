@@ -4,8 +4,9 @@ use crate::{out, parse, plugins};
 use clap::Args;
 use conefield_backend_wgpu::{Shared, Wgpu};
 use conefield_conformance::{
-    Options, Outcome, Report, check_encoder, check_field, check_initializer, check_loss, check_loss_wgsl,
-    check_normalizer, check_prior, check_prior_wgsl, check_projector, check_projector_wgsl, check_wgsl,
+    Options, Outcome, Report, check_basis, check_data_term, check_encoder, check_field, check_initializer, check_loss,
+    check_loss_wgsl, check_normalizer, check_prior, check_prior_wgsl, check_projector, check_projector_wgsl,
+    check_regularizer, check_wgsl,
 };
 use conefield_core::arena::Weights;
 use conefield_core::precision::Tables;
@@ -291,7 +292,17 @@ impl Check {
                     }),
                 );
             }
-            _ => return Err(Error::unsupported(&t.name, format!("a {} cannot come from a plugin", t.kind))),
+            Make::LineField(make) => {
+                let stage = make(settings.clone())?.build()?;
+                let options = options(Options::encoder());
+                add(None, device.map(check_field(stage.as_ref(), &options), stage.as_ref(), &options, true));
+            }
+            Make::Regularizer(make) => add(None, check_regularizer(make(settings.clone())?.build()?.as_ref())),
+            Make::DataTerm(make) => add(None, check_data_term(make(settings.clone())?.build()?.as_ref())),
+            Make::Basis(make) => add(None, check_basis(make(settings.clone())?.build()?.as_ref())),
+            Make::VoxelProjector(_) => {
+                return Err(Error::unsupported(&t.name, format!("a {} cannot come from a plugin", t.kind)));
+            }
         }
         Ok(())
     }

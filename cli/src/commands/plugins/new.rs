@@ -28,17 +28,6 @@ pub struct New {
 }
 
 #[derive(Debug, Clone, Copy, PartialEq, Eq, ValueEnum)]
-enum StageKind {
-    Encoder,
-    Normalizer,
-    Field,
-    Projector,
-    Initializer,
-    Loss,
-    Prior,
-}
-
-#[derive(Debug, Clone, Copy, PartialEq, Eq, ValueEnum)]
 enum Language {
     Rust,
     C,
@@ -111,7 +100,7 @@ const RESERVED: [&str; 62] = [
 ];
 
 macro_rules! template {
-    ($name:literal) => {
+    ($name:expr) => {
         include_str!(concat!("../../../../plugins/templates/", $name))
     };
 }
@@ -129,44 +118,51 @@ struct Start {
     build: &'static str,
 }
 
-impl StageKind {
-    fn kind(self) -> Kind {
-        match self {
-            Self::Encoder => Kind::Encoder,
-            Self::Normalizer => Kind::Normalizer,
-            Self::Field => Kind::Field,
-            Self::Projector => Kind::Projector,
-            Self::Initializer => Kind::Initializer,
-            Self::Loss => Kind::Loss,
-            Self::Prior => Kind::Prior,
+/// Kinds of stages with their templates: the stage in C, where what every plugin begins and ends with is filled in, the stage in
+/// Rust, and its test.
+macro_rules! kinds {
+    ($($kind:ident $file:literal,)*) => {
+        #[derive(Debug, Clone, Copy, PartialEq, Eq, ValueEnum)]
+        enum StageKind {
+            $($kind,)*
         }
-    }
 
-    /// The stage and its test, in Rust.
-    fn rust(self) -> [&'static str; 2] {
-        match self {
-            Self::Encoder => [template!("rust/encoder.rs"), template!("rust/encoder_test.rs")],
-            Self::Normalizer => [template!("rust/normalizer.rs"), template!("rust/normalizer_test.rs")],
-            Self::Field => [template!("rust/field.rs"), template!("rust/field_test.rs")],
-            Self::Projector => [template!("rust/projector.rs"), template!("rust/projector_test.rs")],
-            Self::Initializer => [template!("rust/initializer.rs"), template!("rust/initializer_test.rs")],
-            Self::Loss => [template!("rust/loss.rs"), template!("rust/loss_test.rs")],
-            Self::Prior => [template!("rust/prior.rs"), template!("rust/prior_test.rs")],
-        }
-    }
+        impl StageKind {
+            fn kind(self) -> Kind {
+                match self {
+                    $(Self::$kind => Kind::$kind,)*
+                }
+            }
 
-    /// The stage in C: what every plugin begins and ends with is filled in.
-    fn c(self) -> &'static str {
-        match self {
-            Self::Encoder => template!("c/encoder.c"),
-            Self::Normalizer => template!("c/normalizer.c"),
-            Self::Field => template!("c/field.c"),
-            Self::Projector => template!("c/projector.c"),
-            Self::Initializer => template!("c/initializer.c"),
-            Self::Loss => template!("c/loss.c"),
-            Self::Prior => template!("c/prior.c"),
+            fn c(self) -> &'static str {
+                match self {
+                    $(Self::$kind => template!(concat!("c/", $file, ".c")),)*
+                }
+            }
+
+            fn rust(self) -> [&'static str; 2] {
+                match self {
+                    $(Self::$kind => {
+                        [template!(concat!("rust/", $file, ".rs")), template!(concat!("rust/", $file, "_test.rs"))]
+                    })*
+                }
+            }
         }
-    }
+    };
+}
+
+kinds! {
+    Encoder "encoder",
+    Normalizer "normalizer",
+    Field "field",
+    LineField "line_field",
+    Projector "projector",
+    Initializer "initializer",
+    Loss "loss",
+    Prior "prior",
+    Regularizer "regularizer",
+    DataTerm "data_term",
+    Basis "basis",
 }
 
 impl New {
@@ -239,17 +235,27 @@ impl New {
         Start { files, library: format!("./{}.so", self.name), build: "make" }
     }
 
-    /// A small pipeline with the new stage in it.
+    /// A small method with the new stage in it.
     fn spec(&self) -> String {
         let (name, kind) = (&self.name, self.kind.kind());
-        let table = match kind {
-            Kind::Normalizer | Kind::Prior => format!("[[{kind}s]]"),
-            _ => format!("[{kind}]"),
+        let about = format!("name = \"{name}\"\ndescription = \"The {kind} of the plugin {name}");
+        let stage = |table: &str| format!("\n{table}\ntype = \"{name}\"\n");
+        let of_fast = |table: &str| {
+            let first = "# The small spec that ships with conefield, with the stage of this plugin.";
+            format!("{first}\nextends = \"fast\"\n{about} in the spec fast.\"\n{}", stage(table))
         };
-        format!(
-            "# The small spec that ships with conefield, with the stage of this plugin.\nextends = \"fast\"\nname = \
-             \"{name}\"\ndescription = \"The spec fast with the {kind} of the plugin {name}.\"\n\n{table}\ntype = \"{name}\"\n"
-        )
+        let of_fista = |table: &str| {
+            let first = "# Ordered-subset FISTA with the stage of this plugin.";
+            format!("{first}\ntype = \"fista\"\n{about} in fista.\"\n{}", stage(table))
+        };
+        match kind {
+            Kind::Normalizer | Kind::Prior => of_fast(&format!("[[{kind}s]]")),
+            Kind::Regularizer => of_fista("[prior]"),
+            Kind::DataTerm => of_fista("[data]"),
+            Kind::Basis => of_fista("[basis]"),
+            Kind::LineField => format!("type = \"line-field\"\n{about}, trained on rays.\"\n{}", stage("[field]")),
+            _ => of_fast(&format!("[{kind}]")),
+        }
     }
 
     /// A Rust template with names and dependencies filled in.

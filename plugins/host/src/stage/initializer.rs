@@ -2,10 +2,11 @@
 
 #![allow(unsafe_code)]
 
-use crate::library::{self, Functions, Handle, Text, Type};
+use super::{Foreign, call};
+use crate::library::{self, Handle, Type};
 use crate::trial::{UNTOUCHED, timed};
 use conefield_core::arena::{Arena, Block, InitReport, Layout, Weights};
-use conefield_core::error::{Error, Result};
+use conefield_core::error::Result;
 use conefield_core::settings::{Initializer, KnownVolume};
 use conefield_plugin_abi::*;
 use serde_json::Value;
@@ -14,10 +15,8 @@ use std::sync::Arc;
 
 /// An initializer of a library.
 pub struct InitializerStage {
-    handle: Handle,
-    functions: ConefieldInitializer,
+    own: Foreign<ConefieldInitializer>,
     volume: Option<KnownVolume>,
-    describe: String,
 }
 
 /// Makes an initializer; `weights` reads a file that its settings name.
@@ -26,31 +25,27 @@ pub(crate) fn build(
     settings: &Value,
     weights: &dyn Fn(&str) -> Result<Weights>,
 ) -> Result<InitializerStage> {
-    let Functions::Initializer(functions) = ty.functions else {
-        return Err(ty.failed("create", CONEFIELD_FAILED, "it is no initializer"));
-    };
     let (own, settings) = (ty.clone(), settings.clone());
-    let (handle, path) = timed(ty, move || {
-        let handle = own.create(&settings, 0)?;
-        let path = named(&handle, "weights", |path| {
+    let (own, path) = timed(ty, move || {
+        let own = Foreign::<ConefieldInitializer>::new(own.create(&settings, 0)?)?;
+        let path = named(&own.handle, "weights", |path| {
             // SAFETY: the stage is alive, `path` is to be written.
-            functions.weights.map(|f| unsafe { f(handle.stage, path) })
+            own.functions.weights.map(|f| unsafe { f(own.handle.stage, path) })
         })?;
-        Ok((handle, path))
+        Ok((own, path))
     })?;
     let read = path.map(|p| weights(&p)).transpose()?;
     timed(ty, move || {
-        let handle = match read {
-            Some(weights) => with_weights(&handle, &functions, &weights)?,
-            None => handle,
+        let own = match read {
+            Some(weights) => Foreign::new(with_weights(&own, &weights)?)?,
+            None => own,
         };
         let mut steps = 0;
-        let path = named(&handle, "volume", |path| {
+        let path = named(&own.handle, "volume", |path| {
             // SAFETY: the stage is alive, `path` and `steps` are to be written.
-            functions.volume.map(|f| unsafe { f(handle.stage, path, &mut steps) })
+            own.functions.volume.map(|f| unsafe { f(own.handle.stage, path, &mut steps) })
         })?;
-        let describe = handle.describe();
-        Ok(InitializerStage { handle, functions, volume: path.map(|path| KnownVolume { path, steps }), describe })
+        Ok(InitializerStage { own, volume: path.map(|path| KnownVolume { path, steps }) })
     })
 }
 
@@ -70,7 +65,7 @@ fn named(
 }
 
 /// The stage that has these weights.
-fn with_weights(handle: &Handle, functions: &ConefieldInitializer, weights: &Weights) -> Result<Handle> {
+fn with_weights(own: &Foreign<ConefieldInitializer>, weights: &Weights) -> Result<Handle> {
     let tensor = |(name, (shape, values)): (&String, &(Vec<usize>, Vec<f32>))| ConefieldTensor {
         name: ConefieldStr::of(name),
         shape: shape.as_ptr(),
@@ -79,16 +74,12 @@ fn with_weights(handle: &Handle, functions: &ConefieldInitializer, weights: &Wei
         length: values.len(),
     };
     let tensors: Vec<ConefieldTensor> = weights.tensors.iter().map(tensor).collect();
-    let (mut out, mut error) = (ptr::null_mut(), Text::new());
-    let status = functions.with_weights.map_or(CONEFIELD_FAILED, |f| {
-        // SAFETY: the stage is alive; everything handed over lives for the time of the call and has the length beside it.
-        unsafe { f(handle.stage, tensors.as_ptr(), tensors.len(), &mut out, error.room()) }
-    });
-    if status != CONEFIELD_OK {
-        return Err(handle.ty.failed("with_weights", status, &error.text()));
-    }
-    let nothing = || Error::invalid(handle.ty.words(), "with_weights", "nothing", "a new stage");
-    handle.made(out, "with_weights")?.ok_or_else(nothing)
+    own.must_make("with_weights", |stage, out, error| {
+        own.functions.with_weights.map_or(CONEFIELD_FAILED, |f| {
+            // SAFETY: the stage is alive; everything handed over lives for the time of the call and has the length beside it.
+            unsafe { f(stage, tensors.as_ptr(), tensors.len(), out, error) }
+        })
+    })
 }
 
 /// Blocks as a library sees them.
@@ -108,41 +99,23 @@ const GUARD: usize = 1 << 12;
 
 impl Initializer for InitializerStage {
     fn check(&self, layout: &Layout) -> Result<()> {
-        let Some(check) = self.functions.check else { return Ok(()) };
-        let (blocks, mut error) = (blocks(layout), Text::new());
-        // SAFETY: the stage is alive; everything handed over lives for the time of the call and has the length beside it.
-        let status = unsafe { check(self.handle.stage, blocks.as_ptr(), blocks.len(), error.room()) };
-        if status == CONEFIELD_OK { Ok(()) } else { Err(self.handle.ty.failed("check", status, &error.text())) }
+        let blocks = blocks(layout);
+        match self.own.functions.check {
+            Some(_) => call!(self.own, check(blocks.as_ptr(), blocks.len())),
+            None => Ok(()),
+        }
     }
 
     fn apply(&self, layout: &Layout, arena: &mut Arena) -> Result<InitReport> {
-        let failed = |status, text: &str| self.handle.ty.failed("apply", status, text);
         let blocks = blocks(layout);
         // A copy, so that what it does wrong does no harm.
-        let mut params = arena.params.to_vec();
-        params.resize(arena.params.len() + GUARD, f32::from_bits(UNTOUCHED));
-        let mut filled = vec![0u8; blocks.len()];
-        let mut error = Text::new();
         let n = arena.params.len();
-        let status = self.functions.apply.map_or(CONEFIELD_FAILED, |apply| {
-            // SAFETY: the stage is alive; everything handed over lives for the time of the call and has the length beside it.
-            unsafe {
-                apply(
-                    self.handle.stage,
-                    blocks.as_ptr(),
-                    blocks.len(),
-                    params.as_mut_ptr(),
-                    n,
-                    filled.as_mut_ptr(),
-                    error.room(),
-                )
-            }
-        });
-        if status != CONEFIELD_OK {
-            return Err(failed(status, &error.text()));
-        }
+        let mut params = arena.params.to_vec();
+        params.resize(n + GUARD, f32::from_bits(UNTOUCHED));
+        let mut filled = vec![0u8; blocks.len()];
+        call!(self.own, apply(blocks.as_ptr(), blocks.len(), params.as_mut_ptr(), n, filled.as_mut_ptr()))?;
         if params[n..].iter().any(|v| v.to_bits() != UNTOUCHED) {
-            return Err(failed(CONEFIELD_FAILED, "it writes past the parameters"));
+            return Err(self.own.wrong("apply", "it writes past the parameters"));
         }
         let mut report = InitReport::default();
         for (b, &filled) in layout.blocks.iter().zip(&filled) {
@@ -152,7 +125,7 @@ impl Initializer for InitializerStage {
             }
             let from = &params[b.range.clone()];
             if let Some(v) = from.iter().find(|v| !v.is_finite()) {
-                return Err(failed(CONEFIELD_FAILED, &format!("{} holds {v}", b.name)));
+                return Err(self.own.wrong("apply", &format!("{} holds {v}", b.name)));
             }
             arena.params[b.range.clone()].copy_from_slice(from);
             report.loaded.push(b.name.clone());
@@ -165,6 +138,6 @@ impl Initializer for InitializerStage {
     }
 
     fn describe(&self) -> String {
-        self.describe.clone()
+        self.own.describe.clone()
     }
 }

@@ -1,22 +1,21 @@
-//! Encoders, normalizers and fields.
+//! Encoders, normalizers, fields and line fields.
 
 #![allow(unsafe_code)]
 
-use super::{Fault, fragment};
-use crate::library::{Functions, Handle, Text, Type};
-use crate::trial::{self, GUARD, UNTOUCHED};
+use super::{Foreign, call, raw_ray};
+use crate::library::Handle;
+use crate::trial::{self, GUARD, UNTOUCHED_64};
 use conefield_core::error::{Error, Result, ensure};
 use conefield_core::half::{Bf16, F16};
 use conefield_core::registry::Kind;
 use conefield_core::stage::{
-    Encoder, Field, GradKind, Grads, Halves, Info, Kernel, Normalizer, Parameter, Reduced, Scope, Stage, Tile, TileMut,
+    Encoder, Field, GradKind, Grads, Halves, Info, Kernel, Lines, Normalizer, Parameter, Reduced, Scope, Stage, Tile,
+    TileMut, UnitRay,
 };
 use conefield_core::wgsl::Fragment;
 use conefield_plugin_abi::*;
-use serde_json::Value;
 use std::collections::BTreeSet;
 use std::ops::Range;
-use std::sync::Arc;
 use std::{ptr, slice};
 
 /// Most parameters, channels, … that a stage may say it has: more would overflow what hosts compute from them.
@@ -27,165 +26,58 @@ const MOST_PASSES: usize = 1 << 16;
 
 /// An encoder, a normalizer or a field of a library.
 pub struct MapStage {
-    handle: Handle,
-    map: ConefieldMap,
+    own: Foreign<ConefieldMap>,
     info: Info,
-    coarse_to_fine: bool,
-    double: bool,
-    halves: bool,
+    /// What the library says of it beside that.
+    said: ConefieldInfo,
     passes: usize,
     resolutions: Option<Vec<f64>>,
     parameters: Vec<Parameter>,
     partition: Vec<Range<usize>>,
-    describe: String,
-    fault: Fault,
-}
-
-/// Makes a stage and tries it out.
-pub(crate) fn build(ty: &Arc<Type>, settings: &Value, width: usize) -> Result<MapStage> {
-    let (own, settings) = (ty.clone(), settings.clone());
-    trial::timed(ty, move || {
-        let stage = MapStage::new(own.create(&settings, width)?)?;
-        let found = format!("{width} channels for a stage that takes {}", stage.info.input);
-        ensure(stage.info.input == width, "spec", "", found, "as many as it was made for")?;
-        trial::map(&own, &stage)?;
-        Ok(stage)
-    })
 }
 
 impl MapStage {
+    /// The stage behind `handle` for `width` channels, tried out.
+    pub(crate) fn tried(handle: Handle, width: usize) -> Result<Self> {
+        let stage = Self::new(handle)?;
+        let found = format!("{width} channels for a stage that takes {}", stage.info.input);
+        ensure(stage.info.input == width, "spec", "", found, "as many as it was made for")?;
+        trial::map(stage.own.ty(), &stage)?;
+        if let Some(lines) = stage.lines() {
+            trial::lines(stage.own.ty(), &stage, lines)?;
+        }
+        Ok(stage)
+    }
+
     fn new(handle: Handle) -> Result<Self> {
-        let Functions::Map(map) = handle.ty.functions else {
-            return Err(handle.ty.failed("create", CONEFIELD_FAILED, "it is no map of rows"));
-        };
-        let wrong = |what: &str| handle.ty.failed("info", CONEFIELD_FAILED, what);
-        let mut i = ConefieldInfo {
-            input: 0,
-            output: 0,
-            params: 0,
-            blocks: 0,
-            partitions: 0,
-            tape: 0,
-            macs: 0,
-            scope: 0,
-            grads: 0,
-            identity: 0,
-            coarse_to_fine: 0,
-            double_precision: 0,
-            halves: 0,
-        };
-        // SAFETY: the stage is alive, `i` is to be written.
-        let status = map.info.map_or(CONEFIELD_FAILED, |info| unsafe { info(handle.stage, &mut i) });
-        if status != CONEFIELD_OK {
-            return Err(handle.ty.failed("info", status, ""));
-        }
-        if [i.input, i.output].contains(&0) || [i.input, i.output, i.params, i.tape, i.macs].iter().any(|&n| n > MOST) {
-            return Err(wrong(&format!("{} channels in, {} out, {} parameters", i.input, i.output, i.params)));
-        }
-        let scope = match i.scope {
-            CONEFIELD_SCOPE_ROW => Scope::Row,
-            CONEFIELD_SCOPE_RAY => Scope::Ray,
-            other => return Err(wrong(&format!("it looks as far as {other}, which is none of the known scopes"))),
-        };
-        let grads = match i.grads {
-            CONEFIELD_GRADS_NONE => GradKind::None,
-            CONEFIELD_GRADS_DENSE => GradKind::Dense,
-            CONEFIELD_GRADS_SCATTER => GradKind::Scatter,
-            other => return Err(wrong(&format!("its gradients are {other}, which is none of the known kinds"))),
-        };
-        if (i.params == 0) != (grads == GradKind::None) {
-            return Err(wrong(&format!("{} parameters with gradients {grads:?}", i.params)));
-        }
-        if i.params > 0 && map.init.is_none() {
-            return Err(wrong("there are parameters and no function init"));
-        }
-        let parameters = parameters(&handle, &map, &i)?;
-        let partition = partition(&handle, &map, &i, grads)?;
-        let info = Info {
-            input: i.input,
-            output: i.output,
-            params: i.params,
-            tape: i.tape,
-            scope,
-            grads,
-            macs: i.macs,
-            identity: i.identity != 0,
-        };
-        let describe = handle.describe();
-        let coarse_to_fine = i.coarse_to_fine != 0;
-        let double = i.double_precision != 0;
-        if double && (map.forward_f64.is_none() || map.backward_f64.is_none()) {
-            return Err(wrong("it has no kernels in double precision, and says that it has"));
-        }
-        let halves = i.halves != 0;
-        if halves && (map.forward_halves.is_none() || map.backward_halves.is_none()) {
-            return Err(wrong("it has no kernels that read halves, and says that it has"));
-        }
-        // SAFETY: the stage is alive.
-        let passes = map.passes.map_or(1, |f| unsafe { f(handle.stage) });
-        if passes == 0 || passes > MOST_PASSES || (passes > 1 && map.forward_pass.is_none()) {
-            let there = if map.forward_pass.is_some() { "a" } else { "no" };
-            return Err(wrong(&format!("it goes forward in {passes} passes with {there} function forward_pass")));
-        }
-        if halves && passes > 1 && map.forward_pass_halves.is_none() {
-            return Err(wrong(&format!("it goes forward in {passes} passes with no function forward_pass_halves")));
-        }
-        let resolutions = resolutions(&handle, &map, info.output)?;
-        let fault = Fault::default();
-        Ok(Self {
-            handle,
-            map,
-            info,
-            coarse_to_fine,
-            double,
-            halves,
-            passes,
-            resolutions,
-            parameters,
-            partition,
-            describe,
-            fault,
-        })
-    }
-
-    /// The type that it is of.
-    fn ty(&self) -> &Type {
-        &self.handle.ty
-    }
-
-    /// Notes what a call that may fail said.
-    fn settle(&self, call: &str, status: ConefieldStatus, error: &Text) -> bool {
-        let fine = status == CONEFIELD_OK;
-        if !fine {
-            self.fault.set(self.ty().failed(call, status, &error.text()));
-        }
-        fine
+        let own = Foreign::<ConefieldMap>::new(handle)?;
+        let said = said(&own)?;
+        let info = sound(&said).map_err(|what| own.wrong("info", &what))?;
+        able(&own, &said).map_err(|what| own.wrong("info", what))?;
+        let parameters = parameters(&own, &said)?;
+        let partition = partition(&own, &said)?;
+        let passes = passes(&own, &said).map_err(|what| own.wrong("info", &what))?;
+        let resolutions = resolutions(&own, info.output)?;
+        Ok(Self { own, info, said, passes, resolutions, parameters, partition })
     }
 
     fn reduce(&self, side: u32, keep: &[usize]) -> Result<(Self, Vec<Range<usize>>, Vec<usize>)> {
-        let (ty, info) = (self.ty(), &self.info);
-        let Some(reduce) = self.map.reduce else {
-            return Err(Error::unsupported(ty.words(), "it cannot leave out channels"));
+        let info = &self.info;
+        let Some(reduce) = self.own.functions.reduce else {
+            return Err(Error::unsupported(self.own.ty().words(), "it cannot leave out channels"));
         };
-        let mut r = ConefieldReduced {
-            stage: ptr::null_mut(),
-            params: ptr::null(),
-            params_count: 0,
-            channels: ptr::null(),
-            channels_count: 0,
-        };
-        let mut error = Text::new();
-        // SAFETY: the stage is alive; everything handed over lives for the time of the call.
-        let status = unsafe { reduce(self.handle.stage, side, keep.as_ptr(), keep.len(), &mut r, error.room()) };
-        if status != CONEFIELD_OK {
-            return Err(ty.failed("reduce", status, &error.text()));
-        }
-        let wrong = |what: &str| ty.failed("reduce", CONEFIELD_FAILED, what);
-        let nothing = || Error::invalid(ty.words(), "reduce", "nothing", "a new stage");
-        let handle = self.handle.made(r.stage, "reduce")?.ok_or_else(nothing)?;
+        let (params, channels) = (ptr::null(), ptr::null());
+        let mut r = ConefieldReduced { stage: ptr::null_mut(), params, params_count: 0, channels, channels_count: 0 };
+        let handle = self.own.must_make("reduce", |stage, out, error| {
+            // SAFETY: the stage is alive; everything handed over lives for the time of the call.
+            let status = unsafe { reduce(stage, side, keep.as_ptr(), keep.len(), &mut r, error) };
+            // SAFETY: `out` is to be written.
+            unsafe { *out = r.stage };
+            status
+        })?;
         let smaller = Self::new(handle)?;
         if r.params_count > info.params || r.channels_count > info.input.max(info.output) {
-            return Err(wrong("it keeps more than there is"));
+            return Err(self.own.wrong("reduce", "it keeps more than there is"));
         }
         // SAFETY: the plugin says that so many stand there as long as the smaller stage lives.
         let (ranges, channels) = unsafe { (many(r.params, r.params_count), many(r.channels, r.channels_count)) };
@@ -201,7 +93,7 @@ impl MapStage {
             let [own, other] = widths;
             let found = format!("a stage with {own} and {other} channels, of which {kept} parameters were kept");
             let expected = format!("what is kept to fit it, {} and {} channels", keep.len(), channels.len());
-            return Err(Error::invalid(ty.words(), "reduce", found, expected));
+            return Err(Error::invalid(self.own.ty().words(), "reduce", found, expected));
         }
         Ok((smaller, params, channels.to_vec()))
     }
@@ -213,8 +105,91 @@ unsafe fn many<'a, T>(data: *const T, n: usize) -> &'a [T] {
     if n == 0 || data.is_null() { &[] } else { unsafe { slice::from_raw_parts(data, n) } }
 }
 
-fn parameters(handle: &Handle, map: &ConefieldMap, i: &ConefieldInfo) -> Result<Vec<Parameter>> {
-    let wrong = |what: String| handle.ty.failed("parameter", CONEFIELD_FAILED, &what);
+/// What the library says of a stage.
+fn said(own: &Foreign<ConefieldMap>) -> Result<ConefieldInfo> {
+    let mut i = ConefieldInfo {
+        input: 0,
+        output: 0,
+        params: 0,
+        blocks: 0,
+        partitions: 0,
+        tape: 0,
+        macs: 0,
+        scope: 0,
+        grads: 0,
+        identity: 0,
+        coarse_to_fine: 0,
+        double_precision: 0,
+        halves: 0,
+    };
+    // SAFETY: the stage is alive, `i` is to be written.
+    own.run("info", |stage, _| own.functions.info.map_or(CONEFIELD_FAILED, |f| unsafe { f(stage, &mut i) }))?;
+    Ok(i)
+}
+
+/// What was said, if it makes sense.
+fn sound(i: &ConefieldInfo) -> Result<Info, String> {
+    let &ConefieldInfo { input, output, params, tape, macs, .. } = i;
+    if [input, output].contains(&0) || [input, output, params, tape, macs].iter().any(|&n| n > MOST) {
+        return Err(format!("{input} channels in, {output} out, {params} parameters"));
+    }
+    let scope = match i.scope {
+        CONEFIELD_SCOPE_ROW => Scope::Row,
+        CONEFIELD_SCOPE_RAY => Scope::Ray,
+        other => return Err(format!("it looks as far as {other}, which is none of the known scopes")),
+    };
+    let grads = match i.grads {
+        CONEFIELD_GRADS_NONE => GradKind::None,
+        CONEFIELD_GRADS_DENSE => GradKind::Dense,
+        CONEFIELD_GRADS_SCATTER => GradKind::Scatter,
+        other => return Err(format!("its gradients are {other}, which is none of the known kinds")),
+    };
+    if (params == 0) != (grads == GradKind::None) {
+        return Err(format!("{params} parameters with gradients {grads:?}"));
+    }
+    Ok(Info { input, output, params, tape, scope, grads, macs, identity: i.identity != 0 })
+}
+
+/// Whether there are the functions for what was said.
+fn able(own: &Foreign<ConefieldMap>, i: &ConefieldInfo) -> Result<(), &'static str> {
+    let f = &own.functions;
+    let lines = own.ty().kind == Kind::LineField;
+    let all = [
+        (i.params == 0 || f.init.is_some(), "there are parameters and no function init"),
+        (
+            i.double_precision == 0 || (f.forward_f64.is_some() && f.backward_f64.is_some()),
+            "it has no kernels in double precision, and says that it has",
+        ),
+        (
+            i.halves == 0 || (f.forward_halves.is_some() && f.backward_halves.is_some()),
+            "it has no kernels that read halves, and says that it has",
+        ),
+        (!lines || (f.project.is_some() && f.backproject.is_some()), "it has no line integrals of its own"),
+        (
+            !lines || (f.project_f64.is_some() && f.backproject_f64.is_some()),
+            "its line integrals cannot be had in double precision",
+        ),
+    ];
+    all.into_iter().find(|(holds, _)| !holds).map_or(Ok(()), |(_, what)| Err(what))
+}
+
+/// How many passes it goes forward in.
+fn passes(own: &Foreign<ConefieldMap>, i: &ConefieldInfo) -> Result<usize, String> {
+    let f = &own.functions;
+    // SAFETY: the stage is alive.
+    let passes = f.passes.map_or(1, |f| unsafe { f(own.handle.stage) });
+    if passes == 0 || passes > MOST_PASSES || (passes > 1 && f.forward_pass.is_none()) {
+        let there = if f.forward_pass.is_some() { "a" } else { "no" };
+        return Err(format!("it goes forward in {passes} passes with {there} function forward_pass"));
+    }
+    if i.halves != 0 && passes > 1 && f.forward_pass_halves.is_none() {
+        return Err(format!("it goes forward in {passes} passes with no function forward_pass_halves"));
+    }
+    Ok(passes)
+}
+
+fn parameters(own: &Foreign<ConefieldMap>, i: &ConefieldInfo) -> Result<Vec<Parameter>> {
+    let wrong = |what: String| own.wrong("parameter", &what);
     let mut all: Vec<Parameter> = vec![];
     let mut names = BTreeSet::new();
     let mut start = 0usize;
@@ -225,7 +200,8 @@ fn parameters(handle: &Handle, map: &ConefieldMap, i: &ConefieldInfo) -> Result<
             dimensions: 0,
         };
         // SAFETY: the stage is alive, `p` is to be written.
-        let status = map.parameter.map_or(CONEFIELD_FAILED, |f| unsafe { f(handle.stage, index, &mut p) });
+        let status =
+            own.functions.parameter.map_or(CONEFIELD_FAILED, |f| unsafe { f(own.handle.stage, index, &mut p) });
         if status != CONEFIELD_OK {
             return Err(wrong(format!("block {index} of {} cannot be had", i.blocks)));
         }
@@ -255,16 +231,17 @@ fn parameters(handle: &Handle, map: &ConefieldMap, i: &ConefieldInfo) -> Result<
     Ok(all)
 }
 
-fn partition(handle: &Handle, map: &ConefieldMap, i: &ConefieldInfo, grads: GradKind) -> Result<Vec<Range<usize>>> {
-    let whole = || vec![0..i.params];
-    let Some(f) = map.partition.filter(|_| grads == GradKind::Scatter && i.partitions > 1) else { return Ok(whole()) };
-    let wrong = |what: String| handle.ty.failed("partition", CONEFIELD_FAILED, &what);
+fn partition(own: &Foreign<ConefieldMap>, i: &ConefieldInfo) -> Result<Vec<Range<usize>>> {
+    let parts = i.grads == CONEFIELD_GRADS_SCATTER && i.partitions > 1;
+    let whole = 0..i.params;
+    let Some(f) = own.functions.partition.filter(|_| parts) else { return Ok(vec![whole]) };
+    let wrong = |what: String| own.wrong("partition", &what);
     let mut all = vec![];
     let mut end = 0;
     for index in 0..i.partitions {
         let mut r = ConefieldRange { start: 0, end: 0 };
         // SAFETY: the stage is alive, `r` is to be written.
-        let status = unsafe { f(handle.stage, index, &mut r) };
+        let status = unsafe { f(own.handle.stage, index, &mut r) };
         if status != CONEFIELD_OK || r.start != end || r.end < r.start || r.end > i.params {
             return Err(wrong(format!("range {index} is {}..{} after {end} of {}", r.start, r.end, i.params)));
         }
@@ -275,26 +252,26 @@ fn partition(handle: &Handle, map: &ConefieldMap, i: &ConefieldInfo, grads: Grad
 }
 
 /// How many cells each of `count` channels tells apart, where the encoder says so.
-fn resolutions(handle: &Handle, map: &ConefieldMap, count: usize) -> Result<Option<Vec<f64>>> {
-    let Some(f) = map.resolutions.filter(|_| handle.ty.kind == Kind::Encoder) else { return Ok(None) };
-    let mark = f64::from_bits(UNTOUCHED.into());
-    let mut cells = vec![mark; count + GUARD];
-    let mut error = Text::new();
-    // SAFETY: the stage is alive, `cells` has room for more than `count`.
-    let status = unsafe { f(handle.stage, cells.as_mut_ptr(), count, error.room()) };
-    if status == CONEFIELD_UNSUPPORTED {
+fn resolutions(own: &Foreign<ConefieldMap>, count: usize) -> Result<Option<Vec<f64>>> {
+    let Some(f) = own.functions.resolutions.filter(|_| own.ty().kind == Kind::Encoder) else { return Ok(None) };
+    let mut cells = vec![f64::from_bits(UNTOUCHED_64); count + GUARD];
+    let mut known = true;
+    own.run("resolutions", |stage, error| {
+        // SAFETY: the stage is alive, `cells` has room for more than `count`.
+        let status = unsafe { f(stage, cells.as_mut_ptr(), count, error) };
+        known = status != CONEFIELD_UNSUPPORTED;
+        if known { status } else { CONEFIELD_OK }
+    })?;
+    if !known {
         return Ok(None);
     }
-    if status != CONEFIELD_OK {
-        return Err(handle.ty.failed("resolutions", status, &error.text()));
-    }
-    let wrong = |what: String| Err(handle.ty.failed("resolutions", CONEFIELD_FAILED, &what));
-    let untouched = |v: &f64| v.to_bits() == mark.to_bits();
+    let wrong = |what: String| Err(own.wrong("resolutions", &what));
+    let untouched = |v: &f64| v.to_bits() == UNTOUCHED_64;
     if !cells[count..].iter().all(untouched) {
         return wrong(format!("it writes past the {count} channels that there are"));
     }
     cells.truncate(count);
-    match cells.iter().position(|v| !(v.is_finite() && *v > 0.0) || untouched(v)) {
+    match cells.iter().position(|v| !(v.is_finite() && *v > 0.0)) {
         Some(c) if untouched(&cells[c]) => wrong(format!("channel {c} of {count} is left unwritten")),
         Some(c) => wrong(format!("channel {c} of {count} tells {} cells apart", cells[c])),
         None => Ok(Some(cells)),
@@ -327,10 +304,10 @@ across! {
     f64, ConefieldTile64 ConefieldTileMut64;
 }
 
-/// Calls a function of the library, which is told the format of halves where there is one.
-macro_rules! call {
-    ($f:ident, $stage:expr, ($($format:expr)?), $($rest:expr),*) => {
-        $f($stage, $($format,)? $($rest),*)
+/// As `call`, of a function that is told the format of halves before all else, if there is one.
+macro_rules! told {
+    ($own:expr, ($($format:expr)?), $function:ident($($argument:expr),*)) => {
+        call!($own, $function($($format,)? $($argument),*))
     };
 }
 
@@ -342,14 +319,10 @@ macro_rules! kernel {
     ) => {
         impl Kernel<$real, $param> for MapStage {
             fn forward(&self, params: &[$param], x: Tile<'_, $real>, y: TileMut<'_, $real>, tape: TileMut<'_, $real>) {
-                let rows = x.rows;
-                let mut error = Text::new();
-                // SAFETY: the stage is alive, and every pointer goes with the length of what it leads to.
-                let status = self.map.$forward.map_or(CONEFIELD_UNSUPPORTED, |f| unsafe {
-                    let (x, out, tape) = (x.data.across(rows), y.data.across(rows), tape.data.across(rows));
-                    call!(f, self.handle.stage, $format, params.as_ptr().cast(), x, out, tape, error.room())
-                });
-                if !self.settle(stringify!($forward), status, &error) {
+                let (rows, params) = (x.rows, params.as_ptr().cast());
+                let (x, out, tape) = (x.data.across(rows), y.data.across(rows), tape.data.across(rows));
+                if let Err(e) = told!(self.own, $format, $forward(params, x, out, tape)) {
+                    self.own.fault.set(e);
                     y.data.fill(<$real>::NAN);
                 }
             }
@@ -363,21 +336,15 @@ macro_rules! kernel {
                 grads: Grads<'_, $real>,
                 mut dx: Option<TileMut<'_, $real>>,
             ) {
-                let rows = x.rows;
-                let mut error = Text::new();
-                // SAFETY: as for `forward`.
-                let status = self.map.$backward.map_or(CONEFIELD_UNSUPPORTED, |f| unsafe {
-                    let nowhere = $tile_mut { data: ptr::null_mut(), channels: 0, rows, stride: rows };
-                    let (x, tape, dy) = (x.data.across(rows), tape.data.across(rows), dy.data.across(rows));
-                    let dx = dx.as_mut().map_or(nowhere, |dx| dx.data.across(rows));
-                    let (start, length) = (grads.range.start, grads.values.len());
-                    let grads = $grads { data: grads.values.as_mut_ptr(), start, length };
-                    call!(f, self.handle.stage, $format, params.as_ptr().cast(), x, tape, dy, grads, dx, error.room())
-                });
-                if !self.settle(stringify!($backward), status, &error)
-                    && let Some(dx) = dx
-                {
-                    dx.data.fill(<$real>::NAN);
+                let (rows, params) = (x.rows, params.as_ptr().cast());
+                let nowhere = $tile_mut { data: ptr::null_mut(), channels: 0, rows, stride: rows };
+                let (x, tape, dy) = (x.data.across(rows), tape.data.across(rows), dy.data.across(rows));
+                let to = dx.as_mut().map_or(nowhere, |dx| dx.data.across(rows));
+                let (start, length) = (grads.range.start, grads.values.len());
+                let grads = $grads { data: grads.values.as_mut_ptr(), start, length };
+                if let Err(e) = told!(self.own, $format, $backward(params, x, tape, dy, grads, to)) {
+                    self.own.fault.set(e);
+                    dx.iter_mut().for_each(|dx| dx.data.fill(<$real>::NAN));
                 }
             }
 
@@ -394,17 +361,13 @@ macro_rules! kernel {
                     y: TileMut<'_, $real>,
                     tape: TileMut<'_, $real>,
                 ) {
-                    let Some(f) = self.map.$forward_pass.filter(|_| self.passes > 1) else {
+                    if self.passes <= 1 || self.own.functions.$forward_pass.is_none() {
                         return self.forward(params, x, y, tape);
-                    };
-                    let rows = x.rows;
-                    let mut error = Text::new();
-                    // SAFETY: as for `forward`.
-                    let status = unsafe {
-                        let (x, out, tape) = (x.data.across(rows), y.data.across(rows), tape.data.across(rows));
-                        call!(f, self.handle.stage, $format, pass, params.as_ptr().cast(), x, out, tape, error.room())
-                    };
-                    if !self.settle(stringify!($forward_pass), status, &error) {
+                    }
+                    let (rows, params) = (x.rows, params.as_ptr().cast());
+                    let (x, out, tape) = (x.data.across(rows), y.data.across(rows), tape.data.across(rows));
+                    if let Err(e) = told!(self.own, $format, $forward_pass(pass, params, x, out, tape)) {
+                        self.own.fault.set(e);
                         y.data.fill(<$real>::NAN);
                     }
                 }
@@ -434,11 +397,9 @@ impl Stage for MapStage {
     }
 
     fn init(&self, seed: u64, params: &mut [f32]) {
-        let Some(init) = self.map.init.filter(|_| !params.is_empty()) else { return };
-        let mut error = Text::new();
-        // SAFETY: the stage is alive, `params` has that length.
-        let status = unsafe { init(self.handle.stage, seed, params.as_mut_ptr(), params.len(), error.room()) };
-        self.settle("init", status, &error);
+        if !params.is_empty() {
+            self.own.noted(call!(self.own, init(seed, params.as_mut_ptr(), params.len())), ());
+        }
     }
 
     fn kernel(&self) -> &dyn Kernel<f32> {
@@ -446,11 +407,11 @@ impl Stage for MapStage {
     }
 
     fn reference(&self) -> Option<&dyn Kernel<f64>> {
-        self.double.then_some(self as _)
+        (self.said.double_precision != 0).then_some(self as _)
     }
 
     fn halves(&self) -> Option<Halves<'_>> {
-        self.halves.then(|| Halves::of(self))
+        (self.said.halves != 0).then(|| Halves::of(self))
     }
 
     fn partition(&self) -> Vec<Range<usize>> {
@@ -458,15 +419,15 @@ impl Stage for MapStage {
     }
 
     fn fault(&self) -> Result<()> {
-        self.fault.take()
+        self.own.fault.take()
     }
 
     fn wgsl(&self) -> Option<Fragment> {
-        fragment(&self.handle, self.map.wgsl)
+        self.own.fragment(self.own.functions.wgsl)
     }
 
     fn describe(&self) -> String {
-        self.describe.clone()
+        self.own.describe.clone()
     }
 }
 
@@ -477,7 +438,7 @@ impl Encoder for MapStage {
     }
 
     fn coarse_to_fine(&self) -> bool {
-        self.coarse_to_fine
+        self.said.coarse_to_fine != 0
     }
 
     fn resolutions(&self) -> Option<Vec<f64>> {
@@ -490,6 +451,14 @@ impl Field for MapStage {
         let (stage, params, channels) = self.reduce(CONEFIELD_INPUTS, keep)?;
         Ok(Reduced { stage: Box::new(stage), params, channels })
     }
+
+    fn lines(&self) -> Option<&dyn Lines<f32>> {
+        (self.own.ty().kind == Kind::LineField).then_some(self)
+    }
+
+    fn lines_reference(&self) -> Option<&dyn Lines<f64>> {
+        (self.own.ty().kind == Kind::LineField).then_some(self)
+    }
 }
 
 impl Normalizer for MapStage {
@@ -498,3 +467,29 @@ impl Normalizer for MapStage {
         Ok(Reduced { stage: Box::new(stage), params, channels })
     }
 }
+
+macro_rules! lines {
+    ($real:ty, $grads:ident, $project:ident $backproject:ident) => {
+        impl Lines<$real> for MapStage {
+            fn project(&self, params: &[$real], rays: &[UnitRay], out: &mut [$real]) {
+                let rays: Vec<ConefieldRay> = rays.iter().map(raw_ray).collect();
+                let (at, to) = (rays.as_ptr(), out.as_mut_ptr());
+                if let Err(e) = call!(self.own, $project(params.as_ptr(), at, rays.len(), to)) {
+                    self.own.fault.set(e);
+                    out.fill(<$real>::NAN);
+                }
+            }
+
+            fn backproject(&self, params: &[$real], rays: &[UnitRay], dlines: &[$real], grads: Grads<'_, $real>) {
+                let rays: Vec<ConefieldRay> = rays.iter().map(raw_ray).collect();
+                let (start, length) = (grads.range.start, grads.values.len());
+                let to = $grads { data: grads.values.as_mut_ptr(), start, length };
+                let (params, at, dlines) = (params.as_ptr(), rays.as_ptr(), dlines.as_ptr());
+                self.own.noted(call!(self.own, $backproject(params, at, rays.len(), dlines, to)), ());
+            }
+        }
+    };
+}
+
+lines! { f32, ConefieldGrads, project backproject }
+lines! { f64, ConefieldGrads64, project_f64 backproject_f64 }

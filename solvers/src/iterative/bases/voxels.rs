@@ -46,8 +46,8 @@ impl Expansion for Identity {
     fn operator(&self) -> &dyn BasisOperator<f32> {
         self
     }
-    fn reference(&self) -> &dyn BasisOperator<f64> {
-        self
+    fn reference(&self) -> Option<&dyn BasisOperator<f64>> {
+        Some(self)
     }
 }
 

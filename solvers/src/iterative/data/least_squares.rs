@@ -1,9 +1,10 @@
 //! Least squares: `½Σ r²`.
 
-use crate::iterative::noise::{self, Noise, Weights};
+use crate::iterative::noise::{self, Noise};
 use conefield_core::data_term::{DataTerm, DataTermSpec, Misfit};
 use conefield_core::error::Result;
-use conefield_core::scan::{Scan, ScanHeader};
+use conefield_core::scan::ScanHeader;
+use ndarray::ArrayView3;
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
@@ -22,8 +23,8 @@ impl DataTermSpec for LeastSquares {
 }
 
 impl DataTerm for LeastSquares {
-    fn of<'a>(&self, scan: &'a Scan) -> Box<dyn Misfit + 'a> {
-        Box::new(Weights { noise: Noise::of(scan, false), scan })
+    fn of(&self, measured: ArrayView3<'_, f32>) -> Result<Box<dyn Misfit>> {
+        Ok(Box::new(Noise::of(measured, false)))
     }
 
     fn scratch(&self, header: &ScanHeader) -> u64 {

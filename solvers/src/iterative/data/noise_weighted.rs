@@ -1,10 +1,11 @@
 //! Penalised weighted least squares: `½Σ w·r²`, the weights w inverse variances of the measured values up to a factor
 //! (Fessler, IEEE Trans. Image Process. 3(4), 1994), from the noise that [`Noise`] finds in the scan.
 
-use crate::iterative::noise::{self, Noise, Weights};
+use crate::iterative::noise::{self, Noise};
 use conefield_core::data_term::{DataTerm, DataTermSpec, Misfit};
 use conefield_core::error::Result;
-use conefield_core::scan::{Scan, ScanHeader};
+use conefield_core::scan::ScanHeader;
+use ndarray::ArrayView3;
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
@@ -28,8 +29,8 @@ impl DataTermSpec for NoiseWeighted {
 }
 
 impl DataTerm for NoiseWeighted {
-    fn of<'a>(&self, scan: &'a Scan) -> Box<dyn Misfit + 'a> {
-        Box::new(Weights { noise: Noise::of(scan, true), scan })
+    fn of(&self, measured: ArrayView3<'_, f32>) -> Result<Box<dyn Misfit>> {
+        Ok(Box::new(Noise::of(measured, true)))
     }
 
     fn scratch(&self, header: &ScanHeader) -> u64 {

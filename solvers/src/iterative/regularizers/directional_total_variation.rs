@@ -52,14 +52,14 @@ impl RegularizerSpec for DirectionalTotalVariation {
 }
 
 impl Regularizer for DirectionalTotalVariation {
-    fn on(&self, grid: &VoxelGrid, space: &Space) -> Box<dyn Penalty> {
+    fn on(&self, grid: &VoxelGrid, space: &Space) -> Result<Box<dyn Penalty>> {
         let g = anisotropy(grid);
         let edges = Edges::new(grid.shape, self.strength as f32, self.edge, space);
-        Box::new(On { prox: TvProx::new(grid.shape, g, space).with_edges(edges), inner: self.inner })
+        Ok(Box::new(On { prox: TvProx::new(grid.shape, g, space).with_edges(edges), inner: self.inner }))
     }
 
-    fn weight(&self, grid: &VoxelGrid, noise: &mut dyn FnMut(f64) -> f64) -> f64 {
-        self.weight.lambda(grid, noise)
+    fn weight(&self, grid: &VoxelGrid, noise: &mut dyn FnMut(f64) -> f64) -> Result<f64> {
+        Ok(self.weight.lambda(grid, noise))
     }
 
     fn describe(&self) -> String {

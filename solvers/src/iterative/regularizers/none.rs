@@ -24,12 +24,12 @@ impl RegularizerSpec for Nonnegative {
 }
 
 impl Regularizer for Nonnegative {
-    fn on(&self, _: &VoxelGrid, _: &Space) -> Box<dyn Penalty> {
-        Box::new(*self)
+    fn on(&self, _: &VoxelGrid, _: &Space) -> Result<Box<dyn Penalty>> {
+        Ok(Box::new(*self))
     }
 
-    fn weight(&self, _: &VoxelGrid, _: &mut dyn FnMut(f64) -> f64) -> f64 {
-        0.0
+    fn weight(&self, _: &VoxelGrid, _: &mut dyn FnMut(f64) -> f64) -> Result<f64> {
+        Ok(0.0)
     }
 
     fn describe(&self) -> String {

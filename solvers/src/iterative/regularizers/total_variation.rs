@@ -74,12 +74,12 @@ impl RegularizerSpec for TotalVariation {
 }
 
 impl Regularizer for TotalVariation {
-    fn on(&self, grid: &VoxelGrid, space: &Space) -> Box<dyn Penalty> {
-        Box::new(On { prox: TvProx::new(grid.shape, anisotropy(grid), space), inner: self.inner })
+    fn on(&self, grid: &VoxelGrid, space: &Space) -> Result<Box<dyn Penalty>> {
+        Ok(Box::new(On { prox: TvProx::new(grid.shape, anisotropy(grid), space), inner: self.inner }))
     }
 
-    fn weight(&self, grid: &VoxelGrid, noise: &mut dyn FnMut(f64) -> f64) -> f64 {
-        self.weight.lambda(grid, noise)
+    fn weight(&self, grid: &VoxelGrid, noise: &mut dyn FnMut(f64) -> f64) -> Result<f64> {
+        Ok(self.weight.lambda(grid, noise))
     }
 
     fn describe(&self) -> String {
@@ -112,7 +112,7 @@ impl Penalty for On {
         }
     }
 
-    fn state(&mut self) -> Vec<(&'static str, &mut [f32])> {
+    fn state(&mut self) -> Vec<(&str, &mut [f32])> {
         let [x, y, z] = self.prox.state();
         vec![("dual.x", x), ("dual.y", y), ("dual.z", z)]
     }

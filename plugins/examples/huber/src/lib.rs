@@ -1,0 +1,5 @@
+//! A plugin with a regularizer for iterative methods.
+
+pub mod huber;
+
+conefield_plugin::export!();

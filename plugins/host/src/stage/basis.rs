@@ -1,0 +1,136 @@
+//! Bases.
+
+#![allow(unsafe_code)]
+
+use super::{Foreign, SMALL, call, raw_grid};
+use crate::library::Handle;
+use crate::trial;
+use conefield_core::basis::{Basis, BasisOperator, Expansion};
+use conefield_core::error::Result;
+use conefield_core::geometry::VoxelGrid;
+use conefield_core::simd::Real;
+use conefield_plugin_abi::*;
+use ndarray::{Array3, ArrayView3, ArrayViewMut3};
+
+/// Most coefficients for each voxel.
+const MOST: usize = 64;
+
+/// A basis of a library.
+pub struct BasisStage(Foreign<ConefieldBasis>);
+
+impl BasisStage {
+    /// The basis behind `handle`, tried out.
+    pub(crate) fn tried(handle: Handle) -> Result<Self> {
+        let stage = Self(Foreign::new(handle)?);
+        trial::basis(stage.0.ty(), SMALL.shape, &stage.made_on(&SMALL)?)?;
+        Ok(stage)
+    }
+
+    /// The basis of one grid.
+    fn made_on(&self, grid: &VoxelGrid) -> Result<ExpansionOn> {
+        let on = self.0.functions.on;
+        let handle = self.0.must_make("on", |stage, out, error| {
+            // SAFETY: the stage is alive; everything handed over lives for the time of the call.
+            on.map_or(CONEFIELD_FAILED, |f| unsafe { f(stage, &raw_grid(grid), out, error) })
+        })?;
+        let own = Foreign::<ConefieldBasis>::new(handle)?;
+        let mut info = ConefieldExpansion { coefficients: raw_grid(grid), scratch: 0, samples: 0, double_precision: 0 };
+        // SAFETY: the stage is alive, `info` is to be written.
+        own.run("info", |stage, _| own.functions.info.map_or(CONEFIELD_FAILED, |f| unsafe { f(stage, &mut info) }))?;
+        let ConefieldGrid { shape, spacing, center } = info.coefficients;
+        let coefficients = VoxelGrid { shape, spacing, center };
+        coefficients.validate("coefficients").map_err(|e| own.wrong("info", &e.to_string()))?;
+        let voxels: usize = grid.shape.iter().product();
+        let count = shape.iter().try_fold(1usize, |n, &k| n.checked_mul(k)).filter(|n| *n <= MOST * voxels.max(64));
+        let many = || own.wrong("info", &format!("{shape:?} coefficients for {:?} voxels", grid.shape));
+        count.ok_or_else(many)?;
+        let double = own.functions.expand_f64.is_some() && own.functions.adjoint_f64.is_some();
+        if info.double_precision != 0 && !double {
+            return Err(own.wrong("info", "it does not work in double precision, and says that it does"));
+        }
+        Ok(ExpansionOn { own, coefficients, info })
+    }
+}
+
+impl Basis for BasisStage {
+    fn on(&self, grid: &VoxelGrid) -> Result<Box<dyn Expansion>> {
+        Ok(Box::new(self.made_on(grid)?))
+    }
+
+    fn describe(&self) -> String {
+        self.0.describe.clone()
+    }
+}
+
+/// A basis that a library made for one grid.
+pub(crate) struct ExpansionOn {
+    own: Foreign<ConefieldBasis>,
+    coefficients: VoxelGrid,
+    info: ConefieldExpansion,
+}
+
+impl Expansion for ExpansionOn {
+    fn coefficients(&self) -> VoxelGrid {
+        self.coefficients
+    }
+
+    fn are_samples(&self) -> bool {
+        self.info.samples != 0
+    }
+
+    fn scratch(&self) -> u64 {
+        self.info.scratch
+    }
+
+    fn operator(&self) -> &dyn BasisOperator<f32> {
+        self
+    }
+
+    fn reference(&self) -> Option<&dyn BasisOperator<f64>> {
+        (self.info.double_precision != 0).then_some(self)
+    }
+
+    fn fault(&self) -> Result<()> {
+        self.own.fault.take()
+    }
+}
+
+/// Hands arrays over as a library wants them: numbers that follow each other. What cannot be done leaves NaN.
+fn across<R: Real>(
+    own: &Foreign<ConefieldBasis>,
+    from: ArrayView3<'_, R>,
+    mut to: ArrayViewMut3<'_, R>,
+    call: impl FnOnce(*const R, *mut R) -> Result<()>,
+) {
+    let from = from.as_standard_layout();
+    let done = match to.as_slice_mut() {
+        Some(slice) => call(from.as_ptr(), slice.as_mut_ptr()),
+        None => {
+            let mut dense = Array3::from_elem(to.dim(), R::ZERO);
+            let done = call(from.as_ptr(), dense.as_mut_ptr());
+            to.assign(&dense);
+            done
+        }
+    };
+    if let Err(e) = done {
+        own.fault.set(e);
+        to.fill(R::of(f64::NAN));
+    }
+}
+
+macro_rules! operator {
+    ($real:ty, $expand:ident $adjoint:ident) => {
+        impl BasisOperator<$real> for ExpansionOn {
+            fn expand(&self, coefficients: ArrayView3<'_, $real>, voxels: ArrayViewMut3<'_, $real>) {
+                across(&self.own, coefficients, voxels, |from, to| call!(self.own, $expand(from, to)));
+            }
+
+            fn adjoint(&self, voxels: ArrayView3<'_, $real>, coefficients: ArrayViewMut3<'_, $real>) {
+                across(&self.own, voxels, coefficients, |from, to| call!(self.own, $adjoint(from, to)));
+            }
+        }
+    };
+}
+
+operator! { f32, expand adjoint }
+operator! { f64, expand_f64 adjoint_f64 }

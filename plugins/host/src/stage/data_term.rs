@@ -1,0 +1,100 @@
+//! Data terms.
+
+#![allow(unsafe_code)]
+
+use super::{Foreign, call};
+use crate::library::Handle;
+use crate::trial;
+use conefield_core::data_term::{DataTerm, Misfit};
+use conefield_core::error::Result;
+use conefield_core::scan::ScanHeader;
+use conefield_plugin_abi::*;
+use ndarray::ArrayView3;
+
+/// A data term of a library.
+pub struct DataTermStage(Foreign<ConefieldDataTerm>);
+
+impl DataTermStage {
+    /// The data term behind `handle`, tried out.
+    pub(crate) fn tried(handle: Handle) -> Result<Self> {
+        let stage = Self(Foreign::new(handle)?);
+        trial::data_term(stage.0.ty(), |measured| stage.made_of(measured))?;
+        Ok(stage)
+    }
+
+    /// The data term of one scan.
+    fn made_of(&self, measured: ArrayView3<'_, f32>) -> Result<MisfitOn> {
+        let shape: [usize; 3] = measured.dim().into();
+        let measured = measured.as_standard_layout();
+        let of = self.0.functions.of;
+        let handle = self.0.must_make("of", |stage, out, error| {
+            // SAFETY: the stage is alive; everything handed over lives for the time of the call and has that shape.
+            of.map_or(CONEFIELD_FAILED, |f| unsafe { f(stage, measured.as_ptr(), shape.as_ptr(), out, error) })
+        })?;
+        Ok(MisfitOn(Foreign::new(handle)?))
+    }
+
+    /// Bytes that it holds for a scan, and that it takes for a moment.
+    fn bytes(&self, header: &ScanHeader) -> [u64; 2] {
+        let shape = [header.views, header.detector[0], header.detector[1]];
+        let [mut held, mut brief] = [0; 2];
+        if let Some(f) = self.0.functions.bytes {
+            // SAFETY: the stage is alive, both numbers are to be written.
+            unsafe { f(self.0.handle.stage, shape.as_ptr(), &mut held, &mut brief) };
+        }
+        [held, brief]
+    }
+}
+
+impl DataTerm for DataTermStage {
+    fn of(&self, measured: ArrayView3<'_, f32>) -> Result<Box<dyn Misfit>> {
+        Ok(Box::new(self.made_of(measured)?))
+    }
+
+    fn held(&self, header: &ScanHeader) -> u64 {
+        self.bytes(header)[0]
+    }
+
+    fn scratch(&self, header: &ScanHeader) -> u64 {
+        self.bytes(header)[1]
+    }
+
+    fn describe(&self) -> String {
+        self.0.describe.clone()
+    }
+}
+
+/// A data term that a library made for one scan.
+pub(crate) struct MisfitOn(Foreign<ConefieldDataTerm>);
+
+impl Misfit for MisfitOn {
+    fn differentiate(&self, view: usize, measured: &[f32], residuals: &mut [f32]) -> f64 {
+        let mut sum = f64::NAN;
+        let (from, count, to) = (measured.as_ptr(), measured.len(), residuals.as_mut_ptr());
+        let done = call!(self.0, differentiate(view, from, count, to, &mut sum));
+        self.0.noted(done.map(|()| sum), f64::NAN)
+    }
+
+    fn curve(&self, view: usize, measured: &[f32], values: &mut [f32]) {
+        let (from, count, to) = (measured.as_ptr(), measured.len(), values.as_mut_ptr());
+        self.0.noted(call!(self.0, curve(view, from, count, to)), ());
+    }
+
+    fn spread(&self, view: usize, measured: &[f32], values: &mut [f32]) {
+        let (from, count, to) = (measured.as_ptr(), measured.len(), values.as_mut_ptr());
+        self.0.noted(call!(self.0, spread(view, from, count, to)), ());
+    }
+
+    fn noise(&self) -> f64 {
+        // SAFETY: the stage is alive.
+        self.0.functions.noise.map_or(f64::NAN, |f| unsafe { f(self.0.handle.stage) })
+    }
+
+    fn fault(&self) -> Result<()> {
+        self.0.fault.take()
+    }
+
+    fn describe(&self) -> String {
+        self.0.describe.clone()
+    }
+}

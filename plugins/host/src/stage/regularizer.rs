@@ -1,0 +1,164 @@
+//! Regularizers.
+
+#![allow(unsafe_code)]
+
+use super::{Foreign, SMALL, call, raw_grid};
+use crate::library::{Handle, text};
+use crate::trial;
+use conefield_core::error::{Result, ensure};
+use conefield_core::geometry::VoxelGrid;
+use conefield_core::regularizer::{Penalty, Regularizer};
+use conefield_core::space::Space;
+use conefield_plugin_abi::*;
+use ndarray::ArrayView3;
+use std::collections::BTreeSet;
+use std::ffi::c_void;
+use std::panic::{AssertUnwindSafe, catch_unwind};
+use std::{ptr, slice};
+
+/// Most numbers that a penalty may keep for each coefficient.
+const MOST_STATE: usize = 64;
+
+/// A regularizer of a library.
+pub struct RegularizerStage(Foreign<ConefieldRegularizer>);
+
+impl RegularizerStage {
+    /// The regularizer behind `handle`, tried out.
+    pub(crate) fn tried(handle: Handle) -> Result<Self> {
+        let stage = Self(Foreign::new(handle)?);
+        stage.weight(&SMALL, &mut |k| 0.01 * k)?;
+        let mut penalty = stage.made_on(&SMALL)?;
+        trial::regularizer(stage.0.ty(), penalty.count, |v, u| {
+            penalty.try_prox(v, 0.1, u)?;
+            penalty.try_value(v)
+        })?;
+        Ok(stage)
+    }
+
+    /// The penalty on a grid.
+    fn made_on(&self, grid: &VoxelGrid) -> Result<PenaltyOn> {
+        let on = self.0.functions.on;
+        let handle = self.0.must_make("on", |stage, out, error| {
+            // SAFETY: the stage is alive; everything handed over lives for the time of the call.
+            on.map_or(CONEFIELD_FAILED, |f| unsafe { f(stage, &raw_grid(grid), out, error) })
+        })?;
+        let count = grid.shape.iter().product();
+        let mut made = PenaltyOn { own: Foreign::new(handle)?, count, state: vec![] };
+        made.state = made.read_state()?;
+        Ok(made)
+    }
+}
+
+/// Answers a library that asks what the noise comes to.
+unsafe extern "C" fn noise(context: *mut c_void, k: f64) -> f64 {
+    // SAFETY: it is what `weight` handed over for the time of its call.
+    let measure = unsafe { &mut *context.cast::<&mut dyn FnMut(f64) -> f64>() };
+    // Nothing unwinds into the library.
+    catch_unwind(AssertUnwindSafe(|| measure(k))).unwrap_or(f64::NAN)
+}
+
+impl Regularizer for RegularizerStage {
+    fn on(&self, grid: &VoxelGrid, space: &Space) -> Result<Box<dyn Penalty>> {
+        // SAFETY: the stage is alive, the grid lives for the time of the call.
+        let bytes = self.0.functions.bytes.map_or(0, |f| unsafe { f(self.0.handle.stage, &raw_grid(grid)) });
+        space.hold(bytes);
+        // A tally only counts: nothing is made on the grid.
+        let grid = if space.is_tally() { &SMALL } else { grid };
+        Ok(Box::new(self.made_on(grid)?))
+    }
+
+    fn weight(&self, grid: &VoxelGrid, noise_of: &mut dyn FnMut(f64) -> f64) -> Result<f64> {
+        let mut measure = noise_of;
+        let context = ptr::from_mut(&mut measure).cast();
+        let mut weight = f64::NAN;
+        call!(self.0, weight(&raw_grid(grid), Some(noise), context, &mut weight))?;
+        let good = weight.is_finite() && weight >= 0.0;
+        ensure(good, &self.0.ty().words(), "weight", weight, "a finite number, 0 or more")?;
+        Ok(weight)
+    }
+
+    fn describe(&self) -> String {
+        self.0.describe.clone()
+    }
+}
+
+/// A penalty that a library made for one grid.
+struct PenaltyOn {
+    own: Foreign<ConefieldRegularizer>,
+    /// Coefficients of the grid.
+    count: usize,
+    /// Names and lengths of what it keeps.
+    state: Vec<(String, usize)>,
+}
+
+impl PenaltyOn {
+    fn try_value(&self, x: &[f32]) -> Result<f64> {
+        let mut value = f64::NAN;
+        call!(self.own, value(x.as_ptr(), x.len(), &mut value))?;
+        Ok(value)
+    }
+
+    fn try_prox(&mut self, v: &[f32], tau: f32, u: *mut f32) -> Result<()> {
+        call!(self.own, prox(v.as_ptr(), v.len(), tau, u))
+    }
+
+    /// Entry `index` of its state; nothing past the last.
+    fn entry(&self, index: usize) -> Result<Option<ConefieldState>> {
+        let Some(state) = self.own.functions.state else { return Ok(None) };
+        let name = ConefieldStr { data: ptr::null(), length: 0 };
+        let mut entry = ConefieldState { name, data: ptr::null_mut(), length: 0 };
+        // SAFETY: the penalty is alive, `entry` is to be written.
+        match unsafe { state(self.own.handle.stage, index, &mut entry) } {
+            CONEFIELD_OK => Ok(Some(entry)),
+            CONEFIELD_UNSUPPORTED => Ok(None),
+            status => Err(self.own.ty().failed("state", status, "")),
+        }
+    }
+
+    fn read_state(&self) -> Result<Vec<(String, usize)>> {
+        let wrong = |what: String| self.own.wrong("state", &what);
+        let (mut all, mut names, mut numbers) = (vec![], BTreeSet::new(), 0usize);
+        while let Some(entry) = self.entry(all.len())? {
+            // SAFETY: the plugin says that so many bytes stand there as long as the penalty lives.
+            let name = unsafe { text(entry.name, &self.own.ty().words(), "state") }?;
+            numbers = numbers.saturating_add(entry.length);
+            if entry.data.is_null() || entry.length == 0 || numbers > MOST_STATE * self.count.max(64) {
+                return Err(wrong(format!("{name:?} has {} numbers", entry.length)));
+            }
+            if !names.insert(name.clone()) {
+                return Err(wrong(format!("two entries are called {name:?}")));
+            }
+            all.push((name, entry.length));
+        }
+        Ok(all)
+    }
+}
+
+impl Penalty for PenaltyOn {
+    fn value(&self, x: ArrayView3<'_, f32>) -> f64 {
+        let x = x.as_standard_layout();
+        self.own.noted(self.try_value(x.as_slice().unwrap_or_default()), f64::NAN)
+    }
+
+    fn prox(&mut self, v: &[f32], tau: f32, u: &mut [f32]) {
+        if let Err(e) = self.try_prox(v, tau, u.as_mut_ptr()) {
+            self.own.fault.set(e);
+            u.fill(f32::NAN);
+        }
+    }
+
+    fn state(&mut self) -> Vec<(&str, &mut [f32])> {
+        let mut all = vec![];
+        for (i, (name, length)) in self.state.iter().enumerate() {
+            if let Some(found) = self.entry(i).ok().flatten().filter(|e| e.length == *length) {
+                // SAFETY: the plugin says that so many stand there as long as the penalty lives; entries do not overlap.
+                all.push((name.as_str(), unsafe { slice::from_raw_parts_mut(found.data, *length) }));
+            }
+        }
+        all
+    }
+
+    fn fault(&self) -> Result<()> {
+        self.own.fault.take()
+    }
+}

@@ -1,0 +1,74 @@
+//! Initializers.
+
+use super::{built, guard, hand_over, many, many_mut, shims, text};
+use crate::built::AnyStage;
+use conefield_core::arena::{Arena, Block, Layout, Weights};
+use conefield_core::error::{Error, Result};
+use conefield_plugin_abi::*;
+use std::ffi::c_void;
+use std::ptr;
+
+pub static INITIALIZER: ConefieldInitializer = ConefieldInitializer {
+    size: size_of::<ConefieldInitializer>(),
+    apply: Some(apply),
+    check: Some(check),
+    weights: Some(weights),
+    with_weights: Some(with_weights),
+    volume: Some(volume),
+};
+
+unsafe fn layout(blocks: *const ConefieldBlock, count: usize) -> Result<Layout> {
+    let block = |b: &ConefieldBlock| -> Result<Block> {
+        // SAFETY: see `shims/mod.rs`.
+        let (name, shape) = unsafe { (text(b.name)?, many(b.shape, b.dimensions)) };
+        Ok(Block { name: name.into(), shape: shape.to_vec(), range: b.start..b.start + b.length })
+    };
+    // SAFETY: see `shims/mod.rs`.
+    Ok(Layout { blocks: unsafe { many(blocks, count) }.iter().map(block).collect::<Result<_>>()? })
+}
+
+shims! {
+    fn apply(
+        initializer: initializer, blocks: *const ConefieldBlock, block_count: usize, params: *mut f32, length: usize,
+        filled: *mut u8; error
+    ) {
+        let layout = layout(blocks, block_count)?;
+        let (params, filled) = (many_mut(params, length), many_mut(filled, block_count));
+        let mut arena = Arena::new(length);
+        arena.params.copy_from_slice(params);
+        let report = initializer.apply(&layout, &mut arena)?;
+        params.copy_from_slice(&arena.params);
+        for (filled, b) in filled.iter_mut().zip(&layout.blocks) {
+            *filled = report.loaded.contains(&b.name).into();
+        }
+    }
+
+    fn check(initializer: initializer, blocks: *const ConefieldBlock, block_count: usize; error) {
+        initializer.check(&layout(blocks, block_count)?)?;
+    }
+
+    fn weights(built: any, path: *mut ConefieldStr) {
+        match &built.stage {
+            // The stage keeps the text.
+            AnyStage::Waiting(w) => *path = ConefieldStr { data: w.path.as_ptr(), length: w.path.len() },
+            _ => return Err(Error::unsupported("this stage", "it names no weights file")),
+        }
+    }
+
+    fn with_weights(built: any, tensors: *const ConefieldTensor, count: usize, out: *mut *mut c_void; error) {
+        let AnyStage::Waiting(waiting) = &built.stage else {
+            return Err(Error::unsupported("this stage", "it names no weights file"));
+        };
+        let mut weights = Weights::default();
+        for t in many(tensors, count) {
+            let (shape, values) = (many(t.shape, t.dimensions), many(t.values, t.length));
+            weights.tensors.insert(text(t.name)?.into(), (shape.to_vec(), values.to_vec()));
+        }
+        *out = hand_over(waiting.with(&weights)?);
+    }
+
+    fn volume(built: any, path: *mut ConefieldStr, steps: *mut u64) {
+        let known = built.volume.as_ref().ok_or_else(|| Error::unsupported("this stage", "it names no volume"))?;
+        (*path, *steps) = (ConefieldStr { data: known.path.as_ptr(), length: known.path.len() }, known.steps);
+    }
+}

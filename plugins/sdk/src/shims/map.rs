@@ -1,0 +1,330 @@
+//! Encoders, normalizers, fields and line fields.
+
+use super::projector::ray;
+use super::{built, guard, many, many_mut, shims, wgsl};
+use crate::built::MapInfo;
+use conefield_core::error::{Error, Result, ensure};
+use conefield_core::simd::Real;
+use conefield_core::stage::{Grads, Kernel, Lines, Stage, Tile, TileMut, UnitRay};
+use conefield_plugin_abi::*;
+use std::borrow::Cow;
+use std::ffi::c_void;
+use std::ptr;
+
+pub static MAP: ConefieldMap = ConefieldMap {
+    size: size_of::<ConefieldMap>(),
+    info: Some(info),
+    parameter: Some(parameter),
+    init: Some(init),
+    forward: Some(forward),
+    backward: Some(backward),
+    forward_f64: Some(forward_f64),
+    backward_f64: Some(backward_f64),
+    partition: Some(partition),
+    reduce: Some(reduce),
+    wgsl: Some(wgsl),
+    passes: Some(passes),
+    forward_pass: Some(forward_pass),
+    forward_halves: Some(forward_halves),
+    forward_pass_halves: Some(forward_pass_halves),
+    backward_halves: Some(backward_halves),
+    resolutions: Some(resolutions),
+    project: Some(project),
+    backproject: Some(backproject),
+    project_f64: Some(project_f64),
+    backproject_f64: Some(backproject_f64),
+};
+
+shims! {
+    fn info(map: map, out: *mut ConefieldInfo) {
+        *out = map.1.info;
+    }
+
+    fn parameter(map: map, index: usize, out: *mut ConefieldParameter) {
+        let p = map.1.blocks.get(index).ok_or_else(|| Error::unsupported("parameters", "there are not so many"))?;
+        let name = ConefieldStr { data: p.name.as_ptr(), length: p.name.len() };
+        *out = ConefieldParameter { name, shape: p.shape.as_ptr(), dimensions: p.shape.len() };
+    }
+
+    fn partition(map: map, index: usize, out: *mut ConefieldRange) {
+        let r = map.1.partition.get(index).ok_or_else(|| Error::unsupported("ranges", "there are not so many"))?;
+        *out = ConefieldRange { start: r.start, end: r.end };
+    }
+
+    fn init(map: map, seed: u64, params: *mut f32, length: usize; error) {
+        map.0.init(seed, many_mut(params, length));
+    }
+
+    fn passes(map: map) -> usize, or 0, { map.0.kernel().passes() }
+
+    fn resolutions(encoder: encoder, cells: *mut f64, count: usize; error) {
+        let found = encoder.resolutions().ok_or_else(|| Error::unsupported("resolutions", "they are not known"))?;
+        let expected = format!("one for each of {count} channels");
+        ensure(found.len() == count, "encoder", "resolutions", found.len(), expected)?;
+        many_mut(cells, count).copy_from_slice(&found);
+    }
+
+    fn reduce(stage: any, side: u32, keep: *const usize, keep_count: usize, out: *mut ConefieldReduced; error) {
+        let smaller = Box::new(stage.reduced(side, many(keep, keep_count))?);
+        let (params, channels) = &smaller.kept;
+        let mut reduced = ConefieldReduced {
+            stage: ptr::null_mut(),
+            params: params.as_ptr(),
+            params_count: params.len(),
+            channels: channels.as_ptr(),
+            channels_count: channels.len(),
+        };
+        reduced.stage = Box::into_raw(smaller).cast();
+        *out = reduced;
+    }
+}
+
+/// Channels that the host has laid out with a stride.
+struct Strided<R> {
+    data: *mut R,
+    channels: usize,
+    rows: usize,
+    stride: usize,
+}
+
+impl<R: Real> Strided<R> {
+    fn close(&self) -> bool {
+        self.stride == self.rows || self.channels <= 1
+    }
+
+    /// The channels, one right after the other.
+    unsafe fn read<'a>(&self) -> Cow<'a, [R]> {
+        // SAFETY: see `shims/mod.rs`.
+        unsafe {
+            if self.close() {
+                return Cow::Borrowed(many(self.data, self.channels * self.rows));
+            }
+            let channel = |c| many(self.data.add(c * self.stride), self.rows);
+            Cow::Owned((0..self.channels).flat_map(|c| channel(c).iter().copied()).collect())
+        }
+    }
+
+    /// Runs `f` on the channels, one right after the other.
+    unsafe fn write<T>(&self, f: impl FnOnce(&mut [R]) -> T) -> T {
+        // SAFETY: see `shims/mod.rs`.
+        unsafe {
+            if self.close() {
+                return f(many_mut(self.data, self.channels * self.rows));
+            }
+            let mut dense = self.read().into_owned();
+            let out = f(&mut dense);
+            for (c, from) in dense.chunks_exact(self.rows).enumerate() {
+                many_mut(self.data.add(c * self.stride), self.rows).copy_from_slice(from);
+            }
+            out
+        }
+    }
+}
+
+macro_rules! strided {
+    ($($tile:ident $real:ty)*) => {$(
+        impl From<$tile> for Strided<$real> {
+            fn from(t: $tile) -> Self {
+                Self { data: t.data as *mut $real, channels: t.channels, rows: t.rows, stride: t.stride }
+            }
+        }
+    )*};
+}
+
+strided! { ConefieldTile f32 ConefieldTileMut f32 ConefieldTile64 f64 ConefieldTileMut64 f64 }
+
+/// A map of rows with what is known of it.
+type Map<'a> = (&'a dyn Stage, &'a MapInfo);
+
+/// `forward` of a kernel, or one pass of it.
+unsafe fn run_forward<R: Real, P>(
+    (stage, known): Map<'_>,
+    kernel: &dyn Kernel<R, P>,
+    pass: Option<usize>,
+    params: *const P,
+    [x, y, tape]: [Strided<R>; 3],
+) -> Result<()> {
+    let rows = x.rows;
+    // SAFETY: see `shims/mod.rs`.
+    unsafe {
+        let (params, x) = (many(params, known.info.params), x.read());
+        y.write(|y| {
+            tape.write(|tape| {
+                let (x, y, tape) = (Tile::new(&x, rows), TileMut::new(y, rows), TileMut::new(tape, rows));
+                match pass {
+                    Some(pass) => kernel.forward_pass(pass, params, x, y, tape),
+                    None => kernel.forward(params, x, y, tape),
+                }
+            });
+        });
+    }
+    stage.fault()
+}
+
+unsafe fn run_backward<R: Real, P>(
+    (stage, known): Map<'_>,
+    kernel: &dyn Kernel<R, P>,
+    params: *const P,
+    [x, tape, dy, dx]: [Strided<R>; 4],
+    grads: Grads<'_, R>,
+) -> Result<()> {
+    let rows = x.rows;
+    let wanted = !dx.data.is_null();
+    // SAFETY: see `shims/mod.rs`.
+    unsafe {
+        let (params, x, dy) = (many(params, known.info.params), x.read(), dy.read());
+        tape.write(|tape| {
+            let (x, tape, dy) = (Tile::new(&x, rows), TileMut::new(tape, rows), Tile::new(&dy, rows));
+            if wanted {
+                dx.write(|dx| kernel.backward(params, x, tape, dy, grads, Some(TileMut::new(dx, rows))));
+            } else {
+                kernel.backward(params, x, tape, dy, grads, None);
+            }
+        });
+    }
+    stage.fault()
+}
+
+unsafe fn grads<'a>(g: ConefieldGrads) -> Grads<'a, f32> {
+    // SAFETY: see `shims/mod.rs`.
+    Grads { values: unsafe { many_mut(g.data, g.length) }, range: g.start..g.start + g.length }
+}
+
+unsafe fn grads64<'a>(g: ConefieldGrads64) -> Grads<'a, f64> {
+    // SAFETY: see `shims/mod.rs`.
+    Grads { values: unsafe { many_mut(g.data, g.length) }, range: g.start..g.start + g.length }
+}
+
+/// What a stage may do without.
+fn have<T>(part: Option<T>, what: &str) -> Result<T> {
+    part.ok_or_else(|| Error::unsupported("this stage", format!("it has no {what}")))
+}
+
+/// Runs `$run` with the kernel that reads the parameters as they stand.
+macro_rules! in_halves {
+    ($map:expr, $format:expr, |$kernel:ident| $run:expr) => {{
+        let halves = have($map.0.halves(), "kernel that reads halves")?;
+        match $format {
+            CONEFIELD_F16 => {
+                let $kernel = halves.f16;
+                $run
+            }
+            CONEFIELD_BF16 => {
+                let $kernel = halves.bf16;
+                $run
+            }
+            other => return Err(Error::unsupported("halves", format!("{other} is none of the known formats"))),
+        }
+    }};
+}
+
+shims! {
+    fn forward(map: map, params: *const f32, x: ConefieldTile, y: ConefieldTileMut, tape: ConefieldTileMut; error) {
+        run_forward(map, map.0.kernel(), None, params, [x.into(), y.into(), tape.into()])?;
+    }
+
+    fn forward_pass(
+        map: map, pass: usize, params: *const f32, x: ConefieldTile, y: ConefieldTileMut, tape: ConefieldTileMut; error
+    ) {
+        run_forward(map, map.0.kernel(), Some(pass), params, [x.into(), y.into(), tape.into()])?;
+    }
+
+    fn backward(
+        map: map, params: *const f32, x: ConefieldTile, tape: ConefieldTileMut, dy: ConefieldTile, to: ConefieldGrads,
+        dx: ConefieldTileMut; error
+    ) {
+        run_backward(map, map.0.kernel(), params, [x.into(), tape.into(), dy.into(), dx.into()], grads(to))?;
+    }
+
+    fn forward_f64(
+        map: map, params: *const f64, x: ConefieldTile64, y: ConefieldTileMut64, tape: ConefieldTileMut64; error
+    ) {
+        let kernel = have(map.0.reference(), "kernel in double precision")?;
+        run_forward(map, kernel, None, params, [x.into(), y.into(), tape.into()])?;
+    }
+
+    fn backward_f64(
+        map: map, params: *const f64, x: ConefieldTile64, tape: ConefieldTileMut64, dy: ConefieldTile64,
+        to: ConefieldGrads64, dx: ConefieldTileMut64; error
+    ) {
+        let kernel = have(map.0.reference(), "kernel in double precision")?;
+        run_backward(map, kernel, params, [x.into(), tape.into(), dy.into(), dx.into()], grads64(to))?;
+    }
+
+    fn forward_halves(
+        map: map, format: u32, params: *const u16, x: ConefieldTile, y: ConefieldTileMut, tape: ConefieldTileMut; error
+    ) {
+        let tiles = [x.into(), y.into(), tape.into()];
+        in_halves!(map, format, |kernel| run_forward(map, kernel, None, params.cast(), tiles))?;
+    }
+
+    fn forward_pass_halves(
+        map: map, format: u32, pass: usize, params: *const u16, x: ConefieldTile, y: ConefieldTileMut,
+        tape: ConefieldTileMut; error
+    ) {
+        let tiles = [x.into(), y.into(), tape.into()];
+        in_halves!(map, format, |kernel| run_forward(map, kernel, Some(pass), params.cast(), tiles))?;
+    }
+
+    fn backward_halves(
+        map: map, format: u32, params: *const u16, x: ConefieldTile, tape: ConefieldTileMut, dy: ConefieldTile,
+        to: ConefieldGrads, dx: ConefieldTileMut; error
+    ) {
+        let tiles = [x.into(), tape.into(), dy.into(), dx.into()];
+        in_halves!(map, format, |kernel| run_backward(map, kernel, params.cast(), tiles, grads(to)))?;
+    }
+}
+
+/// Line integrals of a line field.
+unsafe fn run_project<R: Real>(
+    (stage, known): Map<'_>,
+    lines: Option<&dyn Lines<R>>,
+    params: *const R,
+    (rays, count): (*const ConefieldRay, usize),
+    out: *mut R,
+) -> Result<()> {
+    // SAFETY: see `shims/mod.rs`.
+    let (params, rays, out) = unsafe { (many(params, known.info.params), many(rays, count), many_mut(out, count)) };
+    let rays: Vec<UnitRay> = rays.iter().map(ray).collect();
+    have(lines, "line integrals of its own")?.project(params, &rays, out);
+    stage.fault()
+}
+
+unsafe fn run_backproject<R: Real>(
+    (stage, known): Map<'_>,
+    lines: Option<&dyn Lines<R>>,
+    params: *const R,
+    (rays, count): (*const ConefieldRay, usize),
+    dlines: *const R,
+    grads: Grads<'_, R>,
+) -> Result<()> {
+    // SAFETY: see `shims/mod.rs`.
+    let (params, rays, dlines) = unsafe { (many(params, known.info.params), many(rays, count), many(dlines, count)) };
+    let rays: Vec<UnitRay> = rays.iter().map(ray).collect();
+    have(lines, "line integrals of its own")?.backproject(params, &rays, dlines, grads);
+    stage.fault()
+}
+
+shims! {
+    fn project(stage: any, params: *const f32, rays: *const ConefieldRay, count: usize, out: *mut f32; error) {
+        run_project(stage.map()?, stage.field()?.lines(), params, (rays, count), out)?;
+    }
+
+    fn backproject(
+        stage: any, params: *const f32, rays: *const ConefieldRay, count: usize, dlines: *const f32, to: ConefieldGrads;
+        error
+    ) {
+        run_backproject(stage.map()?, stage.field()?.lines(), params, (rays, count), dlines, grads(to))?;
+    }
+
+    fn project_f64(stage: any, params: *const f64, rays: *const ConefieldRay, count: usize, out: *mut f64; error) {
+        run_project(stage.map()?, stage.field()?.lines_reference(), params, (rays, count), out)?;
+    }
+
+    fn backproject_f64(
+        stage: any, params: *const f64, rays: *const ConefieldRay, count: usize, dlines: *const f64,
+        to: ConefieldGrads64; error
+    ) {
+        run_backproject(stage.map()?, stage.field()?.lines_reference(), params, (rays, count), dlines, grads64(to))?;
+    }
+}

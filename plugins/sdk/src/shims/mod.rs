@@ -1,0 +1,331 @@
+//! The functions that the host calls: each turns pointers into slices, runs the stage, and turns what goes wrong, panics
+//! included, into a status and a text.
+
+// Pointers come from the host, by the rules of the contract (`conefield_plugin_abi`): they are valid for the lengths beside
+// them for the time of the call, do not overlap where one of them is written to, and `stage` is what `create` or another of
+// these functions made. Every block in this folder that is unsafe relies on that alone.
+#![allow(unsafe_code)]
+
+mod initializer;
+mod iterative;
+mod map;
+mod projector;
+mod training;
+
+use crate::built::{AnyStage, Built};
+use conefield_core::error::{Error, Result};
+use conefield_core::registry::StageType;
+use conefield_plugin_abi::*;
+use std::ffi::c_void;
+use std::panic::{AssertUnwindSafe, catch_unwind};
+use std::{mem, ptr, slice};
+
+pub use initializer::INITIALIZER;
+pub use iterative::{BASIS, DATA_TERM, REGULARIZER};
+pub use map::MAP;
+pub use projector::PROJECTOR;
+pub use training::{LOSS, PRIOR};
+
+/// Functions of tables. Each finds the stage behind its first pointer, as the kind that stands after it, and works within
+/// [`guard`]. One that names its error text at the end has room for a reason; one with a result of its own says what that is
+/// where it fails.
+macro_rules! shims {
+    () => {};
+    (fn $name:ident($stage:ident: $kind:ident $(, $arg:ident: $ty:ty)* $(; $error:ident)?) $body:block $($rest:tt)*) => {
+        unsafe extern "C" fn $name(
+            stage: *const c_void
+            $(, $arg: $ty)*
+            $(, $error: *mut ConefieldText)?
+        ) -> ConefieldStatus {
+            let error = [$($error,)? ptr::null_mut()][0];
+            // SAFETY: see `shims/mod.rs`.
+            guard(error, || unsafe {
+                let $stage = built(stage).$kind()?;
+                $body;
+                Ok(())
+            })
+        }
+        shims! { $($rest)* }
+    };
+    (fn $name:ident($stage:ident: $kind:ident $(, $arg:ident: $ty:ty)*) -> $out:ty, or $failed:expr, $body:block $($rest:tt)*) => {
+        unsafe extern "C" fn $name(stage: *const c_void $(, $arg: $ty)*) -> $out {
+            let mut out = $failed;
+            // SAFETY: see `shims/mod.rs`.
+            guard(ptr::null_mut(), || unsafe {
+                let $stage = built(stage).$kind()?;
+                out = $body;
+                Ok(())
+            });
+            out
+        }
+        shims! { $($rest)* }
+    };
+}
+use shims;
+
+/// Runs `f`; what goes wrong becomes a status, its text goes to `error`.
+fn guard(error: *mut ConefieldText, f: impl FnOnce() -> Result<()>) -> ConefieldStatus {
+    match catch_unwind(AssertUnwindSafe(f)) {
+        Ok(Ok(())) => CONEFIELD_OK,
+        Ok(Err(e)) => {
+            let (status, text) = match &e {
+                // The host knows the place.
+                Error::Invalid { field, found, expected, .. } => {
+                    (CONEFIELD_INVALID, format!("{field}: found {found}, expected {expected}"))
+                }
+                Error::Unsupported { .. } => (CONEFIELD_UNSUPPORTED, e.to_string()),
+                _ => (CONEFIELD_FAILED, e.to_string()),
+            };
+            write(error, &text);
+            status
+        }
+        Err(panic) => {
+            let text = panic.downcast_ref::<String>().map(String::as_str);
+            let text = text.or_else(|| panic.downcast_ref::<&str>().copied()).unwrap_or("without a word");
+            write(error, &format!("panicked: {text}"));
+            // To drop what was thrown could panic again.
+            mem::forget(panic);
+            CONEFIELD_PANICKED
+        }
+    }
+}
+
+/// Writes as much of `text` as there is room for.
+fn write(out: *mut ConefieldText, text: &str) {
+    // SAFETY: see the top of this file.
+    let Some(out) = (unsafe { out.as_mut() }) else { return };
+    out.length = text.len();
+    let n = text.len().min(out.capacity);
+    if n > 0 {
+        // SAFETY: see the top of this file.
+        unsafe { ptr::copy_nonoverlapping(text.as_ptr(), out.data, n) };
+    }
+}
+
+/// `n` things at `data`, which may be NULL for none.
+unsafe fn many<'a, T>(data: *const T, n: usize) -> &'a [T] {
+    // SAFETY: see the top of this file.
+    if n == 0 { &[] } else { unsafe { slice::from_raw_parts(data, n) } }
+}
+
+/// As [`many`], to be written.
+unsafe fn many_mut<'a, T>(data: *mut T, n: usize) -> &'a mut [T] {
+    // SAFETY: see the top of this file.
+    if n == 0 { &mut [] } else { unsafe { slice::from_raw_parts_mut(data, n) } }
+}
+
+unsafe fn text<'a>(s: ConefieldStr) -> Result<&'a str> {
+    // SAFETY: see the top of this file.
+    let bytes = unsafe { many(s.data, s.length) };
+    std::str::from_utf8(bytes).map_err(|e| Error::unsupported("a text from the host", e.to_string()))
+}
+
+unsafe fn built<'a>(stage: *const c_void) -> &'a Built {
+    // SAFETY: see the top of this file.
+    unsafe { &*stage.cast::<Built>() }
+}
+
+/// Hands a stage over to the host.
+fn hand_over(stage: impl Into<AnyStage>) -> *mut c_void {
+    hand_over_on([0; 3], stage)
+}
+
+/// Hands over what a stage made for a grid of this shape.
+fn hand_over_on(shape: [usize; 3], stage: impl Into<AnyStage>) -> *mut c_void {
+    let mut built = Box::new(Built::of(stage));
+    built.shape = shape;
+    Box::into_raw(built).cast()
+}
+
+pub unsafe extern "C" fn create(
+    context: *const c_void,
+    settings: ConefieldStr,
+    width: usize,
+    stage: *mut *mut c_void,
+    error: *mut ConefieldText,
+) -> ConefieldStatus {
+    guard(error, || {
+        // SAFETY: see the top of this file; `context` is what the table says, a static.
+        let (t, settings) = unsafe { (&*context.cast::<StageType>(), text(settings)?) };
+        let settings = serde_json::from_str(settings).map_err(|e| Error::invalid("spec", "", e, "JSON"))?;
+        let built = Box::new(Built::new(t, settings, width)?);
+        // SAFETY: see the top of this file.
+        unsafe { *stage = Box::into_raw(built).cast() };
+        Ok(())
+    })
+}
+
+pub unsafe extern "C" fn destroy(stage: *mut c_void) {
+    guard(ptr::null_mut(), || {
+        // SAFETY: see the top of this file; the host lets go of it here.
+        drop(unsafe { Box::from_raw(stage.cast::<Built>()) });
+        Ok(())
+    });
+}
+
+pub unsafe extern "C" fn describe(stage: *const c_void, out: *mut ConefieldText) -> ConefieldStatus {
+    guard(out, || {
+        // SAFETY: see the top of this file.
+        write(out, &unsafe { built(stage) }.stage.describe());
+        Ok(())
+    })
+}
+
+shims! {
+    fn wgsl(built: any; source) {
+        let fragment = match &built.stage {
+            AnyStage::Projector(p) => p.wgsl(),
+            AnyStage::Loss(l) => l.wgsl(),
+            AnyStage::Prior(p) => p.wgsl(),
+            _ => built.map()?.0.wgsl(),
+        };
+        let fragment = fragment.ok_or_else(|| Error::unsupported("this stage", "it has no WGSL"))?;
+        write(source, &fragment.source);
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use conefield_core::registry::{Kind, find};
+    use conefield_core::settings::EncoderSpec;
+    use conefield_core::stage::{Encoder, GradKind, Grads, Info, Kernel, Parameter, Scope, Stage, Tile, TileMut};
+    use schemars::JsonSchema;
+    use serde::{Deserialize, Serialize};
+
+    /// `y = w·x`, or a panic.
+    #[derive(Clone, Serialize, Deserialize, JsonSchema)]
+    struct Scaled {
+        panics: bool,
+    }
+
+    conefield_core::stage_type!(Encoder, "scaled", Scaled, "for tests");
+    #[typetag::serde(name = "scaled")]
+    impl EncoderSpec for Scaled {
+        fn build(&self) -> Result<Box<dyn Encoder>> {
+            Ok(Box::new(self.clone()))
+        }
+    }
+
+    impl Kernel<f32> for Scaled {
+        fn forward(&self, params: &[f32], x: Tile<'_, f32>, y: TileMut<'_, f32>, tape: TileMut<'_, f32>) {
+            assert!(!self.panics, "told to, {}", "é".repeat(600));
+            for (y, x) in y.data.iter_mut().zip(x.data) {
+                *y = params[0] * x;
+            }
+            tape.data.copy_from_slice(&x.data[..x.rows]);
+        }
+
+        fn backward(
+            &self,
+            params: &[f32],
+            x: Tile<'_, f32>,
+            tape: TileMut<'_, f32>,
+            dy: Tile<'_, f32>,
+            grads: Grads<'_, f32>,
+            dx: Option<TileMut<'_, f32>>,
+        ) {
+            assert_eq!(*tape.data, x.data[..x.rows]);
+            grads.values[0] += dy.data.iter().zip(x.data).map(|(d, x)| d * x).sum::<f32>();
+            if let Some(dx) = dx {
+                dx.data.iter_mut().zip(dy.data).for_each(|(dx, d)| *dx = params[0] * d);
+            }
+        }
+    }
+
+    impl Stage for Scaled {
+        fn info(&self) -> Info {
+            let (scope, grads) = (Scope::Row, GradKind::Dense);
+            Info { input: 3, output: 3, params: 1, tape: 1, scope, grads, macs: 3, identity: false }
+        }
+        fn parameters(&self) -> Vec<Parameter> {
+            vec![Parameter { name: "w".into(), shape: vec![1], start: 0 }]
+        }
+        fn init(&self, _: u64, params: &mut [f32]) {
+            params.fill(2.0);
+        }
+        fn kernel(&self) -> &dyn Kernel<f32> {
+            self
+        }
+        fn describe(&self) -> String {
+            "scaled".into()
+        }
+    }
+
+    impl Encoder for Scaled {}
+
+    fn made(settings: &str, error: *mut ConefieldText) -> (ConefieldStatus, *mut c_void) {
+        let t = find(Kind::Encoder, "scaled").unwrap();
+        let mut stage = ptr::null_mut();
+        let settings = ConefieldStr::of(settings);
+        let status = unsafe { create(ptr::from_ref(t).cast(), settings, 3, &mut stage, error) };
+        (status, stage)
+    }
+
+    fn room(bytes: &mut [u8]) -> ConefieldText {
+        ConefieldText { data: bytes.as_mut_ptr(), capacity: bytes.len(), length: 0 }
+    }
+
+    /// Rows `0..3` of 3 channels that lie 5 apart; what lies between is -1 and stays so.
+    #[test]
+    fn strided_tiles_are_read_and_written_in_place() {
+        let (status, stage) = made(r#"{"panics": false}"#, ptr::null_mut());
+        assert_eq!(status, CONEFIELD_OK);
+        let spread = |v: [f32; 9]| -> Vec<f32> { v.chunks(3).flat_map(|c| [c[0], c[1], c[2], -1.0, -1.0]).collect() };
+        let x = spread([1., 2., 3., 4., 5., 6., 7., 8., 9.]);
+        let (mut y, mut tape, mut dx) = (vec![-1.0f32; 15], vec![-1.0f32; 5], vec![-1.0f32; 15]);
+        let tile = |v: &[f32], channels| ConefieldTile { data: v.as_ptr(), channels, rows: 3, stride: 5 };
+        let tile_mut =
+            |v: &mut [f32], channels| ConefieldTileMut { data: v.as_mut_ptr(), channels, rows: 3, stride: 5 };
+        let (params, mut grads) = ([2.0f32], [10.0f32]);
+        let none = ptr::null_mut();
+        let (forward, backward) = (MAP.forward.unwrap(), MAP.backward.unwrap());
+        unsafe {
+            let (out, left) = (tile_mut(&mut y, 3), tile_mut(&mut tape, 1));
+            assert_eq!(forward(stage, params.as_ptr(), tile(&x, 3), out, left, none), CONEFIELD_OK);
+            assert_eq!(y, spread([2., 4., 6., 8., 10., 12., 14., 16., 18.]));
+            assert_eq!(tape, [1., 2., 3., -1., -1.]);
+            let dy = spread([1., 0., 0., 0., 1., 0., 0., 0., 1.]);
+            let to = ConefieldGrads { data: grads.as_mut_ptr(), start: 0, length: 1 };
+            let (left, out) = (tile_mut(&mut tape, 1), tile_mut(&mut dx, 3));
+            let status = backward(stage, params.as_ptr(), tile(&x, 3), left, tile(&dy, 3), to, out, none);
+            assert_eq!(status, CONEFIELD_OK);
+            assert_eq!(grads, [10. + 1. + 5. + 9.]);
+            assert_eq!(dx, spread([2., 0., 0., 0., 2., 0., 0., 0., 2.]));
+            destroy(stage);
+        }
+    }
+
+    #[test]
+    fn a_panic_is_a_status_and_a_text_that_fits_its_room() {
+        let (_, stage) = made(r#"{"panics": true}"#, ptr::null_mut());
+        let mut bytes = [0u8; 16];
+        let mut error = room(&mut bytes);
+        let (x, mut y, mut tape) = ([0.5f32; 3], [0.0f32; 3], [0.0f32; 1]);
+        let status = unsafe {
+            MAP.forward.unwrap()(
+                stage,
+                [1.0f32].as_ptr(),
+                ConefieldTile { data: x.as_ptr(), channels: 3, rows: 1, stride: 1 },
+                ConefieldTileMut { data: y.as_mut_ptr(), channels: 3, rows: 1, stride: 1 },
+                ConefieldTileMut { data: tape.as_mut_ptr(), channels: 1, rows: 1, stride: 1 },
+                &mut error,
+            )
+        };
+        assert_eq!((status, error.length), (CONEFIELD_PANICKED, "panicked: told to, ".len() + 1200));
+        assert_eq!(&bytes, b"panicked: told t");
+        unsafe { destroy(stage) };
+    }
+
+    #[test]
+    fn settings_that_do_not_fit_are_refused_in_words() {
+        let mut bytes = [0u8; 200];
+        let mut error = room(&mut bytes);
+        let (status, stage) = made(r#"{"panics": 3}"#, &mut error);
+        assert_eq!(status, CONEFIELD_INVALID);
+        assert!(stage.is_null());
+        let n = error.length;
+        let said = String::from_utf8_lossy(&bytes[..n]);
+        assert!(said.contains("boolean"), "{said}");
+    }
+}

@@ -1,0 +1,75 @@
+//! Projectors.
+
+use super::{built, guard, hand_over, many, many_mut, shims, wgsl};
+use conefield_core::error::Error;
+use conefield_core::stage::{Lengths, Samples, UnitRay};
+use conefield_plugin_abi::*;
+use std::cell::RefCell;
+use std::ffi::c_void;
+use std::ptr;
+
+pub static PROJECTOR: ConefieldProjector = ConefieldProjector {
+    size: size_of::<ConefieldProjector>(),
+    max_samples: Some(max_samples),
+    sample: Some(sample),
+    integrate: Some(integrate),
+    adjoint: Some(adjoint),
+    fitted: Some(fitted),
+    wgsl: Some(wgsl),
+};
+
+/// A ray as stages see it.
+pub(super) fn ray(ray: &ConefieldRay) -> UnitRay {
+    let ConefieldRay { origin, direction, inside, published, per_mm } = *ray;
+    UnitRay { origin, direction, inside, published, per_mm }
+}
+
+thread_local! {
+    /// Samples of a ray, before they are handed over.
+    static SAMPLES: RefCell<Samples> = RefCell::default();
+}
+
+shims! {
+    fn max_samples(projector: projector, at: *const ConefieldRay) -> usize, or 0, { projector.max_samples(&ray(&*at)) }
+
+    fn sample(
+        projector: projector, at: *const ConefieldRay, seed: *const u64, points: *mut f32, weights: *mut f32,
+        capacity: usize, count: *mut usize; error
+    ) {
+        SAMPLES.with_borrow_mut(|samples| {
+            samples.points.clear();
+            samples.weights.clear();
+            projector.sample(&ray(&*at), seed.as_ref().copied(), samples);
+            projector.fault()?;
+            let n = samples.points.len();
+            if n > capacity || samples.weights.len() != n {
+                let why = format!("{n} points and {} weights, room for {capacity}", samples.weights.len());
+                return Err(Error::unsupported("the samples of a ray", why));
+            }
+            many_mut(points.cast::<[f32; 3]>(), n).copy_from_slice(&samples.points);
+            many_mut(weights, n).copy_from_slice(&samples.weights);
+            *count = n;
+            Ok(())
+        })?;
+    }
+
+    fn integrate(projector: projector, weights: *const f32, mu: *const f64, count: usize) -> f64, or f64::NAN, {
+        projector.integrate(many(weights, count), many(mu, count))
+    }
+
+    fn fitted(projector: projector, lengths: *const ConefieldLengths, out: *mut *mut c_void; error) {
+        let ConefieldLengths { voxel_mm, cell_mm } = *lengths;
+        let lengths = Lengths { voxel_mm, cell_mm: (cell_mm > 0.0).then_some(cell_mm) };
+        if let Some(fitted) = projector.fitted(lengths)? {
+            *out = hand_over(fitted);
+        }
+    }
+}
+
+unsafe extern "C" fn adjoint(stage: *const c_void, weights: *const f32, dline: f64, dmu: *mut f64, count: usize) {
+    guard(ptr::null_mut(), || {
+        // SAFETY: see `shims/mod.rs`.
+        unsafe { built(stage).projector()?.adjoint(many(weights, count), dline, many_mut(dmu, count)) };
+        Ok(())
+    });
+}

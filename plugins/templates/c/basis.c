@@ -1,0 +1,116 @@
+/* A basis for conefield in C: a coefficient for each block of voxels. */
+@head@
+
+/* What a spec may set. */
+struct Settings {
+    size_t edge;
+};
+
+/* The blocks of one grid of voxels. */
+struct Blocks {
+    struct ConefieldGrid voxels, blocks;
+    size_t edge;
+};
+
+static ConefieldStatus create(const void *context, struct ConefieldStr settings, size_t width, void **stage,
+                              struct ConefieldText *error) {
+    (void)context;
+    (void)width; /* 0, of a basis */
+    (void)error;
+    struct Settings *s = malloc(sizeof *s);
+    if (s == NULL) return CONEFIELD_FAILED;
+    s->edge = (size_t)number(settings, "edge");
+    *stage = s;
+    return CONEFIELD_OK;
+}
+
+/* Of settings and of what `on` makes. */
+static void destroy(void *stage) {
+    free(stage);
+}
+
+static ConefieldStatus describe(const void *stage, struct ConefieldText *text) {
+    (void)stage;
+    say(text, "blocks of voxels");
+    return CONEFIELD_OK;
+}
+
+static ConefieldStatus on(const void *stage, const struct ConefieldGrid *voxels, void **expansion,
+                          struct ConefieldText *error) {
+    struct Blocks *b = malloc(sizeof *b);
+    if (b == NULL) {
+        say(error, "no memory");
+        return CONEFIELD_FAILED;
+    }
+    *b = (struct Blocks){.voxels = *voxels, .blocks = *voxels, .edge = ((const struct Settings *)stage)->edge};
+    for (size_t k = 0; k < 3; k++) {
+        b->blocks.shape[k] = (voxels->shape[k] + b->edge - 1) / b->edge;
+        b->blocks.spacing[k] = voxels->spacing[k] * (double)b->edge;
+        /* At the far end a block may reach beyond the voxels. */
+        double beyond = (double)(b->blocks.shape[k] * b->edge - voxels->shape[k]) * voxels->spacing[k];
+        b->blocks.center[k] += 0.5 * beyond;
+    }
+    *expansion = b;
+    return CONEFIELD_OK;
+}
+
+static ConefieldStatus info(const void *expansion, struct ConefieldExpansion *info) {
+    const struct Blocks *b = expansion;
+    *info = (struct ConefieldExpansion){.coefficients = b->blocks, .double_precision = 1};
+    return CONEFIELD_OK;
+}
+
+/* The block of voxel `i`. */
+static size_t block(const struct Blocks *b, size_t i) {
+    const size_t *n = b->voxels.shape, *m = b->blocks.shape;
+    size_t x = i / (n[1] * n[2]) / b->edge, y = i / n[2] % n[1] / b->edge, z = i % n[2] / b->edge;
+    return (x * m[1] + y) * m[2] + z;
+}
+
+static size_t count(const struct ConefieldGrid *grid) {
+    return grid->shape[0] * grid->shape[1] * grid->shape[2];
+}
+
+/* Both directions in one precision: voxels of coefficients, and the sum of a block's voxels. */
+#define BOTH(real, expand, adjoint) \
+    static ConefieldStatus expand(const void *expansion, const real *coefficients, real *voxels, struct ConefieldText *error) { \
+        const struct Blocks *b = expansion; \
+        (void)error; \
+        for (size_t i = 0; i < count(&b->voxels); i++) voxels[i] = coefficients[block(b, i)]; \
+        return CONEFIELD_OK; \
+    } \
+    static ConefieldStatus adjoint(const void *expansion, const real *voxels, real *coefficients, struct ConefieldText *error) { \
+        const struct Blocks *b = expansion; \
+        (void)error; \
+        memset(coefficients, 0, count(&b->blocks) * sizeof(real)); \
+        for (size_t i = 0; i < count(&b->voxels); i++) coefficients[block(b, i)] += voxels[i]; \
+        return CONEFIELD_OK; \
+    }
+
+BOTH(float, expand, adjoint)
+BOTH(double, expand_f64, adjoint_f64)
+
+static const struct ConefieldBasis BASIS = {
+    .size = sizeof BASIS,
+    .on = on,
+    .info = info,
+    .expand = expand,
+    .adjoint = adjoint,
+    .expand_f64 = expand_f64,
+    .adjoint_f64 = adjoint_f64,
+};
+
+static const struct ConefieldStage STAGES[] = {{
+    .kind = CONEFIELD_BASIS,
+    .name = TEXT("@name@"),
+    .doc = TEXT("blocks of voxels"),
+    .schema = TEXT(
+        "{\"type\":\"object\",\"properties\":{"
+        "\"edge\":{\"type\":\"integer\",\"minimum\":1,\"maximum\":64,\"default\":2,\"description\":\"Voxels along a block's edge.\"}}}"),
+    .create = create,
+    .destroy = destroy,
+    .describe = describe,
+    .basis = &BASIS,
+}};
+
+@plugin@

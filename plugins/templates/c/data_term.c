@@ -1,0 +1,127 @@
+/* A data term for conefield in C: squares of small residuals, the size of large ones. */
+@head@
+
+/* What a spec may set. */
+struct Settings {
+    double from;
+};
+
+/* The data term of one scan. */
+struct Misfit {
+    double noise, scale;
+};
+
+static ConefieldStatus create(const void *context, struct ConefieldStr settings, size_t width, void **stage,
+                              struct ConefieldText *error) {
+    (void)context;
+    (void)width; /* 0, of a data term */
+    (void)error;
+    struct Settings *s = malloc(sizeof *s);
+    if (s == NULL) return CONEFIELD_FAILED;
+    s->from = number(settings, "from");
+    *stage = s;
+    return CONEFIELD_OK;
+}
+
+/* Of settings and of what `of` makes. */
+static void destroy(void *stage) {
+    free(stage);
+}
+
+static ConefieldStatus describe(const void *stage, struct ConefieldText *text) {
+    (void)stage;
+    say(text, "squares of small residuals, the size of large ones");
+    return CONEFIELD_OK;
+}
+
+static int order(const void *a, const void *b) {
+    float x = *(const float *)a, y = *(const float *)b;
+    return (x > y) - (x < y);
+}
+
+/* Measures the noise: second differences along rows hold little else, and their median is hardly moved by edges. */
+static ConefieldStatus of(const void *stage, const float *measured, const size_t *shape, void **misfit,
+                          struct ConefieldText *error) {
+    size_t rows = shape[0] * shape[1], columns = shape[2], count = 0;
+    struct Misfit *m = malloc(sizeof *m);
+    float *all = malloc(rows * columns * sizeof *all + 1);
+    if (m == NULL || all == NULL) {
+        free(m);
+        free(all);
+        say(error, "no memory");
+        return CONEFIELD_FAILED;
+    }
+    for (size_t r = 0; r < rows; r++) {
+        const float *row = measured + r * columns;
+        for (size_t c = 1; c + 1 < columns; c++) all[count++] = fabsf(row[c - 1] - 2 * row[c] + row[c + 1]);
+    }
+    qsort(all, count, sizeof *all, order);
+    m->noise = count == 0 ? 0 : (double)all[count / 2] / 0.6745 / sqrt(6);
+    m->scale = fmax(((const struct Settings *)stage)->from * m->noise, 1e-6);
+    free(all);
+    *misfit = m;
+    return CONEFIELD_OK;
+}
+
+static void bytes(const void *stage, const size_t *shape, uint64_t *held, uint64_t *brief) {
+    (void)stage;
+    *held = sizeof(struct Misfit);
+    *brief = sizeof(float) * shape[0] * shape[1] * shape[2];
+}
+
+static double noise(const void *misfit) {
+    return ((const struct Misfit *)misfit)->noise;
+}
+
+/* The sum over the pixels of a view; residuals become derivatives. */
+static ConefieldStatus differentiate(const void *misfit, size_t view, const float *measured, size_t count, float *residuals,
+                                     double *sum, struct ConefieldText *error) {
+    (void)view;
+    (void)measured;
+    (void)error;
+    double scale = ((const struct Misfit *)misfit)->scale;
+    *sum = 0;
+    for (size_t i = 0; i < count; i++) {
+        double by = residuals[i] / scale, root = hypot(by, 1);
+        *sum += scale * scale * (by * by / (root + 1));
+        residuals[i] = (float)(residuals[i] / root);
+    }
+    return CONEFIELD_OK;
+}
+
+/* The second derivative is 1 at most, and derivatives scatter at most as the noise does: values stay as they are. */
+static ConefieldStatus as_they_are(const void *misfit, size_t view, const float *measured, size_t count, float *values,
+                                   struct ConefieldText *error) {
+    (void)misfit;
+    (void)view;
+    (void)measured;
+    (void)count;
+    (void)values;
+    (void)error;
+    return CONEFIELD_OK;
+}
+
+static const struct ConefieldDataTerm DATA_TERM = {
+    .size = sizeof DATA_TERM,
+    .bytes = bytes,
+    .of = of,
+    .noise = noise,
+    .differentiate = differentiate,
+    .curve = as_they_are,
+    .spread = as_they_are,
+};
+
+static const struct ConefieldStage STAGES[] = {{
+    .kind = CONEFIELD_DATA_TERM,
+    .name = TEXT("@name@"),
+    .doc = TEXT("squares of small residuals, the size of large ones"),
+    .schema = TEXT(
+        "{\"type\":\"object\",\"properties\":{"
+        "\"from\":{\"type\":\"number\",\"exclusiveMinimum\":0,\"default\":3.0,\"description\":\"From so many standard deviations of the noise on, residuals count by their size.\"}}}"),
+    .create = create,
+    .destroy = destroy,
+    .describe = describe,
+    .data_term = &DATA_TERM,
+}};
+
+@plugin@

@@ -1,0 +1,11 @@
+//! The stage through conefield's conformance kit.
+
+use @crate@::Settings;
+use conefield_conformance::check_data_term;
+use conefield_plugin::prelude::*;
+
+#[test]
+fn it_conforms() {
+    let report = check_data_term(Settings::default().build().unwrap().as_ref());
+    assert!(report.passed(), "{report}");
+}
