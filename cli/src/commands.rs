@@ -12,6 +12,7 @@ mod import;
 mod info;
 mod plugins;
 mod pretrain;
+mod project;
 mod protocol;
 mod reconstruct;
 mod record;
@@ -39,6 +40,7 @@ pub enum Command {
     Pretrain(pretrain::PretrainArgs),
     Evaluate(evaluate::EvaluateArgs),
     Export(export::ExportArgs),
+    Project(project::ProjectArgs),
     Features(features::FeaturesArgs),
     Explain(explain::ExplainArgs),
     Info(info::InfoArgs),
@@ -60,6 +62,7 @@ pub fn run(command: Command, general: &General) -> Result<()> {
         Command::Pretrain(c) => c.run(),
         Command::Evaluate(c) => c.run(),
         Command::Export(c) => c.run(),
+        Command::Project(c) => c.run(),
         Command::Features(c) => c.run(),
         Command::Explain(c) => c.run(),
         Command::Info(c) => c.run(),

@@ -3,7 +3,7 @@
 mod common;
 use common::{conefield, done, refused};
 
-const COMMANDS: [&str; 16] = [
+const COMMANDS: [&str; 17] = [
     "simulate",
     "import",
     "reconstruct",
@@ -12,6 +12,7 @@ const COMMANDS: [&str; 16] = [
     "pretrain",
     "evaluate",
     "export",
+    "project",
     "features",
     "explain",
     "info",
@@ -95,6 +96,7 @@ fn wrong_use_exits_with_2() {
         (&["features", "r", "-o", "f.png", "--after", "field"], "normalizers"),
         (&["--threads", "0", "backends"], "--threads"),
         (&["pretrain", "--spec", "naf", "-o", "w"], "<VOLUME>"),
+        (&["project", "v.nii", "-o", "p"], "--like <SCAN>"),
     ] {
         let said = refused(2, args);
         assert!(said.contains(want), "{args:?}: {said}");
