@@ -2,6 +2,7 @@
 
 mod backends;
 mod compare;
+mod completions;
 mod convert;
 mod demo;
 mod evaluate;
@@ -48,6 +49,7 @@ pub enum Command {
     Backends(backends::BackendsArgs),
     Plugins(plugins::PluginsArgs),
     Schema(schema::SchemaArgs),
+    Completions(completions::CompletionsArgs),
     Demo(demo::DemoArgs),
 }
 
@@ -70,6 +72,7 @@ pub fn run(command: Command, general: &General) -> Result<()> {
         Command::Backends(c) => c.run(),
         Command::Plugins(c) => c.run(),
         Command::Schema(c) => c.run(),
+        Command::Completions(c) => c.run(),
         Command::Demo(c) => c.run(),
     }
 }

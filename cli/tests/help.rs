@@ -3,7 +3,7 @@
 mod common;
 use common::{conefield, done, refused};
 
-const COMMANDS: [&str; 17] = [
+const COMMANDS: [&str; 18] = [
     "simulate",
     "import",
     "reconstruct",
@@ -20,6 +20,7 @@ const COMMANDS: [&str; 17] = [
     "backends",
     "plugins",
     "schema",
+    "completions",
     "demo",
 ];
 
@@ -60,6 +61,24 @@ fn lists_of_specs_and_stage_types_are_whole() {
     for table in done(&["schema", "--tables"]).trim().split("\n\n") {
         assert!(readme.contains(table), "README.md: put in what `conefield schema --tables` prints:\n{table}");
     }
+}
+
+#[test]
+fn shells_and_man_know_every_command() {
+    for shell in ["bash", "zsh", "fish", "powershell", "elvish"] {
+        let script = done(&["completions", shell]);
+        for word in COMMANDS.iter().chain(&["--hold-out"]) {
+            assert!(script.contains(word), "{shell}: {word}");
+        }
+    }
+    let dir = tempfile::tempdir().unwrap();
+    let folder = common::text(&dir.path().join("man1"));
+    done(&["completions", "--man", &folder]);
+    let page = |name: &str| std::fs::read_to_string(dir.path().join("man1").join(name)).unwrap();
+    assert!(page("conefield.1").contains("conefield\\-reconstruct"));
+    assert!(page("conefield-reconstruct.1").contains("hold\\-out"));
+    assert!(refused(1, &["completions", "--man", &folder]).contains("--force"));
+    assert!(refused(2, &["completions", "tcsh"]).contains("fish"));
 }
 
 #[test]

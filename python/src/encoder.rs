@@ -3,7 +3,7 @@
 //! Python's lock is taken once for each batch of rows, and one batch is worked on at a time: this is for trying out an idea,
 //! not for speed.
 
-use crate::stages::{failed, note, words};
+use crate::stages::{Raised, words};
 use conefield_core::error::ensure;
 use conefield_core::simd::Real;
 use conefield_core::stage::{Encoder, GradKind, Grads, Info, Kernel, Parameter, Reduced, Scope, Stage, Tile, TileMut};
@@ -32,6 +32,7 @@ struct Shared {
     double: bool,
     coarse_to_fine: bool,
     resolutions: Option<Vec<f64>>,
+    raised: Arc<Raised>,
 }
 
 /// An encoder of a Python object, perhaps without some of its channels.
@@ -44,7 +45,12 @@ pub struct PythonEncoder {
 
 impl PythonEncoder {
     /// Tries the object out on a few points, to learn its widths. The outer error is an exception of the object.
-    pub fn new(py: Python<'_>, name: &'static str, object: Py<PyAny>) -> PyResult<Result<Self>> {
+    pub fn new(
+        py: Python<'_>,
+        name: &'static str,
+        object: Py<PyAny>,
+        raised: Arc<Raised>,
+    ) -> PyResult<Result<Self>> {
         let own = object.bind(py);
         let mut shared = Shared {
             name,
@@ -56,6 +62,7 @@ impl PythonEncoder {
             double: false,
             coarse_to_fine: optional(own, "coarse_to_fine")?.unwrap_or(false),
             resolutions: optional(own, "resolutions")?,
+            raised,
         };
         if let Some(params) = optional::<Bound<'_, PyDict>>(own, "params")? {
             for (key, value) in params.iter() {
@@ -95,7 +102,7 @@ impl PythonEncoder {
 
     /// Does `call` with Python's lock, one at a time; nothing where it or another stage has failed.
     fn call<T>(&self, call: impl FnOnce(Python<'_>) -> PyResult<T>) -> Option<T> {
-        if failed() {
+        if self.shared.raised.any() {
             return None;
         }
         let _turn = self.shared.turn.lock().unwrap_or_else(PoisonError::into_inner);
@@ -104,7 +111,7 @@ impl PythonEncoder {
             Err(e) => {
                 let what = Error::unsupported(self.shared.name, words(py, &e));
                 self.fault.lock().unwrap_or_else(PoisonError::into_inner).get_or_insert(what);
-                note(e);
+                self.shared.raised.note(e);
                 None
             }
         })

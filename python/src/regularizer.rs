@@ -1,6 +1,6 @@
 //! A regularizer whose arithmetic is a Python object's: a proximal map, or a denoiser that is put in its place.
 
-use crate::stages::{failed, note};
+use crate::stages::Raised;
 use conefield_core::error::ensure;
 use conefield_core::geometry::VoxelGrid;
 use conefield_core::regularizer::{Penalty, Regularizer};
@@ -29,6 +29,7 @@ struct Shared {
     weight: Weight,
     /// Whether the object tells the value of what it is the proximal map of.
     has_value: bool,
+    raised: Arc<Raised>,
 }
 
 /// A regularizer of a Python object.
@@ -36,7 +37,12 @@ pub struct PythonRegularizer(Arc<Shared>);
 
 impl PythonRegularizer {
     /// The outer error is an exception of the object.
-    pub fn new(py: Python<'_>, name: &'static str, object: Py<PyAny>) -> PyResult<Result<Self>> {
+    pub fn new(
+        py: Python<'_>,
+        name: &'static str,
+        object: Py<PyAny>,
+        raised: Arc<Raised>,
+    ) -> PyResult<Result<Self>> {
         let own = object.bind(py);
         let number = |key: &str| -> PyResult<Option<f64>> {
             own.getattr_opt(key)?.filter(|v| !v.is_none()).map(|v| v.extract()).transpose()
@@ -57,7 +63,7 @@ impl PythonRegularizer {
             return Ok(Err(Error::invalid("spec", "prox", "no such method", "prox(v, tau), an array like v")));
         }
         let has_value = own.hasattr("value")?;
-        Ok(Ok(Self(Arc::new(Shared { name, object, turn: Mutex::new(()), weight, has_value }))))
+        Ok(Ok(Self(Arc::new(Shared { name, object, turn: Mutex::new(()), weight, has_value, raised }))))
     }
 }
 
@@ -94,14 +100,14 @@ struct On {
 impl On {
     /// Does `call` with Python's lock, one at a time; nothing where it or another stage has failed.
     fn call<T>(&self, call: impl FnOnce(Python<'_>, &Bound<'_, PyAny>) -> PyResult<T>) -> Option<T> {
-        if failed() {
+        if self.shared.raised.any() {
             return None;
         }
         let _turn = self.shared.turn.lock().unwrap_or_else(PoisonError::into_inner);
         Python::attach(|py| {
             let object = self.shared.object.bind(py);
             let called = object.setattr("spacing", self.grid.spacing).and_then(|()| call(py, object));
-            called.map_err(note).ok()
+            called.map_err(|e| self.shared.raised.note(e)).ok()
         })
     }
 

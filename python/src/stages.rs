@@ -16,8 +16,9 @@ use pyo3::prelude::*;
 use pyo3::types::PyDict;
 use serde::{Serialize, Serializer};
 use serde_json::{Value, json};
+use std::cell::RefCell;
 use std::collections::BTreeMap;
-use std::sync::{Mutex, MutexGuard, PoisonError};
+use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 
 /// Who brings these types, in messages.
 const OWNER: &str = "Python";
@@ -26,31 +27,42 @@ const OWNER: &str = "Python";
 /// of the old one.
 static CLASSES: Mutex<BTreeMap<(Kind, String), Py<PyAny>>> = Mutex::new(BTreeMap::new());
 
-/// What a stage in Python raised while Rust was at work. A kernel has no result to hand it on in.
-static RAISED: Mutex<Option<PyErr>> = Mutex::new(None);
-
 fn locked<T>(mutex: &Mutex<T>) -> MutexGuard<'_, T> {
     mutex.lock().unwrap_or_else(PoisonError::into_inner)
 }
 
-/// Keeps the first exception of a stage.
-pub fn note(error: PyErr) {
-    locked(&RAISED).get_or_insert(error);
+/// What stages in Python have raised during one work of Rust's. A kernel has no result to hand it on in.
+#[derive(Default)]
+pub struct Raised(Mutex<Option<PyErr>>);
+
+impl Raised {
+    /// Keeps the first exception.
+    pub fn note(&self, error: PyErr) {
+        locked(&self.0).get_or_insert(error);
+    }
+
+    /// Whether there is one.
+    pub fn any(&self) -> bool {
+        locked(&self.0).is_some()
+    }
+
+    /// The exception, once.
+    pub fn take(&self) -> Option<PyErr> {
+        locked(&self.0).take()
+    }
 }
 
-/// Whether a stage has raised.
-pub fn failed() -> bool {
-    locked(&RAISED).is_some()
+thread_local! {
+    /// Of the work that this thread is at: stages that are made in it note there what they raise.
+    static CURRENT: RefCell<Arc<Raised>> = RefCell::default();
 }
 
-/// What a stage has raised, once.
-pub fn raised() -> Option<PyErr> {
-    locked(&RAISED).take()
-}
-
-/// Forgets what stages have raised.
-pub fn forget() {
-    raised();
+/// Does `work` with a place of its own for what its stages raise.
+pub fn within<T>(raised: &Arc<Raised>, work: impl FnOnce() -> T) -> T {
+    let before = CURRENT.replace(raised.clone());
+    let done = work();
+    CURRENT.set(before);
+    done
 }
 
 /// The kind of a stage that can be written in Python.
@@ -145,7 +157,7 @@ macro_rules! named {
 impl EncoderSpec for Written {
     fn build(&self) -> Result<Box<dyn Encoder>> {
         let object = self.object(Kind::Encoder)?;
-        Python::attach(|py| match PythonEncoder::new(py, self.name, object) {
+        Python::attach(|py| match PythonEncoder::new(py, self.name, object, CURRENT.with_borrow(Arc::clone)) {
             Ok(encoder) => Ok(Box::new(encoder?) as Box<dyn Encoder>),
             Err(e) => Err(Error::unsupported(self.name, words(py, &e))),
         })
@@ -157,7 +169,7 @@ impl EncoderSpec for Written {
 impl RegularizerSpec for Written {
     fn build(&self) -> Result<Box<dyn Regularizer>> {
         let object = self.object(Kind::Regularizer)?;
-        Python::attach(|py| match PythonRegularizer::new(py, self.name, object) {
+        Python::attach(|py| match PythonRegularizer::new(py, self.name, object, CURRENT.with_borrow(Arc::clone)) {
             Ok(regularizer) => Ok(Box::new(regularizer?) as Box<dyn Regularizer>),
             Err(e) => Err(Error::unsupported(self.name, words(py, &e))),
         })

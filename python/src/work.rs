@@ -1,7 +1,7 @@
 //! Work without Python's lock: Ctrl-C ends it cleanly, a callback sees how it goes, and no panic crosses into Python.
 
 use crate::errors::{broken, raised};
-use crate::stages;
+use crate::stages::{Raised, within};
 use conefield_core::Result;
 use conefield_core::geometry::VoxelGrid;
 use conefield_core::method::{Observer, Record};
@@ -11,7 +11,7 @@ use numpy::IntoPyArray;
 use pyo3::prelude::*;
 use pyo3::types::PyList;
 use std::panic::{AssertUnwindSafe, catch_unwind};
-use std::sync::{Mutex, PoisonError};
+use std::sync::{Arc, Mutex, PoisonError};
 use std::time::{Duration, Instant};
 use tracing::info;
 
@@ -22,13 +22,14 @@ const LOOK: Duration = Duration::from_millis(20);
 pub struct Watch {
     looked: Mutex<Instant>,
     stopped: Mutex<Option<PyErr>>,
+    raised: Arc<Raised>,
 }
 
 impl Watch {
     /// Whether to end.
     pub fn cancelled(&self) -> bool {
         let stopped = || self.stopped.lock().unwrap_or_else(PoisonError::into_inner);
-        if stopped().is_some() || stages::failed() {
+        if stopped().is_some() || self.raised.any() {
             return true;
         }
         let mut looked = self.looked.lock().unwrap_or_else(PoisonError::into_inner);
@@ -54,11 +55,11 @@ impl Watch {
 /// Does `work` without Python's lock. An exception of a callback, a stage or a signal handler goes before the error that
 /// ending the work gives.
 pub fn without_lock<T: Send>(py: Python<'_>, work: impl FnOnce(&Watch) -> Result<T> + Send) -> PyResult<T> {
-    stages::forget();
-    let watch = Watch { looked: Mutex::new(Instant::now()), stopped: Mutex::new(None) };
-    let done = py.detach(|| catch_unwind(AssertUnwindSafe(|| work(&watch))));
+    let (looked, stopped) = (Mutex::new(Instant::now()), Mutex::new(None));
+    let watch = Watch { looked, stopped, raised: Arc::default() };
+    let done = py.detach(|| within(&watch.raised, || catch_unwind(AssertUnwindSafe(|| work(&watch)))));
     let stopped = watch.stopped.into_inner().unwrap_or_else(PoisonError::into_inner);
-    if let Some(e) = stopped.or_else(stages::raised) {
+    if let Some(e) = stopped.or_else(|| watch.raised.take()) {
         return Err(e);
     }
     match done {
