@@ -2,6 +2,7 @@
 
 mod common;
 use common::{done, json, refused, text};
+use conefield_core::geometry::View;
 use conefield_io::{read_scan, read_volume, write_volume};
 use std::fs;
 use std::path::Path;
@@ -12,6 +13,13 @@ fn simulate(folder: &Path) -> String {
     let scan = text(&folder.join("scan"));
     done(&["simulate", "phantom:head:24", "-o", &scan, "--views", "7", "--detector", "20x28", "--offset", "0,3"]);
     scan
+}
+
+/// Whether the views are the same but for rounding: a file has an orbit's numbers.
+fn alike(a: &[View], b: &[View]) -> bool {
+    let numbers = |v: &View| [v.source, v.detector, v.u, v.v].concat();
+    let near = |(a, b): (&View, &View)| numbers(a).iter().zip(numbers(b)).all(|(a, b)| (a - b).abs() < 1e-9);
+    a.len() == b.len() && a.iter().zip(b).all(near)
 }
 
 #[test]
@@ -33,8 +41,8 @@ fn the_truth_explains_its_scan_and_nothing_else_does() {
 
     let [measured, predicted, residual] =
         [&scan, &at("true"), &at("true-residual")].map(|folder| read_scan(folder).unwrap());
-    assert_eq!(predicted.geometry, measured.geometry);
-    assert_eq!(predicted.unit, measured.unit);
+    assert!(alike(&predicted.geometry.views, &measured.geometry.views));
+    assert_eq!((predicted.geometry.volume, &predicted.unit), (measured.geometry.volume, &measured.unit));
     assert!(residual.projections == &measured.projections - &predicted.projections);
     let rms = (residual.projections.iter().map(|x| f64::from(*x).powi(2)).sum::<f64>()
         / residual.projections.len() as f64)
@@ -57,10 +65,10 @@ fn the_truth_explains_its_scan_and_nothing_else_does() {
     // Another projector and some views.
     let two = ["--views", "1,4", "--projector", "siddon", "--json"];
     let out = at("two");
-    let said = json(&[&["project", &truth, "--like", &scan, "-o", &out], &two[..]].concat());
+    let said = json(&[&["project", &truth, "--like", &scan, "-o", &out][..], &two].concat());
     assert!(said["views"] == 2 && said["residual_relative"].as_f64().unwrap() < 0.05, "{said}");
     let two = read_scan(&out).unwrap();
-    assert_eq!(two.geometry.views, [1, 4].map(|v| measured.geometry.views[v]));
+    assert!(alike(&two.geometry.views, &[1, 4].map(|v| measured.geometry.views[v])));
 
     // What is left is told for people too, and the result is a scan for every command.
     let said = done(&["project", &truth, "--like", &scan, "-o", &out, "--force"]);
@@ -77,7 +85,7 @@ fn bad_input_is_refused_before_anything_is_written() {
     fs::write(at("text.nii"), "no volume").unwrap();
     let out = at("out");
     let run = |volume: &str, like: &str, more: &[&str]| {
-        let said = refused(1, &[&["project", volume, "--like", like, "-o", &out], more].concat());
+        let said = refused(1, &[&["project", volume, "--like", like, "-o", &out][..], more].concat());
         assert!(!Path::new(&out).exists(), "{said}");
         said
     };
@@ -96,7 +104,7 @@ fn bad_input_is_refused_before_anything_is_written() {
     }
     // What is read is not replaced, whatever is forced.
     let said = refused(1, &["project", &truth, "--like", &scan, "-o", &scan, "--force"]);
-    assert!(said.contains("which this command reads"), "{said}");
+    assert!(said.contains("this command reads"), "{said}");
     let said = refused(1, &["--memory", "1MiB", "project", &truth, "--like", &scan, "-o", &out]);
     assert!(said.contains("--memory allows 1.0 MiB"), "{said}");
 }

@@ -45,12 +45,7 @@ pub struct PythonEncoder {
 
 impl PythonEncoder {
     /// Tries the object out on a few points, to learn its widths. The outer error is an exception of the object.
-    pub fn new(
-        py: Python<'_>,
-        name: &'static str,
-        object: Py<PyAny>,
-        raised: Arc<Raised>,
-    ) -> PyResult<Result<Self>> {
+    pub fn new(py: Python<'_>, name: &'static str, object: Py<PyAny>, raised: Arc<Raised>) -> PyResult<Result<Self>> {
         let own = object.bind(py);
         let mut shared = Shared {
             name,

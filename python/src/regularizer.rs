@@ -37,12 +37,7 @@ pub struct PythonRegularizer(Arc<Shared>);
 
 impl PythonRegularizer {
     /// The outer error is an exception of the object.
-    pub fn new(
-        py: Python<'_>,
-        name: &'static str,
-        object: Py<PyAny>,
-        raised: Arc<Raised>,
-    ) -> PyResult<Result<Self>> {
+    pub fn new(py: Python<'_>, name: &'static str, object: Py<PyAny>, raised: Arc<Raised>) -> PyResult<Result<Self>> {
         let own = object.bind(py);
         let number = |key: &str| -> PyResult<Option<f64>> {
             own.getattr_opt(key)?.filter(|v| !v.is_none()).map(|v| v.extract()).transpose()

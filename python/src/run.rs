@@ -206,6 +206,7 @@ pub fn reconstruct<'py>(
         let job = input.job(backend.as_ref(), wanted.seed, limits, schedule.as_ref());
         let job = Job { start: start.as_ref(), ..job };
         let solution = plan.run(&job, &mut progress).map_err(|e| loaded.locate(e))?;
+        progress.finish();
         let mut volume = collect(solution.result.voxels(backend.as_ref())?.as_mut(), &|| watch.cancelled())?;
         let reference = input.reference.as_ref();
         volume.affine = volume.affine.or(reference.and_then(|r| r.affine));
@@ -269,6 +270,7 @@ pub fn pretrain<'py>(
         let job = PretrainJob { volumes: &volumes, backend: backend.as_ref(), seed, limits };
         let mut progress = Progress::new(watch, function);
         let weights = pretraining::train(&loaded, plan.as_mut(), &job, &mut progress)?;
+        progress.finish();
         files::write_weights(&output, &weights)?;
         let last = progress.records().last().cloned().unwrap_or_default();
         let numbers: usize = weights.tensors.values().map(|t| t.1.len()).sum();

@@ -90,11 +90,13 @@ pub struct Progress<'a> {
     records: Vec<Record>,
     /// Records that the callback has seen.
     seen: usize,
+    /// The last finished step.
+    step: u64,
 }
 
 impl<'a> Progress<'a> {
     pub fn new(watch: &'a Watch, callback: Option<Callback>) -> Self {
-        Self { watch, callback, told: None, slices: None, records: vec![], seen: 0 }
+        Self { watch, callback, told: None, slices: None, records: vec![], seen: 0, step: 0 }
     }
 
     /// The records so far.
@@ -102,29 +104,38 @@ impl<'a> Progress<'a> {
         &self.records
     }
 
+    /// The run is done: the callback sees the records that it has not seen.
+    pub fn finish(&mut self) {
+        let step = self.records.last().map_or(self.step, |r| r.step.max(self.step));
+        self.tell(step, 1.0, 0.0);
+    }
+
     fn due(&self) -> bool {
         let wait = self.callback.as_ref().map_or(Duration::MAX, |c| c.every);
         self.callback.is_some() && self.told.is_none_or(|t| t.elapsed() >= wait)
     }
-}
 
-impl Observer for Progress<'_> {
-    fn progress(&mut self, step: u64, share: f64, seconds_left: f64) {
-        // The last step is told of in any case.
-        if !(self.due() || (share >= 1.0 && self.callback.is_some())) {
-            return;
-        }
+    fn tell(&mut self, step: u64, share: f64, seconds_left: f64) {
+        let Some(callback) = &self.callback else { return };
         self.told = Some(Instant::now());
         let new = serde_json::to_string(&self.records[self.seen..]).unwrap_or_else(|_| "[]".into());
         self.seen = self.records.len();
         let slices = self.slices.take();
-        let Some(callback) = &self.callback else { return };
         let called = Python::attach(|py| -> PyResult<()> {
             let slices = slices.map(|s| PyList::new(py, s.map(|a| a.into_pyarray(py)))).transpose()?;
             callback.function.call1(py, (step, share, seconds_left, new, slices)).map(drop)
         });
         if let Err(e) = called {
             self.watch.stop(e);
+        }
+    }
+}
+
+impl Observer for Progress<'_> {
+    fn progress(&mut self, step: u64, share: f64, seconds_left: f64) {
+        self.step = step;
+        if self.due() {
+            self.tell(step, share, seconds_left);
         }
     }
 

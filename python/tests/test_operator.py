@@ -78,7 +78,7 @@ def test_tilts_and_offsets_are_as_documented():
     skewed = conefield.circular(**flat, tilt=(0, 0, np.pi / 2)).vectors.reshape(4, 3)
     np.testing.assert_allclose(skewed[2], v / 2, atol=1e-12)
     np.testing.assert_allclose(skewed[3], -2 * u, atol=1e-12)
-    assert plain.orbit()[:2] == (100.0, pytest.approx(150.0))
+    assert plain.orbit()[:2] == pytest.approx((100.0, 150.0))
     assert conefield.circular(**flat, tilt=(0.1, 0, 0)).orbit() is None
 
 

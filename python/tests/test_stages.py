@@ -5,6 +5,9 @@ import pytest
 
 import conefield
 
+# The kit also hands over infinities, which must stay in their rows.
+pytestmark = pytest.mark.filterwarnings("ignore:invalid value")
+
 
 @conefield.encoder("test-waves")
 class Waves:
@@ -72,10 +75,10 @@ def test_the_kit_finds_a_wrong_gradient():
 
 def test_a_field_trains_with_it(scan):
     spec = {"extends": "fast", "name": "waves", **FIELD}
-    seen = []
-    result = conefield.reconstruct(scan, spec, steps=60, callback=seen.append, every=0)
-    losses = [r["loss"] for p in seen for r in p.records]
-    assert losses[-1] < 0.7 * losses[0], losses
+    before = conefield.reconstruct(scan, spec, steps=3)
+    result = conefield.reconstruct(scan, spec, steps=60)
+    # The loss is a mean over all steps.
+    assert result.record["loss"] < 0.8 * before.record["loss"]
     assert "test-waves" in result.record["spec_toml"]
     assert "test-waves" in str(conefield.plan(spec))
     again = conefield.reconstruct(scan, spec, steps=60)
@@ -124,13 +127,13 @@ def test_a_denoiser_is_a_prior(scan):
         """A Gaussian filter."""
 
         def prox(self, v, tau):
-            return ndimage.gaussian_filter(v, 0.4)
+            return v + 0.1 * (ndimage.gaussian_filter(v, 0.6) - v)
 
-    spec = {"type": "fista", "prior": "test-gaussian", "stop": {"passes": 4}}
-    plain = conefield.reconstruct(scan, {"type": "fista", "stop": {"passes": 4}}, reference="truth")
-    result = conefield.reconstruct(scan, spec, reference="truth")
-    assert result.scores["psnr"] > plain.scores["psnr"]
-    assert "a denoiser written in Python" in str(conefield.plan(spec))
+    plain, prior = [{"type": "fista", "prior": p, "stop": {"passes": 12}} for p in ("none", "test-gaussian")]
+    noisy = conefield.simulate("phantom:head:24", views=20, detector=(36, 36), noise="poisson:200", seed=1)
+    without, result = [conefield.reconstruct(noisy, spec, reference="truth") for spec in (plain, prior)]
+    assert result.scores["psnr"] > without.scores["psnr"] + 3, (result, without)
+    assert "a denoiser written in Python" in str(conefield.plan(prior))
 
 
 def test_a_class_that_is_registered_again_takes_its_place():
