@@ -2,6 +2,7 @@
 
 mod backends;
 mod compare;
+mod completions;
 mod convert;
 mod demo;
 mod evaluate;
@@ -12,6 +13,7 @@ mod import;
 mod info;
 mod plugins;
 mod pretrain;
+mod project;
 mod protocol;
 mod reconstruct;
 mod record;
@@ -39,6 +41,7 @@ pub enum Command {
     Pretrain(pretrain::PretrainArgs),
     Evaluate(evaluate::EvaluateArgs),
     Export(export::ExportArgs),
+    Project(project::ProjectArgs),
     Features(features::FeaturesArgs),
     Explain(explain::ExplainArgs),
     Info(info::InfoArgs),
@@ -46,6 +49,7 @@ pub enum Command {
     Backends(backends::BackendsArgs),
     Plugins(plugins::PluginsArgs),
     Schema(schema::SchemaArgs),
+    Completions(completions::CompletionsArgs),
     Demo(demo::DemoArgs),
 }
 
@@ -60,6 +64,7 @@ pub fn run(command: Command, general: &General) -> Result<()> {
         Command::Pretrain(c) => c.run(),
         Command::Evaluate(c) => c.run(),
         Command::Export(c) => c.run(),
+        Command::Project(c) => c.run(),
         Command::Features(c) => c.run(),
         Command::Explain(c) => c.run(),
         Command::Info(c) => c.run(),
@@ -67,6 +72,7 @@ pub fn run(command: Command, general: &General) -> Result<()> {
         Command::Backends(c) => c.run(),
         Command::Plugins(c) => c.run(),
         Command::Schema(c) => c.run(),
+        Command::Completions(c) => c.run(),
         Command::Demo(c) => c.run(),
     }
 }

@@ -1,30 +1,20 @@
 //! The `conefield` command, one module a subcommand, and the specs that come with it.
 
-mod backend;
 mod boundary;
 mod commands;
-mod files;
 mod live;
 mod log;
-mod memory;
-mod method;
 mod out;
 mod outgoing;
-mod parse;
 mod pca;
-mod plugins;
 mod progress;
 mod run_folder;
 mod segmenter;
 mod signals;
-pub mod specs;
 mod table;
 
-// Stage types register themselves when their crate is linked.
-use {
-    conefield_encoders as _, conefield_fields as _, conefield_initializers as _, conefield_normalizers as _,
-    conefield_projectors as _, conefield_solvers as _,
-};
+pub use conefield_run::specs;
+use conefield_run::{backend, files, memory, method, parse, plugins};
 
 use clap::Parser;
 use conefield_core::Error;

@@ -3,7 +3,7 @@
 mod common;
 use common::{conefield, done, refused};
 
-const COMMANDS: [&str; 16] = [
+const COMMANDS: [&str; 18] = [
     "simulate",
     "import",
     "reconstruct",
@@ -12,6 +12,7 @@ const COMMANDS: [&str; 16] = [
     "pretrain",
     "evaluate",
     "export",
+    "project",
     "features",
     "explain",
     "info",
@@ -19,6 +20,7 @@ const COMMANDS: [&str; 16] = [
     "backends",
     "plugins",
     "schema",
+    "completions",
     "demo",
 ];
 
@@ -62,6 +64,24 @@ fn lists_of_specs_and_stage_types_are_whole() {
 }
 
 #[test]
+fn shells_and_man_know_every_command() {
+    for shell in ["bash", "zsh", "fish", "powershell", "elvish"] {
+        let script = done(&["completions", shell]);
+        for word in COMMANDS.iter().chain(&["hold-out"]) {
+            assert!(script.contains(word), "{shell}: {word}");
+        }
+    }
+    let dir = tempfile::tempdir().unwrap();
+    let folder = common::text(&dir.path().join("man1"));
+    done(&["completions", "--man", &folder]);
+    let page = |name: &str| std::fs::read_to_string(dir.path().join("man1").join(name)).unwrap();
+    assert!(page("conefield.1").contains("conefield\\-reconstruct"));
+    assert!(page("conefield-reconstruct.1").contains("hold\\-out"));
+    assert!(refused(1, &["completions", "--man", &folder]).contains("--force"));
+    assert!(refused(2, &["completions", "tcsh"]).contains("fish"));
+}
+
+#[test]
 fn version_is_told() {
     assert_eq!(done(&["--version"]).trim(), concat!("conefield ", env!("CARGO_PKG_VERSION")));
 }
@@ -95,6 +115,7 @@ fn wrong_use_exits_with_2() {
         (&["features", "r", "-o", "f.png", "--after", "field"], "normalizers"),
         (&["--threads", "0", "backends"], "--threads"),
         (&["pretrain", "--spec", "naf", "-o", "w"], "<VOLUME>"),
+        (&["project", "v.nii", "-o", "p"], "--like <SCAN>"),
     ] {
         let said = refused(2, args);
         assert!(said.contains(want), "{args:?}: {said}");

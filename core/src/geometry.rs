@@ -56,6 +56,18 @@ impl View {
         }
     }
 
+    /// The same view with its detector turned about its centre: right-handed about `u`, about `v` and about `u × v`, which
+    /// points away from the source; about the last first, each about the axis that was there before.
+    pub fn tilted(&self, [about_u, about_v, about_normal]: [Radians; 3]) -> Self {
+        let unit = |a: Vec3| a.map(|x| x / norm(a));
+        let axes = [(cross(self.u, self.v), about_normal), (self.v, about_v), (self.u, about_u)];
+        let turned = |a: Vec3| axes.into_iter().fold(a, |a, (axis, angle)| turned(a, unit(axis), angle));
+        if [about_u, about_v, about_normal] == [Radians(0.0); 3] {
+            return *self;
+        }
+        Self { u: turned(self.u), v: turned(self.v), ..*self }
+    }
+
     /// The point on the detector at the (possibly fractional) pixel `row`, `column` of a detector of `shape`
     /// rows × columns; whole numbers are pixel centres.
     pub fn pixel(&self, shape: [usize; 2], row: f64, column: f64) -> Vec3 {
@@ -298,6 +310,13 @@ pub fn cross(a: Vec3, b: Vec3) -> Vec3 {
     [a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]]
 }
 
+/// `a` turned right-handed about the unit vector `axis` (Rodrigues).
+fn turned(a: Vec3, axis: Vec3, Radians(angle): Radians) -> Vec3 {
+    let (s, c) = angle.sin_cos();
+    let (across, along) = (cross(axis, a), dot(axis, a) * (1.0 - c));
+    std::array::from_fn(|k| a[k] * c + across[k] * s + axis[k] * along)
+}
+
 /// Difference `a − b`.
 pub fn sub(a: Vec3, b: Vec3) -> Vec3 {
     std::array::from_fn(|k| a[k] - b[k])
@@ -335,6 +354,23 @@ mod tests {
         assert_eq!((n, d), ([-1.0, 0.0, 0.0], 150.0));
         // First pixel: half of 6 columns to the left, half of 4 rows up.
         assert_eq!(v.pixel([4, 6], 0.0, 0.0), [-50.0, -2.5, 3.0]);
+    }
+
+    #[test]
+    fn a_detector_turns_about_its_own_axes() {
+        let view = geometry().views[0];
+        let near = |a: Vec3, b: Vec3| assert!(norm(sub(a, b)) < 1e-12, "{a:?} {b:?}");
+        assert_eq!(view.tilted([Radians(0.0); 3]), view);
+        let quarter = Radians(std::f64::consts::FRAC_PI_2);
+        // u is y, v is -z: a quarter about the normal u × v (-x) brings u to v and v to -u.
+        let skewed = view.tilted([Radians(0.0), Radians(0.0), quarter]);
+        near(skewed.u, [0.0, 0.0, -1.0]);
+        near(skewed.v, [0.0, -2.0, 0.0]);
+        assert_eq!((skewed.source, skewed.detector), (view.source, view.detector));
+        // About u only v turns, and its length stays.
+        let pitched = view.tilted([quarter, Radians(0.0), Radians(0.0)]);
+        near(pitched.u, view.u);
+        near(pitched.v, [-2.0, 0.0, 0.0]);
     }
 
     #[test]

@@ -1,6 +1,5 @@
 //! `conefield demo`
 
-use super::evaluate::score;
 use crate::boundary::refuse_existing;
 use crate::progress::Progress;
 use crate::table::{SCORES, Table, cells_of};
@@ -14,6 +13,7 @@ use conefield_io::ScanSize;
 use conefield_metrics::Scores;
 use conefield_projectors::simulate::{DetectorNoise, Protocol, phantom, simulate};
 use conefield_report::MiddleSlices;
+use conefield_run::score::score;
 use serde::Serialize;
 use serde_json::json;
 use std::path::PathBuf;
@@ -131,7 +131,9 @@ impl DemoArgs {
         // What is simulated from and the first two results are held beside the run's own.
         let size = ScanSize { pixels, voxels, test_pixels: 0, reading: 12 * voxels, views };
         let run = memory::Run { reference: true, ..memory::Run::on(size) };
-        [VOXELS, FIELD].iter().try_for_each(|spec| method::planned(spec, &[], &Cpu::new(), &run).map(drop))
+        [VOXELS, FIELD].iter().try_for_each(|spec| {
+            method::planned(&|sets| specs::read(spec, sets), &[], None, &Cpu::new(), &run).map(drop)
+        })
     }
 
     fn compete(

@@ -2,13 +2,11 @@
 
 use crate::backend::{self, BackendChoice};
 use crate::memory::{self, Memory};
-use crate::{files, method, out, plugins, specs};
+use crate::{files, method, out, specs};
 use clap::Args;
 use conefield_core::Result;
-use conefield_core::method::{Findings, Line, Outline, Plan};
-use conefield_core::spec::load::Loaded;
-use serde::Serialize;
-use std::path::{Path, PathBuf};
+use conefield_run::explain::Explanation;
+use std::path::PathBuf;
 
 /// Show what a spec builds: stages, widths, parameters, memory, work.
 #[derive(Args)]
@@ -28,152 +26,20 @@ pub struct ExplainArgs {
     json: bool,
 }
 
-/// All that is said of a spec.
-#[derive(Debug, Serialize)]
-struct Report {
-    spec: String,
-    source: String,
-    description: String,
-    #[serde(flatten)]
-    outline: Outline,
-    parameters: usize,
-    model_bytes: usize,
-    /// Whose stages the spec names.
-    #[serde(skip_serializing_if = "Vec::is_empty")]
-    plugins: Vec<plugins::Used>,
-    scan: Option<ForScan>,
-}
-
-/// What depends on the scan.
-#[derive(Debug, Serialize)]
-struct ForScan {
-    views: usize,
-    detector: [usize; 2],
-    volume: [usize; 3],
-    #[serde(flatten)]
-    findings: Findings,
-    memory: Memory,
-}
-
 impl ExplainArgs {
     pub fn run(self) -> Result<()> {
         let loaded = specs::read(&self.spec, &self.sets)?;
         // The weights that an initializer names are not read here: a spec is explained without them.
         let plan = method::plan_without_files(&loaded, self.backend.open()?.as_ref())?;
-        let scan = self.scan.as_ref().map(|path| for_scan(&loaded, plan.as_ref(), path)).transpose()?;
-        let outline = plan.outline();
-        let parameters = outline.parameters();
-        let report = Report {
-            spec: loaded.spec.name.clone(),
-            source: loaded.source.clone(),
-            description: loaded.spec.description.clone(),
-            outline,
-            parameters,
-            model_bytes: 16 * parameters,
-            plugins: plugins::used(&loaded.tree),
-            scan,
+        let explanation = match &self.scan {
+            None => Explanation::new(&loaded, plan.as_ref(), None)?,
+            Some(path) => {
+                let size = conefield_io::scan_size(path)?;
+                Memory::of_views(&size).check(|_| vec![])?;
+                let scan = files::scan(path)?;
+                Explanation::new(&loaded, plan.as_ref(), Some((&scan, memory::Run::on(size))))?
+            }
         };
-        if self.json { out::json(&report) } else { out::say(&text(&report)) }
+        if self.json { out::json(&explanation) } else { out::say(&explanation.text()) }
     }
-}
-
-fn for_scan(loaded: &Loaded, plan: &dyn Plan, path: &Path) -> Result<ForScan> {
-    let size = conefield_io::scan_size(path)?;
-    Memory::of_views(&size).check(|_| vec![])?;
-    let scan = files::scan(path)?;
-    let g = &scan.geometry;
-    Ok(ForScan {
-        views: g.views.len(),
-        detector: g.detector,
-        volume: g.volume.shape,
-        findings: plan.inspect(&scan).map_err(|e| loaded.locate(e))?,
-        memory: memory::Run::on(size).memory(plan),
-    })
-}
-
-fn text(r: &Report) -> String {
-    let mut lines = vec![];
-    let shipped = r.source.strip_prefix(&r.spec) == Some(" (shipped)");
-    lines.push(if shipped || r.spec.is_empty() { r.source.clone() } else { format!("{} ({})", r.spec, r.source) });
-    if !r.description.is_empty() {
-        lines.push(r.description.clone());
-    }
-    lines.push(String::new());
-    outlined(&r.outline, &mut lines);
-    for plugin in &r.plugins {
-        lines.push(format!("\nplugin: {}", plugin.line()));
-    }
-    if r.parameters > 0 {
-        lines.push(String::new());
-        lines.push(format!(
-            "memory for the model: {} (parameters {p}, gradients {p}, moments {})",
-            out::bytes(r.model_bytes as u64),
-            out::bytes(8 * r.parameters as u64),
-            p = out::bytes(4 * r.parameters as u64),
-        ));
-    }
-    if let Some(s) = &r.scan {
-        if r.parameters == 0 {
-            lines.push(String::new());
-        }
-        let ([rows, columns], [x, y, z]) = (s.detector, s.volume);
-        let samples = s.findings.samples.map_or(String::new(), |n| format!(", {n} samples on the middle ray"));
-        let views = s.views;
-        lines.push(format!("this scan: {views} views of {rows} x {columns}, volume {x} x {y} x {z}{samples}"));
-        lines.extend(s.findings.lines.iter().map(|line| format!("  {line}")));
-        lines.push(format!("memory for this scan: {}", s.memory.line()));
-    }
-    lines.join("\n")
-}
-
-/// What a method consists of; the methods of a chain one after the other.
-fn outlined(o: &Outline, lines: &mut Vec<String>) {
-    if !o.stages.is_empty() {
-        lines.push(stages(o));
-        lines.push(String::new());
-    }
-    let row = |l: &Line| vec![l.stage.clone(), l.kind.clone(), l.what.clone()];
-    let rest: Vec<Vec<String>> = o.beside.iter().chain([&o.method]).map(row).collect();
-    lines.push(out::table(&rest, &[]));
-    if let Some(backend) = &o.compiled {
-        lines.push(format!("\nbackend: {}", backend.backend));
-        lines.extend(backend.notes.iter().map(|n| format!("  {n}")));
-    }
-    for link in &o.links {
-        lines.push(String::new());
-        outlined(link, lines);
-    }
-}
-
-/// A field's stages as a table.
-fn stages(o: &Outline) -> String {
-    let heads = ["stage", "type", "in -> out", "parameters", "bytes", "MACs/sample", "gradient", "what"];
-    let mut rows = vec![heads.map(str::to_owned).to_vec()];
-    for s in &o.stages {
-        let gradient = format!("{:?}", s.gradient).to_lowercase();
-        rows.push(vec![
-            s.stage.clone(),
-            s.kind.clone(),
-            format!("{} -> {}", s.input, s.output),
-            out::number(s.parameters as u64),
-            out::bytes(s.parameter_bytes as u64),
-            out::number(s.macs_per_sample as u64),
-            gradient,
-            format!(
-                "{}{}{}",
-                s.what,
-                if s.left_out { " (no work)" } else { "" },
-                if s.wgsl { "" } else { " (CPU only: it has no WGSL)" }
-            ),
-        ]);
-    }
-    rows.push(vec![
-        "total".into(),
-        String::new(),
-        String::new(),
-        out::number(o.stages.iter().map(|s| s.parameters).sum::<usize>() as u64),
-        out::bytes(o.stages.iter().map(|s| s.parameter_bytes).sum::<usize>() as u64),
-        out::number(o.stages.iter().map(|s| s.macs_per_sample).sum::<usize>() as u64),
-    ]);
-    out::table(&rows, &[3, 4, 5])
 }

@@ -1,17 +1,16 @@
 //! `conefield pretrain`
 
-use super::{EndOptions, reconstruct::notes};
+use super::EndOptions;
 use crate::backend::{self, BackendChoice};
 use crate::boundary::{self, Inputs, refuse_existing};
-use crate::memory::Memory;
 use crate::parse::{self, Values};
 use crate::progress::Progress;
 use crate::{files, method, out, signals, specs};
 use clap::Args;
 use conefield_core::Result;
-use conefield_core::arena::Weights;
 use conefield_core::method::PretrainJob;
 use conefield_core::scan::Volume;
+use conefield_run::pretraining;
 use serde_json::json;
 use std::path::PathBuf;
 
@@ -50,21 +49,6 @@ pub struct PretrainArgs {
 }
 
 impl PretrainArgs {
-    /// Refuses what does not fit: every volume has parameters and moments of its own.
-    fn memory(&self, parameters: u64, backend: u64) -> Result<()> {
-        let voxels: Vec<u64> = self.volumes.iter().map(|v| files::voxels(v)).collect::<Result<_>>()?;
-        let need = |voxels: &[u64]| {
-            let half = 8 * parameters * voxels.len() as u64;
-            let volume = 4 * voxels.iter().sum::<u64>();
-            let training = Memory { volume, model: half, optimizer: half, buffers: backend, ..Memory::default() };
-            Memory::most(&[Memory::of_volumes(voxels), training])
-        };
-        need(&voxels).check(|available| {
-            let fewer = (1..voxels.len()).rev().find(|n| need(&voxels[..*n]).total <= available);
-            fewer.map(|n| format!("the first {n} of the {} volumes", voxels.len())).into_iter().collect()
-        })
-    }
-
     pub fn run(self) -> Result<()> {
         boundary::ends(&self.output, "safetensors")?;
         refuse_existing(&self.output, self.force)?;
@@ -72,20 +56,17 @@ impl PretrainArgs {
         Inputs::of(&self.volumes).and_spec(&loaded).spare_file(&self.output)?;
         let backend = self.backend.open()?;
         let mut plan = method::plan(&loaded, backend.as_ref())?;
-        let outline = plan.outline();
-        self.memory(outline.parameters() as u64, outline.backend().scratch_bytes as u64)?;
+        let voxels: Vec<u64> = self.volumes.iter().map(|v| files::voxels(v)).collect::<Result<_>>()?;
+        pretraining::check_memory(&voxels, &plan.outline())?;
         let read = |name: &String| self.values.apply(files::volume(name)?);
         let volumes: Vec<Volume> = self.volumes.iter().map(read).collect::<Result<_>>()?;
         let job =
             PretrainJob { volumes: &volumes, backend: backend.as_ref(), seed: self.seed, limits: self.ends.limits() };
         signals::listen()?;
         let mut progress = Progress::new("pretrain", None);
-        let model = plan.pretrain(&job, &mut progress).map_err(|e| loaded.locate(e))?;
+        let weights = pretraining::train(&loaded, plan.as_mut(), &job, &mut progress)?;
         let last = progress.records().last().cloned().unwrap_or_default();
         drop(progress);
-        let keep = |name: &str| !name.starts_with("encoder.");
-        let mut weights = Weights::from_arena(model.pipeline.layout(), &model.arena.params, keep);
-        weights.notes = notes(&loaded, self.seed)?;
         files::write_weights(&self.output, &weights)?;
         let numbers: usize = weights.tensors.values().map(|t| t.1.len()).sum();
         if self.json {

@@ -1,12 +1,12 @@
 //! What a reconstruction is asked for beside scan and spec: the same for every method that is compared.
 
-use super::{EndOptions, evaluate};
+use super::EndOptions;
 use crate::backend::{self, BackendChoice};
 use crate::parse::{self, HoldOut};
 use clap::Args;
-use conefield_core::error::ensure;
+use conefield_core::Result;
 use conefield_core::scan::{Scan, Volume};
-use conefield_core::{Error, Result};
+use conefield_run::{input, score};
 use std::ffi::{OsStr, OsString};
 use std::path::{Path, PathBuf};
 
@@ -44,34 +44,17 @@ impl RunProtocol {
     /// The reference, if there is one, as large as `scan` asks for.
     pub fn reference(&self, scan_path: &Path, scan: &Scan) -> Result<Option<Volume>> {
         let Some(path) = &self.reference else { return Ok(None) };
-        let volume = if path == Path::new("truth") && !path.exists() {
-            let place = scan_path.display().to_string();
-            conefield_io::read_truth(scan_path)?
-                .ok_or_else(|| Error::invalid(place, "--reference truth", "a scan without a truth", "a volume file"))?
-        } else {
-            conefield_io::read_volume(path)?
-        };
-        let want = scan.geometry.volume.shape;
-        if volume.data.shape() != want {
-            let found = format!("{:?}", volume.data.shape());
-            let expected = format!("{want:?}, the voxels that this scan asks for");
-            return Err(Error::invalid(path.display().to_string(), "shape", found, expected));
-        }
-        Ok(Some(volume))
+        input::reference(path, scan_path, scan).map(Some)
     }
 
     /// The data range that scores refer to.
     pub fn peak(&self, reference: Option<&Volume>) -> f64 {
-        reference.map_or(self.peak.unwrap_or(1.0), |r| evaluate::peak(self.peak, r))
+        reference.map_or(self.peak.unwrap_or(1.0), |r| score::peak(self.peak, r))
     }
 
     /// Indices of the views that are kept aside, of `n`. Refuses a choice that keeps none aside.
     pub fn held_out(&self, n: usize) -> Result<Vec<usize>> {
-        let Some(choice) = &self.hold_out else { return Ok(vec![]) };
-        let held = choice.views(n);
-        let found = format!("{choice}, which is none of {n} views");
-        ensure(!held.is_empty(), "command line", "--hold-out", found, "at least one view")?;
-        Ok(held)
+        input::held_out(self.hold_out.as_ref(), n, "command line", "--hold-out")
     }
 
     /// The same again, for a child process. Flag and value are one word: a value may begin with a dash.

@@ -1,7 +1,7 @@
 //! `conefield reconstruct`
 
 use super::record::{RunRecord, Written, summary};
-use super::{backends::simd_level, evaluate, protocol::RunProtocol};
+use super::{backends::simd_level, protocol::RunProtocol};
 use crate::boundary::{self, Inputs};
 use crate::live::Live;
 use crate::memory;
@@ -16,20 +16,21 @@ use clap::error::ErrorKind;
 use clap::{Args, CommandFactory};
 use conefield_core::backend::Backend;
 use conefield_core::checkpoint::Resume;
-use conefield_core::method::{Job, Limits, Solution};
-use conefield_core::scan::{Scan, Volume};
+use conefield_core::method::{Job, Solution};
 use conefield_core::spec::load::{Loaded, to_toml};
 use conefield_core::{Error, Result};
 use conefield_report::MiddleSlices;
-use conefield_tradeoff::calibrate::Bench;
+use conefield_run::choose::{self, Wish};
+use conefield_run::input::Input;
+use conefield_run::score::score;
 use conefield_tradeoff::front::Front;
 use conefield_tradeoff::schedule::{Budget, Schedule};
 use conefield_tradeoff::trial::ScanRecord;
 use std::collections::BTreeMap;
 use std::fs::File;
 use std::path::PathBuf;
+use std::sync::Arc;
 use std::time::{Duration, Instant};
-use tracing::info;
 
 /// Reconstruct a volume from a scan.
 ///
@@ -130,12 +131,12 @@ impl ReconstructArgs {
         inputs.spare_folder(&self.output)?;
         let input = self.input(&folder, begin)?;
         if let Wish::Method(m) = &wish {
-            specs::check_held_out(&m.loaded, m.plan.as_ref(), &input.held)?;
+            specs::check_held_out(&m.loaded, m.plan.as_ref(), &input.work.held)?;
         }
 
         let chosen = self.choose(&folder, &input, wish, backend.as_ref(), begin)?;
         let Chosen { method: Planned { loaded, mut plan, memory }, schedule, resumed, spent } = chosen;
-        let identity = identity(&loaded, &self.protocol, &input.held, &input.record)?;
+        let identity = identity(&loaded, &self.protocol, &input.work.held, &input.record)?;
         let outline = plan.outline();
         signals::listen()?;
         // Whoever started this run as a part has ended: nothing of it has been written yet.
@@ -152,15 +153,17 @@ impl ReconstructArgs {
             }
         };
         let mut progress = self.progress(&folder, metrics, identity);
-        let job = self.job(&input, schedule.as_ref(), resume.as_ref(), backend.as_ref());
+        let (seed, limits) = (self.protocol.seed, self.protocol.ends.limits());
+        let job = input.work.job(backend.as_ref(), seed, limits, schedule.as_ref());
+        let job = Job { resume: resume.as_ref(), ..job };
         let start = Instant::now();
         let mut solution = plan.run(&job, &mut progress).map_err(|e| loaded.locate(e))?;
         let prepare_s = (start.elapsed().as_secs_f64() + spent - solution.train_s).max(0.0);
         let last = progress.records().last().cloned();
         drop(progress);
 
-        let written = self.write(&folder, &input, &mut solution, &loaded, backend.as_ref())?;
-        let Input { held, peak, record: scan, load_s, .. } = input;
+        let written = self.write(&folder, &input.work, &mut solution, &loaded, backend.as_ref())?;
+        let Reading { work: Input { held, peak, .. }, record: scan, load_s } = input;
         let path = |p: &PathBuf| p.display().to_string();
         let record = RunRecord {
             version: env!("CARGO_PKG_VERSION"),
@@ -199,68 +202,38 @@ impl ReconstructArgs {
     }
 
     /// Reads all that there is to read.
-    fn input(&self, folder: &RunFolder, begin: Instant) -> Result<Input> {
+    fn input(&self, folder: &RunFolder, begin: Instant) -> Result<Reading> {
         let whole = files::scan(&self.scan)?;
         conefield_io::check_shape(folder.file("volume.nii.gz"), whole.geometry.volume.shape)?;
         let reference = self.protocol.reference(&self.scan, &whole)?;
-        let peak = self.protocol.peak(reference.as_ref());
         let held = self.protocol.held_out(whole.geometry.views.len())?;
         let record = ScanRecord::of(&self.scan, &whole)?;
-        let (scan, aside) = if held.is_empty() {
-            (whole, None)
-        } else {
-            let (scan, aside) = whole.split(&held)?;
-            (scan, Some(aside))
-        };
-        Ok(Input { scan, aside, held, reference, peak, record, load_s: begin.elapsed().as_secs_f64() })
+        let work = Input::new(Arc::new(whole), held, reference, self.protocol.peak)?;
+        Ok(Reading { work, record, load_s: begin.elapsed().as_secs_f64() })
     }
 
     /// Settles what will run: the method that is asked for or, within a budget, one of the front's.
     fn choose(
         &self,
         folder: &RunFolder,
-        input: &Input,
+        input: &Reading,
         wish: Wish,
         backend: &dyn Backend,
         begin: Instant,
     ) -> Result<Chosen> {
         let protocol = &self.protocol;
+        let held = &input.work.held;
         let resumed = match &wish {
             Wish::Method(m) if self.resume => {
-                Some(self.reopen(folder, &identity(&m.loaded, protocol, &input.held, &input.record)?)?)
+                Some(self.reopen(folder, &identity(&m.loaded, protocol, held, &input.record)?)?)
             }
             _ => None,
         };
         let spent = resumed.as_ref().map_or(0.0, |(_, r)| r.standing.seconds);
-        let bench = Bench {
-            scan: &input.scan,
-            reference: input.reference.as_ref(),
-            peak: input.peak,
-            backend,
-            seed: protocol.seed,
-            volumes: &files::volume,
-            cancelled: &|| signals::caught().is_some(),
-        };
+        let bench = input.work.bench(backend, protocol.seed, &|| signals::caught().is_some());
         let budget = protocol.budget.map(|seconds| Budget { begin, seconds, spent });
-        let (method, schedule) = match (budget, wish) {
-            (None, Wish::Method(method)) => (method, None),
-            (Some(budget), Wish::Method(mut method)) => {
-                let schedule = budget.plan(&bench, &mut method)?;
-                (method, Some(schedule))
-            }
-            (Some(budget), Wish::OneOf(front)) => {
-                let more = &protocol.sets;
-                let build = |spec: &str, sets: &[String]| self.method(spec, &[sets, more].concat(), backend);
-                let (method, schedule) = budget.choose(&bench, &front, build)?;
-                (method, Some(schedule))
-            }
-            (None, Wish::OneOf(_)) => {
-                return Err(Error::invalid("reconstruct", "--spec", "nothing", "a spec, or --budget to choose one by"));
-            }
-        };
-        specs::check_held_out(&method.loaded, method.plan.as_ref(), &input.held)?;
-        schedule.iter().flat_map(|s| s.lines(&method.loaded.spec.name)).for_each(|line| info!("{line}"));
-        info!("memory: {}", method.memory.line());
+        let build = |spec: &str, sets: &[String]| self.method(spec, &[sets, &protocol.sets].concat(), backend);
+        let (method, schedule) = choose::choose(wish, &bench, budget, held, build)?;
         Ok(Chosen { method, schedule, resumed, spent })
     }
 
@@ -275,29 +248,6 @@ impl ReconstructArgs {
         Progress::new("reconstruct", Some(metrics))
             .keeping(Some(keeper))
             .showing(self.live.map(|seconds| Live::new(folder.file("live.png"), seconds)))
-    }
-
-    fn job<'a>(
-        &self,
-        input: &'a Input,
-        schedule: Option<&Schedule>,
-        resume: Option<&'a Resume>,
-        backend: &'a dyn Backend,
-    ) -> Job<'a> {
-        Job {
-            held_out: input.aside.as_ref(),
-            reference: input.reference.as_ref(),
-            peak: input.peak,
-            seed: self.protocol.seed,
-            limits: Limits {
-                deadline: schedule.map(|s| s.deadline),
-                then: schedule.and_then(|s| s.then),
-                ..self.protocol.ends.limits()
-            },
-            volumes: &files::volume,
-            resume,
-            ..Job::new(&input.scan, backend)
-        }
     }
 
     /// Writes what came out, and scores it.
@@ -315,7 +265,7 @@ impl ReconstructArgs {
         let field = solution.result.field();
         let parameters = field.map_or(0, |f| f.model.pipeline.layout().len());
         if let Some(field) = field {
-            files::write_field(folder.file("weights.safetensors"), field, notes(loaded, self.protocol.seed)?)?;
+            files::write_field(folder.file("weights.safetensors"), field, specs::notes(loaded, self.protocol.seed)?)?;
         }
         let mut voxels = solution.result.voxels(backend)?;
         let affine = reference.and_then(|r| r.affine);
@@ -325,8 +275,8 @@ impl ReconstructArgs {
         files::picture(folder.file("slices.png"), reference.map(MiddleSlices::of).as_ref(), &slices)?;
         let picture_s = start.elapsed().as_secs_f64();
         let start = Instant::now();
-        let score = |(volume, r)| evaluate::score(&place.display().to_string(), volume, r, input.peak);
-        let scores = whole.as_ref().zip(reference).map(score).transpose()?;
+        let scored = |(volume, r)| score(&place.display().to_string(), volume, r, input.peak);
+        let scores = whole.as_ref().zip(reference).map(scored).transpose()?;
         Ok(Written { parameters, export_s, picture_s, score_s: start.elapsed().as_secs_f64(), scores })
     }
 
@@ -346,15 +296,9 @@ impl ReconstructArgs {
             reference: self.protocol.reference.is_some(),
             resume: self.resume,
         };
-        let mut sets = sets.to_vec();
         // A run that is resumed without a spec has it in its own.
-        if let Some(path) = self.init.as_ref().filter(|_| self.spec.is_some() || !self.resume) {
-            if conefield_io::is_volume(path) {
-                memory::Memory::of_volumes(&[conefield_io::volume_voxels(path)?]).check(|_| vec![])?;
-            }
-            sets.push(method::init(&specs::read(spec, &sets)?.tree, path));
-        }
-        method::planned(spec, &sets, backend, &run)
+        let start = self.init.as_deref().filter(|_| self.spec.is_some() || !self.resume);
+        method::planned(&|sets| specs::read(spec, sets), sets, start, backend, &run)
     }
 
     /// The file for metrics of an interrupted run, and where to go on from.
@@ -366,26 +310,11 @@ impl ReconstructArgs {
     }
 }
 
-/// What a run reads.
-struct Input {
-    /// The views to learn from.
-    scan: Scan,
-    /// Those that are kept aside.
-    aside: Option<Scan>,
-    /// Their numbers.
-    held: Vec<usize>,
-    reference: Option<Volume>,
-    /// The data range of scores.
-    peak: f64,
+/// What a run reads, with what its record says of that.
+struct Reading {
+    work: Input,
     record: ScanRecord,
     load_s: f64,
-}
-
-/// What is asked for.
-enum Wish {
-    Method(Planned),
-    /// The best of these for a budget.
-    OneOf(Front),
 }
 
 /// What will run.
@@ -406,7 +335,7 @@ pub fn identity(
     held: &[usize],
     scan: &ScanRecord,
 ) -> Result<BTreeMap<String, String>> {
-    let mut all = notes(loaded, protocol.seed)?;
+    let mut all = specs::notes(loaded, protocol.seed)?;
     all.insert("projections".into(), scan.projections_fnv1a64.clone());
     all.insert("geometry".into(), scan.geometry_fnv1a64.clone());
     all.insert("held_out_views".into(), format!("{held:?}"));
@@ -418,15 +347,4 @@ pub fn identity(
 /// A budget as [`identity`] has it.
 pub fn budget(seconds: Option<f64>) -> String {
     seconds.map_or("none".into(), |s| s.to_string())
-}
-
-/// What weights say of where they come from.
-pub fn notes(loaded: &Loaded, seed: u64) -> Result<BTreeMap<String, String>> {
-    let mut notes = BTreeMap::from([
-        ("conefield".into(), env!("CARGO_PKG_VERSION").into()),
-        ("seed".into(), seed.to_string()),
-        ("spec".into(), to_toml(&loaded.spec)?),
-    ]);
-    notes.extend(plugins::identity(&plugins::used(&loaded.tree)));
-    Ok(notes)
 }

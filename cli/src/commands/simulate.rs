@@ -5,15 +5,11 @@ use crate::memory::Memory;
 use crate::parse::{self, AnglesOption, Values};
 use crate::{files, out};
 use clap::Args;
-use conefield_core::files::{read_text, toml_line};
-use conefield_core::scan::Volume;
-use conefield_core::{Error, Result};
-use conefield_projectors::simulate::{Angles, DetectorNoise, HuMapping, Protocol, downsample, simulate};
+use conefield_core::Result;
+use conefield_projectors::simulate::DetectorNoise;
+use conefield_run::simulation::{self, Changes};
 use serde_json::json;
-use std::path::{Path, PathBuf};
-
-/// Longest protocol or list of angles, in bytes.
-const LONGEST: u64 = 16 << 20;
+use std::path::PathBuf;
 
 /// Make a scan of a known volume.
 ///
@@ -75,24 +71,18 @@ impl SimulateArgs {
         Inputs::of([&self.volume, &self.protocol]).and(angles).spare_folder(&self.output)?;
         let before = files::voxels(&self.volume)?;
         Memory::of_volumes(&[before]).check(|_| vec![])?;
-        let mut volume = self.values.apply(files::volume(&self.volume)?)?;
-        // A scan's volume stands on the rotation axis.
-        volume.grid.center = [0.0; 3];
-        if self.downsample > 1 {
-            volume = downsample(&volume, self.downsample.into())?;
-            volume.grid.center = [0.0; 3];
-        }
-        let protocol = self.protocol(&volume)?;
-        self.memory(&volume, &protocol)?;
-        if let Values::Hu(HuMapping::Mu { .. }) = self.values {
-            // From 1/mm to the protocol's unit.
-            let per_unit = protocol.unit.mm as f32;
-            volume = volume.mapped(|x| x * per_unit);
-        }
-        let mut scan = simulate(&volume, &protocol)?;
-        if let Some(p) = scan.provenance.as_object_mut() {
-            p.insert("source".into(), json!(self.volume));
-        }
+        let volume = simulation::prepared(files::volume(&self.volume)?, self.values, self.downsample.into())?;
+        let changes = Changes {
+            views: self.views.map(|n| n as usize),
+            detector: self.detector,
+            offset: self.offset,
+            angles: self.angles.clone(),
+            noise: self.noise,
+            seed: self.seed,
+        };
+        let protocol = simulation::protocol(&self.protocol, &volume.grid)?;
+        let protocol = simulation::changed(protocol, &changes, "command line")?;
+        let (scan, volume) = simulation::scan(volume, self.values, &protocol, &self.volume)?;
         conefield_io::write_scan(&self.output, &scan, Some(&volume))?;
         let g = &scan.geometry;
         if self.json {
@@ -109,88 +99,4 @@ impl SimulateArgs {
             protocol.noise,
         ))
     }
-
-    /// Refuses what does not fit: projecting takes a copy of the volume with a rim.
-    fn memory(&self, volume: &Volume, protocol: &Protocol) -> Result<()> {
-        let g = protocol.geometry(&volume.grid)?;
-        let rim = g.volume.shape.iter().map(|&n| n as u64 + 2).product::<u64>();
-        let need = |views: usize, share: u64| {
-            let pixels = (views * g.detector[0] * g.detector[1]) as u64 / share;
-            let volume = 4 * (volume.data.len() as u64 + rim);
-            Memory::most(&[Memory { scan: 4 * pixels, volume, ..Memory::default() }])
-        };
-        need(g.views.len(), 1).check(|available| {
-            let fits = |m: Memory| m.total <= available;
-            let views = (1..=g.views.len()).rev().find(|&n| fits(need(n, 1)));
-            let detector = (1..5).find(|k| fits(need(g.views.len(), 1 << (2 * k))));
-            let views = views.map(|n| format!("{n} views"));
-            let detector = detector.map(|k| format!("a detector of {}x{}", g.detector[0] >> k, g.detector[1] >> k));
-            views.into_iter().chain(detector).collect()
-        })
-    }
-
-    fn protocol(&self, volume: &Volume) -> Result<Protocol> {
-        let mut p = match self.protocol.as_str() {
-            "r2" => Protocol::r2(&volume.grid),
-            path => read_protocol(Path::new(path))?,
-        };
-        if let Some(d) = self.detector {
-            p = p.with_detector(d);
-        }
-        if let Some(n) = self.noise {
-            p.noise = n;
-        }
-        if let Some(seed) = self.seed {
-            p.seed = seed;
-        }
-        if let Some(mm) = self.offset {
-            p.offset = mm.map(|x| x / p.unit.mm);
-        }
-        match &self.angles {
-            Some(AnglesOption::File(path)) => {
-                if self.views.is_some() {
-                    let expected = "--views or --angles FILE, which says how many there are";
-                    return Err(Error::invalid("command line", "--views", "both", expected));
-                }
-                p.angles = Angles::ListDeg(read_angles(path)?);
-            }
-            Some(AnglesOption::Even { start, range }) => {
-                let views = self.views.map_or(p.angles.radians().len(), |n| n as usize);
-                p.angles = Angles::Even { views, start_deg: *start, arc_deg: *range };
-            }
-            None => {
-                if let Some(n) = self.views {
-                    let views = n as usize;
-                    p.angles = match p.angles {
-                        Angles::Even { start_deg, arc_deg, .. } => Angles::Even { views, start_deg, arc_deg },
-                        Angles::ListDeg(_) => Angles::Even { views, start_deg: 0.0, arc_deg: 360.0 },
-                    };
-                }
-            }
-        }
-        Ok(p)
-    }
-}
-
-fn read_protocol(path: &Path) -> Result<Protocol> {
-    let text = read_text(path, LONGEST)?;
-    let place = path.display();
-    if text.trim_start().starts_with('{') {
-        return serde_json::from_str(&text)
-            .map_err(|e| Error::invalid(format!("{place}:{}:{}", e.line(), e.column()), "protocol", e, "a protocol"));
-    }
-    toml::from_str(&text).map_err(|e| {
-        let line = toml_line(&text, &e).unwrap_or(1);
-        Error::invalid(format!("{place}:{line}"), "protocol", e.message(), "a protocol")
-    })
-}
-
-fn read_angles(path: &Path) -> Result<Vec<f64>> {
-    let text = read_text(path, LONGEST)?;
-    let lines = text.lines().map(|l| l.split('#').next().unwrap_or_default().trim()).enumerate();
-    let angles = lines.filter(|(_, l)| !l.is_empty()).map(|(i, l)| match l.parse::<f64>() {
-        Ok(a) if a.is_finite() => Ok(a),
-        _ => Err(Error::invalid(format!("{}:{}", path.display(), i + 1), "angle", l, "a number of degrees")),
-    });
-    angles.collect()
 }

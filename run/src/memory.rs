@@ -3,10 +3,11 @@
 //! An estimate is the sum at the moment that takes most: reading, training or export. It leaves out what is small
 //! whatever the input is, but for the program itself.
 
-use crate::out::bytes;
 use conefield_core::method::{Needs, Plan};
+use conefield_core::scan::Scan;
 use conefield_core::{Error, Result, allowance};
 use conefield_io::{SLAB_BYTES, ScanSize};
+use conefield_report::text::bytes;
 use serde::Serialize;
 use std::sync::OnceLock;
 use sysinfo::{MemoryRefreshKind, ProcessesToUpdate, RefreshKind, System, get_current_pid};
@@ -183,6 +184,13 @@ impl Run {
         Self { scan, split: false, reference: false, resume: false }
     }
 
+    /// A run on a scan that is in memory.
+    pub fn on_scan(scan: &Scan) -> Self {
+        let header = scan.header();
+        let (pixels, voxels) = (header.pixels(), header.voxels());
+        Self::on(ScanSize { pixels, voxels, test_pixels: 0, reading: 0, views: header.views })
+    }
+
     /// What it takes to run `plan`.
     pub fn memory(&self, plan: &dyn Plan) -> Memory {
         self.with(plan.needs(&self.scan.header()))
@@ -255,7 +263,7 @@ impl Run {
 mod tests {
     use super::*;
     use conefield_core::method::{Findings, Job, Observer, Outline, Solution};
-    use conefield_core::scan::{Scan, ScanHeader};
+    use conefield_core::scan::ScanHeader;
 
     fn run() -> Run {
         let scan = ScanSize { pixels: 1 << 20, voxels: 512 * 512 * 512, test_pixels: 0, reading: 0, views: 1 };

@@ -15,8 +15,11 @@ use std::path::Path;
 
 /// A spec that is built and priced.
 pub struct Planned {
+    /// The spec.
     pub loaded: Loaded,
+    /// What it builds.
     pub plan: Box<dyn Plan>,
+    /// What that takes.
     pub memory: Memory,
 }
 
@@ -58,13 +61,30 @@ pub fn plan_without_files(loaded: &Loaded, backend: &dyn Backend) -> Result<Box<
     loaded.spec.method.plan(&Context::without_weights(backend)).map_err(|e| loaded.locate(e))
 }
 
-/// Reads and builds a spec, and refuses what does not fit into memory. `run` says what else a run holds.
-pub fn planned(spec: &str, sets: &[String], backend: &dyn Backend, run: &memory::Run) -> Result<Planned> {
-    let loaded = specs::read(spec, sets)?;
+/// Reads a spec with settings on top.
+pub type Read<'a> = &'a dyn Fn(&[String]) -> Result<Loaded>;
+
+/// Reads and builds a spec, and refuses what does not fit into memory. `run` says what else a run holds; `start` is the file
+/// that it starts from, weights or a volume.
+pub fn planned(
+    read: Read<'_>,
+    sets: &[String],
+    start: Option<&Path>,
+    backend: &dyn Backend,
+    run: &memory::Run,
+) -> Result<Planned> {
+    let mut sets = sets.to_vec();
+    if let Some(path) = start {
+        if conefield_io::is_volume(path) {
+            Memory::of_volumes(&[conefield_io::volume_voxels(path)?]).check(|_| vec![])?;
+        }
+        sets.push(init(&read(&sets)?.tree, path));
+    }
+    let loaded = read(&sets)?;
     let plan = plan(&loaded, backend)?;
     let tables = smaller_tables(&loaded);
     let smaller = tables.iter().filter_map(|(bits, set)| {
-        let loaded = specs::read(spec, &[sets, std::slice::from_ref(set)].concat()).ok()?;
+        let loaded = read(&[&sets[..], std::slice::from_ref(set)].concat()).ok()?;
         Some((*bits, plan_without_files(&loaded, backend).ok()?))
     });
     let memory = run.memory(plan.as_ref());

@@ -3,8 +3,9 @@
 use crate::plugins;
 use conefield_core::method::Plan;
 use conefield_core::registry;
-use conefield_core::spec::load::{Draft, Loaded, Shipped};
+use conefield_core::spec::load::{Draft, Loaded, Shipped, to_toml};
 use conefield_core::{Error, Result};
+use std::collections::BTreeMap;
 
 /// The files in `specs/`.
 pub const SHIPPED: &[Shipped] = &[
@@ -46,6 +47,13 @@ pub fn read(what: &str, sets: &[String]) -> Result<Loaded> {
     draft.finish()
 }
 
+/// Reads a spec from its text, TOML or JSON, called `source` in errors, with `sets` on top.
+pub fn parse(text: &str, source: &str, sets: &[String]) -> Result<Loaded> {
+    let draft = Draft::of(text, source, sets, SHIPPED)?;
+    plugins::of_spec(&draft)?;
+    draft.finish()
+}
+
 /// Reads a spec that a file holds, called `source` in errors.
 pub fn reread(text: &str, source: &str) -> Result<Loaded> {
     let draft = Draft::of(text, source, &[], &[])?;
@@ -59,6 +67,17 @@ pub fn fast_weights() -> Option<&'static [u8]> {
     return Some(include_bytes!("../../specs/weights/fast.safetensors"));
     #[cfg(not(fast_weights))]
     None
+}
+
+/// What weights say of where they come from.
+pub fn notes(loaded: &Loaded, seed: u64) -> Result<BTreeMap<String, String>> {
+    let mut notes = BTreeMap::from([
+        ("conefield".into(), env!("CARGO_PKG_VERSION").into()),
+        ("seed".into(), seed.to_string()),
+        ("spec".into(), to_toml(&loaded.spec)?),
+    ]);
+    notes.extend(plugins::identity(&plugins::used(&loaded.tree)));
+    Ok(notes)
 }
 
 /// Refuses a setting that looks at views kept aside where `held`, the views that are, has none.

@@ -1,4 +1,4 @@
-//! Values on the command line. What does not parse is wrong use, told before any work.
+//! Values as users write them, on the command line and elsewhere. What does not parse is told before any work.
 
 use conefield_core::scan::Volume;
 use conefield_io::I0;
@@ -91,7 +91,9 @@ pub fn i0(text: &str) -> Result<I0, String> {
 /// Which views to keep aside.
 #[derive(Debug, Clone, PartialEq)]
 pub enum HoldOut {
+    /// These, counted from 0.
     Views(Vec<usize>),
+    /// One of so many.
     Every(usize),
 }
 
@@ -131,7 +133,12 @@ pub fn hold_out(text: &str) -> Result<HoldOut, String> {
 #[derive(Debug, Clone, PartialEq)]
 pub enum AnglesOption {
     /// Evenly from `start` over `range` degrees, the end left out.
-    Even { start: f64, range: f64 },
+    Even {
+        /// The first angle, degrees.
+        start: f64,
+        /// Degrees from there.
+        range: f64,
+    },
     /// Degrees, one a line.
     File(PathBuf),
 }

@@ -1,0 +1,46 @@
+//! `conefield completions`
+
+use crate::boundary::refuse_existing;
+use clap::{Args, CommandFactory};
+use clap_complete::{Shell, generate};
+use conefield_core::{Error, Result};
+use std::io::{ErrorKind, Write};
+use std::path::PathBuf;
+
+/// Print a shell's completions, or write manual pages.
+///
+/// For bash: conefield completions bash > ~/.local/share/bash-completion/completions/conefield
+#[derive(Args)]
+pub struct CompletionsArgs {
+    /// The shell.
+    #[arg(required_unless_present = "man")]
+    shell: Option<Shell>,
+    /// Write a manual page of each command to this folder instead, such as ~/.local/share/man/man1.
+    #[arg(long, value_name = "FOLDER", conflicts_with = "shell")]
+    man: Option<PathBuf>,
+    /// Write into a folder in which something stands.
+    #[arg(long, requires = "man")]
+    force: bool,
+}
+
+impl CompletionsArgs {
+    pub fn run(self) -> Result<()> {
+        let mut command = crate::Cli::command();
+        if let Some(folder) = &self.man {
+            refuse_existing(folder, self.force)?;
+            let io = |e| Error::io(folder, e);
+            std::fs::create_dir_all(folder).map_err(io)?;
+            command.build();
+            return clap_mangen::generate_to(command, folder).map_err(io);
+        }
+        let mut script = vec![];
+        if let Some(shell) = self.shell {
+            generate(shell, &mut command, "conefield", &mut script);
+        }
+        // It is for a shell, to the byte.
+        match std::io::stdout().write_all(&script) {
+            Err(e) if e.kind() != ErrorKind::BrokenPipe => Err(Error::io("standard output", e)),
+            _ => Ok(()),
+        }
+    }
+}

@@ -1,0 +1,138 @@
+//! `conefield project`
+
+use crate::boundary::{Inputs, refuse_existing};
+use crate::memory::{self, Memory};
+use crate::parse::HoldOut;
+use crate::{files, out, parse, signals};
+use clap::Args;
+use conefield_core::error::ensure;
+use conefield_core::scan::Scan;
+use conefield_core::{Error, Result};
+use conefield_run::projection::{self, Residual};
+use ndarray::Array3;
+use serde_json::{Value, json};
+use std::path::PathBuf;
+use std::time::Instant;
+
+/// Predict the views that a scanner takes of a volume.
+///
+/// The result is a scan with the line integrals of the volume, in the views and on the detector of another scan, that every
+/// command reads. The volume stands around the centre of what that scan reconstructs; a NumPy array, which has no voxel
+/// sizes, fills the same box. With --residual also what the measured views have beside the predicted ones: where a
+/// reconstruction does not explain them, structure is left.
+#[derive(Args)]
+pub struct ProjectArgs {
+    /// The volume, in attenuation a unit of the scan as "reconstruct" leaves it.
+    volume: PathBuf,
+    /// The scan whose views are predicted.
+    #[arg(long, value_name = "SCAN")]
+    like: PathBuf,
+    /// The folder for the predicted views.
+    #[arg(short, long = "output", value_name = "PREDICTED")]
+    output: PathBuf,
+    /// Also a folder for measured less predicted line integrals.
+    #[arg(long, value_name = "FOLDER")]
+    residual: Option<PathBuf>,
+    /// Only these views, such as 3,17 or every:10.
+    #[arg(long, value_name = "VIEWS", value_parser = parse::hold_out)]
+    views: Option<HoldOut>,
+    /// How line integrals of voxels are computed: joseph, siddon or trilinear.
+    #[arg(long, value_name = "TYPE", default_value = projection::PROJECTOR)]
+    projector: String,
+    /// Replace PREDICTED and FOLDER.
+    #[arg(long)]
+    force: bool,
+    /// Print one JSON object.
+    #[arg(long)]
+    json: bool,
+}
+
+impl ProjectArgs {
+    pub fn run(self) -> Result<()> {
+        let inputs = Inputs::of([&self.volume, &self.like]);
+        for folder in std::iter::once(&self.output).chain(&self.residual) {
+            refuse_existing(folder, self.force)?;
+            inputs.spare_file(folder)?;
+            inputs.spare_folder(folder)?;
+        }
+        let twice = self.residual.as_ref() == Some(&self.output);
+        ensure(!twice, "command line", "--residual", "the folder of the predicted views", "another folder")?;
+        let projector = projection::projector(Value::String(self.projector.clone()))?;
+        std::fs::metadata(&self.volume).map_err(|e| Error::io(&self.volume, e))?;
+        let (voxels, size) = (conefield_io::volume_voxels(&self.volume)?, conefield_io::scan_size(&self.like)?);
+        let reading = Memory { scan: 4 * size.pixels + size.reading, volume: 8 * voxels, ..Memory::default() };
+        let header = size.header();
+        // Predicted views beside the measured ones.
+        let buffers = 4 * size.pixels + projector.scratch(&header, header.views);
+        let projecting = Memory { scan: 4 * size.pixels, volume: 4 * voxels, buffers, ..Memory::default() };
+        let memory = Memory::most(&[reading, projecting]);
+        memory.check(|_| vec![])?;
+
+        let volume = conefield_io::read_volume(&self.volume)?;
+        let scan = self.chosen(files::scan(&self.like)?)?;
+        let mut geometry = scan.geometry.clone();
+        // Of what is read here only NumPy arrays have no affine.
+        geometry.volume = projection::placed(&volume, &scan.geometry.volume, volume.affine.is_some());
+        if let Some(odd) = projection::oddity(&geometry.volume, &scan.geometry.volume) {
+            tracing::warn!("{}: {odd}", self.volume.display());
+        }
+        signals::listen()?;
+        let start = Instant::now();
+        let views = projection::predicted(&volume, &geometry, scan.unit.mm, projector.as_ref())?;
+        let project_s = start.elapsed().as_secs_f64();
+        if signals::caught().is_some() {
+            return Err(Error::Aborted { part: "the projection".into() });
+        }
+        let of = |projections: Array3<f32>, what: &str| Scan {
+            geometry: scan.geometry.clone(),
+            projections,
+            unit: scan.unit.clone(),
+            provenance: json!({
+                what: { "volume": self.volume, "scan": self.like, "projector": projector.describe() }
+            }),
+        };
+        let mut predicted = of(views, "predicted");
+        conefield_io::write_scan(&self.output, &predicted, None)?;
+        let residual = projection::residual(&scan, &mut predicted.projections)?;
+        if let Some(folder) = &self.residual {
+            conefield_io::write_scan(folder, &of(predicted.projections, "residual"), None)?;
+        }
+        self.tell(&scan, &residual, project_s, memory)
+    }
+
+    /// The scan with the views that are asked for.
+    fn chosen(&self, scan: Scan) -> Result<Scan> {
+        let n = scan.geometry.views.len();
+        match conefield_run::input::held_out(self.views.as_ref(), n, "command line", "--views")? {
+            all if all.is_empty() || all.len() == n => Ok(scan),
+            some => {
+                if let Some(v) = some.iter().find(|v| **v >= n) {
+                    return Err(Error::invalid("command line", "--views", v, format!("numbers below {n}")));
+                }
+                Ok(scan.split(&some)?.1)
+            }
+        }
+    }
+
+    fn tell(&self, scan: &Scan, residual: &Residual, project_s: f64, memory: Memory) -> Result<()> {
+        let (n, [rows, columns]) = (scan.geometry.views.len(), scan.geometry.detector);
+        if self.json {
+            return out::json(&json!({
+                "predicted": self.output, "residual": self.residual, "views": n, "detector": [rows, columns],
+                "residual_rms": residual.rms, "residual_relative": residual.relative,
+                "residual_rms_of_views": residual.views, "project_s": project_s, "memory": memory,
+                "peak_bytes": memory::peak(),
+            }));
+        }
+        let worst = residual.views.iter().copied().enumerate().max_by(|a, b| a.1.total_cmp(&b.1));
+        let worst = worst.map_or(String::new(), |(v, rms)| format!(", {rms:.5} in view {v}, the worst"));
+        out::say(&format!(
+            "{}: {n} views of {rows} x {columns} in {}\nmeasured less predicted: root mean square {:.5}, {:.5} of the \
+             largest line integral{worst}",
+            self.output.display(),
+            out::duration(project_s),
+            residual.rms,
+            residual.relative,
+        ))
+    }
+}

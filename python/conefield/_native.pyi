@@ -1,0 +1,115 @@
+"""The native half. What users need of it is in ``conefield``."""
+
+from os import PathLike
+from typing import Any, Callable
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ._volume import Volume
+
+__version__: str
+
+_Tell = tuple[Callable[..., None], float, bool] | None
+_Voxels = tuple[list[int], tuple[float, ...], tuple[float, ...]]
+
+class Geometry:
+    """Where source, detector and voxels stand, for every view. It is made by ``circular`` or ``from_vectors``.
+
+    Lengths are millimetres. It does not change, compares by value and can be pickled.
+    """
+
+    @staticmethod
+    def circular(
+        dso: float,
+        dsd: float,
+        angles: NDArray[np.float64],
+        detector: list[int],
+        pixel: tuple[float, float],
+        offset: tuple[float, float],
+        tilt: tuple[float, float, float],
+        volume: _Voxels,
+    ) -> Geometry: ...
+    @staticmethod
+    def from_vectors(vectors: NDArray[np.float64], detector: list[int], volume: _Voxels) -> Geometry: ...
+    def with_volume(
+        self, shape: list[int], spacing: tuple[float, float, float], center: tuple[float, float, float]
+    ) -> Geometry:
+        """The same views of other voxels."""
+    def select(self, views: list[int]) -> Geometry:
+        """Some of the views, by their numbers."""
+    def orbit(self) -> tuple[float, float, list[float], list[float], list[float]] | None:
+        """The circular orbit that the views lie on, if they do: dso, dsd, pixel, offset, angles."""
+    @property
+    def vectors(self) -> NDArray[np.float64]:
+        """``[view, 12]``: source, detector centre, u, v."""
+    @property
+    def detector(self) -> tuple[int, int]:
+        """Rows and columns."""
+    @property
+    def volume_shape(self) -> tuple[int, int, int]:
+        """Voxels along x, y and z."""
+    @property
+    def spacing(self) -> tuple[float, float, float]:
+        """Voxel size, mm."""
+    @property
+    def center(self) -> tuple[float, float, float]:
+        """The middle of the voxels, mm."""
+    @property
+    def projections_shape(self) -> tuple[int, int, int]:
+        """Views, rows and columns."""
+    def __len__(self) -> int: ...
+
+class Scan:
+    """Measured line integrals with the geometry they were taken in. It does not change."""
+
+    def __init__(self, projections: NDArray[np.float32], geometry: Geometry, unit: tuple[str, float]) -> None: ...
+    @property
+    def projections(self) -> NDArray[np.float32]:
+        """``[view, row, column]``, read-only and without a copy."""
+    @property
+    def geometry(self) -> Geometry: ...
+    @property
+    def unit(self) -> tuple[str, float]:
+        """The unit of length that volumes count per: its name and millimetres."""
+    @property
+    def provenance(self) -> Any:
+        """How the scan came about."""
+    @property
+    def truth(self) -> Volume | None:
+        """The volume that it was simulated from, if that is known."""
+    def split(self, held: list[int]) -> tuple[Scan, Scan]:
+        """A scan without these views, and one of these alone."""
+    def __len__(self) -> int: ...
+
+class Field:
+    """What a neural method has trained."""
+
+    def volume(self, voxels: int | None = None, backend: str = "auto") -> Volume:
+        """Its values at voxels of which so many stand along the longest side, in the box that was reconstructed."""
+    def write(self, path: str | PathLike[str]) -> None:
+        """Writes ``weights.safetensors``, which ``conefield export`` and ``read_field`` read."""
+    @property
+    def parameters(self) -> int: ...
+
+def backproject(geometry: Geometry, projector: str, projections: NDArray[Any]) -> NDArray[Any]: ...
+def check_stage(kind: str, table: str) -> tuple[bool, str, list[tuple[str, str, str]]]: ...
+def evaluate(volume: Volume, reference: Volume, peak: float | None, labels: bool) -> dict[str, Any]: ...
+def plan(wanted: str, scan: Scan | None) -> tuple[dict[str, Any], str, dict[str, Any] | None]: ...
+def pretrain(volumes: list[Volume], output: str, wanted: str, function: _Tell) -> dict[str, Any]: ...
+def project(geometry: Geometry, projector: str, volume: NDArray[Any]) -> NDArray[Any]: ...
+def project_scan(scan: Scan, projector: str, volume: Volume, residual: bool) -> NDArray[np.float32]: ...
+def read_field(path: str) -> Field: ...
+def read_scan(path: str) -> Scan: ...
+def read_volume(name: str) -> Volume: ...
+def reconstruct(
+    scan: Scan, wanted: str, start: Volume | None, reference: Volume | None, function: _Tell
+) -> tuple[Volume, dict[str, Any], Field | None]: ...
+def register(kind: str, name: str, doc: str, cls: type) -> None: ...
+def schema() -> dict[str, Any]: ...
+def simulate(volume: Volume, wanted: str, geometry: Geometry | None) -> Scan: ...
+def spec_names() -> list[str]: ...
+def spec_text(spec: str) -> str: ...
+def stage_names(kind: str) -> list[str]: ...
+def write_scan(path: str, scan: Scan) -> None: ...
+def write_volume(path: str, volume: Volume) -> None: ...

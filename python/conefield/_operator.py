@@ -1,0 +1,141 @@
+"""Line integrals of voxels: as functions, and as the system matrix."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from . import _native
+from ._arrays import as_array, as_floats
+from ._errors import invalid
+from ._scan import Scan
+from ._spec import encoded
+from ._volume import Volume, as_volume
+
+
+def _real(values: Any, name: str) -> np.ndarray:
+    """Real numbers, in double precision if they are so already."""
+    array = as_array(values, name)
+    return as_floats(array, name, 3, np.float64 if array.dtype == np.float64 else np.float32)
+
+
+def project(volume: Any, like: _native.Geometry | Scan, *, projector: Any = "joseph", residual: bool = False) -> np.ndarray:
+    """The line integrals of a volume, ``[view, row, column]``.
+
+    Parameters
+    ----------
+    volume
+        Attenuation ``[x, y, z]``.
+    like
+        A geometry: values are in 1/mm, and the array has its voxels. ``float64`` is computed in double precision. Or a
+        scan, whose views are predicted as ``conefield project`` does: values are in 1/unit of it, and a :class:`Volume` of
+        another shape stands with its own voxels around the same centre.
+    projector
+        ``"joseph"``, ``"siddon"``, ``"trilinear"``, or a dict with one's settings.
+    residual
+        Of a scan: measured less predicted line integrals instead.
+    """
+    if isinstance(like, Scan):
+        return _native.project_scan(like, encoded(projector), as_volume(volume, "volume", like.geometry), residual)
+    if residual:
+        raise invalid("arguments", "residual", "a geometry, in which nothing was measured", "a scan")
+    values = volume.data if isinstance(volume, Volume) else volume
+    return _native.project(like, encoded(projector), _real(values, "volume"))
+
+
+def backproject(projections: Any, geometry: _native.Geometry, *, projector: Any = "joseph") -> np.ndarray:
+    """The exact adjoint of :func:`project` in a geometry: ``[view, row, column]`` to ``[x, y, z]``.
+
+    It is not filtered: that is the spec ``fdk``. ``float64`` is computed in double precision.
+    """
+    return _native.backproject(geometry, encoded(projector), _real(projections, "projections"))
+
+
+class Operator:
+    """The system matrix A of a geometry: entries are lengths in mm over which a voxel counts for a ray.
+
+    ``A @ x`` takes a volume ``[x, y, z]`` to projections ``[view, row, column]``, ``A.T @ y`` is the exact adjoint. Both also
+    take flat vectors to flat vectors, so that A is what SciPy's solvers want (``scipy.sparse.linalg.lsqr(A, b)``).
+
+    Parameters
+    ----------
+    geometry
+        Where all stands.
+    projector
+        ``"joseph"``, ``"siddon"``, ``"trilinear"``, or a dict with one's settings.
+    dtype
+        ``float32``, which works fast, or ``float64``.
+    """
+
+    #: NumPy leaves ``array @ A`` to this class, which has no such product.
+    __array_ufunc__ = None
+
+    def __init__(self, geometry: _native.Geometry, *, projector: Any = "joseph", dtype: Any = np.float32) -> None:
+        self.geometry = geometry
+        self.dtype = np.dtype(dtype)
+        if self.dtype not in (np.dtype(np.float32), np.dtype(np.float64)):
+            raise invalid("arguments", "dtype", self.dtype, "float32 or float64")
+        self._projector = encoded(projector)
+        self._transposed = False
+        self._other: Operator | None = None
+
+    @property
+    def T(self) -> Operator:
+        """The adjoint."""
+        if self._other is None:
+            other = Operator.__new__(Operator)
+            other.__dict__.update(self.__dict__)
+            other._transposed = not self._transposed
+            other._other = self
+            self._other = other
+        return self._other
+
+    H = T
+
+    @property
+    def input_shape(self) -> tuple[int, int, int]:
+        """Of what it is applied to."""
+        return self.geometry.projections_shape if self._transposed else self.geometry.volume_shape
+
+    @property
+    def output_shape(self) -> tuple[int, int, int]:
+        """Of what comes out."""
+        return self.geometry.volume_shape if self._transposed else self.geometry.projections_shape
+
+    @property
+    def shape(self) -> tuple[int, int]:
+        """Rows and columns of the matrix."""
+        return int(np.prod(self.output_shape)), int(np.prod(self.input_shape))
+
+    ndim = 2
+
+    def __matmul__(self, x: Any) -> np.ndarray:
+        x = as_array(x.data if isinstance(x, Volume) else x, "operand").astype(self.dtype, copy=False)
+        flat = x.shape in ((self.shape[1],), (self.shape[1], 1))
+        if not flat and x.shape != self.input_shape:
+            expected = f"{self.input_shape}, or a vector of {self.shape[1]}"
+            raise invalid("operator", "shape", x.shape, expected)
+        apply = _native.backproject if self._transposed else _native.project
+        y = apply(self.geometry, self._projector, x.reshape(self.input_shape))
+        return y.reshape((self.shape[0],) + x.shape[1:]) if flat else y
+
+    __call__ = __matmul__
+
+    def matvec(self, x: Any) -> np.ndarray:
+        """``A @ x`` of a flat vector."""
+        return self @ x
+
+    def rmatvec(self, y: Any) -> np.ndarray:
+        """``A.T @ y`` of a flat vector."""
+        return self.T @ y
+
+    def as_linear_operator(self) -> Any:
+        """This as ``scipy.sparse.linalg.LinearOperator``."""
+        from scipy.sparse.linalg import LinearOperator
+
+        return LinearOperator(self.shape, matvec=self.matvec, rmatvec=self.rmatvec, dtype=self.dtype)
+
+    def __repr__(self) -> str:
+        m, n = self.shape
+        return f"Operator({m} x {n}, {self.dtype})"

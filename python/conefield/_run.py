@@ -1,0 +1,293 @@
+"""Runs: planned, reconstructed, pre-trained, scored."""
+
+from __future__ import annotations
+
+import math
+import os
+from typing import Any, Iterable, Mapping
+
+import numpy as np
+
+from . import _native
+from ._errors import invalid
+from ._progress import Callback, Told
+from ._scan import as_scan
+from ._spec import argument, encoded
+from ._volume import Volume, as_volume
+
+
+class Plan:
+    """What a spec builds; ``str`` of it is what ``conefield explain`` prints.
+
+    Attributes
+    ----------
+    facts
+        Stages, widths, parameters, memory and work, with the keys of ``conefield explain --json``.
+    schedule
+        With a budget: what would run, how many steps there is time for, and what each part is expected to take.
+    """
+
+    def __init__(self, facts: dict[str, Any], text: str, schedule: dict[str, Any] | None) -> None:
+        self.facts = facts
+        self.schedule = schedule
+        self._text = text
+
+    @property
+    def parameters(self) -> int:
+        """Parameters of all fields."""
+        return self.facts["parameters"]
+
+    @property
+    def memory(self) -> dict[str, int] | None:
+        """Bytes that a run takes at the moment that takes most, by what holds them; nothing without a scan."""
+        scan = self.facts["scan"]
+        return None if scan is None else scan["memory"]
+
+    def __str__(self) -> str:
+        return self._text
+
+    def __repr__(self) -> str:
+        return f"Plan({self.facts['spec']!r}, {self.parameters} parameters)"
+
+
+class Reconstruction:
+    """What came out of a scan.
+
+    Attributes
+    ----------
+    volume
+        The :class:`Volume`, in 1/unit of the scan.
+    scores
+        PSNR, RMSE and three definitions of SSIM where a reference was given, else nothing.
+    record
+        What was run on what, and what came of it: spec (``spec_toml`` repeats the run), seed, steps, seconds, memory,
+        backend, loss, held-out error, and all records.
+    field
+        The trained :class:`Field` of a neural method: it can be evaluated at other voxels, and written.
+    """
+
+    def __init__(self, volume: Volume, record: dict[str, Any], field: _native.Field | None) -> None:
+        self.volume = volume
+        self.record = record
+        self.scores = _scores(record["scores"])
+        self.field = field
+
+    def __array__(self, dtype: Any = None, copy: bool | None = None) -> np.ndarray:
+        return self.volume.__array__(dtype, copy)
+
+    def __repr__(self) -> str:
+        x, y, z = self.volume.shape
+        score = "" if self.scores is None else f", {self.scores['psnr']:.2f} dB"
+        return f"Reconstruction({self.record['spec']!r}, {x} x {y} x {z}, {self.record['steps']} steps{score})"
+
+
+def _scores(scores: dict[str, Any] | None) -> dict[str, Any] | None:
+    """JSON has no number for the PSNR of equal volumes."""
+    if scores is not None and scores.get("psnr", 0.0) is None:
+        scores["psnr"] = math.inf
+    return scores
+
+
+def _time(value: Any) -> str | None:
+    """Seconds, or a text such as ``"10m"``."""
+    return None if value is None else str(value)
+
+
+def _hold_out(value: Any) -> str | None:
+    """View numbers, or a text such as ``"every:10"``."""
+    if value is None or isinstance(value, str):
+        return value
+    return ",".join(str(int(v)) for v in np.atleast_1d(np.asarray(value, dtype=np.int64)))
+
+
+def _wanted(
+    spec: Any,
+    sets: Mapping[str, Any] | None,
+    overrides: Mapping[str, Any],
+    *,
+    backend: str = "auto",
+    seed: int = 0,
+    steps: int | None = None,
+    seconds: Any = None,
+    at_most: Any = None,
+    budget: Any = None,
+    peak: float | None = None,
+    hold_out: Any = None,
+    init: str | None = None,
+    truth: bool = False,
+) -> str:
+    return encoded(
+        {
+            "spec": argument(spec, sets, overrides),
+            "backend": backend,
+            "seed": seed,
+            "ends": {"steps": steps, "seconds": _time(seconds), "at_most": _time(at_most)},
+            "budget": _time(budget),
+            "peak": peak,
+            "hold_out": _hold_out(hold_out),
+            "init": init,
+            "truth": truth,
+        }
+    )
+
+
+def plan(
+    spec: Any = None,
+    scan: Any = None,
+    *,
+    budget: Any = None,
+    backend: str = "auto",
+    sets: Mapping[str, Any] | None = None,
+    **overrides: Any,
+) -> Plan:
+    """What a spec builds: stages, widths, parameters, memory, work. As ``conefield explain``.
+
+    With a scan also what it takes for that scan, and what is found out about the scan before a run starts. With a
+    ``budget`` (seconds, or a text such as ``"5m"``) the machine is measured for a second or a few, and ``schedule`` says what
+    would run; without a spec it is the best that fits.
+    """
+    scan = None if scan is None else as_scan(scan)
+    wanted = _wanted(spec, sets, overrides, backend=backend, budget=budget)
+    facts, text, schedule = _native.plan(wanted, scan)
+    return Plan(facts, text, schedule)
+
+
+def explain(spec: Any, scan: Any = None, **arguments: Any) -> str:
+    """What ``conefield explain`` prints. As :func:`plan`."""
+    return str(plan(spec, scan, **arguments))
+
+
+def reconstruct(
+    scan: Any,
+    spec: Any = None,
+    *,
+    budget: Any = None,
+    init: Any = None,
+    reference: Any = None,
+    peak: float | None = None,
+    hold_out: Any = None,
+    steps: int | None = None,
+    seconds: Any = None,
+    at_most: Any = None,
+    seed: int = 0,
+    backend: str = "auto",
+    callback: Callback | None = None,
+    every: float = 1.0,
+    slices: bool = False,
+    progress: bool = False,
+    sets: Mapping[str, Any] | None = None,
+    **overrides: Any,
+) -> Reconstruction:
+    """Reconstructs a volume from a scan. As ``conefield reconstruct``, and to the same bits.
+
+    Parameters
+    ----------
+    scan
+        A :class:`Scan`, or the file or folder of one.
+    spec
+        A shipped name (:func:`spec_names`), the type of a method, a TOML or JSON file, or a dict with the keys of one
+        (``{"extends": "fast", "field": {"width": 32}}``). With a budget it may be left out.
+    budget
+        Plan the run to take so long in all: seconds, or a text such as ``"60s"`` or ``"10m"``.
+    init
+        What to start from: the file of weights that :func:`pretrain` made, or a volume (in 1/unit of the scan).
+    reference
+        The volume sought, to compare with: a volume, an array or a file, or ``"truth"`` for the one that the scan comes
+        with. It is looked at, never learned from.
+    peak
+        The data range for PSNR and SSIM: 1 for a reference in [0, 1], else the range of its values.
+    hold_out
+        Views to keep aside and predict: their numbers, or a text such as ``"every:10"``.
+    steps, seconds, at_most
+        When training ends, beside what the spec says: steps, a time that what aims at the end looks at, and one that it does
+        not look at.
+    seed
+        Of everything random. Same spec, seed, input and build give the same bits on the CPU.
+    backend
+        ``"auto"``, ``"cpu"``, ``"wgpu"`` or ``"wgpu:N"``.
+    callback
+        Is called with a :class:`Progress` at most every ``every`` seconds, and at the end. With ``slices`` it also sees the
+        middle slices of a field that trains. What it raises ends the run.
+    progress
+        Show a bar, where tqdm is installed.
+    sets, **overrides
+        Single settings on top of the spec, by their path: ``sets={"encoder.levels": 8}``, or as a keyword with two
+        underscores for a dot: ``encoder__levels=8``.
+
+    Ctrl-C ends the run after its step with :class:`KeyboardInterrupt`. Other threads of Python go on meanwhile.
+    """
+    scan = as_scan(scan)
+    truth = isinstance(reference, str) and reference == "truth" and not os.path.exists(reference)
+    known = None if reference is None or truth else as_volume(reference, "reference", scan.geometry)
+    file, start = _start(init, scan.geometry)
+    wanted = _wanted(
+        spec,
+        sets,
+        overrides,
+        backend=backend,
+        seed=seed,
+        steps=steps,
+        seconds=seconds,
+        at_most=at_most,
+        budget=budget,
+        peak=peak,
+        hold_out=hold_out,
+        init=file,
+        truth=truth,
+    )
+    with Told("reconstruct", callback, every, slices, progress) as tell:
+        return Reconstruction(*_native.reconstruct(scan, wanted, start, known, tell))
+
+
+def _start(init: Any, geometry: _native.Geometry) -> tuple[str | None, Volume | None]:
+    """A file, or a volume in memory."""
+    if init is None:
+        return None, None
+    if isinstance(init, (str, os.PathLike)):
+        return os.fspath(init), None
+    return None, as_volume(init, "init", geometry)
+
+
+def pretrain(
+    volumes: Iterable[Any],
+    output: str | os.PathLike[str],
+    spec: Any,
+    *,
+    steps: int | None = None,
+    seconds: Any = None,
+    at_most: Any = None,
+    seed: int = 0,
+    backend: str = "auto",
+    callback: Callback | None = None,
+    every: float = 1.0,
+    progress: bool = False,
+    sets: Mapping[str, Any] | None = None,
+    **overrides: Any,
+) -> dict[str, Any]:
+    """Trains a field on known volumes and writes the weights that other scans start from (MCI). As ``conefield pretrain``.
+
+    ``volumes`` are volumes, arrays, files or phantoms; ``output`` ends in ``.safetensors``. Returns a record of it.
+    """
+    if isinstance(volumes, (str, os.PathLike, Volume)):
+        raise invalid("arguments", "volumes", "one volume", "a list of them")
+    known = [as_volume(v, "volumes") for v in volumes]
+    wanted = _wanted(
+        spec, sets, overrides, backend=backend, seed=seed, steps=steps, seconds=seconds, at_most=at_most
+    )
+    with Told("pretrain", callback, every, False, progress) as tell:
+        return _native.pretrain(known, os.fspath(output), wanted, tell)
+
+
+def evaluate(volume: Any, reference: Any, *, peak: float | None = None, labels: bool = False) -> dict[str, Any]:
+    """Scores a volume against a reference. As ``conefield evaluate --json``.
+
+    ``psnr`` (dB), ``rmse``, ``ssim_2d``, ``ssim_3d`` and ``ssim_skimage``, the slices of largest error, and ``peak``, the data
+    range that they refer to. With ``labels`` both are label maps of whole numbers, and ``dice`` tells how far they agree.
+    """
+    found = _native.evaluate(as_volume(volume, "volume"), as_volume(reference, "reference"), peak, labels)
+    return _scores(found) or {}
+
+
+def read_field(path: str | os.PathLike[str]) -> _native.Field:
+    """The trained field of a finished run: its folder, or its ``weights.safetensors``."""
+    return _native.read_field(os.fspath(path))

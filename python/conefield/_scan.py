@@ -1,0 +1,103 @@
+"""Scans: read, written, made of arrays, simulated."""
+
+from __future__ import annotations
+
+import json
+import os
+from typing import Any
+
+from . import _native
+from ._arrays import as_floats, counts, pair
+from ._errors import invalid
+from ._volume import as_volume
+
+Scan = _native.Scan
+
+
+def scan(projections: Any, geometry: _native.Geometry, *, unit: str = "mm", unit_mm: float = 1.0) -> Scan:
+    """A scan of measured line integrals.
+
+    Parameters
+    ----------
+    projections
+        ``A = -ln(I/I0)``, ``[view, row, column]``, without a unit: an array, or anything that exports DLPack.
+    geometry
+        Where all stood.
+    unit, unit_mm
+        The unit of length that volumes count per, by name and in millimetres: attenuation comes out in 1/unit.
+    """
+    return Scan(as_floats(projections, "projections", 3), geometry, (unit, float(unit_mm)))
+
+
+def read_scan(path: str | os.PathLike[str]) -> Scan:
+    """Reads a scan: conefield's own folder, R2-Gaussian's, the pickle of NAF and SAX-NeRF, or a ``scanner.toml``."""
+    return _native.read_scan(os.fspath(path))
+
+
+def write_scan(path: str | os.PathLike[str], scan: Scan) -> None:
+    """Writes conefield's own folder of a scan, with its truth where it has one."""
+    _native.write_scan(os.fspath(path), scan)
+
+
+def as_scan(value: Any) -> Scan:
+    """``value`` as a scan: itself or a file."""
+    if isinstance(value, Scan):
+        return value
+    if isinstance(value, (str, os.PathLike)):
+        return read_scan(value)
+    raise invalid("arguments", "scan", f"a {type(value).__name__}", "a Scan, or the file or folder of one")
+
+
+def simulate(
+    volume: Any,
+    geometry: _native.Geometry | None = None,
+    *,
+    protocol: str | os.PathLike[str] = "r2",
+    views: int | None = None,
+    detector: Any = None,
+    offset: Any = None,
+    angles: str | None = None,
+    noise: str | None = None,
+    values: str = "as-is",
+    downsample: int = 1,
+    seed: int | None = None,
+) -> Scan:
+    """A scan of a known volume, which the scan keeps as its truth.
+
+    Line integrals are those of the volume's trilinear interpolation. As ``conefield simulate``.
+
+    Parameters
+    ----------
+    volume
+        A :class:`Volume`, an array ``[x, y, z]``, a file, or ``"phantom:head"``, ``"phantom:abdomen"``,
+        ``"phantom:random:SEED"``, each also with ``:SIZE``.
+    geometry
+        Where all stands; values are in 1/mm then, and the volume is taken as it stands. Without one:
+    protocol, views, detector, offset, angles
+        ``"r2"``, the published synthetic set-up, or a TOML or JSON file; and what is to be other than it says: the number
+        of views, rows and columns, the detector's shift along v and u in mm, and ``"START:RANGE"`` in degrees or a file.
+    noise
+        ``"none"``, ``"tigre:I0,SIGMA"`` such as ``"tigre:1e4,10"`` (the published one), or ``"poisson:I0"``.
+    values
+        What voxel values mean: ``"as-is"`` (attenuation), ``"hu:MU_WATER"`` or ``"clip:LO,HI"``.
+    downsample
+        Average blocks of so many voxels a side first.
+    seed
+        Of the noise.
+    """
+    beside = [name for name, value in [("views", views), ("detector", detector), ("offset", offset), ("angles", angles)] if value is not None]
+    if geometry is not None and (beside or protocol != "r2"):
+        raise invalid("arguments", (beside or ["protocol"])[0], "a geometry beside it", "one of them")
+    wanted = {
+        "protocol": os.fspath(protocol),
+        "views": None if views is None else counts(views, "views", 1)[0],
+        "detector": None if detector is None else counts(detector, "detector", 2),
+        "offset": None if offset is None else pair(offset, "offset"),
+        "angles": angles,
+        "noise": noise,
+        "seed": seed,
+        "downsample": counts(downsample, "downsample", 1)[0],
+        "values": values,
+        "source": os.fspath(volume) if isinstance(volume, (str, os.PathLike)) else "an array",
+    }
+    return _native.simulate(as_volume(volume, "volume", geometry), json.dumps(wanted), geometry)

@@ -1,0 +1,59 @@
+"""Specs: by name, file or dict, with single settings on top."""
+
+from __future__ import annotations
+
+import json
+import os
+from typing import Any, Mapping
+
+import numpy as np
+
+from . import _native
+from ._errors import invalid
+
+
+def _plain(value: Any) -> Any:
+    """NumPy's numbers and paths as JSON has them."""
+    if isinstance(value, (np.generic, np.ndarray)):
+        return value.tolist()
+    if isinstance(value, os.PathLike):
+        return os.fspath(value)
+    raise invalid("spec", "value", f"a {type(value).__name__}", "numbers, texts, lists and dicts")
+
+
+def encoded(value: Any) -> str:
+    """``value`` in JSON."""
+    try:
+        return json.dumps(value, default=_plain)
+    except (TypeError, ValueError) as error:
+        raise invalid("arguments", "value", error, "numbers, texts, lists and dicts") from error
+
+
+def argument(spec: Any, sets: Mapping[str, Any] | None, overrides: Mapping[str, Any]) -> dict[str, Any]:
+    """What the native half is told of a spec."""
+    paths = dict(sets or {})
+    for key, value in overrides.items():
+        path = key.replace("__", ".")
+        if path in paths:
+            raise invalid("arguments", path, "the setting twice", "it once, in sets or by its keyword")
+        paths[path] = value
+    if spec is None or isinstance(spec, (str, os.PathLike)):
+        return {"name": None if spec is None else os.fspath(spec), "table": None, "sets": paths}
+    if isinstance(spec, Mapping):
+        return {"name": None, "table": dict(spec), "sets": paths}
+    raise invalid("arguments", "spec", f"a {type(spec).__name__}", "a name, a file or a dict")
+
+
+def spec_names() -> list[str]:
+    """Every name that stands for a spec: of those that are shipped, and of methods that need no setting."""
+    return _native.spec_names()
+
+
+def spec_text(spec: Any, sets: Mapping[str, Any] | None = None, **overrides: Any) -> str:
+    """The spec as TOML with every default written, as a run would use it."""
+    return _native.spec_text(encoded(argument(spec, sets, overrides)))
+
+
+def schema() -> dict[str, Any]:
+    """The JSON Schema of specs, with every key's meaning and default."""
+    return _native.schema()

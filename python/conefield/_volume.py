@@ -1,0 +1,95 @@
+"""Voxels with their place in the world."""
+
+from __future__ import annotations
+
+import os
+from typing import Any
+
+import numpy as np
+
+from . import _native
+from ._arrays import as_floats, triple
+from ._errors import invalid
+
+
+class Volume:
+    """Voxels of attenuation (or of any other quantity) with their place in the world.
+
+    Parameters
+    ----------
+    data
+        Values, ``[x, y, z]``: an array, or anything that exports DLPack. Attenuation is in 1/mm, or in 1/unit of the scan
+        that it belongs to.
+    spacing
+        Side lengths of a voxel along x, y and z, mm; one number for cubes.
+    center
+        Where the middle of the grid stands, mm. The rotation axis is z through 0.
+    affine
+        Four by four: voxel indices to the patient's or the file's own coordinates in mm (NIfTI's, RAS), if known.
+
+    ``data`` is a NumPy array of ``float32``. It may be changed.
+    """
+
+    __slots__ = ("data", "spacing", "center", "affine")
+
+    data: np.ndarray
+    spacing: tuple[float, float, float]
+    center: tuple[float, float, float]
+    affine: np.ndarray | None
+
+    def __init__(self, data: Any, spacing: Any = 1.0, center: Any = 0.0, affine: Any = None) -> None:
+        self.data = as_floats(data, "data", 3)
+        self.spacing = triple(spacing, "spacing")
+        self.center = triple(center, "center")
+        self.affine = None if affine is None else as_floats(affine, "affine", 2, np.float64)
+        if self.affine is not None and self.affine.shape != (4, 4):
+            raise invalid("arguments", "affine", f"an array of shape {self.affine.shape}", "(4, 4)")
+
+    @property
+    def shape(self) -> tuple[int, int, int]:
+        """Voxels along x, y and z."""
+        return self.data.shape  # type: ignore[return-value]
+
+    def write(self, path: str | os.PathLike[str]) -> None:
+        """Writes ``.nii``, ``.nii.gz``, ``.mha`` or ``.npy``, as the name asks. The file is complete or not there."""
+        _native.write_volume(os.fspath(path), self)
+
+    def __array__(self, dtype: Any = None, copy: bool | None = None) -> np.ndarray:
+        if dtype is not None and np.dtype(dtype) != self.data.dtype:
+            if copy is False:
+                raise ValueError(f"a volume of float32 has no view as {np.dtype(dtype)}")
+            return self.data.astype(dtype)
+        return self.data.copy() if copy else self.data
+
+    def __dlpack__(self, **arguments: Any) -> Any:
+        return self.data.__dlpack__(**arguments)
+
+    def __dlpack_device__(self) -> tuple[int, int]:
+        return self.data.__dlpack_device__()
+
+    def __repr__(self) -> str:
+        x, y, z = self.shape
+        return f"Volume({x} x {y} x {z}, spacing {self.spacing} mm)"
+
+
+def as_volume(value: Any, name: str, like: Any = None) -> Volume:
+    """``value`` as a volume: itself, a file, ``phantom:KIND[:SIZE]``, or an array.
+
+    An array has the voxels of the geometry ``like``, if that is given and of its shape, else voxels of 1 mm.
+    """
+    if isinstance(value, Volume):
+        return value
+    if isinstance(value, (str, os.PathLike)):
+        return _native.read_volume(os.fspath(value))
+    array = as_floats(value, name, 3)
+    if like is not None and tuple(like.volume_shape) == array.shape:
+        return Volume(array, like.spacing, like.center)
+    return Volume(array)
+
+
+def read_volume(path: str | os.PathLike[str]) -> Volume:
+    """Reads a volume: NIfTI, MetaImage, NumPy, or the folder of a DICOM series.
+
+    ``phantom:head``, ``phantom:abdomen`` and ``phantom:random:SEED``, each also with ``:SIZE``, are made by the program.
+    """
+    return _native.read_volume(os.fspath(path))

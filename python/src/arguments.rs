@@ -1,0 +1,41 @@
+//! Arguments that Python hands over as JSON, checked with the words of the command.
+
+use crate::errors::raised;
+use conefield_core::{Error, Result};
+use conefield_run::backend::BackendChoice;
+use conefield_run::parse::{self, HoldOut};
+use pyo3::prelude::*;
+use serde::de::DeserializeOwned;
+
+/// The arguments in `text`, which the package itself has written.
+pub fn read<T: DeserializeOwned>(py: Python<'_>, text: &str) -> PyResult<T> {
+    serde_json::from_str(text)
+        .map_err(|e| raised(py, &Error::invalid("arguments", "values", e, "numbers and texts of the documented kinds")))
+}
+
+/// An argument that is written as on the command line.
+fn parsed<T>(name: &str, text: &str, parse: impl Fn(&str) -> Result<T, String>) -> Result<T> {
+    parse(text)
+        .map_err(|why| Error::invalid("arguments", name, format!("{text:?}"), why.trim_start_matches("expected ")))
+}
+
+/// See [`parsed`]; nothing of nothing.
+pub fn optional<T>(name: &str, text: Option<&String>, parse: impl Fn(&str) -> Result<T, String>) -> Result<Option<T>> {
+    text.map(|t| parsed(name, t, parse)).transpose()
+}
+
+/// What is to compute.
+pub fn backend(text: &str) -> Result<BackendChoice> {
+    parsed("backend", text, |t| t.parse())
+}
+
+/// Seconds.
+pub fn seconds(name: &str, text: Option<&String>) -> Result<Option<f64>> {
+    optional(name, text, parse::seconds)
+}
+
+/// Indices of the views that are kept aside, of `n`.
+pub fn held_out(text: Option<&String>, n: usize) -> Result<Vec<usize>> {
+    let choice: Option<HoldOut> = optional("hold_out", text, parse::hold_out)?;
+    conefield_run::input::held_out(choice.as_ref(), n, "arguments", "hold_out")
+}

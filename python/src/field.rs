@@ -1,0 +1,92 @@
+//! A trained field: it can be evaluated at any voxels.
+
+use crate::arguments;
+use crate::volume::made;
+use crate::work::without_lock;
+use conefield_core::parts::Voxels;
+use conefield_core::scan::Volume;
+use conefield_core::trained::TrainedField;
+use conefield_core::{Error, Result, allowance};
+use conefield_run::files;
+use ndarray::{Array3, s};
+use pyo3::prelude::*;
+use std::collections::BTreeMap;
+use std::path::PathBuf;
+
+/// What a neural method has trained.
+#[pyclass(frozen, module = "conefield._native")]
+pub struct Field {
+    field: TrainedField,
+    notes: BTreeMap<String, String>,
+}
+
+impl Field {
+    pub fn new(field: TrainedField, notes: BTreeMap<String, String>) -> Self {
+        Self { field, notes }
+    }
+}
+
+#[pymethods]
+impl Field {
+    /// Its values at voxels of which `voxels` stand along the longest side.
+    #[pyo3(signature = (voxels = None, backend = "auto"))]
+    fn volume<'py>(&self, py: Python<'py>, voxels: Option<usize>, backend: &str) -> PyResult<Bound<'py, PyAny>> {
+        let volume = without_lock(py, |watch| {
+            let backend = arguments::backend(backend)?.open()?;
+            let own = self.field.scene.grid;
+            let grid = match voxels {
+                None => own,
+                Some(n @ 1..=8192) => own.with_longest(n),
+                Some(n) => return Err(Error::invalid("arguments", "voxels", n, "1 to 8192 along the longest side")),
+            };
+            grid.validate("arguments")?;
+            allowance::numbers("arguments", "voxels", grid.len().unwrap_or(usize::MAX))?;
+            let mut from = self.field.voxels(backend.as_ref(), grid)?;
+            collect(&mut from, &|| watch.cancelled())
+        })?;
+        made(py, volume)
+    }
+
+    /// Writes weights.safetensors, which the command's `export` and `features` read.
+    fn write(&self, py: Python<'_>, path: PathBuf) -> PyResult<()> {
+        without_lock(py, |_| files::write_field(&path, &self.field, self.notes.clone()))
+    }
+
+    #[getter]
+    fn parameters(&self) -> usize {
+        self.field.model.pipeline.layout().len()
+    }
+
+    fn __repr__(&self) -> String {
+        let [x, y, z] = self.field.scene.grid.shape;
+        format!("Field({} parameters, trained for {x} x {y} x {z} voxels)", self.parameters())
+    }
+}
+
+/// All of `voxels`, plane by plane, unless it is cancelled.
+pub fn collect(voxels: &mut dyn Voxels, cancelled: &dyn Fn() -> bool) -> Result<Volume> {
+    let grid = voxels.grid();
+    let mut data = Array3::zeros(grid.shape);
+    let [nx, ny, nz] = grid.shape;
+    // As many planes as are worth a look in between.
+    let planes = (1usize << 20).div_ceil((ny * nz).max(1));
+    for from in (0..nx).step_by(planes) {
+        if cancelled() {
+            return Err(Error::Aborted { part: "the evaluation of voxels".into() });
+        }
+        let x = from..(from + planes).min(nx);
+        voxels.fill(&[x.clone(), 0..ny, 0..nz], data.slice_mut(s![x, .., ..]))?;
+    }
+    Ok(Volume { data, grid, affine: voxels.affine() })
+}
+
+/// Reads what a run has left as weights.safetensors.
+#[pyfunction]
+pub fn read_field(py: Python<'_>, path: PathBuf) -> PyResult<Field> {
+    let file = if path.is_dir() { path.join("weights.safetensors") } else { path };
+    let (field, notes) = without_lock(py, |_| {
+        let notes = conefield_io::read_weights(&file)?.notes;
+        Ok((files::read_field(&file)?, notes))
+    })?;
+    Ok(Field::new(field, notes))
+}

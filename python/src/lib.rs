@@ -1,0 +1,55 @@
+//! The native half of the Python package `conefield`: arrays and settings come in, the workspace's crates work without
+//! Python's lock, and arrays or errors in the same words as the command's go out. What users see, with its documentation,
+//! is written in Python (`conefield/`).
+
+mod arguments;
+mod arrays;
+mod encoder;
+mod errors;
+mod field;
+mod geometry;
+mod log;
+mod operator;
+mod regularizer;
+mod run;
+mod scan;
+mod specs;
+mod stages;
+mod volume;
+mod work;
+
+use peak_alloc::PeakAlloc;
+use pyo3::prelude::*;
+
+/// Counts what is held, so that readers can be kept within what they may take.
+#[global_allocator]
+static HEAP: PeakAlloc = PeakAlloc;
+
+#[pymodule]
+mod _native {
+    #[pymodule_export]
+    use crate::field::{Field, read_field};
+    #[pymodule_export]
+    use crate::geometry::Geometry;
+    #[pymodule_export]
+    use crate::operator::{backproject, project, project_scan};
+    #[pymodule_export]
+    use crate::run::{evaluate, plan, pretrain, reconstruct};
+    #[pymodule_export]
+    use crate::scan::{Scan, read_scan, simulate, write_scan};
+    #[pymodule_export]
+    use crate::specs::{schema, spec_names, spec_text};
+    #[pymodule_export]
+    use crate::stages::{check_stage, register, stage_names};
+    #[pymodule_export]
+    use crate::volume::{read_volume, write_volume};
+    use pyo3::prelude::*;
+
+    #[pymodule_init]
+    fn init(m: &Bound<'_, PyModule>) -> PyResult<()> {
+        conefield_run::memory::count(|| crate::HEAP.current_usage() as u64);
+        conefield_run::memory::set_budget(None);
+        crate::log::start();
+        m.add("__version__", env!("CARGO_PKG_VERSION"))
+    }
+}

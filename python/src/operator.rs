@@ -1,0 +1,126 @@
+//! Line integrals of voxels, and their adjoint.
+
+use crate::arguments;
+use crate::arrays::{given, owned};
+use crate::geometry::Geometry;
+use crate::scan::Scan;
+use crate::volume::taken;
+use crate::work::without_lock;
+use conefield_core::error::ensure;
+use conefield_core::geometry;
+use conefield_core::simd::Real;
+use conefield_core::voxel::{VoxelOperator, VoxelProjector};
+use conefield_core::{Error, Result};
+use conefield_run::memory::Memory;
+use conefield_run::projection;
+use ndarray::Array3;
+use numpy::{Element, PyArray3, PyReadonlyArray3};
+use pyo3::prelude::*;
+use serde_json::Value;
+
+/// Which way.
+#[derive(Clone, Copy)]
+enum Way {
+    Forward,
+    Adjoint,
+}
+
+fn apply<R: Real>(
+    way: Way,
+    operator: &dyn VoxelOperator<R>,
+    g: &geometry::Geometry,
+    x: Array3<R>,
+) -> Result<Array3<R>> {
+    let [rows, columns] = g.detector;
+    let (volume, views) = (g.volume.shape, [g.views.len(), rows, columns]);
+    let (from, to, what) = match way {
+        Way::Forward => (volume, views, "volume"),
+        Way::Adjoint => (views, volume, "projections"),
+    };
+    let found = format!("{:?}", x.shape());
+    ensure(x.shape() == from, what, "shape", found, format!("{from:?}, as the geometry has it"))?;
+    let all: Vec<usize> = (0..g.views.len()).collect();
+    let mut out = Array3::from_elem(to, R::ZERO);
+    match way {
+        Way::Forward => operator.forward(g, &all, x.view(), out.view_mut()),
+        Way::Adjoint => operator.adjoint(g, &all, x.view(), out.view_mut()),
+    }
+    operator.fault()?;
+    Ok(out)
+}
+
+fn run<'py>(
+    py: Python<'py>,
+    way: Way,
+    geometry: &Bound<'py, Geometry>,
+    projector: &str,
+    array: &Bound<'py, PyAny>,
+) -> PyResult<Bound<'py, PyAny>> {
+    fn of<'py, R: Real + Element>(
+        py: Python<'py>,
+        x: &PyReadonlyArray3<'py, R>,
+        work: impl FnOnce(Array3<R>) -> Result<Array3<R>> + Send,
+    ) -> PyResult<Bound<'py, PyAny>> {
+        let x = owned(x);
+        Ok(given(py, without_lock(py, |_| work(x))?).into_any())
+    }
+    let projector: Value = arguments::read(py, projector)?;
+    let g = &geometry.get().0;
+    if let Ok(double) = array.extract::<PyReadonlyArray3<'_, f64>>() {
+        return of(py, &double, |x| apply(way, projection::projector(projector)?.reference(), g, x));
+    }
+    let single: PyReadonlyArray3<'_, f32> = array.extract()?;
+    of(py, &single, |x| apply(way, projection::projector(projector)?.operator(), g, x))
+}
+
+/// `A·x`, in the precision of `volume`.
+#[pyfunction]
+pub fn project<'py>(
+    py: Python<'py>,
+    geometry: &Bound<'py, Geometry>,
+    projector: &str,
+    volume: &Bound<'py, PyAny>,
+) -> PyResult<Bound<'py, PyAny>> {
+    run(py, Way::Forward, geometry, projector, volume)
+}
+
+/// `Aᵀ·y`, in the precision of `projections`.
+#[pyfunction]
+pub fn backproject<'py>(
+    py: Python<'py>,
+    geometry: &Bound<'py, Geometry>,
+    projector: &str,
+    projections: &Bound<'py, PyAny>,
+) -> PyResult<Bound<'py, PyAny>> {
+    run(py, Way::Adjoint, geometry, projector, projections)
+}
+
+/// Predicted views of `scan`, whose unit the volume's values count per; with `residual`, measured less predicted ones.
+#[pyfunction]
+pub fn project_scan<'py>(
+    py: Python<'py>,
+    scan: &Bound<'py, Scan>,
+    projector: &str,
+    volume: &Bound<'py, PyAny>,
+    residual: bool,
+) -> PyResult<Bound<'py, PyArray3<f32>>> {
+    let projector: Value = arguments::read(py, projector)?;
+    let (volume, scan) = (taken(volume)?, &scan.get().scan);
+    let views = without_lock(py, |_| {
+        let projector = projection::projector(projector)?;
+        let mut geometry = scan.geometry.clone();
+        geometry.volume = projection::placed(&volume, &geometry.volume, true);
+        check_memory(projector.as_ref(), &geometry)?;
+        let mut views = projection::predicted(&volume, &geometry, scan.unit.mm, projector.as_ref())?;
+        if residual {
+            projection::residual(scan, &mut views)?;
+        }
+        Ok::<_, Error>(views)
+    })?;
+    Ok(given(py, views))
+}
+
+fn check_memory(projector: &dyn VoxelProjector, geometry: &geometry::Geometry) -> Result<()> {
+    let buffers = projection::bytes(projector, geometry);
+    Memory::most(&[Memory { buffers, ..Memory::default() }]).check(|_| vec![])
+}

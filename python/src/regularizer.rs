@@ -1,0 +1,143 @@
+//! A regularizer whose arithmetic is a Python object's: a proximal map, or a denoiser that is put in its place.
+
+use crate::stages::Raised;
+use conefield_core::error::ensure;
+use conefield_core::geometry::VoxelGrid;
+use conefield_core::regularizer::{Penalty, Regularizer};
+use conefield_core::space::Space;
+use conefield_core::{Error, Result};
+use ndarray::{Array3, ArrayView3};
+use numpy::{IntoPyArray, PyReadonlyArray3};
+use pyo3::prelude::*;
+use pyo3::types::PyDict;
+use std::sync::{Arc, Mutex, PoisonError};
+
+/// How strong it is.
+#[derive(Debug, Clone, Copy)]
+enum Weight {
+    /// λ.
+    Fixed(f64),
+    /// Times the root mean square of back-projected noise.
+    Noise(f64),
+}
+
+struct Shared {
+    name: &'static str,
+    object: Py<PyAny>,
+    /// One call at a time: the spacing is set on the object before it. It is taken before Python's lock, never after.
+    turn: Mutex<()>,
+    weight: Weight,
+    /// Whether the object tells the value of what it is the proximal map of.
+    has_value: bool,
+    raised: Arc<Raised>,
+}
+
+/// A regularizer of a Python object.
+pub struct PythonRegularizer(Arc<Shared>);
+
+impl PythonRegularizer {
+    /// The outer error is an exception of the object.
+    pub fn new(py: Python<'_>, name: &'static str, object: Py<PyAny>, raised: Arc<Raised>) -> PyResult<Result<Self>> {
+        let own = object.bind(py);
+        let number = |key: &str| -> PyResult<Option<f64>> {
+            own.getattr_opt(key)?.filter(|v| !v.is_none()).map(|v| v.extract()).transpose()
+        };
+        let weight = match (number("weight")?, number("noise_weight")?) {
+            (Some(_), Some(_)) => {
+                let expected = "one of them: weight is λ itself, noise_weight counts in the scan's noise";
+                return Ok(Err(Error::invalid("spec", "weight", "noise_weight beside it", expected)));
+            }
+            (Some(w), None) => Weight::Fixed(w),
+            (None, k) => Weight::Noise(k.unwrap_or(1.0)),
+        };
+        let (Weight::Fixed(w) | Weight::Noise(w)) = weight;
+        if let Err(e) = ensure(w.is_finite() && w >= 0.0, "spec", "weight", w, "a finite number, 0 or more") {
+            return Ok(Err(e));
+        }
+        if !own.hasattr("prox")? {
+            return Ok(Err(Error::invalid("spec", "prox", "no such method", "prox(v, tau), an array like v")));
+        }
+        let has_value = own.hasattr("value")?;
+        Ok(Ok(Self(Arc::new(Shared { name, object, turn: Mutex::new(()), weight, has_value, raised }))))
+    }
+}
+
+impl Regularizer for PythonRegularizer {
+    fn on(&self, grid: &VoxelGrid, space: &Space) -> Box<dyn Penalty> {
+        // What goes in, and what comes out.
+        space.hold(8 * grid.shape.iter().map(|&n| n as u64).product::<u64>());
+        Box::new(On { shared: self.0.clone(), grid: *grid })
+    }
+
+    fn weight(&self, _: &VoxelGrid, noise: &mut dyn FnMut(f64) -> f64) -> f64 {
+        match self.0.weight {
+            Weight::Fixed(w) => w,
+            Weight::Noise(k) => noise(k),
+        }
+    }
+
+    fn describe(&self) -> String {
+        let weight = match self.0.weight {
+            Weight::Fixed(w) => format!("weight {w}"),
+            Weight::Noise(k) => format!("weight {k} times the noise"),
+        };
+        let kind = if self.0.has_value { "a proximal map" } else { "a denoiser" };
+        format!("{}: {kind} written in Python, {weight}", self.0.name)
+    }
+}
+
+/// The object on one grid.
+struct On {
+    shared: Arc<Shared>,
+    grid: VoxelGrid,
+}
+
+impl On {
+    /// Does `call` with Python's lock, one at a time; nothing where it or another stage has failed.
+    fn call<T>(&self, call: impl FnOnce(Python<'_>, &Bound<'_, PyAny>) -> PyResult<T>) -> Option<T> {
+        if self.shared.raised.any() {
+            return None;
+        }
+        let _turn = self.shared.turn.lock().unwrap_or_else(PoisonError::into_inner);
+        Python::attach(|py| {
+            let object = self.shared.object.bind(py);
+            let called = object.setattr("spacing", self.grid.spacing).and_then(|()| call(py, object));
+            called.map_err(|e| self.shared.raised.note(e)).ok()
+        })
+    }
+
+    fn prox_of(&self, py: Python<'_>, object: &Bound<'_, PyAny>, v: &[f32], tau: f32) -> PyResult<Array3<f32>> {
+        let v = Array3::from_shape_vec(self.grid.shape, v.to_vec())
+            .map_err(|e| crate::errors::broken(py, &e.to_string()))?;
+        let found = object.call_method1("prox", (v.into_pyarray(py), tau))?;
+        let arguments = PyDict::new(py);
+        arguments.set_item("dtype", numpy::dtype::<f32>(py))?;
+        let found = py.import("numpy")?.call_method("asarray", (found,), Some(&arguments))?;
+        let shape: Vec<usize> = found.getattr("shape")?.extract()?;
+        if shape != self.grid.shape {
+            let (found, expected) = (format!("an array of shape {shape:?}"), format!("{:?}", self.grid.shape));
+            return Err(crate::errors::raised(py, &Error::invalid(self.shared.name, "prox", found, expected)));
+        }
+        let found: PyReadonlyArray3<'_, f32> = found.extract()?;
+        Ok(found.as_array().as_standard_layout().into_owned())
+    }
+}
+
+impl Penalty for On {
+    fn value(&self, x: ArrayView3<'_, f32>) -> f64 {
+        if !self.shared.has_value {
+            return 0.0;
+        }
+        let x = x.as_standard_layout().into_owned();
+        self.call(|py, object| object.call_method1("value", (x.into_pyarray(py),))?.extract()).unwrap_or(0.0)
+    }
+
+    fn prox(&mut self, v: &[f32], tau: f32, u: &mut [f32]) {
+        // Without weight there is nothing to ask.
+        let found = if tau == 0.0 { None } else { self.call(|py, object| self.prox_of(py, object, v, tau)) };
+        match found.as_ref().and_then(|f| f.as_slice()) {
+            Some(found) => u.iter_mut().zip(found).for_each(|(u, x)| *u = x.max(0.0)),
+            None => u.iter_mut().zip(v).for_each(|(u, x)| *u = x.max(0.0)),
+        }
+    }
+}

@@ -1,0 +1,317 @@
+//! Runs: planned, reconstructed, pre-trained, scored.
+
+use crate::arguments;
+use crate::arrays::plain;
+use crate::field::{Field, collect};
+use crate::scan::Scan;
+use crate::specs::SpecArgument;
+use crate::volume::{made, taken, taken_if};
+use crate::work::{Callback, Progress, Watch, without_lock};
+use conefield_core::backend::Backend;
+use conefield_core::error::ensure;
+use conefield_core::method::{Job, Limits, PretrainJob, Reconstruction};
+use conefield_core::scan::{self, Volume};
+use conefield_core::spec::load::to_toml;
+use conefield_core::{Error, Result};
+use conefield_metrics::{dice, label_map};
+use conefield_run::choose::{Wish, choose};
+use conefield_run::explain::Explanation;
+use conefield_run::input::{self, Input};
+use conefield_run::memory::{self, Memory};
+use conefield_run::method::{self, Planned};
+use conefield_run::{files, pretraining, score, specs};
+use conefield_tradeoff::front::Front;
+use conefield_tradeoff::schedule::{Budget, Schedule};
+use pyo3::prelude::*;
+use serde::Deserialize;
+use serde_json::{Value, json};
+use std::path::PathBuf;
+use std::sync::Arc;
+use std::time::{Duration, Instant};
+
+/// When training ends, as texts of the command line.
+#[derive(Deserialize)]
+#[serde(deny_unknown_fields)]
+struct Ends {
+    steps: Option<u64>,
+    seconds: Option<String>,
+    at_most: Option<String>,
+}
+
+impl Ends {
+    fn limits(&self) -> Result<Limits> {
+        ensure(self.steps != Some(0), "arguments", "steps", 0, "at least 1")?;
+        let seconds = arguments::seconds("seconds", self.seconds.as_ref())?;
+        let at_most = arguments::seconds("at_most", self.at_most.as_ref())?;
+        Ok(Limits { steps: self.steps, seconds, at_most, ..Limits::default() })
+    }
+}
+
+/// What a run is asked for beside scan and volumes.
+#[derive(Deserialize)]
+#[serde(deny_unknown_fields)]
+struct Wanted {
+    spec: SpecArgument,
+    backend: String,
+    seed: u64,
+    ends: Ends,
+    budget: Option<String>,
+    peak: Option<f64>,
+    hold_out: Option<String>,
+    /// Weights or a volume to start from.
+    init: Option<PathBuf>,
+    /// Whether the reference is the scan's truth.
+    truth: bool,
+}
+
+/// What is settled before a run starts.
+struct Settled {
+    input: Input,
+    method: Planned,
+    schedule: Option<Schedule>,
+    limits: Limits,
+}
+
+impl Wanted {
+    /// Refuses what does not fit together, plans, and within a budget measures and chooses.
+    fn settle(
+        &self,
+        scan: Arc<scan::Scan>,
+        reference: Option<Volume>,
+        start: Option<&Volume>,
+        backend: &dyn Backend,
+        watch: &Watch,
+    ) -> Result<Settled> {
+        let begin = Instant::now();
+        let limits = self.ends.limits()?;
+        let budget = arguments::seconds("budget", self.budget.as_ref())?;
+        let both = budget.is_some() && limits != Limits::default();
+        ensure(!both, "arguments", "budget", "an end of training beside it", "budget, or steps, seconds and at_most")?;
+        ensure(
+            self.peak.is_none_or(|p| p > 0.0 && p.is_finite()),
+            "arguments",
+            "peak",
+            self.peak.unwrap_or(0.0),
+            "a number above 0",
+        )?;
+        let held = arguments::held_out(self.hold_out.as_ref(), scan.geometry.views.len())?;
+        if let Some(reference) = &reference {
+            input::check_reference("reference", reference, &scan)?;
+        }
+        let run =
+            memory::Run { split: !held.is_empty(), reference: reference.is_some(), ..memory::Run::on_scan(&scan) };
+        let (sets, init) = (self.spec.sets()?, self.init.as_deref());
+        let wish = match (self.spec.is_given(), budget) {
+            (true, _) => Wish::Method(method::planned(&|s| self.spec.read(s), &sets, init, backend, &run)?),
+            (false, Some(_)) => Wish::OneOf(Front::shipped()?),
+            (false, None) => {
+                return Err(Error::invalid("arguments", "spec", "nothing", "a spec, or a budget to choose one by"));
+            }
+        };
+        if let Wish::Method(m) = &wish {
+            specs::check_held_out(&m.loaded, m.plan.as_ref(), &held)?;
+        }
+        let input = Input::new(scan, held, reference, self.peak)?;
+        let cancelled = || watch.cancelled();
+        let bench = input.bench(backend, self.seed, &cancelled);
+        let build = |spec: &str, own: &[String]| {
+            method::planned(&|s| specs::read(spec, s), &[own, &sets].concat(), init, backend, &run)
+        };
+        let budget = budget.map(|seconds| Budget { begin, seconds, spent: 0.0 });
+        let (mut method, schedule) = choose(wish, &bench, budget, &input.held, build)?;
+        let plan = method.plan.as_mut();
+        let starts = match plan.links() {
+            [first, ..] => first.starts_from_volume(),
+            [] => plan.starts_from_volume(),
+        };
+        let name = format!("a volume for {}, which starts from none", method.loaded.spec.name);
+        ensure(start.is_none() || starts, "arguments", "init", name, "a method that starts from a volume")?;
+        Ok(Settled { input, method, schedule, limits })
+    }
+
+    /// The reference of a run on `scan`.
+    fn reference(&self, scan: &Scan, given: Option<Volume>) -> Result<Option<Volume>> {
+        if self.truth { scan.reference().map(Some) } else { Ok(given) }
+    }
+}
+
+/// What a spec builds, for people and for programs; with a budget also what would run, and how long.
+#[pyfunction]
+pub fn plan<'py>(
+    py: Python<'py>,
+    wanted: &str,
+    scan: Option<&Bound<'py, Scan>>,
+) -> PyResult<(Bound<'py, PyAny>, String, Bound<'py, PyAny>)> {
+    let wanted: Wanted = arguments::read(py, wanted)?;
+    let scan = scan.map(|s| s.get().scan.clone());
+    let (explanation, schedule) = without_lock(py, |watch| {
+        let backend = arguments::backend(&wanted.backend)?.open()?;
+        match (&wanted.budget, scan) {
+            (Some(_), None) => {
+                Err(Error::invalid("arguments", "scan", "nothing", "a scan, which a budget is planned for"))
+            }
+            (Some(_), Some(scan)) => {
+                let settled = wanted.settle(scan.clone(), None, None, backend.as_ref(), watch)?;
+                let Planned { loaded, plan, .. } = &settled.method;
+                let about = Some((scan.as_ref(), memory::Run::on_scan(&scan)));
+                let schedule = serde_json::to_value(&settled.schedule).unwrap_or(Value::Null);
+                Ok((Explanation::new(loaded, plan.as_ref(), about)?, schedule))
+            }
+            (None, scan) => {
+                let loaded = wanted.spec.read(&wanted.spec.sets()?)?;
+                let plan = method::plan_without_files(&loaded, backend.as_ref())?;
+                let about = scan.as_ref().map(|s| (s.as_ref(), memory::Run::on_scan(s)));
+                Ok((Explanation::new(&loaded, plan.as_ref(), about)?, Value::Null))
+            }
+        }
+    })?;
+    Ok((plain(py, &explanation)?, explanation.text(), plain(py, &schedule)?))
+}
+
+/// The function that is called while a run goes on, with the seconds between two calls and whether it wants slices.
+type CallbackArgument = Option<(Py<PyAny>, f64, bool)>;
+
+fn callback(argument: CallbackArgument) -> Option<Callback> {
+    argument.map(|(function, every, slices)| Callback {
+        function,
+        every: Duration::try_from_secs_f64(every).unwrap_or(Duration::MAX),
+        slices,
+    })
+}
+
+/// Volume, record and trained field.
+type Reconstructed<'py> = (Bound<'py, PyAny>, Bound<'py, PyAny>, Option<Field>);
+
+/// Reconstructs a scan.
+#[pyfunction]
+pub fn reconstruct<'py>(
+    py: Python<'py>,
+    scan: &Bound<'py, Scan>,
+    wanted: &str,
+    start: Option<&Bound<'py, PyAny>>,
+    reference: Option<&Bound<'py, PyAny>>,
+    function: CallbackArgument,
+) -> PyResult<Reconstructed<'py>> {
+    let begin = Instant::now();
+    let wanted: Wanted = arguments::read(py, wanted)?;
+    let (start, reference, function) = (taken_if(start)?, taken_if(reference)?, callback(function));
+    let scan = scan.get();
+    let (volume, record, field) = without_lock(py, |watch| {
+        let backend = arguments::backend(&wanted.backend)?.open()?;
+        let reference = wanted.reference(scan, reference)?;
+        let settled = wanted.settle(scan.scan.clone(), reference, start.as_ref(), backend.as_ref(), watch)?;
+        let Settled { input, method: Planned { loaded, mut plan, memory }, schedule, limits } = settled;
+        let outline = plan.outline();
+        let mut progress = Progress::new(watch, function);
+        let job = input.job(backend.as_ref(), wanted.seed, limits, schedule.as_ref());
+        let job = Job { start: start.as_ref(), ..job };
+        let solution = plan.run(&job, &mut progress).map_err(|e| loaded.locate(e))?;
+        progress.finish();
+        let mut volume = collect(solution.result.voxels(backend.as_ref())?.as_mut(), &|| watch.cancelled())?;
+        let reference = input.reference.as_ref();
+        volume.affine = volume.affine.or(reference.and_then(|r| r.affine));
+        let scores = reference.map(|r| score::score("the volume", &volume, r, input.peak)).transpose()?;
+        let last = progress.records().last();
+        let best = solution.best;
+        let record = json!({
+            "version": env!("CARGO_PKG_VERSION"),
+            "spec": loaded.spec.name,
+            "spec_toml": to_toml(&loaded.spec)?,
+            "seed": wanted.seed,
+            "held_out_views": input.held,
+            "plan": schedule,
+            "backend": outline.backend(),
+            "memory": memory,
+            "steps": solution.steps,
+            "rollbacks": solution.rollbacks,
+            "train_s": solution.train_s,
+            "total_s": begin.elapsed().as_secs_f64(),
+            "samples": solution.samples,
+            "loss": last.and_then(|r| r.loss),
+            "held_out": best.map(|b| b.held_out).or(last.and_then(|r| r.held_out)),
+            "best_step": best.map(|b| b.step),
+            "peak": input.peak,
+            "scores": scores,
+            "records": progress.records(),
+        });
+        let field = match solution.result {
+            Reconstruction::Volume(_) => None,
+            Reconstruction::Field(field) => Some(field),
+            Reconstruction::Refined { field, .. } => Some(*field),
+        };
+        let notes = specs::notes(&loaded, wanted.seed)?;
+        Ok((volume, record, field.map(|f| Field::new(f, notes))))
+    })?;
+    Ok((made(py, volume)?, plain(py, &record)?, field))
+}
+
+/// Trains a field on known volumes and writes the weights that other scans start from.
+#[pyfunction]
+pub fn pretrain<'py>(
+    py: Python<'py>,
+    volumes: Vec<Bound<'py, PyAny>>,
+    output: PathBuf,
+    wanted: &str,
+    function: CallbackArgument,
+) -> PyResult<Bound<'py, PyAny>> {
+    let wanted: Wanted = arguments::read(py, wanted)?;
+    let volumes: Vec<Volume> = volumes.iter().map(taken).collect::<PyResult<_>>()?;
+    let function = callback(function);
+    let record = without_lock(py, |watch| {
+        let safe = output.extension().is_some_and(|e| e.eq_ignore_ascii_case("safetensors"));
+        ensure(safe, &output.display().to_string(), "file name", output.display(), "an end of .safetensors")?;
+        ensure(!volumes.is_empty(), "arguments", "volumes", 0, "at least one volume")?;
+        let loaded = wanted.spec.read(&wanted.spec.sets()?)?;
+        let backend = arguments::backend(&wanted.backend)?.open()?;
+        let mut plan = method::plan(&loaded, backend.as_ref())?;
+        let voxels: Vec<u64> = volumes.iter().map(|v| v.data.len() as u64).collect();
+        pretraining::check_memory(&voxels, &plan.outline())?;
+        let (seed, limits) = (wanted.seed, wanted.ends.limits()?);
+        let job = PretrainJob { volumes: &volumes, backend: backend.as_ref(), seed, limits };
+        let mut progress = Progress::new(watch, function);
+        let weights = pretraining::train(&loaded, plan.as_mut(), &job, &mut progress)?;
+        progress.finish();
+        files::write_weights(&output, &weights)?;
+        let last = progress.records().last().cloned().unwrap_or_default();
+        let numbers: usize = weights.tensors.values().map(|t| t.1.len()).sum();
+        Ok(json!({
+            "weights": output, "tensors": weights.tensors.keys().collect::<Vec<_>>(), "parameters": numbers,
+            "steps": last.step, "train_s": last.seconds, "loss": last.loss, "records": progress.records(),
+        }))
+    })?;
+    plain(py, &record)
+}
+
+/// The scores of a volume, or the agreement of two label maps.
+#[pyfunction]
+pub fn evaluate<'py>(
+    py: Python<'py>,
+    volume: &Bound<'py, PyAny>,
+    reference: &Bound<'py, PyAny>,
+    peak: Option<f64>,
+    labels: bool,
+) -> PyResult<Bound<'py, PyAny>> {
+    let (volume, reference) = (taken(volume)?, taken(reference)?);
+    let found = without_lock(py, |_| {
+        let held = [&volume, &reference].map(|v| v.data.len() as u64);
+        Memory::of_volumes(&held).check(|_| vec![])?;
+        if labels {
+            score::same_shape("the volume", volume.data.shape(), reference.data.shape())?;
+            let [a, b] = [("the volume", &volume), ("the reference", &reference)];
+            let [a, b] = [label_map(a.0, a.1.data.view())?, label_map(b.0, b.1.data.view())?];
+            return Ok(json!({ "dice": dice(a.view(), b.view())? }));
+        }
+        ensure(
+            peak.is_none_or(|p| p > 0.0 && p.is_finite()),
+            "arguments",
+            "peak",
+            peak.unwrap_or(0.0),
+            "a number above 0",
+        )?;
+        let peak = score::peak(peak, &reference);
+        let mut all = json!(score::score("the volume", &volume, &reference, peak)?);
+        all["peak"] = peak.into();
+        Ok(all)
+    })?;
+    plain(py, &found)
+}

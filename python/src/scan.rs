@@ -1,0 +1,193 @@
+//! Scans: projections with their geometry.
+
+use crate::arguments;
+use crate::arrays::{owned, plain};
+use crate::geometry::Geometry;
+use crate::volume::{made, taken};
+use crate::work::without_lock;
+use conefield_core::error::ensure;
+use conefield_core::scan::{self, Unit, Volume};
+use conefield_projectors::simulate::DetectorNoise;
+use conefield_run::memory::Memory;
+use conefield_run::parse::{self, AnglesOption};
+use conefield_run::simulation::{self, Changes};
+use conefield_run::{files, input};
+use numpy::{PyArray3, PyReadonlyArray3};
+use pyo3::prelude::*;
+use serde::Deserialize;
+use std::path::PathBuf;
+use std::sync::Arc;
+
+/// Measured line integrals with the geometry they were taken in. It does not change: its arrays are read-only.
+#[pyclass(frozen, module = "conefield._native")]
+pub struct Scan {
+    pub scan: Arc<scan::Scan>,
+    /// Where it was read from.
+    pub path: Option<PathBuf>,
+    /// The volume that it was simulated from.
+    truth: Option<Volume>,
+}
+
+impl Scan {
+    /// The volume that it was simulated from, if that is known; of a file, it is read there.
+    pub fn truth(&self) -> conefield_core::Result<Option<Volume>> {
+        match (&self.truth, &self.path) {
+            (Some(truth), _) => Ok(Some(truth.clone())),
+            (None, Some(path)) => conefield_io::read_truth(path),
+            (None, None) => Ok(None),
+        }
+    }
+
+    /// The truth as the reference of a run; refused where there is none.
+    pub fn reference(&self) -> conefield_core::Result<Volume> {
+        let place = self.path.as_ref().map_or("scan".into(), |p| p.display().to_string());
+        let truth = self.truth()?.ok_or_else(|| {
+            conefield_core::Error::invalid(&place, "reference \"truth\"", "a scan without a truth", "a volume")
+        })?;
+        input::check_reference(&place, &truth, &self.scan)?;
+        Ok(truth)
+    }
+}
+
+#[pymethods]
+impl Scan {
+    #[new]
+    fn new(
+        py: Python<'_>,
+        projections: PyReadonlyArray3<'_, f32>,
+        geometry: &Bound<'_, Geometry>,
+        unit: (String, f64),
+    ) -> PyResult<Self> {
+        let (name, mm) = unit;
+        let (projections, geometry) = (owned(&projections), geometry.get().0.clone());
+        let provenance = serde_json::json!({ "made": "in Python" });
+        let scan = scan::Scan { geometry, projections, unit: Unit { name, mm }, provenance };
+        without_lock(py, |_| scan.validate("scan"))?;
+        Ok(Self { scan: Arc::new(scan), path: None, truth: None })
+    }
+
+    /// The line integrals, without a copy.
+    #[getter]
+    #[allow(unsafe_code)]
+    fn projections<'py>(slf: &Bound<'py, Self>) -> PyResult<Bound<'py, PyArray3<f32>>> {
+        let projections = &slf.get().scan.projections;
+        // SAFETY: the array lives in an `Arc` that the scan holds, the class is frozen, and the new array keeps the scan
+        // alive. It is read-only from here on, so that nobody writes what others may read.
+        let array = unsafe { PyArray3::borrow_from_array(projections, slf.clone().into_any()) };
+        array.getattr("flags")?.setattr("writeable", false)?;
+        Ok(array)
+    }
+
+    #[getter]
+    fn geometry(&self) -> Geometry {
+        Geometry(self.scan.geometry.clone())
+    }
+
+    #[getter]
+    fn unit(&self) -> (String, f64) {
+        (self.scan.unit.name.clone(), self.scan.unit.mm)
+    }
+
+    #[getter]
+    fn provenance<'py>(&self, py: Python<'py>) -> PyResult<Bound<'py, PyAny>> {
+        plain(py, &self.scan.provenance)
+    }
+
+    #[getter(truth)]
+    fn truth_volume<'py>(&self, py: Python<'py>) -> PyResult<Option<Bound<'py, PyAny>>> {
+        without_lock(py, |_| self.truth())?.map(|v| made(py, v)).transpose()
+    }
+
+    /// A scan without the views `held`, and one of these alone.
+    fn split(&self, py: Python<'_>, held: Vec<usize>) -> PyResult<(Self, Self)> {
+        let (kept, aside) = without_lock(py, |_| self.scan.split(&held))?;
+        let of = |scan| Self { scan: Arc::new(scan), path: None, truth: self.truth.clone() };
+        Ok((of(kept), of(aside)))
+    }
+
+    fn __len__(&self) -> usize {
+        self.scan.geometry.views.len()
+    }
+
+    fn __repr__(&self) -> String {
+        let h = self.scan.header();
+        let ([rows, columns], [x, y, z]) = (h.detector, h.volume);
+        let unit = &self.scan.unit.name;
+        format!("Scan({} views of {rows} x {columns}, volume {x} x {y} x {z}, unit {unit:?})", h.views)
+    }
+}
+
+/// Reads a scan in any format.
+#[pyfunction]
+pub fn read_scan(py: Python<'_>, path: PathBuf) -> PyResult<Scan> {
+    let scan = without_lock(py, |_| {
+        Memory::of_views(&conefield_io::scan_size(&path)?).check(|_| vec![])?;
+        files::scan(&path)
+    })?;
+    Ok(Scan { scan: Arc::new(scan), path: Some(path), truth: None })
+}
+
+/// Writes conefield's own folder of a scan.
+#[pyfunction]
+pub fn write_scan(py: Python<'_>, path: PathBuf, scan: &Bound<'_, Scan>) -> PyResult<()> {
+    let scan = scan.get();
+    without_lock(py, |_| conefield_io::write_scan(&path, &scan.scan, scan.truth()?.as_ref()))
+}
+
+/// What `simulate` is asked for.
+#[derive(Deserialize)]
+#[serde(deny_unknown_fields)]
+struct Wanted {
+    protocol: String,
+    views: Option<usize>,
+    detector: Option<[usize; 2]>,
+    offset: Option<[f64; 2]>,
+    angles: Option<String>,
+    noise: Option<String>,
+    seed: Option<u64>,
+    downsample: usize,
+    values: String,
+    source: String,
+}
+
+/// A scan of a known volume, by a protocol or in a geometry.
+#[pyfunction]
+pub fn simulate(
+    py: Python<'_>,
+    volume: &Bound<'_, PyAny>,
+    wanted: &str,
+    geometry: Option<&Bound<'_, Geometry>>,
+) -> PyResult<Scan> {
+    let volume = taken(volume)?;
+    let wanted: Wanted = arguments::read(py, wanted)?;
+    let geometry = geometry.map(|g| g.get().0.clone());
+    let (scan, truth) = without_lock(py, |_| {
+        let values = arguments::optional("values", Some(&wanted.values), parse::values)?.unwrap_or(parse::Values::AsIs);
+        let noise = arguments::optional("noise", wanted.noise.as_ref(), parse::noise)?;
+        let angles = arguments::optional("angles", wanted.angles.as_ref(), parse::angles)?;
+        if let Some(geometry) = geometry {
+            let expected = "1 with a geometry: the volume is taken as it stands";
+            ensure(wanted.downsample == 1, "arguments", "downsample", wanted.downsample, expected)?;
+            let volume = values.apply(volume)?;
+            let noise = noise.unwrap_or(DetectorNoise::None);
+            let scan = simulation::scan_in(&volume, geometry, noise, wanted.seed.unwrap_or(0))?;
+            // A truth on other voxels than are reconstructed is none.
+            let same = scan.geometry.volume == volume.grid;
+            return Ok((scan, same.then_some(volume)));
+        }
+        let volume = simulation::prepared(volume, values, wanted.downsample)?;
+        let changes = Changes {
+            views: wanted.views,
+            detector: wanted.detector,
+            offset: wanted.offset,
+            angles: angles as Option<AnglesOption>,
+            noise,
+            seed: wanted.seed,
+        };
+        let protocol = simulation::protocol(&wanted.protocol, &volume.grid)?;
+        let protocol = simulation::changed(protocol, &changes, "arguments")?;
+        let (scan, truth) = simulation::scan(volume, values, &protocol, &wanted.source)?;
+        Ok((scan, Some(truth)))
+    })?;
+    Ok(Scan { scan: Arc::new(scan), path: None, truth })
+}

@@ -1,0 +1,213 @@
+//! Stages that are written in Python: registered under a name, made when a spec names them, tried by the conformance kit.
+
+use crate::arguments;
+use crate::encoder::PythonEncoder;
+use crate::errors::{OrRaise, raised as exception};
+use crate::regularizer::PythonRegularizer;
+use crate::work::without_lock;
+use conefield_conformance::{Options, Outcome, Report, check_encoder, check_regularizer};
+use conefield_core::registry::{self, Kind, Make, NewType};
+use conefield_core::regularizer::{Regularizer, RegularizerSpec};
+use conefield_core::settings::EncoderSpec;
+use conefield_core::spec::stage;
+use conefield_core::stage::Encoder;
+use conefield_core::{Error, Result};
+use pyo3::prelude::*;
+use pyo3::types::PyDict;
+use serde::{Serialize, Serializer};
+use serde_json::{Value, json};
+use std::cell::RefCell;
+use std::collections::BTreeMap;
+use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
+
+/// Who brings these types, in messages.
+const OWNER: &str = "Python";
+
+/// The classes by kind and name. A class that is registered again, as when a cell of a notebook runs twice, takes the place
+/// of the old one.
+static CLASSES: Mutex<BTreeMap<(Kind, String), Py<PyAny>>> = Mutex::new(BTreeMap::new());
+
+fn locked<T>(mutex: &Mutex<T>) -> MutexGuard<'_, T> {
+    mutex.lock().unwrap_or_else(PoisonError::into_inner)
+}
+
+/// What stages in Python have raised during one work of Rust's. A kernel has no result to hand it on in.
+#[derive(Default)]
+pub struct Raised(Mutex<Option<PyErr>>);
+
+impl Raised {
+    /// Keeps the first exception.
+    pub fn note(&self, error: PyErr) {
+        locked(&self.0).get_or_insert(error);
+    }
+
+    /// Whether there is one.
+    pub fn any(&self) -> bool {
+        locked(&self.0).is_some()
+    }
+
+    /// The exception, once.
+    pub fn take(&self) -> Option<PyErr> {
+        locked(&self.0).take()
+    }
+}
+
+thread_local! {
+    /// Of the work that this thread is at: stages that are made in it note there what they raise.
+    static CURRENT: RefCell<Arc<Raised>> = RefCell::default();
+}
+
+/// Does `work` with a place of its own for what its stages raise.
+pub fn within<T>(raised: &Arc<Raised>, work: impl FnOnce() -> T) -> T {
+    let before = CURRENT.replace(raised.clone());
+    let done = work();
+    CURRENT.set(before);
+    done
+}
+
+/// The kind of a stage that can be written in Python.
+fn kind(py: Python<'_>, name: &str) -> PyResult<Kind> {
+    match Kind::named(name) {
+        Some(kind @ (Kind::Encoder | Kind::Regularizer)) => Ok(kind),
+        _ => Err(exception(py, &Error::invalid("stage", "kind", name, "encoder or regularizer"))),
+    }
+}
+
+/// Registers a class, so that a spec names it as a type of this kind.
+#[pyfunction]
+pub fn register(py: Python<'_>, kind_name: &str, name: String, doc: String, class: Py<PyAny>) -> PyResult<()> {
+    let kind = kind(py, kind_name)?;
+    let key = (kind, name.clone());
+    if !locked(&CLASSES).contains_key(&key) {
+        let own: &'static str = name.clone().leak();
+        let settings = move |settings: Value| Written { name: own, settings };
+        let make = match kind {
+            Kind::Encoder => Make::Encoder(Box::new(move |v| Ok(Box::new(settings(v))))),
+            _ => Make::Regularizer(Box::new(move |v| Ok(Box::new(settings(v))))),
+        };
+        // Which settings there are its class says when it is made, and it may be replaced: any key may stand here.
+        let schema = json!({ "type": "object" });
+        registry::add(OWNER, vec![NewType { name, doc, schema, make }]).or_raise(py)?;
+    }
+    let old = locked(&CLASSES).insert(key, class);
+    drop(old);
+    Ok(())
+}
+
+/// The types of a kind that a spec may name.
+#[pyfunction]
+pub fn stage_names(py: Python<'_>, kind: &str) -> PyResult<Vec<&'static str>> {
+    let found = Kind::named(kind);
+    let all = Kind::ALL.iter().map(|k| k.name()).collect::<Vec<_>>().join(", ");
+    found.map(registry::names).ok_or_else(|| exception(py, &Error::invalid("stage", "kind", kind, all)))
+}
+
+/// Settings of a stage in Python.
+struct Written {
+    /// The name of its type.
+    name: &'static str,
+    settings: Value,
+}
+
+impl Written {
+    /// An object of its class.
+    fn object(&self, kind: Kind) -> Result<Py<PyAny>> {
+        Python::attach(|py| {
+            let class = locked(&CLASSES).get(&(kind, self.name.to_owned())).map(|c| c.clone_ref(py));
+            let class = class.ok_or_else(|| Error::unsupported(self.name, "no class is registered under this name"))?;
+            let make = || -> PyResult<Py<PyAny>> {
+                let settings = py.import("json")?.call_method1("loads", (self.settings.to_string(),))?;
+                class.call(py, (), Some(settings.cast::<PyDict>()?))
+            };
+            make().map_err(|e| self.refused(py, e))
+        })
+    }
+
+    /// What a class says against its settings.
+    fn refused(&self, py: Python<'_>, e: PyErr) -> Error {
+        let why = format!("{}, which {} refuses: {}", self.settings, self.name, words(py, &e));
+        Error::invalid("spec", "", why, "settings that the class takes")
+    }
+}
+
+/// An exception in words.
+pub fn words(py: Python<'_>, e: &PyErr) -> String {
+    let kind = e.get_type(py).name().map(|n| n.to_string()).unwrap_or_default();
+    format!("{kind}: {}", e.value(py))
+}
+
+impl Serialize for Written {
+    fn serialize<S: Serializer>(&self, serializer: S) -> Result<S::Ok, S::Error> {
+        self.settings.serialize(serializer)
+    }
+}
+
+// `#[typetag::serde]` gives a type one name; here it is the registered one. Its two methods are therefore written out. To
+// read settings back, the registry is asked (`conefield_core::spec::stage`).
+macro_rules! named {
+    () => {
+        fn typetag_name(&self) -> &'static str {
+            self.name
+        }
+
+        fn typetag_deserialize(&self) {}
+    };
+}
+
+impl EncoderSpec for Written {
+    fn build(&self) -> Result<Box<dyn Encoder>> {
+        let object = self.object(Kind::Encoder)?;
+        Python::attach(|py| match PythonEncoder::new(py, self.name, object, CURRENT.with_borrow(Arc::clone)) {
+            Ok(encoder) => Ok(Box::new(encoder?) as Box<dyn Encoder>),
+            Err(e) => Err(Error::unsupported(self.name, words(py, &e))),
+        })
+    }
+
+    named!();
+}
+
+impl RegularizerSpec for Written {
+    fn build(&self) -> Result<Box<dyn Regularizer>> {
+        let object = self.object(Kind::Regularizer)?;
+        Python::attach(|py| match PythonRegularizer::new(py, self.name, object, CURRENT.with_borrow(Arc::clone)) {
+            Ok(regularizer) => Ok(Box::new(regularizer?) as Box<dyn Regularizer>),
+            Err(e) => Err(Error::unsupported(self.name, words(py, &e))),
+        })
+    }
+
+    named!();
+}
+
+/// Each property of a stage, what became of it and how that was seen.
+type Properties = Vec<(&'static str, &'static str, String)>;
+
+/// Runs the conformance kit over a stage that a spec may name: whether it passes, the report, and each property.
+#[pyfunction]
+pub fn check_stage(py: Python<'_>, kind_name: &str, table: &str) -> PyResult<(bool, String, Properties)> {
+    let kind = kind(py, kind_name)?;
+    let table: Value = arguments::read(py, table)?;
+    let report = without_lock(py, |_| match kind {
+        Kind::Encoder => {
+            let spec: Box<dyn EncoderSpec> = stage::read(table).map_err(unread)?;
+            Ok(check_encoder(spec.build()?.as_ref(), &Options::encoder()))
+        }
+        _ => {
+            let spec: Box<dyn RegularizerSpec> = stage::read(table).map_err(unread)?;
+            Ok(check_regularizer(spec.build()?.as_ref()))
+        }
+    })?;
+    Ok((report.passed(), report.to_string(), properties(report)))
+}
+
+fn unread(why: String) -> Error {
+    Error::invalid("stage", "type", why, "a registered type with its settings")
+}
+
+fn properties(report: Report) -> Properties {
+    let outcome = |(name, outcome)| match outcome {
+        Outcome::Passed(text) => (name, "passed", text),
+        Outcome::Failed(text) => (name, "failed", text),
+        Outcome::Skipped(text) => (name, "skipped", text),
+    };
+    report.entries.into_iter().map(outcome).collect()
+}

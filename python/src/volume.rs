@@ -1,0 +1,58 @@
+//! Volumes: `conefield.Volume` is written in Python, as it holds a NumPy array that its user may change.
+
+use crate::arrays::{given, owned};
+use crate::errors::OrRaise;
+use crate::work::without_lock;
+use conefield_core::geometry::VoxelGrid;
+use conefield_core::scan::Volume;
+use numpy::{PyArray2, PyReadonlyArray3, PyUntypedArrayMethods};
+use pyo3::prelude::*;
+use std::path::PathBuf;
+
+/// The volume of a `conefield.Volume`.
+pub fn taken(volume: &Bound<'_, PyAny>) -> PyResult<Volume> {
+    let data: PyReadonlyArray3<'_, f32> = volume.getattr("data")?.extract()?;
+    let grid = VoxelGrid {
+        shape: [data.shape()[0], data.shape()[1], data.shape()[2]],
+        spacing: volume.getattr("spacing")?.extract()?,
+        center: volume.getattr("center")?.extract()?,
+    };
+    let affine: Option<[[f64; 4]; 4]> = match volume.getattr("affine")? {
+        none if none.is_none() => None,
+        rows => Some(rows.call_method0("tolist")?.extract()?),
+    };
+    grid.validate("volume").or_raise(volume.py())?;
+    Ok(Volume { data: owned(&data), grid, affine })
+}
+
+/// As [`taken`], of an argument that may be left out.
+pub fn taken_if(volume: Option<&Bound<'_, PyAny>>) -> PyResult<Option<Volume>> {
+    volume.map(taken).transpose()
+}
+
+/// A `conefield.Volume` of this volume.
+pub fn made<'py>(py: Python<'py>, volume: Volume) -> PyResult<Bound<'py, PyAny>> {
+    let Volume { data, grid, affine } = volume;
+    let affine = affine.map(|a| PyArray2::from_vec2(py, &a.map(|row| row.to_vec())));
+    let affine = affine.transpose().map_err(|e| crate::errors::broken(py, &e.to_string()))?;
+    let class = py.import("conefield._volume")?.getattr("Volume")?;
+    class.call1((given(py, data), grid.spacing.to_vec(), grid.center.to_vec(), affine))
+}
+
+/// The volume that `name` means: a file, the folder of a DICOM series, or `phantom:KIND[:SIZE]`.
+#[pyfunction]
+pub fn read_volume(py: Python<'_>, name: String) -> PyResult<Bound<'_, PyAny>> {
+    let volume = without_lock(py, |_| {
+        let voxels = conefield_run::files::voxels(&name)?;
+        conefield_run::memory::Memory::of_volumes(&[voxels]).check(|_| vec![])?;
+        conefield_run::files::volume(&name)
+    })?;
+    made(py, volume)
+}
+
+/// Writes a volume in the format that the name of the file asks for.
+#[pyfunction]
+pub fn write_volume(py: Python<'_>, path: PathBuf, volume: &Bound<'_, PyAny>) -> PyResult<()> {
+    let volume = taken(volume)?;
+    without_lock(py, |_| conefield_io::write_volume(&path, &volume))
+}

@@ -1,0 +1,164 @@
+//! Work without Python's lock: Ctrl-C ends it cleanly, a callback sees how it goes, and no panic crosses into Python.
+
+use crate::errors::{broken, raised};
+use crate::stages::{Raised, within};
+use conefield_core::Result;
+use conefield_core::geometry::VoxelGrid;
+use conefield_core::method::{Observer, Record};
+use conefield_core::parts::Part;
+use ndarray::Array3;
+use numpy::IntoPyArray;
+use pyo3::prelude::*;
+use pyo3::types::PyList;
+use std::panic::{AssertUnwindSafe, catch_unwind};
+use std::sync::{Arc, Mutex, PoisonError};
+use std::time::{Duration, Instant};
+use tracing::info;
+
+/// Between two looks for signals, for which Python's lock is taken.
+const LOOK: Duration = Duration::from_millis(20);
+
+/// Whether the work is to end: Python has a signal for it, or something in Python that takes part in it has failed.
+pub struct Watch {
+    looked: Mutex<Instant>,
+    stopped: Mutex<Option<PyErr>>,
+    raised: Arc<Raised>,
+}
+
+impl Watch {
+    /// Whether to end.
+    pub fn cancelled(&self) -> bool {
+        let stopped = || self.stopped.lock().unwrap_or_else(PoisonError::into_inner);
+        if stopped().is_some() || self.raised.any() {
+            return true;
+        }
+        let mut looked = self.looked.lock().unwrap_or_else(PoisonError::into_inner);
+        if looked.elapsed() < LOOK {
+            return false;
+        }
+        *looked = Instant::now();
+        match Python::attach(|py| py.check_signals()) {
+            Ok(()) => false,
+            Err(e) => {
+                *stopped() = Some(e);
+                true
+            }
+        }
+    }
+
+    /// Ends the work with this exception.
+    fn stop(&self, error: PyErr) {
+        self.stopped.lock().unwrap_or_else(PoisonError::into_inner).get_or_insert(error);
+    }
+}
+
+/// Does `work` without Python's lock. An exception of a callback, a stage or a signal handler goes before the error that
+/// ending the work gives.
+pub fn without_lock<T: Send>(py: Python<'_>, work: impl FnOnce(&Watch) -> Result<T> + Send) -> PyResult<T> {
+    let (looked, stopped) = (Mutex::new(Instant::now()), Mutex::new(None));
+    let watch = Watch { looked, stopped, raised: Arc::default() };
+    let done = py.detach(|| within(&watch.raised, || catch_unwind(AssertUnwindSafe(|| work(&watch)))));
+    let stopped = watch.stopped.into_inner().unwrap_or_else(PoisonError::into_inner);
+    if let Some(e) = stopped.or_else(|| watch.raised.take()) {
+        return Err(e);
+    }
+    match done {
+        Ok(done) => done.map_err(|e| raised(py, &e)),
+        Err(panic) => {
+            let text = panic.downcast_ref::<String>().map(String::as_str);
+            Err(broken(py, text.or(panic.downcast_ref::<&str>().copied()).unwrap_or("a panic without words")))
+        }
+    }
+}
+
+/// What is called while a run goes on, and how often.
+pub struct Callback {
+    /// Takes step, share, seconds left, the new records in JSON, and the middle slices or nothing.
+    pub function: Py<PyAny>,
+    /// Time between two calls.
+    pub every: Duration,
+    /// Whether it wants slices.
+    pub slices: bool,
+}
+
+/// Tells a callback of a run, and looks for what ends it.
+pub struct Progress<'a> {
+    watch: &'a Watch,
+    callback: Option<Callback>,
+    told: Option<Instant>,
+    slices: Option<[Array3<f32>; 3]>,
+    records: Vec<Record>,
+    /// Records that the callback has seen.
+    seen: usize,
+    /// The last finished step.
+    step: u64,
+}
+
+impl<'a> Progress<'a> {
+    pub fn new(watch: &'a Watch, callback: Option<Callback>) -> Self {
+        Self { watch, callback, told: None, slices: None, records: vec![], seen: 0, step: 0 }
+    }
+
+    /// The records so far.
+    pub fn records(&self) -> &[Record] {
+        &self.records
+    }
+
+    /// The run is done: the callback sees the records that it has not seen.
+    pub fn finish(&mut self) {
+        let step = self.records.last().map_or(self.step, |r| r.step.max(self.step));
+        self.tell(step, 1.0, 0.0);
+    }
+
+    fn due(&self) -> bool {
+        let wait = self.callback.as_ref().map_or(Duration::MAX, |c| c.every);
+        self.callback.is_some() && self.told.is_none_or(|t| t.elapsed() >= wait)
+    }
+
+    fn tell(&mut self, step: u64, share: f64, seconds_left: f64) {
+        let Some(callback) = &self.callback else { return };
+        self.told = Some(Instant::now());
+        let new = serde_json::to_string(&self.records[self.seen..]).unwrap_or_else(|_| "[]".into());
+        self.seen = self.records.len();
+        let slices = self.slices.take();
+        let called = Python::attach(|py| -> PyResult<()> {
+            let slices = slices.map(|s| PyList::new(py, s.map(|a| a.into_pyarray(py)))).transpose()?;
+            callback.function.call1(py, (step, share, seconds_left, new, slices)).map(drop)
+        });
+        if let Err(e) = called {
+            self.watch.stop(e);
+        }
+    }
+}
+
+impl Observer for Progress<'_> {
+    fn progress(&mut self, step: u64, share: f64, seconds_left: f64) {
+        self.step = step;
+        if self.due() {
+            self.tell(step, share, seconds_left);
+        }
+    }
+
+    fn record(&mut self, record: &Record) {
+        self.records.push(record.clone());
+    }
+
+    fn note(&mut self, text: &str) {
+        info!("{text}");
+    }
+
+    fn cancelled(&self) -> bool {
+        self.watch.cancelled()
+    }
+
+    fn slices_due(&self) -> bool {
+        self.due() && self.callback.as_ref().is_some_and(|c| c.slices)
+    }
+
+    fn slices(&mut self, _: VoxelGrid, slices: &[(Part, Array3<f32>)]) -> Result<()> {
+        if let [x, y, z] = slices {
+            self.slices = Some([&x.1, &y.1, &z.1].map(Array3::clone));
+        }
+        Ok(())
+    }
+}

@@ -1,0 +1,139 @@
+"""What goes in and comes out."""
+
+import multiprocessing
+import pickle
+
+import numpy as np
+import pytest
+
+import conefield
+
+
+def test_volumes_keep_their_place(tmp_path):
+    affine = np.diag([2.0, 3.0, 4.0, 1.0])
+    volume = conefield.Volume(np.arange(24.0).reshape(2, 3, 4), (2, 3, 4), affine=affine)
+    assert volume.data.dtype == np.float32 and volume.shape == (2, 3, 4)
+    volume.write(tmp_path / "v.nii.gz")
+    back = conefield.read_volume(tmp_path / "v.nii.gz")
+    np.testing.assert_array_equal(back.data, volume.data)
+    np.testing.assert_allclose(back.spacing, (2, 3, 4))
+    np.testing.assert_allclose(back.affine, affine)
+    assert np.asarray(volume) is volume.data
+    assert np.asarray(volume, dtype=np.float64).dtype == np.float64
+    np.testing.assert_array_equal(np.from_dlpack(volume), volume.data)
+    assert conefield.Volume(volume.data, 2).spacing == (2.0, 2.0, 2.0)
+
+
+def test_arrays_of_other_libraries_are_taken():
+    class Other:
+        """Of another library: nothing but DLPack."""
+
+        def __init__(self, array):
+            self.array = array
+
+        def __dlpack__(self, **arguments):
+            return self.array.__dlpack__(**arguments)
+
+        def __dlpack_device__(self):
+            return self.array.__dlpack_device__()
+
+    data = np.arange(24, dtype=np.float32).reshape(2, 3, 4)
+    np.testing.assert_array_equal(conefield.Volume(Other(data)).data, data)
+    np.testing.assert_array_equal(conefield.Volume(data.tolist()).data, data)
+    np.testing.assert_array_equal(conefield.Volume(np.asfortranarray(data)).data, data)
+
+    class Elsewhere(Other):
+        def __dlpack__(self, **arguments):
+            raise BufferError("it lies on another device")
+
+    with pytest.raises(conefield.InvalidError, match="on the CPU"):
+        conefield.Volume(Elsewhere(data))
+
+
+def test_scans_are_read_only_and_come_back(scan, tmp_path):
+    projections = scan.projections
+    assert projections.shape == scan.geometry.projections_shape == (16, 24, 28)
+    with pytest.raises(ValueError, match="read-only"):
+        projections[0, 0, 0] = 1
+    kept = scan.projections
+    conefield.write_scan(tmp_path / "s", scan)
+    back = conefield.read_scan(tmp_path / "s")
+    np.testing.assert_array_equal(back.projections, kept)
+    np.testing.assert_allclose(back.geometry.vectors, scan.geometry.vectors, atol=1e-9)
+    assert back.unit == scan.unit and scan.unit[1] != 1.0
+    np.testing.assert_array_equal(back.truth.data, scan.truth.data)
+    made = conefield.scan(kept, scan.geometry, unit=scan.unit[0], unit_mm=scan.unit[1])
+    assert made.truth is None and len(made) == 16
+    np.testing.assert_array_equal(made.projections, kept)
+    one, two = made.split([1, 5])
+    assert (len(one), len(two)) == (14, 2)
+
+
+def test_a_scan_outlives_its_name():
+    projections = conefield.simulate("phantom:head:8", views=2, detector=(4, 4)).projections
+    junk = [np.ones(100_000) for _ in range(20)]
+    assert len(junk) == 20 and np.isfinite(projections).all() and projections.max() > 0
+
+
+def test_geometries_are_values(geometry):
+    again = pickle.loads(pickle.dumps(geometry))
+    assert again == geometry and again != geometry.select([0, 1]) and geometry != 3
+    assert len(geometry.select([4, 0])) == 2
+    np.testing.assert_array_equal(geometry.select([4, 0]).vectors, geometry.vectors[[4, 0]])
+    finer = geometry.with_volume((14, 16, 12), (1.5, 1.25, 1.75), (1.0, -2.0, 0.5))
+    assert finer.volume_shape == (14, 16, 12) and "14 x 16 x 12" in repr(finer)
+
+
+def _sum(geometry):
+    return float(conefield.project(np.ones(geometry.volume_shape), geometry).sum())
+
+
+def test_other_processes_can_work(geometry):
+    with multiprocessing.get_context("spawn").Pool(1) as pool:
+        assert pool.map(_sum, [geometry]) == [_sum(geometry)]
+
+
+def test_simulation_in_any_geometry(geometry):
+    shape = tuple(4 * n for n in geometry.volume_shape)
+    truth = np.zeros(shape, np.float32)
+    truth[8:20, 8:24, 8:16] = 0.02
+    fine = geometry.with_volume(shape, tuple(s / 4 for s in geometry.spacing), geometry.center)
+    scan = conefield.simulate(truth, fine)
+    assert scan.truth.shape == shape and scan.geometry == fine
+    predicted = conefield.project(truth, fine, projector="siddon")
+    # Voxels with sharp edges against their interpolation.
+    assert (predicted - scan.projections).std() < 0.05 * scan.projections.max()
+    noisy = conefield.simulate(truth, fine, noise="poisson:1e5", seed=1).projections
+    assert 0 < np.abs(noisy - scan.projections).max() < 0.1
+
+
+@pytest.mark.parametrize(
+    "make, words",
+    [
+        (lambda: conefield.Volume(np.ones((2, 2))), "3 axes"),
+        (lambda: conefield.Volume(np.ones((2, 2, 2), complex)), "real numbers"),
+        (lambda: conefield.Volume(np.ones((2, 2, 2)), (1, 2)), "three for x, y and z"),
+        (lambda: conefield.Volume(np.ones((2, 2, 2)), affine=np.eye(3)), r"\(4, 4\)"),
+        (lambda: conefield.circular(dso=-1, dsd=2, angles=3, detector=4, pixel=1, volume=4), "dso"),
+        (lambda: conefield.circular(dso=9, dsd=2, angles=3, detector=0, pixel=1, volume=4), "above 0"),
+        (lambda: conefield.circular(dso=1, dsd=2, angles=3, detector=4, pixel=1, volume=4), "outside the volume"),
+        (lambda: conefield.circular(dso=9, dsd=12, angles=[0, np.nan], detector=4, pixel=1, volume=4), "finite"),
+        (lambda: conefield.circular(dso=9, dsd=12, angles=0, detector=4, pixel=1, volume=4), "at least one view"),
+        (lambda: conefield.from_vectors(np.ones((3, 9)), detector=4, volume=4), "12"),
+        (lambda: conefield.read_scan("no/such/folder"), "no/such/folder"),
+        (lambda: conefield.read_volume("phantom:hand"), "hand"),
+        (lambda: conefield.simulate("phantom:head:8", noise="salt"), "poisson"),
+        (lambda: conefield.simulate("phantom:head:8", views=0), "views"),
+    ],
+)
+def test_what_cannot_be_is_refused(make, words):
+    with pytest.raises(conefield.Error, match=words):
+        make()
+
+
+def test_the_system_says_what_it_always_says():
+    with pytest.raises(FileNotFoundError):
+        conefield.read_scan("no/such/folder")
+    with pytest.raises(ValueError) as raised:
+        conefield.Volume(np.ones(3))
+    assert raised.value.field == "data" and raised.value.expected == "3 axes"

@@ -1,0 +1,93 @@
+"""Line integrals of voxels, and their adjoint."""
+
+import numpy as np
+import pytest
+
+import conefield
+
+
+@pytest.mark.parametrize("projector", ["joseph", "siddon", "trilinear", {"type": "trilinear", "samples_per_voxel": 3.0}])
+@pytest.mark.parametrize("dtype, tolerance", [(np.float64, 1e-12), (np.float32, 1e-5)])
+def test_the_adjoint_is_exact(geometry, projector, dtype, tolerance):
+    rng = np.random.default_rng(0)
+    x = rng.standard_normal(geometry.volume_shape).astype(dtype)
+    y = rng.standard_normal(geometry.projections_shape).astype(dtype)
+    ax = conefield.project(x, geometry, projector=projector)
+    aty = conefield.backproject(y, geometry, projector=projector)
+    assert ax.dtype == aty.dtype == dtype and np.abs(ax).max() > 1
+    forward, back = np.vdot(ax.astype(float), y), np.vdot(x, aty.astype(float))
+    scale = np.linalg.norm(ax.astype(float)) * np.linalg.norm(y)
+    assert abs(forward - back) < tolerance * scale
+
+
+def test_a_box_has_the_lengths_of_its_rays():
+    geometry = conefield.circular(
+        dso=100, dsd=150, angles=[0.0], detector=(1, 1), pixel=1.0, volume=(8, 8, 8), spacing=2.0
+    )
+    for projector in ("joseph", "siddon", "trilinear"):
+        found = conefield.project(np.ones((8, 8, 8)), geometry, projector=projector)
+        assert found.item() == pytest.approx(16.0, rel=1e-9), projector
+
+
+def test_the_matrix_is_both_functions(geometry):
+    a = conefield.Operator(geometry, dtype=np.float64)
+    x = np.random.default_rng(1).standard_normal(geometry.volume_shape)
+    y = np.random.default_rng(2).standard_normal(geometry.projections_shape)
+    assert a.shape == (5 * 9 * 11, 7 * 8 * 6) and a.T.shape == a.shape[::-1] and a.T.T is a
+    np.testing.assert_array_equal(a @ x, conefield.project(x, geometry))
+    np.testing.assert_array_equal(a.T @ y, conefield.backproject(y, geometry))
+    np.testing.assert_array_equal(a.matvec(x.ravel()), (a @ x).ravel())
+    np.testing.assert_array_equal(a.rmatvec(y.ravel()), (a.T @ y).ravel())
+    assert (a @ x.reshape(-1, 1)).shape == (a.shape[0], 1)
+    assert (conefield.Operator(geometry) @ x).dtype == np.float32
+    with pytest.raises(conefield.InvalidError, match="shape"):
+        a @ x[1:]
+    with pytest.raises(conefield.InvalidError, match="float32 or float64"):
+        conefield.Operator(geometry, dtype=np.int32)
+    with pytest.raises(conefield.InvalidError, match="joseph, siddon, trilinear"):
+        conefield.Operator(geometry, projector="magic") @ x
+
+
+def test_scipy_solves_with_it():
+    linalg = pytest.importorskip("scipy.sparse.linalg")
+    geometry = conefield.circular(
+        dso=60, dsd=90, angles=24, detector=(12, 12), pixel=1.5, volume=(6, 6, 6), spacing=2.0
+    )
+    a = conefield.Operator(geometry, dtype=np.float64)
+    truth = np.random.default_rng(3).random(geometry.volume_shape)
+    for operator in (a, a.as_linear_operator(), linalg.aslinearoperator(a)):
+        found = linalg.lsqr(operator, (a @ truth).ravel(), atol=1e-12, btol=1e-12, iter_lim=800)[0]
+        assert np.abs(found.reshape(truth.shape) - truth).max() < 1e-5
+    m, n = a.shape
+    np.testing.assert_allclose(
+        linalg.aslinearoperator(a).rmatmat(np.eye(m)[:, :3]).T, [(a.T @ row) for row in np.eye(m)[:3]]
+    )
+
+
+def test_tilts_and_offsets_are_as_documented():
+    flat = dict(dso=100.0, dsd=150.0, angles=[0.3], detector=(4, 6), pixel=(2.0, 1.0), volume=(4, 4, 4))
+    plain = conefield.circular(**flat)
+    s, c = np.sin(0.3), np.cos(0.3)
+    source, detector, u, v = plain.vectors.reshape(4, 3)
+    np.testing.assert_allclose(source, [100 * c, 100 * s, 0])
+    np.testing.assert_allclose(detector, [-50 * c, -50 * s, 0])
+    np.testing.assert_allclose(u, [-s, c, 0])
+    np.testing.assert_allclose(v, [0, 0, -2])
+    shifted = conefield.circular(**flat, offset=(3, 5)).vectors.reshape(4, 3)
+    np.testing.assert_allclose(shifted[1] - detector, 5 * u + 3 * v / 2)
+    skewed = conefield.circular(**flat, tilt=(0, 0, np.pi / 2)).vectors.reshape(4, 3)
+    np.testing.assert_allclose(skewed[2], v / 2, atol=1e-12)
+    np.testing.assert_allclose(skewed[3], -2 * u, atol=1e-12)
+    assert plain.orbit()[:2] == pytest.approx((100.0, 150.0))
+    assert conefield.circular(**flat, tilt=(0.1, 0, 0)).orbit() is None
+
+
+def test_torch_differentiates_through_it(geometry):
+    torch = pytest.importorskip("torch")
+    from conefield.torch import project
+
+    a = conefield.Operator(geometry, dtype=np.float64)
+    x = torch.rand(geometry.volume_shape, dtype=torch.float64, requires_grad=True)
+    y = torch.rand(geometry.projections_shape, dtype=torch.float64)
+    (0.5 * (project(x, a) - y).square().sum()).backward()
+    np.testing.assert_allclose(x.grad.numpy(), a.T @ (a @ x.detach().numpy() - y.numpy()), rtol=1e-10)

@@ -1,0 +1,46 @@
+//! What will run: the method that is asked for or, within a budget of time, one of a front's.
+
+use crate::method::Planned;
+use crate::specs;
+use conefield_core::{Error, Result};
+use conefield_tradeoff::calibrate::Bench;
+use conefield_tradeoff::front::Front;
+use conefield_tradeoff::schedule::{Budget, Schedule};
+use tracing::info;
+
+/// What is asked for.
+pub enum Wish {
+    /// This method.
+    Method(Planned),
+    /// The best of these for a budget.
+    OneOf(Front),
+}
+
+/// Settles what will run, and how long. `held` are the views that are kept aside; `build` makes a method of the front from
+/// a spec and what is set of it.
+pub fn choose(
+    wish: Wish,
+    bench: &Bench<'_>,
+    budget: Option<Budget>,
+    held: &[usize],
+    build: impl Fn(&str, &[String]) -> Result<Planned>,
+) -> Result<(Planned, Option<Schedule>)> {
+    let (method, schedule) = match (budget, wish) {
+        (None, Wish::Method(method)) => (method, None),
+        (Some(budget), Wish::Method(mut method)) => {
+            let schedule = budget.plan(bench, &mut method)?;
+            (method, Some(schedule))
+        }
+        (Some(budget), Wish::OneOf(front)) => {
+            let (method, schedule) = budget.choose(bench, &front, build)?;
+            (method, Some(schedule))
+        }
+        (None, Wish::OneOf(_)) => {
+            return Err(Error::invalid("reconstruct", "--spec", "nothing", "a spec, or --budget to choose one by"));
+        }
+    };
+    specs::check_held_out(&method.loaded, method.plan.as_ref(), held)?;
+    schedule.iter().flat_map(|s| s.lines(&method.loaded.spec.name)).for_each(|line| info!("{line}"));
+    info!("memory: {}", method.memory.line());
+    Ok((method, schedule))
+}

@@ -1,0 +1,115 @@
+//! What a scanner would have measured of a volume: predicted views, and what measured ones have beside them.
+
+use conefield_core::error::{Error, Result, ensure};
+use conefield_core::geometry::{Geometry, VoxelGrid};
+use conefield_core::registry::{Kind, names};
+use conefield_core::scan::{Scan, Volume};
+use conefield_core::spec::stage;
+use conefield_core::voxel::{VoxelProjector, VoxelProjectorSpec};
+use conefield_metrics::rmse;
+use ndarray::{Array3, Axis, Zip};
+use serde::Serialize;
+use serde_json::Value;
+
+/// The projector that iterative methods take where none is named.
+pub const PROJECTOR: &str = "joseph";
+
+/// How far the box of a volume may be from the one that a scan reconstructs, as a share of its side, before that is told.
+const SAME_BOX: f64 = 0.01;
+
+/// The projector of voxels that `value` says as a spec does: the name of a type, or a table with its settings.
+pub fn projector(value: Value) -> Result<Box<dyn VoxelProjector>> {
+    let found = value.to_string();
+    let expected = || format!("a type of voxel projector: {}", names(Kind::VoxelProjector).join(", "));
+    let name = value.as_str().or(value["type"].as_str());
+    let known = name.is_some_and(|n| names(Kind::VoxelProjector).contains(&n));
+    ensure(known, "projection", "projector", &found, expected())?;
+    let spec: Box<dyn VoxelProjectorSpec> = stage::read(value)
+        .map_err(|e| Error::invalid("projection", "projector", format!("{found}: {e}"), expected()))?;
+    spec.build()
+}
+
+/// Where the voxels of `volume` stand in the world of a scan that reconstructs `grid`: around the same centre. One of the
+/// same shape has the same voxels; a file without voxel sizes fills the same box.
+pub fn placed(volume: &Volume, grid: &VoxelGrid, sized: bool) -> VoxelGrid {
+    let shape = volume.grid.shape;
+    if shape == grid.shape {
+        return *grid;
+    }
+    let size = grid.size();
+    let fill = std::array::from_fn(|k| size[k] / shape[k] as f64);
+    VoxelGrid { shape, spacing: if sized { volume.grid.spacing } else { fill }, center: grid.center }
+}
+
+/// What is odd about a volume on `own` voxels in a scan that reconstructs `grid`, in words.
+pub fn oddity(own: &VoxelGrid, grid: &VoxelGrid) -> Option<String> {
+    let (size, want) = (own.size(), grid.size());
+    let differs = (0..3).any(|k| (size[k] / want[k] - 1.0).abs() > SAME_BOX);
+    differs.then(|| {
+        let mm = |s: [f64; 3]| format!("{:.1} x {:.1} x {:.1} mm", s[0], s[1], s[2]);
+        format!("its box of {} is not the {} that the scan reconstructs: it is taken as it is", mm(size), mm(want))
+    })
+}
+
+/// Bytes that [`predicted`] takes, beside the volume.
+pub fn bytes(projector: &dyn VoxelProjector, geometry: &Geometry) -> u64 {
+    let header = conefield_core::scan::ScanHeader {
+        views: geometry.views.len(),
+        detector: geometry.detector,
+        volume: geometry.volume.shape,
+    };
+    4 * header.pixels() + projector.scratch(&header, header.views)
+}
+
+/// The line integrals of `volume`, whose values count per `unit_mm` millimetres, in the views of `geometry`. The voxels are
+/// where `geometry` has them.
+pub fn predicted(
+    volume: &Volume,
+    geometry: &Geometry,
+    unit_mm: f64,
+    projector: &dyn VoxelProjector,
+) -> Result<Array3<f32>> {
+    geometry.validate("projection")?;
+    let (found, expected) = (format!("{:?}", volume.data.shape()), format!("{:?}", geometry.volume.shape));
+    ensure(volume.data.shape() == geometry.volume.shape, "projection", "shape of the volume", found, expected)?;
+    if let Some(((x, y, z), value)) = volume.data.indexed_iter().find(|(_, x)| !x.is_finite()) {
+        return Err(Error::invalid("projection", format!("voxel [{x}, {y}, {z}]"), value, "a finite attenuation"));
+    }
+    let [rows, columns] = geometry.detector;
+    let views: Vec<usize> = (0..geometry.views.len()).collect();
+    let mut out = Array3::zeros((views.len(), rows, columns));
+    let operator = projector.operator();
+    operator.forward(geometry, &views, volume.data.view(), out.view_mut());
+    operator.fault()?;
+    if unit_mm != 1.0 {
+        let per_unit = (1.0 / unit_mm) as f32;
+        out.par_mapv_inplace(|a| a * per_unit);
+    }
+    Ok(out)
+}
+
+/// How far predicted views are from measured ones.
+#[derive(Debug, Clone, PartialEq, Serialize)]
+pub struct Residual {
+    /// Root mean square of measured less predicted line integrals.
+    pub rms: f64,
+    /// The same over the largest measured line integral.
+    pub relative: f64,
+    /// Root mean square of each view.
+    pub views: Vec<f64>,
+}
+
+/// Replaces `views`, predicted for `scan`, by measured less predicted line integrals, and tells how large they are.
+pub fn residual(scan: &Scan, views: &mut Array3<f32>) -> Result<Residual> {
+    let of_view = |(measured, found): (ndarray::ArrayView2<f32>, ndarray::ArrayView2<f32>)| {
+        let [measured, found] = [measured, found].map(|a| a.insert_axis(Axis(0)));
+        rmse(found, measured)
+    };
+    let pairs = scan.projections.outer_iter().zip(views.outer_iter());
+    let each: Vec<f64> = pairs.map(of_view).collect::<Result<_>>()?;
+    let rms = (each.iter().map(|x| x * x).sum::<f64>() / each.len().max(1) as f64).sqrt();
+    let largest = scan.projections.iter().fold(0.0f32, |m, x| m.max(x.abs()));
+    Zip::from(views).and(&scan.projections).par_for_each(|a, p| *a = p - *a);
+    let relative = if largest > 0.0 { rms / f64::from(largest) } else { 0.0 };
+    Ok(Residual { rms, relative, views: each })
+}

@@ -1,0 +1,34 @@
+//! How far a volume is from its reference.
+
+use conefield_core::Result;
+use conefield_core::error::ensure;
+use conefield_core::scan::Volume;
+use conefield_metrics::Scores;
+
+/// Refuses a volume of another shape than the reference's.
+pub fn same_shape(place: &str, found: &[usize], expected: &[usize]) -> Result<()> {
+    ensure(found == expected, place, "shape", format!("{found:?}"), format!("{expected:?}, the reference's shape"))
+}
+
+/// The data range that scores against `reference` refer to: `given`, or what the reference says.
+pub fn peak(given: Option<f64>, reference: &Volume) -> f64 {
+    given.unwrap_or_else(|| {
+        let found = conefield_metrics::peak_of(reference.data.view());
+        if found != 1.0 {
+            tracing::info!("peak {found}, the range of the reference's values; --peak sets another");
+        }
+        found
+    })
+}
+
+/// Scores `volume`, called `place` in errors.
+pub fn score(place: &str, volume: &Volume, reference: &Volume, peak: f64) -> Result<Scores> {
+    same_shape(place, volume.data.shape(), reference.data.shape())?;
+    if let Some(factor) = conefield_metrics::other_unit(volume.data.view(), reference.data.view()) {
+        tracing::warn!(
+            "{place}: it is like the reference if it is multiplied by {factor:.4}: are both in one unit? The scores take \
+             them as they are"
+        );
+    }
+    conefield_metrics::evaluate(volume.data.view(), reference.data.view(), peak)
+}

@@ -1,0 +1,157 @@
+//! Scans of known volumes.
+
+use crate::memory::Memory;
+use crate::parse::{AnglesOption, Values};
+use conefield_core::files::{read_text, toml_line};
+use conefield_core::geometry::{Geometry, VoxelGrid};
+use conefield_core::scan::{Scan, Unit, Volume};
+use conefield_core::{Error, Result};
+use conefield_projectors::simulate::{Angles, DetectorNoise, HuMapping, Protocol, downsample, project, simulate};
+use serde_json::json;
+use std::path::Path;
+
+/// Longest protocol or list of angles, in bytes.
+const LONGEST: u64 = 16 << 20;
+
+/// What is to be other than a protocol says.
+#[derive(Debug, Clone, Default)]
+pub struct Changes {
+    /// Number of views.
+    pub views: Option<usize>,
+    /// Rows and columns of the detector, whose size stays.
+    pub detector: Option<[usize; 2]>,
+    /// Shift of the detector along v and u, mm.
+    pub offset: Option<[f64; 2]>,
+    /// Where the views are taken.
+    pub angles: Option<AnglesOption>,
+    /// What the detector adds.
+    pub noise: Option<DetectorNoise>,
+    /// Seed of the noise.
+    pub seed: Option<u64>,
+}
+
+/// The volume on the rotation axis, in attenuation, of means of `size`³ voxels.
+pub fn prepared(volume: Volume, values: Values, size: usize) -> Result<Volume> {
+    let mut volume = values.apply(volume)?;
+    // A scan's volume stands on the rotation axis.
+    volume.grid.center = [0.0; 3];
+    if size > 1 {
+        volume = downsample(&volume, size)?;
+        volume.grid.center = [0.0; 3];
+    }
+    Ok(volume)
+}
+
+/// The protocol that `name` means for a volume on `grid`: r2, or a TOML or JSON file.
+pub fn protocol(name: &str, grid: &VoxelGrid) -> Result<Protocol> {
+    match name {
+        "r2" => Ok(Protocol::r2(grid)),
+        path => read_protocol(Path::new(path)),
+    }
+}
+
+/// The protocol with some of it changed. `place` names whoever asks for both a number of views and a list of angles.
+pub fn changed(mut p: Protocol, changes: &Changes, place: &str) -> Result<Protocol> {
+    if let Some(d) = changes.detector {
+        p = p.with_detector(d);
+    }
+    if let Some(n) = changes.noise {
+        p.noise = n;
+    }
+    if let Some(seed) = changes.seed {
+        p.seed = seed;
+    }
+    if let Some(mm) = changes.offset {
+        p.offset = mm.map(|x| x / p.unit.mm);
+    }
+    match &changes.angles {
+        Some(AnglesOption::File(path)) => {
+            if changes.views.is_some() {
+                let expected = "--views or --angles FILE, which says how many there are";
+                return Err(Error::invalid(place, "--views", "both", expected));
+            }
+            p.angles = Angles::ListDeg(read_angles(path)?);
+        }
+        Some(AnglesOption::Even { start, range }) => {
+            let views = changes.views.unwrap_or_else(|| p.angles.radians().len());
+            p.angles = Angles::Even { views, start_deg: *start, arc_deg: *range };
+        }
+        None => {
+            if let Some(views) = changes.views {
+                p.angles = match p.angles {
+                    Angles::Even { start_deg, arc_deg, .. } => Angles::Even { views, start_deg, arc_deg },
+                    Angles::ListDeg(_) => Angles::Even { views, start_deg: 0.0, arc_deg: 360.0 },
+                };
+            }
+        }
+    }
+    Ok(p)
+}
+
+/// Scans what [`prepared`] made of `source` by `protocol`; returns the scan and its truth. Refuses what does not fit into
+/// memory.
+pub fn scan(mut volume: Volume, values: Values, protocol: &Protocol, source: &str) -> Result<(Scan, Volume)> {
+    check_memory(&volume, &protocol.geometry(&volume.grid)?)?;
+    if let Values::Hu(HuMapping::Mu { .. }) = values {
+        // From 1/mm to the protocol's unit.
+        let per_unit = protocol.unit.mm as f32;
+        volume = volume.mapped(|x| x * per_unit);
+    }
+    let mut scan = simulate(&volume, protocol)?;
+    if let Some(p) = scan.provenance.as_object_mut() {
+        p.insert("source".into(), json!(source));
+    }
+    Ok((scan, volume))
+}
+
+/// Scans a volume in 1/mm where it stands, in any geometry.
+pub fn scan_in(volume: &Volume, geometry: Geometry, noise: DetectorNoise, seed: u64) -> Result<Scan> {
+    check_memory(volume, &geometry)?;
+    let mut projections = project(volume, &geometry, 2.0)?;
+    noise.add(&mut projections, seed);
+    let provenance = json!({ "simulated": { "noise": noise, "seed": seed, "volume": volume.grid } });
+    let scan = Scan { geometry, projections, unit: Unit::default(), provenance };
+    scan.validate("simulated scan")?;
+    Ok(scan)
+}
+
+/// Refuses what does not fit: projecting takes a copy of the volume with a rim.
+fn check_memory(volume: &Volume, g: &Geometry) -> Result<()> {
+    let rim = volume.grid.shape.iter().map(|&n| n as u64 + 2).product::<u64>();
+    let need = |views: usize, share: u64| {
+        let pixels = (views * g.detector[0] * g.detector[1]) as u64 / share;
+        let volume = 4 * (volume.data.len() as u64 + rim);
+        Memory::most(&[Memory { scan: 4 * pixels, volume, ..Memory::default() }])
+    };
+    need(g.views.len(), 1).check(|available| {
+        let fits = |m: Memory| m.total <= available;
+        let views = (1..=g.views.len()).rev().find(|&n| fits(need(n, 1)));
+        let detector = (1..5).find(|k| fits(need(g.views.len(), 1 << (2 * k))));
+        let views = views.map(|n| format!("{n} views"));
+        let detector = detector.map(|k| format!("a detector of {}x{}", g.detector[0] >> k, g.detector[1] >> k));
+        views.into_iter().chain(detector).collect()
+    })
+}
+
+fn read_protocol(path: &Path) -> Result<Protocol> {
+    let text = read_text(path, LONGEST)?;
+    let place = path.display();
+    if text.trim_start().starts_with('{') {
+        return serde_json::from_str(&text)
+            .map_err(|e| Error::invalid(format!("{place}:{}:{}", e.line(), e.column()), "protocol", e, "a protocol"));
+    }
+    toml::from_str(&text).map_err(|e| {
+        let line = toml_line(&text, &e).unwrap_or(1);
+        Error::invalid(format!("{place}:{line}"), "protocol", e.message(), "a protocol")
+    })
+}
+
+fn read_angles(path: &Path) -> Result<Vec<f64>> {
+    let text = read_text(path, LONGEST)?;
+    let lines = text.lines().map(|l| l.split('#').next().unwrap_or_default().trim()).enumerate();
+    let angles = lines.filter(|(_, l)| !l.is_empty()).map(|(i, l)| match l.parse::<f64>() {
+        Ok(a) if a.is_finite() => Ok(a),
+        _ => Err(Error::invalid(format!("{}:{}", path.display(), i + 1), "angle", l, "a number of degrees")),
+    });
+    angles.collect()
+}
