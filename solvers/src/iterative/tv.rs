@@ -756,8 +756,9 @@ mod tests {
                         let mut prox = prox(shape, g);
                         let (mut ahead, mut x) = (number(1), number(2));
                         for seed in [3, 4] {
+                            let mut gradient = number(seed);
                             let update = Update {
-                                gradient: flat_mut(&mut number(seed)),
+                                gradient: flat_mut(&mut gradient),
                                 ahead: flat_mut(&mut ahead),
                                 x: flat_mut(&mut x),
                                 step: 0.7,
