@@ -1,6 +1,6 @@
 //! Speed of what iterates and of FDK on 50 views of 512² pixels and 256³ voxels: Joseph forward and its adjoint and the
-//! voxel-driven back-projection, upright and with a tilted detector, and total variation, against what the machine allows in
-//! the same run.
+//! voxel-driven back-projection, upright and with a tilted detector, total variation, and a pass of FISTA that all of them
+//! make up, against what the machine allows in the same run.
 //!
 //! `cargo bench -p conefield-benches --bench projectors`; `benches/peers/classical.sh` puts RTK beside it.
 
@@ -9,6 +9,7 @@ use conefield_benches::{bandwidth, multiply_adds, times};
 use conefield_core::Result;
 use conefield_core::geometry::{Geometry, Millimetres, Radians, View, VoxelGrid, norm};
 use conefield_core::method::{Context, Job, Silent};
+use conefield_core::regularizer::Update;
 use conefield_core::scan::{Scan, ScanHeader, Unit};
 use conefield_core::space::Space;
 use conefield_core::spec::load::parse;
@@ -63,9 +64,22 @@ fn main() -> Result<()> {
     let mut prox = TvProx::new(geometry.volume.shape, [1.0; 3], &Space::new(header));
     let (noisy, mut smooth) = (volume.as_slice().unwrap_or_default(), vec![0.0; volume.len()]);
     let dual = times(RUNS, || prox.apply(noisy, 0.1, STEPS, &mut smooth));
+    let mut arrays: [Vec<f32>; 3] = std::array::from_fn(|_| noisy.to_vec());
+    let update = times(RUNS, || {
+        let [gradient, ahead, x] = &mut arrays;
+        let update = Update { gradient, ahead, x, step: -0.1, momentum: 0.5, towards: None, inside: None };
+        assert!(prox.update(update, 0.1, STEPS).is_none());
+    });
     let value = times(RUNS, || assert!(total_variation(volume.view(), [1.0; 3]) > 0.0));
     let scan = Scan { geometry, projections, unit: Unit::default(), provenance: serde_json::Value::Null };
-    let fdk = fdk(&scan)?;
+    let fdk = solver(&scan, "type = \"fdk\"\n", RUNS)?;
+    // What two passes more take, and what comes before the first.
+    let [one, three] = [1, 3].map(|n| {
+        let spec = format!("type = \"fista\"\nprior = \"total-variation\"\nstop = {{ passes = {n} }}\n");
+        solver(&scan, &spec, 3)
+    });
+    let (one, three) = (one?, three?);
+    let pass: [f64; 3] = std::array::from_fn(|k| (three[k] - one[k]) / 2.0);
     let limit = Limit { multiply_adds: multiply_adds(), bytes: bandwidth() };
     println!(
         "limits of this machine, measured now: {:.0} G multiply-adds/s, {:.1} GB/s from memory",
@@ -83,7 +97,12 @@ fn main() -> Result<()> {
     report("fdk", fdk, updates, 2.0 * volume * views.len().div_ceil(8) as f64, &limit);
     // The dual is read and written, the volume is read, its proximal map is written. A step is 16 multiply-adds a voxel.
     report("tv, 4 dual steps", dual, 4.0 * STEPS as f64 * voxels, 8.0 * volume, &limit);
+    // The gradient is read besides, and two volumes are read and written instead.
+    report("tv, a whole update", update, 4.0 * STEPS as f64 * voxels, 11.0 * volume, &limit);
     report("tv, its value", value, 2.0 * voxels, volume, &limit);
+    // Both directions of all views, and an update and a volume's gradient, cleared and filled, for each of ten subsets.
+    report("fista-tv, a pass", pass, 2.0 * samples + 10.0 * 4.0 * STEPS as f64 * voxels, 10.0 * 15.0 * volume, &limit);
+    println!("fista-tv, before the first pass: {:.2} s", one[1] - pass[1]);
     Ok(())
 }
 
@@ -98,14 +117,14 @@ fn geometry() -> Geometry {
     }
 }
 
-/// The whole solver, filters and all.
-fn fdk(scan: &Scan) -> Result<[f64; 3]> {
-    let spec = parse("name = \"fdk\"\ntype = \"fdk\"\n", "bench", &[], &[])?.spec;
+/// A whole method with all that comes before it.
+fn solver(scan: &Scan, method: &str, runs: usize) -> Result<[f64; 3]> {
+    let spec = parse(&format!("name = \"bench\"\n{method}"), "bench", &[], &[])?.spec;
     let backend = Cpu::new();
     let mut plan = spec.method.plan(&Context::new(&backend))?;
     let job = Job::new(scan, &backend);
     let mut failed = None;
-    let spent = times(RUNS, || failed = plan.run(&job, &mut Silent).err());
+    let spent = times(runs, || failed = plan.run(&job, &mut Silent).err());
     failed.map_or(Ok(spent), Err)
 }
 

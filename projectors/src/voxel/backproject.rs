@@ -52,14 +52,14 @@ impl<R: Real> Op for Planes<'_, R> {
         let Self { detector, pixels, zeros, views, first, mut planes } = self;
         let nz = planes.dim().2;
         let mut q = vec![R::ZERO; nz.next_multiple_of(V::<S, R>::LEN)];
-        let mut stands = Stands::new(q.len() / V::<S, R>::LEN);
+        let (mut stands, mut ends) = (Stands::new(q.len() / V::<S, R>::LEN), Ends::default());
         for (index, view) in views.iter().enumerate() {
             let image = Image { view, detector, pixels, index, zeros };
             for (x, mut plane) in planes.outer_iter_mut().enumerate() {
                 for (y, line) in plane.outer_iter_mut().enumerate() {
                     let Some(voxels) = line.into_slice() else { continue };
                     match Line::of(&image, [first + x, y], nz) {
-                        Some(line) => image.add(s, &line, &mut q, &mut stands, voxels),
+                        Some(line) => image.add(s, &line, &mut q, (&mut ends, &mut stands), voxels),
                         None => image.add_one_by_one([first + x, y], voxels),
                     }
                 }
@@ -115,9 +115,16 @@ struct Image<'a, R> {
 }
 
 impl<R: Real> Image<'_, R> {
-    /// Adds to `voxels` what they read on their line; `q` and `stands` are room for where they stand.
+    /// Adds to `voxels` what they read on their line; `q`, `ends` and `stands` are room for where they stand.
     #[inline(always)]
-    fn add<S: Simd>(&self, s: S, line: &Line, q: &mut [R], stands: &mut Stands<R>, voxels: &mut [R]) {
+    fn add<S: Simd>(
+        &self,
+        s: S,
+        line: &Line,
+        q: &mut [R],
+        (ends, stands): (&mut Ends<R>, &mut Stands<R>),
+        voxels: &mut [R],
+    ) {
         let len = V::<S, R>::LEN;
         let [rows, columns] = self.detector;
         let among = Among {
@@ -127,7 +134,8 @@ impl<R: Real> Image<'_, R> {
         };
         places(s, 0.0, [line.middle, line.bend], [0.0, voxels.len() as f64 - 1.0], q);
         let path = line.path.narrow();
-        stands.place(&path, &among, &Ends::of(q, len), len);
+        ends.find(q, len);
+        stands.place(&path, &among, ends, len);
         let column = |c: usize| match c.checked_sub(1) {
             Some(c) if c < columns => self.pixels.column(self.index, c),
             _ => self.zeros,

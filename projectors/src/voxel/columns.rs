@@ -333,7 +333,8 @@ impl<R: Real> Forward<'_, R> {
         let len = V::<S, R>::LEN;
         let mut q = vec![R::ZERO; c.rows.len().next_multiple_of(len)];
         c.places(s, c.rows.start as f64, &mut q);
-        let ends = Ends::of(&q, len);
+        let mut ends = Ends::default();
+        ends.find(&q, len);
         (q, ends)
     }
 

@@ -46,17 +46,21 @@ pub(super) struct Among<R> {
 }
 
 /// `q` of the first and the last reader of every vector.
+#[derive(Default)]
 pub(super) struct Ends<R> {
     first: Vec<R>,
     last: Vec<R>,
 }
 
 impl<R: Real> Ends<R> {
-    /// Of readers at `q`, in vectors of `len`.
-    pub fn of(q: &[R], len: usize) -> Self {
-        Self {
-            first: q.chunks_exact(len).map(|q| q[0]).collect(),
-            last: q.chunks_exact(len).map(|q| q[len - 1]).collect(),
+    /// Those of readers at `q`, in vectors of `len`.
+    #[inline(always)]
+    pub fn find(&mut self, q: &[R], len: usize) {
+        self.first.clear();
+        self.last.clear();
+        for q in q.chunks_exact(len) {
+            self.first.push(q[0]);
+            self.last.push(q[len - 1]);
         }
     }
 }
