@@ -124,18 +124,19 @@ fn a_regularizer_as_built_in() {
     done(&["simulate", "phantom:head:16", "-o", &text(&scan), "--views", "8", "--detector", "16x16"]);
     std::fs::write(&spec, SPEC).unwrap();
     let library = text(&example("huber"));
-    let (scan_at, spec_at, [whole, broken]) =
-        (text(&scan), text(&spec), ["whole", "broken"].map(|run| text(&dir.path().join(run))));
+    let (scan_at, spec_at) = (text(&scan), text(&spec));
+    let [short, whole, broken] = ["short", "whole", "broken"].map(|run| text(&dir.path().join(run)));
     let args = |run| ["--plugin", &library, "reconstruct", &scan_at, "--spec", &spec_at, "-o", run];
+    done(&[&args(&short)[..], &["--steps", "10"]].concat());
     done(&args(&whole));
     let read = |run: &str| conefield_io::read_volume(Path::new(run).join("volume.nii.gz")).unwrap().data;
 
     let scan = conefield_io::read_scan(&scan).unwrap();
     let spec = conefield_core::spec::load::parse(SPEC, "huber.toml", &[], &[]).unwrap().spec;
-    let backend = Cpu::new();
-    let job = Job::new(&scan, &backend);
+    let (backend, limits) = (Cpu::new(), Limits { steps: Some(10), ..Limits::default() });
+    let job = Job { limits, ..Job::new(&scan, &backend) };
     let solution = spec.method.plan(&Context::new(&backend)).unwrap().run(&job, &mut Silent).unwrap();
-    assert!(read(&whole) == solution.result.volume(&backend).unwrap().data, "the volumes differ");
+    assert!(read(&short) == solution.result.volume(&backend).unwrap().data, "the volumes differ");
 
     let mut child = std::process::Command::new(assert_cmd::cargo::cargo_bin("conefield"))
         .arg("--quiet")

@@ -43,7 +43,7 @@ const FAULTS: &[Fault] = &[
         &["ENTRY=another_name"],
         "a library without the function conefield_plugin",
     ),
-    refused("another version of the contract", &["FAULT=WRONG_ABI"], "ABI version: found 3.1, expected 2.x"),
+    refused("another version of the contract", &["FAULT=WRONG_ABI"], "ABI version: found 3.2, expected 2.x"),
     refused("a table that is too short", &["FAULT=SHORT_TABLE"], "the table is too short"),
     refused("functions that are too few", &["FAULT=SHORT_FUNCTIONS"], "the table is too short"),
     refused("a function that must be there is NULL", &["FAULT=NO_FORWARD"], "no function forward"),

@@ -66,6 +66,11 @@ impl RowMap for Settings {
         vec![("height".into(), vec![self.blobs; 3])]
     }
 
+    /// All blobs begin with a height of 0.
+    fn init(&self, _: u64, params: &mut [f32]) {
+        params.fill(0.0);
+    }
+
     fn forward<R: Real>(&self, params: &[impl Stored<R>], x: &[R], y: &mut [R]) {
         let at = [0, 1, 2].map(|k| x[k].f64());
         for (i, height) in params.iter().enumerate() {
