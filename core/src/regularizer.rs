@@ -3,7 +3,7 @@
 use crate::error::Result;
 use crate::geometry::VoxelGrid;
 use crate::space::Space;
-use ndarray::{Array3, ArrayView3};
+use ndarray::ArrayView3;
 use rayon::prelude::*;
 
 /// Settings of a regularizer.
@@ -33,7 +33,7 @@ pub trait Penalty: Send {
 
     /// Fits the penalty to the coefficients `x`, for one that follows what it finds. Called before each pass; what it leaves follows
     /// from `x` alone. Returns the new `R(x)` if it changed.
-    fn adapt(&mut self, x: &Array3<f32>) -> Option<f64> {
+    fn adapt(&mut self, x: ArrayView3<'_, f32>) -> Option<f64> {
         let _ = x;
         None
     }

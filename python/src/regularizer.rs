@@ -63,17 +63,17 @@ impl PythonRegularizer {
 }
 
 impl Regularizer for PythonRegularizer {
-    fn on(&self, grid: &VoxelGrid, space: &Space) -> Box<dyn Penalty> {
+    fn on(&self, grid: &VoxelGrid, space: &Space) -> Result<Box<dyn Penalty>> {
         // What goes in, and what comes out.
         space.hold(8 * grid.shape.iter().map(|&n| n as u64).product::<u64>());
-        Box::new(On { shared: self.0.clone(), grid: *grid })
+        Ok(Box::new(On { shared: self.0.clone(), grid: *grid }))
     }
 
-    fn weight(&self, _: &VoxelGrid, noise: &mut dyn FnMut(f64) -> f64) -> f64 {
-        match self.0.weight {
+    fn weight(&self, _: &VoxelGrid, noise: &mut dyn FnMut(f64) -> f64) -> Result<f64> {
+        Ok(match self.0.weight {
             Weight::Fixed(w) => w,
             Weight::Noise(k) => noise(k),
-        }
+        })
     }
 
     fn describe(&self) -> String {

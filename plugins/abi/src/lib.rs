@@ -12,7 +12,7 @@
 //! - **Tiles** are channel-major: channel `c` of row `i` is `data[c * stride + i]`. A pointer may be NULL where there is
 //!   nothing (no channels, no parameters). Floats are aligned to their own size and no more.
 //! - **Threads.** A stage is called from many threads at once, and every function that takes it as `const` must allow that.
-//!   Only `create`, `destroy`, `reduce`, `fitted`, `weights`, `with_weights`, `check`, `volume`, `on`, `of`, `prox` and `state`
+//!   Only `create`, `destroy`, `reduce`, `fitted`, `weights`, `with_weights`, `check`, `volume`, `on`, `of`, `prox`, `adapt` and `state`
 //!   of one stage are not called at the same time as anything else of that stage, though from any thread.
 //! - **Unwinding** must not leave the library: catch panics and exceptions, return [`CONEFIELD_PANICKED`].
 //! - **Same bits.** The result must not depend on threads, on time, or on how rows are dealt to tiles.
@@ -779,6 +779,17 @@ pub struct ConefieldRegularizer {
     /// NULL: every call starts afresh.
     pub state:
         Option<unsafe extern "C" fn(penalty: *mut c_void, index: usize, state: *mut ConefieldState) -> ConefieldStatus>,
+    /// Fits the penalty to the coefficients `x`, before each pass over the scan. What it leaves follows from `x` alone, and is no
+    /// part of `state`. Writes the new R(x); returns [`CONEFIELD_UNSUPPORTED`] where the penalty stays as it is. NULL: it always does.
+    pub adapt: Option<
+        unsafe extern "C" fn(
+            penalty: *mut c_void,
+            x: *const f32,
+            count: usize,
+            value: *mut f64,
+            error: *mut ConefieldText,
+        ) -> ConefieldStatus,
+    >,
 }
 
 /// Functions of a data term `Σ φ(r)` of residuals `r = measured − predicted`. What `of` makes of a scan is a stage of its own,

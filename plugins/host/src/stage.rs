@@ -92,6 +92,17 @@ impl<F: FunctionsOf> Foreign<F> {
         }
     }
 
+    /// As [`Foreign::run`], of a call that may say that there is no answer: whether there is one.
+    fn asked(&self, call: &str, f: impl FnOnce(*mut c_void, *mut ConefieldText) -> ConefieldStatus) -> Result<bool> {
+        let mut known = true;
+        self.run(call, |stage, error| {
+            let status = f(stage, error);
+            known = status != CONEFIELD_UNSUPPORTED;
+            if known { status } else { CONEFIELD_OK }
+        })?;
+        Ok(known)
+    }
+
     /// What came of a call that has no result; what went wrong is a fault, and `instead` stands for it.
     fn noted<T>(&self, result: Result<T>, instead: T) -> T {
         result.unwrap_or_else(|e| {

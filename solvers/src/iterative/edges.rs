@@ -2,7 +2,7 @@
 
 use super::flat_mut;
 use conefield_core::space::Space;
-use ndarray::Array3;
+use ndarray::{Array3, ArrayView3};
 use rayon::prelude::*;
 
 /// A vector `n` for each voxel: across the edge there, with a length between 0 (no edge) and 1 (a clear one).
@@ -29,13 +29,14 @@ impl Edges {
     }
 
     /// Finds the edges of `x`, whose differences count by `g` along x, y, z. The result does not depend on the number of threads.
-    pub fn find(&mut self, x: &Array3<f32>, g: [f32; 3]) {
+    pub fn find(&mut self, x: ArrayView3<'_, f32>, g: [f32; 3]) {
         let (nx, ny, nz) = x.dim();
         let plane = ny * nz;
         if plane == 0 {
             return;
         }
-        let all = super::flat(x);
+        let x = x.as_standard_layout();
+        let Some(all) = x.as_slice() else { return };
         let at = |i: usize| &all[i * plane..(i + 1) * plane];
         let [a, b, c] = self.n.each_mut().map(flat_mut);
         let planes = a.par_chunks_mut(plane).zip(b.par_chunks_mut(plane)).zip(c.par_chunks_mut(plane));
@@ -119,7 +120,7 @@ mod tests {
         let shape = x.dim().into();
         let space = Space::new(ScanHeader { views: 0, detector: [0; 2], volume: shape });
         let mut edges = Edges::new(shape, 0.81, scale, &space);
-        edges.find(x, g);
+        edges.find(x.view(), g);
         edges
     }
 

@@ -468,7 +468,7 @@ impl Iteration for Iterate {
     fn pass(&mut self, problem: &Problem<'_>, pass: u64) -> Result<Pass> {
         Zip::from(&mut self.arrays.before).and(&self.arrays.x).par_for_each(|before, x| *before = *x);
         // Another penalty is neither progress nor relapse.
-        if let Some(value) = self.arrays.penalty.adapt(&self.arrays.x) {
+        if let Some(value) = self.arrays.penalty.adapt(self.arrays.x.view()) {
             self.objective = self.misfit + self.lambda * value;
         }
         let (mut residual, mut misfit) = (0.0, 0.0);

@@ -116,9 +116,9 @@ impl TvProx {
     }
 
     /// Finds the edges of `x`, if they matter. Returns the total variation of `x` if that changes it.
-    pub fn adapt(&mut self, x: &Array3<f32>) -> Option<f64> {
+    pub fn adapt(&mut self, x: ArrayView3<'_, f32>) -> Option<f64> {
         self.edges.as_mut()?.find(x, self.g);
-        Some(self.value(x.view()))
+        Some(self.value(x))
     }
 
     /// The total variation of `x`.
@@ -605,7 +605,7 @@ mod tests {
     fn with_edges(shape: [usize; 3], g: [f32; 3], x: &Array3<f32>) -> TvProx {
         let space = Space::new(ScanHeader { views: 0, detector: [0; 2], volume: shape });
         let mut prox = prox(shape, g).with_edges(Edges::new(shape, 0.9, 0.7, &space));
-        assert!(prox.adapt(x).is_some());
+        assert!(prox.adapt(x.view()).is_some());
         prox
     }
 

@@ -255,14 +255,8 @@ fn partition(own: &Foreign<ConefieldMap>, i: &ConefieldInfo) -> Result<Vec<Range
 fn resolutions(own: &Foreign<ConefieldMap>, count: usize) -> Result<Option<Vec<f64>>> {
     let Some(f) = own.functions.resolutions.filter(|_| own.ty().kind == Kind::Encoder) else { return Ok(None) };
     let mut cells = vec![f64::from_bits(UNTOUCHED_64); count + GUARD];
-    let mut known = true;
-    own.run("resolutions", |stage, error| {
-        // SAFETY: the stage is alive, `cells` has room for more than `count`.
-        let status = unsafe { f(stage, cells.as_mut_ptr(), count, error) };
-        known = status != CONEFIELD_UNSUPPORTED;
-        if known { status } else { CONEFIELD_OK }
-    })?;
-    if !known {
+    // SAFETY: the stage is alive, `cells` has room for more than `count`.
+    if !own.asked("resolutions", |stage, error| unsafe { f(stage, cells.as_mut_ptr(), count, error) })? {
         return Ok(None);
     }
     let wrong = |what: String| Err(own.wrong("resolutions", &what));

@@ -140,6 +140,18 @@ impl Penalty for PenaltyOn {
         self.own.noted(self.try_value(x.as_slice().unwrap_or_default()), f64::NAN)
     }
 
+    fn adapt(&mut self, x: ArrayView3<'_, f32>) -> Option<f64> {
+        let adapt = self.own.functions.adapt?;
+        let x = x.as_standard_layout();
+        let x = x.as_slice().unwrap_or_default();
+        let mut value = f64::NAN;
+        // SAFETY: the penalty is alive; everything handed over lives for the time of the call.
+        let adapted = self.own.asked("adapt", |penalty, error| unsafe {
+            adapt(penalty, x.as_ptr(), x.len(), &mut value, error)
+        });
+        self.own.noted(adapted.map(|known| known.then_some(value)), Some(f64::NAN))
+    }
+
     fn prox(&mut self, v: &[f32], tau: f32, u: &mut [f32]) {
         if let Err(e) = self.try_prox(v, tau, u.as_mut_ptr()) {
             self.own.fault.set(e);

@@ -22,6 +22,7 @@ pub static REGULARIZER: ConefieldRegularizer = ConefieldRegularizer {
     value: Some(value),
     prox: Some(prox),
     state: Some(state),
+    adapt: Some(adapt),
 };
 
 pub static DATA_TERM: ConefieldDataTerm = ConefieldDataTerm {
@@ -115,6 +116,26 @@ unsafe extern "C" fn prox(
         let (penalty, v, u) = unsafe { (penalty(stage)?, many(v, count), many_mut(u, count)) };
         penalty.prox(v, tau, u);
         penalty.fault()
+    })
+}
+
+unsafe extern "C" fn adapt(
+    stage: *mut c_void,
+    x: *const f32,
+    _: usize,
+    value: *mut f64,
+    error: *mut ConefieldText,
+) -> ConefieldStatus {
+    guard(error, || {
+        // SAFETY: see `shims/mod.rs`; nothing else uses the penalty meanwhile.
+        let (built, value) = unsafe { (&mut *stage.cast::<Built>(), &mut *value) };
+        // SAFETY: as above.
+        let x = unsafe { array(built.shape, x)? };
+        let penalty = built.penalty_mut()?;
+        let adapted = penalty.adapt(x);
+        penalty.fault()?;
+        *value = adapted.ok_or_else(|| Error::unsupported("adapt", "the penalty stays as it is"))?;
+        Ok(())
     })
 }
 

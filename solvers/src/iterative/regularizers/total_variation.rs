@@ -5,7 +5,7 @@ use conefield_core::error::{Result, ensure};
 use conefield_core::geometry::VoxelGrid;
 use conefield_core::regularizer::{Penalty, Regularizer, RegularizerSpec, Update};
 use conefield_core::space::Space;
-use ndarray::{Array3, ArrayView3};
+use ndarray::ArrayView3;
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 use std::fmt::{Display, Formatter};
@@ -98,7 +98,7 @@ impl Penalty for On {
         self.prox.value(x)
     }
 
-    fn adapt(&mut self, x: &Array3<f32>) -> Option<f64> {
+    fn adapt(&mut self, x: ArrayView3<'_, f32>) -> Option<f64> {
         self.prox.adapt(x)
     }
 
