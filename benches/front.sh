@@ -14,7 +14,7 @@ cargo build --release --quiet -p conefield
 bin=${CARGO_TARGET_DIR:-target}/release/conefield
 mkdir -p "$out"
 volumes="engine_256 head_256 teapot_256 chest_128 abdomen_128"
-weight='prior.weight={ noise = 0.7 }'
+prior='prior="directional-total-variation"'
 cubic() { echo "basis={ type = \"cubic\", spacing = 1, samples = $1 }"; }
 names=()
 run() {
@@ -31,19 +31,18 @@ run() {
     done
 }
 run fdk fdk
-run coarse-64 fista-tv "$(cubic 64)" "$weight" bin=4 stop.passes=8
-run coarse-96 fista-tv "$(cubic 96)" "$weight" bin=4 stop.passes=8
-run coarse-112 fista-tv "$(cubic 112)" "$weight" bin=2 stop.passes=8
-run cubic-128 fista-tv "$(cubic 128)" "$weight" stop.passes=8
-run cubic-128-long fista-tv "$(cubic 128)" "$weight" stop.passes=16
+run coarse-64 fista-tv "$(cubic 64)" "$prior" bin=4 stop.passes=8
+run coarse-96 fista-tv "$(cubic 96)" "$prior" bin=4 stop.passes=8
+run coarse-112 fista-tv "$(cubic 112)" "$prior" bin=2 stop.passes=8
+run cubic-128 fista-tv "$(cubic 128)" "$prior" stop.passes=8
+run cubic-128-long fista-tv "$(cubic 128)" "$prior" stop.passes=16
 run smooth-160 smooth-tv methods.1.basis.samples=128 methods.1.stop.passes=4 methods.2.basis.samples=160 \
     methods.2.stop.passes=2
-run smooth-200 smooth-tv methods.1.stop.passes=5 methods.2.stop.passes=2
+run smooth-200 smooth-tv methods.1.stop.passes=5 methods.2.stop.passes=3
 run smooth-tv smooth-tv
-run smooth-tv-long smooth-tv methods.2.stop.passes=12
-run cubic-200 fista-tv "$(cubic 200)" "$weight" stop.passes=12
-run cubic-200-long fista-tv "$(cubic 200)" "$weight" 'stop={ passes = 40, change = 2e-4 }'
-run cubic-200-longest fista-tv "$(cubic 200)" "$weight" 'stop={ passes = 80, change = 1e-4 }'
+run smooth-tv-long smooth-tv methods.2.stop.passes=20
+run cubic-200 fista-tv "$(cubic 200)" "$prior" stop.passes=12
+run cubic-200-long fista-tv "$(cubic 200)" "$prior" 'stop={ passes = 40, change = 2e-4 }'
 python3 - "$out" "$front" "$volumes" "${names[@]}" <<'PY'
 import json, math, sys
 out, front, volumes, *names = sys.argv[1:]
