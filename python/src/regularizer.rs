@@ -107,8 +107,9 @@ impl On {
     }
 
     fn prox_of(&self, py: Python<'_>, object: &Bound<'_, PyAny>, v: &[f32], tau: f32) -> PyResult<Array3<f32>> {
-        let v = Array3::from_shape_vec(self.grid.shape, v.to_vec())
-            .map_err(|e| crate::errors::broken(py, &e.to_string()))?;
+        // A voxel in which no object can be may be handed over as far below 0 as numbers go: to a filter it is empty.
+        let v = v.iter().map(|&v| if v == f32::MIN { 0.0 } else { v }).collect();
+        let v = Array3::from_shape_vec(self.grid.shape, v).map_err(|e| crate::errors::broken(py, &e.to_string()))?;
         let found = object.call_method1("prox", (v.into_pyarray(py), tau))?;
         let arguments = PyDict::new(py);
         arguments.set_item("dtype", numpy::dtype::<f32>(py))?;
@@ -136,7 +137,10 @@ impl Penalty for On {
         // Without weight there is nothing to ask.
         let found = if tau == 0.0 { None } else { self.call(|py, object| self.prox_of(py, object, v, tau)) };
         match found.as_ref().and_then(|f| f.as_slice()) {
-            Some(found) => u.iter_mut().zip(found).for_each(|(u, x)| *u = x.max(0.0)),
+            Some(found) => {
+                let all = u.iter_mut().zip(found).zip(v);
+                all.for_each(|((u, x), v)| *u = if *v == f32::MIN { 0.0 } else { x.max(0.0) });
+            }
             None => u.iter_mut().zip(v).for_each(|(u, x)| *u = x.max(0.0)),
         }
     }

@@ -125,7 +125,7 @@ def test_plans(scan):
 def test_a_budget_chooses_and_holds(scan):
     begin = time.monotonic()
     result = conefield.reconstruct(scan, budget=6)
-    assert time.monotonic() - begin < 9
+    assert time.monotonic() - begin < 12
     assert result.record["plan"]["why"] and result.volume.data.std() > 0
 
 

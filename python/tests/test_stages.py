@@ -133,6 +133,9 @@ def test_a_denoiser_is_a_prior(scan):
     noisy = conefield.simulate("phantom:head:24", views=20, detector=(36, 36), noise="poisson:200", seed=1)
     without, result = [conefield.reconstruct(noisy, spec, reference="truth") for spec in (plain, prior)]
     assert result.scores["psnr"] > without.scores["psnr"] + 3, (result, without)
+    # Voxels in which no object can be are empty to it.
+    carved = conefield.reconstruct(noisy, {**prior, "scene": {"support": "carve"}})
+    assert np.isfinite(carved.volume.data).all() and carved.volume.data.max() < 2
     assert "a denoiser written in Python" in str(conefield.plan(prior))
 
 
