@@ -11,13 +11,14 @@ use conefield_projectors::simulate::{ellipsoids, scan_ellipsoids};
 use std::sync::Arc;
 
 /// Types with settings that suit 24 views.
-const ALL: [(&str, &str); 6] = [
+const ALL: [(&str, &str); 7] = [
     ("sart", ""),
     ("os-sart", "subsets = 6"),
     ("sirt", ""),
     ("cgls", ""),
     ("asd-pocs", "subsets = 6"),
     ("fista-tv", "subsets = 6\nprior.weight = { fixed = 0.1 }"),
+    ("fista", "subsets = 6\nprior = { type = \"directional-total-variation\", weight = { fixed = 0.1 } }"),
 ];
 
 fn passes(n: u64) -> String {

@@ -116,6 +116,8 @@ fn settings_out_of_range_are_named() {
         ("fista-tv", "prior.inner = 0", "prior.inner"),
         ("fista-tv", "prior.weight = { noise = -1.0 }", "prior.weight"),
         ("fista-tv", "prior.weight = 3.0", "prior.weight"),
+        ("fista", "prior = { type = \"directional-total-variation\", strength = 1.0 }", "prior.strength"),
+        ("fista", "prior = { type = \"directional-total-variation\", edge = 0.0 }", "prior.edge"),
     ] {
         let e = said(&method(kind, setting));
         assert!(e.contains(&format!(": {field}: found")), "{kind}, {setting}: {e}");
