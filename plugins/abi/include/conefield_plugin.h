@@ -964,6 +964,15 @@ typedef struct ConefieldRegularizer {
    NULL: every call starts afresh.
    */
   ConefieldStatus (*state)(void *penalty, size_t index, struct ConefieldState *state);
+  /*
+   Fits the penalty to the coefficients `x`, before each pass over the scan. What it leaves follows from `x` alone, and is no
+   part of `state`. Writes the new R(x); returns [`CONEFIELD_UNSUPPORTED`] where the penalty stays as it is. NULL: it always does.
+   */
+  ConefieldStatus (*adapt)(void *penalty,
+                           const float *x,
+                           size_t count,
+                           double *value,
+                           struct ConefieldText *error);
 } ConefieldRegularizer;
 
 /*

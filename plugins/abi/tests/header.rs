@@ -95,7 +95,7 @@ fn the_layout_is_pinned() {
     ];
     let first = [16, 24, 32, 32, 24, 80, 32, 16, 40, 168, 44, 16, 56, 48, 48, 48, 32, 40, 32, 32];
     assert_eq!(sizes[..20], first);
-    assert_eq!(sizes[20..], [72, 32, 56, 56, 88, 56, 152, 88]);
+    assert_eq!(sizes[20..], [72, 32, 64, 56, 88, 56, 152, 88]);
     let plugin = [
         offset_of!(ConefieldPlugin, size),
         offset_of!(ConefieldPlugin, abi_major),
@@ -212,6 +212,7 @@ fn the_layout_of_pieces_of_iterative_methods_is_pinned() {
         offset_of!(ConefieldBasis, adjoint_f64),
     ];
     assert_eq!([regularizer, data_term, basis], [[0, 8, 16, 24, 32, 40, 48]; 3]);
+    assert_eq!(offset_of!(ConefieldRegularizer, adapt), 56);
     let grid =
         [offset_of!(ConefieldGrid, shape), offset_of!(ConefieldGrid, spacing), offset_of!(ConefieldGrid, center)];
     assert_eq!(grid, [0, 24, 48]);

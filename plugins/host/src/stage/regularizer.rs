@@ -146,9 +146,8 @@ impl Penalty for PenaltyOn {
         let x = x.as_slice().unwrap_or_default();
         let mut value = f64::NAN;
         // SAFETY: the penalty is alive; everything handed over lives for the time of the call.
-        let adapted = self.own.asked("adapt", |penalty, error| unsafe {
-            adapt(penalty, x.as_ptr(), x.len(), &mut value, error)
-        });
+        let adapted =
+            self.own.asked("adapt", |penalty, error| unsafe { adapt(penalty, x.as_ptr(), x.len(), &mut value, error) });
         self.own.noted(adapted.map(|known| known.then_some(value)), Some(f64::NAN))
     }
 
