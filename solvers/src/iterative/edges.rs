@@ -45,6 +45,12 @@ impl Edges {
             .map(|(i, ((a, b), c))| {
                 let around = [at(i.saturating_sub(1)), at(i), at((i + 1).min(nx - 1))];
                 slopes(around, nz, g, [&mut *a, &mut *b, &mut *c]);
+                // No difference across the far faces, and so no edge.
+                if i + 1 == nx {
+                    a.fill(0.0);
+                }
+                b[plane - nz..].fill(0.0);
+                c.iter_mut().skip(nz - 1).step_by(nz).for_each(|c| *c = 0.0);
                 let square = |((a, b), c): ((&f32, &f32), &f32)| f64::from(a * a + b * b + c * c);
                 a.iter().zip(&*b).zip(&*c).map(square).sum::<f64>()
             })
