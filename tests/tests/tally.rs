@@ -13,18 +13,18 @@ use peak_alloc::PeakAlloc;
 #[global_allocator]
 static ALLOCATOR: PeakAlloc = PeakAlloc;
 
-/// 24 views of 96 × 96 pixels for 64³ voxels: a ball with noise. With more pixels it is these that decide how much FISTA takes: for a
-/// moment it may hold two numbers of each, to learn the noise, and how many are behind the object is known only then.
+/// 48 views of 96 × 96 pixels for 72³ voxels: a ball with noise. With fewer voxels it is the pixels that decide how much FISTA takes: for
+/// a moment it may hold two numbers of each, to learn the noise, and how many are behind the object is known only then.
 fn scan() -> Scan {
     let mm = Millimetres;
     let view = |i: usize| {
-        let angle = Radians(std::f64::consts::TAU * i as f64 / 24.0);
+        let angle = Radians(std::f64::consts::TAU * i as f64 / 48.0);
         View::circular(angle, mm(500.0), mm(750.0), [mm(2.0); 2], [mm(0.0); 2])
     };
-    let volume = VoxelGrid { shape: [64; 3], spacing: [1.5; 3], center: [0.0; 3] };
-    let geometry = Geometry { detector: [96; 2], views: (0..24).map(view).collect(), volume };
+    let volume = VoxelGrid { shape: [72; 3], spacing: [4.0 / 3.0; 3], center: [0.0; 3] };
+    let geometry = Geometry { detector: [96; 2], views: (0..48).map(view).collect(), volume };
     let mut i = 0;
-    let projections = Array3::from_shape_fn((24, 96, 96), |(_, r, c)| {
+    let projections = Array3::from_shape_fn((48, 96, 96), |(_, r, c)| {
         i += 1;
         let [r, c] = [r, c].map(|x| x as f32 - 47.5);
         2.0 * (1.0 - (r * r + c * c) / 900.0).max(0.0).sqrt() + 0.02 * (unit(mix(3, i)) - 0.5)
