@@ -4,6 +4,7 @@
 //!
 //! - [`sart`], [`cgls`], [`asd_pocs`], [`fista`]: the methods. [`shared`]: what all of them are given.
 //! - [`data`], [`regularizers`], [`bases`]: what FISTA is put together from. [`noise`]: what a scan says of its noise.
+//! - [`tv`], [`edges`]: total variation, and the edges that it may follow.
 //! - [`problem`]: a scan with its system matrix. [`drive`]: the passes of a run. [`monitor`]: what is looked at meanwhile.
 
 pub mod asd_pocs;
@@ -11,7 +12,7 @@ pub mod bases;
 pub mod cgls;
 pub mod data;
 pub mod drive;
-mod edges;
+pub mod edges;
 pub mod fista;
 mod model;
 pub mod monitor;

@@ -147,7 +147,7 @@ impl TvProx {
         }
     }
 
-    /// A whole update, as [`Penalty::update`] has it, in one sweep; gives back one whose `steps` take more than that.
+    /// A whole update, as [`conefield_core::regularizer::Penalty::update`] has it, in one sweep; gives back one whose `steps` take more than that.
     pub fn update<'a>(&mut self, update: Update<'a>, tau: f32, steps: usize) -> Option<Update<'a>> {
         let split = Split::new(self.shape[0], steps, rayon::current_num_threads());
         if tau < f32::MIN_POSITIVE || split.reach < steps {
