@@ -1,16 +1,54 @@
 //! What is known of a volume before its scan: a penalty with its proximal map.
 
-use crate::error::Result;
+use crate::error::{Result, ensure};
 use crate::geometry::VoxelGrid;
 use crate::space::Space;
 use ndarray::ArrayView3;
 use rayon::prelude::*;
+use schemars::JsonSchema;
+use serde::{Deserialize, Serialize};
+use std::fmt::{Display, Formatter};
 
 /// Settings of a regularizer.
 #[typetag::serde(tag = "type")]
 pub trait RegularizerSpec: Send + Sync {
     /// The regularizer, or why the settings make none.
     fn build(&self) -> Result<Box<dyn Regularizer>>;
+}
+
+/// How strong a regularizer is.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize, JsonSchema)]
+#[serde(rename_all = "kebab-case")]
+pub enum Weight {
+    /// λ, for attenuation counted per voxel (geometric mean of its sides) and the projector's lengths in voxels.
+    Fixed(f64),
+    /// Times the root mean square of back-projected noise, whose strength is read from the scan.
+    Noise(f64),
+}
+
+impl Weight {
+    /// Refuses what is no weight.
+    pub fn validate(self) -> Result<()> {
+        let (Self::Fixed(w) | Self::Noise(w)) = self;
+        ensure(w.is_finite() && w >= 0.0, "spec", "weight", w, "a finite number, 0 or more")
+    }
+
+    /// λ for attenuation in 1/mm and lengths in mm ([`Regularizer::weight`]), where `unit` is that λ for a fixed weight of 1.
+    pub fn lambda(self, unit: f64, noise: &mut dyn FnMut(f64) -> f64) -> f64 {
+        match self {
+            Self::Fixed(w) => w * unit,
+            Self::Noise(k) => noise(k),
+        }
+    }
+}
+
+impl Display for Weight {
+    fn fmt(&self, f: &mut Formatter<'_>) -> std::fmt::Result {
+        match self {
+            Self::Fixed(w) => write!(f, "{w}"),
+            Self::Noise(k) => write!(f, "{k} times the noise"),
+        }
+    }
 }
 
 /// A convex penalty of coefficients on any grid.

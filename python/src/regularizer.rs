@@ -1,9 +1,8 @@
 //! A regularizer whose arithmetic is a Python object's: a proximal map, or a denoiser that is put in its place.
 
 use crate::stages::Raised;
-use conefield_core::error::ensure;
 use conefield_core::geometry::VoxelGrid;
-use conefield_core::regularizer::{Penalty, Regularizer};
+use conefield_core::regularizer::{Penalty, Regularizer, Weight};
 use conefield_core::space::Space;
 use conefield_core::{Error, Result};
 use ndarray::{Array3, ArrayView3};
@@ -11,15 +10,6 @@ use numpy::{IntoPyArray, PyReadonlyArray3};
 use pyo3::prelude::*;
 use pyo3::types::PyDict;
 use std::sync::{Arc, Mutex, PoisonError};
-
-/// How strong it is.
-#[derive(Debug, Clone, Copy)]
-enum Weight {
-    /// λ.
-    Fixed(f64),
-    /// Times the root mean square of back-projected noise.
-    Noise(f64),
-}
 
 struct Shared {
     name: &'static str,
@@ -50,8 +40,7 @@ impl PythonRegularizer {
             (Some(w), None) => Weight::Fixed(w),
             (None, k) => Weight::Noise(k.unwrap_or(1.0)),
         };
-        let (Weight::Fixed(w) | Weight::Noise(w)) = weight;
-        if let Err(e) = ensure(w.is_finite() && w >= 0.0, "spec", "weight", w, "a finite number, 0 or more") {
+        if let Err(e) = weight.validate() {
             return Ok(Err(e));
         }
         if !own.hasattr("prox")? {
@@ -70,19 +59,12 @@ impl Regularizer for PythonRegularizer {
     }
 
     fn weight(&self, _: &VoxelGrid, noise: &mut dyn FnMut(f64) -> f64) -> Result<f64> {
-        Ok(match self.0.weight {
-            Weight::Fixed(w) => w,
-            Weight::Noise(k) => noise(k),
-        })
+        Ok(self.0.weight.lambda(1.0, noise))
     }
 
     fn describe(&self) -> String {
-        let weight = match self.0.weight {
-            Weight::Fixed(w) => format!("weight {w}"),
-            Weight::Noise(k) => format!("weight {k} times the noise"),
-        };
         let kind = if self.0.has_value { "a proximal map" } else { "a denoiser" };
-        format!("{}: {kind} written in Python, {weight}", self.0.name)
+        format!("{}: {kind} written in Python, weight {}", self.0.name, self.0.weight)
     }
 }
 

@@ -330,10 +330,7 @@ impl Arrays {
         self.part_by_part(problem, views, &mut |_, views, pixels| {
             let mut signs = images_mut(pixels, views.len());
             signs.iter_mut().for_each(|sign| *sign = if rng.random::<bool>() { 1.0 } else { -1.0 });
-            problem.each_image(views, pixels, |view, measured, signs| {
-                data.spread(view, measured, signs);
-                0.0
-            });
+            problem.each_image(views, pixels, |view, measured, signs| data.spread(view, measured, signs));
         });
         let met = self.gradient.iter().filter(|x| **x != 0.0).count();
         let all = problem.geometry.views.len() as f64 / views.len().max(1) as f64;
@@ -366,10 +363,7 @@ impl Arrays {
         let v = std::mem::take(&mut self.before);
         self.part_by_part(problem, views, &mut |model, views, pixels| {
             model.forward(problem, views, &v, pixels);
-            problem.each_image(views, pixels, |view, measured, values| {
-                data.curve(view, measured, values);
-                0.0
-            });
+            problem.each_image(views, pixels, |view, measured, values| data.curve(view, measured, values));
         });
         self.before = v;
     }
@@ -443,7 +437,8 @@ impl Iterate {
         let data = self.data.as_ref();
         self.arrays.part_by_part(problem, views, &mut |model, views, pixels| {
             residual += model.residual(problem, views, &ahead, pixels);
-            misfit += problem.each_image(views, pixels, |view, measured, r| data.differentiate(view, measured, r));
+            let misfits = problem.each_image(views, pixels, |view, measured, r| data.differentiate(view, measured, r));
+            misfit += misfits.iter().sum::<f64>();
         });
         self.arrays.ahead = ahead;
         let t = 0.5 * (1.0 + (1.0 + 4.0 * self.t * self.t).sqrt());

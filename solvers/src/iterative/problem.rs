@@ -83,17 +83,17 @@ impl Problem<'_> {
         self.operator.adjoint(self.geometry, views, images(y, views.len()), out.view_mut());
     }
 
-    /// Hands each of the first images of `pixels` to `work`, with its view and what was measured there. Returns the sum of what
-    /// comes back, in the order of the views.
-    pub fn each_image(
+    /// Hands each of the first images of `pixels` to `work`, with its view and what was measured there. Returns what comes back,
+    /// in the order of the views.
+    pub fn each_image<T: Send>(
         &self,
         views: &[usize],
         pixels: &mut Array3<f32>,
-        work: impl Fn(usize, &[f32], &mut [f32]) -> f64 + Sync,
-    ) -> f64 {
+        work: impl Fn(usize, &[f32], &mut [f32]) -> T + Sync,
+    ) -> Vec<T> {
         let mut images = images_mut(pixels, views.len());
         let images = images.axis_iter_mut(Axis(0)).into_par_iter().zip(views);
-        let sums: Vec<f64> = images
+        images
             .map(|(image, &view)| {
                 let measured = self.scan.view(view);
                 let measured = measured.as_standard_layout();
@@ -102,8 +102,7 @@ impl Problem<'_> {
                     _ => unreachable!("images are contiguous"),
                 }
             })
-            .collect();
-        sums.iter().sum()
+            .collect()
     }
 
     /// Sets the voxels in which no object can be to `value`.

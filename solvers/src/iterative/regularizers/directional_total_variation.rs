@@ -3,12 +3,12 @@
 //! Slopes across an edge count less than those along it (Ehrhardt and Betcke, SIAM J. Imaging Sci. 9(3), 2016). There the edges
 //! are those of another image of the object. Here they are the volume's own, looked for anew before each pass.
 
-use super::total_variation::{On, Weight, validate};
+use super::total_variation::{On, lambda, validate};
 use crate::iterative::edges::Edges;
 use crate::iterative::tv::{TvProx, anisotropy};
 use conefield_core::error::{Result, ensure};
 use conefield_core::geometry::VoxelGrid;
-use conefield_core::regularizer::{Penalty, Regularizer, RegularizerSpec};
+use conefield_core::regularizer::{Penalty, Regularizer, RegularizerSpec, Weight};
 use conefield_core::space::Space;
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
@@ -59,7 +59,7 @@ impl Regularizer for DirectionalTotalVariation {
     }
 
     fn weight(&self, grid: &VoxelGrid, noise: &mut dyn FnMut(f64) -> f64) -> Result<f64> {
-        Ok(self.weight.lambda(grid, noise))
+        Ok(lambda(self.weight, grid, noise))
     }
 
     fn describe(&self) -> String {

@@ -3,12 +3,11 @@
 use crate::iterative::tv::{TvProx, anisotropy};
 use conefield_core::error::{Result, ensure};
 use conefield_core::geometry::VoxelGrid;
-use conefield_core::regularizer::{Penalty, Regularizer, RegularizerSpec, Update};
+use conefield_core::regularizer::{Penalty, Regularizer, RegularizerSpec, Update, Weight};
 use conefield_core::space::Space;
 use ndarray::ArrayView3;
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
-use std::fmt::{Display, Formatter};
 
 /// Settings of `total-variation`.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize, JsonSchema)]
@@ -20,41 +19,15 @@ pub struct TotalVariation {
     pub inner: usize,
 }
 
-/// How strong a prior is.
-#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize, JsonSchema)]
-#[serde(rename_all = "kebab-case")]
-pub enum Weight {
-    /// λ, for attenuation counted per voxel (geometric mean of its sides) and the projector's lengths in voxels.
-    Fixed(f64),
-    /// Times the root mean square of back-projected noise, whose strength is read from the scan.
-    Noise(f64),
-}
-
-impl Weight {
-    /// The weight λ of a total variation on `grid`. Attenuation a voxel is x̂ = x·h and lengths in voxels are Â = A/h, so that
-    /// λ̂·TV(x̂) = λ̂·h·TV(x).
-    pub(super) fn lambda(self, grid: &VoxelGrid, noise: &mut dyn FnMut(f64) -> f64) -> f64 {
-        match self {
-            Self::Fixed(w) => w * grid.spacing.iter().product::<f64>().cbrt(),
-            Self::Noise(k) => noise(k),
-        }
-    }
-}
-
-impl Display for Weight {
-    fn fmt(&self, f: &mut Formatter<'_>) -> std::fmt::Result {
-        match self {
-            Self::Fixed(w) => write!(f, "{w}"),
-            Self::Noise(k) => write!(f, "{k} times the noise"),
-        }
-    }
-}
-
 /// Refuses a weight and a number of dual steps that make no prior.
 pub(super) fn validate(weight: Weight, inner: usize) -> Result<()> {
     ensure((1..=1000).contains(&inner), "spec", "inner", inner, "1 to 1000")?;
-    let (Weight::Fixed(w) | Weight::Noise(w)) = weight;
-    ensure(w.is_finite() && w >= 0.0, "spec", "weight", w, "a finite number, 0 or more")
+    weight.validate()
+}
+
+/// λ on `grid`. Attenuation a voxel is x̂ = x·h and lengths in voxels are Â = A/h, so that λ̂·TV(x̂) = λ̂·h·TV(x).
+pub(super) fn lambda(weight: Weight, grid: &VoxelGrid, noise: &mut dyn FnMut(f64) -> f64) -> f64 {
+    weight.lambda(grid.spacing.iter().product::<f64>().cbrt(), noise)
 }
 
 impl Default for TotalVariation {
@@ -79,7 +52,7 @@ impl Regularizer for TotalVariation {
     }
 
     fn weight(&self, grid: &VoxelGrid, noise: &mut dyn FnMut(f64) -> f64) -> Result<f64> {
-        Ok(self.weight.lambda(grid, noise))
+        Ok(lambda(self.weight, grid, noise))
     }
 
     fn describe(&self) -> String {
