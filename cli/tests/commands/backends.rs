@@ -1,7 +1,6 @@
 //! The wgpu backend as a user meets it: listed, explained, and running what the CPU runs.
 
-mod common;
-use common::{done, refused, text};
+use crate::common::{done, refused, text};
 use serde_json::Value;
 use std::path::{Path, PathBuf};
 

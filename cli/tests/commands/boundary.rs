@@ -1,11 +1,7 @@
 //! Nothing is lost at the boundary: what a command reads stays, what it replaces goes only when the new is there, a folder has
 //! one writer, and what files say does not reach the terminal as it is.
 
-#![cfg(unix)]
-
-mod common;
-
-use common::{conefield, done, json, refused, text};
+use crate::common::{conefield, done, json, refused, text};
 use std::fs;
 use std::os::unix::ffi::OsStrExt;
 use std::path::{Path, PathBuf};

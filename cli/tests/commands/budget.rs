@@ -1,7 +1,6 @@
 //! `reconstruct --budget`: what is planned, what is refused, and what the record says of it.
 
-mod common;
-use common::{done, json, refused, text};
+use crate::common::{done, json, refused, text};
 use serde_json::Value;
 use std::fs;
 use std::path::PathBuf;

@@ -1,7 +1,6 @@
 //! From a phantom to scores, on a scan that is small enough for every test run.
 
-mod common;
-use common::{done, json, text};
+use crate::common::{done, json, text};
 use serde_json::Value;
 use std::fs;
 use std::path::{Path, PathBuf};
@@ -163,7 +162,7 @@ fn a_volume_starts_another_run() {
     let spec = fs::read_to_string(dir.path().join("held/spec.toml")).unwrap();
     assert!(spec.contains("start = "), "{spec}");
     let alone = ["reconstruct", &scan, "--spec", "fista-tv", "-o", &place("alone"), "--set", "pull=0.1"];
-    let said = common::refused(1, &alone);
+    let said = crate::common::refused(1, &alone);
     assert!(said.contains("pull"), "{said}");
 }
 
@@ -182,7 +181,7 @@ fn pretrained_weights_start_another_run() {
     let spec = fs::read_to_string(dir.path().join("run/spec.toml")).unwrap();
     assert!(spec.contains("type = \"mci\""), "{spec}");
     // A field of another shape cannot start from them.
-    let said = common::refused(
+    let said = crate::common::refused(
         1,
         &[
             "reconstruct",

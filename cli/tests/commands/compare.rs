@@ -1,7 +1,6 @@
 //! `compare`: one table in three forms, one picture, and runs that stand for themselves.
 
-mod common;
-use common::{conefield, done, json, refused, text};
+use crate::common::{conefield, done, json, refused, text};
 use serde_json::Value;
 use std::fs;
 use std::path::{Path, PathBuf};

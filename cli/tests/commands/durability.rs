@@ -1,11 +1,7 @@
 //! What stands under a name is whole: a writer that may not write, has no room or is killed leaves the earlier file as
 //! it was, nothing half-written, and says which file it was.
 
-#![cfg(target_os = "linux")]
-
-mod common;
-
-use common::{done, text};
+use crate::common::{done, text};
 use std::fs;
 use std::os::unix::fs::PermissionsExt;
 use std::path::{Path, PathBuf};

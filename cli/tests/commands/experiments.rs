@@ -1,7 +1,6 @@
 //! The method's own experiments: drift, features as colours, label maps, an end by views kept aside, live slices.
 
-mod common;
-use common::{done, json, refused, text};
+use crate::common::{done, json, refused, text};
 use ndarray::Array3;
 use serde_json::Value;
 use std::fs;
@@ -226,7 +225,7 @@ fn a_segmenter_sees_both_volumes_and_leaves_nothing() {
         dir.path(),
         "my tool",
         &format!(
-            "printf x >> '{}'\n{THRESHOLD}=\"$(printf '%s\\t%s\\t%s' \"$2\" \"$4\" \"$5\")\" exec '{}' --exact threshold",
+            "printf x >> '{}'\n{THRESHOLD}=\"$(printf '%s\\t%s\\t%s' \"$2\" \"$4\" \"$5\")\" exec '{}' --exact experiments::threshold",
             place("calls"),
             me.display()
         ),
@@ -237,7 +236,7 @@ fn a_segmenter_sees_both_volumes_and_leaves_nothing() {
         let mut args = vec!["evaluate".to_owned(), place("a.npy"), place("b.npy"), "--json".into()];
         args.extend(more.iter().map(|&m| m.to_owned()));
         let args: Vec<&str> = args.iter().map(String::as_str).collect();
-        let output = common::conefield(&args).env("TMPDIR", &temporary).assert().success().get_output().clone();
+        let output = crate::common::conefield(&args).env("TMPDIR", &temporary).assert().success().get_output().clone();
         assert_eq!(fs::read_dir(&temporary).unwrap().count(), 0, "something was left behind");
         serde_json::from_slice::<Value>(&output.stdout).unwrap()
     };

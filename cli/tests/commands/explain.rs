@@ -1,7 +1,6 @@
 //! What `explain` says.
 
-mod common;
-use common::{done, json, refused, text};
+use crate::common::{done, json, refused, text};
 use tempfile::tempdir;
 
 /// Words of the line that begins with `head`.

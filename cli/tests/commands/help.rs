@@ -1,7 +1,6 @@
 //! Help, and exit status 2 for wrong use.
 
-mod common;
-use common::{conefield, done, refused};
+use crate::common::{conefield, done, refused};
 
 const COMMANDS: [&str; 18] = [
     "simulate",
@@ -50,7 +49,7 @@ fn every_subcommand_has_help() {
 
 #[test]
 fn lists_of_specs_and_stage_types_are_whole() {
-    let readme = include_str!("../../README.md");
+    let readme = include_str!("../../../README.md");
     let names = conefield::specs::names();
     assert!(["balanced", "fista-tv", "sart"].iter().all(|n| names.contains(n)), "{names:?}");
     for command in ["reconstruct", "compare", "pretrain", "explain"] {
@@ -72,7 +71,7 @@ fn shells_and_man_know_every_command() {
         }
     }
     let dir = tempfile::tempdir().unwrap();
-    let folder = common::text(&dir.path().join("man1"));
+    let folder = crate::common::text(&dir.path().join("man1"));
     done(&["completions", "--man", &folder]);
     let page = |name: &str| std::fs::read_to_string(dir.path().join("man1").join(name)).unwrap();
     assert!(page("conefield.1").contains("conefield\\-reconstruct"));

@@ -1,7 +1,6 @@
 //! `conefield import` from files to a scan that the other commands read.
 
-mod common;
-use common::{done, json, refused, text};
+use crate::common::{done, json, refused, text};
 use ndarray::Array3;
 use std::fs;
 use tempfile::tempdir;

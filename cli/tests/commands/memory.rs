@@ -1,7 +1,6 @@
 //! Memory: the estimate against what a run takes, refusal before anything is taken, and export beyond it.
 
-mod common;
-use common::{done, json, refused, text};
+use crate::common::{done, json, refused, text};
 use conefield_core::geometry::{Geometry, Millimetres, Radians, View, VoxelGrid};
 use conefield_core::scan::{Scan, Unit};
 use ndarray::Array3;

@@ -1,7 +1,6 @@
 //! NAF's pickle in and out of the whole program.
 
-mod common;
-use common::{done, json, refused, text};
+use crate::common::{done, json, refused, text};
 use std::fs;
 use tempfile::tempdir;
 

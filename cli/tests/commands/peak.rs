@@ -1,7 +1,6 @@
 //! The data range that scores refer to: from the reference, where none is given, and said.
 
-mod common;
-use common::{conefield, json, text};
+use crate::common::{conefield, json, text};
 use conefield_projectors::simulate::phantom;
 use serde_json::Value;
 use std::path::Path;

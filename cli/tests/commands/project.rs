@@ -1,7 +1,6 @@
 //! `conefield project`: the views that a scanner takes of a volume, and what measured ones have beside them.
 
-mod common;
-use common::{done, json, refused, text};
+use crate::common::{done, json, refused, text};
 use conefield_core::geometry::View;
 use conefield_io::{read_scan, read_volume, write_volume};
 use std::fs;

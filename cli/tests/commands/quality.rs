@@ -1,8 +1,7 @@
 //! Shipped neural specs make a volume that is worth something on the CPU: a head of 64³ voxels from 20 views, few steps on
 //! smaller tables and fewer samples than the specs ask for.
 
-mod common;
-use common::{done, json, text};
+use crate::common::{done, json, text};
 use conefield::specs::SHIPPED;
 
 /// A volume of zeros has this PSNR.

@@ -1,7 +1,6 @@
 //! Bad input ends with status 1 and one message that names the file, the field, what is there and what should be.
 
-mod common;
-use common::{refused, text};
+use crate::common::{refused, text};
 use std::fs;
 use tempfile::tempdir;
 
@@ -112,7 +111,7 @@ fn sets_are_checked() {
 fn a_run_is_not_mixed_with_other_files() {
     let dir = tempdir().unwrap();
     let (scan, run) = (text(&dir.path().join("scan")), dir.path().join("run"));
-    common::done(&["simulate", "phantom:head:16", "-o", &scan, "--views", "4", "--detector", "8x8"]);
+    crate::common::done(&["simulate", "phantom:head:16", "-o", &scan, "--views", "4", "--detector", "8x8"]);
     fs::create_dir(&run).unwrap();
     fs::write(run.join("letter.txt"), "mine").unwrap();
     let args = ["reconstruct", &scan, "--spec", "naf", "-o", &text(&run), "--steps", "1", "--force"];
@@ -128,7 +127,7 @@ fn a_run_is_not_mixed_with_other_files() {
 fn a_folder_that_is_refused_is_left_as_it_is() {
     let dir = tempdir().unwrap();
     let (scan, other) = (dir.path().join("scan"), dir.path().join("other"));
-    common::done(&["simulate", "phantom:head:16", "-o", &text(&scan), "--views", "4", "--detector", "8x8"]);
+    crate::common::done(&["simulate", "phantom:head:16", "-o", &text(&scan), "--views", "4", "--detector", "8x8"]);
     fs::create_dir(&other).unwrap();
     fs::write(other.join("notes.txt"), "mine").unwrap();
     fs::write(other.join(".conefield-0.tmp"), "under way").unwrap();
@@ -136,7 +135,7 @@ fn a_folder_that_is_refused_is_left_as_it_is() {
     assert!(said.contains("notes.txt"), "{said}");
     assert!(other.join(".conefield-0.tmp").exists());
     fs::remove_file(other.join("notes.txt")).unwrap();
-    common::done(&["reconstruct", &text(&scan), "--spec", "fdk", "-o", &text(&other)]);
+    crate::common::done(&["reconstruct", &text(&scan), "--spec", "fdk", "-o", &text(&other)]);
     assert!(!other.join(".conefield-0.tmp").exists());
 }
 
@@ -144,7 +143,7 @@ fn a_folder_that_is_refused_is_left_as_it_is() {
 fn views_that_are_not_there_are_refused() {
     let dir = tempdir().unwrap();
     let (scan, run) = (text(&dir.path().join("scan")), text(&dir.path().join("run")));
-    common::done(&["simulate", "phantom:head:16", "-o", &scan, "--views", "4", "--detector", "8x8"]);
+    crate::common::done(&["simulate", "phantom:head:16", "-o", &scan, "--views", "4", "--detector", "8x8"]);
     let said = refused(1, &["reconstruct", &scan, "--spec", "naf", "-o", &run, "--hold-out", "4"]);
     assert!(said.contains("found 4, expected an index below 4"), "{said}");
     let said = refused(1, &["reconstruct", &scan, "--spec", "naf", "-o", &run, "--hold-out", "every:100"]);

@@ -1,8 +1,5 @@
 //! A run that is killed or interrupted goes on to the same bits.
-#![cfg(unix)]
-
-mod common;
-use common::{done, refused, text};
+use crate::common::{done, refused, text};
 use std::path::{Path, PathBuf};
 use std::process::{Child, Command, Stdio};
 use std::time::{Duration, Instant};

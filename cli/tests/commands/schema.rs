@@ -1,7 +1,6 @@
 //! The schema for editors is what the program knows now.
 
-mod common;
-use common::done;
+use crate::common::done;
 use serde_json::Value;
 
 #[test]

@@ -1,7 +1,6 @@
 //! `tradeoff`: halving, a front that nothing dominates, specs that run, and `--resume` that repeats nothing.
 
-mod common;
-use common::{conefield, done, json, refused, text};
+use crate::common::{conefield, done, json, refused, text};
 use serde_json::Value;
 use std::fs;
 use std::path::{Path, PathBuf};

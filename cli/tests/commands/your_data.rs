@@ -1,7 +1,6 @@
 //! The steps of docs/your-data.md, as they stand there.
 
-mod common;
-use common::{conefield, done, text};
+use crate::common::{conefield, done, text};
 use std::fs;
 use std::path::Path;
 use tiff::encoder::{TiffEncoder, colortype::Gray16};

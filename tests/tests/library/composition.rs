@@ -1,9 +1,7 @@
 //! Stages of every kind put together in every way that fits, from JSON alone, and trained; what does not fit is
 //! refused in words.
 
-mod common;
-
-use common::{scan, solve, volume};
+use crate::common::{scan, solve, volume};
 use conefield_core::arena::Weights;
 use serde_json::{Value, json};
 

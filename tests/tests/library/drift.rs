@@ -1,8 +1,6 @@
 //! The drift that the callback `drift` logs: what it measures, and what it leaves alone.
 
-mod common;
-
-use common::{Heard, Stop, model, plan, scan, solve, spec};
+use crate::common::{Heard, Stop, model, plan, scan, solve, spec};
 use conefield_backend_cpu::Cpu;
 use conefield_core::Result;
 use conefield_core::arena::Weights;
@@ -52,7 +50,7 @@ fn events(records: &[Record]) -> Vec<String> {
 
 #[test]
 fn stages_on_the_host_compute_what_the_backend_does() {
-    let model = Model::random(common::pipeline(&spec(&settings()).unwrap()), 3);
+    let model = Model::random(crate::common::pipeline(&spec(&settings()).unwrap()), 3);
     let (mut exe, _) = Cpu::new().compile(&model.pipeline).unwrap();
     // More than a tile of rows, and not a whole number of tiles.
     let points: Vec<[f32; 3]> = (0..300).map(|i| [0.1, 0.37, 0.73].map(|k| (i as f32 * k).fract())).collect();
@@ -74,7 +72,7 @@ fn stages_on_the_host_compute_what_the_backend_does() {
 fn a_field_that_moves_by_a_known_amount_drifts_by_it() {
     let (scan, spec, cpu) = (scan(), spec(&settings()).unwrap(), Cpu::new());
     let scene = Scene::new(&scan, &SceneSettings::default()).unwrap();
-    let model = Model::random(common::pipeline(&spec), 3);
+    let model = Model::random(crate::common::pipeline(&spec), 3);
     let exe = cpu.compile(&model.pipeline).unwrap().0;
     let job = Job { seed: 3, ..Job::new(&scan, &cpu) };
     let mut heard = Heard::default();

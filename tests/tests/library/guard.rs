@@ -1,9 +1,6 @@
 //! Training that runs away is found out, goes back, and ends in words if that does not help.
 
-mod common;
-mod device;
-
-use common::{Stop, model, plan, scan, solve, solve_on, spec};
+use crate::common::{Stop, model, plan, scan, solve, solve_on, spec};
 use conefield_backend_cpu::Cpu;
 use conefield_core::arena::{Arena, Weights};
 use conefield_core::backend::{Adam, Backend, Executable, Explain, StepStats, Work};
@@ -267,7 +264,7 @@ fn a_run_that_went_back_resumes_to_the_same_bits() {
 /// updates is, but for what sums in another order come to.
 #[test]
 fn a_device_goes_back_too() {
-    if let Some((name, device)) = device::backends("rollbacks").into_iter().next() {
+    if let Some((name, device)) = crate::device::backends("rollbacks").into_iter().next() {
         let after = |steps: u64, fault| {
             let mut value = settings(steps);
             value["optimizer"]["decay"] = json!("none");

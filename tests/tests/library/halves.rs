@@ -1,9 +1,6 @@
 //! Tables in halves: steps, runs, checkpoints and what is asked of a model, on the CPU and on devices.
 
-mod common;
-mod device;
-
-use common::{Heard, Stop, model, plan, psnr, scan, solve, spec, volume};
+use crate::common::{Heard, Stop, model, plan, psnr, scan, solve, spec, volume};
 use conefield_backend_cpu::Cpu;
 use conefield_backend_cpu::rows::Kernels;
 use conefield_backend_cpu::step::Slots;
@@ -50,7 +47,7 @@ fn several(tables: Tables) -> Vec<(&'static str, Value)> {
 }
 
 fn built(settings: &Value) -> Pipeline {
-    common::pipeline(&spec(settings).unwrap())
+    crate::common::pipeline(&spec(settings).unwrap())
 }
 
 /// A model whose parameters are of order one.
@@ -89,7 +86,7 @@ fn bits(values: &[f32]) -> Vec<u32> {
 /// these agree as they do in `f32`.
 #[test]
 fn gradients_of_a_step_are_off_by_the_rounding_of_tables() {
-    let (rays, devices) = (rays(), device::backends("steps in halves"));
+    let (rays, devices) = (rays(), crate::device::backends("steps in halves"));
     let work = Work { step: 4, seed: 9, loss: &L2 {}, rays: &rays, points: &[], priors: &[] };
     for (tables, limit) in FORMATS {
         for (name, settings) in several(tables) {
@@ -124,7 +121,7 @@ fn gradients_of_a_step_are_off_by_the_rounding_of_tables() {
 /// A stage alone on a device, against its rounding.
 #[test]
 fn a_stage_in_halves_on_a_device_is_off_by_their_rounding() {
-    let Some(shared) = device::shared("tables in halves") else { return };
+    let Some(shared) = crate::device::shared("tables in halves") else { return };
     let grid = json!({"type": "hash-grid", "levels": 3, "log2_table_size": 8, "base_resolution": 4});
     let spec: Box<dyn EncoderSpec> = serde_json::from_value(grid).unwrap();
     let stage = spec.build().unwrap();
@@ -154,7 +151,7 @@ fn a_stage_in_halves_on_a_device_is_off_by_their_rounding() {
 
 #[test]
 fn a_run_in_halves_ends_near_one_in_f32() {
-    let devices = device::backends("a run in halves").into_iter().step_by(2);
+    let devices = crate::device::backends("a run in halves").into_iter().step_by(2);
     let devices: Vec<_> = devices.map(|(name, b)| (name, Box::new(b) as Box<dyn Backend>)).collect();
     let cpu: (&str, Box<dyn Backend>) = ("cpu", Box::new(Cpu::new()));
     for (name, backend) in [cpu].into_iter().chain(devices) {

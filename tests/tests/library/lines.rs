@@ -1,9 +1,6 @@
 //! Fields that bring line integrals of their own, in whole runs.
 
-mod common;
-mod device;
-
-use common::{Stop, model, plan, psnr, scan, solve, spec, truth};
+use crate::common::{Stop, model, plan, psnr, scan, solve, spec, truth};
 use conefield_backend_cpu::Cpu;
 use conefield_core::arena::Weights;
 use conefield_core::backend::{Backend, Executable, TrainRay, Work};
@@ -84,7 +81,7 @@ fn an_interrupted_run_goes_on_to_the_same_bits() {
 fn a_step_s_gradients_are_those_of_its_loss() {
     let (scan, spec) = (scan(), spec(&settings()).unwrap());
     let scene = Scene::new(&scan, &SceneSettings::default()).unwrap();
-    let mut model = Model::random(common::pipeline(&spec), 3);
+    let mut model = Model::random(crate::common::pipeline(&spec), 3);
     model.arena.params.iter_mut().enumerate().for_each(|(i, p)| *p = (i as f32 * 0.37).sin().abs());
     let mut exe = Cpu::new().compile(&model.pipeline).unwrap().0;
     let ray = |i: usize| TrainRay { ray: scene.pixel_ray(&scan.geometry, i % 8, 4 + i % 7, 5 + i % 5), target: 0.2 };
@@ -129,8 +126,8 @@ fn what_such_a_field_has_no_use_for_is_refused() {
 
 #[test]
 fn a_device_refuses_it_in_words() {
-    for (name, backend) in device::backends("a field with line integrals of its own") {
-        let pipeline = common::pipeline(&spec(&settings()).unwrap());
+    for (name, backend) in crate::device::backends("a field with line integrals of its own") {
+        let pipeline = crate::common::pipeline(&spec(&settings()).unwrap());
         let e = backend.compile(&pipeline).err().unwrap().to_string();
         assert!(e.contains("voxels-joseph") && e.contains("--backend cpu"), "{name}: {e}");
     }

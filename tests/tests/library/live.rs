@@ -1,8 +1,6 @@
 //! Slices of a field while it trains.
 
-mod common;
-
-use common::{model, plan, scan, spec, volume};
+use crate::common::{model, plan, scan, spec, volume};
 use conefield_backend_cpu::Cpu;
 use conefield_core::Result;
 use conefield_core::arena::Weights;

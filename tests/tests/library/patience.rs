@@ -1,8 +1,6 @@
 //! Training that ends when views that are kept aside are no longer predicted better.
 
-mod common;
-
-use common::{Stop, model, plan, scan, spec};
+use crate::common::{Stop, model, plan, scan, spec};
 use conefield_backend_cpu::Cpu;
 use conefield_core::arena::Weights;
 use conefield_core::checkpoint::Resume;

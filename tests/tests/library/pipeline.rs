@@ -1,9 +1,7 @@
 //! Whole pipelines: the gradient of a step, the same bits on any number of threads, any unit, weights from another
 //! scan, and masked channels that leave the work.
 
-mod common;
-
-use common::{Heard, model, plan, scan, solve, spec, truth, volume};
+use crate::common::{Heard, model, plan, scan, solve, spec, truth, volume};
 use conefield_backend_cpu::Cpu;
 use conefield_backend_cpu::rows::Kernels;
 use conefield_backend_cpu::step::Slots;
@@ -90,7 +88,7 @@ fn sample(pipeline: &Pipeline, grads: &[f64]) -> Vec<Vec<usize>> {
 
 /// Of a step of `count` rays, 50 points and 4 blocks of `edge`³.
 fn gradients_of(settings: &Value, count: usize, edge: usize) {
-    let pipeline = common::pipeline(&spec(settings).unwrap());
+    let pipeline = crate::common::pipeline(&spec(settings).unwrap());
     let scan = scan();
     let scene = Scene::new(&scan, &conefield_core::scene::SceneSettings::default()).unwrap();
     let mut rays = vec![];
@@ -113,7 +111,7 @@ fn gradients_of(settings: &Value, count: usize, edge: usize) {
         BlockWork { prior: &fine, corners: &corners[..4], spacing },
         BlockWork { prior: &coarse, corners: &corners[4..], spacing: [0.1; 3] },
     ];
-    let params: Vec<f64> = Model::random(common::pipeline(&spec(settings).unwrap()), 3)
+    let params: Vec<f64> = Model::random(crate::common::pipeline(&spec(settings).unwrap()), 3)
         .arena
         .params
         .iter()
@@ -418,7 +416,7 @@ fn masked_channels_leave_the_work() {
     // Fine levels hardly train in a pass and stay as random as they started.
     let mask = json!({"type": "fft-mask", "epoch": 1, "rule": "relative", "threshold": 0.72});
     s["callbacks"] = json!([{"type": "rollback"}, mask]);
-    let whole = common::pipeline(&spec(&s).unwrap());
+    let whole = crate::common::pipeline(&spec(&s).unwrap());
     let (solution, records) = solve(&s, &scan(), &Weights::default()).unwrap();
     let model = model(solution);
     let p = &model.pipeline;

@@ -1,9 +1,6 @@
 //! The wgpu backend against the CPU's: whole steps, runs, masks, weights, checkpoints, refusals.
 
-mod common;
-mod device;
-
-use common::{Heard, Stop, model, plan, psnr, scan, solve, solve_on, spec, truth};
+use crate::common::{Heard, Stop, model, plan, psnr, scan, solve, solve_on, spec, truth};
 use conefield_backend_cpu::Cpu;
 use conefield_backend_cpu::rows::Kernels;
 use conefield_backend_cpu::step::Slots;
@@ -54,8 +51,8 @@ fn worst(pipeline: &Pipeline, found: &[f32], exact: &[f64]) -> f64 {
 /// 1e-6 more. A wrong formula is off by far more, see the negative controls.
 fn steps_agree(settings: &Value) {
     let limit = 2e-5;
-    let devices = device::backends("whole steps");
-    let pipeline = common::pipeline(&spec(settings).unwrap());
+    let devices = crate::device::backends("whole steps");
+    let pipeline = crate::common::pipeline(&spec(settings).unwrap());
     let scan = scan();
     let scene = Scene::new(&scan, &conefield_core::scene::SceneSettings::default()).unwrap();
     let rays: Vec<TrainRay> = (0..40)
@@ -73,7 +70,7 @@ fn steps_agree(settings: &Value) {
         BlockWork { prior: &coarse, corners: &corners[5..], spacing: [0.1; 3] },
     ];
     let filled = || {
-        let mut model = Model::random(common::pipeline(&spec(settings).unwrap()), 3);
+        let mut model = Model::random(crate::common::pipeline(&spec(settings).unwrap()), 3);
         for (i, p) in model.arena.params.iter_mut().enumerate() {
             *p += 0.4 * (unit(mix(5, i as u64)) - 0.5);
         }
@@ -162,7 +159,7 @@ fn what_is_asked_of_a_trained_model_is_that_of_the_cpu() {
         .collect();
     let points: Vec<[f32; 3]> = (0..5000).map(place).collect();
     let run = |backend: &dyn Backend| {
-        let mut model = Model::random(common::pipeline(&spec(&settings()).unwrap()), 3);
+        let mut model = Model::random(crate::common::pipeline(&spec(&settings()).unwrap()), 3);
         let mut exe = backend.compile(&model.pipeline).unwrap().0;
         for step in 1..=10 {
             let work = Work { step, seed: 9, loss: &L2 {}, rays: &rays, points: &[], priors: &[] };
@@ -179,7 +176,7 @@ fn what_is_asked_of_a_trained_model_is_that_of_the_cpu() {
         [values, features, lines, model.arena.params.to_vec()]
     };
     let want = run(&Cpu::new());
-    for (name, backend) in device::backends("a trained model") {
+    for (name, backend) in crate::device::backends("a trained model") {
         for (what, (found, want)) in
             ["values", "features", "lines", "parameters"].iter().zip(run(&backend).iter().zip(&want))
         {
@@ -199,7 +196,7 @@ fn a_run_with_held_out_views_and_a_prior_ends_where_the_cpu_does() {
     let mut s = settings();
     s["priors"] = json!([{"type": "total-variation", "weight": 0.01, "blocks": 4, "edge": 4}]);
     let (want, records) = psnr(&s, &Cpu::new());
-    for (name, backend) in device::backends("a run").into_iter().take(1) {
+    for (name, backend) in crate::device::backends("a run").into_iter().take(1) {
         let (found, on_device) = psnr(&s, &backend);
         println!("{name}: {found:.3} dB, CPU {want:.3} dB");
         assert!((found - want).abs() < 0.1, "{name}: {found} dB, CPU {want} dB");
@@ -211,7 +208,7 @@ fn a_run_with_held_out_views_and_a_prior_ends_where_the_cpu_does() {
 
 #[test]
 fn masked_channels_leave_the_kernels() {
-    let Some((_, backend)) = device::backends("masks").into_iter().next() else { return };
+    let Some((_, backend)) = crate::device::backends("masks").into_iter().next() else { return };
     let mut s = settings();
     s["encoder"]["levels"] = json!(6);
     s["encoder"]["base_resolution"] = json!(2);
@@ -242,7 +239,7 @@ fn pretraining_on_several_volumes_is_that_of_the_cpu() {
         (losses, model.arena.params.to_vec())
     };
     let (want, _) = run(&Cpu::new());
-    for (name, backend) in device::backends("pretraining").into_iter().take(1) {
+    for (name, backend) in crate::device::backends("pretraining").into_iter().take(1) {
         let (found, params) = run(&backend);
         assert!(params.iter().all(|p| p.is_finite()));
         for (a, b) in found.iter().zip(&want) {
@@ -253,7 +250,7 @@ fn pretraining_on_several_volumes_is_that_of_the_cpu() {
 
 #[test]
 fn a_run_begun_on_one_backend_goes_on_on_the_other() {
-    let Some((_, device)) = device::backends("checkpoints").into_iter().next() else { return };
+    let Some((_, device)) = crate::device::backends("checkpoints").into_iter().next() else { return };
     let (scan, spec) = (scan(), spec(&settings()).unwrap());
     let whole = psnr(&settings(), &Cpu::new()).1.last().unwrap().loss.unwrap();
     let cpu = Cpu::new();
@@ -327,14 +324,14 @@ impl Loss for OnTheCpu {
 }
 
 fn changed(change: fn(String) -> Option<String>, scope: Scope) -> Pipeline {
-    let mut pipeline = common::pipeline(&spec(&settings()).unwrap());
+    let mut pipeline = crate::common::pipeline(&spec(&settings()).unwrap());
     pipeline.field = Arc::new(Changed { inner: pipeline.field, change, scope });
     pipeline
 }
 
 #[test]
 fn what_cannot_run_on_a_device_is_refused_in_words() {
-    let Some((_, backend)) = device::backends("refusals").into_iter().next() else { return };
+    let Some((_, backend)) = crate::device::backends("refusals").into_iter().next() else { return };
     let refused = |change, scope, words: &[&str]| {
         let e = backend.compile(&changed(change, scope)).err().unwrap().to_string();
         assert!(words.iter().all(|w| e.contains(w)), "{e:?} lacks one of {words:?}");
@@ -361,7 +358,7 @@ fn what_cannot_run_on_a_device_is_refused_in_words() {
 /// A constant of a shader that is slightly off is found.
 #[test]
 fn a_perturbed_constant_fails_the_parity_check() {
-    let Some(shared) = device::shared("negative controls") else { return };
+    let Some(shared) = crate::device::shared("negative controls") else { return };
     let options = conefield_conformance::Options::features();
     let check = |change: fn(String) -> Option<String>| {
         let settings = json!({"type": "mlp", "width": 5, "depth": 2, "skips": []});
@@ -386,7 +383,7 @@ fn a_perturbed_constant_fails_the_parity_check() {
 /// Stages of random settings: widths that are no multiple of anything, channels left out here and there.
 #[test]
 fn stages_of_random_shapes_agree() {
-    let Some(shared) = device::shared("random shapes") else { return };
+    let Some(shared) = crate::device::shared("random shapes") else { return };
     let pass =
         |s: &dyn Stage, p: &[f32], x: &[f32], dy: &[f32], rows: usize| shared.pass(s, Tables::F32, p, x, dy, rows);
     let mut n = 0u64;
@@ -440,7 +437,7 @@ fn stages_of_random_shapes_agree() {
 
 #[test]
 fn samples_are_random_in_the_same_way() {
-    let Some(shared) = device::shared("samples") else { return };
+    let Some(shared) = crate::device::shared("samples") else { return };
     struct Off(Box<dyn Projector>);
     impl Projector for Off {
         fn max_samples(&self, ray: &conefield_core::stage::UnitRay) -> usize {

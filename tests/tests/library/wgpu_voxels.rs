@@ -1,9 +1,6 @@
 //! Projection of voxel volumes on a device against double precision, and classical methods there against the CPU.
 
-mod common;
-mod device;
-
-use common::{scan, solve_on, truth};
+use crate::common::{scan, solve_on, truth};
 use conefield_backend_cpu::Cpu;
 use conefield_core::arena::Weights;
 use conefield_core::backend::Backend;
@@ -75,7 +72,7 @@ fn errors(p: &dyn VoxelProjector) -> [f64; 3] {
 
 #[test]
 fn projectors_agree_with_double_precision_and_are_adjoint() {
-    for (name, backend) in device::backends("projectors of voxels") {
+    for (name, backend) in crate::device::backends("projectors of voxels") {
         for settings in all() {
             let placed = backend.place(projector(settings.clone())).unwrap();
             assert!(placed.describe().contains(", on "), "{}", placed.describe());
@@ -105,7 +102,7 @@ impl VoxelProjector for Changed {
 
 #[test]
 fn a_perturbed_walk_is_found_and_what_cannot_run_is_refused() {
-    let Some((_, backend)) = device::backends("negative controls").into_iter().next() else { return };
+    let Some((_, backend)) = crate::device::backends("negative controls").into_iter().next() else { return };
     let placed = |change| backend.place(Box::new(Changed(projector(json!({"type": "joseph"})), change)));
     let wrong = placed(|s| Some(s.replace("fa * fb * step", "fa * fb * 1.01 * step"))).unwrap();
     let [forward, adjoint, mismatch] = errors(wrong.as_ref());
@@ -143,7 +140,7 @@ fn classical_methods_end_where_the_cpu_does() {
         println!("{}: {cpu:.4} dB, an empty volume {empty:.4} dB", method["type"]);
         assert!(*cpu > empty + 3.0, "{method}: {cpu} dB, an empty volume {empty} dB");
     }
-    for (name, backend) in device::backends("classical methods") {
+    for (name, backend) in crate::device::backends("classical methods") {
         for (method, cpu) in methods.iter().zip(&on_cpu) {
             let found = psnr(method, &backend);
             println!("{}, {name}: {found:.4} dB, CPU {cpu:.4} dB", method["type"]);

@@ -1,0 +1,29 @@
+//! Every command as a user runs it. One program for all: each program that is linked costs seconds.
+
+#[path = "../common/mod.rs"]
+mod common;
+
+mod backends;
+#[cfg(unix)]
+mod boundary;
+mod budget;
+mod chain;
+mod compare;
+#[cfg(target_os = "linux")]
+mod durability;
+mod experiments;
+mod explain;
+mod help;
+mod import;
+mod memory;
+mod naf;
+mod peak;
+mod project;
+mod quality;
+mod refusals;
+#[cfg(unix)]
+mod resume;
+mod schema;
+mod tradeoff;
+mod unusual;
+mod your_data;

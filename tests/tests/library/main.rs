@@ -1,0 +1,20 @@
+//! Stages, methods and backends together, through the library. One program for all: each program that is linked costs seconds.
+
+#[path = "../common/mod.rs"]
+mod common;
+#[path = "../device/mod.rs"]
+mod device;
+
+mod by_row;
+mod composition;
+mod core_modules;
+mod drift;
+mod guard;
+mod halves;
+mod lines;
+mod live;
+mod masks;
+mod patience;
+mod pipeline;
+mod wgpu;
+mod wgpu_voxels;
