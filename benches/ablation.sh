@@ -1,39 +1,67 @@
 #!/usr/bin/env bash
-# The parts of the method one after the other (NAF, + LayerNorm, + MCI, + FFT mask) on real volumes, same seconds each:
-#   bash benches/ablation.sh DATA_FOLDER OUT_FOLDER [SECONDS]
-# DATA_FOLDER holds volumes/*.nii.gz. MCI weights come from abdomen alone. Writes a curve a volume and scores.txt.
-# All variants learn five times faster than published and take 192 samples inside the volume, so that a short run says
-# something; NAF with its published rate stays at its first plateau that long.
+# The parts of the method one after the other on real volumes, at the published rate (1e-3), with the same steps and rays:
+#   bash benches/ablation.sh DATA_FOLDER OUT_FOLDER [STEPS [SEEDS [VOLUMES]]]
+# DATA_FOLDER holds volumes/*.nii.gz. NAF is the spec naf: 16 levels, leaky ReLU, sigmoid. The others are ni-naf without and with
+# LayerNorm, MCI weights (600 steps on abdomen_128 alone) and the FFT mask. Each has STEPS (900) of 1024 rays with 192 samples inside
+# the volume. Each of SEEDS ("0 1 2") is another noise and another start. OUT_FOLDER/ablation.md has PSNR by steps, mean and half the
+# range over SEEDS; VOLUME.png has the curves. Steps are counted, not timed: other work on the machine changes nothing.
+# What is there is not run again.
 set -euo pipefail
 cd "$(dirname "$0")/.."
 source benches/common.sh
 data=$1
 out=$2
-seconds=${3:-120}
+steps=${3:-900}
+seeds=${4:-0 1 2}
+volumes=${5:-chest_128 head_256 engine_256}
 cargo build --release --quiet -p conefield
 cargo build --release --quiet -p conefield-benches --bin curves
 bin=${CARGO_TARGET_DIR:-target}/release
 mkdir -p "$out"
-none='normalizers=[]'
-norm='normalizers=["layer-norm"]'
-whole='callbacks=["rollback"]'
 weights=$out/abdomen.safetensors
-[[ -f $weights ]] || "$bin/conefield" -q pretrain "$data/volumes/abdomen_128.nii.gz" --spec ni-naf --set "$norm" -o "$weights"
-: >"$out/scores.txt"
-for volume in engine_256 head_256 chest_128; do
-    scan=$out/$volume
-    published_scan "$data" "$volume" "$scan"
-    run() {
-        local name=$1
-        shift
-        echo "== $volume $name" | tee -a "$out/scores.txt"
-        "$bin/conefield" -q reconstruct "$scan" --spec ni-naf -o "$out/$volume-$name" --force --seconds "${seconds}" \
-            --reference truth --set training.report_every=25 --set optimizer.lr=5e-3 --set projector.samples=192 "$@" | tee -a "$out/scores.txt"
-    }
-    run naf --set "$none" --set "$whole"
-    run ln --set "$norm" --set "$whole"
-    run ln-mci --set "$norm" --set "$whole" --init "$weights"
-    run ln-mci-mask --set "$norm" --init "$weights"
-    "$bin/curves" "$out/$volume.png" "$volume, 50 noisy views" "NAF=$out/$volume-naf" "NAF+LN=$out/$volume-ln" \
-        "NAF+LN+MCI=$out/$volume-ln-mci" "NAF+LN+MCI+mask=$out/$volume-ln-mci-mask"
+whole='callbacks=["rollback"]'
+published=(--set optimizer.lr=1e-3 --set projector.samples=192)
+[[ -f $weights ]] || "$bin/conefield" -q pretrain "$data/volumes/abdomen_128.nii.gz" --spec ni-naf --set "$whole" \
+    "${published[@]}" --steps 600 -o "$weights"
+variants=(NAF field +LN +LN+MCI +LN+MCI+mask)
+for volume in $volumes; do
+    curves=()
+    for seed in $seeds; do
+        scan=$out/scan-$volume-$seed
+        published_scan "$data" "$volume" "$scan" 50 "$seed"
+        for variant in "${variants[@]}"; do
+            case $variant in
+            NAF) set=(--spec naf) ;;
+            field) set=(--spec ni-naf --set 'normalizers=[]' --set "$whole") ;;
+            +LN) set=(--spec ni-naf --set "$whole") ;;
+            +LN+MCI) set=(--spec ni-naf --set "$whole" --init "$weights") ;;
+            +LN+MCI+mask) set=(--spec ni-naf --init "$weights") ;;
+            esac
+            run=$out/$volume-$seed-$variant
+            curves+=("$variant=$run")
+            [[ -f $run/record.json ]] && continue
+            "$bin/conefield" -q reconstruct "$scan" "${set[@]}" "${published[@]}" -o "$run" --force --seed "$seed" --steps "$steps" \
+                --reference truth --set training.report_every=50 >/dev/null
+            rm -f "$run/volume.nii.gz"
+        done
+    done
+    "$bin/curves" --steps "$out/$volume.png" "$volume, 50 noisy views, one line a seed" "${curves[@]}"
 done
+python3 - "$out" "$steps" "$seeds" "$volumes" "${variants[@]}" <<'PY' | tee "$out/ablation.md"
+import json, statistics, sys
+out, steps, seeds, volumes, *variants = sys.argv[1:]
+steps, seeds = int(steps), seeds.split()
+at = [steps * k // 6 // 50 * 50 for k in range(1, 7)]
+print("| | | " + " | ".join(map(str, at)) + " | whole volume | ssim_2d |\n|---|---" + "|---" * (len(at) + 2) + "|")
+for volume in volumes.split():
+    for variant in variants:
+        curves, scores = [], []
+        for seed in seeds:
+            run = f"{out}/{volume}-{seed}-{variant}"
+            curves.append({r["step"]: r["psnr"] for r in map(json.loads, open(f"{run}/metrics.jsonl")) if "psnr" in r})
+            scores.append(json.load(open(f"{run}/record.json"))["scores"])
+        of = lambda values: f"{statistics.mean(values):.2f} ± {(max(values) - min(values)) / 2:.2f}"
+        cells = [of([curve[step] for curve in curves]) for step in at] + [of([s["psnr"] for s in scores])]
+        cells.append(f"{statistics.mean(s['ssim_2d'] for s in scores):.3f}")
+        print(f"| {volume} | {variant} | " + " | ".join(cells) + " |")
+PY

@@ -59,7 +59,8 @@ const COLOURS: [RGBColor; 10] = [
 
 pub(crate) const FONT: &str = "sans-serif";
 
-/// Draws named series of `(x, y)` points as lines, on linear axes. Points that are not finite leave a gap.
+/// Draws named series of `(x, y)` points as lines, on linear axes. Points that are not finite leave a gap. Series of one name have
+/// one colour.
 pub fn curves_png(
     path: impl AsRef<Path>,
     title: &str,
@@ -191,10 +192,15 @@ impl Plot<'_> {
             .draw()
             .map_err(text)?;
         let stroke = ((em / 8.0).round() as u32).max(2);
-        for (i, (name, points)) in self.series.iter().enumerate() {
-            let colour = COLOURS[i % COLOURS.len()];
+        let mut names: Vec<&str> = vec![];
+        for (name, points) in self.series {
+            let known = names.iter().position(|n| n == name);
+            let colour = COLOURS[known.unwrap_or(names.len()) % COLOURS.len()];
             let style = colour.stroke_width(stroke);
-            let mut named = false;
+            let mut named = known.is_some();
+            if !named {
+                names.push(name);
+            }
             for part in points.split(|p| !(self.shown)(p)).filter(|p| !p.is_empty()) {
                 // A point without neighbours would leave no trace as a line.
                 if let [p] = part {

@@ -1,5 +1,5 @@
-//! Draws PSNR against training time of finished runs, or their drift against epochs:
-//! `curves [--drift] OUT.png TITLE NAME=RUN_FOLDER...`.
+//! Draws PSNR of finished runs against training time or steps, or their drift against epochs:
+//! `curves [--steps | --drift] OUT.png TITLE NAME=RUN_FOLDER...`. Runs of one name have one colour.
 
 use conefield_benches::{metrics, quality};
 use conefield_report::{CurveOptions, curves_png_with};
@@ -8,17 +8,21 @@ use std::error::Error;
 
 type Curve = (String, Vec<(f64, f64)>);
 
+const USAGE: &str = "usage: curves [--steps | --drift] OUT.png TITLE NAME=RUN_FOLDER...";
+
 fn main() -> Result<(), Box<dyn Error>> {
     let mut arguments: Vec<String> = std::env::args().skip(1).collect();
-    let drift = arguments.first().is_some_and(|a| a == "--drift");
-    arguments.drain(..usize::from(drift));
-    let [out, title, runs @ ..] = &arguments[..] else {
-        return Err("usage: curves [--drift] OUT.png TITLE NAME=RUN_FOLDER...".into());
+    let option = arguments.first().filter(|a| a.starts_with("--")).cloned();
+    arguments.drain(..usize::from(option.is_some()));
+    let [out, title, runs @ ..] = &arguments[..] else { return Err(USAGE.into()) };
+    let (points, x, y): (fn(&Value) -> Vec<(f64, f64)>, _, _) = match option.as_deref() {
+        None => (|r| quality(r).into_iter().collect(), "seconds of training", "PSNR, dB"),
+        Some("--steps") => (|r| r["step"].as_f64().zip(r["psnr"].as_f64()).into_iter().collect(), "steps", "PSNR, dB"),
+        Some("--drift") => (drifts, "epochs", "drift (mean L1)"),
+        Some(_) => return Err(USAGE.into()),
     };
-    let points = if drift { drifts } else { qualities };
     let curves: Vec<Curve> = runs.iter().map(|r| read(r, points)).collect::<Result<_, _>>()?;
-    let (x, y) = if drift { ("epochs", "drift (mean L1)") } else { ("seconds of training", "PSNR, dB") };
-    let options = CurveOptions { log_y: drift, ..CurveOptions::default() };
+    let options = CurveOptions { log_y: option.as_deref() == Some("--drift"), ..CurveOptions::default() };
     curves_png_with(out, title, x, y, &curves, &options)?;
     Ok(())
 }
@@ -26,11 +30,6 @@ fn main() -> Result<(), Box<dyn Error>> {
 fn read(run: &str, points: fn(&Value) -> Vec<(f64, f64)>) -> Result<Curve, Box<dyn Error>> {
     let (name, _, records) = metrics(run)?;
     Ok((name.to_string(), records.iter().flat_map(points).collect()))
-}
-
-/// PSNR against seconds, of a record that has one.
-fn qualities(record: &Value) -> Vec<(f64, f64)> {
-    quality(record).into_iter().collect()
 }
 
 /// Drift against epochs, as often as a record has it.
