@@ -1,8 +1,8 @@
 //! Ray marching: a ray is cut into intervals of equal length, each stands for one sample with its length as weight.
 //!
 //! With `N` intervals of `δ = (far − near)/N` the line integral is `Σ μ(x_i)·δ`, so that no interval is lost at the
-//! end (the published sum gives the last sample a weight of 1e-10). Samples stand in the middle of their interval
-//! (midpoint rule, second order) or at a random place in it (stratified, unbiased).
+//! end. Samples stand in the middle of their interval (midpoint rule, second order) or at a random place in it (stratified,
+//! unbiased). The published sum, which gives the last sample no weight, is there for comparisons.
 
 use conefield_core::error::{Error, Result, ensure};
 use conefield_core::random::{mix, unit};
@@ -20,6 +20,8 @@ pub enum Sampling {
     Uniform,
     /// At random.
     Stratified,
+    /// `N` points from end to end, `(far − near)/(N − 1)` apart, of which the last has no weight: the sum of the published codes.
+    EndToEnd,
 }
 
 /// Which part of a ray is sampled.
@@ -75,6 +77,14 @@ impl ProjectorSpec for RayMarch {
     fn build(&self) -> Result<Box<dyn Projector>> {
         let n = self.count();
         ensure((1..=MOST_SAMPLES).contains(&n), "spec", "samples", n, "1 to 65536")?;
+        let ends = self.sampling == Sampling::EndToEnd;
+        ensure(
+            !ends || self.samples.is_some_and(|n| n > 1),
+            "spec",
+            "sampling",
+            "end-to-end",
+            "another one, or 2 samples and more",
+        )?;
         let positive = |step: Option<f64>| step.is_none_or(|s| s.is_finite() && s > 0.0);
         let shown = |step: Option<f64>| step.map_or(String::new(), |s| s.to_string());
         let steps = [
@@ -123,15 +133,17 @@ impl Projector for RayMarch {
     fn sample(&self, ray: &UnitRay, seed: Option<u64>, out: &mut Samples) {
         let [near, far] = self.range(ray);
         let n = self.max_samples(ray);
-        let delta = (far - near) / n as f32;
+        let ends = self.sampling == Sampling::EndToEnd;
+        let delta = (far - near) / if ends { (n - 1).max(1) } else { n } as f32;
         for i in 0..n {
-            let jitter = match (self.sampling, seed) {
+            let place = match (self.sampling, seed) {
+                (Sampling::EndToEnd, _) => 0.0,
                 (Sampling::Stratified, Some(seed)) => unit(mix(seed, i as u64)),
                 _ => 0.5,
             };
-            let t = near + (i as f32 + jitter) * delta;
+            let t = near + (i as f32 + place) * delta;
             out.points.push(std::array::from_fn(|k| ray.origin[k] + t * ray.direction[k]));
-            out.weights.push(delta);
+            out.weights.push(if ends && i + 1 == n { 0.0 } else { delta });
         }
     }
 
@@ -164,9 +176,10 @@ impl Projector for RayMarch {
 
     fn wgsl(&self) -> Option<Fragment> {
         let settings = format!(
-            "const stage_PUBLISHED = {};\nconst stage_STRATIFIED = {};\n",
+            "const stage_PUBLISHED = {};\nconst stage_STRATIFIED = {};\nconst stage_END_TO_END = {};\n",
             self.extent == Extent::Published,
-            self.sampling == Sampling::Stratified
+            self.sampling == Sampling::Stratified,
+            self.sampling == Sampling::EndToEnd
         );
         Some(Fragment::new(&[&settings, include_str!("ray_march.wgsl")]))
     }
@@ -200,6 +213,15 @@ mod tests {
                 assert!(s.weights.iter().all(|&w| w == s.weights[0]));
             }
         }
+    }
+
+    #[test]
+    fn the_published_sum_goes_from_end_to_end_and_leaves_the_last_sample_out() {
+        let p = RayMarch { samples: Some(5), sampling: Sampling::EndToEnd, ..RayMarch::default() };
+        let mut s = Samples::default();
+        p.sample(&ray(), Some(1), &mut s);
+        assert_eq!(s.points.iter().map(|q| q[0]).collect::<Vec<f32>>(), [0.0, 0.25, 0.5, 0.75, 1.0]);
+        assert_eq!(s.weights, [0.25, 0.25, 0.25, 0.25, 0.0]);
     }
 
     #[test]

@@ -7,8 +7,9 @@ use conefield_core::pipeline::Pipeline;
 use conefield_core::random::stream;
 use conefield_core::scan::{Scan, ScanHeader};
 use conefield_core::scene::Scene;
-use rand::RngExt;
 use rand::seq::SliceRandom;
+use rand::seq::index::sample;
+use rand::{Rng, RngExt};
 use rayon::prelude::*;
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
@@ -17,7 +18,7 @@ use serde::{Deserialize, Serialize};
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
 #[serde(rename_all = "kebab-case")]
 pub enum Views {
-    /// One view a step, every view once an epoch in random order (published).
+    /// One view a step, every view once an epoch in random order, and no pixel twice in a step where there are enough (published).
     One,
     /// All views at once.
     All,
@@ -116,15 +117,49 @@ impl<'a> RaySource<'a> {
             order.shuffle(&mut stream(seed, 2 * (step / steps) + 1));
             order[(step % steps) as usize]
         });
-        while out.len() < count {
-            let view = one.unwrap_or_else(|| self.usable[rng.random_range(0..self.usable.len())]);
-            let pixels = &self.pixels[view];
-            let p = pixels[rng.random_range(0..pixels.len())] as usize;
+        let mut add = |view: usize, pixel: u32| {
             let columns = self.scan.geometry.detector[1];
-            let (row, column) = (p / columns, p % columns);
+            let (row, column) = (pixel as usize / columns, pixel as usize % columns);
             let ray = self.scene.pixel_ray(&self.scan.geometry, view, row, column);
             let target = self.scene.line_to_unit(self.scan.projections[[view, row, column]]);
             out.push(TrainRay { ray, target });
+        };
+        let Some(view) = one else {
+            for _ in 0..count {
+                let view = self.usable[rng.random_range(0..self.usable.len())];
+                let pixels = &self.pixels[view];
+                add(view, pixels[rng.random_range(0..pixels.len())]);
+            }
+            return;
+        };
+        let pixels = &self.pixels[view];
+        apart(&mut rng, pixels.len(), count).for_each(|at| add(view, pixels[at]));
+    }
+}
+
+/// `count` of the numbers below `n`, none of them twice before all were drawn.
+fn apart(rng: &mut impl Rng, n: usize, count: usize) -> impl Iterator<Item = usize> {
+    let rounds = (0..count).step_by(n).map(move |begin| sample(rng, n, n.min(count - begin)));
+    rounds.flatten()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn no_pixel_is_drawn_twice_before_all_were() {
+        let mut rng = stream(1, 0);
+        for (n, count) in [(50, 20), (50, 50), (7, 17), (1, 3)] {
+            let drawn: Vec<usize> = apart(&mut rng, n, count).collect();
+            assert_eq!(drawn.len(), count);
+            for round in drawn.chunks(n) {
+                let mut once = round.to_vec();
+                once.sort_unstable();
+                once.dedup();
+                assert_eq!(once.len(), round.len(), "{drawn:?}");
+                assert!(once.iter().all(|&i| i < n));
+            }
         }
     }
 }
