@@ -3,6 +3,7 @@
 
 use crate::build::{cargo, cc, library, sources};
 use crate::common::{conefield, done, text};
+use rayon::prelude::*;
 use std::fmt::Write as _;
 use std::path::Path;
 
@@ -356,7 +357,6 @@ fn every_fault_is_found_and_none_takes_the_process_down() {
     let dir = tempfile::tempdir().unwrap();
     let scan = text(&dir.path().join("scan"));
     done(&["simulate", "phantom:head:16", "-o", &scan, "--views", "6", "--detector", "16x16"]);
-    let mut rows = vec![];
     let reconstruct = |library: &str, number: usize, spec: &[&str], hide: &[&Path]| {
         let run = text(&dir.path().join(format!("run-{number}")));
         let mut args = vec!["--plugin", library, "reconstruct", &scan, "-o", &run];
@@ -367,8 +367,7 @@ fn every_fault_is_found_and_none_takes_the_process_down() {
         assert!(found.is_empty() || !volume.exists(), "{library}");
         found
     };
-    let here = [dir.path()];
-    let fast = ["--spec", "fast", "--steps", "300", "--set", "training.rays=16", "--set"];
+    let fast = ["--spec", "fast", "--steps", "100", "--set", "training.rays=16", "--set"];
     let of_fast = |sets: &[&'static str]| [&fast[..], sets].concat();
     let encoder = of_fast(&["encoder.type=faulty", "--set", "projector.samples=16"]);
     let [rays, loss, prior] =
@@ -392,18 +391,23 @@ fn every_fault_is_found_and_none_takes_the_process_down() {
         .chain(LOSS_FAULTS.iter().map(|f| (f, "faulty_loss.c", loss.clone())))
         .chain(PRIOR_FAULTS.iter().map(|f| (f, "faulty_prior.c", prior.clone())))
         .chain(pieces);
-    for (i, (fault, source, set)) in all.enumerate() {
-        let library = dir.path().join("faulty.so");
+    let all: Vec<_> = all.enumerate().collect();
+    // Some of them sleep, and most of what they run has one thread.
+    let rows = all.into_par_iter().map(|(i, (fault, source, set))| {
+        let own = dir.path().join(format!("plugin-{i}"));
+        std::fs::create_dir(&own).unwrap();
+        let library = own.join("faulty.so");
         cc(&sources().join("plugins/tests").join(source), fault.defines, &library);
-        let library = text(&library);
+        let (library, here) = (text(&library), [own.as_path(), dir.path()]);
         let list = refusal(&library, &here);
         let check = said(&["plugins", "check", &library], &here);
         let run = reconstruct(&library, i, &set, &here);
         fits(fault.what, "list", &list, fault.list);
         fits(fault.what, "check", &check, fault.check);
         fits(fault.what, "reconstruct", &run, fault.reconstruct);
-        rows.push(Row::of(fault.what, [&list, &check, &run], [fault.list, fault.check, fault.reconstruct]));
-    }
+        Row::of(fault.what, [&list, &check, &run], [fault.list, fault.check, fault.reconstruct])
+    });
+    let mut rows: Vec<Row> = rows.collect();
     cargo(&sources().join("plugins/tests"), &["build", "--release", "--locked", "-p", "panics"]);
     let panics = library("panics");
     let folder = panics.parent().unwrap();
