@@ -55,6 +55,8 @@ pub struct Costs {
     pub then_s: f64,
     /// The least of it that makes sense.
     pub then_least_s: f64,
+    /// Steps and passes of all of it.
+    pub then_steps: f64,
     /// Writing weights, and evaluating, packing and writing voxels.
     pub export_s: f64,
     /// Drawing slices.
@@ -67,6 +69,11 @@ impl Costs {
     /// What comes after the training.
     pub fn after_s(&self) -> f64 {
         self.then_s + self.export_s + self.picture_s + self.score_s
+    }
+
+    /// All that is left of a run of `steps` in all, of which the first method takes `share` of its own.
+    pub fn run_s(&self, steps: f64, share: f64) -> f64 {
+        self.prepare_s + share * (steps - self.then_steps).max(1.0) * self.step_s + self.after_s()
     }
 }
 
@@ -88,6 +95,7 @@ pub fn calibrate(bench: &Bench<'_>, plan: &mut dyn Plan, seconds: f64) -> Result
                 let passes = link.passes().unwrap_or(1) as f64;
                 costs.then_s += before + passes * next.step_s;
                 costs.then_least_s += before + next.step_s;
+                costs.then_steps += passes;
                 costs.export_s = next.export_s;
             }
             costs

@@ -247,7 +247,7 @@ fn pick(
         let needed = |i: usize| {
             let (kind, e) = points[i];
             match &known[i] {
-                Some(Ok(c)) => c.prepare_s + ENOUGH * e.steps * c.step_s + c.after_s(),
+                Some(Ok(c)) => c.run_s(e.steps, ENOUGH),
                 Some(Err(_)) => f64::INFINITY,
                 None => {
                     let factor = slower[of(kind)].or(slower[1 - of(kind)]).unwrap_or(1.0);
@@ -265,7 +265,8 @@ fn pick(
                 let measured = measure(at);
                 if let Ok(costs) = &measured {
                     let (kind, e) = points[at];
-                    slower[of(kind)] = Some(costs.step_s / e.step_s.max(1e-12));
+                    // Of whole runs: a chain's steps are not alike.
+                    slower[of(kind)] = Some(costs.run_s(e.steps, 1.0) / (e.steps * e.step_s + e.beside_s).max(1e-12));
                 }
                 known[at] = Some(measured.map_err(|e| e.to_string()));
             }
@@ -278,7 +279,7 @@ fn pick(
     for (i, (kind, e)) in points.iter().enumerate() {
         match &known[i] {
             Some(Ok(c)) => {
-                let needed = c.prepare_s + ENOUGH * e.steps * c.step_s + c.after_s();
+                let needed = c.run_s(e.steps, ENOUGH);
                 if needed <= now {
                     return Ok(Choice { point: i, costs: *c, fits: true, passed_over });
                 }
@@ -345,6 +346,23 @@ mod tests {
         assert_eq!(chosen(100.0, 3.0), (2, true, vec![0, 2]));
         // A faster machine does better than the front's would.
         assert_eq!(chosen(50.0, 0.5), (0, true, vec![1, 0]));
+    }
+
+    #[test]
+    fn a_chain_whose_first_steps_are_cheap_makes_nothing_else_seem_so() {
+        // A chain of 27 s, 40 passes of 1.7 s and 8 of 1 s, on a machine as fast as the front's.
+        let point = |steps, step_s| (Unknowns::Voxels, Expected { steps, step_s, beside_s: 0.0 });
+        let points = [point(27.0, 1.0), point(40.0, 1.7), point(8.0, 1.0)];
+        let mut measured = vec![];
+        let measure = |i: usize| {
+            measured.push(i);
+            Ok(match i {
+                0 => Costs { step_s: 0.05, then_s: 26.5, then_steps: 17.0, ..Costs::default() },
+                _ => Costs { step_s: points[i].1.step_s, ..Costs::default() },
+            })
+        };
+        let choice = pick(&points, || 26.0, measure).unwrap();
+        assert_eq!((choice.point, choice.fits, measured), (2, true, vec![0, 2]));
     }
 
     #[test]
