@@ -7,6 +7,8 @@ use serde_json::Value;
 use std::error::Error;
 
 type Curve = (String, Vec<(f64, f64)>);
+/// The points that a record of the metrics gives.
+type Points = fn(&Value) -> Vec<(f64, f64)>;
 
 const USAGE: &str = "usage: curves [--steps | --drift] OUT.png TITLE NAME=RUN_FOLDER...";
 
@@ -15,7 +17,7 @@ fn main() -> Result<(), Box<dyn Error>> {
     let option = arguments.first().filter(|a| a.starts_with("--")).cloned();
     arguments.drain(..usize::from(option.is_some()));
     let [out, title, runs @ ..] = &arguments[..] else { return Err(USAGE.into()) };
-    let (points, x, y): (fn(&Value) -> Vec<(f64, f64)>, _, _) = match option.as_deref() {
+    let (points, x, y): (Points, _, _) = match option.as_deref() {
         None => (|r| quality(r).into_iter().collect(), "seconds of training", "PSNR, dB"),
         Some("--steps") => (|r| r["step"].as_f64().zip(r["psnr"].as_f64()).into_iter().collect(), "steps", "PSNR, dB"),
         Some("--drift") => (drifts, "epochs", "drift (mean L1)"),
@@ -27,7 +29,7 @@ fn main() -> Result<(), Box<dyn Error>> {
     Ok(())
 }
 
-fn read(run: &str, points: fn(&Value) -> Vec<(f64, f64)>) -> Result<Curve, Box<dyn Error>> {
+fn read(run: &str, points: Points) -> Result<Curve, Box<dyn Error>> {
     let (name, _, records) = metrics(run)?;
     Ok((name.to_string(), records.iter().flat_map(points).collect()))
 }
