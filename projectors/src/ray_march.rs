@@ -134,7 +134,8 @@ impl Projector for RayMarch {
         let [near, far] = self.range(ray);
         let n = self.max_samples(ray);
         let ends = self.sampling == Sampling::EndToEnd;
-        let delta = (far - near) / if ends { (n - 1).max(1) } else { n } as f32;
+        // A ray that misses has no samples.
+        let delta = (far - near) / if ends { n.saturating_sub(1).max(1) } else { n } as f32;
         for i in 0..n {
             let place = match (self.sampling, seed) {
                 (Sampling::EndToEnd, _) => 0.0,

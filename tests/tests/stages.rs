@@ -275,6 +275,7 @@ fn ray_projectors() {
     for settings in [
         json!({"type": "ray-march"}),
         json!({"type": "ray-march", "samples": 1}),
+        json!({"type": "ray-march", "samples": 9, "sampling": "end-to-end"}),
         json!({"type": "ray-march", "sampling": "stratified", "extent": "clipped"}),
         json!({"type": "ray-march", "step_mm": 3.0, "extent": "published"}),
     ] {
