@@ -83,7 +83,7 @@ impl ProjectorSpec for RayMarch {
             "spec",
             "sampling",
             "end-to-end",
-            "another one, or 2 samples and more",
+            "2 or more for `samples` beside it",
         )?;
         let positive = |step: Option<f64>| step.is_none_or(|s| s.is_finite() && s > 0.0);
         let shown = |step: Option<f64>| step.map_or(String::new(), |s| s.to_string());

@@ -55,7 +55,7 @@ pub struct Costs {
     pub then_s: f64,
     /// The least of it that makes sense.
     pub then_least_s: f64,
-    /// Steps and passes of all of it.
+    /// Steps and passes of the methods after the first.
     pub then_steps: f64,
     /// Writing weights, and evaluating, packing and writing voxels.
     pub export_s: f64,
@@ -71,7 +71,7 @@ impl Costs {
         self.then_s + self.export_s + self.picture_s + self.score_s
     }
 
-    /// All that is left of a run of `steps` in all, of which the first method takes `share` of its own.
+    /// Seconds of a run that has read its scan. All its methods together have `steps`; the first one takes `share` of its own.
     pub fn run_s(&self, steps: f64, share: f64) -> f64 {
         self.prepare_s + share * (steps - self.then_steps).max(1.0) * self.step_s + self.after_s()
     }
