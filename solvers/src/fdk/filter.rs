@@ -5,8 +5,7 @@
 //! padded with zeros to twice their length, so that the convolution does not wrap, and a window may damp high
 //! frequencies.
 
-use rustfft::num_complex::Complex;
-use rustfft::{Fft, FftPlanner};
+use conefield_fourier::{Complex, Fft, forward_f64, pair_f32};
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 use std::f64::consts::PI;
@@ -55,7 +54,6 @@ impl Ramp {
     /// nothing passes.
     pub fn new(columns: usize, pitch: f64, window: Window, cutoff: f64) -> Self {
         let n = (2 * columns).next_power_of_two();
-        let mut planner = FftPlanner::new();
         let kernel = |i: usize| {
             let i = i.min(n - i);
             match i {
@@ -65,14 +63,15 @@ impl Ramp {
             }
         };
         let mut spectrum: Vec<Complex<f64>> = (0..n).map(|i| Complex::new(kernel(i), 0.0)).collect();
-        FftPlanner::new().plan_fft_forward(n).process(&mut spectrum);
+        forward_f64(n).process(&mut spectrum);
         let response = spectrum.iter().enumerate().map(|(i, h)| {
             let x = i.min(n - i) as f64 / (0.5 * n as f64) / cutoff;
             let window = if x > 1.0 { 0.0 } else { window.at(x) };
             (h.re * window * pitch / n as f64) as f32
         });
         let response = response.collect();
-        Self { forward: planner.plan_fft_forward(n), inverse: planner.plan_fft_inverse(n), response }
+        let [forward, inverse] = pair_f32(n);
+        Self { forward, inverse, response }
     }
 
     /// Filters rows of equal length that follow each other in `rows`. Two go through one complex transform.

@@ -19,10 +19,10 @@ use conefield_core::arena::Layout;
 use conefield_core::error::{Error, Result, ensure};
 use conefield_core::pipeline::Pipeline;
 use conefield_core::random::{mix, unit};
-use rustfft::FftPlanner;
-use rustfft::num_complex::Complex;
+use conefield_fourier::{Complex, Fft, forward_f64};
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
+use std::sync::Arc;
 
 /// Its name in specs and checkpoints.
 const NAME: &str = "fft-mask";
@@ -297,7 +297,8 @@ impl FftMask {
 struct Spectrum {
     w: usize,
     h: usize,
-    planner: FftPlanner<f64>,
+    /// The transforms of a row (`h` values) and of a column (`w`).
+    along: [Arc<dyn Fft<f64>>; 2],
     rows: Vec<Complex<f64>>,
     columns: Vec<Complex<f64>>,
 }
@@ -305,20 +306,20 @@ struct Spectrum {
 impl Spectrum {
     fn new(w: usize, h: usize) -> Self {
         let zero = vec![Complex::default(); w * h];
-        Self { w, h, planner: FftPlanner::new(), rows: zero.clone(), columns: zero }
+        Self { w, h, along: [forward_f64(h), forward_f64(w)], rows: zero.clone(), columns: zero }
     }
 
     /// Energy of an image `[w, h]` with values in [0, 1].
     fn energy(&mut self, image: impl Iterator<Item = f64>) -> f64 {
         let (w, h) = (self.w, self.h);
         self.rows.iter_mut().zip(image).for_each(|(c, v)| *c = Complex::new(v, 0.0));
-        self.planner.plan_fft_forward(h).process(&mut self.rows);
+        self.along[0].process(&mut self.rows);
         for i in 0..w {
             for j in 0..h {
                 self.columns[j * w + i] = self.rows[i * h + j];
             }
         }
-        self.planner.plan_fft_forward(w).process(&mut self.columns);
+        self.along[1].process(&mut self.columns);
         let (half_w, half_h, radius) = ((w / 2) as i64, (h / 2) as i64, (w / 4) as i64);
         let mut sum = 0.0;
         for j in 0..h {
