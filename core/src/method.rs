@@ -323,6 +323,13 @@ pub trait Plan: Send {
         scan.samples()
     }
 
+    /// A scan of this size as an iterative method sees it: the pixels that binning leaves, and its unknowns in the place of
+    /// voxels.
+    fn seen(&self, scan: &ScanHeader) -> Option<ScanHeader> {
+        let _ = scan;
+        None
+    }
+
     /// The plans of a chain, in order; nothing of any other method.
     fn links(&mut self) -> &mut [Box<dyn Plan>] {
         &mut []

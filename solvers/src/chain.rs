@@ -35,6 +35,10 @@ pub struct Chain {
     /// What comes out is the mean of the volumes of so many methods, counted from the last: 1 is the last one's alone.
     #[serde(default = "one")]
     pub mean: usize,
+    /// Leave out a method that has the unknowns and the pixels of the next one, which makes its passes too. Two levels of a small
+    /// volume can be the same grid, and an iteration that starts anew in between loses its momentum. The mean then is of fewer.
+    #[serde(default)]
+    pub merge: bool,
 }
 
 fn one() -> usize {
@@ -68,12 +72,12 @@ impl Method for Chain {
             ensure(starts, "spec", &at(i), method.typetag_name(), "a method that starts from a volume")?;
             links.push(link);
         }
-        Ok(Box::new(ChainPlan { links, mean: self.mean }))
+        Ok(Box::new(ChainPlan { links, mean: self.mean, merge: self.merge }))
     }
 }
 
-/// What limits the next of `left` links after `spent` seconds: its own end, and time. The last one has `passes` and ends before
-/// the deadline; one before it leaves as much to each of the others as it takes at most.
+/// What limits the next of `left` links after `spent` seconds: its `passes` if they are not its own end's, and time. The last one
+/// ends before the deadline; one before it leaves as much to each of the others as it takes at most.
 fn later(limits: &Limits, spent: f64, left: usize, passes: Option<u64>) -> Limits {
     let most = limits.at_most.map(|all| (all - spent).max(0.0));
     if left == 1 {
@@ -81,7 +85,7 @@ fn later(limits: &Limits, spent: f64, left: usize, passes: Option<u64>) -> Limit
     }
     let part = limits.then.map(|end| end.saturating_duration_since(Instant::now()).as_secs_f64() / left as f64);
     let at_most = most.into_iter().chain(part).reduce(f64::min);
-    Limits { at_most, ..Limits::default() }
+    Limits { steps: passes, at_most, ..Limits::default() }
 }
 
 /// The key of a link.
@@ -95,12 +99,21 @@ struct ChainPlan {
     links: Vec<Box<dyn Plan>>,
     /// Of how many last links' volumes the mean comes out.
     mean: usize,
+    /// Whether links on one grid are merged.
+    merge: bool,
 }
 
 impl ChainPlan {
     /// Whether the volume of link `i` is one of those that the mean is of.
     fn counts(&self, i: usize) -> bool {
         self.mean > 1 && i + self.mean >= self.links.len()
+    }
+
+    /// The passes of link `i`, where the next one makes them instead. The first one ends by the command line's limits, and stays.
+    fn merged(&self, i: usize, scan: &ScanHeader) -> Option<u64> {
+        let next = self.links.get(i + 1).filter(|next| self.merge && i > 0 && next.passes().is_some())?;
+        let seen = self.links[i].seen(scan)?;
+        self.links[i].passes().filter(|_| next.seen(scan) == Some(seen))
     }
 
     /// The link whose field comes out: the last one that trains one.
@@ -115,7 +128,8 @@ impl Plan for ChainPlan {
         let links: Vec<Outline> = self.links.iter().map(|l| l.outline()).collect();
         let kinds: Vec<&str> = links.iter().map(|l| &l.method.kind[..]).collect();
         let mean = if self.mean > 1 { format!("; the mean of the last {} volumes", self.mean) } else { String::new() };
-        let told = format!("{}{mean}", kinds.join(", then "));
+        let merge = if self.merge { "; methods on one grid are merged" } else { "" };
+        let told = format!("{}{mean}{merge}", kinds.join(", then "));
         Outline { method: Line::new("method", "chain", &told), links, ..Outline::default() }
     }
 
@@ -140,6 +154,10 @@ impl Plan for ChainPlan {
             let found = link.inspect(scan).map_err(|e| e.within(&at(i)))?;
             let new: Vec<String> = found.lines.into_iter().filter(|line| !all.lines.contains(line)).collect();
             all.lines.extend(new);
+            if let Some(passes) = self.merged(i, &scan.header()) {
+                let next = at(i + 1);
+                all.lines.push(format!("{} is the grid of {next}, which makes its {passes} passes too", at(i)));
+            }
             all.attenuation = all.attenuation.or(found.attenuation);
             all.samples = all.samples.or(found.samples);
         }
@@ -152,10 +170,18 @@ impl Plan for ChainPlan {
             None => (Made::default(), None),
         };
         let count = self.links.len();
+        let merged: Vec<Option<u64>> = (0..count).map(|i| self.merged(i, &job.scan.header())).collect();
         for i in made.links..count {
+            if merged[i].is_some() {
+                made.links += 1;
+                continue;
+            }
+            let left = merged[i..].iter().filter(|merged| merged.is_none()).count();
+            let before: u64 = merged[..i].iter().rev().map_while(|passes| *passes).sum();
+            let passes = self.links[i].passes().map(|own| own + before);
             let limits = match i {
                 0 => job.limits,
-                _ => later(&job.limits, made.counts.train_s, count - i, self.links[i].passes()),
+                _ => later(&job.limits, made.counts.train_s, left, passes),
             };
             let resume = kept.take();
             let link = Job { start: made.start().or(job.start), limits, resume: resume.as_ref(), ..*job };
@@ -170,7 +196,8 @@ impl Plan for ChainPlan {
                 observer.checkpoint(&made.checkpoint(None)?)?;
             }
         }
-        made.solution(self.mean)
+        let mean = (0..count).filter(|&i| self.counts(i) && merged[i].is_none()).count();
+        made.solution(mean)
     }
 
     fn pretrain(&mut self, job: &PretrainJob<'_>, observer: &mut dyn Observer) -> Result<Model> {
@@ -252,5 +279,6 @@ mod tests {
         let last = later(&all, 10.0, 1, Some(4));
         assert_eq!((last.deadline, last.at_most, last.steps), (Some(end), Some(90.0), Some(4)));
         assert_eq!(later(&Limits::default(), 10.0, 2, None), Limits::default());
+        assert_eq!(later(&Limits::default(), 10.0, 2, Some(9)).steps, Some(9));
     }
 }

@@ -84,6 +84,10 @@ impl<T: Iterative> Plan for IterativePlan<T> {
         self.0.shared().stop.passes
     }
 
+    fn seen(&self, scan: &ScanHeader) -> Option<ScanHeader> {
+        Some(self.0.seen(scan))
+    }
+
     fn work(&self, scan: &ScanHeader) -> f64 {
         let seen = self.0.seen(scan);
         seen.samples() + SAMPLES * seen.voxels() as f64

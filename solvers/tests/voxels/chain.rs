@@ -116,6 +116,37 @@ fn an_interruption_of_any_goes_on_to_the_same_bits() {
     }
 }
 
+/// Methods two and three are one grid of 24 voxels: merged they are one method of seven passes, and the mean is its volume alone.
+#[test]
+fn methods_on_one_grid_are_merged() {
+    let scan = scan();
+    let tv = "type = \"fista\"\nprior = \"total-variation\"\nsubsets = 4\n";
+    let cubic = |samples: u32, passes: u32| {
+        format!(
+            "[[methods]]\nstop = {{ passes = {passes} }}\n{tv}basis = {{ type = \"cubic\", spacing = 1, samples = {samples} }}\n"
+        )
+    };
+    let chain = |top: &str, levels: &[(u32, u32)]| {
+        let levels: String = levels.iter().map(|&(samples, passes)| cubic(samples, passes)).collect();
+        format!("type = \"chain\"\n{top}{levels}")
+    };
+    let levels = [(12, 2), (32, 3), (48, 4)];
+    let (one, heard) = Case::of(&scan).volume(&chain("", &[(12, 2), (24, 7)]));
+    let merged = chain("mean = 2\nmerge = true\n", &levels);
+    let (both, told) = Case::of(&scan).volume(&merged);
+    assert_eq!(both.data, one.data);
+    assert_eq!(told.records.len(), heard.records.len());
+    assert_ne!(Case::of(&scan).volume(&chain("mean = 2\n", &levels)).0.data, one.data);
+    // Levels on grids of their own stay, and so does the mean.
+    let apart = |top| Case::of(&scan).volume(&chain(top, &[(12, 2), (16, 3), (24, 4)])).0.data;
+    assert_eq!(apart("mean = 2\nmerge = true\n"), apart("mean = 2\n"));
+    // An interruption within the merged method goes on to the same bits.
+    let mut heard = Heard::interrupting_after(5);
+    Case::of(&scan).run(&merged, &mut heard).err().unwrap();
+    let resumed = Case { resume: Some(&heard.kept.unwrap()), ..Case::of(&scan) };
+    assert_eq!(resumed.volume(&merged).0.data, both.data);
+}
+
 #[test]
 fn a_checkpoint_that_does_not_fit_the_chain_is_refused() {
     let scan = scan();
