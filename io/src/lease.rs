@@ -395,3 +395,27 @@ pub(crate) fn put_back_missing(folder: &Path) -> Result<()> {
         }
     }
 }
+
+#[cfg(all(test, unix))]
+mod tests {
+    use super::*;
+
+    const ANY: Contents = Contents { known: |_| true, progressed: |_| Progressed::Begun };
+
+    #[test]
+    fn shares_keep_out_who_wants_all_and_the_last_one_gets_it() {
+        let dir = tempfile::tempdir().unwrap();
+        let folder = dir.path().join("shared");
+        let [a, b] = [0, 1].map(|_| SharedLease::take(&folder).unwrap());
+        assert!(Lease::take(&folder, ANY).err().unwrap().to_string().contains("another conefield"));
+        assert!(try_alone(&folder).is_none());
+        assert!(a.alone(ANY).unwrap().is_none(), "the other one works on");
+        let all = b.alone(ANY).unwrap().expect("the last one");
+        assert!(SharedLease::take(&folder).err().unwrap().to_string().contains("another conefield"));
+        drop(all);
+        let lock = try_alone(&folder).unwrap();
+        assert!(SharedLease::take(&folder).is_err());
+        drop(lock);
+        Lease::take(&folder, ANY).unwrap();
+    }
+}

@@ -23,6 +23,8 @@ pub struct StudyReport {
     commit: Option<&'static str>,
     name: String,
     description: String,
+    /// The study's file, whole.
+    study: String,
     seeds: Vec<u64>,
     protocol: Protocol,
     baseline: Option<String>,
@@ -48,6 +50,8 @@ pub struct CaseRecord {
     name: String,
     /// Of what was simulated.
     volume: Option<String>,
+    /// Of what was simulated, where it is not the protocol's own.
+    noise: Option<String>,
     /// Of a scan that there was.
     scan: Option<PathBuf>,
     views: usize,
@@ -67,9 +71,14 @@ impl CaseRecord {
                 (None, Some(path.clone()), reference.as_ref().map(|r| r.display().to_string()))
             }
         };
+        let noise = match source {
+            Source::Simulated(s) => s.changes.noise.map(|n| n.to_string()),
+            Source::Scan { .. } => None,
+        };
         Self {
             name: name.into(),
             volume,
+            noise,
             scan,
             views: input.scan.views,
             detector: input.scan.detector,
@@ -85,7 +94,8 @@ impl CaseRecord {
         let from = self.volume.clone().or(self.scan.as_ref().map(|s| s.display().to_string())).unwrap_or_default();
         let reference =
             self.reference.as_ref().map_or(String::new(), |r| format!("; reference {r}, peak {}", self.peak));
-        format!("{from}: {views} views of {rows} x {columns} pixels, {x} x {y} x {z} voxels{reference}")
+        let noise = self.noise.as_ref().map_or(String::new(), |n| format!("; noise {n}"));
+        format!("{from}: {views} views of {rows} x {columns} pixels, {x} x {y} x {z} voxels{noise}{reference}")
     }
 }
 
@@ -172,6 +182,7 @@ impl StudyReport {
             commit: option_env!("CONEFIELD_COMMIT"),
             name: study.name.clone(),
             description: study.description.clone(),
+            study: study.text.clone(),
             seeds: study.seeds.clone(),
             protocol: study.protocol.clone(),
             baseline: study.baseline.map(|b| study.methods[b].name.clone()),

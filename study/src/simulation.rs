@@ -42,8 +42,10 @@ impl Simulation {
 
     /// Refuses a volume that cannot be read or scanned, and views to keep aside that there are not.
     pub fn check(&self, hold_out: Option<&HoldOut>) -> Result<()> {
-        let grid = self.prepared()?.grid;
-        let views = self.protocol(&grid, 0)?.geometry(&grid)?.views.len();
+        let volume = self.prepared()?;
+        let geometry = self.protocol(&volume.grid, 0)?.geometry(&volume.grid)?;
+        simulation::check_memory(&volume, &geometry)?;
+        let views = geometry.views.len();
         let held = conefield_run::input::held_out(hold_out, views, &self.written, "hold_out")?;
         let strange = held.iter().find(|i| **i >= views);
         let (found, expected) = (strange.copied().unwrap_or(0), format!("an index below {views}, the number of views"));

@@ -337,7 +337,10 @@ impl Work<'_> {
 
     /// Why a run has no result, where it failed.
     fn failure(&self, cell: &Cell) -> Option<String> {
-        fs::read(self.failure_file(cell)).ok().map(|text| String::from_utf8_lossy(&text).into_owned())
+        // One that was made alone since then has a result.
+        let failed = !is_done(&self.run(cell));
+        let text = failed.then(|| fs::read(self.failure_file(cell)).ok()).flatten();
+        text.map(|text| String::from_utf8_lossy(&text).into_owned())
     }
 
     fn name(&self, cell: &Cell) -> String {

@@ -128,7 +128,11 @@ fn tables_pictures_and_records_agree_and_resume_repeats_nothing() {
     let now = times(&out.join("runs/head-6views-seed0"));
     assert!(before.iter().all(|b| now.contains(b)));
     assert!(scans.iter().all(|b| times(&out.join("scans")).contains(b)));
-    let found = again["runs"].as_array().unwrap().iter().find(|r| r["case"] == "head-8views" && r["method"] == "SIRT" && r["seed"] == 1);
+    let found = again["runs"]
+        .as_array()
+        .unwrap()
+        .iter()
+        .find(|r| r["case"] == "head-8views" && r["method"] == "SIRT" && r["seed"] == 1);
     assert_eq!(found.unwrap()["scores"]["psnr"], psnr("head-8views", 1, "SIRT"));
 
     // What is there belongs to its study.
@@ -189,7 +193,11 @@ fn bad_studies_make_no_folder() {
     for (from, to, want) in [
         ("seeds", "seed", "line 5: seed: found a key that is not known here, expected `seeds`"),
         ("'fdk'", "'fkd'", "fkd: found neither a shipped spec nor a file"),
-        ("encoder.levels=2", "encoder.level=2", "line 4: specs: --set encoder.level=2: encoder.level: found an unknown key"),
+        (
+            "encoder.levels=2",
+            "encoder.level=2",
+            "line 4: specs: --set encoder.level=2: encoder.level: found an unknown key",
+        ),
         ("phantom:head:16", "none.nii", "none.nii"),
         ("steps = 3", "steps = 0", "line 13: steps"),
     ] {
@@ -237,7 +245,10 @@ fn shards_come_to_the_serial_table_whatever_kills_them() {
     let output = first.wait_with_output().unwrap();
     let said = String::from_utf8(output.stderr).unwrap();
     assert_eq!(output.status.code(), Some(130), "{said}");
-    assert!(said.contains("interrupted during head-6views-seed0/SIRT (2 of 12); the same command with --resume"), "{said}");
+    assert!(
+        said.contains("interrupted during head-6views-seed0/SIRT (2 of 12); the same command with --resume"),
+        "{said}"
+    );
     let before = times(&serial.join("runs/head-6views-seed0/fdk"));
     done(&["study", &text(file), "-o", &text(&serial), "--resume"]);
     assert_eq!(times(&serial.join("runs/head-6views-seed0/fdk")), before);
