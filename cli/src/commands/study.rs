@@ -22,9 +22,9 @@ use std::path::{Path, PathBuf};
 use std::time::{Duration, Instant};
 use tracing::info;
 
-/// Reconstruct many scans in several ways with several seeds: means, spreads and paired differences.
+/// Reconstruct many scans in several ways and with several seeds.
 ///
-/// STUDY is a TOML file that names volumes to simulate or scans, specs, seeds and numbers of views (docs/studies.md,
+/// The table has means, standard deviations and paired differences. STUDY is a TOML file that names volumes to simulate or scans, specs, seeds and numbers of views (docs/studies.md,
 /// specs/studies; "conefield schema --study" has every key). FOLDER receives table.md, table.json, for each scan or
 /// volume a picture in slices/ and curves in curves/, the simulated scans in scans/ and in runs/ what "conefield
 /// reconstruct" leaves of every run. Each run is a process of its own; where one fails the others still run. Ctrl-C ends
