@@ -145,6 +145,34 @@ const FIGURES: [(&str, Figure); 10] = [
     ("peak_bytes", |f| f.peak_bytes.map(|b| b as f64)),
 ];
 
+/// A figure as a table for people has it.
+struct Column {
+    key: &'static str,
+    head: &'static str,
+    shown: fn(f64) -> String,
+}
+
+const COLUMNS: [Column; 10] = [
+    Column { key: "psnr", head: "PSNR dB", shown: two },
+    Column { key: "ssim_2d", head: "ssim_2d", shown: four },
+    Column { key: "ssim_3d", head: "ssim_3d", shown: four },
+    Column { key: "ssim_skimage", head: "ssim_skimage", shown: four },
+    Column { key: "held_out", head: "held-out error", shown: |x| format!("{x:.3e}") },
+    Column { key: "loss", head: "loss", shown: |x| format!("{x:.3e}") },
+    Column { key: "steps", head: "steps or passes", shown: |x| number(x.round() as u64) },
+    Column { key: "train_s", head: "solving s", shown: two },
+    Column { key: "total_s", head: "all s", shown: two },
+    Column { key: "peak_bytes", head: "peak memory", shown: |x| bytes(x as u64) },
+];
+
+fn two(x: f64) -> String {
+    format!("{x:.2}")
+}
+
+fn four(x: f64) -> String {
+    format!("{x:.4}")
+}
+
 /// What a run ran on, from its record.
 fn machine(run: &Path) -> Result<Option<Machine>> {
     #[derive(Deserialize)]
@@ -262,37 +290,25 @@ impl StudyReport {
 
     fn table(&self, case: &str) -> Table {
         let lines: Vec<&Line> = self.summary.iter().filter(|l| l.case == case).collect();
-        let two = |x: f64| format!("{x:.2}");
-        let four = |x: f64| format!("{x:.4}");
-        let exponent = |x: f64| format!("{x:.3e}");
-        let whole = |x: f64| number(x.round() as u64);
-        let size = |x: f64| bytes(x as u64);
         // A figure that no method has is left out; the loss says something only where there is nothing better.
         let any = |key: &str| lines.iter().any(|l| l.figures.contains_key(key));
         let (scores, held_out) = (any("psnr"), any("held_out"));
-        let shown: [(&str, &str, bool, &dyn Fn(f64) -> String); 9] = [
-            ("psnr", "PSNR dB", scores, &two),
-            ("ssim_2d", "ssim_2d", scores, &four),
-            ("ssim_3d", "ssim_3d", scores, &four),
-            ("ssim_skimage", "ssim_skimage", scores, &four),
-            ("held_out", "held-out error", held_out, &exponent),
-            ("loss", "loss", !scores && !held_out, &exponent),
-            ("steps", "steps or passes", true, &whole),
-            ("train_s", "solving s", true, &two),
-            ("total_s", "all s", true, &two),
-        ];
+        let columns: Vec<&Column> = COLUMNS
+            .iter()
+            .filter(|c| match c.key {
+                "loss" => !scores && !held_out,
+                key => any(key),
+            })
+            .collect();
         let against = self.baseline.as_deref();
-        let compared = |key: &str| match key {
-            "psnr" | "ssim_2d" => scores,
-            "held_out" => held_out && !scores,
-            _ => key == "total_s",
-        };
+        let compared = columns.iter().filter(|c| match c.key {
+            "psnr" | "ssim_2d" | "total_s" => true,
+            key => key == "held_out" && !scores,
+        });
+        let compared: Vec<&Column> = compared.copied().filter(|_| against.is_some()).collect();
         let mut heads = vec!["method".to_owned(), "runs".into()];
-        heads.extend(shown.iter().filter(|s| s.2).map(|s| s.1.to_owned()));
-        heads.push("peak memory".into());
-        if let Some(b) = against {
-            heads.extend(shown.iter().filter(|s| compared(s.0)).map(|s| format!("{} − {b}'s", s.1)));
-        }
+        heads.extend(columns.iter().map(|c| c.head.to_owned()));
+        heads.extend(compared.iter().map(|c| format!("{} − {}'s", c.head, against.unwrap_or_default())));
         let mut rows = vec![heads];
         for line in lines {
             let runs = if line.failed == 0 {
@@ -302,16 +318,14 @@ impl StudyReport {
             };
             let mut row = vec![line.method.clone(), runs];
             let cell = |s: Option<String>| s.unwrap_or_else(|| "-".into());
-            row.extend(shown.iter().filter(|s| s.2).map(|s| {
-                // How many steps there were is one number.
-                let format = |x: &Spread| if s.0 == "steps" { s.3(x.mean) } else { x.shown(s.3) };
-                cell(line.figures.get(s.0).map(format))
+            row.extend(columns.iter().map(|c| {
+                // How many steps and bytes there were is one number.
+                let whole = ["steps", "peak_bytes"].contains(&c.key);
+                let shown = |x: &Spread| if whole { (c.shown)(x.mean) } else { x.shown(c.shown) };
+                cell(line.figures.get(c.key).map(shown))
             }));
-            row.push(cell(line.figures.get("peak_bytes").map(|x| size(x.mean))));
-            if against.is_some() {
-                let of = |key: &str| line.difference.as_ref().and_then(|d| d.get(key));
-                row.extend(shown.iter().filter(|s| compared(s.0)).map(|s| cell(of(s.0).map(|x| x.signed(s.3)))));
-            }
+            let difference = |c: &Column| line.difference.as_ref().and_then(|d| d.get(c.key));
+            row.extend(compared.iter().map(|c| cell(difference(c).map(|x| x.signed(c.shown)))));
             rows.push(row);
         }
         Table { rows, notes: vec![] }
