@@ -1,6 +1,7 @@
 //! The subcommands.
 
 mod backends;
+mod cell;
 mod compare;
 mod completions;
 mod convert;
@@ -19,6 +20,7 @@ mod reconstruct;
 mod record;
 mod schema;
 mod simulate;
+mod study;
 mod tradeoff;
 mod trained;
 mod trial;
@@ -37,6 +39,7 @@ pub enum Command {
     Import(import::ImportArgs),
     Reconstruct(reconstruct::ReconstructArgs),
     Compare(compare::CompareArgs),
+    Study(study::StudyArgs),
     Tradeoff(tradeoff::TradeoffArgs),
     Pretrain(pretrain::PretrainArgs),
     Evaluate(evaluate::EvaluateArgs),
@@ -60,6 +63,7 @@ pub fn run(command: Command, general: &General) -> Result<()> {
         Command::Import(c) => c.run(),
         Command::Reconstruct(c) => c.run(),
         Command::Compare(c) => c.run(general),
+        Command::Study(c) => c.run(general),
         Command::Tradeoff(c) => c.run(general),
         Command::Pretrain(c) => c.run(),
         Command::Evaluate(c) => c.run(),

@@ -11,7 +11,6 @@ mod progress;
 mod run_folder;
 mod segmenter;
 mod signals;
-mod table;
 
 pub use conefield_run::specs;
 use conefield_run::{backend, files, memory, method, parse, plugins};

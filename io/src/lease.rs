@@ -8,7 +8,7 @@ use crate::atomic::{exchange, parent, sweep, sync_folder};
 use crate::lock::{self, Held};
 use conefield_core::{Error, Result};
 use std::ffi::{OsStr, OsString};
-use std::fs::{self, File};
+use std::fs::{self, File, TryLockError};
 use std::io::ErrorKind;
 use std::path::{Path, PathBuf};
 use std::time::{Duration, Instant};
@@ -228,6 +228,57 @@ impl Drop for Lease {
     }
 }
 
+/// A folder that several processes write at a time, each its own parts of it.
+pub struct SharedLease {
+    path: PathBuf,
+    /// None where folders cannot be locked.
+    lock: Option<File>,
+}
+
+impl SharedLease {
+    /// Takes a share in the folder at `path`, which is made if it is not there. Refused while another process has it alone.
+    pub fn take(path: &Path) -> Result<Self> {
+        fs::create_dir_all(path).map_err(|e| Error::io(path, e))?;
+        match lock::share(path) {
+            Held::Ours(lock) => Ok(Self { path: path.to_path_buf(), lock: Some(lock) }),
+            Held::Theirs => Err(taken(path)),
+            Held::Unknown => Ok(Self { path: path.to_path_buf(), lock: None }),
+        }
+    }
+
+    /// Gives the share back for all of the folder; none while another process has a share in it. Of several processes that
+    /// end with this the last one has the folder: each gives its share back before it looks for those of others.
+    pub fn alone(self, contents: Contents) -> Result<Option<Lease>> {
+        let Self { path, lock } = self;
+        let mut locks = vec![];
+        if let Some(lock) = lock {
+            let at = |e| Error::io(&path, e);
+            lock.unlock().map_err(at)?;
+            match lock.try_lock() {
+                Ok(()) => locks.push(lock),
+                Err(TryLockError::WouldBlock) => return Ok(None),
+                Err(TryLockError::Error(e)) => return Err(at(e)),
+            }
+        }
+        Ok(Some(Lease { path, contents, locks, writing: false, made: false }))
+    }
+}
+
+/// A lock on a folder, until it is dropped.
+pub struct FolderLock {
+    _lock: Option<File>,
+}
+
+/// The lock on `folder` for this process alone; none while another process has it. Where folders cannot be locked, whoever
+/// asks has it.
+pub fn try_alone(folder: &Path) -> Option<FolderLock> {
+    match lock::hold(folder) {
+        Held::Ours(lock) => Some(FolderLock { _lock: Some(lock) }),
+        Held::Theirs => None,
+        Held::Unknown => Some(FolderLock { _lock: None }),
+    }
+}
+
 /// The lock on a folder, if it is there.
 fn own(path: &Path) -> Result<Vec<File>> {
     loop {
@@ -342,5 +393,29 @@ pub(crate) fn put_back_missing(folder: &Path) -> Result<()> {
             let _ = fs::remove_dir(&aside);
             Ok(())
         }
+    }
+}
+
+#[cfg(all(test, unix))]
+mod tests {
+    use super::*;
+
+    const ANY: Contents = Contents { known: |_| true, progressed: |_| Progressed::Begun };
+
+    #[test]
+    fn shares_keep_out_who_wants_all_and_the_last_one_gets_it() {
+        let dir = tempfile::tempdir().unwrap();
+        let folder = dir.path().join("shared");
+        let [a, b] = [0, 1].map(|_| SharedLease::take(&folder).unwrap());
+        assert!(Lease::take(&folder, ANY).err().unwrap().to_string().contains("another conefield"));
+        assert!(try_alone(&folder).is_none());
+        assert!(a.alone(ANY).unwrap().is_none(), "the other one works on");
+        let all = b.alone(ANY).unwrap().expect("the last one");
+        assert!(SharedLease::take(&folder).err().unwrap().to_string().contains("another conefield"));
+        drop(all);
+        let lock = try_alone(&folder).unwrap();
+        assert!(SharedLease::take(&folder).is_err());
+        drop(lock);
+        Lease::take(&folder, ANY).unwrap();
     }
 }

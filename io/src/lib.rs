@@ -14,7 +14,8 @@
 //!
 //! Writers put everything beside its final name, sync it and rename it ([`write_atomic`]), so that a half-written
 //! file never stands under the name that was asked for. A folder that grows while a command works is a [`Lease`]: locked,
-//! and what stood there before waits until the new work is complete.
+//! and what stood there before waits until the new work is complete. Several processes write one that each has a
+//! [`SharedLease`] on.
 
 mod affine;
 mod atomic;
@@ -58,7 +59,7 @@ pub use atomic::{discard_unfinished, is_unfinished, write_atomic, write_folder_a
 pub use checkpoint::{read_checkpoint, write_checkpoint};
 pub use counts::{Correction, CountsReport, OpenBeam, line_integrals};
 pub use file_order::{PACKED_BYTES, SLAB_BYTES};
-pub use lease::{Contents, Lease, Progressed, is_aside};
+pub use lease::{Contents, FolderLock, Lease, Progressed, SharedLease, is_aside, try_alone};
 pub use naf::{read_naf, write_naf};
 pub use r2::{read_r2, write_r2};
 pub use rtk::{read_rtk_geometry, write_rtk_geometry};
@@ -67,5 +68,6 @@ pub use scan::{DataSet, read_data_set, read_scan, read_truth};
 pub use scan_folder::write_scan;
 pub use scanner::{I0, ImportOptions, Imported, read_scanner};
 pub use size::{ScanSize, scan_size, scanner_size, volume_voxels};
+pub use text::parse_toml;
 pub use volume::{check_shape, is_volume, packed_bytes, read_volume, write_volume, write_voxels};
 pub use weights::{read_weights, write_weights};

@@ -17,8 +17,17 @@ pub(crate) enum Held {
 
 /// Locks what stands under `path`, a file or a folder, without waiting.
 pub(crate) fn hold(path: &Path) -> Held {
+    lock(path, File::try_lock)
+}
+
+/// The same beside others that do so: only [`hold`] is kept out, and keeps out.
+pub(crate) fn share(path: &Path) -> Held {
+    lock(path, File::try_lock_shared)
+}
+
+fn lock(path: &Path, way: fn(&File) -> Result<(), TryLockError>) -> Held {
     let Ok(file) = File::open(path) else { return Held::Unknown };
-    match file.try_lock() {
+    match way(&file) {
         Err(TryLockError::WouldBlock) => return Held::Theirs,
         Err(TryLockError::Error(_)) => return Held::Unknown,
         Ok(()) => {}

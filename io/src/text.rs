@@ -62,6 +62,11 @@ pub(crate) fn parse<T: DeserializeOwned>(path: &Path, text: &str, notation: Nota
     }
 }
 
+/// Parses `text`, the content of the TOML file `path`. Errors name the line and, for an unknown key, the nearest valid one.
+pub fn parse_toml<T: DeserializeOwned>(path: &Path, text: &str) -> Result<T> {
+    parse(path, text, Notation::Toml)
+}
+
 fn explain(path: &Path, text: &str, line: Option<usize>, message: &str) -> Error {
     let place = match line {
         Some(n) => format!("{}: line {n}", path.display()),

@@ -25,6 +25,8 @@ pub enum Corner {
 /// What a plot may do differently.
 #[derive(Debug, Clone, PartialEq)]
 pub struct CurveOptions {
+    /// Areas around series, in their colours: the series' name, then x with the lowest and the highest y.
+    pub bands: Vec<(String, Vec<Band>)>,
     /// A logarithmic x axis; points at zero or below are left out.
     pub log_x: bool,
     /// A logarithmic y axis; points at zero or below are left out.
@@ -37,9 +39,12 @@ pub struct CurveOptions {
     pub legend: Option<Corner>,
 }
 
+/// `(x, [lowest y, highest y])`
+pub type Band = (f64, [f64; 2]);
+
 impl Default for CurveOptions {
     fn default() -> Self {
-        Self { log_x: false, log_y: false, x_margin: 0.0, size: [1200, 800], legend: None }
+        Self { bands: vec![], log_x: false, log_y: false, x_margin: 0.0, size: [1200, 800], legend: None }
     }
 }
 
@@ -132,7 +137,8 @@ impl Panel<'_> {
             return Err(Error::invalid(place, "series", format!("{} without a point to draw", series.len()), expected));
         }
         let x = range(all.iter().map(|p| p.0), options.log_x, options.x_margin);
-        let y = range(all.iter().map(|p| p.1), options.log_y, 0.05);
+        let edges = options.bands.iter().flat_map(|(_, b)| b).flat_map(|(x, ys)| ys.map(|y| (*x, y)));
+        let y = range(all.iter().copied().chain(edges.filter(|p| shown(p))).map(|p| p.1), options.log_y, 0.05);
         let plot = Plot { title, labels, series, options, shown: &shown };
         let corner = options.legend.unwrap_or_else(|| emptiest(&all, &x, &y, options));
         let drawn = match (options.log_x, options.log_y) {
@@ -193,14 +199,25 @@ impl Plot<'_> {
             .map_err(text)?;
         let stroke = ((em / 8.0).round() as u32).max(2);
         let mut names: Vec<&str> = vec![];
-        for (name, points) in self.series {
-            let known = names.iter().position(|n| n == name);
-            let colour = COLOURS[known.unwrap_or(names.len()) % COLOURS.len()];
-            let style = colour.stroke_width(stroke);
-            let mut named = known.is_some();
-            if !named {
+        for (name, _) in self.series {
+            if !names.contains(&&name[..]) {
                 names.push(name);
             }
+        }
+        let colour = |name: &str| COLOURS[names.iter().position(|n| *n == name).unwrap_or(0) % COLOURS.len()];
+        for (name, band) in &self.options.bands {
+            for part in band.split(|(x, ys)| !ys.iter().all(|y| (self.shown)(&(*x, *y)))).filter(|b| b.len() > 1) {
+                let above = part.iter().map(|(x, ys)| (*x, ys[1]));
+                let outline: Vec<(f64, f64)> = part.iter().map(|(x, ys)| (*x, ys[0])).chain(above.rev()).collect();
+                chart.draw_series([Polygon::new(outline, colour(name).mix(0.18))]).map_err(text)?;
+            }
+        }
+        let mut told: Vec<&str> = vec![];
+        for (name, points) in self.series {
+            let colour = colour(name);
+            let style = colour.stroke_width(stroke);
+            let mut named = told.contains(&&name[..]);
+            told.push(name);
             for part in points.split(|p| !(self.shown)(p)).filter(|p| !p.is_empty()) {
                 // A point without neighbours would leave no trace as a line.
                 if let [p] = part {
@@ -332,6 +349,28 @@ mod tests {
         let empty = Panel { title: "", labels: ["", ""], series: &nothing, options: &options };
         let path = folder.join("no-panel.png");
         assert!(panels_png(&path, &[panel("left"), empty]).is_err() && !path.exists());
+    }
+
+    #[test]
+    fn a_band_is_drawn_around_its_series_in_its_colour() {
+        let (_dir, folder) = folder();
+        let line = |y: f64| (0..10).map(|i| (1.0 + i as f64, y)).collect::<Vec<_>>();
+        let series = vec![("low".to_string(), line(10.0)), ("high".to_string(), line(20.0))];
+        let band: Vec<Band> = (0..10).map(|i| (1.0 + i as f64, [18.0, 22.0])).collect();
+        let picture = |bands| {
+            let path = folder.join("bands.png");
+            let options = CurveOptions { bands, log_x: true, ..Default::default() };
+            curves_png_with(&path, "", "", "", &series, &options).unwrap();
+            image::open(&path).unwrap().to_rgb8()
+        };
+        // The second colour, thinned.
+        let [r, g, b] = [213.0f64, 94.0, 0.0].map(|c| (255.0 + (c - 255.0) * 0.18).round());
+        let like = |p: &[u8; 3]| [r, g, b].iter().zip(p).all(|(a, b)| (a - f64::from(*b)).abs() < 6.0);
+        let count = |image: &image::RgbImage| image.pixels().filter(|p| like(&p.0)).count();
+        let (with, without) = (picture(vec![("high".into(), band)]), picture(vec![]));
+        assert!(count(&with) > 20_000 && count(&without) < 500, "{} {}", count(&with), count(&without));
+        // Where one side cannot be shown there is a gap.
+        picture(vec![("high".into(), vec![(1.0, [18.0, f64::NAN]), (2.0, [18.0, 22.0]), (3.0, [18.0, 22.0])])]);
     }
 
     #[test]

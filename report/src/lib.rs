@@ -17,7 +17,7 @@ pub mod text;
 #[cfg(test)]
 mod testing;
 
-pub use curves::{Corner, CurveOptions, Panel, curves_png, curves_png_with, panels_png};
+pub use curves::{Band, Corner, CurveOptions, Panel, curves_png, curves_png_with, panels_png};
 pub use slices::{MiddleSlices, compare_png, features_png, result_png, slices_png};
 pub use survey::survey_png;
 pub use table::Table;

@@ -3,7 +3,7 @@
 //! - [`specs`]: the specs that come with the program, found by name; [`method`]: a spec built and priced.
 //! - [`files`]: volumes, scans and weights as users name them; [`plugins`]: libraries with stages; [`parse`]: values as
 //!   users write them.
-//! - [`backend`]: what computes; [`memory`]: what a run will hold, and what there is.
+//! - [`backend`]: what computes; [`memory`]: what a run will hold, and what there is; [`machine`]: where it runs.
 //! - [`input`]: what a run reads; [`choose`]: the method for it, within a budget of time too.
 //! - [`explain`]: what a spec builds; [`score`]: how far a volume is from its reference.
 //! - [`simulation`], [`pretraining`], [`projection`]: the work of the commands of these names.
@@ -13,6 +13,7 @@ pub mod choose;
 pub mod explain;
 pub mod files;
 pub mod input;
+pub mod machine;
 pub mod memory;
 pub mod method;
 pub mod parse;

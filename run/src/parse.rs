@@ -205,6 +205,15 @@ pub fn share(text: &str) -> Result<f64, String> {
     positive(text, form).and_then(|x| if x <= 1.0 { Ok(x) } else { Err(format!("expected {form}")) })
 }
 
+/// `K/N`: the K-th of N parts, from the first.
+pub fn part(text: &str) -> Result<[usize; 2], String> {
+    let form = "K/N, such as 1/4: the first of four";
+    match pair(text, '/', form)? {
+        [k, n] if (1..=n).contains(&k) => Ok([k, n]),
+        _ => Err(format!("expected {form}, K from 1 to N")),
+    }
+}
+
 /// Views to keep aside, where there may be none.
 #[derive(Debug, Clone, PartialEq)]
 pub struct HoldOutOrNone(pub Option<HoldOut>);
@@ -245,6 +254,8 @@ mod tests {
         assert_eq!(hold_out_or_none("none"), Ok(HoldOutOrNone(None)));
         assert!(hold_out_or_none("no").is_err());
         assert_eq!(share("1"), Ok(1.0));
+        assert_eq!((part("2/3"), part("1/1")), (Ok([2, 3]), Ok([1, 1])));
+        assert!(part("0/3").is_err() && part("4/3").is_err() && part("2").is_err() && part("1/0").is_err());
         assert!(share("0").is_err() && share("1.01").is_err() && share("nan").is_err());
         assert!(hold_out("every:1").is_err() && hold_out("a").is_err());
         assert_eq!(angles("0:360"), Ok(AnglesOption::Even { start: 0.0, range: 360.0 }));

@@ -115,8 +115,8 @@ pub fn scan_in(volume: &Volume, geometry: Geometry, noise: DetectorNoise, seed: 
     Ok(scan)
 }
 
-/// Refuses what does not fit: projecting takes a copy of the volume with a rim.
-fn check_memory(volume: &Volume, g: &Geometry) -> Result<()> {
+/// Refuses to scan what does not fit into memory: projecting takes a copy of the volume with a rim.
+pub fn check_memory(volume: &Volume, g: &Geometry) -> Result<()> {
     let rim = volume.grid.shape.iter().map(|&n| n as u64 + 2).product::<u64>();
     let need = |views: usize, share: u64| {
         let pixels = (views * g.detector[0] * g.detector[1]) as u64 / share;

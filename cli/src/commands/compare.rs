@@ -1,28 +1,22 @@
 //! `conefield compare`
 
+use super::cell::{Cell, Start};
 use super::protocol::RunProtocol;
-use super::reconstruct::{budget, identity};
-use super::trial::{self, Trial};
+use super::trial;
 use super::{EndOptions, General, backends::simd_level};
 use crate::backend::BackendChoice;
 use crate::boundary::Inputs;
-use crate::memory::Memory;
-use crate::method;
-use crate::plugins::{self, Used};
-use crate::table::{SCORES, Table, score_cells};
-use crate::{files, out, run_folder, signals, specs};
+use crate::{out, run_folder, signals, specs};
 use clap::Args;
 use conefield_core::error::ensure;
-use conefield_core::method::Plan;
-use conefield_core::spec::load::Loaded;
 use conefield_core::{Error, Result};
 use conefield_io::{Contents, Lease, Progressed};
-use conefield_report::MiddleSlices;
-use conefield_tradeoff::json::{LONGEST, read_json};
-use conefield_tradeoff::trial::{Figures, ScanRecord, TrialInput};
-use serde::{Deserialize, Serialize};
-use serde_json::Value;
-use std::collections::BTreeMap;
+use conefield_report::Table;
+use conefield_study::method::{FOLDER_NAME, Method};
+use conefield_study::outcome::{Columns, Outcome};
+use conefield_study::pictures::{self, Shown};
+use conefield_tradeoff::trial::{ScanRecord, TrialInput};
+use serde::Serialize;
 use std::fs;
 use std::io::ErrorKind;
 use std::path::{Path, PathBuf};
@@ -63,30 +57,6 @@ fn help() -> String {
 /// What lies beside the runs.
 const FILES: [&str; 3] = ["table.md", "table.json", "compare.png"];
 
-/// A spec and how its run starts.
-struct Method {
-    /// Its own name, which is also its folder's.
-    name: String,
-    /// As it was asked for.
-    spec: String,
-    loaded: Loaded,
-    plan: Box<dyn Plan>,
-    start: Start,
-}
-
-/// What stands in a method's folder decides how its run starts.
-#[derive(Debug, Clone, Copy, PartialEq)]
-enum Start {
-    /// Nothing does.
-    Anew,
-    /// What a run left that came to no checkpoint.
-    Replacing,
-    /// A checkpoint.
-    Resuming,
-    /// A finished run.
-    Done,
-}
-
 /// All that `table.json` says.
 #[derive(Serialize)]
 struct Report<'a> {
@@ -118,24 +88,25 @@ struct Entry {
     name: String,
     spec: String,
     run: PathBuf,
-    status: &'static str,
-    error: Option<String>,
     #[serde(flatten)]
-    figures: Option<Figures>,
+    outcome: Outcome,
 }
 
 impl CompareArgs {
     pub fn run(self, general: &General) -> Result<()> {
         // Whatever is wrong with the input is told before anything is made.
-        let mut methods = self.methods()?;
+        let methods = self.methods()?;
         let input = trial::input(&self.scan, &self.protocol)?;
         methods.iter().try_for_each(|m| specs::check_held_out(&m.loaded, m.plan.as_ref(), &input.held))?;
         let mut lease = Lease::take(&self.output, CONTENTS)?;
         self.look_into_folder()?;
         self.spare_inputs(&methods)?;
-        for method in &mut methods {
-            method.start = self.start(method, &input)?;
-        }
+        let runs: Vec<PathBuf> = methods.iter().map(|m| self.output.join(&m.name)).collect();
+        let (scan, protocol) = (&self.scan, &self.protocol);
+        let cells = methods.iter().zip(&runs).map(|(method, run)| Cell { method, scan, run, protocol });
+        let cells: Vec<Cell> = cells.collect();
+        let start = |c: &Cell| if self.resume { c.start(&input) } else { Ok(Start::Anew) };
+        let starts: Vec<Start> = cells.iter().map(start).collect::<Result<_>>()?;
         signals::listen()?;
         if !self.resume || !self.output.exists() {
             lease.replace()?;
@@ -143,14 +114,14 @@ impl CompareArgs {
             lease.go_on();
         }
         let mut entries = vec![];
-        for (i, method) in methods.iter().enumerate() {
-            let part = format!("{} ({} of {})", method.name, i + 1, methods.len());
-            entries.push(self.entry(method, part, general)?);
+        for (i, (cell, start)) in cells.iter().zip(starts).enumerate() {
+            let part = format!("{} ({} of {})", cell.method.name, i + 1, cells.len());
+            entries.push(entry(cell, start, part, general)?);
         }
         // Without any result there is no comparison: an earlier one stays.
-        if entries.iter().all(|e| e.figures.is_none()) {
-            let why: Vec<String> =
-                entries.iter().map(|e| format!("{}: {}", e.name, e.error.as_deref().unwrap_or("no result"))).collect();
+        if entries.iter().all(|e| e.outcome.figures.is_none()) {
+            let why = |e: &Entry| format!("{}: {}", e.name, e.outcome.error.as_deref().unwrap_or("no result"));
+            let why: Vec<String> = entries.iter().map(why).collect();
             return Err(Error::unsupported("compare: every method failed", why.join("; ")));
         }
         let TrialInput { scan, held, reference, peak } = input;
@@ -158,15 +129,18 @@ impl CompareArgs {
         let table = table(&report);
         conefield_io::write_text_atomic(self.output.join("table.json"), &out::to_json(&report)?)?;
         conefield_io::write_text_atomic(self.output.join("table.md"), &table.markdown())?;
-        let picture = self.draw(&report.methods, reference.as_ref())?;
+        let path = self.output.join("compare.png");
+        let drawn = pictures::slices(&path, reference.as_ref(), &shown(&report.methods), None)?;
         lease.complete()?;
         if self.json {
             out::json(&report)?;
         } else {
             out::say(&table.text())?;
+            let picture = if drawn { format!("picture: {}\n", path.display()) } else { String::new() };
             out::say(&format!("\n{}table and runs in {}", picture, self.output.display()))?;
         }
-        let failed: Vec<&str> = report.methods.iter().filter(|m| m.error.is_some()).map(|m| &m.name[..]).collect();
+        let failed: Vec<&str> =
+            report.methods.iter().filter(|m| m.outcome.error.is_some()).map(|m| &m.name[..]).collect();
         match failed.len() {
             0 => Ok(()),
             n => {
@@ -181,20 +155,11 @@ impl CompareArgs {
         let mut methods: Vec<Method> = vec![];
         let backend = self.protocol.backend.open()?;
         for spec in &self.specs {
-            let loaded = specs::read(spec, &self.protocol.sets)?;
-            let plan = method::plan(&loaded, backend.as_ref())?;
-            let name = if loaded.spec.name.is_empty() { files::stem(spec) } else { loaded.spec.name.clone() };
-            let begins = name.starts_with(|c: char| c.is_alphanumeric());
-            let plain =
-                name.chars().all(|c| c.is_alphanumeric() || " ._+()-".contains(c)) && !name.ends_with([' ', '.']);
-            let free = !FILES.contains(&&name.to_lowercase()[..]) && name.len() <= 100;
-            let expected = "a name for a folder: letters, digits, and between them spaces and ._+()-";
-            ensure(begins && plain && free, &loaded.source, "name", format!("{name:?}"), expected)?;
-            if let Some(other) = methods.iter().find(|m| m.name.to_lowercase() == name.to_lowercase()) {
-                let found = format!("{name:?}, the name of {}", other.loaded.source);
-                return Err(Error::invalid(&loaded.source, "name", found, "a name of its own, for table and folder"));
-            }
-            methods.push(Method { name, spec: spec.clone(), loaded, plan, start: Start::Anew });
+            let method = Method::read(spec, None, &self.protocol.sets, None, backend.as_ref())?;
+            let free = !FILES.contains(&&method.name.to_lowercase()[..]);
+            ensure(free, &method.loaded.source, "name", format!("{:?}", method.name), FOLDER_NAME)?;
+            method.differs(&methods)?;
+            methods.push(method);
         }
         Ok(methods)
     }
@@ -223,62 +188,6 @@ impl CompareArgs {
         ensure(free, &place, "output", "an earlier comparison", expected)
     }
 
-    /// How the run of `method` starts. Refuses to go on with another one's.
-    fn start(&self, method: &Method, input: &TrialInput) -> Result<Start> {
-        let folder = self.output.join(&method.name);
-        if !self.resume || !folder.exists() {
-            return Ok(Start::Anew);
-        }
-        let mut now = identity(&method.loaded, &self.protocol, &input.held, &input.scan)?;
-        let [record, checkpoint, volume] =
-            ["record.json", "checkpoint.safetensors", "volume.nii.gz"].map(|f| folder.join(f));
-        if record.exists() && volume.exists() {
-            now.insert("reference".into(), Value::from(self.reference()).to_string());
-            now.insert("peak".into(), input.peak.to_string());
-            files::same_run(&record.display().to_string(), &recorded(&folder)?, &now)?;
-            return Ok(Start::Done);
-        }
-        if checkpoint.exists() {
-            files::read_checkpoint(&checkpoint, &now)?;
-            return Ok(Start::Resuming);
-        }
-        Ok(Start::Replacing)
-    }
-
-    /// Runs `method` unless that is done; its line of the table.
-    fn entry(&self, method: &Method, part: String, general: &General) -> Result<Entry> {
-        let run = self.output.join(&method.name);
-        let error = if method.start == Start::Done {
-            info!("{part} is done already");
-            None
-        } else {
-            info!("{part}");
-            self.reconstruct(method, part, general)?
-        };
-        let figures = match &error {
-            Some(_) => None,
-            None => Some(Figures::of_run(&run)?),
-        };
-        let status = if error.is_some() { "failed" } else { "done" };
-        Ok(Entry { name: method.name.clone(), spec: method.spec.clone(), run, status, error, figures })
-    }
-
-    /// Runs `method` in a process of its own; what went wrong with it, if anything did.
-    fn reconstruct(&self, method: &Method, part: String, general: &General) -> Result<Option<String>> {
-        let trial = Trial {
-            scan: &self.scan,
-            spec: &method.spec,
-            output: &self.output.join(&method.name),
-            protocol: &self.protocol,
-            more: match method.start {
-                Start::Resuming => &["--resume"],
-                Start::Replacing => &["--force"],
-                Start::Anew | Start::Done => &[],
-            },
-        };
-        trial.run(part, general)
-    }
-
     fn reference(&self) -> Option<String> {
         self.protocol.reference.as_ref().map(|r| r.display().to_string())
     }
@@ -300,33 +209,22 @@ impl CompareArgs {
             memory_limit: general.memory,
         }
     }
+}
 
-    /// Draws the results side by side; the picture in words.
-    fn draw(&self, entries: &[Entry], reference: Option<&MiddleSlices>) -> Result<String> {
-        let path = self.output.join("compare.png");
-        let mut panels = vec![];
-        for entry in entries {
-            let Some(figures) = &entry.figures else { continue };
-            let volume = entry.run.join("volume.nii.gz");
-            Memory::of_volumes(&[conefield_io::volume_voxels(&volume)?]).check(|_| vec![])?;
-            let caption = match figures.psnr() {
-                Some(psnr) => format!("{} {psnr:.2} dB", entry.name),
-                None => entry.name.clone(),
-            };
-            panels.push((caption, MiddleSlices::of(&conefield_io::read_volume(&volume)?)));
-        }
-        let panels: Vec<(&str, &MiddleSlices)> = panels.iter().map(|(c, s)| (&c[..], s)).collect();
-        match (reference, panels.first()) {
-            (_, None) => {
-                // One of an earlier comparison would not belong to this table.
-                let _ = fs::remove_file(&path);
-                return Ok(String::new());
-            }
-            (Some(r), _) => conefield_report::compare_png(&path, ("reference", r), &panels, r.window())?,
-            (None, Some((_, first))) => conefield_report::slices_png(&path, &panels, first.window(), None)?,
-        }
-        Ok(format!("picture: {}\n", path.display()))
-    }
+/// Makes a run unless that is done; its line of the table.
+fn entry(cell: &Cell, start: Start, part: String, general: &General) -> Result<Entry> {
+    info!("{part}{}", if start == Start::Done { " is done already" } else { "" });
+    let outcome = match cell.carry_out(start, part, general)? {
+        Some(error) => Outcome::failed(error),
+        None => Outcome::of_run(cell.run)?,
+    };
+    Ok(Entry { name: cell.method.name.clone(), spec: cell.method.spec.clone(), run: cell.run.to_path_buf(), outcome })
+}
+
+/// The results, for a picture.
+fn shown(entries: &[Entry]) -> Vec<Shown> {
+    let results = entries.iter().filter_map(|e| Some((e, e.outcome.figures.as_ref()?)));
+    results.map(|(e, f)| Shown { name: e.name.clone(), psnr: f.psnr(), run: e.run.clone() }).collect()
 }
 
 /// What the folder of a comparison holds.
@@ -350,88 +248,15 @@ fn progressed(folder: &Path) -> Progressed {
     if any { Progressed::Begun } else { Progressed::Nothing }
 }
 
-/// Which run a finished one was, as [`identity`] has it, and what it was compared with.
-fn recorded(folder: &Path) -> Result<BTreeMap<String, String>> {
-    #[derive(Deserialize)]
-    struct Known {
-        version: String,
-        seed: u64,
-        scan: KnownScan,
-        held_out_views: Vec<usize>,
-        limits: EndOptions,
-        #[serde(default)]
-        budget_s: Option<f64>,
-        reference: Value,
-        peak: f64,
-        #[serde(default)]
-        plugins: Vec<Used>,
-    }
-    #[derive(Deserialize)]
-    struct KnownScan {
-        projections_fnv1a64: String,
-        geometry_fnv1a64: String,
-    }
-    let known: Known = read_json(&folder.join("record.json"))?;
-    let mut all = BTreeMap::from([
-        ("conefield".into(), known.version),
-        ("seed".into(), known.seed.to_string()),
-        ("spec".into(), conefield_core::files::read_text(&folder.join("spec.toml"), LONGEST)?),
-        ("projections".into(), known.scan.projections_fnv1a64),
-        ("geometry".into(), known.scan.geometry_fnv1a64),
-        ("budget".into(), budget(known.budget_s)),
-        ("held_out_views".into(), format!("{:?}", known.held_out_views)),
-        ("limits".into(), out::to_json(&known.limits)?),
-        ("reference".into(), known.reference.to_string()),
-        ("peak".into(), known.peak.to_string()),
-    ]);
-    all.extend(plugins::identity(&known.plugins));
-    Ok(all)
-}
-
-/// The table's columns: how the result fits, by what is known, and what it took.
-fn cells(figures: &Figures, with: &Columns) -> Vec<String> {
-    let mut cells = vec![];
-    if with.scores {
-        let ssims = ["ssim_2d", "ssim_3d", "ssim_skimage"].map(|name| figures.score(name));
-        cells.extend(score_cells(figures.psnr().unwrap_or(f64::NAN), ssims));
-    }
-    let figure = |x: Option<f64>| x.map_or("-".into(), |x| format!("{x:.4e}"));
-    cells.extend(with.held_out.then(|| figure(figures.held_out)));
-    cells.extend(with.loss.then(|| figure(figures.loss)));
-    cells.push(out::number(figures.steps));
-    cells.extend([figures.train_s, figures.total_s].map(|s| format!("{s:.2}")));
-    cells.push(figures.peak_bytes.map_or("-".into(), out::bytes));
-    cells
-}
-
-/// Which figures tell how a result fits: scores where there is a reference, otherwise held-out views, otherwise the
-/// loss, which says least.
-struct Columns {
-    scores: bool,
-    held_out: bool,
-    loss: bool,
-}
-
 fn table(report: &Report) -> Table {
     let protocol = &report.protocol;
-    let (scores, held_out) = (protocol.reference.is_some(), !protocol.held_out_views.is_empty());
-    let with = Columns { scores, held_out, loss: !scores && !held_out };
-    let mut heads = vec!["method"];
-    heads.extend(SCORES.iter().filter(|_| with.scores));
-    heads.extend(with.held_out.then_some("held-out error"));
-    heads.extend(with.loss.then_some("loss"));
-    heads.extend(["steps or passes", "solving s", "all s", "peak memory"]);
-    let mut rows = vec![heads.iter().map(|h| h.to_string()).collect::<Vec<_>>()];
+    let columns = Columns::of(protocol.reference.is_some(), !protocol.held_out_views.is_empty());
+    let row = |name: &str, cells: Vec<String>| [vec![name.to_owned()], cells].concat();
+    let mut rows = vec![row("method", columns.heads().iter().map(|h| h.to_string()).collect())];
     let mut notes = vec![protocol.line()];
-    for entry in &report.methods {
-        let cells = match (&entry.figures, &entry.error) {
-            (Some(figures), _) => cells(figures, &with),
-            (None, error) => {
-                notes.extend(error.as_ref().map(|e| format!("{} failed: {e}", entry.name)));
-                (1..heads.len()).map(|c| if c == 1 { "failed" } else { "-" }.to_owned()).collect()
-            }
-        };
-        rows.push([vec![entry.name.clone()], cells].concat());
+    for Entry { name, outcome, .. } in &report.methods {
+        rows.push(row(name, columns.cells(outcome)));
+        notes.extend(outcome.error.as_ref().map(|e| format!("{name} failed: {e}")));
     }
     Table { rows, notes }
 }
@@ -452,33 +277,5 @@ impl Shared<'_> {
         parts.extend(self.sets.iter().map(|s| format!("`{s}`")));
         parts.push(format!("seed {}, {} threads, conefield {}", self.seed, self.threads, self.version));
         parts.join("; ")
-    }
-}
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-
-    #[test]
-    fn an_equal_result_has_no_number_for_its_psnr() {
-        let scores = serde_json::json!({ "psnr": null, "ssim_2d": 1.0, "ssim_3d": null, "ssim_skimage": 1.0 });
-        let figures = Figures {
-            steps: 1,
-            train_s: 1.0,
-            export_s: 0.5,
-            total_s: 2.0,
-            peak_bytes: None,
-            threads: 2,
-            parameters: 0,
-            samples: 0,
-            samples_per_s: None,
-            loss: None,
-            held_out: None,
-            scores: Some(scores),
-        };
-        let shown = cells(&figures, &Columns { scores: true, held_out: true, loss: false });
-        assert_eq!(shown, ["inf", "1.0000", "-", "1.0000", "-", "1", "1.00", "2.00", "-"]);
-        let shown = cells(&figures, &Columns { scores: false, held_out: false, loss: true });
-        assert_eq!(shown, ["-", "1", "1.00", "2.00", "-"]);
     }
 }

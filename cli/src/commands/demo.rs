@@ -2,7 +2,6 @@
 
 use crate::boundary::refuse_existing;
 use crate::progress::Progress;
-use crate::table::{SCORES, Table, cells_of};
 use crate::{memory, method, out, parse, signals, specs};
 use clap::Args;
 use conefield_backend_cpu::Cpu;
@@ -12,8 +11,8 @@ use conefield_core::{Error, Result};
 use conefield_io::ScanSize;
 use conefield_metrics::Scores;
 use conefield_projectors::simulate::{DetectorNoise, Protocol, phantom, simulate};
-use conefield_report::MiddleSlices;
-use conefield_run::score::score;
+use conefield_report::{MiddleSlices, Table};
+use conefield_run::score::{SCORES, cells_of, score};
 use serde::Serialize;
 use serde_json::json;
 use std::path::PathBuf;

@@ -22,6 +22,7 @@ use conefield_core::{Error, Result};
 use conefield_report::MiddleSlices;
 use conefield_run::choose::{self, Wish};
 use conefield_run::input::Input;
+use conefield_run::machine::Machine;
 use conefield_run::score::score;
 use conefield_tradeoff::front::Front;
 use conefield_tradeoff::schedule::{Budget, Schedule};
@@ -180,6 +181,7 @@ impl ReconstructArgs {
             backend: outline.backend(),
             simd: simd_level(),
             threads: rayon::current_num_threads(),
+            machine: Machine::here(),
             memory,
             peak_bytes: memory::peak(),
             steps: solution.steps,

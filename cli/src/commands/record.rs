@@ -6,6 +6,7 @@ use crate::out;
 use crate::plugins::Used;
 use conefield_core::backend::Explain;
 use conefield_metrics::Scores;
+use conefield_run::machine::Machine;
 use conefield_tradeoff::schedule::Schedule;
 use conefield_tradeoff::trial::ScanRecord;
 use serde::Serialize;
@@ -33,6 +34,7 @@ pub struct RunRecord {
     pub backend: Explain,
     pub simd: String,
     pub threads: usize,
+    pub machine: Machine,
     pub memory: Memory,
     pub peak_bytes: Option<u64>,
     pub steps: u64,

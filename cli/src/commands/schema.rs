@@ -11,11 +11,18 @@ pub struct SchemaArgs {
     /// Print lists of the shipped specs and of all types instead, as tables in Markdown.
     #[arg(long)]
     tables: bool,
+    /// Print the JSON Schema of study files instead.
+    #[arg(long, conflicts_with = "tables")]
+    study: bool,
 }
 
 impl SchemaArgs {
     pub fn run(self) -> Result<()> {
-        if self.tables { out::say(&tables()?) } else { out::json(&schema::spec()) }
+        match (self.tables, self.study) {
+            (true, _) => out::say(&tables()?),
+            (_, true) => out::json(&conefield_study::study::schema()),
+            _ => out::json(&schema::spec()),
+        }
     }
 }
 

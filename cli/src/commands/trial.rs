@@ -5,6 +5,7 @@ use super::protocol::{RunProtocol, word};
 use super::reconstruct::FAILED;
 use crate::memory::Run;
 use crate::{files, signals};
+use conefield_core::scan::Scan;
 use conefield_core::{Error, Result};
 use conefield_tradeoff::trial::TrialInput;
 use std::io::Read;
@@ -72,6 +73,11 @@ impl Trial<'_> {
 
 /// Reads scan and reference, to refuse what does not fit; of both only little is kept.
 pub fn input(path: &Path, protocol: &RunProtocol) -> Result<TrialInput> {
+    input_of(path, protocol, |_| Ok(()))
+}
+
+/// The same, once `check` has had a look at the scan.
+pub fn input_of(path: &Path, protocol: &RunProtocol, check: impl FnOnce(&Scan) -> Result<()>) -> Result<TrialInput> {
     let all = Run {
         scan: conefield_io::scan_size(path)?,
         split: protocol.hold_out.is_some(),
@@ -80,6 +86,7 @@ pub fn input(path: &Path, protocol: &RunProtocol) -> Result<TrialInput> {
     };
     all.reading().check(|_| vec![])?;
     let scan = files::scan(path)?;
+    check(&scan)?;
     let reference = protocol.reference(path, &scan)?;
     let held = protocol.held_out(scan.geometry.views.len())?;
     let peak = protocol.peak(reference.as_ref());

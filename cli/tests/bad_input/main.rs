@@ -20,6 +20,7 @@ mod scan_folder;
 mod scanner;
 mod small;
 mod spec;
+mod study;
 mod tiff;
 mod weights;
 
@@ -41,6 +42,7 @@ fn every_bad_input_ends_as_the_page_says() {
         ("Weights and checkpoints", weights::cases()),
         ("Pipeline specs", spec::cases()),
         ("Levers and fronts", levers::cases()),
+        ("Study files", study::cases()),
         ("Small files that claim or unpack to much", small::cases()),
         ("Values on the command line", command::cases()),
     ];

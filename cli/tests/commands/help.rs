@@ -2,11 +2,12 @@
 
 use crate::common::{conefield, done, refused};
 
-const COMMANDS: [&str; 18] = [
+const COMMANDS: [&str; 19] = [
     "simulate",
     "import",
     "reconstruct",
     "compare",
+    "study",
     "tradeoff",
     "pretrain",
     "evaluate",

@@ -24,6 +24,7 @@ mod refusals;
 #[cfg(unix)]
 mod resume;
 mod schema;
+mod study;
 mod tradeoff;
 mod unusual;
 mod your_data;

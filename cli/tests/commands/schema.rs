@@ -4,13 +4,15 @@ use crate::common::done;
 use serde_json::Value;
 
 #[test]
-fn the_file_in_specs_is_current() {
-    let path = concat!(env!("CARGO_MANIFEST_DIR"), "/../specs/schema/spec.schema.json");
-    let file = std::fs::read_to_string(path).unwrap_or_default();
-    assert!(
-        file == done(&["schema"]),
-        "write it anew: cargo run --release -p conefield -- schema > specs/schema/spec.schema.json"
-    );
+fn the_files_in_specs_are_current() {
+    for (file, line) in [("spec.schema.json", &["schema"][..]), ("study.schema.json", &["schema", "--study"])] {
+        let path = std::path::Path::new(env!("CARGO_MANIFEST_DIR")).join("../specs/schema").join(file);
+        let command = line.join(" ");
+        assert!(
+            std::fs::read_to_string(path).unwrap_or_default() == done(line),
+            "write it anew: cargo run --release -p conefield -- {command} > specs/schema/{file}"
+        );
+    }
 }
 
 #[test]

@@ -1,0 +1,120 @@
+//! A run as a part of a comparison or a study: how it starts, and the process of its own that it is.
+
+use super::protocol::RunProtocol;
+use super::reconstruct::{budget, identity};
+use super::trial::Trial;
+use super::{EndOptions, General};
+use crate::plugins::{self, Used};
+use crate::{files, out};
+use conefield_core::Result;
+use conefield_study::method::Method;
+use conefield_tradeoff::json::{LONGEST, read_json};
+use conefield_tradeoff::trial::TrialInput;
+use serde::Deserialize;
+use serde_json::Value;
+use std::collections::BTreeMap;
+use std::path::Path;
+
+/// What stands in a run's folder decides how the run starts.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub enum Start {
+    /// Nothing does.
+    Anew,
+    /// What a run left that came to no checkpoint.
+    Replacing,
+    /// A checkpoint.
+    Resuming,
+    /// A finished run.
+    Done,
+}
+
+/// A method on a scan.
+pub struct Cell<'a> {
+    pub method: &'a Method,
+    pub scan: &'a Path,
+    /// The run's folder.
+    pub run: &'a Path,
+    pub protocol: &'a RunProtocol,
+}
+
+/// Whether a finished run stands in `folder`.
+pub fn is_done(folder: &Path) -> bool {
+    ["record.json", "volume.nii.gz"].iter().all(|f| folder.join(f).exists())
+}
+
+impl Cell<'_> {
+    /// How the run starts. Refuses to go on with another one's.
+    pub fn start(&self, input: &TrialInput) -> Result<Start> {
+        let Self { method, run, protocol, .. } = self;
+        if !run.exists() {
+            return Ok(Start::Anew);
+        }
+        let mut now = identity(&method.loaded, protocol, &input.held, &input.scan)?;
+        if is_done(run) {
+            let reference = protocol.reference.as_ref().map(|r| r.display().to_string());
+            now.insert("reference".into(), Value::from(reference).to_string());
+            now.insert("peak".into(), input.peak.to_string());
+            files::same_run(&run.join("record.json").display().to_string(), &recorded(run)?, &now)?;
+            return Ok(Start::Done);
+        }
+        let checkpoint = run.join("checkpoint.safetensors");
+        if checkpoint.exists() {
+            files::read_checkpoint(&checkpoint, &now)?;
+            return Ok(Start::Resuming);
+        }
+        Ok(Start::Replacing)
+    }
+
+    /// Makes the run unless it is done; what went wrong with it, if anything did. `part` is what an interruption is told to
+    /// have interrupted.
+    pub fn carry_out(&self, start: Start, part: String, general: &General) -> Result<Option<String>> {
+        let mut more: Vec<String> = match start {
+            Start::Done => return Ok(None),
+            Start::Resuming => vec!["--resume".into()],
+            Start::Replacing => vec!["--force".into()],
+            Start::Anew => vec![],
+        };
+        more.extend(self.method.init.as_ref().map(|i| format!("--init={i}")));
+        let more: Vec<&str> = more.iter().map(String::as_str).collect();
+        let Self { method, scan, run, protocol } = self;
+        Trial { scan, spec: &method.spec, output: run, protocol, more: &more }.run(part, general)
+    }
+}
+
+/// Which run a finished one was, as [`identity`] has it, and what it was compared with.
+fn recorded(folder: &Path) -> Result<BTreeMap<String, String>> {
+    #[derive(Deserialize)]
+    struct Known {
+        version: String,
+        seed: u64,
+        scan: KnownScan,
+        held_out_views: Vec<usize>,
+        limits: EndOptions,
+        #[serde(default)]
+        budget_s: Option<f64>,
+        reference: Value,
+        peak: f64,
+        #[serde(default)]
+        plugins: Vec<Used>,
+    }
+    #[derive(Deserialize)]
+    struct KnownScan {
+        projections_fnv1a64: String,
+        geometry_fnv1a64: String,
+    }
+    let known: Known = read_json(&folder.join("record.json"))?;
+    let mut all = BTreeMap::from([
+        ("conefield".into(), known.version),
+        ("seed".into(), known.seed.to_string()),
+        ("spec".into(), conefield_core::files::read_text(&folder.join("spec.toml"), LONGEST)?),
+        ("projections".into(), known.scan.projections_fnv1a64),
+        ("geometry".into(), known.scan.geometry_fnv1a64),
+        ("budget".into(), budget(known.budget_s)),
+        ("held_out_views".into(), format!("{:?}", known.held_out_views)),
+        ("limits".into(), out::to_json(&known.limits)?),
+        ("reference".into(), known.reference.to_string()),
+        ("peak".into(), known.peak.to_string()),
+    ]);
+    all.extend(plugins::identity(&known.plugins));
+    Ok(all)
+}

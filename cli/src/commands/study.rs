@@ -1,0 +1,419 @@
+//! `conefield study`
+
+use super::cell::{self, Start, is_done};
+use super::protocol::RunProtocol;
+use super::{EndOptions, General, trial};
+use crate::boundary::Inputs;
+use crate::{out, parse, signals, specs};
+use clap::Args;
+use conefield_core::error::ensure;
+use conefield_core::{Error, Result};
+use conefield_io::{Lease, SharedLease, try_alone};
+use conefield_study::layout::{CONTENTS, Layout, group};
+use conefield_study::outcome::Outcome;
+use conefield_study::pictures::{self, Shown};
+use conefield_study::report::{CaseRecord, StudyReport};
+use conefield_study::slurm::Jobs;
+use conefield_study::study::{Cell, Source, Study};
+use conefield_tradeoff::trial::TrialInput;
+use serde_json::json;
+use std::fs;
+use std::path::{Path, PathBuf};
+use std::time::{Duration, Instant};
+use tracing::info;
+
+/// Reconstruct many scans in several ways and with several seeds.
+///
+/// The table has means, standard deviations and paired differences. STUDY is a TOML file that names volumes to simulate or scans, specs, seeds and numbers of views (docs/studies.md,
+/// specs/studies; "conefield schema --study" has every key). FOLDER receives table.md, table.json, for each scan or
+/// volume a picture in slices/ and curves in curves/, the simulated scans in scans/ and in runs/ what "conefield
+/// reconstruct" leaves of every run. Each run is a process of its own; where one fails the others still run. Ctrl-C ends
+/// the run under way after its step; the same command with --resume goes on and repeats no finished run.
+#[derive(Args)]
+pub struct StudyArgs {
+    /// The study's file.
+    study: PathBuf,
+    /// The folder for the results; new or empty.
+    #[arg(short, long = "output", value_name = "FOLDER")]
+    output: PathBuf,
+    /// Replace an earlier study in FOLDER with all its runs.
+    #[arg(long)]
+    force: bool,
+    /// Go on with the study in FOLDER. Methods, seeds, scans and volumes may be added; all else must be as it was.
+    #[arg(long, conflicts_with = "force")]
+    resume: bool,
+    /// Make the K-th of N shares of the runs, while other processes make the others in the same FOLDER, on this machine or
+    /// on one that sees it too. What is there is gone on with. The last one to end writes the table.
+    #[arg(long, value_name = "K/N", value_parser = parse::part, conflicts_with = "force")]
+    shard: Option<[usize; 2]>,
+    /// Run nothing: write a script that makes the study as an array of Slurm jobs.
+    #[arg(long, value_name = "FILE", conflicts_with_all = ["force", "resume", "shard", "json"])]
+    slurm: Option<PathBuf>,
+    /// Jobs of that array [default: one a run, 1000 at most].
+    #[arg(long, value_name = "N", requires = "slurm", value_parser = clap::value_parser!(u16).range(1..))]
+    jobs: Option<u16>,
+    /// Print one JSON object: what table.json holds.
+    #[arg(long)]
+    json: bool,
+}
+
+/// Between two looks at what another process holds.
+const LOOK: Duration = Duration::from_millis(50);
+
+/// Jobs of an array where nothing says how many: a Slurm as it comes takes no more.
+const MOST_JOBS: usize = 1000;
+
+/// The study's folder: for this process, or for it and others.
+enum Hold {
+    Alone(Lease),
+    Shared(SharedLease),
+}
+
+impl StudyArgs {
+    pub fn run(self, general: &General) -> Result<()> {
+        // Whatever is wrong with the input is told before anything is made.
+        let study = Study::read(&self.study)?;
+        let inputs = study.methods.iter().fold(Inputs::of(study.inputs()), |i, m| i.and_spec(&m.loaded));
+        if let Some(file) = &self.slurm {
+            inputs.spare_file(file)?;
+            return self.write_script(&study, file, general);
+        }
+        let work = Work { study: &study, layout: Layout(&self.output), general };
+        let [share, of] = self.shard.unwrap_or([1, 1]);
+        let cells: Vec<Cell> = study.cells().into_iter().skip(share - 1).step_by(of).collect();
+        work.check_scans()?;
+        let hold = self.take(&work, &cells, &inputs)?;
+        conefield_io::write_text_atomic(work.layout.study(), &study.text)?;
+        work.carry_out(&cells)?;
+        let lease = match hold {
+            Hold::Alone(lease) => Some(lease),
+            Hold::Shared(share) => share.alone(CONTENTS)?,
+        };
+        match lease {
+            Some(lease) if work.is_over() => self.finish(&work, lease),
+            _ => self.leave_to_others(&work, &cells),
+        }
+    }
+
+    /// The folder to work in. Refuses what stands there where it is none of this study, or nothing says what to do with it.
+    fn take(&self, work: &Work<'_>, cells: &[Cell], inputs: &Inputs) -> Result<Hold> {
+        let mut lease = self.shard.is_none().then(|| Lease::take(&self.output, CONTENTS)).transpose()?;
+        let any = work.layout.look()?;
+        inputs.spare_folder(&self.output)?;
+        let goes_on = self.resume || self.shard.is_some();
+        let expected = "a new or empty folder, --resume to go on or --force to replace it";
+        ensure(
+            !any || goes_on || self.force,
+            &self.output.display().to_string(),
+            "output",
+            "an earlier study",
+            expected,
+        )?;
+        if goes_on {
+            work.check_runs(cells)?;
+        }
+        signals::listen()?;
+        match &mut lease {
+            Some(lease) if goes_on && any => lease.go_on(),
+            Some(lease) => lease.replace()?,
+            None => return SharedLease::take(&self.output).map(Hold::Shared),
+        }
+        lease.map(Hold::Alone).ok_or_else(|| Error::unsupported("study", "the folder is not held"))
+    }
+
+    /// Writes tables and pictures of runs that are all over, and tells what came of them.
+    fn finish(&self, work: &Work<'_>, lease: Lease) -> Result<()> {
+        if self.shard.is_some() {
+            // What others made is of this study, too.
+            work.check_runs(&work.study.cells())?;
+        }
+        let report = work.report()?;
+        report.write(&self.output)?;
+        lease.complete()?;
+        if self.json {
+            out::json(&report)?;
+        } else {
+            out::say(&report.text())?;
+            out::say(&format!("\ntable, pictures and runs in {}", self.output.display()))?;
+        }
+        refuse_failures(&report.failures(), work.study.cells().len())
+    }
+
+    /// Tells what this share came to, where others are not done.
+    fn leave_to_others(&self, work: &Work<'_>, cells: &[Cell]) -> Result<()> {
+        let failed: Vec<String> = cells.iter().filter_map(|c| work.failure(c)).collect();
+        let done = cells.len() - failed.len();
+        if self.json {
+            out::json(&json!({ "done": done, "failed": failed, "table": null }))?;
+        } else {
+            out::say(&format!(
+                "{done} of {} runs of this share done; the last share to end writes the table",
+                cells.len()
+            ))?;
+        }
+        refuse_failures(&failed, cells.len())
+    }
+
+    fn write_script(&self, study: &Study, file: &Path, general: &General) -> Result<()> {
+        let program = std::env::current_exe().map_err(|e| Error::io("conefield", e))?;
+        let runs = study.cells().len();
+        let count = self.jobs.map_or(runs.min(MOST_JOBS), |n| runs.min(n.into()));
+        let general = general
+            .arguments()
+            .into_iter()
+            .map(|a| a.into_string().map_err(|a| Error::invalid("--slurm", "option", a.display(), "text in UTF-8")));
+        let general: Vec<String> = general.collect::<Result<_>>()?;
+        let jobs = Jobs {
+            name: &study.name,
+            program: &program,
+            study: &self.study,
+            output: &self.output,
+            count,
+            general: &general,
+        };
+        conefield_io::write_text_atomic(file, &jobs.script()?)?;
+        out::say(&format!("{}: {count} jobs for {runs} runs; sbatch {} submits them", file.display(), file.display()))
+    }
+}
+
+/// Runs that failed are a failure of the whole, once all else is told.
+fn refuse_failures(failed: &[String], all: usize) -> Result<()> {
+    match failed.len() {
+        0 => Ok(()),
+        n => Err(Error::unsupported("study", format!("{n} of {all} runs failed, the first: {}", failed[0]))),
+    }
+}
+
+/// A study in its folder.
+struct Work<'a> {
+    study: &'a Study,
+    layout: Layout<'a>,
+    general: &'a General,
+}
+
+impl Work<'_> {
+    /// Refuses scans that there are already where they cannot be read or do not suit a method, and views kept aside that a
+    /// method needs.
+    fn check_scans(&self) -> Result<()> {
+        for (case, c) in self.study.cases.iter().enumerate() {
+            let cell = Cell { case, seed: self.study.seeds[0], method: 0 };
+            // Of what is simulated the volume has been read.
+            let held = match c.source {
+                Source::Scan { .. } => self.input(&cell)?.held,
+                Source::Simulated(_) => self.study.protocol.hold_out.iter().map(|_| 0).collect(),
+            };
+            self.study.methods.iter().try_for_each(|m| specs::check_held_out(&m.loaded, m.plan.as_ref(), &held))?;
+        }
+        Ok(())
+    }
+
+    /// Refuses simulated scans and runs in the folder that are of another study.
+    fn check_runs(&self, cells: &[Cell]) -> Result<()> {
+        for cells in cells.chunk_by(same_scan) {
+            // A scan that is not there yet comes again to the same bits, and is looked at then.
+            if self.scan(&cells[0]).exists() && cells.iter().any(|c| self.run(c).exists()) {
+                let input = self.input(&cells[0])?;
+                cells.iter().try_for_each(|c| self.start(c, &input).map(drop))?;
+            }
+        }
+        Ok(())
+    }
+
+    /// Makes every run that is not done, and the scans for them.
+    fn carry_out(&self, cells: &[Cell]) -> Result<()> {
+        let begin = Instant::now();
+        let (mut number, mut made) = (0, 0);
+        for same in cells.chunk_by(same_scan) {
+            self.make_scan(&same[0])?;
+            let input = self.input(&same[0])?;
+            for cell in same {
+                number += 1;
+                let part = format!("{} ({number} of {})", self.name(cell), cells.len());
+                self.await_run(cell, &part)?;
+                let start = self.start(cell, &input)?;
+                if start == Start::Done {
+                    info!("{part} is done already");
+                    continue;
+                }
+                let left = begin.elapsed().as_secs_f64() / f64::from(made) * (cells.len() + 1 - number) as f64;
+                let left = if made > 0 { format!(", about {} left", out::duration(left)) } else { String::new() };
+                info!("{part}{left}");
+                made += 1;
+                self.make_run(cell, start, part)?;
+            }
+        }
+        Ok(())
+    }
+
+    /// Makes a run; why it failed stands in its place.
+    fn make_run(&self, cell: &Cell, start: Start, part: String) -> Result<()> {
+        let (scan, run, protocol, failure) =
+            (self.scan(cell), self.run(cell), self.protocol(cell), self.failure_file(cell));
+        if failure.exists() {
+            fs::remove_file(&failure).map_err(|e| Error::io(&failure, e))?;
+        }
+        let method = &self.study.methods[cell.method];
+        let made =
+            cell::Cell { method, scan: &scan, run: &run, protocol: &protocol }.carry_out(start, part, self.general)?;
+        let Some(error) = made else { return Ok(()) };
+        let folder = failure.parent().unwrap_or(Path::new(""));
+        fs::create_dir_all(folder).map_err(|e| Error::io(folder, e))?;
+        conefield_io::write_text_atomic(&failure, &error)
+    }
+
+    /// Simulates the scan of a run unless that is done, or another process does it.
+    fn make_scan(&self, cell: &Cell) -> Result<()> {
+        let Source::Simulated(simulation) = &self.study.cases[cell.case].source else { return Ok(()) };
+        let (scan, all) = (self.scan(cell), self.layout.scans());
+        fs::create_dir_all(&all).map_err(|e| Error::io(&all, e))?;
+        let part = format!("simulation of {}", group(&self.study.cases[cell.case].name, cell.seed));
+        let _one_at_a_time = await_lock(&all, &part)?;
+        if scan.exists() {
+            return Ok(());
+        }
+        info!("{part}");
+        simulation.make(cell.seed, &scan)?;
+        if signals::caught().is_some() { Err(Error::Stopped { part }) } else { Ok(()) }
+    }
+
+    /// Waits until nobody writes a run: what is left of a process that was killed ends after its step.
+    fn await_run(&self, cell: &Cell, part: &str) -> Result<()> {
+        let run = self.run(cell);
+        if run.exists() {
+            await_lock(&run, part)?;
+        }
+        Ok(())
+    }
+
+    /// What is known of the scan of a run.
+    fn input(&self, cell: &Cell) -> Result<TrialInput> {
+        let scan = self.scan(cell);
+        trial::input_of(&scan, &self.protocol(cell), |s| match &self.study.cases[cell.case].source {
+            Source::Simulated(simulation) => simulation.check_made(cell.seed, s, &scan),
+            Source::Scan { .. } => Ok(()),
+        })
+    }
+
+    fn start(&self, cell: &Cell, input: &TrialInput) -> Result<Start> {
+        let (scan, run, protocol) = (self.scan(cell), self.run(cell), self.protocol(cell));
+        let method = &self.study.methods[cell.method];
+        cell::Cell { method, scan: &scan, run: &run, protocol: &protocol }.start(input)
+    }
+
+    /// What a run is asked for.
+    fn protocol(&self, cell: &Cell) -> RunProtocol {
+        let p = &self.study.protocol;
+        RunProtocol {
+            checkpoint_every: p.checkpoint_every.unwrap_or(60.0),
+            sets: self.study.methods[cell.method].sets.clone(),
+            ends: EndOptions { seconds: p.seconds, steps: p.steps.map(u64::from), at_most: p.at_most },
+            budget: p.budget,
+            backend: p.backend.unwrap_or_default(),
+            reference: match &self.study.cases[cell.case].source {
+                Source::Simulated(_) => Some("truth".into()),
+                Source::Scan { reference, .. } => reference.clone(),
+            },
+            peak: p.peak,
+            hold_out: p.hold_out.clone(),
+            seed: cell.seed,
+        }
+    }
+
+    fn scan(&self, cell: &Cell) -> PathBuf {
+        let case = &self.study.cases[cell.case];
+        match &case.source {
+            Source::Simulated(_) => self.layout.scan(&case.name, cell.seed),
+            Source::Scan { path, .. } => path.clone(),
+        }
+    }
+
+    fn run(&self, cell: &Cell) -> PathBuf {
+        self.layout.run(&self.study.cases[cell.case].name, cell.seed, &self.study.methods[cell.method].name)
+    }
+
+    fn failure_file(&self, cell: &Cell) -> PathBuf {
+        self.layout.failure(&self.study.cases[cell.case].name, cell.seed, &self.study.methods[cell.method].name)
+    }
+
+    /// Why a run has no result, where it failed.
+    fn failure(&self, cell: &Cell) -> Option<String> {
+        // One that was made alone since then has a result.
+        let failed = !is_done(&self.run(cell));
+        let text = failed.then(|| fs::read(self.failure_file(cell)).ok()).flatten();
+        text.map(|text| String::from_utf8_lossy(&text).into_owned())
+    }
+
+    fn name(&self, cell: &Cell) -> String {
+        format!("{}/{}", group(&self.study.cases[cell.case].name, cell.seed), self.study.methods[cell.method].name)
+    }
+
+    /// Whether every run of the study has ended.
+    fn is_over(&self) -> bool {
+        self.study.cells().iter().all(|c| is_done(&self.run(c)) || self.failure_file(c).exists())
+    }
+
+    /// What the runs came to, which are all over; pictures are drawn.
+    fn report(&self) -> Result<StudyReport> {
+        let outcome = |c: &Cell| match self.failure(c) {
+            Some(error) => Ok((*c, Outcome::failed(error))),
+            None => Outcome::of_run(&self.run(c)).map(|o| (*c, o)),
+        };
+        let outcomes: Vec<(Cell, Outcome)> = self.study.cells().iter().map(outcome).collect::<Result<_>>()?;
+        if outcomes.iter().all(|(_, o)| o.figures.is_none()) {
+            let why: Vec<&str> = outcomes.iter().filter_map(|(_, o)| o.error.as_deref()).take(3).collect();
+            return Err(Error::unsupported("study: every run failed", why.join("; ")));
+        }
+        let mut cases = vec![];
+        for (case, c) in self.study.cases.iter().enumerate() {
+            let seed = self.study.seeds[0];
+            let input = self.input(&Cell { case, seed, method: 0 })?;
+            cases.push(CaseRecord::new(&c.name, &c.source, &input));
+            self.draw(case, &input, &outcomes)?;
+        }
+        StudyReport::new(self.study, &self.layout, cases, outcomes)
+    }
+
+    /// Draws what the methods came to on a case: slices with the first seed, curves of all.
+    fn draw(&self, case: usize, input: &TrialInput, outcomes: &[(Cell, Outcome)]) -> Result<()> {
+        let Study { cases, methods, seeds, .. } = self.study;
+        let here = || outcomes.iter().filter(|(c, o)| c.case == case && o.figures.is_some());
+        let shown = here().filter(|(c, _)| c.seed == seeds[0]).map(|(c, o)| Shown {
+            name: methods[c.method].name.clone(),
+            psnr: o.figures.as_ref().and_then(|f| f.psnr()),
+            run: self.run(c),
+        });
+        let (slices, curves) = (self.layout.slices(&cases[case].name), self.layout.curves(&cases[case].name));
+        for folder in [&slices, &curves].into_iter().filter_map(|p| p.parent()) {
+            fs::create_dir_all(folder).map_err(|e| Error::io(folder, e))?;
+        }
+        pictures::slices(&slices, input.reference.as_ref(), &shown.collect::<Vec<_>>(), cases[case].window)?;
+        let of = |method| here().filter(|(c, _)| c.method == method).map(|(c, _)| self.run(c)).collect();
+        let runs: Vec<(String, Vec<PathBuf>)> =
+            methods.iter().enumerate().map(|(m, x)| (x.name.clone(), of(m))).collect();
+        pictures::curves(&curves, &cases[case].name, &runs)?;
+        Ok(())
+    }
+}
+
+/// Runs on one scan stand beside each other.
+fn same_scan(a: &Cell, b: &Cell) -> bool {
+    (a.case, a.seed) == (b.case, b.seed)
+}
+
+/// The lock on `folder`, as soon as no other process has it.
+fn await_lock(folder: &Path, part: &str) -> Result<conefield_io::FolderLock> {
+    let mut told = false;
+    loop {
+        if let Some(lock) = try_alone(folder) {
+            return Ok(lock);
+        }
+        if !told {
+            info!("{}: waiting until another conefield, which is writing it, ends", folder.display());
+            told = true;
+        }
+        if signals::caught().is_some() {
+            return Err(Error::Stopped { part: part.into() });
+        }
+        std::thread::sleep(LOOK);
+    }
+}
