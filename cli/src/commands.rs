@@ -17,6 +17,7 @@ mod project;
 mod protocol;
 mod reconstruct;
 mod record;
+mod report;
 mod schema;
 mod simulate;
 mod tradeoff;
@@ -42,6 +43,7 @@ pub enum Command {
     Evaluate(evaluate::EvaluateArgs),
     Export(export::ExportArgs),
     Project(project::ProjectArgs),
+    Report(report::ReportArgs),
     Features(features::FeaturesArgs),
     Explain(explain::ExplainArgs),
     Info(info::InfoArgs),
@@ -65,6 +67,7 @@ pub fn run(command: Command, general: &General) -> Result<()> {
         Command::Evaluate(c) => c.run(),
         Command::Export(c) => c.run(),
         Command::Project(c) => c.run(),
+        Command::Report(c) => c.run(),
         Command::Features(c) => c.run(),
         Command::Explain(c) => c.run(),
         Command::Info(c) => c.run(),

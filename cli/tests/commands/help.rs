@@ -2,7 +2,7 @@
 
 use crate::common::{conefield, done, refused};
 
-const COMMANDS: [&str; 18] = [
+const COMMANDS: [&str; 19] = [
     "simulate",
     "import",
     "reconstruct",
@@ -12,6 +12,7 @@ const COMMANDS: [&str; 18] = [
     "evaluate",
     "export",
     "project",
+    "report",
     "features",
     "explain",
     "info",
