@@ -108,7 +108,7 @@ pub fn title(page: &Page) -> String {
     let scans: Vec<&str> = page.scans.iter().map(|s| &s.name[..]).collect();
     let runs = match &page.runs[..] {
         [one] => one.name.clone(),
-        [some @ ..] if some.len() <= 4 => some.iter().map(|r| &r.name[..]).collect::<Vec<_>>().join(", "),
+        some if some.len() <= 4 => some.iter().map(|r| &r.name[..]).collect::<Vec<_>>().join(", "),
         many => format!("{} runs", many.len()),
     };
     if scans.is_empty() { runs } else { format!("{}: {runs}", scans.join(", ")) }
