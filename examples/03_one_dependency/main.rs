@@ -5,6 +5,7 @@ use conefield::{Reconstruct, Result, io};
 
 fn main() -> Result<()> {
     let folder = std::env::temp_dir().join(format!("conefield-example-{}", std::process::id()));
+    std::fs::create_dir_all(&folder).map_err(|e| conefield::Error::io(&folder, e))?;
 
     // A scan to read. Yours is a folder or a file of your own: docs/your-data.md.
     let truth = phantom(48);
