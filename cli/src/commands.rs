@@ -18,6 +18,7 @@ mod project;
 mod protocol;
 mod reconstruct;
 mod record;
+mod report;
 mod schema;
 mod simulate;
 mod study;
@@ -45,6 +46,7 @@ pub enum Command {
     Evaluate(evaluate::EvaluateArgs),
     Export(export::ExportArgs),
     Project(project::ProjectArgs),
+    Report(report::ReportArgs),
     Features(features::FeaturesArgs),
     Explain(explain::ExplainArgs),
     Info(info::InfoArgs),
@@ -69,6 +71,7 @@ pub fn run(command: Command, general: &General) -> Result<()> {
         Command::Evaluate(c) => c.run(),
         Command::Export(c) => c.run(),
         Command::Project(c) => c.run(),
+        Command::Report(c) => c.run(),
         Command::Features(c) => c.run(),
         Command::Explain(c) => c.run(),
         Command::Info(c) => c.run(),

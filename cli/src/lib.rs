@@ -1,4 +1,16 @@
-//! The `conefield` command, one module a subcommand, and the specs that come with it.
+//! conefield for Rust programs, and the `conefield` command.
+//!
+//! [`Reconstruct`] goes from a scan to a volume, and [`io`] between files and these; [`simulate`] makes scans of known volumes. What
+//! they are built from is in the other modules here.
+//!
+//! ```no_run
+//! # fn main() -> conefield::Result<()> {
+//! let scan = conefield::io::read_scan("scan")?;
+//! let result = conefield::Reconstruct::with("smooth-tv").run(scan)?;
+//! conefield::io::write_volume("volume.nii.gz", &result.volume)?;
+//! # Ok(())
+//! # }
+//! ```
 
 mod boundary;
 mod commands;
@@ -12,11 +24,15 @@ mod run_folder;
 mod segmenter;
 mod signals;
 
+pub use conefield_core::{Error, Result, geometry, scan, spec};
+pub use conefield_io as io;
+pub use conefield_metrics as metrics;
+pub use conefield_projectors::simulate;
+pub use conefield_run::reconstruct::{Reconstruct, Reconstructed};
 pub use conefield_run::specs;
 use conefield_run::{backend, files, memory, method, parse, plugins};
 
 use clap::Parser;
-use conefield_core::Error;
 use std::ffi::OsString;
 use std::process::ExitCode;
 

@@ -2,8 +2,13 @@
 //! `volume.nii.gz`, `weights.safetensors`, `slices.png` and, last and only of a finished run, `record.json`.
 
 use conefield_core::error::ensure;
+use conefield_core::files::read_text;
 use conefield_core::{Error, Result};
 use conefield_io::{Contents, Lease, Progressed};
+use conefield_tradeoff::json::{LONGEST, read_json};
+use conefield_tradeoff::trial::ScanRecord;
+use serde::Deserialize;
+use serde_json::Value;
 use std::fs::{self, File};
 use std::io::ErrorKind;
 use std::path::{Path, PathBuf};
@@ -118,5 +123,123 @@ impl RunFolder {
             Err(e) if e.kind() != ErrorKind::NotFound => Err(Error::io(&path, e)),
             _ => self.0.complete(),
         }
+    }
+}
+
+/// A run as its folder has it.
+pub struct RunOnDisk {
+    folder: PathBuf,
+    spec: String,
+    curves: Vec<Value>,
+    record: Option<Value>,
+    known: Option<Known>,
+}
+
+/// What reading a run again needs of its record.
+#[derive(Deserialize)]
+struct Known {
+    spec: String,
+    scan: ScanRecord,
+    held_out_views: Vec<usize>,
+    reference: Option<PathBuf>,
+}
+
+impl RunOnDisk {
+    /// Whether `folder` is that of a run: its files tell, and nothing else has them.
+    pub fn is(folder: &Path) -> bool {
+        let has = |name: &str| folder.join(name).is_file();
+        has("record.json") || (has("spec.toml") && has("metrics.jsonl"))
+    }
+
+    /// Reads all but the large files.
+    pub fn read(folder: &Path) -> Result<Self> {
+        let file = folder.join("record.json");
+        let record: Option<Value> = if file.exists() { Some(read_json(&file)?) } else { None };
+        let known = record.clone().map(serde_json::from_value).transpose();
+        let known = known.map_err(|e| {
+            Error::invalid(file.display().to_string(), "JSON", e, "what \"conefield reconstruct\" writes there")
+        })?;
+        let text = |name: &str| match folder.join(name) {
+            path if path.exists() => read_text(&path, LONGEST),
+            _ => Ok(String::new()),
+        };
+        // The last line of a run that was killed may be half written.
+        let curves = text("metrics.jsonl")?.lines().filter_map(|l| serde_json::from_str(l).ok()).collect();
+        Ok(Self { folder: folder.to_path_buf(), spec: text("spec.toml")?, curves, record, known })
+    }
+
+    /// Where it lies.
+    pub fn folder(&self) -> &Path {
+        &self.folder
+    }
+
+    /// The spec with every setting; empty if it is not there.
+    pub fn spec(&self) -> &str {
+        &self.spec
+    }
+
+    /// The lines of `metrics.jsonl`.
+    pub fn curves(&self) -> &[Value] {
+        &self.curves
+    }
+
+    /// `record.json` of a finished run.
+    pub fn record(&self) -> Option<&Value> {
+        self.record.as_ref()
+    }
+
+    /// Whether it came to its end.
+    pub fn is_complete(&self) -> bool {
+        self.record.is_some()
+    }
+
+    /// How far it came, in words.
+    pub fn standing(&self) -> &'static str {
+        match progressed(&self.folder) {
+            Progressed::Complete => "complete",
+            Progressed::Begun if self.folder.join("checkpoint.safetensors").exists() => {
+                "interrupted: the same command with --resume goes on"
+            }
+            Progressed::Begun => "interrupted before its record was written",
+            Progressed::Nothing => "interrupted before its first checkpoint",
+        }
+    }
+
+    /// The result, of a finished run.
+    pub fn volume(&self) -> Option<PathBuf> {
+        Some(self.folder.join("volume.nii.gz")).filter(|v| self.is_complete() && v.exists())
+    }
+
+    /// The spec's own name.
+    pub fn spec_name(&self) -> Option<&str> {
+        self.known.as_ref().map(|k| &k.spec[..]).filter(|n| !n.is_empty())
+    }
+
+    /// Where it read the scan.
+    pub fn scan_path(&self) -> Option<&Path> {
+        self.known.as_ref().map(|k| Path::new(&k.scan.path))
+    }
+
+    /// The volume that it was compared with, as that was named.
+    pub fn reference(&self) -> Option<&Path> {
+        self.known.as_ref()?.reference.as_deref()
+    }
+
+    /// Views that it did not see.
+    pub fn held_out(&self) -> &[usize] {
+        self.known.as_ref().map_or(&[], |k| &k.held_out_views)
+    }
+
+    /// Whether `scan` is the one that it worked on, as far as is known.
+    pub fn is_of(&self, scan: &ScanRecord) -> bool {
+        self.known.as_ref().is_none_or(|k| {
+            (&k.scan.projections_fnv1a64, &k.scan.geometry_fnv1a64)
+                == (&scan.projections_fnv1a64, &scan.geometry_fnv1a64)
+        })
+    }
+
+    /// Whether `other` worked on the same scan.
+    pub fn same_scan(&self, other: &Self) -> bool {
+        other.known.as_ref().is_none_or(|k| self.is_of(&k.scan))
     }
 }

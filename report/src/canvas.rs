@@ -4,6 +4,7 @@ use ab_glyph::{Font, FontRef, PxScale, ScaleFont, point};
 use conefield_core::{Error, Result};
 use conefield_io::write_atomic;
 use image::{ExtendedColorType, ImageEncoder, Rgb, RgbImage};
+use std::io::Write;
 use std::path::Path;
 
 /// Where a text starts, along its line.
@@ -108,14 +109,32 @@ impl Canvas {
 
 /// Writes 8-bit RGB pixels as PNG.
 pub(crate) fn write_png(path: &Path, width: u32, height: u32, rgb: &[u8]) -> Result<()> {
-    write_atomic(path, |w| {
-        image::codecs::png::PngEncoder::new(w).write_image(rgb, width, height, ExtendedColorType::Rgb8).map_err(|e| {
-            match e {
-                image::ImageError::IoError(e) => Error::io(path, e),
-                e => Error::invalid(path.display().to_string(), "picture", e, "pixels that PNG can hold"),
-            }
-        })
+    write_atomic(path, |w| encode_png(w, path, width, height, rgb))
+}
+
+/// 8-bit RGB pixels as PNG, called `place` in errors.
+pub(crate) fn encode_png(out: impl Write, place: &Path, width: u32, height: u32, rgb: &[u8]) -> Result<()> {
+    image::codecs::png::PngEncoder::new(out).write_image(rgb, width, height, ExtendedColorType::Rgb8).map_err(|e| {
+        match e {
+            image::ImageError::IoError(e) => Error::io(place, e),
+            e => Error::invalid(place.display().to_string(), "picture", e, "pixels that PNG can hold"),
+        }
     })
+}
+
+/// A round number that all but half a percent of `sizes` stay within.
+pub(crate) fn round_above(mut sizes: Vec<f32>) -> f32 {
+    if sizes.is_empty() {
+        return 1.0;
+    }
+    let at = (sizes.len() - 1) * 995 / 1000;
+    let x = f64::from(*sizes.select_nth_unstable_by(at, f32::total_cmp).1);
+    if x <= 0.0 {
+        return 1.0;
+    }
+    let power = 10f64.powf(x.log10().floor());
+    let round = [1.0, 2.0, 3.0, 5.0, 10.0].into_iter().map(|m| m * power).find(|m| *m >= x * (1.0 - 1e-9));
+    (round.unwrap_or(x) as f32).max(f32::MIN_POSITIVE)
 }
 
 /// Black at 0, white at 1.

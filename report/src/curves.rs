@@ -49,7 +49,7 @@ impl Default for CurveOptions {
 }
 
 /// The first eight are told apart by all but the rarest colour vision, and in grey (after Okabe and Ito).
-const COLOURS: [RGBColor; 10] = [
+pub(crate) const COLOURS: [RGBColor; 10] = [
     RGBColor(0, 114, 178),
     RGBColor(213, 94, 0),
     RGBColor(0, 158, 115),

@@ -3,12 +3,14 @@
 //! - [`slices_png`], [`compare_png`], [`features_png`]: the middle slices of volumes.
 //! - [`curves_png`], [`panels_png`]: line plots.
 //! - [`survey_png`]: a scan's geometry.
+//! - [`page`]: runs in one HTML file, with a viewer.
 //! - [`Table`] and [`text`]: figures for people to read.
 //!
 //! The font is part of the program: a picture does not depend on what the system has.
 
 mod canvas;
 mod curves;
+pub mod page;
 mod slices;
 mod survey;
 mod table;

@@ -1,6 +1,6 @@
 //! Pictures of volumes: middle slices side by side, with differences.
 
-use crate::canvas::{Align, Canvas, diverging, grey, number};
+use crate::canvas::{Align, Canvas, diverging, grey, number, round_above};
 use conefield_core::geometry::VoxelGrid;
 use conefield_core::parts::Part;
 use conefield_core::scan::Volume;
@@ -297,20 +297,7 @@ fn difference_spread(rows: &[Row]) -> Option<f32> {
             }
         }
     }
-    if !any {
-        return None;
-    }
-    if all.is_empty() {
-        return Some(1.0);
-    }
-    let at = (all.len() - 1) * 995 / 1000;
-    let x = f64::from(*all.select_nth_unstable_by(at, f32::total_cmp).1);
-    if x <= 0.0 {
-        return Some(1.0);
-    }
-    let power = 10f64.powf(x.log10().floor());
-    let round = [1.0, 2.0, 3.0, 5.0, 10.0].into_iter().map(|m| m * power).find(|m| *m >= x * (1.0 - 1e-9));
-    Some((round.unwrap_or(x) as f32).max(f32::MIN_POSITIVE))
+    any.then(|| round_above(all))
 }
 
 fn draw_cell(

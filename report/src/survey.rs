@@ -45,20 +45,24 @@ fn text_of<E: std::error::Error + Send + Sync>(e: DrawingAreaErrorKind<E>) -> St
 /// `title` stands over it. Refuses a geometry that does not pass [`Geometry::validate`].
 pub fn survey_png(path: impl AsRef<Path>, title: &str, geometry: &Geometry) -> Result<()> {
     let path = path.as_ref();
-    let place = path.display().to_string();
-    geometry.validate(&place)?;
+    let picture = survey_picture(&path.display().to_string(), title, geometry)?;
+    write_png(path, picture.width(), picture.height(), picture.as_raw())
+}
+
+/// What [`survey_png`] writes, called `place` in errors.
+pub(crate) fn survey_picture(place: &str, title: &str, geometry: &Geometry) -> Result<RgbImage> {
+    geometry.validate(place)?;
     register();
     let [width, height] = SIZE.map(|n| n * FINER);
     let mut pixels = vec![255u8; 3 * width as usize * height as usize];
     {
         let area = BitMapBackend::with_buffer(&mut pixels, (width, height)).into_drawing_area();
         let picture = Picture { geometry, setup: setup(geometry) };
-        picture.draw(&area, title).map_err(|e| Error::invalid(&place, "picture", e, "a geometry that can be drawn"))?;
+        picture.draw(&area, title).map_err(|e| Error::invalid(place, "picture", e, "a geometry that can be drawn"))?;
     }
     let fine: RgbImage = image::ImageBuffer::<Rgb<u8>, _>::from_raw(width, height, pixels)
-        .ok_or_else(|| Error::invalid(&place, "picture", "too few pixels", "a whole picture"))?;
-    let small = resize(&fine, SIZE[0], SIZE[1], FilterType::Triangle);
-    write_png(path, SIZE[0], SIZE[1], small.as_raw())
+        .ok_or_else(|| Error::invalid(place, "picture", "too few pixels", "a whole picture"))?;
+    Ok(resize(&fine, SIZE[0], SIZE[1], FilterType::Triangle))
 }
 
 struct Picture<'g> {

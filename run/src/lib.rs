@@ -4,6 +4,7 @@
 //! - [`files`]: volumes, scans and weights as users name them; [`plugins`]: libraries with stages; [`parse`]: values as
 //!   users write them.
 //! - [`backend`]: what computes; [`memory`]: what a run will hold, and what there is; [`machine`]: where it runs.
+//! - [`reconstruct`]: all of it in a few lines of Rust.
 //! - [`input`]: what a run reads; [`choose`]: the method for it, within a budget of time too.
 //! - [`explain`]: what a spec builds; [`score`]: how far a volume is from its reference.
 //! - [`simulation`], [`pretraining`], [`projection`]: the work of the commands of these names.
@@ -20,6 +21,7 @@ pub mod parse;
 pub mod plugins;
 pub mod pretraining;
 pub mod projection;
+pub mod reconstruct;
 pub mod score;
 pub mod simulation;
 pub mod specs;

@@ -1,30 +1,12 @@
-//! The specs that come with the program, and the weights that the demonstration uses.
+//! Specs by name.
 
 use crate::plugins;
 use conefield_core::method::Plan;
 use conefield_core::registry;
-use conefield_core::spec::load::{Draft, Loaded, Shipped, to_toml};
+use conefield_core::spec::load::{Draft, Loaded, to_toml};
 use conefield_core::{Error, Result};
+pub use conefield_specs::{FAST_WEIGHTS, SHIPPED};
 use std::collections::BTreeMap;
-
-/// The files in `specs/`.
-pub const SHIPPED: &[Shipped] = &[
-    Shipped { name: "naf", text: include_str!("../../specs/naf.toml") },
-    Shipped { name: "ni-naf", text: include_str!("../../specs/ni-naf.toml") },
-    Shipped { name: "ni-naf-published", text: include_str!("../../specs/ni-naf-published.toml") },
-    Shipped { name: "nerf", text: include_str!("../../specs/nerf.toml") },
-    Shipped { name: "dense", text: include_str!("../../specs/dense.toml") },
-    Shipped { name: "accurate", text: include_str!("../../specs/accurate.toml") },
-    Shipped { name: "balanced", text: include_str!("../../specs/balanced.toml") },
-    Shipped { name: "fast", text: include_str!("../../specs/fast.toml") },
-    Shipped { name: "field-tv", text: include_str!("../../specs/field-tv.toml") },
-    Shipped { name: "accurate-tv", text: include_str!("../../specs/accurate-tv.toml") },
-    Shipped { name: "fdk", text: include_str!("../../specs/fdk.toml") },
-    Shipped { name: "os-sart", text: include_str!("../../specs/os-sart.toml") },
-    Shipped { name: "sirt", text: include_str!("../../specs/sirt.toml") },
-    Shipped { name: "fista-tv", text: include_str!("../../specs/fista-tv.toml") },
-    Shipped { name: "smooth-tv", text: include_str!("../../specs/smooth-tv.toml") },
-];
 
 /// Every name that stands for a spec: of those that are shipped, and of methods that need no setting.
 pub fn names() -> Vec<&'static str> {
@@ -59,14 +41,6 @@ pub fn reread(text: &str, source: &str) -> Result<Loaded> {
     let draft = Draft::of(text, source, &[], &[])?;
     plugins::of_spec(&draft)?;
     draft.finish()
-}
-
-/// The MCI weights for the spec `fast`, as a safetensors file.
-pub fn fast_weights() -> Option<&'static [u8]> {
-    #[cfg(fast_weights)]
-    return Some(include_bytes!("../../specs/weights/fast.safetensors"));
-    #[cfg(not(fast_weights))]
-    None
 }
 
 /// What weights say of where they come from.
@@ -116,18 +90,5 @@ mod tests {
             method::plan(&loaded, &Cpu::new()).unwrap();
         }
         assert!(read("neural-field", &[]).err().unwrap().to_string().contains("encoder"));
-    }
-
-    #[test]
-    fn every_file_is_shipped() {
-        let folder = concat!(env!("CARGO_MANIFEST_DIR"), "/../specs");
-        let mut files: Vec<String> = std::fs::read_dir(folder)
-            .unwrap()
-            .filter_map(|e| e.unwrap().file_name().into_string().unwrap().strip_suffix(".toml").map(str::to_owned))
-            .collect();
-        let mut names: Vec<&str> = SHIPPED.iter().map(|s| s.name).collect();
-        files.sort();
-        names.sort();
-        assert_eq!(files, names);
     }
 }

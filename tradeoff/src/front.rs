@@ -5,11 +5,10 @@ use crate::statistics::mean;
 use conefield_core::error::{Error, Result, ensure};
 use conefield_core::files::toml_line;
 use conefield_core::method::Plan;
+use conefield_specs::FRONT;
 use serde::{Deserialize, Serialize};
 use std::path::Path;
 
-/// The front that comes with the program.
-const SHIPPED: &str = include_str!("../../specs/tradeoff/front.toml");
 /// Longest front file, in bytes.
 const LONGEST: u64 = 4 << 20;
 /// How many times as far in size as the nearest scan one may be to count as near.
@@ -145,7 +144,7 @@ pub struct Expected {
 impl Front {
     /// The shipped one.
     pub fn shipped() -> Result<Self> {
-        Self::parse(SHIPPED, "front.toml (shipped)")
+        Self::parse(FRONT, "front.toml (shipped)")
     }
 
     /// Reads a front file.

@@ -8,12 +8,11 @@ use conefield_core::method::Plan;
 use conefield_core::random::mix;
 use conefield_core::spec::load::Loaded;
 use conefield_report::text::stem;
+pub use conefield_specs::LEVERS;
 use serde::{Deserialize, Serialize};
 use serde_json::Value;
 use std::path::Path;
 
-/// The levers that come with the program.
-pub const SHIPPED: &str = include_str!("../../specs/tradeoff/levers.toml");
 /// Longest levers file, in bytes.
 const LONGEST: u64 = 1 << 20;
 /// Draws for one that is new, before the product counts as used up.
@@ -86,7 +85,7 @@ pub struct Candidate {
 impl<'a> Levers<'a> {
     /// The shipped ones.
     pub fn shipped(specs: &'a dyn Specs) -> Result<Self> {
-        Self::parse(SHIPPED, "levers.toml (shipped)", Path::new(""), specs)
+        Self::parse(LEVERS, "levers.toml (shipped)", Path::new(""), specs)
     }
 
     /// Reads a levers file. Specs that it names are shipped ones or files beside it.

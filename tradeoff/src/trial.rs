@@ -10,7 +10,7 @@ use serde_json::Value;
 use std::path::Path;
 
 /// Which scan it was.
-#[derive(Debug, Serialize)]
+#[derive(Debug, Clone, Serialize, Deserialize)]
 pub struct ScanRecord {
     /// Where it was read from.
     pub path: String,

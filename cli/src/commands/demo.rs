@@ -84,21 +84,13 @@ impl DemoArgs {
         info!("simulated {} views of {size} x {size} pixels", self.views);
 
         signals::listen()?;
-        let mut with = vec![];
-        let mut name = "fast (LN)";
-        match specs::fast_weights() {
-            Some(raw) => {
-                let path = folder.join("fast.safetensors");
-                conefield_io::write_atomic(&path, |w| w.write_all(raw).map_err(|e| Error::io(&path, e)))?;
-                with.push(method::init(&specs::read(FIELD, &[])?.tree, &path));
-                name = "fast (LN, MCI)";
-            }
-            None => info!("this build comes without pre-trained weights: MCI is left out"),
-        }
+        let path = folder.join("fast.safetensors");
+        conefield_io::write_atomic(&path, |w| w.write_all(specs::FAST_WEIGHTS).map_err(|e| Error::io(&path, e)))?;
+        let with = vec![method::init(&specs::read(FIELD, &[])?.tree, &path)];
         let without = vec!["normalizers=[]".to_owned(), "initializer.type=random".to_owned()];
         let entries = [
             self.compete(VOXELS, (VOXELS, &[]), &scan, &truth)?,
-            self.compete(name, (FIELD, &with), &scan, &truth)?,
+            self.compete("fast (LN, MCI)", (FIELD, &with), &scan, &truth)?,
             self.compete("without LN, MCI", (FIELD, &without), &scan, &truth)?,
         ];
         for (entry, file) in entries.iter().zip(["smooth-tv.nii.gz", "fast.nii.gz", "without.nii.gz"]) {

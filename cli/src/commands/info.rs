@@ -2,17 +2,15 @@
 
 use crate::boundary::{self, Inputs};
 use crate::memory::Memory;
-use crate::{files, out, run_folder};
+use crate::run_folder::{self, RunOnDisk};
+use crate::{files, out};
 use clap::Args;
-use conefield_core::files::read_text;
 use conefield_core::geometry::{Geometry, VoxelGrid};
 use conefield_core::scan::{Scan, Volume};
 use conefield_core::{Error, Result};
 use conefield_diagnosis::{Survey, setup, survey};
-use conefield_io::Progressed;
 use conefield_report::MiddleSlices;
 use conefield_report::survey_png;
-use conefield_tradeoff::json::{LONGEST, read_json};
 use ndarray::ArrayView3;
 use serde_json::{Value, json};
 use std::path::{Path, PathBuf};
@@ -48,7 +46,7 @@ impl InfoArgs {
         } else if ends("xml") {
             no_picture(path, png)?;
             geometry(path)?
-        } else if is_run(path) {
+        } else if RunOnDisk::is(path) {
             no_picture(path, png)?;
             run(path)?
         } else if conefield_io::is_volume(path) {
@@ -63,43 +61,23 @@ impl InfoArgs {
     }
 }
 
-/// Whether this is the folder of a run: its files tell, and nothing else has them.
-fn is_run(path: &Path) -> bool {
-    let has = |name: &str| path.join(name).is_file();
-    has("record.json") || (has("spec.toml") && has("metrics.jsonl"))
-}
-
 /// What a run was, how far it came and what its folder holds.
 fn run(path: &Path) -> Result<Value> {
     let files: Vec<&str> = run_folder::FILES.into_iter().filter(|f| path.join(f).exists()).collect();
-    let standing = match run_folder::progressed(path) {
-        Progressed::Complete => "complete",
-        Progressed::Begun if path.join("checkpoint.safetensors").exists() => {
-            "interrupted: the same command with --resume goes on"
-        }
-        Progressed::Begun => "interrupted before its record was written",
-        Progressed::Nothing => "interrupted before its first checkpoint",
-    };
-    let record = path.join("record.json");
-    let mut found = json!({ "kind": "run", "standing": standing, "files": files });
-    if record.exists() {
-        let mut record: Value = read_json(&record)?;
+    let run = RunOnDisk::read(path)?;
+    let mut found = json!({ "kind": "run", "standing": run.standing(), "files": files });
+    if let Some(record) = run.record() {
+        let mut record = record.clone();
         // What a machine reads stands in the file itself.
         if let Some(map) = record.as_object_mut() {
             ["memory", "backend", "plan"].iter().for_each(|key| drop(map.remove(*key)));
         }
         found["record"] = record;
-    } else if let Some(last) = last_record(&path.join("metrics.jsonl"))? {
-        found["last_record"] = last;
+    } else if let Some(last) = run.curves().last() {
+        found["last_record"] = last.clone();
     }
-    found["spec"] = json!(read_text(&path.join("spec.toml"), LONGEST).unwrap_or_default());
+    found["spec"] = json!(run.spec());
     Ok(found)
-}
-
-/// The last whole line of a run's metrics.
-fn last_record(path: &Path) -> Result<Option<Value>> {
-    let text = read_text(path, LONGEST)?;
-    Ok(text.lines().rev().find_map(|l| serde_json::from_str(l).ok()))
 }
 
 /// The warnings for people, a paragraph each.

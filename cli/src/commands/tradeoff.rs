@@ -85,7 +85,7 @@ const NEVER: f64 = 1e9;
 impl TradeoffArgs {
     pub fn run(self, general: &General) -> Result<()> {
         if self.show_levers {
-            return out::say(levers::SHIPPED.trim_end());
+            return out::say(levers::LEVERS.trim_end());
         }
         // Whatever is wrong with the input is told before anything is made.
         let Some(output) = &self.output else { return Err(Error::invalid("tradeoff", "-o", "nothing", "a folder")) };

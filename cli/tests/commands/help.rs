@@ -13,6 +13,7 @@ const COMMANDS: [&str; 19] = [
     "evaluate",
     "export",
     "project",
+    "report",
     "features",
     "explain",
     "info",

@@ -21,6 +21,7 @@ mod peak;
 mod project;
 mod quality;
 mod refusals;
+mod report;
 #[cfg(unix)]
 mod resume;
 mod schema;

@@ -1001,6 +1001,9 @@ pub type ConefieldEntry = unsafe extern "C" fn() -> *const ConefieldPlugin;
 /// The name of the function that a plugin exports.
 pub const ENTRY: &str = "conefield_plugin";
 
+/// The contract as C reads it: the text of `conefield_plugin.h`.
+pub const HEADER: &str = include_str!("../include/conefield_plugin.h");
+
 impl ConefieldStr {
     /// `text`, which must outlive every use of this.
     pub const fn of(text: &str) -> Self {

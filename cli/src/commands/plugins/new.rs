@@ -101,12 +101,9 @@ const RESERVED: [&str; 62] = [
 
 macro_rules! template {
     ($name:expr) => {
-        include_str!(concat!("../../../../plugins/templates/", $name))
+        include_str!(concat!("../../../templates/", $name))
     };
 }
-
-/// The contract, as C reads it.
-const HEADER: &str = include_str!("../../../../plugins/abi/include/conefield_plugin.h");
 
 /// What is written, and what comes of it.
 struct Start {
@@ -211,7 +208,7 @@ impl New {
     fn rust(&self) -> Result<Start> {
         let [stage, test] = self.kind.rust();
         let files = vec![
-            ("Cargo.toml".into(), self.fill(template!("rust/Cargo.toml"))?),
+            ("Cargo.toml".into(), self.fill(template!("rust/manifest.toml"))?),
             (".gitignore".into(), "/target\n".into()),
             ("src/lib.rs".into(), self.fill(stage)?),
             ("tests/conformance.rs".into(), self.fill(test)?),
@@ -228,7 +225,7 @@ impl New {
         let named = |text: &str| text.replace("@head@", head).replace("@plugin@", plugin).replace("@name@", &self.name);
         let files = vec![
             (format!("{}.c", self.name), named(self.kind.c())),
-            ("conefield_plugin.h".into(), HEADER.into()),
+            ("conefield_plugin.h".into(), conefield_plugin_abi::HEADER.into()),
             ("Makefile".into(), named(template!("c/Makefile"))),
             ("spec.toml".into(), self.spec()),
         ];

@@ -1,0 +1,154 @@
+//! `conefield report`
+
+mod runs;
+mod scans;
+
+use crate::boundary::{self, Inputs, refuse_existing};
+use crate::memory::Memory;
+use crate::out;
+use crate::parse::{self, HoldOut};
+use crate::run_folder::RunOnDisk;
+use clap::Args;
+use conefield_core::Result;
+use conefield_report::page::{Page, PageVolume, coarser};
+use conefield_run::projection;
+use scans::{Group, Options};
+use serde_json::{Value, json};
+use std::path::PathBuf;
+
+/// Show runs in one HTML page that any browser opens, without a network.
+///
+/// The page has slices and a rendering of the volumes with the values at a crosshair, windows, differences to the reference and
+/// between runs; scores, times, memory; the curves of training; measured and predicted projections with what is left
+/// between them; the scan's geometry; the spec with what it builds; and warnings. RUN is what "conefield reconstruct"
+/// leaves, or what "conefield compare" does: then all runs of it are shown. Scan and reference are read where the run read
+/// them; what is no longer there is left out and said.
+#[derive(Args)]
+pub struct ReportArgs {
+    /// The folder of a run or of a comparison; several stand beside each other.
+    #[arg(required = true, value_name = "RUN")]
+    runs: Vec<PathBuf>,
+    /// The page, such as report.html.
+    #[arg(short, long = "output", value_name = "FILE")]
+    output: PathBuf,
+    /// Replace FILE.
+    #[arg(long)]
+    force: bool,
+    /// The scan of all runs, where it is elsewhere now.
+    #[arg(long, value_name = "SCAN")]
+    scan: Option<PathBuf>,
+    /// The volume sought, to compare with, where the runs name none or it is elsewhere now: a file, or "truth" for the one
+    /// that the scan comes with.
+    #[arg(long, value_name = "VOLUME")]
+    reference: Option<PathBuf>,
+    /// Views to show, such as 3,17 or every:10 [default: six].
+    #[arg(long, value_name = "VIEWS", value_parser = parse::hold_out)]
+    views: Option<HoldOut>,
+    /// How line integrals of voxels are computed: joseph, siddon or trilinear.
+    #[arg(long, value_name = "TYPE", default_value = projection::PROJECTOR)]
+    projector: String,
+    /// Bytes that the voxels of all volumes may take in the page, two each, before they are packed. Where they take more, the
+    /// page has means of blocks of voxels.
+    #[arg(long, value_name = "SIZE", default_value = "64MiB", value_parser = parse::bytes)]
+    embed: u64,
+    /// Print one JSON object.
+    #[arg(long)]
+    json: bool,
+}
+
+impl ReportArgs {
+    pub fn run(self) -> Result<()> {
+        boundary::ends(&self.output, "html")?;
+        refuse_existing(&self.output, self.force)?;
+        let found = runs::find(&self.runs)?;
+        Inputs::of(&self.runs)
+            .and(found.iter().map(RunOnDisk::folder))
+            .and(found.iter().filter_map(|r| r.scan_path()))
+            .and(found.iter().filter_map(|r| r.reference()))
+            .and(&self.scan)
+            .and(&self.reference)
+            .spare_file(&self.output)?;
+        let options = Options {
+            scan: self.scan.as_deref(),
+            reference: self.reference.as_deref(),
+            views: self.views.as_ref(),
+            projector: projection::projector(Value::String(self.projector.clone()))?,
+        };
+        let mut page = Page::default();
+        let groups = Group::all(&found, &options, &mut page)?;
+        let voxels: Vec<u64> = groups.iter().flat_map(Group::voxels).collect();
+        let coarser = coarser(&voxels, self.embed);
+        self.check_memory(&groups, &options)?;
+
+        page.runs = runs::told(&found, &mut page.warnings);
+        let mut results: Vec<Option<PageVolume>> = found.iter().map(|_| None).collect();
+        let mut references = vec![];
+        for group in groups {
+            group.show(&found, &options, coarser, &mut page, &mut results, &mut references)?;
+        }
+        page.volumes = results.into_iter().flatten().chain(references).collect();
+        page.title = runs::title(&page);
+        page.notes = notes(&page, coarser);
+        let bytes = page.write(&self.output)?;
+        self.tell(&page, coarser, bytes)
+    }
+
+    /// Refuses what does not fit: a volume at a time beside its scan, and what of all is on its way into the page.
+    fn check_memory(&self, groups: &[Group], options: &Options) -> Result<()> {
+        let all: u64 = groups.iter().flat_map(Group::voxels).sum::<u64>() * 2;
+        // Packed at worst as they are, as text, and before that in two halves.
+        let packed = 2 * all.min(self.embed);
+        let moments = groups.iter().map(|g| g.memory(options, packed)).collect::<Result<Vec<_>>>()?;
+        Memory::most(&moments.concat()).check(|_| vec![])
+    }
+
+    fn tell(&self, page: &Page, coarser: usize, bytes: u64) -> Result<()> {
+        let views: Vec<usize> = page.scans.iter().flat_map(|s| s.views.iter().map(|v| v.view)).collect();
+        if self.json {
+            let volumes = page.volumes.iter().map(|v| json!({ "name": v.name(), "shape": v.shape() }));
+            return out::json(&json!({
+                "page": self.output.display().to_string(), "bytes": bytes, "runs": page.runs.iter().map(|r| &r.name).collect::<Vec<_>>(),
+                "volumes": volumes.collect::<Vec<_>>(), "coarser": coarser, "views": views,
+                "warnings": page.warnings.iter().map(|w| &w.found).collect::<Vec<_>>(),
+            }));
+        }
+        let count = |n: usize, what: &str| format!("{n} {what}{}", if n == 1 { "" } else { "s" });
+        let mut lines = vec![format!(
+            "{}: {}, {}, {} in {}",
+            self.output.display(),
+            count(page.runs.len(), "run"),
+            count(page.volumes.len(), "volume"),
+            count(views.len(), "view"),
+            out::bytes(bytes),
+        )];
+        if coarser > 1 {
+            let limit = out::bytes(self.embed);
+            lines.push(format!(
+                "the volumes take more than {limit} (--embed): means of {coarser} x {coarser} x {coarser} voxels are shown"
+            ));
+        }
+        lines.extend(page.warnings.iter().map(|w| format!("warning: {}", w.found)));
+        out::say(&lines.join("\n"))
+    }
+}
+
+/// Sentences on the page itself.
+fn notes(page: &Page, coarser: usize) -> Vec<String> {
+    let mut notes = vec![format!(
+        "Made by conefield {}. All that this page shows is in its file: it fetches nothing.",
+        env!("CARGO_PKG_VERSION")
+    )];
+    if !page.volumes.is_empty() {
+        let coarse = if coarser > 1 { " of means of blocks of voxels" } else { "" };
+        notes.push(format!(
+            "Voxels are 16-bit steps{coarse}, spread evenly from each volume's lowest to its highest value; the step stands below the \
+             volume. Scores are those of the run's record, over all voxels as they are in its files."
+        ));
+        notes.push(
+            "Lung, soft tissue and bone are windows in Hounsfield units: level −600, 40 and 400, width 1500, 400 and 1800. They hold \
+             where the value of air is 0 and that of water is the one beside them, which is a guess: set it to what your data has."
+                .into(),
+        );
+    }
+    notes
+}

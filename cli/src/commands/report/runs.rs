@@ -1,0 +1,115 @@
+//! The runs that a report shows.
+
+use crate::run_folder::RunOnDisk;
+use crate::{method, specs};
+use conefield_backend_cpu::Cpu;
+use conefield_core::Result;
+use conefield_core::error::ensure;
+use conefield_report::page::{Notice, Page, PageRun};
+use conefield_report::text::stem;
+use conefield_run::explain::Explanation;
+use conefield_tradeoff::json::read_json;
+use serde::Deserialize;
+use std::collections::BTreeSet;
+use std::path::{Path, PathBuf};
+
+/// The runs in `folders`: each is a run, or a comparison with several.
+pub fn find(folders: &[PathBuf]) -> Result<Vec<RunOnDisk>> {
+    let mut found: Vec<RunOnDisk> = vec![];
+    for folder in folders {
+        for run in of_folder(folder)? {
+            let twice = found.iter().any(|r| same_file::is_same_file(r.folder(), &run).unwrap_or(false));
+            ensure(!twice, &run.display().to_string(), "run", "a run that is shown already", "each run once")?;
+            found.push(RunOnDisk::read(&run)?);
+        }
+    }
+    Ok(found)
+}
+
+fn of_folder(folder: &Path) -> Result<Vec<PathBuf>> {
+    #[derive(Deserialize)]
+    struct Comparison {
+        methods: Vec<Method>,
+    }
+    #[derive(Deserialize)]
+    struct Method {
+        name: String,
+    }
+    std::fs::metadata(folder).map_err(|e| conefield_core::Error::io(folder, e))?;
+    let place = folder.display().to_string();
+    let table = folder.join("table.json");
+    if !table.is_file() {
+        let expected = "the folder of a run (spec.toml and metrics.jsonl) or of a comparison (table.json)";
+        ensure(RunOnDisk::is(folder), &place, "run", "no run", expected)?;
+        return Ok(vec![folder.to_path_buf()]);
+    }
+    let comparison: Comparison = read_json(&table)?;
+    let mut runs = vec![];
+    for method in comparison.methods {
+        // A name is a folder here, and nothing else.
+        let plain = Path::new(&method.name).components().count() == 1 && !method.name.starts_with('.');
+        ensure(plain, &table.display().to_string(), "name", format!("{:?}", method.name), "the name of a folder")?;
+        runs.extend(Some(folder.join(&method.name)).filter(|run| RunOnDisk::is(run)));
+    }
+    ensure(!runs.is_empty(), &place, "runs", "none", "a comparison with at least one run")?;
+    Ok(runs)
+}
+
+/// The runs as the page tells of them, each under a name of its own.
+pub fn told(found: &[RunOnDisk], warnings: &mut Vec<Notice>) -> Vec<PageRun> {
+    let names = names(found);
+    found
+        .iter()
+        .zip(names)
+        .map(|(run, name)| {
+            let notice = |found: String| Notice { found: format!("{name}: {found}"), advice: String::new() };
+            warnings.extend((!run.is_complete()).then(|| notice(format!("the run is {}", run.standing()))));
+            if let Some(n) = run.record().and_then(|r| r["rollbacks"].as_u64()).filter(|n| *n > 0) {
+                warnings
+                    .push(notice(format!("training ran away {n} times and went back, with half the learning rate")));
+            }
+            PageRun {
+                folder: run.folder().display().to_string(),
+                standing: run.standing().into(),
+                spec: run.spec().to_owned(),
+                plan: plan(run).ok(),
+                record: run.record().cloned(),
+                curves: run.curves().to_vec(),
+                name,
+                ..PageRun::default()
+            }
+        })
+        .collect()
+}
+
+/// What the spec builds. One whose plugins are not loaded builds nothing here.
+fn plan(run: &RunOnDisk) -> Result<String> {
+    let loaded = specs::reread(run.spec(), &run.folder().join("spec.toml").display().to_string())?;
+    let plan = method::plan_without_files(&loaded, &Cpu::new())?;
+    Ok(Explanation::new(&loaded, plan.as_ref(), None)?.text())
+}
+
+/// The specs' names, the folders' where these do not tell the runs apart, or else whole paths.
+fn names(found: &[RunOnDisk]) -> Vec<String> {
+    let own = |run: &RunOnDisk| {
+        run.spec_name().map(str::to_owned).unwrap_or_else(|| stem(&run.folder().display().to_string()))
+    };
+    let folder = |run: &RunOnDisk| stem(&run.folder().canonicalize().unwrap_or_default().display().to_string());
+    let path = |run: &RunOnDisk| run.folder().display().to_string();
+    let ways: [&dyn Fn(&RunOnDisk) -> String; 3] = [&own, &folder, &path];
+    let distinct = |names: &Vec<String>| names.iter().collect::<BTreeSet<_>>().len() == names.len();
+    let all = ways.into_iter().map(|way| found.iter().map(way).collect::<Vec<_>>());
+    let last = all.clone().next_back().unwrap_or_default();
+    all.into_iter().find(distinct).unwrap_or(last)
+}
+
+/// What stands over the page.
+pub fn title(page: &Page) -> String {
+    let scans: Vec<&str> = page.scans.iter().map(|s| &s.name[..]).collect();
+    let runs = match &page.runs[..] {
+        [one] => one.name.clone(),
+        some if some.len() <= 4 => some.iter().map(|r| &r.name[..]).collect::<Vec<_>>().join(", "),
+        many => format!("{} runs", many.len()),
+    };
+    if scans.is_empty() { runs } else { format!("{}: {runs}", scans.join(", ")) }
+}

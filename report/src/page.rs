@@ -1,0 +1,231 @@
+//! One HTML file that shows runs: volumes in a viewer, scores, curves, projections, geometry, specs, warnings.
+//!
+//! All that the page shows and all that shows it is in the file, which fetches nothing: its content security policy forbids that
+//! to it. The viewer and the plots are libraries of others (`report/page/vendor`).
+
+mod picture;
+mod volume;
+
+pub use picture::{Scale, geometry_url, picture_url, spread};
+pub use volume::{PageVolume, coarser};
+
+use conefield_core::{Error, Result};
+use conefield_io::write_atomic;
+use serde::Serialize;
+use serde_json::{Value, json};
+use std::path::Path;
+
+const FRAME: &str = include_str!("../page/page.html");
+const STYLES: [&str; 2] = [include_str!("../page/vendor/uPlot.min.css"), include_str!("../page/page.css")];
+const PLOTS: &str = include_str!("../page/vendor/uPlot.iife.min.js");
+const VIEWER: &str = include_str!("../page/vendor/niivue.min.js");
+const SCRIPT: &str = include_str!("../page/page.js");
+const LICENCES: &str = include_str!("../page/vendor/LICENCES.txt");
+
+/// What a page shows.
+#[derive(Debug, Default, Serialize)]
+pub struct Page {
+    /// What stands over it.
+    pub title: String,
+    /// What whoever reads the results should know first.
+    pub warnings: Vec<Notice>,
+    /// Results in the order of `runs`, then references.
+    pub volumes: Vec<PageVolume>,
+    /// The runs.
+    pub runs: Vec<PageRun>,
+    /// Their scans.
+    pub scans: Vec<PageScan>,
+    /// Sentences on the page itself.
+    pub notes: Vec<String>,
+}
+
+/// A warning.
+#[derive(Debug, Clone, PartialEq, Eq, Serialize)]
+pub struct Notice {
+    /// What was found.
+    pub found: String,
+    /// What to do about it, where that is not plain.
+    pub advice: String,
+}
+
+/// A run.
+#[derive(Debug, Default, Serialize)]
+pub struct PageRun {
+    /// What tells it from the others.
+    pub name: String,
+    /// Where it lies.
+    pub folder: String,
+    /// How far it came.
+    pub standing: String,
+    /// Its spec, with every setting.
+    pub spec: String,
+    /// What the spec builds, for people.
+    pub plan: Option<String>,
+    /// Its `record.json`, of a finished run.
+    pub record: Option<Value>,
+    /// The lines of its `metrics.jsonl`.
+    pub curves: Vec<Value>,
+    /// Which of the page's scans it is of, where that is known.
+    pub scan: Option<usize>,
+    /// Its result in the scan's views.
+    pub views: Option<PredictedViews>,
+}
+
+/// What a scanner would have measured of a result.
+#[derive(Debug, Serialize)]
+pub struct PredictedViews {
+    /// What computed the line integrals.
+    pub projector: String,
+    /// Root mean square of measured less predicted line integrals, of the views shown.
+    pub rms: f64,
+    /// The same over the largest measured line integral of these views.
+    pub relative: f64,
+    /// In the order of the scan's views.
+    pub images: Vec<PredictedView>,
+}
+
+/// One view of a result.
+#[derive(Debug, Serialize)]
+pub struct PredictedView {
+    /// The predicted line integrals, a picture ([`picture_url`]).
+    pub predicted: String,
+    /// Measured less predicted, a picture.
+    pub residual: String,
+    /// Root mean square of that.
+    pub rms: f64,
+}
+
+/// A scan.
+#[derive(Debug, Default, Serialize)]
+pub struct PageScan {
+    /// Its name.
+    pub name: String,
+    /// Its sizes in a sentence.
+    pub line: String,
+    /// How many views it has.
+    pub count: usize,
+    /// What its files say, for people.
+    pub facts: Option<String>,
+    /// A picture of its geometry ([`geometry_url`]).
+    pub geometry: Option<String>,
+    /// The views that are shown.
+    pub views: Vec<MeasuredView>,
+    /// The line integrals that are black and white in them.
+    pub window: [f32; 2],
+    /// The residual that is deepest red, over all runs.
+    pub residual_span: f32,
+}
+
+/// One measured view.
+#[derive(Debug, Serialize)]
+pub struct MeasuredView {
+    /// Its number, from 0.
+    pub view: usize,
+    /// Whether a run did not see it.
+    pub held_out: bool,
+    /// The line integrals, a picture ([`picture_url`]).
+    pub measured: String,
+}
+
+impl Page {
+    /// Writes the page as HTML to `path`; its bytes.
+    pub fn write(&self, path: impl AsRef<Path>) -> Result<u64> {
+        let path = path.as_ref();
+        let text =
+            self.data().map_err(|e| Error::invalid(path.display().to_string(), "page", e, "what JSON can hold"))?;
+        let mut written = 0;
+        write_atomic(path, |out| {
+            let mut put = |piece: &str| {
+                written += piece.len() as u64;
+                out.write_all(piece.as_bytes()).map_err(|e| Error::io(path, e))
+            };
+            // What is put in is not searched for marks again.
+            for (i, piece) in FRAME.split('@').enumerate() {
+                match piece {
+                    text if i % 2 == 0 => put(text)?,
+                    "title" => put(&in_markup(&self.title))?,
+                    "styles" => STYLES.into_iter().try_for_each(&mut put)?,
+                    "page" => put(&text)?,
+                    "volumes" => {
+                        for (i, volume) in self.volumes.iter().enumerate() {
+                            put(&format!("<script type=\"application/octet-stream\" id=\"volume-{i}\">"))?;
+                            put(volume.packed())?;
+                            put("</script>\n")?;
+                        }
+                    }
+                    "plots" => put(PLOTS)?,
+                    "viewer" => put(VIEWER)?,
+                    _ => put(SCRIPT)?,
+                }
+            }
+            Ok(())
+        })?;
+        Ok(written)
+    }
+
+    /// All but the voxels, as JSON that can stand in an element of HTML.
+    fn data(&self) -> serde_json::Result<String> {
+        let mut all = serde_json::to_value(self)?;
+        all["colours"] = json!(crate::curves::COLOURS.map(|c| format!("#{:02x}{:02x}{:02x}", c.0, c.1, c.2)));
+        all["diverging"] = diverging();
+        all["licences"] = json!(LICENCES);
+        let text = serde_json::to_string(&all)?;
+        // Outside texts JSON has none of these, and in texts it reads them escaped.
+        let mut escaped = String::with_capacity(text.len());
+        for c in text.chars() {
+            match c {
+                '<' | '>' | '&' | '\u{2028}' | '\u{2029}' => escaped += &format!("\\u{:04x}", c as u32),
+                c => escaped.push(c),
+            }
+        }
+        Ok(escaped)
+    }
+}
+
+/// The colours of differences as the viewer wants them.
+fn diverging() -> Value {
+    let at = [0u8, 64, 128, 191, 255];
+    let channel = |k: usize| at.map(|i| crate::canvas::diverging(2.0 * f32::from(i) / 255.0 - 1.0).0[k]);
+    // Large differences are opaque in a rendering, and none is not seen.
+    json!({ "R": channel(0), "G": channel(1), "B": channel(2), "A": [160, 60, 0, 60, 160], "I": at })
+}
+
+/// `text` as the text of an element.
+fn in_markup(text: &str) -> String {
+    text.replace('&', "&amp;").replace('<', "&lt;").replace('>', "&gt;")
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn the_frame_has_every_mark_once_and_the_libraries_end_no_element() {
+        let marks: Vec<&str> = FRAME.split('@').skip(1).step_by(2).collect();
+        assert_eq!(marks, ["title", "styles", "page", "volumes", "plots", "viewer", "script"]);
+        for script in [PLOTS, VIEWER, SCRIPT] {
+            let lower = script.to_lowercase();
+            assert!(!lower.contains("</script") && !lower.contains("<!--"));
+        }
+        assert!(STYLES.iter().all(|s| !s.contains('<')));
+        for name in ["NiiVue", "uPlot", "fflate", "gl-matrix", "nifti-reader-js"] {
+            assert!(LICENCES.contains(name), "{name}");
+        }
+    }
+
+    #[test]
+    fn hostile_text_stays_text() {
+        let bad = "</script><script>alert(1)</script><!-- \u{2028} & \"";
+        let page = Page { title: bad.into(), notes: vec![bad.into()], ..Page::default() };
+        let dir = tempfile::tempdir().unwrap();
+        let path = dir.path().join("page.html");
+        let bytes = page.write(&path).unwrap();
+        let html = std::fs::read_to_string(&path).unwrap();
+        assert_eq!(html.len() as u64, bytes);
+        assert!(!html.contains("alert(1)</script>") && !html.contains("<script>alert"));
+        assert!(html.contains("<title>&lt;/script&gt;"));
+        let (_, rest) = html.split_once("<script type=\"application/json\" id=\"page\">").unwrap();
+        let data: Value = serde_json::from_str(rest.split_once("</script>").unwrap().0).unwrap();
+        assert_eq!((data["title"].as_str(), data["notes"][0].as_str()), (Some(bad), Some(bad)));
+    }
+}

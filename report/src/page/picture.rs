@@ -1,0 +1,78 @@
+//! Pictures within a page: PNG as `data:` addresses.
+
+use crate::canvas::{diverging, encode_png, grey, round_above};
+use crate::survey::survey_picture;
+use base64::Engine as _;
+use base64::engine::general_purpose::STANDARD;
+use conefield_core::Result;
+use conefield_core::geometry::Geometry;
+use ndarray::{Array2, ArrayView2, s};
+
+/// Pixels along the longer side, at most.
+const SIDE: usize = 512;
+
+/// Which colours values have.
+#[derive(Debug, Clone, Copy)]
+pub enum Scale {
+    /// From black to white.
+    Grey([f32; 2]),
+    /// Blue below, red above, deepest at this distance from zero.
+    Signed(f32),
+}
+
+/// `values`, rows from the top, as the address of a picture. Larger ones are shown as means of blocks.
+pub fn picture_url(values: ArrayView2<'_, f32>, scale: Scale) -> Result<String> {
+    let by = values.shape().iter().max().map_or(1, |n| n.div_ceil(SIDE)).max(1);
+    let shape = [0, 1].map(|k| values.shape()[k].div_ceil(by));
+    let block = |i: usize, k: usize| i * by..((i + 1) * by).min(values.shape()[k]);
+    let shown = Array2::from_shape_fn(shape, |(row, column)| {
+        values.slice(s![block(row, 0), block(column, 1)]).mean().unwrap_or(0.0)
+    });
+    let rgb: Vec<u8> = shown
+        .iter()
+        .flat_map(|x| match scale {
+            Scale::Grey([low, high]) => grey((x - low) / (high - low)).0,
+            Scale::Signed(span) => diverging(x / span).0,
+        })
+        .collect();
+    url(shape[1] as u32, shape[0] as u32, &rgb)
+}
+
+/// The picture that [`survey_png`](crate::survey_png) draws, as an address.
+pub fn geometry_url(title: &str, geometry: &Geometry) -> Result<String> {
+    let picture = survey_picture("a picture of the geometry", title, geometry)?;
+    url(picture.width(), picture.height(), picture.as_raw())
+}
+
+/// A round number that all but half a percent of the `values` stay within.
+pub fn spread(values: impl Iterator<Item = f32>) -> f32 {
+    round_above(values.map(f32::abs).filter(|x| x.is_finite()).collect())
+}
+
+fn url(width: u32, height: u32, rgb: &[u8]) -> Result<String> {
+    let mut png = vec![];
+    encode_png(&mut png, "a picture in a page".as_ref(), width, height, rgb)?;
+    Ok(format!("data:image/png;base64,{}", STANDARD.encode(png)))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_picture_has_the_values_rows_from_the_top() {
+        let mut values = Array2::zeros((4, 1030));
+        values[(0, 1029)] = 1.0;
+        values[(0, 1028)] = 1.0;
+        values[(3, 0)] = 9.0;
+        let url = picture_url(values.view(), Scale::Grey([0.0, 1.0])).unwrap();
+        let bytes = STANDARD.decode(url.strip_prefix("data:image/png;base64,").unwrap()).unwrap();
+        let image = image::load_from_memory(&bytes).unwrap().to_rgb8();
+        // Blocks of 3, the last ones of what is left.
+        assert_eq!((image.width(), image.height()), (344, 2));
+        assert_eq!(image.get_pixel(343, 0).0, [85; 3], "one of three rows");
+        assert_eq!(image.get_pixel(0, 1).0, [255; 3]);
+        assert_eq!(image.get_pixel(5, 1).0, [0; 3]);
+        assert_eq!(spread([0.1, -2.5, -2.4, f32::NAN].into_iter()), 3.0);
+    }
+}

@@ -1,0 +1,56 @@
+//! The files beside this crate's manifest, as texts that are part of the program: specs by name, weights, and what a search of
+//! settings begins with.
+
+use conefield_core::spec::load::Shipped;
+
+macro_rules! shipped {
+    ($($name:literal)*) => {
+        &[$(Shipped { name: $name, text: include_str!(concat!("../", $name, ".toml")) },)*]
+    };
+}
+
+/// The specs.
+pub const SHIPPED: &[Shipped] = shipped! {
+    "naf"
+    "ni-naf"
+    "ni-naf-published"
+    "nerf"
+    "dense"
+    "accurate"
+    "balanced"
+    "fast"
+    "field-tv"
+    "accurate-tv"
+    "fdk"
+    "os-sart"
+    "sirt"
+    "fista-tv"
+    "smooth-tv"
+};
+
+/// MCI weights for the spec `fast`, as a safetensors file.
+pub const FAST_WEIGHTS: &[u8] = include_bytes!("../weights/fast.safetensors");
+
+/// Which settings a search varies.
+pub const LEVERS: &str = include_str!("../tradeoff/levers.toml");
+
+/// Methods of which none is beaten in time and accuracy.
+pub const FRONT: &str = include_str!("../tradeoff/front.toml");
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn every_file_is_shipped() {
+        let folder = std::fs::read_dir(env!("CARGO_MANIFEST_DIR")).unwrap();
+        let mut files: Vec<String> = folder
+            .filter_map(|e| e.unwrap().file_name().into_string().unwrap().strip_suffix(".toml").map(str::to_owned))
+            .filter(|name| name != "Cargo")
+            .collect();
+        let mut names: Vec<&str> = SHIPPED.iter().map(|s| s.name).collect();
+        files.sort();
+        names.sort();
+        assert_eq!(files, names);
+    }
+}
