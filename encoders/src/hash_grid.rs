@@ -177,20 +177,28 @@ impl HashGridStage {
     }
 }
 
-/// Rows that are located together: their 8 indices and weights stay in the L1 cache.
+/// Rows that are located together: their entries and weights stay in the L1 cache.
 const BLOCK: usize = 64;
 
-/// Where the rows of a block fall on one level.
+/// Where the rows of a block fall on one level. The corners of a cell are the ends of four edges along x, of which
+/// number `e` has the larger y where `e & 1` is set and the larger z where `e & 2` is.
 struct Located<R> {
-    index: [[u32; BLOCK]; 8],
-    weight: [[R; BLOCK]; 8],
-    /// Position within the cell, for the gradient with respect to the point.
+    /// Cell of each row.
+    cell: [[u32; BLOCK]; 3],
+    /// Position within the cell.
     fraction: [[R; BLOCK]; 3],
+    /// Entry of each edge's end with the smaller x.
+    near: [[u32; BLOCK]; 4],
+    /// Entry of the other end. On a dense level it is the next one, and does not stand here.
+    far: [[u32; BLOCK]; 4],
+    /// Weight of each edge.
+    weight: [[R; BLOCK]; 4],
 }
 
 impl<R: Real> Located<R> {
     fn new() -> Self {
-        Self { index: [[0; BLOCK]; 8], weight: [[R::ZERO; BLOCK]; 8], fraction: [[R::ZERO; BLOCK]; 3] }
+        let (entries, numbers) = ([0; BLOCK], [R::ZERO; BLOCK]);
+        Self { cell: [entries; 3], fraction: [numbers; 3], near: [entries; 4], far: [entries; 4], weight: [numbers; 4] }
     }
 
     /// Locates rows `at..at + n` of `x`. Points outside the cube count as on its rim.
@@ -200,7 +208,6 @@ impl<R: Real> Located<R> {
         let (zero, half, scale, top) = (number(0.0), number(0.5), number(level.scale), number(level.scale + 0.5));
         // `top` may have been rounded up to where another cell would begin.
         let last = number(f64::from(level.side - 2));
-        let mut cell = [[0u32; BLOCK]; 3];
         for d in 0..3 {
             let x = &x.channel(d)[at..at + n];
             let mut i = 0;
@@ -209,42 +216,69 @@ impl<R: Real> Located<R> {
                 let p = load(s, x, i).mul_add(scale, half).max_precise(zero).min(top);
                 let c = p.floor().min(last);
                 store::<S, R>(p - c, &mut self.fraction[d], i);
-                R::cells(s, c, &mut cell[d][i..]);
+                R::cells(s, c, &mut self.cell[d][i..]);
                 i += V::<S, R>::LEN;
             }
         }
-        let [cx, cy, cz] = &cell;
+        // These loops go over the whole block, even where it has fewer rows: a known length makes them faster.
+        let [cx, cy, cz] = &self.cell;
         if level.dense {
             let (sy, sz) = (level.side, level.side * level.side);
-            for i in 0..n {
+            for i in 0..BLOCK {
                 let base = cx[i] + cy[i] * sy + cz[i] * sz;
-                for c in 0..8u32 {
-                    self.index[c as usize][i] = base + (c & 1) + (c >> 1 & 1) * sy + (c >> 2) * sz;
+                for e in 0..4u32 {
+                    self.near[e as usize][i] = base + (e & 1) * sy + (e >> 1) * sz;
                 }
             }
         } else {
             let mask = level.entries - 1;
-            for i in 0..n {
+            for i in 0..BLOCK {
                 let (y0, z0) = (cy[i].wrapping_mul(primes[1]), cz[i].wrapping_mul(primes[2]));
                 let (y1, z1) = (y0.wrapping_add(primes[1]), z0.wrapping_add(primes[2]));
                 let (x0, x1) = (cx[i].wrapping_mul(primes[0]), (cx[i] + 1).wrapping_mul(primes[0]));
-                for c in 0..8u32 {
-                    let x = if c & 1 == 0 { x0 } else { x1 };
-                    let y = if c & 2 == 0 { y0 } else { y1 };
-                    let z = if c & 4 == 0 { z0 } else { z1 };
-                    self.index[c as usize][i] = (x ^ y ^ z) & mask;
+                for e in 0..4 {
+                    let (y, z) = (if e & 1 == 0 { y0 } else { y1 }, if e & 2 == 0 { z0 } else { z1 });
+                    self.near[e][i] = (x0 ^ y ^ z) & mask;
+                    self.far[e][i] = (x1 ^ y ^ z) & mask;
                 }
             }
         }
-        let [fx, fy, fz] = &self.fraction;
-        for c in 0..8usize {
-            for i in 0..n {
-                let x = if c & 1 == 0 { R::ONE - fx[i] } else { fx[i] };
-                let y = if c & 2 == 0 { R::ONE - fy[i] } else { fy[i] };
-                let z = if c & 4 == 0 { R::ONE - fz[i] } else { fz[i] };
-                self.weight[c][i] = x * y * z;
+        let [_, fy, fz] = &self.fraction;
+        for e in 0..4 {
+            for i in 0..BLOCK {
+                let y = if e & 1 == 0 { R::ONE - fy[i] } else { fy[i] };
+                let z = if e & 2 == 0 { R::ONE - fz[i] } else { fz[i] };
+                self.weight[e][i] = y * z;
             }
         }
+    }
+
+    /// Whether each of the first `n` rows is the last one that lies in its cell before another row lies elsewhere, and how
+    /// many are.
+    #[inline(always)]
+    fn leaving(&self, n: usize) -> ([bool; BLOCK], usize) {
+        let mut leaves = [true; BLOCK];
+        let [cx, cy, cz] = &self.cell;
+        for i in 0..BLOCK - 1 {
+            leaves[i] = (cx[i] != cx[i + 1]) | (cy[i] != cy[i + 1]) | (cz[i] != cz[i + 1]);
+        }
+        leaves[n - 1] = true;
+        let count = leaves[..n].iter().map(|&l| usize::from(l)).sum();
+        (leaves, count)
+    }
+
+    /// Entries of the two ends of edge `e` of row `i`, on a level that is `dense` or not.
+    #[inline(always)]
+    fn ends(&self, dense: bool, e: usize, i: usize) -> [u32; 2] {
+        let near = self.near[e][i];
+        [near, if dense { near + 1 } else { self.far[e][i] }]
+    }
+
+    /// Weights of an edge's two ends for row `i`, as [`fours`] has their features.
+    #[inline(always)]
+    fn along<S: Simd, const F: usize>(&self, s: S, i: usize) -> [R::Four<S>; 4] {
+        let f = self.fraction[0][i];
+        fours(s, &[[R::ONE - f; F], [f; F]])
     }
 }
 
@@ -259,25 +293,6 @@ fn entry<T>(table: &[T], i: u32) -> &T {
     unsafe { table.get_unchecked(i as usize) }
 }
 
-/// Asks for the cache lines of a block's entries, so that misses overlap instead of stalling one row after another.
-/// Corners that differ in x alone mostly share a line: every second one is enough.
-#[inline(always)]
-#[allow(unsafe_code)]
-fn prefetch<T, R>(table: &[T], located: &Located<R>, n: usize) {
-    #[cfg(target_arch = "x86_64")]
-    for index in &located.index {
-        for &i in &index[..n] {
-            // SAFETY: a prefetch reads nothing and faults on no address.
-            unsafe {
-                use std::arch::x86_64::{_MM_HINT_T0, _mm_prefetch};
-                _mm_prefetch::<_MM_HINT_T0>(table.as_ptr().wrapping_add(i as usize).cast());
-            }
-        }
-    }
-    #[cfg(not(target_arch = "x86_64"))]
-    let _ = (table, located, n);
-}
-
 /// Like [`entry`], to be written.
 #[inline(always)]
 #[allow(unsafe_code)]
@@ -287,15 +302,129 @@ fn entry_mut<T>(table: &mut [T], i: u32) -> &mut T {
     unsafe { table.get_unchecked_mut(i as usize) }
 }
 
-/// The features of one entry, in registers of four. Left to itself the compiler works on many rows at once and gathers
-/// their entries number by number, which takes several times as long as one read an entry.
+/// A table of as many bytes does not stay in a second-level cache.
+const LARGE: usize = 1 << 20;
+
+/// Asks for the cache lines of a block's entries, so that misses overlap instead of stalling one row after another. They
+/// go to the second-level cache: the first one has no room for them beside what else a block needs.
 #[inline(always)]
-fn fours<S: Simd, R: Real, const F: usize>(s: S, x: &[R; F]) -> [R::Four<S>; 2] {
-    let mut lanes = [[R::ZERO; 4]; 2];
-    for f in 0..F {
-        lanes[f / 4][f % 4] = x[f];
+#[allow(unsafe_code)]
+fn prefetch<T, R>(table: &[T], located: &Located<R>, n: usize) {
+    #[cfg(target_arch = "x86_64")]
+    if size_of_val(table) >= LARGE {
+        for index in located.near.iter().chain(&located.far) {
+            for &i in &index[..n] {
+                // SAFETY: a prefetch reads nothing and faults on no address.
+                unsafe {
+                    use std::arch::x86_64::{_MM_HINT_T1, _mm_prefetch};
+                    _mm_prefetch::<_MM_HINT_T1>(table.as_ptr().wrapping_add(i as usize).cast());
+                }
+            }
+        }
     }
-    [R::Four::<S>::from_slice(s, &lanes[0]), R::Four::<S>::from_slice(s, &lanes[1])]
+    #[cfg(not(target_arch = "x86_64"))]
+    let _ = (table, located, n);
+}
+
+/// The features of an edge's two ends, one after the other, in registers of four, of which [`registers`] are used. Left to
+/// itself the compiler works on many rows at once and gathers their entries number by number, which takes several times
+/// as long as one read an entry.
+#[inline(always)]
+fn fours<S: Simd, R: Real, const F: usize>(s: S, ends: &[[R; F]; 2]) -> [R::Four<S>; 4] {
+    let mut lanes = [[R::ZERO; 4]; 4];
+    for f in 0..F {
+        lanes[f / 4][f % 4] = ends[0][f];
+        lanes[(F + f) / 4][(F + f) % 4] = ends[1][f];
+    }
+    let mut all = [R::Four::<S>::splat(s, R::ZERO); 4];
+    for q in 0..registers(F) {
+        all[q] = R::Four::<S>::from_slice(s, &lanes[q]);
+    }
+    all
+}
+
+const fn registers(features: usize) -> usize {
+    (2 * features).div_ceil(4)
+}
+
+/// Adds `sums`, which stand as in [`fours`], to two entries.
+#[inline(always)]
+fn add<S: Simd, R: Real, const F: usize>(s: S, grads: &mut [[R; F]], ends: [u32; 2], sums: [R::Four<S>; 4]) {
+    // The two are never one: the hashes of neighbours differ in their last bit.
+    let mut new = fours(s, &ends.map(|i| *entry(grads, i)));
+    for q in 0..registers(F) {
+        new[q] = new[q] + sums[q];
+    }
+    for (k, i) in ends.into_iter().enumerate() {
+        let to = entry_mut(grads, i);
+        for f in 0..F {
+            to[f] = new[(k * F + f) / 4].as_slice()[(k * F + f) % 4];
+        }
+    }
+}
+
+/// Entries in halves of a block, which are made wide all at once: a loop over neighbours becomes vector code.
+struct Wide<R, P, const F: usize> {
+    read: [[[P; F]; 2]; 4 * BLOCK],
+    wide: [[[R; F]; 2]; 4 * BLOCK],
+}
+
+impl<R: Real, P: Stored<R>, const F: usize> Wide<R, P, F> {
+    fn new() -> Self {
+        Self { read: [[[P::default(); F]; 2]; 4 * BLOCK], wide: [[[R::ZERO; F]; 2]; 4 * BLOCK] }
+    }
+
+    /// The features of the first `n` rows at `located`, on a level that is `DENSE` or not.
+    #[inline(always)]
+    fn interpolate<S: Simd, const DENSE: bool>(
+        &mut self,
+        s: S,
+        table: &[[P; F]],
+        located: &Located<R>,
+        n: usize,
+        out: &mut [[R; F]; BLOCK],
+    ) {
+        let widen = size_of::<P>() < size_of::<R>();
+        if widen {
+            for i in 0..n {
+                for e in 0..4 {
+                    let [near, far] = located.ends(DENSE, e, i);
+                    self.read[4 * i + e] = [*entry(table, near), *entry(table, far)];
+                }
+            }
+            let read = self.read.as_flattened().as_flattened();
+            for (wide, &read) in self.wide.as_flattened_mut().as_flattened_mut().iter_mut().zip(read) {
+                *wide = read.value();
+            }
+        }
+        for i in 0..n {
+            let mut sum = [R::Four::<S>::splat(s, R::ZERO); 4];
+            for e in 0..4 {
+                let [near, far] = located.ends(DENSE, e, i);
+                let ends = if widen {
+                    self.wide[4 * i + e]
+                } else {
+                    [entry(table, near).map(|p| p.value()), entry(table, far).map(|p| p.value())]
+                };
+                let (w, ends) = (R::Four::<S>::splat(s, located.weight[e][i]), fours(s, &ends));
+                for q in 0..registers(F) {
+                    sum[q] = ends[q].mul_add(w, sum[q]);
+                }
+            }
+            let along = located.along::<S, F>(s, i);
+            if F < 4 {
+                let both = sum[0] * along[0];
+                let other = if F == 1 { both.rotate_elements_left::<1>() } else { both.rotate_elements_left::<2>() };
+                out[i].copy_from_slice(&(both + other).as_slice()[..F]);
+            } else {
+                for q in 0..F / 4 {
+                    let other = q + F / 4;
+                    let both = sum[other].mul_add(along[other], sum[q] * along[q]);
+                    out[i][4 * q..4 * q + 4].copy_from_slice(both.as_slice());
+                }
+            }
+        }
+    }
 }
 
 struct Forward<'a, R, P> {
@@ -309,45 +438,26 @@ struct Forward<'a, R, P> {
 impl<R: Real, P: Stored<R>> Forward<'_, R, P> {
     #[inline(always)]
     fn features<S: Simd, const F: usize>(mut self, s: S) {
-        // Halves are made wide a block at a time: a loop over neighbours becomes vector code.
-        let widen = size_of::<P>() < size_of::<R>();
-        let (mut read, mut wide) = ([[P::default(); F]; 8 * BLOCK], [[R::ZERO; F]; 8 * BLOCK]);
+        let mut wide = Wide::<R, P, F>::new();
         let mut located = Located::new();
-        let mut out = [[R::ZERO; BLOCK]; F];
+        let mut out = [[R::ZERO; F]; BLOCK];
         for level in &self.stage.levels[self.levels.clone()] {
             let (table, _) = self.params[self.stage.params_of(level)].as_chunks::<F>();
             assert_eq!(table.len(), level.entries as usize);
             for at in (0..self.x.rows).step_by(BLOCK) {
                 let n = BLOCK.min(self.x.rows - at);
                 located.locate(s, level, self.stage.primes, self.x, at, n);
-                prefetch(table, &located, n);
-                if widen {
-                    for i in 0..n {
-                        for c in 0..8 {
-                            read[8 * i + c] = *entry(table, located.index[c][i]);
-                        }
-                    }
-                    for (wide, &read) in wide.as_flattened_mut().iter_mut().zip(read.as_flattened()) {
-                        *wide = read.value();
-                    }
+                if level.dense {
+                    wide.interpolate::<S, true>(s, table, &located, n, &mut out);
+                } else {
+                    prefetch(table, &located, n);
+                    wide.interpolate::<S, false>(s, table, &located, n, &mut out);
                 }
-                for i in 0..n {
-                    let mut sum = [R::Four::<S>::splat(s, R::ZERO); 2];
-                    for c in 0..8 {
-                        let read =
-                            if widen { wide[8 * i + c] } else { entry(table, located.index[c][i]).map(|p| p.value()) };
-                        let (w, read) = (R::Four::<S>::splat(s, located.weight[c][i]), fours(s, &read));
-                        for q in 0..F.div_ceil(4) {
-                            sum[q] = read[q].mul_add(w, sum[q]);
-                        }
-                    }
-                    for f in 0..F {
-                        out[f][i] = sum[f / 4].as_slice()[f % 4];
-                    }
-                }
-                for (out, channel) in out.iter().zip(&level.outputs) {
+                for (f, channel) in level.outputs.iter().enumerate() {
                     if let Some(c) = *channel {
-                        self.y.channel(c)[at..at + n].copy_from_slice(&out[..n]);
+                        for (y, out) in self.y.channel(c)[at..at + n].iter_mut().zip(&out) {
+                            *y = out[f];
+                        }
                     }
                 }
             }
@@ -368,6 +478,52 @@ impl<R: Real, P: Stored<R>> Op for Forward<'_, R, P> {
     }
 }
 
+/// Adds to a level's gradients what the first `n` of the rows at `located` are worth. Rows that lie in one cell one after
+/// another are summed first, where these are many: then the entries are read and written once for all of them, and no row
+/// waits for what the one before has written.
+#[inline(always)]
+fn scatter<S: Simd, R: Real, const F: usize, const DENSE: bool>(
+    s: S,
+    grads: &mut [[R; F]],
+    located: &Located<R>,
+    dy: &[[R; F]; BLOCK],
+    n: usize,
+) {
+    let (leaves, cells) = located.leaving(n);
+    let together = 3 * cells <= n;
+    let zero = R::Four::<S>::splat(s, R::ZERO);
+    let mut sums = [[zero; 4]; 4];
+    for i in 0..n {
+        let (along, mut part) = (located.along::<S, F>(s, i), fours(s, &[dy[i]; 2]));
+        for q in 0..registers(F) {
+            part[q] = part[q] * along[q];
+        }
+        if together {
+            for e in 0..4 {
+                let w = R::Four::<S>::splat(s, located.weight[e][i]);
+                for q in 0..registers(F) {
+                    sums[e][q] = part[q].mul_add(w, sums[e][q]);
+                }
+            }
+            if leaves[i] {
+                for e in 0..4 {
+                    add(s, grads, located.ends(DENSE, e, i), sums[e]);
+                }
+                sums = [[zero; 4]; 4];
+            }
+        } else {
+            for e in 0..4 {
+                let w = R::Four::<S>::splat(s, located.weight[e][i]);
+                let mut own = [zero; 4];
+                for q in 0..registers(F) {
+                    own[q] = part[q] * w;
+                }
+                add(s, grads, located.ends(DENSE, e, i), own);
+            }
+        }
+    }
+}
+
 struct Backward<'a, R, P> {
     stage: &'a HashGridStage,
     params: &'a [P],
@@ -381,7 +537,7 @@ impl<R: Real, P: Stored<R>> Backward<'_, R, P> {
     #[inline(always)]
     fn features<S: Simd, const F: usize>(mut self, s: S) {
         let mut located = Located::new();
-        let mut dy = [[R::ZERO; F]; BLOCK];
+        let (mut dy, zeros) = ([[R::ZERO; F]; BLOCK], [R::ZERO; BLOCK]);
         if let Some(dx) = &mut self.dx {
             dx.data.fill(R::ZERO);
         }
@@ -392,52 +548,44 @@ impl<R: Real, P: Stored<R>> Backward<'_, R, P> {
             if from >= to && self.dx.is_none() {
                 continue;
             }
-            let whole = from == params.start && to == params.end;
+            // Of a level that is asked for in part the rest is summed too, beside the result: the order of sums stays one.
+            let part = if from < to && to - from < params.len() { params.len() } else { 0 };
+            let mut beside = vec![R::ZERO; part];
+            let own = if from < to { from - range.start..to - range.start } else { 0..0 };
+            let place = if part > 0 { from - params.start..to - params.start } else { 0..0 };
+            if part > 0 {
+                beside[place.clone()].copy_from_slice(&self.grads.values[own.clone()]);
+            }
+            let grads = if part > 0 { &mut beside[..] } else { &mut self.grads.values[own.clone()] };
+            let (grads, _) = grads.as_chunks_mut::<F>();
+            assert!(grads.is_empty() || grads.len() == level.entries as usize);
             for at in (0..self.x.rows).step_by(BLOCK) {
                 let n = BLOCK.min(self.x.rows - at);
-                for (f, channel) in level.outputs.iter().enumerate() {
-                    match *channel {
-                        Some(c) => dy.iter_mut().zip(&self.dy.channel(c)[at..at + n]).for_each(|(dy, &v)| dy[f] = v),
-                        None => dy[..n].iter_mut().for_each(|dy| dy[f] = R::ZERO),
+                let mut channels = [&zeros[..n]; F];
+                for (from, channel) in channels.iter_mut().zip(&level.outputs) {
+                    if let Some(c) = *channel {
+                        *from = &self.dy.channel(c)[at..at + n];
+                    }
+                }
+                for i in 0..n {
+                    for f in 0..F {
+                        dy[i][f] = channels[f][i];
                     }
                 }
                 located.locate(s, level, self.stage.primes, self.x, at, n);
-                if whole {
-                    let (grads, _) = self.grads.values[from - range.start..to - range.start].as_chunks_mut::<F>();
-                    assert_eq!(grads.len(), level.entries as usize);
-                    prefetch(grads, &located, n);
-                    for i in 0..n {
-                        let dy = fours(s, &dy[i]);
-                        for c in 0..8 {
-                            let w = R::Four::<S>::splat(s, located.weight[c][i]);
-                            let g = entry_mut(grads, located.index[c][i]);
-                            let mut sum = fours(s, g);
-                            for q in 0..F.div_ceil(4) {
-                                sum[q] = dy[q].mul_add(w, sum[q]);
-                            }
-                            for f in 0..F {
-                                g[f] = sum[f / 4].as_slice()[f % 4];
-                            }
-                        }
-                    }
-                } else if from < to {
-                    for i in 0..n {
-                        for c in 0..8 {
-                            let (entry, w) = (located.index[c][i] as usize, located.weight[c][i]);
-                            for f in 0..F {
-                                let p = params.start + entry * F + f;
-                                if (from..to).contains(&p) {
-                                    self.grads.values[p - range.start] += w * dy[i][f];
-                                }
-                            }
-                        }
+                if !grads.is_empty() {
+                    if level.dense {
+                        scatter::<S, R, F, true>(s, grads, &located, &dy, n);
+                    } else {
+                        prefetch(grads, &located, n);
+                        scatter::<S, R, F, false>(s, grads, &located, &dy, n);
                     }
                 }
                 if let Some(dx) = &mut self.dx {
                     let (table, _) = self.params[params.clone()].as_chunks::<F>();
                     for i in 0..n {
                         let v: [R; 8] = std::array::from_fn(|c| {
-                            let entry = &table[located.index[c][i] as usize];
+                            let entry = &table[located.ends(level.dense, c >> 1, i)[c & 1] as usize];
                             (0..F).map(|f| entry[f].value() * dy[i][f]).sum()
                         });
                         for d in 0..3 {
@@ -459,6 +607,9 @@ impl<R: Real, P: Stored<R>> Backward<'_, R, P> {
                         }
                     }
                 }
+            }
+            if part > 0 {
+                self.grads.values[own].copy_from_slice(&beside[place]);
             }
         }
     }
@@ -643,8 +794,10 @@ mod tests {
                 for c in 0..8u64 {
                     let corner = [cell[0] + (c & 1), cell[1] + (c >> 1 & 1), cell[2] + (c >> 2)];
                     assert!(corner.iter().all(|&v| v < u64::from(level.side)));
-                    assert_eq!(u64::from(located.index[c as usize][0]), index(level, primes, corner));
-                    total += located.weight[c as usize][0];
+                    let (e, end) = ((c >> 1) as usize, (c & 1) as usize);
+                    assert_eq!(u64::from(located.ends(level.dense, e, 0)[end]), index(level, primes, corner));
+                    let x = located.fraction[0][0];
+                    total += located.weight[e][0] * if end == 0 { 1.0 - x } else { x };
                 }
                 assert!((total - 1.0).abs() < 1e-12);
             }
@@ -667,9 +820,10 @@ mod tests {
             for x in [1.0f32, 2.0, f32::INFINITY] {
                 let mut located = Located::<f32>::new();
                 run(Locate(&mut located, level, stage.primes, Tile::new(&[x; 3], 1)));
-                assert!(located.index.iter().all(|i| i[0] < level.entries), "{base_resolution} x {growth} at {x}");
+                let mut ends = located.near.iter().chain(&located.far);
+                assert!(ends.all(|i| i[0] < level.entries), "{base_resolution} x {growth} at {x}");
                 let total: f32 = located.weight.iter().map(|w| w[0]).sum();
-                assert!((total - 1.0).abs() < 1e-6);
+                assert!((total - 1.0).abs() < 1e-6 && (0.0..=1.0).contains(&located.fraction[0][0]));
             }
         }
     }
