@@ -1,6 +1,7 @@
 //! The subcommands.
 
 mod backends;
+mod calibrate;
 mod compare;
 mod completions;
 mod convert;
@@ -18,6 +19,7 @@ mod protocol;
 mod reconstruct;
 mod record;
 mod schema;
+mod selection;
 mod simulate;
 mod tradeoff;
 mod trained;
@@ -35,6 +37,7 @@ use std::path::PathBuf;
 pub enum Command {
     Simulate(simulate::SimulateArgs),
     Import(import::ImportArgs),
+    Calibrate(calibrate::CalibrateArgs),
     Reconstruct(reconstruct::ReconstructArgs),
     Compare(compare::CompareArgs),
     Tradeoff(tradeoff::TradeoffArgs),
@@ -58,6 +61,7 @@ pub fn run(command: Command, general: &General) -> Result<()> {
     match command {
         Command::Simulate(c) => c.run(),
         Command::Import(c) => c.run(),
+        Command::Calibrate(c) => c.run(),
         Command::Reconstruct(c) => c.run(),
         Command::Compare(c) => c.run(general),
         Command::Tradeoff(c) => c.run(general),

@@ -2,9 +2,10 @@
 
 use crate::common::{conefield, done, refused};
 
-const COMMANDS: [&str; 18] = [
+const COMMANDS: [&str; 19] = [
     "simulate",
     "import",
+    "calibrate",
     "reconstruct",
     "compare",
     "tradeoff",

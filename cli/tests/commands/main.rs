@@ -7,6 +7,7 @@ mod backends;
 #[cfg(unix)]
 mod boundary;
 mod budget;
+mod calibrate;
 mod chain;
 mod compare;
 #[cfg(target_os = "linux")]
@@ -24,6 +25,7 @@ mod refusals;
 #[cfg(unix)]
 mod resume;
 mod schema;
+mod selection;
 mod tradeoff;
 mod unusual;
 mod your_data;
