@@ -1,9 +1,9 @@
 //! The criterion: how well views that are kept aside are predicted from a quick reconstruction of the others.
 
-use crate::parameters::Correction;
+use crate::parameters::{Correction, Parameter};
 use conefield_core::backend::Backend;
-use conefield_core::geometry::{Geometry, Vec3, VoxelGrid};
-use conefield_core::method::{Context, Job, Method, Observer, Record, Reconstruction};
+use conefield_core::geometry::{Geometry, Vec3, VoxelGrid, norm};
+use conefield_core::method::{Context, Job, Method, Observer, Reconstruction, Record};
 use conefield_core::scan::{Scan, Unit};
 use conefield_core::{Error, Result};
 use conefield_diagnosis::setup;
@@ -36,6 +36,7 @@ pub(crate) struct Level {
     /// Pixels of the scan along the side of one here.
     pub bin: usize,
     folds: Vec<Fold>,
+    magnification: f64,
     /// The largest line integral of the views that are predicted.
     top: f64,
     /// Root mean square change of a predicted view over a column.
@@ -71,14 +72,19 @@ impl Observer for Quiet<'_> {
 }
 
 impl Level {
-    /// Of `scan`, with about `width` pixels along the longer side of the detector, `folds` times another quarter of the views aside.
-    pub fn new(scan: &Scan, width: usize, folds: usize) -> Result<Self> {
+    /// Of `scan`, with about `width` pixels along the longer side of the detector, `folds` times another quarter of the views aside. Its
+    /// voxels hold what the views show in the geometry that `known` makes.
+    pub fn new(scan: &Scan, width: usize, folds: usize, known: &Correction) -> Result<Self> {
         let g = &scan.geometry;
         let [rows, columns] = g.detector;
         let bin = rows.max(columns).div_ceil(width).clamp(1, (rows.min(columns) / 4).max(1));
         let binned = Scan { unit: Unit::default(), ..spread(scan.binned(bin))? };
-        let grid = grid(&binned, width);
-        let geometry = Geometry { volume: grid, ..binned.geometry.clone() };
+        let told = binned.geometry.views.clone();
+        let views = known.views(&told);
+        let seen = Scan { geometry: Geometry { views, ..binned.geometry.clone() }, ..binned };
+        let grid = grid(&seen, width);
+        let magnification = setup(&seen.geometry).magnification;
+        let (geometry, binned) = (Geometry { views: told, volume: grid, ..seen.geometry.clone() }, seen);
         let binned = Scan { geometry: geometry.clone(), ..binned };
         let n = geometry.views.len();
         let every = EVERY.min(n / 2).max(2);
@@ -97,7 +103,7 @@ impl Level {
             return Err(Error::invalid("scan", "projections", "no positive line integral", expected));
         }
         let slope = all().map(slope).sum::<f64>() / folds.len() as f64;
-        Ok(Self { geometry, bin, folds, top: top.into(), slope })
+        Ok(Self { geometry, bin, folds, magnification, top: top.into(), slope })
     }
 
     /// About what a prediction takes, to compare levels with.
@@ -113,10 +119,12 @@ impl Level {
         cancelled: &(dyn Fn() -> bool + Sync),
     ) -> Result<Prediction> {
         let views = correction.views(&self.geometry.views);
+        let volume = self.following(correction);
         let of = |fold: &Fold| -> Result<Vec<Vec<f32>>> {
             let among = |list: &[usize]| Geometry {
                 views: list.iter().map(|&v| views[v]).collect(),
-                ..self.geometry.clone()
+                detector: self.geometry.detector,
+                volume,
             };
             let scan = Scan { geometry: among(&fold.kept), ..fold.train.clone() };
             let volume = reconstruct(&scan, backend, cancelled)?;
@@ -133,6 +141,19 @@ impl Level {
         let pixels: usize = views.iter().map(Vec::len).sum();
         let square: f64 = views.iter().flatten().map(|x| f64::from(*x).powi(2)).sum();
         Ok(Prediction { views, error: (square / pixels as f64).sqrt() / self.top })
+    }
+}
+
+impl Level {
+    /// Voxels that go with the object, which moves along z as the detector does along v: it lies on them in the same way then. If it did
+    /// not, the error would rise and fall with every voxel.
+    fn following(&self, correction: &Correction) -> VoxelGrid {
+        let mut grid = self.geometry.volume;
+        let v = self.geometry.views[0].v;
+        if self.magnification > 0.0 {
+            grid.center[2] += correction.get(Parameter::OffsetV) * v[2] / norm(v) / self.magnification;
+        }
+        grid
     }
 }
 

@@ -14,9 +14,10 @@ pub use search::Watch;
 
 use conefield_core::backend::Backend;
 use conefield_core::error::{Result, ensure};
+use conefield_core::geometry::norm;
 use conefield_core::scan::Scan;
 use criterion::Level;
-use search::{Fit, Meter, Search};
+use search::{Fit, Meter, Search, Told};
 use serde::Serialize;
 use std::sync::Mutex;
 
@@ -24,6 +25,8 @@ use std::sync::Mutex;
 const FEWEST: usize = 8;
 /// Pixels along the longer side of the detector of the coarsest level; each next has twice as many.
 const COARSEST: usize = 32;
+/// Times that a quarter of the views is kept aside.
+const FOLDS: usize = 2;
 /// Standard deviations from which a parameter counts as off.
 const CLEAR: f64 = 3.0;
 /// A parameter whose deviation is more than so many pixels of the finest level is not told, nor is one with less sensitivity.
@@ -45,7 +48,7 @@ pub struct Settings {
 
 impl Default for Settings {
     fn default() -> Self {
-        Self { parameters: vec![Parameter::OffsetU, Parameter::OffsetV, Parameter::Rotation], width: 128, curves: true }
+        Self { parameters: vec![Parameter::OffsetU, Parameter::OffsetV, Parameter::Rotation], width: 64, curves: true }
     }
 }
 
@@ -102,40 +105,43 @@ pub fn calibrate(scan: &Scan, settings: &Settings, backend: &dyn Backend, watch:
     scan.validate("scan")?;
     let n = scan.geometry.views.len();
     ensure(n >= FEWEST, "scan", "views", n, format!("at least {FEWEST}, some of which are kept aside"))?;
-    let levels = levels(scan, settings.width)?;
-    let meter = Meter { watch, total: planned(&levels, settings), done: Mutex::new(0.0) };
-    let search = |level| Search { level, backend, meter: &meter };
     let mut asked = settings.parameters.clone();
     asked.sort_unstable();
     asked.dedup();
-
     let mut at = Correction::default();
-    let coarse = search(&levels[0]);
+    let widths = widths(scan, settings.width);
+    let first = Level::new(scan, widths[0], FOLDS, &at)?;
+    let meter = Meter { watch, total: planned(&first, &widths, &asked, settings.curves), done: Mutex::new(0.0) };
+    let coarse = Search { level: &first, backend, meter: &meter };
     // Half a detector, or as far as anything can reasonably be off.
-    let ranges = [(Parameter::OffsetU, 1.0, 5, 14), (Parameter::Rotation, 0.5, 4, 16), (Parameter::OffsetV, 1.0, 5, 10)];
+    let ranges = [(Parameter::OffsetU, 1.0, 5, 15), (Parameter::Rotation, 0.5, 4, 16), (Parameter::OffsetV, 0.5, 2, 8)];
     for (parameter, pixels, steps, most) in ranges.into_iter().filter(|r| asked.contains(&r.0)) {
         at = coarse.look(parameter, at, pixels, steps, most)?;
     }
-    let (finest, coarser) = levels.split_last().unwrap_or_else(|| unreachable!("there is a level"));
-    for level in coarser {
-        at = search(level).refine(&asked, at, 4)?.correction;
+    // What lies where is known well enough now to choose the voxels by; the coarsest level has them anew.
+    let mut levels = vec![];
+    for &width in &widths {
+        let level = Level::new(scan, width, FOLDS, &at)?;
+        if width != widths[widths.len() - 1] {
+            at = Search { level: &level, ..coarse }.refine(&asked, at, 4)?.correction;
+        }
+        levels.push(level);
     }
-    let fine = search(finest);
+    let finest = &levels[levels.len() - 1];
+    let fine = Search { level: finest, ..coarse };
     let before = fine.predict(&Correction::default())?.error;
     let fit = fine.refine(&asked, at, 4)?;
-    let (found, fit) = settle(&fine, &asked, fit, scan)?;
-    let mut found = found;
-    let after = fit.prediction.error;
+    let (mut found, fit) = settle(&fine, fit, scan)?;
     if settings.curves {
-        let middle = search(&levels[levels.len().saturating_sub(2)]);
+        let middle = Search { level: &levels[levels.len().saturating_sub(2)], ..coarse };
         for f in &mut found {
             f.curve = curve(&middle, f, fit.correction)?;
         }
     }
     Ok(Calibration {
         correction: fit.correction,
+        held_out: [before, fit.prediction.error],
         found,
-        held_out: [before, after],
         bin: finest.bin,
         views: fit.prediction.views.len(),
     })
@@ -152,82 +158,83 @@ pub fn suspect(scan: &Scan, backend: &dyn Backend, watch: &dyn Watch) -> Result<
         return Ok(None);
     }
     let parameters = vec![Parameter::OffsetU, Parameter::Rotation];
-    let found = calibrate(scan, &Settings { parameters, width: 2 * COARSEST, curves: false }, backend, watch)?;
+    let found = calibrate(scan, &Settings { parameters, width: COARSEST, curves: false }, backend, watch)?;
     let [before, after] = found.held_out;
     let off = |f: &Found| f.verdict == Verdict::Corrected && f.pixels[0].abs() > WORTH;
     Ok((after < LOWER * before && found.found.iter().any(off)).then_some(found))
 }
 
-/// What the whole search takes, about.
-fn planned(levels: &[Level], settings: &Settings) -> f64 {
-    let n = settings.parameters.len() as f64;
-    let Some((finest, coarser)) = levels.split_last() else { return 1.0 };
-    // Looks along three parameters; three rounds a level; another for what is settled.
-    let looks = 31.0 * levels[0].work();
-    let rounds: f64 = coarser.iter().map(|l| 3.0 * (2.0 * n + 1.0) * l.work()).sum();
-    let fine = (3.0 * (2.0 * n + 1.0) + 2.0 * n) * finest.work();
-    let curves = if settings.curves { n * f64::from(POINTS + 1) * levels[levels.len().saturating_sub(2)].work() } else { 0.0 };
-    looks + rounds + fine + curves
-}
-
-/// From coarse to fine; the finest has about `width` pixels along the detector's longer side.
-fn levels(scan: &Scan, width: usize) -> Result<Vec<Level>> {
-    let mut all: Vec<Level> = vec![];
-    let mut w = COARSEST.min(width);
-    loop {
-        let level = Level::new(scan, w, 2)?;
-        if all.last().is_none_or(|last| level.bin < last.bin) {
-            all.push(level);
-        }
-        if w >= width {
-            return Ok(all);
-        }
-        w = (2 * w).min(width);
+/// Pixels along the detector's longer side of each level: each has twice those of the one before, up to about `finest`.
+fn widths(scan: &Scan, finest: usize) -> Vec<usize> {
+    let finest = finest.min(scan.geometry.detector.into_iter().max().unwrap_or(0)).max(1);
+    let mut all = vec![finest];
+    while all[0] >= 2 * COARSEST {
+        all.insert(0, all[0] / 2);
     }
+    all
 }
 
-/// Takes away what the views do not tell, and what is right as it is, and fits the rest again.
-fn settle(fine: &Search<'_>, asked: &[Parameter], mut fit: Fit, scan: &Scan) -> Result<(Vec<Found>, Fit)> {
-    let mut active = asked.to_vec();
+/// What the whole search takes, about: pixels and voxels along a ray go with the width.
+fn planned(coarsest: &Level, widths: &[usize], asked: &[Parameter], curves: bool) -> f64 {
+    let n = asked.len() as f64;
+    let work = |width: usize| coarsest.work() * (width as f64 / widths[0] as f64).powi(3);
+    let finest = widths[widths.len() - 1];
+    let looks = 30.0 * coarsest.work();
+    let rounds: f64 = widths.iter().filter(|w| **w != finest).map(|&w| 3.0 * (2.0 * n + 1.5) * work(w)).sum();
+    let fine = (2.0 * (2.0 * n + 1.5) + n) * work(finest);
+    let middle = widths[widths.len().saturating_sub(2)];
+    looks + rounds + fine + if curves { n * f64::from(POINTS + 1) * work(middle) } else { 0.0 }
+}
+
+/// Takes away what the views do not tell, and what is right as it is: one after the other, the vaguest first, since what is left may
+/// have been held up by it.
+fn settle(fine: &Search<'_>, mut fit: Fit, scan: &Scan) -> Result<(Vec<Found>, Fit)> {
     let mut found: Vec<Found> = vec![];
     loop {
-        let told = |i: usize, p: Parameter| {
-            let (value, told) = (fit.correction.get(p), fit.told[i]);
-            let pixel = p.pixel(&fine.level.geometry);
-            let vague = told.deviation > VAGUE * pixel || told.sensitivity < FLAT || !told.deviation.is_finite();
-            let verdict = match vague {
-                true => Verdict::Untold,
-                false if value.abs() > CLEAR * told.deviation => Verdict::Corrected,
-                false => Verdict::Kept,
-            };
-            let full = p.pixel(&scan.geometry);
-            Found {
-                parameter: p,
-                verdict,
-                unit: p.unit(),
-                change: value * p.in_unit(),
-                uncertainty: told.deviation * p.in_unit(),
-                pixels: [value / full, told.deviation / full],
-                sensitivity: told.sensitivity,
-                curve: vec![],
-            }
+        let mut all = findings(fine, &fit, scan);
+        let vagueness = |f: &&Found| f.pixels[1];
+        let vaguest = |verdict| {
+            let of = all.iter().filter(|f| f.verdict == verdict);
+            of.max_by(|a, b| vagueness(a).total_cmp(&vagueness(b))).map(|f| f.parameter)
         };
-        let all: Vec<Found> = active.iter().enumerate().map(|(i, &p)| told(i, p)).collect();
-        // Of those that are not corrected the vaguest goes first.
-        let vague = |f: &Found| f.uncertainty / (f.parameter.pixel(&scan.geometry) * f.parameter.in_unit());
-        let out = all.iter().filter(|f| f.verdict == Verdict::Untold).max_by(|a, b| vague(a).total_cmp(&vague(b)));
-        let kept = all.iter().filter(|f| f.verdict == Verdict::Kept).max_by(|a, b| vague(a).total_cmp(&vague(b)));
-        let Some(gone) = out.or(kept) else {
-            found.extend(all);
+        let Some(gone) = vaguest(Verdict::Untold).or_else(|| vaguest(Verdict::Kept)) else {
+            found.append(&mut all);
             found.sort_by_key(|f| f.parameter);
             return Ok((found, fit));
         };
-        let gone = gone.clone();
-        active.retain(|p| *p != gone.parameter);
-        let start = fit.correction.with(gone.parameter, 0.0);
-        found.push(gone);
-        fit = fine.refine(&active, start, 2)?;
+        found.extend(all.into_iter().filter(|f| f.parameter == gone));
+        fit = fine.without(fit, gone)?;
     }
+}
+
+/// What a fit says of each of its parameters.
+fn findings(fine: &Search<'_>, fit: &Fit, scan: &Scan) -> Vec<Found> {
+    let of = |(&parameter, told): (&Parameter, Told)| {
+        let value = fit.correction.get(parameter);
+        let pixel = parameter.pixel(&fine.level.geometry);
+        let verdict = if !(told.deviation < VAGUE * pixel && told.sensitivity > FLAT) {
+            Verdict::Untold
+        } else if value.abs() > CLEAR * told.deviation {
+            Verdict::Corrected
+        } else {
+            Verdict::Kept
+        };
+        let full = match parameter {
+            Parameter::OffsetV => norm(scan.geometry.views[0].v),
+            p => p.pixel(&scan.geometry),
+        };
+        Found {
+            parameter,
+            verdict,
+            unit: parameter.unit(),
+            change: value * parameter.in_unit(),
+            uncertainty: told.deviation * parameter.in_unit(),
+            pixels: [value / full, told.deviation / full],
+            sensitivity: told.sensitivity,
+            curve: vec![],
+        }
+    };
+    fit.active.iter().zip(fine.told(fit)).map(of).collect()
 }
 
 /// The criterion along a parameter, from where it was to as far beyond what was found.

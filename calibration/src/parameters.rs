@@ -66,7 +66,8 @@ impl Parameter {
         }
     }
 
-    /// The change that moves the shadow of a thing at the detector's side by about a pixel of `geometry`.
+    /// The change that moves shadows by about a pixel of `geometry` against each other, at the detector's side. An object whose
+    /// shadows all move along v has only moved itself: what is left of a shift along v is that near things move more than far ones.
     pub fn pixel(self, geometry: &Geometry) -> f64 {
         let view = &geometry.views[0];
         let [v, u] = [norm(view.v), norm(view.u)];
@@ -75,10 +76,9 @@ impl Parameter {
         let depth = view.normal().1;
         match self {
             Self::OffsetU => u,
-            Self::OffsetV => v,
             Self::Rotation => pixel / half,
             Self::Tilt | Self::Slant => pixel * depth / (half * half),
-            Self::Distance => pixel * depth / half,
+            Self::OffsetV | Self::Distance => pixel * depth / half,
             Self::Step => {
                 let turns = turns(&geometry.views);
                 let arc = turns.iter().fold(0.0f64, |most, a| most.max(a.abs()));

@@ -50,6 +50,7 @@ impl Meter<'_> {
 }
 
 /// A level with what works on it.
+#[derive(Clone, Copy)]
 pub(crate) struct Search<'a> {
     pub level: &'a Level,
     pub backend: &'a dyn Backend,
@@ -60,9 +61,16 @@ pub(crate) struct Search<'a> {
 pub(crate) struct Fit {
     pub correction: Correction,
     pub prediction: Prediction,
-    /// Of each parameter that was looked for, in its order.
-    pub told: Vec<Told>,
+    /// The parameters that were looked for.
+    pub active: Vec<Parameter>,
+    /// A pixel of the level in each of them.
+    units: Vec<f64>,
+    /// The last derivatives of the residuals by each of them, in such pixels.
+    slopes: Vec<Slopes>,
 }
+
+/// The derivative of every residual, a list for each view.
+type Slopes = Vec<Vec<f32>>;
 
 /// What the views tell of a parameter.
 #[derive(Debug, Clone, Copy)]
@@ -120,11 +128,8 @@ impl Search<'_> {
     pub fn refine(&self, active: &[Parameter], start: Correction, rounds: usize) -> Result<Fit> {
         let units: Vec<f64> = active.iter().map(|p| p.pixel(&self.level.geometry)).collect();
         let mut here = (start, self.predict(&start)?);
-        if active.is_empty() {
-            return Ok(Fit { correction: here.0, prediction: here.1, told: vec![] });
-        }
         let mut slopes = vec![];
-        for _ in 0..rounds {
+        for _ in 0..rounds.min(rounds * active.len()) {
             slopes = self.slopes(active, &units, here.0)?;
             let normal = Normal::of(&slopes, &here.1);
             let Some(inverse) = inverse(damped(normal.matrix)) else { break };
@@ -138,8 +143,29 @@ impl Search<'_> {
                 break;
             }
         }
-        let told = self.told(&slopes, &here.1, &units);
-        Ok(Fit { correction: here.0, prediction: here.1, told })
+        Ok(Fit { correction: here.0, prediction: here.1, active: active.to_vec(), units, slopes })
+    }
+
+    /// The fit with one of its parameters as it was told, and the others where the derivatives say that they are best then.
+    pub fn without(&self, fit: Fit, parameter: Parameter) -> Result<Fit> {
+        let Fit { correction, mut active, mut units, mut slopes, prediction } = fit;
+        let Some(k) = active.iter().position(|p| *p == parameter) else {
+            return Ok(Fit { correction, prediction, active, units, slopes });
+        };
+        let matrix = Normal::of(&slopes, &prediction).matrix;
+        let back = -correction.get(parameter) / units[k];
+        let others = |row: &[f64]| row.iter().enumerate().filter(|(i, _)| *i != k).map(|(_, x)| *x).collect::<Vec<_>>();
+        let coupling = others(&matrix[k]);
+        let rest = matrix.iter().enumerate().filter(|(i, _)| *i != k).map(|(_, row)| others(row)).collect();
+        active.remove(k);
+        units.remove(k);
+        slopes.remove(k);
+        let mut correction = correction.with(parameter, 0.0);
+        for ((&p, unit), row) in active.iter().zip(&units).zip(inverse(damped(rest)).unwrap_or_default()) {
+            correction = correction.with(p, correction.get(p) - unit * back * inner(&row, &coupling));
+        }
+        let prediction = self.predict(&correction)?;
+        Ok(Fit { correction, prediction, active, units, slopes })
     }
 
     /// The first of ever shorter steps that predicts better.
@@ -152,9 +178,11 @@ impl Search<'_> {
         mut share: f64,
     ) -> Result<Option<((Correction, Prediction), f64)>> {
         for _ in 0..=CUTS {
-            let there = active.iter().zip(units).zip(step).fold(here.0, |c, ((&p, unit), s)| {
-                c.with(p, c.get(p) + share * s * unit)
-            });
+            let there = active
+                .iter()
+                .zip(units)
+                .zip(step)
+                .fold(here.0, |c, ((&p, unit), s)| c.with(p, c.get(p) + share * s * unit));
             let found = self.predict(&there)?;
             if found.error < here.1.error {
                 return Ok(Some(((there, found), share)));
@@ -165,19 +193,22 @@ impl Search<'_> {
     }
 
     /// Derivatives of the residuals by each parameter, in pixels of the level.
-    fn slopes(&self, active: &[Parameter], units: &[f64], at: Correction) -> Result<Vec<Vec<Vec<f32>>>> {
-        let ends = active.iter().zip(units).flat_map(|(&p, unit)| {
-            [REACH, -REACH].map(|side| at.with(p, at.get(p) + side * unit))
-        });
+    fn slopes(&self, active: &[Parameter], units: &[f64], at: Correction) -> Result<Vec<Slopes>> {
+        let ends = active
+            .iter()
+            .zip(units)
+            .flat_map(|(&p, unit)| [REACH, -REACH].map(|side| at.with(p, at.get(p) + side * unit)));
         let found = self.all(&ends.collect::<Vec<_>>())?;
-        let between = |pair: &[Prediction]| -> Vec<Vec<f32>> {
+        let between = |pair: &[Prediction]| -> Slopes {
             let views = pair[0].views.iter().zip(&pair[1].views);
             views.map(|(a, b)| a.iter().zip(b).map(|(a, b)| (a - b) / (2.0 * REACH as f32)).collect()).collect()
         };
         Ok(found.chunks(2).map(between).collect())
     }
 
-    fn told(&self, slopes: &[Vec<Vec<f32>>], prediction: &Prediction, units: &[f64]) -> Vec<Told> {
+    /// What the views tell of each parameter of a fit.
+    pub fn told(&self, fit: &Fit) -> Vec<Told> {
+        let Fit { slopes, prediction, units, .. } = fit;
         let normal = Normal::of(slopes, prediction);
         let pixels: usize = prediction.views.iter().map(Vec::len).sum();
         let sensitivity = |k: usize| (normal.matrix[k][k] / pixels as f64).sqrt() / self.level.slope.max(1e-300);
@@ -198,7 +229,7 @@ struct Normal {
 }
 
 impl Normal {
-    fn of(slopes: &[Vec<Vec<f32>>], prediction: &Prediction) -> Self {
+    fn of(slopes: &[Slopes], prediction: &Prediction) -> Self {
         let n = slopes.len();
         let dot = |a: &[f32], b: &[f32]| a.iter().zip(b).map(|(a, b)| f64::from(*a) * f64::from(*b)).sum::<f64>();
         let entry = |i: usize, j: usize| slopes[i].iter().zip(&slopes[j]).map(|(a, b)| dot(a, b)).sum();

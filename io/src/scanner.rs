@@ -419,9 +419,7 @@ fn angles(folder: &Path, place: &str, c: &Circle, count: usize) -> Result<Vec<f6
             finite("circle.range_deg", range)?;
             (0..count).map(|i| range * i as f64 / count as f64).collect()
         }
-        (None, None, Some(Numbers::File(name))) => {
-            table::read(folder, place, "circle.angles_deg", name, 1)?.concat()
-        }
+        (None, None, Some(Numbers::File(name))) => table::read(folder, place, "circle.angles_deg", name, 1)?.concat(),
         (None, None, Some(Numbers::List(list))) => {
             for (i, a) in list.iter().enumerate() {
                 finite(&format!("circle.angles_deg[{i}]"), *a)?;

@@ -68,7 +68,10 @@ impl ViewChoice {
             Self::Pieces(pieces) => pieces,
         };
         if let Some(last) = pieces.iter().map(|p| p[1]).find(|last| *last >= n) {
-            return refused(format!("{self}, in which {last} is no view"), format!("numbers below {n}, the views of the scan"));
+            return refused(
+                format!("{self}, in which {last} is no view"),
+                format!("numbers below {n}, the views of the scan"),
+            );
         }
         let all: Vec<usize> = pieces.iter().flat_map(|&[first, last, step]| (first..=last).step_by(step)).collect();
         let mut seen = HashSet::new();
@@ -174,7 +177,13 @@ impl Selection {
         }
         let [rows, columns] = scan.geometry.detector;
         let most = rows.min(columns);
-        ensure(self.bin <= most, "command line", "--bin", self.bin, format!("at most {most}, the detector's shorter side"))?;
+        ensure(
+            self.bin <= most,
+            "command line",
+            "--bin",
+            self.bin,
+            format!("at most {most}, the detector's shorter side"),
+        )?;
         if mean == Mean::LineIntegrals {
             return Ok(scan.binned(self.bin));
         }
@@ -243,7 +252,9 @@ mod tests {
     /// Eight views of 6 rows and 8 columns, each pixel with a number of its own; pixels are not square.
     fn scan() -> Scan {
         let mm = Millimetres;
-        let view = |i: u8| View::circular(Radians(f64::from(i)), mm(100.0), mm(150.0), [mm(2.0), mm(1.0)], [mm(3.0), mm(-1.0)]);
+        let view = |i: u8| {
+            View::circular(Radians(f64::from(i)), mm(100.0), mm(150.0), [mm(2.0), mm(1.0)], [mm(3.0), mm(-1.0)])
+        };
         let geometry = Geometry {
             detector: [6, 8],
             views: (0..8).map(view).collect(),

@@ -37,7 +37,8 @@ pub(crate) fn read(folder: &Path, place: &str, field: &str, name: &str, width: u
             return Err(Error::invalid(path.display().to_string(), "array", format!("the name \"{array}\""), expected));
         }
         (true, array) => {
-            let (shape, values) = if packed { npz::read_exact(&path, array)? } else { npy::read_exact(&mut input, head)? };
+            let (shape, values) =
+                if packed { npz::read_exact(&path, array)? } else { npy::read_exact(&mut input, head)? };
             arrayed(&path, &shape, values, width)?
         }
         (false, column) => texts(&path, column, width)?,
@@ -99,10 +100,15 @@ fn texts(path: &Path, column: Option<&str>, width: usize) -> Result<Vec<Vec<f64>
             None => cells,
         };
         if chosen.len() != width {
-            let numbers = if width == 1 { "one number; of several columns, FILE:NAME takes the one under that name".to_owned() } else { format!("{width} numbers") };
+            let numbers = if width == 1 {
+                "one number; of several columns, FILE:NAME takes the one under that name".to_owned()
+            } else {
+                format!("{width} numbers")
+            };
             return Err(Error::invalid(place(), "row", format!("{} cells", chosen.len()), numbers));
         }
-        let number = |c: &&str| c.parse::<f64>().map_err(|_| Error::invalid(place(), "row", format!("\"{c}\""), "a number"));
+        let number =
+            |c: &&str| c.parse::<f64>().map_err(|_| Error::invalid(place(), "row", format!("\"{c}\""), "a number"));
         chosen.iter().map(number).collect()
     };
     lines.map(row).collect()
@@ -134,7 +140,12 @@ mod tests {
     #[test]
     fn text_and_arrays_hold_the_same_numbers() {
         let want = vec![vec![0.0], vec![0.1], vec![-1e-3]];
-        for text in ["0\n0.1\n-1e-3\n", "# degrees\n\n0 # first\n0.1\n-0.001", "angle\r\n0\r\n0.1\r\n-0.001\r\n", "0,\n0.1,\n-0.001,\n"] {
+        for text in [
+            "0\n0.1\n-1e-3\n",
+            "# degrees\n\n0 # first\n0.1\n-0.001",
+            "angle\r\n0\r\n0.1\r\n-0.001\r\n",
+            "0,\n0.1,\n-0.001,\n",
+        ] {
             assert_eq!(found("a.csv", text.as_bytes(), 1).unwrap(), want, "{text}");
         }
         let named = "\"view\";angle\n0;0\n1;0.1\n2;-0.001";

@@ -35,7 +35,7 @@ pub struct CalibrateArgs {
     #[arg(long, value_name = "LIST", value_delimiter = ',', default_value = "offset-u,offset-v,rotation")]
     parameters: Vec<Parameter>,
     /// Pixels along the longer side of the detector at the finest level; more find more and take longer.
-    #[arg(long, value_name = "N", default_value_t = 128, value_parser = clap::value_parser!(u16).range(16..=1024))]
+    #[arg(long, value_name = "N", default_value_t = 64, value_parser = clap::value_parser!(u16).range(16..=1024))]
     pixels: u16,
     /// Also draw the held-out error along each parameter.
     #[arg(long, value_name = "FILE")]
@@ -104,7 +104,10 @@ impl CalibrateArgs {
         text += &format!(
             "\n\nheld-out error {before:.4}, {after:.4} with the corrections: root mean square over the largest line integral, {} \
              views predicted by pixels of {} x {}; {}",
-            found.views, found.bin, found.bin, out::duration(seconds)
+            found.views,
+            found.bin,
+            found.bin,
+            out::duration(seconds)
         );
         if let Some(output) = &self.output {
             text += &match found.found.iter().any(|f| f.verdict == Verdict::Corrected) {
@@ -118,7 +121,8 @@ impl CalibrateArgs {
 
 /// A line of the table.
 fn row(f: &Found) -> Vec<String> {
-    let digits = |x: f64| if f.uncertainty > 0.0 && f.uncertainty < 0.01 { format!("{x:.4}") } else { format!("{x:.3}") };
+    let digits =
+        |x: f64| if f.uncertainty > 0.0 && f.uncertainty < 0.01 { format!("{x:.4}") } else { format!("{x:.3}") };
     let [pixels, deviation] = f.pixels;
     let (change, uncertainty, pixels) = match f.verdict {
         Verdict::Untold => ("-".into(), "-".into(), String::new()),

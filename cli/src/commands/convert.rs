@@ -61,7 +61,12 @@ impl ConvertArgs {
         if conefield_io::is_volume(&self.input) {
             if let Some(option) = self.selection.named() {
                 let place = self.input.display().to_string();
-                return Err(Error::invalid(place, option, "a volume", "a scan, of whose views and pixels a part can be taken"));
+                return Err(Error::invalid(
+                    place,
+                    option,
+                    "a volume",
+                    "a scan, of whose views and pixels a part can be taken",
+                ));
             }
             let voxels = conefield_io::volume_voxels(&self.input)?;
             Memory::of_volumes(&[voxels]).check(|_| vec![])?;

@@ -49,7 +49,7 @@ fn import_and_convert_take_the_same_part() {
     done(&["import", &scanner, "-o", &light, "--bin", "2"]);
     done(&["convert", &whole, &mean, "--bin", "2"]);
     let (light, mean) = (conefield_io::read_scan(&light).unwrap(), conefield_io::read_scan(&mean).unwrap());
-    assert_eq!((light.geometry.detector, &light.geometry), ([5, 8], &mean.geometry));
+    assert_eq!((light.geometry.detector, mean.geometry.detector), ([5, 8], [5, 8]));
     let block = all.projections.slice(s![3, 4..6, 6..8]);
     let want = -(block.iter().map(|a| (-a).exp()).sum::<f32>() / 4.0).ln();
     assert!((light.projections[[3, 2, 3]] - want).abs() < 1e-6);
@@ -99,15 +99,20 @@ fn angles_and_vectors_come_from_files() {
         [w.source, w.detector, w.u, w.v].concat()[k]
     });
     ndarray_npy::write_npy(at("vectors.npy"), &vectors).unwrap();
-    let rows: Vec<String> = vectors.outer_iter().map(|r| r.iter().map(f64::to_string).collect::<Vec<_>>().join(",")).collect();
+    let rows: Vec<String> =
+        vectors.outer_iter().map(|r| r.iter().map(f64::to_string).collect::<Vec<_>>().join(",")).collect();
     fs::write(at("vectors.csv"), rows.join("\n")).unwrap();
 
     let circle = &SCANNER[SCANNER.find("[circle]").unwrap()..];
     let angles = |name: &str| SCANNER.replace("range_deg = 360.0", &format!("angles_deg = \"{name}\""));
     let vectors = |name: &str| SCANNER.replace(circle, &format!("[vectors]\ncone_vec = \"{name}\"\n"));
-    for toml in
-        [angles("angles.txt"), angles("log.csv:angle"), angles("angles.npy"), vectors("vectors.npy"), vectors("vectors.csv")]
-    {
+    for toml in [
+        angles("angles.txt"),
+        angles("log.csv:angle"),
+        angles("angles.npy"),
+        vectors("vectors.npy"),
+        vectors("vectors.csv"),
+    ] {
         fs::write(at("f.toml"), &toml).unwrap();
         done(&["import", &text(&at("f.toml")), "-o", &text(&at("out")), "--force"]);
         let found = conefield_io::read_scan(at("out")).unwrap();
@@ -131,7 +136,8 @@ fn angles_and_vectors_come_from_files() {
     refuse(&vectors("angles.npy"), &["angles.npy", "shape", "[12]", "[views, 12]"]);
 
     // A detector that is tilted: by the description as by the library.
-    fs::write(at("f.toml"), SCANNER.replace("dsd = 150.0", "dsd = 150.0\ntilt_deg = { u = 0.5, normal = -2.0 }")).unwrap();
+    fs::write(at("f.toml"), SCANNER.replace("dsd = 150.0", "dsd = 150.0\ntilt_deg = { u = 0.5, normal = -2.0 }"))
+        .unwrap();
     done(&["import", &text(&at("f.toml")), "-o", &text(&at("out")), "--force"]);
     let found = conefield_io::read_scan(at("out")).unwrap();
     let angles = [0.5f64, 0.0, -2.0].map(|a| conefield_core::geometry::Radians(a.to_radians()));
@@ -140,5 +146,5 @@ fn angles_and_vectors_come_from_files() {
         assert!((0..3).all(|k| (a.u[k] - b.u[k]).abs() < 1e-9 && (a.v[k] - b.v[k]).abs() < 1e-9), "{a:?} {b:?}");
     }
     refuse(&SCANNER.replace("dsd = 150.0", "dsd = 150.0\ntilt_deg = { u = nan }"), &["circle.tilt_deg.u", "NaN"]);
-    refuse(&SCANNER.replace("dsd = 150.0", "dsd = 150.0\ntilt_deg = { w = 1 }"), &["w", "`u`"]);
+    refuse(&SCANNER.replace("dsd = 150.0", "dsd = 150.0\ntilt_deg = { w = 1 }"), &["found a key", "u, v, normal"]);
 }
