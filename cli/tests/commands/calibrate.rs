@@ -43,7 +43,19 @@ fn a_shifted_detector_is_found_and_a_right_one_is_left_alone() {
     let before = fs::read(at("wrong/scan.toml")).unwrap();
 
     let (wrong, out, png) = (text(&at("wrong")), text(&at("out")), text(&at("curves.png")));
-    let found = json(&["calibrate", &wrong, "-o", &out, "--png", &png, "--json"]);
+    let found = json(&[
+        "calibrate",
+        &wrong,
+        "-o",
+        &out,
+        "--png",
+        &png,
+        "--pixels",
+        "24",
+        "--parameters",
+        "offset-u,rotation",
+        "--json",
+    ]);
     let u = of(&found, "offset-u");
     assert_eq!((&u["verdict"], &u["unit"]), (&"corrected".into(), &"mm".into()), "{found}");
     let change = number(&u["change"]);
@@ -70,11 +82,11 @@ fn a_shifted_detector_is_found_and_a_right_one_is_left_alone() {
 
     // Seen again there is nothing left to correct along u, nor in the scan whose geometry was right from the start.
     for scan in [&out, &text(&at("right"))] {
-        let again = json(&["calibrate", scan, "--parameters", "offset-u", "--json"]);
+        let again = json(&["calibrate", scan, "--pixels", "24", "--parameters", "offset-u", "--json"]);
         assert_eq!(of(&again, "offset-u")["verdict"], "kept", "{again}");
         assert_eq!(again["output"], Value::Null);
     }
-    let said = done(&["calibrate", &text(&at("right")), "--parameters", "offset-u"]);
+    let said = done(&["calibrate", &text(&at("right")), "--pixels", "24", "--parameters", "offset-u"]);
     assert!(said.contains("right as it is") && said.contains("held-out error"), "{said}");
 
     // `info` says that something is off, and does not where nothing is.
@@ -96,7 +108,8 @@ fn what_the_views_do_not_tell_is_not_invented() {
         value: 0.5 / geometry.volume.size()[0],
     };
     conefield_io::write_scan(at("ball"), &scan_ellipsoids(&[ball], geometry), None).unwrap();
-    let found = json(&["calibrate", &text(&at("ball")), "--parameters", "offset-u,rotation,step", "--json"]);
+    let found =
+        json(&["calibrate", &text(&at("ball")), "--pixels", "24", "--parameters", "offset-u,rotation,step", "--json"]);
     assert_eq!(of(&found, "rotation")["verdict"], "untold", "{found}");
     assert_eq!(of(&found, "step")["verdict"], "untold", "{found}");
     assert_eq!(of(&found, "offset-u")["verdict"], "kept", "{found}");
@@ -109,7 +122,7 @@ fn what_cannot_be_calibrated_is_refused() {
     scanned(&at("scan"));
     let scan = text(&at("scan"));
     let said = refused(1, &["calibrate", &scan, "-o", &scan, "--force"]);
-    assert!(said.contains("which this command reads"), "{said}");
+    assert!(said.contains("that this command reads"), "{said}");
     fs::create_dir(at("there")).unwrap();
     fs::write(at("there/notes.txt"), "mine").unwrap();
     assert!(refused(1, &["calibrate", &scan, "-o", &text(&at("there"))]).contains("--force"));
