@@ -32,6 +32,8 @@ const CLEAR: f64 = 3.0;
 /// A parameter whose deviation is more than so many pixels of the finest level is not told, nor is one with less sensitivity.
 const VAGUE: f64 = 1.0;
 const FLAT: f64 = 0.03;
+/// Where voxels lie moves the least error by about so many pixels of a level, which no view tells: part of every deviation.
+const INEXACT: f64 = 0.02;
 /// Points of the curve of a parameter.
 const POINTS: i32 = 10;
 
@@ -48,7 +50,7 @@ pub struct Settings {
 
 impl Default for Settings {
     fn default() -> Self {
-        Self { parameters: vec![Parameter::OffsetU, Parameter::OffsetV, Parameter::Rotation], width: 64, curves: true }
+        Self { parameters: vec![Parameter::OffsetU, Parameter::Rotation], width: 64, curves: true }
     }
 }
 
@@ -212,9 +214,10 @@ fn findings(fine: &Search<'_>, fit: &Fit, scan: &Scan) -> Vec<Found> {
     let of = |(&parameter, told): (&Parameter, Told)| {
         let value = fit.correction.get(parameter);
         let pixel = parameter.pixel(&fine.level.geometry);
-        let verdict = if !(told.deviation < VAGUE * pixel && told.sensitivity > FLAT) {
+        let deviation = told.deviation.hypot(INEXACT * pixel);
+        let verdict = if !(deviation < VAGUE * pixel && told.sensitivity > FLAT) {
             Verdict::Untold
-        } else if value.abs() > CLEAR * told.deviation {
+        } else if value.abs() > CLEAR * deviation {
             Verdict::Corrected
         } else {
             Verdict::Kept
@@ -228,8 +231,8 @@ fn findings(fine: &Search<'_>, fit: &Fit, scan: &Scan) -> Vec<Found> {
             verdict,
             unit: parameter.unit(),
             change: value * parameter.in_unit(),
-            uncertainty: told.deviation * parameter.in_unit(),
-            pixels: [value / full, told.deviation / full],
+            uncertainty: deviation * parameter.in_unit(),
+            pixels: [value / full, deviation / full],
             sensitivity: told.sensitivity,
             curve: vec![],
         }

@@ -32,7 +32,7 @@ pub struct CalibrateArgs {
     #[arg(short, long = "output", value_name = "OUT")]
     output: Option<PathBuf>,
     /// What to look for: offset-u, offset-v, rotation, tilt, slant, distance and step.
-    #[arg(long, value_name = "LIST", value_delimiter = ',', default_value = "offset-u,offset-v,rotation")]
+    #[arg(long, value_name = "LIST", value_delimiter = ',', default_value = "offset-u,rotation")]
     parameters: Vec<Parameter>,
     /// Pixels along the longer side of the detector at the finest level; more find more and take longer.
     #[arg(long, value_name = "N", default_value_t = 64, value_parser = clap::value_parser!(u16).range(16..=1024))]
