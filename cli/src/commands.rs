@@ -1,6 +1,7 @@
 //! The subcommands.
 
 mod backends;
+mod calibrate;
 mod cell;
 mod compare;
 mod completions;
@@ -20,6 +21,7 @@ mod reconstruct;
 mod record;
 mod report;
 mod schema;
+mod selection;
 mod simulate;
 mod study;
 mod tradeoff;
@@ -38,6 +40,7 @@ use std::path::PathBuf;
 pub enum Command {
     Simulate(simulate::SimulateArgs),
     Import(import::ImportArgs),
+    Calibrate(calibrate::CalibrateArgs),
     Reconstruct(reconstruct::ReconstructArgs),
     Compare(compare::CompareArgs),
     Study(study::StudyArgs),
@@ -63,6 +66,7 @@ pub fn run(command: Command, general: &General) -> Result<()> {
     match command {
         Command::Simulate(c) => c.run(),
         Command::Import(c) => c.run(),
+        Command::Calibrate(c) => c.run(),
         Command::Reconstruct(c) => c.run(),
         Command::Compare(c) => c.run(general),
         Command::Study(c) => c.run(general),

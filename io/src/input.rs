@@ -125,14 +125,14 @@ impl Input {
 
     /// Reads `count` numbers up to the very end of the file, through `map`. What the file cannot hold is refused
     /// before memory is taken for it, and a byte past the last number is refused as well.
-    pub fn numbers(
+    pub fn numbers<T>(
         &mut self,
         field: &str,
         count: usize,
         number: Number,
         order: ByteOrder,
-        map: impl Fn(f64) -> f32 + Copy,
-    ) -> Result<Vec<f32>> {
+        map: impl Fn(f64) -> T + Copy,
+    ) -> Result<Vec<T>> {
         let want = (count as u64)
             .checked_mul(number.bytes() as u64)
             .ok_or_else(|| self.invalid(field, format!("{count} values"), "a length that can be addressed"))?;
@@ -151,7 +151,7 @@ impl Input {
                 ));
             }
         }
-        let mut out: Vec<f32> = Vec::new();
+        let mut out: Vec<T> = Vec::new();
         // A plain file has just been measured; a packed one must prove its claim piece by piece. Each growth draws from
         // the allowance, so that it does not matter what was claimed.
         let mut left = count;

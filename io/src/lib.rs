@@ -5,6 +5,7 @@
 //!   (R2-Gaussian's folder), [`read_naf`], [`write_naf`] (NAF's file), [`write_rtk`] (for RTK); [`read_data_set`] also
 //!   reads test views.
 //! - Projections as scanners give them: [`read_scanner`] (a description in TOML; TIFF, NumPy, RTK's XML geometry).
+//! - Part of a scan, with its geometry: [`Selection`].
 //! - Sizes, before memory is taken: [`scan_size`], [`scanner_size`], [`volume_voxels`].
 //! - Weights: [`read_weights`], [`write_weights`]; checkpoints: [`read_checkpoint`], [`write_checkpoint`] (safetensors).
 //!
@@ -44,8 +45,10 @@ mod rtk_folder;
 mod scan;
 mod scan_folder;
 mod scanner;
+mod selection;
 mod size;
 mod stack;
+mod table;
 mod text;
 mod tiff;
 mod unit;
@@ -67,6 +70,7 @@ pub use rtk_folder::write_rtk;
 pub use scan::{DataSet, read_data_set, read_scan, read_truth};
 pub use scan_folder::write_scan;
 pub use scanner::{I0, ImportOptions, Imported, read_scanner};
+pub use selection::{Lines, Selection, ViewChoice};
 pub use size::{ScanSize, scan_size, scanner_size, volume_voxels};
 pub use text::parse_toml;
 pub use volume::{check_shape, is_volume, packed_bytes, read_volume, write_volume, write_voxels};

@@ -64,6 +64,22 @@ pub(crate) fn read_one_of(input: &mut Input, start: Vec<u8>, sets: &[&[&str]]) -
     Ok(array)
 }
 
+/// Shape and numbers, in C order, of a small array of one or two axes in full precision; reads on as [`read_from`] does.
+pub(crate) fn read_exact(input: &mut Input, start: Vec<u8>) -> Result<(Vec<usize>, Vec<f64>)> {
+    let header = read_header(input, start)?;
+    let count = header.shape.iter().try_fold(1usize, |n, &s| n.checked_mul(s));
+    let fits = count.filter(|n| (1..=2).contains(&header.shape.len()) && *n > 0 && *n < 1 << 32);
+    let count = fits.ok_or_else(|| {
+        input.invalid("shape", shape_text(&header.shape), "one or two axes with at least one element along each")
+    })?;
+    let values = input.numbers("data", count, header.number, header.order, |x| x)?;
+    let values = match (header.fortran, &header.shape[..]) {
+        (true, &[rows, columns]) => (0..count).map(|i| values[i % columns * rows + i / columns]).collect(),
+        _ => values,
+    };
+    Ok((header.shape, values))
+}
+
 /// Writes `array` as little-endian `f32` in C order.
 pub(crate) fn write<D: Dimension>(w: &mut dyn Write, path: &Path, array: &Array<f32, D>) -> Result<()> {
     let io = |e| Error::io(path, e);

@@ -18,6 +18,11 @@ pub(crate) fn read(path: &Path, name: Option<&str>, sets: &[&[&str]]) -> Result<
     npy::read_one_of(&mut open(path, name)?, Vec::new(), sets)
 }
 
+/// Shape and numbers of the small array `name`, as [`npy::read_exact`] has them.
+pub(crate) fn read_exact(path: &Path, name: Option<&str>) -> Result<(Vec<usize>, Vec<f64>)> {
+    npy::read_exact(&mut open(path, name)?, Vec::new())
+}
+
 /// The shape of the array `name`, from its header.
 pub(crate) fn shape(path: &Path, name: Option<&str>) -> Result<Vec<usize>> {
     npy::shape(&mut open(path, name)?, Vec::new())

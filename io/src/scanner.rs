@@ -14,8 +14,9 @@
 //! dsd = 800.0                        # source to detector plane
 //! pixel = { u = 2.0, v = 2.0 }
 //! offset = { u = 0.0, v = 0.0 }      # shift of the detector along its columns' and its rows' direction
+//! tilt_deg = { u = 0.0, v = 0.0, normal = 0.0 }   # turns of the detector about its own axes; see View::tilted
 //! start_deg = 0.0                    # the first view's angle
-//! step_deg = 14.4                    # or range_deg = 360.0, or angles_deg = [...], counted from start_deg
+//! step_deg = 14.4                    # or range_deg = 360.0, or angles_deg = [...] or "FILE", counted from start_deg
 //! direction = "counterclockwise"     # of the source, seen from +z; that of a turning object is the opposite
 //!
 //! [layout]                           # how the arrays lie; this is the default
@@ -36,16 +37,18 @@
 //! ```
 //!
 //! `[vectors]` has `cone_vec = [[...], ...]`, ASTRA's twelve numbers a view: source, detector centre, the step to the
-//! next column (u) and to the next row (v), all in mm here. `[rtk]` has `file`, `pixel` and `offset`; see
+//! next column (u) and to the next row (v), all in mm here, or the name of a file with them. `[rtk]` has `file`, `pixel` and `offset`; see
 //! [`read_rtk_geometry`]. All lengths are mm; angles are degrees, as their keys say.
 
 use crate::counts::{Correction, CountsReport, OpenBeam, line_integrals};
 use crate::rtk::read_rtk_geometry;
+use crate::selection::{Mean, Selection};
 use crate::stack::{self, Names, StackAxis, StackLayout};
+use crate::table::{self, Numbers};
 use crate::text::described;
 use crate::{ScanSize, folder, memory, scan_folder};
 use conefield_core::error::ensure;
-use conefield_core::geometry::{Geometry, View, VoxelGrid};
+use conefield_core::geometry::{Geometry, Radians, View, VoxelGrid};
 use conefield_core::orbit::CircularOrbit;
 use conefield_core::scan::{Scan, Unit};
 use conefield_core::{Error, Result};
@@ -57,6 +60,9 @@ use std::path::Path;
 pub(crate) const FORMAT: &str = "conefield-scanner";
 pub(crate) const VERSION: u32 = 1;
 
+/// Numbers of a view in ASTRA's notation.
+const VECTOR: usize = 12;
+
 /// The counts of the open beam where no flat field says them.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub enum I0 {
@@ -66,13 +72,17 @@ pub enum I0 {
     Air,
 }
 
-/// What overrides the description.
-#[derive(Debug, Clone, Copy, PartialEq, Default)]
+/// What overrides the description, and the part that is taken.
+#[derive(Debug, Clone, PartialEq, Default)]
 pub struct ImportOptions {
     /// In place of the file's `i0` and flat field.
     pub i0: Option<I0>,
     /// In place of the file's `floor`.
     pub floor: Option<f64>,
+    /// The part of the scan that is taken. Counts are converted before: dead pixels are mended by their neighbours, and air is
+    /// looked for at the border of the whole detector. Larger pixels then hold the mean of the light, as they would have counted it;
+    /// where the files hold line integrals, the mean of these.
+    pub selection: Selection,
 }
 
 /// What [`read_scanner`] makes of a description.
@@ -125,6 +135,15 @@ enum Direction {
     Clockwise,
 }
 
+/// Turns of the detector about u, about v and about u × v.
+#[derive(Deserialize, Clone, Copy, Default)]
+#[serde(deny_unknown_fields, default)]
+struct TiltTable {
+    u: f64,
+    v: f64,
+    normal: f64,
+}
+
 #[derive(Deserialize)]
 #[serde(deny_unknown_fields)]
 struct Circle {
@@ -134,17 +153,19 @@ struct Circle {
     #[serde(default)]
     offset: Uv,
     #[serde(default)]
+    tilt_deg: TiltTable,
+    #[serde(default)]
     start_deg: f64,
     step_deg: Option<f64>,
     range_deg: Option<f64>,
-    angles_deg: Option<Vec<f64>>,
+    angles_deg: Option<Numbers<f64>>,
     direction: Direction,
 }
 
 #[derive(Deserialize)]
 #[serde(deny_unknown_fields)]
 struct Vectors {
-    cone_vec: Vec<[f64; 12]>,
+    cone_vec: Numbers<Vec<f64>>,
 }
 
 #[derive(Deserialize)]
@@ -245,6 +266,8 @@ pub fn read_scanner(path: impl AsRef<Path>, options: &ImportOptions) -> Result<I
     });
     let scan = Scan { geometry, projections, unit: Unit::default(), provenance };
     scan.validate(&place)?;
+    let mean = if counts.is_some() { Mean::Light } else { Mean::LineIntegrals };
+    let scan = options.selection.take(scan, mean)?;
     Ok(Imported { scan, counts })
 }
 
@@ -326,22 +349,40 @@ fn views(folder: &Path, place: &str, d: &Description, count: usize) -> Result<Ve
     };
     match (&d.circle, &d.vectors, &d.rtk) {
         (Some(c), None, None) => {
-            let angles = angles(place, c, count)?;
+            let angles = angles(folder, place, c, count)?;
             fits("circle.angles_deg", angles.len())?;
             for (field, x) in [("circle.dso", c.dso), ("circle.dsd", c.dsd)] {
                 ensure(x.is_finite() && x > 0.0, place, field, x, "a positive finite length in mm")?;
             }
             lengths(place, "circle", c.pixel, c.offset)?;
             let (pixel, offset) = ([c.pixel.v, c.pixel.u], [c.offset.v, c.offset.u]);
-            Ok(CircularOrbit { dso: c.dso, dsd: c.dsd, pixel, offset, angles }.views())
+            let tilt = [("u", c.tilt_deg.u), ("v", c.tilt_deg.v), ("normal", c.tilt_deg.normal)];
+            for (axis, x) in tilt {
+                let fits = x.is_finite() && x.abs() < 90.0;
+                ensure(fits, place, &format!("circle.tilt_deg.{axis}"), x, "degrees between -90 and 90")?;
+            }
+            let tilt = tilt.map(|(_, x)| Radians(x.to_radians()));
+            let orbit = CircularOrbit { dso: c.dso, dsd: c.dsd, pixel, offset, angles };
+            Ok(orbit.views().into_iter().map(|v| v.tilted(tilt)).collect())
         }
         (None, Some(v), None) => {
-            fits("vectors.cone_vec", v.cone_vec.len())?;
-            let view = |n: &[f64; 12]| {
-                let part = |k: usize| [n[k], n[k + 1], n[k + 2]];
-                View { source: part(0), detector: part(3), u: part(6), v: part(9) }
+            let field = "vectors.cone_vec";
+            let read;
+            let rows = match &v.cone_vec {
+                Numbers::List(rows) => rows,
+                Numbers::File(name) => {
+                    read = table::read(folder, place, field, name, VECTOR)?;
+                    &read
+                }
             };
-            Ok(v.cone_vec.iter().map(view).collect())
+            fits(field, rows.len())?;
+            let view = |(i, n): (usize, &Vec<f64>)| {
+                let field = format!("{field}[{i}]");
+                ensure(n.len() == VECTOR, place, &field, format!("{} numbers", n.len()), format!("{VECTOR}"))?;
+                let part = |k: usize| [n[k], n[k + 1], n[k + 2]];
+                Ok(View { source: part(0), detector: part(3), u: part(6), v: part(9) })
+            };
+            rows.iter().enumerate().map(view).collect()
         }
         (None, None, Some(r)) => {
             lengths(place, "rtk", r.pixel, r.offset)?;
@@ -366,7 +407,7 @@ fn lengths(place: &str, table: &str, pixel: Uv, offset: Uv) -> Result<()> {
 }
 
 /// The angles in radians.
-fn angles(place: &str, c: &Circle, count: usize) -> Result<Vec<f64>> {
+fn angles(folder: &Path, place: &str, c: &Circle, count: usize) -> Result<Vec<f64>> {
     let finite = |field: &str, x: f64| ensure(x.is_finite(), place, field, x, "a finite number of degrees");
     finite("circle.start_deg", c.start_deg)?;
     let from_start: Vec<f64> = match (c.step_deg, c.range_deg, &c.angles_deg) {
@@ -378,7 +419,8 @@ fn angles(place: &str, c: &Circle, count: usize) -> Result<Vec<f64>> {
             finite("circle.range_deg", range)?;
             (0..count).map(|i| range * i as f64 / count as f64).collect()
         }
-        (None, None, Some(list)) => {
+        (None, None, Some(Numbers::File(name))) => table::read(folder, place, "circle.angles_deg", name, 1)?.concat(),
+        (None, None, Some(Numbers::List(list))) => {
             for (i, a) in list.iter().enumerate() {
                 finite(&format!("circle.angles_deg[{i}]"), *a)?;
             }

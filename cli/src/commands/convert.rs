@@ -1,5 +1,6 @@
 //! `conefield convert`
 
+use super::selection::SelectionOptions;
 use crate::boundary::{Inputs, refuse_existing};
 use crate::memory::Memory;
 use crate::parse::{self, Values};
@@ -13,7 +14,8 @@ use std::path::PathBuf;
 /// Rewrite a volume or a scan in another format.
 ///
 /// Volumes: NIfTI (.nii, .nii.gz), MetaImage (.mha) and NumPy (.npy), by the name of OUT; IN may also be a .mhd or the
-/// folder of a DICOM series. Scans: as --to says; test views are kept where the format has a place for them (r2, naf).
+/// folder of a DICOM series. Scans: as --to says; test views are kept where the format has a place for them (r2, naf). Of a scan
+/// a part may be taken; larger pixels (--bin) hold the mean of line integrals.
 #[derive(Args)]
 pub struct ConvertArgs {
     /// A volume or a scan.
@@ -28,6 +30,8 @@ pub struct ConvertArgs {
     /// What a volume's values mean: as-is, hu:MU_WATER or clip:LO,HI.
     #[arg(long, default_value = "as-is", value_parser = parse::values)]
     values: Values,
+    #[command(flatten)]
+    selection: SelectionOptions,
     /// Replace OUT.
     #[arg(long)]
     force: bool,
@@ -53,7 +57,17 @@ impl ConvertArgs {
         let inputs = Inputs::of([&self.input]);
         inputs.spare_file(&self.output)?;
         inputs.spare_folder(&self.output)?;
+        let selection = self.selection.selection();
         if conefield_io::is_volume(&self.input) {
+            if let Some(option) = self.selection.named() {
+                let place = self.input.display().to_string();
+                return Err(Error::invalid(
+                    place,
+                    option,
+                    "a volume",
+                    "a scan, of whose views and pixels a part can be taken",
+                ));
+            }
             let voxels = conefield_io::volume_voxels(&self.input)?;
             Memory::of_volumes(&[voxels]).check(|_| vec![])?;
             let volume = conefield_io::read_volume(&self.input)?;
@@ -62,7 +76,9 @@ impl ConvertArgs {
             conefield_io::write_volume(&self.output, &volume)?;
         } else {
             Memory::of_data_set(&conefield_io::scan_size(&self.input)?).check(|_| vec![])?;
-            let data = conefield_io::read_data_set(&self.input)?;
+            let DataSet { train, test, volume } = conefield_io::read_data_set(&self.input)?;
+            let test = test.map(|test| selection.of_detector(test)).transpose()?;
+            let data = DataSet { train: selection.of(train)?, test, volume };
             files::warn_of(&self.input, &survey(&data.train));
             self.tell_lost(&data);
             let (scan, test, truth) = (&data.train, data.test.as_ref(), data.volume.as_ref());

@@ -1,6 +1,6 @@
 //! `conefield import`
 
-use super::info;
+use super::{info, selection::SelectionOptions};
 use crate::boundary::{Inputs, refuse_existing};
 use crate::memory::Memory;
 use crate::{out, parse};
@@ -14,7 +14,8 @@ use std::path::PathBuf;
 /// Make a scan of what a scanner gave.
 ///
 /// SCANNER.toml names the files with the projections (TIFF, .npy, .npz, .mha), says in mm where source and detector stood
-/// and how arrays lie; docs/geometry.md has all keys. Raw counts become line integrals; dead and hot pixels are interpolated.
+/// and how arrays lie; docs/geometry.md has all keys. Raw counts become line integrals; dead and hot pixels are interpolated. Then
+/// the part that is asked for is taken: larger pixels (--bin) hold the mean of the light, as they would have counted it.
 #[derive(Args)]
 pub struct ImportArgs {
     /// The description of the scanner.
@@ -31,6 +32,8 @@ pub struct ImportArgs {
     /// the open beam].
     #[arg(long, value_name = "N", value_parser = parse::above_zero)]
     floor: Option<f64>,
+    #[command(flatten)]
+    selection: SelectionOptions,
     /// Replace SCAN.
     #[arg(long)]
     force: bool,
@@ -44,7 +47,7 @@ impl ImportArgs {
         refuse_existing(&self.output, self.force)?;
         Inputs::default().and_description(&self.scanner).spare_folder(&self.output)?;
         Memory::of_views(&conefield_io::scanner_size(&self.scanner)?).check(|_| vec![])?;
-        let options = ImportOptions { i0: self.i0, floor: self.floor };
+        let options = ImportOptions { i0: self.i0, floor: self.floor, selection: self.selection.selection() };
         let imported = conefield_io::read_scanner(&self.scanner, &options)?;
         conefield_io::write_scan(&self.output, &imported.scan, None)?;
         let found = self.understood(&imported);

@@ -1,10 +1,12 @@
 //! `conefield info`
 
+use super::calibrate;
 use crate::boundary::{self, Inputs};
 use crate::memory::Memory;
 use crate::run_folder::{self, RunOnDisk};
 use crate::{files, out};
 use clap::Args;
+use conefield_backend_cpu::Cpu;
 use conefield_core::geometry::{Geometry, VoxelGrid};
 use conefield_core::scan::{Scan, Volume};
 use conefield_core::{Error, Result};
@@ -181,6 +183,9 @@ fn scan(path: &Path, png: Option<&Path>) -> Result<Value> {
         survey_png(png, &title(path, s, &survey), &s.geometry)?;
     }
     let mut found = facts(s, &survey);
+    if let (Some(warning), Some(all)) = (calibrate::suspicion(s, &Cpu::new())?, found["warnings"].as_array_mut()) {
+        all.push(json!(warning));
+    }
     let mut missing = Vec::new();
     if s.unit.mm == 1.0 && s.provenance["unit_from"].as_str().is_some_and(|f| f.starts_with("nothing")) {
         missing.push("a unit of length: mm is assumed");

@@ -1,7 +1,7 @@
 //! `conefield reconstruct`
 
 use super::record::{RunRecord, Written, summary};
-use super::{backends::simd_level, protocol::RunProtocol};
+use super::{backends::simd_level, calibrate, protocol::RunProtocol};
 use crate::boundary::{self, Inputs};
 use crate::live::Live;
 use crate::memory;
@@ -14,9 +14,11 @@ use crate::run_folder::RunFolder;
 use crate::{files, out, signals, specs};
 use clap::error::ErrorKind;
 use clap::{Args, CommandFactory};
+use conefield_backend_cpu::Cpu;
 use conefield_core::backend::Backend;
 use conefield_core::checkpoint::Resume;
 use conefield_core::method::{Job, Solution};
+use conefield_core::scan::Scan;
 use conefield_core::spec::load::{Loaded, to_toml};
 use conefield_core::{Error, Result};
 use conefield_report::MiddleSlices;
@@ -80,6 +82,9 @@ fn spec_help() -> String {
 
 /// What an error that goes to standard output begins with.
 pub const FAILED: &str = "failed: ";
+
+/// A held-out error above this may come from a wrong geometry.
+const DOUBTFUL: f64 = 0.05;
 
 impl ReconstructArgs {
     pub fn run(self) -> Result<()> {
@@ -164,7 +169,7 @@ impl ReconstructArgs {
         drop(progress);
 
         let written = self.write(&folder, &input.work, &mut solution, &loaded, backend.as_ref())?;
-        let Reading { work: Input { held, peak, .. }, record: scan, load_s } = input;
+        let Reading { work: Input { scan: seen, held, peak, .. }, record: scan, load_s } = input;
         let path = |p: &PathBuf| p.display().to_string();
         let record = RunRecord {
             version: env!("CARGO_PKG_VERSION"),
@@ -200,7 +205,19 @@ impl ReconstructArgs {
         };
         conefield_io::write_text_atomic(folder.file("record.json"), &out::to_json(&record)?)?;
         folder.finish()?;
+        self.doubt(&seen, record.held_out);
         if self.json { out::json(&record) } else { out::say(&summary(&record, &self.output)) }
+    }
+
+    /// Where views that were kept aside are predicted badly, looks whether the geometry is why.
+    /// The run is complete: an interruption only ends the look, which a part of another command's work goes without.
+    fn doubt(&self, scan: &Scan, held_out: Option<f64>) {
+        if held_out.is_some_and(|error| error > DOUBTFUL)
+            && !self.as_part
+            && let Ok(Some(warning)) = calibrate::suspicion(scan, &Cpu::new())
+        {
+            tracing::warn!("{}: {warning}", self.scan.display());
+        }
     }
 
     /// Reads all that there is to read.

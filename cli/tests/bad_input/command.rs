@@ -49,6 +49,16 @@ pub fn cases() -> Vec<Case> {
             &["100 years"],
         ),
         wrong("a time without end", "reconstruct scan --spec fast -o run --budget inf", &["expected seconds"]),
+        wrong("views in a wrong order", "convert scan out --views 9-3", &["--views", "0-719:10"]),
+        wrong("every 0th view", "convert scan out --views every:0", &["--views", "every:10"]),
+        wrong("rows that are no slice", "convert scan out --rows 5", &["--rows", "FROM:TO"]),
+        wrong("pixels of no pixels", "convert scan out --bin 0", &["--bin"]),
+        wrong("five quarter turns", "convert scan out --turns 5", &["--turns", "0..=3"]),
+        wrong(
+            "a distance that no view tells",
+            "calibrate scan --parameters dso",
+            &["dso", "object's size", "offset-u"],
+        ),
         wrong("every view kept aside", "reconstruct scan --spec fast -o run --hold-out every:1", &["every:10"]),
         refused("a phantom that is not known", none, "simulate phantom:hand -o scan", &["`hand`", "`head`"]),
         refused(

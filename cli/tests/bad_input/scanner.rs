@@ -63,6 +63,18 @@ pub fn cases() -> Vec<Case> {
             &["circle.angles_deg[1]", "NaN"],
         ),
         refused(
+            "a file of angles that is not there",
+            circle("range_deg = 360.0", "angles_deg = \"none.csv\""),
+            IMPORT,
+            &["circle.angles_deg", "none.csv"],
+        ),
+        refused(
+            "a tilt that is infinite",
+            circle("range_deg = 360.0", "range_deg = 360.0\ntilt_deg = { u = inf }"),
+            IMPORT,
+            &["circle.tilt_deg.u", "inf"],
+        ),
+        refused(
             "angles said twice",
             circle("range_deg = 360.0", "range_deg = 360.0\nstep_deg = 1.0"),
             IMPORT,

@@ -5,6 +5,7 @@ use crate::common::{conefield, done, refused};
 const COMMANDS: [&str; 19] = [
     "simulate",
     "import",
+    "calibrate",
     "reconstruct",
     "compare",
     "study",

@@ -7,6 +7,7 @@ mod backends;
 #[cfg(unix)]
 mod boundary;
 mod budget;
+mod calibrate;
 mod chain;
 mod compare;
 #[cfg(target_os = "linux")]
@@ -25,6 +26,7 @@ mod report;
 #[cfg(unix)]
 mod resume;
 mod schema;
+mod selection;
 mod study;
 mod tradeoff;
 mod unusual;

@@ -43,7 +43,7 @@ fn every_step_of_the_page_works() {
     assert_eq!(toml.len(), 1);
     fs::write(at("scanner.toml"), toml[0]).unwrap();
     let commands: Vec<&str> = blocks(&page, "sh").into_iter().flat_map(str::lines).collect();
-    assert_eq!(commands.len(), 6);
+    assert_eq!(commands.len(), 7);
     for line in commands {
         let line = line.replace("--budget 10m", "--steps 3");
         let words: Vec<&str> = line.split(' ').collect();

@@ -1,0 +1,248 @@
+//! The criterion: how well views that are kept aside are predicted from a quick reconstruction of the others.
+
+use crate::parameters::{Correction, Parameter};
+use conefield_core::backend::Backend;
+use conefield_core::geometry::{Geometry, Vec3, VoxelGrid, norm};
+use conefield_core::method::{Context, Job, Method, Observer, Reconstruction, Record};
+use conefield_core::scan::{Scan, Unit};
+use conefield_core::{Error, Result};
+use conefield_diagnosis::setup;
+use conefield_projectors::voxel::Joseph;
+use conefield_solvers::iterative::Stop;
+use conefield_solvers::iterative::order::Subsets;
+use conefield_solvers::iterative::sart::Sart;
+use ndarray::{Array3, s};
+use rayon::prelude::*;
+
+/// One of so many views is kept aside, by turns.
+const EVERY: usize = 4;
+/// Subsets of the views and passes of the quick reconstruction.
+const SUBSETS: usize = 8;
+const PASSES: u64 = 3;
+/// More views than this say little more of the geometry.
+const MOST_VIEWS: usize = 120;
+/// Share of the views' squares that may belong to rays beside the volume before the volume is made larger, by how much, and how
+/// often at most.
+const BESIDE: f64 = 0.01;
+const GROWTH: f64 = 1.4;
+const GROWN: usize = 3;
+/// Of the highest line integral: more at a side of the detector is no air.
+const AIR: f32 = 0.05;
+
+/// A scan with larger pixels and voxels, some of whose views are kept aside by turns.
+pub(crate) struct Level {
+    /// The geometry of all its views, as it was told.
+    pub geometry: Geometry,
+    /// Pixels of the scan along the side of one here.
+    pub bin: usize,
+    folds: Vec<Fold>,
+    magnification: f64,
+    /// The largest line integral of the views that are predicted.
+    top: f64,
+    /// Root mean square change of a predicted view over a column.
+    pub slope: f64,
+}
+
+/// Some views kept aside.
+struct Fold {
+    train: Scan,
+    kept: Vec<usize>,
+    test: Scan,
+    held: Vec<usize>,
+}
+
+/// What is left of the views that are kept aside.
+pub(crate) struct Prediction {
+    /// Measured less predicted, a list for each view.
+    pub views: Vec<Vec<f32>>,
+    /// Root mean square of them, over the largest line integral.
+    pub error: f64,
+}
+
+/// Hears nothing and may stop.
+struct Quiet<'a>(&'a (dyn Fn() -> bool + Sync));
+
+impl Observer for Quiet<'_> {
+    fn progress(&mut self, _: u64, _: f64, _: f64) {}
+    fn record(&mut self, _: &Record) {}
+    fn note(&mut self, _: &str) {}
+    fn cancelled(&self) -> bool {
+        (self.0)()
+    }
+}
+
+impl Level {
+    /// Of `scan`, with about `width` pixels along the longer side of the detector, `folds` times another quarter of the views aside. Its
+    /// voxels hold what the views show in the geometry that `known` makes.
+    pub fn new(scan: &Scan, width: usize, folds: usize, known: &Correction) -> Result<Self> {
+        let g = &scan.geometry;
+        let [rows, columns] = g.detector;
+        let bin = rows.max(columns).div_ceil(width).clamp(1, (rows.min(columns) / 4).max(1));
+        let binned = Scan { unit: Unit::default(), ..spread(scan.binned(bin))? };
+        let told = binned.geometry.views.clone();
+        let views = known.views(&told);
+        let seen = Scan { geometry: Geometry { views, ..binned.geometry.clone() }, ..binned };
+        let grid = grid(&seen, width);
+        let magnification = setup(&seen.geometry).magnification;
+        let (geometry, binned) = (Geometry { views: told, volume: grid, ..seen.geometry.clone() }, seen);
+        let binned = Scan { geometry: geometry.clone(), ..binned };
+        let n = geometry.views.len();
+        let every = EVERY.min(n / 2).max(2);
+        let folds: Vec<Fold> = (0..folds.min(every))
+            .map(|f| {
+                let first = (1 + f * every / folds) % every;
+                let (held, kept): (Vec<usize>, Vec<usize>) = (0..n).partition(|v| v % every == first);
+                let (train, test) = binned.split(&held)?;
+                Ok(Fold { train, kept, test, held })
+            })
+            .collect::<Result<_>>()?;
+        let all = || folds.iter().map(|f| &f.test.projections);
+        let top = all().flatten().copied().fold(0.0f32, f32::max);
+        if top <= 0.0 {
+            let expected = "line integrals of an object, positive where it absorbs";
+            return Err(Error::invalid("scan", "projections", "no positive line integral", expected));
+        }
+        let slope = all().map(slope).sum::<f64>() / folds.len() as f64;
+        Ok(Self { geometry, bin, folds, magnification, top: top.into(), slope })
+    }
+
+    /// About what a prediction takes, to compare levels with.
+    pub fn work(&self) -> f64 {
+        self.folds.iter().map(|f| f.train.header().samples()).sum()
+    }
+
+    /// Predicts the views that are kept aside in the geometry that `correction` makes.
+    pub fn predict(
+        &self,
+        correction: &Correction,
+        backend: &dyn Backend,
+        cancelled: &(dyn Fn() -> bool + Sync),
+    ) -> Result<Prediction> {
+        let views = correction.views(&self.geometry.views);
+        let volume = self.following(correction);
+        let of = |fold: &Fold| -> Result<Vec<Vec<f32>>> {
+            let among = |list: &[usize]| Geometry {
+                views: list.iter().map(|&v| views[v]).collect(),
+                detector: self.geometry.detector,
+                volume,
+            };
+            let scan = Scan { geometry: among(&fold.kept), ..fold.train.clone() };
+            let volume = reconstruct(&scan, backend, cancelled)?;
+            let mut residual = Array3::zeros(fold.test.projections.raw_dim());
+            let projector = backend.place(Box::new(Joseph {}))?;
+            let all: Vec<usize> = (0..fold.held.len()).collect();
+            projector.operator().forward(&among(&fold.held), &all, volume.view(), residual.view_mut());
+            projector.operator().fault()?;
+            residual.zip_mut_with(&fold.test.projections, |a, p| *a = p - *a);
+            Ok(residual.outer_iter().map(|view| view.iter().copied().collect()).collect())
+        };
+        let folds: Vec<Vec<Vec<f32>>> = self.folds.par_iter().map(of).collect::<Result<_>>()?;
+        let views: Vec<Vec<f32>> = folds.into_iter().flatten().collect();
+        let pixels: usize = views.iter().map(Vec::len).sum();
+        let square: f64 = views.iter().flatten().map(|x| f64::from(*x).powi(2)).sum();
+        Ok(Prediction { views, error: (square / pixels as f64).sqrt() / self.top })
+    }
+}
+
+impl Level {
+    /// Voxels that go with the object, which moves along z as the detector does along v: it lies on them in the same way then. If it did
+    /// not, the error would rise and fall with every voxel.
+    fn following(&self, correction: &Correction) -> VoxelGrid {
+        let mut grid = self.geometry.volume;
+        let v = self.geometry.views[0].v;
+        if self.magnification > 0.0 {
+            grid.center[2] += correction.get(Parameter::OffsetV) * v[2] / norm(v) / self.magnification;
+        }
+        grid
+    }
+}
+
+/// A quick reconstruction, in 1/mm.
+fn reconstruct(scan: &Scan, backend: &dyn Backend, cancelled: &(dyn Fn() -> bool + Sync)) -> Result<Array3<f32>> {
+    let subsets = Subsets::Count(SUBSETS);
+    let sart = Sart { subsets, relaxation: 1.0, decay: 0.7, stop: Stop::after(PASSES), ..Sart::default() };
+    let mut plan = sart.plan(&Context::new(backend))?;
+    let solution = plan.run(&Job::new(scan, backend), &mut Quiet(cancelled));
+    let solution = solution.map_err(|e| match e {
+        Error::Interrupted { .. } => Error::Aborted { part: "calibration".into() },
+        e => e,
+    })?;
+    match solution.result {
+        Reconstruction::Volume(volume) => Ok(volume.data),
+        other => other.volume(backend).map(|v| v.data),
+    }
+}
+
+/// The scan with some of its views, evenly, where it has very many.
+fn spread(scan: Scan) -> Result<Scan> {
+    let n = scan.geometry.views.len();
+    if n <= MOST_VIEWS {
+        return Ok(scan);
+    }
+    let kept: Vec<usize> = (0..MOST_VIEWS).map(|i| i * n / MOST_VIEWS).collect();
+    Ok(scan.split(&kept)?.1)
+}
+
+/// Voxels as fine as the pixels, in a box that holds what the views show. Where the object reaches past the detector, or past
+/// the volume that is to be reconstructed, the box is larger than that.
+fn grid(scan: &Scan, width: usize) -> VoxelGrid {
+    let asked = scan.geometry.volume;
+    let mut size = asked.size();
+    let top = scan.projections.iter().copied().fold(0.0f32, f32::max);
+    let (_, rows, columns) = scan.projections.dim();
+    let cut = |axis: usize, last: usize| {
+        let side = |i: usize| {
+            let line = scan.projections.index_axis(ndarray::Axis(axis), i);
+            line.iter().filter(|x| **x > AIR * top).count() as f64 > 0.02 * line.len() as f64
+        };
+        side(0) || side(last)
+    };
+    if cut(2, columns - 1) {
+        size = [size[0] * GROWTH, size[1] * GROWTH, size[2]];
+    }
+    if cut(1, rows - 1) {
+        size[2] *= GROWTH;
+    }
+    for _ in 0..GROWN {
+        if beside(scan, &VoxelGrid { spacing: per(size, asked.shape), ..asked }) < BESIDE {
+            break;
+        }
+        size = size.map(|s| s * GROWTH);
+    }
+    let voxel = setup(&scan.geometry).supported_voxel_mm.into_iter().fold(f64::INFINITY, f64::min);
+    let longest = size.into_iter().fold(0.0, f64::max);
+    let most = (1.5 * width as f64) as usize;
+    let n = if voxel > 0.0 { ((longest / voxel).ceil() as usize).clamp(8, most.max(8)) } else { width };
+    VoxelGrid { spacing: per(size, asked.shape), ..asked }.with_longest(n)
+}
+
+fn per(size: Vec3, shape: [usize; 3]) -> Vec3 {
+    std::array::from_fn(|k| size[k] / shape[k] as f64)
+}
+
+/// Share of the views' squares that belong to rays beside the box.
+fn beside(scan: &Scan, grid: &VoxelGrid) -> f64 {
+    let g = &scan.geometry;
+    let bounds = grid.bounds();
+    let some = g.views.len().div_ceil(16);
+    let (mut out, mut all) = (0.0, 0.0);
+    for ((view, row, column), p) in scan.projections.indexed_iter().filter(|((v, ..), _)| v % some == 0) {
+        let square = f64::from(p.max(0.0)).powi(2);
+        all += square;
+        if square > 0.0 && g.ray(view, row, column).clip(bounds).is_none() {
+            out += square;
+        }
+    }
+    if all > 0.0 { out / all } else { 0.0 }
+}
+
+/// Root mean square change from a column to the next.
+fn slope(p: &Array3<f32>) -> f64 {
+    let columns = p.dim().2;
+    if columns < 2 {
+        return 0.0;
+    }
+    let (a, b) = (p.slice(s![.., .., 1..]), p.slice(s![.., .., ..columns - 1]));
+    let sum: f64 = a.iter().zip(b).map(|(a, b)| f64::from(a - b).powi(2)).sum();
+    (sum / a.len() as f64).sqrt()
+}

@@ -1,0 +1,247 @@
+//! `conefield calibrate`
+
+use crate::backend::{self, BackendChoice};
+use crate::boundary::{self, Inputs, refuse_existing};
+use crate::memory::Memory;
+use crate::progress::Progress;
+use crate::{out, signals};
+use clap::Args;
+use conefield_calibration::{Calibration, Found, Parameter, Settings, Verdict, Watch, calibrate, suspect};
+use conefield_core::backend::Backend;
+use conefield_core::scan::Scan;
+use conefield_core::{Error, Result};
+use conefield_io::DataSet;
+use conefield_report::{CurveOptions, Panel, panels_png};
+use serde::Serialize;
+use serde_json::{Value, json};
+use std::fmt;
+use std::path::{Path, PathBuf};
+use std::sync::{Mutex, PoisonError};
+use std::time::Instant;
+
+/// Find out from the views themselves where the detector stood.
+///
+/// Some views are kept aside and predicted from a quick reconstruction of the others; the geometry that predicts them best
+/// is the one in which they were taken. No phantom is needed. SCAN stays as it is; OUT is the same scan with the corrected
+/// geometry. What the views do not tell is left as it was, and so is what is right within three standard deviations.
+#[derive(Args)]
+pub struct CalibrateArgs {
+    /// The scan.
+    scan: PathBuf,
+    /// The folder for the scan with the corrected geometry [default: none is written].
+    #[arg(short, long = "output", value_name = "OUT")]
+    output: Option<PathBuf>,
+    /// What to look for: offset-u, offset-v, rotation, tilt, slant, distance and step.
+    #[arg(long, value_name = "LIST", value_delimiter = ',', default_value = "offset-u,rotation")]
+    parameters: Vec<Parameter>,
+    /// Pixels along the longer side of the detector at the finest level; more find more and take longer.
+    #[arg(long, value_name = "N", default_value_t = 64, value_parser = clap::value_parser!(u16).range(16..=1024))]
+    pixels: u16,
+    /// Also draw the held-out error along each parameter.
+    #[arg(long, value_name = "FILE")]
+    png: Option<PathBuf>,
+    #[arg(long, value_name = "BACKEND", default_value_t, help = backend::HELP)]
+    backend: BackendChoice,
+    /// Replace OUT.
+    #[arg(long)]
+    force: bool,
+    /// Print one JSON object.
+    #[arg(long)]
+    json: bool,
+}
+
+impl CalibrateArgs {
+    pub fn run(self) -> Result<()> {
+        let begin = Instant::now();
+        std::fs::metadata(&self.scan).map_err(|e| Error::io(&self.scan, e))?;
+        let inputs = Inputs::of([&self.scan]);
+        boundary::picture(self.png.as_deref(), &inputs)?;
+        if let Some(output) = &self.output {
+            refuse_existing(output, self.force)?;
+            inputs.spare_file(output)?;
+            inputs.spare_folder(output)?;
+        }
+        let backend = self.backend.open()?;
+        let size = conefield_io::scan_size(&self.scan)?;
+        Memory::of_data_set(&size).check(|_| vec![])?;
+        let DataSet { train: mut scan, test, volume } = conefield_io::read_data_set(&self.scan)?;
+        scan.validate(&self.scan.display().to_string())?;
+        let settings =
+            Settings { parameters: self.parameters.clone(), width: self.pixels.into(), curves: self.png.is_some() };
+        signals::listen()?;
+        let watch = Shown::new();
+        let found = calibrate(&scan, &settings, backend.as_ref(), &watch)?;
+        drop(watch);
+        if let Some(png) = &self.png {
+            draw(png, &found)?;
+        }
+        if let Some(output) = &self.output {
+            if let Some(test) = test {
+                let n = test.geometry.views.len();
+                tracing::warn!("{}: {n} test views are left out, for which this format has no place", output.display());
+            }
+            scan.geometry.views = found.correction.views(&scan.geometry.views);
+            note(&mut scan, &self.scan, &found);
+            conefield_io::write_scan(output, &scan, volume.as_ref())?;
+        }
+        let seconds = begin.elapsed().as_secs_f64();
+        if self.json {
+            return out::json(&json!({
+                "scan": self.scan, "output": self.output, "picture": self.png, "parameters": found.found,
+                "held_out": { "before": found.held_out[0], "after": found.held_out[1], "views": found.views },
+                "bin": found.bin, "seconds": seconds,
+            }));
+        }
+        out::say(&self.told(&found, seconds))
+    }
+
+    /// For people.
+    fn told(&self, found: &Calibration, seconds: f64) -> String {
+        let heads = ["", "change", "uncertainty", "unit", "in pixels", ""].map(str::to_owned).to_vec();
+        let rows: Vec<Vec<String>> = std::iter::once(heads).chain(found.found.iter().map(row)).collect();
+        let [before, after] = found.held_out;
+        let mut text = out::table(&rows, &[1, 2]);
+        text += &format!(
+            "\n\nheld-out error {before:.4}, {after:.4} with the corrections: root mean square over the largest line integral, {} \
+             views predicted by pixels of {} x {}; {}",
+            found.views,
+            found.bin,
+            found.bin,
+            out::duration(seconds)
+        );
+        if let Some(output) = &self.output {
+            text += &match found.found.iter().any(|f| f.verdict == Verdict::Corrected) {
+                true => format!("\ncorrected scan: {}", output.display()),
+                false => format!("\nnothing to correct; the scan as it was: {}", output.display()),
+            };
+        }
+        text
+    }
+}
+
+/// A line of the table.
+fn row(f: &Found) -> Vec<String> {
+    let digits =
+        |x: f64| if f.uncertainty > 0.0 && f.uncertainty < 0.01 { format!("{x:.4}") } else { format!("{x:.3}") };
+    let [pixels, deviation] = f.pixels;
+    let (change, uncertainty, pixels) = match f.verdict {
+        Verdict::Untold => ("-".into(), "-".into(), String::new()),
+        _ => (digits(f.change), digits(f.uncertainty), format!("{pixels:.2} ± {deviation:.2}")),
+    };
+    let said = match f.verdict {
+        Verdict::Corrected => "corrected",
+        Verdict::Kept => "right as it is",
+        Verdict::Untold => "the views do not tell it: left as it is",
+    };
+    vec![f.parameter.to_string(), change, uncertainty, f.unit.into(), pixels, said.into()]
+}
+
+/// Keeps in the scan how its geometry came about.
+fn note(scan: &mut Scan, source: &Path, found: &Calibration) {
+    let corrected: serde_json::Map<String, Value> = found
+        .found
+        .iter()
+        .filter(|f| f.verdict == Verdict::Corrected)
+        .map(|f| (f.parameter.to_string(), json!({ "change": f.change, "uncertainty": f.uncertainty, "unit": f.unit })))
+        .collect();
+    let calibrated = json!({ "from": source, "corrected": corrected, "held_out": found.held_out });
+    match &mut scan.provenance {
+        Value::Object(map) => drop(map.insert("calibrated".into(), calibrated)),
+        Value::Null => scan.provenance = json!({ "calibrated": calibrated }),
+        other => scan.provenance = json!({ "value": other.take(), "calibrated": calibrated }),
+    }
+}
+
+/// The criterion along each parameter, side by side.
+fn draw(path: &Path, found: &Calibration) -> Result<()> {
+    let options = CurveOptions { size: [640, 480], ..CurveOptions::default() };
+    let drawn: Vec<_> = found
+        .found
+        .iter()
+        .map(|f| {
+            let lowest = f.curve.iter().map(|p| p.1).fold(f64::INFINITY, f64::min);
+            let highest = f.curve.iter().map(|p| p.1).fold(0.0, f64::max);
+            let mark = |x: f64| vec![(x, lowest), (x, highest)];
+            let series = vec![
+                ("held-out error".to_owned(), f.curve.clone()),
+                ("found".to_owned(), mark(f.change)),
+                ("as told".to_owned(), mark(0.0)),
+            ];
+            let title = match f.verdict {
+                Verdict::Untold => format!("{}: not told", f.parameter),
+                _ => format!("{}: {:.3} ± {:.3} {}", f.parameter, f.change, f.uncertainty, f.unit),
+            };
+            (title, format!("change of {} ({})", f.parameter, f.unit), series)
+        })
+        .collect();
+    let panels: Vec<Panel<'_>> = drawn
+        .iter()
+        .map(|(title, x, series)| Panel { title, labels: [x, "held-out error"], series, options: &options })
+        .collect();
+    panels_png(path, &panels)
+}
+
+/// Shows how far a calibration is, and ends it when the user wants.
+pub struct Shown {
+    progress: Mutex<Progress>,
+    begin: Instant,
+}
+
+impl Shown {
+    /// From now on.
+    pub fn new() -> Self {
+        Self { progress: Mutex::new(Progress::new("calibrate", None)), begin: Instant::now() }
+    }
+}
+
+impl Watch for Shown {
+    fn cancelled(&self) -> bool {
+        signals::caught().is_some()
+    }
+
+    fn progress(&self, share: f64) {
+        let left = self.begin.elapsed().as_secs_f64() * (1.0 - share) / share.max(1e-6);
+        let mut progress = self.progress.lock().unwrap_or_else(PoisonError::into_inner);
+        progress.show(share, |_| format!("{} left", out::duration(left)));
+    }
+}
+
+/// What is warned of: a geometry under which the views contradict each other.
+#[derive(Debug, Clone, Serialize)]
+pub struct Suspicion {
+    /// As that of other warnings of a scan.
+    kind: &'static str,
+    /// What was found, with figures.
+    found: String,
+    /// What to do about it.
+    advice: &'static str,
+}
+
+impl fmt::Display for Suspicion {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        write!(f, "{}: {}", self.found, self.advice)
+    }
+}
+
+/// Warns where a quick look finds that the geometry of `scan` is off. A scan on which it cannot look gives no warning.
+pub fn suspicion(scan: &Scan, backend: &dyn Backend) -> Result<Option<Suspicion>> {
+    let found = match suspect(scan, backend, &Shown::new()) {
+        Err(e @ Error::Aborted { .. }) => return Err(e),
+        Err(_) => None,
+        Ok(found) => found,
+    };
+    Ok(found.map(|found| {
+        let off = found.found.iter().filter(|f| f.verdict == Verdict::Corrected);
+        let words = off.map(|f| format!("{} by {:.3} {} ({:.1} pixels)", f.parameter, f.change, f.unit, f.pixels[0]));
+        let [before, after] = found.held_out;
+        Suspicion {
+            kind: "geometry",
+            found: format!(
+                "the geometry is off: with the detector corrected ({}) views that are kept aside are predicted with an error of \
+                 {after:.4}, and with {before:.4} as it is told",
+                words.collect::<Vec<_>>().join(", ")
+            ),
+            advice: "conefield calibrate SCAN -o CORRECTED finds the geometry and writes the scan with it",
+        }
+    }))
+}

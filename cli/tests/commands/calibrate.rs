@@ -1,0 +1,136 @@
+//! `conefield calibrate`: a geometry that is told wrongly is found again, and a right one is left alone.
+
+use crate::common::{conefield, done, json, refused, text};
+use conefield_core::geometry::norm;
+use conefield_core::orbit::CircularOrbit;
+use conefield_projectors::simulate::{Ellipsoid, scan_ellipsoids};
+use serde_json::Value;
+use std::fs;
+use std::path::Path;
+use tempfile::tempdir;
+
+/// A noisy scan of a phantom in `folder`.
+fn scanned(folder: &Path) {
+    let size = ["--views", "30", "--detector", "48x48", "--noise", "poisson:1e5"];
+    done(&[&["simulate", "phantom:head:32", "-o", &text(folder)], &size[..]].concat());
+}
+
+/// The same scan in `folder`, told to have its detector so many pixels aside along u.
+fn told_aside(scan: &Path, folder: &Path, pixels: f64) {
+    let mut scan = conefield_io::read_scan(scan).unwrap();
+    let mut orbit = CircularOrbit::fit(&scan.geometry.views).unwrap();
+    orbit.offset[1] += pixels * orbit.pixel[1];
+    scan.geometry.views = orbit.views();
+    conefield_io::write_scan(folder, &scan, None).unwrap();
+}
+
+/// What came out for a parameter.
+fn of<'a>(found: &'a Value, parameter: &str) -> &'a Value {
+    let all = found["parameters"].as_array().unwrap();
+    all.iter().find(|f| f["parameter"] == parameter).unwrap()
+}
+
+fn number(value: &Value) -> f64 {
+    value.as_f64().unwrap()
+}
+
+#[test]
+fn a_shifted_detector_is_found_and_a_right_one_is_left_alone() {
+    let dir = tempdir().unwrap();
+    let at = |n: &str| dir.path().join(n);
+    scanned(&at("right"));
+    told_aside(&at("right"), &at("wrong"), -3.0);
+    let before = fs::read(at("wrong/scan.toml")).unwrap();
+
+    let (wrong, out, png) = (text(&at("wrong")), text(&at("out")), text(&at("curves.png")));
+    let found = json(&[
+        "calibrate",
+        &wrong,
+        "-o",
+        &out,
+        "--png",
+        &png,
+        "--pixels",
+        "24",
+        "--parameters",
+        "offset-u,rotation",
+        "--json",
+    ]);
+    let u = of(&found, "offset-u");
+    assert_eq!((&u["verdict"], &u["unit"]), (&"corrected".into(), &"mm".into()), "{found}");
+    let change = number(&u["change"]);
+    let [pixels, deviation] = [0, 1].map(|k| number(&u["pixels"][k]));
+    assert!((pixels - 3.0).abs() < 0.1 && deviation < 0.1, "{pixels} ± {deviation}");
+    let held_out = &found["held_out"];
+    assert!(number(&held_out["after"]) < 0.5 * number(&held_out["before"]), "{held_out}");
+    assert!(image::open(at("curves.png")).unwrap().width() > 1000);
+    // The curve has its lowest point where the parameter was found.
+    let curve = u["curve"].as_array().unwrap();
+    let lowest = curve.iter().min_by(|a, b| number(&a[1]).total_cmp(&number(&b[1]))).unwrap();
+    assert!((number(&lowest[0]) - change).abs() < 1e-9, "{lowest} {change}");
+
+    // The scan is what it was, and the new one has the geometry that was found.
+    assert_eq!(fs::read(at("wrong/scan.toml")).unwrap(), before);
+    let corrected = conefield_io::read_scan(at("out")).unwrap();
+    let right = conefield_io::read_scan(at("right")).unwrap();
+    assert_eq!(corrected.projections, right.projections);
+    // The first source stands on the axis x: along y lies what u has.
+    let moved = corrected.geometry.views[0].detector[1] - right.geometry.views[0].detector[1];
+    assert!(moved.abs() < 0.1 * norm(right.geometry.views[0].u), "{moved}");
+    let note = &corrected.provenance["calibrated"]["corrected"]["offset-u"];
+    assert!((number(&note["change"]) - change).abs() < 1e-9, "{note}");
+
+    // Seen again there is nothing left to correct along u, nor in the scan whose geometry was right from the start.
+    for scan in [&out, &text(&at("right"))] {
+        let again = json(&["calibrate", scan, "--pixels", "24", "--parameters", "offset-u", "--json"]);
+        assert_eq!(of(&again, "offset-u")["verdict"], "kept", "{again}");
+        assert_eq!(again["output"], Value::Null);
+    }
+    let said = done(&["calibrate", &text(&at("right")), "--pixels", "24", "--parameters", "offset-u"]);
+    assert!(said.contains("right as it is") && said.contains("held-out error"), "{said}");
+
+    // `info` says that something is off, and does not where nothing is.
+    let warned = done(&["info", &wrong]);
+    assert!(warned.contains("conefield calibrate"), "{warned}");
+    assert!(!done(&["info", &text(&at("right"))]).contains("conefield calibrate"));
+}
+
+/// A ball on the axis: turned in its plane or stepped on wider, every view is the same.
+#[test]
+fn what_the_views_do_not_tell_is_not_invented() {
+    let dir = tempdir().unwrap();
+    let at = |n: &str| dir.path().join(n);
+    scanned(&at("right"));
+    let geometry = conefield_io::read_scan(at("right")).unwrap().geometry;
+    let ball = Ellipsoid {
+        center: [0.0; 3],
+        axes: [0.2 * geometry.volume.size()[0]; 3],
+        value: 0.5 / geometry.volume.size()[0],
+    };
+    conefield_io::write_scan(at("ball"), &scan_ellipsoids(&[ball], geometry), None).unwrap();
+    let found =
+        json(&["calibrate", &text(&at("ball")), "--pixels", "24", "--parameters", "offset-u,rotation,step", "--json"]);
+    assert_eq!(of(&found, "rotation")["verdict"], "untold", "{found}");
+    assert_eq!(of(&found, "step")["verdict"], "untold", "{found}");
+    assert_eq!(of(&found, "offset-u")["verdict"], "kept", "{found}");
+}
+
+#[test]
+fn what_cannot_be_calibrated_is_refused() {
+    let dir = tempdir().unwrap();
+    let at = |n: &str| dir.path().join(n);
+    scanned(&at("scan"));
+    let scan = text(&at("scan"));
+    let said = refused(1, &["calibrate", &scan, "-o", &scan, "--force"]);
+    assert!(said.contains("that this command reads"), "{said}");
+    fs::create_dir(at("there")).unwrap();
+    fs::write(at("there/notes.txt"), "mine").unwrap();
+    assert!(refused(1, &["calibrate", &scan, "-o", &text(&at("there"))]).contains("--force"));
+    let few = text(&at("few"));
+    done(&["convert", &scan, &few, "--views", "0-6"]);
+    let said = refused(1, &["calibrate", &few, "-o", &text(&at("out"))]);
+    assert!(said.contains("views") && said.contains("found 7") && !at("out").exists(), "{said}");
+    let output = conefield(&["calibrate", &scan, "--parameters", "dso"]).assert().code(2).get_output().clone();
+    let said = String::from_utf8(output.stderr).unwrap();
+    assert!(said.contains("object's size") && said.contains("offset-u"), "{said}");
+}

@@ -1,0 +1,181 @@
+//! Numbers for each view, in a file beside a description: text (CSV and the like) or NumPy's arrays.
+
+use crate::input::Input;
+use crate::{folder, npy, npz};
+use conefield_core::files::read_text;
+use conefield_core::{Error, Result};
+use serde::Deserialize;
+use std::path::Path;
+
+/// Longest text, in bytes.
+const LONGEST: u64 = 64 << 20;
+
+/// A list, or the name of a file with one.
+#[derive(Deserialize)]
+#[serde(untagged, expecting = "a list of numbers, or the name of a file with them")]
+pub(crate) enum Numbers<T> {
+    /// As the description has it.
+    List(Vec<T>),
+    /// `FILE`, `FILE.npz:ARRAY` or `FILE.csv:COLUMN`.
+    File(String),
+}
+
+/// The rows of `width` numbers each in the file `name` of `folder`.
+///
+/// Text has a row a line, its numbers apart by commas, semicolons or blanks; what follows `#` and a first line without a
+/// number are left out. Where rows are one number wide, `FILE.csv:NAME` takes the column under that name. Refuses rows of another
+/// width and numbers that are not finite.
+pub(crate) fn read(folder: &Path, place: &str, field: &str, name: &str, width: usize) -> Result<Vec<Vec<f64>>> {
+    let (file, part) = split(name);
+    let path = folder::inside(folder, place, field, file)?;
+    let mut input = Input::open(&path)?;
+    let head = input.take(8)?;
+    let packed = head.starts_with(npz::MAGIC);
+    let rows = match (packed || head.starts_with(npy::MAGIC), part) {
+        (true, Some(array)) if !packed => {
+            let expected = "an .npz archive, the only file of NumPy whose arrays have names";
+            return Err(Error::invalid(path.display().to_string(), "array", format!("the name \"{array}\""), expected));
+        }
+        (true, array) => {
+            let (shape, values) =
+                if packed { npz::read_exact(&path, array)? } else { npy::read_exact(&mut input, head)? };
+            arrayed(&path, &shape, values, width)?
+        }
+        (false, column) => texts(&path, column, width)?,
+    };
+    for (i, row) in rows.iter().enumerate() {
+        if let Some(x) = row.iter().find(|x| !x.is_finite()) {
+            return Err(Error::invalid(path.display().to_string(), format!("row {i}"), x, "finite numbers"));
+        }
+    }
+    Ok(rows)
+}
+
+/// The name of a file, and of the array or column in it.
+fn split(name: &str) -> (&str, Option<&str>) {
+    match name.rsplit_once(':') {
+        Some((file, part)) if file.contains('.') => (file, Some(part)),
+        _ => (name, None),
+    }
+}
+
+fn arrayed(path: &Path, shape: &[usize], values: Vec<f64>, width: usize) -> Result<Vec<Vec<f64>>> {
+    let fits = match *shape {
+        [_] => width == 1,
+        [_, w] => w == width,
+        _ => false,
+    };
+    if !fits {
+        let alone = if width == 1 { "[views] or " } else { "" };
+        let expected = format!("{alone}[views, {width}]");
+        return Err(Error::invalid(path.display().to_string(), "shape", format!("{shape:?}"), expected));
+    }
+    Ok(values.chunks(width).map(<[f64]>::to_vec).collect())
+}
+
+fn texts(path: &Path, column: Option<&str>, width: usize) -> Result<Vec<Vec<f64>>> {
+    let text = read_text(path, LONGEST)?;
+    let place = path.display();
+    let lines = text.lines().map(|l| l.split('#').next().unwrap_or_default().trim()).enumerate();
+    let mut lines = lines.filter(|(_, l)| !l.is_empty()).map(|(i, l)| (i + 1, cells(l))).peekable();
+    let heads = lines.next_if(|(_, cells)| cells.iter().all(|c| c.parse::<f64>().is_err()));
+    let at = match (column, &heads) {
+        (None, _) => None,
+        (Some(name), Some((_, heads))) => match heads.iter().position(|h| *h == name) {
+            Some(at) => Some(at),
+            None => {
+                let expected = format!("one of its columns: {}", heads.join(", "));
+                return Err(Error::invalid(place.to_string(), "column", format!("\"{name}\""), expected));
+            }
+        },
+        (Some(name), None) => {
+            let expected = "a first line with the names of the columns";
+            return Err(Error::invalid(place.to_string(), format!("column \"{name}\""), "no names", expected));
+        }
+    };
+    let row = |(line, cells): (usize, Vec<&str>)| -> Result<Vec<f64>> {
+        let place = || format!("{place}: line {line}");
+        let chosen: Vec<&str> = match at {
+            Some(at) => cells.get(at).copied().into_iter().collect(),
+            None => cells,
+        };
+        if chosen.len() != width {
+            let numbers = if width == 1 {
+                "one number; of several columns, FILE:NAME takes the one under that name".to_owned()
+            } else {
+                format!("{width} numbers")
+            };
+            return Err(Error::invalid(place(), "row", format!("{} cells", chosen.len()), numbers));
+        }
+        let number =
+            |c: &&str| c.parse::<f64>().map_err(|_| Error::invalid(place(), "row", format!("\"{c}\""), "a number"));
+        chosen.iter().map(number).collect()
+    };
+    lines.map(row).collect()
+}
+
+/// The cells of a line: apart by commas or semicolons where there are any, else by blanks.
+fn cells(line: &str) -> Vec<&str> {
+    if line.contains([',', ';']) {
+        let line = line.trim_end_matches([',', ';']);
+        line.split([',', ';']).map(|c| c.trim().trim_matches('"')).collect()
+    } else {
+        line.split_whitespace().collect()
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::testing::npy_bytes;
+    use std::fs;
+
+    fn found(name: &str, content: &[u8], width: usize) -> Result<Vec<Vec<f64>>> {
+        let dir = tempfile::tempdir().unwrap();
+        let (file, _) = split(name);
+        fs::write(dir.path().join(file), content).unwrap();
+        read(dir.path(), "s.toml", "circle.angles_deg", name, width)
+    }
+
+    #[test]
+    fn text_and_arrays_hold_the_same_numbers() {
+        let want = vec![vec![0.0], vec![0.1], vec![-1e-3]];
+        for text in [
+            "0\n0.1\n-1e-3\n",
+            "# degrees\n\n0 # first\n0.1\n-0.001",
+            "angle\r\n0\r\n0.1\r\n-0.001\r\n",
+            "0,\n0.1,\n-0.001,\n",
+        ] {
+            assert_eq!(found("a.csv", text.as_bytes(), 1).unwrap(), want, "{text}");
+        }
+        let named = "\"view\";angle\n0;0\n1;0.1\n2;-0.001";
+        assert_eq!(found("a.csv:angle", named.as_bytes(), 1).unwrap(), want);
+        let numbers = [0.0f64, 0.1, -1e-3].map(f64::to_le_bytes).concat();
+        assert_eq!(found("a.npy", &npy_bytes("<f8", false, "(3,)", &numbers), 1).unwrap(), want);
+        assert_eq!(found("a.npy", &npy_bytes("<f8", false, "(3, 1)", &numbers), 1).unwrap(), want);
+        let two = found("a.txt", b"1 2\n3\t4\n", 2).unwrap();
+        assert_eq!(two, [[1.0, 2.0], [3.0, 4.0]]);
+        // An array in Fortran's order has its rows as they are meant.
+        let turned = [1.0f64, 3.0, 2.0, 4.0].map(f64::to_le_bytes).concat();
+        assert_eq!(found("a.npy", &npy_bytes("<f8", true, "(2, 2)", &turned), 2).unwrap(), two);
+    }
+
+    #[test]
+    fn what_is_no_table_is_refused_in_words() {
+        let refused = |name: &str, content: &[u8], width, words: &[&str]| {
+            let e = found(name, content, width).unwrap_err().to_string();
+            assert!(words.iter().all(|w| e.contains(w)), "{words:?} are not all in: {e}");
+        };
+        refused("a.csv", b"0\nx\n", 1, &["a.csv: line 2", "\"x\"", "a number"]);
+        refused("a.csv", b"0,1\n2,3\n", 1, &["line 1", "2 cells", "one number", "NAME"]);
+        refused("a.csv", b"1,2\n3\n", 2, &["line 2", "1 cells", "2 numbers"]);
+        refused("a.csv:b", b"a,c\n1,2\n", 1, &["column", "\"b\"", "a, c"]);
+        refused("a.csv:b", b"1,2\n", 1, &["no names"]);
+        refused("a.csv", b"0\nnan\n", 1, &["row 1", "NaN", "finite"]);
+        let numbers = [0.0f64; 3].map(f64::to_le_bytes).concat();
+        refused("a.npy", &npy_bytes("<f8", false, "(3,)", &numbers), 12, &["shape", "[3]", "[views, 12]"]);
+        refused("a.npy:x", &npy_bytes("<f8", false, "(3,)", &numbers), 1, &["array", "\"x\"", ".npz"]);
+        let e = read(Path::new("."), "s.toml", "circle.angles_deg", "../a.csv", 1).unwrap_err().to_string();
+        assert!(e.contains("s.toml: circle.angles_deg") && e.contains("without \"..\""), "{e}");
+    }
+}
