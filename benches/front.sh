@@ -35,7 +35,7 @@ run coarse-64 fista-tv "$(cubic 64)" "$prior" bin=4 stop.passes=8
 run coarse-96 fista-tv "$(cubic 96)" "$prior" bin=4 stop.passes=8
 run coarse-112 fista-tv "$(cubic 112)" "$prior" bin=2 stop.passes=8
 run cubic-128 fista-tv "$(cubic 128)" "$prior" stop.passes=8
-run smooth-short smooth-tv methods.1.stop.passes=4 methods.2.stop.passes=2 methods.3.stop.passes=3
+run smooth-200 smooth-tv methods.1.stop.passes=5 methods.2.stop.passes=3
 run smooth-tv smooth-tv
 run cubic-200-long fista-tv "$(cubic 200)" "$prior" 'stop={ passes = 40, change = 2e-4 }'
 python3 - "$out" "$front" "$volumes" "${names[@]}" <<'PY'
