@@ -353,7 +353,7 @@ fn add<S: Simd, R: Real, const F: usize>(s: S, grads: &mut [[R; F]], ends: [u32;
     // The two are never one: the hashes of neighbours differ in their last bit.
     let mut new = fours(s, &ends.map(|i| *entry(grads, i)));
     for q in 0..registers(F) {
-        new[q] = new[q] + sums[q];
+        new[q] += sums[q];
     }
     for (k, i) in ends.into_iter().enumerate() {
         let to = entry_mut(grads, i);
@@ -496,7 +496,7 @@ fn scatter<S: Simd, R: Real, const F: usize, const DENSE: bool>(
     for i in 0..n {
         let (along, mut part) = (located.along::<S, F>(s, i), fours(s, &[dy[i]; 2]));
         for q in 0..registers(F) {
-            part[q] = part[q] * along[q];
+            part[q] *= along[q];
         }
         if together {
             for e in 0..4 {

@@ -127,7 +127,7 @@ mod tests {
         let shown: Vec<(f64, f64)> = all.iter().map(|(x, y)| (*x, y.mean)).collect();
         assert_eq!(shown, [(2.0, 22.0), (3.0, 28.0)]);
         assert!((all[0].1.sd.unwrap() - 8f64.sqrt()).abs() < 1e-12);
-        assert_eq!(means(&[a.clone()]).iter().map(|(x, y)| (*x, y.mean)).collect::<Vec<_>>(), a);
+        assert_eq!(means(std::slice::from_ref(&a)).iter().map(|(x, y)| (*x, y.mean)).collect::<Vec<_>>(), a);
         // One point each, at different times.
         let points = means(&[vec![(1.0, 10.0)], vec![(3.0, 20.0)]]);
         assert_eq!((points.len(), points[0].0, points[0].1.mean), (1, 2.0, 15.0));

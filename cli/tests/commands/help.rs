@@ -2,7 +2,7 @@
 
 use crate::common::{conefield, done, refused};
 
-const COMMANDS: [&str; 19] = [
+const COMMANDS: [&str; 21] = [
     "simulate",
     "import",
     "calibrate",
