@@ -375,14 +375,15 @@ fn views(folder: &Path, place: &str, d: &Description, count: usize) -> Result<Ve
                     &read
                 }
             };
-            fits(field, rows.len())?;
             let view = |(i, n): (usize, &Vec<f64>)| {
                 let field = format!("{field}[{i}]");
                 ensure(n.len() == VECTOR, place, &field, format!("{} numbers", n.len()), format!("{VECTOR}"))?;
                 let part = |k: usize| [n[k], n[k + 1], n[k + 2]];
                 Ok(View { source: part(0), detector: part(3), u: part(6), v: part(9) })
             };
-            rows.iter().enumerate().map(view).collect()
+            let views = rows.iter().enumerate().map(view).collect::<Result<Vec<_>>>()?;
+            fits(field, views.len())?;
+            Ok(views)
         }
         (None, None, Some(r)) => {
             lengths(place, "rtk", r.pixel, r.offset)?;
