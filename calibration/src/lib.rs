@@ -124,13 +124,12 @@ pub fn calibrate(scan: &Scan, settings: &Settings, backend: &dyn Backend, watch:
     let mut levels = vec![];
     for &width in &widths {
         let level = Level::new(scan, width, FOLDS, &at)?;
-        if width != widths[widths.len() - 1] {
-            at = Search { level: &level, ..coarse }.refine(&asked, at, 4)?.correction;
-        }
+        at = Search { level: &level, ..coarse }.refine(&asked, at, 4)?.correction;
         levels.push(level);
     }
-    let finest = &levels[levels.len() - 1];
-    let fine = Search { level: finest, ..coarse };
+    // Where voxels lie moves the best: the last steps are taken on voxels that have followed all before.
+    let finest = Level::new(scan, widths[widths.len() - 1], FOLDS, &at)?;
+    let fine = Search { level: &finest, ..coarse };
     let before = fine.predict(&Correction::default())?.error;
     let fit = fine.refine(&asked, at, 4)?;
     let (mut found, fit) = settle(&fine, fit, scan)?;
@@ -182,7 +181,7 @@ fn planned(coarsest: &Level, widths: &[usize], asked: &[Parameter], curves: bool
     let work = |width: usize| coarsest.work() * (width as f64 / widths[0] as f64).powi(3);
     let finest = widths[widths.len() - 1];
     let looks = 30.0 * coarsest.work();
-    let rounds: f64 = widths.iter().filter(|w| **w != finest).map(|&w| 3.0 * (2.0 * n + 1.5) * work(w)).sum();
+    let rounds: f64 = widths.iter().map(|&w| 3.0 * (2.0 * n + 1.5) * work(w)).sum();
     let fine = (2.0 * (2.0 * n + 1.5) + n) * work(finest);
     let middle = widths[widths.len().saturating_sub(2)];
     looks + rounds + fine + if curves { n * f64::from(POINTS + 1) * work(middle) } else { 0.0 }
