@@ -124,15 +124,21 @@ pub fn calibrate(scan: &Scan, settings: &Settings, backend: &dyn Backend, watch:
     let mut levels = vec![];
     for &width in &widths {
         let level = Level::new(scan, width, FOLDS, &at)?;
-        at = Search { level: &level, ..coarse }.refine(&asked, at, 4)?.correction;
+        if width != widths[widths.len() - 1] {
+            at = Search { level: &level, ..coarse }.refine(&asked, at, 4)?.correction;
+        }
         levels.push(level);
     }
-    // Where voxels lie moves the best: the last steps are taken on voxels that have followed all before.
-    let finest = Level::new(scan, widths[widths.len() - 1], FOLDS, &at)?;
+    let last = Search { level: &levels[levels.len() - 1], ..coarse };
+    let (mut found, fit) = settle(&last, last.refine(&asked, at, 4)?, scan)?;
+    // Where voxels lie moves the best: what is off is looked for once more on voxels that have followed.
+    let finest = Level::new(scan, widths[widths.len() - 1], FOLDS, &fit.correction)?;
     let fine = Search { level: &finest, ..coarse };
     let before = fine.predict(&Correction::default())?.error;
-    let fit = fine.refine(&asked, at, 4)?;
-    let (mut found, fit) = settle(&fine, fit, scan)?;
+    let (again, fit) = settle(&fine, fine.refine(&fit.active, fit.correction, 4)?, scan)?;
+    found.retain(|f| again.iter().all(|a| a.parameter != f.parameter));
+    found.extend(again);
+    found.sort_by_key(|f| f.parameter);
     if settings.curves {
         let middle = Search { level: &levels[levels.len().saturating_sub(2)], ..coarse };
         for f in &mut found {
