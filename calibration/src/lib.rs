@@ -2,8 +2,7 @@
 //!
 //! [`calibrate`] looks for the [`Correction`] under which views that are kept aside are predicted best from a quick
 //! reconstruction of the others (ordered subsets of SART, three passes). It goes from coarse to fine, in pixels and voxels and in how
-//! far it looks (`search`). The criterion needs no marker and no symmetry: it holds for truncated objects, offset detectors and
-//! short scans as well.
+//! far it looks (`search`). The criterion needs no marker, no symmetry and no full circle.
 
 mod criterion;
 mod parameters;

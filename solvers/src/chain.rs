@@ -76,8 +76,8 @@ impl Method for Chain {
     }
 }
 
-/// What limits the next of `left` links after `spent` seconds: its `passes` if they are not its own end's, and time. The last one
-/// ends before the deadline; one before it leaves as much to each of the others as it takes at most.
+/// What limits the next of `left` links after `spent` seconds: its `passes`, and time. The last one ends before the deadline; one
+/// before it leaves as much to each of the others as it takes at most.
 fn later(limits: &Limits, spent: f64, left: usize, passes: Option<u64>) -> Limits {
     let most = limits.at_most.map(|all| (all - spent).max(0.0));
     if left == 1 {
