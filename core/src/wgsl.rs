@@ -1,7 +1,7 @@
 //! A stage's formula for a GPU: WGSL functions over one row, which a backend puts together into kernels.
 //!
-//! A fragment defines, and uses, names that begin with [`PREFIX`]. A backend gives every stage a prefix of its own, so
-//! that fragments never meet. What a stage must define, with its widths `IN` and `OUT` written as numbers:
+//! A fragment declares only names that begin with [`PREFIX`], helpers included; others are refused. A backend gives every stage a
+//! prefix of its own, so that fragments never meet. What a stage must define, with its widths `IN` and `OUT` written as numbers:
 //!
 //! ```wgsl
 //! fn stage_forward(x: ptr<function, array<f32, IN>>, y: ptr<function, array<f32, OUT>>)
@@ -130,6 +130,29 @@ impl Fragment {
         out
     }
 
+    /// The first name that it declares without [`PREFIX`]. Two fragments with such a name could not stand in one kernel.
+    pub fn stray(&self) -> Option<&str> {
+        let (mut depth, mut declares, mut space) = (0, false, false);
+        for token in tokens(&self.source) {
+            match token {
+                "{" => depth += 1,
+                "}" => depth -= 1,
+                // The address space of a variable.
+                "<" => space = declares,
+                ">" => space = false,
+                "fn" | "const" | "override" | "var" | "struct" | "alias" if depth == 0 => declares = true,
+                name if declares && !space => {
+                    if !name.starts_with(PREFIX) {
+                        return Some(name);
+                    }
+                    declares = false;
+                }
+                _ => {}
+            }
+        }
+        None
+    }
+
     /// The sums over rows that it uses, by the names that occur in it.
     pub fn sums(&self) -> BTreeSet<Sum> {
         let words = self.source.split(|c: char| !(c.is_alphanumeric() || c == '_'));
@@ -145,6 +168,33 @@ impl Fragment {
     }
 }
 
+/// Words, braces and angle brackets of a text in WGSL, without its comments. Comments in a comment are not followed: such a text is
+/// refused when it is compiled.
+fn tokens(text: &str) -> impl Iterator<Item = &str> {
+    let mut rest = text;
+    std::iter::from_fn(move || {
+        loop {
+            rest = rest.trim_start();
+            let first = rest.chars().next()?;
+            let end = if rest.starts_with("//") {
+                rest.find('\n').unwrap_or(rest.len())
+            } else if rest.starts_with("/*") {
+                rest.find("*/").map_or(rest.len(), |at| at + 2)
+            } else {
+                let word = |c: char| c.is_alphanumeric() || c == '_';
+                let end = if word(first) { rest.find(|c| !word(c)).unwrap_or(rest.len()) } else { first.len_utf8() };
+                let (token, after) = rest.split_at(end);
+                rest = after;
+                if word(first) || "{}<>".contains(first) {
+                    return Some(token);
+                }
+                continue;
+            };
+            rest = &rest[end..];
+        }
+    })
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;
@@ -153,6 +203,21 @@ mod tests {
     fn names_are_changed_where_they_begin() {
         let f = Fragment::new(&["fn stage_a() { backstage_b(stage_param(0u)); stage_stage_c(); }"]);
         assert_eq!(f.named("s1_"), "fn s1_a() { backstage_b(s1_param(0u)); s1_stage_c(); }");
+    }
+
+    #[test]
+    fn a_declared_name_without_the_prefix_is_found() {
+        let stray = |text: &str| Fragment::new(&[text]).stray().map(str::to_owned);
+        let good = "// fn no() {}\n/* const no */ const stage_n = 3u;\nvar<private> stage_x: array<f32, 3>;
+            fn stage_forward() { var y = 1.0; const z = 2.0; if y < z { y = z; } }\nstruct stage_S { a: f32 }";
+        assert_eq!(stray(good), None);
+        assert_eq!(
+            stray("fn stage_a() { let b = 1; }\nfn square(x: f32) -> f32 { return x * x; }").as_deref(),
+            Some("square")
+        );
+        assert_eq!(stray("const N = 3u;").as_deref(), Some("N"));
+        assert_eq!(stray("@group(0) var<storage, read_write> all: array<f32>;").as_deref(), Some("all"));
+        assert_eq!(stray("} } { fn"), None);
     }
 
     #[test]

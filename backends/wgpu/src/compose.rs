@@ -14,7 +14,7 @@ use conefield_core::pipeline::Pipeline;
 use conefield_core::precision::Tables;
 use conefield_core::prior::Prior;
 use conefield_core::stage::{GradKind, Info, Projector, Scope, Stage, titled};
-use conefield_core::wgsl::{Fragment, RANDOM, RAY, Sum};
+use conefield_core::wgsl::{self, Fragment, RANDOM, RAY, Sum};
 use std::fmt::Write;
 use std::ops::Range;
 
@@ -68,12 +68,14 @@ pub struct Chain {
 }
 
 fn fragment_of(name: &str, fragment: Option<Fragment>) -> Result<Fragment> {
-    fragment.ok_or_else(|| {
-        Error::unsupported(
-            format!("{name} on the wgpu backend"),
-            "the stage offers no WGSL; it runs with --backend cpu",
-        )
-    })
+    let refused = |why: &str| Error::unsupported(format!("{name} on the wgpu backend"), why);
+    let fragment = fragment.ok_or_else(|| refused("the stage offers no WGSL; it runs with --backend cpu"))?;
+    match fragment.stray() {
+        Some(stray) => {
+            Err(refused(&format!("its WGSL declares {stray}, expected names that begin with {}", wgsl::PREFIX)))
+        }
+        None => Ok(fragment),
+    }
 }
 
 impl Chain {

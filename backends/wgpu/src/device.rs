@@ -82,6 +82,10 @@ pub struct Adapter {
     pub subgroups: Option<[u32; 2]>,
     /// Whether kernels can be timed on the device.
     pub timestamps: bool,
+    /// Sizes and types of the matrices that subgroups multiply together, where the driver lists some.
+    pub cooperative_matrices: Vec<String>,
+    /// Names of all optional features, as wgpu has them.
+    pub features: Vec<String>,
 }
 
 impl Adapter {
@@ -115,6 +119,8 @@ impl Adapter {
             atomics,
             subgroups: features.contains(wgpu::Features::SUBGROUP).then_some(lanes),
             timestamps: features.contains(wgpu::Features::TIMESTAMP_QUERY),
+            cooperative_matrices: adapter.cooperative_matrix_properties().iter().map(|m| format!("{m:?}")).collect(),
+            features: features.iter_names().map(|(name, _)| name.to_owned()).collect(),
         }
     }
 

@@ -1,32 +1,56 @@
 //! What a device can do at most, measured: the yardstick beside a kernel's own speed.
 
 use crate::Shared;
-use crate::kernel::Buffers;
+use crate::device::{Atomics, Gpu};
+use crate::kernel::{Buffers, Kernel};
 use crate::source::{Access, Source};
 use conefield_core::error::Result;
+use serde::Serialize;
 use std::time::Instant;
 use wgpu::BufferUsages as U;
 
-/// A device's limits, each a second.
-#[derive(Debug, Clone, Copy, PartialEq)]
+/// A device's limits. Rates are per second.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize)]
 pub struct Ceiling {
     /// Multiply-adds in single precision.
     pub multiply_adds: f64,
-    /// Bytes read one after the other.
+    /// Size of the large buffer: 1 GiB, or what one binding holds.
+    pub large_bytes: u64,
+    /// Bytes read in order from the large buffer.
     pub bytes: f64,
-    /// Reads of 8 bytes at random places of 32 MiB.
+    /// Reads of 8 bytes at random places of the large buffer.
+    pub far_reads: f64,
+    /// Reads of 8 bytes at random places of 32 MiB, about the size of a hash grid's tables.
     pub random_reads: f64,
+    /// Additions to `f32` numbers at random places of 32 MiB.
+    pub random_sums: f64,
+    /// Additions in which neighbouring lanes have neighbouring places.
+    pub neighbour_sums: f64,
+    /// Additions in which the 64 lanes of a group share one place.
+    pub shared_sums: f64,
+    /// Seconds of an empty submission and the wait for it.
+    pub submit_s: f64,
+    /// Bytes sent to the device.
+    pub upload: f64,
+    /// Bytes read back from the device.
+    pub read_back: f64,
 }
 
-/// Invocations of a measurement.
-const MANY: u32 = 1 << 18;
-/// Vector multiply-adds of one invocation; reads of one.
+/// Vector multiply-adds of one invocation.
 const ROUNDS: u32 = 256;
+/// Reads or sums of one invocation.
 const READS: u32 = 64;
-/// Bytes that are read.
-const BYTES: u64 = 32 << 20;
+/// Bytes of the small buffer.
+const SMALL: u64 = 32 << 20;
+/// Bytes of a transfer.
+const TRANSFER: u64 = 64 << 20;
+/// A measurement lasts this long at least, in seconds: submission then costs no more than a few thousandths of it.
+const LONG: f64 = 0.05;
+/// Pseudo-random numbers, one after the other: the quotient of the recurrence by 256 is used, since its low bits repeat soon.
+const NEXT: &str = "h = h * 1664525u + 1013904223u;";
 
-fn source(body: &str) -> Source {
+/// A kernel whose invocations run `body` and keep its result `a` alive.
+fn reading(body: &str) -> Source {
     let mut source = Source::default();
     source.bind("data", Access::Write, "array<vec4<f32>>");
     let text = format!(
@@ -47,39 +71,123 @@ fn main(@builtin(global_invocation_id) id: vec3<u32>, @builtin(num_workgroups) g
     source
 }
 
+/// A kernel whose invocations each add [`READS`] times 1 at `place`, an expression of `h`, `i`, `id` and `lane`.
+fn adding(atomics: Atomics, place: &str) -> Source {
+    let mut source = Source::default();
+    source.bind("data", Access::Write, &format!("array<atomic<{}>>", atomics.number()));
+    let text = format!(
+        "fn add(at: u32, v: f32) {{
+{}}}
+@compute @workgroup_size(64)
+fn main(@builtin(global_invocation_id) id: vec3<u32>, @builtin(local_invocation_index) lane: u32) {{
+    var h = id.x;
+    for (var i = 0u; i < {READS}u; i++) {{ {NEXT} add(({place}) % {}u, 1.0); }}
+}}
+",
+        atomics.sum("data[at]"),
+        SMALL / 4
+    );
+    source.add("measure", &text);
+    source
+}
+
+/// The shortest of some runs of `run`, in seconds.
+fn shortest(mut run: impl FnMut() -> Result<()>) -> Result<f64> {
+    let mut best = f64::INFINITY;
+    for _ in 0..5 {
+        let started = Instant::now();
+        run()?;
+        best = best.min(started.elapsed().as_secs_f64());
+    }
+    Ok(best)
+}
+
+/// Seconds of one of `launches` launches in one submission.
+fn seconds(gpu: &Gpu, kernel: &Kernel, bound: &wgpu::BindGroup, groups: u32, launches: u32) -> Result<f64> {
+    let started = Instant::now();
+    let mut encoder = gpu.device.create_command_encoder(&Default::default());
+    {
+        let mut pass = encoder.begin_compute_pass(&Default::default());
+        (0..launches).for_each(|_| kernel.launch(&mut pass, bound, groups));
+    }
+    gpu.queue.submit([encoder.finish()]);
+    gpu.wait()?;
+    Ok(started.elapsed().as_secs_f64() / f64::from(launches))
+}
+
 impl Shared {
-    /// Measures the device; the best of five runs each. Software devices do a 64th of the work.
+    /// Measures the device. Each rate is the best of five runs of at least a twentieth of a second.
     pub fn ceiling(&self) -> Result<Ceiling> {
-        let invocations = if self.gpu.adapter.software { MANY / 64 } else { MANY };
-        let mut buffers = Buffers::default();
-        buffers.reserve(&self.gpu, "data", BYTES, U::STORAGE)?;
-        let entries = BYTES / 16;
-        let best = |body: String| -> Result<f64> {
-            let kernel = self.kernels.get(&self.gpu, "measure", &source(&body))?;
-            let bound = kernel.bind(&self.gpu, &buffers)?;
+        let gpu = &self.gpu;
+        let software = gpu.adapter.software;
+        // A software device has a few lanes, and no memory of its own.
+        let groups = if software { 64 } else { 1 << 14 };
+        let large_bytes = if software { SMALL } else { gpu.adapter.bound_bytes().min(1 << 30) };
+        let best = |source: &Source, bytes: u64| -> Result<f64> {
+            let mut buffers = Buffers::default();
+            buffers.reserve(gpu, "data", bytes, U::STORAGE)?;
+            let kernel = self.kernels.get(gpu, "measure", source)?;
+            let bound = kernel.bind(gpu, &buffers)?;
+            let mut launches = 1;
+            while seconds(gpu, &kernel, &bound, groups, launches)? * f64::from(launches) < LONG && launches < 1 << 14 {
+                launches *= 2;
+            }
             let mut best = f64::INFINITY;
-            for _ in 0..6 {
-                let started = Instant::now();
-                let mut encoder = self.gpu.device.create_command_encoder(&Default::default());
-                kernel.launch(&mut encoder.begin_compute_pass(&Default::default()), &bound, invocations / 64);
-                self.gpu.queue.submit([encoder.finish()]);
-                self.gpu.wait()?;
-                best = best.min(started.elapsed().as_secs_f64());
+            for _ in 0..5 {
+                best = best.min(seconds(gpu, &kernel, &bound, groups, launches)?);
             }
             Ok(best)
         };
+        let invocations = f64::from(groups * 64);
         let each = "a = a * 0.999 + b; b = b * 0.998 + c; c = c * 0.997 + d; d = d * 0.996 + a;";
-        let adds = best(format!("    for (var i = 0u; i < {ROUNDS}u; i++) {{ {each} }}"))?;
-        let lines = best(format!("    for (var i = id.x; i < {entries}u; i += groups.x * 64u) {{ a += data[i]; }}"))?;
-        let places = best(format!(
-            "    var h = id.x;
-    for (var i = 0u; i < {READS}u; i++) {{ h = h * 1664525u + 1013904223u; a += data[(h >> 8u) % {entries}u].xyxy; }}"
-        ))?;
-        let n = f64::from(invocations);
+        let multiply = reading(&format!("    for (var i = 0u; i < {ROUNDS}u; i++) {{ {each} }}"));
+        let in_order = |bytes: u64| {
+            let entries = bytes / 16;
+            reading(&format!("    for (var i = id.x; i < {entries}u; i += groups.x * 64u) {{ a += data[i]; }}"))
+        };
+        let random = |bytes: u64| {
+            let read = format!("{NEXT} a += data[(h >> 6u) % {}u].xyxy;", bytes / 16);
+            reading(&format!("    var h = id.x;\n    for (var i = 0u; i < {READS}u; i++) {{ {read} }}"))
+        };
+        let sums = |place: &str| {
+            Ok::<_, conefield_core::Error>(
+                invocations * f64::from(READS) / best(&adding(gpu.adapter.atomics, place), SMALL)?,
+            )
+        };
+        let small = SMALL.min(gpu.adapter.bound_bytes());
+        let reads = invocations * f64::from(READS);
+
+        let sent = vec![1u8; TRANSFER.min(gpu.adapter.buffer_bytes) as usize];
+        let bytes = sent.len() as u64;
+        let device = gpu.buffer("transfer", bytes, U::COPY_DST | U::COPY_SRC)?;
+        let host = gpu.buffer("read back", bytes, U::COPY_DST | U::MAP_READ)?;
+        let upload = shortest(|| {
+            gpu.queue.write_buffer(&device, 0, &sent);
+            gpu.queue.submit([]);
+            gpu.wait()
+        })?;
+        let read_back = shortest(|| {
+            let mut encoder = gpu.device.create_command_encoder(&Default::default());
+            encoder.copy_buffer_to_buffer(&device, 0, &host, 0, bytes);
+            gpu.queue.submit([encoder.finish()]);
+            gpu.read(&host, bytes, |found| assert_eq!(found.len() as u64, bytes))
+        })?;
+        let submit_s = shortest(|| {
+            gpu.queue.submit([gpu.device.create_command_encoder(&Default::default()).finish()]);
+            gpu.wait()
+        })?;
         Ok(Ceiling {
-            multiply_adds: n * f64::from(ROUNDS * 16) / adds,
-            bytes: BYTES as f64 / lines,
-            random_reads: n * f64::from(READS) / places,
+            multiply_adds: invocations * f64::from(ROUNDS * 16) / best(&multiply, SMALL)?,
+            large_bytes,
+            bytes: large_bytes as f64 / best(&in_order(large_bytes), large_bytes)?,
+            far_reads: reads / best(&random(large_bytes), large_bytes)?,
+            random_reads: reads / best(&random(small), small)?,
+            random_sums: sums("h >> 6u")?,
+            neighbour_sums: sums("id.x + i * 64u")?,
+            shared_sums: sums("(id.x - lane) + i * 64u")?,
+            submit_s,
+            upload: bytes as f64 / upload,
+            read_back: bytes as f64 / read_back,
         })
     }
 }

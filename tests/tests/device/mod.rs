@@ -1,21 +1,38 @@
-//! The device on which tests run kernels: a software one does.
+//! The device on which tests run kernels: a software one does. `CONEFIELD_ADAPTER=N` asks for adapter N of `conefield backends`;
+//! tests then fail where it cannot be opened. Without it they take the best adapter, and skip where there is none.
 
 use conefield_backend_wgpu::{Limits, Shared, Wgpu};
 use std::sync::{Arc, OnceLock};
+
+/// The adapter that was asked for.
+fn asked() -> Option<usize> {
+    let index = std::env::var("CONEFIELD_ADAPTER").ok()?;
+    Some(index.parse().unwrap_or_else(|_| panic!("CONEFIELD_ADAPTER: found {index:?}, expected an adapter's number")))
+}
+
+fn open(limits: Limits) -> Option<Wgpu> {
+    let index = asked();
+    match Wgpu::with_limits(index, limits) {
+        Ok(opened) => Some(opened),
+        // Not every adapter has subgroups.
+        Err(e) if index.is_some() && !limits.subgroups => panic!("CONEFIELD_ADAPTER: {e}"),
+        Err(_) => None,
+    }
+}
 
 /// The device, opened once a program; `None`, said on stderr with what is not tried, where there is no adapter.
 #[allow(dead_code)]
 pub fn shared(what: &str) -> Option<Arc<Shared>> {
     static DEVICE: OnceLock<Option<Arc<Shared>>> = OnceLock::new();
-    let device = DEVICE.get_or_init(|| Wgpu::open(None).ok().map(|w| w.shared().clone()));
+    let device = DEVICE.get_or_init(|| open(Limits::default()).map(|w| w.shared().clone()));
     if device.is_none() {
         eprintln!("SKIPPED: no adapter for {what}");
     }
     device.clone()
 }
 
-/// Backends on the device: as it is, told that it can do less (no atomic sums; buffers so small that everything is cut into
-/// pieces), and with subgroup operations where it has them.
+/// Backends on the device: with its own limits, told that it can do less (no atomic sums; buffers so small that everything is cut
+/// into pieces), and with subgroup operations where it has them.
 #[allow(dead_code)]
 pub fn backends(what: &str) -> Vec<(&'static str, Wgpu)> {
     let small = Limits { binding_bytes: Some(2048), uniform_bytes: Some(0), ..Limits::default() };
@@ -23,9 +40,8 @@ pub fn backends(what: &str) -> Vec<(&'static str, Wgpu)> {
     let subgroups = Limits { subgroups: true, ..Limits::default() };
     let plain = Limits::default();
     let all =
-        [("as it is", plain), ("compare and exchange", exchange), ("small buffers", small), ("subgroups", subgroups)];
-    let opened = all.into_iter().filter_map(|(name, limits)| Some((name, Wgpu::with_limits(None, limits).ok()?)));
-    let opened: Vec<_> = opened.collect();
+        [("own limits", plain), ("compare and exchange", exchange), ("small buffers", small), ("subgroups", subgroups)];
+    let opened: Vec<_> = all.into_iter().filter_map(|(name, limits)| Some((name, open(limits)?))).collect();
     if opened.is_empty() {
         eprintln!("SKIPPED: no adapter for {what}");
     }

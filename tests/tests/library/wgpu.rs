@@ -344,6 +344,8 @@ fn what_cannot_run_on_a_device_is_refused_in_words() {
     refused(broken, Scope::Row, &["field (changed)", "line", "return nothing;"]);
     let narrow = |s: String| Some(s.replacen("fn stage_backward", "fn stage_back", 1));
     refused(narrow, Scope::Row, &["backward"]);
+    let helper = |s: String| Some(s + "\nfn square(x: f32) -> f32 { return x * x; }\n");
+    refused(helper, Scope::Row, &["field (changed)", "declares square", "stage_"]);
     let (exe, _) = backend.compile(&changed(Some, Scope::Row)).unwrap();
     let blocks: [Box<dyn Prior>; 1] = [Box::new(TotalVariation::default())];
     assert!(exe.admits(&L2 {}, &blocks).is_ok());

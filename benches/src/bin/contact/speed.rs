@@ -1,0 +1,255 @@
+//! Whether kernels are right, and how fast they are.
+
+use crate::{Asked, Result, file, say};
+use conefield_backend_cpu::Cpu;
+use conefield_backend_wgpu::{Limits, Wgpu};
+use conefield_benches::{rays, spread};
+use conefield_core::backend::{Adam, Backend, Executable, TrainRay, Work};
+use conefield_core::pipeline::{Model, Pipeline};
+use conefield_core::settings::{EncoderSpec, FieldSpec, NormalizerSpec, ProjectorSpec};
+use conefield_encoders::hash_grid::HashGrid;
+use conefield_fields::mlp::Mlp;
+use conefield_normalizers::layer_norm::LayerNorm;
+use conefield_projectors::ray_march::{RayMarch, Sampling};
+use conefield_projectors::simulate::{Protocol, phantom, simulate};
+use conefield_projectors::voxel::Joseph;
+use conefield_projectors::voxel::layout::Pinhole;
+use conefield_solvers::losses::L1;
+use ndarray::Array3;
+use serde_json::{Value, json};
+use std::process::Command;
+use std::time::Instant;
+
+/// Samples of a ray in the published configuration.
+const SAMPLES: usize = 320;
+
+/// The published configuration: a hash grid of 10 levels of 2 features with tables of 2^19 entries, LayerNorm, an MLP.
+fn pipeline(samples: usize) -> Result<Pipeline> {
+    let encoder = HashGrid::default().build()?;
+    let width = encoder.info().output;
+    let march = RayMarch { samples: Some(samples), sampling: Sampling::Uniform, ..RayMarch::default() };
+    let norm = LayerNorm::default().build(width)?;
+    Ok(Pipeline::new(encoder, vec![norm], Mlp::default().build(width)?, march.build()?)?)
+}
+
+fn open(asked: &Asked, limits: Limits) -> Result<Wgpu> {
+    Ok(Wgpu::with_limits(Some(asked.adapter), limits)?)
+}
+
+/// Seconds that the kernels of the published configuration take to compile, the first time and again, and of the first step, in
+/// which some drivers compile.
+pub fn compile(asked: &Asked) -> Result<()> {
+    let started = Instant::now();
+    let backend = open(asked, Limits::default())?;
+    let opened = started.elapsed().as_secs_f64();
+    let mut seconds = vec![];
+    let mut notes = vec![];
+    for _ in 0..2 {
+        let started = Instant::now();
+        notes = backend.compile(&pipeline(SAMPLES)?)?.1.notes;
+        seconds.push(started.elapsed().as_secs_f64());
+    }
+    let rays = rays(16);
+    let mut training = Training::new(&backend)?;
+    let started = Instant::now();
+    training.step(&rays, 1)?;
+    say(&json!({ "open_s": opened, "compile_s": seconds[0], "again_s": seconds[1],
+        "first_step_s": started.elapsed().as_secs_f64(), "notes": notes }));
+    Ok(())
+}
+
+/// Gradients of one step of the published configuration beside the CPU's.
+pub fn quick_parity(asked: &Asked) -> Result<()> {
+    let rays = rays(if asked.software { 16 } else { 64 });
+    let work = Work { step: 1, seed: 0, loss: &L1 {}, rays: &rays, points: &[], priors: &[] };
+    let gradients = |backend: &dyn Backend| -> Result<(f64, Vec<f32>)> {
+        let mut model = Model::random(pipeline(64)?, 1);
+        let mut exe = backend.compile(&model.pipeline)?.0;
+        let loss = exe.step(&mut model, &work)?.loss;
+        exe.fetch(&mut model)?;
+        Ok((loss, model.arena.grads.to_vec()))
+    };
+    let (cpu_loss, cpu) = gradients(&Cpu::new())?;
+    let top = cpu.iter().fold(0.0f32, |m, g| m.max(g.abs()));
+    let all = [("own limits", Limits::default()), ("subgroups", Limits { subgroups: true, ..Limits::default() })];
+    for (name, limits) in all {
+        let backend = match open(asked, limits) {
+            Err(e) if limits.subgroups => {
+                say(&json!({ "variant": name, "skipped": e.to_string() }));
+                continue;
+            }
+            opened => opened?,
+        };
+        let (loss, found) = gradients(&backend)?;
+        // Not a fold by max, which would pass over a NaN.
+        let off = cpu.iter().zip(&found).map(|(a, b)| (a - b).abs()).reduce(|a, b| if a >= b { a } else { b });
+        let error = off.unwrap_or_default() / top;
+        say(&json!({ "variant": name, "gradient_error": error, "loss": loss, "cpu_loss": cpu_loss }));
+        let close = (loss - cpu_loss).abs() < 1e-4 * cpu_loss;
+        if !(top > 0.0 && error < 1e-3 && close) {
+            return Err(format!("{name}: gradients off by {error:e} of the largest, loss {loss} and {cpu_loss}").into());
+        }
+    }
+    Ok(())
+}
+
+/// A model on a device.
+struct Training {
+    model: Model,
+    exe: Box<dyn Executable>,
+}
+
+impl Training {
+    fn new(backend: &Wgpu) -> Result<Self> {
+        let pipeline = pipeline(SAMPLES)?;
+        let (exe, _) = backend.compile(&pipeline)?;
+        Ok(Self { model: Model::random(pipeline, 1), exe })
+    }
+
+    fn step(&mut self, rays: &[TrainRay], step: u64) -> Result<()> {
+        let work = Work { step, seed: 0, loss: &L1 {}, rays, points: &[], priors: &[] };
+        self.exe.step(&mut self.model, &work)?;
+        Ok(self.exe.update(&mut self.model, &Adam { lr: 1e-3, beta1: 0.9, beta2: 0.999, eps: 1e-8, step })?)
+    }
+
+    /// Seconds of a step with `count` rays: lowest, median, highest, over two seconds or 100 steps. What was timed before is
+    /// forgotten.
+    fn steps(&mut self, count: usize) -> Result<([f64; 3], usize)> {
+        let rays = rays(count);
+        let mut times = vec![];
+        let mut begin = Instant::now();
+        for step in 1..=103 {
+            if step == 4 {
+                self.exe.profile();
+                begin = Instant::now();
+            }
+            let start = Instant::now();
+            self.step(&rays, step)?;
+            if step > 3 {
+                times.push(start.elapsed().as_secs_f64());
+                if begin.elapsed().as_secs_f64() > 2.0 {
+                    break;
+                }
+            }
+        }
+        let steps = times.len();
+        Ok((spread(&mut times), steps))
+    }
+}
+
+/// `n` things in each of these times: median, lowest and highest rate.
+fn rates(n: f64, [low, median, high]: [f64; 3]) -> Value {
+    json!({ "median": n / median, "lowest": n / high, "highest": n / low })
+}
+
+/// Training by ray count and variant, the share of each kernel and of the CPU, and export, beside what the device can do.
+pub fn kernels(asked: &Asked) -> Result<()> {
+    let (counts, side): (&[usize], usize) =
+        if asked.software { (&[64], 32) } else { (&[256, 1024, 4096, 16_384, 65_536], 256) };
+    let backend = open(asked, Limits::default())?;
+    let ceiling = backend.shared().ceiling()?;
+    // Multiply-adds: forward, forward once more on the way back, and two products backward. Table accesses: 8 corners of 10 levels,
+    // read and then updated.
+    let (macs, reads) = (4.0 * pipeline(SAMPLES)?.macs() as f64, 2.0 * 8.0 * 10.0);
+    say(&json!({ "bound_samples_per_s": {
+        "by_multiply_adds": ceiling.multiply_adds / macs, "by_random_reads": ceiling.random_reads / reads,
+    } }));
+    let mut variants = vec![("own limits", Limits::default())];
+    if backend.adapter().subgroups.is_some() {
+        variants.push(("subgroups", Limits { subgroups: true, ..Limits::default() }));
+    }
+    for (name, limits) in variants {
+        let mut training = Training::new(&open(asked, limits)?)?;
+        let mut timed = Training::new(&open(asked, Limits { profile: true, ..limits })?)?;
+        for &count in counts {
+            let samples = (count * SAMPLES) as f64;
+            let (time, _) = training.steps(count)?;
+            let (_, steps) = timed.steps(count)?;
+            let kernels = timed.exe.profile();
+            let on_device: f64 = kernels.iter().map(|(_, s)| s).sum::<f64>() / steps as f64;
+            let each: Value = kernels.iter().map(|(k, s)| (k.clone(), json!(1e3 * s / steps as f64))).collect();
+            let cpu = (on_device > 0.0).then(|| 1.0 - on_device / time[1]);
+            say(&json!({ "variant": name, "rays": count, "samples_per_s": rates(samples, time),
+                "kernels_ms": each, "share_outside_kernels": cpu }));
+        }
+    }
+    let mut training = Training::new(&backend)?;
+    let points: Vec<[f32; 3]> = (0..side * side * side)
+        .map(|i| [i / (side * side), i / side % side, i % side].map(|k| (k as f32 + 0.5) / side as f32))
+        .collect();
+    let mut out = vec![0.0; points.len()];
+    let time = repeated(|| Ok(training.exe.evaluate(&training.model, &points, &mut out)?))?;
+    say(&json!({ "export_points_per_s": rates(points.len() as f64, time) }));
+    Ok(())
+}
+
+/// Seconds of five runs after one to warm up: lowest, median, highest.
+fn repeated(mut run: impl FnMut() -> Result<()>) -> Result<[f64; 3]> {
+    run()?;
+    let mut times = vec![];
+    for _ in 0..5 {
+        let start = Instant::now();
+        run()?;
+        times.push(start.elapsed().as_secs_f64());
+    }
+    Ok(spread(&mut times))
+}
+
+/// FDK's back-projection, forward projection and its adjoint, in voxel updates a second (a voxel and a view each). Transfers of
+/// volume and views count.
+pub fn voxels(asked: &Asked) -> Result<()> {
+    let backend = open(asked, Limits::default())?;
+    let (side, views) = if asked.software { (48, 12) } else { (256, 50) };
+    let truth = phantom(side);
+    let protocol = Protocol::r2(&truth.grid).with_views(views);
+    let scan = simulate(&truth, &protocol.with_detector([side, side]))?;
+    let g = &scan.geometry;
+    let seen: Vec<_> = (0..views).map(|v| Pinhole::of(g, v).voxels(&g.volume, 1.0)).collect();
+    let all: Vec<usize> = (0..views).collect();
+    let joseph = backend.place(Box::new(Joseph {}))?;
+    let operator = joseph.operator();
+    let updates = (side * side * side * views) as f64;
+    let tell = |what: &str, time| say(&json!({ "work": what, "voxel_updates_per_s": rates(updates, time) }));
+
+    let mut volume = Array3::<f32>::zeros(g.volume.shape);
+    let time = repeated(|| Ok(backend.backproject(&seen, scan.projections.view(), volume.view_mut()).map(drop)?))?;
+    tell("FDK back-projection", time);
+    let mut lines = scan.projections.clone();
+    let time = repeated(|| {
+        operator.forward(g, &all, truth.data.view(), lines.view_mut());
+        Ok(operator.fault()?)
+    })?;
+    tell("forward projection", time);
+    let time = repeated(|| {
+        operator.adjoint(g, &all, scan.projections.view(), volume.view_mut());
+        Ok(operator.fault()?)
+    })?;
+    tell("its adjoint", time);
+    Ok(())
+}
+
+/// Sixty seconds of `balanced` on the kit's scan, as a user runs it: the seconds to marks of PSNR, and the last one.
+pub fn training(asked: &Asked) -> Result<()> {
+    let run = std::env::temp_dir().join(format!("conefield-contact-{}", std::process::id()));
+    let mut command = Command::new(file("conefield")?);
+    command.arg("reconstruct").arg(file("scan")?).args(["--spec", "balanced", "--seconds", "60s", "--force"]);
+    command.args(["--reference", "truth", "--set", "training.report_every=25", "-q", "-o"]).arg(&run);
+    command.args(["--backend", &format!("wgpu:{}", asked.adapter)]);
+    if asked.software {
+        command.args(["--set", "training.rays=64", "--set", "projector.samples=64"]);
+    }
+    let done = command.output()?;
+    let metrics = std::fs::read_to_string(run.join("metrics.jsonl"));
+    let _ = std::fs::remove_dir_all(&run);
+    if !done.status.success() {
+        return Err(String::from_utf8_lossy(&done.stderr).into());
+    }
+    let records: Vec<Value> = metrics?.lines().map(serde_json::from_str).collect::<std::result::Result<_, _>>()?;
+    let points: Vec<(f64, f64)> = records.iter().filter_map(conefield_benches::quality).collect();
+    let reached = |mark: f64| points.iter().find(|(_, psnr)| *psnr >= mark).map(|(seconds, _)| *seconds);
+    let marks: Value =
+        [25, 30, 32, 34, 35, 36, 37].map(|mark| (mark.to_string(), json!(reached(mark.into())))).into_iter().collect();
+    let steps = records.last().map(|r| r["step"].clone());
+    say(&json!({ "seconds_to_psnr": marks, "last": points.last(), "steps": steps }));
+    Ok(())
+}
