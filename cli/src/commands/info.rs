@@ -237,7 +237,7 @@ fn geometry(path: &Path) -> Result<Value> {
         "angles": setup.angles,
         "missing": [
             "pixels and projections: RTK keeps them in an image", "a volume",
-            "conefield import takes the three together (docs/geometry.md, [rtk])",
+            "conefield import takes the three together (docs/guide/formats.md, [rtk])",
         ],
     }))
 }

@@ -1,5 +1,5 @@
 //! Plugins that do one thing wrong each, and what becomes of them: refused when loaded, refused when tried out, found by
-//! the check, or an error of the run. `docs/faulty-plugins.md` is made from this; `CONEFIELD_BLESS=1` writes it anew.
+//! the check, or an error of the run. `docs/reference/faulty-plugins.md` is made from this; `CONEFIELD_BLESS=1` writes it anew.
 
 use crate::build::{cargo, cc, library, sources};
 use crate::common::{conefield, done, text};
@@ -458,7 +458,7 @@ fn page(rows: &[Row]) {
             let _ = writeln!(text, "| {what} | {by} | {said} |");
         }
     }
-    let path = sources().join("docs/faulty-plugins.md");
+    let path = sources().join("docs/reference/faulty-plugins.md");
     if std::env::var_os("CONEFIELD_BLESS").is_some() {
         std::fs::write(&path, &text).unwrap();
     }

@@ -107,7 +107,7 @@ fn names_and_folders_are_checked() {
 fn the_page_shows_the_encoder_that_is_made() {
     let read = |path: &str| std::fs::read_to_string(sources().join(path)).unwrap();
     let made = read("cli/templates/rust/encoder.rs").replace("@name@", "waves");
-    let page = read("docs/plugins.md");
+    let page = read("docs/guide/writing-stages.md");
     let shown = page.split_once("```rust\n").and_then(|(_, rest)| rest.split_once("```")).map(|(code, _)| code);
     assert_eq!(shown, Some(&made[..]));
     let example = read("examples/02_an_encoder.rs");
