@@ -438,14 +438,13 @@ fn told(message: &str, want: &str) -> String {
 /// The page of all faults.
 fn page(rows: &[Row]) {
     let mut text = String::from(
-        "# Faulty plugins\n\nWhat becomes of plugins that do one thing wrong each. Made by `cli/tests/plugins/faulty.rs` from \
-         `plugins/tests`; `CONEFIELD_BLESS=1 cargo test -p conefield --test plugins` writes it anew.\n\n- *load*: refused when \
-         it is loaded, by `plugins list` (which shows the others), `plugins check` and a reconstruction alike.\n- *trial*: a \
-         stage is tried out when it is made, on a few rows, between guard zones and under a time limit: a check and a \
-         reconstruction end there, before any work.\n- *check*: found by `plugins check`; gradients that are wrong only the \
-         check can find.\n- *run*: an error of the run, which leaves no volume.\n\nA plugin runs in the process that loads it. One \
-         that calls `abort`, or writes far outside what it was handed, takes that process down; the check runs in a process \
-         of its own and says so.\n\n| what it does | found by | what is said |\n| --- | --- | --- |\n",
+        "# Faulty plugins\n\nWhat happens to plugins with one fault each. `cli/tests/plugins/faulty.rs` makes this page from \
+         `plugins/tests`; `CONEFIELD_BLESS=1 cargo test -p conefield --test plugins` writes it.\n\n- *load*: refused by \
+         `plugins list` (which shows the others), `plugins check` and a reconstruction when the library is loaded.\n- *trial*: \
+         refused when the stage is made. Each stage is tried on a few rows, between guard zones and with a time limit.\n- \
+         *check*: found by `plugins check` only, such as wrong gradients.\n- *run*: an error of the run, which leaves no \
+         volume.\n\nA plugin runs in the process that loads it. One that calls `abort`, or writes far out of bounds, ends that \
+         process; the check runs in a separate process and reports it.\n\n| fault | found by | message |\n| --- | --- | --- |\n",
     );
     for Row { what, list, check, run } in rows {
         let found = match (list.is_empty(), check.is_empty(), run.is_empty()) {
