@@ -75,31 +75,42 @@ def keys(title, intro, schema_text):
     """A table of keys for every object of a JSON Schema that has keys."""
     schema = json.loads(schema_text)
     lines = [f"# {title}", "", intro, ""]
-    for name, entry in [("The file", schema), *sorted(schema.get("$defs", {}).items())]:
-        rows = [row for shape in shapes(entry) for row in properties(shape)]
-        if rows:
+    for name, entry in [("The file", {**schema, "allOf": []}), *sorted(schema.get("$defs", {}).items())]:
+        rows = list(properties(entry, schema))
+        if rows and (name == "The file" or "." in name):
             described = " ".join(entry.get("description", "").split())
             lines += [f"## {name}", "", described, "", "| key | meaning | default |", "| --- | --- | --- |", *rows, ""]
     return "\n".join(lines)
 
 
-def shapes(entry):
-    """The objects that an entry may be."""
+def properties(entry, schema, prefix=""):
+    """A row for every key of the objects that an entry may be, and for the keys below it."""
+    seen = set()
+    for shape in shapes(entry, schema):
+        for key, value in shape["properties"].items():
+            if key in seen or not isinstance(value, dict) or key == "type" and "const" in value or key == "$schema":
+                continue
+            seen.add(key)
+            default = f"`{json.dumps(value['default'])}`" if "default" in value else ""
+            yield f"| `{prefix}{key}` | {cell(value.get('description') or shape.get('description', ''))} | {default} |"
+            yield from properties(value, schema, f"{prefix}{key}.")
+
+
+def shapes(entry, schema):
+    """The objects with keys that an entry may be. A reference to a kind of stage is not followed: it has a section."""
     if "properties" in entry:
         yield entry
-    for word in ("oneOf", "anyOf", "allOf"):
-        for shape in entry.get(word, []):
-            yield from shapes(shape)
-
-
-def properties(shape):
-    for key, value in shape.get("properties", {}).items():
-        if not isinstance(value, dict):
-            continue
-        const = value.get("const")
-        meaning = f"`{const}`" if const is not None else cell(value.get("description") or shape.get("description", ""))
-        default = f"`{cell(json.dumps(value['default']))}`" if "default" in value else ""
-        yield f"| `{key}` | {meaning} | {default} |"
+    nested = [shape for word in ("oneOf", "anyOf", "allOf") for shape in entry.get(word, [])]
+    if isinstance(entry.get("items"), dict):
+        nested.append(entry["items"])
+    path = entry.get("$ref", "").removeprefix("#/$defs/").split("/$defs/")
+    if path != [""] and (len(path) > 1 or "method" not in schema["$defs"]):
+        definitions = schema
+        for part in path:
+            definitions = definitions["$defs"][part]
+        nested.append(definitions)
+    for shape in nested:
+        yield from shapes(shape, schema)
 
 
 def cell(text):
@@ -110,30 +121,49 @@ def python_api():
     """Signatures and docstrings of what the package exports."""
     package = ROOT / "python" / "conefield"
     init = ast.parse((package / "__init__.py").read_text())
+    native = definitions(package / "_native.pyi")
     lines = ["# Python package", "", ast.get_docstring(init), ""]
     for node in init.body:
         if not isinstance(node, ast.ImportFrom) or node.level != 1:
             continue
         module = package / f"{node.module}.py"
         source = module if module.exists() else module.with_suffix(".pyi")
-        found = {item.name: item for item in ast.parse(source.read_text()).body if hasattr(item, "name")}
+        found = native | definitions(source)
         for alias in node.names:
             if alias.name in found:
                 lines += entry(found[alias.name])
-    return "\n".join(lines).replace(":class:", "")
+    return re.sub(":(class|func|meth):", "", "\n".join(lines))
+
+
+def definitions(source):
+    return {item.name: item for item in ast.parse(source.read_text()).body if hasattr(item, "name")}
 
 
 def entry(item):
     lines = [f"## {item.name}", ""]
     if isinstance(item, ast.ClassDef):
-        lines += [ast.get_docstring(item) or "", ""]
+        lines += [doc(item), ""]
         for member in item.body:
             public = isinstance(member, ast.FunctionDef) and not member.name.startswith("_")
             if public and ast.get_docstring(member):
-                lines += [signature(member, f"{item.name}."), "", ast.get_docstring(member), ""]
+                lines += [signature(member, f"{item.name}."), "", doc(member), ""]
     else:
-        lines += [signature(item, ""), "", ast.get_docstring(item) or "", ""]
+        lines += [signature(item, ""), "", doc(item), ""]
     return lines
+
+
+def doc(item):
+    """A docstring in Markdown: sections of NumPy's style become lists."""
+    lines, inside = [], False
+    for line in (ast.get_docstring(item) or "").splitlines():
+        if re.fullmatch(r"-{3,}", line):
+            lines[-1], inside = f"**{lines[-1]}**\n", True
+        elif inside and line and not line.startswith(" ") and not line.endswith("."):
+            lines.append(f"- `{line}`:")
+        else:
+            inside = inside and (not line or line.startswith(" "))
+            lines.append(line)
+    return "\n".join(lines)
 
 
 def signature(function, owner):
