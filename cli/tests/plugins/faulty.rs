@@ -69,8 +69,8 @@ const FAULTS: &[Fault] = &[
     untried("writes before its gradients", &["FAULT=BEFORE_GRADIENTS"], "it writes outside its gradients: 1 before"),
     untried("returns NaN", &["FAULT=NOT_A_NUMBER"], "number 0 of 3 of its output is NaN"),
     untried("fails", &["FAULT=FAILS"], "forward failed: no more numbers"),
-    untried("sleeps in forward", &["FAULT=SLEEPS"], "it has not come back after 5 s"),
-    untried("sleeps in create", &["FAULT=SLEEPS_IN_CREATE"], "it has not come back after 5 s"),
+    untried("sleeps in forward", &["FAULT=SLEEPS"], "it did not return within 5 s"),
+    untried("sleeps in create", &["FAULT=SLEEPS_IN_CREATE"], "it did not return within 5 s"),
     fault(
         "a parameter gradient that is 10 % too large",
         &["FAULT=WRONG_GRADIENT"],
