@@ -156,6 +156,8 @@ def doc(item):
     """A docstring in Markdown: sections of NumPy's style become lists."""
     lines, inside = [], False
     for line in (ast.get_docstring(item) or "").splitlines():
+        if line == "::":
+            continue
         if re.fullmatch(r"-{3,}", line):
             lines[-1], inside = f"**{lines[-1]}**\n", True
         elif inside and line and not line.startswith(" ") and not line.endswith("."):
