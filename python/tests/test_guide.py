@@ -20,4 +20,5 @@ def test_the_code_of_a_page_runs(page, scan, tmp_path, monkeypatch):
     blocks = [b for b in BLOCK.finditer((GUIDE / f"{page}.md").read_text()) if not (b["mark"] or "").startswith("not run")]
     assert blocks
     for block in blocks:
-        exec(compile(block["code"], f"docs/guide/{page}.md", "exec"), names)
+        code = block["code"].replace("60s", "4s")  # a budget is short here
+        exec(compile(code, f"docs/guide/{page}.md", "exec"), names)
