@@ -52,7 +52,7 @@ def beats(a, b):
 kept = [b for b in names if not any(beats(a, b) for a in names if a != b)]
 first = records[names[0]]
 lines = ['# Picked from by "conefield reconstruct --budget": the best of what fits, on those of these scans whose volumes are nearest in size.',
-         '# bash benches/front.sh makes it (docs/speed-and-accuracy-trade.md).',
+         '# bash benches/front.sh makes it (docs/records/methods.md).',
          f'made = "conefield {first[0]["version"]}, {first[0]["threads"]} threads, {first[0]["simd"]}"']
 for volume, record in zip(volumes, first):
     scan = record["scan"]

@@ -1,5 +1,5 @@
 //! An encoder of your own in the tree: settings, forward, backward and registration, then a reconstruction with it. The
-//! same lines make a plugin: docs/plugins.md.
+//! same lines make a plugin: docs/guide/writing-stages.md.
 
 use conefield_backend_cpu::Cpu;
 use conefield_conformance::{Options, check_encoder};

@@ -103,7 +103,7 @@ fn texts(tree: &Value, wanted: &dyn Fn(&str) -> bool, found: &mut Vec<String>) {
 pub fn refuse_existing(path: &Path, force: bool) -> Result<()> {
     let empty = std::fs::read_dir(path).is_ok_and(|mut d| d.next().is_none());
     let free = force || empty || path.symlink_metadata().is_err();
-    ensure(free, &place(path), "output", "something of that name", "a new name, or --force")
+    ensure(free, &place(path), "output", "an existing file or folder", "a new name, or --force")
 }
 
 /// Refuses a name that does not end as the files do that are written under it: what has another end is something else.
@@ -122,7 +122,7 @@ pub fn picture(path: Option<&Path>, inputs: &Inputs) -> Result<()> {
 
 /// A path that a spec can hold.
 pub fn text(path: &Path) -> Result<&str> {
-    let found = || format!("{}, a name with bytes that are no UTF-8", path.display());
+    let found = || format!("{}, a name with bytes that are not UTF-8", path.display());
     path.to_str().ok_or_else(|| {
         Error::invalid(
             "command line",

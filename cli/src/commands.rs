@@ -35,7 +35,7 @@ use serde::{Deserialize, Serialize};
 use std::ffi::OsString;
 use std::path::PathBuf;
 
-/// What to do; the help of each is that of its arguments.
+/// The subcommands; the help of each is that of its arguments.
 #[derive(Subcommand)]
 pub enum Command {
     Simulate(simulate::SimulateArgs),
@@ -91,28 +91,28 @@ pub fn run(command: Command, general: &General) -> Result<()> {
 /// Options of every subcommand.
 #[derive(Args)]
 pub struct General {
-    /// More log messages; twice for all.
+    /// More log messages; twice for all of them.
     #[arg(short, long, global = true, action = ArgAction::Count, help_heading = "General options")]
     pub verbose: u8,
-    /// No progress, and of the log errors only.
+    /// No progress, and only errors in the log.
     #[arg(short, long, global = true, conflicts_with = "verbose", help_heading = "General options")]
     pub quiet: bool,
-    /// Worker threads [default: one a core].
+    /// Worker threads [default: one per core].
     #[arg(long, global = true, value_name = "N", help_heading = "General options", value_parser = clap::value_parser!(u16).range(1..=1024))]
     pub threads: Option<u16>,
-    /// Memory that a command may take, such as 8GiB [default: what is available]. One that needs more is refused.
+    /// Memory limit, such as 8GiB [default: available memory]. A command that needs more is refused.
     #[arg(long, global = true, value_name = "SIZE", help_heading = "General options", value_parser = crate::parse::bytes)]
     pub memory: Option<u64>,
-    /// Load the stages of this plugin, or of every plugin in this folder; repeatable.
+    /// Load this plugin, or every plugin in this folder; repeatable.
     #[arg(long = "plugin", global = true, value_name = "PATH", help_heading = "General options")]
     pub plugins: Vec<PathBuf>,
-    /// Let specs load the plugins that they name. A plugin is code: allow it to specs that you trust.
+    /// Let specs load the plugins that they name. A plugin is code: allow this only for specs that you trust.
     #[arg(long, global = true, help_heading = "General options")]
     pub allow_plugins_from_spec: bool,
 }
 
 impl General {
-    /// The same again, for a child process.
+    /// The same options for a child process.
     pub fn arguments(&self) -> Vec<OsString> {
         let mut all: Vec<OsString> = vec!["--verbose".into(); self.verbose.into()];
         if self.quiet {
@@ -136,21 +136,21 @@ impl General {
 /// When training ends, whichever comes first.
 #[derive(Debug, Clone, Args, Serialize, Deserialize)]
 pub struct EndOptions {
-    /// Stop training after this time, such as 600s or 10m: of training alone, not of what comes before and after.
+    /// Stop training after this time, such as 600s or 10m, without the time before and after training.
     #[arg(long, value_name = "TIME", value_parser = crate::parse::seconds)]
     pub seconds: Option<f64>,
     /// Stop training after this many steps.
     #[arg(long, value_name = "N", value_parser = clap::value_parser!(u64).range(1..))]
     pub steps: Option<u64>,
-    /// Stop training after this time at the latest. Unlike --seconds this replaces no end of the spec, and what aims at
-    /// the end, such as a learning rate that goes down, does not look at it.
+    /// Stop training after this time at the latest. Unlike --seconds it neither replaces the spec's end nor stretches a learning-rate
+    /// schedule.
     #[arg(long, value_name = "TIME", value_parser = crate::parse::seconds)]
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub at_most: Option<f64>,
 }
 
 impl EndOptions {
-    /// As limits of a job.
+    /// The limits of a job.
     pub fn limits(&self) -> Limits {
         Limits { steps: self.steps, seconds: self.seconds, at_most: self.at_most, ..Limits::default() }
     }

@@ -36,7 +36,7 @@ use clap::Parser;
 use std::ffi::OsString;
 use std::process::ExitCode;
 
-/// Reconstructs CT volumes from few cone-beam X-ray views with neural attenuation fields.
+/// Reconstructs CT volumes from few cone-beam X-ray views, with classical methods and neural fields.
 #[derive(Parser)]
 #[command(name = "conefield", version, max_term_width = 100)]
 struct Cli {
@@ -46,7 +46,7 @@ struct Cli {
     general: commands::General,
 }
 
-/// Runs the command line of this process, whose allocator tells how many bytes are `held`.
+/// Runs the command line of this process. `held` returns the bytes that its allocator has handed out.
 pub fn main(held: fn() -> u64) -> ExitCode {
     memory::count(held);
     run(std::env::args_os())

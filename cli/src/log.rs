@@ -1,5 +1,5 @@
-//! The log on standard error. What it is told may come from files: a line of it is one line, of a bounded length, without
-//! anything that a terminal would obey. Where nobody reads it any more, the work goes on.
+//! The log on standard error. Messages may contain text from files, so each is one line of bounded length without control
+//! characters. A closed log does not end the work.
 
 use crate::out::{LONGEST_LINE, plain_line};
 use crate::progress;
@@ -12,7 +12,7 @@ use tracing_subscriber::field::MakeExt as _;
 use tracing_subscriber::fmt::format;
 use tracing_subscriber::fmt::format::Writer;
 
-/// The variable that says what the log tells, where neither --verbose nor --quiet does.
+/// The variable that sets the log level without --verbose and --quiet.
 const VARIABLE: &str = "RUST_LOG";
 
 /// Starts the log: warnings and news, more with `verbose`, errors only when `quiet`, else what `RUST_LOG` asks for.
@@ -37,7 +37,7 @@ pub fn start(verbose: u8, quiet: bool) {
         .with_target(false)
         .try_init();
     if let Some(Err(e)) = filter {
-        warn!("{VARIABLE}: {e}; the log tells what it tells without it");
+        warn!("{VARIABLE}: {e}; it is ignored");
     }
 }
 

@@ -2,7 +2,7 @@
 
 use peak_alloc::PeakAlloc;
 
-/// Counts what is held, so that readers can be kept within what they may take.
+/// Counts allocated bytes, so that readers can be limited.
 #[global_allocator]
 static HEAP: PeakAlloc = PeakAlloc;
 

@@ -1,4 +1,4 @@
-//! Voxels on their way to a file: progress is told and what the end of a run needs of them is kept.
+//! Voxels on their way to a file: shows progress and keeps what the end of a run needs.
 
 use crate::out::duration;
 use crate::progress::Progress;
@@ -33,7 +33,7 @@ pub fn write(path: &Path, voxels: &mut dyn Voxels, affine: Option<Affine>, keep:
     let kept = WrittenVolume { slices: MiddleSlices::new(grid), whole };
     let mut outgoing = Outgoing { kept: Some(kept), affine, ..Outgoing::new(path, voxels) };
     conefield_io::write_voxels(path, &mut outgoing)?;
-    outgoing.kept.ok_or_else(|| Error::unsupported("writing a volume", "nothing of it was kept"))
+    outgoing.kept.ok_or_else(|| Error::unsupported("writing a volume", "it was not kept"))
 }
 
 struct Outgoing<'a> {

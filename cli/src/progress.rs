@@ -20,7 +20,7 @@ use tracing::{debug, info, warn};
 /// The bars on the terminal; the log is written between two drawings of them.
 static BARS: LazyLock<MultiProgress> = LazyLock::new(|| MultiProgress::with_draw_target(ProgressDrawTarget::hidden()));
 
-/// Without a terminal, how often progress is told.
+/// How often progress is reported without a terminal.
 const EVERY: Duration = Duration::from_secs(5);
 
 /// Lets bars be drawn, if there is a terminal to draw them on.

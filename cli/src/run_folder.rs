@@ -198,7 +198,7 @@ impl RunOnDisk {
         match progressed(&self.folder) {
             Progressed::Complete => "complete",
             Progressed::Begun if self.folder.join("checkpoint.safetensors").exists() => {
-                "interrupted: the same command with --resume goes on"
+                "interrupted: the same command with --resume continues"
             }
             Progressed::Begun => "interrupted before its record was written",
             Progressed::Nothing => "interrupted before its first checkpoint",

@@ -15,7 +15,7 @@ use std::time::Duration;
 const FILES: [&str; 2] = ["{in}", "{out}"];
 /// Between two looks at the process.
 const LOOK: Duration = Duration::from_millis(20);
-/// Of what a failed one said, at most so many bytes are told.
+/// Maximum bytes of a failed command's output in an error.
 const TAIL: u64 = 600;
 
 /// A command with `{in}` and `{out}` in its words.
@@ -30,7 +30,7 @@ impl FromStr for Segmenter {
 
     /// Words as a POSIX shell splits and quotes them; nothing is expanded and no shell runs.
     fn from_str(text: &str) -> Result<Self, String> {
-        let words = shlex::split(text).ok_or("a quote or a backslash without what it needs behind it")?;
+        let words = shlex::split(text).ok_or("an unclosed quote or a trailing backslash")?;
         let Some((program, arguments)) = words.split_first() else { return Err("expected a command".into()) };
         match FILES.iter().find(|file| !arguments.iter().any(|a| a.contains(**file))) {
             Some(file) => Err(format!("expected {file} in an argument, such as 'segment -i {{in}} -o {{out}}'")),
@@ -53,10 +53,7 @@ impl Segmenter {
             return Err(Error::unsupported(what(), format!("it ended with {status}; {said}")));
         }
         if !output.exists() {
-            return Err(Error::unsupported(
-                what(),
-                format!("it left no file under the name that stood for {{out}}; {said}"),
-            ));
+            return Err(Error::unsupported(what(), format!("it did not write {{out}}; {said}")));
         }
         // The file's own name is that of a folder that no one will find again.
         let own = output.display().to_string();
@@ -119,7 +116,7 @@ fn tail(log: &mut File) -> std::io::Result<String> {
     // A progress bar ends its lines with carriage returns; colours begin with control characters.
     let lines = text.split(['\n', '\r']).map(str::trim).filter(|l| !l.is_empty());
     let lines: Vec<String> = lines.map(|l| l.chars().filter(|c| !c.is_control()).collect()).collect();
-    Ok(if lines.is_empty() { "it said nothing".into() } else { format!("it said: {}", lines.join(" | ")) })
+    Ok(if lines.is_empty() { "it printed nothing".into() } else { format!("it printed: {}", lines.join(" | ")) })
 }
 
 #[cfg(test)]

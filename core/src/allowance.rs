@@ -6,7 +6,7 @@
 use crate::error::{Error, Result};
 use std::sync::OnceLock;
 
-/// Bytes that the process may hold, and what tells how many it does.
+/// The limit of bytes for the process, and the function that returns how many it holds.
 static MEMORY: OnceLock<(u64, fn() -> u64)> = OnceLock::new();
 
 /// Lets the process hold `most` bytes; `held` tells how many it holds now. Once: a second call changes nothing. Without
@@ -49,7 +49,7 @@ impl Work {
     /// Takes `units` of `what`.
     pub fn spend(&mut self, place: &str, what: &str, units: u64) -> Result<()> {
         let Some(left) = self.left.checked_sub(units) else {
-            let expected = format!("at most {} in all, which no honest file comes near", self.most);
+            let expected = format!("at most {} in all, far above that of any valid file", self.most);
             return Err(Error::invalid(place, what, format!("more than {}", self.most), expected));
         };
         self.left = left;

@@ -1,4 +1,4 @@
-//! Where a run stands between two steps: enough to go on to the same bits.
+//! The state of a run between two steps: enough to continue to the same bits.
 
 use crate::arena::{Arena, Layout, Weights};
 use crate::error::{Error, Result};
@@ -6,7 +6,7 @@ use crate::pipeline::Model;
 use serde::{Deserialize, Serialize};
 use std::sync::Arc;
 
-/// What a run knows beside the arena. Everything random follows from the seed and the step.
+/// The state of a run besides the arena. All random numbers follow from seed and step.
 #[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct Standing {

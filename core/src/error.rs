@@ -7,14 +7,14 @@ use std::path::{Path, PathBuf};
 /// Everything that can go wrong, said in words that a user can act on.
 #[derive(Debug, thiserror::Error)]
 pub enum Error {
-    /// A value that cannot be used: where it stands, what it is, what would do.
+    /// A value that cannot be used: its place, what was found and what is expected.
     #[error("{place}: {field}: found {found}, expected {expected}")]
     Invalid {
         /// File, spec or stage that holds the value.
         place: String,
         /// Name of the field, or path to it.
         field: String,
-        /// What stands there.
+        /// What was found.
         found: String,
         /// What would be accepted.
         expected: String,
@@ -37,19 +37,19 @@ pub enum Error {
         why: String,
     },
     /// The run was interrupted by the user.
-    #[error("interrupted after step {step}; where it keeps checkpoints, the same command with --resume goes on")]
+    #[error("interrupted after step {step}; where it keeps checkpoints, the same command with --resume continues")]
     Interrupted {
         /// The last finished step.
         step: u64,
     },
     /// The user interrupted a work of several parts.
-    #[error("interrupted during {part}; the same command with --resume goes on")]
+    #[error("interrupted during {part}; the same command with --resume continues")]
     Stopped {
         /// The part that is not done.
         part: String,
     },
     /// The user interrupted the writing of a file.
-    #[error("{place}: interrupted while it was written; nothing new stands under this name")]
+    #[error("{place}: interrupted while writing; nothing was replaced")]
     Cancelled {
         /// The file.
         place: String,

@@ -30,7 +30,7 @@ pub fn read_text(path: &Path, most: u64) -> Result<String> {
     let mut raw = Vec::new();
     file.take(most).read_to_end(&mut raw).map_err(|e| Error::io(path, e))?;
     String::from_utf8(raw)
-        .map_err(|e| invalid("text", format!("a byte that is no UTF-8: {}", e.utf8_error()), "UTF-8 text".into()))
+        .map_err(|e| invalid("text", format!("a byte that is not UTF-8: {}", e.utf8_error()), "UTF-8 text".into()))
 }
 
 /// The line of `text`, from 1, that a TOML error is about, where it says so.

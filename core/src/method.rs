@@ -20,7 +20,7 @@ use std::time::Instant;
 pub struct Job<'a> {
     /// Views to learn from.
     pub scan: &'a Scan,
-    /// Views kept aside, whose error is reported.
+    /// Held-out views, whose error is reported.
     pub held_out: Option<&'a Scan>,
     /// The volume sought, if known; it is only looked at, never learned from.
     pub reference: Option<&'a Volume>,
@@ -41,7 +41,7 @@ pub struct Job<'a> {
 }
 
 impl<'a> Job<'a> {
-    /// A job with nothing beside what every one has: no views kept aside, no reference (and a peak of 1), no limits, seed 0,
+    /// A job with nothing beside what every one has: no held-out views, no reference (and a peak of 1), no limits, seed 0,
     /// and no files that the spec may name.
     pub fn new(scan: &'a Scan, backend: &'a dyn Backend) -> Self {
         Self {
@@ -222,11 +222,11 @@ pub struct Solution {
     pub sampling_s: f64,
     /// Times that training ran away and went back to an earlier state.
     pub rollbacks: u64,
-    /// The record whose state came out, where views that are kept aside chose it.
+    /// The record whose state came out, where held-out views chose it.
     pub best: Option<Best>,
 }
 
-/// A record that predicted views that are kept aside best.
+/// A record that predicted held-out views best.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct Best {
@@ -302,7 +302,7 @@ pub trait Plan: Send {
         None
     }
 
-    /// The setting that looks at views kept aside, if there is one: it has no effect in a job without such views.
+    /// The setting that looks at held-out views, if there is one: it has no effect in a job without such views.
     fn needs_held_out(&self) -> Option<String> {
         None
     }

@@ -52,7 +52,7 @@ impl Pipeline {
             encoder.info().scope == Scope::Row,
             "spec",
             "encoder",
-            "one whose rows look at each other",
+            "one whose rows depend on each other",
             "an encoder that treats each point alone",
         )?;
         for (i, n) in normalizers.iter().enumerate() {

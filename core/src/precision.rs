@@ -3,12 +3,12 @@
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
-/// In which precision a field computes. Sums, gradients, moments and the parameters that training changes are `f32`.
+/// The precision of a field. Sums, gradients, moments and trained parameters are always `f32`.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields, default)]
 pub struct Precision {
-    /// In which tables of features are read. Training changes and weights files keep them in `f32`; halves are a copy
-    /// of them.
+    /// Storage precision of feature tables when they are read. Training and weights files keep `f32`; half precision is a
+    /// copy.
     pub tables: Tables,
 }
 
@@ -19,16 +19,16 @@ impl Precision {
     }
 }
 
-/// How parameters are read of which a row touches few.
+/// Storage precision of sparsely accessed tables.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
 #[serde(rename_all = "kebab-case")]
 pub enum Tables {
-    /// As they are.
+    /// Single precision, without a copy.
     #[default]
     F32,
-    /// Rounded to 11 bits, magnitudes from 6e-8 to 65504, which stands for all that is larger.
+    /// 11 significant bits, magnitudes from 6e-8 to 65504; larger ones become 65504.
     F16,
-    /// Rounded to 8 bits, magnitudes as of `f32`.
+    /// 8 significant bits, the range of `f32`.
     Bf16,
 }
 

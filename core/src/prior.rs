@@ -5,7 +5,7 @@ use crate::wgsl::Fragment;
 
 /// Judges a field by its values in cubes of neighbouring points, placed at random.
 pub trait Prior: Send + Sync {
-    /// Where it looks, and how much it counts.
+    /// The blocks and their weight.
     fn blocks(&self) -> Blocks;
 
     /// The penalty of one block, not negative. `values` are those of its `edge³` points, z fastest. Adds `scale` times
@@ -22,7 +22,7 @@ pub trait Prior: Send + Sync {
         Ok(())
     }
 
-    /// A few words for people.
+    /// A short description.
     fn describe(&self) -> String;
 }
 
@@ -31,7 +31,7 @@ pub trait Prior: Send + Sync {
 pub struct Blocks {
     /// Points along a block's edge.
     pub edge: usize,
-    /// Blocks a step.
+    /// Blocks per step.
     pub count: usize,
     /// Distance of neighbouring points in voxels.
     pub spacing: f64,
@@ -40,7 +40,7 @@ pub struct Blocks {
 }
 
 impl Blocks {
-    /// Refuses numbers that cannot be used, under the keys that settings have for them.
+    /// Refuses invalid numbers, by the keys of the settings.
     pub fn validate(&self) -> Result<()> {
         let positive = |x: f64| x.is_finite() && x > 0.0;
         ensure((2..=32).contains(&self.edge), "spec", "edge", self.edge, "2 to 32")?;

@@ -164,7 +164,7 @@ pub enum Origin {
     },
 }
 
-/// Makes a stage's settings from what a spec says beside its `type`.
+/// Makes a stage's settings from the keys of a spec besides `type`.
 pub type MakeFn<T> = Box<dyn Fn(Value) -> Result<Box<T>> + Send + Sync>;
 
 impl StageType {
@@ -230,7 +230,7 @@ pub fn add(owner: &str, types: Vec<NewType>) -> Result<()> {
         let twin = fresh.iter().any(|s| s.make.kind() == kind && s.name == t.name).then(|| owner.to_string());
         if let Some(other) = taken.or(twin) {
             let found = format!("a name that {other} has");
-            return Err(Error::invalid(owner, format!("{kind} type {:?}", t.name), found, "a name of its own"));
+            return Err(Error::invalid(owner, format!("{kind} type {:?}", t.name), found, "a unique name"));
         }
         fresh.push(t);
     }

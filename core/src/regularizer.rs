@@ -12,7 +12,10 @@ use std::fmt::{Display, Formatter};
 /// Settings of a regularizer.
 #[typetag::serde(tag = "type")]
 pub trait RegularizerSpec: Send + Sync {
-    /// The regularizer, or why the settings make none.
+    /// Builds the regularizer.
+    ///
+    /// # Errors
+    /// Invalid settings.
     fn build(&self) -> Result<Box<dyn Regularizer>>;
 }
 
@@ -22,12 +25,12 @@ pub trait RegularizerSpec: Send + Sync {
 pub enum Weight {
     /// λ, for attenuation counted per voxel (geometric mean of its sides) and the projector's lengths in voxels.
     Fixed(f64),
-    /// Times the root mean square of back-projected noise, whose strength is read from the scan.
+    /// A multiple of the root mean square of back-projected noise, estimated from the scan.
     Noise(f64),
 }
 
 impl Weight {
-    /// Refuses what is no weight.
+    /// Refuses a negative or infinite weight.
     pub fn validate(self) -> Result<()> {
         let (Self::Fixed(w) | Self::Noise(w)) = self;
         ensure(w.is_finite() && w >= 0.0, "spec", "weight", w, "a finite number, 0 or more")
@@ -80,8 +83,8 @@ pub trait Penalty: Send {
     /// lie as the grid's coefficients in standard order. The result does not depend on the number of threads.
     fn prox(&mut self, v: &[f32], tau: f32, u: &mut [f32]);
 
-    /// All that `update` says, with [`Penalty::prox`] for `tau`. A penalty whose proximal map goes through the volume once can
-    /// do the rest on the way.
+    /// The whole update, with [`Penalty::prox`] for `tau`. A penalty whose proximal map makes one pass over the volume can do the
+    /// rest in that pass.
     fn update(&mut self, update: Update<'_>, tau: f32) {
         update.around(|v, u| self.prox(v, tau, u));
     }
@@ -91,7 +94,7 @@ pub trait Penalty: Send {
         vec![]
     }
 
-    /// What it could not do since this was last asked, as [`crate::stage::Stage::fault`].
+    /// The fault since the last call, as [`crate::stage::Stage::fault`].
     fn fault(&self) -> Result<()> {
         Ok(())
     }

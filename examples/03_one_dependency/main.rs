@@ -7,7 +7,7 @@ fn main() -> Result<()> {
     let folder = std::env::temp_dir().join(format!("conefield-example-{}", std::process::id()));
     std::fs::create_dir_all(&folder).map_err(|e| conefield::Error::io(&folder, e))?;
 
-    // A scan to read. Yours is a folder or a file of your own: docs/your-data.md.
+    // A scan to read. Yours is a folder or a file of your own: docs/guide/scan-in.md.
     let truth = phantom(48);
     let protocol = Protocol::r2(&truth.grid).with_detector([64, 64]).with_views(40);
     io::write_scan(folder.join("scan"), &conefield::simulate::simulate(&truth, &protocol)?, Some(&truth))?;

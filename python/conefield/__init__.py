@@ -2,12 +2,12 @@
 
 Lengths are millimetres, angles radians unless a text says degrees, attenuation is in 1/mm or in 1/unit of a scan. Volumes
 are ``[x, y, z]``, projections ``[view, row, column]``, rows are v and columns u. The world is right-handed, the rotation
-axis is z; the source at angle a stands at ``dso·(cos a, sin a, 0)``, columns run along ``(-sin a, cos a, 0)`` and rows
+axis is z; the source at angle a is at ``dso·(cos a, sin a, 0)``, columns run along ``(-sin a, cos a, 0)`` and rows
 towards -z. Arrays may be anything that NumPy can read, or that exports DLPack from the CPU.
 
-Work is done without Python's lock. Ctrl-C ends it with KeyboardInterrupt. Errors are :class:`Error`. What is logged goes to
-``logging.getLogger("conefield")``. The number of threads is that of ``RAYON_NUM_THREADS``, else one for each core. Threads do
-not survive a fork: multiprocessing needs the start method ``spawn``.
+Work runs without Python's lock. Ctrl-C ends it with KeyboardInterrupt. Errors are :class:`Error`. Log messages go to
+``logging.getLogger("conefield")``. ``RAYON_NUM_THREADS`` sets the number of threads [default: one per core]. Threads do not
+survive a fork: use multiprocessing with the start method ``spawn``.
 """
 
 from ._errors import (

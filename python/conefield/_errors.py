@@ -2,14 +2,14 @@
 
 
 class Error(Exception):
-    """Everything that conefield raises by itself."""
+    """The base class of conefield's errors."""
 
 
 class InvalidError(Error, ValueError):
     """A value that cannot be used.
 
-    ``place`` says where it stands (a file, a spec, an argument), ``field`` which it is, ``found`` what it is and
-    ``expected`` what would do.
+    ``place`` is a file, a spec or an argument, ``field`` the field in it, ``found`` the value and ``expected`` what is
+    valid.
     """
 
     place: str = ""
@@ -19,7 +19,7 @@ class InvalidError(Error, ValueError):
 
 
 class FileError(Error, OSError):
-    """The operating system refused."""
+    """An error of the operating system for a file."""
 
 
 class MissingFileError(FileError, FileNotFoundError):
@@ -27,19 +27,19 @@ class MissingFileError(FileError, FileNotFoundError):
 
 
 class UnsupportedError(Error, NotImplementedError):
-    """Something that this build or this spec cannot do: also what does not fit into memory."""
+    """Something that this build or this spec cannot do, or that does not fit into memory."""
 
 
 class DeviceError(Error, RuntimeError):
-    """A device that computes refused or was lost."""
+    """A GPU failed or was lost."""
 
 
 class DivergedError(Error, ArithmeticError):
-    """Training left the finite numbers."""
+    """Training diverged."""
 
 
 class InternalError(Error, RuntimeError):
-    """A fault of conefield itself."""
+    """A bug in conefield."""
 
 
 def invalid(place, field, found, expected):

@@ -31,7 +31,7 @@ def circular(
 ) -> Geometry:
     """A circular orbit about the axis z.
 
-    The source at angle ``a`` stands at ``dso·(cos a, sin a, 0)``. Columns of the detector (u) run along
+    The source at angle ``a`` is at ``dso·(cos a, sin a, 0)``. Columns of the detector (u) run along
     ``(-sin a, cos a, 0)``, its rows (v) run towards -z.
 
     Parameters
@@ -39,7 +39,7 @@ def circular(
     dso, dsd
         Source to rotation axis, and source to detector plane, mm.
     angles
-        Of each view, radians; a whole number stands for so many, evenly over the circle from 0.
+        One per view, radians; an integer means this many even steps over the circle from 0.
     detector
         Rows and columns.
     pixel
@@ -49,8 +49,8 @@ def circular(
     offset
         Shift of the detector along v and u, mm.
     tilt
-        Turns of the detector about its centre, radians, right-handed: about u, about v, and in its plane (about u × v,
-        which points away from the source). The last is done first, each about the axis that was there before.
+        Rotations of the detector about its centre, radians, right-handed: about u, about v, and in its plane (about u × v,
+        away from the source). The last is applied first, each about the original axis.
     """
     if isinstance(angles, (int, np.integer)):
         angles = np.arange(int(angles)) * (2 * np.pi / max(int(angles), 1))

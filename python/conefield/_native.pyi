@@ -14,9 +14,9 @@ _Tell = tuple[Callable[..., None], float, bool] | None
 _Voxels = tuple[list[int], tuple[float, ...], tuple[float, ...]]
 
 class Geometry:
-    """Where source, detector and voxels stand, for every view. It is made by ``circular`` or ``from_vectors``.
+    """Source, detector and voxels of every view, made by ``circular`` or ``from_vectors``.
 
-    Lengths are millimetres. It does not change, compares by value and can be pickled.
+    Lengths are millimetres. It is immutable, compares by value and can be pickled.
     """
 
     @staticmethod
@@ -35,9 +35,9 @@ class Geometry:
     def with_volume(
         self, shape: list[int], spacing: tuple[float, float, float], center: tuple[float, float, float]
     ) -> Geometry:
-        """The same views of other voxels."""
+        """The same views with another volume."""
     def select(self, views: list[int]) -> Geometry:
-        """Some of the views, by their numbers."""
+        """Some of the views, by index."""
     def orbit(self) -> tuple[float, float, list[float], list[float], list[float]] | None:
         """The circular orbit that the views lie on, if they do: dso, dsd, pixel, offset, angles."""
     @property
@@ -61,7 +61,7 @@ class Geometry:
     def __len__(self) -> int: ...
 
 class Scan:
-    """Measured line integrals with the geometry they were taken in. It does not change."""
+    """Measured line integrals and their geometry. It is immutable."""
 
     def __init__(self, projections: NDArray[np.float32], geometry: Geometry, unit: tuple[str, float]) -> None: ...
     @property
@@ -71,22 +71,22 @@ class Scan:
     def geometry(self) -> Geometry: ...
     @property
     def unit(self) -> tuple[str, float]:
-        """The unit of length that volumes count per: its name and millimetres."""
+        """The unit of length of the volumes (1/unit): name and millimetres."""
     @property
     def provenance(self) -> Any:
-        """How the scan came about."""
+        """The origin of the scan."""
     @property
     def truth(self) -> Volume | None:
-        """The volume that it was simulated from, if that is known."""
+        """The volume that it was simulated from, if known."""
     def split(self, held: list[int]) -> tuple[Scan, Scan]:
-        """A scan without these views, and one of these alone."""
+        """The scan without these views, and one with only these."""
     def __len__(self) -> int: ...
 
 class Field:
-    """What a neural method has trained."""
+    """A trained field."""
 
     def volume(self, voxels: int | None = None, backend: str = "auto") -> Volume:
-        """Its values at voxels of which so many stand along the longest side, in the box that was reconstructed."""
+        """Its values on a grid with this many voxels along the longest side of the reconstructed box."""
     def write(self, path: str | PathLike[str]) -> None:
         """Writes ``weights.safetensors``, which ``conefield export`` and ``read_field`` read."""
     @property

@@ -29,12 +29,12 @@ def project(volume: Any, like: _native.Geometry | Scan, *, projector: Any = "jos
         Attenuation ``[x, y, z]``.
     like
         A geometry: values are in 1/mm, and the array has its voxels. ``float64`` is computed in double precision. Or a
-        scan, whose views are predicted as ``conefield project`` does: values are in 1/unit of it, and a :class:`Volume` of
-        another shape stands with its own voxels around the same centre.
+        scan, whose views are predicted as by ``conefield project``: values are in 1/unit of it, and a :class:`Volume` of
+        another shape keeps its voxels and is placed at the same centre.
     projector
         ``"joseph"``, ``"siddon"``, ``"trilinear"``, or a dict with one's settings.
     residual
-        Of a scan: measured less predicted line integrals instead.
+        For a scan: return measured minus predicted line integrals.
     """
     if isinstance(like, Scan):
         return _native.project_scan(like, encoded(projector), as_volume(volume, "volume", like.geometry), residual)
@@ -47,25 +47,25 @@ def project(volume: Any, like: _native.Geometry | Scan, *, projector: Any = "jos
 def backproject(projections: Any, geometry: _native.Geometry, *, projector: Any = "joseph") -> np.ndarray:
     """The exact adjoint of :func:`project` in a geometry: ``[view, row, column]`` to ``[x, y, z]``.
 
-    It is not filtered: that is the spec ``fdk``. ``float64`` is computed in double precision.
+    It is not filtered; for that use the spec ``fdk``. ``float64`` is computed in double precision.
     """
     return _native.backproject(geometry, encoded(projector), _real(projections, "projections"))
 
 
 class Operator:
-    """The system matrix A of a geometry: entries are lengths in mm over which a voxel counts for a ray.
+    """The system matrix A of a geometry. An entry is the length in mm of a ray in a voxel.
 
     ``A @ x`` takes a volume ``[x, y, z]`` to projections ``[view, row, column]``, ``A.T @ y`` is the exact adjoint. Both also
-    take flat vectors to flat vectors, so that A is what SciPy's solvers want (``scipy.sparse.linalg.lsqr(A, b)``).
+    take flat vectors to flat vectors, as SciPy's solvers need (``scipy.sparse.linalg.lsqr(A, b)``).
 
     Parameters
     ----------
     geometry
-        Where all stands.
+        The geometry.
     projector
         ``"joseph"``, ``"siddon"``, ``"trilinear"``, or a dict with one's settings.
     dtype
-        ``float32``, which works fast, or ``float64``.
+        ``float32``, which is faster, or ``float64``.
     """
 
     #: NumPy leaves ``array @ A`` to this class, which has no such product.
@@ -95,12 +95,12 @@ class Operator:
 
     @property
     def input_shape(self) -> tuple[int, int, int]:
-        """Of what it is applied to."""
+        """Shape of the input."""
         return self.geometry.projections_shape if self._transposed else self.geometry.volume_shape
 
     @property
     def output_shape(self) -> tuple[int, int, int]:
-        """Of what comes out."""
+        """Shape of the output."""
         return self.geometry.volume_shape if self._transposed else self.geometry.projections_shape
 
     @property

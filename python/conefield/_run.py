@@ -24,7 +24,7 @@ class Plan:
     facts
         Stages, widths, parameters, memory and work, with the keys of ``conefield explain --json``.
     schedule
-        With a budget: what would run, how many steps there is time for, and what each part is expected to take.
+        With a budget: the chosen method, its steps, and the expected time of each part.
     """
 
     def __init__(self, facts: dict[str, Any], text: str, schedule: dict[str, Any] | None) -> None:
@@ -39,7 +39,7 @@ class Plan:
 
     @property
     def memory(self) -> dict[str, int] | None:
-        """Bytes that a run takes at the moment that takes most, by what holds them; nothing without a scan."""
+        """Peak memory of a run in bytes, by use; None without a scan."""
         scan = self.facts["scan"]
         return None if scan is None else scan["memory"]
 
@@ -51,19 +51,19 @@ class Plan:
 
 
 class Reconstruction:
-    """What came out of a scan.
+    """The result of a reconstruction.
 
     Attributes
     ----------
     volume
         The :class:`Volume`, in 1/unit of the scan.
     scores
-        PSNR, RMSE and three definitions of SSIM where a reference was given, else nothing.
+        PSNR, RMSE and three definitions of SSIM if a reference was given, else None.
     record
-        What was run on what, and what came of it: spec (``spec_toml`` repeats the run), seed, steps, seconds, memory,
+        What was run: spec (``spec_toml`` repeats the run), seed, steps, seconds, memory,
         backend, loss, held-out error, and all records.
     field
-        The trained :class:`Field` of a neural method: it can be evaluated at other voxels, and written.
+        The trained :class:`Field` of a neural method, to evaluate on other grids and to write.
     """
 
     def __init__(self, volume: Volume, record: dict[str, Any], field: _native.Field | None) -> None:
@@ -142,9 +142,9 @@ def plan(
 ) -> Plan:
     """What a spec builds: stages, widths, parameters, memory, work. As ``conefield explain``.
 
-    With a scan also what it takes for that scan, and what is found out about the scan before a run starts. With a
-    ``budget`` (seconds, or a text such as ``"5m"``) the machine is measured for a second or a few, and ``schedule`` says what
-    would run; without a spec it is the best that fits.
+    With a scan also the memory for it and what a run finds out about it first. With a ``budget`` (seconds, or a string such as
+    ``"5m"``) the machine is measured for one to three seconds, and ``schedule`` has the plan; without a spec the best method that
+    fits is chosen.
     """
     scan = None if scan is None else as_scan(scan)
     wanted = _wanted(spec, sets, overrides, backend=backend, budget=budget)
@@ -186,35 +186,35 @@ def reconstruct(
         A :class:`Scan`, or the file or folder of one.
     spec
         A shipped name (:func:`spec_names`), the type of a method, a TOML or JSON file, or a dict with the keys of one
-        (``{"extends": "fast", "field": {"width": 32}}``). With a budget it may be left out.
+        (``{"extends": "fast", "field": {"width": 32}}``). Optional with a budget.
     budget
-        Plan the run to take so long in all: seconds, or a text such as ``"60s"`` or ``"10m"``.
+        Time of the whole run: seconds, or a string such as ``"60s"`` or ``"10m"``.
     init
-        What to start from: the file of weights that :func:`pretrain` made, or a volume (in 1/unit of the scan).
+        Weights of :func:`pretrain`, or a volume (in 1/unit of the scan), to start from.
     reference
-        The volume sought, to compare with: a volume, an array or a file, or ``"truth"`` for the one that the scan comes
-        with. It is looked at, never learned from.
+        The volume to score against: a volume, an array or a file, or ``"truth"`` for the one in the scan. It does not
+        influence the result.
     peak
         The data range for PSNR and SSIM: 1 for a reference in [0, 1], else the range of its values.
     hold_out
-        Views to keep aside and predict: their numbers, or a text such as ``"every:10"``.
+        Views to hold out and predict: their indices, or a string such as ``"every:10"``.
     steps, seconds, at_most
-        When training ends, beside what the spec says: steps, a time that what aims at the end looks at, and one that it does
-        not look at.
+        When training ends: a number of steps, a time that learning-rate schedules aim for, and a time limit that they
+        ignore.
     seed
-        Of everything random. Same spec, seed, input and build give the same bits on the CPU.
+        Of all random numbers. The same spec, seed, input and build give the same bits on the CPU.
     backend
         ``"auto"``, ``"cpu"``, ``"wgpu"`` or ``"wgpu:N"``.
     callback
-        Is called with a :class:`Progress` at most every ``every`` seconds, and at the end. With ``slices`` it also sees the
-        middle slices of a field that trains. What it raises ends the run.
+        Called with a :class:`Progress` at most every ``every`` seconds, and at the end. With ``slices`` it also gets the
+        middle slices of a training field. An exception ends the run.
     progress
-        Show a bar, where tqdm is installed.
+        Show a progress bar if tqdm is installed.
     sets, **overrides
-        Single settings on top of the spec, by their path: ``sets={"encoder.levels": 8}``, or as a keyword with two
-        underscores for a dot: ``encoder__levels=8``.
+        Settings to change, by path: ``sets={"encoder.levels": 8}``, or a keyword with two underscores for a dot:
+        ``encoder__levels=8``.
 
-    Ctrl-C ends the run after its step with :class:`KeyboardInterrupt`. Other threads of Python go on meanwhile.
+    Ctrl-C ends the run after its step with :class:`KeyboardInterrupt`. Other Python threads keep running.
     """
     scan = as_scan(scan)
     truth = isinstance(reference, str) and reference == "truth" and not os.path.exists(reference)
@@ -264,9 +264,9 @@ def pretrain(
     sets: Mapping[str, Any] | None = None,
     **overrides: Any,
 ) -> dict[str, Any]:
-    """Trains a field on known volumes and writes the weights that other scans start from (MCI). As ``conefield pretrain``.
+    """Trains a field on known volumes and writes weights for other scans to start from (MCI). As ``conefield pretrain``.
 
-    ``volumes`` are volumes, arrays, files or phantoms; ``output`` ends in ``.safetensors``. Returns a record of it.
+    ``volumes`` are volumes, arrays, files or phantoms; ``output`` ends in ``.safetensors``. Returns the record.
     """
     if isinstance(volumes, (str, os.PathLike, Volume)):
         raise invalid("arguments", "volumes", "one volume", "a list of them")
@@ -282,7 +282,7 @@ def evaluate(volume: Any, reference: Any, *, peak: float | None = None, labels: 
     """Scores a volume against a reference. As ``conefield evaluate --json``.
 
     ``psnr`` (dB), ``rmse``, ``ssim_2d``, ``ssim_3d`` and ``ssim_skimage``, the slices of largest error, and ``peak``, the data
-    range that they refer to. With ``labels`` both are label maps of whole numbers, and ``dice`` tells how far they agree.
+    range that they refer to. With ``labels`` both are label maps of whole numbers, and the result is ``dice``.
     """
     found = _native.evaluate(as_volume(volume, "volume"), as_volume(reference, "reference"), peak, labels)
     return _scores(found) or {}

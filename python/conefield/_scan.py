@@ -22,9 +22,9 @@ def scan(projections: Any, geometry: _native.Geometry, *, unit: str = "mm", unit
     projections
         ``A = -ln(I/I0)``, ``[view, row, column]``, without a unit: an array, or anything that exports DLPack.
     geometry
-        Where all stood.
+        The geometry.
     unit, unit_mm
-        The unit of length that volumes count per, by name and in millimetres: attenuation comes out in 1/unit.
+        Name and millimetres of the unit of length; volumes are in 1/unit.
     """
     return Scan(as_floats(projections, "projections", 3), geometry, (unit, float(unit_mm)))
 
@@ -35,7 +35,7 @@ def read_scan(path: str | os.PathLike[str]) -> Scan:
 
 
 def write_scan(path: str | os.PathLike[str], scan: Scan) -> None:
-    """Writes conefield's own folder of a scan, with its truth where it has one."""
+    """Writes a scan in conefield's own format, with its truth if there is one."""
     _native.write_scan(os.fspath(path), scan)
 
 
@@ -72,16 +72,16 @@ def simulate(
         A :class:`Volume`, an array ``[x, y, z]``, a file, or ``"phantom:head"``, ``"phantom:abdomen"``,
         ``"phantom:random:SEED"``, each also with ``:SIZE``.
     geometry
-        Where all stands; values are in 1/mm then, and the volume is taken as it stands. Without one:
+        The geometry; values are then in 1/mm, and the volume keeps its place. Without one:
     protocol, views, detector, offset, angles
-        ``"r2"``, the published synthetic set-up, or a TOML or JSON file; and what is to be other than it says: the number
-        of views, rows and columns, the detector's shift along v and u in mm, and ``"START:RANGE"`` in degrees or a file.
+        ``"r2"``, the published synthetic set-up, or a TOML or JSON file; and changes to it: number of views, rows and
+        columns, shift of the detector along v and u in mm, and ``"START:RANGE"`` in degrees or a file.
     noise
         ``"none"``, ``"tigre:I0,SIGMA"`` such as ``"tigre:1e4,10"`` (the published one), or ``"poisson:I0"``.
     values
-        What voxel values mean: ``"as-is"`` (attenuation), ``"hu:MU_WATER"`` or ``"clip:LO,HI"``.
+        Meaning of the voxel values: ``"as-is"`` (attenuation), ``"hu:MU_WATER"`` or ``"clip:LO,HI"``.
     downsample
-        Average blocks of so many voxels a side first.
+        Average blocks with this many voxels per side first.
     seed
         Of the noise.
     """

@@ -45,7 +45,7 @@ def argument(spec: Any, sets: Mapping[str, Any] | None, overrides: Mapping[str, 
 
 
 def spec_names() -> list[str]:
-    """Every name that stands for a spec: of those that are shipped, and of methods that need no setting."""
+    """All names of specs: shipped ones, and methods that need no setting."""
     return _native.spec_names()
 
 
@@ -55,5 +55,5 @@ def spec_text(spec: Any, sets: Mapping[str, Any] | None = None, **overrides: Any
 
 
 def schema() -> dict[str, Any]:
-    """The JSON Schema of specs, with every key's meaning and default."""
+    """The JSON Schema of specs, with the meaning and default of every key."""
     return _native.schema()

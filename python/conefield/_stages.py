@@ -27,13 +27,13 @@ def _register(kind: str, methods: tuple[str, ...], name: str, cls: C) -> C:
 
 
 def encoder(name: str) -> Callable[[C], C]:
-    """Registers a class as the encoder type ``name``: specs then name it wherever an encoder is wanted.
+    """Registers a class as the encoder type ``name`` for specs.
 
     ::
 
         @conefield.encoder("waves")
         class Waves:
-            def __init__(self, bands=4):          # what a spec says beside "type"
+            def __init__(self, bands=4):          # the settings of a spec
                 self.rates = np.pi * 2.0 ** np.arange(bands)
                 self.params = {"gain": np.ones(bands, np.float32)}
 
@@ -43,13 +43,13 @@ def encoder(name: str) -> Callable[[C], C]:
             def backward(self, x, dy):            # to ∂L/∂x and {"gain": ∂L/∂gain}, summed over the rows
                 ...
 
-    ``params`` holds the first values of what is trained, by name; without it there is nothing to train. Before each call the
-    values of the moment are set as ``self.params``, in the precision of ``x`` (``float32`` in training; ``float64`` when
-    gradients are checked, for which results must keep the precision of ``x``). A class may also have ``resolutions``, the
-    cells along the unit cube's side that each channel tells apart, and ``coarse_to_fine``.
+    ``params`` holds the initial values of the trained parameters by name; without it nothing is trained. Before each call the
+    current values are set as ``self.params``, in the precision of ``x`` (``float32`` in training, ``float64`` when gradients are
+    checked); results must keep that precision. A class may also have ``resolutions``, the cells per side of the unit cube
+    that each channel resolves, and ``coarse_to_fine``.
 
-    Python's lock is taken for each batch, and one batch runs at a time: it is for trying out an idea. What a method raises
-    ends the run. A class that is registered again takes the place of the old one.
+    Python's lock is taken for each batch, and one batch runs at a time: this is for trying out ideas. An exception ends the
+    run. Registering a name again replaces the class.
     """
     return lambda cls: _register("encoder", ("forward", "backward"), name, cls)
 
@@ -66,17 +66,17 @@ def regularizer(name: str) -> Callable[[C], C]:
             def prox(self, v, tau):               # [x, y, z], float32, to an array like it
                 return scipy.ndimage.gaussian_filter(v, 0.5)
 
-    ``prox(v, tau)`` is ``argmin_u ½‖u − v‖² + tau·R(u)``, or a denoiser in its place (plug-and-play); what falls below 0 is
-    set to 0 after it. ``value(x)`` is R(x); without it only the data term is watched. ``v`` is attenuation in 1/mm.
-    ``tau`` is the weight λ over the step's constant. ``weight`` is λ itself; ``noise_weight`` (1 where neither is given) counts
-    in what the scan's noise comes to. Before each call ``self.spacing`` is set to the voxel size in mm.
+    ``prox(v, tau)`` is ``argmin_u ½‖u − v‖² + tau·R(u)``, or a denoiser in its place (plug-and-play); negative results are
+    set to 0. ``value(x)`` is R(x); without it only the data term is monitored. ``v`` is attenuation in 1/mm.
+    ``tau`` is the weight λ over the step's constant. ``weight`` is λ itself; ``noise_weight`` (default 1) is a multiple of
+    the scan's noise level. Before each call ``self.spacing`` is set to the voxel size in mm.
     """
     return lambda cls: _register("regularizer", ("prox",), name, cls)
 
 
 @dataclass(frozen=True)
 class Check:
-    """What the conformance kit says of a stage; ``str`` of it is the whole report."""
+    """The report of the conformance kit on a stage; ``str`` gives its text."""
 
     #: Whether every property that applies holds.
     passed: bool
@@ -86,7 +86,7 @@ class Check:
 
     @property
     def failed(self) -> list[str]:
-        """Names of the properties that do not hold."""
+        """Names of failed properties."""
         return [name for name, outcome, _ in self.properties if outcome == "failed"]
 
     def __str__(self) -> str:
@@ -97,16 +97,16 @@ class Check:
 
 
 def check_stage(kind: str, name: str, **settings: Any) -> Check:
-    """Runs the conformance kit over a stage, written in Python or not: what hosts rely on, property by property.
+    """Runs the conformance kit on a stage, written in Python or not, property by property.
 
-    Of an encoder gradients against finite differences, independence of the batch's size, extremes, channels left out; of a
-    regularizer that its proximal map is that of its value, that it is convex, and more. A denoiser without ``value`` is no
-    proximal map of anything that the kit knows: "proximal map" fails then, and runs go on as plug-and-play.
+    For an encoder: gradients against finite differences, independence of the batch size, extremes, masked channels. For a
+    regularizer: its proximal map is that of its value, its value is convex, and more. A denoiser without ``value`` fails the property
+    "proximal map" and still runs as plug-and-play.
     """
     passed, report, properties = _native.check_stage(kind, encoded({**settings, "type": name}))
     return Check(passed, properties, report)
 
 
 def stage_names(kind: str) -> list[str]:
-    """The types of a kind ("encoder", "field", "regularizer", …) that specs may name."""
+    """The types of a kind ("encoder", "field", "regularizer", …) that specs can name."""
     return _native.stage_names(kind)

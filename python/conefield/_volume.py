@@ -13,7 +13,7 @@ from ._errors import invalid
 
 
 class Volume:
-    """Voxels of attenuation (or of any other quantity) with their place in the world.
+    """Voxels of attenuation (or another quantity) with their place in the world.
 
     Parameters
     ----------
@@ -23,11 +23,11 @@ class Volume:
     spacing
         Side lengths of a voxel along x, y and z, mm; one number for cubes.
     center
-        Where the middle of the grid stands, mm. The rotation axis is z through 0.
+        Centre of the grid, mm. The rotation axis is z through 0.
     affine
         Four by four: voxel indices to the patient's or the file's own coordinates in mm (NIfTI's, RAS), if known.
 
-    ``data`` is a NumPy array of ``float32``. It may be changed.
+    ``data`` is a NumPy array of ``float32``. It is writable.
     """
 
     __slots__ = ("data", "spacing", "center", "affine")
@@ -51,7 +51,7 @@ class Volume:
         return self.data.shape  # type: ignore[return-value]
 
     def write(self, path: str | os.PathLike[str]) -> None:
-        """Writes ``.nii``, ``.nii.gz``, ``.mha`` or ``.npy``, as the name asks. The file is complete or not there."""
+        """Writes ``.nii``, ``.nii.gz``, ``.mha`` or ``.npy``, by the name. No partial file is left."""
         _native.write_volume(os.fspath(path), self)
 
     def __array__(self, dtype: Any = None, copy: bool | None = None) -> np.ndarray:
@@ -90,6 +90,6 @@ def as_volume(value: Any, name: str, like: Any = None) -> Volume:
 def read_volume(path: str | os.PathLike[str]) -> Volume:
     """Reads a volume: NIfTI, MetaImage, NumPy, or the folder of a DICOM series.
 
-    ``phantom:head``, ``phantom:abdomen`` and ``phantom:random:SEED``, each also with ``:SIZE``, are made by the program.
+    ``phantom:head``, ``phantom:abdomen`` and ``phantom:random:SEED``, each optionally with ``:SIZE``, are built in.
     """
     return _native.read_volume(os.fspath(path))

@@ -34,7 +34,7 @@ pub fn seconds(name: &str, text: Option<&String>) -> Result<Option<f64>> {
     optional(name, text, parse::seconds)
 }
 
-/// Indices of the views that are kept aside, of `n`.
+/// Indices of the held-out views, of `n`.
 pub fn held_out(text: Option<&String>, n: usize) -> Result<Vec<usize>> {
     let choice: Option<HoldOut> = optional("hold_out", text, parse::hold_out)?;
     conefield_run::input::held_out(choice.as_ref(), n, "arguments", "hold_out")

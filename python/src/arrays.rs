@@ -24,6 +24,6 @@ pub fn given_any<T: Element, D: Dimension>(py: Python<'_>, array: Array<T, D>) -
 /// What `value` is in JSON, as Python's dicts, lists and numbers.
 pub fn plain<'py>(py: Python<'py>, value: &impl Serialize) -> PyResult<Bound<'py, PyAny>> {
     let text = serde_json::to_string(value)
-        .map_err(|e| crate::errors::broken(py, &format!("a result that cannot be put into words: {e}")))?;
+        .map_err(|e| crate::errors::broken(py, &format!("a result that cannot be written as text: {e}")))?;
     py.import("json")?.call_method1("loads", (text,))
 }

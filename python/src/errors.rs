@@ -35,7 +35,7 @@ pub fn raised(py: Python<'_>, error: &Error) -> PyErr {
 
 /// The exception of a fault of the program itself, which a panic has told of.
 pub fn broken(py: Python<'_>, what: &str) -> PyErr {
-    let text = format!("a fault of conefield itself, which should be reported: {what}");
+    let text = format!("a bug in conefield, please report it: {what}");
     named(py, "InternalError", &text).map_or_else(|e| e, PyErr::from_value)
 }
 

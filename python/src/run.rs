@@ -86,7 +86,7 @@ impl Wanted {
         let limits = self.ends.limits()?;
         let budget = arguments::seconds("budget", self.budget.as_ref())?;
         let both = budget.is_some() && limits != Limits::default();
-        ensure(!both, "arguments", "budget", "an end of training beside it", "budget, or steps, seconds and at_most")?;
+        ensure(!both, "arguments", "budget", "another end of training", "budget, or steps, seconds and at_most")?;
         ensure(
             self.peak.is_none_or(|p| p > 0.0 && p.is_finite()),
             "arguments",

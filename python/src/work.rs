@@ -66,7 +66,7 @@ pub fn without_lock<T: Send>(py: Python<'_>, work: impl FnOnce(&Watch) -> Result
         Ok(done) => done.map_err(|e| raised(py, &e)),
         Err(panic) => {
             let text = panic.downcast_ref::<String>().map(String::as_str);
-            Err(broken(py, text.or(panic.downcast_ref::<&str>().copied()).unwrap_or("a panic without words")))
+            Err(broken(py, text.or(panic.downcast_ref::<&str>().copied()).unwrap_or("a panic without a message")))
         }
     }
 }

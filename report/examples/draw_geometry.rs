@@ -1,5 +1,5 @@
-//! Draws the conventions of docs/geometry.md, with every place taken from the library:
-//! `cargo run -p conefield-report --example draw_geometry` writes docs/geometry-*.svg. A test here compares.
+//! Draws the conventions of docs/guide/geometry.md, with every place taken from the library:
+//! `cargo run -p conefield-report --example draw_geometry` writes docs/images/geometry-*.svg. A test here compares.
 
 use conefield_core::geometry::{Geometry, Millimetres, Radians, Vec3, View, VoxelGrid};
 use conefield_core::orbit::CircularOrbit;
@@ -387,7 +387,7 @@ fn axes(s: &mut Svg, flat: &dyn Fn(Vec3) -> Point, length: f64, names: [&str; 3]
 
 /// Files and what they should hold.
 fn drawings() -> Vec<(PathBuf, String)> {
-    let docs = PathBuf::from(env!("CARGO_MANIFEST_DIR")).join("../docs");
+    let docs = PathBuf::from(env!("CARGO_MANIFEST_DIR")).join("../docs/images");
     [("world", world()), ("detector", detector()), ("space", space())]
         .into_iter()
         .map(|(name, text)| (docs.join(format!("geometry-{name}.svg")), text))

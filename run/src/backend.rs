@@ -14,8 +14,8 @@ use std::str::FromStr;
 use std::sync::OnceLock;
 
 /// What `--help` says of `--backend`.
-pub const HELP: &str = "Which backend: auto (the CPU; it says where a GPU could be asked for), cpu, wgpu, or wgpu:N with the number of an adapter; +subgroups after wgpu adds up \
-                        gradients of tables in subgroups first";
+pub const HELP: &str = "Backend: auto (currently the CPU), cpu, wgpu, or wgpu:N for adapter N; +subgroups after wgpu sums gradients of \
+                        tables in subgroups first";
 
 /// What `--backend` says.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
@@ -99,11 +99,11 @@ impl Auto {
             // Asking for adapters loads drivers: not worth it where the system shows no GPU.
             let adapters = if shows_gpu() { adapters() } else { vec![] };
             let best = adapters.into_iter().filter(|a| !a.software).max_by_key(|a| a.rank())?;
-            Some(format!("there is a GPU, {best}: --backend wgpu:{} asks for it", best.index))
+            Some(format!("there is a GPU, {best}: --backend wgpu:{} uses it", best.index))
         };
         match self.gpu.get_or_init(look) {
             None => "chosen by --backend auto: no GPU was found".to_owned(),
-            Some(gpu) => format!("chosen by --backend auto, which takes the CPU until a GPU was measured; {gpu}"),
+            Some(gpu) => format!("chosen by --backend auto, which takes the CPU until a GPU has been measured; {gpu}"),
         }
     }
 }

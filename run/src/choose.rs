@@ -16,7 +16,7 @@ pub enum Wish {
     OneOf(Front),
 }
 
-/// Settles what will run, and how long. `held` are the views that are kept aside; `build` makes a method of the front from
+/// Settles what will run, and how long. `held` are the held-out views; `build` makes a method of the front from
 /// a spec and what is set of it.
 pub fn choose(
     wish: Wish,

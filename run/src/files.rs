@@ -76,7 +76,7 @@ pub fn write_field(path: impl AsRef<Path>, field: &TrainedField, mut notes: BTre
     let blocks = &pipeline.layout().blocks;
     let tensors: Vec<_> = blocks.iter().map(|b| (&b.name, &b.shape, &arena.params[b.range.clone()])).collect();
     let placement = serde_json::to_string(&field.placement())
-        .map_err(|e| Error::unsupported("weights", format!("cannot be put into words: {e}")))?;
+        .map_err(|e| Error::unsupported("weights", format!("cannot be written as text: {e}")))?;
     notes.insert(PLACEMENT.into(), placement);
     conefield_io::write_weights(path, &tensors, &notes)
 }
@@ -112,7 +112,7 @@ const STANDING: &str = "standing";
 /// Writes a checkpoint of the run that `run` describes.
 pub fn write_checkpoint(path: &Path, checkpoint: &Checkpoint<'_>, run: &BTreeMap<String, String>) -> Result<()> {
     let standing = serde_json::to_string(&checkpoint.standing)
-        .map_err(|e| Error::unsupported("checkpoint", format!("cannot be put into words: {e}")))?;
+        .map_err(|e| Error::unsupported("checkpoint", format!("cannot be written as text: {e}")))?;
     let mut text = run.clone();
     text.insert(STANDING.into(), standing);
     conefield_io::write_checkpoint(path, &checkpoint.tensors, &text)
@@ -122,7 +122,7 @@ pub fn write_checkpoint(path: &Path, checkpoint: &Checkpoint<'_>, run: &BTreeMap
 pub fn read_checkpoint(path: &Path, run: &BTreeMap<String, String>) -> Result<Resume> {
     let place = path.display().to_string();
     if !path.exists() {
-        let expected = "a run that was interrupted; one that is finished or has no checkpoint yet starts anew";
+        let expected = "an interrupted run with a checkpoint; others start over";
         return Err(Error::invalid(place, "--resume", "no checkpoint", expected));
     }
     let mut file = conefield_io::read_checkpoint(path)?;
@@ -145,7 +145,7 @@ pub fn same_run(place: &str, then: &BTreeMap<String, String>, now: &BTreeMap<Str
             // Of long texts, the first line that differs.
             let (a, b) = (then.lines(), now.lines());
             let pair = a.zip(b).find(|(a, b)| a != b).unwrap_or((then, now));
-            let expected = format!("{} as in the earlier run; --force starts anew", pair.0);
+            let expected = format!("{} as in the earlier run; --force starts over", pair.0);
             return Err(Error::invalid(place, format!("--resume: {key}"), pair.1, expected));
         }
     }

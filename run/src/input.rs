@@ -87,7 +87,7 @@ pub fn check_reference(place: &str, volume: &Volume, scan: &Scan) -> Result<()> 
     ensure(volume.data.shape() == want, place, "shape", format!("{:?}", volume.data.shape()), expected)
 }
 
-/// Indices of the views that are kept aside, of `n`. Refuses a choice that keeps none aside; `place` and `field` say where
+/// Indices of the held-out views, of `n`. Refuses a choice that keeps none aside; `place` and `field` say where
 /// it stands.
 pub fn held_out(choice: Option<&HoldOut>, n: usize, place: &str, field: &str) -> Result<Vec<usize>> {
     let Some(choice) = choice else { return Ok(vec![]) };

@@ -11,7 +11,7 @@ pub struct Machine {
     pub cpu: String,
     /// Cores that this process may use.
     pub cores: usize,
-    /// All memory that there is.
+    /// All memory of the machine.
     pub memory_bytes: u64,
     /// Operating system and architecture.
     pub system: String,

@@ -1,4 +1,4 @@
-//! What a command will hold in memory, reckoned before it takes any, and what there is.
+//! The estimate of a command's memory before it takes any, and the available memory.
 //!
 //! An estimate is the sum at the moment that takes most: reading, training or export. It leaves out what is small
 //! whatever the input is, but for the program itself.
@@ -18,7 +18,7 @@ const PROGRAM: u64 = 24 << 20;
 /// What `--memory` allows.
 static BUDGET: OnceLock<u64> = OnceLock::new();
 
-/// What tells how many bytes the process holds, where its allocator counts them.
+/// Returns the bytes that the process holds, if its allocator counts them.
 static HELD: OnceLock<fn() -> u64> = OnceLock::new();
 
 /// Lets readers draw from the allowance of memory.
@@ -83,7 +83,7 @@ impl Memory {
         format!("{}: {}", bytes(self.total), parts.collect::<Vec<_>>().join(", "))
     }
 
-    /// Refuses what does not fit, with the figures; `smaller` names what would fit into so many bytes.
+    /// Refuses what does not fit, with the figures; `smaller` names what would fit into the given bytes.
     pub fn check(&self, smaller: impl FnOnce(u64) -> Vec<String>) -> Result<()> {
         let (available, whose) = match BUDGET.get() {
             Some(bytes) => (*bytes, "--memory allows"),
@@ -94,7 +94,7 @@ impl Memory {
         }
         let smaller = smaller(available);
         let hint = match smaller.as_slice() {
-            [] => "nothing that is smaller in one respect alone would fit".to_owned(),
+            [] => "no single reduction would make it fit".to_owned(),
             all => format!("{} would fit", all.join(" or ")),
         };
         let there = match BUDGET.get() {
@@ -131,7 +131,7 @@ fn addresses() -> u64 {
     soft.map_or(u64::MAX, |most| most.saturating_sub(used) / 8 * 7)
 }
 
-/// The most that this process has held so far, where the system tells.
+/// Peak memory of this process, if the system reports it.
 pub fn peak() -> Option<u64> {
     let status = std::fs::read_to_string("/proc/self/status").ok()?;
     let line = status.lines().find_map(|l| l.strip_prefix("VmHWM:"))?;
@@ -170,7 +170,7 @@ impl Memory {
 pub struct Run {
     /// The scan.
     pub scan: ScanSize,
-    /// Whether views are kept aside.
+    /// Whether views are held out.
     pub split: bool,
     /// Whether there is a reference.
     pub reference: bool,

@@ -1,4 +1,4 @@
-//! Values as users write them, on the command line and elsewhere. What does not parse is told before any work.
+//! Parsers of values from the command line and elsewhere. Errors are reported before any work.
 
 use conefield_core::scan::Volume;
 use conefield_io::I0;
@@ -88,7 +88,7 @@ pub fn i0(text: &str) -> Result<I0, String> {
     }
 }
 
-/// Which views to keep aside.
+/// Which views to hold out.
 #[derive(Debug, Clone, PartialEq)]
 pub enum HoldOut {
     /// These, counted from 0.
@@ -214,7 +214,7 @@ pub fn part(text: &str) -> Result<[usize; 2], String> {
     }
 }
 
-/// Views to keep aside, where there may be none.
+/// Views to hold out, where there may be none.
 #[derive(Debug, Clone, PartialEq)]
 pub struct HoldOutOrNone(pub Option<HoldOut>);
 

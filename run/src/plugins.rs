@@ -48,7 +48,7 @@ pub fn of_spec(draft: &Draft) -> Result<()> {
         with(|plugins| {
             if plugins.get(&path).is_none() && !LEAVE.load(Ordering::Relaxed) {
                 let expected = format!(
-                    "your leave: --allow-plugins-from-spec for all that the spec names, or --plugin {} for this one",
+                    "permission: --allow-plugins-from-spec for all plugins of the spec, or --plugin {} for this one",
                     path.display()
                 );
                 return Err(Error::invalid(&place, "plugins.paths", path.display(), expected));

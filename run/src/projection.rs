@@ -1,4 +1,4 @@
-//! What a scanner would have measured of a volume: predicted views, and what measured ones have beside them.
+//! Predicted views of a volume, and residuals of measured views.
 
 use conefield_core::error::{Error, Result, ensure};
 use conefield_core::geometry::{Geometry, VoxelGrid};
@@ -47,7 +47,7 @@ pub fn oddity(own: &VoxelGrid, grid: &VoxelGrid) -> Option<String> {
     let differs = (0..3).any(|k| (size[k] / want[k] - 1.0).abs() > SAME_BOX);
     differs.then(|| {
         let mm = |s: [f64; 3]| format!("{:.1} x {:.1} x {:.1} mm", s[0], s[1], s[2]);
-        format!("its box of {} is not the {} that the scan reconstructs: it is taken as it is", mm(size), mm(want))
+        format!("its box of {} is not the {} of the scan's volume: its own box is used", mm(size), mm(want))
     })
 }
 

@@ -58,7 +58,7 @@ impl Reconstruct {
         Self { spec: Some(spec.to_owned()), ..Self::default() }
     }
 
-    /// With whatever is best within so many seconds, all in all, on this machine.
+    /// With the best method for this many seconds in total on this machine.
     pub fn within(seconds: f64) -> Self {
         Self { budget: Some(seconds), ..Self::default() }
     }
@@ -69,19 +69,19 @@ impl Reconstruct {
         self
     }
 
-    /// With so many steps or passes.
+    /// With this many steps or passes.
     pub fn steps(mut self, steps: u64) -> Self {
         self.limits.steps = Some(steps);
         self
     }
 
-    /// With so many seconds of solving.
+    /// With this many seconds of solving.
     pub fn seconds(mut self, seconds: f64) -> Self {
         self.limits.seconds = Some(seconds);
         self
     }
 
-    /// With these views kept aside and predicted.
+    /// With these held-out views and predicted.
     pub fn hold_out(mut self, views: &[usize]) -> Self {
         self.held_out = views.to_vec();
         self
@@ -104,7 +104,7 @@ impl Reconstruct {
         self.watched(scan, &mut Silent)
     }
 
-    /// Runs it, with an observer that is told how it goes and can end it.
+    /// Runs it with an observer, which receives the progress and can end the run.
     pub fn watched(self, scan: impl Into<Arc<Scan>>, observer: &mut dyn Observer) -> Result<Reconstructed> {
         let begin = Instant::now();
         let Self { spec, sets, limits, budget, held_out, reference, seed } = self;
@@ -112,7 +112,7 @@ impl Reconstruct {
         scan.validate("scan")?;
         if budget.is_some() && limits != Limits::default() {
             let expected = "a budget, or steps and seconds";
-            return Err(Error::invalid("reconstruct", "budget", "an end of training beside it", expected));
+            return Err(Error::invalid("reconstruct", "budget", "another end of training", expected));
         }
         if let Some(reference) = &reference {
             check_reference("reference", reference, &scan)?;

@@ -8,7 +8,7 @@ use conefield_core::{Error, Result};
 pub use conefield_specs::{FAST_WEIGHTS, SHIPPED};
 use std::collections::BTreeMap;
 
-/// Every name that stands for a spec: of those that are shipped, and of methods that need no setting.
+/// All names of specs: shipped ones, and methods that need no setting.
 pub fn names() -> Vec<&'static str> {
     let mut names: Vec<&str> = SHIPPED.iter().map(|s| s.name).collect();
     let methods = registry::names(registry::Kind::Method).into_iter();
@@ -54,12 +54,12 @@ pub fn notes(loaded: &Loaded, seed: u64) -> Result<BTreeMap<String, String>> {
     Ok(notes)
 }
 
-/// Refuses a setting that looks at views kept aside where `held`, the views that are, has none.
+/// Refuses a setting that looks at held-out views where `held`, the views that are, has none.
 pub fn check_held_out(loaded: &Loaded, plan: &dyn Plan, held: &[usize]) -> Result<()> {
     match plan.needs_held_out() {
         Some(setting) if held.is_empty() => {
-            let expected = "views to look at, such as --hold-out every:10";
-            Err(loaded.locate(Error::invalid("spec", setting, "no views kept aside", expected)))
+            let expected = "held-out views, such as --hold-out every:10";
+            Err(loaded.locate(Error::invalid("spec", setting, "no held-out views", expected)))
         }
         _ => Ok(()),
     }

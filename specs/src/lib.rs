@@ -1,5 +1,4 @@
-//! The files beside this crate's manifest, as texts that are part of the program: specs by name, weights, and what a search of
-//! settings begins with.
+//! The files in this crate's folder, embedded in the program: specs by name, weights, levers and the front.
 
 use conefield_core::spec::load::Shipped;
 
@@ -34,7 +33,7 @@ pub const FAST_WEIGHTS: &[u8] = include_bytes!("../weights/fast.safetensors");
 /// Which settings a search varies.
 pub const LEVERS: &str = include_str!("../tradeoff/levers.toml");
 
-/// Methods of which none is beaten in time and accuracy.
+/// Methods none of which is beaten in time and accuracy.
 pub const FRONT: &str = include_str!("../tradeoff/front.toml");
 
 #[cfg(test)]

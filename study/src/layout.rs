@@ -5,7 +5,7 @@
 //! scans/CASE-seedS/         what was simulated, once for all methods
 //! runs/CASE-seedS/METHOD/   what "conefield reconstruct" leaves
 //! failed/CASE-seedS/METHOD  why a run has no result
-//! table.md, table.json      what came of it; these come last
+//! table.md, table.json      the results; written last
 //! slices/CASE.png           middle slices of every method with the first seed
 //! curves/CASE.png           PSNR over steps and time
 //! ```
@@ -58,7 +58,7 @@ impl Layout<'_> {
         self.0.join(RUNS).join(group(case, seed)).join(method)
     }
 
-    /// Where stands why the run of a method has no result.
+    /// The file with the error of a run without result.
     pub fn failure(&self, case: &str, seed: u64, method: &str) -> PathBuf {
         self.0.join(FAILED).join(group(case, seed)).join(method)
     }
@@ -73,7 +73,7 @@ impl Layout<'_> {
         self.0.join(CURVES).join(format!("{case}.png"))
     }
 
-    /// Refuses a folder with anything in it that no study leaves; whether a study stands there.
+    /// Refuses a folder with files that no study writes. Returns whether it holds a study.
     pub fn look(&self) -> Result<bool> {
         let place = self.0.display().to_string();
         let entries = match fs::read_dir(self.0) {

@@ -51,7 +51,7 @@ impl Method {
         match others.iter().find(|m| m.name.to_lowercase() == self.name.to_lowercase()) {
             Some(other) => {
                 let found = format!("{:?}, the name of {}", self.name, other.loaded.source);
-                Err(Error::invalid(&self.loaded.source, "name", found, "a name of its own, for table and folder"))
+                Err(Error::invalid(&self.loaded.source, "name", found, "a unique name, for table and folder"))
             }
             None => Ok(()),
         }

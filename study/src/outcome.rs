@@ -54,7 +54,7 @@ pub struct Columns {
 }
 
 impl Columns {
-    /// For runs with a reference, or with views kept aside.
+    /// For runs with a reference, or with held-out views.
     pub fn of(scores: bool, held_out: bool) -> Self {
         Self { scores, held_out, loss: !scores && !held_out }
     }

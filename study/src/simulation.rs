@@ -40,7 +40,7 @@ impl Simulation {
         [&self.volume, &self.protocol].into_iter().map(PathBuf::from).chain(angles).collect()
     }
 
-    /// Refuses a volume that cannot be read or scanned, and views to keep aside that there are not.
+    /// Refuses a volume that cannot be read or scanned, and views to hold out that there are not.
     pub fn check(&self, hold_out: Option<&HoldOut>) -> Result<()> {
         let volume = self.prepared()?;
         let geometry = self.protocol(&volume.grid, 0)?.geometry(&volume.grid)?;
@@ -71,7 +71,7 @@ impl Simulation {
         let same = then.as_ref() == Some(&now)
             && scan.provenance["source"] == self.written
             && scan.provenance["prepared"] == self.preparation();
-        let expected = "the one of this study, as its file says now; --force starts anew";
+        let expected = "the one of this study, as its file says now; --force starts over";
         ensure(
             same,
             &place.display().to_string(),

@@ -26,7 +26,7 @@ impl Jobs<'_> {
         let absolute = |path: &Path| std::path::absolute(path).map_err(|e| Error::io(path, e));
         let quoted = |text: &str| {
             shlex::try_quote(text).map(|q| q.into_owned()).map_err(|e| {
-                Error::invalid("--slurm", "a name", format!("{text:?}: {e}"), "a name that a shell can be told")
+                Error::invalid("--slurm", "a name", format!("{text:?}: {e}"), "a name that a shell accepts")
             })
         };
         let path = |path: &Path| quoted(&absolute(path)?.display().to_string());

@@ -302,7 +302,7 @@ impl Reading<'_> {
     fn add<T>(&self, cases: &mut Vec<Case>, entry: &Spanned<Entry<T>>, case: Case) -> Result<()> {
         let free = cases.iter().all(|c| c.name.to_lowercase() != case.name.to_lowercase());
         let found = format!("{:?}, the name of another one", case.name);
-        ensure(free, &self.at(entry), "name", found, "a name of its own, for table and folders")?;
+        ensure(free, &self.at(entry), "name", found, "a unique name, for table and folders")?;
         cases.push(case);
         Ok(())
     }

@@ -14,76 +14,75 @@ use std::num::{NonZeroU16, NonZeroU64, NonZeroUsize};
 use std::str::FromStr;
 use toml::Spanned;
 
-/// Methods on scans with seeds. Paths are relative to this file.
+/// A study: methods on scans with several seeds. Paths are relative to this file.
 #[derive(Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields)]
 #[schemars(title = "conefield study")]
 pub struct Written {
-    /// Short name, the table's title [default: the file's].
+    /// Short name, the title of the table [default: the file's name].
     pub name: Option<String>,
-    /// What the study is for, in a sentence.
+    /// The purpose of the study, in a sentence.
     #[serde(default)]
     pub description: String,
-    /// Volumes of which scans are simulated, one for each seed and number of views. A text alone is the volume.
+    /// Volumes to simulate: a scan for each seed and number of views. A string is the volume.
     #[serde(default)]
     #[schemars(with = "Vec<Entry<WrittenVolume>>")]
     pub volumes: Vec<Spanned<Entry<WrittenVolume>>>,
-    /// Scans that there are already. A text alone is the scan.
+    /// Existing scans. A string is the scan.
     #[serde(default)]
     #[schemars(with = "Vec<Entry<WrittenScan>>")]
     pub scans: Vec<Spanned<Entry<WrittenScan>>>,
-    /// The methods, in the table's order. A text alone is the spec.
+    /// The methods, in the order of the table. A string is the spec.
     #[schemars(with = "Vec<Entry<WrittenSpec>>")]
     pub specs: Vec<Spanned<Entry<WrittenSpec>>>,
-    /// Seeds of the noise of what is simulated and of everything random in a method [default: 0].
+    /// Seeds of the simulated noise and of all random numbers of a method [default: 0].
     #[schemars(with = "Option<Vec<u64>>")]
     pub seeds: Option<Spanned<Vec<u64>>>,
     /// Numbers of views to simulate [default: the protocol's; r2: 50].
     #[schemars(with = "Option<Vec<NonZeroUsize>>")]
     pub views: Option<Spanned<Vec<NonZeroUsize>>>,
-    /// The name of the method that the others are compared with, on the same scan and with the same seed.
+    /// The method that the others are compared with, on the same scan and with the same seed.
     #[schemars(with = "Option<String>")]
     pub baseline: Option<Spanned<String>>,
-    /// What pictures show as black and as white, in the values of the volumes: attenuation in 1/unit of the scan
-    /// [default: the range of the reference].
+    /// Values shown as black and white in pictures, in 1/unit of the scan [default: the range of the reference].
     #[schemars(with = "Option<[f32; 2]>")]
     pub window: Option<Spanned<[f32; 2]>>,
-    /// How scans are simulated, as by "conefield simulate".
+    /// How scans are simulated, as in "conefield simulate".
     #[serde(default)]
     pub simulate: WrittenSimulation,
-    /// What holds for every run, as for "conefield compare".
+    /// Options of every run, as in "conefield compare".
     #[serde(default)]
     #[schemars(with = "Protocol")]
     pub protocol: Option<Spanned<Protocol>>,
 }
 
-/// A volume to simulate scans of.
+/// A volume to simulate.
 #[derive(Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields)]
 pub struct WrittenVolume {
-    /// A file, or phantom:head, phantom:abdomen or phantom:random:SEED, each also with :SIZE.
+    /// A file, or phantom:head, phantom:abdomen or phantom:random:SEED, each optionally with :SIZE.
     pub volume: String,
-    /// Its name in tables and folders [default: the file's].
+    /// Its name in tables and folders [default: the file's name].
     pub name: Option<String>,
-    /// What voxel values mean: as-is, hu:MU_WATER or clip:LO,HI [default: as-is].
+    /// Meaning of the voxel values: as-is, hu:MU_WATER or clip:LO,HI [default: as-is].
     pub values: Option<String>,
-    /// Average blocks of so many voxels a side first [default: 1].
+    /// Average blocks with this many voxels per side first [default: 1].
     pub downsample: Option<NonZeroU16>,
-    /// As the study's window, for this volume.
+    /// The window of this volume.
     pub window: Option<[f32; 2]>,
 }
 
-/// A scan that there is already.
+/// An existing scan.
 #[derive(Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields)]
 pub struct WrittenScan {
     /// The file or folder.
     pub scan: String,
-    /// Its name in tables and folders [default: the file's].
+    /// Its name in tables and folders [default: the file's name].
     pub name: Option<String>,
-    /// The volume sought: a file, or "truth" for the one that the scan comes with [default: the protocol's].
+    /// The reference: a file, or "truth" for the one in the scan [default: the protocol's].
     pub reference: Option<String>,
-    /// As the study's window, for this scan.
+    /// The window of this scan.
     pub window: Option<[f32; 2]>,
 }
 
@@ -95,10 +94,10 @@ pub struct WrittenSpec {
     pub spec: String,
     /// Its name in tables and folders [default: the spec's own].
     pub name: Option<String>,
-    /// Settings to change, each as --set has it: "encoder.levels=8".
+    /// Settings to change, as in --set: "encoder.levels=8".
     #[serde(default)]
     pub set: Vec<String>,
-    /// What to start from: weights that "conefield pretrain" made, or a volume.
+    /// Weights of "conefield pretrain", or a volume, to start from.
     pub init: Option<String>,
 }
 
@@ -106,9 +105,9 @@ pub struct WrittenSpec {
 #[derive(Default, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields, default)]
 pub struct WrittenSimulation {
-    /// Where source and detector stand: r2, the published synthetic set-up, or a TOML or JSON file [default: r2].
+    /// The geometry: r2, the published synthetic set-up, or a TOML or JSON file [default: r2].
     pub protocol: Option<String>,
-    /// Rows and columns of the detector, whose size stays, such as 256x256 [default: the protocol's; r2: 512x512].
+    /// Rows and columns of the detector at the same size in mm, such as 256x256 [default: the protocol's; r2: 512x512].
     #[serde(deserialize_with = "detector")]
     #[schemars(with = "Option<String>")]
     pub detector: Option<[usize; 2]>,
@@ -116,7 +115,7 @@ pub struct WrittenSimulation {
     #[serde(deserialize_with = "offset")]
     #[schemars(with = "Option<String>")]
     pub offset: Option<[f64; 2]>,
-    /// Angles in degrees: evenly, START:RANGE, or a file with one a line.
+    /// Angles in degrees: START:RANGE for even steps, or a file with one per line.
     #[serde(deserialize_with = "angles")]
     #[schemars(with = "Option<String>")]
     pub angles: Option<AnglesOption>,
@@ -126,7 +125,7 @@ pub struct WrittenSimulation {
     pub noise: Option<DetectorNoise>,
 }
 
-/// What holds for every run.
+/// Options of every run.
 #[derive(Debug, Clone, Default, Deserialize, Serialize, JsonSchema)]
 #[serde(deny_unknown_fields, default)]
 pub struct Protocol {
@@ -141,23 +140,23 @@ pub struct Protocol {
     #[serde(deserialize_with = "seconds", skip_serializing_if = "Option::is_none")]
     #[schemars(with = "Option<String>")]
     pub at_most: Option<f64>,
-    /// Plan training so that the whole run takes this time.
+    /// Time of the whole run.
     #[serde(deserialize_with = "seconds", skip_serializing_if = "Option::is_none")]
     #[schemars(with = "Option<String>")]
     pub budget: Option<f64>,
-    /// Views to keep aside and predict, such as 3,17 or every:10.
+    /// Views to hold out and predict, such as 3,17 or every:10.
     #[serde(deserialize_with = "hold_out", serialize_with = "shown", skip_serializing_if = "Option::is_none")]
     #[schemars(with = "Option<String>")]
     pub hold_out: Option<HoldOut>,
-    /// Of scans that there are already, the volume sought: a file, or "truth" for the one that the scan comes with. What is
-    /// simulated is compared with its truth.
+    /// The reference of existing scans: a file, or "truth" for the one in the scan. Simulated scans are compared with their
+    /// truth.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub reference: Option<String>,
     /// The data range for PSNR and SSIM [default: 1 for a reference in [0, 1], else the range of its values].
     #[serde(deserialize_with = "above_zero", skip_serializing_if = "Option::is_none")]
     #[schemars(with = "Option<f64>")]
     pub peak: Option<f64>,
-    /// Settings to change of every spec, each as --set has it.
+    /// Settings to change in every spec, as in --set.
     #[serde(skip_serializing_if = "Vec::is_empty")]
     pub set: Vec<String>,
     /// auto, cpu, wgpu or wgpu:N [default: auto].
@@ -185,11 +184,11 @@ impl Protocol {
     }
 }
 
-/// A table, or a text that stands for the table with nothing but its first key.
+/// A table, or a string for a table with only its first key.
 #[derive(Debug)]
 pub struct Entry<T>(pub T);
 
-/// What a text alone stands for.
+/// The meaning of a string.
 pub trait Named {
     /// The table with this as its first key.
     fn named(name: String) -> Self;
@@ -244,7 +243,7 @@ impl<T: JsonSchema> JsonSchema for Entry<T> {
     }
 }
 
-/// A text, or a number that stands for itself.
+/// A string or a number.
 struct Text(String);
 
 impl<'de> Deserialize<'de> for Text {
@@ -269,7 +268,7 @@ impl<'de> Deserialize<'de> for Text {
     }
 }
 
-/// A value as the command line has it.
+/// A value, written as on the command line.
 fn said<'de, D: Deserializer<'de>, T>(
     from: D,
     parse: impl Fn(&str) -> Result<T, String>,

@@ -1,4 +1,4 @@
-//! What fuzzing starts from. See `docs/bad-inputs.md`.
+//! What fuzzing starts from. See `docs/reference/bad-inputs.md`.
 
 use conefield_tests::hostile::{PARSERS, seeds};
 use std::path::{Path, PathBuf};

@@ -1,4 +1,4 @@
-//! Every reader takes damaged input without a panic, a hoard of memory or a hang. See `docs/bad-inputs.md`.
+//! Every reader takes damaged input without a panic, a hoard of memory or a hang. See `docs/reference/bad-inputs.md`.
 
 use conefield_tests::hostile::watch::{Bounds, Meter, ReaderFault, once};
 use conefield_tests::hostile::{PARSERS, Parser, find};

@@ -1,4 +1,4 @@
-//! A front file: methods of which none is beaten in time, memory and accuracy, with what they took and reached on
+//! A front file: methods none of which is beaten in time, memory and accuracy, with cost and accuracy on
 //! tuning scans. `conefield tradeoff` makes it, `conefield reconstruct --budget` picks from it.
 
 use crate::statistics::mean;
@@ -103,7 +103,7 @@ pub struct Reached {
     /// SSIM slice by slice, where the reference was known.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub ssim_2d: Option<f64>,
-    /// Error of views that were kept aside, over the largest line integral.
+    /// Error of held-out views, over the largest line integral.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub held_out: Option<f64>,
 }

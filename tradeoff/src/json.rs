@@ -16,6 +16,6 @@ pub fn to_json(value: &impl Serialize) -> Result<String> {
 /// Reads what this program wrote.
 pub fn read_json<T: DeserializeOwned>(path: &Path) -> Result<T> {
     let text = conefield_core::files::read_text(path, LONGEST)?;
-    let expected = "what conefield writes there; --force starts anew";
+    let expected = "the content that conefield writes; --force starts over";
     serde_json::from_str(&text).map_err(|e| Error::invalid(path.display().to_string(), "JSON", e, expected))
 }

@@ -1,4 +1,4 @@
-//! What may be turned, and the candidates that come of it: every base as it is, and seeded draws from the product of
+//! The settings to vary, and the candidates: every base unchanged, and seeded draws from the product of
 //! its levers' values.
 
 use crate::front::Unknowns;
@@ -18,7 +18,7 @@ const LONGEST: u64 = 1 << 20;
 /// Draws for one that is new, before the product counts as used up.
 const TRIES: u64 = 200;
 
-/// A levers file as it is written.
+/// A levers file.
 #[derive(Deserialize)]
 #[serde(deny_unknown_fields)]
 struct Written {
@@ -106,7 +106,7 @@ impl<'a> Levers<'a> {
             let base = Base::of(base, &format!("base[{i}]"), place, folder, specs)?;
             if bases.iter().any(|b| b.name == base.name) {
                 let found = format!("{:?}, the name of another base", base.name);
-                return Err(Error::invalid(place, format!("base[{i}].spec"), found, "a name of its own"));
+                return Err(Error::invalid(place, format!("base[{i}].spec"), found, "a unique name"));
             }
             bases.push(base);
         }

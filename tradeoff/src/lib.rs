@@ -5,7 +5,7 @@
 //!   this machine, and [`schedule`] chooses one and says when its training must end, so that the whole command takes the
 //!   time that it has.
 //! - [`levers`]: what may be turned, and the candidates that come of it; [`search`] tries them by [`halving`], a [`trial`]
-//!   is a whole run, and [`report`] tells what came of it, the front of those that are best by [`pareto`].
+//!   is a whole run, and [`report`] has the result: the front by [`pareto`].
 //! - [`statistics`] and [`json`] serve the others.
 //!
 //! What goes on here knows neither a command line nor how a run is started: the caller brings the specs, runs the trials

@@ -77,7 +77,7 @@ impl TradeoffReport {
         let points = points(&search, &trials);
         if points.is_empty() {
             let why = trials.iter().find_map(|t| t.error.clone()).unwrap_or_else(|| "there is none".into());
-            return Err(Error::unsupported("tradeoff", format!("no trial came to a result; the first: {why}")));
+            return Err(Error::unsupported("tradeoff", format!("no trial had a result; the first error: {why}")));
         }
         let of = |kind: Option<Unknowns>| {
             let some: Vec<&Mean> = points.iter().filter(|p| kind.is_none_or(|k| k == p.kind)).collect();

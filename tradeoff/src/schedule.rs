@@ -31,7 +31,7 @@ pub trait Runnable {
     fn plan(&mut self) -> &mut dyn Plan;
 }
 
-/// The time that there is.
+/// The available time.
 #[derive(Debug, Clone, Copy)]
 pub struct Budget {
     /// When the command started.
@@ -52,7 +52,7 @@ pub struct Schedule {
     /// What other methods would have taken.
     #[serde(skip_serializing_if = "Vec::is_empty")]
     pub passed_over: Vec<String>,
-    /// Steps or passes that there is time for.
+    /// Steps or passes that fit into the time.
     pub steps: u64,
     /// Until the plan was made, in all.
     pub load_s: f64,
@@ -67,7 +67,7 @@ pub struct Schedule {
     /// When training is to be over.
     #[serde(skip)]
     pub deadline: Instant,
-    /// When a solver that goes on after the training is to be over.
+    /// The deadline of a solver that runs after the training.
     #[serde(skip)]
     pub then: Option<Instant>,
 }
@@ -82,7 +82,7 @@ impl Budget {
     pub fn plan(&self, bench: &Bench<'_>, method: &mut impl Runnable) -> Result<Schedule> {
         let start = Instant::now();
         let costs = calibrate(bench, method.plan(), self.measuring())?;
-        self.settle(None, "the spec that was asked for".into(), vec![], method, costs, start)
+        self.settle(None, "the requested spec".into(), vec![], method, costs, start)
     }
 
     /// The best method of `front` that fits, made by `build` from a spec and what is set of it, and its plan.
@@ -113,7 +113,7 @@ impl Budget {
         let point = points[at];
         let why = match fits {
             true => format!("the best of the front that fits ({})", point.told(front)),
-            false => format!("no method of the front fits whole, this one takes least ({})", point.told(front)),
+            false => format!("no method of the front fits completely; this one is the fastest ({})", point.told(front)),
         };
         let passed_over = passed_over.into_iter().map(|(i, why)| format!("{}: {why}", points[i].name)).collect();
         let plan = self.settle(Some(point.name.clone()), why, passed_over, &mut method, costs, start)?;
@@ -151,7 +151,7 @@ impl Budget {
                 Unknowns::Voxels => "one pass".into(),
             };
             let expected = format!(
-                "at least {} here and now: {} until the plan was made, {} to prepare and for {first} of {}, {} to write and compare",
+                "at least {} on this machine: {} until the plan was made, {} to prepare and for {first} of {}, {} to write and compare",
                 time(needed.max(self.seconds * 1.01)),
                 time(load_s + self.spent),
                 time(costs.prepare_s + least),
@@ -205,7 +205,7 @@ impl Schedule {
         let mut lines = vec![format!("planned: {named}, {}", self.why)];
         lines.extend(self.passed_over.iter().map(|line| format!("passed over: {line}")));
         if e.then_s > 0.0 {
-            lines.push(format!("planned: {} at most for what goes on after the training", time(e.then_s)));
+            lines.push(format!("planned: at most {} after the training", time(e.then_s)));
         }
         lines.push(format!(
             "planned: {} to read and to measure, {} to prepare, {} for about {} {steps} of {}, {} to write and compare",

@@ -32,9 +32,9 @@ pub struct Search {
     pub version: &'static str,
     /// The scans to be good on.
     pub scans: Vec<ScanRecord>,
-    /// The volumes sought, one a scan; none where views kept aside rank.
+    /// The volumes sought, one a scan; none where held-out views rank.
     pub references: Vec<PathBuf>,
-    /// Views to keep aside, as the command line has it.
+    /// Views to hold out, as the command line has it.
     pub hold_out: Option<String>,
     /// The data range for PSNR and SSIM.
     pub peak: Option<f64>,
@@ -129,7 +129,7 @@ impl Search {
     pub fn look(&self, folder: &Path, earlier: Earlier) -> Result<Vec<Over>> {
         let place = folder.display().to_string();
         let old = entries(folder)?;
-        let expected = "a new or empty folder, --resume to go on or --force to replace it";
+        let expected = "a new or empty folder, --resume to continue or --force to replace it";
         let state = folder.join(FILES[0]);
         ensure(old.is_empty() || earlier != Earlier::Refuse, &place, "output", "an earlier search", expected)?;
         if earlier == Earlier::Replace {
@@ -151,7 +151,7 @@ impl Search {
         let now = serde_json::to_value(self).map_err(|e| Error::unsupported("the search", e.to_string()))?;
         for (key, now) in now.as_object().into_iter().flatten() {
             let then = &then.search[key];
-            let expected = format!("{} as in the earlier search; --force starts anew", short(then));
+            let expected = format!("{} as in the earlier search; --force starts over", short(then));
             ensure(then == now, &state.display().to_string(), &format!("--resume: {key}"), short(now), expected)?;
         }
         Ok(then.trials)

@@ -62,7 +62,7 @@ fn checksum(bytes: impl Iterator<Item = u8>) -> String {
 pub struct TrialInput {
     /// The whole scan.
     pub scan: ScanRecord,
-    /// Indices of the views that are kept aside.
+    /// Indices of the held-out views.
     pub held: Vec<usize>,
     /// What is known of the volume sought.
     pub reference: Option<MiddleSlices>,
@@ -71,7 +71,7 @@ pub struct TrialInput {
 }
 
 impl TrialInput {
-    /// Of the scan that was read from `path`; little of it is kept. Views to keep aside that leave none to work with are
+    /// Of the scan that was read from `path`; little of it is kept. Views to hold out that leave none to work with are
     /// refused.
     pub fn of(path: &Path, scan: Scan, reference: Option<&Volume>, peak: f64, held: Vec<usize>) -> Result<Self> {
         let record = ScanRecord::of(path, &scan)?;
@@ -105,7 +105,7 @@ pub struct Figures {
     pub samples_per_s: Option<f64>,
     /// The last one.
     pub loss: Option<f64>,
-    /// Error of views that were kept aside, over the largest line integral.
+    /// Error of held-out views, over the largest line integral.
     pub held_out: Option<f64>,
     /// Kept as it stands, with the reasons for what is missing.
     pub scores: Option<Value>,

@@ -6,7 +6,7 @@ use conefield_backend_wgpu::{Adapter, adapters};
 use conefield_core::{Result, simd};
 use serde_json::json;
 
-/// List what can do the computing here.
+/// List the backends of this machine: CPU instructions and GPU adapters.
 #[derive(Args)]
 pub struct BackendsArgs {
     /// Print one JSON object.
@@ -32,7 +32,7 @@ impl BackendsArgs {
     }
 }
 
-/// An adapter with what limits it.
+/// An adapter and its limits.
 fn line(a: &Adapter) -> String {
     let bytes = |n: u64| out::bytes(n);
     let subgroups = a.subgroups.map_or(String::new(), |[least, most]| match least == most {

@@ -19,22 +19,22 @@ use std::path::{Path, PathBuf};
 use std::sync::{Mutex, PoisonError};
 use std::time::Instant;
 
-/// Find out from the views themselves where the detector stood.
+/// Estimate the position of the detector from the views.
 ///
-/// Some views are kept aside and predicted from a quick reconstruction of the others; the geometry that predicts them best
-/// is the one in which they were taken. No phantom is needed. SCAN stays as it is; OUT is the same scan with the corrected
-/// geometry. What the views do not tell is left as it was, and so is what is right within three standard deviations.
+/// A quick reconstruction of some views predicts the others; the geometry with the smallest error is the estimate. No phantom is
+/// needed. SCAN is not changed; OUT is the same scan with the corrected geometry. Parameters that the views do not determine, or
+/// that are right within three standard deviations, stay unchanged.
 #[derive(Args)]
 pub struct CalibrateArgs {
     /// The scan.
     scan: PathBuf,
-    /// The folder for the scan with the corrected geometry [default: none is written].
+    /// The folder for the scan with the corrected geometry [default: no scan is written].
     #[arg(short, long = "output", value_name = "OUT")]
     output: Option<PathBuf>,
-    /// What to look for: offset-u, offset-v, rotation, tilt, slant, distance and step.
+    /// Parameters to estimate: offset-u, offset-v, rotation, tilt, slant, distance and step.
     #[arg(long, value_name = "LIST", value_delimiter = ',', default_value = "offset-u,rotation")]
     parameters: Vec<Parameter>,
-    /// Pixels along the longer side of the detector at the finest level; more find more and take longer.
+    /// Pixels along the longer side of the detector at the finest level; more pixels are more accurate and slower.
     #[arg(long, value_name = "N", default_value_t = 64, value_parser = clap::value_parser!(u16).range(16..=1024))]
     pixels: u16,
     /// Also draw the held-out error along each parameter.
@@ -78,7 +78,7 @@ impl CalibrateArgs {
         if let Some(output) = &self.output {
             if let Some(test) = test {
                 let n = test.geometry.views.len();
-                tracing::warn!("{}: {n} test views are left out, for which this format has no place", output.display());
+                tracing::warn!("{}: {n} test views are left out: this format cannot hold them", output.display());
             }
             scan.geometry.views = found.correction.views(&scan.geometry.views);
             note(&mut scan, &self.scan, &found);
@@ -95,7 +95,7 @@ impl CalibrateArgs {
         out::say(&self.told(&found, seconds))
     }
 
-    /// For people.
+    /// The result as text.
     fn told(&self, found: &Calibration, seconds: f64) -> String {
         let heads = ["", "change", "uncertainty", "unit", "in pixels", ""].map(str::to_owned).to_vec();
         let rows: Vec<Vec<String>> = std::iter::once(heads).chain(found.found.iter().map(row)).collect();
@@ -112,7 +112,7 @@ impl CalibrateArgs {
         if let Some(output) = &self.output {
             text += &match found.found.iter().any(|f| f.verdict == Verdict::Corrected) {
                 true => format!("\ncorrected scan: {}", output.display()),
-                false => format!("\nnothing to correct; the scan as it was: {}", output.display()),
+                false => format!("\nnothing to correct; the unchanged scan: {}", output.display()),
             };
         }
         text
@@ -130,13 +130,13 @@ fn row(f: &Found) -> Vec<String> {
     };
     let said = match f.verdict {
         Verdict::Corrected => "corrected",
-        Verdict::Kept => "right as it is",
-        Verdict::Untold => "the views do not tell it: left as it is",
+        Verdict::Kept => "right: unchanged",
+        Verdict::Untold => "not determined by the views: unchanged",
     };
     vec![f.parameter.to_string(), change, uncertainty, f.unit.into(), pixels, said.into()]
 }
 
-/// Keeps in the scan how its geometry came about.
+/// Records in the scan how its geometry was obtained.
 fn note(scan: &mut Scan, source: &Path, found: &Calibration) {
     let corrected: serde_json::Map<String, Value> = found
         .found
@@ -152,7 +152,7 @@ fn note(scan: &mut Scan, source: &Path, found: &Calibration) {
     }
 }
 
-/// The criterion along each parameter, side by side.
+/// The held-out error along each parameter, side by side.
 fn draw(path: &Path, found: &Calibration) -> Result<()> {
     let options = CurveOptions { size: [640, 480], ..CurveOptions::default() };
     let drawn: Vec<_> = found
@@ -181,14 +181,14 @@ fn draw(path: &Path, found: &Calibration) -> Result<()> {
     panels_png(path, &panels)
 }
 
-/// Shows how far a calibration is, and ends it when the user wants.
+/// Shows the progress of a calibration and handles interruptions.
 pub struct Shown {
     progress: Mutex<Progress>,
     begin: Instant,
 }
 
 impl Shown {
-    /// From now on.
+    /// Starts now.
     pub fn new() -> Self {
         Self { progress: Mutex::new(Progress::new("calibrate", None)), begin: Instant::now() }
     }
@@ -206,14 +206,14 @@ impl Watch for Shown {
     }
 }
 
-/// What is warned of: a geometry under which the views contradict each other.
+/// A warning: with this geometry the views contradict each other.
 #[derive(Debug, Clone, Serialize)]
 pub struct Suspicion {
-    /// As that of other warnings of a scan.
+    /// The kind, as in other warnings about a scan.
     kind: &'static str,
-    /// What was found, with figures.
+    /// The finding, with figures.
     found: String,
-    /// What to do about it.
+    /// The advice.
     advice: &'static str,
 }
 
@@ -223,7 +223,7 @@ impl fmt::Display for Suspicion {
     }
 }
 
-/// Warns where a quick look finds that the geometry of `scan` is off. A scan on which it cannot look gives no warning.
+/// Warns if a quick search finds an error in the geometry of `scan`. A scan that is too small for it gives no warning.
 pub fn suspicion(scan: &Scan, backend: &dyn Backend) -> Result<Option<Suspicion>> {
     let found = match suspect(scan, backend, &Shown::new()) {
         Err(e @ Error::Aborted { .. }) => return Err(e),
@@ -237,8 +237,8 @@ pub fn suspicion(scan: &Scan, backend: &dyn Backend) -> Result<Option<Suspicion>
         Suspicion {
             kind: "geometry",
             found: format!(
-                "the geometry is off: with the detector corrected ({}) views that are kept aside are predicted with an error of \
-                 {after:.4}, and with {before:.4} as it is told",
+                "the geometry is off: with the detector corrected ({}) held-out views are predicted with an error of \
+                 {after:.4}, and without with {before:.4}",
                 words.collect::<Vec<_>>().join(", ")
             ),
             advice: "conefield calibrate SCAN -o CORRECTED finds the geometry and writes the scan with it",

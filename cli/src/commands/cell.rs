@@ -1,4 +1,4 @@
-//! A run as a part of a comparison or a study: how it starts, and the process of its own that it is.
+//! A run as part of a comparison or a study: how it starts, and its process.
 
 use super::protocol::RunProtocol;
 use super::reconstruct::{budget, identity};
@@ -15,16 +15,16 @@ use serde_json::Value;
 use std::collections::BTreeMap;
 use std::path::Path;
 
-/// What stands in a run's folder decides how the run starts.
+/// How a run starts, given the content of its folder.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub enum Start {
-    /// Nothing does.
+    /// The folder is empty.
     Anew,
-    /// What a run left that came to no checkpoint.
+    /// An earlier run ended without a checkpoint.
     Replacing,
-    /// A checkpoint.
+    /// There is a checkpoint.
     Resuming,
-    /// A finished run.
+    /// The run is finished.
     Done,
 }
 
@@ -37,13 +37,16 @@ pub struct Cell<'a> {
     pub protocol: &'a RunProtocol,
 }
 
-/// Whether a finished run stands in `folder`.
+/// Whether `folder` holds a finished run.
 pub fn is_done(folder: &Path) -> bool {
     ["record.json", "volume.nii.gz"].iter().all(|f| folder.join(f).exists())
 }
 
 impl Cell<'_> {
-    /// How the run starts. Refuses to go on with another one's.
+    /// How the run starts.
+    ///
+    /// # Errors
+    /// The folder holds a different run.
     pub fn start(&self, input: &TrialInput) -> Result<Start> {
         let Self { method, run, protocol, .. } = self;
         if !run.exists() {
@@ -65,8 +68,7 @@ impl Cell<'_> {
         Ok(Start::Replacing)
     }
 
-    /// Makes the run unless it is done; what went wrong with it, if anything did. `part` is what an interruption is told to
-    /// have interrupted.
+    /// Runs unless the run is finished. Returns the error of a failed run. `part` names the work in the message of an interruption.
     pub fn carry_out(&self, start: Start, part: String, general: &General) -> Result<Option<String>> {
         let mut more: Vec<String> = match start {
             Start::Done => return Ok(None),
@@ -81,7 +83,7 @@ impl Cell<'_> {
     }
 }
 
-/// Which run a finished one was, as [`identity`] has it, and what it was compared with.
+/// The [`identity`] of a finished run and its reference.
 fn recorded(folder: &Path) -> Result<BTreeMap<String, String>> {
     #[derive(Deserialize)]
     struct Known {

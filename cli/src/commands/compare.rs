@@ -22,12 +22,11 @@ use std::io::ErrorKind;
 use std::path::{Path, PathBuf};
 use tracing::info;
 
-/// Reconstruct a scan in several ways under one protocol: a table and a picture.
+/// Reconstruct a scan with several methods under one protocol.
 ///
-/// FOLDER receives table.md, table.json, compare.png and a folder for every spec, named after it, with what
-/// "conefield reconstruct" leaves. Each run is a process of its own: its memory is its own, and where one fails the
-/// others still run. Every --set holds for every spec. Ctrl-C ends the run under way after its step; the same command
-/// with --resume goes on and leaves alone what is done.
+/// FOLDER receives table.md, table.json, compare.png and, for every spec, a folder with the output of "conefield reconstruct".
+/// Each run is a separate process, so its peak memory is its own, and the others run even if one fails. Every --set applies to every spec.
+/// Ctrl-C stops the current run after its step; the same command with --resume continues and skips finished runs.
 #[derive(Args)]
 pub struct CompareArgs {
     /// The scan.
@@ -37,34 +36,34 @@ pub struct CompareArgs {
     /// The folder for the results; new or empty.
     #[arg(short, long = "output", value_name = "FOLDER")]
     output: PathBuf,
-    /// Replace an earlier comparison in FOLDER with all its runs.
+    /// Replace an earlier comparison in FOLDER and all its runs.
     #[arg(long)]
     force: bool,
-    /// Go on with the comparison in FOLDER; all else must be as it was, but for specs that are added.
+    /// Continue the comparison in FOLDER. Specs may be added; all other options must be the same.
     #[arg(long, conflicts_with = "force")]
     resume: bool,
     #[command(flatten)]
     protocol: RunProtocol,
-    /// Print one JSON object: what table.json holds.
+    /// Print one JSON object: the content of table.json.
     #[arg(long)]
     json: bool,
 }
 
 fn help() -> String {
-    format!("What to compare, in the table's order. Each: {}", specs::help())
+    format!("Specs to compare, in the order of the table. Each: {}", specs::help())
 }
 
-/// What lies beside the runs.
+/// Files beside the runs.
 const FILES: [&str; 3] = ["table.md", "table.json", "compare.png"];
 
-/// All that `table.json` says.
+/// The content of `table.json`.
 #[derive(Serialize)]
 struct Report<'a> {
     protocol: Shared<'a>,
     methods: Vec<Entry>,
 }
 
-/// What is the same for all.
+/// What all runs share.
 #[derive(Serialize)]
 struct Shared<'a> {
     version: &'static str,
@@ -82,7 +81,7 @@ struct Shared<'a> {
     memory_limit: Option<u64>,
 }
 
-/// A line of the table.
+/// A row of the table.
 #[derive(Serialize)]
 struct Entry {
     name: String,
@@ -150,7 +149,7 @@ impl CompareArgs {
         }
     }
 
-    /// Every spec, read and built. Names must serve as folders and differ.
+    /// Reads and builds every spec. Names must be distinct and valid as folder names.
     fn methods(&self) -> Result<Vec<Method>> {
         let mut methods: Vec<Method> = vec![];
         let backend = self.protocol.backend.open()?;
@@ -164,14 +163,13 @@ impl CompareArgs {
         Ok(methods)
     }
 
-    /// Refuses to replace what is read.
+    /// Refuses to replace an input.
     fn spare_inputs(&self, methods: &[Method]) -> Result<()> {
         let inputs = Inputs::of([&self.scan]).and(&self.protocol.reference);
         methods.iter().fold(inputs, |inputs, m| inputs.and_spec(&m.loaded)).spare_folder(&self.output)
     }
 
-    /// Refuses a folder with anything in it that no comparison leaves, and an earlier comparison where nothing says what to
-    /// do with it.
+    /// Refuses a folder with files that no comparison writes, and an earlier comparison without --force or --resume.
     fn look_into_folder(&self) -> Result<()> {
         let place = self.output.display().to_string();
         let entries = match fs::read_dir(&self.output) {
@@ -183,7 +181,7 @@ impl CompareArgs {
             let found = format!("a folder with {} in it", entry.file_name().to_string_lossy());
             ensure(known(&entry.path()), &place, "output", found, "a new or empty folder")?;
         }
-        let expected = "a new or empty folder, --resume to go on or --force to replace it";
+        let expected = "a new or empty folder, --resume to continue or --force to replace it";
         let free = self.force || self.resume || progressed(&self.output) == Progressed::Nothing;
         ensure(free, &place, "output", "an earlier comparison", expected)
     }
@@ -211,9 +209,9 @@ impl CompareArgs {
     }
 }
 
-/// Makes a run unless that is done; its line of the table.
+/// Runs a spec unless that run is finished. Returns its row of the table.
 fn entry(cell: &Cell, start: Start, part: String, general: &General) -> Result<Entry> {
-    info!("{part}{}", if start == Start::Done { " is done already" } else { "" });
+    info!("{part}{}", if start == Start::Done { " is already finished" } else { "" });
     let outcome = match cell.carry_out(start, part, general)? {
         Some(error) => Outcome::failed(error),
         None => Outcome::of_run(cell.run)?,
@@ -230,7 +228,7 @@ fn shown(entries: &[Entry]) -> Vec<Shown> {
 /// What the folder of a comparison holds.
 const CONTENTS: Contents = Contents { known, progressed };
 
-/// Whether a comparison may have left this: a file of its own, or the folder of a run.
+/// Whether a comparison may have written this: one of its files, or the folder of a run.
 fn known(path: &Path) -> bool {
     let name = path.file_name().unwrap_or_default();
     let own = FILES.iter().any(|f| name == *f) || conefield_io::is_unfinished(name) || conefield_io::is_aside(name);
@@ -238,7 +236,7 @@ fn known(path: &Path) -> bool {
     if path.is_dir() { conefield_io::is_aside(name) || conefield_io::is_unfinished(name) || run() } else { own }
 }
 
-/// How far the comparison in `folder` came.
+/// The progress of the comparison in `folder`.
 fn progressed(folder: &Path) -> Progressed {
     if folder.join("table.json").exists() {
         return Progressed::Complete;

@@ -7,7 +7,7 @@ use conefield_core::{Error, Result};
 use std::io::{ErrorKind, Write};
 use std::path::PathBuf;
 
-/// Print a shell's completions, or write manual pages.
+/// Print completions for a shell, or write manual pages.
 ///
 /// For bash: conefield completions bash > ~/.local/share/bash-completion/completions/conefield
 #[derive(Args)]
@@ -15,10 +15,10 @@ pub struct CompletionsArgs {
     /// The shell.
     #[arg(required_unless_present = "man")]
     shell: Option<Shell>,
-    /// Write a manual page of each command to this folder instead, such as ~/.local/share/man/man1.
+    /// Write a manual page for each command to this folder instead, such as ~/.local/share/man/man1.
     #[arg(long, value_name = "FOLDER", conflicts_with = "shell")]
     man: Option<PathBuf>,
-    /// Write into a folder in which something stands.
+    /// Write into a folder that is not empty.
     #[arg(long, requires = "man")]
     force: bool,
 }

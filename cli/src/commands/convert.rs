@@ -13,9 +13,9 @@ use std::path::PathBuf;
 
 /// Rewrite a volume or a scan in another format.
 ///
-/// Volumes: NIfTI (.nii, .nii.gz), MetaImage (.mha) and NumPy (.npy), by the name of OUT; IN may also be a .mhd or the
-/// folder of a DICOM series. Scans: as --to says; test views are kept where the format has a place for them (r2, naf). Of a scan
-/// a part may be taken; larger pixels (--bin) hold the mean of line integrals.
+/// Volumes: NIfTI (.nii, .nii.gz), MetaImage (.mha) and NumPy (.npy), by the name of OUT; IN may also be a .mhd or the folder of a
+/// DICOM series. Scans: the format is --to; r2 and naf keep test views. Part of a scan may be taken; --bin averages line
+/// integrals.
 #[derive(Args)]
 pub struct ConvertArgs {
     /// A volume or a scan.
@@ -27,7 +27,7 @@ pub struct ConvertArgs {
     /// The format of a scan.
     #[arg(long, default_value = "conefield")]
     to: ScanFormat,
-    /// What a volume's values mean: as-is, hu:MU_WATER or clip:LO,HI.
+    /// Meaning of the voxel values: as-is, hu:MU_WATER or clip:LO,HI.
     #[arg(long, default_value = "as-is", value_parser = parse::values)]
     values: Values,
     #[command(flatten)]
@@ -37,16 +37,16 @@ pub struct ConvertArgs {
     force: bool,
 }
 
-/// The formats that scans are written in.
+/// The formats of scans that can be written.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, ValueEnum)]
 enum ScanFormat {
     /// conefield's own folder.
     Conefield,
     /// R2-Gaussian's folder.
     R2,
-    /// The one file (a pickle) of NAF and SAX-NeRF.
+    /// The pickle of NAF and SAX-NeRF.
     Naf,
-    /// A folder for RTK: projections.mha and geometry.xml, with scanner.toml to read it here again.
+    /// A folder for RTK: projections.mha and geometry.xml, and scanner.toml for conefield.
     Rtk,
 }
 
@@ -61,12 +61,7 @@ impl ConvertArgs {
         if conefield_io::is_volume(&self.input) {
             if let Some(option) = self.selection.named() {
                 let place = self.input.display().to_string();
-                return Err(Error::invalid(
-                    place,
-                    option,
-                    "a volume",
-                    "a scan, of whose views and pixels a part can be taken",
-                ));
+                return Err(Error::invalid(place, option, "a volume", "a scan: only scans have views and pixels"));
             }
             let voxels = conefield_io::volume_voxels(&self.input)?;
             Memory::of_volumes(&[voxels]).check(|_| vec![])?;
@@ -92,15 +87,15 @@ impl ConvertArgs {
         out::say(&self.output.display().to_string())
     }
 
-    /// Warns of what the format has no place for.
+    /// Warns about data that the format cannot hold.
     fn tell_lost(&self, data: &DataSet) {
         let lost = |what: String| tracing::warn!("{}: {what}", self.output.display());
         if let Some(test) = data.test.as_ref().filter(|_| matches!(self.to, ScanFormat::Conefield | ScanFormat::Rtk)) {
             let n = test.geometry.views.len();
-            lost(format!("{n} test views are left out, for which this format has no place; r2 and naf keep them"));
+            lost(format!("{n} test views are left out: this format cannot hold them; r2 and naf can"));
         }
         if data.volume.is_some() && self.to == ScanFormat::Rtk {
-            lost("the true volume is left out, for which RTK has no place".into());
+            lost("the true volume is left out: RTK's format cannot hold it".into());
         }
     }
 }

@@ -19,17 +19,17 @@ use std::path::PathBuf;
 use std::time::Instant;
 use tracing::info;
 
-/// Simulate a small scan, reconstruct it in three ways and compare.
+/// Simulate a small scan, reconstruct it with three methods and compare them.
 ///
-/// A head-like phantom is scanned with the published noise. Total variation on a smooth volume (the spec "smooth-tv")
-/// then competes with a field (the spec "fast", started from pre-trained weights: MCI), and with the same field without
-/// LayerNorm and MCI, given the same time.
+/// The scan is of a head phantom with the published noise. The methods are total variation on a smooth volume (spec "smooth-tv"), a
+/// neural field that starts from pre-trained weights (spec "fast" with MCI), and the same field without LayerNorm and MCI for the same
+/// time.
 #[derive(Args)]
 pub struct DemoArgs {
     /// The folder for scan, volumes and picture.
     #[arg(short, long = "output", value_name = "FOLDER", default_value = "conefield-demo")]
     output: PathBuf,
-    /// Stop the training of either field after this time.
+    /// Training time of each field.
     #[arg(long, value_name = "TIME", default_value = "60s", value_parser = parse::seconds)]
     seconds: f64,
     /// Voxels along a side of the volume.
@@ -38,7 +38,7 @@ pub struct DemoArgs {
     /// Number of views.
     #[arg(long, value_name = "N", default_value_t = 40, value_parser = clap::value_parser!(u16).range(2..=1000))]
     views: u16,
-    /// Seed of everything random.
+    /// Seed of all random numbers.
     #[arg(long, default_value_t = 0)]
     seed: u64,
     /// Replace FOLDER.
@@ -49,11 +49,11 @@ pub struct DemoArgs {
     json: bool,
 }
 
-/// The specs that compete.
+/// The specs.
 const VOXELS: &str = "smooth-tv";
 const FIELD: &str = "fast";
 
-/// One of the competitors and what became of it.
+/// A method and its result.
 #[derive(Serialize)]
 struct Entry {
     name: &'static str,
@@ -112,10 +112,10 @@ impl DemoArgs {
             rows.push([&[e.name.to_owned()][..], &cells_of(&e.scores), &rest].concat());
         }
         out::say(&Table { rows, notes: vec![] }.text())?;
-        out::say(&format!("\npicture: {}\nscan and volumes beside it", picture.display()))
+        out::say(&format!("\npicture: {}\nscan and volumes are in the same folder", picture.display()))
     }
 
-    /// Refuses what does not fit into memory: the scan, the volumes and the largest of the methods.
+    /// Refuses a demo that does not fit into memory: the scan, the volumes and the largest of the methods.
     fn reckon(&self) -> Result<()> {
         let (side, views) = (u64::from(self.size), usize::from(self.views));
         let (pixels, voxels) = (4 * side * side * u64::from(self.views), side.pow(3));

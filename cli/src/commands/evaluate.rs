@@ -18,13 +18,13 @@ use std::path::PathBuf;
 /// ssim_2d: 11x11 Gaussian window on slices of three axes (R2-Gaussian). ssim_3d: 11x11x11 Gaussian window (NI-NeRF).
 /// ssim_skimage: 7x7 uniform window on slices of three axes (scikit-image, NAF).
 ///
-/// Dice is 2|A∩B|/(|A|+|B|) over the voxels of a label. Label 0 is background. A label that only one map has scores 0
-/// and counts in the mean like any other.
+/// Dice is 2|A∩B|/(|A|+|B|) over the voxels of a label. Label 0 is background. A label in only one of the maps scores 0 and counts in
+/// the mean.
 #[derive(Args)]
 pub struct EvaluateArgs {
     /// The volume to score.
     volume: PathBuf,
-    /// What it should be.
+    /// The reference.
     reference: PathBuf,
     /// The data range [default: 1 for a reference in [0, 1], else the range of its values].
     #[arg(long, value_parser = parse::above_zero)]
@@ -32,15 +32,15 @@ pub struct EvaluateArgs {
     /// Also draw the middle slices of reference, volume and difference.
     #[arg(long, value_name = "FILE")]
     png: Option<PathBuf>,
-    /// Both are label maps, of whole numbers: score them by Dice alone.
+    /// Both are label maps (whole numbers): compute Dice only.
     #[arg(long, conflicts_with_all = ["peak", "png", "segmenter"])]
     labels: bool,
-    /// Also let this command make a label map of each and score these by Dice, such as 'TotalSegmentator -i {in} -o {out}
-    /// --ml'. {in} and {out} stand for .nii.gz files; words are split as a shell does, but no shell runs. Both volumes
-    /// come with the reference's voxel sizes and place.
+    /// Also segment both with this command and compute Dice, such as 'TotalSegmentator -i {in} -o {out} --ml'. {in} and {out} stand for
+    /// .nii.gz files; words are split as in a shell, but no shell runs. Both volumes have the voxel size and position of the
+    /// reference.
     #[arg(long, value_name = "CMD")]
     segmenter: Option<Segmenter>,
-    /// The Hounsfield units that the values 0 and 1 stand for, to which the segmenter's input is brought.
+    /// Hounsfield units of the values 0 and 1, for the segmenter's input.
     #[arg(long, value_name = "LO,HI", value_parser = parse::hu, requires = "segmenter", allow_hyphen_values = true)]
     hu: Option<[f64; 2]>,
     /// Print one JSON object.
@@ -48,12 +48,12 @@ pub struct EvaluateArgs {
     json: bool,
 }
 
-/// All that was asked for.
+/// All requested scores.
 #[derive(Serialize)]
 struct Evaluation {
     #[serde(flatten)]
     scores: Option<Scores>,
-    /// The data range that the scores refer to.
+    /// The data range of the scores.
     #[serde(skip_serializing_if = "Option::is_none")]
     peak: Option<f64>,
     #[serde(skip_serializing_if = "Option::is_none")]
@@ -86,7 +86,7 @@ impl EvaluateArgs {
         Ok(Evaluation { scores: None, peak: None, dice: Some(dice(volume.view(), reference.view())?) })
     }
 
-    /// The scores of a volume, with the agreement of what the segmenter finds in it and in the reference.
+    /// The scores of a volume, with the Dice of the segmentations of volume and reference.
     fn volumes(&self) -> Result<Evaluation> {
         let volume = conefield_io::read_volume(&self.volume)?;
         let reference = conefield_io::read_volume(&self.reference)?;
@@ -111,7 +111,7 @@ impl EvaluateArgs {
         Ok(Evaluation { scores: Some(scores), peak: Some(peak), dice })
     }
 
-    /// `volume` as the segmenter is to see it.
+    /// `volume` as input of the segmenter.
     fn in_hu(&self, volume: Volume) -> Volume {
         match self.hu {
             None => volume,
@@ -120,7 +120,7 @@ impl EvaluateArgs {
     }
 }
 
-/// The scores for people.
+/// The scores as text.
 pub fn lines(s: &Scores) -> String {
     let mut rows = vec![vec!["psnr".to_owned(), format!("{:.3} dB", s.psnr)]];
     for (name, x) in [("ssim_2d", s.ssim_2d), ("ssim_3d", s.ssim_3d), ("ssim_skimage", s.ssim_skimage)] {
@@ -135,7 +135,7 @@ pub fn lines(s: &Scores) -> String {
     out::table(&rows, &[])
 }
 
-/// The agreement of label maps for people.
+/// The agreement of label maps as text.
 fn dice_lines(d: &Dice) -> String {
     let mut rows = vec![["label", "dice", "voxels", "reference"].map(str::to_owned).to_vec()];
     for l in &d.labels {

@@ -16,7 +16,7 @@ pub struct ExplainArgs {
     /// Change a setting, such as encoder.levels=8.
     #[arg(long = "set", value_name = "KEY=VALUE")]
     sets: Vec<String>,
-    /// Also the memory that this scan takes.
+    /// Also estimate the memory for this scan.
     #[arg(long)]
     scan: Option<PathBuf>,
     #[arg(long, value_name = "BACKEND", default_value_t, help = backend::HELP)]

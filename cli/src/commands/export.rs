@@ -11,10 +11,10 @@ use serde_json::json;
 use std::path::PathBuf;
 use std::time::Instant;
 
-/// Evaluate the field of a finished run at other voxels.
+/// Evaluate the field of a finished run on another grid.
 ///
-/// The voxels fill the box that the run reconstructed. They are written as they are evaluated, slab by slab: a volume
-/// may be larger than memory.
+/// The voxels fill the box that the run reconstructed. They are evaluated and written slab by slab, so a volume may be larger than
+/// memory.
 #[derive(Args)]
 pub struct ExportArgs {
     #[command(flatten)]

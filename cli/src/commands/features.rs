@@ -16,11 +16,10 @@ use ndarray::Array3;
 use serde_json::json;
 use std::path::PathBuf;
 
-/// Draw the principal components of a finished run's features as colours.
+/// Draw the principal components of the features of a finished run as colours.
 ///
-/// The first three show what its encoder has learned, as red, green and blue. The components are those of all points of
-/// the three middle slices where the object can be; each runs from its 1st to its 99th percentile. Their signs mean
-/// nothing. The reconstruction stands beside them.
+/// Red, green and blue are the first three principal components of the encoder's features in the three middle slices, where the object
+/// can be. Each is scaled from its 1st to its 99th percentile; signs have no meaning. The reconstruction is shown beside them.
 #[derive(Args)]
 pub struct FeaturesArgs {
     #[command(flatten)]
@@ -28,7 +27,7 @@ pub struct FeaturesArgs {
     /// The picture to write (PNG).
     #[arg(short, long = "output", visible_alias = "out", value_name = "FILE")]
     output: PathBuf,
-    /// Which features: as they leave the encoder, or as normalizers hand them to the field.
+    /// Which features: the output of the encoder or of the normalizers.
     #[arg(long, value_enum, default_value = "encoder")]
     after: After,
     /// Replace FILE.
@@ -39,14 +38,14 @@ pub struct FeaturesArgs {
     json: bool,
 }
 
-/// Behind which stages features are looked at.
+/// The stages after which features are taken.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, ValueEnum)]
 enum After {
     Encoder,
     Normalizers,
 }
 
-/// Components that are drawn, one a colour.
+/// Components that are drawn, one per colour.
 const DRAWN: usize = 3;
 
 impl FeaturesArgs {

@@ -11,11 +11,11 @@ use conefield_io::{I0, ImportOptions, Imported};
 use serde_json::{Value, json};
 use std::path::PathBuf;
 
-/// Make a scan of what a scanner gave.
+/// Convert the files of a scanner to a scan.
 ///
-/// SCANNER.toml names the files with the projections (TIFF, .npy, .npz, .mha), says in mm where source and detector stood
-/// and how arrays lie; docs/geometry.md has all keys. Raw counts become line integrals; dead and hot pixels are interpolated. Then
-/// the part that is asked for is taken: larger pixels (--bin) hold the mean of the light, as they would have counted it.
+/// SCANNER.toml names the files with the projections (TIFF, .npy, .npz, .mha) and describes geometry (in mm) and array layout;
+/// docs/guide/formats.md has all keys. Raw counts become line integrals; dead and hot pixels are interpolated. Then a part may be taken;
+/// --bin averages counts.
 #[derive(Args)]
 pub struct ImportArgs {
     /// The description of the scanner.
@@ -24,12 +24,12 @@ pub struct ImportArgs {
     /// The folder for the scan.
     #[arg(short, long = "output", value_name = "SCAN")]
     output: PathBuf,
-    /// Counts of the open beam: a number, or air for what the border of each view shows [default: the flat field or
-    /// i0 of SCANNER.toml].
+    /// Counts of the open beam: a number, or air to take them from the border of each view [default: the flat field or i0 of
+    /// SCANNER.toml].
     #[arg(long, value_name = "N|air", value_parser = parse::i0)]
     i0: Option<I0>,
-    /// Counts above dark below which they are taken for this [default: SCANNER.toml's, else 1 or a ten thousandth of
-    /// the open beam].
+    /// Lowest counts above dark; lower ones are raised to it [default: SCANNER.toml's, else 1 or a ten-thousandth of the open
+    /// beam].
     #[arg(long, value_name = "N", value_parser = parse::above_zero)]
     floor: Option<f64>,
     #[command(flatten)]
@@ -54,7 +54,7 @@ impl ImportArgs {
         if self.json { out::json(&found) } else { out::say(&(info::lines(&found) + &info::warnings(&found))) }
     }
 
-    /// The geometry in mm and what the values are like.
+    /// The geometry in mm and a summary of the values.
     fn understood(&self, imported: &Imported) -> Value {
         let views = &imported.scan.geometry.views;
         let survey = survey(&imported.scan);

@@ -17,17 +17,16 @@ use ndarray::ArrayView3;
 use serde_json::{Value, json};
 use std::path::{Path, PathBuf};
 
-/// Say what a scan, volume, run or weights file holds.
+/// Describe a scan, volume, run or weights file.
 ///
-/// Of a scan: lengths in mm, magnification, the voxels that the detector supports, the field of view, which part of the
-/// volume the views see, what is missing, and warnings of what will trouble a reconstruction. SCANNER.toml and RTK's XML
-/// geometry are understood, too. Of the folder of a run: what it was, how far it came, and its scores.
+/// For a scan: lengths in mm, magnification, supported voxel size, field of view, coverage of the volume, missing information, and
+/// warnings about problems for a reconstruction. SCANNER.toml and RTK's XML geometry work, too. For the folder of a run: method,
+/// progress and scores.
 #[derive(Args)]
 pub struct InfoArgs {
     /// A scan, a volume, the folder of a run or a weights file.
     file: PathBuf,
-    /// Also draw source path, detector and volume, with the share of views that see each point of it; of a volume, its
-    /// middle slices.
+    /// Also draw source path, detector, volume and the share of views that see each point; for a volume, its middle slices.
     #[arg(long, value_name = "FILE")]
     png: Option<PathBuf>,
     /// Print one JSON object.
@@ -63,7 +62,7 @@ impl InfoArgs {
     }
 }
 
-/// What a run was, how far it came and what its folder holds.
+/// Method, progress and content of a run's folder.
 fn run(path: &Path) -> Result<Value> {
     let files: Vec<&str> = run_folder::FILES.into_iter().filter(|f| path.join(f).exists()).collect();
     let run = RunOnDisk::read(path)?;
@@ -82,7 +81,7 @@ fn run(path: &Path) -> Result<Value> {
     Ok(found)
 }
 
-/// The warnings for people, a paragraph each.
+/// The warnings as text, one paragraph each.
 pub fn warnings(value: &Value) -> String {
     let one = |w: &Value| {
         let advice = w["advice"].as_str().filter(|a| !a.is_empty()).map_or(String::new(), |a| format!("\n  {a}"));
@@ -95,7 +94,7 @@ fn no_picture(path: &Path, png: Option<&Path>) -> Result<()> {
     match png {
         None => Ok(()),
         Some(_) => {
-            let expected = "a scan or a volume, of which there is something to draw";
+            let expected = "a scan or a volume";
             Err(Error::invalid(path.display().to_string(), "--png", "a file of another kind", expected))
         }
     }
@@ -132,7 +131,7 @@ fn volume(path: &Path, png: Option<&Path>) -> Result<Value> {
     }))
 }
 
-/// What hints at another meaning of the values than attenuation.
+/// Hints that the values are not attenuation.
 fn volume_warnings(v: &Volume) -> Vec<Value> {
     let low = v.data.iter().copied().fold(f32::INFINITY, f32::min);
     let high = v.data.iter().copied().fold(f32::NEG_INFINITY, f32::max);
@@ -142,7 +141,7 @@ fn volume_warnings(v: &Volume) -> Vec<Value> {
     hounsfield.then(|| json!({ "kind": "values", "found": found, "advice": advice })).into_iter().collect()
 }
 
-/// What is known of a scan: its geometry in mm, its values, and what will trouble a reconstruction.
+/// Geometry in mm, values and warnings of a scan.
 pub fn facts(s: &Scan, survey: &Survey) -> Value {
     let g = &s.geometry;
     let setup = &survey.setup;
@@ -194,7 +193,7 @@ fn scan(path: &Path, png: Option<&Path>) -> Result<Value> {
         missing.push("a volume to compare with (truth)");
     }
     if data.test.is_none() {
-        missing.push("test views: reconstruct --hold-out keeps some aside");
+        missing.push("test views: reconstruct --hold-out holds some out");
     }
     found["line_integrals"] = statistics(s.projections.view());
     found["test_views"] = json!(data.test.as_ref().map_or(0, |t| t.geometry.views.len()));
@@ -204,7 +203,7 @@ fn scan(path: &Path, png: Option<&Path>) -> Result<Value> {
     Ok(found)
 }
 
-/// What stands over the picture.
+/// The title of the picture.
 fn title(path: &Path, s: &Scan, survey: &Survey) -> String {
     let name = path.canonicalize().ok().and_then(|p| p.file_name().map(|n| n.to_string_lossy().into_owned()));
     let setup = &survey.setup;
@@ -237,7 +236,7 @@ fn geometry(path: &Path) -> Result<Value> {
         "angles": setup.angles,
         "missing": [
             "pixels and projections: RTK keeps them in an image", "a volume",
-            "conefield import takes the three together (docs/geometry.md, [rtk])",
+            "conefield import takes the three together (docs/guide/formats.md, [rtk])",
         ],
     }))
 }
@@ -250,7 +249,7 @@ fn weights(path: &Path) -> Result<Value> {
     Ok(json!({ "kind": "weights", "parameters": parameters, "tensors": tensors, "notes": w.notes }))
 }
 
-/// Numbers with as many digits as people read.
+/// Numbers with seven significant digits.
 fn rounded(value: &Value) -> Value {
     match value {
         Value::Array(all) => all.iter().map(rounded).collect(),

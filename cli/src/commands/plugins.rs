@@ -7,7 +7,7 @@ mod new;
 use clap::{Args, Subcommand};
 use conefield_core::Result;
 
-/// Stages from shared libraries: list them, check them, begin one.
+/// List, check or create plugins: shared libraries with stages.
 #[derive(Args)]
 pub struct PluginsArgs {
     #[command(subcommand)]
@@ -16,16 +16,16 @@ pub struct PluginsArgs {
 
 #[derive(Subcommand)]
 enum PluginsCommand {
-    /// List the plugins that are found, with their stages, or why one was refused.
+    /// List the plugins with their stages, or why one was refused.
     List(list::List),
     /// Run the conformance kit on every stage of a plugin.
     Check(check::Check),
-    /// Make a folder with the start of a plugin: a stage, its test, and a spec that uses it.
+    /// Create a plugin: a stage, its test, and a spec that uses it.
     New(new::New),
 }
 
 impl PluginsArgs {
-    /// Whether a plugin is to be checked.
+    /// Whether this is `plugins check`.
     pub fn is_check(&self) -> bool {
         matches!(self.command, PluginsCommand::Check(_))
     }

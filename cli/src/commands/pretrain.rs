@@ -14,12 +14,12 @@ use conefield_run::pretraining;
 use serde_json::json;
 use std::path::PathBuf;
 
-/// Train a field on known volumes, for weights that other scans start from (MCI).
+/// Train a field on known volumes, to start other scans from its weights (MCI).
 ///
-/// The weights file holds normalizers and field; the encoder stays with the volume that it was trained on.
+/// The weights file holds normalizers and field. The encoder is not kept: it belongs to the volume that it was trained on.
 #[derive(Args)]
 pub struct PretrainArgs {
-    /// The known volumes: files, or phantoms as "conefield simulate" has them.
+    /// The known volumes: files, or phantoms as in "conefield simulate".
     #[arg(required = true, value_name = "VOLUME")]
     volumes: Vec<String>,
     #[arg(long, help = specs::help())]
@@ -30,14 +30,14 @@ pub struct PretrainArgs {
     /// Change a setting, such as encoder.levels=8.
     #[arg(long = "set", value_name = "KEY=VALUE")]
     sets: Vec<String>,
-    /// What voxel values mean: as-is, hu:MU_WATER or clip:LO,HI.
+    /// Meaning of the voxel values: as-is, hu:MU_WATER or clip:LO,HI.
     #[arg(long, default_value = "as-is", value_parser = parse::values)]
     values: Values,
     #[command(flatten)]
     ends: EndOptions,
     #[arg(long, value_name = "BACKEND", default_value_t, help = backend::HELP)]
     backend: BackendChoice,
-    /// Seed of everything random.
+    /// Seed of all random numbers.
     #[arg(long, default_value_t = 0)]
     seed: u64,
     /// Replace WEIGHTS.

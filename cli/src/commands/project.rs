@@ -14,15 +14,14 @@ use serde_json::{Value, json};
 use std::path::PathBuf;
 use std::time::Instant;
 
-/// Predict the views that a scanner takes of a volume.
+/// Compute the views of a volume in the geometry of a scan.
 ///
-/// The result is a scan with the line integrals of the volume, in the views and on the detector of another scan, that every
-/// command reads. The volume stands around the centre of what that scan reconstructs; a NumPy array, which has no voxel
-/// sizes, fills the same box. With --residual also what the measured views have beside the predicted ones: where a
-/// reconstruction does not explain them, structure is left.
+/// The result is a scan with the line integrals of the volume. The volume is placed at the centre of the volume of that scan; a NumPy
+/// array, which has no voxel size, fills the same box. --residual also writes measured minus predicted line integrals; structure there
+/// shows what the volume does not explain.
 #[derive(Args)]
 pub struct ProjectArgs {
-    /// The volume, in attenuation a unit of the scan as "reconstruct" leaves it.
+    /// The volume, in 1/unit of the scan, as "reconstruct" writes it.
     volume: PathBuf,
     /// The scan whose views are predicted.
     #[arg(long, value_name = "SCAN")]
@@ -30,13 +29,13 @@ pub struct ProjectArgs {
     /// The folder for the predicted views.
     #[arg(short, long = "output", value_name = "PREDICTED")]
     output: PathBuf,
-    /// Also a folder for measured less predicted line integrals.
+    /// Also write measured minus predicted line integrals to this folder.
     #[arg(long, value_name = "FOLDER")]
     residual: Option<PathBuf>,
     /// Only these views, such as 3,17 or every:10.
     #[arg(long, value_name = "VIEWS", value_parser = parse::hold_out)]
     views: Option<HoldOut>,
-    /// How line integrals of voxels are computed: joseph, siddon or trilinear.
+    /// Voxel projector: joseph, siddon or trilinear.
     #[arg(long, value_name = "TYPE", default_value = projection::PROJECTOR)]
     projector: String,
     /// Replace PREDICTED and FOLDER.
@@ -100,7 +99,7 @@ impl ProjectArgs {
         self.tell(&scan, &residual, project_s, memory)
     }
 
-    /// The scan with the views that are asked for.
+    /// The scan with the requested views.
     fn chosen(&self, scan: Scan) -> Result<Scan> {
         let n = scan.geometry.views.len();
         match conefield_run::input::held_out(self.views.as_ref(), n, "command line", "--views")? {

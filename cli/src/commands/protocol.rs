@@ -1,4 +1,4 @@
-//! What a reconstruction is asked for beside scan and spec: the same for every method that is compared.
+//! Options of a reconstruction besides scan and spec, shared by all methods of a comparison.
 
 use super::EndOptions;
 use crate::backend::{self, BackendChoice};
@@ -13,7 +13,7 @@ use std::path::{Path, PathBuf};
 /// The options that `reconstruct` and `compare` share.
 #[derive(Debug, Clone, Args)]
 pub struct RunProtocol {
-    /// Time between two checkpoints, which --resume starts from.
+    /// Time between two checkpoints, for --resume.
     #[arg(long, value_name = "TIME", default_value = "60s", value_parser = parse::seconds)]
     pub checkpoint_every: f64,
     /// Change a setting, such as encoder.levels=8.
@@ -21,43 +21,43 @@ pub struct RunProtocol {
     pub sets: Vec<String>,
     #[command(flatten)]
     pub ends: EndOptions,
-    /// Plan training so that the whole run, from start to last file, takes this time, such as 60s or 10m.
+    /// Time of the whole command, from start to last file, such as 60s or 10m.
     #[arg(long, value_name = "TIME", value_parser = parse::seconds, conflicts_with_all = ["steps", "seconds", "at_most"])]
     pub budget: Option<f64>,
     #[arg(long, value_name = "BACKEND", default_value_t, help = backend::HELP)]
     pub backend: BackendChoice,
-    /// The volume sought, to compare with: a file, or "truth" for the one that the scan comes with.
+    /// The reference volume to score against: a file, or "truth" for the one in the scan.
     #[arg(long, value_name = "VOLUME")]
     pub reference: Option<PathBuf>,
     /// The data range for PSNR and SSIM [default: 1 for a reference in [0, 1], else the range of its values].
     #[arg(long, value_parser = parse::above_zero)]
     pub peak: Option<f64>,
-    /// Views to keep aside and predict, such as 3,17 or every:10.
+    /// Views to hold out and predict, such as 3,17 or every:10.
     #[arg(long, value_name = "VIEWS", value_parser = parse::hold_out)]
     pub hold_out: Option<HoldOut>,
-    /// Seed of everything random.
+    /// Seed of all random numbers.
     #[arg(long, default_value_t = 0)]
     pub seed: u64,
 }
 
 impl RunProtocol {
-    /// The reference, if there is one, as large as `scan` asks for.
+    /// The reference, if there is one, on the grid of `scan`.
     pub fn reference(&self, scan_path: &Path, scan: &Scan) -> Result<Option<Volume>> {
         let Some(path) = &self.reference else { return Ok(None) };
         input::reference(path, scan_path, scan).map(Some)
     }
 
-    /// The data range that scores refer to.
+    /// The data range of the scores.
     pub fn peak(&self, reference: Option<&Volume>) -> f64 {
         reference.map_or(self.peak.unwrap_or(1.0), |r| score::peak(self.peak, r))
     }
 
-    /// Indices of the views that are kept aside, of `n`. Refuses a choice that keeps none aside.
+    /// Indices of the held-out views, of `n`. Refuses a choice without any.
     pub fn held_out(&self, n: usize) -> Result<Vec<usize>> {
         input::held_out(self.hold_out.as_ref(), n, "command line", "--hold-out")
     }
 
-    /// The same again, for a child process. Flag and value are one word: a value may begin with a dash.
+    /// The same options for a child process. Flag and value are one word, since a value may begin with a dash.
     pub fn arguments(&self) -> Vec<OsString> {
         let Self { checkpoint_every, sets, ends, budget, backend, reference, peak, hold_out, seed } = self;
         let all = [

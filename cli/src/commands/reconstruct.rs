@@ -37,17 +37,16 @@ use std::time::{Duration, Instant};
 
 /// Reconstruct a volume from a scan.
 ///
-/// RUN receives volume.nii.gz, metrics.jsonl, spec.toml (every setting), weights.safetensors, slices.png and, when all
-/// is done, record.json. Ctrl-C ends the run after its step; the same command with --resume goes on. With --budget the
-/// whole command is planned to take so long; it first measures what this machine can do, for one to three seconds, or less
-/// of a short budget.
+/// RUN receives volume.nii.gz, metrics.jsonl, spec.toml (every setting), weights.safetensors, slices.png and, at the end,
+/// record.json. Ctrl-C stops the run after its step; the same command with --resume continues. With --budget the command first measures
+/// this machine for one to three seconds (less for a short budget) and then plans its work to take that time.
 #[derive(Args)]
 pub struct ReconstructArgs {
     /// The scan.
     scan: PathBuf,
     #[arg(long, help = spec_help())]
     spec: Option<String>,
-    /// Choose from this front instead of the shipped one, where --budget chooses the spec.
+    /// Let --budget choose the spec from this front instead of the shipped one.
     #[arg(long, value_name = "FILE", conflicts_with = "spec", requires = "budget")]
     front: Option<PathBuf>,
     /// The folder for the results; new or empty.
@@ -56,31 +55,31 @@ pub struct ReconstructArgs {
     /// Replace the files of an earlier run in RUN.
     #[arg(long)]
     force: bool,
-    /// Go on with the run in RUN that was interrupted; all else must be as it was.
+    /// Continue the interrupted run in RUN; all other options must be the same.
     #[arg(long, conflicts_with = "force")]
     resume: bool,
     #[command(flatten)]
     protocol: RunProtocol,
-    /// What to start from: weights that "conefield pretrain" made, or a volume.
+    /// Start from weights of "conefield pretrain", or from a volume.
     #[arg(long, value_name = "FILE")]
     init: Option<PathBuf>,
-    /// Draw live.png, the middle slices of a field that trains, in RUN every so often, such as 5s.
+    /// Draw the middle slices of a training field to live.png in RUN at this interval, such as 5s.
     #[arg(long, value_name = "SECONDS", value_parser = parse::seconds)]
     live: Option<f64>,
-    /// Print one JSON object: what record.json holds.
+    /// Print one JSON object: the content of record.json.
     #[arg(long)]
     json: bool,
-    /// The run is part of another command's work: its error also goes to standard output, and the end of standard
-    /// input ends it as a signal does.
+    /// The run is part of another command: its error also goes to standard output, and the end of standard input stops it like a
+    /// signal.
     #[arg(long, hide = true)]
     as_part: bool,
 }
 
 fn spec_help() -> String {
-    format!("{}; with --budget it may be left out: the best that fits is taken", specs::help())
+    format!("{}; optional with --budget, which then chooses the best that fits", specs::help())
 }
 
-/// What an error that goes to standard output begins with.
+/// The prefix of an error on standard output.
 pub const FAILED: &str = "failed: ";
 
 /// A held-out error above this may come from a wrong geometry.
@@ -102,7 +101,7 @@ impl ReconstructArgs {
         done
     }
 
-    /// Ends the command as wrong use that says what to do.
+    /// Ends the command as wrong use, with advice.
     fn without_a_spec() -> ! {
         let mut whole = crate::Cli::command();
         whole.build();
@@ -209,8 +208,8 @@ impl ReconstructArgs {
         if self.json { out::json(&record) } else { out::say(&summary(&record, &self.output)) }
     }
 
-    /// Where views that were kept aside are predicted badly, looks whether the geometry is why.
-    /// The run is complete: an interruption only ends the look, which a part of another command's work goes without.
+    /// If held-out views are predicted badly, checks whether the geometry is the cause. The run is complete, so an interruption
+    /// only ends the check. Runs that are part of another command skip it.
     fn doubt(&self, scan: &Scan, held_out: Option<f64>) {
         if held_out.is_some_and(|error| error > DOUBTFUL)
             && !self.as_part
@@ -220,7 +219,7 @@ impl ReconstructArgs {
         }
     }
 
-    /// Reads all that there is to read.
+    /// Reads all inputs.
     fn input(&self, folder: &RunFolder, begin: Instant) -> Result<Reading> {
         let whole = files::scan(&self.scan)?;
         conefield_io::check_shape(folder.file("volume.nii.gz"), whole.geometry.volume.shape)?;
@@ -231,7 +230,7 @@ impl ReconstructArgs {
         Ok(Reading { work, record, load_s: begin.elapsed().as_secs_f64() })
     }
 
-    /// Settles what will run: the method that is asked for or, within a budget, one of the front's.
+    /// Chooses what will run: the requested method or, within a budget, one of the front.
     fn choose(
         &self,
         folder: &RunFolder,
@@ -256,7 +255,7 @@ impl ReconstructArgs {
         Ok(Chosen { method, schedule, resumed, spent })
     }
 
-    /// What is shown and kept while it runs.
+    /// What is shown and recorded during the run.
     fn progress(&self, folder: &RunFolder, metrics: (PathBuf, File), run: BTreeMap<String, String>) -> Progress {
         let keeper = Keeper {
             path: folder.file("checkpoint.safetensors"),
@@ -269,7 +268,7 @@ impl ReconstructArgs {
             .showing(self.live.map(|seconds| Live::new(folder.file("live.png"), seconds)))
     }
 
-    /// Writes what came out, and scores it.
+    /// Writes and scores the result.
     fn write(
         &self,
         folder: &RunFolder,
@@ -299,7 +298,7 @@ impl ReconstructArgs {
         Ok(Written { parameters, export_s, picture_s, score_s: start.elapsed().as_secs_f64(), scores })
     }
 
-    /// The spec that is asked for and what is set of it. A run that is resumed knows what it chose.
+    /// The requested spec and its changed settings. A resumed run knows its choice.
     fn asked(&self) -> Option<(String, Vec<String>)> {
         match &self.spec {
             Some(spec) => Some((spec.clone(), self.protocol.sets.clone())),
@@ -307,7 +306,7 @@ impl ReconstructArgs {
         }
     }
 
-    /// Reads, builds and prices a spec. One that does not fit into memory is refused.
+    /// Reads, builds and prices a spec. Refuses one that does not fit into memory.
     fn method(&self, spec: &str, sets: &[String], backend: &dyn Backend) -> Result<Planned> {
         let run = memory::Run {
             scan: conefield_io::scan_size(&self.scan)?,
@@ -320,7 +319,7 @@ impl ReconstructArgs {
         method::planned(&|sets| specs::read(spec, sets), sets, start, backend, &run)
     }
 
-    /// The file for metrics of an interrupted run, and where to go on from.
+    /// The file for metrics of an interrupted run, and the checkpoint to continue from.
     fn reopen(&self, folder: &RunFolder, identity: &BTreeMap<String, String>) -> Result<((PathBuf, File), Resume)> {
         let resume = files::read_checkpoint(&folder.file("checkpoint.safetensors"), identity)?;
         folder.go_on();
@@ -329,7 +328,7 @@ impl ReconstructArgs {
     }
 }
 
-/// What a run reads, with what its record says of that.
+/// The inputs of a run, and their entries in the record.
 struct Reading {
     work: Input,
     record: ScanRecord,
@@ -339,15 +338,15 @@ struct Reading {
 /// What will run.
 struct Chosen {
     method: Planned,
-    /// What a budget came to.
+    /// The plan of a budget.
     schedule: Option<Schedule>,
-    /// The file for metrics of an interrupted run, and where to go on from.
+    /// The file for metrics of an interrupted run, and the checkpoint to continue from.
     resumed: Option<((PathBuf, File), Resume)>,
     /// Seconds of training before that.
     spent: f64,
 }
 
-/// What must be the same for a run to be resumed, or to be taken for done.
+/// What must be the same to resume a run or to count it as finished.
 pub fn identity(
     loaded: &Loaded,
     protocol: &RunProtocol,
@@ -363,7 +362,7 @@ pub fn identity(
     Ok(all)
 }
 
-/// A budget as [`identity`] has it.
+/// A budget as part of [`identity`].
 pub fn budget(seconds: Option<f64>) -> String {
     seconds.map_or("none".into(), |s| s.to_string())
 }

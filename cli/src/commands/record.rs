@@ -1,4 +1,4 @@
-//! What a run leaves on record.
+//! The record of a run.
 
 use super::{EndOptions, evaluate};
 use crate::memory::Memory;
@@ -12,7 +12,7 @@ use conefield_tradeoff::trial::ScanRecord;
 use serde::Serialize;
 use std::path::Path;
 
-/// What is needed to repeat a run, and what came out.
+/// What is needed to repeat a run, and its result.
 #[derive(Debug, Serialize)]
 pub struct RunRecord {
     pub version: &'static str,
@@ -23,12 +23,12 @@ pub struct RunRecord {
     pub limits: EndOptions,
     #[serde(skip_serializing_if = "Option::is_none")]
     pub budget_s: Option<f64>,
-    /// What a budget came to.
+    /// The plan of a budget.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub plan: Option<Schedule>,
     pub init: Option<String>,
     pub reference: Option<String>,
-    /// Whose stages the spec names.
+    /// The plugins whose stages the spec names.
     #[serde(skip_serializing_if = "Vec::is_empty")]
     pub plugins: Vec<Used>,
     pub backend: Explain,
@@ -38,33 +38,33 @@ pub struct RunRecord {
     pub memory: Memory,
     pub peak_bytes: Option<u64>,
     pub steps: u64,
-    /// Times that training ran away and went back.
+    /// How often training diverged and went back.
     pub rollbacks: u64,
-    /// Reading all that there is to read.
+    /// Reading the inputs.
     pub load_s: f64,
-    /// What solving took beside training: before the first step, and to look at the metrics.
+    /// Solving without training: before the first step, and for metrics.
     pub prepare_s: f64,
     pub train_s: f64,
     #[serde(flatten)]
     pub written: Written,
-    /// From the start of the command to this record. Of what came before a --resume, the training alone.
+    /// From the start of the command to this record. Before a --resume only training counts.
     pub total_s: f64,
     pub samples: u64,
-    /// Of solvers that take samples.
+    /// For methods that take samples.
     pub samples_per_s: Option<f64>,
     pub loss: Option<f64>,
-    /// Of what came out.
+    /// Of the result.
     pub held_out: Option<f64>,
-    /// After which step that was, where held-out views chose it.
+    /// The step of the result, if held-out views chose it.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub best_step: Option<u64>,
     pub peak: f64,
 }
 
-/// What was written, and how long that took.
+/// Written files and the time for them.
 #[derive(Debug, Serialize)]
 pub struct Written {
-    /// Of a field.
+    /// For a field.
     pub parameters: usize,
     /// Writing weights and voxels.
     pub export_s: f64,
@@ -73,10 +73,10 @@ pub struct Written {
     pub scores: Option<Scores>,
 }
 
-/// Share of a budget below which it is not used up.
+/// Share of a budget below which it counts as not used up.
 const USED: f64 = 0.8;
 
-/// The record for people.
+/// The record as text.
 pub fn summary(r: &RunRecord, output: &Path) -> String {
     let [x, y, z] = r.scan.volume;
     let speed = r.samples_per_s.map(|s| format!(" ({:.2} M samples/s)", s / 1e6)).unwrap_or_default();
@@ -88,17 +88,18 @@ pub fn summary(r: &RunRecord, output: &Path) -> String {
         out::duration(r.written.export_s),
     )];
     if let Some(budget) = r.budget_s {
-        let why = if r.total_s < USED * budget { ": the method came to its own end" } else { "" };
+        let why = if r.total_s < USED * budget { ": the method ended by itself" } else { "" };
         lines.push(format!("{} in all, of a budget of {}{why}", out::duration(r.total_s), out::duration(budget)));
     }
     if r.rollbacks > 0 {
         let times = if r.rollbacks == 1 { "once".into() } else { format!("{} times", r.rollbacks) };
         lines.push(format!(
-            "training ran away and went back {times}, with half the learning rate; metrics.jsonl says when"
+            "training diverged and went back {times}, with half the learning rate; metrics.jsonl has the steps"
         ));
     }
     if let Some(h) = r.held_out {
-        let best = r.best_step.map_or(String::new(), |n| format!(", the least: what came after step {n} was kept"));
+        let best =
+            r.best_step.map_or(String::new(), |n| format!(", the smallest: the state after step {n} is the result"));
         let views = r.held_out_views.len();
         lines.push(format!("held-out error  {h:.5} of the largest line integral ({views} views){best}"));
     }

@@ -16,16 +16,15 @@ use scans::{Group, Options};
 use serde_json::{Value, json};
 use std::path::PathBuf;
 
-/// Show runs in one HTML page that any browser opens, without a network.
+/// Show runs in one HTML page that any browser opens offline.
 ///
-/// The page has slices and a rendering of the volumes with the values at a crosshair, windows, differences to the reference and
-/// between runs; scores, times, memory; the curves of training; measured and predicted projections with what is left
-/// between them; the scan's geometry; the spec with what it builds; and warnings. RUN is what "conefield reconstruct"
-/// leaves, or what "conefield compare" does: then all runs of it are shown. Scan and reference are read where the run read
-/// them; what is no longer there is left out and said.
+/// The page has slices, a rendering and values of the volumes, differences to the reference and between runs, scores, times, memory, training
+/// curves, measured and predicted projections with residuals, the geometry, the spec and what it builds, and warnings. RUN is the folder of
+/// "conefield reconstruct" or of "conefield compare". Scan and reference are read from where the run read them; missing ones are
+/// left out with a note.
 #[derive(Args)]
 pub struct ReportArgs {
-    /// The folder of a run or of a comparison; several stand beside each other.
+    /// The folder of a run or of a comparison; several are shown side by side.
     #[arg(required = true, value_name = "RUN")]
     runs: Vec<PathBuf>,
     /// The page, such as report.html.
@@ -34,21 +33,20 @@ pub struct ReportArgs {
     /// Replace FILE.
     #[arg(long)]
     force: bool,
-    /// The scan of all runs, where it is elsewhere now.
+    /// The scan of all runs, if it has moved.
     #[arg(long, value_name = "SCAN")]
     scan: Option<PathBuf>,
-    /// The volume sought, to compare with, where the runs name none or it is elsewhere now: a file, or "truth" for the one
-    /// that the scan comes with.
+    /// The reference, if the runs name none or it has moved: a file, or "truth" for the one in the scan.
     #[arg(long, value_name = "VOLUME")]
     reference: Option<PathBuf>,
     /// Views to show, such as 3,17 or every:10 [default: six].
     #[arg(long, value_name = "VIEWS", value_parser = parse::hold_out)]
     views: Option<HoldOut>,
-    /// How line integrals of voxels are computed: joseph, siddon or trilinear.
+    /// Voxel projector: joseph, siddon or trilinear.
     #[arg(long, value_name = "TYPE", default_value = projection::PROJECTOR)]
     projector: String,
-    /// Bytes that the voxels of all volumes may take in the page, two each, before they are packed. Where they take more, the
-    /// page has means of blocks of voxels.
+    /// Size of the voxels of all volumes in the page before packing, two bytes each. Larger volumes are reduced to means of
+    /// blocks.
     #[arg(long, value_name = "SIZE", default_value = "64MiB", value_parser = parse::bytes)]
     embed: u64,
     /// Print one JSON object.
@@ -93,7 +91,7 @@ impl ReportArgs {
         self.tell(&page, coarser, bytes)
     }
 
-    /// Refuses what does not fit: a volume at a time beside its scan, and what of all is on its way into the page.
+    /// Refuses a page that does not fit into memory: one volume at a time beside its scan, and the data of the page.
     fn check_memory(&self, groups: &[Group], options: &Options) -> Result<()> {
         let all: u64 = groups.iter().flat_map(Group::voxels).sum::<u64>() * 2;
         // Packed at worst as they are, as text, and before that in two halves.
@@ -132,12 +130,10 @@ impl ReportArgs {
     }
 }
 
-/// Sentences on the page itself.
+/// Notes on the page.
 fn notes(page: &Page, coarser: usize) -> Vec<String> {
-    let mut notes = vec![format!(
-        "Made by conefield {}. All that this page shows is in its file: it fetches nothing.",
-        env!("CARGO_PKG_VERSION")
-    )];
+    let mut notes =
+        vec![format!("Made by conefield {}. The page is complete: it fetches nothing.", env!("CARGO_PKG_VERSION"))];
     if !page.volumes.is_empty() {
         let coarse = if coarser > 1 { " of means of blocks of voxels" } else { "" };
         notes.push(format!(

@@ -8,7 +8,7 @@ use conefield_core::{Result, spec::schema};
 /// Print the JSON Schema of spec files, for editors.
 #[derive(Args)]
 pub struct SchemaArgs {
-    /// Print lists of the shipped specs and of all types instead, as tables in Markdown.
+    /// Print Markdown tables of the shipped specs and all types instead.
     #[arg(long)]
     tables: bool,
     /// Print the JSON Schema of study files instead.
@@ -26,7 +26,7 @@ impl SchemaArgs {
     }
 }
 
-/// The shipped specs, then every type that comes with the program.
+/// The shipped specs, then every built-in type.
 fn tables() -> Result<String> {
     let mut lines = vec!["| spec | what |".to_owned(), "| --- | --- |".into()];
     for s in specs::SHIPPED {

@@ -3,15 +3,15 @@
 use clap::Args;
 use conefield_io::{Lines, Selection, ViewChoice};
 
-/// Which part of a scan is taken, in this order: views, turned and flipped images, a piece of the detector, larger pixels.
+/// The part of a scan to take, in this order: views, turned and flipped images, a piece of the detector, larger pixels.
 #[derive(Debug, Clone, Args)]
 #[command(next_help_heading = "Part of a scan")]
 pub struct SelectionOptions {
-    /// Only these views: 3,7,9 or 0-719:10 (to the last and with it, in steps of 10) or every:10.
+    /// Only these views: 3,7,9 or 0-719:10 (0 to 719 in steps of 10) or every:10.
     #[arg(long, value_name = "VIEWS")]
     views: Option<ViewChoice>,
-    /// Quarter turns of the images in their file, counterclockwise as arrays are printed (NumPy's rot90). Like the flips it leaves
-    /// source and detector where they are.
+    /// Turn the images by N quarter turns (NumPy's rot90). Like the flips this corrects how images were stored; source and detector
+    /// stay.
     #[arg(long, value_name = "N", default_value_t = 0, value_parser = clap::value_parser!(u8).range(0..=3))]
     turns: u8,
     /// The file has the last row first.
@@ -26,19 +26,19 @@ pub struct SelectionOptions {
     /// Only these columns.
     #[arg(long, value_name = "FROM:TO", allow_hyphen_values = true)]
     columns: Option<Lines>,
-    /// Means of N x N pixels as pixels.
+    /// Average blocks of N x N pixels.
     #[arg(long, value_name = "N", default_value_t = 1, value_parser = clap::value_parser!(u16).range(1..))]
     bin: u16,
 }
 
 impl SelectionOptions {
-    /// What they ask for.
+    /// The selection.
     pub fn selection(&self) -> Selection {
         let Self { views, turns, flip_rows, flip_columns, rows, columns, bin } = self.clone();
         Selection { views, turns, flip_rows, flip_columns, rows, columns, bin: bin.into() }
     }
 
-    /// The first of them that asks for anything.
+    /// The first option that was given.
     pub fn named(&self) -> Option<&'static str> {
         let all = [
             ("--views", self.views.is_some()),

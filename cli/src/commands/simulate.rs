@@ -13,30 +13,29 @@ use std::path::PathBuf;
 
 /// Make a scan of a known volume.
 ///
-/// Projections are line integrals of the volume's trilinear interpolation along a circular orbit. The scan keeps the
-/// volume as its truth.
+/// Projections are line integrals of the trilinearly interpolated volume along a circular orbit. The scan keeps the volume as its
+/// truth.
 #[derive(Args)]
 pub struct SimulateArgs {
-    /// The volume: a file, or one that the program makes: phantom:head, phantom:abdomen or phantom:random:SEED, each also
-    /// with :SIZE (8 to 1024 voxels a side) [default: 128].
+    /// The volume: a file, or phantom:head, phantom:abdomen or phantom:random:SEED, each optionally with :SIZE (8 to 1024 voxels per
+    /// side) [default: 128].
     volume: String,
     /// The folder for the scan.
     #[arg(short, long = "output", value_name = "SCAN")]
     output: PathBuf,
-    /// Where source and detector stand: r2, the published synthetic set-up, or a TOML or JSON file (docs/geometry.md has its
-    /// keys).
+    /// The geometry: r2, the published synthetic set-up, or a TOML or JSON file (docs/guide/formats.md has its keys).
     #[arg(long, default_value = "r2", value_name = "r2|FILE")]
     protocol: String,
     /// Number of views [default: the protocol's; r2: 50].
     #[arg(long, value_name = "N", value_parser = clap::value_parser!(u32).range(1..))]
     views: Option<u32>,
-    /// Rows and columns of the detector, whose size stays [default: the protocol's; r2: 512x512].
+    /// Rows and columns of the detector, at the same size in mm [default: the protocol's; r2: 512x512].
     #[arg(long, value_name = "ROWSxCOLS", value_parser = parse::detector)]
     detector: Option<[usize; 2]>,
     /// Shift of the detector along its rows' and its columns' direction, in mm.
     #[arg(long, value_name = "V,U", value_parser = parse::offset, allow_hyphen_values = true)]
     offset: Option<[f64; 2]>,
-    /// Angles in degrees: evenly from START over RANGE, or a file with one a line.
+    /// Angles in degrees: evenly from START over RANGE, or a file with one per line.
     #[arg(long, value_name = "START:RANGE|FILE", value_parser = parse::angles, allow_hyphen_values = true)]
     angles: Option<AnglesOption>,
     /// Noise: none, tigre:I0,SIGMA such as tigre:1e4,10 (the published one), or poisson:I0 [default: the protocol's;
@@ -46,8 +45,8 @@ pub struct SimulateArgs {
     /// Average blocks of N x N x N voxels first.
     #[arg(long, value_name = "N", default_value_t = 1, value_parser = clap::value_parser!(u16).range(1..))]
     downsample: u16,
-    /// What voxel values mean: as-is (attenuation a unit of the protocol), hu:MU_WATER (HU, with the attenuation of
-    /// water in 1/mm) or clip:LO,HI (LO to HI becomes 0 to 1).
+    /// Meaning of the voxel values: as-is (attenuation per unit of the protocol), hu:MU_WATER (HU, with the attenuation of water in
+    /// 1/mm) or clip:LO,HI (LO to HI becomes 0 to 1).
     #[arg(long, default_value = "as-is", value_parser = parse::values)]
     values: Values,
     /// Seed of the noise [default: the protocol's; r2: 0].

@@ -22,48 +22,48 @@ use std::path::{Path, PathBuf};
 use std::time::{Duration, Instant};
 use tracing::info;
 
-/// Reconstruct many scans in several ways and with several seeds.
+/// Reconstruct many scans with several methods and seeds.
 ///
-/// The table has means, standard deviations and paired differences. STUDY is a TOML file that names volumes to simulate or scans, specs, seeds and numbers of views (docs/studies.md,
-/// specs/studies; "conefield schema --study" has every key). FOLDER receives table.md, table.json, for each scan or
-/// volume a picture in slices/ and curves in curves/, the simulated scans in scans/ and in runs/ what "conefield
-/// reconstruct" leaves of every run. Each run is a process of its own; where one fails the others still run. Ctrl-C ends
-/// the run under way after its step; the same command with --resume goes on and repeats no finished run.
+/// The table has means, standard deviations and paired differences. STUDY is a TOML file with volumes to simulate or scans, specs, seeds
+/// and numbers of views (docs/guide/many-scans.md; "conefield schema --study" has every key). FOLDER receives table.md, table.json, slices/,
+/// curves/, the simulated scans in scans/ and the output of each "conefield reconstruct" in runs/. Each run is a separate process; the
+/// others run even if one fails. Ctrl-C stops the current run after its step; the same command with --resume continues and skips
+/// finished runs.
 #[derive(Args)]
 pub struct StudyArgs {
-    /// The study's file.
+    /// The study file.
     study: PathBuf,
     /// The folder for the results; new or empty.
     #[arg(short, long = "output", value_name = "FOLDER")]
     output: PathBuf,
-    /// Replace an earlier study in FOLDER with all its runs.
+    /// Replace an earlier study in FOLDER and all its runs.
     #[arg(long)]
     force: bool,
-    /// Go on with the study in FOLDER. Methods, seeds, scans and volumes may be added; all else must be as it was.
+    /// Continue the study in FOLDER. Methods, seeds, scans and volumes may be added; the rest must be the same.
     #[arg(long, conflicts_with = "force")]
     resume: bool,
-    /// Make the K-th of N shares of the runs, while other processes make the others in the same FOLDER, on this machine or
-    /// on one that sees it too. What is there is gone on with. The last one to end writes the table.
+    /// Do the K-th of N shares of the runs. Other processes may do the other shares in the same FOLDER, also on other machines.
+    /// Existing runs are continued. The last process writes the table.
     #[arg(long, value_name = "K/N", value_parser = parse::part, conflicts_with = "force")]
     shard: Option<[usize; 2]>,
-    /// Run nothing: write a script that makes the study as an array of Slurm jobs.
+    /// Run nothing; write a script that does the study as an array of Slurm jobs.
     #[arg(long, value_name = "FILE", conflicts_with_all = ["force", "resume", "shard", "json"])]
     slurm: Option<PathBuf>,
-    /// Jobs of that array [default: one a run, 1000 at most].
+    /// Jobs of that array [default: one per run, 1000 at most].
     #[arg(long, value_name = "N", requires = "slurm", value_parser = clap::value_parser!(u16).range(1..))]
     jobs: Option<u16>,
-    /// Print one JSON object: what table.json holds.
+    /// Print one JSON object: the content of table.json.
     #[arg(long)]
     json: bool,
 }
 
-/// Between two looks at what another process holds.
+/// Time between two attempts at a lock of another process.
 const LOOK: Duration = Duration::from_millis(50);
 
-/// Jobs of an array where nothing says how many: a Slurm as it comes takes no more.
+/// Jobs of an array by default: the limit of an unconfigured Slurm.
 const MOST_JOBS: usize = 1000;
 
-/// The study's folder: for this process, or for it and others.
+/// The study's folder, for this process alone or shared with others.
 enum Hold {
     Alone(Lease),
     Shared(SharedLease),
@@ -95,13 +95,13 @@ impl StudyArgs {
         }
     }
 
-    /// The folder to work in. Refuses what stands there where it is none of this study, or nothing says what to do with it.
+    /// The folder to work in. Refuses one that holds other files, or an earlier study without --force or --resume.
     fn take(&self, work: &Work<'_>, cells: &[Cell], inputs: &Inputs) -> Result<Hold> {
         let mut lease = self.shard.is_none().then(|| Lease::take(&self.output, CONTENTS)).transpose()?;
         let any = work.layout.look()?;
         inputs.spare_folder(&self.output)?;
         let goes_on = self.resume || self.shard.is_some();
-        let expected = "a new or empty folder, --resume to go on or --force to replace it";
+        let expected = "a new or empty folder, --resume to continue or --force to replace it";
         ensure(
             !any || goes_on || self.force,
             &self.output.display().to_string(),
@@ -121,7 +121,7 @@ impl StudyArgs {
         lease.map(Hold::Alone).ok_or_else(|| Error::unsupported("study", "the folder is not held"))
     }
 
-    /// Writes tables and pictures of runs that are all over, and tells what came of them.
+    /// Writes tables and pictures when all runs have ended, and reports the result.
     fn finish(&self, work: &Work<'_>, lease: Lease) -> Result<()> {
         if self.shard.is_some() {
             // What others made is of this study, too.
@@ -139,7 +139,7 @@ impl StudyArgs {
         refuse_failures(&report.failures(), work.study.cells().len())
     }
 
-    /// Tells what this share came to, where others are not done.
+    /// Reports the result of this share while others are not finished.
     fn leave_to_others(&self, work: &Work<'_>, cells: &[Cell]) -> Result<()> {
         let failed: Vec<String> = cells.iter().filter_map(|c| work.failure(c)).collect();
         let done = cells.len() - failed.len();
@@ -176,7 +176,7 @@ impl StudyArgs {
     }
 }
 
-/// Runs that failed are a failure of the whole, once all else is told.
+/// Failed runs make the study fail, after everything is reported.
 fn refuse_failures(failed: &[String], all: usize) -> Result<()> {
     match failed.len() {
         0 => Ok(()),
@@ -192,8 +192,7 @@ struct Work<'a> {
 }
 
 impl Work<'_> {
-    /// Refuses scans that there are already where they cannot be read or do not suit a method, and views kept aside that a
-    /// method needs.
+    /// Refuses existing scans that cannot be read or do not suit a method, and methods that need held-out views without any.
     fn check_scans(&self) -> Result<()> {
         for (case, c) in self.study.cases.iter().enumerate() {
             let cell = Cell { case, seed: self.study.seeds[0], method: 0 };
@@ -207,7 +206,7 @@ impl Work<'_> {
         Ok(())
     }
 
-    /// Refuses simulated scans and runs in the folder that are of another study.
+    /// Refuses simulated scans and runs of another study in the folder.
     fn check_runs(&self, cells: &[Cell]) -> Result<()> {
         for cells in cells.chunk_by(same_scan) {
             // A scan that is not there yet comes again to the same bits, and is looked at then.
@@ -219,7 +218,7 @@ impl Work<'_> {
         Ok(())
     }
 
-    /// Makes every run that is not done, and the scans for them.
+    /// Simulates missing scans and does every unfinished run.
     fn carry_out(&self, cells: &[Cell]) -> Result<()> {
         let begin = Instant::now();
         let (mut number, mut made) = (0, 0);
@@ -232,7 +231,7 @@ impl Work<'_> {
                 self.await_run(cell, &part)?;
                 let start = self.start(cell, &input)?;
                 if start == Start::Done {
-                    info!("{part} is done already");
+                    info!("{part} is already finished");
                     continue;
                 }
                 let left = begin.elapsed().as_secs_f64() / f64::from(made) * (cells.len() + 1 - number) as f64;
@@ -245,7 +244,7 @@ impl Work<'_> {
         Ok(())
     }
 
-    /// Makes a run; why it failed stands in its place.
+    /// Does a run. A failure is recorded in its place.
     fn make_run(&self, cell: &Cell, start: Start, part: String) -> Result<()> {
         let (scan, run, protocol, failure) =
             (self.scan(cell), self.run(cell), self.protocol(cell), self.failure_file(cell));
@@ -261,7 +260,7 @@ impl Work<'_> {
         conefield_io::write_text_atomic(&failure, &error)
     }
 
-    /// Simulates the scan of a run unless that is done, or another process does it.
+    /// Simulates the scan of a run unless it exists or another process is doing so.
     fn make_scan(&self, cell: &Cell) -> Result<()> {
         let Source::Simulated(simulation) = &self.study.cases[cell.case].source else { return Ok(()) };
         let (scan, all) = (self.scan(cell), self.layout.scans());
@@ -276,7 +275,7 @@ impl Work<'_> {
         if signals::caught().is_some() { Err(Error::Stopped { part }) } else { Ok(()) }
     }
 
-    /// Waits until nobody writes a run: what is left of a process that was killed ends after its step.
+    /// Waits until no process writes the run: the child of a killed process ends after its step.
     fn await_run(&self, cell: &Cell, part: &str) -> Result<()> {
         let run = self.run(cell);
         if run.exists() {
@@ -285,7 +284,7 @@ impl Work<'_> {
         Ok(())
     }
 
-    /// What is known of the scan of a run.
+    /// The scan of a run.
     fn input(&self, cell: &Cell) -> Result<TrialInput> {
         let scan = self.scan(cell);
         trial::input_of(&scan, &self.protocol(cell), |s| match &self.study.cases[cell.case].source {
@@ -300,7 +299,7 @@ impl Work<'_> {
         cell::Cell { method, scan: &scan, run: &run, protocol: &protocol }.start(input)
     }
 
-    /// What a run is asked for.
+    /// The options of a run.
     fn protocol(&self, cell: &Cell) -> RunProtocol {
         let p = &self.study.protocol;
         RunProtocol {
@@ -335,7 +334,7 @@ impl Work<'_> {
         self.layout.failure(&self.study.cases[cell.case].name, cell.seed, &self.study.methods[cell.method].name)
     }
 
-    /// Why a run has no result, where it failed.
+    /// The error of a failed run.
     fn failure(&self, cell: &Cell) -> Option<String> {
         // One that was made alone since then has a result.
         let failed = !is_done(&self.run(cell));
@@ -352,7 +351,7 @@ impl Work<'_> {
         self.study.cells().iter().all(|c| is_done(&self.run(c)) || self.failure_file(c).exists())
     }
 
-    /// What the runs came to, which are all over; pictures are drawn.
+    /// The outcomes of all runs, after all have ended; draws the pictures.
     fn report(&self) -> Result<StudyReport> {
         let outcome = |c: &Cell| match self.failure(c) {
             Some(error) => Ok((*c, Outcome::failed(error))),
@@ -373,7 +372,7 @@ impl Work<'_> {
         StudyReport::new(self.study, &self.layout, cases, outcomes)
     }
 
-    /// Draws what the methods came to on a case: slices with the first seed, curves of all.
+    /// Draws the results on a case: slices with the first seed, curves of all.
     fn draw(&self, case: usize, input: &TrialInput, outcomes: &[(Cell, Outcome)]) -> Result<()> {
         let Study { cases, methods, seeds, .. } = self.study;
         let here = || outcomes.iter().filter(|(c, o)| c.case == case && o.figures.is_some());
@@ -395,7 +394,7 @@ impl Work<'_> {
     }
 }
 
-/// Runs on one scan stand beside each other.
+/// Puts runs on one scan beside each other.
 fn same_scan(a: &Cell, b: &Cell) -> bool {
     (a.case, a.seed) == (b.case, b.seed)
 }
@@ -408,7 +407,7 @@ fn await_lock(folder: &Path, part: &str) -> Result<conefield_io::FolderLock> {
             return Ok(lock);
         }
         if !told {
-            info!("{}: waiting until another conefield, which is writing it, ends", folder.display());
+            info!("{}: waiting for another conefield process that is writing to it", folder.display());
             told = true;
         }
         if signals::caught().is_some() {

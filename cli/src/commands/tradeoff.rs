@@ -20,66 +20,65 @@ use conefield_tradeoff::report::TradeoffReport;
 use conefield_tradeoff::search::{CONTENTS, Due, Earlier, Search};
 use std::path::{Path, PathBuf};
 
-/// Search what to spend time and memory on: accuracy against both, measured.
+/// Search for the best methods under time budgets, by measuring accuracy, time and memory.
 ///
-/// Candidates are drawn from levers and tried under the smallest budget; the best share of them goes on to the next one
-/// (fields and methods on voxels apart). Each trial is a whole "conefield reconstruct --budget", a process of its own.
-/// FOLDER receives tradeoff.md, tradeoff.json, front.png, front.toml (for "reconstruct --front") and in front/ a spec for
-/// every point that no other one beats in time, memory and accuracy. Ctrl-C ends the trial under way; the same command
-/// with --resume goes on and repeats no finished trial.
+/// Candidates are drawn from levers and tried under the smallest budget; the better ones advance to the next budget (neural fields and voxel
+/// methods separately). Each trial is a whole "conefield reconstruct --budget" in a separate process. FOLDER receives tradeoff.md,
+/// tradeoff.json, front.png, front.toml (for "reconstruct --front") and, in front/, a spec for every point that no other beats in time,
+/// memory and accuracy. Ctrl-C stops the current trial; the same command with --resume continues and skips finished trials.
 #[derive(Args)]
 pub struct TradeoffArgs {
-    /// The scans to be good on; what is told is the mean over them.
+    /// Scans to tune on; results are averaged over them.
     #[arg(required_unless_present = "show_levers", value_name = "SCAN")]
     scans: Vec<PathBuf>,
     /// The folder for the results; new or empty.
     #[arg(short, long = "output", value_name = "FOLDER", required_unless_present = "show_levers")]
     output: Option<PathBuf>,
-    /// Times that a whole reconstruction may take, from the smallest.
+    /// Time budgets of a whole reconstruction, in ascending order.
     #[arg(long, value_name = "TIME,TIME", value_delimiter = ',', default_value = "10s,60s,300s", value_parser = parse::seconds)]
     budgets: Vec<f64>,
-    /// What may be turned [default: the shipped levers].
+    /// The settings to vary [default: the shipped levers].
     #[arg(long, value_name = "FILE")]
     levers: Option<PathBuf>,
     /// Only these bases of the levers, by name.
     #[arg(long, value_name = "BASE,BASE", value_delimiter = ',')]
     bases: Vec<String>,
-    /// Print the shipped levers and end.
+    /// Print the shipped levers and exit.
     #[arg(long)]
     show_levers: bool,
-    /// Methods under the smallest budget.
+    /// Number of candidates under the smallest budget.
     #[arg(long, value_name = "N", default_value_t = 24, value_parser = clap::value_parser!(u16).range(1..=1000))]
     candidates: u16,
-    /// Share of them that goes on to the next budget.
+    /// Share of the candidates that advances to the next budget.
     #[arg(long, value_name = "SHARE", default_value_t = 0.5, value_parser = parse::share)]
     keep: f64,
-    /// The volume sought, to rank by PSNR instead of by held-out views: a file for each scan in turn, or "truth" for what
-    /// the scans come with.
+    /// The reference, to rank by PSNR instead of held-out views: a file for each scan in turn, or "truth" for the ones in the
+    /// scans.
     #[arg(long, value_name = "VOLUME")]
     reference: Vec<PathBuf>,
     /// The data range for PSNR and SSIM [default: 1 for a reference in [0, 1], else the range of its values].
     #[arg(long, value_parser = parse::above_zero)]
     peak: Option<f64>,
-    /// Views to keep aside and predict, such as 3,17 or every:10; with a reference also none.
+    /// Views to hold out and predict, such as 3,17 or every:10; none is allowed with a reference.
     #[arg(long, value_name = "VIEWS", default_value = "every:10", value_parser = parse::hold_out_or_none)]
     hold_out: parse::HoldOutOrNone,
     #[arg(long, value_name = "BACKEND", default_value_t, help = backend::HELP)]
     backend: BackendChoice,
-    /// Seed of everything random, the drawing of candidates included.
+    /// Seed of all random numbers, including the candidates.
     #[arg(long, default_value_t = 0)]
     seed: u64,
-    /// Replace an earlier search in FOLDER with all its trials.
+    /// Replace an earlier search in FOLDER and all its trials.
     #[arg(long)]
     force: bool,
-    /// Go on with the search in FOLDER; all else must be as it was.
+    /// Continue the search in FOLDER; all other options must be the same.
     #[arg(long, conflicts_with = "force")]
     resume: bool,
-    /// Print one JSON object: what tradeoff.json holds.
+    /// Print one JSON object: the content of tradeoff.json.
     #[arg(long)]
     json: bool,
 }
 
-/// Checkpoints would take time from the budget, and a trial that was interrupted is made anew: never.
+/// No checkpoints: they take time from the budget, and an interrupted trial is repeated.
 const NEVER: f64 = 1e9;
 
 impl TradeoffArgs {
@@ -118,7 +117,7 @@ impl TradeoffArgs {
         if self.json { out::json(&report) } else { out::say(&report.text(output)) }
     }
 
-    /// Everything that decides, once it was looked at.
+    /// All settings of the search, after checking.
     fn search(&self, candidates: Vec<Candidate>, general: &General) -> Result<Search> {
         let rising = self.budgets.windows(2).all(|w| w[0] < w[1]);
         ensure(rising, "tradeoff", "--budgets", format!("{:?} seconds", self.budgets), "times that rise")?;
@@ -169,7 +168,7 @@ impl TradeoffArgs {
         }
     }
 
-    /// Runs one trial in a process of its own.
+    /// Runs one trial in a separate process.
     fn trial(&self, search: &Search, due: &Due<'_>, general: &General) -> Result<Option<String>> {
         let Due { candidate, budget_s, scan, output, part } = due;
         let protocol = self.protocol(search.references.get(*scan), *budget_s, &candidate.sets);

@@ -1,4 +1,4 @@
-//! What commands that look at the field of a finished run share.
+//! What commands on the field of a finished run share.
 
 use crate::backend::{self, BackendChoice};
 use crate::files;
@@ -9,12 +9,12 @@ use conefield_core::trained::TrainedField;
 use conefield_core::{Error, Result};
 use std::path::PathBuf;
 
-/// A finished run, the voxels to look at and what computes them.
+/// A finished run, the grid to evaluate and the backend.
 #[derive(Args)]
 pub struct Trained {
     /// The folder of the run, or its weights.safetensors.
     run: PathBuf,
-    /// Voxels along the longest side [default: as the scan asked for].
+    /// Voxels along the longest side [default: as in the scan].
     #[arg(long, value_name = "N", value_parser = clap::value_parser!(u16).range(1..))]
     voxels: Option<u16>,
     #[arg(long, value_name = "BACKEND", default_value_t, help = backend::HELP)]
@@ -25,13 +25,13 @@ pub struct Trained {
 pub struct OpenedField {
     pub file: PathBuf,
     pub field: TrainedField,
-    /// The voxels that are asked for.
+    /// The requested grid.
     pub grid: VoxelGrid,
     bytes: u64,
 }
 
 impl Trained {
-    /// Reads the field, if it fits into memory with `buffers` bytes beside it.
+    /// Reads the field, if it fits into memory together with `buffers` bytes.
     pub fn open(&self, buffers: u64) -> Result<OpenedField> {
         let file = if self.run.is_dir() { self.run.join("weights.safetensors") } else { self.run.clone() };
         let bytes = file.metadata().map_err(|e| Error::io(&file, e))?.len();
@@ -44,13 +44,13 @@ impl Trained {
 }
 
 impl OpenedField {
-    /// What the field takes with `buffers` bytes beside it; refused where that does not fit.
+    /// The memory of the field and `buffers` bytes. Refuses what does not fit.
     pub fn memory(&self, buffers: u64) -> Result<Memory> {
         memory(self.bytes, buffers)
     }
 }
 
-/// The file and the numbers in it, then these and the model.
+/// Memory of the file and its numbers, then of these and the model.
 fn memory(bytes: u64, buffers: u64) -> Result<Memory> {
     let memory = Memory::most(&[Memory { model: 2 * bytes, buffers, ..Memory::default() }]);
     memory.check(|_| vec![]).map(|()| memory)

@@ -1,4 +1,4 @@
-//! `conefield reconstruct` as a process of its own: what comparisons and searches are made of.
+//! `conefield reconstruct` as a separate process, for comparisons, studies and searches.
 
 use super::General;
 use super::protocol::{RunProtocol, word};
@@ -13,13 +13,13 @@ use std::path::Path;
 use std::process::{Command, ExitStatus, Stdio};
 use std::time::Duration;
 
-/// Between two looks at a run's process.
+/// Time between two checks of a run's process.
 const LOOK: Duration = Duration::from_millis(20);
 
 /// One run.
 pub struct Trial<'a> {
     pub scan: &'a Path,
-    /// As it would be asked for.
+    /// The spec, as on the command line.
     pub spec: &'a str,
     /// The run's folder.
     pub output: &'a Path,
@@ -29,7 +29,7 @@ pub struct Trial<'a> {
 }
 
 impl Trial<'_> {
-    /// Runs it; what went wrong with it, if anything did. `part` is what an interruption is told to have interrupted.
+    /// Runs it. Returns the error of a failed run. `part` names the work in the message of an interruption.
     pub fn run(&self, part: String, general: &General) -> Result<Option<String>> {
         if signals::caught().is_some() {
             return Err(Error::Stopped { part });
@@ -71,12 +71,12 @@ impl Trial<'_> {
     }
 }
 
-/// Reads scan and reference, to refuse what does not fit; of both only little is kept.
+/// Reads scan and reference to check that they fit together, and keeps a summary.
 pub fn input(path: &Path, protocol: &RunProtocol) -> Result<TrialInput> {
     input_of(path, protocol, |_| Ok(()))
 }
 
-/// The same, once `check` has had a look at the scan.
+/// The same, after `check` has inspected the scan.
 pub fn input_of(path: &Path, protocol: &RunProtocol, check: impl FnOnce(&Scan) -> Result<()>) -> Result<TrialInput> {
     let all = Run {
         scan: conefield_io::scan_size(path)?,
@@ -93,7 +93,7 @@ pub fn input_of(path: &Path, protocol: &RunProtocol, check: impl FnOnce(&Scan) -
     TrialInput::of(path, scan, reference.as_ref(), peak, held)
 }
 
-/// What ended a process: its exit status above 128, as shells have it, or the signal itself.
+/// The signal that ended a process, from an exit status above 128 (as in shells) or from the system.
 fn ended_by(status: ExitStatus) -> Option<u8> {
     #[cfg(unix)]
     let signal = std::os::unix::process::ExitStatusExt::signal(&status);

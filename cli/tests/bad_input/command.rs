@@ -155,7 +155,7 @@ pub fn cases() -> Vec<Case> {
             SEGMENT,
             &["given a.nii", "exit status: 3", "loading | no weights here"],
         ),
-        refused("a segmenter that writes nothing", segmenter(""), SEGMENT, &["no file", "{out}", "it said nothing"]),
+        refused("a segmenter that writes nothing", segmenter(""), SEGMENT, &["no file", "{out}", "it printed nothing"]),
         refused("a segmenter that writes text", segmenter("echo hello > $2"), SEGMENT, &["cannot be used", "{out}"]),
         refused(
             "a segmenter that writes another shape",
@@ -185,13 +185,13 @@ pub fn cases() -> Vec<Case> {
             "patience without views kept aside",
             scan_toml,
             "reconstruct scan --spec fast -o run --set callbacks.1.type=patience",
-            &["--set callbacks.1.type=patience", "no views kept aside", "--hold-out every:10"],
+            &["--set callbacks.1.type=patience", "no held-out views", "--hold-out every:10"],
         ),
         refused(
             "patience of voxels without views kept aside",
             scan_toml,
             "compare scan --specs sirt -o all --set stop={passes=5,patience=3}",
-            &["stop.patience", "no views kept aside", "--hold-out every:10"],
+            &["stop.patience", "no held-out views", "--hold-out every:10"],
         ),
         refused(
             "a view that is not there, kept aside",

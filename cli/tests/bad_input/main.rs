@@ -1,7 +1,7 @@
 //! Bad input of every kind, as a user would meet it: the real command ends in time, in bounded memory, with the
 //! documented status and one message that says where, what and what instead; it leaves nothing behind.
 //!
-//! The outcome is kept in `docs/bad-inputs.md`: `CONEFIELD_BLESS=1 cargo test -p conefield --test bad_input` writes it
+//! The outcome is kept in `docs/reference/bad-inputs.md`: `CONEFIELD_BLESS=1 cargo test -p conefield --test bad_input` writes it
 //! there, and without that variable the page must be what the command does now.
 
 #![cfg(target_os = "linux")]

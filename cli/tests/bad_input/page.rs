@@ -1,4 +1,4 @@
-//! The table of `docs/bad-inputs.md`.
+//! The table of `docs/reference/bad-inputs.md`.
 
 use crate::case::Outcome;
 use std::fs;
@@ -8,7 +8,7 @@ const BEGIN: &str = "<!-- the table begins here; it is written by cli/tests/bad_
 
 /// Compares the page with what was seen, or writes it there.
 pub fn check(run: &[(&str, Vec<Outcome>)]) {
-    let path = Path::new(env!("CARGO_MANIFEST_DIR")).join("../docs/bad-inputs.md");
+    let path = Path::new(env!("CARGO_MANIFEST_DIR")).join("../docs/reference/bad-inputs.md");
     let page = fs::read_to_string(&path).unwrap();
     let (head, _) = page.split_once(BEGIN).expect("the page marks where the table begins");
     let wanted = format!("{head}{BEGIN}{}", table(run));
@@ -16,7 +16,7 @@ pub fn check(run: &[(&str, Vec<Outcome>)]) {
         return fs::write(path, wanted).unwrap();
     }
     let differ = page.lines().zip(wanted.lines()).find(|(a, b)| a != b);
-    assert!(page == wanted, "docs/bad-inputs.md is not current (CONEFIELD_BLESS=1 writes it): {differ:?}");
+    assert!(page == wanted, "docs/reference/bad-inputs.md is not current (CONEFIELD_BLESS=1 writes it): {differ:?}");
 }
 
 fn table(run: &[(&str, Vec<Outcome>)]) -> String {

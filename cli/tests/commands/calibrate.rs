@@ -87,7 +87,7 @@ fn a_shifted_detector_is_found_and_a_right_one_is_left_alone() {
         assert_eq!(again["output"], Value::Null);
     }
     let said = done(&["calibrate", &text(&at("right")), "--pixels", "24", "--parameters", "offset-u"]);
-    assert!(said.contains("right as it is") && said.contains("held-out error"), "{said}");
+    assert!(said.contains("right: unchanged") && said.contains("held-out error"), "{said}");
 
     // `info` says that something is off, and does not where nothing is.
     let warned = done(&["info", &wrong]);

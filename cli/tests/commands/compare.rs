@@ -195,8 +195,8 @@ fn bad_input_makes_no_folder() {
     );
     for (specs, more, want) in [
         ("fdk,fkd", &[][..], "neither a shipped spec nor a file"),
-        ("fdk,fdk", &[], "a name of its own"),
-        (&twice, &[], "a name of its own"),
+        ("fdk,fdk", &[], "a unique name"),
+        (&twice, &[], "a unique name"),
         (&text(&slash), &[], "a name for a folder"),
         ("fdk", &["--reference", "nothing.nii"], "nothing.nii"),
         ("fdk", &["--reference", &text(&small)], "[24, 24, 24], the voxels that this scan asks for"),

@@ -1,4 +1,4 @@
-//! The method's own experiments: drift, features as colours, label maps, an end by views kept aside, live slices.
+//! The method's own experiments: drift, features as colours, label maps, an end by held-out views, live slices.
 
 use crate::common::{done, json, refused, text};
 use ndarray::Array3;

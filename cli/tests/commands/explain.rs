@@ -60,7 +60,7 @@ fn a_scan_adds_its_memory() {
     // The volume is written as it is evaluated.
     assert_eq!(m["volume"], 0);
     assert_eq!(e["scan"]["samples"], 320);
-    // Training that ends by views kept aside keeps the parameters that predicted them best.
+    // Training that ends by held-out views keeps the parameters that predicted them best.
     let patient = "callbacks=['rollback', {type='patience', records=3}]";
     let e = json(&["explain", "naf", "--scan", &scan, "--set", patient, "--json"]);
     assert_eq!(e["scan"]["memory"]["optimizer"].as_u64().unwrap(), all / 2 + 16 * all / 16);

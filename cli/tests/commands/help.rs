@@ -52,7 +52,7 @@ fn every_subcommand_has_help() {
 
 #[test]
 fn lists_of_specs_and_stage_types_are_whole() {
-    let readme = include_str!("../../../README.md");
+    let page = include_str!("../../../docs/reference/methods-and-stages.md");
     let names = conefield::specs::names();
     assert!(["balanced", "fista-tv", "sart"].iter().all(|n| names.contains(n)), "{names:?}");
     for command in ["reconstruct", "compare", "pretrain", "explain"] {
@@ -61,7 +61,8 @@ fn lists_of_specs_and_stage_types_are_whole() {
     }
     // Both tables are made by a command.
     for table in done(&["schema", "--tables"]).trim().split("\n\n") {
-        assert!(readme.contains(table), "README.md: put in what `conefield schema --tables` prints:\n{table}");
+        let wanted = "docs/reference/methods-and-stages.md: put in what `conefield schema --tables` prints";
+        assert!(page.contains(table), "{wanted}:\n{table}");
     }
 }
 

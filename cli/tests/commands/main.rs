@@ -14,6 +14,8 @@ mod compare;
 mod durability;
 mod experiments;
 mod explain;
+#[cfg(unix)]
+mod guide;
 mod help;
 mod import;
 mod memory;
@@ -30,4 +32,3 @@ mod selection;
 mod study;
 mod tradeoff;
 mod unusual;
-mod your_data;

@@ -1,5 +1,5 @@
 //! Plugins that do one thing wrong each, and what becomes of them: refused when loaded, refused when tried out, found by
-//! the check, or an error of the run. `docs/faulty-plugins.md` is made from this; `CONEFIELD_BLESS=1` writes it anew.
+//! the check, or an error of the run. `docs/reference/faulty-plugins.md` is made from this; `CONEFIELD_BLESS=1` writes it anew.
 
 use crate::build::{cargo, cc, library, sources};
 use crate::common::{conefield, done, text};
@@ -69,8 +69,8 @@ const FAULTS: &[Fault] = &[
     untried("writes before its gradients", &["FAULT=BEFORE_GRADIENTS"], "it writes outside its gradients: 1 before"),
     untried("returns NaN", &["FAULT=NOT_A_NUMBER"], "number 0 of 3 of its output is NaN"),
     untried("fails", &["FAULT=FAILS"], "forward failed: no more numbers"),
-    untried("sleeps in forward", &["FAULT=SLEEPS"], "it has not come back after 5 s"),
-    untried("sleeps in create", &["FAULT=SLEEPS_IN_CREATE"], "it has not come back after 5 s"),
+    untried("sleeps in forward", &["FAULT=SLEEPS"], "it did not return within 5 s"),
+    untried("sleeps in create", &["FAULT=SLEEPS_IN_CREATE"], "it did not return within 5 s"),
     fault(
         "a parameter gradient that is 10 % too large",
         &["FAULT=WRONG_GRADIENT"],
@@ -438,14 +438,13 @@ fn told(message: &str, want: &str) -> String {
 /// The page of all faults.
 fn page(rows: &[Row]) {
     let mut text = String::from(
-        "# Faulty plugins\n\nWhat becomes of plugins that do one thing wrong each. Made by `cli/tests/plugins/faulty.rs` from \
-         `plugins/tests`; `CONEFIELD_BLESS=1 cargo test -p conefield --test plugins` writes it anew.\n\n- *load*: refused when \
-         it is loaded, by `plugins list` (which shows the others), `plugins check` and a reconstruction alike.\n- *trial*: a \
-         stage is tried out when it is made, on a few rows, between guard zones and under a time limit: a check and a \
-         reconstruction end there, before any work.\n- *check*: found by `plugins check`; gradients that are wrong only the \
-         check can find.\n- *run*: an error of the run, which leaves no volume.\n\nA plugin runs in the process that loads it. One \
-         that calls `abort`, or writes far outside what it was handed, takes that process down; the check runs in a process \
-         of its own and says so.\n\n| what it does | found by | what is said |\n| --- | --- | --- |\n",
+        "# Faulty plugins\n\nWhat happens to plugins with one fault each. `cli/tests/plugins/faulty.rs` makes this page from \
+         `plugins/tests`; `CONEFIELD_BLESS=1 cargo test -p conefield --test plugins` writes it.\n\n- *load*: refused by \
+         `plugins list` (which shows the others), `plugins check` and a reconstruction when the library is loaded.\n- *trial*: \
+         refused when the stage is made. Each stage is tried on a few rows, between guard zones and with a time limit.\n- \
+         *check*: found by `plugins check` only, such as wrong gradients.\n- *run*: an error of the run, which leaves no \
+         volume.\n\nA plugin runs in the process that loads it. One that calls `abort`, or writes far out of bounds, ends that \
+         process; the check runs in a separate process and reports it.\n\n| fault | found by | message |\n| --- | --- | --- |\n",
     );
     for Row { what, list, check, run } in rows {
         let found = match (list.is_empty(), check.is_empty(), run.is_empty()) {
@@ -458,7 +457,7 @@ fn page(rows: &[Row]) {
             let _ = writeln!(text, "| {what} | {by} | {said} |");
         }
     }
-    let path = sources().join("docs/faulty-plugins.md");
+    let path = sources().join("docs/reference/faulty-plugins.md");
     if std::env::var_os("CONEFIELD_BLESS").is_some() {
         std::fs::write(&path, &text).unwrap();
     }

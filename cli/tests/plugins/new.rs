@@ -89,14 +89,16 @@ fn names_and_folders_are_checked() {
         assert!(e.contains("lower-case letters"), "{e}");
     }
     for lang in ["rust", "c"] {
-        for (name, why) in [("fn", "no word of Rust"), ("self", "no word of Rust"), ("hash-grid", "conefield itself")] {
+        for (name, why) in
+            [("fn", "not a Rust keyword"), ("self", "not a Rust keyword"), ("hash-grid", "conefield itself")]
+        {
             let e = refused(1, &["plugins", "new", name, "--kind", "encoder", "--lang", lang, "--into", &into]);
             assert!(e.contains(why) && !dir.path().join(name).exists(), "{e}");
         }
     }
     std::fs::create_dir(dir.path().join("taken")).unwrap();
     let e = refused(1, &["plugins", "new", "taken", "--kind", "encoder", "--into", &into]);
-    assert!(e.contains("something that is there"), "{e}");
+    assert!(e.contains("an existing file or folder"), "{e}");
     let e = refused(1, &["plugins", "new", "mine", "--kind", "encoder", "--into", &into, "--sources", &into]);
     assert!(e.contains("--sources"), "{e}");
     assert!(!dir.path().join("mine").exists());
@@ -107,7 +109,7 @@ fn names_and_folders_are_checked() {
 fn the_page_shows_the_encoder_that_is_made() {
     let read = |path: &str| std::fs::read_to_string(sources().join(path)).unwrap();
     let made = read("cli/templates/rust/encoder.rs").replace("@name@", "waves");
-    let page = read("docs/plugins.md");
+    let page = read("docs/guide/writing-stages.md");
     let shown = page.split_once("```rust\n").and_then(|(_, rest)| rest.split_once("```")).map(|(code, _)| code);
     assert_eq!(shown, Some(&made[..]));
     let example = read("examples/02_an_encoder.rs");

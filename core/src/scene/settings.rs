@@ -4,7 +4,7 @@ use crate::error::{Result, ensure};
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
-/// How the scan is mapped to the unit cube and to attenuations of order one.
+/// How the scan is mapped to the unit cube and to attenuation of order one.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields, default)]
 pub struct SceneSettings {
@@ -30,7 +30,7 @@ impl Default for SceneSettings {
 }
 
 impl SceneSettings {
-    /// Refuses settings that mean nothing.
+    /// Refuses invalid settings.
     pub fn validate(&self) -> Result<()> {
         ensure(self.fill > 0.0 && self.fill <= 1.0, "spec", "scene.fill", self.fill, "a number above 0 and at most 1")?;
         if let AttenuationScale::Fixed(x) | AttenuationScale::Relative(x) = self.attenuation {
@@ -47,16 +47,16 @@ pub enum SurroundRule {
     /// Nothing.
     #[default]
     None,
-    /// What coarse cells show, where the object reaches the sides of views: total variation makes them of the whole
-    /// field of view first, and their line integrals are taken off the measured ones.
+    /// Coarse cells, if the object reaches the sides of views. Total variation reconstructs them over the whole field of view
+    /// first, and their line integrals are subtracted from the measured ones.
     Coarse(CoarseSurround),
 }
 
-/// How far and how finely the space beyond the volume is looked at.
+/// Extent and resolution of the space beyond the volume.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields, default)]
 pub struct CoarseSurround {
-    /// How far cells go beyond the volume on every side, as a share of its longest side; less where a source stands closer.
+    /// Extent of the cells beyond the volume on every side, as a share of its longest side; less if a source is closer.
     pub margin: f64,
     /// Cells along the volume's longest side.
     pub cells: usize,
@@ -71,12 +71,12 @@ impl Default for CoarseSurround {
 }
 
 impl SurroundRule {
-    /// Whether there is none.
+    /// Whether it is `none`.
     pub fn is_none(&self) -> bool {
         *self == Self::None
     }
 
-    /// Refuses settings that mean nothing.
+    /// Refuses invalid settings.
     pub fn validate(&self) -> Result<()> {
         let Self::Coarse(CoarseSurround { margin, cells, passes }) = *self else { return Ok(()) };
         let key = |name: &str| format!("scene.surround.coarse.{name}");
@@ -92,8 +92,8 @@ impl SurroundRule {
 pub enum LevelRule {
     /// All.
     All,
-    /// None that is finer than the data: than a voxel to export, or than what a pixel sees at the distance of the volume's
-    /// centre. The coarsest that suffice stay.
+    /// Without levels finer than the data: finer than a voxel, or than a pixel projected to the centre of the volume. The coarsest
+    /// sufficient level stays.
     Needed,
 }
 
@@ -103,9 +103,9 @@ pub enum LevelRule {
 pub enum SupportRule {
     /// Anywhere.
     Box,
-    /// Where no view shows air: a cell that several views see nothing but air through is left out, the unit cube is
-    /// fitted to the rest, and rays are sampled between the first and the last cell that is left; iterative methods
-    /// keep the others at 0. Views whose sides the object reaches say nothing.
+    /// Without air: cells through which several views see only air are left out. The unit cube is fitted to the rest, rays are
+    /// sampled between the first and the last remaining cell, and iterative methods keep other voxels at 0. Truncated views do
+    /// not count.
     Carve,
 }
 
@@ -113,10 +113,10 @@ pub enum SupportRule {
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(rename_all = "kebab-case")]
 pub enum AttenuationScale {
-    /// Four times the mean attenuation of the most absorbing rays over the volume's longest side: from the scan
-    /// alone, so that the result does not depend on units, and large enough for a field whose values cannot exceed 1.
+    /// Four times the mean attenuation of the most absorbing rays over the longest side of the volume. It depends on the scan
+    /// alone, not on units, and is large enough for a field with values up to 1.
     Scan,
-    /// This many times that.
+    /// A multiple of the value for `scan`.
     Relative(f64),
     /// A value in the scan's own unit (1/unit).
     Fixed(f64),

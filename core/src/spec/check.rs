@@ -1,4 +1,4 @@
-//! Checks a spec as written against what the registered stage types know, so that a mistake is told with its line,
+//! Checks a spec as written against the registered stage types, so that a mistake is reported with its line,
 //! its path and the nearest valid name.
 
 use super::LABEL;

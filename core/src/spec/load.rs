@@ -120,7 +120,7 @@ pub fn to_toml(spec: &Spec) -> Result<String> {
     let text = toml::to_string_pretty(&without_nulls(whole.clone())).map_err(|e| failed(&e))?;
     let back: Spec = toml::from_str(&text).map_err(|e| failed(&e.message()))?;
     if whole != tree(&back)? {
-        return Err(failed(&"a setting is null whose default is not; give it a value"));
+        return Err(failed(&"a setting is null, but its default is not: set a value"));
     }
     Ok(text)
 }

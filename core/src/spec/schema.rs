@@ -58,7 +58,7 @@ pub fn spec() -> Value {
         defs.insert(kind.name().into(), json!({ "anyOf": [{ "enum": alone }, table] }));
     }
     let mut common = Map::new();
-    common.insert("$schema".into(), json!({ "type": "string", "description": "Where this schema is." }));
+    common.insert("$schema".into(), json!({ "type": "string", "description": "Path or URL of the schema." }));
     common.insert(
         "extends".into(),
         json!({ "type": "string", "description": "A shipped spec, or a file relative to this one, that this one changes." }),

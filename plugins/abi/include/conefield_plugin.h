@@ -500,7 +500,7 @@ typedef struct ConefieldMap {
                             struct ConefieldReduced *reduced,
                             struct ConefieldText *error);
   /*
-   WGSL of the same formula: functions `stage_forward` and `stage_backward` of a row, as docs/plugins.md says. NULL:
+   WGSL of the same formula: functions `stage_forward` and `stage_backward` of a row, as docs/guide/writing-stages.md says. NULL:
    it runs on the CPU alone.
    */
   ConefieldStatus (*wgsl)(const void *stage, struct ConefieldText *source);
@@ -662,7 +662,7 @@ typedef struct ConefieldProjector {
                             struct ConefieldText *error);
   /*
    WGSL of `sample`, of a projector that integrates as one without `integrate` does: a function `stage_sample`, as
-   docs/plugins.md says. NULL: it runs on the CPU alone.
+   docs/guide/writing-stages.md says. NULL: it runs on the CPU alone.
    */
   ConefieldStatus (*wgsl)(const void *stage, struct ConefieldText *source);
 } ConefieldProjector;
@@ -819,7 +819,7 @@ typedef struct ConefieldLoss {
                             void **fitted,
                             struct ConefieldText *error);
   /*
-   WGSL of `at`: a function `stage_at`, as docs/plugins.md says. NULL: it runs on the CPU alone.
+   WGSL of `at`: a function `stage_at`, as docs/guide/writing-stages.md says. NULL: it runs on the CPU alone.
    */
   ConefieldStatus (*wgsl)(const void *stage, struct ConefieldText *source);
 } ConefieldLoss;
@@ -870,7 +870,7 @@ typedef struct ConefieldPrior {
                            double *penalty,
                            struct ConefieldText *error);
   /*
-   WGSL of `block`: a function `stage_at`, as docs/plugins.md says. NULL: it runs on the CPU alone.
+   WGSL of `block`: a function `stage_at`, as docs/guide/writing-stages.md says. NULL: it runs on the CPU alone.
    */
   ConefieldStatus (*wgsl)(const void *stage, struct ConefieldText *source);
 } ConefieldPrior;

@@ -341,7 +341,7 @@ pub struct ConefieldMap {
             error: *mut ConefieldText,
         ) -> ConefieldStatus,
     >,
-    /// WGSL of the same formula: functions `stage_forward` and `stage_backward` of a row, as docs/plugins.md says. NULL:
+    /// WGSL of the same formula: functions `stage_forward` and `stage_backward` of a row, as docs/guide/writing-stages.md says. NULL:
     /// it runs on the CPU alone.
     pub wgsl: Option<unsafe extern "C" fn(stage: *const c_void, source: *mut ConefieldText) -> ConefieldStatus>,
     /// How many passes `forward` goes in, each over a table of its own; always the same for one stage. A host with many
@@ -528,7 +528,7 @@ pub struct ConefieldProjector {
         ) -> ConefieldStatus,
     >,
     /// WGSL of `sample`, of a projector that integrates as one without `integrate` does: a function `stage_sample`, as
-    /// docs/plugins.md says. NULL: it runs on the CPU alone.
+    /// docs/guide/writing-stages.md says. NULL: it runs on the CPU alone.
     pub wgsl: Option<unsafe extern "C" fn(stage: *const c_void, source: *mut ConefieldText) -> ConefieldStatus>,
 }
 
@@ -656,7 +656,7 @@ pub struct ConefieldLoss {
             error: *mut ConefieldText,
         ) -> ConefieldStatus,
     >,
-    /// WGSL of `at`: a function `stage_at`, as docs/plugins.md says. NULL: it runs on the CPU alone.
+    /// WGSL of `at`: a function `stage_at`, as docs/guide/writing-stages.md says. NULL: it runs on the CPU alone.
     pub wgsl: Option<unsafe extern "C" fn(stage: *const c_void, source: *mut ConefieldText) -> ConefieldStatus>,
 }
 
@@ -695,7 +695,7 @@ pub struct ConefieldPrior {
             error: *mut ConefieldText,
         ) -> ConefieldStatus,
     >,
-    /// WGSL of `block`: a function `stage_at`, as docs/plugins.md says. NULL: it runs on the CPU alone.
+    /// WGSL of `block`: a function `stage_at`, as docs/guide/writing-stages.md says. NULL: it runs on the CPU alone.
     pub wgsl: Option<unsafe extern "C" fn(stage: *const c_void, source: *mut ConefieldText) -> ConefieldStatus>,
 }
 

@@ -117,7 +117,7 @@ pub(crate) fn timed<T: Send + 'static>(ty: &Type, make: impl FnOnce() -> Result<
     });
     wait.recv_timeout(LIMIT).unwrap_or_else(|e| {
         let what = match e {
-            mpsc::RecvTimeoutError::Timeout => format!("it has not come back after {} s", LIMIT.as_secs()),
+            mpsc::RecvTimeoutError::Timeout => format!("it did not return within {} s", LIMIT.as_secs()),
             mpsc::RecvTimeoutError::Disconnected => "it ended its thread".into(),
         };
         Err(refused(ty, &what))

@@ -1,4 +1,4 @@
-//! `docs/numerical-stability.md`: its tables are written here.
+//! `docs/reference/numerical-stability.md`: its tables are written here.
 
 use std::fs;
 use std::path::{Path, PathBuf};
@@ -25,7 +25,7 @@ pub fn head(title: &str) -> String {
 /// Writes `text` between the marks of `part`, or compares what stands there but for its figures.
 pub fn keep(part: &str, text: &str) {
     let _alone = PAGE.lock().unwrap_or_else(|e| e.into_inner());
-    let path = file("numerical-stability.md");
+    let path = file("reference/numerical-stability.md");
     let page = fs::read_to_string(&path).unwrap();
     let (begin, end) =
         (format!("<!-- {part}: written by tests/tests/extremes -->\n"), format!("\n<!-- end of {part} -->"));

@@ -1,4 +1,4 @@
-//! Training that ends when views that are kept aside are no longer predicted better.
+//! Training that ends when held-out views are no longer predicted better.
 
 use crate::common::{Stop, model, plan, scan, spec};
 use conefield_backend_cpu::Cpu;
@@ -9,7 +9,7 @@ use conefield_core::scan::Scan;
 use rand::{RngExt, SeedableRng};
 use serde_json::{Value, json};
 
-/// A scan to learn from and views that are kept aside; the first with noise so strong that a field soon learns nothing else.
+/// A scan to learn from and held-out views; the first with noise so strong that a field soon learns nothing else.
 fn scans(noise: f32) -> (Scan, Scan) {
     let (mut train, held) = scan().split(&[2, 6]).unwrap();
     let top = train.projections.iter().fold(0.0f32, |m, p| m.max(*p));

@@ -26,24 +26,24 @@ use std::thread;
 use std::time::{Duration, Instant};
 
 /// Run the conformance kit on every stage of a plugin: finite differences, shapes, extremes, independence of tiles and
-/// threads, guard zones, save and load. The plugin runs in a process of its own, so that what it does there cannot hide.
+/// threads, guard zones, save and load. The plugin runs in a separate process, so that crashes are reported.
 #[derive(Args)]
 pub struct Check {
     /// The plugin's library.
     library: PathBuf,
-    /// Check this stage type alone.
+    /// Check only this stage type.
     #[arg(long = "type", value_name = "TYPE")]
     name: Option<String>,
-    /// Settings to check, as one JSON object; repeatable [default: the defaults, and the examples in its schema].
+    /// Settings to check, as one JSON object; repeatable [default: the defaults, and the examples in the schema].
     #[arg(long, value_name = "JSON", value_parser = settings)]
     settings: Vec<Value>,
-    /// Channels that go into a normalizer or a field; repeatable [default: 1, 3, 8 and 20].
+    /// Input channels of a normalizer or a field; repeatable [default: 1, 3, 8 and 20].
     #[arg(long, value_name = "N", value_parser = clap::value_parser!(u16).range(1..))]
     width: Vec<u16>,
-    /// Largest error of single against double precision, as a share of the largest output.
+    /// Largest allowed error of single against double precision, as a share of the largest output.
     #[arg(long, value_name = "SHARE", default_value_t = 2e-5)]
     single: f64,
-    /// End the check after this time.
+    /// Stop the check after this time.
     #[arg(long, value_name = "TIME", value_parser = parse::seconds, default_value = "10m")]
     time_limit: f64,
     /// Print one JSON object.
@@ -52,12 +52,12 @@ pub struct Check {
     /// Check in this process.
     #[arg(long, hide = true)]
     here: bool,
-    /// Load it in this process, and no more.
+    /// Only load it, in this process.
     #[arg(long, hide = true)]
     enter: bool,
 }
 
-/// Seconds in which a library must be loaded: its constructors and its entry function have nothing to do that takes time.
+/// Time limit in seconds for loading a library, including its constructors and entry function.
 const ENTERED: f64 = 10.0;
 
 fn settings(text: &str) -> std::result::Result<Value, String> {
@@ -65,7 +65,7 @@ fn settings(text: &str) -> std::result::Result<Value, String> {
     if value.is_object() { Ok(value) } else { Err("expected a JSON object, such as '{\"levels\": 4}'".into()) }
 }
 
-/// All that was found.
+/// The report.
 #[derive(Serialize)]
 struct Checked {
     plugin: String,
@@ -106,15 +106,13 @@ impl Check {
         if self.here {
             return self.check();
         }
-        let late =
-            format!("its entry function has not come back after {}", out::duration(ENTERED.min(self.time_limit)));
+        let late = format!("its entry function did not return within {}", out::duration(ENTERED.min(self.time_limit)));
         self.apart("--enter", ENTERED.min(self.time_limit), late)?;
-        let late = format!("not done after {}, ended; --time-limit allows more", out::duration(self.time_limit));
+        let late = format!("stopped after {}; --time-limit sets the limit", out::duration(self.time_limit));
         self.apart("--here", self.time_limit, late)
     }
 
-    /// Runs a part of the check in a child process, whose end, whatever it is, can be told; `late` if it takes longer than
-    /// `limit` seconds.
+    /// Runs a part of the check in a child process and reports how it ended; `late` if it takes longer than `limit` seconds.
     fn apart(&self, part: &str, limit: f64, late: String) -> Result<()> {
         let program = std::env::current_exe().map_err(|e| Error::io("conefield", e))?;
         let io = |e| Error::io(&program, e);
@@ -151,14 +149,14 @@ impl Check {
                 Err(Error::unsupported(what, why))
             }
             (Some(2), _) => Err(Error::unsupported("plugins check", said.trim())),
-            _ => Err(Error::unsupported(place, format!("took the checking process down ({})", ending(status)))),
+            _ => Err(Error::unsupported(place, format!("crashed the checking process ({})", ending(status)))),
         }
     }
 
     fn check(&self) -> Result<()> {
         let report = plugins::with(|plugins| -> Result<Checked> {
             plugins.load(self.library.clone(), Place::Named)?;
-            let gone = || Error::unsupported(self.library.display().to_string(), "it is no longer there");
+            let gone = || Error::unsupported(self.library.display().to_string(), "the file no longer exists");
             self.report(plugins.get(&self.library).ok_or_else(gone)?)
         })?;
         if self.json {
@@ -197,7 +195,7 @@ impl Check {
             }
             if tries.is_empty() {
                 let expected = "--settings, or examples in its schema: it has settings without a default";
-                return Err(Error::invalid(library.owner(), &t.name, "nothing to check it with", expected));
+                return Err(Error::invalid(library.owner(), &t.name, "no settings to check", expected));
             }
             for settings in tries {
                 self.stage(t, &with_defaults(&t.schema, settings), &device, &mut stages)?;
@@ -219,7 +217,7 @@ impl Check {
         })
     }
 
-    /// Checks one stage type with one set of settings, at every width that makes sense.
+    /// Checks one stage type with one set of settings, at every sensible width.
     fn stage(&self, t: &Type, settings: &Value, device: &Device, all: &mut Vec<StageReport>) -> Result<()> {
         let Some(Origin::Loaded { make, .. }) = registry::find(t.kind, &t.name).map(|t| &t.origin) else {
             return Err(Error::unsupported(&t.name, "it is not registered"));
@@ -314,12 +312,12 @@ impl Check {
 
 const FAILED: &str = "failed";
 
-/// Where a stage's WGSL is tried, opened when the first stage offers some.
+/// The device for WGSL, opened when the first stage offers some.
 #[derive(Default)]
 struct Device(OnceLock<Result<Wgpu, String>>);
 
 impl Device {
-    /// The report with what became of the stage's WGSL.
+    /// The report including the stage's WGSL.
     fn beside(&self, mut report: Report, offers: bool, check: impl FnOnce(&Shared) -> Report) -> Report {
         let open = || Wgpu::open(None).map_err(|e| e.to_string());
         let skipped = |why: String| vec![("WGSL parity", Outcome::Skipped(why))];
@@ -331,7 +329,7 @@ impl Device {
         report
     }
 
-    /// The same for stages that map rows. Compiling takes long on some devices: one width is enough.
+    /// The same for stages that map rows, at one width: compiling takes long on some devices.
     fn map(&self, report: Report, stage: &dyn Stage, options: &Options, this_width: bool) -> Report {
         if !this_width {
             return report;

@@ -7,7 +7,7 @@ use conefield_plugins::search::{PATH_VARIABLE, user_folder};
 use conefield_plugins::{Found, Place};
 use serde::Serialize;
 
-/// List the plugins that are found, with their stages, or why one was refused.
+/// List the plugins with their stages, or why one was refused.
 #[derive(Args)]
 pub struct List {
     /// Print one JSON object.

@@ -7,22 +7,22 @@ use conefield_core::{Error, Result};
 use std::fs;
 use std::path::{Path, PathBuf};
 
-/// Make a folder with the start of a plugin: a stage, its test, and a spec that uses it. It builds as it is.
+/// Create a plugin: a stage, its test, and a spec that uses it. It builds without changes.
 #[derive(Args)]
 pub struct New {
-    /// The plugin's name, which is also the folder's and the stage type's: lower-case letters, digits and hyphens.
+    /// The name of plugin, folder and stage type: lower-case letters, digits and hyphens.
     name: String,
-    /// What the stage is.
+    /// The kind of stage.
     #[arg(long)]
     kind: StageKind,
-    /// What it is written in.
+    /// The language.
     #[arg(long, default_value = "rust")]
     lang: Language,
-    /// Make the folder in this one.
+    /// The parent folder.
     #[arg(long, value_name = "FOLDER", default_value = ".")]
     into: PathBuf,
-    /// conefield's sources, which a Rust plugin builds against [default: those that this program was built from, if they
-    /// are still there, or else the published crates].
+    /// conefield's sources for a Rust plugin [default: those that this program was built from if they still exist, else the
+    /// published crates].
     #[arg(long, value_name = "FOLDER")]
     sources: Option<PathBuf>,
 }
@@ -105,18 +105,18 @@ macro_rules! template {
     };
 }
 
-/// What is written, and what comes of it.
+/// The files of a new plugin and how to build it.
 struct Start {
-    /// Names within the folder, and texts.
+    /// File names and contents.
     files: Vec<(String, String)>,
-    /// The library that they build to.
+    /// The library that results.
     library: String,
     /// The command that builds it.
     build: &'static str,
 }
 
-/// Kinds of stages with their templates: the stage in C, where what every plugin begins and ends with is filled in, the stage in
-/// Rust, and its test.
+/// Kinds of stages and their templates: the stage in C (without the common first and last parts), the stage in Rust, and its
+/// test.
 macro_rules! kinds {
     ($($kind:ident $file:literal,)*) => {
         #[derive(Debug, Clone, Copy, PartialEq, Eq, ValueEnum)]
@@ -174,17 +174,17 @@ impl New {
             return Err(Error::invalid("plugins new", "NAME", format!("{:?}", self.name), expected));
         }
         if RESERVED.contains(&&self.name[..]) {
-            let expected = "a name that is no word of Rust or of its standard library";
+            let expected = "a name that is not a Rust keyword or crate";
             return Err(Error::invalid("plugins new", "NAME", format!("{:?}", self.name), expected));
         }
         if let Some(taken) = registry::find(self.kind.kind(), &self.name) {
             let found = format!("{:?}, the {} of {}", self.name, taken.kind, taken.owner());
-            return Err(Error::invalid("plugins new", "NAME", found, "a name that no stage has yet"));
+            return Err(Error::invalid("plugins new", "NAME", found, "an unused name"));
         }
         let folder = self.into.join(&self.name);
         if folder.exists() {
-            let expected = "a name of which there is no folder yet";
-            return Err(Error::invalid(folder.display().to_string(), "NAME", "something that is there", expected));
+            let expected = "the name of a new folder";
+            return Err(Error::invalid(folder.display().to_string(), "NAME", "an existing file or folder", expected));
         }
         let Start { files, library, build } = match self.lang {
             Language::Rust => self.rust()?,
@@ -273,7 +273,7 @@ impl New {
             .replace("@crate@", &self.name.replace('-', "_")))
     }
 
-    /// Where conefield's sources lie.
+    /// The folder of conefield's sources.
     fn sources(&self) -> Result<Option<PathBuf>> {
         let sound = |root: &Path| root.join("plugins/sdk/Cargo.toml").is_file();
         match &self.sources {

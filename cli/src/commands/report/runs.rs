@@ -55,7 +55,7 @@ fn of_folder(folder: &Path) -> Result<Vec<PathBuf>> {
     Ok(runs)
 }
 
-/// The runs as the page tells of them, each under a name of its own.
+/// The runs of the page, each with a unique name.
 pub fn told(found: &[RunOnDisk], warnings: &mut Vec<Notice>) -> Vec<PageRun> {
     let names = names(found);
     found
@@ -66,7 +66,7 @@ pub fn told(found: &[RunOnDisk], warnings: &mut Vec<Notice>) -> Vec<PageRun> {
             warnings.extend((!run.is_complete()).then(|| notice(format!("the run is {}", run.standing()))));
             if let Some(n) = run.record().and_then(|r| r["rollbacks"].as_u64()).filter(|n| *n > 0) {
                 warnings
-                    .push(notice(format!("training ran away {n} times and went back, with half the learning rate")));
+                    .push(notice(format!("training diverged {n} times and went back, with half the learning rate")));
             }
             PageRun {
                 folder: run.folder().display().to_string(),
@@ -103,7 +103,7 @@ fn names(found: &[RunOnDisk]) -> Vec<String> {
     all.into_iter().find(distinct).unwrap_or(last)
 }
 
-/// What stands over the page.
+/// The title of the page.
 pub fn title(page: &Page) -> String {
     let scans: Vec<&str> = page.scans.iter().map(|s| &s.name[..]).collect();
     let runs = match &page.runs[..] {

@@ -56,7 +56,7 @@ impl Group {
                             "{}: the scan is {where_}; its geometry and projections are not shown",
                             run.folder().display()
                         ),
-                        advice: "conefield report --scan SCAN says where it is".into(),
+                        advice: "name it with conefield report --scan SCAN".into(),
                     });
                     None
                 }
@@ -82,7 +82,7 @@ impl Group {
                 Some(voxels) => group.references.push((path, voxels)),
                 None => page.warnings.push(Notice {
                     found: format!("{}: the reference {} is not there", run.folder().display(), path.display()),
-                    advice: "conefield report --reference VOLUME says where it is".into(),
+                    advice: "name it with conefield report --reference VOLUME".into(),
                 }),
             }
         }
@@ -185,7 +185,7 @@ fn read(path: &Path, run: &RunOnDisk, options: &Options, page: &mut Page) -> Res
     }
     page.warnings.push(Notice {
         found: format!("{place}: {found}; geometry and projections are not shown"),
-        advice: "conefield report --scan SCAN says where it is".into(),
+        advice: "name it with conefield report --scan SCAN".into(),
     });
     Ok(None)
 }

@@ -61,7 +61,7 @@ impl ProjectorStage {
         let (to, by) = (points.as_mut_ptr().cast(), weights.as_mut_ptr());
         call!(self.0, sample(&ray, seed, to, by, capacity, &mut count))?;
         if count > capacity {
-            return failed(&format!("{count} samples where it said that {capacity} are the most"));
+            return failed(&format!("{count} samples, more than its maximum of {capacity}"));
         }
         let untouched = |v: f32| v.to_bits() == trial::UNTOUCHED;
         if points[capacity..].iter().flatten().chain(&weights[capacity..]).any(|&v| !untouched(v)) {
