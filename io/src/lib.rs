@@ -1,10 +1,12 @@
 //! Every file that conefield reads or writes, each format in one module.
 //!
-//! - Volumes: [`read_volume`], [`write_volume`], [`write_voxels`] (NIfTI, MetaImage, NumPy; a DICOM series in).
+//! - Volumes: [`read_volume`], [`write_volume`], [`write_voxels`] (NIfTI, MetaImage, NumPy; a DICOM series
+//!   in; NRRD, a TIFF stack, OME-Zarr out).
 //! - Scans: [`read_scan`], [`read_truth`], [`write_scan`] (conefield's own folder), [`read_r2`], [`write_r2`]
 //!   (R2-Gaussian's folder), [`read_naf`], [`write_naf`] (NAF's file), [`write_rtk`] (for RTK); [`read_data_set`] also
 //!   reads test views.
-//! - Projections as scanners give them: [`read_scanner`] (a description in TOML; TIFF, NumPy, RTK's XML geometry).
+//! - Projections as scanners give them: [`read_scanner`] (a description in TOML; TIFF, NumPy, HDF5, RTK's XML geometry;
+//!   Nikon's description).
 //! - Part of a scan, with its geometry: [`Selection`].
 //! - Sizes, before memory is taken: [`scan_size`], [`scanner_size`], [`volume_voxels`].
 //! - Weights: [`read_weights`], [`write_weights`]; checkpoints: [`read_checkpoint`], [`write_checkpoint`] (safetensors).
@@ -26,6 +28,7 @@ mod dicom;
 mod file_order;
 mod filling;
 mod folder;
+mod hdf5;
 mod input;
 mod lease;
 mod lock;
@@ -35,6 +38,7 @@ mod naf;
 mod nifti;
 mod npy;
 mod npz;
+mod nrrd;
 mod number;
 mod orbit;
 mod pickle;
@@ -54,6 +58,7 @@ mod tiff;
 mod unit;
 mod volume;
 mod weights;
+mod zarr;
 
 #[cfg(test)]
 mod testing;

@@ -1,6 +1,11 @@
-//! TIFF as detectors write it: one grey channel, integers or floats, one image a page.
+//! TIFF as detectors write it: one grey channel, integers or floats, one image a page; plain or packed by LZW, deflate, PackBits or
+//! Zstandard. Out, a page a slice ([`write`]).
 
 mod entries;
+mod write;
+mod zstd;
+
+pub(crate) use write::{check_shape, write};
 
 use crate::input::must_unpack;
 use crate::memory;
@@ -39,6 +44,9 @@ pub(crate) fn read(path: &Path) -> Result<Array3<f32>> {
         memory::grow(&mut values, count, usize::MAX, &place, "pages")?;
         // The page as it is stored, and what its pieces are unpacked to.
         allowance::memory(&place, "page", page.bytes.saturating_mul(2))?;
+        if zstd::is_packed(decoder) {
+            return zstd::read(&place, decoder, page.size, page.bits, &mut values);
+        }
         append(&mut values, decoder.read_image().map_err(|e| broken(&place, &e))?);
         Ok(())
     })?;
@@ -57,6 +65,9 @@ struct Page {
     pixels: u64,
     /// Bytes that they take unpacked.
     bytes: u64,
+    bits: u8,
+    /// Rows and columns.
+    size: [usize; 2],
 }
 
 /// Goes through the pages without unpacking them; their number, rows and columns.
@@ -99,7 +110,7 @@ fn pages(
         limits.decoding_buffer_size = usize::try_from(most).unwrap_or(usize::MAX);
         (limits.ifd_value_size, limits.intermediate_buffer_size) = [limits.decoding_buffer_size; 2].into();
         decoder = decoder.with_limits(limits);
-        each(&mut decoder, Page { pixels, bytes })?;
+        each(&mut decoder, Page { pixels, bytes, bits, size: [height as usize, width as usize] })?;
         pages += 1;
         if !decoder.more_images() {
             break;
