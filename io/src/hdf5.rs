@@ -13,6 +13,7 @@ mod tests;
 use crate::input::must_unpack;
 use crate::memory;
 use crate::number::{ByteOrder, Number};
+use conefield_core::error::ensure;
 use conefield_core::{Error, Result, allowance, files};
 use hdf5_reader::{Dataset, Datatype, FileStorage, Hdf5File, OpenOptions, SliceInfo, SliceInfoElem};
 use layout::{Found, Layout};
@@ -126,6 +127,9 @@ impl Container {
         let file = FileStorage::from_file(file)
             .and_then(|storage| Hdf5File::from_storage_with_options(Arc::new(storage), options))
             .map_err(|e| Error::invalid(&place, "HDF5", e, "a whole HDF5 file"))?;
+        let end = file.superblock().eof_address;
+        let expected = format!("{end} bytes, as the file says: it is cut off");
+        ensure(end <= size, &place, "HDF5", format!("{size} bytes"), expected)?;
         Ok(Self { place, file, size })
     }
 
@@ -269,7 +273,11 @@ impl Container {
             let size: Vec<usize> = chunk.shape().iter().map(|&n| usize::try_from(n).unwrap_or(usize::MAX)).collect();
             let inside = at.iter().zip(shape).all(|(a, s)| a < s) && size.iter().all(|n| *n > 0);
             if at.len() != shape.len() || size.len() != shape.len() || !inside {
-                return Err(self.invalid(data.name(), format!("a chunk at {at:?}"), format!("chunks within {shape:?}")));
+                return Err(self.invalid(
+                    data.name(),
+                    format!("a chunk at {at:?}"),
+                    format!("chunks within {shape:?}"),
+                ));
             }
             wanted = shape.iter().zip(&size).map(|(s, n)| s.div_ceil(*n) as u64).product();
             seen += 1;
@@ -383,7 +391,8 @@ impl Container {
     /// A number beside `data`.
     pub fn number_attribute(&self, data: &Dataset, name: &str) -> Option<f64> {
         let attribute = data.attribute(name).ok()?;
-        let as_integer = || attribute.read_scalar::<i64>().map(|x| x as f64).or(attribute.read_scalar::<i32>().map(f64::from));
+        let as_integer =
+            || attribute.read_scalar::<i64>().map(|x| x as f64).or(attribute.read_scalar::<i32>().map(f64::from));
         let as_float = || attribute.read_scalar::<f64>().or(attribute.read_scalar::<f32>().map(f64::from));
         as_float().or_else(|_| as_integer()).ok().filter(|x| x.is_finite())
     }

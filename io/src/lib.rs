@@ -10,6 +10,7 @@
 //! - Part of a scan, with its geometry: [`Selection`].
 //! - Sizes, before memory is taken: [`scan_size`], [`scanner_size`], [`volume_voxels`].
 //! - Weights: [`read_weights`], [`write_weights`]; checkpoints: [`read_checkpoint`], [`write_checkpoint`] (safetensors).
+//! - Curves and pictures for TensorBoard: [`EventFile`].
 //!
 //! Readers tell a format from what a file holds, check a header before they take memory for what it claims, and
 //! refuse with the file, the field, what was found and what was expected. Lengths are converted once, here: inside
@@ -25,6 +26,7 @@ mod atomic;
 mod checkpoint;
 mod counts;
 mod dicom;
+mod events;
 mod file_order;
 mod filling;
 mod folder;
@@ -66,6 +68,7 @@ mod testing;
 pub use atomic::{discard_unfinished, is_unfinished, write_atomic, write_folder_atomic, write_text_atomic};
 pub use checkpoint::{read_checkpoint, write_checkpoint};
 pub use counts::{Correction, CountsReport, OpenBeam, line_integrals};
+pub use events::EventFile;
 pub use file_order::{PACKED_BYTES, SLAB_BYTES};
 pub use lease::{Contents, FolderLock, Lease, Progressed, SharedLease, is_aside, try_alone};
 pub use naf::{read_naf, write_naf};

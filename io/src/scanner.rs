@@ -259,8 +259,7 @@ pub fn read_scanner(path: impl AsRef<Path>, options: &ImportOptions) -> Result<I
     let layout = layout(&place, &d.layout)?;
     let i0 = i0(&place, &d, options)?;
     let read = |field: &str, part, names: &Names| stack::read_field(folder, &place, field, part, names, layout);
-    let values =
-        stack::read(folder, &place, "files.projections", ScanPart::Projections, &d.files.projections, layout)?;
+    let values = stack::read(folder, &place, "files.projections", ScanPart::Projections, &d.files.projections, layout)?;
     let (count, rows, columns) = values.dim();
     if let Some([r, c]) = d.detector.filter(|found| *found != [rows, columns]) {
         let expected = format!("{r} x {c} (rows x columns), as the detector has");

@@ -304,7 +304,8 @@ mod tests {
             let image = npy_bytes("|u1", false, "(1, 2)", &[i as u8, 7]);
             std::fs::write(at(&format!("views/p{i}.npy")), image).unwrap();
         }
-        let read = |names: Names| super::read(dir.path(), "s.toml", "files.projections", ScanPart::Projections, &names, PLAIN);
+        let read =
+            |names: Names| super::read(dir.path(), "s.toml", "files.projections", ScanPart::Projections, &names, PLAIN);
         let one = |n: &str| read(Names::One(n.into()));
         assert_eq!(one("views").unwrap().slice(ndarray::s![.., 0, 0]).to_vec(), [1.0, 2.0, 10.0]);
         let many = |n: &[&str]| read(Names::Many(n.iter().map(|s| s.to_string()).collect()));

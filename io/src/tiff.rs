@@ -176,6 +176,42 @@ mod tests {
         each!(kind::Gray32Float, f32);
     }
 
+    /// Written by tifffile (`tests/fixtures/make_formats.py`): the i-th value is 9000 + 97 i, or a seventh of that.
+    const ZSTD: &[(&str, &[u8])] = &[
+        ("strips", include_bytes!("../tests/fixtures/zstd.tif")),
+        ("floats", include_bytes!("../tests/fixtures/zstd_floats.tif")),
+        ("tiles", include_bytes!("../tests/fixtures/zstd_tiles.tif")),
+    ];
+
+    #[test]
+    fn zstandard_is_read_in_strips_and_tiles() {
+        let dir = tempfile::tempdir().unwrap();
+        let path = dir.path().join("a.tif");
+        let count = |i: usize| 9000.0 + 97.0 * i as f32;
+        for (name, bytes) in ZSTD {
+            std::fs::write(&path, bytes).unwrap();
+            let a = read(&path).unwrap();
+            let want = |p: usize, r: usize, c: usize| match *name {
+                "strips" => count(20 * p + 5 * r + c),
+                "floats" => ((f64::from(count(20 * p + 5 * r + c))) / 7.0) as f32,
+                _ => count(5 * (r % 4) + c % 5),
+            };
+            assert_eq!(a.dim(), if *name == "tiles" { (1, 24, 25) } else { (3, 4, 5) });
+            assert!(a.indexed_iter().all(|((p, r, c), x)| *x == want(p, r, c)), "{name}: {a}");
+        }
+        let (_, whole) = ZSTD[0];
+        let mut bytes = whole.to_vec();
+        let at = bytes.windows(4).position(|w| w == [0x28, 0xb5, 0x2f, 0xfd]).unwrap();
+        bytes[at] = 0;
+        refused(&bytes, &["TIFF", "Zstandard"]);
+        for at in 0..whole.len() {
+            let mut bytes = whole.to_vec();
+            bytes[at] ^= 0x83;
+            std::fs::write(&path, &bytes).unwrap();
+            let _ = read(&path);
+        }
+    }
+
     fn refused(bytes: &[u8], words: &[&str]) {
         let dir = tempfile::tempdir().unwrap();
         let path = dir.path().join("a.tif");

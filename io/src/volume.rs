@@ -192,7 +192,8 @@ pub(crate) fn from_numpy(path: &Path, array: ndarray::ArrayD<f32>) -> Result<Vol
 
 /// The format that a name asks for; one that asks for none is refused.
 fn wanted(path: &Path) -> Result<VolumeFormat> {
-    let (place, expected) = (path.display().to_string(), "an end of .nii, .nii.gz, .mha, .mhd, .nrrd, .npy, .tif or .zarr");
+    let (place, expected) =
+        (path.display().to_string(), "an end of .nii, .nii.gz, .mha, .mhd, .nrrd, .npy, .tif or .zarr");
     format_of(path).ok_or_else(|| Error::invalid(place, "file name", file_name(path), expected))
 }
 
@@ -298,6 +299,32 @@ mod tests {
     }
 
     #[test]
+    fn raw_and_nrrd_hold_the_voxels_and_where_they_lie() {
+        let dir = tempfile::tempdir().unwrap();
+        let volume = Volume::centered(Array3::from_shape_fn((4, 3, 2), |(x, y, z)| ramp([x, y, z])), [0.5, 0.75, 2.0]);
+        let path = dir.path().join("a.mhd");
+        write_volume(&path, &volume).unwrap();
+        let back = read_volume(&path).unwrap();
+        assert_eq!((back.data, back.grid.spacing), (volume.data.clone(), [0.5, 0.75, 2.0]));
+        assert_eq!(std::fs::metadata(dir.path().join("a.raw")).unwrap().len(), 96);
+        std::fs::rename(dir.path().join("a.raw"), dir.path().join("b.raw")).unwrap();
+        let e = write_volume(dir.path().join("b.mhd"), &volume).unwrap_err().to_string();
+        assert!(e.contains("b.mhd: output") && e.contains("b.raw without its header"), "{e}");
+        let path = dir.path().join("a.nrrd");
+        write_volume(&path, &volume).unwrap();
+        let bytes = std::fs::read(path).unwrap();
+        let end = bytes.windows(2).position(|w| w == b"\n\n").unwrap() + 2;
+        let text = std::str::from_utf8(&bytes[..end]).unwrap();
+        let lines =
+            ["sizes: 4 3 2", "space directions: (-0.5,0,0) (0,-0.75,0) (0,0,2)", "space origin: (0.75,0.75,-1)"];
+        assert!(text.starts_with("NRRD0004\n") && lines.iter().all(|l| text.lines().any(|t| t == *l)), "{text}");
+        let mut raw = Vec::new();
+        std::io::Read::read_to_end(&mut flate2::read::GzDecoder::new(&bytes[end..]), &mut raw).unwrap();
+        let values: Vec<f32> = raw.as_chunks().0.iter().map(|b| f32::from_le_bytes(*b)).collect();
+        assert_eq!(values, volume.data.t().iter().copied().collect::<Vec<_>>());
+    }
+
+    #[test]
     fn bad_names_and_values_are_refused_and_leave_the_file_whole() {
         let dir = tempfile::tempdir().unwrap();
         let path = dir.path().join("a.nii.gz");
@@ -307,8 +334,8 @@ mod tests {
         let e = write_volume(&path, &v).unwrap_err().to_string();
         assert!(e.contains("a.nii.gz") && e.contains("voxel [1, 0, 1]"), "{e}");
         assert_eq!(read_volume(&path).unwrap().data, Array3::<f32>::ones((2, 2, 2)));
-        let e = write_volume(dir.path().join("a.tif"), &v).unwrap_err().to_string();
-        assert!(e.contains("a.tif") && e.contains(".nii.gz"), "{e}");
+        let e = write_volume(dir.path().join("a.png"), &v).unwrap_err().to_string();
+        assert!(e.contains("a.png") && e.contains(".nii.gz"), "{e}");
         let e = read_volume(dir.path().join("none.nii")).unwrap_err().to_string();
         assert!(e.contains("none.nii"), "{e}");
         let e = read_volume(dir.path()).unwrap_err().to_string();

@@ -13,8 +13,8 @@ use std::path::PathBuf;
 
 /// Rewrite a volume or a scan in another format.
 ///
-/// Volumes: NIfTI (.nii, .nii.gz), MetaImage (.mha) and NumPy (.npy), by the name of OUT; IN may also be a .mhd or the
-/// folder of a DICOM series. Scans: as --to says; test views are kept where the format has a place for them (r2, naf). Of a scan
+/// Volumes: NIfTI (.nii, .nii.gz), MetaImage (.mha, .mhd with a .raw), NRRD, NumPy (.npy), a TIFF stack (.tif) or a folder
+/// of OME-Zarr (.zarr), by the name of OUT; IN may also be the folder of a DICOM series, but no NRRD, TIFF or OME-Zarr. Scans: as --to says; test views are kept where the format has a place for them (r2, naf). Of a scan
 /// a part may be taken; larger pixels (--bin) hold the mean of line integrals.
 #[derive(Args)]
 pub struct ConvertArgs {

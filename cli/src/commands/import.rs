@@ -13,8 +13,8 @@ use std::path::PathBuf;
 
 /// Make a scan of what a scanner gave.
 ///
-/// SCANNER.toml names the files with the projections (TIFF, .npy, .npz, .mha), says in mm where source and detector stood
-/// and how arrays lie; docs/geometry.md has all keys. Raw counts become line integrals; dead and hot pixels are interpolated. Then
+/// SCANNER.toml names the files with the projections (TIFF, HDF5, .npy, .npz, .mha), says in mm where source and detector stood
+/// and how arrays lie; docs/geometry.md has all keys. A .xtekct of Nikon's does in its place. Raw counts become line integrals; dead and hot pixels are interpolated. Then
 /// the part that is asked for is taken: larger pixels (--bin) hold the mean of the light, as they would have counted it.
 #[derive(Args)]
 pub struct ImportArgs {

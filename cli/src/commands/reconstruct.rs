@@ -2,6 +2,7 @@
 
 use super::record::{RunRecord, Written, summary};
 use super::{backends::simd_level, calibrate, protocol::RunProtocol};
+use crate::board::Board;
 use crate::boundary::{self, Inputs};
 use crate::live::Live;
 use crate::memory;
@@ -67,6 +68,9 @@ pub struct ReconstructArgs {
     /// Draw live.png, the middle slices of a field that trains, in RUN every so often, such as 5s.
     #[arg(long, value_name = "SECONDS", value_parser = parse::seconds)]
     live: Option<f64>,
+    /// Write events.out.tfevents.conefield in RUN, in which TensorBoard shows the curves and pictures of the run as it goes on.
+    #[arg(long)]
+    tensorboard: bool,
     /// Print one JSON object: what record.json holds.
     #[arg(long)]
     json: bool,
@@ -158,7 +162,7 @@ impl ReconstructArgs {
                 (folder.metrics()?, None)
             }
         };
-        let mut progress = self.progress(&folder, metrics, identity);
+        let mut progress = self.progress(&folder, metrics, identity)?;
         let (seed, limits) = (self.protocol.seed, self.protocol.ends.limits());
         let job = input.work.job(backend.as_ref(), seed, limits, schedule.as_ref());
         let job = Job { resume: resume.as_ref(), ..job };
@@ -166,9 +170,13 @@ impl ReconstructArgs {
         let mut solution = plan.run(&job, &mut progress).map_err(|e| loaded.locate(e))?;
         let prepare_s = (start.elapsed().as_secs_f64() + spent - solution.train_s).max(0.0);
         let last = progress.records().last().cloned();
+        let board = progress.take_board();
         drop(progress);
 
         let written = self.write(&folder, &input.work, &mut solution, &loaded, backend.as_ref())?;
+        if let Some(mut board) = board {
+            board.picture(solution.steps, "slices", &folder.file("slices.png"))?;
+        }
         let Reading { work: Input { scan: seen, held, peak, .. }, record: scan, load_s } = input;
         let path = |p: &PathBuf| p.display().to_string();
         let record = RunRecord {
@@ -257,16 +265,23 @@ impl ReconstructArgs {
     }
 
     /// What is shown and kept while it runs.
-    fn progress(&self, folder: &RunFolder, metrics: (PathBuf, File), run: BTreeMap<String, String>) -> Progress {
+    fn progress(
+        &self,
+        folder: &RunFolder,
+        metrics: (PathBuf, File),
+        run: BTreeMap<String, String>,
+    ) -> Result<Progress> {
+        let board = self.tensorboard.then(|| Board::new(&folder.file("events.out.tfevents.conefield"), &metrics.0));
         let keeper = Keeper {
             path: folder.file("checkpoint.safetensors"),
             every: Duration::from_secs_f64(self.protocol.checkpoint_every),
             run,
             last: Instant::now(),
         };
-        Progress::new("reconstruct", Some(metrics))
+        Ok(Progress::new("reconstruct", Some(metrics))
             .keeping(Some(keeper))
             .showing(self.live.map(|seconds| Live::new(folder.file("live.png"), seconds)))
+            .reporting(board.transpose()?))
     }
 
     /// Writes what came out, and scores it.

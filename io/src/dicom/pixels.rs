@@ -349,7 +349,49 @@ mod tests {
         assert_eq!(found, [100, 101, 99, -5, 2047, -2048]);
     }
 
+    /// The same values, by CharLS and, with a sign and without, by OpenJPEG (`tests/fixtures/make_formats.py`).
+    const JPEG_LS: &[u8] = include_bytes!("../../tests/fixtures/picture.jls");
+    const JPEG_2000: &[u8] = include_bytes!("../../tests/fixtures/picture.j2k");
+    const UNSIGNED: &[u8] = include_bytes!("../../tests/fixtures/picture_unsigned.j2k");
+
+    #[test]
+    fn jpeg_ls_and_jpeg_2000_are_read_and_other_sizes_refused() {
+        let all = PixelFormat { stored: 16, high: 15, ..TWO };
+        let want = [100, 101, 99, -5, 2047, -2048];
+        let decoded = [jpeg_ls(JPEG_LS, &all), jpeg_2000("a", JPEG_2000, &all), jpeg_2000("a", UNSIGNED, &all)];
+        for bits in decoded {
+            assert_eq!(bits.unwrap().into_iter().map(|b| all.number(b)).collect::<Vec<_>>(), want);
+        }
+        let other = PixelFormat { rows: 3, columns: 2, ..all };
+        let byte = PixelFormat { bytes: 1, stored: 8, high: 7, ..all };
+        for (e, word) in [
+            (jpeg_ls(JPEG_LS, &other), "2 rows, 3 columns"),
+            (jpeg_2000("a", JPEG_2000, &other), "2 rows, 3 columns"),
+            (jpeg_ls(JPEG_LS, &byte), "16 bits in values of 1 bytes"),
+            (jpeg_2000("a", JPEG_2000, &byte), "16 bits in values of 1 bytes"),
+            (jpeg_ls(&JPEG_LS[..80], &all), "cannot be decoded"),
+            (jpeg_2000("a", &JPEG_2000[..60], &all), "cannot be decoded"),
+            (jpeg_ls(JPEG_2000, &all), "no JPEG-LS picture"),
+            (jpeg_2000("a", JPEG_LS, &all), "no JPEG 2000 picture"),
+        ] {
+            let e = e.unwrap_err();
+            assert!(e.contains(word), "{word} is not in: {e}");
+        }
+    }
+
     proptest::proptest! {
+        #[test]
+        fn no_changed_picture_makes_a_decoder_panic(changes in proptest::collection::vec((0usize..135, 0u8..), 1..6), cut in 0usize..136) {
+            for picture in [JPEG_LS, JPEG_2000, UNSIGNED] {
+                let mut bytes = picture.to_vec();
+                for &(at, x) in changes.iter().filter(|(at, _)| *at < picture.len()) {
+                    bytes[at] = x;
+                }
+                bytes.truncate(cut.max(30));
+                let _ = (jpeg_ls(&bytes, &TWO), jpeg_2000("a", &bytes, &TWO));
+            }
+        }
+
         #[test]
         fn no_bytes_make_it_panic(changes in proptest::collection::vec((0usize..61, 0u8..), 1..6), cut in 0usize..62) {
             let mut bytes = JPEG.to_vec();

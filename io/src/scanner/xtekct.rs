@@ -31,7 +31,11 @@ pub(super) fn description(path: &Path) -> Result<Description> {
     let whole = |key: &str, most: f64| -> Result<usize> {
         let found = keys.number(key)?;
         let fits = found.fract() == 0.0 && (1.0..=most).contains(&found);
-        if fits { Ok(found as usize) } else { Err(keys.invalid(key, found, format!("a whole number from 1 to {most}"))) }
+        if fits {
+            Ok(found as usize)
+        } else {
+            Err(keys.invalid(key, found, format!("a whole number from 1 to {most}")))
+        }
     };
     let count = whole("Projections", MOST_VIEWS)?;
     let [columns, rows] = [whole("DetectorPixelsX", 1e6)?, whole("DetectorPixelsY", 1e6)?];
@@ -95,7 +99,8 @@ fn volume(keys: &Keys, [columns, rows]: [usize; 2], [across, along]: [f64; 2]) -
     let axes = ["X", "Y", "Z"];
     let named = axes.iter().all(|a| keys.0.contains_key(&format!("Voxels{a}")));
     let (shape, spacing) = if named {
-        let numbers = |name: &str| -> Result<Vec<f64>> { axes.iter().map(|a| keys.length(&format!("{name}{a}"))).collect() };
+        let numbers =
+            |name: &str| -> Result<Vec<f64>> { axes.iter().map(|a| keys.length(&format!("{name}{a}"))).collect() };
         let (n, size) = (numbers("Voxels")?, numbers("VoxelSize")?);
         ([n[0], n[1], n[2]].map(|x| x as usize), [size[0], size[1], size[2]])
     } else {
@@ -158,3 +163,82 @@ const KNOWN: &[&str] = &[
     "InitialAngle",
     "AngularStep",
 ];
+
+#[cfg(test)]
+mod tests {
+    use super::super::{ImportOptions, read_scanner};
+    use super::*;
+    use conefield_core::geometry::{Millimetres, Radians};
+    use std::fs;
+    use tiff::encoder::{TiffEncoder, colortype::Gray16};
+
+    const TEXT: &str = "[XTekCT]\nName=bone\nVoxelsX=4\nVoxelSizeX=0.5\nVoxelsY=4\nVoxelSizeY=0.5\nVoxelsZ=3\nVoxelSizeZ=0.75\n\
+        InputSeparator=_\nInputFolderName=\nInputDigits=4\nProjections=3\nWhiteLevel=50000\nDetectorPixelsX=5\n\
+        DetectorPixelSizeX=2\nDetectorPixelsY=4\nDetectorPixelSizeY=1.5\nSrcToObject=500.000\nSrcToDetector=800\n\
+        InitialAngle=30\nAngularStep=120\nCentreOfRotationTop=1.6\nCentreOfRotationBottom=1.6\n[Xrays]\nXraykV=120\n";
+
+    fn written(text: &str) -> (tempfile::TempDir, std::path::PathBuf) {
+        let dir = tempfile::tempdir().unwrap();
+        for i in 1..=4u16 {
+            let file = fs::File::create(dir.path().join(format!("bone_{i:04}.tif"))).unwrap();
+            TiffEncoder::new(file).unwrap().write_image::<Gray16>(5, 4, &[10_000 * i; 20]).unwrap();
+        }
+        let path = dir.path().join("bone.xtekct");
+        fs::write(&path, text).unwrap();
+        (dir, path)
+    }
+
+    #[test]
+    fn a_description_of_nikons_becomes_a_scan() {
+        let (_dir, path) = written(TEXT);
+        let scan = crate::read_scan(&path).unwrap();
+        assert_eq!(scan.projections.dim(), (3, 4, 5));
+        assert!((scan.projections[[1, 0, 0]] - 2.5f32.ln()).abs() < 1e-6);
+        assert_eq!((scan.geometry.volume.shape, scan.geometry.volume.spacing), ([4, 4, 3], [0.5, 0.5, 0.75]));
+        assert_eq!(crate::scan_size(&path).unwrap().pixels, 60);
+        let mm = Millimetres;
+        for (view, i) in scan.geometry.views.iter().zip(0..) {
+            // The source starts below; its columns run against ours. The axis is 1 mm to the left: seen from it the source is
+            // 1 mm to the right, as the first pixel is.
+            let at = Radians(f64::to_radians(30.0 + 120.0 * f64::from(i) - 180.0 - 90.0));
+            let want = View::circular(at, mm(500.0), mm(800.0), [mm(1.5), mm(2.0)], [mm(0.0); 2]);
+            let (s, c) = at.0.sin_cos();
+            let aside = |p: [f64; 3]| [p[0] - s, p[1] + c, p[2]];
+            for (found, want) in [
+                (view.source, aside(want.source)),
+                (view.detector, aside(want.detector)),
+                (view.u, want.u.map(|x| -x)),
+                (view.v, want.v),
+            ] {
+                assert!((0..3).all(|k| (found[k] - want[k]).abs() < 1e-9), "{i}: {found:?} {want:?}");
+            }
+        }
+        // Without sizes of voxels they are those of the pixels at the axis.
+        let without: String = TEXT.lines().filter(|l| !l.starts_with("Voxel")).flat_map(|l| [l, "\n"]).collect();
+        let (_dir, path) = written(&without);
+        let grid = crate::read_scan(&path).unwrap().geometry.volume;
+        assert_eq!((grid.shape, grid.spacing), ([5, 5, 4], [1.25, 1.25, 0.9375]));
+    }
+
+    #[test]
+    fn what_is_missing_or_wrong_is_named() {
+        for (from, to, words) in [
+            ("SrcToObject=500.000", "", ["SrcToObject", "nothing"]),
+            ("SrcToObject=500.000", "SrcToObject=-5", ["SrcToObject", "above 0"]),
+            ("SrcToObject=500.000", "SrcToObject=five", ["SrcToObject", "\"five\""]),
+            ("SrcToObject=500.000", "SrcToObject=500\nSrcToObject=400", ["line 19: SrcToObject", "one value"]),
+            ("Projections=3", "Projections=1e9", ["Projections", "1000000"]),
+            ("Projections=3", "Projections=2.5", ["Projections", "whole number"]),
+            ("Projections=3", "Projections=9", ["files.projections[4]", "bone_0005.tif"]),
+            ("DetectorPixelsX=5", "DetectorPixelsX=6", ["4 x 5", "4 x 6"]),
+            ("VoxelsX=4", "VoxelsX=-4", ["VoxelsX", "above 0"]),
+            ("InputFolderName=", "InputFolderName=../elsewhere", ["files.projections", "\"..\""]),
+            ("AngularStep=120", "AngularStep=inf", ["AngularStep", "\"inf\""]),
+        ] {
+            assert!(TEXT.contains(from), "{from}");
+            let (_dir, path) = written(&TEXT.replace(from, to));
+            let e = read_scanner(&path, &ImportOptions::default()).unwrap_err().to_string();
+            assert!(e.contains("bone") && words.iter().all(|w| e.contains(w)), "{words:?} are not all in: {e}");
+        }
+    }
+}

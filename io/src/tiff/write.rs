@@ -52,12 +52,16 @@ impl Head {
     fn of(shape: [usize; 3], spacing: [f64; 3]) -> Self {
         let shape = shape.map(|n| n as u64);
         let pages = shape[2];
-        let text = format!(
-            "ImageJ=1.54f\nimages={pages}\nslices={pages}\nunit=mm\nspacing={}\nloop=false\n\0",
-            spacing[2]
-        );
+        let text =
+            format!("ImageJ=1.54f\nimages={pages}\nslices={pages}\nunit=mm\nspacing={}\nloop=false\n\0", spacing[2]);
         // A fraction of numbers of 32 bits keeps six digits of sizes from a nanometre to a kilometre.
-        let ratio = |s: f64| if s < 1.0 { [(1e6 / s).round().min(4e9) as u32, 1_000_000] } else { [1_000_000, (1e6 * s).min(4e9) as u32] };
+        let ratio = |s: f64| {
+            if s < 1.0 {
+                [(1e6 / s).round().min(4e9) as u32, 1_000_000]
+            } else {
+                [1_000_000, (1e6 * s).min(4e9) as u32]
+            }
+        };
         let head = Self { shape, resolution: [ratio(spacing[0]), ratio(spacing[1])], text, big: false };
         let classic = head.length() + 4 * shape.iter().product::<u64>() <= CLASSIC;
         Self { big: !classic, ..head }
@@ -165,7 +169,10 @@ mod tests {
 
     #[test]
     fn a_stack_comes_back_page_by_page_in_either_size_of_offsets() {
-        let volume = Volume::centered(Array3::from_shape_fn((4, 3, 2), |(x, y, z)| (x + 10 * y + 100 * z) as f32), [0.5, 0.75, 2.0]);
+        let volume = Volume::centered(
+            Array3::from_shape_fn((4, 3, 2), |(x, y, z)| (x + 10 * y + 100 * z) as f32),
+            [0.5, 0.75, 2.0],
+        );
         let dir = tempfile::tempdir().unwrap();
         let path = dir.path().join("a.tif");
         for big in [false, true] {

@@ -70,7 +70,12 @@ struct Page<'a> {
 }
 
 impl<'a> Page<'a> {
-    fn of(place: &'a str, decoder: &mut Decoder<impl Read + Seek>, [rows, columns]: [usize; 2], bits: u8) -> Result<Self> {
+    fn of(
+        place: &'a str,
+        decoder: &mut Decoder<impl Read + Seek>,
+        [rows, columns]: [usize; 2],
+        bits: u8,
+    ) -> Result<Self> {
         let tiled = decoder.get_chunk_type() == ChunkType::Tile;
         let (width, height) = decoder.chunk_dimensions();
         let chunk = [height as usize, width as usize];
@@ -83,7 +88,10 @@ impl<'a> Page<'a> {
         let format = format.and_then(|f| f.first().copied()).unwrap_or(1);
         let predictor = decoder.find_tag_unsigned::<u32>(Tag::Predictor).map_err(broken)?.unwrap_or(1);
         let mut list = |strips, tiles| {
-            decoder.find_tag_unsigned_vec::<u64>(if tiled { tiles } else { strips }).map_err(broken).map(Option::unwrap_or_default)
+            decoder
+                .find_tag_unsigned_vec::<u64>(if tiled { tiles } else { strips })
+                .map_err(broken)
+                .map(Option::unwrap_or_default)
         };
         let offsets = list(Tag::StripOffsets, Tag::TileOffsets)?;
         let sizes = list(Tag::StripByteCounts, Tag::TileByteCounts)?;
