@@ -41,6 +41,7 @@ pub struct Progress {
     bar: ProgressBar,
     told: Instant,
     what: String,
+    step: u64,
     latest: Record,
     records: Vec<Record>,
     log: Option<(PathBuf, File)>,
@@ -73,6 +74,7 @@ impl Progress {
             bar,
             told: Instant::now(),
             what: what.into(),
+            step: 0,
             latest: Record::default(),
             records: vec![],
             log,
@@ -161,6 +163,7 @@ impl Progress {
 
 impl Observer for Progress {
     fn progress(&mut self, step: u64, share: f64, seconds_left: f64) {
+        self.step = step;
         self.show(share, |me| me.line(step, seconds_left));
     }
 
@@ -206,7 +209,7 @@ impl Observer for Progress {
 
     fn slices(&mut self, grid: VoxelGrid, slices: &[(Part, Array3<f32>)]) -> Result<()> {
         let Some(live) = &mut self.live else { return Ok(()) };
-        let (picture, step) = (live.draw(grid, slices)?.to_path_buf(), self.latest.step);
+        let (picture, step) = (live.draw(grid, slices)?.to_path_buf(), self.step);
         self.on_board(|board| board.picture(step, "live", &picture));
         Ok(())
     }

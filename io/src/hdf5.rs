@@ -264,6 +264,10 @@ impl Container {
         let frame: usize = shape[1..].iter().product();
         // With two axes each row is a frame of one row.
         let [rows, columns] = [if shape.len() == 3 { shape[1] } else { 1 }, shape[shape.len() - 1]];
+        // A chunk as it is stored and unpacked.
+        let chunk =
+            data.chunks().into_iter().flatten().fold(number.bytes() as u64, |n, k| n.saturating_mul(u64::from(k)));
+        allowance::memory(&self.place, data.name(), chunk.min(LONGEST_CHUNK).saturating_mul(2))?;
         let mut out: Vec<f32> = Vec::new();
         let mut decoded: Vec<f32> = Vec::new();
         let (mut seen, mut wanted) = (0u64, 1u64);

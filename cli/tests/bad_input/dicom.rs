@@ -143,7 +143,7 @@ pub fn cases() -> Vec<Case> {
             &["PixelData", "segment"],
         ),
         refused(
-            "JPEG 2000",
+            "a packing that is not known",
             changed(dicom, FILE, |b| {
                 let at = find(b, [2, 0, 0x10, 0]) + 8;
                 b[at..at + 20].copy_from_slice(b"1.2.840.10008.1.2.9\0");

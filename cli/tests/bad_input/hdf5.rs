@@ -64,7 +64,7 @@ pub fn cases() -> Vec<Case> {
             "no projection",
             keyed(keys([2, 1, 0, 0, 0, 1]), keys([2, 1, 1, 1, 1, 1])),
             IMPORT,
-            &["image_key", "(0)"],
+            &["image_key", "key 0"],
         ),
         refused(
             "no open beam",

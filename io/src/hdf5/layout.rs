@@ -89,15 +89,15 @@ impl Layout {
                     return Err(file.invalid(&format!("{frames} @dim0"), format!("\"{axis}\""), "\"angle\""));
                 }
                 let (key, what) = match part {
-                    ScanPart::Projections => (0, "projection (0)"),
-                    ScanPart::Flat => (1, "open beam (1)"),
-                    ScanPart::Dark => (2, "dark field (2)"),
+                    ScanPart::Projections => (0, "key 0 (projections)"),
+                    ScanPart::Flat => (1, "key 1 (open beam)"),
+                    ScanPart::Dark => (2, "key 2 (dark field)"),
                 };
                 match self.keys(file)? {
                     None if part == ScanPart::Projections => Ok((data, None)),
-                    None => Err(file.invalid(frames, "no image_key", format!("image keys that tell the {what}"))),
+                    None => Err(file.invalid(frames, "no image_key", format!("image keys, and frames of {what}"))),
                     Some(keys) if !keys.contains(&key) => {
-                        Err(file.invalid("image_key", "no such frame", format!("a frame of the {what}")))
+                        Err(file.invalid("image_key", "no such frame", format!("frames of {what}")))
                     }
                     Some(keys) => {
                         file.one_each(&data, keys.len(), file.shape(&data)?[0])?;

@@ -54,13 +54,11 @@ impl Head {
         let pages = shape[2];
         let text =
             format!("ImageJ=1.54f\nimages={pages}\nslices={pages}\nunit=mm\nspacing={}\nloop=false\n\0", spacing[2]);
-        // A fraction of numbers of 32 bits keeps six digits of sizes from a nanometre to a kilometre.
+        // The largest power of ten whose product with the size fits: decimal sizes are kept.
         let ratio = |s: f64| {
-            if s < 1.0 {
-                [(1e6 / s).round().min(4e9) as u32, 1_000_000]
-            } else {
-                [1_000_000, (1e6 * s).min(4e9) as u32]
-            }
+            let fits = |n: &u32| f64::from(*n) * s <= f64::from(u32::MAX);
+            let top = (0..10).rev().map(|k| 10u32.pow(k)).find(fits).unwrap_or(1);
+            [top, (f64::from(top) * s).round() as u32]
         };
         let head = Self { shape, resolution: [ratio(spacing[0]), ratio(spacing[1])], text, big: false };
         let classic = head.length() + 4 * shape.iter().product::<u64>() <= CLASSIC;
