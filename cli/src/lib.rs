@@ -12,6 +12,7 @@
 //! # }
 //! ```
 
+mod board;
 mod boundary;
 mod commands;
 mod live;

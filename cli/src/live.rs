@@ -6,7 +6,7 @@ use conefield_core::geometry::VoxelGrid;
 use conefield_core::parts::Part;
 use conefield_report::MiddleSlices;
 use ndarray::Array3;
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 use std::time::{Duration, Instant};
 
 /// The picture, and how often it is drawn.
@@ -27,12 +27,12 @@ impl Live {
         self.last.elapsed() >= self.every
     }
 
-    /// Draws `slices` of `grid`. The picture replaces the last one at once.
-    pub fn draw(&mut self, grid: VoxelGrid, slices: &[(Part, Array3<f32>)]) -> Result<()> {
+    /// Draws `slices` of `grid`; where the picture is. It replaces the last one at once.
+    pub fn draw(&mut self, grid: VoxelGrid, slices: &[(Part, Array3<f32>)]) -> Result<&Path> {
         let mut middle = MiddleSlices::new(grid);
         slices.iter().for_each(|(part, values)| middle.gather(part, values.view()));
         files::picture(&self.path, None, &middle)?;
         self.last = Instant::now();
-        Ok(())
+        Ok(&self.path)
     }
 }

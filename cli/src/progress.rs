@@ -1,5 +1,6 @@
 //! Progress on standard error: bars on a terminal, else lines of the log.
 
+use crate::board::Board;
 use crate::live::Live;
 use crate::{files, signals};
 use conefield_core::Result;
@@ -40,11 +41,13 @@ pub struct Progress {
     bar: ProgressBar,
     told: Instant,
     what: String,
+    step: u64,
     latest: Record,
     records: Vec<Record>,
     log: Option<(PathBuf, File)>,
     keeper: Option<Keeper>,
     live: Option<Live>,
+    board: Option<Board>,
 }
 
 /// Where checkpoints go, how often, and what they say of the run.
@@ -71,11 +74,13 @@ impl Progress {
             bar,
             told: Instant::now(),
             what: what.into(),
+            step: 0,
             latest: Record::default(),
             records: vec![],
             log,
             keeper: None,
             live: None,
+            board: None,
         }
     }
 
@@ -89,6 +94,27 @@ impl Progress {
     pub fn showing(mut self, live: Option<Live>) -> Self {
         self.live = live;
         self
+    }
+
+    /// With a file for TensorBoard.
+    pub fn reporting(mut self, board: Option<Board>) -> Self {
+        self.board = board;
+        self
+    }
+
+    /// Gives back the file for TensorBoard.
+    pub fn take_board(&mut self) -> Option<Board> {
+        self.board.take()
+    }
+
+    /// Does something with the file for TensorBoard. Where that fails, the run goes on without.
+    fn on_board(&mut self, f: impl FnOnce(&mut Board) -> Result<()>) {
+        if let Some(board) = &mut self.board
+            && let Err(e) = f(board)
+        {
+            warn!("{e}; nothing more is written for TensorBoard");
+            self.board = None;
+        }
     }
 
     /// The records so far.
@@ -137,6 +163,7 @@ impl Progress {
 
 impl Observer for Progress {
     fn progress(&mut self, step: u64, share: f64, seconds_left: f64) {
+        self.step = step;
         self.show(share, |me| me.line(step, seconds_left));
     }
 
@@ -153,6 +180,7 @@ impl Observer for Progress {
                 self.log = None;
             }
         }
+        self.on_board(|board| serde_json::to_value(record).map_or(Ok(()), |record| board.record(&record)));
     }
 
     fn note(&mut self, text: &str) {
@@ -180,7 +208,10 @@ impl Observer for Progress {
     }
 
     fn slices(&mut self, grid: VoxelGrid, slices: &[(Part, Array3<f32>)]) -> Result<()> {
-        self.live.as_mut().map_or(Ok(()), |live| live.draw(grid, slices))
+        let Some(live) = &mut self.live else { return Ok(()) };
+        let (picture, step) = (live.draw(grid, slices)?.to_path_buf(), self.step);
+        self.on_board(|board| board.picture(step, "live", &picture));
+        Ok(())
     }
 }
 

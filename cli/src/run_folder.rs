@@ -1,4 +1,4 @@
-//! The folder of a run: `metrics.jsonl`, `spec.toml`, `live.png` if asked for, while it lasts `checkpoint.safetensors`, at the end
+//! The folder of a run: `metrics.jsonl`, `spec.toml`, `live.png` and `events.out.tfevents.conefield` if asked for, while it lasts `checkpoint.safetensors`, at the end
 //! `volume.nii.gz`, `weights.safetensors`, `slices.png` and, last and only of a finished run, `record.json`.
 
 use conefield_core::error::ensure;
@@ -14,13 +14,14 @@ use std::io::ErrorKind;
 use std::path::{Path, PathBuf};
 
 /// Every file that a run writes.
-pub const FILES: [&str; 8] = [
+pub const FILES: [&str; 9] = [
     "volume.nii.gz",
     "metrics.jsonl",
     "spec.toml",
     "weights.safetensors",
     "slices.png",
     "live.png",
+    "events.out.tfevents.conefield",
     "record.json",
     "checkpoint.safetensors",
 ];

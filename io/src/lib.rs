@@ -1,13 +1,16 @@
 //! Every file that conefield reads or writes, each format in one module.
 //!
-//! - Volumes: [`read_volume`], [`write_volume`], [`write_voxels`] (NIfTI, MetaImage, NumPy; a DICOM series in).
+//! - Volumes: [`read_volume`], [`write_volume`], [`write_voxels`] (NIfTI, MetaImage, NumPy; a DICOM series
+//!   in; NRRD, a TIFF stack, OME-Zarr out).
 //! - Scans: [`read_scan`], [`read_truth`], [`write_scan`] (conefield's own folder), [`read_r2`], [`write_r2`]
 //!   (R2-Gaussian's folder), [`read_naf`], [`write_naf`] (NAF's file), [`write_rtk`] (for RTK); [`read_data_set`] also
 //!   reads test views.
-//! - Projections as scanners give them: [`read_scanner`] (a description in TOML; TIFF, NumPy, RTK's XML geometry).
+//! - Projections as scanners give them: [`read_scanner`] (a description in TOML; TIFF, NumPy, HDF5, RTK's XML geometry;
+//!   Nikon's description).
 //! - Part of a scan, with its geometry: [`Selection`].
 //! - Sizes, before memory is taken: [`scan_size`], [`scanner_size`], [`volume_voxels`].
 //! - Weights: [`read_weights`], [`write_weights`]; checkpoints: [`read_checkpoint`], [`write_checkpoint`] (safetensors).
+//! - Curves and pictures for TensorBoard: [`EventFile`].
 //!
 //! Readers tell a format from what a file holds, check a header before they take memory for what it claims, and
 //! refuse with the file, the field, what was found and what was expected. Lengths are converted once, here: inside
@@ -23,9 +26,11 @@ mod atomic;
 mod checkpoint;
 mod counts;
 mod dicom;
+mod events;
 mod file_order;
 mod filling;
 mod folder;
+mod hdf5;
 mod input;
 mod lease;
 mod lock;
@@ -35,6 +40,7 @@ mod naf;
 mod nifti;
 mod npy;
 mod npz;
+mod nrrd;
 mod number;
 mod orbit;
 mod pickle;
@@ -54,6 +60,7 @@ mod tiff;
 mod unit;
 mod volume;
 mod weights;
+mod zarr;
 
 #[cfg(test)]
 mod testing;
@@ -61,6 +68,7 @@ mod testing;
 pub use atomic::{discard_unfinished, is_unfinished, write_atomic, write_folder_atomic, write_text_atomic};
 pub use checkpoint::{read_checkpoint, write_checkpoint};
 pub use counts::{Correction, CountsReport, OpenBeam, line_integrals};
+pub use events::EventFile;
 pub use file_order::{PACKED_BYTES, SLAB_BYTES};
 pub use lease::{Contents, FolderLock, Lease, Progressed, SharedLease, is_aside, try_alone};
 pub use naf::{read_naf, write_naf};

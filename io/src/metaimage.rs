@@ -6,6 +6,7 @@ use crate::file_order::{self, FileOrder, PACKED_BYTES};
 use crate::folder;
 use crate::input::Input;
 use crate::number::{ByteOrder, Number};
+use crate::write_atomic;
 use conefield_core::geometry::{VoxelGrid, norm};
 use conefield_core::parts::Voxels;
 use conefield_core::scan::Volume;
@@ -308,6 +309,37 @@ fn skip_header(header: &Header, data: &mut Input, compressed: bool, want: u64) -
 /// Writes `voxels` as `f32`, compressed, in one file.
 pub(crate) fn write(w: &mut dyn Write, path: &Path, voxels: &mut dyn Voxels) -> Result<()> {
     let io = |e| Error::io(path, e);
+    // The size of the packed data stands before it: pack it aside, in memory while it is small.
+    let folder = path.parent().filter(|p| !p.as_os_str().is_empty()).unwrap_or(Path::new("."));
+    let mut packed =
+        ZlibEncoder::new(tempfile::spooled_tempfile_in(PACKED_BYTES as usize, folder), Compression::fast());
+    file_order::write(&mut packed, path, voxels, FileOrder::XFastest)?;
+    let mut packed = packed.finish().map_err(io)?;
+    let size = packed.stream_position().map_err(io)?;
+    packed.rewind().map_err(io)?;
+    let packing = format!("CompressedData = True\nCompressedDataSize = {size}");
+    let text = lines(path, voxels, &packing, "LOCAL");
+    w.write_all(text.as_bytes()).map_err(io)?;
+    std::io::copy(&mut packed, w).map_err(io)?;
+    Ok(())
+}
+
+/// Writes a header, `path`, and beside it the voxels as they are: 32-bit floats, little-endian, x fastest, in a file of the same name
+/// that ends in `.raw`. One that is there without the header belongs to something else and is spared.
+pub(crate) fn write_raw(path: &Path, voxels: &mut dyn Voxels) -> Result<()> {
+    let raw = path.with_extension("raw");
+    let name = raw.file_name().map(|n| n.to_string_lossy().into_owned()).unwrap_or_default();
+    if raw.exists() && !path.exists() {
+        let found = format!("{name} without its header");
+        return Err(Error::invalid(path.display().to_string(), "output", found, "a name of which nothing is there"));
+    }
+    write_atomic(&raw, |w| file_order::write(w, &raw, voxels, FileOrder::XFastest))?;
+    let text = lines(path, voxels, "CompressedData = False", &name);
+    write_atomic(path, |w| w.write_all(text.as_bytes()).map_err(|e| Error::io(path, e)))
+}
+
+/// The header's lines.
+fn lines(path: &Path, voxels: &dyn Voxels, packing: &str, data: &str) -> String {
     let grid = voxels.grid();
     let (ras, _) = affine::of(voxels, &path.display().to_string());
     // The grid's sizes and the lengths of the affine's columns may differ in the last bits: keep the former.
@@ -318,26 +350,15 @@ pub(crate) fn write(w: &mut dyn Write, path: &Path, voxels: &mut dyn Voxels) -> 
     });
     let lps = affine::flip(ras);
     let turn = (0..3).flat_map(|k| affine::column(&lps, k).map(|x| x / spacing[k]));
-    // The size of the packed data stands before it: pack it aside, in memory while it is small.
-    let folder = path.parent().filter(|p| !p.as_os_str().is_empty()).unwrap_or(Path::new("."));
-    let mut packed =
-        ZlibEncoder::new(tempfile::spooled_tempfile_in(PACKED_BYTES as usize, folder), Compression::fast());
-    file_order::write(&mut packed, path, voxels, FileOrder::XFastest)?;
-    let mut packed = packed.finish().map_err(io)?;
-    let size = packed.stream_position().map_err(io)?;
-    packed.rewind().map_err(io)?;
     let [nx, ny, nz] = grid.shape;
-    let text = format!(
-        "ObjectType = Image\nNDims = 3\nBinaryData = True\nBinaryDataByteOrderMSB = False\nCompressedData = True\n\
-         CompressedDataSize = {size}\nTransformMatrix = {}\nOffset = {}\nCenterOfRotation = 0 0 0\n\
-         ElementSpacing = {}\nDimSize = {nx} {ny} {nz}\nElementType = MET_FLOAT\nElementDataFile = LOCAL\n",
+    format!(
+        "ObjectType = Image\nNDims = 3\nBinaryData = True\nBinaryDataByteOrderMSB = False\n{packing}\n\
+         TransformMatrix = {}\nOffset = {}\nCenterOfRotation = 0 0 0\n\
+         ElementSpacing = {}\nDimSize = {nx} {ny} {nz}\nElementType = MET_FLOAT\nElementDataFile = {data}\n",
         list(turn),
         list(affine::column(&lps, 3)),
         list(spacing),
-    );
-    w.write_all(text.as_bytes()).map_err(io)?;
-    std::io::copy(&mut packed, w).map_err(io)?;
-    Ok(())
+    )
 }
 
 /// Numbers so that reading them gives the same bits.

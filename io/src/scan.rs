@@ -34,7 +34,7 @@ pub(crate) enum ScanFile {
 
 /// Reads a scan from conefield's own folder (`scan.toml` or `scan.json`), R2-Gaussian's (`meta_data.json`, the training
 /// views), NAF's pickle (the training views), whatever that is called, or what a scanner gave as its description says
-/// (`scanner.toml`, see [`read_scanner`](crate::read_scanner)). For folders, the file that describes them may be named
+/// (`scanner.toml` or Nikon's `.xtekct`, see [`read_scanner`](crate::read_scanner)). For folders, the file that describes them may be named
 /// as well.
 pub fn read_scan(path: impl AsRef<Path>) -> Result<Scan> {
     match find(path.as_ref())? {
@@ -69,11 +69,14 @@ pub fn read_truth(path: impl AsRef<Path>) -> Result<Option<Volume>> {
 pub(crate) fn find(path: &Path) -> Result<ScanFile> {
     let place = path.display().to_string();
     let understood = "a folder with scan.toml or scan.json (conefield), scanner.toml (a scanner's images) or \
-                      meta_data.json (R2-Gaussian), or a pickle (NAF)";
+                      meta_data.json (R2-Gaussian), a pickle (NAF) or Nikon's .xtekct";
     let info = path.metadata().map_err(|e| Error::io(path, e))?;
     if !info.is_dir() {
         if pickle::is_pickle(path)? {
             return Ok(ScanFile::Naf(path.to_path_buf()));
+        }
+        if scanner::is_xtekct(path) {
+            return Ok(ScanFile::Scanner(path.to_path_buf()));
         }
         let folder = path.parent().filter(|p| !p.as_os_str().is_empty()).unwrap_or(Path::new("."));
         return match (path.file_name().and_then(|n| n.to_str()), path.extension().and_then(|e| e.to_str())) {

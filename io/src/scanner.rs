@@ -38,9 +38,19 @@
 //!
 //! `[vectors]` has `cone_vec = [[...], ...]`, ASTRA's twelve numbers a view: source, detector centre, the step to the
 //! next column (u) and to the next row (v), all in mm here, or the name of a file with them. `[rtk]` has `file`, `pixel` and `offset`; see
-//! [`read_rtk_geometry`]. All lengths are mm; angles are degrees, as their keys say.
+//! [`read_rtk_geometry`]. `[cil]` has the `file` that CIL wrote. All lengths are mm; angles are degrees, as their keys say.
+//!
+//! Where a file is HDF5, `scan.h5:/PATH` names a data set in it; `scan.h5` alone stands for the projections, the open beam, the dark
+//! field or the angles that DXchange, NXtomo or CIL keep there. A description of Nikon's, `.xtekct`, stands for one of these.
+
+mod cil;
+mod turning;
+mod xtekct;
+
+pub(crate) use xtekct::is_xtekct;
 
 use crate::counts::{Correction, CountsReport, OpenBeam, line_integrals};
+use crate::hdf5::ScanPart;
 use crate::rtk::read_rtk_geometry;
 use crate::selection::{Mean, Selection};
 use crate::stack::{self, Names, StackAxis, StackLayout};
@@ -62,6 +72,8 @@ pub(crate) const VERSION: u32 = 1;
 
 /// Numbers of a view in ASTRA's notation.
 const VECTOR: usize = 12;
+
+const GEOMETRIES: &str = "one of [circle], [vectors], [rtk] and [cil]";
 
 /// The counts of the open beam where no flat field says them.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -105,11 +117,22 @@ struct Description {
     circle: Option<Circle>,
     vectors: Option<Vectors>,
     rtk: Option<Rtk>,
+    cil: Option<Cil>,
     #[serde(default)]
     layout: LayoutTable,
     #[serde(default)]
     values: ValuesTable,
     volume: VoxelGrid,
+    /// Rows and columns of the detector, where a description says them beside the images.
+    #[serde(skip)]
+    detector: Option<[usize; 2]>,
+}
+
+impl Description {
+    /// Reads the description `path`, by its name Nikon's or the project's own.
+    fn read(path: &Path) -> Result<Self> {
+        if is_xtekct(path) { xtekct::description(path) } else { described(path, FORMAT, VERSION) }
+    }
 }
 
 #[derive(Deserialize)]
@@ -178,6 +201,12 @@ struct Rtk {
 }
 
 #[derive(Deserialize)]
+#[serde(deny_unknown_fields)]
+struct Cil {
+    file: String,
+}
+
+#[derive(Deserialize)]
 #[serde(deny_unknown_fields, default)]
 struct LayoutTable {
     axes: [StackAxis; 3],
@@ -216,7 +245,7 @@ struct ValuesTable {
     flat_includes_dark: Option<bool>,
 }
 
-/// Reads the scan that the TOML (or JSON) file `path` describes; the module's source shows its keys.
+/// Reads the scan that the TOML (or JSON) file `path`, or Nikon's `.xtekct`, describes; the module's source shows its keys.
 ///
 /// Files are relative to the description's folder and stay in it. Counts become line integrals as
 /// [`line_integrals`](crate::line_integrals) says; one of a flat field, `i0` and `options.i0` must be there. The
@@ -224,14 +253,18 @@ struct ValuesTable {
 pub fn read_scanner(path: impl AsRef<Path>, options: &ImportOptions) -> Result<Imported> {
     let path = path.as_ref();
     let place = path.display().to_string();
-    let d: Description = described(path, FORMAT, VERSION)?;
+    let d = Description::read(path)?;
     let folder = scan_folder::folder_of(path);
     d.volume.validate(&place)?;
     let layout = layout(&place, &d.layout)?;
     let i0 = i0(&place, &d, options)?;
-    let read = |field: &str, names: &Names| stack::read_field(folder, &place, field, names, layout);
-    let values = stack::read(folder, &place, "files.projections", &d.files.projections, layout)?;
+    let read = |field: &str, part, names: &Names| stack::read_field(folder, &place, field, part, names, layout);
+    let values = stack::read(folder, &place, "files.projections", ScanPart::Projections, &d.files.projections, layout)?;
     let (count, rows, columns) = values.dim();
+    if let Some([r, c]) = d.detector.filter(|found| *found != [rows, columns]) {
+        let expected = format!("{r} x {c} (rows x columns), as the detector has");
+        return Err(Error::invalid(&place, "files.projections", format!("{rows} x {columns}"), expected));
+    }
     let views = views(folder, &place, &d, count)?;
     let geometry = Geometry { detector: [rows, columns], views, volume: d.volume };
     geometry.validate(&place)?;
@@ -244,10 +277,10 @@ pub fn read_scanner(path: impl AsRef<Path>, options: &ImportOptions) -> Result<I
             None => {
                 let expected = "files.flat, values.i0 or --i0; or values.kind = \"line-integrals\" if they are";
                 let lacks = || Error::invalid(&place, "files.flat", "nothing to compare counts with", expected);
-                OpenBeam::Flat(read("files.flat", d.files.flat.as_ref().ok_or_else(lacks)?)?)
+                OpenBeam::Flat(read("files.flat", ScanPart::Flat, d.files.flat.as_ref().ok_or_else(lacks)?)?)
             }
         };
-        let dark = d.files.dark.as_ref().map(|n| read("files.dark", n)).transpose()?;
+        let dark = d.files.dark.as_ref().map(|n| read("files.dark", ScanPart::Dark, n)).transpose()?;
         let open = match (open, &dark, d.values.flat_includes_dark) {
             // The formula takes the dark field off again. Fields of two shapes are told there.
             (OpenBeam::Flat(flat), Some(dark), Some(false)) if flat.dim() == dark.dim() => OpenBeam::Flat(flat + dark),
@@ -274,7 +307,7 @@ pub fn read_scanner(path: impl AsRef<Path>, options: &ImportOptions) -> Result<I
 /// The size of the scan that the description `path` leads to. Arranging the values and converting counts take copies.
 pub(crate) fn size(path: &Path) -> Result<ScanSize> {
     let place = path.display().to_string();
-    let d: Description = described(path, FORMAT, VERSION)?;
+    let d = Description::read(path)?;
     d.volume.validate(&place)?;
     let folder = scan_folder::folder_of(path);
     let pixels = stack::values(folder, &place, "files.projections", &d.files.projections)?;
@@ -347,8 +380,8 @@ fn views(folder: &Path, place: &str, d: &Description, count: usize) -> Result<Ve
         let expected = format!("{count}, one for each view in the projections");
         ensure(n == count, place, field, format!("{n} of them"), expected)
     };
-    match (&d.circle, &d.vectors, &d.rtk) {
-        (Some(c), None, None) => {
+    match (&d.circle, &d.vectors, &d.rtk, &d.cil) {
+        (Some(c), None, None, None) => {
             let angles = angles(folder, place, c, count)?;
             fits("circle.angles_deg", angles.len())?;
             for (field, x) in [("circle.dso", c.dso), ("circle.dsd", c.dsd)] {
@@ -365,7 +398,7 @@ fn views(folder: &Path, place: &str, d: &Description, count: usize) -> Result<Ve
             let orbit = CircularOrbit { dso: c.dso, dsd: c.dsd, pixel, offset, angles };
             Ok(orbit.views().into_iter().map(|v| v.tilted(tilt)).collect())
         }
-        (None, Some(v), None) => {
+        (None, Some(v), None, None) => {
             let field = "vectors.cone_vec";
             let read;
             let rows = match &v.cone_vec {
@@ -385,15 +418,20 @@ fn views(folder: &Path, place: &str, d: &Description, count: usize) -> Result<Ve
             fits(field, views.len())?;
             Ok(views)
         }
-        (None, None, Some(r)) => {
+        (None, None, Some(r), None) => {
             lengths(place, "rtk", r.pixel, r.offset)?;
             let file = folder::inside(folder, place, "rtk.file", &r.file)?;
             let views = read_rtk_geometry(file, [r.pixel.v, r.pixel.u], [r.offset.v, r.offset.u])?;
             fits("rtk.file", views.len())?;
             Ok(views)
         }
-        (None, None, None) => Err(Error::invalid(place, "circle", "nothing", "one of [circle], [vectors] and [rtk]")),
-        _ => Err(Error::invalid(place, "circle", "several geometries", "one of [circle], [vectors] and [rtk]")),
+        (None, None, None, Some(c)) => {
+            let views = cil::views(&folder::inside(folder, place, "cil.file", &c.file)?)?;
+            fits("cil.file", views.len())?;
+            Ok(views)
+        }
+        (None, None, None, None) => Err(Error::invalid(place, "circle", "nothing", GEOMETRIES)),
+        _ => Err(Error::invalid(place, "circle", "several geometries", GEOMETRIES)),
     }
 }
 

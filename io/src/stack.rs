@@ -1,5 +1,6 @@
-//! Stacks of projections and single fields, from TIFF, `.npy`, `.npz` and MetaImage, brought into the order `[view, row, column]`.
+//! Stacks of projections and single fields, from TIFF, `.npy`, `.npz`, MetaImage and HDF5, brought into the order `[view, row, column]`.
 
+use crate::hdf5::{self, ScanPart};
 use crate::input::Input;
 use crate::{folder, memory, metaimage, npy, npz, tiff};
 use conefield_core::{Error, Result};
@@ -57,7 +58,7 @@ pub(crate) enum Names {
     Many(Vec<String>),
 }
 
-/// A file and, for `.npz`, the array in it.
+/// A file and, for `.npz` and HDF5, the array in it.
 struct StackFile {
     path: PathBuf,
     array: Option<String>,
@@ -66,15 +67,22 @@ struct StackFile {
 /// Reads a stack `[view, row, column]`: files one after the other, each with one view (two axes) or several.
 ///
 /// Names are relative to `folder` and stay in it; a folder stands for its TIFF files, or its `.npy` files if it has
-/// none, in the order of the numbers in their names.
-pub(crate) fn read(folder: &Path, place: &str, field: &str, names: &Names, layout: StackLayout) -> Result<Array3<f32>> {
+/// none, in the order of the numbers in their names. Of an HDF5 file that holds a whole scan, `part` is read.
+pub(crate) fn read(
+    folder: &Path,
+    place: &str,
+    field: &str,
+    part: ScanPart,
+    names: &Names,
+    layout: StackLayout,
+) -> Result<Array3<f32>> {
     let sources = sources(folder, place, field, names)?;
     let mut named = folder::NamedFiles::default();
     sources.iter().try_for_each(|s| named.once(place, field, &s.path, s.array.as_deref()))?;
     let mut all: Option<(Vec<f32>, [usize; 2], usize)> = None;
     let single = sources.len() == 1;
     for source in &sources {
-        let stack = layout.arrange(&source.path.display().to_string(), raw(source, layout.views())?)?;
+        let stack = layout.arrange(&source.path.display().to_string(), raw(source, part, layout.views())?)?;
         if single {
             return Ok(stack);
         }
@@ -107,6 +115,8 @@ pub(crate) fn values(folder: &Path, place: &str, field: &str, names: &Names) -> 
             tiff::values(&path)?
         } else if head.starts_with(npy::MAGIC) {
             product(&npy::shape(&mut input, head)?)
+        } else if head == hdf5::MAGIC {
+            product(&hdf5::shape(&path, array.as_deref(), ScanPart::Projections)?)
         } else if is_metaimage(&mut input, &head)? {
             product(&metaimage::shape(&path)?)
         } else {
@@ -128,15 +138,16 @@ pub(crate) fn read_field(
     folder: &Path,
     place: &str,
     field: &str,
+    part: ScanPart,
     names: &Names,
     layout: StackLayout,
 ) -> Result<Array2<f32>> {
-    let stack = read(folder, place, field, names, layout)?;
+    let stack = read(folder, place, field, part, names, layout)?;
     stack.mean_axis(Axis(0)).ok_or_else(|| Error::invalid(place, field, "no image", "at least one"))
 }
 
 /// The file's array with three axes in its own order; an image gets an axis of one view at `views`.
-fn raw(source: &StackFile, views: usize) -> Result<Array3<f32>> {
+fn raw(source: &StackFile, part: ScanPart, views: usize) -> Result<Array3<f32>> {
     let path = &source.path;
     let place = path.display().to_string();
     let three = |a: ArrayD<f32>| {
@@ -149,19 +160,23 @@ fn raw(source: &StackFile, views: usize) -> Result<Array3<f32>> {
     if head.starts_with(npz::MAGIC) {
         return three(npz::read(path, source.array.as_deref(), sets)?);
     }
-    if let Some(array) = &source.array {
-        let expected = "an .npz archive, the only file whose arrays have names";
-        return Err(Error::invalid(place, "array", format!("the name \"{array}\""), expected));
-    }
-    if head.starts_with(npy::MAGIC) {
-        return three(npy::read_one_of(&mut input, head, sets)?);
-    }
-    // Pages, and slices of MetaImage, are always views: they go where the layout expects them.
+    // Pages, slices of MetaImage and frames of a scan in HDF5 are always views: they go where the layout expects them.
     let pages = |a: Array3<f32>| match views {
         1 => a.permuted_axes([1, 0, 2]),
         2 => a.permuted_axes([1, 2, 0]),
         _ => a,
     };
+    if head == hdf5::MAGIC {
+        let stored = hdf5::read(path, source.array.as_deref(), part)?;
+        return three(stored.values).map(|a| if stored.frames_first { pages(a) } else { a });
+    }
+    if let Some(array) = &source.array {
+        let expected = "an .npz archive or an HDF5 file, whose arrays have names";
+        return Err(Error::invalid(place, "array", format!("the name \"{array}\""), expected));
+    }
+    if head.starts_with(npy::MAGIC) {
+        return three(npy::read_one_of(&mut input, head, sets)?);
+    }
     if tiff::is_tiff(&head) {
         return Ok(pages(tiff::read(path)?));
     }
@@ -169,8 +184,8 @@ fn raw(source: &StackFile, views: usize) -> Result<Array3<f32>> {
         // Columns are its x, rows its y.
         return Ok(pages(metaimage::read(path)?.data.reversed_axes()));
     }
-    let expected = "TIFF (49 49 2a 00 or 4d 4d 00 2a), NumPy's .npy (93 4e 55 4d) or .npz (50 4b 03 04), or MetaImage \
-                    (NDims = 3)";
+    let expected = "TIFF (49 49 2a 00 or 4d 4d 00 2a), NumPy's .npy (93 4e 55 4d) or .npz (50 4b 03 04), HDF5 \
+                    (89 48 44 46) or MetaImage (NDims = 3)";
     Err(Error::invalid(place, "format", format!("{head:02x?} at the start"), expected))
 }
 
@@ -191,7 +206,10 @@ fn sources(folder: &Path, place: &str, field: &str, names: &Names) -> Result<Vec
 fn source(folder: &Path, place: &str, field: &str, name: &str) -> Result<Vec<StackFile>> {
     let (file, array) = match name.split_once(".npz:") {
         Some((stem, array)) => (format!("{stem}.npz"), Some(array.to_string())),
-        None => (name.to_string(), None),
+        None => {
+            let (file, array) = hdf5::split(name);
+            (file.to_string(), array.map(str::to_owned))
+        }
     };
     let path = folder::within(folder, place, field, &file)?;
     if path.is_file() {
@@ -286,7 +304,8 @@ mod tests {
             let image = npy_bytes("|u1", false, "(1, 2)", &[i as u8, 7]);
             std::fs::write(at(&format!("views/p{i}.npy")), image).unwrap();
         }
-        let read = |names: Names| super::read(dir.path(), "s.toml", "files.projections", &names, PLAIN);
+        let read =
+            |names: Names| super::read(dir.path(), "s.toml", "files.projections", ScanPart::Projections, &names, PLAIN);
         let one = |n: &str| read(Names::One(n.into()));
         assert_eq!(one("views").unwrap().slice(ndarray::s![.., 0, 0]).to_vec(), [1.0, 2.0, 10.0]);
         let many = |n: &[&str]| read(Names::Many(n.iter().map(|s| s.to_string()).collect()));

@@ -1,7 +1,7 @@
-//! Numbers for each view, in a file beside a description: text (CSV and the like) or NumPy's arrays.
+//! Numbers for each view, in a file beside a description: text (CSV and the like), NumPy's arrays or HDF5.
 
 use crate::input::Input;
-use crate::{folder, npy, npz};
+use crate::{folder, hdf5, npy, npz};
 use conefield_core::files::read_text;
 use conefield_core::{Error, Result};
 use serde::Deserialize;
@@ -16,14 +16,15 @@ const LONGEST: u64 = 64 << 20;
 pub(crate) enum Numbers<T> {
     /// As the description has it.
     List(Vec<T>),
-    /// `FILE`, `FILE.npz:ARRAY` or `FILE.csv:COLUMN`.
+    /// `FILE`, `FILE.npz:ARRAY`, `FILE.h5:/PATH` or `FILE.csv:COLUMN`.
     File(String),
 }
 
 /// The rows of `width` numbers each in the file `name` of `folder`.
 ///
 /// Text has a row a line, its numbers apart by commas, semicolons or blanks; what follows `#` and a first line without a
-/// number are left out. Where rows are one number wide, `FILE.csv:NAME` takes the column under that name. Refuses rows of another
+/// number are left out. Where rows are one number wide, `FILE.csv:NAME` takes the column under that name. HDF5 gives the data
+/// set of that name, or the angles of a scan's projections. Refuses rows of another
 /// width and numbers that are not finite.
 pub(crate) fn read(folder: &Path, place: &str, field: &str, name: &str, width: usize) -> Result<Vec<Vec<f64>>> {
     let (file, part) = split(name);
@@ -31,6 +32,10 @@ pub(crate) fn read(folder: &Path, place: &str, field: &str, name: &str, width: u
     let mut input = Input::open(&path)?;
     let head = input.take(8)?;
     let packed = head.starts_with(npz::MAGIC);
+    if head == hdf5::MAGIC {
+        let (shape, values) = hdf5::read_exact(&path, part)?;
+        return finite(&path, arrayed(&path, &shape, values, width)?);
+    }
     let rows = match (packed || head.starts_with(npy::MAGIC), part) {
         (true, Some(array)) if !packed => {
             let expected = "an .npz archive, the only file of NumPy whose arrays have names";
@@ -43,6 +48,10 @@ pub(crate) fn read(folder: &Path, place: &str, field: &str, name: &str, width: u
         }
         (false, column) => texts(&path, column, width)?,
     };
+    finite(&path, rows)
+}
+
+fn finite(path: &Path, rows: Vec<Vec<f64>>) -> Result<Vec<Vec<f64>>> {
     for (i, row) in rows.iter().enumerate() {
         if let Some(x) = row.iter().find(|x| !x.is_finite()) {
             return Err(Error::invalid(path.display().to_string(), format!("row {i}"), x, "finite numbers"));

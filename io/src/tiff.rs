@@ -1,6 +1,11 @@
-//! TIFF as detectors write it: one grey channel, integers or floats, one image a page.
+//! TIFF as detectors write it: one grey channel, integers or floats, one image a page; plain or packed by LZW, deflate, PackBits or
+//! Zstandard. Out, a page a slice ([`write`]).
 
 mod entries;
+mod write;
+mod zstd;
+
+pub(crate) use write::{check_shape, write};
 
 use crate::input::must_unpack;
 use crate::memory;
@@ -39,6 +44,9 @@ pub(crate) fn read(path: &Path) -> Result<Array3<f32>> {
         memory::grow(&mut values, count, usize::MAX, &place, "pages")?;
         // The page as it is stored, and what its pieces are unpacked to.
         allowance::memory(&place, "page", page.bytes.saturating_mul(2))?;
+        if zstd::is_packed(decoder) {
+            return zstd::read(&place, decoder, page.size, page.bits, &mut values);
+        }
         append(&mut values, decoder.read_image().map_err(|e| broken(&place, &e))?);
         Ok(())
     })?;
@@ -57,6 +65,9 @@ struct Page {
     pixels: u64,
     /// Bytes that they take unpacked.
     bytes: u64,
+    bits: u8,
+    /// Rows and columns.
+    size: [usize; 2],
 }
 
 /// Goes through the pages without unpacking them; their number, rows and columns.
@@ -99,7 +110,7 @@ fn pages(
         limits.decoding_buffer_size = usize::try_from(most).unwrap_or(usize::MAX);
         (limits.ifd_value_size, limits.intermediate_buffer_size) = [limits.decoding_buffer_size; 2].into();
         decoder = decoder.with_limits(limits);
-        each(&mut decoder, Page { pixels, bytes })?;
+        each(&mut decoder, Page { pixels, bytes, bits, size: [height as usize, width as usize] })?;
         pages += 1;
         if !decoder.more_images() {
             break;
@@ -163,6 +174,42 @@ mod tests {
         each!(kind::Gray32, u32);
         each!(kind::GrayI16, i16);
         each!(kind::Gray32Float, f32);
+    }
+
+    /// Written by tifffile (`tests/fixtures/make_formats.py`): the i-th value is 9000 + 97 i, or a seventh of that.
+    const ZSTD: &[(&str, &[u8])] = &[
+        ("strips", include_bytes!("../tests/fixtures/zstd.tif")),
+        ("floats", include_bytes!("../tests/fixtures/zstd_floats.tif")),
+        ("tiles", include_bytes!("../tests/fixtures/zstd_tiles.tif")),
+    ];
+
+    #[test]
+    fn zstandard_is_read_in_strips_and_tiles() {
+        let dir = tempfile::tempdir().unwrap();
+        let path = dir.path().join("a.tif");
+        let count = |i: usize| 9000.0 + 97.0 * i as f32;
+        for (name, bytes) in ZSTD {
+            std::fs::write(&path, bytes).unwrap();
+            let a = read(&path).unwrap();
+            let want = |p: usize, r: usize, c: usize| match *name {
+                "strips" => count(20 * p + 5 * r + c),
+                "floats" => ((f64::from(count(20 * p + 5 * r + c))) / 7.0) as f32,
+                _ => count(5 * (r % 4) + c % 5),
+            };
+            assert_eq!(a.dim(), if *name == "tiles" { (1, 24, 25) } else { (3, 4, 5) });
+            assert!(a.indexed_iter().all(|((p, r, c), x)| *x == want(p, r, c)), "{name}: {a}");
+        }
+        let (_, whole) = ZSTD[0];
+        let mut bytes = whole.to_vec();
+        let at = bytes.windows(4).position(|w| w == [0x28, 0xb5, 0x2f, 0xfd]).unwrap();
+        bytes[at] = 0;
+        refused(&bytes, &["TIFF", "Zstandard"]);
+        for at in 0..whole.len() {
+            let mut bytes = whole.to_vec();
+            bytes[at] ^= 0x83;
+            std::fs::write(&path, &bytes).unwrap();
+            let _ = read(&path);
+        }
     }
 
     fn refused(bytes: &[u8], words: &[&str]) {

@@ -1,7 +1,7 @@
 //! The door for volumes: which format a file is in, and which one a name asks for.
 
 use crate::input::Input;
-use crate::{dicom, metaimage, nifti, npy, pickle, write_atomic};
+use crate::{dicom, metaimage, nifti, npy, nrrd, pickle, tiff, write_atomic, zarr};
 use conefield_core::geometry::VoxelGrid;
 use conefield_core::parts::Voxels;
 use conefield_core::scan::Volume;
@@ -91,7 +91,7 @@ pub fn is_volume(path: impl AsRef<Path>) -> bool {
     if path.is_dir() {
         return dicom::is_series(path);
     }
-    let named = format_of(path).is_some() || path.extension().is_some_and(|e| e.eq_ignore_ascii_case("mhd"));
+    let named = format_of(path).is_some_and(|f| f.is_read());
     let Ok(mut input) = Input::open(path) else { return named };
     // Of what is read here only volumes are in gzip.
     if input.left().is_none() {
@@ -111,12 +111,15 @@ pub fn check_shape(path: impl AsRef<Path>, shape: [usize; 3]) -> Result<()> {
     let path = path.as_ref();
     match wanted(path)? {
         VolumeFormat::Nifti | VolumeFormat::NiftiGz => nifti::check_shape(&path.display().to_string(), shape),
-        VolumeFormat::MetaImage | VolumeFormat::Npy => Ok(()),
+        VolumeFormat::Tiff => tiff::check_shape(&path.display().to_string(), shape),
+        _ => Ok(()),
     }
 }
 
-/// Writes a volume as its name asks: `.nii`, `.nii.gz` (both `f32` with an sform in mm), `.mha` (`f32`, zlib, with the
-/// same axes as directions and voxel sizes) or `.npy` (`f32`, C order, without voxel sizes).
+/// Writes a volume as its name asks, all in `f32`: `.nii`, `.nii.gz` (with an sform in mm), `.mha` (zlib, with the same axes as
+/// directions and voxel sizes), `.mhd` (the same as a header, and the voxels as they are in a `.raw` beside it), `.nrrd` (gzip, the
+/// same axes), `.npy` (C order, without voxel sizes), `.tif` (a page a slice along z, with voxel sizes) or `.zarr` (a folder:
+/// OME-Zarr 0.4 with a pyramid).
 ///
 /// An affine is kept if its voxel sizes are the grid's; without one, the grid's centre comes to lie at `grid.center`.
 pub fn write_volume(path: impl AsRef<Path>, mut volume: &Volume) -> Result<()> {
@@ -129,11 +132,17 @@ pub fn write_volume(path: impl AsRef<Path>, mut volume: &Volume) -> Result<()> {
 }
 
 /// Writes voxels as [`write_volume`] does, slab by slab: no more than 16 MiB of them (or one row) are in memory at
-/// once, and for `.mha` 32 MiB of what they are packed to; the rest of that waits in a file without a name beside it.
+/// once, and for `.mha` 32 MiB of what they are packed to; the rest of that waits in a file without a name beside it. For `.zarr`
+/// it is eight chunks of 1 MiB a level.
 pub fn write_voxels(path: impl AsRef<Path>, voxels: &mut dyn Voxels) -> Result<()> {
     let path = path.as_ref();
     let format = wanted(path)?;
     voxels.grid().validate(&path.display().to_string())?;
+    match format {
+        VolumeFormat::Zarr => return zarr::write(path, voxels),
+        VolumeFormat::MetaImageHeader => return metaimage::write_raw(path, voxels),
+        _ => {}
+    }
     write_atomic(path, |w| match format {
         VolumeFormat::Nifti => nifti::write(w, path, voxels),
         VolumeFormat::NiftiGz => {
@@ -142,7 +151,9 @@ pub fn write_voxels(path: impl AsRef<Path>, voxels: &mut dyn Voxels) -> Result<(
             packed.finish().and_then(|w| w.flush()).map_err(|e| Error::io(path, e))
         }
         VolumeFormat::Npy => npy::write_voxels(w, path, voxels),
-        VolumeFormat::MetaImage => metaimage::write(w, path, voxels),
+        VolumeFormat::Nrrd => nrrd::write(w, path, voxels),
+        VolumeFormat::Tiff => tiff::write(w, path, voxels),
+        _ => metaimage::write(w, path, voxels),
     })
 }
 
@@ -181,15 +192,29 @@ pub(crate) fn from_numpy(path: &Path, array: ndarray::ArrayD<f32>) -> Result<Vol
 
 /// The format that a name asks for; one that asks for none is refused.
 fn wanted(path: &Path) -> Result<VolumeFormat> {
-    let (place, expected) = (path.display().to_string(), "an end of .nii, .nii.gz, .mha or .npy");
+    let (place, expected) =
+        (path.display().to_string(), "an end of .nii, .nii.gz, .mha, .mhd, .nrrd, .npy, .tif or .zarr");
     format_of(path).ok_or_else(|| Error::invalid(place, "file name", file_name(path), expected))
 }
 
+#[derive(Clone, Copy, PartialEq, Eq)]
 enum VolumeFormat {
     Nifti,
     NiftiGz,
     Npy,
     MetaImage,
+    /// With the voxels in another file.
+    MetaImageHeader,
+    Nrrd,
+    Tiff,
+    Zarr,
+}
+
+impl VolumeFormat {
+    /// Whether it is also read.
+    fn is_read(self) -> bool {
+        !matches!(self, Self::Nrrd | Self::Tiff | Self::Zarr)
+    }
 }
 
 fn file_name(path: &Path) -> String {
@@ -198,17 +223,18 @@ fn file_name(path: &Path) -> String {
 
 fn format_of(path: &Path) -> Option<VolumeFormat> {
     let name = file_name(path).to_ascii_lowercase();
-    if name.ends_with(".nii.gz") {
-        Some(VolumeFormat::NiftiGz)
-    } else if name.ends_with(".nii") {
-        Some(VolumeFormat::Nifti)
-    } else if name.ends_with(".npy") {
-        Some(VolumeFormat::Npy)
-    } else if name.ends_with(".mha") {
-        Some(VolumeFormat::MetaImage)
-    } else {
-        None
-    }
+    let ends = [
+        (".nii.gz", VolumeFormat::NiftiGz),
+        (".nii", VolumeFormat::Nifti),
+        (".npy", VolumeFormat::Npy),
+        (".mha", VolumeFormat::MetaImage),
+        (".mhd", VolumeFormat::MetaImageHeader),
+        (".nrrd", VolumeFormat::Nrrd),
+        (".tif", VolumeFormat::Tiff),
+        (".tiff", VolumeFormat::Tiff),
+        (".zarr", VolumeFormat::Zarr),
+    ];
+    ends.into_iter().find(|(end, _)| name.ends_with(end)).map(|(_, format)| format)
 }
 
 #[cfg(test)]
@@ -273,6 +299,32 @@ mod tests {
     }
 
     #[test]
+    fn raw_and_nrrd_hold_the_voxels_and_where_they_lie() {
+        let dir = tempfile::tempdir().unwrap();
+        let volume = Volume::centered(Array3::from_shape_fn((4, 3, 2), |(x, y, z)| ramp([x, y, z])), [0.5, 0.75, 2.0]);
+        let path = dir.path().join("a.mhd");
+        write_volume(&path, &volume).unwrap();
+        let back = read_volume(&path).unwrap();
+        assert_eq!((back.data, back.grid.spacing), (volume.data.clone(), [0.5, 0.75, 2.0]));
+        assert_eq!(std::fs::metadata(dir.path().join("a.raw")).unwrap().len(), 96);
+        std::fs::rename(dir.path().join("a.raw"), dir.path().join("b.raw")).unwrap();
+        let e = write_volume(dir.path().join("b.mhd"), &volume).unwrap_err().to_string();
+        assert!(e.contains("b.mhd: output") && e.contains("b.raw without its header"), "{e}");
+        let path = dir.path().join("a.nrrd");
+        write_volume(&path, &volume).unwrap();
+        let bytes = std::fs::read(path).unwrap();
+        let end = bytes.windows(2).position(|w| w == b"\n\n").unwrap() + 2;
+        let text = std::str::from_utf8(&bytes[..end]).unwrap();
+        let lines =
+            ["sizes: 4 3 2", "space directions: (-0.5,0,0) (0,-0.75,0) (0,0,2)", "space origin: (0.75,0.75,-1)"];
+        assert!(text.starts_with("NRRD0004\n") && lines.iter().all(|l| text.lines().any(|t| t == *l)), "{text}");
+        let mut raw = Vec::new();
+        std::io::Read::read_to_end(&mut flate2::read::GzDecoder::new(&bytes[end..]), &mut raw).unwrap();
+        let values: Vec<f32> = raw.as_chunks().0.iter().map(|b| f32::from_le_bytes(*b)).collect();
+        assert_eq!(values, volume.data.t().iter().copied().collect::<Vec<_>>());
+    }
+
+    #[test]
     fn bad_names_and_values_are_refused_and_leave_the_file_whole() {
         let dir = tempfile::tempdir().unwrap();
         let path = dir.path().join("a.nii.gz");
@@ -282,8 +334,8 @@ mod tests {
         let e = write_volume(&path, &v).unwrap_err().to_string();
         assert!(e.contains("a.nii.gz") && e.contains("voxel [1, 0, 1]"), "{e}");
         assert_eq!(read_volume(&path).unwrap().data, Array3::<f32>::ones((2, 2, 2)));
-        let e = write_volume(dir.path().join("a.tif"), &v).unwrap_err().to_string();
-        assert!(e.contains("a.tif") && e.contains(".nii.gz"), "{e}");
+        let e = write_volume(dir.path().join("a.png"), &v).unwrap_err().to_string();
+        assert!(e.contains("a.png") && e.contains(".nii.gz"), "{e}");
         let e = read_volume(dir.path().join("none.nii")).unwrap_err().to_string();
         assert!(e.contains("none.nii"), "{e}");
         let e = read_volume(dir.path()).unwrap_err().to_string();

@@ -217,3 +217,47 @@ for kind in ['plain', 'JPEG']:
         assert!(found.data.iter().any(|x| *x < 0.0) && found.data.iter().any(|x| *x > 100.0), "{kind}");
     }
 }
+
+/// A volume of more than one chunk of OME-Zarr along x.
+fn long() -> Volume {
+    let data = Array3::from_shape_fn((70, 5, 3), |(x, y, z)| x as f32 + 100.0 * y as f32 - 0.5 * z as f32);
+    Volume::centered(data, [0.5, 0.75, 2.0])
+}
+
+/// Writes [`long`] as `name`, and compares what `script` prints of it: its sizes along z, y and x, then its values, x fastest.
+fn assert_read_by(modules: &[&str], name: &str, script: &str) {
+    let Some(python) = python(modules) else { return };
+    let dir = tempfile::tempdir().unwrap();
+    let volume = long();
+    write_volume(dir.path().join(name), &volume).unwrap();
+    let found = numbers(&run(&python, dir.path(), script));
+    assert_eq!(found[..3], [2.0, 0.75, 0.5], "{name}");
+    assert_eq!(found[3..], volume.data.t().iter().map(|x| f64::from(*x)).collect::<Vec<_>>(), "{name}");
+}
+
+#[test]
+fn stacks_nrrd_and_ome_zarr_are_read_by_tifffile_pynrrd_and_zarr() {
+    let tiff = "
+import tifffile
+with tifffile.TiffFile('a.tif') as t:
+    size = [b / a for a, b in (t.pages[0].tags[k].value for k in ('YResolution', 'XResolution'))]
+    assert t.series[0].axes == 'ZYX', t.series[0].axes
+    print(t.imagej_metadata['spacing'], *size, *t.asarray().ravel().tolist())
+";
+    assert_read_by(&["tifffile"], "a.tif", tiff);
+    let nrrd = "
+import nrrd, numpy as np
+a, h = nrrd.read('a.nrrd')
+print(*np.abs(np.diag(h['space directions']))[::-1].tolist(), *a.T.ravel().tolist())
+";
+    assert_read_by(&["nrrd"], "a.nrrd", nrrd);
+    let zarr = "
+import zarr
+g = zarr.open('a.zarr', mode='r')
+m = g.attrs['multiscales'][0]
+assert [d['path'] for d in m['datasets']] == ['0', '1'] and g['1'].shape == (2, 3, 35)
+assert g['1'][0, 0, 0] == g['0'][:2, :2, :2].mean()
+print(*m['datasets'][0]['coordinateTransformations'][0]['scale'], *g['0'][:].ravel().tolist())
+";
+    assert_read_by(&["zarr"], "a.zarr", zarr);
+}

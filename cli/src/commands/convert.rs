@@ -13,9 +13,9 @@ use std::path::PathBuf;
 
 /// Rewrite a volume or a scan in another format.
 ///
-/// Volumes: NIfTI (.nii, .nii.gz), MetaImage (.mha) and NumPy (.npy), by the name of OUT; IN may also be a .mhd or the folder of a
-/// DICOM series. Scans: the format is --to; r2 and naf keep test views. Part of a scan may be taken; --bin averages line
-/// integrals.
+/// Volumes: NIfTI (.nii, .nii.gz), MetaImage (.mha, .mhd with a .raw), NRRD, NumPy (.npy), a TIFF stack (.tif) or a folder of
+/// OME-Zarr (.zarr), by the name of OUT; IN may also be the folder of a DICOM series, but no NRRD, TIFF or OME-Zarr. Scans: the
+/// format is --to; r2 and naf keep test views. Part of a scan may be taken; --bin averages line integrals.
 #[derive(Args)]
 pub struct ConvertArgs {
     /// A volume or a scan.

@@ -19,7 +19,7 @@ use std::time::Instant;
 pub struct ExportArgs {
     #[command(flatten)]
     trained: Trained,
-    /// The volume to write: .nii, .nii.gz, .mha or .npy.
+    /// The volume to write: .nii, .nii.gz, .mha, .mhd (with a .raw), .nrrd, .npy, .tif or .zarr (a folder, OME-Zarr).
     #[arg(short, long = "output", visible_alias = "out", value_name = "VOLUME")]
     output: PathBuf,
     /// Replace VOLUME.

@@ -13,9 +13,9 @@ use std::path::PathBuf;
 
 /// Convert the files of a scanner to a scan.
 ///
-/// SCANNER.toml names the files with the projections (TIFF, .npy, .npz, .mha) and describes geometry (in mm) and array layout;
-/// docs/guide/formats.md has all keys. Raw counts become line integrals; dead and hot pixels are interpolated. Then a part may be taken;
-/// --bin averages counts.
+/// SCANNER.toml names the files with the projections (TIFF, HDF5, .npy, .npz, .mha) and describes geometry (in mm) and array layout;
+/// docs/guide/formats.md has all keys. A .xtekct file of Nikon replaces it. Raw counts become line integrals; dead and hot pixels are
+/// interpolated. Then a part may be taken; --bin averages counts.
 #[derive(Args)]
 pub struct ImportArgs {
     /// The description of the scanner.

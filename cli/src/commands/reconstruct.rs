@@ -2,6 +2,7 @@
 
 use super::record::{RunRecord, Written, summary};
 use super::{backends::simd_level, calibrate, protocol::RunProtocol};
+use crate::board::Board;
 use crate::boundary::{self, Inputs};
 use crate::live::Live;
 use crate::memory;
@@ -66,6 +67,9 @@ pub struct ReconstructArgs {
     /// Draw the middle slices of a training field to live.png in RUN at this interval, such as 5s.
     #[arg(long, value_name = "SECONDS", value_parser = parse::seconds)]
     live: Option<f64>,
+    /// Write events.out.tfevents.conefield in RUN, in which TensorBoard shows curves and pictures during the run.
+    #[arg(long)]
+    tensorboard: bool,
     /// Print one JSON object: the content of record.json.
     #[arg(long)]
     json: bool,
@@ -157,7 +161,7 @@ impl ReconstructArgs {
                 (folder.metrics()?, None)
             }
         };
-        let mut progress = self.progress(&folder, metrics, identity);
+        let mut progress = self.progress(&folder, metrics, identity)?;
         let (seed, limits) = (self.protocol.seed, self.protocol.ends.limits());
         let job = input.work.job(backend.as_ref(), seed, limits, schedule.as_ref());
         let job = Job { resume: resume.as_ref(), ..job };
@@ -165,9 +169,13 @@ impl ReconstructArgs {
         let mut solution = plan.run(&job, &mut progress).map_err(|e| loaded.locate(e))?;
         let prepare_s = (start.elapsed().as_secs_f64() + spent - solution.train_s).max(0.0);
         let last = progress.records().last().cloned();
+        let board = progress.take_board();
         drop(progress);
 
         let written = self.write(&folder, &input.work, &mut solution, &loaded, backend.as_ref())?;
+        if let Some(mut board) = board {
+            board.picture(solution.steps, "slices", &folder.file("slices.png"))?;
+        }
         let Reading { work: Input { scan: seen, held, peak, .. }, record: scan, load_s } = input;
         let path = |p: &PathBuf| p.display().to_string();
         let record = RunRecord {
@@ -256,16 +264,23 @@ impl ReconstructArgs {
     }
 
     /// What is shown and recorded during the run.
-    fn progress(&self, folder: &RunFolder, metrics: (PathBuf, File), run: BTreeMap<String, String>) -> Progress {
+    fn progress(
+        &self,
+        folder: &RunFolder,
+        metrics: (PathBuf, File),
+        run: BTreeMap<String, String>,
+    ) -> Result<Progress> {
+        let board = self.tensorboard.then(|| Board::new(&folder.file("events.out.tfevents.conefield"), &metrics.0));
         let keeper = Keeper {
             path: folder.file("checkpoint.safetensors"),
             every: Duration::from_secs_f64(self.protocol.checkpoint_every),
             run,
             last: Instant::now(),
         };
-        Progress::new("reconstruct", Some(metrics))
+        Ok(Progress::new("reconstruct", Some(metrics))
             .keeping(Some(keeper))
             .showing(self.live.map(|seconds| Live::new(folder.file("live.png"), seconds)))
+            .reporting(board.transpose()?))
     }
 
     /// Writes and scores the result.

@@ -1,7 +1,7 @@
 //! A folder of DICOM files.
 
 use crate::case::{Case, changed, cut, cut_end, put, refused};
-use conefield_tests::hostile::seeds::{dicom, dicom_run_length};
+use conefield_tests::hostile::seeds::{dicom, dicom_jpeg_2000, dicom_jpeg_ls, dicom_run_length};
 use std::path::Path;
 
 const INFO: &str = "info series";
@@ -42,6 +42,33 @@ pub fn cases() -> Vec<Case> {
         refused("a file cut within its description", changed(dicom, FILE, cut(200)), INFO, &["0.dcm"]),
         refused("a file cut within its pixels", changed(dicom, FILE, cut_end(1)), INFO, &["(7FE0,0010)", "11 bytes"]),
         refused("a file that is only the mark", changed(dicom, FILE, cut(132)), INFO, &["0.dcm"]),
+        refused(
+            "a JPEG-LS picture of another size",
+            changed(dicom_jpeg_ls, FILE, |b| {
+                let start = find(b, [0xff, 0xf7, 0, 11]);
+                b[start + 6] = 200;
+            }),
+            "convert series out.nii",
+            &["PixelData", "200 rows"],
+        ),
+        refused(
+            "a JPEG 2000 picture of 4 billion columns",
+            changed(dicom_jpeg_2000, FILE, |b| {
+                let start = find(b, [0xff, 0x4f, 0xff, 0x51]);
+                b[start + 8..start + 12].fill(255);
+            }),
+            "convert series out.nii",
+            &["PixelData", "4294967295 columns"],
+        ),
+        refused(
+            "a JPEG 2000 picture that is damaged",
+            changed(dicom_jpeg_2000, FILE, |b| {
+                let start = find(b, [0xff, 0x52, 0, 12]);
+                b[start..start + 14].fill(0);
+            }),
+            "convert series out.nii",
+            &["PixelData", "cannot be decoded"],
+        ),
         refused("no rows", value([0x28, 0, 0x10, 0], &[0, 0]), INFO, &["Rows", "found 0"]),
         refused(
             "65535 rows in 12 bytes",
@@ -116,7 +143,7 @@ pub fn cases() -> Vec<Case> {
             &["PixelData", "segment"],
         ),
         refused(
-            "JPEG 2000",
+            "a packing that is not known",
             changed(dicom, FILE, |b| {
                 let at = find(b, [2, 0, 0x10, 0]) + 8;
                 b[at..at + 20].copy_from_slice(b"1.2.840.10008.1.2.9\0");

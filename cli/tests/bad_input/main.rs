@@ -9,6 +9,7 @@
 mod case;
 mod command;
 mod dicom;
+mod hdf5;
 mod levers;
 mod metaimage;
 mod naf;
@@ -35,6 +36,7 @@ fn every_bad_input_ends_as_the_page_says() {
         ("NumPy: `.npy` and `.npz`", numpy::cases()),
         ("DICOM series", dicom::cases()),
         ("TIFF stacks", tiff::cases()),
+        ("HDF5 and Nikon's description", hdf5::cases()),
         ("Scanner descriptions, RTK's geometry, ASTRA's vectors", scanner::cases()),
         ("NAF's pickle", naf::cases()),
         ("R2-Gaussian's folder", r2::cases()),

@@ -1,7 +1,9 @@
 //! TIFF stacks, by way of a scanner's description.
 
 use crate::case::{Case, changed, cut, cut_end, put, refused};
-use conefield_tests::hostile::seeds::{CIRCLE, scanner_tiff, scanner_tiff_deflate, scanner_tiff_lzw, scanner_toml};
+use conefield_tests::hostile::seeds::{
+    CIRCLE, scanner_tiff, scanner_tiff_deflate, scanner_tiff_lzw, scanner_tiff_zstd, scanner_toml,
+};
 use std::io::Cursor;
 use std::path::Path;
 use tiff::encoder::{Compression, TiffEncoder, colortype};
@@ -54,6 +56,15 @@ pub fn cases() -> Vec<Case> {
             changed(scanner_tiff_deflate, FILE, |b| b[12..30].fill(0xff)),
             IMPORT,
             &["counts.tif"],
+        ),
+        refused(
+            "Zstandard that is damaged",
+            changed(scanner_tiff_zstd, FILE, |b| {
+                let start = b.windows(4).position(|w| w == [0x28, 0xb5, 0x2f, 0xfd]).expect("a stream of the seed");
+                b[start + 6..start + 20].fill(0xff);
+            }),
+            IMPORT,
+            &["counts.tif", "Zstandard"],
         ),
         refused(
             "colours",

@@ -65,8 +65,14 @@ fn the_state_of_the_best_record_comes_out_and_is_told() {
 #[test]
 fn live_slices_are_drawn_and_change_nothing() {
     let (_first, plain) = run(&[]);
-    let (_second, watched) = run(&["--live", "0.001s"]);
-    assert!(!plain.join("live.png").exists());
+    let (_second, watched) = run(&["--live", "0.001s", "--tensorboard"]);
+    let events = "events.out.tfevents.conefield";
+    assert!(!plain.join("live.png").exists() && !plain.join(events).exists());
+    let events = fs::read(watched.join(events)).unwrap();
+    let count = |word: &str| events.windows(word.len()).filter(|w| *w == word.as_bytes()).count();
+    assert_eq!(count("loss"), records(&watched).len());
+    // The last live picture and the final one.
+    assert!(count("\x04live") > 0 && count("slices") == 1 && count("IHDR") == count("\x04live") + 1);
     let picture = image::open(watched.join("live.png")).unwrap();
     assert!(picture.width() > 300 && picture.height() > 300);
     let volume = |run: &Path| fs::read(run.join("volume.nii.gz")).unwrap();

@@ -36,6 +36,8 @@ pub(super) enum Packing {
     Plain,
     RunLength,
     Jpeg,
+    JpegLs,
+    Jpeg2000,
 }
 
 /// How pictures in the transfer syntax `uid` are packed.
@@ -44,6 +46,8 @@ pub(super) fn packing(place: &str, uid: &str) -> Result<Packing> {
         "1.2.840.10008.1.2" | "1.2.840.10008.1.2.1" | "1.2.840.10008.1.2.2" => Ok(Packing::Plain),
         "1.2.840.10008.1.2.5" => Ok(Packing::RunLength),
         "1.2.840.10008.1.2.4.50" | "1.2.840.10008.1.2.4.57" | "1.2.840.10008.1.2.4.70" => Ok(Packing::Jpeg),
+        "1.2.840.10008.1.2.4.80" | "1.2.840.10008.1.2.4.81" => Ok(Packing::JpegLs),
+        "1.2.840.10008.1.2.4.90" | "1.2.840.10008.1.2.4.91" => Ok(Packing::Jpeg2000),
         other => Err(unsupported(place, other)),
     }
 }
@@ -52,15 +56,13 @@ fn unsupported(place: &str, uid: &str) -> Error {
     let name = match uid {
         "1.2.840.10008.1.2.1.99" => " (deflated)",
         "1.2.840.10008.1.2.4.51" => " (JPEG with 12 bits)",
-        "1.2.840.10008.1.2.4.80" | "1.2.840.10008.1.2.4.81" => " (JPEG-LS)",
-        "1.2.840.10008.1.2.4.90" | "1.2.840.10008.1.2.4.91" => " (JPEG 2000)",
         "1.2.840.10008.1.2.4.201" | "1.2.840.10008.1.2.4.202" | "1.2.840.10008.1.2.4.203" => " (HTJ2K)",
         _ => "",
     };
     Error::unsupported(
         format!("{place}: TransferSyntaxUID {uid}{name}"),
-        "uncompressed, RLE and 8-bit or lossless JPEG files are read: decompress the series first \
-         (dcmdjpeg, gdcmconv --raw)",
+        "uncompressed, RLE, 8-bit or lossless JPEG, JPEG-LS and JPEG 2000 files are read: decompress the series first \
+         (gdcmconv --raw)",
     )
 }
 
@@ -82,6 +84,8 @@ pub(super) fn values(
             let pieces = element.fragments().ok_or("no compressed picture".to_owned());
             pieces.map(|p| p.concat()).and_then(|bytes| match packed {
                 Packing::RunLength => run_length(&bytes, format),
+                Packing::JpegLs => jpeg_ls(&bytes, format),
+                Packing::Jpeg2000 => jpeg_2000(place, &bytes, format),
                 _ => jpeg(&bytes, format),
             })
         }
@@ -176,31 +180,85 @@ impl Iterator for Runs<'_> {
 
 /// JPEG of one channel; the picture's own size is compared before memory is taken for it.
 fn jpeg(bytes: &[u8], format: &PixelFormat) -> Result<Vec<u32>, String> {
-    let (precision, rows, columns, channels) = frame(bytes).ok_or("no JPEG picture")?;
-    if (rows, columns, channels) != (format.rows, format.columns, 1) {
-        return Err(format!("a JPEG picture of {rows} rows, {columns} columns and {channels} channels"));
-    }
-    if usize::from(precision).div_ceil(8) > format.bytes {
-        return Err(format!("a JPEG picture of {precision} bits in values of {} bytes", format.bytes));
-    }
+    let found = frame(bytes).ok_or("no JPEG picture")?;
+    must_be(found, format, "JPEG")?;
     let mut decoder = Decoder::new(bytes);
     decoder.set_max_decoding_buffer_size(format.count() * 2);
     let raw = decoder.decode().map_err(|e| format!("a JPEG picture that cannot be decoded: {e}"))?;
-    Ok(match precision {
+    Ok(match found.0 {
         0..=8 => raw.into_iter().map(u32::from).collect(),
         _ => raw.as_chunks().0.iter().map(|b| u32::from(u16::from_ne_bytes(*b))).collect(),
     })
 }
 
-/// Bits, rows, columns and channels of a JPEG picture.
-fn frame(bytes: &[u8]) -> Option<(u8, usize, usize, u8)> {
+/// Refuses a picture of another size than the file says.
+fn must_be((bits, rows, columns, channels): Frame, format: &PixelFormat, name: &str) -> Result<(), String> {
+    if (rows, columns, channels) != (format.rows, format.columns, 1) {
+        return Err(format!("a {name} picture of {rows} rows, {columns} columns and {channels} channels"));
+    }
+    if bits == 0 || usize::from(bits).div_ceil(8) > format.bytes {
+        return Err(format!("a {name} picture of {bits} bits in values of {} bytes", format.bytes));
+    }
+    Ok(())
+}
+
+/// JPEG-LS of one channel, without loss or nearly so.
+fn jpeg_ls(bytes: &[u8], format: &PixelFormat) -> Result<Vec<u32>, String> {
+    must_be(frame(bytes).ok_or("no JPEG-LS picture")?, format, "JPEG-LS")?;
+    let (values, ..) = jpegls::decode(bytes, format.columns as u32, format.rows as u32)
+        .map_err(|e| format!("a JPEG-LS picture that cannot be decoded: {e}"))?;
+    Ok(values.into_iter().map(u32::from).collect())
+}
+
+/// JPEG 2000 of one channel and at most 16 bits, as a code stream or in a JP2 file.
+///
+/// The decoder counts values in floats of 32 bits and adds half of their range also to those with a sign, which need none
+/// (ISO/IEC 15444-1, G.1): it is taken off again.
+fn jpeg_2000(place: &str, bytes: &[u8], format: &PixelFormat) -> Result<Vec<u32>, String> {
+    let (found, signed) = size_marker(bytes).ok_or("no JPEG 2000 picture")?;
+    must_be(found, format, "JPEG 2000")?;
+    let bits = u32::from(found.0);
+    if bits > 16 {
+        return Err(format!("a JPEG 2000 picture of {bits} bits, where at most 16 are read"));
+    }
+    let fail = |e: &dyn std::fmt::Display| format!("a JPEG 2000 picture that cannot be decoded: {e}");
+    // Coefficients and values of 32 bits, and the passes over them.
+    allowance::memory(place, "PixelData", (format.count() as u64).saturating_mul(16)).map_err(|e| e.to_string())?;
+    let image = hayro_jpeg2000::Image::new(bytes, &hayro_jpeg2000::DecodeSettings::default()).map_err(|e| fail(&e))?;
+    if (image.width() as usize, image.height() as usize) != (format.columns, format.rows) {
+        return Err(fail(&"its headers contradict each other"));
+    }
+    let mut context = hayro_jpeg2000::DecoderContext::default();
+    let decoded = image.decode(&mut context).map_err(|e| fail(&e))?;
+    let component = decoded.components().first().ok_or("no channel")?;
+    let half = if signed { (1i64 << (bits - 1)) as f32 } else { 0.0 };
+    let [least, most] = if signed { [-half, half - 1.0] } else { [0.0, ((1i64 << bits) - 1) as f32] };
+    Ok(component.samples().iter().map(|x| (x - half).round().clamp(least, most) as i32 as u32).collect())
+}
+
+/// The frame in the SIZ marker of a JPEG 2000 code stream, and whether its values have a sign.
+fn size_marker(bytes: &[u8]) -> Option<(Frame, bool)> {
+    // SOC and SIZ; in a JP2 file they stand behind boxes.
+    let at = bytes.windows(4).position(|w| w == [0xff, 0x4f, 0xff, 0x51])? + 4;
+    let four = |k: usize| bytes.get(at + k..at + k + 4).map(|b| b.iter().fold(0, |n, b| n << 8 | usize::from(*b)));
+    let [columns, rows, left, top] = [four(4)?, four(8)?, four(12)?, four(16)?];
+    let channels = u8::try_from(usize::from(*bytes.get(at + 36)?) << 8 | usize::from(*bytes.get(at + 37)?)).ok()?;
+    let depth = *bytes.get(at + 38)?;
+    Some((((depth & 0x7f) + 1, rows.checked_sub(top)?, columns.checked_sub(left)?, channels), depth & 0x80 != 0))
+}
+
+/// Bits, rows, columns and channels of a picture.
+type Frame = (u8, usize, usize, u8);
+
+/// The frame of a JPEG picture.
+fn frame(bytes: &[u8]) -> Option<Frame> {
     let two = |at: usize| bytes.get(at..at + 2).map(|b| usize::from(b[0]) << 8 | usize::from(b[1]));
     let mut at = 2;
     loop {
         match (bytes.get(at)?, bytes.get(at + 1)?) {
             (0xff, 0xff) => at += 1,
-            // A start of frame of any coding; C4, C8 and CC among them are tables.
-            (0xff, 0xc0..=0xc3 | 0xc5..=0xc7 | 0xc9..=0xcb | 0xcd..=0xcf) => {
+            // A start of frame of any coding, F7 that of JPEG-LS; C4, C8 and CC among them are tables.
+            (0xff, 0xc0..=0xc3 | 0xc5..=0xc7 | 0xc9..=0xcb | 0xcd..=0xcf | 0xf7) => {
                 return Some((*bytes.get(at + 4)?, two(at + 5)?, two(at + 7)?, *bytes.get(at + 9)?));
             }
             (0xff, 0xd8 | 0x01) => at += 2,
@@ -291,7 +349,49 @@ mod tests {
         assert_eq!(found, [100, 101, 99, -5, 2047, -2048]);
     }
 
+    /// The same values, by CharLS and, with a sign and without, by OpenJPEG (`tests/fixtures/make_formats.py`).
+    const JPEG_LS: &[u8] = include_bytes!("../../tests/fixtures/picture.jls");
+    const JPEG_2000: &[u8] = include_bytes!("../../tests/fixtures/picture.j2k");
+    const UNSIGNED: &[u8] = include_bytes!("../../tests/fixtures/picture_unsigned.j2k");
+
+    #[test]
+    fn jpeg_ls_and_jpeg_2000_are_read_and_other_sizes_refused() {
+        let all = PixelFormat { stored: 16, high: 15, ..TWO };
+        let want = [100, 101, 99, -5, 2047, -2048];
+        let decoded = [jpeg_ls(JPEG_LS, &all), jpeg_2000("a", JPEG_2000, &all), jpeg_2000("a", UNSIGNED, &all)];
+        for bits in decoded {
+            assert_eq!(bits.unwrap().into_iter().map(|b| all.number(b)).collect::<Vec<_>>(), want);
+        }
+        let other = PixelFormat { rows: 3, columns: 2, ..all };
+        let byte = PixelFormat { bytes: 1, stored: 8, high: 7, ..all };
+        for (e, word) in [
+            (jpeg_ls(JPEG_LS, &other), "2 rows, 3 columns"),
+            (jpeg_2000("a", JPEG_2000, &other), "2 rows, 3 columns"),
+            (jpeg_ls(JPEG_LS, &byte), "16 bits in values of 1 bytes"),
+            (jpeg_2000("a", JPEG_2000, &byte), "16 bits in values of 1 bytes"),
+            (jpeg_ls(&JPEG_LS[..80], &all), "cannot be decoded"),
+            (jpeg_2000("a", &JPEG_2000[..60], &all), "cannot be decoded"),
+            (jpeg_ls(JPEG_2000, &all), "no JPEG-LS picture"),
+            (jpeg_2000("a", JPEG_LS, &all), "no JPEG 2000 picture"),
+        ] {
+            let e = e.unwrap_err();
+            assert!(e.contains(word), "{word} is not in: {e}");
+        }
+    }
+
     proptest::proptest! {
+        #[test]
+        fn no_changed_picture_makes_a_decoder_panic(changes in proptest::collection::vec((0usize..135, 0u8..), 1..6), cut in 0usize..136) {
+            for picture in [JPEG_LS, JPEG_2000, UNSIGNED] {
+                let mut bytes = picture.to_vec();
+                for &(at, x) in changes.iter().filter(|(at, _)| *at < picture.len()) {
+                    bytes[at] = x;
+                }
+                bytes.truncate(cut.max(30));
+                let _ = (jpeg_ls(&bytes, &TWO), jpeg_2000("a", &bytes, &TWO));
+            }
+        }
+
         #[test]
         fn no_bytes_make_it_panic(changes in proptest::collection::vec((0usize..61, 0u8..), 1..6), cut in 0usize..62) {
             let mut bytes = JPEG.to_vec();

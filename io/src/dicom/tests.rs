@@ -206,7 +206,7 @@ fn series_that_are_no_volume_are_refused() {
 #[test]
 fn compressions_that_are_not_read_are_named() {
     for (syntax, name) in
-        [("1.2.840.10008.1.2.4.90", "JPEG 2000"), ("1.2.840.10008.1.2.4.80", "JPEG-LS"), ("1.9", "1.9")]
+        [("1.2.840.10008.1.2.4.51", "JPEG with 12 bits"), ("1.2.840.10008.1.2.4.201", "HTJ2K"), ("1.9", "1.9")]
     {
         let dir = series(EXPLICIT, |_, o| {
             o.put(DataElement::new(PIXELS, VR::OB, PixelFragmentSequence::new_fragments(vec![vec![1u8; 16]])));

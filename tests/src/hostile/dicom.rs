@@ -1,5 +1,6 @@
 //! A DICOM series of two slices, written with `dicom-object`.
 
+use super::seeds::fixture;
 use dicom_core::value::PixelFragmentSequence;
 use dicom_core::{DataElement, PrimitiveValue, Tag, VR};
 use dicom_object::{FileMetaTableBuilder, InMemDicomObject};
@@ -8,6 +9,8 @@ use std::path::Path;
 const EXPLICIT: &str = "1.2.840.10008.1.2.1";
 const IMPLICIT: &str = "1.2.840.10008.1.2";
 const RUN_LENGTH: &str = "1.2.840.10008.1.2.5";
+const JPEG_LS: &str = "1.2.840.10008.1.2.4.80";
+const JPEG_2000: &str = "1.2.840.10008.1.2.4.90";
 const PIXELS: Tag = Tag(0x7fe0, 0x0010);
 
 /// Slice `k`: 2 rows of 3 columns, unsigned 16 bits.
@@ -83,4 +86,23 @@ pub fn dicom_run_length(dir: &Path) {
         bytes.extend([251, 0, 5, 0, 1, 2, 3, 4, 5, 128]);
         o.put(DataElement::new(PIXELS, VR::OB, PixelFragmentSequence::new_fragments(vec![bytes])));
     });
+}
+
+fn packed(dir: &Path, syntax: &str, picture: &'static [u8]) {
+    series(dir, syntax, |o| {
+        // Pieces are of even length.
+        let mut bytes = picture.to_vec();
+        bytes.resize(bytes.len().next_multiple_of(2), 0);
+        o.put(DataElement::new(PIXELS, VR::OB, PixelFragmentSequence::new_fragments(vec![bytes])));
+    });
+}
+
+/// The folder `series`, packed by JPEG-LS.
+pub fn dicom_jpeg_ls(dir: &Path) {
+    packed(dir, JPEG_LS, fixture!("picture.jls"));
+}
+
+/// The folder `series`, packed by JPEG 2000.
+pub fn dicom_jpeg_2000(dir: &Path) {
+    packed(dir, JPEG_2000, fixture!("picture_unsigned.j2k"));
 }

@@ -13,7 +13,7 @@ use std::io::{Cursor, Read, Write};
 use std::path::Path;
 use tiff::encoder::{Compression as TiffCompression, TiffEncoder, colortype::Gray16};
 
-pub use super::dicom::{dicom, dicom_implicit, dicom_of_zeros, dicom_run_length};
+pub use super::dicom::{dicom, dicom_implicit, dicom_jpeg_2000, dicom_jpeg_ls, dicom_of_zeros, dicom_run_length};
 
 /// Views, rows and columns of every scan here.
 pub const SHAPE: [usize; 3] = [3, 4, 5];
@@ -195,6 +195,59 @@ pub fn scanner_tiff_deflate(dir: &Path) {
 /// `scanner.toml`, `counts.tif` packed by LZW.
 pub fn scanner_tiff_lzw(dir: &Path) {
     scanner_tiff_of(dir, TiffCompression::Lzw);
+}
+
+/// A file of the reader's own fixtures, which other programs' libraries wrote.
+macro_rules! fixture {
+    ($name:literal) => {
+        include_bytes!(concat!("../../../io/tests/fixtures/", $name))
+    };
+}
+pub(super) use fixture;
+
+/// `scanner.toml`, `counts.tif` packed by Zstandard.
+pub fn scanner_tiff_zstd(dir: &Path) {
+    put(&dir.join("counts.tif"), fixture!("zstd.tif"));
+    put(&dir.join("scanner.toml"), scanner_toml("counts.tif", CIRCLE).as_bytes());
+}
+
+/// `scanner.toml`, `counts.h5` in the layout of DXchange.
+pub fn scanner_hdf5(dir: &Path) {
+    put(&dir.join("counts.h5"), fixture!("dxchange.h5"));
+    put(&dir.join("scanner.toml"), scanner_of_hdf5().as_bytes());
+}
+
+/// `scanner.toml`, `counts.h5` in the layout of NXtomo, as HDF5 wrote it at first.
+pub fn scanner_nxtomo(dir: &Path) {
+    put(&dir.join("counts.h5"), fixture!("nxtomo.nxs"));
+    put(&dir.join("scanner.toml"), scanner_of_hdf5().as_bytes());
+}
+
+/// A description whose counts, fields and angles are in `counts.h5`.
+fn scanner_of_hdf5() -> String {
+    let circle = CIRCLE.replace("range_deg = 360.0", "angles_deg = \"counts.h5\"");
+    let files = "projections = \"counts.h5\"\nflat = \"counts.h5\"\ndark = \"counts.h5\"";
+    scanner_toml("counts.h5", &circle).replace("projections = \"counts.h5\"", files).replace("i0 = 20000.0\n", "")
+}
+
+/// `scanner.toml`, `counts.h5` with geometry, as CIL writes it.
+pub fn scanner_cil(dir: &Path) {
+    put(&dir.join("counts.h5"), fixture!("cil.nxs"));
+    put(&dir.join("scanner.toml"), scanner_toml("counts.h5", "[cil]\nfile = \"counts.h5\"\n").as_bytes());
+}
+
+/// `bone.xtekct` of Nikon, with its images.
+pub fn xtekct(dir: &Path) {
+    for (i, view) in counts().chunks(SHAPE[1] * SHAPE[2]).enumerate() {
+        let file = File::create(dir.join(format!("bone_{:04}.tif", i + 1))).expect("a file of the test's own folder");
+        let mut w = TiffEncoder::new(file).expect("a file");
+        w.write_image::<Gray16>(SHAPE[2] as u32, SHAPE[1] as u32, view).expect("a file");
+    }
+    let text = "[XTekCT]\nName=bone\nVoxelsX=4\nVoxelSizeX=0.5\nVoxelsY=4\nVoxelSizeY=0.5\nVoxelsZ=3\nVoxelSizeZ=0.75\n\
+                InputSeparator=_\nInputFolderName=\nInputDigits=4\nProjections=3\nWhiteLevel=50000\nDetectorPixelsX=5\n\
+                DetectorPixelSizeX=2\nDetectorPixelsY=4\nDetectorPixelSizeY=1.5\nSrcToObject=500\nSrcToDetector=800\n\
+                InitialAngle=30\nAngularStep=120\nObjectOffsetX=0.5\nObjectRoll=0.1\nObjectTilt=0.2\n";
+    put(&dir.join("bone.xtekct"), text.as_bytes());
 }
 
 /// `scan.pickle`, with the volume.

@@ -1,0 +1,34 @@
+//! `events.out.tfevents.conefield`: the curves and pictures of a run for TensorBoard.
+
+use conefield_core::{Error, Result};
+use conefield_io::EventFile;
+use serde_json::Value;
+use std::fs;
+use std::path::Path;
+
+/// The event file of a run.
+pub struct Board(EventFile);
+
+impl Board {
+    /// The file `path`, with the records that `metrics` holds already, one a line.
+    pub fn new(path: &Path, metrics: &Path) -> Result<Self> {
+        let mut board = Self(EventFile::create(path)?);
+        let text = fs::read_to_string(metrics).map_err(|e| Error::io(metrics, e))?;
+        for record in text.lines().filter_map(|line| serde_json::from_str(line).ok()) {
+            board.record(&record)?;
+        }
+        Ok(board)
+    }
+
+    /// Adds a line of `metrics.jsonl`: a point to the curve of each of its numbers.
+    pub fn record(&mut self, record: &Value) -> Result<()> {
+        let (step, numbers) = (record["step"].as_u64().unwrap_or(0), record.as_object().into_iter().flatten());
+        let numbers = numbers.filter(|(name, _)| *name != "step");
+        self.0.scalars(step, numbers.filter_map(|(name, x)| Some((name.as_str(), x.as_f64()?))))
+    }
+
+    /// Adds the picture in the file `png` under the name `name`.
+    pub fn picture(&mut self, step: u64, name: &str, png: &Path) -> Result<()> {
+        self.0.picture(step, name, &fs::read(png).map_err(|e| Error::io(png, e))?)
+    }
+}

@@ -1,0 +1,118 @@
+//! HDF5 in its layouts, and Nikon's description.
+
+use crate::case::{Case, changed, cut, put, refused, replaced};
+use conefield_tests::hostile::seeds::{scanner_cil, scanner_hdf5, scanner_nxtomo, xtekct};
+use std::path::Path;
+
+const IMPORT: &str = "import scanner.toml -o scan";
+const NIKON: &str = "import bone.xtekct -o scan";
+const FILE: &str = "counts.h5";
+
+/// NXtomo with `to` in place of the first `from`: its headers have no checksums.
+fn keyed<const N: usize>(from: [u8; N], to: [u8; N]) -> impl Fn(&Path) + Sync + Send {
+    changed(scanner_nxtomo, FILE, move |b| {
+        let at = b.windows(N).position(|w| w == from).expect("bytes of the seed");
+        b[at..at + N].copy_from_slice(&to);
+    })
+}
+
+/// The number of frames.
+fn frames(n: u64) -> [u8; 24] {
+    let mut all = [0; 24];
+    for (to, x) in all.chunks_exact_mut(8).zip([n, 4, 5]) {
+        to.copy_from_slice(&x.to_le_bytes());
+    }
+    all
+}
+
+/// The image keys.
+fn keys(all: [u8; 6]) -> [u8; 24] {
+    std::array::from_fn(|i| if i % 4 == 0 { all[i / 4] } else { 0 })
+}
+
+fn described(from: &'static str, to: &'static str) -> impl Fn(&Path) + Sync + Send {
+    replaced(scanner_hdf5, "scanner.toml", from, to)
+}
+
+fn nikon(from: &'static str, to: &'static str) -> impl Fn(&Path) + Sync + Send {
+    replaced(xtekct, "bone.xtekct", from, to)
+}
+
+pub fn cases() -> Vec<Case> {
+    vec![
+        refused("cut within its mark", changed(scanner_hdf5, FILE, cut(7)), IMPORT, &[FILE, "format"]),
+        refused("cut behind its mark", changed(scanner_hdf5, FILE, cut(20)), IMPORT, &[FILE, "HDF5"]),
+        refused("cut in the middle", changed(scanner_hdf5, FILE, |b| b.truncate(b.len() / 2)), IMPORT, &[FILE]),
+        refused("a header with a wrong checksum", changed(scanner_hdf5, FILE, |b| b[44] ^= 1), IMPORT, &[FILE]),
+        refused(
+            "a data set that is not there",
+            described("projections = \"counts.h5\"", "projections = \"counts.h5:/exchange/datum\""),
+            IMPORT,
+            &["/exchange/datum", "no such thing"],
+        ),
+        refused(
+            "a data set of one axis",
+            described("projections = \"counts.h5\"", "projections = \"counts.h5:/exchange/theta\""),
+            IMPORT,
+            &["theta", "[3]", "two axes"],
+        ),
+        refused("a million frames in 17 kB", keyed(frames(6), frames(1_000_000)), IMPORT, &[FILE, "at most"]),
+        refused("frames past 2^64", keyed(frames(6), frames(u64::MAX)), IMPORT, &[FILE, "addressed"]),
+        refused("no frames", keyed(frames(6), frames(0)), IMPORT, &[FILE, "at least one"]),
+        refused("more frames than chunks", keyed(frames(6), frames(60)), IMPORT, &[FILE, "one for each frame"]),
+        refused(
+            "no projection",
+            keyed(keys([2, 1, 0, 0, 0, 1]), keys([2, 1, 1, 1, 1, 1])),
+            IMPORT,
+            &["image_key", "key 0"],
+        ),
+        refused(
+            "no open beam",
+            keyed(keys([2, 1, 0, 0, 0, 1]), keys([2, 0, 0, 0, 0, 0])),
+            IMPORT,
+            &[FILE, "image_key"],
+        ),
+        refused(
+            "CIL: another file's geometry",
+            |d| {
+                scanner_cil(d);
+                scanner_nxtomo(&d.join("."));
+                put(
+                    d.join("scanner.toml"),
+                    conefield_tests::hostile::seeds::scanner_toml(FILE, "[cil]\nfile = \"counts.h5\"\n"),
+                );
+            },
+            IMPORT,
+            &[FILE, "entry1/tomo_entry"],
+        ),
+        refused(
+            "CIL: no file of that name",
+            replaced(scanner_cil, "scanner.toml", "file = \"counts.h5\"", "file = \"none.nxs\""),
+            IMPORT,
+            &["cil.file", "none.nxs"],
+        ),
+        refused("Nikon: no distance", nikon("SrcToObject=500\n", ""), NIKON, &["SrcToObject", "nothing"]),
+        refused(
+            "Nikon: a distance of 0",
+            nikon("SrcToDetector=800", "SrcToDetector=0"),
+            NIKON,
+            &["SrcToDetector", "above 0"],
+        ),
+        refused(
+            "Nikon: two distances",
+            nikon("SrcToObject=500\n", "SrcToObject=500\nSrcToObject=5\n"),
+            NIKON,
+            &["SrcToObject", "one value"],
+        ),
+        refused("Nikon: 10^15 views", nikon("Projections=3", "Projections=1e15"), NIKON, &["Projections", "1000000"]),
+        refused("Nikon: more views than images", nikon("Projections=3", "Projections=4"), NIKON, &["bone_0004.tif"]),
+        refused("Nikon: another detector", nikon("DetectorPixelsY=4", "DetectorPixelsY=5"), NIKON, &["4 x 5", "5 x 5"]),
+        refused("Nikon: a folder above", nikon("InputFolderName=", "InputFolderName=.."), NIKON, &["without \"..\""]),
+        refused(
+            "Nikon: an empty file",
+            changed(xtekct, "bone.xtekct", Vec::clear),
+            NIKON,
+            &["bone.xtekct", "Projections"],
+        ),
+    ]
+}

@@ -1,0 +1,146 @@
+//! TensorBoard's event file, out: curves and pictures of a run while it goes on.
+//!
+//! A file of TFRecords (length, masked CRC-32C of it, data, masked CRC-32C of that), each an `Event` in protocol buffers' encoding,
+//! of which a few fields are enough. Source: TensorFlow's `record_writer`, `event.proto` and `summary.proto`.
+
+use conefield_core::{Error, Result};
+use std::fs::File;
+use std::io::Write;
+use std::path::{Path, PathBuf};
+use std::time::{SystemTime, UNIX_EPOCH};
+
+/// An event file that grows.
+pub struct EventFile {
+    path: PathBuf,
+    file: File,
+}
+
+impl EventFile {
+    /// Begins the file `path` anew. TensorBoard looks for names with `tfevents` in them.
+    pub fn create(path: impl AsRef<Path>) -> Result<Self> {
+        let path = path.as_ref().to_path_buf();
+        let file = File::create(&path).map_err(|e| Error::io(&path, e))?;
+        let mut new = Self { path, file };
+        // Field 3, file_version.
+        let version = bytes_field(3, b"brain.Event:2");
+        new.write(&[time(), version].concat())?;
+        Ok(new)
+    }
+
+    /// Adds the numbers `values` after `step`, each a point of the curve of its name. Those that are not finite are left out.
+    pub fn scalars<'a>(&mut self, step: u64, values: impl IntoIterator<Item = (&'a str, f64)>) -> Result<()> {
+        let value = |(name, x): (&str, f64)| {
+            // A simple_value is field 2, of 32 bits.
+            let number = [vec![0x15], (x as f32).to_le_bytes().to_vec()].concat();
+            bytes_field(1, &[bytes_field(1, name.as_bytes()), number].concat())
+        };
+        let summary: Vec<u8> = values.into_iter().filter(|(_, x)| x.is_finite()).flat_map(value).collect();
+        if summary.is_empty() { Ok(()) } else { self.summary(step, &summary) }
+    }
+
+    /// Adds the picture `png`, named `name`, after `step`. Nothing happens if it is no PNG.
+    pub fn picture(&mut self, step: u64, name: &str, png: &[u8]) -> Result<()> {
+        // Width and height stand in the first chunk.
+        let Some([_, _, _, _, a, b, c, d, e, f, g, h]) = png.get(12..24).and_then(|s| <[u8; 12]>::try_from(s).ok())
+        else {
+            return Ok(());
+        };
+        let [width, height] = [[a, b, c, d], [e, f, g, h]].map(|x| u64::from(u32::from_be_bytes(x)));
+        // Of the colour space, 3 is RGB.
+        let image = [number_field(1, height), number_field(2, width), number_field(3, 3), bytes_field(4, png)];
+        let value = [bytes_field(1, name.as_bytes()), bytes_field(4, &image.concat())].concat();
+        self.summary(step, &bytes_field(1, &value))
+    }
+
+    /// Field 2 of an event is the step, field 5 the summary.
+    fn summary(&mut self, step: u64, summary: &[u8]) -> Result<()> {
+        self.write(&[time(), number_field(2, step), bytes_field(5, summary)].concat())
+    }
+
+    fn write(&mut self, event: &[u8]) -> Result<()> {
+        let length = (event.len() as u64).to_le_bytes();
+        let [head, tail] = [&length[..], event].map(|b| masked(crc32c(b)).to_le_bytes());
+        // In one piece, so that a reader meets no half record.
+        let record = [&length[..], &head, event, &tail].concat();
+        self.file.write_all(&record).map_err(|e| Error::io(&self.path, e))
+    }
+}
+
+/// Field 1 of an event, the time in seconds.
+fn time() -> Vec<u8> {
+    let now = SystemTime::now().duration_since(UNIX_EPOCH).map_or(0.0, |d| d.as_secs_f64());
+    [vec![0x09], now.to_le_bytes().to_vec()].concat()
+}
+
+/// A field of wire type 0.
+fn number_field(field: u8, value: u64) -> Vec<u8> {
+    [vec![field << 3], varint(value)].concat()
+}
+
+/// A field of wire type 2.
+fn bytes_field(field: u8, value: &[u8]) -> Vec<u8> {
+    [&[field << 3 | 2][..], &varint(value.len() as u64), value].concat()
+}
+
+fn varint(mut value: u64) -> Vec<u8> {
+    let mut out = Vec::new();
+    while value >= 0x80 {
+        out.push(value as u8 | 0x80);
+        value >>= 7;
+    }
+    out.push(value as u8);
+    out
+}
+
+/// Castagnoli's CRC, bit by bit (RFC 3720, section 12.1).
+fn crc32c(bytes: &[u8]) -> u32 {
+    let step = |crc: u32| if crc & 1 == 1 { crc >> 1 ^ 0x82f6_3b78 } else { crc >> 1 };
+    !bytes.iter().fold(!0, |crc, b| (0..8).fold(crc ^ u32::from(*b), |crc, _| step(crc)))
+}
+
+/// As records have it, so that the CRC of data that holds a CRC stays good.
+fn masked(crc: u32) -> u32 {
+    crc.rotate_right(15).wrapping_add(0xa282_ead8)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn the_checksum_is_castagnolis() {
+        // RFC 3720, B.4, and the usual check value.
+        assert_eq!(crc32c(&[0; 32]), 0x8a91_36aa);
+        assert_eq!(crc32c(&[0xff; 32]), 0x62a8_ab43);
+        assert_eq!(crc32c(b"123456789"), 0xe306_9283);
+        assert_eq!([varint(0), varint(127), varint(300)], [vec![0], vec![127], vec![0xac, 2]]);
+    }
+
+    #[test]
+    fn records_are_whole_and_hold_what_was_written() {
+        let dir = tempfile::tempdir().unwrap();
+        let path = dir.path().join("events.out.tfevents.test");
+        let mut file = EventFile::create(&path).unwrap();
+        file.scalars(300, [("loss", 0.5), ("nothing", f64::NAN)]).unwrap();
+        file.scalars(301, [("nothing", f64::INFINITY)]).unwrap();
+        file.picture(302, "slices", b"\x89PNG\r\n\x1a\n\0\0\0\rIHDR\0\0\0\x07\0\0\x01\0rest").unwrap();
+        file.picture(303, "slices", b"no picture").unwrap();
+        let bytes = std::fs::read(&path).unwrap();
+        let (mut at, mut events) = (0, vec![]);
+        while at < bytes.len() {
+            let n = u64::from_le_bytes(bytes[at..at + 8].try_into().unwrap()) as usize;
+            let word = |at: usize| u32::from_le_bytes(bytes[at..at + 4].try_into().unwrap());
+            assert_eq!(word(at + 8), masked(crc32c(&bytes[at..at + 8])));
+            assert_eq!(word(at + 12 + n), masked(crc32c(&bytes[at + 12..at + 12 + n])));
+            // Behind the time.
+            events.push(bytes[at + 12 + 9..at + 12 + n].to_vec());
+            at += 16 + n;
+        }
+        let half = 0.5f32.to_le_bytes();
+        let loss = [&[0x10, 0xac, 2, 0x2a, 13, 0x0a, 11, 0x0a, 4][..], b"loss", &[0x15], &half].concat();
+        assert_eq!(events[..2], [[&[0x1a, 13][..], b"brain.Event:2"].concat(), loss]);
+        assert_eq!(events.len(), 3);
+        // Height 256, width 7.
+        assert!(events[2].windows(6).any(|w| w == [0x08, 0x80, 2, 0x10, 7, 0x18]), "{:?}", events[2]);
+    }
+}

@@ -1,0 +1,403 @@
+//! HDF5: one data set of it, or the part of a scan that a known layout keeps in it.
+//!
+//! `hdf5-reader` reads the file's structure and unpacks its chunks (deflate, shuffle, Fletcher-32). What it may take is bounded here by
+//! the size of the file, values come out chunk by chunk, and a data set of which chunks were never written is refused rather
+//! than read as zeros. [`layout`] knows where DXchange, NXtomo and CIL keep what a scan is made of.
+//!
+//! Sources: HDF5 File Format Specification 3.0; Data Exchange (dxfile), NeXus application definition NXtomo.
+
+mod layout;
+#[cfg(test)]
+mod tests;
+
+use crate::input::must_unpack;
+use crate::memory;
+use crate::number::{ByteOrder, Number};
+use conefield_core::error::ensure;
+use conefield_core::{Error, Result, allowance, files};
+use hdf5_reader::{Dataset, Datatype, FileStorage, Hdf5File, OpenOptions, SliceInfo, SliceInfoElem};
+use layout::{Found, Layout};
+use ndarray::{ArrayD, Dimension, IxDyn};
+use std::path::Path;
+use std::sync::Arc;
+
+/// The bytes that an HDF5 file starts with.
+pub(crate) const MAGIC: &[u8] = b"\x89HDF\r\n\x1a\n";
+
+/// Deflate unpacks to at most this many times its size.
+const DEFLATE_LIMIT: u64 = 1032;
+
+/// The longest chunk that HDF5 can have, in bytes.
+const LONGEST_CHUNK: u64 = u32::MAX as u64;
+
+/// Most bytes of a data set without chunks that are read at a time (or one frame).
+const SLAB_BYTES: u64 = 16 << 20;
+
+/// What of a scan is asked for, where one file holds all of it.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(crate) enum ScanPart {
+    Projections,
+    Flat,
+    Dark,
+}
+
+/// The name of a file and what is named in it: `scan.h5:/exchange/data`.
+pub(crate) fn split(name: &str) -> (&str, Option<&str>) {
+    let ends = [".h5", ".hdf5", ".hdf", ".nxs", ".nx"];
+    let cut = name.match_indices(':').find(|(at, _)| ends.iter().any(|e| name[..*at].ends_with(e)));
+    match cut {
+        Some((at, _)) => (&name[..at], Some(&name[at + 1..])),
+        None => (name, None),
+    }
+}
+
+/// The shape of what [`read`] gives, from headers and image keys alone.
+pub(crate) fn shape(path: &Path, name: Option<&str>, part: ScanPart) -> Result<Vec<usize>> {
+    let file = Container::open(path)?;
+    let (data, kept) = file.frames(name, part)?;
+    let mut shape = file.shape(&data)?;
+    if let Some(kept) = kept {
+        shape[0] = kept.iter().filter(|k| **k).count();
+    }
+    Ok(shape)
+}
+
+/// Reads the data set `name`, whole, or `part` of the scan in the group `name` (in all of the file without a name).
+///
+/// Two or three axes of integers of 1 to 8 bytes or floats of 4 or 8, as they lie in the file. Refuses other types, what the file
+/// cannot hold, chunks that are missing and values that are not finite.
+pub(crate) fn read(path: &Path, name: Option<&str>, part: ScanPart) -> Result<Stored> {
+    let file = Container::open(path)?;
+    let frames_first = matches!(file.find(name)?, Found::Layout(_));
+    let (data, kept) = file.frames(name, part)?;
+    Ok(Stored { values: file.values(&data, kept.as_deref())?, frames_first })
+}
+
+/// What [`read`] gives.
+pub(crate) struct Stored {
+    pub values: ArrayD<f32>,
+    /// Whether a layout says that the first axis is that of the views.
+    pub frames_first: bool,
+}
+
+/// Shape and numbers of the small data set `name`; of a scan's layout the angles of its projections. In degrees where the
+/// data set says that it holds radians.
+pub(crate) fn read_exact(path: &Path, name: Option<&str>) -> Result<(Vec<usize>, Vec<f64>)> {
+    let file = Container::open(path)?;
+    let (data, kept) = match file.find(name)? {
+        Found::Data(data) => (*data, None),
+        Found::Layout(layout) => {
+            let (angles, keys) = layout.angles(&file)?;
+            (angles, keys.map(|k| k.iter().map(|k| *k == 0).collect::<Vec<bool>>()))
+        }
+    };
+    let mut shape = file.shape(&data)?;
+    let mut values = file.small(&data)?;
+    if let Some(kept) = kept {
+        file.one_each(&data, values.len(), kept.len())?;
+        let mut keep = kept.iter();
+        values.retain(|_| keep.next() == Some(&true));
+        shape = vec![values.len()];
+    }
+    if file.text_attribute(&data, "units").is_some_and(|u| u.to_ascii_lowercase().starts_with("rad")) {
+        values.iter_mut().for_each(|x| *x = x.to_degrees());
+    }
+    Ok((shape, values))
+}
+
+/// An open file.
+pub(crate) struct Container {
+    place: String,
+    file: Hdf5File,
+    /// Bytes on disk.
+    size: u64,
+}
+
+impl Container {
+    pub fn open(path: &Path) -> Result<Self> {
+        let place = path.display().to_string();
+        let (file, size) = files::open(path)?;
+        let chunk = size.saturating_mul(DEFLATE_LIMIT).min(LONGEST_CHUNK);
+        let bound = |bytes: u64| usize::try_from(bytes).unwrap_or(usize::MAX);
+        let options = OpenOptions::default()
+            .with_chunk_cache_bytes(0)
+            .with_max_chunk_bytes(bound(chunk))
+            .with_max_read_bytes(bound(size.max(SLAB_BYTES)))
+            .with_max_object_header_bytes(bound(size));
+        let file = FileStorage::from_file(file)
+            .and_then(|storage| Hdf5File::from_storage_with_options(Arc::new(storage), options))
+            .map_err(|e| Error::invalid(&place, "HDF5", e, "a whole HDF5 file"))?;
+        let end = file.superblock().eof_address;
+        let expected = format!("{end} bytes, as the file says: it is cut off");
+        ensure(end <= size, &place, "HDF5", format!("{size} bytes"), expected)?;
+        Ok(Self { place, file, size })
+    }
+
+    /// An error about `field` of this file.
+    pub fn invalid(&self, field: &str, found: impl ToString, expected: impl Into<String>) -> Error {
+        Error::invalid(&self.place, field, found, expected)
+    }
+
+    fn broken(&self, data: &Dataset, e: &hdf5_reader::error::Error) -> Error {
+        self.invalid(data.name(), e, "data that is not damaged, unpacked or packed by deflate")
+    }
+
+    /// The data set at `path`, if there is one.
+    pub fn data(&self, path: &str) -> Option<Dataset> {
+        self.file.dataset(path).ok()
+    }
+
+    /// The data set at `path`.
+    pub fn needed(&self, path: &str) -> Result<Dataset> {
+        self.file.dataset(path).map_err(|e| self.invalid(path, e, "a data set"))
+    }
+
+    /// Names of the groups at the root.
+    fn root_groups(&self) -> Vec<String> {
+        self.file.root_group().and_then(|g| g.member_names()).map(|(groups, _)| groups).unwrap_or_default()
+    }
+
+    /// The data set or the layout that `name` means.
+    fn find(&self, name: Option<&str>) -> Result<Found> {
+        if let Some(data) = name.and_then(|n| self.data(n)) {
+            return Ok(Found::Data(Box::new(data)));
+        }
+        Ok(Found::Layout(Layout::find(self, name)?))
+    }
+
+    /// Where the frames of `part` are, and which of them belong to it.
+    fn frames(&self, name: Option<&str>, part: ScanPart) -> Result<(Dataset, Option<Vec<bool>>)> {
+        match self.find(name)? {
+            Found::Data(data) => Ok((*data, None)),
+            Found::Layout(layout) => layout.frames(self, part),
+        }
+    }
+
+    /// The shape, every axis at least 1 and as a whole within what the file can hold.
+    fn shape(&self, data: &Dataset) -> Result<Vec<usize>> {
+        let shape: Vec<usize> = data.shape().iter().map(|&n| usize::try_from(n).unwrap_or(usize::MAX)).collect();
+        let text = || format!("{:?}", data.shape());
+        if shape.contains(&0) {
+            return Err(self.invalid(data.name(), text(), "at least one value along every axis"));
+        }
+        let count = data.shape().iter().try_fold(1u64, |n, &s| n.checked_mul(s));
+        let (number, _) = self.number(data)?;
+        let bytes = count.and_then(|n| n.checked_mul(number.bytes() as u64));
+        let (Some(count), Some(bytes)) = (count, bytes) else {
+            return Err(self.invalid(data.name(), text(), "a size that can be addressed"));
+        };
+        let fits = match data.chunks() {
+            Some(_) => must_unpack(self.size, bytes, count),
+            None if bytes > self.size => Err(format!("at most {} bytes, the size of the file", self.size)),
+            None => Ok(()),
+        };
+        fits.map_err(|expected| self.invalid(data.name(), format!("{} of {bytes} bytes", text()), expected))?;
+        Ok(shape)
+    }
+
+    /// How values are stored.
+    fn number(&self, data: &Dataset) -> Result<(Number, ByteOrder)> {
+        let order = |o: hdf5_reader::ByteOrder| match o {
+            hdf5_reader::ByteOrder::LittleEndian => ByteOrder::Little,
+            hdf5_reader::ByteOrder::BigEndian => ByteOrder::Big,
+        };
+        let (number, byte_order) = match *data.dtype() {
+            Datatype::FixedPoint { size, signed, byte_order } => {
+                let number = match (size, signed) {
+                    (1, false) => Number::U8,
+                    (1, true) => Number::I8,
+                    (2, false) => Number::U16,
+                    (2, true) => Number::I16,
+                    (4, false) => Number::U32,
+                    (4, true) => Number::I32,
+                    (8, false) => Number::U64,
+                    (8, true) => Number::I64,
+                    _ => return Err(self.other_type(data)),
+                };
+                (number, byte_order)
+            }
+            Datatype::FloatingPoint { size: 4, byte_order } => (Number::F32, byte_order),
+            Datatype::FloatingPoint { size: 8, byte_order } => (Number::F64, byte_order),
+            _ => return Err(self.other_type(data)),
+        };
+        Ok((number, order(byte_order)))
+    }
+
+    fn other_type(&self, data: &Dataset) -> Error {
+        let found: String = format!("{:?}", data.dtype()).chars().take(80).collect();
+        self.invalid(data.name(), found, "integers of 1 to 8 bytes or floats of 4 or 8")
+    }
+
+    /// The values of the frames along the first axis that `kept` has, all without it.
+    fn values(&self, data: &Dataset, kept: Option<&[bool]>) -> Result<ArrayD<f32>> {
+        let mut shape = self.shape(data)?;
+        if !(2..=3).contains(&shape.len()) {
+            let found = format!("{shape:?}");
+            return Err(self.invalid(data.name(), found, "two axes (row, column) or three (view, row, column)"));
+        }
+        // Where each frame goes.
+        let mut count = 0;
+        let places: Vec<Option<usize>> = (0..shape[0])
+            .map(|i| {
+                let place = kept.is_none_or(|k| k.get(i) == Some(&true)).then_some(count);
+                count += usize::from(place.is_some());
+                place
+            })
+            .collect();
+        let frame: usize = shape[1..].iter().product();
+        let values = match data.chunks() {
+            Some(_) => self.chunked(data, &shape, &places, count * frame)?,
+            None => self.contiguous(data, &shape, &places, count * frame)?,
+        };
+        shape[0] = count;
+        let array = ArrayD::from_shape_vec(IxDyn(&shape), values)
+            .map_err(|e| self.invalid(data.name(), e, "values of its shape"))?;
+        match array.indexed_iter().find(|(_, x)| !x.is_finite()) {
+            Some((at, x)) => Err(self.invalid(&format!("{}{:?}", data.name(), at.slice()), x, "a finite number")),
+            None => Ok(array),
+        }
+    }
+
+    /// Chunk by chunk, in the order in which the file has them; memory grows with the frames that have come.
+    fn chunked(&self, data: &Dataset, shape: &[usize], places: &[Option<usize>], total: usize) -> Result<Vec<f32>> {
+        let (number, order) = self.number(data)?;
+        let frame: usize = shape[1..].iter().product();
+        // With two axes each row is a frame of one row.
+        let [rows, columns] = [if shape.len() == 3 { shape[1] } else { 1 }, shape[shape.len() - 1]];
+        // A chunk as it is stored and unpacked.
+        let chunk =
+            data.chunks().into_iter().flatten().fold(number.bytes() as u64, |n, k| n.saturating_mul(u64::from(k)));
+        allowance::memory(&self.place, data.name(), chunk.min(LONGEST_CHUNK).saturating_mul(2))?;
+        let mut out: Vec<f32> = Vec::new();
+        let mut decoded: Vec<f32> = Vec::new();
+        let (mut seen, mut wanted) = (0u64, 1u64);
+        for chunk in data.iter_chunks().map_err(|e| self.broken(data, &e))? {
+            let chunk = chunk.map_err(|e| self.broken(data, &e))?;
+            let at: Vec<usize> = chunk.offsets().iter().map(|&n| usize::try_from(n).unwrap_or(usize::MAX)).collect();
+            let size: Vec<usize> = chunk.shape().iter().map(|&n| usize::try_from(n).unwrap_or(usize::MAX)).collect();
+            let inside = at.iter().zip(shape).all(|(a, s)| a < s) && size.iter().all(|n| *n > 0);
+            if at.len() != shape.len() || size.len() != shape.len() || !inside {
+                return Err(self.invalid(
+                    data.name(),
+                    format!("a chunk at {at:?}"),
+                    format!("chunks within {shape:?}"),
+                ));
+            }
+            wanted = shape.iter().zip(&size).map(|(s, n)| s.div_ceil(*n) as u64).product();
+            seen += 1;
+            let held = chunk.bytes().len() / number.bytes();
+            allowance::numbers(&self.place, data.name(), held.saturating_sub(decoded.capacity()))?;
+            decoded.clear();
+            number.decode(order, chunk.bytes(), &mut decoded, |x| x as f32);
+            // Frames, rows and columns of the chunk.
+            let [depth, height, width] = match size[..] {
+                [d, h, w] => [d, h, w],
+                [d, w] => [d, 1, w],
+                _ => [0; 3],
+            };
+            if depth.checked_mul(height).and_then(|n| n.checked_mul(width)) != Some(decoded.len()) {
+                let found = format!("a chunk of {} values", decoded.len());
+                return Err(self.invalid(data.name(), found, format!("chunks of {size:?}")));
+            }
+            let [row, column] = [if shape.len() == 3 { at[1] } else { 0 }, at[shape.len() - 1]];
+            let [height_in, width_in] = [height.min(rows - row), width.min(columns - column)];
+            for (d, place) in places[at[0]..].iter().take(depth).enumerate() {
+                let Some(place) = place else { continue };
+                let end = (place + 1) * frame;
+                if out.len() < end {
+                    let more = end - out.len();
+                    memory::grow(&mut out, more, total, &self.place, data.name())?;
+                    out.resize(end, 0.0);
+                }
+                for h in 0..height_in {
+                    let from = (d * height + h) * width;
+                    let to = place * frame + (row + h) * columns + column;
+                    out[to..to + width_in].copy_from_slice(&decoded[from..from + width_in]);
+                }
+            }
+        }
+        if seen < wanted || out.len() < total {
+            let found = format!("{seen} chunks of values");
+            let expected = format!("{wanted}: the file was not written to its end");
+            return Err(self.invalid(data.name(), found, expected));
+        }
+        Ok(out)
+    }
+
+    /// A few frames at a time.
+    fn contiguous(&self, data: &Dataset, shape: &[usize], places: &[Option<usize>], total: usize) -> Result<Vec<f32>> {
+        let (number, _) = self.number(data)?;
+        let frame: usize = shape[1..].iter().product();
+        let step = (SLAB_BYTES / (frame as u64 * number.bytes() as u64).max(1)).max(1) as usize;
+        let mut out: Vec<f32> = Vec::new();
+        memory::grow(&mut out, total, usize::MAX, &self.place, data.name())?;
+        allowance::memory(&self.place, data.name(), 2 * (step.min(shape[0]) * frame * number.bytes()) as u64)?;
+        for from in (0..shape[0]).step_by(step) {
+            let to = (from + step).min(shape[0]);
+            let places = &places[from..to];
+            if places.iter().all(Option::is_none) {
+                continue;
+            }
+            let mut selection = SliceInfo::all(shape.len());
+            selection.selections[0] = SliceInfoElem::Slice { start: from as u64, end: to as u64, step: 1 };
+            macro_rules! append {
+                ($t:ty) => {{
+                    let slab = data.read_slice::<$t>(&selection).map_err(|e| self.broken(data, &e))?;
+                    for (values, place) in slab.outer_iter().zip(places) {
+                        if place.is_some() {
+                            out.extend(values.iter().map(|x| *x as f32));
+                        }
+                    }
+                }};
+            }
+            match number {
+                Number::U8 => append!(u8),
+                Number::I8 => append!(i8),
+                Number::U16 => append!(u16),
+                Number::I16 => append!(i16),
+                Number::U32 => append!(u32),
+                Number::I32 => append!(i32),
+                Number::U64 => append!(u64),
+                Number::I64 => append!(i64),
+                Number::F32 => append!(f32),
+                _ => append!(f64),
+            }
+        }
+        Ok(out)
+    }
+
+    /// The values of a data set with few of them.
+    pub fn small(&self, data: &Dataset) -> Result<Vec<f64>> {
+        let shape = self.shape(data)?;
+        let (number, order) = self.number(data)?;
+        let count: usize = shape.iter().product();
+        allowance::memory(&self.place, data.name(), 2 * (count as u64).saturating_mul(8))?;
+        let mut raw = vec![0; count * number.bytes()];
+        data.read_raw_bytes_into(&mut raw).map_err(|e| self.broken(data, &e))?;
+        let mut values = Vec::with_capacity(count);
+        number.decode(order, &raw, &mut values, |x| x);
+        Ok(values)
+    }
+
+    /// Refuses `found` values of `data` that are not one for each of `frames` frames.
+    fn one_each(&self, data: &Dataset, found: usize, frames: usize) -> Result<()> {
+        if found == frames {
+            return Ok(());
+        }
+        Err(self.invalid(data.name(), format!("{found} values"), format!("{frames}, one for each frame")))
+    }
+
+    /// A text beside `data`.
+    pub fn text_attribute(&self, data: &Dataset, name: &str) -> Option<String> {
+        data.attribute(name).ok()?.read_string().ok()
+    }
+
+    /// A number beside `data`.
+    pub fn number_attribute(&self, data: &Dataset, name: &str) -> Option<f64> {
+        let attribute = data.attribute(name).ok()?;
+        let as_integer =
+            || attribute.read_scalar::<i64>().map(|x| x as f64).or(attribute.read_scalar::<i32>().map(f64::from));
+        let as_float = || attribute.read_scalar::<f64>().or(attribute.read_scalar::<f32>().map(f64::from));
+        as_float().or_else(|_| as_integer()).ok().filter(|x| x.is_finite())
+    }
+}

@@ -1,0 +1,135 @@
+//! Files that h5py wrote (`tests/fixtures/make_formats.py`), and what is done to them.
+
+use crate::scan_size;
+use crate::scanner::{ImportOptions, Imported, read_scanner};
+use conefield_core::Result;
+use conefield_core::geometry::{Millimetres, Radians, View};
+use std::fs;
+use std::path::{Path, PathBuf};
+
+const CIRCLE: &str =
+    "[circle]\ndso = 500.0\ndsd = 800.0\npixel = { u = 2.0, v = 2.0 }\ndirection = \"counterclockwise\"\n";
+const FIXTURES: [&str; 3] = ["dxchange.h5", "nxtomo.nxs", "cil.nxs"];
+
+fn fixture(name: &str) -> PathBuf {
+    Path::new(env!("CARGO_MANIFEST_DIR")).join("tests/fixtures").join(name)
+}
+
+/// Imports a description with `files`, then `rest`, from a folder with all fixtures, the first `change`d.
+fn import(files: &str, rest: &str, change: impl Fn(&mut Vec<u8>)) -> Result<Imported> {
+    let dir = tempfile::tempdir().unwrap();
+    for name in FIXTURES {
+        let mut bytes = fs::read(fixture(name)).unwrap();
+        if name == FIXTURES[0] {
+            change(&mut bytes);
+        }
+        fs::write(dir.path().join(name), bytes).unwrap();
+    }
+    let head = "format = \"conefield-scanner\"\nversion = 1\n";
+    let volume = "[volume]\nshape = [4, 3, 2]\nspacing = [0.5, 0.75, 2.0]\n";
+    let path = dir.path().join("s.toml");
+    fs::write(&path, format!("{head}[files]\n{files}\n{rest}\n{volume}")).unwrap();
+    let size = scan_size(&path);
+    let imported = read_scanner(&path, &ImportOptions::default())?;
+    assert_eq!(size?.pixels, imported.scan.projections.len() as u64);
+    Ok(imported)
+}
+
+fn files(name: &str) -> String {
+    ["projections", "flat", "dark"].map(|part| format!("{part} = \"{name}\"")).join("\n")
+}
+
+fn refused(files: &str, rest: &str, change: impl Fn(&mut Vec<u8>), words: &[&str]) {
+    let e = import(files, rest, change).unwrap_err().to_string();
+    assert!(words.iter().all(|w| e.contains(w)), "{words:?} are not all in: {e}");
+}
+
+#[test]
+fn layouts_give_projections_fields_and_angles() {
+    let angles = |name: &str| format!("{CIRCLE}angles_deg = \"{name}\"\n");
+    let exchange = import(&files("dxchange.h5"), &angles("dxchange.h5"), |_| {}).unwrap().scan;
+    for (v, r, c) in [(0, 0, 0), (1, 2, 3), (2, 3, 4)] {
+        let i = (20 * v + 5 * r + c) as f64;
+        let [dark, flat] = [100.0 + i % 20.0 % 7.0, 20010.0 + i % 20.0];
+        let want = -((9000.0 + 97.0 * i - dark) / (flat - dark)).ln();
+        assert!((f64::from(exchange.projections[[v, r, c]]) - want).abs() < 1e-6, "{v} {r} {c}");
+    }
+    let turned = &exchange.geometry.views[1].source;
+    assert!((turned[0] + 250.0).abs() < 1e-9, "{turned:?}");
+    let tomo = import(&files("nxtomo.nxs"), &angles("nxtomo.nxs"), |_| {}).unwrap().scan;
+    assert_eq!(tomo.projections, exchange.projections);
+    assert!((tomo.geometry.views[2].source[1] - exchange.geometry.views[2].source[1]).abs() < 1e-9);
+    // A group and data sets by name.
+    let named = "projections = \"nxtomo.nxs:/entry\"\nflat = \"dxchange.h5:exchange/data_white\"\ndark = \"dxchange.h5:/exchange\"";
+    let named = import(named, &angles("dxchange.h5:/exchange/theta"), |_| {}).unwrap().scan;
+    assert_eq!(named.projections, exchange.projections);
+    // A data set lies as the description says.
+    let swapped =
+        format!("{CIRCLE}range_deg = 360\n[layout]\naxes = [\"view\", \"column\", \"row\"]\n[values]\ni0 = 20000\n");
+    let swapped = import("projections = \"dxchange.h5:/exchange/data\"", &swapped, |_| {}).unwrap().scan;
+    assert_eq!(swapped.projections.dim(), (3, 5, 4));
+}
+
+#[test]
+fn the_geometry_of_cil_is_that_of_its_conversion_to_vectors() {
+    let scan =
+        import("projections = \"cil.nxs\"", "[cil]\nfile = \"cil.nxs\"\n[values]\nkind = \"line-integrals\"\n", |_| {})
+            .unwrap()
+            .scan;
+    assert!((scan.projections[[2, 3, 4]] - 1.4723).abs() < 1e-6);
+    let mm = Millimetres;
+    for (view, angle) in scan.geometry.views.iter().zip([0.0, 120.0, 240.0]) {
+        // Source and detector go round by minus the angle, from below; the axis is half a millimetre aside.
+        let at = Radians(f64::to_radians(-90.0 - 10.0 - angle));
+        let want = View::circular(at, mm(500.0), mm(800.0), [mm(1.5), mm(2.0)], [mm(0.0), mm(-0.5)]);
+        let (s, c) = at.0.sin_cos();
+        let aside = |p: [f64; 3]| [p[0] + 0.5 * s, p[1] - 0.5 * c, p[2]];
+        for (found, want) in [(view.source, aside(want.source)), (view.detector, want.detector), (view.u, want.u)] {
+            assert!((0..3).all(|k| (found[k] - want[k]).abs() < 1e-9), "{angle}: {found:?} {want:?}");
+        }
+        // Its rows run up.
+        assert_eq!(view.v[2], 1.5);
+    }
+}
+
+#[test]
+fn what_is_not_there_or_damaged_is_refused_in_words() {
+    let same = |_: &mut Vec<u8>| {};
+    let turn = format!("{CIRCLE}range_deg = 360\n[values]\ni0 = 20000\n");
+    let of = |name: &str| format!("projections = \"{name}\"");
+    refused(
+        &of("dxchange.h5:/exchange/datum"),
+        &turn,
+        same,
+        &["dxchange.h5: /exchange/datum", "no such thing", "DXchange"],
+    );
+    refused(&of("dxchange.h5:/exchange/theta"), &turn, same, &["theta", "[3]", "two axes"]);
+    refused(
+        &of("dxchange.h5"),
+        &format!("{CIRCLE}angles_deg = \"nxtomo.nxs:/entry/sample\"\n"),
+        same,
+        &["nxtomo.nxs: /entry/sample"],
+    );
+    let dark = format!("{}\ndark = \"cil.nxs\"", of("dxchange.h5"));
+    refused(&dark, &turn, same, &["cil.nxs", "no image_key", "dark"]);
+    refused(
+        &of("cil.nxs"),
+        &turn.replace(CIRCLE, "[cil]\nfile = \"nxtomo.nxs\"\n").replace("range_deg = 360", ""),
+        same,
+        &["nxtomo.nxs"],
+    );
+    refused(&of("cil.nxs"), &format!("{turn}[cil]\nfile = \"cil.nxs\"\n"), same, &["several geometries", "[cil]"]);
+    let whole = fs::read(fixture("dxchange.h5")).unwrap();
+    for cut in [9, 60, whole.len() / 2, whole.len() - 1] {
+        refused(&of("dxchange.h5"), &turn, |b| b.truncate(cut), &["dxchange.h5"]);
+    }
+}
+
+#[test]
+fn any_one_changed_byte_is_told_or_changes_values_alone() {
+    let turn = format!("{CIRCLE}range_deg = 360\n[values]\ni0 = 20000\n");
+    let size = fs::metadata(fixture("dxchange.h5")).unwrap().len() as usize;
+    for at in (0..size).step_by(13) {
+        let _ = import("projections = \"dxchange.h5\"", &turn, |b| b[at] ^= 0x81);
+    }
+}

@@ -1,0 +1,35 @@
+//! NRRD, out: 32-bit floats in gzip, in the patient's coordinates (left, posterior, superior), as 3D Slicer and ITK read them.
+//!
+//! Source: the definition of the format, teem.sourceforge.net/nrrd/format.html.
+
+use crate::affine;
+use crate::file_order::{self, FileOrder};
+use conefield_core::parts::Voxels;
+use conefield_core::{Error, Result};
+use flate2::{Compression, GzBuilder};
+use std::io::Write;
+use std::path::Path;
+
+pub(crate) fn write(w: &mut dyn Write, path: &Path, voxels: &mut dyn Voxels) -> Result<()> {
+    let io = |e| Error::io(path, e);
+    let [nx, ny, nz] = voxels.grid().shape;
+    let (ras, _) = affine::of(voxels, &path.display().to_string());
+    let lps = affine::flip(ras);
+    let vector = |k: usize| {
+        let [a, b, c] = affine::column(&lps, k);
+        format!("({a},{b},{c})")
+    };
+    let text = format!(
+        "NRRD0004\ntype: float\ndimension: 3\nspace: left-posterior-superior\nsizes: {nx} {ny} {nz}\n\
+         space directions: {} {} {}\nkinds: domain domain domain\nspace units: \"mm\" \"mm\" \"mm\"\nendian: little\n\
+         encoding: gzip\nspace origin: {}\n\n",
+        vector(0),
+        vector(1),
+        vector(2),
+        vector(3),
+    );
+    w.write_all(text.as_bytes()).map_err(io)?;
+    let mut packed = GzBuilder::new().write(w, Compression::fast());
+    file_order::write(&mut packed, path, voxels, FileOrder::XFastest)?;
+    packed.finish().and_then(|w| w.flush()).map_err(io)
+}
