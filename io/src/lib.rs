@@ -24,7 +24,6 @@ mod checkpoint;
 mod counts;
 mod dicom;
 mod file_order;
-mod filling;
 mod folder;
 mod input;
 mod lease;

@@ -1,6 +1,6 @@
 //! `conefield import`
 
-use super::{info, selection::SelectionOptions};
+use super::{corrections::{CorrectionOptions, corrected_size, tell}, info, selection::SelectionOptions};
 use crate::boundary::{Inputs, refuse_existing};
 use crate::memory::Memory;
 use crate::{out, parse};
@@ -14,8 +14,8 @@ use std::path::PathBuf;
 /// Make a scan of what a scanner gave.
 ///
 /// SCANNER.toml names the files with the projections (TIFF, .npy, .npz, .mha), says in mm where source and detector stood
-/// and how arrays lie; docs/geometry.md has all keys. Raw counts become line integrals; dead and hot pixels are interpolated. Then
-/// the part that is asked for is taken: larger pixels (--bin) hold the mean of the light, as they would have counted it.
+/// and how arrays lie; docs/geometry.md has all keys. Raw counts become line integrals; dead and hot pixels are interpolated. What is
+/// asked for is mended (--correct). Then the part that is asked for is taken: larger pixels (--bin) hold the mean of the light, as they would have counted it.
 #[derive(Args)]
 pub struct ImportArgs {
     /// The description of the scanner.
@@ -33,6 +33,8 @@ pub struct ImportArgs {
     #[arg(long, value_name = "N", value_parser = parse::above_zero)]
     floor: Option<f64>,
     #[command(flatten)]
+    corrections: CorrectionOptions,
+    #[command(flatten)]
     selection: SelectionOptions,
     /// Replace SCAN.
     #[arg(long)]
@@ -46,9 +48,13 @@ impl ImportArgs {
     pub fn run(self) -> Result<()> {
         refuse_existing(&self.output, self.force)?;
         Inputs::default().and_description(&self.scanner).spare_folder(&self.output)?;
-        Memory::of_views(&conefield_io::scanner_size(&self.scanner)?).check(|_| vec![])?;
-        let options = ImportOptions { i0: self.i0, floor: self.floor, selection: self.selection.selection() };
+        let corrections = self.corrections.corrections()?;
+        let size = corrected_size(conefield_io::scanner_size(&self.scanner)?, &corrections);
+        Memory::of_views(&size).check(|_| vec![])?;
+        let selection = self.selection.selection();
+        let options = ImportOptions { i0: self.i0, floor: self.floor, corrections, selection };
         let imported = conefield_io::read_scanner(&self.scanner, &options)?;
+        tell(&self.scanner, &imported.corrections);
         conefield_io::write_scan(&self.output, &imported.scan, None)?;
         let found = self.understood(&imported);
         if self.json { out::json(&found) } else { out::say(&(info::lines(&found) + &info::warnings(&found))) }
@@ -63,6 +69,7 @@ impl ImportArgs {
         found["first_view"] = json!(views[0]);
         found["last_view"] = json!(views[views.len() - 1]);
         found["counts"] = json!(imported.counts);
+        found["corrections"] = json!(imported.corrections);
         found["line_integrals"] = json!(survey.check);
         found
     }
