@@ -95,7 +95,9 @@ impl Pixels {
             bad[at] = beyond > self.deviations * noise && beyond > STANDS_OUT * range;
         }
         let count = bad.iter().filter(|b| **b).count();
-        if count > 0 && let Some(filling) = Filling::new(&bad) {
+        if count > 0
+            && let Some(filling) = Filling::new(&bad)
+        {
             filling.fill(view.view_mut());
         }
         count

@@ -49,7 +49,13 @@ impl Correct for Rings {
 
     fn correct(&self, scan: &mut Scan) -> Result<String> {
         let columns = scan.geometry.detector[1];
-        ensure(self.window <= columns, "spec", "window", self.window, format!("at most {columns}, a row of the detector"))?;
+        ensure(
+            self.window <= columns,
+            "spec",
+            "window",
+            self.window,
+            format!("at most {columns}, a row of the detector"),
+        )?;
         let own = |row: ArrayView2<'_, f32>| match self.method {
             RingMethod::Sorting => by_sorting(row, self.window),
             RingMethod::Mean => by_mean(row, self.window),
@@ -100,7 +106,15 @@ fn by_mean(row: ArrayView2<'_, f32>, window: usize) -> Vec<f32> {
 fn moving_median(line: &[f32], window: usize) -> Vec<f32> {
     let (n, reach) = (line.len() as isize, (window / 2) as isize);
     let mut around = Vec::with_capacity(window);
-    let at = |i: isize| if i < 0 { -1 - i } else if i >= n { 2 * n - 1 - i } else { i };
+    let at = |i: isize| {
+        if i < 0 {
+            -1 - i
+        } else if i >= n {
+            2 * n - 1 - i
+        } else {
+            i
+        }
+    };
     let of = |i: isize| {
         around.clear();
         around.extend((i - reach..=i + reach).map(|k| line[at(k) as usize]));

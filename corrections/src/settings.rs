@@ -23,7 +23,8 @@ impl Corrections {
             };
             let keys: Vec<&str> = path.split('.').map(str::trim).collect();
             if keys.len() > DEEPEST || keys.iter().any(|k| k.is_empty()) {
-                let expected = "the name of a correction, such as rings, or one of its settings, such as rings.window=21";
+                let expected =
+                    "the name of a correction, such as rings, or one of its settings, such as rings.window=21";
                 return Err(Error::invalid(PLACE, "name", format!("\"{text}\""), expected));
             }
             put(&mut all, &keys, value, text)?;
@@ -73,12 +74,10 @@ fn put(table: &mut Table, keys: &[&str], value: Value, text: &str) -> Result<()>
             }
             _ => twice(),
         },
-        [key, rest @ ..] => {
-            match table.entry((*key).to_owned()).or_insert_with(|| Value::Table(Table::new())) {
-                Value::Table(inner) => put(inner, rest, value, text),
-                _ => twice(),
-            }
-        }
+        [key, rest @ ..] => match table.entry((*key).to_owned()).or_insert_with(|| Value::Table(Table::new())) {
+            Value::Table(inner) => put(inner, rest, value, text),
+            _ => twice(),
+        },
     }
 }
 

@@ -78,7 +78,12 @@ fn gains_that_stay_are_taken_off() {
         assert!(off_always(&mended, &exact) < 0.5 * before, "{method}: {} {before}", off_always(&mended, &exact));
         assert!(found.contains("gains differ"), "{found}");
         let (kept, _) = corrected(&noisy, &[&method]);
-        assert!(off(&kept, &exact) < 1.06 * off(&noisy, &exact), "{method}: {} {}", off(&kept, &exact), off(&noisy, &exact));
+        assert!(
+            off(&kept, &exact) < 1.06 * off(&noisy, &exact),
+            "{method}: {} {}",
+            off(&kept, &exact),
+            off(&noisy, &exact)
+        );
     }
     assert!(refused(&noisy, &["rings.window=73"]).contains("rings.window: found 73, expected at most 72"));
 }
@@ -103,7 +108,12 @@ fn pixels_that_do_not_measure_are_filled_in() {
         faulty.projections[[v, r, c]] -= 1.0;
     }
     let (mended, found) = corrected(&faulty, &["pixels"]);
-    assert!(off(&mended, &exact) < 1.1 * off(&noisy, &exact), "{found}: {} {}", off(&mended, &exact), off(&noisy, &exact));
+    assert!(
+        off(&mended, &exact) < 1.1 * off(&noisy, &exact),
+        "{found}: {} {}",
+        off(&mended, &exact),
+        off(&noisy, &exact)
+    );
     assert!(off(&faulty, &exact) > 2.0 * off(&noisy, &exact));
     for clean in [&noisy, &exact] {
         let (kept, found) = corrected(clean, &["pixels"]);
@@ -153,7 +163,12 @@ fn scattered_light_is_taken_off() {
         view.mapv_inplace(|a| -((-a).exp() + even).ln());
     }
     let (mended, found) = corrected(&faulty, &["scatter={ share = 0.2, width = 0.3 }"]);
-    assert!(off(&mended, &exact) < 0.6 * off(&faulty, &exact), "{found}: {} {}", off(&mended, &exact), off(&faulty, &exact));
+    assert!(
+        off(&mended, &exact) < 0.6 * off(&faulty, &exact),
+        "{found}: {} {}",
+        off(&mended, &exact),
+        off(&faulty, &exact)
+    );
     // Air scatters nothing.
     let air = changed(&exact, |_, _, _, _| 0.0);
     let (kept, found) = corrected(&air, &["scatter.share=0.2"]);
@@ -217,7 +232,15 @@ fn what_is_done_is_kept_in_the_scan() {
     // Values that none of them is made for.
     for value in [0.0, 80.0, 1e14, -1e14, 1e-30] {
         let odd = changed(&scan, |v, _, c, a| if (v + c) % 3 == 0 { value } else { a });
-        for text in ["pixels", "flux", "rings", "low-counts.photons=1000", "scatter.share=0.5", "hardening.water.kvp=90", "truncation"] {
+        for text in [
+            "pixels",
+            "flux",
+            "rings",
+            "low-counts.photons=1000",
+            "scatter.share=0.5",
+            "hardening.water.kvp=90",
+            "truncation",
+        ] {
             if let Ok((mended, _)) = Corrections::parse(&[text]).unwrap().apply(odd.clone(), "test") {
                 assert!(mended.projections.iter().all(|x| x.is_finite()), "{text} of {value}");
             }
@@ -228,7 +251,9 @@ fn what_is_done_is_kept_in_the_scan() {
     tiny.geometry.detector = [1, 1];
     tiny.geometry.views.truncate(1);
     tiny.projections = Array3::from_elem((1, 1, 1), 0.3);
-    for text in ["pixels", "flux", "low-counts.photons=1000", "scatter.share=0.5", "hardening.water.kvp=90", "truncation"] {
+    for text in
+        ["pixels", "flux", "low-counts.photons=1000", "scatter.share=0.5", "hardening.water.kvp=90", "truncation"]
+    {
         assert!(corrected(&tiny, &[text]).0.projections.iter().all(|x| x.is_finite()), "{text}");
     }
 }

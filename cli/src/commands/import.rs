@@ -1,6 +1,10 @@
 //! `conefield import`
 
-use super::{corrections::{CorrectionOptions, corrected_size, tell}, info, selection::SelectionOptions};
+use super::{
+    corrections::{CorrectionOptions, corrected_size, tell},
+    info,
+    selection::SelectionOptions,
+};
 use crate::boundary::{Inputs, refuse_existing};
 use crate::memory::Memory;
 use crate::{out, parse};

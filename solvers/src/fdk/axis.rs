@@ -72,7 +72,10 @@ impl Axis {
     /// In words, for the log.
     pub fn describe(&self) -> String {
         let [x, y, z] = self.center;
-        format!("circle around ({x:.1}, {y:.1}, {z:.1}) mm, its axis tilted by {:.1} degrees against z", self.tilt().to_degrees())
+        format!(
+            "circle around ({x:.1}, {y:.1}, {z:.1}) mm, its axis tilted by {:.1} degrees against z",
+            self.tilt().to_degrees()
+        )
     }
 }
 

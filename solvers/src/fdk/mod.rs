@@ -11,6 +11,7 @@ pub mod weights;
 use crate::iterative::drive::finite;
 use crate::iterative::monitor::VolumeMonitor;
 use crate::surround::{self, Within};
+use axis::{Axis as OrbitAxis, upright};
 use conefield_core::Error;
 use conefield_core::backend::Backend;
 use conefield_core::error::{Result, ensure};
@@ -25,7 +26,6 @@ use conefield_core::voxel::VoxelView;
 use conefield_projectors::voxel::Joseph;
 use conefield_projectors::voxel::backproject::backproject;
 use conefield_projectors::voxel::layout::{ColumnMajor, Pinhole, column_major_bytes};
-use axis::{Axis as OrbitAxis, upright};
 use filter::{Ramp, Window};
 use ndarray::{Array3, ArrayViewMut3, Axis, s};
 use rayon::prelude::*;
@@ -99,7 +99,8 @@ impl Plan for Fdk {
         let (geometry, measured) = orbit.symmetric(&job.scan.geometry);
         let upright = &orbit.symmetric(&upright).0;
         let (scan, backend) = (job.scan, job.backend);
-        let run = Backprojection { settings: self, scan, backend, orbit: &orbit, upright, geometry: &geometry, measured };
+        let run =
+            Backprojection { settings: self, scan, backend, orbit: &orbit, upright, geometry: &geometry, measured };
         let mut volume = run.all(start, observer)?;
         let floor = if self.nonnegative { 0.0 } else { f32::NEG_INFINITY };
         // A comparison, not a maximum, which would turn NaN into the floor.

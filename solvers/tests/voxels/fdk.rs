@@ -281,7 +281,9 @@ fn a_circle_lies_anywhere() {
         Ellipsoid { center: [-4.0, 3.0, 1.0], axes: [7.0; 3], value: 0.015 },
     ];
     let middle: Vec3 = [3.0, -2.0, 1.0];
-    for (degrees, orbit) in [(25.0f64, CENTRED), (25.0, CENTRED.short(0.5)), (-70.0, CENTRED), (0.0, CENTRED.aside(5.2, true))] {
+    for (degrees, orbit) in
+        [(25.0f64, CENTRED), (25.0, CENTRED.short(0.5)), (-70.0, CENTRED), (0.0, CENTRED.aside(5.2, true))]
+    {
         let mut geometry = geometry(Orbiting { views: 240, ..orbit });
         geometry.detector[0] = 56;
         geometry.volume.shape = [44; 3];
