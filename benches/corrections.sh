@@ -20,7 +20,7 @@ mkdir -p "$out"
 # Corrections as they are asked for where their fault is and, after a bar, where it is not (if they are told its size).
 rows=(
     "rings:rings"
-    "rings:rings.method=mean"
+    "rings:rings.method=sorting"
     "pixels:pixels"
     "flux:flux"
     "low-counts:low-counts.photons=100|low-counts.photons=3e4"

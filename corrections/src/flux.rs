@@ -10,6 +10,8 @@ use serde::{Deserialize, Serialize};
 
 /// Where the border tells: this share of its pieces is taken for air, as where `import` looks for the open beam.
 const AIR: f64 = 0.15;
+/// Pieces that lie above that by no more than so many times what the lowest lies below it are air, too.
+const NOISE: f32 = 3.0;
 /// No tube is so far off from one view to another: a view in which air seems to absorb more shows something else there.
 const MOST: f32 = 0.5;
 
@@ -60,7 +62,11 @@ impl Flux {
     /// What air shows in a view.
     fn air(&self, view: ArrayView2<'_, f32>) -> f32 {
         if self.rows.is_none() && self.columns.is_none() {
-            return quantile(&border_medians(view, |_, _| true), AIR).unwrap_or(0.0);
+            let pieces = border_medians(view, |_, _| true);
+            let (low, air) = (pieces.first().copied().unwrap_or(0.0), quantile(&pieces, AIR).unwrap_or(0.0));
+            // All pieces that differ by noise: the lowest ones alone would be too low.
+            let all: Vec<f32> = pieces.into_iter().filter(|p| *p <= air + NOISE * (air - low)).collect();
+            return all.iter().sum::<f32>() / all.len().max(1) as f32;
         }
         let [rows, columns] = [view.nrows(), view.ncols()];
         let ([top, bottom], [left, right]) = (self.rows.unwrap_or([0, rows]), self.columns.unwrap_or([0, columns]));

@@ -51,10 +51,16 @@ impl Correct for Pixels {
         if values.dim().0 >= LEAST_VIEWS {
             let [changes, flickers] = over_time(values.view());
             for ((at, &change), &flicker) in changes.indexed_iter().zip(&flickers) {
-                let [usual, calm] = [&changes, &flickers].map(|a| median_around(a.view(), at, &bad));
+                let [changes, flickers] = [&changes, &flickers].map(|a| sorted_around(a.view(), at, &bad));
+                // Along an edge of the object two neighbours flicker as well.
+                let (Some(usual), Some(most)) =
+                    (changes.get(changes.len().saturating_sub(1) / 2), flickers.iter().nth_back(1))
+                else {
+                    continue;
+                };
                 if change < STUCK * usual {
                     (bad[at], stuck) = (true, stuck + 1);
-                } else if flicker > self.deviations * calm && flicker > RESTLESS * range {
+                } else if flicker > self.deviations * most && flicker > RESTLESS * range {
                     (bad[at], restless) = (true, restless + 1);
                 }
             }
@@ -162,8 +168,8 @@ fn neighbours(view: ArrayView2<'_, f32>, (i, j): (usize, usize), out: &mut Vec<f
     }
 }
 
-/// The median of the pixels around `at` that are not `bad`; the lower one of two.
-fn median_around(view: ArrayView2<'_, f32>, (i, j): (usize, usize), bad: &Array2<bool>) -> f32 {
+/// The values of the up to eight pixels around `at` that are not `bad`, in rising order.
+fn sorted_around(view: ArrayView2<'_, f32>, (i, j): (usize, usize), bad: &Array2<bool>) -> Vec<f32> {
     let (rows, columns) = view.dim();
     let mut around = Vec::with_capacity(8);
     for r in i.saturating_sub(1)..(i + 2).min(rows) {
@@ -174,5 +180,5 @@ fn median_around(view: ArrayView2<'_, f32>, (i, j): (usize, usize), bad: &Array2
         }
     }
     around.sort_unstable_by(f32::total_cmp);
-    around.get(around.len().saturating_sub(1) / 2).copied().unwrap_or(0.0)
+    around
 }

@@ -7,22 +7,25 @@ use crate::Correct;
 use conefield_core::error::{Result, ensure};
 use conefield_core::scan::Scan;
 use conefield_diagnosis::quantiles::median;
-use ndarray::{Array2, ArrayView2, Axis};
+use ndarray::{Array2, ArrayView1, ArrayView2, Axis};
 use rayon::prelude::*;
 use serde::{Deserialize, Serialize};
+
+/// Standard deviations by which the median of sorted values may be off by chance.
+const CHANCE: f32 = 3.0;
 
 /// How what stays is told from the object.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize)]
 #[serde(rename_all = "kebab-case")]
 pub enum RingMethod {
+    /// What a moving average along the row takes off is the pixel's own if it stays over the views (Boin and Haibel, Optics Express
+    /// 14(25), 2006). Medians stand for both of their means: of few views each weighs much, and edges of the object must not count.
+    #[default]
+    Median,
     /// Each pixel's values are sorted over the views: neighbours then differ little, wherever the object was. What a moving
     /// median along the row takes off the sorted values is the pixel's own (Vo, Atwood and Drakopoulos, Optics Express 26(22), 2018,
-    /// algorithm 3). Of that the median over all ranks is taken off every view.
-    #[default]
+    /// algorithm 3). Of that the median over the ranks is taken off every view, less what it may be by chance.
     Sorting,
-    /// What a moving median along the row takes off the mean of all views (Boin and Haibel, Optics Express 14(25), 2006, with
-    /// the median in place of their moving average).
-    Mean,
 }
 
 /// Ring artefacts.
@@ -37,7 +40,7 @@ pub struct Rings {
 
 impl Default for Rings {
     fn default() -> Self {
-        Self { method: RingMethod::Sorting, window: 11 }
+        Self { method: RingMethod::Median, window: 11 }
     }
 }
 
@@ -57,8 +60,8 @@ impl Correct for Rings {
             format!("at most {columns}, a row of the detector"),
         )?;
         let own = |row: ArrayView2<'_, f32>| match self.method {
+            RingMethod::Median => by_median(row, self.window),
             RingMethod::Sorting => by_sorting(row, self.window),
-            RingMethod::Mean => by_mean(row, self.window),
         };
         let mut squares = 0.0;
         let lines: Vec<Vec<f32>> = scan.projections.axis_iter(Axis(1)).into_par_iter().map(own).collect();
@@ -74,32 +77,39 @@ impl Correct for Rings {
 }
 
 /// What is the pixels' own in a row `[view, column]`.
-fn by_sorting(row: ArrayView2<'_, f32>, window: usize) -> Vec<f32> {
-    let (views, columns) = row.dim();
-    let mut sorted = Array2::zeros((columns, views));
-    for (values, mut out) in row.columns().into_iter().zip(sorted.outer_iter_mut()) {
-        let mut line = values.to_vec();
-        line.sort_unstable_by(f32::total_cmp);
-        out.iter_mut().zip(&line).for_each(|(x, y)| *x = *y);
-    }
-    let mut own = Array2::zeros((columns, views));
-    for rank in 0..views {
-        let line = sorted.column(rank).to_vec();
-        let smooth = moving_median(&line, window);
-        for c in 0..columns {
-            own[[c, rank]] = line[c] - smooth[c];
-        }
-    }
-    own.outer_iter().map(|ranks| median(&mut ranks.to_vec()).unwrap_or(0.0)).collect()
+fn by_median(row: ArrayView2<'_, f32>, window: usize) -> Vec<f32> {
+    let own = taken_off(row, window);
+    own.columns().into_iter().map(|views| median(&mut views.to_vec()).unwrap_or(0.0)).collect()
 }
 
-fn by_mean(row: ArrayView2<'_, f32>, window: usize) -> Vec<f32> {
-    let mean: Vec<f32> = row
-        .columns()
-        .into_iter()
-        .map(|c| (c.iter().map(|&x| f64::from(x)).sum::<f64>() / c.len().max(1) as f64) as f32)
-        .collect();
-    moving_median(&mean, window).iter().zip(&mean).map(|(smooth, x)| x - smooth).collect()
+fn by_sorting(row: ArrayView2<'_, f32>, window: usize) -> Vec<f32> {
+    let mut sorted = row.to_owned();
+    for mut values in sorted.columns_mut() {
+        let mut line = values.to_vec();
+        line.sort_unstable_by(f32::total_cmp);
+        values.iter_mut().zip(&line).for_each(|(x, y)| *x = *y);
+    }
+    let own = taken_off(sorted.view(), window);
+    // 1.4826 makes the median of |x| the standard deviation of normal noise, and the median of n values spreads 1.2533/√n times as far.
+    let by_chance = CHANCE * 1.4826 * 1.2533 / (row.nrows() as f32).sqrt();
+    let of = |ranks: ArrayView1<'_, f32>| {
+        let mut ranks = ranks.to_vec();
+        let middle = median(&mut ranks).unwrap_or(0.0);
+        ranks.iter_mut().for_each(|x| *x = (*x - middle).abs());
+        let least = by_chance * median(&mut ranks).unwrap_or(0.0);
+        middle.signum() * (middle.abs() - least).max(0.0)
+    };
+    own.columns().into_iter().map(of).collect()
+}
+
+/// What a moving median along each line of `[view, column]` takes off it.
+fn taken_off(lines: ArrayView2<'_, f32>, window: usize) -> Array2<f32> {
+    let mut own = lines.to_owned();
+    for mut line in own.rows_mut() {
+        let smooth = moving_median(&line.to_vec(), window);
+        line.iter_mut().zip(&smooth).for_each(|(x, s)| *x -= s);
+    }
+    own
 }
 
 /// The median of the `window` values around each. At the ends the line goes on as its mirror image.
