@@ -6,6 +6,7 @@ mod cell;
 mod compare;
 mod completions;
 mod convert;
+mod corrections;
 mod demo;
 mod evaluate;
 mod explain;

@@ -4,9 +4,9 @@
 //! dark value `d` to what it counts and each pixel answers by its own factor, which the flat field `f` (a view
 //! without object) holds: `A = −ln((I − d)/(f − d))`.
 
-use crate::filling::Filling;
 use conefield_core::error::ensure;
 use conefield_core::{Error, Result};
+use conefield_corrections::filling::Filling;
 use conefield_diagnosis::bad_pixels::{from_fields, outliers};
 use conefield_diagnosis::border::border_medians;
 use conefield_diagnosis::quantiles::{median, quantile};

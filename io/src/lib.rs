@@ -28,7 +28,6 @@ mod counts;
 mod dicom;
 mod events;
 mod file_order;
-mod filling;
 mod folder;
 mod hdf5;
 mod input;

@@ -62,6 +62,7 @@ use conefield_core::geometry::{Geometry, Radians, View, VoxelGrid};
 use conefield_core::orbit::CircularOrbit;
 use conefield_core::scan::{Scan, Unit};
 use conefield_core::{Error, Result};
+use conefield_corrections::{Applied, Corrections};
 use ndarray::{Array3, Axis};
 use serde::{Deserialize, Serialize};
 use serde_json::json;
@@ -91,6 +92,8 @@ pub struct ImportOptions {
     pub i0: Option<I0>,
     /// In place of the file's `floor`.
     pub floor: Option<f64>,
+    /// What is mended, after counts are converted and before a part is taken.
+    pub corrections: Corrections,
     /// The part of the scan that is taken. Counts are converted before: dead pixels are mended by their neighbours, and air is
     /// looked for at the border of the whole detector. Larger pixels then hold the mean of the light, as they would have counted it;
     /// where the files hold line integrals, the mean of these.
@@ -104,6 +107,8 @@ pub struct Imported {
     pub scan: Scan,
     /// What the conversion from counts met; `None` if the files hold line integrals.
     pub counts: Option<CountsReport>,
+    /// What was mended.
+    pub corrections: Vec<Applied>,
 }
 
 #[derive(Deserialize)]
@@ -299,9 +304,10 @@ pub fn read_scanner(path: impl AsRef<Path>, options: &ImportOptions) -> Result<I
     });
     let scan = Scan { geometry, projections, unit: Unit::default(), provenance };
     scan.validate(&place)?;
+    let (scan, corrections) = options.corrections.apply(scan, &place)?;
     let mean = if counts.is_some() { Mean::Light } else { Mean::LineIntegrals };
     let scan = options.selection.take(scan, mean)?;
-    Ok(Imported { scan, counts })
+    Ok(Imported { scan, counts, corrections })
 }
 
 /// The size of the scan that the description `path` leads to. Arranging the values and converting counts take copies.

@@ -1,5 +1,6 @@
 //! `conefield convert`
 
+use super::corrections::{CorrectionOptions, corrected_size, tell};
 use super::selection::SelectionOptions;
 use crate::boundary::{Inputs, refuse_existing};
 use crate::memory::Memory;
@@ -15,7 +16,8 @@ use std::path::PathBuf;
 ///
 /// Volumes: NIfTI (.nii, .nii.gz), MetaImage (.mha, .mhd with a .raw), NRRD, NumPy (.npy), a TIFF stack (.tif) or a folder of
 /// OME-Zarr (.zarr), by the name of OUT; IN may also be the folder of a DICOM series, but no NRRD, TIFF or OME-Zarr. Scans: the
-/// format is --to; r2 and naf keep test views. Part of a scan may be taken; --bin averages line integrals.
+/// format is --to; r2 and naf keep test views. A scan may be corrected (--correct), and part of it taken; --bin averages line
+/// integrals.
 #[derive(Args)]
 pub struct ConvertArgs {
     /// A volume or a scan.
@@ -30,6 +32,8 @@ pub struct ConvertArgs {
     /// Meaning of the voxel values: as-is, hu:MU_WATER or clip:LO,HI.
     #[arg(long, default_value = "as-is", value_parser = parse::values)]
     values: Values,
+    #[command(flatten)]
+    corrections: CorrectionOptions,
     #[command(flatten)]
     selection: SelectionOptions,
     /// Replace OUT.
@@ -57,11 +61,13 @@ impl ConvertArgs {
         let inputs = Inputs::of([&self.input]);
         inputs.spare_file(&self.output)?;
         inputs.spare_folder(&self.output)?;
-        let selection = self.selection.selection();
+        let (selection, corrections) = (self.selection.selection(), self.corrections.corrections()?);
         if conefield_io::is_volume(&self.input) {
-            if let Some(option) = self.selection.named() {
+            let named = self.selection.named().or((!corrections.is_none()).then_some("--correct"));
+            if let Some(option) = named {
                 let place = self.input.display().to_string();
-                return Err(Error::invalid(place, option, "a volume", "a scan: only scans have views and pixels"));
+                let expected = "a scan: only scans have views and pixels";
+                return Err(Error::invalid(place, option, "a volume", expected));
             }
             let voxels = conefield_io::volume_voxels(&self.input)?;
             Memory::of_volumes(&[voxels]).check(|_| vec![])?;
@@ -70,8 +76,13 @@ impl ConvertArgs {
             let volume = self.values.apply(volume)?;
             conefield_io::write_volume(&self.output, &volume)?;
         } else {
-            Memory::of_data_set(&conefield_io::scan_size(&self.input)?).check(|_| vec![])?;
+            let size = corrected_size(conefield_io::scan_size(&self.input)?, &corrections);
+            Memory::of_data_set(&size).check(|_| vec![])?;
             let DataSet { train, test, volume } = conefield_io::read_data_set(&self.input)?;
+            let place = self.input.display().to_string();
+            let (train, applied) = corrections.apply(train, &place)?;
+            tell(&self.input, &applied);
+            let test = test.map(|test| corrections.apply(test, &place)).transpose()?.map(|(test, _)| test);
             let test = test.map(|test| selection.of_detector(test)).transpose()?;
             let data = DataSet { train: selection.of(train)?, test, volume };
             files::warn_of(&self.input, &survey(&data.train));

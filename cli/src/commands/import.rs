@@ -1,6 +1,10 @@
 //! `conefield import`
 
-use super::{info, selection::SelectionOptions};
+use super::{
+    corrections::{CorrectionOptions, corrected_size, tell},
+    info,
+    selection::SelectionOptions,
+};
 use crate::boundary::{Inputs, refuse_existing};
 use crate::memory::Memory;
 use crate::{out, parse};
@@ -15,7 +19,7 @@ use std::path::PathBuf;
 ///
 /// SCANNER.toml names the files with the projections (TIFF, HDF5, .npy, .npz, .mha) and describes geometry (in mm) and array layout;
 /// docs/guide/formats.md has all keys. A .xtekct file of Nikon replaces it. Raw counts become line integrals; dead and hot pixels are
-/// interpolated. Then a part may be taken; --bin averages counts.
+/// interpolated. Then --correct corrects faults and a part may be taken; --bin averages counts.
 #[derive(Args)]
 pub struct ImportArgs {
     /// The description of the scanner.
@@ -33,6 +37,8 @@ pub struct ImportArgs {
     #[arg(long, value_name = "N", value_parser = parse::above_zero)]
     floor: Option<f64>,
     #[command(flatten)]
+    corrections: CorrectionOptions,
+    #[command(flatten)]
     selection: SelectionOptions,
     /// Replace SCAN.
     #[arg(long)]
@@ -46,9 +52,13 @@ impl ImportArgs {
     pub fn run(self) -> Result<()> {
         refuse_existing(&self.output, self.force)?;
         Inputs::default().and_description(&self.scanner).spare_folder(&self.output)?;
-        Memory::of_views(&conefield_io::scanner_size(&self.scanner)?).check(|_| vec![])?;
-        let options = ImportOptions { i0: self.i0, floor: self.floor, selection: self.selection.selection() };
+        let corrections = self.corrections.corrections()?;
+        let size = corrected_size(conefield_io::scanner_size(&self.scanner)?, &corrections);
+        Memory::of_views(&size).check(|_| vec![])?;
+        let selection = self.selection.selection();
+        let options = ImportOptions { i0: self.i0, floor: self.floor, corrections, selection };
         let imported = conefield_io::read_scanner(&self.scanner, &options)?;
+        tell(&self.scanner, &imported.corrections);
         conefield_io::write_scan(&self.output, &imported.scan, None)?;
         let found = self.understood(&imported);
         if self.json { out::json(&found) } else { out::say(&(info::lines(&found) + &info::warnings(&found))) }
@@ -63,6 +73,7 @@ impl ImportArgs {
         found["first_view"] = json!(views[0]);
         found["last_view"] = json!(views[views.len() - 1]);
         found["counts"] = json!(imported.counts);
+        found["corrections"] = json!(imported.corrections);
         found["line_integrals"] = json!(survey.check);
         found
     }

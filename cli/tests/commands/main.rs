@@ -10,6 +10,7 @@ mod budget;
 mod calibrate;
 mod chain;
 mod compare;
+mod corrections;
 #[cfg(target_os = "linux")]
 mod durability;
 mod experiments;

@@ -4,12 +4,14 @@
 //! the voxel, Δβ_i the view's share of the turn and w_i what its rays count ([`weights`]). Rows are filtered with the pitch
 //! that they have at the axis. No factor is fitted: the scale is right for any number of views and any magnification.
 
+mod axis;
 pub mod filter;
 pub mod weights;
 
 use crate::iterative::drive::finite;
 use crate::iterative::monitor::VolumeMonitor;
 use crate::surround::{self, Within};
+use axis::{Axis as OrbitAxis, upright};
 use conefield_core::Error;
 use conefield_core::backend::Backend;
 use conefield_core::error::{Result, ensure};
@@ -31,7 +33,7 @@ use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 use std::ops::Range;
 use std::time::Instant;
-use weights::{Coverage, FdkOrbit, place};
+use weights::{Coverage, FdkOrbit, lean, place};
 
 /// Settings of `fdk`.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
@@ -89,12 +91,16 @@ impl Plan for Fdk {
         job.scan.validate("scan")?;
         let within = Within::of(job, self.scene.surround, observer)?;
         let job = &Within::job(within.as_ref(), job);
-        let orbit = FdkOrbit::of(&job.scan.geometry);
-        check(&orbit, &job.scan.geometry)?;
-        said(&orbit).iter().for_each(|line| observer.note(line));
+        let axis = OrbitAxis::of(&job.scan.geometry);
+        let upright = upright(&job.scan.geometry, axis.as_ref());
+        let orbit = FdkOrbit::of(&upright);
+        check(&orbit, &upright)?;
+        said(axis.as_ref(), &orbit).iter().for_each(|line| observer.note(line));
         let (geometry, measured) = orbit.symmetric(&job.scan.geometry);
+        let upright = &orbit.symmetric(&upright).0;
         let (scan, backend) = (job.scan, job.backend);
-        let run = Backprojection { settings: self, scan, backend, orbit: &orbit, geometry: &geometry, measured };
+        let run =
+            Backprojection { settings: self, scan, backend, orbit: &orbit, upright, geometry: &geometry, measured };
         let mut volume = run.all(start, observer)?;
         let floor = if self.nonnegative { 0.0 } else { f32::NEG_INFINITY };
         // A comparison, not a maximum, which would turn NaN into the floor.
@@ -116,9 +122,12 @@ impl Plan for Fdk {
     }
 
     fn inspect(&self, scan: &Scan) -> Result<Findings> {
-        let orbit = FdkOrbit::of(&scan.geometry);
+        let axis = OrbitAxis::of(&scan.geometry);
+        let upright = upright(&scan.geometry, axis.as_ref());
+        let orbit = FdkOrbit::of(&upright);
         let mut lines = surround::found(scan, self.scene.surround)?;
-        lines.extend(check(&orbit, &scan.geometry).map_or_else(|e| vec![e.to_string()], |()| said(&orbit)));
+        let fits = check(&orbit, &upright);
+        lines.extend(fits.map_or_else(|e| vec![e.to_string()], |()| said(axis.as_ref(), &orbit)));
         Ok(Findings { lines, ..Findings::default() })
     }
 
@@ -144,6 +153,8 @@ struct Backprojection<'a> {
     scan: &'a Scan,
     backend: &'a dyn Backend,
     orbit: &'a FdkOrbit,
+    /// As [`geometry`](Self::geometry), where the orbit's axis is z.
+    upright: &'a Geometry,
     /// With the columns that an offset detector lacks.
     geometry: &'a Geometry,
     /// The columns that were measured.
@@ -194,12 +205,12 @@ impl Backprojection<'_> {
 
     /// Weighs and filters the image of a view.
     fn filter(&self, view: usize, pixels: &mut [f32]) {
-        let (g, v) = (self.geometry, &self.geometry.views[view]);
+        let (g, v) = (self.upright, &self.upright.views[view]);
         let columns = g.detector[1];
         let (normal, distance) = v.normal();
         let radius = self.orbit.radius[view];
         let ramp = Ramp::new(columns, norm(v.u) * radius / distance, self.settings.window, self.settings.cutoff);
-        let count = |c| self.orbit.weight(view, place(g, view, c as f64, radius));
+        let count = |c| self.orbit.weight(view, place(g, view, c as f64, radius)) * lean(g, view, c as f64, radius);
         let counts: Vec<f64> = (0..columns).map(count).collect();
         pixels.par_chunks_mut(16 * columns).enumerate().for_each(|(n, strip)| {
             for (r, line) in strip.chunks_mut(columns).enumerate() {
@@ -214,8 +225,9 @@ impl Backprojection<'_> {
 }
 
 /// What is told of an orbit.
-fn said(orbit: &FdkOrbit) -> Vec<String> {
-    let mut lines = vec![orbit.describe()];
+fn said(axis: Option<&OrbitAxis>, orbit: &FdkOrbit) -> Vec<String> {
+    let mut lines: Vec<String> = axis.into_iter().map(OrbitAxis::describe).collect();
+    lines.push(orbit.describe());
     if orbit.coverage == Coverage::Limited {
         lines.push("expect streaks along the missing directions; an iterative method suits this scan better".into());
     }

@@ -9,7 +9,7 @@
 //!
 //! What the orbit asks for is found from the views alone.
 
-use conefield_core::geometry::{Geometry, dot, norm, sub};
+use conefield_core::geometry::{Geometry, Vec3, View, dot, norm, sub};
 use std::f64::consts::{FRAC_PI_2, FRAC_PI_4, PI, TAU};
 use std::ops::Range;
 
@@ -198,16 +198,43 @@ fn edges(geometry: &Geometry, view: usize, radius: f64) -> [f64; 2] {
     [-0.5, columns - 0.5].map(|c| place(geometry, view, c, radius))
 }
 
-/// Where column `column` of view `view` looks on the virtual detector through the axis: mm along u from the ray that
-/// meets the axis at a right angle to u.
+/// Where column `column` of view `view` looks: `radius` times the tangent of the angle between its ray in the orbit's plane and the one
+/// to the axis, mm towards rising u. On a detector that faces the axis that is the place on the virtual detector through the axis.
 pub fn place(geometry: &Geometry, view: usize, column: f64, radius: f64) -> f64 {
     let v = &geometry.views[view];
-    let (_, distance) = v.normal();
+    let [ahead, across] = in_plane(v, ray(geometry, view, column));
+    let sense = (v.source[0] * v.u[1] - v.source[1] * v.u[0]).signum();
+    radius * sense * across / ahead
+}
+
+/// What a detector that does not face the axis changes in the weight of column `column`: a step of the angle moves the source across the
+/// rays by R·cos γ, with γ counted from the ray to the axis and R the distance to it, where the filter's geometry has
+/// `radius`·cos of the angle to the detector's normal (the change of variables of Kak and Slaney, section 3.4.2, for a normal that
+/// points elsewhere). 1 on a detector that faces the axis.
+pub fn lean(geometry: &Geometry, view: usize, column: f64, radius: f64) -> f64 {
+    let v = &geometry.views[view];
+    let (normal, _) = v.normal();
+    let [ahead, across] = in_plane(v, normal);
+    if across.abs() <= 1e-9 * ahead {
+        return 1.0;
+    }
+    let d = ray(geometry, view, column);
+    let to_axis = v.source[0].hypot(v.source[1]) * in_plane(v, d)[0];
+    to_axis / (radius * (normal[0] * d[0] + normal[1] * d[1]))
+}
+
+/// From the source to the middle row's pixel in column `column`.
+fn ray(geometry: &Geometry, view: usize, column: f64) -> Vec3 {
+    let v = &geometry.views[view];
     let row = (geometry.detector[0] as f64 - 1.0) / 2.0;
-    let to = sub(v.pixel(geometry.detector, row, column), v.source);
-    let axis = [-v.source[0], -v.source[1], 0.0];
-    let unit = v.u.map(|x| x / norm(v.u));
-    dot(to, unit) * radius / distance - dot(axis, unit)
+    sub(v.pixel(geometry.detector, row, column), v.source)
+}
+
+/// How far `a` goes from the source towards the axis, and across in the direction of rising angles.
+fn in_plane(v: &View, a: Vec3) -> [f64; 2] {
+    let radius = v.source[0].hypot(v.source[1]);
+    let [c, s] = [v.source[0] / radius, v.source[1] / radius];
+    [-(a[0] * c + a[1] * s), a[1] * c - a[0] * s]
 }
 
 #[cfg(test)]

@@ -3,7 +3,7 @@
 use ndarray::{Array2, ArrayViewMut2};
 
 /// How the bad pixels of a detector are filled in.
-pub(crate) struct Filling {
+pub struct Filling {
     pixels: Vec<Patch>,
 }
 
