@@ -34,13 +34,14 @@ pub enum RingMethod {
 pub struct Rings {
     /// How what stays is told from the object.
     pub method: RingMethod,
-    /// Pixels along the row over which the median moves, odd. Faults that are half as wide are mended.
+    /// Pixels along the row over which the median moves, odd. Faults of less than half of them are mended; more of them take more of the object for
+    /// its own where that stays in the same columns.
     pub window: usize,
 }
 
 impl Default for Rings {
     fn default() -> Self {
-        Self { method: RingMethod::Median, window: 11 }
+        Self { method: RingMethod::Median, window: 5 }
     }
 }
 

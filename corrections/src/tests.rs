@@ -72,7 +72,7 @@ fn gains_that_stay_are_taken_off() {
     let gains = Array2::from_shape_simple_fn((60, 72), || Normal::new(0.0, 0.03f32).unwrap().sample(&mut random));
     let faulty = changed(&noisy, |_, r, c, a| a + gains[[r, c]]);
     for method in ["median", "sorting"] {
-        let method = format!("rings.method={method}");
+        let method = format!("rings={{ method = \"{method}\", window = 11 }}");
         let (mended, found) = corrected(&faulty, &[&method]);
         let before = off_always(&faulty, &exact);
         assert!(off_always(&mended, &exact) < 0.7 * before, "{method}: {} {before}", off_always(&mended, &exact));
@@ -225,7 +225,7 @@ fn what_is_done_is_kept_in_the_scan() {
     let done = once.provenance["corrections"].as_array().unwrap();
     let names: Vec<&str> = done.iter().map(|d| d["name"].as_str().unwrap()).collect();
     assert_eq!(names, ["rings", "hardening"]);
-    assert_eq!(done[0]["settings"], json!({ "method": "median", "window": 11 }));
+    assert_eq!(done[0]["settings"], json!({ "method": "median", "window": 5 }));
     assert_eq!(once.provenance["simulated"], scan.provenance["simulated"]);
     let (twice, _) = corrected(&once, &["flux"]);
     assert_eq!(twice.provenance["corrections"].as_array().unwrap().len(), 3);
