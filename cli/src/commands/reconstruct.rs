@@ -1,7 +1,7 @@
 //! `conefield reconstruct`
 
 use super::record::{RunRecord, Written, summary};
-use super::{backends::simd_level, calibrate, protocol::RunProtocol};
+use super::{backends::simd_level, calibrate, protocol::RunProtocol, watch};
 use crate::board::Board;
 use crate::boundary::{self, Inputs};
 use crate::live::Live;
@@ -71,6 +71,10 @@ pub struct ReconstructArgs {
     /// Write events.out.tfevents.conefield in RUN, in which TensorBoard shows the curves and pictures of the run as it goes on.
     #[arg(long)]
     tensorboard: bool,
+    /// Show the page of "conefield report" at http://127.0.0.1:PORT/ while the run goes on, with live.png every 5 s where --live says
+    /// nothing else [default: a free port].
+    #[arg(long, value_name = "PORT", num_args = 0..=1, require_equals = true, default_missing_value = "0")]
+    watch: Option<u16>,
     /// Print one JSON object: what record.json holds.
     #[arg(long)]
     json: bool,
@@ -86,6 +90,9 @@ fn spec_help() -> String {
 
 /// What an error that goes to standard output begins with.
 pub const FAILED: &str = "failed: ";
+
+/// Seconds between two live pictures that --watch shows.
+const WATCHED: f64 = 5.0;
 
 /// A held-out error above this may come from a wrong geometry.
 const DOUBTFUL: f64 = 0.05;
@@ -162,6 +169,9 @@ impl ReconstructArgs {
                 (folder.metrics()?, None)
             }
         };
+        if let Some(port) = self.watch {
+            watch::serve(&self.output, port)?;
+        }
         let mut progress = self.progress(&folder, metrics, identity)?;
         let (seed, limits) = (self.protocol.seed, self.protocol.ends.limits());
         let job = input.work.job(backend.as_ref(), seed, limits, schedule.as_ref());
@@ -280,7 +290,9 @@ impl ReconstructArgs {
         };
         Ok(Progress::new("reconstruct", Some(metrics))
             .keeping(Some(keeper))
-            .showing(self.live.map(|seconds| Live::new(folder.file("live.png"), seconds)))
+            .showing(
+                self.live.or(self.watch.map(|_| WATCHED)).map(|seconds| Live::new(folder.file("live.png"), seconds)),
+            )
             .reporting(board.transpose()?))
     }
 
