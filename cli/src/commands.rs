@@ -28,6 +28,7 @@ mod study;
 mod tradeoff;
 mod trained;
 mod trial;
+mod watch;
 
 use clap::{ArgAction, Args, Subcommand};
 use conefield_core::Result;

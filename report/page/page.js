@@ -35,6 +35,9 @@
   }
   byId("warnings-section").hidden = page.warnings.length === 0;
 
+  for (const run of runs.filter((r) => r.live)) byId("live").append(element("img", { class: "picture", src: run.live, alt: "The middle slices" }));
+  byId("live-section").hidden = byId("live").childElementCount === 0;
+
   const scores = byId("scores");
   scores.append(row("th", ["", ...runs.map((r) => r.name)]));
   for (const [name, kind, pick] of [

@@ -6,7 +6,7 @@
 mod picture;
 mod volume;
 
-pub use picture::{Scale, geometry_url, picture_url, spread};
+pub use picture::{Scale, geometry_url, picture_url, png_url, spread};
 pub use volume::{PageVolume, coarser};
 
 use conefield_core::{Error, Result};
@@ -65,6 +65,8 @@ pub struct PageRun {
     pub record: Option<Value>,
     /// The lines of its `metrics.jsonl`.
     pub curves: Vec<Value>,
+    /// The slices of a run that goes on, a picture ([`png_url`]).
+    pub live: Option<String>,
     /// Which of the page's scans it is of, where that is known.
     pub scan: Option<usize>,
     /// Its result in the scan's views.
@@ -131,36 +133,49 @@ impl Page {
     /// Writes the page as HTML to `path`; its bytes.
     pub fn write(&self, path: impl AsRef<Path>) -> Result<u64> {
         let path = path.as_ref();
-        let text =
-            self.data().map_err(|e| Error::invalid(path.display().to_string(), "page", e, "what JSON can hold"))?;
         let mut written = 0;
         write_atomic(path, |out| {
-            let mut put = |piece: &str| {
+            self.pieces(&path.display().to_string(), &mut |piece| {
                 written += piece.len() as u64;
                 out.write_all(piece.as_bytes()).map_err(|e| Error::io(path, e))
-            };
-            // What is put in is not searched for marks again.
-            for (i, piece) in FRAME.split('@').enumerate() {
-                match piece {
-                    text if i % 2 == 0 => put(text)?,
-                    "title" => put(&in_markup(&self.title))?,
-                    "styles" => STYLES.into_iter().try_for_each(&mut put)?,
-                    "page" => put(&text)?,
-                    "volumes" => {
-                        for (i, volume) in self.volumes.iter().enumerate() {
-                            put(&format!("<script type=\"application/octet-stream\" id=\"volume-{i}\">"))?;
-                            put(volume.packed())?;
-                            put("</script>\n")?;
-                        }
-                    }
-                    "plots" => put(PLOTS)?,
-                    "viewer" => put(VIEWER)?,
-                    _ => put(SCRIPT)?,
-                }
-            }
-            Ok(())
+            })
         })?;
         Ok(written)
+    }
+
+    /// The page as HTML; `place` is what errors call it.
+    pub fn html(&self, place: &str) -> Result<String> {
+        let mut html = String::new();
+        self.pieces(place, &mut |piece| {
+            html += piece;
+            Ok(())
+        })?;
+        Ok(html)
+    }
+
+    /// Hands the HTML out, piece by piece.
+    fn pieces(&self, place: &str, put: &mut dyn FnMut(&str) -> Result<()>) -> Result<()> {
+        let text = self.data().map_err(|e| Error::invalid(place, "page", e, "what JSON can hold"))?;
+        // What is put in is not searched for marks again.
+        for (i, piece) in FRAME.split('@').enumerate() {
+            match piece {
+                text if i % 2 == 0 => put(text)?,
+                "title" => put(&in_markup(&self.title))?,
+                "styles" => STYLES.into_iter().try_for_each(&mut *put)?,
+                "page" => put(&text)?,
+                "volumes" => {
+                    for (i, volume) in self.volumes.iter().enumerate() {
+                        put(&format!("<script type=\"application/octet-stream\" id=\"volume-{i}\">"))?;
+                        put(volume.packed())?;
+                        put("</script>\n")?;
+                    }
+                }
+                "plots" => put(PLOTS)?,
+                "viewer" => put(VIEWER)?,
+                _ => put(SCRIPT)?,
+            }
+        }
+        Ok(())
     }
 
     /// All but the voxels, as JSON that can stand in an element of HTML.

@@ -1,7 +1,7 @@
 //! `conefield reconstruct`
 
 use super::record::{RunRecord, Written, summary};
-use super::{backends::simd_level, calibrate, protocol::RunProtocol};
+use super::{backends::simd_level, calibrate, protocol::RunProtocol, watch};
 use crate::board::Board;
 use crate::boundary::{self, Inputs};
 use crate::live::Live;
@@ -70,6 +70,10 @@ pub struct ReconstructArgs {
     /// Write events.out.tfevents.conefield in RUN, in which TensorBoard shows curves and pictures during the run.
     #[arg(long)]
     tensorboard: bool,
+    /// Serve the page of "conefield report" at http://127.0.0.1:PORT/ during the run, with live.png every 5 s unless --live says
+    /// otherwise [default: a free port].
+    #[arg(long, value_name = "PORT", num_args = 0..=1, require_equals = true, default_missing_value = "0")]
+    watch: Option<u16>,
     /// Print one JSON object: the content of record.json.
     #[arg(long)]
     json: bool,
@@ -85,6 +89,9 @@ fn spec_help() -> String {
 
 /// The prefix of an error on standard output.
 pub const FAILED: &str = "failed: ";
+
+/// Seconds between two live pictures that --watch shows.
+const WATCHED: f64 = 5.0;
 
 /// A held-out error above this may come from a wrong geometry.
 const DOUBTFUL: f64 = 0.05;
@@ -161,6 +168,9 @@ impl ReconstructArgs {
                 (folder.metrics()?, None)
             }
         };
+        if let Some(port) = self.watch {
+            watch::serve(&self.output, port)?;
+        }
         let mut progress = self.progress(&folder, metrics, identity)?;
         let (seed, limits) = (self.protocol.seed, self.protocol.ends.limits());
         let job = input.work.job(backend.as_ref(), seed, limits, schedule.as_ref());
@@ -279,7 +289,9 @@ impl ReconstructArgs {
         };
         Ok(Progress::new("reconstruct", Some(metrics))
             .keeping(Some(keeper))
-            .showing(self.live.map(|seconds| Live::new(folder.file("live.png"), seconds)))
+            .showing(
+                self.live.or(self.watch.map(|_| WATCHED)).map(|seconds| Live::new(folder.file("live.png"), seconds)),
+            )
             .reporting(board.transpose()?))
     }
 

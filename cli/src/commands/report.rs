@@ -10,11 +10,11 @@ use crate::parse::{self, HoldOut};
 use crate::run_folder::RunOnDisk;
 use clap::Args;
 use conefield_core::Result;
-use conefield_report::page::{Page, PageVolume, coarser};
+use conefield_report::page::{Page, PageVolume, coarser, png_url};
 use conefield_run::projection;
 use scans::{Group, Options};
 use serde_json::{Value, json};
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 
 /// Show runs in one HTML page that any browser opens offline.
 ///
@@ -128,6 +128,22 @@ impl ReportArgs {
         lines.extend(page.warnings.iter().map(|w| format!("warning: {}", w.found)));
         out::say(&lines.join("\n"))
     }
+}
+
+/// The page of a run that goes on: curves, spec and the live picture, without what large files hold.
+pub fn standing(folder: &Path) -> Result<String> {
+    let found = [RunOnDisk::read(folder)?];
+    let mut page = Page::default();
+    page.runs = runs::told(&found, &mut page.warnings);
+    // A run that goes on is not interrupted, as its files alone would say.
+    page.warnings.clear();
+    page.title = runs::title(&page);
+    let live = folder.join("live.png");
+    for run in page.runs.iter_mut().filter(|run| run.record.is_none()) {
+        run.standing = "going on".into();
+        run.live = std::fs::read(&live).ok().map(|png| png_url(&png));
+    }
+    page.html(&folder.display().to_string())
 }
 
 /// Notes on the page.

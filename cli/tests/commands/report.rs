@@ -7,7 +7,7 @@ use conefield_io::{read_volume, write_volume};
 use ndarray::Array3;
 use serde_json::Value;
 use std::fs;
-use std::io::Read;
+use std::io::{Read, Write};
 use std::path::{Path, PathBuf};
 use std::process::Command;
 use tempfile::{TempDir, tempdir};
@@ -296,5 +296,65 @@ fn a_browser_tells_the_value_at_a_voxel() {
             let want = f64::from(volume.data[voxel]);
             assert!((found - want).abs() < 1e-4, "{voxel:?}: {found} {want}");
         }
+    }
+}
+
+/// The answer to `question` of the server at `port`, or `None` where there is none yet.
+fn asked(port: u16, question: &str) -> Option<String> {
+    let mut stream = std::net::TcpStream::connect(("127.0.0.1", port)).ok()?;
+    stream.write_all(format!("{question}\r\n\r\n").as_bytes()).ok()?;
+    let mut all = String::new();
+    stream.read_to_string(&mut all).ok()?;
+    Some(all)
+}
+
+#[test]
+fn a_run_that_is_watched_shows_its_page_to_this_machine_alone() {
+    let dir = tempdir().unwrap();
+    let [scan, run] = ["scan", "run"].map(|name| text(&dir.path().join(name)));
+    done(&["simulate", "phantom:head:16", "-o", &scan, "--views", "6", "--detector", "16x16"]);
+    // A port that was free a moment ago.
+    let port = std::net::TcpListener::bind(("127.0.0.1", 0)).unwrap().local_addr().unwrap().port();
+    let watch = format!("--watch={port}");
+    let mut child = Command::new(assert_cmd::cargo::cargo_bin("conefield"))
+        .args([
+            "-q",
+            "reconstruct",
+            &scan,
+            "--spec",
+            "fast",
+            "-o",
+            &run,
+            "--steps",
+            "1000000",
+            "--live",
+            "0.1s",
+            &watch,
+        ])
+        .spawn()
+        .unwrap();
+    let page = || asked(port, &format!("GET / HTTP/1.1\r\nHost: localhost:{port}"));
+    let whole = |html: &String| html.contains("data:image/png;base64,iVBOR") && html.contains("\"loss\":");
+    let start = std::time::Instant::now();
+    let mut found = None;
+    while found.is_none() && start.elapsed().as_secs() < 60 {
+        found = page().filter(whole);
+        std::thread::sleep(std::time::Duration::from_millis(200));
+    }
+    let ask = |line: &str, host: &str| asked(port, &format!("{line}\r\nHOST: {host}")).unwrap_or_default();
+    let own = format!("127.0.0.1:{port}");
+    let others = [
+        ask("GET / HTTP/1.1", "evil.example"),
+        ask("GET /../x HTTP/1.1", &own),
+        ask("POST / HTTP/1.1", &own),
+        ask("GET / HTTP/1.1", "127.0.0.1:1"),
+    ];
+    child.kill().unwrap();
+    child.wait().unwrap();
+    let found = found.expect("the page with a curve and a picture");
+    assert!(found.starts_with("HTTP/1.1 200 OK\r\n") && found.contains("\r\nRefresh: 5\r\n"));
+    assert!(!found.contains("interrupted") && found.ends_with("</html>\n"));
+    for (answer, status) in others.iter().zip(["403", "404", "405", "403"]) {
+        assert!(answer.starts_with(&format!("HTTP/1.1 {status} ")) && answer.len() < 500, "{answer}");
     }
 }

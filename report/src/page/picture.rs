@@ -52,7 +52,12 @@ pub fn spread(values: impl Iterator<Item = f32>) -> f32 {
 fn url(width: u32, height: u32, rgb: &[u8]) -> Result<String> {
     let mut png = vec![];
     encode_png(&mut png, "a picture in a page".as_ref(), width, height, rgb)?;
-    Ok(format!("data:image/png;base64,{}", STANDARD.encode(png)))
+    Ok(png_url(&png))
+}
+
+/// The bytes of a PNG as an address.
+pub fn png_url(png: &[u8]) -> String {
+    format!("data:image/png;base64,{}", STANDARD.encode(png))
 }
 
 #[cfg(test)]
