@@ -1,4 +1,4 @@
-//! Position encoders: hash grid, dense grid, frequency, identity, concat.
+//! Position encoders: grids of features (hash, permutohedral, dense), frequency, identity, concat.
 
 pub mod concat;
 pub mod dense_grid;
@@ -6,3 +6,4 @@ pub mod frequency;
 pub mod hash_grid;
 pub mod identity;
 mod levels;
+pub mod permutohedral;

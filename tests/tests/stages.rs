@@ -129,6 +129,19 @@ fn hash_grid() {
 }
 
 #[test]
+fn permutohedral() {
+    for (settings, single) in [
+        (json!({"type": "permutohedral", "levels": 3, "log2_table_size": 8, "base_resolution": 4}), 2e-5),
+        (json!({"type": "permutohedral", "levels": 4, "features": 1, "growth": 1.5, "log2_table_size": 10}), 2e-5),
+        (json!({"type": "permutohedral", "levels": 2, "features": 8, "log2_table_size": 6}), 2e-5),
+        // As for the hash grid.
+        (json!({"type": "permutohedral", "levels": 8, "features": 4, "log2_table_size": 12}), 5e-4),
+    ] {
+        encoder(settings, &Options { single, ..Options::encoder() });
+    }
+}
+
+#[test]
 fn concat() {
     let frequency = json!({"type": "frequency", "bands": 2, "max_frequency": 2.0});
     let dense = json!({"type": "dense-grid", "levels": 2, "base_resolution": 3});
