@@ -3,7 +3,7 @@
 //! `stage_level_backward`, level by level, with the levels' settings written into them.
 
 use conefield_core::random::{mix, unit};
-use conefield_core::simd::Real;
+use conefield_core::simd::{Real, Simd, SimdBase, SimdFloat, V, load, store};
 use conefield_core::stage::{Grads, Parameter, Tile, TileMut};
 use conefield_core::wgsl;
 use std::fmt::Write;
@@ -40,6 +40,47 @@ macro_rules! by_features {
     };
 }
 pub(crate) use by_features;
+
+/// Where the rows of a block fall along each axis of the cube, cut into equal cells.
+pub struct Cells<R> {
+    /// The cell.
+    pub cell: [[u32; BLOCK]; 3],
+    /// How far into it, 0 to 1.
+    pub fraction: [[R; BLOCK]; 3],
+}
+
+impl<R: Real> Cells<R> {
+    /// Room for a block.
+    pub fn new() -> Self {
+        Self { cell: [[0; BLOCK]; 3], fraction: [[R::ZERO; BLOCK]; 3] }
+    }
+
+    /// Locates rows `at..at + n` of `x` among so many cells. Points outside the cube count as on its rim, a coordinate that
+    /// is not a number as 0.
+    #[inline(always)]
+    pub fn locate<S: Simd>(&mut self, s: S, cells: u32, x: Tile<'_, R>, at: usize, n: usize) {
+        let number = |v: f64| V::<S, R>::splat(s, R::of(v));
+        let (zero, scale, last) = (number(0.0), number(f64::from(cells)), number(f64::from(cells - 1)));
+        for d in 0..3 {
+            let x = &x.channel(d)[at..at + n];
+            let mut i = 0;
+            while i < n {
+                // The precise form returns the number where the other side is NaN.
+                let p = (load(s, x, i) * scale).max_precise(zero).min(scale);
+                let c = p.floor().min(last);
+                store::<S, R>(p - c, &mut self.fraction[d], i);
+                R::cells(s, c, &mut self.cell[d][i..]);
+                i += V::<S, R>::LEN;
+            }
+        }
+    }
+}
+
+/// Derivative of a position among `cells` by a coordinate. Beyond the rim it counts as on it, whichever it is.
+#[inline(always)]
+pub fn stretch<R: Real>(x: R, cells: u32) -> R {
+    if x >= R::ZERO && x <= R::ONE { R::of(f64::from(cells)) } else { R::ZERO }
+}
 
 /// The parameters of a level, and where its features go.
 #[derive(Debug, Clone, PartialEq)]

@@ -1,5 +1,6 @@
 //! Position encoders: grids of features (hash, permutohedral, dense), frequency, identity, concat.
 
+pub mod b_spline_grid;
 pub mod concat;
 pub mod dense_grid;
 pub mod frequency;
@@ -7,3 +8,4 @@ pub mod hash_grid;
 pub mod identity;
 mod levels;
 pub mod permutohedral;
+pub mod planes;

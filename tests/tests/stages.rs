@@ -142,6 +142,31 @@ fn permutohedral() {
 }
 
 #[test]
+fn b_spline_grid() {
+    for settings in [
+        json!({"type": "b-spline-grid", "levels": 1, "base_resolution": 1, "features": 1}),
+        json!({"type": "b-spline-grid", "levels": 3, "base_resolution": 4, "growth": 1.7}),
+        json!({"type": "b-spline-grid", "levels": 2, "base_resolution": 3, "features": 8, "growth": 1.0}),
+        // More than one range of a level.
+        json!({"type": "b-spline-grid", "levels": 1, "base_resolution": 78, "features": 1}),
+    ] {
+        encoder(settings, &Options { single: 4e-5, ..Options::encoder() });
+    }
+}
+
+#[test]
+fn planes() {
+    for settings in [
+        json!({"type": "planes", "levels": 3, "base_resolution": 4, "growth": 1.7}),
+        json!({"type": "planes", "levels": 2, "base_resolution": 5, "features": 1}),
+        json!({"type": "planes", "form": "tri-plane", "levels": 2, "base_resolution": 7, "features": 2}),
+        json!({"type": "planes", "form": "tri-plane", "levels": 1, "base_resolution": 1, "features": 8}),
+    ] {
+        encoder(settings, &Options { single: 4e-5, ..Options::encoder() });
+    }
+}
+
+#[test]
 fn concat() {
     let frequency = json!({"type": "frequency", "bands": 2, "max_frequency": 2.0});
     let dense = json!({"type": "dense-grid", "levels": 2, "base_resolution": 3});
