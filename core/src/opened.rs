@@ -3,13 +3,14 @@
 use crate::error::{Error, Result, ensure};
 use crate::half::{Bf16, F16};
 use crate::simd::Real;
-use crate::stage::{Encoder, GradKind, Grads, Halves, Info, Kernel, Parameter, Reduced, Stage, Tile, TileMut};
+use crate::stage::{Encoder, GradKind, Grads, Halves, Info, Kernel, Parameter, Stage, Tile, TileMut};
 use crate::wgsl::{Fragment, functions, hosted};
 use std::ops::Range;
 use std::sync::Arc;
 
 /// An encoder that computes its first channels alone. The others are 0, and their parameters stay as they are. Widths and
-/// parameters are those of the whole, so that an arena fits however many channels are open.
+/// parameters are those of the whole, so that an arena fits however many channels are open. A mask is for the whole
+/// ([`Pipeline::open`](crate::pipeline::Pipeline::open) keeps it).
 #[derive(Clone)]
 pub struct Opened {
     whole: Arc<dyn Encoder>,
@@ -205,12 +206,6 @@ impl Stage for Opened {
 }
 
 impl Encoder for Opened {
-    fn keep_outputs(&self, keep: &[usize]) -> Result<Reduced<dyn Encoder>> {
-        let Reduced { stage, params, channels } = self.whole.keep_outputs(keep)?;
-        let open = keep.iter().filter(|c| **c < self.channels).count().max(1);
-        Ok(Reduced { stage: Box::new(Self::new(Arc::from(stage), open)?), params, channels })
-    }
-
     fn coarse_to_fine(&self) -> bool {
         self.whole.coarse_to_fine()
     }
