@@ -31,6 +31,7 @@ pub mod half;
 pub mod host;
 pub mod loss;
 pub mod method;
+pub mod opened;
 pub mod orbit;
 pub mod pages;
 pub mod parts;

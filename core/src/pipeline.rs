@@ -2,6 +2,7 @@
 
 use crate::arena::{Arena, Block, Layout};
 use crate::error::{Result, ensure};
+use crate::opened::Opened;
 use crate::precision::Tables;
 use crate::scene::Scene;
 use crate::simd::Real;
@@ -27,6 +28,8 @@ pub struct Pipeline {
     pub tables: Tables,
     layout: Layout,
     ranges: Vec<Range<usize>>,
+    /// The encoder with every channel open, where some are closed, and how many are not.
+    whole: Option<(Arc<dyn Encoder>, usize)>,
 }
 
 /// A pipeline with its parameters.
@@ -63,7 +66,7 @@ impl Pipeline {
         let (tables, layout) = (Tables::default(), Layout::default());
         let (encoder, field, projector) = (Arc::from(encoder), Arc::from(field), Arc::from(projector));
         let normalizers = normalizers.into_iter().map(Arc::from).collect();
-        let mut pipeline = Self { encoder, normalizers, field, projector, tables, layout, ranges: vec![] };
+        let mut pipeline = Self { encoder, normalizers, field, projector, tables, layout, ranges: vec![], whole: None };
         pipeline.lay_out();
         // Of any scene: whether the encoder knows what the projector counts in.
         pipeline.fitted(pipeline.lengths(1.0, 1.0))?;
@@ -173,10 +176,33 @@ impl Pipeline {
         Lengths { voxel_mm, cell_mm: finest.filter(|n| *n > 1.0).map(|n| side / n) }
     }
 
+    /// How many of the encoder's channels are open: the first ones. The others are 0.
+    pub fn open_channels(&self) -> usize {
+        self.whole.as_ref().map_or(self.encoder.info().output, |(_, open)| *open)
+    }
+
+    /// Opens the first `channels` of the encoder's and closes the others: they are 0 and not computed, and their parameters
+    /// stay as they are. At least one stays open; as many as there are means all.
+    pub fn open(&mut self, channels: usize) -> Result<()> {
+        let whole = self.whole.as_ref().map_or_else(|| self.encoder.clone(), |(whole, _)| whole.clone());
+        if channels < whole.info().output {
+            self.encoder = Arc::new(Opened::new(whole.clone(), channels)?);
+            self.whole = Some((whole, channels));
+        } else {
+            (self.encoder, self.whole) = (whole, None);
+        }
+        Ok(())
+    }
+
     /// Leaves of the encoder's channels only `masked`: it no longer computes the others, the stages after it become
     /// narrower, and parameters that nothing reads leave the arena.
     fn apply_mask(&mut self, masked: &[usize], arena: &mut Arena) -> Result<()> {
-        let encoder = self.encoder.keep_outputs(masked)?;
+        let (whole, open) = match &self.whole {
+            Some((whole, open)) => (whole, *open),
+            None => (&self.encoder, usize::MAX),
+        };
+        let encoder = whole.keep_outputs(masked)?;
+        let open = masked.iter().filter(|c| **c < open).count().max(1);
         let mut kept = vec![encoder.params];
         let mut keep = masked.to_vec();
         let mut normalizers = vec![];
@@ -193,6 +219,8 @@ impl Pipeline {
         let ranges: Vec<_> =
             all.flat_map(|(k, whole)| k.iter().map(|r| whole.start + r.start..whole.start + r.end)).collect();
         arena.retain(&ranges);
+        self.whole = None;
+        self.open(open)?;
         self.lay_out();
         debug_assert_eq!(arena.params.len(), self.layout.len());
         Ok(())

@@ -67,6 +67,7 @@
 //! (whole numbers are voxel centres), and `length`, that way in mm.
 
 use std::collections::BTreeSet;
+use std::fmt::Write;
 
 /// How every name begins that a fragment defines or uses of its host's.
 pub const PREFIX: &str = "stage_";
@@ -193,6 +194,30 @@ fn tokens(text: &str) -> impl Iterator<Item = &str> {
             rest = &rest[end..];
         }
     })
+}
+
+/// What the fragment of a part expects of its host under names that begin with `name`, by what the whole gets of it; the part's
+/// parameters begin at `first`.
+pub fn hosted(name: &str, first: u32, fragment: &Fragment) -> String {
+    let mut out = format!(
+        "const {name}wants_dx = stage_wants_dx;
+fn {name}param(i: u32) -> f32 {{ return stage_param({first}u + i); }}
+fn {name}grad(i: u32, v: f32) {{ stage_grad({first}u + i, v); }}
+"
+    );
+    for sum in fragment.sums() {
+        let _ = match sum {
+            Sum::Vector(m) => writeln!(
+                out,
+                "fn {name}sum_{m}(at: u32, a: ptr<function, array<f32, {m}>>) {{ stage_sum_{m}({first}u + at, a); }}"
+            ),
+            Sum::Outer(m, k) => writeln!(
+                out,
+                "fn {name}outer_{m}_{k}(at: u32, ld: u32, a: ptr<function, array<f32, {m}>>, b: ptr<function, array<f32, {k}>>) {{ stage_outer_{m}_{k}({first}u + at, ld, a, b); }}"
+            ),
+        };
+    }
+    out
 }
 
 #[cfg(test)]

@@ -8,7 +8,7 @@ use conefield_core::simd::Real;
 use conefield_core::stage::{
     Encoder, GradKind, Grads, Halves, Info, Kernel, Parameter, Reduced, Scope, Stage, Tile, TileMut,
 };
-use conefield_core::wgsl::{Fragment, Sum, functions};
+use conefield_core::wgsl::{Fragment, functions, hosted};
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 use std::fmt::Write;
@@ -120,29 +120,6 @@ impl ConcatStage {
         }
         Ok(Self { parts, info })
     }
-}
-
-/// What a part expects of its host, by what the whole gets of it; the part's parameters begin at `first`.
-fn hosted(name: &str, first: u32, fragment: &Fragment) -> String {
-    let mut out = format!(
-        "const {name}wants_dx = stage_wants_dx;
-fn {name}param(i: u32) -> f32 {{ return stage_param({first}u + i); }}
-fn {name}grad(i: u32, v: f32) {{ stage_grad({first}u + i, v); }}
-"
-    );
-    for sum in fragment.sums() {
-        let _ = match sum {
-            Sum::Vector(m) => writeln!(
-                out,
-                "fn {name}sum_{m}(at: u32, a: ptr<function, array<f32, {m}>>) {{ stage_sum_{m}({first}u + at, a); }}"
-            ),
-            Sum::Outer(m, k) => writeln!(
-                out,
-                "fn {name}outer_{m}_{k}(at: u32, ld: u32, a: ptr<function, array<f32, {m}>>, b: ptr<function, array<f32, {k}>>) {{ stage_outer_{m}_{k}({first}u + at, ld, a, b); }}"
-            ),
-        };
-    }
-    out
 }
 
 /// A kernel of a part, on parameters that stand in memory as `P`.

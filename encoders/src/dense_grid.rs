@@ -5,7 +5,7 @@
 //! A level with `r` cells a side has `(r + 1)³` vertices at the corners of its cells, which fill the cube exactly:
 //! `p = clamp(x, 0, 1)·r`.
 
-use crate::levels::{LevelCode, by_channel, functions};
+use crate::levels::{LevelCode, by_channel, by_features, functions};
 use conefield_core::error::{Error, Result, ensure};
 use conefield_core::half::Stored;
 use conefield_core::settings::EncoderSpec;
@@ -219,23 +219,6 @@ impl<R: Real, P: Stored<R>> Backward<'_, R, P> {
     }
 }
 
-/// Runs `features` with the number of features as a constant.
-macro_rules! by_features {
-    ($op:ident) => {
-        impl<R: Real, P: Stored<R>> Op for $op<'_, R, P> {
-            type Out = ();
-            #[inline(always)]
-            fn call<S: Simd>(self, s: S) {
-                match self.stage.features {
-                    1 => self.features::<S, 1>(s),
-                    2 => self.features::<S, 2>(s),
-                    4 => self.features::<S, 4>(s),
-                    _ => self.features::<S, 8>(s),
-                }
-            }
-        }
-    };
-}
 by_features!(Forward);
 by_features!(Backward);
 

@@ -4,7 +4,7 @@
 //! point's cell, trilinearly interpolated. A level whose vertices fit the table is indexed directly, a finer one by
 //! `h(c) = (c_x·π₁ ⊕ c_y·π₂ ⊕ c_z·π₃) mod T` with products modulo 2³² by definition.
 
-use crate::levels::{LevelCode, by_channel, functions};
+use crate::levels::{self, BLOCK, LevelCode, by_channel, functions, prefetch};
 use conefield_core::error::{Result, ensure};
 use conefield_core::half::Stored;
 use conefield_core::settings::EncoderSpec;
@@ -177,9 +177,6 @@ impl HashGridStage {
     }
 }
 
-/// Rows that are located together: their entries and weights stay in the L1 cache.
-const BLOCK: usize = 64;
-
 /// Where the rows of a block fall on one level. The corners of a cell are the ends of four edges along x, of which
 /// number `e` has the larger y where `e & 1` is set and the larger z where `e & 2` is.
 struct Located<R> {
@@ -282,48 +279,21 @@ impl<R: Real> Located<R> {
     }
 }
 
-/// Entry `i` of a level's table, `i` from [`Located::locate`] for that very level. Checking the bound of each of a
-/// row's 8 entries doubles the time of the backward pass.
+/// Entry `i` of a level's table, `i` from [`Located::locate`] for that very level.
 #[inline(always)]
 #[allow(unsafe_code)]
 fn entry<T>(table: &[T], i: u32) -> &T {
-    debug_assert!((i as usize) < table.len());
     // SAFETY: callers slice `table` to the level's `entries`. `locate` yields indices below that: a hash is masked
     // by `entries - 1`, and direct indices come from cells clamped to `side - 2`, whose corners end at `side³ - 1`.
-    unsafe { table.get_unchecked(i as usize) }
+    unsafe { levels::entry(table, i) }
 }
 
 /// Like [`entry`], to be written.
 #[inline(always)]
 #[allow(unsafe_code)]
 fn entry_mut<T>(table: &mut [T], i: u32) -> &mut T {
-    debug_assert!((i as usize) < table.len());
     // SAFETY: as for `entry`.
-    unsafe { table.get_unchecked_mut(i as usize) }
-}
-
-/// A table of as many bytes does not stay in a second-level cache.
-const LARGE: usize = 1 << 20;
-
-/// Asks for the cache lines of a block's entries, so that misses overlap instead of stalling one row after another. They
-/// go to the second-level cache: the first one has no room for them beside what else a block needs.
-#[inline(always)]
-#[allow(unsafe_code)]
-fn prefetch<T, R>(table: &[T], located: &Located<R>, n: usize) {
-    #[cfg(target_arch = "x86_64")]
-    if size_of_val(table) >= LARGE {
-        for index in located.near.iter().chain(&located.far) {
-            for &i in &index[..n] {
-                // SAFETY: a prefetch reads nothing and faults on no address.
-                unsafe {
-                    use std::arch::x86_64::{_MM_HINT_T1, _mm_prefetch};
-                    _mm_prefetch::<_MM_HINT_T1>(table.as_ptr().wrapping_add(i as usize).cast());
-                }
-            }
-        }
-    }
-    #[cfg(not(target_arch = "x86_64"))]
-    let _ = (table, located, n);
+    unsafe { levels::entry_mut(table, i) }
 }
 
 /// The features of an edge's two ends, one after the other, in registers of four, of which [`registers`] are used. Left to
@@ -450,7 +420,7 @@ impl<R: Real, P: Stored<R>> Forward<'_, R, P> {
                 if level.dense {
                     wide.interpolate::<S, true>(s, table, &located, n, &mut out);
                 } else {
-                    prefetch(table, &located, n);
+                    prefetch(table, located.near.iter().chain(&located.far), n);
                     wide.interpolate::<S, false>(s, table, &located, n, &mut out);
                 }
                 for (f, channel) in level.outputs.iter().enumerate() {
@@ -577,7 +547,7 @@ impl<R: Real, P: Stored<R>> Backward<'_, R, P> {
                     if level.dense {
                         scatter::<S, R, F, true>(s, grads, &located, &dy, n);
                     } else {
-                        prefetch(grads, &located, n);
+                        prefetch(grads, located.near.iter().chain(&located.far), n);
                         scatter::<S, R, F, false>(s, grads, &located, &dy, n);
                     }
                 }
@@ -682,7 +652,7 @@ impl Stage for HashGridStage {
     }
 
     fn init(&self, seed: u64, params: &mut [f32]) {
-        crate::levels::start(seed, params);
+        levels::start(seed, params);
     }
 
     fn kernel(&self) -> &dyn Kernel<f32> {

@@ -1,18 +1,235 @@
 //! What encoders of several levels, each with features of its own, share: how features start, which level a channel comes from,
-//! and WGSL: calls of `stage_level_forward` and `stage_level_backward`, level by level, with the levels' settings written into them.
+//! the parameters of a level and what is asked of their gradients, and WGSL: calls of `stage_level_forward` and
+//! `stage_level_backward`, level by level, with the levels' settings written into them.
 
 use conefield_core::random::{mix, unit};
+use conefield_core::simd::{Real, Simd, SimdBase, SimdFloat, V, load, store};
+use conefield_core::stage::{Grads, Parameter, Tile, TileMut};
 use conefield_core::wgsl;
 use std::fmt::Write;
+use std::ops::Range;
 
 /// Features start uniform in ± this (Müller et al. 2022, section 4).
 const START: f32 = 1e-4;
+
+/// Rows that are located together: their entries and weights stay in the L1 cache.
+pub const BLOCK: usize = conefield_core::trilinear::BLOCK;
 
 /// Fills features as they start.
 pub fn start(seed: u64, params: &mut [f32]) {
     for (i, p) in params.iter_mut().enumerate() {
         *p = (2.0 * unit(mix(seed, i as u64)) - 1.0) * START;
     }
+}
+
+/// Runs `features` of an operation with the number of features of its stage as a constant.
+macro_rules! by_features {
+    ($op:ident) => {
+        impl<R: Real, P: Stored<R>> Op for $op<'_, R, P> {
+            type Out = ();
+            #[inline(always)]
+            fn call<S: Simd>(self, s: S) {
+                match self.stage.features {
+                    1 => self.features::<S, 1>(s),
+                    2 => self.features::<S, 2>(s),
+                    4 => self.features::<S, 4>(s),
+                    _ => self.features::<S, 8>(s),
+                }
+            }
+        }
+    };
+}
+pub(crate) use by_features;
+
+/// Where the rows of a block fall along each axis of the cube, cut into equal cells.
+pub struct Cells<R> {
+    /// The cell.
+    pub cell: [[u32; BLOCK]; 3],
+    /// How far into it, 0 to 1.
+    pub fraction: [[R; BLOCK]; 3],
+}
+
+impl<R: Real> Cells<R> {
+    /// Room for a block.
+    pub fn new() -> Self {
+        Self { cell: [[0; BLOCK]; 3], fraction: [[R::ZERO; BLOCK]; 3] }
+    }
+
+    /// Locates rows `at..at + n` of `x` among so many cells. Points outside the cube count as on its rim, a coordinate that
+    /// is not a number as 0.
+    #[inline(always)]
+    pub fn locate<S: Simd>(&mut self, s: S, cells: u32, x: Tile<'_, R>, at: usize, n: usize) {
+        let number = |v: f64| V::<S, R>::splat(s, R::of(v));
+        let (zero, scale, last) = (number(0.0), number(f64::from(cells)), number(f64::from(cells - 1)));
+        for d in 0..3 {
+            let x = &x.channel(d)[at..at + n];
+            let mut i = 0;
+            while i < n {
+                // The precise form returns the number where the other side is NaN.
+                let p = (load(s, x, i) * scale).max_precise(zero).min(scale);
+                let c = p.floor().min(last);
+                store::<S, R>(p - c, &mut self.fraction[d], i);
+                R::cells(s, c, &mut self.cell[d][i..]);
+                i += V::<S, R>::LEN;
+            }
+        }
+    }
+}
+
+/// Derivative of a position among `cells` by a coordinate. Beyond the rim it counts as on it, whichever it is.
+#[inline(always)]
+pub fn stretch<R: Real>(x: R, cells: u32) -> R {
+    if x >= R::ZERO && x <= R::ONE { R::of(f64::from(cells)) } else { R::ZERO }
+}
+
+/// The parameters of a level, and where its features go.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Table {
+    /// First parameter.
+    pub start: usize,
+    /// Parameters.
+    pub len: usize,
+    /// Number of the level in the settings, which names its parameters.
+    pub number: usize,
+    /// Output channel of each feature, where it is read.
+    pub outputs: Vec<Option<usize>>,
+}
+
+impl Table {
+    /// Its parameters.
+    pub fn range(&self) -> Range<usize> {
+        self.start..self.start + self.len
+    }
+
+    /// The block of its parameters, of this shape.
+    pub fn parameter(&self, shape: Vec<usize>) -> Parameter {
+        Parameter { name: format!("{}.table", self.number), shape, start: self.start }
+    }
+
+    /// The same level, of which only the channels `keep` are read and whose parameters begin at `start`; `None` where no
+    /// channel is.
+    pub fn kept(&self, keep: &[usize], start: usize) -> Option<Self> {
+        let place = |c: &Option<usize>| c.and_then(|c| keep.iter().position(|&k| k == c));
+        let outputs: Vec<_> = self.outputs.iter().map(place).collect();
+        outputs.iter().any(Option::is_some).then(|| Self { start, outputs, ..self.clone() })
+    }
+
+    /// Puts the features of rows `at..at + n` where they are read.
+    #[inline(always)]
+    pub fn put<R: Real, const F: usize>(&self, out: &[[R; F]; BLOCK], y: &mut TileMut<'_, R>, at: usize, n: usize) {
+        for (f, channel) in self.outputs.iter().enumerate() {
+            if let Some(c) = *channel {
+                for (y, out) in y.channel(c)[at..at + n].iter_mut().zip(out) {
+                    *y = out[f];
+                }
+            }
+        }
+    }
+
+    /// Takes the gradients of the features of rows `at..at + n`.
+    #[inline(always)]
+    pub fn take<R: Real, const F: usize>(&self, dy: Tile<'_, R>, into: &mut [[R; F]; BLOCK], at: usize, n: usize) {
+        for (f, channel) in self.outputs.iter().enumerate() {
+            match *channel {
+                Some(c) => into.iter_mut().zip(&dy.channel(c)[at..at + n]).for_each(|(to, &v)| to[f] = v),
+                None => into[..n].iter_mut().for_each(|to| to[f] = R::ZERO),
+            }
+        }
+    }
+}
+
+/// What a call of `backward` asks of a level's gradients: all, none, or a part. Of a level that is asked for in part the rest
+/// is summed too, beside the result: the order of sums stays one.
+pub struct Asked<R> {
+    /// What is asked for, among the values of the call.
+    own: Range<usize>,
+    /// The same, among those of the level.
+    place: Range<usize>,
+    beside: Vec<R>,
+}
+
+impl<R: Real> Asked<R> {
+    /// What `grads` asks of the parameters `level`.
+    pub fn of(grads: &Grads<'_, R>, level: &Range<usize>) -> Self {
+        let range = &grads.range;
+        let (from, to) = (level.start.max(range.start), level.end.min(range.end));
+        if from >= to {
+            return Self { own: 0..0, place: 0..0, beside: vec![] };
+        }
+        let own = from - range.start..to - range.start;
+        let place = from - level.start..to - level.start;
+        let part = if to - from < level.len() { level.len() } else { 0 };
+        let mut beside = vec![R::ZERO; part];
+        if part > 0 {
+            beside[place.clone()].copy_from_slice(&grads.values[own.clone()]);
+        }
+        Self { own, place, beside }
+    }
+
+    /// Whether nothing is.
+    pub fn is_empty(&self) -> bool {
+        self.own.is_empty()
+    }
+
+    /// Where the level's gradients are to be added: all of them, or none.
+    pub fn values<'a>(&'a mut self, grads: &'a mut Grads<'_, R>) -> &'a mut [R] {
+        if self.beside.is_empty() { &mut grads.values[self.own.clone()] } else { &mut self.beside }
+    }
+
+    /// Puts what was asked for where it belongs.
+    pub fn finish(self, grads: &mut Grads<'_, R>) {
+        if !self.beside.is_empty() {
+            grads.values[self.own].copy_from_slice(&self.beside[self.place]);
+        }
+    }
+}
+
+/// Entry `i` of a level's table. Checking the bound of every entry of a row doubles the time of the backward pass.
+///
+/// # Safety
+/// `i` is below the length of `table`.
+#[inline(always)]
+#[allow(unsafe_code)]
+pub unsafe fn entry<T>(table: &[T], i: u32) -> &T {
+    debug_assert!((i as usize) < table.len());
+    // SAFETY: the caller's promise.
+    unsafe { table.get_unchecked(i as usize) }
+}
+
+/// Like [`entry`], to be written.
+///
+/// # Safety
+/// `i` is below the length of `table`.
+#[inline(always)]
+#[allow(unsafe_code)]
+pub unsafe fn entry_mut<T>(table: &mut [T], i: u32) -> &mut T {
+    debug_assert!((i as usize) < table.len());
+    // SAFETY: the caller's promise.
+    unsafe { table.get_unchecked_mut(i as usize) }
+}
+
+/// A table of as many bytes does not stay in a second-level cache.
+const LARGE: usize = 1 << 20;
+
+/// Asks for the cache lines of the first `n` entries of each of `indices`, so that misses overlap instead of stalling one row
+/// after another. They go to the second-level cache: the first one has no room for them beside what else a block needs.
+#[inline(always)]
+#[allow(unsafe_code)]
+pub fn prefetch<'a, T>(table: &[T], indices: impl Iterator<Item = &'a [u32; BLOCK]>, n: usize) {
+    #[cfg(target_arch = "x86_64")]
+    if size_of_val(table) >= LARGE {
+        for index in indices {
+            for &i in &index[..n] {
+                // SAFETY: a prefetch reads nothing and faults on no address.
+                unsafe {
+                    use std::arch::x86_64::{_MM_HINT_T1, _mm_prefetch};
+                    _mm_prefetch::<_MM_HINT_T1>(table.as_ptr().wrapping_add(i as usize).cast());
+                }
+            }
+        }
+    }
+    #[cfg(not(target_arch = "x86_64"))]
+    let _ = (table, indices, n);
 }
 
 /// Of each of `width` channels the cells along a side of the level that it comes from; levels are given with their output

@@ -11,6 +11,7 @@ use conefield_core::arena::Weights;
 use conefield_core::basis::BasisSpec;
 use conefield_core::data_term::DataTermSpec;
 use conefield_core::loss::Loss;
+use conefield_core::opened::Opened;
 use conefield_core::precision::Tables;
 use conefield_core::registry::{Kind, Settings, names};
 use conefield_core::regularizer::RegularizerSpec;
@@ -22,6 +23,7 @@ use conefield_core::stage::{Field, Stage};
 use conefield_core::voxel::VoxelProjectorSpec;
 use serde::de::DeserializeOwned;
 use serde_json::{Value, json};
+use std::sync::Arc;
 
 // Stage types register themselves where their crate is linked.
 use conefield_encoders as _;
@@ -129,6 +131,44 @@ fn hash_grid() {
 }
 
 #[test]
+fn permutohedral() {
+    for (settings, single) in [
+        (json!({"type": "permutohedral", "levels": 3, "log2_table_size": 8, "base_resolution": 4}), 2e-5),
+        (json!({"type": "permutohedral", "levels": 4, "features": 1, "growth": 1.5, "log2_table_size": 10}), 2e-5),
+        (json!({"type": "permutohedral", "levels": 2, "features": 8, "log2_table_size": 6}), 2e-5),
+        // As for the hash grid.
+        (json!({"type": "permutohedral", "levels": 8, "features": 4, "log2_table_size": 12}), 5e-4),
+    ] {
+        encoder(settings, &Options { single, ..Options::encoder() });
+    }
+}
+
+#[test]
+fn b_spline_grid() {
+    for settings in [
+        json!({"type": "b-spline-grid", "levels": 1, "base_resolution": 1, "features": 1}),
+        json!({"type": "b-spline-grid", "levels": 3, "base_resolution": 4, "growth": 1.7}),
+        json!({"type": "b-spline-grid", "levels": 2, "base_resolution": 3, "features": 8, "growth": 1.0}),
+        // More than one range of a level.
+        json!({"type": "b-spline-grid", "levels": 1, "base_resolution": 78, "features": 1}),
+    ] {
+        encoder(settings, &Options { single: 4e-5, ..Options::encoder() });
+    }
+}
+
+#[test]
+fn planes() {
+    for settings in [
+        json!({"type": "planes", "levels": 3, "base_resolution": 4, "growth": 1.7}),
+        json!({"type": "planes", "levels": 2, "base_resolution": 5, "features": 1}),
+        json!({"type": "planes", "form": "tri-plane", "levels": 2, "base_resolution": 7, "features": 2}),
+        json!({"type": "planes", "form": "tri-plane", "levels": 1, "base_resolution": 1, "features": 8}),
+    ] {
+        encoder(settings, &Options { single: 4e-5, ..Options::encoder() });
+    }
+}
+
+#[test]
 fn concat() {
     let frequency = json!({"type": "frequency", "bands": 2, "max_frequency": 2.0});
     let dense = json!({"type": "dense-grid", "levels": 2, "base_resolution": 3});
@@ -172,6 +212,33 @@ fn layer_norm() {
 #[test]
 fn layer_norm_of_one_channel() {
     normalizer(json!({"type": "layer-norm"}), 1, &Options::features());
+}
+
+#[test]
+fn level_attention() {
+    for (features, width) in [(2, 20), (4, 16), (1, 5), (3, 3)] {
+        let settings = json!({"type": "level-attention", "features": features});
+        normalizer(settings.clone(), width, &Options { params: Some(1.0), single: 4e-5, ..Options::features() });
+        normalizer(settings, width, &Options { single: 4e-5, ..Options::features() });
+    }
+}
+
+/// An encoder with closed levels is a stage like any other.
+#[test]
+fn opened() {
+    for (settings, channels) in [
+        (json!({"type": "hash-grid", "levels": 3, "log2_table_size": 8, "base_resolution": 4}), 4),
+        (json!({"type": "planes", "levels": 2, "base_resolution": 3, "features": 2}), 6),
+    ] {
+        let spec: Box<dyn EncoderSpec> = serde_json::from_value(settings).unwrap();
+        let (stage, options) = (spec.build().unwrap(), Options { single: 4e-5, ..Options::encoder() });
+        let opened = Opened::new(Arc::from(stage), channels).unwrap();
+        expect(check_encoder(&opened, &options));
+        on_a_device(&opened, &options);
+    }
+    let of = |settings| serde_json::from_value::<Box<dyn EncoderSpec>>(settings).unwrap().build().unwrap();
+    let refused = Opened::new(Arc::from(of(json!({"type": "frequency"}))), 3).err().unwrap().to_string();
+    assert!(refused.contains("no tables of features"), "{refused}");
 }
 
 #[test]

@@ -113,6 +113,14 @@ impl<'a> Run<'a> {
         Ok(())
     }
 
+    /// Opens the first `channels` of the encoder's, and closes the others.
+    pub fn open(&mut self, channels: usize) -> Result<()> {
+        self.exe.fetch(&mut self.model)?;
+        self.model.pipeline.open(channels)?;
+        self.exe = self.job.backend.compile(&self.model.pipeline)?.0;
+        Ok(())
+    }
+
     /// Fetches the parameters and refuses a state that is not finite.
     pub fn check_finite(&mut self) -> Result<()> {
         self.exe.fetch(&mut self.model)?;

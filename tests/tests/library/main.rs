@@ -6,6 +6,7 @@ mod common;
 mod device;
 
 mod by_row;
+mod coarse_to_fine;
 mod composition;
 mod core_modules;
 mod drift;

@@ -1,5 +1,6 @@
 //! The callbacks: those that a spec names, and those that every run has.
 
+pub mod coarse_to_fine;
 pub mod drift;
 pub mod fft_mask;
 pub mod field_monitor;
@@ -7,6 +8,7 @@ pub mod live_slices;
 pub mod patience;
 pub mod rollback;
 
+pub use coarse_to_fine::CoarseToFine;
 pub use drift::Drift;
 pub use fft_mask::FftMask;
 pub use field_monitor::FieldMonitor;

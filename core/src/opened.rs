@@ -1,0 +1,216 @@
+//! An encoder of which only the coarse levels are open: what coarse-to-fine training works with.
+
+use crate::error::{Error, Result, ensure};
+use crate::half::{Bf16, F16};
+use crate::simd::Real;
+use crate::stage::{Encoder, GradKind, Grads, Halves, Info, Kernel, Parameter, Stage, Tile, TileMut};
+use crate::wgsl::{Fragment, functions, hosted};
+use std::ops::Range;
+use std::sync::Arc;
+
+/// An encoder that computes its first channels alone. The others are 0, and their parameters stay as they are. Widths and
+/// parameters are those of the whole, so that an arena fits however many channels are open. A mask is for the whole
+/// ([`Pipeline::open`](crate::pipeline::Pipeline::open) keeps it).
+#[derive(Clone)]
+pub struct Opened {
+    whole: Arc<dyn Encoder>,
+    /// The whole without the channels that are closed.
+    open: Arc<dyn Encoder>,
+    channels: usize,
+    /// Parameters of the open channels: the first of all.
+    params: usize,
+}
+
+impl Opened {
+    /// `whole` with its first `channels` open, at least one. Refused where it keeps more than tables of features, or where
+    /// those of its first channels are not its first parameters.
+    pub fn new(whole: Arc<dyn Encoder>, channels: usize) -> Result<Self> {
+        let width = whole.info().output;
+        ensure((1..=width).contains(&channels), "encoder", "open channels", channels, format!("1 to {width}"))?;
+        let kept = whole.keep_outputs(&(0..channels).collect::<Vec<_>>())?;
+        let mut params = 0;
+        for range in &kept.params {
+            if range.start != params {
+                return Err(Error::unsupported(whole.describe(), "its coarse levels are not its first parameters"));
+            }
+            params = range.end;
+        }
+        let scattered = [whole.info(), kept.stage.info()].iter().all(|i| i.grads == GradKind::Scatter && i.tape == 0);
+        if !scattered || kept.channels != [0, 1, 2] {
+            return Err(Error::unsupported(whole.describe(), "it has no tables of features that could stay closed"));
+        }
+        Ok(Self { whole, open: Arc::from(kept.stage), channels, params })
+    }
+
+    fn forward_of<R: Real, P>(
+        &self,
+        kernel: &dyn Kernel<R, P>,
+        pass: Option<usize>,
+        params: &[P],
+        x: Tile<'_, R>,
+        y: TileMut<'_, R>,
+        tape: TileMut<'_, R>,
+    ) {
+        let (open, closed) = y.data.split_at_mut(self.channels * x.rows);
+        let (params, y) = (&params[..self.params], TileMut::new(open, x.rows));
+        if pass.unwrap_or(0) == 0 {
+            closed.fill(R::ZERO);
+        }
+        match pass {
+            Some(pass) => kernel.forward_pass(pass, params, x, y, tape),
+            None => kernel.forward(params, x, y, tape),
+        }
+    }
+
+    fn backward_of<R: Real, P>(
+        &self,
+        kernel: &dyn Kernel<R, P>,
+        params: &[P],
+        (x, tape, dy): (Tile<'_, R>, TileMut<'_, R>, Tile<'_, R>),
+        grads: Grads<'_, R>,
+        dx: Option<TileMut<'_, R>>,
+    ) {
+        let range = grads.range.start.min(self.params)..grads.range.end.min(self.params);
+        if range.is_empty() && dx.is_none() {
+            return;
+        }
+        let values = &mut grads.values[..range.len()];
+        let dy = Tile::new(dy.channels(0..self.channels), x.rows);
+        kernel.backward(&params[..self.params], x, tape, dy, Grads { values, range }, dx);
+    }
+}
+
+/// The kernels of one precision: those of the open channels.
+macro_rules! kernels {
+    ($real:ty, $stored:ty, $pick:ident) => {
+        impl Kernel<$real, $stored> for Opened {
+            fn forward(&self, params: &[$stored], x: Tile<'_, $real>, y: TileMut<'_, $real>, tape: TileMut<'_, $real>) {
+                if let Some(kernel) = $pick(&*self.open) {
+                    self.forward_of(kernel, None, params, x, y, tape);
+                }
+            }
+
+            fn passes(&self) -> usize {
+                $pick(&*self.open).map_or(0, |kernel| kernel.passes())
+            }
+
+            fn forward_pass(
+                &self,
+                pass: usize,
+                params: &[$stored],
+                x: Tile<'_, $real>,
+                y: TileMut<'_, $real>,
+                tape: TileMut<'_, $real>,
+            ) {
+                if let Some(kernel) = $pick(&*self.open) {
+                    self.forward_of(kernel, Some(pass), params, x, y, tape);
+                }
+            }
+
+            fn backward(
+                &self,
+                params: &[$stored],
+                x: Tile<'_, $real>,
+                tape: TileMut<'_, $real>,
+                dy: Tile<'_, $real>,
+                grads: Grads<'_, $real>,
+                dx: Option<TileMut<'_, $real>>,
+            ) {
+                if let Some(kernel) = $pick(&*self.open) {
+                    self.backward_of(kernel, params, (x, tape, dy), grads, dx);
+                }
+            }
+        }
+    };
+}
+kernels!(f32, f32, single);
+kernels!(f64, f64, double);
+kernels!(f32, F16, f16);
+kernels!(f32, Bf16, bf16);
+
+fn single(open: &dyn Encoder) -> Option<&dyn Kernel<f32>> {
+    Some(open.kernel())
+}
+
+fn double(open: &dyn Encoder) -> Option<&dyn Kernel<f64>> {
+    open.reference()
+}
+
+fn f16(open: &dyn Encoder) -> Option<&dyn Kernel<f32, F16>> {
+    open.halves().map(|h| h.f16)
+}
+
+fn bf16(open: &dyn Encoder) -> Option<&dyn Kernel<f32, Bf16>> {
+    open.halves().map(|h| h.bf16)
+}
+
+impl Stage for Opened {
+    fn info(&self) -> Info {
+        Info { macs: self.open.info().macs, ..self.whole.info() }
+    }
+
+    fn parameters(&self) -> Vec<Parameter> {
+        self.whole.parameters()
+    }
+
+    fn init(&self, seed: u64, params: &mut [f32]) {
+        self.whole.init(seed, params);
+    }
+
+    fn kernel(&self) -> &dyn Kernel<f32> {
+        self
+    }
+
+    fn reference(&self) -> Option<&dyn Kernel<f64>> {
+        self.open.reference().map(|_| self as _)
+    }
+
+    fn halves(&self) -> Option<Halves<'_>> {
+        self.open.halves().map(|_| Halves::of(self))
+    }
+
+    /// One more range has what is closed.
+    fn partition(&self) -> Vec<Range<usize>> {
+        let closed = self.params..self.whole.info().params;
+        self.open.partition().into_iter().chain((!closed.is_empty()).then_some(closed)).collect()
+    }
+
+    fn fault(&self) -> Result<()> {
+        self.open.fault()
+    }
+
+    fn wgsl(&self) -> Option<Fragment> {
+        let (fragment, n, width) = (self.open.wgsl()?, self.channels, self.info().output);
+        let name = "stage_open_";
+        let parts = hosted(name, 0, &fragment) + &fragment.named(name);
+        let forward = format!(
+            "    var open: array<f32, {n}>;
+    {name}forward(x, &open);
+    for (var c = 0u; c < {width}u; c++) {{ (*y)[c] = 0.0; }}
+    for (var c = 0u; c < {n}u; c++) {{ (*y)[c] = open[c]; }}
+"
+        );
+        let backward = format!(
+            "    var open: array<f32, {n}>;
+    for (var c = 0u; c < {n}u; c++) {{ open[c] = (*dy)[c]; }}
+    {name}backward(x, &open, dx);
+"
+        );
+        Some(Fragment::new(&[&parts, &functions(3, width, &forward, &backward)]))
+    }
+
+    fn describe(&self) -> String {
+        let width = self.whole.info().output;
+        format!("{}, {} of {width} channels open", self.whole.describe(), self.channels)
+    }
+}
+
+impl Encoder for Opened {
+    fn coarse_to_fine(&self) -> bool {
+        self.whole.coarse_to_fine()
+    }
+
+    fn resolutions(&self) -> Option<Vec<f64>> {
+        self.whole.resolutions()
+    }
+}

@@ -1,0 +1,666 @@
+//! Multi-resolution hash of a permutohedral lattice (Rosu and Behnke 2023, PermutoSDF, section 3.1; the lattice is that of Adams
+//! et al. 2010, Fast High-Dimensional Filtering Using the Permutohedral Lattice).
+//!
+//! Points `[n, 3]` in the unit cube to `[n, levels·features]`: on each level the features of the 4 corners of the point's simplex,
+//! weighted by its barycentric coordinates. A hash grid reads 8 corners.
+//!
+//! In three dimensions the lattice is the body-centred cubic one. It is the image of the whole numbers under a linear map, and its
+//! simplices are those of the Kuhn triangulation: with `u = s·(y + z, x + z, x + y)`, cell `k = ⌊u⌋` and fractions
+//! `f_a ≥ f_b ≥ f_c`, the corners are `k`, `k + e_a`, `k + e_a + e_b` and `k + (1, 1, 1)`, and their weights `1 − f_a`, `f_a − f_b`,
+//! `f_b − f_c` and `f_c`. So the axes of the lattice are those of the cube; in the publications they are turned.
+//!
+//! A level with `r` cells a side has as many vertices a volume as a cubic grid of `r` cells a side: `s = r/∛2`. A level whose
+//! vertices fit the table is indexed directly, a finer one by the hash of Müller et al. 2022, equation 4, of `k`.
+
+use crate::levels::{
+    Asked, BLOCK, LevelCode, Table, by_channel, by_features, entry, entry_mut, functions, prefetch, start,
+};
+use conefield_core::error::{Result, ensure};
+use conefield_core::half::Stored;
+use conefield_core::settings::EncoderSpec;
+use conefield_core::simd::{Op, Real, Simd, SimdBase, SimdFloat, V, load, run, store};
+use conefield_core::stage::{
+    Encoder, GradKind, Grads, Halves, Info, Kernel, Parameter, Reduced, Scope, Stage, Tile, TileMut,
+};
+use conefield_core::wgsl::Fragment;
+use schemars::JsonSchema;
+use serde::{Deserialize, Serialize};
+use std::ops::Range;
+
+/// Settings of `permutohedral`.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
+#[serde(deny_unknown_fields, default)]
+pub struct Permutohedral {
+    /// Levels, coarse to fine.
+    pub levels: usize,
+    /// Features a level: 1, 2, 4 or 8.
+    pub features: usize,
+    /// Cells along the cube's side on the coarsest level: of a cubic grid with as many vertices.
+    pub base_resolution: u32,
+    /// Resolution of a level over that of the level before.
+    pub growth: f64,
+    /// Largest table, as a power of two.
+    pub log2_table_size: u32,
+}
+
+impl Default for Permutohedral {
+    fn default() -> Self {
+        Self { levels: 10, features: 2, base_resolution: 16, growth: 2.0, log2_table_size: 19 }
+    }
+}
+
+conefield_core::stage_type!(
+    Encoder,
+    "permutohedral",
+    Permutohedral,
+    "multi-resolution hash of a lattice of simplices: 4 corners instead of 8",
+    example = r#"{"levels": 3, "log2_table_size": 8, "base_resolution": 4}"#
+);
+
+#[typetag::serde(name = "permutohedral")]
+impl EncoderSpec for Permutohedral {
+    fn build(&self) -> Result<Box<dyn Encoder>> {
+        Ok(Box::new(PermutohedralStage::new(self)?))
+    }
+}
+
+/// Positions are `f32`: a finer lattice than this has no fraction of a cell left to interpolate by.
+const FINEST: f64 = 4_194_304.0;
+
+/// Of the hash, as in the paper of Müller et al.
+const PRIMES: [u32; 3] = [1, 2_654_435_761, 805_459_861];
+
+#[derive(Debug, Clone, PartialEq)]
+struct Level {
+    table: Table,
+    /// Cells along the cube's side, of a cubic grid with as many vertices.
+    resolution: f64,
+    /// `s` of the formula.
+    scale: f64,
+    /// Pairs of vertices along a side, where the level is indexed directly, else 0.
+    side: u32,
+    /// Entries less one.
+    last: u32,
+}
+
+impl Level {
+    fn new(s: &Permutohedral, number: usize, resolution: f64, first: usize) -> Self {
+        let scale = resolution * 0.5f64.cbrt();
+        // A vertex stands at whole numbers X, Y, Z of 1/(2s), all even or all odd. Those of a point's simplex lie in
+        // [−2, 2s + 2], where rounding may have moved the point by a hair; a pair is an even vertex and the odd one after it.
+        let side = (((2.0 * scale + 1e-2).ceil() as u64 + 3) >> 1) + 1;
+        let (vertices, table) = (2 * u128::from(side).pow(3), 1u64 << s.log2_table_size);
+        let direct = vertices <= u128::from(table);
+        let entries = if direct { vertices as u64 } else { table };
+        Self {
+            table: Table {
+                start: first,
+                len: entries as usize * s.features,
+                number,
+                outputs: (0..s.features).map(|f| Some(number * s.features + f)).collect(),
+            },
+            resolution,
+            scale,
+            side: if direct { side as u32 } else { 0 },
+            last: (entries - 1) as u32,
+        }
+    }
+}
+
+/// The stage that [`Permutohedral`] builds.
+#[derive(Debug, Clone, PartialEq)]
+pub struct PermutohedralStage {
+    features: usize,
+    log2_table_size: u32,
+    levels: Vec<Level>,
+    params: usize,
+    outputs: usize,
+}
+
+impl PermutohedralStage {
+    /// The stage, or which setting is out of range.
+    pub fn new(settings: &Permutohedral) -> Result<Self> {
+        let s = settings;
+        ensure((1..=32).contains(&s.levels), "spec", "levels", s.levels, "1 to 32")?;
+        ensure([1, 2, 4, 8].contains(&s.features), "spec", "features", s.features, "1, 2, 4 or 8")?;
+        let base = s.base_resolution;
+        ensure((2..=1 << 20).contains(&base), "spec", "base_resolution", base, "2 to 2^20")?;
+        ensure((1.0..=16.0).contains(&s.growth), "spec", "growth", s.growth, "1 to 16")?;
+        let log2 = s.log2_table_size;
+        ensure((4..=28).contains(&log2), "spec", "log2_table_size", log2, "4 to 28")?;
+        let mut levels: Vec<Level> = vec![];
+        let mut params = 0;
+        for l in 0..s.levels {
+            let resolution = f64::from(base) * s.growth.powi(l as i32);
+            let found = format!("level {l} with {resolution:.0} cells a side");
+            let expected = "at most 2^22 cells a side (positions are single precision): fewer levels or less growth";
+            ensure(resolution <= FINEST, "spec", "levels", found, expected)?;
+            levels.push(Level::new(s, l, resolution, params));
+            params += levels[l].table.len;
+        }
+        let outputs = s.levels * s.features;
+        Ok(Self { features: s.features, log2_table_size: log2, levels, params, outputs })
+    }
+}
+
+/// Where the rows of a block fall on one level.
+struct Located<R> {
+    cell: [[u32; BLOCK]; 3],
+    fraction: [[R; BLOCK]; 3],
+    /// How many of the other two fractions come before each.
+    rank: [[u32; BLOCK]; 3],
+    /// Entry of each corner.
+    entry: [[u32; BLOCK]; 4],
+    /// Barycentric coordinates.
+    weight: [[R; BLOCK]; 4],
+}
+
+impl<R: Real> Located<R> {
+    fn new() -> Self {
+        let (whole, numbers) = ([0; BLOCK], [R::ZERO; BLOCK]);
+        Self { cell: [whole; 3], fraction: [numbers; 3], rank: [whole; 3], entry: [whole; 4], weight: [numbers; 4] }
+    }
+
+    /// Locates rows `at..at + n` of `x`. Points outside the cube count as on its rim, a coordinate that is not a number as 0.
+    #[inline(always)]
+    fn locate<S: Simd>(&mut self, s: S, level: &Level, x: Tile<'_, R>, at: usize, n: usize) {
+        let number = |v: f64| V::<S, R>::splat(s, R::of(v));
+        let (zero, one, scale) = (number(0.0), number(1.0), number(level.scale));
+        let [x, y, z] = [0, 1, 2].map(|d| &x.channel(d)[at..at + n]);
+        for (d, [a, b]) in [[y, z], [x, z], [x, y]].into_iter().enumerate() {
+            let mut i = 0;
+            while i < n {
+                // The precise form returns the number where the other side is NaN.
+                let a = load(s, a, i).max_precise(zero).min(one);
+                let b = load(s, b, i).max_precise(zero).min(one);
+                let u = (a + b) * scale;
+                let k = u.floor();
+                store::<S, R>(u - k, &mut self.fraction[d], i);
+                R::cells(s, k, &mut self.cell[d][i..]);
+                i += V::<S, R>::LEN;
+            }
+        }
+        // These loops go over the whole block, even where it has fewer rows: a known length makes them faster.
+        let [f, g, h] = &self.fraction;
+        for i in 0..BLOCK {
+            let (fg, fh, gh) = (u32::from(f[i] >= g[i]), u32::from(f[i] >= h[i]), u32::from(g[i] >= h[i]));
+            self.rank[0][i] = 2 - fg - fh;
+            self.rank[1][i] = 1 + fg - gh;
+            self.rank[2][i] = fh + gh;
+        }
+        for i in 0..BLOCK {
+            let (more, less) = if f[i] >= g[i] { (f[i], g[i]) } else { (g[i], f[i]) };
+            let (top, rest) = if more >= h[i] { (more, h[i]) } else { (h[i], more) };
+            let (middle, bottom) = if rest >= less { (rest, less) } else { (less, rest) };
+            self.weight[0][i] = R::ONE - top;
+            self.weight[1][i] = top - middle;
+            self.weight[2][i] = middle - bottom;
+            self.weight[3][i] = bottom;
+        }
+        let ([a, b, c], [p, q, r]) = (&self.cell, &self.rank);
+        for (corner, entry) in self.entry.iter_mut().enumerate() {
+            let corner = corner as u32;
+            if level.side == 0 {
+                for i in 0..BLOCK {
+                    let k = (a[i] + u32::from(p[i] < corner)).wrapping_mul(PRIMES[0]);
+                    let l = (b[i] + u32::from(q[i] < corner)).wrapping_mul(PRIMES[1]);
+                    let m = (c[i] + u32::from(r[i] < corner)).wrapping_mul(PRIMES[2]);
+                    entry[i] = (k ^ l ^ m) & level.last;
+                }
+            } else {
+                for i in 0..BLOCK {
+                    let k = a[i] + u32::from(p[i] < corner);
+                    let l = b[i] + u32::from(q[i] < corner);
+                    let m = c[i] + u32::from(r[i] < corner);
+                    // Two more than X, Y, Z, so that none is negative.
+                    let two = 2 + k + l + m;
+                    let (x, y, z) = (two - 2 * k, two - 2 * l, two - 2 * m);
+                    let pair = ((x >> 1) * level.side + (y >> 1)) * level.side + (z >> 1);
+                    entry[i] = (2 * pair + (x & 1)).min(level.last);
+                }
+            }
+        }
+    }
+
+    /// Whether each of the first `n` rows is the last one that lies in its simplex before another row lies elsewhere, and how
+    /// many are.
+    #[inline(always)]
+    fn leaving(&self, n: usize) -> ([bool; BLOCK], usize) {
+        let mut leaves = [true; BLOCK];
+        for i in 0..BLOCK - 1 {
+            let mut other = 0;
+            for entry in &self.entry {
+                other |= entry[i] ^ entry[i + 1];
+            }
+            leaves[i] = other != 0;
+        }
+        leaves[n - 1] = true;
+        let count = leaves[..n].iter().map(|&l| usize::from(l)).sum();
+        (leaves, count)
+    }
+
+    /// Entries of the corners of row `i`.
+    #[inline(always)]
+    fn corners(&self, i: usize) -> [u32; 4] {
+        [self.entry[0][i], self.entry[1][i], self.entry[2][i], self.entry[3][i]]
+    }
+
+    /// Weights of the corners of row `i`, as [`fours`] has their features.
+    #[inline(always)]
+    fn weights<S: Simd, const F: usize>(&self, s: S, i: usize) -> [R::Four<S>; 8] {
+        fours(s, &[[self.weight[0][i]; F], [self.weight[1][i]; F], [self.weight[2][i]; F], [self.weight[3][i]; F]])
+    }
+}
+
+/// The features of four corners, one after the other, in registers of four, of which `F` are used.
+#[inline(always)]
+fn fours<S: Simd, R: Real, const F: usize>(s: S, corners: &[[R; F]; 4]) -> [R::Four<S>; 8] {
+    let mut lanes = [[R::ZERO; 4]; 8];
+    for c in 0..4 {
+        for f in 0..F {
+            lanes[(c * F + f) / 4][(c * F + f) % 4] = corners[c][f];
+        }
+    }
+    let mut all = [R::Four::<S>::splat(s, R::ZERO); 8];
+    for q in 0..F {
+        all[q] = R::Four::<S>::from_slice(s, &lanes[q]);
+    }
+    all
+}
+
+/// Entry `i` of a level's table, from [`Located::locate`] for that very level.
+#[inline(always)]
+#[allow(unsafe_code)]
+fn at<T>(table: &[T], i: u32) -> &T {
+    // SAFETY: callers slice `table` to the level's entries. `locate` masks a hash by their number less one, and lowers a
+    // direct index to it.
+    unsafe { entry(table, i) }
+}
+
+/// Adds `sums`, which stand as in [`fours`], to four entries, one after the other: two of them may be one.
+#[inline(always)]
+#[allow(unsafe_code)]
+fn add<R: Real, const F: usize>(grads: &mut [[R; F]], corners: [u32; 4], sums: &[[R; 4]; 8]) {
+    for (c, i) in corners.into_iter().enumerate() {
+        // SAFETY: as for `at`.
+        let to = unsafe { entry_mut(grads, i) };
+        for f in 0..F {
+            to[f] += sums[(c * F + f) / 4][(c * F + f) % 4];
+        }
+    }
+}
+
+struct Forward<'a, R, P> {
+    stage: &'a PermutohedralStage,
+    levels: Range<usize>,
+    params: &'a [P],
+    x: Tile<'a, R>,
+    y: TileMut<'a, R>,
+}
+
+impl<R: Real, P: Stored<R>> Forward<'_, R, P> {
+    #[inline(always)]
+    fn features<S: Simd, const F: usize>(mut self, s: S) {
+        let mut located = Located::new();
+        let mut out = [[R::ZERO; F]; BLOCK];
+        // Entries in halves are made wide a block at a time: a loop over neighbours becomes vector code.
+        let widen = size_of::<P>() < size_of::<R>();
+        let (mut read, mut wide) = ([[[P::default(); F]; 4]; BLOCK], [[[R::ZERO; F]; 4]; BLOCK]);
+        for level in &self.stage.levels[self.levels.clone()] {
+            let (table, _) = self.params[level.table.range()].as_chunks::<F>();
+            assert_eq!(table.len(), level.last as usize + 1);
+            for first in (0..self.x.rows).step_by(BLOCK) {
+                let n = BLOCK.min(self.x.rows - first);
+                located.locate(s, level, self.x, first, n);
+                if level.side == 0 {
+                    prefetch(table, located.entry.iter(), n);
+                }
+                if widen {
+                    for i in 0..n {
+                        for c in 0..4 {
+                            read[i][c] = *at(table, located.entry[c][i]);
+                        }
+                    }
+                    let read = read.as_flattened().as_flattened();
+                    for (wide, &read) in wide.as_flattened_mut().as_flattened_mut().iter_mut().zip(read) {
+                        *wide = read.value();
+                    }
+                }
+                for i in 0..n {
+                    if !widen {
+                        for c in 0..4 {
+                            wide[i][c] = at(table, located.entry[c][i]).map(|p| p.value());
+                        }
+                    }
+                    let (corners, weights) = (fours(s, &wide[i]), located.weights::<S, F>(s, i));
+                    let mut sum = [corners[0] * weights[0], R::Four::<S>::splat(s, R::ZERO)];
+                    for q in 1..F {
+                        let to = if F == 8 { q % 2 } else { 0 };
+                        sum[to] = corners[q].mul_add(weights[q], sum[to]);
+                    }
+                    if F < 4 {
+                        sum[0] += sum[0].rotate_elements_left::<2>();
+                    }
+                    if F < 2 {
+                        sum[0] += sum[0].rotate_elements_left::<1>();
+                    }
+                    for f in 0..F {
+                        out[i][f] = sum[f / 4].as_slice()[f % 4];
+                    }
+                }
+                level.table.put(&out, &mut self.y, first, n);
+            }
+        }
+    }
+}
+
+/// Adds to a level's gradients what the first `n` of the rows at `located` are worth. Rows that lie in one simplex one after
+/// another are summed first, where these are many: then the entries are read and written once for all of them, and no row
+/// waits for what the one before has written.
+#[inline(always)]
+fn scatter<S: Simd, R: Real, const F: usize>(
+    s: S,
+    grads: &mut [[R; F]],
+    located: &Located<R>,
+    dy: &[[R; F]; BLOCK],
+    n: usize,
+) {
+    let (leaves, simplices) = located.leaving(n);
+    let together = 3 * simplices <= n;
+    let zero = R::Four::<S>::splat(s, R::ZERO);
+    let mut sums = [zero; 8];
+    for i in 0..n {
+        let (weights, dy) = (located.weights::<S, F>(s, i), fours(s, &[dy[i]; 4]));
+        for q in 0..F {
+            sums[q] = if together { dy[q].mul_add(weights[q], sums[q]) } else { dy[q] * weights[q] };
+        }
+        if !together || leaves[i] {
+            let mut lanes = [[R::ZERO; 4]; 8];
+            for q in 0..F {
+                sums[q].store_slice(&mut lanes[q]);
+            }
+            add(grads, located.corners(i), &lanes);
+            sums = [zero; 8];
+        }
+    }
+}
+
+struct Backward<'a, R, P> {
+    stage: &'a PermutohedralStage,
+    params: &'a [P],
+    x: Tile<'a, R>,
+    dy: Tile<'a, R>,
+    grads: Grads<'a, R>,
+    dx: Option<TileMut<'a, R>>,
+}
+
+impl<R: Real, P: Stored<R>> Backward<'_, R, P> {
+    #[inline(always)]
+    fn features<S: Simd, const F: usize>(mut self, s: S) {
+        let mut located = Located::new();
+        let mut dy = [[R::ZERO; F]; BLOCK];
+        if let Some(dx) = &mut self.dx {
+            dx.data.fill(R::ZERO);
+        }
+        for level in &self.stage.levels {
+            let mut asked = Asked::of(&self.grads, &level.table.range());
+            if asked.is_empty() && self.dx.is_none() {
+                continue;
+            }
+            let (grads, _) = asked.values(&mut self.grads).as_chunks_mut::<F>();
+            assert!(grads.is_empty() || grads.len() == level.last as usize + 1);
+            let (table, _) = self.params[level.table.range()].as_chunks::<F>();
+            for first in (0..self.x.rows).step_by(BLOCK) {
+                let n = BLOCK.min(self.x.rows - first);
+                level.table.take(self.dy, &mut dy, first, n);
+                located.locate(s, level, self.x, first, n);
+                if !grads.is_empty() {
+                    if level.side == 0 {
+                        prefetch(grads, located.entry.iter(), n);
+                    }
+                    scatter::<S, R, F>(s, grads, &located, &dy, n);
+                }
+                let Some(dx) = &mut self.dx else { continue };
+                for i in 0..n {
+                    let v: [R; 4] = located.corners(i).map(|c| {
+                        let entry = &table[c as usize];
+                        (0..F).map(|f| entry[f].value() * dy[i][f]).sum()
+                    });
+                    // By a fraction: the corner that it adds to, less the one before.
+                    let by = [0, 1, 2].map(|d| {
+                        let rank = located.rank[d][i] as usize;
+                        v[rank + 1] - v[rank]
+                    });
+                    for d in 0..3 {
+                        // Beyond the rim a position counts as on it, whichever it is.
+                        let x = self.x.channel(d)[first + i];
+                        if x >= R::ZERO && x <= R::ONE {
+                            dx.channel(d)[first + i] += R::of(level.scale) * (by[(d + 1) % 3] + by[(d + 2) % 3]);
+                        }
+                    }
+                }
+            }
+            asked.finish(&mut self.grads);
+        }
+    }
+}
+
+by_features!(Forward);
+by_features!(Backward);
+
+impl<R: Real, P: Stored<R>> Kernel<R, P> for PermutohedralStage {
+    fn forward(&self, params: &[P], x: Tile<'_, R>, y: TileMut<'_, R>, _: TileMut<'_, R>) {
+        run(Forward { stage: self, levels: 0..self.levels.len(), params, x, y });
+    }
+
+    fn passes(&self) -> usize {
+        self.levels.len()
+    }
+
+    fn forward_pass(&self, pass: usize, params: &[P], x: Tile<'_, R>, y: TileMut<'_, R>, _: TileMut<'_, R>) {
+        run(Forward { stage: self, levels: pass..pass + 1, params, x, y });
+    }
+
+    fn backward(
+        &self,
+        params: &[P],
+        x: Tile<'_, R>,
+        _: TileMut<'_, R>,
+        dy: Tile<'_, R>,
+        grads: Grads<'_, R>,
+        dx: Option<TileMut<'_, R>>,
+    ) {
+        run(Backward { stage: self, params, x, dy, grads, dx });
+    }
+}
+
+impl Stage for PermutohedralStage {
+    fn info(&self) -> Info {
+        Info {
+            input: 3,
+            output: self.outputs,
+            params: self.params,
+            tape: 0,
+            scope: Scope::Row,
+            grads: GradKind::Scatter,
+            macs: self.levels.len() * (4 * self.features + 9),
+            identity: false,
+        }
+    }
+
+    fn parameters(&self) -> Vec<Parameter> {
+        let f = self.features;
+        self.levels.iter().map(|l| l.table.parameter(vec![l.last as usize + 1, f])).collect()
+    }
+
+    fn init(&self, seed: u64, params: &mut [f32]) {
+        start(seed, params);
+    }
+
+    fn kernel(&self) -> &dyn Kernel<f32> {
+        self
+    }
+
+    fn reference(&self) -> Option<&dyn Kernel<f64>> {
+        Some(self)
+    }
+
+    fn halves(&self) -> Option<Halves<'_>> {
+        Some(Halves::of(self))
+    }
+
+    fn partition(&self) -> Vec<Range<usize>> {
+        self.levels.iter().map(|l| l.table.range()).collect()
+    }
+
+    fn wgsl(&self) -> Option<Fragment> {
+        let code = |l: &Level| {
+            let first = u32::try_from(l.table.start).ok()?;
+            let value = format!("stage_Level({:?}, {}u, {}u, {first}u)", l.scale as f32, l.side, l.last);
+            Some(LevelCode { value, outputs: l.table.outputs.clone() })
+        };
+        let levels = self.levels.iter().map(code).collect::<Option<Vec<_>>>()?;
+        let [x, y, z] = PRIMES;
+        let f = self.features;
+        let constants = format!("const stage_FEATURES = {f}u;\nconst stage_PRIMES = vec3<u32>({x}u, {y}u, {z}u);\n");
+        Some(Fragment::new(&[&constants, include_str!("permutohedral.wgsl"), &functions(&levels, self.outputs)]))
+    }
+
+    fn describe(&self) -> String {
+        let cells = |l: Option<&Level>| l.map_or(0.0, |l| l.resolution);
+        format!(
+            "permutohedral: {} levels x {}, {:.0} to {:.0} cells a side, tables up to 2^{}, {} of them direct",
+            self.levels.len(),
+            self.features,
+            cells(self.levels.first()),
+            cells(self.levels.last()),
+            self.log2_table_size,
+            self.levels.iter().filter(|l| l.side > 0).count()
+        )
+    }
+}
+
+impl Encoder for PermutohedralStage {
+    fn keep_outputs(&self, keep: &[usize]) -> Result<Reduced<dyn Encoder>> {
+        ensure(!keep.is_empty(), "permutohedral", "channels", "none kept", "at least one")?;
+        let mut stage = Self { levels: vec![], params: 0, outputs: keep.len(), ..self.clone() };
+        let mut params = vec![];
+        for level in &self.levels {
+            if let Some(table) = level.table.kept(keep, stage.params) {
+                stage.params += table.len;
+                params.push(level.table.range());
+                stage.levels.push(Level { table, ..level.clone() });
+            }
+        }
+        Ok(Reduced { stage: Box::new(stage), params, channels: vec![0, 1, 2] })
+    }
+
+    fn coarse_to_fine(&self) -> bool {
+        true
+    }
+
+    fn resolutions(&self) -> Option<Vec<f64>> {
+        Some(by_channel(self.levels.iter().map(|l| (l.resolution, &l.table.outputs[..])), self.outputs))
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    struct Locate<'a, R>(&'a mut Located<R>, &'a Level, Tile<'a, R>);
+    impl<R: Real> Op for Locate<'_, R> {
+        type Out = ();
+        #[inline(always)]
+        fn call<S: Simd>(self, s: S) {
+            self.0.locate(s, self.1, self.2, 0, 1);
+        }
+    }
+
+    fn stage(base_resolution: u32, growth: f64, log2_table_size: u32) -> PermutohedralStage {
+        let settings =
+            Permutohedral { levels: 2, base_resolution, growth, log2_table_size, ..Permutohedral::default() };
+        PermutohedralStage::new(&settings).unwrap()
+    }
+
+    /// Cartesian coordinates of a corner, in `1/(2s)`: see the linear map.
+    fn vertex(located: &Located<f64>, corner: u32) -> [i64; 3] {
+        let k = [0, 1, 2].map(|d| i64::from(located.cell[d][0] + u32::from(located.rank[d][0] < corner)));
+        let sum: i64 = k.iter().sum();
+        k.map(|k| sum - 2 * k)
+    }
+
+    /// The lattice is that of Adams et al.: a point is the mean of its simplex' corners, weighted; of all vertices nearby the
+    /// four are those whose Voronoi cells meet in the simplex (edges have the two lengths of that lattice); and every vertex
+    /// of a direct level has an entry of its own.
+    #[test]
+    fn simplices_are_those_of_the_body_centred_lattice() {
+        let stage = stage(5, 1.7, 12);
+        for level in &stage.levels {
+            assert!(level.side > 0);
+            let mut owner = std::collections::BTreeMap::new();
+            for n in 0..4000u64 {
+                let p = [0, 1, 2].map(|d| f64::from(conefield_core::random::unit(conefield_core::random::mix(d, n))));
+                let mut located = Located::<f64>::new();
+                run(Locate(&mut located, level, Tile::new(&p, 1)));
+                let corners: Vec<[i64; 3]> = (0..4).map(|c| vertex(&located, c)).collect();
+                for (c, v) in corners.iter().enumerate() {
+                    assert!(v.iter().all(|x| (x - v[0]) % 2 == 0), "{v:?} is no vertex");
+                    let entry = located.entry[c][0];
+                    assert_eq!(*owner.entry(entry).or_insert(*v), *v, "entry {entry} has two vertices");
+                    for w in &corners[..c] {
+                        let distance: i64 = (0..3).map(|d| (v[d] - w[d]).pow(2)).sum();
+                        assert!(distance == 3 || distance == 4, "{v:?} and {w:?} are no neighbours");
+                    }
+                }
+                let weights = [0, 1, 2, 3].map(|c| located.weight[c][0]);
+                assert!(weights.iter().all(|w| (0.0..=1.0).contains(w)));
+                for d in 0..3 {
+                    let mean: f64 = (0..4).map(|c| weights[c] * corners[c][d] as f64).sum();
+                    assert!((mean - 2.0 * level.scale * p[d]).abs() < 1e-9, "{p:?}");
+                }
+            }
+        }
+    }
+
+    /// A cube with `r` cells a side has about `r³` vertices, but for those around it.
+    #[test]
+    fn a_level_has_as_many_vertices_as_a_cubic_grid() {
+        let stage = stage(64, 2.0, 24);
+        let entries = f64::from(stage.levels[1].last + 1);
+        assert!((1.0..1.08).contains(&(entries / 128f64.powi(3))), "{entries}");
+    }
+
+    /// Corners of the cube, points beyond it and rounding near whole cells stay inside direct tables, with weights of one.
+    #[test]
+    fn the_rim_stays_inside_the_table() {
+        for (base, growth) in [(2, 1.26), (25, 1.14), (63, 1.25), (50, 1.15), (30, 2.05)] {
+            for level in &stage(base, growth, 22).levels {
+                for bits in 0..27 {
+                    let x = [0, 1, 2].map(|d| [0.0f32, 1.0, f32::INFINITY][bits / 3usize.pow(d) % 3]);
+                    let mut located = Located::<f32>::new();
+                    run(Locate(&mut located, level, Tile::new(&x, 1)));
+                    let k = located.cell.map(|c| i64::from(c[0]));
+                    let total: f32 = located.weight.iter().map(|w| w[0]).sum();
+                    assert!((total - 1.0).abs() < 1e-6, "{x:?}");
+                    for c in 0..4 {
+                        let v = [0, 1, 2].map(|d| k[d] + i64::from(located.rank[d][0] < c));
+                        let side = 2 * i64::from(level.side);
+                        let sum: i64 = 2 + v.iter().sum::<i64>();
+                        assert!(
+                            v.iter().all(|k| (0..side).contains(&(sum - 2 * k))),
+                            "{base} x {growth} at {x:?}: {v:?}"
+                        );
+                    }
+                }
+            }
+        }
+    }
+
+    #[test]
+    fn a_level_past_single_precision_is_refused() {
+        let settings = Permutohedral { levels: 32, ..Permutohedral::default() };
+        let e = PermutohedralStage::new(&settings).unwrap_err().to_string();
+        assert!(e.contains("levels") && e.contains("2^22"), "{e}");
+    }
+}

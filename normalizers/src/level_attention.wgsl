@@ -1,0 +1,24 @@
+// Attention over levels: the twin of level_attention.rs, which gives `stage_LEVELS`, `stage_WIDTH` and `stage_BIAS`, and writes
+// what goes channel by channel.
+
+// The weights of the levels.
+fn stage_attention(x: ptr<function, array<f32, stage_WIDTH>>) -> array<f32, stage_LEVELS> {
+    var a: array<f32, stage_LEVELS>;
+    var top = 0.0;
+    for (var l = 0u; l < stage_LEVELS; l++) {
+        a[l] = stage_param(stage_BIAS + l);
+        for (var c = 0u; c < stage_WIDTH; c++) {
+            a[l] += stage_param(l * stage_WIDTH + c) * (*x)[c];
+        }
+        top = select(max(top, a[l]), a[l], l == 0u);
+    }
+    var sum = 0.0;
+    for (var l = 0u; l < stage_LEVELS; l++) {
+        a[l] = exp(max(a[l] - top, -87.0));
+        sum += a[l];
+    }
+    for (var l = 0u; l < stage_LEVELS; l++) {
+        a[l] /= sum;
+    }
+    return a;
+}

@@ -1,0 +1,139 @@
+//! Coarse-to-fine training (Lin et al. 2021, BARF, section 3.3, for frequencies; Li et al. 2023, Neuralangelo, section 3.2, for the
+//! levels of a hash grid): training begins with the encoder's coarse levels, and finer ones open one by one.
+//!
+//! The channels of a closed level are 0 and are not computed, so that a step with few levels is cheap. Its features stay what they
+//! began as, next to 0: where it opens, nothing jumps. It works with every encoder that has tables of features, from coarse to
+//! fine.
+//!
+//! Of `L` levels, `levels` are open at first. The others open at equal distances, the last after `until` of the run:
+//! `levels + ⌊(L − levels)·min(share/until, 1)⌋` are open at `share` of the run.
+
+use crate::training::run::Run;
+use crate::training::{Callback, CallbackSpec};
+use conefield_core::error::{Error, Result, ensure};
+use conefield_core::opened::Opened;
+use conefield_core::pipeline::Pipeline;
+use conefield_core::stage::Encoder;
+use schemars::JsonSchema;
+use serde::{Deserialize, Serialize};
+
+/// Settings of `coarse-to-fine`.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
+#[serde(deny_unknown_fields, default)]
+pub struct CoarseToFine {
+    /// Levels that are open at first.
+    pub levels: usize,
+    /// Share of the run after which all are open, above 0 and at most 1.
+    pub until: f64,
+}
+
+impl Default for CoarseToFine {
+    fn default() -> Self {
+        Self { levels: 1, until: 0.3 }
+    }
+}
+
+conefield_core::stage_type!(
+    Callback,
+    "coarse-to-fine",
+    CoarseToFine,
+    "opens the encoder's levels one by one, coarse ones first"
+);
+
+#[typetag::serde(name = "coarse-to-fine")]
+impl CallbackSpec for CoarseToFine {
+    fn build(&self) -> Result<Box<dyn Callback>> {
+        ensure(self.levels > 0, "spec", "levels", 0, "at least 1")?;
+        ensure(self.until > 0.0 && self.until <= 1.0, "spec", "until", self.until, "above 0, at most 1")?;
+        Ok(Box::new(Opener(self.clone())))
+    }
+
+    fn copy(&self) -> Box<dyn CallbackSpec> {
+        Box::new(self.clone())
+    }
+}
+
+/// The callback that [`CoarseToFine`] builds. What is open follows from the share of the run that is over: there is no state.
+struct Opener(CoarseToFine);
+
+impl CoarseToFine {
+    /// How many of `all` levels are open at `share` of the run.
+    fn open(&self, all: usize, share: f64) -> usize {
+        let closed = all.saturating_sub(self.levels);
+        // A hair more, so that a share of a whole number of levels opens the last of them.
+        let more = (closed as f64 * (share / self.until).min(1.0) + 1e-9).floor() as usize;
+        (self.levels + more).min(all)
+    }
+}
+
+/// Where each level ends among the encoder's channels.
+fn ends(encoder: &dyn Encoder) -> Vec<usize> {
+    let cells = encoder.resolutions().unwrap_or_default();
+    (1..=cells.len()).filter(|&c| c == cells.len() || cells[c] != cells[c - 1]).collect()
+}
+
+impl Callback for Opener {
+    fn name(&self) -> &'static str {
+        "coarse-to-fine"
+    }
+
+    fn check(&self, pipeline: &Pipeline) -> Result<()> {
+        let encoder = &pipeline.encoder;
+        let ends = ends(encoder.as_ref());
+        if ends.is_empty() || !encoder.coarse_to_fine() {
+            return Err(Error::unsupported(
+                encoder.describe(),
+                "coarse-to-fine: its channels do not stand from coarse to fine",
+            ));
+        }
+        let most = ends.len();
+        ensure(self.0.levels <= most, "spec", "levels", self.0.levels, format!("1 to {most}, as the encoder has"))?;
+        Opened::new(encoder.clone(), ends[self.0.levels - 1]).map(drop)
+    }
+
+    fn before_step(&mut self, run: &mut Run<'_>) -> Result<()> {
+        let ends = ends(run.model.pipeline.encoder.as_ref());
+        let open = self.0.open(ends.len(), run.clock.share(run.step));
+        let channels = ends[open - 1];
+        if channels != run.model.pipeline.open_channels() {
+            run.open(channels)?;
+            run.tally.window.events.push(format!("coarse-to-fine: {open} of {} levels are open", ends.len()));
+        }
+        Ok(())
+    }
+
+    fn at_end(&mut self, run: &mut Run<'_>) -> Result<()> {
+        let (open, all) = (run.model.pipeline.open_channels(), run.model.pipeline.encoder.info().output);
+        if open < all {
+            let report = format!("coarse-to-fine: the run ends with {open} of {all} channels open");
+            run.tally.window.events.push(report);
+        }
+        Ok(())
+    }
+
+    /// What comes out is the whole encoder: a level that is still closed has its first features, next to 0.
+    fn finish(&mut self, run: &mut Run<'_>) -> Result<()> {
+        let all = run.model.pipeline.encoder.info().output;
+        if run.model.pipeline.open_channels() < all { run.open(all) } else { Ok(()) }
+    }
+
+    fn describe(&self) -> Option<String> {
+        let CoarseToFine { levels, until } = self.0;
+        Some(format!("coarse-to-fine: {levels} levels at first, all after {:.0}% of the run", 100.0 * until))
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn levels_open_at_equal_distances() {
+        let settings = CoarseToFine { levels: 2, until: 0.4 };
+        for (share, open) in [(0.0, 2), (0.09, 2), (0.1, 3), (0.2, 4), (0.39, 5), (0.4, 6), (1.0, 6)] {
+            assert_eq!(settings.open(6, share), open, "{share}");
+        }
+        // Of an encoder that a mask has left with fewer.
+        assert_eq!(settings.open(1, 0.0), 1);
+    }
+}

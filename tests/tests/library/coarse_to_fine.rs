@@ -1,0 +1,110 @@
+//! Training whose encoder opens level by level.
+
+use crate::common::{Stop, model, plan, psnr, scan, spec};
+use conefield_backend_cpu::Cpu;
+use conefield_core::arena::Weights;
+use conefield_core::checkpoint::Resume;
+use conefield_core::method::Job;
+use conefield_core::pipeline::Model;
+use serde_json::{Value, json};
+
+fn settings(encoder: Value, callbacks: Value) -> Value {
+    json!({
+        "encoder": encoder, "normalizers": [{"type": "layer-norm"}], "callbacks": callbacks,
+        "field": {"type": "mlp", "width": 12, "depth": 3, "skips": [1]},
+        "projector": {"type": "ray-march", "samples": 20},
+        "type": "neural-field", "training": {"steps": 60, "rays": 64, "report_every": 5}, "optimizer": {"lr": 0.02},
+    })
+}
+
+fn hash_grid() -> Value {
+    json!({"type": "hash-grid", "levels": 4, "base_resolution": 3, "log2_table_size": 8})
+}
+
+fn opening(levels: usize, until: f64) -> Value {
+    json!([{"type": "rollback"}, {"type": "coarse-to-fine", "levels": levels, "until": until}])
+}
+
+/// Closed channels are 0 and learn nothing; open ones are as they were, and so is the arena.
+#[test]
+fn a_pipeline_opens_and_closes_without_a_trace() {
+    let mut model = Model::random(crate::common::pipeline(&spec(&settings(hash_grid(), json!([]))).unwrap()), 3);
+    let points: Vec<[f32; 3]> = (0..40).map(|i| [0.1, 0.37, 0.73].map(|k| (i as f32 * k).fract())).collect();
+    let encode = |model: &Model| {
+        use conefield_core::backend::Backend;
+        Cpu::new().compile(&model.pipeline).unwrap().0.encode(model, &points).unwrap()
+    };
+    let (whole, layout) = (encode(&model), model.pipeline.layout().clone());
+    model.pipeline.open(4).unwrap();
+    assert_eq!(model.pipeline.open_channels(), 4);
+    let part = encode(&model);
+    let n = points.len();
+    assert_eq!(part[..4 * n], whole[..4 * n]);
+    assert!(part[4 * n..].iter().all(|y| *y == 0.0) && whole[4 * n..].iter().any(|y| *y != 0.0));
+    // A mask counts channels of the whole; what was open stays so.
+    let mut masked = Model::random(model.pipeline.clone(), 3);
+    masked.mask(vec![0, 3, 5]).unwrap();
+    assert_eq!((masked.pipeline.encoder.info().output, masked.pipeline.open_channels()), (3, 2));
+    masked.pipeline.open(3).unwrap();
+    assert_eq!(encode(&masked)[2 * n..], whole[5 * n..6 * n]);
+    model.pipeline.open(8).unwrap();
+    assert_eq!((encode(&model), model.pipeline.layout()), (whole, &layout));
+}
+
+/// Levels open when they should, for every encoder that has some; what comes out is good and whole.
+#[test]
+fn levels_open_one_by_one() {
+    for encoder in [
+        hash_grid(),
+        json!({"type": "permutohedral", "levels": 4, "base_resolution": 3, "log2_table_size": 8}),
+        json!({"type": "dense-grid", "levels": 4, "base_resolution": 2}),
+        json!({"type": "b-spline-grid", "levels": 4, "base_resolution": 2}),
+        json!({"type": "planes", "levels": 4, "base_resolution": 3}),
+    ] {
+        let name = encoder["type"].clone();
+        let (found, records) = psnr(&settings(encoder, opening(1, 0.5)), &Cpu::new());
+        let told: Vec<(u64, String)> =
+            records.iter().flat_map(|r| r.events.iter().map(|e| (r.step, e.clone()))).collect();
+        let want = [(5, 1), (15, 2), (25, 3), (35, 4)];
+        assert_eq!(told.len(), want.len(), "{name}: {told:?}");
+        for ((step, event), (by, open)) in told.iter().zip(want) {
+            assert!(*step == by && event.contains(&format!("{open} of 4 levels")), "{name}: {told:?}");
+        }
+        assert!(found > 18.0, "{name}: {found} dB");
+    }
+}
+
+/// Wherever a run is interrupted, it goes on to the same bits.
+#[test]
+fn a_run_resumes_to_the_same_bits() {
+    let (scan, backend) = (scan(), Cpu::new());
+    let spec = spec(&settings(hash_grid(), opening(2, 0.5))).unwrap();
+    let solve = |resume: Option<&Resume>, at| {
+        let mut stop = Stop::at(at);
+        let job = Job { seed: 7, resume, ..Job::new(&scan, &backend) };
+        let result = plan(&spec, &backend, &Weights::default()).unwrap().run(&job, &mut stop);
+        (result, stop)
+    };
+    let bits = |m: Model| m.arena.params.iter().map(|x| x.to_bits()).collect::<Vec<_>>();
+    let whole = model(solve(None, u64::MAX).0.unwrap());
+    assert_eq!(whole.pipeline.open_channels(), whole.pipeline.encoder.info().output);
+    let whole = bits(whole);
+    for at in [7, 15, 40] {
+        let (_, stopped) = solve(None, at);
+        let again = solve(stopped.kept.as_ref(), u64::MAX).0.unwrap();
+        assert!(bits(model(again)) == whole, "at {at}");
+    }
+}
+
+#[test]
+fn encoders_without_levels_are_refused() {
+    for (encoder, levels, words) in [
+        (json!({"type": "frequency"}), 1, ["frequency", "tables of features"]),
+        (json!({"type": "concat", "encoders": [hash_grid(), {"type": "identity"}]}), 1, ["concat", "coarse to fine"]),
+        (hash_grid(), 5, ["callbacks.1.levels", "1 to 4"]),
+    ] {
+        let spec = spec(&settings(encoder, opening(levels, 0.5))).unwrap();
+        let e = plan(&spec, &Cpu::new(), &Weights::default()).err().unwrap().to_string();
+        assert!(words.iter().all(|w| e.contains(w)), "{e}");
+    }
+}
