@@ -44,7 +44,7 @@ fn both_commands_mend_alike_and_keep_what_they_did() {
         ("ring", ["corrections", "ring"]),
         ("rings.window=4", ["rings.window", "odd"]),
         ("scatter.share=0", ["scatter.share", "above 0"]),
-        ("flux.columns=[6, 18]", ["flux", "in air"]),
+        ("flux={ rows = [5, 11], columns = [7, 17] }", ["flux", "in air"]),
     ] {
         for command in [vec!["import", &scanner, "-o"], vec!["convert", &whole]] {
             let none = text(&at("none"));

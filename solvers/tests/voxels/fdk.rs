@@ -7,7 +7,7 @@ use crate::kit::{Case, Heard, mean, view};
 use conefield_core::geometry::{Geometry, Radians, Vec3, View, VoxelGrid};
 use conefield_core::scan::{Scan, Unit, Volume};
 use conefield_projectors::simulate::{Ellipsoid, ellipsoids, scan_ellipsoids};
-use conefield_solvers::fdk::weights::{Coverage, FdkOrbit, place};
+use conefield_solvers::fdk::weights::{Coverage, FdkOrbit, lean, place};
 use std::f64::consts::{PI, TAU};
 
 /// Half width of the field of view at the axis, mm.
@@ -266,10 +266,20 @@ fn a_detector_need_not_face_the_axis() {
         geometry.detector[1] += 16;
         let slant = [Radians(0.0), Radians(degrees.to_radians()), Radians(0.0)];
         geometry.views.iter_mut().for_each(|v| *v = v.tilted(slant));
-        let (volume, heard) = fdk(&scan_ellipsoids(&bodies(), geometry), "");
+        let scan = scan_ellipsoids(&bodies(), geometry);
+        let (volume, heard) = fdk(&scan, "");
         println!("{degrees}: {:?}, {:.2} dB", means(&volume), decibels(&volume));
         assert!(heard.said("short scan"), "{:?}", heard.notes);
         assert!(off(&volume) < EXACT && decibels(&volume) > 25.0, "{degrees}: {:?}", means(&volume));
+        // As if it faced the axis.
+        let mut facing = scan.clone();
+        let radius = FdkOrbit::of(&scan.geometry).radius[0];
+        for ((view, _, column), p) in facing.projections.indexed_iter_mut() {
+            *p /= lean(&scan.geometry, view, column as f64, radius) as f32;
+        }
+        let facing = fdk(&facing, "").0;
+        println!("as if it faced the axis: {:?}, {:.2} dB", means(&facing), decibels(&facing));
+        assert!(off(&facing) > 2.0 * EXACT, "{degrees}: {:?}", means(&facing));
     }
 }
 
