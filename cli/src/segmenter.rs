@@ -53,7 +53,7 @@ impl Segmenter {
             return Err(Error::unsupported(what(), format!("it ended with {status}; {said}")));
         }
         if !output.exists() {
-            return Err(Error::unsupported(what(), format!("it did not write {{out}}; {said}")));
+            return Err(Error::unsupported(what(), format!("it wrote no file for {{out}}; {said}")));
         }
         // The file's own name is that of a folder that no one will find again.
         let own = output.display().to_string();

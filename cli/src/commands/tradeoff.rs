@@ -20,7 +20,7 @@ use conefield_tradeoff::report::TradeoffReport;
 use conefield_tradeoff::search::{CONTENTS, Due, Earlier, Search};
 use std::path::{Path, PathBuf};
 
-/// Search for the best methods under time budgets, by measuring accuracy, time and memory.
+/// Search for the best methods under time budgets.
 ///
 /// Candidates are drawn from levers and tried under the smallest budget; the better ones advance to the next budget (neural fields and voxel
 /// methods separately). Each trial is a whole "conefield reconstruct --budget" in a separate process. FOLDER receives tradeoff.md,
