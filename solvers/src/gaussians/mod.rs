@@ -17,6 +17,9 @@ pub mod start;
 pub mod view;
 pub mod views;
 
+#[cfg(test)]
+mod tests;
+
 use crate::fdk::Fdk;
 use crate::fdk::filter::Window;
 use crate::field_plan::{build_callbacks, l1, rollback};

@@ -41,13 +41,13 @@ pub struct Start {
     /// The value above which a voxel counts, as a share of the 99.5th percentile of the positive voxels.
     pub threshold: f64,
     /// Where they stand.
-    pub places: Places,
+    pub sites: Sites,
 }
 
 /// Where Gaussians stand at first.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
 #[serde(rename_all = "kebab-case")]
-pub enum Places {
+pub enum Sites {
     /// In the middle of cells that are small where the volume has detail.
     Cells,
     /// At voxels that are drawn at random (published).
@@ -63,7 +63,7 @@ struct Begin {
 
 impl Default for Start {
     fn default() -> Self {
-        Self { count: 50_000, threshold: 0.05, places: Places::Cells }
+        Self { count: 50_000, threshold: 0.05, sites: Sites::Cells }
     }
 }
 
@@ -104,9 +104,9 @@ impl Start {
         let (_, top, _) = positive.select_nth_unstable_by(at, f32::total_cmp);
         let threshold = *top * self.threshold as f32;
         drop(positive);
-        let mut begins = match self.places {
-            Places::Cells => cells(volume, scene, threshold, self.count),
-            Places::Random => self.random(volume, scene, threshold, seed),
+        let mut begins = match self.sites {
+            Sites::Cells => cells(volume, scene, threshold, self.count),
+            Sites::Random => self.random(volume, scene, threshold, seed),
         };
         if begins.len() <= NEIGHBOURS {
             let expected = "more voxels above start.threshold";
