@@ -62,6 +62,9 @@ pub trait Real:
     fn finite(self) -> bool;
     /// Exponential of every lane.
     fn exp_lanes<S: Simd>(s: S, x: V<S, Self>) -> V<S, Self>;
+    /// One over the square root of every lane, which is positive and neither very large nor very small; `f32`: relative error
+    /// below 3e-7.
+    fn inverse_root_lanes<S: Simd>(s: S, x: V<S, Self>) -> V<S, Self>;
     /// Distribution function and density of the standard normal, `(Φ(x), φ(x))`, of every lane.
     /// `f32`: |error| < 3e-7, by Abramowitz & Stegun 7.1.26, which shares its exponential with φ. Several vectors at
     /// once hide how long each waits for its own results.
@@ -179,6 +182,17 @@ impl Real for f32 {
         p * scale
     }
     #[inline(always)]
+    fn inverse_root_lanes<S: Simd>(s: S, x: V<S, Self>) -> V<S, Self> {
+        #[cfg(target_arch = "x86_64")]
+        if let Level::Avx512(avx512) = s.level() {
+            // 14 bits, and a step of Newton's: y·(3/2 - x·y²/2).
+            let guess = wide::inverse_root::<S>(s, avx512, x);
+            let less = (x * guess * -0.5).mul_add(guess, S::f32s::splat(s, 1.5));
+            return guess * less;
+        }
+        S::f32s::splat(s, 1.0) / x.sqrt()
+    }
+    #[inline(always)]
     fn normal_lanes<S: Simd, const K: usize>(s: S, x: [V<S, Self>; K]) -> [[V<S, Self>; K]; 2] {
         let number = |v: f32| S::f32s::splat(s, v);
         let (zero, one) = (number(0.0), number(1.0));
@@ -274,6 +288,10 @@ impl Real for f64 {
         x
     }
     #[inline(always)]
+    fn inverse_root_lanes<S: Simd>(s: S, x: V<S, Self>) -> V<S, Self> {
+        S::f64s::splat(s, 1.0) / x.sqrt()
+    }
+    #[inline(always)]
     fn normal_lanes<S: Simd, const K: usize>(_: S, x: [V<S, Self>; K]) -> [[V<S, Self>; K]; 2] {
         let (mut cdf, mut pdf) = (x, x);
         for (c, p) in cdf.iter_mut().zip(&mut pdf) {
@@ -295,7 +313,7 @@ impl Real for f64 {
     }
 }
 
-/// What AVX-512 does in one instruction and vectors of bytes in three.
+/// What AVX-512 does in one instruction and others in several.
 #[cfg(target_arch = "x86_64")]
 // The macro calls instructions of a set that its token proves to be there.
 #[allow(unsafe_code)]
@@ -303,7 +321,7 @@ mod wide {
     use super::{Simd, SimdBase};
     use fearless_simd::x86::Avx512;
     use fearless_simd::{SimdFrom, f32x16, kernel, u32x16};
-    use std::arch::x86_64::{__m512, __m512i, _mm512_permutex2var_ps};
+    use std::arch::x86_64::{__m512, __m512i, _mm512_permutex2var_ps, _mm512_rsqrt14_ps};
 
     kernel!(
         #[inline(always)]
@@ -312,6 +330,21 @@ mod wide {
             _mm512_permutex2var_ps(low, number, high)
         }
     );
+
+    kernel!(
+        #[inline(always)]
+        fn rsqrt(token: Avx512, x: __m512) -> __m512 {
+            let _ = token;
+            _mm512_rsqrt14_ps(x)
+        }
+    );
+
+    /// One over the square root of every lane, with a relative error below 2^-14.
+    #[inline(always)]
+    pub(super) fn inverse_root<S: Simd>(s: S, avx512: Avx512, x: S::f32s) -> S::f32s {
+        let x = f32x16::from_slice(avx512, x.as_slice()).into();
+        S::f32s::from_slice(s, f32x16::simd_from(avx512, rsqrt(avx512, x)).as_slice())
+    }
 
     /// The number that each lane of `number` counts, of those in `low` and then in `high`.
     #[inline(always)]
@@ -440,7 +473,7 @@ mod tests {
 
     struct Normal<'a, R>(&'a [R]);
     impl<R: Real> Op for Normal<'_, R> {
-        type Out = Vec<[f64; 3]>;
+        type Out = Vec<[f64; 4]>;
         #[inline(always)]
         fn call<S: Simd>(self, s: S) -> Self::Out {
             let mut out = vec![];
@@ -448,8 +481,9 @@ mod tests {
                 let x = load(s, self.0, i);
                 let [[c], [p]] = R::normal_lanes(s, [x]);
                 let e = R::exp_lanes(s, x);
+                let root = R::inverse_root_lanes(s, e);
                 for k in 0..V::<S, R>::LEN.min(self.0.len() - i) {
-                    out.push([c.as_slice()[k].f64(), p.as_slice()[k].f64(), e.as_slice()[k].f64()]);
+                    out.push([c, p, e, root].map(|v| v.as_slice()[k].f64()));
                 }
             }
             out
@@ -465,6 +499,7 @@ mod tests {
             assert!((a[0] - b[0]).abs() < 3e-7, "Φ({}) = {} not {}", x[i], a[0], b[0]);
             assert!((a[1] - b[1]).abs() < 2e-7, "φ({}) = {} not {}", x[i], a[1], b[1]);
             assert!((a[2] / b[2] - 1.0).abs() < 5e-7, "exp({}) = {} not {}", x[i], a[2], b[2]);
+            assert!((a[3] * a[2].sqrt() - 1.0).abs() < 3e-7, "1/sqrt({}) = {}", a[2], a[3]);
         }
     }
 

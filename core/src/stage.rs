@@ -376,6 +376,28 @@ pub trait Field: Stage {
     fn lines_reference(&self) -> Option<&dyn Lines<f64>> {
         None
     }
+
+    /// Its values on whole grids, of a field that has them faster than point by point.
+    fn on_grid(&self) -> Option<&dyn OnGrid> {
+        None
+    }
+}
+
+/// Values of a field on whole grids: the same as of its [`Kernel`], but for rounding.
+pub trait OnGrid: Send + Sync {
+    /// Overwrites `out` (`[x, y, z]`, z fastest) with the values at the points of `grid`.
+    fn values(&self, params: &[f32], grid: &UnitGrid, out: &mut [f32]);
+}
+
+/// A grid of points in the unit cube.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct UnitGrid {
+    /// The first point.
+    pub first: [f64; 3],
+    /// Distance of neighbouring points, in cube sides.
+    pub spacing: [f64; 3],
+    /// Points along x, y, z.
+    pub shape: [usize; 3],
 }
 
 /// Line integrals that a field brings itself: no projector takes samples of it. In a closed form, or by a walk through

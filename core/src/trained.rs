@@ -8,9 +8,11 @@ use crate::parts::{Part, Voxels};
 use crate::pipeline::{Model, Pipeline};
 use crate::scan::Affine;
 use crate::scene::{Scene, SceneSettings};
+use crate::stage::{OnGrid, UnitGrid};
 use crate::support::Support;
-use ndarray::ArrayViewMut3;
+use ndarray::{ArrayViewMut3, s};
 use serde::{Deserialize, Serialize};
+use std::ops::Range;
 
 /// Points that are evaluated at once.
 const POINTS: usize = 1 << 20;
@@ -158,6 +160,9 @@ impl<'a> Sampler<'a> {
         [xs, ys, zs]: &Part,
         mut out: ArrayViewMut3<'_, f32>,
     ) -> Result<()> {
+        if let Some(field) = model.pipeline.field.on_grid() {
+            return self.fill_grid(field, &model.arena.params, [xs, ys, zs], out);
+        }
         let Self { scene, grid, scale, points, places, values } = self;
         // In the order in which `out` is gone through.
         let mut voxels = xs.clone().flat_map(|x| ys.clone().flat_map(move |y| zs.clone().map(move |z| [x, y, z])));
@@ -184,5 +189,31 @@ impl<'a> Sampler<'a> {
                 *out = known.next_if(|(at, _)| **at == i).map_or(0.0, |(_, value)| value * *scale);
             }
         }
+    }
+
+    /// [`Sampler::fill`] of a field that has whole grids, some planes at a time.
+    fn fill_grid(
+        &mut self,
+        field: &dyn OnGrid,
+        params: &[f32],
+        [xs, ys, zs]: [&Range<usize>; 3],
+        mut out: ArrayViewMut3<'_, f32>,
+    ) -> Result<()> {
+        let Self { scene, grid, scale, values, .. } = self;
+        let planes = (POINTS / (ys.len() * zs.len()).max(1)).max(1);
+        for start in xs.clone().step_by(planes) {
+            let end = (start + planes).min(xs.end);
+            let first = scene.to_unit(grid.voxel([start, ys.start, zs.start])).map(f64::from);
+            let shape = [end - start, ys.len(), zs.len()];
+            let spacing = grid.spacing.map(|s| s / scene.side);
+            values.resize(shape.iter().product(), 0.0);
+            field.values(params, &UnitGrid { first, spacing, shape }, values);
+            let places = (start..end).flat_map(|x| ys.clone().flat_map(move |y| zs.clone().map(move |z| [x, y, z])));
+            let mut part = out.slice_mut(s![start - xs.start..end - xs.start, .., ..]);
+            for ((out, value), voxel) in part.iter_mut().zip(values.iter()).zip(places) {
+                *out = if scene.holds(grid.voxel(voxel)) { value * *scale } else { 0.0 };
+            }
+        }
+        Ok(())
     }
 }

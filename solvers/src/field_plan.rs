@@ -182,7 +182,7 @@ pub(crate) fn rollback() -> Vec<Box<dyn CallbackSpec>> {
 }
 
 /// The callbacks that settings name, each once.
-fn build_callbacks(settings: &[Box<dyn CallbackSpec>]) -> Result<Vec<Box<dyn Callback>>> {
+pub(crate) fn build_callbacks(settings: &[Box<dyn CallbackSpec>]) -> Result<Vec<Box<dyn Callback>>> {
     let mut all: Vec<Box<dyn Callback>> = vec![];
     for (i, spec) in settings.iter().enumerate() {
         let key = format!("callbacks.{i}");

@@ -211,7 +211,7 @@ fn coarse(scan: &Scan, cells: VoxelGrid) -> Scan {
 }
 
 /// Says nothing of the work before the work, but can be stopped.
-struct Quiet<'a>(&'a dyn Observer);
+pub(crate) struct Quiet<'a>(pub(crate) &'a dyn Observer);
 
 impl Observer for Quiet<'_> {
     fn progress(&mut self, _: u64, _: f64, _: f64) {}

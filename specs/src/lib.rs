@@ -25,6 +25,8 @@ pub const SHIPPED: &[Shipped] = shipped! {
     "sirt"
     "fista-tv"
     "smooth-tv"
+    "gaussians"
+    "gaussians-published"
 };
 
 /// MCI weights for the spec `fast`, as a safetensors file.

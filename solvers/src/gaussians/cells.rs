@@ -1,0 +1,54 @@
+//! Values of Gaussians at scattered points.
+
+use super::grid::EXTENT;
+use super::lists::Lists;
+use super::shape::{Shape, V3, apply, dot};
+
+/// Cells along the unit cube's side.
+const SIDE: usize = 48;
+
+/// The Gaussians that reach each cell of the unit cube.
+pub struct Cells {
+    lists: Lists,
+}
+
+fn cell(x: f64) -> usize {
+    ((x * SIDE as f64).max(0.0) as usize).min(SIDE - 1)
+}
+
+impl Cells {
+    /// Of these shapes.
+    pub fn new(shapes: &[Shape]) -> Self {
+        let mut lists = Lists::default();
+        lists.fill(SIDE.pow(3), shapes.len(), |i, put| {
+            let shape = &shapes[i];
+            if shape.density == 0.0 {
+                return;
+            }
+            let reach = shape.reach(EXTENT);
+            let [xs, ys, zs]: [_; 3] =
+                std::array::from_fn(|k| cell(shape.centre[k] - reach[k])..cell(shape.centre[k] + reach[k]) + 1);
+            for x in xs {
+                for y in ys.clone() {
+                    zs.clone().for_each(|z| put((x * SIDE + y) * SIDE + z));
+                }
+            }
+        });
+        Self { lists }
+    }
+
+    /// The value of `shapes`, which may have got other densities since, at a point of the unit cube.
+    pub fn value(&self, shapes: &[Shape], p: V3) -> f64 {
+        let [x, y, z] = p.map(cell);
+        let mut sum = 0.0;
+        for &i in self.lists.of((x * SIDE + y) * SIDE + z) {
+            let shape = &shapes[i as usize];
+            let m = apply(&shape.inverse, std::array::from_fn(|k| p[k] - shape.centre[k]));
+            let e = dot(m, m);
+            if e <= EXTENT * EXTENT {
+                sum += shape.density * (-0.5 * e).exp();
+            }
+        }
+        sum
+    }
+}

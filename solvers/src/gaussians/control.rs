@@ -1,0 +1,195 @@
+//! Where there are too few Gaussians, more are made; where one adds nothing, it goes.
+//!
+//! Every so often those whose centre the loss pulls at most, on the mean over the steps since, are made two: a small one is
+//! cloned, a large one is split into two that are drawn from it and narrower by 1.6. Each has half the density (Zha et al. 2024,
+//! section 4.3, after Kerbl et al. 2023). A Gaussian of too little density is pruned. Places are limited: where more want to be
+//! made than fit, those with the largest pull are.
+
+use super::shape::{CENTRE, DENSITY, FREE, NUMBERS, ROTATION, SCALE, Shape, before_softplus};
+use crate::training::{Callback, Kept, Run, State, Update};
+use conefield_core::arena::Layout;
+use conefield_core::backend::{StepStats, Work};
+use conefield_core::error::{Result, ensure};
+use conefield_core::random::stream;
+use rand::RngExt;
+use schemars::JsonSchema;
+use serde::{Deserialize, Serialize};
+use serde_json::Value;
+use std::f32::consts::TAU;
+
+/// Its name in checkpoints.
+const NAME: &str = "density-control";
+/// By how much a half of a split Gaussian is narrower.
+const NARROWER: f32 = 1.6;
+
+/// Settings of the density control.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize, JsonSchema)]
+#[serde(deny_unknown_fields, default)]
+pub struct Control {
+    /// Steps between two times.
+    pub every: u64,
+    /// From this share of the run on.
+    pub from: f64,
+    /// Up to this share of the run.
+    pub until: f64,
+    /// The pull above which a Gaussian is made two: the derivative of the loss, over the largest line integral, by a shift over
+    /// half the detector.
+    pub pull: f64,
+    /// Width in sides of the cube above which a Gaussian is split and not cloned.
+    pub split: f64,
+    /// Density, as a share of the attenuation that stages see as 1, below which a Gaussian is pruned.
+    pub prune: f64,
+}
+
+impl Default for Control {
+    /// The published numbers: steps 500 to 15,000 of 30,000.
+    fn default() -> Self {
+        Self { every: 100, from: 500.0 / 30_000.0, until: 0.5, pull: 5e-5, split: 0.05, prune: 1e-5 }
+    }
+}
+
+impl Control {
+    /// Refuses numbers that cannot be used.
+    pub fn validate(&self) -> Result<()> {
+        ensure(self.every > 0, "spec", "every", self.every, "at least 1")?;
+        let shares = 0.0 <= self.from && self.from <= self.until && self.until <= 1.0;
+        ensure(
+            shares,
+            "spec",
+            "from",
+            format!("{} until {}", self.from, self.until),
+            "two shares of the run, in order",
+        )?;
+        for (key, x) in [("pull", self.pull), ("split", self.split), ("prune", self.prune)] {
+            ensure(x.is_finite() && x >= 0.0, "spec", key, x, "a finite number, 0 or more")?;
+        }
+        Ok(())
+    }
+}
+
+/// The callback of these settings.
+pub struct DensityControl {
+    settings: Control,
+    /// A derivative by the centre times this is a pull.
+    scale: f32,
+    /// Sums of pulls, and of how many steps, by place.
+    sums: Vec<f32>,
+    counts: Vec<f32>,
+    shape: [usize; 1],
+}
+
+impl DensityControl {
+    /// For so many places; `scale` makes a pull of a derivative by the centre.
+    pub fn new(settings: Control, most: usize, scale: f64) -> Self {
+        Self { settings, scale: scale as f32, sums: vec![0.0; most], counts: vec![0.0; most], shape: [most] }
+    }
+
+    /// Bytes that it holds for so many places.
+    pub fn bytes(most: usize) -> u64 {
+        8 * most as u64
+    }
+
+    /// Prunes, clones and splits; says what.
+    fn act(&mut self, run: &mut Run<'_>) -> Result<()> {
+        run.exe.fetch(&mut run.model)?;
+        let arena = &mut run.model.arena;
+        let set = self.settings;
+        let (mut free, mut wanted, mut pruned) = (vec![], vec![], 0);
+        for (i, p) in arena.params.chunks_mut(NUMBERS).enumerate() {
+            if p[DENSITY] > FREE && Shape::of(p).density < set.prune {
+                p[DENSITY] = FREE;
+                pruned += 1;
+            }
+            if p[DENSITY] <= FREE {
+                free.push(i);
+                continue;
+            }
+            let pull = self.scale * self.sums[i] / self.counts[i].max(1.0);
+            if pull >= set.pull as f32 {
+                wanted.push((pull, i));
+            }
+        }
+        wanted.sort_by(|a, b| b.0.total_cmp(&a.0).then(a.1.cmp(&b.1)));
+        let mut rng = stream(run.job.seed ^ 0xde75_17e5, run.step);
+        let mut normal = || {
+            let (a, b): (f32, f32) = (rng.random(), rng.random());
+            (-2.0 * (1.0 - a).ln()).sqrt() * (TAU * b).cos()
+        };
+        let (mut cloned, mut split) = (0, 0);
+        for (&(_, from), &to) in wanted.iter().zip(&free) {
+            let parent: [f32; NUMBERS] = std::array::from_fn(|k| arena.params[from * NUMBERS + k]);
+            let shape = Shape::of(&parent);
+            let half = before_softplus(0.5 * shape.density) as f32;
+            let large = shape.longest() > set.split;
+            for (place, new) in [(from, false), (to, true)] {
+                let own = place * NUMBERS..(place + 1) * NUMBERS;
+                let p = &mut arena.params[own.clone()];
+                p.copy_from_slice(&parent);
+                p[DENSITY] = half;
+                if large {
+                    // c + R·(s ∘ n), with R's column k being row k of M times s_k.
+                    for k in 0..3 {
+                        let along = normal() * (shape.deviations[k] * shape.deviations[k]) as f32;
+                        (0..3).for_each(|j| p[CENTRE + j] += along * shape.inverse[k][j] as f32);
+                        p[SCALE + k] -= NARROWER.ln();
+                    }
+                    (0..3).for_each(|j| p[CENTRE + j] = p[CENTRE + j].clamp(0.0, 1.0));
+                }
+                if new || large {
+                    arena.first[own.clone()].fill(0.0);
+                    arena.second[own].fill(0.0);
+                }
+            }
+            if large { split += 1 } else { cloned += 1 }
+        }
+        for i in free.iter().skip(cloned + split) {
+            let own = i * NUMBERS..(i + 1) * NUMBERS;
+            arena.params[own.start + ROTATION] = 1.0;
+            arena.first[own.clone()].fill(0.0);
+            arena.second[own].fill(0.0);
+        }
+        run.exe.renew();
+        self.sums.fill(0.0);
+        self.counts.fill(0.0);
+        let there = self.sums.len() + cloned + split - free.len();
+        run.tally.window.events.push(format!("{cloned} cloned, {split} split, {pruned} pruned: {there} Gaussians"));
+        Ok(())
+    }
+}
+
+impl Callback for DensityControl {
+    fn name(&self) -> &'static str {
+        NAME
+    }
+
+    fn before_step(&mut self, run: &mut Run<'_>) -> Result<()> {
+        let share = run.clock.share(run.step);
+        let due = run.step > 0 && run.step.is_multiple_of(self.settings.every);
+        if due && (self.settings.from..=self.settings.until).contains(&share) { self.act(run) } else { Ok(()) }
+    }
+
+    fn after_gradients(&mut self, _: &Work<'_>, _: &StepStats, run: &mut Run<'_>) -> Result<Update> {
+        let grads = run.model.arena.grads.chunks(NUMBERS);
+        for ((g, sum), count) in grads.zip(&mut self.sums).zip(&mut self.counts) {
+            let size = (g[0] * g[0] + g[1] * g[1] + g[2] * g[2]).sqrt();
+            if size > 0.0 {
+                *sum += size;
+                *count += 1.0;
+            }
+        }
+        Ok(Update::Take)
+    }
+
+    fn state<'a>(&'a self, _: &'a Layout) -> Result<State<'a>> {
+        let tensor = |name: &str, values: &'a [f32]| (format!("{NAME}.{name}"), &self.shape[..], values);
+        let tensors = vec![tensor("sums", &self.sums), tensor("counts", &self.counts)];
+        State::new(NAME, &Value::Null, tensors)
+    }
+
+    fn restore(&mut self, kept: &Kept<'_>, _: &Run<'_>) -> Result<()> {
+        kept.value::<()>()?;
+        self.sums = kept.tensor(&format!("{NAME}.sums"), &self.shape)?;
+        self.counts = kept.tensor(&format!("{NAME}.counts"), &self.shape)?;
+        Ok(())
+    }
+}

@@ -1,0 +1,406 @@
+//! Radiative Gaussians: a volume that is a sum of Gaussians, trained on whole views (R²-Gaussian, Zha et al., NeurIPS 2024).
+//!
+//! - [`shape`]: a Gaussian and its parameters. [`stage`]: a mixture of them as a field.
+//! - [`view`]: line integrals for a view, in closed form and exact for cone beams. [`grid`], [`cells`]: values at points of a
+//!   grid, and at scattered ones. [`lists`]: which Gaussian reaches what.
+//! - [`start`]: where Gaussians begin. [`control`]: where they become more or fewer. [`ssim`]: likeness of views.
+//! - [`views`]: a training step. What goes on around it is the training loop of every field.
+
+pub mod cells;
+pub mod control;
+pub mod grid;
+pub mod lists;
+pub mod shape;
+pub mod ssim;
+pub mod stage;
+pub mod start;
+pub mod view;
+pub mod views;
+
+#[cfg(test)]
+mod tests;
+
+use crate::fdk::Fdk;
+use crate::fdk::filter::Window;
+use crate::field_plan::{build_callbacks, l1, rollback};
+use crate::fit::{Fitted, fit};
+use crate::iterative::known_volume;
+use crate::optimizer::Optimizer;
+use crate::priors::Places;
+use crate::schedule::{Clock, Ends};
+use crate::surround::{self, Quiet, Within};
+use crate::training::callbacks::{FieldMonitor, LiveSlices};
+use crate::training::{CallbackSpec, Callbacks, Draw, Run, Task, checkpoint, train};
+use conefield_core::backend::Adam;
+use conefield_core::error::{Error, Result, ensure};
+use conefield_core::loss::Loss;
+use conefield_core::method::{
+    Context, Findings, Job, Line, Method, Needs, Observer, Outline, Plan, Reconstruction, Solution, StageLine,
+};
+use conefield_core::pipeline::{Model, Pipeline};
+use conefield_core::prior::Prior;
+use conefield_core::scan::{Scan, ScanHeader, Volume};
+use conefield_core::scene::{Scene, SceneSettings};
+use conefield_core::settings::{LossSpec, PriorSpec};
+use conefield_core::spec::stage as stages;
+use conefield_core::trained::{FieldVoxels, Placement, TrainedField};
+use control::{Control, DensityControl};
+use schemars::JsonSchema;
+use serde::{Deserialize, Serialize};
+use stage::Mixture;
+use start::Start;
+use std::sync::Arc;
+use views::{Rule, ViewTraining};
+
+/// Places for Gaussians at most: with gradients and moments 11 GiB.
+const MOST: usize = 1 << 26;
+/// The smallest standard deviation in voxels: a narrower Gaussian falls between voxels and pixels.
+const NARROWEST: f64 = 0.4;
+/// The largest one in sides of the unit cube.
+const WIDEST: f64 = 0.25;
+
+/// Settings of `gaussians`.
+#[derive(Serialize, Deserialize, JsonSchema)]
+#[serde(deny_unknown_fields)]
+pub struct Gaussians {
+    /// How the scan is mapped to what the Gaussians see.
+    #[serde(default)]
+    pub scene: SceneSettings,
+    /// Train on means of blocks of so many pixels a side.
+    #[serde(default = "one")]
+    pub bin: usize,
+    /// Places for Gaussians: there are never more.
+    #[serde(default = "places")]
+    pub most: usize,
+    /// Where they begin: at voxels of an FDK, or of the volume that the method starts from.
+    #[serde(default)]
+    pub start: Start,
+    /// What a difference between predicted and measured line integrals costs.
+    #[serde(default = "l1", deserialize_with = "stages::needed")]
+    #[schemars(schema_with = "stages::schema::<dyn LossSpec>")]
+    pub loss: Box<dyn LossSpec>,
+    /// Weight of the structural dissimilarity of a view against the mean loss of a pixel.
+    #[serde(default)]
+    pub ssim: f64,
+    /// What the volume is to be like, whatever was measured.
+    #[serde(default, deserialize_with = "stages::list")]
+    #[schemars(schema_with = "stages::schema_of_list::<dyn PriorSpec>")]
+    pub priors: Vec<Box<dyn PriorSpec>>,
+    /// How gradients change densities.
+    #[serde(default)]
+    pub optimizer: Optimizer,
+    /// Learning rates of other parameters over that of densities.
+    #[serde(default)]
+    pub rates: Rates,
+    /// What a step learns from, and when training ends.
+    #[serde(default)]
+    pub training: Steps,
+    /// Where Gaussians become more or fewer; without it their number stays.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub density_control: Option<Control>,
+    /// What watches over training.
+    #[serde(default = "rollback", deserialize_with = "stages::list")]
+    #[schemars(schema_with = "stages::schema_of_list::<dyn CallbackSpec>")]
+    pub callbacks: Vec<Box<dyn CallbackSpec>>,
+}
+
+/// Learning rates over that of the densities; the published ones over 0.01.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize, JsonSchema)]
+#[serde(deny_unknown_fields, default)]
+pub struct Rates {
+    /// Of centres, in sides of the unit cube.
+    pub centre: f64,
+    /// Of logarithms of the standard deviations.
+    pub scale: f64,
+    /// Of quaternions.
+    pub rotation: f64,
+}
+
+impl Default for Rates {
+    fn default() -> Self {
+        Self { centre: 0.01, scale: 0.5, rotation: 0.1 }
+    }
+}
+
+/// What a step learns from, and when training ends.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize, JsonSchema)]
+#[serde(deny_unknown_fields, default)]
+pub struct Steps {
+    /// Ends after this many steps.
+    pub steps: Option<u64>,
+    /// Ends after this many seconds of training. Which limit comes first ends the run.
+    pub seconds: Option<f64>,
+    /// Views a step.
+    pub views: usize,
+    /// Steps between two records of the metrics.
+    pub report_every: u64,
+}
+
+impl Default for Steps {
+    fn default() -> Self {
+        Self { steps: Some(1500), seconds: None, views: 1, report_every: 100 }
+    }
+}
+
+impl Steps {
+    fn validate(&self) -> Result<()> {
+        ensure((1..=1024).contains(&self.views), "spec", "views", self.views, "1 to 1024")?;
+        ensure(self.report_every > 0, "spec", "report_every", 0, "at least 1")?;
+        ensure(self.steps.is_some() || self.seconds.is_some(), "spec", "", "no end", "one of steps or seconds")?;
+        ensure(self.steps != Some(0), "spec", "steps", 0, "at least 1")?;
+        let x = self.seconds.unwrap_or(1.0);
+        ensure(x.is_finite() && x > 0.0, "spec", "seconds", x, "a positive finite number")
+    }
+}
+
+fn one() -> usize {
+    1
+}
+
+fn places() -> usize {
+    100_000
+}
+
+conefield_core::stage_type!(Method, "gaussians", Gaussians, "a sum of Gaussians, trained on whole views");
+
+#[typetag::serde(name = "gaussians")]
+impl Method for Gaussians {
+    fn plan(&self, context: &Context<'_>) -> Result<Box<dyn Plan>> {
+        self.scene.validate()?;
+        ensure((1..=64).contains(&self.bin), "spec", "bin", self.bin, "1 to 64 pixels")?;
+        ensure((8..=MOST).contains(&self.most), "spec", "most", self.most, format!("8 to {MOST}"))?;
+        self.start.validate(self.most).map_err(|e| e.within("start"))?;
+        ensure(self.ssim.is_finite() && self.ssim >= 0.0, "spec", "ssim", self.ssim, "0 or more")?;
+        self.optimizer.validate().map_err(|e| e.within("optimizer"))?;
+        let Rates { centre, scale, rotation } = self.rates;
+        for (key, x) in [("rates.centre", centre), ("rates.scale", scale), ("rates.rotation", rotation)] {
+            ensure(x.is_finite() && x >= 0.0, "spec", key, x, "a finite number, 0 or more")?;
+        }
+        self.training.validate().map_err(|e| e.within("training"))?;
+        if let Some(control) = &self.density_control {
+            control.validate().map_err(|e| e.within("density_control"))?;
+        }
+        let pipeline = Pipeline::alone(Box::new(Mixture { most: self.most }))?;
+        let callbacks = build_callbacks(&self.callbacks)?;
+        for (i, callback) in callbacks.iter().enumerate() {
+            callback.check(&pipeline).map_err(|e| e.within(&format!("callbacks.{i}")))?;
+        }
+        let loss = self.loss.build().map_err(|e| e.within("loss"))?;
+        let learns = if loss.needs_scan() { "one that learns from the scan" } else { "" };
+        ensure(learns.is_empty(), "spec", "loss", learns, "a loss that knows itself, such as l1")?;
+        let mut priors = vec![];
+        for (i, spec) in self.priors.iter().enumerate() {
+            let prior = spec.build().and_then(|p| p.blocks().validate().map(|()| p));
+            priors.push(prior.map_err(|e| e.within(&format!("priors.{i}")))?);
+        }
+        // Refused where a backend has no fields with line integrals of their own.
+        let (exe, compiled) = context.backend.compile(&pipeline)?;
+        exe.admits(loss.as_ref(), &priors)?;
+        let stages = vec![StageLine::new("field", "gaussians", pipeline.field.as_ref())];
+        let mut beside = vec![Line::new("loss", self.loss.typetag_name(), &loss.describe())];
+        for (i, (p, spec)) in priors.iter().zip(&self.priors).enumerate() {
+            beside.push(Line::new(&format!("priors.{i}"), spec.typetag_name(), &p.describe()));
+        }
+        for (i, (c, spec)) in callbacks.iter().zip(&self.callbacks).enumerate() {
+            let said = c.describe().unwrap_or_default();
+            beside.push(Line::new(&format!("callbacks.{i}"), spec.typetag_name(), &said));
+        }
+        let Self { start, training, optimizer, .. } = self;
+        let what = format!("{} from the start, {} views a step, Adam {}", start.count, training.views, optimizer.lr);
+        let method = Line::new("method", "gaussians", &what);
+        let control = self.density_control.map_or(0, |_| DensityControl::bytes(self.most));
+        let kept = callbacks.iter().map(|c| c.bytes(pipeline.layout().len() as u64)).sum::<u64>() + control;
+        let held_out = callbacks.iter().position(|c| c.needs_held_out()).map(|i| format!("callbacks.{i}"));
+        Ok(Box::new(GaussianPlan {
+            scene: self.scene.clone(),
+            bin: self.bin,
+            most: self.most,
+            start: *start,
+            optimizer: optimizer.clone(),
+            rates: [centre, scale, rotation],
+            ssim: self.ssim,
+            training: *training,
+            control: self.density_control,
+            callbacks: self.callbacks.clone(),
+            loss: Arc::from(loss),
+            priors,
+            pipeline,
+            kept,
+            held_out,
+            outline: Outline { method, stages, beside, compiled: Some(compiled), links: vec![] },
+        }))
+    }
+}
+
+/// The plan of [`Gaussians`].
+struct GaussianPlan {
+    scene: SceneSettings,
+    bin: usize,
+    most: usize,
+    start: Start,
+    optimizer: Optimizer,
+    rates: [f64; 3],
+    ssim: f64,
+    training: Steps,
+    control: Option<Control>,
+    callbacks: Vec<Box<dyn CallbackSpec>>,
+    loss: Arc<dyn Loss>,
+    priors: Vec<Box<dyn Prior>>,
+    pipeline: Pipeline,
+    /// Bytes that callbacks keep.
+    kept: u64,
+    /// The key of the callback that looks at views kept aside.
+    held_out: Option<String>,
+    outline: Outline,
+}
+
+/// The scan as it is trained on.
+fn binned(header: &ScanHeader, bin: usize) -> ScanHeader {
+    ScanHeader { detector: header.detector.map(|n| n / bin), ..*header }
+}
+
+impl Plan for GaussianPlan {
+    fn outline(&self) -> Outline {
+        self.outline.clone()
+    }
+
+    fn needs(&self, scan: &ScanHeader) -> Needs {
+        let n = self.pipeline.layout().len() as u64;
+        let seen = binned(scan, self.bin);
+        let bins = if self.bin > 1 { 4 * seen.pixels() } else { 0 };
+        let begun = first().needs(scan).working + self.start.bytes(scan.voxels());
+        let training = ViewTraining::bytes(&seen, self.most as u64);
+        let [surround, subtracted] = surround::bytes(self.scene.surround, scan);
+        let backend = self.outline.backend().scratch_bytes as u64;
+        Needs {
+            surround,
+            subtracted,
+            model: 8 * n,
+            optimizer: 8 * n + self.kept,
+            backend,
+            // The first volume is gone before training begins.
+            working: bins + begun.max(training),
+            resume: 16 * n + self.kept,
+            volume: false,
+            evaluating: backend + FieldVoxels::BYTES,
+        }
+    }
+
+    fn inspect(&self, scan: &Scan) -> Result<Findings> {
+        let fitted = fit(scan, &self.scene, &mut self.pipeline.clone())?;
+        let mut lines = surround::found(scan, self.scene.surround)?;
+        lines.extend(fitted.found);
+        Ok(Findings { lines, attenuation: Some(fitted.scene.attenuation * scan.unit.mm), samples: None })
+    }
+
+    fn run(&mut self, job: &Job<'_>, observer: &mut dyn Observer) -> Result<Solution> {
+        job.scan.validate("scan")?;
+        let mut pipeline = self.pipeline.clone();
+        let Fitted { scene, found, .. } = fit(job.scan, &self.scene, &mut pipeline)?;
+        found.iter().for_each(|line| observer.note(line));
+        let [rows, columns] = job.scan.geometry.detector;
+        let room = format!("1 to {}, the detector's shorter side", rows.min(columns));
+        ensure(self.bin <= rows.min(columns), "spec", "bin", self.bin, room)?;
+        let within = Within::of(job, self.scene.surround, observer)?;
+        let job = &Within::job(within.as_ref(), job);
+        let widths = [NARROWEST * scene.voxel_mm() / scene.side, WIDEST];
+        let widths = [widths[0].min(WIDEST / 2.0), widths[1]];
+        let mut model = Model::random(pipeline, job.seed);
+        match job.resume {
+            Some(resume) => resume.restore(&mut model)?,
+            None => {
+                let (volume, from) = self.first(job, observer)?;
+                let count = self.start.fill(&volume, &scene, job.seed, widths, &mut model.arena.params)?;
+                observer.note(&format!("{count} Gaussians at voxels of {from}"));
+            }
+        }
+        let rule = Rule { views: self.training.views, ssim: self.ssim, rates: self.rates, widths };
+        let exe = match self.bin {
+            1 => ViewTraining::new(rule, job.scan, &scene),
+            bin => ViewTraining::new(rule, &job.scan.binned(bin), &scene),
+        };
+        let mut callbacks = build_callbacks(&self.callbacks)?;
+        callbacks.insert(0, Box::new(FieldMonitor::new(job, &scene, &model.pipeline)));
+        if let Some(control) = self.control {
+            let scale = exe.half_detector() / exe.top();
+            callbacks.push(Box::new(DensityControl::new(control, self.most, scale)));
+        }
+        callbacks.push(Box::new(LiveSlices));
+        let mut callbacks = Callbacks(callbacks);
+        observer.note(&self.outline.backend().backend);
+        let spent = job.resume.map_or(0.0, |r| r.standing.seconds);
+        let ends = Ends { steps: self.training.steps, seconds: self.training.seconds };
+        let views = job.scan.geometry.views.len();
+        let mut run = Run {
+            clock: Clock::new(ends, job.limits, spent),
+            loss: self.loss.clone(),
+            steps_an_epoch: views.div_ceil(self.training.views) as u64,
+            report_every: self.training.report_every,
+            ..Run::new(job, &scene, observer, model, Box::new(exe))
+        };
+        if let Some(resume) = job.resume {
+            checkpoint::restore(&mut run, &mut callbacks, resume)?;
+            run.observer.note(&format!("resumed after step {}", run.step));
+        }
+        let loss = self.loss.clone();
+        let places = Places::new(&self.priors);
+        let mut task = Whole { optimizer: &self.optimizer, scene: &scene, loss: loss.as_ref(), places };
+        train(&mut run, &mut task, &mut callbacks)?;
+        let Run { model, clock, step, samples, tally, best, .. } = run;
+        let (train_s, rollbacks) = (clock.seconds(), tally.rollbacks);
+        let result = Reconstruction::Field(TrainedField { model, scene: scene.clone(), unit_mm: job.scan.unit.mm });
+        Ok(Solution { result, steps: step, train_s, samples, sampling_s: train_s, rollbacks, best })
+    }
+
+    fn restore(&self, placement: &Placement, load: &mut dyn FnMut(&mut Model) -> Result<()>) -> Result<TrainedField> {
+        TrainedField::restore(self.pipeline.clone(), &self.scene, placement, load)
+    }
+
+    fn pipeline(&self) -> Option<&Pipeline> {
+        Some(&self.pipeline)
+    }
+
+    fn needs_held_out(&self) -> Option<String> {
+        self.held_out.clone()
+    }
+}
+
+/// The FDK that Gaussians begin with: smooth, as its noise would draw them to where nothing is.
+fn first() -> Fdk {
+    Fdk { window: Window::Hann, nonnegative: true, ..Fdk::default() }
+}
+
+impl GaussianPlan {
+    /// The volume that the Gaussians begin with, in 1/mm, and what it is.
+    fn first(&self, job: &Job<'_>, observer: &mut dyn Observer) -> Result<(Volume, String)> {
+        if let Some((volume, _, from)) = known_volume(job, None)? {
+            return Ok((volume, from));
+        }
+        let alone = Job { seed: job.seed, ..Job::new(job.scan, job.backend) };
+        let help = |e: Error| match e {
+            Error::Interrupted { .. } => Error::Interrupted { step: 0 },
+            e => e.within("start"),
+        };
+        let solution = first().run(&alone, &mut Quiet(observer)).map_err(help)?;
+        let mm = job.scan.unit.mm as f32;
+        Ok((solution.result.volume(job.backend)?.mapped(|x| x / mm), "an FDK".into()))
+    }
+}
+
+/// Learns from whole views.
+struct Whole<'a> {
+    optimizer: &'a Optimizer,
+    scene: &'a Scene,
+    loss: &'a dyn Loss,
+    places: Places<'a>,
+}
+
+impl Task for Whole<'_> {
+    fn draw(&mut self, seed: u64, step: u64) -> Draw<'_> {
+        Draw { loss: self.loss, rays: &[], priors: self.places.draw(self.scene, seed, step) }
+    }
+
+    fn adam(&self, epoch: f64, share: f64) -> Adam {
+        self.optimizer.adam(1, epoch, share)
+    }
+}

@@ -1,0 +1,302 @@
+//! A mixture of Gaussians as a field: values at any points, line integrals of any rays, one Gaussian after the other.
+//!
+//! Training looks at whole views and whole grids, which is faster ([`view`](super::view), [`grid`](super::grid)); this is the
+//! same formula for all else.
+
+use super::grid::{self, Grid};
+use super::shape::{DENSITY, FREE, NUMBERS, ROTATION, SCALE, Shape, Slope, V3, apply, cross, dot};
+use super::view;
+use conefield_core::simd::Real;
+use conefield_core::stage::{
+    Field, GradKind, Grads, Info, Kernel, Lines, OnGrid, Parameter, Scope, Stage, Tile, TileMut, UnitGrid, UnitRay,
+};
+use rayon::prelude::*;
+use std::f64::consts::TAU;
+use std::ops::Range;
+
+/// Gaussians whose gradients one worker sums.
+const CHUNK: usize = 1024;
+
+/// Places for so many Gaussians. The parameters of one stand together ([`NUMBERS`]); a place without one has a
+/// density of 0.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct Mixture {
+    /// Places.
+    pub most: usize,
+}
+
+/// What the parameters say, place by place.
+pub fn shapes<R: Real>(params: &[R]) -> Vec<Shape> {
+    let mut all = vec![];
+    reshape(params, &mut all);
+    all
+}
+
+/// [`shapes`] into a vector that keeps its memory.
+pub fn reshape<R: Real>(params: &[R], all: &mut Vec<Shape>) {
+    params.par_chunks(NUMBERS).with_min_len(256).map(Shape::of).collect_into_vec(all);
+}
+
+/// Adds what of `slope`, of the Gaussian `index`, falls into `grads`.
+fn add<R: Real>(grads: &mut Grads<'_, R>, params: &[R], shape: &Shape, index: usize, slope: &Slope) {
+    let own = index * NUMBERS..(index + 1) * NUMBERS;
+    let by = slope.by_parameters(&params[own.clone()], shape);
+    for (at, by) in own.zip(by) {
+        if grads.range.contains(&at) {
+            grads.values[at - grads.range.start] += R::of(by);
+        }
+    }
+}
+
+/// The Gaussians that have a parameter in `range`.
+fn touched(range: &Range<usize>) -> Range<usize> {
+    range.start / NUMBERS..range.end.div_ceil(NUMBERS)
+}
+
+/// The Gaussians of `which` that are there.
+fn present<R: Real>(params: &[R], which: Range<usize>) -> impl Iterator<Item = (usize, &[R])> {
+    let all = which.map(|i| (i, &params[i * NUMBERS..(i + 1) * NUMBERS]));
+    all.filter(|(_, p)| p[DENSITY].f64() > f64::from(FREE))
+}
+
+/// A bound of what a Gaussian reaches, without all of its shape.
+fn far<R: Real>(p: &[R], extent: f64) -> f64 {
+    extent * p[SCALE].f64().max(p[SCALE + 1].f64()).max(p[SCALE + 2].f64()).exp()
+}
+
+fn place<R: Real>(p: &[R]) -> V3 {
+    [p[0].f64(), p[1].f64(), p[2].f64()]
+}
+
+fn less(a: V3, b: V3) -> V3 {
+    std::array::from_fn(|k| a[k] - b[k])
+}
+
+/// The points of a tile, and the box around them.
+struct Points {
+    all: Vec<V3>,
+    bounds: [V3; 2],
+}
+
+impl Points {
+    fn of<R: Real>(x: Tile<'_, R>) -> Self {
+        let all: Vec<V3> = (0..x.rows).map(|i| std::array::from_fn(|k| x.channel(k)[i].f64())).collect();
+        let fold = |start: f64, f: fn(f64, f64) -> f64| -> V3 {
+            std::array::from_fn(|k| all.iter().map(|p| p[k]).fold(start, f))
+        };
+        let bounds = [fold(f64::INFINITY, f64::min), fold(f64::NEG_INFINITY, f64::max)];
+        Self { all, bounds }
+    }
+
+    /// Whether a Gaussian may reach one of them.
+    fn near<R: Real>(&self, p: &[R]) -> bool {
+        let (c, far) = (place(p), far(p, grid::EXTENT));
+        (0..3).all(|k| c[k] + far >= self.bounds[0][k] && c[k] - far <= self.bounds[1][k])
+    }
+}
+
+/// `exp(-½|M(x - c)|²)` at a point, with the displacement; `None` beyond the Gaussian's extent.
+fn fall(shape: &Shape, x: V3) -> Option<(f64, V3)> {
+    let d = less(x, shape.centre);
+    let m = apply(&shape.inverse, d);
+    let e = dot(m, m);
+    (e <= grid::EXTENT * grid::EXTENT).then(|| ((-0.5 * e).exp(), d))
+}
+
+impl<R: Real> Kernel<R> for Mixture {
+    fn forward(&self, params: &[R], x: Tile<'_, R>, y: TileMut<'_, R>, _: TileMut<'_, R>) {
+        let points = Points::of(x);
+        let mut sums = vec![0.0; x.rows];
+        for (_, p) in present(params, 0..self.most).filter(|(_, p)| points.near(p)) {
+            let shape = Shape::of(p);
+            for (sum, x) in sums.iter_mut().zip(&points.all) {
+                *sum += fall(&shape, *x).map_or(0.0, |(w, _)| shape.density * w);
+            }
+        }
+        y.data.iter_mut().zip(sums).for_each(|(y, sum)| *y = R::of(sum));
+    }
+
+    fn backward(
+        &self,
+        params: &[R],
+        x: Tile<'_, R>,
+        _: TileMut<'_, R>,
+        dy: Tile<'_, R>,
+        mut grads: Grads<'_, R>,
+        dx: Option<TileMut<'_, R>>,
+    ) {
+        let points = Points::of(x);
+        let mut by_points = vec![[0.0; 3]; x.rows];
+        let own = touched(&grads.range);
+        // The derivatives by positions are of all.
+        let which = if dx.is_some() { 0..self.most } else { own.clone() };
+        for (index, p) in present(params, which).filter(|(_, p)| points.near(p)) {
+            let shape = Shape::of(p);
+            let (mut sum, mut first, mut second) = (0.0, [0.0; 3], [0.0; 6]);
+            for (i, x) in points.all.iter().enumerate() {
+                let Some((w, d)) = fall(&shape, *x) else { continue };
+                let w = w * dy.data[i].f64();
+                sum += w;
+                let more = [d[0] * d[0], d[0] * d[1], d[0] * d[2], d[1] * d[1], d[1] * d[2], d[2] * d[2]];
+                (0..3).for_each(|k| first[k] += w * d[k]);
+                (0..6).for_each(|k| second[k] += w * more[k]);
+                let m = apply(&shape.inverse, d);
+                for k in 0..3 {
+                    by_points[i][k] -= shape.density * w * (0..3).map(|j| shape.inverse[j][k] * m[j]).sum::<f64>();
+                }
+            }
+            if own.contains(&index) {
+                add(&mut grads, params, &shape, index, &grid::slope(&shape, sum, first, second));
+            }
+        }
+        if let Some(mut dx) = dx {
+            for k in 0..3 {
+                dx.channel(k).iter_mut().zip(&by_points).for_each(|(d, by)| *d = R::of(by[k]));
+            }
+        }
+    }
+}
+
+/// Rays that go about the same way: no Gaussian farther from the first one than `spread` beyond its own reach is met.
+struct Bundle {
+    origin: V3,
+    direction: V3,
+    spread: f64,
+}
+
+impl Bundle {
+    fn of(rays: &[UnitRay]) -> Option<Self> {
+        let of = |r: &UnitRay| (r.origin.map(f64::from), r.direction.map(f64::from));
+        let (origin, direction) = of(rays.first()?);
+        // Beyond the cube's far side no Gaussian has its centre.
+        let far = rays.iter().map(|r| f64::from(r.inside[1])).fold(0.0, f64::max) + 2.0;
+        let at = |(o, d): (V3, V3), t: f64| -> V3 { std::array::from_fn(|k| o[k] + t * d[k]) };
+        let apart = |r: &UnitRay, t: f64| {
+            let d = less(at(of(r), t), at((origin, direction), t));
+            dot(d, d).sqrt()
+        };
+        let spread = rays.iter().map(|r| apart(r, 0.0).max(apart(r, far))).fold(0.0, f64::max);
+        Some(Self { origin, direction, spread })
+    }
+
+    fn near<R: Real>(&self, p: &[R]) -> bool {
+        let off = cross(less(place(p), self.origin), self.direction);
+        dot(off, off) <= (self.spread + far(p, view::EXTENT)).powi(2)
+    }
+}
+
+/// The line integral of a shape of density 1 along a ray, and the derivatives of `density` times it; `None` where the ray
+/// passes by.
+fn along(shape: &Shape, ray: &UnitRay) -> Option<(f64, Slope)> {
+    if ray.inside[1] <= ray.inside[0] {
+        return None;
+    }
+    let d = ray.direction.map(f64::from);
+    let length = dot(d, d).sqrt();
+    let d = d.map(|x| x / length);
+    let y = less(shape.centre, ray.origin.map(f64::from));
+    let (m, z, w) = (&shape.inverse, apply(&shape.inverse, y), apply(&shape.inverse, d));
+    let (a, b, off) = (dot(w, w), dot(z, w), cross(z, w));
+    let e = dot(off, off) / a;
+    if e > view::EXTENT * view::EXTENT {
+        return None;
+    }
+    let line = (TAU / a).sqrt() * (-0.5 * e).exp();
+    let k = -shape.density * line / a;
+    let by: V3 = std::array::from_fn(|i| a * z[i] - b * w[i]);
+    let zz = dot(z, z);
+    let inverse = std::array::from_fn(|i| {
+        std::array::from_fn(|j| k * ((1.0 - e) * w[i] * d[j] + by[i] * y[j] + (zz * w[i] - b * z[i]) * d[j]))
+    });
+    let centre = std::array::from_fn(|j| k * (0..3).map(|i| m[i][j] * by[i]).sum::<f64>());
+    Some((line, Slope { centre, inverse, density: line }))
+}
+
+impl<R: Real> Lines<R> for Mixture {
+    fn project(&self, params: &[R], rays: &[UnitRay], out: &mut [R]) {
+        let mut sums = vec![0.0; rays.len()];
+        if let Some(bundle) = Bundle::of(rays) {
+            for (_, p) in present(params, 0..self.most).filter(|(_, p)| bundle.near(p)) {
+                let shape = Shape::of(p);
+                for (sum, ray) in sums.iter_mut().zip(rays) {
+                    *sum += along(&shape, ray).map_or(0.0, |(line, _)| shape.density * line);
+                }
+            }
+        }
+        out.iter_mut().zip(sums).for_each(|(out, sum)| *out = R::of(sum));
+    }
+
+    fn backproject(&self, params: &[R], rays: &[UnitRay], dlines: &[R], mut grads: Grads<'_, R>) {
+        let Some(bundle) = Bundle::of(rays) else { return };
+        for (index, p) in present(params, touched(&grads.range)).filter(|(_, p)| bundle.near(p)) {
+            let shape = Shape::of(p);
+            let mut all = Slope::default();
+            for (ray, by) in rays.iter().zip(dlines) {
+                if let Some((_, slope)) = along(&shape, ray) {
+                    all.add(&slope, by.f64());
+                }
+            }
+            add(&mut grads, params, &shape, index, &all);
+        }
+    }
+}
+
+impl OnGrid for Mixture {
+    fn values(&self, params: &[f32], points: &UnitGrid, out: &mut [f32]) {
+        let shapes = shapes(params);
+        let mut grid = Grid::default();
+        grid.look(points, &shapes);
+        grid.values(points, &shapes, out);
+    }
+}
+
+impl Stage for Mixture {
+    fn info(&self) -> Info {
+        let (scope, grads) = (Scope::Row, GradKind::Scatter);
+        let params = NUMBERS * self.most;
+        Info { input: 3, output: 1, params, tape: 0, scope, grads, macs: 0, identity: false }
+    }
+
+    fn parameters(&self) -> Vec<Parameter> {
+        vec![Parameter { name: "gaussians".into(), shape: vec![self.most, NUMBERS], start: 0 }]
+    }
+
+    /// No place is taken.
+    fn init(&self, _: u64, params: &mut [f32]) {
+        for p in params.chunks_mut(NUMBERS) {
+            p.fill(0.0);
+            (p[ROTATION], p[DENSITY]) = (1.0, FREE);
+        }
+    }
+
+    fn kernel(&self) -> &dyn Kernel<f32> {
+        self
+    }
+
+    fn reference(&self) -> Option<&dyn Kernel<f64>> {
+        Some(self)
+    }
+
+    fn partition(&self) -> Vec<Range<usize>> {
+        let all = NUMBERS * self.most;
+        (0..all).step_by(CHUNK * NUMBERS).map(|at| at..(at + CHUNK * NUMBERS).min(all)).collect()
+    }
+
+    fn describe(&self) -> String {
+        format!("gaussians: places for {}", self.most)
+    }
+}
+
+impl Field for Mixture {
+    fn lines(&self) -> Option<&dyn Lines<f32>> {
+        Some(self)
+    }
+
+    fn lines_reference(&self) -> Option<&dyn Lines<f64>> {
+        Some(self)
+    }
+
+    fn on_grid(&self) -> Option<&dyn OnGrid> {
+        Some(self)
+    }
+}
