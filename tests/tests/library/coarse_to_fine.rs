@@ -70,7 +70,8 @@ fn levels_open_one_by_one() {
         for ((step, event), (by, open)) in told.iter().zip(want) {
             assert!(*step == by && event.contains(&format!("{open} of 4 levels")), "{name}: {told:?}");
         }
-        assert!(found > 18.0, "{name}: {found} dB");
+        // An empty volume has 10.8 dB.
+        assert!(found > 15.0, "{name}: {found} dB");
     }
 }
 
