@@ -10,6 +10,7 @@ mod coarse_to_fine;
 mod composition;
 mod core_modules;
 mod drift;
+mod gaussians;
 mod guard;
 mod halves;
 mod lines;
