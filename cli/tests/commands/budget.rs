@@ -36,7 +36,7 @@ fn a_plan_names_every_part_and_the_record_holds_them_against_it() {
         assert!(parts.iter().all(|p| *p >= 0.0) && parts.iter().sum::<f64>() <= total + 1e-3, "{parts:?} of {total}");
         assert_eq!((number("budget_s"), &record["limits"]["seconds"]), (3.0, &Value::Null));
         let plan = &record["plan"];
-        assert!(plan["point"].is_null() && plan["why"].as_str().unwrap().contains("asked for"), "{plan}");
+        assert!(plan["point"].is_null() && plan["why"].as_str().unwrap().contains("requested"), "{plan}");
         assert!(plan["train_s"].as_f64().unwrap() > 0.0 && plan["steps"].as_u64().unwrap() > 0, "{plan}");
         assert!(plan["expected"]["step_s"].as_f64().unwrap() > 0.0, "{plan}");
         let then = plan["expected"]["then_s"].as_f64().unwrap();
