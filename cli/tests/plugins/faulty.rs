@@ -112,7 +112,7 @@ const FAULTS: &[Fault] = &[
     fault("results that depend on earlier calls", &["FAULT=REMEMBERS"], ["", "tile sizes: outputs", ""]),
     fault("returns NaN after a hundred calls", &["FAULT=NOT_A_NUMBER_LATER"], ["", "extremes", "training diverged"]),
     fault("fails after a hundred calls", &["FAULT=FAILS_LATER"], ["", "no fault", "forward failed: no more numbers"]),
-    fault("calls abort", &["FAULT=ABORTS"], ["", "took the checking process down (signal 6)", ABORTED]),
+    fault("calls abort", &["FAULT=ABORTS"], ["", "crashed the checking process (signal 6)", ABORTED]),
 ];
 
 /// Faults of projectors that are fitted to a scene: `faulty_rays.c`.
