@@ -85,7 +85,7 @@ impl Beam {
             let [c0, c1, c2] = [dot(start, start), 2.0 * dot(start, u), dot(u, u)];
             for (column, x) in line[..self.detector[1]].iter_mut().enumerate() {
                 let c = column as f64;
-                *x = *x * R::of(((c2 * c + c1) * c + c0).sqrt());
+                *x *= R::of(((c2 * c + c1) * c + c0).sqrt());
             }
         });
     }
