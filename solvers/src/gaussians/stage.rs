@@ -1,6 +1,6 @@
 //! A mixture of Gaussians as a field: values at any points, line integrals of any rays, one Gaussian after the other.
 //!
-//! Training looks at whole views and whole grids, which is faster ([`view`](super::view), [`grid`](super::grid)); this is the
+//! Training looks at whole views and whole grids, which is faster ([`view`], [`grid`]); this is the
 //! same formula for all else.
 
 use super::grid::{self, Grid};
