@@ -10,7 +10,7 @@ from conftest import ROOT
 import conefield
 
 GUIDE = ROOT / "docs" / "guide"
-BLOCK = re.compile(r"(?:<!-- (?P<mark>.*?) -->\n)?```python\n(?P<code>.*?)```", re.S)
+BLOCK = re.compile(r"(?:<!-- (?P<mark>[^\n]*?) -->\n)?```python\n(?P<code>.*?)```", re.S)
 
 
 @pytest.mark.parametrize("page", ["python", "writing-stages"])
