@@ -6,7 +6,9 @@
 //! `t = p − ⌊p⌋`, and `B_0 … B_3` are `(1 − t)³/6`, `(3t³ − 6t² + 4)/6`, `(−3t³ + 3t² + 3t + 1)/6`, `t³/6`. It has two continuous
 //! derivatives, where a trilinear grid has none.
 
-use crate::levels::{BLOCK, Cells, LevelCode, Table, by_channel, by_features, functions, start, stretch};
+use crate::levels::{
+    BLOCK, Cells, LevelCode, Table, by_channel, by_features, functions, kernel_of_levels, start, stretch,
+};
 use conefield_core::error::{Error, Result, ensure};
 use conefield_core::half::Stored;
 use conefield_core::settings::EncoderSpec;
@@ -372,31 +374,7 @@ fn slope_of<R: Real, P: Stored<R>, const F: usize>(
 by_features!(Forward);
 by_features!(Backward);
 
-impl<R: Real, P: Stored<R>> Kernel<R, P> for BSplineGridStage {
-    fn forward(&self, params: &[P], x: Tile<'_, R>, y: TileMut<'_, R>, _: TileMut<'_, R>) {
-        run(Forward { stage: self, levels: 0..self.levels.len(), params, x, y });
-    }
-
-    fn passes(&self) -> usize {
-        self.levels.len()
-    }
-
-    fn forward_pass(&self, pass: usize, params: &[P], x: Tile<'_, R>, y: TileMut<'_, R>, _: TileMut<'_, R>) {
-        run(Forward { stage: self, levels: pass..pass + 1, params, x, y });
-    }
-
-    fn backward(
-        &self,
-        params: &[P],
-        x: Tile<'_, R>,
-        _: TileMut<'_, R>,
-        dy: Tile<'_, R>,
-        grads: Grads<'_, R>,
-        dx: Option<TileMut<'_, R>>,
-    ) {
-        run(Backward { stage: self, params, x, dy, grads, dx });
-    }
-}
+kernel_of_levels!(BSplineGridStage);
 
 impl Stage for BSplineGridStage {
     fn info(&self) -> Info {

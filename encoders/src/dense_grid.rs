@@ -5,7 +5,7 @@
 //! A level with `r` cells a side has `(r + 1)³` vertices at the corners of its cells, which fill the cube exactly:
 //! `p = clamp(x, 0, 1)·r`.
 
-use crate::levels::{LevelCode, by_channel, by_features, functions};
+use crate::levels::{LevelCode, by_channel, by_features, functions, kernel_of_levels};
 use conefield_core::error::{Error, Result, ensure};
 use conefield_core::half::Stored;
 use conefield_core::settings::EncoderSpec;
@@ -222,31 +222,7 @@ impl<R: Real, P: Stored<R>> Backward<'_, R, P> {
 by_features!(Forward);
 by_features!(Backward);
 
-impl<R: Real, P: Stored<R>> Kernel<R, P> for DenseGridStage {
-    fn forward(&self, params: &[P], x: Tile<'_, R>, y: TileMut<'_, R>, _: TileMut<'_, R>) {
-        run(Forward { stage: self, levels: 0..self.levels.len(), params, x, y });
-    }
-
-    fn passes(&self) -> usize {
-        self.levels.len()
-    }
-
-    fn forward_pass(&self, pass: usize, params: &[P], x: Tile<'_, R>, y: TileMut<'_, R>, _: TileMut<'_, R>) {
-        run(Forward { stage: self, levels: pass..pass + 1, params, x, y });
-    }
-
-    fn backward(
-        &self,
-        params: &[P],
-        x: Tile<'_, R>,
-        _: TileMut<'_, R>,
-        dy: Tile<'_, R>,
-        grads: Grads<'_, R>,
-        dx: Option<TileMut<'_, R>>,
-    ) {
-        run(Backward { stage: self, params, x, dy, grads, dx });
-    }
-}
+kernel_of_levels!(DenseGridStage);
 
 impl Stage for DenseGridStage {
     fn info(&self) -> Info {

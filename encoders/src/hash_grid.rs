@@ -4,7 +4,7 @@
 //! point's cell, trilinearly interpolated. A level whose vertices fit the table is indexed directly, a finer one by
 //! `h(c) = (c_x·π₁ ⊕ c_y·π₂ ⊕ c_z·π₃) mod T` with products modulo 2³² by definition.
 
-use crate::levels::{self, BLOCK, LevelCode, by_channel, functions, prefetch};
+use crate::levels::{self, BLOCK, LevelCode, by_channel, functions, kernel_of_levels, prefetch};
 use conefield_core::error::{Result, ensure};
 use conefield_core::half::Stored;
 use conefield_core::settings::EncoderSpec;
@@ -598,31 +598,7 @@ impl<R: Real, P: Stored<R>> Op for Backward<'_, R, P> {
     }
 }
 
-impl<R: Real, P: Stored<R>> Kernel<R, P> for HashGridStage {
-    fn forward(&self, params: &[P], x: Tile<'_, R>, y: TileMut<'_, R>, _: TileMut<'_, R>) {
-        run(Forward { stage: self, levels: 0..self.levels.len(), params, x, y });
-    }
-
-    fn passes(&self) -> usize {
-        self.levels.len()
-    }
-
-    fn forward_pass(&self, pass: usize, params: &[P], x: Tile<'_, R>, y: TileMut<'_, R>, _: TileMut<'_, R>) {
-        run(Forward { stage: self, levels: pass..pass + 1, params, x, y });
-    }
-
-    fn backward(
-        &self,
-        params: &[P],
-        x: Tile<'_, R>,
-        _: TileMut<'_, R>,
-        dy: Tile<'_, R>,
-        grads: Grads<'_, R>,
-        dx: Option<TileMut<'_, R>>,
-    ) {
-        run(Backward { stage: self, params, x, dy, grads, dx });
-    }
-}
+kernel_of_levels!(HashGridStage);
 
 impl Stage for HashGridStage {
     fn info(&self) -> Info {

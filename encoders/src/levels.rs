@@ -41,6 +41,38 @@ macro_rules! by_features {
 }
 pub(crate) use by_features;
 
+/// The kernel of a stage with `levels`: its `Forward` over a range of them, a pass each, and its `Backward`.
+macro_rules! kernel_of_levels {
+    ($stage:ident) => {
+        impl<R: Real, P: Stored<R>> Kernel<R, P> for $stage {
+            fn forward(&self, params: &[P], x: Tile<'_, R>, y: TileMut<'_, R>, _: TileMut<'_, R>) {
+                run(Forward { stage: self, levels: 0..self.levels.len(), params, x, y });
+            }
+
+            fn passes(&self) -> usize {
+                self.levels.len()
+            }
+
+            fn forward_pass(&self, pass: usize, params: &[P], x: Tile<'_, R>, y: TileMut<'_, R>, _: TileMut<'_, R>) {
+                run(Forward { stage: self, levels: pass..pass + 1, params, x, y });
+            }
+
+            fn backward(
+                &self,
+                params: &[P],
+                x: Tile<'_, R>,
+                _: TileMut<'_, R>,
+                dy: Tile<'_, R>,
+                grads: Grads<'_, R>,
+                dx: Option<TileMut<'_, R>>,
+            ) {
+                run(Backward { stage: self, params, x, dy, grads, dx });
+            }
+        }
+    };
+}
+pub(crate) use kernel_of_levels;
+
 /// Where the rows of a block fall along each axis of the cube, cut into equal cells.
 pub struct Cells<R> {
     /// The cell.

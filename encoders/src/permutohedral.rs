@@ -13,7 +13,8 @@
 //! vertices fit the table is indexed directly, a finer one by the hash of Müller et al. 2022, equation 4, of `k`.
 
 use crate::levels::{
-    Asked, BLOCK, LevelCode, Table, by_channel, by_features, entry, entry_mut, functions, prefetch, start,
+    Asked, BLOCK, LevelCode, Table, by_channel, by_features, entry, entry_mut, functions, kernel_of_levels, prefetch,
+    start,
 };
 use conefield_core::error::{Result, ensure};
 use conefield_core::half::Stored;
@@ -448,31 +449,7 @@ impl<R: Real, P: Stored<R>> Backward<'_, R, P> {
 by_features!(Forward);
 by_features!(Backward);
 
-impl<R: Real, P: Stored<R>> Kernel<R, P> for PermutohedralStage {
-    fn forward(&self, params: &[P], x: Tile<'_, R>, y: TileMut<'_, R>, _: TileMut<'_, R>) {
-        run(Forward { stage: self, levels: 0..self.levels.len(), params, x, y });
-    }
-
-    fn passes(&self) -> usize {
-        self.levels.len()
-    }
-
-    fn forward_pass(&self, pass: usize, params: &[P], x: Tile<'_, R>, y: TileMut<'_, R>, _: TileMut<'_, R>) {
-        run(Forward { stage: self, levels: pass..pass + 1, params, x, y });
-    }
-
-    fn backward(
-        &self,
-        params: &[P],
-        x: Tile<'_, R>,
-        _: TileMut<'_, R>,
-        dy: Tile<'_, R>,
-        grads: Grads<'_, R>,
-        dx: Option<TileMut<'_, R>>,
-    ) {
-        run(Backward { stage: self, params, x, dy, grads, dx });
-    }
-}
+kernel_of_levels!(PermutohedralStage);
 
 impl Stage for PermutohedralStage {
     fn info(&self) -> Info {

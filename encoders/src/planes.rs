@@ -7,7 +7,9 @@
 //!
 //! A level with `r` cells a side has `r + 1` nodes along each axis, at the corners of its cells, which fill the cube exactly.
 
-use crate::levels::{Asked, BLOCK, Cells, LevelCode, Table, by_channel, by_features, functions, start, stretch};
+use crate::levels::{
+    Asked, BLOCK, Cells, LevelCode, Table, by_channel, by_features, functions, kernel_of_levels, start, stretch,
+};
 use conefield_core::error::{Result, ensure};
 use conefield_core::half::Stored;
 use conefield_core::settings::EncoderSpec;
@@ -334,31 +336,7 @@ impl<R: Real, P: Stored<R>> Backward<'_, R, P> {
 by_features!(Forward);
 by_features!(Backward);
 
-impl<R: Real, P: Stored<R>> Kernel<R, P> for PlanesStage {
-    fn forward(&self, params: &[P], x: Tile<'_, R>, y: TileMut<'_, R>, _: TileMut<'_, R>) {
-        run(Forward { stage: self, levels: 0..self.levels.len(), params, x, y });
-    }
-
-    fn passes(&self) -> usize {
-        self.levels.len()
-    }
-
-    fn forward_pass(&self, pass: usize, params: &[P], x: Tile<'_, R>, y: TileMut<'_, R>, _: TileMut<'_, R>) {
-        run(Forward { stage: self, levels: pass..pass + 1, params, x, y });
-    }
-
-    fn backward(
-        &self,
-        params: &[P],
-        x: Tile<'_, R>,
-        _: TileMut<'_, R>,
-        dy: Tile<'_, R>,
-        grads: Grads<'_, R>,
-        dx: Option<TileMut<'_, R>>,
-    ) {
-        run(Backward { stage: self, params, x, dy, grads, dx });
-    }
-}
+kernel_of_levels!(PlanesStage);
 
 impl Stage for PlanesStage {
     fn info(&self) -> Info {
