@@ -67,7 +67,8 @@ pub struct Chain {
     target: Target,
 }
 
-fn fragment_of(name: &str, fragment: Option<Fragment>) -> Result<Fragment> {
+/// The fragment that the stage called `name` offers; refuses one without, and one whose names could meet those of another.
+pub(crate) fn fragment_of(name: &str, fragment: Option<Fragment>) -> Result<Fragment> {
     let refused = |why: &str| Error::unsupported(format!("{name} on the wgpu backend"), why);
     let fragment = fragment.ok_or_else(|| refused("the stage offers no WGSL; it runs with --backend cpu"))?;
     match fragment.stray() {

@@ -4,7 +4,7 @@
 //! adjoint adds to voxels atomically: sums have no fixed order.
 
 use crate::Shared;
-use crate::compose::GROUP;
+use crate::compose::{GROUP, fragment_of};
 use crate::device::Atomics;
 use crate::kernel::Buffers;
 use crate::pace::Pace;
@@ -229,9 +229,7 @@ impl OnDevice {
     /// Takes a projector's work to the device; refuses one without WGSL.
     pub fn new(shared: Arc<Shared>, inner: Box<dyn VoxelProjector>) -> Result<Self> {
         let name = format!("projector ({})", inner.describe());
-        let fragment = inner.wgsl().ok_or_else(|| {
-            Error::unsupported(format!("{name} on the wgpu backend"), "it offers no WGSL; it runs with --backend cpu")
-        })?;
+        let fragment = fragment_of(&name, inner.wgsl())?;
         let atomics = shared.gpu.adapter.atomics;
         let [forward, adjoint] = [true, false].map(|forward| kernel(&fragment, &name, atomics, forward));
         forward.validate()?;
