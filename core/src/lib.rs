@@ -1,7 +1,7 @@
 //! The contracts that conefield's stages, backends and methods meet at.
 //!
 //! - [`geometry`], [`orbit`], [`scan`], [`parts`]: what was measured, in millimetres, and what comes out.
-//! - [`simd`], [`half`], [`dense`], [`trilinear`], [`stage`]: what a stage computes and how.
+//! - [`simd`], [`half`], [`dense`], [`activation`], [`trilinear`], [`stage`]: what a stage computes and how.
 //! - [`by_row`]: stages that are written for one row at a time; [`prelude`]: what their authors need.
 //! - [`support`]: where the object can be; [`scene`]: between the world and what stages see.
 //! - [`loss`], [`prior`]: what training makes small.
@@ -16,6 +16,7 @@
 //! - [`method`]: what a spec names, its plan and its run; [`pipeline`], [`backend`], [`trained`]: a field from its stages to a
 //!   volume; [`checkpoint`]: where a run stands.
 
+pub mod activation;
 pub mod allowance;
 pub mod arena;
 pub mod backend;

@@ -5,124 +5,18 @@
 
 mod wgsl;
 
-use conefield_core::dense::{Output as Into, WeightMatrix, affine, affine_input, affine_weights};
+use crate::linear::Linear;
+use conefield_core::activation::{self, Activation, activate};
+use conefield_core::dense::{Output as Into, affine, affine_input, affine_weights};
 use conefield_core::error::{Result, ensure};
 use conefield_core::random::{mix, unit};
 use conefield_core::settings::FieldSpec;
-use conefield_core::simd::{Op, Real, Select, Simd, SimdBase, SimdFloat, V, load, run, store};
+use conefield_core::simd::{Op, Real, Simd, run};
 use conefield_core::stage::{Field, GradKind, Grads, Info, Kernel, Parameter, Reduced, Scope, Stage, Tile, TileMut};
 use conefield_core::wgsl::Fragment;
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 use std::ops::Range;
-
-/// WGSL of every [`Activation`].
-pub(crate) const ACTIVATION: &str = include_str!("activation.wgsl");
-
-/// SquarePlus's `b` as NI-NeRF has it.
-pub const SQUAREPLUS_B: f64 = 1.523_821_03;
-
-/// What follows a linear map.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
-#[serde(rename_all = "kebab-case")]
-pub enum Activation {
-    /// `x`
-    None,
-    /// `max(x, 0)`
-    Relu,
-    /// `x` above 0, `0.01·x` below
-    LeakyRelu,
-    /// `x·Φ(x)` (Hendrycks & Gimpel 2016), not its tanh approximation
-    Gelu,
-    /// `(x + √(x² + b))/2` with b = 1.52382103 (Barron 2021)
-    Squareplus,
-    /// `ln(1 + eˣ)`
-    Softplus,
-    /// `1/(1 + e⁻ˣ)`
-    Sigmoid,
-}
-
-impl Activation {
-    /// Its function in [`ACTIVATION`].
-    pub(crate) fn wgsl(self) -> &'static str {
-        match self {
-            Self::None => "stage_none",
-            Self::Relu => "stage_relu",
-            Self::LeakyRelu => "stage_leaky_relu",
-            Self::Gelu => "stage_gelu",
-            Self::Squareplus => "stage_squareplus",
-            Self::Softplus => "stage_softplus",
-            Self::Sigmoid => "stage_sigmoid",
-        }
-    }
-
-    /// Values and derivatives.
-    #[inline(always)]
-    fn at<S: Simd, R: Real, const K: usize>(self, s: S, x: [V<S, R>; K]) -> [[V<S, R>; K]; 2] {
-        if self == Self::Gelu {
-            return gelu::<S, R, K>(s, x);
-        }
-        let (mut y, mut slope) = (x, x);
-        for k in 0..K {
-            (y[k], slope[k]) = self.of::<S, R>(s, x[k]);
-        }
-        [y, slope]
-    }
-
-    /// Value and derivative of one vector.
-    #[inline(always)]
-    fn of<S: Simd, R: Real>(self, s: S, x: V<S, R>) -> (V<S, R>, V<S, R>) {
-        let number = |v: f64| V::<S, R>::splat(s, R::of(v));
-        let (zero, one) = (number(0.0), number(1.0));
-        match self {
-            Self::None => (x, one),
-            Self::Relu => {
-                let on = x.simd_gt(zero);
-                (x.max(zero), on.select(one, zero))
-            }
-            Self::LeakyRelu => {
-                let slope = x.simd_gt(zero).select(one, number(0.01));
-                (x * slope, slope)
-            }
-            Self::Gelu => {
-                let [[y], [slope]] = gelu::<S, R, 1>(s, [x]);
-                (y, slope)
-            }
-            Self::Squareplus => {
-                // Past 1e18 the square would overflow, and the root is |x| to the last bit.
-                let small = x.abs().min(number(1e18));
-                let root = small.mul_add(small, number(SQUAREPLUS_B)).sqrt().max(x.abs());
-                ((x + root) * number(0.5), (x / root + one) * number(0.5))
-            }
-            Self::Softplus => {
-                let mut y = x;
-                y.as_mut_slice().iter_mut().for_each(|v| *v = v.softplus());
-                (y, sigmoid::<S, R>(s, x))
-            }
-            Self::Sigmoid => {
-                let y = sigmoid::<S, R>(s, x);
-                (y, y * (one - y))
-            }
-        }
-    }
-}
-
-#[inline(always)]
-fn gelu<S: Simd, R: Real, const K: usize>(s: S, x: [V<S, R>; K]) -> [[V<S, R>; K]; 2] {
-    let [cdf, pdf] = R::normal_lanes(s, x);
-    let (mut y, mut slope) = (x, x);
-    for k in 0..K {
-        y[k] = x[k] * cdf[k];
-        slope[k] = x[k].mul_add(pdf[k], cdf[k]);
-    }
-    [y, slope]
-}
-
-#[inline(always)]
-fn sigmoid<S: Simd, R: Real>(s: S, x: V<S, R>) -> V<S, R> {
-    let one = V::<S, R>::splat(s, R::ONE);
-    one / (one + R::exp_lanes(s, V::<S, R>::splat(s, R::ZERO) - x))
-}
 
 /// How weights start. Biases start as the scheme says.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
@@ -176,36 +70,12 @@ impl FieldSpec for Mlp {
     }
 }
 
-#[derive(Debug, Clone, PartialEq)]
-struct Layer {
-    /// Channels that come from the features.
-    skip: usize,
-    /// Channels that come from the layer before (or from the features, on layer 0).
-    input: usize,
-    output: usize,
-    /// First parameter: `[output][skip + input]` weights, then biases.
-    start: usize,
-}
-
-impl Layer {
-    fn ld(&self) -> usize {
-        self.skip + self.input
-    }
-    fn weights(&self) -> Range<usize> {
-        self.start..self.start + self.output * self.ld()
-    }
-    fn bias(&self) -> Range<usize> {
-        let w = self.weights().end;
-        w..w + self.output
-    }
-}
-
 /// The stage that [`Mlp`] builds.
 #[derive(Debug, Clone)]
 pub struct MlpStage {
     settings: Mlp,
     input: usize,
-    layers: Vec<Layer>,
+    layers: Vec<Linear>,
 }
 
 impl MlpStage {
@@ -221,7 +91,7 @@ impl MlpStage {
         let mut layers = vec![];
         let mut start = 0;
         for i in 0..depth {
-            let layer = Layer {
+            let layer = Linear {
                 skip: if s.skips.contains(&i) { input } else { 0 },
                 input: if i == 0 { input } else { s.width },
                 output: if i + 1 == depth { 1 } else { s.width },
@@ -273,53 +143,15 @@ impl<R: Real> Op for Forward<'_, R> {
             let until = stage.slope(i).end;
             let (before, both) = split(tape.data, from..until, n);
             let (h, z) = if last { (&mut y.data[..], both) } else { both.split_at_mut(layer.output * n) };
-            let weights = |column| WeightMatrix { data: &params[layer.weights()], ld: layer.ld(), column };
             let input =
                 if i == 0 { x.data } else { &before[stage.hidden(i - 1).start * n..stage.hidden(i - 1).end * n] };
-            affine(s, weights(layer.skip), Some(&params[layer.bias()]), input, z, n);
+            affine(s, layer.matrix(params, layer.skip), Some(&params[layer.bias()]), input, z, n);
             if layer.skip > 0 {
-                affine(s, weights(0), None, x.data, z, n);
+                affine(s, layer.matrix(params, 0), None, x.data, z, n);
             }
             activate(s, act, z, h);
         }
     }
-}
-
-/// Vectors whose activations are computed side by side.
-const AT_ONCE: usize = 4;
-
-/// `h = f(z)`, `z = f'(z)`.
-#[inline(always)]
-pub(crate) fn activate<S: Simd, R: Real>(s: S, act: Activation, z: &mut [R], h: &mut [R]) {
-    // One loop an activation, so that none of them branches inside.
-    macro_rules! each {
-        ($($a:ident),*) => {
-            match act {
-                $(Activation::$a => {
-                    let len = V::<S, R>::LEN;
-                    let mut i = 0;
-                    while i + AT_ONCE * len <= z.len() {
-                        // Whole vectors: a tail's branch between them would have them wait for one another.
-                        let (z, h) = (&mut z[i..i + AT_ONCE * len], &mut h[i..i + AT_ONCE * len]);
-                        let x = std::array::from_fn(|k| V::<S, R>::from_slice(s, &z[k * len..(k + 1) * len]));
-                        let [y, slope] = Activation::$a.at::<S, R, AT_ONCE>(s, x);
-                        for k in 0..AT_ONCE {
-                            y[k].store_slice(&mut h[k * len..(k + 1) * len]);
-                            slope[k].store_slice(&mut z[k * len..(k + 1) * len]);
-                        }
-                        i += AT_ONCE * len;
-                    }
-                    while i < z.len() {
-                        let [[y], [slope]] = Activation::$a.at::<S, R, 1>(s, [load(s, z, i)]);
-                        store::<S, R>(y, h, i);
-                        store::<S, R>(slope, z, i);
-                        i += len;
-                    }
-                })*
-            }
-        };
-    }
-    each!(None, Relu, LeakyRelu, Gelu, Squareplus, Softplus, Sigmoid);
 }
 
 struct Backward<'a, R> {
@@ -346,12 +178,11 @@ impl<R: Real> Op for Backward<'_, R> {
         }
         let mut fresh = true;
         for (i, layer) in stage.layers.iter().enumerate().rev() {
-            let weights = |column| WeightMatrix { data: &params[layer.weights()], ld: layer.ld(), column };
             let (before, dz) = tape.data.split_at_mut(stage.slope(i).start * n);
             let dz = &dz[..layer.output * n];
             let input =
                 if i == 0 { x.data } else { &before[stage.hidden(i - 1).start * n..stage.hidden(i - 1).end * n] };
-            let (dw, db) = grads.values[layer.start..layer.bias().end].split_at_mut(layer.weights().len());
+            let (dw, db) = layer.gradients(grads.values);
             affine_weights(s, dz, input, dw, layer.ld(), layer.skip, Some(db), n);
             if layer.skip > 0 {
                 affine_weights(s, dz, x.data, dw, layer.ld(), 0, None, n);
@@ -360,14 +191,14 @@ impl<R: Real> Op for Backward<'_, R> {
                 && (layer.skip > 0 || i == 0)
             {
                 let out = if fresh { Into::Set } else { Into::Add };
-                affine_input(s, weights(0), dz, dx.data, out, n);
+                affine_input(s, layer.matrix(params, 0), dz, dx.data, out, n);
                 fresh = false;
             }
             if i > 0 {
                 let slope = stage.slope(i - 1);
                 affine_input(
                     s,
-                    weights(layer.skip),
+                    layer.matrix(params, layer.skip),
                     dz,
                     &mut before[slope.start * n..slope.end * n],
                     Into::Multiply,
@@ -401,7 +232,7 @@ impl Stage for MlpStage {
         Info {
             input: self.input,
             output: 1,
-            params: self.layers.last().map_or(0, |l| l.bias().end),
+            params: self.layers.last().map_or(0, |l| l.all().end),
             tape: self.slope(self.layers.len() - 1).end,
             scope: Scope::Row,
             grads: GradKind::Dense,
@@ -444,7 +275,7 @@ impl Stage for MlpStage {
     }
 
     fn wgsl(&self) -> Option<Fragment> {
-        Some(Fragment::new(&[ACTIVATION, &wgsl::functions(self)]))
+        Some(Fragment::new(&[activation::WGSL, &wgsl::functions(self)]))
     }
 
     fn describe(&self) -> String {
@@ -462,21 +293,8 @@ impl Stage for MlpStage {
 impl Field for MlpStage {
     fn keep_inputs(&self, keep: &[usize]) -> Result<Reduced<dyn Field>> {
         let stage = Self::new(&self.settings, keep.len())?;
-        let mut params: Vec<Range<usize>> = vec![];
-        for (i, l) in self.layers.iter().enumerate() {
-            for o in 0..l.output {
-                let row = l.start + o * l.ld();
-                if i == 0 {
-                    params.extend(keep.iter().map(|&c| row + c..row + c + 1));
-                    continue;
-                }
-                if l.skip > 0 {
-                    params.extend(keep.iter().map(|&c| row + c..row + c + 1));
-                }
-                params.push(row + l.skip..row + l.ld());
-            }
-            params.push(l.bias());
-        }
+        let reads = |(i, l): (usize, &Linear)| if i == 0 || l.skip > 0 { l.keep(keep) } else { vec![l.all()] };
+        let params = self.layers.iter().enumerate().flat_map(reads).collect();
         Ok(Reduced { stage: Box::new(stage), params, channels: vec![0] })
     }
 }

@@ -3,7 +3,7 @@
 //! Values stand at the voxels' centres and are interpolated trilinearly; half a voxel from the rim they no longer
 //! change. The activation follows the interpolation, so that edges may fall between voxels.
 
-use crate::mlp::{ACTIVATION, Activation, activate};
+use conefield_core::activation::{self, Activation, activate};
 use conefield_core::error::{Error, Result, ensure};
 use conefield_core::half::Stored;
 use conefield_core::settings::FieldSpec;
@@ -252,7 +252,7 @@ fn stage_output(x: f32) -> vec2<f32> {{ return {}(x); }}
 ",
             self.output.wgsl()
         );
-        Some(Fragment::new(&[&settings, TRILINEAR, ACTIVATION, include_str!("voxel_grid.wgsl")]))
+        Some(Fragment::new(&[&settings, TRILINEAR, activation::WGSL, include_str!("voxel_grid.wgsl")]))
     }
 
     fn describe(&self) -> String {

@@ -5,8 +5,8 @@
 //! linear in the voxels, and its adjoint goes the same way. The values at points are those of
 //! [`voxel_grid`](crate::voxel_grid), without an activation; as there, half a voxel from the rim they no longer change.
 
-use crate::mlp::Activation;
 use crate::voxel_grid::{Resolution, VoxelGridSettings, VoxelGridStage};
+use conefield_core::activation::Activation;
 use conefield_core::error::Result;
 use conefield_core::settings::LineFieldSpec;
 use conefield_core::simd::Real;

@@ -10,7 +10,7 @@ use crate::losses::L1;
 use crate::optimizer::Optimizer;
 use crate::pretrain::{Pretraining, learn, pretrain};
 use crate::priors::Places;
-use crate::rays::{Pixels, RaySource, Views};
+use crate::rays::{Choice, Pixels, RaySource, Views, Windows};
 use crate::schedule::{Clock, Ends};
 use crate::surround::{self, Within};
 use crate::training::callbacks::{FieldMonitor, LiveSlices, Rollback};
@@ -130,6 +130,9 @@ pub struct Training {
     pub pixels: Pixels,
     /// Pixels by which the support is widened.
     pub margin: usize,
+    /// Takes some of the rays of a step in windows of neighbouring pixels.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub windows: Option<Windows>,
     /// Steps between two records of the metrics.
     pub report_every: u64,
 }
@@ -144,6 +147,7 @@ impl Default for Training {
             views: Views::All,
             pixels: Pixels::Support,
             margin: 8,
+            windows: None,
             report_every: 50,
         }
     }
@@ -154,6 +158,9 @@ impl Training {
     pub fn validate(&self) -> Result<()> {
         ensure((1..=1 << 20).contains(&self.rays), "spec", "rays", self.rays, "1 to 2^20")?;
         ensure(self.report_every > 0, "spec", "report_every", 0, "at least 1")?;
+        if let Some(windows) = self.windows {
+            windows.validate(self.rays).map_err(|e| e.within("windows"))?;
+        }
         let ends = self.epochs.is_some() || self.steps.is_some() || self.seconds.is_some();
         ensure(ends, "spec", "", "no end", "one of epochs, steps or seconds")?;
         ensure(self.steps != Some(0), "spec", "steps", 0, "at least 1: no step leaves the field as it was drawn")?;
@@ -238,7 +245,7 @@ impl Plan for FieldPlan {
             model: 8 * n,
             optimizer: 8 * n + kept,
             backend,
-            working: RaySource::bytes(scan) + learning + known,
+            working: RaySource::bytes(scan, self.training.windows) + learning + known,
             // Parameters and moments from the file, those that callbacks keep too, and one of them again on its way into the
             // model.
             resume: 16 * n + kept,
@@ -268,8 +275,8 @@ impl Plan for FieldPlan {
         found.iter().for_each(|line| observer.note(line));
         let within = Within::of(job, self.scene.surround, observer)?;
         let job = &Within::job(within.as_ref(), job);
-        let Training { views, pixels, margin, .. } = self.training;
-        let source = RaySource::new(job.scan, &scene, &pipeline, views, pixels, margin)?;
+        let Training { views, pixels, margin, windows, .. } = self.training;
+        let source = RaySource::new(job.scan, &scene, &pipeline, Choice { views, pixels, margin, windows })?;
         observer.note(&format!("{:.0}% of the pixels are trained on", 100.0 * source.share()));
         let fitted = self.fitted_loss(job, &scene, &source);
         if let Some(loss) = &fitted {

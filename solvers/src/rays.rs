@@ -2,17 +2,18 @@
 
 use crate::shadow::{air_level, shadow};
 use conefield_core::backend::TrainRay;
-use conefield_core::error::{Error, Result};
+use conefield_core::error::{Error, Result, ensure};
 use conefield_core::pipeline::Pipeline;
 use conefield_core::random::stream;
 use conefield_core::scan::{Scan, ScanHeader};
 use conefield_core::scene::Scene;
-use rand::seq::SliceRandom;
 use rand::seq::index::sample;
+use rand::seq::{IndexedRandom, SliceRandom};
 use rand::{Rng, RngExt};
 use rayon::prelude::*;
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
+use std::borrow::Cow;
 
 /// Where a step takes its rays from.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
@@ -38,32 +39,89 @@ pub enum Pixels {
     All,
 }
 
+/// Square windows of neighbouring pixels (Cai et al., CVPR 2024, "masked local-global ray sampling"): what lies next to each other is
+/// learned from together. Windows stand side by side from the detector's first pixel, and only those count in which every
+/// pixel does.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
+#[serde(deny_unknown_fields)]
+pub struct Windows {
+    /// Windows a step. The other rays of the step are single pixels outside them.
+    pub count: usize,
+    /// Rows and columns of a window.
+    pub side: usize,
+}
+
+impl Windows {
+    /// Refuses windows that a step of `rays` rays has no room for.
+    pub fn validate(&self, rays: usize) -> Result<()> {
+        ensure((2..=256).contains(&self.side), "spec", "side", self.side, "2 to 256 pixels")?;
+        let most = rays / (self.side * self.side);
+        ensure((1..=most).contains(&self.count), "spec", "count", self.count, format!("1 to {most} for {rays} rays"))
+    }
+
+    /// Windows side by side along a detector of `columns` columns; what is left at the end is in none.
+    fn across(&self, columns: usize) -> usize {
+        columns / self.side
+    }
+
+    /// The window of a pixel.
+    fn of(&self, pixel: u32, columns: usize) -> Option<u32> {
+        let (row, column) = (pixel as usize / columns / self.side, pixel as usize % columns / self.side);
+        (column < self.across(columns)).then(|| (row * self.across(columns) + column) as u32)
+    }
+
+    /// The windows all of whose pixels are among `pixels`.
+    fn whole(&self, pixels: &[u32], columns: usize) -> Vec<u32> {
+        let mut inside: Vec<u32> = pixels.iter().filter_map(|&p| self.of(p, columns)).collect();
+        inside.sort_unstable();
+        let all = self.side * self.side;
+        inside.chunk_by(|a, b| a == b).filter(|same| same.len() == all).map(|same| same[0]).collect()
+    }
+
+    /// The pixels of a window.
+    fn pixels(&self, window: u32, columns: usize) -> impl Iterator<Item = u32> {
+        let (row, column) = (window as usize / self.across(columns), window as usize % self.across(columns));
+        let (row, column, side) = (row * self.side, column * self.side, self.side);
+        (0..side * side).map(move |i| ((row + i / side) * columns + column + i % side) as u32)
+    }
+}
+
+/// Which rays a step has.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct Choice {
+    /// The views that they come from.
+    pub views: Views,
+    /// The pixels that count.
+    pub pixels: Pixels,
+    /// Pixels by which the support is wider than the shadow.
+    pub margin: usize,
+    /// Windows, if some rays come in windows.
+    pub windows: Option<Windows>,
+}
+
 /// The rays of a scan that may be trained on.
 pub struct RaySource<'a> {
     scan: &'a Scan,
     scene: &'a Scene,
     /// Of each view, its usable pixels (row-major index).
     pixels: Vec<Vec<u32>>,
+    /// Of each view, the windows whose pixels are all usable.
+    windows: Option<(Windows, Vec<Vec<u32>>)>,
     views: Views,
     /// Views that have a usable pixel.
     usable: Vec<usize>,
 }
 
 impl<'a> RaySource<'a> {
-    /// Bytes of the list of pixels: at most all of them.
-    pub fn bytes(scan: &ScanHeader) -> u64 {
-        size_of::<u32>() as u64 * scan.pixels()
+    /// Bytes of the lists of pixels and windows: at most all of them.
+    pub fn bytes(scan: &ScanHeader, windows: Option<Windows>) -> u64 {
+        let listed = windows.map_or(0, |w| scan.pixels() / (w.side * w.side) as u64);
+        size_of::<u32>() as u64 * (scan.pixels() + listed)
     }
 
-    /// Finds the usable pixels. `margin` widens the support by that many pixels.
-    pub fn new(
-        scan: &'a Scan,
-        scene: &'a Scene,
-        pipeline: &Pipeline,
-        views: Views,
-        which: Pixels,
-        margin: usize,
-    ) -> Result<Self> {
+    /// Finds the usable pixels.
+    pub fn new(scan: &'a Scan, scene: &'a Scene, pipeline: &Pipeline, choice: Choice) -> Result<Self> {
+        let Choice { views, pixels: which, margin, windows } = choice;
         let level = (which == Pixels::Support).then(|| air_level(scan));
         let pixels: Vec<Vec<u32>> = (0..scan.geometry.views.len())
             .into_par_iter()
@@ -93,7 +151,9 @@ impl<'a> RaySource<'a> {
                 "rays to train on (check the geometry and the unit of lengths)",
             ));
         }
-        Ok(Self { scan, scene, pixels, views, usable })
+        let columns = scan.geometry.detector[1];
+        let windows = windows.map(|w| (w, pixels.par_iter().map(|p| w.whole(p, columns)).collect()));
+        Ok(Self { scan, scene, pixels, windows, views, usable })
     }
 
     /// Share of all pixels that may be trained on.
@@ -117,23 +177,48 @@ impl<'a> RaySource<'a> {
             order.shuffle(&mut stream(seed, 2 * (step / steps) + 1));
             order[(step % steps) as usize]
         });
+        let columns = self.scan.geometry.detector[1];
         let mut add = |view: usize, pixel: u32| {
-            let columns = self.scan.geometry.detector[1];
             let (row, column) = (pixel as usize / columns, pixel as usize % columns);
             let ray = self.scene.pixel_ray(&self.scan.geometry, view, row, column);
             let target = self.scene.line_to_unit(self.scan.projections[[view, row, column]]);
             out.push(TrainRay { ray, target });
         };
         let Some(view) = one else {
-            for _ in 0..count {
+            let mut single = count;
+            if let Some((windows, whole)) = &self.windows {
+                for _ in 0..windows.count {
+                    let view = self.usable[rng.random_range(0..self.usable.len())];
+                    if let Some(&window) = whole[view].choose(&mut rng) {
+                        windows.pixels(window, columns).for_each(|pixel| add(view, pixel));
+                        single -= windows.side * windows.side;
+                    }
+                }
+            }
+            for _ in 0..single {
                 let view = self.usable[rng.random_range(0..self.usable.len())];
                 let pixels = &self.pixels[view];
                 add(view, pixels[rng.random_range(0..pixels.len())]);
             }
             return;
         };
-        let pixels = &self.pixels[view];
-        apart(&mut rng, pixels.len(), count).for_each(|at| add(view, pixels[at]));
+        let mut pixels = Cow::from(&self.pixels[view]);
+        let mut single = count;
+        if let Some((windows, whole)) = &self.windows {
+            let whole = &whole[view];
+            let mut chosen: Vec<u32> =
+                sample(&mut rng, whole.len(), windows.count.min(whole.len())).iter().map(|at| whole[at]).collect();
+            chosen.iter().flat_map(|&w| windows.pixels(w, columns)).for_each(|pixel| add(view, pixel));
+            single -= chosen.len() * windows.side * windows.side;
+            chosen.sort_unstable();
+            let inside = |p: &u32| windows.of(*p, columns).is_some_and(|w| chosen.binary_search(&w).is_ok());
+            let outside: Vec<u32> = pixels.iter().copied().filter(|p| !inside(p)).collect();
+            // Where windows take all pixels, what is missing comes from all again.
+            if !outside.is_empty() {
+                pixels = Cow::from(outside);
+            }
+        }
+        apart(&mut rng, pixels.len(), single).for_each(|at| add(view, pixels[at]));
     }
 }
 
@@ -160,6 +245,34 @@ mod tests {
                 assert_eq!(once.len(), round.len(), "{drawn:?}");
                 assert!(once.iter().all(|&i| i < n));
             }
+        }
+    }
+
+    #[test]
+    fn windows_are_whole_and_stand_side_by_side() {
+        let (columns, rows, windows) = (7, 5, Windows { count: 1, side: 2 });
+        // All pixels but one: its window is not whole. The last column and row are in none.
+        let pixels: Vec<u32> = (0..(columns * rows) as u32).filter(|&p| p != 9).collect();
+        let whole = windows.whole(&pixels, columns);
+        assert_eq!(whole, [0, 2, 3, 4, 5]);
+        let mut all: Vec<u32> = whole.iter().flat_map(|&w| windows.pixels(w, columns)).collect();
+        assert_eq!(all[..8], [0, 1, 7, 8, 4, 5, 11, 12]);
+        assert!(all.iter().all(|p| pixels.contains(p)));
+        all.sort_unstable();
+        all.dedup();
+        assert_eq!(all.len(), 4 * whole.len());
+        for w in whole {
+            assert!(windows.pixels(w, columns).all(|p| windows.of(p, columns) == Some(w)));
+        }
+        assert_eq!(windows.of(6, columns), None);
+    }
+
+    #[test]
+    fn windows_that_do_not_fit_are_refused() {
+        assert!(Windows { count: 16, side: 8 }.validate(2048).is_ok());
+        for (windows, named) in [((33, 8), "count"), ((0, 8), "count"), ((1, 1), "side"), ((1, 257), "side")] {
+            let error = Windows { count: windows.0, side: windows.1 }.validate(2048).unwrap_err().to_string();
+            assert!(error.contains(named), "{error}");
         }
     }
 }

@@ -14,6 +14,7 @@ pub const SHIPPED: &[Shipped] = shipped! {
     "ni-naf"
     "ni-naf-published"
     "nerf"
+    "sax-nerf"
     "dense"
     "accurate"
     "balanced"

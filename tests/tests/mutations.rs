@@ -16,7 +16,7 @@ const METER: Meter =
 const BOUNDS: Bounds = Bounds { bytes: 16 << 20, time: Duration::from_secs(5) };
 
 /// Mutations a reader, whose seed is no longer than [`USUAL`] bytes.
-const COUNT: u64 = 20_000;
+const COUNT: u64 = 10_000;
 const USUAL: usize = 5000;
 
 /// A folder in memory where the system has one: a file is written for every mutation.

@@ -224,6 +224,31 @@ fn level_attention() {
     }
 }
 
+#[test]
+fn line_attention() {
+    for (settings, width) in [
+        (json!({"type": "line-attention"}), 32),
+        (json!({"type": "line-attention", "segment": 3, "heads": 2, "head_width": 3, "expansion": 2}), 5),
+        (json!({"type": "line-attention", "segment": 1, "heads": 1, "head_width": 1, "expansion": 1}), 1),
+    ] {
+        normalizer(settings, width, &Options { single: 1e-4, ..Options::features() });
+    }
+}
+
+#[test]
+fn line_transformer() {
+    for (settings, width) in [
+        (json!({"type": "line-transformer"}), 32),
+        (
+            json!({"type": "line-transformer", "width": 9, "blocks": 2, "attention": {"segment": 5, "heads": 3, "head_width": 2}}),
+            5,
+        ),
+        (json!({"type": "line-transformer", "width": 4, "activation": "gelu", "output": "squareplus"}), 3),
+    ] {
+        field(settings, width, &Options { single: 1e-4, ..Options::features() });
+    }
+}
+
 /// An encoder with closed levels is a stage like any other.
 #[test]
 fn opened() {

@@ -206,6 +206,26 @@ pub fn cases() -> Vec<Case> {
             &["training.steps", "at least 1"],
         ),
         refused(
+            "windows of more pixels than a step has rays",
+            scan_toml,
+            "reconstruct scan --spec fast -o run --set training.windows={count=100,side=8}",
+            &["training.windows.count", "100"],
+        ),
+        refused("a correction that is not known", scan_toml, "convert scan out --correct ring", &["ring"]),
+        refused(
+            "a correction with a setting that it does not have",
+            scan_toml,
+            "convert scan out --correct rings.size=5",
+            &["size", "window"],
+        ),
+        refused(
+            "a correction with a setting out of range",
+            scan_toml,
+            "convert scan out --correct rings.window=4",
+            &["rings.window", "odd"],
+        ),
+        refused("a correction of a volume", nifti, "convert a.nii out.npy --correct flux", &["--correct"]),
+        refused(
             "all views kept aside",
             scan_toml,
             "reconstruct scan --spec fast -o run --hold-out 0,1,2",

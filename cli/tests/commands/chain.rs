@@ -122,7 +122,7 @@ fn threads_do_not_change_a_bit() {
 #[test]
 fn every_shipped_spec_reconstructs() {
     let (dir, scan) = scan();
-    let single = ["naf", "ni-naf", "ni-naf-published", "nerf", "dense", "accurate", "balanced", "fast"];
+    let single = ["naf", "ni-naf", "ni-naf-published", "nerf", "sax-nerf", "dense", "accurate", "balanced", "fast"];
     // The passes of a second method count on from there.
     let chains = [("field-tv", 4), ("accurate-tv", 6)];
     for (spec, passes) in single.map(|spec| (spec, 0)).into_iter().chain(chains) {

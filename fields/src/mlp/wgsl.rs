@@ -3,7 +3,8 @@
 //! A product goes block by block over its outputs, so that a number that is read is used as often as there are sums in
 //! registers.
 
-use super::{Layer, MlpStage};
+use super::MlpStage;
+use crate::linear::Linear;
 use std::fmt::Write;
 
 /// Sums that a loop over inputs carries.
@@ -33,7 +34,7 @@ fn reads(i: usize) -> String {
 /// `h{i}` and, where wanted, the activation's derivative `s{i}`.
 fn layer(stage: &MlpStage, i: usize, slopes: bool, out: &mut String) {
     let layer = &stage.layers[i];
-    let Layer { skip, input, output, .. } = *layer;
+    let Linear { skip, input, output, .. } = *layer;
     let last = i + 1 == stage.layers.len();
     let act = if last { stage.settings.output } else { stage.settings.activation }.wgsl();
     let _ = writeln!(out, "    var h{i}: array<f32, {output}>;");
@@ -73,7 +74,7 @@ fn gradients(stage: &MlpStage, out: &mut String) {
     let _ = writeln!(out, "    s{last}[0] *= (*dy)[0];");
     let mut fresh = true;
     for (i, layer) in stage.layers.iter().enumerate().rev() {
-        let Layer { skip, input, output, start } = *layer;
+        let Linear { skip, input, output, start } = *layer;
         let ld = layer.ld();
         let from = if i == 0 { "x".to_owned() } else { format!("&h{}", i - 1) };
         let _ = writeln!(out, "    stage_outer_{output}_{input}({}u, {ld}u, &s{i}, {from});", start + skip);
@@ -96,7 +97,7 @@ fn gradients(stage: &MlpStage, out: &mut String) {
 }
 
 /// `Wᵀ·∂L/∂z` of `count` columns from `column`, each put to use by `put`.
-fn back(i: usize, layer: &Layer, column: usize, count: usize, out: &mut String, put: impl Fn(usize) -> String) {
+fn back(i: usize, layer: &Linear, column: usize, count: usize, out: &mut String, put: impl Fn(usize) -> String) {
     for start in (0..count).step_by(BLOCK) {
         let block = start..(start + BLOCK).min(count);
         out.push_str("    {\n");

@@ -1,0 +1,401 @@
+//! The network of SAX-NeRF (Cai et al., CVPR 2024): features `[n, F]` of the samples of a ray to attenuation `[n, 1]`, by
+//! F → W → blocks of [line attention](conefield_normalizers::line_attention) → (F + W) → W → 1. An activation follows each
+//! linear map and the last block. The skip layer reads the features first.
+//!
+//! `line-attention` alone is a normalizer: it also stands before other fields.
+
+use crate::linear::Linear;
+use conefield_core::activation::{Activation, activate};
+use conefield_core::dense::{Output as Into, affine, affine_input, affine_weights};
+use conefield_core::error::{Result, ensure};
+use conefield_core::random::{mix, unit};
+use conefield_core::settings::FieldSpec;
+use conefield_core::simd::{Op, Real, Simd, run};
+use conefield_core::stage::{Field, GradKind, Grads, Info, Kernel, Parameter, Reduced, Scope, Stage, Tile, TileMut};
+use conefield_normalizers::line_attention::{LineAttention, LineAttentionStage};
+use schemars::JsonSchema;
+use serde::{Deserialize, Serialize};
+use std::ops::Range;
+
+/// Settings of `line-transformer`.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
+#[serde(deny_unknown_fields, default)]
+pub struct LineTransformer {
+    /// Channels of hidden layers.
+    pub width: usize,
+    /// Blocks of line attention, 1 to 16.
+    pub blocks: usize,
+    /// Each block.
+    pub attention: LineAttention,
+    /// Follows each linear map but the last, and the last block.
+    pub activation: Activation,
+    /// Follows the last linear map.
+    pub output: Activation,
+}
+
+impl Default for LineTransformer {
+    fn default() -> Self {
+        Self {
+            width: 32,
+            blocks: 1,
+            attention: LineAttention::default(),
+            activation: Activation::LeakyRelu,
+            output: Activation::Sigmoid,
+        }
+    }
+}
+
+conefield_core::stage_type!(
+    Field,
+    "line-transformer",
+    LineTransformer,
+    "SAX-NeRF's network: attention between neighbouring samples of a ray"
+);
+
+#[typetag::serde(name = "line-transformer")]
+impl FieldSpec for LineTransformer {
+    fn build(&self, width: usize) -> Result<Box<dyn Field>> {
+        Ok(Box::new(LineTransformerStage::new(self, width)?))
+    }
+}
+
+/// The stage that [`LineTransformer`] builds.
+#[derive(Debug, Clone)]
+pub struct LineTransformerStage {
+    settings: LineTransformer,
+    input: usize,
+    first: Linear,
+    block: LineAttentionStage,
+    /// The first parameter of each block.
+    blocks: Vec<usize>,
+    skip: Linear,
+    last: Linear,
+}
+
+impl LineTransformerStage {
+    /// The stage for `input` features, or which setting is out of range.
+    pub fn new(settings: &LineTransformer, input: usize) -> Result<Self> {
+        let &LineTransformer { width, blocks, ref attention, .. } = settings;
+        ensure((1..=512).contains(&width), "spec", "width", width, "1 to 512 channels")?;
+        ensure((1..=16).contains(&blocks), "spec", "blocks", blocks, "1 to 16")?;
+        let block = LineAttentionStage::new(attention, width).map_err(|e| e.within("attention"))?;
+        let first = Linear { skip: 0, input, output: width, start: 0 };
+        let each = block.info().params;
+        let starts: Vec<usize> = (0..blocks).map(|k| first.all().end + k * each).collect();
+        let skip = Linear { skip: input, input: width, output: width, start: first.all().end + blocks * each };
+        let last = Linear { skip: 0, input: width, output: 1, start: skip.all().end };
+        Ok(Self { settings: settings.clone(), input, first, block, blocks: starts, skip, last })
+    }
+
+    fn linear(&self) -> [(&'static str, &Linear); 3] {
+        [("first", &self.first), ("skip", &self.skip), ("last", &self.last)]
+    }
+
+    /// The parameters of a block.
+    fn of_block(&self, start: usize) -> Range<usize> {
+        start..start + self.block.info().params
+    }
+}
+
+/// What forward leaves for backward, `[channels][n]` each.
+struct Tape<'a, R> {
+    /// The layers before the blocks, behind them, and behind the skip: output, and derivative of the activation.
+    first: [&'a mut [R]; 2],
+    mixed: [&'a mut [R]; 2],
+    skip: [&'a mut [R]; 2],
+    /// The derivative of the last activation.
+    last: &'a mut [R],
+    /// Each block's output, and its own tape.
+    blocks: Vec<[&'a mut [R]; 2]>,
+}
+
+impl<'a, R: Real> Tape<'a, R> {
+    fn of(stage: &LineTransformerStage, tape: TileMut<'a, R>) -> Self {
+        let (n, mut rest) = (tape.rows, tape.data);
+        let mut part = |channels: usize| {
+            let (part, behind) = std::mem::take(&mut rest).split_at_mut(channels * n);
+            rest = behind;
+            part
+        };
+        let (width, own) = (stage.settings.width, stage.block.info().tape);
+        let [first, mixed, skip] = std::array::from_fn(|_| [part(width), part(width)]);
+        let last = part(1);
+        let blocks = stage.blocks.iter().map(|_| [part(width), part(own)]).collect();
+        Self { first, mixed, skip, last, blocks }
+    }
+}
+
+/// `output = f(W·x + b)`; the derivative of `f` goes to `slope`.
+struct First<'a, R> {
+    stage: &'a LineTransformerStage,
+    params: &'a [R],
+    x: Tile<'a, R>,
+    output: &'a mut [R],
+    slope: &'a mut [R],
+}
+
+impl<R: Real> Op for First<'_, R> {
+    type Out = ();
+    #[inline(always)]
+    fn call<S: Simd>(self, s: S) {
+        let Self { stage, params, x, output, slope } = self;
+        let layer = &stage.first;
+        affine(s, layer.matrix(params, 0), Some(&params[layer.bias()]), x.data, slope, x.rows);
+        activate(s, stage.settings.activation, slope, output);
+    }
+}
+
+/// All behind the blocks.
+struct Behind<'a, 'b, R> {
+    stage: &'a LineTransformerStage,
+    params: &'a [R],
+    x: Tile<'a, R>,
+    y: TileMut<'a, R>,
+    tape: &'a mut Tape<'b, R>,
+}
+
+impl<R: Real> Op for Behind<'_, '_, R> {
+    type Out = ();
+    #[inline(always)]
+    fn call<S: Simd>(self, s: S) {
+        let Self { stage: LineTransformerStage { settings, skip, last, .. }, params, x, y, tape } = self;
+        let n = x.rows;
+        let [mixed, slope] = &mut tape.mixed;
+        if let Some([output, _]) = tape.blocks.last() {
+            slope.copy_from_slice(output);
+        }
+        activate(s, settings.activation, slope, mixed);
+        let [hidden, slope] = &mut tape.skip;
+        affine(s, skip.matrix(params, skip.skip), Some(&params[skip.bias()]), mixed, slope, n);
+        affine(s, skip.matrix(params, 0), None, x.data, slope, n);
+        activate(s, settings.activation, slope, hidden);
+        affine(s, last.matrix(params, 0), Some(&params[last.bias()]), hidden, tape.last, n);
+        activate(s, settings.output, tape.last, y.data);
+    }
+}
+
+/// All behind the blocks, backwards: the slope of `tape.mixed` becomes `∂L` of the last block's output.
+struct BehindBack<'a, 'b, R> {
+    stage: &'a LineTransformerStage,
+    params: &'a [R],
+    x: Tile<'a, R>,
+    dy: Tile<'a, R>,
+    grads: &'a mut [R],
+    dx: Option<&'a mut [R]>,
+    tape: &'a mut Tape<'b, R>,
+}
+
+impl<R: Real> Op for BehindBack<'_, '_, R> {
+    type Out = ();
+    #[inline(always)]
+    fn call<S: Simd>(self, s: S) {
+        let Self { stage: LineTransformerStage { skip, last, .. }, params, x, dy, grads, dx, tape } = self;
+        let n = x.rows;
+        multiply(tape.last, dy.data);
+        let [hidden, d_skip] = &mut tape.skip;
+        let (dw, db) = last.gradients(grads);
+        affine_weights(s, tape.last, hidden, dw, last.ld(), 0, Some(db), n);
+        affine_input(s, last.matrix(params, 0), tape.last, d_skip, Into::Multiply, n);
+        let [mixed, d_mixed] = &mut tape.mixed;
+        let (dw, db) = skip.gradients(grads);
+        affine_weights(s, d_skip, mixed, dw, skip.ld(), skip.skip, Some(db), n);
+        affine_weights(s, d_skip, x.data, dw, skip.ld(), 0, None, n);
+        affine_input(s, skip.matrix(params, skip.skip), d_skip, d_mixed, Into::Multiply, n);
+        if let Some(dx) = dx {
+            affine_input(s, skip.matrix(params, 0), d_skip, dx, Into::Set, n);
+        }
+    }
+}
+
+/// The first layer backwards, from `d`, `∂L` of its output.
+struct FirstBack<'a, R> {
+    stage: &'a LineTransformerStage,
+    params: &'a [R],
+    x: Tile<'a, R>,
+    d: &'a [R],
+    slope: &'a mut [R],
+    grads: &'a mut [R],
+    dx: Option<&'a mut [R]>,
+}
+
+impl<R: Real> Op for FirstBack<'_, R> {
+    type Out = ();
+    #[inline(always)]
+    fn call<S: Simd>(self, s: S) {
+        let Self { stage, params, x, d, slope, grads, dx } = self;
+        let layer = &stage.first;
+        multiply(slope, d);
+        let (dw, db) = layer.gradients(grads);
+        affine_weights(s, slope, x.data, dw, layer.ld(), 0, Some(db), x.rows);
+        if let Some(dx) = dx {
+            affine_input(s, layer.matrix(params, 0), slope, dx, Into::Add, x.rows);
+        }
+    }
+}
+
+fn multiply<R: Real>(product: &mut [R], other: &[R]) {
+    product.iter_mut().zip(other).for_each(|(a, &b)| *a *= b);
+}
+
+impl<R: Real> Kernel<R> for LineTransformerStage {
+    fn forward(&self, params: &[R], x: Tile<'_, R>, y: TileMut<'_, R>, tape: TileMut<'_, R>) {
+        let n = x.rows;
+        let mut tape = Tape::of(self, tape);
+        let [first, slope] = &mut tape.first;
+        run(First { stage: self, params, x, output: first, slope });
+        let mut before: &[R] = first;
+        for (&start, [output, own]) in self.blocks.iter().zip(&mut tape.blocks) {
+            let (out, own) = (TileMut::new(output, n), TileMut::new(own, n));
+            self.block.forward(&params[self.of_block(start)], Tile::new(before, n), out, own);
+            before = output;
+        }
+        run(Behind { stage: self, params, x, y, tape: &mut tape });
+    }
+
+    fn backward(
+        &self,
+        params: &[R],
+        x: Tile<'_, R>,
+        tape: TileMut<'_, R>,
+        dy: Tile<'_, R>,
+        grads: Grads<'_, R>,
+        dx: Option<TileMut<'_, R>>,
+    ) {
+        debug_assert_eq!(grads.range, 0..params.len());
+        let (n, grads, mut dx) = (x.rows, grads.values, dx.map(|t| t.data));
+        let mut tape = Tape::of(self, tape);
+        run(BehindBack { stage: self, params, x, dy, grads, dx: dx.as_deref_mut(), tape: &mut tape });
+        let [first, slope] = tape.first;
+        let [_, d] = tape.mixed;
+        for (k, &start) in self.blocks.iter().enumerate().rev() {
+            let (before, from) = tape.blocks.split_at_mut(k);
+            let [output, own] = &mut from[0];
+            let input: &[R] = if let Some([output, _]) = before.last() { output } else { first };
+            let of = Grads::all(&mut grads[self.of_block(start)]);
+            // Nobody reads the block's output any more: `∂L` of its input takes the place.
+            let (own, to) = (TileMut::new(own, n), Some(TileMut::new(output, n)));
+            self.block.backward(&params[self.of_block(start)], Tile::new(input, n), own, Tile::new(d, n), of, to);
+            d.copy_from_slice(output);
+        }
+        run(FirstBack { stage: self, params, x, d, slope, grads, dx });
+    }
+}
+
+impl Stage for LineTransformerStage {
+    fn info(&self) -> Info {
+        let (width, block) = (self.settings.width, self.block.info());
+        let linear: usize = self.linear().map(|(_, l)| l.weights().len()).iter().sum();
+        Info {
+            input: self.input,
+            output: 1,
+            params: self.last.all().end,
+            tape: 6 * width + 1 + self.blocks.len() * (width + block.tape),
+            scope: Scope::Ray,
+            grads: GradKind::Dense,
+            macs: linear + self.blocks.len() * block.macs,
+            identity: false,
+        }
+    }
+
+    fn parameters(&self) -> Vec<Parameter> {
+        let mut all = vec![];
+        for (name, l) in self.linear() {
+            all.push(Parameter { name: format!("{name}.weight"), shape: vec![l.output, l.ld()], start: l.start });
+            all.push(Parameter { name: format!("{name}.bias"), shape: vec![l.output], start: l.bias().start });
+        }
+        for (k, start) in self.blocks.iter().enumerate() {
+            let of = |p: Parameter| Parameter { name: format!("blocks.{k}.{}", p.name), start: start + p.start, ..p };
+            all.extend(self.block.parameters().into_iter().map(of));
+        }
+        all.sort_by_key(|p| p.start);
+        all
+    }
+
+    /// Linear maps as PyTorch's start.
+    fn init(&self, seed: u64, params: &mut [f32]) {
+        for (_, l) in self.linear() {
+            let bound = 1.0 / (l.ld() as f64).sqrt();
+            for i in l.all() {
+                params[i] = ((2.0 * f64::from(unit(mix(seed, i as u64))) - 1.0) * bound) as f32;
+            }
+        }
+        for &start in &self.blocks {
+            self.block.init(mix(seed, start as u64), &mut params[self.of_block(start)]);
+        }
+    }
+
+    fn kernel(&self) -> &dyn Kernel<f32> {
+        self
+    }
+
+    fn reference(&self) -> Option<&dyn Kernel<f64>> {
+        Some(self)
+    }
+
+    fn describe(&self) -> String {
+        let (f, w, blocks) = (self.input, self.settings.width, self.blocks.len());
+        let block = self.block.describe();
+        let s = &self.settings;
+        format!("line-transformer: {f}→{w}→{blocks} × ({block})→(+{f})→{w}→1, {:?} and {:?}", s.activation, s.output)
+            .to_lowercase()
+    }
+}
+
+impl Field for LineTransformerStage {
+    fn keep_inputs(&self, keep: &[usize]) -> Result<Reduced<dyn Field>> {
+        let stage = Self::new(&self.settings, keep.len())?;
+        let blocks = self.first.all().end..self.skip.start;
+        let params = [self.first.keep(keep), vec![blocks], self.skip.keep(keep), vec![self.last.all()]].concat();
+        Ok(Reduced { stage: Box::new(stage), params, channels: vec![0] })
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn the_published_network_has_its_parameter_count() {
+        let stage = LineTransformerStage::new(&LineTransformer::default(), 32).unwrap();
+        let block = 2 * 64 + 3 * 32 * 32 + 8 * 4 + 32 * 33 + 128 * 32 + 128 * 128 + 32 * 128;
+        assert_eq!(stage.info().params, 33 * 32 + block + 65 * 32 + 33);
+        let named: usize = stage.parameters().iter().map(|p| p.range().len()).sum();
+        assert_eq!(named, stage.info().params);
+    }
+
+    #[test]
+    fn a_field_without_inputs_equals_one_that_sees_zeros_there() {
+        let stage =
+            LineTransformerStage::new(&LineTransformer { width: 8, blocks: 2, ..Default::default() }, 6).unwrap();
+        let mut params = vec![0.0; stage.info().params];
+        stage.init(3, &mut params);
+        let keep = [0, 3, 4];
+        let reduced = stage.keep_inputs(&keep).unwrap();
+        let small: Vec<f32> = reduced.params.iter().flat_map(|r| params[r.clone()].iter().copied()).collect();
+        let n = 5;
+        let x: Vec<f32> = (0..3 * n).map(|i| (i as f32 * 0.7).sin()).collect();
+        let mut wide = vec![0.0; 6 * n];
+        for (c, &k) in keep.iter().enumerate() {
+            wide[k * n..(k + 1) * n].copy_from_slice(&x[c * n..(c + 1) * n]);
+        }
+        let eval = |s: &dyn Stage, p: &[f32], x: &[f32]| {
+            let (mut y, mut tape) = (vec![0.0; n], vec![0.0; s.info().tape * n]);
+            s.kernel().forward(p, Tile::new(x, n), TileMut::new(&mut y, n), TileMut::new(&mut tape, n));
+            y
+        };
+        let (a, b) = (eval(&stage, &params, &wide), eval(reduced.stage.as_ref(), &small, &x));
+        for (a, b) in a.iter().zip(&b) {
+            assert!((a - b).abs() < 1e-6, "{a} {b}");
+        }
+    }
+
+    #[test]
+    fn settings_out_of_range_are_refused_by_their_key() {
+        let attention = LineAttention { heads: 0, ..LineAttention::default() };
+        let bad = LineTransformer { attention, ..LineTransformer::default() };
+        let error = LineTransformerStage::new(&bad, 4).unwrap_err().to_string();
+        assert!(error.contains("attention.heads"), "{error}");
+        let bad = LineTransformer { blocks: 17, ..LineTransformer::default() };
+        assert!(LineTransformerStage::new(&bad, 4).unwrap_err().to_string().contains("blocks"));
+    }
+}

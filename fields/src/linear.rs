@@ -1,0 +1,61 @@
+//! A linear map within a field.
+
+use conefield_core::dense::WeightMatrix;
+use std::ops::Range;
+
+/// A linear map: `[output][skip + input]` weights, then biases.
+#[derive(Debug, Clone, PartialEq)]
+pub(crate) struct Linear {
+    /// Channels that come from the features.
+    pub skip: usize,
+    /// Channels that come from the layer before, or from the features on the first layer.
+    pub input: usize,
+    /// Channels out.
+    pub output: usize,
+    /// Its first parameter.
+    pub start: usize,
+}
+
+impl Linear {
+    /// Columns of the weights.
+    pub fn ld(&self) -> usize {
+        self.skip + self.input
+    }
+
+    pub fn weights(&self) -> Range<usize> {
+        self.start..self.start + self.output * self.ld()
+    }
+
+    pub fn bias(&self) -> Range<usize> {
+        let start = self.weights().end;
+        start..start + self.output
+    }
+
+    /// Weights and biases.
+    pub fn all(&self) -> Range<usize> {
+        self.start..self.bias().end
+    }
+
+    /// The columns of the weights from `column`.
+    pub fn matrix<'a, R>(&self, params: &'a [R], column: usize) -> WeightMatrix<'a, R> {
+        WeightMatrix { data: &params[self.weights()], ld: self.ld(), column }
+    }
+
+    /// Gradients of weights and of biases.
+    pub fn gradients<'a, R>(&self, grads: &'a mut [R]) -> (&'a mut [R], &'a mut [R]) {
+        grads[self.all()].split_at_mut(self.weights().len())
+    }
+
+    /// The parameters that are left where only `keep` of the features are: of all of them on the first layer (`skip` is 0),
+    /// else of those that are skipped.
+    pub fn keep(&self, keep: &[usize]) -> Vec<Range<usize>> {
+        let features = if self.skip == 0 { self.input } else { self.skip };
+        let mut params = vec![];
+        for row in self.weights().step_by(self.ld()) {
+            params.extend(keep.iter().map(|&c| row + c..row + c + 1));
+            params.push(row + features..row + self.ld());
+        }
+        params.push(self.bias());
+        params
+    }
+}
