@@ -1,40 +1,40 @@
-//! Where on the circle the views stand: the arc, its gaps, and angles that are degrees by mistake.
+//! Angular positions of the views: the arc, its gaps, and angles in degrees that were read as radians.
 
 use conefield_core::geometry::View;
 use serde::Serialize;
 use std::f64::consts::TAU;
 
-/// An opening this wide, in degrees, is the end of a short scan and no gap.
+/// A gap this wide, in degrees, is the open part of a short scan.
 const OPENING: f64 = 60.0;
 
 /// The views' directions from the axis, in degrees.
 #[derive(Debug, Clone, PartialEq, Serialize)]
 pub struct ScanArc {
-    /// Of the first view, from +x towards +y.
+    /// Angle of the first view, from +x towards +y.
     pub first_deg: f64,
-    /// From the first view to the second, by the shorter way; positive from +x towards +y.
+    /// Step from the first view to the second, the shorter way; positive from +x towards +y.
     pub step_deg: f64,
-    /// What the views cover, each with the mean distance between two.
+    /// The arc covered; each view contributes the mean step.
     pub covered_deg: f64,
-    /// Whether they go all round: no opening of 60° or more that is wider than three times any other gap.
+    /// Whether the views cover the full circle: no gap of 60° or more is wider than three times every other gap.
     pub full_circle: bool,
-    /// The largest distance between neighbours along the arc, and where it starts.
+    /// The largest gap between neighbours within the arc.
     pub largest_gap_deg: f64,
-    /// Where it starts.
+    /// Start of the largest gap.
     pub largest_gap_at_deg: f64,
-    /// The mean distance between neighbours along the arc.
+    /// The mean gap between neighbours within the arc.
     pub mean_gap_deg: f64,
-    /// Whether the steps are those of degrees that were taken for radians.
+    /// Whether the steps look like degrees read as radians.
     pub like_degrees: bool,
 }
 
-/// Looks where `views` stand.
+/// Analyses the angular positions of `views`.
 pub(crate) fn scan_arc(views: &[View]) -> ScanArc {
     let turns: Vec<f64> = views.iter().map(|v| v.source[1].atan2(v.source[0]).rem_euclid(TAU)).collect();
     let mut sorted: Vec<f64> = turns.iter().map(|a| a.to_degrees()).collect();
     sorted.sort_unstable_by(f64::total_cmp);
     let n = sorted.len();
-    // Distance to the next view and where it starts, widest first.
+    // Gap to the next view and its start, widest first.
     let mut gaps: Vec<[f64; 2]> = (0..n)
         .map(|i| {
             if i + 1 < n { [sorted[i + 1] - sorted[i], sorted[i]] } else { [sorted[0] + 360.0 - sorted[i], sorted[i]] }
@@ -42,7 +42,7 @@ pub(crate) fn scan_arc(views: &[View]) -> ScanArc {
         .collect();
     gaps.sort_unstable_by(|a, b| b[0].total_cmp(&a[0]));
     let wide = |i: usize| gaps.get(i).map_or(0.0, |g| g[0]);
-    // The views of a short scan stand close to each other, or are too few to tell.
+    // The views of a short scan are close to each other, or too few to decide.
     let full_circle = wide(0) < OPENING || (n > 2 && wide(0) <= 3.0 * wide(1));
     let within = if full_circle { &gaps[..] } else { gaps.get(1..).unwrap_or_default() };
     let sum: f64 = within.iter().map(|g| g[0]).sum();
@@ -64,8 +64,8 @@ pub(crate) fn scan_arc(views: &[View]) -> ScanArc {
     }
 }
 
-/// Whether the even steps between angles in radians (whole turns taken off) are those of 180, 360 or 720 degrees
-/// divided evenly and then not converted.
+/// Whether equal steps between angles in radians (modulo whole turns) equal those of 180, 360 or 720 degrees divided
+/// evenly but not converted.
 fn steps_of_degrees(turns: &[f64]) -> bool {
     let n = turns.len();
     if n < 4 {
@@ -76,7 +76,7 @@ fn steps_of_degrees(turns: &[f64]) -> bool {
     if turns.windows(2).any(|w| apart(w[1] - w[0], step) > 1e-4) {
         return false;
     }
-    // Steps of the golden angle are even too, and come near 360 by chance.
+    // Golden-angle steps are equal too, and come close to 360 by chance.
     let golden = std::f64::consts::PI * (3.0 - 5f64.sqrt());
     if apart(step, golden) < 1e-4 || apart(step, -golden) < 1e-4 {
         return false;

@@ -1,25 +1,26 @@
-//! Pixels that do not measure: found in flat and dark fields, and as outliers that stay.
+//! Detection of bad pixels, in flat and dark fields and as persistent outliers.
 
 use crate::quantiles::{median, quantile};
 use ndarray::{Array2, ArrayView2, ArrayView3, Axis};
 
-/// A pixel that answers with less than this share of the median response is dead.
+/// A pixel whose response is below this share of the median response is dead.
 const DEAD: f32 = 0.1;
-/// One that answers with more than this many times the median response is hot.
+/// A pixel whose response exceeds this multiple of the median response is hot.
 const HOT: f32 = 3.0;
-/// One whose dark value lies this share of the median response above the median dark value is hot.
+/// A pixel whose dark value exceeds the median dark value by this share of the median response is hot.
 const HOT_DARK: f32 = 0.5;
-/// An outlier differs from the two middle ones of its neighbours by this many robust standard deviations of that difference ...
+/// An outlier differs from the two middle ones of its neighbours by this many robust standard deviations of that
+/// difference ...
 const DEVIATIONS: f32 = 8.0;
 /// ... and by this share of the range of the line integrals, ...
 const SHARE_OF_RANGE: f32 = 0.1;
-/// ... in this share of the views that are looked at, of which there must be some.
+/// ... in this share of the views examined, of which there must be some.
 const SHARE_OF_VIEWS: f64 = 0.9;
 const LEAST_VIEWS: usize = 5;
 const MOST_VIEWS: usize = 32;
 
-/// Marks pixels that the open beam hardly moves or that are far brighter than the others. `response` is flat − dark
-/// (or whatever stands for it), `dark` the dark field; both `[row, column]`.
+/// Finds pixels that hardly respond to the open beam or are far brighter than the others. `response` is flat − dark (or
+/// a substitute), `dark` the dark field; both `[row, column]`.
 pub fn from_fields(response: Option<ArrayView2<f32>>, dark: Option<ArrayView2<f32>>, open: f32) -> Vec<[usize; 2]> {
     let middle = |a: ArrayView2<f32>| median(&mut a.iter().copied().collect::<Vec<_>>()).unwrap_or(0.0);
     let typical = response.map_or(open, middle);
@@ -37,8 +38,8 @@ pub fn from_fields(response: Option<ArrayView2<f32>>, dark: Option<ArrayView2<f3
     bad
 }
 
-/// Marks pixels of line integrals `[view, row, column]` that stand out from their neighbours in nearly every view,
-/// as no part of a turning object does. Needs five views; looks at 32 at most. Pixels in `known` are left out.
+/// Finds pixels of line integrals `[view, row, column]` that differ from their neighbours in nearly every view, as no
+/// part of a rotating object does. Needs five views; examines 32 at most. Ignores pixels in `known`.
 pub fn outliers(projections: ArrayView3<f32>, known: &Array2<bool>) -> Vec<[usize; 2]> {
     let (views, rows, columns) = projections.dim();
     if views < LEAST_VIEWS {
@@ -63,7 +64,7 @@ pub fn outliers(projections: ArrayView3<f32>, known: &Array2<bool>) -> Vec<[usiz
             let (Some(lower), Some(upper)) = (around.get(n.saturating_sub(1) / 2), around.get(n / 2)) else {
                 return 0.0;
             };
-            // Anything between the two middle ones is no outlier: one bad neighbour on an edge must not tip it.
+            // A value between the two middle ones is no outlier: one bad neighbour on an edge must not matter.
             let x = view[[i, j]];
             (x - upper).max(lower - x).max(0.0)
         });

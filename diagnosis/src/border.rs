@@ -1,13 +1,13 @@
-//! What stands along the border of a projection, where most scans see air.
+//! Values along the border of a projection, where most scans show air.
 
 use crate::quantiles::median;
 use ndarray::ArrayView2;
 
-/// Pieces that each of the four border strips is cut into.
+/// Segments per border strip.
 const PIECES: usize = 4;
 
-/// Medians of the pieces of the border of `view` (`[row, column]`), in rising order: strips of a 32nd of the shorter
-/// side, four pieces a side. Pixels that `usable` refuses do not count.
+/// Medians of the border segments of `view` (`[row, column]`), ascending: strips of 1/32 of the shorter side, four
+/// segments per side. Ignores pixels that `usable` rejects.
 pub fn border_medians(view: ArrayView2<'_, f32>, usable: impl Fn(usize, usize) -> bool) -> Vec<f32> {
     let (rows, columns) = view.dim();
     let width = (rows.min(columns) / 32).max(1);

@@ -1,4 +1,4 @@
-//! Which part of the volume the views see.
+//! The part of the volume that the views see.
 
 use crate::setup::Setup;
 use crate::shadow::Shadow;
@@ -6,45 +6,45 @@ use conefield_core::geometry::{Geometry, Vec3};
 use rayon::prelude::*;
 use serde::Serialize;
 
-/// Points along each side of the volume that are looked at, and views.
+/// Sample points along each side of the volume, and most views.
 const POINTS: usize = 32;
 const VIEWS: usize = 360;
 
-/// Shares of the volume's voxels by the share of views that see them, from an even sample.
+/// Shares of the volume's voxels by the share of views that see them, from a regular sample.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize)]
 pub struct VolumeCoverage {
-    /// The share of views that is enough: all, or half if the detector stands aside on a full circle.
+    /// The sufficient share of views: all, or half for an offset detector on a full circle.
     pub needed: f64,
-    /// Voxels that enough views see.
+    /// Voxels seen by enough views.
     pub complete: f64,
-    /// Voxels that no view sees.
+    /// Voxels seen by no view.
     pub unseen: f64,
-    /// The mean over voxels of the share of views.
+    /// Mean over voxels of the share of views.
     pub mean: f64,
-    /// The share of views that see the voxel that the fewest see.
+    /// Smallest share of views over all voxels.
     pub least: f64,
 }
 
-/// The shadows of evenly chosen views.
+/// The shadows of evenly spaced views.
 fn shadows(geometry: &Geometry) -> Vec<Shadow> {
     geometry.views.iter().step_by(geometry.views.len().div_ceil(VIEWS).max(1)).map(Shadow::of).collect()
 }
 
-/// The share of `shadows` in which `point` falls on a detector of `[rows, columns]`.
+/// The share of `shadows` in which `point` projects onto a detector of `[rows, columns]`.
 fn share(shadows: &[Shadow], detector: [usize; 2], point: Vec3) -> f64 {
     let [rows, columns] = detector.map(|n| n as f64 / 2.0);
     let sees = |s: &&Shadow| s.of_point(point).is_some_and(|f| f.row.abs() <= rows && f.column.abs() <= columns);
     shadows.iter().filter(sees).count() as f64 / shadows.len().max(1) as f64
 }
 
-/// The share of the views of `geometry` (of evenly chosen ones where there are many) on whose detector each of
-/// `points` (mm) falls.
+/// For each of `points` (mm), the share of the views of `geometry` onto whose detector it projects; uses evenly spaced
+/// views if there are many.
 pub fn share_of_views(geometry: &Geometry, points: &[Vec3]) -> Vec<f64> {
     let shadows = shadows(geometry);
     points.par_iter().map(|p| share(&shadows, geometry.detector, *p)).collect()
 }
 
-/// Looks how many of the views see each part of the volume.
+/// Computes how many views see each part of the volume.
 pub(crate) fn volume_coverage(geometry: &Geometry, setup: &Setup) -> VolumeCoverage {
     let needed = if setup.half_is_enough() { 0.5 } else { 1.0 };
     let grid = &geometry.volume;
@@ -62,7 +62,7 @@ pub(crate) fn volume_coverage(geometry: &Geometry, setup: &Setup) -> VolumeCover
     let shares = share_of_views(geometry, &points);
     let part =
         |test: &dyn Fn(f64) -> bool| shares.iter().filter(|s| test(**s)).count() as f64 / shares.len().max(1) as f64;
-    // Whether just half or one view less is an affair of rounding.
+    // One view less than half is enough too: rounding decides between the two.
     let views = geometry.views.len().clamp(2, VIEWS) as f64;
     let enough = if needed < 1.0 { needed - 1.01 / views } else { needed };
     VolumeCoverage {

@@ -1,10 +1,10 @@
-//! What a scan's geometry means in millimetres, and what in a scan troubles a reconstruction.
+//! Diagnosis of a scan: its geometry in millimetres, and problems for a reconstruction.
 //!
-//! - [`survey`] needs nothing but a [`Scan`](conefield_core::scan::Scan). It tells where source, detector and axis
-//!   stand, which voxels the detector supports and which part of the volume the views see, and warns with figures and
-//!   a way out.
+//! - [`survey`] needs only a [`Scan`](conefield_core::scan::Scan). It reports the positions of source, detector and
+//!   axis, the voxel size that the detector supports and the part of the volume that the views see, and gives warnings
+//!   with figures and advice.
 //! - [`check_line_integrals`]: whether projections look like line integrals.
-//! - [`bad_pixels`]: which pixels do not measure.
+//! - [`bad_pixels`]: finds bad pixels.
 
 mod arc;
 pub mod bad_pixels;

@@ -1,42 +1,42 @@
-//! Whether projections look like line integrals, and what is likely wrong if they do not.
+//! Checks whether projections look like line integrals, and finds the likely cause if they do not.
 
 use crate::border::border_medians;
 use crate::quantiles::{median, quantile};
 use ndarray::{ArrayView3, Axis, s};
 use serde::Serialize;
 
-/// Values that are looked at for the range.
+/// Sample size for the range.
 const SAMPLE: usize = 1_000_000;
-/// Views whose border is looked at.
+/// Views whose border is examined.
 const VIEWS: usize = 32;
-/// A line integral that lets less than one photon in 10²¹ pass: no detector counts that.
+/// A line integral that transmits less than one photon in 10²¹: no detector measures that.
 const OPAQUE: f32 = 50.0;
 
-/// What [`check_line_integrals`] saw.
+/// The result of [`check_line_integrals`].
 #[derive(Debug, Clone, PartialEq, Serialize)]
 pub struct LineIntegralCheck {
     /// The smallest and the largest value.
     pub range: [f32; 2],
-    /// The values that a thousandth of all lie below and above.
+    /// The 0.1 % and 99.9 % quantiles of the values.
     pub typical_range: [f32; 2],
-    /// What the emptiest part of the border shows: near 0 in line integrals of an object with air around it. The
-    /// median over views of the third-lowest of 16 medians along the border.
+    /// Level of the emptiest part of the border: near 0 for line integrals of an object surrounded by air. The median
+    /// over views of the third-lowest of 16 medians along the border.
     pub air: f32,
-    /// Share of values below minus a twentieth of the upper end of the typical range.
+    /// Share of values below −1/20 of the upper end of the typical range.
     pub negative: f64,
-    /// What is likely wrong, in words; empty if nothing is.
+    /// Likely problems, in words; empty if there are none.
     pub complaints: Vec<String>,
 }
 
-/// Looks whether `projections` (`[view, row, column]`) can be line integrals `A = −ln(I/I0)`, which have no unit:
-/// their range, air near zero at the border, how many are negative.
+/// Checks whether `projections` (`[view, row, column]`) can be line integrals `A = −ln(I/I0)`, which have no unit:
+/// their range, air near zero at the border, the share of negative values.
 pub fn check_line_integrals(projections: ArrayView3<'_, f32>) -> LineIntegralCheck {
     let n = projections.len();
     let (mut min, mut max) = (f32::INFINITY, f32::NEG_INFINITY);
     for &x in projections {
         (min, max) = (min.min(x), max.max(x));
     }
-    // An odd stride does not walk down one column of a detector with an even number of them.
+    // An odd stride does not stay on one column of a detector with an even number of columns.
     let mut sample: Vec<f32> = projections.iter().copied().step_by((n / SAMPLE) | 1).collect();
     sample.sort_unstable_by(f32::total_cmp);
     let at = |share| quantile(&sample, share).unwrap_or(0.0);
@@ -56,7 +56,7 @@ pub fn check_line_integrals(projections: ArrayView3<'_, f32>) -> LineIntegralChe
     }
     let [air, bright, centre] = [dark, bright, middle].map(|mut v| median(&mut v).unwrap_or(0.0));
     let mut complaints = Vec::new();
-    // Intensities are highest where there is nothing; line integrals are lowest there.
+    // Intensities are highest in air; line integrals are lowest there.
     let upside_down = bright > 0.7 * high && centre < 0.95 * bright && air > 0.2 * high;
     if high > 0.0 && (upside_down || (high > OPAQUE && bright > 0.5 * high)) {
         complaints.push(format!(
@@ -116,7 +116,7 @@ mod tests {
         told(ball(2.0) - 0.7, "I0 is too low");
         told(-ball(2.0), "the sign is wrong");
         told(ball(200.0), "no detector measures");
-        // Nothing in the beam is no fault.
+        // An empty beam is not an error.
         assert!(check_line_integrals(Array3::zeros((2, 3, 4)).view()).complaints.is_empty());
         assert!(check_line_integrals(Array3::zeros((0, 0, 0)).view()).complaints.is_empty());
     }

@@ -1,12 +1,12 @@
 //! Medians and quantiles of values.
 
-/// The middle value, or `None` of nothing. Of an even number the upper one of the two.
+/// The median, or `None` for no values. For an even number, the upper one of the middle two.
 pub fn median(values: &mut [f32]) -> Option<f32> {
     let middle = values.len() / 2;
     (!values.is_empty()).then(|| *values.select_nth_unstable_by(middle, f32::total_cmp).1)
 }
 
-/// The value below which `share` of the `sorted` ones lie.
+/// The value below which `share` of the `sorted` values lie.
 pub fn quantile(sorted: &[f32], share: f64) -> Option<f32> {
     let last = sorted.len().checked_sub(1)?;
     sorted.get((share * last as f64).round() as usize).copied()

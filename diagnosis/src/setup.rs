@@ -6,41 +6,41 @@ use conefield_core::geometry::{Geometry, Vec3, norm};
 use conefield_core::orbit::CircularOrbit;
 use serde::Serialize;
 
-/// A scan's lengths and angles; where views differ, the median over them. The axis is z; the isocentre is its point at
-/// the height of the source.
+/// A scan's lengths and angles; medians if views differ. The axis is z; the isocentre is its point at the source's
+/// height.
 #[derive(Debug, Clone, PartialEq, Serialize)]
 pub struct Setup {
     /// Whether all views lie on one circle about the axis.
     pub circle: bool,
-    /// From the source to the axis.
+    /// Distance from the source to the axis.
     pub source_to_axis_mm: f64,
-    /// From the source to the plane of the detector.
+    /// Distance from the source to the detector plane.
     pub source_to_detector_mm: f64,
-    /// How much larger the isocentre's surroundings are on the detector.
+    /// Magnification at the isocentre.
     pub magnification: f64,
     /// Along v, u.
     pub pixel_mm: [f64; 2],
-    /// The whole detector along v, u.
+    /// Size of the whole detector along v, u.
     pub detector_mm: [f64; 2],
-    /// From where the isocentre falls on the detector's plane to the detector's centre, along v, u.
+    /// Offset of the detector's centre from the projection of the isocentre, along v, u.
     pub offset_mm: [f64; 2],
-    /// The smallest voxel along x, y, z that the detector supports: a pixel over the magnification, of u across the
-    /// axis and of v along it.
+    /// The smallest voxel along x, y, z that the detector supports: the pixel size divided by the magnification, with u
+    /// for x and y and v for z.
     pub supported_voxel_mm: [f64; 3],
-    /// Where the views see something.
+    /// The region that the views see.
     pub field_of_view: FieldOfView,
-    /// Where on the circle the views stand.
+    /// Angular positions of the views.
     pub angles: ScanArc,
 }
 
 /// The cylinder about the axis that the views see.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize)]
 pub struct FieldOfView {
-    /// What every view sees in the plane of the source; 0 if some do not see the axis.
+    /// Radius that every view sees in the plane of the source; 0 if some views do not see the axis.
     pub radius_mm: f64,
-    /// What every view sees on one side of the axis at least: enough on a full circle.
+    /// Radius that every view sees on at least one side of the axis: sufficient on a full circle.
     pub one_sided_radius_mm: f64,
-    /// What every view sees of the axis.
+    /// Height of the axis that every view sees.
     pub height_mm: f64,
 }
 
@@ -51,7 +51,7 @@ pub fn setup(geometry: &Geometry) -> Setup {
     for view in &geometry.views {
         let s = view.source;
         let shadow = Shadow::of(view);
-        // A source beside its detector's plane sees no isocentre: it adds nothing to the medians.
+        // A source beside its detector plane sees no isocentre and is excluded from the medians.
         let Some(foot) = shadow.of_point([0.0, 0.0, s[2]]) else { continue };
         let pixel = [norm(view.v), norm(view.u)];
         let edge = |column: f64| -> f64 {
@@ -61,7 +61,7 @@ pub fn setup(geometry: &Geometry) -> Setup {
         let side = |room: f64, column: f64| if room < 0.0 { -edge(column) } else { edge(column) };
         let left = side(columns / 2.0 + foot.column, -columns / 2.0);
         let right = side(columns / 2.0 - foot.column, columns / 2.0);
-        // Heights on the axis at which its shadow leaves the detector.
+        // Heights on the axis whose projection leaves the detector.
         let per_mm = foot.magnification / pixel[0] * -view.v[2].signum();
         let ends = [-rows / 2.0, rows / 2.0].map(|r| s[2] - (r - foot.row) / per_mm);
         axis.push([
@@ -102,20 +102,20 @@ pub fn setup(geometry: &Geometry) -> Setup {
     }
 }
 
-/// A rest of rounding is no offset.
+/// Rounds tiny offsets, which are rounding errors, to 0.
 fn round(x: f64, scale: f64) -> f64 {
     if x.abs() < 1e-9 * scale { 0.0 } else { x }
 }
 
 impl Setup {
-    /// Whether the detector stands aside of the axis so that opposite views complement each other: over a full circle
-    /// half the views are enough then.
+    /// Whether the detector is offset so that opposite views complement each other: half of the views then suffice over
+    /// a full circle.
     pub fn half_is_enough(&self) -> bool {
         self.angles.full_circle && self.offset_mm[1].abs() > 0.01 * self.detector_mm[1]
     }
 
-    /// How far the detector reaches past the axis on the shorter side, in mm on the detector; negative if the axis
-    /// does not fall on it.
+    /// How far the detector reaches past the axis on the shorter side, in mm on the detector; negative if the axis does
+    /// not project onto it.
     pub fn overlap_mm(&self) -> f64 {
         self.detector_mm[1] / 2.0 - self.offset_mm[1].abs()
     }

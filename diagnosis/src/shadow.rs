@@ -1,20 +1,20 @@
-//! Where points of the world fall on a view's detector.
+//! Projection of points onto a view's detector.
 
 use conefield_core::geometry::{Vec3, View, cross, dot, sub};
 
-/// Where points of the world fall on a view's detector.
+/// Projects points onto a view's detector.
 pub(crate) struct Shadow {
     source: Vec3,
     detector: Vec3,
-    /// From the source to the plane of the detector.
+    /// Distance from the source to the detector plane.
     pub depth: f64,
     normal: Vec3,
-    /// Their products with a vector in the plane are its columns and rows.
+    /// The products of these with a vector in the plane are its column and row.
     columns: Vec3,
     rows: Vec3,
 }
 
-/// Where a point falls, from the detector's centre, in pixels.
+/// The projection of a point, relative to the detector's centre, in pixels.
 pub(crate) struct Fall {
     pub row: f64,
     pub column: f64,
@@ -33,7 +33,7 @@ impl Shadow {
         Self { source: view.source, detector: view.detector, depth, normal, columns, rows }
     }
 
-    /// `None` for what is not before the source.
+    /// `None` for a point that is not in front of the source.
     pub fn of_point(&self, p: Vec3) -> Option<Fall> {
         let to = sub(p, self.source);
         let magnification = self.depth / dot(self.normal, to);

@@ -1,4 +1,4 @@
-//! All that a scan's diagnosis finds.
+//! The complete diagnosis of a scan.
 
 use crate::coverage::{VolumeCoverage, volume_coverage};
 use crate::line_integrals::{LineIntegralCheck, check_line_integrals};
@@ -8,25 +8,25 @@ use crate::warnings::{Warning, warnings};
 use conefield_core::scan::Scan;
 use serde::Serialize;
 
-/// All that [`survey`] finds.
+/// The result of [`survey`].
 #[derive(Debug, Clone, Serialize)]
 pub struct Survey {
     /// Lengths and angles.
     pub setup: Setup,
-    /// Which part of the volume the views see.
+    /// The part of the volume that the views see.
     pub coverage: VolumeCoverage,
-    /// Whether the object reaches past the detector's sides.
+    /// Whether the object extends beyond the detector's sides.
     pub truncation: Truncation,
     /// Whether the projections look like line integrals.
     pub check: LineIntegralCheck,
-    /// The order of magnitude of the attenuation in 1/mm: the highest line integrals (but for a thousandth) over the
+    /// The order of magnitude of the attenuation in 1/mm: the highest line integrals (99.9 % quantile) divided by the
     /// volume's longer side across the axis.
     pub attenuation_per_mm: f64,
-    /// What will trouble a reconstruction; empty if nothing will.
+    /// Problems for a reconstruction; empty if there are none.
     pub warnings: Vec<Warning>,
 }
 
-/// Surveys `scan`. Values and geometry are taken to be finite and to fit each other ([`Scan::validate`]).
+/// Surveys `scan`, whose values and geometry must be finite and consistent ([`Scan::validate`]).
 pub fn survey(scan: &Scan) -> Survey {
     let g = &scan.geometry;
     let setup = setup(g);

@@ -1,35 +1,35 @@
-//! Whether the object reaches past the left or right side of the detector.
+//! Checks whether the object extends beyond the left or right side of the detector.
 
 use crate::line_integrals::LineIntegralCheck;
 use crate::setup::Setup;
 use ndarray::{ArrayView3, Axis, s};
 use serde::Serialize;
 
-/// Of the highest line integrals: more than this at the side is no air.
+/// Threshold of air at the sides, as a share of the highest line integrals.
 const LEVEL: f32 = 0.05;
 
-/// Where projections are not near zero at the first or last columns. On a full circle with the detector aside of the
-/// axis only the far side counts: the near one cuts through the object by intention.
+/// Truncation: projections that are not near zero at the first or last columns. For an offset detector on a full circle
+/// only the far side counts: the near one cuts through the object on purpose.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize)]
 pub struct Truncation {
-    /// Share of views that are cut.
+    /// Share of truncated views.
     pub views: f64,
-    /// Share of the detector's rows on which they are, over the views that are.
+    /// Share of truncated detector rows in these views.
     pub rows: f64,
     /// The same in mm at the isocentre.
     pub height_mm: f64,
     /// The mean line integral there.
     pub level: f32,
-    /// What counts as near zero.
+    /// Upper limit of values that count as zero.
     pub threshold: f32,
 }
 
-/// Looks at the sides of `projections`, `[view, row, column]`.
+/// Examines the sides of `projections`, `[view, row, column]`.
 pub(crate) fn truncation(projections: ArrayView3<'_, f32>, setup: &Setup, check: &LineIntegralCheck) -> Truncation {
     let (_, rows, columns) = projections.dim();
     let high = check.typical_range[1].max(0.0);
     let threshold = LEVEL * high + check.air.clamp(0.0, LEVEL * high);
-    // A mean over some pixels hides their noise.
+    // Averaging some pixels reduces their noise.
     let (tall, wide) = (rows.div_ceil(64).max(1), columns.div_ceil(64).max(1));
     let [left, right] = match setup.half_is_enough() {
         true => [setup.offset_mm[1] < 0.0, setup.offset_mm[1] > 0.0],
@@ -51,7 +51,7 @@ pub(crate) fn truncation(projections: ArrayView3<'_, f32>, setup: &Setup, check:
                 blocks += 1;
             }
         }
-        // A single piece may be noise or a bad pixel.
+        // A single segment may be noise or a bad pixel.
         if cut > all / 50 + 1 {
             cut_views += 1;
             cut_rows += cut as f64 / all as f64;

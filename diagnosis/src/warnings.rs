@@ -1,42 +1,42 @@
-//! What will trouble a reconstruction, with figures and a way out.
+//! Warnings about problems for a reconstruction, with figures and advice.
 
 use crate::survey::Survey;
 use conefield_core::scan::Scan;
 use serde::Serialize;
 use std::fmt;
 
-/// What a warning is about.
+/// Subject of a warning.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize)]
 #[serde(rename_all = "kebab-case")]
 pub enum WarningKind {
     /// Projections that do not look like line integrals.
     Values,
-    /// An object that reaches past the detector's sides.
+    /// An object that extends beyond the detector's sides.
     Truncated,
-    /// A volume that not all views see.
+    /// A volume that some views see only partly.
     Coverage,
-    /// A detector on which the axis does not fall, or hardly.
+    /// A detector that the axis misses or barely hits.
     Offset,
     /// An arc that is too short.
     Arc,
     /// A gap between views.
     Gap,
-    /// Angles that are degrees and were taken for radians.
+    /// Angles in degrees that were read as radians.
     Degrees,
     /// Lengths or attenuation of an unusual size.
     Scale,
-    /// Voxels that do not fit the detector's resolution.
+    /// Voxels that do not match the detector's resolution.
     VoxelSize,
 }
 
-/// One thing that will trouble a reconstruction.
+/// A problem for a reconstruction.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize)]
 pub struct Warning {
-    /// What it is about.
+    /// Its subject.
     pub kind: WarningKind,
-    /// What was found, with figures.
+    /// The finding, with figures.
     pub found: String,
-    /// What to do about it; empty if `found` says that too.
+    /// Advice; empty if `found` includes it.
     pub advice: String,
 }
 
@@ -49,17 +49,17 @@ impl fmt::Display for Warning {
     }
 }
 
-/// Distances in mm, and attenuations in 1/mm, between which scanners and what they scan lie.
+/// Usual ranges of distances in mm and of attenuation in 1/mm.
 const DISTANCES: [f64; 2] = [10.0, 5000.0];
 const ATTENUATIONS: [f64; 2] = [1e-4, 1.0];
-/// Overlap past the axis below this share of the detector is too small.
+/// Smallest sufficient overlap past the axis, as a share of the detector.
 const OVERLAP: f64 = 0.05;
-/// A gap this many times the mean one.
+/// A gap is large if it exceeds the mean gap by this factor.
 const GAP: f64 = 3.0;
-/// Units that have a size in the world, as data sets call them.
+/// Names of physical units in data sets.
 const UNITS: [&str; 6] = ["mm", "cm", "m", "um", "µm", "dm"];
 
-/// Whether lengths are millimetres, and not those of a unit cube or the like.
+/// Whether lengths are physical, and not those of a unit cube or the like.
 fn has_size(scan: &Scan) -> bool {
     UNITS.contains(&scan.unit.name.as_str())
 }
@@ -72,7 +72,7 @@ fn percent(x: f64) -> String {
     }
 }
 
-/// Everything that is wrong with `scan`.
+/// All problems of `scan`.
 pub(crate) fn warnings(scan: &Scan, s: &Survey) -> Vec<Warning> {
     let mut all = Vec::new();
     let mut warn = |kind, found: String, advice: String| all.push(Warning { kind, found, advice });
@@ -92,7 +92,7 @@ type Warn<'a> = &'a mut dyn FnMut(WarningKind, String, String);
 
 fn truncated(s: &Survey, warn: Warn) {
     let t = &s.truncation;
-    // Values that are no line integrals are not near zero anywhere.
+    // Values that are not line integrals are not near zero anywhere.
     if t.views <= 0.02 || !s.check.complaints.is_empty() {
         return;
     }
@@ -172,7 +172,7 @@ fn angles(scan: &Scan, s: &Survey, warn: Warn) {
         return;
     }
     let size = scan.geometry.volume.size();
-    // What is to be reconstructed, as far as the detector sees it.
+    // The reconstructed region that the detector sees.
     let radius = s.setup.field_of_view.one_sided_radius_mm.min(size[0].hypot(size[1]) / 2.0);
     let fan = 2.0 * (radius / s.setup.source_to_axis_mm.max(radius)).asin().to_degrees();
     let aside = s.setup.offset_mm[1].abs() > 0.1 * s.setup.detector_mm[1];

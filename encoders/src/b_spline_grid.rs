@@ -1,10 +1,10 @@
 //! Pyramid of uniform cubic B-splines (Unser et al. 1993, B-Spline Signal Processing: Part I, IEEE Transactions on Signal
 //! Processing 41(2)): points `[n, 3]` in the unit cube to `[n, levels·features]`.
 //!
-//! A level with `r` cells a side has `(r + 3)³` coefficients of every feature, and its value is the tensor product
-//! `Σ_ijk B_i(t_x)·B_j(t_y)·B_k(t_z)·c[X + i, Y + j, Z + k]`, where the position `p = clamp(x, 0, 1)·r` lies in cell `(X, Y, Z)` at
-//! `t = p − ⌊p⌋`, and `B_0 … B_3` are `(1 − t)³/6`, `(3t³ − 6t² + 4)/6`, `(−3t³ + 3t² + 3t + 1)/6`, `t³/6`. It has two continuous
-//! derivatives, where a trilinear grid has none.
+//! A level with `r` cells per side has `(r + 3)³` coefficients per feature, and its value is the tensor product
+//! `Σ_ijk B_i(t_x)·B_j(t_y)·B_k(t_z)·c[X + i, Y + j, Z + k]`, where the position `p = clamp(x, 0, 1)·r` lies in cell
+//! `(X, Y, Z)` at `t = p − ⌊p⌋`, and `B_0 … B_3` are `(1 − t)³/6`, `(3t³ − 6t² + 4)/6`, `(−3t³ + 3t² + 3t + 1)/6`,
+//! `t³/6`. It has two continuous derivatives; a trilinear grid has none.
 
 use crate::levels::{
     BLOCK, Cells, LevelCode, Table, by_channel, by_features, functions, kernel_of_levels, start, stretch,
@@ -25,13 +25,13 @@ use std::ops::Range;
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields, default)]
 pub struct BSplineGrid {
-    /// Levels, coarse to fine.
+    /// Number of levels, coarse to fine.
     pub levels: usize,
-    /// Features a level: 1, 2, 4 or 8.
+    /// Features per level: 1, 2, 4 or 8.
     pub features: usize,
     /// Cells along the cube's side on the coarsest level.
     pub base_resolution: u32,
-    /// Resolution of a level over that of the level before, at least 1. Resolutions are rounded to whole cells.
+    /// Ratio of consecutive levels' resolutions, at least 1. Resolutions are rounded to whole cells.
     pub growth: f64,
 }
 
@@ -56,29 +56,29 @@ impl EncoderSpec for BSplineGrid {
     }
 }
 
-/// More parameters than this are refused: with gradients and moments they would take 32 GiB.
+/// More parameters are refused: with gradients and moments they would take 32 GiB.
 const MOST: u64 = 1 << 31;
 
-/// A range of parameters that one worker sums has at least this many.
+/// Minimum length of a parameter range that one worker sums.
 const SLAB: usize = 1 << 19;
 
-/// Coefficients along an axis that reach into a cell.
+/// Coefficients along an axis that affect a cell.
 const TAPS: usize = 4;
 
 #[derive(Debug, Clone, PartialEq)]
 struct Level {
     table: Table,
-    /// Cells along a side.
+    /// Cells per side.
     cells: u32,
 }
 
 impl Level {
-    /// Coefficients along a side.
+    /// Coefficients per side.
     fn side(&self) -> usize {
         self.cells as usize + TAPS - 1
     }
 
-    /// First number of the run of [`TAPS`] coefficients along z, `i` and `j` coefficients from the first along x and y.
+    /// Index of the first of [`TAPS`] coefficients along z, `i` and `j` coefficients from the first along x and y.
     #[inline(always)]
     fn run<R>(&self, at: &Cells<R>, row: usize, i: usize, j: usize, features: usize) -> usize {
         let [x, y, z] = [at.cell[0][row] as usize + i, at.cell[1][row] as usize + j, at.cell[2][row] as usize];
@@ -96,7 +96,7 @@ pub struct BSplineGridStage {
 }
 
 impl BSplineGridStage {
-    /// The stage, or which setting is out of range.
+    /// Builds the stage, or names the setting that is out of range.
     pub fn new(settings: &BSplineGrid) -> Result<Self> {
         let s = settings;
         ensure((1..=32).contains(&s.levels), "spec", "levels", s.levels, "1 to 32")?;
@@ -108,7 +108,7 @@ impl BSplineGridStage {
         let mut params = 0u64;
         for number in 0..s.levels {
             let resolution = (f64::from(base) * s.growth.powi(number as i32)).round();
-            // A cast saturates, and what does not fit 64 bits is refused like everything above the limit.
+            // The cast saturates, and what exceeds 64 bits is refused like everything above the limit.
             let len = (resolution as u64)
                 .checked_add(TAPS as u64 - 1)
                 .and_then(|side| side.checked_pow(3))
@@ -134,7 +134,7 @@ impl BSplineGridStage {
     }
 }
 
-/// The four B-splines that reach into a cell.
+/// The four B-splines that affect a cell.
 #[inline(always)]
 fn splines<R: Real>(t: R) -> [R; TAPS] {
     let (one, sixth, rest) = (R::ONE, R::of(1.0 / 6.0), R::ONE - t);
@@ -144,7 +144,7 @@ fn splines<R: Real>(t: R) -> [R; TAPS] {
     [first, second, one - first - second - last, last]
 }
 
-/// Their derivatives by `t`.
+/// Their derivatives with respect to `t`.
 #[inline(always)]
 fn slopes<R: Real>(t: R) -> [R; TAPS] {
     let (half, rest) = (R::of(0.5), R::ONE - t);
@@ -153,10 +153,10 @@ fn slopes<R: Real>(t: R) -> [R; TAPS] {
     [first, second, R::ZERO - first - second - last, last]
 }
 
-/// Where the rows of a block fall on one level, and what the coefficients weigh there.
+/// Cells of a block's rows on one level, and the weights of the coefficients.
 struct Located<R> {
     cells: Cells<R>,
-    /// Of each axis.
+    /// Per axis.
     weight: [[[R; TAPS]; BLOCK]; 3],
 }
 
@@ -175,7 +175,7 @@ impl<R: Real> Located<R> {
         }
     }
 
-    /// Weights along z of row `i`, each as often as there are features: registers of four, of which `F` are used.
+    /// Weights along z of row `i`, each repeated per feature: registers of four, of which `F` are used.
     #[inline(always)]
     fn along<S: Simd, const F: usize>(&self, s: S, i: usize) -> [R::Four<S>; 8] {
         let mut lanes = [[R::ZERO; 4]; 8];
@@ -247,7 +247,8 @@ impl<R: Real, P: Stored<R>> Forward<'_, R, P> {
     }
 }
 
-/// Adds `weight·what` to the numbers of a level from `first` that lie in `own`. `grads` holds the gradients of that range.
+/// Adds `weight·what` to the numbers of a level from `first` that lie in `own`. `grads` holds the gradients of that
+/// range.
 #[inline(always)]
 fn add<S: Simd, R: Real, const F: usize>(
     s: S,
@@ -300,7 +301,7 @@ impl<R: Real, P: Stored<R>> Backward<'_, R, P> {
             if from >= to && self.dx.is_none() {
                 continue;
             }
-            // What of this level is to be summed, counted from its first parameter.
+            // The requested part of this level, relative to its first parameter.
             let own = if from < to { from - params.start..to - params.start } else { 0..0 };
             let grads = if from < to { &mut self.grads.values[from - range.start..to - range.start] } else { &mut [] };
             for at in (0..self.x.rows).step_by(BLOCK) {
@@ -309,7 +310,7 @@ impl<R: Real, P: Stored<R>> Backward<'_, R, P> {
                 located.locate(s, level, self.x, at, n);
                 if !own.is_empty() {
                     for r in 0..n {
-                        // The whole of what a row touches.
+                        // All coefficients that the row affects.
                         let first = level.run(&located.cells, r, 0, 0, F);
                         let end = level.run(&located.cells, r, TAPS - 1, TAPS - 1, F) + TAPS * F;
                         if end <= own.start || own.end <= first {
@@ -346,7 +347,7 @@ impl<R: Real, P: Stored<R>> Backward<'_, R, P> {
     }
 }
 
-/// Derivative of `Σ dy·y` of row `r` by its position in cells.
+/// Derivative of `Σ dy·y` of row `r` with respect to its position in cells.
 fn slope_of<R: Real, P: Stored<R>, const F: usize>(
     level: &Level,
     table: &[P],
@@ -410,8 +411,7 @@ impl Stage for BSplineGridStage {
         Some(Halves::of(self))
     }
 
-    /// Of a large level a worker owns some planes of equal x: no more than 16 parts, because each is a further look at every
-    /// row.
+    /// A worker owns some planes of equal x of a large level: at most 16 parts, because each visits every row again.
     fn partition(&self) -> Vec<Range<usize>> {
         let slabs = |l: &Level| {
             let (start, side, plane) = (l.table.start, l.side(), l.side() * l.side() * self.features);
@@ -474,7 +474,7 @@ impl Encoder for BSplineGridStage {
 mod tests {
     use super::*;
 
-    /// Splines add to 1 and reproduce a straight line: coefficient `c` stands at cell `c − 1`.
+    /// Splines sum to 1 and reproduce a straight line: coefficient `c` is at cell `c − 1`.
     #[test]
     fn a_straight_line_is_reproduced() {
         let settings = BSplineGrid { levels: 2, features: 1, base_resolution: 3, growth: 2.0 };

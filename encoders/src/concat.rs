@@ -19,7 +19,7 @@ use std::sync::Arc;
 #[derive(Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields)]
 pub struct Concat {
-    /// The parts, in the order of their channels: any encoders, this one included.
+    /// The encoders, in the order of their channels; may include `concat`.
     #[serde(deserialize_with = "conefield_core::spec::stage::list")]
     #[schemars(schema_with = "conefield_core::spec::stage::schema_of_list::<dyn EncoderSpec>", extend("minItems" = 1))]
     pub encoders: Vec<Box<dyn EncoderSpec>>,
@@ -51,7 +51,7 @@ impl EncoderSpec for Concat {
 struct ConcatMember {
     stage: Arc<dyn Encoder>,
     info: Info,
-    /// Its place in the settings, which names its parameters.
+    /// Its index in the settings, which names its parameters.
     number: usize,
     outputs: Range<usize>,
     params: Range<usize>,
@@ -59,7 +59,7 @@ struct ConcatMember {
 }
 
 impl ConcatMember {
-    /// What reads its parameters in halves, if it has any.
+    /// The kernel for half-precision parameters, if it has parameters.
     fn in_halves<P>(&self, pick: fn(Halves<'_>) -> &dyn Kernel<f32, P>) -> Option<Own<'_, f32, P>> {
         match self.info.params {
             0 => Some(Own::Alone(self.stage.kernel())),
@@ -76,7 +76,7 @@ pub struct ConcatStage {
 }
 
 impl ConcatStage {
-    /// Puts parts, each with its place in the settings, side by side.
+    /// Concatenates parts, each with its index in the settings.
     fn new(stages: Vec<(usize, Arc<dyn Encoder>)>) -> Result<Self> {
         ensure(!stages.is_empty(), "spec", "encoders", "none", "at least one encoder")?;
         let mut info = Info {
@@ -104,7 +104,8 @@ impl ConcatStage {
             info.params = part.params.end;
             info.tape = part.tape.end;
             info.macs += i.macs;
-            // One scattered part makes the whole scattered; a dense part is then one range of the partition.
+            // One part with scattered gradients makes the whole scattered; a dense part is then one range of the
+            // partition.
             info.grads = match (info.grads, i.grads) {
                 (GradKind::None, g) | (g, GradKind::None) => g,
                 (GradKind::Dense, GradKind::Dense) => GradKind::Dense,
@@ -122,10 +123,10 @@ impl ConcatStage {
     }
 }
 
-/// A kernel of a part, on parameters that stand in memory as `P`.
+/// A kernel of a part, on parameters stored as `P`.
 enum Own<'a, R: Real, P> {
     Reads(&'a dyn Kernel<R, P>),
-    /// Of a part without parameters.
+    /// For a part without parameters.
     Alone(&'a dyn Kernel<R>),
 }
 
@@ -165,7 +166,7 @@ impl ConcatStage {
         }
     }
 
-    /// Passes of every part, one after the other.
+    /// Sum of the passes of all parts.
     fn passes_of_parts<R: Real, P>(&self, pick: Pick<R, P>) -> usize {
         self.parts.iter().map(|part| pick(part).map_or(0, |own| own.passes())).sum()
     }
@@ -206,7 +207,7 @@ impl ConcatStage {
         mut dx: Option<TileMut<'_, R>>,
     ) {
         let n = x.rows;
-        // Parts overwrite their input gradient, so that of every part but the first needs a place of its own.
+        // Parts overwrite their input gradient, so every part except the first needs its own buffer.
         let mut one = if dx.is_some() && self.parts.len() > 1 { vec![R::ZERO; 3 * n] } else { vec![] };
         let range = &grads.range;
         for (i, part) in self.parts.iter().enumerate() {
@@ -238,7 +239,7 @@ impl ConcatStage {
     }
 }
 
-/// The kernels of one precision, from those that `$pick` finds of the parts.
+/// The kernels of one precision, from the parts' kernels that `$pick` finds.
 macro_rules! kernels {
     ($real:ty, $stored:ty, $pick:expr) => {
         impl Kernel<$real, $stored> for ConcatStage {
@@ -285,7 +286,7 @@ impl Stage for ConcatStage {
         self.info.clone()
     }
 
-    /// The parts' names behind their place, e.g. `1.0.table`.
+    /// The parts' parameter names after their index, e.g. `1.0.table`.
     fn parameters(&self) -> Vec<Parameter> {
         let of = |p: &ConcatMember| {
             let (number, start) = (p.number, p.params.start);
@@ -377,7 +378,7 @@ impl Encoder for ConcatStage {
             if keep.is_empty() {
                 continue;
             }
-            // A part that stays whole need not be able to leave out channels.
+            // A part that keeps all channels need not support masking.
             if keep.len() == p.outputs.len() {
                 stages.push((p.number, p.stage.clone()));
                 params.push(p.params.clone());

@@ -1,8 +1,8 @@
-//! Multi-resolution dense grid: points `[n, 3]` in the unit cube to `[n, levels·features]`, on each level the
-//! features of the 8 corners of the point's cell, trilinearly interpolated, as in a hash grid (Müller et al. 2022,
-//! section 3) whose tables hold every vertex.
+//! Multi-resolution dense grid: points `[n, 3]` in the unit cube to `[n, levels·features]`; on each level the features
+//! of the 8 corners of the point's cell, trilinearly interpolated, as in a hash grid (Müller et al. 2022, section 3)
+//! whose tables hold every vertex.
 //!
-//! A level with `r` cells a side has `(r + 1)³` vertices at the corners of its cells, which fill the cube exactly:
+//! A level with `r` cells per side has `(r + 1)³` vertices at the corners of its cells, which fill the cube exactly:
 //! `p = clamp(x, 0, 1)·r`.
 
 use crate::levels::{LevelCode, by_channel, by_features, functions, kernel_of_levels};
@@ -23,13 +23,13 @@ use std::ops::Range;
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields, default)]
 pub struct DenseGrid {
-    /// Levels, coarse to fine.
+    /// Number of levels, coarse to fine.
     pub levels: usize,
-    /// Features a level: 1, 2, 4 or 8.
+    /// Features per level: 1, 2, 4 or 8.
     pub features: usize,
     /// Cells along the cube's side on the coarsest level.
     pub base_resolution: u32,
-    /// Resolution of a level over that of the level before, at least 1. Resolutions are rounded to whole cells.
+    /// Ratio of consecutive levels' resolutions, at least 1. Resolutions are rounded to whole cells.
     pub growth: f64,
 }
 
@@ -54,20 +54,20 @@ impl EncoderSpec for DenseGrid {
     }
 }
 
-/// More parameters than this are refused: with gradients and moments they would take 32 GiB.
+/// More parameters are refused: with gradients and moments they would take 32 GiB.
 const MOST: u64 = 1 << 31;
 
-/// A range of parameters that one worker sums has at least this many.
+/// Minimum length of a parameter range that one worker sums.
 const SLAB: usize = 1 << 19;
 
 #[derive(Debug, Clone, PartialEq)]
 struct Level {
     grid: Grid,
-    /// First parameter.
+    /// Index of the first parameter.
     start: usize,
-    /// Number of the level in the settings, which names its parameters.
+    /// Index of the level in the settings, which names its parameters.
     number: usize,
-    /// Output channel of each feature, where it is read.
+    /// Output channel of each feature; `None` if unused.
     outputs: Vec<Option<usize>>,
 }
 
@@ -81,7 +81,7 @@ pub struct DenseGridStage {
 }
 
 impl DenseGridStage {
-    /// The stage, or which setting is out of range.
+    /// Builds the stage, or names the setting that is out of range.
     pub fn new(settings: &DenseGrid) -> Result<Self> {
         let s = settings;
         ensure((1..=32).contains(&s.levels), "spec", "levels", s.levels, "1 to 32")?;
@@ -93,7 +93,7 @@ impl DenseGridStage {
         let mut total = 0u64;
         for l in 0..s.levels {
             let resolution = (f64::from(base) * s.growth.powi(l as i32)).round();
-            // A cast saturates, and what does not fit 64 bits is refused like everything above the limit.
+            // The cast saturates, and what exceeds 64 bits is refused like everything above the limit.
             let count = (resolution as u64)
                 .checked_add(1)
                 .and_then(|side| side.checked_pow(3))
@@ -186,7 +186,7 @@ impl<R: Real, P: Stored<R>> Backward<'_, R, P> {
             if from >= to && self.dx.is_none() {
                 continue;
             }
-            // What of this level is to be summed, counted from its first parameter.
+            // The requested part of this level, relative to its first parameter.
             let own = if from < to { from - params.start..to - params.start } else { 0..0 };
             let grads = if from < to { &mut self.grads.values[from - range.start..to - range.start] } else { &mut [] };
             let (table, _) = self.params[params].as_chunks::<F>();

@@ -1,9 +1,9 @@
 //! Frequency bands (Mildenhall et al. 2020, NeRF, equation 4): points `[n, 3]` in the unit cube to their sines and
 //! cosines at `bands` frequencies.
 //!
-//! Band `k` of coordinate `x` is `sin(2π·f_k·x)` and `cos(2π·f_k·x)`, where `f_k` counts periods a cube side. NeRF's
-//! `sin(2ᵏ·π·p)` on `p = 2x − 1` has `f_k = 2ᵏ`, up to a phase. Channels stand from low to high frequency: the
-//! coordinates, then of every band `sin x, sin y, sin z, cos x, cos y, cos z`.
+//! Band `k` of coordinate `x` is `sin(2π·f_k·x)` and `cos(2π·f_k·x)`, where `f_k` counts periods per cube side. NeRF's
+//! `sin(2ᵏ·π·p)` on `p = 2x − 1` has `f_k = 2ᵏ`, up to a phase. Channels are ordered from low to high frequency: the
+//! coordinates, then for each band `sin x, sin y, sin z, cos x, cos y, cos z`.
 
 use conefield_core::error::{Result, ensure};
 use conefield_core::settings::EncoderSpec;
@@ -15,13 +15,13 @@ use serde::{Deserialize, Serialize};
 use std::f64::consts::TAU;
 use std::fmt::Write;
 
-/// How frequencies lie between 1 and the highest.
+/// Spacing of the frequencies between 1 and the highest.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
 #[serde(rename_all = "kebab-case")]
 pub enum Spacing {
-    /// Each is the same multiple of the one before: `f_k = f_max^(k/(bands − 1))`.
+    /// Geometric: `f_k = f_max^(k/(bands − 1))`.
     Log,
-    /// Each is the same step above the one before: `f_k = 1 + (f_max − 1)·k/(bands − 1)`.
+    /// Arithmetic: `f_k = 1 + (f_max − 1)·k/(bands − 1)`.
     Linear,
 }
 
@@ -29,12 +29,12 @@ pub enum Spacing {
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields, default)]
 pub struct Frequency {
-    /// Frequencies a coordinate, from 1 period a cube side to `max_frequency`.
+    /// Frequencies per coordinate, from 1 period per cube side to `max_frequency`.
     pub bands: usize,
-    /// How they lie in between.
+    /// Spacing of the frequencies.
     pub spacing: Spacing,
-    /// The highest, in periods a cube side. The default of 10 bands up to 512 has NeRF's octaves 2⁰ to 2⁹. A single
-    /// band has this frequency.
+    /// The highest frequency, in periods per cube side. The default of 10 bands up to 512 gives NeRF's octaves 2⁰ to
+    /// 2⁹. A single band has this frequency.
     pub max_frequency: f64,
 }
 
@@ -59,7 +59,7 @@ impl EncoderSpec for Frequency {
     }
 }
 
-/// One frequency of one coordinate, and the channels that its sine and cosine go to, where they are read.
+/// One frequency of one coordinate, and the channels of its sine and cosine, if used.
 #[derive(Debug, Clone, PartialEq)]
 struct Wave {
     axis: usize,
@@ -72,14 +72,14 @@ struct Wave {
 #[derive(Debug, Clone, PartialEq)]
 pub struct FrequencyStage {
     settings: Frequency,
-    /// Coordinates that are passed on, with their channels.
+    /// Coordinates that are passed through, with their channels.
     inputs: Vec<(usize, usize)>,
     waves: Vec<Wave>,
     outputs: usize,
 }
 
 impl FrequencyStage {
-    /// The stage, or which setting is out of range.
+    /// Builds the stage, or names the setting that is out of range.
     pub fn new(settings: &Frequency) -> Result<Self> {
         let s = settings;
         ensure((1..=64).contains(&s.bands), "spec", "bands", s.bands, "1 to 64")?;
@@ -92,7 +92,7 @@ impl FrequencyStage {
                 Spacing::Log => max.powf(t),
                 Spacing::Linear => 1.0 + (max - 1.0) * t,
             };
-            // Rounded once, so that single and double precision mean the same waves.
+            // Rounded once, so that single and double precision use the same waves.
             let frequency = f64::from(exact as f32);
             for axis in 0..3 {
                 let c = 3 + 6 * k + axis;
@@ -108,13 +108,13 @@ impl FrequencyStage {
     }
 }
 
-/// `sin(2π·t)` and `cos(2π·t)`. `t` is in turns, so that whole turns drop out exactly before anything is rounded;
-/// what remains is at most an eighth of a turn, where the Taylor series ends below half a unit in the last place.
+/// `sin(2π·t)` and `cos(2π·t)`. `t` is in turns, so that whole turns cancel exactly before any rounding. The rest is at
+/// most an eighth of a turn, where the truncation error of the Taylor series is below half a unit in the last place.
 #[inline(always)]
 fn sin_cos_turns<S: Simd, R: Real>(s: S, t: V<S, R>) -> (V<S, R>, V<S, R>) {
     let number = |v: f64| V::<S, R>::splat(s, R::of(v));
     let (single, zero) = (size_of::<R>() == 4, number(0.0));
-    // From here on every number is whole. NaN compares false and stays.
+    // From here on every float is an integer. NaN compares false and stays.
     let whole = t.abs().simd_ge(number(if single { 16_777_216.0 } else { 9_007_199_254_740_992.0 }));
     let t = whole.select(zero, t);
     let quarter = (t * number(4.0)).round_ties_even();
@@ -122,7 +122,7 @@ fn sin_cos_turns<S: Simd, R: Real>(s: S, t: V<S, R>) -> (V<S, R>, V<S, R>) {
     let q = quarter - (quarter * number(0.25)).floor() * number(4.0);
     let square = a * a;
     let series = |last: usize| {
-        // 1 − a²/((last − 1)·last)·(…), from the last term inwards.
+        // 1 − a²/((last − 1)·last)·(…), evaluated from the last term inwards.
         let mut sum = number(1.0);
         let mut k = last;
         while k >= 2 {
@@ -309,7 +309,7 @@ impl Encoder for FrequencyStage {
         true
     }
 
-    /// A period takes two cells to be told from its neighbours.
+    /// Resolving a period takes two cells.
     fn resolutions(&self) -> Option<Vec<f64>> {
         let mut cells = vec![1.0; self.outputs];
         for w in &self.waves {
@@ -348,7 +348,7 @@ mod tests {
                         let (sin, cos) = (TAU * f * x[d]).sin_cos();
                         let c = 3 + 6 * k as usize + d;
                         assert!((y[c] - sin).abs() < 1e-11 && (y[c + 3] - cos).abs() < 1e-11, "{k} {d} {x:?}");
-                        // A product f·x that is not exact is off by up to f·2⁻²⁴ turns.
+                        // An inexact product f·x is off by up to f·2⁻²⁴ turns.
                         let bound = 2e-7 + if spacing == Spacing::Log { 0.0 } else { TAU * f * 6e-8 };
                         assert!((f64::from(y32[c]) - sin).abs() < bound, "{k} {d} {x:?}: {} {sin}", y32[c]);
                         assert!((f64::from(y32[c + 3]) - cos).abs() < bound, "{k} {d} {x:?}");

@@ -1,8 +1,8 @@
 //! Multi-resolution hash grid (Müller et al. 2022, Instant Neural Graphics Primitives, section 3).
 //!
 //! Points `[n, 3]` in the unit cube to `[n, levels·features]`: on each level the features of the 8 corners of the
-//! point's cell, trilinearly interpolated. A level whose vertices fit the table is indexed directly, a finer one by
-//! `h(c) = (c_x·π₁ ⊕ c_y·π₂ ⊕ c_z·π₃) mod T` with products modulo 2³² by definition.
+//! point's cell, trilinearly interpolated. A level whose vertices fit into the table is indexed directly, a finer one
+//! by `h(c) = (c_x·π₁ ⊕ c_y·π₂ ⊕ c_z·π₃) mod T` with products modulo 2³² by definition.
 
 use crate::levels::{self, BLOCK, LevelCode, by_channel, functions, kernel_of_levels, prefetch};
 use conefield_core::error::{Result, ensure};
@@ -17,13 +17,13 @@ use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 use std::ops::Range;
 
-/// Which published hash a grid uses.
+/// Published hash function.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
 #[serde(rename_all = "kebab-case")]
 pub enum Convention {
-    /// torch-ngp's, which NAF, SAX-NeRF and NI-NeRF use: primes 1, 19349663, 83492791.
+    /// Of torch-ngp, also in NAF, SAX-NeRF and NI-NeRF: primes 1, 19349663, 83492791.
     Naf,
-    /// The paper's (its equation 4): primes 1, 2654435761, 805459861.
+    /// Of the paper (its equation 4): primes 1, 2654435761, 805459861.
     InstantNgp,
 }
 
@@ -40,15 +40,15 @@ impl Convention {
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields, default)]
 pub struct HashGrid {
-    /// Which published hash.
+    /// Published hash function.
     pub convention: Convention,
-    /// Levels, coarse to fine.
+    /// Number of levels, coarse to fine.
     pub levels: usize,
-    /// Features a level: 1, 2, 4 or 8.
+    /// Features per level: 1, 2, 4 or 8.
     pub features: usize,
     /// Cells along the cube's side on the coarsest level.
     pub base_resolution: u32,
-    /// Resolution of a level over that of the level before.
+    /// Ratio of consecutive levels' resolutions.
     pub growth: f64,
     /// Largest table, as a power of two.
     pub log2_table_size: u32,
@@ -82,24 +82,24 @@ impl EncoderSpec for HashGrid {
     }
 }
 
-/// Positions are `f32`: a finer grid than this has no fraction of a cell left to interpolate by.
+/// Positions are `f32`: a finer grid leaves no fraction of a cell for interpolation.
 const FINEST: f64 = 8_388_608.0;
 
 #[derive(Debug, Clone, PartialEq)]
 struct Level {
     /// `pos = x·scale + 0.5`.
     scale: f64,
-    /// Vertices along a side.
+    /// Vertices per side.
     side: u32,
     /// Entries of the table.
     entries: u32,
-    /// Indexed directly.
+    /// Whether the level is indexed directly.
     dense: bool,
-    /// First entry among all levels.
+    /// Index of the first entry among all levels.
     start: usize,
-    /// Number of the level in the settings, which names its parameters.
+    /// Index of the level in the settings, which names its parameters.
     number: usize,
-    /// Output channel of each feature, where it is read.
+    /// Output channel of each feature; `None` if unused.
     outputs: Vec<Option<usize>>,
 }
 
@@ -114,7 +114,7 @@ pub struct HashGridStage {
 }
 
 impl HashGridStage {
-    /// The stage, or which setting is out of range.
+    /// Builds the stage, or names the setting that is out of range.
     pub fn new(settings: &HashGrid) -> Result<Self> {
         let s = settings;
         let bad = |field: &str, found: String, expected: &str| ensure(false, "spec", field, found, expected);
@@ -146,7 +146,7 @@ impl HashGridStage {
                 )?;
             }
             let scale = resolution - 1.0;
-            // Cells reach from floor(0.5) to floor(scale + 0.5), and each has a corner one further.
+            // Cells range from floor(0.5) to floor(scale + 0.5), and each has a corner one further.
             let side = (scale + 0.5).floor() as u64 + 2;
             let vertices = u128::from(side).pow(3);
             let dense = vertices <= u128::from(table);
@@ -177,8 +177,8 @@ impl HashGridStage {
     }
 }
 
-/// Where the rows of a block fall on one level. The corners of a cell are the ends of four edges along x, of which
-/// number `e` has the larger y where `e & 1` is set and the larger z where `e & 2` is.
+/// Cells of a block's rows on one level. The corners of a cell are the ends of four edges along x; edge `e` has the
+/// larger y if `e & 1` is set and the larger z if `e & 2` is.
 struct Located<R> {
     /// Cell of each row.
     cell: [[u32; BLOCK]; 3],
@@ -186,7 +186,7 @@ struct Located<R> {
     fraction: [[R; BLOCK]; 3],
     /// Entry of each edge's end with the smaller x.
     near: [[u32; BLOCK]; 4],
-    /// Entry of the other end. On a dense level it is the next one, and does not stand here.
+    /// Entry of the other end. On a dense level it is the next entry and is not stored here.
     far: [[u32; BLOCK]; 4],
     /// Weight of each edge.
     weight: [[R; BLOCK]; 4],
@@ -198,18 +198,18 @@ impl<R: Real> Located<R> {
         Self { cell: [entries; 3], fraction: [numbers; 3], near: [entries; 4], far: [entries; 4], weight: [numbers; 4] }
     }
 
-    /// Locates rows `at..at + n` of `x`. Points outside the cube count as on its rim.
+    /// Locates rows `at..at + n` of `x`. Points outside the cube are clamped to its rim.
     #[inline(always)]
     fn locate<S: Simd>(&mut self, s: S, level: &Level, primes: [u32; 3], x: Tile<'_, R>, at: usize, n: usize) {
         let number = |x: f64| V::<S, R>::splat(s, R::of(x));
         let (zero, half, scale, top) = (number(0.0), number(0.5), number(level.scale), number(level.scale + 0.5));
-        // `top` may have been rounded up to where another cell would begin.
+        // `top` may have been rounded up to the start of another cell.
         let last = number(f64::from(level.side - 2));
         for d in 0..3 {
             let x = &x.channel(d)[at..at + n];
             let mut i = 0;
             while i < n {
-                // NaN becomes 0 here: the precise form returns its other side.
+                // NaN becomes 0 here: the precise maximum returns its other operand.
                 let p = load(s, x, i).mul_add(scale, half).max_precise(zero).min(top);
                 let c = p.floor().min(last);
                 store::<S, R>(p - c, &mut self.fraction[d], i);
@@ -217,7 +217,7 @@ impl<R: Real> Located<R> {
                 i += V::<S, R>::LEN;
             }
         }
-        // These loops go over the whole block, even where it has fewer rows: a known length makes them faster.
+        // These loops process the whole block, even if it has fewer rows: a constant length makes them faster.
         let [cx, cy, cz] = &self.cell;
         if level.dense {
             let (sy, sz) = (level.side, level.side * level.side);
@@ -250,8 +250,7 @@ impl<R: Real> Located<R> {
         }
     }
 
-    /// Whether each of the first `n` rows is the last one that lies in its cell before another row lies elsewhere, and how
-    /// many are.
+    /// For each of the first `n` rows, whether it is the last one before a row in another cell; and their number.
     #[inline(always)]
     fn leaving(&self, n: usize) -> ([bool; BLOCK], usize) {
         let mut leaves = [true; BLOCK];
@@ -264,14 +263,14 @@ impl<R: Real> Located<R> {
         (leaves, count)
     }
 
-    /// Entries of the two ends of edge `e` of row `i`, on a level that is `dense` or not.
+    /// Entries of the two ends of edge `e` of row `i`, on a dense or hashed level.
     #[inline(always)]
     fn ends(&self, dense: bool, e: usize, i: usize) -> [u32; 2] {
         let near = self.near[e][i];
         [near, if dense { near + 1 } else { self.far[e][i] }]
     }
 
-    /// Weights of an edge's two ends for row `i`, as [`fours`] has their features.
+    /// Weights of an edge's two ends for row `i`, in the layout of [`fours`].
     #[inline(always)]
     fn along<S: Simd, const F: usize>(&self, s: S, i: usize) -> [R::Four<S>; 4] {
         let f = self.fraction[0][i];
@@ -279,7 +278,7 @@ impl<R: Real> Located<R> {
     }
 }
 
-/// Entry `i` of a level's table, `i` from [`Located::locate`] for that very level.
+/// Entry `i` of a level's table, with `i` from [`Located::locate`] for the same level.
 #[inline(always)]
 #[allow(unsafe_code)]
 fn entry<T>(table: &[T], i: u32) -> &T {
@@ -288,7 +287,7 @@ fn entry<T>(table: &[T], i: u32) -> &T {
     unsafe { levels::entry(table, i) }
 }
 
-/// Like [`entry`], to be written.
+/// Mutable version of [`entry`].
 #[inline(always)]
 #[allow(unsafe_code)]
 fn entry_mut<T>(table: &mut [T], i: u32) -> &mut T {
@@ -296,9 +295,9 @@ fn entry_mut<T>(table: &mut [T], i: u32) -> &mut T {
     unsafe { levels::entry_mut(table, i) }
 }
 
-/// The features of an edge's two ends, one after the other, in registers of four, of which [`registers`] are used. Left to
-/// itself the compiler works on many rows at once and gathers their entries number by number, which takes several times
-/// as long as one read an entry.
+/// The features of an edge's two ends, one after the other, in registers of four, of which [`registers`] are used.
+/// Otherwise the compiler vectorizes over rows and gathers their entries number by number, which takes several times as
+/// long as one read per entry.
 #[inline(always)]
 fn fours<S: Simd, R: Real, const F: usize>(s: S, ends: &[[R; F]; 2]) -> [R::Four<S>; 4] {
     let mut lanes = [[R::ZERO; 4]; 4];
@@ -317,10 +316,10 @@ const fn registers(features: usize) -> usize {
     (2 * features).div_ceil(4)
 }
 
-/// Adds `sums`, which stand as in [`fours`], to two entries.
+/// Adds `sums`, in the layout of [`fours`], to two entries.
 #[inline(always)]
 fn add<S: Simd, R: Real, const F: usize>(s: S, grads: &mut [[R; F]], ends: [u32; 2], sums: [R::Four<S>; 4]) {
-    // The two are never one: the hashes of neighbours differ in their last bit.
+    // The two always differ: the hashes of neighbours differ in their last bit.
     let mut new = fours(s, &ends.map(|i| *entry(grads, i)));
     for q in 0..registers(F) {
         new[q] += sums[q];
@@ -333,7 +332,7 @@ fn add<S: Simd, R: Real, const F: usize>(s: S, grads: &mut [[R; F]], ends: [u32;
     }
 }
 
-/// Entries in halves of a block, which are made wide all at once: a loop over neighbours becomes vector code.
+/// Half-precision entries of a block, widened together: a loop over neighbours becomes vector code.
 struct Wide<R, P, const F: usize> {
     read: [[[P; F]; 2]; 4 * BLOCK],
     wide: [[[R; F]; 2]; 4 * BLOCK],
@@ -344,7 +343,7 @@ impl<R: Real, P: Stored<R>, const F: usize> Wide<R, P, F> {
         Self { read: [[[P::default(); F]; 2]; 4 * BLOCK], wide: [[[R::ZERO; F]; 2]; 4 * BLOCK] }
     }
 
-    /// The features of the first `n` rows at `located`, on a level that is `DENSE` or not.
+    /// The features of the first `n` rows at `located`, on a `DENSE` or hashed level.
     #[inline(always)]
     fn interpolate<S: Simd, const DENSE: bool>(
         &mut self,
@@ -448,9 +447,9 @@ impl<R: Real, P: Stored<R>> Op for Forward<'_, R, P> {
     }
 }
 
-/// Adds to a level's gradients what the first `n` of the rows at `located` are worth. Rows that lie in one cell one after
-/// another are summed first, where these are many: then the entries are read and written once for all of them, and no row
-/// waits for what the one before has written.
+/// Adds the contributions of the first `n` rows at `located` to a level's gradients. If many consecutive rows share a
+/// cell, they are summed first: the entries are then read and written once for all of them, and no row waits for the
+/// writes of the previous one.
 #[inline(always)]
 fn scatter<S: Simd, R: Real, const F: usize, const DENSE: bool>(
     s: S,
@@ -518,7 +517,8 @@ impl<R: Real, P: Stored<R>> Backward<'_, R, P> {
             if from >= to && self.dx.is_none() {
                 continue;
             }
-            // Of a level that is asked for in part the rest is summed too, beside the result: the order of sums stays one.
+            // If only part of a level is requested, the rest is summed too, into a separate buffer: the order of
+            // summation stays the same.
             let part = if from < to && to - from < params.len() { params.len() } else { 0 };
             let mut beside = vec![R::ZERO; part];
             let own = if from < to { from - range.start..to - range.start } else { 0..0 };
@@ -559,7 +559,7 @@ impl<R: Real, P: Stored<R>> Backward<'_, R, P> {
                             (0..F).map(|f| entry[f].value() * dy[i][f]).sum()
                         });
                         for d in 0..3 {
-                            // Beyond the rim a position counts as on it, whichever it is.
+                            // Beyond the rim a position is clamped, whatever its value.
                             let x = self.x.channel(d)[at + i];
                             if !(x <= R::ONE && x * R::of(level.scale) + R::of(0.5) >= R::ZERO) {
                                 continue;
@@ -748,13 +748,13 @@ mod tests {
                 assert!((total - 1.0).abs() < 1e-12);
             }
         }
-        // NAF's first three levels (17³, 33³, … vertices) and which of them are direct with 2^19 entries.
+        // NAF's first three levels (17³, 33³, … vertices), and which of them are indexed directly with 2^19 entries.
         let naf = HashGridStage::new(&HashGrid::default()).unwrap();
         let entries: Vec<_> = naf.levels.iter().take(4).map(|l| (l.entries, l.dense)).collect();
         assert_eq!(entries, [(4913, true), (35937, true), (274_625, true), (524_288, false)]);
     }
 
-    /// At the rim of these levels `scale + 0.5`, just below a whole number, is that number in single precision.
+    /// At the rim of these levels `scale + 0.5`, just below an integer, rounds to it in single precision.
     #[test]
     fn rounding_at_the_rim_stays_inside_the_table() {
         for (base_resolution, growth) in [(25, 1.14), (50, 1.13), (50, 1.15), (50, 2.01), (30, 2.05)] {
@@ -774,7 +774,7 @@ mod tests {
         }
     }
 
-    /// Where a position is clamped, moving it changes nothing: its gradient is 0, and the others' is not.
+    /// Moving a clamped coordinate changes nothing: its gradient is 0; those of the others are not.
     #[test]
     fn clamped_positions_have_no_gradient() {
         let stage = HashGridStage::new(&HashGrid { levels: 2, ..HashGrid::default() }).unwrap();

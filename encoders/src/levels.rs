@@ -1,6 +1,6 @@
-//! What encoders of several levels, each with features of its own, share: how features start, which level a channel comes from,
-//! the parameters of a level and what is asked of their gradients, and WGSL: calls of `stage_level_forward` and
-//! `stage_level_backward`, level by level, with the levels' settings written into them.
+//! Common code of encoders with several levels of features: initialization, the level of each channel, the parameters
+//! of a level and the requested part of their gradients, and WGSL: calls of `stage_level_forward` and
+//! `stage_level_backward`, level by level, with the levels' settings as constants.
 
 use conefield_core::random::{mix, unit};
 use conefield_core::simd::{Real, Simd, SimdBase, SimdFloat, V, load, store};
@@ -9,20 +9,20 @@ use conefield_core::wgsl;
 use std::fmt::Write;
 use std::ops::Range;
 
-/// Features start uniform in ± this (Müller et al. 2022, section 4).
+/// Features are initialized uniformly in ± this (Müller et al. 2022, section 4).
 const START: f32 = 1e-4;
 
-/// Rows that are located together: their entries and weights stay in the L1 cache.
+/// Rows processed together: their entries and weights stay in the L1 cache.
 pub const BLOCK: usize = conefield_core::trilinear::BLOCK;
 
-/// Fills features as they start.
+/// Initializes features.
 pub fn start(seed: u64, params: &mut [f32]) {
     for (i, p) in params.iter_mut().enumerate() {
         *p = (2.0 * unit(mix(seed, i as u64)) - 1.0) * START;
     }
 }
 
-/// Runs `features` of an operation with the number of features of its stage as a constant.
+/// Runs `features` of an operation with the stage's number of features as a constant.
 macro_rules! by_features {
     ($op:ident) => {
         impl<R: Real, P: Stored<R>> Op for $op<'_, R, P> {
@@ -41,7 +41,7 @@ macro_rules! by_features {
 }
 pub(crate) use by_features;
 
-/// The kernel of a stage with `levels`: its `Forward` over a range of them, a pass each, and its `Backward`.
+/// The kernel of a stage with `levels`: its `Forward` over a range of levels, one pass each, and its `Backward`.
 macro_rules! kernel_of_levels {
     ($stage:ident) => {
         impl<R: Real, P: Stored<R>> Kernel<R, P> for $stage {
@@ -73,22 +73,22 @@ macro_rules! kernel_of_levels {
 }
 pub(crate) use kernel_of_levels;
 
-/// Where the rows of a block fall along each axis of the cube, cut into equal cells.
+/// Cells of a block's rows along each axis of the cube, which is divided into equal cells.
 pub struct Cells<R> {
     /// The cell.
     pub cell: [[u32; BLOCK]; 3],
-    /// How far into it, 0 to 1.
+    /// Fraction within the cell, 0 to 1.
     pub fraction: [[R; BLOCK]; 3],
 }
 
 impl<R: Real> Cells<R> {
-    /// Room for a block.
+    /// A buffer for a block.
     pub fn new() -> Self {
         Self { cell: [[0; BLOCK]; 3], fraction: [[R::ZERO; BLOCK]; 3] }
     }
 
-    /// Locates rows `at..at + n` of `x` among so many cells. Points outside the cube count as on its rim, a coordinate that
-    /// is not a number as 0.
+    /// Locates rows `at..at + n` of `x` among `cells` cells. Points outside the cube are clamped to its rim, a NaN
+    /// coordinate to 0.
     #[inline(always)]
     pub fn locate<S: Simd>(&mut self, s: S, cells: u32, x: Tile<'_, R>, at: usize, n: usize) {
         let number = |v: f64| V::<S, R>::splat(s, R::of(v));
@@ -97,7 +97,7 @@ impl<R: Real> Cells<R> {
             let x = &x.channel(d)[at..at + n];
             let mut i = 0;
             while i < n {
-                // The precise form returns the number where the other side is NaN.
+                // The precise maximum returns the number if the other operand is NaN.
                 let p = (load(s, x, i) * scale).max_precise(zero).min(scale);
                 let c = p.floor().min(last);
                 store::<S, R>(p - c, &mut self.fraction[d], i);
@@ -108,45 +108,45 @@ impl<R: Real> Cells<R> {
     }
 }
 
-/// Derivative of a position among `cells` by a coordinate. Beyond the rim it counts as on it, whichever it is.
+/// Derivative of a position among `cells` with respect to a coordinate. Beyond the rim the position is clamped.
 #[inline(always)]
 pub fn stretch<R: Real>(x: R, cells: u32) -> R {
     if x >= R::ZERO && x <= R::ONE { R::of(f64::from(cells)) } else { R::ZERO }
 }
 
-/// The parameters of a level, and where its features go.
+/// The parameters of a level, and the channels of its features.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Table {
-    /// First parameter.
+    /// Index of the first parameter.
     pub start: usize,
-    /// Parameters.
+    /// Number of parameters.
     pub len: usize,
-    /// Number of the level in the settings, which names its parameters.
+    /// Index of the level in the settings, which names its parameters.
     pub number: usize,
-    /// Output channel of each feature, where it is read.
+    /// Output channel of each feature; `None` if unused.
     pub outputs: Vec<Option<usize>>,
 }
 
 impl Table {
-    /// Its parameters.
+    /// The range of its parameters.
     pub fn range(&self) -> Range<usize> {
         self.start..self.start + self.len
     }
 
-    /// The block of its parameters, of this shape.
+    /// The block of its parameters, with this shape.
     pub fn parameter(&self, shape: Vec<usize>) -> Parameter {
         Parameter { name: format!("{}.table", self.number), shape, start: self.start }
     }
 
-    /// The same level, of which only the channels `keep` are read and whose parameters begin at `start`; `None` where no
-    /// channel is.
+    /// The same level with only the channels `keep` in use and its parameters at `start`; `None` if no channel is in
+    /// use.
     pub fn kept(&self, keep: &[usize], start: usize) -> Option<Self> {
         let place = |c: &Option<usize>| c.and_then(|c| keep.iter().position(|&k| k == c));
         let outputs: Vec<_> = self.outputs.iter().map(place).collect();
         outputs.iter().any(Option::is_some).then(|| Self { start, outputs, ..self.clone() })
     }
 
-    /// Puts the features of rows `at..at + n` where they are read.
+    /// Writes the features of rows `at..at + n` to their channels.
     #[inline(always)]
     pub fn put<R: Real, const F: usize>(&self, out: &[[R; F]; BLOCK], y: &mut TileMut<'_, R>, at: usize, n: usize) {
         for (f, channel) in self.outputs.iter().enumerate() {
@@ -158,7 +158,7 @@ impl Table {
         }
     }
 
-    /// Takes the gradients of the features of rows `at..at + n`.
+    /// Reads the gradients of the features of rows `at..at + n`.
     #[inline(always)]
     pub fn take<R: Real, const F: usize>(&self, dy: Tile<'_, R>, into: &mut [[R; F]; BLOCK], at: usize, n: usize) {
         for (f, channel) in self.outputs.iter().enumerate() {
@@ -170,18 +170,18 @@ impl Table {
     }
 }
 
-/// What a call of `backward` asks of a level's gradients: all, none, or a part. Of a level that is asked for in part the rest
-/// is summed too, beside the result: the order of sums stays one.
+/// The requested part of a level's gradients in a call of `backward`: all, none, or a part. If only part of a level is
+/// requested, the rest is summed too, into a separate buffer: the order of summation stays the same.
 pub struct Asked<R> {
-    /// What is asked for, among the values of the call.
+    /// The requested range among the values of the call.
     own: Range<usize>,
-    /// The same, among those of the level.
+    /// The same range among those of the level.
     place: Range<usize>,
     beside: Vec<R>,
 }
 
 impl<R: Real> Asked<R> {
-    /// What `grads` asks of the parameters `level`.
+    /// The part of `level` that `grads` requests.
     pub fn of(grads: &Grads<'_, R>, level: &Range<usize>) -> Self {
         let range = &grads.range;
         let (from, to) = (level.start.max(range.start), level.end.min(range.end));
@@ -198,17 +198,17 @@ impl<R: Real> Asked<R> {
         Self { own, place, beside }
     }
 
-    /// Whether nothing is.
+    /// Whether nothing is requested.
     pub fn is_empty(&self) -> bool {
         self.own.is_empty()
     }
 
-    /// Where the level's gradients are to be added: all of them, or none.
+    /// Where to add the level's gradients: all of them, or none.
     pub fn values<'a>(&'a mut self, grads: &'a mut Grads<'_, R>) -> &'a mut [R] {
         if self.beside.is_empty() { &mut grads.values[self.own.clone()] } else { &mut self.beside }
     }
 
-    /// Puts what was asked for where it belongs.
+    /// Copies the requested part to its place.
     pub fn finish(self, grads: &mut Grads<'_, R>) {
         if !self.beside.is_empty() {
             grads.values[self.own].copy_from_slice(&self.beside[self.place]);
@@ -216,7 +216,7 @@ impl<R: Real> Asked<R> {
     }
 }
 
-/// Entry `i` of a level's table. Checking the bound of every entry of a row doubles the time of the backward pass.
+/// Entry `i` of a level's table. A bounds check per entry doubles the time of the backward pass.
 ///
 /// # Safety
 /// `i` is below the length of `table`.
@@ -228,7 +228,7 @@ pub unsafe fn entry<T>(table: &[T], i: u32) -> &T {
     unsafe { table.get_unchecked(i as usize) }
 }
 
-/// Like [`entry`], to be written.
+/// Mutable version of [`entry`].
 ///
 /// # Safety
 /// `i` is below the length of `table`.
@@ -240,11 +240,11 @@ pub unsafe fn entry_mut<T>(table: &mut [T], i: u32) -> &mut T {
     unsafe { table.get_unchecked_mut(i as usize) }
 }
 
-/// A table of as many bytes does not stay in a second-level cache.
+/// A table of at least this many bytes does not stay in the L2 cache.
 const LARGE: usize = 1 << 20;
 
-/// Asks for the cache lines of the first `n` entries of each of `indices`, so that misses overlap instead of stalling one row
-/// after another. They go to the second-level cache: the first one has no room for them beside what else a block needs.
+/// Prefetches the cache lines of the first `n` entries of each of `indices`, so that misses overlap instead of stalling
+/// one row after another. They go to the L2 cache: L1 has no room for them besides the block's other data.
 #[inline(always)]
 #[allow(unsafe_code)]
 pub fn prefetch<'a, T>(table: &[T], indices: impl Iterator<Item = &'a [u32; BLOCK]>, n: usize) {
@@ -264,8 +264,7 @@ pub fn prefetch<'a, T>(table: &[T], indices: impl Iterator<Item = &'a [u32; BLOC
     let _ = (table, indices, n);
 }
 
-/// Of each of `width` channels the cells along a side of the level that it comes from; levels are given with their output
-/// channels.
+/// For each of `width` channels, the cells per side of its level; levels are given with their output channels.
 pub fn by_channel<'a>(levels: impl Iterator<Item = (f64, &'a [Option<usize>])>, width: usize) -> Vec<f64> {
     let mut cells = vec![0.0; width];
     for (resolution, outputs) in levels {
@@ -274,15 +273,15 @@ pub fn by_channel<'a>(levels: impl Iterator<Item = (f64, &'a [Option<usize>])>, 
     cells
 }
 
-/// A level as WGSL sees it.
+/// A level in WGSL.
 pub struct LevelCode {
     /// A value of type `stage_Level`.
     pub value: String,
-    /// Output channel of each feature, where it is read.
+    /// Output channel of each feature; `None` if unused.
     pub outputs: Vec<Option<usize>>,
 }
 
-/// `stage_forward` and `stage_backward` of an encoder with `width` channels out.
+/// `stage_forward` and `stage_backward` of an encoder with `width` output channels.
 pub fn functions(levels: &[LevelCode], width: usize) -> String {
     let (mut forward, mut backward) = (String::new(), String::new());
     for (l, LevelCode { value, outputs }) in levels.iter().enumerate() {

@@ -1,4 +1,4 @@
-//! Position encoders: grids of features (hash, permutohedral, dense), frequency, identity, concat.
+//! Position encoders: grids of features (hash, permutohedral, dense, B-spline, planes), frequency, identity, concat.
 
 pub mod b_spline_grid;
 pub mod concat;

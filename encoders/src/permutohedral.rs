@@ -1,16 +1,18 @@
 //! Multi-resolution hash of a permutohedral lattice (Rosu and Behnke 2023, PermutoSDF, section 3.1; the lattice is that of Adams
 //! et al. 2010, Fast High-Dimensional Filtering Using the Permutohedral Lattice).
 //!
-//! Points `[n, 3]` in the unit cube to `[n, levels·features]`: on each level the features of the 4 corners of the point's simplex,
-//! weighted by its barycentric coordinates. A hash grid reads 8 corners.
+//! Points `[n, 3]` in the unit cube to `[n, levels·features]`: on each level the features of the 4 corners of the
+//! point's simplex, weighted by its barycentric coordinates. A hash grid reads 8 corners.
 //!
-//! In three dimensions the lattice is the body-centred cubic one. It is the image of the whole numbers under a linear map, and its
-//! simplices are those of the Kuhn triangulation: with `u = s·(y + z, x + z, x + y)`, cell `k = ⌊u⌋` and fractions
-//! `f_a ≥ f_b ≥ f_c`, the corners are `k`, `k + e_a`, `k + e_a + e_b` and `k + (1, 1, 1)`, and their weights `1 − f_a`, `f_a − f_b`,
-//! `f_b − f_c` and `f_c`. So the axes of the lattice are those of the cube; in the publications they are turned.
+//! In three dimensions the lattice is body-centred cubic. It is the image of the integer lattice under a linear map,
+//! and its simplices are those of the Kuhn triangulation: with `u = s·(y + z, x + z, x + y)`, cell `k = ⌊u⌋` and
+//! fractions `f_a ≥ f_b ≥ f_c`, the corners are `k`, `k + e_a`, `k + e_a + e_b` and `k + (1, 1, 1)`, and their weights
+//! `1 − f_a`, `f_a − f_b`, `f_b − f_c` and `f_c`. The axes of the lattice are thus those of the cube; in the
+//! publications they are rotated.
 //!
-//! A level with `r` cells a side has as many vertices a volume as a cubic grid of `r` cells a side: `s = r/∛2`. A level whose
-//! vertices fit the table is indexed directly, a finer one by the hash of Müller et al. 2022, equation 4, of `k`.
+//! A level with `r` cells per side has as many vertices per volume as a cubic grid of `r` cells per side: `s = r/∛2`. A
+//! level whose vertices fit into the table is indexed directly, a finer one by the hash of Müller et al. 2022, equation
+//! 4, of `k`.
 
 use crate::levels::{
     Asked, BLOCK, LevelCode, Table, by_channel, by_features, entry, entry_mut, functions, kernel_of_levels, prefetch,
@@ -32,13 +34,13 @@ use std::ops::Range;
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields, default)]
 pub struct Permutohedral {
-    /// Levels, coarse to fine.
+    /// Number of levels, coarse to fine.
     pub levels: usize,
-    /// Features a level: 1, 2, 4 or 8.
+    /// Features per level: 1, 2, 4 or 8.
     pub features: usize,
-    /// Cells along the cube's side on the coarsest level: of a cubic grid with as many vertices.
+    /// Cells along the cube's side on the coarsest level, for a cubic grid with as many vertices.
     pub base_resolution: u32,
-    /// Resolution of a level over that of the level before.
+    /// Ratio of consecutive levels' resolutions.
     pub growth: f64,
     /// Largest table, as a power of two.
     pub log2_table_size: u32,
@@ -65,30 +67,31 @@ impl EncoderSpec for Permutohedral {
     }
 }
 
-/// Positions are `f32`: a finer lattice than this has no fraction of a cell left to interpolate by.
+/// Positions are `f32`: a finer lattice leaves no fraction of a cell for interpolation.
 const FINEST: f64 = 4_194_304.0;
 
-/// Of the hash, as in the paper of Müller et al.
+/// Primes of the hash, as in the paper of Müller et al.
 const PRIMES: [u32; 3] = [1, 2_654_435_761, 805_459_861];
 
 #[derive(Debug, Clone, PartialEq)]
 struct Level {
     table: Table,
-    /// Cells along the cube's side, of a cubic grid with as many vertices.
+    /// Cells along the cube's side, for a cubic grid with as many vertices.
     resolution: f64,
-    /// `s` of the formula.
+    /// `s` in the formula.
     scale: f64,
-    /// Pairs of vertices along a side, where the level is indexed directly, else 0.
+    /// Pairs of vertices per side if the level is indexed directly, else 0.
     side: u32,
-    /// Entries less one.
+    /// Number of entries minus one.
     last: u32,
 }
 
 impl Level {
     fn new(s: &Permutohedral, number: usize, resolution: f64, first: usize) -> Self {
         let scale = resolution * 0.5f64.cbrt();
-        // A vertex stands at whole numbers X, Y, Z of 1/(2s), all even or all odd. Those of a point's simplex lie in
-        // [−2, 2s + 2], where rounding may have moved the point by a hair; a pair is an even vertex and the odd one after it.
+        // A vertex has integer coordinates X, Y, Z in units of 1/(2s), all even or all odd. Those of a point's simplex
+        // lie in [−2, 2s + 2], because rounding may move the point slightly; a pair is an even vertex and the odd one
+        // after it.
         let side = (((2.0 * scale + 1e-2).ceil() as u64 + 3) >> 1) + 1;
         let (vertices, table) = (2 * u128::from(side).pow(3), 1u64 << s.log2_table_size);
         let direct = vertices <= u128::from(table);
@@ -119,7 +122,7 @@ pub struct PermutohedralStage {
 }
 
 impl PermutohedralStage {
-    /// The stage, or which setting is out of range.
+    /// Builds the stage, or names the setting that is out of range.
     pub fn new(settings: &Permutohedral) -> Result<Self> {
         let s = settings;
         ensure((1..=32).contains(&s.levels), "spec", "levels", s.levels, "1 to 32")?;
@@ -144,11 +147,11 @@ impl PermutohedralStage {
     }
 }
 
-/// Where the rows of a block fall on one level.
+/// Simplices of a block's rows on one level.
 struct Located<R> {
     cell: [[u32; BLOCK]; 3],
     fraction: [[R; BLOCK]; 3],
-    /// How many of the other two fractions come before each.
+    /// Number of other fractions that precede each one.
     rank: [[u32; BLOCK]; 3],
     /// Entry of each corner.
     entry: [[u32; BLOCK]; 4],
@@ -162,7 +165,7 @@ impl<R: Real> Located<R> {
         Self { cell: [whole; 3], fraction: [numbers; 3], rank: [whole; 3], entry: [whole; 4], weight: [numbers; 4] }
     }
 
-    /// Locates rows `at..at + n` of `x`. Points outside the cube count as on its rim, a coordinate that is not a number as 0.
+    /// Locates rows `at..at + n` of `x`. Points outside the cube are clamped to its rim, a NaN coordinate to 0.
     #[inline(always)]
     fn locate<S: Simd>(&mut self, s: S, level: &Level, x: Tile<'_, R>, at: usize, n: usize) {
         let number = |v: f64| V::<S, R>::splat(s, R::of(v));
@@ -171,7 +174,7 @@ impl<R: Real> Located<R> {
         for (d, [a, b]) in [[y, z], [x, z], [x, y]].into_iter().enumerate() {
             let mut i = 0;
             while i < n {
-                // The precise form returns the number where the other side is NaN.
+                // The precise maximum returns the number if the other operand is NaN.
                 let a = load(s, a, i).max_precise(zero).min(one);
                 let b = load(s, b, i).max_precise(zero).min(one);
                 let u = (a + b) * scale;
@@ -181,7 +184,7 @@ impl<R: Real> Located<R> {
                 i += V::<S, R>::LEN;
             }
         }
-        // These loops go over the whole block, even where it has fewer rows: a known length makes them faster.
+        // These loops process the whole block, even if it has fewer rows: a constant length makes them faster.
         let [f, g, h] = &self.fraction;
         for i in 0..BLOCK {
             let (fg, fh, gh) = (u32::from(f[i] >= g[i]), u32::from(f[i] >= h[i]), u32::from(g[i] >= h[i]));
@@ -213,7 +216,7 @@ impl<R: Real> Located<R> {
                     let k = a[i] + u32::from(p[i] < corner);
                     let l = b[i] + u32::from(q[i] < corner);
                     let m = c[i] + u32::from(r[i] < corner);
-                    // Two more than X, Y, Z, so that none is negative.
+                    // X, Y, Z plus 2, so that none is negative.
                     let two = 2 + k + l + m;
                     let (x, y, z) = (two - 2 * k, two - 2 * l, two - 2 * m);
                     let pair = ((x >> 1) * level.side + (y >> 1)) * level.side + (z >> 1);
@@ -223,8 +226,7 @@ impl<R: Real> Located<R> {
         }
     }
 
-    /// Whether each of the first `n` rows is the last one that lies in its simplex before another row lies elsewhere, and how
-    /// many are.
+    /// For each of the first `n` rows, whether it is the last one before a row in another simplex; and their number.
     #[inline(always)]
     fn leaving(&self, n: usize) -> ([bool; BLOCK], usize) {
         let mut leaves = [true; BLOCK];
@@ -246,7 +248,7 @@ impl<R: Real> Located<R> {
         [self.entry[0][i], self.entry[1][i], self.entry[2][i], self.entry[3][i]]
     }
 
-    /// Weights of the corners of row `i`, as [`fours`] has their features.
+    /// Weights of the corners of row `i`, in the layout of [`fours`].
     #[inline(always)]
     fn weights<S: Simd, const F: usize>(&self, s: S, i: usize) -> [R::Four<S>; 8] {
         fours(s, &[[self.weight[0][i]; F], [self.weight[1][i]; F], [self.weight[2][i]; F], [self.weight[3][i]; F]])
@@ -269,7 +271,7 @@ fn fours<S: Simd, R: Real, const F: usize>(s: S, corners: &[[R; F]; 4]) -> [R::F
     all
 }
 
-/// Entry `i` of a level's table, from [`Located::locate`] for that very level.
+/// Entry `i` of a level's table, with `i` from [`Located::locate`] for the same level.
 #[inline(always)]
 #[allow(unsafe_code)]
 fn at<T>(table: &[T], i: u32) -> &T {
@@ -278,7 +280,7 @@ fn at<T>(table: &[T], i: u32) -> &T {
     unsafe { entry(table, i) }
 }
 
-/// Adds `sums`, which stand as in [`fours`], to four entries, one after the other: two of them may be one.
+/// Adds `sums`, in the layout of [`fours`], to four entries, one after the other: two of them may be the same.
 #[inline(always)]
 #[allow(unsafe_code)]
 fn add<R: Real, const F: usize>(grads: &mut [[R; F]], corners: [u32; 4], sums: &[[R; 4]; 8]) {
@@ -304,7 +306,7 @@ impl<R: Real, P: Stored<R>> Forward<'_, R, P> {
     fn features<S: Simd, const F: usize>(mut self, s: S) {
         let mut located = Located::new();
         let mut out = [[R::ZERO; F]; BLOCK];
-        // Entries in halves are made wide a block at a time: a loop over neighbours becomes vector code.
+        // Half-precision entries are widened a block at a time: a loop over neighbours becomes vector code.
         let widen = size_of::<P>() < size_of::<R>();
         let (mut read, mut wide) = ([[[P::default(); F]; 4]; BLOCK], [[[R::ZERO; F]; 4]; BLOCK]);
         for level in &self.stage.levels[self.levels.clone()] {
@@ -355,9 +357,9 @@ impl<R: Real, P: Stored<R>> Forward<'_, R, P> {
     }
 }
 
-/// Adds to a level's gradients what the first `n` of the rows at `located` are worth. Rows that lie in one simplex one after
-/// another are summed first, where these are many: then the entries are read and written once for all of them, and no row
-/// waits for what the one before has written.
+/// Adds the contributions of the first `n` rows at `located` to a level's gradients. If many consecutive rows share a
+/// simplex, they are summed first: the entries are then read and written once for all of them, and no row waits for the
+/// writes of the previous one.
 #[inline(always)]
 fn scatter<S: Simd, R: Real, const F: usize>(
     s: S,
@@ -427,13 +429,13 @@ impl<R: Real, P: Stored<R>> Backward<'_, R, P> {
                         let entry = &table[c as usize];
                         (0..F).map(|f| entry[f].value() * dy[i][f]).sum()
                     });
-                    // By a fraction: the corner that it adds to, less the one before.
+                    // With respect to a fraction: the corner that it adds to, minus the one before.
                     let by = [0, 1, 2].map(|d| {
                         let rank = located.rank[d][i] as usize;
                         v[rank + 1] - v[rank]
                     });
                     for d in 0..3 {
-                        // Beyond the rim a position counts as on it, whichever it is.
+                        // Beyond the rim a position is clamped, whatever its value.
                         let x = self.x.channel(d)[first + i];
                         if x >= R::ZERO && x <= R::ONE {
                             dx.channel(d)[first + i] += R::of(level.scale) * (by[(d + 1) % 3] + by[(d + 2) % 3]);
@@ -560,16 +562,16 @@ mod tests {
         PermutohedralStage::new(&settings).unwrap()
     }
 
-    /// Cartesian coordinates of a corner, in `1/(2s)`: see the linear map.
+    /// Cartesian coordinates of a corner, in units of `1/(2s)`; see the linear map.
     fn vertex(located: &Located<f64>, corner: u32) -> [i64; 3] {
         let k = [0, 1, 2].map(|d| i64::from(located.cell[d][0] + u32::from(located.rank[d][0] < corner)));
         let sum: i64 = k.iter().sum();
         k.map(|k| sum - 2 * k)
     }
 
-    /// The lattice is that of Adams et al.: a point is the mean of its simplex' corners, weighted; of all vertices nearby the
-    /// four are those whose Voronoi cells meet in the simplex (edges have the two lengths of that lattice); and every vertex
-    /// of a direct level has an entry of its own.
+    /// The lattice is that of Adams et al.: a point is the weighted mean of its simplex's corners; of all nearby
+    /// vertices the four are those whose Voronoi cells meet in the simplex (edges have the two lengths of that
+    /// lattice); and every vertex of a directly indexed level has its own entry.
     #[test]
     fn simplices_are_those_of_the_body_centred_lattice() {
         let stage = stage(5, 1.7, 12);
@@ -600,7 +602,7 @@ mod tests {
         }
     }
 
-    /// A cube with `r` cells a side has about `r³` vertices, but for those around it.
+    /// A cube with `r` cells per side has about `r³` vertices, not counting those around it.
     #[test]
     fn a_level_has_as_many_vertices_as_a_cubic_grid() {
         let stage = stage(64, 2.0, 24);
@@ -608,7 +610,8 @@ mod tests {
         assert!((1.0..1.08).contains(&(entries / 128f64.powi(3))), "{entries}");
     }
 
-    /// Corners of the cube, points beyond it and rounding near whole cells stay inside direct tables, with weights of one.
+    /// Corners of the cube, points beyond it and rounding near integer cells stay inside direct tables, with weights
+    /// that sum to one.
     #[test]
     fn the_rim_stays_inside_the_table() {
         for (base, growth) in [(2, 1.26), (25, 1.14), (63, 1.25), (50, 1.15), (30, 2.05)] {

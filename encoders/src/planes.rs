@@ -1,11 +1,14 @@
-//! Features of planes, on several levels: points `[n, 3]` in the unit cube to features, from tables of `R²` numbers instead of
-//! `R³`. Each of the three orientations has a plane `P(a, b)`, read bilinearly at two coordinates.
+//! Features on planes, at several levels: points `[n, 3]` in the unit cube to features, from tables of `R²` numbers
+//! instead of `R³`. Each of the three orientations has a plane `P(a, b)`, interpolated bilinearly at two coordinates.
 //!
-//! - `form = "vector-matrix"` (Chen et al. 2022, TensoRF, section 4.1, VM decomposition): of each orientation
-//!   `y = P(a, b)·L(c)`, where `L` is a line, read linearly at the third coordinate. `3·features` channels a level.
-//! - `form = "tri-plane"` (Chan et al. 2022, EG3D, section 4.1): `y = P(x, y) + P(x, z) + P(y, z)`. `features` channels a level.
+//! - `form = "vector-matrix"` (Chen et al. 2022, TensoRF, section 4.1, VM decomposition): for each orientation
+//!   `y = P(a, b)·L(c)`, where `L` is a line, interpolated linearly at the third coordinate. `3·features` channels per
+//!   level.
+//! - `form = "tri-plane"` (Chan et al. 2022, EG3D, section 4.1): `y = P(x, y) + P(x, z) + P(y, z)`. `features` channels
+//!   per level.
 //!
-//! A level with `r` cells a side has `r + 1` nodes along each axis, at the corners of its cells, which fill the cube exactly.
+//! A level with `r` cells per side has `r + 1` nodes along each axis, at the corners of its cells, which fill the cube
+//! exactly.
 
 use crate::levels::{
     Asked, BLOCK, Cells, LevelCode, Table, by_channel, by_features, functions, kernel_of_levels, start, stretch,
@@ -22,7 +25,7 @@ use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 use std::ops::Range;
 
-/// What becomes of the planes of a level.
+/// How the planes of a level are combined.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
 #[serde(rename_all = "kebab-case")]
 pub enum Form {
@@ -36,15 +39,15 @@ pub enum Form {
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields, default)]
 pub struct Planes {
-    /// What becomes of the planes of a level.
+    /// How the planes of a level are combined.
     pub form: Form,
-    /// Levels, coarse to fine.
+    /// Number of levels, coarse to fine.
     pub levels: usize,
-    /// Features a plane: 1, 2, 4 or 8.
+    /// Features per plane: 1, 2, 4 or 8.
     pub features: usize,
     /// Cells along the cube's side on the coarsest level.
     pub base_resolution: u32,
-    /// Resolution of a level over that of the level before, at least 1. Resolutions are rounded to whole cells.
+    /// Ratio of consecutive levels' resolutions, at least 1. Resolutions are rounded to whole cells.
     pub growth: f64,
 }
 
@@ -69,10 +72,10 @@ impl EncoderSpec for Planes {
     }
 }
 
-/// The finest level.
+/// Resolution limit of the finest level.
 const FINEST: f64 = 8192.0;
 
-/// The two axes of each plane, and that of its line.
+/// The two axes of each plane, and the axis of its line.
 const AXES: [[usize; 3]; 3] = [[0, 1, 2], [0, 2, 1], [1, 2, 0]];
 
 /// A plane, and its line if it has one: one orientation of one level.
@@ -106,7 +109,7 @@ pub struct PlanesStage {
 }
 
 impl PlanesStage {
-    /// The stage, or which setting is out of range.
+    /// Builds the stage, or names the setting that is out of range.
     pub fn new(settings: &Planes) -> Result<Self> {
         let s = settings;
         ensure((1..=32).contains(&s.levels), "spec", "levels", s.levels, "1 to 32")?;
@@ -133,12 +136,12 @@ impl PlanesStage {
         Ok(stage)
     }
 
-    /// Numbers of a plane with so many nodes along its axes.
+    /// Numbers in a plane with `nodes` nodes per axis.
     fn plane(&self, nodes: usize) -> usize {
         nodes * nodes * self.features
     }
 
-    /// Numbers of a plane and its line, if it has one.
+    /// Numbers in a plane and its line, if it has one.
     fn factor(&self, nodes: usize) -> usize {
         let line = if self.form == Form::VectorMatrix { nodes * self.features } else { 0 };
         self.plane(nodes) + line
@@ -149,19 +152,19 @@ impl PlanesStage {
     }
 }
 
-/// A place on a plane and its line: entries of the plane's four corners around it and their weights, entry of the line's first
-/// node and the weights of both.
+/// A position on a plane and its line: entries and weights of the plane's four surrounding corners, entry of the line's
+/// first node and the weights of both nodes.
 struct Place<R> {
     corners: [usize; 4],
     weights: [R; 4],
     node: usize,
     line: [R; 2],
-    /// Of both coordinates on the plane: the weights of the node and of the next.
+    /// For both coordinates on the plane: the weights of the node and of the next one.
     plane: [[R; 2]; 2],
 }
 
 impl<R: Real> Place<R> {
-    /// That of row `i`, on a plane of this orientation with so many nodes a side.
+    /// The position of row `i`, on a plane of this orientation with `nodes` nodes per side.
     #[inline(always)]
     fn of(at: &Cells<R>, orientation: usize, nodes: usize, i: usize) -> Self {
         let [a, b, c] = AXES[orientation];
@@ -178,7 +181,7 @@ impl<R: Real> Place<R> {
     }
 }
 
-/// Of every corner of a cell of a plane.
+/// The weights of the corners of a plane's cell.
 #[inline(always)]
 fn products<R: Real>(a: [R; 2], b: [R; 2]) -> [R; 4] {
     [a[0] * b[0], a[0] * b[1], a[1] * b[0], a[1] * b[1]]
@@ -244,7 +247,7 @@ impl<R: Real, P: Stored<R>> Forward<'_, R, P> {
                             out[i] = value;
                         }
                     }
-                    // Of planes that are added the last writes the sum.
+                    // The last plane of a sum writes the result.
                     factor.table.put(&out, &mut self.y, at, n);
                 }
             }
@@ -287,7 +290,7 @@ impl<R: Real, P: Stored<R>> Backward<'_, R, P> {
                 cells.locate(s, level.cells, self.x, at, n);
                 for i in 0..n {
                     let place = Place::of(&cells, factor.orientation, nodes, i);
-                    // What the plane's value is worth.
+                    // The gradient with respect to the plane's value.
                     let mut worth = dy[i];
                     if lines {
                         let along = on_line(line, &place, place.line);
@@ -366,7 +369,7 @@ impl Stage for PlanesStage {
         all
     }
 
-    /// Planes start next to nothing, like the features of other grids; lines start as 1, so that planes learn.
+    /// Planes are initialized near 0, like the features of other grids; lines start at 1, so that planes learn.
     fn init(&self, seed: u64, params: &mut [f32]) {
         start(seed, params);
         for (level, factor) in self.factors() {
@@ -386,7 +389,7 @@ impl Stage for PlanesStage {
         Some(Halves::of(self))
     }
 
-    /// A plane and its line a worker.
+    /// A plane and its line per worker.
     fn partition(&self) -> Vec<Range<usize>> {
         self.factors().map(|(_, f)| f.table.range()).collect()
     }
@@ -394,7 +397,7 @@ impl Stage for PlanesStage {
     fn wgsl(&self) -> Option<Fragment> {
         let mut levels = vec![];
         for level in &self.levels {
-            // Planes that are added are one level there.
+            // Planes that are summed count as one level there.
             let each = if self.form == Form::VectorMatrix { 1 } else { 3 };
             for factor in level.factors.iter().step_by(each) {
                 let first = u32::try_from(factor.table.start).ok()?;
@@ -456,7 +459,7 @@ impl Encoder for PlanesStage {
 mod tests {
     use super::*;
 
-    /// Nodes stand where the shape says, and planes meet the axes that the formula names.
+    /// Nodes are where the shape says, and planes use the axes in the formula.
     #[test]
     fn planes_and_lines_follow_the_formula() {
         let x = [0.75, 0.5, 0.125f64];

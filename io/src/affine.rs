@@ -1,20 +1,20 @@
-//! Voxel indices to millimetres, between the conventions of the file formats.
+//! Affine maps from voxel indices to millimetres, converted between the conventions of the file formats.
 //!
-//! The program keeps NIfTI's axes, which point to the patient's right, front and head (RAS). DICOM's and MetaImage's
-//! point to the left, back and head (LPS): the first two coordinates change their sign.
+//! conefield uses NIfTI's axes, which point to the patient's right, front and head (RAS). The axes of DICOM and
+//! MetaImage point to the left, back and head (LPS): the first two coordinates change sign.
 
 use conefield_core::geometry::{VoxelGrid, cross, dot, norm};
 use conefield_core::parts::Voxels;
 pub(crate) use conefield_core::scan::Affine;
 
-/// From RAS to LPS, or back.
+/// Converts RAS to LPS, or back.
 pub(crate) fn flip(affine: Affine) -> Affine {
-    // `0.0 - x` and not `-x`: a zero must not become −0, which files would show.
+    // `0.0 - x` and not `-x`: negation would turn 0 into −0, which shows in files.
     let [x, y, z, w] = affine;
     [x.map(|v| 0.0 - v), y.map(|v| 0.0 - v), z, w]
 }
 
-/// An affine whose columns are `axes`, the steps from one voxel to the next along x, y and z, and `first`, the centre
+/// The affine with the columns `axes`, the steps from one voxel to the next along x, y and z, and `first`, the centre
 /// of the first voxel.
 pub(crate) fn from_columns(axes: [[f64; 3]; 3], first: [f64; 3]) -> Affine {
     let [a, b, c] = axes;
@@ -38,9 +38,9 @@ pub(crate) fn is_regular(affine: &Affine) -> bool {
     affine.iter().flatten().all(|x| x.is_finite()) && volume.is_finite() && volume != 0.0
 }
 
-/// The affine to write for `voxels` into the file `place`, and whether it is their own: one whose voxel sizes
-/// are not the grid's would make the file contradict itself and gives way to one that puts the grid's centre at
-/// `grid.center`.
+/// The affine to write for `voxels` into the file `place`, and whether it is the volume's own. An affine whose voxel
+/// sizes differ from the grid's would make the file contradict itself; it is replaced by one that puts the grid's
+/// centre at `grid.center`.
 pub(crate) fn of(voxels: &dyn Voxels, place: &str) -> (Affine, bool) {
     let grid = voxels.grid();
     match voxels.affine() {
@@ -54,7 +54,7 @@ pub(crate) fn of(voxels: &dyn Voxels, place: &str) -> (Affine, bool) {
     (centred(&grid), false)
 }
 
-/// Whether the affine's columns are as long as the voxels, to the precision of files.
+/// Whether the affine's columns have the lengths `wanted`, to the precision of files.
 fn fits(affine: &Affine, wanted: [f64; 3]) -> bool {
     spacing(affine).iter().zip(wanted).all(|(n, s)| (n - s).abs() <= 1e-3 * s)
 }

@@ -1,4 +1,4 @@
-//! Writing so that the final name never holds half a file.
+//! Atomic writes: a file or folder appears under its final name only when it is complete.
 
 use crate::lease;
 use crate::lock::{self, Held};
@@ -10,19 +10,18 @@ use std::io::{BufWriter, Write};
 use std::path::{Path, PathBuf};
 use std::sync::{Mutex, PoisonError};
 
-/// How the names of unfinished files begin and end.
+/// Prefix and suffix of the names of unfinished files.
 const UNFINISHED: [&str; 2] = [".conefield-", ".tmp"];
 
-/// What this process is writing under temporary names. Who holds the lock keeps others from beginning.
+/// Temporary paths that this process is writing. Holding the lock keeps others from starting a write.
 static OPEN: Mutex<BTreeSet<PathBuf>> = Mutex::new(BTreeSet::new());
 
-/// Whether a file or folder of this name is one that [`write_atomic`] or [`write_folder_atomic`] had begun when its
-/// process was killed.
+/// Whether `name` is a temporary name of [`write_atomic`] or [`write_folder_atomic`], left when the process was killed.
 pub fn is_unfinished(name: &OsStr) -> bool {
     name.to_str().is_some_and(|n| n.starts_with(UNFINISHED[0]) && n.ends_with(UNFINISHED[1]))
 }
 
-/// Removes what other processes had begun in `folder` when they were killed. What a living one writes is locked and stays.
+/// Removes unfinished files that killed processes left in `folder`. Files of running processes are locked and stay.
 pub fn sweep(folder: &Path) {
     for entry in fs::read_dir(folder).into_iter().flatten().flatten() {
         let path = entry.path();
@@ -30,7 +29,7 @@ pub fn sweep(folder: &Path) {
         if !is_unfinished(&entry.file_name()) || !(kind.is_file() || kind.is_dir()) {
             continue;
         }
-        // Held until it is gone: a process that has just made it sees that and makes another.
+        // The lock is held until the file is gone: a process that has just created it notices and creates another.
         if let Held::Ours(_lock) = lock::hold(&path) {
             let gone = if kind.is_dir() { fs::remove_dir_all(&path) } else { fs::remove_file(&path) };
             if let Err(e) = gone {
@@ -40,7 +39,7 @@ pub fn sweep(folder: &Path) {
     }
 }
 
-/// As [`sweep`], once a folder.
+/// Runs [`sweep`] at most once per folder.
 fn sweep_once(folder: &Path) {
     static SWEPT: Mutex<BTreeSet<PathBuf>> = Mutex::new(BTreeSet::new());
     if SWEPT.lock().unwrap_or_else(PoisonError::into_inner).insert(folder.to_path_buf()) {
@@ -48,7 +47,7 @@ fn sweep_once(folder: &Path) {
     }
 }
 
-/// For the last moment of a process that a signal ends: removes what it is writing, and lets nothing new begin.
+/// Removes the unfinished files of this process and blocks new writes. Called when a signal ends the process.
 pub fn discard_unfinished() {
     let open = OPEN.lock().unwrap_or_else(PoisonError::into_inner);
     for path in open.iter() {
@@ -57,7 +56,7 @@ pub fn discard_unfinished() {
     std::mem::forget(open);
 }
 
-/// A temporary name in [`OPEN`].
+/// A temporary path registered in [`OPEN`].
 struct Noted(PathBuf);
 
 impl Drop for Noted {
@@ -66,7 +65,7 @@ impl Drop for Noted {
     }
 }
 
-/// Makes something under a temporary name in `folder` and locks it, so that no other process takes it for left behind.
+/// Creates something under a temporary name in `folder` and locks it, so that no other process sweeps it.
 fn begin<T>(
     folder: &Path,
     mut make: impl FnMut() -> std::io::Result<T>,
@@ -79,7 +78,7 @@ fn begin<T>(
         open.insert(path(&made).to_path_buf());
         drop(open);
         let noted = Noted(path(&made).to_path_buf());
-        // Another process that swept the folder between the two lines has removed it.
+        // Another process may have swept the folder between these two lines.
         match lock::hold(path(&made)) {
             Held::Ours(lock) => return Ok((made, Some(lock), noted)),
             Held::Unknown if path(&made).exists() => return Ok((made, None, noted)),
@@ -88,25 +87,25 @@ fn begin<T>(
     }
 }
 
-/// Writes a file through `fill`: into a temporary file in the same folder, flushed and synced, then renamed.
+/// Writes a file through `fill`: into a temporary file in the same folder, which is flushed, synced and renamed.
 ///
-/// If `fill` or the system fails, an earlier file of that name is left as it was and the temporary one is removed.
+/// If `fill` or the system fails, an earlier file of that name stays unchanged and the temporary file is removed.
 pub fn write_atomic(path: impl AsRef<Path>, fill: impl FnOnce(&mut dyn Write) -> Result<()>) -> Result<()> {
     let path = path.as_ref();
     let folder = parent(path);
     let at = |e| Error::io(path, e);
-    // A rename over a folder fails on its own, but only after all the work is done.
+    // A rename over a folder fails anyway, but only after all the work is done.
     if path.is_dir() {
         return Err(Error::invalid(path.display().to_string(), "file", "a folder", "a name for a file"));
     }
     let mut options = tempfile::Builder::new();
     options.prefix(UNFINISHED[0]).suffix(UNFINISHED[1]);
-    // Without this the file would be private to its owner, unlike any other that the user makes.
+    // Without this the file would be private to its owner, unlike the user's other files.
     #[cfg(unix)]
     options.permissions(<fs::Permissions as std::os::unix::fs::PermissionsExt>::from_mode(0o666));
     let (file, _lock, _noted) =
         begin(&folder, || options.tempfile_in(&folder), |f| f.path()).map_err(|e| at(without_path(e)))?;
-    // The file itself: errors of its guard speak of the temporary name.
+    // Writes to the file itself: errors of its guard would name the temporary path.
     let mut writer = BufWriter::with_capacity(1 << 20, file.as_file());
     fill(&mut writer)?;
     writer.into_inner().map_err(|e| at(e.into_error()))?;
@@ -116,15 +115,15 @@ pub fn write_atomic(path: impl AsRef<Path>, fill: impl FnOnce(&mut dyn Write) ->
     Ok(())
 }
 
-/// Writes `text` as [`write_atomic`] does.
+/// Writes `text` like [`write_atomic`].
 pub fn write_text_atomic(path: impl AsRef<Path>, text: &str) -> Result<()> {
     let path = path.as_ref();
     write_atomic(path, |w| w.write_all(text.as_bytes()).map_err(|e| Error::io(path, e)))
 }
 
-/// Fills a temporary folder beside `folder` and exchanges the two in one step; what stood there before goes away only then.
+/// Fills a temporary folder beside `folder` and exchanges the two in one step; only then is the earlier folder removed.
 ///
-/// Whether an earlier folder may be replaced at all is for the caller to check.
+/// The caller checks whether an earlier folder may be replaced.
 pub fn write_folder_atomic(folder: impl AsRef<Path>, fill: impl FnOnce(&Path) -> Result<()>) -> Result<()> {
     let folder = folder.as_ref();
     let beside = parent(folder);
@@ -143,10 +142,10 @@ pub fn write_folder_atomic(folder: impl AsRef<Path>, fill: impl FnOnce(&Path) ->
     sync_folder(new.path());
     if folder.symlink_metadata().is_err() {
         fs::rename(new.path(), folder).map_err(at)?;
-        // The temporary name is gone: nothing is left for the guard to remove.
+        // The temporary name is gone, so the guard has nothing to remove.
         let _ = new.keep();
     } else if exchange(new.path(), folder).map_err(at)? {
-        // The temporary name is that of the earlier folder now, which the guard removes.
+        // The temporary name now belongs to the earlier folder, which the guard removes.
     } else {
         lease::replace_in_two_steps(new.path(), folder)?;
         let _ = new.keep();
@@ -155,7 +154,7 @@ pub fn write_folder_atomic(folder: impl AsRef<Path>, fill: impl FnOnce(&Path) ->
     Ok(())
 }
 
-/// Exchanges what two names stand for, in one step; false where the system cannot do that.
+/// Exchanges two names in one step; false where the system cannot do that.
 pub(crate) fn exchange(a: &Path, b: &Path) -> std::io::Result<bool> {
     #[cfg(any(target_os = "linux", target_os = "android", target_vendor = "apple"))]
     {
@@ -174,7 +173,7 @@ pub(crate) fn exchange(a: &Path, b: &Path) -> std::io::Result<bool> {
     }
 }
 
-/// An error about a file in the temporary folder `from`, told with the name that the folder would have had.
+/// An error about a file in the temporary folder `from`, reported under the final name `to`.
 fn renamed(e: Error, from: &Path, to: &Path) -> Error {
     match e {
         Error::Io { path, source } => {
@@ -189,7 +188,7 @@ fn renamed(e: Error, from: &Path, to: &Path) -> Error {
     }
 }
 
-/// The system's own words: `tempfile` adds the temporary name, which means nothing to a user.
+/// The system's own message: `tempfile` adds the temporary name, which means nothing to a user.
 fn without_path(e: std::io::Error) -> std::io::Error {
     let text = e.to_string();
     match text.split_once(" at path ") {
@@ -206,7 +205,7 @@ pub(crate) fn parent(path: &Path) -> PathBuf {
     }
 }
 
-/// Makes a rename last through a power cut where the system can do that; the data itself is synced already.
+/// Syncs the folder, so that a rename survives a power cut where the system supports that. The data is already synced.
 pub(crate) fn sync_folder(folder: &Path) {
     if cfg!(unix)
         && let Ok(f) = File::open(folder)

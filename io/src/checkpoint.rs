@@ -1,4 +1,4 @@
-//! Checkpoints: safetensors with a format version and a checksum of all that they hold: text, names, shapes and values.
+//! Checkpoints: safetensors with a format version and a checksum over all text, names, shapes and values.
 
 use crate::weights::{read_weights, write_weights};
 use conefield_core::arena::Weights;
@@ -7,15 +7,15 @@ use flate2::Crc;
 use std::collections::BTreeMap;
 use std::path::Path;
 
-/// What a checkpoint calls itself.
+/// The format name in a checkpoint.
 const FORMAT: &str = "conefield-checkpoint";
-/// Changes whenever an older reader would misread a newer file.
+/// Incremented whenever an older reader would misread a newer file.
 const VERSION: &str = "3";
-/// Where the checksum stands.
+/// The key of the checksum.
 const SUM: &str = "crc32";
 
-/// Writes a checkpoint: named `f32` tensors (name, shape, values in C order) and free text. An earlier one of that
-/// name stays whole until the new one is on the disk.
+/// Writes a checkpoint: named `f32` tensors (name, shape, values in C order) and free text. An earlier file of that
+/// name stays intact until the new one is on disk.
 pub fn write_checkpoint(
     path: impl AsRef<Path>,
     tensors: &[(impl AsRef<str>, impl AsRef<[usize]>, &[f32])],
@@ -31,7 +31,7 @@ pub fn write_checkpoint(
     write_weights(path, tensors, &text)
 }
 
-/// Reads a checkpoint. Refuses other files, other versions, and values that are not those that were written.
+/// Reads a checkpoint. Refuses other files, other versions and values that fail the checksum.
 pub fn read_checkpoint(path: impl AsRef<Path>) -> Result<Weights> {
     let path = path.as_ref();
     let mut file = read_weights(path)?;
@@ -52,7 +52,8 @@ pub fn read_checkpoint(path: impl AsRef<Path>) -> Result<Weights> {
     Ok(file)
 }
 
-/// Over every text and tensor, each after its length: nothing can move from one into the next.
+/// Checksum over every text and tensor. Each is preceded by its length, so that nothing can move from one into the
+/// next.
 fn checksum<'a>(
     text: &BTreeMap<String, String>,
     tensors: impl Iterator<Item = (&'a str, &'a [usize], &'a [f32])>,

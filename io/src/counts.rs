@@ -1,8 +1,8 @@
-//! Raw counts to line integrals: arithmetic only, no files.
+//! Conversion of raw counts to line integrals: arithmetic only, no files.
 //!
-//! Beer and Lambert: of `I0` photons `I = I0·exp(−∫μ dl)` arrive, so that `A = ∫μ dl = −ln(I/I0)`. A detector adds a
-//! dark value `d` to what it counts and each pixel answers by its own factor, which the flat field `f` (a view
-//! without object) holds: `A = −ln((I − d)/(f − d))`.
+//! Beer-Lambert law: of `I0` photons `I = I0·exp(−∫μ dl)` arrive, so that `A = ∫μ dl = −ln(I/I0)`. A detector adds a
+//! dark value `d` to its counts, and each pixel has its own gain, which the flat field `f` (a view without object)
+//! records: `A = −ln((I − d)/(f − d))`.
 
 use conefield_core::error::ensure;
 use conefield_core::{Error, Result};
@@ -14,59 +14,58 @@ use ndarray::parallel::prelude::*;
 use ndarray::{Array2, Array3, ArrayView2, Axis, Zip};
 use serde::Serialize;
 
-/// With more bad pixels than this share the fields are wrong, not the detector.
+/// If a larger share of pixels is bad, the fields are wrong, not the detector.
 const MOST_BAD: f64 = 0.2;
-/// With more clamped values than this share there is no picture.
+/// If a larger share of values is clamped, the image is unusable.
 const MOST_CLAMPED: f64 = 0.5;
 
-/// Where the counts of the open beam come from. All are as the detector gives them, dark value included.
+/// Source of the open-beam counts. All are as the detector reports them, dark value included.
 #[derive(Debug, Clone, PartialEq)]
 pub enum OpenBeam {
     /// A flat field, `[row, column]`.
     Flat(Array2<f32>),
     /// One number for every pixel and view.
     Number(f64),
-    /// Estimated for each view from its border: the 85th percentile of the medians of 16 pieces of it. Three of
+    /// Estimated per view from its border: the 85th percentile of the medians of 16 border segments. At least three of
     /// them must show air.
     Air,
 }
 
-/// How counts become line integrals.
+/// Settings of the conversion from counts to line integrals.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Correction {
     /// The open beam.
     pub open: OpenBeam,
-    /// What the detector shows without a beam, `[row, column]`; 0 if `None`.
+    /// Counts without a beam, `[row, column]`; 0 if `None`.
     pub dark: Option<Array2<f32>>,
-    /// Counts above dark at or below this are taken for this, in the unit of the counts. `None`: 1, or a ten
-    /// thousandth of the open beam if that is less (counts that were scaled to 0 to 1).
+    /// Counts above dark at or below this floor are raised to it, in the unit of the counts. `None`: 1, or 1/10000 of
+    /// the open beam if that is less (counts scaled to 0 to 1).
     pub floor: Option<f64>,
 }
 
-/// What the conversion met.
+/// Statistics of the conversion.
 #[derive(Debug, Clone, PartialEq, Serialize)]
 pub struct CountsReport {
     /// Counts of the open beam above dark, `[lowest, median, highest]` over pixels (flat) or views (air).
     pub open_beam: [f64; 3],
-    /// The floor that held.
+    /// The floor used.
     pub floor: f64,
-    /// Share of values at or below the floor, of the pixels that are not bad.
+    /// Share of good pixels' values at or below the floor.
     pub clamped: f64,
-    /// Pixels that the flat and dark fields show to be dead or hot.
+    /// Dead or hot pixels according to the flat and dark fields.
     pub bad_by_fields: usize,
-    /// Pixels that stand out from their neighbours in nearly every view.
+    /// Pixels that differ from their neighbours in nearly every view.
     pub bad_by_outliers: usize,
-    /// Share of pixels that were interpolated from neighbours: the two above over all.
+    /// Share of pixels interpolated from neighbours: the two above, relative to all pixels.
     pub bad: f64,
 }
 
-/// Converts `counts` (`[view, row, column]`, in place) to line integrals. `place` is what errors name.
+/// Converts `counts` (`[view, row, column]`) to line integrals in place. Errors name `place`.
 ///
-/// Dead and hot pixels are those that the fields show (response below a tenth or above three times the median, dark
-/// value above half the median response) and those that stand out from their neighbours in nine of ten views; they
-/// get the mean of the good pixels around them. Refuses fields of another shape than the views, values that are not
-/// finite, an open beam or a floor that is not positive, more than a fifth bad pixels and more than half clamped
-/// values.
+/// Pixels are bad if the fields show it (response below a tenth or above three times the median, dark value above half
+/// the median response) or if they stand out from their neighbours in nine of ten views. They get the mean of the good
+/// pixels around them. Refuses fields whose shape differs from the views', values that are not finite, an open beam or
+/// a floor that is not positive, more than a fifth bad pixels and more than half clamped values.
 pub fn line_integrals(
     counts: Array3<f32>,
     correction: &Correction,
@@ -96,7 +95,7 @@ pub fn line_integrals(
     let expected = format!("above 0 and below the open beam, {mid} counts above dark");
     ensure(floor > 0.0 && floor < mid, place, "floor", floor, expected)?;
 
-    // Without a flat field every pixel answers alike. A dead pixel's response would only make infinities.
+    // Without a flat field every pixel has the same response. A dead pixel's response would only produce infinities.
     let response = response.map(|r| r.mapv(|x| x.max(floor))).unwrap_or_else(|| Array2::ones((rows, columns)));
     values.axis_iter_mut(Axis(0)).into_par_iter().zip(&open).for_each(|(mut view, &open)| {
         Zip::from(&mut view).and(&response).for_each(|x, &r| *x = (open * r / x.max(floor)).ln());
@@ -151,15 +150,15 @@ fn check_counts(place: &str, counts: &Array3<f32>) -> Result<()> {
     }
 }
 
-/// The flat field above dark, `[row, column]`, if there is one.
+/// The flat field minus dark, `[row, column]`, if there is one.
 fn response(place: &str, correction: &Correction, detector: [usize; 2]) -> Result<Option<Array2<f32>>> {
     let OpenBeam::Flat(flat) = &correction.open else { return Ok(None) };
     check_field(place, "flat", flat, detector)?;
     Ok(Some(correction.dark.as_ref().map_or_else(|| flat.clone(), |d| flat - d)))
 }
 
-/// The open beam above dark, one number a view: 1 where the flat field holds a number a pixel, 0 where only the border
-/// tells.
+/// The open beam above dark, one number per view: 1 if the flat field has a number per pixel, 0 if it must be estimated
+/// from the border.
 fn open_beam(place: &str, correction: &Correction, views: usize) -> Result<Vec<f32>> {
     match &correction.open {
         OpenBeam::Flat(_) => Ok(vec![1.0; views]),
@@ -172,7 +171,7 @@ fn open_beam(place: &str, correction: &Correction, views: usize) -> Result<Vec<f
     }
 }
 
-/// What the border of each view shows, `bad` pixels left out.
+/// The open beam of each view, estimated from its border without the `bad` pixels.
 fn open_beam_of_air(place: &str, values: &Array3<f32>, bad: &Array2<bool>) -> Result<Vec<f32>> {
     let expected = "light at the border: with nothing there, give I0 as a number or a flat field";
     let of_view = |(v, view): (usize, ArrayView2<f32>)| {
@@ -183,11 +182,11 @@ fn open_beam_of_air(place: &str, values: &Array3<f32>, bad: &Array2<bool>) -> Re
     values.axis_iter(Axis(0)).enumerate().map(of_view).collect()
 }
 
-/// How many line integrals come from counts at or below `floor`, `bad` pixels left out.
+/// Number of line integrals from counts at or below `floor`, without the `bad` pixels.
 fn clamped(values: &Array3<f32>, open: &[f32], response: &Array2<f32>, bad: &Array2<bool>, floor: f32) -> usize {
     let of_view = |(view, &open): (ArrayView2<f32>, &f32)| {
         let mut n = 0usize;
-        // Only what was clamped comes out as exactly this.
+        // Only clamped counts give exactly this value.
         Zip::from(&view)
             .and(response)
             .and(bad)

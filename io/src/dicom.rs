@@ -1,9 +1,9 @@
 //! A CT series: a folder of DICOM files, one slice each.
 //!
-//! `dicom-object` reads the elements. What surrounds it is here: [`lengths`] refuses files whose elements claim more
-//! than the file holds before they are read, [`slice`](mod@slice) takes out what a volume needs, [`pixels`] unpacks
-//! the values (the decoders of `dicom-pixeldata` index past the end of damaged data and panic), and this module puts
-//! the slices in order.
+//! `dicom-object` reads the elements. This crate adds the rest: [`lengths`] refuses files whose elements claim more
+//! than the file holds before they are read, [`slice`](mod@slice) extracts what a volume needs, [`pixels`] decodes the
+//! values (the decoders of `dicom-pixeldata` index past the end of damaged data and panic), and this module sorts the
+//! slices.
 
 mod lengths;
 mod pixels;
@@ -21,7 +21,7 @@ use std::collections::BTreeMap;
 use std::io::Read;
 use std::path::{Path, PathBuf};
 
-/// Whether `head`, the start of a file, carries DICOM's mark.
+/// Whether `head`, the start of a file, contains DICOM's magic bytes.
 pub(crate) fn is_header(head: &[u8]) -> bool {
     head.get(128..132) == Some(b"DICM".as_slice())
 }
@@ -31,7 +31,7 @@ pub(crate) fn is_series(folder: &Path) -> bool {
     files(folder).is_ok_and(|all| all.iter().any(|p| is_dicom(p).unwrap_or(false)))
 }
 
-/// Reads the one series of `folder`; subfolders are left alone.
+/// Reads the one series in `folder`; subfolders are ignored.
 ///
 /// x runs along the rows of a slice, y down its columns, z along the normal of both. Values are rescaled (Hounsfield
 /// units in a CT), padding as well. The affine is RAS, in mm; `grid.center` is `[0, 0, 0]`.
@@ -40,7 +40,7 @@ pub(crate) fn read(folder: &Path) -> Result<Volume> {
     assemble(&place, slices(folder)?)
 }
 
-/// How many voxels [`read`] gives, from the headers of the slices.
+/// Number of voxels that [`read`] returns, from the headers of the slices.
 pub(crate) fn voxels(folder: &Path) -> Result<u64> {
     Ok(slices(folder)?.iter().map(|s| s.rows as u64 * s.columns as u64).sum())
 }
@@ -70,7 +70,7 @@ fn slices(folder: &Path) -> Result<Vec<Slice>> {
     Ok(slices)
 }
 
-/// The regular files of `folder` by name.
+/// The regular files of `folder`, sorted by name.
 pub(crate) fn files(folder: &Path) -> Result<Vec<PathBuf>> {
     let io = |e| Error::io(folder, e);
     let mut all = Vec::new();
@@ -131,7 +131,7 @@ fn assemble(place: &str, mut slices: Vec<Slice>) -> Result<Volume> {
     Ok(Volume { data, grid, affine: Some(affine::flip(lps)) })
 }
 
-/// Refuses slices at one place, gaps and steps that differ by a tenth; warns of those that differ by a hundredth.
+/// Refuses coincident slices, gaps and steps that differ by a tenth; warns if steps differ by a hundredth.
 fn even(place: &str, slices: &[Slice], normal: [f64; 3]) -> Result<()> {
     let steps: Vec<f64> = slices.windows(2).map(|p| dot(sub(p[1].position, p[0].position), normal)).collect();
     let mut sorted = steps.clone();
@@ -140,7 +140,7 @@ fn even(place: &str, slices: &[Slice], normal: [f64; 3]) -> Result<()> {
     let mut missing = Vec::new();
     for (pair, &step) in slices.windows(2).zip(&steps) {
         let names = format!("{} and {}", pair[0].name(), pair[1].name());
-        // Files give positions to a micrometre or so.
+        // Files give positions to about a micrometre.
         if step < 1e-3 {
             let found = format!("{:?} in {names}", pair[0].position);
             return Err(Error::invalid(place, "ImagePositionPatient", found, "another position for every slice"));
@@ -170,7 +170,7 @@ fn even(place: &str, slices: &[Slice], normal: [f64; 3]) -> Result<()> {
     Ok(())
 }
 
-/// Refuses a stack that is sheared by more than half a pixel (a tilted gantry): the voxels would be no boxes.
+/// Refuses a stack that is sheared by more than half a pixel (a tilted gantry): its voxels would not be boxes.
 fn upright(place: &str, first: &Slice, last: &Slice, normal: [f64; 3]) -> Result<()> {
     let way = sub(last.position, first.position);
     let along = dot(way, normal);

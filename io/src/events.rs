@@ -1,7 +1,8 @@
-//! TensorBoard's event file, out: curves and pictures of a run while it goes on.
+//! Writer of TensorBoard's event file: curves and images of a run while it goes on.
 //!
-//! A file of TFRecords (length, masked CRC-32C of it, data, masked CRC-32C of that), each an `Event` in protocol buffers' encoding,
-//! of which a few fields are enough. Source: TensorFlow's `record_writer`, `event.proto` and `summary.proto`.
+//! The file is a sequence of TFRecords (length, masked CRC-32C of it, data, masked CRC-32C of that), each an `Event`
+//! encoded as a protocol buffer, of which a few fields suffice. Source: TensorFlow's `record_writer`, `event.proto` and
+//! `summary.proto`.
 
 use conefield_core::{Error, Result};
 use std::fs::File;
@@ -9,14 +10,14 @@ use std::io::Write;
 use std::path::{Path, PathBuf};
 use std::time::{SystemTime, UNIX_EPOCH};
 
-/// An event file that grows.
+/// An event file open for appending.
 pub struct EventFile {
     path: PathBuf,
     file: File,
 }
 
 impl EventFile {
-    /// Begins the file `path` anew. TensorBoard looks for names with `tfevents` in them.
+    /// Creates the file `path`, replacing an earlier one. TensorBoard looks for names that contain `tfevents`.
     pub fn create(path: impl AsRef<Path>) -> Result<Self> {
         let path = path.as_ref().to_path_buf();
         let file = File::create(&path).map_err(|e| Error::io(&path, e))?;
@@ -27,10 +28,11 @@ impl EventFile {
         Ok(new)
     }
 
-    /// Adds the numbers `values` after `step`, each a point of the curve of its name. Those that are not finite are left out.
+    /// Adds the numbers `values` at `step`, each a point on the curve of its name. Values that are not finite are
+    /// skipped.
     pub fn scalars<'a>(&mut self, step: u64, values: impl IntoIterator<Item = (&'a str, f64)>) -> Result<()> {
         let value = |(name, x): (&str, f64)| {
-            // A simple_value is field 2, of 32 bits.
+            // simple_value is field 2, 32 bits.
             let number = [vec![0x15], (x as f32).to_le_bytes().to_vec()].concat();
             bytes_field(1, &[bytes_field(1, name.as_bytes()), number].concat())
         };
@@ -38,15 +40,15 @@ impl EventFile {
         if summary.is_empty() { Ok(()) } else { self.summary(step, &summary) }
     }
 
-    /// Adds the picture `png`, named `name`, after `step`. Nothing happens if it is no PNG.
+    /// Adds the image `png`, named `name`, at `step`. Does nothing if it is not a PNG.
     pub fn picture(&mut self, step: u64, name: &str, png: &[u8]) -> Result<()> {
-        // Width and height stand in the first chunk.
+        // Width and height are in the first chunk.
         let Some([_, _, _, _, a, b, c, d, e, f, g, h]) = png.get(12..24).and_then(|s| <[u8; 12]>::try_from(s).ok())
         else {
             return Ok(());
         };
         let [width, height] = [[a, b, c, d], [e, f, g, h]].map(|x| u64::from(u32::from_be_bytes(x)));
-        // Of the colour space, 3 is RGB.
+        // Colour space 3 is RGB.
         let image = [number_field(1, height), number_field(2, width), number_field(3, 3), bytes_field(4, png)];
         let value = [bytes_field(1, name.as_bytes()), bytes_field(4, &image.concat())].concat();
         self.summary(step, &bytes_field(1, &value))
@@ -60,7 +62,7 @@ impl EventFile {
     fn write(&mut self, event: &[u8]) -> Result<()> {
         let length = (event.len() as u64).to_le_bytes();
         let [head, tail] = [&length[..], event].map(|b| masked(crc32c(b)).to_le_bytes());
-        // In one piece, so that a reader meets no half record.
+        // Written in one piece, so that a reader never sees half a record.
         let record = [&length[..], &head, event, &tail].concat();
         self.file.write_all(&record).map_err(|e| Error::io(&self.path, e))
     }
@@ -98,7 +100,7 @@ fn crc32c(bytes: &[u8]) -> u32 {
     !bytes.iter().fold(!0, |crc, b| (0..8).fold(crc ^ u32::from(*b), |crc, _| step(crc)))
 }
 
-/// As records have it, so that the CRC of data that holds a CRC stays good.
+/// Masked as in TFRecords, so that data which contains a CRC still has a sound CRC.
 fn masked(crc: u32) -> u32 {
     crc.rotate_right(15).wrapping_add(0xa282_ead8)
 }
@@ -132,7 +134,7 @@ mod tests {
             let word = |at: usize| u32::from_le_bytes(bytes[at..at + 4].try_into().unwrap());
             assert_eq!(word(at + 8), masked(crc32c(&bytes[at..at + 8])));
             assert_eq!(word(at + 12 + n), masked(crc32c(&bytes[at + 12..at + 12 + n])));
-            // Behind the time.
+            // The bytes after the time.
             events.push(bytes[at + 12 + 9..at + 12 + n].to_vec());
             at += 16 + n;
         }

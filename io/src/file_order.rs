@@ -1,5 +1,5 @@
-//! The order in which files store voxels: x fastest in NIfTI and MetaImage, z fastest in NumPy's files and in the
-//! program's arrays.
+//! The order in which files store voxels: x fastest in NIfTI and MetaImage, z fastest in NumPy's files and in
+//! conefield's arrays.
 
 use crate::affine::Affine;
 use crate::input::Input;
@@ -20,7 +20,7 @@ pub(crate) enum FileOrder {
     ZFastest,
 }
 
-/// A volume of `values` as NIfTI and MetaImage store them, x fastest; one that is not finite is refused.
+/// A volume from `values` in the order of NIfTI and MetaImage, x fastest; refuses a value that is not finite.
 pub(crate) fn read(input: &Input, grid: VoxelGrid, affine: Affine, values: Vec<f32>) -> Result<Volume> {
     let [nx, ny, nz] = grid.shape;
     let data = Array3::from_shape_vec((nx, ny, nz).f(), values)
@@ -32,24 +32,24 @@ pub(crate) fn read(input: &Input, grid: VoxelGrid, affine: Affine, values: Vec<f
     Ok(Volume { data, grid, affine: Some(affine) })
 }
 
-/// Voxels that are in memory at once while a file is written.
+/// Voxels in memory at once while a file is written.
 const SLAB: usize = 1 << 22;
 
 /// Bytes of a slab.
 pub const SLAB_BYTES: u64 = 4 * SLAB as u64;
 
-/// Bytes of packed data that the writer of MetaImage keeps in memory; more goes to a file.
+/// Bytes of compressed data that the writer of MetaImage keeps in memory; more goes to a file.
 pub const PACKED_BYTES: u64 = 32 << 20;
 
-/// Writes `voxels` to the file `path`, little-endian, slab by slab along the axis that is slowest in the file; one that
-/// is not finite is refused.
+/// Writes `voxels` to the file `path`, little-endian, slab by slab along the file's slowest axis; refuses a value that
+/// is not finite.
 pub(crate) fn write(w: &mut dyn Write, path: &Path, voxels: &mut dyn Voxels, order: FileOrder) -> Result<()> {
     let shape = voxels.grid().shape;
     let axis = match order {
         FileOrder::XFastest => 2,
         FileOrder::ZFastest => 0,
     };
-    // Whole layers where one fits, else rows of one.
+    // Whole layers if one fits, else rows of a layer.
     let (row, rows) = (shape[2 - axis], shape[1]);
     let broad = (SLAB / row).clamp(1, rows);
     let thick = (SLAB / (row * rows)).clamp(1, shape[axis]);

@@ -1,10 +1,10 @@
-//! Names that a scan's description gives must stay inside the scan's folder.
+//! Checks that file names in a scan's description stay inside the scan's folder.
 
 use conefield_core::{Error, Result};
 use std::collections::HashSet;
 use std::path::{Component, Path, PathBuf};
 
-/// The file `name` of `folder`, refused if it is no plain file name.
+/// The file `name` in `folder`; refuses anything but a plain file name.
 pub(crate) fn plain(folder: &Path, place: &str, field: &str, name: &str) -> Result<PathBuf> {
     let mut parts = Path::new(name).components();
     let one = matches!((parts.next(), parts.next()), (Some(Component::Normal(p)), None) if p == name);
@@ -14,7 +14,7 @@ pub(crate) fn plain(folder: &Path, place: &str, field: &str, name: &str) -> Resu
     inside(folder, place, field, name)
 }
 
-/// The file at the relative path `name` in `folder`, refused if it leads out, also through a link.
+/// The file at the relative path `name` in `folder`; refuses a path that leads outside, also through a link.
 pub(crate) fn inside(folder: &Path, place: &str, field: &str, name: &str) -> Result<PathBuf> {
     let path = within(folder, place, field, name)?;
     if !path.is_file() {
@@ -23,7 +23,7 @@ pub(crate) fn inside(folder: &Path, place: &str, field: &str, name: &str) -> Res
     Ok(path)
 }
 
-/// As [`inside`], for a file or a folder.
+/// Like [`inside`], for a file or a folder.
 pub(crate) fn within(folder: &Path, place: &str, field: &str, name: &str) -> Result<PathBuf> {
     let shown = || format!("\"{name}\"");
     let down = Path::new(name).components().all(|c| matches!(c, Component::Normal(_) | Component::CurDir));
@@ -40,12 +40,13 @@ pub(crate) fn within(folder: &Path, place: &str, field: &str, name: &str) -> Res
     Ok(path)
 }
 
-/// The files that a description has named so far. Few bytes that name one large file many times would fill memory.
+/// The files that a description has named so far. A short description that names one large file many times would
+/// otherwise fill memory.
 #[derive(Default)]
 pub(crate) struct NamedFiles(HashSet<(PathBuf, Option<String>)>);
 
 impl NamedFiles {
-    /// Refuses `part` (the array of an archive, say) of `path` if it was named before.
+    /// Refuses `part` (the array of an archive, say) of `path` if it has been named before.
     pub fn once(&mut self, place: &str, field: &str, path: &Path, part: Option<&str>) -> Result<()> {
         let real = path.canonicalize().map_err(|e| Error::io(path, e))?;
         if self.0.insert((real, part.map(str::to_owned))) {
@@ -56,7 +57,7 @@ impl NamedFiles {
     }
 }
 
-/// Refuses to replace a folder that holds anything but what `known` says the format itself writes.
+/// Refuses to replace a folder that holds anything but the files that the format itself writes, as `known` decides.
 pub(crate) fn may_replace(folder: &Path, format: &str, known: impl Fn(&str) -> bool, mark: &[&str]) -> Result<()> {
     let place = folder.display().to_string();
     let io = |e| Error::io(folder, e);

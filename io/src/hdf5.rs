@@ -1,8 +1,8 @@
-//! HDF5: one data set of it, or the part of a scan that a known layout keeps in it.
+//! HDF5: one data set of a file, or part of a scan that is stored in a known layout.
 //!
-//! `hdf5-reader` reads the file's structure and unpacks its chunks (deflate, shuffle, Fletcher-32). What it may take is bounded here by
-//! the size of the file, values come out chunk by chunk, and a data set of which chunks were never written is refused rather
-//! than read as zeros. [`layout`] knows where DXchange, NXtomo and CIL keep what a scan is made of.
+//! `hdf5-reader` reads the file's structure and decompresses its chunks (deflate, shuffle, Fletcher-32). This module
+//! bounds its memory by the size of the file, reads values chunk by chunk, and refuses a data set with unwritten chunks
+//! instead of reading them as zeros. [`layout`] knows where DXchange, NXtomo and CIL keep the parts of a scan.
 //!
 //! Sources: HDF5 File Format Specification 3.0; Data Exchange (dxfile), NeXus application definition NXtomo.
 
@@ -24,16 +24,16 @@ use std::sync::Arc;
 /// The bytes that an HDF5 file starts with.
 pub(crate) const MAGIC: &[u8] = b"\x89HDF\r\n\x1a\n";
 
-/// Deflate unpacks to at most this many times its size.
+/// Deflate expands to at most this many times its size.
 const DEFLATE_LIMIT: u64 = 1032;
 
-/// The longest chunk that HDF5 can have, in bytes.
+/// The longest chunk that HDF5 allows, in bytes.
 const LONGEST_CHUNK: u64 = u32::MAX as u64;
 
-/// Most bytes of a data set without chunks that are read at a time (or one frame).
+/// Most bytes (or one frame) of a data set without chunks that are read at a time.
 const SLAB_BYTES: u64 = 16 << 20;
 
-/// What of a scan is asked for, where one file holds all of it.
+/// The part of a scan to read from a file that holds all of it.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(crate) enum ScanPart {
     Projections,
@@ -41,7 +41,7 @@ pub(crate) enum ScanPart {
     Dark,
 }
 
-/// The name of a file and what is named in it: `scan.h5:/exchange/data`.
+/// Splits a file name from the name of a data set or group in it: `scan.h5:/exchange/data`.
 pub(crate) fn split(name: &str) -> (&str, Option<&str>) {
     let ends = [".h5", ".hdf5", ".hdf", ".nxs", ".nx"];
     let cut = name.match_indices(':').find(|(at, _)| ends.iter().any(|e| name[..*at].ends_with(e)));
@@ -51,7 +51,7 @@ pub(crate) fn split(name: &str) -> (&str, Option<&str>) {
     }
 }
 
-/// The shape of what [`read`] gives, from headers and image keys alone.
+/// The shape of the result of [`read`], from headers and image keys alone.
 pub(crate) fn shape(path: &Path, name: Option<&str>, part: ScanPart) -> Result<Vec<usize>> {
     let file = Container::open(path)?;
     let (data, kept) = file.frames(name, part)?;
@@ -62,10 +62,10 @@ pub(crate) fn shape(path: &Path, name: Option<&str>, part: ScanPart) -> Result<V
     Ok(shape)
 }
 
-/// Reads the data set `name`, whole, or `part` of the scan in the group `name` (in all of the file without a name).
+/// Reads all of the data set `name`, or `part` of the scan in the group `name` (or in the file if there is no name).
 ///
-/// Two or three axes of integers of 1 to 8 bytes or floats of 4 or 8, as they lie in the file. Refuses other types, what the file
-/// cannot hold, chunks that are missing and values that are not finite.
+/// Accepts two or three axes of integers of 1 to 8 bytes or floats of 4 or 8; the axes keep the file's order. Refuses
+/// other types, sizes that the file cannot hold, missing chunks and values that are not finite.
 pub(crate) fn read(path: &Path, name: Option<&str>, part: ScanPart) -> Result<Stored> {
     let file = Container::open(path)?;
     let frames_first = matches!(file.find(name)?, Found::Layout(_));
@@ -73,15 +73,15 @@ pub(crate) fn read(path: &Path, name: Option<&str>, part: ScanPart) -> Result<St
     Ok(Stored { values: file.values(&data, kept.as_deref())?, frames_first })
 }
 
-/// What [`read`] gives.
+/// The result of [`read`].
 pub(crate) struct Stored {
     pub values: ArrayD<f32>,
-    /// Whether a layout says that the first axis is that of the views.
+    /// Whether the layout says that the first axis is the views.
     pub frames_first: bool,
 }
 
-/// Shape and numbers of the small data set `name`; of a scan's layout the angles of its projections. In degrees where the
-/// data set says that it holds radians.
+/// Shape and numbers of the small data set `name`, or the projection angles of a scan's layout. Converted to degrees if
+/// the data set's unit is radians.
 pub(crate) fn read_exact(path: &Path, name: Option<&str>) -> Result<(Vec<usize>, Vec<f64>)> {
     let file = Container::open(path)?;
     let (data, kept) = match file.find(name)? {
@@ -157,7 +157,7 @@ impl Container {
         self.file.root_group().and_then(|g| g.member_names()).map(|(groups, _)| groups).unwrap_or_default()
     }
 
-    /// The data set or the layout that `name` means.
+    /// The data set or layout named `name`.
     fn find(&self, name: Option<&str>) -> Result<Found> {
         if let Some(data) = name.and_then(|n| self.data(n)) {
             return Ok(Found::Data(Box::new(data)));
@@ -165,7 +165,7 @@ impl Container {
         Ok(Found::Layout(Layout::find(self, name)?))
     }
 
-    /// Where the frames of `part` are, and which of them belong to it.
+    /// The data set with the frames of `part`, and which of them belong to it.
     fn frames(&self, name: Option<&str>, part: ScanPart) -> Result<(Dataset, Option<Vec<bool>>)> {
         match self.find(name)? {
             Found::Data(data) => Ok((*data, None)),
@@ -173,7 +173,7 @@ impl Container {
         }
     }
 
-    /// The shape, every axis at least 1 and as a whole within what the file can hold.
+    /// The shape; every axis is at least 1 and the file can hold all values.
     fn shape(&self, data: &Dataset) -> Result<Vec<usize>> {
         let shape: Vec<usize> = data.shape().iter().map(|&n| usize::try_from(n).unwrap_or(usize::MAX)).collect();
         let text = || format!("{:?}", data.shape());
@@ -195,7 +195,7 @@ impl Container {
         Ok(shape)
     }
 
-    /// How values are stored.
+    /// Storage type of the values.
     fn number(&self, data: &Dataset) -> Result<(Number, ByteOrder)> {
         let order = |o: hdf5_reader::ByteOrder| match o {
             hdf5_reader::ByteOrder::LittleEndian => ByteOrder::Little,
@@ -228,14 +228,14 @@ impl Container {
         self.invalid(data.name(), found, "integers of 1 to 8 bytes or floats of 4 or 8")
     }
 
-    /// The values of the frames along the first axis that `kept` has, all without it.
+    /// The values of the `kept` frames along the first axis, or of all.
     fn values(&self, data: &Dataset, kept: Option<&[bool]>) -> Result<ArrayD<f32>> {
         let mut shape = self.shape(data)?;
         if !(2..=3).contains(&shape.len()) {
             let found = format!("{shape:?}");
             return Err(self.invalid(data.name(), found, "two axes (row, column) or three (view, row, column)"));
         }
-        // Where each frame goes.
+        // The place of each frame in the result.
         let mut count = 0;
         let places: Vec<Option<usize>> = (0..shape[0])
             .map(|i| {
@@ -258,13 +258,13 @@ impl Container {
         }
     }
 
-    /// Chunk by chunk, in the order in which the file has them; memory grows with the frames that have come.
+    /// Reads chunk by chunk, in the order of the file; memory grows with the frames read.
     fn chunked(&self, data: &Dataset, shape: &[usize], places: &[Option<usize>], total: usize) -> Result<Vec<f32>> {
         let (number, order) = self.number(data)?;
         let frame: usize = shape[1..].iter().product();
         // With two axes each row is a frame of one row.
         let [rows, columns] = [if shape.len() == 3 { shape[1] } else { 1 }, shape[shape.len() - 1]];
-        // A chunk as it is stored and unpacked.
+        // The stored and the decompressed chunk.
         let chunk =
             data.chunks().into_iter().flatten().fold(number.bytes() as u64, |n, k| n.saturating_mul(u64::from(k)));
         allowance::memory(&self.place, data.name(), chunk.min(LONGEST_CHUNK).saturating_mul(2))?;
@@ -324,7 +324,7 @@ impl Container {
         Ok(out)
     }
 
-    /// A few frames at a time.
+    /// Reads a few frames at a time.
     fn contiguous(&self, data: &Dataset, shape: &[usize], places: &[Option<usize>], total: usize) -> Result<Vec<f32>> {
         let (number, _) = self.number(data)?;
         let frame: usize = shape[1..].iter().product();
@@ -366,7 +366,7 @@ impl Container {
         Ok(out)
     }
 
-    /// The values of a data set with few of them.
+    /// The values of a small data set.
     pub fn small(&self, data: &Dataset) -> Result<Vec<f64>> {
         let shape = self.shape(data)?;
         let (number, order) = self.number(data)?;
@@ -379,7 +379,7 @@ impl Container {
         Ok(values)
     }
 
-    /// Refuses `found` values of `data` that are not one for each of `frames` frames.
+    /// Refuses `found` values of `data` unless there is one per frame.
     fn one_each(&self, data: &Dataset, found: usize, frames: usize) -> Result<()> {
         if found == frames {
             return Ok(());
@@ -387,12 +387,12 @@ impl Container {
         Err(self.invalid(data.name(), format!("{found} values"), format!("{frames}, one for each frame")))
     }
 
-    /// A text beside `data`.
+    /// A text attribute of `data`.
     pub fn text_attribute(&self, data: &Dataset, name: &str) -> Option<String> {
         data.attribute(name).ok()?.read_string().ok()
     }
 
-    /// A number beside `data`.
+    /// A number attribute of `data`.
     pub fn number_attribute(&self, data: &Dataset, name: &str) -> Option<f64> {
         let attribute = data.attribute(name).ok()?;
         let as_integer =

@@ -1,4 +1,4 @@
-//! A file, packed or not, that is read front to back and never trusted about its length.
+//! A file, compressed or not, read sequentially without trust in its claimed length.
 
 use crate::memory;
 use crate::number::{ByteOrder, Number};
@@ -7,41 +7,41 @@ use flate2::bufread::{MultiGzDecoder, ZlibDecoder};
 use std::io::{BufRead, BufReader, ErrorKind, Read};
 use std::path::{Path, PathBuf};
 
-/// Deflate stores at best 258 bytes in two bits, LZW some 3000 in twelve: no such stream unpacks to more than this
-/// many times its size.
+/// Deflate stores at best 258 bytes in two bits, LZW some 3000 in twelve: no such stream expands to more than this many
+/// times its size.
 const UNPACKED_LIMIT: u64 = 2048;
 
-/// Longest description of a scan, in bytes: fifty thousand views that lie on no circle.
+/// Longest description of a scan, in bytes: fifty thousand views that are not on a circle.
 pub(crate) const LONGEST_TEXT: u64 = 16 << 20;
 
-/// Measured values deflate to a half or a tenth; only what is empty shrinks more. An array of more than this many
-/// numbers (256 MiB of `f32`) ...
+/// From this many numbers (256 MiB of `f32`) an array's compression ratio is checked too: measured values deflate to a
+/// half or a tenth, only empty ones shrink more.
 const LARGE: u64 = 1 << 26;
-/// ... that unpacks to more than this many times its packed size is no measurement.
+/// Highest plausible compression ratio of a large array of measured values.
 const MOST_RATIO: u64 = 100;
 
-/// Values decoded between two looks at the file: what a lying header can make us take before the lie shows.
+/// Values decoded between two checks of the file: the most memory that a wrong header can claim unnoticed.
 const CHUNK: usize = 1 << 18;
 
-/// An open file with its name and the bounds on what it can hold.
+/// An open file with its name and the bounds on its content.
 pub(crate) struct Input {
     path: PathBuf,
     reader: Box<dyn BufRead>,
     /// Bytes on disk.
     size: u64,
-    /// What the bytes are unpacked from: `gzip` or `zlib`.
+    /// The compression, `gzip` or `zlib`.
     packed: Option<&'static str>,
-    /// (Unpacked) bytes given out so far.
+    /// Bytes returned so far, after decompression.
     at: u64,
 }
 
 impl Input {
-    /// What `reader` gives, `size` bytes as far as is known, under the name that errors shall use.
+    /// An input over `reader`, of `size` bytes as far as is known, with the name for errors.
     pub fn within(name: PathBuf, reader: impl Read + 'static, size: u64) -> Self {
         Self { path: name, reader: Box::new(BufReader::with_capacity(1 << 16, reader)), size, packed: None, at: 0 }
     }
 
-    /// Opens `path` and unpacks it if it starts with gzip's magic number.
+    /// Opens `path`; decompresses it if it starts with gzip's magic number.
     pub fn open(path: &Path) -> Result<Self> {
         let mut input = Self::open_plain(path)?;
         let start = input.reader.fill_buf().map_err(|e| Error::io(path, e))?;
@@ -52,26 +52,26 @@ impl Input {
         Ok(input)
     }
 
-    /// Opens `path` and gives out its bytes as they are.
+    /// Opens `path` without decompression.
     pub fn open_plain(path: &Path) -> Result<Self> {
         let (file, size) = files::open(path)?;
         let reader = Box::new(BufReader::with_capacity(1 << 18, file));
         Ok(Self { path: path.to_path_buf(), reader, size, packed: None, at: 0 })
     }
 
-    /// Unpacks from here on: the rest of a plain file must be one zlib stream.
+    /// Decompresses from here on: the rest of a plain file must be one zlib stream.
     pub fn inflate(self) -> Self {
         let size = self.size.saturating_sub(self.at);
         let reader = Box::new(BufReader::new(WholeZlib(ZlibDecoder::new(self.reader))));
         Self { path: self.path, reader, size, packed: Some("zlib"), at: 0 }
     }
 
-    /// Bytes between here and the end of a plain file, or `None` if that shows only when it is unpacked.
+    /// Remaining bytes of a plain file; `None` for a compressed one, where only decompression shows them.
     pub fn left(&self) -> Option<u64> {
         self.packed.is_none().then(|| self.size.saturating_sub(self.at))
     }
 
-    /// The file's name, as errors give it.
+    /// The file's name, for errors.
     pub fn place(&self) -> String {
         self.path.display().to_string()
     }
@@ -94,7 +94,8 @@ impl Input {
         }
     }
 
-    /// Reads one line of at most `most` bytes with its line feed; without one at the end of the file or at `most`.
+    /// Reads one line of at most `most` bytes, including its line feed; the line feed is missing at the end of the file
+    /// or at `most`.
     pub fn line(&mut self, most: usize) -> Result<Vec<u8>> {
         let mut out = Vec::new();
         match self.reader.by_ref().take(most as u64).read_until(b'\n', &mut out) {
@@ -115,7 +116,7 @@ impl Input {
         Ok(out)
     }
 
-    /// Passes over `n` bytes of `field`.
+    /// Skips `n` bytes of `field`.
     pub fn skip(&mut self, n: u64, field: &str) -> Result<()> {
         let got = std::io::copy(&mut self.reader.by_ref().take(n), &mut std::io::sink());
         let got = got.map_err(|e| self.broken(e))?;
@@ -123,8 +124,8 @@ impl Input {
         if got < n { Err(self.ended(field, n, got)) } else { Ok(()) }
     }
 
-    /// Reads `count` numbers up to the very end of the file, through `map`. What the file cannot hold is refused
-    /// before memory is taken for it, and a byte past the last number is refused as well.
+    /// Reads `count` numbers through `map`, up to the very end of the file. Refuses more numbers than the file can hold
+    /// before it allocates memory, and any byte after the last number.
     pub fn numbers<T>(
         &mut self,
         field: &str,
@@ -152,8 +153,8 @@ impl Input {
             }
         }
         let mut out: Vec<T> = Vec::new();
-        // A plain file has just been measured; a packed one must prove its claim piece by piece. Each growth draws from
-        // the allowance, so that it does not matter what was claimed.
+        // A plain file has just been measured; a compressed one must prove its claim piece by piece. Each growth draws
+        // from the allowance, so a false claim has no effect.
         let mut left = count;
         while left > 0 {
             let n = left.min(CHUNK);
@@ -163,7 +164,7 @@ impl Input {
             number.decode(order, &raw, &mut out, map);
             left -= n;
         }
-        // Reading on to the end also makes gzip compare its checksum.
+        // Reading to the end also makes gzip verify its checksum.
         if !self.take(1)?.is_empty() {
             return Err(self.invalid(field, "more data", format!("the end of the file after {want} bytes")));
         }
@@ -184,7 +185,7 @@ impl Input {
     }
 }
 
-/// All of a regular file.
+/// Reads a regular file completely.
 pub(crate) fn read_bytes(path: &Path) -> Result<Vec<u8>> {
     let (file, size) = files::open(path)?;
     allowance::memory(&path.display().to_string(), "file size", size)?;
@@ -197,7 +198,7 @@ pub(crate) fn read_bytes(path: &Path) -> Result<Vec<u8>> {
     Ok(bytes)
 }
 
-/// Whether `packed` bytes may hold `count` numbers that take `unpacked` bytes; if not, how many they may.
+/// Whether `packed` bytes can hold `count` numbers of `unpacked` bytes in total; the error says how many they can hold.
 pub(crate) fn must_unpack(packed: u64, unpacked: u64, count: u64) -> Result<(), String> {
     if unpacked > packed.saturating_mul(UNPACKED_LIMIT) {
         let most = packed.saturating_mul(UNPACKED_LIMIT);
@@ -212,7 +213,7 @@ pub(crate) fn must_unpack(packed: u64, unpacked: u64, count: u64) -> Result<(), 
     Ok(())
 }
 
-/// A zlib stream that nothing may follow.
+/// A zlib stream that must end with the file.
 struct WholeZlib(ZlibDecoder<Box<dyn BufRead>>);
 
 impl Read for WholeZlib {

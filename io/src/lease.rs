@@ -1,8 +1,8 @@
-//! A folder that one command writes at a time, and that may take the place of an earlier one.
+//! A lease on an output folder: one command at a time writes it, and it may replace an earlier folder.
 //!
-//! The earlier folder steps aside, under a hidden name beside it, when the command has found nothing wrong with its input.
-//! It comes back if the command ends without a result of its own, and goes when the new one is complete. A process that is
-//! killed leaves both; the next command on that folder does what is due.
+//! When the command has validated its input, it moves the earlier folder aside, under a hidden name next to it. If the
+//! command ends without a result, the earlier folder returns; if the new one is complete, the earlier one is removed. A
+//! killed process leaves both; the next command on that folder cleans up.
 
 use crate::atomic::{exchange, parent, sweep, sync_folder};
 use crate::lock::{self, Held};
@@ -13,52 +13,52 @@ use std::io::ErrorKind;
 use std::path::{Path, PathBuf};
 use std::time::{Duration, Instant};
 
-/// Between two looks at a folder that another process writes.
+/// Polling interval for a folder that another process writes.
 const LOOK: Duration = Duration::from_millis(20);
-/// How long a part of a killed process's work may take to end: a pass over a large volume.
+/// How long to wait for the parts of a killed process to end: a pass over a large volume.
 const ENDING: Duration = Duration::from_secs(120);
-/// How deep the folders of parts lie: those of a search are in one for each budget.
+/// Nesting depth of part folders: a search has one folder per budget.
 const PARTS_WITHIN: usize = 3;
 
-/// How far the work in a folder came.
+/// Progress of the work in a folder.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Progressed {
-    /// Nothing in it is a result, or can be gone on from.
+    /// The folder holds no result and nothing to resume.
     Nothing,
-    /// A part of the result, or a checkpoint.
+    /// The folder holds part of the result, or a checkpoint.
     Begun,
-    /// All of it.
+    /// The result is complete.
     Complete,
 }
 
-/// What a kind of folder holds.
+/// Describes the content of a kind of folder.
 #[derive(Debug, Clone, Copy)]
 pub struct Contents {
-    /// What its commands write, by name. Nothing else is ever removed.
+    /// Whether its commands write a path of this name. Nothing else is ever removed.
     pub known: fn(&Path) -> bool,
-    /// How far it came.
+    /// Progress of the work in a folder.
     pub progressed: fn(&Path) -> Progressed,
 }
 
-/// A folder that this process alone writes.
+/// A folder that only this process writes.
 pub struct Lease {
     path: PathBuf,
     contents: Contents,
     locks: Vec<File>,
     /// Whether this process has begun to write.
     writing: bool,
-    /// Whether it made the folder.
+    /// Whether this process created the folder.
     made: bool,
 }
 
 const ASIDE: [&str; 2] = [".conefield-", ".old"];
 
-/// Whether this is the name under which earlier folders wait.
+/// Whether `name` is the hidden name under which earlier folders are kept.
 pub fn is_aside(name: &OsStr) -> bool {
     name.to_str().is_some_and(|n| n.starts_with(ASIDE[0]) && n.ends_with(ASIDE[1]))
 }
 
-/// Where what stood under `folder` waits, the earliest as `0`.
+/// The hidden folder that keeps the earlier versions of `folder`, the earliest as `0`.
 fn aside(folder: &Path) -> PathBuf {
     let mut name = OsString::from(ASIDE[0]);
     name.push(folder.file_name().unwrap_or_default());
@@ -66,7 +66,7 @@ fn aside(folder: &Path) -> PathBuf {
     parent(folder).join(name)
 }
 
-/// Folders in `aside`, the latest last. One that a killed process had only just made is empty and goes.
+/// The folders in `aside`, the latest last. Removes an empty one that a killed process has only just created.
 fn waiting(aside: &Path) -> Result<Vec<PathBuf>> {
     let entries = match fs::read_dir(aside) {
         Err(e) if e.kind() == ErrorKind::NotFound => return Ok(vec![]),
@@ -87,10 +87,10 @@ fn waiting(aside: &Path) -> Result<Vec<PathBuf>> {
 }
 
 impl Lease {
-    /// Takes the folder at `path`, which need not be there. Refused while another process has it. What a killed process
-    /// left is settled first, once the processes that it had started for parts of its work have ended.
+    /// Takes the folder at `path`, which may not exist yet. Refuses it while another process holds it. First waits for
+    /// part processes of a killed command to end, then cleans up what it left.
     pub fn take(path: &Path, contents: Contents) -> Result<Self> {
-        // Through a link: it stays one, and what it leads to is replaced where that lies.
+        // A symbolic link stays one; the folder that it points to is replaced.
         let plain: PathBuf = path.components().collect();
         let path = if plain.is_symlink() { plain.canonicalize().map_err(|e| Error::io(path, e))? } else { plain };
         let path = path.as_path();
@@ -98,23 +98,23 @@ impl Lease {
         await_parts(path, contents)?;
         let mut lease = Self { path: path.to_path_buf(), contents, locks, writing: false, made: false };
         lease.settle()?;
-        // What is put back has a lock of its own.
+        // A folder that was put back has its own lock.
         let more = own_again(&lease)?;
         lease.locks.extend(more);
         Ok(lease)
     }
 
-    /// The folder.
     pub fn path(&self) -> &Path {
         &self.path
     }
 
-    /// How far what stands there came.
+    /// Progress of the work in the folder.
     pub fn progressed(&self) -> Progressed {
         (self.contents.progressed)(&self.path)
     }
 
-    /// Makes the folder, empty: what is in it steps aside until [`Lease::complete`]. Files of a work that came to nothing go.
+    /// Makes the folder empty: moves its content aside until [`Lease::complete`]. Removes the files of work without a
+    /// result.
     pub fn replace(&mut self) -> Result<()> {
         let at = |e| Error::io(&self.path, e);
         fs::create_dir_all(parent(&self.path)).map_err(at)?;
@@ -147,18 +147,19 @@ impl Lease {
         Ok(())
     }
 
-    /// Goes on with what is there: what a killed process was writing in it goes.
+    /// Resumes in the existing folder: removes the unfinished files of a killed process.
     pub fn go_on(&self) {
         sweep(&self.path);
     }
 
-    /// The work is done: what it replaced goes.
+    /// Ends the work: removes the replaced folder.
     pub fn complete(mut self) -> Result<()> {
         self.writing = false;
         self.settle()
     }
 
-    /// Does what is due: an earlier folder comes back where there is nothing new, and goes where the new one is complete.
+    /// Settles which folder stays: an earlier folder returns if there is nothing new, and is removed if the new one is
+    /// complete.
     fn settle(&self) -> Result<()> {
         let aside = aside(&self.path);
         let mut all = waiting(&aside)?;
@@ -179,7 +180,7 @@ impl Lease {
                 if earlier.is_dir() {
                     self.clear(&earlier)?;
                 }
-                // What another one put there stays where it can be found.
+                // Files that someone else put there stay where they can be found.
                 let _ = fs::remove_dir(&earlier).and_then(|()| fs::remove_dir(&aside));
                 sync_folder(&parent(&self.path));
                 Ok(())
@@ -187,7 +188,7 @@ impl Lease {
         }
     }
 
-    /// Removes the known files of a work that came to nothing.
+    /// Removes the known files of work without a result.
     fn clear(&self, folder: &Path) -> Result<()> {
         for entry in fs::read_dir(folder).map_err(|e| Error::io(folder, e))? {
             let path = entry.map_err(|e| Error::io(folder, e))?.path();
@@ -201,7 +202,7 @@ impl Lease {
 }
 
 impl Drop for Lease {
-    /// The work ended early.
+    /// Handles work that ended early.
     fn drop(&mut self) {
         if !self.writing {
             return;
@@ -228,15 +229,15 @@ impl Drop for Lease {
     }
 }
 
-/// A folder that several processes write at a time, each its own parts of it.
+/// A folder that several processes write at once, each its own parts.
 pub struct SharedLease {
     path: PathBuf,
-    /// None where folders cannot be locked.
+    /// `None` where folders cannot be locked.
     lock: Option<File>,
 }
 
 impl SharedLease {
-    /// Takes a share in the folder at `path`, which is made if it is not there. Refused while another process has it alone.
+    /// Takes a share in the folder at `path`, creating it if needed. Refuses it while another process holds it alone.
     pub fn take(path: &Path) -> Result<Self> {
         fs::create_dir_all(path).map_err(|e| Error::io(path, e))?;
         match lock::share(path) {
@@ -246,8 +247,8 @@ impl SharedLease {
         }
     }
 
-    /// Gives the share back for all of the folder; none while another process has a share in it. Of several processes that
-    /// end with this the last one has the folder: each gives its share back before it looks for those of others.
+    /// Exchanges the share for the whole folder; `None` while another process has a share. If several processes call
+    /// this at the end, the last one gets the folder: each releases its share before it checks for others.
     pub fn alone(self, contents: Contents) -> Result<Option<Lease>> {
         let Self { path, lock } = self;
         let mut locks = vec![];
@@ -264,13 +265,13 @@ impl SharedLease {
     }
 }
 
-/// A lock on a folder, until it is dropped.
+/// A lock on a folder, held until dropped.
 pub struct FolderLock {
     _lock: Option<File>,
 }
 
-/// The lock on `folder` for this process alone; none while another process has it. Where folders cannot be locked, whoever
-/// asks has it.
+/// Locks `folder` for this process alone; `None` while another process holds it. Always succeeds where folders cannot
+/// be locked.
 pub fn try_alone(folder: &Path) -> Option<FolderLock> {
     match lock::hold(folder) {
         Held::Ours(lock) => Some(FolderLock { _lock: Some(lock) }),
@@ -279,7 +280,7 @@ pub fn try_alone(folder: &Path) -> Option<FolderLock> {
     }
 }
 
-/// The lock on a folder, if it is there.
+/// Locks the folder if it exists.
 fn own(path: &Path) -> Result<Vec<File>> {
     loop {
         if !path.is_dir() {
@@ -288,7 +289,7 @@ fn own(path: &Path) -> Result<Vec<File>> {
         match lock::hold(path) {
             Held::Ours(lock) => return Ok(vec![lock]),
             Held::Theirs => return Err(taken(path)),
-            // Where it cannot be locked at all, that stays so; where it has just changed its name, a second look helps.
+            // A folder that cannot be locked at all stays unlocked; if it was just renamed, trying again helps.
             Held::Unknown if File::open(path).is_ok_and(|f| f.try_lock().is_ok()) => {}
             Held::Unknown => return Ok(vec![]),
         }
@@ -300,8 +301,8 @@ fn taken(path: &Path) -> Error {
     Error::invalid(path.display().to_string(), "output", "a folder that another conefield is writing", expected)
 }
 
-/// Waits until no process writes a folder within `path`. A command that works in parts starts a process for each and holds
-/// the lock of the whole: where that was free, who writes a part has lost whom it worked for, and ends after its step.
+/// Waits until no process writes a folder within `path`. A command that works in parts starts a process per part and
+/// locks the whole. If the whole was free, its command has died, and its part processes end after their current step.
 fn await_parts(path: &Path, contents: Contents) -> Result<()> {
     let mut parts = vec![];
     folders(path, PARTS_WITHIN, contents.known, &mut parts)?;
@@ -322,13 +323,13 @@ fn await_parts(path: &Path, contents: Contents) -> Result<()> {
     Ok(())
 }
 
-/// Folders within `path` that are `wanted`, and those within them down to `depth`.
+/// Collects the folders within `path` that are `wanted`, down to `depth`.
 fn folders(path: &Path, depth: usize, wanted: fn(&Path) -> bool, found: &mut Vec<PathBuf>) -> Result<()> {
     if depth == 0 {
         return Ok(());
     }
     let entries = match fs::read_dir(path) {
-        // It is no folder, or whoever wrote it has just removed it.
+        // It is not a folder, or its writer has just removed it.
         Err(e) if [ErrorKind::NotFound, ErrorKind::NotADirectory].contains(&e.kind()) => return Ok(()),
         entries => entries.map_err(|e| Error::io(path, e))?,
     };
@@ -342,7 +343,7 @@ fn folders(path: &Path, depth: usize, wanted: fn(&Path) -> bool, found: &mut Vec
     Ok(())
 }
 
-/// The lock on what stands at the lease's path, unless it has that one.
+/// Locks the folder at the lease's path, unless the lease already holds that lock.
 fn own_again(lease: &Lease) -> Result<Vec<File>> {
     let same = |lock: &File| {
         let a = lock.try_clone().and_then(same_file::Handle::from_file);
@@ -351,7 +352,7 @@ fn own_again(lease: &Lease) -> Result<Vec<File>> {
     if lease.locks.iter().any(same) { Ok(vec![]) } else { own(&lease.path) }
 }
 
-/// Puts `earlier` back to `path`, where at most a work stands that came to nothing: that is at `earlier` afterwards.
+/// Puts `earlier` back to `path`. If `path` exists, it holds work without a result and moves to `earlier`.
 fn put_back(earlier: &Path, path: &Path) -> Result<()> {
     let at = |e| Error::io(path, e);
     if path.symlink_metadata().is_err() {
@@ -366,7 +367,8 @@ fn put_back(earlier: &Path, path: &Path) -> Result<()> {
     fs::rename(&between, earlier).map_err(at)
 }
 
-/// Where two names cannot be exchanged in one step: `folder` steps aside, `new` takes its name.
+/// Replaces `folder` by `new` where two names cannot be exchanged in one step: moves `folder` aside, then renames
+/// `new`.
 pub(crate) fn replace_in_two_steps(new: &Path, folder: &Path) -> Result<()> {
     let at = |e| Error::io(folder, e);
     let aside = aside(folder);
@@ -380,7 +382,7 @@ pub(crate) fn replace_in_two_steps(new: &Path, folder: &Path) -> Result<()> {
     fs::remove_dir_all(&aside).map_err(at)
 }
 
-/// Puts a folder back that a process which was killed between the two steps left aside.
+/// Puts back a folder that a process killed between the two steps left aside.
 pub(crate) fn put_back_missing(folder: &Path) -> Result<()> {
     if folder.symlink_metadata().is_ok() {
         return Ok(());

@@ -1,25 +1,24 @@
-//! Every file that conefield reads or writes, each format in one module.
+//! Reading and writing of every file format that conefield supports, one module per format.
 //!
-//! - Volumes: [`read_volume`], [`write_volume`], [`write_voxels`] (NIfTI, MetaImage, NumPy; a DICOM series
-//!   in; NRRD, a TIFF stack, OME-Zarr out).
+//! - Volumes: [`read_volume`], [`write_volume`], [`write_voxels`] (NIfTI, MetaImage, NumPy; read only: a DICOM series;
+//!   written only: NRRD, a TIFF stack, OME-Zarr).
 //! - Scans: [`read_scan`], [`read_truth`], [`write_scan`] (conefield's own folder), [`read_r2`], [`write_r2`]
 //!   (R2-Gaussian's folder), [`read_naf`], [`write_naf`] (NAF's file), [`write_rtk`] (for RTK); [`read_data_set`] also
 //!   reads test views.
-//! - Projections as scanners give them: [`read_scanner`] (a description in TOML; TIFF, NumPy, HDF5, RTK's XML geometry;
-//!   Nikon's description).
+//! - Projections from scanners: [`read_scanner`] (a description in TOML; TIFF, NumPy, HDF5, RTK's XML geometry; Nikon's
+//!   description).
 //! - Part of a scan, with its geometry: [`Selection`].
-//! - Sizes, before memory is taken: [`scan_size`], [`scanner_size`], [`volume_voxels`].
+//! - Sizes, before memory is allocated: [`scan_size`], [`scanner_size`], [`volume_voxels`].
 //! - Weights: [`read_weights`], [`write_weights`]; checkpoints: [`read_checkpoint`], [`write_checkpoint`] (safetensors).
-//! - Curves and pictures for TensorBoard: [`EventFile`].
+//! - Curves and images for TensorBoard: [`EventFile`].
 //!
-//! Readers tell a format from what a file holds, check a header before they take memory for what it claims, and
-//! refuse with the file, the field, what was found and what was expected. Lengths are converted once, here: inside
-//! the program they are millimetres. Voxel values stay in `1/unit` of the scan they belong to.
+//! Readers recognize a format by a file's content, check a header before they allocate what it claims, and name the
+//! file, the field, the value found and the value expected in errors. Lengths are converted to millimetres once, here.
+//! Voxel values stay in `1/unit` of their scan.
 //!
-//! Writers put everything beside its final name, sync it and rename it ([`write_atomic`]), so that a half-written
-//! file never stands under the name that was asked for. A folder that grows while a command works is a [`Lease`]: locked,
-//! and what stood there before waits until the new work is complete. Several processes write one that each has a
-//! [`SharedLease`] on.
+//! Writers write beside the final name, sync and rename ([`write_atomic`]), so a half-written file never appears under
+//! the final name. A folder that grows while a command works is a [`Lease`]: locked, with the earlier folder kept aside
+//! until the new work is complete. Several processes can write one folder, each with a [`SharedLease`].
 
 mod affine;
 mod atomic;

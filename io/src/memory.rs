@@ -1,10 +1,10 @@
-//! Memory for numbers, drawn from the allowance of the process before it is taken.
+//! Memory for numbers, reserved in the process's allowance before it is allocated.
 
 use conefield_core::{Error, Result, allowance};
 use ndarray::{Array, Dimension};
 
-/// Makes room in `values` for `more` of `field` of the file `place`. A list that grows without a known end, with `most`
-/// beyond what is needed, is doubled, so that it is copied seldom.
+/// Makes room in `values` for `more` of `field` of the file `place`. A growing list doubles its capacity, up to `most`
+/// values, so that it is copied seldom.
 pub(crate) fn grow<T>(values: &mut Vec<T>, more: usize, most: usize, place: &str, field: &str) -> Result<()> {
     if values.capacity() - values.len() >= more {
         return Ok(());
@@ -16,7 +16,7 @@ pub(crate) fn grow<T>(values: &mut Vec<T>, more: usize, most: usize, place: &str
         .map_err(|_| Error::invalid(place, field, format!("{capacity} values"), "an array that fits in memory"))
 }
 
-/// `array` in C order, for which its values are there twice for a moment.
+/// `array` in C order; the conversion briefly holds the values twice.
 pub(crate) fn in_order<D: Dimension>(place: &str, field: &str, array: Array<f32, D>) -> Result<Array<f32, D>> {
     if array.is_standard_layout() {
         return Ok(array);

@@ -1,5 +1,5 @@
-//! MetaImage, ITK's own format: lines of `Name = value`, then the voxels in the same file (`.mha`) or in one beside
-//! it (`.mhd` with `.raw` or `.zraw`).
+//! MetaImage, ITK's own format: lines of `Name = value`, then the voxels in the same file (`.mha`) or in a second one
+//! next to it (`.mhd` with `.raw` or `.zraw`).
 
 use crate::affine::{self, Affine};
 use crate::file_order::{self, FileOrder, PACKED_BYTES};
@@ -15,14 +15,14 @@ use flate2::{Compression, write::ZlibEncoder};
 use std::io::{Seek, Write};
 use std::path::Path;
 
-/// Longest header that is read; real ones are below 1 KiB, but for comments.
+/// Longest header that is read; real ones, without comments, are below 1 KiB.
 const LONGEST_HEADER: usize = 1 << 16;
 
 /// The last entry of a header.
 const DATA_FILE: &str = "ElementDataFile";
 
-/// Whether `head`, the start of a file, has the line that names the kind of object or the number of axes, after
-/// nothing but other lines of this form.
+/// Whether `head`, the start of a file, contains the line with the object type or the number of axes, preceded only by
+/// other lines of this form.
 pub(crate) fn is_header(head: &[u8]) -> bool {
     head.split(|b| *b == b'\n')
         .filter(|line| !line.trim_ascii().is_empty())
@@ -38,14 +38,14 @@ fn entry(line: &[u8]) -> Option<(&str, &[u8])> {
     good.then_some((name, line[at + 1..].trim_ascii()))
 }
 
-/// What a header says, entry by entry.
+/// The entries of a header.
 struct Header {
     place: String,
     entries: Vec<(String, Vec<u8>)>,
 }
 
 impl Header {
-    /// Reads up to and including the line that says where the data is.
+    /// Reads up to and including the line that names the data file.
     fn read(input: &mut Input) -> Result<Self> {
         let mut header = Self { place: input.place(), entries: Vec::new() };
         let mut left = LONGEST_HEADER;
@@ -79,7 +79,7 @@ impl Header {
         Error::invalid(&self.place, field, found, expected)
     }
 
-    /// The text of the entry `name`; only entries that are used must be text and stand there once.
+    /// The text of the entry `name`. Only the entries in use must be text and occur once.
     fn text(&self, name: &str) -> Result<Option<&str>> {
         let mut all = self.entries.iter().filter(|(n, _)| n == name);
         let Some((_, value)) = all.next() else { return Ok(None) };
@@ -94,7 +94,7 @@ impl Header {
         self.text(name)?.ok_or_else(|| self.invalid(name, "no such entry", "one, before ElementDataFile"))
     }
 
-    /// The first of `names` that is there, with its name.
+    /// The first of `names` that exists, with its name.
     fn first<'a>(&self, names: &[&'a str]) -> Result<Option<(&'a str, &str)>> {
         for &name in names {
             if let Some(text) = self.text(name)? {
@@ -113,7 +113,7 @@ impl Header {
         }
     }
 
-    /// `count` numbers under the first of `names` that is there.
+    /// `count` numbers of the entry under the first of `names` that exists.
     fn numbers<'a>(&self, names: &[&'a str], count: usize) -> Result<Option<(&'a str, Vec<f64>)>> {
         let Some((name, text)) = self.first(names)? else { return Ok(None) };
         let numbers: Option<Vec<f64>> =
@@ -124,7 +124,7 @@ impl Header {
         }
     }
 
-    /// Voxels along x, y and z, and the number of axes, of which a fourth may only say 1.
+    /// Voxels along x, y and z, and the number of axes; a fourth axis must have length 1.
     fn shape(&self) -> Result<([usize; 3], usize)> {
         let text = self.required("NDims")?;
         let axes = match text.parse() {
@@ -151,7 +151,7 @@ impl Header {
 
     fn number(&self) -> Result<Number> {
         let text = self.required("ElementType")?;
-        // LONG is four bytes in this format, whatever a compiler makes of it.
+        // LONG has four bytes in this format, whatever its size in C.
         Ok(match text {
             "MET_CHAR" => Number::I8,
             "MET_UCHAR" => Number::U8,
@@ -181,7 +181,7 @@ impl Header {
         Ok(if big { ByteOrder::Big } else { ByteOrder::Little })
     }
 
-    /// Millimetres a unit of length.
+    /// Millimetres per unit of length.
     fn unit(&self) -> Result<f64> {
         match self.text("DistanceUnits")? {
             None | Some("mm" | "?" | "") => Ok(1.0),
@@ -211,13 +211,13 @@ impl Header {
         if axes == 4 && (0..3).any(|k| entry(k, 3) != 0.0 || entry(3, k) != 0.0) {
             return Err(self.invalid(name, format!("{turn:?}"), "a fourth axis apart from the others"));
         }
-        // The file holds one axis after the other: its rows are the affine's columns.
+        // The file stores one axis after the other: its rows are the affine's columns.
         let steps: [[f64; 3]; 3] = std::array::from_fn(|k| std::array::from_fn(|i| entry(k, i) * spacing[k]));
         let lps = affine::from_columns(steps, first);
         if !affine::is_regular(&lps) {
             return Err(self.invalid(name, format!("{turn:?}"), "three independent voxel axes"));
         }
-        // ITK multiplies both: an axis that is no unit vector stretches the voxels.
+        // ITK multiplies both: an axis that is not a unit vector scales the voxels.
         let spacing = std::array::from_fn(|k| {
             let length = norm(std::array::from_fn(|i| entry(k, i)));
             if (length - 1.0).abs() <= 1e-3 { spacing[k] } else { spacing[k] * length }
@@ -231,7 +231,7 @@ pub(crate) fn shape(path: &Path) -> Result<[usize; 3]> {
     Header::read(&mut Input::open_plain(path)?)?.shape().map(|(shape, _)| shape)
 }
 
-/// A value as errors show it.
+/// A value, shortened for errors.
 fn shortened(text: &str) -> String {
     match text.char_indices().nth(80) {
         Some((at, _)) => format!("\"{}…\"", &text[..at]),
@@ -239,7 +239,7 @@ fn shortened(text: &str) -> String {
     }
 }
 
-/// Reads a MetaImage of one number a voxel; the affine is RAS, in mm, and `grid.center` is `[0, 0, 0]`.
+/// Reads a MetaImage with one number per voxel; the affine is RAS, in mm, and `grid.center` is `[0, 0, 0]`.
 pub(crate) fn read(path: &Path) -> Result<Volume> {
     let mut input = Input::open_plain(path)?;
     let header = Header::read(&mut input)?;
@@ -266,7 +266,7 @@ pub(crate) fn read(path: &Path) -> Result<Volume> {
     if compressed {
         let left = data.left().unwrap_or(0);
         let said = header.text("CompressedDataSize")?;
-        // Without a size, or with 0 in its place, the stream goes on to the end of the file.
+        // Without a size, or with size 0, the stream extends to the end of the file.
         if let Some(said) = said.filter(|s| *s != "0" && s.parse() != Ok(left)) {
             let expected = format!("{left}, the bytes that {} has for them", data.place());
             return Err(header.invalid("CompressedDataSize", shortened(said), &expected));
@@ -277,7 +277,7 @@ pub(crate) fn read(path: &Path) -> Result<Volume> {
     file_order::read(&data, grid, affine, values)
 }
 
-/// The file that holds the voxels: `header_file` itself, just past the header, or another one in its folder.
+/// The file with the voxels: `header_file` itself, just past the header, or another one in its folder.
 fn open_data(header: &Header, path: &Path, header_file: Input) -> Result<Input> {
     let name = header.required(DATA_FILE)?;
     if name.eq_ignore_ascii_case("local") {
@@ -291,7 +291,7 @@ fn open_data(header: &Header, path: &Path, header_file: Input) -> Result<Input> 
     Input::open_plain(&folder::inside(parent, &header.place, DATA_FILE, name)?)
 }
 
-/// Passes over what stands before the voxels in the data file; a size of −1 says that the voxels are its last bytes.
+/// Skips the data file's own header before the voxels; a size of −1 means that the voxels are its last bytes.
 fn skip_header(header: &Header, data: &mut Input, compressed: bool, want: u64) -> Result<()> {
     let Some(text) = header.text("HeaderSize")? else { return Ok(()) };
     let left = data.left().unwrap_or(0);
@@ -309,7 +309,7 @@ fn skip_header(header: &Header, data: &mut Input, compressed: bool, want: u64) -
 /// Writes `voxels` as `f32`, compressed, in one file.
 pub(crate) fn write(w: &mut dyn Write, path: &Path, voxels: &mut dyn Voxels) -> Result<()> {
     let io = |e| Error::io(path, e);
-    // The size of the packed data stands before it: pack it aside, in memory while it is small.
+    // The compressed size precedes the data, so the data is compressed to a buffer first: in memory while it is small.
     let folder = path.parent().filter(|p| !p.as_os_str().is_empty()).unwrap_or(Path::new("."));
     let mut packed =
         ZlibEncoder::new(tempfile::spooled_tempfile_in(PACKED_BYTES as usize, folder), Compression::fast());
@@ -324,8 +324,9 @@ pub(crate) fn write(w: &mut dyn Write, path: &Path, voxels: &mut dyn Voxels) -> 
     Ok(())
 }
 
-/// Writes a header, `path`, and beside it the voxels as they are: 32-bit floats, little-endian, x fastest, in a file of the same name
-/// that ends in `.raw`. One that is there without the header belongs to something else and is spared.
+/// Writes the header `path` and, next to it, the uncompressed voxels: 32-bit floats, little-endian, x fastest, in a
+/// file of the same name with the extension `.raw`. An existing `.raw` without its header belongs to something else and
+/// is not overwritten.
 pub(crate) fn write_raw(path: &Path, voxels: &mut dyn Voxels) -> Result<()> {
     let raw = path.with_extension("raw");
     let name = raw.file_name().map(|n| n.to_string_lossy().into_owned()).unwrap_or_default();
@@ -342,7 +343,7 @@ pub(crate) fn write_raw(path: &Path, voxels: &mut dyn Voxels) -> Result<()> {
 fn lines(path: &Path, voxels: &dyn Voxels, packing: &str, data: &str) -> String {
     let grid = voxels.grid();
     let (ras, _) = affine::of(voxels, &path.display().to_string());
-    // The grid's sizes and the lengths of the affine's columns may differ in the last bits: keep the former.
+    // The grid's spacing and the lengths of the affine's columns may differ in the last bits: write the former.
     let lengths = affine::spacing(&ras);
     let spacing: [f64; 3] = std::array::from_fn(|k| {
         let s = grid.spacing[k];
@@ -361,7 +362,7 @@ fn lines(path: &Path, voxels: &dyn Voxels, packing: &str, data: &str) -> String 
     )
 }
 
-/// Numbers so that reading them gives the same bits.
+/// Formats numbers so that they are read back to the same bits.
 fn list(numbers: impl IntoIterator<Item = f64>) -> String {
     numbers.into_iter().map(|x| format!("{x:?}")).collect::<Vec<_>>().join(" ")
 }
@@ -419,13 +420,13 @@ mod tests {
         // The first axis runs along LPS (0, 1, 0), so along RAS (0, −1, 0); the second along −(−1, 0, 0).
         let want = [[0.0, 2.0, 0.0, -10.0], [-0.5, 0.0, 0.0, 20.0], [0.0, 0.0, 3.0, 30.0], [0.0, 0.0, 0.0, 1.0]];
         assert_eq!(v.affine, Some(want));
-        // The other names, ends of lines, separators and a fourth axis.
+        // Alternative names, line endings, separators and a fourth axis.
         let other = "ObjectType: Image\r\nNDims = 4\r\n\r\nDimSize = 2 3 1 1\r\nElementType = MET_UCHAR\r\n\
                      ElementSize = 0.5 2 3 1\r\nPosition = 10 -20 30 7\r\n\
                      Rotation = 0 1 0 0 -1 0 0 0 0 0 1 0 0 0 0 1\r\nElementDataFile = Local\r\n";
         let u = read_bytes(&[other.as_bytes(), &[0, 1, 2, 3, 4, 5]].concat());
         assert_eq!((u.affine, u.grid, u.data), (v.affine, v.grid, v.data));
-        // Nothing said: 1 mm along LPS. Units are converted.
+        // Defaults: 1 mm along LPS. Units are converted.
         let v = read_bytes(&small(""));
         assert_eq!(v.affine.unwrap()[0], [-1.0, 0.0, 0.0, 0.0]);
         assert_eq!(read_bytes(&small("DistanceUnits = cm\nElementSpacing = 1 2 3\n")).grid.spacing, [10.0, 20.0, 30.0]);
@@ -479,7 +480,7 @@ mod tests {
             read_volume(inner.join("a.mhd"))
         };
         let voxels = [0x1f, 0x8b, 2, 3, 4, 5];
-        // These bytes are gzip's mark by chance: a raw file is not looked into.
+        // These bytes happen to be gzip's magic number: raw files are not checked for compression.
         std::fs::write(inner.join("a.raw"), voxels).unwrap();
         std::fs::write(inner.join("b.zraw"), zlib(&voxels)).unwrap();
         std::fs::write(inner.join("c.raw"), [&[9; 7], voxels.as_slice()].concat()).unwrap();
@@ -556,7 +557,7 @@ mod tests {
         refused(&[&small("ObjectType = Tube\n")], &["ObjectType", "two entries"]);
         refused(&[&with("ObjectType = Image", "ObjectType = Tube")], &["ObjectType", "Tube"]);
         refused(&[&small("no value here\n")], &["line 5", "Name = value"]);
-        // Bytes that are no text, in a name and in a value that counts.
+        // Invalid UTF-8 in a name and in an entry in use.
         refused(&[b"NDims = 3\nCaf\xe9 = 1\n", &small("")], &["line 2", "Name = value"]);
         refused(&[b"NDims = 3\nDimSize = \xff\xfe 1 1\nElementDataFile = LOCAL\n"], &["DimSize", "UTF-8"]);
         // A header without an end.
@@ -583,17 +584,17 @@ mod tests {
         let six = zlib(&[7; 6]);
         let n = six.len();
         assert_eq!(read_bytes(&[head(&n.to_string(), "2 3 1"), six.clone()].concat()).data.sum(), 42.0);
-        // The size lies either way, or is none.
+        // The size is too small, too large or invalid.
         for bad in [(n - 1).to_string(), (n + 1).to_string(), "-1".into(), u64::MAX.to_string(), "x".into()] {
             refused(&[&head(&bad, "2 3 1"), &six], &["CompressedDataSize", &bad, &format!("expected {n}")]);
         }
-        // Too few bytes, and a claim that no stream of this length could keep.
+        // Too few bytes, and a claim that no stream of this length can satisfy.
         refused(&[&head("0", "2 3 2"), &six], &["data", "after 6 bytes", "12 bytes"]);
         refused(&[&head("0", "4000 4000 4000"), &six], &["data", "64000000000 bytes in a zlib stream"]);
-        // A bomb is not unpacked further than the header goes.
+        // A decompression bomb is not decompressed further than the header claims.
         let bomb = zlib(&vec![0; 64 << 20]);
         refused(&[&head("0", "2 3 1"), &bomb], &["data", "more data", "6 bytes"]);
-        // Damage, a missing end, something behind the end, another kind of stream.
+        // Damaged data, a missing end, trailing data, another kind of stream.
         let mut bad = six.clone();
         bad[n - 1] ^= 1;
         refused(&[&head("0", "2 3 1"), &bad], &["zlib stream"]);
@@ -608,7 +609,7 @@ mod tests {
         let dir = tempfile::tempdir().unwrap();
         let (s, c) = 0.3f64.sin_cos();
         let round = |x: f64| f64::from(x as f32);
-        // Turned about two axes, with the bits that NIfTI's numbers have.
+        // Rotated about two axes, with NIfTI's precision.
         let turned = [
             [round(0.7 * c), round(-1.3 * s), 0.0, round(-12.34)],
             [round(0.7 * s), round(1.3 * c * c), round(-2.1 * s), round(56.78)],
@@ -636,7 +637,7 @@ mod tests {
                 assert_eq!(second.affine, first.affine);
             }
         }
-        // Without an affine both put the grid's centre at the same place.
+        // Without an affine both place the grid's centre at the same point.
         let mut v = Volume::centered(data, [0.5, 0.75, 2.0]);
         v.grid.center = [1.0, 2.0, 3.0];
         for end in ["c.mha", "c.nii"] {

@@ -1,9 +1,9 @@
-//! The scan files of NAF and SAX-NeRF: one pickle of a dict with TIGRE's names.
+//! The scan files of NAF and SAX-NeRF: one pickle with a dict of TIGRE's names.
 //!
-//! The world is ours: source at `DSO·(cos a, sin a, 0)`, columns along `(-sin a, cos a, 0)`, rows towards −z. `nDetector`,
-//! `dDetector` and `offDetector` are \[v, u\], and as in TIGRE the offset's v points towards +z, against the rows; volumes
-//! are \[x, y, z\]; `offOrigin` is the volume's centre. Lengths are millimetres. What `image` is in is not said:
-//! see [`read_naf`].
+//! Their world is conefield's: source at `DSO·(cos a, sin a, 0)`, columns along `(-sin a, cos a, 0)`, rows towards −z.
+//! `nDetector`, `dDetector` and `offDetector` are \[v, u\]. As in TIGRE, the offset's v points towards +z, against the
+//! rows. Volumes are \[x, y, z\]; `offOrigin` is the volume's centre. Lengths are millimetres. The format does not name
+//! the unit of `image`: see [`read_naf`].
 
 use crate::input::read_bytes;
 use crate::orbit::common_orbit;
@@ -20,19 +20,19 @@ use ndarray::{Array3, Ix3};
 use serde_json::json;
 use std::path::Path;
 
-/// Keys without which there is no scan.
+/// Required keys.
 const REQUIRED: [&str; 8] = ["mode", "DSO", "DSD", "nDetector", "dDetector", "nVoxel", "dVoxel", "train"];
 
-/// Keys that change the scan if they are there.
+/// Optional keys that change the scan.
 const OPTIONAL: [&str; 7] = ["offOrigin", "offDetector", "image", "val", "numTrain", "numVal", "unit"];
 
-/// How near an unknown key must be to one that is missing to be taken for a slip.
+/// How similar an unknown key must be to a missing one to count as a misspelling.
 const NEAR: f64 = 0.9;
 
-/// Two turns either way: radians past this are more likely degrees.
+/// Two turns either way: larger angles are probably degrees.
 const MOST_RADIANS: f64 = 4.0 * std::f64::consts::PI + 1e-6;
 
-/// What the numbers of a file that does not name its unit can mean.
+/// Possible units of a file that does not name one.
 const READINGS: [Reading; 2] = [
     Reading {
         ratio: 1.0,
@@ -52,27 +52,27 @@ const READINGS: [Reading; 2] = [
 
 /// Reads a scan of NAF, SAX-NeRF or TIGRE's demos: training views, `val` views and `image`.
 ///
-/// Lengths are mm and angles radians; a warning says so where angles look like degrees. The unit of `image` is not
-/// named by the format. If the file has a `unit` entry, as our writer makes, that holds. Otherwise the rays tell:
-/// where the integrals of `image` over millimetres give the projections, it is in 1/mm; where they are a thousand
-/// times larger, as in the published files, it is in 1/m. Anything else, and a file without `image`, is taken for
-/// 1/mm, the former with a warning. `provenance.unit_from` says which it was.
+/// Lengths are mm and angles radians; a warning is logged if the angles look like degrees. The format does not name the
+/// unit of `image`. A `unit` entry, as [`write_naf`] adds, decides. Otherwise the rays decide: if the integrals of
+/// `image` over millimetres match the projections, `image` is in 1/mm; if they are a thousand times larger, as in the
+/// published files, it is in 1/m. Any other ratio counts as 1/mm with a warning, and a file without `image` as 1/mm.
+/// `provenance.unit_from` records the decision.
 ///
-/// In `offDetector` the published code has the order \[u, v\] where TIGRE itself has \[v, u\]: the latter is taken unless
-/// the rays through `image` fit clearly better with the former (`provenance.offset_from`).
+/// The published code orders `offDetector` as \[u, v\], TIGRE itself as \[v, u\]. The latter is used unless the rays
+/// through `image` fit clearly better with the former (`provenance.offset_from`).
 ///
 /// Nothing in the file is ever called. Names other than those of NumPy's arrays, missing or misspelt keys, shapes that
-/// do not fit each other and values that are not finite are refused with the byte or the key.
+/// do not match and values that are not finite are refused with the byte or the key.
 pub fn read_naf(path: impl AsRef<Path>) -> Result<DataSet> {
     read(path.as_ref(), true)
 }
 
-/// As [`read_naf`], without the test views.
+/// Like [`read_naf`], without the test views.
 pub(crate) fn read_train(path: &Path) -> Result<Scan> {
     read(path, false).map(|r| r.train)
 }
 
-/// Only the volume. Its voxels are in mm whatever its values are in, so the projections are not looked at.
+/// Reads only the volume. Its voxel sizes are in mm whatever the unit of its values, so the projections are not needed.
 pub(crate) fn read_truth(path: &Path) -> Result<Option<Volume>> {
     let place = path.display().to_string();
     let bytes = read_bytes(path)?;
@@ -97,7 +97,7 @@ fn read(path: &Path, with_test: bool) -> Result<DataSet> {
     let mut train = scan(&required(&top, "train")?)?;
     check_count(&top, "numTrain", train.geometry.views.len())?;
     let test = if with_test { top.get("val")? } else { None };
-    // NAF writes the key even if there are no such views.
+    // NAF writes the key even without test views.
     let mut test = test.filter(|t| has_views(t)).map(|t| scan(&t)).transpose()?;
     let data = file.image(&top)?;
 
@@ -135,7 +135,7 @@ fn read(path: &Path, with_test: bool) -> Result<DataSet> {
     Ok(DataSet { train, test, volume })
 }
 
-/// The entries that hold for all views, in mm.
+/// The entries shared by all views, in mm.
 #[derive(Clone)]
 struct Description {
     dso: f64,
@@ -184,7 +184,7 @@ impl Description {
         CircularOrbit { dso: self.dso, dsd: self.dsd, pixel: self.pixel, offset, angles }
     }
 
-    /// Geometry and projections of `train` or `val`. Shapes are compared before a number is decoded.
+    /// Geometry and projections of `train` or `val`. Checks shapes before it decodes a number.
     fn views(&self, place: &str, views: &Item) -> Result<(Geometry, Array3<f32>)> {
         let item = required(views, "angles")?;
         let angles = item.numbers()?;
@@ -201,7 +201,7 @@ impl Description {
         Ok((geometry, values))
     }
 
-    /// Moves the detectors of `geometry`, made with the offset of `from`, to this one's.
+    /// Moves the detectors of `geometry` from the offset of `from` to the offset of `self`.
     fn turn(&self, geometry: &mut Geometry, from: &Self) {
         let [dv, du] = [from.offset[0] - self.offset[0], self.offset[1] - from.offset[1]];
         for view in &mut geometry.views {
@@ -234,8 +234,8 @@ fn required<'p, 'a>(item: &Item<'p, 'a>, key: &str) -> Result<Item<'p, 'a>> {
     Err(item.invalid_at(path, found, format!("the key \"{key}\"")))
 }
 
-/// Refuses an unknown key that reads like one of those that would have been used. Other keys are passed over: the
-/// published files have many that only their generator needs.
+/// Refuses an unknown key that resembles one of the keys in use. Other keys are ignored: the published files have many
+/// that only their generator needs.
 fn check_keys(top: &Item) -> Result<()> {
     let keys = top.keys()?;
     for key in OPTIONAL.iter().filter(|k| !keys.contains(k)) {
@@ -271,7 +271,7 @@ fn positive<const N: usize>(item: &Item, found: [f64; N], expected: &str) -> Res
     }
 }
 
-/// NAF itself counts views by these keys; a file may say less than it holds.
+/// Checks a count of views that NAF itself uses; it may be smaller than the number of views in the file.
 fn check_count(top: &Item, key: &str, views: usize) -> Result<()> {
     let Some(item) = top.get(key)? else { return Ok(()) };
     let said = item.number()?;
@@ -288,7 +288,7 @@ fn has_views(views: &Item) -> bool {
     views.get("angles").is_ok_and(|a| a.is_some_and(|a| !a.numbers().is_ok_and(|n| n.is_empty())))
 }
 
-/// The entry that our writer adds; NAF's programs read past it.
+/// The `unit` entry that [`write_naf`] adds; NAF's programs ignore it.
 fn stated_unit(place: &str, top: &Item) -> Result<Option<Unit>> {
     let Some(item) = top.get("unit")? else { return Ok(None) };
     let (name, mm) = (required(&item, "name")?.text()?, required(&item, "mm")?.number()?);
@@ -297,15 +297,15 @@ fn stated_unit(place: &str, top: &Item) -> Result<Option<Unit>> {
     Ok(Some(unit))
 }
 
-/// Writes a NAF file: lengths in mm, angles in radians, projections as line integrals, the volume as it is, in `1/unit`
-/// of `train`. A pickle of protocol 4 that NumPy 1 and 2 load.
+/// Writes a NAF file: lengths in mm, angles in radians, projections as line integrals, the volume unchanged, in
+/// `1/unit` of `train`. The pickle has protocol 4, which NumPy 1 and 2 load.
 ///
-/// NAF's own programs want both `image` and `val`, take `image` for 1/m and know no detector that is not square;
-/// without a volume or test views the file is written all the same, for other readers. An additional `unit` entry
-/// tells ours what the values are in.
+/// NAF's own programs require both `image` and `val`, assume that `image` is in 1/m and support only square detectors.
+/// Without a volume or test views the file is still written, for other readers. An additional `unit` entry records the
+/// unit of the values.
 ///
-/// A scan that is no circle about z, a volume of another shape than the scan's grid, or a test scan with another
-/// orbit, detector or grid cannot be said in this format and is refused.
+/// Refuses what the format cannot express: a scan that is not a circle about z, a volume whose shape differs from the
+/// scan's grid, and a test scan with another orbit, detector or grid.
 pub fn write_naf(path: impl AsRef<Path>, train: &Scan, test: Option<&Scan>, volume: Option<&Volume>) -> Result<()> {
     let path = path.as_ref();
     let place = path.display().to_string();
@@ -357,7 +357,7 @@ fn views_out<'a>(angles: &'a [f64], projections: &'a Array3<f32>) -> Out<'a> {
     Out::Dict(vec![("angles", Out::Doubles(angles)), ("projections", Out::Floats(projections.view().into_dyn()))])
 }
 
-/// From the first view to where the next after the last would stand.
+/// The angle from the first view to the position of the next view after the last.
 fn total(angles: &[f64]) -> f64 {
     match angles {
         [first, .., last] => (last - first) * angles.len() as f64 / (angles.len() - 1) as f64,
@@ -373,7 +373,7 @@ mod tests {
     use std::fs;
     use std::path::PathBuf;
 
-    /// The largest distance in mm between what two geometries have.
+    /// The largest distance in mm between two geometries.
     fn apart(a: &Geometry, b: &Geometry) -> f64 {
         assert_eq!((a.detector, a.volume.shape, a.views.len()), (b.detector, b.volume.shape, b.views.len()));
         let far = |x: [f64; 3], y: [f64; 3]| (0..3).map(|k| (x[k] - y[k]).abs()).fold(0.0, f64::max);
@@ -385,7 +385,7 @@ mod tests {
         views.chain(grid).fold(0.0, f64::max)
     }
 
-    /// A scan that its volume explains, with the offset that the standard one lacks the size for.
+    /// A scan that matches its volume, with a larger offset than that of `scan`.
     fn consistent(unit: Unit) -> (Scan, Volume) {
         let mut s = scan();
         let mut orbit = CircularOrbit::fit(&s.geometry.views).unwrap();
@@ -400,11 +400,11 @@ mod tests {
         (s, Volume { data, grid: g.volume, affine: None })
     }
 
-    /// What the file of `train` would be without our own entry for the unit.
+    /// Writes the file of `train` without the `unit` entry.
     fn write_without_unit(path: &Path, train: &Scan, volume: Option<&Volume>) {
         write_naf(path, train, None, volume).unwrap();
         let bytes = fs::read(path).unwrap();
-        // The key becomes another of the same length, which is passed over.
+        // Renames the key to an unknown one of the same length.
         let key = b"\x04\0\0\0\0\0\0\0unit";
         let at = bytes.windows(key.len()).position(|w| w == key).unwrap() + key.len();
         let mut bytes = bytes;
@@ -494,7 +494,7 @@ mod tests {
     fn the_unit_comes_from_the_rays() {
         let dir = tempfile::tempdir().unwrap();
         let path = dir.path().join("a.pickle");
-        // As in the published files: millimetres, integrals over metres.
+        // As in the published files: lengths in millimetres, integrals over metres.
         for unit in [Unit { name: "m".into(), mm: 1000.0 }, Unit::default()] {
             let (s, volume) = consistent(unit);
             write_without_unit(&path, &s, Some(&volume));
@@ -526,7 +526,7 @@ mod tests {
         let back = read_naf(&path).unwrap();
         assert!(apart(&back.train.geometry, &s.geometry) < 1e-9);
         assert!(back.train.provenance["offset_from"].as_str().unwrap().contains("[u, v]"));
-        // Our own files are never doubted.
+        // conefield's own files skip this comparison.
         write_naf(&path, &swapped, None, Some(&volume)).unwrap();
         assert!(apart(&read_naf(&path).unwrap().train.geometry, &swapped.geometry) < 1e-9);
     }
@@ -566,7 +566,7 @@ mod tests {
         let s = read_naf(&path).unwrap().train;
         assert_eq!((s.geometry.detector, s.geometry.volume.shape), ([2, 3], [2, 2, 2]));
         assert_eq!(s.geometry.volume.spacing, [1.0, 1.0, 1.5]);
-        // Degrees are read as they stand, with a warning; no test views are none.
+        // Degrees are read as radians with a warning; an empty list of test views counts as none.
         let (_dir, path) = written(&|e| e.push(("val", views(&[], [0, 2, 3], 0.0))));
         assert!(read_naf(&path).unwrap().test.is_none());
         let (_dir, path) = written(&|e| e[8].1 = views(&[0.0, 180.0], [2, 2, 3], 0.5));

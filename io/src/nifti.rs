@@ -1,7 +1,7 @@
 //! NIfTI-1 in one file (`.nii`, `.nii.gz`).
 //!
-//! The header is parsed by the `nifti` crate. The data is decoded here, because that bounds what a header can make
-//! us allocate, and the header is written here, because that lets the writer go through [`crate::write_atomic`].
+//! The `nifti` crate parses the header. This module decodes the data, to bound what a header can make the program
+//! allocate, and writes the header, to write through [`crate::write_atomic`].
 
 use crate::affine::{self, Affine};
 use crate::file_order::{self, FileOrder};
@@ -16,23 +16,23 @@ use nifti::{Endianness, NiftiHeader};
 use std::io::Write;
 use std::path::Path;
 
-/// Bytes of a header.
+/// Size of a header in bytes.
 pub(crate) const HEADER: usize = 348;
 
 /// Where the data of a single file starts when there is no extension.
 const DATA: u64 = 352;
 
-/// Whether `head` (at least [`HEADER`] bytes) carries the mark of NIfTI-1 or its header-and-image pair.
+/// Whether `head` (at least [`HEADER`] bytes) has the magic bytes of NIfTI-1 or of its header-and-image pair.
 pub(crate) fn is_header(head: &[u8]) -> bool {
     head.get(344..347).is_some_and(|m| m == b"n+1" || m == b"ni1")
 }
 
-/// Whether `head` starts as NIfTI-2 does.
+/// Whether `head` starts like NIfTI-2.
 pub(crate) fn is_second_version(head: &[u8]) -> bool {
     head.get(4..7).is_some_and(|m| m == b"n+2" || m == b"ni2")
 }
 
-/// Reads on from `head`, the first [`HEADER`] bytes.
+/// Reads the volume whose first [`HEADER`] bytes are `head`.
 pub(crate) fn read_from(input: &mut Input, head: &[u8]) -> Result<Volume> {
     if head.get(344..348) == Some(b"ni1\0".as_slice()) {
         return Err(Error::unsupported(
@@ -75,7 +75,7 @@ pub(crate) fn shape_of(input: &Input, head: &[u8]) -> Result<[usize; 3]> {
     shape(input, &parse(input, head)?)
 }
 
-/// Three axes of at least one voxel; later axes may only say 1.
+/// Three axes of at least one voxel; later axes must have length 1.
 fn shape(input: &Input, header: &NiftiHeader) -> Result<[usize; 3]> {
     let dim = header.dim.map(|d| d as i16);
     let shown = || format!("{dim:?}");
@@ -126,7 +126,7 @@ fn number(input: &Input, header: &NiftiHeader) -> Result<Number> {
 
 fn offset(input: &Input, header: &NiftiHeader) -> Result<u64> {
     let offset = header.vox_offset;
-    // Zero is common in the wild and can only mean the earliest place there is.
+    // Zero is common in the wild and can only mean the earliest possible offset.
     if offset == 0.0 {
         return Ok(DATA);
     }
@@ -137,7 +137,8 @@ fn offset(input: &Input, header: &NiftiHeader) -> Result<u64> {
     Ok(offset as u64)
 }
 
-/// Slope and intercept; the standard takes a slope of 0 for "not scaled", and tools take one that is not finite so.
+/// Slope and intercept. In the standard, a slope of 0 means "not scaled"; tools treat a slope that is not finite the
+/// same way.
 fn scaling(input: &Input, header: &NiftiHeader) -> Result<(f64, f64)> {
     let (slope, inter) = (header.scl_slope, header.scl_inter);
     if !slope.is_finite() {
@@ -185,7 +186,7 @@ fn orientation(input: &Input, header: &NiftiHeader) -> Result<Affine> {
 fn quaternion(header: &NiftiHeader) -> [[f64; 4]; 3] {
     let [mut b, mut c, mut d] = [header.quatern_b, header.quatern_c, header.quatern_d].map(f64::from);
     let squares = b * b + c * c + d * d;
-    // Stored without its first component, which rounding may leave a little below the root of zero.
+    // The first component is not stored; rounding may make the number under its root slightly negative.
     let a = if squares > 1.0 {
         let n = squares.sqrt();
         (b, c, d) = (b / n, c / n, d / n);
@@ -205,18 +206,19 @@ fn quaternion(header: &NiftiHeader) -> [[f64; 4]; 3] {
     std::array::from_fn(|i| [r[i][0] * s[0], r[i][1] * s[1], r[i][2] * s[2], t[i]])
 }
 
-/// Refuses more voxels on an axis than the header can say.
+/// Refuses more voxels per axis than the header can express.
 pub(crate) fn check_shape(place: &str, shape: [usize; 3]) -> Result<()> {
     let expected = "at most 32767 voxels an axis, which is all that NIfTI-1 can say (write .npy)";
     ensure(shape.iter().all(|&n| n <= i16::MAX as usize), place, "shape", format!("{shape:?}"), expected)
 }
 
-/// Writes `voxels` as `f32` with an sform: their own affine, or one that puts the grid's centre at `grid.center`.
+/// Writes `voxels` as `f32` with an sform: the volume's own affine, or one that puts the grid's centre at
+/// `grid.center`.
 pub(crate) fn write(w: &mut dyn Write, path: &Path, voxels: &mut dyn Voxels) -> Result<()> {
     let grid = voxels.grid();
     let place = path.display().to_string();
     check_shape(&place, grid.shape)?;
-    // 1: the scanner's own coordinates; 2: some others.
+    // 1: the scanner's own coordinates; 2: other coordinates.
     let (affine, own) = affine::of(voxels, &place);
     let code = if own { 1i16 } else { 2 };
     let mut h = [0u8; DATA as usize];
@@ -356,7 +358,7 @@ mod tests {
         assert_eq!(v.data.as_slice().unwrap(), [-3.0, 2.0]);
         // Micrometres, no orientation: the voxel sizes alone.
         assert_eq!(v.grid.spacing, [0.002, 0.003, 0.004]);
-        // A slope of zero or one that is no number: the values as stored.
+        // With a slope of 0 or NaN the values are as stored.
         for slope in [0.0f32, f32::NAN] {
             b[112..116].copy_from_slice(&slope.to_be_bytes());
             assert_eq!(read_volume(&file("a.nii", &b).1).unwrap().data.as_slice().unwrap(), [-4.0, 6.0]);
@@ -494,7 +496,7 @@ mod tests {
         let low = v.data.iter().copied().fold(f32::INFINITY, f32::min);
         let high = v.data.iter().copied().fold(f32::NEG_INFINITY, f32::max);
         assert!((-3100.0..=-900.0).contains(&low) && high > 300.0, "{low} to {high} are no Hounsfield units");
-        // Against the raw header: int32, sform rows at byte 280, x fastest.
+        // Compared with the raw header: int32, sform rows at byte 280, x fastest.
         let mut raw = Vec::new();
         flate2::read::MultiGzDecoder::new(std::fs::File::open(&path).unwrap()).read_to_end(&mut raw).unwrap();
         let f = |at: usize| f32::from_le_bytes(raw[at..at + 4].try_into().unwrap()) as f64;

@@ -10,13 +10,13 @@ use ndarray::{Array, ArrayD, Dimension, IxDyn, ShapeBuilder};
 use std::io::Write;
 use std::path::Path;
 
-/// The six bytes that every file starts with.
+/// The magic bytes.
 pub(crate) const MAGIC: &[u8] = b"\x93NUMPY";
 
 /// Longest header that is read; NumPy's own are below 200 bytes.
 const LONGEST_HEADER: usize = 1 << 16;
 
-/// What the header says.
+/// The header's entries.
 #[derive(Debug, PartialEq)]
 struct Header {
     number: Number,
@@ -25,17 +25,17 @@ struct Header {
     shape: Vec<usize>,
 }
 
-/// Reads an array with the named axes, converted to `f32` in C order; refuses values that are not finite.
+/// Reads an array with the named axes as `f32` in C order; refuses values that are not finite.
 pub(crate) fn read(path: &Path, axes: &[&str]) -> Result<ArrayD<f32>> {
     read_from(&mut Input::open(path)?, Vec::new(), axes)
 }
 
-/// Reads on from `start`, the bytes (at most the first eight) that were read from `input` to tell the format.
+/// Reads the rest after `start`, the bytes (at most eight) read from `input` to recognize the format.
 pub(crate) fn read_from(input: &mut Input, start: Vec<u8>, axes: &[&str]) -> Result<ArrayD<f32>> {
     read_one_of(input, start, &[axes])
 }
 
-/// As [`read_from`], for an array with any one of several sets of axes.
+/// Like [`read_from`], for an array with any of several sets of axes.
 pub(crate) fn read_one_of(input: &mut Input, start: Vec<u8>, sets: &[&[&str]]) -> Result<ArrayD<f32>> {
     let header = read_header(input, start)?;
     let expected = || {
@@ -64,7 +64,8 @@ pub(crate) fn read_one_of(input: &mut Input, start: Vec<u8>, sets: &[&[&str]]) -
     Ok(array)
 }
 
-/// Shape and numbers, in C order, of a small array of one or two axes in full precision; reads on as [`read_from`] does.
+/// Shape and numbers, in C order and full precision, of a small array of one or two axes; continues after `start` like
+/// [`read_from`].
 pub(crate) fn read_exact(input: &mut Input, start: Vec<u8>) -> Result<(Vec<usize>, Vec<f64>)> {
     let header = read_header(input, start)?;
     let count = header.shape.iter().try_fold(1usize, |n, &s| n.checked_mul(s));
@@ -87,14 +88,13 @@ pub(crate) fn write<D: Dimension>(w: &mut dyn Write, path: &Path, array: &Array<
     number::write(w, array.as_standard_layout().as_slice().unwrap_or(&[])).map_err(io)
 }
 
-/// Writes `voxels`, `[x, y, z]`, as [`write`] writes an array.
+/// Writes `voxels`, `[x, y, z]`, like [`write`].
 pub(crate) fn write_voxels(w: &mut dyn Write, path: &Path, voxels: &mut dyn Voxels) -> Result<()> {
     w.write_all(&header(&voxels.grid().shape)).map_err(|e| Error::io(path, e))?;
     file_order::write(w, path, voxels, FileOrder::ZFastest)
 }
 
-/// What stands before little-endian `f32` of this shape in C order: the format's first version, as long as a multiple
-/// of 64 bytes.
+/// The header of little-endian `f32` of this shape in C order: format version 1, padded to a multiple of 64 bytes.
 fn header(shape: &[usize]) -> Vec<u8> {
     let axes: String = match shape {
         [one] => format!("{one},"),
@@ -108,7 +108,7 @@ fn header(shape: &[usize]) -> Vec<u8> {
     [MAGIC, &[1, 0], &(text.len() as u16).to_le_bytes(), text.as_bytes()].concat()
 }
 
-/// The shape that the header says; reads on as [`read_from`] does.
+/// The shape in the header; continues after `start` like [`read_from`].
 pub(crate) fn shape(input: &mut Input, start: Vec<u8>) -> Result<Vec<usize>> {
     read_header(input, start).map(|h| h.shape)
 }
@@ -165,7 +165,7 @@ fn read_header(input: &mut Input, start: Vec<u8>) -> Result<Header> {
     })
 }
 
-/// How NumPy's name for a type of real numbers, e.g. `<f4`, has them stored; `None` for any other.
+/// Number type and byte order of NumPy's name for a real type, e.g. `<f4`; `None` for any other.
 pub(crate) fn element(descr: &str) -> Option<(Number, ByteOrder)> {
     let (order, kind) = match descr.chars().next()? {
         '<' => (ByteOrder::Little, &descr[1..]),
@@ -195,14 +195,14 @@ fn shape_text(shape: &[usize]) -> String {
     format!("{shape:?}")
 }
 
-/// The three kinds of value that stand in a header.
+/// The three kinds of value in a header.
 enum Literal {
     Text(String),
     Bool(bool),
     Tuple(Vec<usize>),
 }
 
-/// Reads the little of Python's notation that headers use.
+/// Parser of the subset of Python's notation that headers use.
 struct Python<'a> {
     rest: &'a str,
 }
@@ -258,7 +258,7 @@ impl Python<'_> {
             let end = self.rest.find(|c: char| !c.is_ascii_digit())?;
             shape.push(self.rest[..end].parse().ok()?);
             self.rest = &self.rest[end..];
-            // Python 2 wrote long integers so.
+            // Python 2's suffix of long integers.
             let _ = self.eat("L");
             if self.eat(",").is_none() {
                 self.eat(")")?;
@@ -297,7 +297,7 @@ mod tests {
         let a = Array3::from_shape_fn((3, 4, 5), |(x, y, z)| (x * 100 + y * 10 + z) as f32 - 7.5);
         crate::write_atomic(&path, |w| write(w, &path, &a)).unwrap();
         assert_eq!(read(&path, &["x", "y", "z"]).unwrap(), a.clone().into_dyn());
-        // To the byte what a library writes, also of fewer axes; an array in another order is put into C order.
+        // Byte for byte what a library writes, also with fewer axes; an array in another order is converted to C order.
         let bytes = |write: &dyn Fn(&mut Vec<u8>)| {
             let mut out = vec![];
             write(&mut out);

@@ -10,15 +10,15 @@ use std::io::{BufReader, ErrorKind, Read, Seek, SeekFrom};
 use std::path::{Path, PathBuf};
 use zip::{CompressionMethod, ZipArchive};
 
-/// The bytes that a ZIP archive with anything in it starts with.
+/// The magic bytes of a ZIP archive that is not empty.
 pub(crate) const MAGIC: &[u8] = b"PK\x03\x04";
 
-/// Reads the array `name` of the archive (the only one if `None`) with any of the sets of axes, as [`npy::read`] does.
+/// Reads the array `name` of the archive (the only one if `None`) with any of the sets of axes, like [`npy::read`].
 pub(crate) fn read(path: &Path, name: Option<&str>, sets: &[&[&str]]) -> Result<ArrayD<f32>> {
     npy::read_one_of(&mut open(path, name)?, Vec::new(), sets)
 }
 
-/// Shape and numbers of the small array `name`, as [`npy::read_exact`] has them.
+/// Shape and numbers of the small array `name`, like [`npy::read_exact`].
 pub(crate) fn read_exact(path: &Path, name: Option<&str>) -> Result<(Vec<usize>, Vec<f64>)> {
     npy::read_exact(&mut open(path, name)?, Vec::new())
 }
@@ -60,7 +60,7 @@ fn open(path: &Path, name: Option<&str>) -> Result<Input> {
     let start = entry.data_start().ok_or_else(|| Error::invalid(&place, "archive", "no data", "where the data starts"));
     let start = start?;
     drop(entry);
-    // The type of the numbers is not known yet: the smallest, of one byte, makes most of them.
+    // The type of the numbers is unknown here: one byte, the smallest, allows the most of them.
     must_unpack(packed, size, size).map_err(|expected| {
         Error::invalid(&place, "size", format!("{size} bytes in {packed} packed ones"), expected)
     })?;
@@ -75,7 +75,7 @@ fn open(path: &Path, name: Option<&str>) -> Result<Input> {
     }
 }
 
-/// Compares the checksum where the data ends.
+/// Verifies the checksum at the end of the data.
 struct Checked<R> {
     reader: R,
     crc: Crc,
@@ -139,7 +139,7 @@ mod tests {
                 let e = read(&path, None, ONE).unwrap_err().to_string();
                 assert!(e.contains("a.npz"), "{e}");
             }
-            // Any one changed byte either is told or changes nothing.
+            // Each single changed byte causes an error or has no effect.
             for at in 0..whole.len() {
                 let mut bytes = whole.clone();
                 bytes[at] ^= 0x41;
@@ -171,7 +171,7 @@ mod tests {
         );
         let e = read(&path, None, ONE).unwrap_err().to_string();
         assert!(e.contains("data") && e.contains("30000000000"), "{e}");
-        // An archive that says less about the size than it holds, or more.
+        // An archive that claims a smaller or larger size than it holds.
         archive(&path, &[("a.txt", b"hello")], CompressionMethod::Stored);
         assert!(read(&path, None, ONE).unwrap_err().to_string().contains(".npy"));
     }

@@ -1,6 +1,7 @@
-//! NRRD, out: 32-bit floats in gzip, in the patient's coordinates (left, posterior, superior), as 3D Slicer and ITK read them.
+//! NRRD writer: 32-bit floats in gzip, in the patient's coordinates (left, posterior, superior), as 3D Slicer and ITK
+//! read them.
 //!
-//! Source: the definition of the format, teem.sourceforge.net/nrrd/format.html.
+//! Source: the format definition, teem.sourceforge.net/nrrd/format.html.
 
 use crate::affine;
 use crate::file_order::{self, FileOrder};

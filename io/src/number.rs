@@ -2,7 +2,7 @@
 
 use std::io::Write;
 
-/// How one number is stored.
+/// Storage type of a number.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(crate) enum Number {
     Bool,
@@ -18,7 +18,7 @@ pub(crate) enum Number {
     F64,
 }
 
-/// Which end of a number comes first.
+/// Byte order.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(crate) enum ByteOrder {
     Little,
@@ -26,7 +26,7 @@ pub(crate) enum ByteOrder {
 }
 
 impl Number {
-    /// Bytes a number.
+    /// Bytes per number.
     pub fn bytes(self) -> usize {
         match self {
             Self::Bool | Self::U8 | Self::I8 => 1,
@@ -36,7 +36,7 @@ impl Number {
         }
     }
 
-    /// Appends the numbers in `raw` (whole numbers only) to `out`, through `map`.
+    /// Appends the numbers in `raw` (a whole number of them) to `out`, through `map`.
     pub fn decode<T>(self, order: ByteOrder, raw: &[u8], out: &mut Vec<T>, map: impl Fn(f64) -> T) {
         macro_rules! each {
             ($t:ty) => {{

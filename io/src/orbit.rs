@@ -1,12 +1,12 @@
-//! The one circle that some formats know.
+//! The circular orbit that some formats require.
 
 use conefield_core::error::ensure;
 use conefield_core::orbit::CircularOrbit;
 use conefield_core::scan::Scan;
 use conefield_core::{Error, Result};
 
-/// The orbits of `train` and `test` for a `format` that knows only circles, the same for both scans: anything
-/// else is refused, and so is a test scan with another detector or grid.
+/// The orbits of `train` and `test` for a `format` that supports only circles, the same for both scans. Refuses
+/// anything else, and a test scan with another detector or grid.
 pub(crate) fn common_orbit(
     place: &str,
     format: &str,

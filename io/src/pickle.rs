@@ -1,9 +1,9 @@
-//! Python's pickle, protocols 2 to 5, as data.
+//! A reader of Python's pickle, protocols 2 to 5, as pure data.
 //!
-//! A pickle is a program for a stack machine that may call anything. This machine knows numbers, texts, bytes, tuples,
-//! lists, dicts and the names that NumPy's arrays need (`numpy.rs`); every other name or opcode is refused by name.
-//! It calls nothing. Texts, bytes and arrays stay where the file has them until they are asked for, so a file cannot
-//! claim more than it holds, and what it mentions often is kept once.
+//! A pickle is a program for a stack machine that may call anything. This machine supports numbers, texts, bytes,
+//! tuples, lists, dicts and the names that NumPy's arrays need (`numpy.rs`); it refuses every other name or opcode by
+//! name and calls nothing. Texts, bytes and arrays stay in the file's bytes until they are read, so a file cannot claim
+//! more than it holds. Values that the file uses repeatedly are kept once.
 
 mod numpy;
 mod op;
@@ -23,13 +23,13 @@ use value::{Heap, Node, Refusal, Value};
 pub(crate) use value::{Item, Pickle};
 pub(crate) use write::{Out, write};
 
-/// Most values that a pickle may make: a hundred times what long lists of angles need.
+/// Most values in a pickle: a hundred times what long lists of angles need.
 const MOST_VALUES: usize = 1 << 22;
 
-/// Most values that it may number to use again.
+/// Most memo entries.
 const MOST_MEMO: usize = 1 << 20;
 
-/// Most keys of a dict, which are looked for one after the other.
+/// Most keys of a dict, because lookups are linear.
 const MOST_KEYS: usize = 1 << 10;
 
 /// Longest integer, in bytes.
@@ -39,11 +39,11 @@ const PROTOCOLS: std::ops::RangeInclusive<u8> = 2..=5;
 
 /// Whether `start`, the first bytes of a file, are those of a pickle of protocol 2 or later.
 pub(crate) fn is_start(start: &[u8]) -> bool {
-    // Python is at 5; a few more, so that the refusal can name them.
+    // Python's current protocol is 5; a few later ones are accepted here so that the refusal can name them.
     matches!(start, [op::PROTO, 0..=15, ..])
 }
 
-/// Whether the file starts as a pickle of protocol 2 or later does.
+/// Whether the file starts like a pickle of protocol 2 or later.
 pub(crate) fn is_pickle(path: &Path) -> Result<bool> {
     let mut start = Vec::new();
     let (file, _) = files::open(path)?;
@@ -75,18 +75,18 @@ impl<'a> Pickle<'a> {
 struct Machine<'p, 'a> {
     place: &'p str,
     bytes: &'a [u8],
-    /// The next byte.
+    /// Position of the next byte.
     at: usize,
-    /// The byte that the present opcode stands at.
+    /// Position of the current opcode.
     start: usize,
     stack: Vec<Value<'a>>,
     /// Heights of the stack at the open marks.
     marks: Vec<usize>,
     memo: HashMap<u32, Value<'a>>,
     heap: Heap<'a>,
-    /// Values made so far.
+    /// Values created so far.
     made: usize,
-    /// Bytes made by `_codecs.encode` so far.
+    /// Bytes created by `_codecs.encode` so far.
     encoded: usize,
 }
 
@@ -133,7 +133,7 @@ impl<'a> Machine<'_, 'a> {
         if done { Ok(()) } else { Err(self.refused(code)) }
     }
 
-    /// Makes a value that holds no others. Like the functions below: whether the opcode is one of its own.
+    /// Creates a value without children. Like the methods below, returns whether it handles the opcode.
     fn scalar(&mut self, code: u8) -> Result<bool> {
         match code {
             op::NONE => self.push(Value::None)?,
@@ -168,7 +168,7 @@ impl<'a> Machine<'_, 'a> {
         Ok(true)
     }
 
-    /// Makes or fills a tuple or list.
+    /// Creates or fills a tuple or list.
     fn sequence(&mut self, code: u8) -> Result<bool> {
         match code {
             op::EMPTY_TUPLE => self.make(Node::Tuple(Vec::new()))?,
@@ -197,7 +197,7 @@ impl<'a> Machine<'_, 'a> {
         Ok(true)
     }
 
-    /// Makes or fills a dict.
+    /// Creates or fills a dict.
     fn dict(&mut self, code: u8) -> Result<bool> {
         match code {
             op::EMPTY_DICT => self.make(Node::Dict(Vec::new()))?,
@@ -220,7 +220,7 @@ impl<'a> Machine<'_, 'a> {
         Ok(true)
     }
 
-    /// Changes the stack alone, or nothing.
+    /// Rearranges the stack, or does nothing.
     fn rearrange(&mut self, code: u8) -> Result<bool> {
         match code {
             op::PROTO => self.protocol()?,
@@ -243,7 +243,7 @@ impl<'a> Machine<'_, 'a> {
         Ok(true)
     }
 
-    /// Remembers a value or recalls one.
+    /// Stores a value in the memo or recalls one.
     fn memory(&mut self, code: u8) -> Result<bool> {
         match code {
             op::MEMOIZE => {
@@ -271,7 +271,7 @@ impl<'a> Machine<'_, 'a> {
         Ok(true)
     }
 
-    /// Makes one of the few objects that are let through.
+    /// Creates one of the few permitted objects.
     fn object(&mut self, code: u8) -> Result<bool> {
         match code {
             op::GLOBAL => {
@@ -292,7 +292,7 @@ impl<'a> Machine<'_, 'a> {
         Ok(true)
     }
 
-    /// Why an opcode is not taken.
+    /// Why an opcode is refused.
     fn refused(&self, code: u8) -> Error {
         match code {
             op::PERSID
@@ -316,7 +316,7 @@ impl<'a> Machine<'_, 'a> {
         }
     }
 
-    /// An error at the present opcode.
+    /// An error at the current opcode.
     fn wrong(&self, found: impl ToString, expected: impl Into<String>) -> Error {
         let name = self.bytes.get(self.start).and_then(|c| op::name(*c));
         let field = match name {
@@ -391,7 +391,7 @@ impl<'a> Machine<'_, 'a> {
         Ok(())
     }
 
-    /// The top of the stack; what lies below an open mark is out of reach.
+    /// The top of the stack; values below an open mark are out of reach.
     fn peek(&self) -> Result<Value<'a>> {
         let floor = self.marks.last().copied().unwrap_or(0);
         match self.stack.last() {
@@ -406,7 +406,7 @@ impl<'a> Machine<'_, 'a> {
         Ok(value)
     }
 
-    /// As in Python, POP takes an open mark if nothing lies above it.
+    /// As in Python, POP removes an open mark if nothing lies above it.
     fn pop_or_mark(&mut self) -> Result<()> {
         if self.marks.last() == Some(&self.stack.len()) {
             self.marks.pop();
@@ -435,7 +435,7 @@ impl<'a> Machine<'_, 'a> {
             let expected = format!("at most {LONGEST_INTEGER} bytes");
             return Err(self.wrong(format!("an integer of {} bytes", raw.len()), expected));
         }
-        // Two's complement: the last byte's sign goes on.
+        // Two's complement: sign extension of the last byte.
         let sign = if raw.last().is_some_and(|b| b & 0x80 != 0) { 0xff } else { 0 };
         let mut whole = [sign; LONGEST_INTEGER];
         whole[..raw.len()].copy_from_slice(raw);
@@ -513,7 +513,7 @@ impl<'a> Machine<'_, 'a> {
         self.push(Value::Global(global))
     }
 
-    /// Where Python would call something: makes what the few known names stand for.
+    /// REDUCE, which calls a function in Python: creates the objects of the few known names.
     fn reduce(&mut self) -> Result<()> {
         let arguments = self.pop()?;
         let Value::Global(global) = self.pop()? else {
@@ -543,13 +543,13 @@ impl<'a> Machine<'_, 'a> {
         }
     }
 
-    /// Protocol 2 has no bytes: Python writes them as text that `_codecs.encode` turns back.
+    /// Protocol 2 has no bytes: Python writes them as text and decodes it with `_codecs.encode`.
     fn encode(&mut self, arguments: Value<'a>) -> Result<()> {
         let text = match self.heap.tuple(arguments) {
             Some([Value::Text(text), codec]) if matches!(self.heap.text(codec), Some("latin1" | "latin-1")) => text,
             _ => return Err(self.wrong(self.heap.kind(arguments), "a text and \"latin1\"")),
         };
-        // A text that is turned again and again would grow past what the file holds.
+        // Encoding one text repeatedly would create more than the file holds.
         self.encoded += text.len();
         if self.encoded > self.bytes.len() {
             return Err(self.wrong("the same text encoded again and again", "every text at most once"));

@@ -1,9 +1,9 @@
-//! R2-Gaussian's folder: `meta_data.json`, one `.npy` a projection, `vol_gt.npy`.
+//! R2-Gaussian's folder: `meta_data.json`, one `.npy` per projection, `vol_gt.npy`.
 //!
-//! Its world is ours: source at `DSO·(cos a, sin a, 0)`, columns along `(-sin a, cos a, 0)`, rows towards −z; `nDetector`
-//! and `sDetector` are \[v, u\], the volume is \[x, y, z\]. `offDetector` is \[u, v\] and, as in TIGRE, its v points
-//! towards +z, against the rows. `offOrigin` is the volume's centre. Projections are integrals over the lengths of the
-//! file, whatever their unit is.
+//! Its world is conefield's: source at `DSO·(cos a, sin a, 0)`, columns along `(-sin a, cos a, 0)`, rows towards −z;
+//! `nDetector` and `sDetector` are \[v, u\], the volume is \[x, y, z\]. `offDetector` is \[u, v\] and, as in TIGRE, its
+//! v points towards +z, against the rows. `offOrigin` is the volume's centre. Projections are integrals over the file's
+//! lengths, whatever their unit.
 
 use crate::input::LONGEST_TEXT;
 use crate::orbit::common_orbit;
@@ -32,7 +32,7 @@ struct Meta {
     proj_train: Vec<Frame>,
     #[serde(default)]
     proj_test: Vec<Frame>,
-    /// Not R2-Gaussian's own, which reads past it: what our writer adds so that the unit survives.
+    /// An extension that preserves the unit; R2-Gaussian ignores it.
     unit: Option<Unit>,
 }
 
@@ -62,15 +62,15 @@ struct Scanner {
 
 /// Reads R2-Gaussian's folder: training views, test views and the volume.
 ///
-/// The format does not name its unit of length. If the file has a `unit` entry, that holds. Otherwise the volume
-/// tells: where its values times the lengths of the file give the projections, as in the published data, the unit
-/// is called `r2` and taken for 1 mm; where the projections are a thousand times larger, the lengths are metres and
-/// the volume is in 1/mm. Anything else is taken as the first case, with a warning.
+/// The format does not name its unit of length. A `unit` entry decides. Otherwise the volume decides: if its integrals
+/// over the file's lengths match the projections, as in the published data, the unit is called `r2` and counts as 1 mm;
+/// if the projections are a thousand times larger, the lengths are metres and the volume is in 1/mm. Any other ratio
+/// counts as the first case, with a warning.
 pub fn read_r2(path: impl AsRef<Path>) -> Result<DataSet> {
     read(path.as_ref(), true)
 }
 
-/// As [`read_r2`], without the test views.
+/// Like [`read_r2`], without the test views.
 pub(crate) fn read_train(folder: &Path) -> Result<DataSet> {
     read(folder, false)
 }
@@ -118,8 +118,8 @@ fn read(folder: &Path, with_test: bool) -> Result<DataSet> {
     Ok(DataSet { train, test, volume })
 }
 
-/// The size of the folder's training views. While it is read, a list of values that grows may hold as many again, and
-/// the volume is looked at.
+/// The size of the folder's training views. `reading` covers the spare capacity of a growing list, and the volume,
+/// which is read to find the unit.
 pub(crate) fn size(folder: &Path) -> Result<ScanSize> {
     let file = folder.join(META);
     let meta: Meta = parse(&file, &read_text(&file, LONGEST_TEXT)?, Notation::Json)?;
@@ -132,7 +132,7 @@ pub(crate) fn size(folder: &Path) -> Result<ScanSize> {
     Ok(ScanSize { pixels, voxels, test_pixels, reading, views })
 }
 
-/// What the numbers of a folder that does not name its unit can mean.
+/// Possible units of a folder that does not name one.
 const READINGS: [Reading; 2] = [
     Reading { ratio: 1.0, unit: "r2", unit_mm: 1.0, length_mm: 1.0, found: "volume and projections" },
     Reading {
@@ -153,7 +153,7 @@ fn length_unit(place: &str, said: Option<Unit>, train: &Scan, volume: Option<&Ar
     Ok(unit::from_numbers(place, agreement, &READINGS, "nothing: lengths are taken for mm"))
 }
 
-/// Size of one pixel or voxel, from the whole (`s...`), the one (`d...`) or both if they agree.
+/// Size of one pixel or voxel, from the total (`s...`), from the single one (`d...`), or from both if they agree.
 fn each<const N: usize>(
     place: &str,
     [what, axes]: [&str; 2],
@@ -217,12 +217,11 @@ fn volume(folder: &Path, place: &str, name: &str, shape: [usize; 3]) -> Result<A
     data.into_dimensionality::<Ix3>().map_err(|e| Error::invalid(path.display().to_string(), "shape", e, "three axes"))
 }
 
-/// Writes R2-Gaussian's folder, lengths in the unit of `train`. Its own reader wants a volume; without one the
-/// folder is written all the same, for other readers.
+/// Writes R2-Gaussian's folder, lengths in the unit of `train`. R2-Gaussian's own reader requires a volume; without one
+/// the folder is still written, for other readers.
 ///
-/// A scan that is no circle about z, or a test scan with another orbit, detector or grid, cannot be said in this
-/// format and is refused. An earlier folder is replaced only if it is empty or an R2-Gaussian folder with nothing
-/// else in it.
+/// Refuses what the format cannot express: a scan that is not a circle about z, and a test scan with another orbit,
+/// detector or grid. Replaces an earlier folder only if it is empty or an R2-Gaussian folder with nothing else in it.
 pub fn write_r2(folder: impl AsRef<Path>, train: &Scan, test: Option<&Scan>, volume: Option<&Volume>) -> Result<()> {
     let folder = folder.as_ref();
     let place = folder.display().to_string();
@@ -265,7 +264,7 @@ pub fn write_r2(folder: impl AsRef<Path>, train: &Scan, test: Option<&Scan>, vol
             "noise": false,
         },
         "unit": train.unit,
-        // In units of half the longest side, as the published data has it.
+        // In units of half the longest side, as in the published data.
         "bbox": grid.bounds().map(|b| b.map(|x| x / half)),
         "proj_train": frames("proj_train", &orbit.angles),
         "proj_test": frames("proj_test", test_orbit.as_ref().map_or(&[], |o| &o.angles)),
@@ -310,7 +309,8 @@ mod tests {
         }
     }
 
-    /// Root-mean-square difference of measured and integrated, relative to the measured, over a coarse detector.
+    /// Root-mean-square difference of measured and computed integrals, relative to the measured ones, over a coarse
+    /// detector.
     fn error(s: &Scan, volume: &Volume, geometry: &Geometry) -> f64 {
         let (mut d, mut m) = (0.0, 0.0);
         for view in (0..geometry.views.len()).step_by(3) {
@@ -332,7 +332,7 @@ mod tests {
         let Some(path) = data("interop/ellipsoids_50_r2") else { return };
         let r = read_r2(&path).unwrap();
         let (train, volume) = (&r.train, r.volume.as_ref().unwrap());
-        // Lengths of the file are metres, its attenuation is 1/mm: a cube of 100 mm, seen from 500 mm.
+        // The file's lengths are metres, its attenuation is 1/mm: a cube of 100 mm, seen from 500 mm.
         assert_eq!(train.unit, Unit::default());
         assert!((train.geometry.volume.size()[0] - 100.0).abs() < 1e-9);
         assert!((train.geometry.views[0].source[0] - 500.0).abs() < 1e-9);
@@ -351,7 +351,7 @@ mod tests {
         let mirror = |p: [f64; 3]| [p[0], -p[1], p[2]];
         let reversed = changed(&|v| {
             (v.source, v.detector) = (mirror(v.source), mirror(v.detector));
-            // The same handedness of the detector, only the angle's sign differs.
+            // The detector has the same handedness, only the angle's sign differs.
             v.u = minus(mirror(v.u));
         });
         println!("right {right:.4}, test {right_test:.4}, u {u:.4}, v {v:.4}, reversed {reversed:.4}");
@@ -403,7 +403,7 @@ mod tests {
         let back = read_r2(&path).unwrap();
         assert_eq!(back.train.unit, Unit::default());
         near(&back.train.geometry, &g);
-        // Neither: taken as it stands.
+        // Neither ratio: the values are used unchanged.
         save(100.0);
         let back = read_r2(&path).unwrap();
         assert_eq!(back.train.unit.name, "r2");
@@ -425,10 +425,10 @@ mod tests {
         assert_eq!(back.train.projections, train.projections);
         assert_eq!(back.test.unwrap().projections, test.projections);
         assert_eq!(back.volume.unwrap().data, volume.data);
-        // Lengths go out in the scan's own unit, centimetres here.
+        // Lengths are written in the scan's own unit, centimetres here.
         let meta: serde_json::Value = serde_json::from_str(&fs::read_to_string(path.join(META)).unwrap()).unwrap();
         assert!((meta["scanner"]["DSO"].as_f64().unwrap() - 50.0).abs() < 1e-9);
-        // Once more over it, without volume and test.
+        // Overwritten, without volume and test views.
         write_r2(&path, &train, None, None).unwrap();
         let back = read_r2(&path).unwrap();
         assert!(back.test.is_none() && back.volume.is_none());

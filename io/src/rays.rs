@@ -1,10 +1,10 @@
-//! Line integrals through a volume, exact enough to tell which unit a file is in.
+//! Line integrals through a volume, accurate enough to find the unit of a file.
 
 use conefield_core::geometry::{Ray, VoxelGrid};
 use conefield_core::scan::Scan;
 use ndarray::Array3;
 
-/// The integral of `data` along `ray`, in values times mm: trilinear between voxel centres, half a voxel a step.
+/// The integral of `data` along `ray`, in values times mm: trilinear between voxel centres, with steps of half a voxel.
 pub(crate) fn integral(data: &Array3<f32>, grid: &VoxelGrid, ray: &Ray) -> f64 {
     let Some([near, far]) = ray.clip(grid.bounds()) else { return 0.0 };
     let finest = grid.spacing.iter().copied().fold(f64::INFINITY, f64::min);
@@ -19,7 +19,7 @@ pub(crate) fn integral(data: &Array3<f32>, grid: &VoxelGrid, ray: &Ray) -> f64 {
         let mut part = [0.0f64; 3];
         for k in 0..3 {
             let last = (grid.shape[k] - 1) as f64;
-            // Between the outermost centres and the border the outermost value holds.
+            // Between the outermost centres and the border the outermost value applies.
             let x = ((p[k] - lower[k]) / grid.spacing[k] - 0.5).clamp(0.0, last);
             low[k] = x as usize;
             high[k] = (low[k] + 1).min(grid.shape[k] - 1);
@@ -42,17 +42,17 @@ pub(crate) fn integral(data: &Array3<f32>, grid: &VoxelGrid, ray: &Ray) -> f64 {
     sum * length
 }
 
-/// How well a volume explains a scan.
+/// How well a volume matches a scan.
 #[derive(Debug, Clone, Copy)]
 pub(crate) struct Agreement {
-    /// How many times larger the measured line integrals are than those through the volume, by least squares.
+    /// Ratio of the measured line integrals to those through the volume, by least squares.
     pub ratio: f64,
-    /// What is left of the measured ones after that, relative to their root mean square.
+    /// Residual of the measured integrals after scaling, relative to their root mean square.
     pub residual: f64,
 }
 
-/// Compares the measured line integrals with those through `data` on the scan's own grid over some rays; `None` where
-/// the volume casts no shadow on them.
+/// Compares the measured line integrals with those through `data` on the scan's grid along some rays; `None` if none of
+/// them hits the volume's values.
 pub(crate) fn agreement(scan: &Scan, data: &Array3<f32>) -> Option<Agreement> {
     let g = &scan.geometry;
     if data.shape() != g.volume.shape {

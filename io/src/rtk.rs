@@ -1,14 +1,14 @@
 //! RTK's `ThreeDCircularProjectionGeometry` in XML.
 //!
-//! Source of the formulas: RTK's documentation, "3D Circular Projection Geometry". RTK rotates about y; at gantry
-//! angle 0 its source stands on +z and image columns run along +x, image rows along +y. Its `(x, y, z)` are the
-//! `(y, z, x)` of this program, so that the gantry angle is the angle of [`View::circular`]. The rotated axes are
-//! the rows of `R = Rz(−InPlane)·Rx(−OutOfPlane)·Ry(−Gantry)`; along them the source is at `(SourceOffsetX,
-//! SourceOffsetY, SID)`, the detector's point (0, 0) at `(ProjectionOffsetX, ProjectionOffsetY, SID − SDD)`. A point
-//! of the world falls on the detector where the matrix
-//! `T(SourceOffset − ProjectionOffset)·diag(−SDD, −SDD, 1 | −SID)·T(−SourceOffset)·R` puts it.
+//! Source of the formulas: RTK's documentation, "3D Circular Projection Geometry". RTK rotates about y; at gantry angle
+//! 0 its source is on +z, image columns run along +x and image rows along +y. Its `(x, y, z)` is conefield's
+//! `(y, z, x)`, so that the gantry angle is the angle of [`View::circular`]. The rotated axes are the rows of
+//! `R = Rz(−InPlane)·Rx(−OutOfPlane)·Ry(−Gantry)`. Along them the source is at `(SourceOffsetX, SourceOffsetY, SID)`
+//! and the detector's point (0, 0) at `(ProjectionOffsetX, ProjectionOffsetY, SID − SDD)`. A point of the world is
+//! projected onto the detector by the matrix
+//! `T(SourceOffset − ProjectionOffset)·diag(−SDD, −SDD, 1 | −SID)·T(−SourceOffset)·R`.
 //!
-//! RTK names no unit of length; here it is mm. Angles are degrees.
+//! RTK names no unit of length; conefield uses mm. Angles are degrees.
 
 use crate::write_text_atomic;
 use conefield_core::error::ensure;
@@ -19,10 +19,10 @@ use roxmltree::{Document, Node, ParsingOptions};
 use std::path::Path;
 
 const ROOT: &str = "RTKThreeDCircularGeometry";
-/// Longest file, in bytes, and most of what the parser counts as nodes: fifty thousand views.
+/// Longest file, in bytes, and most nodes of the parser: fifty thousand views.
 const LONGEST: u64 = 64 << 20;
 const MOST_NODES: u32 = 4_000_000;
-/// Bytes that a byte of the text becomes at most: a node takes about a hundred, and four bytes of text make one.
+/// Most bytes that a byte of the text expands to: a node takes about a hundred, and four bytes of text can make one.
 const NODE_BYTES: u64 = 24;
 
 /// RTK's nine numbers of one projection, lengths in mm, angles in degrees.
@@ -37,7 +37,7 @@ struct Projection {
     detector: [f64; 2],
 }
 
-/// From RTK's axes to ours and back.
+/// Converts RTK's axes to conefield's.
 fn ours(p: Vec3) -> Vec3 {
     [p[2], p[0], p[1]]
 }
@@ -52,7 +52,7 @@ impl Projection {
         Some(match name {
             "SourceToIsocenterDistance" => &mut self.sid,
             "SourceToDetectorDistance" => &mut self.sdd,
-            // The second name is that of old files.
+            // The second name is from old files.
             "GantryAngle" | "Angle" => &mut self.gantry,
             "OutOfPlaneAngle" => &mut self.out_of_plane,
             "InPlaneAngle" => &mut self.in_plane,
@@ -64,17 +64,17 @@ impl Projection {
         })
     }
 
-    /// The rotated axes in RTK's world, one a row.
+    /// The rotated axes in RTK's world, one per row.
     fn axes(&self) -> [Vec3; 3] {
         let [a, b, g] = [self.in_plane, self.out_of_plane, self.gantry].map(|x| (-x).to_radians().sin_cos());
         let ((sa, ca), (sb, cb), (sg, cg)) = (a, b, g);
-        // Rx·Ry, whose first two rows Rz then mixes.
+        // Rx·Ry; Rz then mixes the first two rows.
         let xy = [[cg, 0.0, sg], [sb * sg, cb, -sb * cg], [-cb * sg, sb, cb * cg]];
         let mix = |p: f64, q: f64| std::array::from_fn(|k| p * xy[0][k] + q * xy[1][k]);
         [mix(ca, -sa), mix(sa, ca), xy[2]]
     }
 
-    /// The view, for pixels and a shift of the image's centre along v and u, in mm.
+    /// The view, for a pixel size and a shift of the image's centre along v and u, in mm.
     fn view(&self, pixel: [f64; 2], offset: [f64; 2]) -> View {
         let [x, y, z] = self.axes();
         let at = |p: f64, q: f64, r: f64| ours(std::array::from_fn(|k| p * x[k] + q * y[k] + r * z[k]));
@@ -89,7 +89,7 @@ impl Projection {
     /// RTK's projection matrix, 3 × 4.
     fn matrix(&self) -> [[f64; 4]; 3] {
         let r = self.axes();
-        // In the rotated frame, seen from the source: s = R·p − (SourceOffset, SID).
+        // In the rotated frame, relative to the source: s = R·p − (SourceOffset, SID).
         let seen: [[f64; 4]; 3] = std::array::from_fn(|i| {
             let shift = [self.source[0], self.source[1], self.sid][i];
             [r[i][0], r[i][1], r[i][2], -shift]
@@ -102,8 +102,7 @@ impl Projection {
         })
     }
 
-    /// The numbers of a view, and whether its rows run against RTK's; `None` if rows and columns are not at right
-    /// angles.
+    /// The numbers of a view, and whether its rows run against RTK's; `None` if rows and columns are not orthogonal.
     fn of(view: &View) -> Option<(Self, bool)> {
         let unit = |a: Vec3| a.map(|x| x / norm(a));
         let (r, c) = (theirs(unit(view.u)), theirs(unit(view.v)));
@@ -111,15 +110,15 @@ impl Projection {
             return None;
         }
         let (source, detector) = (theirs(view.source), theirs(view.detector));
-        // RTK's third axis points from the detector to the source; its rows go where that leads.
+        // RTK's third axis points from the detector to the source, which fixes the direction of its rows.
         let reversed = dot(cross(r, c), sub(source, detector)) < 0.0;
         let c = if reversed { c.map(|x| -x) } else { c };
         let n = cross(r, c);
-        // n = (−cos b·sin g, sin b, cos b·cos g) of b = −OutOfPlane and g = −Gantry.
+        // n = (−cos b·sin g, sin b, cos b·cos g) with b = −OutOfPlane and g = −Gantry.
         let b = n[1].atan2(n[0].hypot(n[2]));
         let (g, a) = match b.cos() {
             x if x > 1e-9 => ((-n[0]).atan2(n[2]), (-r[1]).atan2(c[1])),
-            // Seen along the rotation axis only the sum of the two angles shows.
+            // Along the rotation axis only the sum of the two angles matters.
             _ => (0.0, c[0].atan2(r[0])),
         };
         let turn = |x: f64| (-x).to_degrees().rem_euclid(360.0);
@@ -138,18 +137,18 @@ impl Projection {
 
 /// Reads the views of RTK's geometry file (version 2 or 3).
 ///
-/// The file does not hold the pixels, which RTK keeps in the image: `pixel` is their size and `offset` the place of
-/// the image's centre on the detector (ITK's origin plus half the way to the last pixel), both `[along v, along u]`
-/// in mm. Rows run along RTK's y, which is up (+z).
+/// The file lacks the pixels, which RTK keeps in the image. `pixel` is the pixel size and `offset` the position of the
+/// image's centre on the detector (ITK's origin plus half the distance to the last pixel), both `[along v, along u]` in
+/// mm. Rows run along RTK's y, which is up (+z).
 ///
-/// As in RTK, a number that a projection does not give is that of the projection before. A matrix that does not fit
-/// the numbers, a cylindrical detector and a parallel beam are refused.
+/// As in RTK, a number that a projection omits is inherited from the projection before. Refuses a matrix that
+/// contradicts the numbers, a cylindrical detector and a parallel beam.
 pub fn read_rtk_geometry(path: impl AsRef<Path>, pixel: [f64; 2], offset: [f64; 2]) -> Result<Vec<View>> {
     let path = path.as_ref();
     let place = path.display().to_string();
     let text = read_text(path, LONGEST)?;
     allowance::memory(&place, "XML", (text.len() as u64).saturating_mul(NODE_BYTES))?;
-    // RTK writes a document type without content; entities are limited by the parser.
+    // RTK writes a document type without content; the parser limits entities.
     let options = ParsingOptions { allow_dtd: true, nodes_limit: MOST_NODES, ..ParsingOptions::default() };
     let document =
         Document::parse_with_options(&text, options).map_err(|e| Error::invalid(&place, "XML", e, "RTK's geometry"))?;
@@ -187,7 +186,7 @@ pub fn read_rtk_geometry(path: impl AsRef<Path>, pixel: [f64; 2], offset: [f64; 
     Ok(views)
 }
 
-/// The place with the line of `node`, for errors alone: to find it, the text is read from its start.
+/// The place with the line of `node`. For errors only: it reads the text from its start.
 fn line_of(place: &str, node: Node) -> String {
     format!("{place}: line {}", node.document().text_pos_at(node.range().start).row)
 }
@@ -230,10 +229,10 @@ fn check_matrix(place: &str, node: Node, projection: &Projection) -> Result<()> 
 
 /// Writes `views` as RTK's geometry file, version 3, in mm.
 ///
-/// Returns whether the rows of the projections run against RTK's (on this program's own circles they do): they must
-/// then be flipped for RTK. Refuses detectors whose rows and columns are not at right angles, views of which only
-/// some have reversed rows, and numbers that are not finite. Pixels are the image's affair in RTK; its centre is the
-/// detector's point (0, 0).
+/// Returns whether the rows of the projections run against RTK's, as on conefield's own circles: they must then be
+/// flipped for RTK. Refuses detectors whose rows and columns are not orthogonal, scans in which only some views have
+/// reversed rows, and numbers that are not finite. In RTK the pixels belong to the image; its centre is the detector's
+/// point (0, 0).
 pub fn write_rtk_geometry(path: impl AsRef<Path>, views: &[View]) -> Result<bool> {
     let path = path.as_ref();
     let place = path.display().to_string();
@@ -287,7 +286,7 @@ mod tests {
     #[test]
     fn angles_and_offsets_put_source_and_detector_where_geometry_says() {
         let base = Projection { sid: 1000.0, sdd: 1500.0, ..Projection::default() };
-        // The gantry turns from our +x to our +y; rows run up.
+        // The gantry turns from +x to +y in our axes; rows run up.
         let v = base.view([2.0, 1.0], [0.0; 2]);
         assert!(near(v.source, [1000.0, 0.0, 0.0]) && near(v.detector, [-500.0, 0.0, 0.0]));
         assert!(near(v.u, [0.0, 1.0, 0.0]) && near(v.v, [0.0, 0.0, 2.0]));
@@ -332,9 +331,9 @@ mod tests {
         assert_eq!(views.len(), 2);
         let a = 271.847274780273f64.to_radians();
         assert!(near(views[0].source, [1000.0 * a.cos(), 1000.0 * a.sin(), 0.0]));
-        // What the second projection does not say is that of the first.
+        // The second projection inherits missing numbers from the first.
         assert!((views[1].detector[2] + 1.01195001602173).abs() < 1e-9);
-        // The matrix sends every point of a ray to the pixel that the ray goes through.
+        // The matrix maps every point of a ray to the pixel that the ray hits.
         let p = Projection {
             sid: 1000.0,
             sdd: 1536.0,
@@ -349,8 +348,8 @@ mod tests {
             let pixel: Vec3 = std::array::from_fn(|k| v.detector[k] + x * v.u[k] + y * v.v[k]);
             let q = theirs(std::array::from_fn(|k| 0.4 * v.source[k] + 0.6 * pixel[k]));
             let h = m.map(|r| r[0] * q[0] + r[1] * q[1] + r[2] * q[2] + r[3]);
-            // RTK's detector coordinates count from the world's axis: those of the pixel in the rotated frame,
-            // less the offset, which the matrix takes off.
+            // RTK's detector coordinates are relative to the world's axis: the pixel's coordinates in the rotated frame
+            // minus the offset, which the matrix subtracts.
             assert!((h[0] / h[2] - x).abs() < 1e-9 && (h[1] / h[2] - y).abs() < 1e-9, "{x} {y} {h:?}");
         }
     }
@@ -375,7 +374,7 @@ mod tests {
         assert!(!write_rtk_geometry(&path, &views).unwrap());
         let back = read_rtk_geometry(&path, [2.0, 1.5], [0.0; 2]).unwrap();
         assert!(views.iter().zip(&back).all(|(a, b)| same(a, b)), "{views:?} {back:?}");
-        // Our own circles have their rows the other way.
+        // The rows of conefield's own circles run the other way.
         let views = scan().geometry.views;
         assert!(write_rtk_geometry(&path, &views).unwrap());
         let back = read_rtk_geometry(&path, [2.0, 1.5], [0.0; 2]).unwrap();
@@ -416,7 +415,7 @@ mod tests {
         assert!(read("").unwrap_err().to_string().contains("XML"));
         let e = read("<RTKThreeDCircularGeometry version=\"3\"/>").unwrap_err().to_string();
         assert!(e.contains("one for each view"), "{e}");
-        // Entities within entities must not fill memory.
+        // Nested entities must not fill memory.
         let mut bomb = "<!DOCTYPE a [<!ENTITY x0 \"aaaaaaaaaa\">".to_string();
         for i in 1..30 {
             bomb.push_str(&format!("<!ENTITY x{i} \"{}\">", format!("&x{};", i - 1).repeat(10)));

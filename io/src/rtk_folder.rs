@@ -1,5 +1,5 @@
-//! A scan for RTK: `projections.mha` and `geometry.xml`, which its programs take, and `scanner.toml`, by which it can be
-//! read here again, since neither of them says what to reconstruct.
+//! A scan for RTK: `projections.mha` and `geometry.xml` for its programs, and `scanner.toml` for conefield's own
+//! reader, because neither of the two says which volume to reconstruct.
 
 use crate::affine::{flip, from_columns};
 use crate::scan::SCANNER;
@@ -16,15 +16,14 @@ use std::path::Path;
 const PROJECTIONS: &str = "projections.mha";
 const GEOMETRY: &str = "geometry.xml";
 
-/// Writes the folder `folder` for RTK: line integrals in `projections.mha`, a slice a view, columns along its x and rows
-/// along its y, in mm about the middle of the detector; the views in `geometry.xml`. Rows run up there, against those
-/// of this program's circles. An additional `scanner.toml` says the same to [`read_scan`](crate::read_scan), and which
-/// voxels to reconstruct.
+/// Writes the folder `folder` for RTK: line integrals in `projections.mha`, one slice per view, columns along its x and
+/// rows along its y, in mm relative to the detector's centre; the views in `geometry.xml`. Rows run up there, against
+/// those of conefield's circles. An additional `scanner.toml` describes the same to [`read_scan`](crate::read_scan),
+/// with the grid to reconstruct.
 ///
-/// RTK's files have no place for test views, for the volume that a scan was simulated from, or for a unit other than
-/// mm. Detectors whose rows and columns are not at right angles, and pixels that are not the same in every view, cannot
-/// be said in them and are refused. An earlier folder is replaced only if it is empty or such a folder with nothing else
-/// in it.
+/// RTK's files cannot hold test views, the volume from which a scan was simulated, or a unit other than mm. Refuses
+/// detectors whose rows and columns are not orthogonal and pixels that differ between views, which the files cannot
+/// express. Replaces an earlier folder only if it is empty or such a folder with nothing else in it.
 pub fn write_rtk(folder: impl AsRef<Path>, scan: &Scan) -> Result<()> {
     let folder = folder.as_ref();
     let place = folder.display().to_string();
@@ -56,7 +55,7 @@ pub fn write_rtk(folder: impl AsRef<Path>, scan: &Scan) -> Result<()> {
     })
 }
 
-/// The projections as an image of RTK's: x along the columns, y along its rows, z the views.
+/// The projections as RTK's image: x along the columns, y along its rows, z the views.
 struct Image<'s> {
     /// `[x, y, z]`.
     data: ArrayView3<'s, f32>,
@@ -79,7 +78,7 @@ impl Voxels for Image<'_> {
         VoxelGrid { shape: [columns, rows, views], spacing: [self.pixel[1], self.pixel[0], 1.0], center: [0.0; 3] }
     }
 
-    /// The image stands straight in ITK's axes, its middle at (0, 0).
+    /// The image is axis-aligned in ITK's coordinates, its centre at (0, 0).
     fn affine(&self) -> Option<[[f64; 4]; 4]> {
         let VoxelGrid { shape, spacing: s, .. } = self.grid();
         let first = |k: usize| -(shape[k] as f64 - 1.0) / 2.0 * s[k];
@@ -122,10 +121,10 @@ mod tests {
         {
             assert!(header.contains(line), "{line}: {header}");
         }
-        // The last row of ours is RTK's first, the lowest.
+        // Our last row is RTK's first, the lowest.
         let image = read_volume(path.join(PROJECTIONS)).unwrap();
         assert_eq!(image.data[[2, 0, 5]], want.projections[[5, 3, 2]]);
-        // Again, over itself; not over anything else.
+        // Overwrites itself, but nothing else.
         write_rtk(&path, &want).unwrap();
         std::fs::write(path.join("notes.txt"), "").unwrap();
         assert!(write_rtk(&path, &want).unwrap_err().to_string().contains("notes.txt"));

@@ -1,4 +1,4 @@
-//! The door for scans: which format a folder or file is in.
+//! Entry points for scans: they recognize the format of a folder or file.
 
 use crate::text::format_of;
 use crate::{ImportOptions, naf, pickle, r2, scan_folder, scanner};
@@ -6,17 +6,17 @@ use conefield_core::scan::{Scan, Volume};
 use conefield_core::{Error, Result};
 use std::path::{Path, PathBuf};
 
-/// The description of a scanner's images that is found by its folder's name.
+/// File name of a scanner's description in its folder.
 pub(crate) const SCANNER: &str = "scanner.toml";
 
-/// All that a file or folder holds of one scan.
+/// Everything a file or folder holds of one scan.
 #[derive(Debug, Clone)]
 pub struct DataSet {
     /// The views to reconstruct from.
     pub train: Scan,
-    /// Views kept apart for testing.
+    /// Views held out for testing.
     pub test: Option<Scan>,
-    /// The volume that it was simulated from, in `1/unit` of the scan.
+    /// The volume from which the scan was simulated, in `1/unit` of the scan.
     pub volume: Option<Volume>,
 }
 
@@ -28,14 +28,14 @@ pub(crate) enum ScanFile {
     R2(PathBuf),
     /// NAF's file.
     Naf(PathBuf),
-    /// The description of what a scanner gave.
+    /// A description of a scanner's files.
     Scanner(PathBuf),
 }
 
-/// Reads a scan from conefield's own folder (`scan.toml` or `scan.json`), R2-Gaussian's (`meta_data.json`, the training
-/// views), NAF's pickle (the training views), whatever that is called, or what a scanner gave as its description says
-/// (`scanner.toml` or Nikon's `.xtekct`, see [`read_scanner`](crate::read_scanner)). For folders, the file that describes them may be named
-/// as well.
+/// Reads a scan from conefield's own folder (`scan.toml` or `scan.json`), R2-Gaussian's folder (`meta_data.json`, the
+/// training views), NAF's pickle of any name (the training views), or a scanner's files through their description
+/// (`scanner.toml` or Nikon's `.xtekct`, see [`read_scanner`](crate::read_scanner)). For folders, the path may also
+/// name the description file.
 pub fn read_scan(path: impl AsRef<Path>) -> Result<Scan> {
     match find(path.as_ref())? {
         ScanFile::Own(file) => scan_folder::read(&file),
@@ -45,7 +45,7 @@ pub fn read_scan(path: impl AsRef<Path>) -> Result<Scan> {
     }
 }
 
-/// Reads all that the scan's file or folder holds: training views, test views and volume.
+/// Reads everything in the scan's file or folder: training views, test views and volume.
 pub fn read_data_set(path: impl AsRef<Path>) -> Result<DataSet> {
     match find(path.as_ref())? {
         ScanFile::R2(folder) => r2::read_r2(&folder),
@@ -56,7 +56,7 @@ pub fn read_data_set(path: impl AsRef<Path>) -> Result<DataSet> {
     }
 }
 
-/// Reads the volume that a scan was simulated from, if it carries one. Values are in `1/unit` of the scan.
+/// Reads the volume from which a scan was simulated, if it has one. Values are in `1/unit` of the scan.
 pub fn read_truth(path: impl AsRef<Path>) -> Result<Option<Volume>> {
     match find(path.as_ref())? {
         ScanFile::Own(file) => scan_folder::read_truth(&file),
@@ -84,7 +84,7 @@ pub(crate) fn find(path: &Path) -> Result<ScanFile> {
             (Some(r2::META), _) => Ok(ScanFile::R2(folder.to_path_buf())),
             (_, Some("toml" | "json")) => match format_of(path).as_deref() {
                 Some(scan_folder::FORMAT) => Ok(ScanFile::Own(path.to_path_buf())),
-                // Its reader says what it misses in a description.
+                // The description's reader reports what is missing.
                 _ => Ok(ScanFile::Scanner(path.to_path_buf())),
             },
             _ => Err(Error::invalid(place, "scan", "a file of another kind", understood)),

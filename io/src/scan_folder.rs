@@ -1,4 +1,5 @@
-//! conefield's own scan: a folder with `scan.toml` (or `scan.json`), `projections.npy` and perhaps `truth.nii.gz`.
+//! conefield's own scan format: a folder with `scan.toml` (or `scan.json`), `projections.npy` and optionally
+//! `truth.nii.gz`.
 //!
 //! ```toml
 //! format = "conefield-scan"
@@ -38,7 +39,7 @@ const VERSION: u32 = 1;
 const PROJECTIONS: &str = "projections.npy";
 const TRUTH: &str = "truth.nii.gz";
 
-/// More views than any scanner takes; a larger `count` is a slip and would only fill memory.
+/// More views than any scanner takes; a larger `count` is a typo and would only fill memory.
 const MOST_VIEWS: usize = 1_000_000;
 
 #[derive(Serialize, Deserialize)]
@@ -167,14 +168,14 @@ pub(crate) fn size(file: &Path) -> Result<ScanSize> {
     Ok(ScanSize { pixels, voxels: d.volume.len().unwrap_or(0) as u64, test_pixels: 0, reading: 0, views })
 }
 
-/// Reads the volume that the scan of `file` was simulated from.
+/// Reads the volume from which the scan of `file` was simulated.
 pub(crate) fn read_truth(file: &Path) -> Result<Option<Volume>> {
     let place = file.display().to_string();
     let d = describe(file)?;
     let Some(name) = &d.truth else { return Ok(None) };
     d.volume.validate(&place)?;
     let mut volume = read_volume(folder::plain(folder_of(file), &place, "truth", name)?)?;
-    // On the scan's own grid the description is exact, where NIfTI rounds spacings to 32 bits.
+    // On the scan's own grid the description is exact; NIfTI rounds spacings to 32 bits.
     if volume.grid.shape == d.volume.shape {
         volume.grid = d.volume;
     } else {
@@ -183,10 +184,10 @@ pub(crate) fn read_truth(file: &Path) -> Result<Option<Volume>> {
     Ok(Some(volume))
 }
 
-/// Writes `scan` as the folder `folder`, with the volume that it was simulated from if there is one.
+/// Writes `scan` as the folder `folder`, with the volume from which it was simulated if there is one.
 ///
-/// The folder appears under its name when it is complete. An earlier one is replaced only if it is empty or a
-/// conefield scan with nothing else in it.
+/// The folder appears under its name when it is complete. An earlier one is replaced only if it is empty or a conefield
+/// scan with nothing else in it.
 pub fn write_scan(folder: impl AsRef<Path>, scan: &Scan, truth: Option<&Volume>) -> Result<()> {
     let folder = folder.as_ref();
     let place = folder.display().to_string();
@@ -231,7 +232,8 @@ pub fn write_scan(folder: impl AsRef<Path>, scan: &Scan, truth: Option<&Volume>)
     })
 }
 
-/// TOML knows neither null nor integers past 63 bits: nulls go, larger numbers become text.
+/// Adapts JSON to TOML, which has no null and no integers beyond 63 bits: drops nulls and turns larger numbers into
+/// text.
 fn without_null(value: serde_json::Value) -> Option<serde_json::Value> {
     use serde_json::Value;
     Some(match value {
@@ -243,7 +245,7 @@ fn without_null(value: serde_json::Value) -> Option<serde_json::Value> {
     })
 }
 
-/// A TOML date reaches other types as a table with one reserved key: make it text.
+/// Turns TOML dates into text; other types receive them as a table with one reserved key.
 fn plain_dates(value: serde_json::Value) -> serde_json::Value {
     use serde_json::Value;
     match value {
@@ -275,7 +277,7 @@ mod tests {
         }
     }
 
-    /// A written scan whose description can be changed.
+    /// A written scan with an editable description.
     fn written() -> (tempfile::TempDir, PathBuf, String) {
         let dir = tempfile::tempdir().unwrap();
         let path = dir.path().join("scan");
@@ -402,12 +404,12 @@ mod tests {
     fn only_a_scan_is_replaced() {
         let (_dir, path, _) = written();
         write_scan(&path, &scan(), None).unwrap();
-        // A scan that something else was put beside.
+        // A scan with an unrelated file in its folder.
         fs::write(path.join("notes.txt"), "mine").unwrap();
         let e = write_scan(&path, &scan(), None).unwrap_err().to_string();
         assert!(e.contains("notes.txt") && e.contains("conefield scan"), "{e}");
         assert_eq!(fs::read_to_string(path.join("notes.txt")).unwrap(), "mine");
-        // Files with names as ours, but no description.
+        // Files with a scan's names, but without a description.
         fs::remove_file(path.join("notes.txt")).unwrap();
         fs::remove_file(path.join("scan.toml")).unwrap();
         assert!(write_scan(&path, &scan(), None).is_err());

@@ -1,4 +1,5 @@
-//! A scanner in words: a TOML file that says where source and detector stood and which files hold what they saw.
+//! A scanner's data with a description: a TOML file with the positions of source and detector and the names of the data
+//! files.
 //!
 //! ```toml
 //! format = "conefield-scanner"
@@ -36,12 +37,13 @@
 //! center = [0.0, 0.0, 0.0]
 //! ```
 //!
-//! `[vectors]` has `cone_vec = [[...], ...]`, ASTRA's twelve numbers a view: source, detector centre, the step to the
-//! next column (u) and to the next row (v), all in mm here, or the name of a file with them. `[rtk]` has `file`, `pixel` and `offset`; see
-//! [`read_rtk_geometry`]. `[cil]` has the `file` that CIL wrote. All lengths are mm; angles are degrees, as their keys say.
+//! `[vectors]` has `cone_vec = [[...], ...]`, ASTRA's twelve numbers per view: source, detector centre, the step to the
+//! next column (u) and to the next row (v), all in mm here, or the name of a file with them. `[rtk]` has `file`,
+//! `pixel` and `offset`; see [`read_rtk_geometry`]. `[cil]` has the `file` that CIL wrote. All lengths are mm; angles
+//! are degrees, as their keys say.
 //!
-//! Where a file is HDF5, `scan.h5:/PATH` names a data set in it; `scan.h5` alone stands for the projections, the open beam, the dark
-//! field or the angles that DXchange, NXtomo or CIL keep there. A description of Nikon's, `.xtekct`, stands for one of these.
+//! In an HDF5 file, `scan.h5:/PATH` names a data set; `scan.h5` alone means the projections, open beam, dark field or
+//! angles that DXchange, NXtomo or CIL keep there. Nikon's description, `.xtekct`, may replace this file.
 
 mod cil;
 mod turning;
@@ -71,43 +73,43 @@ use std::path::Path;
 pub(crate) const FORMAT: &str = "conefield-scanner";
 pub(crate) const VERSION: u32 = 1;
 
-/// Numbers of a view in ASTRA's notation.
+/// Numbers per view in ASTRA's notation.
 const VECTOR: usize = 12;
 
 const GEOMETRIES: &str = "one of [circle], [vectors], [rtk] and [cil]";
 
-/// The counts of the open beam where no flat field says them.
+/// The open-beam counts if there is no flat field.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub enum I0 {
-    /// This many in every pixel of every view, dark value included.
+    /// The same for every pixel and view, dark value included.
     Number(f64),
-    /// What the border of each view shows; see [`OpenBeam::Air`].
+    /// Estimated from the border of each view; see [`OpenBeam::Air`].
     Air,
 }
 
-/// What overrides the description, and the part that is taken.
+/// Options that override the description, corrections, and the part of the scan to keep.
 #[derive(Debug, Clone, PartialEq, Default)]
 pub struct ImportOptions {
-    /// In place of the file's `i0` and flat field.
+    /// Replaces the file's `i0` and flat field.
     pub i0: Option<I0>,
-    /// In place of the file's `floor`.
+    /// Replaces the file's `floor`.
     pub floor: Option<f64>,
-    /// What is mended, after counts are converted and before a part is taken.
+    /// Corrections, applied after the conversion of counts and before the selection.
     pub corrections: Corrections,
-    /// The part of the scan that is taken. Counts are converted before: dead pixels are mended by their neighbours, and air is
-    /// looked for at the border of the whole detector. Larger pixels then hold the mean of the light, as they would have counted it;
-    /// where the files hold line integrals, the mean of these.
+    /// The part of the scan to keep. Counts are converted first, so that bad pixels use all their neighbours and air is
+    /// found at the border of the whole detector. Larger pixels then hold the mean light, as they would have measured
+    /// it; if the files hold line integrals, their mean.
     pub selection: Selection,
 }
 
-/// What [`read_scanner`] makes of a description.
+/// The result of [`read_scanner`].
 #[derive(Debug, Clone)]
 pub struct Imported {
     /// The scan, in mm.
     pub scan: Scan,
-    /// What the conversion from counts met; `None` if the files hold line integrals.
+    /// Statistics of the conversion from counts; `None` if the files hold line integrals.
     pub counts: Option<CountsReport>,
-    /// What was mended.
+    /// The corrections applied.
     pub corrections: Vec<Applied>,
 }
 
@@ -128,13 +130,13 @@ struct Description {
     #[serde(default)]
     values: ValuesTable,
     volume: VoxelGrid,
-    /// Rows and columns of the detector, where a description says them beside the images.
+    /// Rows and columns of the detector, if the description states them.
     #[serde(skip)]
     detector: Option<[usize; 2]>,
 }
 
 impl Description {
-    /// Reads the description `path`, by its name Nikon's or the project's own.
+    /// Reads the description `path`: Nikon's or conefield's own, according to its name.
     fn read(path: &Path) -> Result<Self> {
         if is_xtekct(path) { xtekct::description(path) } else { described(path, FORMAT, VERSION) }
     }
@@ -163,7 +165,7 @@ enum Direction {
     Clockwise,
 }
 
-/// Turns of the detector about u, about v and about u × v.
+/// Rotations of the detector about u, v and u × v.
 #[derive(Deserialize, Clone, Copy, Default)]
 #[serde(deny_unknown_fields, default)]
 struct TiltTable {
@@ -250,11 +252,11 @@ struct ValuesTable {
     flat_includes_dark: Option<bool>,
 }
 
-/// Reads the scan that the TOML (or JSON) file `path`, or Nikon's `.xtekct`, describes; the module's source shows its keys.
+/// Reads the scan described by `path`, a TOML (or JSON) file or Nikon's `.xtekct`; the module's source lists the keys.
 ///
-/// Files are relative to the description's folder and stay in it. Counts become line integrals as
-/// [`line_integrals`](crate::line_integrals) says; one of a flat field, `i0` and `options.i0` must be there. The
-/// geometry is checked against the shape of the projections before counts are converted.
+/// Files are relative to the description's folder and stay in it. [`line_integrals`](crate::line_integrals) converts
+/// counts; this requires a flat field, `i0` or `options.i0`. The geometry is checked against the shape of the
+/// projections before counts are converted.
 pub fn read_scanner(path: impl AsRef<Path>, options: &ImportOptions) -> Result<Imported> {
     let path = path.as_ref();
     let place = path.display().to_string();
@@ -287,7 +289,7 @@ pub fn read_scanner(path: impl AsRef<Path>, options: &ImportOptions) -> Result<I
         };
         let dark = d.files.dark.as_ref().map(|n| read("files.dark", ScanPart::Dark, n)).transpose()?;
         let open = match (open, &dark, d.values.flat_includes_dark) {
-            // The formula takes the dark field off again. Fields of two shapes are told there.
+            // The formula subtracts the dark field again. It also reports fields of different shapes.
             (OpenBeam::Flat(flat), Some(dark), Some(false)) if flat.dim() == dark.dim() => OpenBeam::Flat(flat + dark),
             (open, ..) => open,
         };
@@ -310,7 +312,7 @@ pub fn read_scanner(path: impl AsRef<Path>, options: &ImportOptions) -> Result<I
     Ok(Imported { scan, counts, corrections })
 }
 
-/// The size of the scan that the description `path` leads to. Arranging the values and converting counts take copies.
+/// The size of the scan that `path` describes. Reordering the values and converting counts take copies.
 pub(crate) fn size(path: &Path) -> Result<ScanSize> {
     let place = path.display().to_string();
     let d = Description::read(path)?;
@@ -326,8 +328,8 @@ pub(crate) fn size(path: &Path) -> Result<ScanSize> {
     })
 }
 
-/// Turns the rows round where that makes the views one of this program's own circles, on which rows run down: what
-/// knows only those can then take the scan. RTK's rows run up.
+/// Reverses the rows if that turns the views into conefield's own circles, on which rows run down: code that supports
+/// only circles then accepts the scan. RTK's rows run up.
 fn rows_down(place: &str, mut geometry: Geometry, mut projections: Array3<f32>) -> Result<(Geometry, Array3<f32>)> {
     let turned: Vec<View> = geometry.views.iter().map(|w| View { v: w.v.map(|x| 0.0 - x), ..*w }).collect();
     if CircularOrbit::fit(&turned).is_some() {
@@ -345,7 +347,7 @@ fn layout(place: &str, table: &LayoutTable) -> Result<StackLayout> {
     Ok(StackLayout { axes: table.axes, flip_rows: table.flip_rows, flip_columns: table.flip_columns })
 }
 
-/// The one number of the open beam, or `None` if the flat field says it. Refuses what contradicts.
+/// The single open-beam value, or `None` if there is a flat field. Refuses contradictions.
 fn i0(place: &str, d: &Description, options: &ImportOptions) -> Result<Option<I0>> {
     let said = match &d.values.i0 {
         None => None,

@@ -1,4 +1,4 @@
-//! Part of a scan: some of its views, a piece of its detector, images turned round, larger pixels. The geometry goes along.
+//! Part of a scan: some views, a piece of the detector, rotated images, larger pixels. The geometry is adapted.
 
 use conefield_core::error::ensure;
 use conefield_core::geometry::{Geometry, Vec3, View, norm};
@@ -10,12 +10,12 @@ use std::fmt;
 use std::ops::Range;
 use std::str::FromStr;
 
-/// Some of the views, by their numbers from 0.
+/// Some of the views, by index from 0.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub enum ViewChoice {
-    /// One of so many, from the first on.
+    /// Every n-th view, starting with the first.
     Every(usize),
-    /// First, last and step of each piece, in their order.
+    /// First, last and step of each range, in order.
     Pieces(Vec<[usize; 3]>),
 }
 
@@ -60,7 +60,7 @@ impl fmt::Display for ViewChoice {
 }
 
 impl ViewChoice {
-    /// The numbers, of `n` views. Refuses those past the last, and one that is named twice.
+    /// The indices, out of `n` views. Refuses an index beyond the last and a repeated one.
     pub fn of(&self, n: usize) -> Result<Vec<usize>> {
         let refused = |found: String, expected: String| Err(Error::invalid("command line", "--views", found, expected));
         let pieces = match self {
@@ -82,7 +82,8 @@ impl ViewChoice {
     }
 }
 
-/// Some lines of the detector, as NumPy's slices: the end is left out, and a number below 0 counts from behind.
+/// A range of detector rows or columns, as NumPy's slices: the end is excluded, and a negative number counts from the
+/// end.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct Lines {
     from: Option<i64>,
@@ -110,7 +111,7 @@ impl fmt::Display for Lines {
 }
 
 impl Lines {
-    /// The lines, of `n`. Unlike NumPy's, ends past the detector and no line at all are refused.
+    /// The range, out of `n` lines. Unlike in NumPy, ends beyond the detector and an empty range are refused.
     fn of(self, option: &str, n: usize) -> Result<Range<usize>> {
         let place = |end: i64| if end < 0 { end.saturating_add(n as i64) } else { end };
         let (from, to) = (self.from.map_or(0, place), self.to.map_or(n as i64, place));
@@ -121,33 +122,34 @@ impl Lines {
     }
 }
 
-/// What the mean over a larger pixel is of.
+/// How larger pixels average.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(crate) enum Mean {
-    /// Of line integrals.
+    /// Mean of line integrals.
     LineIntegrals,
-    /// Of the share of the beam that arrives, exp(−A), as a larger pixel would count it.
+    /// Mean of the transmitted share of the beam, exp(−A), as a larger pixel would measure it.
     Light,
 }
 
-/// Which part of a scan is taken. In this order: views, turned and flipped images, a piece of them, larger pixels.
+/// The part of a scan to keep. Order: views, rotated and flipped images, a piece of them, larger pixels.
 #[derive(Debug, Clone, PartialEq, Eq, Default)]
 pub struct Selection {
-    /// The views; all if not said.
+    /// The views; all if `None`.
     pub views: Option<ViewChoice>,
-    /// Quarter turns of the images, as NumPy's `rot90`: from rows to columns, counterclockwise as arrays are printed. Like the
-    /// flips it says how images lie in their file: source and detector stay, and with them u along columns and v along rows.
+    /// Quarter turns of the images, as NumPy's `rot90`: from rows to columns, counterclockwise in printed arrays. Like
+    /// the flips, this describes the order of pixels in the file: source and detector stay, and so do u along columns
+    /// and v along rows.
     pub turns: u8,
-    /// The first row becomes the last.
+    /// Whether the first row becomes the last.
     pub flip_rows: bool,
-    /// The first column becomes the last.
+    /// Whether the first column becomes the last.
     pub flip_columns: bool,
-    /// The rows; all if not said.
+    /// The rows; all if `None`.
     pub rows: Option<Lines>,
-    /// The columns; all if not said.
+    /// The columns; all if `None`.
     pub columns: Option<Lines>,
-    /// Pixels of what is left along the side of one that comes out; 0 and 1 leave them as they are. Lines at the end that fill no pixel
-    /// are left out.
+    /// Side of a new pixel in the remaining old ones; 0 and 1 change nothing. Lines at the end that fill no pixel are
+    /// dropped.
     pub bin: usize,
 }
 
@@ -157,7 +159,7 @@ impl Selection {
         self.take(scan, Mean::LineIntegrals)
     }
 
-    /// The same part of the detector, of all views.
+    /// Applies the selection's detector part to all views.
     pub fn of_detector(&self, scan: Scan) -> Result<Scan> {
         Self { views: None, ..self.clone() }.of(scan)
     }
@@ -193,14 +195,14 @@ impl Selection {
         Ok(binned)
     }
 
-    /// Turns and flips the images.
+    /// Rotates and flips the images.
     fn turn(&self, scan: &mut Scan) {
         let turns = self.turns % 4;
         if turns == 0 && !self.flip_rows && !self.flip_columns {
             return;
         }
         let mut images = scan.projections.view();
-        // A quarter turn: rows and columns change places, then the first row becomes the last.
+        // A quarter turn: rows and columns are exchanged, then the first row becomes the last.
         for _ in 0..turns {
             images.swap_axes(1, 2);
             images.invert_axis(Axis(1));
@@ -216,7 +218,7 @@ impl Selection {
             let g = &mut scan.geometry;
             g.detector.reverse();
             for view in &mut g.views {
-                // A pixel that was wide is high now.
+                // A wide pixel becomes a high one.
                 let times = norm(view.v) / norm(view.u);
                 view.u = view.u.map(|x| x * times);
                 view.v = view.v.map(|x| x / times);
@@ -225,7 +227,7 @@ impl Selection {
     }
 }
 
-/// Cuts a piece out of the detector, which moves its centre.
+/// Crops the detector, which moves its centre.
 fn crop(scan: &mut Scan, rows: Range<usize>, columns: Range<usize>) {
     let detector = scan.geometry.detector;
     let piece = [rows.len(), columns.len()];
@@ -249,7 +251,7 @@ mod tests {
     use conefield_core::geometry::{Millimetres, Radians, VoxelGrid};
     use conefield_core::scan::Unit;
 
-    /// Eight views of 6 rows and 8 columns, each pixel with a number of its own; pixels are not square.
+    /// Eight views of 6 rows and 8 columns, each pixel with its own number; pixels are not square.
     fn scan() -> Scan {
         let mm = Millimetres;
         let view = |i: u8| {
@@ -351,7 +353,7 @@ mod tests {
         let whole = scan();
         let bin = Selection { bin: 2, ..Selection::default() };
         assert_eq!(bin.of(whole.clone()).unwrap().projections, whole.binned(2).projections);
-        // What arrives: of light and darkness half the light, not the mean of their logarithms.
+        // The mean of light and darkness is half the light, not the mean of their logarithms.
         let mut two = whole.clone();
         two.projections.indexed_iter_mut().for_each(|((_, _, c), x)| *x = if c % 2 == 0 { 0.0 } else { 10.0 });
         let light = bin.take(two, Mean::Light).unwrap().projections[[0, 0, 0]];

@@ -1,4 +1,4 @@
-//! How large scans and volumes are, read from their headers before memory is taken for them.
+//! Sizes of scans and volumes, read from their headers before memory is allocated.
 
 use crate::scan::{self, ScanFile};
 use crate::volume::{self, VolumeFile};
@@ -11,21 +11,21 @@ use std::path::Path;
 /// The size of a scan.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct ScanSize {
-    /// Measured values, of all views. Of a pickle at most so many.
+    /// Measured values of all views; for a pickle an upper bound.
     pub pixels: u64,
-    /// Voxels to reconstruct. Of a pickle at most so many.
+    /// Voxels to reconstruct; for a pickle an upper bound.
     pub voxels: u64,
-    /// Measured values of test views, which only [`read_data_set`](crate::read_data_set) reads. Of a pickle they are
-    /// among `pixels`.
+    /// Measured values of test views, which only [`read_data_set`](crate::read_data_set) reads. For a pickle, `pixels`
+    /// includes them.
     pub test_pixels: u64,
-    /// Bytes that reading takes beside the projections.
+    /// Bytes that reading takes besides the projections.
     pub reading: u64,
-    /// Views; 1 where a file does not tell before it is read.
+    /// Number of views; 1 if the file does not state it before it is read.
     pub views: usize,
 }
 
 impl ScanSize {
-    /// At least as many values, in square views and a cube: not every file tells more of them before it is read.
+    /// A header for at least as many values, in square views and a cube: not every file states more before it is read.
     pub fn header(&self) -> ScanHeader {
         let views = self.views.max(1);
         let rows = (self.pixels as f64 / views as f64).sqrt().ceil().max(1.0) as usize;
@@ -36,9 +36,8 @@ impl ScanSize {
     }
 }
 
-/// The size of a scan, from what describes it; its projections are not read. A pickle (NAF) tells its sizes only when
-/// it is read: all of the file is taken for 32-bit projections, and for voxels as well. Of a scanner's images the
-/// headers are read.
+/// The size of a scan, from its description; projections are not read. A pickle (NAF) shows its sizes only when it is
+/// read: the whole file counts as 32-bit projections, and as voxels too. For a scanner's images the headers are read.
 pub fn scan_size(path: impl AsRef<Path>) -> Result<ScanSize> {
     let path = path.as_ref();
     let size = match scan::find(path)? {
@@ -58,7 +57,7 @@ pub fn scan_size(path: impl AsRef<Path>) -> Result<ScanSize> {
     Ok(size)
 }
 
-/// The size of the scan that a scanner's description makes.
+/// The size of the scan that a scanner's description gives.
 pub fn scanner_size(path: impl AsRef<Path>) -> Result<ScanSize> {
     let path = path.as_ref();
     let size = scanner::size(path)?;
@@ -67,7 +66,7 @@ pub fn scanner_size(path: impl AsRef<Path>) -> Result<ScanSize> {
     Ok(size)
 }
 
-/// Number of voxels of a volume, from its header; of a DICOM series from those of its slices.
+/// Number of voxels of a volume, from its header, or for a DICOM series from the headers of its slices.
 pub fn volume_voxels(path: impl AsRef<Path>) -> Result<u64> {
     let path = path.as_ref();
     let shape = match volume::open(path)? {
@@ -81,7 +80,7 @@ pub fn volume_voxels(path: impl AsRef<Path>) -> Result<u64> {
     Ok(voxels)
 }
 
-/// More values than any machine holds. Below this, sums of bytes stay far from the end of their range.
+/// More values than any machine holds. Below this, sums of bytes stay far from overflow.
 const MOST: u64 = 1 << 48;
 
 fn must_exist(path: &Path, field: &str, n: u64) -> Result<()> {
@@ -114,7 +113,7 @@ mod tests {
             crate::write_volume(at(name), &v).unwrap();
             assert_eq!(volume_voxels(at(name)).unwrap(), 210, "{name}");
         }
-        // Only the header is looked at: a file that is cut off behind it has the same size.
+        // Only the header is read: a file truncated after it has the same size.
         let whole = std::fs::read(at("a.npy")).unwrap();
         std::fs::write(at("cut.npy"), &whole[..128]).unwrap();
         assert_eq!(volume_voxels(at("cut.npy")).unwrap(), 210);

@@ -1,4 +1,5 @@
-//! Stacks of projections and single fields, from TIFF, `.npy`, `.npz`, MetaImage and HDF5, brought into the order `[view, row, column]`.
+//! Stacks of projections and single fields from TIFF, `.npy`, `.npz`, MetaImage and HDF5, reordered to
+//! `[view, row, column]`.
 
 use crate::hdf5::{self, ScanPart};
 use crate::input::Input;
@@ -8,7 +9,7 @@ use ndarray::{Array2, Array3, ArrayD, Axis, Ix3};
 use serde::{Deserialize, Serialize};
 use std::path::{Path, PathBuf};
 
-/// Bytes in which a MetaImage has said what it is.
+/// Bytes of a MetaImage that suffice to recognize it.
 const LINES: usize = 256;
 
 /// One axis of a stack.
@@ -20,10 +21,10 @@ pub(crate) enum StackAxis {
     Column,
 }
 
-/// How a file's arrays lie.
+/// The order of axes in a file's arrays.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(crate) struct StackLayout {
-    /// What the three axes of a stack mean; an image has two of them, in the same order.
+    /// The meaning of a stack's three axes; an image has two of them, in the same order.
     pub axes: [StackAxis; 3],
     /// Whether the first row is the lowest along v.
     pub flip_rows: bool,
@@ -31,7 +32,7 @@ pub(crate) struct StackLayout {
 }
 
 impl StackLayout {
-    /// Brings the file's array of three axes into the order `[view, row, column]`.
+    /// Reorders the file's three-dimensional array to `[view, row, column]`.
     fn arrange(&self, place: &str, a: Array3<f32>) -> Result<Array3<f32>> {
         let at = |axis| self.axes.iter().position(|&x| x == axis).unwrap_or(0);
         let mut a = a.permuted_axes([at(StackAxis::View), at(StackAxis::Row), at(StackAxis::Column)]);
@@ -44,7 +45,7 @@ impl StackLayout {
         memory::in_order(place, "image", a)
     }
 
-    /// Where the axis of views stands.
+    /// Index of the view axis.
     fn views(&self) -> usize {
         self.axes.iter().position(|&x| x == StackAxis::View).unwrap_or(0)
     }
@@ -64,10 +65,10 @@ struct StackFile {
     array: Option<String>,
 }
 
-/// Reads a stack `[view, row, column]`: files one after the other, each with one view (two axes) or several.
+/// Reads a stack `[view, row, column]` from a sequence of files, each with one view (two axes) or several.
 ///
-/// Names are relative to `folder` and stay in it; a folder stands for its TIFF files, or its `.npy` files if it has
-/// none, in the order of the numbers in their names. Of an HDF5 file that holds a whole scan, `part` is read.
+/// Names are relative to `folder` and stay in it. A folder stands for its TIFF files, or its `.npy` files if it has
+/// none, in the order of the numbers in their names. From an HDF5 file that holds a whole scan, `part` is read.
 pub(crate) fn read(
     folder: &Path,
     place: &str,
@@ -102,7 +103,7 @@ pub(crate) fn read(
         .map_err(|e| Error::invalid(place, field, e, "one image a view"))
 }
 
-/// How many values [`read`] gives, from the headers of its files.
+/// Number of values that [`read`] returns, from the headers of its files.
 pub(crate) fn values(folder: &Path, place: &str, field: &str, names: &Names) -> Result<u64> {
     let product = |all: &[usize]| all.iter().fold(1u64, |n, &s| n.saturating_mul(s as u64));
     let mut sum = 0u64;
@@ -126,7 +127,7 @@ pub(crate) fn values(folder: &Path, place: &str, field: &str, names: &Names) -> 
     Ok(sum)
 }
 
-/// Whether a file that starts with `head` goes on as a MetaImage.
+/// Whether a file that starts with `head` is a MetaImage.
 fn is_metaimage(input: &mut Input, head: &[u8]) -> Result<bool> {
     let mut lines = head.to_vec();
     lines.extend(input.take(LINES)?);
@@ -146,7 +147,7 @@ pub(crate) fn read_field(
     stack.mean_axis(Axis(0)).ok_or_else(|| Error::invalid(place, field, "no image", "at least one"))
 }
 
-/// The file's array with three axes in its own order; an image gets an axis of one view at `views`.
+/// The file's three-dimensional array in its own order; an image gets a view axis of length one at `views`.
 fn raw(source: &StackFile, part: ScanPart, views: usize) -> Result<Array3<f32>> {
     let path = &source.path;
     let place = path.display().to_string();
@@ -160,7 +161,7 @@ fn raw(source: &StackFile, part: ScanPart, views: usize) -> Result<Array3<f32>> 
     if head.starts_with(npz::MAGIC) {
         return three(npz::read(path, source.array.as_deref(), sets)?);
     }
-    // Pages, slices of MetaImage and frames of a scan in HDF5 are always views: they go where the layout expects them.
+    // Pages, slices of MetaImage and frames of a scan in HDF5 are always views: they move to the layout's view axis.
     let pages = |a: Array3<f32>| match views {
         1 => a.permuted_axes([1, 0, 2]),
         2 => a.permuted_axes([1, 2, 0]),
@@ -240,7 +241,7 @@ fn source(folder: &Path, place: &str, field: &str, name: &str) -> Result<Vec<Sta
     inside.collect()
 }
 
-/// A key by which `view2` comes before `view10`: runs of digits count as numbers.
+/// A sort key that puts `view2` before `view10`: runs of digits count as numbers.
 fn natural(name: &str) -> (Vec<(String, usize, String)>, String) {
     let mut parts = Vec::new();
     let mut rest = name;
@@ -250,7 +251,7 @@ fn natural(name: &str) -> (Vec<(String, usize, String)>, String) {
         let end = tail.find(|c: char| !c.is_ascii_digit()).unwrap_or(tail.len());
         let (number, tail) = tail.split_at(end);
         let number = number.trim_start_matches('0');
-        // Of numbers without leading zeros the longer is the larger, whatever their length.
+        // Of two numbers without leading zeros the longer is the larger.
         parts.push((text.to_lowercase(), number.len(), number.to_string()));
         rest = tail;
     }

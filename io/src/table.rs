@@ -1,4 +1,4 @@
-//! Numbers for each view, in a file beside a description: text (CSV and the like), NumPy's arrays or HDF5.
+//! Per-view numbers in a separate file: text (such as CSV), NumPy's arrays or HDF5.
 
 use crate::input::Input;
 use crate::{folder, hdf5, npy, npz};
@@ -14,18 +14,18 @@ const LONGEST: u64 = 64 << 20;
 #[derive(Deserialize)]
 #[serde(untagged, expecting = "a list of numbers, or the name of a file with them")]
 pub(crate) enum Numbers<T> {
-    /// As the description has it.
+    /// A list in the description.
     List(Vec<T>),
     /// `FILE`, `FILE.npz:ARRAY`, `FILE.h5:/PATH` or `FILE.csv:COLUMN`.
     File(String),
 }
 
-/// The rows of `width` numbers each in the file `name` of `folder`.
+/// Reads rows of `width` numbers from the file `name` in `folder`.
 ///
-/// Text has a row a line, its numbers apart by commas, semicolons or blanks; what follows `#` and a first line without a
-/// number are left out. Where rows are one number wide, `FILE.csv:NAME` takes the column under that name. HDF5 gives the data
-/// set of that name, or the angles of a scan's projections. Refuses rows of another
-/// width and numbers that are not finite.
+/// Text has one row per line; commas, semicolons or blanks separate its numbers. Comments after `#` and a first line
+/// without a number are skipped. For rows of one number, `FILE.csv:NAME` selects the column NAME. HDF5 provides the
+/// named data set, or the angles of a scan's projections. Refuses rows of another width and numbers that are not
+/// finite.
 pub(crate) fn read(folder: &Path, place: &str, field: &str, name: &str, width: usize) -> Result<Vec<Vec<f64>>> {
     let (file, part) = split(name);
     let path = folder::inside(folder, place, field, file)?;
@@ -60,7 +60,7 @@ fn finite(path: &Path, rows: Vec<Vec<f64>>) -> Result<Vec<Vec<f64>>> {
     Ok(rows)
 }
 
-/// The name of a file, and of the array or column in it.
+/// Splits a file name from the name of an array or column in it.
 fn split(name: &str) -> (&str, Option<&str>) {
     match name.rsplit_once(':') {
         Some((file, part)) if file.contains('.') => (file, Some(part)),
@@ -123,7 +123,7 @@ fn texts(path: &Path, column: Option<&str>, width: usize) -> Result<Vec<Vec<f64>
     lines.map(row).collect()
 }
 
-/// The cells of a line: apart by commas or semicolons where there are any, else by blanks.
+/// The cells of a line: separated by commas or semicolons if there are any, else by blanks.
 fn cells(line: &str) -> Vec<&str> {
     if line.contains([',', ';']) {
         let line = line.trim_end_matches([',', ';']);
@@ -164,7 +164,7 @@ mod tests {
         assert_eq!(found("a.npy", &npy_bytes("<f8", false, "(3, 1)", &numbers), 1).unwrap(), want);
         let two = found("a.txt", b"1 2\n3\t4\n", 2).unwrap();
         assert_eq!(two, [[1.0, 2.0], [3.0, 4.0]]);
-        // An array in Fortran's order has its rows as they are meant.
+        // The rows of an array in Fortran order are read correctly.
         let turned = [1.0f64, 3.0, 2.0, 4.0].map(f64::to_le_bytes).concat();
         assert_eq!(found("a.npy", &npy_bytes("<f8", true, "(2, 2)", &turned), 2).unwrap(), two);
     }

@@ -1,11 +1,11 @@
-//! What several modules' tests share.
+//! Helpers shared by the tests of several modules.
 
 use conefield_core::geometry::{Geometry, Millimetres, Radians, View, VoxelGrid};
 use conefield_core::scan::{Scan, Unit};
 use ndarray::Array3;
 use std::path::PathBuf;
 
-/// A file of the shared data, or `None` with a note on why the test has nothing to do.
+/// A file of the shared data, or `None` with a note that the test is skipped.
 pub(crate) fn data(name: &str) -> Option<PathBuf> {
     let root = std::env::var_os("CONEFIELD_DATA")
         .map(PathBuf::from)
@@ -33,7 +33,7 @@ pub(crate) fn npy_bytes(descr: &str, fortran: bool, shape: &str, data: &[u8]) ->
     out
 }
 
-/// A small scan on a circle with an offset detector and voxels that are no cubes.
+/// A small scan on a circle, with an offset detector and non-cubic voxels.
 pub(crate) fn scan() -> Scan {
     let mm = Millimetres;
     let views: Vec<View> = (0..7)

@@ -8,7 +8,7 @@ use serde::Deserialize;
 use serde::de::DeserializeOwned;
 use std::path::Path;
 
-/// Which notation a text is in.
+/// The notation of a text.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(crate) enum Notation {
     Toml,
@@ -16,32 +16,32 @@ pub(crate) enum Notation {
 }
 
 impl Notation {
-    /// JSON for a name that ends so, else TOML.
+    /// JSON for the extension `.json`, else TOML.
     pub fn of(path: &Path) -> Self {
         let json = path.extension().is_some_and(|e| e.eq_ignore_ascii_case("json"));
         if json { Self::Json } else { Self::Toml }
     }
 }
 
-/// What tells whether a description can be understood at all.
+/// The keys that identify a description.
 #[derive(Default, Deserialize)]
 struct Mark {
     format: Option<String>,
     version: Option<u32>,
 }
 
-/// The format that the file `path` says it has, if it is a description at all.
+/// The `format` that the file `path` states, if it is a description at all.
 pub(crate) fn format_of(path: &Path) -> Option<String> {
     let mark: Mark = parse(path, &read_text(path, LONGEST_TEXT).ok()?, Notation::of(path)).ok()?;
     mark.format
 }
 
-/// Reads the description `path`, which must say `format` and `version`.
+/// Reads the description `path`, whose `format` and `version` must match.
 pub(crate) fn described<T: DeserializeOwned>(path: &Path, format: &str, version: u32) -> Result<T> {
     let text = read_text(path, LONGEST_TEXT)?;
     let place = path.display().to_string();
     let notation = Notation::of(path);
-    // Before the keys are checked: a later version may well have others.
+    // Checked before the other keys, which may differ in a later version.
     let mark: Mark = parse(path, &text, notation)?;
     let found = mark.format.unwrap_or_else(|| "nothing".into());
     ensure(found == format, &place, "format", format!("\"{found}\""), format!("\"{format}\""))?;
@@ -62,7 +62,8 @@ pub(crate) fn parse<T: DeserializeOwned>(path: &Path, text: &str, notation: Nota
     }
 }
 
-/// Parses `text`, the content of the TOML file `path`. Errors name the line and, for an unknown key, the nearest valid one.
+/// Parses `text`, the content of the TOML file `path`. Errors name the line and, for an unknown key, the nearest valid
+/// one.
 pub fn parse_toml<T: DeserializeOwned>(path: &Path, text: &str) -> Result<T> {
     parse(path, text, Notation::Toml)
 }

@@ -1,5 +1,5 @@
-//! TIFF as detectors write it: one grey channel, integers or floats, one image a page; plain or packed by LZW, deflate, PackBits or
-//! Zstandard. Out, a page a slice ([`write`]).
+//! TIFF from detectors: one grey channel, integers or floats, one image per page; uncompressed, or compressed by LZW,
+//! deflate, PackBits or Zstandard. [`write`] writes a volume with one slice per page.
 
 mod entries;
 mod write;
@@ -17,12 +17,12 @@ use std::path::Path;
 use tiff::decoder::{Decoder, DecodingResult, Limits};
 use tiff::{ColorType, TiffError};
 
-/// Whether `head`, the first bytes of a file, starts a TIFF (also a BigTIFF).
+/// Whether `head`, the first bytes of a file, starts a TIFF or BigTIFF.
 pub(crate) fn is_tiff(head: &[u8]) -> bool {
     [b"II*\0", b"MM\0*", b"II+\0", b"MM\0+"].iter().any(|m| head.starts_with(*m))
 }
 
-/// How many values all pages have, from their directories.
+/// Number of values of all pages, from their directories.
 pub(crate) fn values(path: &Path) -> Result<u64> {
     let mut sum = 0u64;
     pages(path, |_, page| {
@@ -32,17 +32,17 @@ pub(crate) fn values(path: &Path) -> Result<u64> {
     Ok(sum)
 }
 
-/// Reads all pages as `[page, row, column]`; they must be of one size.
+/// Reads all pages as `[page, row, column]`; they must have the same size.
 ///
-/// 8 to 64 bits a pixel, integers or floats, converted to `f32`; other colours, sizes that the file cannot hold,
-/// values that are not finite and damaged files are refused.
+/// Converts 8 to 64 bits per pixel, integers or floats, to `f32`. Refuses other colour types, sizes that the file
+/// cannot hold, values that are not finite and damaged files.
 pub(crate) fn read(path: &Path) -> Result<Array3<f32>> {
     let place = path.display().to_string();
     let mut values = Vec::<f32>::new();
     let (pages, [rows, columns]) = pages(path, |decoder, page| {
         let count = usize::try_from(page.pixels).unwrap_or(usize::MAX);
         memory::grow(&mut values, count, usize::MAX, &place, "pages")?;
-        // The page as it is stored, and what its pieces are unpacked to.
+        // The stored page and its decompressed strips or tiles.
         allowance::memory(&place, "page", page.bytes.saturating_mul(2))?;
         if zstd::is_packed(decoder) {
             return zstd::read(&place, decoder, page.size, page.bits, &mut values);
@@ -63,14 +63,14 @@ pub(crate) fn read(path: &Path) -> Result<Array3<f32>> {
 /// What a page's directory claims.
 struct Page {
     pixels: u64,
-    /// Bytes that they take unpacked.
+    /// Bytes of the decompressed values.
     bytes: u64,
     bits: u8,
     /// Rows and columns.
     size: [usize; 2],
 }
 
-/// Goes through the pages without unpacking them; their number, rows and columns.
+/// Walks over the pages without decompressing them; returns their number, rows and columns.
 fn pages(
     path: &Path,
     mut each: impl FnMut(&mut Decoder<BufReader<File>>, Page) -> Result<()>,
@@ -104,7 +104,7 @@ fn pages(
             let found = format!("{height} x {width} pixels");
             return Err(Error::invalid(&place, format!("page {pages}"), found, "the size of the first page"));
         }
-        // The entries of the next page count as well; a value takes 32 bytes at most.
+        // Includes the next page's entries; a value takes 32 bytes at most.
         let most = bytes.max(packed.saturating_mul(32));
         let mut limits = Limits::default();
         limits.decoding_buffer_size = usize::try_from(most).unwrap_or(usize::MAX);
@@ -229,7 +229,7 @@ mod tests {
         for cut in [0, 3, 9, whole.len() / 2, whole.len() - 20] {
             refused(&whole[..cut], &["TIFF"]);
         }
-        // No changed byte makes it panic or take memory.
+        // No changed byte causes a panic or a large allocation.
         let dir = tempfile::tempdir().unwrap();
         let path = dir.path().join("b.tif");
         for at in (0..8).chain(800..whole.len()) {

@@ -1,25 +1,25 @@
-//! Which unit a file is in that does not say it: the numbers tell.
+//! Finds the unit of a file that does not name it, from its numbers.
 
 use crate::rays::Agreement;
 use conefield_core::Result;
 use conefield_core::error::ensure;
 use conefield_core::scan::Unit;
 
-/// How the unit is known where the file names it.
+/// Source of the unit if the file names it.
 pub(crate) const SAID: &str = "the file";
 
-/// The unit of a scan and how it was decided.
+/// The unit of a scan and its source.
 pub(crate) struct Units {
     pub unit: Unit,
-    /// Millimetres a length of the file.
+    /// Millimetres per length unit of the file.
     pub length_mm: f64,
-    /// In words, for the scan's provenance.
+    /// How the unit was found, in words, for the scan's provenance.
     pub found: &'static str,
 }
 
-/// One meaning that the numbers of a file can have.
+/// A possible unit of a file's numbers.
 pub(crate) struct Reading {
-    /// Measured line integrals over those through the volume, in lengths of the file.
+    /// Expected ratio of measured line integrals to those through the volume, in lengths of the file.
     pub ratio: f64,
     pub unit: &'static str,
     pub unit_mm: f64,
@@ -33,14 +33,14 @@ impl Reading {
     }
 }
 
-/// Refuses a unit that is no length.
+/// Refuses an invalid length unit.
 pub(crate) fn check(place: &str, unit: &Unit) -> Result<()> {
     let expected = "a positive finite number of millimetres";
     ensure(unit.mm.is_finite() && unit.mm > 0.0, place, "unit.mm", unit.mm, expected)
 }
 
-/// The reading whose ratio (to −20 % or +25 %) is the one found. The first stands where none is, with a warning, and
-/// where there is nothing to compare (`otherwise` says so).
+/// The reading whose ratio matches the measured one (to −20 % or +25 %). The first reading is the default: with a
+/// warning if none matches, and with the source `otherwise` if there is nothing to compare.
 pub(crate) fn from_numbers(
     place: &str,
     agreement: Option<Agreement>,

@@ -1,4 +1,4 @@
-//! The door for volumes: which format a file is in, and which one a name asks for.
+//! Entry points for volumes: they recognize a file's format, and choose a format for a file name.
 
 use crate::input::Input;
 use crate::{dicom, metaimage, nifti, npy, nrrd, pickle, tiff, write_atomic, zarr};
@@ -11,13 +11,13 @@ use ndarray::{Array3, Ix3};
 use std::io::Write;
 use std::path::Path;
 
-/// Reads a volume: NIfTI-1 (any real number type, gzip or not), MetaImage (`.mha`, `.mhd` with the file it names
-/// inside its folder, zlib or not), a NumPy array of three axes, or a folder that holds the DICOM files of one series, a
-/// slice each.
+/// Reads a volume: NIfTI-1 (any real number type, gzip or not), MetaImage (`.mha`, or `.mhd` with its data file in the
+/// same folder, zlib or not), a NumPy array of three axes, or a folder with the DICOM files of one series, one slice
+/// each.
 ///
-/// The content decides, not the name. `grid.center` is `[0, 0, 0]`: where the voxels lie in the patient stays in
-/// `affine`, in mm, RAS. A NumPy array has no voxel size and gets 1 mm. Values are converted to `f32`, scaled as
-/// NIfTI's header and DICOM's rescale slope and intercept say; one that is not finite is refused.
+/// The content decides, not the name. `grid.center` is `[0, 0, 0]`: the position in the patient stays in `affine`, in
+/// mm, RAS. A NumPy array has no voxel size and gets 1 mm. Values are converted to `f32` and scaled by NIfTI's or
+/// DICOM's slope and intercept; a value that is not finite is refused.
 pub fn read_volume(path: impl AsRef<Path>) -> Result<Volume> {
     let path = path.as_ref();
     match open(path)? {
@@ -28,19 +28,19 @@ pub fn read_volume(path: impl AsRef<Path>) -> Result<Volume> {
     }
 }
 
-/// A volume's format, with the file where it stands and what was read of it to tell.
+/// A volume's format, with the open file and the bytes read to recognize it.
 pub(crate) enum VolumeFile {
     /// A folder.
     Series,
-    /// Eight bytes are read.
+    /// Eight bytes have been read.
     Npy(Input, Vec<u8>),
-    /// It is opened anew.
+    /// The reader opens the file again.
     MetaImage,
-    /// The header is read.
+    /// The header has been read.
     Nifti(Input, Vec<u8>),
 }
 
-/// Tells the format of a volume by what it holds.
+/// Recognizes the format of a volume by its content.
 pub(crate) fn open(path: &Path) -> Result<VolumeFile> {
     if path.is_dir() {
         return Ok(VolumeFile::Series);
@@ -83,9 +83,9 @@ pub(crate) fn open(path: &Path) -> Result<VolumeFile> {
     Ok(VolumeFile::Nifti(input, head))
 }
 
-/// Whether the file, or the folder with DICOM files in it, looks like a volume; its data is not read. True as well of
-/// what [`read_volume`] refuses with the better reason: a single DICOM file, and a file that is named like a volume but
-/// damaged or none at all.
+/// Whether the file, or the folder with DICOM files, looks like a volume; its data is not read. Also true for paths
+/// that [`read_volume`] refuses with a better error: a single DICOM file, and a file named like a volume that is
+/// damaged or of another format.
 pub fn is_volume(path: impl AsRef<Path>) -> bool {
     let path = path.as_ref();
     if path.is_dir() {
@@ -93,7 +93,7 @@ pub fn is_volume(path: impl AsRef<Path>) -> bool {
     }
     let named = format_of(path).is_some_and(|f| f.is_read());
     let Ok(mut input) = Input::open(path) else { return named };
-    // Of what is read here only volumes are in gzip.
+    // Of the formats read here, only volumes use gzip.
     if input.left().is_none() {
         return true;
     }
@@ -106,7 +106,7 @@ pub fn is_volume(path: impl AsRef<Path>) -> bool {
     })
 }
 
-/// Refuses a name or a number of voxels that [`write_voxels`] would refuse, before they are made.
+/// Refuses a name or a number of voxels that [`write_voxels`] would refuse, before the voxels are computed.
 pub fn check_shape(path: impl AsRef<Path>, shape: [usize; 3]) -> Result<()> {
     let path = path.as_ref();
     match wanted(path)? {
@@ -116,12 +116,12 @@ pub fn check_shape(path: impl AsRef<Path>, shape: [usize; 3]) -> Result<()> {
     }
 }
 
-/// Writes a volume as its name asks, all in `f32`: `.nii`, `.nii.gz` (with an sform in mm), `.mha` (zlib, with the same axes as
-/// directions and voxel sizes), `.mhd` (the same as a header, and the voxels as they are in a `.raw` beside it), `.nrrd` (gzip, the
-/// same axes), `.npy` (C order, without voxel sizes), `.tif` (a page a slice along z, with voxel sizes) or `.zarr` (a folder:
-/// OME-Zarr 0.4 with a pyramid).
+/// Writes a volume in the format of its name, always in `f32`: `.nii`, `.nii.gz` (with an sform in mm), `.mha` (zlib,
+/// with the same axes as directions and voxel sizes), `.mhd` (the same as a header, with uncompressed voxels in a
+/// `.raw` next to it), `.nrrd` (gzip, the same axes), `.npy` (C order, without voxel sizes), `.tif` (one page per slice
+/// along z, with voxel sizes) or `.zarr` (a folder: OME-Zarr 0.4 with a pyramid).
 ///
-/// An affine is kept if its voxel sizes are the grid's; without one, the grid's centre comes to lie at `grid.center`.
+/// An affine is kept if its voxel sizes match the grid; without one, the grid's centre is placed at `grid.center`.
 pub fn write_volume(path: impl AsRef<Path>, mut volume: &Volume) -> Result<()> {
     let path = path.as_ref();
     if volume.data.shape() != volume.grid.shape {
@@ -131,9 +131,9 @@ pub fn write_volume(path: impl AsRef<Path>, mut volume: &Volume) -> Result<()> {
     write_voxels(path, &mut volume)
 }
 
-/// Writes voxels as [`write_volume`] does, slab by slab: no more than 16 MiB of them (or one row) are in memory at
-/// once, and for `.mha` 32 MiB of what they are packed to; the rest of that waits in a file without a name beside it. For `.zarr`
-/// it is eight chunks of 1 MiB a level.
+/// Writes voxels like [`write_volume`], slab by slab. At most 16 MiB of them (or one row) are in memory at once, for
+/// `.mha` also 32 MiB of compressed data, whose rest goes to an unnamed file next to it. For `.zarr` it is eight chunks
+/// of 1 MiB per level.
 pub fn write_voxels(path: impl AsRef<Path>, voxels: &mut dyn Voxels) -> Result<()> {
     let path = path.as_ref();
     let format = wanted(path)?;
@@ -157,7 +157,7 @@ pub fn write_voxels(path: impl AsRef<Path>, voxels: &mut dyn Voxels) -> Result<(
     })
 }
 
-/// Bytes that `voxels` become as `.nii.gz`: all of the work of [`write_voxels`] but for the disk's, to measure it by.
+/// Size of `voxels` as `.nii.gz` in bytes: does all the work of [`write_voxels`] except disk access, to measure it.
 pub fn packed_bytes(voxels: &mut dyn Voxels) -> Result<u64> {
     let place = Path::new("packed voxels");
     voxels.grid().validate("packed voxels")?;
@@ -166,7 +166,7 @@ pub fn packed_bytes(voxels: &mut dyn Voxels) -> Result<u64> {
     packed.finish().map(|counted| counted.0).map_err(|e| Error::io(place, e))
 }
 
-/// Counts bytes and drops them.
+/// Counts bytes and discards them.
 struct Counting(u64);
 
 impl Write for Counting {
@@ -190,7 +190,7 @@ pub(crate) fn from_numpy(path: &Path, array: ndarray::ArrayD<f32>) -> Result<Vol
     Ok(Volume { data, grid, affine: None })
 }
 
-/// The format that a name asks for; one that asks for none is refused.
+/// The format for a file name; refuses an unknown extension.
 fn wanted(path: &Path) -> Result<VolumeFormat> {
     let (place, expected) =
         (path.display().to_string(), "an end of .nii, .nii.gz, .mha, .mhd, .nrrd, .npy, .tif or .zarr");
@@ -211,7 +211,7 @@ enum VolumeFormat {
 }
 
 impl VolumeFormat {
-    /// Whether it is also read.
+    /// Whether conefield also reads this format.
     fn is_read(self) -> bool {
         !matches!(self, Self::Nrrd | Self::Tiff | Self::Zarr)
     }
@@ -256,7 +256,7 @@ mod tests {
         assert_eq!(packed_bytes(&mut &v).unwrap(), packed.metadata().unwrap().len());
     }
 
-    /// Values made where they are asked for, of more voxels than a slab has.
+    /// Voxels computed on demand, more than fit into a slab.
     struct RampVoxels {
         largest: usize,
         parts: usize,

@@ -1,7 +1,7 @@
 //! Weights and checkpoints as safetensors, `f32` only.
 //!
-//! Reading goes through the `safetensors` crate. Writing is done here: it streams, and it puts the metadata in a
-//! fixed order, so that the same weights give the same bytes.
+//! The `safetensors` crate reads. This module writes: it streams, and it orders the metadata, so that the same weights
+//! give the same bytes.
 
 use crate::{number, write_atomic};
 use conefield_core::arena::Weights;
@@ -18,7 +18,7 @@ const METADATA: &str = "__metadata__";
 /// Longest header that is read: a hundred thousand tensors.
 const LONGEST_HEADER: u64 = 16 << 20;
 
-/// Bytes that a byte of a header becomes at most while it is parsed.
+/// Most bytes of memory per byte of a header while it is parsed.
 const HEADER_WORDS: u64 = 16;
 
 /// Writes named `f32` tensors (name, shape, values in C order) and free text.
@@ -50,7 +50,7 @@ pub fn write_weights(
         at = end;
     }
     let mut text = Value::Object(header).to_string();
-    // The data starts on a multiple of eight bytes, as the format asks.
+    // The data starts at a multiple of eight bytes, as the format requires.
     text.push_str(&" ".repeat(text.len().next_multiple_of(8) - text.len()));
     write_atomic(path, |w| {
         let io = |e| Error::io(path, e);
@@ -79,7 +79,7 @@ pub fn read_weights(path: impl AsRef<Path>) -> Result<Weights> {
     let mut raw = Vec::new();
     let too_large = || Error::invalid(&place, "file size", format!("{size} bytes"), "a file that fits in memory");
     let whole = usize::try_from(size).map_err(|_| too_large())?;
-    // The values stand in the file and in their tensors for a moment; of a header, what is parsed is larger than its text.
+    // The values are briefly in memory twice, as file and as tensors; a parsed header is larger than its text.
     let words = header.saturating_mul(HEADER_WORDS);
     allowance::memory(&place, "file size", size.saturating_mul(2).saturating_add(words))?;
     raw.try_reserve_exact(whole).map_err(|_| too_large())?;

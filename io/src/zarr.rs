@@ -1,11 +1,12 @@
-//! OME-Zarr, out: a folder with a pyramid of chunks, for volumes that no viewer loads whole.
+//! OME-Zarr writer: a folder with a pyramid of chunks, for volumes too large for a viewer to load at once.
 //!
-//! Version 0.4 on Zarr 2, which every reader knows: arrays `0` (the volume), `1` (half as many voxels along each axis), … down to one
-//! chunk, axes z, y, x in mm, 32-bit floats in chunks of 64³ packed by zlib. A chunk of a level is made of the eight below it as soon
-//! as they are written, so that a few chunks are in memory at once whatever the volume's size.
+//! Version 0.4 on Zarr 2, which every reader supports: arrays `0` (the volume), `1` (half as many voxels along each
+//! axis), … down to a single chunk; axes z, y, x in mm, 32-bit floats in chunks of 64³ compressed by zlib. Each chunk
+//! is computed from the eight below it as soon as they are written, so that few chunks are in memory at once whatever
+//! the volume's size.
 //!
-//! Source: ngff.openmicroscopy.org/0.4, zarr-specs.readthedocs.io (v2). The format knows sizes and a shift, no turns: of an affine
-//! with turns only those are kept.
+//! Source: ngff.openmicroscopy.org/0.4, zarr-specs.readthedocs.io (v2). The format supports scale and translation, no
+//! rotation: an affine with rotation keeps only the former.
 
 use crate::affine;
 use crate::{folder, number, write_folder_atomic, write_text_atomic};
@@ -21,7 +22,7 @@ use std::path::{Path, PathBuf};
 /// Voxels along each side of a chunk.
 const SIDE: usize = 64;
 
-/// Writes the folder `path`; one that is there is replaced if it holds nothing but such a pyramid.
+/// Writes the folder `path`; an existing folder is replaced only if it holds nothing but such a pyramid.
 pub(crate) fn write(path: &Path, voxels: &mut dyn Voxels) -> Result<()> {
     let known = |name: &str| [".zattrs", ".zgroup"].contains(&name) || name.bytes().all(|b| b.is_ascii_digit());
     folder::may_replace(path, "OME-Zarr", known, &[".zattrs"])?;
@@ -44,13 +45,13 @@ pub(crate) fn write(path: &Path, voxels: &mut dyn Voxels) -> Result<()> {
     })
 }
 
-/// The shapes of all levels, [x, y, z], down to one of a single chunk.
+/// The shapes of all levels, [x, y, z], down to a single chunk.
 fn shapes(full: [usize; 3]) -> Vec<[usize; 3]> {
     let half = |s: &[usize; 3]| s.iter().any(|n| *n > SIDE).then(|| s.map(|n| n.div_ceil(2)));
     std::iter::successors(Some(full), half).collect()
 }
 
-/// The description of the pyramid.
+/// The pyramid's metadata.
 fn attributes(path: &Path, voxels: &dyn Voxels, levels: usize) -> Value {
     let spacing = voxels.grid().spacing;
     let (affine, _) = affine::of(voxels, &path.display().to_string());
@@ -58,7 +59,7 @@ fn attributes(path: &Path, voxels: &dyn Voxels, levels: usize) -> Value {
     let zyx = |v: [f64; 3]| [v[2], v[1], v[0]];
     let data_set = |level: usize| {
         let times = (1u64 << level) as f64;
-        // The centre of a voxel that stands for 2ⁿ along each axis.
+        // The centre of a voxel that covers 2ⁿ voxels along each axis.
         let shift: [f64; 3] = std::array::from_fn(|k| first[k] + 0.5 * (times - 1.0) * spacing[k]);
         json!({ "path": level.to_string(), "coordinateTransformations": [
             { "type": "scale", "scale": zyx(spacing.map(|s| s * times)) },
@@ -73,15 +74,15 @@ fn attributes(path: &Path, voxels: &dyn Voxels, levels: usize) -> Value {
 }
 
 struct Pyramid<'a> {
-    /// Where the files go.
+    /// The folder to write to.
     folder: &'a Path,
-    /// What errors call it.
+    /// The path that errors name.
     path: &'a Path,
     shapes: Vec<[usize; 3]>,
 }
 
 impl Pyramid<'_> {
-    /// Writes the chunk `at` (along x, y, z) of `level` with all below it; its voxels, [x, y, z].
+    /// Writes the chunk `at` (along x, y, z) of `level` and all chunks below it; returns its voxels, [x, y, z].
     fn chunk(&self, voxels: &mut dyn Voxels, level: usize, at: [usize; 3]) -> Result<Array3<f32>> {
         let size: [usize; 3] = std::array::from_fn(|k| SIDE.min(self.shapes[level][k] - at[k] * SIDE));
         let mut values = Array3::zeros(size);
@@ -112,7 +113,7 @@ impl Pyramid<'_> {
         Ok(values)
     }
 
-    /// Writes a chunk, filled up with zeros where the volume ends within it.
+    /// Writes a chunk, padded with zeros where the volume ends within it.
     fn store(&self, level: usize, at: [usize; 3], values: ArrayView3<f32>) -> Result<()> {
         let file: PathBuf = [level, at[2], at[1], at[0]].iter().map(usize::to_string).collect();
         let file = self.folder.join(file);
@@ -129,7 +130,7 @@ impl Pyramid<'_> {
     }
 }
 
-/// Means of 2 × 2 × 2 voxels; of fewer where the volume ends.
+/// Means of 2 × 2 × 2 voxels, of fewer at the end of the volume.
 fn halved(values: ArrayView3<f32>) -> Array3<f32> {
     let shape = [0, 1, 2].map(|k| values.shape()[k].div_ceil(2));
     Array3::from_shape_fn(shape, |(x, y, z)| {
@@ -178,7 +179,7 @@ mod tests {
         assert_eq!(sets[1]["coordinateTransformations"][0]["scale"], json!([4.0, 1.5, 1.0]));
         let first = volume.grid.voxel([0; 3]);
         assert_eq!(sets[1]["coordinateTransformations"][1]["translation"][0], json!(first[2] + 1.0));
-        // Over itself again, never over what is something else.
+        // Overwrites its own output, but nothing else.
         volume.data[[0, 0, 0]] = f32::NAN;
         let e = write(&path, &mut &volume).unwrap_err().to_string();
         assert!(e.contains("a.zarr: voxel [0, 0, 0]") && e.contains("NaN"), "{e}");

@@ -1,8 +1,9 @@
-//! Ray marching: a ray is cut into intervals of equal length, each stands for one sample with its length as weight.
+//! Ray marching: a ray is divided into intervals of equal length; each has one sample, weighted by the interval's
+//! length.
 //!
 //! With `N` intervals of `δ = (far − near)/N` the line integral is `Σ μ(x_i)·δ`, so that no interval is lost at the
-//! end. Samples stand in the middle of their interval (midpoint rule, second order) or at a random place in it (stratified,
-//! unbiased). The published sum, which gives the last sample no weight, is there for comparisons.
+//! end. Samples are in the middle of their interval (midpoint rule, second order) or at a random position in it
+//! (stratified, unbiased). The published sum, which gives the last sample no weight, is available for comparisons.
 
 use conefield_core::error::{Error, Result, ensure};
 use conefield_core::random::{mix, unit};
@@ -12,25 +13,26 @@ use conefield_core::wgsl::Fragment;
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
-/// Where samples stand in their interval while training. Rendering uses the middle.
+/// Sample positions within the intervals during training. Rendering uses the middle.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
 #[serde(rename_all = "kebab-case")]
 pub enum Sampling {
     /// In the middle.
     Uniform,
-    /// At random.
+    /// At random positions.
     Stratified,
-    /// `N` points from end to end, `(far − near)/(N − 1)` apart, of which the last has no weight: the sum of the published codes.
+    /// `N` points from end to end, `(far − near)/(N − 1)` apart, the last without weight: the sum of the published
+    /// codes.
     EndToEnd,
 }
 
-/// Which part of a ray is sampled.
+/// The sampled part of a ray.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
 #[serde(rename_all = "kebab-case")]
 pub enum Extent {
-    /// Between the distances at which the published codes start and stop, the same for every ray of a view.
+    /// Between the near and far distances of the published codes, the same for every ray of a view.
     Published,
-    /// Inside the reconstruction box only.
+    /// Only inside the reconstruction box.
     Clipped,
 }
 
@@ -39,22 +41,23 @@ pub enum Extent {
 #[serde(deny_unknown_fields, default)]
 #[schemars(extend("x-one-of" = [["samples", "step_mm", "step_voxels", "step_cells"]]))]
 pub struct RayMarch {
-    /// Samples a ray; 192 where neither they nor a step are given.
+    /// Samples per ray; 192 if no step is given either.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub samples: Option<usize>,
-    /// Distance of samples in mm, instead of a count.
+    /// Distance between samples in mm, instead of a count.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub step_mm: Option<f64>,
-    /// Distance of samples in sides of a voxel (the shortest), instead of a count: a ray gets as many samples as its path
-    /// through the object asks for.
+    /// Distance between samples in (shortest) voxel sides, instead of a count: the number of samples depends on a ray's
+    /// path through the object.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub step_voxels: Option<f64>,
-    /// The same in sides of the encoder's finest cell: between samples that are closer than these a field has little to tell.
+    /// Distance between samples in sides of the encoder's finest cell, instead of a count: a field has little detail
+    /// below that.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub step_cells: Option<f64>,
-    /// Where samples stand in their interval.
+    /// Sample positions within the intervals.
     pub sampling: Sampling,
-    /// Which part of a ray is sampled.
+    /// The sampled part of a ray.
     pub extent: Extent,
 }
 
@@ -67,9 +70,9 @@ impl Default for RayMarch {
 
 conefield_core::stage_type!(Projector, "ray-march", RayMarch, "equal intervals along the ray, one sample each");
 
-/// Samples a ray where nothing is said of them.
+/// Default number of samples per ray.
 const SAMPLES: usize = 192;
-/// More than this on a ray is a mistake of units.
+/// More samples per ray must be an error in units.
 const MOST_SAMPLES: usize = 65_536;
 
 #[typetag::serde(name = "ray-march")]
@@ -106,7 +109,7 @@ impl ProjectorSpec for RayMarch {
 }
 
 impl RayMarch {
-    /// Samples a ray, where they are counted.
+    /// Samples per ray, if given as a count.
     fn count(&self) -> usize {
         self.samples.unwrap_or(SAMPLES)
     }

@@ -1,4 +1,4 @@
-//! Which backend computes.
+//! Selection of the backend.
 
 use conefield_backend_cpu::Cpu;
 use conefield_backend_wgpu::{Limits, Wgpu, adapters};
@@ -13,23 +13,23 @@ use std::path::Path;
 use std::str::FromStr;
 use std::sync::OnceLock;
 
-/// What `--help` says of `--backend`.
+/// Help text of `--backend`.
 pub const HELP: &str = "Backend: auto (currently the CPU), cpu, wgpu, or wgpu:N for adapter N; +subgroups after wgpu sums gradients of \
                         tables in subgroups first";
 
-/// What `--backend` says.
+/// Value of `--backend`.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
 pub enum BackendChoice {
-    /// The CPU, until a GPU has been measured.
+    /// The CPU, as long as no GPU has been measured.
     #[default]
     Auto,
     /// Rayon and SIMD.
     Cpu,
     /// A GPU.
     Wgpu {
-        /// The adapter's number; otherwise the one that promises most.
+        /// The adapter's number; otherwise the most capable one.
         index: Option<usize>,
-        /// Gradients of tables are added up in subgroups first.
+        /// Whether to sum gradients of tables in subgroups first.
         subgroups: bool,
     },
 }
@@ -72,7 +72,7 @@ impl Serialize for BackendChoice {
 }
 
 impl BackendChoice {
-    /// The backend.
+    /// Opens the backend.
     pub fn open(self) -> Result<Box<dyn Backend>> {
         Ok(match self {
             Self::Auto => Box::<Auto>::default(),
@@ -84,19 +84,18 @@ impl BackendChoice {
     }
 }
 
-/// The CPU, with a word about a GPU that could be asked for: none has been measured yet, so that nobody knows which of the
-/// two is faster.
+/// The CPU, with a hint about available GPUs: none has been measured yet, so the faster one is unknown.
 #[derive(Default)]
 struct Auto {
     cpu: Cpu,
-    /// What there is to ask for, looked up when that is first told.
+    /// The available GPU, looked up when first needed.
     gpu: OnceLock<Option<String>>,
 }
 
 impl Auto {
     fn note(&self) -> String {
         let look = || {
-            // Asking for adapters loads drivers: not worth it where the system shows no GPU.
+            // Enumerating adapters loads drivers: skipped if the system shows no GPU.
             let adapters = if shows_gpu() { adapters() } else { vec![] };
             let best = adapters.into_iter().filter(|a| !a.software).max_by_key(|a| a.rank())?;
             Some(format!("there is a GPU, {best}: --backend wgpu:{} uses it", best.index))
@@ -108,7 +107,7 @@ impl Auto {
     }
 }
 
-/// Whether the system has the files through which a GPU is reached; systems that have none are taken to show one.
+/// Whether the system has the device files of a GPU; true on systems without such files.
 fn shows_gpu() -> bool {
     !cfg!(target_os = "linux") || ["/dev/dri", "/dev/nvidiactl", "/dev/dxg"].iter().any(|p| Path::new(p).exists())
 }

@@ -1,4 +1,4 @@
-//! What will run: the method that is asked for or, within a budget of time, one of a front's.
+//! Choice of the method: the requested one or, for a time budget, one of a front.
 
 use crate::method::Planned;
 use crate::specs;
@@ -8,16 +8,16 @@ use conefield_tradeoff::front::Front;
 use conefield_tradeoff::schedule::{Budget, Schedule};
 use tracing::info;
 
-/// What is asked for.
+/// The user's request.
 pub enum Wish {
     /// This method.
     Method(Planned),
-    /// The best of these for a budget.
+    /// The best of this front for a budget.
     OneOf(Front),
 }
 
-/// Settles what will run, and how long. `held` are the held-out views; `build` makes a method of the front from
-/// a spec and what is set of it.
+/// Determines the method and its time limits. `held` are the held-out views; `build` builds a method of the front from
+/// a spec and settings.
 pub fn choose(
     wish: Wish,
     bench: &Bench<'_>,

@@ -1,4 +1,4 @@
-//! What a spec builds: stages, widths, parameters, memory, work.
+//! Explains a spec: stages, widths, parameters, memory, operations.
 
 use crate::memory::{self, Memory};
 use crate::plugins;
@@ -9,7 +9,7 @@ use conefield_core::spec::load::Loaded;
 use conefield_report::text::{bytes, number, table};
 use serde::Serialize;
 
-/// All that is said of a spec.
+/// The explanation of a spec.
 #[derive(Debug, Serialize)]
 pub struct Explanation {
     spec: String,
@@ -19,13 +19,13 @@ pub struct Explanation {
     outline: Outline,
     parameters: usize,
     model_bytes: usize,
-    /// Whose stages the spec names.
+    /// The plugins whose stages the spec uses.
     #[serde(skip_serializing_if = "Vec::is_empty")]
     plugins: Vec<plugins::Used>,
     scan: Option<ForScan>,
 }
 
-/// What depends on the scan.
+/// The part that depends on the scan.
 #[derive(Debug, Serialize)]
 struct ForScan {
     views: usize,
@@ -37,7 +37,7 @@ struct ForScan {
 }
 
 impl Explanation {
-    /// Of a spec and its plan; with a scan also what that scan takes in such a `run`.
+    /// Explains a spec and its plan; with a scan, also its requirements in such a `run`.
     pub fn new(loaded: &Loaded, plan: &dyn Plan, scan: Option<(&Scan, memory::Run)>) -> Result<Self> {
         let for_scan = |(scan, run): (&Scan, memory::Run)| {
             let g = &scan.geometry;
@@ -64,7 +64,7 @@ impl Explanation {
         })
     }
 
-    /// For people.
+    /// Text for people.
     pub fn text(&self) -> String {
         text(self)
     }
@@ -105,7 +105,7 @@ fn text(r: &Explanation) -> String {
     lines.join("\n")
 }
 
-/// What a method consists of; the methods of a chain one after the other.
+/// The parts of a method; for a chain, those of its methods in turn.
 fn outlined(o: &Outline, lines: &mut Vec<String>) {
     if !o.stages.is_empty() {
         lines.push(stages(o));

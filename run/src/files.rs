@@ -1,4 +1,4 @@
-//! Between the files of `conefield-io` and what the subcommands work with.
+//! Maps the names of files and phantoms to volumes, scans and weights.
 
 use conefield_backend_cpu::Cpu;
 use conefield_core::arena::Weights;
@@ -16,7 +16,7 @@ pub use conefield_report::text::stem;
 use std::collections::BTreeMap;
 use std::path::Path;
 
-/// The volume that `name` means: `phantom:KIND[:SIZE]` or a file.
+/// The volume named `name`: `phantom:KIND[:SIZE]` or a file.
 pub fn volume(name: &str) -> Result<Volume> {
     match phantom(name)? {
         Some((kind, size)) => Ok(phantom_of(kind, size)),
@@ -24,7 +24,7 @@ pub fn volume(name: &str) -> Result<Volume> {
     }
 }
 
-/// Number of voxels of the volume that `name` means, without reading or making it.
+/// Number of voxels of the volume named `name`, without reading or computing it.
 pub fn voxels(name: &str) -> Result<u64> {
     match phantom(name)? {
         Some((_, size)) => Ok((size as u64).pow(3)),
@@ -32,7 +32,7 @@ pub fn voxels(name: &str) -> Result<u64> {
     }
 }
 
-/// The kind and size of `phantom:KIND[:SIZE]`; any other name is a file's.
+/// The kind and size in `phantom:KIND[:SIZE]`; `None` for a file name.
 fn phantom(name: &str) -> Result<Option<(PhantomKind, usize)>> {
     let Some(rest) = name.strip_prefix("phantom:") else { return Ok(None) };
     let (kind, size) = match (rest.parse::<PhantomKind>(), rest.rsplit_once(':')) {
@@ -46,7 +46,7 @@ fn phantom(name: &str) -> Result<Option<(PhantomKind, usize)>> {
     }
 }
 
-/// Reads a scan, checks it and warns of what will trouble a reconstruction.
+/// Reads and validates a scan, and logs warnings about problems for a reconstruction.
 pub fn scan(path: &Path) -> Result<Scan> {
     let scan = conefield_io::read_scan(path)?;
     scan.validate(&path.display().to_string())?;
@@ -54,7 +54,7 @@ pub fn scan(path: &Path) -> Result<Scan> {
     Ok(scan)
 }
 
-/// Warns of what will trouble a reconstruction.
+/// Logs warnings about problems for a reconstruction.
 pub fn warn_of(path: &Path, survey: &Survey) {
     for warning in &survey.warnings {
         tracing::warn!("{}: {warning}", path.display());
@@ -67,10 +67,10 @@ pub fn write_weights(path: impl AsRef<Path>, weights: &Weights) -> Result<()> {
     conefield_io::write_weights(path, &tensors, &weights.notes)
 }
 
-/// The note of a weights file that says where its field stands.
+/// The note with the placement of the field.
 const PLACEMENT: &str = "placement";
 
-/// Writes a trained field: its weights, with `notes` that hold the spec.
+/// Writes the weights of a trained field; `notes` contain the spec.
 pub fn write_field(path: impl AsRef<Path>, field: &TrainedField, mut notes: BTreeMap<String, String>) -> Result<()> {
     let Model { pipeline, arena, .. } = &field.model;
     let blocks = &pipeline.layout().blocks;
@@ -81,7 +81,7 @@ pub fn write_field(path: impl AsRef<Path>, field: &TrainedField, mut notes: BTre
     conefield_io::write_weights(path, &tensors, &notes)
 }
 
-/// Reads what [`write_field`] wrote.
+/// Reads a file written by [`write_field`].
 pub fn read_field(path: &Path) -> Result<TrainedField> {
     let place = path.display().to_string();
     let weights = read_weights(path)?;
@@ -94,7 +94,8 @@ pub fn read_field(path: &Path) -> Result<TrainedField> {
     let placement: Placement = serde_json::from_str(note(PLACEMENT)?)
         .map_err(|e| Error::invalid(&place, PLACEMENT, e, "what conefield writes there"))?;
     placement.validate(&place)?;
-    // The notes say how large the network is: the tensors must be, before memory is taken for it. A mask leaves less of it.
+    // The notes imply the size of the network: the tensors must match before memory is allocated for it. A mask reduces
+    // the size.
     if let Some(pipeline) = plan.pipeline().filter(|_| placement.masks.is_empty()) {
         weights.check(&place, pipeline.layout(), |_| true)?;
     }
@@ -103,13 +104,13 @@ pub fn read_field(path: &Path) -> Result<TrainedField> {
     })
 }
 
-/// No run takes so many steps: counting on from here is exact in any number that counts them.
+/// More steps than any run takes: counting on from here is exact in every number type in use.
 const MOST_STEPS: u64 = 1 << 48;
 
-/// The entry of a checkpoint's text that says where the run stands; the others say which run it is.
+/// The checkpoint text with the run's progress; the other texts identify the run.
 const STANDING: &str = "standing";
 
-/// Writes a checkpoint of the run that `run` describes.
+/// Writes a checkpoint of the run described by `run`.
 pub fn write_checkpoint(path: &Path, checkpoint: &Checkpoint<'_>, run: &BTreeMap<String, String>) -> Result<()> {
     let standing = serde_json::to_string(&checkpoint.standing)
         .map_err(|e| Error::unsupported("checkpoint", format!("cannot be written as text: {e}")))?;
@@ -118,7 +119,7 @@ pub fn write_checkpoint(path: &Path, checkpoint: &Checkpoint<'_>, run: &BTreeMap
     conefield_io::write_checkpoint(path, &checkpoint.tensors, &text)
 }
 
-/// Reads the checkpoint of the run that `run` describes; another run's is refused.
+/// Reads the checkpoint of the run described by `run`; refuses the checkpoint of another run.
 pub fn read_checkpoint(path: &Path, run: &BTreeMap<String, String>) -> Result<Resume> {
     let place = path.display().to_string();
     if !path.exists() {
@@ -137,12 +138,12 @@ pub fn read_checkpoint(path: &Path, run: &BTreeMap<String, String>) -> Result<Re
     Ok(Resume::new(place, standing, Weights { tensors: file.tensors, ..Weights::default() }))
 }
 
-/// Refuses to go on with a run that was another one than `now`; `place` is the file that tells of it.
+/// Refuses to resume a run that differs from `now`; `place` names its file.
 pub fn same_run(place: &str, then: &BTreeMap<String, String>, now: &BTreeMap<String, String>) -> Result<()> {
     for (key, now) in now {
         let then = then.get(key).map_or("nothing", String::as_str);
         if then != now {
-            // Of long texts, the first line that differs.
+            // For long texts, shows the first line that differs.
             let (a, b) = (then.lines(), now.lines());
             let pair = a.zip(b).find(|(a, b)| a != b).unwrap_or((then, now));
             let expected = format!("{} as in the earlier run; --force starts over", pair.0);

@@ -1,4 +1,4 @@
-//! What a run reads: the scan, views of it that are kept aside, the volume to compare with.
+//! Inputs of a run: the scan, held-out views, the reference volume.
 
 use crate::parse::HoldOut;
 use crate::{files, score};
@@ -12,22 +12,23 @@ use conefield_tradeoff::schedule::Schedule;
 use std::path::Path;
 use std::sync::Arc;
 
-/// What a run works on.
+/// Inputs of a run.
 pub struct Input {
-    /// The views to learn from.
+    /// The training views.
     pub scan: Arc<Scan>,
-    /// Those that are kept aside.
+    /// The held-out views.
     pub aside: Option<Scan>,
-    /// Their numbers.
+    /// Indices of the held-out views.
     pub held: Vec<usize>,
-    /// The volume sought, if it is known.
+    /// The reference volume, if known.
     pub reference: Option<Volume>,
     /// The data range of scores.
     pub peak: f64,
 }
 
 impl Input {
-    /// Of `whole`, whose views `held` are kept aside. `peak`, where none is given, is what the reference says.
+    /// Splits `whole` into training views and the held-out views `held`. The default of `peak` comes from the
+    /// reference.
     pub fn new(whole: Arc<Scan>, held: Vec<usize>, reference: Option<Volume>, peak: Option<f64>) -> Result<Self> {
         let peak = reference.as_ref().map_or(peak.unwrap_or(1.0), |r| score::peak(peak, r));
         let (scan, aside) = if held.is_empty() {
@@ -39,13 +40,13 @@ impl Input {
         Ok(Self { scan, aside, held, reference, peak })
     }
 
-    /// What a budget is measured on.
+    /// The inputs for measuring a budget.
     pub fn bench<'a>(&'a self, backend: &'a dyn Backend, seed: u64, cancelled: &'a dyn Fn() -> bool) -> Bench<'a> {
         let reference = self.reference.as_ref();
         Bench { scan: &self.scan, reference, peak: self.peak, backend, seed, volumes: &files::volume, cancelled }
     }
 
-    /// What a method is given, with the ends of `schedule` beside `limits`.
+    /// The job of a method, with the limits of `schedule` in addition to `limits`.
     pub fn job<'a>(
         &'a self,
         backend: &'a dyn Backend,
@@ -66,8 +67,8 @@ impl Input {
     }
 }
 
-/// The volume to compare with, as large as `scan` asks for: the file `path`, or "truth" for the one that the scan at
-/// `scan_path` comes with.
+/// The reference volume, with the shape of the scan's volume: the file `path`, or for "truth" the volume of the scan at
+/// `scan_path`.
 pub fn reference(path: &Path, scan_path: &Path, scan: &Scan) -> Result<Volume> {
     let volume = if path == Path::new("truth") && !path.exists() {
         let place = scan_path.display().to_string();
@@ -80,15 +81,14 @@ pub fn reference(path: &Path, scan_path: &Path, scan: &Scan) -> Result<Volume> {
     Ok(volume)
 }
 
-/// Refuses a reference, called `place` in errors, that is not as large as `scan` asks for.
+/// Refuses a reference whose shape differs from the scan's volume; errors name `place`.
 pub fn check_reference(place: &str, volume: &Volume, scan: &Scan) -> Result<()> {
     let want = scan.geometry.volume.shape;
     let expected = format!("{want:?}, the voxels that this scan asks for");
     ensure(volume.data.shape() == want, place, "shape", format!("{:?}", volume.data.shape()), expected)
 }
 
-/// Indices of the held-out views, of `n`. Refuses a choice that keeps none aside; `place` and `field` say where
-/// it stands.
+/// Indices of the held-out views out of `n`. Refuses an empty choice; errors name `place` and `field`.
 pub fn held_out(choice: Option<&HoldOut>, n: usize, place: &str, field: &str) -> Result<Vec<usize>> {
     let Some(choice) = choice else { return Ok(vec![]) };
     let held = choice.views(n);

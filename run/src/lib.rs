@@ -1,12 +1,12 @@
-//! From a scan and the name of a spec to a volume with its scores: what the command and the Python package share.
+//! From a scan and the name of a spec to a scored volume: the common code of command line and Python package.
 //!
-//! - [`specs`]: the specs that come with the program, found by name; [`method`]: a spec built and priced.
-//! - [`files`]: volumes, scans and weights as users name them; [`plugins`]: libraries with stages; [`parse`]: values as
-//!   users write them.
-//! - [`backend`]: what computes; [`memory`]: what a run will hold, and what there is; [`machine`]: where it runs.
-//! - [`reconstruct`]: all of it in a few lines of Rust.
-//! - [`input`]: what a run reads; [`choose`]: the method for it, within a budget of time too.
-//! - [`explain`]: what a spec builds; [`score`]: how far a volume is from its reference.
+//! - [`specs`]: the built-in specs by name; [`method`]: a spec, built, with its memory.
+//! - [`files`]: volumes, scans and weights by file name; [`plugins`]: libraries with stages; [`parse`]: parsers of
+//!   values.
+//! - [`backend`]: backends; [`memory`]: a run's memory and the available memory; [`machine`]: the current machine.
+//! - [`reconstruct`]: a complete reconstruction in a few lines of Rust.
+//! - [`input`]: inputs of a run; [`choose`]: choice of the method, also for a time budget.
+//! - [`explain`]: explanation of a spec; [`score`]: comparison of a volume with its reference.
 //! - [`simulation`], [`pretraining`], [`projection`]: the work of the commands of these names.
 
 pub mod backend;

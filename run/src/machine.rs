@@ -1,24 +1,24 @@
-//! What a run ran on.
+//! The machine of a run.
 
 use conefield_report::text::bytes;
 use serde::{Deserialize, Serialize};
 use sysinfo::{CpuRefreshKind, MemoryRefreshKind, RefreshKind, System};
 
-/// A machine, as far as it decides how fast a run is.
+/// The properties of a machine that determine the speed of a run.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
 pub struct Machine {
-    /// The processor's own name.
+    /// Name of the processor.
     pub cpu: String,
     /// Cores that this process may use.
     pub cores: usize,
-    /// All memory of the machine.
+    /// Total memory of the machine.
     pub memory_bytes: u64,
     /// Operating system and architecture.
     pub system: String,
 }
 
 impl Machine {
-    /// This one.
+    /// The current machine.
     pub fn here() -> Self {
         let (cpu, memory) = (CpuRefreshKind::nothing(), MemoryRefreshKind::nothing().with_ram());
         let system = System::new_with_specifics(RefreshKind::nothing().with_cpu(cpu).with_memory(memory)).ok();
@@ -31,7 +31,7 @@ impl Machine {
         }
     }
 
-    /// In words.
+    /// Text for people.
     pub fn line(&self) -> String {
         format!("{}, {} cores, {}, {}", self.cpu, self.cores, bytes(self.memory_bytes), self.system)
     }

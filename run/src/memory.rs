@@ -1,7 +1,7 @@
-//! The estimate of a command's memory before it takes any, and the available memory.
+//! Estimates a command's memory before it allocates any, and finds the available memory.
 //!
-//! An estimate is the sum at the moment that takes most: reading, training or export. It leaves out what is small
-//! whatever the input is, but for the program itself.
+//! An estimate is the peak over reading, training and export. It omits everything that is always small, except the
+//! program itself.
 
 use conefield_core::method::{Needs, Plan};
 use conefield_core::scan::Scan;
@@ -12,21 +12,21 @@ use serde::Serialize;
 use std::sync::OnceLock;
 use sysinfo::{MemoryRefreshKind, ProcessesToUpdate, RefreshKind, System, get_current_pid};
 
-/// Code, threads and the libraries' own tables.
+/// Code, threads and tables of libraries.
 const PROGRAM: u64 = 24 << 20;
 
-/// What `--memory` allows.
+/// The limit of `--memory`.
 static BUDGET: OnceLock<u64> = OnceLock::new();
 
-/// Returns the bytes that the process holds, if its allocator counts them.
+/// Returns the bytes allocated by the process, if its allocator counts them.
 static HELD: OnceLock<fn() -> u64> = OnceLock::new();
 
-/// Lets readers draw from the allowance of memory.
+/// Makes readers reserve memory in the allowance.
 pub fn count(held: fn() -> u64) {
     let _ = HELD.set(held);
 }
 
-/// Sets what commands may take; without `bytes`, what the system has. Readers are kept within it as they allocate.
+/// Sets the memory limit; `None` means the available memory. Readers check it as they allocate.
 pub fn set_budget(bytes: Option<u64>) {
     if let Some(bytes) = bytes {
         let _ = BUDGET.set(bytes);
@@ -37,39 +37,39 @@ pub fn set_budget(bytes: Option<u64>) {
     }
 }
 
-/// Bytes by what holds them, at the moment that takes most.
+/// Bytes at the peak, by use.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Serialize)]
 pub struct Memory {
-    /// The projections, and what reading them takes.
+    /// The projections, and memory for reading them.
     pub scan: u64,
-    /// Volumes that are read or made: a result is held whole only to be scored.
+    /// Volumes that are read or computed: a result is held whole only for scoring.
     pub volume: u64,
     /// The reference volume.
     pub reference: u64,
     /// Parameters and gradients.
     pub model: u64,
-    /// Both moments of every parameter, with parameters those of the last good state, and parameters of the best one.
+    /// Both moments of every parameter, parameters and moments of the last good state, and the best parameters.
     pub optimizer: u64,
-    /// What backend, solver and writer work in, and the program itself.
+    /// Working memory of backend, solver and writer, and the program itself.
     pub buffers: u64,
-    /// All of it.
+    /// Sum of all.
     pub total: u64,
 }
 
 impl Memory {
-    /// The sum taken, and the program.
+    /// Computes the sum, including the program.
     fn summed(mut self) -> Self {
         self.buffers += PROGRAM;
         self.total = self.scan + self.volume + self.reference + self.model + self.optimizer + self.buffers;
         self
     }
 
-    /// The one of several moments that takes most.
+    /// The largest of several estimates.
     pub fn most(moments: &[Memory]) -> Self {
         moments.iter().map(|m| m.summed()).max_by_key(|m| m.total).unwrap_or_default()
     }
 
-    /// In words.
+    /// Text for people.
     pub fn line(&self) -> String {
         let parts = [
             ("scan", self.scan),
@@ -83,7 +83,7 @@ impl Memory {
         format!("{}: {}", bytes(self.total), parts.collect::<Vec<_>>().join(", "))
     }
 
-    /// Refuses what does not fit, with the figures; `smaller` names what would fit into the given bytes.
+    /// Refuses an estimate that does not fit, with figures; `smaller` lists what would fit into the given bytes.
     pub fn check(&self, smaller: impl FnOnce(u64) -> Vec<String>) -> Result<()> {
         let (available, whose) = match BUDGET.get() {
             Some(bytes) => (*bytes, "--memory allows"),
@@ -105,8 +105,8 @@ impl Memory {
     }
 }
 
-/// Bytes that this process may take: what the machine has available, less where a control group limits it; no limit
-/// where the system does not tell.
+/// Bytes available to this process: the machine's available memory, less if a control group limits it; no limit if the
+/// system does not report it.
 fn available() -> u64 {
     let memory = RefreshKind::nothing().with_memory(MemoryRefreshKind::nothing().with_ram());
     let Ok(mut system) = System::new_with_specifics(memory) else { return u64::MAX };
@@ -115,12 +115,11 @@ fn available() -> u64 {
         system.refresh_processes(ProcessesToUpdate::Some(&[pid]), false);
         system.process(pid)?.cgroup_limits()
     });
-    // The group's free memory lacks what the system caches for it and gives back when asked.
+    // The group's free memory excludes reclaimable caches.
     limits.map_or(machine, |l| machine.min(l.total_memory.saturating_sub(l.rss))).min(addresses())
 }
 
-/// What is left of the address space where it is limited. An eighth is kept for threads and for what the allocator takes
-/// around what it hands out.
+/// The rest of a limited address space. One eighth is reserved for threads and for overhead of the allocator.
 fn addresses() -> u64 {
     let kib = |text: &str| text.trim().strip_suffix("kB").and_then(|n| n.trim().parse::<u64>().ok());
     let used = std::fs::read_to_string("/proc/self/status").ok();
@@ -139,8 +138,8 @@ pub fn peak() -> Option<u64> {
 }
 
 impl Memory {
-    /// What holding volumes of so many voxels takes, read one after the other. A file's order of voxels is turned into
-    /// the program's, for which each is there twice for a moment.
+    /// Memory for volumes with these numbers of voxels, read one after the other. Reordering a file's voxels briefly
+    /// takes a second copy of each.
     pub fn of_volumes(voxels: &[u64]) -> Self {
         let mut held = 0;
         let moments = voxels.iter().map(|n| {
@@ -151,13 +150,13 @@ impl Memory {
         Self::most(&moments.collect::<Vec<_>>())
     }
 
-    /// What reading a scan's views takes.
+    /// Memory for reading a scan's views.
     pub fn of_views(size: &ScanSize) -> Self {
         let scan = 4 * (size.pixels + size.test_pixels) + size.reading;
         Self::most(&[Memory { scan, ..Memory::default() }])
     }
 
-    /// The same with the volume that it comes with.
+    /// The same, including the scan's volume.
     pub fn of_data_set(size: &ScanSize) -> Self {
         let scan = 4 * (size.pixels + size.test_pixels);
         let reading = Memory { scan: scan + size.reading, volume: 4 * size.voxels, ..Memory::default() };
@@ -165,16 +164,16 @@ impl Memory {
     }
 }
 
-/// What a run holds beside what its method needs.
+/// The memory of a run besides its method's needs.
 #[derive(Debug, Clone, Copy)]
 pub struct Run {
     /// The scan.
     pub scan: ScanSize,
-    /// Whether views are held out.
+    /// Whether some views are held out.
     pub split: bool,
     /// Whether there is a reference.
     pub reference: bool,
-    /// Whether it goes on from a checkpoint.
+    /// Whether it resumes from a checkpoint.
     pub resume: bool,
 }
 
@@ -191,12 +190,12 @@ impl Run {
         Self::on(ScanSize { pixels, voxels, test_pixels: 0, reading: 0, views: header.views })
     }
 
-    /// What it takes to run `plan`.
+    /// Memory for running `plan`.
     pub fn memory(&self, plan: &dyn Plan) -> Memory {
         self.with(plan.needs(&self.scan.header()))
     }
 
-    /// What reading scan and reference takes.
+    /// Memory for reading scan and reference.
     pub fn reading(&self) -> Memory {
         self.with(Needs::default())
     }
@@ -208,7 +207,7 @@ impl Run {
         let iterate = if needs.volume { voxels } else { 0 };
         let checkpoint = if self.resume { needs.resume } else { 0 };
         let reading = Memory { scan: projections + self.scan.reading, ..Memory::default() };
-        // A file's order of voxels is turned into the program's.
+        // Reordering a file's voxels takes a copy.
         let comparing = Memory { scan: projections, reference: 2 * reference, ..Memory::default() };
         let splitting = Memory { scan: if self.split { 2 * projections } else { 0 }, reference, ..Memory::default() };
         let surrounding = Memory { scan: projections, reference, buffers: needs.surround, ..Memory::default() };
@@ -221,15 +220,15 @@ impl Run {
             buffers: needs.backend + needs.working + checkpoint,
             ..Memory::default()
         };
-        // A result is held whole to be scored.
+        // A result is held whole for scoring.
         let volume = if self.reference { voxels } else { iterate };
         let buffers = needs.evaluating + SLAB_BYTES + checkpoint;
         let exporting = Memory { scan: projections, volume, buffers, ..solving };
         Memory::most(&[reading, comparing, splitting, surrounding, solving, exporting])
     }
 
-    /// What would fit into `available` bytes, one thing smaller at a time; `tables` gives plans with tables of so many bits,
-    /// from the largest that is smaller than now.
+    /// Reductions that would fit into `available` bytes, one at a time; `tables` yields plans with tables of the given
+    /// number of bits, from the largest below the current one.
     pub fn smaller(
         &self,
         plan: &dyn Plan,
@@ -281,7 +280,7 @@ mod tests {
         }
     }
 
-    /// Needs the same for every scan.
+    /// The same needs for every scan.
     struct Fixed(u64);
 
     impl Plan for Fixed {

@@ -1,4 +1,4 @@
-//! A spec with its plan and what that takes.
+//! A spec with its plan and memory estimate.
 
 use crate::files;
 use crate::memory::{self, Memory};
@@ -13,13 +13,13 @@ use conefield_tradeoff::schedule::Runnable;
 use serde_json::Value;
 use std::path::Path;
 
-/// A spec that is built and priced.
+/// A spec, built, with its memory estimate.
 pub struct Planned {
     /// The spec.
     pub loaded: Loaded,
-    /// What it builds.
+    /// The plan.
     pub plan: Box<dyn Plan>,
-    /// What that takes.
+    /// The memory estimate.
     pub memory: Memory,
 }
 
@@ -33,7 +33,7 @@ impl Runnable for Planned {
     }
 }
 
-/// Specs as the command line names them: those that are shipped, types and files.
+/// Specs by name on the command line: built-in ones, method types and files.
 pub struct Known;
 
 impl Specs for Known {
@@ -50,22 +50,22 @@ impl Specs for Known {
     }
 }
 
-/// Builds a spec for `backend`: every stage once. Refusals name the line of the spec.
+/// Builds a spec for `backend`: every stage once. Errors name the line of the spec.
 pub fn plan(loaded: &Loaded, backend: &dyn Backend) -> Result<Box<dyn Plan>> {
     let context = Context { weights: &|path| files::read_weights(path), ..Context::new(backend) };
     loaded.spec.method.plan(&context).map_err(|e| loaded.locate(e))
 }
 
-/// Builds a spec without reading the weights that it names.
+/// Builds a spec without reading the weights named in it.
 pub fn plan_without_files(loaded: &Loaded, backend: &dyn Backend) -> Result<Box<dyn Plan>> {
     loaded.spec.method.plan(&Context::without_weights(backend)).map_err(|e| loaded.locate(e))
 }
 
-/// Reads a spec with settings on top.
+/// Reads a spec with overriding settings.
 pub type Read<'a> = &'a dyn Fn(&[String]) -> Result<Loaded>;
 
-/// Reads and builds a spec, and refuses what does not fit into memory. `run` says what else a run holds; `start` is the file
-/// that it starts from, weights or a volume.
+/// Reads and builds a spec, and refuses one that does not fit into memory. `run` gives the other memory of the run;
+/// `start` is the start file, weights or a volume.
 pub fn planned(
     read: Read<'_>,
     sets: &[String],
@@ -92,7 +92,7 @@ pub fn planned(
     Ok(Planned { loaded, plan, memory })
 }
 
-/// Settings that make the tables of a hash grid smaller, from the largest that is smaller than now.
+/// Settings that reduce the tables of a hash grid, from the largest below the current size.
 fn smaller_tables(loaded: &Loaded) -> Vec<(u32, String)> {
     let paths = ["encoder", "methods.0.encoder"];
     let found = paths.into_iter().find_map(|path| {
@@ -103,8 +103,8 @@ fn smaller_tables(loaded: &Loaded) -> Vec<(u32, String)> {
     (10..bits as u32).rev().map(|bits| (bits, format!("{path}.log2_table_size={bits}"))).collect()
 }
 
-/// The setting that starts the method `tree` from the file `path`: weights or a volume. Of a chain its first method starts
-/// from it.
+/// The setting that makes the method `tree` start from the file `path`, weights or a volume. In a chain, it applies to
+/// the first method.
 pub fn init(tree: &Value, path: &Path) -> String {
     if let Some(first) = tree["methods"].get(0) {
         return format!("methods.0.{}", init(first, path));

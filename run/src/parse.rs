@@ -8,7 +8,7 @@ use std::fmt::Display;
 use std::path::PathBuf;
 use std::str::FromStr;
 
-/// A hundred years: sums with the clock's own time stay far from the end of their range.
+/// A hundred years: sums with the system clock stay far from overflow.
 const LONGEST: f64 = 100.0 * 365.25 * 86400.0;
 
 /// `600`, `600s`, `10m` or `1.5h` in seconds.
@@ -44,7 +44,7 @@ pub fn bytes(text: &str) -> Result<u64, String> {
     positive(number, form.trim_start_matches("expected ")).map(|x| (x * 1024f64.powi(power)) as u64)
 }
 
-/// Two numbers with `separator` between them.
+/// Two numbers, separated by `separator`.
 fn pair<T: FromStr>(text: &str, separator: char, form: &str) -> Result<[T; 2], String> {
     let parsed = text.split_once(separator).and_then(|(a, b)| Some([a.trim().parse().ok()?, b.trim().parse().ok()?]));
     parsed.ok_or_else(|| format!("expected {form}"))
@@ -88,17 +88,17 @@ pub fn i0(text: &str) -> Result<I0, String> {
     }
 }
 
-/// Which views to hold out.
+/// Held-out views.
 #[derive(Debug, Clone, PartialEq)]
 pub enum HoldOut {
-    /// These, counted from 0.
+    /// The views with these indices, from 0.
     Views(Vec<usize>),
-    /// One of so many.
+    /// Every n-th view.
     Every(usize),
 }
 
 impl HoldOut {
-    /// Indices among `n` views, each once, in their order.
+    /// Indices out of `n` views, unique and in ascending order.
     pub fn views(&self, n: usize) -> Vec<usize> {
         match self {
             Self::Views(v) => v.iter().copied().collect::<BTreeSet<_>>().into_iter().collect(),
@@ -129,21 +129,21 @@ pub fn hold_out(text: &str) -> Result<HoldOut, String> {
     }
 }
 
-/// Where the source stands.
+/// Angles of the views.
 #[derive(Debug, Clone, PartialEq)]
 pub enum AnglesOption {
-    /// Evenly from `start` over `range` degrees, the end left out.
+    /// Evenly spaced from `start` over `range` degrees, without the end.
     Even {
         /// The first angle, degrees.
         start: f64,
-        /// Degrees from there.
+        /// Range in degrees.
         range: f64,
     },
-    /// Degrees, one a line.
+    /// A file with one angle in degrees per line.
     File(PathBuf),
 }
 
-/// `START:RANGE` in degrees or a file.
+/// `START:RANGE` in degrees, or a file.
 pub fn angles(text: &str) -> Result<AnglesOption, String> {
     match pair::<f64>(text, ':', "") {
         Ok([start, range]) if start.is_finite() && range.is_finite() && range != 0.0 => {
@@ -161,17 +161,17 @@ pub fn hu(text: &str) -> Result<[f64; 2], String> {
     if both[0] < both[1] { Ok(both) } else { Err(format!("expected {form}")) }
 }
 
-/// What voxel values mean.
+/// Meaning of voxel values.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub enum Values {
-    /// Attenuation already, in whatever unit the scan has.
+    /// Attenuation in the unit of the scan.
     AsIs,
-    /// Hounsfield units, to attenuation in 1/mm or to [0, 1].
+    /// Hounsfield units, mapped to attenuation in 1/mm or to [0, 1].
     Hu(HuMapping),
 }
 
 impl Values {
-    /// The volume in attenuation.
+    /// Maps the volume to attenuation.
     pub fn apply(self, volume: Volume) -> conefield_core::Result<Volume> {
         match self {
             Self::AsIs => Ok(volume),
@@ -199,13 +199,13 @@ pub fn above_zero(text: &str) -> Result<f64, String> {
     positive(text, "a number above 0")
 }
 
-/// A share, above 0 and at most 1.
+/// A share: above 0, at most 1.
 pub fn share(text: &str) -> Result<f64, String> {
     let form = "a share above 0 and at most 1, such as 0.5";
     positive(text, form).and_then(|x| if x <= 1.0 { Ok(x) } else { Err(format!("expected {form}")) })
 }
 
-/// `K/N`: the K-th of N parts, from the first.
+/// `K/N`: the K-th of N parts, starting at 1.
 pub fn part(text: &str) -> Result<[usize; 2], String> {
     let form = "K/N, such as 1/4: the first of four";
     match pair(text, '/', form)? {
@@ -214,11 +214,11 @@ pub fn part(text: &str) -> Result<[usize; 2], String> {
     }
 }
 
-/// Views to hold out, where there may be none.
+/// Held-out views, or none.
 #[derive(Debug, Clone, PartialEq)]
 pub struct HoldOutOrNone(pub Option<HoldOut>);
 
-/// As [`hold_out`], or `none`.
+/// Like [`hold_out`], or `none`.
 pub fn hold_out_or_none(text: &str) -> Result<HoldOutOrNone, String> {
     let views = if text == "none" { None } else { Some(hold_out(text)?) };
     Ok(HoldOutOrNone(views))

@@ -1,4 +1,4 @@
-//! The plugins of this run: found before the command starts, or named by a spec that the user lets load them.
+//! Plugins of this run: found at start, or named by a spec that the user permits to load them.
 
 use conefield_core::spec::load::Draft;
 use conefield_core::{Error, Result};
@@ -11,21 +11,21 @@ use std::sync::{Mutex, PoisonError};
 use tracing::{debug, warn};
 
 static PLUGINS: Mutex<Plugins> = Mutex::new(Plugins { found: vec![] });
-/// Whether a spec may load what it names.
+/// Whether specs may load plugins.
 static LEAVE: AtomicBool = AtomicBool::new(false);
 
-/// Does something with the plugins.
+/// Calls `f` with the plugins.
 pub fn with<T>(f: impl FnOnce(&mut Plugins) -> T) -> T {
     f(&mut PLUGINS.lock().unwrap_or_else(PoisonError::into_inner))
 }
 
-/// Loads what `named`, the environment and the user's folder have; `leave`: so may specs.
+/// Loads the plugins in `named`, in the environment and in the user's folder; `leave`: specs may load plugins too.
 pub fn search(named: &[PathBuf], leave: bool) {
     LEAVE.store(leave, Ordering::Relaxed);
     with(|plugins| *plugins = Plugins::search(named));
 }
 
-/// Refuses to go on without a plugin that the command line names; warns of others that are refused.
+/// Fails if a plugin named on the command line was refused; logs warnings about others.
 pub fn settle() -> Result<()> {
     with(|plugins| {
         for found in &mut plugins.found {
@@ -42,7 +42,7 @@ pub fn settle() -> Result<()> {
     })
 }
 
-/// Loads the plugins that a spec names, if the user has given leave; otherwise they must be loaded already.
+/// Loads the plugins that a spec names, if the user permits it; otherwise they must be loaded already.
 pub fn of_spec(draft: &Draft) -> Result<()> {
     for (place, path) in draft.plugins() {
         with(|plugins| {
@@ -59,7 +59,7 @@ pub fn of_spec(draft: &Draft) -> Result<()> {
     Ok(())
 }
 
-/// A plugin whose stages a run uses.
+/// A plugin whose stages are used in a run.
 #[derive(Debug, Clone, Serialize, Deserialize)]
 pub struct Used {
     name: String,
@@ -78,18 +78,18 @@ impl Used {
         }
     }
 
-    /// In words.
+    /// Text for people.
     pub fn line(&self) -> String {
         format!("{} {} ({})", self.name, self.version, self.path)
     }
 }
 
-/// The plugins whose stages the spec `tree` names.
+/// The plugins whose stages the spec `tree` uses.
 pub fn used(tree: &Value) -> Vec<Used> {
     with(|plugins| plugins.used(tree).into_iter().map(Used::of).collect())
 }
 
-/// What must be the same for a run to be resumed; nothing where no plugin is used.
+/// The plugins' identity, which must match when a run is resumed; `None` without plugins.
 pub fn identity(used: &[Used]) -> Option<(String, String)> {
     let all: Vec<String> = used.iter().map(|u| format!("{} {}", u.name, u.version)).collect();
     (!all.is_empty()).then(|| ("plugins".into(), all.join(", ")))

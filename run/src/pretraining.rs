@@ -1,4 +1,4 @@
-//! Weights from known volumes.
+//! Pre-training of weights on known volumes.
 
 use crate::memory::Memory;
 use crate::specs::notes;
@@ -7,7 +7,7 @@ use conefield_core::arena::Weights;
 use conefield_core::method::{Observer, Outline, Plan, PretrainJob};
 use conefield_core::spec::load::Loaded;
 
-/// Refuses volumes of so many `voxels` that do not fit: each has parameters and moments of its own.
+/// Refuses volumes of these sizes if they do not fit into memory: each has its own parameters and moments.
 pub fn check_memory(voxels: &[u64], outline: &Outline) -> Result<()> {
     let (parameters, backend) = (outline.parameters() as u64, outline.backend().scratch_bytes as u64);
     let need = |voxels: &[u64]| {
@@ -22,7 +22,7 @@ pub fn check_memory(voxels: &[u64], outline: &Outline) -> Result<()> {
     })
 }
 
-/// The weights that a field has after training, but for its encoder's, which stay with the volume that they were trained on.
+/// The weights of a field after training, except those of its encoder, which belong to the training volume.
 pub fn train(
     loaded: &Loaded,
     plan: &mut dyn Plan,

@@ -11,13 +11,13 @@ use ndarray::{Array3, Axis, Zip};
 use serde::Serialize;
 use serde_json::Value;
 
-/// The projector that iterative methods take where none is named.
+/// Default projector of iterative methods.
 pub const PROJECTOR: &str = "joseph";
 
-/// How far the box of a volume may be from the one that a scan reconstructs, as a share of its side, before that is told.
+/// Largest relative difference between a volume's box and the scan's volume that is not reported.
 const SAME_BOX: f64 = 0.01;
 
-/// The projector of voxels that `value` says as a spec does: the name of a type, or a table with its settings.
+/// The voxel projector given by `value` as in a spec: a type name, or a table with settings.
 pub fn projector(value: Value) -> Result<Box<dyn VoxelProjector>> {
     let found = value.to_string();
     let expected = || format!("a type of voxel projector: {}", names(Kind::VoxelProjector).join(", "));
@@ -29,8 +29,8 @@ pub fn projector(value: Value) -> Result<Box<dyn VoxelProjector>> {
     spec.build()
 }
 
-/// Where the voxels of `volume` stand in the world of a scan that reconstructs `grid`: around the same centre. One of the
-/// same shape has the same voxels; a file without voxel sizes fills the same box.
+/// The voxel grid of `volume` in a scan with the volume `grid`: around the same centre. A volume of the same shape has
+/// the same voxels; a file without voxel sizes (`sized` is false) fills the same box.
 pub fn placed(volume: &Volume, grid: &VoxelGrid, sized: bool) -> VoxelGrid {
     let shape = volume.grid.shape;
     if shape == grid.shape {
@@ -41,7 +41,7 @@ pub fn placed(volume: &Volume, grid: &VoxelGrid, sized: bool) -> VoxelGrid {
     VoxelGrid { shape, spacing: if sized { volume.grid.spacing } else { fill }, center: grid.center }
 }
 
-/// What is odd about a volume on `own` voxels in a scan that reconstructs `grid`, in words.
+/// A message if the box of the voxels `own` differs from the scan's volume `grid`.
 pub fn oddity(own: &VoxelGrid, grid: &VoxelGrid) -> Option<String> {
     let (size, want) = (own.size(), grid.size());
     let differs = (0..3).any(|k| (size[k] / want[k] - 1.0).abs() > SAME_BOX);
@@ -51,7 +51,7 @@ pub fn oddity(own: &VoxelGrid, grid: &VoxelGrid) -> Option<String> {
     })
 }
 
-/// Bytes that [`predicted`] takes, beside the volume.
+/// Bytes that [`predicted`] needs besides the volume.
 pub fn bytes(projector: &dyn VoxelProjector, geometry: &Geometry) -> u64 {
     let header = conefield_core::scan::ScanHeader {
         views: geometry.views.len(),
@@ -61,8 +61,8 @@ pub fn bytes(projector: &dyn VoxelProjector, geometry: &Geometry) -> u64 {
     4 * header.pixels() + projector.scratch(&header, header.views)
 }
 
-/// The line integrals of `volume`, whose values count per `unit_mm` millimetres, in the views of `geometry`. The voxels are
-/// where `geometry` has them.
+/// The line integrals of `volume`, whose values are per `unit_mm` millimetres, in the views of `geometry`, which also
+/// positions the voxels.
 pub fn predicted(
     volume: &Volume,
     geometry: &Geometry,
@@ -88,18 +88,18 @@ pub fn predicted(
     Ok(out)
 }
 
-/// How far predicted views are from measured ones.
+/// Differences between predicted and measured views.
 #[derive(Debug, Clone, PartialEq, Serialize)]
 pub struct Residual {
-    /// Root mean square of measured less predicted line integrals.
+    /// Root mean square of measured minus predicted line integrals.
     pub rms: f64,
-    /// The same over the largest measured line integral.
+    /// `rms` relative to the largest measured line integral.
     pub relative: f64,
-    /// Root mean square of each view.
+    /// Root mean square per view.
     pub views: Vec<f64>,
 }
 
-/// Replaces `views`, predicted for `scan`, by measured less predicted line integrals, and tells how large they are.
+/// Replaces `views`, predicted for `scan`, by measured minus predicted line integrals, and returns their statistics.
 pub fn residual(scan: &Scan, views: &mut Array3<f32>) -> Result<Residual> {
     let of_view = |(measured, found): (ndarray::ArrayView2<f32>, ndarray::ArrayView2<f32>)| {
         let [measured, found] = [measured, found].map(|a| a.insert_axis(Axis(0)));

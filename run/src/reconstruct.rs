@@ -1,4 +1,4 @@
-//! A reconstruction from Rust: a scan, the name of a spec, a volume.
+//! Reconstruction from Rust: a scan, the name of a spec, a volume.
 
 use crate::choose::{Wish, choose};
 use crate::input::{Input, check_reference};
@@ -15,7 +15,7 @@ use conefield_tradeoff::schedule::Budget;
 use std::sync::Arc;
 use std::time::Instant;
 
-/// A reconstruction on the CPU as `conefield reconstruct` does it, in memory.
+/// A reconstruction on the CPU as in `conefield reconstruct`, in memory.
 ///
 /// ```no_run
 /// # fn main() -> conefield_core::Result<()> {
@@ -36,75 +36,75 @@ pub struct Reconstruct {
     seed: u64,
 }
 
-/// What came out.
+/// The result.
 pub struct Reconstructed {
-    /// The volume, in attenuation a unit of the scan.
+    /// The volume, in attenuation per unit of the scan.
     pub volume: Volume,
-    /// The trained field, of a method that has one.
+    /// The trained field, if the method has one.
     pub field: Option<TrainedField>,
     /// The name of the spec that ran.
     pub spec: String,
-    /// Steps or passes.
+    /// Number of steps or passes.
     pub steps: u64,
-    /// Seconds of them.
+    /// Time for them in seconds.
     pub train_s: f64,
-    /// Against the reference, where there is one.
+    /// Scores against the reference, if there is one.
     pub scores: Option<Scores>,
 }
 
 impl Reconstruct {
-    /// With a shipped spec, the type of a method, or a spec file.
+    /// Uses a built-in spec, a method type, or a spec file.
     pub fn with(spec: &str) -> Self {
         Self { spec: Some(spec.to_owned()), ..Self::default() }
     }
 
-    /// With the best method for this many seconds in total on this machine.
+    /// Uses the best method for this many seconds in total on this machine.
     pub fn within(seconds: f64) -> Self {
         Self { budget: Some(seconds), ..Self::default() }
     }
 
-    /// With a setting changed, such as `encoder.levels=8`.
+    /// Changes a setting, such as `encoder.levels=8`.
     pub fn set(mut self, setting: &str) -> Self {
         self.sets.push(setting.to_owned());
         self
     }
 
-    /// With this many steps or passes.
+    /// Limits the number of steps or passes.
     pub fn steps(mut self, steps: u64) -> Self {
         self.limits.steps = Some(steps);
         self
     }
 
-    /// With this many seconds of solving.
+    /// Limits the solving time in seconds.
     pub fn seconds(mut self, seconds: f64) -> Self {
         self.limits.seconds = Some(seconds);
         self
     }
 
-    /// With these held-out views and predicted.
+    /// Holds out these views and predicts them.
     pub fn hold_out(mut self, views: &[usize]) -> Self {
         self.held_out = views.to_vec();
         self
     }
 
-    /// With the volume sought, to score the result against.
+    /// Sets the reference volume for scores.
     pub fn reference(mut self, volume: Volume) -> Self {
         self.reference = Some(volume);
         self
     }
 
-    /// With another seed of everything random than 0.
+    /// Sets the seed of all randomness (default 0).
     pub fn seed(mut self, seed: u64) -> Self {
         self.seed = seed;
         self
     }
 
-    /// Runs it.
+    /// Runs the reconstruction.
     pub fn run(self, scan: impl Into<Arc<Scan>>) -> Result<Reconstructed> {
         self.watched(scan, &mut Silent)
     }
 
-    /// Runs it with an observer, which receives the progress and can end the run.
+    /// Runs the reconstruction with an observer, which receives progress reports and can end the run.
     pub fn watched(self, scan: impl Into<Arc<Scan>>, observer: &mut dyn Observer) -> Result<Reconstructed> {
         let begin = Instant::now();
         let Self { spec, sets, limits, budget, held_out, reference, seed } = self;

@@ -1,4 +1,4 @@
-//! How far a volume is from its reference.
+//! Compares a volume with its reference.
 
 use conefield_core::Result;
 use conefield_core::error::ensure;
@@ -8,23 +8,23 @@ use conefield_metrics::Scores;
 /// The headings of [`score_cells`].
 pub const SCORES: [&str; 4] = ["PSNR dB", "ssim_2d", "ssim_3d", "ssim_skimage"];
 
-/// PSNR and the SSIMs as cells of a table; one that is not defined is a dash.
+/// PSNR and the SSIMs as table cells; undefined values are dashes.
 pub fn score_cells(psnr: f64, ssims: [Option<f64>; 3]) -> [String; 4] {
     let [a, b, c] = ssims.map(|s| s.map_or("-".into(), |x| format!("{x:.4}")));
     [format!("{psnr:.2}"), a, b, c]
 }
 
-/// The cells of whole scores.
+/// The table cells of all scores.
 pub fn cells_of(s: &Scores) -> [String; 4] {
     score_cells(s.psnr, [s.ssim_2d, s.ssim_3d, s.ssim_skimage])
 }
 
-/// Refuses a volume of another shape than the reference's.
+/// Refuses a volume whose shape differs from the reference's.
 pub fn same_shape(place: &str, found: &[usize], expected: &[usize]) -> Result<()> {
     ensure(found == expected, place, "shape", format!("{found:?}"), format!("{expected:?}, the reference's shape"))
 }
 
-/// The data range that scores against `reference` refer to: `given`, or what the reference says.
+/// The data range of scores against `reference`: `given`, or derived from the reference.
 pub fn peak(given: Option<f64>, reference: &Volume) -> f64 {
     given.unwrap_or_else(|| {
         let found = conefield_metrics::peak_of(reference.data.view());
@@ -35,7 +35,7 @@ pub fn peak(given: Option<f64>, reference: &Volume) -> f64 {
     })
 }
 
-/// Scores `volume`, called `place` in errors.
+/// Scores `volume`; errors name `place`.
 pub fn score(place: &str, volume: &Volume, reference: &Volume, peak: f64) -> Result<Scores> {
     same_shape(place, volume.data.shape(), reference.data.shape())?;
     if let Some(factor) = conefield_metrics::other_unit(volume.data.view(), reference.data.view()) {

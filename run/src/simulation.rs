@@ -1,4 +1,4 @@
-//! Scans of known volumes.
+//! Simulated scans of known volumes.
 
 use crate::memory::Memory;
 use crate::parse::{AnglesOption, Values};
@@ -13,27 +13,27 @@ use std::path::Path;
 /// Longest protocol or list of angles, in bytes.
 const LONGEST: u64 = 16 << 20;
 
-/// What is to be other than a protocol says.
+/// Changes to a protocol.
 #[derive(Debug, Clone, Default)]
 pub struct Changes {
     /// Number of views.
     pub views: Option<usize>,
-    /// Rows and columns of the detector, whose size stays.
+    /// Rows and columns of the detector; its size stays the same.
     pub detector: Option<[usize; 2]>,
     /// Shift of the detector along v and u, mm.
     pub offset: Option<[f64; 2]>,
-    /// Where the views are taken.
+    /// Angles of the views.
     pub angles: Option<AnglesOption>,
-    /// What the detector adds.
+    /// Noise of the detector.
     pub noise: Option<DetectorNoise>,
     /// Seed of the noise.
     pub seed: Option<u64>,
 }
 
-/// The volume on the rotation axis, in attenuation, of means of `size`³ voxels.
+/// The volume centred on the rotation axis, in attenuation, with blocks of `size`³ voxels averaged.
 pub fn prepared(volume: Volume, values: Values, size: usize) -> Result<Volume> {
     let mut volume = values.apply(volume)?;
-    // A scan's volume stands on the rotation axis.
+    // A scan's volume is centred on the rotation axis.
     volume.grid.center = [0.0; 3];
     if size > 1 {
         volume = downsample(&volume, size)?;
@@ -42,7 +42,7 @@ pub fn prepared(volume: Volume, values: Values, size: usize) -> Result<Volume> {
     Ok(volume)
 }
 
-/// The protocol that `name` means for a volume on `grid`: r2, or a TOML or JSON file.
+/// The protocol named `name` for a volume on `grid`: r2, or a TOML or JSON file.
 pub fn protocol(name: &str, grid: &VoxelGrid) -> Result<Protocol> {
     match name {
         "r2" => Ok(Protocol::r2(grid)),
@@ -50,7 +50,7 @@ pub fn protocol(name: &str, grid: &VoxelGrid) -> Result<Protocol> {
     }
 }
 
-/// The protocol with some of it changed. `place` names whoever asks for both a number of views and a list of angles.
+/// Applies changes to a protocol. The error about both a number of views and a list of angles names `place`.
 pub fn changed(mut p: Protocol, changes: &Changes, place: &str) -> Result<Protocol> {
     if let Some(d) = changes.detector {
         p = p.with_detector(d);
@@ -88,12 +88,12 @@ pub fn changed(mut p: Protocol, changes: &Changes, place: &str) -> Result<Protoc
     Ok(p)
 }
 
-/// Scans what [`prepared`] made of `source` by `protocol`; returns the scan and its truth. Refuses what does not fit into
-/// memory.
+/// Simulates a scan of `volume`, after [`prepared`], with `protocol`; returns the scan and its true volume. Refuses a
+/// scan that does not fit into memory.
 pub fn scan(mut volume: Volume, values: Values, protocol: &Protocol, source: &str) -> Result<(Scan, Volume)> {
     check_memory(&volume, &protocol.geometry(&volume.grid)?)?;
     if let Values::Hu(HuMapping::Mu { .. }) = values {
-        // From 1/mm to the protocol's unit.
+        // Converts 1/mm to the protocol's unit.
         let per_unit = protocol.unit.mm as f32;
         volume = volume.mapped(|x| x * per_unit);
     }
@@ -104,7 +104,7 @@ pub fn scan(mut volume: Volume, values: Values, protocol: &Protocol, source: &st
     Ok((scan, volume))
 }
 
-/// Scans a volume in 1/mm where it stands, in any geometry.
+/// Simulates a scan of a volume in 1/mm, at its own position, in any geometry.
 pub fn scan_in(volume: &Volume, geometry: Geometry, noise: DetectorNoise, seed: u64) -> Result<Scan> {
     check_memory(volume, &geometry)?;
     let mut projections = project(volume, &geometry, 2.0)?;
@@ -115,7 +115,7 @@ pub fn scan_in(volume: &Volume, geometry: Geometry, noise: DetectorNoise, seed: 
     Ok(scan)
 }
 
-/// Refuses to scan what does not fit into memory: projecting takes a copy of the volume with a rim.
+/// Refuses a scan that does not fit into memory: the projection takes a padded copy of the volume.
 pub fn check_memory(volume: &Volume, g: &Geometry) -> Result<()> {
     let rim = volume.grid.shape.iter().map(|&n| n as u64 + 2).product::<u64>();
     let need = |views: usize, share: u64| {

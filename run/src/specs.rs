@@ -8,7 +8,7 @@ use conefield_core::{Error, Result};
 pub use conefield_specs::{FAST_WEIGHTS, SHIPPED};
 use std::collections::BTreeMap;
 
-/// All names of specs: shipped ones, and methods that need no setting.
+/// All names of specs: built-in ones, and methods that need no settings.
 pub fn names() -> Vec<&'static str> {
     let mut names: Vec<&str> = SHIPPED.iter().map(|s| s.name).collect();
     let methods = registry::names(registry::Kind::Method).into_iter();
@@ -17,33 +17,33 @@ pub fn names() -> Vec<&'static str> {
     names
 }
 
-/// What a help text says of a spec.
+/// The part of a help text about specs.
 pub fn help() -> String {
     format!("A shipped spec ({}) or a file", names().join(", "))
 }
 
-/// Reads a spec by its shipped name or from a file, with `sets` on top.
+/// Reads a built-in spec by name, or a file, with overriding settings `sets`.
 pub fn read(what: &str, sets: &[String]) -> Result<Loaded> {
     let draft = Draft::find(what, sets, SHIPPED)?;
     plugins::of_spec(&draft)?;
     draft.finish()
 }
 
-/// Reads a spec from its text, TOML or JSON, called `source` in errors, with `sets` on top.
+/// Parses a spec in TOML or JSON with overriding settings `sets`; errors name `source`.
 pub fn parse(text: &str, source: &str, sets: &[String]) -> Result<Loaded> {
     let draft = Draft::of(text, source, sets, SHIPPED)?;
     plugins::of_spec(&draft)?;
     draft.finish()
 }
 
-/// Reads a spec that a file holds, called `source` in errors.
+/// Parses a spec from a saved file; errors name `source`.
 pub fn reread(text: &str, source: &str) -> Result<Loaded> {
     let draft = Draft::of(text, source, &[], &[])?;
     plugins::of_spec(&draft)?;
     draft.finish()
 }
 
-/// What weights say of where they come from.
+/// Notes on the origin of weights.
 pub fn notes(loaded: &Loaded, seed: u64) -> Result<BTreeMap<String, String>> {
     let mut notes = BTreeMap::from([
         ("conefield".into(), env!("CARGO_PKG_VERSION").into()),
@@ -54,7 +54,7 @@ pub fn notes(loaded: &Loaded, seed: u64) -> Result<BTreeMap<String, String>> {
     Ok(notes)
 }
 
-/// Refuses a setting that looks at held-out views where `held`, the views that are, has none.
+/// Refuses a setting that needs held-out views if `held` is empty.
 pub fn check_held_out(loaded: &Loaded, plan: &dyn Plan, held: &[usize]) -> Result<()> {
     match plan.needs_held_out() {
         Some(setting) if held.is_empty() => {

@@ -1,8 +1,8 @@
-//! Methods one after the other, each from the volume of the one before.
+//! Runs methods one after the other, each starting from the volume of the previous one.
 //!
-//! A field and total variation err in different places. A field that is trained first, and total variation that is held to its
-//! volume (`pull` of `fista`), come closer than either alone. So do the errors of one prior on grids of different spacing:
-//! the mean of their volumes comes closer than each of them.
+//! A field and total variation have different errors. Training a field first and then running total variation with a
+//! pull towards the field's volume (`pull` of `fista`) is more accurate than either alone. Likewise, one prior on grids
+//! of different spacing has different errors: the mean of the volumes is more accurate than each of them.
 
 mod made;
 
@@ -27,16 +27,17 @@ use std::time::Instant;
 #[derive(Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields)]
 pub struct Chain {
-    /// The methods, in order. An entry may say `extends`. The command line's limits of steps and seconds are those of the
-    /// first.
+    /// The methods, in order. An entry may use `extends`. The command line's limits on steps and seconds apply to the
+    /// first method.
     #[serde(deserialize_with = "stage::list")]
     #[schemars(schema_with = "stage::schema_of_list::<dyn Method>")]
     pub methods: Vec<Box<dyn Method>>,
-    /// What comes out is the mean of the volumes of so many methods, counted from the last: 1 is the last one's alone.
+    /// Average the volumes of this many last methods; 1 returns the last volume.
     #[serde(default = "one")]
     pub mean: usize,
-    /// Leave out a method that has the unknowns and the pixels of the next one, which makes its passes too. Two levels of a small
-    /// volume can be the same grid, and an iteration that starts anew in between loses its momentum. The mean then is of fewer.
+    /// Skip a method that has the same unknowns and pixels as the next one, which then makes its passes too. Two levels
+    /// of a small volume can have the same grid, and restarting an iteration in between loses its momentum. The mean
+    /// then includes fewer volumes.
     #[serde(default)]
     pub merge: bool,
 }
@@ -76,8 +77,8 @@ impl Method for Chain {
     }
 }
 
-/// What limits the next of `left` links after `spent` seconds: its `passes`, and time. The last one ends before the deadline; one
-/// before it leaves as much to each of the others as it takes at most.
+/// Limits of the next of `left` methods after `spent` seconds: its `passes`, and time. The last method ends before the
+/// deadline; an earlier one leaves each remaining method at least the time that it may take itself.
 fn later(limits: &Limits, spent: f64, left: usize, passes: Option<u64>) -> Limits {
     let most = limits.at_most.map(|all| (all - spent).max(0.0));
     if left == 1 {
@@ -88,35 +89,36 @@ fn later(limits: &Limits, spent: f64, left: usize, passes: Option<u64>) -> Limit
     Limits { steps: passes, at_most, ..Limits::default() }
 }
 
-/// The key of a link.
+/// The key of a method.
 fn at(i: usize) -> String {
     format!("methods.{i}")
 }
 
 /// The plan of [`Chain`].
 struct ChainPlan {
-    /// At least two.
+    /// At least two methods.
     links: Vec<Box<dyn Plan>>,
-    /// Of how many last links' volumes the mean comes out.
+    /// Number of last volumes to average.
     mean: usize,
-    /// Whether links on one grid are merged.
+    /// Whether to merge methods on the same grid.
     merge: bool,
 }
 
 impl ChainPlan {
-    /// Whether the volume of link `i` is one of those that the mean is of.
+    /// Whether the mean includes the volume of method `i`.
     fn counts(&self, i: usize) -> bool {
         self.mean > 1 && i + self.mean >= self.links.len()
     }
 
-    /// The passes of link `i`, where the next one makes them instead. The first one ends by the command line's limits, and stays.
+    /// The passes of method `i` that the next method makes instead. The first method obeys the command line's limits
+    /// and is never merged.
     fn merged(&self, i: usize, scan: &ScanHeader) -> Option<u64> {
         let next = self.links.get(i + 1).filter(|next| self.merge && i > 0 && next.passes().is_some())?;
         let seen = self.links[i].seen(scan)?;
         self.links[i].passes().filter(|_| next.seen(scan) == Some(seen))
     }
 
-    /// The link whose field comes out: the last one that trains one.
+    /// The method whose field is returned: the last one that trains a field.
     fn trains(&self) -> &dyn Plan {
         let last = self.links.iter().rfind(|l| l.pipeline().is_some());
         last.unwrap_or(&self.links[0]).as_ref()
@@ -133,8 +135,8 @@ impl Plan for ChainPlan {
         Outline { method: Line::new("method", "chain", &told), links, ..Outline::default() }
     }
 
-    /// The links run one after the other. Later ones also hold the volume that they start from and the sum of those before; a
-    /// checkpoint has both, and the parameters of a field that was trained.
+    /// The methods run one after the other. Later ones also hold their start volume and the sum of earlier volumes; a
+    /// checkpoint has both, and the parameters of a trained field.
     fn needs(&self, scan: &ScanHeader) -> Needs {
         let volumes = 4 * scan.voxels() * if self.mean > 1 { 2 } else { 1 };
         let mut parameters = 0;
@@ -192,7 +194,7 @@ impl Plan for ChainPlan {
             })?;
             made.add(solution, self.counts(i), i + 1 < count, job)?;
             if i + 1 < count {
-                // The next one begins here, should it be interrupted before it keeps a checkpoint itself.
+                // The next method resumes here if it is interrupted before its own first checkpoint.
                 observer.checkpoint(&made.checkpoint(None)?)?;
             }
         }
@@ -222,7 +224,7 @@ impl Plan for ChainPlan {
     }
 }
 
-/// Hears of a link. Its steps and seconds count on from those before, and its checkpoints hold what was made before.
+/// Observes one method: adds the steps and seconds of earlier methods, and their results to its checkpoints.
 struct LinkObserver<'a> {
     observer: &'a mut dyn Observer,
     made: &'a Made,

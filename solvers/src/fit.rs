@@ -1,4 +1,4 @@
-//! What a scan has need of: where its object can be, how fine its data are, how far apart samples stand.
+//! Adapts a pipeline to a scan: the object's support, the resolution of the data, the distance of samples.
 
 use crate::support::carve;
 use conefield_core::error::Result;
@@ -7,19 +7,19 @@ use conefield_core::scan::Scan;
 use conefield_core::scene::{LevelRule, Scene, SceneSettings, SupportRule};
 use conefield_core::support::Support;
 
-/// A scene, and what of a pipeline it has need of.
+/// A scene, and the parts of a pipeline that it needs.
 pub struct Fitted {
-    /// Between the world and what stages see.
+    /// Maps between the world and the stages.
     pub scene: Scene,
-    /// The encoder's channels that are needed, where some are not.
+    /// The encoder's channels that are needed, if not all.
     pub needed: Option<Vec<usize>>,
-    /// What was found, for people.
+    /// Findings, for the log.
     pub found: Vec<String>,
-    /// Whether a stage is another one for this scene.
+    /// Whether a stage changed for this scene.
     pub changed: bool,
 }
 
-/// Where the object can be, if the settings have it looked for, and what was found.
+/// The object's support, if the settings ask for it, and a log line.
 pub fn support(scan: &Scan, rule: SupportRule) -> (Option<Support>, Option<String>) {
     match rule {
         SupportRule::Box => (None, None),
@@ -30,7 +30,7 @@ pub fn support(scan: &Scan, rule: SupportRule) -> (Option<Support>, Option<Strin
     }
 }
 
-/// The scene of a scan under a spec's settings. Makes `pipeline` count in its lengths.
+/// The scene of a scan under a spec's settings. Converts the lengths of `pipeline` to that scene.
 pub fn fit(scan: &Scan, settings: &SceneSettings, pipeline: &mut Pipeline) -> Result<Fitted> {
     let mut scene = Scene::new(scan, settings)?;
     let (support, said) = support(scan, settings.support);
@@ -48,7 +48,7 @@ pub fn fit(scan: &Scan, settings: &SceneSettings, pipeline: &mut Pipeline) -> Re
     Ok(Fitted { scene, needed, found, changed })
 }
 
-/// Which of the encoder's channels are needed to tell `cells` apart.
+/// Finds the encoder's channels that are needed to resolve `cells`.
 fn levels(pipeline: &Pipeline, needed: Option<&[usize]>, cells: f64) -> Result<String> {
     let info = pipeline.encoder.info();
     let data = format!("the data tell {cells:.0} cells a side apart");

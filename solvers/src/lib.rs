@@ -1,12 +1,13 @@
 //! Methods: scan in, volume out.
 //!
-//! - [`neural_field`] and [`line_field`] train an attenuation field by stochastic gradients. [`training`] is their loop, with
-//!   its callbacks; [`pretrain`] trains a field on known volumes, for weights that other scans reuse. [`losses`] say what a
-//!   difference costs, [`priors`] what the field is to be like, [`optimizer`] how gradients change parameters.
+//! - [`neural_field`] and [`line_field`] train an attenuation field by stochastic gradients. [`training`] is their
+//!   loop, with its callbacks; [`pretrain`] trains a field on known volumes, for weights that other scans reuse.
+//!   [`losses`], [`priors`] and [`optimizer`] hold the parts of training.
 //! - [`gaussians`] trains a sum of Gaussians on whole views, in the same loop.
-//! - [`fit`] finds out what a scan has need of, [`support`] where its object can be, [`surround`] what lies beyond the volume.
-//! - [`fdk`] filters and back-projects.
-//! - [`iterative`] improves voxels pass by pass: SART, CGLS, ASD-POCS, FISTA.
+//! - [`fit`] adapts a pipeline to a scan, [`support`] finds the object's support, [`surround`] models attenuation
+//!   beyond the volume.
+//! - [`fdk`] is filtered back-projection.
+//! - [`iterative`] refines voxels pass by pass: SART, CGLS, ASD-POCS, FISTA.
 //! - [`chain`] runs methods one after the other.
 
 pub mod chain;

@@ -1,4 +1,4 @@
-//! A field that brings line integrals of its own, trained so that they match the measured ones.
+//! A field with its own line integrals, trained to match the measured ones.
 
 use crate::field_plan::{Trained, Training, l1, random, rollback};
 use crate::optimizer::Optimizer;
@@ -17,35 +17,35 @@ use serde::{Deserialize, Serialize};
 #[derive(Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields)]
 pub struct LineField {
-    /// How the scan is mapped to what the field sees.
+    /// How the scan is mapped to the field's unit cube.
     #[serde(default)]
     pub scene: SceneSettings,
-    /// Line integrals of rays, and attenuation at points.
+    /// The field: line integrals of rays and attenuation at points.
     #[serde(deserialize_with = "stage::needed")]
     #[schemars(schema_with = "stage::schema::<dyn LineFieldSpec>")]
     pub field: Box<dyn LineFieldSpec>,
-    /// Where weights come from.
+    /// Source of the initial weights.
     #[serde(default = "random", deserialize_with = "stage::needed")]
     #[schemars(schema_with = "stage::schema::<dyn InitializerSpec>")]
     pub initializer: Box<dyn InitializerSpec>,
-    /// What a difference between predicted and measured line integrals costs.
+    /// Loss between predicted and measured line integrals.
     #[serde(default = "l1", deserialize_with = "stage::needed")]
     #[schemars(schema_with = "stage::schema::<dyn LossSpec>")]
     pub loss: Box<dyn LossSpec>,
-    /// What the field is to be like, whatever was measured.
+    /// Priors on the field, independent of the measurements.
     #[serde(default, deserialize_with = "stage::list")]
     #[schemars(schema_with = "stage::schema_of_list::<dyn PriorSpec>")]
     pub priors: Vec<Box<dyn PriorSpec>>,
-    /// How gradients change parameters.
+    /// Optimizer.
     #[serde(default)]
     pub optimizer: Optimizer,
-    /// What a step learns from, and when training ends.
+    /// Batch of a step, and the end of training.
     #[serde(default)]
     pub training: Training,
-    /// How `conefield pretrain` and a known volume teach the field.
+    /// How the field learns known volumes, in `conefield pretrain` and for a warm start.
     #[serde(default)]
     pub pretraining: Pretraining,
-    /// What watches over training.
+    /// Callbacks during training.
     #[serde(default = "rollback", deserialize_with = "stage::list")]
     #[schemars(schema_with = "stage::schema_of_list::<dyn CallbackSpec>")]
     pub callbacks: Vec<Box<dyn CallbackSpec>>,

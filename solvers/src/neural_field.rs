@@ -1,4 +1,4 @@
-//! A neural attenuation field, trained so that its Beer-Lambert line integrals match the measured ones.
+//! A neural attenuation field, trained to match the measured line integrals by the Beer-Lambert law.
 
 use crate::field_plan::{Trained, Training, l1, random, rollback};
 use crate::optimizer::Optimizer;
@@ -20,50 +20,50 @@ use serde::{Deserialize, Serialize};
 #[derive(Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields)]
 pub struct NeuralField {
-    /// How the scan is mapped to what stages see.
+    /// How the scan is mapped to the unit cube of the stages.
     #[serde(default)]
     pub scene: SceneSettings,
-    /// In which precision the field computes.
+    /// Arithmetic precision of the field.
     #[serde(default, skip_serializing_if = "Precision::is_single")]
     pub precision: Precision,
-    /// Points to features.
+    /// Encoder: points to features.
     #[serde(deserialize_with = "stage::needed")]
     #[schemars(schema_with = "stage::schema::<dyn EncoderSpec>")]
     pub encoder: Box<dyn EncoderSpec>,
-    /// Features to features, in order.
+    /// Normalizers: features to features, in order.
     #[serde(default, deserialize_with = "stage::list")]
     #[schemars(schema_with = "stage::schema_of_list::<dyn NormalizerSpec>")]
     pub normalizers: Vec<Box<dyn NormalizerSpec>>,
-    /// Features to attenuation.
+    /// Field: features to attenuation.
     #[serde(deserialize_with = "stage::needed")]
     #[schemars(schema_with = "stage::schema::<dyn FieldSpec>")]
     pub field: Box<dyn FieldSpec>,
-    /// Rays to samples.
+    /// Projector: rays to samples.
     #[serde(deserialize_with = "stage::needed")]
     #[schemars(schema_with = "stage::schema::<dyn ProjectorSpec>")]
     pub projector: Box<dyn ProjectorSpec>,
-    /// Where weights come from.
+    /// Source of the initial weights.
     #[serde(default = "random", deserialize_with = "stage::needed")]
     #[schemars(schema_with = "stage::schema::<dyn InitializerSpec>")]
     pub initializer: Box<dyn InitializerSpec>,
-    /// What a difference between predicted and measured line integrals costs.
+    /// Loss between predicted and measured line integrals.
     #[serde(default = "l1", deserialize_with = "stage::needed")]
     #[schemars(schema_with = "stage::schema::<dyn LossSpec>")]
     pub loss: Box<dyn LossSpec>,
-    /// What the field is to be like, whatever was measured.
+    /// Priors on the field, independent of the measurements.
     #[serde(default, deserialize_with = "stage::list")]
     #[schemars(schema_with = "stage::schema_of_list::<dyn PriorSpec>")]
     pub priors: Vec<Box<dyn PriorSpec>>,
-    /// How gradients change parameters.
+    /// Optimizer.
     #[serde(default)]
     pub optimizer: Optimizer,
-    /// What a step learns from, and when training ends.
+    /// Batch of a step, and the end of training.
     #[serde(default)]
     pub training: Training,
-    /// How `conefield pretrain` and a known volume teach the field.
+    /// How the field learns known volumes, in `conefield pretrain` and for a warm start.
     #[serde(default)]
     pub pretraining: Pretraining,
-    /// What watches over training.
+    /// Callbacks during training.
     #[serde(default = "rollback", deserialize_with = "stage::list")]
     #[schemars(schema_with = "stage::schema_of_list::<dyn CallbackSpec>")]
     pub callbacks: Vec<Box<dyn CallbackSpec>>,
@@ -97,7 +97,7 @@ impl Method for NeuralField {
 }
 
 impl NeuralField {
-    /// The stages, built and put together.
+    /// Builds the stages and connects them.
     fn pipeline(&self) -> Result<Pipeline> {
         let encoder = self.encoder.build().map_err(|e| e.within("encoder"))?;
         let mut width = encoder.info().output;

@@ -1,4 +1,4 @@
-//! How gradients change parameters: Adam (Kingma and Ba 2015) with a learning rate that goes down.
+//! The optimizer: Adam (Kingma and Ba 2015) with a decaying learning rate.
 
 use crate::schedule::Decay;
 use conefield_core::backend::Adam;
@@ -12,7 +12,7 @@ use serde::{Deserialize, Serialize};
 pub struct Optimizer {
     /// Learning rate.
     pub lr: f64,
-    /// How it goes down.
+    /// Decay of the learning rate.
     pub decay: Decay,
     /// Decay rates of the moments.
     pub betas: [f64; 2],
@@ -27,10 +27,10 @@ impl Default for Optimizer {
 }
 
 impl Optimizer {
-    /// Refuses numbers that cannot be used.
+    /// Refuses invalid settings.
     pub fn validate(&self) -> Result<()> {
         ensure(self.lr.is_finite() && self.lr > 0.0, "spec", "lr", self.lr, "a positive finite number")?;
-        // Second moments are cleared below 1e-36: a smaller ε would leave steps of any size, or 0/0.
+        // Second moments are cleared below 1e-36: a smaller ε would allow steps of any size, or 0/0.
         let eps = self.eps.is_finite() && self.eps >= 1e-16;
         ensure(eps, "spec", "eps", self.eps, "a finite number, at least 1e-16")?;
         let betas = self.betas.iter().all(|b| (0.0..1.0).contains(b));
@@ -38,7 +38,7 @@ impl Optimizer {
         self.decay.validate()
     }
 
-    /// Its settings for update `step` (from 1).
+    /// Adam's settings for update `step` (from 1).
     pub fn adam(&self, step: u64, epoch: f64, share: f64) -> Adam {
         Adam {
             lr: self.lr * self.decay.at(epoch, share),

@@ -1,5 +1,5 @@
-//! Pre-training on a known volume, voxel by voxel: `L = |μ(x) − voxel|`, NI-NeRF's mapping-consistency
-//! initialization. What the LayerNorm and the field learn there is reused for every other scan.
+//! Pre-training on known volumes, voxel by voxel: `L = |μ(x) − voxel|`, NI-NeRF's mapping-consistency initialization.
+//! Every other scan reuses the LayerNorm and the field learned there.
 
 use crate::losses::L1;
 use crate::optimizer::Optimizer;
@@ -19,14 +19,14 @@ use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 use std::time::Instant;
 
-/// Steps on one volume before the next has its turn.
+/// Consecutive steps on one volume before the next.
 const TURN: u64 = 25;
 
-/// How a field learns known volumes.
+/// Settings for learning known volumes.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields, default)]
 pub struct Pretraining {
-    /// Points a step.
+    /// Points per step.
     pub points: usize,
     /// Steps of `conefield pretrain`.
     pub steps: u64,
@@ -39,14 +39,14 @@ impl Default for Pretraining {
 }
 
 impl Pretraining {
-    /// Refuses numbers that cannot be used.
+    /// Refuses invalid settings.
     pub fn validate(&self) -> Result<()> {
         ensure((1..=1 << 22).contains(&self.points), "spec", "points", self.points, "1 to 2^22")
     }
 }
 
-/// Trains a field on the volumes of `job`, in turn. Each volume has an encoder of its own; everything behind the encoder is
-/// shared. The loop keeps a record every so many steps.
+/// Trains a field on the volumes of `job`, in turn. Each volume has its own encoder; everything after the encoder is
+/// shared. Records metrics at regular intervals.
 pub fn pretrain(
     (pipeline, mut exe): (Pipeline, Box<dyn Executable>),
     (optimizer, settings, report_every): (&Optimizer, &Pretraining, u64),
@@ -106,11 +106,11 @@ pub fn pretrain(
         }
     }
     exe.fetch(&mut model)?;
-    // The last update is behind the last loss.
+    // The last update follows the last loss.
     strayed(&model.arena).map_or(Ok(model), |what| Err(Error::Diverged { step, what }))
 }
 
-/// Gradients of the L1 loss at known points; returns the loss.
+/// Computes gradients of the L1 loss at known points; returns the loss.
 fn fit(exe: &mut dyn Executable, model: &mut Model, points: &[([f32; 3], f32)], step: u64, seed: u64) -> Result<f64> {
     let work = Work { step, seed, loss: &L1 {}, rays: &[], points, priors: &[] };
     let stats = exe.step(model, &work)?;
@@ -120,8 +120,8 @@ fn fit(exe: &mut dyn Executable, model: &mut Model, points: &[([f32; 3], f32)], 
     Ok(stats.loss)
 }
 
-/// Brings all of `model` close to `volume`, in 1/mm, within the scene of a scan: a warm start, which a deadline of the job
-/// cuts short. The optimizer's moments are 0 afterwards.
+/// Fits all of `model` to `volume`, in 1/mm, within the scene of a scan: a warm start, which the job's deadline may cut
+/// short. Resets the optimizer's moments to 0.
 pub fn learn(
     (optimizer, settings): (&Optimizer, &Pretraining),
     exe: &mut dyn Executable,
@@ -150,8 +150,8 @@ pub fn learn(
     Ok(())
 }
 
-/// The scene that a scan of `volume` would have: its attenuation scale comes from the sums along x and y, which are
-/// what rays of a scan would measure.
+/// The scene of a simulated scan of `volume`: the attenuation scale comes from the sums along x and y, which rays of a
+/// scan would measure.
 fn scene(volume: &Volume, settings: &SceneSettings) -> Result<Scene> {
     volume.grid.validate("volume")?;
     let longest = volume.grid.size().into_iter().fold(0.0, f64::max);
@@ -171,7 +171,7 @@ fn scene(volume: &Volume, settings: &SceneSettings) -> Result<Scene> {
     Scene::with_attenuation(volume.grid, settings, attenuation)
 }
 
-/// Random voxel centres with their values.
+/// Draws random voxel centres with their values.
 fn draw(volume: &Volume, scene: &Scene, seed: u64, step: u64, count: usize, out: &mut Vec<([f32; 3], f32)>) {
     let mut rng = stream(seed ^ 0x70_7265, step);
     let shape = volume.grid.shape;

@@ -1,4 +1,4 @@
-//! How the learning rate goes down, and when a run ends.
+//! The decay of the learning rate, and the end of a run.
 
 use conefield_core::error::{Result, ensure};
 use conefield_core::method::Limits;
@@ -7,28 +7,28 @@ use serde::{Deserialize, Serialize};
 use std::f64::consts::PI;
 use std::time::{Duration, Instant};
 
-/// The learning rate over a run.
+/// Decay of the learning rate over a run.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(rename_all = "kebab-case", deny_unknown_fields)]
 pub enum Decay {
-    /// Never.
+    /// Constant.
     None,
-    /// Times `factor` after every `epochs` passes over the views (published).
+    /// Multiplied by `factor` after every `epochs` passes over the views (published).
     Step {
-        /// Passes over the views between two steps.
+        /// Passes over the views between two decreases.
         epochs: f64,
         /// Multiplier.
         factor: f64,
     },
-    /// Geometrically from 1 at the start to this at the end of the run, whatever ends it.
+    /// Geometric decay from 1 at the start to this factor at the end of the run, whatever ends it.
     Exponential(f64),
-    /// Along half a cosine from 1 at the start to this at the end of the run, whatever ends it (Loshchilov and Hutter, ICLR
-    /// 2017, without restarts): longer at high rates than a geometric decay to the same end.
+    /// Half a cosine from 1 at the start to this factor at the end of the run, whatever ends it (Loshchilov and Hutter,
+    /// ICLR 2017, without restarts). Stays at high rates longer than a geometric decay to the same end.
     Cosine(f64),
 }
 
 impl Decay {
-    /// The rate's multiplier after `epoch` passes, at `share` of the run.
+    /// The learning rate's factor after `epoch` passes, at `share` of the run.
     pub fn at(&self, epoch: f64, share: f64) -> f64 {
         match *self {
             Decay::None => 1.0,
@@ -38,7 +38,7 @@ impl Decay {
         }
     }
 
-    /// Refuses factors and lengths that are not positive and finite.
+    /// Refuses factors and periods that are not positive and finite.
     pub fn validate(&self) -> Result<()> {
         let all = match *self {
             Decay::None => [1.0, 1.0],
@@ -50,10 +50,10 @@ impl Decay {
     }
 }
 
-/// When a spec ends a run, whichever comes first.
+/// The spec's limits on a run; the first one reached ends it.
 #[derive(Debug, Clone, Copy, Default, PartialEq)]
 pub struct Ends {
-    /// Steps.
+    /// Number of steps.
     pub steps: Option<u64>,
     /// Seconds of training.
     pub seconds: Option<f64>,
@@ -65,15 +65,15 @@ pub struct Clock {
     limits: Limits,
     spent: Duration,
     running: Option<Instant>,
-    /// When it was made, and what had been spent by then: a deadline counts from there.
+    /// Creation time, and the time spent before: a deadline counts from there.
     made: (Instant, Duration),
 }
 
 impl Clock {
-    /// A stopped clock. A limit on the command line replaces the spec's end of the same kind; where it names
-    /// only time, the spec's number of steps does not end the run. A deadline replaces both.
+    /// A stopped clock. A limit on the command line replaces the spec's limit of the same kind. If the command line
+    /// limits only time, the spec's number of steps does not end the run. A deadline replaces both.
     ///
-    /// `spent` seconds of training came before, in a run that is resumed.
+    /// `spent` is the training time in seconds before a resumed run.
     pub fn new(spec: Ends, cli: Limits, spent: f64) -> Self {
         let timed = cli.seconds.is_some() || cli.deadline.is_some();
         let counted = cli.steps.is_some() || cli.deadline.is_some();
@@ -86,12 +86,12 @@ impl Clock {
         Self { limits, spent, running: None, made: (Instant::now(), spent) }
     }
 
-    /// Training goes on.
+    /// Resumes training time.
     pub fn resume(&mut self) {
         self.running.get_or_insert_with(Instant::now);
     }
 
-    /// Training pauses: what follows is not counted.
+    /// Pauses training time: what follows is not counted.
     pub fn pause(&mut self) {
         if let Some(since) = self.running.take() {
             self.spent += since.elapsed();
@@ -103,14 +103,14 @@ impl Clock {
         (self.spent + self.running.map_or(Duration::ZERO, |s| s.elapsed())).as_secs_f64()
     }
 
-    /// Share of the run that is over after `steps` steps, as schedules take it: what cuts a run short is no part of it.
+    /// Share of the run completed after `steps` steps, for schedules; ignores `at_most`, which may cut the run short.
     pub fn share(&self, steps: u64) -> f64 {
         let by_steps = self.share_of_steps(steps);
         let by_time = self.limits.seconds.map_or(0.0, |t| if t <= 0.0 { 1.0 } else { self.seconds() / t });
         by_steps.max(by_time).max(self.share_of_deadline(steps))
     }
 
-    /// Pauses count: what else a run does takes time from it, too. It ends no run before its first step.
+    /// Includes pauses: other work of the run takes time from it too. Does not end a run before its first step.
     fn share_of_deadline(&self, steps: u64) -> f64 {
         let Some(end) = self.limits.deadline else { return 0.0 };
         let (made, before) = self.made;
@@ -123,17 +123,17 @@ impl Clock {
         }
     }
 
-    /// Whether so many seconds more end before the deadline.
+    /// Whether this many more seconds end before the deadline.
     pub fn allows(&self, seconds: f64) -> bool {
         self.limits.deadline.is_none_or(|end| end.saturating_duration_since(Instant::now()).as_secs_f64() >= seconds)
     }
 
-    /// The same by the number of steps alone; 0 where none is set.
+    /// Like [`Clock::share`], by the number of steps alone; 0 without a limit on steps.
     pub fn share_of_steps(&self, steps: u64) -> f64 {
         self.limits.steps.map_or(0.0, |n| if n == 0 { 1.0 } else { steps as f64 / n as f64 })
     }
 
-    /// Like [`Clock::share`], but with what cuts the run short: 1 or more means the end.
+    /// Like [`Clock::share`], but includes `at_most`: 1 or more ends the run.
     pub fn done(&self, steps: u64) -> f64 {
         let cut = self.limits.at_most.map_or(0.0, |t| if t <= 0.0 { 1.0 } else { self.seconds() / t });
         self.share(steps).max(cut)
@@ -180,7 +180,7 @@ mod tests {
         let within =
             |seconds| Limits { deadline: Some(Instant::now() + Duration::from_secs(seconds)), ..Limits::default() };
         let c = Clock::new(spec, within(1000), 3000.0);
-        // 3000 of 4000 seconds came before the run was resumed. The clock does not run.
+        // 3000 of 4000 seconds were spent before the run was resumed. The clock is stopped.
         assert!((0.75..0.76).contains(&c.share(5)), "{}", c.share(5));
         assert!(c.allows(900.0) && !c.allows(1001.0));
         let over = Clock::new(spec, within(0), 0.0);

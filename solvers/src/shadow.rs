@@ -1,10 +1,10 @@
-//! Where an object's shadow falls on the detector.
+//! The object's shadow on the detector.
 
 use conefield_core::scan::Scan;
 use ndarray::{Array2, ArrayView2};
 
-/// The value that a smoothed pixel of air stays below: the noise's standard deviation, estimated from differences of
-/// neighbouring pixels, or 1/500 of the largest values, whichever is more.
+/// Upper limit of smoothed pixels in air: the noise's standard deviation, estimated from differences of neighbouring
+/// pixels, or 1/500 of the largest values, whichever is larger.
 pub fn air_level(scan: &Scan) -> f32 {
     let top = scan.projections.iter().copied().fold(0.0f32, f32::max);
     let mut differences: Vec<f32> = scan
@@ -24,8 +24,8 @@ pub fn air_level(scan: &Scan) -> f32 {
     let sigma = if differences.len() < 100 {
         0.0
     } else {
-        // |a − b| of two equal normals is above 1.05 σ·√2·0.6745… in half of the cases; pixels clipped at zero make
-        // ties at 0, so the 75th percentile is used: 1.150 σ √2.
+        // The median of |a − b| of two equal normals is 0.6745·√2·σ, but pixels clipped at zero cause ties at 0. So the
+        // 75th percentile is used: 1.150·√2·σ.
         let k = differences.len() * 3 / 4;
         let (_, q, _) = differences.select_nth_unstable_by(k, f32::total_cmp);
         *q / (1.150 * std::f32::consts::SQRT_2)
@@ -33,14 +33,14 @@ pub fn air_level(scan: &Scan) -> f32 {
     sigma.max(top / 500.0)
 }
 
-/// Pixels whose 7 × 7 neighbourhood is above `level` in the mean, widened by `margin` pixels.
+/// Pixels whose 7 × 7 neighbourhood has a mean above `level`, dilated by `margin` pixels.
 pub fn shadow(view: ArrayView2<'_, f32>, level: f32, margin: usize) -> Array2<bool> {
     let smooth = box_filter(view.to_owned(), 3, |window| window.iter().sum::<f32>() / window.len() as f32);
     let hit = smooth.mapv(|x| f32::from(u8::from(x > level)));
     box_filter(hit, margin, |window| window.iter().copied().fold(0.0, f32::max)).mapv(|x| x > 0.0)
 }
 
-/// Applies `f` to windows of ± `reach` along rows, then along columns; windows are cut at the border.
+/// Applies `f` to windows of ± `reach` along rows, then along columns; windows are clipped at the border.
 pub fn box_filter(mut image: Array2<f32>, reach: usize, f: impl Fn(&[f32]) -> f32) -> Array2<f32> {
     for axis in [1, 0] {
         for mut lane in image.lanes_mut(ndarray::Axis(axis)) {

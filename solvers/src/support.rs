@@ -1,10 +1,10 @@
-//! Where the object can be, from the views alone: what several views see nothing but air through is air.
+//! Finds the object's support from the views alone: a region through which several views see only air is air.
 //!
-//! Views are reduced to means of blocks, in which noise is smaller and a thin wire still shows. A block above the air's
-//! own level by three standard deviations of such means counts as object, and so do its neighbours as far as a cell's
-//! shadow reaches. A cell is left out where at least two views, and at least 15 % of those that see it, show air there: a
-//! faint detail that noise hides from some views stays. A view whose sides the object reaches says nothing: its level of
-//! air is not known. Cells beside those that are left stay too.
+//! Views are reduced to block means, in which noise is lower and a thin wire is still visible. A block counts as object
+//! if it exceeds the air level by three standard deviations of such means; so do its neighbours within a cell's shadow.
+//! A cell is removed if at least two views, and at least 15 % of those that see it, show air there: a faint detail that
+//! noise hides in some views stays. A view whose borders the object reaches is ignored, because its air level is
+//! unknown. Neighbours of remaining cells stay too.
 
 use crate::shadow::box_filter;
 use conefield_core::geometry::{Vec3, VoxelGrid};
@@ -16,40 +16,40 @@ use rayon::prelude::*;
 
 /// Cells along the longest side of the volume.
 const CELLS: f64 = 64.0;
-/// Blocks along a detector row, about.
+/// Approximate number of blocks along a detector row.
 const BLOCKS: usize = 128;
-/// Standard deviations of a block's mean above air from which it counts as object.
+/// Standard deviations above air from which a block counts as object.
 const DEVIATIONS: f32 = 3.0;
-/// Blocks of a view's side that are looked at together.
+/// Blocks of a view's border that are tested together.
 const TOGETHER: usize = 8;
-/// Share of the views that see a cell which must show air there, and how many at least.
+/// Share of the views that see a cell and must show air there, and their minimum number.
 const SHARE: f64 = 0.15;
 const VIEWS: usize = 2;
 
-/// What carving came to.
+/// The result of carving.
 pub struct CarvedSupport {
-    /// The cells that are left, if any could be left out.
+    /// The remaining cells, if any were removed.
     pub support: Option<Support>,
-    /// In words.
+    /// Description for the log.
     pub said: String,
 }
 
-/// A scan's views, reduced to means of blocks.
+/// A scan's views, reduced to block means.
 pub(crate) struct Blocks {
     /// Pixels along a block's side.
     size: usize,
-    /// Of each view.
+    /// Block means of each view.
     means: Vec<Array2<f32>>,
-    /// Of their noise.
+    /// Standard deviation of their noise.
     deviation: f32,
-    /// The largest of all pixels.
+    /// The largest pixel.
     top: f32,
-    /// Their level in air, where some view shows air.
+    /// Block mean in air, if some view shows air.
     air: Option<f32>,
 }
 
 impl Blocks {
-    /// Of all views.
+    /// The blocks of all views.
     pub(crate) fn of(scan: &Scan) -> Self {
         let g = &scan.geometry;
         let size = g.detector[1].div_ceil(BLOCKS).max(2);
@@ -61,7 +61,7 @@ impl Blocks {
         Self { size, means, deviation, top, air }
     }
 
-    /// Whether the object reaches one of the outer lines of a view along `axis`: 0 its first and last row, 1 its first and
+    /// Whether the object reaches a border of a view along `axis`: 0 for the first and last row, 1 for the first and
     /// last column.
     pub(crate) fn cut(&self, view: usize, axis: usize) -> bool {
         let means = &self.means[view];
@@ -81,7 +81,7 @@ pub fn carve(scan: &Scan) -> CarvedSupport {
     let Some(air) = air else { return nothing("as no view shows air") };
     let level = air + DEVIATIONS * deviation + 1e-3 * top;
     let cells = cells(&g.volume);
-    // Half a cell's diagonal on the detector, in blocks, where it is magnified most.
+    // Half a cell's diagonal on the detector, in blocks, at the largest magnification.
     let half = 0.5 * cells.spacing.iter().map(|s| s * s).sum::<f64>().sqrt();
     let views: Vec<ViewShadow> = blocks
         .means
@@ -133,14 +133,14 @@ pub fn carve(scan: &Scan) -> CarvedSupport {
     }
 }
 
-/// A view's object, widened by a cell's shadow.
+/// The object's shadow in a view, dilated by a cell's shadow.
 struct ViewShadow {
     pinhole: Pinhole,
     object: Array2<bool>,
 }
 
 impl ViewShadow {
-    /// Whether the view shows air at `p`; `None` where it does not see it.
+    /// Whether the view shows air at `p`; `None` if it does not see `p`.
     fn air(&self, p: Vec3, [rows, columns]: [usize; 2], size: usize) -> Option<bool> {
         let ([row, column], depth) = self.pinhole.project(p);
         let inside =
@@ -149,7 +149,7 @@ impl ViewShadow {
     }
 }
 
-/// Means of blocks of `size` × `size` pixels; the last ones of a line may be smaller.
+/// Means of blocks of `size` × `size` pixels; the last blocks of a line may be smaller.
 fn block_means(view: ArrayView2<'_, f32>, size: usize) -> Array2<f32> {
     let (rows, columns) = view.dim();
     Array2::from_shape_fn((rows.div_ceil(size), columns.div_ceil(size)), |(r, c)| {
@@ -159,8 +159,8 @@ fn block_means(view: ArrayView2<'_, f32>, size: usize) -> Array2<f32> {
     })
 }
 
-/// Whether the object reaches a side of a view: some of its blocks next to each other are above air in their mean, by
-/// more than chance does in a scan.
+/// Whether the object reaches a border of a view: the mean of some adjacent blocks exceeds air by more than chance in a
+/// scan.
 fn reached(side: ArrayView1<'_, f32>, air: f32, deviation: f32, top: f32) -> bool {
     side.axis_chunks_iter(Axis(0), TOGETHER).any(|part| {
         let n = part.len() as f32;
@@ -168,8 +168,8 @@ fn reached(side: ArrayView1<'_, f32>, air: f32, deviation: f32, top: f32) -> boo
     })
 }
 
-/// The standard deviation of block means in air: by the median difference of dark neighbours, which edges hardly move.
-/// Means of blocks are near enough to normal even where noise was cut off at 0.
+/// The standard deviation of block means in air, from the median difference of dark neighbours, which edges hardly
+/// change. Block means are nearly normal even if noise was clipped at 0.
 fn deviation(blocks: &[Array2<f32>], top: f32) -> f32 {
     let dark = |x: f32| x < 0.1 * top;
     let pairs = blocks.iter().flat_map(|b| b.rows()).flat_map(|row| {
@@ -182,17 +182,17 @@ fn deviation(blocks: &[Array2<f32>], top: f32) -> f32 {
     }
     let k = all.len() / 2;
     let (_, middle, _) = all.select_nth_unstable_by(k, f32::total_cmp);
-    // The median of |a − b| for two normals of deviation s is 0.954·s.
+    // The median of |a − b| of two normals with deviation s is 0.954·s.
     *middle / 0.954
 }
 
-/// The level of air in block means, if there is air: the median of what lies close to the lowest of them.
+/// The air level of block means, if there is air: the median of the values close to the lowest one.
 fn air(blocks: &[Array2<f32>], deviation: f32, top: f32) -> Option<f32> {
     let mut all: Vec<f32> = blocks.iter().flatten().copied().collect();
     let k = all.len() / 20;
     let (_, low, _) = all.select_nth_unstable_by(k, f32::total_cmp);
     let low = *low;
-    // Noise that is cut off at 0 has a mean above 0, but well below its deviation over single pixels.
+    // Noise clipped at 0 has a mean above 0, but well below its standard deviation over single pixels.
     if !(low.is_finite() && top > 0.0) || low > 2.0 * deviation + 0.01 * top {
         return None;
     }
@@ -202,7 +202,7 @@ fn air(blocks: &[Array2<f32>], deviation: f32, top: f32) -> Option<f32> {
     Some(*middle)
 }
 
-/// Cells of about the same side along every axis that fill the volume.
+/// Nearly cubic cells that fill the volume.
 fn cells(volume: &VoxelGrid) -> VoxelGrid {
     let size = volume.size();
     let side = size.into_iter().fold(0.0, f64::max) / CELLS;

@@ -1,10 +1,10 @@
-//! What lies beyond the volume: where a body is wider than the detector or longer than the volume, rays absorb outside of what
-//! is reconstructed, and that ends up as a bright rim inside.
+//! Attenuation beyond the volume: if a body is wider than the detector or longer than the volume, rays are also
+//! attenuated outside the reconstructed volume, which causes a bright rim inside.
 //!
-//! Total variation on coarse cells, over the volume and a margin around it, first finds about what there is outside. Its line
-//! integrals are taken off the measured ones, and every method works on the rest as if the body ended at the volume's sides
-//! (the idea of region-of-interest reconstruction by subtraction: Ziegler, Nielsen and Grass, Med. Phys. 35(4), 2008). Outside
-//! the volume nothing finer than these cells is modelled, once.
+//! A total-variation reconstruction on coarse cells, over the volume and a margin, first estimates the attenuation
+//! outside. Its line integrals are subtracted from the measured ones, and every method then reconstructs as if the body
+//! ended at the volume's sides (the idea of region-of-interest reconstruction by subtraction: Ziegler, Nielsen and
+//! Grass, Med. Phys. 35(4), 2008). Outside the volume nothing finer than these cells is modelled, and only once.
 
 use crate::iterative::Stop;
 use crate::iterative::fista::Fista;
@@ -18,21 +18,22 @@ use conefield_core::scene::{CoarseSurround, SurroundRule};
 use conefield_projectors::voxel::Joseph;
 use ndarray::{Array3, Axis, Zip, s};
 
-/// Cells at most.
+/// Most cells.
 const MOST: usize = 1 << 24;
-/// Views that are projected together.
+/// Views projected together.
 const TOGETHER: usize = 8;
-/// Share of an axis of the detector's pixels along a world axis from which the body is looked for along it.
+/// Component of a detector axis along a world axis, as a share of its length, from which the body is extended along
+/// that axis.
 const ALONG: f64 = 0.1;
 
-/// A job's scan, and its views kept aside, without what lies beyond the volume.
+/// A job's scan and held-out views, without attenuation beyond the volume.
 pub(crate) struct Within {
     scan: Scan,
     held_out: Option<Scan>,
 }
 
 impl Within {
-    /// Looks beyond the volume where the spec asks for it; `None` where there is nothing to look for.
+    /// Estimates attenuation beyond the volume if the spec asks for it; `None` if there is none to estimate.
     pub(crate) fn of(job: &Job<'_>, rule: SurroundRule, observer: &mut dyn Observer) -> Result<Option<Self>> {
         let SurroundRule::Coarse(settings) = rule else { return Ok(None) };
         let (around, said) = Around::of(job.scan, settings)?;
@@ -54,7 +55,7 @@ impl Within {
         Ok(Some(Self { scan, held_out }))
     }
 
-    /// The job without it.
+    /// The job without attenuation beyond the volume.
     pub(crate) fn job<'a>(within: Option<&'a Self>, job: &Job<'a>) -> Job<'a> {
         match within {
             Some(Self { scan, held_out }) => Job { scan, held_out: held_out.as_ref(), ..*job },
@@ -63,20 +64,20 @@ impl Within {
     }
 }
 
-/// The scan of `job` without what lies beyond the volume, as its method sees it; `None` where the spec does not ask for it or
-/// nothing is there to look for.
+/// The scan of `job` without attenuation beyond the volume, as its method sees it; `None` if the spec does not ask for
+/// it or there is none to estimate.
 pub fn subtracted(job: &Job<'_>, rule: SurroundRule, observer: &mut dyn Observer) -> Result<Option<Scan>> {
     Ok(Within::of(job, rule, observer)?.map(|within| within.scan))
 }
 
-/// What lies beyond the volume of this scan, in words; nothing where the rule asks for nothing.
+/// Log lines about attenuation beyond the volume of this scan; none if the rule does not ask for it.
 pub fn found(scan: &Scan, rule: SurroundRule) -> Result<Vec<String>> {
     let SurroundRule::Coarse(settings) = rule else { return Ok(vec![]) };
     Ok(vec![format!("surround: {}", Around::of(scan, settings)?.1)])
 }
 
-/// Bytes that looking beyond the volume takes at most; and that what it leaves of a scan of these sizes takes, until the
-/// volume is made. The coarse pixels are not counted: how many there are only the scan itself tells.
+/// Upper bounds in bytes: for estimating attenuation beyond the volume, and for the corrected scan until the volume is
+/// complete. Excludes the coarse pixels, whose number only the scan itself determines.
 pub fn bytes(rule: SurroundRule, header: &ScanHeader) -> [u64; 2] {
     let SurroundRule::Coarse(settings) = rule else { return [0; 2] };
     let side = (settings.cells as f64 * (1.0 + 2.0 * settings.margin)) as usize + 2;
@@ -86,21 +87,21 @@ pub fn bytes(rule: SurroundRule, header: &ScanHeader) -> [u64; 2] {
     [4 * cells.voxels() + finding, 4 * header.pixels()]
 }
 
-/// What finds the cells.
+/// The method that reconstructs the cells.
 fn method(passes: u64) -> Fista {
     let stop = Stop { passes: Some(passes), ..Stop::default() };
     Fista { stop, prior: Box::new(TotalVariation::default()), ..Fista::default() }
 }
 
-/// Coarse cells over the volume and around it.
+/// Coarse cells over the volume and its margin.
 struct Around {
     cells: VoxelGrid,
-    /// How many of them the volume's sides are away from the grid's.
+    /// Number of margin cells along each axis.
     margin: [usize; 3],
 }
 
 impl Around {
-    /// Of a scan whose object reaches the sides of views, and what was found in words.
+    /// The cells for a scan whose object reaches the borders of views, and a log line.
     fn of(scan: &Scan, settings: CoarseSurround) -> Result<(Option<Self>, String)> {
         let (g, blocks) = (&scan.geometry, Blocks::of(scan));
         let n = g.views.len();
@@ -139,7 +140,7 @@ impl Around {
         Ok((Some(Self { cells, margin }), said))
     }
 
-    /// What is in the cells beyond the volume, in 1/mm.
+    /// Reconstructs the cells beyond the volume, in 1/mm.
     fn find(&self, job: &Job<'_>, passes: u64, observer: &mut dyn Observer) -> Result<Array3<f32>> {
         let scan = coarse(job.scan, self.cells);
         let alone = Job { seed: job.seed, ..Job::new(&scan, job.backend) };
@@ -149,7 +150,7 @@ impl Around {
         Ok(data)
     }
 
-    /// Hands `take` the line integrals through the cells for each view of `geometry`.
+    /// Calls `take` with the line integrals through the cells for each view of `geometry`.
     fn project(
         &self,
         job: &Job<'_>,
@@ -171,8 +172,8 @@ impl Around {
     }
 }
 
-/// Cells that fill the volume exactly, and as many more of them along the axes `along` as `margin` of its longest side has
-/// room for; how many more.
+/// Cells that fill the volume exactly, plus a margin along the axes `along` of `margin` times the volume's longest
+/// side; and the number of margin cells.
 fn grid(volume: &VoxelGrid, settings: CoarseSurround, along: [bool; 3], margin: f64) -> (VoxelGrid, [usize; 3]) {
     let size = volume.size();
     let longest = size.into_iter().fold(0.0, f64::max);
@@ -185,14 +186,14 @@ fn grid(volume: &VoxelGrid, settings: CoarseSurround, along: [bool; 3], margin: 
     (VoxelGrid { shape, spacing, center: volume.center }, beyond)
 }
 
-/// Whether every source and every detector's middle stands outside the cells.
+/// Whether every source and every detector centre is outside the cells.
 fn apart(g: &Geometry, cells: &VoxelGrid) -> bool {
     let [low, high] = cells.bounds();
     let outside = |p: &[f64; 3]| (0..3).any(|k| p[k] <= low[k] || p[k] >= high[k]);
     g.views.iter().all(|v| outside(&v.source) && outside(&v.detector))
 }
 
-/// The scan with pixels of about a cell's size at the volume's centre, and the cells as its volume.
+/// The scan binned to about a cell's size at the volume's centre, with the cells as its volume.
 fn coarse(scan: &Scan, cells: VoxelGrid) -> Scan {
     let g = &scan.geometry;
     let [rows, columns] = g.detector;
@@ -205,12 +206,12 @@ fn coarse(scan: &Scan, cells: VoxelGrid) -> Scan {
     let size = ((side / pixel) as usize).clamp(1, rows.min(columns));
     let mut coarse = scan.binned(size);
     coarse.geometry.volume = cells;
-    // What comes of it is in 1/mm.
+    // The result is in 1/mm.
     coarse.unit = Unit::default();
     coarse
 }
 
-/// Says nothing of the work before the work, but can be stopped.
+/// Suppresses all reports of preparatory work, but can be cancelled.
 pub(crate) struct Quiet<'a>(pub(crate) &'a dyn Observer);
 
 impl Observer for Quiet<'_> {

@@ -1,13 +1,13 @@
-//! The voxels on which PSNR is watched while a volume takes shape.
+//! The voxels for PSNR during a reconstruction.
 
 use conefield_core::random::mix;
 
-/// Edge of a block of which one voxel is watched.
+/// Edge of a block with one such voxel.
 const EDGE: usize = 4;
 
-/// One voxel of each block of 4³, drawn: every voxel as likely as any other, where every 4th one along an axis would give
-/// some slices four times their weight and others none. The same ones in every run and for every method, so that records
-/// compare.
+/// One random voxel of each block of 4³: every voxel is equally likely, whereas every 4th one along an axis would give
+/// some slices four times their weight and others none. The same voxels are used in every run and by every method, so
+/// that records are comparable.
 pub fn voxels(shape: [usize; 3]) -> impl Iterator<Item = [usize; 3]> {
     let edge = shape.map(|n| n.clamp(1, EDGE));
     let blocks: [usize; 3] = std::array::from_fn(|k| shape[k].div_ceil(edge[k]));
@@ -15,7 +15,7 @@ pub fn voxels(shape: [usize; 3]) -> impl Iterator<Item = [usize; 3]> {
         let at = [block / (blocks[1] * blocks[2]), block / blocks[2] % blocks[1], block % blocks[2]];
         let drawn = mix(block as u64, 0);
         let voxel: [usize; 3] = std::array::from_fn(|k| at[k] * edge[k] + (drawn >> (16 * k)) as usize % edge[k]);
-        // A block that the volume's rim cuts has one as seldom as it has voxels.
+        // A block clipped by the volume's rim has a voxel with a probability equal to its remaining share.
         (0..3).all(|k| voxel[k] < shape[k]).then_some(voxel)
     })
 }

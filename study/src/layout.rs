@@ -1,9 +1,9 @@
-//! Where a study's files lie in its folder.
+//! Layout of a study's folder.
 //!
 //! ```text
-//! study.toml                the study's file, as it was
-//! scans/CASE-seedS/         what was simulated, once for all methods
-//! runs/CASE-seedS/METHOD/   what "conefield reconstruct" leaves
+//! study.toml                a copy of the study's file
+//! scans/CASE-seedS/         the simulated scans, one for all methods
+//! runs/CASE-seedS/METHOD/   output of "conefield reconstruct"
 //! failed/CASE-seedS/METHOD  why a run has no result
 //! table.md, table.json      the results; written last
 //! slices/CASE.png           middle slices of every method with the first seed
@@ -17,11 +17,11 @@ use std::fs;
 use std::io::ErrorKind;
 use std::path::{Path, PathBuf};
 
-/// The copy of the study's file, which also marks the folder as a study's.
+/// The copy of the study's file, which also identifies the folder of a study.
 pub const STUDY: &str = "study.toml";
-/// The table for people.
+/// The Markdown table.
 pub const TABLE: &str = "table.md";
-/// The table for programs.
+/// The JSON record.
 pub const RECORD: &str = "table.json";
 const SCANS: &str = "scans";
 const RUNS: &str = "runs";
@@ -31,49 +31,49 @@ const CURVES: &str = "curves";
 const FILES: [&str; 3] = [STUDY, TABLE, RECORD];
 const FOLDERS: [&str; 5] = [SCANS, RUNS, FAILED, SLICES, CURVES];
 
-/// What the folder of a study holds.
+/// Content of a study's folder.
 pub const CONTENTS: Contents = Contents { known, progressed };
 
 /// A study's folder.
 pub struct Layout<'a>(pub &'a Path);
 
 impl Layout<'_> {
-    /// The study's file, as it was.
+    /// The copy of the study's file.
     pub fn study(&self) -> PathBuf {
         self.0.join(STUDY)
     }
 
-    /// Of simulated scans.
+    /// Folder of the simulated scans.
     pub fn scans(&self) -> PathBuf {
         self.0.join(SCANS)
     }
 
-    /// The scan of a case that was simulated with `seed`.
+    /// Folder of the scan of a case, simulated with `seed`.
     pub fn scan(&self, case: &str, seed: u64) -> PathBuf {
         self.scans().join(group(case, seed))
     }
 
-    /// The run of a method.
+    /// Folder of the run of a method.
     pub fn run(&self, case: &str, seed: u64, method: &str) -> PathBuf {
         self.0.join(RUNS).join(group(case, seed)).join(method)
     }
 
-    /// The file with the error of a run without result.
+    /// File with the error of a failed run.
     pub fn failure(&self, case: &str, seed: u64, method: &str) -> PathBuf {
         self.0.join(FAILED).join(group(case, seed)).join(method)
     }
 
-    /// The middle slices of a case's volumes.
+    /// Picture of the middle slices of a case's volumes.
     pub fn slices(&self, case: &str) -> PathBuf {
         self.0.join(SLICES).join(format!("{case}.png"))
     }
 
-    /// The curves of a case's runs.
+    /// Picture of the curves of a case's runs.
     pub fn curves(&self, case: &str) -> PathBuf {
         self.0.join(CURVES).join(format!("{case}.png"))
     }
 
-    /// Refuses a folder with files that no study writes. Returns whether it holds a study.
+    /// Refuses a folder with files that no study writes. Returns whether it contains a study.
     pub fn look(&self) -> Result<bool> {
         let place = self.0.display().to_string();
         let entries = match fs::read_dir(self.0) {
@@ -85,29 +85,29 @@ impl Layout<'_> {
             let entry = entry.map_err(|e| Error::io(self.0, e))?;
             let found = format!("a folder with {} in it", entry.file_name().to_string_lossy());
             ensure(known(&entry.path()), &place, "output", found, "a new or empty folder")?;
-            // What is being written is nothing yet.
+            // Unfinished files do not count.
             any |= !conefield_io::is_unfinished(&entry.file_name());
         }
-        // Only what bears a study's mark may go with all that is in it.
+        // Only a folder with a study's file may be removed with its content.
         let marked = !any || self.study().is_file();
         ensure(marked, &place, "output", format!("a folder without {STUDY}"), "a new or empty folder, or a study's")?;
         Ok(any)
     }
 }
 
-/// A case and a seed in one name.
+/// A case and a seed, joined to one name.
 pub fn group(case: &str, seed: u64) -> String {
     format!("{case}-seed{seed}")
 }
 
-/// Whether a study may have left this.
+/// Whether a study may have written `path`.
 fn known(path: &Path) -> bool {
     let name = path.file_name().unwrap_or_default();
     let names = if path.is_dir() { &FOLDERS[..] } else { &FILES[..] };
     names.iter().any(|f| name == *f) || conefield_io::is_unfinished(name)
 }
 
-/// How far the study in `folder` came.
+/// Progress of the study in `folder`.
 fn progressed(folder: &Path) -> Progressed {
     let has = |name: &str| fs::read_dir(folder.join(name)).is_ok_and(|mut all| all.next().is_some());
     if folder.join(RECORD).exists() {

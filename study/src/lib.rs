@@ -1,12 +1,12 @@
-//! Many reconstructions under one protocol: every method on every scan, with every seed, and what they come to.
+//! Studies: many reconstructions under one protocol, every method on every scan with every seed, and their statistics.
 //!
-//! - [`study`]: a study, read from its file and checked whole before anything runs; [`schema`](study::schema) is for editors.
-//! - [`method`]: a spec that is built, under a name of its own; [`outcome`]: what became of its run, and the columns for it.
-//! - [`simulation`]: the scans that a study simulates; [`layout`]: where all of it lies in a study's folder.
+//! - [`study`]: a study, parsed and validated before anything runs; [`schema`](study::schema) is for editors.
+//! - [`method`]: a named spec with its plan; [`outcome`]: the outcome of its run, and its table columns.
+//! - [`simulation`]: the scans that a study simulates; [`layout`]: the layout of a study's folder.
 //! - [`report`]: means, spreads and paired differences as table and JSON; [`pictures`]: slices and curves.
-//! - [`slurm`]: the script of an array of jobs.
+//! - [`slurm`]: the script of a job array.
 //!
-//! A single comparison has its methods and outcomes from here too. How a run is started is the caller's matter.
+//! Single comparisons use the methods and outcomes too. The caller starts the runs.
 
 pub mod layout;
 pub mod method;

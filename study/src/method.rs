@@ -1,4 +1,4 @@
-//! A spec as a part of a comparison: built once, under a name that serves for the table and for a folder.
+//! A spec in a comparison: built once, with a name that is valid in tables and as a folder.
 
 use conefield_core::backend::Backend;
 use conefield_core::error::ensure;
@@ -8,24 +8,24 @@ use conefield_core::{Error, Result};
 use conefield_run::{files, method, specs};
 use std::path::Path;
 
-/// A spec with what is changed of it.
+/// A spec with changed settings.
 pub struct Method {
-    /// Its own name.
+    /// Its name.
     pub name: String,
-    /// As --spec has it.
+    /// Value of `--spec`.
     pub spec: String,
-    /// As --set has them.
+    /// Values of `--set`.
     pub sets: Vec<String>,
-    /// As --init has it.
+    /// Value of `--init`.
     pub init: Option<String>,
-    /// All of that read.
+    /// The parsed spec.
     pub loaded: Loaded,
-    /// What it builds.
+    /// The plan.
     pub plan: Box<dyn Plan>,
 }
 
 impl Method {
-    /// Reads and builds `spec` under `name`, or else under its own.
+    /// Reads and builds `spec`, named `name` or by default as the spec itself.
     pub fn read(
         spec: &str,
         name: Option<&str>,
@@ -46,7 +46,7 @@ impl Method {
         Ok(Self { name, spec: spec.into(), sets: sets.to_vec(), init: init.map(str::to_owned), loaded, plan })
     }
 
-    /// Refuses one that is called as one of `others`.
+    /// Refuses a name that occurs in `others`.
     pub fn differs(&self, others: &[Self]) -> Result<()> {
         match others.iter().find(|m| m.name.to_lowercase() == self.name.to_lowercase()) {
             Some(other) => {
@@ -58,10 +58,10 @@ impl Method {
     }
 }
 
-/// What a name must be to serve as a folder's.
+/// Description of names that are valid as folders.
 pub const FOLDER_NAME: &str = "a name for a folder: letters, digits, and between them spaces and ._+()-";
 
-/// Refuses a name that cannot be a folder's.
+/// Refuses a name that is not valid as a folder.
 pub fn check_name(name: &str, place: &str, field: &str) -> Result<()> {
     let begins = name.starts_with(|c: char| c.is_alphanumeric());
     let plain = name.chars().all(|c| c.is_alphanumeric() || " ._+()-".contains(c)) && !name.ends_with([' ', '.']);

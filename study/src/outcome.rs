@@ -1,4 +1,4 @@
-//! What became of a run, and the columns of a table for it.
+//! The outcome of a run, and its table columns.
 
 use conefield_core::Result;
 use conefield_report::text::{bytes, number};
@@ -11,55 +11,55 @@ use std::path::Path;
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize)]
 #[serde(rename_all = "lowercase")]
 pub enum Status {
-    /// It has a result.
+    /// With a result.
     Done,
-    /// It has none.
+    /// Without a result.
     Failed,
 }
 
-/// What became of a run.
+/// The outcome of a run.
 #[derive(Debug, Clone, Serialize)]
 pub struct Outcome {
     /// How it ended.
     pub status: Status,
-    /// What went wrong.
+    /// The error of a failed run.
     pub error: Option<String>,
-    /// What it took and reached.
+    /// Time, memory and scores.
     #[serde(flatten)]
     pub figures: Option<Figures>,
 }
 
 impl Outcome {
-    /// Of the finished run in `folder`.
+    /// The outcome of the finished run in `folder`.
     pub fn of_run(folder: &Path) -> Result<Self> {
         Ok(Self { status: Status::Done, error: None, figures: Some(Figures::of_run(folder)?) })
     }
 
-    /// Of a run that went wrong.
+    /// The outcome of a failed run.
     pub fn failed(error: String) -> Self {
         Self { status: Status::Failed, error: Some(error), figures: None }
     }
 }
 
-/// Which figures tell how a result fits: scores where there is a reference, otherwise held-out views, otherwise the
-/// loss, which says least.
+/// Table columns for the quality of a result: scores if there is a reference, else the error of held-out views, else
+/// the loss, which is the least informative.
 #[derive(Debug, Clone, Copy)]
 pub struct Columns {
-    /// The volume sought is known.
+    /// Whether there is a reference.
     pub scores: bool,
-    /// Views were kept aside.
+    /// Whether there are held-out views.
     pub held_out: bool,
-    /// There is nothing better.
+    /// Whether the loss is the only measure.
     pub loss: bool,
 }
 
 impl Columns {
-    /// For runs with a reference, or with held-out views.
+    /// The columns for runs with a reference, or with held-out views.
     pub fn of(scores: bool, held_out: bool) -> Self {
         Self { scores, held_out, loss: !scores && !held_out }
     }
 
-    /// The headings: how a result fits, and what it took.
+    /// The headings: quality, then time and memory.
     pub fn heads(&self) -> Vec<&'static str> {
         let mut heads = vec![];
         heads.extend(SCORES.iter().filter(|_| self.scores));
@@ -69,7 +69,7 @@ impl Columns {
         heads
     }
 
-    /// The cells below them; one that failed has little to say.
+    /// The cells below the headings; mostly empty for a failed run.
     pub fn cells(&self, outcome: &Outcome) -> Vec<String> {
         let Some(figures) = &outcome.figures else {
             return (0..self.heads().len()).map(|c| if c == 0 { "failed" } else { "-" }.to_owned()).collect();

@@ -1,4 +1,4 @@
-//! Pictures of what methods came to: their middle slices side by side, and PSNR as it rose.
+//! Pictures of results: middle slices side by side, and PSNR curves.
 
 use crate::spread::Spread;
 use conefield_core::Result;
@@ -7,18 +7,19 @@ use conefield_run::memory::Memory;
 use serde_json::Value;
 use std::path::{Path, PathBuf};
 
-/// A method's run as pictures show it.
+/// A method's run in a picture.
 pub struct Shown {
     /// The method's name.
     pub name: String,
-    /// Against the reference, where there is one.
+    /// PSNR against the reference, if there is one.
     pub psnr: Option<f64>,
     /// The run's folder.
     pub run: PathBuf,
 }
 
-/// Draws the middle slices of results side by side, with their differences to the reference where there is one, grey over
-/// `window` or else over the range of the reference. False where there is nothing to draw; an earlier picture goes then.
+/// Draws the middle slices of results side by side, with their differences from the reference if there is one, in grey
+/// over `window` or by default the range of the reference. Returns false if there is nothing to draw; an earlier
+/// picture is then removed.
 pub fn slices(
     path: &Path,
     reference: Option<&MiddleSlices>,
@@ -38,7 +39,7 @@ pub fn slices(
     let panels: Vec<(&str, &MiddleSlices)> = panels.iter().map(|(c, s)| (&c[..], s)).collect();
     match (reference, panels.first()) {
         (_, None) => {
-            // One of earlier results would not belong to these.
+            // A picture of earlier results would not match.
             let _ = std::fs::remove_file(path);
             return Ok(false);
         }
@@ -48,11 +49,11 @@ pub fn slices(
     Ok(true)
 }
 
-/// Points of a curve, their x rising.
+/// Points of a curve, by ascending x.
 type Curve = Vec<(f64, f64)>;
 
-/// Draws the PSNR of methods over steps and over seconds of training: the mean over each one's runs, with the standard
-/// deviation as a band where there are several. False where no run has recorded any.
+/// Draws the PSNR of methods over steps and over training time: the mean over each method's runs, with the standard
+/// deviation as a band if there are several. Returns false if no run has recorded PSNR.
 pub fn curves(path: &Path, title: &str, methods: &[(String, Vec<PathBuf>)]) -> Result<bool> {
     let records: Vec<(&str, Vec<Vec<Value>>)> =
         methods.iter().map(|(name, runs)| (&name[..], runs.iter().map(|r| records(r)).collect())).collect();
@@ -79,7 +80,7 @@ pub fn curves(path: &Path, title: &str, methods: &[(String, Vec<PathBuf>)]) -> R
     Ok(true)
 }
 
-/// The lines of a run's metrics. A line that a killed run left unfinished is none.
+/// The lines of a run's metrics. Skips a line that a killed run left unfinished.
 fn records(run: &Path) -> Vec<Value> {
     let text = std::fs::read(run.join("metrics.jsonl")).unwrap_or_default();
     String::from_utf8_lossy(&text).lines().filter_map(|l| serde_json::from_str(l).ok()).collect()
@@ -91,7 +92,7 @@ fn curve(records: &[Value], key: &str) -> Curve {
     records.iter().filter_map(point).collect()
 }
 
-/// What curves have in common, at every x of any of them that all of them reach; of curves without common ground their last
+/// The mean of the curves at every x of any curve within their common range; if there is none, the mean of their last
 /// points.
 fn means(curves: &[Curve]) -> Vec<(f64, Spread)> {
     let ends = |c: &Curve| Some((c.first()?.0, c.last()?.0));
@@ -109,7 +110,7 @@ fn means(curves: &[Curve]) -> Vec<(f64, Spread)> {
     of(|p| p.0).zip(of(|p| p.1)).map(|(x, y)| (x.mean, y)).into_iter().collect()
 }
 
-/// Where a curve stands at `x`, between its points on a straight line.
+/// The value of a curve at `x`, by linear interpolation.
 fn height(curve: &Curve, x: f64) -> f64 {
     let after = curve.partition_point(|p| p.0 < x).clamp(1, curve.len().max(2) - 1);
     let (a, b) = (curve[after - 1], curve.get(after).copied().unwrap_or(curve[after - 1]));

@@ -1,4 +1,4 @@
-//! What a study came to: every run, and over the seeds means, standard deviations and paired differences.
+//! The results of a study: every run, and means, standard deviations and paired differences over the seeds.
 
 use crate::layout::{Layout, group};
 use crate::outcome::{Columns, Outcome};
@@ -15,24 +15,24 @@ use serde::{Deserialize, Serialize};
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 
-/// All that `table.json` says.
+/// The content of `table.json`.
 #[derive(Serialize)]
 pub struct StudyReport {
     version: &'static str,
-    /// What the program was built from, where its builder said so.
+    /// The commit of the build, if the builder set it.
     commit: Option<&'static str>,
     name: String,
     description: String,
-    /// The study's file, whole.
+    /// The complete study file.
     study: String,
     seeds: Vec<u64>,
     protocol: Protocol,
     baseline: Option<String>,
     methods: Vec<MethodRecord>,
     cases: Vec<CaseRecord>,
-    /// Every run.
+    /// All runs.
     runs: Vec<RunLine>,
-    /// For each case and method, over the seeds.
+    /// Statistics over the seeds for each case and method.
     summary: Vec<Line>,
 }
 
@@ -44,15 +44,15 @@ struct MethodRecord {
     init: Option<String>,
 }
 
-/// What methods were compared on.
+/// The data of a comparison.
 #[derive(Serialize)]
 pub struct CaseRecord {
     name: String,
-    /// Of what was simulated.
+    /// The volume, for a simulated case.
     volume: Option<String>,
-    /// Of what was simulated, where it is not the protocol's own.
+    /// The noise, for a simulated case, if it differs from the protocol's.
     noise: Option<String>,
-    /// Of a scan that there was.
+    /// The scan, for an existing one.
     scan: Option<PathBuf>,
     views: usize,
     detector: [usize; 2],
@@ -63,7 +63,7 @@ pub struct CaseRecord {
 }
 
 impl CaseRecord {
-    /// Of the case `source`, called `name`, with what is known of its first scan.
+    /// The record of the case `source`, named `name`, with the input of its first scan.
     pub fn new(name: &str, source: &Source, input: &TrialInput) -> Self {
         let (volume, scan, reference) = match source {
             Source::Simulated(s) => (Some(s.written.clone()), None, Some("truth".into())),
@@ -99,39 +99,39 @@ impl CaseRecord {
     }
 }
 
-/// A run and what became of it.
+/// A run and its outcome.
 #[derive(Serialize)]
 struct RunLine {
     case: String,
     seed: u64,
     method: String,
     run: PathBuf,
-    /// What it ran on.
+    /// The machine of the run.
     machine: Option<Machine>,
     #[serde(flatten)]
     outcome: Outcome,
 }
 
-/// A case and a method, over the seeds; the case [`ALL`] is the mean over all of them.
+/// A case and a method, over the seeds; the case [`ALL`] is the mean over all cases.
 #[derive(Serialize)]
 struct Line {
     case: String,
     method: String,
     done: usize,
     failed: usize,
-    /// Figures by the names that they have in `record.json`.
+    /// Figures, by their names in `record.json`.
     figures: BTreeMap<&'static str, Spread>,
-    /// Of the same figures, the method's less the baseline's on the same scan and with the same seed.
+    /// Differences of the same figures: the method's minus the baseline's on the same scan with the same seed.
     difference: Option<BTreeMap<&'static str, Spread>>,
 }
 
-/// The mean over all cases.
+/// Name of the mean over all cases.
 const ALL: &str = "all";
 
 /// A figure of a run.
 type Figure = fn(&Figures) -> Option<f64>;
 
-/// What means are taken of.
+/// The figures that are averaged.
 const FIGURES: [(&str, Figure); 10] = [
     ("psnr", Figures::psnr),
     ("ssim_2d", |f| f.score("ssim_2d")),
@@ -145,7 +145,7 @@ const FIGURES: [(&str, Figure); 10] = [
     ("peak_bytes", |f| f.peak_bytes.map(|b| b as f64)),
 ];
 
-/// A figure as a table for people has it.
+/// A column of the Markdown table.
 struct Column {
     key: &'static str,
     head: &'static str,
@@ -173,7 +173,7 @@ fn four(x: f64) -> String {
     format!("{x:.4}")
 }
 
-/// What a run ran on, from its record.
+/// The machine of a run, from its record.
 fn machine(run: &Path) -> Result<Option<Machine>> {
     #[derive(Deserialize)]
     struct Known {
@@ -184,7 +184,7 @@ fn machine(run: &Path) -> Result<Option<Machine>> {
 }
 
 impl StudyReport {
-    /// Of the runs in `layout`, which are all over: `outcomes` are theirs.
+    /// The report on the runs in `layout`, which have all ended; `outcomes` are their outcomes.
     pub fn new(
         study: &Study,
         layout: &Layout<'_>,
@@ -227,13 +227,13 @@ impl StudyReport {
         conefield_io::write_text_atomic(folder.join(crate::layout::RECORD), &to_json(self)?)
     }
 
-    /// Why runs failed: a line each.
+    /// The errors of failed runs, one line each.
     pub fn failures(&self) -> Vec<String> {
         let failed = self.runs.iter().filter_map(|r| Some((r, r.outcome.error.as_ref()?)));
         failed.map(|(r, e)| format!("{}/{} failed: {e}", group(&r.case, r.seed), r.method)).collect()
     }
 
-    /// For a terminal: means and failures.
+    /// Text for a terminal: means and failures.
     pub fn text(&self) -> String {
         let mut parts = vec![self.line()];
         parts.extend(self.tables().into_iter().map(|(case, table)| format!("{case}\n{}", table.text())));
@@ -241,7 +241,7 @@ impl StudyReport {
         parts.join("\n\n")
     }
 
-    /// For people to read later: means with pictures, then every run.
+    /// Markdown: means with pictures, then every run.
     fn markdown(&self) -> String {
         let mut text = format!("# {}\n\n", self.name);
         if !self.description.is_empty() {
@@ -258,7 +258,7 @@ impl StudyReport {
         text + &format!("\n## Every run\n\n{}", self.every_run().markdown())
     }
 
-    /// The protocol in a sentence.
+    /// The protocol in one sentence.
     fn line(&self) -> String {
         let seeds: Vec<String> = self.seeds.iter().map(u64::to_string).collect();
         let mut words = self.protocol.words();
@@ -279,7 +279,7 @@ impl StudyReport {
         line
     }
 
-    /// A table for each case, and one for their mean where there are several.
+    /// One table per case, and one for their mean if there are several.
     fn tables(&self) -> Vec<(String, Table)> {
         let mut names: Vec<&str> = self.cases.iter().map(|c| &c.name[..]).collect();
         if names.len() > 1 {
@@ -290,7 +290,7 @@ impl StudyReport {
 
     fn table(&self, case: &str) -> Table {
         let lines: Vec<&Line> = self.summary.iter().filter(|l| l.case == case).collect();
-        // A figure that no method has is left out; the loss says something only where there is nothing better.
+        // Omits figures that no method has; the loss is only informative if there is no better figure.
         let any = |key: &str| lines.iter().any(|l| l.figures.contains_key(key));
         let (scores, held_out) = (any("psnr"), any("held_out"));
         let columns: Vec<&Column> = COLUMNS
@@ -319,7 +319,7 @@ impl StudyReport {
             let mut row = vec![line.method.clone(), runs];
             let cell = |s: Option<String>| s.unwrap_or_else(|| "-".into());
             row.extend(columns.iter().map(|c| {
-                // How many steps and bytes there were is one number.
+                // Counts of steps and bytes are whole numbers.
                 let whole = ["steps", "peak_bytes"].contains(&c.key);
                 let shown = |x: &Spread| if whole { (c.shown)(x.mean) } else { x.shown(c.shown) };
                 cell(line.figures.get(c.key).map(shown))
@@ -344,7 +344,7 @@ impl StudyReport {
     }
 }
 
-/// The runs of a study, to be summed up.
+/// Summarizes the runs of a study.
 struct Summary<'a> {
     study: &'a Study,
     outcomes: &'a [(Cell, Outcome)],
@@ -353,7 +353,7 @@ struct Summary<'a> {
 impl Summary<'_> {
     fn lines(&self) -> Vec<Line> {
         let cases = (0..self.study.cases.len()).map(Some);
-        // Over one case the mean is that case.
+        // For a single case the mean is that case.
         let all = (self.study.cases.len() > 1).then_some(None);
         let lines = cases.chain(all).flat_map(|case| (0..self.study.methods.len()).map(move |method| (case, method)));
         lines.map(|(case, method)| self.line(case, method)).collect()
@@ -370,7 +370,7 @@ impl Summary<'_> {
         let difference = self.study.baseline.filter(|b| *b != method).map(|baseline| {
             spread(&|figure| {
                 let pairs = values(method, figure).into_iter().zip(values(baseline, figure));
-                // Of two results that both are the reference there is no difference.
+                // If both results equal the reference, there is no difference.
                 pairs.filter_map(|(a, b)| Some(a? - b?)).filter(|d| !d.is_nan()).collect()
             })
         });
@@ -384,7 +384,7 @@ impl Summary<'_> {
         }
     }
 
-    /// A figure with every seed: of one case, or its mean over all where none of them lacks it.
+    /// A figure for every seed: of one case, or its mean over all cases if none is missing.
     fn values(&self, case: Option<usize>, method: usize, figure: Figure) -> Vec<Option<f64>> {
         let of = |case: usize, seed: u64| {
             let cell = Cell { case, seed, method };
@@ -436,7 +436,7 @@ mod tests {
         let study = study(
             "volumes = ['phantom:head:16', 'phantom:abdomen:16']\nspecs = ['fdk', 'sirt']\nseeds = [1, 2, 3]\nbaseline = 'fdk'\n",
         );
-        // With every seed sirt is better by 1, 2 and 3 dB on the head, by 5 on the abdomen, where one run fails.
+        // For every seed sirt is better by 1, 2 and 3 dB on the head, by 5 on the abdomen, where one run fails.
         let psnr = |c: &Cell| match (c.case, c.method) {
             (0, 0) => 20.0 + 10.0 * c.seed as f64,
             (0, _) => 20.0 + 11.0 * c.seed as f64,
@@ -455,13 +455,13 @@ mod tests {
         let head = line("head-16", "sirt");
         let of = |mean, sd, n| Spread { mean, sd: Some(sd), n };
         assert_eq!(head.figures["psnr"], of(42.0, 11.0, 3));
-        // The pairs spread far less than the seeds.
+        // The paired differences spread far less than the seeds.
         assert_eq!(head.difference.as_ref().unwrap()["psnr"], of(2.0, 1.0, 3));
         assert!(line("head-16", "fdk").difference.is_none() && !head.figures.contains_key("held_out"));
         let abdomen = line("abdomen-16", "sirt");
         assert_eq!((abdomen.done, abdomen.failed), (2, 1));
         assert_eq!(abdomen.difference.as_ref().unwrap()["psnr"], of(5.0, 0.0, 2));
-        // Over all: the mean of both with the seeds that have both.
+        // Over all cases: the mean of both for the seeds that both have.
         let all = line("all", "sirt");
         assert_eq!(all.difference.as_ref().unwrap()["psnr"], of(3.25, 0.125f64.sqrt(), 2));
         assert_eq!((all.done, all.failed), (5, 1));

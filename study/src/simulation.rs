@@ -1,4 +1,4 @@
-//! The scans that a study simulates.
+//! The simulated scans of a study.
 
 use conefield_core::error::ensure;
 use conefield_core::geometry::VoxelGrid;
@@ -12,26 +12,26 @@ use conefield_run::simulation::{self, Changes};
 use serde_json::{Value, json};
 use std::path::{Path, PathBuf};
 
-/// What a scan is simulated from; only the seed of its noise is open.
+/// Settings of a simulated scan, except the seed of its noise.
 pub struct Simulation {
-    /// The volume, as the study's file has it.
+    /// The volume, as written in the study's file.
     pub written: String,
-    /// The same as everyone else may use it.
+    /// The volume, resolved relative to the study's file.
     pub volume: String,
-    /// What its voxel values mean.
+    /// Meaning of its voxel values.
     pub values: Values,
-    /// The same, as the study's file has it.
+    /// The same, as written in the study's file.
     pub values_written: String,
-    /// Blocks of so many voxels a side are averaged first.
+    /// Side, in voxels, of the blocks that are averaged first.
     pub downsample: usize,
     /// r2 or a file.
     pub protocol: String,
-    /// What is other than the protocol says.
+    /// Changes to the protocol.
     pub changes: Changes,
 }
 
 impl Simulation {
-    /// Files that it reads.
+    /// Input files.
     pub fn inputs(&self) -> Vec<PathBuf> {
         let angles = match &self.changes.angles {
             Some(AnglesOption::File(path)) => Some(path.clone()),
@@ -40,7 +40,7 @@ impl Simulation {
         [&self.volume, &self.protocol].into_iter().map(PathBuf::from).chain(angles).collect()
     }
 
-    /// Refuses a volume that cannot be read or scanned, and views to hold out that there are not.
+    /// Refuses a volume that cannot be read or scanned, and held-out views that do not exist.
     pub fn check(&self, hold_out: Option<&HoldOut>) -> Result<()> {
         let volume = self.prepared()?;
         let geometry = self.protocol(&volume.grid, 0)?.geometry(&volume.grid)?;
@@ -53,7 +53,7 @@ impl Simulation {
         ensure(held.len() < views, &self.written, "hold_out", "every view", "some views to work with")
     }
 
-    /// Simulates the scan with the noise of `seed` and writes it, with its truth, to `folder`.
+    /// Simulates the scan with the noise of `seed` and writes it, with its true volume, to `folder`.
     pub fn make(&self, seed: u64, folder: &Path) -> Result<()> {
         let volume = self.prepared()?;
         let protocol = self.protocol(&volume.grid, seed)?;
@@ -64,7 +64,7 @@ impl Simulation {
         conefield_io::write_scan(folder, &scan, Some(&volume))
     }
 
-    /// Refuses a `scan` at `place` that [`Self::make`] would not have made with `seed`.
+    /// Refuses a `scan` at `place` that [`Self::make`] would not have produced with `seed`.
     pub fn check_made(&self, seed: u64, scan: &Scan, place: &Path) -> Result<()> {
         let now = self.protocol(&scan.geometry.volume, seed)?;
         let then: Option<Protocol> = serde_json::from_value(scan.provenance["simulated"]["protocol"].clone()).ok();
@@ -81,7 +81,7 @@ impl Simulation {
         )
     }
 
-    /// The volume that is scanned.
+    /// The volume to scan.
     fn prepared(&self) -> Result<Volume> {
         Memory::of_volumes(&[files::voxels(&self.volume)?]).check(|_| vec![])?;
         simulation::prepared(files::volume(&self.volume)?, self.values, self.downsample)
@@ -91,7 +91,7 @@ impl Simulation {
         let changes = Changes { seed: Some(seed), ..self.changes.clone() };
         let protocol = simulation::protocol(&self.protocol, grid)?;
         simulation::changed(protocol, &changes, "study").map_err(|e| match e {
-            // Named after the options of a command line.
+            // Errors name the options of the command line.
             Error::Invalid { place, field, found, .. } if field == "--views" => {
                 Error::invalid(place, "views", found, "views, or angles from a file, which says how many there are")
             }

@@ -1,9 +1,9 @@
-//! A script that Slurm runs as an array of jobs, each a share of a study.
+//! A Slurm script for a job array, each job a share of a study.
 
 use conefield_core::{Error, Result};
 use std::path::Path;
 
-/// What the jobs run.
+/// Settings of the jobs.
 pub struct Jobs<'a> {
     /// The study's name.
     pub name: &'a str,
@@ -11,16 +11,16 @@ pub struct Jobs<'a> {
     pub program: &'a Path,
     /// The study's file.
     pub study: &'a Path,
-    /// The folder for the results, which all jobs must see.
+    /// The folder for the results, which all jobs must be able to access.
     pub output: &'a Path,
-    /// How many share the runs.
+    /// Number of jobs that share the runs.
     pub count: usize,
-    /// Options of every command, as the command line has them.
+    /// General options for every command, as on the command line.
     pub general: &'a [String],
 }
 
 impl Jobs<'_> {
-    /// The script. A job that is killed and requeued, or submitted again, repeats no finished run; the last one to end
+    /// The script. A job that is killed and requeued, or submitted again, repeats no finished run; the last job to end
     /// writes the table.
     pub fn script(&self) -> Result<String> {
         let absolute = |path: &Path| std::path::absolute(path).map_err(|e| Error::io(path, e));

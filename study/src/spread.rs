@@ -1,20 +1,20 @@
-//! A mean and how far values lie from it.
+//! Mean and standard deviation.
 
 use serde::Serialize;
 
-/// Of several values of a figure.
+/// Mean and spread of a figure's values.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize)]
 pub struct Spread {
-    /// Their mean.
+    /// The mean.
     pub mean: f64,
-    /// Their sample standard deviation (n − 1); none of a single one.
+    /// The sample standard deviation (n − 1); `None` for a single value.
     pub sd: Option<f64>,
-    /// How many there are.
+    /// The number of values.
     pub n: usize,
 }
 
 impl Spread {
-    /// Of `values`; none of none.
+    /// The spread of `values`; `None` if there are none.
     pub fn of(values: &[f64]) -> Option<Self> {
         let n = values.len();
         if n == 0 {
@@ -26,13 +26,13 @@ impl Spread {
         Some(Self { mean, sd, n })
     }
 
-    /// Mean ± standard deviation, each as `number` has it.
+    /// Mean ± standard deviation, each formatted by `number`.
     pub fn shown(&self, number: impl Fn(f64) -> String) -> String {
         let mean = number(self.mean);
         self.sd.map_or(mean.clone(), |sd| format!("{mean} ± {}", number(sd)))
     }
 
-    /// The same of differences: with their sign.
+    /// The same for differences, with their sign.
     pub fn signed(&self, number: impl Fn(f64) -> String) -> String {
         let sign = if self.mean >= 0.0 { "+" } else { "" };
         format!("{sign}{}", self.shown(number))

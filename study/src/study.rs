@@ -1,4 +1,4 @@
-//! A study, read from its file: TOML that names volumes or scans, methods and seeds.
+//! A study file in TOML with volumes or scans, methods and seeds.
 //!
 //! ```toml
 //! name = "pairs"
@@ -16,8 +16,8 @@
 //! seconds = "60s"
 //! ```
 //!
-//! Paths are relative to the file. All of it is checked here: keys, values, specs, volumes and the geometry of what is to be
-//! simulated.
+//! Paths are relative to the file. This module validates everything: keys, values, specs, volumes and the geometry of
+//! simulated scans.
 
 use crate::method::{self, Method};
 use crate::simulation::Simulation;
@@ -36,7 +36,7 @@ use toml::Spanned;
 
 /// Longest study file, in bytes.
 const LONGEST: u64 = 1 << 20;
-/// More runs than anyone waits for: a slip.
+/// More runs than anyone waits for: a typo.
 const MOST_CELLS: usize = 100_000;
 
 /// The JSON Schema of a study file.
@@ -44,65 +44,65 @@ pub fn schema() -> Value {
     schemars::schema_for!(Written).to_value()
 }
 
-/// A study, checked.
+/// A validated study.
 pub struct Study {
-    /// Its file, as it was named.
+    /// Path of its file, as given.
     pub path: PathBuf,
-    /// What stands in it.
+    /// Content of its file.
     pub text: String,
-    /// Its own name.
+    /// Its name.
     pub name: String,
-    /// What it is for.
+    /// Its purpose.
     pub description: String,
     /// Scans, and volumes with a number of views, in the table's order.
     pub cases: Vec<Case>,
     /// The methods, in the table's order.
     pub methods: Vec<Method>,
-    /// Every case and method runs with each.
+    /// Every case and method runs with each seed.
     pub seeds: Vec<u64>,
-    /// What holds for every run.
+    /// Options of all runs.
     pub protocol: Protocol,
-    /// The method that the others are compared with.
+    /// The method with which the others are compared.
     pub baseline: Option<usize>,
 }
 
-/// What methods are compared on.
+/// Data for a comparison of methods.
 pub struct Case {
-    /// Its own name, which also begins those of its folders.
+    /// Its name, also the prefix of its folders.
     pub name: String,
-    /// Where its scans come from.
+    /// Source of its scans.
     pub source: Source,
-    /// What pictures show as black and as white.
+    /// Values shown as black and white in pictures.
     pub window: Option<[f32; 2]>,
 }
 
-/// Where the scans of a case come from.
+/// Source of a case's scans.
 pub enum Source {
-    /// A volume, scanned anew for each seed.
+    /// A volume, with a new simulated scan for each seed.
     Simulated(Box<Simulation>),
-    /// One that there is already.
+    /// An existing scan.
     Scan {
         /// The file or folder.
         path: PathBuf,
-        /// The volume sought.
+        /// The reference volume.
         reference: Option<PathBuf>,
     },
 }
 
-/// A run to be made: indices of a case and a method, and a seed.
+/// A planned run: indices of a case and a method, and a seed.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct Cell {
-    /// Of [`Study::cases`].
+    /// Index in [`Study::cases`].
     pub case: usize,
-    /// Of the noise and of the method's start.
+    /// Seed of the noise and of the method.
     pub seed: u64,
-    /// Of [`Study::methods`].
+    /// Index in [`Study::methods`].
     pub method: usize,
 }
 
 impl Study {
-    /// Reads and checks the study in the file `path`, whose specs are built for `backend`, or for the one that the file asks
-    /// for.
+    /// Reads and validates the study in the file `path`. Its specs are built for the default backend, or for the
+    /// file's.
     pub fn read(path: &Path) -> Result<Self> {
         let text = conefield_core::files::read_text(path, LONGEST)?;
         let written: Written = conefield_io::parse_toml(path, &text)?;
@@ -111,7 +111,7 @@ impl Study {
         Reading { path, text: &text, folder }.study(written)
     }
 
-    /// Every run, scan by scan.
+    /// All runs, scan by scan.
     pub fn cells(&self) -> Vec<Cell> {
         let mut cells = vec![];
         for case in 0..self.cases.len() {
@@ -122,7 +122,7 @@ impl Study {
         cells
     }
 
-    /// Files and folders that the study reads, its specs aside.
+    /// Input files and folders of the study, without its specs.
     pub fn inputs(&self) -> Vec<PathBuf> {
         let mut all = vec![self.path.clone()];
         for case in &self.cases {
@@ -138,11 +138,11 @@ impl Study {
     }
 }
 
-/// A study file that is being read.
+/// A study file during parsing.
 struct Reading<'a> {
     path: &'a Path,
     text: &'a str,
-    /// Where its paths begin.
+    /// The folder to which its paths are relative.
     folder: PathBuf,
 }
 
@@ -283,7 +283,7 @@ impl Reading<'_> {
     ) -> Result<Method> {
         let Entry(spec) = entry.get_ref();
         let beside = self.folder.join(&spec.spec);
-        // A name that is neither shipped nor a file is told as it was written, with the nearest that is.
+        // A name that is neither built in nor a file is reported as written, with the nearest valid one.
         let known = conefield_run::specs::names().contains(&&spec.spec[..]);
         let what = if known || !beside.is_file() { spec.spec.clone() } else { self.beside(&spec.spec) };
         let sets = [&protocol.set[..], &spec.set].concat();
@@ -292,7 +292,7 @@ impl Reading<'_> {
             .map_err(|e| self.placed(entry, "specs", e))
     }
 
-    /// The name of a case, which begins those of folders.
+    /// The name of a case, which is the prefix of folders.
     fn name<T>(&self, entry: &Spanned<Entry<T>>, given: Option<&str>, own: &str) -> Result<String> {
         let name = given.unwrap_or(own);
         method::check_name(name, &self.at(entry), "name")?;
@@ -307,7 +307,7 @@ impl Reading<'_> {
         Ok(())
     }
 
-    /// A list without anything twice; `default` where nothing is written.
+    /// A list without duplicates; `default` if it is missing.
     fn distinct<T: Ord + Clone + std::fmt::Display>(
         &self,
         key: &str,
@@ -331,24 +331,24 @@ impl Reading<'_> {
         Ok(window)
     }
 
-    /// A path of the file as everyone else may use it.
+    /// A path in the file, resolved relative to the study's folder.
     fn beside(&self, path: &str) -> String {
         self.folder.join(path).display().to_string()
     }
 
-    /// The file with the line on which something begins.
+    /// The file and the line on which something begins.
     fn at<T>(&self, what: &Spanned<T>) -> String {
         let before = &self.text.as_bytes()[..what.span().start.min(self.text.len())];
         format!("{}: line {}", self.path.display(), 1 + before.iter().filter(|b| **b == b'\n').count())
     }
 
-    /// The same error, with the line of the entry that it is about.
+    /// The same error, with the line of its entry.
     fn placed<T>(&self, entry: &Spanned<T>, key: &str, error: Error) -> Error {
         Error::unsupported(format!("{}: {key}", self.at(entry)), error.to_string())
     }
 }
 
-/// Refuses ends that exclude each other.
+/// Refuses contradictory limits.
 fn check_ends(protocol: &Protocol, at: &str) -> Result<()> {
     let Protocol { steps, seconds, at_most, budget, .. } = protocol;
     let beside = steps.is_some() || seconds.is_some() || at_most.is_some();
@@ -356,7 +356,7 @@ fn check_ends(protocol: &Protocol, at: &str) -> Result<()> {
     ensure(budget.is_none() || !beside, at, "budget", "another end beside it", expected)
 }
 
-/// What a volume is called: phantom:head:64 is head-64, and a file goes without its ends.
+/// The name of a volume: phantom:head:64 becomes head-64, and a file loses its extensions.
 fn volume_name(volume: &str) -> String {
     match volume.strip_prefix("phantom:") {
         Some(phantom) => phantom.replace(':', "-"),
@@ -396,7 +396,7 @@ mod tests {
 
     #[test]
     fn what_is_wrong_is_told_with_its_line() {
-        // Lines at the top, then the two of TINY, then tables.
+        // Lines at the top, then the two lines of TINY, then tables.
         for (top, tables, want) in [
             ("seed = [1]\n", "", "line 1: seed: found a key that is not known here, expected `seeds`"),
             ("", "[simulate]\nviews = 3\n", "line 4: views: found a key that is not known here"),

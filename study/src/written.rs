@@ -1,4 +1,4 @@
-//! A study file as it is written.
+//! A study file as written by the user.
 
 use conefield_projectors::simulate::DetectorNoise;
 use conefield_run::backend::BackendChoice;
@@ -170,7 +170,7 @@ pub struct Protocol {
 }
 
 impl Protocol {
-    /// In words, but for the reference.
+    /// Text for people, without the reference.
     pub fn words(&self) -> Vec<String> {
         use conefield_report::text::{duration, number};
         let mut words: Vec<String> = vec![];
@@ -184,13 +184,13 @@ impl Protocol {
     }
 }
 
-/// A table, or a string for a table with only its first key.
+/// A table, or a string as a short form for a table with only its first key.
 #[derive(Debug)]
 pub struct Entry<T>(pub T);
 
-/// The meaning of a string.
+/// Conversion from the short form.
 pub trait Named {
-    /// The table with this as its first key.
+    /// The table whose first key is `name`.
     fn named(name: String) -> Self;
 }
 
@@ -268,7 +268,7 @@ impl<'de> Deserialize<'de> for Text {
     }
 }
 
-/// A value, written as on the command line.
+/// Parses a value in the notation of the command line.
 fn said<'de, D: Deserializer<'de>, T>(
     from: D,
     parse: impl Fn(&str) -> Result<T, String>,

@@ -1,5 +1,5 @@
-//! What the parts of a run take on this machine, measured for a second or a few: real training steps on some views of the
-//! scan, or real passes over a coarser one, and what comes after the training.
+//! Measures the duration of a run's parts on this machine in a second or a few: real training steps on some views of
+//! the scan, or real passes over a coarser scan, and the work after training.
 
 use conefield_core::backend::Backend;
 use conefield_core::geometry::VoxelGrid;
@@ -12,74 +12,77 @@ use ndarray::{Array3, s};
 use serde::Serialize;
 use std::time::Instant;
 
-/// Views that training steps are measured on; a step takes as long on few as on many.
+/// Views for measuring training steps, whose duration does not depend on the number of views.
 const VIEWS: usize = 8;
-/// Voxels that evaluating and packing are measured on.
+/// Voxels for measuring evaluation and compression.
 const VOXELS: usize = 1 << 18;
-/// Longest side of the part of the reference that scoring is measured on.
+/// Longest side of the part of the reference on which scoring is measured.
 const SCORED: usize = 128;
-/// Bytes a second that files grow by, once packed: of a slow disk, as a run syncs what it writes.
+/// Write speed of a slow disk, in compressed bytes per second, as a run syncs its output.
 const DISK: f64 = 2e8;
-/// How many times as large pixels and voxels are at first, and how many there are at least along a side.
+/// First coarsening factor of pixels and voxels, and their minimum number per side.
 const COARSEST: usize = 8;
 const FEWEST: usize = 8;
-/// How many times as long half as coarse takes: eight times the work, of which small scans have little.
+/// Expected growth of the duration when the coarsening factor is halved: eight times the work, which matters less for
+/// small scans.
 const GROWTH: f64 = 5.0;
 
-/// What is measured on.
+/// Inputs of the measurements.
 pub struct Bench<'a> {
-    /// The scan to be reconstructed.
+    /// The scan to reconstruct.
     pub scan: &'a Scan,
-    /// What the result will be compared with.
+    /// The reference volume, if there is one.
     pub reference: Option<&'a Volume>,
-    /// The data range of that comparison.
+    /// The data range of the scores.
     pub peak: f64,
-    /// Where it is computed.
+    /// The backend.
     pub backend: &'a dyn Backend,
-    /// Seed of everything random.
+    /// Seed of all randomness.
     pub seed: u64,
-    /// The volume that a method names, to start from.
+    /// Reads the start volume that a method names.
     pub volumes: &'a dyn Fn(&str) -> Result<Volume>,
-    /// Whether to end after the step under way.
+    /// Whether to end after the current step.
     pub cancelled: &'a dyn Fn() -> bool,
 }
 
-/// Seconds that the parts of a run take here.
+/// Durations of a run's parts on this machine, in seconds.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Serialize)]
 pub struct Costs {
-    /// Before the first step.
+    /// Time before the first step.
     pub prepare_s: f64,
-    /// A step or pass.
+    /// Time of a step or pass.
     pub step_s: f64,
-    /// All that a solver would do that goes on after the training.
+    /// Time of the solvers after training, if they make all their steps.
     pub then_s: f64,
-    /// The least of it that makes sense.
+    /// Their minimum useful time.
     pub then_least_s: f64,
     /// Steps and passes of the methods after the first.
     pub then_steps: f64,
-    /// Writing weights, and evaluating, packing and writing voxels.
+    /// Time for writing weights and for evaluating, compressing and writing voxels.
     pub export_s: f64,
-    /// Drawing slices.
+    /// Time for drawing slices.
     pub picture_s: f64,
-    /// Comparing with the reference.
+    /// Time for comparing with the reference.
     pub score_s: f64,
 }
 
 impl Costs {
-    /// What comes after the training.
+    /// Time after training.
     pub fn after_s(&self) -> f64 {
         self.then_s + self.export_s + self.picture_s + self.score_s
     }
 
-    /// Seconds of a run that has read its scan. All its methods together have `steps`; the first one takes `share` of its own.
+    /// Duration of a run without reading the scan. All its methods together make `steps`; the first one makes
+    /// the share `share` of its own.
     pub fn run_s(&self, steps: f64, share: f64) -> f64 {
         self.prepare_s + share * (steps - self.then_steps).max(1.0) * self.step_s + self.after_s()
     }
 }
 
-/// Measures what a plan takes, in about `seconds`.
+/// Measures the costs of a plan in about `seconds`.
 pub fn calibrate(bench: &Bench<'_>, plan: &mut dyn Plan, seconds: f64) -> Result<Costs> {
-    // Passes have all of it: one coarse scan alone cannot tell what goes with the work, and they would seem three times too dear.
+    // Passes get all of it: a single coarse scan cannot separate proportional from constant costs, and passes would
+    // seem three times as expensive.
     let begins = |plan: &mut dyn Plan, share: f64| match plan.pipeline() {
         Some(_) => field(bench, plan, share * seconds),
         None => voxels(bench, plan, seconds),
@@ -90,7 +93,7 @@ pub fn calibrate(bench: &Bench<'_>, plan: &mut dyn Plan, seconds: f64) -> Result
             let mut costs = begins(first.as_mut(), 0.25)?;
             for link in later {
                 let next = voxels(bench, link.as_mut(), seconds)?;
-                // The voxels that it starts from are evaluated first.
+                // Its start volume must be evaluated first.
                 let before = costs.export_s + next.prepare_s;
                 let passes = link.passes().unwrap_or(1) as f64;
                 costs.then_s += before + passes * next.step_s;
@@ -104,7 +107,7 @@ pub fn calibrate(bench: &Bench<'_>, plan: &mut dyn Plan, seconds: f64) -> Result
     Ok(Costs { picture_s: picture(bench)?, score_s: score(bench)?, ..solved })
 }
 
-/// Steps on some of the views, then some layers of the field.
+/// Measures steps on some of the views, then evaluation of some layers of the field.
 fn field(bench: &Bench<'_>, plan: &mut dyn Plan, seconds: f64) -> Result<Costs> {
     let n = bench.scan.geometry.views.len();
     let every = n.div_ceil(VIEWS);
@@ -114,7 +117,7 @@ fn field(bench: &Bench<'_>, plan: &mut dyn Plan, seconds: f64) -> Result<Costs> 
     let limits = Limits { at_most: Some(seconds), ..Limits::default() };
     let begin = Instant::now();
     let solution = plan.run(&job(bench, &scan, limits), &mut laps)?;
-    // What comes before the first step goes through all pixels of all views.
+    // The work before the first step visits all pixels of all views.
     let fewer = n as f64 / scan.geometry.views.len() as f64;
     let prepare_s = fewer * (begin.elapsed().as_secs_f64() - solution.train_s).max(0.0);
     let step_s = laps.typical().unwrap_or(solution.train_s / solution.steps.max(1) as f64);
@@ -128,8 +131,8 @@ fn field(bench: &Bench<'_>, plan: &mut dyn Plan, seconds: f64) -> Result<Costs> 
     Ok(Costs { prepare_s, step_s, export_s, ..Costs::default() })
 }
 
-/// Two passes on a coarser detector and volume, then on a finer one while time lets: all views and all that is done with them
-/// stay in proportion.
+/// Measures two passes on a coarser detector and volume, then on finer ones while time permits: all views, so that
+/// they and the work on them stay in proportion.
 fn voxels(bench: &Bench<'_>, plan: &mut dyn Plan, seconds: f64) -> Result<Costs> {
     let mut factor = COARSEST;
     let mut coarser = None;
@@ -139,7 +142,7 @@ fn voxels(bench: &Bench<'_>, plan: &mut dyn Plan, seconds: f64) -> Result<Costs>
         let mut laps = Laps::new(bench.cancelled);
         let limits = Limits { steps: Some(2), ..Limits::default() };
         let begin = Instant::now();
-        // A volume to start from takes as long as an empty one.
+        // A start volume costs as much as an empty one.
         let grid = scan.geometry.volume;
         let empty = Volume { data: Array3::zeros(grid.shape), grid, affine: None };
         let solution = plan.run(&Job { start: Some(&empty), ..job(bench, &scan, limits) }, &mut laps)?;
@@ -161,7 +164,7 @@ fn voxels(bench: &Bench<'_>, plan: &mut dyn Plan, seconds: f64) -> Result<Costs>
     }
 }
 
-/// What passes took of a scan with a share of the work.
+/// Measured durations of passes on a scan with a share of the work.
 #[derive(Clone, Copy)]
 struct Passes {
     share: f64,
@@ -170,7 +173,7 @@ struct Passes {
 }
 
 impl Passes {
-    /// What they take of all of it: two shares tell what goes with the work from what does not.
+    /// Durations for all of the work: two shares separate proportional from constant costs.
     fn whole(self, coarser: Option<Self>) -> Self {
         let scaled = |of: fn(&Self) -> f64| match &coarser {
             Some(less) if less.share < self.share => {
@@ -187,7 +190,7 @@ fn job<'a>(bench: &'a Bench<'_>, scan: &'a Scan, limits: Limits) -> Job<'a> {
     Job { seed: bench.seed, limits, volumes: bench.volumes, ..Job::new(scan, bench.backend) }
 }
 
-/// The same scan with pixels and voxels `factor` times as large, as far as that leaves some.
+/// The scan with pixels and voxels `factor` times as large, as far as some remain.
 fn coarse(scan: &Scan, factor: usize) -> Scan {
     let ([rows, columns], volume) = (scan.geometry.detector, scan.geometry.volume);
     let longest = volume.shape.into_iter().max().unwrap_or(1);
@@ -198,7 +201,7 @@ fn coarse(scan: &Scan, factor: usize) -> Scan {
     coarse
 }
 
-/// The same box in fewer layers along z: at most about so many voxels.
+/// The same box with fewer layers along z: at most about `voxels` voxels.
 fn layers(grid: VoxelGrid, voxels: usize) -> VoxelGrid {
     let [x, y, z] = grid.shape;
     let fewer = (voxels / (x * y).max(1)).clamp(1, z);
@@ -206,7 +209,7 @@ fn layers(grid: VoxelGrid, voxels: usize) -> VoxelGrid {
     VoxelGrid { shape: [x, y, fewer], spacing, ..grid }
 }
 
-/// Seconds of making, packing and writing all voxels of `whole`, by those of `some`.
+/// Time for computing, compressing and writing all voxels of `whole`, extrapolated from `some`.
 fn packing(some: &mut dyn Voxels, whole: VoxelGrid) -> Result<f64> {
     let count = |g: VoxelGrid| g.len().unwrap_or(usize::MAX) as f64;
     let larger = count(whole) / count(some.grid()).max(1.0);
@@ -226,7 +229,7 @@ fn picture(bench: &Bench<'_>) -> Result<f64> {
 
 fn score(bench: &Bench<'_>) -> Result<f64> {
     let Some(reference) = bench.reference else { return Ok(0.0) };
-    // The middle of it: half of every side, unless that is little or much.
+    // The middle part: half of every side, within limits.
     let [x, y, z] = reference.grid.shape.map(|n| {
         let part = (n / 2).clamp(32.min(n), SCORED);
         (n - part) / 2..(n - part) / 2 + part
@@ -238,7 +241,7 @@ fn score(bench: &Bench<'_>) -> Result<f64> {
     Ok(begin.elapsed().as_secs_f64() / share)
 }
 
-/// When each step was done first.
+/// The time at which each step was first completed.
 struct Laps<'a> {
     steps: u64,
     done: Vec<Instant>,
@@ -260,7 +263,7 @@ impl<'a> Laps<'a> {
 }
 
 impl Observer for Laps<'_> {
-    /// A solver that is over says so of its last step once more.
+    /// A finished solver reports its last step once more.
     fn progress(&mut self, step: u64, _: f64, _: f64) {
         if step > self.steps {
             self.steps = step;
@@ -302,14 +305,14 @@ mod tests {
 
     #[test]
     fn what_does_not_go_with_the_work_is_told_from_what_does() {
-        // 0.05 s whatever the work, and 6 s of all of it; passes take 3 s.
+        // 0.05 s whatever the work, and 6 s for all of it; passes take 3 s.
         let of = |share: f64| Passes { share, prepare_s: 0.05 + 6.0 * share, step_s: 3.0 * share };
         let whole = of(1.0 / 64.0).whole(Some(of(1.0 / 512.0)));
         assert!((whole.prepare_s - 6.05).abs() < 1e-9 && (whole.step_s - 3.0).abs() < 1e-9);
-        // One share alone cannot tell, nor can two that are the same.
+        // A single share cannot separate the costs, nor can two equal ones.
         assert_eq!(of(0.5).whole(None).prepare_s, 6.1);
         assert_eq!(of(0.5).whole(Some(of(0.5))).prepare_s, 6.1);
-        // Never less than what was seen.
+        // Never less than measured.
         let odd = Passes { prepare_s: 0.01, ..of(0.5) }.whole(Some(of(0.1)));
         assert_eq!(odd.prepare_s, 0.01);
     }

@@ -1,5 +1,5 @@
-//! A front file: methods none of which is beaten in time, memory and accuracy, with cost and accuracy on
-//! tuning scans. `conefield tradeoff` makes it, `conefield reconstruct --budget` picks from it.
+//! A front file: Pareto-optimal methods in time, memory and accuracy, with their cost and accuracy on tuning scans.
+//! `conefield tradeoff` creates it, `conefield reconstruct --budget` selects from it.
 
 use crate::statistics::mean;
 use conefield_core::error::{Error, Result, ensure};
@@ -11,10 +11,10 @@ use std::path::Path;
 
 /// Longest front file, in bytes.
 const LONGEST: u64 = 4 << 20;
-/// How many times as far in size as the nearest scan one may be to count as near.
+/// A scan counts as near if its size ratio is at most this many times that of the nearest scan.
 const NEAR: f64 = 2.0;
 
-/// What a method works on. The two are searched apart: fields need longer before they show what they can.
+/// The unknowns of a method. The two kinds are searched separately: fields need longer before they show their quality.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Serialize, Deserialize)]
 #[serde(rename_all = "kebab-case")]
 pub enum Unknowns {
@@ -25,12 +25,12 @@ pub enum Unknowns {
 }
 
 impl Unknowns {
-    /// Of a method; of a chain, what its first method solves for.
+    /// The unknowns of a method; for a chain, of its first method.
     pub fn of(plan: &dyn Plan) -> Self {
         if plan.pipeline().is_some() { Self::Field } else { Self::Voxels }
     }
 
-    /// What its steps are called.
+    /// The name of its steps.
     pub fn steps(self) -> &'static str {
         match self {
             Self::Field => "steps",
@@ -43,44 +43,44 @@ impl Unknowns {
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct Front {
-    /// By which program, in how many threads.
+    /// Program and number of threads with which it was made.
     pub made: String,
-    /// The scans that it was measured on.
+    /// The scans on which it was measured.
     pub scans: Vec<Tuned>,
     /// Its points.
     pub points: Vec<Point>,
 }
 
-/// A scan that a front was measured on.
+/// A scan on which a front was measured.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct Tuned {
     /// The name of its file or folder.
     pub name: String,
-    /// How many views it has.
+    /// Number of views.
     pub views: usize,
-    /// Rows and columns of its detector.
+    /// Rows and columns of the detector.
     pub detector: [usize; 2],
-    /// Voxels that it asks for.
+    /// Shape of the volume.
     pub volume: [usize; 3],
 }
 
-/// A method with what it took and reached.
+/// A method with its cost and accuracy.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct Point {
-    /// Its own name.
+    /// Its name.
     pub name: String,
-    /// What it solves for.
+    /// Its unknowns.
     pub kind: Unknowns,
-    /// The spec that it starts from.
+    /// The base spec.
     pub spec: String,
-    /// What is changed of the spec, as `--set` has it.
+    /// Changes to the spec, as in `--set`.
     #[serde(default)]
     pub sets: Vec<String>,
-    /// The budget that it was measured under.
+    /// The budget of the measurement.
     pub budget_s: f64,
-    /// One for each of the front's scans, in their order.
+    /// One run per scan of the front, in the same order.
     pub runs: Vec<Reached>,
 }
 
@@ -88,61 +88,61 @@ pub struct Point {
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct Reached {
-    /// Its cost in its own steps or passes: with the seconds of one, measured anew on any machine, its time there.
+    /// Its cost in steps or passes: times the duration of one, as measured on any machine, it gives the time there.
     pub steps: u64,
-    /// Seconds of them all.
+    /// Time for all steps in seconds.
     pub train_s: f64,
-    /// Seconds of the whole run.
+    /// Time of the whole run in seconds.
     pub total_s: f64,
-    /// The most memory that it held.
+    /// Peak memory.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub peak_bytes: Option<u64>,
-    /// dB, where the reference was known.
+    /// PSNR in dB, if there was a reference.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub psnr: Option<f64>,
-    /// SSIM slice by slice, where the reference was known.
+    /// Mean SSIM over slices, if there was a reference.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub ssim_2d: Option<f64>,
-    /// Error of held-out views, over the largest line integral.
+    /// Error of held-out views, relative to the largest line integral.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub held_out: Option<f64>,
 }
 
-/// How large a scan is.
+/// Size of a scan.
 #[derive(Debug, Clone, Copy)]
 pub struct Size {
-    /// Of all views together.
+    /// Pixels of all views.
     pub pixels: f64,
-    /// Of the volume.
+    /// Voxels of the volume.
     pub voxels: f64,
 }
 
 impl Size {
-    /// Of so many views of a detector of these rows and columns, and a volume of this shape.
+    /// The size for this many views of a detector with these rows and columns, and a volume of this shape.
     pub fn new(views: usize, detector: [usize; 2], volume: [usize; 3]) -> Self {
         let product = |n: &[usize]| n.iter().map(|n| *n as f64).product();
         Self { pixels: views as f64 * product(&detector), voxels: product(&volume) }
     }
 
-    /// What projecting it costs: every pixel's ray goes through the volume.
+    /// The relative cost of a projection: every pixel's ray traverses the volume.
     fn projecting(self) -> f64 {
         self.pixels * self.voxels.cbrt()
     }
 }
 
-/// What a point would take of a scan on the machine that the front was made on.
+/// Expected cost of a point for a scan, on the machine of the front.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Expected {
     /// Steps or passes.
     pub steps: f64,
-    /// Seconds of one.
+    /// Seconds per step or pass.
     pub step_s: f64,
-    /// Seconds of all else.
+    /// Seconds of everything else.
     pub beside_s: f64,
 }
 
 impl Front {
-    /// The shipped one.
+    /// The built-in front.
     pub fn shipped() -> Result<Self> {
         Self::parse(FRONT, "front.toml (shipped)")
     }
@@ -178,7 +178,7 @@ impl Front {
         Ok(front)
     }
 
-    /// The front of those of its scans whose volumes are nearest in size to a scan's: what is best depends on that.
+    /// The front restricted to the scans whose volumes are closest in size, because the best methods depend on it.
     pub fn near(&self, size: Size) -> Self {
         let apart = |scan: &Tuned| (Size::new(scan.views, scan.detector, scan.volume).voxels / size.voxels).ln().abs();
         let least = self.scans.iter().map(apart).fold(f64::INFINITY, f64::min);
@@ -192,7 +192,7 @@ impl Front {
         near
     }
 
-    /// What `point` is expected to take of a scan of this size. A step of a field costs the same whatever the scan.
+    /// The expected cost of `point` for a scan of this size. A step of a field costs the same for every scan.
     pub fn expected(&self, point: &Point, size: Size) -> Expected {
         let mut sum = Expected { steps: 0.0, step_s: 0.0, beside_s: 0.0 };
         let n = point.runs.len() as f64;
@@ -211,14 +211,13 @@ impl Front {
 }
 
 impl Point {
-    /// What it reached, higher is better: the mean PSNR in dB, or where that is not known the error of views that were
-    /// kept aside with its sign turned.
+    /// Accuracy, higher is better: the mean PSNR in dB or, without a reference, the negative error of held-out views.
     pub fn accuracy(&self) -> f64 {
         let mean = |of: fn(&Reached) -> Option<f64>| mean(self.runs.iter().map(of));
         mean(|r| r.psnr).or_else(|| mean(|r| r.held_out).map(|e| -e)).unwrap_or(f64::NEG_INFINITY)
     }
 
-    /// What it reached, in words.
+    /// Its results, in words.
     pub fn told(&self, front: &Front) -> String {
         let one = |(run, scan): (&Reached, &Tuned)| match (run.psnr, run.held_out) {
             (Some(psnr), _) => format!("{psnr:.2} dB on {}", scan.name),

@@ -1,26 +1,26 @@
-//! Successive halving (Jamieson and Talwalkar, AISTATS 2016): many candidates get little time, the best share of them
-//! more. Fields and methods on voxels are ranked apart.
+//! Successive halving (Jamieson and Talwalkar, AISTATS 2016): many candidates get a small budget, the best share of
+//! them a larger one. Fields and voxel methods are ranked separately.
 
 use crate::front::Unknowns;
 
-/// What a candidate came to under a budget.
+/// The result of a candidate under a budget.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub enum TrialOutcome {
-    /// Higher is better.
+    /// Accuracy; higher is better.
     Accuracy(f64),
-    /// The budget was too short to do anything: that says nothing of the candidate.
+    /// The budget was too short to do anything, which says nothing about the candidate.
     TooShort,
     /// It failed.
     Failed,
 }
 
-/// How many of `n` go on: the share `keep`, at least one.
+/// Number of candidates out of `n` to keep: the share `keep`, at least one.
 pub fn kept(n: usize, keep: f64) -> usize {
     ((n as f64 * keep - 1e-9).ceil() as usize).clamp(n.min(1), n)
 }
 
-/// Which go on to the next budget, in the order given: of each kind the best share of those that were judged, and all
-/// that could not be.
+/// Indices of the candidates to keep for the next budget, in the given order: for each kind the best share of the
+/// ranked ones, and all that could not be ranked.
 pub fn go_on(tried: &[(Unknowns, TrialOutcome)], keep: f64) -> Vec<usize> {
     let mut all = vec![];
     for kind in [Unknowns::Field, Unknowns::Voxels] {
@@ -35,7 +35,7 @@ pub fn go_on(tried: &[(Unknowns, TrialOutcome)], keep: f64) -> Vec<usize> {
                 _ => {}
             }
         }
-        // Of equals the first stays first.
+        // Stable: of equal candidates the first stays first.
         ranked.sort_by(|a, b| b.1.total_cmp(&a.1));
         all.extend(ranked.iter().take(kept(judged, keep)).map(|(i, _)| *i));
     }
@@ -43,7 +43,7 @@ pub fn go_on(tried: &[(Unknowns, TrialOutcome)], keep: f64) -> Vec<usize> {
     all
 }
 
-/// How many trials are still to come at each of `rungs` budgets at most, if these candidates go on from here.
+/// Upper bounds for the remaining number of trials at each of `rungs` budgets, for these numbers of candidates.
 pub fn to_come(fields: usize, voxels: usize, rungs: usize, keep: f64) -> Vec<usize> {
     let next = |n: &[usize; 2]| Some(n.map(|n| kept(n, keep)));
     std::iter::successors(Some([fields, voxels]), next).map(|n| n.iter().sum()).take(rungs).collect()

@@ -1,19 +1,19 @@
-//! JSON as this program writes and reads it.
+//! JSON of this program's files.
 
 use conefield_core::{Error, Result};
 use serde::Serialize;
 use serde::de::DeserializeOwned;
 use std::path::Path;
 
-/// Longest record, table or spec that is read back, in bytes.
+/// Longest record, table or spec to read, in bytes.
 pub const LONGEST: u64 = 16 << 20;
 
-/// `value` as JSON for people to read, too.
+/// `value` as pretty-printed JSON.
 pub fn to_json(value: &impl Serialize) -> Result<String> {
     serde_json::to_string_pretty(value).map_err(|e| Error::unsupported("writing JSON", e.to_string()))
 }
 
-/// Reads what this program wrote.
+/// Reads JSON written by this program.
 pub fn read_json<T: DeserializeOwned>(path: &Path) -> Result<T> {
     let text = conefield_core::files::read_text(path, LONGEST)?;
     let expected = "the content that conefield writes; --force starts over";

@@ -1,5 +1,5 @@
-//! The settings to vary, and the candidates: every base unchanged, and seeded draws from the product of
-//! its levers' values.
+//! The settings to vary, and the candidates: every base unchanged, and random draws from the product of its levers'
+//! values.
 
 use crate::front::Unknowns;
 use conefield_core::error::{Error, Result, ensure};
@@ -15,7 +15,7 @@ use std::path::Path;
 
 /// Longest levers file, in bytes.
 const LONGEST: u64 = 1 << 20;
-/// Draws for one that is new, before the product counts as used up.
+/// Attempts to draw a new combination before the product counts as exhausted.
 const TRIES: u64 = 200;
 
 /// A levers file.
@@ -34,67 +34,67 @@ struct WrittenBase {
     levers: toml::Table,
 }
 
-/// Where specs come from.
+/// Source of specs.
 pub trait Specs {
-    /// Whether a spec of this name is shipped.
+    /// Whether there is a built-in spec of this name.
     fn is_shipped(&self, name: &str) -> bool;
-    /// Reads the spec `what`, the name of a shipped one or a file, with `sets` on top.
+    /// Reads the spec `what`, built in or a file, with overriding settings `sets`.
     fn read(&self, what: &str, sets: &[String]) -> Result<Loaded>;
-    /// Builds a spec for trial, without reading the files that it names.
+    /// Test-builds a spec without reading the files it names.
     fn build(&self, loaded: &Loaded) -> Result<Box<dyn Plan>>;
 }
 
-/// Bases with their levers.
+/// Base specs with their levers.
 pub struct Levers<'a> {
     specs: &'a dyn Specs,
     bases: Vec<Base>,
 }
 
-/// A spec and what may be changed of it.
+/// A base spec and its levers.
 struct Base {
     name: String,
-    /// As `--spec` has it.
+    /// Value of `--spec`.
     spec: String,
     kind: Unknowns,
-    /// The spec without its name and description, to tell whether two are the same.
+    /// The spec without name and description, for comparisons.
     tree: Value,
     levers: Vec<Lever>,
 }
 
-/// A key of a spec and the values that it may take.
+/// A key of a spec and its possible values.
 struct Lever {
     key: String,
     values: Vec<toml::Value>,
 }
 
-/// A method to be tried.
+/// A method to try.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct Candidate {
-    /// Its own name.
+    /// Its name.
     pub name: String,
-    /// The name of the base that it comes from.
+    /// The name of its base spec.
     pub base: String,
-    /// As `--spec` has it.
+    /// Value of `--spec`.
     pub spec: String,
-    /// What `--set` changes of it.
+    /// Values of `--set`.
     pub sets: Vec<String>,
-    /// What it solves for.
+    /// Its unknowns.
     pub kind: Unknowns,
 }
 
 impl<'a> Levers<'a> {
-    /// The shipped ones.
+    /// The built-in levers.
     pub fn shipped(specs: &'a dyn Specs) -> Result<Self> {
         Self::parse(LEVERS, "levers.toml (shipped)", Path::new(""), specs)
     }
 
-    /// Reads a levers file. Specs that it names are shipped ones or files beside it.
+    /// Reads a levers file. Its specs are built in, or files next to it.
     pub fn read(path: &Path, specs: &'a dyn Specs) -> Result<Self> {
         let text = conefield_core::files::read_text(path, LONGEST)?;
         Self::parse(&text, &path.display().to_string(), path.parent().unwrap_or(Path::new("")), specs)
     }
 
-    /// Reads what a levers file in `folder` says; `place` is what errors call it.
+    /// Parses a levers file in `folder`; errors name `place`.
     pub fn parse(text: &str, place: &str, folder: &Path, specs: &'a dyn Specs) -> Result<Self> {
         let written: Written = toml::from_str(text).map_err(|e| {
             let line = toml_line(text, &e).unwrap_or(1);
@@ -114,7 +114,7 @@ impl<'a> Levers<'a> {
         Ok(Self { specs, bases })
     }
 
-    /// Only the bases with these names; all where none is named.
+    /// Keeps only the bases with these names; all if there are none.
     pub fn only(mut self, names: &[String]) -> Result<Self> {
         let all: Vec<&str> = self.bases.iter().map(|b| &b.name[..]).collect();
         if let Some(name) = names.iter().find(|n| !all.contains(&&n[..])) {
@@ -125,7 +125,7 @@ impl<'a> Levers<'a> {
         Ok(self)
     }
 
-    /// `count` candidates: every base, then a draw of each in turn. There are fewer where the products are used up.
+    /// `count` candidates: every base, then draws from each in turn. There are fewer if the products are exhausted.
     pub fn candidates(&self, count: usize, seed: u64) -> Result<Vec<Candidate>> {
         let least = self.bases.len();
         ensure(count >= least, "tradeoff", "--candidates", count, format!("at least {least}, one for each base"))?;
@@ -141,11 +141,11 @@ impl<'a> Levers<'a> {
                 for _ in 0..TRIES {
                     let sets = base.draw(seed ^ mix(*b as u64, *draws));
                     *draws += 1;
-                    // Values that each fit may still not fit together: such a draw is none.
+                    // Values that are valid by themselves may not fit together: such a draw is skipped.
                     let Some(tree) = base.built(&sets, self.specs).ok().map(|(tree, _)| tree) else { continue };
                     if !seen.contains(&tree) {
                         seen.push(tree);
-                        // A base of the user's may be called what a draw would be.
+                        // A user's base may have the name that a draw would get.
                         let candidate = loop {
                             *made += 1;
                             let candidate = base.candidate(*made, sets.clone());
@@ -200,13 +200,13 @@ impl Base {
         Ok(base)
     }
 
-    /// One value of every lever.
+    /// Draws one value of every lever.
     fn draw(&self, seed: u64) -> Vec<String> {
         let draw = |(i, l): (usize, &Lever)| set(l, &l.values[(mix(seed, i as u64) % l.values.len() as u64) as usize]);
         self.levers.iter().enumerate().map(draw).collect()
     }
 
-    /// The base with `sets`, built for trial.
+    /// Test-builds the base with `sets`.
     fn built(&self, sets: &[String], specs: &dyn Specs) -> Result<(Value, Unknowns)> {
         let loaded = specs.read(&self.spec, sets)?;
         let plan = specs.build(&loaded)?;
@@ -223,12 +223,12 @@ impl Base {
     }
 }
 
-/// `key=value` as `--set` has it.
+/// `key=value`, as in `--set`.
 fn set(lever: &Lever, value: &toml::Value) -> String {
     format!("{}={value}", lever.key)
 }
 
-/// Goes through `"encoder.levels" = [..]`, `encoder.levels = [..]` and `[encoder] levels = [..]` alike.
+/// Treats `"encoder.levels" = [..]`, `encoder.levels = [..]` and `[encoder] levels = [..]` alike.
 fn flatten(above: &str, table: toml::Table, each: &mut impl FnMut(String, toml::Value) -> Result<()>) -> Result<()> {
     for (key, value) in table {
         let path = if above.is_empty() { key } else { format!("{above}.{key}") };

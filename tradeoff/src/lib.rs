@@ -1,15 +1,15 @@
-//! What time and memory buy: planning a run for the time there is, and searching for the methods that make the most of
-//! it.
+//! The trade-off between time, memory and accuracy: planning a run for the available time, and searching for the best
+//! methods.
 //!
-//! - [`front`]: methods of which none is beaten, with what they took and reached; [`calibrate`] measures what one takes on
-//!   this machine, and [`schedule`] chooses one and says when its training must end, so that the whole command takes the
-//!   time that it has.
-//! - [`levers`]: what may be turned, and the candidates that come of it; [`search`] tries them by [`halving`], a [`trial`]
-//!   is a whole run, and [`report`] has the result: the front by [`pareto`].
-//! - [`statistics`] and [`json`] serve the others.
+//! - [`front`]: Pareto-optimal methods with their cost and accuracy; [`calibrate`] measures the cost of a method on
+//!   this machine; [`schedule`] chooses a method and sets the end of its training, so that the whole command stays
+//!   within its time.
+//! - [`levers`]: the settings to vary, and the resulting candidates; [`search`] tries them by [`halving`]; a [`trial`]
+//!   is a whole run; [`report`] writes the result: the front from [`pareto`].
+//! - [`statistics`] and [`json`] are helpers.
 //!
-//! What goes on here knows neither a command line nor how a run is started: the caller brings the specs, runs the trials
-//! and says when to end.
+//! This crate knows neither the command line nor how to start a run: the caller supplies the specs, runs the trials and
+//! decides when to end.
 
 pub mod calibrate;
 pub mod front;

@@ -1,27 +1,27 @@
-//! Which of many are beaten by none in time, memory and accuracy together.
+//! Pareto optimality in time, memory and accuracy.
 
-/// What something takes and reaches.
+/// Cost and accuracy of a run.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Performance {
-    /// Fewer is better.
+    /// Time; lower is better.
     pub seconds: f64,
-    /// Fewer is better.
+    /// Memory; lower is better.
     pub bytes: f64,
-    /// More is better.
+    /// Accuracy; higher is better.
     pub accuracy: f64,
 }
 
-/// Times and sizes that differ by less than about this share count as equal: a repetition would differ by as much.
+/// Times and sizes within about this share of each other count as equal: repeated runs differ by as much.
 const GRAIN: f64 = 0.1;
 
 impl Performance {
-    /// Time and memory in grains.
+    /// Time and memory in units of the grain.
     fn coarse(&self) -> [f64; 2] {
         [self.seconds, self.bytes].map(|x| (x.max(1e-9).ln() / (1.0 + GRAIN).ln()).round())
     }
 
-    /// Whether it is at least as good in everything and better in something. What counts as equal in time and memory is
-    /// decided by accuracy, then by the figures themselves.
+    /// Whether it is at least as good in everything and better in something. If time and memory count as equal,
+    /// accuracy decides, then the exact figures.
     pub fn beats(&self, other: &Self) -> bool {
         let (a, b) = (self.coarse(), other.coarse());
         let fine = |s: &Self| [s.seconds, s.bytes];
@@ -33,7 +33,7 @@ impl Performance {
     }
 }
 
-/// The indices of those that no other one beats, by rising time.
+/// The indices of those that no other beats, by ascending time.
 pub fn front(all: &[Performance]) -> Vec<usize> {
     let good = |s: &Performance| s.seconds.is_finite() && s.bytes.is_finite() && !s.accuracy.is_nan();
     let free = |i: &usize| good(&all[*i]) && !all.iter().any(|o| good(o) && o.beats(&all[*i]));
@@ -56,7 +56,7 @@ mod tests {
         prop::collection::vec(one, 0..60)
     }
 
-    /// In the plain sense, without grains.
+    /// Plain dominance, without grains.
     fn dominates(a: &Performance, b: &Performance) -> bool {
         let no_worse = a.seconds <= b.seconds && a.bytes <= b.bytes && a.accuracy >= b.accuracy;
         no_worse && a != b

@@ -1,4 +1,5 @@
-//! What a search came to: the front as table, figure and JSON, its specs, and how well held-out views rank.
+//! The result of a search: the front as table, figure and JSON, its specs, and the quality of ranking by held-out
+//! views.
 
 use crate::front::{Front, Point, Reached, Tuned, Unknowns};
 use crate::json::to_json;
@@ -16,25 +17,25 @@ use serde_json::Value;
 use std::fs;
 use std::path::Path;
 
-/// All that `tradeoff.json` says.
+/// The content of `tradeoff.json`.
 #[derive(Serialize)]
 pub struct TradeoffReport {
     search: Search,
     rungs: Vec<Rung>,
     trials: Vec<Over>,
-    /// How well the held-out error ranks methods, where a reference tells.
+    /// How well the held-out error ranks methods, if there is a reference.
     ranking: Vec<Ranking>,
-    /// Every candidate that was done on all scans, under every budget.
+    /// Every candidate that ran on all scans, under every budget.
     points: Vec<Mean>,
-    /// Names of those that none beats; the same among fields alone and among methods on voxels alone.
+    /// Names on the overall front, on the front of fields, and on the front of voxel methods.
     front: Vec<String>,
     front_of_fields: Vec<String>,
     front_of_voxels: Vec<String>,
     best: Vec<Best>,
 }
 
-/// Spearman's rank correlation of the error of held-out views with PSNR, its sign turned: 1 where both put all trials of a
-/// budget into the same order.
+/// Spearman's rank correlation of the negative error of held-out views with PSNR: 1 if both order all trials of a
+/// budget in the same way.
 #[derive(Serialize)]
 struct Ranking {
     budget_s: f64,
@@ -43,7 +44,7 @@ struct Ranking {
     spearman: Option<f64>,
 }
 
-/// A candidate under a budget: means over the scans, of memory the most.
+/// A candidate under a budget: means over the scans, and peak memory.
 #[derive(Serialize)]
 struct Mean {
     name: String,
@@ -63,7 +64,7 @@ struct Mean {
     runs: Vec<Figures>,
 }
 
-/// The most accurate of a kind under a budget.
+/// The most accurate candidate of a kind under a budget.
 #[derive(Serialize)]
 struct Best {
     budget_s: f64,
@@ -72,7 +73,7 @@ struct Best {
 }
 
 impl TradeoffReport {
-    /// What comes of the trials; without a result of any there is nothing to tell.
+    /// The report on the trials; an error if none has a result.
     pub fn new(search: Search, rungs: Vec<Rung>, trials: Vec<Over>) -> Result<Self> {
         let points = points(&search, &trials);
         if points.is_empty() {
@@ -107,8 +108,7 @@ impl TradeoffReport {
         })
     }
 
-    /// Writes everything but the trials themselves. The state comes last: as long as it lacks a front, `--resume` makes
-    /// one.
+    /// Writes everything except the trials. The state is written last: while it has no front, `--resume` creates one.
     pub fn write(&self, folder: &Path, specs: &dyn Specs) -> Result<()> {
         let [state, table, figure, file] = FILES.map(|f| folder.join(f));
         self.write_specs(&folder.join(FOLDERS[0]), specs)?;
@@ -118,7 +118,7 @@ impl TradeoffReport {
         conefield_io::write_text_atomic(&state, &to_json(self)?)
     }
 
-    /// For people.
+    /// Text for people.
     pub fn text(&self, folder: &Path) -> String {
         let at = |name: &str| folder.join(name).display().to_string();
         format!(
@@ -130,7 +130,7 @@ impl TradeoffReport {
         )
     }
 
-    /// The points that are worth a spec: all fronts, and the best of each budget.
+    /// The points that get a spec: those of all fronts, and the best of each budget.
     fn chosen(&self) -> Vec<&Mean> {
         let lists = [&self.front, &self.front_of_fields, &self.front_of_voxels];
         let named =
@@ -143,7 +143,7 @@ impl TradeoffReport {
         found.ok_or_else(|| Error::unsupported("tradeoff", format!("no candidate {}", point.candidate)))
     }
 
-    /// A spec a point, whole, that ends after as many steps or passes as the trial had.
+    /// Writes a complete spec per point, which ends after as many steps or passes as the trial.
     fn write_specs(&self, folder: &Path, specs: &dyn Specs) -> Result<()> {
         match fs::remove_dir_all(folder) {
             Err(e) if e.kind() != std::io::ErrorKind::NotFound => return Err(Error::io(folder, e)),
@@ -211,7 +211,7 @@ impl TradeoffReport {
         !self.search.references.is_empty()
     }
 
-    /// What a point reached, in words.
+    /// The accuracy of a point, in words.
     fn reached(&self, p: &Mean) -> String {
         match p.psnr {
             Some(psnr) => format!("{psnr:.2} dB"),
@@ -280,7 +280,7 @@ impl TradeoffReport {
         self.trials.iter().filter(|t| t.budget_s == budget && t.status == status).count()
     }
 
-    /// Every trial as a dot, the front as a line: over time on the left, over memory on the right.
+    /// Draws every trial as a dot and the front as a line: over time on the left, over memory on the right.
     fn draw(&self, path: &Path) -> Result<()> {
         let (label, value): (_, fn(&Mean) -> f64) = match self.by_reference() {
             true => ("PSNR, dB", |p| p.psnr.unwrap_or(f64::NAN)),
@@ -301,7 +301,7 @@ impl TradeoffReport {
             let mut all = vec![("front".to_owned(), line)];
             for base in &bases {
                 let dots = self.points.iter().filter(|p| base_of(p) == *base);
-                // A gap between any two makes dots of a line.
+                // A NaN between every two points turns the line into dots.
                 let dots: Vec<_> = dots.flat_map(|p| [(x(p), value(p)), (f64::NAN, f64::NAN)]).collect();
                 all.push((base.to_string(), dots));
             }
@@ -309,7 +309,7 @@ impl TradeoffReport {
         };
         let over_time = series(|p| p.total_s, |s| Performance { bytes: 1.0, ..s });
         let over_memory = series(|p| p.standing.bytes / f64::from(1 << 20), |s| Performance { seconds: 1.0, ..s });
-        // A logarithmic axis of less than a decade would have no figures.
+        // A logarithmic axis of less than a decade would have no labels.
         let options = |series: &[(String, Vec<(f64, f64)>)]| {
             let all = || series.iter().flat_map(|(_, s)| s).map(|p| p.0).filter(|x| x.is_finite());
             let log_x = all().fold(0.0, f64::max) > 10.0 * all().fold(f64::INFINITY, f64::min);
@@ -327,7 +327,7 @@ impl TradeoffReport {
     }
 }
 
-/// Candidates under budgets that were done on all scans.
+/// Candidates that ran on all scans, under each budget.
 fn points(search: &Search, trials: &[Over]) -> Vec<Mean> {
     let mut all = vec![];
     for &budget_s in &search.budgets_s {
@@ -382,8 +382,8 @@ fn ranking(search: &Search, trials: &[Over]) -> Vec<Ranking> {
     all
 }
 
-/// What makes a method with these settings end after `steps` steps or passes. FDK has no number to set. The passes of the
-/// later methods of a chain are among its steps.
+/// The setting that ends a method after `steps` steps or passes. FDK has no such setting. The steps of a chain include
+/// the passes of its later methods.
 pub fn end(method: &Value, steps: u64) -> Option<String> {
     if let Some([first, later @ ..]) = method["methods"].as_array().map(|all| &all[..]) {
         let passes: u64 = later.iter().filter_map(|m| m["stop"]["passes"].as_u64()).sum();

@@ -1,4 +1,4 @@
-//! What to do with a budget: the method, if that is left open, and when training must end.
+//! Plans a run for a budget: chooses the method, if it is open, and the end of training.
 
 use crate::calibrate::{Bench, Costs, calibrate};
 use crate::front::{Expected, Front, Size, Unknowns};
@@ -9,83 +9,83 @@ use serde::Serialize;
 use std::cell::RefCell;
 use std::time::{Duration, Instant};
 
-/// How a refusal begins where the time is too short for anything: such a run says nothing of its method.
+/// Prefix of the error for a budget that is too short for anything: such a run says nothing about its method.
 pub const TOO_SHORT: &str = "the budget: ";
-/// Share of the budget that is planned for: what cannot be foreseen has the rest.
+/// Planned share of the budget; the rest is a reserve.
 const AIM: f64 = 0.98;
-/// Share of a point's steps from which there is time enough for it.
+/// Share of a point's steps for which there must be time.
 const ENOUGH: f64 = 0.9;
-/// Methods that are measured at most before one is taken.
+/// Most methods that are measured before one is taken.
 const MEASURED: usize = 3;
-/// Longest that a method is measured for, in seconds and as a share of the budget: of short budgets, and of those in which three
-/// seconds are little. The less coarse the scan that passes are measured on, the better they tell what whole ones take.
+/// Longest measurement of a method, in seconds and as a share of the budget: for short budgets, and for those in which
+/// three seconds matter little. Passes on a less coarse scan predict full passes better.
 const CALIBRATION: [(f64, f64); 2] = [(1.0, 0.1), (3.0, 0.04)];
-/// Steps without which a field is nothing.
+/// Minimum number of steps of a useful field.
 const STEPS: f64 = 10.0;
 
-/// A method that is built, with all that its user needs beside.
+/// A built method, with everything else its user needs.
 pub trait Runnable {
     /// The name of its spec.
     fn name(&self) -> &str;
-    /// What runs.
+    /// The plan to run.
     fn plan(&mut self) -> &mut dyn Plan;
 }
 
 /// The available time.
 #[derive(Debug, Clone, Copy)]
 pub struct Budget {
-    /// When the command started.
+    /// Start of the command.
     pub begin: Instant,
-    /// Seconds from there.
+    /// Seconds from the start.
     pub seconds: f64,
-    /// Seconds of training that an interrupted run has had of them.
+    /// Seconds of training that an interrupted run has already used.
     pub spent: f64,
 }
 
-/// What is going to be done, for people and for the record.
+/// The planned run, for people and for the record.
 #[derive(Debug, Clone, Serialize)]
 pub struct Schedule {
-    /// The point of the front, where the method was chosen.
+    /// The point of the front, if the method was chosen.
     pub point: Option<String>,
-    /// What speaks for the method.
+    /// Reason for the method.
     pub why: String,
-    /// What other methods would have taken.
+    /// Rejected methods, with reasons.
     #[serde(skip_serializing_if = "Vec::is_empty")]
     pub passed_over: Vec<String>,
     /// Steps or passes that fit into the time.
     pub steps: u64,
-    /// Until the plan was made, in all.
+    /// Seconds until the plan was complete.
     pub load_s: f64,
-    /// Of that, measuring.
+    /// Part of `load_s` for measurements.
     pub calibrate_s: f64,
-    /// Seconds expected of each part to come.
+    /// Expected durations of the remaining parts.
     pub expected: Costs,
-    /// Seconds of training that are planned.
+    /// Planned seconds of training.
     pub train_s: f64,
     #[serde(skip)]
     kind: Unknowns,
-    /// When training is to be over.
+    /// Planned end of training.
     #[serde(skip)]
     pub deadline: Instant,
-    /// The deadline of a solver that runs after the training.
+    /// Deadline of a solver that runs after training.
     #[serde(skip)]
     pub then: Option<Instant>,
 }
 
 impl Budget {
-    /// Seconds that are left, of what is planned for.
+    /// Remaining seconds of the planned time.
     fn left(&self) -> f64 {
         AIM * self.seconds - self.spent - self.begin.elapsed().as_secs_f64()
     }
 
-    /// Plans `method`, which was asked for.
+    /// Plans the requested method `method`.
     pub fn plan(&self, bench: &Bench<'_>, method: &mut impl Runnable) -> Result<Schedule> {
         let start = Instant::now();
         let costs = calibrate(bench, method.plan(), self.measuring())?;
         self.settle(None, "the requested spec".into(), vec![], method, costs, start)
     }
 
-    /// The best method of `front` that fits, made by `build` from a spec and what is set of it, and its plan.
+    /// The best method of `front` that fits, built by `build` from a spec and settings, with its schedule.
     pub fn choose<R: Runnable>(
         &self,
         bench: &Bench<'_>,
@@ -120,12 +120,12 @@ impl Budget {
         Ok((method, plan))
     }
 
-    /// How long a method is measured, in seconds.
+    /// Seconds for measuring a method.
     fn measuring(&self) -> f64 {
         CALIBRATION.into_iter().map(|(longest, share)| longest.min(share * self.seconds)).fold(0.0, f64::max)
     }
 
-    /// The plan, or a refusal that says how much time would do.
+    /// The schedule, or an error that states a sufficient time.
     fn settle(
         &self,
         point: Option<String>,
@@ -137,13 +137,13 @@ impl Budget {
     ) -> Result<Schedule> {
         let kind = Unknowns::of(method.plan());
         let left = self.left();
-        // Of little time half is the training's, as far as what follows it can do with less.
+        // If time is short, training gets half of it, as far as later methods can do with less.
         let room = 0.5 * (left - costs.prepare_s - (costs.after_s() - costs.then_s));
         let costs = Costs { then_s: costs.then_s.min(room.max(costs.then_least_s)), ..costs };
         let load_s = self.begin.elapsed().as_secs_f64();
         let train_s = left - costs.after_s() - costs.prepare_s;
         let least = least(kind) * costs.step_s;
-        // A run that is resumed has made something, and goes on to its end.
+        // A resumed run has made progress and continues to its end.
         if train_s < least && self.spent == 0.0 {
             let needed = (load_s + self.spent + costs.prepare_s + least + costs.after_s()) / AIM;
             let first = match kind {
@@ -176,12 +176,12 @@ impl Budget {
     }
 }
 
-/// The moment so many seconds from now.
+/// The time `seconds` from now.
 fn within(seconds: f64) -> Instant {
     Instant::now() + Duration::from_secs_f64(seconds.max(0.0))
 }
 
-/// Steps or passes without which nothing comes of a method.
+/// Minimum number of useful steps or passes.
 fn least(kind: Unknowns) -> f64 {
     match kind {
         Unknowns::Field => STEPS,
@@ -189,13 +189,13 @@ fn least(kind: Unknowns) -> f64 {
     }
 }
 
-/// A time of which tenths matter where it is short.
+/// Formats a time, with tenths if it is short.
 fn time(seconds: f64) -> String {
     if seconds < 10.0 { format!("{seconds:.2} s") } else { duration(seconds) }
 }
 
 impl Schedule {
-    /// In words; `spec` is the name of the method's.
+    /// Text for people; `spec` is the name of the method's spec.
     pub fn lines(&self, spec: &str) -> Vec<String> {
         let named = match &self.point {
             Some(point) => format!("{point} (spec {spec})"),
@@ -220,27 +220,27 @@ impl Schedule {
     }
 }
 
-/// What [`pick`] came to.
+/// The result of [`pick`].
 struct Choice {
-    /// Which point, and what it takes here.
+    /// Index of the point, and its cost on this machine.
     point: usize,
     costs: Costs,
-    /// Whether there is time for all of its steps.
+    /// Whether there is time for all its steps.
     fits: bool,
-    /// Better ones, and why not.
+    /// Better points, with the reason for rejecting each.
     passed_over: Vec<(usize, String)>,
 }
 
-/// Takes the first of `points`, the best first, that fits into `left` seconds. What a point takes is reckoned from the
-/// front's own machine at first; `measure` finds out what it takes here, which also tells how much faster or slower
-/// others of its kind will be.
+/// Takes the first of `points`, sorted from the best, that fits into `left` seconds. The first estimate of a point's
+/// cost comes from the front's own machine; `measure` finds its cost here, which also gives the relative speed for
+/// other points of its kind.
 fn pick(
     points: &[(Unknowns, Expected)],
     left: impl Fn() -> f64,
     mut measure: impl FnMut(usize) -> Result<Costs>,
 ) -> Result<Choice> {
     let mut known: Vec<Option<Result<Costs, String>>> = points.iter().map(|_| None).collect();
-    // Of fields and of voxels; what is known of one kind is the best guess for the other.
+    // For fields and for voxels; what is known of one kind is the best guess for the other.
     let mut slower: [Option<f64>; 2] = [None; 2];
     let of = |kind: Unknowns| kind as usize;
     while known.iter().flatten().filter(|k| k.is_ok()).count() < MEASURED {
@@ -265,7 +265,7 @@ fn pick(
                 let measured = measure(at);
                 if let Ok(costs) = &measured {
                     let (kind, e) = points[at];
-                    // Of whole runs: a chain's steps are not alike.
+                    // Ratio of whole runs, because the steps of a chain differ.
                     slower[of(kind)] = Some(costs.run_s(e.steps, 1.0) / (e.steps * e.step_s + e.beside_s).max(1e-12));
                 }
                 known[at] = Some(measured.map_err(|e| e.to_string()));
@@ -309,7 +309,7 @@ fn pick(
 mod tests {
     use super::*;
 
-    /// Two fields and two methods on voxels, the best first; seconds on the front's machine 100, 40, 20 and 2.
+    /// Two fields and two voxel methods, the best first; seconds on the front's machine 100, 40, 20 and 2.
     fn points() -> Vec<(Unknowns, Expected)> {
         let point = |kind, steps, step_s| (kind, Expected { steps, step_s, beside_s: 0.0 });
         vec![
@@ -320,7 +320,7 @@ mod tests {
         ]
     }
 
-    /// What is chosen with `left` seconds on a machine that is `factor` times as slow, and what was measured for it.
+    /// The choice with `left` seconds on a machine that is `factor` times as slow, and the points measured for it.
     fn chosen(left: f64, factor: f64) -> (usize, bool, Vec<usize>) {
         let points = points();
         let mut measured = vec![];
@@ -342,9 +342,9 @@ mod tests {
 
     #[test]
     fn measuring_one_tells_of_its_kind() {
-        // The field that would take 90 s takes 270, and the method on voxels as much more than it would: 108 s.
+        // The field of 90 s takes 270, and the voxel method more by the same factor: 108 s.
         assert_eq!(chosen(100.0, 3.0), (2, true, vec![0, 2]));
-        // A faster machine does better than the front's would.
+        // On a faster machine a better point fits.
         assert_eq!(chosen(50.0, 0.5), (0, true, vec![1, 0]));
     }
 

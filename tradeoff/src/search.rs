@@ -1,5 +1,5 @@
-//! The search itself: every candidate under the smallest budget, the best share of them under the next one, and so on.
-//! What is done stands in the search's folder, where it can be gone on with.
+//! The search: every candidate under the smallest budget, the best share of them under the next one, and so on. The
+//! state is kept in the search's folder, from which it can be resumed.
 
 use crate::front::Unknowns;
 use crate::halving::{TrialOutcome, go_on, to_come};
@@ -19,113 +19,113 @@ use std::io::ErrorKind;
 use std::path::{Path, PathBuf};
 use tracing::info;
 
-/// What a search leaves in its folder: files, then folders.
+/// Content of a search's folder: files, then folders.
 pub(crate) const FILES: [&str; 4] = ["tradeoff.json", "tradeoff.md", "front.png", "front.toml"];
 pub(crate) const FOLDERS: [&str; 2] = ["front", "trials"];
-/// Of a trial's files, what only its own result needs.
+/// Files of a trial that are not needed after its results are read.
 const HEAVY: [&str; 3] = ["volume.nii.gz", "weights.safetensors", "checkpoint.safetensors"];
 
-/// What decides about every trial: a search may go on only where all of it is as it was.
+/// Everything that determines the trials: a search may be resumed only if all of it is unchanged.
 #[derive(Debug, Serialize)]
 pub struct Search {
-    /// Of the program.
+    /// Version of the program.
     pub version: &'static str,
-    /// The scans to be good on.
+    /// Scans to tune on.
     pub scans: Vec<ScanRecord>,
-    /// The volumes sought, one a scan; none where held-out views rank.
+    /// The reference volumes, one per scan; empty if held-out views rank.
     pub references: Vec<PathBuf>,
-    /// Views to hold out, as the command line has it.
+    /// Held-out views, as on the command line.
     pub hold_out: Option<String>,
     /// The data range for PSNR and SSIM.
     pub peak: Option<f64>,
-    /// Seed of everything random.
+    /// Seed of all randomness.
     pub seed: u64,
-    /// Seconds that a whole run may take, from the least.
+    /// Time of a whole run in seconds, ascending.
     pub budgets_s: Vec<f64>,
-    /// Share that goes on to the next budget.
+    /// Share of candidates kept for the next budget.
     pub keep: f64,
-    /// What is tried under the first budget.
+    /// The candidates under the first budget.
     pub candidates: Vec<Candidate>,
-    /// As the command line has it.
+    /// As on the command line.
     pub backend: String,
-    /// Which SIMD instructions there are.
+    /// Available SIMD instructions.
     pub simd: String,
-    /// Threads of a run.
+    /// Threads per run.
     pub threads: usize,
-    /// Bytes that a run may hold, where that was set.
+    /// Memory limit of a run in bytes, if set.
     pub memory_limit: Option<u64>,
 }
 
-/// A trial that is over.
+/// A finished trial.
 #[derive(Debug, Clone, Serialize, Deserialize)]
 pub struct Over {
-    /// Seconds that it had.
+    /// Its budget in seconds.
     pub budget_s: f64,
     /// The candidate's name.
     pub candidate: String,
-    /// Which of the scans.
+    /// Index of the scan.
     pub scan: usize,
-    /// How it ended.
+    /// Its status.
     pub status: Status,
-    /// What went wrong.
+    /// The error, if it failed.
     pub error: Option<String>,
-    /// What it took and reached.
+    /// Time, memory and scores.
     #[serde(flatten)]
     pub figures: Option<Figures>,
 }
 
-/// How a trial ended.
+/// Status of a finished trial.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "kebab-case")]
 pub enum Status {
-    /// It has a result.
+    /// With a result.
     Done,
     /// The budget was too short to do anything.
     TooShort,
-    /// It has none.
+    /// Without a result.
     Failed,
 }
 
-/// What happened under a budget.
+/// The candidates of a budget.
 #[derive(Debug, Serialize)]
 pub struct Rung {
-    /// Seconds that every trial had.
+    /// Budget of every trial in seconds.
     pub budget_s: f64,
     /// Names of the candidates.
     pub tried: Vec<String>,
-    /// Those that went on.
+    /// Names of the candidates that were kept.
     pub kept: Vec<String>,
 }
 
-/// A trial that is to be made.
+/// A trial to run.
 #[derive(Debug)]
 pub struct Due<'a> {
     /// The method.
     pub candidate: &'a Candidate,
-    /// Seconds that it has.
+    /// Its budget in seconds.
     pub budget_s: f64,
-    /// Which of the scans.
+    /// Index of the scan.
     pub scan: usize,
-    /// The folder for its run, where an interrupted trial may have left something.
+    /// The folder of its run, which may contain the remains of an interrupted trial.
     pub output: PathBuf,
-    /// In words, to say what an interruption interrupted.
+    /// A description for the message about an interruption.
     pub part: String,
 }
 
-/// What to do about an earlier search in the folder.
+/// How to treat an earlier search in the folder.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Earlier {
     /// Refuse to begin.
     Refuse,
     /// Remove it with all its trials.
     Replace,
-    /// Go on with it.
+    /// Resume it.
     Resume,
 }
 
 impl Search {
-    /// Refuses a folder that is none of a search, or holds one with which nothing is to happen; what a search that is resumed
-    /// got done.
+    /// Checks the folder: refuses one with other content, or with an earlier search that must not be touched. Returns
+    /// the finished trials of a resumed search.
     pub fn look(&self, folder: &Path, earlier: Earlier) -> Result<Vec<Over>> {
         let place = folder.display().to_string();
         let old = entries(folder)?;
@@ -133,14 +133,14 @@ impl Search {
         let state = folder.join(FILES[0]);
         ensure(old.is_empty() || earlier != Earlier::Refuse, &place, "output", "an earlier search", expected)?;
         if earlier == Earlier::Replace {
-            // Only what bears a search's mark goes with all that is in it.
+            // Only a folder with a search's state may be removed with its content.
             let marked = old.is_empty() || state.is_file();
             ensure(marked, &place, "output", "a folder without tradeoff.json", "an earlier search to replace")?;
         }
         if earlier == Earlier::Resume && state.is_file() { self.done(&state) } else { Ok(vec![]) }
     }
 
-    /// What the search whose state this is got done; one that was another is refused.
+    /// The finished trials in the state of this search; refuses the state of another search.
     fn done(&self, state: &Path) -> Result<Vec<Over>> {
         #[derive(Deserialize)]
         struct Then {
@@ -157,8 +157,8 @@ impl Search {
         Ok(then.trials)
     }
 
-    /// All trials, budget by budget, but for those in `over`, which has them all in the end. `run` makes one and tells
-    /// what went wrong with it, if anything did; an error of its own ends the search, which can be resumed.
+    /// Runs all trials, budget by budget, except those already in `over`, and appends them to it. `run` makes one and
+    /// returns its error message, if it failed; an `Err` ends the search, which can be resumed.
     pub fn climb(
         &self,
         folder: &Path,
@@ -197,7 +197,7 @@ impl Search {
         Ok(rungs)
     }
 
-    /// Seconds that the search takes from here at most: trial `c` on `scan` of budget `r` is next.
+    /// Upper bound of the remaining seconds: trial `c` on `scan` of budget `r` is next.
     fn left(&self, going: &[&Candidate], r: usize, c: usize, scan: usize) -> f64 {
         let fields = going.iter().filter(|c| c.kind == Unknowns::Field).count();
         let rungs = self.budgets_s.len() - r;
@@ -207,7 +207,7 @@ impl Search {
         scans * all - (c as f64 * scans + scan as f64) * self.budgets_s[r]
     }
 
-    /// Keeps what is done so far where it can be gone on with.
+    /// Saves the state, so that the search can be resumed.
     fn write_state(&self, folder: &Path, rungs: &[Rung], trials: &[Over]) -> Result<()> {
         #[derive(Serialize)]
         struct State<'a> {
@@ -218,13 +218,12 @@ impl Search {
         conefield_io::write_text_atomic(folder.join(FILES[0]), &to_json(&State { search: self, rungs, trials })?)
     }
 
-    /// How accurate `figures` are, higher is better: PSNR where there is a reference, else the held-out error with its
-    /// sign turned.
+    /// Accuracy of `figures`, higher is better: PSNR if there is a reference, else the negative held-out error.
     pub(crate) fn accuracy(&self, figures: &Figures) -> Option<f64> {
         if self.references.is_empty() { figures.held_out.map(|e| -e) } else { figures.psnr() }
     }
 
-    /// What a candidate came to under a budget on all scans together.
+    /// The result of a candidate under a budget on all scans together.
     fn outcome(&self, over: &[Over], candidate: &Candidate, budget: f64) -> TrialOutcome {
         let here: Vec<&Over> = over.iter().filter(|o| o.budget_s == budget && o.candidate == candidate.name).collect();
         if here.iter().any(|o| o.status == Status::TooShort) {
@@ -235,17 +234,17 @@ impl Search {
     }
 }
 
-/// What the folder of a search holds.
+/// Content of a search's folder.
 pub const CONTENTS: Contents = Contents { known, progressed };
 
-/// Whether a search may have left this.
+/// Whether a search may have written `path`.
 fn known(path: &Path) -> bool {
     let name = path.file_name().unwrap_or_default();
     let names = if path.is_dir() { &FOLDERS[..] } else { &FILES[..] };
     names.iter().any(|f| name == *f) || conefield_io::is_unfinished(name)
 }
 
-/// How far the search in `folder` came: its state is written after every trial, the table at the end.
+/// Progress of the search in `folder`: its state is written after every trial, the table at the end.
 fn progressed(folder: &Path) -> Progressed {
     match FILES[..2].iter().rev().position(|f| folder.join(f).exists()) {
         Some(0) => Progressed::Complete,
@@ -254,7 +253,7 @@ fn progressed(folder: &Path) -> Progressed {
     }
 }
 
-/// What lies in the folder. A folder with anything in it that no search leaves is refused.
+/// The content of the folder. Refuses a folder with anything that no search writes.
 fn entries(folder: &Path) -> Result<Vec<PathBuf>> {
     let entries = match fs::read_dir(folder) {
         Err(e) if e.kind() == ErrorKind::NotFound => return Ok(vec![]),
@@ -270,7 +269,7 @@ fn entries(folder: &Path) -> Result<Vec<PathBuf>> {
     Ok(old)
 }
 
-/// Makes a trial, reads what it came to and leaves of its files what is worth keeping.
+/// Runs a trial, reads its results and removes its large files.
 fn settle(due: &Due<'_>, run: &mut dyn FnMut(&Due<'_>) -> Result<Option<String>>) -> Result<Over> {
     let error = run(due)?;
     let figures = if error.is_none() { Some(Figures::of_run(&due.output)?) } else { None };
@@ -290,7 +289,7 @@ fn settle(due: &Due<'_>, run: &mut dyn FnMut(&Due<'_>) -> Result<Option<String>>
     Ok(Over { budget_s, candidate, scan, status, error, figures })
 }
 
-/// A value in few words.
+/// A short text for a value.
 fn short(value: &Value) -> String {
     let text = value.to_string();
     if text.chars().count() <= 80 { text } else { text.chars().take(77).chain("...".chars()).collect() }

@@ -1,12 +1,12 @@
 //! Means and correlations.
 
-/// The mean; none where one of the values is missing, or all are.
+/// The mean; `None` if a value is missing or there are none.
 pub fn mean(values: impl IntoIterator<Item = Option<f64>>) -> Option<f64> {
     let all: Option<Vec<f64>> = values.into_iter().collect();
     all.filter(|a| !a.is_empty()).map(|a| a.iter().sum::<f64>() / a.len() as f64)
 }
 
-/// Pearson's correlation, between −1 and 1; none where one of the two is the same everywhere.
+/// Pearson's correlation, between −1 and 1; `None` if one of the two is constant.
 pub fn pearson(a: &[f64], b: &[f64]) -> Option<f64> {
     let mean = |v: &[f64]| v.iter().sum::<f64>() / v.len() as f64;
     let (mean_a, mean_b) = (mean(a), mean(b));
@@ -19,9 +19,8 @@ pub fn pearson(a: &[f64], b: &[f64]) -> Option<f64> {
     r.is_finite().then(|| r.clamp(-1.0, 1.0))
 }
 
-/// Spearman's rank correlation: how well one figure puts things into the order of another, between −1 (the reverse order)
-/// and 1 (the same); equal values share their mean rank. None of fewer than three pairs, or where one of the figures is the
-/// same for all.
+/// Spearman's rank correlation: how well one figure orders things like another, between −1 (reverse order) and 1 (same
+/// order); equal values share their mean rank. `None` for fewer than three pairs, or if one of the figures is constant.
 pub fn spearman(a: &[f64], b: &[f64]) -> Option<f64> {
     let pairs = a.iter().copied().zip(b.iter().copied()).filter(|(a, b)| !(a.is_nan() || b.is_nan()));
     let (a, b): (Vec<f64>, Vec<f64>) = pairs.unzip();

@@ -1,4 +1,4 @@
-//! A whole run as a part of a search or a comparison: what goes in, and which figures come out.
+//! A whole run in a search or a comparison: its inputs and its figures.
 
 use crate::json::{read_json, to_json};
 use conefield_core::Result;
@@ -9,25 +9,25 @@ use serde::{Deserialize, Serialize};
 use serde_json::Value;
 use std::path::Path;
 
-/// Which scan it was.
+/// Identifies a scan.
 #[derive(Debug, Clone, Serialize, Deserialize)]
 pub struct ScanRecord {
-    /// Where it was read from.
+    /// Path from which it was read.
     pub path: String,
-    /// How many views it has.
+    /// Number of views.
     pub views: usize,
-    /// Rows and columns of its detector.
+    /// Rows and columns of the detector.
     pub detector: [usize; 2],
-    /// Voxels that it asks for.
+    /// Shape of the volume.
     pub volume: [usize; 3],
-    /// Of all line integrals.
+    /// Checksum of all line integrals.
     pub projections_fnv1a64: String,
-    /// Of where everything stood, and of the unit.
+    /// Checksum of geometry and unit.
     pub geometry_fnv1a64: String,
 }
 
 impl ScanRecord {
-    /// The whole scan that was read from `path`.
+    /// The record of the whole scan read from `path`.
     pub fn of(path: &Path, scan: &Scan) -> Result<Self> {
         let placed = to_json(&(&scan.geometry, &scan.unit))?;
         Ok(Self {
@@ -45,34 +45,34 @@ impl ScanRecord {
         stem(&self.path)
     }
 
-    /// In words.
+    /// Text for people.
     pub fn line(&self) -> String {
         let (views, [rows, columns], [x, y, z]) = (self.views, self.detector, self.volume);
         format!("{}: {views} views of {rows} x {columns} pixels, {x} x {y} x {z} voxels", self.path)
     }
 }
 
-/// FNV-1a, to recognise a scan by.
+/// FNV-1a hash, to recognize a scan.
 fn checksum(bytes: impl Iterator<Item = u8>) -> String {
     let hash = bytes.fold(0xcbf2_9ce4_8422_2325u64, |h, b| (h ^ u64::from(b)).wrapping_mul(0x0100_0000_01b3));
     format!("{hash:016x}")
 }
 
-/// What is known of the input once all of it was looked at.
+/// What is known about the input after it has been read.
 pub struct TrialInput {
     /// The whole scan.
     pub scan: ScanRecord,
     /// Indices of the held-out views.
     pub held: Vec<usize>,
-    /// What is known of the volume sought.
+    /// The middle slices of the reference volume.
     pub reference: Option<MiddleSlices>,
-    /// The data range that scores refer to.
+    /// The data range of the scores.
     pub peak: f64,
 }
 
 impl TrialInput {
-    /// Of the scan that was read from `path`; little of it is kept. Views to hold out that leave none to work with are
-    /// refused.
+    /// The facts about the scan read from `path`; keeps little of it. Refuses held-out views that leave no training
+    /// views.
     pub fn of(path: &Path, scan: Scan, reference: Option<&Volume>, peak: f64, held: Vec<usize>) -> Result<Self> {
         let record = ScanRecord::of(path, &scan)?;
         if !held.is_empty() {
@@ -82,47 +82,47 @@ impl TrialInput {
     }
 }
 
-/// What a table takes from a run's `record.json`, under the names that it has there.
+/// The figures in a run's `record.json`, by the same names.
 #[derive(Debug, Clone, Serialize, Deserialize)]
 pub struct Figures {
     /// Steps or passes.
     pub steps: u64,
-    /// Seconds of them all.
+    /// Time for all steps in seconds.
     pub train_s: f64,
-    /// Seconds of writing weights and voxels.
+    /// Time for writing weights and voxels in seconds.
     pub export_s: f64,
-    /// Seconds of the whole run.
+    /// Time of the whole run in seconds.
     pub total_s: f64,
-    /// The most memory that it held.
+    /// Peak memory.
     pub peak_bytes: Option<u64>,
-    /// Threads that it worked in.
+    /// Number of threads.
     pub threads: usize,
-    /// Of a field.
+    /// Number of parameters of a field.
     pub parameters: usize,
-    /// Samples that were evaluated in training.
+    /// Samples evaluated in training.
     pub samples: u64,
-    /// Of solvers that take samples.
+    /// For solvers that use samples.
     pub samples_per_s: Option<f64>,
-    /// The last one.
+    /// The last loss.
     pub loss: Option<f64>,
-    /// Error of held-out views, over the largest line integral.
+    /// Error of held-out views, relative to the largest line integral.
     pub held_out: Option<f64>,
-    /// Kept as it stands, with the reasons for what is missing.
+    /// Scores as recorded, with the reasons for missing ones.
     pub scores: Option<Value>,
 }
 
 impl Figures {
-    /// Of the finished run in `folder`.
+    /// The figures of the finished run in `folder`.
     pub fn of_run(folder: &Path) -> Result<Self> {
         read_json(&folder.join("record.json"))
     }
 
-    /// dB; infinite, which JSON has no number for, where the result is the reference.
+    /// PSNR in dB; infinite, which JSON cannot represent, if the result equals the reference.
     pub fn psnr(&self) -> Option<f64> {
         self.scores.as_ref().map(|s| s["psnr"].as_f64().unwrap_or(f64::INFINITY))
     }
 
-    /// One of the scores, where it is defined.
+    /// A score, if defined.
     pub fn score(&self, name: &str) -> Option<f64> {
         self.scores.as_ref().and_then(|s| s[name].as_f64())
     }

@@ -1,4 +1,4 @@
-//! A clean scan gives no warning, and each fault gives its own.
+//! A clean scan gives no warning, and each problem gives its own.
 
 use super::*;
 use crate::WarningKind;
@@ -56,7 +56,7 @@ impl Setting {
             let a = d[0] * d[0] + d[1] * d[1];
             let b = o[0] * d[0] + o[1] * d[1];
             let under = b * b - a * (o[0] * o[0] + o[1] * o[1] - self.radius * self.radius);
-            // Inside the cylinder's height, as far as the middle of the chord tells.
+            // Inside the cylinder's height, as judged by the middle of the chord.
             let z = o[2] - b / a * d[2];
             if under > 0.0 && z.abs() < half { (self.mu * 2.0 * under.sqrt() / a) as f32 } else { 0.0 }
         });
@@ -67,7 +67,7 @@ impl Setting {
         survey(&self.scan()).warnings.iter().map(|w| w.kind).collect()
     }
 
-    /// The only warning, of the given kind, that says all of `words`.
+    /// Asserts a single warning, of the given kind, that contains all of `words`.
     fn warns(&self, kind: WarningKind, words: &[&str]) {
         let found = survey(&self.scan()).warnings;
         let text: Vec<String> = found.iter().map(ToString::to_string).collect();
@@ -92,7 +92,7 @@ fn a_clean_scan_gives_no_warning_and_the_right_figures() {
         (g.detector_mm[1], 160.0),
         (g.supported_voxel_mm[0], 1.0),
         (g.supported_voxel_mm[2], 1.25),
-        // The ray to the detector's side, 80 mm aside after 800 mm, passes the axis at this distance.
+        // The ray to the detector's side, 80 mm off-axis after 800 mm, passes the axis at this distance.
         (g.field_of_view.radius_mm, 500.0 * (0.1f64).atan().sin()),
         (g.field_of_view.height_mm, 50.0),
         (g.angles.mean_gap_deg, 6.0),
@@ -107,7 +107,7 @@ fn a_clean_scan_gives_no_warning_and_the_right_figures() {
 
 #[test]
 fn scans_that_are_unusual_but_whole_give_no_warning() {
-    // Half the detector aside, with a full circle; a short scan of 180° and more; irregular angles; noise.
+    // A half-offset detector with a full circle; a short scan of 180° and more; irregular angles; noise.
     let offset = Setting { offset: [0.0, 30.0], detector: [40, 80], ..clean() };
     assert_eq!(offset.kinds(), []);
     assert!(survey(&offset.scan()).setup.half_is_enough());
@@ -142,7 +142,7 @@ impl Setting {
 #[test]
 fn each_fault_gives_its_own_warning() {
     use WarningKind as W;
-    // As wide as the field of view and wider.
+    // As wide as the field of view, and wider.
     Setting { radius: 60.0, ..clean() }.warns(W::Truncated, &["100.0 % of the views", "mm at the axis", "air"]);
     let tall = VoxelGrid { shape: [48, 48, 48], spacing: [1.2, 1.2, 1.5], center: [0.0; 3] };
     Setting { volume: tall, radius: 10.0, ..clean() }.warns(W::Coverage, &["72.0 mm", "height 50.0 mm", "smaller"]);

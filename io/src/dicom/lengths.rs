@@ -1,7 +1,7 @@
-//! A walk along the elements of a file that reads only their lengths.
+//! A walk over the elements of a file that reads only their lengths.
 //!
-//! `dicom-object` takes memory for what an element claims, up to 4 GiB, and goes down nested sequences by recursion.
-//! This keeps both in bounds.
+//! `dicom-object` allocates as much as an element claims, up to 4 GiB, and recurses into nested sequences. This walk
+//! bounds both.
 
 use crate::input::must_unpack;
 use conefield_core::{Error, Result, files};
@@ -12,10 +12,10 @@ use std::fs::File;
 use std::io::{BufReader, Read, Seek, SeekFrom};
 use std::path::Path;
 
-/// Everything but the pixels is shorter than this.
+/// Everything before the pixels must be shorter than this.
 const LONGEST_HEADER: u64 = 64 << 20;
 
-/// Sequences in items of sequences: real files stay below ten.
+/// Deepest nesting of sequences; real files stay below ten.
 const DEEPEST: usize = 32;
 
 const PIXELS: Tag = Tag(0x7fe0, 0x0010);
@@ -25,18 +25,18 @@ const ITEM_END: Tag = Tag(0xfffe, 0xe00d);
 const SEQUENCE_END: Tag = Tag(0xfffe, 0xe0dd);
 const UNDEFINED: u32 = u32::MAX;
 
-/// What a file has for pixels.
+/// How a file stores its pixels.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(super) enum PixelStorage {
     None,
-    /// This many bytes as they are.
+    /// This many bytes, uncompressed.
     Plain(u64),
-    /// A compressed picture in at most this many bytes.
+    /// A compressed image in at most this many bytes.
     Packed(u64),
 }
 
 impl PixelStorage {
-    /// Refuses a picture of `count` values of `size` bytes that cannot come from this many.
+    /// Refuses an image of `count` values of `size` bytes that cannot come from this storage.
     pub fn must_hold(self, place: &str, count: u64, size: u64) -> Result<()> {
         let want = count * size;
         let (bytes, ok) = match self {
@@ -53,7 +53,7 @@ impl PixelStorage {
     }
 }
 
-/// How elements are written.
+/// How elements are encoded.
 #[derive(Clone, Copy)]
 struct Coding {
     explicit: bool,
@@ -61,11 +61,11 @@ struct Coding {
 }
 
 enum Level {
-    /// An item or sequence up to this byte.
+    /// An item or sequence that ends at this byte.
     Until(u64),
-    /// One up to its delimiter, and what holds again after it.
+    /// An item or sequence that ends at its delimiter, and the coding that applies after it.
     Delimited(Coding),
-    /// Pieces of a compressed picture, up to the delimiter.
+    /// Fragments of a compressed image, up to the delimiter.
     Pieces,
 }
 
@@ -77,8 +77,8 @@ struct ElementWalk {
     coding: Coding,
 }
 
-/// Walks along `path`, which carries DICOM's mark, up to the end of its pixels: what they are, and the byte behind
-/// them, after which nothing has been looked at.
+/// Walks over `path`, which has DICOM's magic bytes, to the end of its pixels. Returns their storage and the byte after
+/// them; nothing beyond that has been checked.
 pub(super) fn check(path: &Path) -> Result<(PixelStorage, u64)> {
     let io = |e| Error::io(path, e);
     let (file, size) = files::open(path)?;
@@ -92,7 +92,7 @@ impl ElementWalk {
     fn run(mut self) -> Result<(PixelStorage, u64)> {
         let mut stack: Vec<Level> = Vec::new();
         let mut syntax = None;
-        // The description of the file is explicit and little-endian whatever the rest is.
+        // The file meta group is always explicit and little-endian.
         let mut in_rest = false;
         let description_end = self.description_end()?;
         loop {
@@ -145,8 +145,8 @@ impl ElementWalk {
         Ok(())
     }
 
-    /// Refuses a description that ends elsewhere than it says. `dicom-object` trusts that length: what it took for a
-    /// part of the description would go unchecked.
+    /// Refuses a file meta group that ends elsewhere than its length says. `dicom-object` trusts that length, and
+    /// anything it took for part of the group would go unchecked.
     fn refuse_other_end(&self, description_end: u64) -> Result<()> {
         if self.at == description_end {
             return Ok(());
@@ -156,7 +156,7 @@ impl ElementWalk {
         Err(self.invalid("FileMetaInformationGroupLength", found, &expected))
     }
 
-    /// The start or end of an item or sequence.
+    /// Handles the start or end of an item or sequence.
     fn delimiter(&mut self, tag: Tag, stack: &mut Vec<Level>) -> Result<()> {
         let length = self.u32()?;
         match (tag, stack.last()) {
@@ -170,14 +170,14 @@ impl ElementWalk {
             (SEQUENCE_END, Some(Level::Pieces)) => {
                 stack.pop();
             }
-            // Behind an item or sequence of known length a delimiter means nothing.
+            // After an item or sequence of known length a delimiter has no effect.
             (ITEM_END | SEQUENCE_END, Some(Level::Until(_))) => {}
             _ => return Err(self.invalid("elements", format!("{tag} at byte {}", self.at), "an element")),
         }
         Ok(())
     }
 
-    /// What an element of undefined length opens.
+    /// The level that an element of undefined length opens.
     fn undefined(&mut self, kind: VR) -> Level {
         if !self.coding.explicit {
             return Level::Delimited(self.coding);
@@ -186,7 +186,7 @@ impl ElementWalk {
             VR::SQ => Level::Delimited(self.coding),
             VR::UN => {
                 let level = Level::Delimited(self.coding);
-                // Inside an unknown element of undefined length no kinds are given, by the standard.
+                // By the standard, an unknown element of undefined length contains no value representations.
                 self.coding.explicit = false;
                 level
             }
@@ -194,7 +194,7 @@ impl ElementWalk {
         }
     }
 
-    /// The transfer syntax that the rest of the file is in.
+    /// The transfer syntax of the rest of the file.
     fn syntax(&mut self, length: u32) -> Result<String> {
         self.end(SYNTAX, length)?;
         let mut text = vec![0; length.min(64) as usize];
@@ -203,7 +203,7 @@ impl ElementWalk {
         Ok(String::from_utf8_lossy(&text).trim_end_matches(['\0', ' ']).to_owned())
     }
 
-    /// Where the file's description ends, as its first element says.
+    /// End of the file meta group, from its first element.
     fn description_end(&mut self) -> Result<u64> {
         let start = self.at;
         let mut head = [0; 12];
@@ -221,7 +221,7 @@ impl ElementWalk {
         Ok(start + 12 + u64::from(u32::from_le_bytes([a, b, c, d])))
     }
 
-    /// The pieces of a compressed picture, up to their delimiter or the end of the file.
+    /// Walks over the fragments of a compressed image, up to their delimiter or the end of the file.
     fn pieces(mut self) -> Result<(PixelStorage, u64)> {
         let start = self.at;
         while self.at < self.size {
@@ -242,7 +242,7 @@ impl ElementWalk {
         Ok((PixelStorage::Packed(self.at - start), self.at))
     }
 
-    /// The kind of an element's values and its length, which must be one of whole values.
+    /// The value representation of an element and its length, which must be a whole number of values.
     fn kind_and_length(&mut self, tag: Tag) -> Result<(VR, u32)> {
         let (kind, length) = if self.coding.explicit {
             let mut kind = [0; 2];
@@ -273,7 +273,7 @@ impl ElementWalk {
                 | VR::UI
                 | VR::UL
                 | VR::US => u32::from(self.u16()?),
-                // Of all other kinds, also of those that the standard may add, the length takes four bytes.
+                // All other value representations, also ones that the standard may add, have a length of four bytes.
                 _ => {
                     self.read(&mut [0; 2])?;
                     self.u32()?
@@ -299,7 +299,7 @@ impl ElementWalk {
         Ok((kind, length))
     }
 
-    /// The byte behind an element of `length` bytes that starts here; it must lie in the file.
+    /// The byte after an element of `length` bytes that starts here; it must lie in the file.
     fn end(&self, tag: Tag, length: u32) -> Result<u64> {
         let left = self.size - self.at;
         if u64::from(length) > left {
@@ -372,8 +372,8 @@ fn coding(place: &str, syntax: Option<&str>) -> Result<Coding> {
         None => Err(Error::invalid(place, "TransferSyntaxUID", "no such element", "one in the file's description")),
         Some("1.2.840.10008.1.2") => Ok(Coding { explicit: false, big: false }),
         Some("1.2.840.10008.1.2.2") => Ok(Coding { explicit: true, big: true }),
-        // The rest is explicit where it is read at all. Deflated elements are not: there is nothing to walk along, and
-        // a bomb could be in them.
+        // All supported compressed syntaxes are explicit. Deflated elements are not supported: there is nothing to walk
+        // over, and they could hide a decompression bomb.
         Some(other) => super::pixels::packing(place, other).map(|_| Coding { explicit: true, big: false }),
     }
 }

@@ -11,9 +11,9 @@ use jpeg_decoder::Decoder;
 pub(super) struct PixelFormat {
     pub rows: usize,
     pub columns: usize,
-    /// Bytes a value: 1, 2 or 4.
+    /// Bytes per value: 1, 2 or 4.
     pub bytes: usize,
-    /// Bits that count, of which `high` is the uppermost.
+    /// Significant bits, of which `high` is the uppermost.
     pub stored: u32,
     pub high: u32,
     pub signed: bool,
@@ -24,7 +24,7 @@ impl PixelFormat {
         self.rows * self.columns
     }
 
-    /// The number in the bits that count.
+    /// The number in the significant bits.
     fn number(&self, bits: u32) -> i64 {
         let value = i64::from(bits >> (self.high + 1 - self.stored)) & ((1i64 << self.stored) - 1);
         if self.signed && value >> (self.stored - 1) != 0 { value - (1i64 << self.stored) } else { value }
@@ -40,7 +40,7 @@ pub(super) enum Packing {
     Jpeg2000,
 }
 
-/// How pictures in the transfer syntax `uid` are packed.
+/// How the transfer syntax `uid` compresses images.
 pub(super) fn packing(place: &str, uid: &str) -> Result<Packing> {
     match uid {
         "1.2.840.10008.1.2" | "1.2.840.10008.1.2.1" | "1.2.840.10008.1.2.2" => Ok(Packing::Plain),
@@ -66,7 +66,7 @@ fn unsupported(place: &str, uid: &str) -> Error {
     )
 }
 
-/// The values of `object`'s picture, row after row, each through `rescale`.
+/// The pixel values of `object`, row by row, each mapped through `rescale`.
 pub(super) fn values(
     place: &str,
     object: &DefaultDicomObject,
@@ -75,7 +75,7 @@ pub(super) fn values(
     rescale: impl Fn(i64) -> f32,
 ) -> Result<Vec<f32>> {
     let fail = |found: String, expected: String| Error::invalid(place, "PixelData", found, expected);
-    // The pieces joined, stored values and those that are given out, and what a JPEG decoder makes before.
+    // The joined fragments, the stored and returned values, and the intermediate output of a JPEG decoder.
     let held = element.fragments().map_or(0, |all| all.iter().map(|f| f.len() as u64).sum());
     allowance::memory(place, "PixelData", (format.count() as u64).saturating_mul(12).saturating_add(held))?;
     let bits = match packing(place, object.meta().transfer_syntax())? {
@@ -101,7 +101,7 @@ pub(super) fn values(
 fn plain(element: &InMemElement, format: &PixelFormat) -> Result<Vec<u32>, String> {
     let count = format.count();
     let value = element.value().primitive().ok_or("a compressed picture in an uncompressed file")?;
-    // Words come in the machine's order already; what is read as bytes is little-endian.
+    // Words are already in native byte order; byte arrays are little-endian.
     match (value, format.bytes) {
         (PrimitiveValue::U16(words), 2) => Ok(words.iter().take(count).map(|w| u32::from(*w)).collect()),
         (PrimitiveValue::U16(words), 1) => {
@@ -119,7 +119,7 @@ fn plain(element: &InMemElement, format: &PixelFormat) -> Result<Vec<u32>, Strin
     }
 }
 
-/// DICOM's run-length coding: for each byte of a value, the highest first, one run of PackBits.
+/// DICOM's run-length coding: one PackBits run per byte of a value, the highest byte first.
 fn run_length(bytes: &[u8], format: &PixelFormat) -> Result<Vec<u32>, String> {
     let word = |k: usize| bytes.get(4 * k..4 * k + 4).map(|b| b.iter().rev().fold(0, |w, b| w << 8 | usize::from(*b)));
     let header = || format!("{} bytes without a run-length header", bytes.len());
@@ -142,12 +142,12 @@ fn run_length(bytes: &[u8], format: &PixelFormat) -> Result<Vec<u32>, String> {
     Ok(out)
 }
 
-/// The bytes that PackBits stand for.
+/// Iterator over the bytes that PackBits encodes.
 struct Runs<'a> {
     rest: &'a [u8],
-    /// How often the next byte still comes.
+    /// Remaining repetitions of the next byte.
     repeat: usize,
-    /// How many bytes still come as they are.
+    /// Remaining literal bytes.
     literal: usize,
 }
 
@@ -178,7 +178,7 @@ impl Iterator for Runs<'_> {
     }
 }
 
-/// JPEG of one channel; the picture's own size is compared before memory is taken for it.
+/// JPEG with one channel; checks the image's own size before it allocates memory.
 fn jpeg(bytes: &[u8], format: &PixelFormat) -> Result<Vec<u32>, String> {
     let found = frame(bytes).ok_or("no JPEG picture")?;
     must_be(found, format, "JPEG")?;
@@ -191,7 +191,7 @@ fn jpeg(bytes: &[u8], format: &PixelFormat) -> Result<Vec<u32>, String> {
     })
 }
 
-/// Refuses a picture of another size than the file says.
+/// Refuses an image whose size differs from the file's.
 fn must_be((bits, rows, columns, channels): Frame, format: &PixelFormat, name: &str) -> Result<(), String> {
     if (rows, columns, channels) != (format.rows, format.columns, 1) {
         return Err(format!("a {name} picture of {rows} rows, {columns} columns and {channels} channels"));
@@ -202,7 +202,7 @@ fn must_be((bits, rows, columns, channels): Frame, format: &PixelFormat, name: &
     Ok(())
 }
 
-/// JPEG-LS of one channel, without loss or nearly so.
+/// JPEG-LS with one channel, lossless or near-lossless.
 fn jpeg_ls(bytes: &[u8], format: &PixelFormat) -> Result<Vec<u32>, String> {
     must_be(frame(bytes).ok_or("no JPEG-LS picture")?, format, "JPEG-LS")?;
     let (values, ..) = jpegls::decode(bytes, format.columns as u32, format.rows as u32)
@@ -210,10 +210,10 @@ fn jpeg_ls(bytes: &[u8], format: &PixelFormat) -> Result<Vec<u32>, String> {
     Ok(values.into_iter().map(u32::from).collect())
 }
 
-/// JPEG 2000 of one channel and at most 16 bits, as a code stream or in a JP2 file.
+/// JPEG 2000 with one channel and at most 16 bits, as a code stream or in a JP2 file.
 ///
-/// The decoder counts values in floats of 32 bits and adds half of their range also to those with a sign, which need none
-/// (ISO/IEC 15444-1, G.1): it is taken off again.
+/// The decoder computes values in 32-bit floats and adds half of their range also to signed values, which need no shift
+/// (ISO/IEC 15444-1, G.1). This function subtracts it again.
 fn jpeg_2000(place: &str, bytes: &[u8], format: &PixelFormat) -> Result<Vec<u32>, String> {
     let (found, signed) = size_marker(bytes).ok_or("no JPEG 2000 picture")?;
     must_be(found, format, "JPEG 2000")?;
@@ -222,7 +222,7 @@ fn jpeg_2000(place: &str, bytes: &[u8], format: &PixelFormat) -> Result<Vec<u32>
         return Err(format!("a JPEG 2000 picture of {bits} bits, where at most 16 are read"));
     }
     let fail = |e: &dyn std::fmt::Display| format!("a JPEG 2000 picture that cannot be decoded: {e}");
-    // Coefficients and values of 32 bits, and the passes over them.
+    // Coefficients and values of 32 bits, and the decoder's passes.
     allowance::memory(place, "PixelData", (format.count() as u64).saturating_mul(16)).map_err(|e| e.to_string())?;
     let image = hayro_jpeg2000::Image::new(bytes, &hayro_jpeg2000::DecodeSettings::default()).map_err(|e| fail(&e))?;
     if (image.width() as usize, image.height() as usize) != (format.columns, format.rows) {
@@ -236,9 +236,9 @@ fn jpeg_2000(place: &str, bytes: &[u8], format: &PixelFormat) -> Result<Vec<u32>
     Ok(component.samples().iter().map(|x| (x - half).round().clamp(least, most) as i32 as u32).collect())
 }
 
-/// The frame in the SIZ marker of a JPEG 2000 code stream, and whether its values have a sign.
+/// The frame in the SIZ marker of a JPEG 2000 code stream, and whether its values are signed.
 fn size_marker(bytes: &[u8]) -> Option<(Frame, bool)> {
-    // SOC and SIZ; in a JP2 file they stand behind boxes.
+    // SOC and SIZ; in a JP2 file boxes precede them.
     let at = bytes.windows(4).position(|w| w == [0xff, 0x4f, 0xff, 0x51])? + 4;
     let four = |k: usize| bytes.get(at + k..at + k + 4).map(|b| b.iter().fold(0, |n, b| n << 8 | usize::from(*b)));
     let [columns, rows, left, top] = [four(4)?, four(8)?, four(12)?, four(16)?];
@@ -247,17 +247,17 @@ fn size_marker(bytes: &[u8]) -> Option<(Frame, bool)> {
     Some((((depth & 0x7f) + 1, rows.checked_sub(top)?, columns.checked_sub(left)?, channels), depth & 0x80 != 0))
 }
 
-/// Bits, rows, columns and channels of a picture.
+/// Bits, rows, columns and channels of an image.
 type Frame = (u8, usize, usize, u8);
 
-/// The frame of a JPEG picture.
+/// The frame of a JPEG image.
 fn frame(bytes: &[u8]) -> Option<Frame> {
     let two = |at: usize| bytes.get(at..at + 2).map(|b| usize::from(b[0]) << 8 | usize::from(b[1]));
     let mut at = 2;
     loop {
         match (bytes.get(at)?, bytes.get(at + 1)?) {
             (0xff, 0xff) => at += 1,
-            // A start of frame of any coding, F7 that of JPEG-LS; C4, C8 and CC among them are tables.
+            // Start of frame of any coding (F7: JPEG-LS). C4, C8 and CC, which lie among them, are tables.
             (0xff, 0xc0..=0xc3 | 0xc5..=0xc7 | 0xc9..=0xcb | 0xcd..=0xcf | 0xf7) => {
                 return Some((*bytes.get(at + 4)?, two(at + 5)?, two(at + 7)?, *bytes.get(at + 9)?));
             }
@@ -299,7 +299,7 @@ mod tests {
 
     #[test]
     fn run_lengths_unpack_and_lies_are_refused() {
-        // Six times 1 (257 − 251), then 2 3 as they are, a no-op, four times 9.
+        // Six times 1 (257 − 251), then literal 2 3, a no-op, four times 9.
         let good = segments(&[&[251, 1], &[1, 2, 3, 128, 253, 9]]);
         assert_eq!(run_length(&good, &TWO).unwrap(), [0x102, 0x103, 0x109, 0x109, 0x109, 0x109]);
         for (bad, word) in [

@@ -1,4 +1,4 @@
-//! What a volume needs of one file of a series.
+//! The part of a series' file that a volume needs.
 
 use super::lengths::{self, PixelStorage};
 use super::pixels::{self, PixelFormat};
@@ -8,7 +8,7 @@ use dicom_object::{DefaultDicomObject, OpenFileOptions, Tag};
 use std::io::Read;
 use std::path::{Path, PathBuf};
 
-/// An element with the name that errors give it.
+/// A tag with its name in errors.
 type Attribute = (Tag, &'static str);
 
 const PIXEL_DATA: Attribute = (Tag(0x7fe0, 0x0010), "PixelData");
@@ -31,21 +31,21 @@ const STORED: Attribute = (Tag(0x0028, 0x0101), "BitsStored");
 const HIGH: Attribute = (Tag(0x0028, 0x0102), "HighBit");
 const SIGN: Attribute = (Tag(0x0028, 0x0103), "PixelRepresentation");
 
-/// One slice without its values; lengths in mm, directions LPS.
+/// One slice without its values; lengths in mm, directions in LPS.
 #[derive(Debug)]
 pub(super) struct Slice {
     path: PathBuf,
-    /// The byte behind the pixels.
+    /// The byte after the pixels.
     end: u64,
     pub series: String,
-    /// Modality and description of the series, for people.
+    /// Modality and description of the series, for messages.
     pub about: String,
     pub modality: String,
-    /// Along a row (to the next column) and down a column (to the next row), of length 1.
+    /// Unit vectors along a row (to the next column) and down a column (to the next row).
     pub axes: [[f64; 3]; 2],
     /// Centre of the first pixel.
     pub position: [f64; 3],
-    /// From row to row and from column to column.
+    /// Distance from row to row and from column to column.
     pub spacing: [f64; 2],
     thickness: Option<f64>,
     rescale: [f64; 2],
@@ -54,7 +54,7 @@ pub(super) struct Slice {
     format: PixelFormat,
 }
 
-/// An open file's elements.
+/// The elements of an open file.
 struct Elements<'a> {
     place: &'a str,
     object: &'a DefaultDicomObject,
@@ -70,7 +70,7 @@ impl Elements<'_> {
         Some(text.trim_end_matches(['\0', ' ']).trim_start().to_owned()).filter(|t| !t.is_empty())
     }
 
-    /// `N` finite numbers, or `None` without such an element.
+    /// `N` finite numbers, or `None` if the element is missing.
     fn numbers<const N: usize>(&self, field: Attribute) -> Result<Option<[f64; N]>> {
         let Some(element) = self.object.get(field.0).filter(|e| e.value().multiplicity() > 0) else { return Ok(None) };
         let expected = || format!("{N} finite numbers");
@@ -91,7 +91,7 @@ impl Elements<'_> {
         element.to_int().map(Some).map_err(|e| self.invalid(field, e, "a whole number"))
     }
 
-    /// A whole number that `fits`, or `default` without such an element.
+    /// A whole number that `fits`, or `default` if the element is missing.
     fn within(
         &self,
         field: Attribute,
@@ -129,7 +129,7 @@ impl Elements<'_> {
     fn axes(&self) -> Result<[[f64; 3]; 2]> {
         let six = self.required::<6>(ORIENTATION)?;
         let axes = [[six[0], six[1], six[2]], [six[3], six[4], six[5]]];
-        // Files round the numbers: an axis is brought back to length 1.
+        // Files round the numbers: each axis is normalized again.
         if axes.iter().any(|a| (norm(*a) - 1.0).abs() > 1e-2) || dot(axes[0], axes[1]).abs() > 1e-2 {
             return Err(self.invalid(
                 ORIENTATION,
@@ -142,7 +142,7 @@ impl Elements<'_> {
 }
 
 impl Slice {
-    /// Reads all but the values of the DICOM file `path`, or `None` with a warning if there is no picture in it.
+    /// Reads everything but the values of the DICOM file `path`; `None` with a warning if it has no image.
     pub fn read(path: &Path) -> Result<Option<Self>> {
         let place = path.display().to_string();
         let (pixels, end) = lengths::check(path)?;
@@ -210,7 +210,7 @@ impl Slice {
         Ok(())
     }
 
-    /// The size of the voxels across a single slice.
+    /// Slice thickness, for a series of a single slice.
     pub fn thickness(&self) -> Result<f64> {
         let expected = "millimetres above 0, which a single slice needs";
         self.thickness.ok_or_else(|| Error::invalid(self.path.display().to_string(), THICKNESS.1, "none", expected))
@@ -219,7 +219,7 @@ impl Slice {
     /// The rescaled values, row after row.
     pub fn values(&self) -> Result<Vec<f32>> {
         let place = self.path.display().to_string();
-        // The library keeps the pieces that it reads and hands out copies.
+        // The library keeps the fragments it reads and returns copies.
         allowance::memory(&place, "PixelData", self.end.saturating_mul(2))?;
         let object = open(&self.path, self.end, OpenFileOptions::new().read_to(PIXEL_DATA.0))?;
         let element = object.get(PIXEL_DATA.0);
@@ -235,10 +235,10 @@ impl Slice {
     }
 }
 
-/// The first `end` bytes of a file: those whose lengths are known to be true.
+/// The first `end` bytes of a file, whose lengths have been checked.
 fn open(path: &Path, end: u64, options: OpenFileOptions) -> Result<DefaultDicomObject> {
     options.from_reader(files::open(path)?.0.take(end)).map_err(|e| {
-        // The outer message says only that reading failed; the reasons are below it.
+        // The outer message says only that reading failed; the causes are nested in it.
         let reasons: Vec<String> =
             std::iter::successors(std::error::Error::source(&e), |e| e.source()).map(ToString::to_string).collect();
         let found = if reasons.is_empty() { e.to_string() } else { reasons.join(": ") };

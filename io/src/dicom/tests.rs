@@ -1,4 +1,4 @@
-//! Series written with `dicom-object`, read back; then damaged in every way that was thought of.
+//! Series written with `dicom-object` and read back, then damaged in many ways.
 
 use crate::{is_volume, read_volume};
 use dicom_core::value::PixelFragmentSequence;
@@ -51,7 +51,7 @@ fn write(path: &Path, object: InMemDicomObject, syntax: &str) {
     object.with_meta(meta).unwrap().write_to_file(path).unwrap();
 }
 
-/// A folder with the slices 0 to 4, whose names run against their positions, each changed by `change`.
+/// A folder with the slices 0 to 4, whose names are in reverse order of position, each passed through `change`.
 fn series(syntax: &str, change: impl Fn(usize, &mut InMemDicomObject)) -> tempfile::TempDir {
     let dir = tempfile::tempdir().unwrap();
     for k in 0..5 {
@@ -99,7 +99,7 @@ fn run_lengths_and_icons_are_read() {
             bytes.extend(values.map(|v| v[byte]));
         }
         o.put(DataElement::new(PIXELS, VR::OB, PixelFragmentSequence::new_fragments(vec![bytes])));
-        // A picture within: its pixels are not the slice's.
+        // A nested image: its pixels are not the slice's.
         let mut icon = InMemDicomObject::new_empty();
         icon.put(DataElement::new(PIXELS, VR::OB, PrimitiveValue::from(vec![1u8, 2])));
         o.put(DataElement::new(Tag(0x0088, 0x0200), VR::SQ, dicom_core::value::DataSetSequence::from(vec![icon])));
@@ -196,7 +196,7 @@ fn series_that_are_no_volume_are_refused() {
     let empty = tempfile::tempdir().unwrap();
     assert!(!is_volume(empty.path()));
     refused(&empty, &["DICOM slices", "none among 0 files"]);
-    // One file of a series is no volume; its folder is.
+    // One file of a series is not a volume; its folder is.
     let dir = series(EXPLICIT, |_, _| {});
     assert!(is_volume(dir.path().join("5.dcm")));
     let e = read_volume(dir.path().join("5.dcm")).unwrap_err().to_string();
@@ -220,7 +220,7 @@ fn compressions_that_are_not_read_are_named() {
     }
 }
 
-/// The file with another transfer syntax in its description (whose length `dicom-object` does not compare).
+/// The file with another transfer syntax in its meta group (whose length `dicom-object` does not check).
 fn with_syntax(bytes: &[u8], syntax: &str) -> Vec<u8> {
     let mark = [2, 0, 0x10, 0, b'U', b'I'];
     let at = bytes.windows(6).position(|w| w == mark).unwrap();

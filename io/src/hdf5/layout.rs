@@ -4,9 +4,9 @@ use super::{Container, ScanPart};
 use conefield_core::Result;
 use hdf5_reader::Dataset;
 
-/// What a name in a file means.
+/// What a name in a file refers to.
 pub(super) enum Found {
-    /// A data set of its own.
+    /// A plain data set.
     Data(Box<Dataset>),
     /// A scan.
     Layout(Layout),
@@ -16,7 +16,8 @@ pub(super) enum Found {
 pub(super) enum Layout {
     /// Data Exchange: `data`, `data_white`, `data_dark` and `theta` in the group `exchange`.
     Exchange(String),
-    /// Frames of all kinds in one data set, told apart by an image key (0 projection, 1 open beam, 2 dark, 3 unusable).
+    /// Frames of all kinds in one data set, distinguished by an image key (0 projection, 1 open beam, 2 dark, 3
+    /// unusable).
     Keyed {
         frames: String,
         /// Absent: all frames are projections.
@@ -25,7 +26,8 @@ pub(super) enum Layout {
     },
 }
 
-/// Data sets in a group `G` that may hold frames, with where their image keys and angles may be: NXtomo, then CIL's writer.
+/// Data sets in a group `G` that may hold frames, with the possible places of their image keys and angles: NXtomo, then
+/// CIL's writer.
 const KEYED: &[(&str, &[&str], &[&str])] = &[
     (
         "instrument/detector/data",
@@ -35,11 +37,11 @@ const KEYED: &[(&str, &[&str], &[&str])] = &[
     ("data/data", &["data/image_key", "instrument/detector/image_key"], &["config/angles", "data/rotation_angle"]),
 ];
 
-/// Groups at the root that are looked into.
+/// Most groups at the root that are searched.
 const MOST_GROUPS: usize = 1000;
 
 impl Layout {
-    /// The layout in the group `name`; without one the only layout in the file.
+    /// The layout in the group `name`; without a name, the only layout in the file.
     pub fn find(file: &Container, name: Option<&str>) -> Result<Self> {
         let groups = match name {
             Some(group) => vec![group.trim_matches('/').to_owned()],
@@ -71,7 +73,7 @@ impl Layout {
         }
     }
 
-    /// The frames of `part`, and which of them belong to it.
+    /// The data set with the frames of `part`, and which of them belong to it.
     pub fn frames(&self, file: &Container, part: ScanPart) -> Result<(Dataset, Option<Vec<bool>>)> {
         match self {
             Self::Exchange(group) => {
@@ -108,7 +110,7 @@ impl Layout {
         }
     }
 
-    /// The angles of all frames, with the frames' keys.
+    /// The angles of all frames, with the frames' image keys.
     pub fn angles(&self, file: &Container) -> Result<(Dataset, Option<Vec<i64>>)> {
         match self {
             Self::Exchange(group) => Ok((file.needed(&format!("{group}/theta"))?, None)),
@@ -117,7 +119,7 @@ impl Layout {
                     Some(data) => data,
                     None => file.needed(&angles[0])?,
                 };
-                // CIL keeps the angles of the projections alone.
+                // CIL keeps angles of projections only.
                 let keys = self.keys(file)?.filter(|k| data.shape() == [k.len() as u64]);
                 Ok((data, keys))
             }

@@ -1,4 +1,4 @@
-//! Files that h5py wrote (`tests/fixtures/make_formats.py`), and what is done to them.
+//! Files written by h5py (`tests/fixtures/make_formats.py`), intact and damaged.
 
 use crate::scan_size;
 use crate::scanner::{ImportOptions, Imported, read_scanner};
@@ -15,7 +15,8 @@ fn fixture(name: &str) -> PathBuf {
     Path::new(env!("CARGO_MANIFEST_DIR")).join("tests/fixtures").join(name)
 }
 
-/// Imports a description with `files`, then `rest`, from a folder with all fixtures, the first `change`d.
+/// Imports a description with `files`, then `rest`, from a folder with all fixtures, the first one passed through
+/// `change`.
 fn import(files: &str, rest: &str, change: impl Fn(&mut Vec<u8>)) -> Result<Imported> {
     let dir = tempfile::tempdir().unwrap();
     for name in FIXTURES {
@@ -63,7 +64,7 @@ fn layouts_give_projections_fields_and_angles() {
     let named = "projections = \"nxtomo.nxs:/entry\"\nflat = \"dxchange.h5:exchange/data_white\"\ndark = \"dxchange.h5:/exchange\"";
     let named = import(named, &angles("dxchange.h5:/exchange/theta"), |_| {}).unwrap().scan;
     assert_eq!(named.projections, exchange.projections);
-    // A data set lies as the description says.
+    // The description gives the axes of a data set.
     let swapped =
         format!("{CIRCLE}range_deg = 360\n[layout]\naxes = [\"view\", \"column\", \"row\"]\n[values]\ni0 = 20000\n");
     let swapped = import("projections = \"dxchange.h5:/exchange/data\"", &swapped, |_| {}).unwrap().scan;
@@ -79,7 +80,7 @@ fn the_geometry_of_cil_is_that_of_its_conversion_to_vectors() {
     assert!((scan.projections[[2, 3, 4]] - 1.4723).abs() < 1e-6);
     let mm = Millimetres;
     for (view, angle) in scan.geometry.views.iter().zip([0.0, 120.0, 240.0]) {
-        // Source and detector go round by minus the angle, from below; the axis is half a millimetre aside.
+        // Source and detector rotate by minus the angle, from below; the axis is shifted by half a millimetre.
         let at = Radians(f64::to_radians(-90.0 - 10.0 - angle));
         let want = View::circular(at, mm(500.0), mm(800.0), [mm(1.5), mm(2.0)], [mm(0.0), mm(-0.5)]);
         let (s, c) = at.0.sin_cos();
@@ -87,7 +88,7 @@ fn the_geometry_of_cil_is_that_of_its_conversion_to_vectors() {
         for (found, want) in [(view.source, aside(want.source)), (view.detector, want.detector), (view.u, want.u)] {
             assert!((0..3).all(|k| (found[k] - want[k]).abs() < 1e-9), "{angle}: {found:?} {want:?}");
         }
-        // Its rows run up.
+        // Its rows run upwards.
         assert_eq!(view.v[2], 1.5);
     }
 }

@@ -1,10 +1,10 @@
-//! The few names that a pickle may use, and what they make. None of them is ever called: each is a rule for data.
+//! The few names that a pickle may use, and the values they create. None is ever called: each is a rule for data.
 
 use super::value::{Heap, Node, Refusal, Value};
 use crate::npy::element;
 use crate::number::{ByteOrder, Number};
 
-/// More axes than a scan or volume has.
+/// More axes than any scan or volume has.
 const MOST_AXES: usize = 8;
 
 /// A name that a pickle may use.
@@ -51,7 +51,7 @@ impl Global {
     }
 }
 
-/// How a NumPy array stores a number.
+/// How a NumPy array stores numbers.
 #[derive(Debug, Clone, Copy)]
 pub(super) struct Dtype {
     number: Number,
@@ -59,7 +59,7 @@ pub(super) struct Dtype {
 }
 
 impl Dtype {
-    /// From the text that NumPy gives it, e.g. `f4`.
+    /// From NumPy's name of the type, e.g. `f4`.
     pub fn named(name: &str) -> Result<Self, Refusal> {
         if name.trim_start_matches(['|', '<', '>', '=']).starts_with('O') {
             let expected = "numbers: objects would have to be made by calls";
@@ -74,7 +74,7 @@ impl Dtype {
         }
     }
 
-    /// With the state that NumPy adds: (version, byte order, subarray, names, fields, ...).
+    /// Applies the state that NumPy adds: (version, byte order, subarray, names, fields, ...).
     pub fn with_state<'a>(self, heap: &Heap<'a>, state: Value<'a>) -> Result<Self, Refusal> {
         let wrong = || Refusal::new(heap.kind(state), "the state of a dtype of plain numbers");
         let Some([_, order, subarray, names, fields, ..]) = heap.items(state) else { return Err(wrong()) };
@@ -91,11 +91,11 @@ impl Dtype {
     }
 }
 
-/// An array whose numbers still lie where the file has them.
+/// An array whose numbers are still in the file's bytes.
 #[derive(Debug)]
 pub(super) struct Array<'a> {
     dtype: Dtype,
-    /// Lengths in the order of storage, slowest first.
+    /// Lengths in storage order, slowest first.
     stored: Vec<usize>,
     /// Axis `k` of the array is axis `axes[k]` of the storage.
     axes: Vec<usize>,
@@ -120,7 +120,7 @@ impl<'a> Array<'a> {
         self.count
     }
 
-    /// The numbers as `f32`, in the order of storage; `None` if they do not fit in memory.
+    /// The numbers as `f32`, in storage order; `None` if they do not fit in memory.
     pub fn floats(&self, heap: &Heap<'a>) -> Option<Vec<f32>> {
         let mut out = Vec::new();
         out.try_reserve_exact(self.count).ok()?;
@@ -129,7 +129,7 @@ impl<'a> Array<'a> {
         Some(out)
     }
 
-    /// The numbers in the order of storage.
+    /// The numbers in storage order.
     pub fn numbers(&self, heap: &Heap<'a>) -> Vec<f64> {
         let mut out = Vec::new();
         self.dtype.number.decode(self.dtype.order, heap.bytes(self.data).unwrap_or_default(), &mut out, |x| x);
@@ -148,7 +148,7 @@ impl<'a> Array<'a> {
         Self::new(heap, data, dtype, shape, fortran)
     }
 
-    /// From the arguments of `_frombuffer`: data, dtype, shape, order and perhaps the axes that order "K" needs.
+    /// From the arguments of `_frombuffer`: data, dtype, shape, order and optionally the axes for order "K".
     pub fn from_buffer(heap: &Heap<'a>, arguments: Value<'a>) -> Result<Self, Refusal> {
         let wrong = || Refusal::new(heap.kind(arguments), "data, dtype, shape and order of an array");
         let (data, dtype, shape, order, axes) = match heap.items(arguments) {
@@ -201,7 +201,7 @@ impl<'a> Array<'a> {
     }
 }
 
-/// What a NumPy number holds: (dtype, data).
+/// The value of a NumPy scalar: (dtype, data).
 pub(super) fn scalar<'a>(heap: &Heap<'a>, arguments: Value<'a>) -> Result<Value<'a>, Refusal> {
     let wrong = || Refusal::new(heap.kind(arguments), "dtype and data of a number");
     let [dtype, data] = heap.tuple(arguments).ok_or_else(wrong)?;

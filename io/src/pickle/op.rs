@@ -4,7 +4,7 @@ macro_rules! opcodes {
     ($($name:ident = $code:literal)*) => {
         $(pub(super) const $name: u8 = $code;)*
 
-        /// What Python calls the opcode; `None` for a byte that is none.
+        /// Python's name of the opcode; `None` for a byte that is no opcode.
         pub(super) fn name(code: u8) -> Option<&'static str> {
             match code {
                 $($code => Some(stringify!($name)),)*

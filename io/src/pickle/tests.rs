@@ -2,7 +2,7 @@ use super::value::{Node, Value};
 use super::*;
 use ndarray::{ArrayD, IxDyn, array};
 
-/// `numpy.dtype(name, False, True)` with the state that NumPy gives it.
+/// `numpy.dtype(name, False, True)` with NumPy's state.
 fn dtype(name: &str, order: &str) -> Vec<u8> {
     let mut out = b"cnumpy\ndtype\n".to_vec();
     out.extend([op::SHORT_BINUNICODE, name.len() as u8]);
@@ -27,12 +27,12 @@ fn array_of(module: &str, name: &str, order: &str, shape: &[u8], fortran: bool, 
     out
 }
 
-/// A whole pickle of protocol 5.
+/// A complete pickle of protocol 5.
 fn whole(body: &[u8]) -> Vec<u8> {
     [&[op::PROTO, 5], body, b"."].concat()
 }
 
-/// The array in the entry `a` of a dict, or that stands alone.
+/// The array in the entry `a` of a dict, or at the top.
 fn array_in(bytes: &[u8], shape: &[usize]) -> ArrayD<f32> {
     Pickle::parse("a.pickle", bytes).unwrap().top().values(shape, "as the test says").unwrap()
 }
@@ -163,13 +163,13 @@ fn hostile_pickles_are_refused_in_words() {
     for (bytes, words) in &cases {
         refused(bytes, words);
     }
-    // What is encoded once may be mentioned often.
+    // A value that is encoded once may be used often.
     assert!(Pickle::parse("a", &encode_again(0)).is_ok());
 }
 
 #[test]
 fn what_is_said_twice_is_kept_once() {
-    // Ten lists, each holding the one before it ten times: ten thousand million values if they were copied.
+    // Ten lists, each holding the one before it ten times: ten billion values if they were copied.
     let mut body = b"]\x94".to_vec();
     for k in 0..10u8 {
         body.extend(b"](");
@@ -193,7 +193,7 @@ fn what_is_said_twice_is_kept_once() {
     assert!(a == b && matches!(p.heap.nodes[a], Node::Array(Some(_))));
 }
 
-/// A small file with everything that our writer makes.
+/// A small file with every kind of value that our writer produces.
 fn small() -> Vec<u8> {
     let entries = vec![
         ("a", Out::Int(300)),

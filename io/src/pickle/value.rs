@@ -1,29 +1,29 @@
-//! What a pickle holds, and how to look at it.
+//! The values of a pickle, and access to them.
 //!
-//! Lists, tuples, dicts and arrays lie in one [`Heap`] and are named by their number: what a file says twice is kept
-//! once, a structure that holds itself cannot leak, and nothing is freed by recursion.
+//! Lists, tuples, dicts and arrays live in one [`Heap`] and are referenced by index: values that occur twice are kept
+//! once, a structure that contains itself cannot leak, and nothing is freed by recursion.
 
 use super::numpy::{Array, Dtype, Global};
 use crate::memory;
 use conefield_core::{Error, Result, allowance};
 use ndarray::{ArrayD, Dimension, IxDyn};
 
-/// Nesting past this is no data set.
+/// Deeper nesting cannot be a data set.
 const DEEPEST: usize = 32;
 
-/// One value; everything of changing size is elsewhere.
+/// One value; data of variable size is elsewhere.
 #[derive(Debug, Clone, Copy)]
 pub(super) enum Value<'a> {
     None,
     Bool(bool),
     Int(i128),
     Float(f64),
-    /// Bytes of the file.
+    /// A slice of the file.
     Text(&'a str),
-    /// Bytes of the file.
+    /// A slice of the file.
     Bytes(&'a [u8]),
     Global(Global),
-    /// An entry of the heap.
+    /// An index into the heap.
     Node(usize),
 }
 
@@ -32,14 +32,14 @@ pub(super) enum Node<'a> {
     Tuple(Vec<Value<'a>>),
     List(Vec<Value<'a>>),
     Dict(Vec<(Value<'a>, Value<'a>)>),
-    /// What `_codecs.encode` gave.
+    /// The result of `_codecs.encode`.
     Encoded(Vec<u8>),
     Dtype(Dtype),
-    /// `None` until its state is known.
+    /// `None` until its state is set.
     Array(Option<Array<'a>>),
 }
 
-/// Why something cannot be used.
+/// Why a value cannot be used.
 pub(super) struct Refusal {
     pub found: String,
     pub expected: String,
@@ -72,7 +72,7 @@ impl<'a> Heap<'a> {
         }
     }
 
-    /// The items of a tuple of `N`.
+    /// The items of a tuple of length `N`.
     pub fn tuple<const N: usize>(&self, value: Value<'a>) -> Option<[Value<'a>; N]> {
         match self.node(value) {
             Some(Node::Tuple(v)) => v.as_slice().try_into().ok(),
@@ -80,7 +80,7 @@ impl<'a> Heap<'a> {
         }
     }
 
-    /// Python 2 wrote its texts as bytes.
+    /// The text; Python 2 wrote its texts as bytes.
     pub fn text(&self, value: Value<'a>) -> Option<&'a str> {
         match value {
             Value::Text(t) => Some(t),
@@ -97,7 +97,7 @@ impl<'a> Heap<'a> {
         }
     }
 
-    /// The value in words.
+    /// The kind of value, for errors.
     pub fn kind(&self, value: Value<'a>) -> String {
         let cut =
             |t: &str| if t.chars().count() > 40 { t.chars().take(40).chain(['…']).collect() } else { t.to_owned() };
@@ -128,14 +128,14 @@ impl<'a> Heap<'a> {
         }
     }
 
-    /// Refuses what holds itself or nests too deep below `top`. Without recursion, as the file decides how deep.
+    /// Refuses cycles and too deep nesting below `top`. Not recursive, because the file decides the depth.
     pub fn check_nesting(&self, top: Value<'a>) -> Result<(), Refusal> {
         const ON_PATH: usize = usize::MAX;
         let Value::Node(top) = top else { return Ok(()) };
         let too_deep = || Refusal::new(format!("values nested deeper than {DEEPEST}"), "a flat description of a scan");
-        // Levels in and below a node, 0 for one not seen yet.
+        // Levels in and below a node, 0 if not visited yet.
         let mut height = vec![0usize; self.nodes.len()];
-        // Node, its next child, levels below it so far.
+        // Node, its next child, levels found below it so far.
         let mut path = vec![(top, 0usize, 0usize)];
         loop {
             let depth = path.len();
@@ -168,7 +168,7 @@ impl<'a> Heap<'a> {
     }
 }
 
-/// A pickle that was read.
+/// A parsed pickle.
 pub(crate) struct Pickle<'a> {
     pub(super) place: String,
     pub(super) heap: Heap<'a>,
@@ -176,13 +176,13 @@ pub(crate) struct Pickle<'a> {
 }
 
 impl<'a> Pickle<'a> {
-    /// The value that was pickled.
+    /// The pickled value.
     pub fn top(&self) -> Item<'_, 'a> {
         Item { pickle: self, value: self.top, key: String::new() }
     }
 }
 
-/// One value of a pickle with the path of keys to it.
+/// One value of a pickle with its key path.
 #[derive(Clone)]
 pub(crate) struct Item<'p, 'a> {
     pickle: &'p Pickle<'a>,
@@ -191,7 +191,7 @@ pub(crate) struct Item<'p, 'a> {
 }
 
 impl<'p, 'a> Item<'p, 'a> {
-    /// The keys that lead here, joined by dots.
+    /// The key path, joined by dots.
     pub fn key(&self) -> &str {
         if self.key.is_empty() { "content" } else { &self.key }
     }
@@ -217,14 +217,14 @@ impl<'p, 'a> Item<'p, 'a> {
         }
     }
 
-    /// The texts among the keys of a dict.
+    /// The text keys of a dict.
     pub fn keys(&self) -> Result<Vec<&'a str>> {
         Ok(self.entries()?.iter().filter_map(|(k, _)| self.pickle.heap.text(*k)).collect())
     }
 
-    /// The entry `key` of a dict; `None` if there is no such key or it stands for Python's `None`.
+    /// The entry `key` of a dict; `None` if the key is missing or the value is Python's `None`.
     pub fn get(&self, key: &str) -> Result<Option<Self>> {
-        // As in Python, the last of equal keys counts.
+        // As in Python, the last of equal keys wins.
         let found = self.entries()?.iter().rev().find(|(k, _)| self.pickle.heap.text(*k) == Some(key));
         let path = if self.key.is_empty() { key.to_owned() } else { format!("{}.{key}", self.key) };
         Ok(found.filter(|(_, v)| !matches!(v, Value::None)).map(|(_, value)| Self {

@@ -4,7 +4,7 @@ use super::op;
 use ndarray::ArrayViewD;
 use std::io::{Result, Write};
 
-/// What can be written.
+/// A value to write.
 pub(crate) enum Out<'a> {
     None,
     Bool(bool),
@@ -84,8 +84,8 @@ fn global(w: &mut dyn Write, module: &str, name: &str) -> Result<()> {
     w.write_all(&[op::STACK_GLOBAL])
 }
 
-/// As NumPy itself: `_reconstruct(ndarray, (0,), b"b")`, then its state. The name without the underscore is the one
-/// that both versions know.
+/// As NumPy writes it: `_reconstruct(ndarray, (0,), b"b")`, then its state. Both versions know the name without the
+/// underscore.
 fn array(
     w: &mut dyn Write,
     dtype: &str,

@@ -1,7 +1,8 @@
-//! The geometry in a NeXus file of CIL's `NEXUSDataWriter`: cone beam, an object that turns.
+//! The geometry in a NeXus file of CIL's `NEXUSDataWriter`: cone beam, rotating object.
 //!
-//! Source of the layout: CIL (`cil.io.NEXUSDataReader`); of the direction in which the object turns, its conversion to ASTRA's
-//! vectors, by which source and detector go round the object by minus the angle. CIL names no unit of length; here it is mm.
+//! Source of the layout: CIL (`cil.io.NEXUSDataReader`). Source of the direction of rotation: CIL's conversion to
+//! ASTRA's vectors, in which source and detector rotate about the object by minus the angle. CIL names no unit of
+//! length; conefield uses mm.
 
 use super::turning::TurningObject;
 use crate::hdf5::Container;
@@ -11,7 +12,7 @@ use std::path::Path;
 
 const ENTRY: &str = "entry1/tomo_entry";
 
-/// The views, one for each angle of the file.
+/// The views, one per angle of the file.
 pub(super) fn views(path: &Path) -> Result<Vec<View>> {
     let file = Container::open(path)?;
     let data = file.needed(&format!("{ENTRY}/data/data"))?;

@@ -7,7 +7,7 @@ use ndarray::{Array3, Axis};
 use std::fs;
 use std::path::PathBuf;
 
-/// The description of the shared counts, with the geometry that `ellipsoids_50_r2` has.
+/// The description of the shared counts, with the geometry of `ellipsoids_50_r2`.
 const ELLIPSOIDS: &str = r#"format = "conefield-scanner"
 version = 1
 
@@ -32,7 +32,7 @@ shape = [64, 64, 64]
 spacing = [1.5625, 1.5625, 1.5625]
 "#;
 
-/// The shared counts with a description to be changed, and the scan whose projections are exact.
+/// The shared counts with an editable description, and the scan with exact projections.
 struct Ellipsoids {
     dir: tempfile::TempDir,
     exact: DataSet,
@@ -61,7 +61,7 @@ impl Ellipsoids {
         self.import(&text, &ImportOptions::default()).unwrap().scan
     }
 
-    /// The exact line integrals of the views that the counts are of.
+    /// The exact line integrals of the views in the counts.
     fn truth(&self) -> Array3<f32> {
         let all = &self.exact.train.projections;
         let every_other: Vec<usize> = (0..25).map(|i| 2 * i).collect();
@@ -109,8 +109,8 @@ fn counts_through_flat_and_dark_are_the_line_integrals_within_the_noise() {
     println!("rms {:.5}, in units of the noise {normalised:.4}, mean {mean:.6}", rms(found, &truth));
     assert!((0.95..1.05).contains(&normalised), "{normalised}");
     assert!(mean.abs() < 2e-4, "{mean}");
-    // The flat field of this file is one from which the dark field has been taken off. Said wrongly, everything is
-    // too low by −ln(1 − 110/20 890), less than the noise of a pixel but far more than that of the mean.
+    // The dark field has been subtracted from this file's flat field. The opposite flag makes everything too low by
+    // −ln(1 − 110/20 890), less than the noise of a pixel but far more than that of the mean.
     let wrong = e.changed(&[("flat_includes_dark = false", "flat_includes_dark = true")]);
     let shift: f64 = wrong.projections.iter().zip(&truth).map(|(a, t)| f64::from(a - t)).sum::<f64>();
     let shift = shift / truth.len() as f64;
@@ -121,7 +121,7 @@ fn counts_through_flat_and_dark_are_the_line_integrals_within_the_noise() {
     let complaints = |scan: &Scan| check_line_integrals(scan.projections.view()).complaints;
     assert!(complaints(&imported.scan).is_empty());
 
-    // Without the flat field the beam's shape stays in the picture, and the estimate at the border is what it is.
+    // Without the flat field the beam's shape stays in the projections, and the estimate at the border is rough.
     let air = ImportOptions { i0: Some(I0::Air), ..ImportOptions::default() };
     let by_air = e.import(ELLIPSOIDS, &air).unwrap();
     let number = ImportOptions { i0: Some(I0::Number(21000.0)), ..ImportOptions::default() };
@@ -129,10 +129,10 @@ fn counts_through_flat_and_dark_are_the_line_integrals_within_the_noise() {
     let (air, number) = (rms(&by_air.scan.projections, &truth), rms(&by_number.scan.projections, &truth));
     println!("air {air:.4}, number {number:.4}");
     assert!(air < 0.1 && number < 0.1 && air > 2.0 * rms(found, &truth), "{air} {number}");
-    // Where the beam is brighter than the one number, air comes out negative, and that is told.
+    // If the beam is brighter than the single number, air becomes negative; a warning says so.
     assert!(complaints(&by_number.scan)[0].contains("I0 is too low"));
 
-    // Taken for line integrals, the counts are told for what they are.
+    // Counts read as line integrals are recognized.
     let raw = ELLIPSOIDS
         .replace("flat = \"scan.npz:flat\"\ndark = \"scan.npz:dark\"", "")
         .replace("flat_includes_dark = false", "kind = \"line-integrals\"");
@@ -186,12 +186,12 @@ fn every_way_to_say_the_geometry_gives_the_same_scan() {
     let row = |v: &View| format!("{:?}", [v.source, v.detector, v.u, v.v].concat());
     let rows: Vec<String> = want.geometry.views.iter().map(row).collect();
     near(&e.changed(&[(circle, &format!("[vectors]\ncone_vec = [{}]\n\n", rows.join(",\n")))]));
-    // RTK's rows run up: the stack is turned over for it, and back by the reader.
+    // RTK's rows run up: the stack is flipped for it, and the reader flips it back.
     let xml = e.dir.path().join("geometry.xml");
     assert!(crate::write_rtk_geometry(&xml, &want.geometry.views).unwrap());
     let rtk = "[rtk]\nfile = \"geometry.xml\"\npixel = { u = 2.0, v = 2.0 }\n[layout]\nflip_rows = true\n\n";
     near(&e.changed(&[(circle, rtk)]));
-    // Written as conefield's own folder it comes back.
+    // Written as conefield's own folder, the scan is read back unchanged.
     let folder = e.dir.path().join("out");
     write_scan(&folder, &want, None).unwrap();
     near(&read_scan(&folder).unwrap());
@@ -282,7 +282,7 @@ fn hostile_descriptions_and_files_are_refused_in_words() {
     edit("\"views\"", "\"none\"", &["files.projections", "none"]);
     edit("\"views\"", "3", &["projections", "a file name or a list of file names"]);
     edit("\"flat.tif\"", "\"flat.tif:a\"", &["files.flat"]);
-    // An odd number of numbers a view, or of views.
+    // A wrong number of values per view, or of views.
     let circle = |t: &str| t[t.find("[circle]").unwrap()..t.find("[volume]").unwrap()].to_string();
     let vectors = |list: &str| format!("[vectors]\ncone_vec = [{list}]\n\n");
     refused(&|_, t| t.replace(&circle(&t), &vectors("[1.0, 2.0]")), &["cone_vec[0]", "2 numbers", "expected 12"]);
@@ -293,7 +293,7 @@ fn hostile_descriptions_and_files_are_refused_in_words() {
     refused(&|_, t| t.replace(&circle(&t), ""), &["circle", "nothing", "one of [circle]"]);
     let rtk = "[rtk]\nfile = \"../g.xml\"\npixel = { u = 1, v = 1 }\n\n";
     refused(&|_, t| t.replace(&circle(&t), rtk), &["rtk.file", "without \"..\""]);
-    // Files that are not what they seem.
+    // Files of the wrong content.
     let with = |name: &'static str, bytes: Vec<u8>, words: &[&str]| {
         refused(
             &|dir, t| {

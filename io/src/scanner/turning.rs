@@ -1,26 +1,26 @@
-//! Source and detector at rest, an object that turns between them: how CIL and Nikon describe a scan.
+//! A fixed source and detector with an object rotating between them: the geometry of CIL and Nikon.
 
 use conefield_core::geometry::{Vec3, View, cross, dot, norm, sub};
 
-/// Everything in the frame of the laboratory, in mm; the object turns.
+/// All in the laboratory frame, in mm; the object rotates.
 #[derive(Debug, Clone, Copy)]
 pub(super) struct TurningObject {
     pub source: Vec3,
     /// The detector's centre.
     pub detector: Vec3,
-    /// The step to the next column and to the next row.
+    /// The steps to the next column and to the next row.
     pub u: Vec3,
     pub v: Vec3,
-    /// A point of the rotation axis and its direction, of any length above 0.
+    /// A point of the rotation axis, and its direction, of any length above 0.
     pub axis: Vec3,
     pub axis_direction: Vec3,
 }
 
 impl TurningObject {
-    /// The views in the object's frame, whose origin is the axis' point and whose z is the axis. `turns` are the angles, in degrees,
-    /// by which source and detector go round it, counterclockwise seen from +z.
+    /// The views in the object's frame, whose origin is the axis' point and whose z is the axis. `turns` are the
+    /// angles, in degrees, by which source and detector rotate about it, counterclockwise seen from +z.
     ///
-    /// The frame is tipped by the smallest rotation that brings the axis to z (Rodrigues' formula).
+    /// The smallest rotation that brings the axis to z tilts the frame (Rodrigues' formula).
     pub fn views(&self, turns: impl Iterator<Item = f64>) -> Vec<View> {
         let length = norm(self.axis_direction);
         let d = self.axis_direction.map(|x| x / length);
@@ -37,7 +37,7 @@ impl TurningObject {
     }
 }
 
-/// `p` under the smallest rotation that brings the unit vector `d` to z.
+/// Rotates `p` by the smallest rotation that brings the unit vector `d` to z.
 fn tip(d: Vec3, p: Vec3) -> Vec3 {
     let c = d[2];
     if c <= -1.0 + 1e-12 {
@@ -87,7 +87,7 @@ mod tests {
             let d = direction.map(|x| x / norm(direction));
             near(tip(d, d), [0.0, 0.0, 1.0]);
             let view = tipped.views([40.0].into_iter())[0];
-            // The axis' distance from the source's ray to the detector's centre does not change, nor do lengths.
+            // Lengths, and the distance from the axis to the central ray, do not change.
             let away = |p: Vec3, q: Vec3| norm(sub(p, q));
             assert!((away(view.source, view.detector) - 800.0).abs() < 1e-9);
             assert!((norm(view.source) - away(rest.source, axis)).abs() < 1e-9);

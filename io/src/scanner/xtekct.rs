@@ -1,9 +1,10 @@
-//! Nikon's scan description `.xtekct`: an INI file beside the folder of its 16-bit TIFFs.
+//! Nikon's scan description `.xtekct`: an INI file next to the folder of its 16-bit TIFFs.
 //!
-//! Lengths are mm, angles degrees. Source of the meaning of the keys: CIL (`cil.io.NikonDataReader`): the source looks along +y on a
-//! detector whose first pixel is at the top right, at the distance `SrcToDetector`; the object turns at `SrcToObject`, with its axis
-//! `ObjectOffsetX` to the left (without that key: as the centres of rotation at the top and bottom of the detector say, by the
-//! magnification), rolled about the ray and tilted towards it. Counts of the open beam are `WhiteLevel`.
+//! Lengths are mm, angles degrees. Source of the meaning of the keys: CIL (`cil.io.NikonDataReader`). The source looks
+//! along +y at a detector whose first pixel is at the top right, at the distance `SrcToDetector`. The object rotates at
+//! the distance `SrcToObject`, with its axis `ObjectOffsetX` to the left (without that key, computed from the centres
+//! of rotation at the top and bottom of the detector and the magnification), rolled about the ray and tilted towards
+//! it. `WhiteLevel` is the open-beam count.
 
 use super::turning::TurningObject;
 use super::{Description, Files, I0Text, LayoutTable, ValueKind, ValuesTable, Vectors};
@@ -16,10 +17,10 @@ use conefield_core::{Error, Result};
 use std::collections::HashMap;
 use std::path::Path;
 
-/// Views that a description may claim: a circle in steps of four seconds of arc.
+/// Most views of a description: a circle in steps of about one second of arc.
 const MOST_VIEWS: f64 = 1e6;
 
-/// Whether the name of `path` is that of such a file.
+/// Whether `path` has the extension of such a file.
 pub(crate) fn is_xtekct(path: &Path) -> bool {
     path.extension().is_some_and(|e| e.eq_ignore_ascii_case("xtekct"))
 }
@@ -79,7 +80,7 @@ pub(super) fn description(path: &Path) -> Result<Description> {
     })
 }
 
-/// The images: by their names as the description makes them, else all of the folder.
+/// The images: by the names that the description implies, else all of the folder.
 fn projections(keys: &Keys, path: &Path, count: usize) -> Names {
     let text = |key| keys.0.get(key).map_or("", |v| v.as_str());
     let folder = match text("InputFolderName") {
@@ -94,7 +95,7 @@ fn projections(keys: &Keys, path: &Path, count: usize) -> Names {
     }
 }
 
-/// The volume that the file names, else as many voxels as pixels, in the size of a pixel at the axis.
+/// The volume in the file, else as many voxels as pixels, with the pixel size at the axis.
 fn volume(keys: &Keys, [columns, rows]: [usize; 2], [across, along]: [f64; 2]) -> Result<VoxelGrid> {
     let axes = ["X", "Y", "Z"];
     let named = axes.iter().all(|a| keys.0.contains_key(&format!("Voxels{a}")));
@@ -120,7 +121,7 @@ impl Keys {
         for (i, line) in text.lines().enumerate() {
             let Some((key, value)) = line.split_once('=') else { continue };
             let (key, value) = (key.trim().to_owned(), value.trim().to_owned());
-            // Later sections say of other devices what has the same name.
+            // Later sections may use the same names for other devices.
             if all.get(&key).is_some_and(|v| *v != value) && KNOWN.contains(&key.as_str()) {
                 let at = format!("{place}: line {}", i + 1);
                 return Err(Error::invalid(at, key, format!("a second value, {value}"), "one value"));
@@ -150,7 +151,7 @@ impl Keys {
     }
 }
 
-/// Keys that say the geometry: two values of one would leave it open.
+/// Keys of the geometry: two different values of one are an error.
 const KNOWN: &[&str] = &[
     "Projections",
     "WhiteLevel",
@@ -198,8 +199,8 @@ mod tests {
         assert_eq!(crate::scan_size(&path).unwrap().pixels, 60);
         let mm = Millimetres;
         for (view, i) in scan.geometry.views.iter().zip(0..) {
-            // The source starts below; its columns run against ours. The axis is 1 mm to the left: seen from it the source is
-            // 1 mm to the right, as the first pixel is.
+            // The source starts below; its columns run against ours. The axis is 1 mm to the left: relative to it,
+            // source and first pixel are 1 mm to the right.
             let at = Radians(f64::to_radians(30.0 + 120.0 * f64::from(i) - 180.0 - 90.0));
             let want = View::circular(at, mm(500.0), mm(800.0), [mm(1.5), mm(2.0)], [mm(0.0); 2]);
             let (s, c) = at.0.sin_cos();
@@ -213,7 +214,7 @@ mod tests {
                 assert!((0..3).all(|k| (found[k] - want[k]).abs() < 1e-9), "{i}: {found:?} {want:?}");
             }
         }
-        // Without sizes of voxels they are those of the pixels at the axis.
+        // Default voxel sizes are the pixel sizes at the axis.
         let without: String = TEXT.lines().filter(|l| !l.starts_with("Voxel")).flat_map(|l| [l, "\n"]).collect();
         let (_dir, path) = written(&without);
         let grid = crate::read_scan(&path).unwrap().geometry.volume;

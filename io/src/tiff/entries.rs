@@ -1,7 +1,7 @@
-//! A walk along the directories of a TIFF that looks only at the lengths of their entries.
+//! A walk over the directories of a TIFF that checks only the lengths of their entries.
 //!
-//! The `tiff` crate takes memory for what an entry claims, at the first page up to 256 MiB whatever the file's size,
-//! and tells a text that is too long for it on standard error. This keeps claims within the file.
+//! The `tiff` crate allocates what an entry claims, on the first page up to 256 MiB whatever the file's size, and
+//! prints an overlong text to standard error. This check keeps claims within the file's size.
 
 use conefield_core::{Error, Result};
 use std::collections::HashSet;
@@ -13,7 +13,7 @@ struct EntryWalk<'a, R> {
     big_tiff: bool,
 }
 
-/// Refuses an entry of more bytes than the `size` of the whole file. Other damage is left for the reader to tell.
+/// Refuses an entry longer than the `size` of the whole file. The reader reports other damage.
 pub(super) fn check(place: &str, reader: &mut (impl Read + Seek), size: u64) -> Result<()> {
     let mut mark = [0; 4];
     if reader.rewind().and_then(|()| reader.read_exact(&mut mark)).is_err() {
@@ -35,16 +35,16 @@ pub(super) fn check(place: &str, reader: &mut (impl Read + Seek), size: u64) -> 
 }
 
 impl<R: Read + Seek> EntryWalk<'_, R> {
-    /// Where the first directory stands.
+    /// Offset of the first directory.
     fn first(&mut self) -> Option<u64> {
         if self.big_tiff {
-            // The size of an offset, always eight, stands before it.
+            // The size of an offset, always eight, precedes it.
             self.number(4)?;
         }
         self.offset()
     }
 
-    /// Where the directory behind the one at `at` stands; `None` at the end of the file as well.
+    /// Offset of the directory after the one at `at`; `None` also at the end of the file.
     fn directory(&mut self, at: u64, size: u64) -> Result<Option<u64>, String> {
         let (count_bytes, entry_bytes) = if self.big_tiff { (8, 20) } else { (2, 12) };
         if self.reader.seek(SeekFrom::Start(at)).is_err() {
@@ -64,7 +64,7 @@ impl<R: Read + Seek> EntryWalk<'_, R> {
         Ok(self.offset())
     }
 
-    /// Tag, kind and number of values.
+    /// Tag, type and number of values.
     fn entry(&mut self) -> Option<[u64; 3]> {
         let found = [self.number(2)?, self.number(2)?, self.offset()?];
         self.offset()?;
@@ -86,7 +86,7 @@ impl<R: Read + Seek> EntryWalk<'_, R> {
     }
 }
 
-/// Bytes a value of a kind; those that are not known count as the longest.
+/// Bytes per value of a type; unknown types count as the longest.
 fn bytes_of(kind: u64) -> u64 {
     match kind {
         1 | 2 | 6 | 7 => 1,

@@ -1,8 +1,9 @@
-//! A volume as a stack: a page a slice along z, rows along y, columns along x, 32-bit floats.
+//! Writes a volume as a stack: one page per slice along z, rows along y, columns along x, 32-bit floats.
 //!
-//! All directories come first, then all pixels in one piece, so that the file is written front to back. Above 4 GiB it is a
-//! BigTIFF. The first page describes the stack in the words of ImageJ, which `tifffile`, Fiji and napari understand: slices, and their
-//! distance in mm; the pixel size is in the resolution. Where the volume lies is not kept.
+//! All directories come first, then all pixels in one piece, so that the file is written front to back. Above 4 GiB it
+//! is a BigTIFF. The first page describes the stack in ImageJ's terms, which `tifffile`, Fiji and napari understand:
+//! the number of slices and their distance in mm; the resolution gives the pixel size. The volume's position is not
+//! stored.
 
 use crate::file_order::{self, FileOrder};
 use conefield_core::error::ensure;
@@ -11,20 +12,20 @@ use conefield_core::{Error, Result};
 use std::io::Write;
 use std::path::Path;
 
-/// Largest distance in a TIFF that is no BigTIFF.
+/// Largest offset in a TIFF that is not a BigTIFF.
 const CLASSIC: u64 = u32::MAX as u64;
 
-/// Directory entries of a page.
+/// Directory entries per page.
 const ENTRIES: u64 = 14;
 
-/// Kinds of entries.
+/// Types of entries.
 const TEXT: u16 = 2;
 const SHORT: u16 = 3;
 const LONG: u16 = 4;
 const RATIO: u16 = 5;
 const LONG8: u16 = 16;
 
-/// Refuses a shape of which a slice is no page: its sides are numbers of 32 bits.
+/// Refuses a shape whose slice does not fit a page: its sides are 32-bit numbers.
 pub(crate) fn check_shape(place: &str, shape: [usize; 3]) -> Result<()> {
     let fits = shape.iter().all(|n| u32::try_from(*n).is_ok());
     ensure(fits, place, "shape", format!("{shape:?}"), format!("at most {} along each axis", u32::MAX))
@@ -38,11 +39,11 @@ pub(crate) fn write(w: &mut dyn Write, path: &Path, voxels: &mut dyn Voxels) -> 
     file_order::write(w, path, voxels, FileOrder::XFastest)
 }
 
-/// All but the pixels.
+/// Everything before the pixels.
 struct Head {
     /// Columns, rows, pages.
     shape: [u64; 3],
-    /// Pixels a mm, as a fraction.
+    /// Pixels per mm, as a fraction.
     resolution: [[u32; 2]; 2],
     text: String,
     big: bool,
@@ -54,7 +55,7 @@ impl Head {
         let pages = shape[2];
         let text =
             format!("ImageJ=1.54f\nimages={pages}\nslices={pages}\nunit=mm\nspacing={}\nloop=false\n\0", spacing[2]);
-        // The largest power of ten whose product with the size fits: decimal sizes are kept.
+        // The largest power of ten whose product with the size fits keeps decimal sizes exact.
         let ratio = |s: f64| {
             let fits = |n: &u32| f64::from(*n) * s <= f64::from(u32::MAX);
             let top = (0..10).rev().map(|k| 10u32.pow(k)).find(fits).unwrap_or(1);
@@ -73,7 +74,7 @@ impl Head {
         if self.big { 8 + 20 * ENTRIES + 8 } else { 2 + 12 * ENTRIES + 4 }
     }
 
-    /// Where the text and, behind it, the two fractions stand.
+    /// Offset of the text; the two fractions follow it.
     fn text_at(&self) -> u64 {
         self.header_bytes() + self.shape[2] * self.directory_bytes()
     }
@@ -115,7 +116,7 @@ impl Head {
         let page_bytes = 4 * columns * rows;
         let long = if self.big { LONG8 } else { LONG };
         let ratios = self.ratios_at();
-        // The text belongs to the first page; to the others a shorter one, its end.
+        // The text belongs to the first page; the other pages get a shorter one, its end.
         let text = if page == 0 { 0 } else { self.text.len() as u64 - 1 };
         let entries: [(u16, u16, u64, u64); ENTRIES as usize] = [
             (256, LONG, 1, columns),
@@ -126,13 +127,13 @@ impl Head {
             (262, SHORT, 1, 1),
             (270, TEXT, self.text.len() as u64 - text, if page == 0 { self.text_at() } else { 0 }),
             (273, long, 1, self.length() + page * page_bytes),
-            // Samples a pixel.
+            // Samples per pixel.
             (277, SHORT, 1, 1),
             (278, LONG, 1, rows),
             (279, long, 1, page_bytes),
             (282, RATIO, 1, ratios),
             (283, RATIO, 1, ratios + 8),
-            // The resolution's unit is in the text.
+            // The text names the resolution's unit.
             (296, SHORT, 1, 1),
             // Floats.
             (339, SHORT, 1, 3),
@@ -146,7 +147,7 @@ impl Head {
             out.extend(tag.to_le_bytes());
             out.extend(kind.to_le_bytes());
             self.offset(out, count);
-            // A fraction fills the value of a BigTIFF itself.
+            // In a BigTIFF a fraction fits into the value field.
             if self.big && kind == RATIO {
                 let [a, b] = self.resolution[usize::from(tag - 282)];
                 out.extend([a, b].iter().flat_map(|x| x.to_le_bytes()));

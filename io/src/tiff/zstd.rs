@@ -1,7 +1,7 @@
-//! Pages that Zstandard packs (compression 50000), which the `tiff` crate leaves to a library in C.
+//! Pages compressed by Zstandard (compression 50000), which the `tiff` crate leaves to a C library.
 //!
-//! The strips or tiles are unpacked by `ruzstd`; differences between neighbours are summed as the predictor says (TIFF 6.0, section
-//! 14; Adobe's Technical Note 3 for floats).
+//! `ruzstd` decompresses the strips or tiles; this module undoes the predictor (TIFF 6.0, section 14; Adobe's Technical
+//! Note 3 for floats).
 
 use crate::number::{ByteOrder, Number};
 use conefield_core::{Error, Result, allowance};
@@ -10,18 +10,18 @@ use std::io::{Read, Seek, SeekFrom};
 use tiff::decoder::{ChunkType, Decoder};
 use tiff::tags::Tag;
 
-/// The value of the tag Compression.
+/// Value of the Compression tag.
 const ZSTD: u32 = 50_000;
 
-/// Zstandard's own encoder looks back as far as this at most.
+/// Largest window of Zstandard's own encoder.
 const WINDOW: u64 = 8 << 20;
 
-/// Whether the page that `decoder` stands at is packed by Zstandard.
+/// Whether Zstandard compresses the current page of `decoder`.
 pub(super) fn is_packed(decoder: &mut Decoder<impl Read + Seek>) -> bool {
     decoder.find_tag_unsigned::<u32>(Tag::Compression).is_ok_and(|c| c == Some(ZSTD))
 }
 
-/// The `rows` × `columns` values of `bits` bits of the page that `decoder` stands at, row after row, appended to `out`.
+/// Appends the `rows` × `columns` values of `bits` bits of the current page of `decoder` to `out`, row by row.
 pub(super) fn read(
     place: &str,
     decoder: &mut Decoder<impl Read + Seek>,
@@ -39,13 +39,13 @@ pub(super) fn read(
         if row >= rows {
             break;
         }
-        // The last strip ends with the page, a tile goes on beyond it.
+        // The last strip ends with the page; a tile extends beyond it.
         let height = if page.tiled { page.chunk[0] } else { page.chunk[0].min(rows - row) };
         let packed = page.bytes(decoder.inner(), at, size)?;
         let mut raw = page.unpack(&packed, height)?;
         page.sum(&mut raw);
         values.clear();
-        // Floats that are stored as differences have their highest byte first.
+        // The float predictor stores the highest byte first.
         let order = if page.predictor == 3 { ByteOrder::Big } else { page.order };
         page.number.decode(order, &raw, &mut values, |x| x as f32);
         let width = page.chunk[1].min(columns - column);
@@ -119,7 +119,7 @@ impl<'a> Page<'a> {
         }
         let pieces = chunk.iter().all(|n| *n > 0).then(|| rows.div_ceil(chunk[0]) * columns.div_ceil(chunk[1]));
         let fits = pieces == Some(offsets.len()) && offsets.len() == sizes.len();
-        // A tile is about as large as its page at most.
+        // A tile is at most about as large as its page.
         let within = !tiled || (chunk[0] <= rows.max(1 << 12) && chunk[1] <= columns.max(1 << 12));
         if !(fits && within) {
             let found = format!("{} strips or tiles of {} x {} pixels", offsets.len(), chunk[0], chunk[1]);
@@ -128,7 +128,7 @@ impl<'a> Page<'a> {
         Ok(Self { place, number, order, predictor, tiled, chunk, offsets, sizes })
     }
 
-    /// The packed bytes of a strip or tile.
+    /// The compressed bytes of a strip or tile.
     fn bytes(&self, reader: &mut (impl Read + Seek), at: u64, size: u64) -> Result<Vec<u8>> {
         let mut packed = Vec::new();
         let read = reader.seek(SeekFrom::Start(at)).and_then(|_| reader.take(size).read_to_end(&mut packed));
@@ -142,7 +142,7 @@ impl<'a> Page<'a> {
     /// The bytes of `height` rows of a strip or tile.
     fn unpack(&self, packed: &[u8], height: usize) -> Result<Vec<u8>> {
         let want = height * self.chunk[1] * self.number.bytes();
-        // With what the decoder looks back on.
+        // Includes the decoder's window.
         allowance::memory(self.place, "strip", (want as u64).saturating_mul(2).saturating_add(WINDOW))?;
         let mut decoder = FrameDecoder::new();
         decoder.set_max_window_size(WINDOW.max(want as u64));
@@ -161,7 +161,7 @@ impl<'a> Page<'a> {
             match self.predictor {
                 2 => self.sum_integers(row),
                 3 => {
-                    // Differences of bytes; all highest bytes come first, then all second ones.
+                    // Differences of bytes: all highest bytes first, then all second ones.
                     for i in 1..row.len() {
                         row[i] = row[i].wrapping_add(row[i - 1]);
                     }

@@ -1,4 +1,4 @@
-//! An abdomen, painted from the skin inwards. A unit is 200 mm; the belly looks towards -y, the liver lies at -x.
+//! The abdomen phantom, painted from the skin inwards. The unit is 200 mm; the belly faces -y, the liver is at -x.
 
 use super::paint::{Paint, ball, block, cone, ellipsoid, path, tube};
 use conefield_core::geometry::Vec3;
@@ -13,7 +13,7 @@ const BLOOD: f64 = 0.43;
 const SPONGY: f64 = 0.47;
 const CORTICAL: f64 = 0.75;
 
-/// Everything in an abdomen, in the order of painting.
+/// All parts of an abdomen, in painting order.
 pub(super) fn abdomen() -> Vec<Paint> {
     let mut random = ChaCha8Rng::seed_from_u64(0x6162_646f);
     [wall(), bowel(&mut random), organs(), spine_and_ribs(), vessels(&mut random)].concat()

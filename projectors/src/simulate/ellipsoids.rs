@@ -1,11 +1,11 @@
-//! Ellipsoids, whose line integrals are known in closed form: projectors and solvers are held against them.
+//! Ellipsoids, whose line integrals have a closed form: a reference for projectors and solvers.
 
 use conefield_core::geometry::{Geometry, Ray, Vec3, VoxelGrid, dot};
 use conefield_core::scan::{Scan, Unit, Volume};
 use ndarray::{Array3, Axis};
 use rayon::prelude::*;
 
-/// A homogeneous ellipsoid with its axes along x, y and z. Where several overlap their attenuations add up.
+/// A homogeneous ellipsoid with its axes along x, y and z. Where several overlap, their attenuations add up.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Ellipsoid {
     /// Its centre, mm.
@@ -17,7 +17,7 @@ pub struct Ellipsoid {
 }
 
 impl Ellipsoid {
-    /// Length of `ray` within it, mm. The source stands outside.
+    /// Length of `ray` inside it, mm. The source must be outside.
     pub fn chord(&self, ray: &Ray) -> f64 {
         let o: Vec3 = std::array::from_fn(|k| (ray.origin[k] - self.center[k]) / self.axes[k]);
         let d: Vec3 = std::array::from_fn(|k| ray.direction[k] / self.axes[k]);
@@ -25,19 +25,19 @@ impl Ellipsoid {
         2.0 * (b * b - a * c).max(0.0).sqrt() / a
     }
 
-    /// Whether the point lies within.
+    /// Whether the point is inside.
     pub fn contains(&self, p: Vec3) -> bool {
         let q: Vec3 = std::array::from_fn(|k| (p[k] - self.center[k]) / self.axes[k]);
         dot(q, q) < 1.0
     }
 
-    /// The same with half axes that are `by` mm longer (shorter, where `by` is below 0).
+    /// The ellipsoid with half axes `by` mm longer (shorter if `by` is negative).
     pub fn grown(self, by: f64) -> Self {
         Self { axes: self.axes.map(|a| (a + by).max(f64::MIN_POSITIVE)), ..self }
     }
 }
 
-/// The attenuation of `bodies` in the voxels of `grid`, each by the share of 4³ points inside.
+/// The attenuation of `bodies` in the voxels of `grid`, each weighted by the share of 4³ points inside.
 pub fn ellipsoids(bodies: &[Ellipsoid], grid: &VoxelGrid) -> Volume {
     let mut data = Array3::zeros(grid.shape);
     data.axis_iter_mut(Axis(0)).into_par_iter().enumerate().for_each(|(x, mut plane)| {
@@ -55,7 +55,8 @@ pub fn ellipsoids(bodies: &[Ellipsoid], grid: &VoxelGrid) -> Volume {
     Volume { data, grid: *grid, affine: None }
 }
 
-/// The noise-free scan of `bodies`: the line integral of each pixel's middle ray in closed form, whatever the voxels are.
+/// The noise-free scan of `bodies`: closed-form line integrals of the rays through the pixels' centres, independent of
+/// the voxels.
 pub fn scan_ellipsoids(bodies: &[Ellipsoid], geometry: Geometry) -> Scan {
     let [rows, columns] = geometry.detector;
     let mut projections = Array3::zeros((geometry.views.len(), rows, columns));

@@ -1,4 +1,4 @@
-//! A head, painted from the skin inwards. A unit is about 128 mm; the face looks towards -y.
+//! The head phantom, painted from the skin inwards. The unit is about 128 mm; the face is towards -y.
 
 use super::paint::{Paint, ball, block, cone, ellipsoid, path, tube};
 use conefield_core::geometry::Vec3;
@@ -19,7 +19,7 @@ const ENAMEL: f64 = 1.0;
 /// The base of the skull rises from the back to the front: `BASE · p` is the height above the slope.
 const BASE: Vec3 = [0.0, 0.41, 1.0];
 
-/// Everything in a head, in the order of painting.
+/// All parts of a head, in painting order.
 pub(super) fn head() -> Vec<Paint> {
     let mut random = ChaCha8Rng::seed_from_u64(0x6865_6164);
     [
@@ -37,7 +37,7 @@ pub(super) fn head() -> Vec<Paint> {
     .concat()
 }
 
-/// The same on the right (-x) and on the left.
+/// Makes a part on the right (-x) and on the left.
 fn both(make: impl Fn(f64) -> Vec<Paint>) -> Vec<Paint> {
     [make(-1.0), make(1.0)].concat()
 }
@@ -147,7 +147,7 @@ fn skull_base(random: &mut ChaCha8Rng) -> Vec<Paint> {
     out
 }
 
-/// A slice of the brain's hollow about the plane between the halves.
+/// A slab of the cranial cavity around the plane between the hemispheres.
 fn midline(half: f64, value: f64) -> Paint {
     ellipsoid([0.0, 0.03, 0.27], [0.502, 0.632, 0.56], value)
         .above([1.0, 0.0, 0.0], -half)
@@ -174,7 +174,7 @@ fn brain() -> Vec<Paint> {
         ]
     }));
     out.extend([
-        // Corpus callosum, then the fissure between the halves and the membrane in it.
+        // Corpus callosum, then the fissure between the hemispheres and the membrane in it.
         ellipsoid([0.0, 0.02, 0.38], [0.10, 0.30, 0.045], WHITE),
         midline(0.011, FLUID).above([0.0, 0.0, 1.0], 0.43),
         midline(0.011, FLUID).above([0.0, -1.0, 0.0], 0.28).above([0.0, 0.0, 1.0], 0.13),
@@ -373,7 +373,7 @@ fn vessels(random: &mut ChaCha8Rng) -> Vec<Paint> {
         })
         .collect();
     out.extend(path(&vault, 0.018, 0.45));
-    // Arteries of the brain: three trunks a side, each of which branches as it goes outwards.
+    // Arteries of the brain: three trunks per side, which branch outwards.
     for s in [-1.0, 1.0] {
         for (start, towards) in [
             ([s * 0.10, -0.11, 0.07], [s * 1.0, 0.1, 0.25]),
@@ -404,7 +404,7 @@ fn vessels(random: &mut ChaCha8Rng) -> Vec<Paint> {
     out
 }
 
-/// Details of known size: lesions of low contrast, rows of ever smaller balls, a fan of bars.
+/// Details of known size: low-contrast lesions, rows of ever smaller balls, a fan of bars.
 fn inserts() -> Vec<Paint> {
     let mut out = vec![
         ellipsoid([0.27, 0.27, 0.42], [0.07, 0.06, 0.06], 0.43).wavy(0.012, 12.0, 51),

@@ -1,12 +1,12 @@
-//! Scans made from volumes: phantoms, protocols, ray integrals and noise.
+//! Simulation of scans from volumes: phantoms, protocols, line integrals and noise.
 //!
-//! - [`phantom`], [`phantom_of`]: objects made by the project itself.
-//! - [`Ellipsoid`]: bodies whose scan is known in closed form.
-//! - [`downsample`], [`HuMapping`]: from a clinical volume to the one that is to be scanned.
-//! - [`Protocol`]: where source and detector stand, how many views, which noise.
+//! - [`phantom`], [`phantom_of`]: computed phantoms.
+//! - [`Ellipsoid`]: bodies with closed-form scans.
+//! - [`downsample`], [`HuMapping`]: preparation of clinical volumes.
+//! - [`Protocol`]: geometry, number of views, noise.
 //! - [`project`]: line integrals of the trilinear interpolation of a volume.
-//! - [`DetectorNoise`]: counting statistics.
-//! - [`simulate`]: all of it, with a record of how the scan came about.
+//! - [`DetectorNoise`]: photon counting statistics.
+//! - [`simulate`]: the complete simulation, with a record of its settings.
 
 mod abdomen;
 mod ellipsoids;
@@ -33,10 +33,10 @@ use conefield_core::geometry::Geometry;
 use conefield_core::scan::{Scan, Volume};
 use serde_json::json;
 
-/// Scans `volume` by `protocol`.
+/// Simulates a scan of `volume` with `protocol`.
 ///
-/// The volume's values count per protocol unit of length (1/mm for the default unit), so that a projection is
-/// Σ value · length in units and has no unit itself.
+/// The volume's values are per protocol unit of length (1/mm for the default unit), so that a projection is Σ value ·
+/// length in units and has no unit itself.
 pub fn simulate(volume: &Volume, protocol: &Protocol) -> Result<Scan> {
     let geometry: Geometry = protocol.geometry(&volume.grid)?;
     let mut projections = project(volume, &geometry, protocol.samples_per_voxel)?;

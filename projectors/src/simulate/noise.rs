@@ -1,4 +1,4 @@
-//! What counting photons does to line integrals.
+//! Photon counting noise of line integrals.
 
 use conefield_core::error::{Error, Result, ensure};
 use ndarray::{Array3, ArrayViewMut2, Axis};
@@ -10,8 +10,7 @@ use serde::{Deserialize, Serialize};
 use std::fmt;
 use std::str::FromStr;
 
-/// The least number of photons that a pixel is taken to have counted, so that every logarithm is finite: half a
-/// photon, between "none" and "one".
+/// The smallest count of a pixel, so that every logarithm is finite: half a photon, between "none" and "one".
 pub const MIN_COUNT: f64 = 0.5;
 
 /// Noise of a detector. Written `none`, `tigre:1e4,10` or `poisson:1e5`, in files as on the command line.
@@ -21,28 +20,28 @@ pub enum DetectorNoise {
     /// Exact line integrals.
     #[default]
     None,
-    /// The noise of published synthetic scans: `I = i0·exp(-A/Amax)` with `Amax` the largest line integral of the
-    /// scan, `I ← Poisson(I) + N(0, sigma)`, `A ← -ln(I/i0)·Amax`, negative `A` set to 0; counts below
-    /// [`MIN_COUNT`] count as that. A scan without a positive line integral stays as it is.
+    /// The noise of published synthetic scans: `I = i0·exp(-A/Amax)` with `Amax` the largest line integral of the scan,
+    /// `I ← Poisson(I) + N(0, sigma)`, `A ← -ln(I/i0)·Amax`, negative `A` set to 0; counts below [`MIN_COUNT`] are
+    /// raised to it. A scan without a positive line integral is unchanged.
     Tigre {
-        /// Photons a pixel without an object.
+        /// Photons per pixel without an object.
         i0: f64,
-        /// Standard deviation of the read-out, in photons.
+        /// Standard deviation of the read-out noise, in photons.
         sigma: f64,
     },
-    /// Beer-Lambert: `I = i0·exp(-A)`, `I ← Poisson(I)`, `A ← -ln(I/i0)`; counts below [`MIN_COUNT`] count as that.
-    /// Negative `A` are kept: without them the mean of an empty background would be above 0.
+    /// Beer-Lambert: `I = i0·exp(-A)`, `I ← Poisson(I)`, `A ← -ln(I/i0)`; counts below [`MIN_COUNT`] are raised to it.
+    /// Negative `A` are kept: otherwise the mean of an empty background would be above 0.
     Poisson {
-        /// Photons a pixel without an object.
+        /// Photons per pixel without an object.
         i0: f64,
     },
 }
 
 impl DetectorNoise {
-    /// Adds the noise to `[view, row, column]` line integrals. Each view draws from its own stream of the generator,
-    /// so that neither threads nor the other views change it.
+    /// Adds the noise to `[view, row, column]` line integrals. Each view has its own random stream, so its noise
+    /// depends neither on threads nor on other views.
     pub fn add(&self, projections: &mut Array3<f32>, seed: u64) {
-        // Scale of A, photons, read-out noise, least value.
+        // Scale of A, photons, read-out noise, smallest value.
         let (scale, i0, sigma, least) = match *self {
             Self::None => return,
             Self::Tigre { i0, sigma } => {
@@ -62,9 +61,9 @@ impl DetectorNoise {
         });
     }
 
-    /// Refuses numbers of photons that are none.
+    /// Refuses invalid photon numbers.
     pub fn validate(&self, place: &str) -> Result<()> {
-        // Beyond 1e15 photons a pixel noise is below the rounding of an f32 line integral.
+        // Beyond 1e15 photons per pixel, noise is below the rounding of an f32 line integral.
         let photons =
             |i0: f64| ensure((1.0..=1e15).contains(&i0), place, "noise: photons i0", i0, "a number from 1 to 1e15");
         match *self {
@@ -88,7 +87,7 @@ struct Detector {
 
 impl Detector {
     fn read(&self, mut pixels: ArrayViewMut2<f32>, random: &mut ChaCha8Rng) {
-        // Both are `None` only for numbers that `validate` refuses: then nothing is drawn.
+        // Both are `None` only for numbers that `validate` refuses: no noise is drawn then.
         let read_out = if self.sigma > 0.0 { Normal::new(0.0, self.sigma).ok() } else { None };
         pixels.mapv_inplace(|a| {
             let expected = self.i0 * (-f64::from(a) / self.scale).exp();

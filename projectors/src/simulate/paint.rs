@@ -1,4 +1,4 @@
-//! Painting solids into voxels, one over the other.
+//! Paints solids into voxels, one over the other.
 
 use super::shape::{Solid, Turn, UPRIGHT, smooth_noise, turn};
 use conefield_core::geometry::{Vec3, dot};
@@ -11,9 +11,9 @@ pub(super) struct Paint {
     solid: Solid,
     turn: Turn,
     value: f64,
-    /// Half spaces that the solid is cut to: `normal · p > offset`.
+    /// Half spaces that clip the solid: `normal · p > offset`.
     cuts: Vec<(Vec3, f64)>,
-    /// Amplitude, frequency and seed of waves in the surface.
+    /// Amplitude, frequency and seed of the surface's waves.
     wave: Option<(f64, f64, u64)>,
     texture: Texture,
 }
@@ -62,31 +62,31 @@ impl Paint {
         Self { solid, turn: UPRIGHT, value, cuts: Vec::new(), wave: None, texture: Texture::Even }
     }
 
-    /// Turned by degrees about x, y, z.
+    /// Rotates by degrees about x, y, z.
     pub(super) fn turned(mut self, degrees: Vec3) -> Self {
         self.turn = turn(degrees);
         self
     }
 
-    /// Cut to `normal · p > offset`.
+    /// Clips to `normal · p > offset`.
     pub(super) fn above(mut self, normal: Vec3, offset: f64) -> Self {
         self.cuts.push((normal, offset));
         self
     }
 
-    /// With a surface that waves by `amplitude`.
+    /// Makes the surface wavy by `amplitude`.
     pub(super) fn wavy(mut self, amplitude: f64, frequency: f64, seed: u64) -> Self {
         self.wave = Some((amplitude, frequency, seed));
         self
     }
 
-    /// With values that vary smoothly by `amplitude`.
+    /// Varies the values smoothly by `amplitude`.
     pub(super) fn textured(mut self, amplitude: f64, frequency: f64, seed: u64) -> Self {
         self.texture = Texture::Smooth(amplitude, frequency, seed);
         self
     }
 
-    /// With clefts of `value`, as between the windings of a brain.
+    /// Adds clefts of `value`, as between the gyri of a brain.
     pub(super) fn cleft(mut self, value: f64, frequency: f64, width: f64, depth: f64) -> Self {
         self.texture = Texture::Clefts { value, frequency, width, depth };
         self
@@ -118,7 +118,7 @@ impl Paint {
                 if deep > 1.0 {
                     return self.value;
                 }
-                // Where a smooth noise crosses zero lies a winding surface; it thins out downwards.
+                // A winding surface lies where a smooth noise crosses zero; it thins out downwards.
                 let width = width * (1.0 - deep.max(0.0));
                 let n = smooth_noise(p, frequency, 71) + 0.5 * smooth_noise(p, 1.9 * frequency, 72);
                 let open = (1.0 - n.abs() / width.max(1e-9)).clamp(0.0, 1.0);
@@ -128,8 +128,8 @@ impl Paint {
     }
 }
 
-/// Paints one after the other into a cube of `n³` voxels, later ones over earlier ones. Voxels at an edge are covered
-/// by as much as 3³ points in them say. Values are cut to 0 to 1.
+/// Paints the solids in order into a cube of `n³` voxels, later ones over earlier ones. At an edge, a voxel's coverage
+/// is the share of 3³ points inside. Values are clipped to 0 to 1.
 pub(super) fn paint(n: usize, paints: &[Paint]) -> Array3<f32> {
     const POINTS: usize = 3;
     let voxel = 2.0 / n as f64;

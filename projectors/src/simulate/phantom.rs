@@ -1,4 +1,4 @@
-//! Phantoms made by the project itself: every voxel is computed, none was measured.
+//! Computed phantoms: none of their voxels is measured.
 
 use super::abdomen::abdomen;
 use super::head::head;
@@ -11,14 +11,14 @@ use rand_chacha::ChaCha8Rng;
 use std::fmt;
 use std::str::FromStr;
 
-/// What a phantom shows. Written `head`, `abdomen` or `random:SEED`.
+/// Kind of phantom. Written `head`, `abdomen` or `random:SEED`.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum PhantomKind {
     /// A head: skull with diploe and sinuses, brain with ventricles, eyes, teeth, vessels, fine inserts.
     Head,
     /// An abdomen: organs, spine, ribs, bowel with gas, vessels.
     Abdomen,
-    /// Ellipsoids, boxes and tubes at random, another set for every seed.
+    /// Random ellipsoids, boxes and tubes, different for every seed.
     Random(u64),
 }
 
@@ -38,8 +38,8 @@ pub fn phantom(shape: usize) -> Volume {
     phantom_of(PhantomKind::Head, shape)
 }
 
-/// A phantom of `shape³` voxels with values from 0 (air) to 1 (enamel), x from right to left, y from front to back,
-/// z upwards. The same kind and shape give the same voxels on any number of threads.
+/// A phantom of `shape³` voxels with values from 0 (air) to 1 (enamel), x from right to left, y from front to back, z
+/// upwards. The voxels depend only on kind and shape, not on the number of threads.
 pub fn phantom_of(kind: PhantomKind, shape: usize) -> Volume {
     let paints = match kind {
         PhantomKind::Head => head(),
@@ -62,7 +62,7 @@ fn random(seed: u64) -> Vec<Paint> {
     ];
     let count = within(40.0, 80.0) as usize;
     for i in 0..count {
-        // Sizes fall off, so that the last ones are a few hundredths across.
+        // Sizes decrease to a few hundredths.
         let size = 0.45 * (0.07f64).powf(i as f64 / count as f64);
         let room = 0.75 - 0.5 * size;
         let at: Vec3 = std::array::from_fn(|k| body[k] * room * within(-1.0, 1.0));

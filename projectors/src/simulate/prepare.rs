@@ -1,4 +1,4 @@
-//! From a volume as it was found to the one that is to be scanned.
+//! Prepares a volume for a simulated scan.
 
 use conefield_core::error::{Error, Result, ensure};
 use conefield_core::geometry::VoxelGrid;
@@ -8,8 +8,8 @@ use ndarray::parallel::prelude::*;
 use std::fmt;
 use std::str::FromStr;
 
-/// Means of `factor³` voxels. Voxels at the upper end that fill no block are left out; the others keep their place
-/// in the world, so the grid's centre moves by half of what is missing.
+/// Means of `factor³` voxels. Voxels at the upper end that fill no block are dropped; the others keep their world
+/// position, so the grid's centre moves by half of what is missing.
 pub fn downsample(volume: &Volume, factor: usize) -> Result<Volume> {
     let shape = volume.grid.shape;
     ensure(
@@ -54,19 +54,19 @@ pub fn downsample(volume: &Volume, factor: usize) -> Result<Volume> {
     Ok(Volume { data, grid, affine })
 }
 
-/// How Hounsfield units become what is scanned. Written `mu:0.02` or `clip:-1000,2000`.
+/// Mapping of Hounsfield units. Written `mu:0.02` or `clip:-1000,2000`.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub enum HuMapping {
-    /// Attenuation in 1/mm, `mu_water·(1 + HU/1000)`, nowhere below 0.
+    /// Attenuation in 1/mm, `mu_water·(1 + HU/1000)`, at least 0.
     Mu {
         /// Attenuation of water in 1/mm.
         mu_water: f64,
     },
-    /// HU from `low` to `high` become 0 to 1; what lies beyond is cut.
+    /// Maps HU from `low` to `high` to 0 to 1 and clips the rest.
     Clip {
-        /// Becomes 0.
+        /// HU mapped to 0.
         low: f64,
-        /// Becomes 1.
+        /// HU mapped to 1.
         high: f64,
     },
 }
@@ -81,7 +81,7 @@ impl HuMapping {
         }
     }
 
-    /// Every voxel mapped. Refuses voxels that are not finite.
+    /// Maps every voxel. Refuses voxels that are not finite.
     pub fn apply(&self, volume: Volume) -> Result<Volume> {
         if let Some(((i, j, k), x)) = volume.data.indexed_iter().find(|(_, x)| !x.is_finite()) {
             return Err(Error::invalid("HU mapping", format!("volume[{i}, {j}, {k}]"), x, "a finite value in HU"));

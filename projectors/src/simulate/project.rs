@@ -1,7 +1,7 @@
 //! Line integrals of a voxel volume.
 //!
-//! The volume is the trilinear interpolation of its voxel centres. Between the outermost centres and the box that the
-//! voxels fill lies half a voxel: there the outermost values are held constant. Beyond the box is nothing. A ray is
+//! The volume is the trilinear interpolation of its voxel centres. In the outer half voxel, between the outermost
+//! centres and the box of the voxels, the outermost values are constant. Outside the box there is nothing. A ray is
 //! clipped to the box and sampled at the midpoints of equal steps.
 
 use conefield_core::error::{Error, Result, ensure};
@@ -10,16 +10,16 @@ use conefield_core::scan::Volume;
 use ndarray::Array3;
 use rayon::prelude::*;
 
-/// Side of the blocks of cells that are skipped where they are empty.
+/// Side of the blocks of cells that are skipped if empty.
 const BLOCK: usize = 8;
-/// Rows that one task walks together: neighbours along z read the same cache lines.
+/// Rows that one task processes together: neighbours along z read the same cache lines.
 const BAND: usize = 16;
 
-/// Line integrals `[view, row, column]` of `volume` (where its own grid says it is) for every pixel of `geometry`.
+/// Line integrals `[view, row, column]` of `volume` (positioned by its own grid) for every pixel of `geometry`.
 ///
-/// Values count per mm: a projection is Σ value · mm. `per_voxel_samples` is the least number of samples within the
-/// smallest voxel side, 2 or more: the step is at most half a voxel. Positions are set up in `f64`, sampled in `f32`
-/// and summed in `f64` block by block. The result does not depend on the number of threads.
+/// Values are per mm: a projection is Σ value · mm. `per_voxel_samples` is the minimum number of samples per smallest
+/// voxel side, at least 2: the step is at most half a voxel. Positions are computed in `f64`, sampled in `f32` and
+/// summed in `f64` block by block. The result does not depend on the number of threads.
 pub fn project(volume: &Volume, geometry: &Geometry, per_voxel_samples: f64) -> Result<Array3<f32>> {
     geometry.validate("projection")?;
     volume.grid.validate("projection")?;
@@ -53,15 +53,14 @@ pub fn project(volume: &Volume, geometry: &Geometry, per_voxel_samples: f64) -> 
         .map_err(|e| Error::invalid("projection", "detector", e, "as many pixels as the shape has"))
 }
 
-/// The volume with a rim of one voxel, which repeats the outermost values, so that every sample inside the box has
-/// eight neighbours.
+/// The volume padded by one voxel of the outermost values, so that every sample inside the box has eight neighbours.
 struct Sampler {
     data: Vec<f32>,
-    /// Distance in `data` from a voxel to its neighbour along x and y (along z it is 1).
+    /// Strides in `data` along x and y (along z it is 1).
     stride: [usize; 2],
     /// Largest lower corner of a cell along each axis.
     last: [f32; 3],
-    /// Whether a block of cells, or a cell beside it, holds anything but zero.
+    /// Whether a block of cells, or a neighbouring cell, has a nonzero value.
     occupied: Vec<bool>,
     /// Blocks along y and z.
     blocks: [usize; 2],
@@ -104,8 +103,8 @@ impl Sampler {
         let mut occupied = vec![false; blocks.iter().product()];
         let stride = [padded[1] * padded[2], padded[2]];
         for (at, _) in data.iter().enumerate().filter(|(_, x)| **x != 0.0) {
-            // A voxel is a corner of the cells on both of its sides. One cell more on each side covers positions
-            // that rounding puts across the boundary of a block.
+            // A voxel is a corner of the cells on both of its sides. One more cell on each side covers positions that
+            // rounding moves across the boundary of a block.
             let voxel = [at / stride[0], at % stride[0] / stride[1], at % stride[1]];
             let low = voxel.map(|v| v.saturating_sub(2) / BLOCK);
             let high: [usize; 3] = std::array::from_fn(|k| ((voxel[k] + 1) / BLOCK).min(blocks[k] - 1));
@@ -134,7 +133,7 @@ impl Sampler {
         let Some([near, far]) = ray.clip(self.bounds) else { return 0.0 };
         let count = ((far - near) / self.step).ceil().max(1.0);
         let step = (far - near) / count;
-        // In voxels of the padded volume: the first sample and what leads to the next.
+        // In voxels of the padded volume: the first sample and the step to the next.
         let first = ray.at(near + 0.5 * step);
         let start: [f32; 3] = std::array::from_fn(|k| ((first[k] - self.bounds[0][k]) / self.spacing[k] + 0.5) as f32);
         let ahead: [f32; 3] = std::array::from_fn(|k| (ray.direction[k] * step / self.spacing[k]) as f32);
@@ -147,7 +146,7 @@ impl Sampler {
         let mut sum = 0.0;
         let mut n = 0;
         while n < count {
-            // The block that sample `n` is in, and how many samples follow before the ray leaves it.
+            // The block of sample `n`, and the number of samples before the ray leaves it.
             let mut block = [0usize; 3];
             let mut stay = f32::INFINITY;
             for k in 0..3 {
@@ -169,7 +168,7 @@ impl Sampler {
         sum
     }
 
-    /// Coordinate of sample `n`, kept within the padded volume.
+    /// Coordinate of sample `n`, clamped to the padded volume.
     #[inline(always)]
     fn along(&self, start: [f32; 3], ahead: [f32; 3], n: usize, k: usize) -> f32 {
         (start[k] + n as f32 * ahead[k]).max(0.0).min(self.last[k] + 0.999)
@@ -178,7 +177,7 @@ impl Sampler {
     /// The trilinear interpolation at a point of the padded volume.
     #[inline(always)]
     fn sample(&self, at: [f32; 3]) -> f32 {
-        // Through i32: the conversion is one instruction.
+        // Via i32: the conversion is a single instruction.
         let cell = at.map(|x| x as i32);
         let f: [f32; 3] = std::array::from_fn(|k| at[k] - cell[k] as f32);
         let at = cell[0] as usize * self.stride[0] + cell[1] as usize * self.stride[1] + cell[2] as usize;

@@ -1,4 +1,4 @@
-//! The settings of a scan that is to be simulated.
+//! Settings of a simulated scan.
 
 use super::noise::DetectorNoise;
 use conefield_core::error::{Result, ensure};
@@ -9,33 +9,33 @@ use serde::{Deserialize, Serialize};
 /// More views than any scanner takes; readers of scans have the same bound.
 const MOST_VIEWS: usize = 1_000_000;
 
-/// A circular orbit with a flat detector. Lengths count in the protocol's own [`Protocol::unit`].
+/// A circular orbit with a flat detector. Lengths are in the protocol's own [`Protocol::unit`].
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct Protocol {
-    /// The unit of every length below, and of the volume's values (per unit).
+    /// Unit of all lengths below, and of the volume's values (per unit).
     #[serde(default)]
     pub unit: Unit,
-    /// From the source to the rotation axis.
+    /// Distance from the source to the rotation axis.
     pub dso: f64,
-    /// From the source to the detector's plane.
+    /// Distance from the source to the detector plane.
     pub dsd: f64,
     /// Detector rows and columns.
     pub detector: [usize; 2],
-    /// How large the detector is.
+    /// Size of the detector.
     pub extent: DetectorExtent,
-    /// Shift of the detector along its rows' direction v and its columns' direction u.
+    /// Shift of the detector along v (towards the next row) and u (towards the next column).
     #[serde(default)]
     pub offset: [f64; 2],
-    /// Where the views are taken.
+    /// Angles of the views.
     pub angles: Angles,
-    /// What the detector adds.
+    /// Noise of the detector.
     #[serde(default)]
     pub noise: DetectorNoise,
     /// Seed of the noise.
     #[serde(default)]
     pub seed: u64,
-    /// Samples along a ray, per smallest voxel side; at least 2.
+    /// Samples along a ray per smallest voxel side; at least 2.
     #[serde(default = "two")]
     pub samples_per_voxel: f64,
 }
@@ -48,9 +48,9 @@ fn two() -> f64 {
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
 pub enum DetectorExtent {
-    /// Of one pixel.
+    /// Size of one pixel.
     Pixel([f64; 2]),
-    /// Of the whole detector.
+    /// Size of the whole detector.
     Side([f64; 2]),
 }
 
@@ -58,10 +58,10 @@ pub enum DetectorExtent {
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case", deny_unknown_fields)]
 pub enum Angles {
-    /// View `i` of `views` at `start_deg + arc_deg·i/views`: the end of the arc, which closes a full circle, is not
-    /// taken.
+    /// View `i` of `views` at `start_deg + arc_deg·i/views`: the end of the arc, which closes a full circle, is
+    /// excluded.
     Even {
-        /// How many.
+        /// Number of views.
         views: usize,
         /// The first angle in degrees.
         #[serde(default)]
@@ -91,8 +91,8 @@ impl Angles {
 }
 
 impl Protocol {
-    /// The published synthetic set-up, scaled to `grid`: the volume's largest side is the cube of side 2; DSO 5,
-    /// DSD 7, detector 512×512 of side 4, 50 views evenly over the circle from angle 0, no noise.
+    /// The published synthetic setup, scaled to `grid`: the volume's largest side corresponds to a cube of side 2; DSO
+    /// 5, DSD 7, detector 512×512 of side 4, 50 evenly spaced views on the circle from angle 0, no noise.
     pub fn r2(grid: &VoxelGrid) -> Self {
         let side = grid.size().into_iter().fold(0.0, f64::max);
         Self {
@@ -109,20 +109,20 @@ impl Protocol {
         }
     }
 
-    /// The same with `rows × columns` pixels on a detector of the same size.
+    /// Sets `rows × columns` pixels on a detector of the same size.
     pub fn with_detector(mut self, detector: [usize; 2]) -> Self {
         self.extent = DetectorExtent::Side(self.side());
         self.detector = detector;
         self
     }
 
-    /// The same with `views` views evenly over the circle from angle 0.
+    /// Sets `views` evenly spaced views on the circle from angle 0.
     pub fn with_views(mut self, views: usize) -> Self {
         self.angles = Angles::Even { views, start_deg: 0.0, arc_deg: 360.0 };
         self
     }
 
-    /// The same with noise.
+    /// Sets the noise.
     pub fn with_noise(mut self, noise: DetectorNoise, seed: u64) -> Self {
         (self.noise, self.seed) = (noise, seed);
         self
@@ -136,7 +136,7 @@ impl Protocol {
         }
     }
 
-    /// Source, detector and `grid` in mm. Refuses what cannot be scanned.
+    /// Source, detector and `grid` in mm. Refuses an impossible geometry.
     pub fn geometry(&self, grid: &VoxelGrid) -> Result<Geometry> {
         self.validate()?;
         let mm = |x: f64| Millimetres(x * self.unit.mm);
@@ -177,7 +177,7 @@ impl Protocol {
         }
         let finite_offset = self.offset.iter().all(|x| x.is_finite());
         ensure(finite_offset, "protocol", "offset", format!("{:?}", self.offset), "finite numbers")?;
-        // An even orbit's angles are not made before their number is known to be sensible.
+        // Checks the number of views before computing an even orbit's angles.
         if let Angles::Even { views, .. } = self.angles {
             let expected = format!("at most {MOST_VIEWS}");
             ensure(views <= MOST_VIEWS, "protocol", "angles.even.views", views, expected)?;

@@ -1,27 +1,27 @@
-//! Solids with signed distances: what phantoms are painted with.
+//! Solids with signed distances: the parts of phantoms.
 //!
-//! Coordinates are those of the phantom's cube, -1 to 1 along each axis.
+//! Coordinates are relative to the phantom's cube, -1 to 1 along each axis.
 
 use conefield_core::geometry::{Vec3, dot, norm, sub};
 
 /// A solid body.
 #[derive(Debug, Clone, Copy)]
 pub(super) enum Solid {
-    /// Half axes along the (turned) axes.
+    /// Half axes along the (rotated) axes.
     Ellipsoid { center: Vec3, radii: Vec3 },
-    /// Half sides along the (turned) axes.
+    /// Half sides along the (rotated) axes.
     Box { center: Vec3, half: Vec3 },
-    /// A tube with round ends whose radius runs from one value to the other.
+    /// A tube with round ends whose radius changes linearly from one value to the other.
     Tube { from: Vec3, to: Vec3, radii: [f64; 2] },
 }
 
-/// Rows are the axes of a turned body.
+/// The rows are the axes of a rotated body.
 pub(super) type Turn = [Vec3; 3];
 
-/// No turn.
+/// No rotation.
 pub(super) const UPRIGHT: Turn = [[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]];
 
-/// Turned by these angles in degrees, first about x, then y, then z.
+/// Rotation by these angles in degrees, first about x, then y, then z.
 pub(super) fn turn(degrees: Vec3) -> Turn {
     let about = |v: Vec3, axis: usize| {
         let (s, c) = degrees[axis].to_radians().sin_cos();
@@ -35,7 +35,7 @@ pub(super) fn turn(degrees: Vec3) -> Turn {
 }
 
 impl Solid {
-    /// Distance to the surface, negative inside; exact at the surface and of the right sign everywhere.
+    /// Distance to the surface, negative inside; exact at the surface, with the right sign everywhere.
     pub(super) fn distance(&self, turn: &Turn, p: Vec3) -> f64 {
         match self {
             Self::Ellipsoid { center, radii } => {
@@ -43,7 +43,7 @@ impl Solid {
                 let unit: Vec3 = std::array::from_fn(|k| local[k] / radii[k]);
                 let slope: Vec3 = std::array::from_fn(|k| unit[k] / radii[k]);
                 let (r, s) = (norm(unit), norm(slope));
-                // The centre itself has no nearest direction: the smallest half axis will do.
+                // The centre itself has no nearest direction: the smallest half axis serves.
                 if s == 0.0 { -radii.iter().copied().fold(f64::INFINITY, f64::min) } else { r * (r - 1.0) / s }
             }
             Self::Box { center, half } => {
@@ -96,7 +96,7 @@ pub(super) fn smooth_noise(p: Vec3, frequency: f64, seed: u64) -> f64 {
         let at = [i, j, k];
         let mut h = seed.wrapping_mul(0x9e37_79b9_7f4a_7c15);
         for (&at, &cell) in at.iter().zip(&cell) {
-            // Mixed after every coordinate, so that neighbours share nothing.
+            // Mixed after every coordinate, so that neighbours are independent.
             h = (h ^ (cell as i64).wrapping_add(at as i64) as u64).wrapping_mul(0xff51_afd7_ed55_8ccd);
             h = (h ^ (h >> 33)).wrapping_mul(0xc4ce_b9fe_1a85_ec53);
             h ^= h >> 33;

@@ -1,4 +1,4 @@
-//! Ray integrals against closed forms and against an exact scan; noise against its statistics.
+//! Compares line integrals with closed forms and with an exact scan, and noise with its statistics.
 
 use super::*;
 use conefield_core::geometry::{Millimetres, Radians, Ray, Vec3, View, VoxelGrid};
@@ -52,7 +52,7 @@ fn ellipsoids(n: usize) -> Volume {
     Volume { data, grid, affine: None }
 }
 
-/// Relative error of the projections of `ellipsoids(n)`, moved by `shift` voxels, against the chords.
+/// Relative error of the projections of `ellipsoids(n)`, moved by `shift` voxels, relative to the chords.
 fn chord_error(n: usize, shift: Vec3) -> f64 {
     let mut volume = ellipsoids(n);
     let geometry = Protocol::r2(&volume.grid).with_detector([40, 48]).with_views(5).geometry(&volume.grid).unwrap();
@@ -87,7 +87,7 @@ fn voxels_are_where_the_grid_says() {
 
 #[test]
 fn a_constant_box_gives_the_length_of_the_ray_in_it() {
-    // The rim of half a voxel counts: the constant reaches the faces of the box.
+    // The outer half voxel counts: the constant reaches the faces of the box.
     let grid = VoxelGrid { shape: [5, 9, 7], spacing: [0.5, 0.25, 0.3], center: [0.1, -0.2, 0.05] };
     let volume = Volume { data: Array3::from_elem(grid.shape, 2.0), grid, affine: None };
     let mm = Millimetres;
@@ -103,7 +103,7 @@ fn a_constant_box_gives_the_length_of_the_ray_in_it() {
 
 #[test]
 fn skipping_empty_blocks_changes_nothing() {
-    // Single voxels at block boundaries, against the plain sum over all samples of a volume without empty blocks.
+    // Single voxels at block boundaries, compared with the plain sum over all samples of a volume without empty blocks.
     let n = 40;
     let mut volume = Volume { data: Array3::zeros((n, n, n)), grid: grid(n), affine: None };
     for at in [[0, 0, 0], [7, 8, 15], [16, 23, 24], [31, 32, 39], [39, 39, 39], [6, 6, 6], [14, 22, 30]] {
@@ -134,7 +134,7 @@ fn projection_is_the_same_on_any_number_of_threads() {
         simulate(&volume, &Protocol { seed: 6, ..protocol.clone() }).unwrap().projections,
         "another seed"
     );
-    // A view's noise is its own: the same view of a scan with more views has it too.
+    // A view's noise is independent: the same view of a scan with more views has the same noise.
     let noise = DetectorNoise::Poisson { i0: 1e3 };
     let mut few = Array3::from_elem((2, 8, 8), 0.5f32);
     let mut many = Array3::from_elem((5, 8, 8), 0.5f32);
@@ -155,7 +155,7 @@ fn phantoms_are_the_same_on_any_number_of_threads() {
     }
     assert_ne!(phantom_of(PhantomKind::Random(1), 16).data, phantom_of(PhantomKind::Random(2), 16).data);
     assert_eq!(phantom(0).data.len(), 0);
-    // Bone around brain: along the middle of the head, something dense comes before and after something soft.
+    // Bone around brain: along the middle of the head, dense tissue lies before and after soft tissue.
     let head = phantom(64);
     let line: Vec<f32> = (0..64).map(|i| head.data[[i, 32, 42]]).collect();
     assert!(
@@ -163,7 +163,7 @@ fn phantoms_are_the_same_on_any_number_of_threads() {
     );
 }
 
-/// Mean and variance of the counts that a constant line integral leaves behind.
+/// Mean and variance of the counts of a constant line integral.
 fn counts(noise: DetectorNoise, value: f32, scale: f64, i0: f64) -> (f64, f64) {
     let mut pixels = Array3::from_elem((2, 300, 300), value);
     noise.add(&mut pixels, 3);
@@ -260,7 +260,7 @@ fn downsampling_averages_and_keeps_the_place() {
     assert_eq!(half.grid.shape, [2, 2, 3]);
     assert_eq!(half.data[[0, 0, 0]], 55.5);
     assert_eq!(half.grid.spacing, [2.0, 4.0, 1.0]);
-    // A new voxel's centre is the middle of the old voxels' centres, in the grid and by the affine.
+    // A new voxel's centre is the mean of the old voxels' centres, in the grid and by the affine.
     let (a, b) = (volume.grid.voxel([2, 2, 4]), volume.grid.voxel([3, 3, 5]));
     assert_eq!(half.grid.voxel([1, 1, 2]), std::array::from_fn(|k| (a[k] + b[k]) / 2.0));
     let affine = half.affine.unwrap();
@@ -333,7 +333,7 @@ fn a_protocol_is_read_from_a_file_and_refused_in_words() {
     assert!(project(&volume, &geometry, 2.0).unwrap_err().to_string().contains("shape of its grid"));
 }
 
-/// The folder of `shared/data`, if it is there.
+/// The folder `shared/data`, if it exists.
 fn data() -> Option<PathBuf> {
     let folder = std::env::var_os("CONEFIELD_DATA")
         .map_or_else(|| PathBuf::from(env!("CARGO_MANIFEST_DIR")).join("../../shared/data"), PathBuf::from);

@@ -1,8 +1,8 @@
 //! The voxel-driven, distance-weighted back-projection of FDK (Feldkamp, Davis and Kress, JOSA A 1(6), 1984).
 //!
-//! Every voxel receives `Σ_i s_i/U_i²·p_i(u, v)`: `U_i` is its depth in view `i`, `p_i` is read by bilinear
-//! interpolation where the ray through the voxel's centre meets the detector, and outside the detector nothing is
-//! added. The voxels of a line along z stand in a row on the detector, and read columns of pixels as `readers` has it.
+//! Every voxel receives `Σ_i s_i/U_i²·p_i(u, v)`: `U_i` is its depth in view `i`, `p_i` is interpolated bilinearly
+//! where the ray through the voxel's centre meets the detector; pixels outside the detector are 0. The voxels of a line
+//! along z project to a line on the detector and read columns of pixels as described in `readers`.
 
 use super::layout::{ColumnMajor, Pinhole};
 use super::readers::{Among, Ends, PAD, Path, Stands, places, read};
@@ -12,13 +12,12 @@ use conefield_core::voxel::VoxelView;
 use ndarray::{ArrayViewMut3, Axis};
 use rayon::prelude::*;
 
-/// Planes of voxels that one task owns.
+/// Planes of voxels per task.
 const TILE: usize = 4;
-/// A line of voxels changes columns by at most this share of what it rises along the rows; steeper ones go voxel by voxel.
+/// Largest slant of a line of voxels: change in columns per change in rows. Steeper lines are processed voxel by voxel.
 const SLANT: f64 = 0.5;
 
-/// Adds the views `views` of `geometry`, whose pixels are `pixels` and whose scales `s_i` are `scales` in mm², to
-/// `volume`.
+/// Adds the views `views` of `geometry`, with the pixels `pixels` and the scales `s_i` in `scales` (mm²), to `volume`.
 pub fn backproject<R: Real>(
     geometry: &Geometry,
     views: &[usize],
@@ -70,17 +69,17 @@ impl<R: Real> Op for Planes<'_, R> {
 
 /// A line of voxels along z on the detector of a view.
 struct Line {
-    /// The voxel from which q counts, and the bend of q.
+    /// The voxel from which q is measured, and the bend of q.
     middle: f64,
     bend: f64,
     /// Columns across, rows from below along them.
     path: Path<f64>,
-    /// What the middle voxel is given of a pixel.
+    /// Weight of a pixel for the middle voxel.
     weight: f64,
 }
 
 impl Line {
-    /// The line of `nz` voxels at `x` and `y`; `None` if it does not run along the columns, upwards and in front of the
+    /// The line of `nz` voxels at `x` and `y`; `None` unless it runs along the columns, upwards and in front of the
     /// source.
     fn of<R: Real>(image: &Image<'_, R>, [x, y]: [usize; 2], nz: usize) -> Option<Self> {
         let view = image.view;
@@ -109,13 +108,13 @@ struct Image<'a, R> {
     view: &'a VoxelView,
     detector: [usize; 2],
     pixels: &'a ColumnMajor<R>,
-    /// Which of `pixels` it is.
+    /// Its index in `pixels`.
     index: usize,
     zeros: &'a [R],
 }
 
 impl<R: Real> Image<'_, R> {
-    /// Adds to `voxels` what they read on their line; `q`, `ends` and `stands` are room for where they stand.
+    /// Adds to `voxels` the values that they read on their line; `q`, `ends` and `stands` are buffers.
     #[inline(always)]
     fn add<S: Simd>(
         &self,
@@ -142,7 +141,7 @@ impl<R: Real> Image<'_, R> {
         };
         let weight = V::<S, R>::splat(s, R::of(line.weight));
         let (bend, one) = (V::<S, R>::splat(s, R::of(-line.bend)), V::<S, R>::splat(s, R::ONE));
-        // The end of a line that is no whole vector is worked on beside it.
+        // The end of a line that does not fill a vector is processed in a separate buffer.
         let (whole, rest) = voxels.split_at_mut(voxels.len() - voxels.len() % len);
         let mut tail = [R::ZERO; WIDEST];
         tail[..rest.len()].copy_from_slice(rest);
@@ -150,7 +149,7 @@ impl<R: Real> Image<'_, R> {
             let q = V::<S, R>::from_slice(s, q);
             let Some(found) = read(s, &path, &among, stands, i, q, column) else { continue };
             let voxels = if i * len < whole.len() { &mut whole[i * len..(i + 1) * len] } else { &mut tail[..len] };
-            // The middle's depth over the voxel's is 1/(1 + bend·ρ) = 1 − bend·q.
+            // The ratio of the middle's depth to the voxel's is 1/(1 + bend·ρ) = 1 − bend·q.
             let nearer = q.mul_add(bend, one);
             let sum = (found * weight).mul_add(nearer * nearer, V::<S, R>::from_slice(s, voxels));
             sum.store_slice(voxels);
@@ -158,7 +157,7 @@ impl<R: Real> Image<'_, R> {
         rest.copy_from_slice(&tail[..rest.len()]);
     }
 
-    /// The same voxel by voxel, wherever they lie.
+    /// The same voxel by voxel, for any geometry.
     fn add_one_by_one(&self, [x, y]: [usize; 2], voxels: &mut [R]) {
         let [rows, columns] = self.detector.map(|n| n as f64);
         for (z, voxel) in voxels.iter_mut().enumerate() {
@@ -171,7 +170,7 @@ impl<R: Real> Image<'_, R> {
         }
     }
 
-    /// The pixels around a place on the detector; those outside are 0.
+    /// Bilinear interpolation on the detector; pixels outside are 0.
     fn bilinear(&self, row: f64, column: f64) -> f64 {
         let (r, c) = (row.floor(), column.floor());
         let (fr, fc) = (row - r, column - c);

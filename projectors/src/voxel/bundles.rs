@@ -1,9 +1,9 @@
-//! Joseph's projector for views of any orientation, the pixels side by side in bundles.
+//! Joseph's projector for views of any orientation, with neighbouring pixels in bundles.
 //!
-//! From plane to plane of voxels across its main direction a ray's position changes by the same amount. So where the rays of a
-//! bundle meet a plane, between which voxels and with which shares, is one computation for all of them; only the voxels
-//! themselves are read, or written, one after the other. Forward, a strip of columns goes through a few planes, row after
-//! row, before it turns to the next ones; back, some planes gather from all bundles. Both take their shares from
+//! From plane to plane of voxels across its main direction a ray's position changes by a constant. The intersections of
+//! a bundle's rays with a plane, their voxels and interpolation weights are computed together; only the voxels
+//! themselves are read or written one by one. In the forward projection, a strip of columns traverses a few planes, row
+//! by row, before the next planes. In the adjoint, some planes gather from all bundles. Both take their weights from
 //! `Bundle::meet`, so they are adjoint by construction.
 
 use super::layout::main_axis;
@@ -14,16 +14,16 @@ use ndarray::{ArrayView3, ArrayViewMut2, ArrayViewMut3, Axis};
 use rayon::prelude::*;
 use std::ops::Range;
 
-/// Pixels of a bundle.
+/// Pixels per bundle.
 const BUNDLE: usize = 16;
-/// Planes that a strip of columns goes through before it turns to the next: what they hold near the strip stays in cache.
+/// Planes that a strip of columns traverses at once: their part near the strip stays in cache.
 const PLANES: usize = 16;
-/// Planes that one task of [`adjoint`] owns.
+/// Planes per task of [`adjoint`].
 const TILE: usize = 8;
 /// Bytes of bundles that [`adjoint`] holds at once.
 const HELD: usize = 32 << 20;
 
-/// Where a ray goes: the axis of which it meets most planes, and whether upwards along it.
+/// Heading of a ray: its main axis, along which it meets most planes, and whether it runs upwards along it.
 type Heading = (usize, bool);
 
 const HEADINGS: [Heading; 6] = [(0, true), (0, false), (1, true), (1, false), (2, true), (2, false)];
@@ -33,30 +33,31 @@ fn heading_of(ray: &VoxelRay) -> Heading {
     (main, ray.ahead[main] > 0.0)
 }
 
-/// The axes across `main`, in order.
+/// The two axes other than `main`, in order.
 fn across(main: usize) -> [usize; 2] {
     [[1, 2], [0, 2], [0, 1]][main]
 }
 
-/// Pixels side by side in a row whose rays have one heading. Lanes of other pixels meet no voxel.
+/// Neighbouring pixels of a row whose rays have one heading. Lanes of other pixels meet no voxel.
 struct Bundle<R> {
-    /// Which of the images that are projected at once.
+    /// Index among the images projected at once.
     image: usize,
     row: usize,
-    /// The first lane's.
+    /// Column of the first lane.
     column: usize,
     main: usize,
     /// Planes in which a ray may meet voxels.
     planes: Range<usize>,
-    /// Positions across the main axis in the volume's middle plane, in voxels from one before the first.
+    /// Positions across the main axis in the volume's middle plane, in voxels, relative to one before the first.
     middle: [[R; BUNDLE]; 2],
-    /// What they change by from plane to plane.
+    /// Their change from plane to plane.
     slope: [[R; BUNDLE]; 2],
     /// mm from plane to plane.
     step: [R; BUNDLE],
 }
 
-/// Between which voxels along an axis the rays of a bundle go, and the shares of both; voxels outside have none.
+/// The two voxels along an axis between which each ray of a bundle passes, and their weights; voxels outside have
+/// weight 0.
 struct Beside<R> {
     voxels: [[u32; BUNDLE]; 2],
     shares: [[R; BUNDLE]; 2],
@@ -69,7 +70,7 @@ impl<R: Real> Beside<R> {
 }
 
 impl<R: Real> Bundle<R> {
-    /// Adds the bundles of the pixels from `column` on to `all`: one for each heading among them.
+    /// Appends the bundles of the pixels from `column` on to `all`: one per heading among them.
     fn of(geometry: &Geometry, [view, row, column]: [usize; 3], image: usize, all: &mut Vec<Self>) {
         let grid = &geometry.volume;
         let rays: [VoxelRay; BUNDLE] = std::array::from_fn(|i| VoxelRay::of(geometry, view, row, column + i));
@@ -100,7 +101,7 @@ impl<R: Real> Bundle<R> {
         }
     }
 
-    /// Where its rays meet plane `plane`.
+    /// Computes where its rays meet plane `plane`.
     #[inline(always)]
     fn meet<S: Simd>(&self, s: S, plane: usize, shape: [usize; 3], found: &mut [Beside<R>; 2]) {
         let number = |x: f64| V::<S, R>::splat(s, R::of(x));
@@ -112,7 +113,7 @@ impl<R: Real> Bundle<R> {
             let [of_low, of_high] = &mut found.shares;
             for i in (0..BUNDLE).step_by(V::<S, R>::LEN) {
                 let position = load(s, &self.slope[d], i).mul_add(away, load(s, &self.middle[d], i));
-                // Counted from one voxel before the first to one after the last, where nothing is.
+                // Clamped between one voxel before the first and one after the last, which are empty.
                 let position = position.max(zero).min(count + one);
                 let cell = position.floor();
                 let share = position - cell;
@@ -127,7 +128,7 @@ impl<R: Real> Bundle<R> {
     }
 }
 
-/// The planes that a ray from `source` may meet voxels in, and one more on either side.
+/// The planes in which a ray from `source` may meet voxels, and one more on either side.
 fn crossed(grid: &VoxelGrid, source: Vec3, (main, up): Heading, slopes: [f64; 2]) -> Range<usize> {
     let last = grid.shape[main] as f64 - 1.0;
     // In front of the source.
@@ -153,7 +154,7 @@ fn crossed(grid: &VoxelGrid, source: Vec3, (main, up): Heading, slopes: [f64; 2]
     if low > high { 0..0 } else { low as usize..high as usize + 1 }
 }
 
-/// Line integrals of `volume` for `views`, an image each.
+/// Line integrals of `volume` for `views`, one image each.
 pub fn forward<R: Real>(
     geometry: &Geometry,
     views: &[usize],
@@ -180,7 +181,7 @@ struct Forward<'a, R> {
     shape: [usize; 3],
     voxels: &'a [R],
     bundles: &'a [Bundle<R>],
-    /// A row each.
+    /// One row each.
     sums: &'a mut [[R; BUNDLE]],
 }
 
@@ -194,7 +195,7 @@ impl<R: Real> Op for Forward<'_, R> {
             let [a, b] = across(main).map(|k| strides[k]);
             for from in (0..self.shape[main]).step_by(PLANES) {
                 for bundle in self.bundles.iter().filter(|b| b.main == main) {
-                    // Sums of a few planes, added up in turn: two short sums round less than one long one.
+                    // Partial sums over a few planes: two short sums have a smaller rounding error than one long sum.
                     let mut part = [R::ZERO; BUNDLE];
                     for plane in from.max(bundle.planes.start)..(from + PLANES).min(bundle.planes.end) {
                         bundle.meet(s, plane, self.shape, &mut found);
@@ -252,7 +253,7 @@ pub fn adjoint<R: Real>(
     }
 }
 
-/// What some planes of voxels gather from all bundles that cross them, `[plane, a, b]` with the axes across in order.
+/// Planes of voxels that gather from all bundles crossing them, `[plane, a, b]` with the other two axes in order.
 struct Adjoint<'a, R> {
     main: usize,
     planes: Range<usize>,

@@ -1,9 +1,9 @@
-//! Joseph's projector, a detector column at a time.
+//! Joseph's projector, one detector column at a time.
 //!
-//! The rays of a detector column lie in one plane, and where that meets a plane of voxels they stand in a row (`readers`
-//! has the formula). Columns that run along z, or nearly so as those of calibrated scans do, then read lines of voxels along
-//! z upwards, a vector of rows at a time. The adjoint goes the same way back: every voxel of a line gathers from the rows
-//! that are less than a voxel away, with the same hat-shaped weights.
+//! The rays of a detector column lie in a plane and meet a plane of voxels on a straight line (formula in `readers`).
+//! If columns run along z, or nearly so as in calibrated scans, they read lines of voxels upwards along z, one vector
+//! of rows at a time. The adjoint goes the same way back: every voxel of a line gathers from the rows that are less
+//! than a voxel away, with the same hat-shaped weights.
 
 use super::layout::{ColumnMajor, batch, column_major_bytes, main_axis, to_voxels};
 use super::readers::{Among, Ends, PAD, Path, Stands, mix, places, read, read_on};
@@ -14,21 +14,21 @@ use ndarray::{ArrayView3, ArrayViewMut2, ArrayViewMut3, Axis};
 use rayon::prelude::*;
 use std::ops::Range;
 
-/// Columns that one task of [`forward`] projects.
+/// Columns per task of [`forward`].
 const STRIP: usize = 32;
-/// Planes that a strip goes through at once: what they hold near the strip stays in cache.
+/// Planes that a strip traverses at once: their part near the strip stays in cache.
 const PLANES: usize = 8;
-/// Planes that one task of [`adjoint`] owns.
+/// Planes per task of [`adjoint`].
 const TILE: usize = 4;
-/// Rows that share a voxel at most for [`Adjoint::gather`]; beyond that [`Adjoint::scatter`] is used.
+/// Most rows per voxel for [`Adjoint::gather`]; with more, [`Adjoint::scatter`] is used.
 const TAPS: usize = 8;
-/// A column changes lines by at most this share of what it rises along z.
+/// Largest slant of a column: change in lines per rise along z.
 const SLANT: f64 = 0.5;
 
-/// Rays of a detector column that have one main axis, x or y, and one direction along it.
+/// Rays of a detector column with the same main axis, x or y, and the same direction along it.
 #[derive(Debug, Clone)]
 pub struct Column {
-    /// Its number on the detector.
+    /// Its index on the detector.
     number: usize,
     /// Its rows, counted from below.
     rows: Range<usize>,
@@ -36,21 +36,21 @@ pub struct Column {
     main: usize,
     /// The source in voxels.
     source: Vec3,
-    /// The row from which q counts, and the bend of q: see [`places`].
+    /// The row from which q is measured, and the bend of q: see [`places`].
     middle: f64,
     bend: f64,
-    /// The ray of that row: its way per plane along the other axis and z, in voxels.
+    /// The ray of that row: its step per plane along the other axis and z, in voxels.
     slope: [f64; 2],
-    /// What that changes by with q.
+    /// Change of the slope with q.
     drift: [f64; 2],
-    /// Whether planes are met upwards.
+    /// Whether planes are traversed upwards.
     up: bool,
-    /// Square of the distance from source to pixel in mm², over that in planes squared: a polynomial in ρ.
+    /// Square of the distance from source to pixel in mm², divided by that in planes squared: a polynomial in ρ.
     length: [f64; 3],
 }
 
-/// The columns of a view that this module projects: no ray is so steep that z would be its main axis, and columns run along
-/// z rather than across.
+/// The columns of a view, if this module can project it: no ray has z as its main axis, and columns run along z rather
+/// than across.
 pub fn of(geometry: &Geometry, view: usize) -> Option<Vec<Column>> {
     let (w, grid) = (&geometry.views[view], &geometry.volume);
     let [rows, columns] = geometry.detector;
@@ -78,7 +78,7 @@ pub fn of(geometry: &Geometry, view: usize) -> Option<Vec<Column>> {
             let a = ahead[main];
             let across = [1 - main, 2];
             let drift = across.map(|k| (step[k] * a - step[main] * ahead[k]) / (a * a));
-            // Against the direction of the planes, z falls with the row where they are met downwards.
+            // If planes are traversed downwards, z decreases with the row relative to the direction of the planes.
             let rise = if up { drift[1] } else { -drift[1] };
             if rise <= 0.0 || drift[0].abs() > SLANT * rise {
                 return None;
@@ -100,7 +100,8 @@ pub fn of(geometry: &Geometry, view: usize) -> Option<Vec<Column>> {
     Some(all)
 }
 
-/// Runs of rows of one heading. Those with the same at both ends have it between them: rays that have it are a convex cone.
+/// Runs of rows with the same heading. Rays of one heading form a convex cone, so a range with equal ends has it
+/// throughout.
 fn runs<H: PartialEq + Copy>(rows: usize, heading: &impl Fn(usize) -> H) -> Vec<(Range<usize>, H)> {
     fn split<H: PartialEq + Copy>(
         (low, high): (usize, usize),
@@ -109,7 +110,7 @@ fn runs<H: PartialEq + Copy>(rows: usize, heading: &impl Fn(usize) -> H) -> Vec<
         all: &mut Vec<(Range<usize>, H)>,
     ) {
         if ends[0] == ends[1] || high - low == 1 {
-            // The last row belongs to what follows.
+            // The last row belongs to the next run.
             match all.last_mut() {
                 Some((range, h)) if *h == ends[0] => range.end = high,
                 _ => all.push((low..high, ends[0])),
@@ -135,7 +136,7 @@ fn runs<H: PartialEq + Copy>(rows: usize, heading: &impl Fn(usize) -> H) -> Vec<
 }
 
 impl Column {
-    /// Where its rays meet plane `plane`, if that lies before the source.
+    /// Where its rays meet plane `plane`, if the plane is in front of the source.
     fn meet(&self, plane: usize) -> Option<Path<f64>> {
         let away = plane as f64 - self.source[self.main];
         if away == 0.0 || (away > 0.0) != self.up {
@@ -145,7 +146,7 @@ impl Column {
         Some(Path { across: of(0, 1 - self.main), along: of(1, 2) })
     }
 
-    /// Whether it runs along z, at equal distances in every plane.
+    /// Whether it runs along z, with equal spacing in every plane.
     fn is_upright(&self) -> bool {
         self.bend == 0.0 && self.drift[0] == 0.0
     }
@@ -158,14 +159,14 @@ impl Column {
         })
     }
 
-    /// `q` of the rows from `from` on, which may be below 0.
+    /// `q` of the rows from `from` on, which may be negative.
     #[inline(always)]
     fn places<S: Simd, R: Real>(&self, s: S, from: f64, q: &mut [R]) {
         let valid = [self.rows.start as f64, self.rows.end as f64 - 1.0];
         places(s, from, [self.middle, self.bend], valid, q);
     }
 
-    /// Multiplies a number for each row with the length in mm of that row's ray between two planes.
+    /// Multiplies one number per row by the length in mm of that row's ray between two planes.
     #[inline(always)]
     fn lengthen<R: Real>(&self, numbers: &mut [R]) {
         let [a, b, c] = self.length;
@@ -176,7 +177,7 @@ impl Column {
     }
 }
 
-/// Where a line holds anything but zero.
+/// The range of nonzero values of a line.
 fn occupied<R: Real>(line: &[R]) -> Range<usize> {
     let Some(first) = line.iter().position(|x| *x != R::ZERO) else { return 0..0 };
     first..line.iter().rposition(|x| *x != R::ZERO).unwrap_or(first) + 1
@@ -190,7 +191,7 @@ fn union(a: &Range<usize>, b: &Range<usize>) -> Range<usize> {
     }
 }
 
-/// Line integrals of `volume` for views of which [`of`] gave the columns.
+/// Line integrals of `volume` for views whose columns [`of`] returned.
 pub fn forward<R: Real>(
     geometry: &Geometry,
     views: &[(usize, Vec<Column>)],
@@ -210,7 +211,7 @@ pub fn forward<R: Real>(
             let first = n * STRIP;
             let at = |number: usize| columns.partition_point(|c| c.number < number);
             let columns = &columns[at(first)..at(first + STRIP)];
-            // Not a power of two apart: rows of many columns would share few places in the cache.
+            // The stride is not a power of two: otherwise rows of many columns would share few cache sets.
             let apart = rows.next_multiple_of(WIDEST) + WIDEST;
             let mut sums = vec![R::ZERO; out.ncols() * apart];
             run(Forward { shape, voxels, occupied: &lines, columns, first, apart, sums: &mut sums });
@@ -230,16 +231,16 @@ struct Forward<'a, R> {
     columns: &'a [Column],
     /// The first column.
     first: usize,
-    /// Numbers from column to column of `sums`.
+    /// Stride between the columns of `sums`.
     apart: usize,
     /// `[column][rows]`, from below.
     sums: &'a mut [R],
 }
 
-/// The lines of a plane of voxels that a strip may read, on a [`Forward`]'s shelf.
+/// The lines of a plane of voxels that a strip may read, in a [`Forward`]'s buffer.
 struct Plane<R> {
     number: usize,
-    /// Where on the shelf line −1 would stand.
+    /// Position of line −1 in the buffer.
     start: isize,
     among: Among<R>,
 }
@@ -271,7 +272,7 @@ impl<R: Real> Op for Forward<'_, R> {
                     continue;
                 }
                 for (c, (q, ends)) in self.columns.iter().zip(&readers).filter(|(c, _)| c.main == main) {
-                    // All rows of an upright column are between the same two lines: those are mixed once.
+                    // All rows of an upright column lie between the same two lines, which are interpolated once.
                     let upright = c.is_upright();
                     let mut met: [Option<(Path<R>, &Plane<R>)>; PLANES] = [const { None }; PLANES];
                     let mut count = 0;
@@ -293,7 +294,7 @@ impl<R: Real> Op for Forward<'_, R> {
                         met[count] = Some((path, plane));
                         count += 1;
                     }
-                    // Sums of a few planes, added up in turn: two short sums round less than one long one.
+                    // Partial sums over a few planes: two short sums have a smaller rounding error than one long sum.
                     for (i, (q, sums)) in q.chunks_exact(len).zip(parts.chunks_exact_mut(len)).enumerate() {
                         let q = V::<S, R>::from_slice(s, q);
                         let mut part = V::<S, R>::splat(s, R::ZERO);
@@ -321,7 +322,7 @@ impl<R: Real> Op for Forward<'_, R> {
     }
 }
 
-/// Numbers of a line of `nz` between zeros: whole vectors.
+/// Length of a padded line of `nz` numbers: whole vectors.
 fn stride(nz: usize) -> usize {
     nz.next_multiple_of(WIDEST) + 2 * PAD
 }
@@ -338,8 +339,8 @@ impl<R: Real> Forward<'_, R> {
         (q, ends)
     }
 
-    /// Puts the lines of the planes `planes` that the strip may read side by side, between zeros: from afar they would share
-    /// few places in the cache. Planes without any are left out.
+    /// Copies the lines of the planes `planes` that the strip may read into a contiguous, zero-padded buffer: in place
+    /// they would share few cache sets. Skips empty planes.
     fn planes(&self, main: usize, planes: Range<usize>, shelf: &mut Vec<R>) -> Vec<Plane<R>> {
         let [_, ny, nz] = self.shape;
         let (others, stride) = (self.shape[1 - main] as f64, stride(nz));
@@ -353,7 +354,7 @@ impl<R: Real> Forward<'_, R> {
                     (low, high) = (low.min(at), high.max(at));
                 }
             }
-            // A line more on either side, for rounding.
+            // One more line on either side, for rounding.
             let (low, high) = ((low - 1.0).floor().max(-1.0), (high + 2.0).floor().min(others));
             if low > high {
                 continue;
@@ -385,7 +386,7 @@ impl<R: Real> Forward<'_, R> {
     }
 }
 
-/// Bytes that [`adjoint`] takes in single precision for `views` views; [`forward`] takes less.
+/// Bytes that [`adjoint`] needs in single precision for `views` views; [`forward`] needs less.
 pub fn scratch(header: &ScanHeader, views: usize) -> u64 {
     let [nx, ny, nz] = header.volume;
     let [rows, columns] = header.detector;
@@ -396,7 +397,7 @@ pub fn scratch(header: &ScanHeader, views: usize) -> u64 {
         + (views * columns * (size_of::<Column>() + size_of::<Range<usize>>()) + tiles) as u64
 }
 
-/// Adds the adjoint of [`forward`] to `volume`. `projections` holds an image for each of `views`.
+/// Adds the adjoint of [`forward`] to `volume`. `projections` has one image per view of `views`.
 pub fn adjoint<R: Real>(
     geometry: &Geometry,
     views: &[(usize, &[Column])],
@@ -410,7 +411,7 @@ pub fn adjoint<R: Real>(
         let numbers: Vec<usize> = views.iter().map(|v| v.0).collect();
         let images = projections.slice_axis(Axis(0), part.into());
         let mut pixels = ColumnMajor::new(geometry, &numbers, images, |_, _, _, x| x);
-        // Rows of each column that hold anything but zero: what an empty volume makes of air is not gathered.
+        // The nonzero rows of each column: zeros, as the residual of air in an empty volume, are not gathered.
         let lengthened = pixels.views_mut().zip(views).map(|(mut view, (_, columns))| {
             let rows = |c: &Column| {
                 let pixels = view.rows(c.number, c.rows.clone());
@@ -454,18 +455,18 @@ impl<R: Real> Op for Lengthen<'_, R> {
     }
 }
 
-/// What some planes of voxels gather from all columns that cross them.
+/// Planes of voxels that gather from all columns crossing them.
 struct Adjoint<'a, R> {
     main: usize,
     /// The first plane.
     first: usize,
-    /// Lines of a plane and numbers of a line.
+    /// Lines per plane and numbers per line.
     lines: usize,
     nz: usize,
-    /// `[plane][1 + lines + 1][PAD + nz + PAD]`: the lines before the first and after the last are not looked at.
+    /// `[plane][1 + lines + 1][PAD + nz + PAD]`: the lines before the first and after the last are ignored.
     gathered: &'a mut [R],
     views: &'a [(usize, &'a [Column])],
-    /// The rows of each column that hold anything.
+    /// The nonzero rows of each column.
     occupied: &'a [Vec<Range<usize>>],
     pixels: &'a ColumnMajor<R>,
 }
@@ -486,7 +487,7 @@ impl<R: Real> Op for Adjoint<'_, R> {
                 let mut pixels = self.pixels.column(view, c.number);
                 let rows = pixels.len() - 2 * PAD;
                 if c.rows != (0..rows) {
-                    // The others have another main axis.
+                    // The other columns have another main axis.
                     alone.clear();
                     alone.resize(pixels.len(), R::ZERO);
                     let own = PAD + c.rows.start..PAD + c.rows.end;
@@ -528,31 +529,32 @@ impl<R: Real> Op for Adjoint<'_, R> {
     }
 }
 
-/// What vectors of voxels on one line gather from: the same for all voxels of a vector, and found for many vectors at a time.
+/// The rows and lines from which vectors of voxels on one line gather: common to all voxels of a vector, and computed
+/// for many vectors at a time.
 #[derive(Default)]
 struct Windows<R> {
-    /// The first row that may share a voxel of the vector, in a column between zeros.
+    /// The first row that may contribute to a voxel of the vector, in a zero-padded column.
     first: Vec<u32>,
-    /// How far the first voxel's first such row is from there, and a row more: what lanes begin to count from.
+    /// Distance from there to the first voxel's first such row, in rows, plus one row: the start value of the lanes.
     from: Vec<R>,
-    /// Rows from voxel to voxel.
+    /// Rows per voxel.
     apart: Vec<R>,
-    /// How far the first voxel is from where q is 0, in voxels; of an upright column how far that row is from the voxel.
+    /// Distance of the first voxel from q = 0, in voxels; for an upright column, that row's distance from the voxel.
     off: Vec<R>,
     /// The first line, counted from line −1, and one after the last; or [`Windows::NONE`], or [`Windows::PAIR`].
     low: Vec<u32>,
     until: Vec<u32>,
-    /// How far the first voxel's place is from the first line, in lines.
+    /// Distance of the first voxel's position from the first line, in lines.
     across: Vec<R>,
 }
 
 impl<R: Real> Windows<R> {
-    /// Between no lines. One after the last is 2 or more otherwise.
+    /// No lines. Otherwise `until` is at least 2.
     const NONE: u32 = 1;
-    /// Between the same two lines.
+    /// The same two lines for all voxels.
     const PAIR: u32 = 0;
 
-    /// Room for `n` vectors.
+    /// Resizes to `n` vectors.
     #[inline(always)]
     fn resize(&mut self, n: usize) {
         for numbers in [&mut self.first, &mut self.low, &mut self.until] {
@@ -564,20 +566,20 @@ impl<R: Real> Windows<R> {
     }
 }
 
-/// Where a column meets a plane of voxels.
+/// The intersection of a column with a plane of voxels.
 struct Hit<'a> {
     column: &'a Column,
     path: Path<f64>,
-    /// Lines of the plane.
+    /// Lines per plane.
     lines: f64,
     numbers: usize,
-    /// Voxels along z that its rows touch.
+    /// Voxels along z that its rows affect.
     z: Range<usize>,
     /// q per voxel along z.
     per_z: f64,
-    /// Rows by which those that share a voxel are at most away from it.
+    /// Largest distance, in rows, of a row that contributes to a voxel.
     reach: f64,
-    /// Rows that share a voxel at most.
+    /// Most rows that contribute to a voxel.
     taps: usize,
 }
 
@@ -590,8 +592,8 @@ impl<'a> Hit<'a> {
             return None;
         }
         let z = (low - 1.0).ceil().max(0.0) as usize..((high + 1.0).floor().min(numbers as f64 - 1.0) as usize + 1);
-        // Rows lie closest where q rises least; within a vector they are taken to lie at equal distances, which they do
-        // but for `bow`.
+        // Rows are closest where q rises least. Within a vector they are treated as equally spaced; the error is at
+        // most `bow`.
         let half = 0.5 * column.rows.len() as f64 + 1.0;
         let per_z = 1.0 / path.along[1];
         let reach = (1.0 + column.bend.abs() * half).powi(2) * per_z;
@@ -601,13 +603,13 @@ impl<'a> Hit<'a> {
         (!z.is_empty()).then_some(Self { column, path, lines, numbers, z, per_z, reach, taps })
     }
 
-    /// The row that would meet place `z` along the lines.
+    /// The (fractional) row that meets position `z` along the lines.
     fn row(&self, z: f64) -> f64 {
         let q = (z - self.path.along[0]) * self.per_z;
         self.column.middle + q / (1.0 - self.column.bend * q)
     }
 
-    /// What the vectors of voxels of an upright column gather from.
+    /// The windows for the vectors of voxels of an upright column.
     #[inline(always)]
     fn windows_upright<R: Real>(&self, n: usize, len: usize, windows: &mut Windows<R>) {
         windows.resize(n);
@@ -624,7 +626,7 @@ impl<'a> Hit<'a> {
         }
     }
 
-    /// What the vectors of voxels of any column gather from.
+    /// The windows for the vectors of voxels of any column.
     #[inline(always)]
     fn windows<R: Real>(&self, n: usize, len: usize, windows: &mut Windows<R>) {
         windows.resize(n);
@@ -642,7 +644,7 @@ impl<'a> Hit<'a> {
             starts[i] = R::of(from - base);
             apart[i] = R::of((after - row) / (next - z) as f64);
             off[i] = R::of(self.path.along[0] - z as f64);
-            // Beside the rows that touch this vector: across which lines they go.
+            // Besides the rows that affect this vector: the lines that they cross.
             let y = self.path.across[0] + per_z * (z as f64 - self.path.along[0]);
             let (a, b) = (y - per_z, y + per_z * len as f64);
             let (lowest, highest) = (a.min(b).floor(), a.max(b).floor());
@@ -659,7 +661,7 @@ impl<'a> Hit<'a> {
         }
     }
 
-    /// Every voxel sums over the rows that are less than a voxel away: at most `K` of them. `from` are pixels and their q.
+    /// Every voxel sums over the rows less than a voxel away: at most `K` of them. `from` are pixels and their q.
     #[inline(always)]
     fn gather<S: Simd, R: Real, const K: usize>(
         &self,
@@ -705,11 +707,11 @@ impl<'a> Hit<'a> {
                 moment = share.mul_add(d, moment);
                 (shares[k], away[k]) = (share, d);
             }
-            // Where the column is at each voxel's own z, in lines from `low`.
+            // The column's position at each voxel's own z, in lines from `low`.
             let y = lanes.mul_add(slant, number(windows.across[i]));
             let to = PAD + self.z.start + i * len;
             if until == Windows::<R>::PAIR {
-                // All between the same two lines: the upper one's share is linear.
+                // All between the same two lines: the weight of the upper one is linear.
                 let upper = y.mul_add(sum, moment * slant);
                 add::<S, R>(s, plane, low * stride + to, sum - upper);
                 add::<S, R>(s, plane, (low + 1) * stride + to, upper);
@@ -728,7 +730,7 @@ impl<'a> Hit<'a> {
         }
     }
 
-    /// [`Hit::gather`] for an upright column: its rows are at equal distances, between the same two lines.
+    /// [`Hit::gather`] for an upright column: its rows are equally spaced, between the same two lines.
     #[inline(always)]
     fn gather_upright<S: Simd, R: Real, const K: usize>(
         &self,
@@ -764,7 +766,7 @@ impl<'a> Hit<'a> {
             } else {
                 R::neighbours::<S, K>(s, pixels, (cell + number(first as f64)).min(most))
             };
-            // How far the first of those rows is from each voxel, in voxels.
+            // Distance of the first of those rows from each voxel, in voxels.
             let mut d = cell.mul_add(rise, V::<S, R>::splat(s, windows.off[i]) - lanes);
             let mut sum = zero;
             for x in pixels {
@@ -776,7 +778,7 @@ impl<'a> Hit<'a> {
         }
     }
 
-    /// Every row gives to the voxels beside it: for detectors with many rows a voxel.
+    /// Every row contributes to its neighbouring voxels: for detectors with many rows per voxel.
     #[inline(always)]
     fn scatter<R: Real>(&self, [pixels, q]: [&[R]; 2], plane: &mut [R], stride: usize) {
         let path: Path<R> = self.path.narrow();

@@ -1,4 +1,4 @@
-//! Geometry in voxels, and projections that lie column by column.
+//! Geometry in voxel coordinates, and projections stored column by column.
 
 use super::readers::PAD;
 use conefield_core::geometry::{Geometry, Vec3, VoxelGrid, cross, dot, sub};
@@ -8,7 +8,7 @@ use ndarray::{ArrayView3, Axis};
 use rayon::prelude::*;
 use std::ops::Range;
 
-/// A world position in voxels: whole numbers are voxel centres.
+/// A world position in voxel coordinates: integers are voxel centres.
 pub fn to_voxels(grid: &VoxelGrid, p: Vec3) -> Vec3 {
     let lower = grid.bounds()[0];
     std::array::from_fn(|k| (p[k] - lower[k]) / grid.spacing[k] - 0.5)
@@ -26,8 +26,7 @@ pub fn main_axis(ahead: Vec3) -> usize {
     }
 }
 
-/// Some views with the pixels of a detector column side by side, from below, between
-/// `PAD` zeros.
+/// Some views with the pixels of each detector column contiguous, from below, between `PAD` zeros.
 pub struct ColumnMajor<R> {
     /// `[view][column][PAD + rows + PAD]`.
     data: Vec<R>,
@@ -38,8 +37,8 @@ pub struct ColumnMajor<R> {
 }
 
 impl<R: Real> ColumnMajor<R> {
-    /// The views `views` of `geometry`, of which `projections` holds one each; `value` makes a number of a pixel from
-    /// its view (counted within `views`), row, column and measured value.
+    /// The views `views` of `geometry`, with one image each in `projections`; `value` computes a number from a pixel's
+    /// view (index within `views`), row, column and measured value.
     pub fn new(
         geometry: &Geometry,
         views: &[usize],
@@ -52,7 +51,7 @@ impl<R: Real> ColumnMajor<R> {
         let downwards: Vec<bool> = views.iter().map(|&v| geometry.views[v].v[2] < 0.0).collect();
         data.par_chunks_mut(columns * stride).zip(&downwards).enumerate().for_each(|(n, (out, &downwards))| {
             let view = projections.index_axis(Axis(0), n);
-            // Strips of columns: each row's numbers are read side by side and written to lines that stay in cache.
+            // Strips of columns: each row's numbers are read contiguously and written to lines that stay in cache.
             const STRIP: usize = 16;
             for left in (0..columns).step_by(STRIP) {
                 for row in 0..rows {
@@ -66,14 +65,14 @@ impl<R: Real> ColumnMajor<R> {
         Self { data, rows, columns, downwards }
     }
 
-    /// A column with its zeros; row 0 stands at `PAD`.
+    /// A column with its padding; row 0 is at `PAD`.
     pub fn column(&self, view: usize, column: usize) -> &[R] {
         let stride = self.rows + 2 * PAD;
         let at = (view * self.columns + column) * stride;
         &self.data[at..at + stride]
     }
 
-    /// Every view, to be changed.
+    /// Mutable access to every view.
     pub fn views_mut(&mut self) -> impl IndexedParallelIterator<Item = ViewColumns<'_, R>> {
         let (rows, stride) = (self.rows, self.rows + 2 * PAD);
         self.data.par_chunks_mut((self.columns * stride).max(1)).map(move |data| ViewColumns { data, rows })
@@ -95,7 +94,7 @@ impl<R: Real> ColumnMajor<R> {
     }
 }
 
-/// The columns of a view, to be changed.
+/// Mutable access to the columns of a view.
 pub struct ViewColumns<'a, R> {
     data: &'a mut [R],
     rows: usize,
@@ -109,7 +108,7 @@ impl<R> ViewColumns<'_, R> {
     }
 }
 
-/// How many views to hold column by column at once: a few MiB, which stay in the last cache.
+/// Number of views to hold column by column at once: a few MiB, which stay in the last-level cache.
 pub fn batch<R>([rows, columns]: [usize; 2]) -> usize {
     let view = (rows + 2 * PAD) * columns * size_of::<R>();
     ((12 << 20) / view.max(1)).clamp(1, 64)
@@ -120,13 +119,13 @@ pub fn column_major_bytes<R>([rows, columns]: [usize; 2], views: usize) -> u64 {
     (views * columns * (rows + 2 * PAD) * size_of::<R>()) as u64
 }
 
-/// Detector coordinates of world positions for a view, tilted or not: `u`, `v` in pixels and the depth.
+/// Maps world positions to detector coordinates of a view, tilted or not: `u`, `v` in pixels and the depth.
 #[derive(Debug, Clone, Copy)]
 pub struct Pinhole {
     source: Vec3,
-    /// Unit normal of the detector, away from the source.
+    /// Unit normal of the detector, pointing away from the source.
     pub normal: Vec3,
-    /// Distance of source and detector along the normal, mm.
+    /// Distance between source and detector along the normal, mm.
     pub distance: f64,
     /// From the source to the pixel (0, 0), mm.
     corner: Vec3,
@@ -146,7 +145,7 @@ impl Pinhole {
         Self { source: w.source, normal, distance, corner, dual }
     }
 
-    /// The same for the voxels of `grid` by their index, for a view that counts `scale`.
+    /// The same map for the voxel indices of `grid`, for a view with the weight `scale`.
     pub fn voxels(&self, grid: &VoxelGrid, scale: f64) -> VoxelView {
         let corner = sub(grid.voxel([0; 3]), self.source);
         let linear = |axis: Vec3| {
@@ -162,8 +161,8 @@ impl Pinhole {
         VoxelView { depth, row: place(self.dual[1]), column: place(self.dual[0]), scale }
     }
 
-    /// Row and column (whole numbers are pixel centres) where the ray through `p` meets the detector, and the depth
-    /// of `p`: its distance from the source along the normal in mm.
+    /// Row and column (integers are pixel centres) where the ray through `p` meets the detector, and the depth of `p`:
+    /// its distance from the source along the normal in mm.
     pub fn project(&self, p: Vec3) -> ([f64; 2], f64) {
         let d = sub(p, self.source);
         let depth = dot(self.normal, d);

@@ -1,13 +1,13 @@
-//! Projection of voxel volumes and its adjoint.
+//! Projectors of voxel volumes and their adjoints.
 //!
-//! - [`walk`]: where a ray meets voxels and for how long, by Siddon and by trilinear sampling. One walk serves both
+//! - [`walk`]: the voxels along a ray and their lengths, by Siddon and by trilinear sampling. One walk serves both
 //!   directions, so they are adjoint by construction.
-//! - [`rays`]: a walk ray by ray, for any geometry.
-//! - [`columns`]: Joseph for views whose detector columns run along z, or nearly so, as those of every circular orbit do.
-//!   The rows of a column then read lines of voxels upwards, where voxels are neighbours in memory.
+//! - [`rays`]: projection ray by ray, for any geometry.
+//! - [`columns`]: Joseph for views whose detector columns run along z, or nearly so, as on every circular orbit. The
+//!   rows of a column then read lines of voxels upwards, which are contiguous in memory.
 //! - [`bundles`]: Joseph for all other views.
 //! - [`backproject`]: the voxel-driven, distance-weighted back-projection of FDK. It is not an adjoint.
-//! - [`layout`]: how projections and volumes lie in memory for all of these.
+//! - [`layout`]: memory layouts of projections and volumes for all of these.
 
 pub mod backproject;
 pub mod bundles;

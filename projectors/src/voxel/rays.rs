@@ -1,4 +1,5 @@
-//! A walk ray by ray: forward every ray sums over its voxels, back every slab of voxels gathers from all rays.
+//! Projection ray by ray: in the forward projection every ray sums over its voxels; in the adjoint every slab of voxels
+//! gathers from all rays.
 
 use super::walk::{VoxelRay, Walk};
 use conefield_core::geometry::Geometry;
@@ -6,7 +7,7 @@ use conefield_core::simd::Real;
 use ndarray::{ArrayView3, ArrayViewMut3, Axis};
 use rayon::prelude::*;
 
-/// Planes of voxels along x that one task of [`adjoint`] owns.
+/// Planes of voxels along x per task of [`adjoint`].
 const SLAB: usize = 8;
 
 /// Line integrals of `volume` along the pixels of `views`; sums are in double precision.
@@ -30,8 +31,8 @@ pub fn forward<R: Real, W: Walk>(
     });
 }
 
-/// Adds the adjoint of [`forward`] to `volume`. Each task owns some planes of voxels and goes through the rays in
-/// order, so that nothing is written from two sides and sums have one order.
+/// Adds the adjoint of [`forward`] to `volume`. Each task owns some planes of voxels and processes the rays in order,
+/// so that there are no conflicting writes and the order of summation is fixed.
 pub fn adjoint<R: Real, W: Walk>(
     walk: &W,
     geometry: &Geometry,

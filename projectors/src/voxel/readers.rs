@@ -1,16 +1,18 @@
-//! Readers that stand in a row between lines of numbers: what projectors and the voxel-driven back-projection have in common.
+//! Readers: rays or voxels that interpolate between lines of numbers, shared by projectors and voxel-driven
+//! back-projection.
 //!
-//! The rays of a detector column meet a plane of voxels on a straight line, and so do the voxels of a line on the detector.
-//! Along that line readers stand at `q(i)`, a projective function of their number (of i itself where nothing is tilted), and
-//! both coordinates of a place are linear in q. One coordinate counts lines, the other numbers within them. Readers go
-//! upwards within lines, so a vector of them reads two vectors of neighbours and shuffles; they change lines slowly.
+//! The rays of a detector column meet a plane of voxels on a straight line, and the voxels of a line project to a
+//! straight line on the detector. Along that line the readers are at `q(i)`, a projective function of their index
+//! (equal to i if nothing is tilted), and both coordinates of a position are linear in q. One coordinate counts lines,
+//! the other numbers within them. Readers run upwards within lines, so a vector of them loads two neighbouring vectors
+//! and shuffles; they change lines slowly.
 
 use conefield_core::simd::{Real, Simd, SimdBase, SimdFloat, V, store};
 
-/// Zeros before the first and after the last number of a line: vectors read up to so many beyond it.
+/// Zero padding before and after a line: vectors may read this far beyond it.
 pub const PAD: usize = 32;
 
-/// Where readers are at `q`: `at + per·q`, across the lines and along them. The first line and number are at 0.
+/// Positions of readers at `q`: `at + per·q`, across the lines and along them. The first line and number are at 0.
 #[derive(Debug, Clone, Copy)]
 pub(super) struct Path<R> {
     pub across: [R; 2],
@@ -34,14 +36,14 @@ impl Path<f64> {
     }
 }
 
-/// The lines that a path goes between.
+/// The lines between which a path runs.
 #[derive(Debug, Clone, Copy)]
 pub(super) struct Among<R> {
-    /// How many lines there are; all others are zero.
+    /// Number of lines; all others are zero.
     pub lines: R,
-    /// How many numbers a line has.
+    /// Numbers per line.
     pub numbers: R,
-    /// Places along the lines between which something other than 0 may be read.
+    /// Range along the lines outside which all values are 0.
     pub span: [R; 2],
 }
 
@@ -53,7 +55,7 @@ pub(super) struct Ends<R> {
 }
 
 impl<R: Real> Ends<R> {
-    /// Those of readers at `q`, in vectors of `len`.
+    /// Computes them for readers at `q`, in vectors of `len`.
     #[inline(always)]
     pub fn find(&mut self, q: &[R], len: usize) {
         self.first.clear();
@@ -65,35 +67,35 @@ impl<R: Real> Ends<R> {
     }
 }
 
-/// Where every vector of readers stands on the lines of one path. What is the same for all readers of a vector is found here
-/// for many vectors at a time, which the compiler makes vectors of again; next to the readers themselves it took most of the
-/// time.
+/// Positions of all vectors of readers on the lines of one path. The part common to a vector's readers is computed here
+/// for many vectors at a time, which the compiler vectorizes again; computed per vector it took most of the time.
 pub(super) struct Stands<R> {
-    /// Where on a line the numbers that a vector reads begin; or [`NOWHERE`], or [`FAR`].
+    /// Start of the window on a line that a vector reads; or [`NOWHERE`], or [`FAR`].
     from: Vec<u32>,
-    /// What to add to `per·q` for a reader's place from there on.
+    /// Offset added to `per·q` to get a reader's position in the window.
     along: Vec<R>,
-    /// The first line, counted from line −1, and one after the last; 0 for a vector that stands between two lines.
+    /// The first line, counted from line −1, and one after the last; `until` is 0 for a vector between two lines.
     low: Vec<u32>,
     until: Vec<u32>,
-    /// What to add to `per·q` for a reader's distance from the first line.
+    /// Offset added to `per·q` to get a reader's distance from the first line.
     across: Vec<R>,
 }
 
-/// Readers of a vector find nothing but 0. No window begins here, as readers before the first number are within a vector of it.
+/// The readers of a vector read only zeros. No window begins here, because readers before the first number are within a
+/// vector of it.
 const NOWHERE: u32 = 0;
-/// Readers of a vector stand too far apart for a window. None begins here either.
+/// The readers of a vector are too far apart for a window. No window begins here either.
 const FAR: u32 = 1;
 
 impl<R: Real> Stands<R> {
-    /// For so many vectors at most.
+    /// Buffers for at most `vectors` vectors.
     pub fn new(vectors: usize) -> Self {
         let zeros = || vec![R::ZERO; vectors];
         let numbers = || vec![0; vectors];
         Self { from: numbers(), along: zeros(), low: numbers(), until: numbers(), across: zeros() }
     }
 
-    /// Of vectors of `len` readers.
+    /// Computes the positions of vectors of `len` readers.
     #[inline(always)]
     pub fn place(&mut self, path: &Path<R>, among: &Among<R>, ends: &Ends<R>, len: usize) {
         self.place_along(path, among, ends, len);
@@ -117,7 +119,7 @@ impl<R: Real> Stands<R> {
         }
     }
 
-    /// Of vectors of `len` readers, on a line that stands where they all do.
+    /// Computes the positions of vectors of `len` readers along a line that they all share.
     #[inline(always)]
     pub fn place_along(&mut self, path: &Path<R>, among: &Among<R>, ends: &Ends<R>, len: usize) {
         let n = ends.first.len();
@@ -126,7 +128,7 @@ impl<R: Real> Stands<R> {
         let most = R::of(2.0 * len as f64 - 2.5);
         for i in 0..n {
             let (first, last) = (path.along(first[i]), path.along(last[i]));
-            // A little below the first reader, so that rounding puts none before it.
+            // Slightly below the first reader, so that rounding moves none before it.
             let base = (first - R::of(1.0 / 64.0)).floor();
             let window = if last - base <= most { (base + R::of(PAD as f64)).count() } else { FAR };
             from[i] = if last <= among.span[0] || first >= among.span[1] { NOWHERE } else { window };
@@ -135,8 +137,8 @@ impl<R: Real> Stands<R> {
     }
 }
 
-/// What the readers of vector `i`, at `q`, find by bilinear interpolation; `None` if that is 0. `line` gives a line between
-/// [`PAD`] zeros, counted from line −1.
+/// The values of the readers of vector `i`, at `q`, by bilinear interpolation; `None` if they are 0. `line` returns a
+/// line with [`PAD`] zeros on both sides, counted from line −1.
 #[inline(always)]
 pub(super) fn read<'a, S: Simd, R: Real>(
     s: S,
@@ -155,7 +157,7 @@ pub(super) fn read<'a, S: Simd, R: Real>(
         let (a, b) = (between(s, line(low), &stand), between(s, line(low + 1), &stand));
         return Some(y.mul_add(b - a, a));
     }
-    // Between more than two lines: each counts by its distance.
+    // Between more than two lines: each is weighted by its distance.
     let (zero, one) = (number(R::ZERO), number(R::ONE));
     let mut sum = zero;
     let mut away = y;
@@ -167,7 +169,7 @@ pub(super) fn read<'a, S: Simd, R: Real>(
     Some(sum)
 }
 
-/// What the readers of vector `i`, at `q`, find on a line that stands where they all do; `None` if that is 0.
+/// The values of the readers of vector `i`, at `q`, on a line that they all share; `None` if they are 0.
 #[inline(always)]
 pub(super) fn read_on<S: Simd, R: Real>(
     s: S,
@@ -181,15 +183,15 @@ pub(super) fn read_on<S: Simd, R: Real>(
     Some(between(s, line, &stand(s, path, among, stands, i, q)?))
 }
 
-/// Where readers stand along the lines: a `share` of the way from number `cell` to the next one, counted from `from` where
-/// all are near.
+/// Positions of readers along the lines: a `share` of the way from number `cell` to the next one, relative to the
+/// window at `from`, if there is one.
 struct Stand<S: Simd, R: Real> {
     from: Option<usize>,
     cell: V<S, R>,
     share: V<S, R>,
 }
 
-/// Where the readers of vector `i` stand along the lines; `None` where all lines are zero.
+/// The positions of the readers of vector `i` along the lines; `None` if all lines are zero.
 #[inline(always)]
 fn stand<S: Simd, R: Real>(
     s: S,
@@ -218,7 +220,7 @@ fn stand<S: Simd, R: Real>(
     }
 }
 
-/// `line = (1 − share)·a + share·b`, all of whole vectors.
+/// `line = (1 − share)·a + share·b`, in whole vectors.
 #[inline(always)]
 pub(super) fn mix<S: Simd, R: Real>(s: S, a: &[R], b: &[R], share: R, line: &mut [R]) {
     let len = V::<S, R>::LEN;
@@ -229,8 +231,8 @@ pub(super) fn mix<S: Simd, R: Real>(s: S, a: &[R], b: &[R], share: R, line: &mut
     }
 }
 
-/// What readers find on one line.
-/// (No closure: whether one is inlined into code for an instruction set is the compiler's choice.)
+/// The values of readers on one line.
+/// (No closure: the compiler would decide whether to inline it into code for an instruction set.)
 #[inline(always)]
 fn between<S: Simd, R: Real>(s: S, line: &[R], stand: &Stand<S, R>) -> V<S, R> {
     let [a, b] = match stand.from {
@@ -240,8 +242,8 @@ fn between<S: Simd, R: Real>(s: S, line: &[R], stand: &Stand<S, R>) -> V<S, R> {
     stand.share.mul_add(b - a, a)
 }
 
-/// `q` of readers from `from` on, of which the numbers `valid` count: `ρ/(1 + bend·ρ)` with ρ the distance from `middle`.
-/// Numbers beyond have the nearest one's.
+/// `q` of readers from `from` on: `ρ/(1 + bend·ρ)` with ρ the distance from `middle`. Indices outside `valid` get the
+/// nearest valid value.
 #[inline(always)]
 pub(super) fn places<S: Simd, R: Real>(s: S, from: f64, [middle, bend]: [f64; 2], valid: [f64; 2], q: &mut [R]) {
     let len = V::<S, R>::LEN;

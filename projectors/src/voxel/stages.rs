@@ -1,4 +1,4 @@
-//! The voxel projectors that a spec may name.
+//! The built-in voxel projectors.
 
 use super::rays;
 use super::walk::{SiddonWalk, TrilinearWalk};
@@ -28,7 +28,7 @@ pub struct Joseph {}
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields, default)]
 pub struct Trilinear {
-    /// Samples along the smallest side of a voxel, at least.
+    /// Minimum number of samples along the smallest side of a voxel.
     pub samples_per_voxel: f64,
 }
 
@@ -134,7 +134,7 @@ impl<R: Real> VoxelOperator<R> for Trilinear {
     }
 }
 
-/// Views that go column by column run so, the others bundle by bundle.
+/// Uses columns for views that allow it, and bundles for the others.
 impl<R: Real> VoxelOperator<R> for Joseph {
     fn forward(&self, geometry: &Geometry, views: &[usize], volume: ArrayView3<'_, R>, mut out: ArrayViewMut3<'_, R>) {
         let (mut fitting, mut others) = ((vec![], vec![]), (vec![], vec![]));
@@ -151,7 +151,7 @@ impl<R: Real> VoxelOperator<R> for Joseph {
                 }
             }
         }
-        // Most scans have views of one kind only, and nothing is to be prepared for the other.
+        // Most scans have views of one kind only: nothing is prepared for the other.
         if !fitting.0.is_empty() {
             columns::forward(geometry, &fitting.0, volume, fitting.1);
         }

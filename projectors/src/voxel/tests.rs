@@ -1,4 +1,4 @@
-//! Adjointness, agreement of the ways to compute the same, and closed forms.
+//! Tests of adjointness, of agreement between implementations, and against closed forms.
 
 use super::backproject::backproject;
 use super::columns;
@@ -19,7 +19,7 @@ fn circular(angle: f64, dso: f64, dsd: f64, pixel: [f64; 2], offset: [f64; 2]) -
     View::circular(Radians(angle), Millimetres(dso), Millimetres(dsd), pixel.map(Millimetres), offset.map(Millimetres))
 }
 
-/// Non-square detector and volume, anisotropic voxels beside the axis, offsets, angles at and between the axes.
+/// Non-square detector and volume, anisotropic off-axis voxels, offsets, angles on and between the axes.
 fn crooked(upright: bool) -> Geometry {
     let angles = [0.0, 0.3, std::f64::consts::FRAC_PI_4, 1.6, 2.9, 3.7, 1.5 * std::f64::consts::PI, 5.5];
     let mut views: Vec<View> = angles.iter().map(|&a| circular(a, 90.0, 140.0, [2.1, 1.7], [3.0, -4.5])).collect();
@@ -38,7 +38,7 @@ fn crooked(upright: bool) -> Geometry {
     }
 }
 
-/// The same scan with its detectors turned in their planes by some degrees and leaning by half as much.
+/// The same scan with detectors rotated in their planes by some degrees and tilted by half as much.
 fn turned(mut g: Geometry, degrees: f64) -> Geometry {
     let (sin, cos) = degrees.to_radians().sin_cos();
     let lean = (0.5 * degrees.to_radians()).sin();
@@ -109,7 +109,7 @@ fn adjoints_are_exact() {
     }
 }
 
-/// The check above can fail: a forward of another projector is no adjoint's partner.
+/// Verifies that the check above can fail: a forward projection of another projector does not match the adjoint.
 #[test]
 fn a_wrong_adjoint_is_caught() {
     struct Wrong;
@@ -136,9 +136,9 @@ fn a_wrong_adjoint_is_caught() {
     assert!(mismatch(&Wrong, &crooked(true), 7) > 1e-4);
 }
 
-/// Bilinear interpolation in the planes of voxel centres across the ray's main direction, one plane after another
-/// (Joseph, IEEE Trans. Med. Imaging 1(3), 1982), voxel by voxel: what the fast ways are compared with. Outside the volume is
-/// nothing.
+/// Bilinear interpolation in the planes of voxel centres across the ray's main direction, plane by plane (Joseph, IEEE
+/// Trans. Med. Imaging 1(3), 1982), voxel by voxel: the reference for the fast implementations. Outside the volume
+/// there is nothing.
 #[derive(Debug, Clone, Copy)]
 struct JosephWalk;
 
@@ -154,7 +154,7 @@ impl Walk for JosephWalk {
         if main == 0 {
             (lower[0], upper[0]) = (slab.start as f64, slab.end as f64 - 1.0);
         }
-        // A plane more on both sides: positions on the edge are told voxel by voxel.
+        // One more plane on both sides: each voxel is checked for positions on the edge.
         let (lo, hi) = (lower[main], upper[main]);
         (lower[main], upper[main]) = (lo - 1.0, hi + 1.0);
         let Some([near, far]) = ray.clip(lower, upper) else { return };
@@ -186,7 +186,8 @@ impl Walk for JosephWalk {
     }
 }
 
-/// How far `g`'s projections are from those ray by ray: in double precision, and in single as a share of the largest value.
+/// Differences between `g`'s projections and those ray by ray: in double precision, and in single precision relative to
+/// the largest value.
 fn off_the_rays(g: &Geometry) -> [f64; 2] {
     let x = noise::<f64>(g.volume.shape, 3);
     let mut slow = Array3::zeros((g.views.len(), g.detector[0], g.detector[1]));
@@ -202,7 +203,7 @@ fn off_the_rays(g: &Geometry) -> [f64; 2] {
 
 #[test]
 fn columns_and_bundles_agree_with_rays() {
-    // Two of these views are tilted; from above, rays run along z; a detector that is narrower than a bundle.
+    // Two of these views are tilted; from above, rays run along z; a detector narrower than a bundle.
     let (upright, tilted) = (crooked(true), crooked(false));
     assert!(all_views(&upright).iter().all(|&v| columns::of(&upright, v).is_some()));
     assert!(all_views(&tilted).iter().all(|&v| columns::of(&tilted, v).is_some()));
@@ -221,8 +222,8 @@ fn columns_and_bundles_agree_with_rays() {
     }
 }
 
-/// Detectors that are turned and lean, little and much; voxels that are tiny, flat, long; volumes of one voxel and of lines
-/// longer than vectors; a source so near that rays of one column have different main axes.
+/// Detectors with small and large rotation and tilt; tiny, flat and long voxels; volumes of one voxel and of lines
+/// longer than vectors; a source so close that rays of one column have different main axes.
 #[test]
 fn tilted_columns_agree_with_rays_and_are_adjoint() {
     let grids = [
@@ -249,7 +250,7 @@ fn tilted_columns_agree_with_rays_and_are_adjoint() {
     }
 }
 
-/// Rays of one column that have x and y as their main axes are two runs of rows.
+/// Rays of one column with x and y as their main axes form two runs of rows.
 #[test]
 fn a_column_across_the_diagonal_is_split() {
     let mut g = turned(crooked(true), 8.0);
@@ -293,7 +294,7 @@ fn any_number_of_threads_gives_the_same_bits() {
     assert_eq!(on(1), on(3));
 }
 
-/// Root mean square error against the closed form, over the mean of the closed form.
+/// Root mean square error against the closed form, relative to its mean.
 fn error_at(p: &dyn VoxelProjector, n: usize) -> f64 {
     let side = 40.0;
     let g = Geometry {
@@ -312,7 +313,7 @@ fn error_at(p: &dyn VoxelProjector, n: usize) -> f64 {
     (square / count).sqrt() / (sum / count)
 }
 
-/// Voxels know the edge of a homogeneous body to a share of their size: the order is about 1 for every projector.
+/// Voxels resolve the edge of a homogeneous body to a fraction of their size: every projector has order about 1.
 #[test]
 fn projections_of_an_ellipsoid_converge() {
     for (p, least) in projectors().iter().zip([0.9; 3]) {
@@ -323,7 +324,7 @@ fn projections_of_an_ellipsoid_converge() {
     }
 }
 
-/// Sums of 512 planes in single precision: rounding stays below 1e-6 of the sum.
+/// Sums of 512 planes in single precision: the rounding error stays below 1e-6 of the sum.
 #[test]
 fn long_sums_keep_their_accuracy() {
     let g = Geometry {
@@ -339,7 +340,7 @@ fn long_sums_keep_their_accuracy() {
     }
 }
 
-/// Formula by formula, voxel by voxel: what FDK's back-projection is compared with.
+/// The plain formula, voxel by voxel: the reference for FDK's back-projection.
 fn backprojected(g: &Geometry, y: &Array3<f64>, scales: &[f64]) -> Array3<f64> {
     let [rows, columns] = g.detector;
     Array3::from_shape_fn(g.volume.shape, |(i, j, k)| {
@@ -361,8 +362,8 @@ fn backprojected(g: &Geometry, y: &Array3<f64>, scales: &[f64]) -> Array3<f64> {
     })
 }
 
-/// Upright, tilted, on its side; a detector that the volume leaves; lines shorter and longer than a vector; steps of many
-/// rows from voxel to voxel.
+/// Upright, tilted, on its side; a volume larger than the detector; lines shorter and longer than a vector; steps of
+/// many rows from voxel to voxel.
 #[test]
 fn backprojection_by_lines_agrees_with_voxels() {
     let mut lying = crooked(true);

@@ -1,16 +1,16 @@
-//! Which voxels a ray meets and for how many millimetres each counts.
+//! The voxels along a ray and the millimetres in each.
 
 use conefield_core::geometry::{Geometry, Vec3, VoxelGrid, norm, sub};
 use std::ops::Range;
 
-/// A ray in voxels: `source + t·ahead`, where `t = 1` is the pixel.
+/// A ray in voxel coordinates: `source + t·ahead`, where `t = 1` is the pixel.
 #[derive(Debug, Clone, Copy)]
 pub struct VoxelRay {
-    /// The source in voxels; whole numbers are voxel centres.
+    /// The source in voxel coordinates; integers are voxel centres.
     pub source: Vec3,
     /// From the source to the pixel, in voxels.
     pub ahead: Vec3,
-    /// The same in mm: length of the way from `t = 0` to `t = 1`.
+    /// The length from `t = 0` to `t = 1` in mm.
     pub length: f64,
 }
 
@@ -31,7 +31,7 @@ impl VoxelRay {
         self.source[k] + t * self.ahead[k]
     }
 
-    /// The `t` before the detector side is left where `lower ≤ position ≤ upper` on every axis, from the source on.
+    /// The range of `t`, from the source on, in which `lower ≤ position ≤ upper` on every axis; `None` if it is empty.
     pub(super) fn clip(&self, lower: Vec3, upper: Vec3) -> Option<[f64; 2]> {
         let (mut near, mut far) = (0.0f64, f64::INFINITY);
         for k in 0..3 {
@@ -49,14 +49,14 @@ impl VoxelRay {
     }
 }
 
-/// Calls back with the voxels `(x, y, z)` of a ray and the millimetres that each counts for.
+/// Enumerates the voxels `(x, y, z)` along a ray with their weights in mm.
 pub trait Walk: Sync {
-    /// Visits the voxels with `x` in `slab`. What a voxel is given must not depend on the slab but by rounding.
+    /// Visits the voxels with `x` in `slab`. A voxel's weight must not depend on the slab except by rounding.
     fn walk(&self, ray: &VoxelRay, grid: &VoxelGrid, slab: &Range<usize>, visit: impl FnMut([usize; 3], f64));
 }
 
-/// The exact length of the ray inside each voxel (Siddon, Med. Phys. 12(2), 1985), voxel by voxel as Amanatides and
-/// Woo step (Eurographics 1987).
+/// The exact length of the ray inside each voxel (Siddon, Med. Phys. 12(2), 1985), traversed voxel by voxel (Amanatides
+/// and Woo, Eurographics 1987).
 #[derive(Debug, Clone, Copy)]
 pub struct SiddonWalk;
 
@@ -98,11 +98,11 @@ impl Walk for SiddonWalk {
     }
 }
 
-/// Trilinear interpolation at the midpoints of equal steps inside the box that the voxels fill; in its outer half
-/// voxel the outermost values go on.
+/// Trilinear interpolation at the midpoints of equal steps inside the box of the voxels; in its outer half voxel the
+/// outermost values are constant.
 #[derive(Debug, Clone, Copy)]
 pub struct TrilinearWalk {
-    /// Steps of at most the smallest voxel side divided by this.
+    /// The step is at most the smallest voxel side divided by this.
     pub samples_per_voxel: f64,
 }
 

@@ -1,4 +1,4 @@
-//! What the links of a chain have made so far, as the next one and a checkpoint need it.
+//! Results of a chain's finished methods, for the next method and for checkpoints.
 
 use conefield_core::checkpoint::{Checkpoint, Resume, Standing, tensors_of};
 use conefield_core::error::{Error, Result, ensure};
@@ -8,28 +8,28 @@ use conefield_core::trained::{Placement, TrainedField};
 use ndarray::{Array3, Zip};
 use serde::{Deserialize, Serialize};
 
-/// Names of tensors in a checkpoint: the volume that the next link starts from, the sum of those that the mean is of; and what
-/// names begin with: those of the field that was trained, and those of the link that runs.
+/// Names of tensors in a checkpoint: the start volume of the next method and the sum for the mean; then the name
+/// prefixes of the trained field and of the running method.
 const START: &str = "chain.start";
 const SUM: &str = "chain.sum";
 const FIELD: &str = "chain.field.";
 const LINK: &str = "link.";
 
-/// What links have made.
+/// Results of the finished methods.
 #[derive(Default)]
 pub(super) struct Made {
-    /// How many.
+    /// Number of finished methods.
     pub(super) links: usize,
     pub(super) counts: Counts,
-    /// The volume of the last one, where it is needed.
+    /// The last volume, if it is needed.
     volume: Option<Volume>,
-    /// The sum of the volumes that the mean is of.
+    /// The sum of the volumes for the mean.
     sum: Option<Array3<f32>>,
-    /// The last field that was trained, and by which link.
+    /// The last trained field, and the index of its method.
     field: Option<(usize, TrainedField)>,
 }
 
-/// What the solutions of all links add up to.
+/// Totals over the solutions of all methods.
 #[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub(super) struct Counts {
@@ -41,26 +41,26 @@ pub(super) struct Counts {
     best: Option<Best>,
 }
 
-/// What a checkpoint says of a chain.
+/// The chain's entry in a checkpoint.
 #[derive(Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 struct Kept {
-    /// Finished links.
+    /// Number of finished methods.
     links: usize,
     counts: Counts,
-    /// The link that trained the field, and where the field stands.
+    /// The index of the method that trained the field, and the field's placement.
     field: Option<(usize, Placement)>,
-    /// Where the link that runs stands; nothing before its first checkpoint.
+    /// Progress of the running method; `None` before its first checkpoint.
     link: Option<Standing>,
 }
 
 impl Made {
-    /// What the next link starts from.
+    /// The start volume of the next method.
     pub(super) fn start(&self) -> Option<&Volume> {
         self.volume.as_ref()
     }
 
-    /// Adds what a link made. Its volume `counts` among those that the mean is of, or is what the `next` link starts from.
+    /// Adds a method's result. `counts`: the mean includes its volume; `next`: the next method starts from it.
     pub(super) fn add(&mut self, solution: Solution, counts: bool, next: bool, job: &Job<'_>) -> Result<()> {
         let Solution { result, steps, train_s, samples, sampling_s, rollbacks, best } = solution;
         self.volume = None;
@@ -94,7 +94,7 @@ impl Made {
         Ok(())
     }
 
-    /// What came out of all links: of `mean` links the mean.
+    /// The result of the chain: with several volumes, the mean of the last `mean`.
     pub(super) fn solution(self, mean: usize) -> Result<Solution> {
         let volume = match (self.sum, self.volume) {
             (Some(sum), Some(last)) => Some(Volume { data: sum / mean as f32, affine: None, ..last }),
@@ -110,7 +110,7 @@ impl Made {
         Ok(Solution { result, steps, train_s, samples, sampling_s, rollbacks, best })
     }
 
-    /// A checkpoint of the chain, with that of the `link` that runs.
+    /// A checkpoint of the chain, including that of the running method `link`.
     pub(super) fn checkpoint<'a>(&'a self, link: Option<&Checkpoint<'a>>) -> Result<Checkpoint<'a>> {
         let mut tensors = vec![];
         let volume = self.volume.as_ref().map(|v| &v.data);
@@ -138,7 +138,7 @@ impl Made {
         Ok(Checkpoint { tensors, standing })
     }
 
-    /// What stands in a checkpoint, with the part of the link that runs, if that has one.
+    /// Restores the state from a checkpoint, with the running method's own part if there is one.
     pub(super) fn resumed(resume: &Resume, links: &[Box<dyn Plan>], job: &Job<'_>) -> Result<(Self, Option<Resume>)> {
         let place = &resume.place;
         let kept = Kept::deserialize(&resume.standing.method);
@@ -170,7 +170,7 @@ impl Made {
     }
 }
 
-/// A volume whose numbers follow each other in standard order, as a checkpoint writes them.
+/// A volume in standard memory order, as checkpoints require.
 fn dense(volume: Volume) -> Volume {
     if volume.data.is_standard_layout() {
         return volume;

@@ -1,35 +1,36 @@
-//! The axis of a circle that the sources stand on, wherever it lies.
+//! Finds the axis of the source circle, wherever it lies.
 
 use conefield_core::geometry::{Geometry, Vec3, View, cross, dot, norm, sub};
 use std::borrow::Cow;
 
-/// An axis that is this near to z, in radians and as a share of the circle's radius, is z: what calibrated scans differ from their circle
-/// by does not move it.
+/// An axis this close to z, in radians and as a share of the circle's radius, counts as z: the deviations of calibrated
+/// scans do not move the axis.
 const NEAR: f64 = 0.01;
-/// Sources lie on a circle if none is farther from it than this share of its radius, nor farther from its plane than that: a turn of a
+/// Largest distance of sources on a circle from the circle and from its plane, as a share of the radius: a turn of a
 /// helix with a small pitch is nearly flat.
 const OFF: f64 = 0.05;
 const OFF_PLANE: f64 = 0.01;
-/// Sources on less of a circle than this, in radians, tell no centre.
+/// A shorter arc of sources, in radians, does not determine the centre.
 const LEAST_ARC: f64 = 1.5;
 
-/// Where the circle's axis lies.
+/// The axis of the source circle.
 #[derive(Debug, Clone, Copy)]
 pub(super) struct Axis {
     center: Vec3,
-    /// Two directions across the axis and the axis itself, right-handed.
+    /// Two directions orthogonal to the axis, and the axis itself, right-handed.
     axes: [Vec3; 3],
 }
 
 impl Axis {
-    /// The axis of the circle that the sources of `geometry` stand on. `None` if it is z, or if they stand on no circle that tells one.
+    /// The axis of the circle on which the sources of `geometry` lie. `None` if it is z, or if no circle can be
+    /// determined.
     pub fn of(geometry: &Geometry) -> Option<Self> {
         let sources: Vec<Vec3> = geometry.views.iter().map(|v| v.source).collect();
         let n = sources.len() as f64;
         let mean: Vec3 = std::array::from_fn(|k| sources.iter().map(|s| s[k]).sum::<f64>() / n);
         let from_mean: Vec<Vec3> = sources.iter().map(|s| sub(*s, mean)).collect();
         let normal = normal(&from_mean)?;
-        // A direction across the normal: z's other axes, as far as they are.
+        // A direction orthogonal to the normal, close to a world axis where possible.
         let along = if normal[0].abs() < 0.9 { [1.0, 0.0, 0.0] } else { [0.0, 1.0, 0.0] };
         let first = unit(std::array::from_fn(|k| along[k] - dot(along, normal) * normal[k]))?;
         let axes = [first, cross(normal, first), normal];
@@ -40,7 +41,7 @@ impl Axis {
         axis.is_of(&sources).then_some(axis)
     }
 
-    /// Whether the sources stand on the circle, on enough of it, and its axis is not z.
+    /// Whether the sources lie on the circle and cover enough of it, and its axis is not z.
     fn is_of(&self, sources: &[Vec3]) -> bool {
         let local: Vec<Vec3> = sources.iter().map(|s| self.point(*s)).collect();
         let radii: Vec<f64> = local.iter().map(|p| p[0].hypot(p[1])).collect();
@@ -69,7 +70,7 @@ impl Axis {
         self.direction(sub(a, self.center))
     }
 
-    /// In words, for the log.
+    /// Description for the log.
     pub fn describe(&self) -> String {
         let [x, y, z] = self.center;
         format!(
@@ -79,7 +80,7 @@ impl Axis {
     }
 }
 
-/// `geometry` as it looks where the circle's axis is z, for weights alone: the volume stays where it is.
+/// `geometry` rotated so that the circle's axis is z. Only for weights: the volume does not move.
 pub(super) fn upright<'a>(geometry: &'a Geometry, axis: Option<&Axis>) -> Cow<'a, Geometry> {
     let Some(axis) = axis else { return Cow::Borrowed(geometry) };
     let turned = |w: &View| View {
@@ -97,8 +98,8 @@ fn unit(a: Vec3) -> Option<Vec3> {
     (length > 0.0 && length.is_finite()).then(|| a.map(|x| x / length))
 }
 
-/// The direction in which `points` around 0 spread least, towards +z: the largest column of the adjugate of their scatter matrix, which
-/// tends to λ₁λ₂·n·nᵀ as they lie flat.
+/// The direction in which the centred `points` spread least, towards +z: the largest column of the adjugate of their
+/// scatter matrix, which tends to λ₁λ₂·n·nᵀ for coplanar points.
 fn normal(points: &[Vec3]) -> Option<Vec3> {
     let scatter = |i: usize, j: usize| points.iter().map(|p| p[i] * p[j]).sum::<f64>();
     let rows: [Vec3; 3] = std::array::from_fn(|i| std::array::from_fn(|j| scatter(i, j)));
@@ -108,8 +109,8 @@ fn normal(points: &[Vec3]) -> Option<Vec3> {
     Some(if normal[2] < 0.0 { normal.map(|x| -x) } else { normal })
 }
 
-/// The middle of the circle through `points` around 0, by least squares of x² + y² = 2ax + 2by + c (Kåsa, IEEE Trans. Instrum. Meas. 25(1),
-/// 1976).
+/// The centre of the circle through the centred `points`, by least squares of x² + y² = 2ax + 2by + c (Kåsa, IEEE
+/// Trans. Instrum. Meas. 25(1), 1976).
 fn middle(points: &[[f64; 2]]) -> Option<[f64; 2]> {
     let sum = |f: &dyn Fn(&[f64; 2]) -> f64| points.iter().map(f).sum::<f64>();
     let (xx, xy, yy) = (sum(&|p| p[0] * p[0]), sum(&|p| p[0] * p[1]), sum(&|p| p[1] * p[1]));

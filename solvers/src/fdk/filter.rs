@@ -1,9 +1,8 @@
 //! The ramp filter along detector rows.
 //!
 //! The ramp is the discrete one in space (Kak and Slaney, Principles of Computerized Tomographic Imaging, eq. 3.61):
-//! `h(0) = 1/4τ²`, `h(n) = −1/(πnτ)²` for odd n, 0 for even n. A ramp sampled in frequency would lose the mean. Rows are
-//! padded with zeros to twice their length, so that the convolution does not wrap, and a window may damp high
-//! frequencies.
+//! `h(0) = 1/4τ²`, `h(n) = −1/(πnτ)²` for odd n, 0 for even n. A ramp sampled in frequency would lose the mean. Rows
+//! are zero-padded to twice their length, so that the convolution does not wrap; a window may damp high frequencies.
 
 use conefield_fourier::{Complex, Fft, forward_f64, pair_f32};
 use schemars::JsonSchema;
@@ -11,7 +10,7 @@ use serde::{Deserialize, Serialize};
 use std::f64::consts::PI;
 use std::sync::Arc;
 
-/// The window that the ramp is multiplied with; `x` is the frequency over that at which the window ends.
+/// The window of the ramp filter; `x` is the frequency divided by the window's cutoff.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
 #[serde(rename_all = "kebab-case")]
 pub enum Window {
@@ -45,13 +44,13 @@ impl Window {
 pub struct Ramp {
     forward: Arc<dyn Fft<f32>>,
     inverse: Arc<dyn Fft<f32>>,
-    /// The filter's transform over the padded length, with what the inverse transform lacks.
+    /// The filter's transform over the padded length, with the normalization of the inverse transform.
     response: Vec<f32>,
 }
 
 impl Ramp {
-    /// For rows of `columns` pixels of `pitch` mm. The window ends at `cutoff` times the highest frequency, and beyond it
-    /// nothing passes.
+    /// A filter for rows of `columns` pixels of `pitch` mm. The window ends at `cutoff` times the Nyquist frequency and
+    /// blocks everything beyond.
     pub fn new(columns: usize, pitch: f64, window: Window, cutoff: f64) -> Self {
         let n = (2 * columns).next_power_of_two();
         let kernel = |i: usize| {
@@ -74,7 +73,7 @@ impl Ramp {
         Self { forward, inverse, response }
     }
 
-    /// Filters rows of equal length that follow each other in `rows`. Two go through one complex transform.
+    /// Filters consecutive rows of equal length in `rows`, two per complex transform.
     pub fn filter(&self, rows: &mut [f32], columns: usize) {
         let n = self.response.len();
         let mut pair = vec![Complex::new(0.0, 0.0); n];

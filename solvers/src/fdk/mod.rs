@@ -1,8 +1,9 @@
 //! FDK: filtered back-projection of a cone-beam scan (Feldkamp, Davis and Kress, JOSA A 1(6), 1984).
 //!
-//! `μ(x) = Σ_i Δβ_i · (R/U_i)² · w_i · [cos-weighted p_i * ramp]`, with R the distance of source and axis, U_i the depth of
-//! the voxel, Δβ_i the view's share of the turn and w_i what its rays count ([`weights`]). Rows are filtered with the pitch
-//! that they have at the axis. No factor is fitted: the scale is right for any number of views and any magnification.
+//! `μ(x) = Σ_i Δβ_i · (R/U_i)² · w_i · [cos-weighted p_i * ramp]`, with R the distance from source to axis, U_i the
+//! depth of the voxel, Δβ_i the angular step of the view and w_i the weight of its rays ([`weights`]). Rows are
+//! filtered with their pitch at the axis. No factor is fitted: the scale is right for any number of views and any
+//! magnification.
 
 mod axis;
 pub mod filter;
@@ -39,21 +40,21 @@ use weights::{Coverage, FdkOrbit, lean, place};
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields, default)]
 pub struct Fdk {
-    /// What the ramp filter is multiplied with.
+    /// Window of the ramp filter.
     pub window: Window,
-    /// Where the window ends, as a share of the highest frequency; nothing beyond it passes.
+    /// Cutoff of the window, as a share of the Nyquist frequency; nothing beyond it passes.
     pub cutoff: f64,
-    /// Set negative attenuation to 0 in the end.
+    /// Set negative attenuation to 0 at the end.
     pub nonnegative: bool,
-    /// How the scan is seen.
+    /// Attenuation beyond the volume.
     pub scene: FdkScene,
 }
 
-/// How FDK sees the scan.
+/// Scene settings of FDK.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields, default)]
 pub struct FdkScene {
-    /// What lies beyond the volume.
+    /// Treatment of attenuation beyond the volume.
     #[serde(skip_serializing_if = "SurroundRule::is_none")]
     pub surround: SurroundRule,
 }
@@ -131,7 +132,7 @@ impl Plan for Fdk {
         Ok(Findings { lines, ..Findings::default() })
     }
 
-    /// Without the columns that an offset detector lacks, which only the scan itself tells.
+    /// Without the columns added for an offset detector, which only the scan itself determines.
     fn needs(&self, header: &ScanHeader) -> Needs {
         let space = Space::tally(*header);
         let at_once = views_at_once(header.detector, held(header));
@@ -142,7 +143,7 @@ impl Plan for Fdk {
     }
 }
 
-/// Room for the filtered images of `views` views at most.
+/// Buffer for the filtered images of at most `views` views.
 fn images(space: &Space, [rows, columns]: [usize; 2], views: usize) -> Array3<f32> {
     space.array([views.min(space.header().views), rows, columns])
 }
@@ -153,16 +154,16 @@ struct Backprojection<'a> {
     scan: &'a Scan,
     backend: &'a dyn Backend,
     orbit: &'a FdkOrbit,
-    /// As [`geometry`](Self::geometry), where the orbit's axis is z.
+    /// Like [`geometry`](Self::geometry), rotated so that the orbit's axis is z.
     upright: &'a Geometry,
-    /// With the columns that an offset detector lacks.
+    /// Includes the columns added for an offset detector.
     geometry: &'a Geometry,
-    /// The columns that were measured.
+    /// The measured columns.
     measured: Range<usize>,
 }
 
 impl Backprojection<'_> {
-    /// The volume of all views, some at a time. They are told as they are done, from `start`.
+    /// Back-projects all views, in batches. Reports progress since `start`.
     fn all(&self, start: Instant, observer: &mut dyn Observer) -> Result<Array3<f32>> {
         let space = Space::new(self.scan.header());
         let mut volume = space.volume();
@@ -183,7 +184,7 @@ impl Backprojection<'_> {
         Ok(volume)
     }
 
-    /// Adds some views, which follow each other, to `volume`; `images` is room for theirs.
+    /// Adds the consecutive views `views` to `volume`; `images` is their buffer.
     fn some(&self, views: &[usize], mut images: ArrayViewMut3<'_, f32>, volume: &mut Array3<f32>) -> Result<()> {
         let g = self.geometry;
         let measured = self.scan.projections.slice_axis(Axis(0), (views[0]..views[0] + views.len()).into());
@@ -203,7 +204,7 @@ impl Backprojection<'_> {
         Ok(())
     }
 
-    /// Weighs and filters the image of a view.
+    /// Weights and filters the image of a view.
     fn filter(&self, view: usize, pixels: &mut [f32]) {
         let (g, v) = (self.upright, &self.upright.views[view]);
         let columns = g.detector[1];
@@ -224,7 +225,7 @@ impl Backprojection<'_> {
     }
 }
 
-/// What is told of an orbit.
+/// Log lines about the orbit.
 fn said(axis: Option<&OrbitAxis>, orbit: &FdkOrbit) -> Vec<String> {
     let mut lines: Vec<String> = axis.into_iter().map(OrbitAxis::describe).collect();
     lines.push(orbit.describe());
@@ -234,22 +235,22 @@ fn said(axis: Option<&OrbitAxis>, orbit: &FdkOrbit) -> Vec<String> {
     lines
 }
 
-/// Bytes of views to hold at once: a 32nd of what scan and volume take, but at least one MiB and no more than stays in the
-/// last cache.
+/// Bytes of views to hold at once: 1/32 of scan and volume, but at least one MiB and no more than fits into the
+/// last-level cache.
 fn held(header: &ScanHeader) -> u64 {
     (header.pixels().saturating_add(header.voxels()) / 8).clamp(1 << 20, 12 << 20)
 }
 
-/// How many views take up `bytes`.
+/// Number of views that fit into `bytes`.
 fn views_at_once(detector: [usize; 2], bytes: u64) -> usize {
     (bytes / column_major_bytes::<f32>(detector, 1).max(1)).clamp(1, 64) as usize
 }
 
-/// Sources may lie along z by this share of the circle's radius, and rows of the detector rise by it: what calibrated scans
-/// differ from a circle by is less, a helix and a detector on its side are more.
+/// Largest spread of the sources along z and slope of the detector rows, as a share of the circle's radius. Calibrated
+/// circles deviate less; a helix or a detector on its side deviates more.
 const TILT: f64 = 0.05;
 
-/// FDK is for circles around z, whose rows of the detector lie across z.
+/// Refuses orbits other than a circle about z whose detector rows lie across z.
 fn check(orbit: &FdkOrbit, geometry: &Geometry) -> Result<()> {
     let span = |values: &mut dyn Iterator<Item = f64>| {
         values.fold((f64::INFINITY, f64::NEG_INFINITY), |(l, h), r| (l.min(r), h.max(r)))

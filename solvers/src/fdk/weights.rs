@@ -1,82 +1,82 @@
-//! How much each ray counts: the step of the angle, and rays that are measured twice.
+//! Ray weights: the angular step, and corrections for rays that are measured twice.
 //!
-//! - A full turn measures every line of the orbit's plane twice: each counts half.
-//! - A short scan measures some lines twice and others once: Parker's weights (Med. Phys. 9(2), 1982), for any arc of at
-//!   least π plus the fan by widening the fan (Silver, Med. Phys. 27(4), 2000).
+//! - A full turn measures every line of the orbit's plane twice: each measurement has weight 1/2.
+//! - A short scan measures some lines twice and others once: Parker's weights (Med. Phys. 9(2), 1982), for any arc of
+//!   at least π plus the fan angle by widening the fan (Silver, Med. Phys. 27(4), 2000).
 //! - A detector shifted sideways measures, over a full turn, the middle twice and the wide side once: Wang's weights
-//!   (Med. Phys. 29(7), 2002). Rows go on with zeros on the shorter side: filtered, they are not 0 there, and voxels on
-//!   that side need them. One wholly on one side measures every line once, and none near the axis: each counts whole.
+//!   (Med. Phys. 29(7), 2002). Rows are zero-padded on the shorter side: after filtering they are not 0 there, and
+//!   voxels on that side need them. A detector wholly on one side measures every line once and none near the axis: each
+//!   has weight 1.
 //!
-//! What the orbit asks for is found from the views alone.
+//! The views alone determine the kind of orbit.
 
 use conefield_core::geometry::{Geometry, Vec3, View, dot, norm, sub};
 use std::f64::consts::{FRAC_PI_2, FRAC_PI_4, PI, TAU};
 use std::ops::Range;
 
-/// What the orbit is.
+/// Kind of orbit.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub enum Coverage {
     /// A full turn with a centred detector.
     Full,
-    /// A full turn with a detector that reaches further on one side: `overlap` mm on the virtual detector at the axis
-    /// are seen from both sides, `sign` is the side of u that reaches further.
+    /// A full turn with a detector that reaches further on one side. Both sides see `overlap` mm on the virtual
+    /// detector at the axis; `sign` is the side of u that reaches further.
     Offset {
-        /// Half width of what is measured twice, mm at the axis; 0 where the detector lies wholly on one side.
+        /// Half width of the part measured twice, mm at the axis; 0 if the detector lies wholly on one side.
         overlap: f64,
-        /// 1 where u reaches further, −1 where −u does.
+        /// 1 if u reaches further, −1 if −u does.
         sign: f64,
     },
-    /// An arc of at least π plus the fan, from `start`, in the direction of rising angles.
+    /// An arc of at least π plus the fan angle, from `start`, in the direction of increasing angles.
     Short {
         /// The first angle, rad.
         start: f64,
         /// Parker's half fan angle, widened to the arc: `arc = π + 2·delta`.
         delta: f64,
     },
-    /// Less than a short scan, or part of a turn with a detector aside: no weights can make up for what was not
-    /// measured.
+    /// Less than a short scan, or a partial turn with an offset detector: no weights can replace the missing data.
     Limited,
 }
 
-/// A detector that stands aside by more than this share of its width needs a full turn: the opposite rays of its longer
-/// side were not measured.
+/// A detector offset by more than this share of its width needs a full turn: the opposite rays of its longer side were
+/// not measured.
 const ASIDE: f64 = 0.1;
 
-/// The orbit of a scan as FDK sees it.
+/// The orbit of a scan for FDK.
 #[derive(Debug, Clone)]
 pub struct FdkOrbit {
-    /// What it is.
+    /// Kind of orbit.
     pub coverage: Coverage,
-    /// The arc that is covered, rad.
+    /// The arc covered, rad.
     pub arc: f64,
     /// Fan angle, rad.
     pub fan: f64,
     /// Each view's angle, rad.
     pub angles: Vec<f64>,
-    /// Each view's share of the turn, rad.
+    /// Angular step of each view, rad.
     pub steps: Vec<f64>,
-    /// Distance of source and axis for each view, along the detector's normal, mm.
+    /// Distance from source to axis for each view, along the detector's normal, mm.
     pub radius: Vec<f64>,
     /// How much further an offset detector reaches on one side than on the other, mm at the axis.
     aside: f64,
-    /// 1 where u points the way that the source moves at rising angles, −1 against it.
+    /// 1 if u points in the direction in which the source moves at increasing angles, else −1.
     sense: f64,
 }
 
 impl FdkOrbit {
-    /// Reads the orbit of `geometry` around the axis x = y = 0.
+    /// Determines the orbit of `geometry` about the axis x = y = 0.
     pub fn of(geometry: &Geometry) -> Self {
         let views = &geometry.views;
         let angles: Vec<f64> = views.iter().map(|v| v.source[1].atan2(v.source[0]).rem_euclid(TAU)).collect();
         let mut order: Vec<usize> = (0..views.len()).collect();
         order.sort_by(|&a, &b| angles[a].total_cmp(&angles[b]));
         let n = order.len();
-        // Gap after each view in order.
+        // Gap after each view, in angular order.
         let gaps: Vec<f64> = (0..n).map(|i| (angles[order[(i + 1) % n]] - angles[order[i]]).rem_euclid(TAU)).collect();
         let gaps = if n == 1 { vec![TAU] } else { gaps };
         let (widest, gap) = gaps.iter().copied().enumerate().fold((0, 0.0), |a, b| if b.1 > a.1 { b } else { a });
         let rest = (TAU - gap) / (n.max(2) - 1) as f64;
-        // One gap that is much wider than the others are on average is where the orbit ends.
+        // A gap much wider than the average of the others marks the end of the arc.
         let full = n < 3 || gap <= 2.5 * rest;
         let mut steps = vec![0.0; n];
         for i in 0..n {
@@ -96,7 +96,7 @@ impl FdkOrbit {
         let both = low < 0.0 && high > 0.0;
         let aside = (low + high).abs();
         let coverage = if full && aside > 1.5 * pitch {
-            // A border on the axis itself is there but for rounding.
+            // An edge on the axis itself, up to rounding.
             let overlap = if both && narrow > 1e-6 * pitch { narrow } else { 0.0 };
             Coverage::Offset { overlap, sign: if high > -low { 1.0 } else { -1.0 } }
         } else if full {
@@ -112,8 +112,8 @@ impl FdkOrbit {
         Self { coverage, arc, fan, angles, steps, radius, aside, sense }
     }
 
-    /// `geometry` with as many columns added to the shorter side of an offset detector as the longer one has more, and
-    /// the columns that were measured.
+    /// `geometry` with columns added to the shorter side of an offset detector until both sides are equal, and the
+    /// measured columns.
     pub fn symmetric(&self, geometry: &Geometry) -> (Geometry, Range<usize>) {
         let mut wide = geometry.clone();
         let columns = geometry.detector[1];
@@ -123,14 +123,14 @@ impl FdkOrbit {
         let more = (more - 1e-6).ceil() as usize;
         wide.detector[1] += more;
         for v in &mut wide.views {
-            // The middle moves towards the columns that are added.
+            // The centre moves towards the added columns.
             v.detector = std::array::from_fn(|k| v.detector[k] - sign * 0.5 * more as f64 * v.u[k]);
         }
         let first = if sign > 0.0 { more } else { 0 };
         (wide, first..first + columns)
     }
 
-    /// What a ray of view `view` counts, whose place on the virtual detector at the axis is `u` mm from the axis.
+    /// The weight of a ray of view `view` at `u` mm from the axis on the virtual detector at the axis.
     pub fn weight(&self, view: usize, u: f64) -> f64 {
         match self.coverage {
             Coverage::Full | Coverage::Limited => 0.5,
@@ -147,14 +147,14 @@ impl FdkOrbit {
                 }
             }
             Coverage::Short { start, delta } => {
-                // Towards rising u a ray turns against the rising angle.
+                // With increasing u a ray turns against the direction of increasing angles.
                 let gamma = -self.sense * (u / self.radius[view]).atan();
                 parker((self.angles[view] - start).rem_euclid(TAU), gamma, delta)
             }
         }
     }
 
-    /// In words, for the log.
+    /// Description for the log.
     pub fn describe(&self) -> String {
         let degrees = |x: f64| x.to_degrees();
         let arc = format!("{:.1} of 360 degrees, fan {:.1}", degrees(self.arc), degrees(self.fan));
@@ -192,14 +192,15 @@ fn parker(beta: f64, gamma: f64, delta: f64) -> f64 {
     ramp(beta, 2.0 * (delta - gamma)) * ramp(PI + 2.0 * delta - beta, 2.0 * (delta + gamma))
 }
 
-/// Where the detector of view `view` begins and ends along u, at the axis' distance, mm from the axis.
+/// Edges of the detector of view `view` along u, at the axis' distance, mm from the axis.
 fn edges(geometry: &Geometry, view: usize, radius: f64) -> [f64; 2] {
     let columns = geometry.detector[1] as f64;
     [-0.5, columns - 0.5].map(|c| place(geometry, view, c, radius))
 }
 
-/// Where column `column` of view `view` looks: `radius` times the tangent of the angle between its ray in the orbit's plane and the one
-/// to the axis, mm towards rising u. On a detector that faces the axis that is the place on the virtual detector through the axis.
+/// Position of column `column` of view `view`: `radius` times the tangent of the angle between its ray in the orbit's
+/// plane and the ray to the axis, mm along increasing u. On a detector that faces the axis this is the position on the
+/// virtual detector through the axis.
 pub fn place(geometry: &Geometry, view: usize, column: f64, radius: f64) -> f64 {
     let v = &geometry.views[view];
     let [ahead, across] = in_plane(v, ray(geometry, view, column));
@@ -207,10 +208,10 @@ pub fn place(geometry: &Geometry, view: usize, column: f64, radius: f64) -> f64 
     radius * sense * across / ahead
 }
 
-/// What a detector that does not face the axis changes in the weight of column `column`: a step of the angle moves the source across the
-/// rays by R·cos γ, with γ counted from the ray to the axis and R the distance to it, where the filter's geometry has
-/// `radius`·cos of the angle to the detector's normal (the change of variables of Kak and Slaney, section 3.4.2, for a normal that
-/// points elsewhere). 1 on a detector that faces the axis.
+/// Correction of the weight of column `column` for a detector that does not face the axis. An angular step moves the
+/// source across the rays by R·cos γ, with γ measured from the ray to the axis and R the distance to it. The filter's
+/// geometry has `radius`·cos of the angle to the detector's normal instead (the change of variables of Kak and Slaney,
+/// section 3.4.2, for a normal in another direction). 1 on a detector that faces the axis.
 pub fn lean(geometry: &Geometry, view: usize, column: f64, radius: f64) -> f64 {
     let v = &geometry.views[view];
     let (normal, _) = v.normal();
@@ -230,7 +231,7 @@ fn ray(geometry: &Geometry, view: usize, column: f64) -> Vec3 {
     sub(v.pixel(geometry.detector, row, column), v.source)
 }
 
-/// How far `a` goes from the source towards the axis, and across in the direction of rising angles.
+/// Components of `a` from the source towards the axis, and across it in the direction of increasing angles.
 fn in_plane(v: &View, a: Vec3) -> [f64; 2] {
     let radius = v.source[0].hypot(v.source[1]);
     let [c, s] = [v.source[0] / radius, v.source[1] / radius];
@@ -316,7 +317,7 @@ mod tests {
         assert!((o.steps.iter().sum::<f64>() - 4.0).abs() < 1e-12 && (o.arc - 4.0).abs() < 1e-12);
     }
 
-    /// Two measurements of one line count 1 together, in every case.
+    /// The weights of two measurements of one line sum to 1 in every case.
     #[test]
     fn conjugate_rays_count_one() {
         for gamma in [-0.15, -0.04, 0.0, 0.11] {

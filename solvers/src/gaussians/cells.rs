@@ -4,10 +4,10 @@ use super::grid::EXTENT;
 use super::lists::Lists;
 use super::shape::{Shape, V3, apply, dot};
 
-/// Cells along the unit cube's side.
+/// Cells per side of the unit cube.
 const SIDE: usize = 48;
 
-/// The Gaussians that reach each cell of the unit cube.
+/// Lists, for each cell of the unit cube, the Gaussians that reach it.
 pub struct Cells {
     lists: Lists,
 }
@@ -17,7 +17,7 @@ fn cell(x: f64) -> usize {
 }
 
 impl Cells {
-    /// Of these shapes.
+    /// Builds the lists for `shapes`.
     pub fn new(shapes: &[Shape]) -> Self {
         let mut lists = Lists::default();
         lists.fill(SIDE.pow(3), shapes.len(), |i, put| {
@@ -37,7 +37,7 @@ impl Cells {
         Self { lists }
     }
 
-    /// The value of `shapes`, which may have got other densities since, at a point of the unit cube.
+    /// The value of `shapes` at a point of the unit cube; their densities may have changed since.
     pub fn value(&self, shapes: &[Shape], p: V3) -> f64 {
         let [x, y, z] = p.map(cell);
         let mut sum = 0.0;

@@ -1,9 +1,9 @@
-//! Where there are too few Gaussians, more are made; where one adds nothing, it goes.
+//! Density control: adds Gaussians where there are too few, and removes those that contribute nothing.
 //!
-//! Every so often those whose centre the loss pulls at most, on the mean over the steps since, are made two: a small one is
-//! cloned, a large one is split into two that are drawn from it and narrower by 1.6. Each has half the density (Zha et al. 2024,
-//! section 4.3, after Kerbl et al. 2023). A Gaussian of too little density is pruned. Places are limited: where more want to be
-//! made than fit, those with the largest pull are.
+//! At regular intervals, Gaussians whose centres have the largest loss gradient, averaged over the steps since, are
+//! doubled: a small one is cloned; a large one is split into two, sampled from it and narrower by a factor of 1.6. Each
+//! gets half the density (Zha et al. 2024, section 4.3, after Kerbl et al. 2023). A Gaussian of too low density is
+//! pruned. Slots are limited: if they run out, the Gaussians with the largest gradients are doubled.
 
 use super::shape::{CENTRE, DENSITY, FREE, NUMBERS, ROTATION, SCALE, Shape, before_softplus};
 use crate::training::{Callback, Kept, Run, State, Update};
@@ -19,37 +19,37 @@ use std::f32::consts::TAU;
 
 /// Its name in checkpoints.
 const NAME: &str = "density-control";
-/// By how much a half of a split Gaussian is narrower.
+/// Factor by which the halves of a split Gaussian are narrower.
 const NARROWER: f32 = 1.6;
 
 /// Settings of the density control.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields, default)]
 pub struct Control {
-    /// Steps between two times.
+    /// Steps between density updates.
     pub every: u64,
-    /// From this share of the run on.
+    /// Share of the run after which density control starts.
     pub from: f64,
-    /// Up to this share of the run.
+    /// Share of the run after which density control ends.
     pub until: f64,
-    /// The pull above which a Gaussian is made two: the derivative of the loss, over the largest line integral, by a shift over
-    /// half the detector.
+    /// The pull above which a Gaussian is doubled: the loss gradient, divided by the largest line integral, for a shift
+    /// by half the detector.
     pub pull: f64,
-    /// Width in sides of the cube above which a Gaussian is split and not cloned.
+    /// Width, in sides of the cube, above which a Gaussian is split instead of cloned.
     pub split: f64,
     /// Density, as a share of the attenuation that stages see as 1, below which a Gaussian is pruned.
     pub prune: f64,
 }
 
 impl Default for Control {
-    /// The published numbers: steps 500 to 15,000 of 30,000.
+    /// The published values: steps 500 to 15,000 of 30,000.
     fn default() -> Self {
         Self { every: 100, from: 500.0 / 30_000.0, until: 0.5, pull: 5e-5, split: 0.05, prune: 1e-5 }
     }
 }
 
 impl Control {
-    /// Refuses numbers that cannot be used.
+    /// Refuses invalid settings.
     pub fn validate(&self) -> Result<()> {
         ensure(self.every > 0, "spec", "every", self.every, "at least 1")?;
         let shares = 0.0 <= self.from && self.from <= self.until && self.until <= 1.0;
@@ -67,29 +67,29 @@ impl Control {
     }
 }
 
-/// The callback of these settings.
+/// The callback for these settings.
 pub struct DensityControl {
     settings: Control,
-    /// A derivative by the centre times this is a pull.
+    /// Converts a derivative with respect to the centre to a pull.
     scale: f32,
-    /// Sums of pulls, and of how many steps, by place.
+    /// Sums of pulls, and numbers of steps, per slot.
     sums: Vec<f32>,
     counts: Vec<f32>,
     shape: [usize; 1],
 }
 
 impl DensityControl {
-    /// For so many places; `scale` makes a pull of a derivative by the centre.
+    /// For `most` slots; `scale` converts a derivative with respect to the centre to a pull.
     pub fn new(settings: Control, most: usize, scale: f64) -> Self {
         Self { settings, scale: scale as f32, sums: vec![0.0; most], counts: vec![0.0; most], shape: [most] }
     }
 
-    /// Bytes that it holds for so many places.
+    /// Bytes for `most` slots.
     pub fn bytes(most: usize) -> u64 {
         8 * most as u64
     }
 
-    /// Prunes, clones and splits; says what.
+    /// Prunes, clones and splits; reports the numbers.
     fn act(&mut self, run: &mut Run<'_>) -> Result<()> {
         run.exe.fetch(&mut run.model)?;
         let arena = &mut run.model.arena;

@@ -1,7 +1,7 @@
-//! Values of Gaussians at the points of a grid, and the derivatives of a loss on them.
+//! Values of Gaussians at the points of a grid, and the gradient of a loss with respect to them.
 //!
-//! The grid is cut into slabs along x, each with the list of the Gaussians that reach it. Along z the exponent is a polynomial
-//! of the second degree, from which follows where it ends. The threads change no bit.
+//! The grid is divided into slabs along x, each with the list of the Gaussians that reach it. Along z the exponent is a
+//! quadratic polynomial, which gives the Gaussian's end points. Results are bit-identical for any number of threads.
 
 use super::lists::Lists;
 use super::shape::{M3, Shape, Slope, V3, apply, dot};
@@ -10,23 +10,23 @@ use conefield_core::stage::UnitGrid;
 use rayon::prelude::*;
 use std::ops::Range;
 
-/// Standard deviations from its centre to which a Gaussian has values. What is left out of its integral is 0.1 %: less than
-/// of the line integrals, so that a volume is what its projections say.
+/// Cutoff of a Gaussian in standard deviations. The truncated part of its integral is 0.1 %, less than for line
+/// integrals, so that the volume matches its projections.
 pub const EXTENT: f64 = 4.0;
-/// Planes of a slab.
+/// Planes per slab.
 const PLANES: usize = 2;
-/// Gaussians that a worker takes at once.
+/// Gaussians per work item.
 const CHUNK: usize = 64;
 
-/// Which Gaussians reach a grid. Kept from grid to grid for its memory.
+/// The Gaussians that reach a grid. Reused from grid to grid to keep its memory.
 #[derive(Debug, Default)]
 pub struct Grid {
-    /// Those that do.
+    /// The Gaussians that reach the grid.
     reaching: Vec<Reach>,
     slabs: Lists,
 }
 
-/// A Gaussian that reaches a grid, and where.
+/// A Gaussian that reaches a grid, and its range.
 #[derive(Debug, Clone)]
 struct Reach {
     index: usize,
@@ -34,7 +34,7 @@ struct Reach {
 }
 
 impl Grid {
-    /// Finds out which of `shapes` reach `grid`.
+    /// Finds the `shapes` that reach `grid`.
     pub fn look(&mut self, grid: &UnitGrid, shapes: &[Shape]) {
         let range = |centre: f64, reach: f64, k: usize| -> Range<usize> {
             let at = |x: f64| (x - grid.first[k]) / grid.spacing[k];
@@ -58,7 +58,7 @@ impl Grid {
         });
     }
 
-    /// Overwrites `out` (`[x, y, z]`, z fastest) with the values of the shapes that were looked at.
+    /// Overwrites `out` (`[x, y, z]`, z fastest) with the values of the shapes found.
     pub fn values<R: Real>(&self, grid: &UnitGrid, shapes: &[Shape], out: &mut [R]) {
         let plane = grid.shape[1] * grid.shape[2];
         out.par_chunks_mut(PLANES * plane).enumerate().for_each(|(i, out)| {
@@ -68,7 +68,7 @@ impl Grid {
         });
     }
 
-    /// Hands out the derivatives of a loss by what each shape that was looked at says, with its index, from those by the
+    /// The derivatives of a loss with respect to each shape found, with its index, from those with respect to the
     /// values of the grid.
     pub fn slopes<R: Real>(&self, grid: &UnitGrid, shapes: &[Shape], by: &[R]) -> Vec<(usize, Slope)> {
         let mut all = vec![(0, Slope::default()); self.reaching.len()];
@@ -221,8 +221,8 @@ impl<R: Real> Op for Collect<'_, R> {
     }
 }
 
-/// Derivatives by what a shape says, from `Σ w`, `Σ w·d` and the upper half of `Σ w·d·dᵀ` with `w = dμ·exp(-½|Md|²)` and `d` from
-/// the centre.
+/// Derivatives with respect to a shape, from `Σ w`, `Σ w·d` and the upper half of `Σ w·d·dᵀ` with `w = dμ·exp(-½|Md|²)`
+/// and `d` the displacement from the centre.
 pub(super) fn slope(shape: &Shape, sum: f64, first: V3, [xx, xy, xz, yy, yz, zz]: [f64; 6]) -> Slope {
     let m = &shape.inverse;
     let spread: M3 = [[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]];

@@ -1,6 +1,6 @@
-//! Which Gaussians reach which part of what is computed.
+//! Bins of Gaussians by the part of the computation that they reach.
 
-/// Lists of Gaussians, one a bin, each in the Gaussians' order. Kept from use to use for its memory.
+/// Lists of Gaussians, one per bin, each in the Gaussians' order. Reused to keep their memory.
 #[derive(Debug, Default)]
 pub struct Lists {
     all: Vec<u32>,
@@ -8,7 +8,7 @@ pub struct Lists {
 }
 
 impl Lists {
-    /// Makes `bins` lists anew: Gaussian `i` of `count` stands in those that `visit(i, put)` puts it into.
+    /// Rebuilds `bins` lists: `visit(i, put)` puts Gaussian `i` of `count` into its bins.
     pub fn fill(&mut self, bins: usize, count: usize, visit: impl Fn(usize, &mut dyn FnMut(usize))) {
         let Self { all, starts } = self;
         starts.clear();
@@ -18,7 +18,7 @@ impl Lists {
             starts[bin + 1] += starts[bin];
         }
         all.resize(starts[bins], 0);
-        // Each start runs to its list's end, which is where the next one began.
+        // Each start advances to its list's end, which is where the next list began.
         (0..count).for_each(|i| {
             visit(i, &mut |bin| {
                 all[starts[bin]] = i as u32;

@@ -1,10 +1,10 @@
-//! Radiative Gaussians: a volume that is a sum of Gaussians, trained on whole views (R²-Gaussian, Zha et al., NeurIPS 2024).
+//! Radiative Gaussians: a volume as a sum of Gaussians, trained on whole views (R²-Gaussian, Zha et al., NeurIPS 2024).
 //!
-//! - [`shape`]: a Gaussian and its parameters. [`stage`]: a mixture of them as a field.
-//! - [`view`]: line integrals for a view, in closed form and exact for cone beams. [`grid`], [`cells`]: values at points of a
-//!   grid, and at scattered ones. [`lists`]: which Gaussian reaches what.
-//! - [`start`]: where Gaussians begin. [`control`]: where they become more or fewer. [`ssim`]: likeness of views.
-//! - [`views`]: a training step. What goes on around it is the training loop of every field.
+//! - [`shape`]: a Gaussian and its parameters. [`stage`]: a mixture of Gaussians as a field.
+//! - [`view`]: line integrals for a view, in closed form and exact for cone beams. [`grid`], [`cells`]: values at
+//!   points of a grid, and at scattered points. [`lists`]: which Gaussian reaches what.
+//! - [`start`]: initial Gaussians. [`control`]: density control. [`ssim`]: structural similarity of views.
+//! - [`views`]: a training step. The training loop is the same as for every field.
 
 pub mod cells;
 pub mod control;
@@ -52,67 +52,67 @@ use start::Start;
 use std::sync::Arc;
 use views::{Rule, ViewTraining};
 
-/// Places for Gaussians at most: with gradients and moments 11 GiB.
+/// Most slots for Gaussians: 11 GiB with gradients and moments.
 const MOST: usize = 1 << 26;
-/// The smallest standard deviation in voxels: a narrower Gaussian falls between voxels and pixels.
+/// The smallest standard deviation, in voxels: a narrower Gaussian falls between voxels and pixels.
 const NARROWEST: f64 = 0.4;
-/// The largest one in sides of the unit cube.
+/// The largest standard deviation, in sides of the unit cube.
 const WIDEST: f64 = 0.25;
 
 /// Settings of `gaussians`.
 #[derive(Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields)]
 pub struct Gaussians {
-    /// How the scan is mapped to what the Gaussians see.
+    /// How the scan is mapped to the Gaussians' unit cube.
     #[serde(default)]
     pub scene: SceneSettings,
-    /// Train on means of blocks of so many pixels a side.
+    /// Average blocks of this many pixels per side before training.
     #[serde(default = "one")]
     pub bin: usize,
-    /// Places for Gaussians: there are never more.
+    /// Slots for Gaussians, their largest number.
     #[serde(default = "places")]
     pub most: usize,
-    /// Where they begin: at voxels of an FDK, or of the volume that the method starts from.
+    /// Initial Gaussians: at voxels of an FDK, or of the method's start volume.
     #[serde(default)]
     pub start: Start,
-    /// What a difference between predicted and measured line integrals costs.
+    /// Loss between predicted and measured line integrals.
     #[serde(default = "l1", deserialize_with = "stages::needed")]
     #[schemars(schema_with = "stages::schema::<dyn LossSpec>")]
     pub loss: Box<dyn LossSpec>,
-    /// Weight of the structural dissimilarity of a view against the mean loss of a pixel.
+    /// Weight of a view's structural dissimilarity relative to the mean loss of a pixel.
     #[serde(default)]
     pub ssim: f64,
-    /// What the volume is to be like, whatever was measured.
+    /// Priors on the volume, independent of the measurements.
     #[serde(default, deserialize_with = "stages::list")]
     #[schemars(schema_with = "stages::schema_of_list::<dyn PriorSpec>")]
     pub priors: Vec<Box<dyn PriorSpec>>,
-    /// How gradients change densities.
+    /// Optimizer of the densities.
     #[serde(default)]
     pub optimizer: Optimizer,
-    /// Learning rates of other parameters over that of densities.
+    /// Learning rates of other parameters relative to that of the densities.
     #[serde(default)]
     pub rates: Rates,
-    /// What a step learns from, and when training ends.
+    /// Views per step, and the end of training.
     #[serde(default)]
     pub training: Steps,
-    /// Where Gaussians become more or fewer; without it their number stays.
+    /// Adds and removes Gaussians; without it their number stays constant.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub density_control: Option<Control>,
-    /// What watches over training.
+    /// Callbacks during training.
     #[serde(default = "rollback", deserialize_with = "stages::list")]
     #[schemars(schema_with = "stages::schema_of_list::<dyn CallbackSpec>")]
     pub callbacks: Vec<Box<dyn CallbackSpec>>,
 }
 
-/// Learning rates over that of the densities; the published ones over 0.01.
+/// Learning rates relative to that of the densities; the published ones relative to 0.01.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields, default)]
 pub struct Rates {
-    /// Of centres, in sides of the unit cube.
+    /// Rate of centres, in sides of the unit cube.
     pub centre: f64,
-    /// Of logarithms of the standard deviations.
+    /// Rate of the logarithms of standard deviations.
     pub scale: f64,
-    /// Of quaternions.
+    /// Rate of quaternions.
     pub rotation: f64,
 }
 
@@ -122,17 +122,17 @@ impl Default for Rates {
     }
 }
 
-/// What a step learns from, and when training ends.
+/// Views per step, and the end of training.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields, default)]
 pub struct Steps {
-    /// Ends after this many steps.
+    /// Ends training after this many steps.
     pub steps: Option<u64>,
-    /// Ends after this many seconds of training. Which limit comes first ends the run.
+    /// Ends training after this many seconds. The first limit reached ends the run.
     pub seconds: Option<f64>,
-    /// Views a step.
+    /// Views per step.
     pub views: usize,
-    /// Steps between two records of the metrics.
+    /// Steps between records of the metrics.
     pub report_every: u64,
 }
 
@@ -193,7 +193,7 @@ impl Method for Gaussians {
             let prior = spec.build().and_then(|p| p.blocks().validate().map(|()| p));
             priors.push(prior.map_err(|e| e.within(&format!("priors.{i}")))?);
         }
-        // Refused where a backend has no fields with line integrals of their own.
+        // Fails on a backend that does not support fields with their own line integrals.
         let (exe, compiled) = context.backend.compile(&pipeline)?;
         exe.admits(loss.as_ref(), &priors)?;
         let stages = vec![StageLine::new("field", "gaussians", pipeline.field.as_ref())];
@@ -247,14 +247,14 @@ struct GaussianPlan {
     loss: Arc<dyn Loss>,
     priors: Vec<Box<dyn Prior>>,
     pipeline: Pipeline,
-    /// Bytes that callbacks keep.
+    /// Bytes that callbacks hold.
     kept: u64,
-    /// The key of the callback that looks at views kept aside.
+    /// The key of the callback that uses held-out views.
     held_out: Option<String>,
     outline: Outline,
 }
 
-/// The scan as it is trained on.
+/// The scan header after binning.
 fn binned(header: &ScanHeader, bin: usize) -> ScanHeader {
     ScanHeader { detector: header.detector.map(|n| n / bin), ..*header }
 }
@@ -278,7 +278,7 @@ impl Plan for GaussianPlan {
             model: 8 * n,
             optimizer: 8 * n + self.kept,
             backend,
-            // The first volume is gone before training begins.
+            // The first volume is freed before training begins.
             working: bins + begun.max(training),
             resume: 16 * n + self.kept,
             volume: false,
@@ -365,13 +365,13 @@ impl Plan for GaussianPlan {
     }
 }
 
-/// The FDK that Gaussians begin with: smooth, as its noise would draw them to where nothing is.
+/// The FDK for the initial Gaussians. It is smooth, because noise would place Gaussians in empty regions.
 fn first() -> Fdk {
     Fdk { window: Window::Hann, nonnegative: true, ..Fdk::default() }
 }
 
 impl GaussianPlan {
-    /// The volume that the Gaussians begin with, in 1/mm, and what it is.
+    /// The volume for the initial Gaussians, in 1/mm, and its description.
     fn first(&self, job: &Job<'_>, observer: &mut dyn Observer) -> Result<(Volume, String)> {
         if let Some((volume, _, from)) = known_volume(job, None)? {
             return Ok((volume, from));
@@ -387,7 +387,7 @@ impl GaussianPlan {
     }
 }
 
-/// Learns from whole views.
+/// Training on whole views.
 struct Whole<'a> {
     optimizer: &'a Optimizer,
     scene: &'a Scene,

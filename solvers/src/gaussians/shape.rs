@@ -1,22 +1,22 @@
-//! A Gaussian `ρ·exp(-½|M(x - c)|²)` and the eleven parameters that it is made of.
+//! A Gaussian `ρ·exp(-½|M(x - c)|²)` and its eleven parameters.
 //!
-//! `M = diag(1/s)·Rᵀ` takes a displacement to standard deviations: `R` is the rotation of a quaternion, `s` are the standard
-//! deviations along its axes. Lengths are sides of the unit cube (Zha et al., R²-Gaussian, NeurIPS 2024, eq. 4, with the
-//! covariance `R·diag(s²)·Rᵀ`).
+//! `M = diag(1/s)·Rᵀ` converts a displacement to standard deviations: `R` is the rotation of a quaternion, `s` are the
+//! standard deviations along its axes. Lengths are in sides of the unit cube (Zha et al., R²-Gaussian, NeurIPS 2024,
+//! eq. 4, with the covariance `R·diag(s²)·Rᵀ`).
 
 use conefield_core::simd::Real;
 
-/// Numbers of a Gaussian: centre (3), logarithms of the standard deviations (3), quaternion (4), density (1).
+/// Parameters of a Gaussian: centre (3), logarithms of the standard deviations (3), quaternion (4), density (1).
 pub const NUMBERS: usize = 11;
-/// Where each kind begins.
+/// Offset of the centre.
 pub const CENTRE: usize = 0;
-/// Logarithms of the standard deviations.
+/// Offset of the logarithms of the standard deviations.
 pub const SCALE: usize = 3;
-/// Quaternion, real part first. Its length does not matter.
+/// Offset of the quaternion, real part first. Its norm does not matter.
 pub const ROTATION: usize = 6;
-/// The density before softplus.
+/// Offset of the density before softplus.
 pub const DENSITY: usize = 10;
-/// The density before softplus of a place that no Gaussian takes: its softplus is 0 to the bit.
+/// The density before softplus of a free slot: its softplus is exactly 0.
 pub const FREE: f32 = -1000.0;
 
 /// A vector of three.
@@ -42,26 +42,26 @@ pub fn apply(m: &M3, x: V3) -> V3 {
     [dot(m[0], x), dot(m[1], x), dot(m[2], x)]
 }
 
-/// What a Gaussian's parameters say.
+/// A Gaussian, decoded from its parameters.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Shape {
     /// Centre, in cube sides.
     pub centre: V3,
-    /// Displacements to standard deviations.
+    /// Maps displacements to standard deviations.
     pub inverse: M3,
     /// Standard deviations along its own axes, in cube sides.
     pub deviations: V3,
-    /// Value at the centre, at least 0; 0 where the place is free.
+    /// Value at the centre, at least 0; 0 if the slot is free.
     pub density: f64,
 }
 
 impl Shape {
-    /// Of its [`NUMBERS`] parameters.
+    /// From [`NUMBERS`] parameters.
     #[inline]
     pub fn of<R: Real>(p: &[R]) -> Self {
         let n = |i: usize| p[i].f64();
         let raw = n(DENSITY);
-        // No Gaussian, and no logarithm to take.
+        // A free slot: there is no logarithm to take.
         let density = if raw <= f64::from(FREE) { 0.0 } else { softplus(raw) };
         let deviations = [n(SCALE).exp(), n(SCALE + 1).exp(), n(SCALE + 2).exp()];
         let (turn, _) = rotation([n(ROTATION), n(ROTATION + 1), n(ROTATION + 2), n(ROTATION + 3)]);
@@ -70,12 +70,12 @@ impl Shape {
         Self { centre: [n(0), n(1), n(2)], inverse, deviations, density }
     }
 
-    /// The largest of its standard deviations.
+    /// The largest standard deviation.
     pub fn longest(&self) -> f64 {
         self.deviations[0].max(self.deviations[1]).max(self.deviations[2])
     }
 
-    /// Half the sides of the box around all points within `extent` standard deviations.
+    /// Half sides of the box around all points within `extent` standard deviations.
     pub fn reach(&self, extent: f64) -> V3 {
         // Σ_jj = Σ_k (R_jk s_k)² with R_jk = M_kj s_k.
         std::array::from_fn(|j| {
@@ -85,19 +85,19 @@ impl Shape {
     }
 }
 
-/// Derivatives by what a [`Shape`] says.
+/// Derivatives with respect to a [`Shape`].
 #[derive(Debug, Clone, Copy, Default, PartialEq)]
 pub struct Slope {
-    /// By the centre.
+    /// With respect to the centre.
     pub centre: V3,
-    /// By the entries of the matrix.
+    /// With respect to the entries of the matrix.
     pub inverse: M3,
-    /// By the density.
+    /// With respect to the density.
     pub density: f64,
 }
 
 impl Slope {
-    /// Adds `times` another.
+    /// Adds `times` another slope.
     pub fn add(&mut self, other: &Self, times: f64) {
         for i in 0..3 {
             self.centre[i] += times * other.centre[i];
@@ -106,7 +106,7 @@ impl Slope {
         self.density += times * other.density;
     }
 
-    /// Derivatives by the parameters `p` of `shape`.
+    /// Derivatives with respect to the parameters `p` of `shape`.
     pub fn by_parameters<R: Real>(&self, p: &[R], shape: &Shape) -> [f64; NUMBERS] {
         let mut out = [0.0; NUMBERS];
         out[CENTRE..SCALE].copy_from_slice(&self.centre);
@@ -126,7 +126,7 @@ impl Slope {
             2.0 * (x * (d(2, 0) + d(0, 2)) + y * (d(2, 1) + d(1, 2)) + w * (d(1, 0) - d(0, 1)))
                 - 4.0 * z * (d(0, 0) + d(1, 1)),
         ];
-        // The length of a quaternion does not matter.
+        // The norm of a quaternion does not matter.
         let n = [w, x, y, z];
         let along: f64 = (0..4).map(|i| by[i] * n[i]).sum();
         for i in 0..4 {
@@ -137,13 +137,13 @@ impl Slope {
     }
 }
 
-/// A quaternion of length 1, and the length that it had.
+/// The normalized quaternion, and its original norm.
 fn unit(q: [f64; 4]) -> ([f64; 4], f64) {
     let length = q.iter().map(|x| x * x).sum::<f64>().sqrt();
     if length > 1e-12 { (q.map(|x| x / length), length) } else { ([1.0, 0.0, 0.0, 0.0], 1.0) }
 }
 
-/// The rotation of a quaternion of any length, and the length.
+/// The rotation of a quaternion of any norm, and that norm.
 fn rotation(q: [f64; 4]) -> (M3, f64) {
     let ([w, x, y, z], length) = unit(q);
     let turn = [
@@ -162,7 +162,7 @@ fn sigmoid(x: f64) -> f64 {
     1.0 / (1.0 + (-x).exp())
 }
 
-/// The parameter whose density is `x`, which is above 0.
+/// The inverse of softplus, for `x` above 0.
 pub fn before_softplus(x: f64) -> f64 {
     if x > 20.0 { x } else { x.exp_m1().max(1e-30).ln() }
 }

@@ -1,14 +1,14 @@
-//! Structural similarity of a projected and a measured view, with its gradient (Wang et al., IEEE Trans. Image Process. 13(4),
-//! 2004): a Gaussian window of 11 × 11 pixels with σ 1.5, zeros beyond the image, as the published code has it.
+//! Structural similarity of a projected and a measured view, with its gradient (Wang et al., IEEE Trans. Image Process.
+//! 13(4), 2004): a Gaussian window of 11 × 11 pixels with σ 1.5 and zero padding, as in the published code.
 
 use conefield_core::simd::{self, Op, Simd, SimdBase, SimdFloat, V, load, store};
 use rayon::prelude::*;
 
-/// Pixels on each side of a window's middle.
+/// Pixels on each side of the window's centre.
 const REACH: usize = 5;
 const TAPS: usize = 2 * REACH + 1;
 
-/// Images on the way. Kept from view to view for its memory.
+/// Intermediate images. Reused from view to view to keep their memory.
 #[derive(Debug, Default)]
 pub struct Ssim {
     maps: [Vec<f32>; 5],
@@ -17,13 +17,14 @@ pub struct Ssim {
 }
 
 impl Ssim {
-    /// Bytes for images of so many numbers.
+    /// Bytes for images of `numbers` values.
     pub fn bytes(numbers: u64) -> u64 {
         9 * 4 * numbers
     }
 
-    /// The mean similarity of `found` and `wanted` over rows of `columns` pixels, `stride` numbers apart; what lies between is
-    /// 0 in both. `range` is that of the values. Adds `scale` times the derivative by each pixel of `found` to `gradient`.
+    /// The mean similarity of `found` and `wanted` over rows of `columns` pixels, `stride` numbers apart; the padding
+    /// is 0 in both. `range` is the range of the values. Adds `scale` times the derivative with respect to each pixel
+    /// of `found` to `gradient`.
     pub fn add(
         &mut self,
         [found, wanted]: [&[f32]; 2],
@@ -60,7 +61,7 @@ impl Ssim {
                     let (a1, a2) = (2.0 * x * y + c1, 2.0 * vxy + c2);
                     let (b1, b2) = (x * x + y * y + c1, vx + vy + c2);
                     let s = a1 * a2 / (b1 * b2);
-                    // Windows around what is no pixel do not count.
+                    // Windows centred on padding do not count.
                     let weight = if i < columns { weight } else { 0.0 };
                     sum += if i < columns { f64::from(s) } else { 0.0 };
                     by_mean[i] = weight * 2.0 * (y * (a2 - a1) / (b1 * b2) + x * s * (1.0 / b2 - 1.0 / b1));
@@ -90,7 +91,7 @@ fn window() -> [f32; TAPS] {
     raw.map(|x| (x / sum) as f32)
 }
 
-/// `image` under the window, which is symmetric: the blur is its own adjoint.
+/// Blurs `image` with the window, which is symmetric: the blur is its own adjoint.
 fn blur(taps: &[f32; TAPS], image: &mut [f32], between: &mut Vec<f32>, stride: usize) {
     between.resize(image.len(), 0.0);
     let (rows, source) = (image.len() / stride, &*image);
@@ -110,7 +111,7 @@ fn blur(taps: &[f32; TAPS], image: &mut [f32], between: &mut Vec<f32>, stride: u
     });
 }
 
-/// The weighted sum of some lines, of which an empty one is zeros.
+/// The weighted sum of some lines; an empty line counts as zeros.
 struct Weighted<'a> {
     taps: &'a [f32; TAPS],
     lines: [&'a [f32]; TAPS],

@@ -1,7 +1,7 @@
-//! A mixture of Gaussians as a field: values at any points, line integrals of any rays, one Gaussian after the other.
+//! A mixture of Gaussians as a field: values at any points and line integrals of any rays, one Gaussian at a time.
 //!
-//! Training looks at whole views and whole grids, which is faster ([`view`], [`grid`]); this is the
-//! same formula for all else.
+//! Training uses whole views and whole grids, which is faster ([`view`], [`grid`]); this module implements the same
+//! formula for everything else.
 
 use super::grid::{self, Grid};
 use super::shape::{DENSITY, FREE, NUMBERS, ROTATION, SCALE, Shape, Slope, V3, apply, cross, dot};
@@ -14,30 +14,30 @@ use rayon::prelude::*;
 use std::f64::consts::TAU;
 use std::ops::Range;
 
-/// Gaussians whose gradients one worker sums.
+/// Gaussians per worker when gradients are summed.
 const CHUNK: usize = 1024;
 
-/// Places for so many Gaussians. The parameters of one stand together ([`NUMBERS`]); a place without one has a
+/// A mixture of up to `most` Gaussians. The parameters of one are contiguous ([`NUMBERS`]); an unused slot has a
 /// density of 0.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct Mixture {
-    /// Places.
+    /// Number of slots.
     pub most: usize,
 }
 
-/// What the parameters say, place by place.
+/// The shapes of the parameters, slot by slot.
 pub fn shapes<R: Real>(params: &[R]) -> Vec<Shape> {
     let mut all = vec![];
     reshape(params, &mut all);
     all
 }
 
-/// [`shapes`] into a vector that keeps its memory.
+/// Like [`shapes`], into a vector that keeps its memory.
 pub fn reshape<R: Real>(params: &[R], all: &mut Vec<Shape>) {
     params.par_chunks(NUMBERS).with_min_len(256).map(Shape::of).collect_into_vec(all);
 }
 
-/// Adds what of `slope`, of the Gaussian `index`, falls into `grads`.
+/// Adds the part of `slope`, of the Gaussian `index`, that falls into `grads`.
 fn add<R: Real>(grads: &mut Grads<'_, R>, params: &[R], shape: &Shape, index: usize, slope: &Slope) {
     let own = index * NUMBERS..(index + 1) * NUMBERS;
     let by = slope.by_parameters(&params[own.clone()], shape);
@@ -48,18 +48,18 @@ fn add<R: Real>(grads: &mut Grads<'_, R>, params: &[R], shape: &Shape, index: us
     }
 }
 
-/// The Gaussians that have a parameter in `range`.
+/// The Gaussians with a parameter in `range`.
 fn touched(range: &Range<usize>) -> Range<usize> {
     range.start / NUMBERS..range.end.div_ceil(NUMBERS)
 }
 
-/// The Gaussians of `which` that are there.
+/// The Gaussians of `which` whose slots are in use.
 fn present<R: Real>(params: &[R], which: Range<usize>) -> impl Iterator<Item = (usize, &[R])> {
     let all = which.map(|i| (i, &params[i * NUMBERS..(i + 1) * NUMBERS]));
     all.filter(|(_, p)| p[DENSITY].f64() > f64::from(FREE))
 }
 
-/// A bound of what a Gaussian reaches, without all of its shape.
+/// A bound on the reach of a Gaussian, cheaper than its shape.
 fn far<R: Real>(p: &[R], extent: f64) -> f64 {
     extent * p[SCALE].f64().max(p[SCALE + 1].f64()).max(p[SCALE + 2].f64()).exp()
 }
@@ -72,7 +72,7 @@ fn less(a: V3, b: V3) -> V3 {
     std::array::from_fn(|k| a[k] - b[k])
 }
 
-/// The points of a tile, and the box around them.
+/// The points of a tile, and their bounding box.
 struct Points {
     all: Vec<V3>,
     bounds: [V3; 2],
@@ -88,7 +88,7 @@ impl Points {
         Self { all, bounds }
     }
 
-    /// Whether a Gaussian may reach one of them.
+    /// Whether a Gaussian may reach one of the points.
     fn near<R: Real>(&self, p: &[R]) -> bool {
         let (c, far) = (place(p), far(p, grid::EXTENT));
         (0..3).all(|k| c[k] + far >= self.bounds[0][k] && c[k] - far <= self.bounds[1][k])
@@ -128,7 +128,7 @@ impl<R: Real> Kernel<R> for Mixture {
         let points = Points::of(x);
         let mut by_points = vec![[0.0; 3]; x.rows];
         let own = touched(&grads.range);
-        // The derivatives by positions are of all.
+        // Derivatives with respect to positions need all Gaussians.
         let which = if dx.is_some() { 0..self.most } else { own.clone() };
         for (index, p) in present(params, which).filter(|(_, p)| points.near(p)) {
             let shape = Shape::of(p);
@@ -157,7 +157,8 @@ impl<R: Real> Kernel<R> for Mixture {
     }
 }
 
-/// Rays that go about the same way: no Gaussian farther from the first one than `spread` beyond its own reach is met.
+/// Rays in similar directions: a Gaussian further from the first ray than `spread` plus its own reach meets none of
+/// them.
 struct Bundle {
     origin: V3,
     direction: V3,
@@ -168,7 +169,7 @@ impl Bundle {
     fn of(rays: &[UnitRay]) -> Option<Self> {
         let of = |r: &UnitRay| (r.origin.map(f64::from), r.direction.map(f64::from));
         let (origin, direction) = of(rays.first()?);
-        // Beyond the cube's far side no Gaussian has its centre.
+        // No Gaussian has its centre beyond the cube's far side.
         let far = rays.iter().map(|r| f64::from(r.inside[1])).fold(0.0, f64::max) + 2.0;
         let at = |(o, d): (V3, V3), t: f64| -> V3 { std::array::from_fn(|k| o[k] + t * d[k]) };
         let apart = |r: &UnitRay, t: f64| {
@@ -185,8 +186,8 @@ impl Bundle {
     }
 }
 
-/// The line integral of a shape of density 1 along a ray, and the derivatives of `density` times it; `None` where the ray
-/// passes by.
+/// The line integral of a shape of density 1 along a ray, and the derivatives of `density` times it; `None` if the ray
+/// misses the shape.
 fn along(shape: &Shape, ray: &UnitRay) -> Option<(f64, Slope)> {
     if ray.inside[1] <= ray.inside[0] {
         return None;
@@ -261,7 +262,7 @@ impl Stage for Mixture {
         vec![Parameter { name: "gaussians".into(), shape: vec![self.most, NUMBERS], start: 0 }]
     }
 
-    /// No place is taken.
+    /// All slots are free.
     fn init(&self, _: u64, params: &mut [f32]) {
         for p in params.chunks_mut(NUMBERS) {
             p.fill(0.0);

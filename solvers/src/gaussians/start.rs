@@ -1,10 +1,10 @@
-//! Where Gaussians begin: at voxels of a first volume.
+//! Initial Gaussians, at voxels of a first volume.
 //!
-//! Either cells of the volume get one each: cells of eight voxels a side at first, of which those whose voxels differ most
-//! are halved along each axis, until there are enough. Neighbours on a lattice whose standard deviation is 0.6 of its spacing
-//! add up to a constant within 0.5 %. Or, as published, places are drawn among the voxels above a threshold, and a Gaussian is
-//! as wide as its three nearest neighbours are away. Densities are then scaled until the mixture has the volume's value at
-//! every centre, which the published factor of 0.15 comes to on average.
+//! `cells` puts one Gaussian into each cell of the volume. Cells have eight voxels per side at first; the cell whose
+//! voxels vary most is halved along each axis until there are enough cells. Neighbours on a lattice whose standard
+//! deviation is 0.6 of its spacing add up to a constant within 0.5 %. `random`, as published, draws voxels above a
+//! threshold; a Gaussian is as wide as the distance to its three nearest neighbours. Densities are then scaled until
+//! the mixture has the volume's value at every centre, which matches the published factor of 0.15 on average.
 
 use super::cells::Cells;
 use super::lists::Lists;
@@ -21,40 +21,40 @@ use serde::{Deserialize, Serialize};
 use std::cmp::Ordering;
 use std::collections::BinaryHeap;
 
-/// Voxels along a side of the first cells.
+/// Voxels per side of the first cells.
 const LARGEST: usize = 8;
-/// Standard deviation of a Gaussian over the side of its cell.
+/// Standard deviation of a Gaussian relative to the side of its cell.
 const LATTICE: f64 = 0.6;
-/// Neighbours whose distance is a Gaussian's width.
+/// Nearest neighbours that define a Gaussian's width.
 const NEIGHBOURS: usize = 3;
-/// Rounds in which densities are scaled.
+/// Rounds of density scaling.
 const ROUNDS: usize = 5;
-/// Of the voxels above 0, the share below the value that a threshold counts by.
+/// Percentile of the positive voxels that the threshold is relative to.
 const TOP: f64 = 0.995;
 
-/// Settings of the start.
+/// Settings of the initial Gaussians.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields, default)]
 pub struct Start {
-    /// Gaussians, at most as many as voxels are above the threshold.
+    /// Number of Gaussians, at most the number of voxels above the threshold.
     pub count: usize,
-    /// The value above which a voxel counts, as a share of the 99.5th percentile of the positive voxels.
+    /// Smallest value of a voxel with a Gaussian, as a share of the 99.5th percentile of the positive voxels.
     pub threshold: f64,
-    /// Where they stand.
+    /// Positions of the Gaussians.
     pub sites: Sites,
 }
 
-/// Where Gaussians stand at first.
+/// Initial positions of Gaussians.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
 #[serde(rename_all = "kebab-case")]
 pub enum Sites {
     /// In the middle of cells that are small where the volume has detail.
     Cells,
-    /// At voxels that are drawn at random (published).
+    /// At random voxels (published).
     Random,
 }
 
-/// Where a Gaussian begins: its centre, its standard deviations, and the volume's value there, in the scale that stages see.
+/// An initial Gaussian: centre, standard deviations, and the volume's value there, in the scale that stages see.
 struct Begin {
     centre: V3,
     widths: V3,
@@ -68,7 +68,7 @@ impl Default for Start {
 }
 
 impl Start {
-    /// Refuses numbers that cannot be used.
+    /// Refuses invalid settings.
     pub fn validate(&self, most: usize) -> Result<()> {
         ensure(
             (8..=most).contains(&self.count),
@@ -81,14 +81,14 @@ impl Start {
         ensure(share, "spec", "threshold", self.threshold, "a share from 0 to below 1")
     }
 
-    /// Bytes that it works in for so many voxels.
+    /// Working memory in bytes for this many voxels.
     pub fn bytes(&self, voxels: u64) -> u64 {
-        // The volume, its positive values or the numbers of its voxels, and neighbours with lists.
+        // The volume, its positive values or the indices of its voxels, and neighbours with lists.
         12 * voxels + 1024 * self.count as u64
     }
 
-    /// Fills `params` with Gaussians for `volume` (1/mm), each not narrower than `least` and not wider than `widest` cube
-    /// sides; returns how many.
+    /// Fills `params` with Gaussians for `volume` (1/mm), with widths from `least` to `widest` cube sides; returns
+    /// their number.
     pub fn fill(
         &self,
         volume: &Volume,
@@ -112,7 +112,7 @@ impl Start {
             let expected = "more voxels above start.threshold";
             return Err(Error::invalid("start", "volume", format!("{} of them", begins.len()), expected));
         }
-        // What is near in space is near in memory.
+        // Neighbours in space become neighbours in memory.
         begins.sort_by_cached_key(|b| morton(b.centre));
         let count = begins.len();
         for (p, begin) in params.chunks_mut(NUMBERS).zip(&begins) {
@@ -138,7 +138,7 @@ impl Start {
         Ok(count)
     }
 
-    /// Gaussians at voxels above `threshold` (1/mm), drawn at random.
+    /// Gaussians at random voxels above `threshold` (1/mm).
     fn random(&self, volume: &Volume, scene: &Scene, threshold: f32, seed: u64) -> Vec<Begin> {
         let [_, ny, nz] = volume.grid.shape;
         let voxel = |i: usize| [i / (ny * nz), i / nz % ny, i % nz];
@@ -158,10 +158,10 @@ impl Start {
     }
 }
 
-/// A cell of voxels; those whose voxels differ more are larger.
+/// A cell of voxels, ordered by the variation of its voxels.
 #[derive(PartialEq)]
 struct Cell {
-    /// Sum of the squared differences from the mean.
+    /// Sum of squared differences from the mean.
     differing: f64,
     mean: f64,
     first: [usize; 3],
@@ -235,15 +235,15 @@ fn cells(volume: &Volume, scene: &Scene, threshold: f32, count: usize) -> Vec<Be
     done.into_iter().take(count).filter(|c| c.mean > 0.0).map(begin).collect()
 }
 
-/// A number that grows along a curve through the unit cube on which neighbours stay close.
+/// Morton code of a point in the unit cube: neighbours stay close.
 fn morton(p: V3) -> u64 {
     let n = p.map(|x| (x * 1024.0).clamp(0.0, 1023.0) as u64);
     (0..10).fold(0, |code, bit| (0..3).fold(code, |code, k| code | (n[k] >> bit & 1) << (3 * bit + k)))
 }
 
-/// Of each point, the root mean square distance of its nearest neighbours.
+/// For each point, the root mean square distance of its nearest neighbours.
 fn widths(points: &[V3]) -> Vec<f64> {
-    // About one point in a cell that has some.
+    // About one point per occupied cell.
     let side = ((4.0 * points.len() as f64).cbrt() as usize).clamp(1, 128);
     let cell = |p: V3| p.map(|x| ((x * side as f64).max(0.0) as usize).min(side - 1));
     let mut lists = Lists::default();
@@ -259,7 +259,7 @@ fn widths(points: &[V3]) -> Vec<f64> {
             for x in range(0) {
                 for y in range(1) {
                     for z in range(2) {
-                        // Cells within the ring were looked at before.
+                        // Cells within the ring have been visited.
                         let apart = x.abs_diff(at[0]).max(y.abs_diff(at[1])).max(z.abs_diff(at[2]));
                         if apart < ring {
                             continue;
@@ -278,7 +278,7 @@ fn widths(points: &[V3]) -> Vec<f64> {
                     }
                 }
             }
-            // No cell beyond has a nearer one.
+            // No cell further out has a nearer point.
             if nearest[NEIGHBOURS - 1].sqrt() <= ring as f64 / side as f64 {
                 break;
             }

@@ -1,5 +1,5 @@
-//! Line integrals against quadrature, derivatives against finite differences, whole views and grids against single rays and
-//! points.
+//! Compares line integrals with quadrature, derivatives with finite differences, and whole views and grids with single
+//! rays and points.
 
 use super::grid::Grid;
 use super::shape::{DENSITY, FREE, NUMBERS, Shape, Slope, V3, apply, cross, dot};
@@ -10,14 +10,14 @@ use conefield_core::stage::{Grads, Kernel, Lines, Tile, TileMut, UnitGrid, UnitR
 const ROWS: usize = 24;
 const COLUMNS: usize = 29;
 
-/// A cone beam on a detector that is turned and shifted.
+/// A cone beam on a rotated and shifted detector.
 fn beam() -> Beam {
     let (u, v) = ([-0.045, 0.05, 0.004], [0.003, 0.006, -0.07]);
     let first: V3 = std::array::from_fn(|k| [-2.1, -1.9, 0.1][k] - 13.0 * u[k] - 11.5 * v[k]);
     Beam { source: [1.9, 1.8, 0.4], first, u, v, detector: [ROWS, COLUMNS] }
 }
 
-/// Gaussians of any shape and direction, and a free place.
+/// Gaussians of any shape and orientation, and a free slot.
 fn parameters() -> Vec<f64> {
     let mut state = 77u64;
     let mut draw = move || {
@@ -34,7 +34,7 @@ fn parameters() -> Vec<f64> {
     all
 }
 
-/// Some number for each pixel, and 0 between rows.
+/// Arbitrary weights for pixels, and 0 between rows.
 fn weights(beam: &Beam) -> Vec<f64> {
     let stride = beam.padded() / ROWS;
     let value = |i: usize| ((i * 7919) % 1009) as f64 / 504.5 - 1.0;
@@ -63,12 +63,12 @@ fn gradient(params: &[f64], by: &[f64]) -> (Vec<f64>, Vec<Slope>) {
     (all.flat_map(|((slope, shape), p)| slope.by_parameters(p, shape)).collect(), slopes)
 }
 
-/// The largest difference of `gradient` from differences of `loss`, over its largest number.
+/// The largest difference between `gradient` and finite differences of `loss`, relative to its largest entry.
 fn off(params: &[f64], gradient: &[f64], loss: impl Fn(&[f64]) -> f64) -> f64 {
     let most = gradient.iter().fold(0.0f64, |m, g| m.max(g.abs()));
     let mut worst = 0.0f64;
     for i in 0..params.len() {
-        // Steps so small that no pixel passes the end of a Gaussian, where it falls to nothing.
+        // Steps so small that no pixel crosses a Gaussian's cutoff, where the value drops to 0.
         let h = 1e-7;
         let at = |h: f64| {
             let mut p = params.to_vec();
@@ -115,7 +115,7 @@ fn derivatives_of_a_view_are_finite_differences() {
     let (p, by) = (parameters(), weights(&beam()));
     let worst = off(&p, &gradient(&p, &by).0, |p| dot_all(&project(p), &by));
     assert!(worst < 1e-7, "{worst:e}");
-    // A wrong derivative is found.
+    // A wrong derivative is detected.
     let mut wrong = gradient(&p, &by).0;
     wrong[4] *= 1.01;
     assert!(off(&p, &wrong, |p| dot_all(&project(p), &by)) > 1e-5);
@@ -125,7 +125,7 @@ fn dot_all(a: &[f64], b: &[f64]) -> f64 {
     a.iter().zip(b).map(|(a, b)| a * b).sum()
 }
 
-/// In the densities a view is linear: `<Aρ, y> = <ρ, Aᵀy>`.
+/// A view is linear in the densities: `<Aρ, y> = <ρ, Aᵀy>`.
 #[test]
 fn the_way_back_is_the_adjoint() {
     let (p, by) = (parameters(), weights(&beam()));
@@ -148,7 +148,7 @@ fn a_view_is_its_rays_in_both_precisions() {
     Sight::default().project(&beam, &shapes(&single(&p)), &mut narrow);
     let mixture = Mixture { most: p.len() / NUMBERS };
     let most = image.iter().fold(0.0f64, |m, x| m.max(*x));
-    // At the end of a Gaussian rounding decides whether a pixel gets its last 0.2 %.
+    // At a Gaussian's cutoff rounding decides whether a pixel gets its last 0.2 %.
     let (mut unlike, mut apart) = (0, 0.0f64);
     for row in 0..ROWS {
         for column in 0..COLUMNS {
@@ -221,7 +221,7 @@ fn a_grid_is_its_points_and_so_are_derivatives() {
         let wanted = &g[i * NUMBERS..(i + 1) * NUMBERS];
         assert!(own.iter().zip(wanted).all(|(a, b)| (a - b).abs() < 1e-9), "{i}: {own:?} {wanted:?}");
     }
-    // By positions: what moves a point moves the values.
+    // Derivatives with respect to positions: moving a point changes the values.
     let h = 1e-6;
     for at in [5, n + 700, 2 * n + 811] {
         let moved = |h: f64| {
@@ -255,7 +255,7 @@ fn derivatives_of_rays_are_finite_differences() {
         dot_all(&lines, &by)
     };
     assert!(loss(&p) != 0.0 && off(&p, &g, loss) < 1e-7);
-    // A free place stays out of everything.
+    // A free slot gets no gradient.
     assert!(g[3 * NUMBERS..4 * NUMBERS].iter().all(|g| *g == 0.0));
     assert_eq!(Shape::of(&p[3 * NUMBERS..]).density, 0.0);
     assert_eq!(p[3 * NUMBERS + DENSITY], f64::from(FREE));

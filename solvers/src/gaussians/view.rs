@@ -5,13 +5,13 @@
 //!
 //! `A = ρ·√(2π)·|D|/√a·exp(-N/2a)`, with `a = |MD|²` and `N = |My × MD|²`.
 //!
-//! Across the detector `D` is linear in row and column, so that `a` and `N` are polynomials of the second degree. Counted
-//! from the point `(u, v)` where the line through the centre meets the detector, `N` has no constant and no linear part:
-//! `N = A·du² + 2B·du·dv + C·dv²`, without cancellation. That is exact for cone beams. Pixels with `N/a` above
-//! [`EXTENT`]² get nothing; they lie outside of a conic, from which the columns of each row follow.
+//! On the detector `D` is linear in row and column, so that `a` and `N` are quadratic polynomials. Relative to the
+//! point `(u, v)` where the line through the centre meets the detector, `N` has no constant and no linear part:
+//! `N = A·du² + 2B·du·dv + C·dv²`, without cancellation. This is exact for cone beams. Pixels with `N/a` above
+//! [`EXTENT`]² get nothing; they lie outside a conic, which gives the columns of each row.
 //!
-//! The detector is cut into strips of rows, each with the list of the Gaussians that reach it in their order: strips
-//! are independent, and so are the Gaussians of the way back. The threads change no bit.
+//! The detector is divided into strips of rows, each with an ordered list of the Gaussians that reach it. Strips are
+//! independent, and so are Gaussians in the back-projection. Results are bit-identical for any number of threads.
 
 use super::lists::Lists;
 use super::shape::{M3, Shape, Slope, V3, apply, cross, dot};
@@ -19,20 +19,20 @@ use conefield_core::simd::{self, Op, Real, Select, Simd, SimdBase, SimdFloat, V,
 use rayon::prelude::*;
 use std::f64::consts::TAU;
 
-/// Standard deviations from its middle to which a Gaussian's line integrals are looked at. What is left out of the
-/// sum over all pixels is `exp(-EXTENT²/2)`, 0.2 %.
+/// Cutoff of a Gaussian's line integrals, in standard deviations. The truncated part of the sum over all pixels is
+/// `exp(-EXTENT²/2)`, 0.2 %.
 pub const EXTENT: f64 = 3.5;
-/// Rows of a strip.
+/// Rows per strip.
 const STRIP: usize = 16;
-/// Gaussians that a worker takes at once.
+/// Gaussians per work item.
 const CHUNK: usize = 256;
 
-/// Where the rays of a view go, in the unit cube.
+/// The rays of a view, in the unit cube.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Beam {
     /// The source.
     pub source: V3,
-    /// From the source to the middle of the pixel of row 0 and column 0.
+    /// From the source to the centre of the pixel in row 0 and column 0.
     pub first: V3,
     /// From one column to the next.
     pub u: V3,
@@ -42,7 +42,7 @@ pub struct Beam {
     pub detector: [usize; 2],
 }
 
-/// What the pixels of a view see of a Gaussian.
+/// The footprint of a Gaussian on a view's detector.
 #[derive(Debug, Clone, Copy, Default, PartialEq)]
 struct Footprint<R> {
     /// Column and row of the point where the line through the centre meets the detector.
@@ -67,17 +67,17 @@ struct Moments {
 }
 
 impl Beam {
-    /// The length of an image's rows in memory: there is room for a vector past the last column.
+    /// The row stride of an image: it leaves room for a vector beyond the last column.
     fn stride(&self) -> usize {
         self.detector[1] + WIDEST
     }
 
-    /// Numbers of an image of this view.
+    /// Numbers in an image of this view, including padding.
     pub fn padded(&self) -> usize {
         self.stride() * self.detector[0]
     }
 
-    /// `|D|` of every pixel times what stands there. Exact lengths enter here, once a pixel.
+    /// Multiplies every pixel by `|D|`. Exact lengths enter here, once per pixel.
     fn scaled<R: Real>(&self, image: &mut [R]) {
         let (d, u, v) = (self.first, self.u, self.v);
         image.par_chunks_mut(self.stride()).enumerate().for_each(|(row, line)| {
@@ -90,8 +90,8 @@ impl Beam {
         });
     }
 
-    /// Where the line from the source through `y` beyond it meets the detector: column, row, and the multiple of `D` that `y`
-    /// is; `None` of a point that is not before the detector's plane.
+    /// Where the line from the source through `y` meets the detector: column, row, and the factor from `D` to `y`;
+    /// `None` for a point that is not in front of the detector's plane.
     fn meet(&self, y: V3, normal: V3) -> Option<([f64; 2], f64)> {
         let t = dot(y, normal) / dot(self.first, normal);
         if t <= 1e-9 {
@@ -104,7 +104,7 @@ impl Beam {
         Some(([(pu * vv - pv * uv) / det, (pv * uu - pu * uv) / det], t))
     }
 
-    /// What is seen of a Gaussian; `None` of one that no pixel sees, or that reaches to the source.
+    /// The footprint of a Gaussian; `None` if no pixel sees it, or if it reaches the source.
     fn footprint<R: Real>(&self, shape: &Shape, normal: V3) -> Option<Footprint<R>> {
         if shape.density == 0.0 {
             return None;
@@ -121,9 +121,9 @@ impl Beam {
         let k = EXTENT * EXTENT;
         // qa·du² + 2(qb·dv + qd)·du + qc·dv² + 2·qe·dv + qf ≤ 0.
         let [qa, qb, qc, qd, qe, qf] = [sa - k * a11, sb - k * a12, sc - k * a22, -k * a1, -k * a2, -k * a0];
-        // Rows in which it has real ends: (qb·dv + qd)² ≥ qa·(qc·dv² + 2·qe·dv + qf).
+        // Rows with real end points: (qb·dv + qd)² ≥ qa·(qc·dv² + 2·qe·dv + qf).
         let [r2, r1, r0] = [qb * qb - qa * qc, qb * qd - qa * qe, qd * qd - qa * qf];
-        // Not a closed curve: it reaches the plane of the source.
+        // Not an ellipse: the Gaussian reaches the plane of the source.
         if qa <= 0.0 || r2 >= 0.0 {
             return None;
         }
@@ -131,7 +131,7 @@ impl Beam {
         let [low, high] = [(r1 - half) / -r2, (r1 + half) / -r2];
         let first = (at[1] + low).ceil().max(0.0);
         let end = ((at[1] + high).floor() + 1.0).min(self.detector[0] as f64);
-        // Columns that it reaches at all.
+        // All columns that it reaches.
         let [c2, c1, c0] = [r2, qb * qe - qc * qd, qe * qe - qc * qf];
         let half = (c1 * c1 - c2 * c0).max(0.0).sqrt();
         let [left, right] = [at[0] + (c1 - half) / -c2, at[0] + (c1 + half) / -c2];
@@ -148,7 +148,7 @@ impl Beam {
         })
     }
 
-    /// Derivatives of a loss by what `shape` says, from the moments over its pixels.
+    /// Derivatives of a loss with respect to `shape`, from the moments over its pixels.
     fn slope(&self, shape: &Shape, normal: V3, moments: &Moments) -> Slope {
         let y: V3 = std::array::from_fn(|k| shape.centre[k] - self.source[k]);
         let Some((_, t)) = self.meet(y, normal) else { return Slope::default() };
@@ -162,7 +162,7 @@ impl Beam {
                 + 2.0 * (p[1] * dot(mc, mu) + p[2] * dot(mc, mv) + p[4] * dot(mu, mv))
                 + p[3] * dot(mu, mu)
                 + p[5] * dot(mv, mv));
-        // Σ w·D·Dᵀ from the left by M: rows belong to M, columns to D.
+        // Σ w·D·Dᵀ multiplied by M from the left: rows belong to M, columns to D.
         let spread = |s: &[f64; 6]| -> M3 {
             let part =
                 |a: f64, b: f64, c: f64| -> V3 { std::array::from_fn(|k| a * d[k] + b * self.u[k] + c * self.v[k]) };
@@ -171,10 +171,10 @@ impl Beam {
                 std::array::from_fn(|k| mc[i] * parts[0][k] + mu[i] * parts[1][k] + mv[i] * parts[2][k])
             })
         };
-        // Without the constant: its part vanishes, as N has none.
+        // Without the constant, which vanishes because `N` has none.
         let free = [0.0, p[1], p[2], p[3], p[4], p[5]];
         let (full, bent) = (spread(&moments.less), spread(&free));
-        // By My: Σ w(|MD|²·z - (z·MD)·MD), of which the part along z cancels.
+        // With respect to My: Σ w(|MD|²·z - (z·MD)·MD), whose component along z cancels.
         let [zc, zu, zv] = [dot(z, mc), dot(z, mu), dot(z, mv)];
         let trace = 2.0 * (p[1] * dot(mc, mu) + p[2] * dot(mc, mv) + p[4] * dot(mu, mv))
             + p[3] * dot(mu, mu)
@@ -192,7 +192,7 @@ impl Beam {
     }
 }
 
-/// A view on its way: what it sees of every Gaussian. Kept from view to view for its memory.
+/// The footprints of all Gaussians on a view. Reused from view to view to keep its memory.
 #[derive(Debug, Default)]
 pub struct Sight<R> {
     seen: Vec<Footprint<R>>,
@@ -201,7 +201,7 @@ pub struct Sight<R> {
 }
 
 impl<R: Real> Sight<R> {
-    /// Bytes a Gaussian: what is seen of it, and its places in lists of strips, of which it mostly reaches two.
+    /// Bytes per Gaussian: its footprint, and its entries in the lists of usually two strips.
     pub const BYTES: usize = size_of::<Footprint<R>>() + 16;
 
     /// Overwrites `image` (rows of [`Beam::padded`] length) with the line integrals of `shapes`, in cube sides.
@@ -215,8 +215,8 @@ impl<R: Real> Sight<R> {
         beam.scaled(image);
     }
 
-    /// Overwrites `slopes` with the derivatives of a loss by what the shapes say, given those by the pixels of the view that
-    /// was projected last, in `image`, which is used up.
+    /// Overwrites `slopes` with the derivatives of a loss with respect to the shapes, from those with respect to the
+    /// pixels of the last projected view in `image`, which is overwritten.
     pub fn backproject(&self, beam: &Beam, shapes: &[Shape], image: &mut [R], slopes: &mut [Slope]) {
         beam.scaled(image);
         let (seen, stride, normal) = (&self.seen, beam.stride(), cross(beam.u, beam.v));
@@ -235,7 +235,7 @@ impl<R: Real> Sight<R> {
         });
     }
 
-    /// Finds out what is seen of each shape, and by which strips.
+    /// Computes the footprint of each shape, and its strips.
     fn look(&mut self, beam: &Beam, shapes: &[Shape]) {
         let normal = cross(beam.u, beam.v);
         self.seen.resize(shapes.len(), Footprint::default());
@@ -252,11 +252,12 @@ impl<R: Real> Sight<R> {
     }
 }
 
-/// A few rows of a footprint, as many as a vector has lanes: the columns that it reaches, and its polynomials along each.
+/// A few rows of a footprint, as many as a vector has lanes: the columns that it reaches, and its polynomials along
+/// each.
 struct Rows<R> {
-    /// First column and the one after the last.
+    /// First column and the column after the last.
     columns: [[R; WIDEST]; 2],
-    /// Distance from the middle's row.
+    /// Distance from the row of the footprint's middle.
     dv: [R; WIDEST],
     /// Coefficients of `N` and of `a`: of 1 and of du.
     n: [[R; WIDEST]; 2],
@@ -264,7 +265,7 @@ struct Rows<R> {
 }
 
 impl<R: Real> Footprint<R> {
-    /// Its rows from `row` on, on a detector of so many columns.
+    /// Its rows from `row` on, on a detector of `columns` columns.
     #[inline(always)]
     fn rows<S: Simd>(&self, s: S, row: usize, columns: usize, out: &mut Rows<R>) {
         let len = V::<S, R>::LEN;
@@ -284,7 +285,7 @@ impl<R: Real> Footprint<R> {
         let low = (middle - (half + root) * inverse).ceil().max(zero);
         let high = (middle - (half - root) * inverse).floor() + R::ONE;
         let high = high.max(zero).min(V::<S, R>::splat(s, R::of(columns as f64)));
-        // Rows beyond its ends have none.
+        // Rows beyond its ends have no columns.
         let high = disc.simd_ge(zero).select(high, zero);
         low.store_slice(&mut out.columns[0][..len]);
         high.store_slice(&mut out.columns[1][..len]);
@@ -305,7 +306,7 @@ impl<R: Real> Rows<R> {
     };
 }
 
-/// Sums the Gaussians of `list` into rows of an image.
+/// Sums the Gaussians of `list` into the rows of an image.
 struct Splat<'a, R> {
     seen: &'a [Footprint<R>],
     list: &'a [u32],
@@ -355,7 +356,7 @@ impl<R: Real> Op for Splat<'_, R> {
     }
 }
 
-/// Moments over the pixels of an image, and from them derivatives.
+/// Moments over the pixels of an image, and derivatives from them.
 struct Gather<'a, R> {
     beam: &'a Beam,
     shapes: &'a [Shape],

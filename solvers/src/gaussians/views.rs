@@ -1,4 +1,4 @@
-//! Training on whole views: what a backend's executable is for other fields.
+//! Training on whole views: implements the executable that a backend provides for other fields.
 
 use super::cells::Cells;
 use super::grid::Grid;
@@ -21,23 +21,23 @@ use rayon::prelude::*;
 
 /// Rays that a worker renders at once.
 const TOGETHER: usize = 64;
-/// Numbers of Gaussians whose kinds repeat: as many as a whole number of vectors holds.
+/// Period of the parameter kinds: a whole number of vectors.
 const PATTERN: usize = NUMBERS * WIDEST;
 
-/// What a step learns from, and by which rates.
+/// Settings of a training step.
 #[derive(Debug, Clone, Copy)]
 pub struct Rule {
-    /// Views a step.
+    /// Views per step.
     pub views: usize,
-    /// Weight of the structural dissimilarity against the mean loss of a pixel.
+    /// Weight of the structural dissimilarity relative to the mean loss of a pixel.
     pub ssim: f64,
-    /// Learning rates of centre, scale and rotation over that of the density.
+    /// Learning rates of centre, scale and rotation relative to that of the density.
     pub rates: [f64; 3],
-    /// Standard deviations stay between these, in cube sides.
+    /// Bounds of the standard deviations, in cube sides.
     pub widths: [f64; 2],
 }
 
-/// The views of a scan, with what a step works in.
+/// The views of a scan, with the working memory of a step.
 pub struct ViewTraining {
     rule: Rule,
     beams: Vec<Beam>,
@@ -69,7 +69,7 @@ pub fn beam(geometry: &Geometry, view: usize, scene: &Scene) -> Beam {
 }
 
 impl ViewTraining {
-    /// On the views of `scan`.
+    /// Training on the views of `scan`.
     pub fn new(rule: Rule, scan: &Scan, scene: &Scene) -> Self {
         let g = &scan.geometry;
         let beams: Vec<Beam> = (0..g.views.len()).map(|view| beam(g, view, scene)).collect();
@@ -106,7 +106,7 @@ impl ViewTraining {
         }
     }
 
-    /// Bytes for a scan of this size and so many places.
+    /// Bytes for a scan of this size and this many slots.
     pub fn bytes(header: &ScanHeader, places: u64) -> u64 {
         let image = (header.detector[0] * (header.detector[1] + WIDEST)) as u64;
         let each = size_of::<Shape>() + size_of::<Slope>() + Sight::<f32>::BYTES;
@@ -118,7 +118,7 @@ impl ViewTraining {
         self.top
     }
 
-    /// What a shift of a centre in the cube is as a share of half the detector.
+    /// The shift of a centre in the cube that moves its projection by half the detector.
     pub fn half_detector(&self) -> f64 {
         let beam = &self.beams[0];
         let [rows, columns] = beam.detector.map(|n| n as f64);
@@ -128,8 +128,8 @@ impl ViewTraining {
         0.5 * (columns * norm(beam.u)).max(rows * norm(beam.v)) * to_cube / norm(middle)
     }
 
-    /// The mean loss of a view's pixels and the dissimilarity that is added, with derivatives of their share of the step by
-    /// the shapes in `slopes`.
+    /// The mean loss of a view's pixels and the weighted dissimilarity; `slopes` gets the derivatives with respect to
+    /// the shapes of the view's share of the step.
     fn view(&mut self, view: usize, loss: &dyn Loss) -> [f64; 2] {
         let Self { rule, beams, measured, shapes, sight, slopes, found, gradient, ssim, top, .. } = self;
         let beam = &beams[view];
@@ -194,7 +194,7 @@ impl ViewTraining {
     }
 }
 
-/// The views of step `step` (from 0): all of them once before one comes again, in another order each time.
+/// The views of step `step` (from 0): every view once before any repeats, in a new order each time.
 fn drawn(seed: u64, step: u64, views: usize, count: usize) -> impl Iterator<Item = usize> {
     (0..views as u64).map(move |i| {
         let turn = step * views as u64 + i;
@@ -276,7 +276,7 @@ impl Executable for ViewTraining {
     }
 }
 
-/// Adam (Kingma and Ba 2015, algorithm 1) with a rate for each kind of number.
+/// Adam (Kingma and Ba 2015, algorithm 1) with a learning rate per kind of parameter.
 #[derive(Clone, Copy)]
 struct AdamRule<'a> {
     rate: f32,
@@ -309,7 +309,7 @@ impl Op for AdamStep<'_> {
             let rate = load(s, rule.rates, i) * rule.rate;
             let step = first * rate / (second.sqrt() * rule.root + rule.eps);
             store::<S, f32>(load(s, p, i) - step, p, i);
-            // Moments that decay towards nothing end at zero, not among the denormals, which are slow.
+            // Decaying moments are set to zero before they become denormal numbers, which are slow.
             store::<S, f32>(first.abs().simd_gt(V::<S, f32>::splat(s, 1e-30)).select(first, zero), m, i);
             store::<S, f32>(second.simd_gt(V::<S, f32>::splat(s, 1e-36)).select(second, zero), v, i);
             i += V::<S, f32>::LEN;

@@ -1,5 +1,5 @@
 //! ASD-POCS (Sidky and Pan, Phys. Med. Biol. 53(17), 2008): a pass of ordered-subset SART towards the data, then steps
-//! of steepest descent on total variation, whose length is tied to what the data pass changed.
+//! of steepest descent on total variation, whose length depends on the change of the data pass.
 
 use super::noise::{self, Noise};
 use super::norms::{change, distance, norm2};
@@ -26,20 +26,20 @@ use std::time::Instant;
 #[derive(Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields, default)]
 pub struct AsdPocs {
-    /// Line integrals of voxels.
+    /// Voxel projector.
     #[serde(deserialize_with = "stage::needed")]
     #[schemars(schema_with = "stage::schema::<dyn VoxelProjectorSpec>")]
     pub projector: Box<dyn VoxelProjectorSpec>,
-    /// How the scan is seen.
+    /// Support of the object, and attenuation beyond the volume.
     pub scene: VoxelScene,
-    /// The file of a known volume to start from.
+    /// File of a known volume to start from.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub start: Option<String>,
-    /// When it ends.
+    /// Stopping criteria.
     pub stop: Stop,
-    /// Subsets of the views: a number, or "views" for a view at a time.
+    /// Number of ordered subsets of the views, or "views" for one view at a time.
     pub subsets: Subsets,
-    /// Descent steps a pass.
+    /// Descent steps per pass.
     pub descents: usize,
 }
 
@@ -56,13 +56,13 @@ impl Default for AsdPocs {
     }
 }
 
-/// Relaxation of the data passes, and what it is multiplied with after each.
+/// Relaxation of the data passes, and its factor after each pass.
 const RELAXATION: f64 = 1.0;
 const DECAY: f64 = 0.97;
-/// Length of the first descent steps against what the first data pass changed.
+/// Length of the first descent steps relative to the change of the first data pass.
 const ALPHA: f64 = 0.05;
-/// What the descent steps are multiplied with while they change more than [`RATIO`] of the data pass and the residual is above
-/// what the scan's noise explains.
+/// Factor of the step length, applied while the descent steps change more than [`RATIO`] of the data pass and the
+/// residual exceeds what the scan's noise explains.
 const ALPHA_DECAY: f64 = 0.95;
 const RATIO: f64 = 0.95;
 
@@ -85,7 +85,7 @@ impl AsdPocs {
     }
 }
 
-/// What [`AsdPocs`] builds.
+/// The stages that [`AsdPocs`] builds.
 struct Built {
     shared: Shared,
     updates: Updates,
@@ -134,7 +134,7 @@ impl Iterative for Built {
 struct Iterate {
     descents: usize,
     sweep: Sweep,
-    /// The residual's norm that noise alone explains.
+    /// Norm of a residual of pure noise.
     target: f64,
     /// Length of a descent step.
     length: f64,

@@ -1,5 +1,5 @@
 //! Conjugate gradients on the normal equations `AᵀA·x = Aᵀp` (Hestenes and Stiefel 1952; Björck, Numerical Methods for
-//! Least Squares Problems, algorithm 7.4.1). Early passes find what is smooth; noise comes with more of them.
+//! Least Squares Problems, algorithm 7.4.1). Early passes recover smooth structure; later ones also fit noise.
 
 use super::norms::norm2;
 use super::order::Subsets;
@@ -23,18 +23,18 @@ use std::time::Instant;
 #[derive(Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields, default)]
 pub struct Cgls {
-    /// Line integrals of voxels.
+    /// Voxel projector.
     #[serde(deserialize_with = "stage::needed")]
     #[schemars(schema_with = "stage::schema::<dyn VoxelProjectorSpec>")]
     pub projector: Box<dyn VoxelProjectorSpec>,
-    /// How the scan is seen.
+    /// Support of the object, and attenuation beyond the volume.
     pub scene: VoxelScene,
-    /// The file of a known volume to start from.
+    /// File of a known volume to start from.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub start: Option<String>,
-    /// When it ends.
+    /// Stopping criteria.
     pub stop: Stop,
-    /// Set negative attenuation to 0 in the end.
+    /// Set negative attenuation to 0 at the end.
     pub nonnegative: bool,
 }
 
@@ -55,7 +55,7 @@ impl Method for Cgls {
     }
 }
 
-/// What [`Cgls`] builds.
+/// The stages that [`Cgls`] builds.
 struct Built {
     shared: Shared,
     nonnegative: bool,

@@ -1,4 +1,4 @@
-//! The passes of a run: reports, checkpoints, and what ends it.
+//! The driver of iterative methods: passes, records, checkpoints, stopping criteria.
 
 use super::flat_mut;
 use super::monitor::VolumeMonitor;
@@ -16,59 +16,59 @@ use ndarray::Array3;
 use serde::{Deserialize, Serialize};
 use std::time::Instant;
 
-/// What a pass came to.
+/// The results of a pass.
 #[derive(Debug, Clone, Copy, Default)]
 pub struct Pass {
-    /// `‖p − A·x‖²` of the volumes that the pass met, each view once.
+    /// `‖p − A·x‖²` over all views, each with the volume at the time of its update.
     pub residual: f64,
-    /// Root mean square change of the volume over its root mean square, where the method knows it.
+    /// Root mean square change of the volume relative to its root mean square, if the method knows it.
     pub change: Option<f64>,
-    /// The value of the prior, where there is one.
+    /// The value of the prior, if there is one.
     pub prior: Option<f64>,
 }
 
-/// What changes from pass to pass.
+/// The state of an iterative method.
 pub trait Iteration {
-    /// Goes through all views once. `pass` counts from 0.
+    /// Makes one pass over all views. `pass` counts from 0.
     fn pass(&mut self, problem: &Problem<'_>, pass: u64) -> Result<Pass>;
 
-    /// The volume as it stands, in 1/mm.
+    /// The current volume, in 1/mm.
     fn volume(&mut self, problem: &Problem<'_>) -> &Array3<f32>;
 
-    /// The volume, which the method needs no more.
+    /// The final volume; ends the method.
     fn take(&mut self, problem: &Problem<'_>) -> Array3<f32>;
 
-    /// All that the next pass depends on, by name, for checkpoints.
+    /// The complete state for the next pass, by name, for checkpoints.
     fn state(&mut self) -> Vec<(String, &mut [f32])>;
 
-    /// What a stage could not do since this was last asked.
+    /// An error of a stage since the last call.
     fn fault(&self) -> Result<()> {
         Ok(())
     }
 
-    /// Numbers that belong to the state.
+    /// Scalars of the state.
     fn numbers(&mut self) -> Vec<&mut f64> {
         vec![]
     }
 }
 
-/// Where the driver stands beside the method.
+/// The driver's state in a checkpoint.
 #[derive(Debug, Default, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 struct Kept {
     numbers: Vec<f64>,
     best: Option<f64>,
     since_best: u64,
-    /// Whether the stopping rule is met.
+    /// Whether a stopping rule is met.
     settled: bool,
 }
 
-/// Room for the volume that `patience` keeps.
+/// Buffer for the best volume, if `stop` has `patience`.
 pub(super) fn best(stop: &Stop, space: &Space) -> Option<Array3<f32>> {
     stop.patience.map(|_| space.volume())
 }
 
-/// Runs `method` on `job` until `stop` or the job's limits end it. What was computed since `begun` counts as its time.
+/// Runs `method` on `job` until `stop` or the job's limits end it. The time since `begun` counts.
 pub(super) fn drive(
     job: &Job<'_>,
     stop: &Stop,
@@ -102,12 +102,12 @@ struct Run<'a> {
     monitor: VolumeMonitor<'a>,
     clock: Clock,
     kept: Kept,
-    /// The volume that predicted held-out views best, as [`Kept::best`] has it.
+    /// The volume that predicted held-out views best, see [`Kept::best`].
     best: Option<Array3<f32>>,
-    /// The step from which this process goes on.
+    /// The step at which this process started.
     started: u64,
     step: u64,
-    /// The last pass' residual, and that of an empty volume.
+    /// The last pass's residual, and that of an empty volume.
     residual: Option<f64>,
     empty: f64,
     over: bool,
@@ -139,7 +139,7 @@ impl<'a> Run<'a> {
         let empty = problem.scan.projections.as_slice().map_or(f64::MAX, square_sum);
         let (started, residual, over) = (step, None, false);
         let mut run = Self { job, stop, problem, monitor, clock, kept, best, started, step, residual, empty, over };
-        // Time alone does not end a run that has made nothing yet.
+        // Time alone does not end a run before its first pass.
         let share = if step == 0 { run.clock.share_of_steps(step) } else { run.clock.done(step) };
         run.over = share >= 1.0 || run.kept.settled || (step > 0 && !run.clock.allows(0.0));
         if run.over {
@@ -148,7 +148,7 @@ impl<'a> Run<'a> {
         Ok(run)
     }
 
-    /// One pass, its record and its progress.
+    /// Makes one pass with its record and progress report.
     fn pass(&mut self, method: &mut dyn Iteration, observer: &mut dyn Observer) -> Result<()> {
         let begun = Instant::now();
         let pass = method.pass(self.problem, self.step)?;
@@ -168,7 +168,7 @@ impl<'a> Run<'a> {
         Ok(())
     }
 
-    /// Refuses a residual ten times that of an empty volume, and growing: that is no reconstruction.
+    /// Refuses a growing residual that is ten times that of an empty volume: the iteration diverges.
     fn check(&mut self, pass: &Pass) -> Result<()> {
         let away = pass.residual > 100.0 * self.empty && self.residual.is_some_and(|last| pass.residual > last);
         if away || !pass.residual.is_finite() {
@@ -180,10 +180,10 @@ impl<'a> Run<'a> {
         Ok(())
     }
 
-    /// Looks at the volume after a pass, keeps the best one, and sees whether a stopping rule is met.
+    /// Evaluates the volume after a pass, keeps the best one, and checks the stopping rules.
     fn look(&mut self, pass: &Pass, method: &mut dyn Iteration) -> Result<Record> {
         let pixels = self.job.scan.projections.len() as f64;
-        // A method may have to make its volume first.
+        // A method may have to compute its volume first.
         let volume = if self.monitor.looks() { Some(method.volume(self.problem)) } else { None };
         let (mut held_out, mut psnr) = (None, None);
         if let Some(volume) = volume {
@@ -261,10 +261,10 @@ impl<'a> Run<'a> {
     }
 }
 
-/// The best volume in a checkpoint.
+/// Name of the best volume in a checkpoint.
 const BEST: &str = "best";
 
-/// Refuses a volume with a number that is not finite.
+/// Refuses a volume with a value that is not finite.
 pub(crate) fn finite(volume: &Array3<f32>, step: u64) -> Result<()> {
     match volume.indexed_iter().find(|(_, x)| !x.is_finite()) {
         Some((at, x)) => Err(Error::Diverged { step, what: format!("voxel {at:?} is {x}") }),
@@ -272,7 +272,7 @@ pub(crate) fn finite(volume: &Array3<f32>, step: u64) -> Result<()> {
     }
 }
 
-/// Brings method, best volume and driver to where a checkpoint stands.
+/// Restores method, best volume and driver from a checkpoint.
 fn restore(resume: &Resume, method: &mut dyn Iteration, best: Option<&mut Array3<f32>>) -> Result<Kept> {
     let kept: std::result::Result<Kept, _> = serde_json::from_value(resume.standing.method.clone());
     let kept = kept.map_err(|e| Error::invalid(&resume.place, "method", e, "what this method keeps"))?;

@@ -1,34 +1,35 @@
-//! Where a volume has edges, and which way they face.
+//! Edges of a volume, and their normals.
 
 use super::flat_mut;
 use conefield_core::space::Space;
 use ndarray::{Array3, ArrayView3};
 use rayon::prelude::*;
 
-/// A vector `n` for each voxel: across the edge there, with a length between 0 (no edge) and 1 (a clear one).
+/// A vector `n` per voxel, normal to the edge there, with a length from 0 (no edge) to 1 (a clear edge).
 ///
-/// `n = √γ·s/√(|s|² + η²)`, where the slope s is a central difference, smoothed by 1-2-1 along the other two axes (Sobel), and η
-/// is a multiple of the root mean square of all |s|.
+/// `n = √γ·s/√(|s|² + η²)`, where the slope s is a central difference, smoothed by 1-2-1 along the other two axes
+/// (Sobel), and η is a multiple of the root mean square of all |s|.
 pub struct Edges {
     n: [Array3<f32>; 3],
     /// γ, below 1.
     strength: f32,
-    /// η over the root mean square of the slopes.
+    /// η relative to the root mean square of the slopes.
     scale: f64,
 }
 
 impl Edges {
-    /// No edges yet.
+    /// Edges that are 0 until [`Self::find`].
     pub fn new(shape: [usize; 3], strength: f32, scale: f64, space: &Space) -> Self {
         Self { n: std::array::from_fn(|_| space.array(shape)), strength, scale }
     }
 
-    /// Along x, y and z.
+    /// The components along x, y and z.
     pub fn vectors(&self) -> [&[f32]; 3] {
         self.n.each_ref().map(super::flat)
     }
 
-    /// Finds the edges of `x`, whose differences count by `g` along x, y, z. The result does not depend on the number of threads.
+    /// Finds the edges of `x`, whose differences are weighted by `g` along x, y, z. The result does not depend on the
+    /// number of threads.
     pub fn find(&mut self, x: ArrayView3<'_, f32>, g: [f32; 3]) {
         let (nx, ny, nz) = x.dim();
         let plane = ny * nz;
@@ -45,7 +46,7 @@ impl Edges {
             .map(|(i, ((a, b), c))| {
                 let around = [at(i.saturating_sub(1)), at(i), at((i + 1).min(nx - 1))];
                 slopes(around, nz, g, [&mut *a, &mut *b, &mut *c]);
-                // No difference across the far faces, and so no edge.
+                // No difference across the far faces, hence no edge.
                 if i + 1 == nx {
                     a.fill(0.0);
                 }
@@ -70,7 +71,7 @@ impl Edges {
     }
 }
 
-/// The slopes of the middle one of three planes; what lies outside the volume is as its nearest voxel.
+/// The slopes of the middle one of three planes; voxels outside the volume repeat the nearest one.
 fn slopes(around: [&[f32]; 3], nz: usize, g: [f32; 3], out: [&mut [f32]; 3]) {
     let [before, here, after] = around;
     let ny = here.len() / nz;
@@ -80,7 +81,7 @@ fn slopes(around: [&[f32]; 3], nz: usize, g: [f32; 3], out: [&mut [f32]; 3]) {
         *across = 0.5 * g[0] * (after[k] - before[k]);
         *smooth = 0.25 * (before[k] + after[k]) + 0.5 * here[k];
     }
-    // Each along z, one line of three after the other.
+    // Three neighbouring lines along z.
     let mut lines = [[0; 3]; 3].map(|line| line.map(|_| vec![0.0; nz]));
     let [a, b, c] = out;
     for j in 0..ny {
@@ -101,7 +102,7 @@ fn slopes(around: [&[f32]; 3], nz: usize, g: [f32; 3], out: [&mut [f32]; 3]) {
     }
 }
 
-/// A line smoothed by 1-2-1.
+/// Smooths a line by 1-2-1.
 fn smoothed(line: &[f32], out: &mut [f32]) {
     let last = line.len() - 1;
     for (k, out) in out.iter_mut().enumerate() {

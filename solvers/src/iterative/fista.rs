@@ -1,14 +1,14 @@
-//! Ordered-subset FISTA: `min_{x ≥ 0} D(p − A·B·x) + λ·R(x)` with any basis B, data term D and prior R (Beck and Teboulle,
-//! SIAM J. Imaging Sci. 2(1), 2009; ordered subsets with momentum as in Kim, Ramani and Fessler, IEEE Trans. Med. Imaging
-//! 34(1), 2015).
+//! Ordered-subset FISTA: `min_{x ≥ 0} D(p − A·B·x) + λ·R(x)` with any basis B, data term D and prior R (Beck and
+//! Teboulle, SIAM J. Imaging Sci. 2(1), 2009; ordered subsets with momentum as in Kim, Ramani and Fessler, IEEE Trans.
+//! Med. Imaging 34(1), 2015).
 //!
-//! With n subsets the step is `1/L`, L a little above the largest eigenvalue of every `n·(A_s·B)ᵀW(A_s·B)`, W the largest
-//! curvature of the data term: some steps of the power iteration, each on another subset. Line integrals of a smooth volume
-//! hardly depend on the views, so few subsets stand for all.
+//! With n subsets the step is `1/L`, with L slightly above the largest eigenvalue of every `n·(A_s·B)ᵀW(A_s·B)` and W
+//! the largest curvature of the data term. L comes from a few power iterations, each on another subset: line integrals
+//! of a smooth volume hardly depend on the views, so few subsets represent all.
 //!
-//! Subsets and unbounded momentum do not go together: what one subset's gradient lacks of the others' is amplified, and
-//! the iterates run away. FISTA's t is therefore bounded, and after a pass whose objective is above the last one's two
-//! subsets become one, down to plain FISTA, which converges.
+//! Subsets and unbounded momentum are incompatible: momentum amplifies the difference between one subset's gradient and
+//! the full one, and the iterates diverge. FISTA's t is therefore bounded. After a pass that increases the objective,
+//! pairs of subsets are merged, down to plain FISTA, which converges.
 
 use super::bases::Voxels;
 use super::data::NoiseWeighted;
@@ -44,40 +44,40 @@ use std::time::Instant;
 #[derive(Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields, default)]
 pub struct Fista {
-    /// Line integrals of voxels.
+    /// Voxel projector.
     #[serde(deserialize_with = "stage::needed")]
     #[schemars(schema_with = "stage::schema::<dyn VoxelProjectorSpec>")]
     pub projector: Box<dyn VoxelProjectorSpec>,
-    /// What the volume is made of.
+    /// Basis of the volume.
     #[serde(deserialize_with = "stage::needed")]
     #[schemars(schema_with = "stage::schema::<dyn BasisSpec>")]
     pub basis: Box<dyn BasisSpec>,
-    /// How far line integrals are from the measured ones.
+    /// Data term: misfit between computed and measured line integrals.
     #[serde(deserialize_with = "stage::needed")]
     #[schemars(schema_with = "stage::schema::<dyn DataTermSpec>")]
     pub data: Box<dyn DataTermSpec>,
-    /// What is known of the volume before the scan.
+    /// Regularizer of the volume.
     #[serde(deserialize_with = "stage::needed")]
     #[schemars(schema_with = "stage::schema::<dyn RegularizerSpec>")]
     pub prior: Box<dyn RegularizerSpec>,
-    /// How the scan is seen.
+    /// Support of the object, and attenuation beyond the volume.
     pub scene: VoxelScene,
-    /// The file of a known volume to start from.
+    /// File of a known volume to start from.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub start: Option<String>,
-    /// When it ends.
+    /// Stopping criteria.
     pub stop: Stop,
-    /// Take pixels that the object's shadow leaves out for 0, whatever noise they hold. Where negative values were cut off,
-    /// noise has a mean above 0, which puts a haze around the object.
+    /// Set pixels outside the object's shadow to 0, whatever noise they have. If negative values were clipped, noise
+    /// has a mean above 0, which causes a haze around the object.
     pub air: bool,
-    /// Take means of so many rows and columns of the detector for a pixel.
+    /// Average this many detector rows and columns to one pixel.
     pub bin: usize,
-    /// Subsets of the views: a number, or "views" for a view at a time.
+    /// Number of ordered subsets of the views, or "views" for one view at a time.
     pub subsets: Subsets,
-    /// The order of the subsets.
+    /// Order of the subsets.
     pub order: Order,
-    /// How strongly the volume is held to the one that it starts from: the weight μ of a third term `½μ‖x − x₀‖²`, as a share
-    /// of the largest eigenvalue L of the data's. 0 only starts from it.
+    /// Strength of the pull towards the start volume: the weight μ of a third term `½μ‖x − x₀‖²`, relative to the
+    /// largest eigenvalue L of the data term. With 0, the volume is only the start.
     pub pull: f64,
 }
 
@@ -100,8 +100,8 @@ impl Default for Fista {
     }
 }
 
-/// FISTA's t goes up to this over the number of subsets. On 50 views of abdomen_128 with 10 subsets 100, 200 and 400 gave
-/// 34.2, 34.5 and 34.7 dB after 15 passes.
+/// Bound of FISTA's t, to be divided by the number of subsets. On 50 views of abdomen_128 with 10 subsets, 100, 200 and
+/// 400 gave 34.2, 34.5 and 34.7 dB after 15 passes.
 const MOMENTUM: f64 = 400.0;
 
 conefield_core::stage_type!(Method, "fista", Fista, "ordered-subset FISTA with any basis, data term and prior");
@@ -114,7 +114,7 @@ impl Method for Fista {
 }
 
 impl Fista {
-    /// Bytes that it takes for a scan of this size, beside the volume that comes out.
+    /// Bytes for a scan of this size, besides the resulting volume.
     pub(crate) fn bytes(&self, scan: &ScanHeader) -> u64 {
         self.built().map_or(0, |built| Iterative::bytes(&built, scan))
     }
@@ -144,13 +144,13 @@ impl Fista {
     }
 }
 
-/// What [`Fista`] builds.
+/// The stages that [`Fista`] builds.
 struct Built {
     shared: Shared,
     basis: Box<dyn Basis>,
     data: Box<dyn DataTerm>,
     prior: Box<dyn Regularizer>,
-    /// The types of the three.
+    /// The type names of basis, data term and prior.
     kinds: [&'static str; 3],
     air: bool,
     bin: usize,
@@ -160,12 +160,12 @@ struct Built {
 }
 
 impl Built {
-    /// The scan's size with the pixels that are left of its detector.
+    /// The scan header after binning of its detector.
     fn binned(&self, header: ScanHeader) -> ScanHeader {
         ScanHeader { detector: header.detector.map(|n| n / self.bin), ..header }
     }
 
-    /// The basis on voxels of any size; none that refuses such a grid.
+    /// The basis on voxels of any size; `None` if it refuses the grid.
     fn expansion(&self, volume: [usize; 3]) -> Option<(Box<dyn Expansion>, VoxelGrid)> {
         let grid = VoxelGrid { shape: volume, spacing: [1.0; 3], center: [0.0; 3] };
         Some((self.basis.on(&grid).ok()?, grid))
@@ -246,7 +246,7 @@ impl Iterative for Built {
         }
         space.hold(self.data.held(header));
         space.pass(self.data.scratch(header));
-        // A stage that refuses the grid refuses the run, which then takes nothing.
+        // If a stage refuses the grid, the run is refused and needs no memory.
         if let Some((expansion, grid)) = self.expansion(header.volume) {
             let _ = Arrays::new(self, expansion, &grid, &space, space.volume());
         }
@@ -259,27 +259,27 @@ impl Iterative for Built {
     }
 }
 
-/// What FISTA works in.
+/// FISTA's working memory.
 struct Arrays {
     model: Model,
     penalty: Box<dyn Penalty>,
     x: Array3<f32>,
-    /// Where the next gradient is taken.
+    /// The extrapolated point, at which the next gradient is computed.
     ahead: Array3<f32>,
     gradient: Array3<f32>,
     /// The coefficients before a pass.
     before: Array3<f32>,
-    /// What the coefficients are held to, if there is a pull.
+    /// The target of the pull, if there is one.
     towards: Option<Array3<f32>>,
-    /// The pixels of a subset. Where subsets have become one, its views come a part after another.
+    /// The pixels of a subset. After subsets have been merged, their views are processed in parts.
     pixels: Array3<f32>,
 }
 
-/// What [`Arrays::part_by_part`] is to be given: images of some views, to be projected back.
+/// The callback of [`Arrays::part_by_part`]: computes images of some views for back-projection.
 type Images<'a> = &'a mut dyn FnMut(&mut Model, &[usize], &mut Array3<f32>);
 
 impl Arrays {
-    /// For a volume on the grid `voxels` that is at first `start`.
+    /// Arrays for a volume on the grid `voxels`, initially `start`.
     fn new(
         settings: &Built,
         expansion: Box<dyn Expansion>,
@@ -302,7 +302,7 @@ impl Arrays {
         })
     }
 
-    /// Leaves nothing where the object cannot be, and starts from what is left.
+    /// Clears coefficients outside the object's support and restarts from the rest.
     fn begin(&mut self, problem: &Problem<'_>) {
         self.model.prepare(problem, &mut self.gradient);
         self.model.outside(problem, &mut self.x, 0.0);
@@ -311,8 +311,8 @@ impl Arrays {
         }
     }
 
-    /// Overwrites `gradient` with the adjoint of the images that `images` makes of `views`, as many at a time as there is room
-    /// for.
+    /// Overwrites `gradient` with the adjoint of the images that `images` computes for `views`, in parts that fit the
+    /// buffer.
     fn part_by_part(&mut self, problem: &Problem<'_>, views: &[usize], images: Images<'_>) {
         let Self { model, gradient, pixels, .. } = self;
         gradient.par_mapv_inplace(|_| 0.0);
@@ -323,8 +323,8 @@ impl Arrays {
         model.outside(problem, gradient, 0.0);
     }
 
-    /// Root mean square of `(A·B)ᵀ·n` over the coefficients that rays meet, for noise n as `data` spreads it: that of `views`
-    /// stands for all of them.
+    /// Root mean square of `(A·B)ᵀ·n` over the coefficients that rays meet, for noise n as `data` spreads it; computed
+    /// from `views` and scaled to all views.
     fn noise_gain(&mut self, problem: &Problem<'_>, data: &dyn Misfit, views: &[usize]) -> f64 {
         let mut rng = stream(problem.seed ^ 0x0000_7e57_0015_e000, 0);
         self.part_by_part(problem, views, &mut |_, views, pixels| {
@@ -337,8 +337,8 @@ impl Arrays {
         (all * norm2(&self.gradient) / met.max(1) as f64).sqrt()
     }
 
-    /// A number above the largest eigenvalue of `n·(A_s·B)ᵀW(A_s·B)` over n subsets, W the curvature of `data`. Takes `before`
-    /// for work.
+    /// An upper bound for the largest eigenvalue of `n·(A_s·B)ᵀW(A_s·B)` over n subsets, W the curvature of `data`.
+    /// Uses `before` as working memory.
     fn largest_eigenvalue(&mut self, problem: &Problem<'_>, data: &dyn Misfit, subsets: &[Vec<usize>]) -> f64 {
         let Some(first) = subsets.first() else { return 0.0 };
         self.before.fill(1.0);
@@ -369,7 +369,7 @@ impl Arrays {
     }
 }
 
-/// Subsets on which the largest eigenvalue is looked for, and how much larger than found it is taken to be.
+/// Number of subsets for the power iteration, and the safety factor on the eigenvalue found.
 const PROBES: usize = 3;
 const SAFETY: f64 = 1.15;
 
@@ -377,20 +377,20 @@ struct Iterate {
     arrays: Arrays,
     data: Box<dyn Misfit>,
     views: usize,
-    /// How many subsets there are now.
+    /// Current number of subsets.
     subsets: f64,
     order: Order,
     /// λ in mm.
     lambda: f64,
-    /// L, with what the pull adds.
+    /// L, including the pull.
     lipschitz: f64,
-    /// How many times L the pull makes of it.
+    /// Factor by which the pull increases L.
     pulled: f64,
-    /// The share of a step that goes to what the coefficients are held to.
+    /// Share of the pull in a step.
     pull: f32,
     /// FISTA's t.
     t: f64,
-    /// The last pass' objective, and what of it is not the prior's.
+    /// The last pass's objective, and its part without the prior.
     objective: f64,
     misfit: f64,
 }
@@ -430,7 +430,7 @@ impl Iterate {
         format!("{}: the prior's weight is {:.3e}", self.data.describe(), self.lambda / side)
     }
 
-    /// One subset: a step along its gradient and the prior's proximal map. Returns `‖p − A·x‖²` and the data term.
+    /// Processes one subset: a gradient step and the prior's proximal map. Returns `‖p − A·x‖²` and the data term.
     fn update(&mut self, problem: &Problem<'_>, views: &[usize]) -> [f64; 2] {
         let (mut residual, mut misfit) = (0.0, 0.0);
         let ahead = std::mem::take(&mut self.arrays.ahead);
@@ -462,7 +462,7 @@ impl Iterate {
 impl Iteration for Iterate {
     fn pass(&mut self, problem: &Problem<'_>, pass: u64) -> Result<Pass> {
         Zip::from(&mut self.arrays.before).and(&self.arrays.x).par_for_each(|before, x| *before = *x);
-        // Another penalty is neither progress nor relapse.
+        // A changed penalty must not count as progress or regress.
         if let Some(value) = self.arrays.penalty.adapt(self.arrays.x.view()) {
             self.objective = self.misfit + self.lambda * value;
         }
@@ -481,7 +481,7 @@ impl Iteration for Iterate {
         let objective = self.misfit + prior;
         if objective > self.objective {
             let fewer = (0.5 * self.subsets).ceil();
-            // Of unions of the subsets before, their bound is one too.
+            // For unions of the previous subsets their bound still holds.
             if self.subsets % fewer != 0.0 {
                 let fewer = split(self.views, fewer as usize);
                 self.lipschitz = self.pulled * self.arrays.largest_eigenvalue(problem, self.data.as_ref(), &fewer);

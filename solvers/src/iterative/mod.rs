@@ -1,11 +1,11 @@
-//! Iterative methods on voxels: one driver, and an [`Iteration`] each.
+//! Iterative methods on voxels: one driver, and an [`Iteration`] per method.
 //!
-//! A step is one pass over all views. After each the driver reports, checkpoints, and looks at what ends the run.
+//! A step is one pass over all views. After each, the driver records, checkpoints and checks the stopping criteria.
 //!
-//! - [`sart`], [`cgls`], [`asd_pocs`], [`fista`]: the methods. [`shared`]: what all of them are given.
-//! - [`data`], [`regularizers`], [`bases`]: what FISTA is put together from. [`noise`]: what a scan says of its noise.
+//! - [`sart`], [`cgls`], [`asd_pocs`], [`fista`]: the methods. [`shared`]: their common settings.
+//! - [`data`], [`regularizers`], [`bases`]: the parts of FISTA. [`noise`]: estimation of a scan's noise.
 //! - [`tv`], [`edges`]: total variation, and the edges that it may follow.
-//! - [`problem`]: a scan with its system matrix. [`drive`]: the passes of a run. [`monitor`]: what is looked at meanwhile.
+//! - [`problem`]: a scan with its system matrix. [`drive`]: the passes of a run. [`monitor`]: metrics during a run.
 
 pub mod asd_pocs;
 pub mod bases;
@@ -36,7 +36,7 @@ pub use problem::Problem;
 pub use shared::known_volume;
 pub use stop::Stop;
 
-/// Bytes of the mask that says where the object can be.
+/// Bytes of the object's support mask.
 pub fn mask_bytes(rule: SupportRule, header: &ScanHeader) -> u64 {
     match rule {
         SupportRule::Box => 0,
@@ -44,12 +44,12 @@ pub fn mask_bytes(rule: SupportRule, header: &ScanHeader) -> u64 {
     }
 }
 
-/// All of an array that this crate made.
+/// The data of a contiguous array.
 pub(crate) fn flat(x: &Array3<f32>) -> &[f32] {
     x.as_slice().unwrap_or_else(|| unreachable!("arrays of this crate are contiguous"))
 }
 
-/// Like [`flat`], to be written.
+/// Mutable version of [`flat`].
 pub(crate) fn flat_mut(x: &mut Array3<f32>) -> &mut [f32] {
     x.as_slice_mut().unwrap_or_else(|| unreachable!("arrays of this crate are contiguous"))
 }

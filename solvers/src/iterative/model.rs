@@ -1,4 +1,4 @@
-//! A problem as a basis sees it: line integrals of coefficients.
+//! A problem in terms of a basis: line integrals of coefficients.
 
 use super::flat_mut;
 use super::norms::norm2;
@@ -10,28 +10,28 @@ use conefield_core::space::Space;
 use ndarray::{Array3, Zip};
 use rayon::prelude::*;
 
-/// Steps in which coefficients are fitted to a volume.
+/// Iterations that fit coefficients to a volume.
 const FIT: usize = 20;
 
-/// The matrix `A·B` of a problem's projector A and a basis B; `A` alone, on the grid of the coefficients, where these are
-/// samples. Where coefficients are the voxels, none is copied.
+/// The matrix `A·B` of a problem's projector A and a basis B. If the coefficients are samples, it is `A` alone, on
+/// their grid. If they are the voxels, nothing is copied.
 pub(super) struct Model {
     expansion: Box<dyn Expansion>,
-    /// The voxels of coefficients, unless they are the voxels.
+    /// The voxels of the coefficients, unless the coefficients are voxels.
     voxels: Option<Array3<f32>>,
-    /// The coefficients of voxels in which the object can be, unless all are or the problem's mask is theirs.
+    /// The coefficients inside the object's support; `None` if all are, or if the problem's mask applies.
     inside: Option<Array3<bool>>,
-    /// Room for the coefficients' adjoint, unless the voxels' is theirs.
+    /// Buffer for the adjoint on the voxels, unless the coefficients are samples.
     adjoint: Option<Array3<f32>>,
 }
 
-/// The grid that a problem's projector works on: that of the coefficients where they are samples, else `voxels`.
+/// The grid of the problem's projector: that of the coefficients if they are samples, else `voxels`.
 pub(super) fn projected(expansion: &dyn Expansion, voxels: VoxelGrid) -> VoxelGrid {
     if expansion.are_samples() { expansion.coefficients() } else { voxels }
 }
 
 impl Model {
-    /// The model with its arrays, and the coefficients of the volume `start` on the grid `voxels`, which it takes.
+    /// The model with its buffers, and the coefficients of `start`, a volume on the grid `voxels`.
     pub(super) fn new(
         expansion: Box<dyn Expansion>,
         voxels: &VoxelGrid,
@@ -49,7 +49,7 @@ impl Model {
         (model, x)
     }
 
-    /// Finds out which coefficients can be other than 0.
+    /// Determines which coefficients can be nonzero.
     pub(super) fn prepare(&mut self, problem: &Problem<'_>, work: &mut Array3<f32>) {
         if self.expansion.are_samples() {
             return;
@@ -61,17 +61,17 @@ impl Model {
         }
     }
 
-    /// What the basis could not do since this was last asked.
+    /// An error of the basis since the last call.
     pub(super) fn fault(&self) -> Result<()> {
         self.expansion.fault()
     }
 
-    /// Where the coefficients stand.
+    /// The grid of the coefficients.
     pub(super) fn grid(&self) -> VoxelGrid {
         self.expansion.coefficients()
     }
 
-    /// The volume of coefficients: 0 where samples overshoot below it, and in voxels that the object cannot be in.
+    /// The volume of coefficients: 0 where samples overshoot below 0, and outside the object's support.
     pub(super) fn volume<'a>(&'a mut self, problem: &Problem<'_>, x: &'a Array3<f32>) -> &'a Array3<f32> {
         let Some(voxels) = &mut self.voxels else { return x };
         self.expansion.operator().expand(x.view(), voxels.view_mut());
@@ -83,23 +83,23 @@ impl Model {
         voxels
     }
 
-    /// What the problem's projector projects.
+    /// The input of the problem's projector.
     fn projected<'a>(&'a mut self, problem: &Problem<'_>, x: &'a Array3<f32>) -> &'a Array3<f32> {
         if self.expansion.are_samples() { x } else { self.volume(problem, x) }
     }
 
-    /// The volume of coefficients that are needed no more.
+    /// The volume of coefficients that are no longer needed.
     pub(super) fn take(&mut self, problem: &Problem<'_>, x: Array3<f32>) -> Array3<f32> {
         self.volume(problem, &x);
         self.voxels.take().unwrap_or(x)
     }
 
-    /// As [`Problem::forward`].
+    /// Like [`Problem::forward`].
     pub(super) fn forward(&mut self, problem: &Problem<'_>, views: &[usize], x: &Array3<f32>, out: &mut Array3<f32>) {
         problem.forward(views, self.projected(problem, x), out);
     }
 
-    /// As [`Problem::residual`].
+    /// Like [`Problem::residual`].
     pub(super) fn residual(
         &mut self,
         problem: &Problem<'_>,
@@ -120,13 +120,13 @@ impl Model {
         Zip::from(out).and(&*adjoint).par_for_each(|sum, x| *sum += x);
     }
 
-    /// Which coefficients can be other than 0, if not all.
+    /// Which coefficients can be nonzero, if not all.
     pub(super) fn inside<'a>(&'a self, problem: &'a Problem<'_>) -> Option<&'a [bool]> {
         let inside = if self.expansion.are_samples() { problem.inside } else { self.inside.as_ref() };
         inside.map(|inside| inside.as_slice().unwrap_or_else(|| unreachable!("masks are contiguous")))
     }
 
-    /// Sets coefficients that are to stay 0 to `value`.
+    /// Sets the coefficients that must stay 0 to `value`.
     pub(super) fn outside(&self, problem: &Problem<'_>, x: &mut Array3<f32>, value: f32) {
         if let Some(inside) = self.inside(problem) {
             let all = flat_mut(x).par_iter_mut().zip(inside);
@@ -134,7 +134,7 @@ impl Model {
         }
     }
 
-    /// The coefficients, `x` at first 0, whose volume is nearest to the one in `voxels`: some steps of conjugate gradients.
+    /// The coefficients whose volume is closest to `voxels`, from `x = 0` by a few conjugate gradient steps.
     fn fit(&mut self, mut x: Array3<f32>, space: &Space) -> Array3<f32> {
         let Some(residual) = &mut self.voxels else { return x };
         let operator = self.expansion.operator();

@@ -1,4 +1,4 @@
-//! What is looked at while a voxel volume takes shape: PSNR against a reference, the error of held-out views.
+//! Metrics during a voxel reconstruction: PSNR against a reference, the error of held-out views.
 
 use crate::watched;
 use conefield_core::error::Result;
@@ -8,7 +8,7 @@ use conefield_core::scan::Scan;
 use conefield_core::voxel::VoxelOperator;
 use ndarray::Array3;
 
-/// Looks at a job's reference and held-out views; never learns from them.
+/// Evaluates a job's reference and held-out views; never trains on them.
 pub struct VolumeMonitor<'a> {
     reference: Option<&'a Array3<f32>>,
     held_out: Option<&'a Scan>,
@@ -16,14 +16,14 @@ pub struct VolumeMonitor<'a> {
 }
 
 impl<'a> VolumeMonitor<'a> {
-    /// For what `job` has to look at.
+    /// A monitor of the job's reference and held-out views.
     pub fn new(job: &Job<'a>) -> Self {
         let shape = job.scan.geometry.volume.shape;
         let reference = job.reference.map(|r| &r.data).filter(|r| r.shape() == shape);
         Self { reference, held_out: job.held_out, peak: job.peak }
     }
 
-    /// Whether there is anything to look at.
+    /// Whether there is anything to evaluate.
     pub fn looks(&self) -> bool {
         self.reference.is_some() || self.held_out.is_some()
     }
@@ -40,7 +40,7 @@ impl<'a> VolumeMonitor<'a> {
         Some(10.0 * (self.peak * self.peak / mse.max(1e-300)).log10())
     }
 
-    /// Root mean square error of the held-out views' line integrals over their largest value.
+    /// Root mean square error of the held-out views' line integrals, relative to their largest value.
     pub fn held_out(&self, operator: &dyn VoxelOperator<f32>, volume: &Array3<f32>) -> Result<Option<f64>> {
         let Some(scan) = self.held_out else { return Ok(None) };
         let geometry: &Geometry = &scan.geometry;

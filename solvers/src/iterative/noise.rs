@@ -1,22 +1,22 @@
-//! The noise of a scan, from the scan alone.
+//! Estimates the noise of a scan from the scan alone.
 
 use conefield_core::data_term::Misfit;
 use conefield_core::scan::ScanHeader;
 use ndarray::{ArrayView3, Axis};
 use rayon::prelude::*;
 
-/// Pixels looked at, about.
+/// Approximate number of pixels used.
 const LOOKED_AT: usize = 4 << 20;
-/// Groups of equally many pixels, from low to high line integrals.
+/// Groups of equal size, from low to high line integrals.
 const GROUPS: usize = 16;
 
-/// Noise of line integrals `p` with the variance `sigma²·exp(growth·p)`: what Poisson counts leave behind the logarithm,
-/// with a growth of 1 (the variance of `−ln(I/I₀)` is about `1/I = exp(p)/I₀`).
+/// Noise of line integrals `p` with the variance `sigma²·exp(growth·p)`. The logarithm of Poisson counts has a growth
+/// of 1 (the variance of `−ln(I/I₀)` is about `1/I = exp(p)/I₀`).
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Noise {
-    /// Standard deviation where nothing is in the way.
+    /// Standard deviation at `p = 0`.
     pub sigma: f64,
-    /// How the variance grows with the line integral, 0 or more.
+    /// Growth of the variance with the line integral, 0 or more.
     pub growth: f64,
 }
 
@@ -31,10 +31,10 @@ impl std::fmt::Display for Noise {
 }
 
 impl Noise {
-    /// The noise where rays meet the object: second differences along rows hold little else, and the median of their
-    /// absolute values is hardly moved by edges. For white noise `p[-1] − 2p[0] + p[1]` has the variance 6σ². Noise that
-    /// is correlated between pixels is underestimated. `growing` also fits how it grows from group to group, a line
-    /// through the logarithms of the variances.
+    /// Estimates the noise where rays meet the object: second differences along rows contain little else, and edges
+    /// hardly change the median of their absolute values. For white noise `p[-1] − 2p[0] + p[1]` has the variance 6σ².
+    /// Noise that is correlated between pixels is underestimated. `growing` also fits the growth: a line through the
+    /// logarithms of the groups' variances.
     pub fn of(measured: ArrayView3<'_, f32>, growing: bool) -> Self {
         let mut all = differences(measured);
         if all.is_empty() {
@@ -57,8 +57,8 @@ impl Noise {
 }
 
 impl Noise {
-    /// Multiplies values with powers of the weights `exp(−growth·p)`, at most 1: inverse variances up to a factor. Returns
-    /// `Σ w·y²`.
+    /// Multiplies values by powers of the weights `exp(−growth·p)`, at most 1: inverse variances up to a factor.
+    /// Returns `Σ w·y²`.
     fn weigh(&self, power: f64, measured: &[f32], y: &mut [f32]) -> f64 {
         let rate = (power * self.growth) as f32;
         let mut sum = 0.0;
@@ -71,7 +71,7 @@ impl Noise {
     }
 }
 
-/// Weighted least squares. Where the noise does not grow, all weights are 1.
+/// Weighted least squares. If the noise does not grow, all weights are 1.
 impl Misfit for Noise {
     fn differentiate(&self, _: usize, measured: &[f32], residuals: &mut [f32]) -> f64 {
         0.5 * self.weigh(1.0, measured, residuals)
@@ -81,7 +81,7 @@ impl Misfit for Noise {
         self.weigh(1.0, measured, values);
     }
 
-    /// Noise of the variance `sigma²/w` has the standard deviation `sigma·√w` once it is weighted.
+    /// Noise of the variance `sigma²/w` has the standard deviation `sigma·√w` after weighting.
     fn spread(&self, _: usize, measured: &[f32], values: &mut [f32]) {
         self.weigh(0.5, measured, values);
     }
@@ -95,15 +95,15 @@ impl Misfit for Noise {
     }
 }
 
-/// Bytes that [`Noise::of`] takes: pairs of numbers, in lists and then in one.
+/// Bytes that [`Noise::of`] needs: pairs of numbers, in lists and then in one.
 pub fn scratch(header: &ScanHeader) -> u64 {
     2 * 8 * header.pixels().min(2 * LOOKED_AT as u64)
 }
 
-/// Levels and absolute second differences of pixels within the object.
+/// Values and absolute second differences of pixels within the object.
 fn differences(measured: ArrayView3<'_, f32>) -> Vec<(f32, f32)> {
     let top = measured.iter().fold(0.0f32, |m, &x| m.max(x));
-    // Outside the object negative noise is often cut off.
+    // Outside the object negative noise is often clipped.
     let least = 0.1 * top;
     let every = measured.len().div_ceil(LOOKED_AT).max(1);
     let view = |(n, view): (usize, ndarray::ArrayView2<'_, f32>)| {
@@ -121,14 +121,14 @@ fn differences(measured: ArrayView3<'_, f32>) -> Vec<(f32, f32)> {
     measured.axis_iter(Axis(0)).into_par_iter().enumerate().flat_map_iter(view).collect()
 }
 
-/// The line of least squares through `ln σ²` over the level; level if it would fall.
+/// The least-squares line through `ln σ²` over the line integral; constant if it would fall.
 fn line(points: &[[f64; 2]]) -> Noise {
     let seen: Vec<[f64; 2]> = points.iter().filter(|p| p[1] > 0.0).map(|p| [p[0], 2.0 * p[1].ln()]).collect();
     let n = seen.len().max(1) as f64;
     let mean: [f64; 2] = std::array::from_fn(|k| seen.iter().map(|p| p[k]).sum::<f64>() / n);
     let [square, product] = [0, 1].map(|k| seen.iter().map(|p| (p[0] - mean[0]) * (p[k] - mean[k])).sum::<f64>());
     if 2 * seen.len() <= points.len() {
-        // Most pixels equal their neighbours to the last bit: there is no noise.
+        // Most pixels are exactly equal to their neighbours: there is no noise.
         return Noise { sigma: 0.0, growth: 0.0 };
     }
     let growth = if square > 0.0 { (product / square).max(0.0) } else { 0.0 };
@@ -142,7 +142,7 @@ mod tests {
     use ndarray::Array3;
     use rand_distr::{Distribution, Normal};
 
-    /// A hill of line integrals up to 3 with noise of the standard deviation `sigma(p)`.
+    /// A hill of line integrals up to 3 with noise of standard deviation `sigma(p)`.
     fn hill(sigma: impl Fn(f64) -> f64) -> Array3<f32> {
         let mut rng = stream(5, 0);
         let normal = Normal::new(0.0, 1.0).unwrap();

@@ -1,10 +1,10 @@
-//! Sums over arrays, the same whatever the number of threads.
+//! Norms of arrays, independent of the number of threads.
 
 use super::flat;
 use ndarray::Array3;
 use rayon::prelude::*;
 
-/// Numbers that are summed in one go.
+/// Numbers per partial sum.
 const PART: usize = 1 << 16;
 
 /// Sum of squares.
@@ -32,7 +32,7 @@ pub(crate) fn distance(x: &Array3<f32>, y: &Array3<f32>) -> f64 {
     difference_square_sum(flat(x), flat(y)).sqrt()
 }
 
-/// Root mean square of `x − before` over that of `x`.
+/// Root mean square of `x − before`, relative to that of `x`.
 pub(crate) fn change(x: &Array3<f32>, before: &Array3<f32>) -> f64 {
     distance(x, before) / norm2(x).max(1e-300).sqrt()
 }

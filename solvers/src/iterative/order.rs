@@ -1,4 +1,4 @@
-//! Subsets of the views and the order in which they are taken.
+//! Ordered subsets of the views.
 
 use conefield_core::error::{Result, ensure};
 use conefield_core::random::stream;
@@ -6,34 +6,34 @@ use rand::seq::SliceRandom;
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
-/// How many subsets the views are split into.
+/// Number of subsets of the views.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
 #[serde(untagged)]
 pub enum Subsets {
-    /// So many: 1 takes all views at once.
+    /// This many; 1 uses all views at once.
     Count(usize),
-    /// As many as there are views.
+    /// One subset per view.
     Each(Each),
 }
 
-/// One subset for each of them.
+/// One subset per element.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
 #[serde(rename_all = "kebab-case")]
 pub enum Each {
-    /// A view at a time.
+    /// One view at a time.
     Views,
 }
 
 impl Subsets {
-    /// A view at a time.
+    /// One view at a time.
     pub const VIEWS: Self = Self::Each(Each::Views);
 
-    /// Refuses 0. It stands at the key `subsets` of its method.
+    /// Refuses 0; the error names the key `subsets`.
     pub fn validate(self) -> Result<()> {
         ensure(self != Self::Count(0), "spec", "subsets", 0, "at least 1, or \"views\"")
     }
 
-    /// How many subsets `views` views make.
+    /// The number of subsets for `views` views.
     pub fn count(self, views: usize) -> usize {
         match self {
             Self::Count(n) => n.clamp(1, views.max(1)),
@@ -63,18 +63,18 @@ impl std::fmt::Display for Subsets {
 pub enum Order {
     /// One after another.
     Sequential,
-    /// Shuffled anew for every pass, by the run's seed.
+    /// Shuffled in every pass, by the run's seed.
     Random,
-    /// By steps of the golden section of the orbit: what follows lies far from all that came before.
+    /// By golden section steps around the orbit: each subset is far from all earlier ones.
     Golden,
 }
 
-/// Splits `views` views into `n` groups of every `n`th view, as equal in size as can be.
+/// Splits `views` views into `n` interleaved groups (every `n`th view) of nearly equal size.
 pub fn split(views: usize, n: usize) -> Vec<Vec<usize>> {
     (0..n).map(|s| (s..views).step_by(n).collect()).collect()
 }
 
-/// In words: how many subsets of how many views.
+/// Text for the log: number of subsets and views.
 pub fn told(subsets: &[Vec<usize>]) -> String {
     let sizes = || subsets.iter().map(Vec::len);
     let (least, most) = (sizes().min().unwrap_or(0), sizes().max().unwrap_or(0));
@@ -94,7 +94,7 @@ impl Order {
             Order::Sequential => {}
             Order::Random => order.shuffle(&mut stream(seed ^ 0x0bde_5ed0, pass)),
             Order::Golden => {
-                // Step k lands at the fraction k·0.618…; the nearest subset that is still free is taken.
+                // Step k lands at the fraction k·0.618…; it takes the nearest free subset.
                 let mut free = order.clone();
                 for (k, slot) in order.iter_mut().enumerate() {
                     let at = (k as f64 * 0.618_033_988_749_895).fract() * count as f64;

@@ -1,4 +1,4 @@
-//! What the planned iterative methods have in common.
+//! Common part of the plans of iterative methods.
 
 use super::mask_bytes;
 use super::shared::Shared;
@@ -8,42 +8,42 @@ use conefield_core::error::Result;
 use conefield_core::method::{Findings, Job, Line, Needs, Observer, Outline, Plan, Solution};
 use conefield_core::scan::{Scan, ScanHeader};
 
-/// An iterative method that is built and checked.
+/// An iterative method, built and validated.
 pub(super) trait Iterative: Send + Sync {
-    /// The name of its type.
+    /// Its type name.
     fn kind(&self) -> &'static str;
 
-    /// Its projector, scene, start and end.
+    /// Its common settings.
     fn shared(&self) -> &Shared;
 
-    /// Its own stages: key, type, settings in words.
+    /// Its own stages: key, type and description.
     fn stages(&self) -> Vec<Line> {
         vec![]
     }
 
-    /// What it finds out about a scan, a line each.
+    /// Its findings about a scan, one line each.
     fn found(&self, scan: &Scan) -> Vec<String> {
         let _ = scan;
         vec![]
     }
 
-    /// A scan of this size as it is worked on: its detector, and its unknowns in the place of voxels.
+    /// The header of the scan as the method uses it: binned detector, unknowns in place of voxels.
     fn seen(&self, scan: &ScanHeader) -> ScanHeader {
         *scan
     }
 
-    /// Bytes of all its arrays but the volume that comes out.
+    /// Bytes of all its arrays except the resulting volume.
     fn bytes(&self, scan: &ScanHeader) -> u64;
 
-    /// Its settings in words.
+    /// Description of its settings.
     fn describe(&self) -> String;
 
-    /// Reconstructs.
+    /// Runs the method.
     fn solve(&self, job: &Job<'_>, observer: &mut dyn Observer) -> Result<Solution>;
 }
 
-/// Samples along rays, projected and back, that take as long as all else that a pass does with an unknown. On 50 views of 512²
-/// and 256³ voxels, ten subsets with total variation spend as long on the one as on the other.
+/// The rest of a pass, per unknown, in ray samples (forward and back-projection) of the same cost. On 50 views of 512²
+/// and 256³ voxels, ten subsets with total variation spend equal time on both.
 const SAMPLES: f64 = 200.0;
 
 /// The plan of an iterative method.

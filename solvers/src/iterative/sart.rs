@@ -1,6 +1,6 @@
-//! SART: `x ← x + λ·D·A_sᵀ·W·(p_s − A_s·x)` over subsets s of the views, with W the inverse row sums of A and D the inverse
-//! column sums of the subset (Andersen and Kak, Ultrasonic Imaging 6, 1984). One view at a time is SART, all views at once
-//! are SIRT, and what lies between is OS-SART.
+//! SART: `x ← x + λ·D·A_sᵀ·W·(p_s − A_s·x)` over subsets s of the views, with W the inverse row sums of A and D the
+//! inverse column sums of the subset (Andersen and Kak, Ultrasonic Imaging 6, 1984). One view per subset is SART, all
+//! views at once are SIRT, anything in between is OS-SART.
 
 use super::norms::change;
 use super::order::{Order, Subsets, told};
@@ -25,24 +25,24 @@ use std::time::Instant;
 #[derive(Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields, default)]
 pub struct Sart {
-    /// Line integrals of voxels.
+    /// Voxel projector.
     #[serde(deserialize_with = "stage::needed")]
     #[schemars(schema_with = "stage::schema::<dyn VoxelProjectorSpec>")]
     pub projector: Box<dyn VoxelProjectorSpec>,
-    /// How the scan is seen.
+    /// Support of the object, and attenuation beyond the volume.
     pub scene: VoxelScene,
-    /// The file of a known volume to start from.
+    /// File of a known volume to start from.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub start: Option<String>,
-    /// When it ends.
+    /// Stopping criteria.
     pub stop: Stop,
-    /// Subsets of the views: a number, or "views" for a view at a time. 1 takes all views at once.
+    /// Number of ordered subsets of the views, or "views" for one view at a time. 1 uses all views at once.
     pub subsets: Subsets,
     /// Relaxation λ of the first pass, above 0 and below 2.
     pub relaxation: f64,
-    /// What λ is multiplied with after each pass.
+    /// Factor of λ after each pass.
     pub decay: f64,
-    /// The order of the subsets.
+    /// Order of the subsets.
     pub order: Order,
     /// Set negative attenuation to 0 after each update.
     pub nonnegative: bool,
@@ -87,7 +87,7 @@ impl Sart {
     }
 }
 
-/// How a [`Sweep`] updates its volume.
+/// The update rule of a [`Sweep`].
 #[derive(Debug, Clone, Copy)]
 pub(super) struct Updates {
     pub(super) subsets: Subsets,
@@ -107,7 +107,7 @@ impl Updates {
     }
 }
 
-/// What [`Sart`] builds.
+/// The stages that [`Sart`] builds.
 struct Built {
     shared: Shared,
     updates: Updates,
@@ -156,23 +156,23 @@ impl Iterative for Built {
     }
 }
 
-/// The iterate with what its updates need.
+/// The iterate with its buffers.
 pub(super) struct Sweep {
     updates: Updates,
     subsets: Vec<Vec<usize>>,
     pub(super) x: Array3<f32>,
     /// Inverse row sums, `[view, row, column]`.
     rows: Array3<f32>,
-    /// Inverse column sums of the subset at hand.
+    /// Inverse column sums of the current subset.
     columns: Array3<f32>,
-    /// A volume to work in: between sweeps it is free.
+    /// Working memory, free between sweeps.
     pub(super) work: Array3<f32>,
     /// The pixels of a subset.
     pixels: Array3<f32>,
 }
 
 impl Sweep {
-    /// The arrays of a sweep that starts from `x`.
+    /// The buffers of a sweep that starts from `x`.
     pub(super) fn new(updates: Updates, space: &Space, x: Array3<f32>) -> Self {
         let views = space.header().views;
         Self {
@@ -186,10 +186,10 @@ impl Sweep {
         }
     }
 
-    /// Makes the sums that do not change.
+    /// Computes the sums that do not change.
     pub(super) fn prepare(&mut self, problem: &Problem<'_>) {
         problem.ones(&mut self.work);
-        // A subset at a time, as in every pass.
+        // One subset at a time, as in every pass.
         for views in &self.subsets {
             problem.forward(views, &self.work, &mut self.pixels);
             for (image, &v) in self.pixels.outer_iter().zip(views) {
@@ -202,7 +202,7 @@ impl Sweep {
         }
     }
 
-    /// Pass `pass`, counted from 0; returns `‖p − A·x‖²`.
+    /// Makes pass `pass`, counted from 0; returns `‖p − A·x‖²`.
     pub(super) fn sweep(&mut self, problem: &Problem<'_>, pass: u64) -> f64 {
         let Updates { relaxation, decay, order, nonnegative, .. } = self.updates;
         let relaxation = (relaxation * decay.powi(pass.min(1 << 20) as i32)) as f32;
@@ -227,7 +227,7 @@ impl Sweep {
     }
 }
 
-/// Overwrites `sums` with the inverse column sums of some views; `pixels` is room for theirs.
+/// Overwrites `sums` with the inverse column sums of some views; `pixels` is a buffer for their images.
 fn column_sums(problem: &Problem<'_>, views: &[usize], pixels: &mut Array3<f32>, sums: &mut Array3<f32>) {
     images_mut(pixels, views.len()).fill(1.0);
     problem.back(views, pixels, sums);
@@ -236,7 +236,7 @@ fn column_sums(problem: &Problem<'_>, views: &[usize], pixels: &mut Array3<f32>,
 
 struct Iterate {
     sweep: Sweep,
-    /// The volume before a pass, where its change is asked for.
+    /// The volume before a pass, if its change is needed.
     before: Option<Array3<f32>>,
 }
 

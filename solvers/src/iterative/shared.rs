@@ -1,4 +1,4 @@
-//! What every iterative method is given: a projector, a volume to start from, an end.
+//! Common settings of the iterative methods: projector, start volume, stopping criteria.
 
 use super::order::Subsets;
 use super::problem::Problem;
@@ -17,13 +17,13 @@ use conefield_core::voxel::{VoxelProjector, VoxelProjectorSpec};
 use ndarray::{Array3, Zip};
 use std::sync::Arc;
 
-/// The settings that all iterative methods have, built.
+/// The common settings, built.
 pub(super) struct Shared {
     pub(super) projector: Arc<dyn VoxelProjector>,
-    /// The name of its type.
+    /// The projector's type name.
     pub(super) projector_kind: &'static str,
     pub(super) scene: VoxelScene,
-    /// The file of the volume to start from.
+    /// File of the start volume.
     start: Option<String>,
     pub(super) stop: Stop,
 }
@@ -43,19 +43,19 @@ impl Shared {
         Ok(Self { projector: projector.into(), projector_kind, scene, start: start.clone(), stop: stop.clone() })
     }
 
-    /// Whether there is a volume to start from.
+    /// Whether there is a start volume.
     pub(super) fn has_start(&self, job: &Job<'_>) -> bool {
         job.start.is_some() || self.start.is_some()
     }
 
-    /// The volume to start from, in 1/mm; 0 where none is known and where no object can be.
+    /// The start volume, in 1/mm; 0 if there is none, and outside the object's support.
     pub(super) fn start(&self, job: &Job<'_>, problem: &Problem<'_>, space: &Space) -> Result<Array3<f32>> {
         let mut x = self.known(job, space)?;
         problem.outside(&mut x, 0.0);
         Ok(x)
     }
 
-    /// The volume that is known, in 1/mm; 0 where none is.
+    /// The known volume, in 1/mm; 0 if there is none.
     pub(super) fn known(&self, job: &Job<'_>, space: &Space) -> Result<Array3<f32>> {
         let volume = match (job.start, &self.start) {
             (Some(given), _) => in_mm(job, "start", given.clone())?,
@@ -67,12 +67,12 @@ impl Shared {
         Ok(if data.is_standard_layout() { data } else { data.as_standard_layout().into_owned() })
     }
 
-    /// Refuses a scan that makes no sense, tells `method` and its projector, and finds out where the object is.
+    /// Validates the scan, logs `method` and its projector, and finds the object's support.
     pub(super) fn open(&self, method: &str, job: &Job<'_>, observer: &mut dyn Observer) -> Result<Opened> {
         self.open_on(job.scan.geometry.volume, 1, method, job, observer)
     }
 
-    /// As [`Shared::open`], with `grid` as the grid of the unknowns and means of `bin` × `bin` pixels as pixels.
+    /// Like [`Shared::open`], with `grid` as the grid of the unknowns and `bin` × `bin` pixels averaged to one.
     pub(super) fn open_on(
         &self,
         grid: VoxelGrid,
@@ -89,7 +89,7 @@ impl Shared {
         ensure(met, "scan", "geometry", "rays that all miss the volume", "rays through the volume")?;
         let projector = job.backend.place(Box::new(self.projector.clone()))?;
         observer.note(&format!("{method}; {}", projector.describe()));
-        // By the views as they were measured: what is taken off them afterwards is known too coarsely to carve by.
+        // Uses the views as measured: the attenuation subtracted later is too coarse for carving.
         let (support, said) = support(job.scan, self.scene.support);
         said.iter().for_each(|line| observer.note(line));
         let inside = support.map(|support| {
@@ -104,8 +104,8 @@ impl Shared {
         Ok(Opened { projector, inside, within, binned, geometry })
     }
 
-    /// Counts in a tally what the driver, and the projector of a subset, take beside the method's own arrays; returns all bytes without
-    /// the volume that comes out.
+    /// Adds the memory of the driver and of the projector for a subset to the method's own arrays in `space`; returns
+    /// all bytes except the resulting volume.
     pub(super) fn price(&self, space: &Space, subsets: Subsets) -> u64 {
         super::drive::best(&self.stop, space);
         let header = space.header();
@@ -114,26 +114,26 @@ impl Shared {
     }
 }
 
-/// What a job on voxels begins with.
+/// The inputs of a voxel reconstruction.
 pub(super) struct Opened {
     projector: Box<dyn VoxelProjector>,
-    /// The voxels that the object can be in, where that is known.
+    /// The object's support, if known.
     inside: Option<Array3<bool>>,
-    /// The scan without what lies beyond the volume.
+    /// The scan without attenuation beyond the volume.
     within: Option<Within>,
-    /// The scan with larger pixels, if these are asked for.
+    /// The binned scan, if requested.
     binned: Option<Scan>,
-    /// The geometry of the scan that is worked on, with the grid of the unknowns.
+    /// The geometry of the scan in use, with the grid of the unknowns.
     geometry: Geometry,
 }
 
 impl Opened {
-    /// The job on what is inside the volume.
+    /// The job without attenuation beyond the volume.
     pub(super) fn job<'a>(&'a self, job: &Job<'a>) -> Job<'a> {
         Within::job(self.within.as_ref(), job)
     }
 
-    /// Its problem, with every pixel as it was measured or binned.
+    /// Its problem, with every pixel as measured or binned.
     pub(super) fn problem<'a>(&'a self, job: &Job<'a>) -> Problem<'a> {
         let (operator, inside) = (self.projector.operator(), self.inside.as_ref());
         let scan = self.binned.as_ref().unwrap_or(job.scan);
@@ -141,8 +141,8 @@ impl Opened {
     }
 }
 
-/// The volume that a field begins with, in 1/mm, the steps in which it learns it, and where it comes from: what the job hands
-/// over, or the file that the initializer names.
+/// The start volume of a field, in 1/mm, the number of steps to learn it, and its source: the job, or the initializer's
+/// file.
 pub fn known_volume(job: &Job<'_>, named: Option<KnownVolume>) -> Result<Option<(Volume, u64, String)>> {
     match (job.start, named) {
         (Some(given), named) => {
@@ -154,12 +154,12 @@ pub fn known_volume(job: &Job<'_>, named: Option<KnownVolume>) -> Result<Option<
     }
 }
 
-/// Reads a volume that fits the scan, in 1/mm.
+/// Reads a volume that matches the scan, in 1/mm.
 fn start_volume(job: &Job<'_>, path: &str) -> Result<Volume> {
     in_mm(job, path, (job.volumes)(path)?)
 }
 
-/// A volume in 1/unit of the scan, in 1/mm. Refuses one that does not fit the scan.
+/// Converts a volume from 1/unit of the scan to 1/mm. Refuses one that does not match the scan.
 fn in_mm(job: &Job<'_>, place: &str, volume: Volume) -> Result<Volume> {
     let shape = job.scan.geometry.volume.shape;
     let found = format!("{:?}", volume.data.shape());

@@ -1,34 +1,34 @@
-//! When an iterative method ends.
+//! Stopping criteria of iterative methods.
 
 use conefield_core::error::{Result, ensure};
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
-/// When an iterative method ends, whichever comes first.
+/// Stopping criteria; the first one reached ends the run.
 #[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields, default)]
 pub struct Stop {
-    /// After this many passes over the views.
+    /// Stop after this many passes over the views.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub passes: Option<u64>,
-    /// After this many seconds.
+    /// Stop after this many seconds.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub seconds: Option<f64>,
-    /// When a pass changes the volume by less than this share of it, both in root mean square.
+    /// Stop when a pass changes the volume by less than this share of it, both in root mean square.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub change: Option<f64>,
-    /// When the held-out views' error has not fallen for this many passes; the best volume is kept.
+    /// Stop when the error of the held-out views has not fallen for this many passes; keep the best volume.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub patience: Option<u64>,
 }
 
 impl Stop {
-    /// Ends after `n` passes.
+    /// Stops after `n` passes.
     pub fn after(n: u64) -> Self {
         Self { passes: Some(n), ..Self::default() }
     }
 
-    /// Refuses a run without an end. It stands at the key `stop` of its method.
+    /// Refuses a run without an end; the error names the key `stop`.
     pub fn validate(&self) -> Result<()> {
         let ends = self.passes.is_some() || self.seconds.is_some() || self.change.is_some();
         ensure(ends, "spec", "stop", "no end", "one of passes, seconds or change")?;

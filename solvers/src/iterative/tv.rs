@@ -1,8 +1,9 @@
-//! Total variation of a volume: `Σ_j √(Σ_k (g_k·(x_{j+k} − x_j))²)` over voxels j and axes k, where differences across
-//! voxels of different sides count by `g_k = h/h_k` with h the sides' geometric mean. At the far faces differences are 0.
+//! Total variation of a volume: `Σ_j √(Σ_k (g_k·(x_{j+k} − x_j))²)` over voxels j and axes k. For anisotropic voxels,
+//! differences are weighted by `g_k = h/h_k` with h the geometric mean of the sides. At the far faces differences are
+//! 0.
 //!
-//! With [`Edges`] it is directional: `Σ_j |D_j·∇x_j|` with `D = I − n·nᵀ`, which counts slopes across edges less than those
-//! along them (Ehrhardt and Betcke, SIAM J. Imaging Sci. 9(3), 2016, whose edges come from another image).
+//! With [`Edges`] it is directional: `Σ_j |D_j·∇x_j|` with `D = I − n·nᵀ`, in which slopes across edges cost less than
+//! slopes along them (Ehrhardt and Betcke, SIAM J. Imaging Sci. 9(3), 2016, whose edges come from another image).
 
 use super::edges::Edges;
 use super::flat_mut;
@@ -14,13 +15,13 @@ use ndarray::{Array3, ArrayView3};
 use rayon::prelude::*;
 use std::ops::Range;
 
-/// Differences count by these, along x, y, z.
+/// Weights of differences along x, y, z.
 pub fn anisotropy(grid: &VoxelGrid) -> [f32; 3] {
     let h = grid.spacing.iter().product::<f64>().cbrt();
     grid.spacing.map(|s| (h / s) as f32)
 }
 
-/// The total variation of `x` itself, which lies in standard order.
+/// The total variation of `x`, which must be contiguous in standard order.
 pub fn total_variation(x: ArrayView3<'_, f32>, g: [f32; 3], edges: Option<&Edges>) -> f64 {
     let (_, ny, nz) = x.dim();
     let plane = ny * nz;
@@ -63,7 +64,7 @@ impl Op for Variation<'_> {
             let next = self.x.get((j + 1) * nz..(j + 2) * nz).unwrap_or(x);
             line[..nz].copy_from_slice(x);
             line[nz] = x[nz - 1];
-            // A line is short enough for single precision.
+            // A line is short enough for sums in single precision.
             let mut part = zero;
             for k in (0..nz).step_by(len) {
                 let here = load(s, x, k);
@@ -84,23 +85,25 @@ impl Op for Variation<'_> {
     }
 }
 
-/// The proximal map of total variation with `x ≥ 0`, by gradient steps on its dual, which starts where it ended before.
+/// The proximal map of total variation with `x ≥ 0`, by gradient steps on its dual, warm-started from the previous
+/// call.
 ///
-/// `argmin_{u ≥ 0} ½‖u − v‖² + τ·TV(u)`, with `u = max(0, v − τ·∇ᵀp)` and `|p_j| ≤ 1` (Beck and Teboulle, IEEE Trans. Image
-/// Process. 18(11), 2009; without their momentum, which a warm start does not need).
+/// `argmin_{u ≥ 0} ½‖u − v‖² + τ·TV(u)`, with `u = max(0, v − τ·∇ᵀp)` and `|p_j| ≤ 1` (Beck and Teboulle, IEEE Trans.
+/// Image Process. 18(11), 2009; without their momentum, which a warm start does not need).
 ///
-/// All steps go through the volume in one sweep (`Sweep::sweep`), so that memory is read and written once for all of them.
+/// All steps pass through the volume in one sweep (`Sweep::sweep`), so that memory is read and written once for all of
+/// them.
 pub struct TvProx {
     shape: [usize; 3],
     g: [f32; 3],
     /// The dual variable along x, y and z; with edges it is `D·p`.
     dual: [Array3<f32>; 3],
-    /// Edges across which slopes count less.
+    /// Edges across which slopes cost less.
     edges: Option<Edges>,
 }
 
 impl TvProx {
-    /// For volumes of `shape`, from a dual of 0.
+    /// For volumes of `shape`, starting with a dual of 0.
     pub fn new(shape: [usize; 3], g: [f32; 3], space: &Space) -> Self {
         let split = Split::new(shape[0], REACH, rayon::current_num_threads());
         space.briefly(|space| {
@@ -110,12 +113,12 @@ impl TvProx {
         Self { shape, g, dual: std::array::from_fn(|_| space.array(shape)), edges: None }
     }
 
-    /// Counts slopes across `edges` less from now on. They are none at first.
+    /// Reduces the cost of slopes across `edges`, which are initially 0.
     pub fn with_edges(self, edges: Edges) -> Self {
         Self { edges: Some(edges), ..self }
     }
 
-    /// Finds the edges of `x`, if they matter. Returns the total variation of `x` if that changes it.
+    /// Updates the edges from `x`, if they are in use. Returns the total variation of `x` if that changes it.
     pub fn adapt(&mut self, x: ArrayView3<'_, f32>) -> Option<f64> {
         self.edges.as_mut()?.find(x, self.g);
         Some(self.value(x))
@@ -131,7 +134,8 @@ impl TvProx {
         self.dual.each_mut().map(flat_mut)
     }
 
-    /// Overwrites `u` with the proximal map of `v` after `steps` dual steps. Without a weight only what is below 0 goes.
+    /// Overwrites `u` with the proximal map of `v` after `steps` dual steps. With a weight of 0, only clips negative
+    /// values.
     pub fn apply(&mut self, v: &[f32], tau: f32, steps: usize, u: &mut [f32]) {
         if tau < f32::MIN_POSITIVE {
             return u.par_iter_mut().zip(v).for_each(|(u, v)| *u = v.max(0.0));
@@ -147,7 +151,8 @@ impl TvProx {
         }
     }
 
-    /// A whole update, as [`conefield_core::regularizer::Penalty::update`] has it, in one sweep; gives back one whose `steps` take more than that.
+    /// Makes a whole update in one sweep, see [`conefield_core::regularizer::Penalty::update`]; returns the update if
+    /// `steps` does not fit into one.
     pub fn update<'a>(&mut self, update: Update<'a>, tau: f32, steps: usize) -> Option<Update<'a>> {
         let split = Split::new(self.shape[0], steps, rayon::current_num_threads());
         if tau < f32::MIN_POSITIVE || split.reach < steps {
@@ -157,15 +162,15 @@ impl TvProx {
         None
     }
 
-    /// Some steps in one sweep. The slabs of `split` run side by side; near their ends each works on a copy of what belongs
-    /// to its neighbour, so that every number is computed from the same ones whatever the split.
+    /// Makes some steps in one sweep. The slabs of `split` run in parallel; near its ends each works on a copy of its
+    /// neighbour's data, so that every number is computed from the same values whatever the split.
     fn steps(&mut self, lines: impl Lines, tau: f32, split: Split) {
         let [nx, ny, nz] = self.shape;
         let plane = ny * nz;
         let bounds = split.bounds(nx);
         let edges = self.edges.as_ref().map(Edges::vectors);
         let dual = self.dual.each_mut().map(flat_mut);
-        // Around every inner bound, what the slab above copies of the one below, and the other way round.
+        // Copies of the neighbour's planes on both sides of every inner bound.
         let mut halos: Vec<([Vec<f32>; 3], Vec<f32>)> = bounds[1..bounds.len() - 1]
             .iter()
             .map(|&b| {
@@ -209,10 +214,10 @@ impl TvProx {
     }
 }
 
-/// Dual steps of one sweep at most: what they hold of the volume stays in the last cache.
+/// Most dual steps per sweep, so that their part of the volume stays in the last-level cache.
 const REACH: usize = 4;
 
-/// Into how many slabs along x the volume is split, and how many steps a sweep makes.
+/// Number of slabs along x, and steps per sweep.
 #[derive(Debug, Clone, Copy)]
 struct Split {
     slabs: usize,
@@ -220,7 +225,7 @@ struct Split {
 }
 
 impl Split {
-    /// For `planes` planes and `threads` threads: no slab is less than twice as thick as what it computes beside itself.
+    /// For `planes` planes and `threads` threads: each slab is at least twice as thick as its redundant part.
     fn new(planes: usize, steps: usize, threads: usize) -> Self {
         let reach = steps.min((planes / threads.max(1) / 4).clamp(1, REACH));
         let mut split = Self { slabs: 1, reach };
@@ -228,7 +233,7 @@ impl Split {
         split
     }
 
-    /// Planes that a step reaches below: one a step, and the dual's before the first.
+    /// Planes below a slab that affect it: one per step, and the dual's before the first.
     fn below(self) -> usize {
         self.reach + 1
     }
@@ -237,18 +242,18 @@ impl Split {
         self.below() + self.reach
     }
 
-    /// Where slabs begin, and the last one's end.
+    /// Where slabs begin, and where the last one ends.
     fn bounds(self, planes: usize) -> Vec<usize> {
         (0..=self.slabs).map(|n| n * planes / self.slabs).collect()
     }
 }
 
-/// What differences are multiplied with.
+/// Factors of differences.
 #[derive(Clone, Copy)]
 struct Scale {
     /// For the primal: `g·τ`.
     down: [f32; 3],
-    /// For a step of the dual: `g/(L·τ)`, L a bound of `‖∇‖²`.
+    /// For a dual step: `g/(L·τ)`, L a bound on `‖∇‖²`.
     up: [f32; 3],
 }
 
@@ -263,13 +268,13 @@ impl Scale {
 #[derive(Default)]
 struct Planes<'a>([Vec<&'a mut [f32]>; 3]);
 
-/// What a sweep takes the proximal map of, and what becomes of the map, line by line. A line that was written is not read again.
+/// Input and output of the proximal map in a sweep, line by line. A line is not read again after it was written.
 trait Lines: Send + Sized {
-    /// Overwrites `v` with the numbers from `at` on.
+    /// Overwrites `v` with the input from index `at` on.
     fn read(&self, at: usize, v: &mut [f32]);
-    /// Takes the proximal map `u` from number `at` on.
+    /// Receives the proximal map `u` from index `at` on.
     fn write(&mut self, at: usize, u: &[f32]);
-    /// The first `at` numbers, and the others.
+    /// Splits into the first `at` numbers and the rest.
     fn split(self, at: usize) -> [Self; 2];
 }
 
@@ -308,18 +313,18 @@ impl Lines for Map<'_> {
     }
 }
 
-/// Dual steps and then the primal on a slab of planes, of which `own` are to be right in the end. At the slab's ends
-/// differences count as 0: where the volume goes on there, that is wrong, and spreads by a plane with every step.
+/// Dual steps and then the primal on a slab of planes, of which `own` are correct at the end. Differences at the slab's
+/// ends count as 0; where the volume goes on, the resulting error spreads by one plane per step.
 struct Sweep<'a, L> {
     planes: Planes<'a>,
     own: Range<usize>,
     /// The lines of `own`.
     lines: L,
-    /// What the map is of below and above `own`.
+    /// The input of the map below and above `own`.
     v: [&'a [f32]; 2],
     /// The edges of all planes.
     edges: Option<[&'a [f32]; 3]>,
-    /// Numbers of a line along z.
+    /// Numbers per line along z.
     line: usize,
     steps: usize,
 }
@@ -335,19 +340,19 @@ impl<L: Lines> Op for Sweeping<'_, L> {
 }
 
 impl<L: Lines> Sweep<'_, L> {
-    /// Step k follows step k − 1 a plane behind, line by line: when the primal of a line is known, the dual of the line
-    /// one plane before can go on, whose primal the next step then takes. So of every step one plane is kept.
+    /// Step k runs one plane behind step k − 1, line by line: once a line's primal is known, the dual of the line one
+    /// plane before can advance, whose primal the next step then uses. So one plane per step is kept.
     #[inline(always)]
     fn sweep<S: Simd>(mut self, s: S, scale: Scale) {
         let nz = self.line;
         let plane = self.planes.0[0].first().map_or(0, |p| p.len());
         let (ny, count) = (plane / nz, self.planes.0[0].len());
-        // The primal of every step, with each line's last number twice: no difference across the far face. A line takes the
-        // place of one that is a plane and a line older, which no dual needs any more.
+        // The primal of every step, with each line's last number doubled: no difference across the far face. A line
+        // replaces the one that is a plane and a line older, which no dual needs any more.
         let stride = nz + 1;
         let ring = ny + 1;
         let mut kept = vec![0.0f32; self.steps * ring * stride];
-        // What the map is of, from the line that the last step is at to the one that the first is at.
+        // The map's input, from the line of the last step to the line of the first.
         let reach = self.steps * ny + 1;
         let mut given = vec![0.0f32; reach * nz];
         let given_at = |i: usize, j: usize| (i * ny + j) % reach * nz;
@@ -384,7 +389,7 @@ impl<L: Lines> Sweep<'_, L> {
         }
     }
 
-    /// Overwrites `v` with line `j` of plane `i` of what the map is of.
+    /// Overwrites `v` with line `j` of plane `i` of the map's input.
     #[inline(always)]
     fn give(&self, i: usize, j: usize, v: &mut [f32]) {
         let (nz, plane) = (self.line, self.planes.0[0][i].len());
@@ -399,7 +404,7 @@ impl<L: Lines> Sweep<'_, L> {
     }
 }
 
-/// The dual at a line, and along x and y at the lines before: zeros where there are none.
+/// The dual at a line, and along x and y at the lines before; zeros if there are none.
 struct Beside<'a> {
     p: [&'a [f32]; 3],
     before: [&'a [f32]; 2],
@@ -420,8 +425,8 @@ impl Planes<'_> {
     }
 }
 
-/// A whole vector of a line. Loops over these leave the end of a line to [`load`] and [`store`], whose ways out of line make
-/// the compiler put every vector on the stack.
+/// A whole vector of a line. Loops over these leave the end of a line to [`load`] and [`store`], whose out-of-line
+/// paths make the compiler spill every vector to the stack.
 #[inline(always)]
 fn whole<S: Simd>(s: S, line: &[f32], k: usize) -> S::f32s {
     S::f32s::from_slice(s, &line[k..k + S::f32s::LEN])
@@ -433,7 +438,7 @@ fn primal<S: Simd>(s: S, Beside { p: [px, py, pz], before }: Beside<'_>, v: &[f3
     let (n, len) = (u.len(), S::f32s::LEN);
     let scale = scale.map(|x| S::f32s::splat(s, x));
     let [bx, by] = before;
-    // Before the first voxel along z there is no difference.
+    // There is no difference before the first voxel along z.
     let mut first = [0.0; 32];
     let head = n.min(len);
     first[1..=head].copy_from_slice(&pz[..head]);
@@ -462,8 +467,8 @@ fn descent<S: Simd>(s: S, behind: [S::f32s; 3], p: [S::f32s; 3], v: S::f32s, sca
     (v - turn).max(S::f32s::splat(s, 0.0))
 }
 
-/// `p ← p + D·∇u/(L·τ)` along a line, then back into the unit ball. `u` has its last number twice; `after` are the next lines
-/// along x and y, and `u` itself where there is none; `n` are the edges, if `D` is not 1.
+/// `p ← p + D·∇u/(L·τ)` along a line, then projection onto the unit ball. `u` has its last number doubled; `after` are
+/// the next lines along x and y, or `u` itself at the end; `n` are the edges, if `D` is not 1.
 #[inline(always)]
 fn ascend<S: Simd>(
     s: S,
@@ -497,8 +502,8 @@ fn ascend<S: Simd>(
     }
 }
 
-/// The dual of a vector of voxels after a step. With edges it is kept as `w = D·p`, so that the primal needs no edges; then
-/// `p = D⁻¹·w = w + n·(n·w)/(1 − |n|²)`.
+/// The dual of a vector of voxels after a step. With edges it is stored as `w = D·p`, so that the primal does not need
+/// them; then `p = D⁻¹·w = w + n·(n·w)/(1 − |n|²)`.
 #[inline(always)]
 fn ascent<S: Simd>(
     s: S,
@@ -512,7 +517,7 @@ fn ascent<S: Simd>(
     let Some(n) = n else {
         let [x, y, z]: [S::f32s; 3] = std::array::from_fn(|k| (next[k] - here).mul_add(scale[k], p[k]));
         let square = x.mul_add(x, y.mul_add(y, z * z));
-        // Flat parts stay in the ball: there neither the root nor the quotient is needed.
+        // Flat parts stay in the ball and need neither the root nor the quotient.
         if square.simd_le(one).all_true() {
             return [x, y, z];
         }
@@ -532,8 +537,8 @@ fn dot<T: Copy + std::ops::Add<Output = T> + std::ops::Mul<Output = T>>(a: [T; 3
     a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
 }
 
-/// Adds `−step·∇TV/‖∇TV‖` of the smoothed total variation to `x`: a step of ASD-POCS. `work` is scratch of `x`'s length.
-/// Differences are counted in `smoothing`, so that their squares are of order one whatever the unit of `x`.
+/// Adds `−step·∇TV/‖∇TV‖` of the smoothed total variation to `x`: a step of ASD-POCS. `work` is scratch of `x`'s
+/// length. Differences are divided by `smoothing`, so that their squares are of order one whatever the unit of `x`.
 pub fn descend(x: &mut [f32], shape: [usize; 3], g: [f32; 3], step: f64, smoothing: f32, work: &mut [f32]) {
     let [nx, ny, nz] = shape;
     if !smoothing.is_normal() {
@@ -566,12 +571,12 @@ pub fn descend(x: &mut [f32], shape: [usize; 3], g: [f32; 3], step: f64, smoothi
     debug_assert_eq!(nx * plane, x.len());
 }
 
-/// Derivative of the smoothed total variation by one voxel; differences times `unit` are held against 1.
+/// Derivative of the smoothed total variation with respect to one voxel; differences times `unit` are compared with 1.
 #[inline(always)]
 fn slope(x: &[f32], shape: [usize; 3], g: [f32; 3], unit: f32, at: [usize; 3]) -> f32 {
     let stride = [shape[1] * shape[2], shape[2], 1];
     let index = at[0] * stride[0] + at[1] * stride[1] + at[2];
-    // Forward differences at a voxel and what they are in length.
+    // Forward differences at a voxel and their norm.
     let forward = |at: [usize; 3], index: usize| {
         let to_next = |k: usize| g[k] * ((x[index + stride[k]] - x[index]) * unit);
         let d: [f32; 3] = std::array::from_fn(|k| if at[k] + 1 < shape[k] { to_next(k) } else { 0.0 });
@@ -601,7 +606,7 @@ mod tests {
         TvProx::new(shape, g, &Space::new(ScanHeader { views: 0, detector: [0; 2], volume: shape }))
     }
 
-    /// The prior that follows the edges of `x`.
+    /// The prior with the edges of `x`.
     fn with_edges(shape: [usize; 3], g: [f32; 3], x: &Array3<f32>) -> TvProx {
         let space = Space::new(ScanHeader { views: 0, detector: [0; 2], volume: shape });
         let mut prox = prox(shape, g).with_edges(Edges::new(shape, 0.9, 0.7, &space));
@@ -617,7 +622,7 @@ mod tests {
         })
     }
 
-    /// Primal and dual objective of the proximal problem meet, which proves both right.
+    /// Primal and dual objective of the proximal problem converge, which verifies both.
     #[test]
     fn the_duality_gap_closes() {
         let shape = [9, 8, 19];
@@ -645,7 +650,7 @@ mod tests {
         }
     }
 
-    /// A step between two faces costs less than without edges, a step of the same size on one voxel does not.
+    /// A step between two faces costs less than without edges; a step of the same size on one voxel does not.
     #[test]
     fn slopes_across_an_edge_count_less() {
         let (shape, g) = ([12, 9, 10], [1.0; 3]);
@@ -696,7 +701,7 @@ mod tests {
     }
 
     /// Tiny volumes, lines shorter and longer than a vector, more steps than a sweep makes, slabs with and without
-    /// neighbours: a sweep is what its steps are one by one, and the number of threads changes no bit.
+    /// neighbours: a sweep equals its single steps, bit by bit, for any number of threads.
     #[test]
     fn a_sweep_is_its_steps_one_by_one_on_any_number_of_threads() {
         let (g, tau) = ([1.0, 0.7, 1.3], 0.15f32);
@@ -735,8 +740,8 @@ mod tests {
         }
     }
 
-    /// With and without a pull and a mask, on any number of threads: the same bits as step, proximal map and momentum one after
-    /// another.
+    /// With and without pull and mask, for any number of threads: bit-identical to step, proximal map and momentum in
+    /// turn.
     #[test]
     fn an_update_in_one_sweep_is_its_parts_one_after_another() {
         let (g, tau) = ([1.0, 0.7, 1.3], 0.15f32);
@@ -814,7 +819,7 @@ mod tests {
         }
     }
 
-    /// Attenuation of a micrometre's object in 1/mm is large: without a weight nothing may be divided by next to nothing.
+    /// Attenuation of a micrometre-sized object in 1/mm is large: a weight of 0 must not cause a division by almost 0.
     #[test]
     fn no_weight_leaves_what_is_positive() {
         let v: Vec<f32> = noisy([9, 8, 19]).iter().map(|x| 1e4 * (x - 0.5)).collect();

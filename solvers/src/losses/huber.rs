@@ -11,8 +11,8 @@ use serde::{Deserialize, Serialize};
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields, default)]
 pub struct Huber {
-    /// The difference from which the loss is linear, in the scale that stages see: there the most absorbing rays measure
-    /// about 0.25.
+    /// The difference from which the loss is linear, in the scale that stages see: the most absorbing rays measure
+    /// about 0.25 there.
     pub delta: f64,
 }
 

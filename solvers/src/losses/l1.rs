@@ -1,4 +1,4 @@
-//! The absolute difference, as NI-NeRF has it.
+//! The absolute difference, as in NI-NeRF.
 
 use conefield_core::error::Result;
 use conefield_core::loss::Loss;

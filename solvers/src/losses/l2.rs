@@ -1,4 +1,4 @@
-//! Half the squared difference, as NAF has it up to the factor.
+//! Half the squared difference, as in NAF up to the factor.
 
 use conefield_core::error::Result;
 use conefield_core::loss::Loss;

@@ -1,4 +1,4 @@
-//! Losses: how far predicted line integrals are from the measured ones.
+//! Losses between predicted and measured line integrals.
 
 mod huber;
 mod l1;

@@ -1,4 +1,4 @@
-//! Half the squared difference, weighted by how little noise the measured value has.
+//! Half the squared difference, weighted by the inverse noise variance of the measured value.
 
 use conefield_core::error::Result;
 use conefield_core::loss::{Loss, NoiseModel};
@@ -26,8 +26,8 @@ impl LossSpec for NoiseWeighted {
     }
 }
 
-/// The weight of a measured value `p` is `factor·exp(−growth·p)`, that of a negative one `factor`. Before it is fitted to
-/// a scan every weight is 1.
+/// The weight of a measured value `p` is `factor·exp(−growth·p)`, for negative ones `factor`. Before the loss is fitted
+/// to a scan, every weight is 1.
 struct Weighted {
     growth: f64,
     factor: f64,
@@ -61,7 +61,7 @@ impl Loss for Weighted {
         true
     }
 
-    /// Weights have a mean of 1 over what training draws, so that learning rates keep their meaning.
+    /// Normalizes the weights to a mean of 1 over the training data, so that learning rates keep their meaning.
     fn fitted(&self, noise: &NoiseModel<'_>) -> Option<Box<dyn Loss>> {
         let inverse = Self { growth: noise.growth, factor: 1.0 };
         let sum: f64 = noise.measured.iter().map(|&p| inverse.weight(p)).sum();

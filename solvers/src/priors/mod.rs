@@ -1,4 +1,4 @@
-//! Priors of a field, and where in the volume a step looks at them.
+//! Priors of a field, and the sampling of their blocks.
 
 mod total_variation;
 
@@ -22,7 +22,7 @@ impl<'a> Places<'a> {
         Self { priors, corners: vec![vec![]; priors.len()] }
     }
 
-    /// The blocks of step `step`: at random inside the volume, the same for the same seed.
+    /// The blocks of step `step`: at random positions in the volume, reproducible by the seed.
     pub(crate) fn draw(&mut self, scene: &Scene, seed: u64, step: u64) -> Vec<BlockWork<'_>> {
         let voxel = scene.unit_spacing();
         let (lo, hi) = (scene.to_unit(scene.bounds[0]), scene.to_unit(scene.bounds[1]));
@@ -30,7 +30,7 @@ impl<'a> Places<'a> {
         for (i, (prior, corners)) in self.priors.iter().zip(&mut self.corners).enumerate() {
             let Blocks { edge, count, spacing, .. } = prior.blocks();
             let spacing = voxel.map(|s| s * spacing as f32);
-            // Each prior has a random stream of its own.
+            // Each prior has its own random stream.
             let mut rng = stream(seed ^ 0x7e57_b10c ^ (i as u64) << 32, step);
             corners.clear();
             for _ in 0..count {

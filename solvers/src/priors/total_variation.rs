@@ -1,4 +1,4 @@
-//! Isotropic total variation: values that differ from their neighbours' cost as much as they differ.
+//! Isotropic total variation: the cost of a difference between neighbours is proportional to its size.
 
 use conefield_core::error::{Result, ensure};
 use conefield_core::prior::{Blocks, Prior};
@@ -11,15 +11,15 @@ use serde::{Deserialize, Serialize};
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields, default)]
 pub struct TotalVariation {
-    /// Weight against the mean loss of a ray.
+    /// Weight relative to the mean loss of a ray.
     pub weight: f64,
-    /// Blocks a step.
+    /// Blocks per step.
     pub blocks: usize,
     /// Points along a block's edge.
     pub edge: usize,
-    /// Distance of the points in voxels.
+    /// Spacing of the points in voxels.
     pub spacing: f64,
-    /// Differences below this (in the scale that stages see) count quadratically.
+    /// Differences below this (in the scale that stages see) have a quadratic cost.
     pub smoothing: f64,
 }
 
@@ -52,7 +52,7 @@ impl Prior for TotalVariation {
         Blocks { edge, count, spacing, weight }
     }
 
-    /// By forward differences, none across the block's sides.
+    /// Uses forward differences, without differences across the block's sides.
     fn block(&self, values: &[f64], scale: f64, gradient: &mut [f64]) -> f64 {
         let e = self.edge;
         let strides = [e * e, e, 1];

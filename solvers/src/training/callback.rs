@@ -1,4 +1,4 @@
-//! What a callback is: something beside the training loop that looks at a run and may act on it.
+//! Callbacks: they observe a training run and may act on it.
 
 use super::run::Run;
 use conefield_core::arena::Layout;
@@ -17,9 +17,9 @@ use std::fmt::Debug;
 /// Settings of a callback.
 #[typetag::serde(tag = "type")]
 pub trait CallbackSpec: Debug + Send + Sync {
-    /// The callback, or why the settings make none.
+    /// The callback, or why the settings are invalid.
     fn build(&self) -> Result<Box<dyn Callback>>;
-    /// The same settings again.
+    /// A copy of the settings.
     fn copy(&self) -> Box<dyn CallbackSpec>;
 }
 
@@ -33,98 +33,99 @@ impl Clone for Box<dyn CallbackSpec> {
     }
 }
 
-/// Whether a step's gradients are used.
+/// Whether to use a step's gradients.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Update {
-    /// The parameters are updated with them.
+    /// Update the parameters.
     Take,
-    /// They are left: the callback has put the run into another state.
+    /// Discard the gradients: the callback has changed the run's state.
     Leave,
 }
 
-/// Looks at a run beside the training loop. A method that a callback does not write does nothing.
+/// Observes a run alongside the training loop. By default, each method does nothing.
 ///
-/// A loop goes: [`between_steps`](Self::between_steps), checkpoint, at the end of the run [`at_end`](Self::at_end), then
-/// [`at_record`](Self::at_record), [`before_step`](Self::before_step), [`after_gradients`](Self::after_gradients), update.
+/// Order of calls per iteration: [`between_steps`](Self::between_steps), checkpoint, at the end of the run
+/// [`at_end`](Self::at_end), then [`at_record`](Self::at_record), [`before_step`](Self::before_step),
+/// [`after_gradients`](Self::after_gradients), update.
 pub trait Callback: Send {
-    /// Its name: the key of its state in a checkpoint.
+    /// Its name, the key of its state in a checkpoint.
     fn name(&self) -> &'static str;
 
-    /// Refuses a pipeline that it cannot work on, before anything is trained.
+    /// Refuses an unsuitable pipeline before training.
     fn check(&self, pipeline: &Pipeline) -> Result<()> {
         let _ = pipeline;
         Ok(())
     }
 
-    /// Before the first step of a run, of a resumed one after [`Callback::restore`].
+    /// Called before the first step of a run; in a resumed run, after [`Callback::restore`].
     fn begin(&mut self, run: &mut Run<'_>) -> Result<()> {
         let _ = run;
         Ok(())
     }
 
-    /// Between two steps, before a checkpoint. A resumed run calls it again.
+    /// Called between two steps, before a checkpoint. A resumed run calls it again.
     fn between_steps(&mut self, run: &mut Run<'_>) -> Result<()> {
         let _ = run;
         Ok(())
     }
 
-    /// After the last step of a run that its limits end, before the last record.
+    /// Called after the last step if the run reaches its limits, before the last record.
     fn at_end(&mut self, run: &mut Run<'_>) -> Result<()> {
         let _ = run;
         Ok(())
     }
 
-    /// When a record is made: may add to it, or end the run with it ([`Run::settled`]).
+    /// Called for each record: may add to it, or end the run with it ([`Run::settled`]).
     fn at_record(&mut self, record: &mut Record, run: &mut Run<'_>) -> Result<()> {
         let _ = (record, run);
         Ok(())
     }
 
-    /// Before a step that follows.
+    /// Called before each step.
     fn before_step(&mut self, run: &mut Run<'_>) -> Result<()> {
         let _ = run;
         Ok(())
     }
 
-    /// Channels have left the model: what is kept of its parameters or features no longer fits.
+    /// Called after channels were removed from the model: stored parameters or features no longer match.
     fn masked(&mut self) {}
 
-    /// Between gradients and update.
+    /// Called between gradients and update.
     fn after_gradients(&mut self, work: &Work<'_>, stats: &StepStats, run: &mut Run<'_>) -> Result<Update> {
         let _ = (work, stats, run);
         Ok(Update::Take)
     }
 
-    /// After training: may change what comes out.
+    /// Called after training: may change the result.
     fn finish(&mut self, run: &mut Run<'_>) -> Result<()> {
         let _ = run;
         Ok(())
     }
 
-    /// What it needs to go on from a checkpoint.
+    /// The state for a checkpoint.
     fn state<'a>(&'a self, layout: &'a Layout) -> Result<State<'a>> {
         let _ = layout;
         Ok(State::default())
     }
 
-    /// Takes back what [`Callback::state`] gave.
+    /// Restores the result of [`Callback::state`].
     fn restore(&mut self, kept: &Kept<'_>, run: &Run<'_>) -> Result<()> {
         let _ = run;
         kept.value()
     }
 
-    /// Whether it looks at views that are kept aside.
+    /// Whether it uses held-out views.
     fn needs_held_out(&self) -> bool {
         false
     }
 
-    /// Bytes that it holds for so many parameters.
+    /// Bytes for this many parameters.
     fn bytes(&self, parameters: u64) -> u64 {
         let _ = parameters;
         0
     }
 
-    /// Its settings in words.
+    /// Description of its settings.
     fn describe(&self) -> Option<String> {
         None
     }
@@ -133,9 +134,9 @@ pub trait Callback: Send {
 /// The state of a callback for a checkpoint.
 #[derive(Debug, Default)]
 pub struct State<'a> {
-    /// What it knows.
+    /// Serialized values.
     pub value: Value,
-    /// Name, shape and values of what it keeps; names begin with that of the callback and a point.
+    /// Name, shape and values of its tensors; names begin with the callback's name and a dot.
     pub tensors: Vec<(String, &'a [usize], &'a [f32])>,
 }
 
@@ -153,12 +154,12 @@ pub struct Kept<'a> {
     pub resume: &'a Resume,
     /// The callback's name.
     pub name: &'static str,
-    /// What it knew.
+    /// Serialized values.
     pub value: &'a Value,
 }
 
 impl Kept<'_> {
-    /// What it knew, as it wrote it.
+    /// The deserialized values.
     pub fn value<T: DeserializeOwned>(&self) -> Result<T> {
         let expected = "what this callback keeps";
         T::deserialize(self.value).map_err(|e| Error::invalid(&self.resume.place, self.name, e, expected))
@@ -169,13 +170,14 @@ impl Kept<'_> {
         self.resume.shaped(name, shape).map(<[f32]>::to_vec)
     }
 
-    /// The parts of an arena that [`tensors_of`](conefield_core::checkpoint::tensors_of) named after the callback.
+    /// Reads the parts of an arena that [`tensors_of`](conefield_core::checkpoint::tensors_of) stored under the
+    /// callback's name.
     pub fn parts<const N: usize>(&self, layout: &Layout, parts: [&mut [f32]; N]) -> Result<()> {
         self.resume.load(&format!("{}.", self.name), layout, parts)
     }
 }
 
-/// The callbacks of a run, in the order in which they are called.
+/// The callbacks of a run, in calling order.
 pub struct Callbacks(pub Vec<Box<dyn Callback>>);
 
 impl Callbacks {

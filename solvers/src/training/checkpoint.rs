@@ -1,4 +1,4 @@
-//! Checkpoints of a run: the model, what the run has counted, and the state of every callback under its name.
+//! Checkpoints of a run: the model, the run's counters, and the state of every callback under its name.
 
 use super::callback::{Callbacks, Kept};
 use super::run::{Run, Tally, strayed};
@@ -8,7 +8,7 @@ use serde::{Deserialize, Serialize};
 use serde_json::Value;
 use std::collections::{BTreeMap, BTreeSet};
 
-/// What a checkpoint keeps beside the model.
+/// The content of a checkpoint besides the model.
 #[derive(Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 struct Whole<T> {
@@ -16,15 +16,15 @@ struct Whole<T> {
     callbacks: BTreeMap<String, Value>,
 }
 
-/// Keeps a checkpoint where one is due, and ends an interrupted run.
+/// Writes a checkpoint if one is due, and ends an interrupted run.
 pub fn keep(run: &mut Run<'_>, callbacks: &Callbacks) -> Result<()> {
     let cancelled = run.observer.cancelled();
-    // What a run was resumed from needs no checkpoint.
+    // The state from which a run was resumed needs no checkpoint.
     let begun = run.step > run.job.resume.map_or(0, |r| r.standing.step);
     if begun && (cancelled || run.observer.checkpoint_due()) {
         run.clock.pause();
         run.exe.fetch(&mut run.model)?;
-        // A state that a callback has yet to find astray is nothing to go on from: an earlier checkpoint stays.
+        // A state that is not finite, which a callback has yet to detect, is not saved: an earlier checkpoint stays.
         if strayed(&run.model.arena).is_none() {
             let layout = run.model.pipeline.layout();
             let mut tensors = tensors(&run.model);
@@ -37,7 +37,7 @@ pub fn keep(run: &mut Run<'_>, callbacks: &Callbacks) -> Result<()> {
             let method = serde_json::to_value(Whole { run: &run.tally, callbacks: values });
             let standing = Standing {
                 step: run.step,
-                // The record of this step, if one is due, comes after the checkpoint.
+                // The record of this step, if due, follows the checkpoint.
                 recorded: run.step.saturating_sub(1),
                 samples: run.samples,
                 seconds: run.clock.seconds(),
@@ -51,8 +51,8 @@ pub fn keep(run: &mut Run<'_>, callbacks: &Callbacks) -> Result<()> {
     if cancelled { Err(Error::Interrupted { step: run.step }) } else { Ok(()) }
 }
 
-/// Brings a run, whose model is restored, and its callbacks to where `resume` stood. Refuses a state that is missing, and one
-/// that no part of the run keeps.
+/// Restores a run, whose model is already restored, and its callbacks from `resume`. Refuses a missing state, and a
+/// state that belongs to no part of the run.
 pub fn restore(run: &mut Run<'_>, callbacks: &mut Callbacks, resume: &Resume) -> Result<()> {
     let whole: Whole<Tally> = Whole::deserialize(&resume.standing.method)
         .map_err(|e| Error::invalid(&resume.place, "method", e, "what training keeps"))?;

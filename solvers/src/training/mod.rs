@@ -1,7 +1,7 @@
-//! The training loop: draw what a step learns from, take its gradients, update the parameters.
+//! The training loop: draw a batch, compute its gradients, update the parameters.
 //!
-//! [`callbacks`] do all that goes on beside: they look at gradients before the update, at the model between steps and at
-//! every record. A spec chooses some of them; [`checkpoint`] keeps the state of all.
+//! [`callbacks`] do everything else: they inspect gradients before the update, the model between steps, and every
+//! record. A spec chooses some of them; [`checkpoint`] saves the state of all.
 
 pub mod callback;
 pub mod callbacks;
@@ -16,7 +16,7 @@ use conefield_core::error::{Error, Result};
 use conefield_core::loss::Loss;
 use std::time::Instant;
 
-/// What a step learns from, drawn at random.
+/// The random batch of a step.
 pub struct Draw<'a> {
     /// The loss of rays and points.
     pub loss: &'a dyn Loss,
@@ -26,15 +26,15 @@ pub struct Draw<'a> {
     pub priors: Vec<BlockWork<'a>>,
 }
 
-/// What is learned, and by which rule.
+/// The data and the update rule of training.
 pub trait Task {
-    /// What step `step` (from 0) of a run with `seed` learns from.
+    /// The batch of step `step` (from 0) of a run with `seed`.
     fn draw(&mut self, seed: u64, step: u64) -> Draw<'_>;
-    /// Adam's settings for an update at `epoch` passes over the views and `share` of the run.
+    /// Adam's settings for an update after `epoch` passes over the views, at `share` of the run.
     fn adam(&self, epoch: f64, share: f64) -> Adam;
 }
 
-/// Trains to the end of the run. The model of `run` is then what came out.
+/// Trains to the end of the run. The model of `run` is then the result.
 pub fn train(run: &mut Run<'_>, task: &mut dyn Task, callbacks: &mut Callbacks) -> Result<()> {
     callbacks.each(|c| c.begin(run))?;
     run.clock.resume();
@@ -68,7 +68,7 @@ pub fn train(run: &mut Run<'_>, task: &mut dyn Task, callbacks: &mut Callbacks) 
     callbacks.each(|c| c.finish(run))
 }
 
-/// One step: draw, gradients and, unless a callback refuses it, update.
+/// One step: batch, gradients and, unless a callback refuses it, update.
 fn step(run: &mut Run<'_>, task: &mut dyn Task, callbacks: &mut Callbacks) -> Result<()> {
     let adam = task.adam(run.epoch(), run.clock.share(run.step));
     let Draw { loss, rays, priors } = task.draw(run.job.seed, run.step);
@@ -97,7 +97,7 @@ fn step(run: &mut Run<'_>, task: &mut dyn Task, callbacks: &mut Callbacks) -> Re
     Ok(())
 }
 
-/// Records the steps since the last record, if a record is due.
+/// Records the steps since the last record, if one is due.
 fn record(run: &mut Run<'_>, task: &dyn Task, callbacks: &mut Callbacks, over: bool) -> Result<()> {
     let due = run.step > 0 && (run.step.is_multiple_of(run.report_every) || over);
     if !due || run.tally.window.steps == 0 {

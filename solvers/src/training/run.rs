@@ -1,4 +1,4 @@
-//! A run: all that the training loop and its callbacks work on.
+//! A run: the state shared by the training loop and its callbacks.
 
 use crate::schedule::{Clock, Ends};
 use conefield_core::arena::Arena;
@@ -12,26 +12,26 @@ use rayon::prelude::*;
 use serde::{Deserialize, Serialize};
 use std::sync::Arc;
 
-/// What may help where training diverges.
+/// Advice when training diverges.
 pub const HINT: &str = "try a smaller optimizer.lr";
 
 /// A run of the training loop.
 pub struct Run<'a> {
     /// The job.
     pub job: &'a Job<'a>,
-    /// Between the world and what stages see.
+    /// Maps between the world and the stages.
     pub scene: &'a Scene,
-    /// Hears of the run.
+    /// Receives reports.
     pub observer: &'a mut dyn Observer,
-    /// Stages and parameters. The parameters may be elsewhere: [`Executable::fetch`] brings them.
+    /// Stages and parameters. The parameters may be on a device: [`Executable::fetch`] copies them.
     pub model: Model,
-    /// Does the work.
+    /// Computes gradients and updates.
     pub exe: Box<dyn Executable>,
-    /// Counts training time.
+    /// Measures training time.
     pub clock: Clock,
-    /// What a difference between predicted and measured costs.
+    /// Loss between predicted and measured values.
     pub loss: Arc<dyn Loss>,
-    /// Steps that make a pass over the views.
+    /// Steps per pass over the views.
     pub steps_an_epoch: u64,
     /// Steps between two records.
     pub report_every: u64,
@@ -39,25 +39,25 @@ pub struct Run<'a> {
     pub step: u64,
     /// Training samples so far.
     pub samples: u64,
-    /// What else the run has counted.
+    /// Further counters.
     pub tally: Tally,
-    /// Whether the run ends with the record at hand.
+    /// Whether the run ends with the current record.
     pub settled: bool,
-    /// The record whose state came out, where a callback chose one.
+    /// The record of the final state, if a callback chose one.
     pub best: Option<Best>,
 }
 
-/// What a run counts beside its steps. A checkpoint keeps it.
+/// Counters of a run besides its steps, saved in checkpoints.
 #[derive(Debug, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct Tally {
     /// Sums since the last record.
     pub window: Window,
-    /// Updates that parameters and moments have seen.
+    /// Updates of parameters and moments.
     pub updates: u64,
-    /// What the learning rate is multiplied with.
+    /// Factor of the learning rate.
     pub rate: f64,
-    /// Times that the run went back to an earlier state.
+    /// Number of rollbacks to an earlier state.
     pub rollbacks: u64,
 }
 
@@ -68,7 +68,7 @@ impl Default for Tally {
 }
 
 impl<'a> Run<'a> {
-    /// A run of `job` before its first step, with every limit and setting to be set.
+    /// A run of `job` before its first step, with default limits and settings.
     pub fn new(
         job: &'a Job<'a>,
         scene: &'a Scene,
@@ -94,18 +94,18 @@ impl<'a> Run<'a> {
         }
     }
 
-    /// Finished passes over the views.
+    /// Completed passes over the views.
     pub fn epoch(&self) -> f64 {
         self.step as f64 / self.steps_an_epoch as f64
     }
 
-    /// Says what happened, now and in the next record.
+    /// Reports an event, now and in the next record.
     pub fn tell(&mut self, said: String) {
         self.observer.note(&said);
         self.tally.window.events.push(said);
     }
 
-    /// Removes all channels of the encoder but `keep` for good.
+    /// Permanently removes all channels of the encoder except `keep`.
     pub fn mask(&mut self, keep: Vec<usize>) -> Result<()> {
         self.exe.fetch(&mut self.model)?;
         self.model.mask(keep)?;
@@ -113,7 +113,7 @@ impl<'a> Run<'a> {
         Ok(())
     }
 
-    /// Opens the first `channels` of the encoder's, and closes the others.
+    /// Enables the first `channels` channels of the encoder and disables the others.
     pub fn open(&mut self, channels: usize) -> Result<()> {
         self.exe.fetch(&mut self.model)?;
         self.model.pipeline.open(channels)?;
@@ -121,7 +121,7 @@ impl<'a> Run<'a> {
         Ok(())
     }
 
-    /// Fetches the parameters and refuses a state that is not finite.
+    /// Fetches the parameters and refuses values that are not finite.
     pub fn check_finite(&mut self) -> Result<()> {
         self.exe.fetch(&mut self.model)?;
         match strayed(&self.model.arena) {
@@ -135,15 +135,15 @@ impl<'a> Run<'a> {
 #[derive(Debug, Default, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct Window {
-    /// Steps that were updated with.
+    /// Steps with an update.
     pub steps: u64,
     loss: f64,
     prior: f64,
     samples: u64,
     seconds: f64,
-    /// Drift that was found.
+    /// Measured drift.
     pub drift: Vec<DriftRecord>,
-    /// What else happened.
+    /// Other events.
     pub events: Vec<String>,
 }
 
@@ -174,7 +174,7 @@ impl Window {
     }
 }
 
-/// How parameters or moments show that they are no longer finite.
+/// A message if parameters or moments are no longer finite.
 pub fn strayed(arena: &Arena) -> Option<String> {
     let parts = [("parameter", &arena.params), ("first moment", &arena.first), ("second moment", &arena.second)];
     parts.into_iter().find_map(|(name, part)| {

@@ -1,9 +1,9 @@
-//! Samples of a cubic spline: a smooth volume on a coarse grid.
+//! A cubic spline basis: a smooth volume on a coarse grid.
 //!
-//! Coefficients are the values of the volume at the centres of cells that fill the same box; between them it is the cubic
-//! spline through them (Unser, IEEE Signal Process. Mag. 16(6), 1999). Along an axis the samples `c` first become the
-//! spline's own coefficients `P⁻¹c`, where P has 4/6 on its diagonal and 1/6 beside it; a voxel's value is then a sum over the
-//! four nearest. The spline is mirrored at the sides of the box.
+//! Coefficients are samples of the volume at the centres of cells that fill the same box; between them the volume is
+//! the cubic spline through them (Unser, IEEE Signal Process. Mag. 16(6), 1999). Along an axis, the samples `c` are
+//! first converted to spline coefficients `P⁻¹c`, where P has 4/6 on its diagonal and 1/6 next to it; a voxel's value
+//! is then a sum over the four nearest. The spline is mirrored at the sides of the box.
 
 use conefield_core::basis::{Basis, BasisOperator, BasisSpec, Expansion};
 use conefield_core::error::{Result, ensure};
@@ -18,10 +18,10 @@ use serde::{Deserialize, Serialize};
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields, default)]
 pub struct Cubic {
-    /// The distance of the samples in voxels, 0.5 to 64. It is adjusted so that a whole number of samples fills the volume.
+    /// Spacing of the samples in voxels, 0.5 to 64. It is adjusted so that a whole number of samples fills the volume.
     pub spacing: f64,
-    /// At most so many samples along the longest side, 2 or more: larger volumes have them further apart. What few views can
-    /// tell depends more on this number than on how fine the voxels are.
+    /// Most samples along the longest side, 2 or more: larger volumes get a larger spacing. The resolution that few
+    /// views support depends more on this number than on the voxel size.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub samples: Option<u32>,
 }
@@ -60,14 +60,14 @@ impl Basis for Cubic {
     }
 }
 
-/// A sparse matrix along one axis, a row each output: which inputs it sums over, with which weights.
+/// A sparse matrix along one axis: for each output, its inputs and their weights.
 struct Taps {
     inputs: usize,
     rows: Vec<Vec<(usize, f64)>>,
 }
 
 impl Taps {
-    /// The spline's coefficients to its values at the centres of `voxels` voxels.
+    /// Maps spline coefficients to values at the centres of `voxels` voxels.
     fn evaluate(samples: usize, voxels: usize) -> Self {
         let row = |i| {
             let at = (i as f64 + 0.5) * samples as f64 / voxels as f64 - 0.5;
@@ -100,7 +100,7 @@ impl Taps {
         Self { inputs: self.rows.len(), rows }
     }
 
-    /// Applies the matrix along one axis of `x`, of which each entry is a run of `inner` numbers. Overwrites `y`.
+    /// Applies the matrix along one axis of `x`, whose entries are runs of `inner` numbers. Overwrites `y`.
     fn apply<R: Real>(&self, x: &[R], inner: usize, y: &mut [R]) {
         let (inputs, outputs) = (self.inputs, self.rows.len());
         if inner == 1 {
@@ -122,16 +122,16 @@ impl Taps {
     }
 }
 
-/// Index `i` of `n` entries that go on mirrored at both sides.
+/// Index `i` of `n` entries with mirrored boundaries.
 fn mirrored(i: isize, n: usize) -> usize {
     let turn = i.rem_euclid(2 * n as isize) as usize;
     turn.min(2 * n - 1 - turn)
 }
 
-/// P⁻¹ along one axis, which is its own adjoint: Thomas' algorithm. Mirrored sides add 1/6 to the first and the last diagonal
-/// entry of P.
+/// P⁻¹ along one axis, which is its own adjoint, by Thomas' algorithm. Mirrored boundaries add 1/6 to the first and the
+/// last diagonal entry of P.
 struct Prefilter {
-    /// One over the pivot of every entry.
+    /// Reciprocal pivots.
     pivots: Vec<f64>,
 }
 
@@ -147,7 +147,7 @@ impl Prefilter {
         Self { pivots: pivots.collect() }
     }
 
-    /// Applies it in place along one axis of `x`, of which each entry is a run of `inner` numbers.
+    /// Applies it in place along one axis of `x`, whose entries are runs of `inner` numbers.
     fn apply<R: Real>(&self, x: &mut [R], inner: usize) {
         let n = self.pivots.len();
         if inner == 1 {
@@ -156,7 +156,7 @@ impl Prefilter {
         if x.len() > n * inner {
             return x.par_chunks_mut(n * inner).for_each(|x| self.solve_rows(x.chunks_mut(inner).collect()));
         }
-        // Along the first axis, some columns at a time.
+        // Along the first axis, in blocks of columns.
         let mut parts: Vec<Vec<&mut [R]>> = (0..inner.div_ceil(COLUMNS)).map(|_| Vec::with_capacity(n)).collect();
         for row in x.chunks_mut(inner) {
             row.chunks_mut(COLUMNS).zip(&mut parts).for_each(|(part, parts)| parts.push(part));
@@ -164,7 +164,7 @@ impl Prefilter {
         parts.into_par_iter().for_each(|part| self.solve_rows(part));
     }
 
-    /// `P·y = x` in place.
+    /// Solves `P·y = x` in place.
     fn solve<R: Real>(&self, x: &mut [R]) {
         let (sixth, mut last) = (R::of(1.0 / 6.0), R::ZERO);
         for (x, &pivot) in x.iter_mut().zip(&self.pivots) {
@@ -177,7 +177,7 @@ impl Prefilter {
         }
     }
 
-    /// The same for many right-hand sides: row i has the i-th number of each.
+    /// Solves for many right-hand sides: row i has the i-th number of each.
     fn solve_rows<R: Real>(&self, mut rows: Vec<&mut [R]>) {
         let sixth = R::of(1.0 / 6.0);
         for (i, &pivot) in self.pivots.iter().enumerate() {
@@ -196,10 +196,10 @@ impl Prefilter {
     }
 }
 
-/// Columns that are solved together.
+/// Columns solved together.
 const COLUMNS: usize = 1024;
 
-/// What is done along one axis: samples to the spline's coefficients, and these to its values and back.
+/// The operators along one axis: samples to spline coefficients, and coefficients to values.
 struct Axis {
     prefilter: Prefilter,
     evaluate: [Taps; 2],
@@ -229,7 +229,7 @@ impl Expansion for Spline {
     fn scratch(&self) -> u64 {
         let [sx, sy, sz] = self.samples.shape;
         let [vx, vy, vz] = self.voxels;
-        // The largest two arrays that follow each other.
+        // The largest two consecutive arrays.
         let steps = [[sx, sy, sz], [sx, sy, vz], [sx, vy, vz], [vx, vy, vz]];
         let bytes = steps.map(|shape| shape.iter().fold(4u64, |n, side| n.saturating_mul(*side as u64)));
         bytes.windows(2).map(|pair| pair[0].saturating_add(pair[1])).max().unwrap_or(0).max(2 * bytes[0])
@@ -282,7 +282,7 @@ impl<R: Real> BasisOperator<R> for Spline {
 }
 
 impl Spline {
-    /// Samples to the spline's coefficients, and the adjoint.
+    /// Samples to spline coefficients; also its adjoint.
     fn prefilter<R: Real>(&self, x: &mut [R]) {
         let [_, sy, sz] = self.samples.shape;
         for (axis, inner) in self.axes.iter().zip([sy * sz, sz, 1]) {
@@ -306,7 +306,7 @@ mod tests {
         voxels
     }
 
-    /// Where a sample stands at a voxel's centre, that voxel has its value.
+    /// A voxel whose centre is a sample point has the sample's value.
     #[test]
     fn the_spline_goes_through_its_samples() {
         let shape = [15, 9, 12];
@@ -321,7 +321,7 @@ mod tests {
         assert!(expand(of.as_ref(), shape, &Array3::ones((5, 3, 4))).iter().all(|v| (v - 1.0).abs() < 1e-8));
     }
 
-    /// Away from the sides a spline of order four repeats cubics.
+    /// Away from the boundaries a spline of order four reproduces cubics.
     #[test]
     fn cubics_are_exact() {
         let of = spline([1, 1, 96], 2.0);

@@ -1,4 +1,4 @@
-//! Bases that a method may name.
+//! The built-in bases.
 
 pub mod cubic;
 pub mod voxels;

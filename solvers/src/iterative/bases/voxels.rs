@@ -1,4 +1,4 @@
-//! The basis of voxels: coefficients are the voxels themselves.
+//! The voxel basis: coefficients are the voxels themselves.
 
 use conefield_core::basis::{Basis, BasisOperator, BasisSpec, Expansion};
 use conefield_core::error::Result;

@@ -1,4 +1,4 @@
-//! Data terms that a method may name.
+//! The built-in data terms.
 
 pub mod least_squares;
 pub mod noise_weighted;

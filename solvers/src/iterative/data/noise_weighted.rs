@@ -1,5 +1,5 @@
-//! Penalised weighted least squares: `½Σ w·r²`, the weights w inverse variances of the measured values up to a factor
-//! (Fessler, IEEE Trans. Image Process. 3(4), 1994), from the noise that [`Noise`] finds in the scan.
+//! Penalized weighted least squares: `½Σ w·r²`, where the weights w are inverse variances of the measured values up to
+//! a factor (Fessler, IEEE Trans. Image Process. 3(4), 1994), from the noise that [`Noise`] finds in the scan.
 
 use crate::iterative::noise::{self, Noise};
 use conefield_core::data_term::{DataTerm, DataTermSpec, Misfit};

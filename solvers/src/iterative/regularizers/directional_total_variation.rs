@@ -1,7 +1,8 @@
-//! Directional total variation: attenuation is flat but for edges that run smoothly.
+//! Directional total variation: attenuation is piecewise constant with smooth edges.
 //!
-//! Slopes across an edge count less than those along it (Ehrhardt and Betcke, SIAM J. Imaging Sci. 9(3), 2016). There the edges
-//! are those of another image of the object. Here they are the volume's own, looked for anew before each pass.
+//! Slopes across an edge cost less than slopes along it (Ehrhardt and Betcke, SIAM J. Imaging Sci. 9(3), 2016). There
+//! the edges come from another image of the object. Here they come from the volume itself and are updated before each
+//! pass.
 
 use super::total_variation::{On, lambda, validate};
 use crate::iterative::edges::Edges;
@@ -13,17 +14,18 @@ use conefield_core::space::Space;
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
-/// Settings of `directional-total-variation`: `Σ_j |(I − n·nᵀ)·∇x_j|`, `n = √γ·s/√(|s|² + η²)`, s the volume's slope at voxel j.
+/// Settings of `directional-total-variation`: `Σ_j |(I − n·nᵀ)·∇x_j|`, `n = √γ·s/√(|s|² + η²)`, s the volume's slope at
+/// voxel j.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields, default)]
 pub struct DirectionalTotalVariation {
-    /// How strong it is.
+    /// Strength of the prior.
     pub weight: Weight,
-    /// Dual steps for each update.
+    /// Dual steps per update.
     pub inner: usize,
-    /// γ: by how much less a slope counts that goes straight across a clear edge. 0 is `total-variation`.
+    /// γ: how much less a slope across a clear edge costs. 0 is `total-variation`.
     pub strength: f64,
-    /// What a clear edge is: η, as a multiple of the root mean square of all slopes.
+    /// Threshold of a clear edge: η, as a multiple of the root mean square of all slopes.
     pub edge: f64,
 }
 

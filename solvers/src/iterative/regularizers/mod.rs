@@ -1,4 +1,4 @@
-//! Regularizers that a method may name.
+//! The built-in regularizers.
 
 pub mod directional_total_variation;
 pub mod none;

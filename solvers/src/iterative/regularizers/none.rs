@@ -1,4 +1,4 @@
-//! No prior but that attenuation is not negative.
+//! No regularizer except that attenuation is not negative.
 
 use conefield_core::error::Result;
 use conefield_core::geometry::VoxelGrid;

@@ -1,4 +1,4 @@
-//! Total variation: attenuation is flat but for a few edges.
+//! Total variation: attenuation is piecewise constant with few edges.
 
 use crate::iterative::tv::{TvProx, anisotropy};
 use conefield_core::error::{Result, ensure};
@@ -13,19 +13,19 @@ use serde::{Deserialize, Serialize};
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields, default)]
 pub struct TotalVariation {
-    /// How strong it is.
+    /// Strength of the prior.
     pub weight: Weight,
-    /// Dual steps for each update.
+    /// Dual steps per update.
     pub inner: usize,
 }
 
-/// Refuses a weight and a number of dual steps that make no prior.
+/// Refuses an invalid weight or number of dual steps.
 pub(super) fn validate(weight: Weight, inner: usize) -> Result<()> {
     ensure((1..=1000).contains(&inner), "spec", "inner", inner, "1 to 1000")?;
     weight.validate()
 }
 
-/// λ on `grid`. Attenuation a voxel is x̂ = x·h and lengths in voxels are Â = A/h, so that λ̂·TV(x̂) = λ̂·h·TV(x).
+/// λ on `grid`. Attenuation per voxel is x̂ = x·h and lengths in voxels are Â = A/h, so that λ̂·TV(x̂) = λ̂·h·TV(x).
 pub(super) fn lambda(weight: Weight, grid: &VoxelGrid, noise: &mut dyn FnMut(f64) -> f64) -> f64 {
     weight.lambda(grid.spacing.iter().product::<f64>().cbrt(), noise)
 }

@@ -1,12 +1,13 @@
-//! Coarse-to-fine training (Lin et al. 2021, BARF, section 3.3, for frequencies; Li et al. 2023, Neuralangelo, section 3.2, for the
-//! levels of a hash grid): training begins with the encoder's coarse levels, and finer ones open one by one.
+//! Coarse-to-fine training (Lin et al. 2021, BARF, section 3.3, for frequencies; Li et al. 2023, Neuralangelo, section
+//! 3.2, for the levels of a hash grid): training begins with the encoder's coarse levels, and finer ones are enabled
+//! one by one.
 //!
-//! The channels of a closed level are 0 and are not computed, so that a step with few levels is cheap. Its features stay what they
-//! began as, next to 0: where it opens, nothing jumps. It works with every encoder that has tables of features, from coarse to
-//! fine.
+//! The channels of a disabled level are 0 and are not computed, so that a step with few levels is cheap. Its features
+//! keep their initial values, close to 0, so that enabling it causes no jump. It works with every encoder that has
+//! tables of features ordered from coarse to fine.
 //!
-//! Of `L` levels, `levels` are open at first. The others open at equal distances, the last after `until` of the run:
-//! `levels + ⌊(L − levels)·min(share/until, 1)⌋` are open at `share` of the run.
+//! Of `L` levels, `levels` are enabled at first. The others follow at equal intervals, the last after `until` of the
+//! run: at `share` of the run, `levels + ⌊(L − levels)·min(share/until, 1)⌋` are enabled.
 
 use crate::training::run::Run;
 use crate::training::{Callback, CallbackSpec};
@@ -21,9 +22,9 @@ use serde::{Deserialize, Serialize};
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields, default)]
 pub struct CoarseToFine {
-    /// Levels that are open at first.
+    /// Levels enabled at first.
     pub levels: usize,
-    /// Share of the run after which all are open, above 0 and at most 1.
+    /// Share of the run after which all levels are enabled, above 0 and at most 1.
     pub until: f64,
 }
 
@@ -53,20 +54,20 @@ impl CallbackSpec for CoarseToFine {
     }
 }
 
-/// The callback that [`CoarseToFine`] builds. What is open follows from the share of the run that is over: there is no state.
+/// The callback that [`CoarseToFine`] builds. It is stateless: the completed share of the run determines the levels.
 struct Opener(CoarseToFine);
 
 impl CoarseToFine {
-    /// How many of `all` levels are open at `share` of the run.
+    /// Number of enabled levels, out of `all`, at `share` of the run.
     fn open(&self, all: usize, share: f64) -> usize {
         let closed = all.saturating_sub(self.levels);
-        // A hair more, so that a share of a whole number of levels opens the last of them.
+        // The small addend makes an exact multiple enable its level despite rounding.
         let more = (closed as f64 * (share / self.until).min(1.0) + 1e-9).floor() as usize;
         (self.levels + more).min(all)
     }
 }
 
-/// Where each level ends among the encoder's channels.
+/// End of each level in the encoder's channels.
 fn ends(encoder: &dyn Encoder) -> Vec<usize> {
     let cells = encoder.resolutions().unwrap_or_default();
     (1..=cells.len()).filter(|&c| c == cells.len() || cells[c] != cells[c - 1]).collect()
@@ -111,7 +112,7 @@ impl Callback for Opener {
         Ok(())
     }
 
-    /// What comes out is the whole encoder: a level that is still closed has its first features, next to 0.
+    /// Returns the whole encoder: a level that is still disabled has its initial features, close to 0.
     fn finish(&mut self, run: &mut Run<'_>) -> Result<()> {
         let all = run.model.pipeline.encoder.info().output;
         if run.model.pipeline.open_channels() < all { run.open(all) } else { Ok(()) }
@@ -133,7 +134,7 @@ mod tests {
         for (share, open) in [(0.0, 2), (0.09, 2), (0.1, 3), (0.2, 4), (0.39, 5), (0.4, 6), (1.0, 6)] {
             assert_eq!(settings.open(6, share), open, "{share}");
         }
-        // Of an encoder that a mask has left with fewer.
+        // An encoder that a mask has left with fewer levels.
         assert_eq!(settings.open(1, 0.0), 1);
     }
 }

@@ -1,9 +1,9 @@
-//! How much normalizers and field change under the same features: NI-NeRF's measure of stability.
+//! How much normalizers and field change for the same features: NI-NeRF's measure of stability.
 //!
-//! Every so often the encoder's features of a fixed batch of points are recorded with the attenuation that normalizers
-//! and field make of them. The next time these recorded features go through normalizers and field as they are by then,
-//! and the mean absolute difference to the recorded attenuation is the drift (L1, in the scale that stages see). A
-//! LayerNorm is within what is evaluated again: features are recorded as they leave the encoder, before it.
+//! At regular intervals, the encoder's features of a fixed batch of points are recorded with the attenuation that
+//! normalizers and field compute from them. At the next interval, the recorded features are evaluated with the current
+//! normalizers and field; the mean absolute difference from the recorded attenuation is the drift (L1, in the scale
+//! that stages see). This includes a LayerNorm: features are recorded at the encoder's output, before it.
 
 use crate::training::run::{HINT, Run};
 use crate::training::{Callback, CallbackSpec, Kept, State};
@@ -17,7 +17,7 @@ use rand::RngExt;
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
-/// Its name in specs and checkpoints, and its tensors there.
+/// Its name in specs and checkpoints, and the names of its tensors.
 const NAME: &str = "drift";
 const FEATURES: &str = "drift.features";
 const ATTENUATION: &str = "drift.attenuation";
@@ -57,15 +57,15 @@ impl CallbackSpec for Drift {
 /// The callback that [`Drift`] builds.
 struct Watch {
     settings: Drift,
-    /// Steps between two looks.
+    /// Steps between evaluations.
     every: u64,
     points: Vec<[f32; 3]>,
-    /// The step before which it was last looked.
+    /// The step before which it was last evaluated.
     looked: Option<u64>,
     recorded: Option<Recorded>,
 }
 
-/// Features with what was made of them.
+/// Features with the attenuation computed from them.
 struct Recorded {
     /// Channels and points.
     shape: [usize; 2],
@@ -73,7 +73,7 @@ struct Recorded {
     attenuation: Vec<f32>,
 }
 
-/// What is known beside the recording.
+/// The state besides the recording.
 #[derive(Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 struct Looked {
@@ -86,7 +86,7 @@ impl Callback for Watch {
         NAME
     }
 
-    /// Draws points where the object can be.
+    /// Draws points inside the object's support.
     fn begin(&mut self, run: &mut Run<'_>) -> Result<()> {
         self.every = (self.settings.every * run.steps_an_epoch as f64).round().max(1.0) as u64;
         self.points = points(run.scene, run.job.seed, self.settings.points);
@@ -129,8 +129,8 @@ impl Callback for Watch {
 }
 
 impl Watch {
-    /// Evaluates what was recorded again and records anew. Channels that were masked since then are gone from the
-    /// stages, which can make nothing of the features any more: there is no drift then, and the record says so.
+    /// Evaluates the recorded features and records new ones. If channels were masked in the meantime, the stages no
+    /// longer accept the features: there is no drift, and the record says so.
     fn look(&mut self, run: &mut Run<'_>) -> Result<()> {
         run.exe.fetch(&mut run.model)?;
         let (step, n, from) = (run.step, self.points.len(), self.looked.unwrap_or(0));
@@ -156,14 +156,14 @@ impl Watch {
     }
 }
 
-/// Random points of the volume where the object can be.
+/// Random points of the volume inside the object's support.
 fn points(scene: &Scene, seed: u64, count: usize) -> Vec<[f32; 3]> {
     let mut rng = stream(seed ^ 0x6472_6966_7421, 0);
     let [low, high] = scene.bounds;
     let mut draw = || std::array::from_fn(|k| low[k] + (high[k] - low[k]) * rng.random::<f64>());
     (0..count)
         .map(|_| {
-            // A support that is a tiny part of its box must not hold us up.
+            // A support that is a tiny part of its bounding box must not cause a long loop.
             let first = draw();
             let held = std::iter::once(first).chain((0..1000).map(|_| draw())).find(|p| scene.holds(*p));
             scene.to_unit(held.unwrap_or(first))

@@ -1,17 +1,17 @@
-//! Spectral channel mask (Xu et al. 2025, NI-NeRF, section 2.3; details from its published code): channels whose image
-//! is noise are removed for good.
+//! Spectral channel mask (Xu et al. 2025, NI-NeRF, section 2.3; details from its published code): permanently removes
+//! channels whose image is noise.
 //!
-//! Once, after `epoch` passes over the views, every channel is looked at on slices of the volume: its image is scaled
-//! to [0, 1] by its extremes, Fourier-transformed, and what lies within a quarter of the width of the zero frequency
-//! is left out: `(i − w/2)² + (j − h/2)² < (w/4)²` with whole halves and quarters, the zero frequency at
+//! Once, after `epoch` passes over the views, every channel is evaluated on slices of the volume. Its image is scaled
+//! to [0, 1] by its extremes and Fourier-transformed; frequencies within a quarter of the width around zero are
+//! excluded: `(i − w/2)² + (j − h/2)² < (w/4)²` with integer halves and quarters and the zero frequency at
 //! `(w/2, h/2)`. Magnitudes are clipped to [0, 1]; the mean of their squares over all pixels is the channel's energy.
 //!
-//! White noise scores at most the share of pixels that is not left out: `1 − π/16 ≈ 0.804` on a square, less where x
-//! is longer than y (0.61 at 2:1), and a little less again on small slices, where fewer magnitudes reach 1. The
-//! published threshold of 0.8 is therefore met by nearly white channels only, and on some slices by none.
-//! `rule = "relative"` divides by what white noise, uniform between its extremes, scores on slices of this very size.
+//! White noise scores at most the share of included pixels: `1 − π/16 ≈ 0.804` on a square, less where x is longer than
+//! y (0.61 at 2:1), and slightly less again on small slices, where fewer magnitudes reach 1. Only nearly white channels
+//! therefore reach the published threshold of 0.8, and on some slices none do. `rule = "relative"` divides by the score
+//! of white noise, uniform between its extremes, on slices of the same size.
 //!
-//! Features are looked at as they leave the encoder: channels leave the encoder and all that follows.
+//! Features are evaluated at the encoder's output: channels are removed from the encoder and all later stages.
 
 use crate::training::run::Run;
 use crate::training::{Callback, CallbackSpec, Kept, State};
@@ -27,21 +27,21 @@ use std::sync::Arc;
 /// Its name in specs and checkpoints.
 const NAME: &str = "fft-mask";
 
-/// What goes when a channel is noise.
+/// Which channels are removed when a channel is noise.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
 #[serde(rename_all = "kebab-case")]
 pub enum Scope {
-    /// This channel and all after it, as published. Channels must stand from coarse to fine.
+    /// This channel and all after it, as published. Channels must be ordered from coarse to fine.
     Finer,
-    /// This channel.
+    /// This channel only.
     Channel,
 }
 
-/// What the energy is compared with.
+/// Reference of the energy.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
 #[serde(rename_all = "kebab-case")]
 pub enum Rule {
-    /// The threshold itself, as published; what the same noise scores depends on the size of the slice.
+    /// The threshold itself, as published; the score of the same noise depends on the size of the slice.
     Published,
     /// The threshold times the energy of white noise on slices of the same size.
     Relative,
@@ -51,17 +51,17 @@ pub enum Rule {
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(untagged)]
 pub enum Slices {
-    /// By name.
+    /// A named set of slices.
     Named(Named),
     /// At these fractions of the volume's height, 0 to 1.
     Fractions(Vec<f64>),
 }
 
-/// Slices that have a name.
+/// Named sets of slices.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
 #[serde(rename_all = "kebab-case")]
 pub enum Named {
-    /// The middle one, as published.
+    /// The middle slice, as published.
     CentralAxial,
 }
 
@@ -69,17 +69,17 @@ pub enum Named {
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields, default)]
 pub struct FftMask {
-    /// Finished passes over all views after which the mask is decided, once.
+    /// Completed passes over all views after which the mask is decided, once.
     pub epoch: f64,
-    /// A channel with more energy is noise; see `rule`.
+    /// Energy above which a channel is noise; see `rule`.
     pub threshold: f64,
-    /// What the energy is compared with.
+    /// Reference of the energy.
     pub rule: Rule,
-    /// What goes when a channel is noise.
+    /// Which channels are removed when a channel is noise.
     pub scope: Scope,
-    /// Slices to look at: `"central-axial"`, or fractions of the height. Energies are averaged over them.
+    /// Slices to evaluate: `"central-axial"`, or fractions of the height. Energies are averaged over them.
     pub slices: Slices,
-    /// Channels of the encoder to keep as an earlier run decided, ascending: applied at the first step, nothing is measured.
+    /// Channels of the encoder to keep, ascending, from an earlier run: applied at the first step without measurement.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub keep: Option<Vec<usize>>,
 }
@@ -122,7 +122,7 @@ impl CallbackSpec for FftMask {
 /// The callback that [`FftMask`] builds.
 struct Masker {
     settings: FftMask,
-    /// The mask was decided. It is decided once.
+    /// Whether the mask has been decided.
     done: bool,
 }
 
@@ -207,7 +207,7 @@ impl Callback for Masker {
     }
 }
 
-/// Where the channels `keep` of the whole encoder stand after `masks` have left some of them.
+/// Positions of the channels `keep` of the whole encoder after `masks` have been applied.
 fn still_there(keep: &[usize], masks: &[Vec<usize>]) -> Vec<usize> {
     masks.iter().fold(keep.to_vec(), |keep, mask| {
         keep.iter().filter_map(|c| mask.iter().position(|stayed| stayed == c)).collect()
@@ -218,8 +218,8 @@ fn still_there(keep: &[usize], masks: &[Vec<usize>]) -> Vec<usize> {
 type Features<'a> = dyn FnMut(usize) -> Result<Vec<f32>> + 'a;
 
 impl FftMask {
-    /// Mean energy of each of `width` channels over the slices, `None` where a feature is not finite; and whether the channel
-    /// is constant on all of them.
+    /// Mean energy of each of `width` channels over the slices, `None` if a feature is not finite; and whether the
+    /// channel is constant on all slices.
     fn energies(&self, width: usize, [w, h, d]: [usize; 3], of: &mut Features<'_>) -> Result<Vec<(Option<f64>, bool)>> {
         let heights: Vec<usize> = match &self.slices {
             Slices::Named(Named::CentralAxial) => vec![d / 2],
@@ -246,7 +246,7 @@ impl FftMask {
         Ok(found)
     }
 
-    /// Which of `width` channels stay in a volume of this shape, and what was found.
+    /// Which of `width` channels to keep in a volume of this shape, and a log line.
     fn decide(&self, width: usize, shape: [usize; 3], of: &mut Features<'_>) -> Result<(Vec<usize>, String)> {
         let all: Vec<usize> = (0..width).collect();
         let [w, h, d] = shape;
@@ -293,7 +293,7 @@ impl FftMask {
     }
 }
 
-/// Energies of images of one size.
+/// Computes energies of images of one size.
 struct Spectrum {
     w: usize,
     h: usize,
@@ -324,7 +324,7 @@ impl Spectrum {
         let mut sum = 0.0;
         for j in 0..h {
             for i in 0..w {
-                // Bin i holds frequency i or i − w: after the shift it stands at w/2 + frequency.
+                // Bin i holds frequency i or i − w: after the shift it is at w/2 + frequency.
                 let shifted = ((i + w / 2) % w) as i64 - half_w;
                 let across = ((j + h / 2) % h) as i64 - half_h;
                 if shifted * shifted + across * across >= radius * radius {
@@ -336,7 +336,7 @@ impl Spectrum {
     }
 }
 
-/// Energy of white noise, uniform in [0, 1], on a slice of this size; of a fixed seed.
+/// Energy of white noise, uniform in [0, 1], on a slice of this size, with a fixed seed.
 fn white_noise(w: usize, h: usize) -> f64 {
     let noise: Vec<f32> = (0..w * h).map(|p| unit(mix(0x5EED, p as u64))).collect();
     let (low, high) = noise.iter().fold((f32::INFINITY, f32::NEG_INFINITY), |(a, b), &v| (a.min(v), b.max(v)));
@@ -363,7 +363,7 @@ mod tests {
         if p[0] > 0.5 { f32::NAN } else { 0.0 }
     }
 
-    /// What is decided of these channels in a volume of this shape, and the slices that were asked for.
+    /// The decision for these channels in a volume of this shape, and the requested slices.
     fn decide(settings: &FftMask, shape: [usize; 3], channels: &[Channel]) -> (Vec<usize>, String, Vec<usize>) {
         let mut asked = vec![];
         let [w, h, _] = shape;

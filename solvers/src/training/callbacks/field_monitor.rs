@@ -1,4 +1,4 @@
-//! What a record says of the field: PSNR against the reference and the error of views that are kept aside.
+//! The field's metrics in a record: PSNR against the reference and the error of held-out views.
 
 use crate::training::Callback;
 use crate::training::run::Run;
@@ -10,26 +10,26 @@ use conefield_core::pipeline::Pipeline;
 use conefield_core::scene::Scene;
 use conefield_core::stage::UnitRay;
 
-/// Rays of held-out views that are rendered for a record, at most.
+/// Most held-out rays rendered for a record.
 const HELD_OUT_RAYS: usize = 8192;
 
-/// Looks at some voxels of the reference and some rays of the held-out views.
+/// Evaluates some voxels of the reference and some rays of the held-out views.
 pub struct FieldMonitor {
     points: Vec<[f32; 3]>,
     reference: Vec<f32>,
-    /// Voxels where the object cannot be, and the sum of their squares in the reference.
+    /// Number of voxels outside the object's support, and the sum of their squares in the reference.
     outside: (usize, f64),
-    /// From what stages see to the reference's unit.
+    /// Converts the scale of the stages to the reference's unit.
     scale: f32,
     peak: f64,
     rays: Vec<TrainRay>,
-    /// Rays that meet nothing that is modelled, and the sum of the squares of what they measured.
+    /// Number of rays that miss the scene, and the sum of squares of their measured values.
     missing: (usize, f64),
     top: f64,
 }
 
 impl FieldMonitor {
-    /// For a run of `job` in `scene`.
+    /// A monitor of `job` in `scene`.
     pub fn new(job: &Job<'_>, scene: &Scene, pipeline: &Pipeline) -> Self {
         let (mut points, mut reference, mut outside) = (vec![], vec![], (0, 0.0));
         let shape = scene.grid.shape;
@@ -48,7 +48,7 @@ impl FieldMonitor {
         if let Some(scan) = job.held_out {
             let [rows, columns] = scan.geometry.detector;
             let every = (scan.projections.len() / HELD_OUT_RAYS).max(1) | 1;
-            // Over all pixels, as iterative methods have it: errors of either kind compare.
+            // Over all pixels, as in iterative methods, so that both kinds of error are comparable.
             top = scan.projections.iter().map(|p| f64::from(scene.line_to_unit(*p))).fold(0.0, f64::max);
             for i in (0..scan.projections.len()).step_by(every) {
                 let at = [i / (rows * columns), i / columns % rows, i % columns];

@@ -1,4 +1,4 @@
-//! Hands out the middle slices of the field while it trains, whenever the observer wants them.
+//! Sends the middle slices of the field during training, whenever the observer requests them.
 
 use crate::training::Callback;
 use crate::training::run::Run;
@@ -7,7 +7,7 @@ use conefield_core::parts::Part;
 use conefield_core::trained::Sampler;
 use ndarray::Array3;
 
-/// Evaluates the field on the three middle slices of its grid. The run is none the wiser.
+/// Evaluates the field on the three middle slices of its grid. Does not affect the run.
 #[derive(Default)]
 pub struct LiveSlices;
 

@@ -1,4 +1,4 @@
-//! The callbacks: those that a spec names, and those that every run has.
+//! The callbacks: those that a spec may name, and those of every run.
 
 pub mod coarse_to_fine;
 pub mod drift;

@@ -1,4 +1,4 @@
-//! Ends training when views that are kept aside are no longer predicted better, and keeps the state that predicted them best.
+//! Ends training when the error of held-out views stops falling, and keeps the state with the lowest error.
 
 use crate::training::run::{Run, strayed};
 use crate::training::{Callback, CallbackSpec, Kept, State};
@@ -10,7 +10,7 @@ use conefield_core::pages::Pages;
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
-/// Its name in specs and checkpoints, and what its tensors begin with.
+/// Its name in specs and checkpoints, and the prefix of its tensors.
 const NAME: &str = "patience";
 const PREFIX: &str = "patience.";
 
@@ -18,8 +18,8 @@ const PREFIX: &str = "patience.";
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields, default)]
 pub struct Patience {
-    /// Ends the run when the held-out views' error has not fallen for this many records; the best of them is kept. A
-    /// learning rate that goes down does so until the end that is set: what it still brings may come late.
+    /// Ends the run when the held-out views' error has not fallen for this many records; the best one is kept. A
+    /// decaying learning rate keeps falling until the end of the run, so late improvements may be missed.
     pub records: u64,
 }
 
@@ -43,13 +43,13 @@ impl CallbackSpec for Patience {
     }
 }
 
-/// What is known beside the best state.
+/// The state besides the best parameters.
 #[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 struct Waited {
-    /// The best record so far; starts anew when channels leave the work.
+    /// The best record so far; reset when channels are removed.
     best: Option<Best>,
-    /// Records since.
+    /// Records since the best one.
     since: u64,
 }
 
@@ -57,7 +57,7 @@ struct Waited {
 struct Waiting {
     records: u64,
     waited: Waited,
-    /// Parameters that predicted best.
+    /// The best parameters.
     copy: Option<Pages>,
 }
 
@@ -77,7 +77,7 @@ impl Callback for Waiting {
         (self.waited, self.copy) = (Waited::default(), None);
     }
 
-    /// Ends the run when too many records have passed without a better one.
+    /// Ends the run after too many records without improvement.
     fn at_record(&mut self, record: &mut Record, run: &mut Run<'_>) -> Result<()> {
         let Some(held_out) = record.held_out else { return Ok(()) };
         let better = held_out.is_finite() && self.waited.best.is_none_or(|b| held_out < b.held_out);
@@ -90,7 +90,7 @@ impl Callback for Waiting {
         Ok(())
     }
 
-    /// Brings the best state back.
+    /// Restores the best state.
     fn finish(&mut self, run: &mut Run<'_>) -> Result<()> {
         if let (Some(copy), Some(best)) = (&self.copy, self.waited.best) {
             run.model.arena.params.copy_from_slice(copy);
@@ -119,7 +119,7 @@ impl Callback for Waiting {
         true
     }
 
-    /// Parameters.
+    /// One copy of the parameters.
     fn bytes(&self, parameters: u64) -> u64 {
         size_of::<f32>() as u64 * parameters
     }
@@ -131,7 +131,7 @@ impl Callback for Waiting {
 }
 
 impl Waiting {
-    /// Copies the parameters, unless the state is not finite, which is yet to be found out.
+    /// Copies the parameters, unless the state is not finite, which later checks report.
     fn keep(&mut self, run: &mut Run<'_>) -> Result<bool> {
         run.exe.fetch(&mut run.model)?;
         if strayed(&run.model.arena).is_some() {

@@ -1,12 +1,13 @@
-//! Watches over training. A run that leaves the finite numbers, or whose loss runs away, goes back to its last good state
-//! and on from there with half the learning rate.
+//! Guards training. If values become non-finite or the loss diverges, the run returns to its last good state and
+//! continues with half the learning rate.
 //!
-//! Losses are judged in windows of 25 steps, so that a run is found out within 50. It has run away where a window's mean
-//! is that of differences ten times as large as in the best window so far. Before the first window that is what an empty
-//! volume has, or the first loss; and differences below a hundredth of what was measured count as that, since a loss next
-//! to nothing may well jump. It has died where a field that was not empty gives the loss of an empty volume for 25 steps on
-//! end: too long a step has taken it to where no gradient comes back from. Steps go on counting: the run still ends, and
-//! meets other rays than those that led astray. Adam's count of updates goes back with its moments, whose bias it corrects.
+//! Losses are judged in windows of 25 steps, so that divergence is found within 50 steps. A run has diverged if a
+//! window's mean corresponds to differences ten times as large as in the best window so far. Before the first window,
+//! the reference is the loss of an empty volume or the first loss. Differences below a hundredth of the measured values
+//! count as that, because a loss close to 0 may well jump. A run has died if a field that was not empty has the loss of
+//! an empty volume for 25 consecutive steps: too long a step has moved it to a place without gradients. Steps continue
+//! to count: the run still ends, and uses other rays than those that caused the problem. Adam's update count is
+//! restored with its moments, whose bias it corrects.
 
 use crate::training::run::{HINT, Run, strayed};
 use crate::training::{Callback, CallbackSpec, Kept, State, Update};
@@ -24,15 +25,15 @@ use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 use std::sync::Arc;
 
-/// Steps whose losses are judged together.
+/// Steps per window.
 const WINDOW: u64 = 25;
-/// Steps between two copies of the state, at least.
+/// Minimum number of steps between two copies of the state.
 const EVERY: u64 = 100;
-/// Share of what was measured below which differences count as that share.
+/// Differences below this share of the measured values count as this share.
 const SMALL: f64 = 0.01;
-/// Share by which a field's loss differs from that of an empty volume, if it is none.
+/// Relative difference between a field's loss and that of an empty volume from which the field is not empty.
 const ALIVE: f64 = 1e-3;
-/// Its name in specs and checkpoints, and what its tensors begin with.
+/// Its name in specs and checkpoints, and the prefix of its tensors.
 const NAME: &str = "rollback";
 const PREFIX: &str = "rollback.";
 
@@ -40,7 +41,7 @@ const PREFIX: &str = "rollback.";
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields, default)]
 pub struct Rollback {
-    /// Times that a run may go back to its last good state, with half the learning rate.
+    /// How often a run may return to its last good state, each time with half the learning rate.
     pub times: u64,
 }
 
@@ -64,21 +65,21 @@ impl CallbackSpec for Rollback {
     }
 }
 
-/// What is known beside the copy.
+/// The state besides the copy.
 #[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 struct Watched {
-    /// The lowest mean of a window so far; starts anew when channels leave the work.
+    /// The lowest mean of a window so far; reset when channels are removed.
     level: Option<f64>,
-    /// Losses of the window that is not over, and of an empty volume there.
+    /// Losses of the current window: of the field, and of an empty volume.
     sum: f64,
     empty: f64,
     steps: u64,
-    /// Both sums of the window before.
+    /// Both sums of the previous window.
     last: [f64; 2],
-    /// Whether the field has ever been other than empty.
+    /// Whether the field has ever been different from empty.
     alive: bool,
-    /// Steps on end in which it was not.
+    /// Consecutive steps in which the field was empty.
     dead: u64,
     /// Step and updates of the copy.
     kept: Option<[u64; 2]>,
@@ -87,12 +88,12 @@ struct Watched {
 /// The callback that [`Rollback`] builds.
 struct Guard {
     times: u64,
-    /// That of the run.
+    /// The run's loss.
     loss: Option<Arc<dyn Loss>>,
-    /// A line integral as it was measured where there is an object, in the scale that stages see.
+    /// A typical measured line integral through the object, in the scale that stages see.
     measured: f64,
     watched: Watched,
-    /// Parameters and moments under which a loss was fine.
+    /// Parameters and both moments of the last good state.
     copy: Option<[Pages; 3]>,
 }
 
@@ -111,7 +112,7 @@ impl Callback for Guard {
         (self.watched.sum, self.watched.empty, self.watched.steps) = (0.0, 0.0, 0);
     }
 
-    /// Judges the gradients of a step by their loss. Where the run goes back, the gradients are gone.
+    /// Judges a step by its loss. If the run is rolled back, the gradients are discarded.
     fn after_gradients(&mut self, work: &Work<'_>, stats: &StepStats, run: &mut Run<'_>) -> Result<Update> {
         if !(stats.loss.is_finite() && stats.prior.is_finite()) {
             let what = format!("the loss is {}, the prior {}", stats.loss, stats.prior);
@@ -147,7 +148,7 @@ impl Callback for Guard {
         if calm && due { self.keep(run) } else { Ok(Update::Take) }
     }
 
-    /// Judges what no further step would look at; and says so where all of the run was for nothing.
+    /// Judges the last steps, which no further step judges; reports if the whole run was in vain.
     fn at_end(&mut self, run: &mut Run<'_>) -> Result<()> {
         let away = self.ran_away();
         run.exe.fetch(&mut run.model)?;
@@ -176,14 +177,15 @@ impl Callback for Guard {
         Ok(())
     }
 
-    /// Parameters and both moments.
+    /// The parameters and both moments.
     fn bytes(&self, parameters: u64) -> u64 {
         3 * size_of::<f32>() as u64 * parameters
     }
 }
 
 impl Guard {
-    /// That the last steps are no better than an empty volume, if so. The first ones seldom are, whatever comes of them.
+    /// The message that the last steps are no better than an empty volume, if so. Early steps seldom are, whatever
+    /// follows.
     fn in_vain(&self, step: u64) -> Option<String> {
         if step < 4 * WINDOW {
             return None;
@@ -194,7 +196,7 @@ impl Guard {
         (empty > 0.0 && found > 0.99 * empty).then(|| text.to_owned())
     }
 
-    /// How the window's losses show that the run has run away. Steps that the window still lacks count 0.
+    /// How the window's losses show divergence. Missing steps of the window count 0.
     fn ran_away(&self) -> Option<String> {
         let Watched { level, sum, steps, .. } = self.watched;
         let level = level?;
@@ -214,7 +216,7 @@ impl Guard {
         of(1.0) / of(1.0 / factor) * level.max(of(SMALL * self.measured))
     }
 
-    /// Copies the state, which the step's loss has found good; one that is not finite is no good after all.
+    /// Copies the state after a good loss; rejects it if it is not finite after all.
     fn keep(&mut self, run: &mut Run<'_>) -> Result<Update> {
         run.exe.fetch(&mut run.model)?;
         if let Some(what) = strayed(&run.model.arena) {
@@ -229,7 +231,7 @@ impl Guard {
         Ok(Update::Take)
     }
 
-    /// Brings the last good state back and says so, or gives up.
+    /// Restores the last good state and reports it, or gives up.
     fn back(&mut self, what: &str, run: &mut Run<'_>) -> Result<Update> {
         let step = run.step;
         let (Some(copy), Some([at, updates])) = (&self.copy, self.watched.kept) else {
@@ -253,8 +255,8 @@ impl Guard {
     }
 }
 
-/// The mean of what `scan` measured, weighted with itself: air does not count, however much of it there is. In the scale that
-/// stages see.
+/// The mean of the measurements of `scan`, weighted by themselves, so that air does not count. In the scale that stages
+/// see.
 fn measured(scan: &Scan, scene: &Scene) -> f64 {
     let view = |v: ArrayView2<'_, f32>| {
         v.iter().fold([0.0; 2], |[s, t], p| [s + f64::from(*p).powi(2), t + f64::from(p.abs())])
