@@ -26,6 +26,7 @@ run() {
     for volume in $volumes; do
         [[ -f $out/$name-$volume.json ]] && continue
         published_scan "$data" "$volume" "$out/$volume"
+        "$bin" backends --json >>"$out/backends.jsonl"
         "$bin" -q reconstruct "$out/$volume" -o "$out/run" --force --reference truth --spec "$spec" "${sets[@]}" >/dev/null
         cp "$out/run/record.json" "$out/$name-$volume.json"
     done
@@ -39,7 +40,7 @@ run smooth-200 smooth-tv methods.1.stop.passes=5 methods.2.stop.passes=3
 run smooth-tv smooth-tv
 run cubic-200-long fista-tv "$(cubic 200)" "$prior" 'stop={ passes = 40, change = 2e-4 }'
 python3 - "$out" "$front" "$volumes" "${names[@]}" <<'PY'
-import json, math, sys
+import json, math, statistics, sys
 out, front, volumes, *names = sys.argv[1:]
 volumes = volumes.split()
 records = {name: [json.load(open(f"{out}/{name}-{volume}.json")) for volume in volumes] for name in names}
@@ -53,7 +54,8 @@ kept = [b for b in names if not any(beats(a, b) for a in names if a != b)]
 first = records[names[0]]
 lines = ['# Picked from by "conefield reconstruct --budget": the best of what fits, on those of these scans whose volumes are nearest in size.',
          '# bash benches/front.sh makes it (docs/records/methods.md).',
-         f'made = "conefield {first[0]["version"]}, {first[0]["threads"]} threads, {first[0]["simd"]}"']
+         f'made = "conefield {first[0]["version"]}, {first[0]["threads"]} threads, {first[0]["simd"]}"',
+         f"pass_s = {statistics.median(json.loads(line)['backends'][0]['pass_s'] for line in open(f'{out}/backends.jsonl')):.4f}"]
 for volume, record in zip(volumes, first):
     scan = record["scan"]
     lines += ["", "[[scans]]", f'name = "{volume}"', f'views = {scan["views"]}', f'detector = {scan["detector"]}', f'volume = {scan["volume"]}']
@@ -64,7 +66,7 @@ for name in sorted(kept, key=lambda name: sum(r["total_s"] for r in records[name
     lines += [f"sets = {json.dumps(sets)}"] if sets else []
     lines += [f"budget_s = {budget}.0"]
     for r in records[name]:
-        lines += ["", "[[points.runs]]", f'steps = {r["steps"]}', f'train_s = {r["train_s"]:.2f}', f'total_s = {r["total_s"]:.2f}',
+        lines += ["", "[[points.runs]]", f'steps = {r["steps"]}', f'train_s = {r["train_s"]:.2f}', f'total_s = {r["total_s"]:.2f}', f'beside_s = {r["prepare_s"] + r["export_s"]:.2f}',
                   f'peak_bytes = {r["peak_bytes"]}', f'psnr = {r["scores"]["psnr"]:.2f}', f'ssim_2d = {r["scores"]["ssim_2d"]:.4f}']
 open(front, "w").write("\n".join(lines) + "\n")
 print("| | " + " | ".join(volumes) + " |\n|---" + "|---" * len(volumes) + "|")

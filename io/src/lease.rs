@@ -104,6 +104,7 @@ impl Lease {
         Ok(lease)
     }
 
+    /// The folder.
     pub fn path(&self) -> &Path {
         &self.path
     }

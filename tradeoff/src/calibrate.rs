@@ -218,7 +218,8 @@ fn packing(some: &mut dyn Voxels, whole: VoxelGrid) -> Result<f64> {
     Ok(larger * (begin.elapsed().as_secs_f64() + bytes as f64 / DISK))
 }
 
-fn picture(bench: &Bench<'_>) -> Result<f64> {
+/// Time to draw the slices.
+pub(crate) fn picture(bench: &Bench<'_>) -> Result<f64> {
     let result = MiddleSlices::new(bench.scan.geometry.volume);
     let reference = bench.reference.map(MiddleSlices::of);
     let folder = tempfile::tempdir().map_err(|e| Error::io(std::env::temp_dir(), e))?;
@@ -227,7 +228,8 @@ fn picture(bench: &Bench<'_>) -> Result<f64> {
     Ok(begin.elapsed().as_secs_f64())
 }
 
-fn score(bench: &Bench<'_>) -> Result<f64> {
+/// Time to compare with the reference.
+pub(crate) fn score(bench: &Bench<'_>) -> Result<f64> {
     let Some(reference) = bench.reference else { return Ok(0.0) };
     // The middle part: half of every side, within limits.
     let [x, y, z] = reference.grid.shape.map(|n| {
@@ -242,19 +244,19 @@ fn score(bench: &Bench<'_>) -> Result<f64> {
 }
 
 /// The time at which each step was first completed.
-struct Laps<'a> {
+pub(crate) struct Laps<'a> {
     steps: u64,
     done: Vec<Instant>,
     cancelled: &'a dyn Fn() -> bool,
 }
 
 impl<'a> Laps<'a> {
-    fn new(cancelled: &'a dyn Fn() -> bool) -> Self {
+    pub(crate) fn new(cancelled: &'a dyn Fn() -> bool) -> Self {
         Self { steps: 0, done: vec![], cancelled }
     }
 
     /// The median of the later half: the first steps touch memory for the first time.
-    fn typical(&self) -> Option<f64> {
+    pub(crate) fn typical(&self) -> Option<f64> {
         let all: Vec<f64> = self.done.windows(2).map(|w| (w[1] - w[0]).as_secs_f64()).collect();
         let mut late = all[all.len() / 2..].to_vec();
         late.sort_by(f64::total_cmp);

@@ -45,6 +45,9 @@ impl Unknowns {
 pub struct Front {
     /// Program and number of threads with which it was made.
     pub made: String,
+    /// Time of a pass of the [standard reconstruction](crate::speed) there, in seconds: how fast the machine was.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub pass_s: Option<f64>,
     /// The scans on which it was measured.
     pub scans: Vec<Tuned>,
     /// Its points.
@@ -94,6 +97,9 @@ pub struct Reached {
     pub train_s: f64,
     /// Time of the whole run in seconds.
     pub total_s: f64,
+    /// Of that, the time for all but the steps, reading and scoring.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub beside_s: Option<f64>,
     /// Peak memory.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub peak_bytes: Option<u64>,
@@ -163,12 +169,16 @@ impl Front {
             let empty = scan.views == 0 || scan.detector.contains(&0) || scan.volume.contains(&0);
             ensure(!empty, place, &format!("scans: {}", scan.name), "a size of 0", "views, pixels and voxels")?;
         }
+        if let Some(pass_s) = front.pass_s {
+            let good = pass_s.is_finite() && pass_s > 0.0;
+            ensure(good, place, "pass_s", pass_s, "a positive number of seconds")?;
+        }
         for (i, point) in front.points.iter().enumerate() {
             let field = |what: &str| format!("points[{i}].{what}");
             let (found, want) = (point.runs.len(), front.scans.len());
             ensure(found == want, place, &field("runs"), format!("{found}"), format!("{want}, one a scan"))?;
             for run in &point.runs {
-                let times = [point.budget_s, run.train_s, run.total_s];
+                let times = [point.budget_s, run.train_s, run.total_s, run.beside_s.unwrap_or(0.0)];
                 let good = times.iter().all(|t| t.is_finite() && *t >= 0.0) && run.steps > 0;
                 ensure(good, place, &field("runs"), format!("{run:?}"), "steps, and seconds that are 0 or more")?;
                 let told = [run.psnr, run.held_out].iter().flatten().any(|x| x.is_finite());
@@ -192,6 +202,15 @@ impl Front {
         near
     }
 
+    /// Whether one of its scans is about as large: the front then says what methods cost, as far as the speeds of both machines do.
+    pub fn close(&self, size: Size) -> bool {
+        let within = |a: f64, b: f64| (a / b).ln().abs() < NEAR.ln();
+        self.scans.iter().any(|scan| {
+            let then = Size::new(scan.views, scan.detector, scan.volume);
+            within(then.pixels, size.pixels) && within(then.voxels, size.voxels)
+        })
+    }
+
     /// The expected cost of `point` for a scan of this size. A step of a field costs the same for every scan.
     pub fn expected(&self, point: &Point, size: Size) -> Expected {
         let mut sum = Expected { steps: 0.0, step_s: 0.0, beside_s: 0.0 };
@@ -204,7 +223,8 @@ impl Front {
             };
             sum.steps += run.steps as f64 / n;
             sum.step_s += run.train_s / run.steps as f64 * larger / n;
-            sum.beside_s += (run.total_s - run.train_s).max(0.0) * size.voxels / then.voxels / n;
+            let beside = run.beside_s.unwrap_or(run.total_s - run.train_s);
+            sum.beside_s += beside.max(0.0) * size.voxels / then.voxels / n;
         }
         sum
     }
@@ -269,6 +289,8 @@ mod tests {
         for (from, to, says) in [
             ("psnr = 30.0", "psnr = nan", "psnr or held_out"),
             ("steps = 4", "steps = 0", "points[0].runs"),
+            ("made = \"test\"", "made = \"test\"\npass_s = 0", "pass_s"),
+            ("psnr = 30.0", "psnr = 30.0\nbeside_s = -1.0", "points[0].runs"),
             ("kind", "kinds", "a:9: front"),
             ("views = 10", "views = 0", "scans: a"),
             (

@@ -20,5 +20,6 @@ pub mod pareto;
 pub mod report;
 pub mod schedule;
 pub mod search;
+pub mod speed;
 pub mod statistics;
 pub mod trial;

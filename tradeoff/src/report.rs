@@ -187,6 +187,7 @@ impl TradeoffReport {
                 steps: f.steps,
                 train_s: f.train_s,
                 total_s: f.total_s,
+                beside_s: None,
                 peak_bytes: f.peak_bytes,
                 psnr: f.psnr().filter(|p| p.is_finite()),
                 ssim_2d: f.score("ssim_2d"),
@@ -202,7 +203,7 @@ impl TradeoffReport {
             });
         }
         let made = format!("conefield {version}, {threads} threads, {simd}");
-        let front = Front { made, scans: tuned.collect(), points };
+        let front = Front { made, pass_s: None, scans: tuned.collect(), points };
         let text = toml::to_string(&front).map_err(|e| Error::unsupported("front.toml", e.to_string()))?;
         Ok(format!("# Made by \"conefield tradeoff\", picked from by \"conefield reconstruct --budget\".\n{text}"))
     }

@@ -1,7 +1,8 @@
 //! Plans a run for a budget: chooses the method, if it is open, and the end of training.
 
-use crate::calibrate::{Bench, Costs, calibrate};
+use crate::calibrate::{Bench, Costs, calibrate, picture, score};
 use crate::front::{Expected, Front, Size, Unknowns};
+use crate::speed::pass_s;
 use conefield_core::method::Plan;
 use conefield_core::{Error, Result};
 use conefield_report::text::{duration, number};
@@ -20,6 +21,8 @@ const MEASURED: usize = 3;
 /// Longest measurement of a method, in seconds and as a share of the budget: for short budgets, and for those in which
 /// three seconds matter little. Passes on a less coarse scan predict full passes better.
 const CALIBRATION: [(f64, f64); 2] = [(1.0, 0.1), (3.0, 0.04)];
+/// Least share of a chain's time that its methods after the first take: the first one may end a little late.
+const LATER: f64 = 0.7;
 /// Minimum number of steps of a useful field.
 const STEPS: f64 = 10.0;
 
@@ -99,10 +102,21 @@ impl Budget {
         let mut points: Vec<_> = front.points.iter().collect();
         points.sort_by(|a, b| b.accuracy().total_cmp(&a.accuracy()));
         let expected: Vec<(Unknowns, Expected)> = points.iter().map(|p| (p.kind, front.expected(p, size))).collect();
+        // A scan as large as one of the front costs what it cost there, on a machine of another speed. That is closer than what
+        // a coarser scan tells of the whole.
+        let slower = match front.pass_s {
+            Some(then) if front.close(size) => Some(pass_s(bench.backend)? / then),
+            _ => None,
+        };
         let built = RefCell::new(vec![]);
         let measure = |i: usize| {
             let mut method = build(&points[i].spec, &points[i].sets)?;
-            let costs = calibrate(bench, method.plan(), self.measuring() / 2.0)?;
+            let costs = match (slower, expected[i]) {
+                (Some(slower), (Unknowns::Voxels, e)) => {
+                    Costs { picture_s: picture(bench)?, score_s: score(bench)?, ..as_there(e, slower, method.plan()) }
+                }
+                _ => calibrate(bench, method.plan(), self.measuring() / 2.0)?,
+            };
             built.borrow_mut().push((i, method));
             Ok(costs)
         };
@@ -174,6 +188,19 @@ impl Budget {
             then: (costs.then_s > 0.0).then(|| within(left - costs.after_s() + costs.then_s)),
         })
     }
+}
+
+/// The costs of a voxel method that are `expected` on the front's machine, on one that takes `slower` times as long. Drawing and
+/// scoring are not included.
+fn as_there(expected: Expected, slower: f64, plan: &mut dyn Plan) -> Costs {
+    let step_s = slower * expected.step_s;
+    let costs = Costs { step_s, export_s: slower * expected.beside_s, ..Costs::default() };
+    if plan.links().is_empty() {
+        return costs;
+    }
+    let then_steps = LATER * expected.steps;
+    let then_s = then_steps * step_s;
+    Costs { then_s, then_least_s: 0.1 * then_s, then_steps, ..costs }
 }
 
 /// The time `seconds` from now.
@@ -284,7 +311,11 @@ fn pick(
                     return Ok(Choice { point: i, costs: *c, fits: true, passed_over });
                 }
                 passed_over.push((i, format!("would take {} more, {} are left", time(needed), time(now))));
-                let least = c.prepare_s + least(*kind) * c.step_s + c.after_s();
+                // A field makes something of few steps; of few passes little comes.
+                let least = match kind {
+                    Unknowns::Field => c.prepare_s + STEPS * c.step_s + c.after_s(),
+                    Unknowns::Voxels => needed,
+                };
                 if fallback.is_none_or(|f| least < f.2) {
                     fallback = Some((i, *c, least));
                 }

@@ -2,11 +2,16 @@
 
 use crate::out;
 use clap::Args;
+use conefield_backend_cpu::Cpu;
 use conefield_backend_wgpu::{Adapter, adapters};
 use conefield_core::{Result, simd};
+use conefield_tradeoff::speed::pass_s;
 use serde_json::json;
 
-/// List the backends of this machine: CPU instructions and GPU adapters.
+/// List the backends of this machine: CPU instructions and speed, GPU adapters.
+///
+/// The standard reconstruction is a small one with total variation. It takes as much work on every machine, so that its time compares
+/// machines; a front of methods keeps it, too.
 #[derive(Args)]
 pub struct BackendsArgs {
     /// Print one JSON object.
@@ -17,13 +22,15 @@ pub struct BackendsArgs {
 impl BackendsArgs {
     pub fn run(self) -> Result<()> {
         let (level, threads) = (simd_level(), rayon::current_num_threads());
+        let pass_s = pass_s(&Cpu::new())?;
         let adapters = adapters();
         if self.json {
-            let cpu = json!({ "name": "cpu", "simd": level, "threads": threads });
+            let cpu = json!({ "name": "cpu", "simd": level, "threads": threads, "pass_s": pass_s });
             let wgpu = json!({ "name": "wgpu", "adapters": adapters });
             return out::json(&json!({ "backends": [cpu, wgpu] }));
         }
-        let mut lines = vec![format!("cpu     {level}, {threads} threads")];
+        let mut lines =
+            vec![format!("cpu     {level}, {threads} threads, {pass_s:.3} s per pass of the standard reconstruction")];
         if adapters.is_empty() {
             lines.push("wgpu    no Vulkan, Metal or DX12 adapter was found".into());
         }

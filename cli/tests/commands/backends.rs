@@ -33,6 +33,7 @@ fn reconstruct(scan: &Path, run: &Path, more: &[&str]) -> Value {
 fn adapters_are_listed_with_their_limits() {
     let listed = listed();
     assert_eq!(listed["backends"][0]["name"], "cpu");
+    assert!(listed["backends"][0]["pass_s"].as_f64().is_some_and(|s| s > 0.0 && s < 60.0), "{listed}");
     for (i, a) in listed["backends"][1]["adapters"].as_array().unwrap().iter().enumerate() {
         assert_eq!(a["index"], i);
         assert!(a["binding_bytes"].as_u64().unwrap() >= 1 << 20, "{a}");

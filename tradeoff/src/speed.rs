@@ -1,0 +1,69 @@
+//! How fast this machine is: the time of a pass of a small reconstruction, which is the same on every machine.
+
+use crate::calibrate::Laps;
+use conefield_core::Result;
+use conefield_core::backend::Backend;
+use conefield_core::geometry::{Geometry, VoxelGrid};
+use conefield_core::method::{Context, Job, Limits};
+use conefield_core::orbit::CircularOrbit;
+use conefield_core::random::{mix, unit};
+use conefield_core::scan::{Scan, Unit};
+use conefield_core::spec::load::Draft;
+use conefield_specs::SHIPPED;
+use ndarray::Array3;
+use std::f64::consts::TAU;
+
+/// Views, rows and columns of the detector, and voxels along a side of the volume.
+const VIEWS: usize = 16;
+const PIXELS: usize = 128;
+const VOXELS: usize = 96;
+/// Passes. The first ones touch memory for the first time.
+const PASSES: u64 = 6;
+
+/// Seconds of a pass of total variation on 96³ samples of a cubic spline, from 16 views of 128 × 128 pixels: projector and prior, the work
+/// of all voxel methods of the shipped front.
+pub fn pass_s(backend: &dyn Backend) -> Result<f64> {
+    let sets = [
+        "basis={ type = \"cubic\", spacing = 1 }",
+        "prior=\"directional-total-variation\"",
+        "stop={ passes = 100, change = 1e-12 }",
+    ];
+    let loaded = Draft::find("fista-tv", &sets.map(String::from), SHIPPED)?.finish()?;
+    let mut plan = loaded.spec.method.plan(&Context::new(backend))?;
+    let scan = scan();
+    let mut laps = Laps::new(&|| false);
+    let limits = Limits { steps: Some(PASSES), ..Limits::default() };
+    let solution = plan.run(&Job { limits, ..Job::new(&scan, backend) }, &mut laps)?;
+    Ok(laps.typical().unwrap_or(solution.train_s / PASSES as f64))
+}
+
+/// The shadow of a ball, with noise.
+fn scan() -> Scan {
+    let angles = (0..VIEWS).map(|i| TAU * i as f64 / VIEWS as f64).collect();
+    let orbit = CircularOrbit { dso: 500.0, dsd: 700.0, pixel: [2.2; 2], offset: [0.0; 2], angles };
+    let volume = VoxelGrid { shape: [VOXELS; 3], spacing: [2.0; 3], center: [0.0; 3] };
+    let value = |(view, row, column): (usize, usize, usize)| {
+        let [y, x] = [row, column].map(|i| (i as f64 + 0.5) / PIXELS as f64 * 2.5 - 1.25);
+        let chord = (1.0 - x * x - y * y).max(0.0).sqrt();
+        (chord + 0.02 * f64::from(unit(mix(view as u64, (row * PIXELS + column) as u64)))) as f32
+    };
+    Scan {
+        geometry: Geometry { views: orbit.views(), detector: [PIXELS; 2], volume },
+        projections: Array3::from_shape_fn((VIEWS, PIXELS, PIXELS), value),
+        unit: Unit::default(),
+        provenance: serde_json::Value::Null,
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn the_scan_is_one_that_methods_take() {
+        let scan = scan();
+        scan.validate("speed").unwrap();
+        let [middle, corner] = [[0, 64, 64], [0, 0, 0]].map(|at| scan.projections[at]);
+        assert!(middle > 0.95 && corner < 0.03, "{middle} {corner}");
+    }
+}
