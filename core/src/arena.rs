@@ -67,11 +67,6 @@ impl Arena {
             *part = kept;
         }
     }
-
-    /// Bytes held.
-    pub fn bytes(&self) -> usize {
-        4 * (self.params.len() + self.grads.len() + self.first.len() + self.second.len())
-    }
 }
 
 /// Named tensors with the notes of the file that they came from.

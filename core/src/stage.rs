@@ -73,6 +73,13 @@ impl<'a, R> TileMut<'a, R> {
     pub fn channel(&mut self, c: usize) -> &mut [R] {
         &mut self.data[c * self.rows..(c + 1) * self.rows]
     }
+
+    /// Splits off the first `channels`; the tile keeps the others.
+    pub fn take(&mut self, channels: usize) -> &'a mut [R] {
+        let (first, others) = std::mem::take(&mut self.data).split_at_mut(channels * self.rows);
+        self.data = others;
+        first
+    }
 }
 
 /// The part of a stage's gradient that a call of [`Kernel::backward`] adds to.

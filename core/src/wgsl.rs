@@ -220,6 +220,11 @@ fn {name}grad(i: u32, v: f32) {{ stage_grad({first}u + i, v); }}
     out
 }
 
+/// Whether a setting is a positive normal number also in single precision, in which shaders have it.
+pub fn is_positive(x: f64) -> bool {
+    x > 0.0 && (x as f32).is_normal()
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;

@@ -1,6 +1,7 @@
 //! The network of SAX-NeRF (Cai et al., CVPR 2024): features `[n, F]` of the samples of a ray to attenuation `[n, 1]`, by
 //! F → W → blocks of [line attention](conefield_normalizers::line_attention) → (F + W) → W → 1. An activation follows each
-//! linear map and the last block. The skip layer reads the features first.
+//! linear map and the last block. The columns of the skip layer are the F features, then the W channels of the
+//! last block.
 //!
 //! `line-attention` alone is a normalizer: it also stands before other fields.
 
@@ -110,17 +111,11 @@ struct Tape<'a, R> {
 }
 
 impl<'a, R: Real> Tape<'a, R> {
-    fn of(stage: &LineTransformerStage, tape: TileMut<'a, R>) -> Self {
-        let (n, mut rest) = (tape.rows, tape.data);
-        let mut part = |channels: usize| {
-            let (part, behind) = std::mem::take(&mut rest).split_at_mut(channels * n);
-            rest = behind;
-            part
-        };
+    fn of(stage: &LineTransformerStage, mut tape: TileMut<'a, R>) -> Self {
         let (width, own) = (stage.settings.width, stage.block.info().tape);
-        let [first, mixed, skip] = std::array::from_fn(|_| [part(width), part(width)]);
-        let last = part(1);
-        let blocks = stage.blocks.iter().map(|_| [part(width), part(own)]).collect();
+        let [first, mixed, skip] = std::array::from_fn(|_| [tape.take(width), tape.take(width)]);
+        let last = tape.take(1);
+        let blocks = stage.blocks.iter().map(|_| [tape.take(width), tape.take(own)]).collect();
         Self { first, mixed, skip, last, blocks }
     }
 }
@@ -145,8 +140,8 @@ impl<R: Real> Op for First<'_, R> {
     }
 }
 
-/// All behind the blocks.
-struct Behind<'a, 'b, R> {
+/// Everything after the blocks.
+struct Tail<'a, 'b, R> {
     stage: &'a LineTransformerStage,
     params: &'a [R],
     x: Tile<'a, R>,
@@ -154,7 +149,7 @@ struct Behind<'a, 'b, R> {
     tape: &'a mut Tape<'b, R>,
 }
 
-impl<R: Real> Op for Behind<'_, '_, R> {
+impl<R: Real> Op for Tail<'_, '_, R> {
     type Out = ();
     #[inline(always)]
     fn call<S: Simd>(self, s: S) {
@@ -174,8 +169,8 @@ impl<R: Real> Op for Behind<'_, '_, R> {
     }
 }
 
-/// All behind the blocks, backwards: the slope of `tape.mixed` becomes `∂L` of the last block's output.
-struct BehindBack<'a, 'b, R> {
+/// Everything after the blocks, backwards: the slope of `tape.mixed` becomes `∂L` of the last block's output.
+struct TailBackward<'a, 'b, R> {
     stage: &'a LineTransformerStage,
     params: &'a [R],
     x: Tile<'a, R>,
@@ -185,7 +180,7 @@ struct BehindBack<'a, 'b, R> {
     tape: &'a mut Tape<'b, R>,
 }
 
-impl<R: Real> Op for BehindBack<'_, '_, R> {
+impl<R: Real> Op for TailBackward<'_, '_, R> {
     type Out = ();
     #[inline(always)]
     fn call<S: Simd>(self, s: S) {
@@ -249,7 +244,7 @@ impl<R: Real> Kernel<R> for LineTransformerStage {
             self.block.forward(&params[self.of_block(start)], Tile::new(before, n), out, own);
             before = output;
         }
-        run(Behind { stage: self, params, x, y, tape: &mut tape });
+        run(Tail { stage: self, params, x, y, tape: &mut tape });
     }
 
     fn backward(
@@ -264,7 +259,7 @@ impl<R: Real> Kernel<R> for LineTransformerStage {
         debug_assert_eq!(grads.range, 0..params.len());
         let (n, grads, mut dx) = (x.rows, grads.values, dx.map(|t| t.data));
         let mut tape = Tape::of(self, tape);
-        run(BehindBack { stage: self, params, x, dy, grads, dx: dx.as_deref_mut(), tape: &mut tape });
+        run(TailBackward { stage: self, params, x, dy, grads, dx: dx.as_deref_mut(), tape: &mut tape });
         let [first, slope] = tape.first;
         let [_, d] = tape.mixed;
         for (k, &start) in self.blocks.iter().enumerate().rev() {

@@ -69,17 +69,19 @@ pub struct LineAttentionStage {
     norm: LayerNormStage,
     width: usize,
     hidden: usize,
+    at: Places,
 }
 
-/// The parameters of the stage. Matrices are row-major, a row for each output.
+/// Where the parameters are. Matrices are row-major, with a row for each output.
+#[derive(Debug, Clone)]
 struct Places {
     norms: [Range<usize>; 2],
     /// Queries, keys and values, one after the other.
-    read: Range<usize>,
+    qkv: Range<usize>,
     /// `[head][i][j]`.
     position: Range<usize>,
-    write: Range<usize>,
-    write_bias: Range<usize>,
+    project: Range<usize>,
+    project_bias: Range<usize>,
     feed: [Range<usize>; 3],
 }
 
@@ -96,50 +98,32 @@ impl LineAttentionStage {
         for (name, found, most) in named {
             ensure((1..=most).contains(&found), "spec", name, found, format!("1 to {most}"))?;
         }
+        Self::of(settings.clone(), width, expansion * width)
+    }
+
+    fn of(settings: LineAttention, width: usize, hidden: usize) -> Result<Self> {
         let norm = LayerNormStage::new(&LayerNorm::default(), width)?;
-        Ok(Self { settings: settings.clone(), norm, width, hidden: expansion * width })
+        let mut end = 0;
+        let ranges = blocks(&settings, width, hidden).map(|(_, shape)| {
+            let start = end;
+            end += shape.iter().product::<usize>();
+            start..end
+        });
+        let [scale_0, shift_0, qkv, position, project, project_bias, scale_1, shift_1, feed_0, feed_1, feed_2] = ranges;
+        let at = Places {
+            norms: [scale_0.start..shift_0.end, scale_1.start..shift_1.end],
+            qkv,
+            position,
+            project,
+            project_bias,
+            feed: [feed_0, feed_1, feed_2],
+        };
+        Ok(Self { settings, norm, width, hidden, at })
     }
 
     /// Channels of all heads.
     fn inner(&self) -> usize {
         self.settings.heads * self.settings.head_width
-    }
-
-    /// Names and shapes of the parameters, in order.
-    fn blocks(&self) -> [(&'static str, Vec<usize>); 11] {
-        let (f, h, inner) = (self.width, self.hidden, self.inner());
-        let LineAttention { segment, heads, .. } = self.settings;
-        [
-            ("norm.0.weight", vec![f]),
-            ("norm.0.bias", vec![f]),
-            ("read.weight", vec![3 * inner, f]),
-            ("position", vec![heads, segment, segment]),
-            ("write.weight", vec![f, inner]),
-            ("write.bias", vec![f]),
-            ("norm.1.weight", vec![f]),
-            ("norm.1.bias", vec![f]),
-            ("feed.0.weight", vec![h, f]),
-            ("feed.1.weight", vec![h, h]),
-            ("feed.2.weight", vec![f, h]),
-        ]
-    }
-
-    fn places(&self) -> Places {
-        let mut end = 0;
-        let all = self.blocks().map(|(_, shape)| {
-            let start = end;
-            end += shape.iter().product::<usize>();
-            start..end
-        });
-        let [scale_0, shift_0, read, position, write, write_bias, scale_1, shift_1, feed_0, feed_1, feed_2] = all;
-        Places {
-            norms: [scale_0.start..shift_0.end, scale_1.start..shift_1.end],
-            read,
-            position,
-            write,
-            write_bias,
-            feed: [feed_0, feed_1, feed_2],
-        }
     }
 
     /// Channels of each part of the tape, in the order of [`Tape`].
@@ -157,47 +141,61 @@ impl LineAttentionStage {
     }
 }
 
+/// Names and shapes of the parameters, in order.
+fn blocks(settings: &LineAttention, f: usize, h: usize) -> [(&'static str, Vec<usize>); 11] {
+    let LineAttention { segment, heads, head_width, .. } = *settings;
+    let inner = heads * head_width;
+    [
+        ("norm.0.weight", vec![f]),
+        ("norm.0.bias", vec![f]),
+        ("qkv.weight", vec![3 * inner, f]),
+        ("position", vec![heads, segment, segment]),
+        ("project.weight", vec![f, inner]),
+        ("project.bias", vec![f]),
+        ("norm.1.weight", vec![f]),
+        ("norm.1.bias", vec![f]),
+        ("feed.0.weight", vec![h, f]),
+        ("feed.1.weight", vec![h, h]),
+        ("feed.2.weight", vec![f, h]),
+    ]
+}
+
 /// What forward leaves for backward, `[channels][n]` each, and room that backward works in.
 struct Tape<'a, R> {
     norm: [&'a mut [R]; 2],
     /// What attention and the feed-forward part read; backward puts `∂L` of it there.
     normed: [&'a mut [R]; 2],
     /// Queries, keys and values.
-    read: &'a mut [R],
+    qkv: &'a mut [R],
     /// Weights, `[head][j]`: how much a row takes of row `j` of its segment.
-    attention: &'a mut [R],
-    /// What attention found; backward puts `∂L` of it there.
-    found: &'a mut [R],
-    /// The sum after attention.
-    middle: &'a mut [R],
+    weights: &'a mut [R],
+    /// The output of all heads; backward puts `∂L` of it there.
+    attended: &'a mut [R],
+    /// `z`, the sum after attention.
+    sum: &'a mut [R],
     /// Hidden layers and the derivatives of their activations.
     hidden: [&'a mut [R]; 2],
     slope: [&'a mut [R]; 2],
-    /// `∂L` of `read`, and of `middle`.
-    d_read: &'a mut [R],
-    d_middle: &'a mut [R],
+    /// `∂L` of `qkv`, and of `sum`.
+    d_qkv: &'a mut [R],
+    d_sum: &'a mut [R],
 }
 
 impl<'a, R: Real> Tape<'a, R> {
-    fn of(stage: &LineAttentionStage, tape: TileMut<'a, R>) -> Self {
-        let (n, mut rest) = (tape.rows, tape.data);
-        let [norm_0, normed_0, read, attention, found, middle, norm_1, normed_1, h0, s0, h1, s1, d_read, d_middle] =
-            stage.tape().map(|channels| {
-                let (part, behind) = std::mem::take(&mut rest).split_at_mut(channels * n);
-                rest = behind;
-                part
-            });
+    fn of(stage: &LineAttentionStage, mut tape: TileMut<'a, R>) -> Self {
+        let [norm_0, normed_0, qkv, weights, attended, sum, norm_1, normed_1, h0, s0, h1, s1, d_qkv, d_sum] =
+            stage.tape().map(|channels| tape.take(channels));
         Self {
             norm: [norm_0, norm_1],
             normed: [normed_0, normed_1],
-            read,
-            attention,
-            found,
-            middle,
+            qkv,
+            weights,
+            attended,
+            sum,
             hidden: [h0, h1],
             slope: [s0, s1],
-            d_read,
-            d_middle,
+            d_qkv,
+            d_sum,
         }
     }
 }
@@ -207,7 +205,7 @@ fn matrix<R>(data: &[R], columns: usize) -> WeightMatrix<'_, R> {
     WeightMatrix { data, ld: columns, column: 0 }
 }
 
-/// `middle = x + attention(normed[0])`.
+/// `sum = x + attention(normed[0])`.
 struct Attend<'a, 'b, R> {
     stage: &'a LineAttentionStage,
     params: &'a [R],
@@ -220,17 +218,17 @@ impl<R: Real> Op for Attend<'_, '_, R> {
     #[inline(always)]
     fn call<S: Simd>(self, s: S) {
         let Self { stage, params, x, tape } = self;
-        let (n, at, inner) = (x.rows, stage.places(), stage.inner());
+        let (n, at, inner) = (x.rows, stage.at.clone(), stage.inner());
         let LineAttention { segment, heads, head_width: d, .. } = stage.settings;
-        tape.read.fill(R::ZERO);
-        affine(s, matrix(&params[at.read], stage.width), None, tape.normed[0], tape.read, n);
-        let (queries, rest) = tape.read.split_at(inner * n);
+        tape.qkv.fill(R::ZERO);
+        affine(s, matrix(&params[at.qkv], stage.width), None, tape.normed[0], tape.qkv, n);
+        let (queries, rest) = tape.qkv.split_at(inner * n);
         let (keys, values) = rest.split_at(inner * n);
         let position = &params[at.position];
         let scale = R::of(1.0 / (d as f64).sqrt());
         for head in 0..heads {
             for j in 0..segment {
-                let weights = &mut tape.attention[(head * segment + j) * n..][..n];
+                let weights = &mut tape.weights[(head * segment + j) * n..][..n];
                 for start in (0..n).step_by(segment) {
                     let long = segment.min(n - start);
                     for i in 0..long {
@@ -244,25 +242,25 @@ impl<R: Real> Op for Attend<'_, '_, R> {
                     }
                 }
             }
-            softmax(s, &mut tape.attention[head * segment * n..][..segment * n], segment, n);
+            softmax(s, &mut tape.weights[head * segment * n..][..segment * n], segment, n);
         }
-        tape.found.fill(R::ZERO);
+        tape.attended.fill(R::ZERO);
         for c in 0..inner {
-            let (value, found) = (&values[c * n..][..n], &mut tape.found[c * n..][..n]);
+            let (value, out) = (&values[c * n..][..n], &mut tape.attended[c * n..][..n]);
             for j in 0..segment {
-                let weights = &tape.attention[(c / d * segment + j) * n..][..n];
+                let weights = &tape.weights[(c / d * segment + j) * n..][..n];
                 for start in (0..n).step_by(segment).take_while(|start| start + j < n) {
                     for i in start..(start + segment).min(n) {
-                        found[i] += weights[i] * value[start + j];
+                        out[i] += weights[i] * value[start + j];
                     }
                 }
             }
         }
-        tape.middle.copy_from_slice(x.data);
-        let (weights, bias) = (matrix(&params[at.write], inner), &params[at.write_bias]);
-        affine(s, weights, None, tape.found, tape.middle, n);
-        for (middle, &b) in tape.middle.chunks_exact_mut(n).zip(bias) {
-            middle.iter_mut().for_each(|v| *v += b);
+        tape.sum.copy_from_slice(x.data);
+        let (weights, bias) = (matrix(&params[at.project], inner), &params[at.project_bias]);
+        affine(s, weights, None, tape.attended, tape.sum, n);
+        for (sum, &b) in tape.sum.chunks_exact_mut(n).zip(bias) {
+            sum.iter_mut().for_each(|v| *v += b);
         }
     }
 }
@@ -302,7 +300,7 @@ fn softmax<S: Simd, R: Real>(s: S, scores: &mut [R], segment: usize, n: usize) {
     }
 }
 
-/// `y = middle + feed(normed[1])`.
+/// `y = sum + feed(normed[1])`.
 struct Feed<'a, 'b, R> {
     stage: &'a LineAttentionStage,
     params: &'a [R],
@@ -315,7 +313,7 @@ impl<R: Real> Op for Feed<'_, '_, R> {
     #[inline(always)]
     fn call<S: Simd>(self, s: S) {
         let Self { stage, params, y, tape } = self;
-        let (n, [first, second, third]) = (y.rows, stage.places().feed);
+        let (n, [first, second, third]) = (y.rows, stage.at.feed.clone());
         let ([h0, h1], [s0, s1]) = (&mut tape.hidden, &mut tape.slope);
         s0.fill(R::ZERO);
         affine(s, matrix(&params[first], stage.width), None, tape.normed[1], s0, n);
@@ -323,7 +321,7 @@ impl<R: Real> Op for Feed<'_, '_, R> {
         s1.fill(R::ZERO);
         affine(s, matrix(&params[second], stage.hidden), None, h0, s1, n);
         activate(s, Activation::Gelu, s1, h1);
-        y.data.copy_from_slice(tape.middle);
+        y.data.copy_from_slice(tape.sum);
         affine(s, matrix(&params[third], stage.hidden), None, h1, y.data, n);
     }
 }
@@ -342,7 +340,7 @@ impl<R: Real> Op for FeedBack<'_, '_, R> {
     #[inline(always)]
     fn call<S: Simd>(self, s: S) {
         let Self { stage, params, dy, grads, tape } = self;
-        let (n, [first, second, third]) = (dy.rows, stage.places().feed);
+        let (n, [first, second, third]) = (dy.rows, stage.at.feed.clone());
         let (f, h) = (stage.width, stage.hidden);
         let ([h0, h1], [s0, s1]) = (&tape.hidden, &mut tape.slope);
         affine_weights(s, dy.data, h1, &mut grads[third.clone()], h, 0, None, n);
@@ -354,7 +352,7 @@ impl<R: Real> Op for FeedBack<'_, '_, R> {
     }
 }
 
-/// Attention backwards: `∂L` of `normed[0]` from `d_middle`.
+/// Attention backwards: `∂L` of `normed[0]` from `d_sum`.
 struct AttendBack<'a, 'b, R> {
     stage: &'a LineAttentionStage,
     params: &'a [R],
@@ -368,18 +366,18 @@ impl<R: Real> Op for AttendBack<'_, '_, R> {
     #[inline(always)]
     fn call<S: Simd>(self, s: S) {
         let Self { stage, params, rows: n, grads, tape } = self;
-        let (at, inner) = (stage.places(), stage.inner());
+        let (at, inner) = (stage.at.clone(), stage.inner());
         let LineAttention { segment, heads, head_width: d, .. } = stage.settings;
-        affine_weights(s, tape.d_middle, tape.found, &mut grads[at.write.clone()], inner, 0, None, n);
-        for (sum, d) in grads[at.write_bias].iter_mut().zip(tape.d_middle.chunks_exact(n)) {
+        affine_weights(s, tape.d_sum, tape.attended, &mut grads[at.project.clone()], inner, 0, None, n);
+        for (sum, d) in grads[at.project_bias].iter_mut().zip(tape.d_sum.chunks_exact(n)) {
             *sum += conefield_core::dense::total(s, d);
         }
-        affine_input(s, matrix(&params[at.write], inner), tape.d_middle, tape.found, Into::Set, n);
-        let (d_found, position) = (&*tape.found, &mut grads[at.position]);
-        let (queries, rest) = tape.read.split_at(inner * n);
+        affine_input(s, matrix(&params[at.project], inner), tape.d_sum, tape.attended, Into::Set, n);
+        let (d_attended, position) = (&*tape.attended, &mut grads[at.position]);
+        let (queries, rest) = tape.qkv.split_at(inner * n);
         let (keys, values) = rest.split_at(inner * n);
-        tape.d_read.fill(R::ZERO);
-        let (d_queries, rest) = tape.d_read.split_at_mut(inner * n);
+        tape.d_qkv.fill(R::ZERO);
+        let (d_queries, rest) = tape.d_qkv.split_at_mut(inner * n);
         let (d_keys, d_values) = rest.split_at_mut(inner * n);
         let scale = R::of(1.0 / (d as f64).sqrt());
         let mut d_weight = [R::ZERO; LONGEST];
@@ -389,13 +387,13 @@ impl<R: Real> Op for AttendBack<'_, '_, R> {
                 let long = segment.min(n - start);
                 for i in 0..long {
                     let row = start + i;
-                    let weight = |j: usize| tape.attention[(head * segment + j) * n + row];
+                    let weight = |j: usize| tape.weights[(head * segment + j) * n + row];
                     let mut mean = R::ZERO;
                     for j in 0..long {
                         let mut product = R::ZERO;
                         for c in channels.clone() {
-                            product += d_found[c * n + row] * values[c * n + start + j];
-                            d_values[c * n + start + j] += weight(j) * d_found[c * n + row];
+                            product += d_attended[c * n + row] * values[c * n + start + j];
+                            d_values[c * n + start + j] += weight(j) * d_attended[c * n + row];
                         }
                         d_weight[j] = product;
                         mean += weight(j) * product;
@@ -411,22 +409,22 @@ impl<R: Real> Op for AttendBack<'_, '_, R> {
                 }
             }
         }
-        affine_weights(s, tape.d_read, tape.normed[0], &mut grads[at.read.clone()], stage.width, 0, None, n);
-        affine_input(s, matrix(&params[at.read], stage.width), tape.d_read, tape.normed[0], Into::Set, n);
+        affine_weights(s, tape.d_qkv, tape.normed[0], &mut grads[at.qkv.clone()], stage.width, 0, None, n);
+        affine_input(s, matrix(&params[at.qkv], stage.width), tape.d_qkv, tape.normed[0], Into::Set, n);
     }
 }
 
 impl<R: Real> Kernel<R> for LineAttentionStage {
     fn forward(&self, params: &[R], x: Tile<'_, R>, y: TileMut<'_, R>, tape: TileMut<'_, R>) {
-        let (n, [first, second]) = (x.rows, self.places().norms);
+        let (n, [first, second]) = (x.rows, self.at.norms.clone());
         let mut tape = Tape::of(self, tape);
         let Tape { norm, normed, .. } = &mut tape;
         let tiles = (TileMut::new(normed[0], n), TileMut::new(norm[0], n));
         self.norm.forward(&params[first], x, tiles.0, tiles.1);
         run(Attend { stage: self, params, x, tape: &mut tape });
-        let Tape { norm, normed, middle, .. } = &mut tape;
+        let Tape { norm, normed, sum, .. } = &mut tape;
         let tiles = (TileMut::new(normed[1], n), TileMut::new(norm[1], n));
-        self.norm.forward(&params[second], Tile::new(middle, n), tiles.0, tiles.1);
+        self.norm.forward(&params[second], Tile::new(sum, n), tiles.0, tiles.1);
         run(Feed { stage: self, params, y, tape: &mut tape });
     }
 
@@ -440,23 +438,23 @@ impl<R: Real> Kernel<R> for LineAttentionStage {
         dx: Option<TileMut<'_, R>>,
     ) {
         debug_assert_eq!(grads.range, 0..params.len());
-        let (n, [first, second], grads) = (x.rows, self.places().norms, grads.values);
+        let (n, [first, second], grads) = (x.rows, self.at.norms.clone(), grads.values);
         let mut tape = Tape::of(self, tape);
         run(FeedBack { stage: self, params, dy, grads, tape: &mut tape });
-        let Tape { norm, normed, middle, d_middle, .. } = &mut tape;
+        let Tape { norm, normed, sum, d_sum, .. } = &mut tape;
         let of = Grads::all(&mut grads[second.clone()]);
-        let (z, kept) = (Tile::new(middle, n), TileMut::new(norm[1], n));
-        let d = Some(TileMut::new(d_middle, n));
+        let (z, kept) = (Tile::new(sum, n), TileMut::new(norm[1], n));
+        let d = Some(TileMut::new(d_sum, n));
         self.norm.backward(&params[second], z, kept, Tile::new(normed[1], n), of, d);
-        add(d_middle, dy.data);
+        add(d_sum, dy.data);
         run(AttendBack { stage: self, params, rows: n, grads, tape: &mut tape });
-        let Tape { norm, normed, d_middle, .. } = &mut tape;
+        let Tape { norm, normed, d_sum, .. } = &mut tape;
         let of = Grads::all(&mut grads[first.clone()]);
         let (kept, d) = (TileMut::new(norm[0], n), Tile::new(normed[0], n));
         match dx {
             Some(dx) => {
                 self.norm.backward(&params[first], x, kept, d, of, Some(TileMut::new(dx.data, n)));
-                add(dx.data, d_middle);
+                add(dx.data, d_sum);
             }
             None => self.norm.backward(&params[first], x, kept, d, of, None),
         }
@@ -472,7 +470,7 @@ impl Stage for LineAttentionStage {
         Info {
             input: self.width,
             output: self.width,
-            params: self.places().feed[2].end,
+            params: self.at.feed[2].end,
             tape: self.tape().iter().sum(),
             scope: Scope::Ray,
             grads: GradKind::Dense,
@@ -488,16 +486,16 @@ impl Stage for LineAttentionStage {
             start = p.range().end;
             p
         };
-        self.blocks().map(of).into()
+        blocks(&self.settings, self.width, self.hidden).map(of).into()
     }
 
-    /// Matrices as PyTorch's linear layers start, norms at 1 and 0, positions from a normal distribution of deviation 1 that ends
-    /// at 2: as published.
+    /// Matrices as PyTorch's linear layers start, norms at 1 and 0, positions from a normal distribution of standard
+    /// deviation 1, truncated at ±2: as published.
     fn init(&self, seed: u64, params: &mut [f32]) {
         let inner = self.inner();
         for p in self.parameters() {
             let fan_in = match p.name.as_str() {
-                "write.bias" => inner,
+                "project.bias" => inner,
                 _ => p.shape[p.shape.len() - 1],
             };
             let bound = 1.0 / (fan_in as f64).sqrt();
@@ -541,17 +539,17 @@ fn normal(seed: u64, i: u64) -> f64 {
 impl Normalizer for LineAttentionStage {
     fn keep_inputs(&self, keep: &[usize]) -> Result<Reduced<dyn Normalizer>> {
         ensure(!keep.is_empty(), "line-attention", "channels", "none kept", "at least one")?;
-        let norm = LayerNormStage::new(&LayerNorm::default(), keep.len())?;
-        let stage = Self { settings: self.settings.clone(), norm, width: keep.len(), hidden: self.hidden };
+        // The hidden layers keep their width.
+        let stage = Self::of(self.settings.clone(), keep.len(), self.hidden)?;
         let mut params = vec![];
         for p in self.parameters() {
             match p.name.as_str() {
                 // A column for each channel.
-                "read.weight" | "feed.0.weight" => {
+                "qkv.weight" | "feed.0.weight" => {
                     let rows = p.range().step_by(self.width);
                     params.extend(rows.flat_map(|row| keep.iter().map(move |c| row + c..row + c + 1)));
                 }
-                // Nothing for single channels.
+                // Independent of the channels.
                 "position" | "feed.1.weight" => params.push(p.range()),
                 // A row for each channel.
                 _ => {
@@ -584,7 +582,7 @@ mod tests {
     /// The formula, row by row.
     fn plainly(stage: &LineAttentionStage, params: &[f64], x: &[f64], n: usize) -> Vec<f64> {
         let (f, inner, d) = (stage.width, stage.inner(), stage.settings.head_width);
-        let (segment, at) = (stage.settings.segment, stage.places());
+        let (segment, at) = (stage.settings.segment, &stage.at);
         let norm = |row: &[f64], p: &[f64]| -> Vec<f64> {
             let mean = row.iter().sum::<f64>() / f as f64;
             let variance = row.iter().map(|v| (v - mean).powi(2)).sum::<f64>() / f as f64;
@@ -595,7 +593,7 @@ mod tests {
         };
         let row = |i: usize| -> Vec<f64> { (0..f).map(|c| x[c * n + i]).collect() };
         let read: Vec<Vec<f64>> =
-            (0..n).map(|i| times(&params[at.read.clone()], &norm(&row(i), &params[at.norms[0].clone()]))).collect();
+            (0..n).map(|i| times(&params[at.qkv.clone()], &norm(&row(i), &params[at.norms[0].clone()]))).collect();
         let mut y = vec![0.0; f * n];
         for i in 0..n {
             let start = i / segment * segment;
@@ -613,8 +611,8 @@ mod tests {
                     found.push(mates.iter().zip(&e).map(|(j, e)| e / sum * read[*j][2 * inner + c]).sum());
                 }
             }
-            let out = times(&params[at.write.clone()], &found);
-            let z: Vec<f64> = (0..f).map(|c| row(i)[c] + out[c] + params[at.write_bias.clone()][c]).collect();
+            let out = times(&params[at.project.clone()], &found);
+            let z: Vec<f64> = (0..f).map(|c| row(i)[c] + out[c] + params[at.project_bias.clone()][c]).collect();
             let gelu =
                 |v: Vec<f64>| -> Vec<f64> { v.into_iter().map(|x| 0.5 * x * libm::erfc(-x / 2f64.sqrt())).collect() };
             let mut hidden = norm(&z, &params[at.norms[1].clone()]);

@@ -120,9 +120,13 @@ pub fn init(tree: &Value, path: &Path) -> String {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use conefield_core::scan::{Scan, Volume};
     use conefield_projectors::simulate::{PhantomKind, Protocol, phantom_of, simulate};
     use conefield_tradeoff::calibrate::{Bench, calibrate};
     use conefield_tradeoff::front::{Front, Unknowns};
+    use conefield_tradeoff::schedule::Budget;
+    use conefield_tradeoff::speed::pass_s;
+    use std::time::Instant;
 
     #[test]
     fn the_shipped_front_loads_and_its_specs_build() {
@@ -137,24 +141,65 @@ mod tests {
 
     #[test]
     fn every_kind_of_solver_is_measured() {
-        let truth = phantom_of(PhantomKind::Head, 24);
-        let scan = simulate(&truth, &Protocol::r2(&truth.grid).with_detector([24, 24]).with_views(12)).unwrap();
-        let backend = Cpu::new();
-        let bench = Bench {
-            scan: &scan,
-            reference: Some(&truth),
-            peak: 1.0,
-            backend: &backend,
-            seed: 0,
-            volumes: &files::volume,
-            cancelled: &|| false,
-        };
+        let (truth, backend) = (phantom_of(PhantomKind::Head, 24), Cpu::new());
+        let scan = scan_of(&truth);
+        let bench = bench(&scan, &truth, &backend);
         for spec in ["fast", "fdk", "sart", "cgls", "fista-tv", "asd-pocs"] {
             let loaded = specs::read(spec, &[]).unwrap();
             let mut plan = plan(&loaded, &backend).unwrap();
             let costs = calibrate(&bench, plan.as_mut(), 0.05).unwrap();
             let all = [costs.step_s, costs.export_s, costs.picture_s, costs.score_s];
             assert!(all.iter().all(|s| *s > 0.0 && s.is_finite()) && costs.prepare_s >= 0.0, "{spec}: {costs:?}");
+        }
+    }
+
+    fn scan_of(truth: &Volume) -> Scan {
+        simulate(truth, &Protocol::r2(&truth.grid).with_detector([24, 24]).with_views(12)).unwrap()
+    }
+
+    fn bench<'a>(scan: &'a Scan, truth: &'a Volume, backend: &'a Cpu) -> Bench<'a> {
+        Bench {
+            scan,
+            reference: Some(truth),
+            peak: 1.0,
+            backend,
+            seed: 0,
+            volumes: &files::volume,
+            cancelled: &|| false,
+        }
+    }
+
+    /// A front that was measured on a scan of the same size, with a chain of 10 s and FDK.
+    #[test]
+    fn a_front_of_a_faster_machine_promises_less_here() {
+        let (truth, backend) = (phantom_of(PhantomKind::Head, 24), Cpu::new());
+        let scan = scan_of(&truth);
+        let here = pass_s(&backend, &|| false).unwrap();
+        let dir = tempfile::tempdir().unwrap();
+        for (faster, wanted) in [(0.05, "long"), (4.0, "short")] {
+            let point = |name: &str, spec: &str, steps: u32, train_s: f64, psnr: u32| {
+                format!(
+                    "[[points]]\nname = \"{name}\"\nkind = \"voxels\"\nspec = \"{spec}\"\nbudget_s = 20.0\n[[points.runs]]\n\
+                     steps = {steps}\ntrain_s = {train_s}\ntotal_s = {train_s}\nbeside_s = 0.01\npsnr = {psnr}\n"
+                )
+            };
+            let text = format!(
+                "made = \"test\"\npass_s = {}\n[[scans]]\nname = \"a\"\nviews = 12\ndetector = [24, 24]\nvolume = [24, 24, 24]\n{}{}",
+                here / faster,
+                point("long", "smooth-tv", 27, 10.0, 30),
+                point("short", "fdk", 1, 0.01, 20),
+            );
+            let file = dir.path().join("front.toml");
+            std::fs::write(&file, text).unwrap();
+            let front = Front::read(&file).unwrap();
+            let build = |spec: &str, sets: &[String]| {
+                let loaded = specs::read(spec, sets)?;
+                let plan = plan(&loaded, &backend)?;
+                Ok(Planned { loaded, plan, memory: Memory::default() })
+            };
+            let budget = Budget { begin: Instant::now(), seconds: 8.0, spent: 0.0 };
+            let (_, schedule) = budget.choose(&bench(&scan, &truth, &backend), &front, build).unwrap();
+            assert_eq!(schedule.point.as_deref(), Some(wanted), "{schedule:?}");
         }
     }
 }

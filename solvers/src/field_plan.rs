@@ -10,7 +10,7 @@ use crate::losses::L1;
 use crate::optimizer::Optimizer;
 use crate::pretrain::{Pretraining, learn, pretrain};
 use crate::priors::Places;
-use crate::rays::{Choice, Pixels, RaySource, Views, Windows};
+use crate::rays::{Pixels, RayChoice, RaySource, Views, Windows};
 use crate::schedule::{Clock, Ends};
 use crate::surround::{self, Within};
 use crate::training::callbacks::{FieldMonitor, LiveSlices, Rollback};
@@ -157,6 +157,7 @@ impl Training {
     /// Refuses numbers that cannot be used, and a run without an end.
     pub fn validate(&self) -> Result<()> {
         ensure((1..=1 << 20).contains(&self.rays), "spec", "rays", self.rays, "1 to 2^20")?;
+        ensure(self.margin <= 1024, "spec", "margin", self.margin, "at most 1024 pixels")?;
         ensure(self.report_every > 0, "spec", "report_every", 0, "at least 1")?;
         if let Some(windows) = self.windows {
             windows.validate(self.rays).map_err(|e| e.within("windows"))?;
@@ -201,9 +202,8 @@ pub(crate) fn build_callbacks(settings: &[Box<dyn CallbackSpec>]) -> Result<Vec<
     Ok(all)
 }
 
-/// Steps whose rays a loss learns from at most, and rays of each.
-const DRAWS: u64 = 64;
-const DRAWN: usize = 1024;
+/// Rays that a loss learns from at most, unless one step has more.
+const DRAWN: u64 = 1 << 16;
 
 /// The plan of a field that is trained.
 struct FieldPlan {
@@ -276,8 +276,11 @@ impl Plan for FieldPlan {
         let within = Within::of(job, self.scene.surround, observer)?;
         let job = &Within::job(within.as_ref(), job);
         let Training { views, pixels, margin, windows, .. } = self.training;
-        let source = RaySource::new(job.scan, &scene, &pipeline, Choice { views, pixels, margin, windows })?;
+        let source = RaySource::new(job.scan, &scene, &pipeline, RayChoice { views, pixels, margin, windows })?;
         observer.note(&format!("{:.0}% of the pixels are trained on", 100.0 * source.share()));
+        if let Some(whole) = source.whole_windows() {
+            observer.note(&format!("windows: {whole} whole ones in all views"));
+        }
         let fitted = self.fitted_loss(job, &scene, &source);
         if let Some(loss) = &fitted {
             observer.note(&format!("loss: {}", loss.describe()));
@@ -359,8 +362,9 @@ impl FieldPlan {
         }
         let noise = Noise::of(job.scan.projections.view(), true);
         let (mut rays, mut measured) = (vec![], vec![]);
-        for step in 0..source.steps_an_epoch().min(DRAWS) {
-            source.draw(job.seed, step, DRAWN, &mut rays);
+        let most = (DRAWN / self.training.rays as u64).max(1);
+        for step in 0..source.steps_an_epoch().min(most) {
+            source.draw(job.seed, step, self.training.rays, &mut rays);
             measured.extend(rays.iter().map(|r| f64::from(r.target)));
         }
         let line = scene.line_scale();

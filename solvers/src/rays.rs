@@ -39,9 +39,8 @@ pub enum Pixels {
     All,
 }
 
-/// Square windows of neighbouring pixels (Cai et al., CVPR 2024, "masked local-global ray sampling"): what lies next to each other is
-/// learned from together. Windows stand side by side from the detector's first pixel, and only those count in which every
-/// pixel does.
+/// Some rays of a step come in square windows of neighbouring pixels (Cai et al., CVPR 2024: masked local-global ray sampling).
+/// Windows lie side by side from the detector's first pixel; only those whose pixels can all be trained on count.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields)]
 pub struct Windows {
@@ -57,6 +56,11 @@ impl Windows {
         ensure((2..=256).contains(&self.side), "spec", "side", self.side, "2 to 256 pixels")?;
         let most = rays / (self.side * self.side);
         ensure((1..=most).contains(&self.count), "spec", "count", self.count, format!("1 to {most} for {rays} rays"))
+    }
+
+    /// Windows of a step of `rays` rays.
+    fn fitting(&self, rays: usize) -> usize {
+        self.count.min(rays / (self.side * self.side))
     }
 
     /// Windows side by side along a detector of `columns` columns; what is left at the end is in none.
@@ -86,9 +90,9 @@ impl Windows {
     }
 }
 
-/// Which rays a step has.
+/// Which rays of a scan are trained on.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub struct Choice {
+pub struct RayChoice {
     /// The views that they come from.
     pub views: Views,
     /// The pixels that count.
@@ -120,8 +124,8 @@ impl<'a> RaySource<'a> {
     }
 
     /// Finds the usable pixels.
-    pub fn new(scan: &'a Scan, scene: &'a Scene, pipeline: &Pipeline, choice: Choice) -> Result<Self> {
-        let Choice { views, pixels: which, margin, windows } = choice;
+    pub fn new(scan: &'a Scan, scene: &'a Scene, pipeline: &Pipeline, choice: RayChoice) -> Result<Self> {
+        let RayChoice { views, pixels: which, margin, windows } = choice;
         let level = (which == Pixels::Support).then(|| air_level(scan));
         let pixels: Vec<Vec<u32>> = (0..scan.geometry.views.len())
             .into_par_iter()
@@ -129,17 +133,19 @@ impl<'a> RaySource<'a> {
                 let view = scan.view(v);
                 let support = level.map(|level| shadow(view, level, margin));
                 let columns = scan.geometry.detector[1];
-                (0..view.len() as u32)
-                    .filter(|&p| {
-                        let (row, column) = (p as usize / columns, p as usize % columns);
-                        let counts = match (which, &support) {
-                            (Pixels::Positive, _) => view[[row, column]] > 0.0,
-                            (_, Some(s)) => s[[row, column]],
-                            _ => true,
-                        };
-                        counts && pipeline.sees(&scene.pixel_ray(&scan.geometry, v, row, column))
-                    })
-                    .collect()
+                let usable = |&p: &u32| {
+                    let (row, column) = (p as usize / columns, p as usize % columns);
+                    let counts = match (which, &support) {
+                        (Pixels::Positive, _) => view[[row, column]] > 0.0,
+                        (_, Some(s)) => s[[row, column]],
+                        _ => true,
+                    };
+                    counts && pipeline.sees(&scene.pixel_ray(&scan.geometry, v, row, column))
+                };
+                let mut pixels: Vec<u32> = (0..view.len() as u32).filter(usable).collect();
+                // The list has grown by doubling, and the estimate of memory counts what it holds.
+                pixels.shrink_to_fit();
+                pixels
             })
             .collect();
         let usable: Vec<usize> = (0..pixels.len()).filter(|&v| !pixels[v].is_empty()).collect();
@@ -152,7 +158,13 @@ impl<'a> RaySource<'a> {
             ));
         }
         let columns = scan.geometry.detector[1];
-        let windows = windows.map(|w| (w, pixels.par_iter().map(|p| w.whole(p, columns)).collect()));
+        let windows: Option<(Windows, Vec<Vec<u32>>)> =
+            windows.map(|w| (w, pixels.par_iter().map(|p| w.whole(p, columns)).collect()));
+        if let Some((w, whole)) = &windows {
+            let found = format!("{} x {} pixels, and no window that can be trained on as a whole", w.side, w.side);
+            let any = whole.iter().any(|of_view| !of_view.is_empty());
+            ensure(any, "spec", "training.windows.side", found, "smaller windows, or none")?;
+        }
         Ok(Self { scan, scene, pixels, windows, views, usable })
     }
 
@@ -167,58 +179,78 @@ impl<'a> RaySource<'a> {
         self.usable.len() as u64
     }
 
+    /// How many windows there are to draw, if rays come in windows.
+    pub fn whole_windows(&self) -> Option<usize> {
+        self.windows.as_ref().map(|(_, whole)| whole.iter().map(Vec::len).sum())
+    }
+
     /// The rays of step `step` (from 0): the same for the same seed.
     pub fn draw(&self, seed: u64, step: u64, count: usize, out: &mut Vec<TrainRay>) {
         out.clear();
-        let steps = self.steps_an_epoch();
         let mut rng = stream(seed, 2 * step);
-        let one = (self.views == Views::One).then(|| {
-            let mut order = self.usable.clone();
-            order.shuffle(&mut stream(seed, 2 * (step / steps) + 1));
-            order[(step % steps) as usize]
-        });
-        let columns = self.scan.geometry.detector[1];
-        let mut add = |view: usize, pixel: u32| {
-            let (row, column) = (pixel as usize / columns, pixel as usize % columns);
-            let ray = self.scene.pixel_ray(&self.scan.geometry, view, row, column);
-            let target = self.scene.line_to_unit(self.scan.projections[[view, row, column]]);
-            out.push(TrainRay { ray, target });
-        };
-        let Some(view) = one else {
-            let mut single = count;
-            if let Some((windows, whole)) = &self.windows {
-                for _ in 0..windows.count {
-                    let view = self.usable[rng.random_range(0..self.usable.len())];
-                    if let Some(&window) = whole[view].choose(&mut rng) {
-                        windows.pixels(window, columns).for_each(|pixel| add(view, pixel));
-                        single -= windows.side * windows.side;
-                    }
-                }
-            }
-            for _ in 0..single {
-                let view = self.usable[rng.random_range(0..self.usable.len())];
-                let pixels = &self.pixels[view];
-                add(view, pixels[rng.random_range(0..pixels.len())]);
-            }
-            return;
-        };
+        match self.views {
+            Views::One => self.draw_from(self.view_of(seed, step), count, &mut rng, out),
+            Views::All => self.draw_from_all(count, &mut rng, out),
+        }
+    }
+
+    /// The view of step `step`: every view once an epoch.
+    fn view_of(&self, seed: u64, step: u64) -> usize {
+        let steps = self.steps_an_epoch();
+        let mut order = self.usable.clone();
+        order.shuffle(&mut stream(seed, 2 * (step / steps) + 1));
+        order[(step % steps) as usize]
+    }
+
+    fn ray(&self, view: usize, pixel: u32) -> TrainRay {
+        let columns = self.columns();
+        let (row, column) = (pixel as usize / columns, pixel as usize % columns);
+        let ray = self.scene.pixel_ray(&self.scan.geometry, view, row, column);
+        TrainRay { ray, target: self.scene.line_to_unit(self.scan.projections[[view, row, column]]) }
+    }
+
+    fn columns(&self) -> usize {
+        self.scan.geometry.detector[1]
+    }
+
+    /// Rays of one view: no pixel twice, as far as there are enough.
+    fn draw_from(&self, view: usize, count: usize, rng: &mut impl Rng, out: &mut Vec<TrainRay>) {
+        let columns = self.columns();
         let mut pixels = Cow::from(&self.pixels[view]);
-        let mut single = count;
         if let Some((windows, whole)) = &self.windows {
             let whole = &whole[view];
-            let mut chosen: Vec<u32> =
-                sample(&mut rng, whole.len(), windows.count.min(whole.len())).iter().map(|at| whole[at]).collect();
-            chosen.iter().flat_map(|&w| windows.pixels(w, columns)).for_each(|pixel| add(view, pixel));
-            single -= chosen.len() * windows.side * windows.side;
+            let most = windows.fitting(count).min(whole.len());
+            let mut chosen: Vec<u32> = sample(rng, whole.len(), most).iter().map(|at| whole[at]).collect();
+            let inside = chosen.iter().flat_map(|&w| windows.pixels(w, columns));
+            out.extend(inside.map(|pixel| self.ray(view, pixel)));
             chosen.sort_unstable();
-            let inside = |p: &u32| windows.of(*p, columns).is_some_and(|w| chosen.binary_search(&w).is_ok());
-            let outside: Vec<u32> = pixels.iter().copied().filter(|p| !inside(p)).collect();
-            // Where windows take all pixels, what is missing comes from all again.
+            let is_inside = |p: &u32| windows.of(*p, columns).is_some_and(|w| chosen.binary_search(&w).is_ok());
+            let outside: Vec<u32> = pixels.iter().copied().filter(|p| !is_inside(p)).collect();
+            // If the windows have all pixels, the other rays come from all of them again.
             if !outside.is_empty() {
                 pixels = Cow::from(outside);
             }
         }
-        apart(&mut rng, pixels.len(), single).for_each(|at| add(view, pixels[at]));
+        let single = apart(rng, pixels.len(), count - out.len());
+        out.extend(single.map(|at| self.ray(view, pixels[at])));
+    }
+
+    /// Rays of any views.
+    fn draw_from_all(&self, count: usize, rng: &mut impl Rng, out: &mut Vec<TrainRay>) {
+        let columns = self.columns();
+        if let Some((windows, whole)) = &self.windows {
+            for _ in 0..windows.fitting(count) {
+                let view = self.usable[rng.random_range(0..self.usable.len())];
+                if let Some(&window) = whole[view].choose(rng) {
+                    out.extend(windows.pixels(window, columns).map(|pixel| self.ray(view, pixel)));
+                }
+            }
+        }
+        while out.len() < count {
+            let view = self.usable[rng.random_range(0..self.usable.len())];
+            let pixels = &self.pixels[view];
+            out.push(self.ray(view, pixels[rng.random_range(0..pixels.len())]));
+        }
     }
 }
 
@@ -270,6 +302,8 @@ mod tests {
     #[test]
     fn windows_that_do_not_fit_are_refused() {
         assert!(Windows { count: 16, side: 8 }.validate(2048).is_ok());
+        // A draw of fewer rays has as many as fit.
+        assert_eq!(Windows { count: 16, side: 8 }.fitting(1000), 15);
         for (windows, named) in [((33, 8), "count"), ((0, 8), "count"), ((1, 1), "side"), ((1, 257), "side")] {
             let error = Windows { count: windows.0, side: windows.1 }.validate(2048).unwrap_err().to_string();
             assert!(error.contains(named), "{error}");

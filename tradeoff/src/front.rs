@@ -269,6 +269,8 @@ mod tests {
         let front = Front::parse(&text, "a").unwrap();
         let accuracy = |n: usize| front.near(Size::new(10, [10, 10], [n; 3])).points[0].accuracy();
         assert_eq!([accuracy(8), accuracy(16), accuracy(68), accuracy(512)], [20.0, 20.0, 31.0, 31.0]);
+        let close = |views: usize, n: usize| front.close(Size::new(views, [10, 10], [n; 3]));
+        assert_eq!([close(10, 16), close(15, 70), close(30, 16), close(10, 32)], [true, true, false, false]);
     }
 
     #[test]

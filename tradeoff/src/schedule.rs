@@ -21,8 +21,11 @@ const MEASURED: usize = 3;
 /// Longest measurement of a method, in seconds and as a share of the budget: for short budgets, and for those in which
 /// three seconds matter little. Passes on a less coarse scan predict full passes better.
 const CALIBRATION: [(f64, f64); 2] = [(1.0, 0.1), (3.0, 0.04)];
-/// Least share of a chain's time that its methods after the first take: the first one may end a little late.
+/// Share of a chain's time that is kept for its methods after the first. Of `smooth-tv` they take nine tenths; what is left lets
+/// the first one end a little late.
 const LATER: f64 = 0.7;
+/// Share of that without which they make nothing useful.
+const LEAST_LATER: f64 = 0.1;
 /// Minimum number of steps of a useful field.
 const STEPS: f64 = 10.0;
 
@@ -104,8 +107,12 @@ impl Budget {
         let expected: Vec<(Unknowns, Expected)> = points.iter().map(|p| (p.kind, front.expected(p, size))).collect();
         // A scan as large as one of the front costs what it cost there, on a machine of another speed. That is closer than what
         // a coarser scan tells of the whole.
+        let iterates = points.iter().any(|p| p.kind == Unknowns::Voxels);
         let slower = match front.pass_s {
-            Some(then) if front.close(size) => Some(pass_s(bench.backend)? / then),
+            // If it fails, the methods themselves are timed.
+            Some(then) if iterates && front.close(size) => {
+                pass_s(bench.backend, bench.cancelled).ok().map(|s| s / then)
+            }
             _ => None,
         };
         let built = RefCell::new(vec![]);
@@ -200,7 +207,7 @@ fn as_there(expected: Expected, slower: f64, plan: &mut dyn Plan) -> Costs {
     }
     let then_steps = LATER * expected.steps;
     let then_s = then_steps * step_s;
-    Costs { then_s, then_least_s: 0.1 * then_s, then_steps, ..costs }
+    Costs { then_s, then_least_s: LEAST_LATER * then_s, then_steps, ..costs }
 }
 
 /// The time `seconds` from now.
@@ -269,7 +276,7 @@ fn pick(
     let mut known: Vec<Option<Result<Costs, String>>> = points.iter().map(|_| None).collect();
     // For fields and for voxels; what is known of one kind is the best guess for the other.
     let mut slower: [Option<f64>; 2] = [None; 2];
-    let of = |kind: Unknowns| kind as usize;
+    let index = |kind: Unknowns| kind as usize;
     while known.iter().flatten().filter(|k| k.is_ok()).count() < MEASURED {
         let needed = |i: usize| {
             let (kind, e) = points[i];
@@ -277,7 +284,7 @@ fn pick(
                 Some(Ok(c)) => c.run_s(e.steps, ENOUGH),
                 Some(Err(_)) => f64::INFINITY,
                 None => {
-                    let factor = slower[of(kind)].or(slower[1 - of(kind)]).unwrap_or(1.0);
+                    let factor = slower[index(kind)].or(slower[1 - index(kind)]).unwrap_or(1.0);
                     factor * (ENOUGH * e.steps * e.step_s + e.beside_s)
                 }
             }
@@ -293,7 +300,8 @@ fn pick(
                 if let Ok(costs) = &measured {
                     let (kind, e) = points[at];
                     // Ratio of whole runs, because the steps of a chain differ.
-                    slower[of(kind)] = Some(costs.run_s(e.steps, 1.0) / (e.steps * e.step_s + e.beside_s).max(1e-12));
+                    slower[index(kind)] =
+                        Some(costs.run_s(e.steps, 1.0) / (e.steps * e.step_s + e.beside_s).max(1e-12));
                 }
                 known[at] = Some(measured.map_err(|e| e.to_string()));
             }

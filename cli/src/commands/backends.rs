@@ -22,7 +22,7 @@ pub struct BackendsArgs {
 impl BackendsArgs {
     pub fn run(self) -> Result<()> {
         let (level, threads) = (simd_level(), rayon::current_num_threads());
-        let pass_s = pass_s(&Cpu::new())?;
+        let pass_s = pass_s(&Cpu::new(), &|| false)?;
         let adapters = adapters();
         if self.json {
             let cpu = json!({ "name": "cpu", "simd": level, "threads": threads, "pass_s": pass_s });

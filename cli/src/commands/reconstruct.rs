@@ -118,7 +118,7 @@ impl ReconstructArgs {
         whole.build();
         let name = "reconstruct";
         let command = whole.find_subcommand_mut(name).map(std::mem::take).unwrap_or(clap::Command::new(name));
-        let what = "what to reconstruct with is not said\n\n  --budget 60s     the best method for a minute, all in all, on \
+        let what = "neither --spec nor --budget is given\n\n  --budget 60s     the best method for a minute, all in all, on \
                     this machine\n  --spec fista-tv  total variation\n  --spec balanced  a neural field, for one to five \
                     minutes; conefield explain SPEC says what a spec does";
         command.bin_name("conefield reconstruct").error(ErrorKind::MissingRequiredArgument, what).exit()
@@ -130,7 +130,7 @@ impl ReconstructArgs {
         if !self.resume {
             folder.may_begin(self.force)?;
         }
-        // Before a spec is read: it is text, and a name that is none would come back as another one.
+        // A spec holds the name of this file as text; a name that is not UTF-8 would be stored as another one.
         self.init.as_deref().map(boundary::text).transpose()?;
         let backend = self.protocol.backend.open()?;
         // What is wrong with a spec, or weights that cannot be read or do not fit, is told before anything is made.

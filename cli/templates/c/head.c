@@ -14,14 +14,17 @@ static void say(struct ConefieldText *out, const char *line) {
     memcpy(out->data, line, out->length < out->capacity ? out->length : out->capacity);
 }
 
-/* The number under `key` of the settings. The host has checked them against the schema and filled in defaults: they are one
- * flat JSON object, and the key is there. */
+/* The number under `key` of the settings: one flat JSON object, checked against the schema by the host, with defaults filled in.
+ * For numbers only: settings that are texts, lists or tables need a JSON parser. NaN if the key is not there. */
 static double number(struct ConefieldStr settings, const char *key) {
-    char text[1024], quoted[64];
-    size_t n = settings.length < sizeof text - 1 ? settings.length : sizeof text - 1;
-    memcpy(text, settings.data, n);
-    text[n] = 0;
+    char quoted[64];
+    char *text = malloc(settings.length + 1);
+    if (text == NULL) return NAN;
+    memcpy(text, settings.data, settings.length);
+    text[settings.length] = 0;
     snprintf(quoted, sizeof quoted, "\"%s\":", key);
     const char *at = strstr(text, quoted);
-    return at == NULL ? 0.0 : strtod(at + strlen(quoted), NULL);
+    double value = at == NULL ? NAN : strtod(at + strlen(quoted), NULL);
+    free(text);
+    return value;
 }

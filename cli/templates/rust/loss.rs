@@ -22,8 +22,9 @@ impl Default for Settings {
 #[typetag::serde(name = "@name@")]
 impl LossSpec for Settings {
     fn build(&self) -> Result<Box<dyn Loss>> {
-        let good = self.scale.is_finite() && self.scale > 0.0;
-        ensure(good, "spec", "scale", self.scale, "a positive finite number")?;
+        // A shader has it in single precision.
+        let good = self.scale > 0.0 && (self.scale as f32).is_normal();
+        ensure(good, "spec", "scale", self.scale, "a positive number of single precision")?;
         Ok(Box::new(self.clone()))
     }
 }

@@ -32,7 +32,8 @@ impl Default for SceneSettings {
 impl SceneSettings {
     /// Refuses invalid settings.
     pub fn validate(&self) -> Result<()> {
-        ensure(self.fill > 0.0 && self.fill <= 1.0, "spec", "scene.fill", self.fill, "a number above 0 and at most 1")?;
+        // In a smaller part of the cube neighbouring positions would be the same number in single precision.
+        ensure((0.01..=1.0).contains(&self.fill), "spec", "scene.fill", self.fill, "0.01 to 1")?;
         if let AttenuationScale::Fixed(x) | AttenuationScale::Relative(x) = self.attenuation {
             ensure(x.is_finite() && x > 0.0, "spec", "scene.attenuation", x, "a positive finite number")?;
         }

@@ -3,7 +3,7 @@
 use conefield_core::error::{Result, ensure};
 use conefield_core::loss::Loss;
 use conefield_core::settings::LossSpec;
-use conefield_core::wgsl::Fragment;
+use conefield_core::wgsl::{Fragment, is_positive};
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
@@ -11,8 +11,8 @@ use serde::{Deserialize, Serialize};
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields, default)]
 pub struct Huber {
-    /// The difference from which the loss is linear, in the scale that stages see: the most absorbing rays measure
-    /// about 0.25 there.
+    /// The difference from which the loss is linear, in the scale that stages see. The most absorbing rays measure about 0.25
+    /// there with `scene.attenuation = "scan"`, and about 1 with `{ relative = 0.25 }`.
     pub delta: f64,
 }
 
@@ -27,8 +27,7 @@ conefield_core::stage_type!(Loss, "huber", Huber, "half the squared difference, 
 #[typetag::serde(name = "huber")]
 impl LossSpec for Huber {
     fn build(&self) -> Result<Box<dyn Loss>> {
-        let usable = self.delta.is_finite() && self.delta > 0.0;
-        ensure(usable, "spec", "delta", self.delta, "a positive finite number")?;
+        ensure(is_positive(self.delta), "spec", "delta", self.delta, "a positive number of single precision")?;
         Ok(Box::new(*self))
     }
 }

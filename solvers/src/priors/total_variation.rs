@@ -3,7 +3,7 @@
 use conefield_core::error::{Result, ensure};
 use conefield_core::prior::{Blocks, Prior};
 use conefield_core::settings::PriorSpec;
-use conefield_core::wgsl::Fragment;
+use conefield_core::wgsl::{Fragment, is_positive};
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
@@ -40,8 +40,8 @@ conefield_core::stage_type!(
 impl PriorSpec for TotalVariation {
     fn build(&self) -> Result<Box<dyn Prior>> {
         self.blocks().validate()?;
-        let usable = self.smoothing.is_finite() && self.smoothing > 0.0;
-        ensure(usable, "spec", "smoothing", self.smoothing, "a positive finite number")?;
+        let found = self.smoothing;
+        ensure(is_positive(found), "spec", "smoothing", found, "a positive number of single precision")?;
         Ok(Box::new(*self))
     }
 }
