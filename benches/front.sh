@@ -26,7 +26,7 @@ run() {
     for volume in $volumes; do
         [[ -f $out/$name-$volume.json ]] && continue
         published_scan "$data" "$volume" "$out/$volume"
-        "$bin" backends --json >>"$out/backends.jsonl"
+        "$bin" backends --json >"$out/$name-$volume.speed"
         "$bin" -q reconstruct "$out/$volume" -o "$out/run" --force --reference truth --spec "$spec" "${sets[@]}" >/dev/null
         cp "$out/run/record.json" "$out/$name-$volume.json"
     done
@@ -52,10 +52,12 @@ def beats(a, b):
     return faster and better
 kept = [b for b in names if not any(beats(a, b) for a in names if a != b)]
 first = records[names[0]]
+# The machine's speed, again before each run.
+speeds = [json.load(open(f"{out}/{name}-{volume}.speed"))["backends"][0]["pass_s"] for name in names for volume in volumes]
 lines = ['# Picked from by "conefield reconstruct --budget": the best of what fits, on those of these scans whose volumes are nearest in size.',
          '# bash benches/front.sh makes it (docs/records/methods.md).',
          f'made = "conefield {first[0]["version"]}, {first[0]["threads"]} threads, {first[0]["simd"]}"',
-         f"pass_s = {statistics.median(json.loads(line)['backends'][0]['pass_s'] for line in open(f'{out}/backends.jsonl')):.4f}"]
+         f"pass_s = {statistics.median(speeds):.4f}"]
 for volume, record in zip(volumes, first):
     scan = record["scan"]
     lines += ["", "[[scans]]", f'name = "{volume}"', f'views = {scan["views"]}', f'detector = {scan["detector"]}', f'volume = {scan["volume"]}']

@@ -151,7 +151,7 @@ struct Files {
 }
 
 #[derive(Deserialize, Clone, Copy, Default)]
-#[serde(deny_unknown_fields)]
+#[serde(deny_unknown_fields, expecting = "u and v, as in { u = 0.2, v = 0.2 }")]
 struct Uv {
     u: f64,
     v: f64,

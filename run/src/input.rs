@@ -60,7 +60,7 @@ impl Input {
             reference: self.reference.as_ref(),
             peak: self.peak,
             seed,
-            limits: Limits { deadline, then, ..limits },
+            limits: Limits { deadline, then, steps: limits.steps.or(schedule.and_then(|s| s.passes)), ..limits },
             volumes: &files::volume,
             ..Job::new(&self.scan, backend)
         }

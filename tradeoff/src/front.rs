@@ -205,9 +205,27 @@ impl Front {
     /// Whether one of its scans is about as large: the front then says what methods cost, as far as the speeds of both machines do.
     pub fn close(&self, size: Size) -> bool {
         let within = |a: f64, b: f64| (a / b).ln().abs() < NEAR.ln();
-        self.scans.iter().any(|scan| {
-            let then = Size::new(scan.views, scan.detector, scan.volume);
-            within(then.pixels, size.pixels) && within(then.voxels, size.voxels)
+        self.sizes().any(|then| within(then.pixels, size.pixels) && within(then.voxels, size.voxels))
+    }
+
+    /// Whether all of its scans are larger: a method takes less time than there.
+    pub fn larger(&self, size: Size) -> bool {
+        self.sizes().all(|then| then.pixels > size.pixels && then.voxels > size.voxels)
+    }
+
+    fn sizes(&self) -> impl Iterator<Item = Size> {
+        self.scans.iter().map(|scan| Size::new(scan.views, scan.detector, scan.volume))
+    }
+
+    /// The cost of `point` on the smallest of the scans.
+    pub fn least(&self, point: &Point) -> Expected {
+        let sizes: Vec<Size> = self.sizes().collect();
+        let costs = sizes.iter().map(|size| self.expected(point, *size));
+        let whole = |e: &Expected| e.steps * e.step_s + e.beside_s;
+        costs.min_by(|a, b| whole(a).total_cmp(&whole(b))).unwrap_or(Expected {
+            steps: 1.0,
+            step_s: 0.0,
+            beside_s: 0.0,
         })
     }
 
@@ -271,6 +289,8 @@ mod tests {
         assert_eq!([accuracy(8), accuracy(16), accuracy(68), accuracy(512)], [20.0, 20.0, 31.0, 31.0]);
         let close = |views: usize, n: usize| front.close(Size::new(views, [10, 10], [n; 3]));
         assert_eq!([close(10, 16), close(15, 70), close(30, 16), close(10, 32)], [true, true, false, false]);
+        let larger = |views: usize, n: usize| front.larger(Size::new(views, [10, 10], [n; 3]));
+        assert_eq!([larger(9, 15), larger(10, 15), larger(9, 20)], [true, false, false]);
     }
 
     #[test]

@@ -68,6 +68,9 @@ pub struct Schedule {
     pub expected: Costs,
     /// Planned seconds of training.
     pub train_s: f64,
+    /// Passes at which a voxel method ends by itself, however much time is left: more of them do not always come closer.
+    #[serde(skip)]
+    pub passes: Option<u64>,
     #[serde(skip)]
     kind: Unknowns,
     /// Planned end of training.
@@ -106,11 +109,11 @@ impl Budget {
         points.sort_by(|a, b| b.accuracy().total_cmp(&a.accuracy()));
         let expected: Vec<(Unknowns, Expected)> = points.iter().map(|p| (p.kind, front.expected(p, size))).collect();
         // A scan as large as one of the front costs what it cost there, on a machine of another speed. That is closer than what
-        // a coarser scan tells of the whole.
+        // a coarser scan tells of the whole. A smaller scan costs less.
         let iterates = points.iter().any(|p| p.kind == Unknowns::Voxels);
         let slower = match front.pass_s {
             // If it fails, the methods themselves are timed.
-            Some(then) if iterates && front.close(size) => {
+            Some(then) if iterates && (front.close(size) || front.larger(size)) => {
                 pass_s(bench.backend, bench.cancelled).ok().map(|s| s / then)
             }
             _ => None,
@@ -118,11 +121,21 @@ impl Budget {
         let built = RefCell::new(vec![]);
         let measure = |i: usize| {
             let mut method = build(&points[i].spec, &points[i].sets)?;
-            let costs = match (slower, expected[i]) {
-                (Some(slower), (Unknowns::Voxels, e)) => {
-                    Costs { picture_s: picture(bench)?, score_s: score(bench)?, ..as_there(e, slower, method.plan()) }
+            let there = match (slower, points[i].kind) {
+                (Some(slower), Unknowns::Voxels) => {
+                    let e = if front.close(size) { expected[i].1 } else { front.least(points[i]) };
+                    let there = as_there(e, slower, method.plan());
+                    Some(Costs { picture_s: picture(bench)?, score_s: score(bench)?, ..there })
                 }
-                _ => calibrate(bench, method.plan(), self.measuring() / 2.0)?,
+                _ => None,
+            };
+            let whole = |c: &Costs| c.run_s(expected[i].1.steps, 1.0);
+            let costs = match there {
+                Some(there) if front.close(size) => there,
+                there => {
+                    let here = calibrate(bench, method.plan(), self.measuring() / 2.0)?;
+                    there.filter(|t| whole(t) < whole(&here)).unwrap_or(here)
+                }
             };
             built.borrow_mut().push((i, method));
             Ok(costs)
@@ -181,11 +194,19 @@ impl Budget {
             );
             return Err(Error::invalid(TOO_SHORT.trim_end_matches(": "), "time", time(self.seconds), expected));
         }
+        let plan = method.plan();
+        let passes = match (kind, plan.links()) {
+            (Unknowns::Field, _) => None,
+            (Unknowns::Voxels, [first, ..]) => first.passes(),
+            (Unknowns::Voxels, []) => method.plan().passes(),
+        };
+        let steps = (train_s / costs.step_s.max(1e-12)) as u64;
         Ok(Schedule {
             point,
             why,
             passed_over,
-            steps: (train_s / costs.step_s.max(1e-12)) as u64,
+            steps: passes.map_or(steps, |most| most.min(steps)),
+            passes,
             load_s,
             calibrate_s: start.elapsed().as_secs_f64(),
             expected: costs,

@@ -10,6 +10,7 @@ use conefield_projectors::simulate::DetectorNoise;
 use conefield_run::simulation::{self, Changes};
 use serde_json::json;
 use std::path::PathBuf;
+use tracing::warn;
 
 /// Make a scan of a known volume.
 ///
@@ -84,6 +85,12 @@ impl SimulateArgs {
         let (scan, volume) = simulation::scan(volume, self.values, &protocol, &self.volume)?;
         conefield_io::write_scan(&self.output, &scan, Some(&volume))?;
         let g = &scan.geometry;
+        if scan.projections.iter().all(|a| *a == 0.0) {
+            warn!(
+                "every line integral is 0: no ray meets the object; lengths of the protocol are in its unit ({} mm)",
+                scan.unit.mm
+            );
+        }
         if self.json {
             return out::json(&json!({
                 "scan": self.output, "views": g.views.len(), "detector": g.detector, "volume": g.volume.shape,
