@@ -118,14 +118,18 @@ impl Budget {
             }
             _ => None,
         };
+        let afterwards = match slower {
+            Some(_) => Costs { picture_s: picture(bench)?, score_s: score(bench)?, ..Costs::default() },
+            None => Costs::default(),
+        };
         let built = RefCell::new(vec![]);
         let measure = |i: usize| {
             let mut method = build(&points[i].spec, &points[i].sets)?;
             let there = match (slower, points[i].kind) {
                 (Some(slower), Unknowns::Voxels) => {
                     let e = if front.close(size) { expected[i].1 } else { front.least(points[i]) };
-                    let there = as_there(e, slower, method.plan());
-                    Some(Costs { picture_s: picture(bench)?, score_s: score(bench)?, ..there })
+                    let Costs { picture_s, score_s, .. } = afterwards;
+                    Some(Costs { picture_s, score_s, ..as_there(e, slower, method.plan()) })
                 }
                 _ => None,
             };
