@@ -51,7 +51,9 @@ impl fmt::Display for Warning {
 
 /// Usual ranges of distances in mm and of attenuation in 1/mm.
 const DISTANCES: [f64; 2] = [10.0, 5000.0];
-const ATTENUATIONS: [f64; 2] = [1e-4, 1.0];
+const ATTENUATIONS: [f64; 2] = [1e-4, 10.0];
+/// Fewest voxels along a side that are worth a proposal.
+const FEW: f64 = 8.0;
 /// Smallest sufficient overlap past the axis, as a share of the detector.
 const OVERLAP: f64 = 0.05;
 /// A gap is large if it exceeds the mean gap by this factor.
@@ -183,7 +185,7 @@ fn angles(scan: &Scan, s: &Survey, warn: Warn) {
     if !a.full_circle && a.covered_deg < least - a.mean_gap_deg.max(0.1) {
         warn(
             WarningKind::Arc,
-            format!("the views cover an arc of {:.1}°, less than {why}", a.covered_deg),
+            format!("the views cover an arc of {:.1}°, less than {least:.1}°: {why}", a.covered_deg),
             format!(
                 "edges along the missing directions will be blurred; take views over {least:.0}°, or check the range of \
                  the angles"
@@ -212,11 +214,15 @@ fn scale(scan: &Scan, s: &Survey, warn: Warn) {
     }
     let dso = s.setup.source_to_axis_mm;
     if !(DISTANCES[0]..=DISTANCES[1]).contains(&dso) {
-        let likely = if dso < DISTANCES[0] { "metres" } else { "micrometres" };
+        let advice = if dso < DISTANCES[0] {
+            "unless this is a micro-CT, check that the lengths are mm and not metres"
+        } else {
+            "check that the lengths are mm and not micrometres"
+        };
         warn(
             WarningKind::Scale,
-            format!("the source is {dso:.4} mm from the axis; scanners have {} to {} mm", DISTANCES[0], DISTANCES[1]),
-            format!("check that the lengths are mm and not {likely}"),
+            format!("the source is {dso:.4} mm from the axis; most have {} to {} mm", DISTANCES[0], DISTANCES[1]),
+            advice.into(),
         );
     }
     let mu = s.attenuation_per_mm;
@@ -249,15 +255,17 @@ fn voxels(scan: &Scan, s: &Survey, warn: Warn) {
         return;
     }
     let size = grid.size();
-    let fitting: Vec<String> =
-        (0..3).map(|k| format!("{}", (size[k] / supported[k]).round().max(1.0) as usize)).collect();
+    let fitting: [f64; 3] = std::array::from_fn(|k| (size[k] / supported[k]).round().max(1.0));
     let found = format!(
         "voxels of {} where a pixel over the magnification of {:.3} is {}",
         list(grid.spacing),
         s.setup.magnification,
         list(supported)
     );
-    let shape = format!("a shape of [{}] has voxels of that size", fitting.join(", "));
+    let shape = match fitting.iter().all(|n| *n >= FEW) {
+        true => format!("a shape of {:?} has voxels of that size", fitting.map(|n| n as usize)),
+        false => "check that the pixel size is in mm, and that dso and dsd are not swapped".into(),
+    };
     match fine {
         true => warn(WarningKind::VoxelSize, found, format!("finer than the detector sees; {shape}")),
         false => warn(WarningKind::VoxelSize, found, format!("details that the detector sees are lost; {shape}")),

@@ -28,7 +28,12 @@ pub(crate) fn within(folder: &Path, place: &str, field: &str, name: &str) -> Res
     let shown = || format!("\"{name}\"");
     let down = Path::new(name).components().all(|c| matches!(c, Component::Normal(_) | Component::CurDir));
     if name.is_empty() || !down || name.contains(['\\', ':', '\0']) {
-        return Err(Error::invalid(place, field, shown(), "a path inside the folder, without \"..\""));
+        return Err(Error::invalid(
+            place,
+            field,
+            shown(),
+            "a relative path inside the folder, without \"..\" and backslashes",
+        ));
     }
     let path = folder.join(name);
     let real = path.canonicalize().map_err(|e| Error::invalid(place, field, format!("{} ({e})", shown()), "a file"))?;

@@ -395,6 +395,9 @@ fn views(folder: &Path, place: &str, d: &Description, count: usize) -> Result<Ve
             for (field, x) in [("circle.dso", c.dso), ("circle.dsd", c.dsd)] {
                 ensure(x.is_finite() && x > 0.0, place, field, x, "a positive finite length in mm")?;
             }
+            let expected =
+                format!("more than the {} of dso: the detector lies behind the axis (are they swapped?)", c.dso);
+            ensure(c.dsd > c.dso, place, "circle.dsd", c.dsd, expected)?;
             lengths(place, "circle", c.pixel, c.offset)?;
             let (pixel, offset) = ([c.pixel.v, c.pixel.u], [c.offset.v, c.offset.u]);
             let tilt = [("u", c.tilt_deg.u), ("v", c.tilt_deg.v), ("normal", c.tilt_deg.normal)];

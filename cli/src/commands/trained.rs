@@ -34,6 +34,12 @@ impl Trained {
     /// Reads the field, if it fits into memory together with `buffers` bytes.
     pub fn open(&self, buffers: u64) -> Result<OpenedField> {
         let file = if self.run.is_dir() { self.run.join("weights.safetensors") } else { self.run.clone() };
+        let volume = self.run.join("volume.nii.gz");
+        if self.run.is_dir() && !file.exists() && volume.exists() {
+            let expected =
+                format!("a run that trained a field; \"conefield convert {}\" writes other formats", volume.display());
+            return Err(Error::invalid(self.run.display().to_string(), "field", "voxels without a field", expected));
+        }
         let bytes = file.metadata().map_err(|e| Error::io(&file, e))?.len();
         memory(bytes, buffers)?;
         let field = files::read_field(&file)?;

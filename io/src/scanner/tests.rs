@@ -259,6 +259,7 @@ fn hostile_descriptions_and_files_are_refused_in_words() {
     edit("dso = 500.0", "dso = 10.0", &["views[0]", "inside the volume"]);
     edit("u = 2.0, v", "v", &["u", "nothing"]);
     edit("u = 2.0, v", "u = 0.0, v", &["circle.pixel.u", "positive"]);
+    edit("dsd = 800.0", "dsd = 300.0", &["circle.dsd", "300", "swapped"]);
     edit("direction = \"counterclockwise\"", "", &["direction", "nothing"]);
     edit("\"counterclockwise\"", "\"left\"", &["direction", "left", "clockwise"]);
     edit("step_deg = 14.4", "", &["circle.step_deg", "no angles", "angles_deg"]);
