@@ -10,7 +10,7 @@ use std::path::Path;
 pub struct Board(EventFile);
 
 impl Board {
-    /// The file `path`, with the records that `metrics` holds already, one a line.
+    /// Opens the file `path` with the existing records in `metrics`, one per line.
     pub fn new(path: &Path, metrics: &Path) -> Result<Self> {
         let mut board = Self(EventFile::create(path)?);
         let text = fs::read_to_string(metrics).map_err(|e| Error::io(metrics, e))?;
@@ -20,14 +20,14 @@ impl Board {
         Ok(board)
     }
 
-    /// Adds a line of `metrics.jsonl`: a point to the curve of each of its numbers.
+    /// Adds a line of `metrics.jsonl`: one point per number, to the curve of that number.
     pub fn record(&mut self, record: &Value) -> Result<()> {
         let (step, numbers) = (record["step"].as_u64().unwrap_or(0), record.as_object().into_iter().flatten());
         let numbers = numbers.filter(|(name, _)| *name != "step");
         self.0.scalars(step, numbers.filter_map(|(name, x)| Some((name.as_str(), x.as_f64()?))))
     }
 
-    /// Adds the picture in the file `png` under the name `name`.
+    /// Adds the picture in the file `png` as `name`.
     pub fn picture(&mut self, step: u64, name: &str, png: &Path) -> Result<()> {
         self.0.picture(step, name, &fs::read(png).map_err(|e| Error::io(png, e))?)
     }

@@ -1,6 +1,6 @@
-//! What a command reads and what it writes: the first is never removed or overwritten by the second.
+//! Inputs and outputs of a command: an output never removes or overwrites an input.
 //!
-//! Files are the same if the system says that they are, whatever they are called.
+//! Files are compared by identity as reported by the system, not by name.
 
 use conefield_core::error::ensure;
 use conefield_core::spec::load::Loaded;
@@ -8,7 +8,7 @@ use conefield_core::{Error, Result};
 use serde_json::Value;
 use std::path::{Path, PathBuf};
 
-/// Keys of a spec whose texts name files.
+/// Keys of a spec whose values name files.
 const FILES: [&str; 4] = ["weights", "path", "paths", "start"];
 
 /// The files and folders that a command reads.
@@ -16,25 +16,25 @@ const FILES: [&str; 4] = ["weights", "path", "paths", "start"];
 pub struct Inputs(Vec<PathBuf>);
 
 impl Inputs {
-    /// These; what is no file, such as the name of a phantom, does no harm.
+    /// The inputs in `paths`; entries that are not files, such as names of phantoms, are harmless.
     pub fn of<P: AsRef<Path>>(paths: impl IntoIterator<Item = P>) -> Self {
         Self::default().and(paths)
     }
 
-    /// These too.
+    /// Adds further inputs.
     pub fn and<P: AsRef<Path>>(mut self, paths: impl IntoIterator<Item = P>) -> Self {
         self.0.extend(paths.into_iter().map(|p| p.as_ref().to_path_buf()).filter(|p| p.exists()));
         self
     }
 
-    /// Also a spec with all that it extends and names.
+    /// Adds a spec with everything it extends and names.
     pub fn and_spec(self, loaded: &Loaded) -> Self {
         let mut named = vec![];
         texts(&loaded.tree, &|key| FILES.contains(&key), &mut named);
         self.and(loaded.sources()).and(named)
     }
 
-    /// Also a description with every file that it names beside it: TOML.
+    /// Adds a TOML description with every file that it names.
     pub fn and_description(self, path: &Path) -> Self {
         let text = conefield_core::files::read_text(path, 16 << 20).unwrap_or_default();
         let tree: Value = toml::from_str(&text).unwrap_or_default();
@@ -44,7 +44,7 @@ impl Inputs {
         self.and([path]).and(named.into_iter().map(|n| folder.join(n)))
     }
 
-    /// Refuses to write a file that is read, or that lies in a folder that is read.
+    /// Refuses to write a file that is an input or lies in an input folder.
     pub fn spare_file(&self, output: &Path) -> Result<()> {
         if output.symlink_metadata().is_err() {
             return Ok(());
@@ -60,7 +60,7 @@ impl Inputs {
         Ok(())
     }
 
-    /// Refuses to replace a folder that is read, or in which something is that is read.
+    /// Refuses to replace a folder that is an input or contains one.
     pub fn spare_folder(&self, output: &Path) -> Result<()> {
         for input in self.0.iter().filter(|_| output.exists()) {
             let found = format!("{} in it, which this command reads", input.display());
@@ -75,18 +75,18 @@ fn place(path: &Path) -> String {
     path.display().to_string()
 }
 
-/// Where a name stands, without following it if it is a link.
+/// The location of a path, without following it if it is a link.
 fn named(path: &Path) -> Option<PathBuf> {
     let folder = path.parent().filter(|p| !p.as_os_str().is_empty()).unwrap_or(Path::new("."));
     Some(folder.canonicalize().ok()?.join(path.file_name()?))
 }
 
-/// Whether `path`, which is whole, is `folder` or lies in it.
+/// Whether the absolute `path` is `folder` or lies in it.
 fn below(path: &Path, folder: &Path) -> bool {
     folder.canonicalize().is_ok_and(|f| path.starts_with(f))
 }
 
-/// All texts of `tree` under keys that `wanted` takes.
+/// All strings of `tree` under keys accepted by `wanted`.
 fn texts(tree: &Value, wanted: &dyn Fn(&str) -> bool, found: &mut Vec<String>) {
     fn walk(value: &Value, take: bool, wanted: &dyn Fn(&str) -> bool, found: &mut Vec<String>) {
         match value {
@@ -99,28 +99,28 @@ fn texts(tree: &Value, wanted: &dyn Fn(&str) -> bool, found: &mut Vec<String>) {
     walk(tree, false, wanted, found);
 }
 
-/// Refuses to write over something unless `force`.
+/// Refuses to overwrite an existing path unless `force`.
 pub fn refuse_existing(path: &Path, force: bool) -> Result<()> {
     let empty = std::fs::read_dir(path).is_ok_and(|mut d| d.next().is_none());
     let free = force || empty || path.symlink_metadata().is_err();
     ensure(free, &place(path), "output", "an existing file or folder", "a new name, or --force")
 }
 
-/// Refuses a name that does not end as the files do that are written under it: what has another end is something else.
+/// Refuses a path without the file extension of the output: another extension would mean another format.
 pub fn ends(path: &Path, end: &str) -> Result<()> {
     let found = path.file_name().map(|n| n.to_string_lossy().into_owned()).unwrap_or_default();
     let fits = path.extension().is_some_and(|e| e.eq_ignore_ascii_case(end));
     ensure(fits, &place(path), "file name", found, format!("an end of .{end}"))
 }
 
-/// Refuses a picture that would not be one, or that would overwrite what is read.
+/// Refuses a picture path that is not a picture, or that would overwrite an input.
 pub fn picture(path: Option<&Path>, inputs: &Inputs) -> Result<()> {
     let Some(path) = path else { return Ok(()) };
     ends(path, "png")?;
     inputs.spare_file(path)
 }
 
-/// A path that a spec can hold.
+/// A path that can be stored in a spec.
 pub fn text(path: &Path) -> Result<&str> {
     let found = || format!("{}, a name with bytes that are not UTF-8", path.display());
     path.to_str().ok_or_else(|| {

@@ -37,7 +37,7 @@ use serde::{Deserialize, Serialize};
 use std::ffi::OsString;
 use std::path::PathBuf;
 
-/// The subcommands; the help of each is that of its arguments.
+/// The subcommands; their help is that of their arguments.
 #[derive(Subcommand)]
 pub enum Command {
     Simulate(simulate::SimulateArgs),
@@ -135,7 +135,7 @@ impl General {
     }
 }
 
-/// When training ends, whichever comes first.
+/// Limits of training; the first one reached ends it.
 #[derive(Debug, Clone, Args, Serialize, Deserialize)]
 pub struct EndOptions {
     /// Stop training after this time, such as 600s or 10m, without the time before and after training.

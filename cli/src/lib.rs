@@ -1,7 +1,7 @@
 //! conefield for Rust programs, and the `conefield` command.
 //!
-//! [`Reconstruct`] goes from a scan to a volume, and [`io`] between files and these; [`simulate`] makes scans of known volumes. What
-//! they are built from is in the other modules here.
+//! [`Reconstruct`] turns a scan into a volume, [`io`] reads and writes both, and [`simulate`] makes scans of known
+//! volumes. The other modules contain their building blocks.
 //!
 //! ```no_run
 //! # fn main() -> conefield::Result<()> {
@@ -47,13 +47,14 @@ struct Cli {
     general: commands::General,
 }
 
-/// Runs the command line of this process. `held` returns the bytes that its allocator has handed out.
+/// Runs the command line of this process. `held` returns the bytes allocated now.
 pub fn main(held: fn() -> u64) -> ExitCode {
     memory::count(held);
     run(std::env::args_os())
 }
 
-/// Runs a command line, the program's name first. Exit status: 0 done, 1 failed, 2 wrong use, 130 or 143 interrupted.
+/// Runs a command line, starting with the program's name. Exit status: 0 success, 1 failure, 2 usage error, 130 or 143
+/// interrupted.
 pub fn run(args: impl IntoIterator<Item = OsString>) -> ExitCode {
     let cli = Cli::parse_from(args);
     let general = cli.general;
@@ -72,11 +73,11 @@ pub fn run(args: impl IntoIterator<Item = OsString>) -> ExitCode {
         log::error(&format!("{n} threads: {e}"));
         return ExitCode::FAILURE;
     }
-    // What is checked is entered in a process of its own, and alone.
+    // A plugin under check is loaded only in a separate process.
     if !matches!(&cli.command, commands::Command::Plugins(p) if p.is_check()) {
         plugins::search(&general.plugins, general.allow_plugins_from_spec);
     }
-    // What is refused is what `plugins` is there to show.
+    // `plugins` shows refused plugins itself.
     let listed = matches!(cli.command, commands::Command::Plugins(_));
     let settled = if listed { Ok(()) } else { plugins::settle() };
     match settled.and_then(|()| commands::run(cli.command, &general)) {

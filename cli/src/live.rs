@@ -1,4 +1,4 @@
-//! `live.png`: the middle slices of a field while it trains.
+//! `live.png`: the middle slices of a field during training.
 
 use crate::files;
 use conefield_core::Result;
@@ -9,7 +9,7 @@ use ndarray::Array3;
 use std::path::{Path, PathBuf};
 use std::time::{Duration, Instant};
 
-/// The picture, and how often it is drawn.
+/// The live picture and its interval.
 pub struct Live {
     path: PathBuf,
     every: Duration,
@@ -27,7 +27,7 @@ impl Live {
         self.last.elapsed() >= self.every
     }
 
-    /// Draws `slices` of `grid`; where the picture is. It replaces the last one at once.
+    /// Draws `slices` of `grid` and returns the path. The picture is replaced atomically.
     pub fn draw(&mut self, grid: VoxelGrid, slices: &[(Part, Array3<f32>)]) -> Result<&Path> {
         let mut middle = MiddleSlices::new(grid);
         slices.iter().for_each(|(part, values)| middle.gather(part, values.view()));

@@ -1,5 +1,5 @@
-//! The log on standard error. Messages may contain text from files, so each is one line of bounded length without control
-//! characters. A closed log does not end the work.
+//! The log on standard error. Messages may contain text from files, so each is one line of limited length without
+//! control characters. A closed log does not stop the work.
 
 use crate::out::{LONGEST_LINE, plain_line};
 use crate::progress;
@@ -12,10 +12,11 @@ use tracing_subscriber::field::MakeExt as _;
 use tracing_subscriber::fmt::format;
 use tracing_subscriber::fmt::format::Writer;
 
-/// The variable that sets the log level without --verbose and --quiet.
+/// The environment variable for the log level without --verbose and --quiet.
 const VARIABLE: &str = "RUST_LOG";
 
-/// Starts the log: warnings and news, more with `verbose`, errors only when `quiet`, else what `RUST_LOG` asks for.
+/// Starts the log: warnings and information by default, more with `verbose`, errors only if `quiet`, otherwise as set
+/// in `RUST_LOG`.
 pub fn start(verbose: u8, quiet: bool) {
     let level = match (quiet, verbose) {
         (true, _) => "error",
@@ -41,18 +42,18 @@ pub fn start(verbose: u8, quiet: bool) {
     }
 }
 
-/// One field of an event; the message has no name.
+/// Formats one field of an event; the message has no name.
 fn field(writer: &mut Writer<'_>, field: &Field, value: &dyn fmt::Debug) -> fmt::Result {
     let text = plain_line(&format!("{value:?}"), LONGEST_LINE);
     if field.name() == "message" { write!(writer, "{text}") } else { write!(writer, "{}={text}", field.name()) }
 }
 
-/// Tells the error that ends the command.
+/// Logs the error that ends the command.
 pub fn error(text: &str) {
     let _ = writeln!(Stderr, "error: {}", plain_line(text, LONGEST_LINE));
 }
 
-/// Standard error, written while no bar is drawn. That it is closed or full is no reason to end a work.
+/// Standard error, written between redraws of bars. Failed writes (closed, full) do not stop the work.
 struct Stderr;
 
 impl Write for Stderr {

@@ -1,4 +1,4 @@
-//! Results on standard output, for people and for programs.
+//! Results on standard output, readable or as JSON.
 
 use conefield_core::{Error, Result};
 pub use conefield_report::text::{bytes, duration, number, table};
@@ -7,17 +7,17 @@ use serde::Serialize;
 use std::fmt::Write as _;
 use std::io::{ErrorKind, Write};
 
-/// Characters of a line of the log, or of an error, that are still shown.
+/// Maximum characters shown of a line of the log or of an error.
 pub const LONGEST_LINE: usize = 4000;
 
-/// Prints `text` and a line end. A reader that has gone away (`| head`) is no failure.
+/// Prints `text` and a line end. A closed reader (`| head`) is not an error.
 pub fn say(text: &str) -> Result<()> {
     print(&plain(text))
 }
 
 /// Prints one JSON object.
 pub fn json(value: &impl Serialize) -> Result<()> {
-    // JSON leaves these characters as they are, but reads them escaped as well.
+    // JSON does not escape these characters by itself, but may.
     let text = to_json(value)?;
     print(&escaped(&text, |c| c.is_control() && c != '\n', |c, out| write!(out, "\\u{:04x}", c as u32)))
 }
@@ -29,13 +29,13 @@ fn print(text: &str) -> Result<()> {
     }
 }
 
-/// `text` without anything that a terminal obeys but ends of lines.
+/// `text` without terminal control characters except line ends.
 fn plain(text: &str) -> String {
     escaped(text, |c| obeyed(c) && c != '\n', |c, out| write!(out, "{}", c.escape_default()))
 }
 
-/// `text` in one line of at most `most` characters, without anything that a terminal obeys. Of a longer one the middle is
-/// left out: where a message begins and what it expects at its end both stay.
+/// `text` as one line of at most `most` characters, without terminal control characters. A longer text loses its
+/// middle, so that the start of a message and the expectation at its end stay.
 pub fn plain_line(text: &str, most: usize) -> String {
     let count = text.chars().count();
     if count <= most {
@@ -47,7 +47,7 @@ pub fn plain_line(text: &str, most: usize) -> String {
     format!("{begin}… ({} characters left out) …{end}", count - 2 * (most / 2))
 }
 
-/// What a terminal does not show but does: control characters, and those that turn the direction of writing.
+/// Characters that control a terminal: control characters, and those that change the writing direction.
 fn obeyed(c: char) -> bool {
     c.is_control()
         || matches!(c, '\u{200e}' | '\u{200f}' | '\u{2028}' | '\u{2029}' | '\u{202a}'..='\u{202e}' | '\u{2066}'..='\u{2069}')
@@ -57,7 +57,7 @@ fn escaped(text: &str, bad: impl Fn(char) -> bool, escape: impl Fn(char, &mut St
     let mut out = String::with_capacity(text.len());
     for c in text.chars() {
         if bad(c) {
-            // Writing to a text does not fail.
+            // Writing to a string cannot fail.
             let _ = escape(c, &mut out);
         } else {
             out.push(c);

@@ -1,4 +1,4 @@
-//! Voxels on their way to a file: shows progress and keeps what the end of a run needs.
+//! Writing of voxels to a file: shows progress and keeps what the end of a run needs.
 
 use crate::out::duration;
 use crate::progress::Progress;
@@ -12,20 +12,20 @@ use ndarray::{Array3, ArrayViewMut3};
 use std::path::Path;
 use std::time::Instant;
 
-/// Writes `voxels` to `path` and keeps none.
+/// Writes `voxels` to `path` without keeping any.
 pub fn write_only(path: &Path, voxels: &mut dyn Voxels) -> Result<()> {
     conefield_io::write_voxels(path, &mut Outgoing::new(path, voxels))
 }
 
-/// What is kept of voxels that were written.
+/// What is kept of written voxels.
 pub struct WrittenVolume {
     /// The middle slices.
     pub slices: MiddleSlices,
-    /// All of them, if that was asked for.
+    /// All voxels, if requested.
     pub whole: Option<Volume>,
 }
 
-/// Writes `voxels` to `path`, with `affine` if they have none of their own, and keeps all of them with `keep`.
+/// Writes `voxels` to `path`, with `affine` if they have none of their own; keeps all of them if `keep`.
 pub fn write(path: &Path, voxels: &mut dyn Voxels, affine: Option<Affine>, keep: bool) -> Result<WrittenVolume> {
     let grid = voxels.grid();
     let affine = voxels.affine().or(affine);

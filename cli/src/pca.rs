@@ -2,21 +2,21 @@
 
 use rayon::prelude::*;
 
-/// Sweeps of Jacobi's method at most; some ten suffice for hundreds of channels.
+/// Maximum sweeps of Jacobi's method; about ten suffice for hundreds of channels.
 const SWEEPS: usize = 50;
 
-/// The directions along which features vary most.
+/// The directions of largest variance of features.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Pca {
     mean: Vec<f64>,
-    /// A direction each: unit vectors over channels, by falling variance.
+    /// One unit vector over channels per direction, by decreasing variance.
     axes: Vec<Vec<f64>>,
     /// Variance along each direction.
     pub variance: Vec<f64>,
 }
 
 impl Pca {
-    /// Of features `[F][rows]`. The sign of a direction is that of its largest entry, which is positive.
+    /// Analyses features `[F][rows]`. The largest entry of each direction is positive.
     pub fn of(features: &[f32], rows: usize) -> Self {
         let channels: Vec<&[f32]> = features.chunks_exact(rows).collect();
         let n = rows as f64;
@@ -31,17 +31,17 @@ impl Pca {
         let lower: Vec<Vec<f64>> = covariance.collect();
         let whole = |i: usize| (0..lower.len()).map(|j| lower[i.max(j)][i.min(j)]).collect();
         let (variance, axes) = eigen((0..lower.len()).map(whole).collect());
-        // Rounding may leave a variance of 0 a little below it.
+        // Rounding may make a variance of 0 slightly negative.
         Self { mean, axes, variance: variance.into_iter().map(|v| v.max(0.0)).collect() }
     }
 
-    /// The share of all variance along each direction; `None` where nothing varies.
+    /// The share of the total variance along each direction; `None` if it is zero.
     pub fn explained(&self) -> Option<Vec<f64>> {
         let total: f64 = self.variance.iter().sum();
         (total > 0.0 && total.is_finite()).then(|| self.variance.iter().map(|v| v / total).collect())
     }
 
-    /// Every row along direction `k`.
+    /// The projection of every row onto direction `k`.
     pub fn component(&self, k: usize, features: &[f32], rows: usize) -> Vec<f32> {
         let mut out = vec![0.0f64; rows];
         for ((channel, mean), weight) in features.chunks_exact(rows).zip(&self.mean).zip(&self.axes[k]) {
@@ -51,15 +51,15 @@ impl Pca {
     }
 }
 
-/// Eigenvalues of a symmetric matrix, falling, with their unit vectors: Jacobi's rotations, row by row (Golub & Van Loan,
-/// Matrix Computations, 8.5).
+/// Eigenvalues of a symmetric matrix in decreasing order, with unit eigenvectors, by cyclic Jacobi rotations (Golub &
+/// Van Loan, Matrix Computations, 8.5).
 fn eigen(mut a: Vec<Vec<f64>>) -> (Vec<f64>, Vec<Vec<f64>>) {
     let n = a.len();
     let mut v: Vec<Vec<f64>> = (0..n).map(|i| (0..n).map(|j| f64::from(u8::from(i == j))).collect()).collect();
     let size = a.iter().flatten().map(|x| x * x).sum::<f64>();
     for _ in 0..SWEEPS {
         let off: f64 = (0..n).flat_map(|i| (0..i).map(move |j| (i, j))).map(|(i, j)| a[i][j] * a[i][j]).sum();
-        // Below this, eigenvalues are right to rounding.
+        // Below this, eigenvalues are exact up to rounding.
         if off <= 1e-32 * size {
             break;
         }
@@ -68,7 +68,7 @@ fn eigen(mut a: Vec<Vec<f64>>) -> (Vec<f64>, Vec<Vec<f64>>) {
                 if a[p][q] == 0.0 {
                     continue;
                 }
-                // The rotation that makes a[p][q] zero, by the smaller of its two angles.
+                // The rotation that zeroes a[p][q], by the smaller of its two angles.
                 let tau = (a[q][q] - a[p][p]) / (2.0 * a[p][q]);
                 let t = 1f64.copysign(tau) / (tau.abs() + tau.hypot(1.0));
                 let c = 1.0 / t.hypot(1.0);
@@ -112,7 +112,7 @@ mod tests {
         close(values[1], 1.0);
         close(vectors[0][0], 0.5f64.sqrt());
         close(vectors[0][1], 0.5f64.sqrt());
-        // The second difference on n points has 2 − 2·cos(kπ/(n + 1)).
+        // The second difference on n points has the eigenvalues 2 − 2·cos(kπ/(n + 1)).
         let n = 40;
         let entry = |i: usize, j: usize| match i.abs_diff(j) {
             0 => 2.0,
@@ -131,14 +131,14 @@ mod tests {
             }
             close(v.iter().map(|x| x * x).sum(), 1.0);
         }
-        // Nothing to turn, and one number alone.
+        // Nothing to rotate, and a single number.
         assert_eq!(eigen(vec![vec![0.0; 3]; 3]).0, [0.0; 3]);
         assert_eq!(eigen(vec![vec![5.0]]), (vec![5.0], vec![vec![1.0]]));
     }
 
     #[test]
     fn points_along_known_directions() {
-        // x = 1 + 3a + b, y = 2 + 3a − b, z = 7: a and b run over a grid, so they do not go together.
+        // x = 1 + 3a + b, y = 2 + 3a − b, z = 7: a and b are on a grid, so they are uncorrelated.
         let (mut x, mut y) = (vec![], vec![]);
         for a in -4..=4 {
             for b in -4..=4 {

@@ -1,4 +1,4 @@
-//! Progress on standard error: bars on a terminal, else lines of the log.
+//! Progress on standard error: bars on a terminal, otherwise log lines.
 
 use crate::board::Board;
 use crate::live::Live;
@@ -18,20 +18,20 @@ use std::sync::LazyLock;
 use std::time::{Duration, Instant};
 use tracing::{debug, info, warn};
 
-/// The bars on the terminal; the log is written between two drawings of them.
+/// The bars on the terminal; the log is written between redraws.
 static BARS: LazyLock<MultiProgress> = LazyLock::new(|| MultiProgress::with_draw_target(ProgressDrawTarget::hidden()));
 
-/// How often progress is reported without a terminal.
+/// Interval of progress reports without a terminal.
 const EVERY: Duration = Duration::from_secs(5);
 
-/// Lets bars be drawn, if there is a terminal to draw them on.
+/// Enables bars if standard error is a terminal.
 pub fn show_bars() {
     if io::stderr().is_terminal() {
         BARS.set_draw_target(ProgressDrawTarget::stderr());
     }
 }
 
-/// Does something while no bar is drawn.
+/// Calls `f` while no bar is drawn.
 pub fn between_bars(f: impl FnOnce()) {
     BARS.suspend(f);
 }
@@ -50,20 +50,20 @@ pub struct Progress {
     board: Option<Board>,
 }
 
-/// Where checkpoints go, how often, and what they say of the run.
+/// Path, interval and identity of checkpoints.
 pub struct Keeper {
     /// The file.
     pub path: PathBuf,
-    /// Time between two.
+    /// Interval between checkpoints.
     pub every: Duration,
-    /// What makes this run the one that it is.
+    /// Identity of the run.
     pub run: BTreeMap<String, String>,
-    /// When the last one was written.
+    /// Time of the last checkpoint.
     pub last: Instant,
 }
 
 impl Progress {
-    /// Progress of `what`. Records go to `log` (JSON, one a line) as they come.
+    /// Progress of `what`. Records are written to `log` (JSON, one per line) as they arrive.
     pub fn new(what: &str, log: Option<(PathBuf, File)>) -> Self {
         let bar = BARS.add(ProgressBar::new(1000));
         if let Ok(style) = ProgressStyle::with_template("{prefix} [{bar:30}] {percent:>3} %  {msg}") {
@@ -84,30 +84,30 @@ impl Progress {
         }
     }
 
-    /// With checkpoints.
+    /// Adds checkpoints.
     pub fn keeping(mut self, keeper: Option<Keeper>) -> Self {
         self.keeper = keeper;
         self
     }
 
-    /// With live pictures.
+    /// Adds live pictures.
     pub fn showing(mut self, live: Option<Live>) -> Self {
         self.live = live;
         self
     }
 
-    /// With a file for TensorBoard.
+    /// Adds a file for TensorBoard.
     pub fn reporting(mut self, board: Option<Board>) -> Self {
         self.board = board;
         self
     }
 
-    /// Gives back the file for TensorBoard.
+    /// Returns the file for TensorBoard.
     pub fn take_board(&mut self) -> Option<Board> {
         self.board.take()
     }
 
-    /// Does something with the file for TensorBoard. Where that fails, the run goes on without.
+    /// Calls `f` with the file for TensorBoard. After a failure the run continues without it.
     fn on_board(&mut self, f: impl FnOnce(&mut Board) -> Result<()>) {
         if let Some(board) = &mut self.board
             && let Err(e) = f(board)
@@ -122,7 +122,7 @@ impl Progress {
         &self.records
     }
 
-    /// Shows that `share` of the work is done, with a line that says more, unless that was done just now.
+    /// Shows that `share` of the work is done, with an explanatory line, unless the last update is recent.
     pub fn show(&mut self, share: f64, line: impl FnOnce(&Self) -> String) {
         let wait = if self.bar.is_hidden() { EVERY } else { Duration::from_millis(100) };
         if self.told.elapsed() < wait {
@@ -138,7 +138,7 @@ impl Progress {
         }
     }
 
-    /// How things stand, in a line.
+    /// The current state in one line.
     fn line(&self, step: u64, seconds_left: f64) -> String {
         let r = &self.latest;
         let mut line = format!("step {step}");

@@ -1,5 +1,6 @@
-//! The folder of a run: `metrics.jsonl`, `spec.toml`, `live.png` and `events.out.tfevents.conefield` if asked for, while it lasts `checkpoint.safetensors`, at the end
-//! `volume.nii.gz`, `weights.safetensors`, `slices.png` and, last and only of a finished run, `record.json`.
+//! The folder of a run: `metrics.jsonl`, `spec.toml`, `live.png` and `events.out.tfevents.conefield` if requested, and
+//! `checkpoint.safetensors` during the run. At the end `volume.nii.gz`, `weights.safetensors`, `slices.png` and, last
+//! and only for a finished run, `record.json`.
 
 use conefield_core::error::ensure;
 use conefield_core::files::read_text;
@@ -13,7 +14,7 @@ use std::fs::{self, File};
 use std::io::ErrorKind;
 use std::path::{Path, PathBuf};
 
-/// Every file that a run writes.
+/// All files that a run writes.
 pub const FILES: [&str; 9] = [
     "volume.nii.gz",
     "metrics.jsonl",
@@ -26,16 +27,16 @@ pub const FILES: [&str; 9] = [
     "checkpoint.safetensors",
 ];
 
-/// What such a folder holds.
+/// The contents of a run's folder.
 pub const CONTENTS: Contents = Contents { known, progressed };
 
-/// Whether a run may have left this.
+/// Whether a run may have written this path.
 pub fn known(path: &Path) -> bool {
     let name = path.file_name().unwrap_or_default();
     FILES.iter().any(|f| name == *f) || conefield_io::is_unfinished(name)
 }
 
-/// How far the run in `folder` came.
+/// The progress of the run in `folder`.
 pub fn progressed(folder: &Path) -> Progressed {
     let has = |name: &str| folder.join(name).exists();
     if has("record.json") {
@@ -47,16 +48,16 @@ pub fn progressed(folder: &Path) -> Progressed {
     }
 }
 
-/// A folder that belongs to this run alone.
+/// A folder reserved for this run.
 pub struct RunFolder(Lease);
 
 impl RunFolder {
-    /// Takes the folder, which need not be there yet. Nothing changes in it.
+    /// Reserves the folder, which need not exist yet, without changing it.
     pub fn take(path: &Path) -> Result<Self> {
         Lease::take(path, CONTENTS).map(Self)
     }
 
-    /// Refuses a folder that holds something else than a run, and a run that came to something unless `force`.
+    /// Refuses a folder with other content than a run, and a run with progress unless `force`.
     pub fn may_begin(&self, force: bool) -> Result<()> {
         let path = self.0.path();
         let place = path.display().to_string();
@@ -78,12 +79,12 @@ impl RunFolder {
         ensure(force || self.0.progressed() == Progressed::Nothing, &place, "output", "an earlier run", expected)
     }
 
-    /// Begins a run in the folder, which is empty then; an earlier run waits until this one is complete.
+    /// Begins a run in the folder, emptying it; an earlier run is set aside until this one is complete.
     pub fn begin(&mut self) -> Result<()> {
         self.0.replace()
     }
 
-    /// Goes on with the run that is there.
+    /// Continues the existing run.
     pub fn go_on(&self) {
         self.0.go_on();
     }
@@ -94,14 +95,14 @@ impl RunFolder {
         self.0.path().join(name)
     }
 
-    /// Opens `metrics.jsonl`, which grows a line at a time.
+    /// Opens `metrics.jsonl`, which is written line by line.
     pub fn metrics(&self) -> Result<(PathBuf, File)> {
         let path = self.file("metrics.jsonl");
         let file = File::create(&path).map_err(|e| Error::io(&path, e))?;
         Ok((path, file))
     }
 
-    /// Opens `metrics.jsonl` of an interrupted run without the records after `step`, which come again.
+    /// Opens `metrics.jsonl` of an interrupted run without the records after `step`, which will be repeated.
     pub fn metrics_until(&self, step: u64) -> Result<(PathBuf, File)> {
         let path = self.file("metrics.jsonl");
         let io = |e| Error::io(&path, e);
@@ -109,7 +110,7 @@ impl RunFolder {
             let record: Option<serde_json::Value> = serde_json::from_str(line).ok();
             record.and_then(|r| r["step"].as_u64()).is_some_and(|s| s <= step)
         };
-        // The last line may be half written.
+        // The last line may be incomplete.
         let text = fs::read(&path).map_err(io)?;
         let kept: String = String::from_utf8_lossy(&text).lines().filter(before).flat_map(|l| [l, "\n"]).collect();
         conefield_io::write_text_atomic(&path, &kept)?;
@@ -117,7 +118,7 @@ impl RunFolder {
         Ok((path, file))
     }
 
-    /// The run is done: its checkpoint goes, and what it replaced.
+    /// Finishes the run: removes its checkpoint and the run it replaced.
     pub fn finish(self) -> Result<()> {
         let path = self.file("checkpoint.safetensors");
         match fs::remove_file(&path) {
@@ -127,7 +128,7 @@ impl RunFolder {
     }
 }
 
-/// A run as its folder has it.
+/// A run read from its folder.
 pub struct RunOnDisk {
     folder: PathBuf,
     spec: String,
@@ -136,7 +137,7 @@ pub struct RunOnDisk {
     known: Option<Known>,
 }
 
-/// What reading a run again needs of its record.
+/// The fields of a record needed to show a run.
 #[derive(Deserialize)]
 struct Known {
     spec: String,
@@ -146,13 +147,13 @@ struct Known {
 }
 
 impl RunOnDisk {
-    /// Whether `folder` is that of a run: its files tell, and nothing else has them.
+    /// Whether `folder` is the folder of a run, judging by its files.
     pub fn is(folder: &Path) -> bool {
         let has = |name: &str| folder.join(name).is_file();
         has("record.json") || (has("spec.toml") && has("metrics.jsonl"))
     }
 
-    /// Reads all but the large files.
+    /// Reads everything but the large files.
     pub fn read(folder: &Path) -> Result<Self> {
         let file = folder.join("record.json");
         let record: Option<Value> = if file.exists() { Some(read_json(&file)?) } else { None };
@@ -164,17 +165,17 @@ impl RunOnDisk {
             path if path.exists() => read_text(&path, LONGEST),
             _ => Ok(String::new()),
         };
-        // The last line of a run that was killed may be half written.
+        // The last line of a killed run may be incomplete.
         let curves = text("metrics.jsonl")?.lines().filter_map(|l| serde_json::from_str(l).ok()).collect();
         Ok(Self { folder: folder.to_path_buf(), spec: text("spec.toml")?, curves, record, known })
     }
 
-    /// Where it lies.
+    /// The run's folder.
     pub fn folder(&self) -> &Path {
         &self.folder
     }
 
-    /// The spec with every setting; empty if it is not there.
+    /// The spec with all settings; empty if it is missing.
     pub fn spec(&self) -> &str {
         &self.spec
     }
@@ -189,12 +190,12 @@ impl RunOnDisk {
         self.record.as_ref()
     }
 
-    /// Whether it came to its end.
+    /// Whether the run is finished.
     pub fn is_complete(&self) -> bool {
         self.record.is_some()
     }
 
-    /// How far it came, in words.
+    /// The progress in words.
     pub fn standing(&self) -> &'static str {
         match progressed(&self.folder) {
             Progressed::Complete => "complete",
@@ -206,32 +207,32 @@ impl RunOnDisk {
         }
     }
 
-    /// The result, of a finished run.
+    /// The result of a finished run.
     pub fn volume(&self) -> Option<PathBuf> {
         Some(self.folder.join("volume.nii.gz")).filter(|v| self.is_complete() && v.exists())
     }
 
-    /// The spec's own name.
+    /// The name in the spec.
     pub fn spec_name(&self) -> Option<&str> {
         self.known.as_ref().map(|k| &k.spec[..]).filter(|n| !n.is_empty())
     }
 
-    /// Where it read the scan.
+    /// The path from which it read the scan.
     pub fn scan_path(&self) -> Option<&Path> {
         self.known.as_ref().map(|k| Path::new(&k.scan.path))
     }
 
-    /// The volume that it was compared with, as that was named.
+    /// The reference volume, as named on the command line.
     pub fn reference(&self) -> Option<&Path> {
         self.known.as_ref()?.reference.as_deref()
     }
 
-    /// Views that it did not see.
+    /// Held-out views.
     pub fn held_out(&self) -> &[usize] {
         self.known.as_ref().map_or(&[], |k| &k.held_out_views)
     }
 
-    /// Whether `scan` is the one that it worked on, as far as is known.
+    /// Whether `scan` is the one it used, as far as known.
     pub fn is_of(&self, scan: &ScanRecord) -> bool {
         self.known.as_ref().is_none_or(|k| {
             (&k.scan.projections_fnv1a64, &k.scan.geometry_fnv1a64)
@@ -239,7 +240,7 @@ impl RunOnDisk {
         })
     }
 
-    /// Whether `other` worked on the same scan.
+    /// Whether `other` used the same scan.
     pub fn same_scan(&self, other: &Self) -> bool {
         other.known.as_ref().is_none_or(|k| self.is_of(&k.scan))
     }

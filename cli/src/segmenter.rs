@@ -1,4 +1,4 @@
-//! A program that makes a label map of a volume, such as TotalSegmentator where that is installed.
+//! An external program that segments a volume, such as an installed TotalSegmentator.
 
 use crate::signals;
 use conefield_core::error::{Error, Result, ensure};
@@ -11,9 +11,9 @@ use std::process::{Command, ExitStatus, Stdio};
 use std::str::FromStr;
 use std::time::Duration;
 
-/// Where the command names the files.
+/// Placeholders of the files in the command.
 const FILES: [&str; 2] = ["{in}", "{out}"];
-/// Between two looks at the process.
+/// Interval between two checks of the process.
 const LOOK: Duration = Duration::from_millis(20);
 /// Maximum bytes of a failed command's output in an error.
 const TAIL: u64 = 600;
@@ -28,7 +28,7 @@ pub struct Segmenter {
 impl FromStr for Segmenter {
     type Err = String;
 
-    /// Words as a POSIX shell splits and quotes them; nothing is expanded and no shell runs.
+    /// Splits and unquotes words like a POSIX shell; nothing is expanded and no shell runs.
     fn from_str(text: &str) -> Result<Self, String> {
         let words = shlex::split(text).ok_or("an unclosed quote or a trailing backslash")?;
         let Some((program, arguments)) = words.split_first() else { return Err("expected a command".into()) };
@@ -40,7 +40,7 @@ impl FromStr for Segmenter {
 }
 
 impl Segmenter {
-    /// The label map of `volume`, called `name` in errors. The files between are in a temporary folder, which is gone
+    /// Segments `volume`, called `name` in errors. Intermediate files are in a temporary folder, which is removed
     /// afterwards.
     pub fn run(&self, name: &str, volume: &Volume) -> Result<Array3<u32>> {
         let dir =
@@ -55,7 +55,7 @@ impl Segmenter {
         if !output.exists() {
             return Err(Error::unsupported(what(), format!("it wrote no file for {{out}}; {said}")));
         }
-        // The file's own name is that of a folder that no one will find again.
+        // The file is in a temporary folder that the user cannot find again.
         let own = output.display().to_string();
         let read = |e: Error| {
             let why = e.to_string().replace(&own, "{out}");
@@ -72,7 +72,7 @@ impl Segmenter {
         conefield_metrics::label_map(&place, labels.data.view()).map_err(read)
     }
 
-    /// Runs it to its end; its status and the last of what it said on standard error.
+    /// Runs the process to its end; returns its status and the end of its standard error.
     fn start(&self, name: &str, dir: &Path, files: [&Path; 2]) -> Result<(ExitStatus, String)> {
         let log = dir.join("stderr");
         let mut errors = File::options()
@@ -106,7 +106,7 @@ impl Segmenter {
     }
 }
 
-/// The last lines of a log, in one.
+/// The last lines of a log, joined into one.
 fn tail(log: &mut File) -> std::io::Result<String> {
     let length = log.seek(SeekFrom::End(0))?;
     log.seek(SeekFrom::Start(length.saturating_sub(TAIL)))?;

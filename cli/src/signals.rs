@@ -1,5 +1,5 @@
-//! Ctrl-C, termination and a terminal that is closed. A command that listens ends after its step at the first signal and at
-//! once at the second; any other ends at once. Unfinished files go before that.
+//! Ctrl-C, termination and a closed terminal. A command that listens stops after its step at the first signal and
+//! immediately at the second; other commands stop immediately. Unfinished files are removed first.
 
 use conefield_core::{Error, Result};
 use signal_hook::consts::{SIGINT, SIGTERM};
@@ -8,9 +8,9 @@ use std::io;
 use std::path::Path;
 use std::sync::atomic::{AtomicBool, AtomicU8, Ordering};
 
-/// The first signal that came; 0 before that.
+/// The first signal received, or 0.
 static CAUGHT: AtomicU8 = AtomicU8::new(0);
-/// Whether the command looks at [`caught`].
+/// Whether the command checks [`caught`].
 static LISTENING: AtomicBool = AtomicBool::new(false);
 
 /// Starts to watch for signals.
@@ -30,13 +30,13 @@ pub fn watch() -> Result<()> {
     Ok(())
 }
 
-/// From here on the command looks at [`caught`] and ends by itself.
+/// From now on the command checks [`caught`] and stops by itself.
 pub fn listen() -> Result<()> {
     LISTENING.store(true, Ordering::Relaxed);
     Ok(())
 }
 
-/// The signal of a terminal that is closed, unless whoever started the program wants it ignored, as `nohup` does.
+/// The signal of a closed terminal, unless the parent process ignores it, as `nohup` does.
 fn hangup() -> Option<i32> {
     #[cfg(target_os = "linux")]
     {
@@ -50,7 +50,7 @@ fn hangup() -> Option<i32> {
     None
 }
 
-/// Takes the end of standard input for a termination: whoever started this run holds the other end.
+/// Treats the end of standard input as termination: the parent process holds the other end.
 pub fn follow_input() {
     std::thread::spawn(|| {
         let _ = io::copy(&mut io::stdin().lock(), &mut io::sink());
@@ -58,12 +58,12 @@ pub fn follow_input() {
     });
 }
 
-/// Goes on as if this signal had come, unless one has.
+/// Acts as if this signal had been received, unless there was one already.
 pub fn note(signal: u8) {
     let _ = CAUGHT.compare_exchange(0, signal, Ordering::Relaxed, Ordering::Relaxed);
 }
 
-/// The signal that came, if any did.
+/// The signal received, if any.
 pub fn caught() -> Option<u8> {
     Some(CAUGHT.load(Ordering::Relaxed)).filter(|s| *s > 0)
 }

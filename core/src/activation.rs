@@ -1,16 +1,16 @@
-//! Activations: what follows a linear map, element by element, with its derivative.
+//! Element-wise activations with their derivatives.
 
 use crate::simd::{Real, Select, Simd, SimdBase, SimdFloat, V, load, store};
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
-/// WGSL of every [`Activation`].
+/// WGSL source of every [`Activation`].
 pub const WGSL: &str = include_str!("activation.wgsl");
 
-/// SquarePlus's `b` as NI-NeRF has it.
+/// SquarePlus's `b` in NI-NeRF.
 pub const SQUAREPLUS_B: f64 = 1.523_821_03;
 
-/// What follows a linear map.
+/// Element-wise function after a linear map.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
 #[serde(rename_all = "kebab-case")]
 pub enum Activation {
@@ -31,7 +31,7 @@ pub enum Activation {
 }
 
 impl Activation {
-    /// Its function in [`WGSL`].
+    /// Name of its function in [`WGSL`].
     pub fn wgsl(self) -> &'static str {
         match self {
             Self::None => "stage_none",
@@ -77,7 +77,7 @@ impl Activation {
                 (y, slope)
             }
             Self::Squareplus => {
-                // Past 1e18 the square would overflow, and the root is |x| to the last bit.
+                // Above 1e18 the square would overflow, and the root equals |x| to the last bit.
                 let small = x.abs().min(number(1e18));
                 let root = small.mul_add(small, number(SQUAREPLUS_B)).sqrt().max(x.abs());
                 ((x + root) * number(0.5), (x / root + one) * number(0.5))
@@ -118,7 +118,7 @@ const AT_ONCE: usize = 4;
 /// `h = f(z)`, `z = f'(z)`.
 #[inline(always)]
 pub fn activate<S: Simd, R: Real>(s: S, act: Activation, z: &mut [R], h: &mut [R]) {
-    // One loop an activation, so that none of them branches inside.
+    // One loop per activation, so that no loop branches inside.
     macro_rules! each {
         ($($a:ident),*) => {
             match act {
@@ -126,7 +126,7 @@ pub fn activate<S: Simd, R: Real>(s: S, act: Activation, z: &mut [R], h: &mut [R
                     let len = V::<S, R>::LEN;
                     let mut i = 0;
                     while i + AT_ONCE * len <= z.len() {
-                        // Whole vectors: a tail's branch between them would have them wait for one another.
+                        // Whole vectors only: a branch for the tail would serialize them.
                         let (z, h) = (&mut z[i..i + AT_ONCE * len], &mut h[i..i + AT_ONCE * len]);
                         let x = std::array::from_fn(|k| V::<S, R>::from_slice(s, &z[k * len..(k + 1) * len]));
                         let [y, slope] = Activation::$a.at::<S, R, AT_ONCE>(s, x);

@@ -1,22 +1,22 @@
-//! What reading may take: one allowance of memory for the whole process, one of work for each input.
+//! Limits of what reading may use: memory for the whole process, work for each input.
 //!
-//! A reader draws from them as it allocates and as it goes on, not from what a header or a packed size claims. What is
-//! drawn of memory need not be given back: what the process holds is counted where it is allocated.
+//! Readers charge what they really allocate and process, not what a header or a packed size claims. Memory need not be
+//! given back: the process's own allocation count is authoritative.
 
 use crate::error::{Error, Result};
 use std::sync::OnceLock;
 
-/// The limit of bytes for the process, and the function that returns how many it holds.
+/// The byte limit of the process, and the function that returns its current allocation.
 static MEMORY: OnceLock<(u64, fn() -> u64)> = OnceLock::new();
 
-/// Lets the process hold `most` bytes; `held` tells how many it holds now. Once: a second call changes nothing. Without
-/// one there is no limit.
+/// Limits the process to `most` bytes; `held` returns its current allocation. Only the first call has an effect.
+/// Without it there is no limit.
 pub fn set_memory(most: u64, held: fn() -> u64) {
     let _ = MEMORY.set((most, held));
 }
 
-/// Asks for `bytes` more, before they are allocated for `field` of the file `place`. A look, not a reservation: one
-/// thread reads.
+/// Checks that `bytes` more may be allocated for `field` of the file `place`. This is a check, not a reservation: a
+/// single thread reads.
 pub fn memory(place: &str, field: &str, bytes: u64) -> Result<()> {
     let Some((most, held)) = MEMORY.get() else { return Ok(()) };
     let held = held();
@@ -28,12 +28,12 @@ pub fn memory(place: &str, field: &str, bytes: u64) -> Result<()> {
     Err(Error::invalid(place, field, found, format!("at most {} in all, as --memory or the system allows", mib(*most))))
 }
 
-/// The same for `count` numbers of 32 bits.
+/// The same check for `count` 32-bit numbers.
 pub fn numbers(place: &str, field: &str, count: usize) -> Result<()> {
     memory(place, field, (count as u64).saturating_mul(4))
 }
 
-/// The work that one input may make: bytes, items, steps, in units that take about as long as each other.
+/// A budget of work for one input: bytes, items or steps, in units of similar cost.
 #[derive(Debug)]
 pub struct Work {
     most: u64,
@@ -41,12 +41,12 @@ pub struct Work {
 }
 
 impl Work {
-    /// `most` units.
+    /// A budget of `most` units.
     pub fn new(most: u64) -> Self {
         Self { most, left: most }
     }
 
-    /// Takes `units` of `what`.
+    /// Spends `units` on `what`.
     pub fn spend(&mut self, place: &str, what: &str, units: u64) -> Result<()> {
         let Some(left) = self.left.checked_sub(units) else {
             let expected = format!("at most {} in all, far above that of any valid file", self.most);
@@ -72,7 +72,7 @@ mod tests {
 
     #[test]
     fn memory_is_asked_for_beside_what_is_held() {
-        // No other test of this crate's library reads a file of a gigabyte.
+        // No other unit test of this crate reads a file of a gigabyte.
         memory("a", "data", u64::MAX).unwrap();
         set_memory(3 << 30, || 2 << 30);
         memory("a", "data", 1 << 30).unwrap();

@@ -5,21 +5,21 @@ use crate::pages::Pages;
 use std::collections::BTreeMap;
 use std::ops::Range;
 
-/// A named block of the arena.
+/// A named block of parameters.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Block {
     /// Full name: `encoder.…`, `normalizers.0.…`, `field.…`.
     pub name: String,
     /// Shape, row-major.
     pub shape: Vec<usize>,
-    /// Place in the arena.
+    /// Its position in the arena.
     pub range: Range<usize>,
 }
 
-/// Names and places of every parameter.
+/// Names and positions of all parameters.
 #[derive(Debug, Clone, Default, PartialEq, Eq)]
 pub struct Layout {
-    /// In the order of the arena, without gaps.
+    /// In arena order, without gaps.
     pub blocks: Vec<Block>,
 }
 
@@ -29,7 +29,7 @@ impl Layout {
         self.blocks.last().map_or(0, |b| b.range.end)
     }
 
-    /// Whether there are none.
+    /// Whether there are no parameters.
     pub fn is_empty(&self) -> bool {
         self.len() == 0
     }
@@ -69,23 +69,23 @@ impl Arena {
     }
 }
 
-/// Named tensors with the notes of the file that they came from.
+/// Named tensors with the notes of their file.
 #[derive(Debug, Clone, Default, PartialEq)]
 pub struct Weights {
     /// Shape and values by name.
     pub tensors: BTreeMap<String, (Vec<usize>, Vec<f32>)>,
-    /// Free notes: the spec that made them, the program's version.
+    /// Free-form notes, such as the spec that produced them and the program version.
     pub notes: BTreeMap<String, String>,
 }
 
-/// What an initializer did, tensor by tensor.
+/// Report of an initializer, tensor by tensor.
 #[derive(Debug, Clone, Default, PartialEq, serde::Serialize)]
 pub struct InitReport {
-    /// Loaded, by name.
+    /// Names of loaded tensors.
     pub loaded: Vec<String>,
-    /// In the pipeline but left as the stage's own scheme made it, with the reason.
+    /// Tensors of the pipeline that keep their stage's own initialization, with the reason.
     pub fresh: Vec<(String, String)>,
-    /// In the file but not used, with the reason.
+    /// Unused tensors of the file, with the reason.
     pub unused: Vec<(String, String)>,
 }
 
@@ -101,7 +101,7 @@ impl Weights {
         Self { tensors, notes: BTreeMap::new() }
     }
 
-    /// Copies every block for which `take` holds into `params`, if [`Weights::check`] finds nothing wrong.
+    /// Copies every block for which `take` holds into `params`, after [`Weights::check`].
     pub fn load(
         &self,
         place: &str,
@@ -116,8 +116,8 @@ impl Weights {
         Ok(report)
     }
 
-    /// What [`Weights::load`] would do, without an array of parameters. Refuses a block for which `take` holds that is
-    /// missing here, has another shape, or holds a number that is not finite.
+    /// Checks [`Weights::load`] without an array of parameters. Refuses a block for which `take` holds if it is missing
+    /// here, has another shape or contains a non-finite number.
     pub fn check(&self, place: &str, layout: &Layout, take: impl Fn(&str) -> bool) -> Result<InitReport> {
         let mut report = InitReport::default();
         for b in &layout.blocks {

@@ -1,4 +1,4 @@
-//! A backend compiles a pipeline and does its work: training steps, evaluation at points, rendering of rays.
+//! Backends compile a pipeline and run it: training steps, evaluation at points, rendering of rays.
 
 use crate::error::Result;
 use crate::loss::Loss;
@@ -9,7 +9,7 @@ use crate::voxel::{VoxelProjector, VoxelView};
 use ndarray::{ArrayView3, ArrayViewMut3};
 use serde::Serialize;
 
-/// A ray with its measured value, both scaled to what stages see.
+/// A ray with its measured value, both in the scale of the stages.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct TrainRay {
     /// The ray.
@@ -18,29 +18,29 @@ pub struct TrainRay {
     pub target: f32,
 }
 
-/// The blocks on which a step looks at a prior.
+/// The blocks at which a step evaluates a prior.
 #[derive(Clone, Copy)]
 pub struct BlockWork<'a> {
-    /// The prior. It says how many points a block has.
+    /// The prior; it determines the number of points per block.
     pub prior: &'a dyn Prior,
     /// Lowest corner of each block in the unit cube.
     pub corners: &'a [[f32; 3]],
-    /// Distance of neighbouring points along each axis, in cube sides.
+    /// Distance between neighbouring points along each axis, in cube sides.
     pub spacing: [f32; 3],
 }
 
 impl BlockWork<'_> {
-    /// What the penalty of a block counts by: the prior is a mean over blocks and points.
+    /// Factor of a block's penalty: the prior is a mean over blocks and points.
     pub fn scale(&self) -> f64 {
         let blocks = self.prior.blocks();
         blocks.weight / (self.corners.len() * blocks.points()).max(1) as f64
     }
 }
 
-/// What a step learns from. Each part's loss is a mean over its entries; parts add.
+/// Inputs of a training step. The loss of each part is a mean over its entries; the parts are summed.
 #[derive(Clone)]
 pub struct Work<'a> {
-    /// Which step this is; decides random sample positions together with `seed`.
+    /// Number of the step; determines random sample positions together with `seed`.
     pub step: u64,
     /// Seed of the run.
     pub seed: u64,
@@ -55,14 +55,14 @@ pub struct Work<'a> {
 }
 
 impl Work<'_> {
-    /// An error of the loss or a prior in the calls so far.
+    /// Returns an error of the loss or a prior in the calls so far.
     pub fn fault(&self) -> Result<()> {
         self.loss.fault()?;
         self.priors.iter().try_for_each(|p| p.prior.fault())
     }
 }
 
-/// What a step found.
+/// Results of a step.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Serialize)]
 pub struct StepStats {
     /// Mean loss of rays and of points.
@@ -71,13 +71,13 @@ pub struct StepStats {
     pub prior: f64,
     /// Samples evaluated.
     pub samples: u64,
-    /// Seconds in forward and in the backward passes of dense stages.
+    /// Seconds in the forward pass and in the backward pass of dense stages.
     pub dense_s: f64,
-    /// Seconds in gradients of scattered parameters.
+    /// Seconds in the gradients of scattered parameters.
     pub scatter_s: f64,
 }
 
-/// Adam's settings for one step.
+/// Adam settings for one step.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Adam {
     /// Learning rate of this step.
@@ -88,34 +88,34 @@ pub struct Adam {
     pub beta2: f64,
     /// Added to the root of the second moment.
     pub eps: f64,
-    /// Steps taken, this one included.
+    /// Number of steps, including this one.
     pub step: u64,
 }
 
-/// What a backend made of a pipeline, for people.
+/// Human-readable description of a compiled pipeline.
 #[derive(Debug, Clone, Default, PartialEq, Serialize)]
 pub struct Explain {
     /// Name of the backend, with the instruction set or device.
     pub backend: String,
-    /// One line a decision.
+    /// One line per decision.
     pub notes: Vec<String>,
     /// Bytes beyond model and scan.
     pub scratch_bytes: usize,
 }
 
-/// Makes a pipeline ready to run.
+/// Compiles pipelines.
 pub trait Backend: Send + Sync {
     /// Its name on the command line.
     fn name(&self) -> &'static str;
-    /// Checks that every stage can run here and says how; never falls back silently.
+    /// Checks that this backend can run every stage and describes how; never falls back silently.
     fn compile(&self, pipeline: &Pipeline) -> Result<(Box<dyn Executable>, Explain)>;
-    /// The projector with its work on this backend's device; as it is where the backend has none of its own.
+    /// Moves the projector to this backend's device; returns it unchanged if there is no device.
     fn place(&self, projector: Box<dyn VoxelProjector>) -> Result<Box<dyn VoxelProjector>> {
         Ok(projector)
     }
-    /// Adds to each voxel of `volume` `Σ s/U²·p(row, column)` over the views whose pixels are `images`
+    /// Adds `Σ s/U²·p(row, column)` to each voxel of `volume`, summed over the views with pixels `images`
     /// (`[view, row, column]`), bilinear between pixels and 0 outside the detector. Returns whether it did: a backend
-    /// without a device leaves it to the method.
+    /// without a device leaves this to the method.
     fn backproject(
         &self,
         _views: &[VoxelView],
@@ -126,17 +126,17 @@ pub trait Backend: Send + Sync {
     }
 }
 
-/// A compiled pipeline. After a mask changed the pipeline, compile again. What a stage reports with
-/// [`crate::stage::Stage::fault`] during a call is the call's error.
+/// A compiled pipeline. Compile again after a mask has changed the pipeline. Each call returns the errors that stages
+/// report in [`crate::stage::Stage::fault`].
 ///
-/// Parameters, gradients and moments may live on a device: the first call takes the arena of its model there, later
-/// ones change that copy. [`Executable::fetch`] brings it back, [`Executable::renew`] takes another arena there.
+/// Parameters, gradients and moments may live on a device: the first call uploads the model's arena, later calls change
+/// the uploaded copy. [`Executable::fetch`] downloads it, [`Executable::renew`] makes the next call upload again.
 pub trait Executable: Send {
-    /// Refuses a loss, or a prior, that cannot run here: told when a plan is made, before the first step.
+    /// Refuses a loss or prior that cannot run here, at planning time.
     fn admits(&self, _loss: &dyn Loss, _priors: &[Box<dyn Prior>]) -> Result<()> {
         Ok(())
     }
-    /// Gradients of `work`'s loss, written over the arena's gradients.
+    /// Computes the gradients of `work`'s loss and overwrites the arena's gradients with them.
     fn step(&mut self, model: &mut Model, work: &Work<'_>) -> Result<StepStats>;
     /// One Adam step with the arena's gradients.
     fn update(&mut self, model: &mut Model, adam: &Adam) -> Result<()>;
@@ -146,15 +146,15 @@ pub trait Executable: Send {
     fn encode(&mut self, model: &Model, points: &[[f32; 3]]) -> Result<Vec<f32>>;
     /// Line integrals of `rays`.
     fn render(&mut self, model: &Model, rays: &[UnitRay], out: &mut [f32]) -> Result<()>;
-    /// Brings the model's arena to where the calls so far have left it.
+    /// Brings the model's arena up to date with the calls so far.
     fn fetch(&mut self, _model: &mut Model) -> Result<()> {
         Ok(())
     }
-    /// Seconds of each of its kernels since this was last asked, of a backend that was told to measure them.
+    /// Seconds per kernel since the last call, if the backend was told to measure them.
     fn profile(&mut self) -> Vec<(String, f64)> {
         vec![]
     }
-    /// Says that something else has changed the model's arena, after it was fetched if its state was wanted: the next
-    /// call takes it as it is then.
+    /// Tells the backend that the model's arena was changed elsewhere: the next call reads it again. Fetch first if the
+    /// device's state is needed.
     fn renew(&mut self) {}
 }

@@ -1,4 +1,4 @@
-//! What a volume is made of: coefficients, and the linear map that expands them to voxels.
+//! Representations of a volume: coefficients and the linear map that expands them to voxels.
 
 use crate::error::Result;
 use crate::geometry::VoxelGrid;
@@ -8,46 +8,46 @@ use ndarray::{ArrayView3, ArrayViewMut3};
 /// Settings of a basis.
 #[typetag::serde(tag = "type")]
 pub trait BasisSpec: Send + Sync {
-    /// The basis, or why the settings make none.
+    /// Builds the basis; fails on invalid settings.
     fn build(&self) -> Result<Box<dyn Basis>>;
 }
 
 /// A basis of volumes on any grid of voxels.
 pub trait Basis: Send + Sync {
-    /// The basis for the voxels of `grid`. The number of coefficients follows from the grid's shape alone, so that memory
-    /// can be told before a scan is read.
+    /// The basis for the voxels of `grid`. The number of coefficients depends on the grid's shape only, so that memory
+    /// can be estimated before a scan is read.
     fn on(&self, grid: &VoxelGrid) -> Result<Box<dyn Expansion>>;
 
     /// A line for `explain`.
     fn describe(&self) -> String;
 }
 
-/// The basis of one grid of voxels: a matrix `B`. Its entries are not negative, so that coefficients of 0 and more give voxels
-/// of 0 and more, unless coefficients are samples.
+/// The basis of one voxel grid: a matrix `B`. Its entries are non-negative, so that non-negative coefficients give
+/// non-negative voxels, unless coefficients are samples.
 pub trait Expansion: Send + Sync {
-    /// Where the coefficients stand. A prior acts on this grid, with its spacing.
+    /// Positions of the coefficients. A regularizer acts on this grid, with its spacing.
     fn coefficients(&self) -> VoxelGrid;
 
-    /// Whether coefficients are the volume's values where they stand, on a grid that fills the same box. A projector then
-    /// takes them for voxels of that grid, and only the volume that comes out is expanded, with what falls below 0 set to 0.
+    /// Whether coefficients are samples of the volume on a grid that fills the same box. A projector then treats them
+    /// as voxels of that grid. Only the final volume is expanded, with negative values set to 0.
     fn are_samples(&self) -> bool {
         false
     }
 
-    /// Bytes that either direction of the operator takes while it works.
+    /// Working memory of either direction of the operator, in bytes.
     fn scratch(&self) -> u64 {
         0
     }
 
-    /// The operator that works.
+    /// The operator in single precision.
     fn operator(&self) -> &dyn BasisOperator<f32>;
 
-    /// The same formula in double precision, by which it is checked.
+    /// The same formula in double precision, for checks.
     fn reference(&self) -> Option<&dyn BasisOperator<f64>> {
         None
     }
 
-    /// What the operator could not do since this was last asked, as [`crate::stage::Stage::fault`].
+    /// Returns and clears the first error since the last call; see [`crate::stage::Stage::fault`].
     fn fault(&self) -> Result<()> {
         Ok(())
     }

@@ -1,9 +1,9 @@
-//! Stages that are written for one row at a time: the short way to an encoder, a normalizer or a field.
+//! Stages written for one row at a time: the simple way to an encoder, normalizer or field.
 //!
-//! [`RowMap`] says what becomes of the channels of one row, and of their gradients. [`ByRow`] makes a whole [`Stage`] of
-//! it: it runs on tiles, is checked in double precision, reads parameters in halves, and leaves out channels for masks. A
-//! stage that must be as fast as it can be is written against [`Stage`] and [`Kernel`] instead. A field that brings line
-//! integrals of its own says them ray by ray ([`RayMap`], [`ByRay`]).
+//! A [`RowMap`] defines the channels of one row and their gradients. [`ByRow`] makes a complete [`Stage`] of it, with
+//! tiles, double-precision checks, half-precision parameters and masked channels. Stages that need maximum speed
+//! implement [`Stage`] and [`Kernel`] directly. A field with line integrals of its own defines them ray by ray
+//! ([`RayMap`], [`ByRay`]).
 
 use crate::error::{Error, Result};
 use crate::half::Stored;
@@ -16,13 +16,13 @@ use crate::wgsl::Fragment;
 use std::ops::Range;
 use std::sync::Arc;
 
-/// Up to so many parameters each worker sums gradients in a copy of its own. Of more, one worker sums all.
+/// Up to this many parameters, each worker sums gradients in its own copy. Above it, one worker sums all.
 const FEW: usize = 1 << 20;
 
 /// A map of the channels of one row. One source serves `f32`, `f64` and parameters in halves: `params[i].value()` is
 /// parameter `i`.
 pub trait RowMap: Send + Sync + 'static {
-    /// Channels in and channels out. An encoder has 3 in, a field 1 out.
+    /// Input and output channels. An encoder has 3 inputs, a field 1 output.
     fn widths(&self) -> [usize; 2];
 
     /// Name and shape of each block of parameters, in order.
@@ -30,18 +30,18 @@ pub trait RowMap: Send + Sync + 'static {
         vec![]
     }
 
-    /// Fills `params` with first values, the same for the same `seed`.
+    /// Fills `params` with initial values, reproducible by `seed`.
     fn init(&self, seed: u64, params: &mut [f32]) {
         let _ = (seed, params);
     }
 
-    /// Writes the channels that come out for those that go in. `y` is 0 before.
+    /// Computes the output channels `y` from the input channels `x`. `y` is 0 on entry.
     fn forward<R: Real>(&self, params: &[impl Stored<R>], x: &[R], y: &mut [R]);
 
-    /// Given `dy = ∂L/∂y`: adds `∂L/∂params` to `grads` and `∂L/∂x` to `dx`, which is 0 before.
+    /// Given `dy = ∂L/∂y`, adds `∂L/∂params` to `grads` and `∂L/∂x` to `dx`, which is 0 on entry.
     fn backward<R: Real>(&self, params: &[impl Stored<R>], x: &[R], dy: &[R], grads: &mut Sums<'_, R>, dx: &mut [R]);
 
-    /// A line for `explain` that begins with the name of the type.
+    /// A line for `explain` that begins with the type name.
     fn describe(&self) -> String;
 
     /// Multiply-adds of a forward pass, for `explain`.
@@ -50,30 +50,30 @@ pub trait RowMap: Send + Sync + 'static {
         input * output
     }
 
-    /// As [`Encoder::coarse_to_fine`].
+    /// See [`Encoder::coarse_to_fine`].
     fn coarse_to_fine(&self) -> bool {
         false
     }
 
-    /// As [`Encoder::resolutions`].
+    /// See [`Encoder::resolutions`].
     fn resolutions(&self) -> Option<Vec<f64>> {
         None
     }
 
-    /// As [`Stage::wgsl`].
+    /// See [`Stage::wgsl`].
     fn wgsl(&self) -> Option<Fragment> {
         None
     }
 }
 
-/// Sums of the gradients of parameters.
+/// Accumulator of parameter gradients.
 pub struct Sums<'a, R>(Grads<'a, R>);
 
 impl<R: Real> Sums<'_, R> {
     /// Adds `value` to the gradient of parameter `index`.
     #[inline(always)]
     pub fn add(&mut self, index: usize, value: R) {
-        // Others are summed by another worker.
+        // Another worker sums the others.
         if self.0.range.contains(&index) {
             self.0.values[index - self.0.range.start] += value;
         }
@@ -83,9 +83,9 @@ impl<R: Real> Sums<'_, R> {
 /// The stage of a [`RowMap`].
 pub struct ByRow<T> {
     map: Arc<T>,
-    /// Which of the map's channels go in; those that do not are 0.
+    /// Input channels of the map that are used; the others are 0.
     inputs: Vec<usize>,
-    /// Which of the map's channels come out.
+    /// Output channels of the map that are used.
     outputs: Vec<usize>,
 }
 
@@ -96,7 +96,7 @@ impl<T: RowMap> ByRow<T> {
         Self { map: Arc::new(map), inputs: (0..input).collect(), outputs: (0..output).collect() }
     }
 
-    /// The whole of parameters: a smaller stage keeps them all.
+    /// All parameters: a reduced stage keeps them.
     fn params(&self) -> Vec<Range<usize>> {
         vec![0..self.info().params]
     }
@@ -108,7 +108,7 @@ impl<T: RowMap> ByRow<T> {
         (stage, self.params(), (0..self.inputs.len()).collect())
     }
 
-    /// Row `i` of `from`, put at `places` of `to`.
+    /// Copies row `i` of `from` to channels `places` of `to`.
     #[inline(always)]
     fn take<R: Real>(from: Tile<'_, R>, i: usize, places: &[usize], to: &mut [R]) {
         for (c, &place) in places.iter().enumerate() {
@@ -193,7 +193,7 @@ impl<T: RowMap> Stage for ByRow<T> {
         Some(Halves::of(self))
     }
 
-    /// Of the whole map: a smaller stage runs on the CPU.
+    /// Only for the whole map: a reduced stage runs on the CPU.
     fn wgsl(&self) -> Option<Fragment> {
         let [input, output] = self.map.widths();
         let whole = [self.inputs.len(), self.outputs.len()] == [input, output];
@@ -237,12 +237,13 @@ impl<T: RowMap> Field for ByRow<T> {
     }
 }
 
-/// A field of positions with line integrals of its own, one ray at a time. Only rays that are inside are asked for.
+/// A field of positions with line integrals of its own, one ray at a time. It is called only for rays that cross the
+/// reconstruction box.
 pub trait RayMap: RowMap {
     /// The line integral along `ray`, in cube sides.
     fn project<R: Real>(&self, params: &[R], ray: &UnitRay) -> R;
 
-    /// Given `dline = ∂L/∂line`: adds `∂L/∂params` to `grads`.
+    /// Given `dline = ∂L/∂line`, adds `∂L/∂params` to `grads`.
     fn backproject<R: Real>(&self, params: &[R], ray: &UnitRay, dline: R, grads: &mut Sums<'_, R>);
 }
 
@@ -256,7 +257,7 @@ impl<T: RayMap> ByRay<T> {
     }
 }
 
-/// Rays that are inside, with what goes with each.
+/// Rays that cross the box, with their associated items.
 fn inside<'a, A>(
     rays: &'a [UnitRay],
     with: impl IntoIterator<Item = A> + 'a,

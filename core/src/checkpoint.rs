@@ -1,4 +1,4 @@
-//! The state of a run between two steps: enough to continue to the same bits.
+//! The state of a run between two steps: enough to continue bit-identically.
 
 use crate::arena::{Arena, Layout, Weights};
 use crate::error::{Error, Result};
@@ -6,33 +6,33 @@ use crate::pipeline::Model;
 use serde::{Deserialize, Serialize};
 use std::sync::Arc;
 
-/// The state of a run besides the arena. All random numbers follow from seed and step.
+/// The state of a run besides the arena. Random numbers depend on seed and step only.
 #[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct Standing {
     /// Finished steps.
     pub step: u64,
-    /// The last of them of which the records so far may tell: what comes after it is told again.
+    /// Last step that existing records may cover; later steps are recorded again.
     pub recorded: u64,
     /// Training samples so far.
     pub samples: u64,
     /// Seconds of training so far.
     pub seconds: f64,
-    /// The encoder's channels that stayed each time some were removed, in order; see [`Model::masks`].
+    /// The encoder's remaining channels after each masking, in order; see [`Model::masks`].
     pub masks: Vec<Vec<usize>>,
-    /// What the method keeps for itself, such as sums that are not reported yet.
+    /// The method's own state, such as sums not yet reported.
     pub method: serde_json::Value,
 }
 
-/// A run between two steps, to be written.
+/// A run between two steps, ready to be written.
 pub struct Checkpoint<'a> {
-    /// Name, shape and values of all that the next step depends on.
+    /// Name, shape and values of every tensor that the next step depends on.
     pub tensors: Vec<(String, &'a [usize], &'a [f32])>,
-    /// All else.
+    /// Everything else.
     pub standing: Standing,
 }
 
-/// Parts of the arena that go into a checkpoint, under these names; gradients are zero between steps.
+/// Parts of the arena in a checkpoint, by name. Gradients are zero between steps.
 const PARTS: [&str; 3] = ["params", "first", "second"];
 
 /// A model's tensors for a checkpoint: `params.…`, `first.…` and `second.…` of each block of the layout.
@@ -41,7 +41,7 @@ pub fn tensors(model: &Model) -> Vec<(String, &[usize], &[f32])> {
     tensors_of("", model.pipeline.layout(), [params, first, second])
 }
 
-/// Parameters of `layout`, or these and both moments, under the names of [`tensors`], with `prefix` before them.
+/// Parameters of `layout`, optionally with both moments, named as in [`tensors`] after `prefix`.
 pub fn tensors_of<'a, const N: usize>(
     prefix: &str,
     layout: &'a Layout,
@@ -56,32 +56,32 @@ pub fn tensors_of<'a, const N: usize>(
     all
 }
 
-/// A checkpoint read back, or the part of it that one method of a chain wrote.
+/// A checkpoint read from a file, or the part of one method of a chain.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Resume {
-    /// The file, for messages.
+    /// File name, for messages.
     pub place: String,
-    /// All but the tensors.
+    /// Everything but the tensors.
     pub standing: Standing,
     /// The tensors of the whole file.
     pub weights: Arc<Weights>,
-    /// What the names of this part's tensors begin with.
+    /// Name prefix of this part's tensors.
     prefix: String,
 }
 
 impl Resume {
-    /// What stands in the file `place`.
+    /// The content of the file `place`.
     pub fn new(place: String, standing: Standing, weights: Weights) -> Self {
         Self { place, standing, weights: Arc::new(weights), prefix: String::new() }
     }
 
-    /// The part whose tensors have `prefix` before their names, with a standing of its own.
+    /// The part of the tensors with name prefix `prefix`, with its own standing.
     pub fn part(&self, prefix: &str, standing: Standing) -> Self {
         let prefix = format!("{}{prefix}", self.prefix);
         Self { place: self.place.clone(), standing, weights: self.weights.clone(), prefix }
     }
 
-    /// Names of its [`Checkpoint::tensors`].
+    /// Names of its tensors.
     pub fn names(&self) -> impl Iterator<Item = &str> {
         self.weights.tensors.keys().filter_map(|name| name.strip_prefix(&self.prefix))
     }
@@ -91,7 +91,7 @@ impl Resume {
         self.weights.tensors.get(&format!("{}{name}", self.prefix))
     }
 
-    /// The values of one of its tensors, which is to have this shape.
+    /// The values of one of its tensors; fails unless it has this shape.
     pub fn shaped(&self, name: &str, shape: &[usize]) -> Result<&[f32]> {
         match self.tensor(name) {
             Some((found, values)) if found == shape => Ok(values),
@@ -102,8 +102,8 @@ impl Resume {
         }
     }
 
-    /// Brings a model that was built from the same spec to where the run stood: masked channels leave it again, and
-    /// parameters and moments are replaced. Refuses a checkpoint that does not fit.
+    /// Restores a model that was built from the same spec: removes masked channels again and replaces parameters and
+    /// moments. Refuses a checkpoint that does not fit.
     pub fn restore(&self, model: &mut Model) -> Result<()> {
         for keep in &self.standing.masks {
             model.mask(keep.clone())?;
@@ -112,7 +112,7 @@ impl Resume {
         self.load("", model.pipeline.layout(), [params, first, second])
     }
 
-    /// What [`tensors_of`] gave of `layout` under `prefix`.
+    /// Loads what [`tensors_of`] returned for `layout` under `prefix`.
     pub fn load<const N: usize>(&self, prefix: &str, layout: &Layout, parts: [&mut [f32]; N]) -> Result<()> {
         for (part, values) in PARTS.into_iter().zip(parts) {
             let prefix = format!("{}{prefix}{part}.", self.prefix);

@@ -1,4 +1,4 @@
-//! How far line integrals are from the measured ones.
+//! Data terms: distance between computed and measured line integrals.
 
 use crate::error::Result;
 use crate::scan::ScanHeader;
@@ -7,22 +7,22 @@ use ndarray::ArrayView3;
 /// Settings of a data term.
 #[typetag::serde(tag = "type")]
 pub trait DataTermSpec: Send + Sync {
-    /// The data term, or why the settings make none.
+    /// Builds the data term; fails on invalid settings.
     fn build(&self) -> Result<Box<dyn DataTerm>>;
 }
 
 /// A convex function of the residuals `r = p − A·x`, pixel by pixel, for any scan.
 pub trait DataTerm: Send + Sync {
-    /// The function for these measured line integrals, `[view, row, column]`. They are only looked at.
+    /// The function for these measured line integrals, `[view, row, column]`, which it does not keep.
     fn of(&self, measured: ArrayView3<'_, f32>) -> Result<Box<dyn Misfit>>;
 
-    /// Bytes that [`DataTerm::of`] takes for a moment.
+    /// Temporary memory of [`DataTerm::of`], in bytes.
     fn scratch(&self, header: &ScanHeader) -> u64 {
         let _ = header;
         0
     }
 
-    /// Bytes that it holds for a scan of this size.
+    /// Memory held for a scan of this size, in bytes.
     fn held(&self, header: &ScanHeader) -> u64 {
         let _ = header;
         0
@@ -32,26 +32,26 @@ pub trait DataTerm: Send + Sync {
     fn describe(&self) -> String;
 }
 
-/// A data term `Σ φ_i(r_i)` of one scan. It is asked for an image at a time, from many threads: of the view `view`, whose
-/// line integrals `measured` were found, row by row.
+/// A data term `Σ φ_i(r_i)` of one scan. It is called for one image at a time, from many threads: view `view`, with its
+/// line integrals `measured`, row by row.
 pub trait Misfit: Send + Sync {
     /// Overwrites the residuals with the derivatives `φ'_i(r_i)`. Returns `Σ φ_i(r_i)`.
     fn differentiate(&self, view: usize, measured: &[f32], residuals: &mut [f32]) -> f64;
 
-    /// Multiplies each value by an upper bound of `φ''_i`: what the step of a gradient method follows from.
+    /// Multiplies each value by an upper bound of `φ''_i`, which determines the step of a gradient method.
     fn curve(&self, view: usize, measured: &[f32], values: &mut [f32]);
 
-    /// Multiplies each value by the standard deviation that noise gives `φ'_i`, in units of [`Misfit::noise`].
+    /// Multiplies each value by the standard deviation of `φ'_i` under noise, in units of [`Misfit::noise`].
     fn spread(&self, view: usize, measured: &[f32], values: &mut [f32]);
 
-    /// Standard deviation of the noise of line integrals near 0, from the scan.
+    /// Standard deviation of the noise of line integrals near 0, estimated from the scan.
     fn noise(&self) -> f64;
 
-    /// What it could not do since this was last asked, as [`crate::stage::Stage::fault`].
+    /// Returns and clears the first error since the last call; see [`crate::stage::Stage::fault`].
     fn fault(&self) -> Result<()> {
         Ok(())
     }
 
-    /// What was found in the scan.
+    /// Describes what was estimated from the scan.
     fn describe(&self) -> String;
 }

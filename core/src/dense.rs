@@ -6,7 +6,7 @@
 
 use crate::simd::{Real, Simd, SimdBase, SimdFloat, V, load, store};
 
-/// Which part of a weight matrix a product uses.
+/// The part of a weight matrix that a product uses.
 #[derive(Clone, Copy)]
 pub struct WeightMatrix<'a, R> {
     /// `[m][ld]`, row-major.
@@ -17,14 +17,14 @@ pub struct WeightMatrix<'a, R> {
     pub column: usize,
 }
 
-/// What a product does with the numbers that stand in its output.
+/// How a product treats existing output values.
 #[derive(Clone, Copy, PartialEq, Eq)]
 pub enum Output {
     /// Replaces them.
     Set,
     /// Adds to them.
     Add,
-    /// Multiplies them: the chain rule through an activation whose derivative stands there.
+    /// Multiplies them: chain rule through an activation whose derivative is stored there.
     Multiply,
 }
 
@@ -63,7 +63,7 @@ pub fn affine<S: Simd, R: Real>(s: S, w: WeightMatrix<'_, R>, bias: Option<&[R]>
     }
 }
 
-/// `M` output channels × `C` vectors of rows in registers. `FULL` blocks reach no further than the tile.
+/// `M` output channels × `C` vectors of rows in registers. `FULL` blocks do not reach past the end of the tile.
 #[inline(always)]
 fn affine_block<S: Simd, R: Real, const M: usize, const C: usize, const FULL: bool>(
     s: S,
@@ -75,7 +75,7 @@ fn affine_block<S: Simd, R: Real, const M: usize, const C: usize, const FULL: bo
     n: usize,
     i: usize,
 ) {
-    // Plain loops, not closures: a closure is compiled without the instructions that `s` stands for.
+    // Plain loops instead of closures: a closure is compiled without the instructions of `s`.
     let zero = V::<S, R>::splat(s, R::ZERO);
     let mut acc = [[zero; C]; M];
     let mut rows: [&[R]; M] = [&[]; M];
@@ -286,8 +286,8 @@ fn weights_block<S: Simd, R: Real, const M: usize, const K: usize>(
     }
 }
 
-/// The sum over lanes of each of 16 vectors. A tree of pairwise sums: after `log2(LEN)` rounds the sums stand in
-/// order, a vector of them for every `LEN` inputs.
+/// The sum over lanes of each of 16 vectors, by a tree of pairwise sums: after `log2(LEN)` rounds the sums are in
+/// order, one vector of them for every `LEN` inputs.
 #[inline(always)]
 fn lane_sums<S: Simd, R: Real>(mut v: [V<S, R>; 16]) -> [R; 16] {
     let len = V::<S, R>::LEN;
@@ -314,7 +314,7 @@ fn lane_sums<S: Simd, R: Real>(mut v: [V<S, R>; 16]) -> [R; 16] {
     out
 }
 
-/// The sum of a slice, lane by lane first.
+/// The sum of a slice, first within lanes.
 #[inline(always)]
 pub fn total<S: Simd, R: Real>(s: S, x: &[R]) -> R {
     let mut acc = V::<S, R>::splat(s, R::ZERO);

@@ -1,13 +1,13 @@
 //! The error that every crate of conefield returns.
 //!
-//! A message names the place (a file, a spec, a stage), the field, what was found and what was expected.
+//! A message names the place (file, spec or stage), the field, the value found and the value expected.
 
 use std::path::{Path, PathBuf};
 
-/// Everything that can go wrong, said in words that a user can act on.
+/// All errors, in words that a user can act on.
 #[derive(Debug, thiserror::Error)]
 pub enum Error {
-    /// A value that cannot be used: its place, what was found and what is expected.
+    /// An unusable value: its place, the value and what is expected.
     #[error("{place}: {field}: found {found}, expected {expected}")]
     Invalid {
         /// File, spec or stage that holds the value.
@@ -19,7 +19,7 @@ pub enum Error {
         /// What would be accepted.
         expected: String,
     },
-    /// The operating system refused.
+    /// An error of the operating system.
     #[error("{}: {source}", path.display())]
     Io {
         /// The file or folder.
@@ -28,7 +28,7 @@ pub enum Error {
         #[source]
         source: std::io::Error,
     },
-    /// Something was asked for that this build or this pipeline cannot do.
+    /// A request that this build or this pipeline cannot fulfil.
     #[error("{what}: {why}")]
     Unsupported {
         /// What was asked for.
@@ -42,25 +42,25 @@ pub enum Error {
         /// The last finished step.
         step: u64,
     },
-    /// The user interrupted a work of several parts.
+    /// The user interrupted a task of several parts.
     #[error("interrupted during {part}; the same command with --resume continues")]
     Stopped {
-        /// The part that is not done.
+        /// The unfinished part.
         part: String,
     },
-    /// The user interrupted the writing of a file.
+    /// The user interrupted writing a file.
     #[error("{place}: interrupted while writing; nothing was replaced")]
     Cancelled {
         /// The file.
         place: String,
     },
-    /// The user interrupted a work that leaves nothing behind.
+    /// The user interrupted a task that leaves nothing behind.
     #[error("interrupted during {part}")]
     Aborted {
-        /// What was under way.
+        /// The interrupted part.
         part: String,
     },
-    /// A device that computes refused or was lost.
+    /// A compute device failed or was lost.
     #[error("{device}: {what}")]
     Device {
         /// Its name.
@@ -68,10 +68,10 @@ pub enum Error {
         /// What happened.
         what: String,
     },
-    /// Training left the finite numbers.
+    /// Training produced non-finite numbers.
     #[error("training diverged at step {step}: {what}")]
     Diverged {
-        /// The step at which it was seen.
+        /// The step at which it was detected.
         step: u64,
         /// What was not finite.
         what: String,
@@ -82,7 +82,7 @@ pub enum Error {
 pub type Result<T, E = Error> = std::result::Result<T, E>;
 
 impl Error {
-    /// A value that cannot be used; see [`Error::Invalid`].
+    /// An unusable value; see [`Error::Invalid`].
     pub fn invalid(
         place: impl Into<String>,
         field: impl Into<String>,
@@ -92,8 +92,8 @@ impl Error {
         Self::Invalid { place: place.into(), field: field.into(), found: found.to_string(), expected: expected.into() }
     }
 
-    /// The same error for the owner of the stage that it is about: `key` goes before a field of a spec. A stage does not
-    /// know where it stands.
+    /// The same error with `key` prepended to the field of a spec. The owner of a stage calls this, as a stage does not
+    /// know its own path.
     pub fn within(self, key: &str) -> Self {
         match self {
             Self::Invalid { place, field, found, expected } if place == "spec" => {
@@ -109,7 +109,7 @@ impl Error {
         Self::Io { path: path.as_ref().to_path_buf(), source }
     }
 
-    /// A thing that cannot be done, with the reason.
+    /// An unsupported request, with the reason.
     pub fn unsupported(what: impl Into<String>, why: impl Into<String>) -> Self {
         Self::Unsupported { what: what.into(), why: why.into() }
     }

@@ -1,14 +1,14 @@
-//! Opening what a user or a description names, which may be anything.
+//! Opening of user-named files, which may be anything.
 
 use crate::error::{Error, Result};
 use std::fs::File;
 use std::io::Read;
 use std::path::Path;
 
-/// Opens a regular file; its size. Anything else could keep us waiting or give bytes without end.
+/// Opens a regular file and returns its size. Other file types could block or never end.
 pub fn open(path: &Path) -> Result<(File, u64)> {
     let io = |e| Error::io(path, e);
-    // Before it is opened: opening a pipe waits for its writer.
+    // Checked before opening: opening a pipe waits for its writer.
     if !path.metadata().map_err(io)?.is_file() {
         return Err(Error::invalid(path.display().to_string(), "file", "a folder, pipe or device", "a regular file"));
     }
@@ -17,7 +17,7 @@ pub fn open(path: &Path) -> Result<(File, u64)> {
     Ok((file, size))
 }
 
-/// Reads a text of at most `most` bytes.
+/// Reads a text file of at most `most` bytes.
 pub fn read_text(path: &Path, most: u64) -> Result<String> {
     let invalid = |field: &str, found: String, expected: String| {
         Error::invalid(path.display().to_string(), field, found, expected)
@@ -33,7 +33,7 @@ pub fn read_text(path: &Path, most: u64) -> Result<String> {
         .map_err(|e| invalid("text", format!("a byte that is not UTF-8: {}", e.utf8_error()), "UTF-8 text".into()))
 }
 
-/// The line of `text`, from 1, that a TOML error is about, where it says so.
+/// The line of `text` (from 1) of a TOML error, if known.
 pub fn toml_line(text: &str, error: &toml::de::Error) -> Option<usize> {
     let before = &text.as_bytes()[..error.span()?.start.min(text.len())];
     Some(1 + before.iter().filter(|b| **b == b'\n').count())

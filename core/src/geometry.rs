@@ -1,8 +1,8 @@
-//! Scan geometry: where source, detector and volume stand, in millimetres.
+//! Scan geometry: positions of source, detector and volume, in millimetres.
 //!
-//! World: right-handed, rotation axis z. On a circular orbit the source at angle `a` stands at
-//! `DSO·(cos a, sin a, 0)`, detector columns (u) run along `(-sin a, cos a, 0)` and detector rows (v) run
-//! towards −z. A view is stored as vectors, so that irregular orbits need nothing special.
+//! World: right-handed, rotation axis z. On a circular orbit the source at angle `a` is at `DSO·(cos a, sin a, 0)`,
+//! detector columns (u) run along `(-sin a, cos a, 0)` and detector rows (v) run towards −z. A view is stored as
+//! vectors, so that irregular orbits need no special case.
 
 use crate::error::{Error, Result, ensure};
 use serde::{Deserialize, Serialize};
@@ -26,11 +26,11 @@ pub struct Radians(pub f64);
 pub struct View {
     /// The X-ray source.
     pub source: Vec3,
-    /// The centre of the detector (between the middle pixels where their number is even).
+    /// The centre of the detector (between the middle pixels if their number is even).
     pub detector: Vec3,
-    /// From one pixel's centre to the next column's.
+    /// Vector between the centres of neighbouring columns.
     pub u: Vec3,
-    /// From one pixel's centre to the next row's.
+    /// Vector between the centres of neighbouring rows.
     pub v: Vec3,
 }
 
@@ -56,8 +56,8 @@ impl View {
         }
     }
 
-    /// The same view with its detector turned about its centre: right-handed about `u`, about `v` and about `u × v`, which
-    /// points away from the source; about the last first, each about the axis that was there before.
+    /// The same view with its detector rotated about its centre: right-handed about `u`, `v` and `u × v` (pointing away
+    /// from the source). The rotation about `u × v` comes first; each uses the axis before any rotation.
     pub fn tilted(&self, [about_u, about_v, about_normal]: [Radians; 3]) -> Self {
         let unit = |a: Vec3| a.map(|x| x / norm(a));
         let axes = [(cross(self.u, self.v), about_normal), (self.v, about_v), (self.u, about_u)];
@@ -68,15 +68,16 @@ impl View {
         Self { u: turned(self.u), v: turned(self.v), ..*self }
     }
 
-    /// The point on the detector at the (possibly fractional) pixel `row`, `column` of a detector of `shape`
-    /// rows × columns; whole numbers are pixel centres.
+    /// The world position of the (possibly fractional) pixel `row`, `column` of a detector of `shape` rows × columns;
+    /// whole numbers are pixel centres.
     pub fn pixel(&self, shape: [usize; 2], row: f64, column: f64) -> Vec3 {
         let dv = row - (shape[0] as f64 - 1.0) / 2.0;
         let du = column - (shape[1] as f64 - 1.0) / 2.0;
         std::array::from_fn(|k| self.detector[k] + dv * self.v[k] + du * self.u[k])
     }
 
-    /// The unit normal of the detector, pointing from the source towards it, and the distance between them.
+    /// The detector's unit normal, pointing away from the source, and the distance from the source to the detector
+    /// plane.
     pub fn normal(&self) -> (Vec3, f64) {
         let n = cross(self.u, self.v);
         let len = norm(n);
@@ -86,7 +87,7 @@ impl View {
     }
 }
 
-/// The grid of voxels that is to be reconstructed.
+/// The voxel grid to reconstruct.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct VoxelGrid {
@@ -105,8 +106,7 @@ impl VoxelGrid {
         std::array::from_fn(|k| self.shape[k] as f64 * self.spacing[k])
     }
 
-    /// A grid of the same box with `n` voxels along its longest side, and along the others as many as make them nearly
-    /// cubes.
+    /// A grid of the same box with `n` voxels along its longest side and nearly cubic voxels.
     pub fn with_longest(&self, n: usize) -> Self {
         let size = self.size();
         let voxel = size.into_iter().fold(0.0, f64::max) / n as f64;
@@ -114,7 +114,7 @@ impl VoxelGrid {
         Self { shape, spacing: std::array::from_fn(|k| size[k] / shape[k] as f64), center: self.center }
     }
 
-    /// Lower and upper corner of the box that the voxels fill.
+    /// Lower and upper corner of the box.
     pub fn bounds(&self) -> [Vec3; 2] {
         let size = self.size();
         [
@@ -129,17 +129,17 @@ impl VoxelGrid {
         std::array::from_fn(|k| lo[k] + (index[k] as f64 + 0.5) * self.spacing[k])
     }
 
-    /// Number of voxels, or `None` past what a `usize` holds.
+    /// Number of voxels, or `None` if it overflows `usize`.
     pub fn len(&self) -> Option<usize> {
         self.shape.iter().try_fold(1usize, |n, &s| n.checked_mul(s))
     }
 
-    /// Whether there is no voxel.
+    /// Whether there are no voxels.
     pub fn is_empty(&self) -> bool {
         self.shape.contains(&0)
     }
 
-    /// Refuses empty grids, sizes past memory and spacings that are not positive and finite.
+    /// Refuses empty grids, sizes beyond memory, and spacings that are not positive and finite.
     pub fn validate(&self, place: &str) -> Result<()> {
         ensure(!self.is_empty(), place, "volume.shape", format!("{:?}", self.shape), "at least one voxel an axis")?;
         ensure(
@@ -166,18 +166,18 @@ impl VoxelGrid {
     }
 }
 
-/// Everything that relates a detector pixel to a ray through the volume.
+/// All that maps a detector pixel to a ray through the volume.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct Geometry {
     /// Detector rows (v) × columns (u).
     pub detector: [usize; 2],
-    /// One entry a view, in the order of the projections.
+    /// One entry per view, in the order of the projections.
     pub views: Vec<View>,
     /// The voxels to reconstruct.
     pub volume: VoxelGrid,
 }
 
-/// A straight line from the source through the world: `origin + t·direction`, `t` in mm.
+/// A straight line from the source: `origin + t·direction`, `t` in mm.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Ray {
     /// The source.
@@ -187,7 +187,7 @@ pub struct Ray {
 }
 
 impl Ray {
-    /// Where the ray is inside the box `[lower, upper]`: `t` in mm, entry and exit, or `None` if it misses.
+    /// Entry into and exit from the box `[lower, upper]`, as `t` in mm, or `None` if the ray misses it.
     pub fn clip(&self, bounds: [Vec3; 2]) -> Option<[f64; 2]> {
         let (mut near, mut far) = (0.0f64, f64::INFINITY);
         for k in 0..3 {
@@ -220,12 +220,12 @@ impl Geometry {
         Ray { origin: v.source, direction: d.map(|x| x / len) }
     }
 
-    /// Number of measured values, or `None` past what a `usize` holds.
+    /// Number of measured values, or `None` if it overflows `usize`.
     pub fn measurements(&self) -> Option<usize> {
         self.views.len().checked_mul(self.detector[0])?.checked_mul(self.detector[1])
     }
 
-    /// Every length times `factor`.
+    /// All lengths multiplied by `factor`.
     pub fn scaled(&self, factor: f64) -> Self {
         let s = |v: Vec3| v.map(|x| x * factor);
         Self {
@@ -243,8 +243,8 @@ impl Geometry {
         }
     }
 
-    /// Refuses what no reconstruction can use: no views, no pixels, numbers that are not finite, a degenerate
-    /// detector, a source inside the volume.
+    /// Refuses unusable geometry: no views, no pixels, non-finite numbers, a degenerate detector, a source inside the
+    /// volume.
     pub fn validate(&self, place: &str) -> Result<()> {
         self.volume.validate(place)?;
         ensure(!self.views.is_empty(), place, "views", 0, "at least one view")?;
@@ -310,7 +310,7 @@ pub fn cross(a: Vec3, b: Vec3) -> Vec3 {
     [a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]]
 }
 
-/// `a` turned right-handed about the unit vector `axis` (Rodrigues).
+/// `a` rotated right-handed about the unit vector `axis` (Rodrigues).
 fn turned(a: Vec3, axis: Vec3, Radians(angle): Radians) -> Vec3 {
     let (s, c) = angle.sin_cos();
     let (across, along) = (cross(axis, a), dot(axis, a) * (1.0 - c));
@@ -362,12 +362,12 @@ mod tests {
         let near = |a: Vec3, b: Vec3| assert!(norm(sub(a, b)) < 1e-12, "{a:?} {b:?}");
         assert_eq!(view.tilted([Radians(0.0); 3]), view);
         let quarter = Radians(std::f64::consts::FRAC_PI_2);
-        // u is y, v is -z: a quarter about the normal u × v (-x) brings u to v and v to -u.
+        // u is y, v is -z: a quarter turn about the normal u × v (-x) takes u to v and v to -u.
         let skewed = view.tilted([Radians(0.0), Radians(0.0), quarter]);
         near(skewed.u, [0.0, 0.0, -1.0]);
         near(skewed.v, [0.0, -2.0, 0.0]);
         assert_eq!((skewed.source, skewed.detector), (view.source, view.detector));
-        // About u only v turns, and its length stays.
+        // About u only v rotates, and its length is preserved.
         let pitched = view.tilted([quarter, Radians(0.0), Radians(0.0)]);
         near(pitched.u, view.u);
         near(pitched.v, [-2.0, 0.0, 0.0]);

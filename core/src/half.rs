@@ -1,13 +1,12 @@
-//! Numbers of 16 bits, in which tables may be kept to be read: half the memory, fewer digits.
+//! 16-bit numbers for tables: half the memory, fewer digits.
 //!
-//! Conversions are integer arithmetic without branches, so that a plain loop over them becomes vector code on every
-//! instruction set. They round to the nearest, ties to even. What is finite stays finite: it ends at the largest number
-//! of the format.
+//! Conversions are branch-free integer arithmetic, so that a plain loop over them vectorizes on every instruction set.
+//! They round to nearest, ties to even. Finite numbers stay finite: they saturate at the largest number of the format.
 
 use crate::simd::Real;
 use bytemuck::{Pod, Zeroable};
 
-/// A number as it stands in memory, to be computed with as `R`.
+/// A storage format of numbers that are computed with as `R`.
 pub trait Stored<R>: Copy + Default + Send + Sync + 'static {
     /// Its value, exactly.
     fn value(self) -> R;
@@ -20,9 +19,9 @@ impl<R: Real> Stored<R> for R {
     }
 }
 
-/// 16 bits that stand for an `f32`.
+/// A 16-bit format of `f32` values.
 pub trait Half: Stored<f32> + Pod {
-    /// The nearest to `x`.
+    /// The nearest number to `x`.
     fn nearest(x: f32) -> Self;
 }
 
@@ -31,7 +30,7 @@ pub trait Half: Stored<f32> + Pod {
 #[repr(transparent)]
 pub struct F16(pub u16);
 
-/// The upper half of an `f32`: 8 bits, its range.
+/// The upper half of an `f32`: 8 bits, same range.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Pod, Zeroable)]
 #[repr(transparent)]
 pub struct Bf16(pub u16);
@@ -43,7 +42,7 @@ impl Stored<f32> for F16 {
     fn value(self) -> f32 {
         let bits = u32::from(self.0);
         let magnitude = bits & 0x7fff;
-        // Exponents count from 15 here and from 127 there; the largest one says infinite or NaN in both.
+        // Exponents have bias 15 here and 127 there; the largest one means infinite or NaN in both.
         let normal = (magnitude << 13) + (112 << 23);
         let normal = if magnitude < 0x7c00 { normal } else { normal + (112 << 23) };
         let denormal = (magnitude as i32 as f32 * (1.0 / 16_777_216.0)).to_bits();
@@ -58,7 +57,7 @@ impl Half for F16 {
         let magnitude = bits & 0x7fff_ffff;
         let finite = magnitude.min(65_504f32.to_bits());
         let normal = ((finite + 0xfff + (finite >> 13 & 1)) >> 13).wrapping_sub(112 << 10);
-        // The last bit of a number from ½ to 1 is 2⁻²⁴, as of a denormal half: the sum rounds.
+        // The last bit of a number from ½ to 1 is 2⁻²⁴, as for a denormal half: the sum rounds.
         let denormal = (f32::from_bits(finite) + 0.5).to_bits().wrapping_sub(0.5f32.to_bits());
         let rounded = if finite < 0x3880_0000 { denormal } else { normal };
         let special = if magnitude > INFINITE { 0x7e00 } else { 0x7c00 };
@@ -85,7 +84,7 @@ impl Half for Bf16 {
     }
 }
 
-/// `to` of `from`, as many as there are of both.
+/// Applies `to` to `from`, element by element, up to the shorter length.
 #[inline(always)]
 pub fn round<H: Half>(from: &[f32], to: &mut [H]) {
     for (to, &from) in to.iter_mut().zip(from) {
@@ -146,7 +145,7 @@ mod tests {
         assert_eq!(F16::nearest(1e-8).value(), 0.0);
         assert_eq!(F16::nearest(f32::INFINITY).value(), f32::INFINITY);
         assert_eq!(Bf16::nearest(f32::NEG_INFINITY).value(), f32::NEG_INFINITY);
-        // All bits of a NaN: rounding them up would make 0 of it.
+        // All bits of a NaN: rounding them up would give 0.
         let nan = f32::from_bits(0x7fff_ffff);
         assert!(F16::nearest(nan).value().is_nan() && Bf16::nearest(nan).value().is_nan());
     }

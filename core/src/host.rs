@@ -1,23 +1,23 @@
-//! Stages on the host by their `f32` kernels, whatever backend trains: for what looks at a model beside training.
+//! Runs stages on the host with their `f32` kernels, on any backend, to inspect a model beside training.
 
 use crate::error::{Result, ensure};
 use crate::pipeline::Model;
 use crate::stage::{Scope, Stage, TILE_ROWS, Tile, TileMut};
 use std::ops::Range;
 
-/// The encoder's features `[F][rows]` as the normalizers hand them to the field, `[F'][rows]`. Rows are points off any
-/// ray. The model's arena must be up to date ([`crate::backend::Executable::fetch`]).
+/// The encoder's features `[F][rows]` after the normalizers, `[F'][rows]`. Rows are points off any ray. The model's
+/// arena must be up to date ([`crate::backend::Executable::fetch`]).
 pub fn normalize(model: &Model, features: &[f32], rows: usize) -> Result<Vec<f32>> {
     through(model, 1..model.pipeline.normalizers.len() + 1, features, rows)
 }
 
-/// The attenuation `[rows]` that normalizers and field make of the encoder's features `[F][rows]`, in the scale that
-/// stages see. As [`normalize`] otherwise.
+/// The attenuation `[rows]` computed by normalizers and field from the encoder's features `[F][rows]`, in the scale of
+/// the stages. Otherwise as [`normalize`].
 pub fn attenuation(model: &Model, features: &[f32], rows: usize) -> Result<Vec<f32>> {
     through(model, 1..model.pipeline.normalizers.len() + 2, features, rows)
 }
 
-/// `features` through some neighbouring stages of the pipeline.
+/// Applies some consecutive stages of the pipeline to `features`.
 fn through(model: &Model, which: Range<usize>, features: &[f32], rows: usize) -> Result<Vec<f32>> {
     let pipeline = &model.pipeline;
     let stages: Vec<(&dyn Stage, &[f32])> = pipeline
@@ -37,7 +37,7 @@ fn through(model: &Model, which: Range<usize>, features: &[f32], rows: usize) ->
     )?;
     let wide = stages.last().map_or(width, |(stage, _)| stage.info().output);
     let mut out = vec![0.0; wide * rows];
-    // A stage that looks along rays gets points off any ray one at a time.
+    // Stages that look along rays get points off any ray one at a time.
     let most = if stages.iter().any(|(s, _)| s.info().scope == Scope::Ray) { 1 } else { TILE_ROWS };
     for at in (0..rows).step_by(most) {
         let n = most.min(rows - at);

@@ -1,20 +1,19 @@
-//! The contracts that conefield's stages, backends and methods meet at.
+//! The contracts between conefield's stages, backends and methods.
 //!
-//! - [`geometry`], [`orbit`], [`scan`], [`parts`]: what was measured, in millimetres, and what comes out.
-//! - [`simd`], [`half`], [`dense`], [`activation`], [`trilinear`], [`stage`]: what a stage computes and how.
-//! - [`by_row`]: stages that are written for one row at a time; [`prelude`]: what their authors need.
-//! - [`support`]: where the object can be; [`scene`]: between the world and what stages see.
-//! - [`loss`], [`prior`]: what training makes small.
+//! - [`geometry`], [`orbit`], [`scan`], [`parts`]: measurements in millimetres, and the resulting volumes.
+//! - [`simd`], [`half`], [`dense`], [`activation`], [`trilinear`], [`stage`]: the arithmetic of stages.
+//! - [`by_row`]: stages written for one row at a time; [`prelude`]: imports for their authors.
+//! - [`support`]: where the object can be; [`scene`]: the mapping between the world and the stages.
+//! - [`loss`], [`prior`]: what training minimizes.
 //! - [`wgsl`]: the same for a GPU.
-//! - [`arena`]: parameters, gradients and optimizer state under their names.
-//! - [`files`]: opening what a user or a description names; [`allowance`]: the memory and work that reading it may take.
-//! - [`settings`], [`precision`], [`spec`], [`registry`]: what a user writes, and the types that it may name.
-//! - [`host`]: stages on the host, for what looks at a model beside training.
+//! - [`arena`]: parameters, gradients and optimizer state by name.
+//! - [`files`]: opening of user-named files; [`allowance`]: limits of memory and work for reading them.
+//! - [`settings`], [`precision`], [`spec`], [`registry`]: what a user writes, and the available types.
+//! - [`host`]: stages on the host, to inspect a model beside training.
 //! - [`voxel`]: line integrals of voxel volumes.
-//! - [`basis`], [`data_term`], [`regularizer`]: what an iterative method is put together from; [`space`]: its arrays and
-//!   what they take.
-//! - [`method`]: what a spec names, its plan and its run; [`pipeline`], [`backend`], [`trained`]: a field from its stages to a
-//!   volume; [`checkpoint`]: where a run stands.
+//! - [`basis`], [`data_term`], [`regularizer`]: parts of an iterative method; [`space`]: its arrays and their memory.
+//! - [`method`]: methods, their plans and runs; [`pipeline`], [`backend`], [`trained`]: from the stages of a field to a
+//!   volume; [`checkpoint`]: the state of a run.
 
 pub mod activation;
 pub mod allowance;

@@ -1,5 +1,5 @@
-//! A method: scan in, volume out. [`Method`] is what a spec says; [`Method::plan`] builds it once into a [`Plan`], which is
-//! explained, priced and run.
+//! Methods: scan in, volume out. A [`Method`] holds the settings of a spec; [`Method::plan`] builds it once into a
+//! [`Plan`], which is explained, priced and run.
 
 use crate::arena::Weights;
 use crate::backend::{Backend, Explain};
@@ -15,34 +15,34 @@ use ndarray::Array3;
 use serde::{Deserialize, Serialize};
 use std::time::Instant;
 
-/// What a method works on.
+/// Inputs of a method.
 #[derive(Clone, Copy)]
 pub struct Job<'a> {
-    /// Views to learn from.
+    /// Views to reconstruct from.
     pub scan: &'a Scan,
-    /// Held-out views, whose error is reported.
+    /// Held-out views, for reporting their error.
     pub held_out: Option<&'a Scan>,
-    /// The volume sought, if known; it is only looked at, never learned from.
+    /// The true volume, if known; used for evaluation only.
     pub reference: Option<&'a Volume>,
-    /// The value that PSNR takes for the reference's full range.
+    /// The reference's full range in PSNR.
     pub peak: f64,
-    /// Does the work.
+    /// The compute backend.
     pub backend: &'a dyn Backend,
-    /// Seed of everything random.
+    /// Seed of all random numbers.
     pub seed: u64,
-    /// Limits that the command line adds to the spec's.
+    /// Limits from the command line, in addition to the spec's.
     pub limits: Limits,
-    /// The volume to start from, in 1/unit of the scan. It goes before one that the method's settings name.
+    /// Initial volume, in 1/unit of the scan. Takes precedence over one named in the method's settings.
     pub start: Option<&'a Volume>,
-    /// Reads a volume that the spec names, in 1/unit of the scan.
+    /// Reads a volume named by the spec, in 1/unit of the scan.
     pub volumes: &'a dyn Fn(&str) -> Result<Volume>,
-    /// Where an earlier run of the same job stood, to go on from.
+    /// State of an earlier run of the same job to continue from.
     pub resume: Option<&'a Resume>,
 }
 
 impl<'a> Job<'a> {
-    /// A job with nothing beside what every one has: no held-out views, no reference (and a peak of 1), no limits, seed 0,
-    /// and no files that the spec may name.
+    /// A job with defaults: no held-out views, no reference (and a peak of 1), no limits, seed 0, and no files for the
+    /// spec.
     pub fn new(scan: &'a Scan, backend: &'a dyn Backend) -> Self {
         Self {
             scan,
@@ -63,17 +63,17 @@ fn no_volumes(path: &str) -> Result<Volume> {
     Err(Error::unsupported(path, "this job reads no volumes"))
 }
 
-/// When to stop, whichever comes first.
+/// Limits of a run; the first one reached stops it.
 #[derive(Debug, Clone, Copy, Default, PartialEq)]
 pub struct Limits {
     /// Steps (iterations).
     pub steps: Option<u64>,
     /// Seconds of training.
     pub seconds: Option<f64>,
-    /// Seconds of training at the latest. What follows the run's end, such as a learning rate, does not look at it.
+    /// Upper bound of the training seconds. Schedules that depend on the end of the run, such as learning rates, ignore
+    /// it.
     pub at_most: Option<f64>,
-    /// When training is to be over by the clock on the wall, whatever happens beside it. Methods that cannot stop anywhere
-    /// stop before they would pass it.
+    /// Wall-clock end of training. Methods that can stop only at certain points stop before they would pass it.
     pub deadline: Option<Instant>,
     /// The same for the later methods of a chain.
     pub then: Option<Instant>,
@@ -84,57 +84,58 @@ pub struct Limits {
 pub struct Record {
     /// Finished steps.
     pub step: u64,
-    /// Seconds of training so far (evaluation and export left out).
+    /// Seconds of training so far (without evaluation and export).
     pub seconds: f64,
-    /// Mean loss since the last record; of iterative methods, the root mean square of the residual `p − A·x`. FDK has none.
+    /// Mean loss since the last record; for iterative methods the root mean square of the residual `p − A·x`. None for
+    /// FDK.
     pub loss: Option<f64>,
     /// Mean weighted prior since the last record.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub prior: Option<f64>,
-    /// Learning rate, of methods that have one.
+    /// Learning rate, for methods that have one.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub lr: Option<f64>,
-    /// Training samples a second since the last record, of methods that take samples.
+    /// Training samples per second since the last record, for methods that take samples.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub samples_per_s: Option<f64>,
-    /// Root mean square change of the volume by this pass over its root mean square, of iterative methods.
+    /// Relative root mean square change of the volume in this pass, for iterative methods.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub change: Option<f64>,
-    /// Root mean square error of the held-out views' line integrals, over their largest value.
+    /// Root mean square error of the held-out line integrals, relative to their largest value.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub held_out: Option<f64>,
-    /// PSNR against the reference over one voxel, drawn, of each block of 4³, dB.
+    /// PSNR against the reference in dB, over one random voxel of each block of 4³.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub psnr: Option<f64>,
-    /// Drift found since the last record, of a spec with the callback `drift`.
+    /// Drift found since the last record, if the spec has the callback `drift`.
     #[serde(skip_serializing_if = "Vec::is_empty")]
     pub drift: Vec<DriftRecord>,
-    /// What else happened since the last record, e.g. channels masked.
+    /// Other events since the last record, e.g. masked channels.
     #[serde(skip_serializing_if = "Vec::is_empty")]
     pub events: Vec<String>,
 }
 
-/// How much normalizers and field have changed under the same features.
+/// Change of normalizers and field, measured on fixed features.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct DriftRecord {
-    /// Finished steps when features were recorded.
+    /// Finished steps when the features were recorded.
     pub from_step: u64,
-    /// Finished steps when they were evaluated again.
+    /// Finished steps when the features were evaluated again.
     pub step: u64,
     /// Finished passes over the views by then.
     pub epoch: f64,
-    /// Mean absolute difference of the attenuation, in the scale that stages see.
+    /// Mean absolute difference of the attenuation, in the scale of the stages.
     pub mean_l1: f64,
 }
 
-/// Hears of a run's progress and may stop it.
+/// Receives the progress of a run and may stop it.
 pub trait Observer {
-    /// After every step: finished share in [0, 1] and the seconds left by the method's own estimate.
+    /// Called after every step with the finished share in [0, 1] and the method's estimate of the seconds left.
     fn progress(&mut self, step: u64, share: f64, seconds_left: f64);
-    /// A record is due.
+    /// Receives a record.
     fn record(&mut self, record: &Record);
-    /// A sentence for the log.
+    /// Receives a message for the log.
     fn note(&mut self, text: &str);
     /// Whether to stop after this step, with [`crate::Error::Interrupted`].
     fn cancelled(&self) -> bool {
@@ -144,7 +145,7 @@ pub trait Observer {
     fn checkpoint_due(&self) -> bool {
         false
     }
-    /// Keeps a checkpoint: when one is due, and before an interrupted run ends.
+    /// Stores a checkpoint: when one is due, and before an interrupted run ends.
     fn checkpoint(&mut self, checkpoint: &Checkpoint<'_>) -> Result<()> {
         let _ = checkpoint;
         Ok(())
@@ -153,14 +154,14 @@ pub trait Observer {
     fn slices_due(&self) -> bool {
         false
     }
-    /// Sees the three middle slices of what takes shape, each with the part of `grid` that it is, in 1/unit of the scan.
+    /// Receives the three middle slices of the current state, each with its part of `grid`, in 1/unit of the scan.
     fn slices(&mut self, grid: VoxelGrid, slices: &[(Part, Array3<f32>)]) -> Result<()> {
         let _ = (grid, slices);
         Ok(())
     }
 }
 
-/// Hears nothing.
+/// An observer that ignores everything.
 pub struct Silent;
 
 impl Observer for Silent {
@@ -169,23 +170,23 @@ impl Observer for Silent {
     fn note(&mut self, _: &str) {}
 }
 
-/// What came out of a scan, in 1/unit of it.
+/// The result of a method, in 1/unit of the scan.
 pub enum Reconstruction {
     /// Voxels.
     Volume(Volume),
     /// A field that can be evaluated on any grid.
     Field(TrainedField),
-    /// Voxels that a later method of a chain made of a field's, and that field.
+    /// Voxels that a later method of a chain computed from a field, and that field.
     Refined {
-        /// What came out.
+        /// The final volume.
         volume: Volume,
-        /// What it was made of.
+        /// The field it was computed from.
         field: Box<TrainedField>,
     },
 }
 
 impl Reconstruction {
-    /// The voxels that the scan asks for, part by part; a field is evaluated by `backend`.
+    /// The voxels requested by the scan, part by part; a field is evaluated by `backend`.
     pub fn voxels<'a>(&'a self, backend: &dyn Backend) -> Result<Box<dyn Voxels + 'a>> {
         Ok(match self {
             Self::Volume(volume) | Self::Refined { volume, .. } => Box::new(volume),
@@ -193,12 +194,12 @@ impl Reconstruction {
         })
     }
 
-    /// The voxels that the scan asks for, all at once.
+    /// The voxels requested by the scan, all at once.
     pub fn volume(&self, backend: &dyn Backend) -> Result<Volume> {
         Volume::collect(self.voxels(backend)?.as_mut())
     }
 
-    /// The field, of methods that train one.
+    /// The field, if the method trains one.
     pub fn field(&self) -> Option<&TrainedField> {
         match self {
             Self::Volume(_) => None,
@@ -208,9 +209,9 @@ impl Reconstruction {
     }
 }
 
-/// What a method made.
+/// The outcome of a run.
 pub struct Solution {
-    /// What came out.
+    /// The reconstruction.
     pub result: Reconstruction,
     /// Steps done.
     pub steps: u64,
@@ -218,15 +219,15 @@ pub struct Solution {
     pub train_s: f64,
     /// Training samples.
     pub samples: u64,
-    /// Seconds of `train_s` that they took; iterative methods take none.
+    /// Seconds of `train_s` spent on those samples; 0 for iterative methods.
     pub sampling_s: f64,
-    /// Times that training ran away and went back to an earlier state.
+    /// Number of returns to an earlier state after training diverged.
     pub rollbacks: u64,
-    /// The record whose state came out, where held-out views chose it.
+    /// The record whose state was kept, if held-out views selected it.
     pub best: Option<Best>,
 }
 
-/// A record that predicted held-out views best.
+/// The record with the smallest error on held-out views.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct Best {
@@ -236,19 +237,19 @@ pub struct Best {
     pub held_out: f64,
 }
 
-/// What a method is built with.
+/// The environment in which a method is built.
 #[derive(Clone, Copy)]
 pub struct Context<'a> {
     /// Compiles and computes.
     pub backend: &'a dyn Backend,
-    /// Reads a weights file that the spec names.
+    /// Reads a weights file named by the spec.
     pub weights: &'a dyn Fn(&str) -> Result<Weights>,
-    /// Whether weights are read: a spec is explained, and a field restored, without those that it starts from.
+    /// Whether to read weights. Not needed to explain a spec or to restore a field.
     pub reads_weights: bool,
 }
 
 impl<'a> Context<'a> {
-    /// A context whose plans start from no weights: they are for looking at.
+    /// A context without initial weights, for inspection only.
     pub fn without_weights(backend: &'a dyn Backend) -> Self {
         Self { reads_weights: false, ..Self::new(backend) }
     }
@@ -263,80 +264,79 @@ impl<'a> Context<'a> {
     }
 }
 
-/// The settings of a method with the stages that it owns: what a spec says.
+/// The settings of a method and of the stages it owns, as given by a spec.
 #[typetag::serde(tag = "type")]
 pub trait Method: Send + Sync {
-    /// Checks the settings, builds every stage, compiles, and reads the weights that the settings name; each once.
+    /// Checks the settings, builds and compiles every stage, and reads the weights named in the settings, each once.
     fn plan(&self, context: &Context<'_>) -> Result<Box<dyn Plan>>;
 }
 
-/// A method that is built and checked: it is explained, priced and run.
+/// A method that is built and checked, ready to be explained, priced and run.
 pub trait Plan: Send {
     /// What it consists of.
     fn outline(&self) -> Outline;
 
-    /// What it holds in memory for a scan of this size.
+    /// Memory needed for a scan of this size.
     fn needs(&self, scan: &ScanHeader) -> Needs;
 
-    /// What it finds out about a scan before it starts.
+    /// Analyses a scan before the start.
     fn inspect(&self, scan: &Scan) -> Result<Findings>;
 
     /// Reconstructs.
     fn run(&mut self, job: &Job<'_>, observer: &mut dyn Observer) -> Result<Solution>;
 
-    /// Trains its field on known volumes, voxel by voxel, for weights that other scans reuse.
+    /// Trains its field on known volumes, voxel by voxel; the weights are reused for other scans.
     fn pretrain(&mut self, job: &PretrainJob<'_>, observer: &mut dyn Observer) -> Result<Model> {
         let _ = (job, observer);
         let what = self.outline().method.kind;
         Err(Error::unsupported(what, "this method has nothing to pre-train"))
     }
 
-    /// A field that it has trained, with the parameters that `load` puts into its model.
+    /// Restores a trained field with the parameters that `load` puts into its model.
     fn restore(&self, placement: &Placement, load: &mut dyn FnMut(&mut Model) -> Result<()>) -> Result<TrainedField> {
         let _ = (placement, load);
         Err(Error::unsupported(self.outline().method.kind, "this method trains no field"))
     }
 
-    /// The stages of a field, of a method that trains one.
+    /// The stages of the field, if the method trains one.
     fn pipeline(&self) -> Option<&Pipeline> {
         None
     }
 
-    /// The setting that looks at held-out views, if there is one: it has no effect in a job without such views.
+    /// The setting that requires held-out views, if any: it has no effect without them.
     fn needs_held_out(&self) -> Option<String> {
         None
     }
 
-    /// Whether [`Job::start`] means something to it.
+    /// Whether [`Job::start`] has an effect.
     fn starts_from_volume(&self) -> bool {
         true
     }
 
-    /// Passes over the views that it makes at most, of an iterative method that counts them.
+    /// Upper bound of the passes over the views, for iterative methods.
     fn passes(&self) -> Option<u64> {
         None
     }
 
-    /// What a pass over a scan of this size takes, in samples along rays: passes over two sizes of a scan take times that are
-    /// about in proportion.
+    /// Cost of one pass over a scan of this size, in samples along rays. Times of passes over scans of different sizes
+    /// are about proportional to it.
     fn work(&self, scan: &ScanHeader) -> f64 {
         scan.samples()
     }
 
-    /// A scan of this size as an iterative method sees it: the pixels that binning leaves, and its unknowns in the place of
-    /// voxels.
+    /// The size of the scan for an iterative method: pixels after binning, and unknowns in place of voxels.
     fn seen(&self, scan: &ScanHeader) -> Option<ScanHeader> {
         let _ = scan;
         None
     }
 
-    /// The plans of a chain, in order; nothing of any other method.
+    /// The plans of a chain, in order; empty for other methods.
     fn links(&mut self) -> &mut [Box<dyn Plan>] {
         &mut []
     }
 }
 
-/// What a method consists of, for people and for records.
+/// The parts of a method, for display and records.
 #[derive(Debug, Clone, Default, Serialize)]
 pub struct Outline {
     /// The method itself.
@@ -345,7 +345,7 @@ pub struct Outline {
     pub stages: Vec<StageLine>,
     /// All other stages.
     pub beside: Vec<Line>,
-    /// What the backend makes of the stages of a field.
+    /// The compiled stages of a field.
     pub compiled: Option<Explain>,
     /// The methods of a chain.
     #[serde(skip_serializing_if = "Vec::is_empty")]
@@ -353,20 +353,20 @@ pub struct Outline {
 }
 
 impl Outline {
-    /// What the backend makes of its first field.
+    /// The compiled stages of the first field.
     pub fn backend(&self) -> Explain {
         let links = self.links.iter().map(Self::backend).find(|e| !e.backend.is_empty());
         self.compiled.clone().or(links).unwrap_or_default()
     }
 
-    /// Parameters of all fields.
+    /// Number of parameters of all fields.
     pub fn parameters(&self) -> usize {
         let own: usize = self.stages.iter().map(|s| s.parameters).sum();
         own + self.links.iter().map(Self::parameters).sum::<usize>()
     }
 }
 
-/// A stage in a line.
+/// A description of one stage.
 #[derive(Debug, Clone, Default, Serialize)]
 pub struct Line {
     /// Its key in the spec.
@@ -379,13 +379,13 @@ pub struct Line {
 }
 
 impl Line {
-    /// The line of a stage whose description may begin with the name of its type.
+    /// A line from a description that may begin with the type name.
     pub fn new(stage: &str, kind: &str, what: &str) -> Self {
         Self { stage: stage.into(), kind: kind.into(), what: untitled(kind, what) }
     }
 }
 
-/// A description without the name of the type before it.
+/// A description without a leading type name.
 fn untitled(kind: &str, what: &str) -> String {
     let rest = what.strip_prefix(kind).map(|rest| rest.trim_start_matches([':', ',', ' ']));
     rest.unwrap_or(what).to_owned()
@@ -413,20 +413,20 @@ pub struct StageLine {
     pub gradient_bytes: usize,
     /// Bytes of their moments.
     pub moment_bytes: usize,
-    /// Bytes that forward leaves for backward, a sample.
+    /// Bytes kept from forward to backward, per sample.
     pub tape_bytes_per_sample: usize,
-    /// Multiply-adds a sample, forward.
+    /// Multiply-adds of the forward pass, per sample.
     pub macs_per_sample: usize,
-    /// How gradients arrive.
+    /// How its gradients are accumulated.
     pub gradient: GradKind,
-    /// Whether it runs on a GPU as well.
+    /// Whether it also runs on a GPU.
     pub wgsl: bool,
-    /// Output equals input: it does no work.
+    /// The stage is an identity and is skipped.
     pub left_out: bool,
 }
 
 impl StageLine {
-    /// The line of a stage under its key and the name of its type.
+    /// The description of a stage with this key and type name.
     pub fn new(stage: &str, kind: &str, built: &dyn Stage) -> Self {
         let info = built.info();
         Self {
@@ -448,42 +448,42 @@ impl StageLine {
     }
 }
 
-/// What a method finds out about a scan before it starts.
+/// Results of the analysis of a scan.
 #[derive(Debug, Clone, Default, PartialEq, Serialize)]
 pub struct Findings {
-    /// In words, a line each.
+    /// Readable results, one per line.
     pub lines: Vec<String>,
-    /// The attenuation that the stages of a field see as 1, in 1/unit of the scan.
+    /// The attenuation that counts as 1 for the stages of a field, in 1/unit of the scan.
     pub attenuation: Option<f64>,
-    /// Samples that a field takes on the middle ray of the first view.
+    /// Samples of a field on the middle ray of the first view.
     pub samples: Option<usize>,
 }
 
-/// Bytes that a method holds, beside the scan and the reference.
+/// Memory of a method in bytes, besides the scan and the reference.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Serialize)]
 pub struct Needs {
-    /// While it looks beyond the volume, before all else.
+    /// The reconstruction of the surroundings of the volume, before everything else.
     pub surround: u64,
-    /// A copy of the scan without what is beyond the volume.
+    /// A copy of the scan without the contribution of the surroundings.
     pub subtracted: u64,
     /// Parameters and gradients.
     pub model: u64,
-    /// Moments, and copies of parameters that callbacks keep.
+    /// Moments, and copies of parameters kept by callbacks.
     pub optimizer: u64,
-    /// What the backend works in.
+    /// Working memory of the backend.
     pub backend: u64,
-    /// What else it works in: iterates, directions, residuals, lists of rays.
+    /// Other working memory: iterates, directions, residuals, lists of rays.
     pub working: u64,
-    /// What an interrupted run reads again, beside all that.
+    /// Additional memory to resume an interrupted run.
     pub resume: u64,
-    /// Whether it makes the voxels of the scan itself: its last iterate is the volume.
+    /// Whether the method produces the scan's voxels itself: its last iterate is the volume.
     pub volume: bool,
-    /// What evaluating voxels takes, of a field.
+    /// Evaluation of a field at voxels.
     pub evaluating: u64,
 }
 
 impl Needs {
-    /// The larger of each: what two methods take one after the other.
+    /// The element-wise maximum: memory of two methods that run one after the other.
     pub fn most(self, other: Self) -> Self {
         Self {
             surround: self.surround.max(other.surround),
@@ -499,14 +499,14 @@ impl Needs {
     }
 }
 
-/// What pre-training works on.
+/// Inputs of pre-training.
 pub struct PretrainJob<'a> {
     /// The known volumes, in any unit of attenuation.
     pub volumes: &'a [Volume],
-    /// Does the work.
+    /// The compute backend.
     pub backend: &'a dyn Backend,
-    /// Seed of everything random.
+    /// Seed of all random numbers.
     pub seed: u64,
-    /// Limits that the command line adds to the spec's.
+    /// Limits from the command line, in addition to the spec's.
     pub limits: Limits,
 }

@@ -1,4 +1,4 @@
-//! An encoder of which only the coarse levels are open: what coarse-to-fine training works with.
+//! An encoder with only its coarse levels open, for coarse-to-fine training.
 
 use crate::error::{Error, Result, ensure};
 use crate::half::{Bf16, F16};
@@ -8,22 +8,22 @@ use crate::wgsl::{Fragment, functions, hosted};
 use std::ops::Range;
 use std::sync::Arc;
 
-/// An encoder that computes its first channels alone. The others are 0, and their parameters stay as they are. Widths and
-/// parameters are those of the whole, so that an arena fits however many channels are open. A mask is for the whole
-/// ([`Pipeline::open`](crate::pipeline::Pipeline::open) keeps it).
+/// An encoder that computes only its first channels. The others are 0, and their parameters do not change. Widths and
+/// parameters are those of the whole encoder, so that an arena fits however many channels are open. A mask applies to
+/// the whole encoder ([`Pipeline::open`](crate::pipeline::Pipeline::open) keeps it).
 #[derive(Clone)]
 pub struct Opened {
     whole: Arc<dyn Encoder>,
-    /// The whole without the channels that are closed.
+    /// The whole encoder without the closed channels.
     open: Arc<dyn Encoder>,
     channels: usize,
-    /// Parameters of the open channels: the first of all.
+    /// Number of parameters of the open channels, which come first.
     params: usize,
 }
 
 impl Opened {
-    /// `whole` with its first `channels` open, at least one. Refused where it keeps more than tables of features, or where
-    /// those of its first channels are not its first parameters.
+    /// Opens the first `channels` of `whole`, at least one. Refused if it has parameters other than feature tables, or
+    /// if the parameters of its first channels do not come first.
     pub fn new(whole: Arc<dyn Encoder>, channels: usize) -> Result<Self> {
         let width = whole.info().output;
         ensure((1..=width).contains(&channels), "encoder", "open channels", channels, format!("1 to {width}"))?;
@@ -80,7 +80,7 @@ impl Opened {
     }
 }
 
-/// The kernels of one precision: those of the open channels.
+/// The kernels of one precision, for the open channels.
 macro_rules! kernels {
     ($real:ty, $stored:ty, $pick:ident) => {
         impl Kernel<$real, $stored> for Opened {
@@ -169,7 +169,7 @@ impl Stage for Opened {
         self.open.halves().map(|_| Halves::of(self))
     }
 
-    /// One more range has what is closed.
+    /// The closed channels are one additional range.
     fn partition(&self) -> Vec<Range<usize>> {
         let closed = self.params..self.whole.info().params;
         self.open.partition().into_iter().chain((!closed.is_empty()).then_some(closed)).collect()

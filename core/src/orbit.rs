@@ -1,4 +1,4 @@
-//! A circular orbit of source and detector, as a few numbers.
+//! Circular orbits of source and detector, described by a few numbers.
 
 use crate::geometry::{Millimetres, Radians, View, dot, norm, sub};
 
@@ -17,7 +17,7 @@ pub struct CircularOrbit {
     pub angles: Vec<f64>,
 }
 
-/// How far, relative to the source's distance from the detector, a view may lie off the circle.
+/// Tolerance of a view's deviation from the circle, relative to the source-detector distance.
 const TOLERANCE: f64 = 1e-9;
 
 impl CircularOrbit {
@@ -33,9 +33,9 @@ impl CircularOrbit {
         self.angles.iter().map(|&a| self.view(a)).collect()
     }
 
-    /// The orbit that `views` lie on, or `None` if they are not one circle to a relative 1e-9.
+    /// The orbit of `views`, or `None` if they do not lie on one circle to a relative 1e-9.
     ///
-    /// Angles rise or fall steadily from view to view: no jump of more than half a turn.
+    /// Angles increase or decrease monotonically, without jumps of more than half a turn.
     pub fn fit(views: &[View]) -> Option<Self> {
         let first = views.first()?;
         let mut angles = Vec::with_capacity(views.len());
@@ -48,9 +48,9 @@ impl CircularOrbit {
         }
         let dso = first.source[0].hypot(first.source[1]);
         let (s, c) = angles[0].sin_cos();
-        // Along the circle's own axes the first view gives every length.
+        // Along the circle's own axes the first view gives all lengths.
         let reach = sub(first.detector, first.source);
-        // A rest of rounding is no shift.
+        // Rounding errors are no shift.
         let shift = |x: f64| if x.abs() < 1e-12 * norm(reach) { 0.0 } else { x };
         let orbit = Self {
             dso,
@@ -108,7 +108,7 @@ mod tests {
             [&mut v.source, &mut v.detector, &mut v.u, &mut v.v][change][2] += 1e-4;
             assert_eq!(CircularOrbit::fit(&views), None);
         }
-        // Columns that run the other way are no orbit of ours either.
+        // Columns in the opposite direction are no such orbit either.
         let mut views = circle();
         views.iter_mut().for_each(|v| v.u = v.u.map(|x| -x));
         assert_eq!(CircularOrbit::fit(&views), None);

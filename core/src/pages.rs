@@ -1,17 +1,17 @@
-//! Memory for parameters: a slice of numbers on huge pages where the system has them.
+//! Memory for parameters: slices of numbers on huge pages if the system has them.
 //!
-//! Hash tables are read at random all over. On pages of 4 KiB most of those reads miss the processor's address
-//! cache, and a step takes about twice as long.
+//! Hash tables are read at random addresses. On pages of 4 KiB most reads miss the translation lookaside buffer (TLB),
+//! and a step takes about twice as long.
 
 use bytemuck::Pod;
 use memmap2::MmapMut;
 use std::fmt;
 use std::ops::{Deref, DerefMut};
 
-/// Below this a plain page does.
+/// Smaller slices use plain pages.
 const WORTH_IT: usize = 1 << 21;
 
-/// A fixed number of numbers, zero at first.
+/// A slice of numbers of fixed length, initially zero.
 pub struct Pages<T: Pod = f32>(Storage<T>);
 
 enum Storage<T> {
@@ -26,7 +26,7 @@ impl<T: Pod> Pages<T> {
         if bytes >= WORTH_IT
             && let Ok(map) = MmapMut::map_anon(bytes)
         {
-            // Only advice: without huge pages everything works, slower.
+            // Only advice: without huge pages everything works, but slower.
             #[cfg(target_os = "linux")]
             let _ = map.advise(memmap2::Advice::HugePage);
             return Self(Storage::Mapped { map, len });

@@ -1,4 +1,4 @@
-//! Voxels that are had part by part, so that a volume need not be in memory as a whole.
+//! Volumes available part by part, so that they need not be in memory as a whole.
 
 use crate::error::Result;
 use crate::geometry::VoxelGrid;
@@ -9,7 +9,7 @@ use std::ops::Range;
 /// A box of voxels: a range along each of x, y and z.
 pub type Part = [Range<usize>; 3];
 
-/// A volume in memory, or something that makes its voxels where they are asked for.
+/// A volume in memory, or one that computes its voxels on demand.
 pub trait Voxels {
     /// Where the voxels are.
     fn grid(&self) -> VoxelGrid;

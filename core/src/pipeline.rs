@@ -1,4 +1,4 @@
-//! A pipeline: encoder, normalizers and field, built and checked, with the layout of their parameters.
+//! Pipelines: encoder, normalizers and field, built and checked, with their parameter layout.
 
 use crate::arena::{Arena, Block, Layout};
 use crate::error::{Result, ensure};
@@ -13,7 +13,7 @@ use crate::stage::{
 use std::ops::Range;
 use std::sync::Arc;
 
-/// The built stages of a field, in order, with the arena's layout. A copy shares the stages.
+/// The built stages of a field, in order, with the arena's layout. Copies share the stages.
 #[derive(Clone)]
 pub struct Pipeline {
     /// Points to features.
@@ -28,7 +28,7 @@ pub struct Pipeline {
     pub tables: Tables,
     layout: Layout,
     ranges: Vec<Range<usize>>,
-    /// The encoder with every channel open, where some are closed, and how many are not.
+    /// The whole encoder and its number of open channels, if some are closed.
     whole: Option<(Arc<dyn Encoder>, usize)>,
 }
 
@@ -36,14 +36,14 @@ pub struct Pipeline {
 pub struct Model {
     /// The stages.
     pub pipeline: Pipeline,
-    /// Their parameters and what training needs beside them.
+    /// Their parameters, gradients and optimizer state.
     pub arena: Arena,
     masks: Vec<Vec<usize>>,
 }
 
 impl Pipeline {
-    /// Puts stages together. Refuses those that do not fit, before any parameter is allocated; the error names the key of
-    /// the stage.
+    /// Assembles stages. Refuses stages that do not fit together, before any parameter is allocated; the error names
+    /// the key of the stage.
     pub fn new(
         encoder: Box<dyn Encoder>,
         normalizers: Vec<Box<dyn Normalizer>>,
@@ -68,12 +68,12 @@ impl Pipeline {
         let normalizers = normalizers.into_iter().map(Arc::from).collect();
         let mut pipeline = Self { encoder, normalizers, field, projector, tables, layout, ranges: vec![], whole: None };
         pipeline.lay_out();
-        // Of any scene: whether the encoder knows what the projector counts in.
+        // For any scene: checks that the encoder knows the lengths that the projector counts in.
         pipeline.fitted(pipeline.lengths(1.0, 1.0))?;
         Ok(pipeline)
     }
 
-    /// A field that brings line integrals of its own ([`Field::lines`]): it reads positions.
+    /// A pipeline of a field with line integrals of its own ([`Field::lines`]), which reads positions.
     pub fn alone(field: Box<dyn Field>) -> Result<Self> {
         ensure(field.lines().is_some(), "spec", "field", "none", "line integrals of the field's own")?;
         Self::new(Box::new(Positions), vec![], field, Box::new(NoSamples))
@@ -100,9 +100,8 @@ impl Pipeline {
         self.ranges = ranges;
     }
 
-    /// Encoder, normalizers and field with the names under which their parameters stand in the arena. A
-    /// normalizer is named by its place among those that have parameters, so that a mask beside it does not
-    /// change the names in a weights file.
+    /// Encoder, normalizers and field with the names of their parameters in the arena. A normalizer is named by its
+    /// position among those with parameters, so that a mask beside it does not change the names in a weights file.
     pub fn stages(&self) -> Vec<(String, &dyn Stage)> {
         let mut all: Vec<(String, &dyn Stage)> = vec![("encoder".into(), self.encoder.as_ref())];
         let mut index = 0;
@@ -114,49 +113,49 @@ impl Pipeline {
         all
     }
 
-    /// Names and places of every parameter.
+    /// Names and positions of all parameters.
     pub fn layout(&self) -> &Layout {
         &self.layout
     }
 
-    /// Where each of [`Pipeline::stages`] has its parameters.
+    /// Parameter range of each of [`Pipeline::stages`].
     pub fn ranges(&self) -> &[Range<usize>] {
         &self.ranges
     }
 
-    /// The furthest that any stage looks.
+    /// The widest scope of all stages.
     pub fn scope(&self) -> Scope {
         let ray = self.stages().iter().any(|(_, s)| s.info().scope == Scope::Ray);
         if ray { Scope::Ray } else { Scope::Row }
     }
 
-    /// What a stage could not do since this was last asked; see [`Stage::fault`].
+    /// Returns and clears the first error of a stage since the last call; see [`Stage::fault`].
     pub fn fault(&self) -> Result<()> {
         self.stages().iter().try_for_each(|(_, s)| s.fault())?;
         self.projector.fault()
     }
 
-    /// Whether `ray` meets anything of the scene.
+    /// Whether `ray` crosses the scene.
     pub fn sees(&self, ray: &UnitRay) -> bool {
         if self.field.lines().is_some() { ray.inside[1] > ray.inside[0] } else { self.projector.max_samples(ray) > 0 }
     }
 
-    /// Multiply-adds a sample, forward.
+    /// Multiply-adds of the forward pass, per sample.
     pub fn macs(&self) -> usize {
         self.stages().iter().map(|(_, s)| s.info().macs).sum()
     }
 
-    /// The encoder's channels that a scene needs of which `cells` along the unit cube's side are to be told apart: all up to
-    /// the coarsest that suffice. `None` where it needs all.
+    /// The encoder's channels needed to resolve `cells` along the unit cube's side: all up to the coarsest sufficient
+    /// resolution. `None` if all are needed.
     pub fn needed(&self, cells: f64) -> Option<Vec<usize>> {
         let all = self.encoder.resolutions()?;
-        // A hair more, so that a cube of 256 voxels takes 256 cells for enough.
+        // Slightly more, so that a cube of 256 voxels counts as 256 cells.
         let enough = all.iter().copied().filter(|r| 1.001 * r >= cells).fold(f64::INFINITY, f64::min);
         let keep: Vec<usize> = (0..all.len()).filter(|&c| all[c] <= enough).collect();
         (keep.len() < all.len()).then_some(keep)
     }
 
-    /// Takes a scene's lengths for the measure of what counts in them. Returns whether that changed a stage.
+    /// Sets the lengths of settings that count in units of the scene. Returns whether a stage changed.
     pub fn fit(&mut self, scene: &Scene) -> Result<bool> {
         let fitted = self.fitted(self.lengths(scene.voxel_mm(), scene.side))?;
         let changed = fitted.is_some();
@@ -170,19 +169,19 @@ impl Pipeline {
         self.projector.fitted(lengths).map_err(|e| e.within("projector"))
     }
 
-    /// What settings may count in, of a unit cube with a side of `side` mm.
+    /// The lengths that settings may count in, for a unit cube with a side of `side` mm.
     fn lengths(&self, voxel_mm: f64, side: f64) -> Lengths {
         let finest = self.encoder.resolutions().map(|all| all.into_iter().fold(1.0, f64::max));
         Lengths { voxel_mm, cell_mm: finest.filter(|n| *n > 1.0).map(|n| side / n) }
     }
 
-    /// How many of the encoder's channels are open: the first ones. The others are 0.
+    /// Number of open channels of the encoder: the first ones. The others are 0.
     pub fn open_channels(&self) -> usize {
         self.whole.as_ref().map_or(self.encoder.info().output, |(_, open)| *open)
     }
 
-    /// Opens the first `channels` of the encoder's and closes the others: they are 0 and not computed, and their parameters
-    /// stay as they are. At least one stays open; as many as there are means all.
+    /// Opens the first `channels` of the encoder and closes the others: they are 0 and not computed, and their
+    /// parameters do not change. At least one channel stays open.
     pub fn open(&mut self, channels: usize) -> Result<()> {
         let whole = self.whole.as_ref().map_or_else(|| self.encoder.clone(), |(whole, _)| whole.clone());
         if channels < whole.info().output {
@@ -194,8 +193,8 @@ impl Pipeline {
         Ok(())
     }
 
-    /// Leaves of the encoder's channels only `masked`: it no longer computes the others, the stages after it become
-    /// narrower, and parameters that nothing reads leave the arena.
+    /// Keeps only `masked` of the encoder's channels: the encoder no longer computes the others, later stages become
+    /// narrower, and unused parameters leave the arena.
     fn apply_mask(&mut self, masked: &[usize], arena: &mut Arena) -> Result<()> {
         let (whole, open) = match &self.whole {
             Some((whole, open)) => (whole, *open),
@@ -228,7 +227,7 @@ impl Pipeline {
 }
 
 impl Model {
-    /// A model with every parameter as its stage's own scheme makes it.
+    /// A model with every parameter initialized by its own stage.
     pub fn random(pipeline: Pipeline, seed: u64) -> Self {
         let mut arena = Arena::new(pipeline.layout.len());
         for ((i, (_, stage)), range) in pipeline.stages().into_iter().enumerate().zip(&pipeline.ranges) {
@@ -240,12 +239,12 @@ impl Model {
         Self { pipeline, arena, masks: vec![] }
     }
 
-    /// The encoder's channels that stayed each time some were removed: of those that it computed until then, ascending.
+    /// The encoder's remaining channels after each masking, ascending, as indices into the channels before it.
     pub fn masks(&self) -> &[Vec<usize>] {
         &self.masks
     }
 
-    /// Removes all of the encoder's channels but `keep` for good.
+    /// Permanently removes all encoder channels but `keep`.
     pub fn mask(&mut self, keep: Vec<usize>) -> Result<()> {
         let width = self.pipeline.encoder.info().output;
         let ascending = keep.is_sorted_by(|a, b| a < b) && keep.last().is_some_and(|&k| k < width);
@@ -257,7 +256,7 @@ impl Model {
     }
 }
 
-/// Stands where a field needs no encoder: positions are its features.
+/// Placeholder encoder for fields that need none: positions are the features.
 struct Positions;
 
 impl<R: Real> Kernel<R> for Positions {
@@ -307,7 +306,7 @@ impl Stage for Positions {
 
 impl Encoder for Positions {}
 
-/// Stands where a field needs no projector.
+/// Placeholder projector for fields that need none.
 struct NoSamples;
 
 impl Projector for NoSamples {

@@ -1,4 +1,4 @@
-//! In which precision a field computes.
+//! Precision of a field's arithmetic.
 
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
@@ -7,13 +7,13 @@ use serde::{Deserialize, Serialize};
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields, default)]
 pub struct Precision {
-    /// Storage precision of feature tables when they are read. Training and weights files keep `f32`; half precision is a
+    /// Storage precision of feature tables for reading. Training and weights files keep `f32`; half precision is a
     /// copy.
     pub tables: Tables,
 }
 
 impl Precision {
-    /// Whether all is `f32`.
+    /// Whether everything is `f32`.
     pub fn is_single(&self) -> bool {
         self.tables == Tables::F32
     }

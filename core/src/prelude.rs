@@ -1,4 +1,4 @@
-//! What the author of a stage needs: `use conefield_core::prelude::*;`.
+//! Imports for authors of stages: `use conefield_core::prelude::*;`.
 
 pub use crate::basis::{Basis, BasisOperator, BasisSpec, Expansion};
 pub use crate::by_row::{ByRay, ByRow, RayMap, RowMap, Sums};

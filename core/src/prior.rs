@@ -3,21 +3,21 @@
 use crate::error::{Result, ensure};
 use crate::wgsl::Fragment;
 
-/// Judges a field by its values in cubes of neighbouring points, placed at random.
+/// Penalizes the values of a field in cubes of neighbouring points at random positions.
 pub trait Prior: Send + Sync {
     /// The blocks and their weight.
     fn blocks(&self) -> Blocks;
 
-    /// The penalty of one block, not negative. `values` are those of its `edge³` points, z fastest. Adds `scale` times
+    /// The penalty of one block, non-negative. `values` are those of its `edge³` points, z fastest. Adds `scale` times
     /// the derivative by each of them to `gradient`.
     fn block(&self, values: &[f64], scale: f64, gradient: &mut [f64]) -> f64;
 
-    /// The same in WGSL, see [`crate::wgsl`]; `None` where the prior runs on the CPU only.
+    /// The same in WGSL, see [`crate::wgsl`]; `None` if the prior runs on the CPU only.
     fn wgsl(&self) -> Option<Fragment> {
         None
     }
 
-    /// An error of the calls so far, such as a panic in a plugin.
+    /// Returns an error of the calls so far, such as a panic in a plugin.
     fn fault(&self) -> Result<()> {
         Ok(())
     }
@@ -33,14 +33,14 @@ pub struct Blocks {
     pub edge: usize,
     /// Blocks per step.
     pub count: usize,
-    /// Distance of neighbouring points in voxels.
+    /// Distance between neighbouring points, in voxels.
     pub spacing: f64,
-    /// Weight of the mean over all points against the mean loss of a ray.
+    /// Weight of the mean over all points relative to the mean loss of a ray.
     pub weight: f64,
 }
 
 impl Blocks {
-    /// Refuses invalid numbers, by the keys of the settings.
+    /// Refuses invalid numbers; errors name the keys of the settings.
     pub fn validate(&self) -> Result<()> {
         let positive = |x: f64| x.is_finite() && x > 0.0;
         ensure((2..=32).contains(&self.edge), "spec", "edge", self.edge, "2 to 32")?;

@@ -1,9 +1,9 @@
-//! Random numbers that depend on a seed and a position alone, never on threads or on how often they are drawn.
+//! Random numbers that depend on a seed and a position only, not on threads or the number of draws.
 
 use rand_chacha::ChaCha8Rng;
 use rand_chacha::rand_core::SeedableRng;
 
-/// A generator of its own for `(seed, stream)`.
+/// A separate generator for `(seed, stream)`.
 pub fn stream(seed: u64, stream: u64) -> ChaCha8Rng {
     let mut rng = ChaCha8Rng::seed_from_u64(seed);
     rng.set_stream(stream);

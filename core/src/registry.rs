@@ -1,8 +1,8 @@
 //! The stage types that a spec may name.
 //!
-//! Built-in types register themselves with [`stage_type!`](crate::stage_type) beside their `typetag` implementation;
-//! types of libraries that are loaded at run time come in by [`add`]. Editors' schemas and the lists in error messages
-//! come from here.
+//! Built-in types register with [`stage_type!`](crate::stage_type) beside their `typetag` implementation; types of
+//! libraries loaded at run time are registered by [`add`]. Editor schemas and the lists in error messages use this
+//! registry.
 
 use crate::basis::BasisSpec;
 use crate::data_term::DataTermSpec;
@@ -17,13 +17,13 @@ use serde_json::Value;
 use std::fmt;
 use std::sync::{PoisonError, RwLock};
 
-/// What each kind is called in a spec, its settings, and what it is.
+/// Defines the kinds: name in a spec, settings trait and description.
 macro_rules! kinds {
     (
         linked { $($(#[$linked_doc:meta])* $linked:ident $linked_name:literal,)* }
         loadable { $($(#[$doc:meta])* $kind:ident $name:literal $spec:ident,)* }
     ) => {
-        /// What a spec names: a method, and the kinds of stage that methods put together.
+        /// Kinds of types in a spec: methods, and the stages that they consist of.
         #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, serde::Serialize)]
         #[serde(rename_all = "kebab-case")]
         pub enum Kind {
@@ -35,7 +35,7 @@ macro_rules! kinds {
             /// Every kind: methods, then their stages in order.
             pub const ALL: &'static [Self] = &[$(Self::$linked,)* $(Self::$kind,)*];
 
-            /// What it is called in a spec.
+            /// Its name in a spec.
             pub fn name(self) -> &'static str {
                 match self {
                     $(Self::$linked => $linked_name,)*
@@ -44,7 +44,7 @@ macro_rules! kinds {
             }
         }
 
-        /// [`MakeFn`] of each kind that a library can bring.
+        /// The [`MakeFn`] of each kind that a library can provide.
         pub enum Make {
             $($(#[$doc])* $kind(MakeFn<dyn $spec>),)*
         }
@@ -74,7 +74,7 @@ kinds! {
     linked {
         /// Scan to volume.
         Method "method",
-        /// What watches over training.
+        /// Observes training and acts on it.
         Callback "callback",
     }
     loadable {
@@ -88,17 +88,17 @@ kinds! {
         Field "field" FieldSpec,
         /// Rays to samples of a field.
         Projector "projector" ProjectorSpec,
-        /// Where weights come from.
+        /// Source of weights.
         Initializer "initializer" InitializerSpec,
         /// Predicted against measured values.
         Loss "loss" LossSpec,
-        /// What a field is to be like, whatever was measured.
+        /// A penalty on a field, independent of the measurements.
         Prior "prior" PriorSpec,
         /// Line integrals of voxels, for iterative methods.
         VoxelProjector "voxel-projector" VoxelProjectorSpec,
         /// Coefficients to voxels, for iterative methods.
         Basis "basis" BasisSpec,
-        /// How far line integrals are from the measured ones, for iterative methods.
+        /// Distance between computed and measured line integrals, for iterative methods.
         DataTerm "data-term" DataTermSpec,
         /// Penalty of coefficients with its proximal map, for iterative methods.
         Regularizer "regularizer" RegularizerSpec,
@@ -107,10 +107,10 @@ kinds! {
 
 /// The settings of one kind of stage.
 pub trait Settings {
-    /// Which.
+    /// The kind.
     const KIND: Kind;
 
-    /// How a type of this kind from a library is made; nothing where libraries bring none.
+    /// The constructor of a library's type of this kind; `None` for kinds that libraries cannot provide.
     fn made_by(make: &Make) -> Option<&MakeFn<Self>> {
         let _ = make;
         None
@@ -118,7 +118,7 @@ pub trait Settings {
 }
 
 impl Kind {
-    /// The kind called `name`.
+    /// The kind named `name`.
     pub fn named(name: &str) -> Option<Self> {
         Self::ALL.iter().copied().find(|k| k.name() == name)
     }
@@ -132,39 +132,39 @@ impl fmt::Display for Kind {
 
 /// A type that a spec may name.
 pub struct StageType {
-    /// What it is.
+    /// Its kind.
     pub kind: Kind,
     /// The value of `type`.
     pub name: &'static str,
-    /// One line for people.
+    /// A one-line description.
     pub doc: &'static str,
-    /// Where it comes from.
+    /// Its origin.
     pub origin: Origin,
 }
 
-/// Where a stage type comes from.
+/// Origin of a stage type.
 pub enum Origin {
-    /// It is linked into the program; `typetag` knows it.
+    /// Linked into the program; known to `typetag`.
     Linked {
-        /// The package that brings it.
+        /// The package that defines it.
         package: &'static str,
         /// JSON Schema of its settings, without `type`.
         schema: fn() -> Schema,
-        /// Settings in JSON, without `type`, by which it is tried.
+        /// Example settings in JSON, without `type`, for tests.
         example: &'static str,
     },
-    /// It came with a library at run time.
+    /// From a library loaded at run time.
     Loaded {
-        /// The library, for people: name, version, file.
+        /// The library in readable form: name, version, file.
         owner: String,
         /// JSON Schema of its settings, without `type`.
         schema: Value,
-        /// Makes settings of it.
+        /// Builds its settings.
         make: Make,
     },
 }
 
-/// Makes a stage's settings from the keys of a spec besides `type`.
+/// Builds a stage's settings from the keys of a spec except `type`.
 pub type MakeFn<T> = Box<dyn Fn(Value) -> Result<Box<T>> + Send + Sync>;
 
 impl StageType {
@@ -176,7 +176,7 @@ impl StageType {
         }
     }
 
-    /// A spec's table with settings by which it is tried: those of its registration, or its defaults.
+    /// A spec table with example settings: those of its registration, or its defaults.
     pub fn example(&self) -> Value {
         let mut table = match &self.origin {
             Origin::Linked { example, .. } => serde_json::from_str(example).unwrap_or_else(|_| serde_json::json!({})),
@@ -186,7 +186,7 @@ impl StageType {
         table
     }
 
-    /// Who brings it.
+    /// The package or library that provides it.
     pub fn owner(&self) -> String {
         match &self.origin {
             Origin::Linked { package, .. } => format!("conefield itself ({package})"),
@@ -197,7 +197,7 @@ impl StageType {
 
 inventory::collect!(StageType);
 
-/// Types of loaded libraries. Libraries stay loaded to the end, so their types are kept as long.
+/// Types of loaded libraries. Libraries are never unloaded, so neither are their types.
 static LOADED: RwLock<Vec<&'static StageType>> = RwLock::new(vec![]);
 
 /// Every registered type, by kind and name.
@@ -208,7 +208,7 @@ pub fn stage_types() -> Vec<&'static StageType> {
     all
 }
 
-/// The type called `name`.
+/// The type named `name`.
 pub fn find(kind: Kind, name: &str) -> Option<&'static StageType> {
     stage_types().into_iter().find(|t| t.kind == kind && t.name == name)
 }
@@ -218,8 +218,8 @@ pub fn names(kind: Kind) -> Vec<&'static str> {
     stage_types().into_iter().filter(|t| t.kind == kind).map(|t| t.name).collect()
 }
 
-/// Adds the types of one library: all of them, or none and an error that names both owners of a name that is taken.
-/// `owner` says which library, in words.
+/// Adds the types of one library `owner` (in readable form). Adds all or none: if a name is taken, the error names both
+/// owners.
 pub fn add(owner: &str, types: Vec<NewType>) -> Result<()> {
     let mut loaded = LOADED.write().unwrap_or_else(PoisonError::into_inner);
     let mut fresh: Vec<&NewType> = vec![];
@@ -238,15 +238,15 @@ pub fn add(owner: &str, types: Vec<NewType>) -> Result<()> {
     Ok(())
 }
 
-/// A type to be [`add`]ed.
+/// A type to [`add`].
 pub struct NewType {
     /// The value of `type`.
     pub name: String,
-    /// One line for people.
+    /// A one-line description.
     pub doc: String,
     /// JSON Schema of its settings, without `type`.
     pub schema: Value,
-    /// Makes settings of it.
+    /// Builds its settings.
     pub make: Make,
 }
 
@@ -267,8 +267,8 @@ pub use inventory;
 #[doc(hidden)]
 pub use schemars;
 
-/// Registers a settings type under the name that specs use. The type implements `JsonSchema`. Where default settings are
-/// missing or make a large stage, `example = "{ … }"` gives settings in JSON that the conformance kit tries.
+/// Registers a settings type under its name in specs. The type implements `JsonSchema`. If there are no default
+/// settings, or they make a large stage, `example = "{ … }"` gives settings in JSON for the conformance kit.
 #[macro_export]
 macro_rules! stage_type {
     ($kind:ident, $name:literal, $settings:ty, $doc:literal $(,)?) => {

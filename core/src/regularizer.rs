@@ -1,4 +1,4 @@
-//! What is known of a volume before its scan: a penalty with its proximal map.
+//! Regularizers: penalties of a volume with their proximal maps.
 
 use crate::error::{Result, ensure};
 use crate::geometry::VoxelGrid;
@@ -19,7 +19,7 @@ pub trait RegularizerSpec: Send + Sync {
     fn build(&self) -> Result<Box<dyn Regularizer>>;
 }
 
-/// How strong a regularizer is.
+/// Strength of a regularizer.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(rename_all = "kebab-case")]
 pub enum Weight {
@@ -36,7 +36,8 @@ impl Weight {
         ensure(w.is_finite() && w >= 0.0, "spec", "weight", w, "a finite number, 0 or more")
     }
 
-    /// λ for attenuation in 1/mm and lengths in mm ([`Regularizer::weight`]), where `unit` is that λ for a fixed weight of 1.
+    /// λ for attenuation in 1/mm and lengths in mm ([`Regularizer::weight`]); `unit` is the value for a fixed weight of
+    /// 1.
     pub fn lambda(self, unit: f64, noise: &mut dyn FnMut(f64) -> f64) -> f64 {
         match self {
             Self::Fixed(w) => w * unit,
@@ -54,76 +55,77 @@ impl Display for Weight {
     }
 }
 
-/// A convex penalty of coefficients on any grid.
+/// A convex penalty of coefficients, for any grid.
 pub trait Regularizer: Send + Sync {
     /// The penalty on `grid`, with its arrays from `space`.
     fn on(&self, grid: &VoxelGrid, space: &Space) -> Result<Box<dyn Penalty>>;
 
-    /// The weight λ for attenuation in 1/mm and lengths in mm. `noise(k)` measures what the scan's noise comes to in the
-    /// gradient of the data term: k times its root mean square over the coefficients. That takes a back-projection.
+    /// The weight λ for attenuation in 1/mm and lengths in mm. `noise(k)` returns k times the root mean square over the
+    /// coefficients of the scan's noise in the gradient of the data term. It takes a back-projection.
     fn weight(&self, grid: &VoxelGrid, noise: &mut dyn FnMut(f64) -> f64) -> Result<f64>;
 
     /// A line for `explain`.
     fn describe(&self) -> String;
 }
 
-/// A penalty `R` on one grid. It keeps what the next call of [`Penalty::prox`] starts from.
+/// A penalty `R` on one grid. It keeps the state from which the next call of [`Penalty::prox`] starts.
 pub trait Penalty: Send {
     /// `R(x)`, without weight.
     fn value(&self, x: ArrayView3<'_, f32>) -> f64;
 
-    /// Fits the penalty to the coefficients `x`, for one that follows what it finds. Called before each pass; what it leaves follows
-    /// from `x` alone. Returns the new `R(x)` if it changed.
+    /// Adapts an adaptive penalty to the coefficients `x`. Called before each pass; the result depends on `x` only.
+    /// Returns the new `R(x)` if it changed.
     fn adapt(&mut self, x: ArrayView3<'_, f32>) -> Option<f64> {
         let _ = x;
         None
     }
 
-    /// Overwrites `u` with `argmin_{u ≥ 0} ½‖u − v‖² + tau·R(u)`, or comes nearer to it with each call for the same `v`. Both
-    /// lie as the grid's coefficients in standard order. The result does not depend on the number of threads.
+    /// Overwrites `u` with `argmin_{u ≥ 0} ½‖u − v‖² + tau·R(u)`, or approaches it with each call for the same `v`.
+    /// Both are in the grid's standard order. The result does not depend on the number of threads.
     fn prox(&mut self, v: &[f32], tau: f32, u: &mut [f32]);
 
-    /// The whole update, with [`Penalty::prox`] for `tau`. A penalty whose proximal map makes one pass over the volume can do the
-    /// rest in that pass.
+    /// The whole update, with [`Penalty::prox`] for `tau`. A penalty whose proximal map is a single pass over the
+    /// volume can fuse the rest into it.
     fn update(&mut self, update: Update<'_>, tau: f32) {
         update.around(|v, u| self.prox(v, tau, u));
     }
 
-    /// What the next call starts from, by name, for checkpoints.
+    /// State for the next call, by name, for checkpoints.
     fn state(&mut self) -> Vec<(&str, &mut [f32])> {
         vec![]
     }
 
-    /// The fault since the last call, as [`crate::stage::Stage::fault`].
+    /// Returns and clears the first error since the last call; see [`crate::stage::Stage::fault`].
     fn fault(&self) -> Result<()> {
         Ok(())
     }
 }
 
-/// An update of a proximal gradient method with momentum. `v = ahead + step·gradient`, pulled and masked, is what the proximal
-/// map is taken of; its result `u` is the new `x`, and `u + momentum·(u − x)` the new `ahead`. All slices are of one length.
+/// An update of a proximal gradient method with momentum. The proximal map is applied to `v = ahead + step·gradient`
+/// after pulling and masking. Its result `u` is the new `x`, and `u + momentum·(u − x)` the new `ahead`. All slices
+/// have the same length.
 pub struct Update<'a> {
-    /// Against the gradient of the data term at `ahead`; afterwards it may be anything.
+    /// Negative gradient of the data term at `ahead`; unspecified afterwards.
     pub gradient: &'a mut [f32],
-    /// Where the gradient was taken; afterwards where the next one is to be.
+    /// Point of the gradient; afterwards the point of the next one.
     pub ahead: &'a mut [f32],
     /// The coefficients.
     pub x: &'a mut [f32],
-    /// How far to go along `gradient`.
+    /// Step along `gradient`.
     pub step: f32,
-    /// How far to go on beyond the new coefficients.
+    /// Extrapolation beyond the new coefficients.
     pub momentum: f32,
-    /// What the coefficients are held to, and the share of the way there.
+    /// The coefficients to pull towards, and the share of the way.
     pub towards: Option<(&'a [f32], f32)>,
-    /// Which coefficients can be other than 0, if not all.
+    /// Coefficients that may be non-zero, if not all.
     pub inside: Option<&'a [bool]>,
 }
 
-/// Numbers that one task of [`Update::step`] and [`Update::momentum`] goes through: few enough for the first-level cache.
+/// Numbers per task of [`Update::step`] and [`Update::momentum`]: few enough for the first-level cache.
 const PART: usize = 1 << 12;
 
 impl<'a> Update<'a> {
-    /// Overwrites `v` with what the proximal map is to be of, from number `at` on.
+    /// Overwrites `v` with the argument of the proximal map, from index `at` on.
     #[inline(always)]
     pub fn read(&self, at: usize, v: &mut [f32]) {
         let part = at..at + v.len();
@@ -137,12 +139,12 @@ impl<'a> Update<'a> {
             }
         }
         if let Some(inside) = self.inside {
-            // What is far below 0 stays at 0, whatever its neighbours are.
+            // Values far below 0 stay at 0, whatever their neighbours are.
             v.iter_mut().zip(&inside[part]).for_each(|(v, inside)| *v = if *inside { *v } else { f32::MIN });
         }
     }
 
-    /// Takes the proximal map `u` from number `at` on.
+    /// Applies the result `u` of the proximal map from index `at` on.
     #[inline(always)]
     pub fn write(&mut self, at: usize, u: &[f32]) {
         let part = at..at + u.len();
@@ -152,7 +154,7 @@ impl<'a> Update<'a> {
         }
     }
 
-    /// The first `at` numbers, and the others.
+    /// Splits into the first `at` numbers and the rest.
     pub fn split(self, at: usize) -> [Self; 2] {
         let (gradient, ahead) = (self.gradient.split_at_mut(at), self.ahead.split_at_mut(at));
         let x = self.x.split_at_mut(at);
@@ -168,14 +170,15 @@ impl<'a> Update<'a> {
         ]
     }
 
-    /// The whole update around a proximal map that overwrites its second argument: one pass over memory before, one after.
+    /// The whole update around a proximal map that overwrites its second argument: one pass over memory before and one
+    /// after.
     pub fn around(mut self, prox: impl FnOnce(&[f32], &mut [f32])) {
         self.step();
         prox(self.gradient, self.ahead);
         self.momentum();
     }
 
-    /// Puts what the proximal map is to be of into `gradient`.
+    /// Writes the argument of the proximal map into `gradient`.
     fn step(&mut self) {
         self.parts().into_par_iter().for_each(|part| {
             let mut v = [0.0; PART];
@@ -185,7 +188,7 @@ impl<'a> Update<'a> {
         });
     }
 
-    /// Takes the proximal map from `ahead`.
+    /// Reads the result of the proximal map from `ahead`.
     fn momentum(&mut self) {
         self.parts().into_par_iter().for_each(|mut part| {
             let mut u = [0.0; PART];
@@ -195,7 +198,7 @@ impl<'a> Update<'a> {
         });
     }
 
-    /// Parts that threads work on side by side.
+    /// Parts for parallel threads.
     fn parts(&mut self) -> Vec<Update<'_>> {
         let mut rest = Update { gradient: self.gradient, ahead: self.ahead, x: self.x, ..*self };
         let mut parts = vec![];

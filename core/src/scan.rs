@@ -1,18 +1,17 @@
-//! A scan: projections with their geometry; a volume: voxels with their grid.
+//! Scans (projections with geometry) and volumes (voxels with grid).
 
 use crate::error::{Result, ensure};
 use crate::geometry::{Geometry, Vec3, View, VoxelGrid};
 use ndarray::{Array3, ArrayView2, Zip, s};
 use serde::{Deserialize, Serialize};
 
-/// The length unit of the data set that a scan came from. Inside the program lengths are mm and attenuation is
-/// 1/mm; volumes go back out in `1/unit`.
+/// The length unit of the scan's data set. The program uses mm and 1/mm; volumes are written in `1/unit`.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct Unit {
-    /// What the data set calls it, e.g. `mm`, `m`, `cube half side`.
+    /// Its name in the data set, e.g. `mm`, `m`, `cube half side`.
     pub name: String,
-    /// Millimetres a unit.
+    /// Millimetres per unit.
     pub mm: f64,
 }
 
@@ -22,7 +21,7 @@ impl Default for Unit {
     }
 }
 
-/// The size of a scan, which its files tell before anything large is read.
+/// The size of a scan, known from its files before large data is read.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize)]
 pub struct ScanHeader {
     /// Views.
@@ -34,37 +33,37 @@ pub struct ScanHeader {
 }
 
 impl ScanHeader {
-    /// Measured values.
+    /// Number of measured values.
     pub fn pixels(&self) -> u64 {
         [self.views, self.detector[0], self.detector[1]].iter().fold(1, |n, &k| n.saturating_mul(k as u64))
     }
 
-    /// Voxels.
+    /// Number of voxels.
     pub fn voxels(&self) -> u64 {
         self.volume.iter().fold(1, |n, &k| n.saturating_mul(k as u64))
     }
 
-    /// Samples along the rays of all pixels, a voxel of the longest side apart.
+    /// Number of samples along the rays of all pixels at a distance of one voxel of the longest side.
     pub fn samples(&self) -> f64 {
         let longest = self.volume.into_iter().max().unwrap_or(0);
         self.pixels() as f64 * longest as f64
     }
 }
 
-/// Measured line integrals `A = -ln(I/I0)` with the geometry they were taken in.
+/// Measured line integrals `A = -ln(I/I0)` with their geometry.
 #[derive(Debug, Clone)]
 pub struct Scan {
     /// Source, detector and volume, in mm.
     pub geometry: Geometry,
-    /// Line integrals, `[view, row, column]`, no unit.
+    /// Line integrals, `[view, row, column]`, dimensionless.
     pub projections: Array3<f32>,
-    /// The data set's own unit of length.
+    /// The length unit of the data set.
     pub unit: Unit,
-    /// How the scan came about (simulated from what, with which noise; read from which file).
+    /// Origin of the scan (simulation source and noise, or the file read).
     pub provenance: serde_json::Value,
 }
 
-/// Largest line integral: squares of it, summed over a scan, stay far below the end of single precision.
+/// Largest line integral: sums of squares over a scan stay far below the single-precision maximum.
 const MOST: f32 = 1e15;
 
 impl Scan {
@@ -79,7 +78,7 @@ impl Scan {
         self.projections.index_axis(ndarray::Axis(0), view)
     }
 
-    /// Refuses a scan whose parts do not fit each other or whose values are not finite.
+    /// Refuses a scan with inconsistent parts or non-finite values.
     pub fn validate(&self, place: &str) -> Result<()> {
         self.geometry.validate(place)?;
         let g = &self.geometry;
@@ -114,7 +113,8 @@ impl Scan {
         Ok(())
     }
 
-    /// The scan without the views in `held_out`, and a scan of those alone. Indices past the last view are refused.
+    /// Splits off the views in `held_out`: the scan without them, and a scan of them only. Refuses indices past the
+    /// last view.
     pub fn split(&self, held_out: &[usize]) -> Result<(Scan, Scan)> {
         let n = self.geometry.views.len();
         for &v in held_out {
@@ -125,8 +125,8 @@ impl Scan {
         Ok((self.select(&keep), self.select(&out)))
     }
 
-    /// The scan with means of blocks of `size` × `size` pixels as its pixels; rows and columns at the end that fill no block
-    /// are left out. `size` is at least 1 and at most the detector's shorter side.
+    /// The scan averaged over blocks of `size` × `size` pixels; rows and columns at the end that fill no block are
+    /// dropped. `size` is at least 1 and at most the detector's shorter side.
     pub fn binned(&self, size: usize) -> Scan {
         let g = &self.geometry;
         let detector = g.detector.map(|n| n / size);
@@ -158,15 +158,15 @@ impl Scan {
     }
 }
 
-/// Rows of voxel index → millimetres, the last one `[0, 0, 0, 1]`.
+/// Matrix rows, voxel index → millimetres; the last row is `[0, 0, 0, 1]`.
 pub type Affine = [[f64; 4]; 4];
 
-/// Voxels of attenuation (or any other quantity) with their place in the world.
+/// Voxels of attenuation (or another quantity) with their grid.
 #[derive(Debug, Clone)]
 pub struct Volume {
     /// Values, `[x, y, z]`.
     pub data: Array3<f32>,
-    /// Where the voxels are, in mm.
+    /// Position of the voxels, in mm.
     pub grid: VoxelGrid,
     /// Voxel indices to the patient's or file's own coordinates in mm (NIfTI's affine, RAS), row-major, if known.
     pub affine: Option<Affine>,
@@ -180,7 +180,7 @@ impl Volume {
         Self { data, grid, affine: None }
     }
 
-    /// Every value through `f`.
+    /// Applies `f` to every value.
     pub fn mapped(mut self, f: impl Fn(f32) -> f32 + Sync + Send) -> Self {
         self.data.par_mapv_inplace(f);
         self
@@ -192,7 +192,7 @@ mod tests {
     use super::*;
     use crate::geometry::{Millimetres, Radians};
 
-    /// Of 7 × 9 pixels blocks of 2 × 2 leave out the last row and column: what is left keeps its place.
+    /// Blocks of 2 × 2 in 7 × 9 pixels drop the last row and column; the rest keeps its position.
     #[test]
     fn blocks_stand_where_their_pixels_stood() {
         let mm = Millimetres;

@@ -1,4 +1,4 @@
-//! The scene: between the world in millimetres and the unit cube that stages see.
+//! The scene: the mapping between the world in millimetres and the unit cube of the stages.
 
 use crate::error::{Result, ensure};
 use crate::geometry::{Geometry, Ray, Vec3, View, VoxelGrid, dot, norm, sub};
@@ -11,7 +11,7 @@ mod settings;
 
 pub use settings::{AttenuationScale, CoarseSurround, LevelRule, SceneSettings, SupportRule, SurroundRule, VoxelScene};
 
-/// Maps lengths to cube sides and attenuation to order one, by the scan alone.
+/// Maps lengths to cube sides and attenuation to order one, based on the scan only.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Scene {
     /// World position of the cube's lowest corner, mm.
@@ -20,19 +20,19 @@ pub struct Scene {
     pub side: f64,
     /// The box to reconstruct, mm.
     pub bounds: [Vec3; 2],
-    /// Where in it the object can be, if that is known.
+    /// Where the object can be inside the box, if known.
     pub support: Option<Arc<Support>>,
     /// The voxels to export.
     pub grid: VoxelGrid,
-    /// The attenuation that stages see as 1, in 1/mm.
+    /// The attenuation that counts as 1 for the stages, in 1/mm.
     pub attenuation: f64,
-    /// Half the diagonal of the volume in the plane of the orbit plus a small tolerance: the published sampling
-    /// range reaches this far before and behind the axis.
+    /// Half the diagonal of the volume in the orbit plane plus a small tolerance: the published sampling range extends
+    /// this far before and behind the axis.
     published_reach: f64,
 }
 
 impl Scene {
-    /// The scene of `scan` under the spec's settings.
+    /// The scene of `scan` for the spec's settings.
     pub fn new(scan: &Scan, settings: &SceneSettings) -> Result<Self> {
         let grid = scan.geometry.volume;
         let longest = grid.size().into_iter().fold(0.0, f64::max);
@@ -77,7 +77,7 @@ impl Scene {
         self
     }
 
-    /// Whether the object may be at `p` (mm).
+    /// Whether the object can be at `p` (mm).
     pub fn holds(&self, p: Vec3) -> bool {
         self.support.as_ref().is_none_or(|s| s.holds(p))
     }
@@ -87,8 +87,8 @@ impl Scene {
         std::array::from_fn(|k| ((p[k] - self.origin[k]) / self.side) as f32)
     }
 
-    /// A ray in the unit cube; one that misses the reconstruction box has no length inside. `axis` is the unit vector
-    /// from the source to the detector along which the published codes measure depth.
+    /// A ray in the unit cube, with zero length inside if it misses the reconstruction box. `axis` is the unit vector
+    /// from source to detector along which the published codes measure depth.
     pub fn ray(&self, ray: &Ray, axis: Vec3) -> UnitRay {
         let inside = match &self.support {
             Some(support) => support.clip(ray),
@@ -114,23 +114,23 @@ impl Scene {
         self.ray(&geometry.ray(view, row, column), geometry.views[view].normal().0)
     }
 
-    /// A line integral as stages see it: attenuations of order one over cube sides.
+    /// A line integral in the scale of the stages: attenuation of order one times cube sides.
     pub fn line_to_unit(&self, a: f32) -> f32 {
         (f64::from(a) / (self.attenuation * self.side)) as f32
     }
 
-    /// The line integral that stages see as 1.
+    /// The line integral that counts as 1 for the stages.
     pub fn line_scale(&self) -> f64 {
         self.attenuation * self.side
     }
 
-    /// The shortest side of a voxel to export, mm.
+    /// The shortest side of an exported voxel, mm.
     pub fn voxel_mm(&self) -> f64 {
         self.grid.spacing.into_iter().fold(f64::INFINITY, f64::min)
     }
 
-    /// How many cells along the cube's side the data tell apart: voxels to export, or pixels at the distance of the volume's
-    /// centre where these are larger.
+    /// Number of cells along the cube's side that the data resolve: exported voxels, or pixels projected to the
+    /// volume's centre if these are larger.
     pub fn cells(&self, geometry: &Geometry) -> f64 {
         let pixel = |w: &View| {
             let [rows, columns] = geometry.detector;
@@ -142,7 +142,7 @@ impl Scene {
         self.side / finest.max(self.voxel_mm())
     }
 
-    /// Spacing of the voxels to export, in cube sides.
+    /// Spacing of the exported voxels, in cube sides.
     pub fn unit_spacing(&self) -> [f32; 3] {
         std::array::from_fn(|k| (self.grid.spacing[k] / self.side) as f32)
     }

@@ -1,6 +1,5 @@
-//! Settings of stages: what a spec says of each. They are checked when they build their stage. A stage does not know where
-//! it stands in a spec: its errors name its own keys, and its owner puts the way to it before them
-//! ([`Error::within`](crate::Error::within)).
+//! Settings of stages in a spec. They are checked when they build their stage. A stage does not know its path in a
+//! spec: its errors name its own keys, and its owner prepends the path ([`Error::within`](crate::Error::within)).
 
 use crate::arena::{Arena, InitReport, Layout, Weights};
 use crate::error::Result;
@@ -11,7 +10,7 @@ use crate::stage::{Encoder, Field, Normalizer, Projector};
 /// Settings of an encoder.
 #[typetag::serde(tag = "type")]
 pub trait EncoderSpec: Send + Sync {
-    /// The stage, or why the settings make none.
+    /// Builds the stage; fails on invalid settings.
     fn build(&self) -> Result<Box<dyn Encoder>>;
 }
 
@@ -29,7 +28,7 @@ pub trait FieldSpec: Send + Sync {
     fn build(&self, width: usize) -> Result<Box<dyn Field>>;
 }
 
-/// Settings of a field that brings line integrals of its own ([`Field::lines`]). It reads positions.
+/// Settings of a field with line integrals of its own ([`Field::lines`]). It reads positions.
 #[typetag::serde(tag = "type")]
 pub trait LineFieldSpec: Send + Sync {
     /// The stage.
@@ -46,36 +45,36 @@ pub trait ProjectorSpec: Send + Sync {
 /// Settings of an initializer.
 #[typetag::serde(tag = "type")]
 pub trait InitializerSpec: Send + Sync {
-    /// The stage that fills weights. `weights` reads a weights file that the settings name.
+    /// Builds the initializer. `weights` reads a weights file named in the settings.
     fn build(&self, weights: &dyn Fn(&str) -> Result<Weights>) -> Result<Box<dyn Initializer>>;
 }
 
 /// Settings of a loss.
 #[typetag::serde(tag = "type")]
 pub trait LossSpec: Send + Sync {
-    /// The loss, or why the settings make none.
+    /// Builds the loss; fails on invalid settings.
     fn build(&self) -> Result<Box<dyn Loss>>;
 }
 
 /// Settings of a prior.
 #[typetag::serde(tag = "type")]
 pub trait PriorSpec: Send + Sync {
-    /// The prior, or why the settings make none.
+    /// Builds the prior; fails on invalid settings.
     fn build(&self) -> Result<Box<dyn Prior>>;
 }
 
-/// Brings named weights into the arena.
+/// Initializes parameters in the arena.
 pub trait Initializer: Send + Sync {
-    /// Refuses weights that do not fit.
+    /// Refuses weights that do not fit the layout.
     fn check(&self, layout: &Layout) -> Result<()> {
         let _ = layout;
         Ok(())
     }
 
-    /// Fills what it fills (the stages' own random scheme has run before) and reports it.
+    /// Fills its parameters, after the stages' own random initialization, and reports which.
     fn apply(&self, layout: &Layout, arena: &mut Arena) -> Result<InitReport>;
 
-    /// A known volume that the field learns voxel by voxel, once the weights are filled.
+    /// A known volume that the field learns voxel by voxel after the weights are filled.
     fn volume(&self) -> Option<KnownVolume> {
         None
     }
@@ -84,16 +83,16 @@ pub trait Initializer: Send + Sync {
     fn describe(&self) -> String;
 }
 
-/// A known volume for a field to begin with.
+/// A known volume as initial state of a field.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct KnownVolume {
     /// Its file.
     pub path: String,
-    /// Steps in which the field learns it.
+    /// Training steps on it.
     pub steps: u64,
 }
 
 impl KnownVolume {
-    /// Steps where settings say nothing.
+    /// Default number of steps.
     pub const STEPS: u64 = 500;
 }

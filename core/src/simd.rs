@@ -1,7 +1,7 @@
-//! One source for every precision and instruction set.
+//! One source for all precisions and instruction sets.
 //!
-//! A kernel is written once over a number type [`Real`] (`f32` for work, `f64` for checking gradients) and a SIMD
-//! token `S`; [`run`] picks the best instruction set of the machine at run time.
+//! A kernel is written once over a number type [`Real`] (`f32` for work, `f64` for checking gradients) and a SIMD token
+//! `S`; [`run`] selects the best instruction set of the machine at run time.
 
 use fearless_simd::Bytes;
 pub use fearless_simd::{Level, Select, Simd, SimdBase, SimdFloat, SimdFloatElement, SimdMask};
@@ -13,7 +13,7 @@ use std::sync::OnceLock;
 /// A native vector of `R` under the token `S`.
 pub type V<S, R> = <R as SimdFloatElement>::Native<S>;
 
-/// The numbers that stages compute with.
+/// The number types of stages.
 pub trait Real:
     SimdFloatElement
     + Copy
@@ -33,7 +33,7 @@ pub trait Real:
     + Sum
     + 'static
 {
-    /// Four numbers side by side, on every machine.
+    /// Four numbers side by side, on all machines.
     type Four<S: Simd>: SimdFloat<S, Element = Self, Array = [Self; 4]>;
     /// 0.
     const ZERO: Self;
@@ -41,33 +41,32 @@ pub trait Real:
     const ONE: Self;
     /// The nearest number to `x`.
     fn of(x: f64) -> Self;
-    /// As `f64`, exactly.
+    /// Exact conversion to `f64`.
     fn f64(self) -> f64;
-    /// Largest whole number not above.
+    /// Largest integer not above.
     fn floor(self) -> Self;
-    /// As a signed whole number, towards zero, saturating.
+    /// As a signed integer, rounded towards zero, saturating.
     fn int(self) -> i64;
-    /// As a whole number of 0 or more, towards zero, saturating.
+    /// As an unsigned integer, rounded towards zero, saturating.
     fn count(self) -> u32;
-    /// The whole part of every lane, which is at least 0 and below 2³¹, into `out`; as many as fit.
+    /// Writes the integer part of every lane (at least 0 and below 2³¹) to `out`, as many as fit.
     fn cells<S: Simd>(s: S, x: V<S, Self>, out: &mut [u32]);
-    /// `K` neighbours of every lane: `line[at]`, `line[at + 1]`, … The lanes of `at` are whole numbers that do not fall
-    /// from one lane to the next. Where they lie within four vectors of each other, and `line` goes on for as many
-    /// from the first, registers are shuffled instead of reading memory lane by lane.
+    /// `K` neighbours of every lane: `line[at]`, `line[at + 1]`, … The lanes of `at` are integers in non-decreasing
+    /// order. If they span less than four vectors, and `line` is long enough from the first one, registers are shuffled
+    /// instead of reading memory lane by lane.
     fn neighbours<S: Simd, const K: usize>(s: S, line: &[Self], at: V<S, Self>) -> [V<S, Self>; K];
-    /// `K` neighbours of every lane within the first two vectors of `line`: `line[at]`, `line[at + 1]`, … The lanes of `at`
-    /// are whole numbers, of which none reaches beyond.
+    /// `K` neighbours of every lane within the first two vectors of `line`: `line[at]`, `line[at + 1]`, … The lanes of
+    /// `at` are integers, and all neighbours are in range.
     fn window<S: Simd, const K: usize>(s: S, line: &[Self], at: V<S, Self>) -> [V<S, Self>; K];
-    /// Whether neither infinite nor NaN.
+    /// Whether the number is neither infinite nor NaN.
     fn finite(self) -> bool;
     /// Exponential of every lane.
     fn exp_lanes<S: Simd>(s: S, x: V<S, Self>) -> V<S, Self>;
-    /// One over the square root of every lane, which is positive and neither very large nor very small; `f32`: relative error
-    /// below 3e-7.
+    /// Reciprocal square root of every lane, which is positive and neither very large nor very small; `f32`: relative
+    /// error below 3e-7.
     fn inverse_root_lanes<S: Simd>(s: S, x: V<S, Self>) -> V<S, Self>;
-    /// Distribution function and density of the standard normal, `(Φ(x), φ(x))`, of every lane.
-    /// `f32`: |error| < 3e-7, by Abramowitz & Stegun 7.1.26, which shares its exponential with φ. Several vectors at
-    /// once hide how long each waits for its own results.
+    /// Distribution function and density of the standard normal, `(Φ(x), φ(x))`, of every lane. `f32`: |error| < 3e-7,
+    /// by Abramowitz & Stegun 7.1.26, which shares its exponential with φ. Several vectors at once hide the latency.
     fn normal_lanes<S: Simd, const K: usize>(s: S, x: [V<S, Self>; K]) -> [[V<S, Self>; K]; 2];
     /// Sine and cosine.
     fn sin_cos(self) -> (Self, Self);
@@ -120,13 +119,13 @@ impl Real for f32 {
         if span <= 2 * len && base + 2 * len <= line.len() {
             return Self::window(s, &line[base..], lane);
         }
-        // The four bytes of every lane's number.
+        // The four bytes of every lane's index.
         let number: S::u32s = lane.to_int();
         let mut bytes = number * 0x0404_0404 + 0x0302_0100;
         if span <= 4 * len && base + 4 * len <= line.len() {
             let near = [register(0), register(1)];
             let far = [register(2), register(3)];
-            // Numbers of the far two registers count from their own first; those of the near two then mean nothing.
+            // Indices into the far two registers count from their start; those into the near two are ignored.
             let start = S::u32s::splat(s, 0x0101_0101 * (8 * len) as u32);
             let mut all = [lane; K];
             for (k, taken) in all.iter_mut().enumerate() {
@@ -153,9 +152,9 @@ impl Real for f32 {
             }
             return all;
         }
-        // The four bytes of every lane's number.
+        // The four bytes of every lane's index.
         let mut bytes = number * 0x0404_0404 + 0x0302_0100;
-        // A loop, as a closure need not be inlined into what is compiled for an instruction set.
+        // A loop: a closure might not be inlined into the code for an instruction set.
         for taken in &mut all {
             *taken = low.concat_swizzle_dyn(high, bytes.to_bytes());
             bytes += 0x0404_0404;
@@ -185,7 +184,7 @@ impl Real for f32 {
     fn inverse_root_lanes<S: Simd>(s: S, x: V<S, Self>) -> V<S, Self> {
         #[cfg(target_arch = "x86_64")]
         if let Level::Avx512(avx512) = s.level() {
-            // 14 bits, and a step of Newton's: y·(3/2 - x·y²/2).
+            // 14 bits, then one Newton step: y·(3/2 - x·y²/2).
             let guess = wide::inverse_root::<S>(s, avx512, x);
             let less = (x * guess * -0.5).mul_add(guess, S::f32s::splat(s, 1.5));
             return guess * less;
@@ -313,9 +312,9 @@ impl Real for f64 {
     }
 }
 
-/// What AVX-512 does in one instruction and others in several.
+/// Single instructions of AVX-512 that take several on other instruction sets.
 #[cfg(target_arch = "x86_64")]
-// The macro calls instructions of a set that its token proves to be there.
+// The macro calls instructions that its token proves available.
 #[allow(unsafe_code)]
 mod wide {
     use super::{Simd, SimdBase};
@@ -339,14 +338,14 @@ mod wide {
         }
     );
 
-    /// One over the square root of every lane, with a relative error below 2^-14.
+    /// Reciprocal square root of every lane, with a relative error below 2^-14.
     #[inline(always)]
     pub(super) fn inverse_root<S: Simd>(s: S, avx512: Avx512, x: S::f32s) -> S::f32s {
         let x = f32x16::from_slice(avx512, x.as_slice()).into();
         S::f32s::from_slice(s, f32x16::simd_from(avx512, rsqrt(avx512, x)).as_slice())
     }
 
-    /// The number that each lane of `number` counts, of those in `low` and then in `high`.
+    /// The element of `low` followed by `high` at the index in each lane of `number`.
     #[inline(always)]
     pub(super) fn take<S: Simd>(s: S, avx512: Avx512, low: S::f32s, high: S::f32s, number: S::u32s) -> S::f32s {
         let [low, high] = [low, high].map(|x| f32x16::from_slice(avx512, x.as_slice()).into());
@@ -355,8 +354,8 @@ mod wide {
     }
 }
 
-/// [`Real::neighbours`] by reading memory. Loops, as a call, though it be rare, makes the compiler keep all vectors around it
-/// in memory.
+/// [`Real::neighbours`] by reading memory. Loops, because even a rare call makes the compiler keep all surrounding
+/// vectors in memory.
 #[inline(always)]
 fn one_by_one<S: Simd, R: Real, const K: usize>(s: S, line: &[R], at: V<S, R>) -> [V<S, R>; K] {
     let mut all = [at; K];
@@ -370,16 +369,16 @@ fn one_by_one<S: Simd, R: Real, const K: usize>(s: S, line: &[R], at: V<S, R>) -
     all
 }
 
-/// A piece of work that is compiled for every instruction set. `call` must be `#[inline(always)]`.
+/// Work compiled for every instruction set. `call` must be `#[inline(always)]`.
 pub trait Op {
-    /// What the work returns.
+    /// Result of the work.
     type Out;
-    /// Does the work with the instructions that `s` stands for.
+    /// Does the work with the instructions of `s`.
     fn call<S: Simd>(self, s: S) -> Self::Out;
 }
 
-/// Runs `op` with the best instruction set of this machine, or the one that `CONEFIELD_SIMD` names
-/// (`avx512`, `avx2`, `sse4.2`, `baseline`) where the machine has it.
+/// Runs `op` with the best instruction set of this machine, or the one named by `CONEFIELD_SIMD` (`avx512`, `avx2`,
+/// `sse4.2`, `baseline`) if the machine has it.
 #[inline]
 pub fn run<O: Op>(op: O) -> O::Out {
     fearless_simd::dispatch!(level(), s => op.call(s))
@@ -405,7 +404,7 @@ pub fn level() -> Level {
     })
 }
 
-/// The name of [`level`], as `CONEFIELD_SIMD` spells it.
+/// The name of [`level`], as in `CONEFIELD_SIMD`.
 pub fn level_name() -> &'static str {
     match level() {
         #[cfg(target_arch = "x86_64")]
@@ -418,14 +417,14 @@ pub fn level_name() -> &'static str {
     }
 }
 
-/// Lanes of the widest vector there is.
+/// Lanes of the widest supported vector.
 pub const WIDEST: usize = 16;
 
 /// Up to a vector's worth of `x` from `at`; lanes past the end are 0.
 #[inline(always)]
 pub fn load<S: Simd, R: Real>(s: S, x: &[R], at: usize) -> V<S, R> {
     let len = V::<S, R>::LEN;
-    // Both ways end in one load of a vector: joined after it, they are joined lane by lane.
+    // Both branches end in one vector load: joined after it, they are merged lane by lane.
     let tail;
     let whole = if at + len <= x.len() {
         &x[at..at + len]
@@ -436,7 +435,7 @@ pub fn load<S: Simd, R: Real>(s: S, x: &[R], at: usize) -> V<S, R> {
     V::<S, R>::from_slice(s, whole)
 }
 
-/// What `x` has from `at`, and zeros.
+/// The remaining elements of `x` from `at`, padded with zeros.
 #[cold]
 #[inline(never)]
 fn padded<R: Real>(x: &[R], at: usize) -> [R; WIDEST] {
@@ -459,7 +458,7 @@ pub fn store<S: Simd, R: Real>(v: V<S, R>, y: &mut [R], at: usize) {
     }
 }
 
-/// The first of `lanes`, as many as `y` has from `at`.
+/// Copies as many of the first `lanes` as `y` has from `at`.
 #[cold]
 #[inline(never)]
 fn store_tail<R: Real>(lanes: &[R; WIDEST], y: &mut [R], at: usize) {

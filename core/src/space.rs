@@ -1,19 +1,19 @@
-//! The arrays of a method, and what they take.
+//! The arrays of a method and their memory.
 //!
-//! A constructor asks a [`Space`] for its arrays. One kind of space allocates them. The other, a tally, gives empty arrays
-//! and adds up their bytes: the same code that allocates gives the price.
+//! A constructor requests its arrays from a [`Space`]. One kind of space allocates them. The other kind, a tally,
+//! returns empty arrays and adds up their bytes: the same code allocates and estimates memory.
 
 use crate::scan::ScanHeader;
 use ndarray::Array3;
 use std::cell::Cell;
 
-/// Makes arrays for a scan of known sizes, or only counts them.
+/// Allocates arrays for a scan of known size, or only counts their bytes.
 pub struct Space {
     header: ScanHeader,
     tally: bool,
-    /// Bytes held now.
+    /// Bytes currently held.
     held: Cell<u64>,
-    /// The most that were held at once.
+    /// Peak of the bytes held.
     most: Cell<u64>,
 }
 
@@ -23,7 +23,7 @@ impl Space {
         Self { header, tally: false, held: Cell::new(0), most: Cell::new(0) }
     }
 
-    /// A space that gives empty arrays and counts what they would take.
+    /// A space that returns empty arrays and counts the bytes they would take.
     pub fn tally(header: ScanHeader) -> Self {
         Self { tally: true, ..Self::new(header) }
     }
@@ -38,12 +38,12 @@ impl Space {
         &self.header
     }
 
-    /// Zeros, one for each voxel.
+    /// A zero for each voxel.
     pub fn volume(&self) -> Array3<f32> {
         self.array(self.header.volume)
     }
 
-    /// Zeros, one for each pixel of `views` views.
+    /// A zero for each pixel of `views` views.
     pub fn projections(&self, views: usize) -> Array3<f32> {
         let [rows, columns] = self.header.detector;
         self.array([views, rows, columns])
@@ -55,19 +55,19 @@ impl Space {
         Array3::zeros(if self.tally { [0; 3] } else { shape })
     }
 
-    /// Counts bytes that are held from now on.
+    /// Counts bytes held from now on.
     pub fn hold(&self, bytes: u64) {
         let held = self.held.get().saturating_add(bytes);
         self.held.set(held);
         self.most.set(self.most.get().max(held));
     }
 
-    /// Counts bytes that are held for a moment.
+    /// Counts bytes held temporarily.
     pub fn pass(&self, bytes: u64) {
         self.briefly(|space| space.hold(bytes));
     }
 
-    /// Counts what `make` takes as given back when it returns.
+    /// Counts the memory of `make` as released when it returns.
     pub fn briefly<T>(&self, make: impl FnOnce(&Self) -> T) -> T {
         let held = self.held.get();
         let made = make(self);
@@ -75,7 +75,7 @@ impl Space {
         made
     }
 
-    /// The most bytes that were held at once.
+    /// Peak of the bytes held.
     pub fn bytes(&self) -> u64 {
         self.most.get()
     }

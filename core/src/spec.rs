@@ -1,7 +1,7 @@
-//! What a user writes: a spec, in TOML or JSON. It names a method by its `type`; the other keys are the method's settings.
+//! Specs, in TOML or JSON. A spec names a method by its `type`; the other keys are the method's settings.
 //!
-//! Every stage is a table with a `type` and the settings of that type. A stage with default settings may be written as the
-//! name of its type. [`crate::registry`] lists the types; [`load`] reads files and says where a mistake stands.
+//! Every stage is a table with a `type` and the settings of that type. A stage with default settings may be written as
+//! its type name. [`crate::registry`] lists the types; [`load`] reads files and locates mistakes.
 
 mod check;
 pub mod load;
@@ -16,19 +16,19 @@ use serde::de::Error as _;
 use serde::{Deserialize, Deserializer, Serialize, Serializer};
 use serde_json::{Map, Value};
 
-/// A method with what names it.
+/// A method with its name and description.
 pub struct Spec {
     /// Short name, shown in tables.
     pub name: String,
-    /// What it is for, in a sentence.
+    /// Its purpose, in a sentence.
     pub description: String,
-    /// Libraries with stages that the spec names.
+    /// Libraries of stages used by the spec.
     pub plugins: PluginPaths,
     /// The method.
     pub method: Box<dyn Method>,
 }
 
-/// The keys of a spec beside its method.
+/// The keys of a spec besides its method.
 #[derive(Default, Serialize, Deserialize)]
 #[serde(default)]
 struct Label {
@@ -38,7 +38,7 @@ struct Label {
     plugins: PluginPaths,
 }
 
-/// Keys of a spec that are not its method's.
+/// Keys of a spec that do not belong to its method.
 const LABEL: [&str; 3] = ["name", "description", "plugins"];
 
 impl Serialize for Spec {
@@ -67,17 +67,17 @@ impl<'de> Deserialize<'de> for Spec {
     }
 }
 
-/// Libraries with stages that a spec names. A spec alone never makes the program load one: its user allows it.
+/// Libraries of stages named by a spec. A spec alone never loads a library: the user must allow it.
 #[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields, default)]
 pub struct PluginPaths {
-    /// The files of the libraries, relative to the spec's own. Loaded only where the user says so, with
-    /// `--allow-plugins-from-spec`, or names the same file with `--plugin`.
+    /// Library files, relative to the spec file. Loaded only if the user allows it with `--allow-plugins-from-spec`, or
+    /// names the same file with `--plugin`.
     pub paths: Vec<String>,
 }
 
 impl PluginPaths {
-    /// Whether none is named.
+    /// Whether no library is named.
     pub fn is_empty(&self) -> bool {
         self.paths.is_empty()
     }

@@ -1,7 +1,6 @@
-//! What a stage is: a validated, immutable set of settings with a forward and a hand-written backward pass over
-//! tiles of rows.
+//! Stages: validated, immutable settings with a forward and a hand-written backward pass over tiles of rows.
 //!
-//! A tile is channel-major: channel `c` of row `i` stands at `c·rows + i`. Rows are samples, in ray-major order.
+//! A tile is channel-major: channel `c` of row `i` is at index `c·rows + i`. Rows are samples, in ray-major order.
 
 use crate::error::{Error, Result};
 use crate::half::{Bf16, F16, Half};
@@ -9,8 +8,7 @@ use crate::simd::Real;
 use crate::wgsl::Fragment;
 use std::ops::Range;
 
-/// Rows that the host puts into a tile at most; the encoder gets thousands at once. A stage must accept any number
-/// from 1 up.
+/// Maximum rows per tile from the host; the encoder gets thousands at once. A stage must accept any number from 1 up.
 pub const TILE_ROWS: usize = 256;
 
 /// Channels of some rows, read-only.
@@ -40,14 +38,14 @@ impl<'a, R> Tile<'a, R> {
         &self.data[c * self.rows..(c + 1) * self.rows]
     }
 
-    /// Some neighbouring channels.
+    /// Some consecutive channels.
     #[inline(always)]
     pub fn channels(&self, c: Range<usize>) -> &'a [R] {
         &self.data[c.start * self.rows..c.end * self.rows]
     }
 }
 
-/// Channels of some rows, to be written.
+/// Mutable channels of some rows.
 #[derive(Debug)]
 pub struct TileMut<'a, R> {
     /// `[width][rows]`.
@@ -82,44 +80,43 @@ impl<'a, R> TileMut<'a, R> {
     }
 }
 
-/// The part of a stage's gradient that a call of [`Kernel::backward`] adds to.
+/// The part of a stage's gradient that one call of [`Kernel::backward`] accumulates.
 #[derive(Debug)]
 pub struct Grads<'a, R> {
     /// Gradients of the parameters `range`, which starts at parameter `range.start` of the stage.
     pub values: &'a mut [R],
-    /// Which parameters of the stage these are. A kernel leaves the others alone.
+    /// The range of the stage's parameters. A kernel ignores the others.
     pub range: Range<usize>,
 }
 
 impl<'a, R> Grads<'a, R> {
-    /// Gradients of every parameter of a stage.
+    /// Gradients of all parameters of a stage.
     pub fn all(values: &'a mut [R]) -> Self {
         let range = 0..values.len();
         Self { values, range }
     }
 }
 
-/// How far the result of a row may look.
+/// The rows on which the result of a row may depend.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, serde::Serialize)]
 #[serde(rename_all = "kebab-case")]
 pub enum Scope {
     /// Its own row only.
     Row,
-    /// The rows of its ray: the host hands it tiles of one whole ray, and of a single row for points off any ray.
+    /// The rows of its ray: the host passes tiles of one whole ray, and of a single row for points off any ray.
     Ray,
 }
 
-/// How a stage's parameters receive gradients.
+/// How a stage accumulates parameter gradients.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, serde::Serialize)]
 #[serde(rename_all = "kebab-case")]
 pub enum GradKind {
     /// It has no parameters.
     None,
-    /// Few parameters, every one touched by every row: each worker sums its own copy, copies are merged in order.
+    /// Few parameters, each affected by every row: each worker sums its own copy, and copies are merged in order.
     Dense,
-    /// Many parameters, few touched by a row: workers own disjoint ranges ([`Stage::partition`]) and go through
-    /// the rows in order, so that no copy and no atomic is needed and sums have one order. Such a stage keeps no
-    /// tape.
+    /// Many parameters, few affected by a row: workers own disjoint ranges ([`Stage::partition`]) and process the rows
+    /// in order, so that neither copies nor atomics are needed and sums have one order. Such a stage keeps no tape.
     Scatter,
 }
 
@@ -128,7 +125,7 @@ pub fn titled(name: &str, what: &str) -> String {
     format!("{name} ({})", what.split(':').next().unwrap_or(what))
 }
 
-/// All that a planner needs to know of a stage.
+/// Widths, counts and costs of a stage, for planning.
 #[derive(Debug, Clone, PartialEq, serde::Serialize)]
 pub struct Info {
     /// Channels in.
@@ -137,15 +134,15 @@ pub struct Info {
     pub output: usize,
     /// Parameters.
     pub params: usize,
-    /// Numbers a row that forward leaves for backward.
+    /// Numbers per row kept from forward to backward.
     pub tape: usize,
-    /// How far a row looks.
+    /// Rows that a row depends on.
     pub scope: Scope,
-    /// How gradients arrive.
+    /// How gradients are accumulated.
     pub grads: GradKind,
-    /// Multiply-adds a row, forward.
+    /// Multiply-adds of the forward pass, per row.
     pub macs: usize,
-    /// Output equals input: hosts leave the stage out.
+    /// Output equals input: hosts skip the stage.
     pub identity: bool,
 }
 
@@ -161,19 +158,20 @@ pub struct Parameter {
 }
 
 impl Parameter {
-    /// Its place within the stage's parameters.
+    /// Its range within the stage's parameters.
     pub fn range(&self) -> Range<usize> {
         self.start..self.start + self.shape.iter().product::<usize>()
     }
 }
 
-/// The arithmetic of a stage in one precision, of parameters that stand in memory as `P`.
+/// The arithmetic of a stage in one precision, with parameters stored as `P`.
 pub trait Kernel<R: Real, P = R>: Send + Sync {
-    /// `y = f(x; params)`. Fills `tape` (`[info.tape][rows]`) with what [`Kernel::backward`] needs.
+    /// Computes `y = f(x; params)`. Fills `tape` (`[info.tape][rows]`) for [`Kernel::backward`].
     fn forward(&self, params: &[P], x: Tile<'_, R>, y: TileMut<'_, R>, tape: TileMut<'_, R>);
 
-    /// `tape` holds what forward left and may be used as scratch. Given `dy = ∂L/∂y`: *adds* `∂L/∂params` to `grads` and, where `dx` is given, overwrites it with `∂L/∂x`.
-    /// The order in which a parameter's gradient is summed must not depend on `grads.range`.
+    /// `tape` holds the values of the forward pass and may be used as scratch. Given `dy = ∂L/∂y`, *adds* `∂L/∂params`
+    /// to `grads` and, if `dx` is given, overwrites it with `∂L/∂x`. The summation order of a parameter's gradient must
+    /// not depend on `grads.range`.
     fn backward(
         &self,
         params: &[P],
@@ -184,13 +182,13 @@ pub trait Kernel<R: Real, P = R>: Send + Sync {
         dx: Option<TileMut<'_, R>>,
     );
 
-    /// How many passes [`Kernel::forward`] goes in, each over a table of its own: a host with many tiles sends all of
-    /// them through one before the next, while its table is in the cache.
+    /// Number of passes of [`Kernel::forward`], each over a table of its own: a host with many tiles runs one pass for
+    /// all of them before the next, while its table is in the cache.
     fn passes(&self) -> usize {
         1
     }
 
-    /// One pass of [`Kernel::forward`], `pass` of [`Kernel::passes`]; all of them in order are the whole.
+    /// Pass `pass` of [`Kernel::forward`]; all [`Kernel::passes`] in order give the whole.
     fn forward_pass(&self, pass: usize, params: &[P], x: Tile<'_, R>, y: TileMut<'_, R>, tape: TileMut<'_, R>) {
         debug_assert_eq!(pass, 0);
         self.forward(params, x, y, tape);
@@ -223,28 +221,28 @@ impl<R: Real, P, K: Kernel<R, P> + ?Sized> Kernel<R, P> for &K {
     }
 }
 
-/// A stage's arithmetic on parameters that are read in halves: what [`Stage::kernel`] makes of the same values.
-/// Gradients are `f32`.
+/// A stage's arithmetic with half-precision parameters, equivalent to [`Stage::kernel`] on the same values. Gradients
+/// are `f32`.
 #[derive(Clone, Copy)]
 pub struct Halves<'a> {
-    /// Of `binary16`.
+    /// For `binary16`.
     pub f16: &'a dyn Kernel<f32, F16>,
-    /// Of `bfloat16`.
+    /// For `bfloat16`.
     pub bf16: &'a dyn Kernel<f32, Bf16>,
 }
 
 impl<'a> Halves<'a> {
-    /// Of a stage that has one source for both.
+    /// From a kernel that implements both.
     pub fn of<K: Kernel<f32, F16> + Kernel<f32, Bf16>>(kernel: &'a K) -> Self {
         Self { f16: kernel, bf16: kernel }
     }
 }
 
-/// A kernel with parameters in halves, which it reads instead of those that it is handed.
+/// A kernel that reads its own half-precision parameters instead of those passed to it.
 pub struct Reader<'a, H> {
     /// The arithmetic.
     pub kernel: &'a dyn Kernel<f32, H>,
-    /// What it reads.
+    /// Its parameters.
     pub params: &'a [H],
 }
 
@@ -282,37 +280,36 @@ pub trait Stage: Send + Sync {
     /// Names and shapes of the parameters, in order, without gaps.
     fn parameters(&self) -> Vec<Parameter>;
 
-    /// Fills `params` by the stage's own scheme, repeatable by `seed`.
+    /// Initializes `params` by the stage's own scheme, reproducible by `seed`.
     fn init(&self, seed: u64, params: &mut [f32]);
 
-    /// The arithmetic that trains.
+    /// The arithmetic for training.
     fn kernel(&self) -> &dyn Kernel<f32>;
 
-    /// The same formula in double precision, by which gradients are checked.
+    /// The same formula in double precision, for checking gradients.
     fn reference(&self) -> Option<&dyn Kernel<f64>> {
         None
     }
 
-    /// The arithmetic that reads parameters in halves, or `None` where they are read as they are. Hosts want it of
-    /// [`GradKind::Scatter`] stages where a spec asks for it ([`crate::precision::Precision`]).
+    /// The arithmetic with half-precision parameters, or `None` if there is none. Hosts use it for
+    /// [`GradKind::Scatter`] stages if a spec asks for it ([`crate::precision::Precision`]).
     fn halves(&self) -> Option<Halves<'_>> {
         None
     }
 
-    /// Disjoint ranges that cover the parameters of a [`GradKind::Scatter`] stage; each may be summed by a worker
-    /// of its own.
+    /// Disjoint ranges that cover the parameters of a [`GradKind::Scatter`] stage; different workers may sum them.
     fn partition(&self) -> Vec<Range<usize>> {
         vec![0..self.info().params]
     }
 
-    /// What its kernels could not do since this was last asked. A kernel has no result of its own, as it runs on tiles
-    /// from many threads; one that may fail, as those of loaded libraries may, leaves numbers that mean nothing and says
-    /// so here. Backends ask after every call.
+    /// Returns and clears the first error of the kernels since the last call. Kernels return no result, as they run on
+    /// tiles from many threads. A kernel that can fail, such as one of a loaded library, leaves meaningless numbers and
+    /// reports the error here. Backends check after every call.
     fn fault(&self) -> Result<()> {
         Ok(())
     }
 
-    /// The same formula for a GPU, or `None` where there is only the CPU; see [`crate::wgsl`].
+    /// The same formula for a GPU, or `None` for CPU-only stages; see [`crate::wgsl`].
     fn wgsl(&self) -> Option<Fragment> {
         None
     }
@@ -321,13 +318,13 @@ pub trait Stage: Send + Sync {
     fn describe(&self) -> String;
 }
 
-/// A stage without some of its channels, and what became of the rest.
+/// A stage without some of its channels, with the remaining parameters and channels.
 pub struct Reduced<S: ?Sized> {
     /// The smaller stage.
     pub stage: Box<S>,
-    /// Which of the old parameters it keeps, in its order.
+    /// Ranges of the original parameters that it keeps, in its order.
     pub params: Vec<Range<usize>>,
-    /// Which channels remain on the other side of the stage.
+    /// Channels that remain on the other side of the stage.
     pub channels: Vec<usize>,
 }
 
@@ -339,58 +336,58 @@ pub trait Encoder: Stage {
         Err(Error::unsupported(self.describe(), "this encoder cannot leave out channels"))
     }
 
-    /// Channels ordered from coarse to fine, which masks that drop "all finer" channels rely on.
+    /// Whether channels are ordered from coarse to fine, as required by masks that drop "all finer" channels.
     fn coarse_to_fine(&self) -> bool {
         false
     }
 
-    /// Of each channel, how many cells along the unit cube's side it tells apart, where that is known: what is finer than
-    /// the data can be left out.
+    /// Resolution of each channel in cells along the unit cube's side, if known: channels finer than the data can be
+    /// left out.
     fn resolutions(&self) -> Option<Vec<f64>> {
         None
     }
 }
 
-/// Lengths of a scene that a projector's settings may count in.
+/// Lengths of a scene that projector settings may be relative to.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Lengths {
     /// The shortest side of a voxel, mm.
     pub voxel_mm: f64,
-    /// The side of the encoder's finest cell, mm, where it says how fine it is.
+    /// The side of the encoder's finest cell, mm, if the encoder reports its resolution.
     pub cell_mm: Option<f64>,
 }
 
 /// Features `[n, F]` to features `[n, F]`.
 pub trait Normalizer: Stage {
-    /// The normalizer without the inputs that are not in `keep`: they are gone from its sums too.
+    /// The normalizer without the inputs outside `keep`, which also leave its sums.
     fn keep_inputs(&self, keep: &[usize]) -> Result<Reduced<dyn Normalizer>>;
 }
 
 /// Features `[n, F]` to attenuation `[n, 1]`.
 pub trait Field: Stage {
-    /// The field without the inputs that are not in `keep`.
+    /// The field without the inputs outside `keep`.
     fn keep_inputs(&self, keep: &[usize]) -> Result<Reduced<dyn Field>> {
         let _ = keep;
         Err(Error::unsupported(self.describe(), "this field cannot do without some of its inputs"))
     }
 
-    /// Its own line integrals, of a field that brings them ([`crate::settings::LineFieldSpec`]).
+    /// Its own line integrals, if it has any ([`crate::settings::LineFieldSpec`]).
     fn lines(&self) -> Option<&dyn Lines<f32>> {
         None
     }
 
-    /// The same formula in double precision, by which gradients are checked.
+    /// The same formula in double precision, for checking gradients.
     fn lines_reference(&self) -> Option<&dyn Lines<f64>> {
         None
     }
 
-    /// Its values on whole grids, of a field that has them faster than point by point.
+    /// Its values on whole grids, if these are faster than point by point.
     fn on_grid(&self) -> Option<&dyn OnGrid> {
         None
     }
 }
 
-/// Values of a field on whole grids: the same as of its [`Kernel`], but for rounding.
+/// Values of a field on whole grids: equal to those of its [`Kernel`] up to rounding.
 pub trait OnGrid: Send + Sync {
     /// Overwrites `out` (`[x, y, z]`, z fastest) with the values at the points of `grid`.
     fn values(&self, params: &[f32], grid: &UnitGrid, out: &mut [f32]);
@@ -401,21 +398,21 @@ pub trait OnGrid: Send + Sync {
 pub struct UnitGrid {
     /// The first point.
     pub first: [f64; 3],
-    /// Distance of neighbouring points, in cube sides.
+    /// Distance between neighbouring points, in cube sides.
     pub spacing: [f64; 3],
     /// Points along x, y, z.
     pub shape: [usize; 3],
 }
 
-/// Line integrals that a field brings itself: no projector takes samples of it. In a closed form, or by a walk through
+/// Line integrals computed by a field itself, without samples of a projector, e.g. in closed form or by a walk through
 /// voxels. The field reads positions; its [`Kernel`] gives its values at points, for priors and export.
 pub trait Lines<R: Real>: Send + Sync {
-    /// Overwrites `out` with the line integrals of `rays`, in cube sides. A ray that is not inside
-    /// ([`UnitRay::inside`]) has 0.
+    /// Overwrites `out` with the line integrals of `rays`, in cube sides; 0 for a ray that misses the box
+    /// ([`UnitRay::inside`]).
     fn project(&self, params: &[R], rays: &[UnitRay], out: &mut [R]);
 
-    /// Given `dlines = ∂L/∂out`: *adds* `∂L/∂params` to `grads`. The order in which a parameter's gradient is summed must
-    /// not depend on `grads.range`: hosts hand each range of [`Stage::partition`] to a worker of its own.
+    /// Given `dlines = ∂L/∂out`, *adds* `∂L/∂params` to `grads`. The summation order of a parameter's gradient must not
+    /// depend on `grads.range`: hosts assign each range of [`Stage::partition`] to a worker.
     fn backproject(&self, params: &[R], rays: &[UnitRay], dlines: &[R], grads: Grads<'_, R>);
 }
 
@@ -426,29 +423,29 @@ pub struct UnitRay {
     pub origin: [f32; 3],
     /// Unit vector.
     pub direction: [f32; 3],
-    /// Entry into and exit from the reconstruction box, in cube sides; equal where the ray misses it.
+    /// Entry into and exit from the reconstruction box, in cube sides; equal if the ray misses it.
     pub inside: [f32; 2],
     /// Beginning and end of the published sampling range (`near`, `far`), in cube sides.
     pub published: [f32; 2],
-    /// Cube sides a millimetre.
+    /// Cube sides per millimetre.
     pub per_mm: f32,
 }
 
-/// Samples of rays: positions and the lengths that they stand for.
+/// Samples of rays: positions and lengths.
 #[derive(Debug, Default, Clone)]
 pub struct Samples {
     /// Positions in the unit cube.
     pub points: Vec<[f32; 3]>,
-    /// `δ` of each sample in cube sides.
+    /// Length `δ` of each sample in cube sides.
     pub weights: Vec<f32>,
 }
 
 /// Rays to samples with weights.
 pub trait Projector: Send + Sync {
-    /// Samples that [`Projector::sample`] adds at most for `ray`; 0 where it sees nothing of the scene.
+    /// Maximum number of samples that [`Projector::sample`] adds for `ray`; 0 if it misses the scene.
     fn max_samples(&self, ray: &UnitRay) -> usize;
 
-    /// Appends the samples of `ray`. `seed` decides random positions; `None` (rendering) means none are random.
+    /// Appends the samples of `ray`. `seed` determines random positions; with `None` (rendering) none are random.
     fn sample(&self, ray: &UnitRay, seed: Option<u64>, out: &mut Samples);
 
     /// Beer-Lambert: the line integral `Σ μᵢ δᵢ` of one ray.
@@ -463,13 +460,13 @@ pub trait Projector: Send + Sync {
         }
     }
 
-    /// The projector for a scene with these lengths, where its settings count in them.
+    /// The projector for a scene with these lengths, if its settings depend on them.
     fn fitted(&self, lengths: Lengths) -> Result<Option<Box<dyn Projector>>> {
         let _ = lengths;
         Ok(None)
     }
 
-    /// What it could not do since this was last asked, as [`Stage::fault`].
+    /// Returns and clears the first error since the last call; see [`Stage::fault`].
     fn fault(&self) -> Result<()> {
         Ok(())
     }
@@ -477,7 +474,7 @@ pub trait Projector: Send + Sync {
     /// A line for `explain`.
     fn describe(&self) -> String;
 
-    /// [`Projector::sample`] for a GPU, of a projector that integrates as [`Projector::integrate`] does by itself; see
+    /// [`Projector::sample`] for a GPU, for projectors that use the default [`Projector::integrate`]; see
     /// [`crate::wgsl`].
     fn wgsl(&self) -> Option<Fragment> {
         None

@@ -4,7 +4,7 @@ use crate::error::{Error, Result};
 use crate::geometry::{Ray, Vec3, VoxelGrid};
 use serde::{Deserialize, Serialize};
 
-/// Cells that may hold something; all others are air.
+/// Cells that may contain the object; all others are air.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(try_from = "Written", into = "Written")]
 pub struct Support {
@@ -12,11 +12,11 @@ pub struct Support {
     grid: VoxelGrid,
     /// `[x][y][z]`.
     occupied: Vec<bool>,
-    /// The box around the occupied ones, mm.
+    /// The bounding box of the occupied cells, mm.
     bounds: [Vec3; 2],
 }
 
-/// As it stands in a file: lengths of runs of cells, the first one empty.
+/// File format: lengths of runs of cells, starting with empty ones.
 #[derive(Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 struct Written {
@@ -50,11 +50,11 @@ impl TryFrom<Written> for Support {
     }
 }
 
-/// Cells of a support at most.
+/// Maximum number of cells.
 const MOST: usize = 1 << 24;
 
 impl Support {
-    /// The support of these cells (`[x][y][z]` of `grid`); `None` where none is occupied.
+    /// The support of these cells (`[x][y][z]` of `grid`); `None` if none is occupied.
     pub fn new(grid: VoxelGrid, occupied: Vec<bool>) -> Option<Self> {
         let [_, ny, nz] = grid.shape;
         let (mut low, mut high) = ([usize::MAX; 3], [0; 3]);
@@ -71,7 +71,7 @@ impl Support {
         Some(Self { bounds: [corner(low), corner(high)], grid, occupied })
     }
 
-    /// The box around all occupied cells, mm.
+    /// The bounding box of the occupied cells, mm.
     pub fn bounds(&self) -> [Vec3; 2] {
         self.bounds
     }
@@ -86,33 +86,33 @@ impl Support {
         self.occupied[(cell[0] * ny + cell[1]) * nz + cell[2]]
     }
 
-    /// The cell of a place in cells; places outside count as on the rim.
+    /// The cell at a position in cell units; positions outside are clamped.
     fn cell(&self, p: Vec3) -> [usize; 3] {
         std::array::from_fn(|k| (p[k].max(0.0) as usize).min(self.grid.shape[k] - 1))
     }
 
-    /// A world position in cells, from the lowest corner.
+    /// A world position in cell units, from the lowest corner.
     fn place(&self, p: Vec3) -> Vec3 {
         let lower = self.grid.bounds()[0];
         std::array::from_fn(|k| (p[k] - lower[k]) / self.grid.spacing[k])
     }
 
-    /// Whether something may be at `p` (mm).
+    /// Whether the object can be at `p` (mm).
     pub fn holds(&self, p: Vec3) -> bool {
         self.at(self.cell(self.place(p)))
     }
 
-    /// From where to where (mm along the ray) it meets occupied cells, holes in between included; `None` where it
-    /// meets none.
+    /// Range (mm along the ray) from the first to the last occupied cell, including holes in between; `None` if there
+    /// is none.
     pub fn clip(&self, ray: &Ray) -> Option<[f64; 2]> {
         let [near, far] = ray.clip(self.bounds)?;
         let forth = self.first(ray, near, far, 1.0)?;
-        // From the other end; it meets at least the cell that was found on the way here.
+        // From the other end; it meets at least the cell found above.
         let back = self.first(ray, far, near, -1.0).unwrap_or(far);
         Some([forth, back.max(forth)])
     }
 
-    /// Where a walk from `t` to `end`, forwards or backwards, first meets an occupied cell (Amanatides and Woo 1987).
+    /// First occupied cell on the way from `t` to `end`, forwards or backwards (Amanatides and Woo 1987).
     fn first(&self, ray: &Ray, t: f64, end: f64, way: f64) -> Option<f64> {
         let direction: Vec3 = std::array::from_fn(|k| way * ray.direction[k] / self.grid.spacing[k]);
         let reach = (end - t) * way;
@@ -169,7 +169,7 @@ mod tests {
                 let towards: Vec3 = std::array::from_fn(|k| 25.0 * draw(3 + k as u64) - origin[k]);
                 let length = towards.iter().map(|x| x * x).sum::<f64>().sqrt();
                 let ray = Ray { origin, direction: towards.map(|x| x / length) };
-                // By small steps.
+                // In small steps.
                 let hits: Vec<f64> = (0..4000)
                     .map(|j| f64::from(j) * 0.06)
                     .filter(|&t| ray.clip(grid().bounds()).is_some_and(|[a, b]| t > a && t < b) && s.holds(ray.at(t)))
@@ -178,7 +178,7 @@ mod tests {
                     (Some([a, b]), Some(first), Some(last)) => {
                         assert!((a - first).abs() < 0.07 && (b - last).abs() < 0.07, "{a} {first} {b} {last}");
                     }
-                    // A corner that is cut between two steps.
+                    // A corner cut between two steps.
                     (Some([a, b]), None, None) => assert!(b - a < 0.07, "{a} {b}"),
                     (found, first, _) => assert!(found.is_none() && first.is_none(), "{found:?} {first:?}"),
                 }

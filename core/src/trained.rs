@@ -1,4 +1,4 @@
-//! A trained field, whose values can be had at the voxels of any grid.
+//! Trained fields, which can be evaluated at the voxels of any grid.
 
 use crate::allowance;
 use crate::backend::{Backend, Executable};
@@ -14,38 +14,38 @@ use ndarray::{ArrayViewMut3, s};
 use serde::{Deserialize, Serialize};
 use std::ops::Range;
 
-/// Points that are evaluated at once.
+/// Points evaluated at once.
 const POINTS: usize = 1 << 20;
 
-/// A model with the scene that it was trained in.
+/// A model with the scene of its training.
 pub struct TrainedField {
     /// Stages and parameters.
     pub model: Model,
-    /// Between the world and what stages see.
+    /// The mapping between the world and the stages.
     pub scene: Scene,
-    /// Millimetres a unit of the scan.
+    /// Millimetres per unit of the scan.
     pub unit_mm: f64,
 }
 
-/// What is to be kept beside spec and weights to have the field again.
+/// What is stored beside spec and weights to restore the field.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct Placement {
     /// The grid that the field was trained for.
     pub grid: VoxelGrid,
-    /// The attenuation that stages see as 1, in 1/mm.
+    /// The attenuation that counts as 1 for the stages, in 1/mm.
     pub attenuation: f64,
-    /// Millimetres a unit of the scan.
+    /// Millimetres per unit of the scan.
     pub unit_mm: f64,
-    /// The encoder's channels that stayed each time some were removed, in order.
+    /// The encoder's remaining channels after each masking, in order.
     pub masks: Vec<Vec<usize>>,
-    /// Where in the volume the object can be, if that was found out.
+    /// Where the object can be inside the volume, if known.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub support: Option<Support>,
 }
 
 impl Placement {
-    /// Refuses numbers that no run leaves; `place` is the file that holds it.
+    /// Refuses numbers that no run produces; `place` is the file name.
     pub fn validate(&self, place: &str) -> Result<()> {
         self.grid.validate(&format!("{place}: placement"))?;
         for (field, x) in [("attenuation", self.attenuation), ("unit_mm", self.unit_mm)] {
@@ -57,7 +57,7 @@ impl Placement {
 }
 
 impl TrainedField {
-    /// What is to be kept.
+    /// The data to store.
     pub fn placement(&self) -> Placement {
         Placement {
             grid: self.scene.grid,
@@ -68,7 +68,7 @@ impl TrainedField {
         }
     }
 
-    /// The field of these stages where `placement` says, with the parameters that `load` puts into its model.
+    /// The field of these stages with `placement` and the parameters that `load` puts into its model.
     pub fn restore(
         mut pipeline: Pipeline,
         settings: &SceneSettings,
@@ -99,7 +99,7 @@ impl TrainedField {
     }
 }
 
-/// A field's values at the voxels of a grid, evaluated where they are asked for; 0 where the object cannot be.
+/// A field's values at the voxels of a grid, evaluated on demand; 0 where the object cannot be.
 pub struct FieldVoxels<'a> {
     model: &'a Model,
     exe: Box<dyn Executable>,
@@ -107,7 +107,7 @@ pub struct FieldVoxels<'a> {
 }
 
 impl FieldVoxels<'_> {
-    /// Bytes that evaluation works in, beside what the backend needs.
+    /// Working memory of the evaluation in bytes, besides that of the backend.
     pub const BYTES: u64 = 24 * POINTS as u64;
 }
 
@@ -134,19 +134,19 @@ impl Voxels for FieldVoxels<'_> {
     }
 }
 
-/// Samples a model at the voxels of a grid.
+/// Evaluates a model at the voxels of a grid.
 pub struct Sampler<'a> {
     scene: &'a Scene,
     grid: VoxelGrid,
     scale: f32,
     points: Vec<[f32; 3]>,
-    /// Which of the voxels at hand the points are.
+    /// Voxel indices of the current points.
     places: Vec<usize>,
     values: Vec<f32>,
 }
 
 impl<'a> Sampler<'a> {
-    /// For the voxels of `grid` and a model in `scene`, of a scan with `unit_mm` millimetres a unit.
+    /// A sampler for the voxels of `grid`, for a model in `scene` and a scan with `unit_mm` millimetres per unit.
     pub fn new(scene: &'a Scene, unit_mm: f64, grid: VoxelGrid) -> Self {
         let scale = (scene.attenuation * unit_mm) as f32;
         Self { scene, grid, scale, points: vec![], places: vec![], values: vec![] }
@@ -164,7 +164,7 @@ impl<'a> Sampler<'a> {
             return self.fill_grid(field, &model.arena.params, [xs, ys, zs], out);
         }
         let Self { scene, grid, scale, points, places, values } = self;
-        // In the order in which `out` is gone through.
+        // In the iteration order of `out`.
         let mut voxels = xs.clone().flat_map(|x| ys.clone().flat_map(move |y| zs.clone().map(move |z| [x, y, z])));
         let mut out = out.iter_mut();
         loop {
@@ -191,7 +191,7 @@ impl<'a> Sampler<'a> {
         }
     }
 
-    /// [`Sampler::fill`] of a field that has whole grids, some planes at a time.
+    /// [`Sampler::fill`] for a field with whole grids, a few planes at a time.
     fn fill_grid(
         &mut self,
         field: &dyn OnGrid,

@@ -1,19 +1,19 @@
-//! Trilinear interpolation on a regular grid over the unit cube, its slope and its adjoint.
+//! Trilinear interpolation on a regular grid over the unit cube, with its gradient and adjoint.
 //!
 //! Grids of vertices ([`Grid::corners`]) and of voxel centres ([`Grid::centres`]) share the arithmetic. Vertex
-//! `(x, y, z)` is entry `(x·n_y + y)·n_z + z`: row-major, as the shape `[n_x, n_y, n_z]` says. Along an axis of `n`
-//! vertices the position is `p = clamp(x·scale + shift, 0, n − 1)`, the cell is `⌊p⌋` (the last cell where `p = n − 1`)
-//! and the fraction is what remains.
+//! `(x, y, z)` is entry `(x·n_y + y)·n_z + z`: row-major, shape `[n_x, n_y, n_z]`. Along an axis of `n` vertices the
+//! position is `p = clamp(x·scale + shift, 0, n − 1)`, the cell is `⌊p⌋` (the last cell if `p = n − 1`) and the
+//! fraction is the remainder.
 
 use crate::half::Stored;
 use crate::simd::{Real, Select, Simd, SimdBase, SimdFloat, V, load, store};
 use crate::stage::Tile;
 use std::ops::Range;
 
-/// Rows that are located together: what [`Located`] holds stays in the L1 cache.
+/// Rows located together: [`Located`] fits into the L1 cache.
 pub const BLOCK: usize = 64;
 
-/// Where the vertices of a grid stand.
+/// The positions of a grid's vertices.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Grid {
     side: [usize; 3],
@@ -22,43 +22,43 @@ pub struct Grid {
 }
 
 impl Grid {
-    /// Vertices at the corners of `cells` cells an axis, which fill the cube: `cells + 1` vertices, `p = x·cells`.
-    /// A point outside the cube counts as the nearest one on its rim.
+    /// Vertices at the corners of `cells` cells per axis, which fill the cube: `cells + 1` vertices, `p = x·cells`. A
+    /// point outside the cube is clamped to its surface.
     pub fn corners(cells: [usize; 3]) -> Self {
         Self { side: cells.map(|n| n + 1), scale: cells.map(|n| n as f64), shift: 0.0 }
     }
 
-    /// Vertices at the centres of `voxels` voxels an axis, which fill the cube: `p = x·voxels − 1/2`. Half a voxel
-    /// from the rim the value no longer changes.
+    /// Vertices at the centres of `voxels` voxels per axis, which fill the cube: `p = x·voxels − 1/2`. Values are
+    /// constant within half a voxel of the surface.
     pub fn centres(voxels: [usize; 3]) -> Self {
         Self { side: voxels, scale: voxels.map(|n| n as f64), shift: -0.5 }
     }
 
-    /// Vertices along x, y, z.
+    /// Number of vertices along x, y, z.
     pub fn side(&self) -> [usize; 3] {
         self.side
     }
 
-    /// Vertices.
+    /// Total number of vertices.
     pub fn entries(&self) -> usize {
         self.side.iter().product()
     }
 
-    /// Steps to the next vertex along x, y, z; 0 along an axis with one vertex, which is its own neighbour.
+    /// Strides to the next vertex along x, y, z; 0 along an axis with one vertex, which is its own neighbour.
     pub fn strides(&self) -> [usize; 3] {
         let [x, y, z] = self.side;
         let step = |n: usize, s: usize| if n > 1 { s } else { 0 };
         [step(x, y * z), step(y, z), step(z, 1)]
     }
 
-    /// From a cell's first corner to its corner `c`, which is further along x, y, z where bits 0, 1, 2 are set.
+    /// Offsets from a cell's first corner to its corner `c`, which is further along x, y, z if bits 0, 1, 2 are set.
     pub fn offsets(&self) -> [usize; 8] {
         let s = self.strides();
         std::array::from_fn(|c| (0..3).map(|d| (c >> d & 1) * s[d]).sum())
     }
 
-    /// Disjoint ranges of entries that cover the grid, of whole planes of equal x: as many as keep a range below
-    /// `most` entries, but no more than 16, because each is a further look at every row.
+    /// Disjoint ranges of entries that cover the grid, of whole planes of equal x: enough to keep each below `most`
+    /// entries, but at most 16, because each range reads every row again.
     pub fn slabs(&self, most: usize) -> Vec<Range<usize>> {
         let [n, y, z] = self.side;
         let plane = y * z;
@@ -67,7 +67,7 @@ impl Grid {
     }
 }
 
-/// Where up to [`BLOCK`] rows fall on a grid.
+/// Locations of up to [`BLOCK`] rows on a grid.
 #[derive(Debug, Clone)]
 pub struct Located<R> {
     cell: [[u32; BLOCK]; 3],
@@ -85,8 +85,8 @@ impl<R: Real> Default for Located<R> {
 }
 
 impl<R: Real> Located<R> {
-    /// Locates rows `at..at + n` of `x` (`[3][rows]`, unit cube), `n` at most [`BLOCK`]. A coordinate that is not a
-    /// number counts as 0, so that it cannot reach other rows through a gradient.
+    /// Locates rows `at..at + n` of `x` (`[3][rows]`, unit cube), `n` at most [`BLOCK`]. A NaN coordinate counts as 0,
+    /// so that it cannot reach other rows through a gradient.
     #[inline(always)]
     pub fn locate<S: Simd>(&mut self, s: S, grid: &Grid, x: Tile<'_, R>, at: usize, n: usize) {
         let number = |v: f64| V::<S, R>::splat(s, R::of(v));
@@ -100,7 +100,7 @@ impl<R: Real> Located<R> {
             while i < n {
                 let p = load(s, x, i).mul_add(scale, shift);
                 let inside = p.simd_ge(zero) & p.simd_le(top);
-                // The precise forms return the number where the other side is NaN.
+                // The precise forms return the other operand if one is NaN.
                 let p = p.max_precise(zero).min_precise(top);
                 let c = p.floor().min(last);
                 store::<S, R>(p - c, &mut self.fraction[d][..n], i);
@@ -160,8 +160,8 @@ impl<R: Real> Located<R> {
         sum
     }
 
-    /// Adds row `i`'s `dy` to the corners that lie in `own`, a range of the grid's numbers (entry `e`, feature `f` is
-    /// number `e·F + f`). `grads` holds the gradients of that range.
+    /// Adds row `i`'s `dy` to the corners in `own`, a range of the grid's numbers (entry `e`, feature `f` is number
+    /// `e·F + f`). `grads` holds the gradients of that range.
     #[inline(always)]
     pub fn scatter<const F: usize>(
         &self,

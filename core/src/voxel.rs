@@ -1,4 +1,4 @@
-//! Line integrals of a voxel volume, as iterative methods need them: a linear operator and its exact adjoint.
+//! Line integrals of a voxel volume for iterative methods: a linear operator and its exact adjoint.
 
 use crate::error::Result;
 use crate::geometry::Geometry;
@@ -11,13 +11,13 @@ use std::sync::Arc;
 /// Settings of a projector of voxel volumes.
 #[typetag::serde(tag = "type")]
 pub trait VoxelProjectorSpec: Send + Sync {
-    /// The projector, or why the settings make none.
+    /// Builds the projector; fails on invalid settings.
     fn build(&self) -> Result<Box<dyn VoxelProjector>>;
 }
 
-/// A projector of voxel volumes, in single precision for work and in double precision to be checked by.
+/// A projector of voxel volumes, in single precision for work and in double precision for checks.
 pub trait VoxelProjector: Send + Sync {
-    /// The operator that works.
+    /// The operator in single precision.
     fn operator(&self) -> &dyn VoxelOperator<f32>;
 
     /// The same formula in double precision.
@@ -28,7 +28,7 @@ pub trait VoxelProjector: Send + Sync {
         None
     }
 
-    /// Bytes that either direction takes while it works on `views` views of a scan of these sizes, on the CPU.
+    /// Working memory of either direction for `views` views of a scan of this size on the CPU, in bytes.
     fn scratch(&self, header: &ScanHeader, views: usize) -> u64 {
         let _ = (header, views);
         0
@@ -38,7 +38,7 @@ pub trait VoxelProjector: Send + Sync {
     fn describe(&self) -> String;
 }
 
-/// The same projector, held by several.
+/// A shared projector.
 impl VoxelProjector for Arc<dyn VoxelProjector> {
     fn operator(&self) -> &dyn VoxelOperator<f32> {
         self.as_ref().operator()
@@ -57,8 +57,8 @@ impl VoxelProjector for Arc<dyn VoxelProjector> {
     }
 }
 
-/// The system matrix `A` of a geometry: `(Aμ)_i = Σ_j a_ij μ_j`, where `a_ij` is the length in mm over which voxel
-/// `j` counts for ray `i`. Neither direction depends on the number of threads.
+/// The system matrix `A` of a geometry: `(Aμ)_i = Σ_j a_ij μ_j`, where `a_ij` is the weight in mm of voxel `j` for ray
+/// `i`. Neither direction depends on the number of threads.
 pub trait VoxelOperator<R: Real>: Send + Sync {
     /// Overwrites `projections`, `[views.len(), row, column]`, with the line integrals of `volume`, `[x, y, z]` in
     /// 1/mm, for the views `views` of `geometry`.
@@ -79,13 +79,13 @@ pub trait VoxelOperator<R: Real>: Send + Sync {
         volume: ArrayViewMut3<'_, R>,
     );
 
-    /// What it could not do since this was last asked, as [`crate::stage::Stage::fault`].
+    /// Returns and clears the first error since the last call; see [`crate::stage::Stage::fault`].
     fn fault(&self) -> Result<()> {
         Ok(())
     }
 }
 
-/// A view as voxel-driven back-projection sees it: depth, row and column of a voxel `(x, y, z)`, each
+/// A view for voxel-driven back-projection: depth, row and column of a voxel `(x, y, z)`, each
 /// `n[0] + n[1]·x + n[2]·y + n[3]·z`, row and column after division by the depth.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct VoxelView {
@@ -95,6 +95,6 @@ pub struct VoxelView {
     pub row: [f64; 4],
     /// Column times depth.
     pub column: [f64; 4],
-    /// What the view is multiplied with, beside the inverse square of the depth, mm².
+    /// Factor of the view in mm², besides the inverse square of the depth.
     pub scale: f64,
 }

@@ -1,16 +1,17 @@
-//! A stage's formula for a GPU: WGSL functions over one row, which a backend puts together into kernels.
+//! Stages on a GPU: WGSL functions over one row, which a backend combines into kernels.
 //!
-//! A fragment declares only names that begin with [`PREFIX`], helpers included; others are refused. A backend gives every stage a
-//! prefix of its own, so that fragments never meet. What a stage must define, with its widths `IN` and `OUT` written as numbers:
+//! A fragment declares only names that begin with [`PREFIX`], including helpers; others are refused. A backend gives
+//! every stage a different prefix, so that fragments never collide. A stage with widths `IN` and `OUT` (written as
+//! numbers) must define:
 //!
 //! ```wgsl
 //! fn stage_forward(x: ptr<function, array<f32, IN>>, y: ptr<function, array<f32, OUT>>)
 //! fn stage_backward(x: ptr<function, array<f32, IN>>, dy: ptr<function, array<f32, OUT>>, dx: ptr<function, array<f32, IN>>)
 //! ```
 //!
-//! `forward` overwrites `y`. `backward` adds to gradients and overwrites `dx`, but where `stage_wants_dx` is false it may
-//! leave `dx` alone. Nothing is kept between the two: what `backward` needs it computes again. What the host defines for
-//! them:
+//! `forward` overwrites `y`. `backward` adds to gradients and overwrites `dx`, but may leave `dx` alone if
+//! `stage_wants_dx` is false. Nothing is kept between the two: `backward` recomputes what it needs. The host defines
+//! for them:
 //!
 //! ```wgsl
 //! const stage_wants_dx: bool;
@@ -21,9 +22,9 @@
 //!                                                                        // adds Σ a[j]·b[k] to at + j·ld + k
 //! ```
 //!
-//! `stage_grad` is for parameters of which a row touches few. `stage_sum_M` and `stage_outer_M_K`, sums over rows for
-//! any numbers `M` and `K` in the name, are for those that every row touches: all rows call them together, so never
-//! inside a branch or a loop that only some rows take.
+//! `stage_grad` is for parameters of which a row affects few. `stage_sum_M` and `stage_outer_M_K` are sums over rows,
+//! for any numbers `M` and `K` in the name, for parameters that every row affects: all rows call them together, so
+//! never inside a branch or loop that only some rows take.
 //!
 //! A projector defines
 //!
@@ -31,9 +32,9 @@
 //! fn stage_sample(ray: Ray, i: u32, training: bool) -> vec4<f32>
 //! ```
 //!
-//! sample `i` of `ray.count` on a ray: its position in the unit cube and its weight. `ray.count` is what
-//! [`Projector::max_samples`](crate::stage::Projector::max_samples) says; samples beyond what the ray has weigh 0. The
-//! line integral is the sum of weight times attenuation. [`RAY`] defines `Ray`, [`RANDOM`] random numbers.
+//! This is sample `i` of `ray.count` on a ray: its position in the unit cube and its weight. `ray.count` equals
+//! [`Projector::max_samples`](crate::stage::Projector::max_samples); samples beyond the actual number have weight 0.
+//! The line integral is the sum of weight times attenuation. [`RAY`] defines `Ray`, [`RANDOM`] random numbers.
 //!
 //! A loss ([`Loss`](crate::loss::Loss)) defines
 //!
@@ -47,8 +48,8 @@
 //! fn stage_at(p: u32) -> vec2<f32>
 //! ```
 //!
-//! the share of point `p` in the penalty of a block (all shares add up to it), and the derivative of the whole penalty by
-//! the value of point `p`. The host defines for it
+//! This is the share of point `p` in the penalty of a block (the shares sum to the penalty), and the derivative of the
+//! whole penalty by the value of point `p`. The host defines for it
 //!
 //! ```wgsl
 //! const stage_edge: u32;                                                 // points along the block's edge
@@ -61,22 +62,22 @@
 //! fn stage_walk(ray: VoxelRay)
 //! ```
 //!
-//! which calls `stage_visit(voxel: vec3<u32>, weight: f32)` for every voxel that the ray meets, with the millimetres for
-//! which it counts. One walk serves both directions, so that they are adjoint. `stage_shape() -> vec3<u32>` and
-//! `stage_spacing() -> vec3<f32>` are the volume's; a `VoxelRay` has `source` and `ahead`, the way to the pixel, in voxels
-//! (whole numbers are voxel centres), and `length`, that way in mm.
+//! It calls `stage_visit(voxel: vec3<u32>, weight: f32)` for every voxel that the ray meets, with its weight in mm. One
+//! walk serves both directions, so that they are adjoint. `stage_shape() -> vec3<u32>` and
+//! `stage_spacing() -> vec3<f32>` are the volume's; a `VoxelRay` has `source` and `ahead`, the vector to the pixel, in
+//! voxels (whole numbers are voxel centres), and `length`, that vector's length in mm.
 
 use std::collections::BTreeSet;
 use std::fmt::Write;
 
-/// How every name begins that a fragment defines or uses of its host's.
+/// Prefix of every name that a fragment declares or uses from its host.
 pub const PREFIX: &str = "stage_";
 
-/// `struct Ray`: [`UnitRay`](crate::stage::UnitRay) with its seed and its number of samples.
+/// `struct Ray`: [`UnitRay`](crate::stage::UnitRay) with its seed and number of samples.
 pub const RAY: &str = include_str!("wgsl/ray.wgsl");
-/// `random_mix` and `random_unit`: the twins of [`mix`](crate::random::mix) and [`unit`](crate::random::unit).
+/// `random_mix` and `random_unit`: equivalents of [`mix`](crate::random::mix) and [`unit`](crate::random::unit).
 pub const RANDOM: &str = include_str!("wgsl/random.wgsl");
-/// `stage_trilinear_locate`, `…_index`, `…_weight` and `…_slopes`: the twin of [`crate::trilinear`].
+/// `stage_trilinear_locate`, `…_index`, `…_weight` and `…_slopes`: equivalents of [`crate::trilinear`].
 pub const TRILINEAR: &str = include_str!("wgsl/trilinear.wgsl");
 
 /// WGSL of one stage.
@@ -86,7 +87,7 @@ pub struct Fragment {
     pub source: String,
 }
 
-/// `stage_forward` and `stage_backward` of a stage from `input` to `output` channels, from the lines of their bodies.
+/// `stage_forward` and `stage_backward` of a stage with `input` and `output` channels, from the lines of their bodies.
 pub fn functions(input: usize, output: usize, forward: &str, backward: &str) -> String {
     format!(
         "fn stage_forward(x: ptr<function, array<f32, {input}>>, y: ptr<function, array<f32, {output}>>) {{
@@ -102,7 +103,7 @@ fn stage_backward(
     )
 }
 
-/// A sum over rows that a fragment asks for.
+/// A sum over rows used by a fragment.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
 pub enum Sum {
     /// `stage_sum_M`.
@@ -112,12 +113,12 @@ pub enum Sum {
 }
 
 impl Fragment {
-    /// A fragment of pieces, one after the other.
+    /// A fragment from pieces, concatenated.
     pub fn new(pieces: &[&str]) -> Self {
         Self { source: pieces.join("\n") }
     }
 
-    /// The same functions with names that begin with `prefix` instead of [`PREFIX`].
+    /// The same functions with `prefix` instead of [`PREFIX`] in names.
     pub fn named(&self, prefix: &str) -> String {
         let mut out = String::with_capacity(self.source.len());
         let mut end = 0;
@@ -131,7 +132,7 @@ impl Fragment {
         out
     }
 
-    /// The first name that it declares without [`PREFIX`]. Two fragments with such a name could not stand in one kernel.
+    /// The first declared name without [`PREFIX`]. Two fragments with such a name could not be in one kernel.
     pub fn stray(&self) -> Option<&str> {
         let (mut depth, mut declares, mut space) = (0, false, false);
         for token in tokens(&self.source) {
@@ -154,7 +155,7 @@ impl Fragment {
         None
     }
 
-    /// The sums over rows that it uses, by the names that occur in it.
+    /// The sums over rows that it uses, found by name.
     pub fn sums(&self) -> BTreeSet<Sum> {
         let words = self.source.split(|c: char| !(c.is_alphanumeric() || c == '_'));
         let sum = |word: &str| {
@@ -169,7 +170,7 @@ impl Fragment {
     }
 }
 
-/// Words, braces and angle brackets of a text in WGSL, without its comments. Comments in a comment are not followed: such a text is
+/// Words, braces and angle brackets of a WGSL text, without comments. Nested comments are not followed: such a text is
 /// refused when it is compiled.
 fn tokens(text: &str) -> impl Iterator<Item = &str> {
     let mut rest = text;
@@ -196,8 +197,8 @@ fn tokens(text: &str) -> impl Iterator<Item = &str> {
     })
 }
 
-/// What the fragment of a part expects of its host under names that begin with `name`, by what the whole gets of it; the part's
-/// parameters begin at `first`.
+/// Declares what the fragment of a part expects of its host, under names with prefix `name`, in terms of the whole's
+/// own functions; the part's parameters begin at `first`.
 pub fn hosted(name: &str, first: u32, fragment: &Fragment) -> String {
     let mut out = format!(
         "const {name}wants_dx = stage_wants_dx;
@@ -220,7 +221,7 @@ fn {name}grad(i: u32, v: f32) {{ stage_grad({first}u + i, v); }}
     out
 }
 
-/// Whether a setting is a positive normal number also in single precision, in which shaders have it.
+/// Whether a setting is a positive normal number also in single precision, as used in shaders.
 pub fn is_positive(x: f64) -> bool {
     x > 0.0 && (x as f32).is_normal()
 }

@@ -1,4 +1,4 @@
-//! Attenuation fields: MLP, line transformer, voxel grid, voxels with line integrals of their own.
+//! Attenuation fields: MLP, line transformer, voxel grid, and voxels with line integrals of their own.
 
 pub mod line_transformer;
 mod linear;

@@ -1,9 +1,9 @@
-//! The network of SAX-NeRF (Cai et al., CVPR 2024): features `[n, F]` of the samples of a ray to attenuation `[n, 1]`, by
-//! F → W → blocks of [line attention](conefield_normalizers::line_attention) → (F + W) → W → 1. An activation follows each
-//! linear map and the last block. The columns of the skip layer are the F features, then the W channels of the
-//! last block.
+//! The network of SAX-NeRF (Cai et al., CVPR 2024): maps features `[n, F]` of the samples of a ray to attenuation
+//! `[n, 1]` by F → W → blocks of [line attention](conefield_normalizers::line_attention) → (F + W) → W → 1. An
+//! activation follows each linear map and the last block. The columns of the skip layer are the F features, then the W
+//! channels of the last block.
 //!
-//! `line-attention` alone is a normalizer: it also stands before other fields.
+//! `line-attention` alone is a normalizer, which can also precede other fields.
 
 use crate::linear::Linear;
 use conefield_core::activation::{Activation, activate};
@@ -22,15 +22,15 @@ use std::ops::Range;
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields, default)]
 pub struct LineTransformer {
-    /// Channels of hidden layers.
+    /// Channels of the hidden layers.
     pub width: usize,
     /// Blocks of line attention, 1 to 16.
     pub blocks: usize,
-    /// Each block.
+    /// Settings of each block.
     pub attention: LineAttention,
-    /// Follows each linear map but the last, and the last block.
+    /// Activation after each linear map but the last, and after the last block.
     pub activation: Activation,
-    /// Follows the last linear map.
+    /// Activation after the last linear map.
     pub output: Activation,
 }
 
@@ -74,7 +74,7 @@ pub struct LineTransformerStage {
 }
 
 impl LineTransformerStage {
-    /// The stage for `input` features, or which setting is out of range.
+    /// The stage for `input` features; fails if a setting is out of range.
     pub fn new(settings: &LineTransformer, input: usize) -> Result<Self> {
         let &LineTransformer { width, blocks, ref attention, .. } = settings;
         ensure((1..=512).contains(&width), "spec", "width", width, "1 to 512 channels")?;
@@ -92,21 +92,21 @@ impl LineTransformerStage {
         [("first", &self.first), ("skip", &self.skip), ("last", &self.last)]
     }
 
-    /// The parameters of a block.
+    /// The parameter range of a block.
     fn of_block(&self, start: usize) -> Range<usize> {
         start..start + self.block.info().params
     }
 }
 
-/// What forward leaves for backward, `[channels][n]` each.
+/// Values kept from forward to backward, `[channels][n]` each.
 struct Tape<'a, R> {
-    /// The layers before the blocks, behind them, and behind the skip: output, and derivative of the activation.
+    /// The layers before the blocks, after them, and after the skip: output and derivative of the activation.
     first: [&'a mut [R]; 2],
     mixed: [&'a mut [R]; 2],
     skip: [&'a mut [R]; 2],
     /// The derivative of the last activation.
     last: &'a mut [R],
-    /// Each block's output, and its own tape.
+    /// Each block's output and tape.
     blocks: Vec<[&'a mut [R]; 2]>,
 }
 
@@ -120,7 +120,7 @@ impl<'a, R: Real> Tape<'a, R> {
     }
 }
 
-/// `output = f(W·x + b)`; the derivative of `f` goes to `slope`.
+/// Computes `output = f(W·x + b)`; the derivative of `f` goes to `slope`.
 struct First<'a, R> {
     stage: &'a LineTransformerStage,
     params: &'a [R],
@@ -140,7 +140,7 @@ impl<R: Real> Op for First<'_, R> {
     }
 }
 
-/// Everything after the blocks.
+/// All layers after the blocks.
 struct Tail<'a, 'b, R> {
     stage: &'a LineTransformerStage,
     params: &'a [R],
@@ -169,7 +169,7 @@ impl<R: Real> Op for Tail<'_, '_, R> {
     }
 }
 
-/// Everything after the blocks, backwards: the slope of `tape.mixed` becomes `∂L` of the last block's output.
+/// Backward pass of all layers after the blocks: the slope of `tape.mixed` becomes `∂L` of the last block's output.
 struct TailBackward<'a, 'b, R> {
     stage: &'a LineTransformerStage,
     params: &'a [R],
@@ -202,7 +202,7 @@ impl<R: Real> Op for TailBackward<'_, '_, R> {
     }
 }
 
-/// The first layer backwards, from `d`, `∂L` of its output.
+/// Backward pass of the first layer, from `d`, `∂L` of its output.
 struct FirstBack<'a, R> {
     stage: &'a LineTransformerStage,
     params: &'a [R],
@@ -267,7 +267,7 @@ impl<R: Real> Kernel<R> for LineTransformerStage {
             let [output, own] = &mut from[0];
             let input: &[R] = if let Some([output, _]) = before.last() { output } else { first };
             let of = Grads::all(&mut grads[self.of_block(start)]);
-            // Nobody reads the block's output any more: `∂L` of its input takes the place.
+            // The block's output is no longer needed: `∂L` of its input replaces it.
             let (own, to) = (TileMut::new(own, n), Some(TileMut::new(output, n)));
             self.block.backward(&params[self.of_block(start)], Tile::new(input, n), own, Tile::new(d, n), of, to);
             d.copy_from_slice(output);
@@ -306,7 +306,7 @@ impl Stage for LineTransformerStage {
         all
     }
 
-    /// Linear maps as PyTorch's start.
+    /// Linear maps are initialized as in PyTorch.
     fn init(&self, seed: u64, params: &mut [f32]) {
         for (_, l) in self.linear() {
             let bound = 1.0 / (l.ld() as f64).sqrt();

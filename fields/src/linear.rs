@@ -1,4 +1,4 @@
-//! A linear map within a field.
+//! A linear map of a field.
 
 use conefield_core::dense::WeightMatrix;
 use std::ops::Range;
@@ -6,18 +6,18 @@ use std::ops::Range;
 /// A linear map: `[output][skip + input]` weights, then biases.
 #[derive(Debug, Clone, PartialEq)]
 pub(crate) struct Linear {
-    /// Channels that come from the features.
+    /// Input channels from the features.
     pub skip: usize,
-    /// Channels that come from the layer before, or from the features on the first layer.
+    /// Input channels from the previous layer, or from the features on the first layer.
     pub input: usize,
-    /// Channels out.
+    /// Output channels.
     pub output: usize,
     /// Its first parameter.
     pub start: usize,
 }
 
 impl Linear {
-    /// Columns of the weights.
+    /// Number of columns of the weights.
     pub fn ld(&self) -> usize {
         self.skip + self.input
     }
@@ -36,7 +36,7 @@ impl Linear {
         self.start..self.bias().end
     }
 
-    /// The columns of the weights from `column`.
+    /// The columns of the weights from `column` on.
     pub fn matrix<'a, R>(&self, params: &'a [R], column: usize) -> WeightMatrix<'a, R> {
         WeightMatrix { data: &params[self.weights()], ld: self.ld(), column }
     }
@@ -46,8 +46,8 @@ impl Linear {
         grads[self.all()].split_at_mut(self.weights().len())
     }
 
-    /// The parameters that are left where only `keep` of the features are: of all of them on the first layer (`skip` is 0),
-    /// else of those that are skipped.
+    /// The parameters left if only `keep` of the features remain: columns of the first layer (`skip` is 0), or of the
+    /// skip features.
     pub fn keep(&self, keep: &[usize]) -> Vec<Range<usize>> {
         let features = if self.skip == 0 { self.input } else { self.skip };
         let mut params = vec![];

@@ -1,7 +1,7 @@
 //! Multi-layer perceptron with skip connections: features `[n, F]` to attenuation `[n, 1]`.
 //!
 //! Layers count linear maps: `depth = 4, width = 32, skips = [2]` is F→32→32→(F+32)→32→1, the shape of NAF
-//! (Zha et al. 2022) and NI-NeRF (Xu et al. 2025). A skip layer reads the features first, then the layer before.
+//! (Zha et al. 2022) and NI-NeRF (Xu et al. 2025). A skip layer reads the features first, then the previous layer.
 
 mod wgsl;
 
@@ -18,7 +18,7 @@ use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 use std::ops::Range;
 
-/// How weights start. Biases start as the scheme says.
+/// Initialization of weights and biases.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
 #[serde(rename_all = "kebab-case")]
 pub enum Scheme {
@@ -34,17 +34,17 @@ pub enum Scheme {
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields, default)]
 pub struct Mlp {
-    /// Channels of hidden layers.
+    /// Channels of the hidden layers.
     pub width: usize,
-    /// Linear layers, the last included.
+    /// Number of linear layers, including the last.
     pub depth: usize,
-    /// Layers (counted from 0) that read the features again beside the layer before.
+    /// Layers (counted from 0) that read the features again, besides the previous layer.
     pub skips: Vec<usize>,
-    /// After every layer but the last.
+    /// Activation after every layer but the last.
     pub activation: Activation,
-    /// After the last.
+    /// Activation after the last layer.
     pub output: Activation,
-    /// How weights start.
+    /// Initialization of the weights.
     pub init: Scheme,
 }
 
@@ -79,7 +79,7 @@ pub struct MlpStage {
 }
 
 impl MlpStage {
-    /// The stage for `input` features, or which setting is out of range.
+    /// The stage for `input` features; fails if a setting is out of range.
     pub fn new(settings: &Mlp, input: usize) -> Result<Self> {
         let s = settings;
         let depth = s.depth;
@@ -103,8 +103,8 @@ impl MlpStage {
         Ok(Self { settings: s.clone(), input, layers })
     }
 
-    /// Tape channels: of each hidden layer its output and the activation's derivative, then the derivative of the
-    /// output.
+    /// Tape channels: output and activation derivative of each hidden layer, then the derivative of the output
+    /// activation.
     fn hidden(&self, layer: usize) -> Range<usize> {
         2 * layer * self.settings.width..(2 * layer + 1) * self.settings.width
     }
@@ -123,7 +123,7 @@ struct Forward<'a, R> {
     tape: TileMut<'a, R>,
 }
 
-/// Splits `data` into `[..at]` and the channels `range` behind it.
+/// Splits `data` into `[..at]` and the channels `range` after it.
 fn split<R>(data: &mut [R], range: Range<usize>, rows: usize) -> (&[R], &mut [R]) {
     let (before, rest) = data.split_at_mut(range.start * rows);
     (before, &mut rest[..range.len() * rows])
@@ -138,7 +138,7 @@ impl<R: Real> Op for Forward<'_, R> {
         for (i, layer) in stage.layers.iter().enumerate() {
             let last = i + 1 == stage.layers.len();
             let act = if last { stage.settings.output } else { stage.settings.activation };
-            // The linear map goes where its derivative will stand; the activation then reads it in place.
+            // The linear map is written where its derivative will be stored; the activation then reads it in place.
             let from = if last { stage.slope(i).start } else { stage.hidden(i).start };
             let until = stage.slope(i).end;
             let (before, both) = split(tape.data, from..until, n);

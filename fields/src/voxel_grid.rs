@@ -1,7 +1,7 @@
-//! A grid of voxels as the field itself: positions `[n, 3]` in the unit cube to attenuation `[n, 1]`.
+//! A voxel grid as the field itself: positions `[n, 3]` in the unit cube to attenuation `[n, 1]`.
 //!
-//! Values stand at the voxels' centres and are interpolated trilinearly; half a voxel from the rim they no longer
-//! change. The activation follows the interpolation, so that edges may fall between voxels.
+//! Values are given at the voxel centres and interpolated trilinearly; they are constant within half a voxel of the
+//! surface. The activation follows the interpolation, so that edges can lie between voxels.
 
 use conefield_core::activation::{self, Activation, activate};
 use conefield_core::error::{Error, Result, ensure};
@@ -17,7 +17,7 @@ use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 use std::ops::Range;
 
-/// Voxels along the unit cube's sides.
+/// Number of voxels along the unit cube's sides.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
 #[serde(untagged)]
 pub enum Resolution {
@@ -31,11 +31,11 @@ pub enum Resolution {
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields, default)]
 pub struct VoxelGridSettings {
-    /// Voxels along the unit cube's sides: one number, or three for x, y, z.
+    /// Number of voxels along the unit cube's sides: one number, or three for x, y, z.
     pub resolution: Resolution,
-    /// What follows the interpolation.
+    /// Activation after the interpolation.
     pub output: Activation,
-    /// Value of every voxel at first, before the activation.
+    /// Initial value of every voxel, before the activation.
     pub init: f64,
 }
 
@@ -61,10 +61,10 @@ impl FieldSpec for VoxelGridSettings {
     }
 }
 
-/// More voxels than this are refused: with gradients and moments they would take 32 GiB.
+/// Maximum number of voxels: with gradients and moments they would take 32 GiB.
 const MOST: u64 = 1 << 31;
 
-/// A range of voxels that one worker sums has at least this many.
+/// Minimum number of voxels in a range summed by one worker.
 const SLAB: usize = 1 << 18;
 
 /// The stage that [`VoxelGridSettings`] builds.
@@ -76,7 +76,7 @@ pub struct VoxelGridStage {
 }
 
 impl VoxelGridStage {
-    /// The stage, or which setting is out of range. `width` must be 3: the positions.
+    /// The stage; fails if a setting is out of range. `width` must be 3: the positions.
     pub fn new(settings: &VoxelGridSettings, width: usize) -> Result<Self> {
         let expected = "3, the position: use encoder type \"identity\" and no normalizer that changes it";
         ensure(width == 3, "spec", "field", format!("{width} channels for a voxel-grid"), expected)?;
@@ -101,7 +101,7 @@ impl VoxelGridStage {
         self.grid.side()
     }
 
-    /// Disjoint ranges of voxels, of about `most` each or more.
+    /// Disjoint ranges of voxels, of at least about `most` each.
     pub fn slabs(&self, most: usize) -> Vec<Range<usize>> {
         self.grid.slabs(most)
     }
@@ -161,7 +161,7 @@ impl<R: Real, P: Stored<R>> Op for Backward<'_, R, P> {
             if !touched && self.dx.is_none() {
                 continue;
             }
-            // A scattered stage keeps no tape, so that the activation's derivative is found again.
+            // A scattered stage keeps no tape, so the activation's derivative is recomputed.
             slope[..n].fill(R::ONE);
             if self.stage.output != Activation::None {
                 for i in 0..n {

@@ -1,9 +1,10 @@
-//! Voxels whose line integrals are those of Joseph (IEEE Trans. Med. Imaging 1(3), 1982) instead of sums over samples.
+//! Voxels with line integrals by Joseph's method (IEEE Trans. Med. Imaging 1(3), 1982) instead of sums over samples.
 //!
-//! A ray goes from plane to plane of voxel centres across the axis along which it passes most of them. On each plane it
-//! takes the value between the four nearest centres times the distance of the planes along the ray. A line integral is
-//! linear in the voxels, and its adjoint goes the same way. The values at points are those of
-//! [`voxel_grid`](crate::voxel_grid), without an activation; as there, half a voxel from the rim they no longer change.
+//! A ray steps through the planes of voxel centres perpendicular to its main axis. On each plane it takes the value
+//! interpolated between the four nearest centres, times the distance between planes along the ray. A line integral is
+//! linear in the voxels, and its adjoint takes the same walk. Values at points are those of
+//! [`voxel_grid`](crate::voxel_grid), without an activation; as there, they are constant within half a voxel of the
+//! surface.
 
 use crate::voxel_grid::{Resolution, VoxelGridSettings, VoxelGridStage};
 use conefield_core::activation::Activation;
@@ -20,9 +21,9 @@ use std::ops::Range;
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields, default)]
 pub struct VoxelsJoseph {
-    /// Voxels along the unit cube's sides: one number, or three for x, y, z.
+    /// Number of voxels along the unit cube's sides: one number, or three for x, y, z.
     pub resolution: Resolution,
-    /// Value of every voxel at first, in the scale that stages see.
+    /// Initial value of every voxel, in the scale of the field.
     pub init: f64,
 }
 
@@ -48,7 +49,7 @@ impl LineFieldSpec for VoxelsJoseph {
     }
 }
 
-/// A range of voxels that one worker sums has at least about this many.
+/// Approximate minimum number of voxels in a range summed by one worker.
 const SLAB: usize = 1 << 14;
 
 /// The stage that [`VoxelsJoseph`] builds.
@@ -57,13 +58,13 @@ pub struct VoxelsJosephStage {
     grid: VoxelGridStage,
 }
 
-/// A ray's way from plane to plane.
+/// A ray's walk from plane to plane.
 struct Walk {
-    /// The axis across the planes, and the other two.
+    /// The axis perpendicular to the planes, and the other two.
     axes: [usize; 3],
-    /// Planes that it meets.
+    /// Planes that the ray crosses.
     planes: Range<usize>,
-    /// Position along each of the other axes on plane 0, and its change from plane to plane, in voxels.
+    /// Position along each of the other axes on plane 0, and its change per plane, in voxels.
     start: [f64; 2],
     step: [f64; 2],
     /// Length between two planes, in cube sides.
@@ -71,7 +72,7 @@ struct Walk {
 }
 
 impl Walk {
-    /// The way of `ray` through `side` voxels, of which those with an x in `slab` count; `None` where it meets none.
+    /// The walk of `ray` through `side` voxels, counting those with an x in `slab`; `None` if it crosses none.
     fn of(ray: &UnitRay, side: [usize; 3], slab: &Range<usize>) -> Option<Self> {
         let [from, to] = ray.inside.map(f64::from);
         if to <= from {
@@ -92,7 +93,7 @@ impl Walk {
         let step = [axes[1], axes[2]].map(slope);
         let ends = [from, to].map(|t| p[across] + t * q[across]);
         let (mut low, mut high) = (ends[0].min(ends[1]), ends[0].max(ends[1]));
-        // Planes on which the ray can reach the slab; some too many do no harm.
+        // Planes on which the ray can reach the slab; a few too many do no harm.
         let open = [slab.start == 0, slab.end == side[0]];
         let within = [
             if open[0] { f64::NEG_INFINITY } else { slab.start as f64 - 1.5 },
@@ -108,7 +109,7 @@ impl Walk {
         (!planes.is_empty()).then(|| Self { axes, planes, start, step, length: 1.0 / q[across].abs() })
     }
 
-    /// Hands `take` every voxel that the ray meets, with the length for which it counts.
+    /// Calls `take` with every voxel that the ray crosses, and its weight (a length).
     fn visit(&self, side: [usize; 3], mut take: impl FnMut(usize, f64)) {
         let strides = [side[1] * side[2], side[2], 1];
         let [a, b, c] = self.axes;
@@ -228,12 +229,12 @@ mod tests {
         // Along z through the centres of x = 1 of 2, y = 0 of 3.
         let along = ray([0.75, 1.0 / 6.0, -1.0], [0.0, 0.0, 1.0]);
         assert!((line([2, 3, 4], &params, along) - (12.0 + 13.0 + 14.0 + 15.0) / 4.0).abs() < 1e-6);
-        // Between two columns it takes both by halves, at the rim one.
+        // Between two columns it takes half of both, at the surface one.
         let between = ray([0.5, 1.0 / 6.0, -1.0], [0.0, 0.0, 1.0]);
         assert!((line([2, 3, 4], &params, between) - (1.5 + 13.5) / 2.0).abs() < 1e-6);
         let rim = ray([1.0, 1.0 / 6.0, -1.0], [0.0, 0.0, 1.0]);
         assert!((line([2, 3, 4], &params, rim) - 13.5).abs() < 1e-6);
-        // Backwards it is the same line.
+        // The opposite direction gives the same line.
         let back = ray([0.75, 1.0 / 6.0, 2.0], [0.0, 0.0, -1.0]);
         assert_eq!(line([2, 3, 4], &params, back), line([2, 3, 4], &params, along));
     }

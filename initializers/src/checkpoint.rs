@@ -1,4 +1,4 @@
-//! Every weight from a file: an earlier run's model, taken up again or rendered.
+//! All weights from a file, to continue training or rendering a model of an earlier run.
 
 use conefield_core::arena::{Arena, InitReport, Layout, Weights};
 use conefield_core::error::{Result, ensure};
@@ -10,7 +10,7 @@ use serde::{Deserialize, Serialize};
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields)]
 pub struct CheckpointSettings {
-    /// The weights file. It must hold every weight of the pipeline, in the same shape.
+    /// The weights file. It must contain every weight of the pipeline, in the same shape.
     pub weights: String,
 }
 

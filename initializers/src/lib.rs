@@ -1,4 +1,4 @@
-//! What the parameters of a field start from: random numbers, a trained model (MCI), a checkpoint, a known volume.
+//! Initializers of a field's parameters: random numbers, a trained model (MCI), a checkpoint, a known volume.
 
 pub mod checkpoint;
 pub mod mci;

@@ -1,8 +1,8 @@
-//! Mapping-consistency initialisation (Xu et al. 2025, NI-NeRF, section 2.4): what maps features to attenuation comes
-//! from a model that was trained on a known volume; the features themselves start afresh.
+//! Mapping-consistency initialization (Xu et al. 2025, NI-NeRF, section 2.4): the map from features to attenuation
+//! comes from a model trained on a known volume; the features themselves start afresh.
 //!
-//! Loaded are the normalizers' and the field's weights, that is every block whose name does not start with
-//! `encoder.`. A block that the file lacks or has in another shape is refused.
+//! Loads the weights of the normalizers and the field, that is every block whose name does not start with `encoder.`.
+//! Refuses a file that lacks a block or has it in another shape.
 
 use conefield_core::arena::{Arena, InitReport, Layout, Weights};
 use conefield_core::error::{Error, Result, ensure};

@@ -1,4 +1,4 @@
-//! Every stage as its own seeded scheme makes it.
+//! Seeded random initialization of every stage by its own scheme.
 
 use conefield_core::arena::{Arena, InitReport, Layout, Weights};
 use conefield_core::error::Result;
@@ -6,7 +6,7 @@ use conefield_core::settings::{Initializer, InitializerSpec};
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
-/// Settings of `random`: none, the schemes belong to the stages.
+/// Settings of `random`: none, as the schemes belong to the stages.
 #[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields)]
 pub struct Random {}

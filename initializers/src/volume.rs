@@ -1,5 +1,5 @@
-//! A known volume to start from: another method's result, an earlier scan of the same object. The field is trained on it
-//! voxel by voxel for some steps before it sees the scan.
+//! A known volume as the start: another method's result, or an earlier scan of the same object. The field is trained on
+//! it voxel by voxel for some steps before it sees the scan.
 
 use conefield_core::arena::{Arena, InitReport, Layout, Weights};
 use conefield_core::error::{Result, ensure};
@@ -11,9 +11,9 @@ use serde::{Deserialize, Serialize};
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields)]
 pub struct FromVolume {
-    /// The volume's file, in 1/unit of the scan and with as many voxels.
+    /// The volume file, in 1/unit of the scan and with as many voxels.
     pub path: String,
-    /// Steps in which a field learns it.
+    /// Number of training steps on the volume.
     #[serde(default = "steps")]
     pub steps: u64,
 }

@@ -1,4 +1,4 @@
-//! What no metric can be computed on is refused here, before any work.
+//! Refuses inputs on which no metric can be computed, before any work.
 
 use conefield_core::error::{Error, Result, ensure};
 use ndarray::{ArrayView3, Zip};
@@ -6,7 +6,7 @@ use rayon::prelude::*;
 
 const PLACE: &str = "metrics";
 
-/// Refuses pairs of different shape, empty ones, values that are not finite and a peak that is no data range.
+/// Refuses pairs of different shape, empty ones, non-finite values and a peak that is not a data range.
 pub(crate) fn pair(result: ArrayView3<f32>, reference: ArrayView3<f32>, peak: f64) -> Result<()> {
     ensure(
         result.shape() == reference.shape(),
@@ -22,7 +22,7 @@ pub(crate) fn pair(result: ArrayView3<f32>, reference: ArrayView3<f32>, peak: f6
 }
 
 fn finite(volume: ArrayView3<f32>, name: &str) -> Result<()> {
-    // The usual case is decided in one parallel pass; the index is looked for only once it is known to exist.
+    // The usual case is decided in one parallel pass; the index is searched only if there is one.
     let ok = volume.axis_iter(ndarray::Axis(0)).into_par_iter().all(|plane| Zip::from(&plane).all(|x| x.is_finite()));
     if ok {
         return Ok(());
@@ -44,10 +44,10 @@ pub(crate) fn window(metric: &str, shape: &[usize], window: usize) -> Result<()>
     )
 }
 
-/// Largest value, in units of the data range, whose square leaves the constants of an SSIM their digits.
+/// Largest value, in units of the data range, whose square leaves the constants of an SSIM significant.
 const SSIM_REACH: f64 = 1e4;
 
-/// Refuses, in the name of `metric`, values so far beyond the data range that rounding would decide.
+/// Refuses, in the name of `metric`, values so far beyond the data range that rounding would dominate.
 pub(crate) fn reach(metric: &str, result: ArrayView3<f32>, reference: ArrayView3<f32>, peak: f64) -> Result<()> {
     let top = [result, reference].iter().flatten().fold(0.0f32, |m, x| m.max(x.abs()));
     let found = format!("values to {top:e} for a data range of {peak}");

@@ -1,41 +1,41 @@
-//! Dice's coefficient of two label maps, label by label: `2·|A ∩ B| / (|A| + |B|)` (Dice 1945) over the voxels that
-//! carry a label.
+//! Dice coefficient of two label maps, per label: `2·|A ∩ B| / (|A| + |B|)` (Dice 1945) over the voxels with that
+//! label.
 
 use conefield_core::error::{Error, Result, ensure};
 use ndarray::{Array3, ArrayView3};
 use serde::Serialize;
 use std::collections::BTreeMap;
 
-/// Above this not every whole number is an `f32`.
+/// Above this, not every integer is an `f32`.
 const LARGEST: f32 = 16_777_216.0;
 
-/// The agreement of one label.
+/// The overlap for one label.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize)]
 pub struct LabelDice {
     /// The label, from 1.
     pub label: u32,
-    /// From 0 to 1; 0 where only one of the maps has the label.
+    /// From 0 to 1; 0 if only one of the maps has the label.
     pub dice: f64,
-    /// Voxels of the result that carry it.
+    /// Voxels of the result with this label.
     pub voxels: u64,
-    /// Voxels of the reference that carry it.
+    /// Voxels of the reference with this label.
     pub reference_voxels: u64,
 }
 
-/// The agreement of two label maps.
+/// The overlap of two label maps.
 #[derive(Debug, Clone, PartialEq, Serialize)]
 pub struct Dice {
-    /// Mean over all labels that either map has, each counting alike; `None` where there is only background.
+    /// Mean over all labels of either map, equally weighted; `None` if there is only background.
     pub mean: Option<f64>,
-    /// Label by label, ascending.
+    /// Per label, ascending.
     pub labels: Vec<LabelDice>,
-    /// Labels that the reference lacks.
+    /// Labels missing in the reference.
     pub only_in_result: Vec<u32>,
-    /// Labels that the result lacks.
+    /// Labels missing in the result.
     pub only_in_reference: Vec<u32>,
 }
 
-/// The labels that a volume of whole numbers holds. `place` names it where it holds anything else.
+/// The labels of an integer-valued volume. Other values are refused; `place` names the volume in errors.
 pub fn label_map(place: &str, volume: ArrayView3<f32>) -> Result<Array3<u32>> {
     let whole = |x: f32| x.fract() == 0.0 && (0.0..LARGEST).contains(&x);
     if let Some(((x, y, z), value)) = volume.indexed_iter().find(|(_, v)| !whole(**v)) {
@@ -45,12 +45,12 @@ pub fn label_map(place: &str, volume: ArrayView3<f32>) -> Result<Array3<u32>> {
     Ok(volume.mapv(|x| x as u32))
 }
 
-/// Compares two label maps of one shape. Label 0 is background and counts for nothing.
+/// Compares two label maps of equal shape. Label 0 is background and is ignored.
 pub fn dice(result: ArrayView3<u32>, reference: ArrayView3<u32>) -> Result<Dice> {
     let (found, expected) = (format!("{:?}", result.shape()), format!("{:?}", reference.shape()));
     let same = result.shape() == reference.shape();
     ensure(same, "dice", "shape of the result", found, format!("{expected}, the shape of the reference"))?;
-    // In the result, in the reference, in both.
+    // Voxels in the result, in the reference, in both.
     let mut counts: BTreeMap<u32, [u64; 3]> = BTreeMap::new();
     let mut count = |(a, b): (u32, u32), voxels: u64| {
         for (label, which, there) in [(a, 0, true), (b, 1, true), (a, 2, a == b)] {
@@ -59,7 +59,7 @@ pub fn dice(result: ArrayView3<u32>, reference: ArrayView3<u32>) -> Result<Dice>
             }
         }
     };
-    // Neighbours mostly carry the same labels: they are counted together.
+    // Neighbours mostly have the same labels: they are counted together.
     let (mut last, mut run) = ((0, 0), 0);
     for (&a, &b) in result.iter().zip(&reference) {
         if (a, b) != last {
@@ -114,9 +114,9 @@ mod tests {
         assert_eq!(found.labels.iter().map(|l| (l.label, l.dice)).collect::<Vec<_>>(), [(1, 1.0), (2, 0.0), (9, 0.0)]);
         assert_eq!(found.mean, Some(1.0 / 3.0));
         assert_eq!((found.only_in_result, found.only_in_reference), (vec![2], vec![9]));
-        // Each way round the same.
+        // It is symmetric.
         assert_eq!(dice(b.view(), a.view()).unwrap().mean, Some(1.0 / 3.0));
-        // Another label at the same place is no agreement.
+        // Different labels at the same place do not count.
         assert_eq!(dice(block(3, 2..6).view(), block(4, 2..6).view()).unwrap().mean, Some(0.0));
     }
 

@@ -1,4 +1,4 @@
-//! Metrics of the squared error: RMSE, PSNR, and the slice of each axis where it is largest.
+//! Metrics of the squared error: RMSE, PSNR, and the worst slice of each axis.
 
 use crate::check;
 use conefield_core::Result;
@@ -6,7 +6,7 @@ use ndarray::{ArrayView3, Axis as Along};
 use rayon::prelude::*;
 use serde::Serialize;
 
-/// The axis that a slice is cut across.
+/// The axis perpendicular to a slice.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize)]
 #[serde(rename_all = "lowercase")]
 pub enum Axis {
@@ -21,11 +21,11 @@ pub enum Axis {
 /// The slice with the largest mean squared error along an axis (the first one if several share it).
 #[derive(Debug, Clone, Copy, PartialEq, Serialize)]
 pub struct WorstSlice {
-    /// The axis that the slice is cut across.
+    /// The axis perpendicular to the slice.
     pub axis: Axis,
     /// Index along that axis.
     pub index: usize,
-    /// PSNR of this slice in dB; infinite, and `null` in JSON, where result and reference are equal.
+    /// PSNR of this slice in dB; infinite, and `null` in JSON, if result and reference are equal.
     pub psnr: f64,
 }
 
@@ -35,7 +35,7 @@ pub fn rmse(result: ArrayView3<f32>, reference: ArrayView3<f32>) -> Result<f64> 
     Ok(SquaredError::of(result, reference).mean().sqrt())
 }
 
-/// Peak signal to noise ratio over the whole volume in dB, `10·log10(peak²/MSE)`; infinite for equal volumes.
+/// Peak signal-to-noise ratio over the whole volume in dB, `10·log10(peak²/MSE)`; infinite for equal volumes.
 pub fn psnr(result: ArrayView3<f32>, reference: ArrayView3<f32>, peak: f64) -> Result<f64> {
     check::pair(result, reference, peak)?;
     Ok(decibels(SquaredError::of(result, reference).mean(), peak))
@@ -47,12 +47,12 @@ pub fn worst_slices(result: ArrayView3<f32>, reference: ArrayView3<f32>, peak: f
     Ok(SquaredError::of(result, reference).worst(peak))
 }
 
-/// PSNR of a mean squared error.
+/// PSNR from a mean squared error.
 pub(crate) fn decibels(mse: f64, peak: f64) -> f64 {
     10.0 * (peak * peak / mse).log10()
 }
 
-/// Squared errors, summed over every slice of each axis.
+/// Sums of squared errors over every slice of each axis.
 pub(crate) struct SquaredError {
     slices: [Vec<f64>; 3],
 }
@@ -76,7 +76,7 @@ impl SquaredError {
                 [y, z]
             })
             .collect();
-        // Planes are added in their order, whichever thread finished first.
+        // Planes are added in order, whichever thread finishes first.
         let mut slices = [Vec::with_capacity(nx), vec![0.0; ny], vec![0.0; nz]];
         for [y, z] in &planes {
             slices[0].push(y.iter().sum());

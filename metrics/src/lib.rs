@@ -1,9 +1,9 @@
-//! How far a reconstructed volume is from its reference: PSNR, RMSE and the three SSIMs in use; and how
-//! far two label maps agree: Dice.
+//! Distance between a reconstructed volume and its reference: PSNR, RMSE and the three common SSIMs; and overlap of two
+//! label maps: Dice.
 //!
-//! Three definitions of SSIM are published under the one name and differ by several hundredths. Each has its own
-//! function here ([`ssim_2d`], [`ssim_3d`], [`ssim_skimage`]) and [`evaluate`] reports all of them, so that a number
-//! is always named. Every sum is kept in `f64`; results do not depend on the number of threads.
+//! Three definitions of SSIM are published under one name and differ by several hundredths. Each has its own function
+//! here ([`ssim_2d`], [`ssim_3d`], [`ssim_skimage`]), and [`evaluate`] reports all of them by name. All sums are in
+//! `f64`; results do not depend on the number of threads.
 //!
 //! Volumes are `[x, y, z]`. `peak` is the data range: 1 for volumes in `[0, 1]`, which all published figures use;
 //! [`peak_of`] derives it from a reference.

@@ -1,24 +1,23 @@
-//! The data range that scores refer to, where none is given.
+//! The default data range of scores.
 
 use ndarray::ArrayView3;
 
-/// Values that were brought to `[0, 1]` reach at least so far.
+/// Minimum of the largest value of volumes normalized to `[0, 1]`.
 const REACH: f32 = 0.5;
 
-/// The data range of `reference`: 1 where its values lie in `[0, 1]` and reach above ½, as those of volumes that were brought
-/// to this range do; else the difference of its largest and smallest value (1/mm, Hounsfield units). 1 where all values are
-/// equal.
+/// The data range of `reference`: 1 if its values lie in `[0, 1]` and exceed ½, as for normalized volumes; otherwise
+/// the difference of its largest and smallest value (1/mm, Hounsfield units). 1 if all values are equal.
 pub fn peak_of(reference: ArrayView3<f32>) -> f64 {
     let low = reference.iter().copied().fold(f32::INFINITY, f32::min);
     let high = reference.iter().copied().fold(f32::NEG_INFINITY, f32::max);
-    // What interpolation and rounding put over the ends.
+    // Tolerance for interpolation and rounding beyond the ends.
     let unit = low >= -1e-3 && high <= 1.0 + 1e-3 && high > REACH;
     let range = f64::from(high) - f64::from(low);
     if unit || !(range > 0.0 && range.is_finite()) { 1.0 } else { range }
 }
 
-/// What `result` must be multiplied by to be nearest to `reference`, where the two are alike but for a factor of more than 3
-/// either way: they are then in different units, most likely.
+/// The factor that brings `result` nearest to `reference`, if the two are similar except for a factor of more than 3
+/// either way: most likely they have different units.
 pub fn other_unit(result: ArrayView3<f32>, reference: ArrayView3<f32>) -> Option<f64> {
     let (mut both, mut own, mut other) = (0.0f64, 0.0f64, 0.0f64);
     for (&a, &b) in result.iter().zip(reference) {

@@ -1,4 +1,4 @@
-//! All metrics of a pair at once.
+//! All metrics of a pair.
 
 use crate::check;
 use crate::error::{SquaredError, WorstSlice, decibels};
@@ -8,10 +8,10 @@ use ndarray::ArrayView3;
 use serde::Serialize;
 use std::collections::BTreeMap;
 
-/// Every metric of a reconstruction, under its name.
+/// All metrics of a reconstruction, by name.
 #[derive(Debug, Clone, PartialEq, Serialize)]
 pub struct Scores {
-    /// Over the whole volume, in dB; infinite, and `null` in JSON, where result and reference are equal.
+    /// Over the whole volume, in dB; infinite, and `null` in JSON, if result and reference are equal.
     pub psnr: f64,
     /// Root mean square error.
     pub rmse: f64,
@@ -21,17 +21,17 @@ pub struct Scores {
     pub ssim_3d: Option<f64>,
     /// See [`crate::ssim_skimage`].
     pub ssim_skimage: Option<f64>,
-    /// The slice of largest error along x, y and z.
+    /// The slice with the largest error along x, y and z.
     pub worst_slices: [WorstSlice; 3],
-    /// Why a metric is missing, by its name.
+    /// Reasons for missing metrics, by name.
     pub missing: BTreeMap<&'static str, String>,
 }
 
 /// Scores `result` against `reference` with the data range `peak`.
 ///
-/// Refuses pairs of different shape, empty ones and values that are not finite. A metric that is not defined for
-/// the pair (a volume smaller than its window, an empty reference) is left out with its reason in
-/// [`Scores::missing`]; the others are still given.
+/// Refuses pairs of different shape, empty ones and non-finite values. A metric that is undefined for the pair (a
+/// volume smaller than its window, an empty reference) is omitted with its reason in [`Scores::missing`]; the others
+/// are still computed.
 pub fn evaluate(result: ArrayView3<f32>, reference: ArrayView3<f32>, peak: f64) -> Result<Scores> {
     check::pair(result, reference, peak)?;
     let error = SquaredError::of(result, reference);

@@ -1,12 +1,12 @@
-//! The three SSIMs in use.
+//! The three common definitions of SSIM.
 //!
-//! All have K1 = 0.01, K2 = 0.03 and the given peak as data range. They differ in window, border and covariance:
+//! All use K1 = 0.01, K2 = 0.03 and the given peak as data range. They differ in window, border and covariance:
 //!
 //! | function | window | border | covariance | mean over |
 //! |---|---|---|---|---|
-//! | [`ssim_2d`] | Gaussian 11×11, σ 1.5, in each slice | zeros beyond the edge | biased | slices with a positive reference value, then axes |
-//! | [`ssim_3d`] | Gaussian 11×11×11, σ 1.5 | where the window fits | biased | all places of the window |
-//! | [`ssim_skimage`] | uniform 7×7 in each slice | where the window fits | sample (N − 1) | slices, then axes |
+//! | [`ssim_2d`] | Gaussian 11×11, σ 1.5, per slice | zero padding | biased | positive-reference slices, then axes |
+//! | [`ssim_3d`] | Gaussian 11×11×11, σ 1.5 | valid positions only | biased | all window positions |
+//! | [`ssim_skimage`] | uniform 7×7 per slice | valid positions only | sample (N − 1) | slices, then axes |
 
 use crate::check;
 use crate::window::{FIELDS, SsimWindow, products};
@@ -14,28 +14,28 @@ use conefield_core::error::{Result, ensure};
 use ndarray::{Array3, ArrayView2, ArrayView3, Axis, Slice, s};
 use rayon::prelude::*;
 
-/// SSIM as R2-Gaussian reports it: per slice, 11×11 Gaussian, zero padding; slices whose reference has no positive
-/// value are left out; mean over slices, then over the three axes. Refuses a reference without a positive value.
+/// SSIM as reported by R2-Gaussian: per slice, 11×11 Gaussian, zero padding; slices without a positive reference value
+/// are skipped; mean over slices, then over the three axes. Refuses a reference without a positive value.
 pub fn ssim_2d(result: ArrayView3<f32>, reference: ArrayView3<f32>, peak: f64) -> Result<f64> {
     check::pair(result, reference, peak)?;
     gaussian_slices(result, reference, peak)
 }
 
-/// SSIM as NI-NeRF reports it: one map over the volume, 11×11×11 Gaussian, where the window fits. Refuses volumes
+/// SSIM as reported by NI-NeRF: one map over the volume, 11×11×11 Gaussian, valid positions only. Refuses volumes
 /// smaller than the window.
 pub fn ssim_3d(result: ArrayView3<f32>, reference: ArrayView3<f32>, peak: f64) -> Result<f64> {
     check::pair(result, reference, peak)?;
     gaussian_volume(result, reference, peak)
 }
 
-/// SSIM as NAF reports it: scikit-image's default per slice (7×7 uniform, sample covariance, without the border of
-/// 3 pixels), mean over slices, then over the three axes. Refuses volumes smaller than the window.
+/// SSIM as reported by NAF: scikit-image's default per slice (7×7 uniform, sample covariance, without the border of 3
+/// pixels), mean over slices, then over the three axes. Refuses volumes smaller than the window.
 pub fn ssim_skimage(result: ArrayView3<f32>, reference: ArrayView3<f32>, peak: f64) -> Result<f64> {
     check::pair(result, reference, peak)?;
     uniform_slices(result, reference, peak)
 }
 
-/// [`ssim_2d`] of a pair that has been checked.
+/// [`ssim_2d`] of a checked pair.
 pub(crate) fn gaussian_slices(result: ArrayView3<f32>, reference: ArrayView3<f32>, peak: f64) -> Result<f64> {
     check::reach("ssim_2d", result, reference, peak)?;
     let window = SsimWindow::gaussian();
@@ -46,7 +46,7 @@ pub(crate) fn gaussian_slices(result: ArrayView3<f32>, reference: ArrayView3<f32
     Ok(mean.unwrap_or(0.0))
 }
 
-/// [`ssim_skimage`] of a pair that has been checked.
+/// [`ssim_skimage`] of a checked pair.
 pub(crate) fn uniform_slices(result: ArrayView3<f32>, reference: ArrayView3<f32>, peak: f64) -> Result<f64> {
     check::reach("ssim_skimage", result, reference, peak)?;
     let window = SsimWindow::uniform();
@@ -54,13 +54,13 @@ pub(crate) fn uniform_slices(result: ArrayView3<f32>, reference: ArrayView3<f32>
     Ok(over_axes(result, reference, |x, y| Some(slice_ssim(x, y, &window, 0, peak))).unwrap_or(0.0))
 }
 
-/// Mean over the slices that have a score, then over the axes; `None` if an axis has none.
+/// Mean over the slices with a score, then over the axes; `None` if an axis has none.
 fn over_axes(
     result: ArrayView3<f32>,
     reference: ArrayView3<f32>,
     score: impl Fn(ArrayView2<f32>, ArrayView2<f32>) -> Option<f64> + Sync,
 ) -> Option<f64> {
-    // Slices across z touch every cache line of the volume: copying a few at once reads each line once.
+    // Slices across z touch every cache line of the volume: copying a few at once reads each line only once.
     const BLOCK: usize = 16;
     let mut means = 0.0;
     for axis in 0..3 {
@@ -86,7 +86,7 @@ fn over_axes(
     Some(means / 3.0)
 }
 
-/// Slices `range` across `axis`, one after the other, each with contiguous rows.
+/// Slices `range` perpendicular to `axis`, in order, each with contiguous rows.
 fn slices(volume: ArrayView3<f32>, axis: usize, range: std::ops::Range<usize>) -> Array3<f32> {
     let mut part = volume.slice_axis(Axis(axis), Slice::from(range));
     match axis {
@@ -102,12 +102,12 @@ fn slices(volume: ArrayView3<f32>, axis: usize, range: std::ops::Range<usize>) -
     copy
 }
 
-/// Mean of the SSIM map of one slice, `pad` zeros added on every side.
+/// Mean of the SSIM map of one slice, with `pad` zeros on every side.
 fn slice_ssim(x: ArrayView2<f32>, y: ArrayView2<f32>, window: &SsimWindow, pad: usize, peak: f64) -> f64 {
     let (rows, columns) = x.dim();
     let (border, wide) = (window.len() - 1, columns + 2 * pad);
     let (high, out) = (rows + 2 * pad, wide - border);
-    // The window along every row first; rows of padding stay zero.
+    // First the window along every row; padding rows stay zero.
     let mut fields: [Vec<f64>; FIELDS] = std::array::from_fn(|_| vec![0.0; high * out]);
     let mut row: [Vec<f64>; FIELDS] = std::array::from_fn(|_| vec![0.0; wide]);
     for (r, (x, y)) in x.rows().into_iter().zip(y.rows()).enumerate() {
@@ -129,7 +129,7 @@ fn slice_ssim(x: ArrayView2<f32>, y: ArrayView2<f32>, window: &SsimWindow, pad: 
     sum / ((high - border) * out) as f64
 }
 
-/// [`ssim_3d`] of a pair that has been checked.
+/// [`ssim_3d`] of a checked pair.
 pub(crate) fn gaussian_volume(result: ArrayView3<f32>, reference: ArrayView3<f32>, peak: f64) -> Result<f64> {
     check::reach("ssim_3d", result, reference, peak)?;
     // A tile keeps a ring of 11 windowed planes of `TILE[1] × nz`: a few megabytes, however large the volume is.
@@ -152,7 +152,7 @@ pub(crate) fn gaussian_volume(result: ArrayView3<f32>, reference: ArrayView3<f32
     Ok(sums.iter().sum::<f64>() / (places[0] * places[1] * (nz - border)) as f64)
 }
 
-/// Sum of the SSIM map over the places of a 3D window inside the tile.
+/// Sum of the SSIM map over the positions of a 3D window inside the tile.
 fn tile_sum(result: ArrayView3<f32>, reference: ArrayView3<f32>, window: &SsimWindow, peak: f64) -> f64 {
     let (nx, ny, nz) = result.dim();
     let (size, border) = (window.len(), window.len() - 1);
@@ -162,7 +162,7 @@ fn tile_sum(result: ArrayView3<f32>, reference: ArrayView3<f32>, window: &SsimWi
     let (mut row, mut rows, mut ring, mut mean) = (new(nz), new(ny * out), new(size * plane), new(plane));
     let mut sum = 0.0;
     for i in 0..nx {
-        // Along z, then y, into the place of the oldest plane of the ring.
+        // Along z, then y, replacing the oldest plane of the ring.
         let (x, y) = (result.index_axis(Axis(0), i), reference.index_axis(Axis(0), i));
         for (j, (x, y)) in x.rows().into_iter().zip(y.rows()).enumerate() {
             products(x, y, 0, &mut row);
@@ -177,7 +177,7 @@ fn tile_sum(result: ArrayView3<f32>, reference: ArrayView3<f32>, window: &SsimWi
                 window.across(|t| &from[(j + t) * out..(j + t + 1) * out], to);
             }
         }
-        // Along x, once the ring is full: the oldest plane stands after the newest.
+        // Along x, once the ring is full: the oldest plane is after the newest.
         if i >= border {
             for (to, from) in mean.iter_mut().zip(&ring) {
                 let at = |t: usize| ((i - border + t) % size) * plane;

@@ -1,22 +1,22 @@
-//! Separable windows over the four fields that an SSIM is made of.
+//! Separable windows over the four fields of an SSIM.
 //!
-//! SSIM needs the windowed means of `x`, `y`, `x²`, `y²` and `xy`, but the two squares only as their sum; so four
-//! fields are filtered, not five.
+//! SSIM needs the windowed means of `x`, `y`, `x²`, `y²` and `xy`, but the two squares only as a sum: four fields are
+//! filtered, not five.
 
 use ndarray::ArrayView1;
 
 /// `x`, `y`, `x² + y²`, `xy`.
 pub(crate) const FIELDS: usize = 4;
 
-/// A window of odd size, the same along every axis, whose weights add up to one.
+/// A window of odd size, equal along every axis, whose weights sum to one.
 pub(crate) struct SsimWindow {
     weights: Vec<f64>,
-    /// What turns a windowed `E[xy] − E[x]E[y]` into the covariance that the metric asks for.
+    /// Factor from the windowed `E[xy] − E[x]E[y]` to the covariance of the metric.
     covariance: f64,
 }
 
 impl SsimWindow {
-    /// Gaussian of 11 samples with σ = 1.5; covariances stay biased, as in the code that introduced it.
+    /// Gaussian of 11 samples with σ = 1.5; covariances stay biased, as in the original code.
     pub(crate) fn gaussian() -> Self {
         let raw: Vec<f64> = (-5i32..=5).map(|i| (-f64::from(i * i) / (2.0 * 1.5 * 1.5)).exp()).collect();
         let sum: f64 = raw.iter().sum();
@@ -33,7 +33,7 @@ impl SsimWindow {
         self.weights.len()
     }
 
-    /// `to[i] = Σ w[t]·from[i + t]`: where the window fits, so `to` is shorter by its size less one.
+    /// `to[i] = Σ w[t]·from[i + t]` at valid positions, so `to` is shorter by the window size less one.
     pub(crate) fn along_row(&self, from: &[f64], to: &mut [f64]) {
         to.fill(0.0);
         for (t, &w) in self.weights.iter().enumerate() {
@@ -63,7 +63,7 @@ impl SsimWindow {
     }
 }
 
-/// The four fields of a row of voxels, written from `pad` on; what lies around stays as it was.
+/// Writes the four fields of a row of voxels from `pad` on; the rest is left unchanged.
 pub(crate) fn products(x: ArrayView1<f32>, y: ArrayView1<f32>, pad: usize, to: &mut [Vec<f64>; FIELDS]) {
     let [tx, ty, squares, xy] = to;
     let to = tx[pad..].iter_mut().zip(&mut ty[pad..]).zip(squares[pad..].iter_mut().zip(&mut xy[pad..]));

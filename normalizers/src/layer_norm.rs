@@ -1,10 +1,10 @@
-//! Layer normalisation (Ba et al. 2016, equation 3): every row of features `[n, F]` to mean 0 and variance 1 over its
-//! channels, then scaled and shifted channel by channel: `y = γ·(x − mean)/√(variance + eps) + β`, with the biased
-//! variance (divided by F), as PyTorch has it.
+//! Layer normalization (Ba et al. 2016, equation 3): every row of features `[n, F]` to mean 0 and variance 1 over its
+//! channels, then scaled and shifted per channel: `y = γ·(x − mean)/√(variance + eps) + β`, with the biased variance
+//! (divided by F), as in PyTorch.
 //!
-//! Means are taken of differences to the row's first channel, so that a row of equal values gives exactly `β`,
-//! whatever its rounding. A row whose largest magnitude would overflow when squared is scaled down by a power of two
-//! first, which changes nothing but the share of `eps`, by then far below rounding.
+//! Means are taken of differences to the row's first channel, so that a row of equal values gives exactly `β` despite
+//! rounding. A row whose largest magnitude would overflow when squared is first scaled down by a power of two. This
+//! changes only the influence of `eps`, which is then far below rounding.
 
 use conefield_core::dense::total;
 use conefield_core::error::{Result, ensure};
@@ -23,7 +23,7 @@ use serde::{Deserialize, Serialize};
 pub struct LayerNorm {
     /// Added to the variance.
     pub eps: f64,
-    /// Whether a learned scale and shift follow; they start at 1 and 0.
+    /// Whether a learned scale and shift follow, initially 1 and 0.
     pub affine: bool,
 }
 
@@ -49,11 +49,11 @@ pub struct LayerNormStage {
     width: usize,
 }
 
-/// Tape: mean of the (scaled) differences to the first channel, reciprocal deviation, scale.
+/// Tape: mean of the (scaled) differences to the first channel, reciprocal standard deviation, scale.
 const TAPE: usize = 3;
 
 impl LayerNormStage {
-    /// The stage for `width` channels, or which setting is out of range.
+    /// The stage for `width` channels; fails if a setting is out of range.
     pub fn new(settings: &LayerNorm, width: usize) -> Result<Self> {
         let eps = settings.eps;
         ensure((1e-30..=1.0).contains(&eps), "spec", "eps", eps, "1e-30 to 1")?;
@@ -61,7 +61,7 @@ impl LayerNormStage {
         Ok(Self { settings: settings.clone(), width })
     }
 
-    /// `γ` of channel `c`, and `β` of it `width` further.
+    /// `γ` of channel `c`; its `β` is `width` further.
     fn gamma<R: Real>(&self, params: &[R], c: usize) -> R {
         if self.settings.affine { params[c] } else { R::ONE }
     }
@@ -71,8 +71,8 @@ impl LayerNormStage {
     }
 }
 
-/// Above the first number a row is scaled by the second. A variance counts as at least the third, so that it has a
-/// finite root where `eps` vanishes at that scale.
+/// Above the first number a row is scaled by the second. The third is a lower bound of the variance, for a finite root
+/// if `eps` vanishes at that scale.
 fn huge<R: Real>() -> [R; 3] {
     let powers = if size_of::<R>() == 4 { [50, -80, -120] } else { [400, -600, -960] };
     powers.map(|p| R::of(f64::powi(2.0, p)))
@@ -137,7 +137,7 @@ struct Backward<'a, R> {
     dx: Option<TileMut<'a, R>>,
 }
 
-/// What forward found about a vector of rows.
+/// Results of forward for one vector of rows.
 #[derive(Clone, Copy)]
 struct RowMoments<T> {
     first: T,
@@ -155,7 +155,7 @@ impl<R: Real> Backward<'_, R> {
         RowMoments { first: load(s, self.x.channel(0), i) * scale, mean, root, scale }
     }
 
-    /// `(x − mean)/deviation` of input `c`, the rows from `i`.
+    /// `(x − mean)/deviation` of input `c`, for the rows from `i`.
     #[inline(always)]
     fn normal<S: Simd>(&self, s: S, f: RowMoments<V<S, R>>, c: usize, i: usize) -> V<S, R> {
         ((load(s, self.x.channel(c), i) * f.scale - f.first) - f.mean) * f.root
@@ -266,7 +266,7 @@ impl Stage for LayerNormStage {
 
     fn wgsl(&self) -> Option<Fragment> {
         let (n, eps, affine) = (self.width, self.settings.eps as f32, self.settings.affine);
-        // Parameters that every row touches are summed over rows.
+        // Parameters affected by every row are summed over rows.
         let sums = if affine {
             format!(
                 "    var normal: array<f32, {n}>;

@@ -1,12 +1,13 @@
-//! Attention over the levels of an encoder (Oh et al. 2026, GH-NAF: Grid-Adaptive Hash-Level-Attended Neural Attenuation Fields,
-//! CVPR): each point weighs the levels by a softmax, so that smooth tissue may be told by coarse levels and edges by fine ones.
+//! Attention over the levels of an encoder (Oh et al. 2026, GH-NAF: Grid-Adaptive Hash-Level-Attended Neural
+//! Attenuation Fields, CVPR). Each point weights the levels by a softmax, so that coarse levels can represent smooth
+//! tissue and fine ones edges.
 //!
-//! Features `[n, F]` of `L` levels to `[n, F]`: `a = softmax(W·x + b)` over the levels, `y_c = L·a_l·x_c` for each channel `c` of level
-//! `l`. It starts near the identity: features that are next to nothing give every level the weight 1/L.
+//! Maps features `[n, F]` of `L` levels to `[n, F]`: `a = softmax(W·x + b)` over the levels, `y_c = L·a_l·x_c` for each
+//! channel `c` of level `l`. It starts near the identity: small features give every level the weight 1/L.
 //!
-//! The publication's code is not out, and its abstract leaves open what the attention reads and how levels are put together. Here
-//! it is a linear map of the features, and levels stay side by side. What the publication trains the attention with beside the
-//! projections (a target made of gradients of the attenuation, and uncertainty) is not part of it.
+//! The publication's code is not available, and its abstract specifies neither the input of the attention nor how
+//! levels are combined. Here the input is a linear map of the features, and levels stay separate. The publication's
+//! additional training target of the attention (from gradients of the attenuation, and uncertainty) is not included.
 
 use conefield_core::dense::{Output as Into, WeightMatrix, affine, affine_input, affine_weights};
 use conefield_core::error::{Result, ensure};
@@ -25,7 +26,7 @@ use std::fmt::Write;
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields, default)]
 pub struct LevelAttention {
-    /// Channels of a level, as the encoder's `features` says.
+    /// Channels per level, equal to the encoder's `features`.
     pub features: usize,
 }
 
@@ -52,13 +53,13 @@ impl NormalizerSpec for LevelAttention {
 /// The stage that [`LevelAttention`] builds.
 #[derive(Debug, Clone, PartialEq)]
 pub struct LevelAttentionStage {
-    /// Of each channel its level, from 0, ascending.
+    /// Level of each channel, from 0, ascending.
     level: Vec<usize>,
     levels: usize,
 }
 
 impl LevelAttentionStage {
-    /// The stage for `width` channels, or which setting does not fit.
+    /// The stage for `width` channels; fails if a setting does not fit.
     pub fn new(settings: &LevelAttention, width: usize) -> Result<Self> {
         let f = settings.features;
         ensure((1..=64).contains(&f), "spec", "features", f, "1 to 64")?;
@@ -220,7 +221,7 @@ impl Stage for LevelAttentionStage {
         ]
     }
 
-    /// Weights uniform in ±1/√F, as of PyTorch's linear layers; no level is preferred.
+    /// Weights uniform in ±1/√F, as for PyTorch's linear layers; no level is preferred.
     fn init(&self, seed: u64, params: &mut [f32]) {
         let (weights, bias) = params.split_at_mut(self.weights());
         let bound = 1.0 / (self.width() as f32).sqrt();

@@ -1,14 +1,16 @@
-//! Line attention (Cai et al., *Structure-aware sparse-view X-ray 3D reconstruction*, SAX-NeRF, CVPR 2024): neighbouring samples
-//! of a ray, in segments, look at one another.
+//! Line attention (Cai et al., *Structure-aware sparse-view X-ray 3D reconstruction*, SAX-NeRF, CVPR 2024): attention
+//! between neighbouring samples of a ray, in segments.
 //!
-//! Features `[n, F]` to `[n, F]`, in two steps with skip connections: `z = x + attention(LN(x))`, `y = z + feed(LN(z))`.
+//! Maps features `[n, F]` to `[n, F]` in two steps with skip connections: `z = x + attention(LN(x))`,
+//! `y = z + feed(LN(z))`.
 //!
 //! - Attention: a linear map gives queries, keys and values of several heads, `d` channels each. Within a segment,
-//!   `o_i = Σ_j softmax_j(q_i·k_j/√d + p_ij)·v_j`, where `p` is learned for each head; a linear map takes all `o` back to `F` channels.
-//! - Feed-forward: `F → H → H → F` without biases, GELU between.
+//!   `o_i = Σ_j softmax_j(q_i·k_j/√d + p_ij)·v_j`, with learned `p` for each head; a linear map takes all `o` back to
+//!   `F` channels.
+//! - Feed-forward: `F → H → H → F` without biases, with GELU in between.
 //!
-//! A segment is `segment` samples in a row; the last of a ray may be shorter. A point that is on no ray is a segment of its
-//! own. The published code has no such points: it evaluates volumes in segments of neighbouring voxels.
+//! A segment has `segment` consecutive samples; the last of a ray may be shorter. A point off any ray is its own
+//! segment. The published code has no such points: it evaluates volumes in segments of neighbouring voxels.
 
 use crate::layer_norm::{LayerNorm, LayerNormStage};
 use conefield_core::activation::{Activation, activate};
@@ -25,14 +27,14 @@ use serde::{Deserialize, Serialize};
 use std::f64::consts::TAU;
 use std::ops::Range;
 
-/// Samples of a segment at most.
+/// Maximum samples per segment.
 const LONGEST: usize = 64;
 
 /// Settings of `line-attention`.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields, default)]
 pub struct LineAttention {
-    /// Samples in a segment, 1 to 64.
+    /// Samples per segment, 1 to 64.
     pub segment: usize,
     /// Attention heads.
     pub heads: usize,
@@ -72,11 +74,11 @@ pub struct LineAttentionStage {
     at: Places,
 }
 
-/// Where the parameters are. Matrices are row-major, with a row for each output.
+/// Parameter ranges. Matrices are row-major, with a row for each output.
 #[derive(Debug, Clone)]
 struct Places {
     norms: [Range<usize>; 2],
-    /// Queries, keys and values, one after the other.
+    /// Queries, keys and values, concatenated.
     qkv: Range<usize>,
     /// `[head][i][j]`.
     position: Range<usize>,
@@ -86,7 +88,7 @@ struct Places {
 }
 
 impl LineAttentionStage {
-    /// The stage for `width` channels, or which setting is out of range.
+    /// The stage for `width` channels; fails if a setting is out of range.
     pub fn new(settings: &LineAttention, width: usize) -> Result<Self> {
         let LineAttention { segment, heads, head_width, expansion } = *settings;
         let named = [
@@ -134,7 +136,7 @@ impl LineAttentionStage {
         [norm, f, 3 * inner, attention, inner, f, norm, f, h, h, h, h, 3 * inner, f]
     }
 
-    /// Forward and its products, in the order in which the parts are named in `blocks`.
+    /// Multiply-adds of the forward pass, in the order of the parts in `blocks`.
     fn macs(&self) -> usize {
         let (f, h, inner) = (self.width, self.hidden, self.inner());
         4 * f * inner + 2 * inner * self.settings.segment + 2 * f * h + h * h + 2 * self.norm.info().macs
@@ -160,16 +162,16 @@ fn blocks(settings: &LineAttention, f: usize, h: usize) -> [(&'static str, Vec<u
     ]
 }
 
-/// What forward leaves for backward, `[channels][n]` each, and room that backward works in.
+/// Values kept from forward to backward, `[channels][n]` each, and working memory of backward.
 struct Tape<'a, R> {
     norm: [&'a mut [R]; 2],
-    /// What attention and the feed-forward part read; backward puts `∂L` of it there.
+    /// Inputs of attention and of the feed-forward part; backward stores their `∂L` there.
     normed: [&'a mut [R]; 2],
     /// Queries, keys and values.
     qkv: &'a mut [R],
-    /// Weights, `[head][j]`: how much a row takes of row `j` of its segment.
+    /// Weights, `[head][j]`: the share of row `j` of its segment in a row.
     weights: &'a mut [R],
-    /// The output of all heads; backward puts `∂L` of it there.
+    /// The output of all heads; backward stores its `∂L` there.
     attended: &'a mut [R],
     /// `z`, the sum after attention.
     sum: &'a mut [R],
@@ -200,12 +202,12 @@ impl<'a, R: Real> Tape<'a, R> {
     }
 }
 
-/// A whole matrix of `columns` columns.
+/// A whole matrix with `columns` columns.
 fn matrix<R>(data: &[R], columns: usize) -> WeightMatrix<'_, R> {
     WeightMatrix { data, ld: columns, column: 0 }
 }
 
-/// `sum = x + attention(normed[0])`.
+/// Computes `sum = x + attention(normed[0])`.
 struct Attend<'a, 'b, R> {
     stage: &'a LineAttentionStage,
     params: &'a [R],
@@ -232,7 +234,7 @@ impl<R: Real> Op for Attend<'_, '_, R> {
                 for start in (0..n).step_by(segment) {
                     let long = segment.min(n - start);
                     for i in 0..long {
-                        // Where the last segment has no row j, any finite score does: its weight becomes 0.
+                        // If the last segment has no row j, any finite score will do: its weight becomes 0.
                         let partner = start + if j < long { j } else { 0 };
                         let mut product = R::ZERO;
                         for c in head * d..(head + 1) * d {
@@ -265,7 +267,7 @@ impl<R: Real> Op for Attend<'_, '_, R> {
     }
 }
 
-/// Softmax over `segment` channels of scores. Rows that a short last segment does not have get the weight 0.
+/// Softmax over `segment` channels of scores. Rows missing in a short last segment get the weight 0.
 #[inline(always)]
 fn softmax<S: Simd, R: Real>(s: S, scores: &mut [R], segment: usize, n: usize) {
     let mut i = 0;
@@ -300,7 +302,7 @@ fn softmax<S: Simd, R: Real>(s: S, scores: &mut [R], segment: usize, n: usize) {
     }
 }
 
-/// `y = sum + feed(normed[1])`.
+/// Computes `y = sum + feed(normed[1])`.
 struct Feed<'a, 'b, R> {
     stage: &'a LineAttentionStage,
     params: &'a [R],
@@ -326,7 +328,7 @@ impl<R: Real> Op for Feed<'_, '_, R> {
     }
 }
 
-/// The feed-forward part backwards: `∂L` of `normed[1]` from `dy`.
+/// Backward pass of the feed-forward part: `∂L` of `normed[1]` from `dy`.
 struct FeedBack<'a, 'b, R> {
     stage: &'a LineAttentionStage,
     params: &'a [R],
@@ -352,7 +354,7 @@ impl<R: Real> Op for FeedBack<'_, '_, R> {
     }
 }
 
-/// Attention backwards: `∂L` of `normed[0]` from `d_sum`.
+/// Backward pass of attention: `∂L` of `normed[0]` from `d_sum`.
 struct AttendBack<'a, 'b, R> {
     stage: &'a LineAttentionStage,
     params: &'a [R],
@@ -489,8 +491,8 @@ impl Stage for LineAttentionStage {
         blocks(&self.settings, self.width, self.hidden).map(of).into()
     }
 
-    /// Matrices as PyTorch's linear layers start, norms at 1 and 0, positions from a normal distribution of standard
-    /// deviation 1, truncated at ±2: as published.
+    /// Matrices are initialized as PyTorch's linear layers, norms with 1 and 0, positions from a normal distribution of
+    /// standard deviation 1, truncated at ±2, as published.
     fn init(&self, seed: u64, params: &mut [f32]) {
         let inner = self.inner();
         for p in self.parameters() {
@@ -527,7 +529,7 @@ impl Stage for LineAttentionStage {
     }
 }
 
-/// A normal number of deviation 1 between -2 and 2 (Box and Muller 1958; what lies outside is drawn again).
+/// A standard normal number between -2 and 2 (Box and Muller 1958; values outside are redrawn).
 fn normal(seed: u64, i: u64) -> f64 {
     let mut draws = (0..).map(|k| {
         let [a, b] = [0, 1].map(|part| f64::from(unit(mix(mix(seed, i), 2 * k + part))));
@@ -544,14 +546,14 @@ impl Normalizer for LineAttentionStage {
         let mut params = vec![];
         for p in self.parameters() {
             match p.name.as_str() {
-                // A column for each channel.
+                // One column per channel.
                 "qkv.weight" | "feed.0.weight" => {
                     let rows = p.range().step_by(self.width);
                     params.extend(rows.flat_map(|row| keep.iter().map(move |c| row + c..row + c + 1)));
                 }
                 // Independent of the channels.
                 "position" | "feed.1.weight" => params.push(p.range()),
-                // A row for each channel.
+                // One row per channel.
                 _ => {
                     let row: usize = p.shape[1..].iter().product();
                     params.extend(keep.iter().map(|c| p.start + c * row..p.start + (c + 1) * row));
@@ -579,7 +581,7 @@ mod tests {
         (params.into_iter().map(f64::from).collect(), x)
     }
 
-    /// The formula, row by row.
+    /// The formula, evaluated row by row.
     fn plainly(stage: &LineAttentionStage, params: &[f64], x: &[f64], n: usize) -> Vec<f64> {
         let (f, inner, d) = (stage.width, stage.inner(), stage.settings.head_width);
         let (segment, at) = (stage.settings.segment, &stage.at);

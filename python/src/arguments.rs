@@ -1,4 +1,4 @@
-//! Arguments that Python hands over as JSON, checked with the words of the command.
+//! Arguments passed from Python as JSON, parsed like those of the command line.
 
 use crate::errors::raised;
 use conefield_core::{Error, Result};
@@ -13,18 +13,18 @@ pub fn read<T: DeserializeOwned>(py: Python<'_>, text: &str) -> PyResult<T> {
         .map_err(|e| raised(py, &Error::invalid("arguments", "values", e, "numbers and texts of the documented kinds")))
 }
 
-/// An argument that is written as on the command line.
+/// An argument in command-line syntax.
 fn parsed<T>(name: &str, text: &str, parse: impl Fn(&str) -> Result<T, String>) -> Result<T> {
     parse(text)
         .map_err(|why| Error::invalid("arguments", name, format!("{text:?}"), why.trim_start_matches("expected ")))
 }
 
-/// See [`parsed`]; nothing of nothing.
+/// See [`parsed`]; `None` stays `None`.
 pub fn optional<T>(name: &str, text: Option<&String>, parse: impl Fn(&str) -> Result<T, String>) -> Result<Option<T>> {
     text.map(|t| parsed(name, t, parse)).transpose()
 }
 
-/// What is to compute.
+/// The compute backend.
 pub fn backend(text: &str) -> Result<BackendChoice> {
     parsed("backend", text, |t| t.parse())
 }

@@ -1,5 +1,5 @@
-//! Between NumPy's arrays and ours. What comes in is copied: Python may change an array while the work goes on without its
-//! lock. What goes out is moved.
+//! Conversion between NumPy arrays and ndarray. Inputs are copied, as Python may change an array while the work runs
+//! without the GIL. Outputs are moved.
 
 use ndarray::{Array, Array3, Dimension};
 use numpy::{Element, IntoPyArray, PyArray, PyArray3, PyReadonlyArray};
@@ -11,17 +11,17 @@ pub fn owned<T: Element + Clone, D: Dimension>(array: &PyReadonlyArray<'_, T, D>
     array.as_array().as_standard_layout().into_owned()
 }
 
-/// The array, without a copy.
+/// Passes the array to Python without a copy.
 pub fn given<T: Element>(py: Python<'_>, array: Array3<T>) -> Bound<'_, PyArray3<T>> {
     array.into_pyarray(py)
 }
 
-/// As [`given`], of any number of axes.
+/// As [`given`], for any number of axes.
 pub fn given_any<T: Element, D: Dimension>(py: Python<'_>, array: Array<T, D>) -> Bound<'_, PyArray<T, D>> {
     array.into_pyarray(py)
 }
 
-/// What `value` is in JSON, as Python's dicts, lists and numbers.
+/// Converts the JSON form of `value` to Python dicts, lists and numbers.
 pub fn plain<'py>(py: Python<'py>, value: &impl Serialize) -> PyResult<Bound<'py, PyAny>> {
     let text = serde_json::to_string(value)
         .map_err(|e| crate::errors::broken(py, &format!("a result that cannot be written as text: {e}")))?;

@@ -1,7 +1,7 @@
-//! An encoder whose arithmetic is a Python object's.
+//! An encoder implemented by a Python object.
 //!
-//! Python's lock is taken once for each batch of rows, and one batch is worked on at a time: this is for trying out an idea,
-//! not for speed.
+//! The GIL is acquired once per batch of rows, and batches are processed one at a time: this is for prototyping, not
+//! for speed.
 
 use crate::stages::{Raised, words};
 use conefield_core::error::ensure;
@@ -14,37 +14,37 @@ use pyo3::prelude::*;
 use pyo3::types::{PyDict, PyTuple};
 use std::sync::{Arc, Mutex, PoisonError};
 
-/// Coordinates of a point.
+/// Number of coordinates of a point.
 const INPUT: usize = 3;
 
-/// What all encoders of one object share.
+/// State shared by all encoders of one object.
 struct Shared {
     name: &'static str,
     object: Py<PyAny>,
-    /// One call at a time: the parameters are set on the object before it. It is taken before Python's lock, never after.
+    /// One call at a time: the parameters are set on the object before it. Acquired before the GIL, never after.
     turn: Mutex<()>,
     blocks: Vec<Parameter>,
-    /// What the parameters start as.
+    /// Initial parameters.
     first: Vec<f32>,
-    /// Channels out.
+    /// Output channels.
     width: usize,
-    /// Whether it computes in double precision what is handed over in it.
+    /// Whether it computes in double precision for double-precision inputs.
     double: bool,
     coarse_to_fine: bool,
     resolutions: Option<Vec<f64>>,
     raised: Arc<Raised>,
 }
 
-/// An encoder of a Python object, perhaps without some of its channels.
+/// An encoder of a Python object, possibly without some of its channels.
 pub struct PythonEncoder {
     shared: Arc<Shared>,
-    /// Which of the object's channels come out.
+    /// Output channels of the object that are used.
     outputs: Vec<usize>,
     fault: Mutex<Option<Error>>,
 }
 
 impl PythonEncoder {
-    /// Tries the object out on a few points, to learn its widths. The outer error is an exception of the object.
+    /// Calls the object on a few points to find its widths. The outer error is an exception of the object.
     pub fn new(py: Python<'_>, name: &'static str, object: Py<PyAny>, raised: Arc<Raised>) -> PyResult<Result<Self>> {
         let own = object.bind(py);
         let mut shared = Shared {
@@ -95,7 +95,7 @@ impl PythonEncoder {
         Ok(Ok(Self { shared: Arc::new(shared), outputs, fault: Mutex::new(None) }))
     }
 
-    /// Does `call` with Python's lock, one at a time; nothing where it or another stage has failed.
+    /// Runs `call` with the GIL, one at a time; `None` if it or another stage has failed.
     fn call<T>(&self, call: impl FnOnce(Python<'_>) -> PyResult<T>) -> Option<T> {
         if self.shared.raised.any() {
             return None;
@@ -113,7 +113,7 @@ impl PythonEncoder {
     }
 }
 
-/// An attribute that may be absent or None.
+/// An attribute that may be missing or None.
 fn optional<'py, T>(object: &Bound<'py, PyAny>, name: &str) -> PyResult<Option<T>>
 where
     T: for<'a> FromPyObject<'a, 'py, Error: Into<PyErr>>,
@@ -124,7 +124,7 @@ where
     }
 }
 
-/// `value` as an array of this type of number.
+/// `value` as an array of this number type.
 fn array<'py, R: Real + Element>(py: Python<'py>, value: &Bound<'py, PyAny>) -> PyResult<ArrayD<R>> {
     let arguments = PyDict::new(py);
     arguments.set_item("dtype", numpy::dtype::<R>(py))?;
@@ -133,7 +133,7 @@ fn array<'py, R: Real + Element>(py: Python<'py>, value: &Bound<'py, PyAny>) -> 
     Ok(read.as_array().as_standard_layout().into_owned())
 }
 
-/// Channels of rows as Python sees them: `[row, channel]`.
+/// Channels of rows in Python's layout: `[row, channel]`.
 fn rows<'py, R: Real + Element>(py: Python<'py>, tile: Tile<'_, R>) -> PyResult<Bound<'py, PyAny>> {
     let channels = Array2::from_shape_vec((tile.width(), tile.rows), tile.data.to_vec());
     let channels = channels.map_err(|e| crate::errors::broken(py, &e.to_string()))?;
@@ -141,7 +141,7 @@ fn rows<'py, R: Real + Element>(py: Python<'py>, tile: Tile<'_, R>) -> PyResult<
 }
 
 impl Shared {
-    /// The first values of the parameters in double precision.
+    /// The initial parameters in double precision.
     fn wide(&self) -> Vec<f64> {
         self.first.iter().map(|&x| f64::from(x)).collect()
     }
@@ -175,7 +175,7 @@ impl Shared {
         self.shaped(py, array(py, &y)?, [x.rows, self.width], "forward")
     }
 
-    /// `∂L/∂x`, `[row, 3]`, and the gradients of all parameters one after the other.
+    /// `∂L/∂x`, `[row, 3]`, and the gradients of all parameters, concatenated.
     fn backward<R: Real + Element>(
         &self,
         py: Python<'_>,

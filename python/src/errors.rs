@@ -1,10 +1,10 @@
-//! The workspace's errors as exceptions, with the same words.
+//! The workspace's errors as Python exceptions with the same messages.
 
 use conefield_core::Error;
 use pyo3::prelude::*;
 use std::io::ErrorKind;
 
-/// Which class of `conefield._errors` an error is.
+/// The class in `conefield._errors` for an error.
 fn class(error: &Error) -> &'static str {
     match error {
         Error::Invalid { .. } => "InvalidError",
@@ -17,7 +17,7 @@ fn class(error: &Error) -> &'static str {
     }
 }
 
-/// The exception of an error. That of a value that cannot be used also has its parts.
+/// The exception for an error. For an unusable value it also has the parts of the error as attributes.
 pub fn raised(py: Python<'_>, error: &Error) -> PyErr {
     let exception = named(py, class(error), &error.to_string());
     match (exception, error) {
@@ -33,7 +33,7 @@ pub fn raised(py: Python<'_>, error: &Error) -> PyErr {
     }
 }
 
-/// The exception of a fault of the program itself, which a panic has told of.
+/// The exception for an internal error, reported by a panic.
 pub fn broken(py: Python<'_>, what: &str) -> PyErr {
     let text = format!("a bug in conefield, please report it: {what}");
     named(py, "InternalError", &text).map_or_else(|e| e, PyErr::from_value)
@@ -43,7 +43,7 @@ fn named<'py>(py: Python<'py>, class: &str, text: &str) -> PyResult<Bound<'py, P
     py.import("conefield._errors")?.getattr(class)?.call1((text,))
 }
 
-/// For `?`: the result of work, with its error as an exception.
+/// Converts errors to exceptions, for `?`.
 pub trait OrRaise<T> {
     /// See [`raised`].
     fn or_raise(self, py: Python<'_>) -> PyResult<T>;

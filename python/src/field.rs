@@ -1,4 +1,4 @@
-//! A trained field: it can be evaluated at any voxels.
+//! Trained fields, which can be evaluated at any voxels.
 
 use crate::arguments;
 use crate::volume::made;
@@ -13,7 +13,7 @@ use pyo3::prelude::*;
 use std::collections::BTreeMap;
 use std::path::PathBuf;
 
-/// What a neural method has trained.
+/// The field trained by a neural method.
 #[pyclass(frozen, module = "conefield._native")]
 pub struct Field {
     field: TrainedField,
@@ -28,7 +28,7 @@ impl Field {
 
 #[pymethods]
 impl Field {
-    /// Its values at voxels of which `voxels` stand along the longest side.
+    /// Evaluates the field on a grid with `voxels` voxels along the longest side.
     #[pyo3(signature = (voxels = None, backend = "auto"))]
     fn volume<'py>(&self, py: Python<'py>, voxels: Option<usize>, backend: &str) -> PyResult<Bound<'py, PyAny>> {
         let volume = without_lock(py, |watch| {
@@ -47,7 +47,7 @@ impl Field {
         made(py, volume)
     }
 
-    /// Writes weights.safetensors, which the command's `export` and `features` read.
+    /// Writes weights.safetensors, which the commands `export` and `features` read.
     fn write(&self, py: Python<'_>, path: PathBuf) -> PyResult<()> {
         without_lock(py, |_| files::write_field(&path, &self.field, self.notes.clone()))
     }
@@ -63,12 +63,12 @@ impl Field {
     }
 }
 
-/// All of `voxels`, plane by plane, unless it is cancelled.
+/// Collects all of `voxels`, several planes at a time, unless cancelled.
 pub fn collect(voxels: &mut dyn Voxels, cancelled: &dyn Fn() -> bool) -> Result<Volume> {
     let grid = voxels.grid();
     let mut data = Array3::zeros(grid.shape);
     let [nx, ny, nz] = grid.shape;
-    // As many planes as are worth a look in between.
+    // Number of planes between two checks for cancellation.
     let planes = (1usize << 20).div_ceil((ny * nz).max(1));
     for from in (0..nx).step_by(planes) {
         if cancelled() {
@@ -80,7 +80,7 @@ pub fn collect(voxels: &mut dyn Voxels, cancelled: &dyn Fn() -> bool) -> Result<
     Ok(Volume { data, grid, affine: voxels.affine() })
 }
 
-/// Reads what a run has left as weights.safetensors.
+/// Reads the weights.safetensors of a run.
 #[pyfunction]
 pub fn read_field(py: Python<'_>, path: PathBuf) -> PyResult<Field> {
     let file = if path.is_dir() { path.join("weights.safetensors") } else { path };

@@ -1,4 +1,4 @@
-//! Where source, detector and voxels stand.
+//! Positions of source, detector and voxels.
 
 use crate::arrays::{given_any, owned};
 use crate::errors::{OrRaise, raised};
@@ -11,11 +11,11 @@ use numpy::{PyArray2, PyReadonlyArray1, PyReadonlyArray2, PyUntypedArrayMethods}
 use pyo3::prelude::*;
 use pyo3::types::PyTuple;
 
-/// Where source, detector and voxels stand, for every view.
+/// Positions of source, detector and voxels, for every view.
 #[pyclass(frozen, module = "conefield._native")]
 pub struct Geometry(pub geometry::Geometry);
 
-/// Numbers of a view: source, detector centre, step to the next column u, step to the next row v.
+/// Numbers per view: source, detector centre, step to the next column u, step to the next row v.
 const VECTOR: usize = 12;
 
 impl Geometry {
@@ -60,7 +60,7 @@ impl Geometry {
         Self::checked(py, geometry::Geometry { detector, views, volume: VoxelGrid { shape, spacing, center } })
     }
 
-    /// Views by their vectors, `[view, 12]`.
+    /// Views given by their vectors, `[view, 12]`.
     #[staticmethod]
     fn from_vectors(
         py: Python<'_>,
@@ -81,12 +81,12 @@ impl Geometry {
         Self::checked(py, geometry::Geometry { detector, views, volume: VoxelGrid { shape, spacing, center } })
     }
 
-    /// The same views of other voxels.
+    /// The same views with another voxel grid.
     fn with_volume(&self, py: Python<'_>, shape: [usize; 3], spacing: Vec3, center: Vec3) -> PyResult<Self> {
         Self::checked(py, geometry::Geometry { volume: VoxelGrid { shape, spacing, center }, ..self.0.clone() })
     }
 
-    /// Some of the views, in the order of their numbers.
+    /// Some of the views, in the order of the indices.
     fn select(&self, py: Python<'_>, views: Vec<usize>) -> PyResult<Self> {
         let n = self.0.views.len();
         if let Some(v) = views.iter().find(|v| **v >= n) {
@@ -127,7 +127,7 @@ impl Geometry {
         (self.0.views.len(), rows, columns)
     }
 
-    /// The circular orbit that the views lie on, if they do: dso, dsd, pixel, offset, angles.
+    /// The circular orbit of the views, if they lie on one: dso, dsd, pixel, offset, angles.
     #[allow(clippy::type_complexity)]
     fn orbit(&self) -> Option<(f64, f64, [f64; 2], [f64; 2], Vec<f64>)> {
         CircularOrbit::fit(&self.0.views).map(|o| (o.dso, o.dsd, o.pixel, o.offset, o.angles))
@@ -146,7 +146,7 @@ impl Geometry {
         format!("Geometry({} views of {rows} x {columns}, volume {x} x {y} x {z})", g.views.len())
     }
 
-    /// For pickles, which multiprocessing makes.
+    /// For pickling, as used by multiprocessing.
     fn __reduce__<'py>(slf: &Bound<'py, Self>) -> PyResult<(Bound<'py, PyAny>, Bound<'py, PyTuple>)> {
         let (py, g) = (slf.py(), slf.get());
         let make = py.get_type::<Self>().getattr("from_vectors")?;

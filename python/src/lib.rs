@@ -1,6 +1,6 @@
-//! The native half of the Python package `conefield`: arrays and settings come in, the workspace's crates work without
-//! Python's lock, and arrays or errors in the same words as the command's go out. What users see, with its documentation,
-//! is written in Python (`conefield/`).
+//! The native half of the Python package `conefield`: it takes arrays and settings, runs the workspace's crates without
+//! the GIL, and returns arrays, or errors with the same messages as the command. The public, documented interface is
+//! written in Python (`conefield/`).
 
 mod arguments;
 mod arrays;
@@ -21,7 +21,7 @@ mod work;
 use peak_alloc::PeakAlloc;
 use pyo3::prelude::*;
 
-/// Counts what is held, so that readers can be kept within what they may take.
+/// Counts allocated bytes, so that the memory of readers can be limited.
 #[global_allocator]
 static HEAP: PeakAlloc = PeakAlloc;
 

@@ -1,4 +1,4 @@
-//! The log goes to Python's, under the name `conefield`.
+//! Forwards the log to Python's logging, under the name `conefield`.
 
 use pyo3::prelude::*;
 use std::fmt::{Debug, Write};
@@ -7,7 +7,7 @@ use tracing::level_filters::LevelFilter;
 use tracing::{Event, Level, Subscriber};
 use tracing_subscriber::layer::{Context, Layer, SubscriberExt};
 
-/// Hands on what is said from here on. A program that has a log already keeps it.
+/// Forwards messages from now on. A program that already has a logger keeps it.
 pub fn start() {
     let log = tracing_subscriber::registry().with(ToPython.with_filter(LevelFilter::INFO));
     let _ = tracing::subscriber::set_global_default(log);
@@ -17,7 +17,7 @@ struct ToPython;
 
 impl<S: Subscriber> Layer<S> for ToPython {
     fn on_event(&self, event: &Event<'_>, _: Context<'_, S>) {
-        // What other libraries say is not for users.
+        // Messages of other libraries are not meant for users.
         if !event.metadata().target().starts_with("conefield") {
             return;
         }
@@ -28,7 +28,7 @@ impl<S: Subscriber> Layer<S> for ToPython {
             Level::WARN => "warning",
             _ => "info",
         };
-        // A log that fails stops no work.
+        // A failing logger does not stop the work.
         let _ = Python::attach(|py| -> PyResult<()> {
             let logger = py.import("logging")?.call_method1("getLogger", ("conefield",))?;
             logger.call_method1(level, ("%s", text.0))?;

@@ -1,4 +1,4 @@
-//! Line integrals of voxels, and their adjoint.
+//! Line integrals of voxels and their adjoint.
 
 use crate::arguments;
 use crate::arrays::{given, owned};
@@ -18,7 +18,7 @@ use numpy::{Element, PyArray3, PyReadonlyArray3};
 use pyo3::prelude::*;
 use serde_json::Value;
 
-/// Which way.
+/// The direction.
 #[derive(Clone, Copy)]
 enum Way {
     Forward,
@@ -95,7 +95,7 @@ pub fn backproject<'py>(
     run(py, Way::Adjoint, geometry, projector, projections)
 }
 
-/// Predicted views of `scan`, whose unit the volume's values count per; with `residual`, measured less predicted ones.
+/// Predicted views of `scan` for a volume in 1/unit of the scan; with `residual` measured minus predicted ones.
 #[pyfunction]
 pub fn project_scan<'py>(
     py: Python<'py>,

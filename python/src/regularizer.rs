@@ -1,4 +1,4 @@
-//! A regularizer whose arithmetic is a Python object's: a proximal map, or a denoiser that is put in its place.
+//! A regularizer implemented by a Python object: a proximal map, or a denoiser in its place.
 
 use crate::stages::Raised;
 use conefield_core::geometry::VoxelGrid;
@@ -14,10 +14,10 @@ use std::sync::{Arc, Mutex, PoisonError};
 struct Shared {
     name: &'static str,
     object: Py<PyAny>,
-    /// One call at a time: the spacing is set on the object before it. It is taken before Python's lock, never after.
+    /// One call at a time: the spacing is set on the object before it. Acquired before the GIL, never after.
     turn: Mutex<()>,
     weight: Weight,
-    /// Whether the object tells the value of what it is the proximal map of.
+    /// Whether the object can evaluate its penalty.
     has_value: bool,
     raised: Arc<Raised>,
 }
@@ -53,7 +53,7 @@ impl PythonRegularizer {
 
 impl Regularizer for PythonRegularizer {
     fn on(&self, grid: &VoxelGrid, space: &Space) -> Result<Box<dyn Penalty>> {
-        // What goes in, and what comes out.
+        // Input and output arrays.
         space.hold(8 * grid.shape.iter().map(|&n| n as u64).product::<u64>());
         Ok(Box::new(On { shared: self.0.clone(), grid: *grid }))
     }
@@ -68,14 +68,14 @@ impl Regularizer for PythonRegularizer {
     }
 }
 
-/// The object on one grid.
+/// The object for one grid.
 struct On {
     shared: Arc<Shared>,
     grid: VoxelGrid,
 }
 
 impl On {
-    /// Does `call` with Python's lock, one at a time; nothing where it or another stage has failed.
+    /// Runs `call` with the GIL, one at a time; `None` if it or another stage has failed.
     fn call<T>(&self, call: impl FnOnce(Python<'_>, &Bound<'_, PyAny>) -> PyResult<T>) -> Option<T> {
         if self.shared.raised.any() {
             return None;
@@ -89,7 +89,7 @@ impl On {
     }
 
     fn prox_of(&self, py: Python<'_>, object: &Bound<'_, PyAny>, v: &[f32], tau: f32) -> PyResult<Array3<f32>> {
-        // A voxel in which no object can be may be handed over as far below 0 as numbers go: to a filter it is empty.
+        // Voxels outside the support may be passed as the lowest number: for a filter they are empty.
         let v = v.iter().map(|&v| if v == f32::MIN { 0.0 } else { v }).collect();
         let v = Array3::from_shape_vec(self.grid.shape, v).map_err(|e| crate::errors::broken(py, &e.to_string()))?;
         let found = object.call_method1("prox", (v.into_pyarray(py), tau))?;
@@ -116,7 +116,7 @@ impl Penalty for On {
     }
 
     fn prox(&mut self, v: &[f32], tau: f32, u: &mut [f32]) {
-        // Without weight there is nothing to ask.
+        // With weight 0 the object is not needed.
         let found = if tau == 0.0 { None } else { self.call(|py, object| self.prox_of(py, object, v, tau)) };
         match found.as_ref().and_then(|f| f.as_slice()) {
             Some(found) => {

@@ -1,4 +1,4 @@
-//! Runs: planned, reconstructed, pre-trained, scored.
+//! Runs: planning, reconstruction, pre-training, scoring.
 
 use crate::arguments;
 use crate::arrays::plain;
@@ -29,7 +29,7 @@ use std::path::PathBuf;
 use std::sync::Arc;
 use std::time::{Duration, Instant};
 
-/// When training ends, as texts of the command line.
+/// Limits of training in command-line syntax.
 #[derive(Deserialize)]
 #[serde(deny_unknown_fields)]
 struct Ends {
@@ -47,7 +47,7 @@ impl Ends {
     }
 }
 
-/// What a run is asked for beside scan and volumes.
+/// Options of a run besides scan and volumes.
 #[derive(Deserialize)]
 #[serde(deny_unknown_fields)]
 struct Wanted {
@@ -64,7 +64,7 @@ struct Wanted {
     truth: bool,
 }
 
-/// What is settled before a run starts.
+/// Everything decided before a run starts.
 struct Settled {
     input: Input,
     method: Planned,
@@ -73,7 +73,7 @@ struct Settled {
 }
 
 impl Wanted {
-    /// Refuses what does not fit together, plans, and within a budget measures and chooses.
+    /// Refuses inconsistent options, plans the run, and within a budget measures the machine and chooses.
     fn settle(
         &self,
         scan: Arc<scan::Scan>,
@@ -135,7 +135,7 @@ impl Wanted {
     }
 }
 
-/// What a spec builds, for people and for programs; with a budget also what would run, and how long.
+/// Describes what a spec builds, as text and as data; with a budget also what would run, and for how long.
 #[pyfunction]
 pub fn plan<'py>(
     py: Python<'py>,
@@ -168,7 +168,7 @@ pub fn plan<'py>(
     Ok((plain(py, &explanation)?, explanation.text(), plain(py, &schedule)?))
 }
 
-/// The function that is called while a run goes on, with the seconds between two calls and whether it wants slices.
+/// The function called during a run, with the seconds between calls and whether it wants slices.
 type CallbackArgument = Option<(Py<PyAny>, f64, bool)>;
 
 fn callback(argument: CallbackArgument) -> Option<Callback> {
@@ -245,7 +245,7 @@ pub fn reconstruct<'py>(
     Ok((made(py, volume)?, plain(py, &record)?, field))
 }
 
-/// Trains a field on known volumes and writes the weights that other scans start from.
+/// Trains a field on known volumes and writes weights to start other scans from.
 #[pyfunction]
 pub fn pretrain<'py>(
     py: Python<'py>,
@@ -282,7 +282,7 @@ pub fn pretrain<'py>(
     plain(py, &record)
 }
 
-/// The scores of a volume, or the agreement of two label maps.
+/// The scores of a volume, or the Dice scores of two label maps.
 #[pyfunction]
 pub fn evaluate<'py>(
     py: Python<'py>,

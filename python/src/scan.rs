@@ -18,18 +18,18 @@ use serde::Deserialize;
 use std::path::PathBuf;
 use std::sync::Arc;
 
-/// Measured line integrals with the geometry they were taken in. It does not change: its arrays are read-only.
+/// Measured line integrals with their geometry. Immutable: its arrays are read-only.
 #[pyclass(frozen, module = "conefield._native")]
 pub struct Scan {
     pub scan: Arc<scan::Scan>,
-    /// Where it was read from.
+    /// The path it was read from.
     pub path: Option<PathBuf>,
-    /// The volume that it was simulated from.
+    /// The volume it was simulated from.
     truth: Option<Volume>,
 }
 
 impl Scan {
-    /// The volume that it was simulated from, if that is known; of a file, it is read there.
+    /// The volume it was simulated from, if known; read from the scan's files if necessary.
     pub fn truth(&self) -> conefield_core::Result<Option<Volume>> {
         match (&self.truth, &self.path) {
             (Some(truth), _) => Ok(Some(truth.clone())),
@@ -38,7 +38,7 @@ impl Scan {
         }
     }
 
-    /// The truth as the reference of a run; refused where there is none.
+    /// The truth as the reference of a run; an error if there is none.
     pub fn reference(&self) -> conefield_core::Result<Volume> {
         let place = self.path.as_ref().map_or("scan".into(), |p| p.display().to_string());
         let truth = self.truth()?.ok_or_else(|| {
@@ -66,13 +66,13 @@ impl Scan {
         Ok(Self { scan: Arc::new(scan), path: None, truth: None })
     }
 
-    /// The line integrals, without a copy.
+    /// The line integrals, without copying.
     #[getter]
     #[allow(unsafe_code)]
     fn projections<'py>(slf: &Bound<'py, Self>) -> PyResult<Bound<'py, PyArray3<f32>>> {
         let projections = &slf.get().scan.projections;
-        // SAFETY: the array lives in an `Arc` that the scan holds, the class is frozen, and the new array keeps the scan
-        // alive. It is read-only from here on, so that nobody writes what others may read.
+        // SAFETY: the array lives in an `Arc` held by the scan, the class is frozen, and the new array keeps the scan
+        // alive. It is read-only from here on, so that nobody writes data that others may read.
         let array = unsafe { PyArray3::borrow_from_array(projections, slf.clone().into_any()) };
         array.getattr("flags")?.setattr("writeable", false)?;
         Ok(array)
@@ -98,7 +98,7 @@ impl Scan {
         without_lock(py, |_| self.truth())?.map(|v| made(py, v)).transpose()
     }
 
-    /// A scan without the views `held`, and one of these alone.
+    /// The scan without the views `held`, and a scan of only these.
     fn split(&self, py: Python<'_>, held: Vec<usize>) -> PyResult<(Self, Self)> {
         let (kept, aside) = without_lock(py, |_| self.scan.split(&held))?;
         let of = |scan| Self { scan: Arc::new(scan), path: None, truth: self.truth.clone() };
@@ -127,14 +127,14 @@ pub fn read_scan(py: Python<'_>, path: PathBuf) -> PyResult<Scan> {
     Ok(Scan { scan: Arc::new(scan), path: Some(path), truth: None })
 }
 
-/// Writes conefield's own folder of a scan.
+/// Writes a scan to a folder in conefield's own format.
 #[pyfunction]
 pub fn write_scan(py: Python<'_>, path: PathBuf, scan: &Bound<'_, Scan>) -> PyResult<()> {
     let scan = scan.get();
     without_lock(py, |_| conefield_io::write_scan(&path, &scan.scan, scan.truth()?.as_ref()))
 }
 
-/// What `simulate` is asked for.
+/// Options of `simulate`.
 #[derive(Deserialize)]
 #[serde(deny_unknown_fields)]
 struct Wanted {
@@ -150,7 +150,7 @@ struct Wanted {
     source: String,
 }
 
-/// A scan of a known volume, by a protocol or in a geometry.
+/// Simulates a scan of a known volume, by a protocol or in a geometry.
 #[pyfunction]
 pub fn simulate(
     py: Python<'_>,
@@ -171,7 +171,7 @@ pub fn simulate(
             let volume = values.apply(volume)?;
             let noise = noise.unwrap_or(DetectorNoise::None);
             let scan = simulation::scan_in(&volume, geometry, noise, wanted.seed.unwrap_or(0))?;
-            // A truth on other voxels than are reconstructed is none.
+            // The volume is the truth only on the reconstructed voxels.
             let same = scan.geometry.volume == volume.grid;
             return Ok((scan, same.then_some(volume)));
         }

@@ -1,4 +1,4 @@
-//! Specs: by name, file or dict, with single settings on top.
+//! Specs: by name, file or dict, with overridden settings.
 
 use crate::arguments;
 use crate::arrays::plain;
@@ -10,25 +10,25 @@ use pyo3::prelude::*;
 use serde::Deserialize;
 use serde_json::{Map, Value};
 
-/// What Python says of a spec.
+/// A spec as given in Python.
 #[derive(Debug, Clone, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct SpecArgument {
-    /// A shipped name, the type of a method, or a file.
+    /// The name of a shipped spec, the type of a method, or a file.
     name: Option<String>,
     /// A whole spec.
     table: Option<Value>,
-    /// Single settings, by their path in the spec.
+    /// Overridden settings, by their path in the spec.
     sets: Map<String, Value>,
 }
 
 impl SpecArgument {
-    /// Whether a spec is named at all.
+    /// Whether a spec is given at all.
     pub fn is_given(&self) -> bool {
         self.name.is_some() || self.table.is_some()
     }
 
-    /// Its single settings, as `--set` has them.
+    /// Its overridden settings, in the syntax of `--set`.
     pub fn sets(&self) -> Result<Vec<String>> {
         self.sets.iter().map(|(path, value)| Ok(format!("{path}={}", inline(path, value)?))).collect()
     }
@@ -43,7 +43,7 @@ impl SpecArgument {
     }
 }
 
-/// A value as TOML has it in one line.
+/// A value as one line of TOML.
 fn inline(path: &str, value: &Value) -> Result<String> {
     let value = toml::Value::try_from(value).map_err(|e| {
         Error::invalid(format!("--set {path}"), "value", e, "a number, a text, a list or a table, not None")
@@ -51,13 +51,13 @@ fn inline(path: &str, value: &Value) -> Result<String> {
     Ok(value.to_string())
 }
 
-/// Names that stand for a spec.
+/// All names of specs.
 #[pyfunction]
 pub fn spec_names() -> Vec<&'static str> {
     specs::names()
 }
 
-/// The spec as TOML, with every default written.
+/// The spec as TOML, with all defaults written out.
 #[pyfunction]
 pub fn spec_text(py: Python<'_>, spec: &str) -> PyResult<String> {
     let spec: SpecArgument = arguments::read(py, spec)?;

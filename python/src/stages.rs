@@ -1,4 +1,4 @@
-//! Stages that are written in Python: registered under a name, made when a spec names them, tried by the conformance kit.
+//! Stages written in Python: registered under a name, built if a spec names them, tested by the conformance kit.
 
 use crate::arguments;
 use crate::encoder::PythonEncoder;
@@ -20,18 +20,18 @@ use std::cell::RefCell;
 use std::collections::BTreeMap;
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 
-/// Who brings these types, in messages.
+/// The owner of these types, in messages.
 const OWNER: &str = "Python";
 
-/// The classes by kind and name. A class that is registered again, as when a cell of a notebook runs twice, takes the place
-/// of the old one.
+/// The classes by kind and name. A class registered again, e.g. when a notebook cell is run twice, replaces the old
+/// one.
 static CLASSES: Mutex<BTreeMap<(Kind, String), Py<PyAny>>> = Mutex::new(BTreeMap::new());
 
 fn locked<T>(mutex: &Mutex<T>) -> MutexGuard<'_, T> {
     mutex.lock().unwrap_or_else(PoisonError::into_inner)
 }
 
-/// What stages in Python have raised during one work of Rust's. A kernel has no result to hand it on in.
+/// Exceptions raised by Python stages during one piece of Rust work. A kernel has no result to return them in.
 #[derive(Default)]
 pub struct Raised(Mutex<Option<PyErr>>);
 
@@ -41,23 +41,23 @@ impl Raised {
         locked(&self.0).get_or_insert(error);
     }
 
-    /// Whether there is one.
+    /// Whether there is an exception.
     pub fn any(&self) -> bool {
         locked(&self.0).is_some()
     }
 
-    /// The exception, once.
+    /// Returns and clears the exception.
     pub fn take(&self) -> Option<PyErr> {
         locked(&self.0).take()
     }
 }
 
 thread_local! {
-    /// Of the work that this thread is at: stages that are made in it note there what they raise.
+    /// Exceptions of the current thread's work: stages built during it report theirs here.
     static CURRENT: RefCell<Arc<Raised>> = RefCell::default();
 }
 
-/// Does `work` with a place of its own for what its stages raise.
+/// Runs `work`, with `raised` collecting the exceptions of its stages.
 pub fn within<T>(raised: &Arc<Raised>, work: impl FnOnce() -> T) -> T {
     let before = CURRENT.replace(raised.clone());
     let done = work();
@@ -65,7 +65,7 @@ pub fn within<T>(raised: &Arc<Raised>, work: impl FnOnce() -> T) -> T {
     done
 }
 
-/// The kind of a stage that can be written in Python.
+/// The kind of a stage, if it can be written in Python.
 fn kind(py: Python<'_>, name: &str) -> PyResult<Kind> {
     match Kind::named(name) {
         Some(kind @ (Kind::Encoder | Kind::Regularizer)) => Ok(kind),
@@ -73,7 +73,7 @@ fn kind(py: Python<'_>, name: &str) -> PyResult<Kind> {
     }
 }
 
-/// Registers a class, so that a spec names it as a type of this kind.
+/// Registers a class, so that a spec can name it as a type of this kind.
 #[pyfunction]
 pub fn register(py: Python<'_>, kind_name: &str, name: String, doc: String, class: Py<PyAny>) -> PyResult<()> {
     let kind = kind(py, kind_name)?;
@@ -85,7 +85,7 @@ pub fn register(py: Python<'_>, kind_name: &str, name: String, doc: String, clas
             Kind::Encoder => Make::Encoder(Box::new(move |v| Ok(Box::new(settings(v))))),
             _ => Make::Regularizer(Box::new(move |v| Ok(Box::new(settings(v))))),
         };
-        // Which settings there are its class says when it is made, and it may be replaced: any key may stand here.
+        // The settings are known only to the class, which may be replaced: any key is allowed here.
         let schema = json!({ "type": "object" });
         registry::add(OWNER, vec![NewType { name, doc, schema, make }]).or_raise(py)?;
     }
@@ -94,7 +94,7 @@ pub fn register(py: Python<'_>, kind_name: &str, name: String, doc: String, clas
     Ok(())
 }
 
-/// The types of a kind that a spec may name.
+/// All types of a kind available to specs.
 #[pyfunction]
 pub fn stage_names(py: Python<'_>, kind: &str) -> PyResult<Vec<&'static str>> {
     let found = Kind::named(kind);
@@ -102,7 +102,7 @@ pub fn stage_names(py: Python<'_>, kind: &str) -> PyResult<Vec<&'static str>> {
     found.map(registry::names).ok_or_else(|| exception(py, &Error::invalid("stage", "kind", kind, all)))
 }
 
-/// Settings of a stage in Python.
+/// Settings of a Python stage.
 struct Written {
     /// The name of its type.
     name: &'static str,
@@ -110,7 +110,7 @@ struct Written {
 }
 
 impl Written {
-    /// An object of its class.
+    /// A new object of its class.
     fn object(&self, kind: Kind) -> Result<Py<PyAny>> {
         Python::attach(|py| {
             let class = locked(&CLASSES).get(&(kind, self.name.to_owned())).map(|c| c.clone_ref(py));
@@ -123,14 +123,14 @@ impl Written {
         })
     }
 
-    /// What a class says against its settings.
+    /// The error for settings that a class refuses.
     fn refused(&self, py: Python<'_>, e: PyErr) -> Error {
         let why = format!("{}, which {} refuses: {}", self.settings, self.name, words(py, &e));
         Error::invalid("spec", "", why, "settings that the class takes")
     }
 }
 
-/// An exception in words.
+/// An exception as text.
 pub fn words(py: Python<'_>, e: &PyErr) -> String {
     let kind = e.get_type(py).name().map(|n| n.to_string()).unwrap_or_default();
     format!("{kind}: {}", e.value(py))
@@ -142,8 +142,8 @@ impl Serialize for Written {
     }
 }
 
-// `#[typetag::serde]` gives a type one name; here it is the registered one. Its two methods are therefore written out. To
-// read settings back, the registry is asked (`conefield_core::spec::stage`).
+// `#[typetag::serde]` gives a Rust type one name; here it is the registered one. Its two methods are therefore
+// implemented by hand. Reading settings back goes through the registry (`conefield_core::spec::stage`).
 macro_rules! named {
     () => {
         fn typetag_name(&self) -> &'static str {
@@ -178,10 +178,10 @@ impl RegularizerSpec for Written {
     named!();
 }
 
-/// Each property of a stage, what became of it and how that was seen.
+/// Name, outcome and evidence of each property of a stage.
 type Properties = Vec<(&'static str, &'static str, String)>;
 
-/// Runs the conformance kit over a stage that a spec may name: whether it passes, the report, and each property.
+/// Runs the conformance kit on a stage type: returns whether it passes, the report, and each property.
 #[pyfunction]
 pub fn check_stage(py: Python<'_>, kind_name: &str, table: &str) -> PyResult<(bool, String, Properties)> {
     let kind = kind(py, kind_name)?;

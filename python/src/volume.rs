@@ -1,4 +1,4 @@
-//! Volumes: `conefield.Volume` is written in Python, as it holds a NumPy array that its user may change.
+//! Volumes: `conefield.Volume` is written in Python, as it holds a NumPy array that users may change.
 
 use crate::arrays::{given, owned};
 use crate::errors::OrRaise;
@@ -9,7 +9,7 @@ use numpy::{PyArray2, PyReadonlyArray3, PyUntypedArrayMethods};
 use pyo3::prelude::*;
 use std::path::PathBuf;
 
-/// The volume of a `conefield.Volume`.
+/// Converts from a `conefield.Volume`.
 pub fn taken(volume: &Bound<'_, PyAny>) -> PyResult<Volume> {
     let data: PyReadonlyArray3<'_, f32> = volume.getattr("data")?.extract()?;
     let grid = VoxelGrid {
@@ -25,12 +25,12 @@ pub fn taken(volume: &Bound<'_, PyAny>) -> PyResult<Volume> {
     Ok(Volume { data: owned(&data), grid, affine })
 }
 
-/// As [`taken`], of an argument that may be left out.
+/// As [`taken`], for an optional argument.
 pub fn taken_if(volume: Option<&Bound<'_, PyAny>>) -> PyResult<Option<Volume>> {
     volume.map(taken).transpose()
 }
 
-/// A `conefield.Volume` of this volume.
+/// Converts to a `conefield.Volume`.
 pub fn made<'py>(py: Python<'py>, volume: Volume) -> PyResult<Bound<'py, PyAny>> {
     let Volume { data, grid, affine } = volume;
     let affine = affine.map(|a| PyArray2::from_vec2(py, &a.map(|row| row.to_vec())));
@@ -39,7 +39,7 @@ pub fn made<'py>(py: Python<'py>, volume: Volume) -> PyResult<Bound<'py, PyAny>>
     class.call1((given(py, data), grid.spacing.to_vec(), grid.center.to_vec(), affine))
 }
 
-/// The volume that `name` means: a file, the folder of a DICOM series, or `phantom:KIND[:SIZE]`.
+/// Reads the volume `name`: a file, the folder of a DICOM series, or `phantom:KIND[:SIZE]`.
 #[pyfunction]
 pub fn read_volume(py: Python<'_>, name: String) -> PyResult<Bound<'_, PyAny>> {
     let volume = without_lock(py, |_| {
@@ -50,7 +50,7 @@ pub fn read_volume(py: Python<'_>, name: String) -> PyResult<Bound<'_, PyAny>> {
     made(py, volume)
 }
 
-/// Writes a volume in the format that the name of the file asks for.
+/// Writes a volume in the format given by the file extension.
 #[pyfunction]
 pub fn write_volume(py: Python<'_>, path: PathBuf, volume: &Bound<'_, PyAny>) -> PyResult<()> {
     let volume = taken(volume)?;

@@ -1,4 +1,4 @@
-//! Work without Python's lock: Ctrl-C ends it cleanly, a callback sees how it goes, and no panic crosses into Python.
+//! Work without the GIL: Ctrl-C ends it cleanly, a callback observes progress, and no panic crosses into Python.
 
 use crate::errors::{broken, raised};
 use crate::stages::{Raised, within};
@@ -15,10 +15,10 @@ use std::sync::{Arc, Mutex, PoisonError};
 use std::time::{Duration, Instant};
 use tracing::info;
 
-/// Between two looks for signals, for which Python's lock is taken.
+/// Interval between two checks for signals, which acquire the GIL.
 const LOOK: Duration = Duration::from_millis(20);
 
-/// Whether the work is to end: Python has a signal for it, or something in Python that takes part in it has failed.
+/// Whether the work must end: Python received a signal, or a Python object that takes part in it has failed.
 pub struct Watch {
     looked: Mutex<Instant>,
     stopped: Mutex<Option<PyErr>>,
@@ -26,7 +26,7 @@ pub struct Watch {
 }
 
 impl Watch {
-    /// Whether to end.
+    /// Whether to stop.
     pub fn cancelled(&self) -> bool {
         let stopped = || self.stopped.lock().unwrap_or_else(PoisonError::into_inner);
         if stopped().is_some() || self.raised.any() {
@@ -46,14 +46,14 @@ impl Watch {
         }
     }
 
-    /// Ends the work with this exception.
+    /// Stops the work with this exception.
     fn stop(&self, error: PyErr) {
         self.stopped.lock().unwrap_or_else(PoisonError::into_inner).get_or_insert(error);
     }
 }
 
-/// Does `work` without Python's lock. An exception of a callback, a stage or a signal handler goes before the error that
-/// ending the work gives.
+/// Runs `work` without the GIL. An exception of a callback, a stage or a signal handler takes precedence over the error
+/// caused by stopping.
 pub fn without_lock<T: Send>(py: Python<'_>, work: impl FnOnce(&Watch) -> Result<T> + Send) -> PyResult<T> {
     let (looked, stopped) = (Mutex::new(Instant::now()), Mutex::new(None));
     let watch = Watch { looked, stopped, raised: Arc::default() };
@@ -71,24 +71,24 @@ pub fn without_lock<T: Send>(py: Python<'_>, work: impl FnOnce(&Watch) -> Result
     }
 }
 
-/// What is called while a run goes on, and how often.
+/// A function called during a run, and its interval.
 pub struct Callback {
-    /// Takes step, share, seconds left, the new records in JSON, and the middle slices or nothing.
+    /// Called with step, share, seconds left, the new records in JSON, and the middle slices or None.
     pub function: Py<PyAny>,
-    /// Time between two calls.
+    /// Interval between calls.
     pub every: Duration,
     /// Whether it wants slices.
     pub slices: bool,
 }
 
-/// Tells a callback of a run, and looks for what ends it.
+/// Calls a callback during a run, and checks for cancellation.
 pub struct Progress<'a> {
     watch: &'a Watch,
     callback: Option<Callback>,
     told: Option<Instant>,
     slices: Option<[Array3<f32>; 3]>,
     records: Vec<Record>,
-    /// Records that the callback has seen.
+    /// Number of records that the callback has received.
     seen: usize,
     /// The last finished step.
     step: u64,
@@ -104,7 +104,7 @@ impl<'a> Progress<'a> {
         &self.records
     }
 
-    /// The run is done: the callback sees the records that it has not seen.
+    /// At the end of the run, the callback receives the remaining records.
     pub fn finish(&mut self) {
         let step = self.records.last().map_or(self.step, |r| r.step.max(self.step));
         self.tell(step, 1.0, 0.0);

@@ -1,4 +1,4 @@
-//! A picture to draw on: rectangles, text in DejaVu Sans, and colours for values.
+//! A drawing canvas: rectangles, text in DejaVu Sans, and colour maps.
 
 use ab_glyph::{Font, FontRef, PxScale, ScaleFont, point};
 use conefield_core::{Error, Result};
@@ -7,7 +7,7 @@ use image::{ExtendedColorType, ImageEncoder, Rgb, RgbImage};
 use std::io::Write;
 use std::path::Path;
 
-/// Where a text starts, along its line.
+/// Alignment of a text along its line.
 #[derive(Debug, Clone, Copy)]
 pub(crate) enum Align {
     Left,
@@ -15,14 +15,14 @@ pub(crate) enum Align {
     Right,
 }
 
-/// Pixels and the font to write on them.
+/// Pixels and the font.
 pub(crate) struct Canvas {
     pub image: RgbImage,
     font: FontRef<'static>,
 }
 
 impl Canvas {
-    /// A picture of one colour.
+    /// A picture filled with one colour.
     pub fn new(width: u32, height: u32, colour: Rgb<u8>) -> Result<Self> {
         let font = FontRef::try_from_slice(dejavu::sans::regular())
             .map_err(|e| Error::invalid("the embedded font", "DejaVu Sans", e, "a font"))?;
@@ -42,7 +42,7 @@ impl Canvas {
         x
     }
 
-    /// `text`, cut with an ellipsis so that it is at most `width` wide.
+    /// `text`, shortened with an ellipsis to a width of at most `width`.
     pub fn shortened(&self, text: &str, size: f32, width: f32) -> String {
         if self.text_width(text, size) <= width {
             return text.to_string();
@@ -57,7 +57,7 @@ impl Canvas {
         String::new()
     }
 
-    /// Writes one line of text; `y` is its top.
+    /// Draws one line of text; `y` is its top.
     pub fn text(&mut self, at: (f32, f32), align: Align, size: f32, colour: Rgb<u8>, text: &str) {
         let width = self.text_width(text, size);
         let mut x = match align {
@@ -92,7 +92,7 @@ impl Canvas {
         }
     }
 
-    /// Fills a rectangle; what lies outside the picture is left away.
+    /// Fills a rectangle, clipped to the picture.
     pub fn fill(&mut self, x: u32, y: u32, width: u32, height: u32, mut colour: impl FnMut(u32, u32) -> Rgb<u8>) {
         for dy in 0..height.min(self.image.height().saturating_sub(y)) {
             for dx in 0..width.min(self.image.width().saturating_sub(x)) {
@@ -112,7 +112,7 @@ pub(crate) fn write_png(path: &Path, width: u32, height: u32, rgb: &[u8]) -> Res
     write_atomic(path, |w| encode_png(w, path, width, height, rgb))
 }
 
-/// 8-bit RGB pixels as PNG, called `place` in errors.
+/// Encodes 8-bit RGB pixels as PNG; `place` is the name in errors.
 pub(crate) fn encode_png(out: impl Write, place: &Path, width: u32, height: u32, rgb: &[u8]) -> Result<()> {
     image::codecs::png::PngEncoder::new(out).write_image(rgb, width, height, ExtendedColorType::Rgb8).map_err(|e| {
         match e {
@@ -122,7 +122,7 @@ pub(crate) fn encode_png(out: impl Write, place: &Path, width: u32, height: u32,
     })
 }
 
-/// A round number that all but half a percent of `sizes` stay within.
+/// A round number that bounds all but half a percent of `sizes`.
 pub(crate) fn round_above(mut sizes: Vec<f32>) -> f32 {
     if sizes.is_empty() {
         return 1.0;
@@ -142,21 +142,21 @@ pub(crate) fn grey(x: f32) -> Rgb<u8> {
     Rgb([(x.clamp(0.0, 1.0) * 255.0).round() as u8; 3])
 }
 
-/// Blue at −1, white at 0, red at 1, so that no difference and the sign of one are plain to see.
+/// Blue at −1, white at 0, red at 1, so that equality and sign are easy to see.
 pub(crate) fn diverging(x: f32) -> Rgb<u8> {
     const ENDS: [[f32; 3]; 5] =
         [[10.0, 40.0, 110.0], [67.0, 140.0, 195.0], [250.0, 250.0, 250.0], [225.0, 110.0, 80.0], [110.0, 5.0, 30.0]];
     between(&ENDS, (x.clamp(-1.0, 1.0) + 1.0) / 2.0)
 }
 
-/// From dark violet at 0 over blue and green to yellow at 1, as light as the value is high (after viridis).
+/// From dark violet at 0 over blue and green to yellow at 1, with lightness increasing with the value (after viridis).
 pub(crate) fn sequential(x: f32) -> Rgb<u8> {
     const ENDS: [[f32; 3]; 5] =
         [[68.0, 1.0, 84.0], [59.0, 82.0, 139.0], [33.0, 145.0, 140.0], [94.0, 201.0, 98.0], [253.0, 231.0, 37.0]];
     between(&ENDS, x.clamp(0.0, 1.0))
 }
 
-/// The colour at `x`, from 0 to 1, among colours at equal distances.
+/// The colour at `x`, from 0 to 1, interpolated between equidistant colours.
 fn between(ends: &[[f32; 3]; 5], x: f32) -> Rgb<u8> {
     let at = x * 4.0;
     let low = (at as usize).min(3);
@@ -164,7 +164,7 @@ fn between(ends: &[[f32; 3]; 5], x: f32) -> Rgb<u8> {
     Rgb(std::array::from_fn(|k| (ends[low][k] + (ends[low + 1][k] - ends[low][k]) * part).round() as u8))
 }
 
-/// A number in as few characters as tell it from its neighbours.
+/// A number with as few characters as distinguish it from its neighbours.
 pub(crate) fn number(x: f64) -> String {
     let size = x.abs();
     if x == 0.0 {

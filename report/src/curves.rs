@@ -9,7 +9,7 @@ use std::ops::Range;
 use std::path::Path;
 use std::sync::Once;
 
-/// Where the legend stands.
+/// Corner of the legend.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Corner {
     /// Top left.
@@ -22,20 +22,20 @@ pub enum Corner {
     LowerRight,
 }
 
-/// What a plot may do differently.
+/// Options of a plot.
 #[derive(Debug, Clone, PartialEq)]
 pub struct CurveOptions {
-    /// Areas around series, in their colours: the series' name, then x with the lowest and the highest y.
+    /// Areas around series, in their colours: the name of the series, then x with the lowest and highest y.
     pub bands: Vec<(String, Vec<Band>)>,
-    /// A logarithmic x axis; points at zero or below are left out.
+    /// A logarithmic x axis; points at zero or below are omitted.
     pub log_x: bool,
-    /// A logarithmic y axis; points at zero or below are left out.
+    /// A logarithmic y axis; points at zero or below are omitted.
     pub log_y: bool,
-    /// Share of the x axis that is left free on either side.
+    /// Share of the x axis left free on either side.
     pub x_margin: f64,
     /// Width and height in pixels.
     pub size: [u32; 2],
-    /// The legend's corner; the emptiest one if not given.
+    /// The legend's corner; by default the emptiest one.
     pub legend: Option<Corner>,
 }
 
@@ -48,7 +48,7 @@ impl Default for CurveOptions {
     }
 }
 
-/// The first eight are told apart by all but the rarest colour vision, and in grey (after Okabe and Ito).
+/// The first eight are distinguishable with all but the rarest colour vision, and in grey (after Okabe and Ito).
 pub(crate) const COLOURS: [RGBColor; 10] = [
     RGBColor(0, 114, 178),
     RGBColor(213, 94, 0),
@@ -64,8 +64,8 @@ pub(crate) const COLOURS: [RGBColor; 10] = [
 
 pub(crate) const FONT: &str = "sans-serif";
 
-/// Draws named series of `(x, y)` points as lines, on linear axes. Points that are not finite leave a gap. Series of one name have
-/// one colour.
+/// Draws named series of `(x, y)` points as lines, on linear axes. Non-finite points leave a gap. Series with the same
+/// name share a colour.
 pub fn curves_png(
     path: impl AsRef<Path>,
     title: &str,
@@ -90,17 +90,17 @@ pub fn curves_png_with(
 
 /// One of several plots.
 pub struct Panel<'a> {
-    /// What stands above it.
+    /// Its title.
     pub title: &'a str,
-    /// What the x axis and the y axis say.
+    /// Labels of the x axis and the y axis.
     pub labels: [&'a str; 2],
-    /// As for [`curves_png`].
+    /// See [`curves_png`].
     pub series: &'a [(String, Vec<(f64, f64)>)],
-    /// What it does differently.
+    /// Its options.
     pub options: &'a CurveOptions,
 }
 
-/// Draws plots side by side in one picture, from top to bottom as high as the highest.
+/// Draws plots side by side in one picture, as high as the highest of them.
 pub fn panels_png(path: impl AsRef<Path>, panels: &[Panel<'_>]) -> Result<()> {
     let path = path.as_ref();
     let place = path.display().to_string();
@@ -219,7 +219,7 @@ impl Plot<'_> {
             let mut named = told.contains(&&name[..]);
             told.push(name);
             for part in points.split(|p| !(self.shown)(p)).filter(|p| !p.is_empty()) {
-                // A point without neighbours would leave no trace as a line.
+                // A line through a single point would be invisible.
                 if let [p] = part {
                     chart.draw_series([Circle::new(*p, stroke as i32 + 1, colour.filled())]).map_err(text)?;
                 }
@@ -259,13 +259,13 @@ fn range(values: impl Iterator<Item = f64>, log: bool, margin: f64) -> Range<f64
         let room = (hi / lo).powf(margin);
         return lo / room..hi * room;
     }
-    // A span lost in rounding gives ticks that no longer differ, and a search for them that does not end.
+    // A range lost in rounding gives identical ticks, and the search for ticks would not end.
     let flat = hi - lo <= 1e-9 * lo.abs().max(hi.abs());
     let room = if !flat { (hi - lo) * margin } else { lo.abs().max(1.0) * 0.05 };
     lo - room..hi + room
 }
 
-/// The corner of the plot that the fewest points are in.
+/// The corner of the plot with the fewest points.
 fn emptiest(points: &[(f64, f64)], x: &Range<f64>, y: &Range<f64>, options: &CurveOptions) -> Corner {
     let part = |v: f64, r: &Range<f64>, log: bool| {
         if log { (v / r.start).ln() / (r.end / r.start).ln() } else { (v - r.start) / (r.end - r.start) }
@@ -283,7 +283,7 @@ fn emptiest(points: &[(f64, f64)], x: &Range<f64>, y: &Range<f64>, options: &Cur
     corners.into_iter().min_by_key(count).unwrap_or(Corner::LowerRight)
 }
 
-/// Gives the plotting crate its one font, so that nothing depends on what the system has.
+/// Registers the font with the plotting crate, so that nothing depends on system fonts.
 pub(crate) fn register() {
     static ONCE: Once = Once::new();
     ONCE.call_once(|| {
@@ -342,7 +342,7 @@ mod tests {
         panels_png(&path, &[panel("left"), panel("right")]).unwrap();
         let image = image::open(&path).unwrap().to_rgb8();
         assert_eq!(image.dimensions(), (1200, 400));
-        // The same picture twice, but for the titles.
+        // Both halves are equal, except for the titles.
         let same = (60..400).all(|y| (0..600).all(|x| image.get_pixel(x, y) == image.get_pixel(x + 600, y)));
         assert!(same);
         let nothing = vec![];
@@ -363,13 +363,13 @@ mod tests {
             curves_png_with(&path, "", "", "", &series, &options).unwrap();
             image::open(&path).unwrap().to_rgb8()
         };
-        // The second colour, thinned.
+        // The second colour, lightened.
         let [r, g, b] = [213.0f64, 94.0, 0.0].map(|c| (255.0 + (c - 255.0) * 0.18).round());
         let like = |p: &[u8; 3]| [r, g, b].iter().zip(p).all(|(a, b)| (a - f64::from(*b)).abs() < 6.0);
         let count = |image: &image::RgbImage| image.pixels().filter(|p| like(&p.0)).count();
         let (with, without) = (picture(vec![("high".into(), band)]), picture(vec![]));
         assert!(count(&with) > 20_000 && count(&without) < 500, "{} {}", count(&with), count(&without));
-        // Where one side cannot be shown there is a gap.
+        // A gap if one side cannot be shown.
         picture(vec![("high".into(), vec![(1.0, [18.0, f64::NAN]), (2.0, [18.0, 22.0]), (3.0, [18.0, 22.0])])]);
     }
 

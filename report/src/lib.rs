@@ -1,12 +1,12 @@
-//! Pictures of results, as PNG, and figures in words and tables.
+//! Pictures of results as PNG, and numbers in words and tables.
 //!
 //! - [`slices_png`], [`compare_png`], [`features_png`]: the middle slices of volumes.
 //! - [`curves_png`], [`panels_png`]: line plots.
 //! - [`survey_png`]: a scan's geometry.
 //! - [`page`]: runs in one HTML file, with a viewer.
-//! - [`Table`] and [`text`]: figures for people to read.
+//! - [`Table`] and [`text`]: human-readable numbers.
 //!
-//! The font is part of the program: a picture does not depend on what the system has.
+//! The font is part of the program, so that pictures do not depend on system fonts.
 
 mod canvas;
 mod curves;

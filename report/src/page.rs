@@ -1,7 +1,7 @@
 //! One HTML file that shows runs: volumes in a viewer, scores, curves, projections, geometry, specs, warnings.
 //!
-//! All that the page shows and all that shows it is in the file, which fetches nothing: its content security policy forbids that
-//! to it. The viewer and the plots are libraries of others (`report/page/vendor`).
+//! The file contains all data and code and fetches nothing; its content security policy forbids it. The viewer and the
+//! plots use third-party libraries (`report/page/vendor`).
 
 mod picture;
 mod volume;
@@ -22,12 +22,12 @@ const VIEWER: &str = include_str!("../page/vendor/niivue.min.js");
 const SCRIPT: &str = include_str!("../page/page.js");
 const LICENCES: &str = include_str!("../page/vendor/LICENCES.txt");
 
-/// What a page shows.
+/// The content of a page.
 #[derive(Debug, Default, Serialize)]
 pub struct Page {
-    /// What stands over it.
+    /// Its title.
     pub title: String,
-    /// What whoever reads the results should know first.
+    /// What readers of the results should know first.
     pub warnings: Vec<Notice>,
     /// Results in the order of `runs`, then references.
     pub volumes: Vec<PageVolume>,
@@ -35,52 +35,52 @@ pub struct Page {
     pub runs: Vec<PageRun>,
     /// Their scans.
     pub scans: Vec<PageScan>,
-    /// Sentences on the page itself.
+    /// Remarks about the page itself.
     pub notes: Vec<String>,
 }
 
 /// A warning.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize)]
 pub struct Notice {
-    /// What was found.
+    /// The finding.
     pub found: String,
-    /// What to do about it, where that is not plain.
+    /// What to do about it, if not obvious.
     pub advice: String,
 }
 
 /// A run.
 #[derive(Debug, Default, Serialize)]
 pub struct PageRun {
-    /// What tells it from the others.
+    /// A name that distinguishes it from the others.
     pub name: String,
-    /// Where it lies.
+    /// Its folder.
     pub folder: String,
-    /// How far it came.
+    /// Its progress.
     pub standing: String,
-    /// Its spec, with every setting.
+    /// Its spec, with all settings.
     pub spec: String,
-    /// What the spec builds, for people.
+    /// A description of what the spec builds.
     pub plan: Option<String>,
-    /// Its `record.json`, of a finished run.
+    /// The `record.json` of a finished run.
     pub record: Option<Value>,
     /// The lines of its `metrics.jsonl`.
     pub curves: Vec<Value>,
-    /// The slices of a run that goes on, a picture ([`png_url`]).
+    /// The current slices of an unfinished run, as a picture ([`png_url`]).
     pub live: Option<String>,
-    /// Which of the page's scans it is of, where that is known.
+    /// Index of its scan on the page, if known.
     pub scan: Option<usize>,
-    /// Its result in the scan's views.
+    /// Its result projected to the scan's views.
     pub views: Option<PredictedViews>,
 }
 
-/// What a scanner would have measured of a result.
+/// Predicted measurements of a result.
 #[derive(Debug, Serialize)]
 pub struct PredictedViews {
-    /// What computed the line integrals.
+    /// The projector used.
     pub projector: String,
-    /// Root mean square of measured less predicted line integrals, of the views shown.
+    /// Root mean square of measured minus predicted line integrals, over the views shown.
     pub rms: f64,
-    /// The same over the largest measured line integral of these views.
+    /// The same relative to the largest measured line integral of these views.
     pub relative: f64,
     /// In the order of the scan's views.
     pub images: Vec<PredictedView>,
@@ -89,11 +89,11 @@ pub struct PredictedViews {
 /// One view of a result.
 #[derive(Debug, Serialize)]
 pub struct PredictedView {
-    /// The predicted line integrals, a picture ([`picture_url`]).
+    /// The predicted line integrals, as a picture ([`picture_url`]).
     pub predicted: String,
-    /// Measured less predicted, a picture.
+    /// Measured minus predicted, as a picture.
     pub residual: String,
-    /// Root mean square of that.
+    /// Root mean square of the residual.
     pub rms: f64,
 }
 
@@ -104,33 +104,33 @@ pub struct PageScan {
     pub name: String,
     /// Its sizes in a sentence.
     pub line: String,
-    /// How many views it has.
+    /// Number of views.
     pub count: usize,
-    /// What its files say, for people.
+    /// A description of its files.
     pub facts: Option<String>,
     /// A picture of its geometry ([`geometry_url`]).
     pub geometry: Option<String>,
     /// The views that are shown.
     pub views: Vec<MeasuredView>,
-    /// The line integrals that are black and white in them.
+    /// The line integrals shown as black and white.
     pub window: [f32; 2],
-    /// The residual that is deepest red, over all runs.
+    /// The residual shown in the deepest red, over all runs.
     pub residual_span: f32,
 }
 
 /// One measured view.
 #[derive(Debug, Serialize)]
 pub struct MeasuredView {
-    /// Its number, from 0.
+    /// Its index, from 0.
     pub view: usize,
-    /// Whether a run did not see it.
+    /// Whether it was held out from a run.
     pub held_out: bool,
-    /// The line integrals, a picture ([`picture_url`]).
+    /// The line integrals, as a picture ([`picture_url`]).
     pub measured: String,
 }
 
 impl Page {
-    /// Writes the page as HTML to `path`; its bytes.
+    /// Writes the page as HTML to `path`; returns its size in bytes.
     pub fn write(&self, path: impl AsRef<Path>) -> Result<u64> {
         let path = path.as_ref();
         let mut written = 0;
@@ -143,7 +143,7 @@ impl Page {
         Ok(written)
     }
 
-    /// The page as HTML; `place` is what errors call it.
+    /// The page as HTML; `place` is its name in errors.
     pub fn html(&self, place: &str) -> Result<String> {
         let mut html = String::new();
         self.pieces(place, &mut |piece| {
@@ -153,10 +153,10 @@ impl Page {
         Ok(html)
     }
 
-    /// Hands the HTML out, piece by piece.
+    /// Produces the HTML piece by piece.
     fn pieces(&self, place: &str, put: &mut dyn FnMut(&str) -> Result<()>) -> Result<()> {
         let text = self.data().map_err(|e| Error::invalid(place, "page", e, "what JSON can hold"))?;
-        // What is put in is not searched for marks again.
+        // Inserted content is not searched for placeholders.
         for (i, piece) in FRAME.split('@').enumerate() {
             match piece {
                 text if i % 2 == 0 => put(text)?,
@@ -178,14 +178,14 @@ impl Page {
         Ok(())
     }
 
-    /// All but the voxels, as JSON that can stand in an element of HTML.
+    /// Everything but the voxels, as JSON that is safe inside an HTML element.
     fn data(&self) -> serde_json::Result<String> {
         let mut all = serde_json::to_value(self)?;
         all["colours"] = json!(crate::curves::COLOURS.map(|c| format!("#{:02x}{:02x}{:02x}", c.0, c.1, c.2)));
         all["diverging"] = diverging();
         all["licences"] = json!(LICENCES);
         let text = serde_json::to_string(&all)?;
-        // Outside texts JSON has none of these, and in texts it reads them escaped.
+        // JSON has none of these outside strings, and inside strings they can be escaped.
         let mut escaped = String::with_capacity(text.len());
         for c in text.chars() {
             match c {
@@ -197,15 +197,15 @@ impl Page {
     }
 }
 
-/// The colours of differences as the viewer wants them.
+/// The colour map of differences in the viewer's format.
 fn diverging() -> Value {
     let at = [0u8, 64, 128, 191, 255];
     let channel = |k: usize| at.map(|i| crate::canvas::diverging(2.0 * f32::from(i) / 255.0 - 1.0).0[k]);
-    // Large differences are opaque in a rendering, and none is not seen.
+    // Large differences are opaque in a rendering, and zero is invisible.
     json!({ "R": channel(0), "G": channel(1), "B": channel(2), "A": [160, 60, 0, 60, 160], "I": at })
 }
 
-/// `text` as the text of an element.
+/// `text`, escaped as the text of an element.
 fn in_markup(text: &str) -> String {
     text.replace('&', "&amp;").replace('<', "&lt;").replace('>', "&gt;")
 }

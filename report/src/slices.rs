@@ -12,22 +12,22 @@ use std::path::Path;
 
 const INK: Rgb<u8> = Rgb([20; 3]);
 const PAPER: Rgb<u8> = Rgb([255; 3]);
-/// Width that small volumes are enlarged to, and that large ones are not to pass, in pixels of slices.
+/// Width in pixels to which small volumes are enlarged, and maximum width of large ones.
 const WIDTH: [f64; 2] = [1000.0, 4000.0];
 const GAP: u32 = 8;
-/// Columns side by side; more go below, so that slices and captions stay legible.
+/// Maximum columns side by side; more are placed below, so that slices and captions stay legible.
 const COLUMNS: usize = 5;
 
-/// The three middle slices of a volume, which is all of it that pictures show.
+/// The three middle slices of a volume; pictures show nothing else.
 #[derive(Debug, Clone)]
 pub struct MiddleSlices {
     grid: VoxelGrid,
-    /// Across x, y and z; the remaining axes in their order.
+    /// Slices perpendicular to x, y and z; the remaining axes keep their order.
     across: [Array2<f32>; 3],
 }
 
 impl MiddleSlices {
-    /// Slices of zeros, for [`MiddleSlices::gather`].
+    /// Slices of zeros, to be filled by [`MiddleSlices::gather`].
     pub fn new(grid: VoxelGrid) -> Self {
         let [x, y, z] = grid.shape;
         Self { grid, across: [[y, z], [x, z], [x, y]].map(Array2::zeros) }
@@ -40,7 +40,7 @@ impl MiddleSlices {
         slices
     }
 
-    /// Takes over what the voxels of `part` have of the slices.
+    /// Copies the voxels of `part` that belong to the slices.
     pub fn gather(&mut self, part: &Part, values: ArrayView3<'_, f32>) {
         for (k, slice) in self.across.iter_mut().enumerate() {
             let middle = self.grid.shape[k] / 2;
@@ -51,7 +51,7 @@ impl MiddleSlices {
         }
     }
 
-    /// From black to white: the values shown but for the outermost thousandth on either side.
+    /// Grey window: the values shown, without the outermost thousandth on either side.
     pub fn window(&self) -> [f32; 2] {
         let mut all: Vec<f32> = self.across.iter().flatten().copied().filter(|x| x.is_finite()).collect();
         all.sort_unstable_by(f32::total_cmp);
@@ -61,12 +61,12 @@ impl MiddleSlices {
     }
 }
 
-/// A middle slice, named after the axis it cuts.
+/// A middle slice, named after the axis perpendicular to it.
 #[derive(Clone, Copy)]
 struct Plane {
     name: &'static str,
     axes: &'static str,
-    /// The axis across, and the two that are seen: to the right and up.
+    /// The perpendicular axis, and the two visible axes: to the right and up.
     cut: usize,
     seen: [usize; 2],
 }
@@ -75,7 +75,7 @@ const AXIAL: Plane = Plane { name: "axial", axes: "x → y ↑", cut: 2, seen: [
 const CORONAL: Plane = Plane { name: "coronal", axes: "x → z ↑", cut: 1, seen: [0, 2] };
 const SAGITTAL: Plane = Plane { name: "sagittal", axes: "y → z ↑", cut: 0, seen: [1, 2] };
 
-/// One picture of the table.
+/// One picture of the grid.
 enum Cell<'a> {
     Empty,
     Values(&'a MiddleSlices),
@@ -87,12 +87,12 @@ enum Cell<'a> {
 
 struct Row<'a> {
     plane: Plane,
-    /// Under the plane's name.
+    /// Text under the plane's name.
     note: &'a str,
     cells: Vec<Cell<'a>>,
 }
 
-/// Draws the middle slices of a result, with those of `reference` and their difference where there is one.
+/// Draws the middle slices of a result, with those of `reference` and their difference if given.
 pub fn result_png(path: impl AsRef<Path>, reference: Option<&MiddleSlices>, result: &MiddleSlices) -> Result<()> {
     match reference {
         Some(r) => slices_png(path, &[("reference", r), ("result", result)], r.window(), Some(0)),
@@ -103,8 +103,8 @@ pub fn result_png(path: impl AsRef<Path>, reference: Option<&MiddleSlices>, resu
 /// Draws the three middle slices (axial, coronal, sagittal) of every panel side by side, grey from `window[0]` to
 /// `window[1]`.
 ///
-/// With `difference_to`, the index of a panel, every other panel gets a column more: its values minus those of that
-/// panel, blue below and red above, on a scale that is the same for all and stands in the picture.
+/// With `difference_to`, the index of a panel, every other panel gets an additional column: its values minus those of
+/// that panel, blue below and red above, on a common scale that the picture shows.
 pub fn slices_png(
     path: impl AsRef<Path>,
     panels: &[(&str, &MiddleSlices)],
@@ -136,8 +136,8 @@ pub fn slices_png(
     draw(path, &captions, &rows, window)
 }
 
-/// Draws results next to a reference, each under its caption (say `NAF 28.1 dB`): axial and coronal middle slices,
-/// and under each the result minus the reference.
+/// Draws results next to a reference, each under its caption (e.g. `NAF 28.1 dB`): axial and coronal middle slices, and
+/// below each the result minus the reference.
 pub fn compare_png(
     path: impl AsRef<Path>,
     reference: (&str, &MiddleSlices),
@@ -155,15 +155,15 @@ pub fn compare_png(
     draw(path.as_ref(), &captions, &rows, window)
 }
 
-/// Draws features as colours beside the attenuation: `colours` are red, green and blue from 0 to 1, or NaN where there is
-/// nothing to show.
+/// Draws features as colours beside the attenuation: `colours` are red, green and blue from 0 to 1, or NaN where there
+/// is nothing to show.
 pub fn features_png(path: impl AsRef<Path>, attenuation: &MiddleSlices, colours: [&MiddleSlices; 3]) -> Result<()> {
     let cells = || vec![Cell::Values(attenuation), Cell::Colours(colours)];
     let rows = [AXIAL, CORONAL, SAGITTAL].map(|plane| Row { plane, note: "", cells: cells() });
     draw(path.as_ref(), &["attenuation".into(), "features".into()], &rows, attenuation.window())
 }
 
-/// Columns that stand side by side: as even as can be, [`COLUMNS`] at most.
+/// Bands of columns of nearly equal length, at most [`COLUMNS`] each.
 fn bands(columns: usize) -> Vec<Range<usize>> {
     let bands = columns.div_ceil(COLUMNS).max(1);
     let wide = columns.div_ceil(bands).max(1);
@@ -184,12 +184,12 @@ fn draw(path: &Path, captions: &[String], rows: &[Row], window: [f32; 2]) -> Res
     }
     let columns = captions.len();
     let bands = bands(columns);
-    // Columns of one place are as wide in every band.
+    // Columns at the same position have the same width in every band.
     let wide = bands[0].len();
     let place_mm = |c: usize| most((c..columns).step_by(wide).flat_map(|c| rows.iter().map(move |r| r.size(c)[0])));
     let width_mm: Vec<f64> = (0..wide).map(place_mm).collect();
     let height_mm: Vec<f64> = rows.iter().map(|r| most((0..columns).map(|c| r.size(c)[1]))).collect();
-    // A whole voxel a pixel at least, unless that makes the picture too large to look at.
+    // At least one voxel per pixel, unless the picture becomes too large.
     let finest = rows.iter().flat_map(|r| &r.cells).filter_map(Cell::volume).flat_map(|v| v.grid.spacing);
     let finest = finest.fold(f64::INFINITY, f64::min);
     let total: f64 = width_mm.iter().sum();
@@ -284,7 +284,7 @@ impl Row<'_> {
     }
 }
 
-/// A round number that all but half a percent of the shown differences stay within; `None` without differences.
+/// A round number that bounds all but half a percent of the shown differences; `None` without differences.
 fn difference_spread(rows: &[Row]) -> Option<f32> {
     let mut all: Vec<f32> = Vec::new();
     let mut any = false;
@@ -316,7 +316,7 @@ fn draw_cell(
     let (w, h) = (size[0].min(width), size[1].min(height));
     let (x, y) = (x + (width - w) / 2, y + (height - h) / 2);
     let n = v.across[plane.cut].dim();
-    // The nearest voxel, so that the picture shows the voxels that there are.
+    // Nearest-neighbour interpolation, so that the picture shows the actual voxels.
     canvas.fill(x, y, w, h, |dx, dy| {
         let i = ((f64::from(dx) + 0.5) / f64::from(w) * n.0 as f64) as usize;
         let j = ((f64::from(h - 1 - dy) + 0.5) / f64::from(h) * n.1 as f64) as usize;
@@ -330,12 +330,12 @@ fn draw_cell(
     });
 }
 
-/// Red, green and blue from 0 to 1; paper where one is not known.
+/// Red, green and blue from 0 to 1; paper colour if one is unknown.
 fn mixed(colours: [f32; 3]) -> Rgb<u8> {
     if colours.iter().all(|c| c.is_finite()) { Rgb(colours.map(|c| grey(c).0[0])) } else { PAPER }
 }
 
-/// A scale, lowest value at the foot, with its ends and its middle in numbers.
+/// A colour bar, lowest value at the bottom, with its ends and middle labelled.
 fn draw_bar(
     canvas: &mut Canvas,
     [x, y, width, height]: [u32; 4],
@@ -384,7 +384,7 @@ mod tests {
         assert!(image.width() >= 900, "{}", image.width());
         // Equal sides in mm are equal sides in pixels: three square rows.
         assert!(image.height() > 1000 && image.height() < 1200, "{}", image.height());
-        // Red and blue of the difference are there.
+        // The difference contains red and blue.
         assert!(image.pixels().any(|p| p.0[0] > 150 && p.0[2] < 120));
         assert!(image.pixels().any(|p| p.0[2] > 150 && p.0[0] < 120));
     }
@@ -413,7 +413,7 @@ mod tests {
             compare_png(&path, ("reference", &ball([24; 3], [2.0; 3], 0.3)), &results[..n], [0.0, 1.0]).unwrap();
             image::open(&path).unwrap().to_rgb8().dimensions()
         });
-        // A second band below the first, in columns as wide.
+        // A second band below the first, with columns of the same width.
         assert_eq!((sizes[1].0, sizes[1].1), (sizes[0].0, 2 * sizes[0].1));
         assert!(sizes[0].0 >= 1000, "{sizes:?}");
         let path = folder.join("slices8.png");
@@ -479,7 +479,7 @@ mod tests {
         refused(slices_png(&path, &[("a", &a)], [1.0, 1.0], None), "window");
         refused(slices_png(&path, &[("a", &a)], [0.0, 1.0], Some(1)), "difference_to");
         refused(slices_png(&path, &[("a", &a), ("b", &b)], [0.0, 1.0], Some(0)), "shape of a result");
-        // One flat voxel, and no difference at all, are no trouble.
+        // A single voxel and a zero difference are handled.
         let dot = MiddleSlices::of(&Volume::centered(Array3::zeros((1, 1, 1)), [1.0; 3]));
         assert_eq!(dot.window(), [0.0, 1.0]);
         slices_png(&path, &[("a", &dot), ("b", &dot)], [0.0, 1.0], Some(0)).unwrap();

@@ -1,4 +1,4 @@
-//! A picture of a scan's geometry: source path, detector, volume, and which part of it the views see.
+//! A picture of a scan's geometry: source path, detector, volume, and the part of it seen by the views.
 
 use crate::canvas::{number, sequential, write_png};
 use crate::curves::{FONT, register};
@@ -13,12 +13,12 @@ use plotters::style::text_anchor::{HPos, Pos, VPos};
 use std::ops::Range;
 use std::path::Path;
 
-/// Pixels of the picture, and how many times more it is drawn with.
+/// Pixels of the picture, and the supersampling factor of the drawing.
 const SIZE: [u32; 2] = [1480, 1180];
 const FINER: u32 = 2;
 /// Height of a line of text.
 const EM: f64 = 17.0 * FINER as f64;
-/// Views that are drawn; of more, evenly chosen ones.
+/// Maximum number of views drawn; evenly selected if there are more.
 const SHOWN: usize = 90;
 /// Points along the longer side of a map.
 const POINTS: usize = 160;
@@ -39,17 +39,17 @@ fn text_of<E: std::error::Error + Send + Sync>(e: DrawingAreaErrorKind<E>) -> St
     e.to_string()
 }
 
-/// Draws `geometry` from above (x to the right, y up) and from the side of its first view, and beside them what share
-/// of the views sees each point of the volume's central slices x–y and x–z.
+/// Draws `geometry` from above (x to the right, y up) and from the side of its first view. Beside them it maps the
+/// share of views that see each point of the volume's central slices x–y and x–z.
 ///
-/// `title` stands over it. Refuses a geometry that does not pass [`Geometry::validate`].
+/// `title` is the heading. Refuses a geometry that fails [`Geometry::validate`].
 pub fn survey_png(path: impl AsRef<Path>, title: &str, geometry: &Geometry) -> Result<()> {
     let path = path.as_ref();
     let picture = survey_picture(&path.display().to_string(), title, geometry)?;
     write_png(path, picture.width(), picture.height(), picture.as_raw())
 }
 
-/// What [`survey_png`] writes, called `place` in errors.
+/// The picture of [`survey_png`]; `place` is the name in errors.
 pub(crate) fn survey_picture(place: &str, title: &str, geometry: &Geometry) -> Result<RgbImage> {
     geometry.validate(place)?;
     register();
@@ -70,7 +70,7 @@ struct Picture<'g> {
     setup: Setup,
 }
 
-/// The area's pixels, what axes and titles take of them, and the part of the world in the rest.
+/// The pixels of an area, the margins of axes and titles, and the part of the world shown in the rest.
 struct Frame<'t> {
     title: &'t str,
     labels: [&'t str; 2],
@@ -79,13 +79,13 @@ struct Frame<'t> {
 }
 
 impl Frame<'_> {
-    /// Axes with equal millimetres, and a title.
+    /// Axes of equal scale, and a title.
     fn chart<'a, 'b>(&self, area: &'a Area<'b>) -> Result<Chart<'a, 'b>, String> {
         let (w, h) = area.dim_in_pixel();
         let (edge, left, foot, head, right) = (EM * 0.6, EM * 4.2, EM * 3.0, EM * 2.0, EM);
         let inner = [f64::from(w) - edge - left - right, f64::from(h) - foot - head];
         let size = [self.x[1] - self.x[0], self.y[1] - self.y[0]];
-        // A millimetre is the same in both directions: the scarcer one decides.
+        // A millimetre is the same in both directions: the tighter one determines the scale.
         let mm = (size[0] / inner[0]).max(size[1] / inner[1]);
         let range = |r: [f64; 2], pixels: f64| -> Range<f64> {
             let middle = (r[0] + r[1]) / 2.0;
@@ -120,7 +120,7 @@ impl Frame<'_> {
     }
 }
 
-/// The smallest box around points, a little larger.
+/// The smallest box around points, slightly enlarged.
 fn around(points: impl Iterator<Item = (f64, f64)>) -> ([f64; 2], [f64; 2]) {
     let empty = [f64::INFINITY, f64::NEG_INFINITY];
     let (mut x, mut y) = (empty, empty);
@@ -135,7 +135,7 @@ fn line(chart: &mut Chart, points: Vec<(f64, f64)>, style: impl Into<ShapeStyle>
     chart.draw_series([PathElement::new(points, style)]).map(|_| ()).map_err(text_of)
 }
 
-/// Strokes from each second point to the next.
+/// Dashes: a line from each even-numbered point to the next.
 fn dashed(chart: &mut Chart, points: &[(f64, f64)], style: ShapeStyle) -> Drawn {
     for pair in points.chunks(2).filter(|c| c.len() == 2) {
         line(chart, pair.to_vec(), style)?;
@@ -190,7 +190,7 @@ impl Picture<'_> {
         let [low, high] = self.geometry.volume.bounds();
         let seen = self.views().flat_map(|v| [v.source, self.ends(v)[0][0], self.ends(v)[0][1]]).chain([low, high]);
         let (x, mut y) = around(seen.map(flat));
-        // The legend stands above.
+        // Space for the legend at the top.
         y[1] += 0.12 * (y[1] - y[0]);
         let frame = Frame { title: "from above (+z)", labels: ["x (mm)", "y (mm)"], x, y };
         let mut chart = frame.chart(area)?;
@@ -211,7 +211,7 @@ impl Picture<'_> {
         self.legend(area)
     }
 
-    /// An arrow from the first view's source the way that the views go.
+    /// An arrow from the first view's source in the direction of the orbit.
     fn turning(&self, chart: &mut Chart, size: f64) -> Drawn {
         let angles = &self.setup.angles;
         if angles.step_deg == 0.0 {
@@ -245,7 +245,7 @@ impl Picture<'_> {
         chart.draw_series([Circle::new(source, 6 * FINER as i32, SOURCE.filled())]).map(|_| ()).map_err(text_of)
     }
 
-    /// What colours and lines mean, in the corner that a circle leaves empty.
+    /// A legend of colours and lines, in the corner that a circle leaves empty.
     fn legend(&self, area: &Area) -> Drawn {
         let rows = [
             (SOURCE, "source; large: view 0"),
@@ -260,7 +260,7 @@ impl Picture<'_> {
         Ok(())
     }
 
-    /// The plane through the axis and the first view's source.
+    /// The plane of the axis and the first view's source.
     fn side_view(&self, area: &Area) -> Drawn {
         let first = self.geometry.views[0].source;
         let r = first[0].hypot(first[1]).max(f64::MIN_POSITIVE);
@@ -316,7 +316,7 @@ impl Picture<'_> {
         });
         chart.draw_series(tiles).map_err(text_of)?;
         let (a, b) = ((low[seen[0]], low[seen[1]]), (high[seen[0]], high[seen[1]]));
-        // Black on white shows on every colour of the map.
+        // Black on white is visible on every colour of the map.
         for (colour, width) in [(WHITE, 4 * FINER), (INK, 2 * FINER)] {
             line(&mut chart, vec![a, (b.0, a.1), b, (a.0, b.1), a], colour.stroke_width(width))?;
         }

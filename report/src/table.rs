@@ -1,18 +1,18 @@
-//! Tables of figures: once for the terminal, once in Markdown.
+//! Tables of numbers for the terminal and in Markdown.
 
 use crate::text;
 
-/// Columns with a heading each, the first a name and the others figures, and sentences below.
+/// Columns with headings, the first one names and the others numbers, and notes below.
 #[derive(Debug, Default)]
 pub struct Table {
-    /// The headings, then a line each.
+    /// The headings, then the lines.
     pub rows: Vec<Vec<String>>,
-    /// What the cells have no room for.
+    /// Remarks that do not fit into cells.
     pub notes: Vec<String>,
 }
 
 impl Table {
-    /// For a terminal.
+    /// The table as text for a terminal.
     pub fn text(&self) -> String {
         let right: Vec<usize> = (1..self.columns()).collect();
         let mut text = text::table(&self.rows, &right);
@@ -22,7 +22,7 @@ impl Table {
         text
     }
 
-    /// The same cells in Markdown.
+    /// The table in Markdown.
     pub fn markdown(&self) -> String {
         let line = |cells: &[String]| {
             let cells: Vec<String> = cells.iter().map(|c| c.replace('|', "\\|")).collect();

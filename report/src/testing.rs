@@ -1,8 +1,8 @@
-//! What several modules' tests share.
+//! Shared helpers of several modules' tests.
 
 use std::path::PathBuf;
 
-/// A file of the shared data, or `None` with a note on why the test has nothing to do.
+/// A file of the shared data, or `None` with a note on why the test is skipped.
 pub(crate) fn data(name: &str) -> Option<PathBuf> {
     let root = std::env::var_os("CONEFIELD_DATA")
         .map(PathBuf::from)
@@ -15,7 +15,7 @@ pub(crate) fn data(name: &str) -> Option<PathBuf> {
     None
 }
 
-/// Where pictures go to be looked at, if CONEFIELD_PICTURES names a folder.
+/// Folder for pictures to inspect, if CONEFIELD_PICTURES names one.
 pub(crate) fn folder() -> (Option<tempfile::TempDir>, PathBuf) {
     match std::env::var_os("CONEFIELD_PICTURES") {
         Some(p) => (None, p.into()),

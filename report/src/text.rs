@@ -1,4 +1,4 @@
-//! Figures in words, for people.
+//! Human-readable numbers.
 
 use std::path::Path;
 
@@ -15,7 +15,7 @@ pub fn number(n: u64) -> String {
     out
 }
 
-/// The name of a file or folder, without what it ends with.
+/// The name of a file or folder without its extension.
 pub fn stem(path: &str) -> String {
     Path::new(path).file_stem().map(|s| s.to_string_lossy().into_owned()).unwrap_or_default()
 }
@@ -42,7 +42,7 @@ pub fn duration(seconds: f64) -> String {
     }
 }
 
-/// Rows of cells as aligned columns; columns in `right` are aligned to the right.
+/// Rows of cells as aligned columns; columns in `right` are right-aligned.
 pub fn table(rows: &[Vec<String>], right: &[usize]) -> String {
     let columns = rows.iter().map(Vec::len).max().unwrap_or(0);
     let width = |c: usize| rows.iter().filter_map(|r| r.get(c)).map(|s| s.chars().count()).max().unwrap_or(0);

@@ -1,4 +1,4 @@
-//! Adam (Kingma & Ba 2015, algorithm 1) over the whole arena, one pass, in which the copy in halves is made anew.
+//! Adam (Kingma & Ba 2015, algorithm 1) over the whole arena in one pass, which also updates the half-precision copy.
 
 use crate::halves::Rounded;
 use conefield_core::arena::Arena;
@@ -9,7 +9,7 @@ use rayon::prelude::*;
 
 const BLOCK: usize = 16_384;
 
-/// One step with the arena's gradients, which are zero afterwards. `copy` is that of the new parameters afterwards.
+/// One step with the arena's gradients, which are reset to zero. Updates `copy` to the new parameters.
 pub fn update(arena: &mut Arena, adam: &Adam, copy: Option<&mut Rounded>) {
     let bias1 = 1.0 - adam.beta1.powf(adam.step as f64);
     let bias2 = 1.0 - adam.beta2.powf(adam.step as f64);
@@ -27,7 +27,7 @@ pub fn update(arena: &mut Arena, adam: &Adam, copy: Option<&mut Rounded>) {
     }
 }
 
-/// `copy` is as long as the arena or empty.
+/// `copy` has the length of the arena or is empty.
 fn sweep<H: Half>(arena: &mut Arena, rule: Rule, copy: &mut [H]) {
     let Arena { params, grads, first, second } = arena;
     let mut copies = copy.chunks_mut(BLOCK);
@@ -73,7 +73,7 @@ impl<H: Half> Op for Block<'_, H> {
             let second = load(s, v, i).mul_add(number(rule.beta2), grad * grad * number(1.0 - rule.beta2));
             let step = first * number(rule.rate) / second.sqrt().mul_add(number(rule.root), number(rule.eps));
             store::<S, f32>(load(s, p, i) - step, p, i);
-            // Moments that decay towards nothing end at zero, not among the denormals, which are slow.
+            // Decaying moments are flushed to zero instead of becoming denormals, which are slow.
             store::<S, f32>(first.abs().simd_gt(number(1e-30)).select(first, zero), m, i);
             store::<S, f32>(second.simd_gt(number(1e-36)).select(second, zero), v, i);
             store::<S, f32>(zero, g, i);

@@ -1,4 +1,4 @@
-//! The copy of the parameters from which tables are read in halves.
+//! Half-precision copy of the parameters, for reading tables.
 
 use conefield_core::half::{Bf16, F16, Half, round};
 use conefield_core::pages::Pages;
@@ -8,10 +8,10 @@ use conefield_core::stage::{Halves, Kernel, Reader, Stage};
 use rayon::prelude::*;
 use std::ops::Range;
 
-/// Numbers that are rounded at once.
+/// Numbers rounded at once.
 const BLOCK: usize = 16_384;
 
-/// Every parameter of the arena, rounded. Those that every row reads are few; kernels read them where they are.
+/// All parameters of the arena, rounded. The few that every row reads are read from the arena.
 pub enum Rounded {
     /// As `binary16`.
     F16(Pages<F16>),
@@ -20,10 +20,10 @@ pub enum Rounded {
 }
 
 impl Rounded {
-    /// Bytes a parameter.
+    /// Bytes per parameter.
     pub const BYTES: usize = size_of::<F16>();
 
-    /// A copy of `params` for `tables`; `None` where these are `f32`.
+    /// A copy of `params` for `tables`; `None` for `f32`.
     pub fn new(tables: Tables, params: &[f32]) -> Option<Self> {
         let n = params.len();
         let mut copy = match tables {
@@ -35,7 +35,7 @@ impl Rounded {
         Some(copy)
     }
 
-    /// Takes `params` as they are now.
+    /// Updates the copy to `params`.
     pub fn renew(&mut self, params: &[f32]) {
         match self {
             Self::F16(copy) => round_all(params, copy),
@@ -43,8 +43,8 @@ impl Rounded {
         }
     }
 
-    /// The kernel of `stage` that reads its parameters, `range` of the arena, here instead of where it is told. `None`
-    /// where the stage has none that reads halves.
+    /// The kernel of `stage` that reads its parameters, `range` of the arena, from this copy instead of those passed to
+    /// it. `None` if the stage has no half-precision kernel.
     pub(crate) fn kernel<'a>(&'a self, stage: &'a dyn Stage, range: Range<usize>) -> Option<Box<dyn Kernel<f32> + 'a>> {
         let Halves { f16, bf16 } = stage.halves()?;
         Some(match self {

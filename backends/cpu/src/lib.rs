@@ -1,13 +1,13 @@
 //! The CPU backend.
 //!
-//! A step goes wave by wave (some hundred thousand rows). In a wave, every slot samples its share of the rays; all slots
-//! then go through the encoder pass by pass, so that a level's table is read while it is in the cache; then each takes
-//! its share in groups: normalise, evaluate the field, integrate, take the loss and go backward, tile by tile, while a
-//! tile is in the cache ([`rows`]). Dense stages sum their gradients in copies of their own, one a slot, merged in order.
-//! Stages with scattered parameters get the rows of the wave a second time, each worker with a range of parameters of its
-//! own ([`step`]). Where tables are read in halves, these are a copy of the parameters ([`halves`]) that each update makes
-//! anew ([`adam`]). A field that brings line integrals of its own goes another way ([`lines`]). The number of slots and the
-//! order of every sum depend on the plan alone: the same bits come out on any number of threads.
+//! A step is processed in waves of some hundred thousand rows. In a wave, every slot samples its share of the rays. All
+//! slots then run the encoder pass by pass, so that a level's table is read while it is in the cache. Then each slot
+//! processes its share in groups: normalize, evaluate the field, integrate, compute the loss and run backward, tile by
+//! tile, while a tile is in the cache ([`rows`]). Dense stages sum their gradients in one copy per slot, merged in
+//! order. Stages with scattered parameters process the rows of the wave a second time, each worker with its own range
+//! of parameters ([`step`]). Half-precision tables are a copy of the parameters ([`halves`]) renewed by each update
+//! ([`adam`]). A field with line integrals of its own takes another path ([`lines`]). The number of slots and the order
+//! of every sum depend on the plan only, so that results are bit-identical on any number of threads.
 
 pub mod adam;
 pub mod halves;
@@ -26,12 +26,12 @@ use rayon::prelude::*;
 use rows::{Belong, Encoded, Kernels, Scratch};
 use step::Slots;
 
-/// Points that are encoded at once when the field is evaluated, or rays rendered.
+/// Points encoded at once when the field is evaluated or rays are rendered.
 const CHUNK_ROWS: usize = 32_768;
-/// Rays that are rendered at once at most.
+/// Maximum number of rays rendered at once.
 const CHUNK_RAYS: usize = 256;
 
-/// The CPU backend: rayon threads, SIMD chosen at run time.
+/// The CPU backend: rayon threads, SIMD selected at run time.
 #[derive(Debug, Clone, Copy, Default)]
 pub struct Cpu;
 
@@ -97,32 +97,32 @@ impl Backend for Cpu {
 }
 
 struct CpuExecutable {
-    /// Made by the first step: evaluation needs none.
+    /// Created by the first step: evaluation needs none.
     slots: Option<Slots<f32>>,
-    /// The arena's gradients are known to be zero.
+    /// Whether the arena's gradients are known to be zero.
     clean: bool,
-    /// How tables are read.
+    /// Storage precision of tables.
     tables: Tables,
-    /// What they are read from, if not from the arena.
+    /// The copy that tables are read from, if not the arena.
     copy: Option<Rounded>,
-    /// It is that of the arena.
+    /// Whether the copy is up to date.
     current: bool,
 }
 
-/// The kernels of `pipeline`, which [`Backend::compile`] has seen.
+/// The kernels of `pipeline`, which [`Backend::compile`] has checked.
 fn kernels<'a>(pipeline: &'a Pipeline, copy: Option<&'a Rounded>) -> Result<Kernels<'a, f32>> {
     let lacks = || Error::unsupported("the CPU backend", "a stage that is not the one which it was compiled for");
     Kernels::reading(pipeline, copy).ok_or_else(lacks)
 }
 
 impl CpuExecutable {
-    /// The kernels with what they read, made where it is not current.
+    /// The kernels with their parameters; updates the copy if needed.
     fn kernels<'a>(&'a mut self, model: &'a Model) -> Result<Kernels<'a, f32>> {
         self.refresh(model);
         kernels(&model.pipeline, self.copy.as_ref())
     }
 
-    /// Makes the copy that of the arena.
+    /// Updates the copy from the arena.
     fn refresh(&mut self, model: &Model) {
         let params = &model.arena.params;
         match &mut self.copy {
@@ -156,7 +156,7 @@ impl Executable for CpuExecutable {
             );
         }
         if let Some(lines) = lines {
-            // Such a field stands alone: the arena is its own.
+            // Such a field is the only stage: the arena is its own.
             let (params, grads) = (&model.arena.params, &mut model.arena.grads);
             stats.loss += lines::step(pipeline.field.as_ref(), lines, params, grads, work);
             stats.samples += work.rays.len() as u64;

@@ -1,10 +1,10 @@
-//! Line integrals that a field brings itself, with their gradients.
+//! Line integrals computed by a field itself, with their gradients.
 
 use conefield_core::backend::Work;
 use conefield_core::stage::{Field, Grads, Lines, UnitRay};
 use rayon::prelude::*;
 
-/// Rays that a worker projects at once.
+/// Rays projected at once by a worker.
 const TOGETHER: usize = 64;
 
 /// The line integrals of `rays`.
@@ -14,8 +14,8 @@ pub fn project(lines: &dyn Lines<f32>, params: &[f32], rays: &[UnitRay], out: &m
         .for_each(|(out, rays)| lines.project(params, rays, out));
 }
 
-/// Adds the gradients of the mean loss of `work`'s rays to `grads`, which are those of `field` alone; returns the loss. A
-/// parameter's gradient is summed in the order of the rays by one worker: the threads change no bit.
+/// Adds the gradients of the mean loss of `work`'s rays to `grads`, which are those of `field` alone; returns the loss.
+/// One worker sums a parameter's gradient in the order of the rays, so that the number of threads changes no bit.
 pub fn step(field: &dyn Field, lines: &dyn Lines<f32>, params: &[f32], grads: &mut [f32], work: &Work<'_>) -> f64 {
     let rays: Vec<UnitRay> = work.rays.iter().map(|r| r.ray).collect();
     let mut found = vec![0.0; rays.len()];

@@ -6,31 +6,31 @@ use conefield_core::simd::Real;
 use conefield_core::stage::{GradKind, Grads, Info, Kernel, Scope, Stage, TILE_ROWS, Tile, TileMut};
 use std::ops::Range;
 
-/// A stage ready to run: its arithmetic, its widths and its place in the arena.
+/// A stage ready to run: its kernel, widths and place in the arena.
 pub struct Step<'a, R: Real> {
     /// The arithmetic.
     pub kernel: Box<dyn Kernel<R> + 'a>,
     /// Widths and counts.
     pub info: Info,
-    /// Its parameters in the arena.
+    /// Its parameter range in the arena.
     pub params: Range<usize>,
-    /// Ranges of its parameters (within the stage) that workers may own, for scattered ones.
+    /// Parameter ranges (within the stage) that workers may own, for scattered stages.
     pub partition: Vec<Range<usize>>,
-    /// Whether a stage before it learns, so that it must hand a gradient on.
+    /// Whether an earlier stage learns, so that it must compute an input gradient.
     pub hands_on: bool,
-    /// Channels of a tile that it reads and writes; its tape follows its output. The encoder's features come first.
+    /// Tile channels of its input and output; its tape follows its output. The encoder's features come first.
     input: Range<usize>,
     output: Range<usize>,
 }
 
 impl<R: Real> Step<'_, R> {
-    /// Whether rows must be handed to it one at a time.
+    /// Whether it needs rows one at a time.
     fn apart(&self, belong: Belong) -> bool {
         belong == Belong::Nowhere && self.info.scope == Scope::Ray
     }
 }
 
-/// Every stage that does something, in order.
+/// All stages except identities, in order.
 pub struct Kernels<'a, R: Real> {
     /// Encoder first, field last.
     pub steps: Vec<Step<'a, R>>,
@@ -38,12 +38,12 @@ pub struct Kernels<'a, R: Real> {
 }
 
 impl<'a, R: Real> Kernels<'a, R> {
-    /// The kernels of `pipeline` in the precision that `pick` chooses; `None` where a stage lacks it.
+    /// The kernels of `pipeline` in the precision that `pick` chooses; `None` if a stage lacks it.
     pub fn new(pipeline: &'a Pipeline, pick: impl Fn(&'a dyn Stage) -> Option<&'a dyn Kernel<R>>) -> Option<Self> {
         Self::of(pipeline, |stage, _| Some(Box::new(pick(stage)?)))
     }
 
-    /// `pick` gets each stage with the place of its parameters in the arena.
+    /// `pick` gets each stage with its parameter range in the arena.
     fn of(
         pipeline: &'a Pipeline,
         pick: impl Fn(&'a dyn Stage, Range<usize>) -> Option<Box<dyn Kernel<R> + 'a>>,
@@ -68,17 +68,17 @@ impl<'a, R: Real> Kernels<'a, R> {
         Some(Self { steps, scope: pipeline.scope() })
     }
 
-    /// Passes that the encoder goes in.
+    /// Number of passes of the encoder.
     pub fn encoder_passes(&self) -> usize {
         self.steps[0].kernel.passes()
     }
 
-    /// Channels that the encoder computes.
+    /// Number of channels that the encoder computes.
     pub fn encoder_width(&self) -> usize {
         self.steps[0].info.output
     }
 
-    /// Tiles for one ray of `n` samples.
+    /// Tile sizes for one ray of `n` samples.
     pub fn ray_tiles(&self, n: usize) -> Vec<usize> {
         if self.scope == Scope::Ray { vec![n] } else { even_tiles(n) }
     }
@@ -88,23 +88,23 @@ impl<'a, R: Real> Kernels<'a, R> {
         self.scope == Scope::Row
     }
 
-    /// Numbers a row that a tile holds: the encoder's features, then of every other stage output and tape.
+    /// Numbers per row of a tile: the encoder's features, then output and tape of every other stage.
     fn row_numbers(&self) -> usize {
         self.encoder_width() + self.steps[1..].iter().map(|s| s.info.output + s.info.tape).sum::<usize>()
     }
 
-    /// Numbers a row that [`Encoded`] holds.
+    /// Numbers per row of [`Encoded`].
     pub fn encoded_numbers(&self) -> usize {
         3 + self.steps[0].info.output + self.steps[0].info.tape
     }
 
-    /// Numbers a row that all [`Log`]s but the encoder's hold.
+    /// Numbers per row of all [`Log`]s except the encoder's.
     pub fn logged_numbers(&self) -> usize {
         let scattered = self.steps[1..].iter().filter(|s| s.info.grads == GradKind::Scatter);
         scattered.map(|s| s.info.input + s.info.output).sum()
     }
 
-    /// Numbers a row that [`Scratch`] holds.
+    /// Numbers per row of [`Scratch`].
     pub fn scratch_numbers(&self) -> usize {
         self.row_numbers() + 1
     }
@@ -115,8 +115,8 @@ impl<'a, R: Real> Kernels<'a, R> {
 }
 
 impl<'a> Kernels<'a, f32> {
-    /// The kernels that train. Stages with scattered parameters read them in `copy`, where there is one; `None` where
-    /// one of them has no kernel for that.
+    /// The kernels for training. Stages with scattered parameters read them from `copy`, if given; `None` if one of
+    /// them has no kernel for it.
     pub fn reading(pipeline: &'a Pipeline, copy: Option<&'a Rounded>) -> Option<Self> {
         Self::of(pipeline, |stage, range| match copy {
             Some(copy) if stage.info().grads == GradKind::Scatter => copy.kernel(stage, range),
@@ -125,14 +125,14 @@ impl<'a> Kernels<'a, f32> {
     }
 }
 
-/// `n` rows in as few tiles of nearly the same size as [`TILE_ROWS`] allows, whole vectors each but the last.
+/// Splits `n` rows into as few tiles of nearly equal size as [`TILE_ROWS`] allows, of whole vectors except the last.
 pub fn even_tiles(n: usize) -> Vec<usize> {
     let tiles = n.div_ceil(TILE_ROWS).max(1);
     let each = n.div_ceil(tiles).next_multiple_of(32).min(TILE_ROWS);
     (0..n).step_by(each).map(|at| each.min(n - at)).collect()
 }
 
-/// What a scattered stage needs in the second pass.
+/// Inputs of a scattered stage's second pass.
 #[derive(Debug, Default, Clone)]
 pub struct Log<R> {
     /// Tile by tile: input channels, then output-gradient channels.
@@ -142,7 +142,7 @@ pub struct Log<R> {
 }
 
 impl<R> Log<R> {
-    /// Appends a tile, or where its rows stand `apart` a tile for each.
+    /// Appends a tile, or one tile per row if `apart`.
     fn push(&mut self, x: Tile<'_, R>, dy: Tile<'_, R>, apart: bool)
     where
         R: Copy,
@@ -160,7 +160,7 @@ impl<R> Log<R> {
         }
     }
 
-    /// Forgets everything.
+    /// Removes everything.
     pub fn clear(&mut self) {
         self.data.clear();
         self.rows.clear();
@@ -180,7 +180,7 @@ fn set_row<R: Copy>(tile: &mut TileMut<'_, R>, i: usize, from: &[R]) {
     }
 }
 
-/// Hands a stage the rows of a tile one at a time.
+/// Passes the rows of a tile to a stage one at a time.
 #[derive(Debug, Default)]
 struct Single<R> {
     x: Vec<R>,
@@ -246,11 +246,11 @@ impl<R: Real> Single<R> {
     }
 }
 
-/// The encoder's part of the work: it sees many tiles' rows at once, so that it goes through the table of a level
-/// while that is in the cache.
+/// The encoder's part of the work: it processes the rows of many tiles at once, so that the table of a level stays in
+/// the cache.
 #[derive(Debug, Default)]
 pub struct Encoded<R> {
-    /// One tile of all rows: the points, then the features; once their gradients are known, these.
+    /// One tile of all rows: the points, then the features, which their gradients later replace.
     log: Log<R>,
     tape: Vec<R>,
 }
@@ -264,7 +264,7 @@ impl<R: Real> Encoded<R> {
         }
     }
 
-    /// Takes `points`, which [`Encoded::pass`] then encodes.
+    /// Sets `points`, which [`Encoded::pass`] then encodes.
     pub fn begin(&mut self, kernels: &Kernels<'_, R>, points: &[[f32; 3]]) {
         let (s, n) = (&kernels.steps[0], points.len());
         self.log.rows.clear();
@@ -278,7 +278,7 @@ impl<R: Real> Encoded<R> {
         }
     }
 
-    /// One pass of the encoder, `pass` of [`Kernels::encoder_passes`].
+    /// Pass `pass` of the encoder's [`Kernels::encoder_passes`].
     pub fn pass(&mut self, kernels: &Kernels<'_, R>, params: &[R], pass: usize) {
         let (s, n) = (&kernels.steps[0], self.rows());
         let (x, y) = self.log.data.split_at_mut(3 * n);
@@ -293,7 +293,7 @@ impl<R: Real> Encoded<R> {
         }
     }
 
-    /// Hands the gradients of all features to the encoder where it sums them itself.
+    /// Runs the encoder's backward pass, unless its gradients are scattered.
     pub fn backward(&mut self, kernels: &Kernels<'_, R>, params: &[R], dense: &mut DenseGrads<R>) {
         let s = &kernels.steps[0];
         let n = self.rows();
@@ -310,12 +310,12 @@ impl<R: Real> Encoded<R> {
         }
     }
 
-    /// What the encoder needs in the second pass, where its gradients are scattered.
+    /// Inputs of the encoder's second pass, if its gradients are scattered.
     pub fn log(&self) -> &Log<R> {
         &self.log
     }
 
-    /// Forgets all rows.
+    /// Removes all rows.
     pub fn clear(&mut self) {
         self.log.clear();
     }
@@ -336,7 +336,7 @@ impl<R: Real> Encoded<R> {
         }
     }
 
-    /// Replaces the features of a tile's rows by their gradients.
+    /// Replaces the features of a tile's rows with their gradients.
     fn store(&mut self, rows: Range<usize>, tile: &[R]) {
         let n = self.rows();
         for (y, tile) in self.log.data[3 * n..].chunks_exact_mut(n).zip(tile.chunks_exact(rows.len())) {
@@ -345,40 +345,38 @@ impl<R: Real> Encoded<R> {
     }
 }
 
-/// What the rows of a tile have to do with each other.
+/// Relation between the rows of a tile.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
 pub enum Belong {
-    /// They are samples of one ray, or of several where no stage looks along rays.
+    /// Samples of one ray, or of several if no stage looks along rays.
     #[default]
     ToRays,
-    /// They are points off any ray: a stage that looks along rays gets them one at a time.
+    /// Points off any ray: a stage that looks along rays gets them one at a time.
     Nowhere,
 }
 
-/// Working memory of a worker for all stages behind the encoder; it grows to what the largest group needs and is
-/// used again.
+/// Working memory of a worker for all stages after the encoder; it grows to the largest group and is reused.
 #[derive(Debug, Default)]
 pub struct Scratch<R> {
-    /// Tile by tile: features, then of each stage output and tape.
+    /// Tile by tile: features, then output and tape of each stage.
     data: Vec<R>,
-    /// Rows of each tile, and where they stand among the encoded ones.
+    /// Rows of each tile, as a range of the encoded rows.
     tiles: Vec<Range<usize>>,
     outputs: Vec<R>,
-    /// Gradients on the way back: of a stage's output and of its input.
+    /// Gradients in the backward pass: of a stage's output and of its input.
     back: [Vec<R>; 2],
     belong: Belong,
-    /// One row, of a stage that gets them one at a time.
+    /// Working memory for stages that get one row at a time.
     single: Single<R>,
 }
 
 impl<R: Real> Scratch<R> {
-    /// The field at every row of the last [`Scratch::forward`].
+    /// The field's value at every row of the last [`Scratch::forward`].
     pub fn outputs(&self) -> &[R] {
         &self.outputs
     }
 
-    /// Runs every stage behind the encoder over tiles of `tiles` rows, the first of which is row `first` of
-    /// `encoded`.
+    /// Runs every stage after the encoder over tiles of `tiles` rows; the first one starts at row `first` of `encoded`.
     pub fn forward(
         &mut self,
         kernels: &Kernels<'_, R>,
@@ -421,9 +419,9 @@ impl<R: Real> Scratch<R> {
         }
     }
 
-    /// Given the gradient of every row's output, adds the gradients of dense stages to `dense`, appends what
-    /// scattered stages need to `logs` (one a stage; the encoder's stays empty), and puts the gradients of the
-    /// features in their place in `encoded`.
+    /// Given the gradient of every row's output, adds the gradients of dense stages to `dense`, appends the inputs of
+    /// scattered stages to `logs` (one per stage; the encoder's stays empty), and stores the gradients of the features
+    /// in `encoded`.
     pub fn backward(
         &mut self,
         kernels: &Kernels<'_, R>,
@@ -483,11 +481,11 @@ impl<R: Real> Scratch<R> {
     }
 }
 
-/// Gradients of the dense stages, one buffer.
+/// Gradients of all dense stages in one buffer.
 #[derive(Debug, Default, Clone)]
 pub struct DenseGrads<R> {
     values: Vec<R>,
-    /// Of each step: its place in `values`, empty for those that are not dense.
+    /// Range of each step in `values`, empty for those that are not dense.
     places: Vec<Range<usize>>,
 }
 
@@ -504,7 +502,7 @@ impl<R: Real> DenseGrads<R> {
         Self { values: vec![R::ZERO; end], places }
     }
 
-    /// How many there are for `kernels`.
+    /// Number of dense gradients of `kernels`.
     pub fn numbers(kernels: &Kernels<'_, R>) -> usize {
         kernels.steps.iter().map(Self::of_step).sum()
     }
@@ -518,7 +516,7 @@ impl<R: Real> DenseGrads<R> {
         &mut self.values[self.places[k].clone()]
     }
 
-    /// Numbers held.
+    /// Number of gradients.
     pub fn len(&self) -> usize {
         self.values.len()
     }
@@ -528,7 +526,7 @@ impl<R: Real> DenseGrads<R> {
         self.values.is_empty()
     }
 
-    /// Back to zero.
+    /// Resets to zero.
     pub fn clear(&mut self) {
         self.values.fill(R::ZERO);
     }

@@ -9,29 +9,29 @@ use rayon::prelude::*;
 use std::ops::Range;
 use std::time::Instant;
 
-/// Rows of a wave at most: enough for every entry of a large table to be used several times while it is in the cache.
+/// Maximum rows of a wave: enough to use every entry of a large table several times while it is in the cache.
 const WAVE_ROWS: usize = 393_216;
-/// Bytes that a wave may take, of stages that keep many numbers a row.
+/// Maximum bytes of a wave, for stages with many numbers per row.
 const WAVE_BYTES: usize = 64 << 20;
-/// Rows that a worker carries through forward and backward at once: those of a group, or a part of a larger one.
+/// Rows that a worker takes through forward and backward at once: those of a group, or a part of a larger one.
 const GROUP_ROWS: usize = 512;
-/// Groups of a wave are dealt to this many slots at most, each with its own sums.
+/// Maximum number of slots, each with its own sums, among which the groups of a wave are distributed.
 const SLOTS: usize = 16;
-/// Bytes of a row's sample: position, weight, and the place of its ray.
+/// Bytes per row of a sample: position, weight, and index of its ray.
 const SAMPLE_BYTES: usize = 4 * size_of::<f32>();
-/// Bytes that all slots' copies of dense gradients may take together.
+/// Maximum total bytes of all slots' copies of dense gradients.
 const DENSE_BYTES: usize = 128 << 20;
 
-/// A group of rows that goes forward and backward together.
+/// A group of rows that runs forward and backward together.
 #[derive(Debug, Clone)]
 enum Group {
     Rays(Range<usize>),
     Points(Range<usize>),
-    /// Blocks of the prior with this number.
+    /// Blocks of the prior with this index.
     Blocks(usize, Range<usize>),
 }
 
-/// What belongs to one slot.
+/// Data of one slot.
 #[derive(Debug, Default)]
 struct Slot<R> {
     encoded: Encoded<R>,
@@ -58,7 +58,7 @@ pub struct Slots<R> {
 }
 
 impl<R: Real> Slots<R> {
-    /// Slots for `kernels`. Their number depends on the plan alone, since it decides the order of sums.
+    /// Slots for `kernels`. Their number depends on the plan only, since it determines the order of sums.
     pub fn new(kernels: &Kernels<'_, R>) -> Self {
         let dense = DenseGrads::new(kernels);
         let count = Self::count(dense.len());
@@ -66,12 +66,12 @@ impl<R: Real> Slots<R> {
         Self { slots: std::iter::repeat_with(slot).take(count).collect() }
     }
 
-    /// How many, for `dense` numbers of dense gradients.
+    /// Number of slots, for `dense` dense gradients.
     fn count(dense: usize) -> usize {
         (DENSE_BYTES / (dense * size_of::<R>()).max(1)).clamp(1, SLOTS)
     }
 
-    /// Bytes that slots for `kernels` come to hold once steps are under way.
+    /// Bytes held by the slots for `kernels` during training.
     pub fn bytes(kernels: &Kernels<'_, R>) -> usize {
         let dense = DenseGrads::numbers(kernels);
         let numbers = Self::count(dense) * (dense + GROUP_ROWS * kernels.scratch_numbers());
@@ -117,7 +117,7 @@ impl<R: Real> Slots<R> {
         stats
     }
 
-    /// The second pass: each worker owns a range of scattered parameters and goes through the logs in order.
+    /// The second pass: each worker owns a range of scattered parameters and processes the logs in order.
     fn scatter(&mut self, kernels: &Kernels<'_, R>, params: &[R], grads: &mut [R]) {
         let slots = &self.slots;
         let mut rest = grads;
@@ -131,7 +131,7 @@ impl<R: Real> Slots<R> {
                 tasks.push((k, range.clone(), own));
             }
         }
-        // The last ranges are the largest (finest levels): start with them, so that workers end together.
+        // The last ranges are the largest (finest levels): start with them to balance the load.
         tasks.into_par_iter().rev().with_max_len(1).for_each(|(k, range, values)| {
             let s = &kernels.steps[k];
             for log in slots.iter().map(|slot| if k == 0 { slot.encoded.log() } else { &slot.logs[k] }) {
@@ -159,17 +159,17 @@ impl<R: Real> Slots<R> {
     }
 }
 
-/// Rows of a wave. They depend on the plan alone, since they decide the order of sums.
+/// Rows of a wave. They depend on the plan only, since they determine the order of sums.
 fn wave_rows<R: Real>(kernels: &Kernels<'_, R>) -> usize {
     (WAVE_BYTES / row_bytes(kernels)).clamp(GROUP_ROWS, WAVE_ROWS)
 }
 
-/// Bytes of a row that are kept until its wave is through.
+/// Bytes per row kept until its wave is finished.
 fn row_bytes<R: Real>(kernels: &Kernels<'_, R>) -> usize {
     (kernels.encoded_numbers() + kernels.logged_numbers()) * size_of::<R>() + SAMPLE_BYTES
 }
 
-/// Cuts the work into groups, and these into waves.
+/// Splits the work into groups, and these into waves.
 fn waves<R: Real>(kernels: &Kernels<'_, R>, projector: &dyn Projector, work: &Work<'_>) -> Vec<Vec<Group>> {
     let mut groups: Vec<(Group, usize)> = vec![];
     let (mut start, mut rows) = (0, 0);
@@ -212,13 +212,13 @@ fn waves<R: Real>(kernels: &Kernels<'_, R>, projector: &dyn Projector, work: &Wo
     waves
 }
 
-/// Parts of `rows` that are no longer than [`GROUP_ROWS`].
+/// Splits `rows` into parts no longer than [`GROUP_ROWS`].
 fn cut(rows: Range<usize>) -> impl Iterator<Item = Range<usize>> {
     rows.clone().step_by(GROUP_ROWS).map(move |start| start..(start + GROUP_ROWS).min(rows.end))
 }
 
 impl<R: Real> Slot<R> {
-    /// Samples `groups`, which the encoder then goes through.
+    /// Samples `groups`, as input of the encoder.
     fn begin(&mut self, kernels: &Kernels<'_, R>, projector: &dyn Projector, work: &Work<'_>, groups: &[Group]) {
         self.samples.points.clear();
         self.samples.weights.clear();
@@ -230,7 +230,7 @@ impl<R: Real> Slot<R> {
         self.encoded.begin(kernels, &self.samples.points);
     }
 
-    /// Once `groups` are encoded: forward and backward of all that follows, group by group.
+    /// Forward and backward of all stages after the encoder, group by group.
     fn learn_all(
         &mut self,
         kernels: &Kernels<'_, R>,
@@ -270,7 +270,7 @@ impl<R: Real> Slot<R> {
         if let Some(&last) = points.last()
             && kernels.mixes_rays()
         {
-            // Whole vectors: the last row is repeated with no weight.
+            // Whole vectors: the last row is repeated with weight 0.
             let padded = start + (points.len() - start).next_multiple_of(16);
             points.resize(padded, last);
         }
@@ -278,7 +278,7 @@ impl<R: Real> Slot<R> {
         self.placed.push([start..points.len(), counted..self.counts.len()]);
     }
 
-    /// What follows the encoder, for the group placed as number `at`.
+    /// All stages after the encoder, for the group with index `at`.
     fn learn(
         &mut self,
         kernels: &Kernels<'_, R>,
@@ -290,7 +290,7 @@ impl<R: Real> Slot<R> {
     ) {
         let [rows, counts] = self.placed[at].clone();
         if rows.is_empty() {
-            // Rays without samples still have something measured that they do not explain.
+            // Rays without samples still have a measured value that they do not explain.
             if let Group::Rays(range) = group {
                 self.mu.clear();
                 self.dmu.clear();
@@ -302,7 +302,7 @@ impl<R: Real> Slot<R> {
             Group::Rays(_) => Belong::ToRays,
             Group::Points(_) | Group::Blocks(..) => Belong::Nowhere,
         };
-        // A ray or block of more rows than a group has goes through in parts: what a worker holds does not grow with it.
+        // A ray or block larger than a group is processed in parts, so that a worker's memory does not grow with it.
         let parts: Vec<(usize, Vec<usize>)> = match (group, kernels.mixes_rays()) {
             (Group::Rays(_), false) => vec![(rows.start, self.counts[counts.clone()].to_vec())],
             _ => cut(rows.clone()).map(|part| (part.start, even_tiles(part.len()))).collect(),
@@ -328,7 +328,7 @@ impl<R: Real> Slot<R> {
                 let work = &work.priors[*number];
                 let (points, scale) = (work.prior.blocks().points(), work.scale());
                 let blocks = self.mu.chunks_exact(points).zip(self.dmu.chunks_exact_mut(points));
-                // What follows the last block is padding.
+                // Rows after the last block are padding.
                 for (mu, dmu) in blocks.take(range.len()) {
                     self.prior += scale * work.prior.block(mu, scale, dmu);
                 }
@@ -345,7 +345,7 @@ impl<R: Real> Slot<R> {
         }
     }
 
-    /// Losses of `rays`, whose rows begin at `first` of the slot's.
+    /// Losses of `rays`, whose rows begin at `first` of the slot.
     fn ray_loss(
         &mut self,
         projector: &dyn Projector,

@@ -10,8 +10,8 @@ use serde_json::json;
 
 /// List the backends of this machine: CPU instructions and speed, GPU adapters.
 ///
-/// The standard reconstruction is a small one with total variation. It takes as much work on every machine, so that its time compares
-/// machines; a front of methods keeps it, too.
+/// The standard reconstruction is a small total-variation run. Its work is the same on every machine, so its time
+/// compares machines; fronts of methods record it, too.
 #[derive(Args)]
 pub struct BackendsArgs {
     /// Print one JSON object.
@@ -39,7 +39,7 @@ impl BackendsArgs {
     }
 }
 
-/// An adapter and its limits.
+/// One line about an adapter and its limits.
 fn line(a: &Adapter) -> String {
     let bytes = |n: u64| out::bytes(n);
     let subgroups = a.subgroups.map_or(String::new(), |[least, most]| match least == most {

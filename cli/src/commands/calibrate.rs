@@ -188,7 +188,7 @@ pub struct Shown {
 }
 
 impl Shown {
-    /// Starts now.
+    /// Starts the clock.
     pub fn new() -> Self {
         Self { progress: Mutex::new(Progress::new("calibrate", None)), begin: Instant::now() }
     }
@@ -209,7 +209,7 @@ impl Watch for Shown {
 /// A warning: with this geometry the views contradict each other.
 #[derive(Debug, Clone, Serialize)]
 pub struct Suspicion {
-    /// The kind, as in other warnings about a scan.
+    /// The kind, as for other warnings about a scan.
     kind: &'static str,
     /// The finding, with figures.
     found: String,

@@ -53,7 +53,7 @@ fn help() -> String {
     format!("Specs to compare, in the order of the table. Each: {}", specs::help())
 }
 
-/// Files beside the runs.
+/// Files besides the runs.
 const FILES: [&str; 3] = ["table.md", "table.json", "compare.png"];
 
 /// The content of `table.json`.
@@ -63,7 +63,7 @@ struct Report<'a> {
     methods: Vec<Entry>,
 }
 
-/// What all runs share.
+/// Settings shared by all runs.
 #[derive(Serialize)]
 struct Shared<'a> {
     version: &'static str,
@@ -93,7 +93,7 @@ struct Entry {
 
 impl CompareArgs {
     pub fn run(self, general: &General) -> Result<()> {
-        // Whatever is wrong with the input is told before anything is made.
+        // Errors in the input are reported before anything is created.
         let methods = self.methods()?;
         let input = trial::input(&self.scan, &self.protocol)?;
         methods.iter().try_for_each(|m| specs::check_held_out(&m.loaded, m.plan.as_ref(), &input.held))?;
@@ -117,7 +117,7 @@ impl CompareArgs {
             let part = format!("{} ({} of {})", cell.method.name, i + 1, cells.len());
             entries.push(entry(cell, start, part, general)?);
         }
-        // Without any result there is no comparison: an earlier one stays.
+        // Without any result there is no comparison: an earlier one is kept.
         if entries.iter().all(|e| e.outcome.figures.is_none()) {
             let why = |e: &Entry| format!("{}: {}", e.name, e.outcome.error.as_deref().unwrap_or("no result"));
             let why: Vec<String> = entries.iter().map(why).collect();
@@ -225,10 +225,10 @@ fn shown(entries: &[Entry]) -> Vec<Shown> {
     results.map(|(e, f)| Shown { name: e.name.clone(), psnr: f.psnr(), run: e.run.clone() }).collect()
 }
 
-/// What the folder of a comparison holds.
+/// The contents of a comparison's folder.
 const CONTENTS: Contents = Contents { known, progressed };
 
-/// Whether a comparison may have written this: one of its files, or the folder of a run.
+/// Whether a comparison may have written this path: one of its files, or a run's folder.
 fn known(path: &Path) -> bool {
     let name = path.file_name().unwrap_or_default();
     let own = FILES.iter().any(|f| name == *f) || conefield_io::is_unfinished(name) || conefield_io::is_aside(name);

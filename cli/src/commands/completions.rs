@@ -37,7 +37,7 @@ impl CompletionsArgs {
         if let Some(shell) = self.shell {
             generate(shell, &mut command, "conefield", &mut script);
         }
-        // It is for a shell, to the byte.
+        // Written byte for byte, as the reader is a shell.
         match std::io::stdout().write_all(&script) {
             Err(e) if e.kind() != ErrorKind::BrokenPipe => Err(Error::io("standard output", e)),
             _ => Ok(()),

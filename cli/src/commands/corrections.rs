@@ -1,4 +1,4 @@
-//! The option that asks for corrections.
+//! The option for corrections.
 
 use clap::Args;
 use conefield_core::Result;
@@ -18,7 +18,7 @@ pub struct CorrectionOptions {
 }
 
 impl CorrectionOptions {
-    /// The corrections that the options name.
+    /// The corrections selected by the options.
     pub fn corrections(&self) -> Result<Corrections> {
         Corrections::parse(&self.correct)
     }

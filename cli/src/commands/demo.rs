@@ -119,7 +119,7 @@ impl DemoArgs {
     fn reckon(&self) -> Result<()> {
         let (side, views) = (u64::from(self.size), usize::from(self.views));
         let (pixels, voxels) = (4 * side * side * u64::from(self.views), side.pow(3));
-        // What is simulated from and the first two results are held beside the run's own.
+        // The simulated volume and the first two results are held in addition to the run's memory.
         let size = ScanSize { pixels, voxels, test_pixels: 0, reading: 12 * voxels, views };
         let run = memory::Run { reference: true, ..memory::Run::on(size) };
         [VOXELS, FIELD].iter().try_for_each(|spec| {
@@ -139,7 +139,7 @@ impl DemoArgs {
         let mut plan = method::plan(&loaded, &backend)?;
         let job = Job {
             seed: self.seed,
-            // Passes over the views end by themselves, in seconds.
+            // Passes over the views end by themselves, within seconds.
             limits: Limits { seconds: (spec == FIELD).then_some(self.seconds), ..Limits::default() },
             ..Job::new(scan, &backend)
         };

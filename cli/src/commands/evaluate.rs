@@ -77,7 +77,7 @@ impl EvaluateArgs {
         out::say(&parts.into_iter().flatten().collect::<Vec<_>>().join("\n\n"))
     }
 
-    /// The agreement of two label maps.
+    /// The Dice scores of two label maps.
     fn label_maps(&self) -> Result<Evaluation> {
         let read =
             |path: &PathBuf| label_map(&path.display().to_string(), conefield_io::read_volume(path)?.data.view());
@@ -100,7 +100,7 @@ impl EvaluateArgs {
             None => None,
             Some(segmenter) => {
                 signals::listen()?;
-                // What a segmenter finds may depend on the size of voxels: both volumes come with the same.
+                // A segmentation may depend on the voxel size: both volumes get the same.
                 let volume = Volume { data: volume.data, grid: reference.grid, affine: reference.affine };
                 let [volume, reference] = [volume, reference].map(|v| self.in_hu(v));
                 let volume = segmenter.run(&place, &volume)?;
@@ -135,7 +135,7 @@ pub fn lines(s: &Scores) -> String {
     out::table(&rows, &[])
 }
 
-/// The agreement of label maps as text.
+/// Dice scores as text.
 fn dice_lines(d: &Dice) -> String {
     let mut rows = vec![["label", "dice", "voxels", "reference"].map(str::to_owned).to_vec()];
     for l in &d.labels {

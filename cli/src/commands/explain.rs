@@ -29,7 +29,7 @@ pub struct ExplainArgs {
 impl ExplainArgs {
     pub fn run(self) -> Result<()> {
         let loaded = specs::read(&self.spec, &self.sets)?;
-        // The weights that an initializer names are not read here: a spec is explained without them.
+        // Weights named by an initializer are not read here: a spec is explained without them.
         let plan = method::plan_without_files(&loaded, self.backend.open()?.as_ref())?;
         let explanation = match &self.scan {
             None => Explanation::new(&loaded, plan.as_ref(), None)?,

@@ -45,7 +45,7 @@ enum After {
     Normalizers,
 }
 
-/// Components that are drawn, one per colour.
+/// Number of components drawn, one per colour.
 const DRAWN: usize = 3;
 
 impl FeaturesArgs {
@@ -116,7 +116,7 @@ impl FeaturesArgs {
     }
 }
 
-/// The middle slices across x, y and z.
+/// The middle slices perpendicular to x, y and z.
 fn planes(grid: &VoxelGrid) -> [Part; 3] {
     std::array::from_fn(|cut| {
         std::array::from_fn(|k| {
@@ -126,7 +126,7 @@ fn planes(grid: &VoxelGrid) -> [Part; 3] {
     })
 }
 
-/// The voxels of a part, as an array has them.
+/// The voxels of a part, in array order.
 fn indices([xs, ys, zs]: &Part) -> impl Iterator<Item = [usize; 3]> {
     let (ys, zs) = (ys.clone(), zs.clone());
     xs.clone().flat_map(move |x| {
@@ -135,14 +135,14 @@ fn indices([xs, ys, zs]: &Part) -> impl Iterator<Item = [usize; 3]> {
     })
 }
 
-/// Values at the points that are held as slices; the other points are `outside`.
+/// Slices with values at the points in `held`; other points get `outside`.
 fn slices(grid: &VoxelGrid, planes: &[Part; 3], held: &[bool], values: &[f32], outside: f32) -> MiddleSlices {
     let mut slices = MiddleSlices::new(*grid);
     let mut values = values.iter();
     let mut held = held.iter();
     for part in planes {
         let shape = [part[0].len(), part[1].len(), part[2].len()];
-        // In the order of `indices`, which is the array's.
+        // In the order of `indices`, which is array order.
         let plane = Array3::from_shape_simple_fn(shape, || match held.next() {
             Some(true) => values.next().copied().unwrap_or(outside),
             _ => outside,
@@ -152,7 +152,7 @@ fn slices(grid: &VoxelGrid, planes: &[Part; 3], held: &[bool], values: &[f32], o
     slices
 }
 
-/// From the 1st to the 99th percentile as 0 to 1.
+/// Scales the range from the 1st to the 99th percentile to 0 to 1.
 fn stretched(values: &[f32]) -> Vec<f32> {
     let mut sorted = values.to_vec();
     sorted.sort_unstable_by(f32::total_cmp);

@@ -69,7 +69,7 @@ fn run(path: &Path) -> Result<Value> {
     let mut found = json!({ "kind": "run", "standing": run.standing(), "files": files });
     if let Some(record) = run.record() {
         let mut record = record.clone();
-        // What a machine reads stands in the file itself.
+        // Programs read the record from its own file.
         if let Some(map) = record.as_object_mut() {
             ["memory", "backend", "plan"].iter().for_each(|key| drop(map.remove(*key)));
         }
@@ -220,7 +220,7 @@ fn title(path: &Path, s: &Scan, survey: &Survey) -> String {
     )
 }
 
-/// RTK's geometry file says nothing about pixels, projections and volume.
+/// RTK's geometry file has no pixels, projections or volume.
 fn geometry(path: &Path) -> Result<Value> {
     let views = conefield_io::read_rtk_geometry(path, [1.0; 2], [0.0; 2])?;
     let count = views.len();
@@ -261,7 +261,7 @@ fn rounded(value: &Value) -> Value {
     }
 }
 
-/// A line that people can read: what is longer is cut.
+/// A line of readable length: longer text is cut.
 fn shown(text: &str) -> String {
     let length = text.chars().count();
     if length <= LONG {
@@ -271,10 +271,10 @@ fn shown(text: &str) -> String {
     format!("{begin}… ({length} characters, with --json all of them)")
 }
 
-/// Characters of a line that people still read.
+/// Maximum number of characters of such a line.
 const LONG: usize = 400;
 
-/// One line a key; tables become dotted keys. Warnings are left to [`warnings`].
+/// One line per key; tables become dotted keys. [`warnings`] prints the warnings.
 pub fn lines(value: &Value) -> String {
     fn walk(prefix: &str, value: &Value, rows: &mut Vec<Vec<String>>) {
         match value {
@@ -301,7 +301,7 @@ pub fn lines(value: &Value) -> String {
     let mut rest = value.clone();
     if let Value::Object(map) = &mut rest {
         map.remove("kind");
-        // People read them as sentences.
+        // They are printed as sentences.
         map.remove("warnings");
     }
     walk("", &rest, &mut rows);

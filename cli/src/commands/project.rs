@@ -61,7 +61,7 @@ impl ProjectArgs {
         let (voxels, size) = (conefield_io::volume_voxels(&self.volume)?, conefield_io::scan_size(&self.like)?);
         let reading = Memory { scan: 4 * size.pixels + size.reading, volume: 8 * voxels, ..Memory::default() };
         let header = size.header();
-        // Predicted views beside the measured ones.
+        // Predicted views in addition to the measured ones.
         let buffers = 4 * size.pixels + projector.scratch(&header, header.views);
         let projecting = Memory { scan: 4 * size.pixels, volume: 4 * voxels, buffers, ..Memory::default() };
         let memory = Memory::most(&[reading, projecting]);
@@ -70,7 +70,7 @@ impl ProjectArgs {
         let volume = conefield_io::read_volume(&self.volume)?;
         let scan = self.chosen(files::scan(&self.like)?)?;
         let mut geometry = scan.geometry.clone();
-        // Of what is read here only NumPy arrays have no affine.
+        // Of the readable formats only NumPy arrays have no affine.
         geometry.volume = projection::placed(&volume, &scan.geometry.volume, volume.affine.is_some());
         if let Some(odd) = projection::oddity(&geometry.volume, &scan.geometry.volume) {
             tracing::warn!("{}: {odd}", self.volume.display());

@@ -41,7 +41,7 @@ pub struct RunProtocol {
 }
 
 impl RunProtocol {
-    /// The reference, if there is one, on the grid of `scan`.
+    /// The reference on the grid of `scan`, if there is one.
     pub fn reference(&self, scan_path: &Path, scan: &Scan) -> Result<Option<Volume>> {
         let Some(path) = &self.reference else { return Ok(None) };
         input::reference(path, scan_path, scan).map(Some)
@@ -57,7 +57,7 @@ impl RunProtocol {
         input::held_out(self.hold_out.as_ref(), n, "command line", "--hold-out")
     }
 
-    /// The same options for a child process. Flag and value are one word, since a value may begin with a dash.
+    /// The same options for a child process. Flag and value form one argument, since a value may begin with a dash.
     pub fn arguments(&self) -> Vec<OsString> {
         let Self { checkpoint_every, sets, ends, budget, backend, reference, peak, hold_out, seed } = self;
         let all = [

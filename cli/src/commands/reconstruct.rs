@@ -87,13 +87,13 @@ fn spec_help() -> String {
     format!("{}; optional with --budget, which then chooses the best that fits", specs::help())
 }
 
-/// The prefix of an error on standard output.
+/// Prefix of an error on standard output.
 pub const FAILED: &str = "failed: ";
 
-/// Seconds between two live pictures that --watch shows.
+/// Seconds between two live pictures for --watch.
 const WATCHED: f64 = 5.0;
 
-/// A held-out error above this may come from a wrong geometry.
+/// A held-out error above this may be due to a wrong geometry.
 const DOUBTFUL: f64 = 0.05;
 
 impl ReconstructArgs {
@@ -112,7 +112,7 @@ impl ReconstructArgs {
         done
     }
 
-    /// Ends the command as wrong use, with advice.
+    /// Exits with a usage error and advice.
     fn without_a_spec() -> ! {
         let mut whole = crate::Cli::command();
         whole.build();
@@ -130,10 +130,10 @@ impl ReconstructArgs {
         if !self.resume {
             folder.may_begin(self.force)?;
         }
-        // A spec holds the name of this file as text; a name that is not UTF-8 would be stored as another one.
+        // A spec stores this file name as text; a name that is not UTF-8 would be stored as another one.
         self.init.as_deref().map(boundary::text).transpose()?;
         let backend = self.protocol.backend.open()?;
-        // What is wrong with a spec, or weights that cannot be read or do not fit, is told before anything is made.
+        // An invalid spec, and weights that cannot be read or do not fit, are reported before anything is created.
         let wish = match (self.asked(), &self.front) {
             (Some((spec, sets)), _) => Wish::Method(self.method(&spec, &sets, backend.as_ref())?),
             (None, Some(path)) => Wish::OneOf(Front::read(path)?),
@@ -155,7 +155,7 @@ impl ReconstructArgs {
         let identity = identity(&loaded, &self.protocol, &input.work.held, &input.record)?;
         let outline = plan.outline();
         signals::listen()?;
-        // Whoever started this run as a part has ended: nothing of it has been written yet.
+        // The parent process has ended, and nothing of this run has been written yet.
         if signals::caught().is_some() {
             return Err(Error::Aborted { part: "preparation".into() });
         }
@@ -248,7 +248,7 @@ impl ReconstructArgs {
         Ok(Reading { work, record, load_s: begin.elapsed().as_secs_f64() })
     }
 
-    /// Chooses what will run: the requested method or, within a budget, one of the front.
+    /// Chooses the method to run: the requested one or, within a budget, one of the front.
     fn choose(
         &self,
         folder: &RunFolder,
@@ -273,7 +273,7 @@ impl ReconstructArgs {
         Ok(Chosen { method, schedule, resumed, spent })
     }
 
-    /// What is shown and recorded during the run.
+    /// Display and recording of the run.
     fn progress(
         &self,
         folder: &RunFolder,
@@ -325,7 +325,7 @@ impl ReconstructArgs {
         Ok(Written { parameters, export_s, picture_s, score_s: start.elapsed().as_secs_f64(), scores })
     }
 
-    /// The requested spec and its changed settings. A resumed run knows its choice.
+    /// The requested spec and its changed settings. A resumed run reads its choice from its folder.
     fn asked(&self) -> Option<(String, Vec<String>)> {
         match &self.spec {
             Some(spec) => Some((spec.clone(), self.protocol.sets.clone())),
@@ -341,7 +341,7 @@ impl ReconstructArgs {
             reference: self.protocol.reference.is_some(),
             resume: self.resume,
         };
-        // A run that is resumed without a spec has it in its own.
+        // A run resumed without a spec reads the start from its own spec.
         let start = self.init.as_deref().filter(|_| self.spec.is_some() || !self.resume);
         method::planned(&|sets| specs::read(spec, sets), sets, start, backend, &run)
     }
@@ -362,18 +362,18 @@ struct Reading {
     load_s: f64,
 }
 
-/// What will run.
+/// The method to run.
 struct Chosen {
     method: Planned,
     /// The plan of a budget.
     schedule: Option<Schedule>,
     /// The file for metrics of an interrupted run, and the checkpoint to continue from.
     resumed: Option<((PathBuf, File), Resume)>,
-    /// Seconds of training before that.
+    /// Seconds of training before the checkpoint.
     spent: f64,
 }
 
-/// What must be the same to resume a run or to count it as finished.
+/// Properties that must match to resume a run or to count it as finished.
 pub fn identity(
     loaded: &Loaded,
     protocol: &RunProtocol,

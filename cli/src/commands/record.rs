@@ -12,7 +12,7 @@ use conefield_tradeoff::trial::ScanRecord;
 use serde::Serialize;
 use std::path::Path;
 
-/// What is needed to repeat a run, and its result.
+/// Everything needed to repeat a run, and its result.
 #[derive(Debug, Serialize)]
 pub struct RunRecord {
     pub version: &'static str,
@@ -38,24 +38,24 @@ pub struct RunRecord {
     pub memory: Memory,
     pub peak_bytes: Option<u64>,
     pub steps: u64,
-    /// How often training diverged and went back.
+    /// Number of returns to an earlier state after training diverged.
     pub rollbacks: u64,
-    /// Reading the inputs.
+    /// Seconds to read the inputs.
     pub load_s: f64,
-    /// Solving without training: before the first step, and for metrics.
+    /// Seconds of solving without training: before the first step, and for metrics.
     pub prepare_s: f64,
     pub train_s: f64,
     #[serde(flatten)]
     pub written: Written,
-    /// From the start of the command to this record. Before a --resume only training counts.
+    /// Seconds from the start of the command to this record. Before a --resume only training counts.
     pub total_s: f64,
     pub samples: u64,
     /// For methods that take samples.
     pub samples_per_s: Option<f64>,
     pub loss: Option<f64>,
-    /// Of the result.
+    /// Held-out error of the result.
     pub held_out: Option<f64>,
-    /// The step of the result, if held-out views chose it.
+    /// The step of the result, if held-out views selected it.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub best_step: Option<u64>,
     pub peak: f64,
@@ -64,16 +64,16 @@ pub struct RunRecord {
 /// Written files and the time for them.
 #[derive(Debug, Serialize)]
 pub struct Written {
-    /// For a field.
+    /// Number of parameters of a field.
     pub parameters: usize,
-    /// Writing weights and voxels.
+    /// Seconds to write weights and voxels.
     pub export_s: f64,
     pub picture_s: f64,
     pub score_s: f64,
     pub scores: Option<Scores>,
 }
 
-/// Share of a budget below which it counts as not used up.
+/// Below this share a budget counts as not used up.
 const USED: f64 = 0.8;
 
 /// The record as text.

@@ -94,7 +94,7 @@ impl ReportArgs {
     /// Refuses a page that does not fit into memory: one volume at a time beside its scan, and the data of the page.
     fn check_memory(&self, groups: &[Group], options: &Options) -> Result<()> {
         let all: u64 = groups.iter().flat_map(Group::voxels).sum::<u64>() * 2;
-        // Packed at worst as they are, as text, and before that in two halves.
+        // Worst case: incompressible data as text, and before that its two halves.
         let packed = 2 * all.min(self.embed);
         let moments = groups.iter().map(|g| g.memory(options, packed)).collect::<Result<Vec<_>>>()?;
         Memory::most(&moments.concat()).check(|_| vec![])
@@ -130,12 +130,12 @@ impl ReportArgs {
     }
 }
 
-/// The page of a run that goes on: curves, spec and the live picture, without what large files hold.
+/// The page of an unfinished run: curves, spec and the live picture, without large files.
 pub fn standing(folder: &Path) -> Result<String> {
     let found = [RunOnDisk::read(folder)?];
     let mut page = Page::default();
     page.runs = runs::told(&found, &mut page.warnings);
-    // A run that goes on is not interrupted, as its files alone would say.
+    // The run is still active, so the warning about an interrupted run does not apply.
     page.warnings.clear();
     page.title = runs::title(&page);
     let live = folder.join("live.png");

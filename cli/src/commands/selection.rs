@@ -1,4 +1,4 @@
-//! The options that take part of a scan.
+//! The options that select part of a scan.
 
 use clap::Args;
 use conefield_io::{Lines, Selection, ViewChoice};
@@ -38,7 +38,7 @@ impl SelectionOptions {
         Selection { views, turns, flip_rows, flip_columns, rows, columns, bin: bin.into() }
     }
 
-    /// The first option that was given.
+    /// The first option given.
     pub fn named(&self) -> Option<&'static str> {
         let all = [
             ("--views", self.views.is_some()),

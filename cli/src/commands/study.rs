@@ -57,13 +57,13 @@ pub struct StudyArgs {
     json: bool,
 }
 
-/// Time between two attempts at a lock of another process.
+/// Time between two attempts to take a lock held by another process.
 const LOOK: Duration = Duration::from_millis(50);
 
-/// Jobs of an array by default: the limit of an unconfigured Slurm.
+/// Default maximum number of jobs of an array: the limit of an unconfigured Slurm.
 const MOST_JOBS: usize = 1000;
 
-/// The study's folder, for this process alone or shared with others.
+/// Access to the study's folder, exclusive or shared with other processes.
 enum Hold {
     Alone(Lease),
     Shared(SharedLease),
@@ -71,7 +71,7 @@ enum Hold {
 
 impl StudyArgs {
     pub fn run(self, general: &General) -> Result<()> {
-        // Whatever is wrong with the input is told before anything is made.
+        // Errors in the input are reported before anything is created.
         let study = Study::read(&self.study)?;
         let inputs = study.methods.iter().fold(Inputs::of(study.inputs()), |i, m| i.and_spec(&m.loaded));
         if let Some(file) = &self.slurm {
@@ -95,7 +95,7 @@ impl StudyArgs {
         }
     }
 
-    /// The folder to work in. Refuses one that holds other files, or an earlier study without --force or --resume.
+    /// Takes the folder. Refuses one with other files, or an earlier study without --force or --resume.
     fn take(&self, work: &Work<'_>, cells: &[Cell], inputs: &Inputs) -> Result<Hold> {
         let mut lease = self.shard.is_none().then(|| Lease::take(&self.output, CONTENTS)).transpose()?;
         let any = work.layout.look()?;
@@ -124,7 +124,7 @@ impl StudyArgs {
     /// Writes tables and pictures when all runs have ended, and reports the result.
     fn finish(&self, work: &Work<'_>, lease: Lease) -> Result<()> {
         if self.shard.is_some() {
-            // What others made is of this study, too.
+            // Runs of other processes must belong to this study, too.
             work.check_runs(&work.study.cells())?;
         }
         let report = work.report()?;
@@ -139,7 +139,7 @@ impl StudyArgs {
         refuse_failures(&report.failures(), work.study.cells().len())
     }
 
-    /// Reports the result of this share while others are not finished.
+    /// Reports the result of this share while other shares are unfinished.
     fn leave_to_others(&self, work: &Work<'_>, cells: &[Cell]) -> Result<()> {
         let failed: Vec<String> = cells.iter().filter_map(|c| work.failure(c)).collect();
         let done = cells.len() - failed.len();
@@ -192,11 +192,12 @@ struct Work<'a> {
 }
 
 impl Work<'_> {
-    /// Refuses existing scans that cannot be read or do not suit a method, and methods that need held-out views without any.
+    /// Refuses existing scans that are unreadable or do not suit a method, and methods that need held-out views if
+    /// there are none.
     fn check_scans(&self) -> Result<()> {
         for (case, c) in self.study.cases.iter().enumerate() {
             let cell = Cell { case, seed: self.study.seeds[0], method: 0 };
-            // Of what is simulated the volume has been read.
+            // For simulations the volume has been read already.
             let held = match c.source {
                 Source::Scan { .. } => self.input(&cell)?.held,
                 Source::Simulated(_) => self.study.protocol.hold_out.iter().map(|_| 0).collect(),
@@ -206,10 +207,10 @@ impl Work<'_> {
         Ok(())
     }
 
-    /// Refuses simulated scans and runs of another study in the folder.
+    /// Refuses simulated scans and runs in the folder that belong to another study.
     fn check_runs(&self, cells: &[Cell]) -> Result<()> {
         for cells in cells.chunk_by(same_scan) {
-            // A scan that is not there yet comes again to the same bits, and is looked at then.
+            // A missing scan is simulated again bit-identically, and is checked then.
             if self.scan(&cells[0]).exists() && cells.iter().any(|c| self.run(c).exists()) {
                 let input = self.input(&cells[0])?;
                 cells.iter().try_for_each(|c| self.start(c, &input).map(drop))?;
@@ -218,7 +219,7 @@ impl Work<'_> {
         Ok(())
     }
 
-    /// Simulates missing scans and does every unfinished run.
+    /// Simulates missing scans and does all unfinished runs.
     fn carry_out(&self, cells: &[Cell]) -> Result<()> {
         let begin = Instant::now();
         let (mut number, mut made) = (0, 0);
@@ -244,7 +245,7 @@ impl Work<'_> {
         Ok(())
     }
 
-    /// Does a run. A failure is recorded in its place.
+    /// Does a run. A failure is recorded in its folder.
     fn make_run(&self, cell: &Cell, start: Start, part: String) -> Result<()> {
         let (scan, run, protocol, failure) =
             (self.scan(cell), self.run(cell), self.protocol(cell), self.failure_file(cell));
@@ -260,7 +261,7 @@ impl Work<'_> {
         conefield_io::write_text_atomic(&failure, &error)
     }
 
-    /// Simulates the scan of a run unless it exists or another process is doing so.
+    /// Simulates the scan of a run, unless it exists or another process is simulating it.
     fn make_scan(&self, cell: &Cell) -> Result<()> {
         let Source::Simulated(simulation) = &self.study.cases[cell.case].source else { return Ok(()) };
         let (scan, all) = (self.scan(cell), self.layout.scans());
@@ -275,7 +276,7 @@ impl Work<'_> {
         if signals::caught().is_some() { Err(Error::Stopped { part }) } else { Ok(()) }
     }
 
-    /// Waits until no process writes the run: the child of a killed process ends after its step.
+    /// Waits until no process writes to the run: the child of a killed process ends after its step.
     fn await_run(&self, cell: &Cell, part: &str) -> Result<()> {
         let run = self.run(cell);
         if run.exists() {
@@ -336,7 +337,7 @@ impl Work<'_> {
 
     /// The error of a failed run.
     fn failure(&self, cell: &Cell) -> Option<String> {
-        // One that was made alone since then has a result.
+        // A run repeated separately since then has a result.
         let failed = !is_done(&self.run(cell));
         let text = failed.then(|| fs::read(self.failure_file(cell)).ok()).flatten();
         text.map(|text| String::from_utf8_lossy(&text).into_owned())
@@ -394,12 +395,12 @@ impl Work<'_> {
     }
 }
 
-/// Puts runs on one scan beside each other.
+/// Whether two runs use the same scan.
 fn same_scan(a: &Cell, b: &Cell) -> bool {
     (a.case, a.seed) == (b.case, b.seed)
 }
 
-/// The lock on `folder`, as soon as no other process has it.
+/// Waits for the lock on `folder`.
 fn await_lock(folder: &Path, part: &str) -> Result<conefield_io::FolderLock> {
     let mut told = false;
     loop {

@@ -86,7 +86,7 @@ impl TradeoffArgs {
         if self.show_levers {
             return out::say(levers::LEVERS.trim_end());
         }
-        // Whatever is wrong with the input is told before anything is made.
+        // Errors in the input are reported before anything is created.
         let Some(output) = &self.output else { return Err(Error::invalid("tradeoff", "-o", "nothing", "a folder")) };
         let levers = match &self.levers {
             Some(path) => Levers::read(path, &Known)?,
@@ -177,7 +177,7 @@ impl TradeoffArgs {
             spec: &candidate.spec,
             output,
             protocol: &protocol,
-            // What an interrupted trial left.
+            // Replaces the remains of an interrupted trial.
             more: &["--force"],
         };
         trial.run(part.clone(), general)

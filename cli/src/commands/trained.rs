@@ -1,4 +1,4 @@
-//! What commands on the field of a finished run share.
+//! Shared parts of commands on the field of a finished run.
 
 use crate::backend::{self, BackendChoice};
 use crate::files;
@@ -21,7 +21,7 @@ pub struct Trained {
     pub backend: BackendChoice,
 }
 
-/// Its field.
+/// The field of a run.
 pub struct OpenedField {
     pub file: PathBuf,
     pub field: TrainedField,
@@ -31,7 +31,7 @@ pub struct OpenedField {
 }
 
 impl Trained {
-    /// Reads the field, if it fits into memory together with `buffers` bytes.
+    /// Reads the field if it fits into memory together with `buffers` bytes.
     pub fn open(&self, buffers: u64) -> Result<OpenedField> {
         let file = if self.run.is_dir() { self.run.join("weights.safetensors") } else { self.run.clone() };
         let volume = self.run.join("volume.nii.gz");
@@ -50,13 +50,13 @@ impl Trained {
 }
 
 impl OpenedField {
-    /// The memory of the field and `buffers` bytes. Refuses what does not fit.
+    /// The memory of the field plus `buffers` bytes. Refuses a field that does not fit.
     pub fn memory(&self, buffers: u64) -> Result<Memory> {
         memory(self.bytes, buffers)
     }
 }
 
-/// Memory of the file and its numbers, then of these and the model.
+/// Memory of the file with its numbers, then of the numbers with the model.
 fn memory(bytes: u64, buffers: u64) -> Result<Memory> {
     let memory = Memory::most(&[Memory { model: 2 * bytes, buffers, ..Memory::default() }]);
     memory.check(|_| vec![]).map(|()| memory)

@@ -52,7 +52,8 @@ impl Trial<'_> {
             if let Some(status) = child.try_wait().map_err(io)? {
                 break status;
             }
-            // Ctrl-C reaches the child by itself; a signal to this process alone reaches it by the end of its input.
+            // Ctrl-C reaches the child directly; a signal to this process alone reaches it through the end of its
+            // input.
             if signals::caught().is_some() {
                 input = None;
             }

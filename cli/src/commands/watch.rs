@@ -1,4 +1,4 @@
-//! `reconstruct --watch`: the report's page of a run while it goes on, on the loopback address.
+//! `reconstruct --watch`: the report page of a running reconstruction, on the loopback address.
 
 use super::report::standing;
 use conefield_core::{Error, Result};
@@ -8,16 +8,16 @@ use std::path::{Path, PathBuf};
 use std::time::Duration;
 use tracing::{debug, info};
 
-/// Seconds after which a browser asks again.
+/// Refresh interval of the browser in seconds.
 const REFRESH: u64 = 5;
 
-/// How long a browser may take to ask, and longest question, in bytes.
+/// Time limit of a request, and maximum size of one in bytes.
 const PATIENCE: Duration = Duration::from_secs(2);
 const LONGEST: usize = 8 << 10;
 
-/// Serves the page of the run in `folder` on `port` (any free one for 0) until the process ends.
+/// Serves the page of the run in `folder` on `port` (any free port for 0) until the process ends.
 ///
-/// Only this machine reaches it, and only the page is there: one question, one answer, after each other.
+/// Only this machine can connect, and only the page is served, one request at a time.
 pub fn serve(folder: &Path, port: u16) -> Result<()> {
     let failed = |e| Error::io(PathBuf::from(format!("127.0.0.1:{port}")), e);
     let listener = TcpListener::bind((Ipv4Addr::LOCALHOST, port)).map_err(failed)?;
@@ -65,8 +65,8 @@ fn answer(mut stream: TcpStream, port: u16, folder: &Path) -> std::io::Result<()
     stream.write_all(body.as_bytes())
 }
 
-/// What is answered instead of the page. Another name of this machine than its own would let a page of the web read the run
-/// (DNS rebinding).
+/// The refusal of a request, if it is not answered with the page. Accepting other host names would let a web page read
+/// the run (DNS rebinding).
 fn refusal(asked: &str, port: u16) -> Option<(&'static str, &'static str)> {
     let mut lines = asked.split("\r\n");
     let question = lines.next().unwrap_or_default();

@@ -1,4 +1,4 @@
-//! What a spec says of the scene.
+//! Scene settings of a spec.
 
 use crate::error::{Result, ensure};
 use schemars::JsonSchema;
@@ -8,12 +8,12 @@ use serde::{Deserialize, Serialize};
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields, default)]
 pub struct SceneSettings {
-    /// Share of the unit cube's side that the longest side of the volume fills, in (0, 1]. Published codes leave
-    /// most of the cube empty; 1 spends every cell on the volume.
+    /// Share of the unit cube's side filled by the longest side of the volume, in (0, 1]. Published codes leave most of
+    /// the cube empty; 1 spends every cell on the volume.
     pub fill: f64,
-    /// The attenuation that stages see as 1.
+    /// The attenuation that counts as 1 for the field.
     pub attenuation: AttenuationScale,
-    /// Where in the volume the object can be.
+    /// Where the object can be inside the volume.
     pub support: SupportRule,
     /// Which of the encoder's channels are computed.
     pub levels: LevelRule,
@@ -32,7 +32,7 @@ impl Default for SceneSettings {
 impl SceneSettings {
     /// Refuses invalid settings.
     pub fn validate(&self) -> Result<()> {
-        // In a smaller part of the cube neighbouring positions would be the same number in single precision.
+        // With less, neighbouring positions would coincide in single precision.
         ensure((0.01..=1.0).contains(&self.fill), "spec", "scene.fill", self.fill, "0.01 to 1")?;
         if let AttenuationScale::Fixed(x) | AttenuationScale::Relative(x) = self.attenuation {
             ensure(x.is_finite() && x > 0.0, "spec", "scene.attenuation", x, "a positive finite number")?;
@@ -98,7 +98,7 @@ pub enum LevelRule {
     Needed,
 }
 
-/// Where in the volume the object can be.
+/// Where the object can be inside the volume.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
 #[serde(rename_all = "kebab-case")]
 pub enum SupportRule {
@@ -110,12 +110,12 @@ pub enum SupportRule {
     Carve,
 }
 
-/// The attenuation that stages see as 1.
+/// The attenuation that counts as 1 for the field.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(rename_all = "kebab-case")]
 pub enum AttenuationScale {
-    /// Four times the mean attenuation of the most absorbing rays over the longest side of the volume. It depends on the scan
-    /// alone, not on units, and is large enough for a field with values up to 1.
+    /// Four times the mean attenuation of the most absorbing rays over the longest side of the volume. It depends on
+    /// the scan only, not on units, and is large enough for a field with values up to 1.
     Scan,
     /// A multiple of the value for `scan`.
     Relative(f64),
@@ -124,8 +124,8 @@ pub enum AttenuationScale {
 }
 
 impl AttenuationScale {
-    /// In 1/mm, for a scan in units of `mm` millimetres and a volume whose longest side is `longest` mm. `top` gives the line
-    /// integral of the most absorbing rays.
+    /// The value in 1/mm, for a scan in units of `mm` millimetres and a volume whose longest side is `longest` mm.
+    /// `top` returns the line integral of the most absorbing rays.
     pub fn of(self, mm: f64, longest: f64, top: impl FnOnce() -> Result<f64>) -> Result<f64> {
         Ok(match self {
             Self::Scan => 4.0 * top()? / longest,
@@ -135,11 +135,11 @@ impl AttenuationScale {
     }
 }
 
-/// How an iterative method sees the scan.
+/// How an iterative method treats the scan.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields, default)]
 pub struct VoxelScene {
-    /// Where in the volume the object can be.
+    /// Where the object can be inside the volume.
     pub support: SupportRule,
     /// What lies beyond the volume.
     #[serde(skip_serializing_if = "SurroundRule::is_none")]

@@ -1,5 +1,5 @@
-//! Checks a spec as written against the registered stage types, so that a mistake is reported with its line,
-//! its path and the nearest valid name.
+//! Checks a spec as written against the registered stage types, so that a mistake is reported with its line, path and
+//! the nearest valid name.
 
 use super::LABEL;
 use super::one_of;
@@ -9,7 +9,7 @@ use crate::error::{Error, Result};
 use crate::registry::{Kind, find, names};
 use serde_json::Value;
 
-/// Refuses unknown keys, unknown types and values of another type than their setting has.
+/// Refuses unknown keys, unknown types and values of the wrong type.
 pub(super) fn spec(root: &Node) -> Result<()> {
     table(root, "spec")?;
     for (key, schema) in label() {
@@ -20,12 +20,12 @@ pub(super) fn spec(root: &Node) -> Result<()> {
     stage(root, Kind::Method, "")
 }
 
-/// Checks a stage: its type, then its settings. At the top of a spec, where `path` is empty, the spec's own keys stand beside
-/// them.
+/// Checks a stage: its type, then its settings. At the top of a spec (empty `path`) the spec's own keys are allowed
+/// too.
 fn stage(node: &Node, kind: Kind, path: &str) -> Result<()> {
     let known = names(kind);
     let types = || format!("a type: {}", listed(&known));
-    // The name of a type stands for its default settings.
+    // A type name stands for its default settings.
     let alone = node.text().is_some();
     let at = if alone { path.into() } else { join(path, "type") };
     let name = if alone { Some(node) } else { node.get("type") };
@@ -43,7 +43,7 @@ fn stage(node: &Node, kind: Kind, path: &str) -> Result<()> {
     object(node, &schema, &cx, path)
 }
 
-/// Where references of a schema lead, and what kind of stage it belongs to.
+/// Target of a schema's references, and the kind of stage it belongs to.
 pub(super) struct Context<'a> {
     root: &'a Value,
     kind: Option<Kind>,
@@ -54,7 +54,7 @@ impl<'a> Context<'a> {
         Self { root, kind }
     }
 
-    /// The schema that `schema` refers to, or itself.
+    /// The schema that `schema` refers to, or `schema` itself.
     pub(super) fn resolve<'b>(&'b self, schema: &'b Value) -> &'b Value {
         let target = schema["$ref"].as_str().and_then(|r| self.root.pointer(r.trim_start_matches('#')));
         target.unwrap_or(schema)
@@ -78,7 +78,7 @@ fn setting(node: &Node, schema: &Value, cx: &Context<'_>, path: &str) -> Result<
         if choices.iter().any(|s| setting(node, s, cx, path).is_ok()) {
             return Ok(());
         }
-        // Where only one choice is of this value's shape, its own message says more.
+        // If only one choice has this value's shape, its own message says more.
         let mut alike = choices.iter().filter(|s| shape_fits(node, s) && s["const"].is_null() && s["enum"].is_null());
         return match (alike.next(), alike.next()) {
             (Some(one), None) => setting(node, one, cx, path),
@@ -140,7 +140,7 @@ fn object(node: &Node, schema: &Value, cx: &Context<'_>, path: &str) -> Result<(
     required(node, schema, cx, path)
 }
 
-/// Refuses a table that lacks a key which has no default.
+/// Refuses a table that lacks a key without default.
 fn required(node: &Node, schema: &Value, cx: &Context<'_>, path: &str) -> Result<()> {
     let empty = serde_json::Map::new();
     let properties = schema["properties"].as_object().unwrap_or(&empty);
@@ -153,14 +153,14 @@ fn required(node: &Node, schema: &Value, cx: &Context<'_>, path: &str) -> Result
     Ok(())
 }
 
-/// Whether a schema says nothing about a value's type.
+/// Whether a schema does not restrict a value's type.
 fn is_open(schema: &Value) -> bool {
     schema
         .as_object()
         .is_none_or(|s| ["type", "properties", "anyOf", "oneOf", "const", "enum"].iter().all(|k| !s.contains_key(*k)))
 }
 
-/// Whether the value is of the type that the schema names.
+/// Whether the value has the type of the schema.
 fn shape_fits(node: &Node, schema: &Value) -> bool {
     let one = |name: &str| match (&node.kind, name) {
         (Is::Null, "null")
@@ -192,7 +192,7 @@ fn constants(schema: &Value, cx: &Context<'_>) -> Vec<Value> {
     all
 }
 
-/// In words, what a schema allows.
+/// Describes in words what a schema allows.
 fn wanted(schema: &Value, cx: &Context<'_>) -> String {
     let schema = cx.resolve(schema);
     if let Some(kind) = schema[NESTED].as_str().and_then(Kind::named) {
@@ -246,7 +246,7 @@ fn plain(value: &Value) -> String {
     value.as_str().map_or_else(|| value.to_string(), str::to_owned)
 }
 
-/// A text that is none of the texts allowed.
+/// Error for a text that is none of the allowed ones.
 fn misnamed(node: &Node, path: &str, allowed: &[Value]) -> Option<Error> {
     let names: Vec<&str> = allowed.iter().filter_map(Value::as_str).collect();
     let text = node.text().filter(|_| !names.is_empty())?;
@@ -272,7 +272,7 @@ fn unknown(at: &At, path: &str, key: &str, known: &[&str]) -> Error {
     invalid(at, path, "an unknown key".into(), suggest(key, known))
 }
 
-/// The nearest of `known` if one is near, and all of them.
+/// The nearest of `known`, if one is near, followed by all.
 pub(super) fn suggest(name: &str, known: &[&str]) -> String {
     let distance = |k: &str| strsim::osa_distance(&name.to_lowercase(), k);
     let near = known

@@ -1,8 +1,8 @@
-//! Reading specs: layers, `--set`, and errors that say where.
+//! Reading specs: layers, `--set`, and located errors.
 //!
-//! A spec is read into a tree whose values know their line. `extends` lays it over the spec that it names, `--set`
-//! lays single values over that; the result is checked against the settings of the registered stage types and only
-//! then becomes a [`Spec`].
+//! A spec is read into a tree whose values know their line. `extends` merges it over the named spec, and `--set`
+//! overrides single values. The result is checked against the settings of the registered stage types before it becomes
+//! a [`Spec`].
 
 use super::tree::{At, Entry, Is, Node, parse_json, parse_toml};
 use super::{LABEL, Spec, check, one_of};
@@ -13,47 +13,47 @@ use serde_json::Value;
 use std::collections::BTreeSet;
 use std::path::{Path, PathBuf};
 
-/// Longest spec, in bytes; those that come with the program are a hundredth of this.
+/// Longest spec, in bytes; shipped specs are a hundredth of this.
 const LONGEST: u64 = 256 << 10;
 
-/// A spec that comes with the program.
+/// A spec shipped with the program.
 #[derive(Debug, Clone, Copy)]
 pub struct Shipped {
-    /// The name that users write.
+    /// Its name for users.
     pub name: &'static str,
     /// The file's text, TOML.
     pub text: &'static str,
 }
 
-/// A spec, checked, with where it came from.
+/// A checked spec with its origin.
 pub struct Loaded {
     /// The spec.
     pub spec: Spec,
-    /// The same with every default written.
+    /// The same with all defaults written out.
     pub tree: Value,
-    /// The file or shipped name.
+    /// The file or name of a shipped spec.
     pub source: String,
     written: Node,
 }
 
-/// Reads the spec `what`: the name of a shipped one or a TOML or JSON file. `sets` are `path=value` and lie on top.
+/// Reads the spec `what`: the name of a shipped spec, or a TOML or JSON file. `sets` are overrides `path=value`.
 pub fn load(what: &str, sets: &[String], shipped: &[Shipped]) -> Result<Loaded> {
     Draft::find(what, sets, shipped)?.finish()
 }
 
-/// Reads a spec from `text`, called `source` in errors; TOML unless it begins like JSON.
+/// Reads a spec from `text`, named `source` in errors; TOML unless it starts like JSON.
 pub fn parse(text: &str, source: &str, sets: &[String], shipped: &[Shipped]) -> Result<Loaded> {
     Draft::of(text, source, sets, shipped)?.finish()
 }
 
-/// A spec with all its layers, not yet checked: the stage types that it names may still have to be loaded.
+/// A spec with all its layers, before checking: the stage types it names may still have to be loaded.
 pub struct Draft {
     written: Node,
     source: String,
 }
 
 impl Draft {
-    /// As [`load`].
+    /// See [`load`].
     pub fn find(what: &str, sets: &[String], shipped: &[Shipped]) -> Result<Self> {
         let layer = Layer::find(what, None, shipped).map_err(|e| match e {
             Unfound::Nothing => Error::invalid("spec", what, NOTHING, format!("a file or {}", names(what, shipped))),
@@ -62,7 +62,7 @@ impl Draft {
         Self::layered(layer, sets, shipped)
     }
 
-    /// As [`parse`].
+    /// See [`parse`].
     pub fn of(text: &str, source: &str, sets: &[String], shipped: &[Shipped]) -> Result<Self> {
         Self::layered(Layer { origin: Origin::Text(source.into()), text: text.into() }, sets, shipped)
     }
@@ -71,7 +71,8 @@ impl Draft {
         let source = layer.label();
         let mut written = layer.resolve(shipped, &[], &mut Work::new(MOST_LAYERS))?;
         let mut sets = sets.iter().map(|s| Set::parse(s)).collect::<Result<Vec<_>>>()?;
-        // A type clears the keys of the old one, so it goes before the keys beside it, whatever the order on the line.
+        // A new type clears the keys of the old one, so it is applied before the keys beside it, whatever the order on
+        // the line.
         sets.sort_by_key(|s| (s.path.len(), s.path.last().is_some_and(|k| k != "type")));
         for set in sets {
             set.apply(&mut written)?;
@@ -79,14 +80,14 @@ impl Draft {
         Ok(Self { written, source })
     }
 
-    /// The plugins that it names, each with where it stands.
+    /// The plugins it names, each with its location.
     pub fn plugins(&self) -> Vec<(String, PathBuf)> {
         let paths = self.written.get(PLUGINS).and_then(|p| p.get(PATHS)).map(|p| &p.kind);
         let Some(Is::Array(paths)) = paths else { return vec![] };
         paths.iter().filter_map(|p| Some((p.at.to_string(), PathBuf::from(p.text()?)))).collect()
     }
 
-    /// Checks it against the stage types that there are.
+    /// Checks the spec against the available stage types.
     pub fn finish(self) -> Result<Loaded> {
         let Self { mut written, source } = self;
         one_of::settle(&mut written);
@@ -101,18 +102,18 @@ impl Draft {
     }
 }
 
-/// Specs on the way from one to the last that it extends, at most.
+/// Maximum depth of a chain of `extends`.
 const DEEPEST: usize = 32;
-/// Specs that one is put together from, at most: each method of a chain may extend others.
+/// Maximum number of specs combined into one: each method of a chain may extend others.
 const MOST_LAYERS: u64 = 256;
-/// The methods of a chain.
+/// Key of the methods of a chain.
 const METHODS: &str = "methods";
-/// Where a spec names plugins.
+/// Key of the plugins.
 const PLUGINS: &str = "plugins";
 const PATHS: &str = "paths";
 
-/// The spec as TOML with every default written. Refuses one that would not read back the same: TOML has no null, so
-/// a JSON spec that clears a setting whose default is something cannot be said in it.
+/// The spec as TOML with all defaults written out. Refuses a spec that would not read back the same: TOML has no null,
+/// so it cannot express a JSON spec that clears a setting with a default.
 pub fn to_toml(spec: &Spec) -> Result<String> {
     let failed = |e: &dyn std::fmt::Display| Error::unsupported("writing the spec as TOML", e.to_string());
     let tree = |s: &Spec| serde_json::to_value(s).map_err(|e| failed(&e));
@@ -136,14 +137,14 @@ fn without_nulls(value: Value) -> Value {
 }
 
 impl Loaded {
-    /// Files and shipped specs that something in this one comes from, as they were named.
+    /// Files and shipped specs that this one is made of, as they were named.
     pub fn sources(&self) -> BTreeSet<String> {
         let mut all = BTreeSet::from([self.source.clone()]);
         self.written.sources(&mut all);
         all
     }
 
-    /// The same error, with the line of the spec that it is about.
+    /// The same error, with the line of the spec it refers to.
     pub fn locate(&self, error: Error) -> Error {
         let Error::Invalid { place, field, found, expected } = error else { return error };
         if place != "spec" {
@@ -155,12 +156,12 @@ impl Loaded {
     }
 }
 
-/// `normalizers[0].epoch` and `normalizers.0.epoch` alike.
+/// Treats `normalizers[0].epoch` and `normalizers.0.epoch` alike.
 fn steps(path: &str) -> Vec<String> {
     path.replace('[', ".").replace(']', "").split('.').filter(|s| !s.is_empty()).map(str::to_owned).collect()
 }
 
-/// `one of a, b` of the shipped names, the nearest first where one is near.
+/// `one of a, b` of the shipped names, with the nearest one first if there is one.
 fn names(what: &str, shipped: &[Shipped]) -> String {
     let mut known: Vec<&str> = shipped.iter().map(|s| s.name).collect();
     let types = registry::names(registry::Kind::Method);
@@ -168,7 +169,7 @@ fn names(what: &str, shipped: &[Shipped]) -> String {
     format!("the name of a shipped spec or of a method: {}", check::suggest(what, &known))
 }
 
-/// Where a layer comes from.
+/// Origin of a layer.
 #[derive(Debug, Clone, PartialEq)]
 enum Origin {
     Shipped(&'static str),
@@ -176,9 +177,9 @@ enum Origin {
     Text(String),
 }
 
-/// Why there is no layer of some name.
+/// Why a layer was not found.
 enum Unfound {
-    /// Nothing is called so.
+    /// Nothing has this name.
     Nothing,
     /// A file that cannot be read.
     Unreadable(Error),
@@ -187,14 +188,14 @@ enum Unfound {
 /// [`Unfound::Nothing`] in words.
 const NOTHING: &str = "neither a shipped spec nor a file";
 
-/// One spec file before layering.
+/// One spec file before merging.
 struct Layer {
     origin: Origin,
     text: String,
 }
 
 impl Layer {
-    /// What `what` means, written in a file of `folder`; or why it means nothing.
+    /// Finds `what`, as written in a file of `folder`, or says why it was not found.
     fn find(what: &str, folder: Option<&Path>, shipped: &[Shipped]) -> Result<Self, Unfound> {
         if let Some(s) = shipped.iter().find(|s| s.name == what) {
             return Ok(Self { origin: Origin::Shipped(s.name), text: s.text.into() });
@@ -219,7 +220,7 @@ impl Layer {
         }
     }
 
-    /// The tree of this layer over those that it extends. `above` are the layers that led here.
+    /// Merges this layer over those that it extends. `above` are the layers that led here.
     fn resolve(self, shipped: &[Shipped], above: &[Origin], work: &mut Work) -> Result<Node> {
         let label = self.label();
         work.spend(&label, "extends: specs that are read", 1)?;
@@ -228,7 +229,7 @@ impl Layer {
             Origin::File(p) if p.extension().is_some_and(|e| e.eq_ignore_ascii_case("toml")) => false,
             _ => self.text.trim_start().starts_with('{'),
         };
-        // Over the first one lie the `--set`s.
+        // The `--set`s are above the first layer.
         let depth = 1 + above.len();
         let parse = if is_json { parse_json } else { parse_toml };
         let mut node = parse(&label, &self.text, depth)?;
@@ -269,8 +270,8 @@ impl Layer {
         base.resolve(shipped, above, work).map(Some)
     }
 
-    /// Puts what the methods of a chain extend under them. Of the specs that they name only the method counts, and the
-    /// plugins that it needs.
+    /// Merges the methods of a chain over what they extend. Only the method of an extended spec is used, with the
+    /// plugins it needs.
     fn extend_methods(&self, node: &mut Node, shipped: &[Shipped], above: &[Origin], work: &mut Work) -> Result<()> {
         let Some(Is::Array(methods)) = node.get_mut(METHODS).map(|m| &mut m.kind) else { return Ok(()) };
         let mut plugins = vec![];
@@ -288,7 +289,7 @@ impl Layer {
     }
 }
 
-/// Makes the plugin paths of a spec file, which are relative to it, absolute: they outlive the file's place in layers.
+/// Makes the plugin paths of a spec file, which are relative to it, absolute, so that merging keeps them valid.
 fn anchor_plugins(node: &mut Node, file: &Path) {
     let folder = file.parent().unwrap_or(Path::new(""));
     let Some(Is::Array(paths)) = node.get_mut(PLUGINS).and_then(|p| p.get_mut(PATHS)).map(|p| &mut p.kind) else {
@@ -303,7 +304,7 @@ fn anchor_plugins(node: &mut Node, file: &Path) {
     }
 }
 
-/// Whether two layers are one file.
+/// Whether two layers are the same file.
 fn same(a: &Origin, b: &Origin) -> bool {
     match (a, b) {
         (Origin::File(a), Origin::File(b)) => {
@@ -329,7 +330,7 @@ impl Set {
             return Err(Error::invalid(label, "path", format!("{text:?}"), "path=value, such as encoder.levels=8"));
         }
         let at = At::whole(&label);
-        // A TOML value, or else a text that needs no quotes.
+        // A TOML value, or else a text without quotes.
         let parsed = parse_toml("", &format!("value = {value}"), 0).ok().filter(|n| n.entries().len() == 1);
         let kind = match parsed.and_then(|mut n| n.take("value")) {
             Some(e) => e.value.kind,
@@ -339,7 +340,7 @@ impl Set {
         Ok(Self { path: path.split('.').map(str::to_owned).collect(), value, at })
     }
 
-    /// Lays the value over `tree`.
+    /// Sets the value in `tree`.
     fn apply(self, tree: &mut Node) -> Result<()> {
         let Self { path, value, at } = self;
         let mut node = tree;
@@ -363,14 +364,14 @@ impl Set {
                     }
                 }
                 Is::Table(entries) => {
-                    // A type that changes leaves nothing of the old settings.
+                    // A changed type discards the old settings.
                     let retyped = |e: &Entry| e.key == "type" && e.value.text() != value.text();
                     if i + 1 == path.len() && step == "type" && entries.iter().any(retyped) {
                         entries.retain(|e| LABEL.contains(&&*e.key));
                     }
                     let found = entries.iter().position(|e| e.key == *step);
                     let index = found.unwrap_or_else(|| {
-                        // A number after the key makes it a list.
+                        // A number as the next key makes it a list.
                         let list = path.get(i + 1).is_some_and(|next| next.parse::<usize>().is_ok());
                         let kind = if list { Is::Array(vec![]) } else { Is::Table(vec![]) };
                         let fresh = Node { at: at.clone(), kind };
@@ -403,7 +404,7 @@ impl Set {
     }
 }
 
-/// The node with every place in it `at`.
+/// The node with all locations replaced by `at`.
 fn at_everywhere(mut node: Node, at: &At) -> Node {
     node.at = at.clone();
     match &mut node.kind {
@@ -564,7 +565,7 @@ mod tests {
         loaded.spec.method.plan(&Context::new(&Nothing))
     }
 
-    /// A backend that nothing gets as far as.
+    /// A backend that is never reached.
     struct Nothing;
 
     impl crate::backend::Backend for Nothing {
@@ -723,7 +724,7 @@ mod tests {
             assert_eq!(said(base, &[set]).1, "{\"fast\":0.5}", "{set}");
         }
         assert_eq!(said(base, &["pace.slow.by=3"]).1, "{\"slow\":{\"by\":3.0}}");
-        // Two ways in one layer are a mistake.
+        // Both keys in one layer are a mistake.
         let e = refusal(&format!("{base}steps = 3\npasses = 4\n"), &[]);
         assert!(e.starts_with("a.toml:3:1: passes: found steps beside it, expected one of steps, "), "{e}");
         let e = refusal(base, &["steps=3", "passes=4"]);

@@ -1,5 +1,5 @@
-//! Keys of a table that exclude each other. What an upper layer says takes the place of what lower ones say in another way;
-//! one layer that says two is refused.
+//! Mutually exclusive keys of a table. A key of an upper layer replaces the alternatives of lower ones; one layer with
+//! two of them is refused.
 
 use super::check::{Context, invalid, join, listed};
 use super::schema::{NESTED, ONE_OF, of_type};
@@ -8,7 +8,7 @@ use crate::error::Result;
 use crate::registry::{Kind, find};
 use serde_json::Value;
 
-/// Leaves in the stages of `root`, of keys that exclude each other, those of the uppermost layer.
+/// Keeps, of mutually exclusive keys in the stages of `root`, only those of the uppermost layer.
 pub(super) fn settle(root: &mut Node) {
     stage(root, Kind::Method);
 }
@@ -40,7 +40,7 @@ fn setting(node: &mut Node, schema: &Value, cx: &Context<'_>) {
     }
 }
 
-/// Refuses a table with two keys that exclude each other.
+/// Refuses a table with two mutually exclusive keys.
 pub(super) fn check(node: &Node, schema: &Value, cx: &Context<'_>, path: &str) -> Result<()> {
     for group in groups(schema, cx) {
         let said = |e: &&Entry| group.contains(&&*e.key) && e.value.kind != Is::Null;
@@ -54,7 +54,7 @@ pub(super) fn check(node: &Node, schema: &Value, cx: &Context<'_>, path: &str) -
     Ok(())
 }
 
-/// Groups of keys of which a table has one: those that are marked, and the names of an enumeration's values.
+/// Groups of mutually exclusive keys: marked ones, and the names of an enumeration's values.
 fn groups<'a>(schema: &'a Value, cx: &'a Context<'_>) -> Vec<Vec<&'a str>> {
     let mut all = vec![];
     for schema in alternatives(schema, cx) {
@@ -66,14 +66,14 @@ fn groups<'a>(schema: &'a Value, cx: &'a Context<'_>) -> Vec<Vec<&'a str>> {
     all
 }
 
-/// A schema and those that it lets one choose from.
+/// A schema and its alternatives.
 fn alternatives<'a>(schema: &'a Value, cx: &'a Context<'_>) -> Vec<&'a Value> {
     let schema = cx.resolve(schema);
     let choices = ["anyOf", "oneOf"].iter().filter_map(|k| schema[*k].as_array()).flatten();
     std::iter::once(schema).chain(choices.flat_map(|s| alternatives(s, cx))).collect()
 }
 
-/// The name of an enumeration's value that is written as a table of it alone.
+/// The name of an enumeration value written as a table with that single key.
 fn tag(choice: &Value) -> Option<&str> {
     let (properties, required) = (choice["properties"].as_object()?, choice["required"].as_array()?);
     let name = required.first()?.as_str()?;

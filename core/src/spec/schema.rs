@@ -4,11 +4,11 @@ use super::PluginPaths;
 use crate::registry::{Kind, StageType, stage_types};
 use serde_json::{Map, Value, json};
 
-/// Marks, in a settings schema, a value that is itself a stage: `{"x-stage": "encoder"}`, which [`super::stage::schema`]
-/// writes.
+/// Marks, in a settings schema, a value that is itself a stage: `{"x-stage": "encoder"}`, written by
+/// [`super::stage::schema`].
 pub const NESTED: &str = "x-stage";
 
-/// Marks, in a settings schema, groups of keys of which a table has only one:
+/// Marks, in a settings schema, groups of mutually exclusive keys:
 /// `#[schemars(extend("x-one-of" = [["steps", "seconds"]]))]`.
 pub const ONE_OF: &str = "x-one-of";
 
@@ -25,7 +25,7 @@ pub(super) fn of_type(stage: &StageType) -> Value {
     schema
 }
 
-/// The schemas of the keys that every spec has beside those of its method.
+/// The schemas of the keys that every spec has besides those of its method.
 pub(super) fn label() -> [(&'static str, Value); 3] {
     let mut plugins = schemars::schema_for!(PluginPaths).to_value();
     if let Value::Object(s) = &mut plugins {
@@ -44,7 +44,7 @@ pub fn spec() -> Value {
     let mut defs = Map::new();
     for &kind in Kind::ALL {
         let mut any = vec![];
-        // Types that have defaults for all their settings.
+        // Types with defaults for all their settings.
         let mut alone = vec![];
         for t in stage_types().into_iter().filter(|t| t.kind == kind) {
             let (name, schema) = (format!("{}.{}", kind.name(), t.name), of_type(t));
@@ -66,7 +66,7 @@ pub fn spec() -> Value {
     for (key, schema) in label() {
         common.insert(key.into(), relocated(schema, key));
     }
-    // What a spec says beside its type goes with the type, or with that of the spec that it extends.
+    // The other keys of a spec belong to its type, or to the type of the spec it extends.
     let methods = stage_types().into_iter().filter(|t| t.kind == Kind::Method);
     let methods: Vec<Value> = methods
         .map(|t| {
@@ -91,7 +91,7 @@ pub fn spec() -> Value {
     })
 }
 
-/// `schema` with its references changed for its place under `#/$defs/name`, and nested stages referring to theirs.
+/// `schema` with its references adjusted to its place under `#/$defs/name`, and nested stages referring to theirs.
 fn relocated(mut schema: Value, name: &str) -> Value {
     fn walk(value: &mut Value, name: &str) {
         match value {

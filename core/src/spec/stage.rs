@@ -1,7 +1,7 @@
-//! Stages as a spec writes them: a table with a `type`, or the name of a type whose settings all have their default.
+//! Stages as written in a spec: a table with a `type`, or the name of a type with defaults for all its settings.
 //!
-//! `typetag` reads the types that are linked in. Those of loaded libraries it cannot see, as every library has statics
-//! of its own; [`needed`] and [`list`] look their names up at run time.
+//! `typetag` reads linked types. It cannot see those of loaded libraries, as every library has its own statics;
+//! [`needed`] and [`list`] look their names up at run time.
 
 use super::schema::NESTED;
 use crate::method::Method;
@@ -11,12 +11,12 @@ use serde::Deserialize;
 use serde::de::{DeserializeOwned, Deserializer, Error};
 use serde_json::{Value, json};
 
-/// Libraries bring stages, no methods.
+/// Libraries cannot provide methods.
 impl Settings for dyn Method {
     const KIND: Kind = Kind::Method;
 }
 
-/// The settings that `value` says.
+/// Reads the settings in `value`.
 pub fn read<T: Settings + ?Sized>(mut value: Value) -> Result<Box<T>, String>
 where
     Box<T>: DeserializeOwned,
@@ -37,7 +37,7 @@ where
     })
 }
 
-/// For `#[serde(deserialize_with = …)]`: a stage.
+/// For `#[serde(deserialize_with = …)]`: one stage.
 pub fn needed<'de, T: Settings + ?Sized, D: Deserializer<'de>>(from: D) -> Result<Box<T>, D::Error>
 where
     Box<T>: DeserializeOwned,
@@ -45,7 +45,7 @@ where
     read(Value::deserialize(from)?).map_err(D::Error::custom)
 }
 
-/// For `#[serde(deserialize_with = …)]`: several stages.
+/// For `#[serde(deserialize_with = …)]`: a list of stages.
 pub fn list<'de, T: Settings + ?Sized, D: Deserializer<'de>>(from: D) -> Result<Vec<Box<T>>, D::Error>
 where
     Box<T>: DeserializeOwned,

@@ -1,4 +1,4 @@
-//! A spec as written: values that know where they stand.
+//! A spec as written: values with their locations.
 
 use crate::error::{Error, Result};
 use serde_json::{Number, Value};
@@ -7,21 +7,21 @@ use std::fmt;
 use std::sync::Arc;
 use toml::de::{DeTable, DeValue};
 
-/// A place in a source: a file with line and column, or a `--set`.
+/// A location in a source: a file with line and column, or a `--set`.
 #[derive(Debug, Clone, PartialEq)]
 pub(super) struct At {
     source: Arc<Source>,
-    /// A byte of the source's text. Line and column are counted when they are shown: to count them for every value of
-    /// a long text would take the square of its length.
+    /// Byte offset in the source's text. Line and column are counted only for display: counting them for every value of
+    /// a long text would take quadratic time.
     offset: Option<usize>,
 }
 
-/// A name with the text that stands there.
+/// A source name with its text.
 #[derive(Debug, PartialEq)]
 struct Source {
     name: String,
     text: String,
-    /// Layers of a spec that lie over it.
+    /// Number of layers above it.
     depth: usize,
 }
 
@@ -32,22 +32,22 @@ impl Source {
 }
 
 impl At {
-    /// A source without lines, over all layers.
+    /// A source without lines, above all layers.
     pub(super) fn whole(name: &str) -> Self {
         Self { source: Source::new(name, "", 0), offset: None }
     }
 
-    /// The byte of its source, if it has any.
+    /// The byte offset in its source, if any.
     pub(super) fn offset(&self) -> Option<usize> {
         self.offset
     }
 
-    /// How many layers of a spec lie over its source.
+    /// The number of layers above its source.
     pub(super) fn depth(&self) -> usize {
         self.source.depth
     }
 
-    /// The byte `offset` of the source's text.
+    /// The location of byte `offset` in the source's text.
     fn byte(source: &Arc<Source>, offset: usize) -> Self {
         Self { source: source.clone(), offset: Some(offset) }
     }
@@ -67,7 +67,7 @@ impl fmt::Display for At {
     }
 }
 
-/// A value and its place.
+/// A value and its location.
 #[derive(Debug, Clone, PartialEq)]
 pub(super) struct Node {
     pub(super) at: At,
@@ -75,7 +75,7 @@ pub(super) struct Node {
 }
 
 impl Node {
-    /// Adds the names of all sources that something here comes from.
+    /// Adds the names of all sources used here.
     pub(super) fn sources(&self, all: &mut BTreeSet<String>) {
         all.insert(self.at.source.name.clone());
         match &self.kind {
@@ -86,7 +86,7 @@ impl Node {
     }
 }
 
-/// What a value is.
+/// The content of a value.
 #[derive(Debug, Clone, PartialEq)]
 pub(super) enum Is {
     Null,
@@ -101,7 +101,7 @@ pub(super) enum Is {
 #[derive(Debug, Clone, PartialEq)]
 pub(super) struct Entry {
     pub(super) key: String,
-    /// Where the key stands.
+    /// Location of the key.
     pub(super) at: At,
     pub(super) value: Node,
 }
@@ -117,7 +117,7 @@ impl Node {
         self.entries().iter().find(|e| e.key == key).map(|e| &e.value)
     }
 
-    /// The value of `key`, to be changed.
+    /// The value of `key`, mutable.
     pub(super) fn get_mut(&mut self, key: &str) -> Option<&mut Node> {
         match &mut self.kind {
             Is::Table(entries) => entries.iter_mut().find(|e| e.key == key).map(|e| &mut e.value),
@@ -125,7 +125,7 @@ impl Node {
         }
     }
 
-    /// The entries of a table; none of anything else.
+    /// The entries of a table; empty for anything else.
     pub(super) fn entries(&self) -> &[Entry] {
         match &self.kind {
             Is::Table(entries) => entries,
@@ -133,7 +133,7 @@ impl Node {
         }
     }
 
-    /// Takes `key` out of a table.
+    /// Removes `key` from a table.
     pub(super) fn take(&mut self, key: &str) -> Option<Entry> {
         match &mut self.kind {
             Is::Table(entries) => entries.iter().position(|e| e.key == key).map(|i| entries.remove(i)),
@@ -141,7 +141,7 @@ impl Node {
         }
     }
 
-    /// The text of a string.
+    /// The text, if this is a string.
     pub(super) fn text(&self) -> Option<&str> {
         match &self.kind {
             Is::String(s) => Some(s),
@@ -165,7 +165,7 @@ impl Node {
         node
     }
 
-    /// Writes a stage that is only named as a table with that type.
+    /// Expands a stage given by name only to a table with that type.
     pub(super) fn spell_out(&mut self) {
         if let Is::String(_) = self.kind {
             let at = self.at.clone();
@@ -174,7 +174,7 @@ impl Node {
         }
     }
 
-    /// Appends the items of a list to that at `path`, which is made where it is not there.
+    /// Appends the items of a list to the list at `path`, which is created if missing.
     pub(super) fn push_all(&mut self, path: &[&str], items: Node) {
         let at = items.at.clone();
         match (path, &mut self.kind, items.kind) {
@@ -193,8 +193,8 @@ impl Node {
         }
     }
 
-    /// Lays `over` on top: tables merge, everything else is replaced. A table of another `type` replaces too, as
-    /// the keys of one type mean nothing to another. A table without a `type` over a stage that is only named changes
+    /// Merges `over` on top: tables merge, everything else is replaced. A table with another `type` replaces too, as
+    /// the keys of one type mean nothing to another. A table without a `type` over a stage given by name only changes
     /// settings of that stage.
     pub(super) fn merge(&mut self, over: Node) {
         if matches!(over.kind, Is::Table(_)) && over.get("type").is_none() {
@@ -233,7 +233,7 @@ impl Node {
         }
     }
 
-    /// For an error message: the value, or what it is where it is long.
+    /// For an error message: the value, or its type if it is long.
     pub(super) fn shown(&self) -> String {
         match &self.kind {
             Is::Array(items) => format!("a list of {}", items.len()),
@@ -244,7 +244,7 @@ impl Node {
     }
 }
 
-/// Reads TOML, over which `depth` layers lie.
+/// Parses TOML with `depth` layers above it.
 pub(super) fn parse_toml(source: &str, text: &str, depth: usize) -> Result<Node> {
     let source = Source::new(source, text, depth);
     let root = DeTable::parse(text).map_err(|e| {
@@ -292,10 +292,10 @@ fn toml_value(source: &Arc<Source>, value: &DeValue<'_>, at: At) -> Result<Node>
     Ok(Node { at, kind })
 }
 
-/// Reads JSON, over which `depth` layers lie.
+/// Parses JSON with `depth` layers above it.
 pub(super) fn parse_json(source: &str, text: &str, depth: usize) -> Result<Node> {
     let source = Source::new(source, text, depth);
-    // serde_json checks syntax and depth; what follows only has to find its way through valid text.
+    // serde_json checks syntax and depth; the reader below relies on valid text.
     serde_json::from_str::<Value>(text).map_err(|e| {
         let why = e.to_string();
         let why = why.split(" at line ").next().unwrap_or_default();
@@ -305,7 +305,7 @@ pub(super) fn parse_json(source: &str, text: &str, depth: usize) -> Result<Node>
     reader.value()
 }
 
-/// Reads text that is known to be valid JSON.
+/// Reader of valid JSON.
 struct Json<'a> {
     source: Arc<Source>,
     text: &'a str,
@@ -323,7 +323,7 @@ impl Json<'_> {
         self.text.as_bytes().get(self.at).copied().unwrap_or(0)
     }
 
-    /// Steps over `byte` if it is next.
+    /// Consumes `byte` if it is next.
     fn eat(&mut self, byte: u8) -> bool {
         let found = self.peek() == byte;
         self.at += usize::from(found);

@@ -1,13 +1,12 @@
-//! WGSL of a multi-layer perceptron, layer by layer with the widths written into it.
+//! WGSL of a multi-layer perceptron, layer by layer with constant widths.
 //!
-//! A product goes block by block over its outputs, so that a number that is read is used as often as there are sums in
-//! registers.
+//! Products are computed in blocks of outputs, so that each value read is used for all sums in registers.
 
 use super::MlpStage;
 use crate::linear::Linear;
 use std::fmt::Write;
 
-/// Sums that a loop over inputs carries.
+/// Number of sums in a loop over inputs.
 const BLOCK: usize = 8;
 
 /// `stage_forward` and `stage_backward`.
@@ -26,12 +25,12 @@ pub fn functions(stage: &MlpStage) -> String {
     conefield_core::wgsl::functions(stage.input, 1, &forward, &backward)
 }
 
-/// Where a layer finds what it reads: the features or the layer before.
+/// The input of a layer: the features or the previous layer.
 fn reads(i: usize) -> String {
     if i == 0 { "(*x)".into() } else { format!("h{}", i - 1) }
 }
 
-/// `h{i}` and, where wanted, the activation's derivative `s{i}`.
+/// Computes `h{i}` and, if wanted, the activation's derivative `s{i}`.
 fn layer(stage: &MlpStage, i: usize, slopes: bool, out: &mut String) {
     let layer = &stage.layers[i];
     let Linear { skip, input, output, .. } = *layer;
@@ -68,7 +67,7 @@ fn layer(stage: &MlpStage, i: usize, slopes: bool, out: &mut String) {
     }
 }
 
-/// From the last layer to the first: `s{i}` becomes `∂L/∂z`, gradients are summed, `*dx` collects.
+/// From the last layer to the first: `s{i}` becomes `∂L/∂z`, gradients are summed, `*dx` accumulates.
 fn gradients(stage: &MlpStage, out: &mut String) {
     let last = stage.layers.len() - 1;
     let _ = writeln!(out, "    s{last}[0] *= (*dy)[0];");
@@ -96,7 +95,7 @@ fn gradients(stage: &MlpStage, out: &mut String) {
     }
 }
 
-/// `Wᵀ·∂L/∂z` of `count` columns from `column`, each put to use by `put`.
+/// `Wᵀ·∂L/∂z` of `count` columns from `column`; `put` writes the code that uses each.
 fn back(i: usize, layer: &Linear, column: usize, count: usize, out: &mut String, put: impl Fn(usize) -> String) {
     for start in (0..count).step_by(BLOCK) {
         let block = start..(start + BLOCK).min(count);

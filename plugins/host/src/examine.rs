@@ -1,7 +1,7 @@
-//! A library, looked at before the system maps it.
+//! Checks of a library file before the operating system maps it.
 //!
-//! The system maps what a header claims. Where the file is shorter, because a copy of it broke off, the first look at what is
-//! missing ends the whole process.
+//! The system maps as much as the header claims. If the file is shorter, e.g. after an interrupted copy, the first
+//! access to the missing part kills the process.
 
 use conefield_core::error::{Error, Result, ensure};
 use object::read::ReadCache;
@@ -9,7 +9,7 @@ use object::{Object, ObjectSection, ObjectSegment};
 use std::fs::File;
 use std::path::Path;
 
-/// Refuses a file that is no library, and one that holds less than its header says.
+/// Refuses a file that is not a library or is shorter than its header says.
 pub(crate) fn whole(path: &Path, place: &str) -> Result<()> {
     let io = |e| Error::io(path, e);
     let file = File::open(path).map_err(io)?;

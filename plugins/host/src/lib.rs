@@ -1,13 +1,13 @@
-//! Plugins: shared libraries with stages, found, verified and loaded at run time.
+//! Plugins: shared libraries of stages, found, verified and loaded at run time.
 //!
-//! [`library`] reads a library's tables and trusts nothing in them that can be checked; [`stage`] makes ordinary stages of
-//! theirs, tried out between guard zones and under a time limit ([`trial`]) before any real work is handed to them;
-//! [`spec`] registers their types, so that a spec names them like any other; [`search`] says where libraries are looked
-//! for. A library that was loaded is never unloaded.
+//! [`library`] reads a library's tables and checks everything that can be checked; [`stage`] wraps its stages as
+//! ordinary ones, after trial runs between guard zones and under a time limit ([`trial`]); [`spec`] registers their
+//! types, so that a spec can name them; [`search`] defines where libraries are searched. Loaded libraries are never
+//! unloaded.
 //!
-//! What no process can survive: a library that calls `abort`, that writes far outside what it was handed, or whose
-//! constructors, which the system runs before anything can be checked, do harm. A library is code, and loading it is
-//! running it: only files that the user names, or puts where plugins are looked for, are ever loaded.
+//! No process survives a library that calls `abort`, writes far outside its buffers, or has harmful constructors, which
+//! the system runs before any check. Loading a library means running its code: only files that the user names, or puts
+//! into the search locations, are loaded.
 
 mod examine;
 pub mod library;

@@ -1,7 +1,7 @@
-//! A library and the tables in it.
+//! Libraries and their tables.
 
-// Everything unsafe here reads what a library says about itself. A library that lies in its pointers cannot be told from
-// one that does not; lengths, versions, numbers and texts are checked before they are used.
+// All unsafe code here reads what a library says about itself. Wrong pointers cannot be detected; lengths, versions,
+// numbers and texts are checked before use.
 #![allow(unsafe_code)]
 
 use crate::examine;
@@ -16,11 +16,11 @@ use std::path::{Path, PathBuf};
 use std::sync::{Arc, Mutex, PoisonError};
 use std::{fmt, ptr, slice};
 
-/// Longest text that a table may hold.
+/// Longest text in a table.
 const LONGEST_TEXT: usize = 1 << 20;
-/// Bytes of a stage's table in the first minor version.
+/// Size in bytes of a stage's table in the first minor version.
 const FIRST_STAGE: usize = offset_of!(ConefieldStage, regularizer);
-/// Most stages that a library may bring.
+/// Maximum number of stages in a library.
 const MOST_STAGES: usize = 1024;
 
 /// A loaded library.
@@ -33,23 +33,23 @@ pub struct Library {
     pub version: String,
     /// Its licence.
     pub licence: String,
-    /// The version of the contract that it was built with.
+    /// The contract version that it was built with.
     pub abi: (u32, u32),
-    /// Its stage types, all of them sound as far as their tables go.
+    /// Its stage types; their tables have been checked.
     pub types: Vec<Arc<Type>>,
 }
 
 /// A stage type of a library.
 pub struct Type {
-    /// Which kind.
+    /// Its kind.
     pub kind: Kind,
     /// Its name in specs.
     pub name: String,
-    /// One line for people.
+    /// A one-line description.
     pub doc: String,
     /// JSON Schema of its settings.
     pub schema: Value,
-    /// The library, in words.
+    /// The library in readable form.
     pub owner: String,
     pub(crate) functions: Functions,
     context: *const c_void,
@@ -61,17 +61,17 @@ pub struct Type {
 type CreateFn =
     unsafe extern "C" fn(*const c_void, ConefieldStr, usize, *mut *mut c_void, *mut ConefieldText) -> ConefieldStatus;
 
-// SAFETY: its pointers lead into the library, which is never unloaded, and the contract allows its functions to be called
-// from any thread.
+// SAFETY: its pointers lead into the library, which is never unloaded, and the contract allows its functions to be
+// called from any thread.
 unsafe impl Send for Type {}
-// SAFETY: as above; nothing here changes.
+// SAFETY: as above; nothing here is mutated.
 unsafe impl Sync for Type {}
 
-/// The tables of functions: which kinds have them, where the stage's table points to them, how much of them the first minor
-/// version had, and which functions must be there.
+/// The function tables: the kinds that have them, their field in the stage's table, their size in the first minor
+/// version, and their required functions.
 macro_rules! tables {
     ($($functions:ident($table:ident) $($code:ident $kind:ident)+: $field:ident, from $least:expr, needs [$($needed:ident)*];)*) => {
-        /// What can be asked of a stage.
+        /// The functions of a stage.
         #[derive(Clone, Copy)]
         pub(crate) enum Functions {
             $($functions($table),)*
@@ -87,7 +87,7 @@ macro_rules! tables {
         })*
 
         impl Functions {
-            /// The kind of the stage `t` and its functions; `at` is the stage in words.
+            /// The kind of the stage `t` and its functions; `at` describes the stage in words.
             unsafe fn read(t: &ConefieldStage, place: &str, at: &str) -> Result<(Kind, Self)> {
                 $(
                     let kind = match t.kind {
@@ -109,7 +109,7 @@ macro_rules! tables {
 
 /// The functions of one kind of stage.
 pub(crate) trait FunctionsOf: Copy {
-    /// These functions, if they are of that kind.
+    /// These functions, if they are of this kind.
     fn of(functions: Functions) -> Option<Self>;
 }
 
@@ -131,7 +131,7 @@ tables! {
         basis, from size_of::<ConefieldBasis>(), needs [on info expand adjoint];
 }
 
-/// What functions need of each other, beyond those that must be there.
+/// Checks dependencies between functions, beyond the required ones.
 fn consistent(functions: &Functions) -> Result<(), (&'static str, &'static str)> {
     match functions {
         Functions::Projector(p) if p.integrate.is_some() != p.adjoint.is_some() => {
@@ -145,22 +145,22 @@ fn consistent(functions: &Functions) -> Result<(), (&'static str, &'static str)>
 }
 
 impl Library {
-    /// Loads the library at `path` and reads its tables. A file that was loaded before is read again from what is loaded.
+    /// Loads the library at `path` and reads its tables. A file loaded before is read again from memory.
     pub fn open(path: &Path) -> Result<Self> {
         let real = path.canonicalize().map_err(|e| Error::io(path, e))?;
         let place = path.display().to_string();
         ensure(real.is_file(), &place, "plugin", "no file", "a shared library")?;
         examine::whole(&real, &place)?;
         let plugin = table_of(&real, &place)?;
-        // SAFETY: the library says that this is its table, which lives as long as it does.
+        // SAFETY: the library returned this table, which lives as long as the library.
         unsafe { Self::read(&real, &place, plugin) }
     }
 
     unsafe fn read(path: &Path, place: &str, plugin: *const ConefieldPlugin) -> Result<Self> {
-        // Size and version stand first and are read before anything that another version may have elsewhere.
+        // Size and version come first and are read before any field that may differ between versions.
         let bad = |field: &str, found: &dyn fmt::Display, expected: &str| Error::invalid(place, field, found, expected);
         ensure(!plugin.is_null() && plugin.is_aligned(), place, "plugin table", "nothing", "a table")?;
-        // SAFETY: see the top of this file; both fields stand at the start of the table in every version.
+        // SAFETY: see the top of this file; both fields are at the start of the table in every version.
         let (size, major) =
             unsafe { (ptr::addr_of!((*plugin).size).read(), ptr::addr_of!((*plugin).abi_major).read()) };
         if size < offset_of!(ConefieldPlugin, name) {
@@ -202,14 +202,14 @@ impl Library {
         Ok(Self { path: path.into(), name, version, licence, abi: (major, minor), types })
     }
 
-    /// The library in words.
+    /// The library in readable form.
     pub fn owner(&self) -> String {
         format!("{} {} ({})", self.name, self.version, self.path.display())
     }
 }
 
-/// Tables of the libraries that were loaded, by file. They are never unloaded: stages, and what the system keeps for
-/// threads, may outlive any moment at which that would be safe.
+/// Tables of loaded libraries, by file. Libraries are never unloaded: stages and thread-local data of the system may
+/// outlive any point at which that would be safe.
 static TABLES: Mutex<BTreeMap<PathBuf, usize>> = Mutex::new(BTreeMap::new());
 
 /// The table of the library at `path`.
@@ -224,7 +224,7 @@ fn table_of(path: &Path, place: &str) -> Result<*const ConefieldPlugin> {
         let why = std::error::Error::source(&e).map_or_else(|| e.to_string(), ToString::to_string);
         Error::invalid(place, "plugin", why, "a shared library for this system")
     })?;
-    // SAFETY: a function of this name is what the contract says, or the file is no plugin.
+    // SAFETY: a function of this name has the contract's signature, or the file is not a plugin.
     let entry = unsafe { library.get::<ConefieldEntry>(ENTRY) }.map(|f| *f);
     let Ok(entry) = entry else {
         let found = format!("a library without the function {ENTRY}");
@@ -237,33 +237,33 @@ fn table_of(path: &Path, place: &str) -> Result<*const ConefieldPlugin> {
     Ok(table)
 }
 
-/// A table that says its size first.
+/// Reads a table that starts with its size.
 ///
-/// It has at least the first `least` bytes: what the first minor version had. Functions that it does not reach are NULL.
+/// It has at least the first `least` bytes, the size in the first minor version. Missing functions become NULL.
 unsafe fn sized<T>(table: *const T, place: &str, what: &str, least: usize) -> Result<T> {
     ensure(!table.is_null() && table.is_aligned(), place, what, "nothing", "a table")?;
     // SAFETY: every table begins with its size.
     let size = unsafe { table.cast::<usize>().read() };
     ensure(size >= least, place, what, format!("{size} bytes"), format!("at least {least}: the table is too short"))?;
-    // SAFETY: the table says that it is so long.
+    // SAFETY: the table states this size.
     Ok(unsafe { grown(table, size) })
 }
 
-/// A table of `size` bytes, of which a later version may have more.
+/// Copies a table of `size` bytes, which may be larger in a later version.
 unsafe fn grown<T>(table: *const T, size: usize) -> T {
     let mut own = MaybeUninit::<T>::zeroed();
-    // SAFETY: the table has as many bytes as are copied. `T` is plain data, in which zeros stand for NULL.
+    // SAFETY: the table has as many bytes as are copied. `T` is plain data, and zeros mean NULL.
     unsafe {
         ptr::copy_nonoverlapping(table.cast::<u8>(), own.as_mut_ptr().cast(), size.min(size_of::<T>()));
         own.assume_init()
     }
 }
 
-/// A text of a table.
+/// A text from a table.
 pub(crate) unsafe fn text(s: ConefieldStr, place: &str, what: &str) -> Result<String> {
     let fits = s.length <= LONGEST_TEXT && (s.length == 0 || !s.data.is_null());
     ensure(fits, place, what, format!("a text of {} bytes", s.length), "at most 1 MiB at some address")?;
-    // SAFETY: the table says so.
+    // SAFETY: the table states this length.
     let bytes = if s.length == 0 { &[] } else { unsafe { slice::from_raw_parts(s.data, s.length) } };
     let text = std::str::from_utf8(bytes).map_err(|e| Error::invalid(place, what, e, "UTF-8"))?;
     Ok(text.into())
@@ -285,7 +285,7 @@ impl Type {
         let Some(keys) = schema.as_object_mut() else {
             return Err(Error::invalid(place, format!("{at}: schema"), schema, "a JSON Schema of an object"));
         };
-        // A setting that the schema does not know is a mistake, whether it says so or not.
+        // A setting missing in the schema is a mistake, whether the schema says so or not.
         keys.entry("additionalProperties").or_insert(Value::Bool(false));
         // SAFETY: see the top of this file.
         let (kind, functions) = unsafe { Functions::read(t, place, &at)? };
@@ -305,12 +305,12 @@ impl Type {
         })
     }
 
-    /// Makes a stage from settings, without their type, for `width` channels in. A refusal names the setting.
+    /// Creates a stage from settings without their type, for `width` input channels. Errors name the setting.
     pub(crate) fn create(self: &Arc<Self>, settings: &Value, width: usize) -> Result<Handle> {
         let settings = settings.to_string();
         let mut stage = ptr::null_mut();
         let mut error = Text::new();
-        // SAFETY: everything handed over lives for the time of the call.
+        // SAFETY: all arguments live during the call.
         let status =
             unsafe { (self.create)(self.context, ConefieldStr::of(&settings), width, &mut stage, error.room()) };
         if status != CONEFIELD_OK {
@@ -322,7 +322,7 @@ impl Type {
         Ok(Handle { ty: self.clone(), stage })
     }
 
-    /// What `create` or `fitted` refused, as an error about the stage's settings: its owner says where they stand.
+    /// The error for settings refused by `create` or `fitted`; the caller adds their path.
     pub(crate) fn refusal(&self, call: &str, status: ConefieldStatus, text: &str) -> Error {
         let parts = text.split_once(": found ").and_then(|(field, rest)| {
             let (found, expected) = rest.rsplit_once(", expected ")?;
@@ -335,12 +335,12 @@ impl Type {
         }
     }
 
-    /// What it is and whose.
+    /// The type and its library in words.
     pub(crate) fn words(&self) -> String {
         format!("{} {:?} of plugin {}", self.kind, self.name, self.owner)
     }
 
-    /// A call that went wrong, in words.
+    /// The error for a failed call.
     pub(crate) fn failed(&self, call: &str, status: ConefieldStatus, text: &str) -> Error {
         let how = match status {
             CONEFIELD_INVALID => "refused",
@@ -354,32 +354,32 @@ impl Type {
     }
 }
 
-/// A stage that a library made.
+/// A stage created by a library.
 pub(crate) struct Handle {
     pub ty: Arc<Type>,
     pub stage: *mut c_void,
 }
 
-// SAFETY: the contract allows a stage to be called from many threads and to be freed from any.
+// SAFETY: the contract allows a stage to be called from many threads and freed from any.
 unsafe impl Send for Handle {}
 // SAFETY: as above.
 unsafe impl Sync for Handle {}
 
 impl Drop for Handle {
     fn drop(&mut self) {
-        // SAFETY: the library handed it over, and nothing uses it any more.
+        // SAFETY: the library returned it, and nothing uses it any more.
         unsafe { (self.ty.destroy)(self.stage) };
     }
 }
 
 impl Handle {
-    /// What `call` made of this stage: a new one, or nothing.
+    /// The stage that `call` returned, if any.
     pub fn made(&self, stage: *mut c_void, call: &str) -> Result<Option<Self>> {
         ensure(stage != self.stage, &self.ty.words(), call, "the old stage", "a new one")?;
         Ok((!stage.is_null()).then(|| Self { ty: self.ty.clone(), stage }))
     }
 
-    /// The stage in its own words.
+    /// The stage's own description.
     pub fn describe(&self) -> String {
         let mut text = Text::new();
         // SAFETY: the stage is alive.
@@ -390,7 +390,7 @@ impl Handle {
     }
 }
 
-/// Room for a line from a library.
+/// A buffer for a line from a library.
 pub(crate) struct Text {
     bytes: [u8; 512],
     room: ConefieldText,
@@ -401,20 +401,20 @@ impl Text {
         Self { bytes: [0; 512], room: ConefieldText { data: ptr::null_mut(), capacity: 0, length: 0 } }
     }
 
-    /// To be handed to one call.
+    /// The buffer as an argument of one call.
     pub fn room(&mut self) -> *mut ConefieldText {
         self.room = ConefieldText { data: self.bytes.as_mut_ptr(), capacity: self.bytes.len(), length: 0 };
         &mut self.room
     }
 
-    /// What was written.
+    /// The text written.
     pub fn text(&self) -> String {
         let n = self.room.length.min(self.bytes.len());
         String::from_utf8_lossy(&self.bytes[..n]).into_owned()
     }
 }
 
-/// A text of any length: asks again if it did not fit.
+/// A text of any length: calls again if it did not fit.
 pub(crate) fn whole_text(
     mut ask: impl FnMut(*mut ConefieldText) -> ConefieldStatus,
 ) -> Result<String, (ConefieldStatus, String)> {
@@ -452,7 +452,7 @@ mod tests {
             with_weights: None,
             volume: Some(volume),
         };
-        // SAFETY: the tables are whole, whatever they say.
+        // SAFETY: the tables are complete, whatever size they state.
         let read = |size| unsafe { sized(&table(size), "p", "table", first) };
         assert!(read(size_of::<ConefieldInitializer>()).unwrap().volume.is_some());
         assert!(read(first).unwrap().volume.is_none());

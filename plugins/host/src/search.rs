@@ -1,4 +1,4 @@
-//! Where plugins are looked for, and what was found there.
+//! Search locations of plugins, and the plugins found.
 
 use crate::library::Library;
 use crate::spec;
@@ -8,25 +8,25 @@ use std::collections::BTreeSet;
 use std::env;
 use std::path::{Path, PathBuf};
 
-/// The variable that lists files and folders of plugins, as `PATH` lists folders.
+/// The environment variable that lists files and folders of plugins, like `PATH`.
 pub const PATH_VARIABLE: &str = "CONEFIELD_PLUGIN_PATH";
 
-/// Who named a plugin.
+/// Origin of a plugin.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, serde::Serialize)]
 #[serde(rename_all = "kebab-case")]
 pub enum Place {
-    /// The command line.
+    /// Named on the command line.
     Named,
-    /// The environment.
+    /// Named in the environment.
     Environment,
-    /// The user's folder of plugins.
+    /// Found in the user's plugin folder.
     UserFolder,
-    /// A spec, with the user's leave.
+    /// Named in a spec, with the user's permission.
     Spec,
 }
 
 impl Place {
-    /// In words.
+    /// A readable description.
     pub fn words(self) -> &'static str {
         match self {
             Self::Named => "--plugin",
@@ -37,32 +37,32 @@ impl Place {
     }
 }
 
-/// A file that was found, with what became of it.
+/// A file that was found, and the result of loading it.
 pub struct Found {
-    /// Where.
+    /// Its path.
     pub path: PathBuf,
-    /// Who named it.
+    /// Its origin.
     pub place: Place,
-    /// The library, or why it was refused.
+    /// The library, or the reason for refusing it.
     pub library: Result<Library>,
 }
 
-/// Every plugin that was looked at.
+/// All plugins examined.
 #[derive(Default)]
 pub struct Plugins {
-    /// In the order in which they were found.
+    /// In the order of discovery.
     pub found: Vec<Found>,
 }
 
-/// The folder in which a user's plugins are looked for: `conefield/plugins` in the system's folder for data.
+/// The user's plugin folder: `conefield/plugins` in the system's data folder.
 pub fn user_folder() -> Option<PathBuf> {
-    // A home that is a relative name would be one folder here and another there: whoever owns the current one could bring code.
+    // A relative home would depend on the current folder, whose owner could then inject code.
     dirs::data_dir().filter(|d| d.is_absolute()).map(|d| d.join("conefield").join("plugins"))
 }
 
 impl Plugins {
-    /// Loads and registers what `named` (files and folders) and the environment name and what lies in the user's folder.
-    /// What is wrong with a plugin is noted with it.
+    /// Loads and registers plugins from `named` (files and folders), the environment and the user's folder. Errors are
+    /// kept with the plugin.
     pub fn search(named: &[PathBuf]) -> Self {
         let mut plugins = Self::default();
         let environment: Vec<PathBuf> = env::var_os(PATH_VARIABLE).iter().flat_map(env::split_paths).collect();
@@ -82,7 +82,7 @@ impl Plugins {
         plugins
     }
 
-    /// Loads and registers the library at `path`, if it is not there yet.
+    /// Loads and registers the library at `path`, unless it is loaded already.
     pub fn load(&mut self, path: PathBuf, place: Place) -> Result<()> {
         if self.get(&path).is_none() {
             let library = Library::open(&path)?;
@@ -92,25 +92,25 @@ impl Plugins {
         Ok(())
     }
 
-    /// As [`Plugins::load`]; what is wrong is kept with the file.
+    /// As [`Plugins::load`], but keeps the error with the file.
     fn note(&mut self, path: PathBuf, place: Place) {
         if let Err(e) = self.load(path.clone(), place) {
             self.found.push(Found { path, place, library: Err(e) });
         }
     }
 
-    /// The library that was loaded from `path`.
+    /// The library loaded from `path`.
     pub fn get(&self, path: &Path) -> Option<&Library> {
         let real = path.canonicalize().ok()?;
         self.loaded().find(|l| l.path == real)
     }
 
-    /// Every library that is loaded.
+    /// All loaded libraries.
     pub fn loaded(&self) -> impl Iterator<Item = &Library> {
         self.found.iter().filter_map(|f| f.library.as_ref().ok())
     }
 
-    /// The libraries whose types the spec `tree` names.
+    /// The libraries whose types are used by the spec `tree`.
     pub fn used(&self, tree: &Value) -> Vec<&Library> {
         let mut names = BTreeSet::new();
         collect_types(tree, &mut names);
@@ -130,7 +130,7 @@ fn collect_types<'a>(tree: &'a Value, names: &mut BTreeSet<&'a str>) {
     }
 }
 
-/// The plugins that `path` names: itself, or every library of a folder.
+/// The plugins at `path`: the file itself, or every library in a folder.
 fn files(path: &Path) -> Result<Vec<PathBuf>> {
     if !path.is_dir() {
         return Ok(vec![path.to_path_buf()]);

@@ -1,4 +1,4 @@
-//! A library's types as settings that a spec may hold.
+//! Types of a library as settings in a spec.
 
 use crate::library::{Library, Type};
 use crate::stage::basis::BasisStage;
@@ -35,15 +35,15 @@ pub fn register(library: &Library) -> Result<()> {
     registry::add(&library.owner(), library.types.iter().map(new).collect::<Result<_>>()?)
 }
 
-/// Settings of a stage of a library, with every default written.
+/// Settings of a library's stage, with all defaults written out.
 struct Loaded {
     ty: Arc<Type>,
-    /// The type's name, for as long as the program runs.
+    /// The type's name, with static lifetime.
     name: &'static str,
     settings: Value,
 }
 
-/// `written` with the defaults of `schema` for what it leaves out.
+/// `written`, completed with the defaults of `schema`.
 pub fn with_defaults(schema: &Value, mut written: Value) -> Value {
     let properties = schema["properties"].as_object().into_iter().flatten();
     if let Some(keys) = written.as_object_mut() {
@@ -64,7 +64,7 @@ impl Serialize for Loaded {
     }
 }
 
-/// What makes settings of each kind, and what they build.
+/// Implements the settings traits of all kinds.
 macro_rules! kinds {
     ($($kind:ident $spec:ident ($self:ident $(, $argument:ident: $type:ty)?) -> $stage:ty { $build:expr })*) => {
         fn make(ty: Arc<Type>) -> Result<Make> {
@@ -83,8 +83,9 @@ macro_rules! kinds {
                 Ok(Box::new($build?))
             }
 
-            // `#[typetag::serde]` gives a type one name; here it is the loaded type's. Its two methods are therefore written
-            // out. To read settings back, the registry is asked (`conefield_core::spec::stage`).
+            // `#[typetag::serde]` gives a Rust type one name; here it is the loaded type's. Its two methods are
+            // therefore implemented by hand. Reading settings back goes through the registry
+            // (`conefield_core::spec::stage`).
             fn typetag_name(&self) -> &'static str {
                 self.name
             }

@@ -1,4 +1,4 @@
-//! Ordinary stages made of a library's.
+//! Ordinary stages that wrap a library's.
 
 #![allow(unsafe_code)]
 
@@ -24,7 +24,7 @@ use std::ptr;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::{Arc, Mutex, PoisonError};
 
-/// What a stage's functions could not do since it was last asked for: the first of it.
+/// The first error of a stage's functions since the last query.
 #[derive(Default)]
 struct Fault {
     there: AtomicBool,
@@ -46,7 +46,7 @@ impl Fault {
     }
 }
 
-/// A stage of a library with the functions of its kind: what every adapter holds.
+/// A stage of a library with the functions of its kind, shared by all adapters.
 pub(crate) struct Foreign<F> {
     handle: Handle,
     functions: F,
@@ -54,7 +54,7 @@ pub(crate) struct Foreign<F> {
     fault: Fault,
 }
 
-/// Makes a stage and tries it out, both within the time limit.
+/// Creates and tries a stage, both within the time limit.
 pub(crate) fn build<T: Send + 'static>(
     ty: &Arc<Type>,
     settings: &Value,
@@ -73,17 +73,17 @@ impl<F: FunctionsOf> Foreign<F> {
         Ok(Self { handle, functions, describe, fault: Fault::default() })
     }
 
-    /// The type that it is of.
+    /// Its type.
     fn ty(&self) -> &Arc<Type> {
         &self.handle.ty
     }
 
-    /// What is wrong with what `call` gave.
+    /// The error for a wrong result of `call`.
     fn wrong(&self, call: &str, what: &str) -> Error {
         self.ty().failed(call, CONEFIELD_FAILED, what)
     }
 
-    /// Makes the call `f`, which gets the stage and room for a reason. One that fails is an error that names `call`.
+    /// Calls `f` with the stage and a buffer for the reason. Errors name `call`.
     fn run(&self, call: &str, f: impl FnOnce(*mut c_void, *mut ConefieldText) -> ConefieldStatus) -> Result<()> {
         let mut error = Text::new();
         match f(self.handle.stage, error.room()) {
@@ -92,7 +92,7 @@ impl<F: FunctionsOf> Foreign<F> {
         }
     }
 
-    /// As [`Foreign::run`], of a call that may say that there is no answer: whether there is one.
+    /// As [`Foreign::run`], for a call that may have no answer; returns whether there is one.
     fn asked(&self, call: &str, f: impl FnOnce(*mut c_void, *mut ConefieldText) -> ConefieldStatus) -> Result<bool> {
         let mut known = true;
         self.run(call, |stage, error| {
@@ -103,7 +103,7 @@ impl<F: FunctionsOf> Foreign<F> {
         Ok(known)
     }
 
-    /// What came of a call that has no result; what went wrong is a fault, and `instead` stands for it.
+    /// The value of a call that cannot return an error: records the error as a fault and returns `instead`.
     fn noted<T>(&self, result: Result<T>, instead: T) -> T {
         result.unwrap_or_else(|e| {
             self.fault.set(e);
@@ -111,16 +111,16 @@ impl<F: FunctionsOf> Foreign<F> {
         })
     }
 
-    /// The WGSL of the stage, if it has any.
+    /// The WGSL of the stage, if any.
     fn fragment(&self, wgsl: Option<WgslFn>) -> Option<Fragment> {
         let wgsl = wgsl?;
-        // SAFETY: the stage is alive; everything handed over lives for the time of the call.
+        // SAFETY: the stage is alive; all arguments live during the call.
         let source = whole_text(|room| unsafe { wgsl(self.handle.stage, room) }).ok()?;
         Some(Fragment { source })
     }
 
-    /// The stage that `call` makes of this one by `f`, which writes where to find it; nothing if it makes none. A refusal of
-    /// settings names the setting.
+    /// The stage that `call` derives from this one by `f`, which writes its address; `None` if there is none. Errors
+    /// about settings name the setting.
     fn make(
         &self,
         call: &str,
@@ -133,7 +133,7 @@ impl<F: FunctionsOf> Foreign<F> {
         }
     }
 
-    /// As [`Foreign::make`], of a call that always makes a stage.
+    /// As [`Foreign::make`], for a call that always returns a stage.
     fn must_make(
         &self,
         call: &str,
@@ -143,8 +143,8 @@ impl<F: FunctionsOf> Foreign<F> {
     }
 }
 
-/// Calls a function of a stage with the arguments between the stage and the room for a reason. What it is handed must live
-/// for the time of the call and have the lengths that go with it.
+/// Calls a function of a stage; the arguments go between the stage and the buffer for the reason. They must live during
+/// the call and have the accompanying lengths.
 macro_rules! call {
     ($own:expr, $function:ident($($argument:expr),* $(,)?)) => {
         match $own.functions.$function {
@@ -158,16 +158,16 @@ use call;
 
 type WgslFn = unsafe extern "C" fn(*const c_void, *mut ConefieldText) -> ConefieldStatus;
 
-/// A grid as a library sees it.
+/// A grid in the format of the ABI.
 fn raw_grid(grid: &VoxelGrid) -> ConefieldGrid {
     let VoxelGrid { shape, spacing, center } = *grid;
     ConefieldGrid { shape, spacing, center }
 }
 
-/// A small grid on which pieces of iterative methods are tried.
+/// A small grid for trials of parts of iterative methods.
 const SMALL: VoxelGrid = VoxelGrid { shape: [5, 4, 6], spacing: [1.0, 0.8, 1.5], center: [0.0; 3] };
 
-/// A ray as a library sees it.
+/// A ray in the format of the ABI.
 fn raw_ray(ray: &UnitRay) -> ConefieldRay {
     let UnitRay { origin, direction, inside, published, per_mm } = *ray;
     ConefieldRay { origin, direction, inside, published, per_mm }

@@ -1,6 +1,6 @@
-//! A stage is tried out before any real work is handed to it: on a few rows, between guard zones, under a time limit. What
-//! writes outside its tile, leaves outputs unwritten, returns numbers that are not finite, fails or does not come back is
-//! refused here. Whether gradients are right only the conformance kit can say.
+//! Trial runs of stages before real work: on a few rows, between guard zones, under a time limit. A stage is refused if
+//! it writes outside its tile, leaves outputs unwritten, returns non-finite numbers, fails or hangs. Only the
+//! conformance kit checks gradients.
 
 use crate::library::Type;
 use bytemuck::Pod;
@@ -18,19 +18,19 @@ use std::sync::mpsc;
 use std::thread;
 use std::time::Duration;
 
-/// How long a trial may take.
+/// Time limit of a trial.
 pub const LIMIT: Duration = Duration::from_secs(5);
 
-/// Numbers on either side of a buffer that nobody may write to: more than a tile of the widest common stages.
+/// Guard numbers on either side of a buffer: more than a tile of the widest common stages.
 pub(crate) const GUARD: usize = 1 << 14;
-/// NaNs that no arithmetic makes: the marks of what nobody has written to.
+/// NaNs that no arithmetic produces, marking unwritten numbers.
 pub(crate) const UNTOUCHED: u32 = 0x7fc5_a7e1;
 pub(crate) const UNTOUCHED_64: u64 = 0x7ff8_5a7e_1c5a_7e1c;
 
-/// Stages of more parameters are not initialised for their trial; that takes long, and the run does it anyway.
+/// Stages with more parameters are not initialized for their trial: it takes long, and the run does it anyway.
 const MANY: usize = 1 << 20;
 
-/// Numbers with a mark of their own.
+/// Numbers with a marker value.
 trait Marked: Real + Pod {
     const MARK: Self;
 
@@ -53,8 +53,7 @@ impl Marked for f64 {
     }
 }
 
-/// A buffer between guard zones. What is only zeroed takes no memory until it is written to: a trial comes before what a run
-/// would take is reckoned.
+/// A buffer between guard zones. Zeroed pages take no memory until written: a trial runs before the memory check.
 struct Guarded<R: Marked>(Pages<R>);
 
 impl<R: Marked> Guarded<R> {
@@ -64,7 +63,7 @@ impl<R: Marked> Guarded<R> {
         g
     }
 
-    /// Numbers to be read or changed.
+    /// A buffer with a copy of these numbers.
     fn of(values: &[R]) -> Self {
         let mut g = Self::zeroed(values.len());
         g.inner().copy_from_slice(values);
@@ -84,7 +83,7 @@ impl<R: Marked> Guarded<R> {
         Self(pages)
     }
 
-    /// What is wrong with the zones.
+    /// Describes damage to the guard zones.
     fn broken(&self, what: &str) -> Option<String> {
         let n = self.0.len();
         let outside = (0..GUARD).chain(n - GUARD..n);
@@ -94,7 +93,7 @@ impl<R: Marked> Guarded<R> {
         Some(format!("it writes outside its {what}: {place} {} numbers", n - 2 * GUARD))
     }
 
-    /// What is wrong with what was written.
+    /// Describes errors in the written numbers.
     fn unsound(&mut self, what: &str) -> Option<String> {
         let n = self.inner().len();
         let (i, v) = self.inner().iter().enumerate().find(|(_, v)| !v.f64().is_finite())?;
@@ -102,17 +101,17 @@ impl<R: Marked> Guarded<R> {
         Some(format!("number {i} of {n} of its {what} {how}"))
     }
 
-    /// What is wrong with the zones or with what was written.
+    /// Describes damage to the guard zones or errors in the written numbers.
     fn complaint(&mut self, what: &str) -> Option<String> {
         self.broken(what).or_else(|| self.unsound(what))
     }
 }
 
-/// Makes something of a library under the time limit, on a thread of its own: one that hangs is left behind.
+/// Runs a library's constructor under the time limit, on a thread of its own, which is abandoned if it hangs.
 pub(crate) fn timed<T: Send + 'static>(ty: &Type, make: impl FnOnce() -> Result<T> + Send + 'static) -> Result<T> {
     let (done, wait) = mpsc::channel();
     thread::spawn(move || {
-        // Nobody listens any more if this came too late.
+        // The receiver is gone after a timeout.
         let _ = done.send(make());
     });
     wait.recv_timeout(LIMIT).unwrap_or_else(|e| {
@@ -128,12 +127,12 @@ fn refused(ty: &Type, what: &str) -> Error {
     Error::unsupported(ty.words(), format!("refused: {what}"))
 }
 
-/// Refuses what there is a complaint about.
+/// Returns the complaint as an error, if there is one.
 fn settled(ty: &Type, complaint: Option<String>) -> Result<()> {
     complaint.map_or(Ok(()), |complaint| Err(refused(ty, &complaint)))
 }
 
-/// Tries an encoder, a normalizer or a field of type `ty`.
+/// Tries an encoder, normalizer or field of type `ty`.
 pub(crate) fn map(ty: &Type, stage: &dyn Stage) -> Result<()> {
     settled(ty, try_map(stage)?)
 }
@@ -160,7 +159,7 @@ fn try_map(stage: &dyn Stage) -> Result<Option<String>> {
     Ok(complaint.map(|c| format!("with parameters in halves, {c}")))
 }
 
-/// The first complaint about a kernel that reads halves.
+/// The first complaint about a half-precision kernel.
 fn try_halves<H: Half>(
     stage: &dyn Stage,
     kernel: &dyn Kernel<f32, H>,
@@ -236,7 +235,7 @@ fn try_kernel(stage: &dyn Stage, kernel: &dyn Kernel<f32>, params: &mut Guarded<
     Ok(None)
 }
 
-/// Rays along an axis, across the cube, the other way, and past it.
+/// Rays along an axis, across the cube, in the opposite direction, and past the cube.
 fn rays() -> [UnitRay; 4] {
     let ray = |origin, direction: [f32; 3], inside| UnitRay {
         origin,
@@ -254,7 +253,7 @@ fn rays() -> [UnitRay; 4] {
     ]
 }
 
-/// Tries a projector of type `ty`: `cast` samples a ray, with that many untouchable numbers behind the samples, and gives
+/// Tries a projector of type `ty`: `cast` samples a ray, with this many guard numbers behind the samples, and returns
 /// the line integral of ones.
 pub(crate) fn projector(ty: &Type, cast: impl Fn(&UnitRay, Option<u64>, usize) -> Result<f64>) -> Result<()> {
     for ray in rays() {
@@ -304,17 +303,17 @@ pub(crate) fn loss(ty: &Type, at: impl Fn(&[f64], &[f64], [&mut [f64]; 2]) -> Re
     Ok(())
 }
 
-/// `n` numbers in [0, 1).
+/// `n` random numbers in [0, 1).
 fn drawn(n: usize) -> impl Iterator<Item = f32> {
     (0..n).map(|i| unit(mix(5, i as u64)))
 }
 
-/// What is wrong with a number that is to be finite, 0 or more.
+/// Describes a number that should be finite and non-negative but is not.
 fn below_zero(what: &str, value: f64) -> Option<String> {
     (!(value.is_finite() && value >= 0.0)).then(|| format!("{what} is {value}"))
 }
 
-/// Tries a prior of type `ty` on a block of `points`: `block` adds to the gradient and gives the penalty.
+/// Tries a prior of type `ty` on a block of `points`: `block` adds to the gradient and returns the penalty.
 pub(crate) fn prior(ty: &Type, points: usize, block: impl Fn(&[f64], &mut [f64]) -> Result<f64>) -> Result<()> {
     let values: Vec<f64> = drawn(points).map(f64::from).collect();
     let mut gradient = Guarded::zeroed(points);
@@ -323,8 +322,7 @@ pub(crate) fn prior(ty: &Type, points: usize, block: impl Fn(&[f64], &mut [f64])
     settled(ty, complaint.or_else(|| gradient.unsound("gradient")))
 }
 
-/// Tries a regularizer of type `ty` on `count` coefficients: `prox` writes what its proximal map makes of some, and gives their
-/// penalty.
+/// Tries a regularizer of type `ty` on `count` coefficients: `prox` applies its proximal map and returns the penalty.
 pub(crate) fn regularizer(
     ty: &Type,
     count: usize,
@@ -342,7 +340,7 @@ pub(crate) fn regularizer(
     Ok(())
 }
 
-/// Tries a data term of type `ty`: `of` makes it for a scan.
+/// Tries a data term of type `ty`: `of` builds it for a scan.
 pub(crate) fn data_term<M: Misfit>(ty: &Type, of: impl Fn(ArrayView3<'_, f32>) -> Result<M>) -> Result<()> {
     let shape = [2, 6, 7];
     let scan = Array3::from_shape_vec(shape, drawn(2 * 6 * 7).map(|x| 2.0 * x).collect());

@@ -1,4 +1,4 @@
-//! A stage behind the pointer that the host holds.
+//! The stage behind the pointer that the host holds.
 
 use conefield_core::arena::Weights;
 use conefield_core::basis::{Basis, BasisSpec, Expansion};
@@ -19,25 +19,25 @@ use serde_json::Value;
 use std::cell::RefCell;
 use std::ops::Range;
 
-/// What the host holds.
+/// A stage held by the host.
 pub struct Built {
     pub stage: AnyStage,
-    /// Of an encoder, a normalizer or a field.
+    /// For an encoder, a normalizer or a field.
     map: Option<MapInfo>,
     /// The known volume of an initializer.
     pub volume: Option<KnownVolume>,
-    /// What a smaller stage kept of the one that it was made from.
+    /// What a reduced stage kept of the original.
     pub kept: (Vec<ConefieldRange>, Vec<usize>),
-    /// The shape of the grid that a penalty or an expansion was made for.
+    /// The grid shape of a penalty or an expansion.
     pub shape: [usize; 3],
 }
 
 macro_rules! any_stage {
     ($($kind:ident $($name:ident)?: $stage:ty,)*) => {
-        /// A stage of any kind, or a part that one made for a grid or a scan.
+        /// A stage of any kind, or a part made for a grid or a scan.
         pub enum AnyStage {
             $($kind(Box<$stage>),)*
-            /// An initializer before its weights were read.
+            /// An initializer whose weights are not read yet.
             Waiting(Waiting),
         }
 
@@ -74,14 +74,14 @@ any_stage! {
     Expansion expansion: dyn Expansion,
 }
 
-/// Settings of an initializer that name a weights file.
+/// Settings of an initializer that names a weights file.
 pub struct Waiting {
     spec: Box<dyn InitializerSpec>,
     pub path: String,
 }
 
 impl Waiting {
-    /// The initializer, or what waits for the file that it asks for.
+    /// Builds the initializer, or returns the settings if it needs a weights file.
     fn build(spec: Box<dyn InitializerSpec>) -> Result<AnyStage> {
         let asked = RefCell::new(None);
         let built = spec.build(&|path| {
@@ -94,7 +94,7 @@ impl Waiting {
         }
     }
 
-    /// The initializer with what stands in the file.
+    /// The initializer with the weights of the file.
     pub fn with(&self, weights: &Weights) -> Result<AnyStage> {
         let only = |path: &str| {
             let why = || Error::unsupported(path, "an initializer from a plugin has one weights file");
@@ -104,7 +104,7 @@ impl Waiting {
     }
 }
 
-/// What the host asks of a map again and again.
+/// Properties of a map that the host queries repeatedly.
 pub struct MapInfo {
     pub info: ConefieldInfo,
     pub blocks: Vec<Parameter>,
@@ -112,7 +112,7 @@ pub struct MapInfo {
 }
 
 impl Built {
-    /// The stage that `settings`, without their type, make of `t`.
+    /// The stage of type `t` with `settings`, which have no type key.
     pub fn new(t: &StageType, mut settings: Value, width: usize) -> Result<Self> {
         let Some(keys) = settings.as_object_mut() else {
             return Err(Error::invalid("spec", "", &settings, "a table of settings"));
@@ -140,7 +140,7 @@ impl Built {
         }))
     }
 
-    /// What the host holds of `stage`.
+    /// The host's object for `stage`.
     pub fn of(stage: impl Into<AnyStage>) -> Self {
         let stage = stage.into();
         let map = stage.map().map(|s| {
@@ -157,17 +157,17 @@ impl Built {
         Self { stage, map, volume, kept: (vec![], vec![]), shape: [0; 3] }
     }
 
-    /// The stage as such, of any kind.
+    /// Returns the stage, whatever its kind.
     pub fn any(&self) -> Result<&Self> {
         Ok(self)
     }
 
-    /// As a map of rows, with what is known of it.
+    /// As a map of rows, with its properties.
     pub fn map(&self) -> Result<(&dyn Stage, &MapInfo)> {
         self.stage.map().zip(self.map.as_ref()).ok_or_else(|| self.stage.is_no("encoder, normalizer or field"))
     }
 
-    /// As a penalty, to be changed.
+    /// As a mutable penalty.
     pub fn penalty_mut(&mut self) -> Result<&mut dyn Penalty> {
         match &mut self.stage {
             AnyStage::Penalty(penalty) => Ok(penalty.as_mut()),
@@ -195,7 +195,7 @@ impl Built {
 }
 
 impl AnyStage {
-    /// As an encoder, a normalizer or a field.
+    /// As an encoder, normalizer or field.
     fn map(&self) -> Option<&dyn Stage> {
         match self {
             Self::Encoder(s) => Some(s.as_ref()),
@@ -223,7 +223,7 @@ impl AnyStage {
         }
     }
 
-    /// It was asked for as another kind of stage than it is.
+    /// The error for a stage of a different kind than requested.
     fn is_no(&self, kind: &str) -> Error {
         match self {
             Self::Waiting(w) => Error::unsupported(&w.path, "the weights were not handed over"),

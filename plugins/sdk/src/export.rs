@@ -1,4 +1,4 @@
-//! The table of a plugin, from the stage types that its crate registered.
+//! The table of a plugin, built from the stage types that its crate registers.
 
 #![allow(unsafe_code)]
 
@@ -9,7 +9,7 @@ use std::panic::catch_unwind;
 use std::ptr;
 use std::sync::OnceLock;
 
-/// A plugin crate's name and version, from which its table is made when it is asked for.
+/// A plugin crate's name and version, from which its table is built on demand.
 pub struct Plugin {
     name: &'static str,
     version: &'static str,
@@ -17,27 +17,27 @@ pub struct Plugin {
     table: OnceLock<Table>,
 }
 
-/// A table that never changes.
+/// An immutable table.
 struct Table(ConefieldPlugin);
 
-// SAFETY: it points to statics and to memory that is leaked and never written again.
+// SAFETY: it points to statics and to leaked memory that is never written again.
 unsafe impl Send for Table {}
 // SAFETY: as above.
 unsafe impl Sync for Table {}
 
 impl Plugin {
-    /// The plugin that the crate called `name` is.
+    /// The plugin of the crate `name`.
     pub const fn new(name: &'static str, version: &'static str, licence: &'static str) -> Self {
         Self { name, version, licence, table: OnceLock::new() }
     }
 
-    /// Its table; NULL where that cannot be made.
+    /// Its table; NULL if it cannot be built.
     pub fn table(&'static self) -> *const ConefieldPlugin {
         catch_unwind(|| ptr::from_ref(&self.table.get_or_init(|| Table(self.make())).0)).unwrap_or(ptr::null())
     }
 
     fn make(&self) -> ConefieldPlugin {
-        // Crates that this one uses may register types of their own; those are theirs to export.
+        // Dependencies may register types of their own, which are not exported here.
         let own = |t: &&StageType| matches!(t.origin, Origin::Linked { package, .. } if package == self.name);
         let stages: Vec<ConefieldStage> = stage_types().into_iter().filter(own).filter_map(stage).collect();
         let stages = stages.leak();

@@ -1,8 +1,8 @@
-//! What a conefield plugin is written against.
+//! The crate for writing conefield plugins.
 //!
-//! A plugin's stage is written like a built-in one, against the same traits: settings that implement `EncoderSpec` (or the
-//! trait of another kind), a stage that implements [`Stage`](stage::Stage) and [`Kernel`](stage::Kernel). The crate's type
-//! is `cdylib`, and [`export!`] at its root offers every type that the crate registers with [`stage_type!`]:
+//! A plugin's stage is written like a built-in one, with the same traits: settings that implement `EncoderSpec` (or the
+//! trait of another kind), and a stage that implements [`Stage`](stage::Stage) and [`Kernel`](stage::Kernel). The
+//! crate's type is `cdylib`. [`export!`] at its root exports every type that the crate registers with [`stage_type!`]:
 //!
 //! ```text
 //! conefield_plugin::export!();
@@ -12,8 +12,8 @@
 //! impl EncoderSpec for Wavelet { … }
 //! ```
 //!
-//! `conefield plugins new NAME --kind encoder --lang rust` makes such a crate. A panic in a stage becomes an error of the
-//! run; keep `panic = "unwind"`, which is Cargo's default. Methods, callbacks and projectors of voxels cannot be exported.
+//! `conefield plugins new NAME --kind encoder --lang rust` creates such a crate. A panic in a stage becomes an error of
+//! the run; keep `panic = "unwind"`, Cargo's default. Methods, callbacks and voxel projectors cannot be exported.
 
 mod built;
 mod export;
@@ -26,11 +26,11 @@ pub use conefield_core::{
 pub use conefield_plugin_abi as abi;
 pub use export::Plugin;
 
-/// Exports every stage type that this crate registers. To be called once, at the root of the crate.
+/// Exports every stage type that this crate registers. Call it once, at the root of the crate.
 #[macro_export]
 macro_rules! export {
     () => {
-        /// What the host asks for when it loads this library.
+        /// The function that the host calls when it loads this library.
         #[allow(unsafe_code)]
         #[unsafe(no_mangle)]
         pub extern "C" fn conefield_plugin() -> *const $crate::abi::ConefieldPlugin {

@@ -1,4 +1,4 @@
-//! Pictures within a page: PNG as `data:` addresses.
+//! Pictures in a page: PNG as `data:` URLs.
 
 use crate::canvas::{diverging, encode_png, grey, round_above};
 use crate::survey::survey_picture;
@@ -8,19 +8,19 @@ use conefield_core::Result;
 use conefield_core::geometry::Geometry;
 use ndarray::{Array2, ArrayView2, s};
 
-/// Pixels along the longer side, at most.
+/// Maximum number of pixels along the longer side.
 const SIDE: usize = 512;
 
-/// Which colours values have.
+/// Colour map of values.
 #[derive(Debug, Clone, Copy)]
 pub enum Scale {
     /// From black to white.
     Grey([f32; 2]),
-    /// Blue below, red above, deepest at this distance from zero.
+    /// Blue below, red above, with the deepest colours at this distance from zero.
     Signed(f32),
 }
 
-/// `values`, rows from the top, as the address of a picture. Larger ones are shown as means of blocks.
+/// `values`, rows from the top, as the URL of a picture. Larger arrays are averaged over blocks.
 pub fn picture_url(values: ArrayView2<'_, f32>, scale: Scale) -> Result<String> {
     let by = values.shape().iter().max().map_or(1, |n| n.div_ceil(SIDE)).max(1);
     let shape = [0, 1].map(|k| values.shape()[k].div_ceil(by));
@@ -38,13 +38,13 @@ pub fn picture_url(values: ArrayView2<'_, f32>, scale: Scale) -> Result<String> 
     url(shape[1] as u32, shape[0] as u32, &rgb)
 }
 
-/// The picture that [`survey_png`](crate::survey_png) draws, as an address.
+/// The picture of [`survey_png`](crate::survey_png), as a URL.
 pub fn geometry_url(title: &str, geometry: &Geometry) -> Result<String> {
     let picture = survey_picture("a picture of the geometry", title, geometry)?;
     url(picture.width(), picture.height(), picture.as_raw())
 }
 
-/// A round number that all but half a percent of the `values` stay within.
+/// A round number that bounds all but half a percent of the `values`.
 pub fn spread(values: impl Iterator<Item = f32>) -> f32 {
     round_above(values.map(f32::abs).filter(|x| x.is_finite()).collect())
 }
@@ -55,7 +55,7 @@ fn url(width: u32, height: u32, rgb: &[u8]) -> Result<String> {
     Ok(png_url(&png))
 }
 
-/// The bytes of a PNG as an address.
+/// The bytes of a PNG as a URL.
 pub fn png_url(png: &[u8]) -> String {
     format!("data:image/png;base64,{}", STANDARD.encode(png))
 }
@@ -73,7 +73,7 @@ mod tests {
         let url = picture_url(values.view(), Scale::Grey([0.0, 1.0])).unwrap();
         let bytes = STANDARD.decode(url.strip_prefix("data:image/png;base64,").unwrap()).unwrap();
         let image = image::load_from_memory(&bytes).unwrap().to_rgb8();
-        // Blocks of 3, the last ones of what is left.
+        // Blocks of 3; the last ones are smaller.
         assert_eq!((image.width(), image.height()), (344, 2));
         assert_eq!(image.get_pixel(343, 0).0, [85; 3], "one of three rows");
         assert_eq!(image.get_pixel(0, 1).0, [255; 3]);

@@ -1,4 +1,4 @@
-//! A volume as a page holds it: 16-bit steps of its values, on coarser voxels where there are too many.
+//! Volumes in a page: values quantized to 16 bits, on coarser voxels if there are too many.
 
 use crate::MiddleSlices;
 use base64::Engine as _;
@@ -12,12 +12,12 @@ use ndarray::{Array3, ArrayView3, CowArray, s};
 use serde::Serialize;
 use std::io::Write;
 
-/// Steps from the middle of the values to either end.
+/// Quantization steps from the middle of the values to either end.
 const STEPS: f64 = 32767.0;
-/// What stands for a value that is no number.
+/// Represents NaN.
 const NO_NUMBER: i16 = i16::MIN;
 
-/// A volume with what a viewer has to know of it.
+/// A volume with metadata for the viewer.
 #[derive(Debug, Serialize)]
 pub struct PageVolume {
     name: String,
@@ -27,7 +27,7 @@ pub struct PageVolume {
     spacing: [f64; 3],
     center: [f64; 3],
     unit: String,
-    /// The attenuation of water, as a first guess.
+    /// The attenuation of water, as an initial guess.
     water: f64,
     /// A value is `stored · slope + offset`.
     slope: f64,
@@ -41,15 +41,15 @@ pub struct PageVolume {
     packed: String,
 }
 
-/// The factor by which volumes of so many `voxels` are to be made coarser so that all of them take at most `bytes` before they
-/// are packed.
+/// The coarsening factor with which volumes of these numbers of `voxels` take at most `bytes` in total, before
+/// compression.
 pub fn coarser(voxels: &[u64], bytes: u64) -> usize {
     let size = |factor: u64| voxels.iter().map(|n| 2 * n / factor.pow(3)).sum::<u64>();
     (1..64u64).find(|f| size(*f) <= bytes).unwrap_or(64) as usize
 }
 
 impl PageVolume {
-    /// `volume`, whose voxels are those of `grid`, with means of blocks of `coarser`³ voxels as its voxels.
+    /// `volume` on `grid`, averaged over blocks of `coarser`³ voxels.
     pub fn new(name: &str, reference: bool, volume: &Volume, grid: &VoxelGrid, coarser: usize) -> Result<Self> {
         let (values, coarse) = coarsened(volume.data.view(), grid, coarser);
         let (mut low, mut high) = (f64::INFINITY, f64::NEG_INFINITY);
@@ -86,28 +86,28 @@ impl PageVolume {
         })
     }
 
-    /// With the unit of its values, and the attenuation of water in it.
+    /// Sets the unit of its values, and the attenuation of water in it.
     pub fn in_unit(self, unit: &str, water: f64) -> Self {
         Self { unit: unit.to_owned(), water, ..self }
     }
 
-    /// What people call it.
+    /// Its display name.
     pub fn name(&self) -> &str {
         &self.name
     }
 
-    /// Voxels along x, y and z, of the page.
+    /// Voxels of the page along x, y and z.
     pub fn shape(&self) -> [usize; 3] {
         self.shape
     }
 
-    /// The stored numbers, x fastest: the high bytes of all, then the low ones, gzip, base64.
+    /// The stored numbers, x fastest: all high bytes, then all low bytes, gzip, base64.
     pub(super) fn packed(&self) -> &str {
         &self.packed
     }
 }
 
-/// Means of blocks, and where they stand. A block at an end may be smaller.
+/// Means of blocks, with their grid. Blocks at the end may be smaller.
 fn coarsened<'a>(
     values: ArrayView3<'a, f32>,
     grid: &VoxelGrid,
@@ -133,7 +133,7 @@ fn pack(values: ArrayView3<'_, f32>, slope: f64, offset: f64) -> std::io::Result
         x if x.is_finite() => ((x - offset) / slope).round().clamp(-STEPS, STEPS) as i16,
         _ => NO_NUMBER,
     };
-    // The high bytes change slowly: on their own they pack well.
+    // The high bytes change slowly and compress well on their own.
     let (high, low): (Vec<u8>, Vec<u8>) =
         values.reversed_axes().iter().map(|x| stored(x).to_be_bytes()).map(|[high, low]| (high, low)).unzip();
     let mut zipped = GzEncoder::new(Vec::new(), Compression::default());
@@ -189,7 +189,7 @@ mod tests {
         let v = volume([4, 4, 5]);
         let page = PageVolume::new("v", false, &v, &v.grid, 2).unwrap();
         assert_eq!((page.shape, page.spacing), ([2, 2, 3], [2.0, 4.0, 6.0]));
-        // The box begins where it began, and its last block is half full.
+        // The box starts at the same position, and its last block is half full.
         assert_eq!(page.center, [5.0, 0.0, 1.5]);
         let back = unpacked(&page);
         let near = |a: f64, b: f64| (a - b).abs() <= page.slope;

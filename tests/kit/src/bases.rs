@@ -1,4 +1,4 @@
-//! What a basis must keep to: a linear map without negative entries, and its exact adjoint.
+//! Properties of a basis: a linear map without negative entries, and its exact adjoint.
 
 use crate::call::{differing, settle};
 use crate::voxels::{above, apart, dot, flat, noise};
@@ -9,12 +9,12 @@ use conefield_core::simd::Real;
 use ndarray::Array3;
 use rayon::ThreadPoolBuilder;
 
-/// Largest mismatch of `<Bx, y>` and `<x, Bᵀy>` over `‖Bx‖·‖y‖`, in double and in single precision.
+/// Largest mismatch of `<Bx, y>` and `<x, Bᵀy>` relative to `‖Bx‖·‖y‖`, in double and in single precision.
 const ADJOINT: [f64; 2] = [1e-12, 1e-5];
-/// Largest error of single against double precision, as a share of the largest number.
+/// Largest error of single against double precision, relative to the largest number.
 const SINGLE: f64 = 1e-5;
 
-/// Runs every property that a basis must have.
+/// Checks all properties of a basis.
 pub fn check_basis(basis: &dyn Basis) -> Report {
     let mut report = Report { stage: basis.describe(), entries: vec![] };
     report.add("builds", || builds(basis));
@@ -35,12 +35,12 @@ pub fn check_basis(basis: &dyn Basis) -> Report {
     report
 }
 
-/// The operator in double precision, of a basis that has one.
+/// The operator in double precision, if the basis has one.
 fn reference(basis: &dyn Expansion) -> &dyn BasisOperator<f64> {
     basis.reference().unwrap_or_else(|| unreachable!("only asked of what has one"))
 }
 
-/// The voxels of coefficients, in double precision where there is an operator.
+/// Expands coefficients to voxels, in double precision if there is such an operator.
 fn exact(basis: &dyn Expansion, voxels: [usize; 3], x: &Array3<f64>) -> Array3<f64> {
     match basis.reference() {
         Some(of) => expand(of, voxels, x),
@@ -50,7 +50,7 @@ fn exact(basis: &dyn Expansion, voxels: [usize; 3], x: &Array3<f64>) -> Array3<f
 
 type Made = [(VoxelGrid, Box<dyn Expansion>)];
 
-/// Voxels that are no cubes, sides that are odd, lines and planes of voxels.
+/// Non-cubic voxels, odd sides, lines and planes of voxels.
 fn grids() -> Vec<VoxelGrid> {
     let grid = |shape, spacing| VoxelGrid { shape, spacing, center: [1.0, -2.0, 3.0] };
     vec![
@@ -61,7 +61,7 @@ fn grids() -> Vec<VoxelGrid> {
     ]
 }
 
-/// It is made for every grid, and the number of coefficients follows from the grid's shape alone.
+/// The basis exists for every grid, and the number of coefficients depends on the grid's shape only.
 fn builds(basis: &dyn Basis) -> Outcome {
     let complaint = grids().into_iter().find_map(|grid| {
         let made = match basis.on(&grid) {
@@ -130,7 +130,7 @@ fn linear(all: &Made, close: f64) -> Outcome {
     settle(complaint, "sums and multiples go through")
 }
 
-/// Both directions, over NaN as over 0.
+/// Both directions overwrite their output, whether it holds NaN or 0.
 fn overwrites(all: &Made) -> Outcome {
     let complaint = all.iter().find_map(|(grid, basis)| {
         let (op, shape) = (basis.operator(), basis.coefficients().shape);
@@ -155,7 +155,7 @@ fn no_negative_entries(all: &Made) -> Outcome {
         let one = |i: usize| {
             let mut x = Array3::zeros(shape);
             x.as_slice_mut()?[i] = 1.0;
-            // NaN is found as well.
+            // This also finds NaN.
             let all = exact(basis.as_ref(), grid.shape, &x);
             let least = all.into_iter().find(|v| v.is_nan() || *v < 0.0).unwrap_or(0.0);
             (least.is_nan() || least < 0.0).then(|| format!("{:?}: coefficient {i} gives {least:e}", grid.shape))
@@ -167,8 +167,7 @@ fn no_negative_entries(all: &Made) -> Outcome {
     settle(complaint, &format!("in {coefficients} columns"))
 }
 
-/// What says that its coefficients are samples fills the same box, keeps constants, and changes nothing where the grids are
-/// the same.
+/// Coefficients that are samples fill the same box, preserve constants, and change nothing if the grids are equal.
 fn samples(all: &Made, close: f64) -> Outcome {
     if !all.iter().any(|(_, basis)| basis.are_samples()) {
         return Outcome::Skipped("coefficients are none".into());

@@ -1,4 +1,4 @@
-//! How a stage treats what it is handed: sizes, buffers, threads, numbers at the edge.
+//! Behaviour of a stage with its inputs: sizes, buffers, threads, extreme numbers.
 
 use crate::call::{
     Before, Guarded, backward, data, differing, error, forward, forward_in_passes, forward_over, gradients, params,
@@ -9,10 +9,10 @@ use conefield_core::arena::{Block, Layout, Weights};
 use conefield_core::stage::{GradKind, Grads, Scope, Stage, Tile, TileMut};
 use std::collections::BTreeSet;
 
-/// Rows of the tile that is cut into others; more than a host uses, and no multiple of anything.
+/// Rows of the tile that is split into others; more than a host uses, and not a multiple of anything.
 const ROWS: usize = 301;
 
-/// Counts and kinds agree, and an identity is one.
+/// Counts and kinds are consistent, and an identity stage is one.
 pub fn info(stage: &dyn Stage, options: &Options) -> Outcome {
     let info = stage.info();
     let complaint = if info.input == 0 || info.output == 0 {
@@ -31,7 +31,7 @@ pub fn info(stage: &dyn Stage, options: &Options) -> Outcome {
     settle(complaint, &format!("{} to {} channels, {} parameters", info.input, info.output, info.params))
 }
 
-/// Blocks stand one after the other, cover everything and have names of their own.
+/// Blocks are consecutive, cover all parameters and have unique names.
 pub fn parameters(stage: &dyn Stage) -> Outcome {
     let mut names = BTreeSet::new();
     let mut end = 0;
@@ -67,7 +67,7 @@ fn by_row(stage: &dyn Stage) -> Result<(), Outcome> {
     if stage.info().scope == Scope::Row { Ok(()) } else { Err(Outcome::Skipped("its rows look at each other".into())) }
 }
 
-/// Rows do not depend on the tile they stand in.
+/// Rows do not depend on their tile.
 pub fn tile_outputs(stage: &dyn Stage, options: &Options) -> Outcome {
     if let Err(skip) = by_row(stage) {
         return skip;
@@ -93,7 +93,7 @@ pub fn tile_outputs(stage: &dyn Stage, options: &Options) -> Outcome {
     Outcome::Passed("1, 7, 64 and 256 rows give the bits of one tile".into())
 }
 
-/// All passes in order leave what forward leaves.
+/// All passes in order give the result of forward.
 pub fn passes(stage: &dyn Stage, options: &Options) -> Outcome {
     let (info, k, p) = (stage.info(), stage.kernel(), params::<f32>(stage, options));
     let n = 37;
@@ -106,7 +106,7 @@ pub fn passes(stage: &dyn Stage, options: &Options) -> Outcome {
     )
 }
 
-/// Gradients do not depend on the tiles that they are summed over, but for rounding.
+/// Gradients do not depend on the split into tiles, except for rounding.
 pub fn tile_gradients(stage: &dyn Stage, options: &Options) -> Outcome {
     if let Err(skip) = by_row(stage) {
         return skip;
@@ -130,7 +130,7 @@ pub fn tile_gradients(stage: &dyn Stage, options: &Options) -> Outcome {
     within("sums over tiles", worst, 1e-5)
 }
 
-/// Whatever stood in output and tape does not matter.
+/// Previous contents of output and tape do not matter.
 pub fn outputs_overwrite(stage: &dyn Stage, options: &Options) -> Outcome {
     let (info, k, p) = (stage.info(), stage.kernel(), params::<f32>(stage, options));
     let n = 37;
@@ -141,7 +141,7 @@ pub fn outputs_overwrite(stage: &dyn Stage, options: &Options) -> Outcome {
     settle(hole.or_else(|| differing("output", &y, &want)), "every output is written")
 }
 
-/// Parameter gradients are added to what is there, with and without an input gradient.
+/// Parameter gradients are accumulated, with and without an input gradient.
 pub fn gradients_add(stage: &dyn Stage, options: &Options) -> Outcome {
     let (info, k, p) = (stage.info(), stage.kernel(), params::<f32>(stage, options));
     if info.params == 0 {
@@ -161,7 +161,7 @@ pub fn gradients_add(stage: &dyn Stage, options: &Options) -> Outcome {
     within(&format!("on top of {start:.2}"), error(&added, &want), 1e-5)
 }
 
-/// The input gradient replaces what is there.
+/// The input gradient is overwritten.
 pub fn input_gradient_overwrites(stage: &dyn Stage, options: &Options) -> Outcome {
     let (info, k, p) = (stage.info(), stage.kernel(), params::<f32>(stage, options));
     let n = 37;
@@ -192,7 +192,7 @@ pub fn partition(stage: &dyn Stage) -> Outcome {
     settle(complaint, &format!("{} ranges", ranges.len()))
 }
 
-/// A range's gradients are the bits of all gradients there.
+/// A range's gradients are bit-identical to that part of all gradients.
 pub fn partition_gradients(stage: &dyn Stage, options: &Options) -> Outcome {
     let (info, k, p) = (stage.info(), stage.kernel(), params::<f32>(stage, options));
     if info.grads != GradKind::Scatter {
@@ -211,7 +211,7 @@ pub fn partition_gradients(stage: &dyn Stage, options: &Options) -> Outcome {
     Outcome::Passed(format!("{} ranges", ranges.len()))
 }
 
-/// Nothing beside the buffers is written, and what is to be read stays as it is.
+/// Nothing outside the buffers is written, and inputs stay unchanged.
 pub fn guards(stage: &dyn Stage, options: &Options) -> Outcome {
     let (info, k, p) = (stage.info(), stage.kernel(), params::<f32>(stage, options));
     let ranges = if info.grads == GradKind::Scatter { stage.partition() } else { vec![] };
@@ -246,7 +246,7 @@ pub fn guards(stage: &dyn Stage, options: &Options) -> Outcome {
     Outcome::Passed("on either side of every buffer".into())
 }
 
-/// Calls from several threads at once give the bits of one alone.
+/// Concurrent calls from several threads are bit-identical to a single call.
 pub fn threads(stage: &dyn Stage, options: &Options) -> Outcome {
     let (info, k, p) = (stage.info(), stage.kernel(), params::<f32>(stage, options));
     let n = 100;
@@ -266,7 +266,7 @@ pub fn threads(stage: &dyn Stage, options: &Options) -> Outcome {
     settle(complaint, "4 threads, 3 calls each")
 }
 
-/// Finite inputs at the edge of their range give finite outputs, and the way back does not panic.
+/// Finite inputs at the limits of their range give finite outputs, and backward does not panic.
 pub fn extremes(stage: &dyn Stage, options: &Options) -> Outcome {
     let (info, k) = (stage.info(), stage.kernel());
     let mut p = vec![0.0; info.params];
@@ -295,7 +295,7 @@ pub fn extremes(stage: &dyn Stage, options: &Options) -> Outcome {
     settle(wild, "0, denormal, ±1e30 give finite outputs")
 }
 
-/// NaN and infinities stay in their rows.
+/// NaN and infinities do not leave their rows.
 pub fn poison(stage: &dyn Stage, options: &Options) -> Outcome {
     if let Err(skip) = by_row(stage) {
         return skip;
@@ -308,7 +308,7 @@ pub fn poison(stage: &dyn Stage, options: &Options) -> Outcome {
     let poisoned = |i: usize| i % 5 == 2;
     for i in (0..n).filter(|&i| poisoned(i)) {
         for c in 0..info.input {
-            // Some rows are poisoned in one channel, some in all.
+            // Some rows are poisoned in one channel, others in all.
             if i % 2 == 0 || c == i % info.input {
                 x[c * n + i] = bad[i % 3];
             }
@@ -330,7 +330,7 @@ pub fn poison(stage: &dyn Stage, options: &Options) -> Outcome {
     )
 }
 
-/// Parameters come back under their names.
+/// Parameters are restored by name.
 pub fn save_and_load(stage: &dyn Stage, options: &Options) -> Outcome {
     let p: Vec<f32> = params(stage, options);
     let block = |b: conefield_core::stage::Parameter| Block {

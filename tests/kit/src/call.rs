@@ -1,4 +1,4 @@
-//! Calls of a stage's kernels on drawn data, and comparisons.
+//! Calls of a stage's kernels on random data, and comparisons.
 
 use crate::{Options, Outcome};
 use conefield_core::random::{mix, unit};
@@ -6,7 +6,7 @@ use conefield_core::simd::Real;
 use conefield_core::stage::{Grads, Info, Kernel, Stage, Tile, TileMut};
 use std::ops::Range;
 
-/// Numbers drawn one after the other.
+/// A sequence of random numbers.
 pub struct Draw(u64, u64);
 
 impl Draw {
@@ -31,7 +31,7 @@ impl Draw {
     }
 }
 
-/// Parameters as `options` ask for them.
+/// Parameters as defined by `options`.
 pub fn params<R: Real>(stage: &dyn Stage, options: &Options) -> Vec<R> {
     let n = stage.info().params;
     match options.params {
@@ -54,8 +54,8 @@ pub fn data<R: Real>(info: &Info, options: &Options, rows: usize) -> (Vec<R>, Ve
 const GUARD: usize = 64;
 const SENTINEL: f64 = -1.25e-7;
 
-/// A buffer between guards. Everything that a stage writes to is one, so that a stage in another language that writes
-/// past an end is found out and does no harm.
+/// A buffer between guards. All outputs are written to such buffers, so that a stage in another language that writes
+/// out of bounds is detected and does no harm.
 pub struct Guarded<R>(Vec<R>);
 
 impl<R: Real> Guarded<R> {
@@ -75,7 +75,7 @@ impl<R: Real> Guarded<R> {
         self.0.split_off(GUARD)
     }
 
-    /// Where the guards were written to.
+    /// Describes where the guards were overwritten.
     pub fn broken(&self, what: &str) -> Option<String> {
         let inside = GUARD..self.0.len() - GUARD;
         let i = (0..self.0.len()).find(|i| !inside.contains(i) && self.0[*i] != R::of(SENTINEL))?;
@@ -102,7 +102,7 @@ pub fn forward_over<R: Real>(
     [y.into_inner(), tape.into_inner()]
 }
 
-/// [`forward`], pass by pass.
+/// [`forward`] in separate passes.
 pub fn forward_in_passes<R: Real>(k: &dyn Kernel<R>, info: &Info, params: &[R], x: &[R], rows: usize) -> [Vec<R>; 2] {
     let [mut y, mut tape] = [info.output, info.tape].map(|c| Guarded::new(c * rows, R::of(f64::NAN)));
     for pass in 0..k.passes() {
@@ -112,12 +112,12 @@ pub fn forward_in_passes<R: Real>(k: &dyn Kernel<R>, info: &Info, params: &[R], 
     [y.into_inner(), tape.into_inner()]
 }
 
-/// What [`backward`] starts from.
+/// State before [`backward`].
 #[derive(Clone, Copy)]
 pub struct Before<R> {
     /// Gradients before the call.
     pub grads: R,
-    /// Input gradient before the call; `None` asks for none.
+    /// Input gradient before the call; `None` if it is not requested.
     pub dx: Option<R>,
 }
 
@@ -127,7 +127,7 @@ impl<R: Real> Before<R> {
     }
 }
 
-/// Gradients of the parameters `range`, and the input gradient (empty if not asked for).
+/// Gradients of the parameters `range`, and the input gradient (empty if not requested).
 pub fn backward<R: Real>(
     k: &dyn Kernel<R>,
     info: &Info,
@@ -154,12 +154,12 @@ pub fn backward<R: Real>(
     [grads.into_inner(), dx.map(Guarded::into_inner).unwrap_or_default()]
 }
 
-/// Gradients of every parameter and the input gradient.
+/// Gradients of all parameters, and the input gradient.
 pub fn gradients<R: Real>(k: &dyn Kernel<R>, info: &Info, params: &[R], x: &[R], dy: &[R], rows: usize) -> [Vec<R>; 2] {
     backward(k, info, params, x, dy, rows, 0..info.params, Before::clean())
 }
 
-/// Rows `at..at + n` of channels of `rows` rows.
+/// Rows `at..at + n` of channels with `rows` rows.
 pub fn rows_of<R: Real>(data: &[R], rows: usize, at: usize, n: usize) -> Vec<R> {
     data.chunks_exact(rows).flat_map(|c| c[at..at + n].iter().copied()).collect()
 }
@@ -169,7 +169,7 @@ pub fn channels_of<R: Real>(data: &[R], rows: usize, which: &[usize]) -> Vec<R> 
     which.iter().flat_map(|&c| data[c * rows..(c + 1) * rows].iter().copied()).collect()
 }
 
-/// Where two slices differ in their bits, in words. NaN equals NaN.
+/// Describes the first bitwise difference of two slices. NaN equals NaN.
 pub fn differing(what: &str, a: &[f32], b: &[f32]) -> Option<String> {
     if a.len() != b.len() {
         return Some(format!("{what}: {} numbers against {}", a.len(), b.len()));
@@ -179,7 +179,7 @@ pub fn differing(what: &str, a: &[f32], b: &[f32]) -> Option<String> {
     Some(format!("{what} {i}: {:e} against {:e}", a[i], b[i]))
 }
 
-/// Largest difference as a share of the largest magnitude of `b`; infinite where one side is not finite.
+/// Largest difference relative to the largest magnitude of `b`; infinite if one side is not finite.
 pub fn error<A: Real, B: Real>(a: &[A], b: &[B]) -> f64 {
     let scale = b.iter().map(|v| v.f64().abs()).fold(1e-30, f64::max);
     let of = |(a, b): (&A, &B)| {
@@ -195,7 +195,7 @@ pub fn within(what: &str, found: f64, limit: f64) -> Outcome {
     if found <= limit { Outcome::Passed(text) } else { Outcome::Failed(text) }
 }
 
-/// Failed with the first complaint, or passed.
+/// Failed with the complaint, or passed without one.
 pub fn settle(complaint: Option<String>, fine: &str) -> Outcome {
     complaint.map_or_else(|| Outcome::Passed(fine.into()), Outcome::Failed)
 }

@@ -1,4 +1,4 @@
-//! Stages without some of their channels.
+//! Stages reduced to some of their channels.
 
 use crate::call::{channels_of, data, differing, error, forward, gradients, params};
 use crate::{Options, Outcome, check};
@@ -23,14 +23,14 @@ fn choices(n: usize) -> Vec<Vec<usize>> {
     all
 }
 
-/// Gradients may be summed in another order.
+/// Gradients may be summed in a different order.
 const ROUNDING: f64 = 1e-5;
 
 fn gather(ranges: &[Range<usize>], params: &[f32]) -> Vec<f32> {
     ranges.iter().flat_map(|r| params[r.clone()].iter().copied()).collect()
 }
 
-/// What holds for every smaller stage: its counts fit, and its names are the old ones.
+/// Properties of every reduced stage: its counts are consistent, and its names are unchanged.
 fn counts(full: &dyn Stage, small: &dyn Stage, params: &[Range<usize>], input: usize, output: usize) -> Option<String> {
     let (info, params) = (small.info(), params.iter().map(Range::len).sum::<usize>());
     let names: BTreeSet<String> = full.parameters().into_iter().map(|p| p.name).collect();
@@ -44,13 +44,13 @@ fn counts(full: &dyn Stage, small: &dyn Stage, params: &[Range<usize>], input: u
     }
 }
 
-/// Runs the kit over a smaller stage.
+/// Runs the kit on a reduced stage.
 fn whole(stage: &dyn Stage, options: &Options) -> Option<String> {
     let report = check(stage, options);
     (!report.passed()).then(|| format!("the smaller stage fails {:?}:\n{report}", report.failed()))
 }
 
-/// Kept channels have the old bits; gradients are those of a zero gradient of the channels left out.
+/// Kept channels are bit-identical; gradients are those for a zero gradient of the removed channels.
 fn same_outputs(
     full: &dyn Stage,
     small: &dyn Stage,
@@ -95,13 +95,13 @@ fn each(n: usize, mut one: impl FnMut(&[usize]) -> Result<Option<String>>) -> Ou
     Outcome::Passed(format!("{} choices", all.len()))
 }
 
-/// An encoder without some outputs.
+/// An encoder with fewer outputs.
 pub fn encoder_outputs(stage: &dyn Encoder, options: &Options) -> Outcome {
     let n = stage.info().output;
     each(n, |keep| {
         let r = stage.keep_outputs(keep)?;
         let mut complaint = same_outputs(stage, r.stage.as_ref(), &r.params, &r.channels, keep, options);
-        // Left out twice is left out at once.
+        // Removing channels in two steps equals removing them at once.
         if complaint.is_none() && keep.len() > 1 {
             let again: Vec<usize> = (0..keep.len()).skip(1).step_by(2).collect();
             let second = r.stage.keep_outputs(&again)?;
@@ -120,7 +120,7 @@ pub fn encoder_outputs(stage: &dyn Encoder, options: &Options) -> Outcome {
     })
 }
 
-/// How fine channels are: one number each, that of the same channel in a smaller encoder.
+/// Resolutions of channels: one number each, the same for that channel in a reduced encoder.
 pub fn resolutions(stage: &dyn Encoder) -> Outcome {
     let Some(cells) = stage.resolutions() else {
         return Outcome::Skipped("it does not say how fine its channels are".into());
@@ -136,7 +136,7 @@ pub fn resolutions(stage: &dyn Encoder) -> Outcome {
         return Outcome::Failed(format!("channels stand from coarse to fine, their cells do not: {cells:?}"));
     }
     for keep in choices(n) {
-        // Whether it can leave out channels is another property.
+        // Whether it can remove channels is a separate property.
         let Ok(smaller) = stage.keep_outputs(&keep) else { continue };
         let want: Vec<f64> = keep.iter().map(|&c| cells[c]).collect();
         let found = smaller.stage.resolutions();
@@ -149,7 +149,7 @@ pub fn resolutions(stage: &dyn Encoder) -> Outcome {
     Outcome::Passed(format!("{low} to {high} cells along the cube's side"))
 }
 
-/// A normalizer without some inputs is a smaller stage of the same kind.
+/// A normalizer with fewer inputs is a reduced stage of the same kind.
 pub fn normalizer_inputs(stage: &dyn Normalizer, options: &Options) -> Outcome {
     let info = stage.info();
     each(info.input, |keep| {
@@ -167,7 +167,7 @@ pub fn normalizer_inputs(stage: &dyn Normalizer, options: &Options) -> Outcome {
     })
 }
 
-/// A field without some inputs is the field that sees zeros there.
+/// A field with fewer inputs equals the field with zeros there.
 pub fn field_inputs(stage: &dyn Field, options: &Options) -> Outcome {
     let info = stage.info();
     each(info.input, |keep| {

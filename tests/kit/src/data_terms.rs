@@ -1,4 +1,4 @@
-//! What a data term must keep to: a convex function of residuals, its derivative and a bound of its curvature.
+//! Properties of a data term: a convex function of residuals, its derivative and a bound of its curvature.
 
 use crate::call::{differing, settle};
 use crate::voxels::{above, noise};
@@ -10,15 +10,15 @@ use rayon::ThreadPoolBuilder;
 
 /// Standard deviation of the scan's noise.
 const SIGMA: f32 = 0.02;
-/// Step of second differences, and of first ones.
+/// Step of first and second differences.
 const STEP: f32 = 0.05;
 const SHORT: f32 = 1.0 / 512.0;
-/// By how much of the largest derivative slopes over one and two steps may differ.
+/// Largest difference of slopes over one and two steps, relative to the largest derivative.
 const KINK: f64 = 1e-3;
-/// Largest error of a derivative, as a share of the largest.
+/// Largest error of a derivative, relative to the largest one.
 const ERROR: f64 = 2e-3;
 
-/// Runs every property that a data term must have.
+/// Checks all properties of a data term.
 pub fn check_data_term(term: &dyn DataTerm) -> Report {
     let mut report = Report { stage: term.describe(), entries: vec![] };
     let scan = scan();
@@ -42,14 +42,14 @@ pub fn check_data_term(term: &dyn DataTerm) -> Report {
     report
 }
 
-/// A data term with the line integrals that it is for.
+/// A data term with its measured line integrals.
 struct On {
     of: Box<dyn Misfit>,
     measured: Array3<f32>,
 }
 
 impl On {
-    /// Hands `work` each image with its view and what was measured there; the sum of what comes back.
+    /// Calls `work` with each view, its measurements and its image; returns the sum of the results.
     fn each(&self, views: &[usize], images: &mut Array3<f32>, work: impl Fn(usize, &[f32], &mut [f32]) -> f64) -> f64 {
         let all = images.outer_iter_mut().zip(views);
         all.map(|(mut image, &view)| {
@@ -63,7 +63,7 @@ impl On {
         self.each(views, residuals, |view, measured, r| self.of.differentiate(view, measured, r))
     }
 
-    /// What `f` makes of ones.
+    /// Applies `f` to ones.
     fn of_ones(&self, f: impl Fn(usize, &[f32], &mut [f32])) -> Array3<f32> {
         let mut ones = Array3::ones(self.measured.dim());
         self.each(&ALL, &mut ones, |view, measured, image| {
@@ -82,12 +82,12 @@ impl On {
     }
 }
 
-/// Three views of a hill of line integrals up to 3, with noise that grows with them.
+/// Three views of a bump of line integrals up to 3, with noise that increases with them.
 fn scan() -> Array3<f32> {
     let mut i = 0;
     Array3::from_shape_fn((3, 24, 40), |(_, _, c)| {
         let p = 3.0 * (std::f32::consts::PI * c as f32 / 39.0).sin();
-        // Twelve draws together are about normal.
+        // The sum of twelve draws is approximately normal.
         let drawn: f32 = (0..12)
             .map(|_| {
                 unit(mix(11, {
@@ -109,7 +109,7 @@ fn at(of: &On, views: &[usize], residuals: &Array3<f32>) -> (f64, Array3<f32>) {
     (value, r)
 }
 
-/// Value at `r` with a pixel `change` away.
+/// Value at `r` after changing one pixel by `change`.
 fn moved(of: &On, r: &Array3<f32>, pixel: [usize; 3], change: f32) -> f64 {
     let mut r = r.clone();
     r[pixel] += change;
@@ -121,7 +121,7 @@ fn pixels() -> impl Iterator<Item = [usize; 3]> {
     ALL.into_iter().flat_map(|v| (0..24).step_by(7).flat_map(move |r| (0..40).step_by(6).map(move |c| [v, r, c])))
 }
 
-/// Central differences over a step and over two. Where these are apart, a kink lies near: such a pixel says nothing.
+/// Central differences over one and two steps. If they disagree, there is a kink nearby, and the pixel is ignored.
 fn differences(of: &On) -> Outcome {
     let r = noise::<f32>([3, 24, 40], 3);
     let (_, derivative) = at(of, &ALL, &r);
@@ -129,7 +129,7 @@ fn differences(of: &On) -> Outcome {
     let (mut worst, mut smooth, mut all) = (0.0f64, 0, 0);
     for pixel in pixels() {
         let slope = |step: f32| {
-            // The step as single precision has it.
+            // The step as represented in single precision.
             let length = f64::from(r[pixel] + step) - f64::from(r[pixel] - step);
             (moved(of, &r, pixel, step) - moved(of, &r, pixel, -step)) / length
         };
@@ -145,7 +145,7 @@ fn differences(of: &On) -> Outcome {
     settle(few.or(off), &format!("off by {worst:.1e} at most"))
 }
 
-/// Second differences lie between 0 and what [`Misfit::curve`] says.
+/// Second differences lie between 0 and [`Misfit::curve`].
 fn curvature(of: &On) -> Outcome {
     let r = noise::<f32>([3, 24, 40], 4);
     let bound = of.curve();
@@ -189,7 +189,7 @@ fn views_stand_alone(of: &On) -> Outcome {
     settle(complaint, "alone, together, turned round and repeated")
 }
 
-/// The noise of line integrals near 0 is found, or of all of them in the mean.
+/// The noise is found, either of line integrals near 0 or on average over all of them.
 fn sigma(of: &On) -> Outcome {
     let found = of.of.noise() / f64::from(SIGMA);
     let complaint = (!(0.7..5.0).contains(&found)).then(|| format!("{found:.2} times what it is"));
@@ -208,7 +208,7 @@ fn spread(of: &On) -> Outcome {
     settle(bad.or(complaint), "at most the root of the curvature")
 }
 
-/// Scans without noise, of nothing, and of a single pixel.
+/// Scans without noise, empty scans, and scans of a single pixel.
 fn finite(term: &dyn DataTerm) -> Outcome {
     let complaint = [0.0f32, 1e-30, 1.0, 1e4].into_iter().find_map(|value| {
         [[24, 40], [1, 1], [1, 7], [7, 1]].into_iter().find_map(|[rows, columns]| {

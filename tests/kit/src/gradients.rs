@@ -5,13 +5,13 @@ use crate::{Options, Outcome};
 use conefield_core::simd::Real;
 use conefield_core::stage::{Info, Kernel, Scope, Stage};
 
-/// Parameters and inputs that are differenced one by one, at most.
+/// Maximum number of parameters and inputs differenced one by one.
 const SINGLES: usize = 400;
-/// Directions through all parameters at once.
+/// Number of random directions through all parameters.
 const DIRECTIONS: u64 = 3;
 
-/// Steps, the best first, and the error that differences over them have at most. In single precision a stage that varies
-/// fast is smooth over short steps alone; there its slopes are steep, so that rounding still leaves two digits.
+/// Steps, the best first, and the largest error of differences over them. In single precision a stage that varies fast
+/// is smooth only over short steps; its slopes are steep there, so that rounding still leaves two digits.
 struct Steps {
     all: &'static [f64],
     tolerance: f64,
@@ -31,14 +31,14 @@ fn loss<R: Real>(k: &dyn Kernel<R>, info: &Info, params: &[R], x: &[R], dy: &[R]
     y.iter().zip(dy).map(|(y, d)| y.f64() * d.f64()).sum()
 }
 
-/// Derivative of `f` at 0 by central differences over two steps (Richardson): the error is of fourth order.
+/// Derivative of `f` at 0 by central differences over two steps (Richardson); the error is of fourth order.
 pub fn slope(h: f64, mut f: impl FnMut(f64) -> f64) -> f64 {
     let mut central = |h: f64| (f(h) - f(-h)) / (2.0 * h);
     let (wide, narrow) = (central(h), central(0.5 * h));
     (4.0 * narrow - wide) / 3.0
 }
 
-/// Inputs of rows around which the stage is smooth, with the longest step over which it is.
+/// Inputs around which the stage is smooth, with the longest step over which it is.
 fn smooth_rows<R: Real>(
     k: &dyn Kernel<R>,
     info: &Info,
@@ -88,7 +88,7 @@ fn rows_smooth_over<R: Real>(
 
 const NO_ROWS: &str = "no rows found around which the stage is smooth";
 
-/// Every parameter's gradient, one by one and along directions through all of them.
+/// The gradient of every parameter, one by one and along directions through all of them.
 pub fn parameters(stage: &dyn Stage, options: &Options) -> Outcome {
     match stage.reference() {
         Some(k) => parameters_in(stage, k, options),
@@ -111,7 +111,7 @@ fn parameters_in<R: Real>(stage: &dyn Stage, k: &dyn Kernel<R>, options: &Option
     let largest = g.iter().map(|g| g.f64().abs()).fold(0.0, f64::max);
     let mut draw = Draw::new(options.seed, 6);
     let mut worst = 0.0f64;
-    // One by one: half of them where a gradient was found, half anywhere.
+    // One by one: half of them with a non-zero gradient, half anywhere.
     let touched: Vec<usize> = (0..info.params).filter(|&i| g[i] != R::ZERO).collect();
     let chosen: Vec<usize> = if info.params <= SINGLES {
         (0..info.params).collect()
@@ -159,7 +159,7 @@ fn parameters_in<R: Real>(stage: &dyn Stage, k: &dyn Kernel<R>, options: &Option
     Outcome::Passed(format!("{n} of {} and {DIRECTIONS} directions, worst error {worst:.1e}", info.params))
 }
 
-/// Every input's gradient.
+/// The gradient of every input.
 pub fn inputs(stage: &dyn Stage, options: &Options) -> Outcome {
     match stage.reference() {
         Some(k) => inputs_in(stage, k, options),
@@ -205,7 +205,7 @@ pub fn no_rows<R: Real>() -> Outcome {
     if size_of::<R>() == 8 { Outcome::Failed(text) } else { Outcome::Skipped(text) }
 }
 
-/// Inputs at which both precisions mean the same cells and sides of kinks.
+/// Inputs at which both precisions select the same cells and sides of kinks.
 pub fn shared(stage: &dyn Stage, k: &dyn Kernel<f64>, options: &Options) -> Option<[Vec<f64>; 3]> {
     let info = stage.info();
     let p: Vec<f64> = params(stage, options);
@@ -218,7 +218,7 @@ pub fn narrow(v: &[f64]) -> Vec<f32> {
     v.iter().map(|&v| v as f32).collect()
 }
 
-/// Outputs of the kernel that trains against the reference.
+/// Outputs of the training kernel against the reference.
 pub fn single_outputs(stage: &dyn Stage, options: &Options) -> Outcome {
     let Some(k) = stage.reference() else { return Outcome::Skipped("no double-precision kernel".into()) };
     let Some([p, x, _]) = shared(stage, k, options) else { return no_rows::<f64>() };
@@ -228,7 +228,7 @@ pub fn single_outputs(stage: &dyn Stage, options: &Options) -> Outcome {
     within("outputs", error(&y, &want), options.single)
 }
 
-/// Gradients of the kernel that trains against the reference.
+/// Gradients of the training kernel against the reference.
 pub fn single_gradients(stage: &dyn Stage, options: &Options) -> Outcome {
     let Some(k) = stage.reference() else { return Outcome::Skipped("no double-precision kernel".into()) };
     let Some([p, x, dy]) = shared(stage, k, options) else { return no_rows::<f64>() };

@@ -1,19 +1,19 @@
-//! Parameters that are read in halves: the same arithmetic, of rounded numbers.
+//! Half-precision parameters: the same arithmetic on rounded numbers.
 
 use crate::call::{data, differing, error, forward, forward_in_passes, gradients as backward, params, settle};
 use crate::{Options, Outcome};
 use conefield_core::half::{Half, round};
 use conefield_core::stage::{Halves, Kernel, Reader, Stage};
 
-/// Largest error against the kernel that trains on the rounded parameters.
+/// Largest error against the training kernel on the rounded parameters.
 const SAME: f64 = 1e-6;
-/// Outputs may be off by so many roundings of the largest parameter.
+/// Largest error of outputs, in roundings of the largest parameter.
 const ROUNDINGS: f64 = 4.0;
 
-/// What a kernel that reads halves is off: outputs or gradients, of the same numbers and by rounding them.
+/// Errors of a half-precision kernel (outputs or gradients), on the same rounded numbers and due to rounding.
 type Off = fn(&dyn Stage, &dyn Kernel<f32>, &Options, [&[f32]; 2]) -> [f64; 2];
 
-/// Outputs are those of the rounded parameters, and as far from those of the unrounded as rounding makes them.
+/// Outputs equal those of the rounded parameters, and differ from unrounded ones only by rounding.
 pub fn outputs(stage: &dyn Stage, options: &Options) -> Outcome {
     let off: Off = |stage, halves, options, [exact, rounded]| {
         let info = stage.info();
@@ -25,7 +25,7 @@ pub fn outputs(stage: &dyn Stage, options: &Options) -> Outcome {
     compared(stage, options, off)
 }
 
-/// Gradients of parameters and inputs are those at the rounded parameters, in single precision.
+/// Gradients of parameters and inputs equal those at the rounded parameters, in single precision.
 pub fn gradients(stage: &dyn Stage, options: &Options) -> Outcome {
     let off: Off = |stage, halves, options, [_, rounded]| {
         let info = stage.info();
@@ -37,7 +37,7 @@ pub fn gradients(stage: &dyn Stage, options: &Options) -> Outcome {
     compared(stage, options, off)
 }
 
-/// All passes in order leave what forward leaves.
+/// All passes in order give the result of forward.
 pub fn passes(stage: &dyn Stage, options: &Options) -> Outcome {
     let Some(Halves { f16, bf16 }) = stage.halves() else { return not_read() };
     let (info, n) = (stage.info(), 37);

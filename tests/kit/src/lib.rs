@@ -1,9 +1,9 @@
-//! The conformance kit: runs a stage through everything that hosts rely on and reports property by property.
+//! The conformance kit: checks every property of a stage that hosts rely on, and reports each.
 //!
-//! Gradients are compared with central differences of the stage's own forward pass, in double precision where the
-//! stage has a reference kernel and coarsely in single precision where it has not. Rows for that are drawn where the
-//! stage is smooth: a row is taken only if differences over a step and over four steps agree, so that no cell boundary
-//! and no kink of an activation lies near.
+//! Gradients are compared with central differences of the stage's own forward pass: in double precision if the stage
+//! has a reference kernel, otherwise coarsely in single precision. Rows for this are sampled where the stage is smooth:
+//! a row is accepted only if differences over one step and over four steps agree, so that no cell boundary and no kink
+//! of an activation is nearby.
 
 mod bases;
 mod behaviour;
@@ -38,21 +38,21 @@ pub use voxels::check_voxel_projector;
 pub use weights::check_initializer;
 pub use wgsl::{Pass, Sample, check_projector_wgsl, check_wgsl};
 
-/// How a stage is tried out.
+/// Options of the checks.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Options {
-    /// Inputs are drawn uniformly from here.
+    /// Range of the uniformly random inputs.
     pub inputs: Range<f64>,
-    /// Parameters are drawn uniformly from ± this; `None`: as the stage initialises them.
+    /// Parameters are uniformly random in ± this; `None`: initialized by the stage.
     pub params: Option<f64>,
-    /// Rows for gradients.
+    /// Number of rows for gradients.
     pub rows: usize,
-    /// Largest relative error of gradients in double precision against differences.
+    /// Largest relative error of double-precision gradients against differences.
     pub tolerance: f64,
-    /// Largest error of single against double precision, as a share of the largest output; gradients may be four
-    /// times as far off.
+    /// Largest error of single against double precision, relative to the largest output; four times as much for
+    /// gradients.
     pub single: f64,
-    /// Seed of everything drawn.
+    /// Seed of all random numbers.
     pub seed: u64,
 }
 
@@ -68,28 +68,28 @@ impl Options {
     }
 }
 
-/// What became of a property.
+/// The outcome of a property check.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub enum Outcome {
-    /// It holds; how it was seen.
+    /// It holds, with the evidence.
     Passed(String),
-    /// It does not hold; what was found.
+    /// It does not hold, with the finding.
     Failed(String),
-    /// It does not apply, and why.
+    /// It does not apply, with the reason.
     Skipped(String),
 }
 
-/// What became of a stage's properties, in the order in which they were tried.
+/// The outcomes of all property checks of a stage, in order.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Report {
-    /// The stage, in its own words.
+    /// The stage's own description.
     pub stage: String,
     /// Name and outcome of each property.
     pub entries: Vec<(&'static str, Outcome)>,
 }
 
 impl Report {
-    /// Names of the properties that do not hold.
+    /// Names of the violated properties.
     pub fn failed(&self) -> Vec<&'static str> {
         self.entries.iter().filter(|(_, o)| matches!(o, Outcome::Failed(_))).map(|(n, _)| *n).collect()
     }
@@ -124,7 +124,7 @@ impl fmt::Display for Report {
     }
 }
 
-/// Runs every property that any stage must have.
+/// Checks all properties that any stage must have.
 pub fn check(stage: &dyn Stage, options: &Options) -> Report {
     let mut report = Report { stage: stage.describe(), entries: vec![] };
     report.add("info", || behaviour::info(stage, options));
@@ -154,7 +154,7 @@ pub fn check(stage: &dyn Stage, options: &Options) -> Report {
     report
 }
 
-/// [`check`], and what an encoder must keep to when it says how fine it is and when channels are left out.
+/// [`check`], and the properties of an encoder's resolutions and reduced channels.
 pub fn check_encoder(stage: &dyn Encoder, options: &Options) -> Report {
     let mut report = check(stage, options);
     report.add("resolutions", || channels::resolutions(stage));
@@ -162,14 +162,14 @@ pub fn check_encoder(stage: &dyn Encoder, options: &Options) -> Report {
     report
 }
 
-/// [`check`], and what a normalizer must keep to when channels are left out.
+/// [`check`], and the properties of a normalizer with reduced channels.
 pub fn check_normalizer(stage: &dyn Normalizer, options: &Options) -> Report {
     let mut report = check(stage, options);
     report.add("keep inputs", || channels::normalizer_inputs(stage, options));
     report
 }
 
-/// [`check`], what a field must keep to when channels are left out, and its own line integrals.
+/// [`check`], and the properties of a field with reduced channels and of its own line integrals.
 pub fn check_field(stage: &dyn Field, options: &Options) -> Report {
     let mut report = check(stage, options);
     report.add("keep inputs", || channels::field_inputs(stage, options));

@@ -1,4 +1,5 @@
-//! Line integrals that a field brings itself: derivatives, adjointness, precision, and agreement with the field's values.
+//! Line integrals computed by a field itself: derivatives, adjointness, precision, and agreement with the field's
+//! values.
 
 use crate::call::{Draw, differing, error, forward, params, settle, within};
 use crate::rays::rays;
@@ -7,12 +8,12 @@ use conefield_core::simd::Real;
 use conefield_core::stage::{Field, Grads, Lines, UnitRay};
 use std::ops::Range;
 
-/// Points along a ray by which its line integral is compared with the field's values.
+/// Points along a ray at which its line integral is compared with the field's values.
 const POINTS: usize = 2000;
-/// By how much of the largest these two may differ: a walk from plane to plane is no exact integral.
+/// Largest relative difference of the two: a walk from plane to plane is not an exact integral.
 const CLOSE: f64 = 0.15;
 
-/// Adds to `report` every property that a field's own line integrals must have, if it brings some.
+/// Adds the properties of a field's own line integrals to `report`, if it has any.
 pub fn check(report: &mut Report, field: &dyn Field, options: &Options) {
     let (Some(single), reference) = (field.lines(), field.lines_reference()) else { return };
     let Some(double) = reference else {
@@ -52,14 +53,14 @@ fn dot(a: &[f64], b: &[f64]) -> f64 {
     a.iter().zip(b).map(|(a, b)| a * b).sum()
 }
 
-/// What every property starts from: rays, parameters and `∂L/∂lines`.
+/// Inputs of every property: rays, parameters and `∂L/∂lines`.
 fn drawn<R: Real>(field: &dyn Field, options: &Options) -> (Vec<UnitRay>, Vec<R>, Vec<R>) {
     let rays = rays();
     let dlines = Draw::new(options.seed, 21).many(&(-1.0..1.0), rays.len());
     (rays, params(field, options), dlines)
 }
 
-/// `Σ dlines·lines` along random directions through the parameters, and along single ones.
+/// Differences of `Σ dlines·lines` along random directions through the parameters, and along single ones.
 fn differences(field: &dyn Field, lines: &dyn Lines<f64>, options: &Options) -> Outcome {
     let (rays, p, dlines) = drawn::<f64>(field, options);
     let gradient = backproject(lines, &p, &rays, &dlines, 0.0, 0..p.len());
@@ -83,7 +84,7 @@ fn differences(field: &dyn Field, lines: &dyn Lines<f64>, options: &Options) -> 
     within("24 directions", worst, options.tolerance)
 }
 
-/// Where line integrals are linear in the parameters: `<Aμ, y> = <μ, Aᵀy>`.
+/// If line integrals are linear in the parameters: `<Aμ, y> = <μ, Aᵀy>`.
 fn adjoint(field: &dyn Field, lines: &dyn Lines<f64>, options: &Options) -> Outcome {
     let (rays, p, y) = drawn::<f64>(field, options);
     let twice: Vec<f64> = p.iter().map(|p| 2.0 * p).collect();
@@ -115,7 +116,7 @@ fn adds(field: &dyn Field, lines: &dyn Lines<f32>, options: &Options) -> Outcome
     within("over 3", error(&less, &clean), 1e-5)
 }
 
-/// Ranges of parameters that workers own get the bits that they get together.
+/// Gradients of parameter ranges are bit-identical to those of all parameters together.
 fn partition(field: &dyn Field, lines: &dyn Lines<f32>, options: &Options) -> Outcome {
     let (rays, p, d) = drawn::<f32>(field, options);
     let whole = backproject(lines, &p, &rays, &d, 0.0, 0..p.len());
@@ -134,7 +135,7 @@ fn partition(field: &dyn Field, lines: &dyn Lines<f32>, options: &Options) -> Ou
     Outcome::Passed(format!("{} ranges", parts.len()))
 }
 
-/// Rays that are not inside give exactly 0 and leave gradients as they were.
+/// Rays that miss the box give exactly 0 and leave gradients unchanged.
 fn misses(field: &dyn Field, lines: &dyn Lines<f32>, options: &Options) -> Outcome {
     let (mut rays, p, d) = drawn::<f32>(field, options);
     rays.iter_mut().for_each(|r| r.inside = [0.0; 2]);
@@ -155,12 +156,12 @@ fn callers(field: &dyn Field, lines: &dyn Lines<f32>, options: &Options) -> Outc
     settle(missing.or_else(|| found.iter().find_map(|f| differing("number", f, &want))), "3 callers")
 }
 
-/// A line integral is the sum of the field's values along the ray, about.
+/// A line integral is approximately the sum of the field's values along the ray.
 fn values(field: &dyn Field, lines: &dyn Lines<f64>, options: &Options) -> Outcome {
     let Some(kernel) = field.reference() else {
         return Outcome::Skipped("no reference kernel".into());
     };
-    // Parameters of one sign: sums of both would be small, and their errors large beside them.
+    // Parameters of one sign: sums of both signs would be small, with large relative errors.
     let p: Vec<f64> = params::<f64>(field, options).into_iter().map(|p| 1.0 + 0.3 * p).collect();
     let rays = rays();
     let sums: Vec<f64> = rays

@@ -1,4 +1,4 @@
-//! What a loss must keep to: a derivative that is that of its value, least where both values agree, numbers at the edge.
+//! Properties of a loss: a correct derivative, a minimum where both values agree, behaviour for extreme numbers.
 
 use crate::call::{Draw, settle, within};
 use crate::gradients::slope;
@@ -6,7 +6,7 @@ use crate::{Outcome, Report};
 use conefield_core::error::Result;
 use conefield_core::loss::{Loss, NoiseModel};
 
-/// Runs a loss's WGSL at pairs of a predicted and a measured value. Returns the loss and its derivative for each.
+/// Runs a loss's WGSL on pairs of a predicted and a measured value. Returns the loss and its derivative for each.
 pub type Compare<'a> = dyn Fn(&dyn Loss, &[[f32; 2]]) -> Result<Vec<[f32; 2]>> + 'a;
 
 /// Largest relative error of the derivative against differences.
@@ -14,7 +14,7 @@ const TOLERANCE: f64 = 1e-6;
 /// Largest relative error of the WGSL in single precision.
 const SINGLE: f64 = 1e-5;
 
-/// Runs every property that a loss must have.
+/// Checks all properties of a loss.
 pub fn check_loss(loss: &dyn Loss) -> Report {
     let mut report = Report { stage: loss.describe(), entries: vec![] };
     report.add("finite differences", || derivative(loss));
@@ -30,22 +30,22 @@ pub fn check_loss(loss: &dyn Loss) -> Report {
     report
 }
 
-/// Runs every property that a loss's WGSL must have.
+/// Checks all properties of a loss's WGSL.
 pub fn check_loss_wgsl(loss: &dyn Loss, run: &Compare<'_>) -> Report {
     let mut report = Report { stage: loss.describe(), entries: vec![] };
     report.add("WGSL parity", || parity(loss, run));
     report
 }
 
-/// What a scan might show a loss.
+/// Example noise of a scan.
 const SHOWN: NoiseModel<'static> = NoiseModel { sigma: 0.01, growth: 0.7, measured: &[0.0, 0.1, 0.5, 1.0, 2.0] };
 
-/// The loss that training would use: one that learns from a scan has seen one.
+/// The loss as used in training, fitted to a scan if it adapts to one.
 pub fn ready(loss: &dyn Loss) -> Option<Box<dyn Loss>> {
     loss.fitted(&SHOWN)
 }
 
-/// Predicted and measured values, exact in single precision: around each other and far apart, of every sign.
+/// Predicted and measured values, exact in single precision: close and far apart, of both signs.
 fn pairs() -> Vec<[f64; 2]> {
     let mut draw = Draw::new(3, 1);
     let mut pairs = vec![];
@@ -66,7 +66,7 @@ fn derivative(loss: &dyn Loss) -> Outcome {
     let (mut worst, mut seen) = (0.0f64, 0);
     for [predicted, measured] in pairs() {
         let at = |d: f64| loss.at(predicted + d, measured).0;
-        // Where it is smooth, differences over a step and over four agree.
+        // Where it is smooth, differences over one step and over four agree.
         let h = 1e-6;
         let [near, far] = [h, 4.0 * h].map(|h| (at(h) - at(-h)) / (2.0 * h));
         if (near - far).abs() > 1e-3 * near.abs().max(1e-3) {
@@ -74,7 +74,7 @@ fn derivative(loss: &dyn Loss) -> Outcome {
         }
         seen += 1;
         let (found, want) = (loss.at(predicted, measured).1, slope(h, at));
-        // Differences of a loss next to nothing are rounded.
+        // Differences of nearly zero losses are dominated by rounding.
         let e = (found - want).abs() / (found.abs().max(want.abs()) + 1e-4);
         if e.is_nan() || e > TOLERANCE {
             let at = format!("predicted {predicted}, measured {measured}");
@@ -116,13 +116,13 @@ fn extremes(loss: &dyn Loss) -> Outcome {
     Outcome::Passed("0, denormal, ±1e30 give finite numbers".into())
 }
 
-/// A run is judged by its loss: a number that is none must show there.
+/// Runs are monitored by their loss: NaN must propagate to it.
 fn poison(loss: &dyn Loss) -> Outcome {
     let hidden = [f64::NAN, f64::INFINITY, f64::NEG_INFINITY].into_iter().find(|&p| loss.at(p, 0.5).0.is_finite());
     settle(hidden.map(|p| format!("predicted {p}: loss {}", loss.at(p, 0.5).0)), "NaN and infinities stay visible")
 }
 
-/// One that learns gives a loss that keeps to all the rest and is of the same order.
+/// An adaptive loss gives a loss with all other properties and of the same order.
 fn learns(loss: &dyn Loss) -> Outcome {
     let Some(fitted) = ready(loss) else {
         return if loss.needs_scan() {

@@ -1,4 +1,4 @@
-//! What a prior of a field must keep to: a gradient that is that of its penalty, sums that add, numbers at the edge.
+//! Properties of a prior of a field: a correct gradient, additive sums, behaviour for extreme numbers.
 
 use crate::call::{Draw, Guarded, error, settle, within};
 use crate::gradients::slope;
@@ -9,14 +9,14 @@ use conefield_core::prior::Prior;
 /// Runs a prior's WGSL on the values of one block. Returns the penalty and its derivatives.
 pub type Penalise<'a> = dyn Fn(&dyn Prior, &[f32]) -> Result<(f32, Vec<f32>)> + 'a;
 
-/// Largest error of the gradient against differences, as a share of the largest derivative.
+/// Largest error of the gradient against differences, relative to the largest derivative.
 const TOLERANCE: f64 = 1e-6;
-/// Largest error of the WGSL in single precision, as a share of the penalty or the largest derivative.
+/// Largest error of the WGSL in single precision, relative to the penalty or the largest derivative.
 const SINGLE: f64 = 2e-5;
-/// Values that are differenced one by one, at most.
+/// Maximum number of values differenced one by one.
 const SINGLES: usize = 200;
 
-/// Runs every property that a prior must have.
+/// Checks all properties of a prior.
 pub fn check_prior(prior: &dyn Prior) -> Report {
     let mut report = Report { stage: prior.describe(), entries: vec![] };
     report.add("blocks", || {
@@ -41,14 +41,14 @@ pub fn check_prior(prior: &dyn Prior) -> Report {
     report
 }
 
-/// Runs every property that a prior's WGSL must have.
+/// Checks all properties of a prior's WGSL.
 pub fn check_prior_wgsl(prior: &dyn Prior, device: &Penalise<'_>) -> Report {
     let mut report = Report { stage: prior.describe(), entries: vec![] };
     report.add("WGSL parity", || parity(prior, device));
     report
 }
 
-/// Values of a block, exact in single precision.
+/// Random values of a block, exact in single precision.
 fn drawn(prior: &dyn Prior) -> Vec<f64> {
     Draw::new(4, 1).many(&(0.0..1.0), prior.blocks().points())
 }
@@ -93,7 +93,7 @@ fn adds(prior: &dyn Prior) -> Outcome {
     within("on top of 3", error(&added.into_inner(), &want), 1e-12)
 }
 
-/// The gradient is multiplied with the scale, the penalty is not.
+/// The gradient is multiplied by the scale, the penalty is not.
 fn scale(prior: &dyn Prior) -> Outcome {
     let values = drawn(prior);
     let ((plain, slopes), (value, scaled)) = (run(prior, &values, 1.0), run(prior, &values, 0.25));
@@ -123,7 +123,7 @@ fn extremes(prior: &dyn Prior) -> Outcome {
     Outcome::Passed("0, denormal, ±1e30 give finite numbers".into())
 }
 
-/// A run is judged by its sums: a number that is none must show there.
+/// Runs are monitored by their sums: NaN must propagate to them.
 fn poison(prior: &dyn Prior) -> Outcome {
     let mut values = drawn(prior);
     let middle = values.len() / 2;

@@ -1,13 +1,13 @@
-//! What a projector that samples rays must keep to: bounded, finite, repeatable samples, and an exact adjoint.
+//! Properties of a projector that samples rays: bounded, finite, reproducible samples, and an exact adjoint.
 
 use crate::call::{Draw, settle};
 use crate::{Outcome, Report};
 use conefield_core::stage::{Lengths, Projector, Samples, UnitRay};
 
-/// Largest mismatch of `<Aμ, y>` and `<μ, Aᵀy>` over their size.
+/// Largest mismatch of `<Aμ, y>` and `<μ, Aᵀy>`, relative to their size.
 const ADJOINT: f64 = 1e-12;
 
-/// Runs every property that a projector of rays must have, as it is and fitted to a scene.
+/// Checks all properties of a ray projector, as it is and fitted to a scene.
 pub fn check_projector(projector: &dyn Projector) -> Report {
     let mut report = as_it_is(projector);
     report.add("fitted to a scene", || fitted(projector));
@@ -30,7 +30,7 @@ fn as_it_is(projector: &dyn Projector) -> Report {
     report
 }
 
-/// A projector that is made for a scene has every property, and is the same each time.
+/// A projector fitted to a scene has all properties, and is the same each time.
 fn fitted(p: &dyn Projector) -> Outcome {
     let lengths = Lengths { voxel_mm: 2.0, cell_mm: Some(3.0) };
     let (one, other) = match (p.fitted(lengths), p.fitted(lengths)) {
@@ -50,7 +50,7 @@ fn fitted(p: &dyn Projector) -> Outcome {
     settle(differs.then(|| "made twice for one scene, it gives two results".into()), &one.describe())
 }
 
-/// Rays through the unit cube in many directions, some along axes, with box and published range in agreement.
+/// Rays through the unit cube in many directions, some along axes, with consistent box and published range.
 pub fn rays() -> Vec<UnitRay> {
     let mut draw = Draw::new(11, 9);
     let mut all = vec![];
@@ -63,7 +63,7 @@ pub fn rays() -> Vec<UnitRay> {
         let length = direction.iter().map(|d| d * d).sum::<f64>().sqrt();
         let direction = direction.map(|d| d / length);
         let through: [f64; 3] = std::array::from_fn(|_| draw.from(&(0.1..0.9)));
-        // From a source outside, two sides of the cube before the point.
+        // The source is outside, two cube sides before the point.
         let origin: [f64; 3] = std::array::from_fn(|k| through[k] - 2.0 * direction[k]);
         let (mut near, mut far) = (0.0f64, f64::INFINITY);
         for k in 0..3 {
@@ -90,7 +90,7 @@ pub fn samples(p: &dyn Projector, ray: &UnitRay, seed: Option<u64>) -> Samples {
     s
 }
 
-/// The first complaint about any ray, drawn and rendered.
+/// The first complaint about any ray, in training and in rendering.
 fn each(p: &dyn Projector, mut one: impl FnMut(&UnitRay, &Samples) -> Option<String>) -> Option<String> {
     let all = rays();
     let mut tries = all.iter().enumerate().flat_map(|(i, r)| [(i, r, None), (i, r, Some(i as u64))]);
@@ -131,7 +131,7 @@ fn on_their_ray(p: &dyn Projector) -> Outcome {
     settle(complaint, "to 1e-4 of the cube's side")
 }
 
-/// What was there before stays.
+/// Existing samples are kept.
 fn adds(p: &dyn Projector) -> Outcome {
     let complaint = rays().iter().enumerate().find_map(|(i, r)| {
         let mut out = Samples { points: vec![[7.0; 3]; 3], weights: vec![9.0; 3] };
@@ -154,7 +154,7 @@ fn repeatable(p: &dyn Projector) -> Outcome {
     settle(complaint, "by seed, and without one")
 }
 
-/// A ray that meets neither the box nor the published range gives no samples and the line integral 0.
+/// A ray that misses both the box and the published range has no samples and the line integral 0.
 fn misses(p: &dyn Projector) -> Outcome {
     let r = UnitRay { origin: [4.0; 3], inside: [0.0; 2], published: [0.0; 2], ..rays()[7] };
     let (s, most) = (samples(p, &r, None), p.max_samples(&r));
@@ -164,7 +164,7 @@ fn misses(p: &dyn Projector) -> Outcome {
     settle(complaint, "give no samples and 0")
 }
 
-/// An attenuation of 1 gives the length that is sampled: that inside the box, or the published range.
+/// An attenuation of 1 gives the sampled length: that inside the box, or the published range.
 fn constant(p: &dyn Projector) -> Outcome {
     let complaint = each(p, |r, s| {
         let line = p.integrate(&s.weights, &vec![1.0; s.weights.len()]);

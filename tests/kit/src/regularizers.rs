@@ -1,4 +1,4 @@
-//! What a regularizer must keep to: a convex penalty, and the proximal map that belongs to it.
+//! Properties of a regularizer: a convex penalty and its proximal map.
 
 use crate::call::{differing, settle};
 use crate::{Outcome, Report};
@@ -10,14 +10,14 @@ use conefield_core::space::Space;
 use ndarray::ArrayView3;
 use rayon::ThreadPoolBuilder;
 
-/// Calls after which a proximal map that comes nearer with each has to be there.
+/// Calls after which an iterative proximal map must have converged.
 const CALLS: usize = 400;
-/// What a search may still gain on the proximal map's objective, as a share of what the map gained on the start.
+/// Largest gain of a search in the proximal map's objective, relative to the map's gain over the start.
 const GAIN: f64 = 1e-3;
-/// Weights that are tried.
+/// Weights tested.
 const TAUS: [f32; 3] = [0.01, 0.1, 1.0];
 
-/// Runs every property that a regularizer must have.
+/// Checks all properties of a regularizer.
 pub fn check_regularizer(regularizer: &dyn Regularizer) -> Report {
     let mut report = Report { stage: regularizer.describe(), entries: vec![] };
     report.add("value", || value(regularizer));
@@ -35,13 +35,13 @@ pub fn check_regularizer(regularizer: &dyn Regularizer) -> Report {
     report
 }
 
-/// Few voxels, of unequal sides; a line and a plane.
+/// Few voxels, with unequal sides; a line and a plane.
 fn grids() -> Vec<VoxelGrid> {
     let grid = |shape, spacing| VoxelGrid { shape, spacing, center: [0.0; 3] };
     vec![grid([3, 2, 4], [1.0, 0.7, 1.6]), grid([1, 1, 5], [1.0; 3]), grid([3, 4, 1], [0.5, 1.0, 2.0])]
 }
 
-/// Numbers in [-0.4, 1).
+/// Random numbers in [-0.4, 1).
 fn noise(grid: &VoxelGrid, seed: u64) -> Vec<f32> {
     (0..grid.shape.iter().product::<usize>() as u64).map(|i| 1.4 * unit(mix(seed, i)) - 0.4).collect()
 }
@@ -58,7 +58,7 @@ fn value_of(penalty: &dyn Penalty, grid: &VoxelGrid, x: &[f32]) -> f64 {
     ArrayView3::from_shape(grid.shape, x).map_or(f64::NAN, |x| penalty.value(x))
 }
 
-/// The proximal map after many calls.
+/// The proximal map after convergence.
 fn prox(penalty: &mut dyn Penalty, v: &[f32], tau: f32) -> Vec<f32> {
     let mut u = vec![0.0; v.len()];
     (0..CALLS).for_each(|_| penalty.prox(v, tau, &mut u));
@@ -87,7 +87,7 @@ fn convex(regularizer: &dyn Regularizer) -> Outcome {
     let complaint = grids().iter().find_map(|grid| {
         let penalty = on(regularizer, grid);
         (0..20).find_map(|seed| {
-            // Every other time towards 0: numbers of about the same size say little of how the penalty grows.
+            // Every other time towards 0: numbers of similar size say little about the growth of the penalty.
             let towards = if seed % 2 == 0 { 1.0 } else { 0.0 };
             let a = noise(grid, seed);
             let b: Vec<f32> = noise(grid, seed + 100).iter().map(|x| towards * x).collect();
@@ -110,7 +110,7 @@ fn weight(regularizer: &dyn Regularizer) -> Outcome {
     settle(complaint, "finite, 0 or more, not less with more noise")
 }
 
-/// No other coefficients have less of the objective: a search that starts where the map ends gains next to nothing.
+/// No other coefficients have a smaller objective: a search from the map's result gains almost nothing.
 fn proximal(regularizer: &dyn Regularizer) -> Outcome {
     let mut worst = 0.0f64;
     let mut complaint = None;
@@ -134,7 +134,7 @@ fn proximal(regularizer: &dyn Regularizer) -> Outcome {
     settle(complaint, &format!("a search gains {worst:.1e} of the objective at most"))
 }
 
-/// The least that steps along single coefficients, along all of them, and in drawn directions come to.
+/// The minimum found by steps along single coefficients, along all of them, and in random directions.
 fn search(of: &dyn Fn(&[f32]) -> f64, mut x: Vec<f32>) -> f64 {
     let mut least = of(&x);
     let mut seed = 0;
@@ -211,7 +211,7 @@ fn overwrites(regularizer: &dyn Regularizer) -> Outcome {
     settle(complaint, "over NaN as over 0")
 }
 
-/// What [`Penalty::state`] names is all that a call depends on.
+/// A call depends only on the state in [`Penalty::state`].
 fn state(regularizer: &dyn Regularizer) -> Outcome {
     let complaint = grids().iter().find_map(|grid| {
         let v = noise(grid, 7);
@@ -235,11 +235,11 @@ fn state(regularizer: &dyn Regularizer) -> Outcome {
     settle(complaint, "handed over, it goes on to the same bits")
 }
 
-/// A tally counts what is allocated.
+/// A tally counts exactly what is allocated.
 fn tally(regularizer: &dyn Regularizer) -> Outcome {
     let complaint = grids().iter().find_map(|grid| {
         let [real, tally] = [Space::new(header(grid)), Space::tally(header(grid))].map(|space| {
-            // What it holds is counted as long as it is there.
+            // The penalty's memory counts as long as it exists.
             regularizer.on(grid, &space).map_or(u64::MAX, |_| space.bytes())
         });
         let state = on(regularizer, grid).state().iter().map(|s| 4 * s.1.len() as u64).sum::<u64>();
@@ -264,7 +264,7 @@ fn threads(regularizer: &dyn Regularizer) -> Outcome {
     settle(complaint, "1 and 3 threads")
 }
 
-/// Whatever was asked of it.
+/// No fault, whatever was called.
 fn no_fault(regularizer: &dyn Regularizer) -> Outcome {
     let complaint = grids().iter().find_map(|grid| {
         let (mut penalty, v) = (on(regularizer, grid), noise(grid, 10));

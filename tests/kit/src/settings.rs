@@ -1,4 +1,4 @@
-//! What the settings of a stage must keep to: written and read again they are the same.
+//! Properties of a stage's settings: they are unchanged after writing and reading.
 
 use crate::Report;
 use crate::call::settle;
@@ -8,7 +8,7 @@ use serde::Serialize;
 use serde::de::DeserializeOwned;
 use serde_json::{Value, json};
 
-/// Writes and reads the settings of the type called `name`: all defaults, which its name alone stands for, and `settings`.
+/// Writes and reads the settings of the type `name`: the defaults, also given by the name only, and `settings`.
 pub fn check_settings<T>(name: &str, settings: &Value) -> Report
 where
     T: Settings + Serialize + ?Sized,

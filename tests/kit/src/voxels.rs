@@ -1,4 +1,4 @@
-//! What a projector of voxels must keep to: a linear operator that measures lengths, and its exact adjoint.
+//! Properties of a voxel projector: a linear operator that measures lengths, and its exact adjoint.
 
 use crate::call::{differing, error, settle};
 use crate::{Outcome, Report};
@@ -10,16 +10,16 @@ use conefield_projectors::simulate::{Ellipsoid, ellipsoids, scan_ellipsoids};
 use ndarray::{Array3, Axis, Zip};
 use rayon::ThreadPoolBuilder;
 
-/// Largest mismatch of `<Ax, y>` and `<x, Aᵀy>` over `‖Ax‖·‖y‖`, in double and in single precision.
+/// Largest mismatch of `<Ax, y>` and `<x, Aᵀy>` relative to `‖Ax‖·‖y‖`, in double and in single precision.
 const ADJOINT: [f64; 2] = [1e-12, 1e-5];
-/// Largest error of single against double precision, as a share of the largest number.
+/// Largest error of single against double precision, relative to the largest number.
 const SINGLE: f64 = 1e-5;
-/// Root mean square error of an ellipsoid of some 14 voxels' radius against its closed form, over the mean.
+/// Root mean square error of an ellipsoid of about 14 voxels' radius against its closed form, relative to the mean.
 const CLOSED_FORM: f64 = 0.08;
-/// The same with half as many voxels along a side must be larger by this.
+/// With half as many voxels per side, the error must be larger by this factor.
 const REFINED: f64 = 1.5;
 
-/// Runs every property that a projector of voxels must have.
+/// Checks all properties of a voxel projector.
 pub fn check_voxel_projector(projector: &dyn VoxelProjector) -> Report {
     let mut report = Report { stage: projector.describe(), entries: vec![] };
     let (single, double) = (projector.operator(), projector.reference());
@@ -42,8 +42,8 @@ pub(crate) fn view(angle: f64, distances: [f64; 2], pixel: [f64; 2], offset: [f6
     View::circular(Radians(angle), mm(distances[0]), mm(distances[1]), pixel.map(mm), offset.map(mm))
 }
 
-/// A detector that is no square, voxels that are no cubes and lie beside the axis, views at and between the axes; one with
-/// rows that run upwards and, unless `upright`, two that are tilted.
+/// A non-square detector, non-cubic voxels off the axis, views along and between the axes; one with rows in the
+/// opposite direction and, unless `upright`, two tilted ones.
 fn crooked(upright: bool) -> Geometry {
     let angles = [0.0, 0.3, std::f64::consts::FRAC_PI_4, 1.6, 2.9, 3.7];
     let mut views: Vec<View> = angles.iter().map(|&a| view(a, [90.0, 140.0], [2.1, 1.7], [3.0, -4.5])).collect();
@@ -85,7 +85,7 @@ fn all_views(g: &Geometry) -> Vec<usize> {
     (0..g.views.len()).collect()
 }
 
-/// Numbers in [-0.5, 0.5).
+/// Random numbers in [-0.5, 0.5).
 pub(crate) fn noise<R: Real>(shape: [usize; 3], seed: u64) -> Array3<R> {
     let mut i = 0;
     Array3::from_shape_simple_fn(shape, || {
@@ -118,12 +118,12 @@ pub(crate) fn flat<R: Real>(x: &Array3<R>) -> Vec<R> {
     x.iter().copied().collect()
 }
 
-/// Whether `x` is above `most` or not a number.
+/// Whether `x` is above `most` or NaN.
 pub(crate) fn above(x: f64, most: f64) -> bool {
     x.is_nan() || x > most
 }
 
-/// `Some(complaint)` where the relative error of `a` against `b` is above `most` or not a number.
+/// A complaint if the relative error of `a` against `b` is above `most` or NaN.
 pub(crate) fn apart<A: Real, B: Real>(what: &str, a: &Array3<A>, b: &Array3<B>, most: f64) -> Option<String> {
     let e = error(&flat(a), &flat(b));
     above(e, most).then(|| format!("{what}: off by {e:.1e}, at most {most:.0e}"))
@@ -162,7 +162,8 @@ fn single_precision(p: &dyn VoxelProjector) -> Outcome {
     settle(complaint, &format!("within {SINGLE:.0e} of double precision"))
 }
 
-/// Lengths are mm: an ellipsoid's projections approach their closed form as voxels become finer, and their sum is right.
+/// Lengths are in mm: an ellipsoid's projections converge to their closed form for finer voxels, and their sum is
+/// right.
 fn closed_form(op: &dyn VoxelOperator<f32>) -> Outcome {
     let body = [Ellipsoid { center: [2.0, -1.0, 1.5], axes: [15.0, 11.0, 13.0], value: 0.02 }];
     let of = |n: usize| {
@@ -207,8 +208,8 @@ fn linear(op: &dyn VoxelOperator<f64>) -> Outcome {
     settle(complaint, "sums and multiples go through")
 }
 
-/// A view's line integrals are the same bits whatever other views are asked for, in whatever order and how often; and the
-/// adjoint of several views is the sum of theirs.
+/// A view's line integrals are bit-identical whatever other views are requested, in any order and number; and the
+/// adjoint of several views is the sum of their adjoints.
 fn views_stand_alone(p: &dyn VoxelProjector) -> Outcome {
     let g = crooked(false);
     let x = noise::<f32>(g.volume.shape, 5);
@@ -257,7 +258,7 @@ fn adjoint_adds(op: &dyn VoxelOperator<f64>) -> Outcome {
     settle(complaint, "to what is there")
 }
 
-/// The same bits on pools of one and of three threads, and from callers at the same time.
+/// Results are bit-identical on pools of one and three threads, and from concurrent callers.
 fn threads(op: &dyn VoxelOperator<f32>) -> Outcome {
     let g = crooked(false);
     let views = all_views(&g);
@@ -281,14 +282,14 @@ fn threads(op: &dyn VoxelOperator<f32>) -> Outcome {
     settle(complaint, "1 and 3 threads, 3 callers")
 }
 
-/// Rays that pass the voxels by give exactly 0 and take nothing back, and emptiness gives emptiness.
+/// Rays that miss the voxels give exactly 0 and contribute nothing to the adjoint; empty input gives empty output.
 fn rays_that_miss(p: &dyn VoxelProjector) -> Outcome {
     let mut g = crooked(false);
-    // Twice as far out as the voxels reach.
+    // Twice as far out as the voxels.
     g.detector = [61, 67];
     let views = all_views(&g);
     let [low, high] = g.volume.bounds();
-    // Interpolation may reach a voxel beyond the box.
+    // Interpolation may reach one voxel beyond the box.
     let around = [0, 1].map(|s| {
         let side = if s == 0 { low } else { high };
         std::array::from_fn(|k| side[k] + g.volume.spacing[k] * if s == 0 { -1.0 } else { 1.0 })
@@ -314,7 +315,7 @@ fn rays_that_miss(p: &dyn VoxelProjector) -> Outcome {
     settle(complaint, &format!("{misses} of {} rays miss", hit.len()))
 }
 
-/// Rays along axes, on the faces between voxels and through corners, large and tiny numbers: never a NaN or an infinity.
+/// Rays along axes, on faces between voxels and through corners, large and tiny numbers: never NaN or infinity.
 fn finite(op: &dyn VoxelOperator<f32>) -> Outcome {
     // The middle ray runs along x through the faces between voxels, others through their edges.
     let along = |shape: [usize; 3], detector| Geometry {

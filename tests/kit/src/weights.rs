@@ -1,4 +1,4 @@
-//! What an initializer must keep to: it fills what it says, with finite numbers, the same each time, and nothing else.
+//! Properties of an initializer: it fills what it reports, with finite numbers, reproducibly, and nothing else.
 
 use crate::Report;
 use crate::call::{Draw, differing, settle};
@@ -6,7 +6,7 @@ use conefield_core::arena::{Arena, Block, InitReport, Layout};
 use conefield_core::error::Result;
 use conefield_core::settings::Initializer;
 
-/// Runs every property that an initializer must have, on the layout of a small pipeline.
+/// Checks all properties of an initializer, on the layout of a small pipeline.
 pub fn check_initializer(initializer: &dyn Initializer) -> Report {
     let mut report = Report { stage: initializer.describe(), entries: vec![] };
     let layout = layout();

@@ -1,4 +1,4 @@
-//! A stage's WGSL on a device against its Rust: double precision, single precision and the device side by side.
+//! A stage's WGSL on a device against its Rust code: double precision, single precision and the device side by side.
 
 use crate::call::{Draw, error, forward, gradients};
 use crate::gradients::{narrow, no_rows, shared};
@@ -7,17 +7,17 @@ use crate::{Options, Outcome, Report};
 use conefield_core::error::Result;
 use conefield_core::stage::{Projector, Samples, Stage, UnitRay};
 
-/// Runs a stage's WGSL on parameters, inputs and output gradients (channel-major, so many rows). Returns outputs,
-/// gradients of the parameters and gradients of the inputs.
+/// Runs a stage's WGSL on parameters, inputs and output gradients (channel-major, with this number of rows). Returns
+/// outputs, gradients of the parameters and gradients of the inputs.
 pub type Pass<'a> = dyn Fn(&dyn Stage, &[f32], &[f32], &[f32], usize) -> Result<[Vec<f32>; 3]> + 'a;
 
-/// Runs a projector's WGSL on rays, each with its seed where positions are random.
+/// Runs a projector's WGSL on rays, each with its seed if positions are random.
 pub type Sample<'a> = dyn Fn(&dyn Projector, &[(UnitRay, Option<u64>)]) -> Result<Vec<Samples>> + 'a;
 
-/// How often the rows around which a stage is smooth are gone through: several groups, the last one not full.
+/// Repetitions of the rows around which a stage is smooth: several workgroups, the last one partly filled.
 const ROUNDS: usize = 9;
 
-/// Runs every property that a stage's WGSL must have.
+/// Checks all properties of a stage's WGSL.
 pub fn check_wgsl(stage: &dyn Stage, options: &Options, pass: &Pass<'_>) -> Report {
     let mut report = Report { stage: stage.describe(), entries: vec![] };
     report.add("WGSL parity", || parity(stage, options, pass));
@@ -25,8 +25,8 @@ pub fn check_wgsl(stage: &dyn Stage, options: &Options, pass: &Pass<'_>) -> Repo
     report
 }
 
-/// Outputs and gradients against double precision. Single precision on the CPU is said beside it: the device may be
-/// as far off as that may, gradients four times as far, because their sums have no fixed order.
+/// Outputs and gradients against double precision, reported beside single precision on the CPU. The device may have the
+/// same error, and four times as much in gradients, because their sums have no fixed order.
 fn parity(stage: &dyn Stage, options: &Options, pass: &Pass<'_>) -> Outcome {
     let info = stage.info();
     if stage.wgsl().is_none() {
@@ -73,7 +73,7 @@ fn parity(stage: &dyn Stage, options: &Options, pass: &Pass<'_>) -> Outcome {
     if fine { Outcome::Passed(words) } else { Outcome::Failed(words) }
 }
 
-/// Against single precision on the CPU, where there is no other.
+/// Against single precision on the CPU, if there is no double precision.
 fn single_only(stage: &dyn Stage, options: &Options, pass: &Pass<'_>) -> Outcome {
     let info = stage.info();
     let rows = ROUNDS * options.rows;
@@ -90,8 +90,8 @@ fn single_only(stage: &dyn Stage, options: &Options, pass: &Pass<'_>) -> Outcome
     }
 }
 
-/// What the CPU answers with finite numbers the device does too: zeros, denormals (which it may flush to zero) and
-/// huge numbers.
+/// The device gives finite numbers wherever the CPU does: for zeros, denormals (which it may flush to zero) and huge
+/// numbers.
 fn extremes(stage: &dyn Stage, options: &Options, pass: &Pass<'_>) -> Outcome {
     let info = stage.info();
     if stage.wgsl().is_none() {
@@ -123,14 +123,14 @@ fn extremes(stage: &dyn Stage, options: &Options, pass: &Pass<'_>) -> Outcome {
     Outcome::Passed("finite wherever the CPU is".into())
 }
 
-/// Runs every property that a projector's WGSL must have.
+/// Checks all properties of a projector's WGSL.
 pub fn check_projector_wgsl(projector: &dyn Projector, sample: &Sample<'_>) -> Report {
     let mut report = Report { stage: projector.describe(), entries: vec![] };
     report.add("WGSL parity", || same_samples(projector, sample));
     report
 }
 
-/// Largest difference of positions and weights, in cube sides: rounding of positions two sides from the origin.
+/// Largest difference of positions and weights, in cube sides: rounding of positions two cube sides from the origin.
 const PLACES: f32 = 2e-6;
 
 fn same_samples(projector: &dyn Projector, sample: &Sample<'_>) -> Outcome {

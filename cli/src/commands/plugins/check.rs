@@ -217,7 +217,7 @@ impl Check {
         })
     }
 
-    /// Checks one stage type with one set of settings, at every sensible width.
+    /// Checks one stage type with one set of settings, at all sensible widths.
     fn stage(&self, t: &Type, settings: &Value, device: &Device, all: &mut Vec<StageReport>) -> Result<()> {
         let Some(Origin::Loaded { make, .. }) = registry::find(t.kind, &t.name).map(|t| &t.origin) else {
             return Err(Error::unsupported(&t.name, "it is not registered"));
@@ -243,7 +243,7 @@ impl Check {
                 let mut refused = None;
                 let mut built = false;
                 for width in self.widths() {
-                    // A field may take points of the cube alone.
+                    // A field may accept only points of the cube.
                     let stage = match make(settings.clone())?.build(width) {
                         Ok(stage) => stage,
                         Err(e) => {
@@ -312,12 +312,12 @@ impl Check {
 
 const FAILED: &str = "failed";
 
-/// The device for WGSL, opened when the first stage offers some.
+/// The device for WGSL, opened when the first stage provides WGSL.
 #[derive(Default)]
 struct Device(OnceLock<Result<Wgpu, String>>);
 
 impl Device {
-    /// The report including the stage's WGSL.
+    /// Adds the checks of the stage's WGSL to the report.
     fn beside(&self, mut report: Report, offers: bool, check: impl FnOnce(&Shared) -> Report) -> Report {
         let open = || Wgpu::open(None).map_err(|e| e.to_string());
         let skipped = |why: String| vec![("WGSL parity", Outcome::Skipped(why))];
@@ -329,7 +329,7 @@ impl Device {
         report
     }
 
-    /// The same for stages that map rows, at one width: compiling takes long on some devices.
+    /// The same for stages that map rows, at one width: compilation is slow on some devices.
     fn map(&self, report: Report, stage: &dyn Stage, options: &Options, this_width: bool) -> Report {
         if !this_width {
             return report;

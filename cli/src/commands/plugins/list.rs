@@ -21,7 +21,7 @@ struct ListedFile {
     place: Place,
     #[serde(skip_serializing_if = "Option::is_none")]
     plugin: Option<ListedPlugin>,
-    /// Why it was refused.
+    /// The reason for refusing it.
     #[serde(skip_serializing_if = "Option::is_none")]
     refused: Option<String>,
 }

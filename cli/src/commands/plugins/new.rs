@@ -33,7 +33,7 @@ enum Language {
     C,
 }
 
-/// Names that a crate or its types cannot have: Rust's keywords, and the crates that every crate can name.
+/// Names that a crate or its types cannot have: Rust keywords and crates always in scope.
 const RESERVED: [&str; 62] = [
     "abstract",
     "alloc",
@@ -105,17 +105,17 @@ macro_rules! template {
     };
 }
 
-/// The files of a new plugin and how to build it.
+/// The files of a new plugin and its build command.
 struct Start {
     /// File names and contents.
     files: Vec<(String, String)>,
-    /// The library that results.
+    /// The resulting library.
     library: String,
     /// The command that builds it.
     build: &'static str,
 }
 
-/// Kinds of stages and their templates: the stage in C (without the common first and last parts), the stage in Rust, and its
+/// Kinds of stages and their templates: the stage in C (without the common start and end), the stage in Rust, and its
 /// test.
 macro_rules! kinds {
     ($($kind:ident $file:literal,)*) => {
@@ -232,7 +232,7 @@ impl New {
         Start { files, library: format!("./{}.so", self.name), build: "make" }
     }
 
-    /// A small method with the new stage in it.
+    /// A small method that uses the new stage.
     fn spec(&self) -> String {
         let (name, kind) = (&self.name, self.kind.kind());
         let about = format!("name = \"{name}\"\ndescription = \"The {kind} of the plugin {name}");

@@ -1,4 +1,4 @@
-//! The runs that a report shows.
+//! The runs in a report.
 
 use crate::run_folder::RunOnDisk;
 use crate::{method, specs};
@@ -46,7 +46,7 @@ fn of_folder(folder: &Path) -> Result<Vec<PathBuf>> {
     let comparison: Comparison = read_json(&table)?;
     let mut runs = vec![];
     for method in comparison.methods {
-        // A name is a folder here, and nothing else.
+        // The name must be a plain folder name.
         let plain = Path::new(&method.name).components().count() == 1 && !method.name.starts_with('.');
         ensure(plain, &table.display().to_string(), "name", format!("{:?}", method.name), "the name of a folder")?;
         runs.extend(Some(folder.join(&method.name)).filter(|run| RunOnDisk::is(run)));
@@ -55,7 +55,7 @@ fn of_folder(folder: &Path) -> Result<Vec<PathBuf>> {
     Ok(runs)
 }
 
-/// The runs of the page, each with a unique name.
+/// The runs of the page, with unique names.
 pub fn told(found: &[RunOnDisk], warnings: &mut Vec<Notice>) -> Vec<PageRun> {
     let names = names(found);
     found
@@ -82,14 +82,14 @@ pub fn told(found: &[RunOnDisk], warnings: &mut Vec<Notice>) -> Vec<PageRun> {
         .collect()
 }
 
-/// What the spec builds. One whose plugins are not loaded builds nothing here.
+/// Describes what the spec builds. Fails if its plugins are not loaded.
 fn plan(run: &RunOnDisk) -> Result<String> {
     let loaded = specs::reread(run.spec(), &run.folder().join("spec.toml").display().to_string())?;
     let plan = method::plan_without_files(&loaded, &Cpu::new())?;
     Ok(Explanation::new(&loaded, plan.as_ref(), None)?.text())
 }
 
-/// The specs' names, the folders' where these do not tell the runs apart, or else whole paths.
+/// Names of the specs, of the folders if these are ambiguous, or else full paths.
 fn names(found: &[RunOnDisk]) -> Vec<String> {
     let own = |run: &RunOnDisk| {
         run.spec_name().map(str::to_owned).unwrap_or_else(|| stem(&run.folder().display().to_string()))

@@ -1,4 +1,4 @@
-//! Scans and references of the runs that a report shows, and what comes of them.
+//! Scans and references of the runs in a report, with projections and residuals.
 
 use crate::commands::info::facts;
 use crate::commands::info::lines;
@@ -19,10 +19,10 @@ use conefield_tradeoff::trial::ScanRecord;
 use ndarray::{Array3, Axis};
 use std::path::{Path, PathBuf};
 
-/// Views that are shown where none are asked for.
+/// Default number of views.
 const VIEWS: usize = 6;
 
-/// What is asked for.
+/// The requested content.
 pub struct Options<'a> {
     pub scan: Option<&'a Path>,
     pub reference: Option<&'a Path>,
@@ -30,18 +30,18 @@ pub struct Options<'a> {
     pub projector: Box<dyn VoxelProjector>,
 }
 
-/// The runs of one scan.
+/// All runs of one scan.
 pub struct Group {
-    /// Where the scan lies, if it is still there.
+    /// Path of the scan, if it still exists.
     scan: Option<PathBuf>,
-    /// Which of all runs, and the voxels of their results.
+    /// Indices of the runs, and the voxels of their results.
     runs: Vec<(usize, Option<u64>)>,
-    /// The volumes that these are compared with, and their voxels.
+    /// The reference volumes, and their voxels.
     references: Vec<(PathBuf, u64)>,
 }
 
 impl Group {
-    /// The runs by their scans. What is no longer where it was is told of on the page, and refused where it was asked for.
+    /// Groups the runs by scan. Missing files are noted on the page, or refused if they were requested explicitly.
     pub fn all(found: &[RunOnDisk], options: &Options, page: &mut Page) -> Result<Vec<Group>> {
         let mut groups: Vec<Group> = vec![];
         for (i, run) in found.iter().enumerate() {
@@ -89,12 +89,12 @@ impl Group {
         Ok(groups)
     }
 
-    /// The voxels of every volume that is shown.
+    /// The number of voxels of every volume shown.
     pub fn voxels(&self) -> impl Iterator<Item = u64> {
         self.runs.iter().filter_map(|(_, n)| *n).chain(self.references.iter().map(|(_, n)| *n))
     }
 
-    /// What this part takes, moment by moment, beside `packed` bytes.
+    /// Memory of this group in each phase, in addition to `packed` bytes.
     pub fn memory(&self, options: &Options, packed: u64) -> Result<Vec<Memory>> {
         let volume = 8 * self.voxels().max().unwrap_or(0);
         let Some(path) = &self.scan else {
@@ -104,7 +104,7 @@ impl Group {
         let header = size.header();
         let views = options.views.map_or(VIEWS.min(header.views), |v| v.views(header.views).len());
         let pixels = (views * header.detector[0] * header.detector[1]) as u64;
-        // Predicted views beside the measured ones, the residuals of every run, and volumes with the scan.
+        // Predicted and measured views, the residuals of every run, and volumes with the scan.
         let buffers = packed + options.projector.scratch(&header, views) + 4 * pixels * (2 + self.runs.len() as u64);
         let scan = 4 * size.pixels;
         let reading =
@@ -112,7 +112,7 @@ impl Group {
         Ok(vec![reading, Memory { scan, volume, buffers, ..Memory::default() }])
     }
 
-    /// Puts volumes and projections into the page.
+    /// Adds volumes and projections to the page.
     pub fn show(
         self,
         found: &[RunOnDisk],
@@ -143,7 +143,7 @@ impl Group {
             let volume = match (&scan, &self.scan) {
                 (Some(scan), Some(place)) => input::reference(path, place, scan)?,
                 _ if path.exists() => conefield_io::read_volume(path)?,
-                // The scan that it comes with is not the one of the run.
+                // The truth in this scan is not the one of the run.
                 _ => continue,
             };
             let several = self.references.len() > 1 || !references.is_empty();
@@ -171,7 +171,7 @@ impl Group {
     }
 }
 
-/// The scan, if it is the one that `run` worked on.
+/// The scan, if it is the one used by `run`.
 fn read(path: &Path, run: &RunOnDisk, options: &Options, page: &mut Page) -> Result<Option<Scan>> {
     let scan = conefield_io::read_scan(path)?;
     let place = path.display().to_string();
@@ -190,14 +190,14 @@ fn read(path: &Path, run: &RunOnDisk, options: &Options, page: &mut Page) -> Res
     Ok(None)
 }
 
-/// Where a volume stands: in the scan's world, if there is one.
+/// The grid of a volume in the scan's world, if there is a scan.
 fn own_grid(volume: &Volume, grid: Option<&VoxelGrid>) -> VoxelGrid {
-    // Of what is read here only NumPy arrays have no affine.
+    // Of the readable formats only NumPy arrays have no affine.
     grid.map_or(volume.grid, |g| projection::placed(volume, g, volume.affine.is_some()))
 }
 
-/// The unit of attenuation, and that of water in it: about 0.02/mm at the energies of CT, or what HU from −1000 to 2000
-/// become in volumes from 0 to 1.
+/// Sets the unit of attenuation and the value of water: about 0.02/mm at CT energies, or the value to which HU from
+/// −1000 to 2000 are mapped in volumes from 0 to 1.
 fn in_unit(volume: PageVolume, unit: Option<&Unit>) -> PageVolume {
     match unit {
         None => volume,
@@ -208,13 +208,13 @@ fn in_unit(volume: PageVolume, unit: Option<&Unit>) -> PageVolume {
     }
 }
 
-/// Some views of a scan, and what is left of them beside the runs' predictions.
+/// Some views of a scan, with what is needed after the runs' predictions.
 struct Shown {
-    /// Their numbers, and whether a run did not see them.
+    /// Their indices, and whether they were held out from a run.
     views: Vec<(usize, bool)>,
     scan: Scan,
     window: [f32; 2],
-    /// Measured less predicted, of every run that has a result.
+    /// Measured minus predicted, for every run with a result.
     residuals: Vec<Array3<f32>>,
 }
 
@@ -235,7 +235,7 @@ impl Shown {
         Ok(Self { views, scan: some, window, residuals: vec![] })
     }
 
-    /// The views of `volume`, whose voxels are those of `grid`. The pictures of residuals wait for their common scale.
+    /// Predicts the views of `volume` on `grid`. Pictures of residuals are drawn later, on a common scale.
     fn predict(&mut self, volume: &Volume, grid: VoxelGrid, options: &Options) -> Result<PredictedViews> {
         let mut geometry = self.scan.geometry.clone();
         geometry.volume = grid;

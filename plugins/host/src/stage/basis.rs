@@ -12,14 +12,14 @@ use conefield_core::simd::Real;
 use conefield_plugin_abi::*;
 use ndarray::{Array3, ArrayView3, ArrayViewMut3};
 
-/// Most coefficients for each voxel.
+/// Maximum number of coefficients per voxel.
 const MOST: usize = 64;
 
-/// A basis of a library.
+/// A basis from a library.
 pub struct BasisStage(Foreign<ConefieldBasis>);
 
 impl BasisStage {
-    /// The basis behind `handle`, tried out.
+    /// The basis of `handle`, after a trial.
     pub(crate) fn tried(handle: Handle) -> Result<Self> {
         let stage = Self(Foreign::new(handle)?);
         trial::basis(stage.0.ty(), SMALL.shape, &stage.made_on(&SMALL)?)?;
@@ -30,12 +30,12 @@ impl BasisStage {
     fn made_on(&self, grid: &VoxelGrid) -> Result<ExpansionOn> {
         let on = self.0.functions.on;
         let handle = self.0.must_make("on", |stage, out, error| {
-            // SAFETY: the stage is alive; everything handed over lives for the time of the call.
+            // SAFETY: the stage is alive; all arguments live during the call.
             on.map_or(CONEFIELD_FAILED, |f| unsafe { f(stage, &raw_grid(grid), out, error) })
         })?;
         let own = Foreign::<ConefieldBasis>::new(handle)?;
         let mut info = ConefieldExpansion { coefficients: raw_grid(grid), scratch: 0, samples: 0, double_precision: 0 };
-        // SAFETY: the stage is alive, `info` is to be written.
+        // SAFETY: the stage is alive, `info` is writable.
         own.run("info", |stage, _| own.functions.info.map_or(CONEFIELD_FAILED, |f| unsafe { f(stage, &mut info) }))?;
         let ConefieldGrid { shape, spacing, center } = info.coefficients;
         let coefficients = VoxelGrid { shape, spacing, center };
@@ -95,7 +95,7 @@ impl Expansion for ExpansionOn {
     }
 }
 
-/// Hands arrays over as a library wants them: numbers that follow each other. What cannot be done leaves NaN.
+/// Passes arrays to a library as contiguous numbers. Failure leaves NaN.
 fn across<R: Real>(
     own: &Foreign<ConefieldBasis>,
     from: ArrayView3<'_, R>,

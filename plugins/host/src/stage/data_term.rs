@@ -11,11 +11,11 @@ use conefield_core::scan::ScanHeader;
 use conefield_plugin_abi::*;
 use ndarray::ArrayView3;
 
-/// A data term of a library.
+/// A data term from a library.
 pub struct DataTermStage(Foreign<ConefieldDataTerm>);
 
 impl DataTermStage {
-    /// The data term behind `handle`, tried out.
+    /// The data term of `handle`, after a trial.
     pub(crate) fn tried(handle: Handle) -> Result<Self> {
         let stage = Self(Foreign::new(handle)?);
         trial::data_term(stage.0.ty(), |measured| stage.made_of(measured))?;
@@ -28,18 +28,18 @@ impl DataTermStage {
         let measured = measured.as_standard_layout();
         let of = self.0.functions.of;
         let handle = self.0.must_make("of", |stage, out, error| {
-            // SAFETY: the stage is alive; everything handed over lives for the time of the call and has that shape.
+            // SAFETY: the stage is alive; all arguments live during the call and have that shape.
             of.map_or(CONEFIELD_FAILED, |f| unsafe { f(stage, measured.as_ptr(), shape.as_ptr(), out, error) })
         })?;
         Ok(MisfitOn(Foreign::new(handle)?))
     }
 
-    /// Bytes that it holds for a scan, and that it takes for a moment.
+    /// Memory held for a scan, and temporary memory, in bytes.
     fn bytes(&self, header: &ScanHeader) -> [u64; 2] {
         let shape = [header.views, header.detector[0], header.detector[1]];
         let [mut held, mut brief] = [0; 2];
         if let Some(f) = self.0.functions.bytes {
-            // SAFETY: the stage is alive, both numbers are to be written.
+            // SAFETY: the stage is alive, both numbers are writable.
             unsafe { f(self.0.handle.stage, shape.as_ptr(), &mut held, &mut brief) };
         }
         [held, brief]

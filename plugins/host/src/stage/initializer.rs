@@ -13,13 +13,13 @@ use serde_json::Value;
 use std::ptr;
 use std::sync::Arc;
 
-/// An initializer of a library.
+/// An initializer from a library.
 pub struct InitializerStage {
     own: Foreign<ConefieldInitializer>,
     volume: Option<KnownVolume>,
 }
 
-/// Makes an initializer; `weights` reads a file that its settings name.
+/// Builds an initializer; `weights` reads a file named in its settings.
 pub(crate) fn build(
     ty: &Arc<Type>,
     settings: &Value,
@@ -29,7 +29,7 @@ pub(crate) fn build(
     let (own, path) = timed(ty, move || {
         let own = Foreign::<ConefieldInitializer>::new(own.create(&settings, 0)?)?;
         let path = named(&own.handle, "weights", |path| {
-            // SAFETY: the stage is alive, `path` is to be written.
+            // SAFETY: the stage is alive, `path` is writable.
             own.functions.weights.map(|f| unsafe { f(own.handle.stage, path) })
         })?;
         Ok((own, path))
@@ -42,14 +42,14 @@ pub(crate) fn build(
         };
         let mut steps = 0;
         let path = named(&own.handle, "volume", |path| {
-            // SAFETY: the stage is alive, `path` and `steps` are to be written.
+            // SAFETY: the stage is alive, `path` and `steps` are writable.
             own.functions.volume.map(|f| unsafe { f(own.handle.stage, path, &mut steps) })
         })?;
         Ok(InitializerStage { own, volume: path.map(|path| KnownVolume { path, steps }) })
     })
 }
 
-/// A name that the stage gives, if it has the function and anything to name.
+/// A name from the stage, if it has the function and a name.
 fn named(
     handle: &Handle,
     call: &str,
@@ -58,13 +58,13 @@ fn named(
     let mut path = ConefieldStr { data: ptr::null(), length: 0 };
     match ask(&mut path) {
         None | Some(CONEFIELD_UNSUPPORTED) => Ok(None),
-        // SAFETY: the plugin says that so many bytes stand there as long as the stage lives.
+        // SAFETY: the plugin guarantees that this many bytes are valid while the stage lives.
         Some(CONEFIELD_OK) => unsafe { library::text(path, &handle.ty.words(), call) }.map(Some),
         Some(status) => Err(handle.ty.failed(call, status, "")),
     }
 }
 
-/// The stage that has these weights.
+/// The stage with these weights.
 fn with_weights(own: &Foreign<ConefieldInitializer>, weights: &Weights) -> Result<Handle> {
     let tensor = |(name, (shape, values)): (&String, &(Vec<usize>, Vec<f32>))| ConefieldTensor {
         name: ConefieldStr::of(name),
@@ -76,13 +76,13 @@ fn with_weights(own: &Foreign<ConefieldInitializer>, weights: &Weights) -> Resul
     let tensors: Vec<ConefieldTensor> = weights.tensors.iter().map(tensor).collect();
     own.must_make("with_weights", |stage, out, error| {
         own.functions.with_weights.map_or(CONEFIELD_FAILED, |f| {
-            // SAFETY: the stage is alive; everything handed over lives for the time of the call and has the length beside it.
+            // SAFETY: the stage is alive; all arguments live during the call and have the accompanying lengths.
             unsafe { f(stage, tensors.as_ptr(), tensors.len(), out, error) }
         })
     })
 }
 
-/// Blocks as a library sees them.
+/// Blocks in the format of the ABI.
 fn blocks(layout: &Layout) -> Vec<ConefieldBlock> {
     let block = |b: &Block| ConefieldBlock {
         name: ConefieldStr::of(&b.name),
@@ -94,7 +94,7 @@ fn blocks(layout: &Layout) -> Vec<ConefieldBlock> {
     layout.blocks.iter().map(block).collect()
 }
 
-/// Numbers behind the parameters that nobody may write to.
+/// Guard numbers behind the parameters, which must not be written.
 const GUARD: usize = 1 << 12;
 
 impl Initializer for InitializerStage {
@@ -108,7 +108,7 @@ impl Initializer for InitializerStage {
 
     fn apply(&self, layout: &Layout, arena: &mut Arena) -> Result<InitReport> {
         let blocks = blocks(layout);
-        // A copy, so that what it does wrong does no harm.
+        // A copy, so that errors do no harm.
         let n = arena.params.len();
         let mut params = arena.params.to_vec();
         params.resize(n + GUARD, f32::from_bits(UNTOUCHED));

@@ -10,14 +10,14 @@ use conefield_core::loss::{Loss, NoiseModel};
 use conefield_core::wgsl::Fragment;
 use conefield_plugin_abi::*;
 
-/// A loss of a library.
+/// A loss from a library.
 pub struct LossStage {
     own: Foreign<ConefieldLoss>,
     needs_scan: bool,
 }
 
 impl LossStage {
-    /// The loss behind `handle`, tried out.
+    /// The loss of `handle`, after a trial.
     pub(crate) fn tried(handle: Handle) -> Result<Self> {
         let own = Foreign::<ConefieldLoss>::new(handle)?;
         // SAFETY: the stage is alive.
@@ -32,17 +32,17 @@ impl LossStage {
         Ok(stage)
     }
 
-    /// The losses of as many pairs as there are to `loss`, their derivatives to `slope`.
+    /// Writes the losses of all pairs to `loss` and their derivatives to `slope`.
     fn compare(&self, predicted: &[f64], measured: &[f64], loss: *mut f64, slope: *mut f64) -> Result<()> {
         call!(self.own, at(predicted.as_ptr(), measured.as_ptr(), measured.len(), loss, slope))
     }
 
-    /// [`Loss::fitted`] with what went wrong.
+    /// [`Loss::fitted`] with its error.
     fn try_fitted(&self, noise: &NoiseModel<'_>) -> Result<Option<Box<dyn Loss>>> {
         let Some(fitted) = self.own.functions.fitted.filter(|_| self.needs_scan) else { return Ok(None) };
         let NoiseModel { sigma, growth, measured } = *noise;
         let noise = ConefieldNoise { sigma, growth, measured: measured.as_ptr(), count: measured.len() };
-        // SAFETY: the stage is alive; everything handed over lives for the time of the call.
+        // SAFETY: the stage is alive; all arguments live during the call.
         let made = self.own.make("fitted", |stage, out, error| unsafe { fitted(stage, &noise, out, error) })?;
         let Some(handle) = made else { return Ok(None) };
         Ok(Some(Box::new(trial::timed(self.own.ty(), move || Self::tried(handle))?)))

@@ -18,17 +18,17 @@ use std::collections::BTreeSet;
 use std::ops::Range;
 use std::{ptr, slice};
 
-/// Most parameters, channels, … that a stage may say it has: more would overflow what hosts compute from them.
+/// Upper bound of the numbers of parameters, channels, … of a stage: more would overflow computations of hosts.
 const MOST: usize = 1 << 40;
 
-/// Most passes that a stage may go forward in: a host does something for each.
+/// Maximum number of forward passes: a host does some work for each.
 const MOST_PASSES: usize = 1 << 16;
 
-/// An encoder, a normalizer or a field of a library.
+/// An encoder, normalizer or field from a library.
 pub struct MapStage {
     own: Foreign<ConefieldMap>,
     info: Info,
-    /// What the library says of it beside that.
+    /// Further properties reported by the library.
     said: ConefieldInfo,
     passes: usize,
     resolutions: Option<Vec<f64>>,
@@ -37,7 +37,7 @@ pub struct MapStage {
 }
 
 impl MapStage {
-    /// The stage behind `handle` for `width` channels, tried out.
+    /// The stage of `handle` for `width` channels, after a trial.
     pub(crate) fn tried(handle: Handle, width: usize) -> Result<Self> {
         let stage = Self::new(handle)?;
         let found = format!("{width} channels for a stage that takes {}", stage.info.input);
@@ -69,9 +69,9 @@ impl MapStage {
         let (params, channels) = (ptr::null(), ptr::null());
         let mut r = ConefieldReduced { stage: ptr::null_mut(), params, params_count: 0, channels, channels_count: 0 };
         let handle = self.own.must_make("reduce", |stage, out, error| {
-            // SAFETY: the stage is alive; everything handed over lives for the time of the call.
+            // SAFETY: the stage is alive; all arguments live during the call.
             let status = unsafe { reduce(stage, side, keep.as_ptr(), keep.len(), &mut r, error) };
-            // SAFETY: `out` is to be written.
+            // SAFETY: `out` is writable.
             unsafe { *out = r.stage };
             status
         })?;
@@ -79,7 +79,7 @@ impl MapStage {
         if r.params_count > info.params || r.channels_count > info.input.max(info.output) {
             return Err(self.own.wrong("reduce", "it keeps more than there is"));
         }
-        // SAFETY: the plugin says that so many stand there as long as the smaller stage lives.
+        // SAFETY: the plugin guarantees that this many items are valid while the reduced stage lives.
         let (ranges, channels) = unsafe { (many(r.params, r.params_count), many(r.channels, r.channels_count)) };
         let params: Vec<Range<usize>> = ranges.iter().map(|r| r.start..r.end).collect();
         let sound = params.iter().all(|r| r.start <= r.end && r.end <= info.params);
@@ -99,13 +99,13 @@ impl MapStage {
     }
 }
 
-/// `n` things at `data`.
+/// `n` items at `data`.
 unsafe fn many<'a, T>(data: *const T, n: usize) -> &'a [T] {
-    // SAFETY: the caller knows that so many stand there.
+    // SAFETY: the caller guarantees that this many items are valid.
     if n == 0 || data.is_null() { &[] } else { unsafe { slice::from_raw_parts(data, n) } }
 }
 
-/// What the library says of a stage.
+/// Properties of a stage as reported by the library.
 fn said(own: &Foreign<ConefieldMap>) -> Result<ConefieldInfo> {
     let mut i = ConefieldInfo {
         input: 0,
@@ -122,12 +122,12 @@ fn said(own: &Foreign<ConefieldMap>) -> Result<ConefieldInfo> {
         double_precision: 0,
         halves: 0,
     };
-    // SAFETY: the stage is alive, `i` is to be written.
+    // SAFETY: the stage is alive, `i` is writable.
     own.run("info", |stage, _| own.functions.info.map_or(CONEFIELD_FAILED, |f| unsafe { f(stage, &mut i) }))?;
     Ok(i)
 }
 
-/// What was said, if it makes sense.
+/// The reported properties, if they make sense.
 fn sound(i: &ConefieldInfo) -> Result<Info, String> {
     let &ConefieldInfo { input, output, params, tape, macs, .. } = i;
     if [input, output].contains(&0) || [input, output, params, tape, macs].iter().any(|&n| n > MOST) {
@@ -150,7 +150,7 @@ fn sound(i: &ConefieldInfo) -> Result<Info, String> {
     Ok(Info { input, output, params, tape, scope, grads, macs, identity: i.identity != 0 })
 }
 
-/// Whether there are the functions for what was said.
+/// Checks that the functions needed for the reported properties exist.
 fn able(own: &Foreign<ConefieldMap>, i: &ConefieldInfo) -> Result<(), &'static str> {
     let f = &own.functions;
     let lines = own.ty().kind == Kind::LineField;
@@ -173,7 +173,7 @@ fn able(own: &Foreign<ConefieldMap>, i: &ConefieldInfo) -> Result<(), &'static s
     all.into_iter().find(|(holds, _)| !holds).map_or(Ok(()), |(_, what)| Err(what))
 }
 
-/// How many passes it goes forward in.
+/// Number of forward passes.
 fn passes(own: &Foreign<ConefieldMap>, i: &ConefieldInfo) -> Result<usize, String> {
     let f = &own.functions;
     // SAFETY: the stage is alive.
@@ -199,7 +199,7 @@ fn parameters(own: &Foreign<ConefieldMap>, i: &ConefieldInfo) -> Result<Vec<Para
             shape: ptr::null(),
             dimensions: 0,
         };
-        // SAFETY: the stage is alive, `p` is to be written.
+        // SAFETY: the stage is alive, `p` is writable.
         let status =
             own.functions.parameter.map_or(CONEFIELD_FAILED, |f| unsafe { f(own.handle.stage, index, &mut p) });
         if status != CONEFIELD_OK {
@@ -211,7 +211,7 @@ fn parameters(own: &Foreign<ConefieldMap>, i: &ConefieldInfo) -> Result<Vec<Para
                 p.name.length, p.dimensions
             )));
         }
-        // SAFETY: the plugin says that so many stand there as long as the stage lives.
+        // SAFETY: the plugin guarantees that this many items are valid while the stage lives.
         let (name, shape) = unsafe { (many(p.name.data, p.name.length), many(p.shape, p.dimensions)) };
         let name = String::from_utf8_lossy(name).into_owned();
         let count = shape.iter().try_fold(1usize, |n, &d| n.checked_mul(d)).filter(|&n| n <= i.params);
@@ -240,7 +240,7 @@ fn partition(own: &Foreign<ConefieldMap>, i: &ConefieldInfo) -> Result<Vec<Range
     let mut end = 0;
     for index in 0..i.partitions {
         let mut r = ConefieldRange { start: 0, end: 0 };
-        // SAFETY: the stage is alive, `r` is to be written.
+        // SAFETY: the stage is alive, `r` is writable.
         let status = unsafe { f(own.handle.stage, index, &mut r) };
         if status != CONEFIELD_OK || r.start != end || r.end < r.start || r.end > i.params {
             return Err(wrong(format!("range {index} is {}..{} after {end} of {}", r.start, r.end, i.params)));
@@ -251,7 +251,7 @@ fn partition(own: &Foreign<ConefieldMap>, i: &ConefieldInfo) -> Result<Vec<Range
     if end == i.params { Ok(all) } else { Err(wrong(format!("ranges end at {end} of {}", i.params))) }
 }
 
-/// How many cells each of `count` channels tells apart, where the encoder says so.
+/// Resolution of each of `count` channels in cells, if the encoder reports it.
 fn resolutions(own: &Foreign<ConefieldMap>, count: usize) -> Result<Option<Vec<f64>>> {
     let Some(f) = own.functions.resolutions.filter(|_| own.ty().kind == Kind::Encoder) else { return Ok(None) };
     let mut cells = vec![f64::from_bits(UNTOUCHED_64); count + GUARD];
@@ -272,7 +272,7 @@ fn resolutions(own: &Foreign<ConefieldMap>, count: usize) -> Result<Option<Vec<f
     }
 }
 
-/// Channel-major rows, as a library sees them.
+/// Channel-major rows in the format of the ABI.
 trait Across<T> {
     fn across(self, rows: usize) -> T;
 }
@@ -298,14 +298,14 @@ across! {
     f64, ConefieldTile64 ConefieldTileMut64;
 }
 
-/// As `call`, of a function that is told the format of halves before all else, if there is one.
+/// As `call`, for a function with the half-precision format as first argument, if any.
 macro_rules! told {
     ($own:expr, ($($format:expr)?), $function:ident($($argument:expr),*)) => {
         call!($own, $function($($format,)? $($argument),*))
     };
 }
 
-/// A kernel in `$real` on parameters that stand as `$param`, which the library's functions are told by `$format`.
+/// A kernel in `$real` with parameters stored as `$param`, which `$format` identifies for the library.
 macro_rules! kernel {
     (
         $real:ty, $param:ty, $tile_mut:ident $grads:ident,

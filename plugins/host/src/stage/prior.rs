@@ -10,18 +10,18 @@ use conefield_core::prior::{Blocks, Prior};
 use conefield_core::wgsl::Fragment;
 use conefield_plugin_abi::*;
 
-/// A prior of a library.
+/// A prior from a library.
 pub struct PriorStage {
     own: Foreign<ConefieldPrior>,
     blocks: Blocks,
 }
 
 impl PriorStage {
-    /// The prior behind `handle`, tried out.
+    /// The prior of `handle`, after a trial.
     pub(crate) fn tried(handle: Handle) -> Result<Self> {
         let own = Foreign::<ConefieldPrior>::new(handle)?;
         let mut b = ConefieldBlocks { edge: 0, count: 0, spacing: 0.0, weight: 0.0 };
-        // SAFETY: the stage is alive, `b` is to be written.
+        // SAFETY: the stage is alive, `b` is writable.
         own.run("blocks", |stage, _| own.functions.blocks.map_or(CONEFIELD_FAILED, |f| unsafe { f(stage, &mut b) }))?;
         let blocks = Blocks { edge: b.edge, count: b.count, spacing: b.spacing, weight: b.weight };
         blocks.validate().map_err(|e| own.wrong("blocks", &e.to_string()))?;
@@ -32,7 +32,7 @@ impl PriorStage {
         Ok(stage)
     }
 
-    /// The penalty of `values`; adds as many derivatives to `gradient`.
+    /// The penalty of `values`; adds one derivative per value to `gradient`.
     fn penalty(&self, values: &[f64], scale: f64, gradient: *mut f64) -> Result<f64> {
         let mut penalty = f64::NAN;
         call!(self.own, block(values.as_ptr(), values.len(), scale, gradient, &mut penalty))?;

@@ -11,14 +11,14 @@ use conefield_core::wgsl::Fragment;
 use conefield_plugin_abi::*;
 use std::ptr;
 
-/// Most samples of one ray: more than any detector resolves.
+/// Maximum number of samples per ray: more than any detector resolves.
 const MOST: usize = 1 << 24;
 
-/// A projector of a library.
+/// A projector from a library.
 pub struct ProjectorStage(Foreign<ConefieldProjector>);
 
 impl ProjectorStage {
-    /// The projector behind `handle`, tried out.
+    /// The projector of `handle`, after a trial.
     pub(crate) fn tried(handle: Handle) -> Result<Self> {
         let stage = Self(Foreign::new(handle)?);
         trial::projector(stage.0.ty(), |ray, seed, guard| {
@@ -29,8 +29,8 @@ impl ProjectorStage {
         Ok(stage)
     }
 
-    /// Appends the samples of `ray`, written with `guard` untouchable numbers behind them. What is wrong with them is an
-    /// error, and nothing is appended.
+    /// Appends the samples of `ray`, written with `guard` guard numbers behind them. Wrong samples are an error, and
+    /// nothing is appended.
     fn sample_guarded(&self, ray: &UnitRay, seed: Option<u64>, guard: usize, out: &mut Samples) -> Result<()> {
         let capacity = self.max_samples(ray);
         self.0.fault.take()?;
@@ -77,7 +77,7 @@ impl ProjectorStage {
 
 impl Projector for ProjectorStage {
     fn max_samples(&self, ray: &UnitRay) -> usize {
-        // SAFETY: the stage is alive, the ray lives for the time of the call.
+        // SAFETY: the stage is alive, the ray lives during the call.
         let most = self.0.functions.max_samples.map_or(0, |f| unsafe { f(self.0.handle.stage, &raw_ray(ray)) });
         let few = if most > MOST {
             Err(self.0.wrong("max_samples", &format!("{most} samples for one ray")))
@@ -113,7 +113,7 @@ impl Projector for ProjectorStage {
         let Some(fitted) = self.0.functions.fitted else { return Ok(None) };
         let Lengths { voxel_mm, cell_mm } = lengths;
         let lengths = ConefieldLengths { voxel_mm, cell_mm: cell_mm.unwrap_or(0.0) };
-        // SAFETY: the stage is alive; everything handed over lives for the time of the call.
+        // SAFETY: the stage is alive; all arguments live during the call.
         let made = self.0.make("fitted", |stage, out, error| unsafe { fitted(stage, &lengths, out, error) })?;
         let Some(handle) = made else { return Ok(None) };
         Ok(Some(Box::new(trial::timed(self.0.ty(), move || Self::tried(handle))?)))

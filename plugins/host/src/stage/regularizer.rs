@@ -16,14 +16,14 @@ use std::ffi::c_void;
 use std::panic::{AssertUnwindSafe, catch_unwind};
 use std::{ptr, slice};
 
-/// Most numbers that a penalty may keep for each coefficient.
+/// Maximum number of state values per coefficient.
 const MOST_STATE: usize = 64;
 
-/// A regularizer of a library.
+/// A regularizer from a library.
 pub struct RegularizerStage(Foreign<ConefieldRegularizer>);
 
 impl RegularizerStage {
-    /// The regularizer behind `handle`, tried out.
+    /// The regularizer of `handle`, after a trial.
     pub(crate) fn tried(handle: Handle) -> Result<Self> {
         let stage = Self(Foreign::new(handle)?);
         stage.weight(&SMALL, &mut |k| 0.01 * k)?;
@@ -39,7 +39,7 @@ impl RegularizerStage {
     fn made_on(&self, grid: &VoxelGrid) -> Result<PenaltyOn> {
         let on = self.0.functions.on;
         let handle = self.0.must_make("on", |stage, out, error| {
-            // SAFETY: the stage is alive; everything handed over lives for the time of the call.
+            // SAFETY: the stage is alive; all arguments live during the call.
             on.map_or(CONEFIELD_FAILED, |f| unsafe { f(stage, &raw_grid(grid), out, error) })
         })?;
         let count = grid.shape.iter().product();
@@ -49,20 +49,20 @@ impl RegularizerStage {
     }
 }
 
-/// Answers a library that asks what the noise comes to.
+/// Callback for a library that queries the noise.
 unsafe extern "C" fn noise(context: *mut c_void, k: f64) -> f64 {
-    // SAFETY: it is what `weight` handed over for the time of its call.
+    // SAFETY: `weight` passes it for the duration of its call.
     let measure = unsafe { &mut *context.cast::<&mut dyn FnMut(f64) -> f64>() };
-    // Nothing unwinds into the library.
+    // Panics must not unwind into the library.
     catch_unwind(AssertUnwindSafe(|| measure(k))).unwrap_or(f64::NAN)
 }
 
 impl Regularizer for RegularizerStage {
     fn on(&self, grid: &VoxelGrid, space: &Space) -> Result<Box<dyn Penalty>> {
-        // SAFETY: the stage is alive, the grid lives for the time of the call.
+        // SAFETY: the stage is alive, the grid lives during the call.
         let bytes = self.0.functions.bytes.map_or(0, |f| unsafe { f(self.0.handle.stage, &raw_grid(grid)) });
         space.hold(bytes);
-        // A tally only counts: nothing is made on the grid.
+        // A tally only counts bytes: nothing is built for the actual grid.
         let grid = if space.is_tally() { &SMALL } else { grid };
         Ok(Box::new(self.made_on(grid)?))
     }
@@ -85,9 +85,9 @@ impl Regularizer for RegularizerStage {
 /// A penalty that a library made for one grid.
 struct PenaltyOn {
     own: Foreign<ConefieldRegularizer>,
-    /// Coefficients of the grid.
+    /// Number of coefficients of the grid.
     count: usize,
-    /// Names and lengths of what it keeps.
+    /// Names and lengths of its state.
     state: Vec<(String, usize)>,
 }
 
@@ -102,12 +102,12 @@ impl PenaltyOn {
         call!(self.own, prox(v.as_ptr(), v.len(), tau, u))
     }
 
-    /// Entry `index` of its state; nothing past the last.
+    /// Entry `index` of its state; `None` after the last.
     fn entry(&self, index: usize) -> Result<Option<ConefieldState>> {
         let Some(state) = self.own.functions.state else { return Ok(None) };
         let name = ConefieldStr { data: ptr::null(), length: 0 };
         let mut entry = ConefieldState { name, data: ptr::null_mut(), length: 0 };
-        // SAFETY: the penalty is alive, `entry` is to be written.
+        // SAFETY: the penalty is alive, `entry` is writable.
         match unsafe { state(self.own.handle.stage, index, &mut entry) } {
             CONEFIELD_OK => Ok(Some(entry)),
             CONEFIELD_UNSUPPORTED => Ok(None),
@@ -119,7 +119,7 @@ impl PenaltyOn {
         let wrong = |what: String| self.own.wrong("state", &what);
         let (mut all, mut names, mut numbers) = (vec![], BTreeSet::new(), 0usize);
         while let Some(entry) = self.entry(all.len())? {
-            // SAFETY: the plugin says that so many bytes stand there as long as the penalty lives.
+            // SAFETY: the plugin guarantees that this many bytes are valid while the penalty lives.
             let name = unsafe { text(entry.name, &self.own.ty().words(), "state") }?;
             numbers = numbers.saturating_add(entry.length);
             if entry.data.is_null() || entry.length == 0 || numbers > MOST_STATE * self.count.max(64) {
@@ -145,7 +145,7 @@ impl Penalty for PenaltyOn {
         let x = x.as_standard_layout();
         let x = x.as_slice().unwrap_or_default();
         let mut value = f64::NAN;
-        // SAFETY: the penalty is alive; everything handed over lives for the time of the call.
+        // SAFETY: the penalty is alive; all arguments live during the call.
         let adapted =
             self.own.asked("adapt", |penalty, error| unsafe { adapt(penalty, x.as_ptr(), x.len(), &mut value, error) });
         self.own.noted(adapted.map(|known| known.then_some(value)), Some(f64::NAN))
@@ -162,7 +162,8 @@ impl Penalty for PenaltyOn {
         let mut all = vec![];
         for (i, (name, length)) in self.state.iter().enumerate() {
             if let Some(found) = self.entry(i).ok().flatten().filter(|e| e.length == *length) {
-                // SAFETY: the plugin says that so many stand there as long as the penalty lives; entries do not overlap.
+                // SAFETY: the plugin guarantees that this many numbers are valid while the penalty lives; entries do
+                // not overlap.
                 all.push((name.as_str(), unsafe { slice::from_raw_parts_mut(found.data, *length) }));
             }
         }

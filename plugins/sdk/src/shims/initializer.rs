@@ -49,7 +49,7 @@ shims! {
 
     fn weights(built: any, path: *mut ConefieldStr) {
         match &built.stage {
-            // The stage keeps the text.
+            // The stage owns the text.
             AnyStage::Waiting(w) => *path = ConefieldStr { data: w.path.as_ptr(), length: w.path.len() },
             _ => return Err(Error::unsupported("this stage", "it names no weights file")),
         }

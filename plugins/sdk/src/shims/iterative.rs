@@ -51,7 +51,7 @@ unsafe fn grid(grid: *const ConefieldGrid) -> VoxelGrid {
     VoxelGrid { shape, spacing, center }
 }
 
-/// The size of a scan of which only the volume is known, or only the views.
+/// The size of a scan of which only the volume or only the views are known.
 fn header(volume: [usize; 3], [views, rows, columns]: [usize; 3]) -> ScanHeader {
     ScanHeader { views, detector: [rows, columns], volume }
 }

@@ -79,7 +79,7 @@ shims! {
     }
 }
 
-/// Channels that the host has laid out with a stride.
+/// Channels in the host's memory, with a stride.
 struct Strided<R> {
     data: *mut R,
     channels: usize,
@@ -92,7 +92,7 @@ impl<R: Real> Strided<R> {
         self.stride == self.rows || self.channels <= 1
     }
 
-    /// The channels, one right after the other.
+    /// The channels, contiguous.
     unsafe fn read<'a>(&self) -> Cow<'a, [R]> {
         // SAFETY: see `shims/mod.rs`.
         unsafe {
@@ -104,7 +104,7 @@ impl<R: Real> Strided<R> {
         }
     }
 
-    /// Runs `f` on the channels, one right after the other.
+    /// Runs `f` on the channels, made contiguous.
     unsafe fn write<T>(&self, f: impl FnOnce(&mut [R]) -> T) -> T {
         // SAFETY: see `shims/mod.rs`.
         unsafe {
@@ -133,10 +133,10 @@ macro_rules! strided {
 
 strided! { ConefieldTile f32 ConefieldTileMut f32 ConefieldTile64 f64 ConefieldTileMut64 f64 }
 
-/// A map of rows with what is known of it.
+/// A map of rows with its properties.
 type Map<'a> = (&'a dyn Stage, &'a MapInfo);
 
-/// `forward` of a kernel, or one pass of it.
+/// `forward` of a kernel, or one of its passes.
 unsafe fn run_forward<R: Real, P>(
     (stage, known): Map<'_>,
     kernel: &dyn Kernel<R, P>,
@@ -195,12 +195,12 @@ unsafe fn grads64<'a>(g: ConefieldGrads64) -> Grads<'a, f64> {
     Grads { values: unsafe { many_mut(g.data, g.length) }, range: g.start..g.start + g.length }
 }
 
-/// What a stage may do without.
+/// Unwraps an optional part of a stage.
 fn have<T>(part: Option<T>, what: &str) -> Result<T> {
     part.ok_or_else(|| Error::unsupported("this stage", format!("it has no {what}")))
 }
 
-/// Runs `$run` with the kernel that reads the parameters as they stand.
+/// Runs `$run` with the kernel for the stored format of the parameters.
 macro_rules! in_halves {
     ($map:expr, $format:expr, |$kernel:ident| $run:expr) => {{
         let halves = have($map.0.halves(), "kernel that reads halves")?;

@@ -1,9 +1,9 @@
-//! The functions that the host calls: each turns pointers into slices, runs the stage, and turns what goes wrong, panics
-//! included, into a status and a text.
+//! The functions that the host calls. Each turns pointers into slices, runs the stage, and turns errors and panics into
+//! a status and a text.
 
-// Pointers come from the host, by the rules of the contract (`conefield_plugin_abi`): they are valid for the lengths beside
-// them for the time of the call, do not overlap where one of them is written to, and `stage` is what `create` or another of
-// these functions made. Every block in this folder that is unsafe relies on that alone.
+// Pointers come from the host, by the rules of the contract (`conefield_plugin_abi`): they are valid for the given
+// lengths during the call, writable ones do not overlap others, and `stage` was returned by `create` or another of
+// these functions. Every unsafe block in this folder relies on that alone.
 #![allow(unsafe_code)]
 
 mod initializer;
@@ -26,9 +26,9 @@ pub use map::MAP;
 pub use projector::PROJECTOR;
 pub use training::{LOSS, PRIOR};
 
-/// Functions of tables. Each finds the stage behind its first pointer, as the kind that stands after it, and works within
-/// [`guard`]. One that names its error text at the end has room for a reason; one with a result of its own says what that is
-/// where it fails.
+/// Defines functions of tables. Each one gets the stage behind its first pointer, as the kind named after it, and runs
+/// inside [`guard`]. A function with an error text as last argument reports a reason; one with a result of its own
+/// defines its value on failure.
 macro_rules! shims {
     () => {};
     (fn $name:ident($stage:ident: $kind:ident $(, $arg:ident: $ty:ty)* $(; $error:ident)?) $body:block $($rest:tt)*) => {
@@ -63,13 +63,13 @@ macro_rules! shims {
 }
 use shims;
 
-/// Runs `f`; what goes wrong becomes a status, its text goes to `error`.
+/// Runs `f`; an error becomes a status, and its text goes to `error`.
 fn guard(error: *mut ConefieldText, f: impl FnOnce() -> Result<()>) -> ConefieldStatus {
     match catch_unwind(AssertUnwindSafe(f)) {
         Ok(Ok(())) => CONEFIELD_OK,
         Ok(Err(e)) => {
             let (status, text) = match &e {
-                // The host knows the place.
+                // The host adds the place.
                 Error::Invalid { field, found, expected, .. } => {
                     (CONEFIELD_INVALID, format!("{field}: found {found}, expected {expected}"))
                 }
@@ -83,14 +83,14 @@ fn guard(error: *mut ConefieldText, f: impl FnOnce() -> Result<()>) -> Conefield
             let text = panic.downcast_ref::<String>().map(String::as_str);
             let text = text.or_else(|| panic.downcast_ref::<&str>().copied()).unwrap_or("without a word");
             write(error, &format!("panicked: {text}"));
-            // To drop what was thrown could panic again.
+            // Dropping the payload could panic again.
             mem::forget(panic);
             CONEFIELD_PANICKED
         }
     }
 }
 
-/// Writes as much of `text` as there is room for.
+/// Writes as much of `text` as fits.
 fn write(out: *mut ConefieldText, text: &str) {
     // SAFETY: see the top of this file.
     let Some(out) = (unsafe { out.as_mut() }) else { return };
@@ -102,13 +102,13 @@ fn write(out: *mut ConefieldText, text: &str) {
     }
 }
 
-/// `n` things at `data`, which may be NULL for none.
+/// `n` items at `data`, which may be NULL if there are none.
 unsafe fn many<'a, T>(data: *const T, n: usize) -> &'a [T] {
     // SAFETY: see the top of this file.
     if n == 0 { &[] } else { unsafe { slice::from_raw_parts(data, n) } }
 }
 
-/// As [`many`], to be written.
+/// As [`many`], mutable.
 unsafe fn many_mut<'a, T>(data: *mut T, n: usize) -> &'a mut [T] {
     // SAFETY: see the top of this file.
     if n == 0 { &mut [] } else { unsafe { slice::from_raw_parts_mut(data, n) } }
@@ -125,12 +125,12 @@ unsafe fn built<'a>(stage: *const c_void) -> &'a Built {
     unsafe { &*stage.cast::<Built>() }
 }
 
-/// Hands a stage over to the host.
+/// Passes ownership of a stage to the host.
 fn hand_over(stage: impl Into<AnyStage>) -> *mut c_void {
     hand_over_on([0; 3], stage)
 }
 
-/// Hands over what a stage made for a grid of this shape.
+/// Passes ownership of what a stage made for a grid of this shape.
 fn hand_over_on(shape: [usize; 3], stage: impl Into<AnyStage>) -> *mut c_void {
     let mut built = Box::new(Built::of(stage));
     built.shape = shape;
@@ -145,7 +145,7 @@ pub unsafe extern "C" fn create(
     error: *mut ConefieldText,
 ) -> ConefieldStatus {
     guard(error, || {
-        // SAFETY: see the top of this file; `context` is what the table says, a static.
+        // SAFETY: see the top of this file; `context` is set by the table and points to a static.
         let (t, settings) = unsafe { (&*context.cast::<StageType>(), text(settings)?) };
         let settings = serde_json::from_str(settings).map_err(|e| Error::invalid("spec", "", e, "JSON"))?;
         let built = Box::new(Built::new(t, settings, width)?);
@@ -157,7 +157,7 @@ pub unsafe extern "C" fn create(
 
 pub unsafe extern "C" fn destroy(stage: *mut c_void) {
     guard(ptr::null_mut(), || {
-        // SAFETY: see the top of this file; the host lets go of it here.
+        // SAFETY: see the top of this file; the host gives up ownership here.
         drop(unsafe { Box::from_raw(stage.cast::<Built>()) });
         Ok(())
     });
@@ -266,7 +266,7 @@ mod tests {
         ConefieldText { data: bytes.as_mut_ptr(), capacity: bytes.len(), length: 0 }
     }
 
-    /// Rows `0..3` of 3 channels that lie 5 apart; what lies between is -1 and stays so.
+    /// Rows `0..3` of 3 channels with stride 5; the gaps are -1 and must stay so.
     #[test]
     fn strided_tiles_are_read_and_written_in_place() {
         let (status, stage) = made(r#"{"panics": false}"#, ptr::null_mut());

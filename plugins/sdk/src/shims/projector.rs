@@ -18,14 +18,14 @@ pub static PROJECTOR: ConefieldProjector = ConefieldProjector {
     wgsl: Some(wgsl),
 };
 
-/// A ray as stages see it.
+/// A ray in the unit cube.
 pub(super) fn ray(ray: &ConefieldRay) -> UnitRay {
     let ConefieldRay { origin, direction, inside, published, per_mm } = *ray;
     UnitRay { origin, direction, inside, published, per_mm }
 }
 
 thread_local! {
-    /// Samples of a ray, before they are handed over.
+    /// Samples of a ray, before they are passed on.
     static SAMPLES: RefCell<Samples> = RefCell::default();
 }
 
