@@ -1,4 +1,4 @@
-// Activations as in mlp.rs: value and derivative.
+// Activations as in activation.rs: value and derivative.
 
 fn stage_none(x: f32) -> vec2<f32> {
     return vec2<f32>(x, 1.0);
