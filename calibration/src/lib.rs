@@ -282,10 +282,10 @@ fn look_at_pairs(
     Ok((found, place.correction))
 }
 
-/// Whether the sources stand on a circle about the axis z. With z from its plane, the map `(x, y, z) → (x, y, z)/(1 + b·z)` of space changes
-/// every view as a tilt of the detector does, so that the same planes meet the views in the same lines. It is one of the two maps that views on a
-/// turntable do not tell (Fitzgibbon, Cross and Zisserman, SMILE 1998; the other one is the scale of z). Only lengths
-/// of rays change, by the tilt times the ray's slope, and a change of the object takes most of that up.
+/// Whether the sources stand on a circle about the axis z. With z from its plane, the map `(x, y, z) → (x, y, z)/(1 + b·z)` of space
+/// changes every view as a tilt of the detector does, so that the same planes meet the views in the same lines. It is one of the two
+/// maps that views on a turntable do not tell (Fitzgibbon, Cross and Zisserman, SMILE 1998; the other one is the scale of z). Only
+/// lengths of rays change, by the tilt times the ray's slope, and a change of the object takes most of that up.
 fn on_a_circle(views: &[View]) -> bool {
     let place = |v: &View| (v.source[0].hypot(v.source[1]), v.source[2]);
     let Some((radius, height)) = views.first().map(place) else { return false };
