@@ -10,7 +10,7 @@ data=$1
 out=$2
 scans=${3:-head engine counts}
 seeds=${4:-0}
-errors=${5:-offset-u=0 offset-u=0.1 offset-u=0.5 offset-u=2 offset-u=20 rotation=1 tilt=1 tilt=2 slant=2 distance=2 distance=-2 step=0.1 step=-0.1}
+errors=${5:-offset-u=0 offset-u=0.1 offset-u=0.5 offset-u=2 offset-u=20 rotation=1 tilt=1 tilt=2 slant=2 distance=2 distance=-2 step=0.1 step=-0.1 step=1 offset-v=2}
 python=${PYTHON:-python3}
 bin=${CARGO_TARGET_DIR:-target}/release/conefield
 [[ -x $bin ]] || cargo build --release --quiet -p conefield
@@ -74,7 +74,9 @@ scan, error, file, before, after = sys.argv[1:]
 found = json.load(open(file))
 key = error.split("=")[0]
 def said(p):
-    end = {"corrected": "", "kept": " kept", "untold": " untold"}[p["verdict"]]
+    if p["verdict"] == "untold":
+        return f"{p['parameter']} untold"
+    end = {"corrected": "", "kept": " kept"}[p["verdict"]]
     return f"{p['parameter']} {p['change']:.3f} ± {p['uncertainty']:.3f} {p['unit']}, {p['pixels'][0]:.2f} ± {p['pixels'][1]:.2f} pixels{end}"
 asked = [said(p) for p in found["parameters"] if p["parameter"] == key or p["verdict"] == "corrected"]
 held = found["held_out"]

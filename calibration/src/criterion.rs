@@ -174,7 +174,7 @@ fn reconstruct(scan: &Scan, backend: &dyn Backend, cancelled: &(dyn Fn() -> bool
 }
 
 /// The scan with some of its views, evenly, where it has very many.
-fn spread(scan: Scan) -> Result<Scan> {
+pub(crate) fn spread(scan: Scan) -> Result<Scan> {
     let n = scan.geometry.views.len();
     if n <= MOST_VIEWS {
         return Ok(scan);

@@ -48,6 +48,11 @@ impl Parameter {
         }
     }
 
+    /// Whether it is sought by what pairs of views say of the same planes, and not by how well views are predicted.
+    pub fn by_pairs(self) -> bool {
+        matches!(self, Self::OffsetV | Self::Tilt | Self::Distance | Self::Step)
+    }
+
     /// The unit in which people read it.
     pub fn unit(self) -> &'static str {
         match self {
@@ -78,7 +83,9 @@ impl Parameter {
             Self::OffsetU => u,
             Self::Rotation => pixel / half,
             Self::Tilt | Self::Slant => pixel * depth / (half * half),
-            Self::OffsetV | Self::Distance => pixel * depth / half,
+            Self::OffsetV => pixel * depth / half,
+            // Farther off all shadows are larger, as those of a larger object: what is left is that near things grow more than far ones.
+            Self::Distance => pixel * (depth / half).powi(2),
             Self::Step => {
                 let turns = turns(&geometry.views);
                 let arc = turns.iter().fold(0.0f64, |most, a| most.max(a.abs()));

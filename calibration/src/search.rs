@@ -15,11 +15,11 @@ use rayon::prelude::*;
 use std::sync::{Mutex, PoisonError};
 
 /// Pixels of a level over which derivatives are taken to either side.
-const REACH: f64 = 0.5;
+pub(crate) const REACH: f64 = 0.5;
 /// Longest step of a parameter, in pixels of a level.
-const LONGEST: f64 = 2.0;
+pub(crate) const LONGEST: f64 = 2.0;
 /// A step that helps by less than this, in pixels of a level, is the last one.
-const SMALL: f64 = 0.01;
+pub(crate) const SMALL: f64 = 0.01;
 /// How often a step that does not help is cut to a third.
 const CUTS: usize = 3;
 
@@ -41,7 +41,7 @@ pub(crate) struct Meter<'a> {
 
 impl Meter<'_> {
     /// So much more is done. Says whether to end.
-    fn count(&self, work: f64) -> Result<()> {
+    pub(crate) fn count(&self, work: f64) -> Result<()> {
         let mut done = self.done.lock().unwrap_or_else(PoisonError::into_inner);
         *done += work;
         self.watch.progress((*done / self.total).min(0.99));
@@ -79,6 +79,8 @@ pub(crate) struct Told {
     pub deviation: f64,
     /// How much the predicted views change with it beside a shift by a pixel: near 0 where nothing tells.
     pub sensitivity: f64,
+    /// Whether the criterion is surely better with what was found than as it was told.
+    pub sure: bool,
 }
 
 impl Search<'_> {
@@ -214,7 +216,9 @@ impl Search<'_> {
         let sensitivity = |k: usize| (normal.matrix[k][k] / pixels as f64).sqrt() / self.level.slope.max(1e-300);
         let covariance = normal.covariance();
         let deviation = |k: usize| covariance.as_ref().map_or(f64::INFINITY, |c| c[k][k].max(0.0).sqrt());
-        (0..slopes.len()).map(|k| Told { deviation: units[k] * deviation(k), sensitivity: sensitivity(k) }).collect()
+        (0..slopes.len())
+            .map(|k| Told { deviation: units[k] * deviation(k), sensitivity: sensitivity(k), sure: true })
+            .collect()
     }
 }
 
@@ -255,7 +259,7 @@ impl Normal {
     }
 }
 
-fn inner(a: &[f64], b: &[f64]) -> f64 {
+pub(crate) fn inner(a: &[f64], b: &[f64]) -> f64 {
     a.iter().zip(b).map(|(a, b)| a * b).sum()
 }
 
@@ -265,7 +269,7 @@ fn product(a: &[Vec<f64>], b: &[Vec<f64>]) -> Vec<Vec<f64>> {
 }
 
 /// A little more on the diagonal: a parameter that nothing tells stays where it is.
-fn damped(mut matrix: Vec<Vec<f64>>) -> Vec<Vec<f64>> {
+pub(crate) fn damped(mut matrix: Vec<Vec<f64>>) -> Vec<Vec<f64>> {
     let most = (0..matrix.len()).map(|k| matrix[k][k]).fold(0.0, f64::max);
     for (k, row) in matrix.iter_mut().enumerate() {
         row[k] += 1e-6 * most;
@@ -274,7 +278,7 @@ fn damped(mut matrix: Vec<Vec<f64>>) -> Vec<Vec<f64>> {
 }
 
 /// The inverse of a small matrix by Gauss and Jordan; `None` where a pivot vanishes.
-fn inverse(mut a: Vec<Vec<f64>>) -> Option<Vec<Vec<f64>>> {
+pub(crate) fn inverse(mut a: Vec<Vec<f64>>) -> Option<Vec<Vec<f64>>> {
     let n = a.len();
     for (i, row) in a.iter_mut().enumerate() {
         row.extend((0..n).map(|j| f64::from(u8::from(i == j))));

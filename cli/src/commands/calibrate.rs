@@ -21,9 +21,10 @@ use std::time::Instant;
 
 /// Estimate the position of the detector from the views.
 ///
-/// A quick reconstruction of some views predicts the others; the geometry with the smallest error is the estimate. No phantom is
-/// needed. SCAN is not changed; OUT is the same scan with the corrected geometry. Parameters that the views do not determine, or
-/// that are right within three standard deviations, stay unchanged.
+/// A quick reconstruction of some views predicts the others; the geometry with the smallest error is the estimate. For offset-v,
+/// tilt, distance and step, pairs of views are compared without a reconstruction. No phantom is needed. SCAN is not changed; OUT is
+/// the same scan with the corrected geometry. Parameters that the views do not determine, or that are right within three standard
+/// deviations, stay unchanged.
 #[derive(Args)]
 pub struct CalibrateArgs {
     /// The scan.
@@ -37,7 +38,7 @@ pub struct CalibrateArgs {
     /// Pixels along the longer side of the detector at the finest level; more pixels are more accurate and slower.
     #[arg(long, value_name = "N", default_value_t = 64, value_parser = clap::value_parser!(u16).range(16..=1024))]
     pixels: u16,
-    /// Also draw the held-out error along each parameter.
+    /// Also draw the error along each parameter.
     #[arg(long, value_name = "FILE")]
     png: Option<PathBuf>,
     #[arg(long, value_name = "BACKEND", default_value_t, help = backend::HELP)]
@@ -101,6 +102,9 @@ impl CalibrateArgs {
         let rows: Vec<Vec<String>> = std::iter::once(heads).chain(found.found.iter().map(row)).collect();
         let [before, after] = found.held_out;
         let mut text = out::table(&rows, &[1, 2]);
+        for (parameter, reason) in found.found.iter().filter_map(|f| Some((f.parameter, f.reason?))) {
+            text += &format!("\n{parameter}: {reason}");
+        }
         text += &format!(
             "\n\nheld-out error {before:.4}, {after:.4} with the corrections: root mean square over the largest line integral, {} \
              views predicted by pixels of {} x {}; {}",
@@ -152,18 +156,19 @@ fn note(scan: &mut Scan, source: &Path, found: &Calibration) {
     }
 }
 
-/// The held-out error along each parameter, side by side.
+/// The error along each parameter, side by side.
 fn draw(path: &Path, found: &Calibration) -> Result<()> {
     let options = CurveOptions { size: [640, 480], ..CurveOptions::default() };
     let drawn: Vec<_> = found
         .found
         .iter()
         .map(|f| {
+            let name = if f.parameter.by_pairs() { "difference of pairs of views" } else { "held-out error" };
             let lowest = f.curve.iter().map(|p| p.1).fold(f64::INFINITY, f64::min);
             let highest = f.curve.iter().map(|p| p.1).fold(0.0, f64::max);
             let mark = |x: f64| vec![(x, lowest), (x, highest)];
             let series = vec![
-                ("held-out error".to_owned(), f.curve.clone()),
+                (name.to_owned(), f.curve.clone()),
                 ("found".to_owned(), mark(f.change)),
                 ("as told".to_owned(), mark(0.0)),
             ];
@@ -171,12 +176,12 @@ fn draw(path: &Path, found: &Calibration) -> Result<()> {
                 Verdict::Untold => format!("{}: not told", f.parameter),
                 _ => format!("{}: {:.3} ± {:.3} {}", f.parameter, f.change, f.uncertainty, f.unit),
             };
-            (title, format!("change of {} ({})", f.parameter, f.unit), series)
+            (title, [format!("change of {} ({})", f.parameter, f.unit), name.to_owned()], series)
         })
         .collect();
     let panels: Vec<Panel<'_>> = drawn
         .iter()
-        .map(|(title, x, series)| Panel { title, labels: [x, "held-out error"], series, options: &options })
+        .map(|(title, [x, y], series)| Panel { title, labels: [x, y], series, options: &options })
         .collect();
     panels_png(path, &panels)
 }
