@@ -279,7 +279,8 @@ impl Plan for FieldPlan {
         let source = RaySource::new(job.scan, &scene, &pipeline, RayChoice { views, pixels, margin, windows })?;
         observer.note(&format!("{:.0}% of the pixels are trained on", 100.0 * source.share()));
         if let Some(whole) = source.whole_windows() {
-            observer.note(&format!("windows: {whole} whole ones in all views"));
+            let none = if whole == 0 { ": all rays are single pixels" } else { "" };
+            observer.note(&format!("windows that can be trained on as a whole: {whole} in all views{none}"));
         }
         let fitted = self.fitted_loss(job, &scene, &source);
         if let Some(loss) = &fitted {

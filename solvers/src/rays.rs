@@ -160,11 +160,6 @@ impl<'a> RaySource<'a> {
         let columns = scan.geometry.detector[1];
         let windows: Option<(Windows, Vec<Vec<u32>>)> =
             windows.map(|w| (w, pixels.par_iter().map(|p| w.whole(p, columns)).collect()));
-        if let Some((w, whole)) = &windows {
-            let found = format!("{} x {} pixels, and no window that can be trained on as a whole", w.side, w.side);
-            let any = whole.iter().any(|of_view| !of_view.is_empty());
-            ensure(any, "spec", "training.windows.side", found, "smaller windows, or none")?;
-        }
         Ok(Self { scan, scene, pixels, windows, views, usable })
     }
 

@@ -144,7 +144,7 @@ impl Budget {
             built.borrow_mut().push((i, method));
             Ok(costs)
         };
-        let Choice { point: at, costs, fits, passed_over } = pick(&expected, || self.left(), measure)?;
+        let Choice { point: at, costs, fits, passed_over } = pick(&expected, slower, || self.left(), measure)?;
         let method = built.take().into_iter().find(|(i, _)| *i == at).map(|(_, m)| m);
         let mut method =
             method.ok_or_else(|| Error::unsupported("the budget", "no method of the front was measured"))?;
@@ -291,16 +291,18 @@ struct Choice {
 }
 
 /// Takes the first of `points`, sorted from the best, that fits into `left` seconds. The first estimate of a point's
-/// cost comes from the front's own machine; `measure` finds its cost here, which also gives the relative speed for
-/// other points of its kind.
+/// cost comes from the front's own machine; voxel methods take `voxels_slower` times as long here, if that is known.
+/// `measure` finds the cost here, which also gives the relative speed for other points of its kind.
 fn pick(
     points: &[(Unknowns, Expected)],
+    voxels_slower: Option<f64>,
     left: impl Fn() -> f64,
     mut measure: impl FnMut(usize) -> Result<Costs>,
 ) -> Result<Choice> {
     let mut known: Vec<Option<Result<Costs, String>>> = points.iter().map(|_| None).collect();
     // For fields and for voxels; what is known of one kind is the best guess for the other.
     let mut slower: [Option<f64>; 2] = [None; 2];
+    slower[Unknowns::Voxels as usize] = voxels_slower;
     let index = |kind: Unknowns| kind as usize;
     while known.iter().flatten().filter(|k| k.is_ok()).count() < MEASURED {
         let needed = |i: usize| {
@@ -392,7 +394,7 @@ mod tests {
             measured.push(i);
             Ok(Costs { step_s: factor * points[i].1.step_s, ..Costs::default() })
         };
-        let choice = pick(&points, || left, measure).unwrap();
+        let choice = pick(&points, None, || left, measure).unwrap();
         (choice.point, choice.fits, measured)
     }
 
@@ -425,7 +427,7 @@ mod tests {
                 _ => Costs { step_s: points[i].1.step_s, ..Costs::default() },
             })
         };
-        let choice = pick(&points, || 26.0, measure).unwrap();
+        let choice = pick(&points, None, || 26.0, measure).unwrap();
         assert_eq!((choice.point, choice.fits, measured), (2, true, vec![0, 2]));
     }
 
@@ -433,7 +435,7 @@ mod tests {
     fn where_nothing_fits_the_least_is_taken() {
         let (point, fits, measured) = chosen(1.0, 1.0);
         assert_eq!((point, fits, measured), (3, false, vec![3]));
-        let refused = pick(&points(), || 1e9, |_| Err(Error::unsupported("memory", "too little")));
+        let refused = pick(&points(), None, || 1e9, |_| Err(Error::unsupported("memory", "too little")));
         assert!(refused.err().unwrap().to_string().contains("too little"));
     }
 
@@ -444,7 +446,7 @@ mod tests {
             0 => Err(Error::unsupported("memory", "too little")),
             _ => Ok(Costs { step_s: points[i].1.step_s, ..Costs::default() }),
         };
-        let choice = pick(&points, || 100.0, measure).unwrap();
+        let choice = pick(&points, None, || 100.0, measure).unwrap();
         assert_eq!((choice.point, choice.passed_over.len()), (1, 1));
     }
 }

@@ -11,26 +11,19 @@ const FEW: &[&str] = &["training.rays=256"];
 const SMALL: &[&str] =
     &["training.rays=128", "projector.samples=64", "optimizer.lr=1e-2", "encoder.log2_table_size=14"];
 const DENSE: &[&str] = &["training.rays=128", "projector.samples=64", "optimizer.lr=1e-2"];
-const LINES: &[&str] = &[
-    "training.rays=128",
-    "training.windows={ count = 1, side = 8 }",
-    "projector.samples=64",
-    "optimizer.lr=1e-2",
-    "encoder.log2_table_size=14",
-];
 const MIXTURE: &[&str] = &["most=6000", "start.count=5000"];
-/// Its wide network takes many minutes for a volume better than an empty one.
-const TOO_SLOW: &str = "nerf";
+/// The wide network of `nerf` takes many minutes for a volume better than an empty one. The attention of `sax-nerf` takes half a minute to
+/// export this volume, as it computes points off any ray one by one.
+const TOO_SLOW: [&str; 2] = ["nerf", "sax-nerf"];
 
 /// Steps, settings, and the least PSNR in dB, at least one below what was measured.
-const RUNS: [(&str, u32, &[&str], f64); 10] = [
+const RUNS: [(&str, u32, &[&str], f64); 9] = [
     ("fast", 150, FEW, 20.0),
     ("balanced", 150, FEW, 17.5),
     ("accurate", 150, FEW, 17.5),
     ("ni-naf", 300, SMALL, 20.5),
     ("ni-naf-published", 300, SMALL, 22.5),
     ("naf", 300, SMALL, 18.5),
-    ("sax-nerf", 100, LINES, 17.0),
     ("dense", 300, DENSE, 20.5),
     ("gaussians", 60, MIXTURE, 16.0),
     ("gaussians-published", 60, MIXTURE, 16.0),
@@ -44,7 +37,8 @@ fn every_shipped_field_makes_a_volume() {
     // A chain's field is that of a spec of its own.
     let has_field =
         |name: &str| json(&["explain", name, "--json"])["stages"].as_array().is_some_and(|stages| !stages.is_empty());
-    let untried = |name: &&str| *name != TOO_SLOW && has_field(name) && !RUNS.iter().any(|(run, ..)| run == name);
+    let untried =
+        |name: &&str| !TOO_SLOW.contains(name) && has_field(name) && !RUNS.iter().any(|(run, ..)| run == name);
     let missing: Vec<&str> = SHIPPED.iter().map(|s| s.name).filter(untried).collect();
     assert!(missing.is_empty(), "no run of {missing:?}");
     let mut faults = vec![];

@@ -36,7 +36,7 @@ fn an_unknown_spec_lists_the_shipped_ones() {
     let said = refused(1, &["explain", "ni-nef"]);
     assert!(
         said.contains(
-            "\"ni-naf\" (of naf, ni-naf, ni-naf-published, nerf, dense, accurate, balanced, fast, field-tv, accurate-tv, fdk, "
+            "\"ni-naf\" (of naf, ni-naf, ni-naf-published, nerf, sax-nerf, dense, accurate, balanced, fast, field-tv, accurate-tv, fdk, "
         ),
         "{said}"
     );
