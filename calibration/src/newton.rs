@@ -33,6 +33,9 @@ pub(crate) struct Place {
     pub told: Vec<Told>,
 }
 
+/// A correction with the misfit of each pair.
+type Misfits = (Correction, Vec<f64>);
+
 /// The criterion around a place, of each pair: all in pixels of the parameters.
 struct Around {
     /// By parameter.
@@ -82,10 +85,10 @@ impl Newton<'_> {
         &self,
         active: &[Parameter],
         units: &[f64],
-        here: &(Correction, Vec<f64>),
+        here: &Misfits,
         step: &[f64],
         mut share: f64,
-    ) -> Result<Option<((Correction, Vec<f64>), f64)>> {
+    ) -> Result<Option<(Misfits, f64)>> {
         let before: f64 = here.1.iter().sum();
         for _ in 0..=CUTS {
             let moves = active.iter().zip(units).zip(step);
@@ -99,7 +102,7 @@ impl Newton<'_> {
         Ok(None)
     }
 
-    fn around(&self, active: &[Parameter], units: &[f64], here: &(Correction, Vec<f64>)) -> Result<Around> {
+    fn around(&self, active: &[Parameter], units: &[f64], here: &Misfits) -> Result<Around> {
         let n = active.len();
         let moved = |sides: &[(usize, f64)]| {
             let to = |c: Correction, &(k, side): &(usize, f64)| c.with(active[k], c.get(active[k]) + side * units[k]);
