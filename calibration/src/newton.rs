@@ -139,9 +139,8 @@ impl Newton<'_> {
             pair.iter().for_each(|&v| views[v] += a - b);
         }
         // Every pair belongs to two views.
-        let (n, all) = (views.len() as f64, views.iter().sum::<f64>() / 2.0);
-        let spread = views.iter().map(|x| (x - 2.0 * all / n).powi(2)).sum::<f64>() * (n - 1.0) / n;
-        all > CLEAR * spread.sqrt()
+        let all = views.iter().sum::<f64>() / 2.0;
+        all > CLEAR * jackknife(&views)
     }
 
     /// What the pairs tell of each parameter.
@@ -152,9 +151,7 @@ impl Newton<'_> {
         let steps: Option<Vec<Vec<f64>>> = (0..views).map(without).collect();
         let deviation = |k: usize| {
             let Some(steps) = &steps else { return f64::INFINITY };
-            let n = steps.len() as f64;
-            let mean = steps.iter().map(|s| s[k]).sum::<f64>() / n;
-            (steps.iter().map(|s| (s[k] - mean).powi(2)).sum::<f64>() * (n - 1.0) / n).sqrt()
+            jackknife(&steps.iter().map(|s| s[k]).collect::<Vec<_>>())
         };
         let sensitivity = |k: usize| {
             let sum: f64 = around.curvature[k][k].iter().sum();
@@ -167,6 +164,13 @@ impl Newton<'_> {
         };
         units.iter().enumerate().map(of).collect()
     }
+}
+
+/// The standard deviation of an estimate from its values without each of the views, or from what each view adds to it.
+fn jackknife(values: &[f64]) -> f64 {
+    let n = values.len() as f64;
+    let mean = values.iter().sum::<f64>() / n;
+    (values.iter().map(|x| (x - mean).powi(2)).sum::<f64>() * (n - 1.0) / n).sqrt()
 }
 
 impl Around {

@@ -25,6 +25,12 @@ pub fn unit(h: u64) -> f32 {
     (h >> 40) as f32 * (1.0 / 16_777_216.0)
 }
 
+/// Number `i` of a seed, uniform in ±`bound`.
+#[inline(always)]
+pub fn uniform(seed: u64, i: usize, bound: f64) -> f32 {
+    ((2.0 * f64::from(unit(mix(seed, i as u64))) - 1.0) * bound) as f32
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;

@@ -3,5 +3,7 @@
 pub mod line_transformer;
 mod linear;
 pub mod mlp;
+#[cfg(test)]
+mod testing;
 pub mod voxel_grid;
 pub mod voxels_joseph;

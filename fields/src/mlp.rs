@@ -9,7 +9,7 @@ use crate::linear::Linear;
 use conefield_core::activation::{self, Activation, activate};
 use conefield_core::dense::{Output as Into, affine, affine_input, affine_weights};
 use conefield_core::error::{Result, ensure};
-use conefield_core::random::{mix, unit};
+use conefield_core::random::uniform;
 use conefield_core::settings::FieldSpec;
 use conefield_core::simd::{Op, Real, Simd, run};
 use conefield_core::stage::{Field, GradKind, Grads, Info, Kernel, Parameter, Reduced, Scope, Stage, Tile, TileMut};
@@ -260,7 +260,7 @@ impl Stage for MlpStage {
             };
             for (range, bound) in [(l.weights(), w), (l.bias(), b)] {
                 for i in range {
-                    params[i] = ((2.0 * f64::from(unit(mix(seed, i as u64))) - 1.0) * bound) as f32;
+                    params[i] = uniform(seed, i, bound);
                 }
             }
         }
@@ -302,6 +302,7 @@ impl Field for MlpStage {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::testing::left_out_inputs_are_zeros;
 
     #[test]
     fn the_published_shapes_have_their_parameter_counts() {
@@ -315,27 +316,7 @@ mod tests {
 
     #[test]
     fn a_field_without_inputs_equals_one_that_sees_zeros_there() {
-        let m = MlpStage::new(&Mlp { width: 9, ..Mlp::default() }, 6).unwrap();
-        let mut params = vec![0.0; m.info().params];
-        m.init(3, &mut params);
-        let keep = [0, 3, 4];
-        let r = m.keep_inputs(&keep).unwrap();
-        let small: Vec<f32> = r.params.iter().flat_map(|r| params[r.clone()].iter().copied()).collect();
-        let n = 5;
-        let x: Vec<f32> = (0..3 * n).map(|i| (i as f32 * 0.7).sin()).collect();
-        let mut wide = vec![0.0; 6 * n];
-        for (c, &k) in keep.iter().enumerate() {
-            wide[k * n..(k + 1) * n].copy_from_slice(&x[c * n..(c + 1) * n]);
-        }
-        let eval = |s: &dyn Stage, p: &[f32], x: &[f32]| {
-            let (mut y, mut tape) = (vec![0.0; n], vec![0.0; s.info().tape * n]);
-            s.kernel().forward(p, Tile::new(x, n), TileMut::new(&mut y, n), TileMut::new(&mut tape, n));
-            y
-        };
-        let (a, b) = (eval(&m, &params, &wide), eval(r.stage.as_ref(), &small, &x));
-        for (a, b) in a.iter().zip(&b) {
-            assert!((a - b).abs() < 1e-6, "{a} {b}");
-        }
+        left_out_inputs_are_zeros(&MlpStage::new(&Mlp { width: 9, ..Mlp::default() }, 6).unwrap(), &[0, 3, 4]);
     }
 
     /// Output and gradients against central differences of the f64 kernel, for every activation.

@@ -16,7 +16,7 @@ use crate::layer_norm::{LayerNorm, LayerNormStage};
 use conefield_core::activation::{Activation, activate};
 use conefield_core::dense::{Output as Into, WeightMatrix, affine, affine_input, affine_weights};
 use conefield_core::error::{Result, ensure};
-use conefield_core::random::{mix, unit};
+use conefield_core::random::{mix, uniform, unit};
 use conefield_core::settings::NormalizerSpec;
 use conefield_core::simd::{Op, Real, Simd, SimdBase, V, load, run, store};
 use conefield_core::stage::{
@@ -506,7 +506,7 @@ impl Stage for LineAttentionStage {
                     "norm.0.weight" | "norm.1.weight" => 1.0,
                     "norm.0.bias" | "norm.1.bias" => 0.0,
                     "position" => normal(seed, i as u64) as f32,
-                    _ => ((2.0 * f64::from(unit(mix(seed, i as u64))) - 1.0) * bound) as f32,
+                    _ => uniform(seed, i, bound),
                 };
             }
         }

@@ -38,7 +38,8 @@ fn expect(report: Report) {
     assert!(report.passed(), "{report}\nfails {:?}", report.failed());
 }
 
-/// The stage's WGSL, where there is a device. Every built-in stage that does anything has one.
+/// The stage's WGSL, where there is a device. Every built-in stage that does anything has one, but those that look along
+/// rays.
 fn on_a_device(stage: &dyn Stage, options: &Options) {
     if stage.wgsl().is_none() {
         return;

@@ -68,6 +68,12 @@ pub struct Tuned {
     pub volume: [usize; 3],
 }
 
+impl Tuned {
+    fn size(&self) -> Size {
+        Size::new(self.views, self.detector, self.volume)
+    }
+}
+
 /// A method with its cost and accuracy.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
@@ -190,7 +196,7 @@ impl Front {
 
     /// The front restricted to the scans whose volumes are closest in size, because the best methods depend on it.
     pub fn near(&self, size: Size) -> Self {
-        let apart = |scan: &Tuned| (Size::new(scan.views, scan.detector, scan.volume).voxels / size.voxels).ln().abs();
+        let apart = |scan: &Tuned| (scan.size().voxels / size.voxels).ln().abs();
         let least = self.scans.iter().map(apart).fold(f64::INFINITY, f64::min);
         let kept: Vec<bool> = self.scans.iter().map(|scan| apart(scan) < least + NEAR.ln()).collect();
         let chosen = |i: &usize| kept[*i];
@@ -214,7 +220,7 @@ impl Front {
     }
 
     fn sizes(&self) -> impl Iterator<Item = Size> {
-        self.scans.iter().map(|scan| Size::new(scan.views, scan.detector, scan.volume))
+        self.scans.iter().map(Tuned::size)
     }
 
     /// The cost of `point` on the smallest of the scans.
@@ -234,7 +240,7 @@ impl Front {
         let mut sum = Expected { steps: 0.0, step_s: 0.0, beside_s: 0.0 };
         let n = point.runs.len() as f64;
         for (run, scan) in point.runs.iter().zip(&self.scans) {
-            let then = Size::new(scan.views, scan.detector, scan.volume);
+            let then = scan.size();
             let larger = match point.kind {
                 Unknowns::Field => 1.0,
                 Unknowns::Voxels => size.projecting() / then.projecting(),

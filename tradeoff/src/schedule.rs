@@ -327,8 +327,8 @@ fn pick(
                 if let Ok(costs) = &measured {
                     let (kind, e) = points[at];
                     // Ratio of whole runs, because the steps of a chain differ.
-                    slower[index(kind)] =
-                        Some(costs.run_s(e.steps, 1.0) / (e.steps * e.step_s + e.beside_s).max(1e-12));
+                    let ratio = costs.run_s(e.steps, 1.0) / (e.steps * e.step_s + e.beside_s).max(1e-12);
+                    slower[index(kind)] = voxels_slower.filter(|_| kind == Unknowns::Voxels).or(Some(ratio));
                 }
                 known[at] = Some(measured.map_err(|e| e.to_string()));
             }
@@ -429,6 +429,21 @@ mod tests {
         };
         let choice = pick(&points, None, || 26.0, measure).unwrap();
         assert_eq!((choice.point, choice.fits, measured), (2, true, vec![0, 2]));
+    }
+
+    /// Drawing and scoring are costs of every run, no sign of a slow machine.
+    #[test]
+    fn a_known_speed_is_not_overruled_by_what_is_measured() {
+        let points = [(20.0, 1.0), (15.0, 1.0), (1.0, 1.0)]
+            .map(|(steps, step_s)| (Unknowns::Voxels, Expected { steps, step_s, beside_s: 0.0 }));
+        let mut measured = vec![];
+        let measure = |i: usize| {
+            measured.push(i);
+            let score_s = if i == 0 { 10.0 } else { 0.0 };
+            Ok(Costs { step_s: points[i].1.step_s, score_s, ..Costs::default() })
+        };
+        let choice = pick(&points, Some(1.0), || 19.0, measure).unwrap();
+        assert_eq!((choice.point, choice.fits, measured), (1, true, vec![0, 1]));
     }
 
     #[test]
