@@ -4,7 +4,7 @@
 //! `[m][ld]` row-major. Register blocks hold 8 channels × 2 vectors (forward, input gradient) and 4 × 4 channels
 //! (weight gradient).
 
-use crate::simd::{Real, Simd, SimdBase, SimdFloat, V, load, store};
+use crate::simd::{Real, Select, Simd, SimdBase, SimdFloat, V, WIDEST, load, store};
 
 /// The part of a weight matrix that a product uses.
 #[derive(Clone, Copy)]
@@ -84,15 +84,14 @@ fn affine_block<S: Simd, R: Real, const M: usize, const C: usize, const FULL: bo
         for c in 0..C {
             acc[j][c] = match bias {
                 Some(b) => V::<S, R>::splat(s, b[j]),
-                None => read::<S, R, FULL>(s, &y[j * n..(j + 1) * n], i, c),
+                None => read::<S, R, FULL>(s, y, j * n + i, c),
             };
         }
     }
     for k in 0..k {
-        let x = &x[k * n..(k + 1) * n];
         let mut v = [zero; C];
         for c in 0..C {
-            v[c] = read::<S, R, FULL>(s, x, i, c);
+            v[c] = read::<S, R, FULL>(s, x, k * n + i, c);
         }
         for j in 0..M {
             let w = V::<S, R>::splat(s, rows[j][k]);
@@ -108,7 +107,8 @@ fn affine_block<S: Simd, R: Real, const M: usize, const C: usize, const FULL: bo
     }
 }
 
-/// Vector `c` of the rows from `i`.
+/// Vector `c` from `x[i]`. `x` is the whole tile, not one channel: if the rows left do not fill a vector, its last lanes
+/// hold values of the next channel, which `write` drops. Only at the end of the tile is a vector read lane by lane.
 #[inline(always)]
 fn read<S: Simd, R: Real, const FULL: bool>(s: S, x: &[R], i: usize, c: usize) -> V<S, R> {
     let (at, len) = (i + c * V::<S, R>::LEN, V::<S, R>::LEN);
@@ -172,15 +172,14 @@ fn input_block<S: Simd, R: Real, const K: usize, const C: usize, const FULL: boo
     if out == Output::Add {
         for j in 0..K {
             for c in 0..C {
-                acc[j][c] = read::<S, R, FULL>(s, &dx[j * n..(j + 1) * n], i, c);
+                acc[j][c] = read::<S, R, FULL>(s, dx, j * n + i, c);
             }
         }
     }
     for o in 0..m {
-        let dy = &dy[o * n..(o + 1) * n];
         let mut d = [zero; C];
         for c in 0..C {
-            d[c] = read::<S, R, FULL>(s, dy, i, c);
+            d[c] = read::<S, R, FULL>(s, dy, o * n + i, c);
         }
         let w = &w.data[o * w.ld + w.column..][..K];
         for j in 0..K {
@@ -192,9 +191,9 @@ fn input_block<S: Simd, R: Real, const K: usize, const C: usize, const FULL: boo
     }
     for j in 0..K {
         for c in 0..C {
-            let dx = &mut dx[j * n..(j + 1) * n];
-            let v = if out == Output::Multiply { acc[j][c] * read::<S, R, FULL>(s, dx, i, c) } else { acc[j][c] };
-            write::<S, R, FULL>(v, dx, i, c);
+            let v =
+                if out == Output::Multiply { acc[j][c] * read::<S, R, FULL>(s, dx, j * n + i, c) } else { acc[j][c] };
+            write::<S, R, FULL>(v, &mut dx[j * n..(j + 1) * n], i, c);
         }
     }
 }
@@ -212,19 +211,22 @@ pub fn affine_weights<S: Simd, R: Real>(
     n: usize,
 ) {
     let (m, k) = (dy.len() / n, x.len() / n);
+    let len = V::<S, R>::LEN;
+    // 1 in the lanes that the rows of the last vector fill.
+    let last = load(s, &[R::ONE; WIDEST][..n % len], 0);
     let mut o = 0;
     while o < m {
         let tall = if o + 4 <= m { 4 } else { 1 };
         let mut c = 0;
         while c < k {
             let broad = if c + 4 <= k { 4 } else { 1 };
-            let (dy, x) = (&dy[o * n..(o + tall) * n], &x[c * n..(c + broad) * n]);
+            let (dy, x) = (&dy[o * n..], &x[c * n..]);
             let dw = &mut dw[o * ld + column + c..];
             match (tall, broad) {
-                (4, 4) => weights_block::<S, R, 4, 4>(s, dy, x, dw, ld, n),
-                (4, _) => weights_block::<S, R, 4, 1>(s, dy, x, dw, ld, n),
-                (_, 4) => weights_block::<S, R, 1, 4>(s, dy, x, dw, ld, n),
-                _ => weights_block::<S, R, 1, 1>(s, dy, x, dw, ld, n),
+                (4, 4) => weights_block::<S, R, 4, 4>(s, dy, x, dw, ld, n, last),
+                (4, _) => weights_block::<S, R, 4, 1>(s, dy, x, dw, ld, n, last),
+                (_, 4) => weights_block::<S, R, 1, 4>(s, dy, x, dw, ld, n, last),
+                _ => weights_block::<S, R, 1, 1>(s, dy, x, dw, ld, n, last),
             }
             c += broad;
         }
@@ -246,6 +248,7 @@ fn weights_block<S: Simd, R: Real, const M: usize, const K: usize>(
     dw: &mut [R],
     ld: usize,
     n: usize,
+    last: V<S, R>,
 ) {
     let len = V::<S, R>::LEN;
     let zero = V::<S, R>::splat(s, R::ZERO);
@@ -257,7 +260,7 @@ fn weights_block<S: Simd, R: Real, const M: usize, const K: usize>(
     for k in 0..K {
         columns[k] = &x[k * n..(k + 1) * n];
     }
-    let (dy, x) = (rows, columns);
+    let (tile_dy, tile_x, dy, x) = (dy, x, rows, columns);
     let whole = n / len * len;
     for i in (0..whole).step_by(len) {
         let mut v = [zero; K];
@@ -272,9 +275,16 @@ fn weights_block<S: Simd, R: Real, const M: usize, const K: usize>(
         }
     }
     if whole < n {
+        // Lanes past the last row hold values of the next channel, infinities too: they are replaced, not multiplied by 0.
+        let fill = last.simd_ge(V::<S, R>::splat(s, R::ONE));
+        let mut v = [zero; K];
+        for k in 0..K {
+            v[k] = fill.select(load(s, tile_x, k * n + whole), zero);
+        }
         for j in 0..M {
+            let d = fill.select(load(s, tile_dy, j * n + whole), zero);
             for k in 0..K {
-                acc[j * K + k] = load(s, dy[j], whole).mul_add(load(s, x[k], whole), acc[j * K + k]);
+                acc[j * K + k] = d.mul_add(v[k], acc[j * K + k]);
             }
         }
     }

@@ -2,7 +2,7 @@
 
 use crate::error::{Result, ensure};
 use crate::pipeline::Model;
-use crate::stage::{Scope, Stage, TILE_ROWS, Tile, TileMut};
+use crate::stage::{Kernel, Scope, Stage, TILE_ROWS, Tile, TileMut};
 use std::ops::Range;
 
 /// The encoder's features `[F][rows]` after the normalizers, `[F'][rows]`. Rows are points off any ray. The model's
@@ -37,15 +37,16 @@ fn through(model: &Model, which: Range<usize>, features: &[f32], rows: usize) ->
     )?;
     let wide = stages.last().map_or(width, |(stage, _)| stage.info().output);
     let mut out = vec![0.0; wide * rows];
-    // Stages that look along rays get points off any ray one at a time.
-    let most = if stages.iter().any(|(s, _)| s.info().scope == Scope::Ray) { 1 } else { TILE_ROWS };
+    // Some stages that look along rays need points off any ray one at a time.
+    let most = if stages.iter().all(|(s, _)| of_points(*s).is_some()) { TILE_ROWS } else { 1 };
     for at in (0..rows).step_by(most) {
         let n = most.min(rows - at);
         let mut x: Vec<f32> = features.chunks_exact(rows).flat_map(|c| &c[at..at + n]).copied().collect();
         for (stage, params) in stages {
             let info = stage.info();
             let (mut y, mut tape) = (vec![0.0; info.output * n], vec![0.0; info.tape * n]);
-            stage.kernel().forward(params, Tile::new(&x, n), TileMut::new(&mut y, n), TileMut::new(&mut tape, n));
+            let kernel = of_points(*stage).unwrap_or_else(|| stage.kernel());
+            kernel.forward(params, Tile::new(&x, n), TileMut::new(&mut y, n), TileMut::new(&mut tape, n));
             x = y;
         }
         for (out, x) in out.chunks_exact_mut(rows).zip(x.chunks_exact(n)) {
@@ -54,4 +55,12 @@ fn through(model: &Model, which: Range<usize>, features: &[f32], rows: usize) ->
     }
     pipeline.fault()?;
     Ok(out)
+}
+
+/// The kernel that takes whole tiles of points off any ray, if the stage has one.
+fn of_points(stage: &dyn Stage) -> Option<&dyn Kernel<f32>> {
+    match stage.info().scope {
+        Scope::Ray => stage.kernel().points(),
+        Scope::Row => Some(stage.kernel()),
+    }
 }

@@ -193,6 +193,12 @@ pub trait Kernel<R: Real, P = R>: Send + Sync {
         debug_assert_eq!(pass, 0);
         self.forward(params, x, y, tape);
     }
+
+    /// For a stage that looks along rays ([`Scope::Ray`]): the same function of points off any ray, each row a ray of one
+    /// sample. Without it, a host passes such rows one at a time, which is slow.
+    fn points(&self) -> Option<&(dyn Kernel<R, P> + '_)> {
+        None
+    }
 }
 
 impl<R: Real, P, K: Kernel<R, P> + ?Sized> Kernel<R, P> for &K {
@@ -206,6 +212,10 @@ impl<R: Real, P, K: Kernel<R, P> + ?Sized> Kernel<R, P> for &K {
 
     fn forward_pass(&self, pass: usize, params: &[P], x: Tile<'_, R>, y: TileMut<'_, R>, tape: TileMut<'_, R>) {
         (**self).forward_pass(pass, params, x, y, tape);
+    }
+
+    fn points(&self) -> Option<&(dyn Kernel<R, P> + '_)> {
+        (**self).points()
     }
 
     fn backward(

@@ -71,6 +71,8 @@ pub struct LineTransformerStage {
     blocks: Vec<usize>,
     skip: Linear,
     last: Linear,
+    /// The stage for points off any ray.
+    points: Option<Box<Self>>,
 }
 
 impl LineTransformerStage {
@@ -85,7 +87,9 @@ impl LineTransformerStage {
         let starts: Vec<usize> = (0..blocks).map(|k| first.all().end + k * each).collect();
         let skip = Linear { skip: input, input: width, output: width, start: first.all().end + blocks * each };
         let last = Linear { skip: 0, input: width, output: 1, start: skip.all().end };
-        Ok(Self { settings: settings.clone(), input, first, block, blocks: starts, skip, last })
+        let alone = block.of_points();
+        let stage = Self { settings: settings.clone(), input, first, block, blocks: starts, skip, last, points: None };
+        Ok(Self { points: Some(Box::new(Self { block: alone, ..stage.clone() })), ..stage })
     }
 
     fn linear(&self) -> [(&'static str, &Linear); 3] {
@@ -273,6 +277,10 @@ impl<R: Real> Kernel<R> for LineTransformerStage {
             d.copy_from_slice(output);
         }
         run(FirstBack { stage: self, params, x, d, slope, grads, dx });
+    }
+
+    fn points(&self) -> Option<&(dyn Kernel<R> + '_)> {
+        self.points.as_deref().map(|stage| stage as _)
     }
 }
 

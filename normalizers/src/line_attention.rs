@@ -72,6 +72,10 @@ pub struct LineAttentionStage {
     width: usize,
     hidden: usize,
     at: Places,
+    /// Samples that look at each other: `settings.segment`, or 1 for points off any ray.
+    reach: usize,
+    /// The stage for points off any ray.
+    points: Option<Box<Self>>,
 }
 
 /// Parameter ranges. Matrices are row-major, with a row for each output.
@@ -120,7 +124,13 @@ impl LineAttentionStage {
             project_bias,
             feed: [feed_0, feed_1, feed_2],
         };
-        Ok(Self { settings, norm, width, hidden, at })
+        let stage = Self { reach: settings.segment, settings, norm, width, hidden, at, points: None };
+        Ok(Self { points: Some(Box::new(stage.of_points())), ..stage })
+    }
+
+    /// The same function of points off any ray: each row is a segment of its own.
+    pub fn of_points(&self) -> Self {
+        Self { reach: 1, points: None, ..self.clone() }
     }
 
     /// Channels of all heads.
@@ -222,6 +232,7 @@ impl<R: Real> Op for Attend<'_, '_, R> {
         let Self { stage, params, x, tape } = self;
         let (n, at, inner) = (x.rows, stage.at.clone(), stage.inner());
         let LineAttention { segment, heads, head_width: d, .. } = stage.settings;
+        let reach = stage.reach;
         tape.qkv.fill(R::ZERO);
         affine(s, matrix(&params[at.qkv], stage.width), None, tape.normed[0], tape.qkv, n);
         let (queries, rest) = tape.qkv.split_at(inner * n);
@@ -229,10 +240,10 @@ impl<R: Real> Op for Attend<'_, '_, R> {
         let position = &params[at.position];
         let scale = R::of(1.0 / (d as f64).sqrt());
         for head in 0..heads {
-            for j in 0..segment {
+            for j in 0..reach {
                 let weights = &mut tape.weights[(head * segment + j) * n..][..n];
-                for start in (0..n).step_by(segment) {
-                    let long = segment.min(n - start);
+                for start in (0..n).step_by(reach) {
+                    let long = reach.min(n - start);
                     for i in 0..long {
                         // If the last segment has no row j, any finite score will do: its weight becomes 0.
                         let partner = start + if j < long { j } else { 0 };
@@ -244,15 +255,15 @@ impl<R: Real> Op for Attend<'_, '_, R> {
                     }
                 }
             }
-            softmax(s, &mut tape.weights[head * segment * n..][..segment * n], segment, n);
+            softmax(s, &mut tape.weights[head * segment * n..][..reach * n], reach, n);
         }
         tape.attended.fill(R::ZERO);
         for c in 0..inner {
             let (value, out) = (&values[c * n..][..n], &mut tape.attended[c * n..][..n]);
-            for j in 0..segment {
+            for j in 0..reach {
                 let weights = &tape.weights[(c / d * segment + j) * n..][..n];
-                for start in (0..n).step_by(segment).take_while(|start| start + j < n) {
-                    for i in start..(start + segment).min(n) {
+                for start in (0..n).step_by(reach).take_while(|start| start + j < n) {
+                    for i in start..(start + reach).min(n) {
                         out[i] += weights[i] * value[start + j];
                     }
                 }
@@ -370,6 +381,7 @@ impl<R: Real> Op for AttendBack<'_, '_, R> {
         let Self { stage, params, rows: n, grads, tape } = self;
         let (at, inner) = (stage.at.clone(), stage.inner());
         let LineAttention { segment, heads, head_width: d, .. } = stage.settings;
+        let reach = stage.reach;
         affine_weights(s, tape.d_sum, tape.attended, &mut grads[at.project.clone()], inner, 0, None, n);
         for (sum, d) in grads[at.project_bias].iter_mut().zip(tape.d_sum.chunks_exact(n)) {
             *sum += conefield_core::dense::total(s, d);
@@ -385,8 +397,8 @@ impl<R: Real> Op for AttendBack<'_, '_, R> {
         let mut d_weight = [R::ZERO; LONGEST];
         for head in 0..heads {
             let channels = head * d..(head + 1) * d;
-            for start in (0..n).step_by(segment) {
-                let long = segment.min(n - start);
+            for start in (0..n).step_by(reach) {
+                let long = reach.min(n - start);
                 for i in 0..long {
                     let row = start + i;
                     let weight = |j: usize| tape.weights[(head * segment + j) * n + row];
@@ -460,6 +472,10 @@ impl<R: Real> Kernel<R> for LineAttentionStage {
             }
             None => self.norm.backward(&params[first], x, kept, d, of, None),
         }
+    }
+
+    fn points(&self) -> Option<&(dyn Kernel<R> + '_)> {
+        self.points.as_deref().map(|stage| stage as _)
     }
 }
 

@@ -24,9 +24,14 @@ pub struct Step<'a, R: Real> {
 }
 
 impl<R: Real> Step<'_, R> {
-    /// Whether it needs rows one at a time.
-    fn apart(&self, belong: Belong) -> bool {
+    /// Whether it looks along rays, but the rows are on none.
+    fn off_rays(&self, belong: Belong) -> bool {
         belong == Belong::Nowhere && self.info.scope == Scope::Ray
+    }
+
+    /// The kernel for whole tiles; `None` if it needs rows one at a time.
+    fn whole(&self, belong: Belong) -> Option<&(dyn Kernel<R> + '_)> {
+        if self.off_rays(belong) { self.kernel.points() } else { Some(self.kernel.as_ref()) }
     }
 }
 
@@ -351,7 +356,7 @@ pub enum Belong {
     /// Samples of one ray, or of several if no stage looks along rays.
     #[default]
     ToRays,
-    /// Points off any ray: a stage that looks along rays gets them one at a time.
+    /// Points off any ray: to a stage that looks along rays, each is a ray of one sample.
     Nowhere,
 }
 
@@ -408,10 +413,9 @@ impl<R: Real> Scratch<R> {
                 let params = &params[s.params.clone()];
                 let x = Tile::new(&before[s.input.start * n..s.input.end * n], n);
                 let (y, tape) = (TileMut::new(y, n), TileMut::new(tape, n));
-                if s.apart(belong) {
-                    self.single.forward(s.kernel.as_ref(), params, x, y, tape);
-                } else {
-                    s.kernel.forward(params, x, y, tape);
+                match s.whole(belong) {
+                    Some(kernel) => kernel.forward(params, x, y, tape),
+                    None => self.single.forward(s.kernel.as_ref(), params, x, y, tape),
                 }
             }
             let y = &kernels.steps[kernels.steps.len() - 1].output;
@@ -451,9 +455,8 @@ impl<R: Real> Scratch<R> {
                 let x = &before[s.input.start * n..s.input.end * n];
                 let g = &dy[..s.info.output * n];
                 let scattered = s.info.grads == GradKind::Scatter;
-                let apart = s.apart(self.belong);
                 if scattered {
-                    logs[k].push(Tile::new(x, n), Tile::new(g, n), apart);
+                    logs[k].push(Tile::new(x, n), Tile::new(g, n), s.off_rays(self.belong));
                 }
                 if scattered && !s.hands_on {
                     continue 'tiles;
@@ -466,10 +469,9 @@ impl<R: Real> Scratch<R> {
                 let (params, x, g) = (&params[s.params.clone()], Tile::new(x, n), Tile::new(g, n));
                 let tape = TileMut::new(&mut after[s.info.output * n..(s.info.output + s.info.tape) * n], n);
                 let dx_here = s.hands_on.then(|| TileMut::new(&mut dx[..s.info.input * n], n));
-                if apart {
-                    self.single.backward(s.kernel.as_ref(), params, x, tape, g, grads, dx_here);
-                } else {
-                    s.kernel.backward(params, x, tape, g, grads, dx_here);
+                match s.whole(self.belong) {
+                    Some(kernel) => kernel.backward(params, x, tape, g, grads, dx_here),
+                    None => self.single.backward(s.kernel.as_ref(), params, x, tape, g, grads, dx_here),
                 }
                 if !s.hands_on {
                     continue 'tiles;

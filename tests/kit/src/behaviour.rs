@@ -93,6 +93,29 @@ pub fn tile_outputs(stage: &dyn Stage, options: &Options) -> Outcome {
     Outcome::Passed("1, 7, 64 and 256 rows give the bits of one tile".into())
 }
 
+/// The kernel for points off any ray treats each row as a ray of one sample.
+pub fn points(stage: &dyn Stage, options: &Options) -> Outcome {
+    let (info, k, p) = (stage.info(), stage.kernel(), params::<f32>(stage, options));
+    let Some(points) = k.points() else { return Outcome::Skipped("none".into()) };
+    let n = 37;
+    let (x, dy) = data(&info, options, n);
+    let [y, _] = forward(points, &info, &p, &x, n);
+    let [grads, dx] = gradients(points, &info, &p, &x, &dy, n);
+    let mut sum = vec![0.0; info.params];
+    for i in 0..n {
+        let (x, dy) = (rows_of(&x, n, i, 1), rows_of(&dy, n, i, 1));
+        let [one, _] = forward(k, &info, &p, &x, 1);
+        let [one_grads, one_dx] = gradients(k, &info, &p, &x, &dy, 1);
+        let complaint = differing(&format!("row {i}: output"), &rows_of(&y, n, i, 1), &one)
+            .or_else(|| differing(&format!("row {i}: input gradient"), &rows_of(&dx, n, i, 1), &one_dx));
+        if complaint.is_some() {
+            return settle(complaint, "");
+        }
+        sum.iter_mut().zip(one_grads).for_each(|(s, g)| *s += f64::from(g));
+    }
+    within("rows give the bits of single ones; sums of gradients", error(&grads, &sum), 1e-5)
+}
+
 /// All passes in order give the result of forward.
 pub fn passes(stage: &dyn Stage, options: &Options) -> Outcome {
     let (info, k, p) = (stage.info(), stage.kernel(), params::<f32>(stage, options));

@@ -59,27 +59,31 @@ fn rows_smooth_over<R: Real>(
     rows: usize,
 ) -> Option<Vec<R>> {
     let mut draw = Draw::new(options.seed, 4);
-    if info.scope == Scope::Ray {
-        return Some(draw.many(&options.inputs, info.input * rows));
-    }
-    let dy: Vec<R> = draw.many(&(0.5..1.0), info.output);
+    // Rows of a ray are drawn together, others one by one.
+    let each = if info.scope == Scope::Ray { rows } else { 1 };
+    let dy: Vec<R> = draw.many(&(0.5..1.0), info.output * each);
     let mut found: Vec<Vec<R>> = vec![];
-    for _ in 0..40 * rows {
-        let mut x: Vec<R> = draw.many(&options.inputs, info.input);
+    for _ in 0..40 * rows / each {
+        let mut x: Vec<R> = draw.many(&options.inputs, info.input * each);
         let mut at = |c: usize, d: f64| {
             let keep = x[c];
             x[c] = R::of(keep.f64() + d);
-            let l = loss(k, info, params, &x, &dy, 1);
+            let l = loss(k, info, params, &x, &dy, each);
             x[c] = keep;
             l
         };
         let slopes: Vec<[f64; 2]> =
-            (0..info.input).map(|c| [h, 4.0 * h].map(|h| (at(c, h) - at(c, -h)) / (2.0 * h))).collect();
+            (0..info.input * each).map(|c| [h, 4.0 * h].map(|h| (at(c, h) - at(c, -h)) / (2.0 * h))).collect();
         let scale = slopes.iter().flatten().fold(1e-9f64, |m, s| m.max(s.abs()));
         if slopes.iter().all(|[a, b]| (a - b).abs() <= 3e-3 * scale.max(1e-2)) {
             found.push(x);
-            if found.len() == rows {
-                return Some((0..info.input).flat_map(|c| found.iter().map(move |r| r[c])).collect());
+            if found.len() * each == rows {
+                return Some(
+                    (0..info.input)
+                        .flat_map(|c| found.iter().flat_map(move |x| &x[c * each..(c + 1) * each]))
+                        .copied()
+                        .collect(),
+                );
             }
         }
     }

@@ -138,6 +138,7 @@ pub fn check(stage: &dyn Stage, options: &Options) -> Report {
     report.add("halves: gradients", || halves::gradients(stage, options));
     report.add("halves: passes", || halves::passes(stage, options));
     report.add("tile sizes: outputs", || behaviour::tile_outputs(stage, options));
+    report.add("points off any ray", || behaviour::points(stage, options));
     report.add("passes", || behaviour::passes(stage, options));
     report.add("tile sizes: gradients", || behaviour::tile_gradients(stage, options));
     report.add("outputs overwrite", || behaviour::outputs_overwrite(stage, options));

@@ -82,8 +82,8 @@ fn bits(values: &[f32]) -> Vec<u32> {
 
 // ---- steps ----
 
-/// Gradients of a step in halves are off by what rounding the tables makes of them, on the CPU and on every device, and
-/// these agree as they do in `f32`.
+/// Gradients of a step in halves are off by what rounding the tables makes of them, on the CPU and on a device, and these
+/// agree as they do in `f32`. Other limits of a device are tried with one format of one pipeline: each takes seconds to compile.
 #[test]
 fn gradients_of_a_step_are_off_by_the_rounding_of_tables() {
     let (rays, devices) = (rays(), crate::device::backends("steps in halves"));
@@ -109,7 +109,8 @@ fn gradients_of_a_step_are_off_by_the_rounding_of_tables() {
             println!("{tables}, {name}: gradients {off:.1e}, limit {limit:.0e}; f32 {single:.1e}");
             assert!(off <= limit && cpu != whole, "{tables}, {name}: {off:e}");
             let cpu: Vec<f64> = cpu.iter().map(|g| f64::from(*g)).collect();
-            for (device, backend) in &devices {
+            let tried = if tables == Tables::F16 && name == "hash grid" { devices.len() } else { 1 };
+            for (device, backend) in devices.iter().take(tried) {
                 let off = apart(&on(backend, &settings), &cpu);
                 println!("  {device}: {off:.1e} from the CPU");
                 assert!(off < 2e-5, "{tables}, {name}, {device}: {off:e}");
@@ -151,7 +152,7 @@ fn a_stage_in_halves_on_a_device_is_off_by_their_rounding() {
 
 #[test]
 fn a_run_in_halves_ends_near_one_in_f32() {
-    let devices = crate::device::backends("a run in halves").into_iter().step_by(2);
+    let devices = crate::device::backends("a run in halves").into_iter().take(1);
     let devices: Vec<_> = devices.map(|(name, b)| (name, Box::new(b) as Box<dyn Backend>)).collect();
     let cpu: (&str, Box<dyn Backend>) = ("cpu", Box::new(Cpu::new()));
     for (name, backend) in [cpu].into_iter().chain(devices) {
