@@ -1,4 +1,3 @@
-#!/usr/bin/env python3
 """Writes the measured tables of the documentation from the JSON files in docs/records/data.
 
 usage: records.py                    write every table into its page
