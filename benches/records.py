@@ -184,6 +184,9 @@ def take(name, source):
     usual = table["columns"][-1].get("cell")
     table["columns"] = [known.get(n, {"name": n} | ({"cell": usual} if usual and i else {})) for i, n in enumerate(head)]
     table["rows"] = [[value(cell, column, table["units"]) for cell, column in zip(row, table["columns"])] for row in rows]
+    for cell, column in ((cell, column) for row in table["rows"] for cell, column in zip(row, table["columns"])):
+        if type(cell) is str and "cell" in column:
+            print(f"taken as text, not as numbers: {cell} (column {column['name']})", file=sys.stderr)
     git = subprocess.run(["git", "rev-parse", "--short=7", "HEAD"], cwd=ROOT, check=True, capture_output=True, text=True)
     table |= {"commit": git.stdout.strip(), "date": datetime.date.today().isoformat(), "machine": machine()}
     (DATA / f"{name}.json").write_text(dump(table))
