@@ -68,7 +68,7 @@ cells = collections.OrderedDict()
 for line in open(sys.argv[1]):
     volume, asked, *numbers = line.strip().split("|")
     cells.setdefault((volume, asked), []).append([float(x) for x in numbers])
-print("| volume | `--correct` | with the fault | mended | without fault | asked for all the same | least gain | most loss |")
+print("| volume | `--correct` | fault | fault, corrected | no fault | no fault, corrected | least gain | most loss |")
 print("|---|---|---|---|---|---|---|---|")
 for (volume, asked), runs in cells.items():
     means = " | ".join(f"{statistics.mean(column):.2f} dB" for column in zip(*runs))

@@ -67,7 +67,7 @@ pub enum Command {
 pub fn run(command: Command, general: &General) -> Result<()> {
     match command {
         Command::Simulate(c) => c.run(),
-        Command::Import(c) => c.run(),
+        Command::Import(c) => c.run(general),
         Command::Calibrate(c) => c.run(),
         Command::Reconstruct(c) => c.run(),
         Command::Compare(c) => c.run(general),

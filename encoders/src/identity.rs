@@ -13,7 +13,7 @@ use serde::{Deserialize, Serialize};
 #[serde(deny_unknown_fields)]
 pub struct Identity {}
 
-conefield_core::stage_type!(Encoder, "identity", Identity, "the three coordinates as they are");
+conefield_core::stage_type!(Encoder, "identity", Identity, "the three coordinates, unchanged");
 
 #[typetag::serde(name = "identity")]
 impl EncoderSpec for Identity {

@@ -1,6 +1,7 @@
 //! `conefield import`
 
 use super::{
+    General,
     corrections::{CorrectionOptions, corrected_size, tell},
     info,
     selection::SelectionOptions,
@@ -10,7 +11,7 @@ use crate::memory::Memory;
 use crate::{out, parse};
 use clap::Args;
 use conefield_core::Result;
-use conefield_diagnosis::survey;
+use conefield_diagnosis::{Survey, survey};
 use conefield_io::{I0, ImportOptions, Imported};
 use serde_json::{Value, json};
 use std::path::PathBuf;
@@ -19,7 +20,8 @@ use std::path::PathBuf;
 ///
 /// SCANNER.toml names the files with the projections (TIFF, HDF5, .npy, .npz, .mha) and describes geometry (in mm) and array layout;
 /// docs/guide/formats.md has all keys. A .xtekct file of Nikon replaces it. Raw counts become line integrals; dead and hot pixels are
-/// interpolated. Then --correct corrects faults and a part may be taken; --bin averages counts.
+/// interpolated. Then --correct corrects faults and a part may be taken; --bin averages counts. The command prints a summary of
+/// the scan; with -v all that conefield info prints of it, and the first and the last view.
 #[derive(Args)]
 pub struct ImportArgs {
     /// The description of the scanner.
@@ -49,7 +51,7 @@ pub struct ImportArgs {
 }
 
 impl ImportArgs {
-    pub fn run(self) -> Result<()> {
+    pub fn run(self, general: &General) -> Result<()> {
         refuse_existing(&self.output, self.force)?;
         Inputs::default().and_description(&self.scanner).spare_folder(&self.output)?;
         let corrections = self.corrections.corrections()?;
@@ -60,15 +62,71 @@ impl ImportArgs {
         let imported = conefield_io::read_scanner(&self.scanner, &options)?;
         tell(&self.scanner, &imported.corrections);
         conefield_io::write_scan(&self.output, &imported.scan, None)?;
-        let found = self.understood(&imported);
-        if self.json { out::json(&found) } else { out::say(&(info::lines(&found) + &info::warnings(&found))) }
+        let survey = survey(&imported.scan);
+        let found = self.understood(&imported, &survey);
+        if self.json {
+            return out::json(&found);
+        }
+        let mut text = self.summary(&imported, &survey);
+        if general.verbose > 0 {
+            text += &format!("\n\n{}", info::lines(&found));
+        }
+        out::say(&(text + &info::warnings(&found)))
+    }
+
+    /// Views, distances, arc, values and the folder, a line each.
+    fn summary(&self, imported: &Imported, survey: &Survey) -> String {
+        let g = &imported.scan.geometry;
+        let (setup, arc, check) = (&survey.setup, &survey.setup.angles, &survey.check);
+        let [rows, columns] = g.detector;
+        let [height, width] = setup.pixel_mm.map(short);
+        let orbit = if setup.circle { "" } else { " (medians: the views are not on one circle)" };
+        let values =
+            format!("line integrals from {} to {}", short(check.range[0].into()), short(check.range[1].into()));
+        let counts = match &imported.counts {
+            None => ", as in the files".to_owned(),
+            Some(c) => format!(
+                "; open beam {}, {} % of the counts raised to {}, {} of {} pixels interpolated",
+                short(c.open_beam[1]),
+                short(100.0 * c.clamped),
+                short(c.floor),
+                c.bad_by_fields + c.bad_by_outliers,
+                rows * columns,
+            ),
+        };
+        let lines = [
+            (
+                "views",
+                format!("{} of {rows} x {columns} pixels (rows x columns), {height} x {width} mm each", g.views.len()),
+            ),
+            (
+                "source",
+                format!(
+                    "{} mm to the axis, {} mm to the detector, magnification {}{orbit}",
+                    short(setup.source_to_axis_mm),
+                    short(setup.source_to_detector_mm),
+                    short(setup.magnification),
+                ),
+            ),
+            (
+                "arc",
+                format!(
+                    "{} degrees from {} in steps of {}",
+                    short(arc.covered_deg),
+                    short(arc.first_deg),
+                    short(arc.step_deg)
+                ),
+            ),
+            ("values", values + &counts),
+            ("written", format!("{} (conefield info prints more)", self.output.display())),
+        ];
+        out::table(&lines.map(|(name, line)| vec![name.to_owned(), line]), &[])
     }
 
     /// The geometry in mm and a summary of the values.
-    fn understood(&self, imported: &Imported) -> Value {
+    fn understood(&self, imported: &Imported, survey: &Survey) -> Value {
         let views = &imported.scan.geometry.views;
-        let survey = survey(&imported.scan);
-        let mut found = info::facts(&imported.scan, &survey);
+        let mut found = info::facts(&imported.scan, survey);
         found["scan"] = json!(self.output);
         found["first_view"] = json!(views[0]);
         found["last_view"] = json!(views[views.len() - 1]);
@@ -77,4 +135,12 @@ impl ImportArgs {
         found["line_integrals"] = json!(survey.check);
         found
     }
+}
+
+/// `x` with at most six significant digits and nine decimals.
+fn short(x: f64) -> String {
+    let digits = if x == 0.0 { 0 } else { (5 - x.abs().log10().floor() as i32).clamp(0, 9) };
+    let text = format!("{x:.*}", digits as usize);
+    let text = if text.contains('.') { text.trim_end_matches('0').trim_end_matches('.') } else { &text };
+    if text == "-0" { "0".to_owned() } else { text.to_owned() }
 }

@@ -36,8 +36,23 @@ fn counts_become_a_scan_that_the_other_commands_read() {
 
     // A scan that stands there is not replaced unasked; air says the same as the number.
     assert!(refused(1, &["import", &scanner, "-o", &out, "--i0", "air"]).contains("--force"));
-    let said = done(&["import", &scanner, "-o", &out, "--i0", "air", "--force"]);
-    assert!(said.contains("source_to_detector_mm") && said.contains("counts.bad"), "{said}");
+    let again = ["import", &scanner, "-o", &out, "--i0", "air", "--force"];
+    let said = done(&again);
+    let [views, source, arc, values, written] = said.trim().lines().collect::<Vec<_>>()[..] else { panic!("{said}") };
+    assert!(views.ends_with("8 of 16 x 16 pixels (rows x columns), 2 x 2 mm each"), "{said}");
+    assert!(source.ends_with("100 mm to the axis, 150 mm to the detector, magnification 1.5"), "{said}");
+    assert!(arc.ends_with("360 degrees from 0 in steps of -45"), "{said}");
+    assert!(
+        values.contains("line integrals from 0 to 1.38629; open beam 10000, 0 % of the counts raised to 1,"),
+        "{said}"
+    );
+    assert!(written.contains(&out), "{said}");
+    // The rest comes on request.
+    let all = done(&[&again[..], &["-v"]].concat());
+    assert!(
+        all.starts_with(said.trim()) && all.contains("source_to_detector_mm") && all.contains("counts.bad"),
+        "{all}"
+    );
 
     // Counts that are taken for line integrals get a warning, also when the scan is read later.
     fs::write(at("s.toml"), format!("{toml}[values]\nkind = \"line-integrals\"\n")).unwrap();
