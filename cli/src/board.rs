@@ -10,25 +10,35 @@ use std::path::Path;
 pub struct Board(EventFile);
 
 impl Board {
-    /// Opens the file `path` with the existing records in `metrics`, one per line.
+    /// Opens the file `path` for a run with the existing records in `metrics`, one per line. Events up to the last record
+    /// stay in the file; records after its last event are added.
     pub fn new(path: &Path, metrics: &Path) -> Result<Self> {
-        let mut board = Self(EventFile::create(path)?);
         let text = fs::read_to_string(metrics).map_err(|e| Error::io(metrics, e))?;
-        for record in text.lines().filter_map(|line| serde_json::from_str(line).ok()) {
-            board.record(&record)?;
+        let records: Vec<Value> = text.lines().filter_map(|line| serde_json::from_str(line).ok()).collect();
+        let (file, last) = match records.last() {
+            Some(record) => EventFile::resume(path, step(record))?,
+            None => (EventFile::create(path)?, None),
+        };
+        let mut board = Self(file);
+        for record in records.iter().filter(|record| last.is_none_or(|last| step(record) > last)) {
+            board.record(record)?;
         }
         Ok(board)
     }
 
     /// Adds a line of `metrics.jsonl`: one point per number, to the curve of that number.
     pub fn record(&mut self, record: &Value) -> Result<()> {
-        let (step, numbers) = (record["step"].as_u64().unwrap_or(0), record.as_object().into_iter().flatten());
-        let numbers = numbers.filter(|(name, _)| *name != "step");
-        self.0.scalars(step, numbers.filter_map(|(name, x)| Some((name.as_str(), x.as_f64()?))))
+        let numbers = record.as_object().into_iter().flatten().filter(|(name, _)| *name != "step");
+        self.0.scalars(step(record), numbers.filter_map(|(name, x)| Some((name.as_str(), x.as_f64()?))))
     }
 
     /// Adds the picture in the file `png` as `name`.
     pub fn picture(&mut self, step: u64, name: &str, png: &Path) -> Result<()> {
         self.0.picture(step, name, &fs::read(png).map_err(|e| Error::io(png, e))?)
     }
+}
+
+/// The step of a record.
+fn step(record: &Value) -> u64 {
+    record["step"].as_u64().unwrap_or(0)
 }

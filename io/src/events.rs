@@ -6,9 +6,12 @@
 
 use conefield_core::{Error, Result};
 use std::fs::File;
-use std::io::Write;
+use std::io::{BufReader, ErrorKind, Read, Seek, SeekFrom, Write};
 use std::path::{Path, PathBuf};
 use std::time::{SystemTime, UNIX_EPOCH};
+
+/// Longest event that is kept when a file is opened again, in bytes: far above a picture's size.
+const LONGEST: u64 = 1 << 28;
 
 /// An event file open for appending.
 pub struct EventFile {
@@ -26,6 +29,34 @@ impl EventFile {
         let version = bytes_field(3, b"brain.Event:2");
         new.write(&[time(), version].concat())?;
         Ok(new)
+    }
+
+    /// Opens the file `path` to continue after `step`, with the step of the last event kept. Events of later steps, and
+    /// whatever follows a damaged event, are removed. Creates the file if there is none, or if it is no event file.
+    pub fn resume(path: impl AsRef<Path>, step: u64) -> Result<(Self, Option<u64>)> {
+        let path = path.as_ref();
+        let error = |e| Error::io(path, e);
+        let file = match File::options().read(true).write(true).open(path) {
+            Ok(file) => file,
+            Err(e) if e.kind() == ErrorKind::NotFound => return Ok((Self::create(path)?, None)),
+            Err(e) => return Err(error(e)),
+        };
+        let mut reader = BufReader::new(&file);
+        let (mut end, mut last) = (0, None);
+        while let Some(event) = next(&mut reader) {
+            let at = step_of(&event);
+            if at.is_some_and(|at| at > step) {
+                break;
+            }
+            last = at.or(last);
+            end += 16 + event.len() as u64;
+        }
+        if end == 0 {
+            return Ok((Self::create(path)?, None));
+        }
+        file.set_len(end).map_err(error)?;
+        (&file).seek(SeekFrom::Start(end)).map_err(error)?;
+        Ok((Self { path: path.to_path_buf(), file }, last))
     }
 
     /// Adds the numbers `values` at `step`, each a point on the curve of its name. Values that are not finite are
@@ -66,6 +97,35 @@ impl EventFile {
         let record = [&length[..], &head, event, &tail].concat();
         self.file.write_all(&record).map_err(|e| Error::io(&self.path, e))
     }
+}
+
+/// The next event of a file; `None` at its end and where it is damaged.
+fn next(reader: &mut impl Read) -> Option<Vec<u8>> {
+    let mut head = [0; 12];
+    reader.read_exact(&mut head).ok()?;
+    let (length, check) = head.split_at(8);
+    if check != masked(crc32c(length)).to_le_bytes() {
+        return None;
+    }
+    let length = u64::from_le_bytes(length.try_into().ok()?);
+    let mut event = vec![];
+    reader.take(length.min(LONGEST)).read_to_end(&mut event).ok()?;
+    let mut check = [0; 4];
+    reader.read_exact(&mut check).ok()?;
+    (event.len() as u64 == length && check == masked(crc32c(&event)).to_le_bytes()).then_some(event)
+}
+
+/// The step of an event as this module writes it, after its time.
+fn step_of(event: &[u8]) -> Option<u64> {
+    let mut step = 0;
+    let varint = event.get(9..).and_then(|rest| rest.strip_prefix(&[0x10]))?;
+    for (k, byte) in varint.iter().take(9).enumerate() {
+        step |= u64::from(byte & 0x7f) << (7 * k);
+        if byte & 0x80 == 0 {
+            return Some(step);
+        }
+    }
+    None
 }
 
 /// Field 1 of an event, the time in seconds.
@@ -144,5 +204,37 @@ mod tests {
         assert_eq!(events.len(), 3);
         // Height 256, width 7.
         assert!(events[2].windows(6).any(|w| w == [0x08, 0x80, 2, 0x10, 7, 0x18]), "{:?}", events[2]);
+    }
+    #[test]
+    fn a_resumed_file_keeps_what_comes_before_the_step() {
+        let dir = tempfile::tempdir().unwrap();
+        let path = dir.path().join("events.out.tfevents.test");
+        assert_eq!(EventFile::resume(&path, 9).unwrap().1, None);
+        let mut file = EventFile::create(&path).unwrap();
+        file.scalars(3, [("loss", 0.5)]).unwrap();
+        file.picture(300, "slices", b"\x89PNG\r\n\x1a\n\0\0\0\rIHDR\0\0\0\x07\0\0\x01\0rest").unwrap();
+        let kept = std::fs::read(&path).unwrap();
+        file.scalars(301, [("loss", 0.4)]).unwrap();
+        let (mut file, last) = EventFile::resume(&path, 300).unwrap();
+        assert_eq!((last, std::fs::read(&path).unwrap()), (Some(300), kept.clone()));
+        file.scalars(301, [("loss", 0.3)]).unwrap();
+        drop(file);
+        let whole = std::fs::read(&path).unwrap();
+        assert!(whole.starts_with(&kept) && whole.len() > kept.len());
+        // Half an event, a wrong check sum and a length beyond the file end what is kept.
+        for damaged in [whole[..whole.len() - 1].to_vec(), [&whole[..whole.len() - 1], b"x"].concat(), {
+            let mut long = whole.clone();
+            long[kept.len() + 3] ^= 1;
+            long
+        }] {
+            std::fs::write(&path, damaged).unwrap();
+            assert_eq!(EventFile::resume(&path, u64::MAX).unwrap().1, Some(300));
+            assert_eq!(std::fs::read(&path).unwrap(), kept);
+        }
+        // Another file is replaced.
+        std::fs::write(&path, "text").unwrap();
+        assert_eq!(EventFile::resume(&path, 5).unwrap().1, None);
+        assert_eq!(EventFile::resume(&path, 5).unwrap().1, None);
+        assert_eq!(std::fs::metadata(&path).unwrap().len(), 40);
     }
 }
