@@ -28,6 +28,11 @@ pub(crate) fn read_volume(path: &Path) -> Result<Volume> {
         Ok(())
     })?;
     let (slices, rows, columns) = pages.dim();
+    // Above 4 GiB ImageJ writes one page and the other slices after it.
+    if let Some(n) = text.number("images").filter(|n| *n != slices as f64) {
+        let expected = format!("{slices}, the pages of the file (save the stack with one page a slice)");
+        return Err(Error::invalid(place, "images", n, expected));
+    }
     let (grid, affine) = text.place_of_voxels(&place, [columns, rows, slices])?;
     file_order::read(&place, grid, affine, pages.into_raw_vec_and_offset().0)
 }
@@ -252,6 +257,9 @@ mod tests {
         write(&path, 2, Some("ImageJ=1.54f\nimages=2\nchannels=2\n"));
         let e = read_volume(&path).unwrap_err().to_string();
         assert!(e.contains("a.tif: channels: found 2"), "{e}");
+        write(&path, 2, Some("ImageJ=1.54f\nimages=3\n"));
+        let e = read_volume(&path).unwrap_err().to_string();
+        assert!(e.contains("a.tif: images: found 3") && e.contains("expected 2"), "{e}");
     }
 
     #[test]
