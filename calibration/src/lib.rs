@@ -6,13 +6,17 @@
 //!
 //! How well few views predict others also depends on how large the object is made. What changes that ([`Parameter::by_pairs`]) is
 //! sought by what pairs of views say of the same planes (`consistency`, `newton`), which no object changes.
+//!
+//! [`directions`] compares the angles with the same ones in the other direction.
 
 mod consistency;
 mod criterion;
+mod direction;
 mod newton;
 mod parameters;
 mod search;
 
+pub use direction::{Directions, directions};
 pub use parameters::{Correction, Parameter, turns};
 pub use search::Watch;
 

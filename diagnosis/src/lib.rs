@@ -12,6 +12,7 @@ pub mod border;
 mod coverage;
 mod line_integrals;
 pub mod quantiles;
+mod repeated;
 mod setup;
 mod shadow;
 mod survey;

@@ -1,5 +1,6 @@
 //! Warnings about problems for a reconstruction, with figures and advice.
 
+use crate::repeated::repeated;
 use crate::survey::Survey;
 use conefield_core::scan::Scan;
 use serde::Serialize;
@@ -23,6 +24,8 @@ pub enum WarningKind {
     Gap,
     /// Angles in degrees that were read as radians.
     Degrees,
+    /// A last view that shows the same as the first.
+    Repeated,
     /// Lengths or attenuation of an unusual size.
     Scale,
     /// Voxels that do not match the detector's resolution.
@@ -85,6 +88,7 @@ pub(crate) fn warnings(scan: &Scan, s: &Survey) -> Vec<Warning> {
     covered(scan, s, &mut warn);
     offset(s, &mut warn);
     angles(scan, s, &mut warn);
+    repeats(scan, s, &mut warn);
     scale(scan, s, &mut warn);
     voxels(scan, s, &mut warn);
     all
@@ -206,6 +210,29 @@ fn angles(scan: &Scan, s: &Survey, warn: Warn) {
             "check that no views are missing and that angles belong to their projections".into(),
         );
     }
+}
+
+fn repeats(scan: &Scan, s: &Survey, warn: Warn) {
+    let Some([seam, least]) = repeated(scan) else { return };
+    let n = scan.geometry.views.len();
+    // With both ends the same angles have one step less.
+    let told = s.setup.angles.step_deg.abs();
+    let step = told * n as f64 / (n - 1) as f64;
+    warn(
+        WarningKind::Repeated,
+        format!(
+            "the last view repeats the first: they differ by {}, views beside them by {} or more, and by the angles they \
+             stand {told:.4}° apart",
+            percent(seam),
+            percent(least)
+        ),
+        format!(
+            "if the scan takes both ends of a full turn, its steps are {step:.4}°: import it with step_deg = {} in place \
+             of range_deg, and leave the last view out with --views 0-{}",
+            (step * 1e6).round() / 1e6,
+            n - 2
+        ),
+    );
 }
 
 fn scale(scan: &Scan, s: &Survey, warn: Warn) {

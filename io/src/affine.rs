@@ -55,11 +55,12 @@ pub(crate) fn of(voxels: &dyn Voxels, place: &str) -> (Affine, bool) {
 }
 
 /// Whether the affine's columns have the lengths `wanted`, to the precision of files.
-fn fits(affine: &Affine, wanted: [f64; 3]) -> bool {
+pub(crate) fn fits(affine: &Affine, wanted: [f64; 3]) -> bool {
     spacing(affine).iter().zip(wanted).all(|(n, s)| (n - s).abs() <= 1e-3 * s)
 }
 
-fn centred(grid: &VoxelGrid) -> Affine {
+/// The affine of a grid whose place is not known: its centre lies at `grid.center`.
+pub(crate) fn centred(grid: &VoxelGrid) -> Affine {
     let s = grid.spacing;
     from_columns([[s[0], 0.0, 0.0], [0.0, s[1], 0.0], [0.0, 0.0, s[2]]], grid.voxel([0; 3]))
 }

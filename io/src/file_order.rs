@@ -1,8 +1,7 @@
-//! The order in which files store voxels: x fastest in NIfTI and MetaImage, z fastest in NumPy's files and in
+//! The order in which files store voxels: x fastest in NIfTI, MetaImage, NRRD and TIFF stacks, z fastest in NumPy's files and in
 //! conefield's arrays.
 
 use crate::affine::Affine;
-use crate::input::Input;
 use crate::memory;
 use crate::number;
 use conefield_core::geometry::VoxelGrid;
@@ -20,16 +19,18 @@ pub(crate) enum FileOrder {
     ZFastest,
 }
 
-/// A volume from `values` in the order of NIfTI and MetaImage, x fastest; refuses a value that is not finite.
-pub(crate) fn read(input: &Input, grid: VoxelGrid, affine: Affine, values: Vec<f32>) -> Result<Volume> {
+/// A volume from `values` in the order of NIfTI and MetaImage, x fastest, of the file `place`; refuses a value that is
+/// not finite.
+pub(crate) fn read(place: &str, grid: VoxelGrid, affine: Option<Affine>, values: Vec<f32>) -> Result<Volume> {
     let [nx, ny, nz] = grid.shape;
     let data = Array3::from_shape_vec((nx, ny, nz).f(), values)
-        .map_err(|e| input.invalid("data", e, "as many values as voxels"))?;
-    let data = memory::in_order(&input.place(), "data", data)?;
+        .map_err(|e| Error::invalid(place, "data", e, "as many values as voxels"))?;
+    let data = memory::in_order(place, "data", data)?;
     if let Some((at, x)) = data.indexed_iter().find(|(_, x)| !x.is_finite()) {
-        return Err(input.invalid(format!("voxel [{}, {}, {}]", at.0, at.1, at.2), x, "a finite number"));
+        let voxel = format!("voxel [{}, {}, {}]", at.0, at.1, at.2);
+        return Err(Error::invalid(place, voxel, x, "a finite number"));
     }
-    Ok(Volume { data, grid, affine: Some(affine) })
+    Ok(Volume { data, grid, affine })
 }
 
 /// Voxels in memory at once while a file is written.

@@ -1,4 +1,4 @@
-//! Checks that file names in a scan's description stay inside the scan's folder.
+//! Names of files in a folder: those in a scan's description stay inside it, those of a series come in order.
 
 use conefield_core::{Error, Result};
 use std::collections::HashSet;
@@ -86,4 +86,49 @@ pub(crate) fn may_replace(folder: &Path, format: &str, known: impl Fn(&str) -> b
         return Err(Error::invalid(place, "folder", format!("\"{n}\" in it"), expected));
     }
     Ok(())
+}
+
+/// The names in `folder` that end in one of `ends` (small letters, no dot), in the order of the numbers in them; hidden
+/// files are left out.
+pub(crate) fn names(folder: &Path, ends: &[&str]) -> Result<Vec<String>> {
+    let io = |e| Error::io(folder, e);
+    let mut found = Vec::new();
+    for entry in std::fs::read_dir(folder).map_err(io)? {
+        found.extend(entry.map_err(io)?.file_name().into_string());
+    }
+    found.retain(|n| {
+        let end = n.rsplit_once('.').map(|(_, e)| e.to_ascii_lowercase()).unwrap_or_default();
+        !n.starts_with('.') && ends.contains(&end.as_str())
+    });
+    found.sort_by_cached_key(|n| natural(n));
+    Ok(found)
+}
+
+/// A sort key that puts `view2` before `view10`: runs of digits count as numbers.
+fn natural(name: &str) -> (Vec<(String, usize, String)>, String) {
+    let mut parts = Vec::new();
+    let mut rest = name;
+    while !rest.is_empty() {
+        let digits = rest.find(|c: char| c.is_ascii_digit()).unwrap_or(rest.len());
+        let (text, tail) = rest.split_at(digits);
+        let end = tail.find(|c: char| !c.is_ascii_digit()).unwrap_or(tail.len());
+        let (number, tail) = tail.split_at(end);
+        let number = number.trim_start_matches('0');
+        // Of two numbers without leading zeros the longer is the larger.
+        parts.push((text.to_lowercase(), number.len(), number.to_string()));
+        rest = tail;
+    }
+    (parts, name.to_string())
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn names_sort_by_their_numbers() {
+        let mut names = ["p10.tif", "p9.tif", "p010.tif", "P1.tif", "p100000000000000000000000.tif", "a.tif"];
+        names.sort_by_cached_key(|n| natural(n));
+        assert_eq!(names, ["a.tif", "P1.tif", "p9.tif", "p010.tif", "p10.tif", "p100000000000000000000000.tif"]);
+    }
 }

@@ -61,9 +61,18 @@ impl Input {
 
     /// Decompresses from here on: the rest of a plain file must be one zlib stream.
     pub fn inflate(self) -> Self {
+        self.unpack("zlib", |r| Box::new(WholeZlib(ZlibDecoder::new(r))))
+    }
+
+    /// Decompresses from here on: the rest of a plain file must be gzip.
+    pub fn gunzip(self) -> Self {
+        self.unpack("gzip", |r| Box::new(MultiGzDecoder::new(r)))
+    }
+
+    fn unpack(self, packed: &'static str, decoder: impl FnOnce(Box<dyn BufRead>) -> Box<dyn Read>) -> Self {
         let size = self.size.saturating_sub(self.at);
-        let reader = Box::new(BufReader::new(WholeZlib(ZlibDecoder::new(self.reader))));
-        Self { path: self.path, reader, size, packed: Some("zlib"), at: 0 }
+        let reader = Box::new(BufReader::new(decoder(self.reader)));
+        Self { path: self.path, reader, size, packed: Some(packed), at: 0 }
     }
 
     /// Remaining bytes of a plain file; `None` for a compressed one, where only decompression shows them.

@@ -1,7 +1,7 @@
 //! Reading and writing of every file format that conefield supports, one module per format.
 //!
-//! - Volumes: [`read_volume`], [`write_volume`], [`write_voxels`] (NIfTI, MetaImage, NumPy; read only: a DICOM series;
-//!   written only: NRRD, a TIFF stack, OME-Zarr).
+//! - Volumes: [`read_volume`], [`write_volume`], [`write_voxels`] (NIfTI, MetaImage, NRRD, NumPy, TIFF stacks, OME-Zarr;
+//!   read only: a DICOM series).
 //! - Scans: [`read_scan`], [`read_truth`], [`write_scan`] (conefield's own folder), [`read_r2`], [`write_r2`]
 //!   (R2-Gaussian's folder), [`read_naf`], [`write_naf`] (NAF's file), [`write_rtk`] (for RTK); [`read_data_set`] also
 //!   reads test views.

@@ -6,6 +6,7 @@ use crate::file_order::{self, FileOrder, PACKED_BYTES};
 use crate::folder;
 use crate::input::Input;
 use crate::number::{ByteOrder, Number};
+use crate::text::shortened;
 use crate::write_atomic;
 use conefield_core::geometry::{VoxelGrid, norm};
 use conefield_core::parts::Voxels;
@@ -231,14 +232,6 @@ pub(crate) fn shape(path: &Path) -> Result<[usize; 3]> {
     Header::read(&mut Input::open_plain(path)?)?.shape().map(|(shape, _)| shape)
 }
 
-/// A value, shortened for errors.
-fn shortened(text: &str) -> String {
-    match text.char_indices().nth(80) {
-        Some((at, _)) => format!("\"{}…\"", &text[..at]),
-        None => format!("\"{text}\""),
-    }
-}
-
 /// Reads a MetaImage with one number per voxel; the affine is RAS, in mm, and `grid.center` is `[0, 0, 0]`.
 pub(crate) fn read(path: &Path) -> Result<Volume> {
     let mut input = Input::open_plain(path)?;
@@ -274,7 +267,7 @@ pub(crate) fn read(path: &Path) -> Result<Volume> {
         data = data.inflate();
     }
     let values = data.numbers("data", count, number, order, |x| x as f32)?;
-    file_order::read(&data, grid, affine, values)
+    file_order::read(&data.place(), grid, Some(affine), values)
 }
 
 /// The file with the voxels: `header_file` itself, just past the header, or another one in its folder.

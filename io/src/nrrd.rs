@@ -1,7 +1,11 @@
-//! NRRD writer: 32-bit floats in gzip, in the patient's coordinates (left, posterior, superior), as 3D Slicer and ITK
-//! read them.
+//! NRRD. Written are 32-bit floats in gzip, in the patient's coordinates (left, posterior, superior), as 3D Slicer and
+//! ITK read them.
 //!
 //! Source: the format definition, teem.sourceforge.net/nrrd/format.html.
+
+mod read;
+
+pub(crate) use read::{is_header, read, shape};
 
 use crate::affine;
 use crate::file_order::{self, FileOrder};

@@ -2,7 +2,7 @@
 
 use crate::scan::{self, ScanFile};
 use crate::volume::{self, VolumeFile};
-use crate::{dicom, metaimage, nifti, npy, r2, scan_folder, scanner};
+use crate::{dicom, metaimage, nifti, npy, nrrd, r2, scan_folder, scanner, tiff, zarr};
 use conefield_core::error::ensure;
 use conefield_core::scan::ScanHeader;
 use conefield_core::{Error, Result};
@@ -66,16 +66,20 @@ pub fn scanner_size(path: impl AsRef<Path>) -> Result<ScanSize> {
     Ok(size)
 }
 
-/// Number of voxels of a volume, from its header, or for a DICOM series from the headers of its slices.
+/// Number of voxels of a volume, from its header, or for a DICOM series and TIFF files from the headers of the slices.
 pub fn volume_voxels(path: impl AsRef<Path>) -> Result<u64> {
     let path = path.as_ref();
-    let shape = match volume::open(path)? {
-        VolumeFile::Series => return dicom::voxels(path),
-        VolumeFile::Npy(mut input, head) => npy::shape(&mut input, head)?,
-        VolumeFile::MetaImage => metaimage::shape(path)?.to_vec(),
-        VolumeFile::Nifti(input, head) => nifti::shape_of(&input, &head)?.to_vec(),
+    let product = |shape: &[usize]| shape.iter().fold(1, |n: u64, &s| n.saturating_mul(s as u64));
+    let voxels = match volume::open(path)? {
+        VolumeFile::Series => dicom::voxels(path)?,
+        VolumeFile::Slices => tiff::folder_voxels(path)?,
+        VolumeFile::Zarr => product(&zarr::shape(path)?),
+        VolumeFile::Npy(mut input, head) => product(&npy::shape(&mut input, head)?),
+        VolumeFile::MetaImage => product(&metaimage::shape(path)?),
+        VolumeFile::Nrrd => product(&nrrd::shape(path)?),
+        VolumeFile::Tiff => tiff::values(path)?,
+        VolumeFile::Nifti(input, head) => product(&nifti::shape_of(&input, &head)?),
     };
-    let voxels = shape.iter().fold(1, |n: u64, &s| n.saturating_mul(s as u64));
     must_exist(path, "voxels", voxels)?;
     Ok(voxels)
 }
@@ -109,7 +113,7 @@ mod tests {
         let dir = tempfile::tempdir().unwrap();
         let at = |name: &str| dir.path().join(name);
         let v = Volume::centered(Array3::ones((5, 6, 7)), [1.0; 3]);
-        for name in ["a.nii", "a.nii.gz", "a.mha", "a.npy"] {
+        for name in ["a.nii", "a.nii.gz", "a.mha", "a.npy", "a.nrrd", "a.tif", "a.zarr"] {
             crate::write_volume(at(name), &v).unwrap();
             assert_eq!(volume_voxels(at(name)).unwrap(), 210, "{name}");
         }

@@ -216,46 +216,19 @@ fn source(folder: &Path, place: &str, field: &str, name: &str) -> Result<Vec<Sta
     if path.is_file() {
         return Ok(vec![StackFile { path, array }]);
     }
-    let io = |e| Error::io(&path, e);
-    let mut found: Vec<String> = Vec::new();
-    for entry in std::fs::read_dir(&path).map_err(io)? {
-        found.extend(entry.map_err(io)?.file_name().into_string());
-    }
-    let ends = |n: &str, ends: &[&str]| {
-        let end = n.rsplit_once('.').map(|(_, e)| e.to_ascii_lowercase()).unwrap_or_default();
-        !n.starts_with('.') && ends.contains(&end.as_str())
-    };
-    let mut chosen: Vec<&String> = found.iter().filter(|n| ends(n, &["tif", "tiff"])).collect();
+    let mut chosen = folder::names(&path, &["tif", "tiff"])?;
     if chosen.is_empty() {
-        chosen = found.iter().filter(|n| ends(n, &["npy"])).collect();
+        chosen = folder::names(&path, &["npy"])?;
     }
     if chosen.is_empty() {
-        let what = format!("a folder \"{file}\" of {} other files", found.len());
+        let what = format!("a folder \"{file}\" without them");
         return Err(Error::invalid(place, field, what, "a folder with .tif, .tiff or .npy files"));
     }
-    chosen.sort_by_cached_key(|n| natural(n));
     let inside = chosen.iter().map(|n| {
         let path = folder::inside(folder, place, field, &format!("{}/{n}", file.trim_end_matches('/')))?;
         Ok(StackFile { path, array: None })
     });
     inside.collect()
-}
-
-/// A sort key that puts `view2` before `view10`: runs of digits count as numbers.
-fn natural(name: &str) -> (Vec<(String, usize, String)>, String) {
-    let mut parts = Vec::new();
-    let mut rest = name;
-    while !rest.is_empty() {
-        let digits = rest.find(|c: char| c.is_ascii_digit()).unwrap_or(rest.len());
-        let (text, tail) = rest.split_at(digits);
-        let end = tail.find(|c: char| !c.is_ascii_digit()).unwrap_or(tail.len());
-        let (number, tail) = tail.split_at(end);
-        let number = number.trim_start_matches('0');
-        // Of two numbers without leading zeros the longer is the larger.
-        parts.push((text.to_lowercase(), number.len(), number.to_string()));
-        rest = tail;
-    }
-    (parts, name.to_string())
 }
 
 #[cfg(test)]
@@ -268,13 +241,6 @@ mod tests {
         flip_rows: false,
         flip_columns: false,
     };
-
-    #[test]
-    fn names_sort_by_their_numbers() {
-        let mut names = ["p10.tif", "p9.tif", "p010.tif", "P1.tif", "p100000000000000000000000.tif", "a.tif"];
-        names.sort_by_cached_key(|n| natural(n));
-        assert_eq!(names, ["a.tif", "P1.tif", "p9.tif", "p010.tif", "p10.tif", "p100000000000000000000000.tif"]);
-    }
 
     #[test]
     fn axes_and_flips_bring_every_layout_to_view_row_column() {

@@ -94,6 +94,14 @@ fn explain(path: &Path, text: &str, line: Option<usize>, message: &str) -> Error
     }
 }
 
+/// A value in quotes, cut to 80 characters for errors.
+pub(crate) fn shortened(text: &str) -> String {
+    match text.char_indices().nth(80) {
+        Some((at, _)) => format!("\"{}…\"", &text[..at]),
+        None => format!("\"{text}\""),
+    }
+}
+
 /// "`spacing`, the nearest of: ...".
 fn suggestion(unknown: &str, valid: &[&str]) -> String {
     let near = |name: &str| strsim::jaro_winkler(&unknown.to_lowercase(), name);

@@ -1,10 +1,13 @@
 //! TIFF from detectors: one grey channel, integers or floats, one image per page; uncompressed, or compressed by LZW,
-//! deflate, PackBits or Zstandard. [`write`] writes a volume with one slice per page.
+//! deflate, PackBits or Zstandard. [`write`] writes a volume with one slice per page; [`read_volume`] and
+//! [`read_folder`] read slices.
 
 mod entries;
+mod volume;
 mod write;
 mod zstd;
 
+pub(crate) use volume::{folder_voxels, is_stack, read_folder, read_volume};
 pub(crate) use write::{check_shape, write};
 
 use crate::input::must_unpack;
@@ -37,9 +40,18 @@ pub(crate) fn values(path: &Path) -> Result<u64> {
 /// Converts 8 to 64 bits per pixel, integers or floats, to `f32`. Refuses other colour types, sizes that the file
 /// cannot hold, values that are not finite and damaged files.
 pub(crate) fn read(path: &Path) -> Result<Array3<f32>> {
+    stack(path, |_| Ok(()))
+}
+
+/// Like [`read`]; `first` gets the decoder at the first page.
+fn stack(path: &Path, first: impl FnOnce(&mut Decoder<BufReader<File>>) -> Result<()>) -> Result<Array3<f32>> {
     let place = path.display().to_string();
     let mut values = Vec::<f32>::new();
+    let mut first = Some(first);
     let (pages, [rows, columns]) = pages(path, |decoder, page| {
+        if let Some(first) = first.take() {
+            first(decoder)?;
+        }
         let count = usize::try_from(page.pixels).unwrap_or(usize::MAX);
         memory::grow(&mut values, count, usize::MAX, &place, "pages")?;
         // The stored page and its decompressed strips or tiles.

@@ -1,7 +1,7 @@
 //! Entry points for volumes: they recognize a file's format, and choose a format for a file name.
 
 use crate::input::Input;
-use crate::{dicom, metaimage, nifti, npy, nrrd, pickle, tiff, write_atomic, zarr};
+use crate::{dicom, metaimage, nifti, npy, nrrd, pickle, scan, tiff, write_atomic, zarr};
 use conefield_core::geometry::VoxelGrid;
 use conefield_core::parts::Voxels;
 use conefield_core::scan::Volume;
@@ -12,30 +12,41 @@ use std::io::Write;
 use std::path::Path;
 
 /// Reads a volume: NIfTI-1 (any real number type, gzip or not), MetaImage (`.mha`, or `.mhd` with its data file in the
-/// same folder, zlib or not), a NumPy array of three axes, or a folder with the DICOM files of one series, one slice
-/// each.
+/// same folder, zlib or not), NRRD (`.nrrd`, or `.nhdr` with its data file in the same folder, gzip or not), a NumPy
+/// array of three axes, the pages of a TIFF file, or a folder: OME-Zarr (0.4), the DICOM files of one series, one slice
+/// each, or TIFF files, one slice each in the order of the numbers in their names.
 ///
 /// The content decides, not the name. `grid.center` is `[0, 0, 0]`: the position in the patient stays in `affine`, in
-/// mm, RAS. A NumPy array has no voxel size and gets 1 mm. Values are converted to `f32` and scaled by NIfTI's or
-/// DICOM's slope and intercept; a value that is not finite is refused.
+/// mm, RAS. A NumPy array has no voxel size and gets 1 mm, as do a NRRD and TIFF files that do not say it. Values are
+/// converted to `f32` and scaled by NIfTI's or DICOM's slope and intercept; a value that is not finite is refused.
 pub fn read_volume(path: impl AsRef<Path>) -> Result<Volume> {
     let path = path.as_ref();
     match open(path)? {
         VolumeFile::Series => dicom::read(path),
+        VolumeFile::Zarr => zarr::read(path),
+        VolumeFile::Slices => tiff::read_folder(path),
         VolumeFile::Npy(mut input, head) => from_numpy(path, npy::read_from(&mut input, head, &["x", "y", "z"])?),
         VolumeFile::MetaImage => metaimage::read(path),
+        VolumeFile::Nrrd => nrrd::read(path),
+        VolumeFile::Tiff => tiff::read_volume(path),
         VolumeFile::Nifti(mut input, head) => nifti::read_from(&mut input, &head),
     }
 }
 
 /// A volume's format, with the open file and the bytes read to recognize it.
 pub(crate) enum VolumeFile {
-    /// A folder.
+    /// A folder of DICOM files.
     Series,
+    /// A folder of OME-Zarr.
+    Zarr,
+    /// A folder of TIFF files.
+    Slices,
     /// Eight bytes have been read.
     Npy(Input, Vec<u8>),
-    /// The reader opens the file again.
+    /// The reader opens the file again, as do the next two.
     MetaImage,
+    Nrrd,
+    Tiff,
     /// The header has been read.
     Nifti(Input, Vec<u8>),
 }
@@ -43,7 +54,11 @@ pub(crate) enum VolumeFile {
 /// Recognizes the format of a volume by its content.
 pub(crate) fn open(path: &Path) -> Result<VolumeFile> {
     if path.is_dir() {
-        return Ok(VolumeFile::Series);
+        if zarr::is_zarr(path) {
+            return Ok(VolumeFile::Zarr);
+        }
+        let slices = tiff::is_stack(path) && !dicom::is_series(path);
+        return Ok(if slices { VolumeFile::Slices } else { VolumeFile::Series });
     }
     let mut input = Input::open(path)?;
     let mut head = input.take(8)?;
@@ -59,12 +74,17 @@ pub(crate) fn open(path: &Path) -> Result<VolumeFile> {
         let what = format!("{}: one DICOM file", path.display());
         return Err(Error::unsupported(what, "give the folder that holds the files of its series"));
     }
-    if metaimage::is_header(&head) {
+    let found = [
+        (metaimage::is_header(&head), VolumeFile::MetaImage, "a MetaImage"),
+        (nrrd::is_header(&head), VolumeFile::Nrrd, "a NRRD"),
+        (tiff::is_tiff(&head), VolumeFile::Tiff, "a TIFF file"),
+    ];
+    if let Some((_, file, name)) = found.into_iter().find(|(is, ..)| *is) {
         if input.left().is_none() {
-            let what = format!("{}: a MetaImage inside gzip", path.display());
-            return Err(Error::unsupported(what, "unpack it first; MetaImage has a compression of its own"));
+            let what = format!("{}: {name} inside gzip", path.display());
+            return Err(Error::unsupported(what, "unpack it first; the format has a compression of its own"));
         }
-        return Ok(VolumeFile::MetaImage);
+        return Ok(file);
     }
     if !nifti::is_header(&head) {
         let mark = head.get(344..348).map_or_else(
@@ -74,8 +94,8 @@ pub(crate) fn open(path: &Path) -> Result<VolumeFile> {
         let hint = match format_of(path) {
             Some(VolumeFormat::Npy) => "a NumPy array (93 4e 55 4d 50 59 at the start); a NIfTI-1 header is read too",
             _ => {
-                "a NIfTI-1 header (6e 2b 31 00 at byte 344), a NumPy array (93 4e 55 4d 50 59 at the start) or a \
-                 MetaImage header (NDims = 3)"
+                "a NIfTI-1 header (6e 2b 31 00 at byte 344), a NumPy array (93 4e 55 4d 50 59 at the start), a \
+                 MetaImage header (NDims = 3), NRRD (4e 52 52 44 at the start) or TIFF (49 49 2a 00 or 4d 4d 00 2a)"
             }
         };
         return Err(input.invalid("format", mark, hint));
@@ -83,15 +103,16 @@ pub(crate) fn open(path: &Path) -> Result<VolumeFile> {
     Ok(VolumeFile::Nifti(input, head))
 }
 
-/// Whether the file, or the folder with DICOM files, looks like a volume; its data is not read. Also true for paths
+/// Whether the file, or the folder of DICOM files, TIFF files or OME-Zarr, looks like a volume; its data is not read. Also true for paths
 /// that [`read_volume`] refuses with a better error: a single DICOM file, and a file named like a volume that is
 /// damaged or of another format.
 pub fn is_volume(path: impl AsRef<Path>) -> bool {
     let path = path.as_ref();
     if path.is_dir() {
-        return dicom::is_series(path);
+        // The images in the folder of a scan are its views.
+        return zarr::is_zarr(path) || dicom::is_series(path) || (tiff::is_stack(path) && scan::find(path).is_err());
     }
-    let named = format_of(path).is_some_and(|f| f.is_read());
+    let named = format_of(path).is_some();
     let Ok(mut input) = Input::open(path) else { return named };
     // Of the formats read here, only volumes use gzip.
     if input.left().is_none() {
@@ -101,6 +122,8 @@ pub fn is_volume(path: impl AsRef<Path>) -> bool {
         head.starts_with(npy::MAGIC)
             || nifti::is_header(&head)
             || metaimage::is_header(&head)
+            || nrrd::is_header(&head)
+            || tiff::is_tiff(&head)
             || dicom::is_header(&head)
             || (named && !pickle::is_start(&head))
     })
@@ -210,13 +233,6 @@ enum VolumeFormat {
     Zarr,
 }
 
-impl VolumeFormat {
-    /// Whether conefield also reads this format.
-    fn is_read(self) -> bool {
-        !matches!(self, Self::Nrrd | Self::Tiff | Self::Zarr)
-    }
-}
-
 fn file_name(path: &Path) -> String {
     path.file_name().map(|n| n.to_string_lossy().into_owned()).unwrap_or_default()
 }
@@ -287,7 +303,7 @@ mod tests {
         let dir = tempfile::tempdir().unwrap();
         let whole = Volume::collect(&mut RampVoxels { largest: 0, parts: 0 }).unwrap();
         assert_eq!(whole.data[[199, 189, 179]], ramp([199, 189, 179]));
-        for end in ["nii", "nii.gz", "mha", "npy"] {
+        for end in ["nii", "nii.gz", "mha", "npy", "nrrd", "tif"] {
             let [streamed, at_once] = ["streamed", "at_once"].map(|n| dir.path().join(format!("{n}.{end}")));
             let mut voxels = RampVoxels { largest: 0, parts: 0 };
             write_voxels(&streamed, &mut voxels).unwrap();

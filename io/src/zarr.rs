@@ -1,12 +1,16 @@
-//! OME-Zarr writer: a folder with a pyramid of chunks, for volumes too large for a viewer to load at once.
+//! OME-Zarr: a folder with a pyramid of chunks, for volumes too large for a viewer to load at once.
 //!
-//! Version 0.4 on Zarr 2, which every reader supports: arrays `0` (the volume), `1` (half as many voxels along each
+//! Written is version 0.4 on Zarr 2, which every reader supports: arrays `0` (the volume), `1` (half as many voxels along each
 //! axis), … down to a single chunk; axes z, y, x in mm, 32-bit floats in chunks of 64³ compressed by zlib. Each chunk
 //! is computed from the eight below it as soon as they are written, so that few chunks are in memory at once whatever
 //! the volume's size.
 //!
 //! Source: ngff.openmicroscopy.org/0.4, zarr-specs.readthedocs.io (v2). The format supports scale and translation, no
-//! rotation: an affine with rotation keeps only the former.
+//! rotation: an affine of the volume's own is kept in an attribute that only conefield reads.
+
+mod read;
+
+pub(crate) use read::{is_zarr, read, shape};
 
 use crate::affine;
 use crate::{folder, number, write_folder_atomic, write_text_atomic};
@@ -54,7 +58,7 @@ fn shapes(full: [usize; 3]) -> Vec<[usize; 3]> {
 /// The pyramid's metadata.
 fn attributes(path: &Path, voxels: &dyn Voxels, levels: usize) -> Value {
     let spacing = voxels.grid().spacing;
-    let (affine, _) = affine::of(voxels, &path.display().to_string());
+    let (affine, own) = affine::of(voxels, &path.display().to_string());
     let first = affine::column(&affine, 3);
     let zyx = |v: [f64; 3]| [v[2], v[1], v[0]];
     let data_set = |level: usize| {
@@ -67,10 +71,14 @@ fn attributes(path: &Path, voxels: &dyn Voxels, levels: usize) -> Value {
         ] })
     };
     let axes = ["z", "y", "x"].map(|name| json!({ "name": name, "type": "space", "unit": "millimeter" }));
-    json!({ "multiscales": [{
+    let mut found = json!({ "multiscales": [{
         "version": "0.4", "name": path.file_stem().map(|n| n.to_string_lossy()), "axes": axes, "type": "mean",
         "datasets": (0..levels).map(data_set).collect::<Vec<_>>(),
-    }] })
+    }] });
+    if own {
+        found["conefield"] = json!({ "affine": affine });
+    }
+    found
 }
 
 struct Pyramid<'a> {

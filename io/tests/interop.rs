@@ -85,7 +85,7 @@ fn simple_itk_reads_what_is_written() {
     let Some(python) = python(&["SimpleITK", "numpy"]) else { return };
     let dir = tempfile::tempdir().unwrap();
     let v = turned();
-    for (name, tolerance) in [("a.mha", 1e-12), ("a.nii.gz", 1e-5)] {
+    for (name, tolerance) in [("a.mha", 1e-12), ("a.nii.gz", 1e-5), ("a.nrrd", 1e-12)] {
         write_volume(dir.path().join(name), &v).unwrap();
         let text = run(&python, dir.path(), &format!("{SHOW}\nshow(sitk.ReadImage('{name}'))"));
         assert_shown(&text, &v, tolerance, name);
@@ -101,7 +101,7 @@ fn what_simple_itk_writes_is_read() {
     let script = "
 import SimpleITK as sitk
 a = sitk.ReadImage('a.mha')
-for end in ['mha', 'mhd', 'nii', 'nii.gz']:
+for end in ['mha', 'mhd', 'nii', 'nii.gz', 'nrrd', 'nhdr']:
     for packed in [False, True]:
         sitk.WriteImage(a, f'{int(packed)}.{end}', packed)
 for name in ['Int8', 'UInt8', 'Int16', 'UInt16', 'Int32', 'UInt32', 'Int64', 'UInt64', 'Float64']:
@@ -260,4 +260,58 @@ assert g['1'][0, 0, 0] == g['0'][:2, :2, :2].mean()
 print(*m['datasets'][0]['coordinateTransformations'][0]['scale'], *g['0'][:].ravel().tolist())
 ";
     assert_read_by(&["zarr"], "a.zarr", zarr);
+}
+
+/// Lets `script` write [`long`], which lies in `a.npy`, into `names`, and reads them.
+fn assert_written_by(modules: &[&str], names: &[&str], script: &str) {
+    let Some(python) = python(modules) else { return };
+    let dir = tempfile::tempdir().unwrap();
+    let want = long();
+    write_volume(dir.path().join("a.npy"), &want).unwrap();
+    run(&python, dir.path(), script);
+    for name in names {
+        let found = read_volume(dir.path().join(name)).unwrap();
+        assert_eq!(found.data, want.data, "{name}");
+        let sizes = found.grid.spacing.iter().zip(want.grid.spacing);
+        assert!(sizes.into_iter().all(|(f, w)| (f - w).abs() < 1e-6), "{name}: {:?}", found.grid.spacing);
+    }
+}
+
+#[test]
+fn what_tifffile_pynrrd_and_zarr_write_is_read() {
+    let tiff = "
+import numpy as np, os, tifffile
+a = np.load('a.npy').T
+about = dict(imagej=True, resolution=(2, 4 / 3))
+tifffile.imwrite('a.tif', a, metadata={'spacing': 2, 'unit': 'mm', 'axes': 'ZYX'}, **about)
+about = dict(imagej=True, resolution=(2e-3, 4e-3 / 3))
+tifffile.imwrite('um.tif', a, metadata={'spacing': 2000, 'unit': 'um', 'axes': 'ZYX'}, **about)
+os.mkdir('slices')
+for i, s in enumerate(a):
+    tifffile.imwrite(f'slices/{i + 9}.tif', s, metadata={'spacing': 2, 'unit': 'mm'}, imagej=True, resolution=(2, 4 / 3))
+";
+    assert_written_by(&["tifffile", "numpy"], &["a.tif", "um.tif", "slices"], tiff);
+    let nrrd = "
+import nrrd, numpy as np
+a = np.load('a.npy')
+about = {'space': 'RAS', 'space directions': np.diag([0.5, 0.75, 2]), 'kinds': ['domain'] * 3}
+for name, kind, encoding in [('gzip', '<f4', 'gzip'), ('raw', '<f4', 'raw'), ('big', '>f8', 'raw')]:
+    nrrd.write(f'{name}.nrrd', a.astype(kind), {**about, 'encoding': encoding})
+    nrrd.write(f'{name}.nhdr', a.astype(kind), {**about, 'encoding': encoding}, detached_header=True)
+";
+    let names = ["gzip.nrrd", "raw.nrrd", "big.nrrd", "gzip.nhdr", "raw.nhdr", "big.nhdr"];
+    assert_written_by(&["nrrd", "numpy"], &names, nrrd);
+    let zarr = "
+import numpy as np, zarr, numcodecs
+a = np.load('a.npy').T
+axes = [{'name': n, 'type': 'space', 'unit': 'micrometer'} for n in 'zyx']
+level = {'path': '0', 'coordinateTransformations': [{'type': 'scale', 'scale': [2000, 750, 500]}]}
+for name, codec in [('zlib', numcodecs.Zlib()), ('gzip', numcodecs.GZip()), ('none', None)]:
+    for separator in './':
+        g = zarr.open_group(f'{name}{ord(separator)}.zarr', mode='w')
+        g.attrs['multiscales'] = [{'version': '0.4', 'axes': axes, 'datasets': [level]}]
+        g.create_dataset('0', data=a, chunks=(2, 3, 33), compressor=codec, dimension_separator=separator, write_empty_chunks=True)
+";
+    let names = ["zlib46.zarr", "zlib47.zarr", "gzip46.zarr", "gzip47.zarr", "none46.zarr", "none47.zarr"];
+    assert_written_by(&["zarr", "numcodecs", "numpy"], &names, zarr);
 }

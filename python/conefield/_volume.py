@@ -88,7 +88,7 @@ def as_volume(value: Any, name: str, like: Any = None) -> Volume:
 
 
 def read_volume(path: str | os.PathLike[str]) -> Volume:
-    """Reads a volume: NIfTI, MetaImage, NumPy, or the folder of a DICOM series.
+    """Reads a volume: NIfTI, MetaImage, NRRD, NumPy, a TIFF stack, OME-Zarr, or a folder of DICOM or TIFF slices.
 
     ``phantom:head``, ``phantom:abdomen`` and ``phantom:random:SEED``, each optionally with ``:SIZE``, are built in.
     """

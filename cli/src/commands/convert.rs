@@ -15,7 +15,7 @@ use std::path::PathBuf;
 /// Rewrite a volume or a scan in another format.
 ///
 /// Volumes: NIfTI (.nii, .nii.gz), MetaImage (.mha, .mhd with a .raw), NRRD, NumPy (.npy), a TIFF stack (.tif) or a folder of
-/// OME-Zarr (.zarr), by the name of OUT; IN may also be the folder of a DICOM series, but no NRRD, TIFF or OME-Zarr. Scans: the
+/// OME-Zarr (.zarr), by the name of OUT; IN may also be a .nhdr, or the folder of a DICOM series or of TIFF slices. Scans: the
 /// format is --to; r2 and naf keep test views. A scan may be corrected (--correct), and part of it taken; --bin averages line
 /// integrals.
 #[derive(Args)]

@@ -95,6 +95,26 @@ fn a_shifted_detector_is_found_and_a_right_one_is_left_alone() {
     assert!(!done(&["info", &text(&at("right"))]).contains("conefield calibrate"));
 }
 
+#[test]
+fn the_other_direction_is_told_where_the_views_fit_it() {
+    let dir = tempdir().unwrap();
+    let at = |n: &str| dir.path().join(n);
+    scanned(&at("right"));
+    let mut scan = conefield_io::read_scan(at("right")).unwrap();
+    let mut orbit = CircularOrbit::fit(&scan.geometry.views).unwrap();
+    orbit.angles.iter_mut().for_each(|a| *a = -*a);
+    scan.geometry.views = orbit.views();
+    conefield_io::write_scan(at("wrong"), &scan, None).unwrap();
+    let calibrate = ["--pixels", "24", "--parameters", "offset-u"];
+    let told = |name: &str| done(&[&["calibrate", &text(&at(name))], &calibrate[..]].concat());
+    let said = told("wrong");
+    assert!(said.contains("the other `direction`") && said.contains("--flip-columns"), "{said}");
+    assert!(!told("right").contains("direction"));
+    let found = json(&[&["calibrate", &text(&at("wrong"))], &calibrate[..], &["--json"]].concat());
+    let [as_told, reversed] = ["as_told", "reversed"].map(|k| number(&found["direction"][k]));
+    assert!(reversed < 0.7 * as_told, "{found}");
+}
+
 /// A ball on the axis: turned in its plane or stepped on wider, every view is the same.
 #[test]
 fn what_the_views_do_not_tell_is_not_invented() {

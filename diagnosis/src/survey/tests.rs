@@ -18,6 +18,7 @@ struct Setting {
     detector: [usize; 2],
     volume: VoxelGrid,
     radius: f64,
+    at: [f64; 2],
     mu: f64,
 }
 
@@ -36,6 +37,7 @@ fn clean() -> Setting {
         detector: [40, 100],
         volume: VoxelGrid { shape: [48, 48, 24], spacing: [1.2, 1.2, 1.5], center: [0.0; 3] },
         radius: 24.0,
+        at: [0.0, 0.0],
         mu: 0.02,
     }
 }
@@ -52,7 +54,8 @@ impl Setting {
         let half = self.volume.size()[2] / 2.0;
         let projections = Array3::from_shape_fn(shape, |(view, row, column)| {
             let ray = geometry.ray(view, row, column);
-            let (o, d) = (ray.origin, ray.direction);
+            let (mut o, d) = (ray.origin, ray.direction);
+            (o[0], o[1]) = (o[0] - self.at[0], o[1] - self.at[1]);
             let a = d[0] * d[0] + d[1] * d[1];
             let b = o[0] * d[0] + o[1] * d[1];
             let under = b * b - a * (o[0] * o[0] + o[1] * o[1] - self.radius * self.radius);
@@ -191,4 +194,44 @@ fn values_that_are_no_line_integrals_are_told_once() {
 fn one_view_and_one_pixel_are_no_trouble() {
     let one = Setting { angles: vec![0.3], detector: [1, 1], ..clean() };
     assert!(survey(&one.scan()).setup.angles.covered_deg.is_finite());
+}
+
+/// The images of `n` views over a full turn with both ends, but the geometry of `told`.
+fn with_both_ends(n: usize, told: Vec<f64>) -> Scan {
+    let off_axis = Setting { radius: 10.0, at: [8.0, 5.0], ..clean() };
+    let images = Setting { angles: even(n, TAU * n as f64 / (n - 1) as f64), ..off_axis }.scan();
+    Scan { geometry: Geometry { views: Setting { angles: told, ..clean() }.views(), ..images.geometry }, ..images }
+}
+
+#[test]
+fn a_last_view_that_repeats_the_first_is_told_with_the_options_that_mend_it() {
+    let noise = |i: usize| 0.004 * (((i * 7919) % 101) as f32 / 50.0 - 1.0);
+    for (n, step) in [(13, "step_deg = 30 "), (61, "step_deg = 6 "), (361, "step_deg = 1 ")] {
+        for told in [even(n, TAU), even(n, -TAU)] {
+            let mut scan = with_both_ends(n, told);
+            scan.projections.iter_mut().enumerate().for_each(|(i, x)| *x += noise(i));
+            let said = survey(&scan).warnings;
+            assert_eq!(said.iter().map(|w| w.kind).collect::<Vec<_>>(), [WarningKind::Repeated], "{n}: {said:?}");
+            assert!(
+                said[0].advice.contains(step) && said[0].advice.ends_with(&format!("--views 0-{}", n - 2)),
+                "{said:?}"
+            );
+        }
+        // Angles with both ends say as much as the images.
+        let right = with_both_ends(n, even(n, TAU * n as f64 / (n - 1) as f64));
+        assert_eq!(survey(&right).warnings, [], "{n}");
+    }
+}
+
+#[test]
+fn views_that_only_look_like_each_other_are_no_repeated_ones() {
+    // Off the axis; on it, where all views are equal; and where both sides of the seam look alike.
+    for n in [12, 60, 360] {
+        let half_step = 0.5 * TAU / n as f64;
+        let seam = [8.0 * half_step.cos(), -8.0 * half_step.sin()];
+        for at in [[8.0, 5.0], [0.0, 0.0], [0.0, 8.0], [8.0, 0.0], seam] {
+            let setting = Setting { angles: even(n, TAU), radius: 10.0, at, ..clean() };
+            assert_eq!(setting.kinds(), [], "{n}, {at:?}");
+        }
+    }
 }

@@ -2,9 +2,11 @@
 //!
 //! All directories come first, then all pixels in one piece, so that the file is written front to back. Above 4 GiB it
 //! is a BigTIFF. The first page describes the stack in ImageJ's terms, which `tifffile`, Fiji and napari understand:
-//! the number of slices and their distance in mm; the resolution gives the pixel size. The volume's position is not
-//! stored.
+//! the number of slices and their distance in mm; the resolution gives the pixel size. ImageJ's terms have no place for
+//! directions: a line that only conefield reads holds the affine.
 
+use super::volume::AFFINE;
+use crate::affine::{self, Affine};
 use crate::file_order::{self, FileOrder};
 use conefield_core::error::ensure;
 use conefield_core::parts::Voxels;
@@ -33,8 +35,10 @@ pub(crate) fn check_shape(place: &str, shape: [usize; 3]) -> Result<()> {
 
 pub(crate) fn write(w: &mut dyn Write, path: &Path, voxels: &mut dyn Voxels) -> Result<()> {
     let grid = voxels.grid();
-    check_shape(&path.display().to_string(), grid.shape)?;
-    let head = Head::of(grid.shape, grid.spacing);
+    let place = path.display().to_string();
+    check_shape(&place, grid.shape)?;
+    let (affine, _) = affine::of(voxels, &place);
+    let head = Head::of(grid.shape, grid.spacing, &affine);
     w.write_all(&head.bytes()).map_err(|e| Error::io(path, e))?;
     file_order::write(w, path, voxels, FileOrder::XFastest)
 }
@@ -50,11 +54,15 @@ struct Head {
 }
 
 impl Head {
-    fn of(shape: [usize; 3], spacing: [f64; 3]) -> Self {
+    fn of(shape: [usize; 3], spacing: [f64; 3], affine: &Affine) -> Self {
         let shape = shape.map(|n| n as u64);
         let pages = shape[2];
-        let text =
-            format!("ImageJ=1.54f\nimages={pages}\nslices={pages}\nunit=mm\nspacing={}\nloop=false\n\0", spacing[2]);
+        let rows: Vec<String> = affine[..3].iter().flatten().map(f64::to_string).collect();
+        let text = format!(
+            "ImageJ=1.54f\nimages={pages}\nslices={pages}\nunit=mm\nspacing={}\nloop=false\n{AFFINE}={}\n\0",
+            spacing[2],
+            rows.join(" ")
+        );
         // The largest power of ten whose product with the size fits keeps decimal sizes exact.
         let ratio = |s: f64| {
             let fits = |n: &u32| f64::from(*n) * s <= f64::from(u32::MAX);
@@ -174,16 +182,20 @@ mod tests {
         );
         let dir = tempfile::tempdir().unwrap();
         let path = dir.path().join("a.tif");
+        let (affine, _) = affine::of(&&volume, "a.tif");
         for big in [false, true] {
-            let head = Head { big, ..Head::of([4, 3, 2], [0.5, 0.75, 2.0]) };
+            let head = Head { big, ..Head::of([4, 3, 2], [0.5, 0.75, 2.0], &affine) };
             assert_eq!(head.bytes().len() as u64, head.length());
             let mut bytes = head.bytes();
             file_order::write(&mut bytes, &path, &mut &volume, FileOrder::XFastest).unwrap();
             std::fs::write(&path, bytes).unwrap();
             let pages = crate::tiff::read(&path).unwrap();
             assert_eq!(pages, volume.data.t().to_owned(), "{big}");
+            let back = crate::tiff::read_volume(&path).unwrap();
+            assert_eq!((&back.data, back.grid, back.affine), (&volume.data, volume.grid, Some(affine)), "{big}");
         }
-        assert!(!Head::of([1000, 1000, 1000], [1.0; 3]).big && Head::of([1100, 1000, 1000], [1.0; 3]).big);
+        let big = |side| Head::of([side, 1000, 1000], [1.0; 3], &affine).big;
+        assert!(!big(1000) && big(1100));
         let e = check_shape("a.tif", [1 << 33, 1, 1]).unwrap_err().to_string();
         assert!(e.contains("a.tif: shape") && e.contains("4294967295"), "{e}");
     }

@@ -86,6 +86,41 @@ pub fn metaimage_header(dir: &Path) {
     put(&dir.join("a.raw"), &[7; 24]);
 }
 
+/// `a.nrrd`, packed.
+pub fn nrrd(dir: &Path) {
+    written(conefield_io::write_volume(dir.join("a.nrrd"), &volume()));
+}
+
+/// `a.nhdr` and `a.raw`.
+pub fn nrrd_header(dir: &Path) {
+    let text = "NRRD0005\ntype: unsigned char\ndimension: 3\nspace: left-posterior-superior\nsizes: 4 3 2\n\
+                space directions: (0.5,0,0) (0,0.75,0) (0,0,2)\nkinds: domain domain domain\n\
+                space units: \"mm\" \"mm\" \"mm\"\nencoding: raw\nspace origin: (-1,0,2.5)\nline skip: 0\n\
+                byte skip: -1\nnote:=a test\ndata file: a.raw\n";
+    put(&dir.join("a.nhdr"), text.as_bytes());
+    put(&dir.join("a.raw"), &[7; 24]);
+}
+
+/// `a.tif`, a volume.
+pub fn tiff_volume(dir: &Path) {
+    written(conefield_io::write_volume(dir.join("a.tif"), &volume()));
+}
+
+/// The folder `a.zarr`: one level in two chunks, which are smaller than those of the project's own writer.
+pub fn zarr(dir: &Path) {
+    let folder = dir.join("a.zarr");
+    written(conefield_io::write_volume(&folder, &volume()));
+    let array = folder.join("0/.zarray");
+    let text = fs::read_to_string(&array).expect("what was written");
+    let mut value: serde_json::Value = serde_json::from_str(&text).expect("what was written");
+    value["chunks"] = serde_json::json!([1, 3, 4]);
+    put(&array, value.to_string().as_bytes());
+    for slice in 0..2 {
+        fs::create_dir_all(folder.join(format!("0/{slice}/0"))).expect("a folder of the test's own");
+        put(&folder.join(format!("0/{slice}/0/0")), &zlib(&[7; 48]));
+    }
+}
+
 /// A description of a scanner with `geometry` and counts in `file`.
 pub fn scanner_toml(file: &str, geometry: &str) -> String {
     format!(

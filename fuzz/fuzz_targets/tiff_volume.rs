@@ -1,0 +1,3 @@
+#![no_main]
+
+conefield_fuzz::target!("tiff_volume");

@@ -1,0 +1,298 @@
+//! Reads a stack of slices as a volume: the pages of one file, or a folder with one file per slice.
+//!
+//! Voxel sizes are read where ImageJ's text on the first page states their unit; the affine where conefield's writer
+//! has added it.
+
+use super::{stack, values};
+use crate::affine::{self, Affine};
+use crate::{file_order, folder};
+use conefield_core::geometry::VoxelGrid;
+use conefield_core::scan::Volume;
+use conefield_core::{Error, Result, allowance};
+use ndarray::{Array3, s};
+use std::io::{Read, Seek};
+use std::path::Path;
+use tiff::decoder::{Decoder, ifd::Value};
+use tiff::tags::Tag;
+
+/// Key of the affine in the text of the first page: twelve numbers, row by row, RAS in mm.
+pub(super) const AFFINE: &str = "affine";
+
+/// Reads the pages of one file as slices along z, with rows along y and columns along x. The affine is RAS, in mm, and
+/// `grid.center` is `[0, 0, 0]`. Without voxel sizes they are 1 mm, and the affine is `None`.
+pub(crate) fn read_volume(path: &Path) -> Result<Volume> {
+    let place = path.display().to_string();
+    let mut text = StackText::default();
+    let pages = stack(path, |decoder| {
+        text = StackText::of(decoder);
+        Ok(())
+    })?;
+    let (slices, rows, columns) = pages.dim();
+    // Above 4 GiB ImageJ writes one page and the other slices after it.
+    if let Some(n) = text.number("images").filter(|n| *n != slices as f64) {
+        let expected = format!("{slices}, the pages of the file (save the stack with one page a slice)");
+        return Err(Error::invalid(place, "images", n, expected));
+    }
+    let (grid, affine) = text.place_of_voxels(&place, [columns, rows, slices])?;
+    file_order::read(&place, grid, affine, pages.into_raw_vec_and_offset().0)
+}
+
+/// Whether there is a TIFF file in `folder`, by its name.
+pub(crate) fn is_stack(folder: &Path) -> bool {
+    slices(folder).is_ok_and(|names| !names.is_empty())
+}
+
+/// Number of voxels of [`read_folder`], from the directories of its files.
+pub(crate) fn folder_voxels(folder: &Path) -> Result<u64> {
+    let place = folder.display().to_string();
+    slices(folder)?
+        .iter()
+        .try_fold(0u64, |sum, name| Ok(sum.saturating_add(values(&folder::inside(folder, &place, "slices", name)?)?)))
+}
+
+/// Reads the TIFF files of `folder`, in the order of the numbers in their names, as slices along z; otherwise like
+/// [`read_volume`].
+pub(crate) fn read_folder(folder: &Path) -> Result<Volume> {
+    let place = folder.display().to_string();
+    let names = slices(folder)?;
+    // What the files claim is checked against their sizes here, before memory is taken for all of them.
+    let voxels = usize::try_from(folder_voxels(folder)?).unwrap_or(usize::MAX);
+    allowance::numbers(&place, "slices", voxels)?;
+    let mut text = StackText::default();
+    let mut data: Option<Array3<f32>> = None;
+    for (z, name) in names.iter().enumerate() {
+        let path = folder::inside(folder, &place, "slices", name)?;
+        let slice = stack(&path, |decoder| {
+            if z == 0 {
+                text = StackText::of(decoder);
+            }
+            Ok(())
+        })?;
+        let (pages, rows, columns) = slice.dim();
+        let invalid = |field: &str, found: String, expected: String| {
+            Err(Error::invalid(path.display().to_string(), field, found, expected))
+        };
+        if pages != 1 {
+            return invalid("pages", pages.to_string(), "1: one slice a file, or all slices in one file".into());
+        }
+        let data = match &mut data {
+            Some(data) => data,
+            // The claims of all files, which must then be equal, are as many.
+            None if Some(voxels) == rows.checked_mul(columns).and_then(|n| n.checked_mul(names.len())) => {
+                data.insert(Array3::zeros([columns, rows, names.len()]))
+            }
+            None => {
+                let found = format!("{} files like {name} ({rows} x {columns} pixels), {voxels} pixels", names.len());
+                return Err(Error::invalid(&place, "slices", found, "files of one size, one page each"));
+            }
+        };
+        if [columns, rows] != data.shape()[..2] {
+            let expected = format!("{} x {} pixels, as in {}", data.shape()[1], data.shape()[0], names[0]);
+            return invalid("image", format!("{rows} x {columns} pixels"), expected);
+        }
+        data.slice_mut(s![.., .., z]).assign(&slice.slice(s![0, .., ..]).t());
+    }
+    let Some(data) = data else {
+        return Err(Error::invalid(place, "slices", "no TIFF file", "one TIFF file a slice"));
+    };
+    let [x, y, z] = [0, 1, 2].map(|k| data.shape()[k]);
+    let (grid, affine) = text.place_of_voxels(&place, [x, y, z])?;
+    Ok(Volume { data, grid, affine })
+}
+
+/// The names of the TIFF files in `folder`, in the order of their numbers.
+fn slices(folder: &Path) -> Result<Vec<String>> {
+    folder::names(folder, &["tif", "tiff"])
+}
+
+/// What the first page says of the voxels.
+#[derive(Default)]
+struct StackText {
+    /// ImageJ's lines; empty for another program's file.
+    text: String,
+    /// Columns and rows per unit of length.
+    resolution: [Option<f64>; 2],
+}
+
+impl StackText {
+    /// A tag that is damaged or of another type counts as absent: the slices do not depend on it.
+    fn of(decoder: &mut Decoder<impl Read + Seek>) -> Self {
+        let mut tag = |tag| decoder.find_tag(tag).ok().flatten();
+        let text = tag(Tag::ImageDescription).and_then(|v| v.into_string().ok());
+        let ratio = |v: Option<Value>| match v? {
+            Value::Rational(a, b) => Some(f64::from(a) / f64::from(b)),
+            _ => None,
+        };
+        let resolution = [ratio(tag(Tag::XResolution)), ratio(tag(Tag::YResolution))];
+        Self { text: text.filter(|t| t.starts_with("ImageJ=")).unwrap_or_default(), resolution }
+    }
+
+    fn entry(&self, name: &str) -> Option<&str> {
+        self.text.lines().find_map(|l| l.strip_prefix(name)?.strip_prefix('=')).map(str::trim)
+    }
+
+    fn number(&self, name: &str) -> Option<f64> {
+        self.entry(name)?.parse().ok()
+    }
+
+    /// The voxel sizes in mm, if the file says all of them.
+    fn spacing(&self) -> Option<[f64; 3]> {
+        let mm = match self.entry("unit")? {
+            "mm" | "millimeter" => 1.0,
+            "cm" => 10.0,
+            "m" => 1000.0,
+            "um" | "µm" | "μm" | "\\u00B5m" | "micron" | "microns" => 0.001,
+            "nm" => 1e-6,
+            "inch" => 25.4,
+            _ => return None,
+        };
+        // ImageJ leaves out a distance of 1 between the slices of a stack.
+        let between = self.number("spacing").or_else(|| self.number("images").filter(|n| *n > 1.0).map(|_| 1.0))?;
+        let [x, y] = self.resolution;
+        let spacing = [mm / x?, mm / y?, mm * between];
+        spacing.iter().all(|s| s.is_finite() && *s > 0.0).then_some(spacing)
+    }
+
+    /// The affine that conefield wrote, if it has voxels of about `spacing`: other programs may have rescaled the image
+    /// since.
+    fn affine(&self, spacing: [f64; 3]) -> Option<Affine> {
+        let numbers: Option<Vec<f64>> = self.entry(AFFINE)?.split_ascii_whitespace().map(|t| t.parse().ok()).collect();
+        let rows: [f64; 12] = numbers?.try_into().ok()?;
+        let row = |i: usize| [rows[4 * i], rows[4 * i + 1], rows[4 * i + 2], rows[4 * i + 3]];
+        let affine = [row(0), row(1), row(2), [0.0, 0.0, 0.0, 1.0]];
+        (affine::is_regular(&affine) && affine::fits(&affine, spacing)).then_some(affine)
+    }
+
+    /// The grid of `shape` voxels, and the affine. Refuses a stack of several channels or points in time.
+    fn place_of_voxels(&self, place: &str, shape: [usize; 3]) -> Result<(VoxelGrid, Option<Affine>)> {
+        for name in ["channels", "frames"] {
+            if let Some(n) = self.number(name).filter(|n| *n > 1.0) {
+                return Err(Error::invalid(place, name, n, "1: one volume, one number a voxel"));
+            }
+        }
+        let mut grid = VoxelGrid { shape, spacing: self.spacing().unwrap_or([1.0; 3]), center: [0.0; 3] };
+        grid.validate(place)?;
+        let affine = self.spacing().map(|spacing| self.affine(spacing).unwrap_or_else(|| affine::centred(&grid)));
+        // The resolution is a fraction of 32-bit numbers: the affine is more exact.
+        if let Some(affine) = &affine {
+            grid.spacing = affine::spacing(affine);
+        }
+        Ok((grid, affine))
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use crate::{is_volume, read_volume, volume_voxels, write_volume};
+    use conefield_core::scan::Volume;
+    use ndarray::Array3;
+    use std::fs::File;
+    use std::path::Path;
+    use tiff::encoder::{Rational, TiffEncoder, colortype::Gray16};
+    use tiff::tags::Tag;
+
+    #[test]
+    fn what_is_written_comes_back_to_the_bit() {
+        let dir = tempfile::tempdir().unwrap();
+        let path = dir.path().join("a.tif");
+        let data = Array3::from_shape_fn((4, 3, 2), |(x, y, z)| (x + 10 * y + 100 * z) as f32 / 7.0);
+        let mut volume = Volume::centered(data, [1.0 / 3.0, 0.7, 2.0]);
+        write_volume(&path, &volume).unwrap();
+        let back = read_volume(&path).unwrap();
+        assert_eq!((&back.data, back.grid), (&volume.data, volume.grid));
+        assert!(back.data.is_standard_layout());
+        let turned = [[0.0, 0.7, 0.0, 5.1], [-1.0 / 3.0, 0.0, 0.0, 6.0], [0.0, 0.0, -2.0, -7.0], [0.0, 0.0, 0.0, 1.0]];
+        volume.affine = Some(turned);
+        write_volume(&path, &volume).unwrap();
+        let back = read_volume(&path).unwrap();
+        assert_eq!((back.data, back.grid, back.affine), (volume.data, volume.grid, Some(turned)));
+        assert!(is_volume(&path));
+        assert_eq!(volume_voxels(&path).unwrap(), 24);
+    }
+
+    /// Pages of 3 x 2 pixels, with a text on the first one.
+    fn write(path: &Path, pages: u16, text: Option<&str>) {
+        let mut w = TiffEncoder::new(File::create(path).unwrap()).unwrap();
+        for page in 0..pages {
+            let mut image = w.new_image::<Gray16>(3, 2).unwrap();
+            if let Some(text) = text {
+                image.encoder().write_tag(Tag::ImageDescription, text).unwrap();
+                image.encoder().write_tag(Tag::XResolution, Rational { n: 4, d: 1 }).unwrap();
+                image.encoder().write_tag(Tag::YResolution, Rational { n: 1, d: 2 }).unwrap();
+            }
+            let data: Vec<u16> = (0..6).map(|i| 10 * page + i).collect();
+            image.write_data(&data).unwrap();
+        }
+    }
+
+    #[test]
+    fn voxel_sizes_are_those_of_imagej_or_1_mm() {
+        let dir = tempfile::tempdir().unwrap();
+        let path = dir.path().join("a.tif");
+        let known = |spacing: [f64; 3]| (spacing, true);
+        for (text, want) in [
+            (None, ([1.0; 3], false)),
+            (Some("a microscope"), ([1.0; 3], false)),
+            (Some("ImageJ=1.54f\nimages=2\nunit=pixel\nspacing=3"), ([1.0; 3], false)),
+            (Some("ImageJ=1.54f\nimages=2\nunit=mm\nspacing=3"), known([0.25, 2.0, 3.0])),
+            (Some("ImageJ=1.54f\nimages=2\nunit=mm"), known([0.25, 2.0, 1.0])),
+            (Some("ImageJ=1.54f\nimages=2\nunit=cm\nspacing=0.5"), known([2.5, 20.0, 5.0])),
+            (Some("ImageJ=1.54f\nimages=2\nunit=mm\nspacing=-1"), ([1.0; 3], false)),
+            // Rescaled since conefield wrote it.
+            (
+                Some("ImageJ=1.54f\nimages=2\nunit=mm\nspacing=3\naffine=9 0 0 0 0 9 0 0 0 0 9 0\n"),
+                known([0.25, 2.0, 3.0]),
+            ),
+            (
+                Some("ImageJ=1.54f\nimages=2\nunit=mm\nspacing=3\naffine=inf 0 0 0 0 9 0 0 0 0 9\n"),
+                known([0.25, 2.0, 3.0]),
+            ),
+        ] {
+            write(&path, 2, text);
+            let v = read_volume(&path).unwrap();
+            assert_eq!(v.grid.shape, [3, 2, 2]);
+            assert_eq!((v.data[[2, 0, 0]], v.data[[0, 1, 0]], v.data[[1, 1, 1]]), (2.0, 3.0, 14.0));
+            assert_eq!((v.grid.spacing, v.affine.is_some()), want, "{text:?}");
+        }
+        write(&path, 2, Some("ImageJ=1.54f\nimages=2\nchannels=2\n"));
+        let e = read_volume(&path).unwrap_err().to_string();
+        assert!(e.contains("a.tif: channels: found 2"), "{e}");
+        write(&path, 2, Some("ImageJ=1.54f\nimages=3\n"));
+        let e = read_volume(&path).unwrap_err().to_string();
+        assert!(e.contains("a.tif: images: found 3") && e.contains("expected 2"), "{e}");
+    }
+
+    #[test]
+    fn a_folder_of_slices_is_read_in_the_order_of_their_numbers() {
+        let dir = tempfile::tempdir().unwrap();
+        let at = |name: &str| dir.path().join(name);
+        assert!(!is_volume(dir.path()));
+        for (name, value) in [("s2.tif", 20u16), ("s10.TIFF", 100), ("s1.tif", 10)] {
+            let mut w = TiffEncoder::new(File::create(at(name)).unwrap()).unwrap();
+            w.write_image::<Gray16>(3, 2, &[value, 1, 2, 3, 4, 5]).unwrap();
+        }
+        std::fs::write(at("log.txt"), "any").unwrap();
+        let v = read_volume(dir.path()).unwrap();
+        assert_eq!((v.grid.shape, v.grid.spacing, v.affine), ([3, 2, 3], [1.0; 3], None));
+        assert_eq!(v.data.slice(ndarray::s![0, 0, ..]).to_vec(), [10.0, 20.0, 100.0]);
+        assert_eq!(v.data.slice(ndarray::s![.., 1, 0]).to_vec(), [3.0, 4.0, 5.0]);
+        assert!(is_volume(dir.path()) && v.data.is_standard_layout());
+        assert_eq!(volume_voxels(dir.path()).unwrap(), 18);
+        // The folder of a scan is no volume.
+        std::fs::write(at("scanner.toml"), "").unwrap();
+        assert!(!is_volume(dir.path()));
+
+        let refused = |words: &[&str]| {
+            let e = read_volume(dir.path()).unwrap_err().to_string();
+            assert!(words.iter().all(|w| e.contains(w)), "{words:?} are not all in: {e}");
+        };
+        write(&at("s3.tif"), 2, None);
+        refused(&["slices", "4 files like s1.tif"]);
+        let mut w = TiffEncoder::new(File::create(at("s3.tif")).unwrap()).unwrap();
+        w.write_image::<Gray16>(2, 3, &[0; 6]).unwrap();
+        drop(w);
+        refused(&["s3.tif: image", "3 x 2 pixels", "2 x 3 pixels, as in s1.tif"]);
+        std::fs::write(at("s3.tif"), "no image").unwrap();
+        refused(&["s3.tif", "TIFF"]);
+    }
+}
