@@ -74,8 +74,8 @@ scan, error, file, before, after = sys.argv[1:]
 found = json.load(open(file))
 key = error.split("=")[0]
 def said(p):
-    if p["verdict"] == "untold":
-        return f"{p['parameter']} untold"
+    if p["verdict"] == "not-determined":
+        return f"{p['parameter']} not determined"
     end = {"corrected": "", "kept": " kept"}[p["verdict"]]
     return f"{p['parameter']} {p['change']:.3f} ± {p['uncertainty']:.3f} {p['unit']}, {p['pixels'][0]:.2f} ± {p['pixels'][1]:.2f} pixels{end}"
 asked = [said(p) for p in found["parameters"] if p["parameter"] == key or p["verdict"] == "corrected"]

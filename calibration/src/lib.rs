@@ -85,7 +85,7 @@ pub enum Verdict {
     /// It is right as far as the views tell: the correction leaves it as it is.
     Kept,
     /// The views do not tell: it is left as it is.
-    Untold,
+    NotDetermined,
 }
 
 /// What the views tell of a parameter.
@@ -268,8 +268,8 @@ fn look_at_pairs(
     for &parameter in asked {
         if let Some(reason) = reason(&parameter) {
             let told = Told { deviation: f64::INFINITY, sensitivity: 0.0, sure: false };
-            let untold = finding(parameter, 0.0, told, PAIRS, geometry, scan);
-            found.push(Found { reason: Some(reason), ..untold });
+            let unchanged = finding(parameter, 0.0, told, PAIRS, geometry, scan);
+            found.push(Found { reason: Some(reason), ..unchanged });
         }
     }
     let active: Vec<Parameter> = asked.iter().copied().filter(|p| reason(p).is_none()).collect();
@@ -312,7 +312,7 @@ fn settle<F>(
             let of = all.iter().filter(|f| f.verdict == verdict);
             of.max_by(|a, b| vagueness(a).total_cmp(&vagueness(b))).map(|f| f.parameter)
         };
-        let Some(gone) = vaguest(Verdict::Untold).or_else(|| vaguest(Verdict::Kept)) else {
+        let Some(gone) = vaguest(Verdict::NotDetermined).or_else(|| vaguest(Verdict::Kept)) else {
             found.append(&mut all);
             found.sort_by_key(|f| f.parameter);
             return Ok((found, fit));
@@ -347,13 +347,13 @@ fn finding(parameter: Parameter, value: f64, told: Told, limits: Limits, geometr
     let pixel = parameter.pixel(geometry);
     let deviation = told.deviation.hypot(limits.inexact * pixel);
     let verdict = if !(deviation < VAGUE * pixel && told.sensitivity > limits.flat) {
-        Verdict::Untold
+        Verdict::NotDetermined
     } else if value.abs() <= CLEAR * deviation {
         Verdict::Kept
     } else if told.sure {
         Verdict::Corrected
     } else {
-        Verdict::Untold
+        Verdict::NotDetermined
     };
     let full = match parameter {
         Parameter::OffsetV => norm(scan.geometry.views[0].v),
@@ -362,7 +362,7 @@ fn finding(parameter: Parameter, value: f64, told: Told, limits: Limits, geometr
     Found {
         parameter,
         verdict,
-        reason: (verdict == Verdict::Untold).then_some(FLAT_REASON),
+        reason: (verdict == Verdict::NotDetermined).then_some(FLAT_REASON),
         unit: parameter.unit(),
         change: value * parameter.in_unit(),
         uncertainty: deviation * parameter.in_unit(),

@@ -145,13 +145,13 @@ fn row(f: &Found) -> Vec<String> {
         |x: f64| if f.uncertainty > 0.0 && f.uncertainty < 0.01 { format!("{x:.4}") } else { format!("{x:.3}") };
     let [pixels, deviation] = f.pixels;
     let (change, uncertainty, pixels) = match f.verdict {
-        Verdict::Untold => ("-".into(), "-".into(), String::new()),
+        Verdict::NotDetermined => ("-".into(), "-".into(), String::new()),
         _ => (digits(f.change), digits(f.uncertainty), format!("{pixels:.2} ± {deviation:.2}")),
     };
     let said = match f.verdict {
         Verdict::Corrected => "corrected",
         Verdict::Kept => "right: unchanged",
-        Verdict::Untold => "not determined by the views: unchanged",
+        Verdict::NotDetermined => "not determined by the views: unchanged",
     };
     vec![f.parameter.to_string(), change, uncertainty, f.unit.into(), pixels, said.into()]
 }
@@ -189,7 +189,7 @@ fn draw(path: &Path, found: &Calibration) -> Result<()> {
                 ("as told".to_owned(), mark(0.0)),
             ];
             let title = match f.verdict {
-                Verdict::Untold => format!("{}: not told", f.parameter),
+                Verdict::NotDetermined => format!("{}: not determined", f.parameter),
                 _ => format!("{}: {:.3} ± {:.3} {}", f.parameter, f.change, f.uncertainty, f.unit),
             };
             (title, [format!("change of {} ({})", f.parameter, f.unit), name.to_owned()], series)

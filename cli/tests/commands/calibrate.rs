@@ -130,8 +130,8 @@ fn what_the_views_do_not_tell_is_not_invented() {
     conefield_io::write_scan(at("ball"), &scan_ellipsoids(&[ball], geometry), None).unwrap();
     let found =
         json(&["calibrate", &text(&at("ball")), "--pixels", "24", "--parameters", "offset-u,rotation,step", "--json"]);
-    assert_eq!(of(&found, "rotation")["verdict"], "untold", "{found}");
-    assert_eq!(of(&found, "step")["verdict"], "untold", "{found}");
+    assert_eq!(of(&found, "rotation")["verdict"], "not-determined", "{found}");
+    assert_eq!(of(&found, "step")["verdict"], "not-determined", "{found}");
     assert_eq!(of(&found, "offset-u")["verdict"], "kept", "{found}");
 }
 
