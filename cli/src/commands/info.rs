@@ -127,18 +127,23 @@ fn volume(path: &Path, png: Option<&Path>) -> Result<Value> {
         "values": statistics(v.data.view()),
         "affine": v.affine,
         "missing": missing,
-        "warnings": volume_warnings(&v),
+        "warnings": volume_warnings(path, &v),
     }))
 }
 
-/// Hints that the values are not attenuation.
-fn volume_warnings(v: &Volume) -> Vec<Value> {
+/// Hints that the values are not attenuation, and that images may be views instead of slices.
+fn volume_warnings(path: &Path, v: &Volume) -> Vec<Value> {
     let low = v.data.iter().copied().fold(f32::INFINITY, f32::min);
     let high = v.data.iter().copied().fold(f32::NEG_INFINITY, f32::max);
     let advice = "simulate, pretrain and convert take --values hu:MU_WATER or clip:LO,HI for them";
     let hounsfield = low <= -500.0 && high > 0.0;
     let found = format!("values from {low} to {high} look like Hounsfield units, not attenuation");
-    hounsfield.then(|| json!({ "kind": "values", "found": found, "advice": advice })).into_iter().collect()
+    let values = hounsfield.then(|| json!({ "kind": "values", "found": found, "advice": advice }));
+    let found = "a folder of images without voxel sizes is read as the slices of a volume";
+    let advice = "if they are the views of a scan, describe them in a scanner.toml (docs/guide/scan-in.md) and use `conefield import`";
+    let views =
+        (path.is_dir() && v.affine.is_none()).then(|| json!({ "kind": "views", "found": found, "advice": advice }));
+    values.into_iter().chain(views).collect()
 }
 
 /// Geometry in mm, values and warnings of a scan.

@@ -124,6 +124,8 @@ fn a_scan_comes_in_as_the_guide_says() {
     let dir = tempfile::tempdir().unwrap();
     let at = |name: &str| dir.path().join(name);
     scanner_files(dir.path());
+    let said = done(&["info", &text(&at("views"))]);
+    assert!(said.contains("scanner.toml") && said.contains("views of a scan"), "{said}");
     assert_eq!(run("scan-in", &page, dir.path()), 5);
     assert!(at("volume.mha").exists());
 

@@ -22,6 +22,8 @@ pub fn cargo(folder: &Path, args: &[&str]) {
     let _one = CARGO.lock().unwrap_or_else(|e| e.into_inner());
     let mut command = Command::new(env!("CARGO"));
     command.current_dir(folder).args(args).env("CARGO_TARGET_DIR", target());
+    // Compilation takes longer than what the plugins compute here.
+    command.env("CARGO_PROFILE_RELEASE_OPT_LEVEL", "1");
     let output = command.output().expect("cargo starts");
     let said = String::from_utf8_lossy(&output.stderr);
     assert!(output.status.success(), "cargo {args:?} in {}: {said}", folder.display());
