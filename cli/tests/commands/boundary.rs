@@ -406,7 +406,7 @@ fn what_a_killed_comparison_had_started_is_waited_for() {
     let (dir, scan) = with_scan();
     let all = dir.path().join("all");
     // Steps of a second, so that the run outlives its comparison.
-    let sets = ["--set", "training.rays=20000", "--set", "projector.samples=800", "--steps", "3"];
+    let sets = ["--set", "training.rays=5000", "--set", "projector.samples=800", "--steps", "3"];
     let begin = ["compare", &scan, "--specs", "fast", "-o", &text(&all), "--checkpoint-every", "0.05s"];
     let args = [&begin[..], &sets].concat();
     let mut child = Command::new(assert_cmd::cargo::cargo_bin("conefield"))

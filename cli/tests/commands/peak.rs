@@ -53,7 +53,7 @@ fn a_reference_in_another_unit_is_told() {
         let program = command.get_program().to_owned();
         command = assert_cmd::Command::new(program);
         let output = command.args(["evaluate", volume, &truth]).output().unwrap();
-        assert!(output.status.success());
+        assert!(output.status.success(), "{output:?}");
         String::from_utf8_lossy(&output.stderr).into_owned()
     };
     assert!(said(&other).contains("multiplied by 49"), "{}", said(&other));

@@ -160,9 +160,9 @@ fn a_regularizer_as_built_in() {
 fn killed_and_resumed() {
     let place = place();
     let [whole, killed] = ["whole", "killed"].map(|f| text(&place.dir.path().join(f)));
-    done(&place.reconstruct(&whole, "3000", &[]));
+    done(&place.reconstruct(&whole, "1500", &[]));
     let checkpoint = Path::new(&killed).join("checkpoint.safetensors");
-    let arguments = place.reconstruct(&killed, "3000", &["--checkpoint-every", "0.02s"]);
+    let arguments = place.reconstruct(&killed, "1500", &["--checkpoint-every", "0.02s"]);
     let mut child = std::process::Command::new(assert_cmd::cargo::cargo_bin("conefield"))
         .arg("--quiet")
         .args(&arguments)
