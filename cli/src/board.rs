@@ -42,3 +42,38 @@ impl Board {
 fn step(record: &Value) -> u64 {
     record["step"].as_u64().unwrap_or(0)
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_resumed_run_keeps_its_pictures_and_repeats_no_point() {
+        let dir = tempfile::tempdir().unwrap();
+        let [events, metrics] = ["events", "metrics.jsonl"].map(|name| dir.path().join(name));
+        let line = |step: u64| format!("{{\"step\":{step},\"loss\":0.5}}\n");
+        let count = |word: &str| {
+            let bytes = fs::read(&events).unwrap();
+            bytes.windows(word.len()).filter(|w| *w == word.as_bytes()).count()
+        };
+        fs::write(&metrics, "").unwrap();
+        let mut board = Board::new(&events, &metrics).unwrap();
+        board.record(&serde_json::from_str(&line(10)).unwrap()).unwrap();
+        let png = dir.path().join("live.png");
+        fs::write(&png, b"\x89PNG\r\n\x1a\n\0\0\0\rIHDR\0\0\0\x07\0\0\x01\0rest").unwrap();
+        board.picture(15, "live", &png).unwrap();
+        board.record(&serde_json::from_str(&line(20)).unwrap()).unwrap();
+        board.picture(25, "live", &png).unwrap();
+        // The run goes on after step 20: the later picture is made again.
+        fs::write(&metrics, line(10) + &line(20)).unwrap();
+        drop(Board::new(&events, &metrics).unwrap());
+        assert_eq!([count("IHDR"), count("loss")], [1, 2]);
+        fs::write(&metrics, line(10) + &line(20) + &line(30)).unwrap();
+        drop(Board::new(&events, &metrics).unwrap());
+        assert_eq!([count("IHDR"), count("loss")], [1, 3]);
+        // A new run begins a new file.
+        fs::write(&metrics, "").unwrap();
+        drop(Board::new(&events, &metrics).unwrap());
+        assert_eq!([count("IHDR"), count("loss")], [0, 0]);
+    }
+}
