@@ -1,7 +1,8 @@
 //! Helpers shared by the tests of several modules.
 
+use crate::{is_volume, read_volume, volume_voxels, write_volume};
 use conefield_core::geometry::{Geometry, Millimetres, Radians, View, VoxelGrid};
-use conefield_core::scan::{Scan, Unit};
+use conefield_core::scan::{Scan, Unit, Volume};
 use ndarray::Array3;
 use std::path::PathBuf;
 
@@ -16,6 +17,30 @@ pub(crate) fn data(name: &str) -> Option<PathBuf> {
     }
     eprintln!("skipped: {} is not there; CONEFIELD_DATA names the folder of the shared data", path.display());
     None
+}
+
+/// Writes `data` to a file called `name` and reads it: values, grid and affine are the same bits, with the volume centred
+/// and with an affine of its own that turns and mirrors.
+pub(crate) fn comes_back_to_the_bit(name: &str, data: Array3<f32>) {
+    let dir = tempfile::tempdir().unwrap();
+    let path = dir.path().join(name);
+    let count = data.len();
+    let mut volume = Volume::centered(data, [1.0 / 3.0, 0.7, 2.0]);
+    write_volume(&path, &volume).unwrap();
+    let back = read_volume(&path).unwrap();
+    assert_eq!((&back.data, back.grid), (&volume.data, volume.grid));
+    assert!(is_volume(&path) && back.data.is_standard_layout());
+    assert_eq!(volume_voxels(&path).unwrap(), count as u64);
+    let centred = back.affine.unwrap();
+    let corner = volume.grid.voxel([0; 3]);
+    assert_eq!(centred.map(|r| r[3]), [corner[0], corner[1], corner[2], 1.0]);
+    let turned = [[0.0, 0.7, 0.0, 5.1], [-1.0 / 3.0, 0.0, 0.0, 6.0], [0.0, 0.0, -2.0, -7.0], [0.0, 0.0, 0.0, 1.0]];
+    for affine in [centred, turned] {
+        volume.affine = Some(affine);
+        write_volume(&path, &volume).unwrap();
+        let back = read_volume(&path).unwrap();
+        assert_eq!((&back.data, back.grid, back.affine), (&volume.data, volume.grid, Some(affine)));
+    }
 }
 
 /// A `.npy` file with the given header entries.

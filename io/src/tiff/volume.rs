@@ -183,8 +183,8 @@ impl StackText {
 
 #[cfg(test)]
 mod tests {
-    use crate::{is_volume, read_volume, volume_voxels, write_volume};
-    use conefield_core::scan::Volume;
+    use crate::testing::comes_back_to_the_bit;
+    use crate::{is_volume, read_volume, volume_voxels};
     use ndarray::Array3;
     use std::fs::File;
     use std::path::Path;
@@ -193,21 +193,8 @@ mod tests {
 
     #[test]
     fn what_is_written_comes_back_to_the_bit() {
-        let dir = tempfile::tempdir().unwrap();
-        let path = dir.path().join("a.tif");
         let data = Array3::from_shape_fn((4, 3, 2), |(x, y, z)| (x + 10 * y + 100 * z) as f32 / 7.0);
-        let mut volume = Volume::centered(data, [1.0 / 3.0, 0.7, 2.0]);
-        write_volume(&path, &volume).unwrap();
-        let back = read_volume(&path).unwrap();
-        assert_eq!((&back.data, back.grid), (&volume.data, volume.grid));
-        assert!(back.data.is_standard_layout());
-        let turned = [[0.0, 0.7, 0.0, 5.1], [-1.0 / 3.0, 0.0, 0.0, 6.0], [0.0, 0.0, -2.0, -7.0], [0.0, 0.0, 0.0, 1.0]];
-        volume.affine = Some(turned);
-        write_volume(&path, &volume).unwrap();
-        let back = read_volume(&path).unwrap();
-        assert_eq!((back.data, back.grid, back.affine), (volume.data, volume.grid, Some(turned)));
-        assert!(is_volume(&path));
-        assert_eq!(volume_voxels(&path).unwrap(), 24);
+        comes_back_to_the_bit("a.tif", data);
     }
 
     /// Pages of 3 x 2 pixels, with a text on the first one.

@@ -4,6 +4,7 @@
 use crate::affine::{self, Affine};
 use crate::folder;
 use crate::input::{Input, LONGEST_TEXT, must_unpack};
+use crate::npy;
 use crate::number::{ByteOrder, Number};
 use crate::text::{Notation, parse, shortened};
 use conefield_core::files::read_text;
@@ -159,28 +160,12 @@ impl Stored {
             let found = format!("{:?} in chunks of {:?}", array.shape, array.chunks);
             return Err(invalid("shape", found, "at least one voxel along each axis"));
         }
-        let (order, number) = match array.dtype.split_at_checked(1) {
-            Some(("<" | "|", kind)) => (ByteOrder::Little, kind),
-            Some((">", kind)) => (ByteOrder::Big, kind),
-            _ => (ByteOrder::Little, ""),
-        };
-        let number = match number {
-            "b1" => Number::Bool,
-            "u1" => Number::U8,
-            "i1" => Number::I8,
-            "u2" => Number::U16,
-            "i2" => Number::I16,
-            "u4" => Number::U32,
-            "i4" => Number::I32,
-            "u8" => Number::U64,
-            "i8" => Number::I64,
-            "f4" => Number::F32,
-            "f8" => Number::F64,
-            _ => {
-                let expected = "a real number of 8 to 64 bits such as \"<f4\" or \"|u1\"";
-                return Err(invalid("dtype", shortened(&array.dtype), expected));
-            }
-        };
+        // Unlike NumPy, Zarr always says the byte order.
+        let element = npy::element(&array.dtype).filter(|_| array.dtype.starts_with(['<', '>', '|']));
+        let (number, order) = element.ok_or_else(|| {
+            let expected = "a real number of 8 to 64 bits such as \"<f4\" or \"|u1\"";
+            invalid("dtype", shortened(&array.dtype), expected)
+        })?;
         let packing = match array.compressor.as_ref().map(|c| c.id.as_str()) {
             None => Packing::None,
             Some("zlib") => Packing::Zlib,
@@ -341,8 +326,8 @@ pub(crate) fn read(path: &Path) -> Result<Volume> {
 
 #[cfg(test)]
 mod tests {
-    use crate::{is_volume, read_volume, volume_voxels, write_volume};
-    use conefield_core::scan::Volume;
+    use crate::read_volume;
+    use crate::testing::comes_back_to_the_bit;
     use flate2::{Compression, write::GzEncoder};
     use ndarray::Array3;
     use std::fs;
@@ -351,22 +336,9 @@ mod tests {
 
     #[test]
     fn what_is_written_comes_back_to_the_bit() {
-        let dir = tempfile::tempdir().unwrap();
-        let path = dir.path().join("a.zarr");
+        // More than one chunk along x and z.
         let data = Array3::from_shape_fn((70, 5, 66), |(x, y, z)| (x + 100 * y) as f32 / 7.0 - 3.5 * z as f32);
-        let mut volume = Volume::centered(data, [1.0 / 3.0, 0.7, 2.0]);
-        write_volume(&path, &volume).unwrap();
-        let back = read_volume(&path).unwrap();
-        assert_eq!((&back.data, back.grid), (&volume.data, volume.grid));
-        let corner = volume.grid.voxel([0; 3]);
-        assert_eq!(back.affine.unwrap().map(|r| r[3]), [corner[0], corner[1], corner[2], 1.0]);
-        assert!(is_volume(&path) && back.data.is_standard_layout());
-        assert_eq!(volume_voxels(&path).unwrap(), 70 * 5 * 66);
-        let turned = [[0.0, 0.7, 0.0, 5.1], [-1.0 / 3.0, 0.0, 0.0, 6.0], [0.0, 0.0, -2.0, -7.0], [0.0, 0.0, 0.0, 1.0]];
-        volume.affine = Some(turned);
-        write_volume(&path, &volume).unwrap();
-        let back = read_volume(&path).unwrap();
-        assert_eq!((back.data, back.grid, back.affine), (volume.data, volume.grid, Some(turned)));
+        comes_back_to_the_bit("a.zarr", data);
     }
 
     /// A pyramid of one level with 2 x 1 x 3 voxels along x, y, z, in chunks of two slices.
