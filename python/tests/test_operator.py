@@ -91,3 +91,62 @@ def test_torch_differentiates_through_it(geometry):
     y = torch.rand(geometry.projections_shape, dtype=torch.float64)
     (0.5 * (project(x, a) - y).square().sum()).backward()
     np.testing.assert_allclose(x.grad.numpy(), a.T @ (a @ x.detach().numpy() - y.numpy()), rtol=1e-10)
+
+
+def test_torch_checks_the_gradients_of_both(geometry):
+    torch = pytest.importorskip("torch")
+    from conefield.torch import project
+
+    for projector in ("joseph", "siddon", "trilinear"):
+        a = conefield.Operator(geometry, projector=projector, dtype=np.float64)
+        for operator in (a, a.T):
+            x = torch.rand(operator.input_shape, dtype=torch.float64, requires_grad=True)
+            apply = lambda x: project(x, operator)
+            assert torch.autograd.gradcheck(apply, x, fast_mode=True)
+            assert torch.autograd.gradgradcheck(apply, x, fast_mode=True)
+
+
+def test_torch_trains_an_unrolled_network_through_it():
+    torch = pytest.importorskip("torch")
+    from conefield.torch import project
+
+    torch.manual_seed(0)
+    scan = conefield.simulate("phantom:head:16", views=8, detector=(16, 16), noise="tigre:1e4,10")
+    a = conefield.Operator(scan.geometry)
+    measured, truth = torch.tensor(scan.projections), torch.tensor(scan.truth.data)
+    # Steps in units of 1/|A|^2.
+    v = np.ones(a.input_shape, np.float32)
+    for _ in range(5):
+        v = a.T @ (a @ v)
+        size = np.linalg.norm(v)
+        v /= size
+
+    class Unrolled(torch.nn.Module):
+        """Gradient steps with trained lengths, each followed by a small convolutional correction."""
+
+        def __init__(self, steps=5):
+            super().__init__()
+            self.lengths = torch.nn.Parameter(torch.ones(steps))
+            self.prior = torch.nn.Sequential(
+                torch.nn.Conv3d(1, 4, 3, padding=1), torch.nn.Tanh(), torch.nn.Conv3d(4, 1, 3, padding=1)
+            )
+
+        def forward(self, y):
+            x = torch.zeros(a.input_shape)
+            for length in self.lengths:
+                x = x + length / size * project(y - project(x, a), a.T)
+                x = x + self.prior(x[None, None])[0, 0]
+            return x
+
+    network = Unrolled()
+    optimizer = torch.optim.Adam(network.parameters(), lr=1e-2)
+    losses = []
+    for _ in range(20):
+        loss = (network(measured) - truth).square().mean()
+        optimizer.zero_grad()
+        loss.backward()
+        optimizer.step()
+        losses.append(loss.item())
+    assert all(p.grad.abs().max() > 0 for p in network.parameters())
+    # An empty volume is no success.
+    assert losses[-1] < 0.5 * losses[0] and losses[-1] < 0.5 * truth.square().mean().item(), losses
