@@ -141,7 +141,7 @@ def test_torch_trains_an_unrolled_network_through_it():
     network = Unrolled()
     optimizer = torch.optim.Adam(network.parameters(), lr=1e-2)
     losses = []
-    for _ in range(20):
+    for _ in range(50):
         loss = (network(measured) - truth).square().mean()
         optimizer.zero_grad()
         loss.backward()
