@@ -35,7 +35,13 @@
   }
   byId("warnings-section").hidden = page.warnings.length === 0;
 
-  for (const run of runs.filter((r) => r.live)) byId("live").append(element("img", { class: "picture", src: run.live, alt: "The middle slices" }));
+  for (const run of runs.filter((r) => !r.record && page.renewed)) {
+    const last = run.curves[run.curves.length - 1] ?? {};
+    const told = [["step", last.step, String], ["after", last.seconds, seconds], ["loss", last.loss], ["PSNR", last.psnr, (x) => `${x.toFixed(2)} dB`], ["held-out error", last.held_out]];
+    const known = told.filter(([, x]) => Number.isFinite(x)).map(([name, x, show = (x) => short(x, 4)]) => `${name} ${show(x)}`);
+    byId("live").append(element("p", {}, known.join(" · ") || "Nothing is recorded yet."));
+    if (run.live) byId("live").append(element("img", { class: "picture", src: run.live, alt: "The middle slices" }));
+  }
   byId("live-section").hidden = byId("live").childElementCount === 0;
 
   const scores = byId("scores");
@@ -57,15 +63,18 @@
     const known = parts.map(([name, key], i) => [name, run.record?.[key] ?? 0, page.colours[i]]).filter(([, s]) => s > 0);
     const all = known.reduce((sum, [, s]) => sum + s, 0);
     if (all === 0) continue;
-    const bar = element("div", { class: "bar" });
+    // Short parts have no room for their names in the bar: all names stand above it.
+    const bar = element("div", { class: "bar" }), names = element("p", {}, `${run.name}: `);
     for (const [name, s, colour] of known) {
-      const part = element("span", { title: `${name}: ${seconds(s)}` }, `${name} ${seconds(s)}`);
+      const [part, swatch] = [element("span", { title: `${name}: ${seconds(s)}` }), element("span", { class: "swatch" })];
       part.style.width = `${(100 * s) / all}%`;
-      part.style.background = colour;
+      part.style.background = swatch.style.background = colour;
       bar.append(part);
+      names.append(element("span", { class: "part" }, swatch, `${name} ${seconds(s)}`));
     }
-    byId("times").append(element("div", { class: "bars" }, `${run.name}: where the time went`, bar));
+    byId("times").append(element("div", { class: "bars" }, names, bar));
   }
+  byId("scores-section").hidden = scores.childElementCount === 1 && byId("times").childElementCount === 0;
 
   for (const run of runs) {
     const plan = run.record?.plan;
@@ -159,8 +168,31 @@
   window.addEventListener("resize", () => { clearTimeout(resized); resized = setTimeout(curves, 200); });
   curves();
 
+  // The page of a run that goes on asks for a newer one, and takes over what the reader has opened. Without an answer it stays.
+  if (page.renewed) {
+    const kept = JSON.parse(sessionStorage.getItem("kept") ?? "{}");
+    for (const summary of document.querySelectorAll("summary")) summary.parentElement.open = (kept.open ?? []).includes(summary.textContent);
+    if (kept.against) byId("against").value = kept.against;
+    curves();
+    const told = (text) => { byId("live-note").textContent = text; };
+    told(`State of ${new Date().toLocaleTimeString()}, renewed every ${page.renewed} s.`);
+    const renew = async () => {
+      try {
+        if (!(await fetch(location.href, { cache: "no-store" })).ok) throw new Error("refused");
+        const open = Array.from(document.querySelectorAll("details[open] > summary"), (s) => s.textContent);
+        sessionStorage.setItem("kept", JSON.stringify({ open, against: byId("against").value }));
+        location.reload();
+      } catch {
+        told("No answer any more: the run has ended, or its process. This is its last state; conefield report shows the result.");
+        setTimeout(renew, 1000 * page.renewed);
+      }
+    };
+    setTimeout(renew, 1000 * page.renewed);
+  }
+
   // Volumes.
   byId("volumes-section").hidden = volumes.length === 0;
+  for (const link of document.querySelectorAll("nav a")) link.hidden = document.querySelector(link.hash).hidden;
   if (volumes.length === 0) return;
 
   /** The stored integers of a volume, decoded once, x fastest. */
@@ -242,6 +274,7 @@
   const low = Math.min(...volumes.map((v) => v.low)), high = Math.max(...volumes.map((v) => v.high));
   const unit = volumes[0].unit;
   byId("water").value = Number(volumes[0].water.toPrecision(4));
+  byId("water").addEventListener("change", () => { if (state.at) moved(state.at); });
   byId("water-label").append(` ${unit}`);
   const hounsfield = (level, width) => () => [level - width / 2, level + width / 2].map((h) => Number(byId("water").value) * (1 + h / 1000));
   const presets = [
@@ -327,6 +360,11 @@
       }
       this.window();
     }
+    /** What stands in the canvas, in words. */
+    caption() {
+      const [index, minus] = this.shown.split(",").map(Number);
+      return volumes[index].name + (minus < 0 ? "" : ` minus ${volumes[minus].name}`);
+    }
     window() {
       const image = this.nv.volumes[0];
       if (!image) return;
@@ -374,12 +412,13 @@
     const voxels = at?.map((i) => (coarser === 1 ? i : `${i * coarser}–${i * coarser + coarser - 1}`)).join(", ");
     byId("place").textContent = `Crosshair at x ${mm[0].toFixed(2)}, y ${mm[1].toFixed(2)}, z ${mm[2].toFixed(2)} mm` + (at ? `, voxel ${voxels}` : "");
     const base = state.minus >= 0 ? rows[state.minus][1] : undefined;
-    byId("values").replaceChildren(row("th", ["volume", `value, ${unit}`, ...(base !== undefined ? [`less ${volumes[state.minus].name}`] : [])]),
+    const water = Number(byId("water").value), hu = (x) => (x === undefined || !(water > 0) ? "-" : String(Math.round(1000 * (x / water - 1))));
+    byId("values").replaceChildren(row("th", ["volume", `value, ${unit}`, "HU, water as above", ...(base !== undefined ? [`less ${volumes[state.minus].name}`] : [])]),
       ...rows.map(([v, x], i) => {
         const cell = figure(x === undefined ? "-" : short(x));
         cell.dataset.volume = i;
         cell.dataset.value = x;
-        return row("td", [v.name, cell, ...(base !== undefined ? [figure(x === undefined ? "-" : short(x - base))] : [])]);
+        return row("td", [v.name, cell, figure(hu(x)), ...(base !== undefined ? [figure(x === undefined ? "-" : short(x - base))] : [])]);
       }));
     remember();
   }
@@ -421,6 +460,8 @@
     }
     await first_pane.show(state.show, state.minus);
     if (state.beside >= 0) await second_pane.show(state.beside, state.minus >= 0 && state.minus !== state.beside && same(volumes[state.beside], volumes[state.minus]) ? state.minus : -1);
+    byId("shown").textContent = first_pane.caption();
+    if (state.beside >= 0) byId("shown-beside").textContent = second_pane.caption();
     const shown = volumes[state.show];
     byId("volume-note").textContent = shown.note;
     showWindow();

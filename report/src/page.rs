@@ -1,7 +1,7 @@
 //! One HTML file that shows runs: volumes in a viewer, scores, curves, projections, geometry, specs, warnings.
 //!
-//! The file contains all data and code and fetches nothing; its content security policy forbids it. The viewer and the
-//! plots use third-party libraries (`report/page/vendor`).
+//! The file contains all data and code and fetches nothing; its content security policy forbids it. Only the page of a run that goes
+//! on asks its own server for a newer one. The viewer and the plots use third-party libraries (`report/page/vendor`).
 
 mod picture;
 mod volume;
@@ -37,6 +37,8 @@ pub struct Page {
     pub scans: Vec<PageScan>,
     /// Remarks about the page itself.
     pub notes: Vec<String>,
+    /// Seconds after which the page asks its server for a newer one; without a server it fetches nothing.
+    pub renewed: Option<u64>,
 }
 
 /// A warning.
@@ -160,6 +162,7 @@ impl Page {
         for (i, piece) in FRAME.split('@').enumerate() {
             match piece {
                 text if i % 2 == 0 => put(text)?,
+                "server" => put(self.renewed.map_or("", |_| " 'self'"))?,
                 "title" => put(&in_markup(&self.title))?,
                 "styles" => STYLES.into_iter().try_for_each(&mut *put)?,
                 "page" => put(&text)?,
@@ -217,7 +220,7 @@ mod tests {
     #[test]
     fn the_frame_has_every_mark_once_and_the_libraries_end_no_element() {
         let marks: Vec<&str> = FRAME.split('@').skip(1).step_by(2).collect();
-        assert_eq!(marks, ["title", "styles", "page", "volumes", "plots", "viewer", "script"]);
+        assert_eq!(marks, ["server", "title", "styles", "page", "volumes", "plots", "viewer", "script"]);
         for script in [PLOTS, VIEWER, SCRIPT] {
             let lower = script.to_lowercase();
             assert!(!lower.contains("</script") && !lower.contains("<!--"));

@@ -79,6 +79,8 @@ const SAGITTAL: Plane = Plane { name: "sagittal", axes: "y → z ↑", cut: 0, s
 enum Cell<'a> {
     Empty,
     Values(&'a MiddleSlices),
+    /// Of a plane of its own.
+    Slice(Plane, &'a MiddleSlices),
     /// Result and reference.
     Difference(&'a MiddleSlices, &'a MiddleSlices),
     /// Red, green and blue from 0 to 1.
@@ -92,11 +94,17 @@ struct Row<'a> {
     cells: Vec<Cell<'a>>,
 }
 
-/// Draws the middle slices of a result, with those of `reference` and their difference if given.
+/// Draws the middle slices of a result: side by side, or with those of `reference` and their difference in rows.
 pub fn result_png(path: impl AsRef<Path>, reference: Option<&MiddleSlices>, result: &MiddleSlices) -> Result<()> {
     match reference {
         Some(r) => slices_png(path, &[("reference", r), ("result", result)], r.window(), Some(0)),
-        None => slices_png(path, &[("result", result)], result.window(), None),
+        None => {
+            let planes = [AXIAL, CORONAL, SAGITTAL];
+            let captions = planes.map(|p| format!("{}  {}", p.name, p.axes));
+            let cells = planes.map(|p| Cell::Slice(p, result)).into();
+            let row = Row { plane: Plane { name: "", axes: "", ..AXIAL }, note: "", cells };
+            draw(path.as_ref(), &captions, &[row], result.window())
+        }
     }
 }
 
@@ -201,7 +209,8 @@ fn draw(path: &Path, captions: &[String], rows: &[Row], window: [f32; 2]) -> Res
     let text = (f64::from(widths.iter().sum::<u32>()) / 60.0).clamp(15.0, 40.0) as f32;
 
     let spread = difference_spread(rows);
-    let left = (text * 6.2) as u32;
+    let named = rows.iter().any(|r| !r.plane.name.is_empty());
+    let left = if named { (text * 6.2) as u32 } else { GAP };
     let top = (text * 1.9) as u32;
     let bars = (text * if spread.is_some() { 8.4 } else { 4.6 }) as u32;
     let inner: u32 = heights.iter().map(|h| h + GAP).sum();
@@ -271,16 +280,22 @@ impl Cell<'_> {
     fn volume(&self) -> Option<&MiddleSlices> {
         match self {
             Cell::Empty => None,
-            Cell::Values(v) | Cell::Difference(v, _) | Cell::Colours([v, ..]) => Some(v),
+            Cell::Values(v) | Cell::Slice(_, v) | Cell::Difference(v, _) | Cell::Colours([v, ..]) => Some(v),
         }
+    }
+
+    /// The plane that it shows in a row of `plane`.
+    fn plane(&self, plane: Plane) -> Plane {
+        if let Cell::Slice(own, _) = self { *own } else { plane }
     }
 }
 
 impl Row<'_> {
     /// Width and height of a cell in mm.
     fn size(&self, column: usize) -> [f64; 2] {
-        let size = self.cells.get(column).and_then(Cell::volume).map(|v| v.grid.size());
-        size.map_or([0.0; 2], |s| self.plane.seen.map(|k| s[k]))
+        let cell = self.cells.get(column);
+        let size = cell.and_then(|c| Some((c.plane(self.plane), c.volume()?.grid.size())));
+        size.map_or([0.0; 2], |(plane, s)| plane.seen.map(|k| s[k]))
     }
 }
 
@@ -310,7 +325,7 @@ fn draw_cell(
     spread: f32,
 ) {
     let Some(v) = cell.volume() else { return };
-    let plane = row.plane;
+    let plane = cell.plane(row.plane);
     // `[right, up]`
     let size = plane.seen.map(|k| (v.grid.size()[k] * scale).round().max(1.0) as u32);
     let (w, h) = (size[0].min(width), size[1].min(height));
@@ -323,7 +338,7 @@ fn draw_cell(
         let at = |v: &MiddleSlices| v.across[plane.cut][[i.min(n.0 - 1), j.min(n.1 - 1)]];
         match cell {
             Cell::Empty => PAPER,
-            Cell::Values(v) => grey((at(v) - window[0]) / (window[1] - window[0])),
+            Cell::Values(v) | Cell::Slice(_, v) => grey((at(v) - window[0]) / (window[1] - window[0])),
             Cell::Difference(v, r) => diverging((at(v) - at(r)) / spread),
             Cell::Colours(c) => mixed(c.map(at)),
         }
@@ -387,6 +402,19 @@ mod tests {
         // The difference contains red and blue.
         assert!(image.pixels().any(|p| p.0[0] > 150 && p.0[2] < 120));
         assert!(image.pixels().any(|p| p.0[2] > 150 && p.0[0] < 120));
+    }
+
+    #[test]
+    fn the_planes_of_a_result_alone_stand_side_by_side() {
+        let (_dir, folder) = folder();
+        let path = folder.join("alone.png");
+        result_png(&path, None, &ball([40, 40, 20], [1.0; 3], 0.5)).unwrap();
+        let image = image::open(&path).unwrap().to_rgb8();
+        // Three of the same width, the axial one twice as high as the others.
+        assert!(image.width() > 900 && image.height() < image.width() / 2, "{:?}", image.dimensions());
+        let black = |x: u32| (0..image.height()).filter(|y| image.get_pixel(x, *y).0.iter().all(|c| *c < 60)).count();
+        let (axial, coronal) = (black(20), black(20 + image.width() * 3 / 10));
+        assert!(coronal > 50 && axial > coronal * 3 / 2, "{axial} {coronal}");
     }
 
     #[test]

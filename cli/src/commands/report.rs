@@ -20,11 +20,11 @@ use std::path::{Path, PathBuf};
 ///
 /// The page has slices, a rendering and values of the volumes, differences to the reference and between runs, scores, times, memory, training
 /// curves, measured and predicted projections with residuals, the geometry, the spec and what it builds, and warnings. RUN is the folder of
-/// "conefield reconstruct" or of "conefield compare". Scan and reference are read from where the run read them; missing ones are
-/// left out with a note.
+/// "conefield reconstruct", "conefield compare" or "conefield study". Scan and reference are read from where the run read them; missing
+/// ones are left out with a note.
 #[derive(Args)]
 pub struct ReportArgs {
-    /// The folder of a run or of a comparison; several are shown side by side.
+    /// The folder of a run, a comparison or a study; several are shown side by side.
     #[arg(required = true, value_name = "RUN")]
     runs: Vec<PathBuf>,
     /// The page, such as report.html.
@@ -130,10 +130,10 @@ impl ReportArgs {
     }
 }
 
-/// The page of an unfinished run: curves, spec and the live picture, without large files.
-pub fn standing(folder: &Path) -> Result<String> {
+/// The page of an unfinished run: curves, spec and the live picture, without large files. Browsers renew it after `seconds`.
+pub fn standing(folder: &Path, seconds: u64) -> Result<String> {
     let found = [RunOnDisk::read(folder)?];
-    let mut page = Page::default();
+    let mut page = Page { renewed: Some(seconds), ..Page::default() };
     page.runs = runs::told(&found, &mut page.warnings);
     // The run is still active, so the warning about an interrupted run does not apply.
     page.warnings.clear();

@@ -8,8 +8,8 @@ use std::path::{Path, PathBuf};
 use std::time::Duration;
 use tracing::{debug, info};
 
-/// Refresh interval of the browser in seconds.
-const REFRESH: u64 = 5;
+/// Seconds after which the page asks for a newer one.
+const RENEWED: u64 = 5;
 
 /// Time limit of a request, and maximum size of one in bytes.
 const PATIENCE: Duration = Duration::from_secs(2);
@@ -50,14 +50,14 @@ fn answer(mut stream: TcpStream, port: u16, folder: &Path) -> std::io::Result<()
     }
     let (status, body) = match refusal(&String::from_utf8_lossy(&asked), port) {
         Some((status, text)) => (status, text.to_owned()),
-        None => match standing(folder) {
+        None => match standing(folder, RENEWED) {
             Ok(page) => ("200 OK", page),
             Err(e) => ("500 Internal Server Error", e.to_string()),
         },
     };
     let kind = if status.starts_with("200") { "text/html" } else { "text/plain" };
     let head = format!(
-        "HTTP/1.1 {status}\r\nContent-Type: {kind}; charset=utf-8\r\nContent-Length: {}\r\nRefresh: {REFRESH}\r\n\
+        "HTTP/1.1 {status}\r\nContent-Type: {kind}; charset=utf-8\r\nContent-Length: {}\r\n\
          Cache-Control: no-store\r\nX-Frame-Options: DENY\r\nX-Content-Type-Options: nosniff\r\nConnection: close\r\n\r\n",
         body.len()
     );

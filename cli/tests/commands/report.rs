@@ -221,8 +221,8 @@ fn bad_input_is_refused_before_anything_is_written() {
     fs::create_dir(at("empty")).unwrap();
     for (args, want) in [
         (&["report", &at("none"), "-o", &out][..], "none"),
-        (&["report", &at("empty"), "-o", &out], "a comparison (table.json)"),
-        (&["report", &scan, "-o", &out], "a comparison (table.json)"),
+        (&["report", &at("empty"), "-o", &out], "or a study (table.json)"),
+        (&["report", &scan, "-o", &out], "or a study (table.json)"),
         (&["report", &run, &run, "-o", &out], "each run once"),
         (&["report", &run, "-o", &at("page.pdf")], "an end of .html"),
         (&["report", &run, "-o", &out, "--views", "9"], "below 9"),
@@ -352,7 +352,9 @@ fn a_run_that_is_watched_shows_its_page_to_this_machine_alone() {
     child.kill().unwrap();
     child.wait().unwrap();
     let found = found.expect("the page with a curve and a picture");
-    assert!(found.starts_with("HTTP/1.1 200 OK\r\n") && found.contains("\r\nRefresh: 5\r\n"));
+    assert!(found.starts_with("HTTP/1.1 200 OK\r\n") && found.contains("\"renewed\":5"));
+    // Only this page may ask its server, and no other.
+    assert!(found.contains("connect-src data: blob: 'self'\""));
     assert!(!found.contains("interrupted") && found.ends_with("</html>\n"));
     for (answer, status) in others.iter().zip(["403", "404", "405", "403"]) {
         assert!(answer.starts_with(&format!("HTTP/1.1 {status} ")) && answer.len() < 500, "{answer}");

@@ -13,7 +13,7 @@ use serde::Deserialize;
 use std::collections::BTreeSet;
 use std::path::{Path, PathBuf};
 
-/// The runs in `folders`: each is a run, or a comparison with several.
+/// The runs in `folders`: each is a run, or a comparison or a study with several.
 pub fn find(folders: &[PathBuf]) -> Result<Vec<RunOnDisk>> {
     let mut found: Vec<RunOnDisk> = vec![];
     for folder in folders {
@@ -39,20 +39,35 @@ fn of_folder(folder: &Path) -> Result<Vec<PathBuf>> {
     let place = folder.display().to_string();
     let table = folder.join("table.json");
     if !table.is_file() {
-        let expected = "the folder of a run (spec.toml and metrics.jsonl) or of a comparison (table.json)";
+        let expected = "the folder of a run (spec.toml and metrics.jsonl), or of a comparison or a study (table.json)";
         ensure(RunOnDisk::is(folder), &place, "run", "no run", expected)?;
         return Ok(vec![folder.to_path_buf()]);
     }
     let comparison: Comparison = read_json(&table)?;
     let mut runs = vec![];
-    for method in comparison.methods {
-        // The name must be a plain folder name.
-        let plain = Path::new(&method.name).components().count() == 1 && !method.name.starts_with('.');
-        ensure(plain, &table.display().to_string(), "name", format!("{:?}", method.name), "the name of a folder")?;
-        runs.extend(Some(folder.join(&method.name)).filter(|run| RunOnDisk::is(run)));
+    for case in cases(folder)? {
+        for method in &comparison.methods {
+            // The name must be a plain folder name.
+            let plain = Path::new(&method.name).components().count() == 1 && !method.name.starts_with('.');
+            ensure(plain, &table.display().to_string(), "name", format!("{:?}", method.name), "the name of a folder")?;
+            runs.extend(Some(case.join(&method.name)).filter(|run| RunOnDisk::is(run)));
+        }
     }
-    ensure(!runs.is_empty(), &place, "runs", "none", "a comparison with at least one run")?;
+    ensure(!runs.is_empty(), &place, "runs", "none", "a comparison or a study with at least one run")?;
     Ok(runs)
+}
+
+/// The folders that hold a run of each method: a comparison itself, those in `runs` of a study.
+fn cases(folder: &Path) -> Result<Vec<PathBuf>> {
+    let inner = folder.join("runs");
+    if !inner.is_dir() || RunOnDisk::is(&inner) {
+        return Ok(vec![folder.to_path_buf()]);
+    }
+    let failed = |e| conefield_core::Error::io(&inner, e);
+    let entries = std::fs::read_dir(&inner).map_err(failed)?.map(|entry| Ok(entry.map_err(failed)?.path()));
+    let mut found: Vec<PathBuf> = entries.collect::<Result<_>>()?;
+    found.sort();
+    Ok(found)
 }
 
 /// The runs of the page, with unique names.
@@ -89,14 +104,26 @@ fn plan(run: &RunOnDisk) -> Result<String> {
     Ok(Explanation::new(&loaded, plan.as_ref(), None)?.text())
 }
 
-/// Names of the specs, of the folders if these are ambiguous, or else full paths.
+/// Names of the specs; if these are ambiguous, of the folders, of the folders in their parents as in a study, or else full paths.
 fn names(found: &[RunOnDisk]) -> Vec<String> {
+    #[derive(Deserialize)]
+    struct Named {
+        name: String,
+    }
+    // A run that goes on has no record yet.
     let own = |run: &RunOnDisk| {
-        run.spec_name().map(str::to_owned).unwrap_or_else(|| stem(&run.folder().display().to_string()))
+        let named = run.spec_name().map(str::to_owned);
+        let named = named.or_else(|| toml::from_str(run.spec()).ok().map(|n: Named| n.name));
+        named.unwrap_or_else(|| stem(&run.folder().display().to_string()))
     };
-    let folder = |run: &RunOnDisk| stem(&run.folder().canonicalize().unwrap_or_default().display().to_string());
+    let whole = |run: &RunOnDisk| run.folder().canonicalize().unwrap_or_default();
+    let folder = |run: &RunOnDisk| stem(&whole(run).display().to_string());
+    let nested = |run: &RunOnDisk| {
+        let parent = whole(run).parent().map(|p| stem(&p.display().to_string()));
+        format!("{}/{}", parent.unwrap_or_default(), folder(run))
+    };
     let path = |run: &RunOnDisk| run.folder().display().to_string();
-    let ways: [&dyn Fn(&RunOnDisk) -> String; 3] = [&own, &folder, &path];
+    let ways: [&dyn Fn(&RunOnDisk) -> String; 4] = [&own, &folder, &nested, &path];
     let distinct = |names: &Vec<String>| names.iter().collect::<BTreeSet<_>>().len() == names.len();
     let all = ways.into_iter().map(|way| found.iter().map(way).collect::<Vec<_>>());
     let last = all.clone().next_back().unwrap_or_default();
