@@ -38,7 +38,7 @@ psnr() { # of the scan $1, which is reconstructed into $2
 for volume in $volumes; do
     exact=$out/$volume-exact
     if [[ ! -d $exact ]]; then
-        "$bin" -q convert "$data/volumes/${volume}_256.nii.gz" "$out/$volume.npy" --force
+        "$bin" -q convert "$data/volumes/${volume}_256.nii.gz" "$out/$volume.npy" --force >/dev/null
         "$python" benches/faults.py 3 "$out/$volume.npy" "$out/$volume-3.npy"
         "$bin" -q simulate "$out/$volume-3.npy" -o "$exact" --protocol r2 --downsample 2 --detector 128x128 --views 50 >/dev/null
     fi

@@ -1,7 +1,7 @@
-//! Which way the source goes about the object: both ways are calibrated, and the views predicted in each.
+//! The direction in which the source moves around the object. Both are calibrated; the better prediction of views decides.
 //!
-//! Views taken in the wrong direction are those of the mirrored object if all rays are parallel. The wider the cone is, the less are
-//! they those of any object. The same holds for columns that run the wrong way.
+//! With parallel rays, views in the wrong direction are exactly those of the mirrored object. The wider the cone, the less any object
+//! explains them. Reversed columns have the same effect.
 
 use crate::criterion::spread;
 use crate::{COARSEST, Correction, Parameter, Settings, Watch, calibrate, on_a_circle};
@@ -11,41 +11,53 @@ use conefield_core::geometry::Geometry;
 use conefield_core::scan::Scan;
 use serde::Serialize;
 
-/// A direction whose held-out error is less than this share of the other's is the right one.
+/// A direction is right if its held-out error is below this share of the other's.
 const CLEARLY: f64 = 0.7;
 
 /// The held-out errors of both directions, each after a quick calibration, relative to the largest line integral.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize)]
 pub struct Directions {
-    /// Of the angles as they were told.
-    pub as_told: f64,
-    /// Of the same angles with the other sign.
+    /// With the scan's angles.
+    pub given: f64,
+    /// With the angles reversed.
     pub reversed: f64,
 }
 
 impl Directions {
     /// Whether the views clearly belong to the other direction.
     pub fn is_reversed(&self) -> bool {
-        self.reversed < CLEARLY * self.as_told
+        self.reversed < CLEARLY * self.given
+    }
+
+    /// What to do about a wrong direction; `None` if the views do not clearly belong to the other one.
+    pub fn advice(&self) -> Option<String> {
+        self.is_reversed().then(|| {
+            format!(
+                "the views fit the other direction: after a quick calibration the held-out error is {:.4}, and {:.4} with the angles \
+                 reversed\n  import the scan with the other `direction` in scanner.toml; if that is right, with --flip-columns (with \
+                 the wrong one of the two the volume is mirrored)",
+                self.given, self.reversed
+            )
+        })
     }
 }
 
-/// Compares both directions on coarse pixels. `None` if the sources do not stand on a circle about the axis.
+/// Compares both directions on coarse pixels. `None` if the sources do not lie on a circle around the axis.
 pub fn directions(scan: &Scan, backend: &dyn Backend, watch: &dyn Watch) -> Result<Option<Directions>> {
     if !on_a_circle(&scan.geometry.views) {
         return Ok(None);
     }
     let [rows, columns] = scan.geometry.detector;
     let bin = rows.max(columns).div_ceil(2 * COARSEST).clamp(1, (rows.min(columns) / 4).max(1));
-    let told = spread(scan.binned(bin))?;
-    // A shift along u changes its sign with the direction; what else is off makes both errors larger.
+    let coarse = spread(scan.binned(bin))?;
+    // Only a shift along u has another sign in the other direction. Other errors of the geometry affect both alike.
     let settings = Settings { parameters: vec![Parameter::OffsetU], width: COARSEST, curves: false };
     let error = |scan: &Scan, from: f64| -> Result<f64> {
         Ok(calibrate(scan, &settings, backend, &Half { watch, from })?.held_out[1])
     };
-    let as_told = error(&told, 0.0)?;
-    let reversed = error(&reversed(told), 0.5)?;
-    Ok(Some(Directions { as_told, reversed }))
+    let given = error(&coarse, 0.0)?;
+    let reversed = error(&reversed(coarse), 0.5)?;
+    Ok(Some(Directions { given, reversed }))
 }
 
 /// The same views with their angles from the first one in the other direction.
@@ -90,28 +102,28 @@ mod tests {
         fn progress(&self, _: f64) {}
     }
 
-    /// Both ways with this scan and with the one that is told the wrong way.
+    /// The errors of a scan and of the same scan with reversed angles.
     fn both(right: Scan) -> [Directions; 2] {
         let of = |scan: &Scan| directions(scan, &Cpu::new(), &Silent).unwrap().unwrap();
         [of(&right), of(&reversed(right))]
     }
 
     #[test]
-    fn the_wrong_direction_is_told_and_the_right_one_is_not() {
+    fn only_the_wrong_direction_is_reported() {
         for noise in [0.0, 0.02] {
             let mut scan = scan(40, noise);
-            // The detector is told to stand two pixels aside.
+            // The detector is off by two pixels.
             let aside = Correction::default().with(Parameter::OffsetU, 5.0);
             scan.geometry.views = aside.views(&scan.geometry.views);
             let [right, wrong] = both(scan);
             assert!(wrong.is_reversed() && !right.is_reversed(), "{noise}: {right:?}, {wrong:?}");
-            assert!((right.as_told - wrong.reversed).abs() < 0.01 * right.as_told, "{noise}: {right:?}, {wrong:?}");
+            assert!((right.given - wrong.reversed).abs() < 0.01 * right.given, "{noise}: {right:?}, {wrong:?}");
         }
     }
 
     /// Nearly parallel rays show the mirrored object.
     #[test]
-    fn a_narrow_cone_tells_no_direction() {
+    fn a_narrow_cone_determines_no_direction() {
         let angles = (0..24).map(|i| TAU * f64::from(i) / 24.0).collect();
         let orbit = CircularOrbit { dso: 1e5, dsd: 1.1e5, pixel: [3.0; 2], offset: [0.0; 2], angles };
         let volume = VoxelGrid { shape: [32; 3], spacing: [3.0; 3], center: [0.0; 3] };
@@ -124,7 +136,7 @@ mod tests {
     }
 
     #[test]
-    fn views_that_stand_on_no_circle_are_not_compared() {
+    fn views_off_a_circle_are_not_compared() {
         let mut scan = scan(12, 0.0);
         for (i, view) in scan.geometry.views.iter_mut().enumerate() {
             view.source[2] += 10.0 * i as f64;

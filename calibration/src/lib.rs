@@ -29,6 +29,7 @@ use criterion::Level;
 use newton::{Newton, Place};
 use search::{Fit, Meter, Search, Told};
 use serde::Serialize;
+use serde_json::{Value, json};
 use std::sync::Mutex;
 
 /// Fewer views are not enough to keep any aside.
@@ -125,6 +126,34 @@ pub struct Calibration {
     pub bin: usize,
     /// Views that were kept aside and predicted.
     pub views: usize,
+}
+
+impl Calibration {
+    /// Corrects the geometry of `scan` and records in its provenance how, with the scan that the calibration began from.
+    pub fn correct(&self, scan: &mut Scan, source: &str) {
+        scan.geometry.views = self.correction.views(&scan.geometry.views);
+        let corrected: serde_json::Map<String, Value> = self
+            .found
+            .iter()
+            .filter(|f| f.verdict == Verdict::Corrected)
+            .map(|f| (f.parameter.to_string(), json!({ "change": f.change, "uncertainty": f.uncertainty, "unit": f.unit })))
+            .collect();
+        let calibrated = json!({ "from": source, "corrected": corrected, "held_out": self.held_out });
+        match &mut scan.provenance {
+            Value::Object(map) => drop(map.insert("calibrated".into(), calibrated)),
+            Value::Null => scan.provenance = json!({ "calibrated": calibrated }),
+            other => scan.provenance = json!({ "value": other.take(), "calibrated": calibrated }),
+        }
+    }
+
+    /// The result as JSON, with that of [`directions`].
+    pub fn json(&self, directions: Option<Directions>) -> Value {
+        let [before, after] = self.held_out;
+        json!({
+            "parameters": self.found, "held_out": { "before": before, "after": after, "views": self.views },
+            "direction": directions, "bin": self.bin,
+        })
+    }
 }
 
 /// Looks for the correction of `scan`'s geometry.

@@ -10,6 +10,7 @@ Work runs without Python's lock. Ctrl-C ends it with KeyboardInterrupt. Errors a
 survive a fork: use multiprocessing with the start method ``spawn``.
 """
 
+from ._calibration import Calibration, calibrate
 from ._errors import (
     DeviceError,
     DivergedError,
@@ -31,6 +32,7 @@ from ._stages import Check, check_stage, encoder, regularizer, stage_names
 from ._volume import Volume, read_volume
 
 __all__ = [
+    "Calibration",
     "Check",
     "DeviceError",
     "DivergedError",
@@ -50,6 +52,7 @@ __all__ = [
     "Volume",
     "__version__",
     "backproject",
+    "calibrate",
     "check_stage",
     "circular",
     "encoder",

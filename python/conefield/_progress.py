@@ -1,4 +1,4 @@
-"""How a run goes: for callbacks, and for a bar."""
+"""The progress of a run, for callbacks and a bar."""
 
 from __future__ import annotations
 
@@ -56,8 +56,8 @@ def _has_tqdm() -> bool:
     return True
 
 
-class Told:
-    """Hands a run's progress to a callback and to a bar, and closes the bar."""
+class Reporter:
+    """Passes the progress of a run to a callback and a bar."""
 
     def __init__(self, what: str, callback: Callback | None, every: float, slices: bool, bar: bool) -> None:
         self._callback = callback
@@ -68,13 +68,13 @@ class Told:
     def __enter__(self) -> tuple[Callable[..., None], float, bool] | None:
         if self._callback is None and self._bar is None:
             return None
-        return self._tell, max(self._every, 0.0), self._slices and self._callback is not None
+        return self._report, max(self._every, 0.0), self._slices and self._callback is not None
 
     def __exit__(self, *_: Any) -> None:
         if self._bar is not None:
             self._bar.close()
 
-    def _tell(self, step: int, share: float, seconds_left: float, records: str, slices: list[np.ndarray] | None) -> None:
+    def _report(self, step: int, share: float, seconds_left: float, records: str, slices: list[np.ndarray] | None) -> None:
         flat = None
         if slices is not None:
             x, y, z = slices

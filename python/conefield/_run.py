@@ -10,7 +10,7 @@ import numpy as np
 
 from . import _native
 from ._errors import invalid
-from ._progress import Callback, Told
+from ._progress import Callback, Reporter
 from ._scan import as_scan
 from ._spec import argument, encoded
 from ._volume import Volume, as_volume
@@ -235,8 +235,8 @@ def reconstruct(
         init=file,
         truth=truth,
     )
-    with Told("reconstruct", callback, every, slices, progress) as tell:
-        return Reconstruction(*_native.reconstruct(scan, wanted, start, known, tell))
+    with Reporter("reconstruct", callback, every, slices, progress) as report:
+        return Reconstruction(*_native.reconstruct(scan, wanted, start, known, report))
 
 
 def _start(init: Any, geometry: _native.Geometry) -> tuple[str | None, Volume | None]:
@@ -274,8 +274,8 @@ def pretrain(
     wanted = _wanted(
         spec, sets, overrides, backend=backend, seed=seed, steps=steps, seconds=seconds, at_most=at_most
     )
-    with Told("pretrain", callback, every, False, progress) as tell:
-        return _native.pretrain(known, os.fspath(output), wanted, tell)
+    with Reporter("pretrain", callback, every, False, progress) as report:
+        return _native.pretrain(known, os.fspath(output), wanted, report)
 
 
 def evaluate(volume: Any, reference: Any, *, peak: float | None = None, labels: bool = False) -> dict[str, Any]:

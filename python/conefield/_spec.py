@@ -30,7 +30,7 @@ def encoded(value: Any) -> str:
 
 
 def argument(spec: Any, sets: Mapping[str, Any] | None, overrides: Mapping[str, Any]) -> dict[str, Any]:
-    """What the native half is told of a spec."""
+    """A spec, as the native half takes it."""
     paths = dict(sets or {})
     for key, value in overrides.items():
         path = key.replace("__", ".")

@@ -4,6 +4,7 @@
 
 mod arguments;
 mod arrays;
+mod calibration;
 mod encoder;
 mod errors;
 mod field;
@@ -27,6 +28,8 @@ static HEAP: PeakAlloc = PeakAlloc;
 
 #[pymodule]
 mod _native {
+    #[pymodule_export]
+    use crate::calibration::calibrate;
     #[pymodule_export]
     use crate::field::{Field, read_field};
     #[pymodule_export]

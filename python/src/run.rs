@@ -169,9 +169,10 @@ pub fn plan<'py>(
 }
 
 /// The function called during a run, with the seconds between calls and whether it wants slices.
-type CallbackArgument = Option<(Py<PyAny>, f64, bool)>;
+pub type CallbackArgument = Option<(Py<PyAny>, f64, bool)>;
 
-fn callback(argument: CallbackArgument) -> Option<Callback> {
+/// The callback of a run.
+pub fn callback(argument: CallbackArgument) -> Option<Callback> {
     argument.map(|(function, every, slices)| Callback {
         function,
         every: Duration::try_from_secs_f64(every).unwrap_or(Duration::MAX),

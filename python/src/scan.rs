@@ -29,6 +29,11 @@ pub struct Scan {
 }
 
 impl Scan {
+    /// Another scan of the same object, made from this one.
+    pub fn with(&self, scan: scan::Scan) -> Self {
+        Self { scan: Arc::new(scan), path: self.path.clone(), truth: self.truth.clone() }
+    }
+
     /// The volume it was simulated from, if known; read from the scan's files if necessary.
     pub fn truth(&self) -> conefield_core::Result<Option<Volume>> {
         match (&self.truth, &self.path) {

@@ -85,7 +85,7 @@ pub struct Callback {
 pub struct Progress<'a> {
     watch: &'a Watch,
     callback: Option<Callback>,
-    told: Option<Instant>,
+    called_at: Option<Instant>,
     slices: Option<[Array3<f32>; 3]>,
     records: Vec<Record>,
     /// Number of records that the callback has received.
@@ -96,7 +96,7 @@ pub struct Progress<'a> {
 
 impl<'a> Progress<'a> {
     pub fn new(watch: &'a Watch, callback: Option<Callback>) -> Self {
-        Self { watch, callback, told: None, slices: None, records: vec![], seen: 0, step: 0 }
+        Self { watch, callback, called_at: None, slices: None, records: vec![], seen: 0, step: 0 }
     }
 
     /// The records so far.
@@ -112,12 +112,12 @@ impl<'a> Progress<'a> {
 
     fn due(&self) -> bool {
         let wait = self.callback.as_ref().map_or(Duration::MAX, |c| c.every);
-        self.callback.is_some() && self.told.is_none_or(|t| t.elapsed() >= wait)
+        self.callback.is_some() && self.called_at.is_none_or(|t| t.elapsed() >= wait)
     }
 
     fn tell(&mut self, step: u64, share: f64, seconds_left: f64) {
         let Some(callback) = &self.callback else { return };
-        self.told = Some(Instant::now());
+        self.called_at = Some(Instant::now());
         let new = serde_json::to_string(&self.records[self.seen..]).unwrap_or_else(|_| "[]".into());
         self.seen = self.records.len();
         let slices = self.slices.take();

@@ -37,7 +37,7 @@ def test_specs_are_names_files_and_dicts(scan, tmp_path):
     assert "neural-field" in str(conefield.schema())
 
 
-def test_wrong_settings_are_told_with_their_place(scan):
+def test_errors_name_the_wrong_setting(scan):
     for spec, overrides, words in [
         ("fast", {"encoder__level": 3}, "encoder.level.*levels"),
         ({"type": "fista", "prior": {"type": "total-variatio"}}, {}, 'spec:.*prior.type.*total-variation'),
@@ -69,7 +69,7 @@ def test_wrong_settings_are_told_with_their_place(scan):
         conefield.reconstruct(conefield.scan(scan.projections, scan.geometry), "fdk", reference="truth")
 
 
-def test_a_result_tells_of_itself(scan):
+def test_a_result_describes_itself(scan):
     result = conefield.reconstruct(scan, "fista-tv", reference=scan.truth, hold_out="every:5", stop__passes=2)
     assert result.record["held_out_views"] == [2, 7, 12] and result.record["held_out"] > 0
     assert result.scores["psnr"] > 15 and result.scores["ssim_3d"] is not None

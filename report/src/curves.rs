@@ -212,12 +212,12 @@ impl Plot<'_> {
                 chart.draw_series([Polygon::new(outline, colour(name).mix(0.18))]).map_err(text)?;
             }
         }
-        let mut told: Vec<&str> = vec![];
+        let mut seen: Vec<&str> = vec![];
         for (name, points) in self.series {
             let colour = colour(name);
             let style = colour.stroke_width(stroke);
-            let mut named = told.contains(&&name[..]);
-            told.push(name);
+            let mut named = seen.contains(&&name[..]);
+            seen.push(name);
             for part in points.split(|p| !(self.shown)(p)).filter(|p| !p.is_empty()) {
                 // A line through a single point would be invisible.
                 if let [p] = part {

@@ -7,7 +7,7 @@ use crate::progress::Progress;
 use crate::{out, signals};
 use clap::Args;
 use conefield_calibration::{
-    Calibration, Directions, Found, Parameter, Settings, Verdict, Watch, calibrate, directions, suspect,
+    Calibration, Found, Parameter, Settings, Verdict, Watch, calibrate, directions, suspect,
 };
 use conefield_core::backend::Backend;
 use conefield_core::scan::Scan;
@@ -15,7 +15,7 @@ use conefield_core::{Error, Result};
 use conefield_io::DataSet;
 use conefield_report::{CurveOptions, Panel, panels_png};
 use serde::Serialize;
-use serde_json::{Value, json};
+use serde_json::json;
 use std::fmt;
 use std::path::{Path, PathBuf};
 use std::sync::{Mutex, PoisonError};
@@ -86,24 +86,25 @@ impl CalibrateArgs {
                 let n = test.geometry.views.len();
                 tracing::warn!("{}: {n} test views are left out: this format cannot hold them", output.display());
             }
-            scan.geometry.views = found.correction.views(&scan.geometry.views);
-            note(&mut scan, &self.scan, &found);
+            found.correct(&mut scan, &self.scan.display().to_string());
             conefield_io::write_scan(output, &scan, volume.as_ref())?;
         }
         let seconds = begin.elapsed().as_secs_f64();
         if self.json {
-            return out::json(&json!({
-                "scan": self.scan, "output": self.output, "picture": self.png, "parameters": found.found,
-                "held_out": { "before": found.held_out[0], "after": found.held_out[1], "views": found.views },
-                "direction": directions, "bin": found.bin, "seconds": seconds,
-            }));
+            let mut result = found.json(directions);
+            result["scan"] = json!(self.scan);
+            result["output"] = json!(self.output);
+            result["picture"] = json!(self.png);
+            result["seconds"] = json!(seconds);
+            return out::json(&result);
         }
-        let warning = directions.filter(Directions::is_reversed).map(wrong_direction).unwrap_or_default();
-        out::say(&(self.told(&found, seconds) + &warning))
+        let advice = directions.and_then(|d| d.advice());
+        let warning = advice.map_or(String::new(), |advice| format!("\n\nwarning: {advice}"));
+        out::say(&(self.text(&found, seconds) + &warning))
     }
 
     /// The result as text.
-    fn told(&self, found: &Calibration, seconds: f64) -> String {
+    fn text(&self, found: &Calibration, seconds: f64) -> String {
         let heads = ["", "change", "uncertainty", "unit", "in pixels", ""].map(str::to_owned).to_vec();
         let rows: Vec<Vec<String>> = std::iter::once(heads).chain(found.found.iter().map(row)).collect();
         let [before, after] = found.held_out;
@@ -129,16 +130,6 @@ impl CalibrateArgs {
     }
 }
 
-/// The warning about angles whose sign is wrong.
-fn wrong_direction(errors: Directions) -> String {
-    format!(
-        "\n\nwarning: the views fit the other direction: after a quick calibration the held-out error is {:.4}, and {:.4} \
-         with the angles reversed\n  import the scan with the other `direction` in scanner.toml; if that is right, with \
-         --flip-columns (with the wrong one of the two the volume is mirrored)",
-        errors.as_told, errors.reversed
-    )
-}
-
 /// A line of the table.
 fn row(f: &Found) -> Vec<String> {
     let digits =
@@ -156,22 +147,6 @@ fn row(f: &Found) -> Vec<String> {
     vec![f.parameter.to_string(), change, uncertainty, f.unit.into(), pixels, said.into()]
 }
 
-/// Records in the scan how its geometry was obtained.
-fn note(scan: &mut Scan, source: &Path, found: &Calibration) {
-    let corrected: serde_json::Map<String, Value> = found
-        .found
-        .iter()
-        .filter(|f| f.verdict == Verdict::Corrected)
-        .map(|f| (f.parameter.to_string(), json!({ "change": f.change, "uncertainty": f.uncertainty, "unit": f.unit })))
-        .collect();
-    let calibrated = json!({ "from": source, "corrected": corrected, "held_out": found.held_out });
-    match &mut scan.provenance {
-        Value::Object(map) => drop(map.insert("calibrated".into(), calibrated)),
-        Value::Null => scan.provenance = json!({ "calibrated": calibrated }),
-        other => scan.provenance = json!({ "value": other.take(), "calibrated": calibrated }),
-    }
-}
-
 /// The error along each parameter, side by side.
 fn draw(path: &Path, found: &Calibration) -> Result<()> {
     let options = CurveOptions { size: [640, 480], ..CurveOptions::default() };
@@ -186,7 +161,7 @@ fn draw(path: &Path, found: &Calibration) -> Result<()> {
             let series = vec![
                 (name.to_owned(), f.curve.clone()),
                 ("found".to_owned(), mark(f.change)),
-                ("as told".to_owned(), mark(0.0)),
+                ("as given".to_owned(), mark(0.0)),
             ];
             let title = match f.verdict {
                 Verdict::NotDetermined => format!("{}: not determined", f.parameter),

@@ -78,7 +78,7 @@ impl ReportArgs {
         let coarser = coarser(&voxels, self.embed);
         self.check_memory(&groups, &options)?;
 
-        page.runs = runs::told(&found, &mut page.warnings);
+        page.runs = runs::page_runs(&found, &mut page.warnings);
         let mut results: Vec<Option<PageVolume>> = found.iter().map(|_| None).collect();
         let mut references = vec![];
         for group in groups {
@@ -88,7 +88,7 @@ impl ReportArgs {
         page.title = runs::title(&page);
         page.notes = notes(&page, coarser);
         let bytes = page.write(&self.output)?;
-        self.tell(&page, coarser, bytes)
+        self.summarize(&page, coarser, bytes)
     }
 
     /// Refuses a page that does not fit into memory: one volume at a time beside its scan, and the data of the page.
@@ -100,7 +100,7 @@ impl ReportArgs {
         Memory::most(&moments.concat()).check(|_| vec![])
     }
 
-    fn tell(&self, page: &Page, coarser: usize, bytes: u64) -> Result<()> {
+    fn summarize(&self, page: &Page, coarser: usize, bytes: u64) -> Result<()> {
         let views: Vec<usize> = page.scans.iter().flat_map(|s| s.views.iter().map(|v| v.view)).collect();
         if self.json {
             let volumes = page.volumes.iter().map(|v| json!({ "name": v.name(), "shape": v.shape() }));
@@ -134,7 +134,7 @@ impl ReportArgs {
 pub fn standing(folder: &Path, seconds: u64) -> Result<String> {
     let found = [RunOnDisk::read(folder)?];
     let mut page = Page { renewed: Some(seconds), ..Page::default() };
-    page.runs = runs::told(&found, &mut page.warnings);
+    page.runs = runs::page_runs(&found, &mut page.warnings);
     // The run is still active, so the warning about an interrupted run does not apply.
     page.warnings.clear();
     page.title = runs::title(&page);

@@ -111,8 +111,8 @@ fn the_other_direction_is_told_where_the_views_fit_it() {
     assert!(said.contains("the other `direction`") && said.contains("--flip-columns"), "{said}");
     assert!(!told("right").contains("direction"));
     let found = json(&[&["calibrate", &text(&at("wrong"))], &calibrate[..], &["--json"]].concat());
-    let [as_told, reversed] = ["as_told", "reversed"].map(|k| number(&found["direction"][k]));
-    assert!(reversed < 0.7 * as_told, "{found}");
+    let [given, reversed] = ["given", "reversed"].map(|k| number(&found["direction"][k]));
+    assert!(reversed < 0.7 * given, "{found}");
 }
 
 /// A ball on the axis: turned in its plane or stepped on wider, every view is the same.

@@ -46,12 +46,12 @@ impl Page {
 
     /// The values of a volume, [x, y, z], and the step that they have.
     fn volume(&self, index: usize) -> (Array3<f64>, f64) {
-        let told = &self.data["volumes"][index];
-        let number = |key: &str| told[key].as_f64().unwrap();
+        let volume = &self.data["volumes"][index];
+        let number = |key: &str| volume[key].as_f64().unwrap();
         let packed = STANDARD.decode(Self::element(&self.html, &format!("volume-{index}"))).unwrap();
         let mut raw = vec![];
         flate2::read::GzDecoder::new(&packed[..]).read_to_end(&mut raw).unwrap();
-        let shape: [usize; 3] = serde_json::from_value(told["shape"].clone()).unwrap();
+        let shape: [usize; 3] = serde_json::from_value(volume["shape"].clone()).unwrap();
         let n = shape.iter().product::<usize>();
         assert_eq!(raw.len(), 2 * n);
         let value = |i: usize| f64::from(i16::from_be_bytes([raw[i], raw[n + i]])) * number("slope") + number("offset");
@@ -148,7 +148,7 @@ fn runs_stand_beside_each_other() {
     let (dir, scan, first) = run("fdk", &[]);
     let at = |name: &str| text(&dir.path().join(name));
     let out = at("page.html");
-    // Two of one name are told apart by their folders.
+    // Two of one name are distinguished by their folders.
     reconstruct(&scan, "fdk", &at("again"), &[]);
     done(&["report", &first, &at("again"), "-o", &out]);
     assert_eq!(Page::read(out.as_ref()).names("runs"), ["run", "again"]);

@@ -71,7 +71,7 @@ fn cases(folder: &Path) -> Result<Vec<PathBuf>> {
 }
 
 /// The runs of the page, with unique names.
-pub fn told(found: &[RunOnDisk], warnings: &mut Vec<Notice>) -> Vec<PageRun> {
+pub fn page_runs(found: &[RunOnDisk], warnings: &mut Vec<Notice>) -> Vec<PageRun> {
     let names = names(found);
     found
         .iter()
