@@ -37,8 +37,8 @@
 
   for (const run of runs.filter((r) => !r.record && page.renewed)) {
     const last = run.curves[run.curves.length - 1] ?? {};
-    const told = [["step", last.step, String], ["after", last.seconds, seconds], ["loss", last.loss], ["PSNR", last.psnr, (x) => `${x.toFixed(2)} dB`], ["held-out error", last.held_out]];
-    const known = told.filter(([, x]) => Number.isFinite(x)).map(([name, x, show = (x) => short(x, 4)]) => `${name} ${show(x)}`);
+    const status = [["step", last.step, String], ["after", last.seconds, seconds], ["loss", last.loss], ["PSNR", last.psnr, (x) => `${x.toFixed(2)} dB`], ["held-out error", last.held_out]];
+    const known = status.filter(([, x]) => Number.isFinite(x)).map(([name, x, show = (x) => short(x, 4)]) => `${name} ${show(x)}`);
     byId("live").append(element("p", {}, known.join(" · ") || "Nothing is recorded yet."));
     if (run.live) byId("live").append(element("img", { class: "picture", src: run.live, alt: "The middle slices" }));
   }
@@ -113,14 +113,14 @@
         return element("div", {}, element("h3", {}, run.name), element("div", { class: "row" },
           picture(measured.measured, `measured, black ${short(scan.window[0], 3)} to white ${short(scan.window[1], 3)}`),
           picture(view.predicted, "predicted, the same scale"),
-          picture(view.residual, `measured less predicted: blue ${short(-scan.residual_span, 3)} to red ${short(scan.residual_span, 3)}, root mean square ${short(view.rms, 3)}`)));
+          picture(view.residual, `measured minus predicted: blue ${short(-scan.residual_span, 3)} to red ${short(scan.residual_span, 3)}, root mean square ${short(view.rms, 3)}`)));
       }));
     };
     pick.addEventListener("change", () => show(Number(pick.value)));
     slider.addEventListener("input", () => show(Number(slider.value)));
     byId("views").append(
       element("p", {}, `${scan.name}: line integrals in ${scan.views.length} of ${scan.count} views. `, element("label", {}, "View ", pick, " ", slider)),
-      ...projected.map((r) => element("p", { class: "note" }, `${r.name}: measured less predicted in these views, root mean square ${short(r.views.rms, 4)}, ${short(r.views.relative, 4)} of the largest line integral; projector ${r.views.projector}`)),
+      ...projected.map((r) => element("p", { class: "note" }, `${r.name}: measured minus predicted in these views, root mean square ${short(r.views.rms, 4)}, ${short(r.views.relative, 4)} of the largest line integral; projector ${r.views.projector}`)),
       shown);
     show(0);
   });
@@ -174,8 +174,8 @@
     for (const summary of document.querySelectorAll("summary")) summary.parentElement.open = (kept.open ?? []).includes(summary.textContent);
     if (kept.against) byId("against").value = kept.against;
     curves();
-    const told = (text) => { byId("live-note").textContent = text; };
-    told(`State of ${new Date().toLocaleTimeString()}, renewed every ${page.renewed} s.`);
+    const status = (text) => { byId("live-note").textContent = text; };
+    status(`State of ${new Date().toLocaleTimeString()}, renewed every ${page.renewed} s.`);
     const renew = async () => {
       try {
         if (!(await fetch(location.href, { cache: "no-store" })).ok) throw new Error("refused");
@@ -183,7 +183,7 @@
         sessionStorage.setItem("kept", JSON.stringify({ open, against: byId("against").value }));
         location.reload();
       } catch {
-        told("No answer any more: the run has ended, or its process. This is its last state; conefield report shows the result.");
+        status("The run has ended or was stopped. This is its last state; conefield report shows the result.");
         setTimeout(renew, 1000 * page.renewed);
       }
     };

@@ -126,7 +126,7 @@ impl ProjectArgs {
         let worst = residual.views.iter().copied().enumerate().max_by(|a, b| a.1.total_cmp(&b.1));
         let worst = worst.map_or(String::new(), |(v, rms)| format!(", {rms:.5} in view {v}, the worst"));
         out::say(&format!(
-            "{}: {n} views of {rows} x {columns} in {}\nmeasured less predicted: root mean square {:.5}, {:.5} of the \
+            "{}: {n} views of {rows} x {columns} in {}\nmeasured minus predicted: root mean square {:.5}, {:.5} of the \
              largest line integral{worst}",
             self.output.display(),
             out::duration(project_s),

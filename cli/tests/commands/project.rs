@@ -71,7 +71,7 @@ fn the_truth_explains_its_scan_and_nothing_else_does() {
 
     // What is left is told for people too, and the result is a scan for every command.
     let said = done(&["project", &truth, "--like", &scan, "-o", &out, "--force"]);
-    assert!(said.contains("measured less predicted"), "{said}");
+    assert!(said.contains("measured minus predicted"), "{said}");
     assert_eq!(json(&["info", &out, "--json"])["views"], 7);
 }
 
