@@ -20,6 +20,7 @@ mod log;
 mod out;
 mod outgoing;
 mod pca;
+mod program;
 mod progress;
 mod run_folder;
 mod segmenter;
@@ -47,15 +48,21 @@ struct Cli {
     general: commands::General,
 }
 
+const SUCCESS: u8 = 0;
+const FAILURE: u8 = 1;
+
 /// Runs the command line of this process. `held` returns the bytes allocated now.
 pub fn main(held: fn() -> u64) -> ExitCode {
     memory::count(held);
-    run(std::env::args_os())
+    ExitCode::from(run(std::env::args_os(), None))
 }
 
-/// Runs a command line, starting with the program's name. Exit status: 0 success, 1 failure, 2 usage error, 130 or 143
-/// interrupted.
-pub fn run(args: impl IntoIterator<Item = OsString>) -> ExitCode {
+/// Runs a command line, starting with the program's name. Returns the exit status: 0 success, 1 failure, 2 usage error, 130
+/// or 143 interrupted. `program` are the words that start the command in another process if the executable of this one
+/// does not: an interpreter and its arguments.
+pub fn run(args: impl IntoIterator<Item = OsString>, program: Option<Vec<OsString>>) -> u8 {
+    let args: Vec<OsString> = args.into_iter().collect();
+    program::note(program, args.iter().skip(1).cloned().collect());
     let cli = Cli::parse_from(args);
     let general = cli.general;
     if !general.quiet {
@@ -64,14 +71,14 @@ pub fn run(args: impl IntoIterator<Item = OsString>) -> ExitCode {
     log::start(general.verbose, general.quiet);
     if let Err(e) = signals::watch() {
         log::error(&e.to_string());
-        return ExitCode::FAILURE;
+        return FAILURE;
     }
     memory::set_budget(general.memory);
     if let Some(n) = general.threads
         && let Err(e) = rayon::ThreadPoolBuilder::new().num_threads(n.into()).build_global()
     {
         log::error(&format!("{n} threads: {e}"));
-        return ExitCode::FAILURE;
+        return FAILURE;
     }
     // A plugin under check is loaded only in a separate process.
     if !matches!(&cli.command, commands::Command::Plugins(p) if p.is_check()) {
@@ -81,15 +88,15 @@ pub fn run(args: impl IntoIterator<Item = OsString>) -> ExitCode {
     let listed = matches!(cli.command, commands::Command::Plugins(_));
     let settled = if listed { Ok(()) } else { plugins::settle() };
     match settled.and_then(|()| commands::run(cli.command, &general)) {
-        Ok(()) => ExitCode::SUCCESS,
+        Ok(()) => SUCCESS,
         Err(e) => {
             log::error(&e.to_string());
             match (&e, signals::caught()) {
                 (
                     Error::Interrupted { .. } | Error::Stopped { .. } | Error::Cancelled { .. } | Error::Aborted { .. },
                     Some(signal),
-                ) => ExitCode::from(128 + signal),
-                _ => ExitCode::FAILURE,
+                ) => 128 + signal,
+                _ => FAILURE,
             }
         }
     }

@@ -9,7 +9,6 @@ use conefield_projectors::ray_march::RayMarch;
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 use std::path::Path;
-use std::process::ExitCode;
 use std::sync::atomic::{AtomicUsize, Ordering};
 
 /// How often an encoder, a field and a projector were built.
@@ -52,7 +51,7 @@ impl ProjectorSpec for Counted {
 fn built(args: &[&str]) -> [usize; 3] {
     BUILT.iter().for_each(|n| n.store(0, Ordering::Relaxed));
     let args = std::iter::once("conefield").chain(args.iter().copied()).map(Into::into);
-    assert_eq!(conefield::run(args), ExitCode::SUCCESS);
+    assert_eq!(conefield::run(args, None), 0);
     BUILT.each_ref().map(|n| n.load(Ordering::Relaxed))
 }
 

@@ -29,6 +29,7 @@ from ._run import Plan, Reconstruction, evaluate, explain, plan, pretrain, read_
 from ._scan import Scan, read_scan, scan, simulate, write_scan
 from ._spec import schema, spec_names, spec_text
 from ._stages import Check, check_stage, encoder, regularizer, stage_names
+from ._study import study
 from ._volume import Volume, read_volume
 
 __all__ = [
@@ -73,5 +74,6 @@ __all__ = [
     "spec_names",
     "spec_text",
     "stage_names",
+    "study",
     "write_scan",
 ]

@@ -5,6 +5,7 @@
 mod arguments;
 mod arrays;
 mod calibration;
+mod command;
 mod encoder;
 mod errors;
 mod field;
@@ -31,6 +32,8 @@ mod _native {
     #[pymodule_export]
     use crate::calibration::calibrate;
     #[pymodule_export]
+    use crate::command::command;
+    #[pymodule_export]
     use crate::field::{Field, read_field};
     #[pymodule_export]
     use crate::geometry::Geometry;
@@ -52,7 +55,6 @@ mod _native {
     fn init(m: &Bound<'_, PyModule>) -> PyResult<()> {
         conefield_run::memory::count(|| crate::HEAP.current_usage() as u64);
         conefield_run::memory::set_budget(None);
-        crate::log::start();
         m.add("__version__", env!("CARGO_PKG_VERSION"))
     }
 }

@@ -2,13 +2,19 @@
 
 use pyo3::prelude::*;
 use std::fmt::{Debug, Write};
+use std::sync::Once;
 use tracing::field::{Field, Visit};
 use tracing::level_filters::LevelFilter;
 use tracing::{Event, Level, Subscriber};
 use tracing_subscriber::layer::{Context, Layer, SubscriberExt};
 
-/// Forwards messages from now on. A program that already has a logger keeps it.
+/// Forwards messages from the first call on. A program that already has a logger keeps it.
 pub fn start() {
+    static ONCE: Once = Once::new();
+    ONCE.call_once(forward);
+}
+
+fn forward() {
     let log = tracing_subscriber::registry().with(ToPython.with_filter(LevelFilter::INFO));
     let _ = tracing::subscriber::set_global_default(log);
 }

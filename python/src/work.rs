@@ -1,6 +1,7 @@
 //! Work without the GIL: Ctrl-C ends it cleanly, a callback observes progress, and no panic crosses into Python.
 
 use crate::errors::{broken, raised};
+use crate::log;
 use crate::stages::{Raised, within};
 use conefield_core::Result;
 use conefield_core::geometry::VoxelGrid;
@@ -55,6 +56,7 @@ impl Watch {
 /// Runs `work` without the GIL. An exception of a callback, a stage or a signal handler takes precedence over the error
 /// caused by stopping.
 pub fn without_lock<T: Send>(py: Python<'_>, work: impl FnOnce(&Watch) -> Result<T> + Send) -> PyResult<T> {
+    log::start();
     let (looked, stopped) = (Mutex::new(Instant::now()), Mutex::new(None));
     let watch = Watch { looked, stopped, raised: Arc::default() };
     let done = py.detach(|| within(&watch.raised, || catch_unwind(AssertUnwindSafe(|| work(&watch)))));

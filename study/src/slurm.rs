@@ -7,8 +7,8 @@ use std::path::Path;
 pub struct Jobs<'a> {
     /// The study's name.
     pub name: &'a str,
-    /// This program.
-    pub program: &'a Path,
+    /// The words that start this program.
+    pub program: &'a [String],
     /// The study's file.
     pub study: &'a Path,
     /// The folder for the results, which all jobs must be able to access.
@@ -31,12 +31,14 @@ impl Jobs<'_> {
         };
         let path = |path: &Path| quoted(&absolute(path)?.display().to_string());
         let job: String = self.name.chars().map(|c| if c.is_ascii_alphanumeric() { c } else { '-' }).collect();
+        let program: Vec<String> = self.program.iter().map(|w| quoted(w)).collect::<Result<_>>()?;
+        let program = program.join(" ");
         let general: Vec<String> = self.general.iter().map(|g| quoted(g)).collect::<Result<_>>()?;
         let mut general: String = general.iter().map(|g| format!(" {g}")).collect();
         if !self.general.iter().any(|g| g.starts_with("--threads")) {
             general += " --threads \"${SLURM_CPUS_PER_TASK:-1}\"";
         }
-        let (program, study, output) = (path(self.program)?, path(self.study)?, path(self.output)?);
+        let (study, output) = (path(self.study)?, path(self.output)?);
         let count = self.count;
         Ok(format!(
             "#!/bin/bash
@@ -63,7 +65,7 @@ mod tests {
     fn names_are_quoted_and_whole() {
         let jobs = Jobs {
             name: "my study",
-            program: Path::new("/bin/conefield"),
+            program: &["/bin/python".into(), "-m".into(), "conefield".into()],
             study: Path::new("/a b/s.toml"),
             output: Path::new("/out"),
             count: 3,
@@ -73,7 +75,7 @@ mod tests {
         assert!(script.starts_with("#!/bin/bash\n") && script.contains("#SBATCH --array=1-3\n"), "{script}");
         assert!(script.contains("--job-name=my-study\n"), "{script}");
         let last = script.lines().last().unwrap();
-        let want = "exec /bin/conefield --quiet --threads \"${SLURM_CPUS_PER_TASK:-1}\" study '/a b/s.toml' -o /out --shard \"$SLURM_ARRAY_TASK_ID/3\"";
+        let want = "exec /bin/python -m conefield --quiet --threads \"${SLURM_CPUS_PER_TASK:-1}\" study '/a b/s.toml' -o /out --shard \"$SLURM_ARRAY_TASK_ID/3\"";
         assert_eq!(last, want);
     }
 }

@@ -4,7 +4,7 @@ use super::cell::{self, Start, is_done};
 use super::protocol::RunProtocol;
 use super::{EndOptions, General, trial};
 use crate::boundary::Inputs;
-use crate::{out, parse, signals, specs};
+use crate::{out, parse, program, signals, specs};
 use clap::Args;
 use conefield_core::error::ensure;
 use conefield_core::{Error, Result};
@@ -17,6 +17,7 @@ use conefield_study::slurm::Jobs;
 use conefield_study::study::{Cell, Source, Study};
 use conefield_tradeoff::trial::TrialInput;
 use serde_json::json;
+use std::ffi::OsString;
 use std::fs;
 use std::path::{Path, PathBuf};
 use std::time::{Duration, Instant};
@@ -155,14 +156,13 @@ impl StudyArgs {
     }
 
     fn write_script(&self, study: &Study, file: &Path, general: &General) -> Result<()> {
-        let program = std::env::current_exe().map_err(|e| Error::io("conefield", e))?;
         let runs = study.cells().len();
         let count = self.jobs.map_or(runs.min(MOST_JOBS), |n| runs.min(n.into()));
-        let general = general
-            .arguments()
-            .into_iter()
-            .map(|a| a.into_string().map_err(|a| Error::invalid("--slurm", "option", a.display(), "text in UTF-8")));
-        let general: Vec<String> = general.collect::<Result<_>>()?;
+        let text = |word: OsString| {
+            word.into_string().map_err(|w| Error::invalid("--slurm", "option", w.display(), "text in UTF-8"))
+        };
+        let program: Vec<String> = program::words()?.into_iter().map(text).collect::<Result<_>>()?;
+        let general: Vec<String> = general.arguments().into_iter().map(text).collect::<Result<_>>()?;
         let jobs = Jobs {
             name: &study.name,
             program: &program,

@@ -4,13 +4,13 @@ use super::General;
 use super::protocol::{RunProtocol, word};
 use super::reconstruct::FAILED;
 use crate::memory::Run;
-use crate::{files, signals};
+use crate::{files, program, signals};
 use conefield_core::scan::Scan;
 use conefield_core::{Error, Result};
 use conefield_tradeoff::trial::TrialInput;
 use std::io::Read;
 use std::path::Path;
-use std::process::{Command, ExitStatus, Stdio};
+use std::process::{ExitStatus, Stdio};
 use std::time::Duration;
 
 /// Time between two checks of a run's process.
@@ -34,9 +34,8 @@ impl Trial<'_> {
         if signals::caught().is_some() {
             return Err(Error::Stopped { part });
         }
-        let program = std::env::current_exe().map_err(|e| Error::io("conefield", e))?;
-        let io = |e| Error::io(&program, e);
-        let mut command = Command::new(&program);
+        let mut command = program::command()?;
+        let io = |e| Error::io("conefield", e);
         command.args(general.arguments()).args(["reconstruct", "--as-part"]).args(self.more);
         command.arg(word("--spec", self.spec)).arg(word("--output", self.output));
         command.args(self.protocol.arguments()).arg("--").arg(self.scan);

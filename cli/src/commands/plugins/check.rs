@@ -1,6 +1,6 @@
 //! `conefield plugins check`
 
-use crate::{out, parse, plugins};
+use crate::{out, parse, plugins, program};
 use clap::Args;
 use conefield_backend_wgpu::{Shared, Wgpu};
 use conefield_conformance::{
@@ -20,7 +20,7 @@ use serde::Serialize;
 use serde_json::Value;
 use std::io::Read;
 use std::path::PathBuf;
-use std::process::{Command, ExitStatus, Stdio};
+use std::process::{ExitStatus, Stdio};
 use std::sync::OnceLock;
 use std::thread;
 use std::time::{Duration, Instant};
@@ -114,10 +114,9 @@ impl Check {
 
     /// Runs a part of the check in a child process and reports how it ended; `late` if it takes longer than `limit` seconds.
     fn apart(&self, part: &str, limit: f64, late: String) -> Result<()> {
-        let program = std::env::current_exe().map_err(|e| Error::io("conefield", e))?;
-        let io = |e| Error::io(&program, e);
-        let mut command = Command::new(&program);
-        command.args(std::env::args_os().skip(1)).arg(part);
+        let mut command = program::command()?;
+        let io = |e| Error::io("conefield", e);
+        command.args(program::arguments()).arg(part);
         let mut child = command.stdin(Stdio::null()).stderr(Stdio::piped()).spawn().map_err(io)?;
         let errors = child.stderr.take();
         let said = thread::spawn(move || {
