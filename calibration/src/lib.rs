@@ -136,7 +136,9 @@ impl Calibration {
             .found
             .iter()
             .filter(|f| f.verdict == Verdict::Corrected)
-            .map(|f| (f.parameter.to_string(), json!({ "change": f.change, "uncertainty": f.uncertainty, "unit": f.unit })))
+            .map(|f| {
+                (f.parameter.to_string(), json!({ "change": f.change, "uncertainty": f.uncertainty, "unit": f.unit }))
+            })
             .collect();
         let calibrated = json!({ "from": source, "corrected": corrected, "held_out": self.held_out });
         match &mut scan.provenance {

@@ -29,7 +29,8 @@ impl Wanted {
         ensure((16..=1024).contains(&self.pixels), "arguments", "pixels", self.pixels, "16 to 1024")?;
         let read = |name: &String| {
             let names = Parameter::ALL.map(Parameter::name).join(", ");
-            let unknown = |_| Error::invalid("arguments", "parameters", format!("{name:?}"), format!("some of {names}"));
+            let unknown =
+                |_| Error::invalid("arguments", "parameters", format!("{name:?}"), format!("some of {names}"));
             name.parse().map_err(unknown)
         };
         let parameters = self.parameters.iter().map(read).collect::<Result<_>>()?;

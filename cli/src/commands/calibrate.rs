@@ -6,9 +6,7 @@ use crate::memory::Memory;
 use crate::progress::Progress;
 use crate::{out, signals};
 use clap::Args;
-use conefield_calibration::{
-    Calibration, Found, Parameter, Settings, Verdict, Watch, calibrate, directions, suspect,
-};
+use conefield_calibration::{Calibration, Found, Parameter, Settings, Verdict, Watch, calibrate, directions, suspect};
 use conefield_core::backend::Backend;
 use conefield_core::scan::Scan;
 use conefield_core::{Error, Result};
