@@ -55,7 +55,7 @@ pub fn cases() -> Vec<Case> {
         wrong("pixels of no pixels", "convert scan out --bin 0", &["--bin"]),
         wrong("five quarter turns", "convert scan out --turns 5", &["--turns", "0..=3"]),
         wrong(
-            "a distance that no view tells",
+            "a distance that no view shows",
             "calibrate scan --parameters dso",
             &["dso", "object's size", "offset-u"],
         ),
