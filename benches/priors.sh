@@ -21,14 +21,14 @@ for volume in $volumes; do
         scan=$out/$volume-$views-$seed
         published_scan "$data" "$volume" "$scan" "$views" "$seed"
         for prior in $priors; do
-            told=$out/$volume-$views-$seed-$prior.json
-            [[ -f $told ]] && continue
+            record=$out/$volume-$views-$seed-$prior.json
+            [[ -f $record ]] && continue
             edge=
             [[ $prior == directional-* ]] && edge=", edge = 0.7"
             value="{ type = \"$prior\", weight = { noise = 0.7 }$edge }"
             "$bin" -q reconstruct "$scan" -o "$out/run" --force --reference truth --spec smooth-tv \
                 --set "methods.1.prior=$value" --set "methods.2.prior=$value" >/dev/null
-            cp "$out/run/record.json" "$told"
+            cp "$out/run/record.json" "$record"
         done
     done
 done

@@ -91,12 +91,12 @@ const FAULTS: &[Fault] = &[
     untried(
         "a resolution that is NaN",
         &["FAULT=NAN_RESOLUTION"],
-        "resolutions failed: channel 1 of 3 tells NaN cells apart",
+        "resolutions failed: channel 1 of 3 resolves NaN cells",
     ),
     untried(
         "a negative resolution",
         &["FAULT=NEGATIVE_RESOLUTION"],
-        "resolutions failed: channel 1 of 3 tells -8 cells apart",
+        "resolutions failed: channel 1 of 3 resolves -8 cells",
     ),
     untried(
         "reads halves without a function for them",
