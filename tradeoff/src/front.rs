@@ -261,8 +261,8 @@ impl Point {
         mean(|r| r.psnr).or_else(|| mean(|r| r.held_out).map(|e| -e)).unwrap_or(f64::NEG_INFINITY)
     }
 
-    /// Its results as text.
-    pub fn results(&self, front: &Front) -> String {
+    /// Its scores as text.
+    pub fn scores(&self, front: &Front) -> String {
         let one = |(run, scan): (&Reached, &Tuned)| match (run.psnr, run.held_out) {
             (Some(psnr), _) => format!("{psnr:.2} dB on {}", scan.name),
             (None, error) => format!("held-out error {:.4} on {}", error.unwrap_or(f64::NAN), scan.name),

@@ -150,8 +150,10 @@ impl Budget {
             method.ok_or_else(|| Error::unsupported("the budget", "no method of the front was measured"))?;
         let point = points[at];
         let why = match fits {
-            true => format!("the best of the front that fits ({})", point.results(front)),
-            false => format!("no method of the front fits completely; this one is the fastest ({})", point.results(front)),
+            true => format!("the best of the front that fits ({})", point.scores(front)),
+            false => {
+                format!("no method of the front fits completely; this one is the fastest ({})", point.scores(front))
+            }
         };
         let passed_over = passed_over.into_iter().map(|(i, why)| format!("{}: {why}", points[i].name)).collect();
         let plan = self.settle(Some(point.name.clone()), why, passed_over, &mut method, costs, start)?;
