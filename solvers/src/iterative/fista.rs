@@ -218,7 +218,10 @@ impl Iterative for Built {
 
     fn found(&self, scan: &Scan) -> Vec<String> {
         let noise = self.data.of(scan.projections.view());
-        vec![summary(&self.subsets.of(scan.geometry.views.len())), noise.map_or_else(|e| e.to_string(), |n| n.describe())]
+        vec![
+            summary(&self.subsets.of(scan.geometry.views.len())),
+            noise.map_or_else(|e| e.to_string(), |n| n.describe()),
+        ]
     }
 
     fn stages(&self) -> Vec<Line> {
