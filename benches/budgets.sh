@@ -39,13 +39,13 @@ for volume in $volumes; do
 import json, pathlib, sys
 run, begin, end = sys.argv[1:]
 record = pathlib.Path(run) / "record.json"
-told = {"seconds": float(end) - float(begin)}
+result = {"seconds": float(end) - float(begin)}
 if record.exists():
     record = json.loads(record.read_text())
     point = (record.get("plan") or {}).get("point") or record["spec"]
     scores = json.loads((pathlib.Path(run) / "scores.json").read_text())
-    told |= {"point": point, **{key: scores[key] for key in ("psnr", "ssim_2d")}}
-pathlib.Path(run + ".json").write_text(json.dumps(told))
+    result |= {"point": point, **{key: scores[key] for key in ("psnr", "ssim_2d")}}
+pathlib.Path(run + ".json").write_text(json.dumps(result))
 PY
                 rm -rf "$run"
             done

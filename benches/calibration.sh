@@ -1,9 +1,9 @@
 #!/usr/bin/env bash
-# What `conefield calibrate` finds back of a geometry that is told wrongly, and what that does for a reconstruction:
+# The accuracy of `conefield calibrate` on scans with a wrong geometry, and its effect on a reconstruction:
 #   bash benches/calibration.sh DATA_FOLDER OUT_FOLDER [SCANS [SEEDS [ERRORS]]]
 # DATA_FOLDER holds volumes/*_256.nii.gz and, for the scan `counts`, interop/ellipsoids_*. head and engine: volumes of 128^3, 50 views
 # of 128 x 128 pixels with the published noise. counts: 25 views of raw counts with flat and dark fields, 96 x 96 pixels. ERRORS are
-# those of misplace.py. A row each: what was found, held-out error before and after, PSNR of 30 passes of sirt as told and as corrected.
+# those of misplace.py. A row each: the result, then held-out error and PSNR of 30 passes of sirt, before and after correction.
 set -euo pipefail
 cd "$(dirname "$0")/.."
 data=$1
@@ -27,7 +27,7 @@ for scan in $scans; do
         mkdir -p "$at"
         truth=$at/right/truth.nii.gz
         if [[ $scan == counts ]]; then
-            # Counted once: there is one seed of it.
+            # The counts exist for one seed only.
             [[ $seed == "${seeds%% *}" ]] || continue
             truth=$at/exact/truth.nii.gz
             if [[ ! -d $at/right ]]; then
@@ -59,26 +59,26 @@ T
                 --views 50 --noise tigre:1e4,10 --seed "$seed" >/dev/null
         fi
         for error in $errors; do
-            told=$at/$error-told
+            wrong=$at/$error-wrong
             corrected=$at/$error-corrected
-            "$python" benches/misplace.py "$at/right" "$told" "$error"
-            # What the command looks for by itself, and what is wrong.
+            "$python" benches/misplace.py "$at/right" "$wrong" "$error"
+            # The parameters that the command estimates by default, and the wrong one.
             case $error in
             offset-u=* | rotation=*) parameters=offset-u,rotation ;;
             *) parameters=offset-u,rotation,${error%%=*} ;;
             esac
-            "$bin" -q calibrate "$told" -o "$corrected" --force --parameters "$parameters" --json >"$at/$error.json"
-            "$python" - "$scan" "$error" "$at/$error.json" "$(psnr "$told")" "$(psnr "$corrected")" <<'PY'
+            "$bin" -q calibrate "$wrong" -o "$corrected" --force --parameters "$parameters" --json >"$at/$error.json"
+            "$python" - "$scan" "$error" "$at/$error.json" "$(psnr "$wrong")" "$(psnr "$corrected")" <<'PY'
 import json, sys
 scan, error, file, before, after = sys.argv[1:]
 found = json.load(open(file))
 key = error.split("=")[0]
-def said(p):
+def text(p):
     if p["verdict"] == "not-determined":
         return f"{p['parameter']} not determined"
     end = {"corrected": "", "kept": " kept"}[p["verdict"]]
     return f"{p['parameter']} {p['change']:.3f} ± {p['uncertainty']:.3f} {p['unit']}, {p['pixels'][0]:.2f} ± {p['pixels'][1]:.2f} pixels{end}"
-asked = [said(p) for p in found["parameters"] if p["parameter"] == key or p["verdict"] == "corrected"]
+asked = [text(p) for p in found["parameters"] if p["parameter"] == key or p["verdict"] == "corrected"]
 held = found["held_out"]
 print(f"| {scan} | {error} | {'; '.join(asked)} | {held['before']:.4f}, {held['after']:.4f} | {before} dB | {after} dB |")
 PY

@@ -17,7 +17,7 @@ bin=${CARGO_TARGET_DIR:-target}/release/conefield
 [[ -x $bin ]] || cargo build --release --quiet -p conefield
 mkdir -p "$out"
 
-# Corrections as they are asked for where their fault is and, after a bar, where it is not (if they are told its size).
+# The options of each correction for scans with its fault and, after a bar, without it (if an option is the size of the fault).
 rows=(
     "rings:rings"
     "rings:rings.method=sorting"

@@ -1,6 +1,6 @@
 #!/usr/bin/env bash
-# Kills commands that write at random moments, 200 times in all, and looks at what is left: what stood under a name before is
-# whole under it again (or the new is), what is resumed ends as if nothing had been, and the next command leaves no stray file.
+# Kills commands at random moments while they write, 200 times in all, and checks the files: the earlier or the new file is complete
+# under its name, a resumed run ends as if it had not been interrupted, and the next command leaves no stray file.
 #
 #   benches/kills.sh [BINARY] [KILLS] [SEED]
 set -euo pipefail

@@ -1,15 +1,15 @@
-"""A scan whose description is wrong: its views stay as they are.
+"""Writes a scan with a wrong geometry. Its views are unchanged.
 
 usage: misplace.py SCAN OUT KEY=VALUE
 
-SCAN and OUT are folders of conefield's own, SCAN's views a circle. KEY is offset-u or offset-v (pixels), rotation, tilt or slant of the
-detector (degrees), distance of source and detector or step of the angle (%).
+SCAN and OUT are folders in conefield's format; SCAN's views are on a circle. KEY is offset-u or offset-v (pixels), rotation, tilt or slant of the
+detector (degrees), distance from source to detector or step of the angle (%).
 """
 import json, math, os, pathlib, sys, tomllib
 
 source, out, (key, value) = pathlib.Path(sys.argv[1]), pathlib.Path(sys.argv[2]), sys.argv[3].split("=")
-told = tomllib.loads((source / "scan.toml").read_text())
-orbit = told["orbit"]
+scan = tomllib.loads((source / "scan.toml").read_text())
+orbit = scan["orbit"]
 count = orbit.get("count") or len(orbit["angles"])
 angles = orbit.get("angles") or [orbit["start"] + orbit["range"] * i / count for i in range(count)]
 off = {k: 0.0 for k in "offset-u offset-v rotation tilt slant distance step".split()}
@@ -18,7 +18,7 @@ off[key] = float(value)
 
 
 def turned(a, axis, degrees):
-    """a, right-handed about axis (Rodrigues)."""
+    """Vector a, rotated right-handed about axis (Rodrigues)."""
     c, s = math.cos(math.radians(degrees)), math.sin(math.radians(degrees))
     n = math.hypot(*axis)
     axis = [x / n for x in axis]
@@ -43,11 +43,11 @@ def view(angle):
 
 
 out.mkdir(parents=True, exist_ok=True)
-told.pop("orbit")
-told.pop("truth", None)
-told["provenance"] = {"misplaced": sys.argv[3]}
-told["views"] = [view(a) for a in angles]
-(out / "scan.json").write_text(json.dumps(told))
+scan.pop("orbit")
+scan.pop("truth", None)
+scan["provenance"] = {"misplaced": sys.argv[3]}
+scan["views"] = [view(a) for a in angles]
+(out / "scan.json").write_text(json.dumps(scan))
 name = "projections.npy"
 if not (out / name).exists():
     os.link(source / name, out / name)

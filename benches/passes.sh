@@ -41,11 +41,11 @@ for line in open(f"{sys.argv[1]}/seconds.txt"):
     scan, spec, passes, build, begin, end = line.split()
     taken[scan, spec, build, passes].append(float(end) - float(begin))
 each = lambda *key: [(b - a) / 8 for a, b in zip(taken[*key, "4"], taken[*key, "12"])]
-told = lambda x: f"{statistics.median(x):.2f} s ({min(x):.2f} to {max(x):.2f})"
+text = lambda x: f"{statistics.median(x):.2f} s ({min(x):.2f} to {max(x):.2f})"
 print("| | this build | the other | factor |\n|---|---|---|---|")
 for spec in ("fista-tv", "sirt"):
     for scan in ("upright", "tilted"):
         both = [each(scan, spec, build) for build in ("this", "other")]
         factor = statistics.median(both[1]) / statistics.median(both[0])
-        print(f"| {spec}, {scan} | {told(both[0])} | {told(both[1])} | {factor:.2f} |")
+        print(f"| {spec}, {scan} | {text(both[0])} | {text(both[1])} | {factor:.2f} |")
 PY

@@ -1,8 +1,8 @@
 #!/usr/bin/env bash
-# What ending when views kept aside get no better is worth, for a field (balanced, a rate that stays) and for SART:
+# The benefit of ending a run when the held-out views no longer improve, for a field (balanced, constant learning rate) and for SART:
 #   bash benches/patience.sh DATA_FOLDER OUT_FOLDER [SECONDS [VOLUMES]]
-# DATA_FOLDER holds volumes/*.nii.gz. Every tenth view is kept aside. A field has SECONDS (90), SART ten passes; with patience
-# they end sooner, and keep the best record. OUT_FOLDER/patience.md has what each ended with.
+# DATA_FOLDER holds volumes/*.nii.gz. Every tenth view is held out. A field has SECONDS (90), SART ten passes; with patience
+# they end sooner, and keep the best record. OUT_FOLDER/patience.md has the result of each.
 set -euo pipefail
 cd "$(dirname "$0")/.."
 source benches/common.sh

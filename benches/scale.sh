@@ -22,11 +22,11 @@ for volume in $volumes; do
         scan=$out/$volume-$seed
         published_scan "$data" "$volume" "$scan" 50 "$seed"
         for share in $shares; do
-            told=$out/$spec-$steps-$volume-$seed-$share.json
-            [[ -f $told ]] && continue
+            record=$out/$spec-$steps-$volume-$seed-$share.json
+            [[ -f $record ]] && continue
             "$bin" -q reconstruct "$scan" -o "$out/run" --force --reference truth --spec "$spec" --steps "$steps" --seed "$seed" \
                 --set "scene.attenuation={ relative = $share }" >/dev/null
-            cp "$out/run/record.json" "$told"
+            cp "$out/run/record.json" "$record"
         done
     done
 done

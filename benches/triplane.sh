@@ -24,13 +24,13 @@ for seed in $seeds; do
         key=encoder.type
         [[ $spec == *-tv ]] && key=methods.0.encoder.type
         for encoder in hash-grid triplane; do
-            told=$out/$spec-$encoder-$seed.json
-            [[ -f $told ]] && continue
+            record=$out/$spec-$encoder-$seed.json
+            [[ -f $record ]] && continue
             set=()
             [[ $encoder == hash-grid ]] || set=(--set "$key=$encoder")
             "$bin" -q --plugin "$plugin" reconstruct "$scan" -o "$out/run" --force --reference truth --spec "$spec" "${set[@]}" \
                 --budget "$budget" --seed "$seed" >/dev/null
-            cp "$out/run/record.json" "$told"
+            cp "$out/run/record.json" "$record"
         done
     done
 done

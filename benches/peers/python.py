@@ -37,7 +37,7 @@ def apart(ours, theirs):
     return f"largest {np.abs(error).max() / np.abs(theirs).max():.1e}, rms {rms(error) / rms(theirs):.1e}"
 
 
-def told(name, ours, theirs, times):
+def report(name, ours, theirs, times):
     inner = tuple(slice(BORDER, -BORDER) if n > 4 * BORDER else slice(None) for n in ours.shape)
     seconds = [f"{t[len(t) // 2]:.3f} s ({t[0]:.3f} to {t[-1]:.3f})" for t in times]
     factor = np.median(times[1]) / np.median(times[0])
@@ -85,17 +85,17 @@ def main():
     (ours, found), times = in_turn(
         arguments.runs, lambda: conefield.project(truth, geometry), lambda: peer.forward(theirs[0])
     )
-    told("Joseph forward", ours, views(found), times)
+    report("Joseph forward", ours, views(found), times)
     (ours, found), times = in_turn(
         arguments.runs,
         lambda: conefield.backproject(measured, geometry),
         lambda: back(rtk.JosephBackProjectionImageFilter, theirs[1]),
     )
-    told("Joseph adjoint", ours, voxels(found), times)
+    report("Joseph adjoint", ours, voxels(found), times)
     (ours, found), times = in_turn(
         arguments.runs, lambda: conefield.reconstruct(scan, "fdk", window="ramp", nonnegative=False), fdk
     )
-    told("FDK", ours.volume.data, voxels(found) * peer.mm, times)
+    report("FDK", ours.volume.data, voxels(found) * peer.mm, times)
     _, times = in_turn(arguments.runs, lambda: back(rtk.BackProjectionImageFilter, theirs[1]))
     median = times[0][len(times[0]) // 2]
     print(f"voxel-driven back-projection: RTK {median:.3f} s ({times[0][0]:.3f} to {times[0][-1]:.3f})")

@@ -1,15 +1,15 @@
-//! The criterion without a reconstruction: what two views say of the planes through both their sources.
+//! The criterion without a reconstruction: the consistency of two views on the planes through both sources.
 //!
-//! A plane `n` through a source meets the detector in a line. The derivative of the plane's integral of the object, at right angles
-//! to the plane, follows from the view alone (Grangeat, Mathematical Methods in Tomography, LNM 1497, 1991):
-//! `R(n) = ∫ g(θ)·δ'(n·θ) dθ` over all directions `θ` of rays, `g` their line integrals. Both views of a pair must say the same of
-//! every plane through both sources (Debbeler et al., Fully3D 2013; Aichert et al., IEEE Trans. Med. Imaging 34, 2015). This holds
-//! for every object, so that neither its size nor how well few views predict others takes part.
+//! A plane `n` through a source meets the detector in a line. The view alone gives the derivative of the object's plane integral
+//! along the plane's normal (Grangeat, Mathematical Methods in Tomography, LNM 1497, 1991): `R(n) = ∫ g(θ)·δ'(n·θ) dθ` over all
+//! ray directions `θ` with line integrals `g`. For every plane through both sources, both views must give the same value
+//! (Debbeler et al., Fully3D 2013; Aichert et al., IEEE Trans. Med. Imaging 34, 2015). This holds for every object: the criterion
+//! depends neither on its size nor on the accuracy of a prediction from few views.
 //!
-//! With `e₁`, `e₂` at right angles to the line through the sources the planes are `n = e₂ − k·e₁`. A pixel, direction `d` from the
-//! source and solid angle `|det(u, v, w)|/|d|³` (`w` to the detector's middle), lies in the plane `k = d·e₂/d·e₁`, and
-//! `R(k) = Σ g·|det|/(|d|·(d·e₁)²)·δ'(k(pixel) − k)`. In place of `δ'` stands the derivative of a Gaussian, as wide for both views:
-//! no interpolation, and equal values stay equal.
+//! With `e₁`, `e₂` at right angles to the line through the sources, the planes are `n = e₂ − k·e₁`. A pixel with direction `d`
+//! from the source and solid angle `|det(u, v, w)|/|d|³` (`w` to the detector's centre) lies in the plane `k = d·e₂/d·e₁`, and
+//! `R(k) = Σ g·|det|/(|d|·(d·e₁)²)·δ'(k(pixel) − k)`. The derivative of a Gaussian of the same width for both views replaces
+//! `δ'`. So there is no interpolation, and equal values stay equal.
 
 use crate::criterion::spread;
 use crate::parameters::{Correction, Parameter};
@@ -20,72 +20,73 @@ use ndarray::{Array3, ArrayView2, s};
 use rayon::prelude::*;
 use std::f64::consts::PI;
 
-/// Most pairs of views.
+/// Largest number of pairs of views.
 const MOST_PAIRS: usize = 1500;
-/// Standard deviation of the Gaussian, in pixels where the pair's pixels are widest.
+/// Standard deviation of the Gaussian, in widths of the pair's widest pixel.
 const WIDE: f64 = 1.5;
-/// Bins in a standard deviation; standard deviations after which a Gaussian ends.
+/// Bins per standard deviation; the Gaussian is cut off after `END` standard deviations.
 const FINE: usize = 8;
 const END: usize = 5;
-/// Share of the planes at either end that is left out: there the object would come and go as the geometry changes.
+/// Share of planes ignored at either end, where the object enters and leaves as the geometry changes.
 const MARGIN: f64 = 0.1;
-/// Fewer planes of a pair are left out.
+/// Least number of planes of a pair; pairs with fewer are ignored.
 const FEWEST: usize = 4;
-/// Of the highest line integral: less, as a mean of the pixels around, is air, which counts as nothing. More at a side of the detector
-/// is an object cut off.
+/// Shares of the highest line integral. A local mean below the first is air and is ignored. A local mean above the second at a
+/// side of the detector is an object that is cut off.
 const AIR: f32 = 0.01;
 const CUT: f32 = 0.05;
-/// The line through two sources must pass the middle of the volume, and the plane at right angles to it every ray, by these shares of the
-/// distances: planes about a line through the object are no lines that lie side by side.
+/// Least distance of the line through two sources from the volume's centre, and of every ray's end from the plane at right angles
+/// to `e₁`, as shares of the distances from the source: planes around a line through the object do not give parallel lines on the
+/// detector.
 const PAST: f64 = 0.05;
 const AHEAD: f64 = 0.15;
-/// Steps of brightness in which the noise is measured.
+/// Number of brightness intervals for the noise measurement.
 const STEPS: usize = 16;
 
-/// A scan, with what its pairs of views need.
+/// A scan prepared for comparing pairs of views.
 pub(crate) struct Consistency {
-    /// The geometry of all its views, as it was told.
+    /// The geometry of all views, before correction.
     pub geometry: Geometry,
     pixels: Vec<Vec<Pixel>>,
     pairs: Vec<Pair>,
-    /// Planes of all pairs.
+    /// Number of planes of all pairs.
     planes: usize,
-    /// Mean square of what a view says of a plane, over the variance of its noise.
+    /// Mean square of a view's values on the planes, divided by their noise variance.
     signal: f64,
-    /// Root mean square change of the differences with a shift by a pixel.
+    /// Root mean square change of the differences for a shift by a pixel.
     pub steepness: f64,
 }
 
-/// A pixel that shows something.
+/// A pixel that shows the object.
 struct Pixel {
     row: f64,
     column: f64,
     value: f64,
-    /// Of its noise.
+    /// Variance of its noise.
     variance: f64,
 }
 
-/// Two views with the planes that both show whole.
+/// Two views and the planes that both show completely.
 struct Pair {
     views: [usize; 2],
-    /// The first plane, and from each to the next: also the standard deviation of the Gaussian.
+    /// The first plane, and the spacing of planes, which is also the standard deviation of the Gaussian.
     first: f64,
     width: f64,
-    /// Whether no plane near is cut off, for each.
+    /// For each plane, whether no plane nearby is cut off.
     whole: Vec<bool>,
 }
 
 /// A pixel in a corrected geometry.
 struct Seen {
     direction: Vec3,
-    /// `g·|det|/|d|` and the variance of that.
+    /// `g·|det|/|d|` and its variance.
     value: f64,
     variance: f64,
 }
 
 impl Consistency {
-    /// Of `scan`, with about `width` pixels along the longer side of the detector. Its planes are those that are whole in the geometry
-    /// that `known` makes.
+    /// Prepares `scan` with about `width` pixels along the longer side of the detector. Uses the planes that are complete in the
+    /// geometry corrected by `known`.
     pub fn new(scan: &Scan, width: usize, known: &Correction) -> Result<Self> {
         let [rows, columns] = scan.geometry.detector;
         let bin = rows.max(columns).div_ceil(width).clamp(1, (rows.min(columns) / 4).max(1));
@@ -100,7 +101,7 @@ impl Consistency {
         let noise = Noise::of(p, AIR * top);
         let [rows, columns] = binned.geometry.detector;
         let view = |(v, mean): (usize, &Vec<f32>)| -> Vec<Pixel> {
-            // What is not air, and two pixels around it.
+            // Pixels within two pixels of one that is not air.
             let shows = |r: usize, c: usize| {
                 let near = |i: usize, n: usize| i.saturating_sub(2)..(i + 3).min(n);
                 near(r, rows).any(|r| near(c, columns).any(|c| mean[r * columns + c] > AIR * top))
@@ -134,12 +135,12 @@ impl Consistency {
         Ok(new)
     }
 
-    /// Planes of all pairs; 0 where no pair of views shows any whole.
+    /// Number of planes of all pairs; 0 if no pair of views shows a plane completely.
     pub fn planes(&self) -> usize {
         self.planes
     }
 
-    /// About what the misfits take, in samples of a ray.
+    /// Approximate work of the misfits, in samples of a ray.
     pub fn work(&self) -> f64 {
         let of = |p: &Pair| p.views.iter().map(|&v| self.pixels[v].len() as f64).sum::<f64>();
         self.pairs.iter().map(of).sum()
@@ -150,19 +151,19 @@ impl Consistency {
         self.pairs.iter().map(|p| p.views).collect()
     }
 
-    /// The sum of squares of what the views of each pair say differently, over the variance of their noise, in the geometry that
-    /// `correction` makes. Noise alone makes it the number of planes, whatever the geometry: the criterion has no preference.
+    /// For each pair in the corrected geometry, the sum of squared differences of its views, divided by their noise variance. For
+    /// pure noise this equals the number of planes in every geometry: the criterion is unbiased.
     pub fn misfits(&self, correction: &Correction) -> Vec<f64> {
         let of = |[(a, va), (b, vb)]: &[(f64, f64); 2]| (a - b).powi(2) / (va + vb).max(f64::MIN_POSITIVE);
         self.both(correction).iter().map(|pair| pair.iter().map(of).sum()).collect()
     }
 
-    /// The sum of `misfits` as a share of what the views say: 0 where they agree.
+    /// The sum of `misfits` relative to the views' values: 0 if they agree.
     pub fn error(&self, misfits: &[f64]) -> f64 {
         (misfits.iter().sum::<f64>() / (self.planes.max(1) as f64 * self.signal)).sqrt()
     }
 
-    /// What both views say of each whole plane of each pair, and the variance of that.
+    /// The values and variances of both views on each complete plane of each pair.
     fn both(&self, correction: &Correction) -> Vec<Vec<[(f64, f64); 2]>> {
         let views = correction.views(&self.geometry.views);
         let seen: Vec<Vec<Seen>> =
@@ -176,11 +177,11 @@ impl Consistency {
         self.pairs.par_iter().map(of).collect()
     }
 
-    /// How much the views say, and how much more they differ with a shift along u.
+    /// Measures the signal of the views and the increase of their difference with a shift along u.
     fn measure(&mut self, known: &Correction) -> Result<()> {
-        let said = self.both(known);
+        let values = self.both(known);
         let square = |(a, v): &(f64, f64)| a * a / v.max(f64::MIN_POSITIVE);
-        let sum: f64 = said.iter().flatten().flatten().map(square).sum();
+        let sum: f64 = values.iter().flatten().flatten().map(square).sum();
         self.signal = (sum / (2 * self.planes) as f64).max(f64::MIN_POSITIVE);
         let (u, pixel) = (Parameter::OffsetU, Parameter::OffsetU.pixel(&self.geometry));
         let at = |x: f64| self.misfits(&known.with(u, known.get(u) + x * pixel)).iter().sum::<f64>();
@@ -198,7 +199,8 @@ impl Consistency {
         pixels.iter().map(of).collect()
     }
 
-    /// `e₁` and `e₂` of a pair, `e₁` towards the middle of the volume; `None` where the line through the sources passes that too near.
+    /// `e₁` and `e₂` of a pair, `e₁` towards the centre of the volume; `None` if the line through the sources passes too near the
+    /// centre.
     fn frame(&self, views: &[View], [i, j]: [usize; 2]) -> Option<[Vec3; 2]> {
         let along = sub(views[j].source, views[i].source);
         let along = along.map(|x| x / norm(along));
@@ -206,14 +208,14 @@ impl Consistency {
         let part = dot(ahead, along);
         let e1: Vec3 = std::array::from_fn(|k| ahead[k] - part * along[k]);
         let past = norm(e1);
-        // Not for sources in one place either, where nothing is a number.
+        // Also false for identical sources, where the values are NaN.
         (past > PAST * norm(ahead)).then(|| {
             let e1 = e1.map(|x| x / past);
             [e1, cross(along, e1)]
         })
     }
 
-    /// The planes of two views, if there are enough that both show whole.
+    /// The planes of two views, if both show enough of them completely.
     fn pair(&self, views: &[View], pair: [usize; 2], side: &(impl Fn(usize, &Pixel) -> bool + Sync)) -> Option<Pair> {
         let [e1, e2] = self.frame(views, pair)?;
         let (mut low, mut high, mut width) = (f64::NEG_INFINITY, f64::INFINITY, 0.0f64);
@@ -254,7 +256,7 @@ impl Consistency {
     }
 }
 
-/// What a view says of each plane of a pair, and the variance of that.
+/// The value of a view on each plane of a pair, and its variance.
 fn planes(seen: &[Seen], [e1, e2]: [Vec3; 2], pair: &Pair) -> Vec<(f64, f64)> {
     let n = (pair.whole.len() + 2 * END) * FINE;
     let mut bins = vec![(0.0, 0.0); n + 1];
@@ -262,7 +264,7 @@ fn planes(seen: &[Seen], [e1, e2]: [Vec3; 2], pair: &Pair) -> Vec<(f64, f64)> {
     let start = pair.first - (END * FINE) as f64 * fine;
     for x in seen {
         let ahead = dot(x.direction, e1);
-        // A geometry far from the one that the pair was made for.
+        // Only in a geometry far from the pair's original one.
         if ahead <= 0.0 {
             continue;
         }
@@ -301,14 +303,16 @@ fn means(view: ArrayView2<f32>, reach: usize) -> Vec<f32> {
     .collect()
 }
 
-/// Variance of a pixel's noise by how bright it is. A wrong one would prefer the geometry in which noisy pixels count least.
+/// Variance of a pixel's noise as a function of brightness. A wrong variance would favour geometries in which noisy pixels have
+/// less weight.
 struct Noise {
-    /// Up to which value, and the variance.
+    /// The upper limit of each interval, and the variance in it.
     steps: Vec<(f32, f64)>,
 }
 
 impl Noise {
-    /// From the curvature of three pixels in a row, whose median no edge changes much (Hampel, J. Am. Stat. Assoc. 69, 1974).
+    /// Measured from the curvature of three pixels in a row; edges hardly affect its median (Hampel, J. Am. Stat. Assoc. 69,
+    /// 1974).
     fn of(p: &Array3<f32>, air: f32) -> Self {
         let columns = p.dim().2;
         let triples = |view: ArrayView2<f32>| -> Vec<(f32, f32)> {
@@ -324,15 +328,15 @@ impl Noise {
             let mut bends: Vec<f32> = part.iter().map(|x| x.1).collect();
             let middle = bends.len() / 2;
             let median = f64::from(*bends.select_nth_unstable_by(middle, f32::total_cmp).1);
-            // A median deviation is 0.6745 standard ones; three pixels with weights 1, -2, 1 have six times the variance.
+            // A median deviation is 0.6745 standard deviations; three pixels with weights 1, -2, 1 have six times the variance.
             (part[part.len() - 1].0, (median / 0.6745).powi(2) / 6.0)
         };
         let mut steps: Vec<(f32, f64)> = all.chunks(all.len().div_ceil(STEPS).max(1)).map(step).collect();
-        // Brighter pixels have been reached by fewer photons: what varies more than they do is no noise but an edge.
+        // Fewer photons reach brighter pixels, so their noise is larger: a larger variance at lower brightness comes from edges.
         for i in (1..steps.len()).rev() {
             steps[i - 1].1 = steps[i - 1].1.min(steps[i].1);
         }
-        // Where nothing varies at all every pixel counts alike.
+        // Without any noise, every pixel has the same weight.
         let most = steps.iter().map(|s| s.1).fold(0.0, f64::max);
         let least = if most > 0.0 { 1e-3 * most } else { 1.0 };
         steps.iter_mut().for_each(|s| s.1 = s.1.max(least));
@@ -352,7 +356,7 @@ pub(crate) mod tests {
     use conefield_core::orbit::CircularOrbit;
     use std::f64::consts::TAU;
 
-    /// Gaussians, whose line integrals are known: middle in mm, width in mm, largest value in 1/mm.
+    /// Gaussians with known line integrals: centre in mm, width in mm, largest value in 1/mm.
     const OBJECT: [(Vec3, f64, f64); 6] = [
         ([30.0, 5.0, 20.0], 7.0, 0.03),
         ([-25.0, 28.0, -5.0], 6.0, 0.03),
@@ -362,7 +366,7 @@ pub(crate) mod tests {
         ([-35.0, -5.0, 15.0], 5.0, 0.03),
     ];
 
-    /// Views of the Gaussians by a detector of 256 mm × 256 mm, with noise of this standard deviation.
+    /// Views of the Gaussians on a detector of 96 × 96 pixels of 2.5 mm, with noise of this standard deviation.
     pub(crate) fn scan(views: usize, noise: f64) -> Scan {
         let angles = (0..views).map(|i| TAU * i as f64 / views as f64).collect();
         let orbit = CircularOrbit { dso: 500.0, dsd: 800.0, pixel: [2.5; 2], offset: [0.0; 2], angles };
@@ -381,7 +385,7 @@ pub(crate) mod tests {
                 let past = dot(to, to) - dot(to, ray).powi(2) / dot(ray, ray);
                 value * width * (2.0 * PI).sqrt() * (-past / (2.0 * width * width)).exp()
             };
-            // Twelve uniform numbers have nearly a normal sum of variance 1.
+            // The sum of twelve uniform numbers is nearly normal with variance 1.
             let random = (0..12).map(|_| uniform()).sum::<f64>() - 6.0;
             (OBJECT.iter().map(integral).sum::<f64>() + noise * random) as f32
         });
@@ -393,7 +397,7 @@ pub(crate) mod tests {
     }
 
     #[test]
-    fn pairs_say_the_same_in_the_true_geometry_and_in_no_other() {
+    fn pairs_are_consistent_only_in_the_true_geometry() {
         let pairs = Consistency::new(&scan(24, 0.0), 96, &Correction::default()).unwrap();
         let right = error(&pairs, Parameter::OffsetU, 0.0);
         let wrong = [
@@ -412,9 +416,9 @@ pub(crate) mod tests {
         assert!(right < 0.01, "{right}");
     }
 
-    /// Why tilt is not looked for on a circle.
+    /// The reason why tilt is not estimated on a circle.
     #[test]
-    fn a_tilt_on_a_circle_changes_hardly_anything() {
+    fn a_tilt_on_a_circle_hardly_changes_the_error() {
         let pairs = Consistency::new(&scan(24, 0.0), 96, &Correction::default()).unwrap();
         let right = error(&pairs, Parameter::Tilt, 0.0);
         for degrees in [-3.0f64, 3.0] {
@@ -424,16 +428,16 @@ pub(crate) mod tests {
         }
     }
 
-    /// The mean of the misfits, which the search makes small, is that of the noise, whatever the geometry.
+    /// The search minimizes the mean of the misfits; for pure noise it is 1 in every geometry.
     #[test]
-    fn noise_has_no_preference() {
+    fn noise_favours_no_geometry() {
         let mut blank = scan(24, 0.01);
         let object = scan(24, 0.0).projections;
         let pairs = |scan: &Scan| Consistency::new(scan, 96, &Correction::default()).unwrap();
         let mean = |p: &Consistency, c: Correction| p.misfits(&c).iter().sum::<f64>() / p.planes as f64;
         let noisy = mean(&pairs(&blank), Correction::default());
         assert!((noisy - 1.0).abs() < 0.1, "{noisy}");
-        // The same pixels with their noise only.
+        // The same pixels with only their noise.
         let mut only = pairs(&blank);
         blank.projections -= &object;
         for (v, pixels) in only.pixels.iter_mut().enumerate() {
@@ -448,7 +452,7 @@ pub(crate) mod tests {
     }
 
     #[test]
-    fn planes_that_are_cut_off_are_left_out() {
+    fn planes_that_are_cut_off_are_ignored() {
         let whole = scan(24, 0.0);
         let all = Consistency::new(&whole, 96, &Correction::default()).unwrap().planes();
         let crop = |rows: usize, columns: usize| {
@@ -466,7 +470,7 @@ pub(crate) mod tests {
     }
 
     #[test]
-    fn noise_is_measured_by_brightness() {
+    fn noise_is_measured_for_each_brightness() {
         let mut scan = scan(24, 0.0);
         let noise = super::tests::scan(24, 1.0).projections - &scan.projections;
         scan.projections = Array3::from_shape_fn(scan.projections.dim(), |(_, r, _)| if r < 48 { 1.0 } else { 2.0 });

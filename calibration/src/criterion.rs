@@ -1,4 +1,4 @@
-//! The criterion: how well views that are kept aside are predicted from a quick reconstruction of the others.
+//! The criterion: the error of held-out views, predicted from a quick reconstruction of the others.
 
 use crate::parameters::{Correction, Parameter};
 use conefield_core::backend::Backend;
@@ -14,52 +14,52 @@ use conefield_solvers::iterative::sart::Sart;
 use ndarray::{Array3, s};
 use rayon::prelude::*;
 
-/// One of so many views is kept aside, by turns.
+/// One in this many views is held out.
 const EVERY: usize = 4;
 /// Subsets of the views and passes of the quick reconstruction.
 const SUBSETS: usize = 8;
 const PASSES: u64 = 3;
-/// More views than this say little more of the geometry.
+/// More views than this add little information on the geometry.
 const MOST_VIEWS: usize = 120;
-/// Share of the views' squares that may belong to rays beside the volume before the volume is made larger, by how much, and how
-/// often at most.
+/// The volume grows if rays that miss it have more than this share of the views' sum of squares; the growth factor, and the
+/// largest number of such steps.
 const BESIDE: f64 = 0.01;
 const GROWTH: f64 = 1.4;
 const GROWN: usize = 3;
-/// Of the highest line integral: more at a side of the detector is no air.
+/// Share of the highest line integral; a larger value at a side of the detector is not air.
 const AIR: f32 = 0.05;
 
-/// A scan with larger pixels and voxels, some of whose views are kept aside by turns.
+/// A scan with larger pixels and voxels, and its folds of held-out views.
 pub(crate) struct Level {
-    /// The geometry of all its views, as it was told.
+    /// The geometry of all views, before correction.
     pub geometry: Geometry,
-    /// Pixels of the scan along the side of one here.
+    /// Pixels of the scan along the side of a pixel of the level.
     pub bin: usize,
     folds: Vec<Fold>,
     magnification: f64,
-    /// The largest line integral of the views that are predicted.
+    /// The largest line integral of the held-out views.
     top: f64,
-    /// Root mean square change of a predicted view over a column.
+    /// Root mean square difference of adjacent columns in the held-out views.
     pub slope: f64,
 }
 
-/// Some views kept aside.
+/// One split into training views and held-out views.
 struct Fold {
     train: Scan,
-    kept: Vec<usize>,
+    training: Vec<usize>,
     test: Scan,
-    held: Vec<usize>,
+    held_out: Vec<usize>,
 }
 
-/// What is left of the views that are kept aside.
+/// The residuals of the held-out views.
 pub(crate) struct Prediction {
-    /// Measured less predicted, a list for each view.
+    /// Measured minus predicted, a list for each view.
     pub views: Vec<Vec<f32>>,
-    /// Root mean square of them, over the largest line integral.
+    /// Their root mean square, divided by the largest line integral.
     pub error: f64,
 }
 
-/// Hears nothing and may stop.
+/// An observer without output that can cancel the work.
 struct Quiet<'a>(&'a (dyn Fn() -> bool + Sync));
 
 impl Observer for Quiet<'_> {
@@ -72,28 +72,28 @@ impl Observer for Quiet<'_> {
 }
 
 impl Level {
-    /// Of `scan`, with about `width` pixels along the longer side of the detector, `folds` times another quarter of the views aside. Its
-    /// voxels hold what the views show in the geometry that `known` makes.
+    /// The level of `scan` with about `width` pixels along the longer side of the detector and `folds` folds. Each fold holds out
+    /// another quarter of the views. The voxels cover the object in the geometry corrected by `known`.
     pub fn new(scan: &Scan, width: usize, folds: usize, known: &Correction) -> Result<Self> {
         let g = &scan.geometry;
         let [rows, columns] = g.detector;
         let bin = rows.max(columns).div_ceil(width).clamp(1, (rows.min(columns) / 4).max(1));
         let binned = Scan { unit: Unit::default(), ..spread(scan.binned(bin))? };
-        let told = binned.geometry.views.clone();
-        let views = known.views(&told);
+        let given = binned.geometry.views.clone();
+        let views = known.views(&given);
         let seen = Scan { geometry: Geometry { views, ..binned.geometry.clone() }, ..binned };
         let grid = grid(&seen, width);
         let magnification = setup(&seen.geometry).magnification;
-        let (geometry, binned) = (Geometry { views: told, volume: grid, ..seen.geometry.clone() }, seen);
+        let (geometry, binned) = (Geometry { views: given, volume: grid, ..seen.geometry.clone() }, seen);
         let binned = Scan { geometry: geometry.clone(), ..binned };
         let n = geometry.views.len();
         let every = EVERY.min(n / 2).max(2);
         let folds: Vec<Fold> = (0..folds.min(every))
             .map(|f| {
                 let first = (1 + f * every / folds) % every;
-                let (held, kept): (Vec<usize>, Vec<usize>) = (0..n).partition(|v| v % every == first);
-                let (train, test) = binned.split(&held)?;
-                Ok(Fold { train, kept, test, held })
+                let (held_out, training): (Vec<usize>, Vec<usize>) = (0..n).partition(|v| v % every == first);
+                let (train, test) = binned.split(&held_out)?;
+                Ok(Fold { train, training, test, held_out })
             })
             .collect::<Result<_>>()?;
         let all = || folds.iter().map(|f| &f.test.projections);
@@ -106,12 +106,12 @@ impl Level {
         Ok(Self { geometry, bin, folds, magnification, top: top.into(), slope })
     }
 
-    /// About what a prediction takes, to compare levels with.
+    /// Approximate work of a prediction, to compare levels.
     pub fn work(&self) -> f64 {
         self.folds.iter().map(|f| f.train.header().samples()).sum()
     }
 
-    /// Predicts the views that are kept aside in the geometry that `correction` makes.
+    /// Predicts the held-out views in the corrected geometry.
     pub fn predict(
         &self,
         correction: &Correction,
@@ -126,12 +126,12 @@ impl Level {
                 detector: self.geometry.detector,
                 volume,
             };
-            let scan = Scan { geometry: among(&fold.kept), ..fold.train.clone() };
+            let scan = Scan { geometry: among(&fold.training), ..fold.train.clone() };
             let volume = reconstruct(&scan, backend, cancelled)?;
             let mut residual = Array3::zeros(fold.test.projections.raw_dim());
             let projector = backend.place(Box::new(Joseph {}))?;
-            let all: Vec<usize> = (0..fold.held.len()).collect();
-            projector.operator().forward(&among(&fold.held), &all, volume.view(), residual.view_mut());
+            let all: Vec<usize> = (0..fold.held_out.len()).collect();
+            projector.operator().forward(&among(&fold.held_out), &all, volume.view(), residual.view_mut());
             projector.operator().fault()?;
             residual.zip_mut_with(&fold.test.projections, |a, p| *a = p - *a);
             Ok(residual.outer_iter().map(|view| view.iter().copied().collect()).collect())
@@ -145,8 +145,8 @@ impl Level {
 }
 
 impl Level {
-    /// Voxels that go with the object, which moves along z as the detector does along v: it lies on them in the same way then. If it did
-    /// not, the error would rise and fall with every voxel.
+    /// Voxels that follow the object: it moves along z when the detector moves along v. Its position on the voxels then stays the
+    /// same; otherwise the error would oscillate with every voxel.
     fn following(&self, correction: &Correction) -> VoxelGrid {
         let mut grid = self.geometry.volume;
         let v = self.geometry.views[0].v;
@@ -173,7 +173,7 @@ fn reconstruct(scan: &Scan, backend: &dyn Backend, cancelled: &(dyn Fn() -> bool
     }
 }
 
-/// The scan with some of its views, evenly, where it has very many.
+/// The scan, reduced to at most [`MOST_VIEWS`] evenly spaced views.
 pub(crate) fn spread(scan: Scan) -> Result<Scan> {
     let n = scan.geometry.views.len();
     if n <= MOST_VIEWS {
@@ -183,8 +183,8 @@ pub(crate) fn spread(scan: Scan) -> Result<Scan> {
     Ok(scan.split(&kept)?.1)
 }
 
-/// Voxels as fine as the pixels, in a box that holds what the views show. Where the object reaches past the detector, or past
-/// the volume that is to be reconstructed, the box is larger than that.
+/// Voxels as fine as the pixels, in the volume of the scan. If the object extends beyond the detector or the volume, the box is
+/// larger than the volume.
 fn grid(scan: &Scan, width: usize) -> VoxelGrid {
     let asked = scan.geometry.volume;
     let mut size = asked.size();
@@ -220,7 +220,7 @@ fn per(size: Vec3, shape: [usize; 3]) -> Vec3 {
     std::array::from_fn(|k| size[k] / shape[k] as f64)
 }
 
-/// Share of the views' squares that belong to rays beside the box.
+/// Share of the views' sum of squares that belongs to rays that miss the box.
 fn beside(scan: &Scan, grid: &VoxelGrid) -> f64 {
     let g = &scan.geometry;
     let bounds = grid.bounds();
@@ -236,7 +236,7 @@ fn beside(scan: &Scan, grid: &VoxelGrid) -> f64 {
     if all > 0.0 { out / all } else { 0.0 }
 }
 
-/// Root mean square change from a column to the next.
+/// Root mean square difference of adjacent columns.
 fn slope(p: &Array3<f32>) -> f64 {
     let columns = p.dim().2;
     if columns < 2 {

@@ -1,13 +1,14 @@
-//! What a scan itself tells of its geometry, without a phantom.
+//! Estimates a scan's geometry from its own views, without a phantom.
 //!
-//! [`calibrate`] looks for the [`Correction`] under which views that are kept aside are predicted best from a quick
-//! reconstruction of the others (ordered subsets of SART, three passes). It goes from coarse to fine, in pixels and voxels and in how
-//! far it looks (`search`). The criterion needs no marker, no symmetry and no full circle.
+//! [`calibrate`] finds the [`Correction`] with the smallest held-out error: a quick reconstruction (ordered subsets of SART, three
+//! passes) of some views predicts the held-out ones. Pixels, voxels and the search range go from coarse to fine (`search`). The
+//! criterion needs no marker, no symmetry and no full circle.
 //!
-//! How well few views predict others also depends on how large the object is made. What changes that ([`Parameter::by_pairs`]) is
-//! sought by what pairs of views say of the same planes (`consistency`, `newton`), which no object changes.
+//! The held-out error also depends on the size of the reconstructed object. Parameters that change this size
+//! ([`Parameter::by_pairs`]) are found by comparing pairs of views on the same planes (`consistency`, `newton`). This comparison
+//! is independent of the object.
 //!
-//! [`directions`] compares the angles with the same ones in the other direction.
+//! [`directions`] compares the angles with the reversed ones.
 
 mod consistency;
 mod criterion;
@@ -27,47 +28,48 @@ use conefield_core::scan::Scan;
 use consistency::Consistency;
 use criterion::Level;
 use newton::{Newton, Place};
-use search::{Fit, Meter, Search, Told};
+use search::{Evidence, Fit, Meter, Search};
 use serde::Serialize;
 use serde_json::{Value, json};
 use std::sync::Mutex;
 
-/// Fewer views are not enough to keep any aside.
+/// Least number of views; with fewer, none can be held out.
 const FEWEST: usize = 8;
 /// Pixels along the longer side of the detector of the coarsest level; each next has twice as many.
 const COARSEST: usize = 32;
-/// Times that a quarter of the views is kept aside.
+/// Times that a quarter of the views is held out.
 const FOLDS: usize = 2;
-/// Standard deviations from which a parameter counts as off.
+/// A parameter is wrong if its change exceeds this many standard deviations.
 const CLEAR: f64 = 3.0;
-/// A parameter whose deviation is more than so many pixels of the finest level is not told, nor is one with less sensitivity.
+/// A parameter is not determined if its deviation exceeds this number of pixels of the finest level, or if its sensitivity is
+/// below these limits.
 const VAGUE: f64 = 1.0;
 const FLAT: f64 = 0.03;
 const FLAT_PAIRS: f64 = 0.01;
-/// Where voxels lie moves the least error by about so many pixels of a level, which no view tells: part of every deviation. So does how
-/// pixels sample the object, for pairs of views.
+/// The voxel positions shift the minimum of the error by about this many pixels of a level. The views do not show this shift, so
+/// it is part of every deviation. For pairs of views, the sampling of the object by pixels has the same effect.
 const INEXACT: f64 = 0.02;
 const INEXACT_PAIRS: f64 = 0.1;
-/// Pairs of views are compared on so many times finer pixels, which cost them little; most of Newton's steps.
+/// Pairs of views are compared on pixels finer by this factor, at little cost; the largest number of Newton's steps.
 const FINER: usize = 2;
 const ROUNDS: usize = 6;
-/// Why the views do not tell a parameter.
+/// Reasons why the views do not determine a parameter.
 const FLAT_REASON: &str = "the views hardly depend on it, or another parameter changes them in the same way";
-const CUT_REASON: &str = "no two views show the same planes whole: the object is cut off at the detector's border";
-const CIRCLE_REASON: &str = "on a circle a tilted detector gives the views of an object that is wider at one end";
-/// Sources whose distance from the axis and height differ by less than this share of the distance stand on a circle.
+const CUT_REASON: &str = "no two views show the same planes completely: the object is cut off at the detector's border";
+const CIRCLE_REASON: &str = "on a circle a tilted detector gives the same views as an object that is wider at one end";
+/// Sources are on a circle if their heights and distances from the axis differ by less than this share of the distance.
 const CIRCLE: f64 = 0.01;
-/// Points of the curve of a parameter.
+/// Intervals of the curve of a parameter.
 const POINTS: i32 = 10;
 
-/// What to look for, and how finely.
+/// The parameters to estimate, and the resolution.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Settings {
     /// The parameters.
     pub parameters: Vec<Parameter>,
-    /// Pixels along the longer side of the detector of the finest level, about.
+    /// Approximate number of pixels along the longer side of the detector at the finest level.
     pub width: usize,
-    /// Whether to follow the criterion along each parameter, to draw it.
+    /// Whether to compute the curve of the criterion along each parameter.
     pub curves: bool,
 }
 
@@ -77,59 +79,59 @@ impl Default for Settings {
     }
 }
 
-/// What came out for a parameter.
+/// The outcome for a parameter.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize)]
 #[serde(rename_all = "kebab-case")]
 pub enum Verdict {
-    /// It is off: the correction holds its change.
+    /// It is wrong: the correction contains its change.
     Corrected,
-    /// It is right as far as the views tell: the correction leaves it as it is.
+    /// It is right within the uncertainty: the correction does not change it.
     Kept,
-    /// The views do not tell: it is left as it is.
+    /// The views do not determine it: the correction does not change it.
     NotDetermined,
 }
 
-/// What the views tell of a parameter.
+/// The result for one parameter.
 #[derive(Debug, Clone, PartialEq, Serialize)]
 pub struct Found {
-    /// Which.
+    /// The parameter.
     pub parameter: Parameter,
-    /// What becomes of it.
+    /// The outcome.
     pub verdict: Verdict,
-    /// Why the views do not tell it, if they do not.
+    /// Why the views do not determine it, if they do not.
     pub reason: Option<&'static str>,
     /// Its unit.
     pub unit: &'static str,
-    /// The change that predicts best, in its unit.
+    /// The best change, in its unit.
     pub change: f64,
-    /// Standard deviation of that.
+    /// Standard deviation of the change.
     pub uncertainty: f64,
-    /// Both in pixels of the scan: of offsets, else as the shadow of a thing at the detector's side moves.
+    /// Both in pixels of the scan: for parameters other than offsets, the shift of a shadow at the side of the detector.
     pub pixels: [f64; 2],
-    /// How much the predicted views change with it, beside a shift by a pixel.
+    /// Change of the predicted views with it, relative to a shift by a pixel.
     pub sensitivity: f64,
-    /// The criterion's error for changes around it, with all else as corrected: the held-out error, relative to the largest line
-    /// integral, or, where [`Parameter::by_pairs`], how much pairs of views differ, relative to what they say.
+    /// The criterion for changes around the best one, with the other parameters corrected: the held-out error relative to the
+    /// largest line integral or, if [`Parameter::by_pairs`], the difference of pairs of views relative to their values.
     pub curve: Vec<(f64, f64)>,
 }
 
-/// What [`calibrate`] finds.
+/// The result of [`calibrate`].
 #[derive(Debug, Clone)]
 pub struct Calibration {
     /// The change of the geometry.
     pub correction: Correction,
-    /// Of each parameter that was looked for.
+    /// The result for each requested parameter.
     pub found: Vec<Found>,
-    /// The held-out error at the finest level with the geometry as it was told, and corrected.
+    /// The held-out error at the finest level, before and after correction.
     pub held_out: [f64; 2],
-    /// Pixels of the scan along the side of one at the finest level.
+    /// Pixels of the scan along the side of a pixel of the finest level.
     pub bin: usize,
-    /// Views that were kept aside and predicted.
+    /// Number of held-out views.
     pub views: usize,
 }
 
 impl Calibration {
-    /// Corrects the geometry of `scan` and records in its provenance how, with the scan that the calibration began from.
+    /// Corrects the geometry of `scan` and records the correction and the path of the original scan in its provenance.
     pub fn correct(&self, scan: &mut Scan, source: &str) {
         scan.geometry.views = self.correction.views(&scan.geometry.views);
         let corrected: serde_json::Map<String, Value> = self
@@ -148,7 +150,7 @@ impl Calibration {
         }
     }
 
-    /// The result as JSON, with that of [`directions`].
+    /// The result as JSON, with the result of [`directions`].
     pub fn json(&self, directions: Option<Directions>) -> Value {
         let [before, after] = self.held_out;
         json!({
@@ -158,11 +160,11 @@ impl Calibration {
     }
 }
 
-/// Looks for the correction of `scan`'s geometry.
+/// Estimates the correction of `scan`'s geometry.
 pub fn calibrate(scan: &Scan, settings: &Settings, backend: &dyn Backend, watch: &dyn Watch) -> Result<Calibration> {
     scan.validate("scan")?;
     let n = scan.geometry.views.len();
-    ensure(n >= FEWEST, "scan", "views", n, format!("at least {FEWEST}, some of which are kept aside"))?;
+    ensure(n >= FEWEST, "scan", "views", n, format!("at least {FEWEST}, some of which are held out"))?;
     let mut asked = settings.parameters.clone();
     asked.sort_unstable();
     asked.dedup();
@@ -176,12 +178,12 @@ pub fn calibrate(scan: &Scan, settings: &Settings, backend: &dyn Backend, watch:
         + pairs.as_ref().map_or(0.0, |p| planned_pairs(p, &paired, settings.curves));
     let meter = Meter { watch, total: work, done: Mutex::new(0.0) };
     let coarse = Search { level: &first, backend, meter: &meter };
-    // Half a detector, or as far as anything can reasonably be off.
+    // Half a detector, or the largest error that is plausible.
     let ranges = [(Parameter::OffsetU, 1.0, 5, 15), (Parameter::Rotation, 0.5, 4, 16)];
     for (parameter, pixels, steps, most) in ranges.into_iter().filter(|r| asked.contains(&r.0)) {
-        at = coarse.look(parameter, at, pixels, steps, most)?;
+        at = coarse.scan(parameter, at, pixels, steps, most)?;
     }
-    // What lies where is known well enough now to choose the voxels by; the coarsest level has them anew.
+    // The geometry is now accurate enough to choose the voxels. The coarsest level gets new ones too.
     let mut levels = vec![];
     for &width in &widths {
         let level = Level::new(scan, width, FOLDS, &at)?;
@@ -192,19 +194,20 @@ pub fn calibrate(scan: &Scan, settings: &Settings, backend: &dyn Backend, watch:
     }
     let last = Search { level: &levels[levels.len() - 1], ..coarse };
     let (mut found, mut fit) = settled(&last, last.refine(&asked, at, 4)?, scan)?;
-    let mut told_by_pairs = vec![];
+    let mut by_pairs = vec![];
     if pairs.is_some() {
         let made = Consistency::new(scan, FINER * finest, &fit.correction)?;
-        let told = look_at_pairs(&Newton { pairs: &made, meter: &meter }, &paired, fit.correction, scan)?;
-        if told.0.iter().any(|f| f.verdict == Verdict::Corrected) {
-            // What the first search found was found in another geometry.
-            fit = last.refine(&asked, told.1, 4)?;
+        let (results, corrected) =
+            compare_pairs(&Newton { pairs: &made, meter: &meter }, &paired, fit.correction, scan)?;
+        if results.iter().any(|f| f.verdict == Verdict::Corrected) {
+            // The results of the first search belong to another geometry.
+            fit = last.refine(&asked, corrected, 4)?;
             found.clear();
         }
         pairs = Some(made);
-        told_by_pairs = told.0;
+        by_pairs = results;
     }
-    // Where voxels lie moves the best: what is off is looked for once more on voxels that have followed.
+    // The voxel positions shift the minimum: the search is repeated on voxels in the corrected geometry.
     let level = Level::new(scan, finest, FOLDS, &fit.correction)?;
     let fine = Search { level: &level, ..coarse };
     let before = fine.predict(&Correction::default())?.error;
@@ -212,14 +215,13 @@ pub fn calibrate(scan: &Scan, settings: &Settings, backend: &dyn Backend, watch:
     found.retain(|f| again.iter().all(|a| a.parameter != f.parameter));
     found.extend(again);
     let (mut correction, mut after) = (fit.correction, fit.prediction.error);
-    if told_by_pairs.iter().any(|f| f.verdict == Verdict::Corrected) {
+    if by_pairs.iter().any(|f| f.verdict == Verdict::Corrected) {
         let made = Consistency::new(scan, FINER * finest, &correction)?;
-        (told_by_pairs, correction) =
-            look_at_pairs(&Newton { pairs: &made, meter: &meter }, &paired, correction, scan)?;
+        (by_pairs, correction) = compare_pairs(&Newton { pairs: &made, meter: &meter }, &paired, correction, scan)?;
         after = fine.predict(&correction)?.error;
         pairs = Some(made);
     }
-    found.extend(told_by_pairs);
+    found.extend(by_pairs);
     found.sort_by_key(|f| f.parameter);
     if settings.curves {
         let middle = Search { level: &levels[levels.len().saturating_sub(2)], ..coarse };
@@ -236,12 +238,12 @@ pub fn calibrate(scan: &Scan, settings: &Settings, backend: &dyn Backend, watch:
     Ok(Calibration { correction, held_out: [before, after], found, bin: level.bin, views: fit.prediction.views.len() })
 }
 
-/// Changes of a pixel and more than this, that lower the held-out error to less than this share, are worth a warning.
+/// A change is worth a warning above this many pixels, and if it lowers the held-out error below this share.
 const WORTH: f64 = 0.5;
 const LOWER: f64 = 0.85;
 
-/// A quick look, on coarse pixels, whether the detector stands aside or is turned: what [`calibrate`] finds of that, if the views
-/// are predicted clearly better with it.
+/// Quick test on coarse pixels for a shifted or rotated detector. Returns the result of [`calibrate`] if the correction lowers the
+/// held-out error clearly.
 pub fn suspect(scan: &Scan, backend: &dyn Backend, watch: &dyn Watch) -> Result<Option<Calibration>> {
     if scan.geometry.views.len() < FEWEST {
         return Ok(None);
@@ -253,7 +255,7 @@ pub fn suspect(scan: &Scan, backend: &dyn Backend, watch: &dyn Watch) -> Result<
     Ok((after < LOWER * before && found.found.iter().any(off)).then_some(found))
 }
 
-/// Pixels along the detector's longer side of each level: each has twice those of the one before, up to about `finest`.
+/// Pixels along the detector's longer side at each level. Each level has twice as many as the previous one, up to about `finest`.
 fn widths(scan: &Scan, finest: usize) -> Vec<usize> {
     let finest = finest.min(scan.geometry.detector.into_iter().max().unwrap_or(0)).max(1);
     let mut all = vec![finest];
@@ -263,7 +265,7 @@ fn widths(scan: &Scan, finest: usize) -> Vec<usize> {
     all
 }
 
-/// What the whole search takes, about: pixels and voxels along a ray go with the width.
+/// Approximate work of the whole search: pixels and voxels along a ray are proportional to the width.
 fn planned(coarsest: &Level, widths: &[usize], asked: &[Parameter], curves: bool) -> f64 {
     let n = asked.len() as f64;
     let work = |width: usize| coarsest.work() * (width as f64 / widths[0] as f64).powi(3);
@@ -275,15 +277,15 @@ fn planned(coarsest: &Level, widths: &[usize], asked: &[Parameter], curves: bool
     looks + rounds + fine + if curves { n * f64::from(POINTS + 1) * work(middle) } else { 0.0 }
 }
 
-/// What pairs of views take, about.
+/// Approximate work for pairs of views.
 fn planned_pairs(pairs: &Consistency, asked: &[Parameter], curves: bool) -> f64 {
     let n = asked.len() as f64;
     let round = 2.0 + 2.0 * n + n * (n - 1.0) / 2.0;
     pairs.work() * (5.0 * round + if curves { n * f64::from(POINTS + 1) } else { 0.0 })
 }
 
-/// What pairs of views tell of some parameters, from `at`.
-fn look_at_pairs(
+/// Estimates parameters from pairs of views, starting at `at`.
+fn compare_pairs(
     newton: &Newton<'_>,
     asked: &[Parameter],
     at: Correction,
@@ -298,29 +300,30 @@ fn look_at_pairs(
     let mut found: Vec<Found> = vec![];
     for &parameter in asked {
         if let Some(reason) = reason(&parameter) {
-            let told = Told { deviation: f64::INFINITY, sensitivity: 0.0, sure: false };
-            let unchanged = finding(parameter, 0.0, told, PAIRS, geometry, scan);
+            let evidence = Evidence { deviation: f64::INFINITY, sensitivity: 0.0, sure: false };
+            let unchanged = finding(parameter, 0.0, evidence, PAIRS, geometry, scan);
             found.push(Found { reason: Some(reason), ..unchanged });
         }
     }
     let active: Vec<Parameter> = asked.iter().copied().filter(|p| reason(p).is_none()).collect();
     let findings = |place: &Place| -> Vec<Found> {
-        let all = place.active.iter().zip(&place.told);
-        all.map(|(&p, &told)| finding(p, place.correction.get(p), told, PAIRS, geometry, scan)).collect()
+        let all = place.active.iter().zip(&place.evidence);
+        all.map(|(&p, &evidence)| finding(p, place.correction.get(p), evidence, PAIRS, geometry, scan)).collect()
     };
     let without = |place: Place, gone: Parameter| {
         let rest: Vec<Parameter> = place.active.into_iter().filter(|p| *p != gone).collect();
         newton.refine(&rest, place.correction.with(gone, 0.0), ROUNDS)
     };
-    let (told, place) = settle(newton.refine(&active, at, ROUNDS)?, findings, without)?;
-    found.extend(told);
+    let (determined, place) = settle(newton.refine(&active, at, ROUNDS)?, findings, without)?;
+    found.extend(determined);
     Ok((found, place.correction))
 }
 
-/// Whether the sources stand on a circle about the axis z. With z from its plane, the map `(x, y, z) → (x, y, z)/(1 + b·z)` of space
-/// changes every view as a tilt of the detector does, so that the same planes meet the views in the same lines. It is one of the two
-/// maps that views on a turntable do not tell (Fitzgibbon, Cross and Zisserman, SMILE 1998; the other one is the scale of z). Only
-/// lengths of rays change, by the tilt times the ray's slope, and a change of the object takes most of that up.
+/// Whether the sources are on a circle around the z axis. With z measured from the plane of the circle, the map
+/// `(x, y, z) → (x, y, z)/(1 + b·z)` of space changes every view like a tilt of the detector: the same planes meet the views in
+/// the same lines. Views on a turntable leave two maps undetermined: this one and the scale of z (Fitzgibbon, Cross and Zisserman,
+/// SMILE 1998). Only the lengths of rays change, by the tilt times the ray's slope. A change of the object compensates most of
+/// this.
 fn on_a_circle(views: &[View]) -> bool {
     let place = |v: &View| (v.source[0].hypot(v.source[1]), v.source[2]);
     let Some((radius, height)) = views.first().map(place) else { return false };
@@ -328,8 +331,8 @@ fn on_a_circle(views: &[View]) -> bool {
     views.iter().map(place).all(|(r, h)| near(r, radius) && near(h, height))
 }
 
-/// Takes away what the views do not tell, and what is right as it is: one after the other, the vaguest first, since what is left may
-/// have been held up by it.
+/// Removes the parameters that the views do not determine or that are already right. It removes the least certain one first and
+/// fits again, because this can make the others more certain.
 fn settle<F>(
     mut fit: F,
     findings: impl Fn(&F) -> Vec<Found>,
@@ -353,17 +356,17 @@ fn settle<F>(
     }
 }
 
-/// The same for a fit to views that are kept aside.
+/// The same for a fit to held-out views.
 fn settled(fine: &Search<'_>, fit: Fit, scan: &Scan) -> Result<(Vec<Found>, Fit)> {
     let geometry = &fine.level.geometry;
     let findings = |fit: &Fit| -> Vec<Found> {
-        let all = fit.active.iter().zip(fine.told(fit));
-        all.map(|(&p, told)| finding(p, fit.correction.get(p), told, PREDICTION, geometry, scan)).collect()
+        let all = fit.active.iter().zip(fine.evidence(fit));
+        all.map(|(&p, evidence)| finding(p, fit.correction.get(p), evidence, PREDICTION, geometry, scan)).collect()
     };
     settle(fit, findings, |fit, gone| fine.without(fit, gone))
 }
 
-/// What a criterion cannot tell: least sensitivity, and pixels that are part of every deviation.
+/// Limits of a criterion: the least sensitivity, and the part of every deviation in pixels.
 #[derive(Clone, Copy)]
 struct Limits {
     flat: f64,
@@ -373,15 +376,22 @@ struct Limits {
 const PREDICTION: Limits = Limits { flat: FLAT, inexact: INEXACT };
 const PAIRS: Limits = Limits { flat: FLAT_PAIRS, inexact: INEXACT_PAIRS };
 
-/// What is said of a parameter with this value; `geometry` is the level's.
-fn finding(parameter: Parameter, value: f64, told: Told, limits: Limits, geometry: &Geometry, scan: &Scan) -> Found {
+/// The result for a parameter with this value; `geometry` is the level's.
+fn finding(
+    parameter: Parameter,
+    value: f64,
+    evidence: Evidence,
+    limits: Limits,
+    geometry: &Geometry,
+    scan: &Scan,
+) -> Found {
     let pixel = parameter.pixel(geometry);
-    let deviation = told.deviation.hypot(limits.inexact * pixel);
-    let verdict = if !(deviation < VAGUE * pixel && told.sensitivity > limits.flat) {
+    let deviation = evidence.deviation.hypot(limits.inexact * pixel);
+    let verdict = if !(deviation < VAGUE * pixel && evidence.sensitivity > limits.flat) {
         Verdict::NotDetermined
     } else if value.abs() <= CLEAR * deviation {
         Verdict::Kept
-    } else if told.sure {
+    } else if evidence.sure {
         Verdict::Corrected
     } else {
         Verdict::NotDetermined
@@ -398,12 +408,12 @@ fn finding(parameter: Parameter, value: f64, told: Told, limits: Limits, geometr
         change: value * parameter.in_unit(),
         uncertainty: deviation * parameter.in_unit(),
         pixels: [value / full, deviation / full],
-        sensitivity: told.sensitivity,
+        sensitivity: evidence.sensitivity,
         curve: vec![],
     }
 }
 
-/// The criterion along a parameter, from where it was to as far beyond what was found.
+/// The criterion along a parameter, from its original value to the same distance beyond the best one.
 fn curve(
     found: &Found,
     geometry: &Geometry,

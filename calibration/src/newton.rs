@@ -1,42 +1,42 @@
-//! The search for the geometry in which pairs of views say the same.
+//! The search for the geometry in which pairs of views are consistent.
 //!
-//! The residuals of pairs are mostly noise, and their derivatives are too: `JᵀJ` of Gauss and Newton would take noise for a criterion
-//! that is steep. The curvature of the criterion itself has no such part, since noise adds the same in every geometry. So these are
-//! Newton's steps, `H·δ = −g`, with gradient and curvature from differences of the criterion.
+//! The residuals of pairs are mostly noise, and so are their derivatives: in `JᵀJ` of Gauss-Newton, noise would appear as
+//! steepness of the criterion. The curvature of the criterion itself has no such term, because noise contributes the same in
+//! every geometry. So the steps are Newton's, `H·δ = −g`, with gradient and curvature from differences of the criterion.
 //!
-//! The uncertainty is the jackknife's: how far the step would go without one of the views, for each of them (Efron and Stein, Annals of
-//! Statistics 9, 1981). It sees the noise of the curvature too.
+//! The jackknife gives the uncertainty: the scatter of the step when each view in turn is removed (Efron and Stein, Annals of
+//! Statistics 9, 1981). It includes the noise of the curvature.
 
 use crate::CLEAR;
 use crate::consistency::Consistency;
 use crate::parameters::{Correction, Parameter};
-use crate::search::{LONGEST, Meter, REACH, SMALL, Told, damped, inner, inverse};
+use crate::search::{Evidence, LONGEST, Meter, REACH, SMALL, damped, inner, inverse};
 use conefield_core::Result;
 use rayon::prelude::*;
 
-/// How often a step that does not help is cut to a third.
+/// How often a step that does not reduce the criterion is cut to a third.
 const CUTS: usize = 3;
 
-/// The pairs with what counts the work on them.
+/// The pairs with their progress meter.
 #[derive(Clone, Copy)]
 pub(crate) struct Newton<'a> {
     pub pairs: &'a Consistency,
     pub meter: &'a Meter<'a>,
 }
 
-/// Where Newton's steps ended.
+/// The result of Newton's steps.
 pub(crate) struct Place {
     pub correction: Correction,
-    /// The parameters that were looked for.
+    /// The fitted parameters.
     pub active: Vec<Parameter>,
-    /// What the pairs tell of each.
-    pub told: Vec<Told>,
+    /// The evidence of the pairs on each.
+    pub evidence: Vec<Evidence>,
 }
 
 /// A correction with the misfit of each pair.
 type Misfits = (Correction, Vec<f64>);
 
-/// The criterion around a place, of each pair: all in pixels of the parameters.
+/// Derivatives of each pair's criterion, per pixel of each parameter.
 struct Around {
     /// By parameter.
     gradient: Vec<Vec<f64>>,
@@ -51,20 +51,20 @@ impl Newton<'_> {
         Ok(found)
     }
 
-    /// The errors of `values` for one parameter, all else as in `at`.
+    /// The errors for `values` of one parameter, with the others as in `at`.
     pub fn along(&self, parameter: Parameter, at: Correction, values: &[f64]) -> Result<Vec<(f64, f64)>> {
         let error = |&x: &f64| Ok((x, self.pairs.error(&self.misfits(&at.with(parameter, x))?)));
         values.par_iter().map(error).collect()
     }
 
-    /// Steps from `start` in some parameters, at most `rounds`.
+    /// At most `rounds` steps from `start` in the parameters `active`.
     pub fn refine(&self, active: &[Parameter], start: Correction, rounds: usize) -> Result<Place> {
         let units: Vec<f64> = active.iter().map(|p| p.pixel(&self.pairs.geometry)).collect();
         let mut here = (start, self.misfits(&start)?);
-        let mut told = vec![];
+        let mut evidence = vec![];
         for _ in 0..rounds.min(rounds * active.len()) {
             let around = self.around(active, &units, &here)?;
-            told = self.told(&around, &units);
+            evidence = self.evidence(&around, &units);
             let Some(step) = around.step(None) else { break };
             let longest = step.iter().fold(0.0f64, |m, s| m.max(s.abs()));
             let share = (LONGEST / longest.max(1e-12)).min(1.0);
@@ -74,13 +74,13 @@ impl Newton<'_> {
                 break;
             }
         }
-        for (told, &p) in told.iter_mut().zip(active) {
-            told.sure = self.surely_better(&here.1, &self.misfits(&here.0.with(p, 0.0))?);
+        for (one, &p) in evidence.iter_mut().zip(active) {
+            one.sure = self.surely_better(&here.1, &self.misfits(&here.0.with(p, 0.0))?);
         }
-        Ok(Place { correction: here.0, active: active.to_vec(), told })
+        Ok(Place { correction: here.0, active: active.to_vec(), evidence })
     }
 
-    /// The first of ever shorter steps with a smaller criterion.
+    /// The first of ever shorter steps that reduces the criterion.
     fn better(
         &self,
         active: &[Parameter],
@@ -130,8 +130,8 @@ impl Newton<'_> {
         })
     }
 
-    /// Whether the criterion falls by more than the pairs of single views can make it fall: noise alone has lows too, far off where the
-    /// object tells little, and each of them looks like a bowl from inside.
+    /// Whether the criterion falls by more than the pairs of single views can explain. Noise alone also has minima, far from the
+    /// truth where the object contributes little, and each has a positive curvature.
     fn surely_better(&self, here: &[f64], there: &[f64]) -> bool {
         let pairs = self.pairs.pairs();
         let mut views = vec![0.0; self.pairs.geometry.views.len()];
@@ -143,8 +143,8 @@ impl Newton<'_> {
         all > CLEAR * jackknife(&views)
     }
 
-    /// What the pairs tell of each parameter.
-    fn told(&self, around: &Around, units: &[f64]) -> Vec<Told> {
+    /// The evidence of the pairs on each parameter.
+    fn evidence(&self, around: &Around, units: &[f64]) -> Vec<Evidence> {
         let pairs = self.pairs.pairs();
         let views = pairs.iter().flatten().max().map_or(0, |v| v + 1);
         let without = |v: usize| around.step(Some(&|p: usize| !pairs[p].contains(&v)));
@@ -157,7 +157,7 @@ impl Newton<'_> {
             let sum: f64 = around.curvature[k][k].iter().sum();
             (sum.max(0.0) / self.pairs.planes() as f64).sqrt() / self.pairs.steepness.max(1e-300)
         };
-        let of = |(k, unit): (usize, &f64)| Told {
+        let of = |(k, unit): (usize, &f64)| Evidence {
             deviation: unit * deviation(k),
             sensitivity: sensitivity(k),
             sure: false,
@@ -166,7 +166,7 @@ impl Newton<'_> {
     }
 }
 
-/// The standard deviation of an estimate from its values without each of the views, or from what each view adds to it.
+/// The standard deviation of an estimate, from its values without each view or from the contribution of each view.
 fn jackknife(values: &[f64]) -> f64 {
     let n = values.len() as f64;
     let mean = values.iter().sum::<f64>() / n;
@@ -174,7 +174,7 @@ fn jackknife(values: &[f64]) -> f64 {
 }
 
 impl Around {
-    /// Newton's step by some of the pairs; `None` where they have no curvature.
+    /// Newton's step from some of the pairs; `None` if they have no curvature.
     fn step(&self, some: Option<&dyn Fn(usize) -> bool>) -> Option<Vec<f64>> {
         let sum = |of: &Vec<f64>| {
             of.iter().enumerate().filter(|(p, _)| some.is_none_or(|s| s(*p))).map(|(_, x)| x).sum::<f64>()
@@ -202,24 +202,24 @@ mod tests {
     }
 
     #[test]
-    fn distance_and_step_are_found_within_what_is_said_of_them() {
+    fn distance_and_step_are_found_within_their_uncertainty() {
         let active = [Parameter::OffsetV, Parameter::Distance, Parameter::Step];
         let right = scan(24, 0.003);
         let meter = Meter { watch: &Nobody, total: 1.0, done: Mutex::new(0.0) };
         for off in
             [Correction::default(), Correction::default().with(Parameter::Distance, -40.0).with(Parameter::Step, 0.01)]
         {
-            let mut told = right.clone();
-            told.geometry.views = off.views(&told.geometry.views);
-            let pairs = Consistency::new(&told, 96, &Correction::default()).unwrap();
+            let mut wrong = right.clone();
+            wrong.geometry.views = off.views(&wrong.geometry.views);
+            let pairs = Consistency::new(&wrong, 96, &Correction::default()).unwrap();
             let found = Newton { pairs: &pairs, meter: &meter }.refine(&active, Correction::default(), 8).unwrap();
-            for (p, told) in active.iter().zip(&found.told) {
-                // The step is a factor: 1.01 is taken back by 1/1.01.
+            for (p, evidence) in active.iter().zip(&found.evidence) {
+                // The step is a factor: 1/1.01 reverses 1.01.
                 let truth = -off.get(*p) / if *p == Parameter::Step { 1.0 + off.get(*p) } else { 1.0 };
                 let (value, pixel) = (found.correction.get(*p), p.pixel(&pairs.geometry));
-                let allowed = 3.0 * told.deviation + 0.05 * pixel;
-                assert!((value - truth).abs() < allowed, "{p}: {value} ± {} of {truth}", told.deviation);
-                assert!(told.deviation < 0.5 * pixel, "{p}: ± {} of {pixel}", told.deviation);
+                let allowed = 3.0 * evidence.deviation + 0.05 * pixel;
+                assert!((value - truth).abs() < allowed, "{p}: {value} ± {} of {truth}", evidence.deviation);
+                assert!(evidence.deviation < 0.5 * pixel, "{p}: ± {} of {pixel}", evidence.deviation);
             }
         }
     }

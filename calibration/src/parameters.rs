@@ -1,4 +1,4 @@
-//! What of a geometry can be corrected, and the views that a correction makes.
+//! The parameters of a geometry that can be corrected, and the corrected views.
 
 use conefield_core::Error;
 use conefield_core::geometry::{Geometry, Radians, Vec3, View, norm};
@@ -7,26 +7,26 @@ use std::f64::consts::TAU;
 use std::fmt;
 use std::str::FromStr;
 
-/// One number of a scan's geometry that its own views can tell.
+/// One number of a scan's geometry that its own views can determine.
 ///
-/// The distance from source to axis is none of them: an object twice as large, twice as far from the source, gives the same
-/// views. Nor is the angle of the first view, which turns the object.
+/// They cannot determine the distance from source to axis: an object twice as large and twice as far from the source gives the
+/// same views. Nor can they determine the angle of the first view, which only rotates the object.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Serialize, Deserialize)]
 #[serde(rename_all = "kebab-case")]
 pub enum Parameter {
-    /// Shift of the detector along its columns' direction u: the centre of rotation.
+    /// Shift of the detector along u (the direction of the column index): the centre of rotation.
     OffsetU,
-    /// Shift of the detector along its rows' direction v.
+    /// Shift of the detector along v (the direction of the row index).
     OffsetV,
-    /// Turn of the detector in its own plane: about u × v, right-handed.
+    /// Rotation of the detector in its own plane: about u × v, right-handed.
     Rotation,
-    /// Turn of the detector about u.
+    /// Rotation of the detector about u.
     Tilt,
-    /// Turn of the detector about v.
+    /// Rotation of the detector about v.
     Slant,
-    /// Shift of the detector away from the source: the distance of source and detector.
+    /// Shift of the detector away from the source: the distance from source to detector.
     Distance,
-    /// How much wider the angles between views are than they were taken for.
+    /// Relative error of the angles between views.
     Step,
 }
 
@@ -35,7 +35,7 @@ impl Parameter {
     pub const ALL: [Self; 7] =
         [Self::OffsetU, Self::OffsetV, Self::Rotation, Self::Tilt, Self::Slant, Self::Distance, Self::Step];
 
-    /// What command line and results call it.
+    /// Its name on the command line and in results.
     pub fn name(self) -> &'static str {
         match self {
             Self::OffsetU => "offset-u",
@@ -48,12 +48,12 @@ impl Parameter {
         }
     }
 
-    /// Whether it is sought by what pairs of views say of the same planes, and not by how well views are predicted.
+    /// Whether pairs of views determine it, instead of the prediction of held-out views.
     pub fn by_pairs(self) -> bool {
         matches!(self, Self::OffsetV | Self::Tilt | Self::Distance | Self::Step)
     }
 
-    /// The unit in which people read it.
+    /// Its unit in results.
     pub fn unit(self) -> &'static str {
         match self {
             Self::OffsetU | Self::OffsetV | Self::Distance => "mm",
@@ -62,7 +62,7 @@ impl Parameter {
         }
     }
 
-    /// How much one in a [`Correction`] is in [`Parameter::unit`].
+    /// The factor from a [`Correction`] to [`Parameter::unit`].
     pub fn in_unit(self) -> f64 {
         match self {
             Self::OffsetU | Self::OffsetV | Self::Distance => 1.0,
@@ -71,8 +71,9 @@ impl Parameter {
         }
     }
 
-    /// The change that moves shadows by about a pixel of `geometry` against each other, at the detector's side. An object whose
-    /// shadows all move along v has only moved itself: what is left of a shift along v is that near things move more than far ones.
+    /// The change that moves shadows at the side of the detector by about a pixel of `geometry` relative to each other. An equal
+    /// shift of all shadows along v is a shift of the object; only the larger shift of parts near the source is evidence of the
+    /// detector.
     pub fn pixel(self, geometry: &Geometry) -> f64 {
         let view = &geometry.views[0];
         let [v, u] = [norm(view.v), norm(view.u)];
@@ -84,7 +85,7 @@ impl Parameter {
             Self::Rotation => pixel / half,
             Self::Tilt | Self::Slant => pixel * depth / (half * half),
             Self::OffsetV => pixel * depth / half,
-            // Farther off all shadows are larger, as those of a larger object: what is left is that near things grow more than far ones.
+            // A larger distance enlarges all shadows, like a larger object. Only the stronger growth of near parts is evidence.
             Self::Distance => pixel * (depth / half).powi(2),
             Self::Step => {
                 let turns = turns(&geometry.views);
@@ -108,7 +109,7 @@ impl FromStr for Parameter {
         let found = Self::ALL.into_iter().find(|p| p.name() == text);
         found.ok_or_else(|| {
             let why = match text {
-                "dso" => " (the distance from source to axis goes with the object's size, which a scan does not tell)",
+                "dso" => " (the distance from source to axis goes with the object's size, which a scan does not show)",
                 _ => "",
             };
             Error::invalid("command line", "parameter", format!("\"{text}\"{why}"), format!("one of {names}"))
@@ -121,19 +122,19 @@ impl FromStr for Parameter {
 pub struct Correction([f64; Parameter::ALL.len()]);
 
 impl Correction {
-    /// What it has for one parameter.
+    /// The change of one parameter.
     pub fn get(&self, parameter: Parameter) -> f64 {
         self.0[parameter as usize]
     }
 
-    /// The same with another number for one parameter.
+    /// The same with another change of one parameter.
     pub fn with(mut self, parameter: Parameter, value: f64) -> Self {
         self.0[parameter as usize] = value;
         self
     }
 
-    /// The views of one scan, corrected: turned about z by the step, then their detectors shifted along their own axes, then
-    /// turned about their centres.
+    /// The corrected views of a scan: rotates the views about z by the step, then shifts the detectors along their own axes, then
+    /// rotates them about their centres.
     pub fn views(&self, views: &[View]) -> Vec<View> {
         let get = |p| self.get(p);
         let angles = [get(Parameter::Tilt), get(Parameter::Slant), get(Parameter::Rotation)].map(Radians);
@@ -151,7 +152,7 @@ impl Correction {
     }
 }
 
-/// Angles of the sources from the first one, without jumps of more than half a turn.
+/// Angles of the sources relative to the first one, without jumps of more than half a turn.
 pub fn turns(views: &[View]) -> Vec<f64> {
     let angle = |v: &View| v.source[1].atan2(v.source[0]);
     let Some(first) = views.first().map(angle) else { return vec![] };
@@ -164,7 +165,7 @@ pub fn turns(views: &[View]) -> Vec<f64> {
     views.iter().map(follow).collect()
 }
 
-/// A view turned about z.
+/// A view rotated about z.
 fn turned(view: &View, angle: f64) -> View {
     if angle == 0.0 {
         return *view;
@@ -193,7 +194,7 @@ mod tests {
     }
 
     #[test]
-    fn a_correction_makes_the_circle_that_it_names() {
+    fn a_correction_gives_the_expected_circle() {
         let start = orbit([1.0, -2.0], 150.0, TAU);
         assert_eq!(Correction::default().views(&start), start);
         let moved = Correction::default()
@@ -205,7 +206,7 @@ mod tests {
     }
 
     #[test]
-    fn angles_go_on_past_a_turn() {
+    fn angles_continue_beyond_a_full_turn() {
         let views = orbit([0.0; 2], 150.0, 2.0 * TAU);
         let found = turns(&views);
         assert!(found.iter().enumerate().all(|(i, a)| (a - 2.0 * TAU * i as f64 / 9.0).abs() < 1e-9), "{found:?}");
@@ -214,7 +215,7 @@ mod tests {
     }
 
     #[test]
-    fn names_are_read_back_and_others_refused() {
+    fn names_are_parsed_and_others_refused() {
         for p in Parameter::ALL {
             assert_eq!(p.name().parse::<Parameter>().unwrap(), p);
         }

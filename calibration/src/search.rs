@@ -1,11 +1,11 @@
-//! The search for the correction under which a level's views are predicted best: a look along one parameter where the start may
-//! be far, then Gauss-Newton steps in all of them.
+//! The search for the correction with the smallest held-out error of a level: a scan along single parameters where the start may
+//! be far off, then Gauss-Newton steps in all parameters.
 //!
-//! The residual `r(θ)` of the views kept aside depends on the correction `θ` through the whole reconstruction. Central
-//! differences give its derivatives `J`, all parameters at once; a step solves `JᵀJ·δ = −Jᵀr` (Nocedal and Wright, Numerical
-//! Optimization, section 10.3). What a view has to say is its gradient `g_v = J_vᵀ·r_v`. The gradients of all views differ by
-//! what each happens to show, and tell how uncertain their sum is: `cov θ = (JᵀJ)⁻¹·(Σ g_v·g_vᵀ)·(JᵀJ)⁻¹` (the sandwich of Huber,
-//! Proc. 5th Berkeley Symposium, 1967, with views as clusters).
+//! The residual `r(θ)` of the held-out views depends on the correction `θ` through the whole reconstruction. Central differences
+//! give its derivatives `J` for all parameters at once; a step solves `JᵀJ·δ = −Jᵀr` (Nocedal and Wright, Numerical Optimization,
+//! section 10.3). Each view contributes its gradient `g_v = J_vᵀ·r_v`. The scatter of these gradients gives the uncertainty of
+//! their sum: `cov θ = (JᵀJ)⁻¹·(Σ g_v·g_vᵀ)·(JᵀJ)⁻¹` (the sandwich of Huber, Proc. 5th Berkeley Symposium, 1967, with views as
+//! clusters).
 
 use crate::criterion::{Level, Prediction};
 use crate::parameters::{Correction, Parameter};
@@ -14,33 +14,33 @@ use conefield_core::{Error, Result};
 use rayon::prelude::*;
 use std::sync::{Mutex, PoisonError};
 
-/// Pixels of a level over which derivatives are taken to either side.
+/// Half the distance of central differences, in pixels of a level.
 pub(crate) const REACH: f64 = 0.5;
 /// Longest step of a parameter, in pixels of a level.
 pub(crate) const LONGEST: f64 = 2.0;
-/// A step that helps by less than this, in pixels of a level, is the last one.
+/// A step shorter than this, in pixels of a level, is the last one.
 pub(crate) const SMALL: f64 = 0.01;
-/// How often a step that does not help is cut to a third.
+/// How often a step that does not reduce the error is cut to a third.
 const CUTS: usize = 3;
 
-/// Hears how far the work is, and may end it.
+/// Receives the progress of the work and can cancel it.
 pub trait Watch: Sync {
-    /// Whether to end now.
+    /// Whether the work is cancelled.
     fn cancelled(&self) -> bool;
-    /// This share of the work is done, about.
+    /// Reports the approximate share of the work that is done.
     fn progress(&self, share: f64);
 }
 
 /// Counts the work for a [`Watch`].
 pub(crate) struct Meter<'a> {
     pub watch: &'a dyn Watch,
-    /// All of it, about.
+    /// Approximate total work.
     pub total: f64,
     pub done: Mutex<f64>,
 }
 
 impl Meter<'_> {
-    /// So much more is done. Says whether to end.
+    /// Adds finished work. Fails if the work is cancelled.
     pub(crate) fn count(&self, work: f64) -> Result<()> {
         let mut done = self.done.lock().unwrap_or_else(PoisonError::into_inner);
         *done += work;
@@ -49,7 +49,7 @@ impl Meter<'_> {
     }
 }
 
-/// A level with what works on it.
+/// A level with its backend and progress meter.
 #[derive(Clone, Copy)]
 pub(crate) struct Search<'a> {
     pub level: &'a Level,
@@ -57,29 +57,29 @@ pub(crate) struct Search<'a> {
     pub meter: &'a Meter<'a>,
 }
 
-/// Where Gauss-Newton ended.
+/// The result of the Gauss-Newton steps.
 pub(crate) struct Fit {
     pub correction: Correction,
     pub prediction: Prediction,
-    /// The parameters that were looked for.
+    /// The fitted parameters.
     pub active: Vec<Parameter>,
-    /// A pixel of the level in each of them.
+    /// The change of each parameter that equals a pixel of the level.
     units: Vec<f64>,
-    /// The last derivatives of the residuals by each of them, in such pixels.
+    /// The last derivatives of the residuals by each parameter, per pixel.
     slopes: Vec<Slopes>,
 }
 
 /// The derivative of every residual, a list for each view.
 type Slopes = Vec<Vec<f32>>;
 
-/// What the views tell of a parameter.
+/// The evidence of the views on one parameter.
 #[derive(Debug, Clone, Copy)]
-pub(crate) struct Told {
+pub(crate) struct Evidence {
     /// Standard deviation, as in a [`Correction`].
     pub deviation: f64,
-    /// How much the predicted views change with it beside a shift by a pixel: near 0 where nothing tells.
+    /// Change of the predicted views with it, relative to a shift by a pixel: near 0 if the views do not determine it.
     pub sensitivity: f64,
-    /// Whether the criterion is surely better with what was found than as it was told.
+    /// Whether the correction improves the criterion significantly.
     pub sure: bool,
 }
 
@@ -94,39 +94,39 @@ impl Search<'_> {
         corrections.par_iter().map(|c| self.predict(c)).collect()
     }
 
-    /// The errors of `values` for one parameter, all else as in `at`.
+    /// The errors for `values` of one parameter, with the others as in `at`.
     pub fn along(&self, parameter: Parameter, at: Correction, values: &[f64]) -> Result<Vec<(f64, f64)>> {
         let corrections: Vec<Correction> = values.iter().map(|&x| at.with(parameter, x)).collect();
         let errors = corrections.par_iter().map(|c| self.predict(c).map(|p| p.error)).collect::<Result<Vec<f64>>>()?;
         Ok(values.iter().copied().zip(errors).collect())
     }
 
-    /// Looks along one parameter from `at`, in steps of so many pixels of the level and so many of them to either side; farther
-    /// where the best lies at an end, up to `most` steps. Returns the best that was met.
-    pub fn look(&self, parameter: Parameter, at: Correction, pixels: f64, steps: i32, most: i32) -> Result<Correction> {
+    /// Scans one parameter around `at`: `steps` steps of `pixels` pixels of the level to either side. Extends the range, up to
+    /// `most` steps, while the best value lies at an end. Returns the best correction.
+    pub fn scan(&self, parameter: Parameter, at: Correction, pixels: f64, steps: i32, most: i32) -> Result<Correction> {
         let (from, step) = (at.get(parameter), pixels * parameter.pixel(&self.level.geometry));
         let place = |i: i32| from + f64::from(i) * step;
         let (mut low, mut high) = (-steps, steps);
-        let mut met = self.along(parameter, at, &(low..=high).map(place).collect::<Vec<_>>())?;
+        let mut tried = self.along(parameter, at, &(low..=high).map(place).collect::<Vec<_>>())?;
         loop {
-            let best = met.iter().enumerate().min_by(|a, b| a.1.1.total_cmp(&b.1.1)).map_or(0, |(i, _)| i);
+            let best = tried.iter().enumerate().min_by(|a, b| a.1.1.total_cmp(&b.1.1)).map_or(0, |(i, _)| i);
             let more: Vec<f64> = match best {
                 0 if low > -most => (low - steps..low).map(place).collect(),
-                i if i + 1 == met.len() && high < most => (high + 1..=high + steps).map(place).collect(),
-                i => return Ok(at.with(parameter, met[i].0)),
+                i if i + 1 == tried.len() && high < most => (high + 1..=high + steps).map(place).collect(),
+                i => return Ok(at.with(parameter, tried[i].0)),
             };
             let found = self.along(parameter, at, &more)?;
             if best == 0 {
                 low -= steps;
-                met.splice(0..0, found);
+                tried.splice(0..0, found);
             } else {
                 high += steps;
-                met.extend(found);
+                tried.extend(found);
             }
         }
     }
 
-    /// Gauss-Newton steps from `start` in some parameters, at most `rounds`.
+    /// At most `rounds` Gauss-Newton steps from `start` in the parameters `active`.
     pub fn refine(&self, active: &[Parameter], start: Correction, rounds: usize) -> Result<Fit> {
         let units: Vec<f64> = active.iter().map(|p| p.pixel(&self.level.geometry)).collect();
         let mut here = (start, self.predict(&start)?);
@@ -148,7 +148,7 @@ impl Search<'_> {
         Ok(Fit { correction: here.0, prediction: here.1, active: active.to_vec(), units, slopes })
     }
 
-    /// The fit with one of its parameters as it was told, and the others where the derivatives say that they are best then.
+    /// The fit without the change of one parameter. The derivatives give the best values of the others.
     pub fn without(&self, fit: Fit, parameter: Parameter) -> Result<Fit> {
         let Fit { correction, mut active, mut units, mut slopes, prediction } = fit;
         let Some(k) = active.iter().position(|p| *p == parameter) else {
@@ -170,7 +170,7 @@ impl Search<'_> {
         Ok(Fit { correction, prediction, active, units, slopes })
     }
 
-    /// The first of ever shorter steps that predicts better.
+    /// The first of ever shorter steps that reduces the held-out error.
     fn better(
         &self,
         active: &[Parameter],
@@ -194,7 +194,7 @@ impl Search<'_> {
         Ok(None)
     }
 
-    /// Derivatives of the residuals by each parameter, in pixels of the level.
+    /// Derivatives of the residuals by each parameter, per pixel of the level.
     fn slopes(&self, active: &[Parameter], units: &[f64], at: Correction) -> Result<Vec<Slopes>> {
         let ends = active
             .iter()
@@ -208,8 +208,8 @@ impl Search<'_> {
         Ok(found.chunks(2).map(between).collect())
     }
 
-    /// What the views tell of each parameter of a fit.
-    pub fn told(&self, fit: &Fit) -> Vec<Told> {
+    /// The evidence of the views on each parameter of a fit.
+    pub fn evidence(&self, fit: &Fit) -> Vec<Evidence> {
         let Fit { slopes, prediction, units, .. } = fit;
         let normal = Normal::of(slopes, prediction);
         let pixels: usize = prediction.views.iter().map(Vec::len).sum();
@@ -217,7 +217,7 @@ impl Search<'_> {
         let covariance = normal.covariance();
         let deviation = |k: usize| covariance.as_ref().map_or(f64::INFINITY, |c| c[k][k].max(0.0).sqrt());
         (0..slopes.len())
-            .map(|k| Told { deviation: units[k] * deviation(k), sensitivity: sensitivity(k), sure: true })
+            .map(|k| Evidence { deviation: units[k] * deviation(k), sensitivity: sensitivity(k), sure: true })
             .collect()
     }
 }
@@ -244,11 +244,11 @@ impl Normal {
         Self { matrix, gradient, views }
     }
 
-    /// The sandwich; `None` where the matrix has no inverse.
+    /// The sandwich covariance; `None` if the matrix has no inverse.
     fn covariance(&self) -> Option<Vec<Vec<f64>>> {
         let (n, count) = (self.gradient.len(), self.views.len() as f64);
         let inverse = inverse(self.matrix.clone())?;
-        // What is left of the sum at the end of the search belongs to no view.
+        // The sum is not exactly zero at the end of the search; this remainder belongs to no single view.
         let mean: Vec<f64> = self.gradient.iter().map(|g| g / count).collect();
         let spread = |i: usize, j: usize| {
             let sum: f64 = self.views.iter().map(|g| (g[i] - mean[i]) * (g[j] - mean[j])).sum();
@@ -268,7 +268,7 @@ fn product(a: &[Vec<f64>], b: &[Vec<f64>]) -> Vec<Vec<f64>> {
     a.iter().map(|row| (0..b.len()).map(|j| inner(row, &column(j))).collect()).collect()
 }
 
-/// A little more on the diagonal: a parameter that nothing tells stays where it is.
+/// Adds a small number to the diagonal: a parameter that the views do not determine then keeps its value.
 pub(crate) fn damped(mut matrix: Vec<Vec<f64>>) -> Vec<Vec<f64>> {
     let most = (0..matrix.len()).map(|k| matrix[k][k]).fold(0.0, f64::max);
     for (k, row) in matrix.iter_mut().enumerate() {
@@ -277,7 +277,7 @@ pub(crate) fn damped(mut matrix: Vec<Vec<f64>>) -> Vec<Vec<f64>> {
     matrix
 }
 
-/// The inverse of a small matrix by Gauss and Jordan; `None` where a pivot vanishes.
+/// The inverse of a small matrix by Gauss-Jordan elimination; `None` if a pivot vanishes.
 pub(crate) fn inverse(mut a: Vec<Vec<f64>>) -> Option<Vec<Vec<f64>>> {
     let n = a.len();
     for (i, row) in a.iter_mut().enumerate() {
@@ -306,7 +306,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn an_inverse_is_one_and_a_singular_matrix_has_none() {
+    fn a_singular_matrix_has_no_inverse() {
         let a = vec![vec![0.0, 2.0, 1.0], vec![2.0, 1.0, 0.0], vec![1.0, 0.0, 5.0]];
         let unit = product(&a, &inverse(a.clone()).unwrap());
         for (i, row) in unit.iter().enumerate() {

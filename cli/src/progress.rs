@@ -39,7 +39,7 @@ pub fn between_bars(f: impl FnOnce()) {
 /// Shows a solver's progress and writes its records.
 pub struct Progress {
     bar: ProgressBar,
-    told: Instant,
+    shown: Instant,
     what: String,
     step: u64,
     latest: Record,
@@ -72,7 +72,7 @@ impl Progress {
         bar.set_prefix(what.to_owned());
         Self {
             bar,
-            told: Instant::now(),
+            shown: Instant::now(),
             what: what.into(),
             step: 0,
             latest: Record::default(),
@@ -125,10 +125,10 @@ impl Progress {
     /// Shows that `share` of the work is done, with an explanatory line, unless the last update is recent.
     pub fn show(&mut self, share: f64, line: impl FnOnce(&Self) -> String) {
         let wait = if self.bar.is_hidden() { EVERY } else { Duration::from_millis(100) };
-        if self.told.elapsed() < wait {
+        if self.shown.elapsed() < wait {
             return;
         }
-        self.told = Instant::now();
+        self.shown = Instant::now();
         let line = line(self);
         if self.bar.is_hidden() {
             info!("{} {:.0} %: {line}", self.what, 100.0 * share);

@@ -150,11 +150,11 @@ pub trait Executable: Send {
     fn fetch(&mut self, _model: &mut Model) -> Result<()> {
         Ok(())
     }
-    /// Seconds per kernel since the last call, if the backend was told to measure them.
+    /// Seconds per kernel since the last call, if the backend measures them.
     fn profile(&mut self) -> Vec<(String, f64)> {
         vec![]
     }
-    /// Tells the backend that the model's arena was changed elsewhere: the next call reads it again. Fetch first if the
+    /// Informs the backend that the model's arena was changed elsewhere: the next call reads it again. Fetch first if the
     /// device's state is needed.
     fn renew(&mut self) {}
 }

@@ -105,7 +105,7 @@ mod tests {
     }
 
     #[test]
-    fn sizes_that_no_memory_holds_are_told_without_overflow() {
+    fn sizes_beyond_any_memory_are_counted_without_overflow() {
         let space = Space::tally(ScanHeader { volume: [usize::MAX; 3], ..HEADER });
         space.volume();
         space.volume();

@@ -1,21 +1,21 @@
-//! Bad pixels are filled in from their neighbours.
+//! Replaces bad pixels by means of their neighbours.
 
 use ndarray::{Array2, ArrayViewMut2};
 
-/// How the bad pixels of a detector are filled in.
+/// The weights that fill in a detector's bad pixels.
 pub struct Filling {
     pixels: Vec<Patch>,
 }
 
-/// One bad pixel and the good ones that it is filled from, with their weights.
+/// One bad pixel and the good pixels that replace it, with their weights.
 struct Patch {
     at: [usize; 2],
     from: Vec<([usize; 2], f32)>,
 }
 
 impl Filling {
-    /// Each bad pixel gets the mean of the good ones in the smallest square around it that has any two, weighted by
-    /// one over their squared distance. `None` where there is no good pixel at all.
+    /// Each bad pixel gets the mean of the good ones in the smallest square around it with at least two, weighted by
+    /// one over their squared distance. `None` if there is no good pixel at all.
     pub fn new(bad: &Array2<bool>) -> Option<Self> {
         let (rows, columns) = bad.dim();
         let good = bad.iter().filter(|b| !**b).count();

@@ -8,22 +8,22 @@ use conefield_diagnosis::quantiles::{median, quantile};
 use ndarray::{ArrayView2, s};
 use serde::{Deserialize, Serialize};
 
-/// Where the border tells: this share of its pieces is taken for air, as where `import` looks for the open beam.
+/// Share of the border segments that counts as air, as in `import`'s search for the open beam.
 const AIR: f64 = 0.15;
-/// Pieces that lie above that by no more than so many times what the lowest lies below it are air, too.
+/// Segments above this level are air too, up to this multiple of the distance from the lowest segment to the level.
 const NOISE: f32 = 3.0;
-/// No tube is so far off from one view to another: a view in which air seems to absorb more shows something else there.
+/// No tube varies by more than this between views: a larger line integral in air means that the region shows something else.
 const MOST: f32 = 0.5;
 
-/// A tube that shines `k` times as bright in one view as in the flat field takes `ln k` off every line integral of that view. What air
-/// shows, where nothing absorbs, tells how much: it is taken off the whole view.
+/// Corrects the tube's brightness. A tube that is `k` times as bright in a view as in the flat field lowers every line integral of
+/// this view by `ln k`. The value in air, where nothing absorbs, shows this offset; it is subtracted from the whole view.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct Flux {
-    /// The first row of a region that shows air in every view, and the one after its last; all rows if not said.
+    /// The first row of a region that shows air in every view, and the one after its last; all rows if absent.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub rows: Option<[usize; 2]>,
-    /// Its columns; all if not said. With neither, the border of each view tells: of 16 pieces of it some must show air.
+    /// Its columns; all if absent. With neither, the border of each view is used: some of its 16 segments must show air.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub columns: Option<[usize; 2]>,
 }
@@ -45,8 +45,9 @@ impl Correct for Flux {
         }
         let air = scan.projections.outer_iter().map(|v| self.air(v)).collect::<Vec<f32>>();
         if let Some(view) = air.iter().position(|a| a.abs() > MOST) {
-            let found = format!("line integrals of {:.3} where air is looked for in view {view}", air[view]);
-            let expected = format!("at most {MOST} in air; flux.rows and flux.columns tell where air is in every view");
+            let found = format!("line integrals of {:.3} in the air region of view {view}", air[view]);
+            let expected =
+                format!("at most {MOST} in air; flux.rows and flux.columns select a region of air in every view");
             return Err(Error::invalid("spec", "rows", found, expected));
         }
         for (mut view, &air) in scan.projections.outer_iter_mut().zip(&air) {
@@ -59,12 +60,12 @@ impl Correct for Flux {
 }
 
 impl Flux {
-    /// What air shows in a view.
+    /// The line integral of air in a view.
     fn air(&self, view: ArrayView2<'_, f32>) -> f32 {
         if self.rows.is_none() && self.columns.is_none() {
             let pieces = border_medians(view, |_, _| true);
             let (low, air) = (pieces.first().copied().unwrap_or(0.0), quantile(&pieces, AIR).unwrap_or(0.0));
-            // All pieces that differ by noise: the lowest ones alone would be too low.
+            // The mean of all segments that differ only by noise; the lowest ones alone would be too low.
             let all: Vec<f32> = pieces.into_iter().filter(|p| *p <= air + NOISE * (air - low)).collect();
             return all.iter().sum::<f32>() / all.len().max(1) as f32;
         }

@@ -1,4 +1,4 @@
-//! Beam hardening: soft X-rays are absorbed first, so that thick paths seem to absorb too little.
+//! Beam hardening: soft X-rays are absorbed first, so thick paths seem to absorb too little.
 
 use crate::Correct;
 use crate::spectrum::{Spectrum, VOLTAGES};
@@ -6,30 +6,30 @@ use conefield_core::error::{Error, Result, ensure};
 use conefield_core::scan::Scan;
 use serde::{Deserialize, Serialize};
 
-/// Lengths of water that are looked up.
+/// Number of table entries.
 const NODES: usize = 4096;
 
-/// Line integrals as of one energy. One of the two ways must be given.
+/// Converts line integrals to a single energy. Exactly one of the two ways must be given.
 #[derive(Debug, Clone, PartialEq, Default, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct Hardening {
-    /// Factors of A, A², A³, ...: A becomes their sum (Herman, Phys. Med. Biol. 24(1), 1979). From a step wedge, or by trial until a
-    /// homogeneous part is as bright inside as at its rim.
+    /// Factors of A, A², A³, ...: their sum replaces A (Herman, Phys. Med. Biol. 24(1), 1979). Measure them with a step wedge, or
+    /// adjust them until a homogeneous part is as bright inside as at its rim.
     #[serde(skip_serializing_if = "Vec::is_empty")]
     pub polynomial: Vec<f64>,
-    /// From the tube: the object is taken for water.
+    /// The tube; the object is treated as water.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub water: Option<Water>,
 }
 
-/// The tube and its filter. What a length of water absorbs of its spectrum is computed and turned round (Joseph and Spital, J. Comput. Assist.
-/// Tomogr. 2(1), 1978); thin paths keep their values.
+/// The tube and its filter. The absorption of its spectrum by a length of water is computed and inverted (Joseph and Spital,
+/// J. Comput. Assist. Tomogr. 2(1), 1978); thin paths keep their values.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct Water {
     /// Tube voltage in kV.
     pub kvp: f64,
-    /// Aluminium in the beam in mm, or as much of it as filters alike.
+    /// Aluminium in the beam in mm, or the equivalent of another filter.
     #[serde(default = "filter")]
     pub aluminium: f64,
 }
@@ -74,7 +74,7 @@ impl Correct for Hardening {
     }
 }
 
-/// Below 0, where only noise is, goes on as at 0.
+/// The polynomial; linear below 0, where there is only noise.
 fn polynomial(factors: &[f64], a: f64) -> f64 {
     match a > 0.0 {
         true => factors.iter().rev().fold(0.0, |sum, c| (sum + c) * a),
@@ -82,7 +82,7 @@ fn polynomial(factors: &[f64], a: f64) -> f64 {
     }
 }
 
-/// Refuses a polynomial that falls somewhere: two thicknesses would look the same.
+/// Refuses a polynomial that is not increasing: two thicknesses would give the same value.
 fn rising(factors: &[f64], most: f64) -> Result<()> {
     let mut last = 0.0;
     for i in 1..=1000 {
@@ -98,15 +98,15 @@ fn rising(factors: &[f64], most: f64) -> Result<()> {
     Ok(())
 }
 
-/// What is measured of water, turned round.
+/// The inverse of the measured line integral of water.
 struct Table {
-    /// Line integrals as of one energy at even steps of the measured ones.
+    /// Line integrals of a single energy at even steps of the measured ones.
     nodes: Vec<f32>,
     step: f64,
 }
 
 impl Table {
-    /// For measured line integrals up to `most`.
+    /// The table for measured line integrals up to `most`.
     fn of(water: Water, most: f64) -> Result<Self> {
         let spectrum = Spectrum::of_tube(water.kvp, water.aluminium);
         let thin = spectrum.thin();
@@ -115,7 +115,7 @@ impl Table {
         let mut length = 0.0;
         for i in 0..NODES {
             let measured = step * i as f64;
-            // Newton's steps from the last length; the measured integral rises and bends down, so that none overshoots.
+            // Newton's steps from the last length; the measured integral is increasing and concave, so no step overshoots.
             for _ in 0..50 {
                 let off = measured - spectrum.measured(length);
                 let small = 1e-4 / thin;
@@ -126,7 +126,7 @@ impl Table {
                 }
             }
             let fits = length.is_finite() && thin * length <= 1e3;
-            ensure(fits, "spec", "water.kvp", water.kvp, format!("a tube whose light tells water of A = {most:.3}"))?;
+            ensure(fits, "spec", "water.kvp", water.kvp, format!("a tube whose light passes water of A = {most:.3}"))?;
             nodes.push((thin * length) as f32);
         }
         Ok(Self { nodes, step })

@@ -1,15 +1,14 @@
-//! Mends what detectors, tubes and scatter do to line integrals: a scan comes in, a scan goes out, no file is read.
+//! Corrects the effects of detectors, tubes and scatter on line integrals. Takes a scan and returns a scan; reads no files.
 //!
-//! Every correction is off unless it is asked for. They run in one order, whatever order they are asked for in, from the
-//! detector back to the object:
+//! Every correction is off by default. They always run in the same order, from the detector back to the object:
 //!
-//! 1. `pixels`: pixels that do not measure, before anything reads their neighbours;
+//! 1. `pixels`: pixels that do not measure, before another correction reads their neighbours;
 //! 2. `flux`: the brightness of each view;
-//! 3. `rings`: what a pixel adds to every view, which is one number a pixel only as long as nothing has bent the values;
+//! 3. `rings`: a constant offset of each pixel in all views, before a nonlinear correction changes it;
 //! 4. `low-counts`: the logarithm of few photons, before anything is subtracted from them;
-//! 5. `scatter`: light that did not come straight, which is subtracted from the rest;
-//! 6. `hardening`: what is left are the line integrals of many energies;
-//! 7. `truncation`: what the detector's sides cut off, of rows that are right otherwise.
+//! 5. `scatter`: scattered light, subtracted from the rest;
+//! 6. `hardening`: the remaining line integrals of many energies;
+//! 7. `truncation`: the parts beyond the detector's sides, from rows that are otherwise right.
 
 pub mod filling;
 mod flux;
@@ -36,7 +35,7 @@ use conefield_core::scan::Scan;
 use serde::{Deserialize, Serialize};
 use serde_json::{Value, json};
 
-/// The corrections that are asked for, with their settings.
+/// The requested corrections, with their settings.
 #[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default, rename_all = "kebab-case")]
 pub struct Corrections {
@@ -63,28 +62,28 @@ pub struct Corrections {
     pub truncation: Option<Truncation>,
 }
 
-/// What a correction did.
+/// The result of a correction.
 #[derive(Debug, Clone, PartialEq, Serialize)]
 pub struct Applied {
     /// Its name, as in [`Corrections`].
     pub name: &'static str,
     /// All its settings.
     pub settings: Value,
-    /// What it found and changed, in words.
+    /// A summary of its findings and changes.
     pub found: String,
 }
 
 /// A correction: settings that change a scan.
 trait Correct {
-    /// Refuses settings that mean nothing. Errors name a setting; [`Corrections`] puts the correction's name before it.
+    /// Refuses invalid settings. Errors name a setting; [`Corrections`] puts the correction's name before it.
     fn validate(&self) -> Result<()>;
 
-    /// Changes the scan, whose values are finite, and tells what it found.
+    /// Changes the scan, whose values are finite, and returns a summary.
     fn correct(&self, scan: &mut Scan) -> Result<String>;
 }
 
 impl Corrections {
-    /// Those that are asked for, in the order in which they run.
+    /// The requested corrections, in the order in which they run.
     fn chosen(&self) -> Vec<(&'static str, &dyn Correct, Value)> {
         fn one<'a, T: Correct + Serialize>(
             name: &'static str,
@@ -104,25 +103,25 @@ impl Corrections {
         all.into_iter().flatten().collect()
     }
 
-    /// Whether none is asked for.
+    /// Whether no correction is requested.
     pub fn is_none(&self) -> bool {
         *self == Self::default()
     }
 
-    /// Bytes that they take at most beside a scan of so many `pixels`, the new scan of a wider detector included.
+    /// Largest memory in bytes in addition to a scan of `pixels` pixels, including the new scan of a wider detector.
     pub fn bytes(&self, pixels: u64) -> u64 {
         let over_time = if self.pixels.is_some() { 4 * pixels } else { 0 };
         let wider = self.truncation.map_or(0, |t| (4.0 * (1.0 + 2.0 * t.share) * pixels as f64) as u64);
         over_time.max(wider)
     }
 
-    /// Refuses settings that mean nothing.
+    /// Refuses invalid settings.
     pub fn validate(&self) -> Result<()> {
         self.chosen().into_iter().try_for_each(|(name, c, _)| c.validate().map_err(|e| settings::placed(e, name)))
     }
 
-    /// The corrected scan and what was done. Its provenance gets the list `corrections`, to which another call appends. Refuses
-    /// a scan that is none, settings that mean nothing, and a scan that a correction has no use for, in words.
+    /// Returns the corrected scan and the results of the corrections. Adds the list `corrections` to its provenance; another call
+    /// appends to it. Refuses an invalid scan, invalid settings, and a scan that a correction cannot use.
     pub fn apply(&self, mut scan: Scan, place: &str) -> Result<(Scan, Vec<Applied>)> {
         if self.is_none() {
             return Ok((scan, vec![]));
@@ -140,7 +139,7 @@ impl Corrections {
     }
 }
 
-/// Keeps in the scan what was done to it.
+/// Records the corrections in the scan.
 fn note(scan: &mut Scan, applied: &[Applied]) {
     let map = match &mut scan.provenance {
         Value::Object(map) => map,

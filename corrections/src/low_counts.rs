@@ -8,20 +8,20 @@ use ndarray::{Array2, ArrayViewMut2, Axis};
 use rayon::prelude::*;
 use serde::{Deserialize, Serialize};
 
-/// A pixel takes neighbours in that are at most so many pixels away.
+/// Largest distance of averaged neighbours, in pixels.
 const FARTHEST: usize = 4;
-/// How many photons there are is read from the mean over so many pixels either way: a pixel's own count would choose itself.
+/// The number of photons comes from the mean within this distance in pixels; a pixel's own noisy count would bias the choice.
 const LOOK: usize = 2;
 
-/// Where few photons arrive, the logarithm of a noisy count is too large on average and its noise is huge. There each pixel takes the mean
-/// of as many neighbours' light as together count enough photons, and the logarithm comes after that (Hsieh, Med. Phys. 25(11), 1998,
-/// in its idea: a filter that widens as the signal falls). Where enough arrive nothing changes.
+/// Corrects the logarithm of few photons: it is too large on average and very noisy. Each such pixel gets the mean intensity of
+/// as many neighbours as together count enough photons, and the logarithm follows (after the idea of Hsieh, Med. Phys. 25(11),
+/// 1998: a filter that widens as the signal falls). Pixels with enough photons do not change.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct LowCounts {
-    /// Photons a pixel in the open beam.
+    /// Photons per pixel in the open beam.
     pub photons: f64,
-    /// Photons that are enough.
+    /// Sufficient number of photons.
     #[serde(default = "enough")]
     pub enough: f64,
 }
@@ -33,7 +33,7 @@ fn enough() -> f64 {
 impl Correct for LowCounts {
     fn validate(&self) -> Result<()> {
         let number = |x: f64| (1.0..=1e15).contains(&x);
-        ensure(number(self.photons), "spec", "photons", self.photons, "photons a pixel in the open beam, 1 to 1e15")?;
+        ensure(number(self.photons), "spec", "photons", self.photons, "photons per pixel in the open beam, 1 to 1e15")?;
         let fits = number(self.enough) && self.enough < self.photons;
         ensure(fits, "spec", "enough", self.enough, format!("a number of photons from 1 to {}", self.photons))
     }
@@ -42,12 +42,12 @@ impl Correct for LowCounts {
         let views = scan.projections.axis_iter_mut(Axis(0)).into_par_iter();
         let changed: usize = views.map(|v| self.view(v)).collect::<Vec<_>>().iter().sum();
         let share = 100.0 * changed as f64 / scan.projections.len() as f64;
-        Ok(format!("{share:.2} % of the values come from fewer than {} photons and took neighbours in", self.enough))
+        Ok(format!("{share:.2} % of the values come from fewer than {} photons and include neighbours", self.enough))
     }
 }
 
 impl LowCounts {
-    /// Corrects a view; how many values changed.
+    /// Corrects a view and returns the number of changed values.
     fn view(&self, mut view: ArrayViewMut2<'_, f32>) -> usize {
         let light = view.mapv(|a| (-a).exp().min(f32::MAX));
         let sums = Sums::of(light.view());
@@ -55,11 +55,11 @@ impl LowCounts {
         for ((i, j), reach) in reach.indexed_iter_mut() {
             let (sum, n) = sums.around([i, j], LOOK);
             let photons = self.photons * sum / n as f64;
-            // (2k + 1)² pixels with these count enough.
+            // (2k + 1)² pixels of this mean count enough.
             let k = 0.5 * ((self.enough / photons.max(1e-9)).sqrt() - 1.0);
             *reach = k.ceil().clamp(0.0, FARTHEST as f64) as u8;
         }
-        // Less than half a photon is not told from none.
+        // Less than half a photon cannot be distinguished from none.
         let least = 0.5 / self.photons;
         let mut changed = 0;
         for (at, x) in view.indexed_iter_mut() {

@@ -1,4 +1,4 @@
-//! Pixels that do not measure, by what they show over time.
+//! Pixels that do not measure, detected from their values over the views.
 
 use crate::Correct;
 use crate::filling::Filling;
@@ -10,23 +10,23 @@ use ndarray::{Array2, Array3, ArrayView2, ArrayView3, Axis};
 use rayon::prelude::*;
 use serde::{Deserialize, Serialize};
 
-/// With fewer views nothing is said of what a pixel does over time.
+/// Least number of views for judging a pixel over the views.
 const LEAST_VIEWS: usize = 16;
-/// A pixel that changes over the views by less than this share of what its neighbours do is dead.
+/// A pixel that changes over the views by less than this share of its neighbours' change is dead.
 const STUCK: f32 = 0.1;
-/// What flickers differs from its neighbours by this share of the range of the line integrals, ...
+/// A flickering pixel differs from its neighbours by this share of the range of the line integrals, ...
 const RESTLESS: f32 = 0.02;
-/// ... and what stands out in one view by this.
+/// ... and a single outlier by this share.
 const STANDS_OUT: f32 = 0.1;
-/// With more bad values than this share the scan is wrong, not the detector.
+/// With a larger share of bad values, the scan is wrong, not the detector.
 const MOST: f64 = 0.2;
 
-/// Dead, hot and flickering pixels, and single values that stand out (cosmic rays): each gets the mean of the good pixels around it,
-/// weighted by one over their squared distance.
+/// Dead, hot and flickering pixels, and single outliers (cosmic rays): each gets the mean of the good pixels around it, weighted
+/// by one over their squared distance.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct Pixels {
-    /// Standard deviations of the noise, as the neighbours show it, from which on a value stands out.
+    /// A value is an outlier above this many standard deviations of the noise of its neighbours.
     pub deviations: f32,
 }
 
@@ -84,7 +84,7 @@ impl Correct for Pixels {
 }
 
 impl Pixels {
-    /// Fills in what stands out in one view; how many values.
+    /// Fills in the outliers of one view and returns their number.
     fn single(&self, mut view: ndarray::ArrayViewMut2<'_, f32>, range: f32) -> usize {
         let mut bad = Array2::from_elem(view.dim(), false);
         let mut around = Vec::with_capacity(8);
@@ -96,7 +96,7 @@ impl Pixels {
                 continue;
             }
             let beyond = (x - around[n / 2]).max(around[(n - 1) / 2] - x);
-            // Between the quartiles lie 1.35 standard deviations of normal noise.
+            // The quartiles of normal noise are 1.35 standard deviations apart.
             let noise = (around[n - 1 - n / 4] - around[n / 4]) / 1.35;
             bad[at] = beyond > self.deviations * noise && beyond > STANDS_OUT * range;
         }
@@ -118,7 +118,7 @@ fn few(bad: usize, all: usize, what: &str) -> Result<()> {
     }
 }
 
-/// How far the line integrals reach, but for a hundredth of them at either end.
+/// The range of the line integrals, without one percent at either end.
 fn range(values: ArrayView3<'_, f32>) -> f32 {
     let mut sample: Vec<f32> = values.iter().copied().step_by((values.len() / 1_000_000) | 1).collect();
     sample.sort_unstable_by(f32::total_cmp);
@@ -126,8 +126,8 @@ fn range(values: ArrayView3<'_, f32>) -> f32 {
     at(0.99) - at(0.01)
 }
 
-/// For each pixel: by how much it changes over the views, and by how much what it differs from its neighbours by does (mean distance
-/// from the mean, and median distance from the median).
+/// For each pixel: the change of its value over the views (mean distance from the mean), and the change of its difference from its
+/// neighbours (median distance from the median).
 fn over_time(values: ArrayView3<'_, f32>) -> [Array2<f32>; 2] {
     let (views, rows, columns) = values.dim();
     let mut apart = Array3::<f32>::zeros((rows, columns, views));

@@ -1,7 +1,7 @@
-//! What a pixel adds to every view, which becomes a ring.
+//! Ring artefacts, from a constant that a pixel adds to every view.
 //!
-//! A pixel whose gain is not that of its flat field adds one number to all of its line integrals. The object moves over the
-//! detector from view to view, that number stays.
+//! A pixel whose gain differs from its flat field adds the same number to all of its line integrals. The object moves over the
+//! detector from view to view; this number stays.
 
 use crate::Correct;
 use conefield_core::error::{Result, ensure};
@@ -11,20 +11,21 @@ use ndarray::{Array2, ArrayView1, ArrayView2, Axis};
 use rayon::prelude::*;
 use serde::{Deserialize, Serialize};
 
-/// Standard deviations by which the median of sorted values may be off by chance.
+/// Offsets within this many standard deviations of the median of sorted values count as chance.
 const CHANCE: f32 = 3.0;
 
-/// How what stays is told from the object.
+/// How the constant offset is separated from the object.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize)]
 #[serde(rename_all = "kebab-case")]
 pub enum RingMethod {
-    /// What a moving average along the row takes off is the pixel's own if it stays over the views (Boin and Haibel, Optics Express
-    /// 14(25), 2006). Medians stand for both of their means: of few views each weighs much, and edges of the object must not count.
+    /// The difference from a moving average along the row is the pixel's offset if it is constant over the views (Boin and Haibel,
+    /// Optics Express 14(25), 2006). Medians replace both of their means: with few views each has a large weight, and edges of the
+    /// object must not count.
     #[default]
     Median,
-    /// Each pixel's values are sorted over the views: neighbours then differ little, wherever the object was. What a moving
-    /// median along the row takes off the sorted values is the pixel's own (Vo, Atwood and Drakopoulos, Optics Express 26(22), 2018,
-    /// algorithm 3). Of that the median over the ranks is taken off every view, less what it may be by chance.
+    /// Each pixel's values are sorted over the views: neighbours then differ little, wherever the object was. The difference of
+    /// the sorted values from their moving median along the row is the pixel's offset (Vo, Atwood and Drakopoulos, Optics Express
+    /// 26(22), 2018, algorithm 3). Its median over the ranks, reduced by its chance level, is subtracted from every view.
     Sorting,
 }
 
@@ -32,10 +33,10 @@ pub enum RingMethod {
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct Rings {
-    /// How what stays is told from the object.
+    /// How the constant offset is separated from the object.
     pub method: RingMethod,
-    /// Pixels along the row over which the median moves, odd. Faults of less than half of them are mended; more of them take more of the object for
-    /// its own where that stays in the same columns.
+    /// Width of the moving median along the row in pixels, odd. Corrects faults narrower than half of it. A wider window also
+    /// removes more of the object where it stays in the same columns.
     pub window: usize,
 }
 
@@ -77,9 +78,9 @@ impl Correct for Rings {
     }
 }
 
-/// What is the pixels' own in a row `[view, column]`.
+/// The pixels' offsets in a row `[view, column]`.
 fn by_median(row: ArrayView2<'_, f32>, window: usize) -> Vec<f32> {
-    let own = taken_off(row, window);
+    let own = differences(row, window);
     own.columns().into_iter().map(|views| median(&mut views.to_vec()).unwrap_or(0.0)).collect()
 }
 
@@ -90,7 +91,7 @@ fn by_sorting(row: ArrayView2<'_, f32>, window: usize) -> Vec<f32> {
         line.sort_unstable_by(f32::total_cmp);
         values.iter_mut().zip(&line).for_each(|(x, y)| *x = *y);
     }
-    let own = taken_off(sorted.view(), window);
+    let own = differences(sorted.view(), window);
     // 1.4826 makes the median of |x| the standard deviation of normal noise, and the median of n values spreads 1.2533/√n times as far.
     let by_chance = CHANCE * 1.4826 * 1.2533 / (row.nrows() as f32).sqrt();
     let of = |ranks: ArrayView1<'_, f32>| {
@@ -103,8 +104,8 @@ fn by_sorting(row: ArrayView2<'_, f32>, window: usize) -> Vec<f32> {
     own.columns().into_iter().map(of).collect()
 }
 
-/// What a moving median along each line of `[view, column]` takes off it.
-fn taken_off(lines: ArrayView2<'_, f32>, window: usize) -> Array2<f32> {
+/// The difference of each line of `[view, column]` from its moving median.
+fn differences(lines: ArrayView2<'_, f32>, window: usize) -> Array2<f32> {
     let mut own = lines.to_owned();
     for mut line in own.rows_mut() {
         let smooth = moving_median(&line.to_vec(), window);
@@ -113,7 +114,7 @@ fn taken_off(lines: ArrayView2<'_, f32>, window: usize) -> Array2<f32> {
     own
 }
 
-/// The median of the `window` values around each. At the ends the line goes on as its mirror image.
+/// The median of the `window` values around each value. The line is mirrored at its ends.
 fn moving_median(line: &[f32], window: usize) -> Vec<f32> {
     let (n, reach) = (line.len() as isize, (window / 2) as isize);
     let mut around = Vec::with_capacity(window);

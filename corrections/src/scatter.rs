@@ -1,4 +1,4 @@
-//! Light that did not come straight.
+//! Scattered radiation.
 
 use crate::Correct;
 use crate::smooth::blurred;
@@ -8,19 +8,20 @@ use ndarray::{Array2, ArrayView2, ArrayViewMut2, Axis, Zip};
 use rayon::prelude::*;
 use serde::{Deserialize, Serialize};
 
-/// Times that the scatter is computed anew from what is left without it. Each is a twentieth as far from the end as the one before, where a
-/// fifth of the light is scattered.
+/// Iterations of computing the scatter from the corrected intensity. If a fifth of the light is scattered, each iteration reduces
+/// the error to a twentieth.
 const ROUNDS: usize = 4;
-/// No more than this share of the light of a pixel is taken for scatter.
+/// Largest share of a pixel's light that counts as scatter.
 const MOST: f32 = 0.8;
 
-/// What a ray of transmission T = exp(−A) scatters grows with the rays that are absorbed on the way and falls with those that do not come
-/// through: as T·A, spread widely over the detector (Ohnesorge, Flohr and Klingenbeck-Regn, Eur. Radiol. 9(3), 1999). That is taken off the light.
+/// Subtracts scattered light. The scatter of a ray with transmission T = exp(−A) increases with absorption along the ray and
+/// decreases with the light that does not get through: as T·A, spread widely over the detector (Ohnesorge, Flohr and
+/// Klingenbeck-Regn, Eur. Radiol. 9(3), 1999).
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct Scatter {
-    /// Scattered light over T·A, both summed over the detector. A strip of lead on the source's side of the object shows it: all
-    /// light behind it is scattered.
+    /// Scattered light over T·A, both summed over the detector. A strip of lead between source and object allows a measurement:
+    /// all light behind it is scattered.
     pub share: f64,
     /// Standard deviation of its spread, as a share of the detector's wider side in pixels.
     #[serde(default = "width")]
@@ -48,7 +49,7 @@ impl Correct for Scatter {
 }
 
 impl Scatter {
-    /// Takes the scatter off a view; the largest share of a pixel's light that was taken off.
+    /// Subtracts the scatter from a view and returns the largest subtracted share of a pixel's light.
     fn view(&self, mut view: ArrayViewMut2<'_, f32>, sigma: f64) -> f32 {
         let light = view.mapv(|a| (-a).exp().min(f32::MAX));
         let mut scattered = Array2::zeros(light.dim());
@@ -62,14 +63,14 @@ impl Scatter {
         Zip::from(&mut view).and(&light).and(&scattered).for_each(|a, &t, &s| {
             let share = (s / t.max(f32::MIN_POSITIVE)).clamp(0.0, MOST);
             most = most.max(share);
-            // Not through the light: a pixel without scatter keeps its bits.
+            // Subtracting the logarithm keeps the exact bits of a pixel without scatter.
             *a -= (1.0 - share).ln();
         });
         most
     }
 }
 
-/// The light without what is scattered, never 0.
+/// The light minus the scatter, never 0.
 fn straight(light: ArrayView2<'_, f32>, scattered: ArrayView2<'_, f32>) -> Array2<f32> {
     let mut out = light.to_owned();
     Zip::from(&mut out).and(&scattered).for_each(|t, &s| *t = (*t - s).max((1.0 - MOST) * *t).max(f32::MIN_POSITIVE));

@@ -1,18 +1,18 @@
-//! Corrections as they are asked for on a command line.
+//! Parses the corrections of a command line.
 
 use crate::Corrections;
 use conefield_core::{Error, Result};
 use toml::{Table, Value};
 
-/// Who asks, in errors.
+/// The place in errors.
 const PLACE: &str = "corrections";
-/// The settings that a text may nest.
+/// Largest nesting depth of a setting's name.
 const DEEPEST: usize = 3;
 
 impl Corrections {
-    /// Reads texts such as `rings`, `rings.window=21` or `hardening.polynomial=[1.0, 0.05]`: the name of a correction, which has its
-    /// default settings then, or one setting of it. A value is TOML; what is none is taken for a word. Refuses names and settings
-    /// that are not there, and values that mean nothing.
+    /// Parses texts such as `rings`, `rings.window=21` or `hardening.polynomial=[1.0, 0.05]`: the name of a correction, with its
+    /// default settings, or one setting of it. Values are TOML; anything else is a string. Refuses unknown names and settings, and
+    /// invalid values.
     pub fn parse<S: AsRef<str>>(texts: &[S]) -> Result<Self> {
         let mut all = Table::new();
         for text in texts {
@@ -38,7 +38,7 @@ impl Corrections {
     }
 }
 
-/// The error of the correction `name`, whose settings it is about.
+/// `error` with the name of the correction that it belongs to.
 pub(crate) fn placed(error: Error, name: &str) -> Error {
     match error.within(name) {
         Error::Invalid { place, field, found, expected } if place == "spec" => {
@@ -48,16 +48,16 @@ pub(crate) fn placed(error: Error, name: &str) -> Error {
     }
 }
 
-/// TOML, or else a word.
+/// A TOML value, or else a string.
 fn read(text: &str) -> Value {
     let parsed = format!("value = {text}").parse::<Table>().ok();
     parsed.and_then(|mut t| t.remove("value")).unwrap_or_else(|| Value::String(text.to_owned()))
 }
 
-/// Puts `value` at `keys`. A name alone leaves the settings that others have set.
+/// Puts `value` at `keys`. A name alone keeps the settings from other texts.
 fn put(table: &mut Table, keys: &[&str], value: Value, text: &str) -> Result<()> {
     let twice = || {
-        let found = format!("\"{text}\" beside another value for the same");
+        let found = format!("\"{text}\" and another value for the same setting");
         Err(Error::invalid(PLACE, keys.join("."), found, "each setting once"))
     };
     match keys {
@@ -105,7 +105,7 @@ mod tests {
     }
 
     #[test]
-    fn what_means_nothing_is_refused_in_words() {
+    fn invalid_texts_are_refused_with_a_clear_message() {
         for (texts, words) in [
             (vec!["ring"], vec!["ring", "rings"]),
             (vec!["rings.windows=3"], vec!["windows", "window"]),

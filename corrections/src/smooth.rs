@@ -2,11 +2,11 @@
 
 use ndarray::{Array2, ArrayView2, Axis};
 
-/// Passes of a moving average, which together are nearly a Gaussian.
+/// Passes of a moving average; together they approximate a Gaussian.
 const PASSES: usize = 3;
 
-/// `image` through a Gaussian of a standard deviation of `sigma` pixels, as three moving averages along each axis. Beyond the image
-/// is nothing. Sums are in double precision, so that what a wide average adds and takes away again leaves no trace.
+/// `image` blurred by a Gaussian with a standard deviation of `sigma` pixels, as three moving averages along each axis. Values
+/// beyond the image are 0. Sums are in double precision, so that adding and subtracting values in a wide average leaves no error.
 pub(crate) fn blurred(image: ArrayView2<'_, f32>, sigma: f64) -> Array2<f32> {
     // Three boxes of 2r + 1 pixels have a variance of ((2r + 1)² − 1)/4.
     let reach = ((((4.0 * sigma * sigma + 1.0).sqrt()) - 1.0) / 2.0).round() as usize;
@@ -39,12 +39,12 @@ fn averaged(line: &[f32], reach: usize) -> Vec<f32> {
 
 /// Sums of rectangles of an image in four look-ups.
 pub(crate) struct Sums {
-    /// `[row, column]`, one more than the image each way: the sum above and to the left.
+    /// `[row, column]`, one larger than the image along both axes: the sum above and to the left.
     below: Array2<f64>,
 }
 
 impl Sums {
-    /// Of `image`.
+    /// The sums of `image`.
     pub fn of(image: ArrayView2<'_, f32>) -> Self {
         let (rows, columns) = image.dim();
         let mut below = Array2::zeros((rows + 1, columns + 1));
@@ -76,7 +76,7 @@ mod tests {
     fn a_point_becomes_a_gaussian() {
         let mut image = Array2::zeros((61, 61));
         image[[30, 30]] = 1.0;
-        // What boxes of 9 pixels make.
+        // The result of boxes of 9 pixels.
         let sigma = 20f64.sqrt();
         let b = blurred(image.view(), sigma);
         assert!((b.sum() - 1.0).abs() < 1e-4);

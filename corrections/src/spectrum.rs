@@ -1,7 +1,7 @@
-//! The light of an X-ray tube and what water and aluminium absorb of it.
+//! The spectrum of an X-ray tube and its absorption by water and aluminium.
 
 /// Photon energies in keV and mass attenuation coefficients in cm²/g of water and of aluminium (Hubbell and Seltzer, Tables of X-Ray Mass
-/// Attenuation Coefficients, NISTIR 5632, 1995). Between them logarithms are interpolated.
+/// Attenuation Coefficients, NISTIR 5632, 1995). Interpolation is logarithmic.
 const TABLE: [[f64; 3]; 14] = [
     [10.0, 5.329, 26.23],
     [15.0, 1.673, 7.955],
@@ -18,11 +18,11 @@ const TABLE: [[f64; 3]; 14] = [
     [400.0, 0.1061, 0.09276],
     [500.0, 0.09687, 0.08445],
 ];
-/// The least and the largest tube voltage that the table is for, in kV.
+/// Lowest and highest tube voltage that the table covers, in kV.
 pub(crate) const VOLTAGES: [f64; 2] = [20.0, 500.0];
 /// Density of aluminium in g/cm³.
 const ALUMINIUM: f64 = 2.699;
-/// Energies that a spectrum is summed over.
+/// Number of energies in a spectrum.
 const STEPS: usize = 100;
 
 /// Attenuation of water in 1/mm and the share of the detector's signal, for each energy.
@@ -32,7 +32,7 @@ pub(crate) struct Spectrum {
 
 impl Spectrum {
     /// Bremsstrahlung of a tube at `kvp` kV through `aluminium` mm of filter, on a detector that sums energies: Kramers' law gives
-    /// (E₀ − E)/E photons of energy E, each of which counts E.
+    /// (E₀ − E)/E photons of energy E, and each contributes E.
     pub fn of_tube(kvp: f64, aluminium: f64) -> Self {
         let lowest = TABLE[0][0];
         let line = |i: usize| {
@@ -46,7 +46,7 @@ impl Spectrum {
         Self { lines }
     }
 
-    /// The attenuation of thin water in 1/mm.
+    /// The attenuation of a thin layer of water in 1/mm.
     pub fn thin(&self) -> f64 {
         self.lines.iter().map(|[mu, share]| mu * share).sum()
     }
@@ -57,7 +57,7 @@ impl Spectrum {
     }
 }
 
-/// The mass attenuation of a column of the table at `energy`, cm²/g.
+/// The mass attenuation at `energy` from a column of the table, in cm²/g.
 fn attenuation(energy: f64, column: usize) -> f64 {
     let above = TABLE.iter().position(|l| l[0] > energy).unwrap_or(TABLE.len() - 1).max(1);
     let (low, high) = (TABLE[above - 1], TABLE[above]);
@@ -72,7 +72,7 @@ mod tests {
     #[test]
     fn harder_beams_are_absorbed_less() {
         assert!((attenuation(60.0, 1) - 0.2059).abs() < 1e-12 && (attenuation(500.0, 1) - 0.09687).abs() < 1e-12);
-        // NIST has 0.1929 at 70 keV; interpolated.
+        // NIST has 0.1929 at 70 keV; this value is interpolated.
         assert!((attenuation(70.0, 1) - 0.1929).abs() < 2e-3);
         let [soft, filtered, hard] =
             [(80.0, 1.0), (80.0, 5.0), (140.0, 1.0)].map(|(kvp, al)| Spectrum::of_tube(kvp, al).thin());
@@ -82,7 +82,7 @@ mod tests {
         );
         let s = Spectrum::of_tube(120.0, 2.5);
         assert!(s.measured(0.0).abs() < 1e-12 && (s.measured(1e-3) / 1e-3 / s.thin() - 1.0).abs() < 1e-3);
-        // 20 cm of water: some 15 % less than without hardening.
+        // 20 cm of water: about 15 % less than without hardening.
         let share = s.measured(200.0) / (200.0 * s.thin());
         assert!((0.7..0.95).contains(&share), "{share}");
     }

@@ -1,4 +1,4 @@
-//! Each correction on projections with its fault and on the same without it. Line integrals are those of ellipsoids in closed form.
+//! Tests each correction on projections with and without its fault. Line integrals are those of ellipsoids in closed form.
 
 use super::*;
 use conefield_core::geometry::{Geometry, Millimetres, Radians, View, VoxelGrid};
@@ -11,7 +11,7 @@ use std::f64::consts::TAU;
 
 const VIEWS: usize = 40;
 
-/// A body with a bone and a hole in it, of line integrals up to about 1.7, times `scale`.
+/// A body with a bone and a hole, with line integrals up to about 1.7, times `scale`.
 fn exact(scale: f64) -> Scan {
     let body = |center, axes, value| Ellipsoid { center, axes, value: scale * value };
     let bodies = [
@@ -30,7 +30,7 @@ fn exact(scale: f64) -> Scan {
     scan_ellipsoids(&bodies, geometry)
 }
 
-/// The scan with photons counted.
+/// The scan with the noise of counted photons.
 fn counted(scan: &Scan, photons: f64) -> Scan {
     let mut scan = scan.clone();
     DetectorNoise::Poisson { i0: photons }.add(&mut scan.projections, 3);
@@ -49,7 +49,7 @@ fn off(a: &Scan, b: &Scan) -> f64 {
     (squares.sum::<f64>() / a.projections.len() as f64).sqrt()
 }
 
-/// The same of what stays over the views, which is what makes rings.
+/// The same for the mean over the views, which makes rings.
 fn off_always(a: &Scan, b: &Scan) -> f64 {
     let mean: Array2<f32> = (&a.projections - &b.projections).mean_axis(Axis(0)).unwrap();
     (mean.iter().map(|x| f64::from(*x).powi(2)).sum::<f64>() / mean.len() as f64).sqrt()
@@ -65,7 +65,7 @@ fn refused(scan: &Scan, texts: &[&str]) -> String {
 }
 
 #[test]
-fn gains_that_stay_are_taken_off() {
+fn constant_gains_are_removed() {
     let exact = exact(1.0);
     let noisy = counted(&exact, 3e4);
     let mut random = ChaCha8Rng::seed_from_u64(1);
@@ -97,7 +97,7 @@ fn pixels_that_do_not_measure_are_filled_in() {
     let pixel = |random: &mut ChaCha8Rng| [random.random_range(4..56), random.random_range(4..68)];
     for _ in 0..8 {
         let [r, c] = pixel(&mut random);
-        // Dead: a value that the object could have.
+        // Dead, with a value that the object could have.
         faulty.projections.slice_mut(s![.., r, c]).fill(0.5);
         let [r, c] = pixel(&mut random);
         // Flickers in half the views.
@@ -134,7 +134,7 @@ fn the_tube_s_brightness_is_read_from_air() {
         assert!(off(&kept, &exact) < 1.02 * off(&noisy, &exact), "{texts:?}");
     }
     assert!(off(&faulty, &exact) > 5.0 * off(&noisy, &exact));
-    // The body is no air.
+    // The body is not air.
     let said = refused(&noisy, &["flux.rows=[20, 40]", "flux.columns=[30, 40]"]);
     assert!(said.contains("flux.rows") && said.contains("in air") && said.contains("view 0"), "{said}");
     assert!(refused(&noisy, &["flux.columns=[0, 80]"]).contains("at most 72"));
@@ -146,16 +146,16 @@ fn few_photons_keep_their_mean() {
     let noisy = counted(&dark, 500.0);
     let (mended, found) = corrected(&noisy, &["low-counts.photons=500"]);
     assert!(off(&mended, &dark) < 0.6 * off(&noisy, &dark), "{found}: {} {}", off(&mended, &dark), off(&noisy, &dark));
-    // Where enough arrive, nothing changes.
+    // With enough photons, nothing changes.
     let bright = counted(&exact(1.0), 1e4);
     let (kept, found) = corrected(&bright, &["low-counts.photons=1e4"]);
     assert!(kept.projections == bright.projections && found.starts_with("0.00 %"), "{found}");
 }
 
 #[test]
-fn scattered_light_is_taken_off() {
+fn scattered_light_is_subtracted() {
     let exact = exact(1.5);
-    // The scatter of the model, computed in another way: an even spread over the whole detector.
+    // The scatter of the model, computed in another way: spread evenly over the whole detector.
     let mut faulty = exact.clone();
     for mut view in faulty.projections.outer_iter_mut() {
         let n = view.len() as f32;
@@ -176,14 +176,14 @@ fn scattered_light_is_taken_off() {
 }
 
 #[test]
-fn thick_paths_get_back_what_hardening_took() {
+fn hardening_is_corrected_in_thick_paths() {
     let exact = exact(1.0);
     let spectrum = spectrum::Spectrum::of_tube(120.0, 2.5);
     let hardened = |a: f32| spectrum.measured(f64::from(a.max(0.0)) / spectrum.thin()) as f32;
     let faulty = changed(&exact, |_, _, _, a| hardened(a));
     let (mended, found) = corrected(&faulty, &["hardening.water.kvp=120"]);
     assert!(off(&mended, &exact) < 1e-4, "{found}: {}", off(&mended, &exact));
-    // Told a tube that is 10 % off, most of it is mended.
+    // With a tube voltage that is 10 % wrong, most of the error is corrected.
     let (about, _) = corrected(&faulty, &["hardening.water.kvp=108"]);
     assert!(off(&about, &exact) < 0.3 * off(&faulty, &exact), "{} {}", off(&about, &exact), off(&faulty, &exact));
     // A parabola that meets the exact one at the thickest path.
@@ -198,7 +198,7 @@ fn thick_paths_get_back_what_hardening_took() {
 }
 
 #[test]
-fn rows_go_on_beyond_the_sides_that_cut_the_object() {
+fn rows_are_extended_where_the_detector_cuts_the_object() {
     let exact = exact(1.0);
     let (kept, found) = corrected(&exact, &["truncation"]);
     assert!(kept.projections == exact.projections && found.contains("nothing is added"), "{found}");
@@ -209,7 +209,7 @@ fn rows_go_on_beyond_the_sides_that_cut_the_object() {
     assert!(found.contains("18 columns"), "{found}");
     assert_eq!(wide.geometry.detector, [60, 72]);
     assert!(wide.projections.slice(s![.., .., 18..54]) == cut.projections);
-    // Nearer to what is there than nothing.
+    // Closer to the object than zeros.
     let mut padded = exact.clone();
     padded.projections.slice_mut(s![.., .., ..18]).fill(0.0);
     padded.projections.slice_mut(s![.., .., 54..]).fill(0.0);
@@ -217,9 +217,9 @@ fn rows_go_on_beyond_the_sides_that_cut_the_object() {
     assert_eq!(wide.geometry.ray(3, 5, 20), exact.geometry.ray(3, 5, 20));
 }
 
-/// One order, one list of what was done, nothing that is not finite.
+/// The order is fixed, all corrections are listed, and all values are finite.
 #[test]
-fn what_is_done_is_kept_in_the_scan() {
+fn corrections_are_recorded_in_the_scan() {
     let scan = counted(&exact(1.0), 1e3);
     let (once, _) = corrected(&scan, &["hardening.polynomial=[1, 0.1]", "rings"]);
     let done = once.provenance["corrections"].as_array().unwrap();
@@ -229,7 +229,7 @@ fn what_is_done_is_kept_in_the_scan() {
     assert_eq!(once.provenance["simulated"], scan.provenance["simulated"]);
     let (twice, _) = corrected(&once, &["flux"]);
     assert_eq!(twice.provenance["corrections"].as_array().unwrap().len(), 3);
-    // Values that none of them is made for.
+    // Values that no correction expects.
     for value in [0.0, 80.0, 1e14, -1e14, 1e-30] {
         let odd = changed(&scan, |v, _, c, a| if (v + c) % 3 == 0 { value } else { a });
         for text in [
@@ -246,7 +246,7 @@ fn what_is_done_is_kept_in_the_scan() {
             }
         }
     }
-    // The smallest scan there is.
+    // The smallest possible scan.
     let mut tiny = scan.clone();
     tiny.geometry.detector = [1, 1];
     tiny.geometry.views.truncate(1);

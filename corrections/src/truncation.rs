@@ -1,4 +1,4 @@
-//! Objects that are wider than the detector.
+//! Extends the views of objects that are wider than the detector.
 
 use crate::Correct;
 use conefield_core::Result;
@@ -10,18 +10,19 @@ use serde::{Deserialize, Serialize};
 use std::f64::consts::FRAC_PI_2;
 use std::ops::Range;
 
-/// One of so many columns at a side tells what is there.
+/// The strip examined at each side is the detector's width divided by this number.
 const SIDE: usize = 64;
-/// Of the largest line integral: less than this at a side is air.
+/// Share of the largest line integral below which a side shows air.
 const AIR: f32 = 0.05;
 
-/// Rows that end in the object go on beyond the detector's sides as their mirror images, which turn about the last value and fade to 0
-/// (Ohnesorge et al., Med. Phys. 27(1), 2000). It makes the detector wider. The ramp filter of `fdk` then finds no step at the side, which would
-/// become a bright rim. The new values are made up: for methods that fit them use `scene.surround.coarse` of the spec in its place.
+/// Extends rows that end in the object beyond the detector's sides, by point reflection about the last value, faded to 0
+/// (Ohnesorge et al., Med. Phys. 27(1), 2000). The detector becomes wider. Without the step at the side, the ramp filter of `fdk`
+/// makes no bright rim. The new values are not measured: for methods that fit them, use `scene.surround.coarse` of the spec
+/// instead.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct Truncation {
-    /// Columns that are added on either side, as a share of the detector's.
+    /// Number of columns added on either side, as a share of the detector's.
     pub share: f64,
 }
 
@@ -41,7 +42,7 @@ impl Correct for Truncation {
         let (views, rows, columns) = scan.projections.dim();
         let side = columns.div_ceil(SIDE);
         let most = scan.projections.iter().copied().fold(0.0, f32::max);
-        // A mean over some pixels hides their noise.
+        // Averaging some pixels reduces their noise.
         let tall = rows.div_ceil(SIDE);
         let reaches = |view: ArrayView2<'_, f32>, columns: Range<usize>| {
             let strip = view.slice_move(s![.., columns]);

@@ -86,7 +86,7 @@ mod tests {
     use ndarray::Array3;
 
     #[test]
-    fn fields_tell_dead_and_hot_pixels() {
+    fn dead_and_hot_pixels_are_found_in_fields() {
         let mut flat = Array2::from_elem((6, 8), 1000.0f32);
         let mut dark = Array2::from_elem((6, 8), 10.0f32);
         (flat[[1, 2]], flat[[3, 4]], dark[[5, 7]]) = (20.0, 9000.0, 700.0);
@@ -97,7 +97,7 @@ mod tests {
     }
 
     #[test]
-    fn what_stays_is_an_outlier_and_what_moves_is_not() {
+    fn persistent_outliers_are_found_and_moving_edges_are_not() {
         let bump = |v: usize, i: usize, j: usize| if (i, j) == (4, v + 2) { 2.0 } else { 0.0 };
         let mut p = Array3::from_shape_fn((8, 12, 12), |(v, i, j)| {
             0.2 * (i as f32) + if j > 6 { 1.0 } else { 0.0 } + bump(v, i, j)

@@ -38,7 +38,7 @@ mod tests {
     use ndarray::Array2;
 
     #[test]
-    fn the_border_is_found_whatever_the_size() {
+    fn the_border_is_found_at_every_size() {
         for (rows, columns) in [(1, 1), (2, 9), (64, 96), (5, 200)] {
             let view = Array2::from_elem((rows, columns), 3.0f32);
             let found = border_medians(view.view(), |_, _| true);

@@ -9,7 +9,7 @@ use serde::Serialize;
 const SAMPLE: usize = 1_000_000;
 /// Views whose border is examined.
 const VIEWS: usize = 32;
-/// A line integral that transmits less than one photon in 10²¹: no detector measures that.
+/// At this line integral less than one photon in 10²¹ gets through; no detector measures that.
 const OPAQUE: f32 = 50.0;
 
 /// The result of [`check_line_integrals`].
@@ -101,21 +101,21 @@ mod tests {
     }
 
     #[test]
-    fn line_integrals_pass_and_others_are_told() {
+    fn line_integrals_pass_and_other_values_are_reported() {
         for peak in [1e-3, 0.5, 5.0, 12.0] {
             let c = check_line_integrals(ball(peak).view());
             assert!(c.complaints.is_empty(), "{peak}: {c:?}");
         }
-        let told = |p: Array3<f32>, words: &str| {
+        let reported = |p: Array3<f32>, words: &str| {
             let c = check_line_integrals(p.view());
             assert!(c.complaints.iter().any(|w| w.contains(words)), "{words}: {c:?}");
         };
-        told(ball(2.0).mapv(|a| 20000.0 * (-a).exp()), "looks like intensities, not line integrals: pass --i0");
-        told(ball(2.0).mapv(|a| (-a).exp()), "looks like intensities, not line integrals: pass --i0 or flat/dark");
-        told(ball(2.0) + 0.7, "I0 is too high");
-        told(ball(2.0) - 0.7, "I0 is too low");
-        told(-ball(2.0), "the sign is wrong");
-        told(ball(200.0), "no detector measures");
+        reported(ball(2.0).mapv(|a| 20000.0 * (-a).exp()), "looks like intensities, not line integrals: pass --i0");
+        reported(ball(2.0).mapv(|a| (-a).exp()), "looks like intensities, not line integrals: pass --i0 or flat/dark");
+        reported(ball(2.0) + 0.7, "I0 is too high");
+        reported(ball(2.0) - 0.7, "I0 is too low");
+        reported(-ball(2.0), "the sign is wrong");
+        reported(ball(200.0), "no detector measures");
         // An empty beam is not an error.
         assert!(check_line_integrals(Array3::zeros((2, 3, 4)).view()).complaints.is_empty());
         assert!(check_line_integrals(Array3::zeros((0, 0, 0)).view()).complaints.is_empty());

@@ -17,7 +17,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn nothing_has_no_median_and_no_quantile() {
+    fn an_empty_list_has_no_median_and_no_quantile() {
         assert_eq!((median(&mut []), quantile(&[], 0.5)), (None, None));
         assert_eq!((median(&mut [3.0, 1.0, 2.0, 4.0]), quantile(&[1.0, 2.0, 5.0], 0.5)), (Some(3.0), Some(2.0)));
     }

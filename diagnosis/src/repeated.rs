@@ -1,25 +1,25 @@
-//! A last view that repeats the first: a scan over a full turn with both ends, whose angles were taken without the last.
+//! Detects a last view that repeats the first: a full turn with both ends, imported with angles that exclude the end.
 
 use conefield_core::geometry::{View, norm, sub};
 use conefield_core::scan::Scan;
 use ndarray::{Array2, ArrayView2, Zip};
 
-/// Fewer views are too far apart to compare neighbours.
+/// Least number of views; with fewer, neighbours are too far apart to compare.
 const FEWEST: usize = 8;
-/// Pixels along the longer side of the images that are compared: noise is averaged out, the object is not.
+/// Pixels along the longer side of the compared images: few enough to average out the noise, but not the object.
 const SIDE: usize = 64;
-/// Largest difference of first and last view, as a share of that of neighbours.
+/// Largest difference of first and last view, as a share of the difference of neighbours.
 const SHARE: f64 = 0.5;
-/// Neighbours that differ by less, as a share of the first view, tell nothing: the object is round.
+/// Least difference of neighbours, as a share of the first view. Below it the object is round, and the test decides nothing.
 const ROUND: f64 = 1e-4;
-/// Distances of sources, in steps, that count as a step.
+/// Range of source distances, in steps, that counts as one step.
 const STEPS: std::ops::Range<f64> = 0.5..1.5;
 
-/// The difference of last and first view and the least one between their neighbours, as shares of the first view, if
-/// the two views show the same although they stand a step apart.
+/// If the last view repeats the first although their sources are a step apart: the difference of the two views and the
+/// smallest difference of their neighbours, both as shares of the first view.
 ///
 /// A symmetric object can look alike from both sides of the seam. Then the neighbours of first and last view look alike
-/// too, which a repeated view does not explain.
+/// too; those of a repeated view do not.
 pub(crate) fn repeated(scan: &Scan) -> Option<[f64; 2]> {
     let views = &scan.geometry.views;
     let n = views.len();
@@ -35,14 +35,14 @@ pub(crate) fn repeated(scan: &Scan) -> Option<[f64; 2]> {
     (least > ROUND * size && seam < SHARE * least).then(|| [seam / size, least / size])
 }
 
-/// Whether the first view follows the last at a distance of about a step.
+/// Whether the first and the last view are about a step apart.
 fn a_step_apart(views: &[View]) -> bool {
     let n = views.len();
     let apart = |a: usize, b: usize| norm(sub(views[a].source, views[b].source));
     [apart(0, 1), apart(n - 2, n - 1)].iter().all(|step| STEPS.contains(&(apart(n - 1, 0) / step)))
 }
 
-/// Means of square blocks; what is left at the last rows and columns is dropped.
+/// Means of square blocks; drops incomplete blocks at the last rows and columns.
 fn coarse(view: ArrayView2<'_, f32>) -> Array2<f64> {
     let (rows, columns) = view.dim();
     let block = rows.max(columns).div_ceil(SIDE).min(rows.min(columns)).max(1);

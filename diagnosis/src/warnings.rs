@@ -105,8 +105,8 @@ fn truncated(s: &Survey, warn: Warn) {
     warn(
         WarningKind::Truncated,
         format!(
-            "the object reaches past the detector's side in {} of the views, on {} of the rows ({:.1} mm at the axis): \
-             line integrals of {:.3} there, above {:.3} which counts as air",
+            "the object extends beyond the detector's side in {} of the views, on {} of the rows ({:.1} mm at the \
+             axis): line integrals of {:.3} there, above {:.3} which counts as air",
             percent(t.views),
             percent(t.rows),
             t.height_mm,
@@ -140,7 +140,7 @@ fn covered(scan: &Scan, s: &Survey, warn: Warn) {
             size[2],
             fov.height_mm
         ),
-        "make the volume smaller, or trust what lies outside less; --png of info shows where".into(),
+        "make the volume smaller, or trust the parts outside less; --png of info shows them".into(),
     );
 }
 
@@ -148,7 +148,7 @@ fn offset(s: &Survey, warn: Warn) {
     let g = &s.setup;
     let (overlap, half) = (g.overlap_mm(), g.detector_mm[1] / 2.0);
     let found = format!(
-        "the detector stands {:.2} mm aside along u, which is {} its half width of {half:.2} mm",
+        "the detector is shifted by {:.2} mm along u, {} its half width of {half:.2} mm",
         g.offset_mm[1].abs(),
         if overlap < 0.0 { "more than" } else { "nearly" },
     );
@@ -158,8 +158,8 @@ fn offset(s: &Survey, warn: Warn) {
     } else if overlap < OVERLAP * 2.0 * half {
         warn(
             WarningKind::Offset,
-            format!("{found}: {overlap:.2} mm reach past the axis"),
-            format!("opposite views hardly overlap; {:.1} mm or more would tie them together", OVERLAP * 2.0 * half),
+            format!("{found}: only {overlap:.2} mm extend beyond the axis"),
+            format!("opposite views hardly overlap; {:.1} mm or more would connect them", OVERLAP * 2.0 * half),
         );
     }
 }
@@ -173,7 +173,7 @@ fn angles(scan: &Scan, s: &Survey, warn: Warn) {
                 "views follow each other in steps of {:.4} rad, which divide 180, 360 or 720 evenly",
                 a.step_deg.to_radians()
             ),
-            "the angles look like degrees that were taken for radians: convert them".into(),
+            "the angles look like degrees read as radians: convert them".into(),
         );
         return;
     }
@@ -181,9 +181,9 @@ fn angles(scan: &Scan, s: &Survey, warn: Warn) {
     // The reconstructed region that the detector sees.
     let radius = s.setup.field_of_view.one_sided_radius_mm.min(size[0].hypot(size[1]) / 2.0);
     let fan = 2.0 * (radius / s.setup.source_to_axis_mm.max(radius)).asin().to_degrees();
-    let aside = s.setup.offset_mm[1].abs() > 0.1 * s.setup.detector_mm[1];
-    let (least, why) = match aside {
-        true => (360.0, "a full circle, since the detector stands aside".to_owned()),
+    let shifted = s.setup.offset_mm[1].abs() > 0.1 * s.setup.detector_mm[1];
+    let (least, why) = match shifted {
+        true => (360.0, "a full circle, because the detector is shifted".to_owned()),
         false => (180.0 + fan, format!("180° and the fan angle of {fan:.1}°")),
     };
     if !a.full_circle && a.covered_deg < least - a.mean_gap_deg.max(0.1) {
@@ -215,14 +215,14 @@ fn angles(scan: &Scan, s: &Survey, warn: Warn) {
 fn repeats(scan: &Scan, s: &Survey, warn: Warn) {
     let Some([seam, least]) = repeated(scan) else { return };
     let n = scan.geometry.views.len();
-    // With both ends the same angles have one step less.
-    let told = s.setup.angles.step_deg.abs();
-    let step = told * n as f64 / (n - 1) as f64;
+    // With both ends, the same angles have one step fewer.
+    let given = s.setup.angles.step_deg.abs();
+    let step = given * n as f64 / (n - 1) as f64;
     warn(
         WarningKind::Repeated,
         format!(
-            "the last view repeats the first: they differ by {}, views beside them by {} or more, and by the angles they \
-             stand {told:.4}° apart",
+            "the last view repeats the first: they differ by {} and their neighbours by {} or more, but their angles are \
+             {given:.4}° apart",
             percent(seam),
             percent(least)
         ),
@@ -258,7 +258,7 @@ fn scale(scan: &Scan, s: &Survey, warn: Warn) {
             WarningKind::Scale,
             format!(
                 "line integrals up to {:.3} over a volume of {:.3} mm are an attenuation of about {mu:.1e} /mm; \
-                 scanned things have {:.0e} to {} /mm (water 0.02)",
+                 scanned objects have {:.0e} to {} /mm (water 0.02)",
                 s.check.typical_range[1],
                 scan.geometry.volume.size()[0].max(scan.geometry.volume.size()[1]),
                 ATTENUATIONS[0],

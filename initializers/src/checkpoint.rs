@@ -58,7 +58,7 @@ mod tests {
     use conefield_core::error::Error;
 
     #[test]
-    fn everything_is_loaded_and_a_missing_file_is_told() {
+    fn everything_is_loaded_and_a_missing_file_is_reported() {
         let block = Block { name: "encoder.0.table".into(), shape: vec![2], range: 0..2 };
         let layout = Layout { blocks: vec![block] };
         let weights = Weights::from_arena(&layout, &[1.0, 2.0], |_| true);

@@ -20,7 +20,7 @@ pub struct EventFile {
 }
 
 impl EventFile {
-    /// Creates the file `path`, replacing an earlier one. TensorBoard looks for names that contain `tfevents`.
+    /// Creates the file `path`, replacing an earlier one. TensorBoard reads files whose names contain `tfevents`.
     pub fn create(path: impl AsRef<Path>) -> Result<Self> {
         let path = path.as_ref().to_path_buf();
         let file = File::create(&path).map_err(|e| Error::io(&path, e))?;

@@ -309,11 +309,11 @@ fn await_parts(path: &Path, contents: Contents) -> Result<()> {
     folders(path, PARTS_WITHIN, contents.known, &mut parts)?;
     let begin = Instant::now();
     for part in parts {
-        let mut told = false;
+        let mut reported = false;
         while matches!(lock::hold(&part), Held::Theirs) {
-            if !told {
+            if !reported {
                 tracing::info!("{}: waiting until another conefield, which is writing it, ends", part.display());
-                told = true;
+                reported = true;
             }
             if begin.elapsed() > ENDING {
                 return Err(taken(&part));

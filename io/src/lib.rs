@@ -17,7 +17,7 @@
 //! Voxel values stay in `1/unit` of their scan.
 //!
 //! Writers write beside the final name, sync and rename ([`write_atomic`]), so a half-written file never appears under
-//! the final name. A folder that grows while a command works is a [`Lease`]: locked, with the earlier folder kept aside
+//! the final name. A folder that grows while a command works is a [`Lease`]: locked, with the earlier folder preserved
 //! until the new work is complete. Several processes can write one folder, each with a [`SharedLease`].
 
 mod affine;

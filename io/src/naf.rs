@@ -513,7 +513,7 @@ mod tests {
     }
 
     #[test]
-    fn the_published_order_of_the_offset_is_told_from_the_rays() {
+    fn the_published_order_of_the_offset_is_recognized_from_the_rays() {
         let dir = tempfile::tempdir().unwrap();
         let path = dir.path().join("a.pickle");
         let (s, volume) = consistent(Unit::default());

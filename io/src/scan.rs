@@ -106,7 +106,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn what_is_no_scan_is_told_what_would_be() {
+    fn a_refusal_lists_the_files_of_a_scan() {
         let dir = tempfile::tempdir().unwrap();
         let e = read_scan(dir.path()).unwrap_err().to_string();
         assert!(e.contains("scan.toml") && e.contains("scan.json") && e.contains("meta_data.json"), "{e}");

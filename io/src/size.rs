@@ -109,7 +109,7 @@ mod tests {
     use ndarray::Array3;
 
     #[test]
-    fn sizes_are_told_without_the_data() {
+    fn sizes_are_read_without_the_data() {
         let dir = tempfile::tempdir().unwrap();
         let at = |name: &str| dir.path().join(name);
         let v = Volume::centered(Array3::ones((5, 6, 7)), [1.0; 3]);

@@ -67,7 +67,7 @@ mod tests {
     }
 
     #[test]
-    fn another_unit_is_told_and_a_poor_result_is_not_taken_for_one() {
+    fn another_unit_is_reported_and_a_poor_result_is_not_mistaken_for_one() {
         let truth = ramp(0.0, 1.0);
         let scaled = |k: f32| truth.mapv(|x| k * x);
         let found = other_unit(scaled(0.02).view(), truth.view()).unwrap();

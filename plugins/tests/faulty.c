@@ -183,7 +183,7 @@ static ConefieldStatus backward_halves(const void *stage, uint32_t format, const
     return backward(stage, ones, x, tape, dy, grads, dx, error);
 }
 
-/* Every channel tells 8 cells apart. */
+/* Every channel resolves 8 cells. */
 static ConefieldStatus resolutions(const void *stage, double *cells, size_t count, struct ConefieldText *error) {
     (void)stage, (void)error;
     if (FAULT == FEW_RESOLUTIONS) count -= 1;

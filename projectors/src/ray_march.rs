@@ -229,7 +229,7 @@ mod tests {
     }
 
     #[test]
-    fn samples_are_told_in_one_way() {
+    fn samples_are_given_in_one_way() {
         let all = RayMarch { samples: Some(7), step_mm: Some(1.0), step_voxels: Some(2.0), ..RayMarch::default() };
         for both in [
             RayMarch { samples: None, ..all.clone() },

@@ -299,7 +299,7 @@ mod tests {
     }
 
     #[test]
-    fn the_moment_that_takes_most_is_told() {
+    fn the_moment_with_the_largest_need_is_reported() {
         let m = run().memory(&Fixed(1 << 22));
         assert_eq!((m.reference, m.volume), (512 << 20, 512 << 20));
         assert_eq!((m.model, m.optimizer), (32 << 20, 80 << 20));

@@ -135,7 +135,7 @@ mod tests {
             let loaded = specs::read(&point.spec, &point.sets).unwrap();
             let plan = plan(&loaded, &Cpu::new()).unwrap();
             assert_eq!(Unknowns::of(plan.as_ref()), point.kind, "{}", point.name);
-            assert!(point.accuracy().is_finite() && !point.told(&front).contains("NaN"));
+            assert!(point.accuracy().is_finite() && !point.scores(&front).contains("NaN"));
         }
     }
 

@@ -131,8 +131,8 @@ impl Plan for ChainPlan {
         let kinds: Vec<&str> = links.iter().map(|l| &l.method.kind[..]).collect();
         let mean = if self.mean > 1 { format!("; the mean of the last {} volumes", self.mean) } else { String::new() };
         let merge = if self.merge { "; methods on one grid are merged" } else { "" };
-        let told = format!("{}{mean}{merge}", kinds.join(", then "));
-        Outline { method: Line::new("method", "chain", &told), links, ..Outline::default() }
+        let what = format!("{}{mean}{merge}", kinds.join(", then "));
+        Outline { method: Line::new("method", "chain", &what), links, ..Outline::default() }
     }
 
     /// The methods run one after the other. Later ones also hold their start volume and the sum of earlier volumes; a

@@ -49,7 +49,7 @@ pub(crate) struct Trained<'a> {
 }
 
 impl Trained<'_> {
-    /// Builds what is left to build, and compiles `pipeline`. `stages` are the lines of its stages, `beside` of others.
+    /// Builds the remaining parts and compiles `pipeline`. `stages` are the lines of its stages, `beside` those of others.
     pub(crate) fn plan(
         &self,
         pipeline: Pipeline,
@@ -220,7 +220,7 @@ struct FieldPlan {
     callbacks: Option<Vec<Box<dyn Callback>>>,
     /// Bytes that callbacks keep.
     kept: u64,
-    /// The key of the callback that looks at views kept aside.
+    /// The key of the callback that needs held-out views.
     held_out: Option<String>,
     /// Of the first run, unless the scan changes the stages.
     compiled: Option<Box<dyn Executable>>,

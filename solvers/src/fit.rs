@@ -51,7 +51,7 @@ pub fn fit(scan: &Scan, settings: &SceneSettings, pipeline: &mut Pipeline) -> Re
 /// Finds the encoder's channels that are needed to resolve `cells`.
 fn levels(pipeline: &Pipeline, needed: Option<&[usize]>, cells: f64) -> Result<String> {
     let info = pipeline.encoder.info();
-    let data = format!("the data tell {cells:.0} cells a side apart");
+    let data = format!("the data resolve {cells:.0} cells along each side");
     Ok(match needed {
         None if pipeline.encoder.resolutions().is_none() => {
             "all channels, as the encoder does not say how fine they are".into()

@@ -63,7 +63,7 @@ impl Windows {
         self.count.min(rays / (self.side * self.side))
     }
 
-    /// Windows side by side along a detector of `columns` columns; what is left at the end is in none.
+    /// Windows side by side along a detector of `columns` columns; the remaining columns at the end are in none.
     fn across(&self, columns: usize) -> usize {
         columns / self.side
     }

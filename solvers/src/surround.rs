@@ -124,7 +124,7 @@ impl Around {
             }
             margin *= 0.75;
             if beyond.iter().all(|n| *n <= 1) {
-                let said = format!("not looked for, as sources or detectors of {n} views stand at the volume's sides");
+                let said = format!("none, as sources or detectors of {n} views are at the volume's sides");
                 return Ok((None, said));
             }
         };

@@ -395,7 +395,7 @@ mod tests {
     }
 
     #[test]
-    fn what_is_wrong_is_told_with_its_line() {
+    fn mistakes_are_reported_with_their_line() {
         // Lines at the top, then the two lines of TINY, then tables.
         for (top, tables, want) in [
             ("seed = [1]\n", "", "line 1: seed: found a key that is not known here, expected `seeds`"),

@@ -53,7 +53,7 @@ enum Fault {
     SpreadsNan,
     /// The result depends on the number of rows.
     TileSize,
-    /// An output is left as it was.
+    /// An output is not written.
     SkipsOutput,
     /// Squares overflow.
     Overflows,
@@ -629,9 +629,9 @@ fn every_fault_of_a_ray_projector_fails_its_property() {
 #[derive(Debug, Clone, Copy, PartialEq)]
 enum WeightFault {
     None,
-    /// It fills more than it tells of.
+    /// It fills more than it reports.
     Silent,
-    /// A block is told of nowhere.
+    /// A block is missing in its report.
     Forgets,
     /// One number is infinite.
     Infinite,

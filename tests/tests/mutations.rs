@@ -115,7 +115,7 @@ fn fnv(bytes: &[u8]) -> u64 {
     bytes.iter().fold(0xcbf2_9ce4_8422_2325, |h, b| (h ^ u64::from(*b)).wrapping_mul(0x0100_0000_01b3))
 }
 
-/// Readers that do what none may do are told.
+/// Checks that the harness reports faulty readers.
 fn controls(faults: &mut Vec<String>) {
     fn damaged(dir: &Path) -> bool {
         std::fs::read(dir.join("a.npy")).unwrap().len() < 100
@@ -133,15 +133,15 @@ fn controls(faults: &mut Vec<String>) {
     });
     let quick = Bounds { time: Duration::from_millis(1), ..BOUNDS };
     type Is = fn(&ReaderFault) -> bool;
-    let told: [(&str, Parser, Bounds, Is); 3] = [
+    let cases: [(&str, Parser, Bounds, Is); 3] = [
         ("a panic", panics, BOUNDS, |f| *f == ReaderFault::Panic("on purpose".into())),
         ("a hoard", hoards, BOUNDS, |f| matches!(f, ReaderFault::Memory(n) if *n >= 17 << 20)),
         ("a hang", hangs, quick, |f| matches!(f, ReaderFault::Time(_))),
     ];
-    for (what, parser, bounds, is) in told {
+    for (what, parser, bounds, is) in cases {
         let seen = parser.run(folder().path(), 0..100, &[], bounds, METER);
         if !seen.faults.iter().any(|(_, f, _)| is(f)) {
-            faults.push(format!("the harness does not tell {what}"));
+            faults.push(format!("the harness does not report {what}"));
         }
     }
 }

@@ -140,7 +140,7 @@ fn what_iterative_methods_are_put_together_from() {
     each::<dyn RegularizerSpec>(|spec| expect(check_regularizer(spec.build().unwrap().as_ref())));
 }
 
-/// Every type is in the schema that editors read, and an unknown one is told what there is.
+/// Every type is in the schema that editors read. The refusal of an unknown type lists the known ones.
 #[test]
 fn every_type_is_in_the_schema_and_in_refusals() {
     let schema = schema::spec().to_string();

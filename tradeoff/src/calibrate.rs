@@ -306,7 +306,7 @@ mod tests {
     }
 
     #[test]
-    fn what_does_not_go_with_the_work_is_told_from_what_does() {
+    fn costs_independent_of_the_work_are_separated() {
         // 0.05 s whatever the work, and 6 s for all of it; passes take 3 s.
         let of = |share: f64| Passes { share, prepare_s: 0.05 + 6.0 * share, step_s: 3.0 * share };
         let whole = of(1.0 / 64.0).whole(Some(of(1.0 / 512.0)));
@@ -328,7 +328,7 @@ mod tests {
     }
 
     #[test]
-    fn a_step_that_is_told_of_twice_is_one() {
+    fn a_step_reported_twice_counts_once() {
         let mut laps = Laps::new(&|| false);
         let pause = std::time::Duration::from_millis(20);
         for step in [1, 2, 2] {

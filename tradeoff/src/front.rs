@@ -187,8 +187,8 @@ impl Front {
                 let times = [point.budget_s, run.train_s, run.total_s, run.beside_s.unwrap_or(0.0)];
                 let good = times.iter().all(|t| t.is_finite() && *t >= 0.0) && run.steps > 0;
                 ensure(good, place, &field("runs"), format!("{run:?}"), "steps, and seconds that are 0 or more")?;
-                let told = [run.psnr, run.held_out].iter().flatten().any(|x| x.is_finite());
-                ensure(told, place, &field("runs"), format!("{run:?}"), "a finite psnr or held_out")?;
+                let scored = [run.psnr, run.held_out].iter().flatten().any(|x| x.is_finite());
+                ensure(scored, place, &field("runs"), format!("{run:?}"), "a finite psnr or held_out")?;
             }
         }
         Ok(front)
@@ -261,8 +261,8 @@ impl Point {
         mean(|r| r.psnr).or_else(|| mean(|r| r.held_out).map(|e| -e)).unwrap_or(f64::NEG_INFINITY)
     }
 
-    /// Its results, in words.
-    pub fn told(&self, front: &Front) -> String {
+    /// Its scores as text.
+    pub fn scores(&self, front: &Front) -> String {
         let one = |(run, scan): (&Reached, &Tuned)| match (run.psnr, run.held_out) {
             (Some(psnr), _) => format!("{psnr:.2} dB on {}", scan.name),
             (None, error) => format!("held-out error {:.4} on {}", error.unwrap_or(f64::NAN), scan.name),

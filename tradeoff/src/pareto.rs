@@ -90,7 +90,7 @@ mod tests {
     }
 
     #[test]
-    fn what_measurement_cannot_tell_apart_is_decided_by_accuracy() {
+    fn equal_times_within_measurement_error_are_decided_by_accuracy() {
         let s = |seconds, bytes, accuracy| Performance { seconds, bytes, accuracy };
         let all =
             [s(60.0, 1e8, 30.0), s(59.0, 1e8, 29.0), s(10.0, 1e8, 20.0), s(70.0, 5e7, 25.0), s(9.0, 2e8, f64::NAN)];

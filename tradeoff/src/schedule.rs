@@ -21,8 +21,8 @@ const MEASURED: usize = 3;
 /// Longest measurement of a method, in seconds and as a share of the budget: for short budgets, and for those in which
 /// three seconds matter little. Passes on a less coarse scan predict full passes better.
 const CALIBRATION: [(f64, f64); 2] = [(1.0, 0.1), (3.0, 0.04)];
-/// Share of a chain's time that is kept for its methods after the first. Of `smooth-tv` they take nine tenths; what is left lets
-/// the first one end a little late.
+/// Share of a chain's time that is reserved for its methods after the first. In `smooth-tv` they take nine tenths; the difference
+/// lets the first one end a little late.
 const LATER: f64 = 0.7;
 /// Share of that without which they make nothing useful.
 const LEAST_LATER: f64 = 0.1;
@@ -108,8 +108,8 @@ impl Budget {
         let mut points: Vec<_> = front.points.iter().collect();
         points.sort_by(|a, b| b.accuracy().total_cmp(&a.accuracy()));
         let expected: Vec<(Unknowns, Expected)> = points.iter().map(|p| (p.kind, front.expected(p, size))).collect();
-        // A scan as large as one of the front costs what it cost there, on a machine of another speed. That is closer than what
-        // a coarser scan tells of the whole. A smaller scan costs less.
+        // A scan as large as one of the front costs what it cost there, on a machine of another speed. That is more
+        // accurate than an extrapolation from a coarser scan. A smaller scan costs less.
         let iterates = points.iter().any(|p| p.kind == Unknowns::Voxels);
         let slower = match front.pass_s {
             // If it fails, the methods themselves are timed.
@@ -150,8 +150,10 @@ impl Budget {
             method.ok_or_else(|| Error::unsupported("the budget", "no method of the front was measured"))?;
         let point = points[at];
         let why = match fits {
-            true => format!("the best of the front that fits ({})", point.told(front)),
-            false => format!("no method of the front fits completely; this one is the fastest ({})", point.told(front)),
+            true => format!("the best of the front that fits ({})", point.scores(front)),
+            false => {
+                format!("no method of the front fits completely; this one is the fastest ({})", point.scores(front))
+            }
         };
         let passed_over = passed_over.into_iter().map(|(i, why)| format!("{}: {why}", points[i].name)).collect();
         let plan = self.settle(Some(point.name.clone()), why, passed_over, &mut method, costs, start)?;
@@ -407,7 +409,7 @@ mod tests {
     }
 
     #[test]
-    fn measuring_one_tells_of_its_kind() {
+    fn one_measurement_predicts_others_of_its_kind() {
         // The field of 90 s takes 270, and the voxel method more by the same factor: 108 s.
         assert_eq!(chosen(100.0, 3.0), (2, true, vec![0, 2]));
         // On a faster machine a better point fits.

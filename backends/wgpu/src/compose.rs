@@ -120,7 +120,7 @@ impl Chain {
         if u32::try_from(self.params).is_err() {
             return Err(Error::unsupported(
                 "the wgpu backend",
-                format!("{} parameters; 2^32 can be told apart", self.params),
+                format!("{} parameters; at most 2^32 can be addressed", self.params),
             ));
         }
         let fragment = fragment_of(&name, stage.wgsl())?;

@@ -296,12 +296,12 @@ impl Gpu {
             return self.wait();
         }
         let slice = from.slice(..bytes);
-        let (tell, told) = mpsc::channel();
-        slice.map_async(wgpu::MapMode::Read, move |r| drop(tell.send(r)));
+        let (sender, receiver) = mpsc::channel();
+        slice.map_async(wgpu::MapMode::Read, move |r| drop(sender.send(r)));
         self.wait()?;
         // Another thread's wait may be what calls back, and a moment later than this one's ends.
         let mapped = loop {
-            match told.recv_timeout(CALLBACK) {
+            match receiver.recv_timeout(CALLBACK) {
                 Err(mpsc::RecvTimeoutError::Timeout) => self.wait()?,
                 Err(mpsc::RecvTimeoutError::Disconnected) => break None,
                 Ok(r) => break Some(r),

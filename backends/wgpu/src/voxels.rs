@@ -261,7 +261,7 @@ impl DeviceOperator {
         (bytes as usize / (4 * pixels).max(1)).max(1)
     }
 
-    /// Writes the views and says what a launch on the planes `held` is told.
+    /// Writes the views. Returns the uniform values of a launch, still without the range of planes.
     fn prepare(&self, room: &mut Room, geometry: &Geometry, views: &[usize]) -> Result<Projection> {
         let data: Vec<f32> = views.iter().flat_map(|&v| projected(geometry, v)).flatten().collect();
         room.buffers.reserve(&self.shared.gpu, "views", 4 * data.len() as u64, U::STORAGE | U::COPY_DST)?;
@@ -307,8 +307,8 @@ impl DeviceOperator {
                 let part = part.as_standard_layout();
                 room.write(shared, "volume", part.as_slice().unwrap_or_default());
                 let (held, held_end) = (slab.start as u32, slab.end as u32);
-                let told = |begin, end| Projection { held, held_end, begin, end, ..uniform };
-                room.run(shared, "forward projection", &self.forward, ("projection", told), uniform.count)?;
+                let uniforms = |begin, end| Projection { held, held_end, begin, end, ..uniform };
+                room.run(shared, "forward projection", &self.forward, ("projection", uniforms), uniform.count)?;
             }
             let mut lines = vec![0.0; out.len()];
             room.read(shared, "lines", &mut lines)?;
@@ -336,8 +336,8 @@ impl DeviceOperator {
                 let uniform = self.prepare(room, geometry, views)?;
                 room.write(shared, "lines", lines.as_standard_layout().as_slice().unwrap_or_default());
                 let (held, held_end) = (slab.start as u32, slab.end as u32);
-                let told = |begin, end| Projection { held, held_end, begin, end, ..uniform };
-                room.run(shared, "adjoint of projection", &self.adjoint, ("projection", told), uniform.count)?;
+                let uniforms = |begin, end| Projection { held, held_end, begin, end, ..uniform };
+                room.run(shared, "adjoint of projection", &self.adjoint, ("projection", uniforms), uniform.count)?;
             }
             let mut found = vec![0.0; slab.len() * plane];
             room.read(shared, "volume", &mut found)?;
@@ -417,7 +417,7 @@ pub fn backproject(
             room.buffers.reserve(gpu, "images", n * bytes, usage)?;
             room.write(shared, "views", bytemuck::cast_slice(&seen));
             room.write(shared, "images", images.as_standard_layout().as_slice().unwrap_or_default());
-            let told = |begin, end| Back {
+            let uniforms = |begin, end| Back {
                 shape: shape.map(|n| n as u32),
                 views: views.len() as u32,
                 held: slab.start as u32,
@@ -427,7 +427,7 @@ pub fn backproject(
                 columns: columns as u32,
                 pad: [0; 3],
             };
-            room.run(shared, "back-projection", &source, ("back", told), voxels as u32)?;
+            room.run(shared, "back-projection", &source, ("back", uniforms), voxels as u32)?;
         }
         let mut found = vec![0.0; voxels];
         room.read(shared, "volume", &mut found)?;

@@ -1,6 +1,6 @@
 //! `conefield convert`
 
-use super::corrections::{CorrectionOptions, corrected_size, tell};
+use super::corrections::{CorrectionOptions, corrected_size, log_applied};
 use super::selection::SelectionOptions;
 use crate::boundary::{Inputs, refuse_existing};
 use crate::memory::Memory;
@@ -81,12 +81,12 @@ impl ConvertArgs {
             let DataSet { train, test, volume } = conefield_io::read_data_set(&self.input)?;
             let place = self.input.display().to_string();
             let (train, applied) = corrections.apply(train, &place)?;
-            tell(&self.input, &applied);
+            log_applied(&self.input, &applied);
             let test = test.map(|test| corrections.apply(test, &place)).transpose()?.map(|(test, _)| test);
             let test = test.map(|test| selection.of_detector(test)).transpose()?;
             let data = DataSet { train: selection.of(train)?, test, volume };
             files::warn_of(&self.input, &survey(&data.train));
-            self.tell_lost(&data);
+            self.warn_of_lost(&data);
             let (scan, test, truth) = (&data.train, data.test.as_ref(), data.volume.as_ref());
             match self.to {
                 ScanFormat::Conefield => conefield_io::write_scan(&self.output, scan, truth)?,
@@ -99,7 +99,7 @@ impl ConvertArgs {
     }
 
     /// Warns about data that the format cannot hold.
-    fn tell_lost(&self, data: &DataSet) {
+    fn warn_of_lost(&self, data: &DataSet) {
         let lost = |what: String| tracing::warn!("{}: {what}", self.output.display());
         if let Some(test) = data.test.as_ref().filter(|_| matches!(self.to, ScanFormat::Conefield | ScanFormat::Rtk)) {
             let n = test.geometry.views.len();

@@ -30,8 +30,8 @@ pub fn corrected_size(size: ScanSize, corrections: &Corrections) -> ScanSize {
     ScanSize { reading: size.reading.max(corrections.bytes(pixels)), ..size }
 }
 
-/// Logs what was done to the scan at `path`.
-pub fn tell(path: &Path, applied: &[Applied]) {
+/// Logs the corrections applied to the scan at `path`.
+pub fn log_applied(path: &Path, applied: &[Applied]) {
     for Applied { name, found, .. } in applied {
         tracing::info!("{}: {name}: {found}", path.display());
     }

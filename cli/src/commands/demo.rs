@@ -69,7 +69,7 @@ impl DemoArgs {
     pub fn run(self) -> Result<()> {
         let folder = &self.output;
         refuse_existing(folder, self.force)?;
-        self.reckon()?;
+        self.check_memory()?;
         std::fs::create_dir_all(folder).map_err(|e| Error::io(folder, e))?;
         let size = usize::from(self.size);
         let truth = phantom(size);
@@ -116,7 +116,7 @@ impl DemoArgs {
     }
 
     /// Refuses a demo that does not fit into memory: the scan, the volumes and the largest of the methods.
-    fn reckon(&self) -> Result<()> {
+    fn check_memory(&self) -> Result<()> {
         let (side, views) = (u64::from(self.size), usize::from(self.views));
         let (pixels, voxels) = (4 * side * side * u64::from(self.views), side.pow(3));
         // The simulated volume and the first two results are held in addition to the run's memory.

@@ -2,7 +2,7 @@
 
 use super::{
     General,
-    corrections::{CorrectionOptions, corrected_size, tell},
+    corrections::{CorrectionOptions, corrected_size, log_applied},
     info,
     selection::SelectionOptions,
 };
@@ -60,7 +60,7 @@ impl ImportArgs {
         let selection = self.selection.selection();
         let options = ImportOptions { i0: self.i0, floor: self.floor, corrections, selection };
         let imported = conefield_io::read_scanner(&self.scanner, &options)?;
-        tell(&self.scanner, &imported.corrections);
+        log_applied(&self.scanner, &imported.corrections);
         conefield_io::write_scan(&self.output, &imported.scan, None)?;
         let survey = survey(&imported.scan);
         let found = self.understood(&imported, &survey);

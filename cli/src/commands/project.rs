@@ -96,7 +96,7 @@ impl ProjectArgs {
         if let Some(folder) = &self.residual {
             conefield_io::write_scan(folder, &of(predicted.projections, "residual"), None)?;
         }
-        self.tell(&scan, &residual, project_s, memory)
+        self.report(&scan, &residual, project_s, memory)
     }
 
     /// The scan with the requested views.
@@ -113,7 +113,8 @@ impl ProjectArgs {
         }
     }
 
-    fn tell(&self, scan: &Scan, residual: &Residual, project_s: f64, memory: Memory) -> Result<()> {
+    /// Prints the result.
+    fn report(&self, scan: &Scan, residual: &Residual, project_s: f64, memory: Memory) -> Result<()> {
         let (n, [rows, columns]) = (scan.geometry.views.len(), scan.geometry.detector);
         if self.json {
             return out::json(&json!({

@@ -97,7 +97,7 @@ mod tests {
     }
 
     #[test]
-    fn a_child_is_told_the_same() {
+    fn a_child_gets_the_same_options() {
         let full = "x --checkpoint-every 0.1m --set a=b --set c=[1,2] ENDS --backend wgpu:2 \
                     --reference -v.nii --peak 2.5 --hold-out";
         for (held, ends) in [("3,17", "--seconds 1h --steps 7 --at-most 1e-9s"), ("every:10", "--budget 2m")] {

@@ -402,14 +402,14 @@ fn same_scan(a: &Cell, b: &Cell) -> bool {
 
 /// Waits for the lock on `folder`.
 fn await_lock(folder: &Path, part: &str) -> Result<conefield_io::FolderLock> {
-    let mut told = false;
+    let mut reported = false;
     loop {
         if let Some(lock) = try_alone(folder) {
             return Ok(lock);
         }
-        if !told {
+        if !reported {
             info!("{}: waiting for another conefield process that is writing to it", folder.display());
-            told = true;
+            reported = true;
         }
         if signals::caught().is_some() {
             return Err(Error::Stopped { part: part.into() });

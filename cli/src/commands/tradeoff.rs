@@ -125,8 +125,8 @@ impl TradeoffArgs {
         let truth = all == 1 && self.reference[0] == Path::new("truth");
         let fits = all == 0 || truth || all == self.scans.len();
         ensure(fits, "tradeoff", "--reference", format!("{all} volumes"), format!("{}, one a scan", self.scans.len()))?;
-        let told = all > 0 || self.hold_out.0.is_some();
-        ensure(told, "tradeoff", "--hold-out", "none", "views to rank by, as there is no --reference")?;
+        let ranked = all > 0 || self.hold_out.0.is_some();
+        ensure(ranked, "tradeoff", "--hold-out", "none", "views to rank by, as there is no --reference")?;
         let references: Vec<PathBuf> =
             if truth { vec![self.reference[0].clone(); self.scans.len()] } else { self.reference.clone() };
         let mut scans = vec![];

@@ -117,7 +117,7 @@ static const struct ConefieldStage STAGES[] = {{
     .doc = TEXT("squares of small residuals, the size of large ones"),
     .schema = TEXT(
         "{\"type\":\"object\",\"properties\":{"
-        "\"from\":{\"type\":\"number\",\"exclusiveMinimum\":0,\"default\":3.0,\"description\":\"From so many standard deviations of the noise on, residuals count by their size.\"}}}"),
+        "\"from\":{\"type\":\"number\",\"exclusiveMinimum\":0,\"default\":3.0,\"description\":\"Residuals of at least this many standard deviations of the noise count by their size.\"}}}"),
     .create = create,
     .destroy = destroy,
     .describe = describe,

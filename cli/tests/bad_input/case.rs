@@ -132,13 +132,13 @@ pub struct Outcome {
     pub faults: Vec<String>,
 }
 
-/// The line that matters: the error, or the warning that `says` looks for, which `info` and `import` give as a part of
-/// their result and readers on standard error.
+/// The relevant line: the error, or the warning with the words of `says`. `info` and `import` print warnings with their result,
+/// readers on standard error.
 fn message(said: &str, printed: &str, end: End, says: &[&str]) -> String {
     match end {
         End::Refused | End::WrongUse => said.lines().find(|l| l.starts_with("error: ")).unwrap_or(said).to_owned(),
         End::Warned => {
-            // The log says when.
+            // Lines of the log begin with the time.
             let untimed = |l: &'_ str| l.split_once("Z  WARN ").map(|(_, rest)| format!("WARN {rest}"));
             let mut lines =
                 said.lines().chain(printed.lines()).map(|l| untimed(l).unwrap_or(l.trim_start().to_owned()));

@@ -37,11 +37,7 @@ pub fn cases() -> Vec<Case> {
         wrong("a window that is reversed", "convert a.nii b.nii --values clip:3,1", &["LO below HI"]),
         wrong("a peak of zero", "evaluate a.nii b.nii --peak 0", &["above 0"]),
         wrong("label maps with a data range", "evaluate a.nii b.nii --labels --peak 2", &["--peak"]),
-        wrong(
-            "a segmenter that is not told where to write",
-            "evaluate a.nii b.nii --segmenter 'tool {in}'",
-            &["{out}"],
-        ),
+        wrong("a segmenter without an output path", "evaluate a.nii b.nii --segmenter 'tool {in}'", &["{out}"]),
         wrong("Hounsfield units that are reversed", "evaluate a.nii b.nii --hu 2000,-1000", &["LO below HI"]),
         wrong(
             "a time of 10^300 seconds",
@@ -55,11 +51,11 @@ pub fn cases() -> Vec<Case> {
         wrong("pixels of no pixels", "convert scan out --bin 0", &["--bin"]),
         wrong("five quarter turns", "convert scan out --turns 5", &["--turns", "0..=3"]),
         wrong(
-            "a distance that no view tells",
+            "a distance that no view shows",
             "calibrate scan --parameters dso",
             &["dso", "object's size", "offset-u"],
         ),
-        wrong("every view kept aside", "reconstruct scan --spec fast -o run --hold-out every:1", &["every:10"]),
+        wrong("every view held out", "reconstruct scan --spec fast -o run --hold-out every:1", &["every:10"]),
         refused("a phantom that is not known", none, "simulate phantom:hand -o scan", &["`hand`", "`head`"]),
         refused(
             "a phantom of 10^9 voxels a side",
@@ -182,19 +178,19 @@ pub fn cases() -> Vec<Case> {
             &["b.nii", "--force"],
         ),
         refused(
-            "patience without views kept aside",
+            "patience without held-out views",
             scan_toml,
             "reconstruct scan --spec fast -o run --set callbacks.1.type=patience",
             &["--set callbacks.1.type=patience", "no held-out views", "--hold-out every:10"],
         ),
         refused(
-            "patience of voxels without views kept aside",
+            "patience of voxels without held-out views",
             scan_toml,
             "compare scan --specs sirt -o all --set stop={passes=5,patience=3}",
             &["stop.patience", "no held-out views", "--hold-out every:10"],
         ),
         refused(
-            "a view that is not there, kept aside",
+            "a held-out view that does not exist",
             scan_toml,
             "reconstruct scan --spec fast -o run --hold-out 3",
             &["found 3", "below 3"],
@@ -226,7 +222,7 @@ pub fn cases() -> Vec<Case> {
         ),
         refused("a correction of a volume", nifti, "convert a.nii out.npy --correct flux", &["--correct"]),
         refused(
-            "all views kept aside",
+            "all views held out",
             scan_toml,
             "reconstruct scan --spec fast -o run --hold-out 0,1,2",
             &["at least one view"],

@@ -81,7 +81,7 @@ fn repeated_keys(d: &Path, count: usize) {
     put(d.join("scan.pickle"), bytes);
 }
 
-/// RTK's geometry of so many views; all but the first repeat what the one before says.
+/// RTK's geometry of `count` views; all but the first repeat the previous one.
 fn many_views(d: &Path, count: usize) {
     let first = "<Projection><SourceToIsocenterDistance>500</SourceToIsocenterDistance>\
                  <SourceToDetectorDistance>800</SourceToDetectorDistance></Projection>\n";

@@ -136,7 +136,7 @@ pub fn cases() -> Vec<Case> {
             &["spec.toml:2:", "callbacks.0.records", "at least 1"],
         ),
         refused(
-            "samples told in two ways",
+            "samples given in two ways",
             toml("extends = \"naf\"\n[projector]\nsamples = 64\nstep_voxels = 2\n"),
             TOML,
             &["spec.toml:4:1", "projector.step_voxels", "samples beside it", "one of samples, step_mm, step_voxels"],

@@ -162,7 +162,7 @@ fn a_log_that_nobody_reads_ends_no_run() {
         let said = String::from_utf8_lossy(&output.stderr);
         assert!(output.status.success() && !said.contains("panicked"), "{name}: {said}");
         assert!(run.join("record.json").exists(), "{name}");
-        // A failure has its own status, whether it can be told or not.
+        // A failure has its own status, even if its message cannot be written.
         let output =
             shell(&script.replace(" | true", "").replace(" | head -1", ""), &fast("nowhere", &text(&run), &[]));
         assert!(name == "dead reader" || output.status.code() == Some(1), "{name}: {:?}", output.status);
@@ -299,7 +299,7 @@ fn what_files_say_does_not_reach_the_terminal_as_it_is() {
 }
 
 #[test]
-fn a_name_without_utf_8_is_told_as_what_it_is() {
+fn a_name_without_utf_8_is_reported_as_such() {
     let (dir, scan) = with_scan();
     let init = dir.path().join(std::ffi::OsStr::from_bytes(b"w\xff.safetensors"));
     fs::write(&init, "x").unwrap();
@@ -310,7 +310,7 @@ fn a_name_without_utf_8_is_told_as_what_it_is() {
 }
 
 #[test]
-fn a_full_disk_is_told_with_the_name_that_was_asked_for() {
+fn a_full_disk_is_reported_with_the_requested_name() {
     let (dir, scan) = with_scan();
     for args in [
         vec!["simulate", "phantom:head:16", "-o", &text(&dir.path().join("new"))],
@@ -357,15 +357,15 @@ fn a_signal_leaves_no_unfinished_file() {
 }
 
 #[test]
-fn axes_that_a_format_cannot_hold_are_told_before_the_work() {
+fn axes_that_a_format_cannot_hold_are_refused_before_the_work() {
     let (dir, scan) = with_scan();
     let run = text(&dir.path().join("run"));
     done(&words(&fast(&scan, &run, &[])));
     let start = Instant::now();
     let args = ["export", &run, "--voxels", "40000", "-o", &text(&dir.path().join("o.nii"))];
     refused_whole(dir.path(), &args, &["at most 32767 voxels"]);
-    let told = fs::read_to_string(dir.path().join("scan/scan.toml")).unwrap();
-    assert!(start.elapsed() < Duration::from_secs(20) && !told.is_empty());
+    let kept = fs::read_to_string(dir.path().join("scan/scan.toml")).unwrap();
+    assert!(start.elapsed() < Duration::from_secs(20) && !kept.is_empty());
 }
 
 #[test]

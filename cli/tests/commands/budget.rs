@@ -42,7 +42,7 @@ fn a_plan_names_every_part_and_the_record_holds_them_against_it() {
         let then = plan["expected"]["then_s"].as_f64().unwrap();
         assert_eq!(then > 0.0, spec == "field-tv", "{spec}: {then}");
         if spec == "field-tv" {
-            // Five passes more than the least take more than being told of a pass does.
+            // Five passes more than the minimum take longer than the report of a pass.
             let least = plan["expected"]["then_least_s"].as_f64().unwrap();
             assert!(then - least > 1e-4, "{then} after {least}");
         }

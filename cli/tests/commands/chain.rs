@@ -243,13 +243,13 @@ fn simulation_takes_noise_offset_and_angles() {
                    angles = { even = { views = 5, start_deg = -90.0, arc_deg = 180.0 } }\nunit = { name = \"half\", mm = 300.0 }\n";
     fs::write(&protocol, text_of).unwrap();
     let protocol = text(&protocol);
-    let told = |more: &[&str]| {
-        let out = text(&dir.path().join("told"));
+    let seed = |more: &[&str]| {
+        let out = text(&dir.path().join("seeded"));
         let line = ["simulate", "phantom:head:16", "-o", &out, "--protocol", &protocol, "--force", "--json"];
         json(&[&line[..], more].concat())["seed"].clone()
     };
     assert_eq!(
-        (told(&[]), told(&["--seed", "0"])),
+        (seed(&[]), seed(&["--seed", "0"])),
         (1.into(), 0.into()),
         "the protocol's seed, unless another is asked for"
     );

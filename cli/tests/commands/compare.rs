@@ -104,9 +104,9 @@ fn table_picture_and_records_agree_and_resume_skips_what_is_done() {
         assert_eq!(row[6], record["steps"].to_string());
         assert!(record["total_s"].as_f64() >= record["train_s"].as_f64());
         // The terminal has the same cells.
-        let told = shown.lines().find(|l| l.split("  ").next() == Some(name)).unwrap();
-        let told: Vec<&str> = told.split("  ").map(str::trim).filter(|c| !c.is_empty()).collect();
-        assert_eq!(told, *row);
+        let printed = shown.lines().find(|l| l.split("  ").next() == Some(name)).unwrap();
+        let printed: Vec<&str> = printed.split("  ").map(str::trim).filter(|c| !c.is_empty()).collect();
+        assert_eq!(printed, *row);
     }
     // No step of FDK takes samples or has a loss: nothing is made up for it. Views that it has not seen it predicts.
     assert_eq!([&methods[0]["samples_per_s"], &methods[0]["loss"]], [&Value::Null; 2]);

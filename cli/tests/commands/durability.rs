@@ -163,7 +163,7 @@ fn a_killed_writer_leaves_the_earlier_file_whole() {
             fs::remove_file(dir.path().join(left)).unwrap();
         }
     }
-    assert_eq!(names(dir.path()), ["out.nii.gz", "v.npy"], "what is left is told by its name");
+    assert_eq!(names(dir.path()), ["out.nii.gz", "v.npy"], "unfinished files are recognized by their names");
     assert!(caught > 0, "no writer was killed while it wrote");
 }
 

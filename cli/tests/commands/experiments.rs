@@ -41,8 +41,8 @@ fn drift_stands_in_the_metrics_where_it_is_asked_for() {
 }
 
 #[test]
-fn the_state_of_the_best_record_comes_out_and_is_told() {
-    // Every step is looked at, and steps are so long that not each is better than the one before.
+fn the_state_of_the_best_record_is_returned_and_reported() {
+    // Every step is evaluated, and steps are so long that some of them increase the error.
     let more = [
         "--hold-out",
         "every:4",
@@ -80,7 +80,7 @@ fn live_slices_are_drawn_and_change_nothing() {
 }
 
 #[test]
-fn features_are_drawn_and_their_variance_told() {
+fn features_are_drawn_and_their_variance_reported() {
     let (dir, run) = run(&[]);
     let picture = dir.path().join("features.png");
     let (run, out) = (text(&run), text(&picture));

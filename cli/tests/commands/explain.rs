@@ -10,7 +10,7 @@ fn line(all: &str, head: &str) -> String {
 }
 
 #[test]
-fn stages_are_told_with_widths_and_parameters() {
+fn stages_are_listed_with_widths_and_parameters() {
     let all = done(&["explain", "naf"]);
     assert!(all.starts_with("naf (shipped)\n"), "{all}");
     assert!(line(&all, "encoder").starts_with("encoder hash-grid 3 -> 32 "), "{all}");
@@ -72,7 +72,7 @@ fn a_scan_adds_its_memory() {
 }
 
 #[test]
-fn what_lies_beyond_the_volume_is_told_and_taken_off() {
+fn the_surround_of_the_volume_is_reported_and_removed() {
     let dir = tempdir().unwrap();
     let (scan, protocol) = (text(&dir.path().join("scan")), dir.path().join("protocol.toml"));
     // A detector of a quarter of the published width.
@@ -109,7 +109,7 @@ fn carving_serves_methods_on_voxels() {
 }
 
 #[test]
-fn methods_on_voxels_are_told_without_a_field() {
+fn methods_on_voxels_are_listed_without_a_field() {
     let all = done(&["explain", "fdk"]);
     assert!(all.starts_with("fdk (shipped)\n"), "{all}");
     assert_eq!(line(&all, "method"), "method fdk hann window to 1 of the highest frequency");
@@ -129,7 +129,7 @@ fn methods_on_voxels_are_told_without_a_field() {
 }
 
 #[test]
-fn what_a_method_on_voxels_does_with_a_scan_is_told() {
+fn the_plan_of_a_voxel_method_for_a_scan_is_reported() {
     let dir = tempdir().unwrap();
     let scan = text(&dir.path().join("scan"));
     done(&["simulate", "phantom:head:16", "-o", &scan, "--views", "6", "--detector", "8x12"]);

@@ -85,7 +85,7 @@ fn shells_and_man_know_every_command() {
 }
 
 #[test]
-fn version_is_told() {
+fn version_is_printed() {
     assert_eq!(done(&["--version"]).trim(), concat!("conefield ", env!("CARGO_PKG_VERSION")));
 }
 

@@ -58,8 +58,8 @@ fn counts_become_a_scan_that_the_other_commands_read() {
     fs::write(at("s.toml"), format!("{toml}[values]\nkind = \"line-integrals\"\n")).unwrap();
     done(&["import", &scanner, "-o", &out, "--force"]);
     let complaint = "looks like intensities, not line integrals: pass --i0 or flat/dark";
-    let told = done(&["info", &out]);
-    assert!(told.contains(&format!("warning: {complaint}")), "{told}");
+    let printed = done(&["info", &out]);
+    assert!(printed.contains(&format!("warning: {complaint}")), "{printed}");
     let log = assert_cmd::Command::cargo_bin("conefield").unwrap();
     let log = { log }.args(["explain", "fast", "--scan", &out]).output().unwrap();
     assert!(String::from_utf8(log.stderr).unwrap().contains(complaint));

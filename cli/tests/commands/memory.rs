@@ -67,10 +67,10 @@ fn the_estimate_is_near_the_measured_peak() {
     }
 }
 
-/// What looks beyond the volume is reckoned for an object that is cut off on all sides.
+/// The estimate for the surround of the volume assumes an object that is cut off on all sides.
 #[test]
 #[cfg_attr(not(target_os = "linux"), ignore = "the peak is read from /proc")]
-fn the_estimate_is_near_the_peak_of_a_look_beyond_the_volume() {
+fn the_estimate_is_near_the_peak_with_a_surround() {
     let dir = tempfile::tempdir().unwrap();
     let path = scan(dir.path(), 8, 64);
     let mut cut = conefield_io::read_scan(&path).unwrap();
@@ -166,7 +166,7 @@ fn what_does_not_fit_is_refused_with_figures_before_anything_is_made() {
     assert!(said.contains(" views") && said.contains("a detector of 512x512 would fit"), "{said}");
 }
 
-/// A layer of 576 MB is written by its rows. The file runs into its limit, which is told.
+/// A layer of 576 MB is written row by row. The file reaches its size limit, and the error reports this.
 #[test]
 #[cfg(target_os = "linux")]
 fn an_export_of_large_layers_stays_within_its_memory() {

@@ -5,7 +5,7 @@ use std::fs;
 use tempfile::tempdir;
 
 #[test]
-fn a_pickle_is_told_from_its_content_and_converted_both_ways() {
+fn a_pickle_is_recognized_by_its_content_and_converted_both_ways() {
     let dir = tempdir().unwrap();
     let at = |name: &str| text(&dir.path().join(name));
     let (scan, pickle, folder) = (at("scan"), at("scan.data"), at("r2"));
@@ -20,8 +20,8 @@ fn a_pickle_is_told_from_its_content_and_converted_both_ways() {
         assert_eq!(naf[key], own[key], "{key}");
     }
     assert_eq!(naf["volume"]["shape"], own["volume"]["shape"]);
-    let told = done(&["info", &pickle]);
-    assert!(told.contains("unit.name") && told.contains("provenance.unit_from"), "{told}");
+    let printed = done(&["info", &pickle]);
+    assert!(printed.contains("unit.name") && printed.contains("provenance.unit_from"), "{printed}");
 
     done(&["convert", &pickle, &folder, "--to", "r2"]);
     let r2 = json(&["info", &folder, "--json"]);

@@ -44,7 +44,7 @@ fn a_volume_scores_the_same_in_any_unit() {
 }
 
 #[test]
-fn a_reference_in_another_unit_is_told() {
+fn a_reference_in_another_unit_is_reported() {
     let dir = tempfile::tempdir().unwrap();
     let ([truth, found], [_, other]) = (pair(dir.path(), 1.0), pair(dir.path(), 0.02));
     let said = |volume: &str| {

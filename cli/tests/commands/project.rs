@@ -69,7 +69,7 @@ fn the_truth_explains_its_scan_and_nothing_else_does() {
     let two = read_scan(&out).unwrap();
     assert!(alike(&two.geometry.views, &[1, 4].map(|v| measured.geometry.views[v])));
 
-    // What is left is told for people too, and the result is a scan for every command.
+    // The residual is also printed as text, and the result is a scan for every command.
     let said = done(&["project", &truth, "--like", &scan, "-o", &out, "--force"]);
     assert!(said.contains("measured minus predicted"), "{said}");
     assert_eq!(json(&["info", &out, "--json"])["views"], 7);

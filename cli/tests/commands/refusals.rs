@@ -43,7 +43,7 @@ fn an_unknown_spec_lists_the_shipped_ones() {
 }
 
 #[test]
-fn unknown_keys_and_types_are_told_with_line_and_nearest_name() {
+fn unknown_keys_and_types_are_reported_with_line_and_nearest_name() {
     let base = "extends = \"naf\"\n[encoder]\n";
     refused_spec(
         &format!("{base}level = 8\n"),
@@ -64,7 +64,7 @@ fn unknown_keys_and_types_are_told_with_line_and_nearest_name() {
 }
 
 #[test]
-fn settings_out_of_range_are_told_with_their_line() {
+fn settings_out_of_range_are_reported_with_their_line() {
     refused_spec(
         "extends = \"naf\"\n\n[encoder]\nlevels = 0\n",
         "mine.toml:4:10: encoder.levels: found 0, expected 1 to 32",

@@ -218,13 +218,13 @@ fn another_run_s_checkpoint_and_none_are_refused_in_words() {
     assert!(said.contains("limits"), "{said}");
     // The same projections, taken elsewhere.
     let place = scan.join("scan.toml");
-    let told = std::fs::read_to_string(&place).unwrap();
-    let moved = told.replace("\ndso = ", "\ndso = 1");
-    assert_ne!(told, moved);
+    let original = std::fs::read_to_string(&place).unwrap();
+    let moved = original.replace("\ndso = ", "\ndso = 1");
+    assert_ne!(original, moved);
     std::fs::write(&place, moved).unwrap();
     let said = resume(100_000, &[]);
     assert!(said.contains("--resume: geometry"), "{said}");
-    std::fs::write(&place, told).unwrap();
+    std::fs::write(&place, original).unwrap();
     // A damaged file.
     let mut raw = std::fs::read(&file).unwrap();
     let last = raw.len() - 3;

@@ -34,7 +34,7 @@ fn import_and_convert_take_the_same_part() {
         assert_eq!(found.projections, all.projections.slice(s![0..12;3, 1..9, 2..16]), "{name}");
         let (a, b) = (&found.geometry, &all.geometry);
         assert_eq!((a.detector, a.views.len(), a.volume), ([8, 14], 4, b.volume));
-        // What is left stands where it stood.
+        // The remaining pixels keep their positions.
         for (row, column) in [(0.0, 0.0), (7.0, 13.0)] {
             let here = a.views[2].pixel(a.detector, row, column);
             let there = b.views[6].pixel(b.detector, row + 1.0, column + 2.0);

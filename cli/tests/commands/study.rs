@@ -273,8 +273,8 @@ fn shards_come_to_the_serial_table_whatever_kills_them() {
     assert!(again.status.success(), "{}", String::from_utf8_lossy(&again.stderr));
     let one = one.wait_with_output().unwrap();
     assert!(one.status.success(), "{}", String::from_utf8_lossy(&one.stderr));
-    let told = [one, again].map(|o| String::from_utf8(o.stdout).unwrap());
-    assert!(told.iter().any(|t| t.contains("PSNR dB")), "{told:?}");
+    let printed = [one, again].map(|o| String::from_utf8(o.stdout).unwrap());
+    assert!(printed.iter().any(|t| t.contains("PSNR dB")), "{printed:?}");
     let [a, b] = [&serial, &shared].map(|f| read(&f.join("table.json")));
     assert_eq!(results(&a), results(&b));
     let volume = |out: &Path| fs::read(out.join("runs/head-6views-seed0/SIRT/volume.nii.gz")).unwrap();

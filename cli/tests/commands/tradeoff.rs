@@ -81,7 +81,7 @@ fn halving_front_and_specs_agree() {
     assert_eq!(rungs[1]["tried"], rungs[0]["kept"]);
     assert!(names(&rungs[1]["kept"]).is_empty());
 
-    // No point dominates one of the front, in the figures that are told.
+    // No point dominates one of the front, in the reported figures.
     let points = found["points"].as_array().unwrap();
     let number = |p: &Value, key: &str| p[key].as_f64().unwrap();
     for name in names(&found["front"]) {
@@ -182,7 +182,7 @@ fn a_search_that_was_interrupted_repeats_no_finished_trial() {
     // Times of every finished trial are those that were measured then.
     assert_eq!(found["trials"].as_array().unwrap()[..before.len()], before[..]);
     assert!(found["trials"].as_array().unwrap().len() >= 8 && out.join("front.png").exists());
-    // All is done: nothing runs any more, and the front comes out as it was.
+    // The search is complete: nothing runs again, and the front is the same.
     let again = json(&words(&line(&scan, &levers, &out, &["--reference", "truth", "--resume", "--json"])));
     assert_eq!(again, found);
     let all = line(&scan, &levers, dir.path(), &["--force"]);

@@ -41,7 +41,7 @@ struct Bench {
 }
 
 impl Bench {
-    /// The volume and a scan of it by a detector of 14 × 22 that stands aside.
+    /// The volume and a scan of it by a shifted detector of 14 × 22.
     fn new() -> Self {
         let bench = Self { dir: tempdir().unwrap() };
         write_volume(bench.at("truth.mha"), &volume()).unwrap();
@@ -140,7 +140,7 @@ fn every_format_keeps_the_geometry() {
 }
 
 #[test]
-fn test_views_are_kept_or_told_of() {
+fn test_views_are_kept_or_their_loss_is_reported() {
     let b = Bench::new();
     let whole = read_data_set(b.at("scan")).unwrap();
     let (train, test) = whole.train.split(&[1, 4, 5]).unwrap();

@@ -203,7 +203,7 @@ fn explained_and_in_the_schema() {
     assert_eq!(report["stages"][0]["parameters"], 3 * (12 * 12 + 12) * 3);
     let schema = json(&["--plugin", siren, "schema"]);
     assert!(schema["$defs"]["field.siren"]["properties"]["omega"].is_object());
-    // A mistake in a plugin's settings is told like one in built-in settings.
+    // A mistake in a plugin's settings is reported like one in built-in settings.
     let set = |s| refused(1, &["--plugin", siren, "--plugin", triplane, "explain", &spec, "--set", s]);
     let e = set("field.omgea=2.0");
     assert!(e.contains("field.omgea: found an unknown key, expected \"omega\""), "{e}");

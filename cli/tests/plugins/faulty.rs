@@ -91,12 +91,12 @@ const FAULTS: &[Fault] = &[
     untried(
         "a resolution that is NaN",
         &["FAULT=NAN_RESOLUTION"],
-        "resolutions failed: channel 1 of 3 tells NaN cells apart",
+        "resolutions failed: channel 1 of 3 resolves NaN cells",
     ),
     untried(
         "a negative resolution",
         &["FAULT=NEGATIVE_RESOLUTION"],
-        "resolutions failed: channel 1 of 3 tells -8 cells apart",
+        "resolutions failed: channel 1 of 3 resolves -8 cells",
     ),
     untried(
         "reads halves without a function for them",
@@ -200,7 +200,7 @@ const PIECE_FAULTS: &[(&str, &[Fault])] = &[
             untried("two states of one name", &["FAULT=R_TWIN_STATE"], "two entries are called \"calls\""),
             untried("a weight that is NaN", &["FAULT=R_WEIGHT"], "weight: found NaN, expected a finite number"),
             fault("a proximal map that shrinks half as much", &["FAULT=R_HALVED"], ["", "proximal map", ""]),
-            fault("a state that is not told", &["FAULT=R_FORGETS"], ["", "state", ""]),
+            fault("a state that is not reported", &["FAULT=R_FORGETS"], ["", "state", ""]),
             fault(
                 "a proximal map that fails later",
                 &["FAULT=R_LATER"],
@@ -332,7 +332,7 @@ fn refusal(library: &str, hide: &[&Path]) -> String {
     why
 }
 
-/// A line of the page: what each command says, or nothing if all is well.
+/// A line of the page: the message of each command, or nothing if all is well.
 struct Row {
     what: String,
     list: String,
@@ -342,7 +342,7 @@ struct Row {
 
 impl Row {
     fn of(what: &str, said: [&str; 3], want: [&str; 3]) -> Self {
-        let [list, check, run] = [0, 1, 2].map(|i| told(said[i], want[i]));
+        let [list, check, run] = [0, 1, 2].map(|i| shortened(said[i], want[i]));
         Self { what: what.into(), list, check, run }
     }
 }
@@ -425,8 +425,8 @@ fn every_fault_is_found_and_none_takes_the_process_down() {
     page(&rows);
 }
 
-/// A message up to what must be in it: what follows may depend on how many threads there are.
-fn told(message: &str, want: &str) -> String {
+/// A message up to its required part: the rest may depend on the number of threads.
+fn shortened(message: &str, want: &str) -> String {
     if message.contains("not hold: ") {
         return format!("does not hold: {want}");
     }

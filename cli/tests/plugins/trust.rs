@@ -1,4 +1,4 @@
-//! What is loaded, and what is not: only what the user names, or puts where plugins are looked for.
+//! Only libraries that the user names, or puts into a folder of plugins, are loaded.
 
 use crate::build::{cc, sources};
 use crate::common::{conefield, text};

@@ -607,7 +607,7 @@ mod tests {
     }
 
     #[test]
-    fn mistakes_are_told_with_line_path_and_nearest_name() {
+    fn mistakes_are_reported_with_line_path_and_nearest_name() {
         let base = "extends = 'plain'\n[encoder]\n";
         for (line, want) in [
             ("level = 3", "a.toml:3:1: encoder.level: found an unknown key, expected \"levels\""),

@@ -109,7 +109,7 @@ fn a_clean_scan_gives_no_warning_and_the_right_figures() {
 }
 
 #[test]
-fn scans_that_are_unusual_but_whole_give_no_warning() {
+fn unusual_but_complete_scans_give_no_warning() {
     // A half-offset detector with a full circle; a short scan of 180° and more; irregular angles; noise.
     let offset = Setting { offset: [0.0, 30.0], detector: [40, 80], ..clean() };
     assert_eq!(offset.kinds(), []);
@@ -153,8 +153,11 @@ fn each_fault_gives_its_own_warning() {
     Setting { volume: aside, ..clean() }.warns(W::Coverage, &["radius 49.8 mm"]);
     Setting { offset: [0.0, 75.0], ..clean() }.warns(W::Offset, &["75.00 mm", "nearly", "5.00 mm"]);
     let off = Setting { offset: [0.0, 100.0], ..clean() };
-    let said = survey(&off.scan()).warnings;
-    assert!(said.iter().any(|w| w.kind == W::Offset && w.advice.contains("no ray crosses the axis")), "{said:?}");
+    let warnings = survey(&off.scan()).warnings;
+    assert!(
+        warnings.iter().any(|w| w.kind == W::Offset && w.advice.contains("no ray crosses the axis")),
+        "{warnings:?}"
+    );
     Setting { angles: even(60, 2.5), ..clean() }.warns(W::Arc, &["143.2°", "180°"]);
     let half = Setting { offset: [0.0, 30.0], detector: [40, 80], angles: even(60, 3.6), ..clean() };
     assert!(half.kinds().contains(&W::Arc), "{:?}", half.kinds());
@@ -172,59 +175,63 @@ fn each_fault_gives_its_own_warning() {
 }
 
 #[test]
-fn metres_taken_for_millimetres_are_told_unless_the_unit_has_no_size() {
+fn metres_read_as_millimetres_give_a_warning_unless_the_unit_has_no_size() {
     let mut scan = clean().scan();
     scan.geometry = scan.geometry.scaled(1e-3);
-    let said = survey(&scan).warnings;
-    assert_eq!(said.iter().map(|w| w.kind).collect::<Vec<_>>(), [WarningKind::Scale; 2], "{said:?}");
-    assert!(said[0].to_string().contains("not metres"), "{said:?}");
+    let warnings = survey(&scan).warnings;
+    assert_eq!(warnings.iter().map(|w| w.kind).collect::<Vec<_>>(), [WarningKind::Scale; 2], "{warnings:?}");
+    assert!(warnings[0].to_string().contains("not metres"), "{warnings:?}");
     scan.unit.name = "cube half side".into();
     assert_eq!(survey(&scan).warnings, []);
 }
 
 #[test]
-fn values_that_are_no_line_integrals_are_told_once() {
+fn values_that_are_not_line_integrals_give_one_warning() {
     let mut scan = clean().scan();
     scan.projections.mapv_inplace(|a| 20000.0 * (-a).exp());
-    let said = survey(&scan).warnings;
-    assert_eq!(said.iter().map(|w| w.kind).collect::<Vec<_>>(), [WarningKind::Values], "{said:?}");
+    let warnings = survey(&scan).warnings;
+    assert_eq!(warnings.iter().map(|w| w.kind).collect::<Vec<_>>(), [WarningKind::Values], "{warnings:?}");
 }
 
 #[test]
-fn one_view_and_one_pixel_are_no_trouble() {
+fn one_view_and_one_pixel_are_accepted() {
     let one = Setting { angles: vec![0.3], detector: [1, 1], ..clean() };
     assert!(survey(&one.scan()).setup.angles.covered_deg.is_finite());
 }
 
-/// The images of `n` views over a full turn with both ends, but the geometry of `told`.
-fn with_both_ends(n: usize, told: Vec<f64>) -> Scan {
+/// The images of `n` views over a full turn with both ends, but with the geometry of `angles`.
+fn with_both_ends(n: usize, angles: Vec<f64>) -> Scan {
     let off_axis = Setting { radius: 10.0, at: [8.0, 5.0], ..clean() };
     let images = Setting { angles: even(n, TAU * n as f64 / (n - 1) as f64), ..off_axis }.scan();
-    Scan { geometry: Geometry { views: Setting { angles: told, ..clean() }.views(), ..images.geometry }, ..images }
+    Scan { geometry: Geometry { views: Setting { angles, ..clean() }.views(), ..images.geometry }, ..images }
 }
 
 #[test]
-fn a_last_view_that_repeats_the_first_is_told_with_the_options_that_mend_it() {
+fn a_last_view_that_repeats_the_first_gives_a_warning_with_the_right_options() {
     let noise = |i: usize| 0.004 * (((i * 7919) % 101) as f32 / 50.0 - 1.0);
     for (n, step) in [(13, "step_deg = 30 "), (61, "step_deg = 6 "), (361, "step_deg = 1 ")] {
-        for told in [even(n, TAU), even(n, -TAU)] {
-            let mut scan = with_both_ends(n, told);
+        for angles in [even(n, TAU), even(n, -TAU)] {
+            let mut scan = with_both_ends(n, angles);
             scan.projections.iter_mut().enumerate().for_each(|(i, x)| *x += noise(i));
-            let said = survey(&scan).warnings;
-            assert_eq!(said.iter().map(|w| w.kind).collect::<Vec<_>>(), [WarningKind::Repeated], "{n}: {said:?}");
+            let warnings = survey(&scan).warnings;
+            assert_eq!(
+                warnings.iter().map(|w| w.kind).collect::<Vec<_>>(),
+                [WarningKind::Repeated],
+                "{n}: {warnings:?}"
+            );
             assert!(
-                said[0].advice.contains(step) && said[0].advice.ends_with(&format!("--views 0-{}", n - 2)),
-                "{said:?}"
+                warnings[0].advice.contains(step) && warnings[0].advice.ends_with(&format!("--views 0-{}", n - 2)),
+                "{warnings:?}"
             );
         }
-        // Angles with both ends say as much as the images.
+        // Angles with both ends agree with the images.
         let right = with_both_ends(n, even(n, TAU * n as f64 / (n - 1) as f64));
         assert_eq!(survey(&right).warnings, [], "{n}");
     }
 }
 
 #[test]
-fn views_that_only_look_like_each_other_are_no_repeated_ones() {
+fn similar_views_are_not_reported_as_repeated() {
     // Off the axis; on it, where all views are equal; and where both sides of the seam look alike.
     for n in [12, 60, 360] {
         let half_step = 0.5 * TAU / n as f64;

@@ -127,7 +127,7 @@ fn what_is_not_there_or_damaged_is_refused_in_words() {
 }
 
 #[test]
-fn any_one_changed_byte_is_told_or_changes_values_alone() {
+fn any_changed_byte_is_refused_or_changes_only_values() {
     let turn = format!("{CIRCLE}range_deg = 360\n[values]\ni0 = 20000\n");
     let size = fs::metadata(fixture("dxchange.h5")).unwrap().len() as usize;
     for at in (0..size).step_by(13) {

@@ -12,7 +12,7 @@
 #define CONEFIELD_ABI_MAJOR 2
 
 /*
- Minor version: tables have grown so many times.
+ Minor version: the number of times that tables have grown.
  */
 #define CONEFIELD_ABI_MINOR 2
 
@@ -555,8 +555,8 @@ typedef struct ConefieldMap {
                                      struct ConefieldTileMut dx,
                                      struct ConefieldText *error);
   /*
-   Of an encoder: writes for each of its `count` channels how many cells along the unit cube's side the channel tells
-   apart, a finite number above 0. Projectors count in the finest cell, and channels finer than the data can be left
+   Of an encoder: writes for each of its `count` channels how many cells along the unit cube's side the channel
+   resolves, a finite number above 0. Projectors count in the finest cell, and channels finer than the data can be left
    out. Returns [`CONEFIELD_UNSUPPORTED`] where that is not known. NULL: it is not known.
    */
   ConefieldStatus (*resolutions)(const void *stage,
@@ -759,7 +759,7 @@ typedef struct ConefieldInitializer {
                                   void **out,
                                   struct ConefieldText *error);
   /*
-   Optional, since 2.1. The file of a known volume that the field learns in so many `steps` once weights are filled;
+   Optional, since 2.1. The file of a known volume that the field learns in `steps` steps once weights are filled;
    [`CONEFIELD_UNSUPPORTED`] where there is none.
    */
   ConefieldStatus (*volume)(const void *stage, struct ConefieldStr *path, uint64_t *steps);

@@ -21,7 +21,7 @@ use std::ffi::c_void;
 
 /// Major version of this contract. A plugin of another one is refused.
 pub const CONEFIELD_ABI_MAJOR: u32 = 2;
-/// Minor version: tables have grown so many times.
+/// Minor version: the number of times that tables have grown.
 pub const CONEFIELD_ABI_MINOR: u32 = 2;
 
 /// What a function returns.
@@ -400,8 +400,8 @@ pub struct ConefieldMap {
             error: *mut ConefieldText,
         ) -> ConefieldStatus,
     >,
-    /// Of an encoder: writes for each of its `count` channels how many cells along the unit cube's side the channel tells
-    /// apart, a finite number above 0. Projectors count in the finest cell, and channels finer than the data can be left
+    /// Of an encoder: writes for each of its `count` channels how many cells along the unit cube's side the channel
+    /// resolves, a finite number above 0. Projectors count in the finest cell, and channels finer than the data can be left
     /// out. Returns [`CONEFIELD_UNSUPPORTED`] where that is not known. NULL: it is not known.
     pub resolutions: Option<
         unsafe extern "C" fn(
@@ -605,7 +605,7 @@ pub struct ConefieldInitializer {
             error: *mut ConefieldText,
         ) -> ConefieldStatus,
     >,
-    /// Optional, since 2.1. The file of a known volume that the field learns in so many `steps` once weights are filled;
+    /// Optional, since 2.1. The file of a known volume that the field learns in `steps` steps once weights are filled;
     /// [`CONEFIELD_UNSUPPORTED`] where there is none.
     pub volume:
         Option<unsafe extern "C" fn(stage: *const c_void, path: *mut ConefieldStr, steps: *mut u64) -> ConefieldStatus>,

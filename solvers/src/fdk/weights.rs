@@ -254,7 +254,7 @@ mod tests {
     }
 
     #[test]
-    fn orbits_are_told_apart() {
+    fn orbits_are_distinguished() {
         let turn = |n: usize, arc: f64| (0..n).map(move |i| 0.3 + arc * i as f64 / n as f64);
         assert_eq!(FdkOrbit::of(&scan(turn(50, TAU), 0.0)).coverage, Coverage::Full);
         assert_eq!(FdkOrbit::of(&scan(turn(3, TAU), 0.0)).coverage, Coverage::Full);

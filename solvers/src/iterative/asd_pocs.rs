@@ -3,7 +3,7 @@
 
 use super::noise::{self, Noise};
 use super::norms::{change, distance, norm2};
-use super::order::{Order, Subsets, told};
+use super::order::{Order, Subsets, summary};
 use super::plan::{Iterative, IterativePlan};
 use super::sart::{Sweep, Updates};
 use super::shared::Shared;
@@ -116,7 +116,7 @@ impl Iterative for Built {
 
     fn found(&self, scan: &Scan) -> Vec<String> {
         let noise = Noise::of(scan.projections.view(), false).to_string();
-        vec![told(&self.updates.subsets.of(scan.geometry.views.len())), noise]
+        vec![summary(&self.updates.subsets.of(scan.geometry.views.len())), noise]
     }
 
     fn bytes(&self, header: &ScanHeader) -> u64 {

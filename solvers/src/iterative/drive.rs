@@ -130,7 +130,7 @@ impl<'a> Run<'a> {
             observer.note(&format!("resumed after pass {step}"));
         }
         if stop.patience.is_some() && job.held_out.is_none() {
-            observer.note("stop.patience looks at views that are kept aside, and none are: it does not end this run");
+            observer.note("stop.patience needs held-out views, and there are none: it does not end this run");
         }
         let ends = Ends { steps: stop.passes, seconds: stop.seconds };
         let mut clock = Clock::new(ends, job.limits, seconds + begun.elapsed().as_secs_f64());

@@ -14,7 +14,7 @@ use super::bases::Voxels;
 use super::data::NoiseWeighted;
 use super::model::{Model, projected};
 use super::norms::{change, distance, norm2};
-use super::order::{Order, Subsets, split, told};
+use super::order::{Order, Subsets, split, summary};
 use super::plan::{Iterative, IterativePlan};
 use super::problem::{images_mut, room};
 use super::regularizers::Nonnegative;
@@ -212,13 +212,16 @@ impl Iterative for Built {
         let mut arrays = Arrays::new(self, expansion, &voxels, &space, start)?;
         arrays.begin(&problem);
         let mut iterate = Iterate::new(self, &problem, data, arrays)?;
-        observer.note(&iterate.told());
+        observer.note(&iterate.description());
         drive(job, &self.shared.stop, begun, &problem, &space, &mut iterate, observer)
     }
 
     fn found(&self, scan: &Scan) -> Vec<String> {
         let noise = self.data.of(scan.projections.view());
-        vec![told(&self.subsets.of(scan.geometry.views.len())), noise.map_or_else(|e| e.to_string(), |n| n.describe())]
+        vec![
+            summary(&self.subsets.of(scan.geometry.views.len())),
+            noise.map_or_else(|e| e.to_string(), |n| n.describe()),
+        ]
     }
 
     fn stages(&self) -> Vec<Line> {
@@ -425,7 +428,7 @@ impl Iterate {
     }
 
     /// The noise and the prior's weight, for attenuation counted per coefficient.
-    fn told(&self) -> String {
+    fn description(&self) -> String {
         let side = self.arrays.model.grid().spacing.iter().product::<f64>().cbrt();
         format!("{}: the prior's weight is {:.3e}", self.data.describe(), self.lambda / side)
     }

@@ -75,7 +75,7 @@ pub fn split(views: usize, n: usize) -> Vec<Vec<usize>> {
 }
 
 /// Text for the log: number of subsets and views.
-pub fn told(subsets: &[Vec<usize>]) -> String {
+pub fn summary(subsets: &[Vec<usize>]) -> String {
     let sizes = || subsets.iter().map(Vec::len);
     let (least, most) = (sizes().min().unwrap_or(0), sizes().max().unwrap_or(0));
     let views = if least == most { format!("{most}") } else { format!("{least} or {most}") };
@@ -137,9 +137,9 @@ mod tests {
         assert_eq!(s, [vec![0, 3, 6, 9], vec![1, 4, 7, 10], vec![2, 5, 8]]);
         assert_eq!(Subsets::Count(9).of(4).len(), 4);
         assert_eq!(Subsets::VIEWS.of(4), Subsets::Count(4).of(4));
-        assert_eq!(told(&s), "3 subsets of 3 or 4 views");
-        assert_eq!(told(&Subsets::VIEWS.of(4)), "4 subsets of 1 view");
-        assert_eq!(told(&Subsets::Count(1).of(4)), "1 subset of 4 views");
+        assert_eq!(summary(&s), "3 subsets of 3 or 4 views");
+        assert_eq!(summary(&Subsets::VIEWS.of(4)), "4 subsets of 1 view");
+        assert_eq!(summary(&Subsets::Count(1).of(4)), "1 subset of 4 views");
     }
 
     #[test]

@@ -3,7 +3,7 @@
 //! views at once are SIRT, anything in between is OS-SART.
 
 use super::norms::change;
-use super::order::{Order, Subsets, told};
+use super::order::{Order, Subsets, summary};
 use super::plan::{Iterative, IterativePlan};
 use super::problem::{images_mut, invert, room};
 use super::shared::Shared;
@@ -141,7 +141,7 @@ impl Iterative for Built {
     }
 
     fn found(&self, scan: &Scan) -> Vec<String> {
-        vec![told(&self.updates.subsets.of(scan.geometry.views.len()))]
+        vec![summary(&self.updates.subsets.of(scan.geometry.views.len()))]
     }
 
     fn bytes(&self, header: &ScanHeader) -> u64 {

@@ -100,7 +100,7 @@ impl<'a> Run<'a> {
     }
 
     /// Reports an event, now and in the next record.
-    pub fn tell(&mut self, said: String) {
+    pub fn report(&mut self, said: String) {
         self.observer.note(&said);
         self.tally.window.events.push(said);
     }

@@ -179,7 +179,7 @@ fn a_start_is_fitted_and_held_to() {
     assert!(off(&crate::kit::volume(fitted).data, &exact) < 1e-5, "what blocks cannot say is left out");
 }
 
-/// Every ingredient together: a prior on the blocks, subsets, a support, views kept aside, and an interruption.
+/// Every ingredient together: a prior on the blocks, subsets, a support, held-out views, and an interruption.
 #[test]
 fn an_interrupted_run_with_a_basis_goes_on_to_the_same_bits() {
     let (scan, held) = scan().0.split(&[3, 9]).unwrap();

@@ -88,7 +88,7 @@ fn an_interruption_of_any_goes_on_to_the_same_bits() {
             let stopped = Case::of(&scan).run(&text, &mut heard);
             let stopped_at = heard.records.last().unwrap().step;
             match stopped.err().unwrap() {
-                // A field looks for the next step's end first.
+                // A field may complete one more step.
                 Error::Interrupted { step } => assert!(step == stopped_at || step == stopped_at + 1, "{step}"),
                 e => panic!("{e}"),
             }
@@ -104,11 +104,11 @@ fn an_interruption_of_any_goes_on_to_the_same_bits() {
             assert_eq!(weights(&got), weights(&want), "after record {after}");
             assert_eq!((got.steps, got.samples), (want.steps, want.samples), "after record {after}");
             assert!(got.train_s >= kept.standing.seconds, "{} after {}", got.train_s, kept.standing.seconds);
-            // No record is lost and none comes twice, none is of a method that was done.
+            // No record is lost or repeated, and none belongs to a completed method.
             heard.records.retain(|r| r.step <= recorded);
-            let told: Vec<_> = [&heard, &rest].iter().flat_map(|h| &h.records).map(|r| (r.step, r.loss)).collect();
+            let records: Vec<_> = [&heard, &rest].iter().flat_map(|h| &h.records).map(|r| (r.step, r.loss)).collect();
             assert_eq!(
-                told,
+                records,
                 whole.records.iter().map(|r| (r.step, r.loss)).collect::<Vec<_>>(),
                 "after record {after}"
             );
@@ -133,9 +133,9 @@ fn methods_on_one_grid_are_merged() {
     let levels = [(12, 2), (32, 3), (48, 4)];
     let (one, heard) = Case::of(&scan).volume(&chain("", &[(12, 2), (24, 7)]));
     let merged = chain("mean = 2\nmerge = true\n", &levels);
-    let (both, told) = Case::of(&scan).volume(&merged);
+    let (both, found) = Case::of(&scan).volume(&merged);
     assert_eq!(both.data, one.data);
-    assert_eq!(told.records.len(), heard.records.len());
+    assert_eq!(found.records.len(), heard.records.len());
     assert_ne!(Case::of(&scan).volume(&chain("mean = 2\n", &levels)).0.data, one.data);
     // Levels on grids of their own stay, and so does the mean.
     let apart = |top| Case::of(&scan).volume(&chain(top, &[(12, 2), (16, 3), (24, 4)])).0.data;
@@ -194,7 +194,7 @@ fn what_makes_no_chain_is_refused() {
 }
 
 #[test]
-fn limits_are_the_firsts_and_what_is_told_is_of_both() {
+fn limits_apply_to_the_first_and_the_outline_shows_both() {
     let scan = scan();
     let text = chain(FIRST, THEN, 4);
     let limits = Limits { steps: Some(1), ..Limits::default() };

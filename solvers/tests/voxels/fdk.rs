@@ -191,7 +191,7 @@ fn unweighted(scan: &Scan) -> Scan {
     scan
 }
 
-/// The means above tell a scale that is 1 % wrong and every kind of weights from none.
+/// The means above detect a scale that is 1 % wrong, and the absence of each kind of weights.
 #[test]
 fn wrong_scales_and_weights_are_seen() {
     let views = 360;

@@ -261,7 +261,7 @@ fn passes_time_or_a_small_change_end_a_run() {
     }
 }
 
-/// Noise comes with passes of conjugate gradients: views that are kept aside see it, and the best volume comes out.
+/// Noise grows with the passes of conjugate gradients. The held-out views detect it, and the run returns the best volume.
 #[test]
 fn patience_ends_a_run_at_the_best_volume() {
     let (scan, held) = noisy().split(&[3, 11, 19]).unwrap();
@@ -276,9 +276,9 @@ fn patience_ends_a_run_at_the_best_volume() {
     same_bits(&volume, &early, "the best pass");
     let (late, _) = case.volume(&spec("cgls", &passes(40)));
     assert!(psnr(&volume, &truth()) > psnr(&late, &truth()) + 1.0);
-    // Without views kept aside it cannot end a run, and that is said.
+    // Without held-out views it cannot end a run, and a note reports this.
     let (_, heard) = Case::of(&scan).volume(&spec("cgls", "stop = { passes = 5, patience = 1 }"));
-    assert!(heard.records.len() == 5 && heard.said("kept aside"), "{:?}", heard.notes);
+    assert!(heard.records.len() == 5 && heard.said("held-out views"), "{:?}", heard.notes);
 }
 
 #[test]

@@ -99,7 +99,7 @@ fn a_scan_that_shows_all_of_the_object_is_left_alone() {
 }
 
 #[test]
-fn what_would_be_looked_at_is_told_before() {
+fn the_surround_is_reported_before_a_run() {
     let near = SurroundRule::Coarse(CoarseSurround { cells: 20, margin: 0.5, ..CoarseSurround::default() });
     let far = SurroundRule::Coarse(CoarseSurround { cells: 20, margin: 2.0, ..CoarseSurround::default() });
     assert!(found(&scan(), SurroundRule::None).unwrap().is_empty());
@@ -112,7 +112,7 @@ fn what_would_be_looked_at_is_told_before() {
     let all = said(&close, far);
     let side: usize = all.split(" views: ").nth(1).unwrap().split(' ').next().unwrap().parse().unwrap();
     assert!((22..46).contains(&side), "{all}");
-    // A body that is only longer than the detector is looked for above and below.
+    // For a body that is only longer than the detector, the cells extend only above and below.
     let long = [Ellipsoid { center: [0.0; 3], axes: [15.0, 15.0, 60.0], value: 0.02 }];
     let all = said(&scan_ellipsoids(&long, geometry(false)), near);
     assert!(all.contains("20 x 20 x 40 cells"), "{all}");

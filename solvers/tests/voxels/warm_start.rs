@@ -134,7 +134,7 @@ const GRID: &str = "type = \"voxel-grid\"\nresolution = 24";
 const DENSE: &str = "type = \"dense-grid\"\nlevels = 2\nbase_resolution = 12\ngrowth = 2.0";
 const MLP: &str = "type = \"mlp\"\nwidth = 16\ndepth = 3\nskips = []\noutput = \"squareplus\"";
 
-/// A field that is trained for a few steps, each of them told.
+/// A field that is trained for a few steps, with a record of each.
 fn field(encoder: &str, field: &str, steps: usize) -> String {
     format!(
         "type = \"neural-field\"\nprojector = {{ type = \"ray-march\", samples = 48 }}\noptimizer.lr = 0.03\n\

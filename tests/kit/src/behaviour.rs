@@ -191,7 +191,7 @@ pub fn input_gradient_overwrites(stage: &dyn Stage, options: &Options) -> Outcom
     let (x, dy) = data(&info, options, n);
     let run = |dx| backward(k, &info, &p, &x, &dy, n, 0..info.params, Before { grads: 0.0, dx: Some(dx) });
     let [[_, clean], [_, seven], [_, nan]] = [0.0, 7.0, f32::NAN].map(run);
-    let hole = nan.iter().position(|v| v.is_nan()).map(|i| format!("input gradient {i} was left as it was"));
+    let hole = nan.iter().position(|v| v.is_nan()).map(|i| format!("input gradient {i} was not written"));
     let complaint = hole.or_else(|| differing("over 7, input gradient", &seven, &clean));
     settle(complaint.or_else(|| differing("over NaN, input gradient", &nan, &clean)), "nothing of before is left")
 }

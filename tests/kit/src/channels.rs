@@ -130,7 +130,7 @@ pub fn resolutions(stage: &dyn Encoder) -> Outcome {
         return Outcome::Failed(format!("{} numbers for {n} channels", cells.len()));
     }
     if let Some(c) = cells.iter().position(|v| !(v.is_finite() && *v > 0.0)) {
-        return Outcome::Failed(format!("channel {c} tells {} cells apart", cells[c]));
+        return Outcome::Failed(format!("channel {c} resolves {} cells", cells[c]));
     }
     if stage.coarse_to_fine() && !cells.is_sorted() {
         return Outcome::Failed(format!("channels stand from coarse to fine, their cells do not: {cells:?}"));

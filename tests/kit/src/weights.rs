@@ -13,8 +13,8 @@ pub fn check_initializer(initializer: &dyn Initializer) -> Report {
     report.add("applies", || match run(initializer, &layout) {
         Ok((_, found)) => {
             let n = layout.blocks.len();
-            let told = found.loaded.len() + found.fresh.len();
-            let complaint = (told != n).then(|| format!("it tells of {told} of {n} blocks"));
+            let reported = found.loaded.len() + found.fresh.len();
+            let complaint = (reported != n).then(|| format!("it reports {reported} of {n} blocks"));
             settle(complaint, &format!("{} of {n} blocks filled", found.loaded.len()))
         }
         Err(e) => settle(Some(e.to_string()), ""),
@@ -36,7 +36,7 @@ pub fn check_initializer(initializer: &dyn Initializer) -> Report {
             let mut rest = layout.blocks.iter().filter(|b| !found.loaded.contains(&b.name));
             rest.find_map(|b| differing(&b.name, &p[b.range.clone()], &before[b.range.clone()]))
         });
-        settle(complaint, "blocks that it does not tell of keep their bits")
+        settle(complaint, "blocks that it does not report keep their bits")
     });
     report
 }

@@ -1,4 +1,4 @@
-//! Runs a reader over damaged bytes, and tells what no reader may do.
+//! Runs a reader over damaged bytes and reports its faults.
 
 use super::Parser;
 use super::mutate::mutated;
@@ -10,7 +10,7 @@ use std::panic::{AssertUnwindSafe, catch_unwind};
 use std::path::{Path, PathBuf};
 use std::time::{Duration, Instant};
 
-/// What a reader may take for an input of a few kilobytes.
+/// Limits of a reader for an input of a few kilobytes.
 #[derive(Debug, Clone, Copy)]
 pub struct Bounds {
     /// Bytes of memory at a time, beyond those held before.
@@ -30,12 +30,12 @@ pub struct Meter {
     pub reset: fn(),
 }
 
-/// What a reader did that none may do.
+/// A fault of a reader.
 #[derive(Debug, Clone, PartialEq)]
 pub enum ReaderFault {
-    /// It panicked with these words.
+    /// It panicked with this message.
     Panic(String),
-    /// It took this many bytes.
+    /// It used this many bytes of memory.
     Memory(usize),
     /// It took this long.
     Time(Duration),
@@ -51,12 +51,12 @@ impl fmt::Display for ReaderFault {
     }
 }
 
-/// What a run over many mutations saw.
+/// The result of a run over many mutations.
 #[derive(Debug, Clone, Default)]
 pub struct Seen {
     /// Mutations.
     pub count: u64,
-    /// Those that were read all the same.
+    /// Mutations that were accepted.
     pub accepted: u64,
     /// The most bytes taken at a time.
     pub most_bytes: usize,
@@ -64,7 +64,7 @@ pub struct Seen {
     pub longest: Duration,
     /// Each fault with the number of its mutation and the input.
     pub faults: Vec<(u64, ReaderFault, Vec<u8>)>,
-    /// Inputs that ended in another way than those before them, unpacked. They are damaged further in turn.
+    /// Inputs whose end differs from those before them, unpacked. They are damaged further.
     pub found: Vec<Vec<u8>>,
 }
 
@@ -72,10 +72,10 @@ pub struct Seen {
 const MOST_FOUND: usize = 256;
 const LONGER: usize = 1024;
 
-/// How an input ended: accepted, or refused with which words.
+/// The end of an input: accepted (`None`), or refused with this message.
 pub type End = Option<String>;
 
-/// Runs `read` and tells how its input ended, and what that took; or the panic.
+/// Runs `read`. Returns the end of its input, the bytes and the time; or the panic.
 pub fn once<E: fmt::Display>(
     meter: Meter,
     read: impl FnOnce() -> Result<(), E>,
@@ -95,7 +95,7 @@ pub fn once<E: fmt::Display>(
     }
 }
 
-/// A refusal without what it found, which differs from input to input, and without numbers.
+/// A refusal without the value found, which differs between inputs, and without numbers.
 fn shape(said: &str) -> String {
     let (before, after) = said.split_once(": found ").unwrap_or((said, ""));
     let after = after.rsplit_once(", expected ").map_or("", |(_, expected)| expected);

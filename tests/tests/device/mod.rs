@@ -31,8 +31,8 @@ pub fn shared(what: &str) -> Option<Arc<Shared>> {
     device.clone()
 }
 
-/// Backends on the device: with its own limits, told that it can do less (no atomic sums; buffers so small that everything is cut
-/// into pieces), and with subgroup operations where it has them.
+/// Backends on the device: with its own limits, with lower ones (no atomic sums; buffers so small that everything is cut into pieces),
+/// and with subgroup operations if it has them.
 #[allow(dead_code)]
 pub fn backends(what: &str) -> Vec<(&'static str, Wgpu)> {
     let small = Limits { binding_bytes: Some(2048), uniform_bytes: Some(0), ..Limits::default() };

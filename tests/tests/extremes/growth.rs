@@ -1,7 +1,7 @@
 //! Errors of single against double precision, stage by stage and of whole steps, as inputs and sizes grow.
 //!
-//! Both get the same numbers, exact in single precision: what is left is the rounding of the work itself, and of tables
-//! where these are read in halves.
+//! Both get the same numbers, exact in single precision. The differences come from the rounding of the work itself, and of tables
+//! that are read in half precision.
 
 use crate::common::{self, scan, spec};
 use crate::page;
@@ -142,7 +142,7 @@ fn stages() -> Vec<(String, String, Errors, f64)> {
     let norm: Box<dyn NormalizerSpec> = serde_json::from_value(json!({"type": "layer-norm"})).unwrap();
     let norm = norm.build(20).unwrap();
     for inputs in [-1e-30..1e-30, -1e-4..1e-4, -1.0..1.0, 999.0..1001.0, -1e30..1e30] {
-        // The mean's rounding is a share of the inputs, what is left of them 2 in 1000.
+        // The rounding of the mean is relative to the inputs; without the mean, 2 in 1000 of them remain.
         let limit = if inputs.start > 0.0 { 1e-3 } else { 1e-5 };
         add("layer-norm, 20 channels", norm.as_ref(), None, 1.0, inputs, limit);
     }
@@ -188,7 +188,7 @@ fn halves() -> Vec<(String, String, Errors, f64)> {
     all
 }
 
-/// Errors of loss and gradients of a step with so many rays and samples.
+/// Errors of loss and gradients of a step with this number of rays and samples.
 fn step(rays: usize, samples: usize, tables: Tables) -> [f64; 2] {
     let mut value = crate::scans::field();
     value["projector"]["samples"] = json!(samples);

@@ -63,12 +63,12 @@ fn levels_open_one_by_one() {
     ] {
         let name = encoder["type"].clone();
         let (found, records) = psnr(&settings(encoder, opening(1, 0.5)), &Cpu::new());
-        let told: Vec<(u64, String)> =
+        let events: Vec<(u64, String)> =
             records.iter().flat_map(|r| r.events.iter().map(|e| (r.step, e.clone()))).collect();
         let want = [(5, 1), (15, 2), (25, 3), (35, 4)];
-        assert_eq!(told.len(), want.len(), "{name}: {told:?}");
-        for ((step, event), (by, open)) in told.iter().zip(want) {
-            assert!(*step == by && event.contains(&format!("{open} of 4 levels")), "{name}: {told:?}");
+        assert_eq!(events.len(), want.len(), "{name}: {events:?}");
+        for ((step, event), (by, open)) in events.iter().zip(want) {
+            assert!(*step == by && event.contains(&format!("{open} of 4 levels")), "{name}: {events:?}");
         }
         // An empty volume has 10.8 dB.
         assert!(found > 15.0, "{name}: {found} dB");

@@ -94,7 +94,7 @@ fn every_combination_that_fits_learns() {
 
 /// A mask for which a run is too short says so in the last record.
 #[test]
-fn a_mask_that_is_never_decided_is_told() {
+fn a_mask_that_is_never_decided_is_reported() {
     let (_, encoder, ..) = encoders().remove(0);
     let mask = json!([{"type": "fft-mask", "epoch": 1000}]);
     let spec = pipeline(&encoder, &[json!([]), mask], &mlp(), &projectors()[0]);

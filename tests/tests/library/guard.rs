@@ -254,8 +254,8 @@ fn a_run_that_went_back_resumes_to_the_same_bits() {
             assert!(stopped.unwrap_err().contains("interrupted"));
             let (again, second) = solve(first.kept.as_ref(), u64::MAX);
             assert!(again == whole, "interrupted after step {at}");
-            let told = |s: &Stop| s.heard.iter().map(|r| (r.step, r.loss, r.events.clone())).collect::<Vec<_>>();
-            assert_eq!([told(&first), told(&second)].concat(), told(&heard), "after step {at}");
+            let records = |s: &Stop| s.heard.iter().map(|r| (r.step, r.loss, r.events.clone())).collect::<Vec<_>>();
+            assert_eq!([records(&first), records(&second)].concat(), records(&heard), "after step {at}");
         }
     }
 }

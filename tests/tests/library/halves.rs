@@ -296,7 +296,7 @@ fn a_stage_that_cannot_read_halves_is_refused_in_words() {
 
 /// Where no stage has tables there is no copy; where one has, it is counted.
 #[test]
-fn the_copy_is_told_and_counted() {
+fn the_copy_is_reported_and_counted() {
     let explained = |settings: &Value| Cpu::new().compile(&built(settings)).unwrap().1;
     let whole = explained(&settings(Tables::F32));
     let halves = explained(&settings(Tables::F16));

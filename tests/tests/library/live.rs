@@ -10,7 +10,7 @@ use conefield_core::parts::Part;
 use ndarray::{Array3, s};
 use serde_json::json;
 
-/// Takes slices after every so many steps.
+/// Takes slices at intervals of `every` steps.
 struct Slices {
     every: u64,
     step: u64,

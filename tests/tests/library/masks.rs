@@ -1,4 +1,4 @@
-//! Masks in whole pipelines: what is removed, and that what is left computes what it did before.
+//! Masks in whole pipelines: what is removed, and that the rest computes the same as before.
 
 use conefield_core::pipeline::{Model, Pipeline};
 use conefield_core::settings::{EncoderSpec, FieldSpec, NormalizerSpec};

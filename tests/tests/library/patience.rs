@@ -61,7 +61,7 @@ fn a_run_that_learns_noise_ends_early_and_returns_the_best() {
     assert_eq!((solution.best, solution.steps), (Some(best), best.step + 5 * 20));
     let met = |r: &Record| r.events.iter().any(|e| e.contains("stopping rule"));
     assert!(met(records.last().unwrap()) && !records[..records.len() - 1].iter().any(met));
-    // What comes out is what a run of so many steps comes to, and going on would have made it worse.
+    // The result equals that of a run with this number of steps. More steps would have made it worse.
     let (early, _) = solve(&settings(best.step, None), &scans, Limits::default());
     assert_eq!(early.best, None);
     assert!(params(solution) == params(early));
@@ -88,10 +88,10 @@ fn a_run_that_improves_goes_to_its_end_whatever_sets_it() {
 fn without_patience_nothing_changes() {
     let scans = scans(1.0);
     let (plain, with) = (settings(200, None), settings(200, Some(1000)));
-    let told = |r: &[Record]| r.iter().map(|r| (r.step, r.loss, r.held_out)).collect::<Vec<_>>();
+    let values = |r: &[Record]| r.iter().map(|r| (r.step, r.loss, r.held_out)).collect::<Vec<_>>();
     let ((a, of_a), (b, of_b)) = (solve(&plain, &scans, Limits::default()), solve(&with, &scans, Limits::default()));
-    assert_eq!(told(&of_a), told(&of_b));
-    // Looking changes nothing of the training; only what comes out may be an earlier state.
+    assert_eq!(values(&of_a), values(&of_b));
+    // Patience does not change the training; only the returned state may be an earlier one.
     assert_eq!(params(a) == params(b), least(&of_a).1 == 0);
 }
 
@@ -121,14 +121,14 @@ fn a_run_resumes_to_the_same_best() {
             assert!(stopped.unwrap_err().contains("interrupted"), "at {at}");
             let (again, second) = solve(first.kept.as_ref(), u64::MAX);
             assert!(again == whole, "interrupted after step {at}");
-            let told = |s: &Stop| s.heard.iter().map(|r| (r.step, r.held_out, r.events.clone())).collect::<Vec<_>>();
-            assert_eq!([told(&first), told(&second)].concat(), told(&heard), "after step {at}");
+            let records = |s: &Stop| s.heard.iter().map(|r| (r.step, r.held_out, r.events.clone())).collect::<Vec<_>>();
+            assert_eq!([records(&first), records(&second)].concat(), records(&heard), "after step {at}");
         }
     }
 }
 
 #[test]
-fn what_it_needs_is_told() {
+fn its_needs_are_reported() {
     let planned = |patience| plan(&spec(&settings(9, patience)).unwrap(), &Cpu::new(), &Weights::default());
     let (with, without) = (planned(Some(3)).unwrap(), planned(None).unwrap());
     assert_eq!((with.needs_held_out(), without.needs_held_out()), (Some("callbacks.1".into()), None));

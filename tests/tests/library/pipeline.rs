@@ -153,7 +153,7 @@ fn a_steps_gradient_is_that_of_its_loss() {
     gradients_of(&settings(), 40, 3);
 }
 
-/// They go through in parts, as a worker holds only so many rows at once.
+/// They are processed in parts, because a worker holds a limited number of rows.
 #[test]
 fn a_steps_gradient_is_that_of_its_loss_where_rays_and_blocks_have_many_rows() {
     let mut long = settings();
@@ -423,7 +423,7 @@ fn masked_channels_leave_the_work() {
     let events: Vec<&String> = records.iter().flat_map(|r| &r.events).collect();
     assert_eq!(events.len(), 1, "{events:?}");
     println!("{}", events[0]);
-    // 8 views make an epoch: the record after step 8 tells.
+    // 8 views make an epoch: the record after step 8 reports the mask.
     assert!(records.iter().all(|r| r.events.is_empty() == (r.step != 10)));
 
     let kept = p.encoder.info().output;
@@ -447,7 +447,7 @@ fn masked_channels_leave_the_work() {
 
 // ---- what a scan has need of ----
 
-/// 160 mm of voxels of 10 mm, seen by pixels of 11.7 mm at their distance: 14 cells are told apart, 16 suffice.
+/// 160 mm of voxels of 10 mm, seen by pixels of 11.7 mm at their distance: 14 cells are resolved, 16 suffice.
 #[test]
 fn channels_finer_than_the_data_leave_the_work() {
     let mut s = settings();

@@ -79,7 +79,7 @@ fn steps_agree(settings: &Value) {
     let params: Vec<f64> = filled().arena.params.iter().map(|&p| f64::from(p)).collect();
     let losses: [&dyn Loss; 3] = [&L1 {}, &L2 {}, &Huber { delta: 0.5 }];
     for (k, loss) in losses.into_iter().enumerate() {
-        let told = loss.describe();
+        let text = loss.describe();
         let work = Work { step: 4, seed: 9, loss, rays: &rays, points: &points, priors: &priors };
         let kernels = Kernels::new(&pipeline, |s| s.reference()).unwrap();
         let mut exact = vec![0.0; params.len()];
@@ -98,8 +98,8 @@ fn steps_agree(settings: &Value) {
         for (name, backend) in devices.iter().take(tried) {
             let (stats, grads) = on(backend);
             let (e, on_cpu) = (worst(&pipeline, &grads, &exact), worst(&pipeline, &cpu, &exact));
-            println!("{told}, {name}: gradients {e:.1e} (CPU {on_cpu:.1e}), loss {} and {}", stats.loss, want.loss);
-            assert!(e < limit, "{told}, {name}: {e:e}");
+            println!("{text}, {name}: gradients {e:.1e} (CPU {on_cpu:.1e}), loss {} and {}", stats.loss, want.loss);
+            assert!(e < limit, "{text}, {name}: {e:e}");
             assert!((stats.loss - want.loss).abs() < 1e-5 * want.loss, "{} {}", stats.loss, want.loss);
             assert!((stats.prior - want.prior).abs() < 1e-5 * want.prior, "{} {}", stats.prior, want.prior);
             let all = 20 * 40 - missed(&pipeline, &rays) + 150 + 5 * 125 + 3 * 64;

@@ -45,7 +45,7 @@ const fn program(name: &'static str, limit_s: u64, program: &'static str, argume
     Stage { name, limit_s, work: Work::Program(program, arguments) }
 }
 
-/// The most telling stages come first: what runs on a machine that is lent for minutes is what was waited for.
+/// The most informative stages come first, because the machine may be available for a few minutes only.
 const STAGES: [Stage; 9] = [
     own("adapter", 20, device::adapter),
     own("limits", 60, device::limits),

@@ -209,22 +209,22 @@ pub fn voxels(asked: &Asked) -> Result<()> {
     let joseph = backend.place(Box::new(Joseph {}))?;
     let operator = joseph.operator();
     let updates = (side * side * side * views) as f64;
-    let tell = |what: &str, time| say(&json!({ "work": what, "voxel_updates_per_s": rates(updates, time) }));
+    let report = |what: &str, time| say(&json!({ "work": what, "voxel_updates_per_s": rates(updates, time) }));
 
     let mut volume = Array3::<f32>::zeros(g.volume.shape);
     let time = repeated(|| Ok(backend.backproject(&seen, scan.projections.view(), volume.view_mut()).map(drop)?))?;
-    tell("FDK back-projection", time);
+    report("FDK back-projection", time);
     let mut lines = scan.projections.clone();
     let time = repeated(|| {
         operator.forward(g, &all, truth.data.view(), lines.view_mut());
         Ok(operator.fault()?)
     })?;
-    tell("forward projection", time);
+    report("forward projection", time);
     let time = repeated(|| {
         operator.adjoint(g, &all, scan.projections.view(), volume.view_mut());
         Ok(operator.fault()?)
     })?;
-    tell("its adjoint", time);
+    report("its adjoint", time);
     Ok(())
 }
 

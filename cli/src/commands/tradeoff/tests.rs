@@ -70,7 +70,7 @@ fn three_ways_to_write_a_key_are_one() {
 }
 
 #[test]
-fn mistakes_are_told_with_their_place() {
+fn mistakes_are_reported_with_their_place() {
     for (text, want) in [
         ("", "levers.toml: base: found none"),
         ("[[base]]\n", "levers.toml:1: levers: found missing field `spec`"),

@@ -267,7 +267,7 @@ fn resolutions(own: &Foreign<ConefieldMap>, count: usize) -> Result<Option<Vec<f
     cells.truncate(count);
     match cells.iter().position(|v| !(v.is_finite() && *v > 0.0)) {
         Some(c) if untouched(&cells[c]) => wrong(format!("channel {c} of {count} is left unwritten")),
-        Some(c) => wrong(format!("channel {c} of {count} tells {} cells apart", cells[c])),
+        Some(c) => wrong(format!("channel {c} of {count} resolves {} cells", cells[c])),
         None => Ok(Some(cells)),
     }
 }
@@ -299,7 +299,7 @@ across! {
 }
 
 /// As `call`, for a function with the half-precision format as first argument, if any.
-macro_rules! told {
+macro_rules! with_format {
     ($own:expr, ($($format:expr)?), $function:ident($($argument:expr),*)) => {
         call!($own, $function($($format,)? $($argument),*))
     };
@@ -315,7 +315,7 @@ macro_rules! kernel {
             fn forward(&self, params: &[$param], x: Tile<'_, $real>, y: TileMut<'_, $real>, tape: TileMut<'_, $real>) {
                 let (rows, params) = (x.rows, params.as_ptr().cast());
                 let (x, out, tape) = (x.data.across(rows), y.data.across(rows), tape.data.across(rows));
-                if let Err(e) = told!(self.own, $format, $forward(params, x, out, tape)) {
+                if let Err(e) = with_format!(self.own, $format, $forward(params, x, out, tape)) {
                     self.own.fault.set(e);
                     y.data.fill(<$real>::NAN);
                 }
@@ -336,7 +336,7 @@ macro_rules! kernel {
                 let to = dx.as_mut().map_or(nowhere, |dx| dx.data.across(rows));
                 let (start, length) = (grads.range.start, grads.values.len());
                 let grads = $grads { data: grads.values.as_mut_ptr(), start, length };
-                if let Err(e) = told!(self.own, $format, $backward(params, x, tape, dy, grads, to)) {
+                if let Err(e) = with_format!(self.own, $format, $backward(params, x, tape, dy, grads, to)) {
                     self.own.fault.set(e);
                     dx.iter_mut().for_each(|dx| dx.data.fill(<$real>::NAN));
                 }
@@ -360,7 +360,7 @@ macro_rules! kernel {
                     }
                     let (rows, params) = (x.rows, params.as_ptr().cast());
                     let (x, out, tape) = (x.data.across(rows), y.data.across(rows), tape.data.across(rows));
-                    if let Err(e) = told!(self.own, $format, $forward_pass(pass, params, x, out, tape)) {
+                    if let Err(e) = with_format!(self.own, $format, $forward_pass(pass, params, x, out, tape)) {
                         self.own.fault.set(e);
                         y.data.fill(<$real>::NAN);
                     }

@@ -144,7 +144,7 @@ unsafe extern "C" fn state(stage: *mut c_void, index: usize, out: *mut Conefield
         // SAFETY: see `shims/mod.rs`.
         let all = unsafe { penalty(stage)? }.state();
         let entry = all.into_iter().nth(index);
-        let (name, values) = entry.ok_or_else(|| Error::unsupported("state", "there are not so many"))?;
+        let (name, values) = entry.ok_or_else(|| Error::unsupported("state", "the index is too large"))?;
         let name = ConefieldStr { data: name.as_ptr(), length: name.len() };
         // SAFETY: see `shims/mod.rs`.
         unsafe { *out = ConefieldState { name, data: values.as_mut_ptr(), length: values.len() } };

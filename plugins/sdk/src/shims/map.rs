@@ -41,13 +41,13 @@ shims! {
     }
 
     fn parameter(map: map, index: usize, out: *mut ConefieldParameter) {
-        let p = map.1.blocks.get(index).ok_or_else(|| Error::unsupported("parameters", "there are not so many"))?;
+        let p = map.1.blocks.get(index).ok_or_else(|| Error::unsupported("parameters", "the index is too large"))?;
         let name = ConefieldStr { data: p.name.as_ptr(), length: p.name.len() };
         *out = ConefieldParameter { name, shape: p.shape.as_ptr(), dimensions: p.shape.len() };
     }
 
     fn partition(map: map, index: usize, out: *mut ConefieldRange) {
-        let r = map.1.partition.get(index).ok_or_else(|| Error::unsupported("ranges", "there are not so many"))?;
+        let r = map.1.partition.get(index).ok_or_else(|| Error::unsupported("ranges", "the index is too large"))?;
         *out = ConefieldRange { start: r.start, end: r.end };
     }
 

@@ -209,7 +209,7 @@ mod tests {
 
     impl Kernel<f32> for Scaled {
         fn forward(&self, params: &[f32], x: Tile<'_, f32>, y: TileMut<'_, f32>, tape: TileMut<'_, f32>) {
-            assert!(!self.panics, "told to, {}", "é".repeat(600));
+            assert!(!self.panics, "on request, {}", "é".repeat(600));
             for (y, x) in y.data.iter_mut().zip(x.data) {
                 *y = params[0] * x;
             }
@@ -312,8 +312,8 @@ mod tests {
                 &mut error,
             )
         };
-        assert_eq!((status, error.length), (CONEFIELD_PANICKED, "panicked: told to, ".len() + 1200));
-        assert_eq!(&bytes, b"panicked: told t");
+        assert_eq!((status, error.length), (CONEFIELD_PANICKED, "panicked: on request, ".len() + 1200));
+        assert_eq!(&bytes, b"panicked: on req");
         unsafe { destroy(stage) };
     }
 

@@ -1,4 +1,4 @@
-//! An encoder that panics when it is told to: none of it may take the host down.
+//! An encoder that panics on request. No panic may take the host down.
 
 use conefield_plugin::error::Result;
 use conefield_plugin::settings::EncoderSpec;
@@ -8,9 +8,9 @@ use serde::{Deserialize, Serialize};
 use std::sync::atomic::{AtomicU32, Ordering};
 
 conefield_plugin::export!();
-conefield_plugin::stage_type!(Encoder, "panics", Panics, "panics when it is told to");
+conefield_plugin::stage_type!(Encoder, "panics", Panics, "panics on request");
 
-/// When.
+/// When it panics.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(rename_all = "kebab-case")]
 enum When {

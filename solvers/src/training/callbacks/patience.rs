@@ -68,7 +68,7 @@ impl Callback for Waiting {
 
     fn begin(&mut self, run: &mut Run<'_>) -> Result<()> {
         if run.job.held_out.is_none() {
-            run.observer.note("patience looks at views that are kept aside, and none are: it does not end this run");
+            run.observer.note("patience needs held-out views, and there are none: it does not end this run");
         }
         Ok(())
     }

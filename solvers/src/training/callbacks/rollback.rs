@@ -155,7 +155,7 @@ impl Callback for Guard {
         if let Some(what) = away.or_else(|| strayed(&run.model.arena)) {
             self.back(&what, run)?;
         } else if let Some(said) = self.in_vain(run.step) {
-            run.tell(said);
+            run.report(said);
         }
         Ok(())
     }
@@ -250,7 +250,7 @@ impl Guard {
         run.tally.rate *= 0.5;
         self.watched = Watched { sum: 0.0, empty: 0.0, steps: 0, dead: 0, ..self.watched.clone() };
         let rate = run.tally.rate;
-        run.tell(format!("step {step}: {what}; back to where step {at} was, learning rate times {rate}"));
+        run.report(format!("step {step}: {what}; back to where step {at} was, learning rate times {rate}"));
         Ok(Update::Leave)
     }
 }
