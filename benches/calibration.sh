@@ -10,7 +10,7 @@ data=$1
 out=$2
 scans=${3:-head engine counts}
 seeds=${4:-0}
-errors=${5:-offset-u=0 offset-u=0.1 offset-u=0.5 offset-u=2 offset-u=20 rotation=1 tilt=1 tilt=2 slant=2 distance=2 distance=-2 step=0.1 step=-0.1 step=1 offset-v=2}
+errors=${5:-offset-u=0 offset-u=0.1 offset-u=0.5 offset-u=2 offset-u=20 rotation=1 tilt=1 tilt=2 slant=2 distance=2 distance=-2 step=0.1 step=-0.1 step=1 offset-v=2 jitter=0 jitter=0.5 jitter=2}
 python=${PYTHON:-python3}
 bin=${CARGO_TARGET_DIR:-target}/release/conefield
 [[ -x $bin ]] || cargo build --release --quiet -p conefield
@@ -64,10 +64,11 @@ T
             "$python" benches/misplace.py "$at/right" "$wrong" "$error"
             # The parameters that the command estimates by default, and the wrong one.
             case $error in
-            offset-u=* | rotation=*) parameters=offset-u,rotation ;;
-            *) parameters=offset-u,rotation,${error%%=*} ;;
+            offset-u=* | rotation=*) parameters=(--parameters offset-u,rotation) ;;
+            jitter=*) parameters=(--jitter) ;;
+            *) parameters=(--parameters "offset-u,rotation,${error%%=*}") ;;
             esac
-            "$bin" -q calibrate "$wrong" -o "$corrected" --force --parameters "$parameters" --json >"$at/$error.json"
+            "$bin" -q calibrate "$wrong" -o "$corrected" --force "${parameters[@]}" --json >"$at/$error.json"
             "$python" - "$scan" "$error" "$at/$error.json" "$(psnr "$wrong")" "$(psnr "$corrected")" <<'PY'
 import json, sys
 scan, error, file, before, after = sys.argv[1:]
@@ -80,6 +81,10 @@ def text(p):
     return f"{p['parameter']} {p['change']:.3f} ± {p['uncertainty']:.3f} {p['unit']}, {p['pixels'][0]:.2f} ± {p['pixels'][1]:.2f} pixels{end}"
 asked = [text(p) for p in found["parameters"] if p["parameter"] == key or p["verdict"] == "corrected"]
 held = found["held_out"]
+if j := found["jitter"]:
+    rms = [f"{x:.2f} ± {d:.2f}" for x, d in zip(j["pixels"], j["uncertainty"])]
+    asked.append(f"jitter {rms[1]} pixels along u, {rms[0]} along v, {j['verdict']}")
+    held = {"before": held["before"], "after": j["held_out"][1 if j["verdict"] == "corrected" else 0]}
 print(f"| {scan} | {error} | {'; '.join(asked)} | {held['before']:.4f}, {held['after']:.4f} | {before} dB | {after} dB |")
 PY
         done

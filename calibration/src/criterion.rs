@@ -2,7 +2,7 @@
 
 use crate::parameters::{Correction, Parameter};
 use conefield_core::backend::Backend;
-use conefield_core::geometry::{Geometry, Vec3, VoxelGrid, norm};
+use conefield_core::geometry::{Geometry, Vec3, View, VoxelGrid, norm};
 use conefield_core::method::{Context, Job, Method, Observer, Reconstruction, Record};
 use conefield_core::scan::{Scan, Unit};
 use conefield_core::{Error, Result};
@@ -11,7 +11,7 @@ use conefield_projectors::voxel::Joseph;
 use conefield_solvers::iterative::Stop;
 use conefield_solvers::iterative::order::Subsets;
 use conefield_solvers::iterative::sart::Sart;
-use ndarray::{Array3, s};
+use ndarray::{Array3, ArrayView2, s};
 use rayon::prelude::*;
 
 /// One in this many views is held out.
@@ -75,10 +75,18 @@ impl Level {
     /// The level of `scan` with about `width` pixels along the longer side of the detector and `folds` folds. Each fold holds out
     /// another quarter of the views. The voxels cover the object in the geometry corrected by `known`.
     pub fn new(scan: &Scan, width: usize, folds: usize, known: &Correction) -> Result<Self> {
-        let g = &scan.geometry;
-        let [rows, columns] = g.detector;
-        let bin = rows.max(columns).div_ceil(width).clamp(1, (rows.min(columns) / 4).max(1));
-        let binned = Scan { unit: Unit::default(), ..spread(scan.binned(bin))? };
+        let bin = bin(scan, width);
+        Self::of(spread(scan.binned(bin))?, bin, width, folds, known)
+    }
+
+    /// The level of all views of `scan`, each of them held out once.
+    pub fn whole(scan: &Scan, width: usize) -> Result<Self> {
+        let bin = bin(scan, width);
+        Self::of(scan.binned(bin), bin, width, EVERY, &Correction::default())
+    }
+
+    fn of(binned: Scan, bin: usize, width: usize, folds: usize, known: &Correction) -> Result<Self> {
+        let binned = Scan { unit: Unit::default(), ..binned };
         let given = binned.geometry.views.clone();
         let views = known.views(&given);
         let seen = Scan { geometry: Geometry { views, ..binned.geometry.clone() }, ..binned };
@@ -119,8 +127,19 @@ impl Level {
         cancelled: &(dyn Fn() -> bool + Sync),
     ) -> Result<Prediction> {
         let views = correction.views(&self.geometry.views);
-        let volume = self.following(correction);
-        let of = |fold: &Fold| -> Result<Vec<Vec<f32>>> {
+        let folds = self.residuals(&views, self.following(correction), backend, cancelled)?;
+        Ok(self.prediction(&folds))
+    }
+
+    /// The residuals of each fold's held-out views, measured minus predicted, with these views and voxels.
+    pub fn residuals(
+        &self,
+        views: &[View],
+        volume: VoxelGrid,
+        backend: &dyn Backend,
+        cancelled: &(dyn Fn() -> bool + Sync),
+    ) -> Result<Vec<Array3<f32>>> {
+        let of = |fold: &Fold| -> Result<Array3<f32>> {
             let among = |list: &[usize]| Geometry {
                 views: list.iter().map(|&v| views[v]).collect(),
                 detector: self.geometry.detector,
@@ -134,14 +153,30 @@ impl Level {
             projector.operator().forward(&among(&fold.held_out), &all, volume.view(), residual.view_mut());
             projector.operator().fault()?;
             residual.zip_mut_with(&fold.test.projections, |a, p| *a = p - *a);
-            Ok(residual.outer_iter().map(|view| view.iter().copied().collect()).collect())
+            Ok(residual)
         };
-        let folds: Vec<Vec<Vec<f32>>> = self.folds.par_iter().map(of).collect::<Result<_>>()?;
-        let views: Vec<Vec<f32>> = folds.into_iter().flatten().collect();
+        self.folds.par_iter().map(of).collect()
+    }
+
+    /// The residuals of each held-out view, and their size.
+    pub fn prediction(&self, folds: &[Array3<f32>]) -> Prediction {
+        let views: Vec<Vec<f32>> =
+            folds.iter().flat_map(|f| f.outer_iter()).map(|view| view.iter().copied().collect()).collect();
         let pixels: usize = views.iter().map(Vec::len).sum();
         let square: f64 = views.iter().flatten().map(|x| f64::from(*x).powi(2)).sum();
-        Ok(Prediction { views, error: (square / pixels as f64).sqrt() / self.top })
+        Prediction { views, error: (square / pixels as f64).sqrt() / self.top }
     }
+
+    /// The held-out views in the order of [`Level::residuals`]: their numbers and measured line integrals.
+    pub fn held_out(&self) -> impl Iterator<Item = (usize, ArrayView2<'_, f32>)> {
+        self.folds.iter().flat_map(|f| f.held_out.iter().copied().zip(f.test.projections.outer_iter()))
+    }
+}
+
+/// The side of a level's pixels, in pixels of the scan.
+fn bin(scan: &Scan, width: usize) -> usize {
+    let [rows, columns] = scan.geometry.detector;
+    rows.max(columns).div_ceil(width).clamp(1, (rows.min(columns) / 4).max(1))
 }
 
 impl Level {

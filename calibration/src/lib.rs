@@ -8,16 +8,18 @@
 //! ([`Parameter::by_pairs`]) are found by comparing pairs of views on the same planes (`consistency`, `newton`). This comparison
 //! is independent of the object.
 //!
-//! [`directions`] compares the angles with the reversed ones.
+//! [`directions`] compares the angles with the reversed ones. [`jitter()`] estimates a shift of the detector for each view.
 
 mod consistency;
 mod criterion;
 mod direction;
+mod jitter;
 mod newton;
 mod parameters;
 mod search;
 
 pub use direction::{Directions, directions};
+pub use jitter::{Jitter, jitter};
 pub use parameters::{Correction, Parameter, turns};
 pub use search::Watch;
 
@@ -150,12 +152,12 @@ impl Calibration {
         }
     }
 
-    /// The result as JSON, with the result of [`directions`].
-    pub fn json(&self, directions: Option<Directions>) -> Value {
+    /// The result as JSON, with those of [`directions`] and [`jitter()`].
+    pub fn json(&self, directions: Option<Directions>, jitter: Option<&Jitter>) -> Value {
         let [before, after] = self.held_out;
         json!({
             "parameters": self.found, "held_out": { "before": before, "after": after, "views": self.views },
-            "direction": directions, "bin": self.bin,
+            "direction": directions, "jitter": jitter, "bin": self.bin,
         })
     }
 }

@@ -26,6 +26,9 @@ class Calibration:
     direction
         The errors with the ``given`` direction of rotation and with the ``reversed`` one; None if the sources are not on a circle.
         A much smaller second one is also logged as a warning.
+    jitter
+        With ``jitter=True`` a dict: ``shifts`` of the detector along v and u for each view in mm, their root mean square in ``pixels``
+        along v and u, its ``uncertainty``, the ``held_out`` error before and after, and the ``verdict``.
     """
 
     def __init__(self, scan: Scan, result: dict[str, Any]) -> None:
@@ -33,6 +36,7 @@ class Calibration:
         self.parameters = result["parameters"]
         self.held_out = result["held_out"]
         self.direction = result["direction"]
+        self.jitter = result["jitter"]
 
     def __str__(self) -> str:
         def line(p: dict[str, Any]) -> str:
@@ -45,7 +49,11 @@ class Calibration:
             )
 
         errors = f"held-out error {self.held_out['before']:.4f}, {self.held_out['after']:.4f} with the corrections"
-        return "\n".join([*map(line, self.parameters), errors])
+        lines = [*map(line, self.parameters), errors]
+        if self.jitter is not None:
+            v, u = self.jitter["pixels"]
+            lines.append(f"shifts of single views: root mean square {u:.2f} pixels along u, {v:.2f} along v, {self.jitter['verdict']}")
+        return "\n".join(lines)
 
     __repr__ = __str__
 
@@ -55,6 +63,7 @@ def calibrate(
     parameters: Iterable[str] = ("offset-u", "rotation"),
     *,
     pixels: int = 64,
+    jitter: bool = False,
     backend: str = "auto",
     callback: Callback | None = None,
     every: float = 1.0,
@@ -70,10 +79,12 @@ def calibrate(
         ``"offset-u"``, ``"offset-v"``, ``"rotation"``, ``"tilt"``, ``"slant"``, ``"distance"`` or ``"step"``.
     pixels
         Pixels along the longer side of the detector at the finest level, 16 to 1024.
+    jitter
+        Also estimate a shift of the detector in each view, after the other parameters.
     callback, every, progress
         As of :func:`reconstruct`.
     """
     names = [parameters] if isinstance(parameters, str) else list(parameters)
-    wanted = encoded({"parameters": names, "pixels": int(pixels), "backend": backend})
+    wanted = encoded({"parameters": names, "pixels": int(pixels), "jitter": bool(jitter), "backend": backend})
     with Reporter("calibrate", callback, every, False, progress) as report:
         return Calibration(*_native.calibrate(as_scan(scan), wanted, report))

@@ -5,7 +5,7 @@ use crate::arrays::plain;
 use crate::run::{CallbackArgument, callback};
 use crate::scan::Scan;
 use crate::work::{Progress, without_lock};
-use conefield_calibration::{Parameter, Settings, Watch, calibrate as search, directions};
+use conefield_calibration::{Parameter, Settings, Watch, calibrate as search, directions, jitter};
 use conefield_core::error::ensure;
 use conefield_core::method::Observer;
 use conefield_core::{Error, Result};
@@ -21,6 +21,7 @@ use tracing::warn;
 struct Wanted {
     parameters: Vec<String>,
     pixels: usize,
+    jitter: bool,
     backend: String,
 }
 
@@ -38,11 +39,12 @@ impl Wanted {
     }
 }
 
-/// Passes progress on to Python, as one of two parts of equal length.
+/// Passes progress on to Python, as one part of the work.
 struct Part<'a, 'b> {
     progress: &'a Mutex<Progress<'b>>,
     begin: Instant,
     from: f64,
+    share: f64,
 }
 
 impl Watch for Part<'_, '_> {
@@ -51,7 +53,7 @@ impl Watch for Part<'_, '_> {
     }
 
     fn progress(&self, share: f64) {
-        let share = self.from + 0.5 * share;
+        let share = self.from + self.share * share;
         let left = self.begin.elapsed().as_secs_f64() * (1.0 - share) / share.max(1e-6);
         self.progress.lock().unwrap_or_else(PoisonError::into_inner).progress(0, share, left);
     }
@@ -71,17 +73,24 @@ pub fn calibrate<'py>(
         let settings = wanted.settings()?;
         let backend = arguments::backend(&wanted.backend)?.open()?;
         let progress = Mutex::new(Progress::new(watch, function));
-        let part = |from| Part { progress: &progress, begin: Instant::now(), from };
+        let parts = if wanted.jitter { 3.0 } else { 2.0 };
+        let begin = Instant::now();
+        let part = |i: f64| Part { progress: &progress, begin, from: i / parts, share: 1.0 / parts };
         let found = search(&scan.scan, &settings, backend.as_ref(), &part(0.0))?;
-        let directions = directions(&scan.scan, backend.as_ref(), &part(0.5))?;
+        let directions = directions(&scan.scan, backend.as_ref(), &part(1.0))?;
         if let Some(advice) = directions.and_then(|d| d.advice()) {
             warn!("{advice}");
         }
-        progress.lock().unwrap_or_else(PoisonError::into_inner).finish();
         let mut corrected = scan.scan.as_ref().clone();
         let source = scan.path.as_ref().map_or("a scan in memory".into(), |p| p.display().to_string());
         found.correct(&mut corrected, &source);
-        Ok((corrected, found.json(directions)))
+        let shifts =
+            wanted.jitter.then(|| jitter(&corrected, wanted.pixels, backend.as_ref(), &part(2.0))).transpose()?;
+        if let Some(shifts) = &shifts {
+            shifts.correct(&mut corrected);
+        }
+        progress.lock().unwrap_or_else(PoisonError::into_inner).finish();
+        Ok((corrected, found.json(directions, shifts.as_ref())))
     })?;
     Ok((scan.with(corrected), plain(py, &result)?))
 }

@@ -10,7 +10,7 @@ import conefield
 
 @pytest.fixture(scope="module")
 def shifted():
-    """A scan whose detector stands three columns aside of its description, and the distance in mm."""
+    """A scan whose detector is shifted by three columns, and the distance in mm."""
     exact = conefield.simulate("phantom:head:32", views=24, detector=(48, 48), noise="tigre:1e5,10")
     dso, dsd, pixel, _, angles = exact.geometry.orbit()
     shift = 3 * pixel[1]
@@ -42,6 +42,12 @@ def test_the_result_is_that_of_the_command(shifted, command, tmp_path):
     assert found.direction == printed["direction"] and found.held_out == printed["held_out"]
     for ours, theirs in zip(found.parameters, printed["parameters"], strict=True):
         assert {**ours, "curve": None} == {**theirs, "curve": None}
+
+
+def test_steady_views_are_not_shifted(shifted):
+    found = conefield.calibrate(shifted[0], pixels=32, jitter=True)
+    assert found.jitter["verdict"] == "kept" and len(found.jitter["shifts"]) == len(shifted[0])
+    assert "shifts of single views" in str(found)
 
 
 def test_bad_settings_name_what_is_expected(shifted):

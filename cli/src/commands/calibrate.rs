@@ -6,7 +6,9 @@ use crate::memory::Memory;
 use crate::progress::Progress;
 use crate::{out, signals};
 use clap::Args;
-use conefield_calibration::{Calibration, Found, Parameter, Settings, Verdict, Watch, calibrate, directions, suspect};
+use conefield_calibration::{
+    Calibration, Found, Jitter, Parameter, Settings, Verdict, Watch, calibrate, directions, jitter, suspect,
+};
 use conefield_core::backend::Backend;
 use conefield_core::scan::Scan;
 use conefield_core::{Error, Result};
@@ -35,6 +37,9 @@ pub struct CalibrateArgs {
     /// Parameters to estimate: offset-u, offset-v, rotation, tilt, slant, distance and step.
     #[arg(long, value_name = "LIST", value_delimiter = ',', default_value = "offset-u,rotation")]
     parameters: Vec<Parameter>,
+    /// Also estimate a shift of the detector in each view, after the other parameters.
+    #[arg(long)]
+    jitter: bool,
     /// Pixels along the longer side of the detector at the finest level; more pixels are more accurate and slower.
     #[arg(long, value_name = "N", default_value_t = 64, value_parser = clap::value_parser!(u16).range(16..=1024))]
     pixels: u16,
@@ -65,7 +70,7 @@ impl CalibrateArgs {
         let backend = self.backend.open()?;
         let size = conefield_io::scan_size(&self.scan)?;
         Memory::of_data_set(&size).check(|_| vec![])?;
-        let DataSet { train: mut scan, test, volume } = conefield_io::read_data_set(&self.scan)?;
+        let DataSet { train: scan, test, volume } = conefield_io::read_data_set(&self.scan)?;
         scan.validate(&self.scan.display().to_string())?;
         let settings =
             Settings { parameters: self.parameters.clone(), width: self.pixels.into(), curves: self.png.is_some() };
@@ -76,6 +81,13 @@ impl CalibrateArgs {
         let watch = Shown::new();
         let directions = directions(&scan, backend.as_ref(), &watch)?;
         drop(watch);
+        let mut corrected = scan.clone();
+        found.correct(&mut corrected, &self.scan.display().to_string());
+        let jitter =
+            self.jitter.then(|| jitter(&corrected, self.pixels.into(), backend.as_ref(), &Shown::new())).transpose()?;
+        if let Some(jitter) = &jitter {
+            jitter.correct(&mut corrected);
+        }
         if let Some(png) = &self.png {
             draw(png, &found)?;
         }
@@ -84,12 +96,11 @@ impl CalibrateArgs {
                 let n = test.geometry.views.len();
                 tracing::warn!("{}: {n} test views are left out: this format cannot hold them", output.display());
             }
-            found.correct(&mut scan, &self.scan.display().to_string());
-            conefield_io::write_scan(output, &scan, volume.as_ref())?;
+            conefield_io::write_scan(output, &corrected, volume.as_ref())?;
         }
         let seconds = begin.elapsed().as_secs_f64();
         if self.json {
-            let mut result = found.json(directions);
+            let mut result = found.json(directions, jitter.as_ref());
             result["scan"] = json!(self.scan);
             result["output"] = json!(self.output);
             result["picture"] = json!(self.png);
@@ -98,11 +109,11 @@ impl CalibrateArgs {
         }
         let advice = directions.and_then(|d| d.advice());
         let warning = advice.map_or(String::new(), |advice| format!("\n\nwarning: {advice}"));
-        out::say(&(self.text(&found, seconds) + &warning))
+        out::say(&(self.text(&found, jitter.as_ref(), seconds) + &warning))
     }
 
     /// The result as text.
-    fn text(&self, found: &Calibration, seconds: f64) -> String {
+    fn text(&self, found: &Calibration, jitter: Option<&Jitter>, seconds: f64) -> String {
         let heads = ["", "change", "uncertainty", "unit", "in pixels", ""].map(str::to_owned).to_vec();
         let rows: Vec<Vec<String>> = std::iter::once(heads).chain(found.found.iter().map(row)).collect();
         let [before, after] = found.held_out;
@@ -118,8 +129,21 @@ impl CalibrateArgs {
             found.bin,
             out::duration(seconds)
         );
+        if let Some(jitter) = jitter {
+            let ([v, u], [dv, du], [before, after]) = (jitter.pixels, jitter.uncertainty, jitter.held_out);
+            text += &format!(
+                "\nshifts of single views: root mean square {u:.2} ± {du:.2} pixels along u, {v:.2} ± {dv:.2} along v, {}; held-out \
+                 error {before:.4}, {after:.4} with them",
+                match jitter.verdict {
+                    Verdict::Corrected => "corrected",
+                    _ => "not clear: unchanged",
+                }
+            );
+        }
+        let mut verdicts = found.found.iter().map(|f| f.verdict).chain(jitter.map(|j| j.verdict));
+        let any = verdicts.any(|v| v == Verdict::Corrected);
         if let Some(output) = &self.output {
-            text += &match found.found.iter().any(|f| f.verdict == Verdict::Corrected) {
+            text += &match any {
                 true => format!("\ncorrected scan: {}", output.display()),
                 false => format!("\nnothing to correct; the unchanged scan: {}", output.display()),
             };

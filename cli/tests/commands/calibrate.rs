@@ -1,4 +1,4 @@
-//! `conefield calibrate`: a geometry that is told wrongly is found again, and a right one is left alone.
+//! `conefield calibrate`: a wrong geometry is corrected, and a right one is unchanged.
 
 use crate::common::{conefield, done, json, refused, text};
 use conefield_core::geometry::norm;
@@ -15,8 +15,8 @@ fn scanned(folder: &Path) {
     done(&[&["simulate", "phantom:head:32", "-o", &text(folder)], &size[..]].concat());
 }
 
-/// The same scan in `folder`, told to have its detector so many pixels aside along u.
-fn told_aside(scan: &Path, folder: &Path, pixels: f64) {
+/// The same scan in `folder`, described with its detector shifted along u.
+fn shifted(scan: &Path, folder: &Path, pixels: f64) {
     let mut scan = conefield_io::read_scan(scan).unwrap();
     let mut orbit = CircularOrbit::fit(&scan.geometry.views).unwrap();
     orbit.offset[1] += pixels * orbit.pixel[1];
@@ -24,7 +24,7 @@ fn told_aside(scan: &Path, folder: &Path, pixels: f64) {
     conefield_io::write_scan(folder, &scan, None).unwrap();
 }
 
-/// What came out for a parameter.
+/// The result for a parameter.
 fn of<'a>(found: &'a Value, parameter: &str) -> &'a Value {
     let all = found["parameters"].as_array().unwrap();
     all.iter().find(|f| f["parameter"] == parameter).unwrap()
@@ -39,7 +39,7 @@ fn a_shifted_detector_is_found_and_a_right_one_is_left_alone() {
     let dir = tempdir().unwrap();
     let at = |n: &str| dir.path().join(n);
     scanned(&at("right"));
-    told_aside(&at("right"), &at("wrong"), -3.0);
+    shifted(&at("right"), &at("wrong"), -3.0);
     let before = fs::read(at("wrong/scan.toml")).unwrap();
 
     let (wrong, out, png) = (text(&at("wrong")), text(&at("out")), text(&at("curves.png")));
@@ -95,8 +95,37 @@ fn a_shifted_detector_is_found_and_a_right_one_is_left_alone() {
     assert!(!done(&["info", &text(&at("right"))]).contains("conefield calibrate"));
 }
 
+/// Views that are shifted along u and v in turn.
 #[test]
-fn the_other_direction_is_told_where_the_views_fit_it() {
+fn shifts_of_single_views_are_corrected_and_steady_views_are_unchanged() {
+    let dir = tempdir().unwrap();
+    let at = |n: &str| dir.path().join(n);
+    scanned(&at("right"));
+    let mut scan = conefield_io::read_scan(at("right")).unwrap();
+    for (i, view) in scan.geometry.views.iter_mut().enumerate() {
+        let [along_v, along_u] = [[1.0, -0.5], [-1.0, 0.0], [0.0, 1.5], [0.0, -1.0]][i % 4];
+        view.detector = std::array::from_fn(|k| view.detector[k] + along_v * view.v[k] + along_u * view.u[k]);
+    }
+    conefield_io::write_scan(at("wrong"), &scan, None).unwrap();
+    let calibrate = |name: &str, out: &str| {
+        let [scan, out] = [name, out].map(|n| text(&at(n)));
+        json(&["calibrate", &scan, "-o", &out, "--pixels", "48", "--parameters", "offset-u", "--jitter", "--json"])
+    };
+    let found = calibrate("wrong", "corrected");
+    assert_eq!(found["jitter"]["verdict"], "corrected", "{found}");
+    let [before, after] = [0, 1].map(|i| number(&found["jitter"]["held_out"][i]));
+    assert!(after < 0.8 * before, "{found}");
+    let provenance = conefield_io::read_scan(at("corrected")).unwrap().provenance;
+    assert!(number(&provenance["jitter"]["rms_pixels"]["u"]) > 0.5, "{provenance}");
+
+    assert_eq!(calibrate("right", "same")["jitter"]["verdict"], "kept");
+    let [same, right] = ["same", "right"].map(|n| conefield_io::read_scan(at(n)).unwrap().geometry);
+    assert_eq!(same, right);
+    assert!(done(&["calibrate", &text(&at("wrong")), "--pixels", "32", "--jitter"]).contains("shifts of single views"));
+}
+
+#[test]
+fn a_wrong_direction_of_rotation_is_reported() {
     let dir = tempdir().unwrap();
     let at = |n: &str| dir.path().join(n);
     scanned(&at("right"));
@@ -106,10 +135,10 @@ fn the_other_direction_is_told_where_the_views_fit_it() {
     scan.geometry.views = orbit.views();
     conefield_io::write_scan(at("wrong"), &scan, None).unwrap();
     let calibrate = ["--pixels", "24", "--parameters", "offset-u"];
-    let told = |name: &str| done(&[&["calibrate", &text(&at(name))], &calibrate[..]].concat());
-    let said = told("wrong");
+    let printed = |name: &str| done(&[&["calibrate", &text(&at(name))], &calibrate[..]].concat());
+    let said = printed("wrong");
     assert!(said.contains("the other `direction`") && said.contains("--flip-columns"), "{said}");
-    assert!(!told("right").contains("direction"));
+    assert!(!printed("right").contains("direction"));
     let found = json(&[&["calibrate", &text(&at("wrong"))], &calibrate[..], &["--json"]].concat());
     let [given, reversed] = ["given", "reversed"].map(|k| number(&found["direction"][k]));
     assert!(reversed < 0.7 * given, "{found}");
@@ -117,7 +146,7 @@ fn the_other_direction_is_told_where_the_views_fit_it() {
 
 /// A ball on the axis: turned in its plane or stepped on wider, every view is the same.
 #[test]
-fn what_the_views_do_not_tell_is_not_invented() {
+fn undetermined_parameters_are_unchanged() {
     let dir = tempdir().unwrap();
     let at = |n: &str| dir.path().join(n);
     scanned(&at("right"));
