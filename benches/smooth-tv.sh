@@ -21,7 +21,20 @@ level() { # a method of the chain: SAMPLES PASSES
     echo "{ extends = \"fista-tv\", basis = { type = \"cubic\", spacing = 1, samples = $1 }, \
 prior = { type = \"directional-total-variation\", edge = 0.7 }, stop = { passes = $2, change = 1e-3 } }"
 }
-coarse='{ extends = "fista-tv", basis = { type = "cubic", spacing = 1, samples = 64 }, prior = { type = "total-variation", weight = { noise = 0.7 } }, bin = 4, stop = { passes = 10, change = 1e-3 } }'
+three() { # a spec with the mean of three methods: SAMPLES PASSES of each
+    spec=$out/three.toml
+    cat >"$spec" <<T
+type = "chain"
+name = "three"
+mean = 3
+merge = true
+methods = [
+    { extends = "fista-tv", basis = { type = "cubic", spacing = 1, samples = 64 }, \
+prior = { type = "total-variation", weight = { noise = 0.7 } }, bin = 4, stop = { passes = 10, change = 1e-3 } },
+    $(level "$1" "$2"), $(level "$3" "$4"), $(level "$5" "$6"),
+]
+T
+}
 
 for volume in $volumes; do
     for seed in $seeds; do
@@ -30,17 +43,18 @@ for volume in $volumes; do
         for variant in $variants; do
             record=$out/$volume-$views-$seed-$variant.json
             [[ -f $record ]] && continue
+            spec=smooth-tv
             case $variant in
                 total-variation) sets=(merge=false 'methods.1.prior={ type = "total-variation", weight = { noise = 0.7 } }'
                     'methods.2.prior={ type = "total-variation", weight = { noise = 0.7 } }') ;;
                 along-edges) sets=(merge=false methods.1.prior.edge=1 methods.2.prior.edge=1) ;;
                 merged) sets=(methods.1.prior.edge=1 methods.2.prior.edge=1) ;;
                 shipped) sets=() ;;
-                three-from-144) sets=(mean=3 "methods=[$coarse, $(level 144 7), $(level 176 8), $(level 208 10)]") ;;
-                three-from-128) sets=(mean=3 "methods=[$coarse, $(level 128 8), $(level 168 8), $(level 208 12)]") ;;
+                three-from-144) sets=() && three 144 7 176 8 208 10 ;;
+                three-from-128) sets=() && three 128 8 168 8 208 12 ;;
                 *) echo "$variant: no such variant" >&2 && exit 2 ;;
             esac
-            "$bin" -q reconstruct "$scan" -o "$out/run" --force --reference truth --spec smooth-tv "${sets[@]/#/--set=}" >/dev/null
+            "$bin" -q reconstruct "$scan" -o "$out/run" --force --reference truth --spec "$spec" "${sets[@]/#/--set=}" >/dev/null
             cp "$out/run/record.json" "$record"
         done
     done
