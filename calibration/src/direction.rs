@@ -34,8 +34,8 @@ impl Directions {
         self.is_reversed().then(|| {
             format!(
                 "the views fit the other direction: after a quick calibration the held-out error is {:.4}, and {:.4} with the angles \
-                 reversed\n  import the scan with the other `direction` in scanner.toml; if that is right, with --flip-columns (with \
-                 the wrong one of the two the volume is mirrored)",
+                 reversed\n  import the scan with the other `direction` in scanner.toml. If `direction` is certain, use \
+                 --flip-columns instead; the wrong choice mirrors the volume",
                 self.given, self.reversed
             )
         })

@@ -14,8 +14,8 @@ use std::str::FromStr;
 use std::sync::OnceLock;
 
 /// Help text of `--backend`.
-pub const HELP: &str = "Backend: auto (currently the CPU), cpu, wgpu, or wgpu:N for adapter N; +subgroups after wgpu sums gradients of \
-                        tables in subgroups first";
+pub const HELP: &str = "Backend: auto (currently the CPU), cpu, wgpu, or wgpu:N for adapter N; wgpu+subgroups sums gradients of \
+                        tables within subgroups first";
 
 /// Value of `--backend`.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
@@ -101,7 +101,7 @@ impl Auto {
             Some(format!("there is a GPU, {best}: --backend wgpu:{} uses it", best.index))
         };
         match self.gpu.get_or_init(look) {
-            None => "chosen by --backend auto: no GPU was found".to_owned(),
+            None => "chosen by --backend auto, which takes the CPU; no GPU is available".to_owned(),
             Some(gpu) => format!("chosen by --backend auto, which takes the CPU until a GPU has been measured; {gpu}"),
         }
     }

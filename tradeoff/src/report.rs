@@ -257,7 +257,7 @@ impl TradeoffReport {
             let short = self.count(rung.budget_s, Status::TooShort);
             let failed = self.count(rung.budget_s, Status::Failed);
             let mut line =
-                format!("{}: {} tried, {} went on", duration(rung.budget_s), rung.tried.len(), rung.kept.len());
+                format!("{}: {} tried, {} advanced", duration(rung.budget_s), rung.tried.len(), rung.kept.len());
             for (n, what) in [(short, "had too little time"), (failed, "failed")] {
                 if n > 0 {
                     line += &format!(", {n} trials {what}");

@@ -198,7 +198,7 @@ fn scan(path: &Path, png: Option<&Path>) -> Result<Value> {
         missing.push("a volume to compare with (truth)");
     }
     if data.test.is_none() {
-        missing.push("test views: reconstruct --hold-out holds some out");
+        missing.push("test views (reconstruct --hold-out sets some aside)");
     }
     found["line_integrals"] = statistics(s.projections.view());
     found["test_views"] = json!(data.test.as_ref().map_or(0, |t| t.geometry.views.len()));

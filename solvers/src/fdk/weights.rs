@@ -159,10 +159,10 @@ impl FdkOrbit {
         let degrees = |x: f64| x.to_degrees();
         let arc = format!("{:.1} of 360 degrees, fan {:.1}", degrees(self.arc), degrees(self.fan));
         match self.coverage {
-            Coverage::Full => format!("full turn: every ray counts half ({arc})"),
+            Coverage::Full => format!("full turn: each ray is measured twice and weighted by one half ({arc})"),
             Coverage::Offset { overlap: 0.0, .. } => {
                 format!(
-                    "detector wholly on one side of the axis: every ray counts whole, those near the axis are missing ({arc})"
+                    "detector wholly on one side of the axis: each ray is measured once, those near the axis are missing ({arc})"
                 )
             }
             Coverage::Offset { overlap, .. } => {

@@ -66,7 +66,7 @@ const ALPHA: f64 = 0.05;
 const ALPHA_DECAY: f64 = 0.95;
 const RATIO: f64 = 0.95;
 
-conefield_core::stage_type!(Method, "asd-pocs", AsdPocs, "data passes in turn with descent on total variation");
+conefield_core::stage_type!(Method, "asd-pocs", AsdPocs, "alternates data passes and total-variation descent");
 
 #[typetag::serde(name = "asd-pocs")]
 impl Method for AsdPocs {

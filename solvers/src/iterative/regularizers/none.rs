@@ -14,7 +14,7 @@ use serde::{Deserialize, Serialize};
 #[serde(deny_unknown_fields, default)]
 pub struct Nonnegative {}
 
-conefield_core::stage_type!(Regularizer, "none", Nonnegative, "no prior but that attenuation is not negative");
+conefield_core::stage_type!(Regularizer, "none", Nonnegative, "non-negative attenuation, no other prior");
 
 #[typetag::serde(name = "none")]
 impl RegularizerSpec for Nonnegative {
@@ -33,7 +33,7 @@ impl Regularizer for Nonnegative {
     }
 
     fn describe(&self) -> String {
-        "none: attenuation of 0 and more".into()
+        "none: non-negative attenuation".into()
     }
 }
 

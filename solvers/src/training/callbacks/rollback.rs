@@ -51,7 +51,7 @@ impl Default for Rollback {
     }
 }
 
-conefield_core::stage_type!(Callback, "rollback", Rollback, "takes a run whose loss runs away back to a good state");
+conefield_core::stage_type!(Callback, "rollback", Rollback, "returns a diverging run to its last good state");
 
 #[typetag::serde(name = "rollback")]
 impl CallbackSpec for Rollback {
