@@ -5,6 +5,7 @@
 # The second command needs a driver and nothing else: no cargo, no registry, no Python. It prints one JSON line a finding, writes the
 # same to FILE (findings.jsonl) at once, and gives each stage a time limit of its own. FOLDER holds the command, parity tests and a
 # scan: engine_256 of DATA_FOLDER (volumes/*.nii.gz) at half its resolution, or a phantom without it. Both are 50 noisy views.
+# FOLDER.tar.xz is the same in one file.
 set -euo pipefail
 cd "$(dirname "$0")/.."
 folder=$1
@@ -30,4 +31,5 @@ if [[ -n $data ]]; then
 fi
 [[ -d $folder/scan ]] || "$target/conefield" -q simulate "$volume" -o "$folder/scan" --protocol r2 --views 50 --seed 0 \
     --noise tigre:1e4,10 --detector 256x256 "${size[@]}"
-du -sh "$folder"
+XZ_OPT=-T0 tar -C "$folder/.." -cJf "$folder.tar.xz" "$(basename "$folder")"
+du -sh "$folder" "$folder.tar.xz"
