@@ -1,8 +1,8 @@
 #!/usr/bin/env bash
 # What each part of smooth-tv is worth, and what Gaussians add to it:
 #   bash benches/smooth-tv.sh DATA_FOLDER OUT_FOLDER [VARIANTS [SEEDS [VOLUMES [VIEWS]]]]
-# VARIANTS (those of smooth-tv) from plain total variation to three resolutions, or of gaussians, smooth-gaussians and
-# fitted-gaussians, on VIEWS (50) noisy views of each of VOLUMES. Each of SEEDS ("0") is
+# VARIANTS (those of smooth-tv) from plain total variation to three resolutions, or of gaussians and
+# smooth-gaussians, on VIEWS (50) noisy views of each of VOLUMES. Each of SEEDS ("0") is
 # another noise. Prints mean and half the range of PSNR, the mean of ssim_2d and the longest time. Passes are counted, not timed:
 # other work on the machine changes nothing but the seconds. An interrupted run continues.
 set -euo pipefail
@@ -44,7 +44,7 @@ for volume in $volumes; do
         for variant in $variants; do
             record=$out/$volume-$views-$seed-$variant.json
             [[ -f $record ]] && continue
-            spec=smooth-tv more=()
+            spec=smooth-tv
             case $variant in
                 total-variation) sets=(merge=false 'methods.1.prior={ type = "total-variation", weight = { noise = 0.7 } }'
                     'methods.2.prior={ type = "total-variation", weight = { noise = 0.7 } }') ;;
@@ -54,11 +54,9 @@ for volume in $volumes; do
                 three-from-144) sets=() && three 144 7 176 8 208 10 ;;
                 three-from-128) sets=() && three 128 8 168 8 208 12 ;;
                 gaussians | smooth-gaussians) sets=() && spec=$variant ;;
-                fitted-gaussians) sets=(weighting=held-out) && spec=smooth-gaussians more=(--hold-out every:16) ;;
                 *) echo "$variant: no such variant" >&2 && exit 2 ;;
             esac
-            "$bin" -q reconstruct "$scan" -o "$out/run" --force --reference truth --spec "$spec" "${sets[@]/#/--set=}" \
-                "${more[@]}" >/dev/null
+            "$bin" -q reconstruct "$scan" -o "$out/run" --force --reference truth --spec "$spec" "${sets[@]/#/--set=}" >/dev/null
             cp "$out/run/record.json" "$record"
         done
     done

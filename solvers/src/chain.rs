@@ -5,7 +5,6 @@
 //! of different spacing has different errors: the mean of the volumes is more accurate than each of them.
 
 mod made;
-mod weighting;
 
 use conefield_core::checkpoint::Checkpoint;
 use conefield_core::error::{Error, Result, ensure};
@@ -23,7 +22,6 @@ use ndarray::Array3;
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 use std::time::Instant;
-use weighting::Weighting;
 
 /// Settings of `chain`.
 #[derive(Serialize, Deserialize, JsonSchema)]
@@ -37,9 +35,6 @@ pub struct Chain {
     /// Average the volumes of this many last methods; 1 returns the last volume.
     #[serde(default = "one")]
     pub mean: usize,
-    /// Weights of the volumes in the mean. `held-out` needs views held out.
-    #[serde(default)]
-    pub weighting: Weighting,
     /// Skip a method that has the same unknowns and pixels as the next one, which then makes its passes too. Two levels
     /// of a small volume can have the same grid, and restarting an iteration in between loses its momentum. The mean
     /// then includes fewer volumes.
@@ -78,7 +73,7 @@ impl Method for Chain {
             ensure(starts, "spec", &at(i), method.typetag_name(), "a method that starts from a volume")?;
             links.push(link);
         }
-        Ok(Box::new(ChainPlan { links, mean: self.mean, weighting: self.weighting, merge: self.merge }))
+        Ok(Box::new(ChainPlan { links, mean: self.mean, merge: self.merge }))
     }
 }
 
@@ -105,7 +100,6 @@ struct ChainPlan {
     links: Vec<Box<dyn Plan>>,
     /// Number of last volumes to average.
     mean: usize,
-    weighting: Weighting,
     /// Whether to merge methods on the same grid.
     merge: bool,
 }
@@ -135,20 +129,13 @@ impl Plan for ChainPlan {
     fn outline(&self) -> Outline {
         let links: Vec<Outline> = self.links.iter().map(|l| l.outline()).collect();
         let kinds: Vec<&str> = links.iter().map(|l| &l.method.kind[..]).collect();
-        let weights = match self.weighting {
-            Weighting::Equal => "",
-            Weighting::HeldOut => ", with weights fitted to the held-out views",
-        };
-        let mean = match self.mean {
-            1 => String::new(),
-            n => format!("; the mean of the last {n} volumes{weights}"),
-        };
+        let mean = if self.mean > 1 { format!("; the mean of the last {} volumes", self.mean) } else { String::new() };
         let merge = if self.merge { "; methods on one grid are merged" } else { "" };
         let what = format!("{}{mean}{merge}", kinds.join(", then "));
         Outline { method: Line::new("method", "chain", &what), links, ..Outline::default() }
     }
 
-    /// The methods run one after the other. Later ones also hold their start volume and the mean of earlier volumes; a
+    /// The methods run one after the other. Later ones also hold their start volume and the sum of earlier volumes; a
     /// checkpoint has both, and the parameters of a trained field.
     fn needs(&self, scan: &ScanHeader) -> Needs {
         let volumes = 4 * scan.voxels() * if self.mean > 1 { 2 } else { 1 };
@@ -205,16 +192,14 @@ impl Plan for ChainPlan {
                 Error::Interrupted { step } => Error::Interrupted { step: made.counts.steps + step },
                 e => e.within(&at(i)),
             })?;
-            let weighting = self.counts(i).then_some(self.weighting);
-            if let Some(weight) = made.add(solution, weighting, i + 1 < count, job)? {
-                observer.note(&format!("{}: weight {weight:.2} in the mean, fitted to the held-out views", at(i)));
-            }
+            made.add(solution, self.counts(i), i + 1 < count, job)?;
             if i + 1 < count {
                 // The next method resumes here if it is interrupted before its own first checkpoint.
                 observer.checkpoint(&made.checkpoint(None)?)?;
             }
         }
-        made.solution()
+        let mean = (0..count).filter(|&i| self.counts(i) && merged[i].is_none()).count();
+        made.solution(mean)
     }
 
     fn pretrain(&mut self, job: &PretrainJob<'_>, observer: &mut dyn Observer) -> Result<Model> {
@@ -230,9 +215,6 @@ impl Plan for ChainPlan {
     }
 
     fn needs_held_out(&self) -> Option<String> {
-        if self.mean > 1 && self.weighting == Weighting::HeldOut {
-            return Some("weighting".into());
-        }
         let mut all = self.links.iter().enumerate();
         all.find_map(|(i, l)| l.needs_held_out().map(|setting| format!("{}.{setting}", at(i))))
     }

@@ -117,12 +117,11 @@ fn a_signal_ends_the_step_keeps_a_checkpoint_and_says_so() {
     }
 }
 
-/// Three methods, whose last two volumes make the mean with a fitted weight: a field of 140 steps with 20 records, and 300 passes twice.
+/// Three methods, whose last two volumes make the mean: a field of 140 steps with 20 records, and 300 passes twice.
 const THREE: &str = r#"
 type = "chain"
 name = "three"
 mean = 2
-weighting = "held-out"
 
 [[methods]]
 extends = "fast"
@@ -157,7 +156,6 @@ fn interrupted_passes_lose_no_record() {
     {
         let arguments = |run: &Path, more: &[&str]| -> Vec<String> {
             let mut all = vec!["reconstruct", scan.to_str().unwrap(), "--spec", spec, "-o", run.to_str().unwrap()];
-            all.extend(["--hold-out", "every:5"]);
             all.extend(passes.iter().flat_map(|s| ["--set", *s]));
             [&all[..], more].concat().into_iter().map(str::to_owned).collect()
         };

@@ -1,6 +1,5 @@
 //! Results of a chain's finished methods, for the next method and for checkpoints.
 
-use super::weighting::{Weighting, fitted};
 use conefield_core::checkpoint::{Checkpoint, Resume, Standing, tensors_of};
 use conefield_core::error::{Error, Result, ensure};
 use conefield_core::method::{Best, Job, Plan, Reconstruction, Solution};
@@ -9,10 +8,10 @@ use conefield_core::trained::{Placement, TrainedField};
 use ndarray::{Array3, Zip};
 use serde::{Deserialize, Serialize};
 
-/// Names of tensors in a checkpoint: the start volume of the next method and the mean so far; then the name
+/// Names of tensors in a checkpoint: the start volume of the next method and the sum for the mean; then the name
 /// prefixes of the trained field and of the running method.
 const START: &str = "chain.start";
-const MEAN: &str = "chain.mean";
+const SUM: &str = "chain.sum";
 const FIELD: &str = "chain.field.";
 const LINK: &str = "link.";
 
@@ -24,8 +23,8 @@ pub(super) struct Made {
     pub(super) counts: Counts,
     /// The last volume, if it is needed.
     volume: Option<Volume>,
-    /// The mean so far, and the number of its volumes.
-    mean: Option<(Array3<f32>, usize)>,
+    /// The sum of the volumes for the mean.
+    sum: Option<Array3<f32>>,
     /// The last trained field, and the index of its method.
     field: Option<(usize, TrainedField)>,
 }
@@ -48,8 +47,6 @@ pub(super) struct Counts {
 struct Kept {
     /// Number of finished methods.
     links: usize,
-    /// Number of volumes in the mean so far.
-    averaged: usize,
     counts: Counts,
     /// The index of the method that trained the field, and the field's placement.
     field: Option<(usize, Placement)>,
@@ -63,15 +60,8 @@ impl Made {
         self.volume.as_ref()
     }
 
-    /// Adds a method's result. `weighting`: how the mean includes its volume, if it does; `next`: the next method starts
-    /// from it. Returns a fitted weight.
-    pub(super) fn add(
-        &mut self,
-        solution: Solution,
-        weighting: Option<Weighting>,
-        next: bool,
-        job: &Job<'_>,
-    ) -> Result<Option<f32>> {
+    /// Adds a method's result. `counts`: the mean includes its volume; `next`: the next method starts from it.
+    pub(super) fn add(&mut self, solution: Solution, counts: bool, next: bool, job: &Job<'_>) -> Result<()> {
         let Solution { result, steps, train_s, samples, sampling_s, rollbacks, best } = solution;
         self.volume = None;
         match result {
@@ -80,25 +70,17 @@ impl Made {
                 (self.field, self.volume) = (Some((self.links, *field)), Some(dense(volume)));
             }
             Reconstruction::Field(field) => {
-                if weighting.is_some() || next {
+                if counts || next {
                     let voxels = field.voxels(job.backend, field.scene.grid);
                     self.volume = Some(dense(Volume::collect(&mut voxels?)?));
                 }
                 self.field = Some((self.links, field));
             }
         }
-        let mut fit = None;
-        if let (Some(weighting), Some(Volume { data, .. })) = (weighting, &self.volume) {
-            match &mut self.mean {
-                Some((mean, count)) => {
-                    *count += 1;
-                    let weight = match weighting {
-                        Weighting::Equal => 1.0 / *count as f32,
-                        Weighting::HeldOut => *fit.insert(fitted(mean, data, job)?),
-                    };
-                    Zip::from(mean).and(data).par_for_each(|mean, x| *mean = (1.0 - weight) * *mean + weight * x);
-                }
-                None => self.mean = Some((data.clone(), 1)),
+        if let (true, Some(volume)) = (counts, &self.volume) {
+            match &mut self.sum {
+                Some(sum) => Zip::from(sum).and(&volume.data).par_for_each(|sum, x| *sum += x),
+                None => self.sum = Some(volume.data.clone()),
             }
         }
         let c = &mut self.counts;
@@ -109,13 +91,13 @@ impl Made {
         c.sampling_s += sampling_s;
         c.rollbacks += rollbacks;
         self.links += 1;
-        Ok(fit)
+        Ok(())
     }
 
-    /// The result of the chain: the mean, if there is one.
-    pub(super) fn solution(self) -> Result<Solution> {
-        let volume = match (self.mean, self.volume) {
-            (Some((data, _)), Some(last)) => Some(Volume { data, affine: None, ..last }),
+    /// The result of the chain: with several volumes, the mean of the last `mean`.
+    pub(super) fn solution(self, mean: usize) -> Result<Solution> {
+        let volume = match (self.sum, self.volume) {
+            (Some(sum), Some(last)) => Some(Volume { data: sum / mean as f32, affine: None, ..last }),
             (_, last) => last,
         };
         let result = match (volume, self.field) {
@@ -132,7 +114,7 @@ impl Made {
     pub(super) fn checkpoint<'a>(&'a self, link: Option<&Checkpoint<'a>>) -> Result<Checkpoint<'a>> {
         let mut tensors = vec![];
         let volume = self.volume.as_ref().map(|v| &v.data);
-        for (name, data) in [(START, volume), (MEAN, self.mean.as_ref().map(|(mean, _)| mean))] {
+        for (name, data) in [(START, volume), (SUM, self.sum.as_ref())] {
             tensors.extend(data.and_then(|d| Some((name.to_owned(), d.shape(), d.as_slice()?))));
         }
         if let Some((_, TrainedField { model, .. })) = &self.field {
@@ -144,8 +126,7 @@ impl Made {
         let Standing { step, recorded, samples, seconds, .. } = link.clone().unwrap_or_default();
         let c = &self.counts;
         let field = self.field.as_ref().map(|(by, field)| (*by, field.placement()));
-        let averaged = self.mean.as_ref().map_or(0, |(_, count)| *count);
-        let kept = serde_json::to_value(Kept { links: self.links, averaged, counts: c.clone(), field, link });
+        let kept = serde_json::to_value(Kept { links: self.links, counts: c.clone(), field, link });
         let standing = Standing {
             step: c.steps + step,
             recorded: c.steps + recorded,
@@ -182,7 +163,7 @@ impl Made {
             links: kept.links,
             counts: kept.counts,
             volume: volume.map(|data| Volume { data, grid, affine: None }),
-            mean: (kept.averaged > 0).then(|| read(MEAN)).transpose()?.map(|mean| (mean, kept.averaged)),
+            sum: resume.tensor(SUM).map(|_| read(SUM)).transpose()?,
             field: kept.field.map(field).transpose()?,
         };
         Ok((made, kept.link.map(|standing| resume.part(LINK, standing))))
