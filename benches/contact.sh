@@ -5,10 +5,10 @@
 # The second command needs a driver and nothing else: no cargo, no registry, no Python. It prints one JSON line a finding, writes the
 # same to FILE (findings.jsonl) at once, and gives each stage a time limit of its own. FOLDER holds the command, parity tests and a
 # scan: engine_256 of DATA_FOLDER (volumes/*.nii.gz) at half its resolution, or a phantom without it. Both are 50 noisy views.
-# FOLDER.tar.xz is the same in one file.
+# FOLDER.tar.xz is the folder in one file.
 set -euo pipefail
 cd "$(dirname "$0")/.."
-folder=$1
+folder=${1%/}
 data=${2:-}
 mkdir -p "$folder"
 target=${CARGO_TARGET_DIR:-target}/release

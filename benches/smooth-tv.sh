@@ -1,10 +1,10 @@
 #!/usr/bin/env bash
 # What each part of smooth-tv is worth, and what Gaussians add to it:
 #   bash benches/smooth-tv.sh DATA_FOLDER OUT_FOLDER [VARIANTS [SEEDS [VOLUMES [VIEWS]]]]
-# VARIANTS (those of smooth-tv) from plain total variation to three resolutions, or of gaussians and
-# smooth-gaussians, on VIEWS (50) noisy views of each of VOLUMES. Each of SEEDS ("0") is
-# another noise. Prints mean and half the range of PSNR, the mean of ssim_2d and the longest time. Passes are counted, not timed:
-# other work on the machine changes nothing but the seconds. An interrupted run continues.
+# VARIANTS: total-variation along-edges merged shipped three-from-144 three-from-128 (the default: all of these), gaussians,
+# smooth-gaussians. Each runs on VIEWS (50) noisy views of each of VOLUMES; each of SEEDS ("0") is another noise. Prints mean and
+# half the range of PSNR, the mean of ssim_2d and the longest time. Passes and steps are counted, not timed: other work on the
+# machine changes nothing but the seconds. An interrupted run continues.
 set -euo pipefail
 cd "$(dirname "$0")/.."
 source benches/common.sh

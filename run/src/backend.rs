@@ -14,8 +14,8 @@ use std::str::FromStr;
 use std::sync::OnceLock;
 
 /// Help text of `--backend`.
-pub const HELP: &str = "Backend: auto (currently the CPU), cpu, wgpu, or wgpu:N for adapter N; wgpu+subgroups sums gradients of \
-                        tables within subgroups first";
+pub const HELP: &str = "Backend: auto (currently the CPU), cpu, wgpu, or wgpu:N for adapter N; with +subgroups after it, \
+                        gradients of tables are summed within subgroups first";
 
 /// Value of `--backend`.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]

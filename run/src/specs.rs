@@ -82,6 +82,18 @@ mod tests {
         }
     }
 
+    /// A chain cannot contain a chain, so `smooth-gaussians` repeats the methods of `smooth-tv`.
+    #[test]
+    fn smooth_gaussians_starts_with_the_methods_of_smooth_tv() {
+        let methods = |name| {
+            let spec = serde_json::to_value(&read(name, &[]).unwrap().spec).unwrap();
+            spec["methods"].as_array().unwrap().clone()
+        };
+        let [tv, all] = ["smooth-tv", "smooth-gaussians"].map(methods);
+        assert_eq!((tv.len(), all.len()), (3, 4));
+        assert_eq!(tv, all[..3]);
+    }
+
     #[test]
     fn a_method_is_named_by_its_type_alone() {
         for name in ["sart", "cgls", "asd-pocs", "fista"] {

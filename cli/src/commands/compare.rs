@@ -50,7 +50,7 @@ pub struct CompareArgs {
 }
 
 fn help() -> String {
-    format!("Specs to compare, in the order of the table. Each is: {}", specs::help())
+    format!("Specs to compare, in the order of the table. {}", specs::help())
 }
 
 /// Files besides the runs.

@@ -59,7 +59,7 @@ pub struct TradeoffArgs {
     /// The data range for PSNR and SSIM [default: 1 for a reference in [0, 1], else the range of its values].
     #[arg(long, value_parser = parse::above_zero)]
     peak: Option<f64>,
-    /// Views to hold out and predict, such as 3,17 or every:10. With --reference, none is allowed.
+    /// Views to hold out and predict, such as 3,17 or every:10; the value none needs --reference.
     #[arg(long, value_name = "VIEWS", default_value = "every:10", value_parser = parse::hold_out_or_none)]
     hold_out: parse::HoldOutOrNone,
     #[arg(long, value_name = "BACKEND", default_value_t, help = backend::HELP)]

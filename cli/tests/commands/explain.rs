@@ -137,7 +137,7 @@ fn the_plan_of_a_voxel_method_for_a_scan_is_reported() {
     let all = with("fdk", "cutoff=0.5");
     assert!(line(&all, "method").contains("hann window to 0.5"), "{all}");
     assert!(all.contains("this scan: 6 views of 8 x 12, volume 16 x 16 x 16\n"), "{all}");
-    assert!(all.contains("full turn: each ray is measured twice"), "{all}");
+    assert!(all.contains("full turn: each ray is measured twice and weighted by one half"), "{all}");
     assert!(all.contains("memory for this scan: ") && all.contains("volume 16.0 KiB"), "{all}");
     assert!(with("sart", "name=\"x\"").contains("  6 subsets of 1 view\n"));
     assert!(with("os-sart", "subsets=4").contains("  4 subsets of 1 or 2 views\n"));
