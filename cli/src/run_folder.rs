@@ -196,7 +196,7 @@ impl RunOnDisk {
     }
 
     /// The progress in words.
-    pub fn standing(&self) -> &'static str {
+    pub fn status(&self) -> &'static str {
         match progressed(&self.folder) {
             Progressed::Complete => "complete",
             Progressed::Begun if self.folder.join("checkpoint.safetensors").exists() => {

@@ -80,7 +80,7 @@
     const plan = run.record?.plan;
     byId("method").append(
       element("h3", {}, run.name),
-      element("p", { class: "note" }, `${run.folder}: ${run.standing}`),
+      element("p", { class: "note" }, `${run.folder}: ${run.status}`),
       ...(plan ? [element("p", {}, `Planned for a budget of ${seconds(run.record.budget_s ?? 0)}: ${plan.why}`)] : []),
       ...(run.plan ? [element("details", {}, element("summary", {}, "What the spec builds"), element("pre", {}, run.plan))] : []),
       element("details", {}, element("summary", {}, "Spec, with every setting"), element("pre", {}, run.spec)),

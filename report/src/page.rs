@@ -58,7 +58,7 @@ pub struct PageRun {
     /// Its folder.
     pub folder: String,
     /// Its progress.
-    pub standing: String,
+    pub status: String,
     /// Its spec, with all settings.
     pub spec: String,
     /// A description of what the spec builds.

@@ -30,7 +30,7 @@ pub struct DemoArgs {
     #[arg(short, long = "output", value_name = "FOLDER", default_value = "conefield-demo")]
     output: PathBuf,
     /// Training time of each field.
-    #[arg(long, value_name = "TIME", default_value = "60s", value_parser = parse::seconds)]
+    #[arg(long, value_name = "TIME", default_value = "20s", value_parser = parse::seconds)]
     seconds: f64,
     /// Voxels along a side of the volume.
     #[arg(long, value_name = "N", default_value_t = 96, value_parser = clap::value_parser!(u16).range(16..=256))]

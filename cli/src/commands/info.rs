@@ -66,7 +66,7 @@ impl InfoArgs {
 fn run(path: &Path) -> Result<Value> {
     let files: Vec<&str> = run_folder::FILES.into_iter().filter(|f| path.join(f).exists()).collect();
     let run = RunOnDisk::read(path)?;
-    let mut found = json!({ "kind": "run", "standing": run.standing(), "files": files });
+    let mut found = json!({ "kind": "run", "status": run.status(), "files": files });
     if let Some(record) = run.record() {
         let mut record = record.clone();
         // Programs read the record from its own file.

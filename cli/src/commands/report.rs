@@ -140,7 +140,7 @@ pub fn standing(folder: &Path, seconds: u64) -> Result<String> {
     page.title = runs::title(&page);
     let live = folder.join("live.png");
     for run in page.runs.iter_mut().filter(|run| run.record.is_none()) {
-        run.standing = "in progress".into();
+        run.status = "in progress".into();
         run.live = std::fs::read(&live).ok().map(|png| png_url(&png));
     }
     page.html(&folder.display().to_string())

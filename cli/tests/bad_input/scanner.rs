@@ -36,6 +36,13 @@ pub fn cases() -> Vec<Case> {
     vec![
         refused("an empty file", |d| put(d.join("scanner.toml"), ""), IMPORT, &["scanner.toml", "format"]),
         refused("no UTF-8", |d| put(d.join("scanner.toml"), b"format = \"\xff\""), IMPORT, &["scanner.toml", "UTF-8"]),
+        refused("a folder", scanner_npy, "import . -o scan", &["SCANNER.toml", "a folder", "a text file"]),
+        refused(
+            "an image",
+            |d| put(d.join("view.TIF"), ""),
+            "import view.TIF -o scan",
+            &["SCANNER.toml", "a .tif file of projections", "a text file"],
+        ),
         refused("another format", circle("conefield-scanner", "conefield-scan"), IMPORT, &["format", "conefield-scan"]),
         refused("a later version", circle("version = 1", "version = 2"), IMPORT, &["version", "found 2"]),
         refused("no TOML", circle("[files]", "[files"), IMPORT, &["scanner.toml: line 4"]),

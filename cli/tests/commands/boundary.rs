@@ -381,7 +381,7 @@ fn the_folder_of_a_run_is_described() {
     let run = text(&dir.path().join("run"));
     done(&words(&fast(&scan, &run, &["--reference", "truth"])));
     let found = json(&["info", &run, "--json"]);
-    assert_eq!((found["kind"].as_str(), found["standing"].as_str()), (Some("run"), Some("complete")));
+    assert_eq!((found["kind"].as_str(), found["status"].as_str()), (Some("run"), Some("complete")));
     assert!(found["record"]["scores"]["psnr"].is_number(), "{found:#}");
     let said = done(&["info", &run]);
     assert!(said.contains("record.scores.psnr") && said.contains("volume.nii.gz"), "{said}");

@@ -204,7 +204,8 @@ impl Iterative for Built {
         let mut problem = opened.problem(job);
         if self.air {
             problem.clear_air();
-            observer.note(&format!("{:.0} % of the pixels are air", 100.0 * problem.air_share()));
+            let air = 100.0 * problem.air_share();
+            observer.note(&format!("{air:.0} % of the pixels are air (views binned by {})", self.bin));
         }
         let data = self.data.of(problem.scan.projections.view()).map_err(|e| e.within("data"))?;
         let space = Space::new(self.binned(job.scan.header()));

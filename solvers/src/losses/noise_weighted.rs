@@ -16,7 +16,7 @@ conefield_core::stage_type!(
     Loss,
     "noise-weighted",
     NoiseWeighted,
-    "half the squared difference over the variance that the scan's noise has there"
+    "half the squared difference divided by the noise variance of the measured value"
 );
 
 #[typetag::serde(name = "noise-weighted")]

@@ -13,7 +13,7 @@ use serde::{Deserialize, Serialize};
 #[serde(deny_unknown_fields, default)]
 pub struct LeastSquares {}
 
-conefield_core::stage_type!(DataTerm, "least-squares", LeastSquares, "squares of residuals, all of the same weight");
+conefield_core::stage_type!(DataTerm, "least-squares", LeastSquares, "squared residuals with equal weights");
 
 #[typetag::serde(name = "least-squares")]
 impl DataTermSpec for LeastSquares {

@@ -18,7 +18,7 @@ conefield_core::stage_type!(
     DataTerm,
     "noise-weighted",
     NoiseWeighted,
-    "squares of residuals, weighted by how little noise the scan has there"
+    "squared residuals divided by the noise variance of the measured values"
 );
 
 #[typetag::serde(name = "noise-weighted")]
@@ -38,6 +38,6 @@ impl DataTerm for NoiseWeighted {
     }
 
     fn describe(&self) -> String {
-        "noise-weighted: less weight where the scan has more noise".into()
+        "noise-weighted: noisier values count less".into()
     }
 }

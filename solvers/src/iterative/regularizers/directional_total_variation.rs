@@ -39,7 +39,7 @@ conefield_core::stage_type!(
     Regularizer,
     "directional-total-variation",
     DirectionalTotalVariation,
-    "flat attenuation with few edges, which run smoothly"
+    "flat regions with few, smooth edges"
 );
 
 #[typetag::serde(name = "directional-total-variation")]
