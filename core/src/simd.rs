@@ -197,7 +197,7 @@ impl Real for f32 {
         let (zero, one) = (number(0.0), number(1.0));
         let [mut e, mut t, mut p, mut cdf, mut pdf] = [[zero; K]; 5];
         // exp(-x²/2) = 2^(n + r), |r| ≤ ½, by a polynomial of degree 5 (Remez, relative error 8e-8). Below 2^-40 (|x| > 7.45)
-        // it is 0: products of tails would end among the denormals, which take processors a hundred times as long.
+        // it is 0: products of tails would end among the denormals, which some processors compute far more slowly.
         let least = number(-40.0);
         for k in 0..K {
             let exponent = x[k] * x[k] * (-0.5 * std::f32::consts::LOG2_E);
