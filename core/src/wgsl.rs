@@ -17,12 +17,13 @@
 //! const stage_wants_dx: bool;
 //! fn stage_param(i: u32) -> f32                                          // parameter i of the stage
 //! fn stage_grad(i: u32, v: f32)                                          // adds v to the gradient of parameter i
+//! fn stage_grad_pair(i: u32, v: vec2<f32>)                               // adds v to the gradients of i and i + 1; i is even
 //! fn stage_sum_M(at: u32, a: ptr<function, array<f32, M>>)               // adds Σ a[j] to parameters at + j
 //! fn stage_outer_M_K(at: u32, ld: u32, a: ptr<function, array<f32, M>>, b: ptr<function, array<f32, K>>)
-//!                                                                        // adds Σ a[j]·b[k] to at + j·ld + k
+//!                                                                        // adds Σ a[j]·b[k] to at + j·ld + k, all different
 //! ```
 //!
-//! `stage_grad` is for parameters of which a row affects few. `stage_sum_M` and `stage_outer_M_K` are sums over rows,
+//! `stage_grad` and `stage_grad_pair` are for parameters of which a row affects few. `stage_sum_M` and `stage_outer_M_K` are sums over rows,
 //! for any numbers `M` and `K` in the name, for parameters that every row affects: all rows call them together, so
 //! never inside a branch or loop that only some rows take.
 //!
@@ -72,6 +73,10 @@ use std::fmt::Write;
 
 /// Prefix of every name that a fragment declares or uses from its host.
 pub const PREFIX: &str = "stage_";
+
+/// Ends the text of a fragment that a plugin brings. Kernels with it keep all checks at run time, which end loops that do
+/// not end by themselves.
+pub const FOREIGN: &str = "// from a plugin\n";
 
 /// `struct Ray`: [`UnitRay`](crate::stage::UnitRay) with its seed and number of samples.
 pub const RAY: &str = include_str!("wgsl/ray.wgsl");
@@ -206,6 +211,10 @@ fn {name}param(i: u32) -> f32 {{ return stage_param({first}u + i); }}
 fn {name}grad(i: u32, v: f32) {{ stage_grad({first}u + i, v); }}
 "
     );
+    out += &match first.is_multiple_of(2) {
+        true => format!("fn {name}grad_pair(i: u32, v: vec2<f32>) {{ stage_grad_pair({first}u + i, v); }}\n"),
+        false => one_by_one(name),
+    };
     for sum in fragment.sums() {
         let _ = match sum {
             Sum::Vector(m) => writeln!(
@@ -219,6 +228,11 @@ fn {name}grad(i: u32, v: f32) {{ stage_grad({first}u + i, v); }}
         };
     }
     out
+}
+
+/// `grad_pair` of stage `name` by two of its `grad`.
+pub fn one_by_one(name: &str) -> String {
+    format!("fn {name}grad_pair(i: u32, v: vec2<f32>) {{ {name}grad(i, v.x); {name}grad(i + 1u, v.y); }}\n")
 }
 
 /// Whether a setting is a positive normal number also in single precision, as used in shaders.

@@ -78,9 +78,7 @@ fn stage_level_backward(x: vec3<f32>, level: stage_Level, dy: ptr<function, arra
         let k = n & 3u;
         let entry = at.first + ((i * level.side + j) * level.side + k) * stage_FEATURES;
         let w = a[i] * b[j] * c[k];
-        for (var f = 0u; f < stage_FEATURES; f++) {
-            stage_grad(entry + f, w * (*dy)[f]);
-        }
+        stage_features_grad(entry, w, dy);
         if stage_wants_dx {
             var along = 0.0;
             for (var f = 0u; f < stage_FEATURES; f++) {

@@ -32,9 +32,7 @@ fn stage_level_backward(x: vec3<f32>, level: stage_Level, dy: ptr<function, arra
     for (var c = 0u; c < 8u; c++) {
         let entry = level.start + stage_trilinear_index(at, level.strides, c) * stage_FEATURES;
         let w = stage_trilinear_weight(at, c);
-        for (var f = 0u; f < stage_FEATURES; f++) {
-            stage_grad(entry + f, w * (*dy)[f]);
-        }
+        stage_features_grad(entry, w, dy);
         if stage_wants_dx {
             var along = 0.0;
             for (var f = 0u; f < stage_FEATURES; f++) {

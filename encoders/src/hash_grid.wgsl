@@ -60,9 +60,7 @@ fn stage_level_backward(x: vec3<f32>, level: stage_Level, dy: ptr<function, arra
     for (var c = 0u; c < 8u; c++) {
         let entry = stage_entry(level, cell, c);
         let w = stage_weights(cell, c);
-        for (var f = 0u; f < stage_FEATURES; f++) {
-            stage_grad(entry + f, w.x * w.y * w.z * (*dy)[f]);
-        }
+        stage_features_grad(entry, w.x * w.y * w.z, dy);
         if stage_wants_dx {
             var along = 0.0;
             for (var f = 0u; f < stage_FEATURES; f++) {

@@ -281,8 +281,19 @@ pub struct LevelCode {
     pub outputs: Vec<Option<usize>>,
 }
 
-/// `stage_forward` and `stage_backward` of an encoder with `width` output channels.
+/// `stage_forward` and `stage_backward` of an encoder with `width` output channels, and `stage_features_grad` for its levels,
+/// which adds `w` times `dy` to the gradients of the entry that begins at parameter `entry`.
 pub fn functions(levels: &[LevelCode], width: usize) -> String {
+    let mut grad =
+        String::from("fn stage_features_grad(entry: u32, w: f32, dy: ptr<function, array<f32, stage_FEATURES>>) {\n");
+    let features = levels.first().map_or(0, |l| l.outputs.len());
+    for f in (0..features).step_by(if features.is_multiple_of(2) { 2 } else { 1 }) {
+        let _ = match features.is_multiple_of(2) {
+            true => writeln!(grad, "    stage_grad_pair(entry + {f}u, w * vec2<f32>((*dy)[{f}], (*dy)[{}]));", f + 1),
+            false => writeln!(grad, "    stage_grad(entry + {f}u, w * (*dy)[{f}]);"),
+        };
+    }
+    grad += "}\n";
     let (mut forward, mut backward) = (String::new(), String::new());
     for (l, LevelCode { value, outputs }) in levels.iter().enumerate() {
         let _ = writeln!(forward, "    let v{l} = stage_level_forward(p, {value});");
@@ -296,5 +307,5 @@ pub fn functions(levels: &[LevelCode], width: usize) -> String {
     let p = "    let p = vec3<f32>((*x)[0], (*x)[1], (*x)[2]);\n";
     let slope = "    (*dx)[0] = slope.x;\n    (*dx)[1] = slope.y;\n    (*dx)[2] = slope.z;\n";
     let backward = format!("{p}    var slope = vec3<f32>(0.0);\n{backward}{slope}");
-    wgsl::functions(3, width, &format!("{p}{forward}"), &backward)
+    grad + &wgsl::functions(3, width, &format!("{p}{forward}"), &backward)
 }

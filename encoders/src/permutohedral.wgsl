@@ -65,9 +65,7 @@ fn stage_level_backward(x: vec3<f32>, level: stage_Level, dy: ptr<function, arra
     var along: array<f32, 4>;
     for (var c = 0u; c < 4u; c++) {
         let entry = stage_entry(level, at, c);
-        for (var f = 0u; f < stage_FEATURES; f++) {
-            stage_grad(entry + f, at.weight[c] * (*dy)[f]);
-        }
+        stage_features_grad(entry, at.weight[c], dy);
         if stage_wants_dx {
             for (var f = 0u; f < stage_FEATURES; f++) {
                 along[c] += stage_param(entry + f) * (*dy)[f];

@@ -138,8 +138,21 @@ struct Description {
 impl Description {
     /// Reads the description `path`: Nikon's or conefield's own, according to its name.
     fn read(path: &Path) -> Result<Self> {
+        refuse_images(path)?;
         if is_xtekct(path) { xtekct::description(path) } else { described(path, FORMAT, VERSION) }
     }
+}
+
+/// Refuses a folder or a file of images in place of the text that describes them.
+fn refuse_images(path: &Path) -> Result<()> {
+    let extension = path.extension().map(|e| e.to_string_lossy().to_lowercase()).unwrap_or_default();
+    let found = match &extension[..] {
+        _ if path.is_dir() => "a folder".to_owned(),
+        "tif" | "tiff" | "npy" | "npz" | "mha" | "h5" | "hdf5" | "nxs" => format!("a .{extension} file of projections"),
+        _ => return Ok(()),
+    };
+    let expected = "a text file that describes the scanner and names its projections (docs/guide/scan-in.md)";
+    Err(Error::invalid(path.display().to_string(), "SCANNER.toml", found, expected))
 }
 
 #[derive(Deserialize)]

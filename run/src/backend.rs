@@ -1,7 +1,7 @@
 //! Selection of the backend.
 
 use conefield_backend_cpu::Cpu;
-use conefield_backend_wgpu::{Limits, Wgpu, adapters};
+use conefield_backend_wgpu::{Wgpu, adapters};
 use conefield_core::Result;
 use conefield_core::backend::{Backend, Executable, Explain};
 use conefield_core::pipeline::Pipeline;
@@ -14,13 +14,12 @@ use std::str::FromStr;
 use std::sync::OnceLock;
 
 /// Help text of `--backend`.
-pub const HELP: &str = "Backend: auto (currently the CPU), cpu, wgpu, or wgpu:N for adapter N; with +subgroups after it, \
-                        gradients of tables are summed within subgroups first";
+pub const HELP: &str = "Backend: auto (the CPU, whose results repeat to the bit), cpu, wgpu, or wgpu:N for adapter N";
 
 /// Value of `--backend`.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
 pub enum BackendChoice {
-    /// The CPU, as long as no GPU has been measured.
+    /// The CPU, whose results repeat to the bit.
     #[default]
     Auto,
     /// Rayon and SIMD.
@@ -29,24 +28,18 @@ pub enum BackendChoice {
     Wgpu {
         /// The adapter's number; otherwise the most capable one.
         index: Option<usize>,
-        /// Whether to sum gradients of tables in subgroups first.
-        subgroups: bool,
     },
 }
 
 impl FromStr for BackendChoice {
     type Err = String;
     fn from_str(s: &str) -> Result<Self, String> {
-        let (name, subgroups) = s.strip_suffix("+subgroups").map_or((s, false), |name| (name, true));
-        match name.split_once(':') {
+        match s.split_once(':') {
             None if s == "auto" => Ok(Self::Auto),
             None if s == "cpu" => Ok(Self::Cpu),
-            None if name == "wgpu" => Ok(Self::Wgpu { index: None, subgroups }),
-            Some(("wgpu", n)) if n.parse::<usize>().is_ok() => Ok(Self::Wgpu { index: n.parse().ok(), subgroups }),
-            _ => {
-                Err("expected auto, cpu, wgpu, or wgpu:N with the number of an adapter; after wgpu also +subgroups"
-                    .into())
-            }
+            None if s == "wgpu" => Ok(Self::Wgpu { index: None }),
+            Some(("wgpu", n)) if n.parse::<usize>().is_ok() => Ok(Self::Wgpu { index: n.parse().ok() }),
+            _ => Err("expected auto, cpu, wgpu, or wgpu:N with the number of an adapter".into()),
         }
     }
 }
@@ -56,10 +49,9 @@ impl fmt::Display for BackendChoice {
         match self {
             Self::Auto => f.write_str("auto"),
             Self::Cpu => f.write_str("cpu"),
-            Self::Wgpu { index, subgroups } => {
+            Self::Wgpu { index } => {
                 f.write_str("wgpu")?;
-                index.map_or(Ok(()), |n| write!(f, ":{n}"))?;
-                f.write_str(if *subgroups { "+subgroups" } else { "" })
+                index.map_or(Ok(()), |n| write!(f, ":{n}"))
             }
         }
     }
@@ -77,14 +69,12 @@ impl BackendChoice {
         Ok(match self {
             Self::Auto => Box::<Auto>::default(),
             Self::Cpu => Box::new(Cpu::new()),
-            Self::Wgpu { index, subgroups } => {
-                Box::new(Wgpu::with_limits(index, Limits { subgroups, ..Limits::default() })?)
-            }
+            Self::Wgpu { index } => Box::new(Wgpu::open(index)?),
         })
     }
 }
 
-/// The CPU, with a hint about available GPUs: none has been measured yet, so the faster one is unknown.
+/// The CPU, with a hint about available GPUs, which are faster but whose results do not repeat to the bit.
 #[derive(Default)]
 struct Auto {
     cpu: Cpu,
@@ -102,7 +92,7 @@ impl Auto {
         };
         match self.gpu.get_or_init(look) {
             None => "chosen by --backend auto, which takes the CPU; no GPU is available".to_owned(),
-            Some(gpu) => format!("chosen by --backend auto, which takes the CPU until a GPU has been measured; {gpu}"),
+            Some(gpu) => format!("chosen by --backend auto, which takes the CPU; {gpu}"),
         }
     }
 }

@@ -57,15 +57,17 @@ pub fn upload(shared: &Shared, buffers: &Buffers, chain: &Chain, arena: &Arena) 
             }
         }
     }
-    refresh(shared, buffers, chain)
+    let mut encoder = gpu.device.create_command_encoder(&Default::default());
+    refresh(shared, buffers, chain, &mut encoder)?;
+    gpu.queue.submit([encoder.finish()]);
+    gpu.fault()
 }
 
 /// Makes the copies anew that parameters are read from: of those that every row reads in the uniform buffer, of tables
 /// in halves.
-pub fn refresh(shared: &Shared, buffers: &Buffers, chain: &Chain) -> Result<()> {
+pub fn refresh(shared: &Shared, buffers: &Buffers, chain: &Chain, encoder: &mut wgpu::CommandEncoder) -> Result<()> {
     let (gpu, size) = (&shared.gpu, shared.target().segment);
-    let mut encoder = gpu.device.create_command_encoder(&Default::default());
-    copy_dense(buffers, chain, &mut encoder, size);
+    copy_dense(buffers, chain, encoder, size);
     if let Some(tables) = chain.halves() {
         let kernel = shared.kernels.get(gpu, "halve", &compose::halve(tables))?;
         for s in 0..chain.segments() {
@@ -76,8 +78,7 @@ pub fn refresh(shared: &Shared, buffers: &Buffers, chain: &Chain) -> Result<()> 
             kernel.launch(&mut encoder.begin_compute_pass(&Default::default()), &bound, groups);
         }
     }
-    gpu.queue.submit([encoder.finish()]);
-    gpu.fault()
+    Ok(())
 }
 
 fn copy_dense(buffers: &Buffers, chain: &Chain, encoder: &mut wgpu::CommandEncoder, size: usize) {

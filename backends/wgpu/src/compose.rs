@@ -2,9 +2,10 @@
 //!
 //! Rows go through a kernel one an invocation, 64 to a group. `forward` takes them from the encoder to μ and keeps the
 //! features of an encoder with parameters, which are dear to compute again; `backward` starts from these, runs what lies
-//! between once more, and goes back. Sums over rows are taken within a group and added to the group's own partial sums,
-//! which `merge` adds up; scattered gradients are added where they belong at once. Samples of rays that weigh 0 are passed
-//! over, and by `backward` all 64 of a group where none has a derivative.
+//! between once more, and goes back as far as the features; `scatter` goes from there to the encoder's tables. Sums over rows
+//! are taken within a group and added to the group's own partial sums, which `merge` adds up; scattered gradients are added
+//! where they belong at once. Samples of rays that weigh 0 are passed over, and by `backward` all 64 of a group where none
+//! has a derivative.
 
 use crate::device::Atomics;
 use crate::source::{Access, Source};
@@ -20,6 +21,9 @@ use std::ops::Range;
 
 /// Rows of a group.
 pub const GROUP: u32 = 64;
+
+/// Groups whose partial sums one invocation of `merge` adds up.
+const MERGED: usize = 32;
 
 /// What of the device the text of kernels depends on.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -181,7 +185,7 @@ impl Chain {
 
     fn declare(&self, source: &mut Source, gradients: bool) {
         for s in 0..self.segments() {
-            source.bind(&format!("params_{s}"), Access::Read, "array<f32>");
+            source.bind(&format!("params_{s}"), Access::Read, "array<vec2<f32>>");
         }
         if self.halves().is_some() {
             for s in 0..self.segments() {
@@ -192,7 +196,8 @@ impl Chain {
             source.bind("dense", Access::Uniform, &format!("array<vec4<f32>, {}>", self.dense.div_ceil(4)));
         }
         let mut text = String::from("fn arena_param(i: u32) -> f32 {\n");
-        self.each_segment(&mut text, |s, i| format!("return params_{s}[{i}];"));
+        // One number at a time: on an H200, reading both of a pair took twice as long.
+        self.each_segment(&mut text, |s, i| format!("let at = {i}; return params_{s}[at >> 1u][at & 1u];"));
         text += "    return 0.0;\n}\n";
         if let Some(tables) = self.halves() {
             text += "fn arena_half(i: u32) -> f32 {\n";
@@ -245,33 +250,45 @@ impl Chain {
 fn {prefix}param(i: u32) -> f32 {{ return {param}; }}
 "
         );
-        // A kernel that only goes forward has no place for gradients; what adds to them is there, and does nothing.
-        let add = match (gradients, partial) {
-            (false, _) => String::new(),
-            (true, None) => format!("arena_grad({first}u + i, v);"),
-            (true, Some(offset)) => format!("partial[group * {}u + {offset}u + i] += v;", self.dense),
-        };
         let scattered = if gradients { format!("arena_scatter({first}u + i, v);") } else { String::new() };
-        let _ = write!(
-            text,
-            "fn {prefix}grad(i: u32, v: f32) {{ {scattered} }}
-fn {prefix}accumulate(i: u32, v: f32) {{ {add} }}
-"
-        );
-        for sum in fragment.sums() {
-            match (sum, gradients) {
-                (Sum::Vector(m), true) => text += &vector(prefix, m),
-                (Sum::Outer(m, k), true) => text += &outer(prefix, m, k),
-                (Sum::Vector(m), false) => {
-                    let _ = writeln!(text, "fn {prefix}sum_{m}(at: u32, a: ptr<function, array<f32, {m}>>) {{}}");
-                }
-                (Sum::Outer(m, k), false) => {
-                    let _ = writeln!(
-                        text,
-                        "fn {prefix}outer_{m}_{k}(at: u32, ld: u32, a: ptr<function, array<f32, {m}>>, b: ptr<function, array<f32, {k}>>) {{}}"
-                    );
-                }
+        let _ = writeln!(text, "fn {prefix}grad(i: u32, v: f32) {{ {scattered} }}");
+        text += &match (gradients, first.is_multiple_of(2)) {
+            (true, true) => {
+                format!("fn {prefix}grad_pair(i: u32, v: vec2<f32>) {{ arena_scatter_pair({first}u + i, v); }}\n")
             }
+            // Pairs stand at even places of the arena.
+            _ => wgsl::one_by_one(prefix),
+        };
+        let sums = fragment.sums();
+        if gradients && !sums.is_empty() {
+            // The sum so far, and that with what a group adds.
+            let (so_far, store) = match partial {
+                None => ("0.0".to_owned(), format!("arena_grad({first}u + i, v);")),
+                Some(offset) => {
+                    let at = format!("partial[group * {}u + {offset}u + i]", self.dense);
+                    (at.clone(), format!("{at} = before + v;"))
+                }
+            };
+            let _ = write!(
+                text,
+                "fn {prefix}so_far(i: u32) -> f32 {{ return {so_far}; }}
+fn {prefix}store(i: u32, before: f32, v: f32) {{ {store} }}
+"
+            );
+        }
+        for sum in sums {
+            text += &match (sum, gradients) {
+                (Sum::Vector(m), true) => vector(prefix, m),
+                (Sum::Outer(1, k), true) => row_outer(prefix, k),
+                (Sum::Outer(m, k), true) => outer(prefix, m, k),
+                // A kernel that only goes forward has no place for gradients.
+                (Sum::Vector(m), false) => {
+                    format!("fn {prefix}sum_{m}(at: u32, a: ptr<function, array<f32, {m}>>) {{}}\n")
+                }
+                (Sum::Outer(m, k), false) => format!(
+                    "fn {prefix}outer_{m}_{k}(at: u32, ld: u32, a: ptr<function, array<f32, {m}>>, b: ptr<function, array<f32, {k}>>) {{}}\n"
+                ),
+            };
         }
         source.add(&format!("what the host gives {name}"), &text);
         source.add(name, &fragment.named(prefix));
@@ -313,10 +330,9 @@ fn {prefix}accumulate(i: u32, v: f32) {{ {add} }}
                 i + 1
             );
             if i == 0 && keep > 0 {
-                let _ = writeln!(
-                    body,
-                    "        for (var c = 0u; c < {keep}u; c++) {{ features[c * step.stride + row] = x1[c]; }}"
-                );
+                for c in 0..keep {
+                    let _ = writeln!(body, "        features[{c}u * step.stride + row] = x1[{c}];");
+                }
             }
         }
         let _ = writeln!(body, "        mu[row] = x{}[0];", self.links.len());
@@ -356,12 +372,13 @@ fn {prefix}accumulate(i: u32, v: f32) {{ {add} }}
         source.bind("dmu", Access::Read, "array<f32>");
         let kept = self.kept();
         if kept > 0 {
-            source.bind("features", Access::Read, "array<f32>");
+            let access = if self.scatters() { Access::Write } else { Access::Read };
+            source.bind("features", access, "array<f32>");
         }
         self.sums(&mut source);
         self.declare(&mut source, true);
-        self.scatter(&mut source);
-        self.links.iter().for_each(|l| self.include(&mut source, l, true));
+        self.additions(&mut source);
+        self.links.iter().skip(usize::from(self.scatters())).for_each(|l| self.include(&mut source, l, true));
         let n = self.links.len();
         let mut body = String::from(
             "        var at = vec4<f32>();
@@ -377,7 +394,10 @@ fn {prefix}accumulate(i: u32, v: f32) {{ {add} }}
             if i == 0 && kept > 0 {
                 let _ = writeln!(
                     body,
-                    "        if live {{ for (var c = 0u; c < {kept}u; c++) {{ x1[c] = features[c * step.stride + row]; }} }}"
+                    "        if live {{\n{}        }}",
+                    (0..kept)
+                        .map(|c| format!("            x1[{c}] = features[{c}u * step.stride + row];\n"))
+                        .collect::<String>()
                 );
             } else {
                 let _ = writeln!(body, "        {}forward(&x{i}, &x{});", l.prefix, i + 1);
@@ -385,14 +405,64 @@ fn {prefix}accumulate(i: u32, v: f32) {{ {add} }}
         }
         let _ = writeln!(body, "        var d{n} = array<f32, 1>(d);");
         self.back(&mut body);
+        if self.scatters() {
+            body += "        if live {\n";
+            for c in 0..kept {
+                let _ = writeln!(body, "            features[{c}u * step.stride + row] = d1[{c}];");
+            }
+            body += "        }\n";
+        }
         source.add("any", include_str!("kernels/any.wgsl"));
-        source.add("backward", &groups(&body));
+        source.add("backward", &self.groups(&body));
+        source
+    }
+
+    /// Whether the encoder's gradients are a kernel of their own, to which `backward` hands the derivatives by the features in
+    /// place of these: it takes few registers, so that more of its rows wait for memory at the same time.
+    pub fn scatters(&self) -> bool {
+        let scattered = |l: &Link| l.info.grads == GradKind::Scatter && l.fragment.sums().is_empty();
+        self.kept() > 0 && self.links.len() > 1 && self.links.first().is_some_and(scattered)
+    }
+
+    /// From derivatives by the features to the encoder's gradients.
+    pub fn scatter(&self) -> Source {
+        let mut source = Source::default();
+        Self::step(&mut source);
+        source.bind("samples", Access::Read, "array<vec4<f32>>");
+        source.bind("dmu", Access::Read, "array<f32>");
+        source.bind("features", Access::Read, "array<f32>");
+        source.add("rows", "var<private> lane: u32;\nvar<private> group: u32;");
+        self.declare(&mut source, true);
+        self.additions(&mut source);
+        let l = &self.links[0];
+        self.include(&mut source, l, true);
+        let kept = self.kept();
+        let mut body = format!(
+            "        var at = vec4<f32>();
+        var d: array<f32, {kept}>;
+        if row < step.rows && dmu[row] != 0.0 {{
+            at = samples[row];
+"
+        );
+        for c in 0..kept {
+            let _ = writeln!(body, "            d[{c}] = features[{c}u * step.stride + row];");
+        }
+        let _ = write!(
+            body,
+            "        }}
+        var x0 = array<f32, 3>(at.x, at.y, at.z);
+        var dx: array<f32, 3>;
+        {}backward(&x0, &d, &dx);
+",
+            l.prefix
+        );
+        source.add("scatter", &self.groups(&body));
         source
     }
 
     /// Calls of `backward`, from the last link as far as there are parameters.
     fn back(&self, body: &mut String) {
-        for (i, l) in self.links.iter().enumerate().rev() {
+        for (i, l) in self.links.iter().enumerate().skip(usize::from(self.scatters())).rev() {
             if l.info.params == 0 && !l.wants_dx {
                 break;
             }
@@ -414,17 +484,59 @@ fn {prefix}accumulate(i: u32, v: f32) {{ {add} }}
         source.add("sums", include_str!("kernels/sums.wgsl"));
     }
 
+    /// A kernel whose groups take 64 rows at a time, together; rows past the end are there too.
+    fn groups(&self, body: &str) -> String {
+        let (builtins, begin) = match self.together() {
+            true => (
+                "\n    @builtin(subgroup_invocation_id) within: u32,\n    @builtin(subgroup_size) size: u32,",
+                "    together_lane = within;\n    together_size = size;\n",
+            ),
+            false => ("", ""),
+        };
+        format!(
+            "@compute @workgroup_size(64)
+fn main(
+    @builtin(workgroup_id) id: vec3<u32>,
+    @builtin(num_workgroups) all: vec3<u32>,
+    @builtin(local_invocation_index) index: u32,{builtins}
+) {{
+    lane = index;
+    group = id.x;
+{begin}    let pieces = (step.rows + 63u) / 64u;
+    for (var piece = id.x; piece < pieces; piece += all.x) {{
+        let row = piece * 64u + index;
+{body}    }}
+}}
+"
+        )
+    }
+
     /// How rows add to the arena's gradients.
-    fn scatter(&self, source: &mut Source) {
-        let alone = "fn arena_scatter(i: u32, v: f32) { arena_grad(i, v); }";
-        let text = if self.target.subgroups { include_str!("kernels/together.wgsl") } else { alone };
+    fn additions(&self, source: &mut Source) {
+        let text = match self.together() {
+            true => include_str!("kernels/together.wgsl"),
+            false => {
+                "fn arena_scatter(i: u32, v: f32) { arena_grad(i, v); }
+fn arena_scatter_pair(i: u32, v: vec2<f32>) { arena_grad(i, v.x); arena_grad(i + 1u, v.y); }"
+            }
+        };
         source.add("scattered gradients", text);
+    }
+
+    /// Whether lanes of a subgroup add up first what goes to the same entry. They do it together, which a plugin's stage may
+    /// call from a branch that some take.
+    pub fn together(&self) -> bool {
+        self.target.subgroups && !self.links.iter().any(|l| l.fragment.source.contains(wgsl::FOREIGN))
+    }
+
+    /// Groups of `merge` for the sums of `groups` groups.
+    pub fn merging(&self, groups: usize) -> usize {
+        self.dense.div_ceil(GROUP as usize) * groups.div_ceil(MERGED)
     }
 
     /// Adds all groups' partial sums to the arena's gradients.
     pub fn merge(&self) -> Source {
         let mut source = Source::default();
-        Self::step(&mut source);
         source.bind("partial", Access::Read, "array<f32>");
         self.declare(&mut source, true);
         let mut text = String::from("fn arena_index(i: u32) -> u32 {\n");
@@ -434,19 +546,29 @@ fn {prefix}accumulate(i: u32, v: f32) {{ {add} }}
                 let _ = writeln!(text, "    if i < {end}u {{ return {first}u + i - {offset}u; }}");
             }
         }
-        let dense = self.dense;
+        let (dense, blocks) = (self.dense, self.dense.div_ceil(GROUP as usize));
         let _ = write!(
             text,
             "    return 0u;
 }}
 
-// `step.rows` is the number of groups.
+// Each invocation adds up the sums of {MERGED} groups.
 @compute @workgroup_size(64)
-fn main(@builtin(global_invocation_id) id: vec3<u32>) {{
-    if id.x >= {dense}u {{ return; }}
-    var sum = 0.0;
-    for (var g = 0u; g < step.rows; g++) {{ sum += partial[g * {dense}u + id.x]; }}
-    arena_grad(arena_index(id.x), sum);
+fn main(
+    @builtin(workgroup_id) id: vec3<u32>,
+    @builtin(num_workgroups) all: vec3<u32>,
+    @builtin(local_invocation_index) lane: u32,
+) {{
+    let summed = arrayLength(&partial) / {dense}u;
+    let pieces = {blocks}u * ((summed + {MERGED}u - 1u) / {MERGED}u);
+    for (var piece = id.x; piece < pieces; piece += all.x) {{
+        let i = (piece % {blocks}u) * 64u + lane;
+        if i >= {dense}u {{ continue; }}
+        let first = piece / {blocks}u * {MERGED}u;
+        var sum = 0.0;
+        for (var g = first; g < min(first + {MERGED}u, summed); g++) {{ sum += partial[g * {dense}u + i]; }}
+        arena_grad(arena_index(i), sum);
+    }}
 }}
 "
         );
@@ -488,13 +610,13 @@ fn main(@builtin(global_invocation_id) id: vec3<u32>) {{
         }
         self.sums(&mut source);
         self.declare(&mut source, true);
-        self.scatter(&mut source);
+        self.additions(&mut source);
         let l = &self.links[0];
         self.include(&mut source, l, true);
         let Info { input, output, .. } = l.info;
         source.add(
             "backward",
-            &groups(&format!(
+            &self.groups(&format!(
                 "        let live = row < step.rows;
         var x0: array<f32, {input}>;
         var d1: array<f32, {output}>;
@@ -525,76 +647,97 @@ fn main(@builtin(global_invocation_id) id: vec3<u32>, @builtin(num_workgroups) g
     )
 }
 
-/// A kernel whose groups take 64 rows at a time, together; rows past the end are there too.
-fn groups(body: &str) -> String {
-    format!(
-        "@compute @workgroup_size(64)
-fn main(
-    @builtin(workgroup_id) id: vec3<u32>,
-    @builtin(num_workgroups) all: vec3<u32>,
-    @builtin(local_invocation_index) index: u32,
-) {{
-    lane = index;
-    group = id.x;
-    let pieces = (step.rows + 63u) / 64u;
-    for (var piece = id.x; piece < pieces; piece += all.x) {{
-        let row = piece * 64u + index;
-{body}    }}
-}}
-"
-    )
+/// Lines that hand 32 channels of `name`, from `first` on, over to the group, with a factor; channels past `count` are 0.
+fn hand_over(side: &str, name: &str, factor: &str, first: usize, count: usize) -> String {
+    let channel = |c: usize| if c < count { format!("(*{name})[{c}]{factor}") } else { "0.0".into() };
+    let mut text = String::new();
+    for quad in 0..8 {
+        let c = first + 4 * quad;
+        if c < count {
+            let of = [c, c + 1, c + 2, c + 3].map(channel).join(", ");
+            let _ = writeln!(text, "    {side}[sums_place(lane, {quad}u)] = vec4<f32>({of});");
+        }
+    }
+    text
 }
 
 /// Adds the sums of `m` channels over the rows of a group.
 fn vector(prefix: &str, m: usize) -> String {
+    let lines = sums_of(prefix, "a", "", m);
+    format!("fn {prefix}sum_{m}(at: u32, a: ptr<function, array<f32, {m}>>) {{\n{lines}}}\n")
+}
+
+/// Adds the sums of the products of one and `k` channels over the rows of a group.
+fn row_outer(prefix: &str, k: usize) -> String {
+    let lines = sums_of(prefix, "b", " * (*a)[0]", k);
     format!(
-        "fn {prefix}sum_{m}(at: u32, a: ptr<function, array<f32, {m}>>) {{
-    for (var first = 0u; first < {m}u; first += 32u) {{
-        workgroupBarrier();
-        for (var c = 0u; c < 32u; c++) {{
-            if first + c < {m}u {{ left[sums_place(lane, c)] = (*a)[first + c]; }}
-        }}
-        workgroupBarrier();
-        let sum = sums_channel();
-        if lane < 32u && first + lane < {m}u {{ {prefix}accumulate(at + first + lane, sum); }}
-    }}
-}}
+        "fn {prefix}outer_1_{k}(at: u32, ld: u32, a: ptr<function, array<f32, 1>>, b: ptr<function, array<f32, {k}>>) {{
+{lines}}}
 "
     )
 }
 
+/// Lines that add the sums of `count` channels of `name`, each times `factor`.
+fn sums_of(prefix: &str, name: &str, factor: &str, count: usize) -> String {
+    let mut text = String::new();
+    for first in (0..count).step_by(32) {
+        let put = hand_over("left", name, factor, first, count);
+        let _ = write!(
+            text,
+            "    workgroupBarrier();
+{put}    workgroupBarrier();
+    let sum{first} = sums_channel();
+    if lane < 32u && {first}u + lane < {count}u {{
+        {prefix}store(at + {first}u + lane, {prefix}so_far(at + {first}u + lane), sum{first});
+    }}
+"
+        );
+    }
+    text
+}
+
 /// Adds the sums of all products of `m` and `k` channels over the rows of a group.
 fn outer(prefix: &str, m: usize, k: usize) -> String {
-    format!(
+    let mut text = format!(
         "fn {prefix}outer_{m}_{k}(at: u32, ld: u32, a: ptr<function, array<f32, {m}>>, b: ptr<function, array<f32, {k}>>) {{
-    let j = (lane >> 3u) * 4u;
-    let c = (lane & 7u) * 4u;
-    for (var top = 0u; top < {m}u; top += 32u) {{
-        workgroupBarrier();
-        for (var i = 0u; i < 32u; i++) {{
-            if top + i < {m}u {{ left[sums_place(lane, i)] = (*a)[top + i]; }}
-        }}
-        for (var side = 0u; side < {k}u; side += 32u) {{
-            workgroupBarrier();
-            for (var i = 0u; i < 32u; i++) {{
-                if side + i < {k}u {{ right[sums_place(lane, i)] = (*b)[side + i]; }}
-            }}
-            workgroupBarrier();
-            if top + j < {m}u && side + c < {k}u {{
-                let block = sums_block(j, c);
-                for (var p = 0u; p < 4u; p++) {{
-                    for (var q = 0u; q < 4u; q++) {{
-                        if top + j + p < {m}u && side + c + q < {k}u {{
-                            {prefix}accumulate(at + (top + j + p) * ld + side + c + q, block[p][q]);
-                        }}
-                    }}
-                }}
-            }}
-        }}
-    }}
-}}
+    let j = lane >> 3u;
+    let c = lane & 7u;
 "
-    )
+    );
+    for top in (0..m).step_by(32) {
+        for side in (0..k).step_by(32) {
+            let put = if side == 0 { hand_over("left", "a", "", top, m) } else { String::new() };
+            let other = hand_over("right", "b", "", side, k);
+            let _ = write!(
+                text,
+                "    workgroupBarrier();
+{put}{other}    workgroupBarrier();
+    if {top}u + 4u * j < {m}u && {side}u + 4u * c < {k}u {{
+        let block = sums_block(j, c);
+        let begin = at + ({top}u + 4u * j) * ld + {side}u + 4u * c;
+"
+            );
+            let block = || (0..4).flat_map(|p| (0..4).map(move |q| (p, q)));
+            let at = |p, q| format!("begin + {p}u * ld + {q}u");
+            // All are read before the first is written: otherwise each waits for the one before.
+            for (p, q) in block() {
+                let _ = writeln!(text, "        let v{p}{q} = {prefix}so_far({});", at(p, q));
+            }
+            for (p, q) in block() {
+                let store = format!("{prefix}store({}, v{p}{q}, block[{p}][{q}]);", at(p, q));
+                // A block at the edge has too many.
+                let rows = (p > (m - 1) % 4).then(|| format!("{top}u + 4u * j + {p}u < {m}u"));
+                let columns = (q > (k - 1) % 4).then(|| format!("{side}u + 4u * c + {q}u < {k}u"));
+                let within: Vec<String> = rows.into_iter().chain(columns).collect();
+                let _ = match within.is_empty() {
+                    true => writeln!(text, "        {store}"),
+                    false => writeln!(text, "        if {} {{ {store} }}", within.join(" && ")),
+                };
+            }
+            text += "    }\n";
+        }
+    }
+    text + "}\n"
 }
 
 /// Samples of rays.

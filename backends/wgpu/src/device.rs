@@ -159,7 +159,7 @@ pub fn adapters() -> Vec<Adapter> {
     found().iter().enumerate().map(|(i, a)| Adapter::of(i, a)).collect()
 }
 
-/// What may be set otherwise than an adapter's defaults: less than it offers, to try what others have to do, and more.
+/// What a device is to do without, to try what others have to do, and whether to time it.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
 pub struct Limits {
     /// Sums of scattered gradients by compare and exchange, even where the device adds by itself.
@@ -168,8 +168,8 @@ pub struct Limits {
     pub binding_bytes: Option<u64>,
     /// Bytes of the largest uniform buffer, if fewer than the device allows.
     pub uniform_bytes: Option<u64>,
-    /// Lanes of a subgroup add up first what goes to the same entry. Refused where the device has no subgroup operations.
-    pub subgroups: bool,
+    /// No subgroup operations, even where the device has them.
+    pub no_subgroups: bool,
     /// Time every kernel, where the device has timestamps; every call then waits for the device.
     pub profile: bool,
 }
@@ -204,9 +204,8 @@ impl Gpu {
                 }
             });
         };
-        if limits.subgroups && adapter.subgroups.is_none() {
-            let found = "an adapter without subgroup operations";
-            return Err(Error::invalid("--backend", "subgroups", format!("{found}: {adapter}"), "one that has them"));
+        if limits.no_subgroups {
+            adapter.subgroups = None;
         }
         if limits.compare_exchange {
             adapter.atomics = Atomics::CompareExchange;

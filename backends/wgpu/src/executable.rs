@@ -22,8 +22,9 @@ use wgpu::BufferUsages as U;
 
 /// Bytes that all groups' partial sums may take together.
 const PARTIAL_BYTES: usize = 64 << 20;
-/// Groups of `backward` at most: enough to fill a device, few enough that their sums are merged fast.
-const BACKWARD_GROUPS: usize = 2048;
+/// Groups of `backward` at most, on a software device and on others: enough to fill it, few enough that their sums are merged
+/// fast.
+const BACKWARD_GROUPS: [usize; 2] = [64, 4096];
 /// Rows of a wave at first, at least, and at most.
 const FIRST_ROWS: u32 = 1 << 14;
 const LEAST_ROWS: u32 = 1 << 12;
@@ -87,6 +88,9 @@ impl Kernels {
         }
         if chain.learns() {
             kernels.add(shared, "backward", chain.backward())?;
+        }
+        if chain.scatters() {
+            kernels.add(shared, "scatter", chain.scatter())?;
         }
         if chain.dense > 0 {
             kernels.add(shared, "merge", chain.merge())?;
@@ -162,7 +166,8 @@ impl Wgpu {
     /// Groups of `backward`.
     fn groups(&self) -> usize {
         let each = 4 * self.chain.dense.max(1);
-        (PARTIAL_BYTES / each).clamp(1, BACKWARD_GROUPS)
+        let most = BACKWARD_GROUPS[usize::from(!self.gpu().adapter.software)];
+        (PARTIAL_BYTES / each).clamp(1, most)
     }
 
     fn gpu(&self) -> &Gpu {
@@ -179,7 +184,10 @@ impl Wgpu {
         arena::allocate(&shared.gpu, &mut self.buffers, &self.chain, params, size)?;
         arena::upload(&shared, &self.buffers, &self.chain, &model.arena)?;
         self.buffers.reserve(&shared.gpu, "step", size_of::<Step>() as u64, U::UNIFORM | U::COPY_DST)?;
-        self.buffers.reserve(&shared.gpu, "rule", size_of::<Rule>() as u64, U::UNIFORM | U::COPY_DST)?;
+        for s in 0..self.chain.segments() {
+            let name = format!("rule_{s}");
+            self.buffers.reserve(&shared.gpu, &name, size_of::<Rule>() as u64, U::UNIFORM | U::COPY_DST)?;
+        }
         if self.chain.dense > 0 {
             let bytes = 4 * (self.groups() * self.chain.dense) as u64;
             self.buffers.reserve(&shared.gpu, "partial", bytes, U::STORAGE | U::COPY_DST)?;
@@ -345,7 +353,7 @@ impl Wgpu {
     }
 
     /// The kernels of one wave of a step.
-    fn learn(&mut self, wave: &Wave, work: &Work<'_>, sums: u64) -> Result<()> {
+    fn learn(&mut self, encoder: &mut wgpu::CommandEncoder, wave: &Wave, work: &Work<'_>, sums: u64) -> Result<()> {
         self.place(wave)?;
         let mut step = Step {
             rows: wave.rows,
@@ -382,9 +390,9 @@ impl Wgpu {
         self.write("step", bytemuck::bytes_of(&step))?;
         let groups = |rows: usize| rows.div_ceil(GROUP as usize);
         let backward = if self.chain.learns() { groups(wave.rows as usize).min(self.groups()) } else { 0 };
-        let mut encoder = self.encoder();
+        let scatter = if self.chain.scatters() { groups(wave.rows as usize) } else { 0 };
         self.launch(
-            &mut encoder,
+            encoder,
             &[
                 ("sample", groups(wave.ray_rows as usize)),
                 ("blocks", groups(block_rows)),
@@ -393,11 +401,10 @@ impl Wgpu {
                 (OF_POINTS, groups(wave.points.len())),
                 (&of_blocks(wave.prior), wave.blocks.len()),
                 ("backward", backward),
+                ("scatter", scatter),
             ],
         )?;
-        self.copy(&mut encoder, "losses", 4 * wave.losses() as u64, sums)?;
-        self.gpu().queue.submit([encoder.finish()]);
-        Ok(())
+        self.copy(encoder, "losses", 4 * wave.losses() as u64, sums)
     }
 }
 
@@ -430,31 +437,31 @@ impl Executable for Wgpu {
         self.learn_by(work)?;
         self.load(model)?;
         let started = Instant::now();
-        if !self.clean || self.chain.dense > 0 {
-            let mut encoder = self.encoder();
-            if !self.clean {
-                for s in 0..self.chain.segments() {
-                    self.buffers.get(&format!("grads_{s}")).inspect(|b| encoder.clear_buffer(b, 0, None));
-                }
+        let mut encoder = self.encoder();
+        if !self.clean {
+            for s in 0..self.chain.segments() {
+                self.buffers.get(&format!("grads_{s}")).inspect(|b| encoder.clear_buffer(b, 0, None));
             }
-            self.buffers.get("partial").inspect(|b| encoder.clear_buffer(b, 0, None));
-            self.gpu().queue.submit([encoder.finish()]);
         }
+        self.buffers.get("partial").inspect(|b| encoder.clear_buffer(b, 0, None));
         self.clean = false;
         let waves = wave::of_step(model.pipeline.projector.as_ref(), work, self.pace.size());
         let losses: usize = waves.iter().map(Wave::losses).sum();
         self.reserve("staging", 4 * losses.max(1) as u64, U::MAP_READ | U::COPY_DST)?;
         let mut at = 0;
-        for wave in &waves {
-            self.learn(wave, work, at)?;
+        for (i, wave) in waves.iter().enumerate() {
+            if i > 0 {
+                // What the host writes for this wave replaces that of the last one.
+                let last = std::mem::replace(&mut encoder, self.encoder());
+                self.gpu().queue.submit([last.finish()]);
+            }
+            self.learn(&mut encoder, wave, work, at)?;
             at += 4 * wave.losses() as u64;
         }
         if self.chain.dense > 0 {
-            self.write("step", bytemuck::bytes_of(&Step { rows: self.groups() as u32, ..Step::default() }))?;
-            let mut encoder = self.encoder();
-            self.launch(&mut encoder, &[("merge", self.chain.dense.div_ceil(GROUP as usize))])?;
-            self.gpu().queue.submit([encoder.finish()]);
+            self.launch(&mut encoder, &[("merge", self.chain.merging(self.groups()))])?;
         }
+        self.gpu().queue.submit([encoder.finish()]);
         let mut stats = StepStats { samples: waves.iter().map(|w| u64::from(w.rows)).sum(), ..StepStats::default() };
         let [ray_scale, point_scale] = [work.rays.len(), work.points.len()].map(|n| 1.0 / n.max(1) as f64);
         self.read(at, |bytes| {
@@ -479,6 +486,7 @@ impl Executable for Wgpu {
         let (bias1, bias2) = (1.0 - adam.beta1.powf(adam.step as f64), 1.0 - adam.beta2.powf(adam.step as f64));
         let size = self.shared.target().segment;
         let kernel = self.kernel("adam")?;
+        let mut encoder = self.encoder();
         for s in 0..self.chain.segments() {
             let count = arena::segment(&self.chain, s, model.arena.params.len(), size).len();
             let rule = Rule {
@@ -491,23 +499,21 @@ impl Executable for Wgpu {
                 root: (1.0 / bias2.sqrt()) as f32,
                 eps: adam.eps as f32,
             };
-            self.write("rule", bytemuck::bytes_of(&rule))?;
-            let names: Vec<(&str, String)> = arena::PARTS.iter().map(|p| (*p, format!("{p}_{s}"))).collect();
+            self.write(&format!("rule_{s}"), bytemuck::bytes_of(&rule))?;
+            let own = arena::PARTS.iter().chain(["rule"].iter());
+            let names: Vec<(&str, String)> = own.map(|p| (*p, format!("{p}_{s}"))).collect();
             let find = |name: &str| {
                 let own = names.iter().find(|(part, _)| *part == name).map_or(name, |(_, own)| own);
                 self.buffers.get(own)
             };
             let bound = kernel.bind_as(&self.shared.gpu, find)?;
-            let mut encoder = self.encoder();
-            {
-                let timestamp_writes = self.profile.as_mut().and_then(|p| p.around("adam"));
-                let mut pass =
-                    encoder.begin_compute_pass(&wgpu::ComputePassDescriptor { label: Some("adam"), timestamp_writes });
-                kernel.launch(&mut pass, &bound, count.div_ceil(256).clamp(1, MOST_GROUPS) as u32);
-            }
-            self.gpu().queue.submit([encoder.finish()]);
+            let timestamp_writes = self.profile.as_mut().and_then(|p| p.around("adam"));
+            let mut pass =
+                encoder.begin_compute_pass(&wgpu::ComputePassDescriptor { label: Some("adam"), timestamp_writes });
+            kernel.launch(&mut pass, &bound, count.div_ceil(256).clamp(1, MOST_GROUPS) as u32);
         }
-        arena::refresh(&self.shared, &self.buffers, &self.chain)?;
+        arena::refresh(&self.shared, &self.buffers, &self.chain, &mut encoder)?;
+        self.gpu().queue.submit([encoder.finish()]);
         self.clean = true;
         self.collect()?;
         self.gpu().fault()

@@ -3,6 +3,7 @@
 use crate::device::Gpu;
 use crate::source::{Access, Source};
 use conefield_core::error::{Error, Result};
+use conefield_core::wgsl::FOREIGN;
 use std::collections::HashMap;
 use std::sync::{Arc, Mutex, PoisonError};
 use std::time::Instant;
@@ -65,10 +66,14 @@ fn compile(gpu: &Gpu, label: &str, source: &Source) -> Result<Kernel> {
     };
     let entries: Vec<_> = source.bindings().iter().map(|b| b.access).enumerate().map(entry).collect();
     let (pipeline, layout) = gpu.checked(&format!("kernel {label}"), || {
-        let module = gpu.device.create_shader_module(wgpu::ShaderModuleDescriptor {
-            label: Some(label),
-            source: wgpu::ShaderSource::Wgsl(source.text().into()),
-        });
+        let descriptor =
+            wgpu::ShaderModuleDescriptor { label: Some(label), source: wgpu::ShaderSource::Wgsl(source.text().into()) };
+        let mut checks = wgpu::ShaderRuntimeChecks::checked();
+        // A counter in each loop keeps compilers from unrolling it.
+        checks.force_loop_bounding = source.text().contains(FOREIGN);
+        // SAFETY: all other checks stay, and every loop of the program's own WGSL ends.
+        #[expect(unsafe_code, reason = "wgpu asks for it where a check is left out")]
+        let module = unsafe { gpu.device.create_shader_module_trusted(descriptor, checks) };
         let layout = gpu
             .device
             .create_bind_group_layout(&wgpu::BindGroupLayoutDescriptor { label: Some(label), entries: &entries });

@@ -51,8 +51,6 @@ pub struct Shared {
     pub gpu: Gpu,
     /// Kernels by their text.
     pub kernels: Cache,
-    /// Whether lanes of a subgroup add up first what goes to the same entry.
-    pub subgroups: bool,
     /// Whether executables time their kernels.
     pub profile: bool,
 }
@@ -64,7 +62,7 @@ impl Shared {
         let bytes = adapter.bound_bytes();
         Target {
             atomics: adapter.atomics,
-            subgroups: self.subgroups,
+            subgroups: adapter.subgroups.is_some(),
             segment: ((bytes / 4) as usize / 64 * 64).max(64),
             uniform_bytes: adapter.uniform_bytes as usize,
         }
@@ -80,8 +78,7 @@ impl Wgpu {
     /// The same, set otherwise than the adapter's defaults.
     pub fn with_limits(index: Option<usize>, limits: Limits) -> Result<Self> {
         let gpu = Gpu::open(index, limits)?;
-        let Limits { subgroups, profile, .. } = limits;
-        Ok(Self { shared: Arc::new(Shared { gpu, kernels: Cache::default(), subgroups, profile }) })
+        Ok(Self { shared: Arc::new(Shared { gpu, kernels: Cache::default(), profile: limits.profile }) })
     }
 
     /// The device.
@@ -121,17 +118,18 @@ impl Backend for Wgpu {
                 (_, GradKind::None) => format!("{name}: fused"),
                 (_, GradKind::Dense) => format!("{name}: fused, gradients summed in each group of 64 rows"),
                 (_, GradKind::Scatter) => {
-                    let first = if shared.subgroups { ", added up in subgroups first" } else { "" };
+                    let first = if chain.together() { ", added up in subgroups first" } else { "" };
                     format!("{name}: fused, gradients by {}{first}", adapter.atomics)
                 }
             });
         }
         notes.push("split: samples and line integrals are kernels of their own, since a ray's rows meet there".into());
+        let after = if chain.scatters() { ", and the encoder's gradients after it" } else { "" };
         notes.push(match chain.kept() {
             0 => {
                 "split: forward and backward; the encoder is computed again, which costs less than its features".into()
             }
-            n => format!("split: forward and backward; {n} features a sample are kept in between"),
+            n => format!("split: forward and backward{after}; {n} features a sample are kept in between"),
         });
         if let Some(tables) = chain.halves() {
             notes.push(format!("tables are read from a copy in {tables}"));

@@ -59,8 +59,7 @@ impl Shared {
         run("forward", &chain.single_forward(), step, groups)?;
         run("backward", &chain.single_backward(), step, groups)?;
         if chain.dense > 0 {
-            let step = Step { rows: groups as u32, ..step };
-            run("merge", &chain.merge(), step, chain.dense.div_ceil(GROUP as usize))?;
+            run("merge", &chain.merge(), step, chain.merging(groups))?;
         }
         arena::download(gpu, &buffers, &chain, &mut arena, target.segment)?;
         let [y, dx] =

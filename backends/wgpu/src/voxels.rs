@@ -5,7 +5,7 @@
 
 use crate::Shared;
 use crate::compose::{GROUP, fragment_of};
-use crate::device::Atomics;
+use crate::device::{Atomics, Gpu};
 use crate::kernel::Buffers;
 use crate::pace::Pace;
 use crate::source::{Access, Source};
@@ -22,8 +22,10 @@ use wgpu::BufferUsages as U;
 
 /// Bytes of projections on the device at once.
 const LINES_BYTES: u64 = 64 << 20;
-/// Rays or voxels of a launch at first, at least and at most.
-const FIRST: u32 = 1 << 15;
+/// Views that one uniform buffer holds for back-projection.
+const VIEWS: usize = 128;
+/// Rays or voxels of a launch at first, on a software device and on others, at least and at most.
+const FIRST: [u32; 2] = [1 << 15, 1 << 20];
 const LEAST: u32 = 1 << 10;
 const MOST: u32 = 1 << 22;
 
@@ -88,11 +90,11 @@ fn kernel(fragment: &Fragment, name: &str, atomics: Atomics, forward: bool) -> S
     let (what, begin, end) = if forward {
         source.bind("volume", Access::Read, "array<f32>");
         source.bind("lines", Access::Write, "array<f32>");
-        ("value += weight * volume[i];".to_owned(), "value = 0.0;", "lines[i] += value;")
+        ("value += weight * volume[i];".to_owned(), "value = 0.0;", "lines[line] += value;")
     } else {
         source.bind("volume", Access::Write, &format!("array<atomic<{}>>", atomics.number()));
         source.bind("lines", Access::Read, "array<f32>");
-        let begin = "value = lines[i];\n        if value == 0.0 { continue; }";
+        let begin = "value = lines[line];\n        if value == 0.0 { continue; }";
         (format!("let v = weight * value;\n{}", atomics.sum("volume[i]")), begin, "")
     };
     source.add(
@@ -116,8 +118,9 @@ fn walk_visit(voxel: vec3<u32>, weight: f32) {{
             "@compute @workgroup_size(64)
 fn main(@builtin(global_invocation_id) id: vec3<u32>, @builtin(num_workgroups) groups: vec3<u32>) {{
     for (var i = projection.begin + id.x; i < projection.end; i += groups.x * 64u) {{
+        let line = line_of(i);
         {begin}
-        walk_walk(projected(i));
+        walk_walk(projected(line));
         {end}
     }}
 }}
@@ -133,13 +136,12 @@ struct Room {
     pace: Pace,
 }
 
-impl Default for Room {
-    fn default() -> Self {
-        Self { buffers: Buffers::default(), pace: Pace::new(FIRST, LEAST, MOST) }
-    }
-}
-
 impl Room {
+    fn new(gpu: &Gpu) -> Self {
+        let first = FIRST[usize::from(!gpu.adapter.software)];
+        Self { buffers: Buffers::default(), pace: Pace::new(first, LEAST, MOST) }
+    }
+
     /// Runs `source` over `0..count` in launches, each after `uniform` has written where it begins and ends.
     fn run<T: bytemuck::Pod>(
         &mut self,
@@ -181,16 +183,24 @@ impl Room {
         shared.gpu.queue.submit([encoder.finish()]);
     }
 
-    /// Copies `name`'s numbers to `out`.
-    fn read(&mut self, shared: &Shared, name: &str, out: &mut [f32]) -> Result<()> {
+    /// Hands the first `count` numbers of `name` to `take`.
+    fn read(&mut self, shared: &Shared, name: &str, count: usize, take: impl FnOnce(&[f32])) -> Result<()> {
         let gpu = &shared.gpu;
-        let bytes = 4 * out.len() as u64;
+        let bytes = 4 * count as u64;
         self.buffers.reserve(gpu, "staging", bytes, U::MAP_READ | U::COPY_DST)?;
         let (Some(from), Some(staging)) = (self.buffers.get(name), self.buffers.get("staging")) else { return Ok(()) };
         let mut encoder = gpu.device.create_command_encoder(&Default::default());
         encoder.copy_buffer_to_buffer(from, 0, staging, 0, bytes);
         gpu.queue.submit([encoder.finish()]);
-        gpu.read(staging, bytes, |found| out.copy_from_slice(bytemuck::cast_slice(found)))
+        gpu.read(staging, bytes, |found| take(bytemuck::cast_slice(found)))
+    }
+
+    /// Adds the numbers of `name` to those of `part`, in order.
+    fn add_to(&mut self, shared: &Shared, name: &str, mut part: ArrayViewMut3<'_, f32>) -> Result<()> {
+        self.read(shared, name, part.len(), |found| match part.as_slice_mut() {
+            Some(part) => part.iter_mut().zip(found).for_each(|(p, f)| *p += f),
+            None => part.iter_mut().zip(found).for_each(|(p, f)| *p += f),
+        })
     }
 }
 
@@ -234,7 +244,8 @@ impl OnDevice {
         let [forward, adjoint] = [true, false].map(|forward| kernel(&fragment, &name, atomics, forward));
         forward.validate()?;
         adjoint.validate()?;
-        let operator = DeviceOperator { shared, forward, adjoint, room: Mutex::default(), fault: Mutex::default() };
+        let room = Mutex::new(Room::new(&shared.gpu));
+        let operator = DeviceOperator { shared, forward, adjoint, room, fault: Mutex::default() };
         Ok(Self { inner, operator })
     }
 }
@@ -310,9 +321,7 @@ impl DeviceOperator {
                 let uniforms = |begin, end| Projection { held, held_end, begin, end, ..uniform };
                 room.run(shared, "forward projection", &self.forward, ("projection", uniforms), uniform.count)?;
             }
-            let mut lines = vec![0.0; out.len()];
-            room.read(shared, "lines", &mut lines)?;
-            out.iter_mut().zip(lines).for_each(|(o, l)| *o = l);
+            room.read(shared, "lines", out.len(), |found| out.iter_mut().zip(found).for_each(|(o, l)| *o = *l))?;
         }
         Ok(())
     }
@@ -339,9 +348,7 @@ impl DeviceOperator {
                 let uniforms = |begin, end| Projection { held, held_end, begin, end, ..uniform };
                 room.run(shared, "adjoint of projection", &self.adjoint, ("projection", uniforms), uniform.count)?;
             }
-            let mut found = vec![0.0; slab.len() * plane];
-            room.read(shared, "volume", &mut found)?;
-            volume.slice_mut(s![slab, .., ..]).iter_mut().zip(found).for_each(|(v, f)| *v += f);
+            room.add_to(shared, "volume", volume.slice_mut(s![slab, .., ..]))?;
         }
         Ok(())
     }
@@ -373,6 +380,25 @@ impl VoxelOperator<f32> for DeviceOperator {
     }
 }
 
+/// The kernels of FDK's back-projection: views with rows and columns exchanged, and voxels.
+fn back_kernels() -> [Source; 2] {
+    let begun = || {
+        let mut source = Source::default();
+        source.add("structures", include_str!("kernels/back.wgsl"));
+        source.bind("back", Access::Uniform, "Back");
+        source
+    };
+    let (mut pad, mut voxels) = (begun(), begun());
+    pad.bind("images", Access::Read, "array<f32>");
+    pad.bind("padded", Access::Write, "array<f32>");
+    pad.add("exchange", include_str!("kernels/pad.wgsl"));
+    voxels.bind("views", Access::Uniform, &format!("array<SeenView, {VIEWS}>"));
+    voxels.bind("padded", Access::Read, "array<f32>");
+    voxels.bind("volume", Access::Write, "array<f32>");
+    voxels.add("back-projection", include_str!("kernels/backproject.wgsl"));
+    [pad, voxels]
+}
+
 /// FDK's back-projection on the device; see [`conefield_core::backend::Backend::backproject`].
 pub fn backproject(
     shared: &Shared,
@@ -380,22 +406,17 @@ pub fn backproject(
     images: ArrayView3<'_, f32>,
     mut volume: ArrayViewMut3<'_, f32>,
 ) -> Result<()> {
-    let mut source = Source::default();
-    source.add("back-projection", include_str!("kernels/backproject.wgsl"));
-    source.bind("back", Access::Uniform, "Back");
-    source.bind("views", Access::Read, "array<SeenView>");
-    source.bind("images", Access::Read, "array<f32>");
-    source.bind("volume", Access::Write, "array<f32>");
+    let [pad, voxels] = back_kernels();
     let gpu = &shared.gpu;
-    let (count, rows, columns) = images.dim();
+    let (_, rows, columns) = images.dim();
     let shape: [usize; 3] = volume.dim().into();
     let plane = shape[1] * shape[2];
-    let bytes = 4 * (rows * columns) as u64;
-    let most = gpu.adapter.bound_bytes();
+    let padded = (rows + 2) * (columns + 2);
+    let (bytes, most) = (4 * padded as u64, gpu.adapter.bound_bytes());
     if bytes > most {
         return Err(gpu.error(format!("a view takes {bytes} bytes, a buffer holds {most}")));
     }
-    let chunk = (LINES_BYTES.min(most) / bytes).max(1) as usize;
+    let chunk = ((LINES_BYTES.min(most) / bytes).max(1) as usize).min(VIEWS);
     let narrow = |n: [f64; 4]| n.map(|x| x as f32);
     let seen = |v: &VoxelView| SeenView {
         depth: narrow(v.depth),
@@ -404,17 +425,17 @@ pub fn backproject(
         scale: v.scale as f32,
         pad: [0.0; 3],
     };
-    let mut room = Room::default();
+    let mut room = Room::new(gpu);
     let usage = U::STORAGE | U::COPY_SRC | U::COPY_DST;
+    room.buffers.reserve(gpu, "views", (VIEWS * size_of::<SeenView>()) as u64, U::UNIFORM | U::COPY_DST)?;
+    room.buffers.reserve(gpu, "images", (chunk * rows * columns * 4) as u64, usage)?;
+    room.buffers.reserve(gpu, "padded", chunk as u64 * bytes, usage)?;
     for slab in shared.slabs(shape)? {
-        let voxels = slab.len() * plane;
-        room.buffers.reserve(gpu, "volume", 4 * voxels as u64, usage)?;
+        let count = slab.len() * plane;
+        room.buffers.reserve(gpu, "volume", 4 * count as u64, usage)?;
         room.clear(shared, "volume");
         for (views, images) in views.chunks(chunk).zip(images.axis_chunks_iter(Axis(0), chunk)) {
             let seen: Vec<SeenView> = views.iter().map(seen).collect();
-            let n = chunk.min(count) as u64;
-            room.buffers.reserve(gpu, "views", n * size_of::<SeenView>() as u64, usage)?;
-            room.buffers.reserve(gpu, "images", n * bytes, usage)?;
             room.write(shared, "views", bytemuck::cast_slice(&seen));
             room.write(shared, "images", images.as_standard_layout().as_slice().unwrap_or_default());
             let uniforms = |begin, end| Back {
@@ -427,11 +448,10 @@ pub fn backproject(
                 columns: columns as u32,
                 pad: [0; 3],
             };
-            room.run(shared, "back-projection", &source, ("back", uniforms), voxels as u32)?;
+            room.run(shared, "exchange", &pad, ("back", uniforms), (views.len() * padded) as u32)?;
+            room.run(shared, "back-projection", &voxels, ("back", uniforms), count as u32)?;
         }
-        let mut found = vec![0.0; voxels];
-        room.read(shared, "volume", &mut found)?;
-        volume.slice_mut(s![slab, .., ..]).iter_mut().zip(found).for_each(|(v, f)| *v += f);
+        room.add_to(shared, "volume", volume.slice_mut(s![slab, .., ..]))?;
     }
     Ok(())
 }

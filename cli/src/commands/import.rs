@@ -10,11 +10,11 @@ use crate::boundary::{Inputs, refuse_existing};
 use crate::memory::Memory;
 use crate::{out, parse};
 use clap::Args;
-use conefield_core::{Error, Result};
+use conefield_core::Result;
 use conefield_diagnosis::{Survey, survey};
 use conefield_io::{I0, ImportOptions, Imported};
 use serde_json::{Value, json};
-use std::path::{Path, PathBuf};
+use std::path::PathBuf;
 
 /// Convert the files of a scanner to a scan.
 ///
@@ -50,21 +50,8 @@ pub struct ImportArgs {
     json: bool,
 }
 
-/// Refuses a folder or a file of images in place of the text that describes them.
-fn refuse_images(path: &Path) -> Result<()> {
-    let extension = path.extension().map(|e| e.to_string_lossy().to_lowercase()).unwrap_or_default();
-    let found = match &extension[..] {
-        _ if path.is_dir() => "a folder".to_owned(),
-        "tif" | "tiff" | "npy" | "npz" | "mha" | "h5" | "hdf5" | "nxs" => format!("a .{extension} file of projections"),
-        _ => return Ok(()),
-    };
-    let expected = "a text file that describes the scanner and names its projections (docs/guide/scan-in.md)";
-    Err(Error::invalid(path.display().to_string(), "SCANNER.toml", found, expected))
-}
-
 impl ImportArgs {
     pub fn run(self, general: &General) -> Result<()> {
-        refuse_images(&self.scanner)?;
         refuse_existing(&self.output, self.force)?;
         Inputs::default().and_description(&self.scanner).spare_folder(&self.output)?;
         let corrections = self.corrections.corrections()?;

@@ -16,7 +16,7 @@ use crate::trial;
 use conefield_core::error::{Error, Result};
 use conefield_core::geometry::VoxelGrid;
 use conefield_core::stage::UnitRay;
-use conefield_core::wgsl::Fragment;
+use conefield_core::wgsl::{FOREIGN, Fragment};
 use conefield_plugin_abi::*;
 use serde_json::Value;
 use std::ffi::c_void;
@@ -116,7 +116,7 @@ impl<F: FunctionsOf> Foreign<F> {
         let wgsl = wgsl?;
         // SAFETY: the stage is alive; all arguments live during the call.
         let source = whole_text(|room| unsafe { wgsl(self.handle.stage, room) }).ok()?;
-        Some(Fragment { source })
+        Some(Fragment { source: format!("{source}\n{FOREIGN}") })
     }
 
     /// The stage that `call` derives from this one by `f`, which writes its address; `None` if there is none. Errors

@@ -1,56 +1,44 @@
-// Voxel-driven, distance-weighted back-projection (Feldkamp, Davis and Kress 1984): a voxel an invocation.
+// Voxel-driven, distance-weighted back-projection (Feldkamp, Davis and Kress 1984): four voxels an invocation. Neighbouring
+// lanes have neighbouring z and so neighbouring rows of a view, which `padded` holds one after the other.
 
-struct SeenView {
-    // Constant part, and what x, y, z add.
-    depth: vec4<f32>,
-    row: vec4<f32>,
-    column: vec4<f32>,
-    scale: f32,
+fn share(v: u32, at: vec4<f32>) -> f32 {
+    let depth = dot(views[v].depth, at);
+    let near = 1.0 / depth;
+    let seen = vec2<f32>(dot(views[v].row, at), dot(views[v].column, at)) * near;
+    let size = vec2<f32>(f32(back.rows), f32(back.columns));
+    let inside = depth > 0.0 && all(seen > vec2<f32>(-1.0)) && all(seen < size);
+    // The rim of zeros is row and column -1.
+    let place = select(vec2<f32>(-1.0), seen, inside);
+    let low = floor(place);
+    let f = place - low;
+    let corner = vec2<u32>(vec2<i32>(low) + 1);
+    let column = back.rows + 2u;
+    let i = (v * (back.columns + 2u) + corner.y) * column + corner.x;
+    let left = mix(padded[i], padded[i + 1u], f.x);
+    let right = mix(padded[i + column], padded[i + column + 1u], f.x);
+    return select(0.0, views[v].scale * near * near * mix(left, right, f.y), inside);
 }
 
-struct Back {
-    shape: vec3<u32>,
-    views: u32,
-    // First plane of x in the buffer, and voxels of this launch.
-    held: u32,
-    begin: u32,
-    end: u32,
-    rows: u32,
-    columns: u32,
-}
-
-fn pixel(view: u32, row: i32, column: i32) -> f32 {
-    if row < 0 || column < 0 || row >= i32(back.rows) || column >= i32(back.columns) {
-        return 0.0;
-    }
-    return images[(view * back.rows + u32(row)) * back.columns + u32(column)];
+fn voxel(i: u32) -> vec4<f32> {
+    let line = back.shape.z;
+    let plane = back.shape.y * line;
+    return vec4<f32>(1.0, f32(back.held + i / plane), f32((i / line) % back.shape.y), f32(i % line));
 }
 
 @compute @workgroup_size(64)
-fn main(@builtin(global_invocation_id) id: vec3<u32>, @builtin(num_workgroups) groups: vec3<u32>) {
-    let line = back.shape.z;
-    let plane = back.shape.y * line;
-    for (var i = back.begin + id.x; i < back.end; i += groups.x * 64u) {
-        let at = vec4<f32>(1.0, f32(back.held + i / plane), f32((i / line) % back.shape.y), f32(i % line));
-        var sum = 0.0;
+fn main(@builtin(workgroup_id) group: vec3<u32>, @builtin(local_invocation_index) lane: u32, @builtin(num_workgroups) groups: vec3<u32>) {
+    for (var i = back.begin + group.x * 256u + lane; i < back.end; i += groups.x * 256u) {
+        let at0 = voxel(i);
+        let at1 = voxel(i + 64u);
+        let at2 = voxel(i + 128u);
+        let at3 = voxel(i + 192u);
+        var sum = vec4<f32>();
         for (var v = 0u; v < back.views; v++) {
-            let depth = dot(views[v].depth, at);
-            if depth <= 0.0 {
-                continue;
-            }
-            let row = dot(views[v].row, at) / depth;
-            let column = dot(views[v].column, at) / depth;
-            if row <= -1.0 || column <= -1.0 || row >= f32(back.rows) || column >= f32(back.columns) {
-                continue;
-            }
-            let r = i32(floor(row));
-            let c = i32(floor(column));
-            let fr = row - floor(row);
-            let fc = column - floor(column);
-            let low = (1.0 - fc) * pixel(v, r, c) + fc * pixel(v, r, c + 1);
-            let high = (1.0 - fc) * pixel(v, r + 1, c) + fc * pixel(v, r + 1, c + 1);
-            sum += views[v].scale / (depth * depth) * ((1.0 - fr) * low + fr * high);
+            sum += vec4<f32>(share(v, at0), share(v, at1), share(v, at2), share(v, at3));
         }
-        volume[i] += sum;
+        volume[i] += sum.x;
+        if i + 64u < back.end { volume[i + 64u] += sum.y; }
+        if i + 128u < back.end { volume[i + 128u] += sum.z; }
+        if i + 192u < back.end { volume[i + 192u] += sum.w; }
     }
 }

@@ -30,6 +30,13 @@ struct Projection {
     end: u32,
 }
 
+// Neighbouring lanes have neighbouring rows of a column, whose rays meet neighbouring z: voxels that follow each other.
+fn line_of(i: u32) -> u32 {
+    let rows = projection.pixels / projection.columns;
+    let place = i % projection.pixels;
+    return i - place + (place % rows) * projection.columns + place / rows;
+}
+
 fn projected(i: u32) -> VoxelRay {
     let view = views[i / projection.pixels];
     let pixel = i % projection.pixels;

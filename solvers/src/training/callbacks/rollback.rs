@@ -27,8 +27,10 @@ use std::sync::Arc;
 
 /// Steps per window.
 const WINDOW: u64 = 25;
-/// Minimum number of steps between two copies of the state.
+/// Minimum number of steps between two copies of the state, and the share of the steps so far: a copy brings all parameters
+/// from the device.
 const EVERY: u64 = 100;
+const SHARE: u64 = 8;
 /// Differences below this share of the measured values count as this share.
 const SMALL: f64 = 0.01;
 /// Relative difference between a field's loss and that of an empty volume from which the field is not empty.
@@ -144,7 +146,7 @@ impl Callback for Guard {
         self.watched.last = [self.watched.sum, self.watched.empty];
         (self.watched.sum, self.watched.empty, self.watched.steps) = (0.0, 0.0, 0);
         let calm = mean <= self.beyond(2.0, level);
-        let due = self.watched.kept.is_none_or(|[at, _]| run.step >= at + EVERY);
+        let due = self.watched.kept.is_none_or(|[at, _]| run.step >= at + EVERY.max(at / SHARE));
         if calm && due { self.keep(run) } else { Ok(Update::Take) }
     }
 
