@@ -46,6 +46,15 @@ pub fn fits(gpu: &Gpu, label: &str, source: &Source) -> Result<()> {
     ))
 }
 
+/// What is checked while a kernel runs. A counter that ends every loop keeps drivers from unrolling it: only kernels with a
+/// plugin's text have it.
+fn checks(source: &Source) -> wgpu::ShaderRuntimeChecks {
+    wgpu::ShaderRuntimeChecks {
+        force_loop_bounding: source.text().contains(FOREIGN),
+        ..wgpu::ShaderRuntimeChecks::checked()
+    }
+}
+
 fn compile(gpu: &Gpu, label: &str, source: &Source) -> Result<Kernel> {
     fits(gpu, label, source)?;
     source.validate()?;
@@ -68,12 +77,9 @@ fn compile(gpu: &Gpu, label: &str, source: &Source) -> Result<Kernel> {
     let (pipeline, layout) = gpu.checked(&format!("kernel {label}"), || {
         let descriptor =
             wgpu::ShaderModuleDescriptor { label: Some(label), source: wgpu::ShaderSource::Wgsl(source.text().into()) };
-        let mut checks = wgpu::ShaderRuntimeChecks::checked();
-        // A counter in each loop keeps compilers from unrolling it.
-        checks.force_loop_bounding = source.text().contains(FOREIGN);
         // SAFETY: all other checks stay, and every loop of the program's own WGSL ends.
         #[expect(unsafe_code, reason = "wgpu asks for it where a check is left out")]
-        let module = unsafe { gpu.device.create_shader_module_trusted(descriptor, checks) };
+        let module = unsafe { gpu.device.create_shader_module_trusted(descriptor, checks(source)) };
         let layout = gpu
             .device
             .create_bind_group_layout(&wgpu::BindGroupLayoutDescriptor { label: Some(label), entries: &entries });
@@ -168,5 +174,19 @@ impl Kernel {
         pass.set_pipeline(&self.pipeline);
         pass.set_bind_group(0, bound, &[]);
         pass.dispatch_workgroups(groups, 1, 1);
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn only_own_loops_run_unchecked() {
+        let mut source = Source::default();
+        source.add("field (own)", "fn own() {}");
+        assert!(!checks(&source).force_loop_bounding && checks(&source).bounds_checks && checks(&source).int_div_checks);
+        source.add("field (plugin)", &format!("fn other() {{}}\n{FOREIGN}"));
+        assert!(checks(&source).force_loop_bounding);
     }
 }
