@@ -185,7 +185,9 @@ mod tests {
     fn only_own_loops_run_unchecked() {
         let mut source = Source::default();
         source.add("field (own)", "fn own() {}");
-        assert!(!checks(&source).force_loop_bounding && checks(&source).bounds_checks && checks(&source).int_div_checks);
+        assert!(
+            !checks(&source).force_loop_bounding && checks(&source).bounds_checks && checks(&source).int_div_checks
+        );
         source.add("field (plugin)", &format!("fn other() {{}}\n{FOREIGN}"));
         assert!(checks(&source).force_loop_bounding);
     }
