@@ -416,7 +416,7 @@ pub fn backproject(
     if bytes > most {
         return Err(gpu.error(format!("a view takes {bytes} bytes, a buffer holds {most}")));
     }
-    let chunk = ((LINES_BYTES.min(most) / bytes).max(1) as usize).min(VIEWS);
+    let chunk = ((LINES_BYTES.min(most) / bytes) as usize).min(VIEWS).clamp(1, views.len().max(1));
     let narrow = |n: [f64; 4]| n.map(|x| x as f32);
     let seen = |v: &VoxelView| SeenView {
         depth: narrow(v.depth),
