@@ -23,9 +23,12 @@
 //!                                                                        // adds Σ a[j]·b[k] to at + j·ld + k, all different
 //! ```
 //!
-//! `stage_grad` and `stage_grad_pair` are for parameters of which a row affects few. `stage_sum_M` and `stage_outer_M_K` are sums over rows,
-//! for any numbers `M` and `K` in the name, for parameters that every row affects: all rows call them together, so
-//! never inside a branch or loop that only some rows take.
+//! `stage_grad` and `stage_grad_pair` are for parameters of which a row affects few. `stage_sum_M` and `stage_outer_M_K` are
+//! sums over rows, for any numbers `M` and `K` in the name, for parameters that every row affects: all rows call them
+//! together, so never inside a branch or loop that only some rows take.
+//!
+//! A stage that is compiled into the program must also call `stage_grad` and `stage_grad_pair` for all rows together, and
+//! every loop of its WGSL must end. A plugin's stage need not: its kernels carry [`FOREIGN`].
 //!
 //! A projector defines
 //!
@@ -74,8 +77,8 @@ use std::fmt::Write;
 /// Prefix of every name that a fragment declares or uses from its host.
 pub const PREFIX: &str = "stage_";
 
-/// Ends the text of a fragment that a plugin brings. Kernels with it keep all checks at run time, which end loops that do
-/// not end by themselves.
+/// The last line of a plugin's fragment. Kernels with it keep the counter that ends every loop, and add gradients lane by
+/// lane.
 pub const FOREIGN: &str = "// from a plugin\n";
 
 /// `struct Ray`: [`UnitRay`](crate::stage::UnitRay) with its seed and number of samples.

@@ -287,11 +287,14 @@ pub fn functions(levels: &[LevelCode], width: usize) -> String {
     let mut grad =
         String::from("fn stage_features_grad(entry: u32, w: f32, dy: ptr<function, array<f32, stage_FEATURES>>) {\n");
     let features = levels.first().map_or(0, |l| l.outputs.len());
-    for f in (0..features).step_by(if features.is_multiple_of(2) { 2 } else { 1 }) {
-        let _ = match features.is_multiple_of(2) {
-            true => writeln!(grad, "    stage_grad_pair(entry + {f}u, w * vec2<f32>((*dy)[{f}], (*dy)[{}]));", f + 1),
-            false => writeln!(grad, "    stage_grad(entry + {f}u, w * (*dy)[{f}]);"),
-        };
+    if features.is_multiple_of(2) {
+        for f in (0..features).step_by(2) {
+            let _ = writeln!(grad, "    stage_grad_pair(entry + {f}u, w * vec2<f32>((*dy)[{f}], (*dy)[{}]));", f + 1);
+        }
+    } else {
+        for f in 0..features {
+            let _ = writeln!(grad, "    stage_grad(entry + {f}u, w * (*dy)[{f}]);");
+        }
     }
     grad += "}\n";
     let (mut forward, mut backward) = (String::new(), String::new());

@@ -197,10 +197,7 @@ impl Room {
 
     /// Adds the numbers of `name` to those of `part`, in order.
     fn add_to(&mut self, shared: &Shared, name: &str, mut part: ArrayViewMut3<'_, f32>) -> Result<()> {
-        self.read(shared, name, part.len(), |found| match part.as_slice_mut() {
-            Some(part) => part.iter_mut().zip(found).for_each(|(p, f)| *p += f),
-            None => part.iter_mut().zip(found).for_each(|(p, f)| *p += f),
-        })
+        self.read(shared, name, part.len(), |found| part.iter_mut().zip(found).for_each(|(p, f)| *p += f))
     }
 }
 

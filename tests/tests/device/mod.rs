@@ -30,8 +30,8 @@ pub fn shared(what: &str) -> Option<Arc<Shared>> {
     device.clone()
 }
 
-/// Backends on the device: with its own limits, and with lower ones: no atomic sums; buffers so small that everything is cut into pieces; no
-/// subgroup operations.
+/// Backends on the device: with its own limits, and with lower ones: no atomic sums; buffers so small that everything is
+/// cut into pieces; no subgroup operations.
 #[allow(dead_code)]
 pub fn backends(what: &str) -> Vec<(&'static str, Wgpu)> {
     let small = Limits { binding_bytes: Some(2048), uniform_bytes: Some(0), ..Limits::default() };

@@ -27,9 +27,9 @@ use std::sync::Arc;
 
 /// Steps per window.
 const WINDOW: u64 = 25;
-/// Minimum number of steps between two copies of the state, and the share of the steps so far: a copy brings all parameters
-/// from the device.
+/// Minimum number of steps between two copies of the state, which bring all parameters from the device.
 const EVERY: u64 = 100;
+/// At least one step in this many of those before a copy lies between it and the next.
 const SHARE: u64 = 8;
 /// Differences below this share of the measured values count as this share.
 const SMALL: f64 = 0.01;
