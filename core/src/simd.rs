@@ -62,6 +62,8 @@ pub trait Real:
     fn finite(self) -> bool;
     /// Exponential of every lane.
     fn exp_lanes<S: Simd>(s: S, x: V<S, Self>) -> V<S, Self>;
+    /// 2 to the power of every lane, which is at most 0; `f32`: relative error below 2e-7, and at least 2^-126.
+    fn exp2_lanes<S: Simd>(s: S, x: V<S, Self>) -> V<S, Self>;
     /// Reciprocal square root of every lane, which is positive and neither very large nor very small; `f32`: relative
     /// error below 3e-7.
     fn inverse_root_lanes<S: Simd>(s: S, x: V<S, Self>) -> V<S, Self>;
@@ -73,6 +75,10 @@ pub trait Real:
     /// Natural logarithm of `1 + exp(x)` without overflow.
     fn softplus(self) -> Self;
 }
+
+/// 2^r for |r| ≤ ½, highest power first (Remez, relative error 8e-8).
+const POWER_OF_TWO: [f32; 6] =
+    [1.327_647_2e-3, 9.675_541e-3, 5.550_713_3e-2, 2.402_211_9e-1, 6.931_469_7e-1, 1.000_000_1];
 
 impl Real for f32 {
     type Four<S: Simd> = fearless_simd::f32x4<S>;
@@ -181,6 +187,19 @@ impl Real for f32 {
         p * scale
     }
     #[inline(always)]
+    fn exp2_lanes<S: Simd>(s: S, x: V<S, Self>) -> V<S, Self> {
+        let x = x.max(S::f32s::splat(s, -126.0));
+        let n = x.round_ties_even();
+        let r = x - n;
+        let mut p = S::f32s::splat(s, POWER_OF_TWO[0]);
+        for &c in &POWER_OF_TWO[1..] {
+            p = p.mul_add(r, S::f32s::splat(s, c));
+        }
+        // Adds to the exponent: |r| ≤ ½ keeps `p` between 0.7 and 1.5, and n is at least -126.
+        let (bits, n): (S::i32s, S::i32s) = (p.bitcast(), n.to_int());
+        (bits + (n << 23)).bitcast()
+    }
+    #[inline(always)]
     fn inverse_root_lanes<S: Simd>(s: S, x: V<S, Self>) -> V<S, Self> {
         #[cfg(target_arch = "x86_64")]
         if let Level::Avx512(avx512) = s.level() {
@@ -196,7 +215,7 @@ impl Real for f32 {
         let number = |v: f32| S::f32s::splat(s, v);
         let (zero, one) = (number(0.0), number(1.0));
         let [mut e, mut t, mut p, mut cdf, mut pdf] = [[zero; K]; 5];
-        // exp(-x²/2) = 2^(n + r), |r| ≤ ½, by a polynomial of degree 5 (Remez, relative error 8e-8). Below 2^-40 (|x| > 7.45)
+        // exp(-x²/2) = 2^(n + r), |r| ≤ ½. Below 2^-40 (|x| > 7.45)
         // it is 0: products of tails would end among the denormals, which some processors compute far more slowly.
         let least = number(-40.0);
         for k in 0..K {
@@ -208,9 +227,9 @@ impl Real for f32 {
             let bits: S::i32s = n.to_int();
             let power: S::f32s = ((bits + 127) << 23).bitcast();
             e[k] = inside.select(power, zero);
-            p[k] = number(1.327_647_2e-3);
+            p[k] = number(POWER_OF_TWO[0]);
         }
-        for c in [9.675_541e-3, 5.550_713_3e-2, 2.402_211_9e-1, 6.931_469_7e-1, 1.000_000_1] {
+        for &c in &POWER_OF_TWO[1..] {
             for k in 0..K {
                 p[k] = p[k].mul_add(t[k], number(c));
             }
@@ -289,6 +308,11 @@ impl Real for f64 {
     #[inline(always)]
     fn exp_lanes<S: Simd>(_: S, mut x: V<S, Self>) -> V<S, Self> {
         x.as_mut_slice().iter_mut().for_each(|v| *v = v.exp());
+        x
+    }
+    #[inline(always)]
+    fn exp2_lanes<S: Simd>(_: S, mut x: V<S, Self>) -> V<S, Self> {
+        x.as_mut_slice().iter_mut().for_each(|v| *v = v.exp2());
         x
     }
     #[inline(always)]
@@ -477,7 +501,7 @@ mod tests {
 
     struct Normal<'a, R>(&'a [R]);
     impl<R: Real> Op for Normal<'_, R> {
-        type Out = Vec<[f64; 4]>;
+        type Out = Vec<[f64; 5]>;
         #[inline(always)]
         fn call<S: Simd>(self, s: S) -> Self::Out {
             let mut out = vec![];
@@ -486,8 +510,9 @@ mod tests {
                 let [[c], [p]] = R::normal_lanes(s, [x]);
                 let e = R::exp_lanes(s, x);
                 let root = R::inverse_root_lanes(s, e);
+                let power = R::exp2_lanes(s, x.min(V::<S, R>::splat(s, R::ZERO)));
                 for k in 0..V::<S, R>::LEN.min(self.0.len() - i) {
-                    out.push([c, p, e, root].map(|v| v.as_slice()[k].f64()));
+                    out.push([c, p, e, root, power].map(|v| v.as_slice()[k].f64()));
                 }
             }
             out
@@ -504,7 +529,11 @@ mod tests {
             assert!((a[1] - b[1]).abs() < 2e-7, "φ({}) = {} not {}", x[i], a[1], b[1]);
             assert!((a[2] / b[2] - 1.0).abs() < 5e-7, "exp({}) = {} not {}", x[i], a[2], b[2]);
             assert!((a[3] * a[2].sqrt() - 1.0).abs() < 3e-7, "1/sqrt({}) = {}", a[2], a[3]);
+            assert!((a[4] / b[4] - 1.0).abs() < 2e-7, "2^{} = {} not {}", x[i].min(0.0), a[4], b[4]);
         }
+        let ends = run(Normal(&[-125.75f32, -126.0, -1e30]));
+        assert!((ends[0][4] / f64::from(-125.75).exp2() - 1.0).abs() < 2e-7);
+        assert!(ends[1][4] >= f64::from(-126).exp2() * (1.0 - 2e-7) && ends[2][4] == ends[1][4]);
     }
 
     /// Products of several of them must not end among the denormals, which halved the speed of training.

@@ -35,11 +35,10 @@ impl Ssim {
     ) -> f64 {
         let Self { maps, slopes, between } = self;
         let taps = window();
-        let products: [fn(f32, f32) -> f32; 5] = [|x, _| x, |_, y| y, |x, _| x * x, |_, y| y * y, |x, y| x * y];
-        for (map, product) in maps.iter_mut().zip(products) {
-            map.clear();
-            map.extend(found.iter().zip(wanted).map(|(x, y)| product(*x, *y)));
-            blur(&taps, map, between, stride);
+        for (map, [a, b]) in
+            maps.iter_mut().zip([[found, &[]], [wanted, &[]], [found; 2], [wanted; 2], [found, wanted]])
+        {
+            blur(&taps, [a, b], map, between, stride);
         }
         let [c1, c2] = [0.01, 0.03].map(|k: f64| ((k * range).powi(2)) as f32);
         let pixels = (found.len() / stride * columns) as f64;
@@ -71,9 +70,10 @@ impl Ssim {
                 sum
             })
             .collect();
-        for slope in [&mut *by_mean, &mut *by_square, &mut *by_product] {
-            blur(&taps, slope, between, stride);
+        for (slope, map) in [by_mean, by_square, by_product].into_iter().zip(maps.iter_mut()) {
+            blur(&taps, [slope, &[]], map, between, stride);
         }
+        let [by_mean, by_square, by_product, ..] = &*maps;
         gradient.par_chunks_mut(stride).enumerate().for_each(|(row, gradient)| {
             for i in 0..columns {
                 let at = row * stride + i;
@@ -91,18 +91,30 @@ fn window() -> [f32; TAPS] {
     raw.map(|x| (x / sum) as f32)
 }
 
-/// Blurs `image` with the window, which is symmetric: the blur is its own adjoint.
-fn blur(taps: &[f32; TAPS], image: &mut [f32], between: &mut Vec<f32>, stride: usize) {
+/// Blurs the product of two images, or one image if the other is empty, with the window. The window is symmetric, so that
+/// the blur is its own adjoint.
+fn blur(
+    taps: &[f32; TAPS],
+    [image, times]: [&[f32]; 2],
+    blurred: &mut Vec<f32>,
+    between: &mut Vec<f32>,
+    stride: usize,
+) {
     between.resize(image.len(), 0.0);
-    let (rows, source) = (image.len() / stride, &*image);
+    blurred.resize(image.len(), 0.0);
+    let rows = image.len() / stride;
     between.par_chunks_mut(stride).enumerate().for_each(|(row, out)| {
+        let own = row * stride..(row + 1) * stride;
         let mut padded = vec![0.0; stride + TAPS];
-        padded[REACH..REACH + stride].copy_from_slice(&source[row * stride..(row + 1) * stride]);
+        padded[REACH..REACH + stride].copy_from_slice(&image[own.clone()]);
+        if let Some(times) = times.get(own) {
+            padded[REACH..].iter_mut().zip(times).for_each(|(x, y)| *x *= y);
+        }
         let lines: [&[f32]; TAPS] = std::array::from_fn(|k| &padded[k..k + stride]);
         simd::run(Weighted { taps, lines, out });
     });
     let between = &*between;
-    image.par_chunks_mut(stride).enumerate().for_each(|(row, out)| {
+    blurred.par_chunks_mut(stride).enumerate().for_each(|(row, out)| {
         let lines: [&[f32]; TAPS] = std::array::from_fn(|k| match (row + k).checked_sub(REACH) {
             Some(r) if r < rows => &between[r * stride..(r + 1) * stride],
             _ => &[],

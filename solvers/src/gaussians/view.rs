@@ -18,14 +18,22 @@ use super::shape::{M3, Shape, Slope, V3, apply, cross, dot};
 use conefield_core::simd::{self, Op, Real, Select, Simd, SimdBase, SimdFloat, V, WIDEST};
 use rayon::prelude::*;
 use std::f64::consts::TAU;
+use std::ops::Range;
 
 /// Cutoff of a Gaussian's line integrals, in standard deviations. The truncated part of the sum over all pixels is
 /// `exp(-EXTENT²/2)`, 0.2 %.
 pub const EXTENT: f64 = 3.5;
+/// `exp(-x/2)` is 2 to the power of this times `x`.
+const HALVINGS: f64 = -0.5 * std::f64::consts::LOG2_E;
 /// Rows per strip.
 const STRIP: usize = 16;
 /// Gaussians per work item.
 const CHUNK: usize = 256;
+/// Rows whose pixels are computed together: each pixel is a long chain of dependent operations, and the chains overlap.
+const TOGETHER: usize = 4;
+/// Columns looked at beyond the computed ends of a row, because of rounding. Whether a pixel gets something depends on
+/// its `N/a` alone, so that both directions decide alike.
+const SLACK: f64 = 0.01;
 
 /// The rays of a view, in the unit cube.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -252,48 +260,66 @@ impl<R: Real> Sight<R> {
     }
 }
 
-/// A few rows of a footprint, as many as a vector has lanes: the columns that it reaches, and its polynomials along
-/// each.
+/// Up to [`WIDEST`] rows of a footprint: the columns that it reaches, and its polynomials along each.
 struct Rows<R> {
-    /// First column and the column after the last.
+    /// First column and the column after the last; no columns if the first is not below it.
     columns: [[R; WIDEST]; 2],
     /// Distance from the row of the footprint's middle.
     dv: [R; WIDEST],
-    /// Coefficients of `N` and of `a`: of 1 and of du.
+    /// Coefficients of [`HALVINGS`]`·N` and of `a`: of 1 and of du.
     n: [[R; WIDEST]; 2],
     a: [[R; WIDEST]; 2],
 }
 
 impl<R: Real> Footprint<R> {
-    /// Its rows from `row` on, on a detector of `columns` columns.
+    /// Its rows `rows` on a detector of `columns` columns. Whole groups of [`TOGETHER`] rows are filled; those after the
+    /// last row lie outside the footprint.
     #[inline(always)]
-    fn rows<S: Simd>(&self, s: S, row: usize, columns: usize, out: &mut Rows<R>) {
+    fn rows<S: Simd>(&self, s: S, rows: Range<usize>, columns: usize, out: &mut Rows<R>) {
         let len = V::<S, R>::LEN;
-        let zero = V::<S, R>::splat(s, R::ZERO);
+        let (zero, far) = (V::<S, R>::splat(s, R::ZERO), V::<S, R>::splat(s, R::of(-1e30)));
+        let halvings = R::of(HALVINGS);
         let extent = V::<S, R>::splat(s, R::of(-EXTENT * EXTENT));
+        let count = V::<S, R>::splat(s, R::of(rows.len() as f64));
+        let lanes = V::<S, R>::from_fn(s, |i| R::of(i as f64));
         let [_, s12, s22] = self.spread;
         let [a0, a1, a2, _, a12, a22] = self.square;
         let [qa, qb, qd] = self.conic;
-        let dv = V::<S, R>::from_fn(s, |i| R::of(i as f64)) + (R::of(row as f64) - self.middle[1]);
-        let n0 = dv * dv * s22;
-        let a_ = (dv * a22 + a2).mul_add(dv, V::<S, R>::splat(s, a0));
-        let half = dv * qb + qd;
-        let disc = half * half - extent.mul_add(a_, n0) * qa;
-        let root = disc.max(zero).sqrt();
         let inverse = V::<S, R>::splat(s, R::ONE / qa);
-        let middle = V::<S, R>::splat(s, self.middle[0]);
-        let low = (middle - (half + root) * inverse).ceil().max(zero);
-        let high = (middle - (half - root) * inverse).floor() + R::ONE;
-        let high = high.max(zero).min(V::<S, R>::splat(s, R::of(columns as f64)));
-        // Rows beyond its ends have no columns.
-        let high = disc.simd_ge(zero).select(high, zero);
-        low.store_slice(&mut out.columns[0][..len]);
-        high.store_slice(&mut out.columns[1][..len]);
-        dv.store_slice(&mut out.dv[..len]);
-        n0.store_slice(&mut out.n[0][..len]);
-        (dv * s12).store_slice(&mut out.n[1][..len]);
-        a_.store_slice(&mut out.a[0][..len]);
-        (dv * a12 + a1).store_slice(&mut out.a[1][..len]);
+        let (before, after) = (self.middle[0] - R::of(SLACK), self.middle[0] + R::of(SLACK));
+        for k in (0..rows.len().next_multiple_of(TOGETHER)).step_by(len) {
+            let lane = lanes + R::of(k as f64);
+            let dv = lane + R::of(rows.start as f64) - self.middle[1];
+            let n0 = dv * dv * s22;
+            let a_ = (dv * a22 + a2).mul_add(dv, V::<S, R>::splat(s, a0));
+            let half = dv * qb + qd;
+            let disc = half * half - extent.mul_add(a_, n0) * qa;
+            let root = disc.max(zero).sqrt();
+            let low = (V::<S, R>::splat(s, before) - (half + root) * inverse).ceil().max(zero);
+            let high = (V::<S, R>::splat(s, after) - (half - root) * inverse).floor() + R::ONE;
+            let high = high.min(V::<S, R>::splat(s, R::of(columns as f64)));
+            let inside = lane.simd_lt(count);
+            // Rows that the ellipse does not meet have no columns.
+            let high = inside.select(disc.simd_ge(zero).select(high, zero), zero);
+            low.store_slice(&mut out.columns[0][k..k + len]);
+            high.store_slice(&mut out.columns[1][k..k + len]);
+            dv.store_slice(&mut out.dv[k..k + len]);
+            inside.select(n0 * halvings, far).store_slice(&mut out.n[0][k..k + len]);
+            (dv * (s12 * halvings)).store_slice(&mut out.n[1][k..k + len]);
+            a_.store_slice(&mut out.a[0][k..k + len]);
+            (dv * a12 + a1).store_slice(&mut out.a[1][k..k + len]);
+        }
+    }
+
+    /// `1/√a` and [`HALVINGS`]`·N/a` in row `i` of `rows`, at the distances `du` from the footprint's middle.
+    #[inline(always)]
+    fn at<S: Simd>(&self, s: S, rows: &Rows<R>, i: usize, du: V<S, R>) -> [V<S, R>; 2] {
+        let splat = |x: R| V::<S, R>::splat(s, x);
+        let n2 = splat(self.spread[0] * R::of(HALVINGS));
+        let n = n2.mul_add(du, splat(rows.n[1][i])).mul_add(du, splat(rows.n[0][i]));
+        let a = splat(self.square[3]).mul_add(du, splat(rows.a[1][i])).mul_add(du, splat(rows.a[0][i]));
+        let root = R::inverse_root_lanes(s, a);
+        [root, n * (root * root)]
     }
 }
 
@@ -304,6 +330,20 @@ impl<R: Real> Rows<R> {
         n: [[R::ZERO; WIDEST]; 2],
         a: [[R::ZERO; WIDEST]; 2],
     };
+
+    /// The columns that any row of the group at `i` reaches.
+    #[inline(always)]
+    fn span(&self, i: usize) -> Range<usize> {
+        let (mut low, mut high) = (R::of(1e9), R::ZERO);
+        for k in i..i + TOGETHER {
+            let (first, end) = (self.columns[0][k], self.columns[1][k]);
+            if first < end {
+                low = if first < low { first } else { low };
+                high = if end > high { end } else { high };
+            }
+        }
+        low.count() as usize..high.count() as usize
+    }
 }
 
 /// Sums the Gaussians of `list` into the rows of an image.
@@ -321,34 +361,30 @@ impl<R: Real> Op for Splat<'_, R> {
     #[inline(always)]
     fn call<S: Simd>(self, s: S) {
         let len = V::<S, R>::LEN;
-        let step = V::<S, R>::from_fn(s, |i| R::of(i as f64));
-        let (zero, most) = (V::<S, R>::splat(s, R::ZERO), V::<S, R>::splat(s, R::of(EXTENT * EXTENT)));
-        let rows = self.lines.len() / self.stride;
+        let lanes = V::<S, R>::from_fn(s, |i| R::of(i as f64));
+        let (zero, least) = (V::<S, R>::splat(s, R::ZERO), V::<S, R>::splat(s, R::of(HALVINGS * EXTENT * EXTENT)));
+        let strip = self.lines.len() / self.stride;
         let mut some = Rows::NONE;
         for &g in self.list {
             let f = &self.seen[g as usize];
             let weight = V::<S, R>::splat(s, f.weight);
-            let (n2, a2) = (V::<S, R>::splat(s, f.spread[0]), V::<S, R>::splat(s, f.square[3]));
             let from = (f.rows[0] as usize).max(self.first);
-            let to = (f.rows[1] as usize).min(self.first + rows);
-            for start in (from..to).step_by(len) {
-                f.rows(s, start, self.columns, &mut some);
-                for i in 0..len.min(to - start) {
-                    let first = (start + i - self.first) * self.stride;
-                    let (mut c, end) = (some.columns[0][i].count() as usize, some.columns[1][i].count() as usize);
-                    let (n0, n1) = (V::<S, R>::splat(s, some.n[0][i]), V::<S, R>::splat(s, some.n[1][i]));
-                    let (a0, a1) = (V::<S, R>::splat(s, some.a[0][i]), V::<S, R>::splat(s, some.a[1][i]));
-                    while c < end {
-                        let du = step + (R::of(c as f64) - f.middle[0]);
-                        let n = n2.mul_add(du, n1).mul_add(du, n0);
-                        let a = a2.mul_add(du, a1).mul_add(du, a0);
-                        let root = R::inverse_root_lanes(s, a);
-                        let e = n * (root * root);
-                        let value = R::exp_lanes(s, e * R::of(-0.5)) * (root * weight);
-                        let value = e.simd_le(most).select(value, zero);
-                        let at = &mut self.lines[first + c..first + c + len];
-                        (V::<S, R>::from_slice(s, at) + value).store_slice(at);
-                        c += len;
+            let to = (f.rows[1] as usize).min(self.first + strip);
+            for start in (from..to).step_by(WIDEST) {
+                let rows = start..to.min(start + WIDEST);
+                f.rows(s, rows.clone(), self.columns, &mut some);
+                for i in (0..rows.len()).step_by(TOGETHER) {
+                    for c in some.span(i).step_by(len) {
+                        let du = lanes + R::of(c as f64) - f.middle[0];
+                        for k in i..i + TOGETHER {
+                            let [root, x] = f.at(s, &some, k, du);
+                            let value = R::exp2_lanes(s, x) * (root * weight);
+                            let value = x.simd_ge(least).select(value, zero);
+                            // A row after the last one adds 0 to the last.
+                            let at = (start + k.min(rows.len() - 1) - self.first) * self.stride + c;
+                            let pixels = &mut self.lines[at..at + len];
+                            (V::<S, R>::from_slice(s, pixels) + value).store_slice(pixels);
+                        }
                     }
                 }
             }
@@ -372,9 +408,10 @@ impl<R: Real> Op for Gather<'_, R> {
     #[inline(always)]
     fn call<S: Simd>(self, s: S) {
         let len = V::<S, R>::LEN;
-        let step = V::<S, R>::from_fn(s, |i| R::of(i as f64));
+        let lanes = V::<S, R>::from_fn(s, |i| R::of(i as f64));
         let (zero, one) = (V::<S, R>::splat(s, R::ZERO), V::<S, R>::splat(s, R::ONE));
-        let most = V::<S, R>::splat(s, R::of(EXTENT * EXTENT));
+        let least = V::<S, R>::splat(s, R::of(HALVINGS * EXTENT * EXTENT));
+        let per_halving = V::<S, R>::splat(s, R::of(-1.0 / HALVINGS));
         let mut some = Rows::NONE;
         for ((f, shape), slope) in self.seen.iter().zip(self.shapes).zip(self.slopes.iter_mut()) {
             *slope = Slope::default();
@@ -382,53 +419,43 @@ impl<R: Real> Op for Gather<'_, R> {
             if from == to {
                 continue;
             }
-            let (n2, a2) = (V::<S, R>::splat(s, f.spread[0]), V::<S, R>::splat(s, f.square[3]));
-            let (mut plain, mut less) = ([zero; 6], [zero; 6]);
-            for start in (from..to).step_by(len) {
-                f.rows(s, start, self.beam.detector[1], &mut some);
-                for i in 0..len.min(to - start) {
-                    let first = (start + i) * self.stride;
-                    let (mut c, end) = (some.columns[0][i].count() as usize, some.columns[1][i].count() as usize);
-                    let (n0, n1) = (V::<S, R>::splat(s, some.n[0][i]), V::<S, R>::splat(s, some.n[1][i]));
-                    let (a0, a1) = (V::<S, R>::splat(s, some.a[0][i]), V::<S, R>::splat(s, some.a[1][i]));
-                    let (mut p0, mut p1, mut q0, mut q1) = (zero, zero, zero, zero);
-                    while c < end {
-                        let du = step + (R::of(c as f64) - f.middle[0]);
-                        let n = n2.mul_add(du, n1).mul_add(du, n0);
-                        let a = a2.mul_add(du, a1).mul_add(du, a0);
-                        let root = R::inverse_root_lanes(s, a);
-                        let inverse = root * root;
-                        let e = n * inverse;
-                        let d = V::<S, R>::from_slice(s, &self.image[first + c..first + c + len]);
-                        let w = R::exp_lanes(s, e * R::of(-0.5)) * (root * inverse * d);
-                        let w = e.simd_le(most).select(w, zero);
-                        let x = w * (one - e);
-                        let (wd, xd) = (w * du, x * du);
-                        p0 += w;
-                        p1 += wd;
-                        plain[3] = wd.mul_add(du, plain[3]);
-                        q0 += x;
-                        q1 += xd;
-                        less[3] = xd.mul_add(du, less[3]);
-                        c += len;
-                    }
-                    let dv = V::<S, R>::splat(s, some.dv[i]);
-                    for (all, (row0, row1)) in [(&mut plain, (p0, p1)), (&mut less, (q0, q1))] {
-                        let down = row0 * dv;
-                        all[0] += row0;
-                        all[1] += row1;
-                        all[2] += down;
-                        all[4] = row1.mul_add(dv, all[4]);
-                        all[5] = down.mul_add(dv, all[5]);
+            let mut all = [[zero; 6]; 2];
+            for start in (from..to).step_by(WIDEST) {
+                let rows = start..to.min(start + WIDEST);
+                f.rows(s, rows.clone(), self.beam.detector[1], &mut some);
+                for i in (0..rows.len()).step_by(TOGETHER) {
+                    for c in some.span(i).step_by(len) {
+                        let du = lanes + R::of(c as f64) - f.middle[0];
+                        // Sums over the group of w and of w·(1 - N/a), times 1, dv and dv².
+                        let mut sums = [[zero; 3]; 2];
+                        for k in i..i + TOGETHER {
+                            let [root, x] = f.at(s, &some, k, du);
+                            let at = (start + k.min(rows.len() - 1)) * self.stride + c;
+                            let d = V::<S, R>::from_slice(s, &self.image[at..at + len]);
+                            let w = R::exp2_lanes(s, x) * (root * root * root * d);
+                            let w = x.simd_ge(least).select(w, zero);
+                            let dv = V::<S, R>::splat(s, some.dv[k]);
+                            for (sums, w) in sums.iter_mut().zip([w, w * x.mul_add(per_halving, one)]) {
+                                let down = w * dv;
+                                sums[0] += w;
+                                sums[1] += down;
+                                sums[2] = down.mul_add(dv, sums[2]);
+                            }
+                        }
+                        for (all, [flat, down, bent]) in all.iter_mut().zip(sums) {
+                            let along = flat * du;
+                            all[0] += flat;
+                            all[1] += along;
+                            all[2] += down;
+                            all[3] = along.mul_add(du, all[3]);
+                            all[4] = down.mul_add(du, all[4]);
+                            all[5] += bent;
+                        }
                     }
                 }
             }
-            let mut moments = Moments::default();
-            for k in 0..6 {
-                moments.plain[k] = plain[k].as_slice().iter().map(|x| x.f64()).sum();
-                moments.less[k] = less[k].as_slice().iter().map(|x| x.f64()).sum();
-            }
-            *slope = self.beam.slope(shape, self.normal, &moments);
+            let [plain, less] = all.map(|sums| sums.map(|sum| sum.as_slice().iter().map(|x| x.f64()).sum()));
+            *slope = self.beam.slope(shape, self.normal, &Moments { plain, less });
         }
     }
 }
