@@ -1,10 +1,9 @@
 #!/usr/bin/env bash
-# What modelling only what a scan has need of is worth: a field of six levels (benches/six-levels.toml) with each rule alone
-# and all for SECONDS (60), and with none, as published, for 10/3 as long:
+# What it is worth to model only what a scan needs: a field of six levels (benches/six-levels.toml) with each rule alone and
+# with all for SECONDS (60), and with none, as published, for 10/3 as long:
 #   bash benches/scene.sh DATA_FOLDER OUT_FOLDER [SECONDS [VOLUMES [RUNS]]]
 # RUNS ("none support levels channels samples six-levels all") may name fewer.
-# DATA_FOLDER holds volumes/*.nii.gz. OUT_FOLDER/scene.md has a table a volume: what each ends with, and after how many seconds
-# it was where the run with none of the rules ended.
+# DATA_FOLDER holds volumes/*.nii.gz. OUT_FOLDER/scene.md has PSNR, ssim_2d and the seconds of the command.
 set -euo pipefail
 cd "$(dirname "$0")/.."
 source benches/common.sh
@@ -14,22 +13,18 @@ seconds=${3:-60}
 volumes=${4:-engine_256 teapot_256 head_256 chest_128 abdomen_128}
 wanted=${5:-none support levels channels samples six-levels all}
 cargo build --release --quiet -p conefield
-cargo build --release --quiet -p conefield-benches --bin reach
-bin=${CARGO_TARGET_DIR:-target}/release
+bin=${CARGO_TARGET_DIR:-target}/release/conefield
 mkdir -p "$out"
-: >"$out/scene.md"
 for volume in $volumes; do
     scan=$out/$volume
     published_scan "$data" "$volume" "$scan"
-    runs=()
     run() {
         local name=$1 time=$2 support=$3 levels=$4
         shift 4
         [[ " $wanted " == *" $name "* ]] || return 0
-        "$bin/conefield" -q reconstruct "$scan" --spec benches/six-levels.toml -o "$out/$volume-$name" --force --reference truth \
+        "$bin" -q reconstruct "$scan" --spec benches/six-levels.toml -o "$out/$volume-$name" --force --reference truth \
             --set training.seconds="$time" --set training.steps=1000000 --set scene.support="$support" \
             --set scene.levels="$levels" "$@" >/dev/null
-        runs+=("$name=$out/$volume-$name")
     }
     # As published: as many samples on every ray.
     count=(--set projector.samples=320 --set training.rays=1024)
@@ -40,6 +35,5 @@ for volume in $volumes; do
     run samples "$seconds" box all
     run six-levels "$seconds" carve all
     run all "$seconds" carve needed
-    printf '\n`%s`\n\n' "$volume" >>"$out/scene.md"
-    "$bin/reach" "${runs[@]}" | tee -a "$out/scene.md"
 done
+python3 benches/spread.py "$out/{column}-{row}/record.json" "$wanted" "$volumes" 0 | tee "$out/scene.md"

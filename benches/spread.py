@@ -1,4 +1,4 @@
-"""A table of runs over seeds: mean and half the range of PSNR, the mean of ssim_2d, the longest command.
+"""A table of runs over seeds: mean and half the range of PSNR (with several seeds), the mean of ssim_2d, the longest command.
 
 usage: spread.py PATTERN ROWS COLUMNS SEEDS
 
@@ -15,5 +15,7 @@ for row in rows:
         psnr = [run["scores"]["psnr"] for run in runs]
         ssim = statistics.mean(run["scores"]["ssim_2d"] for run in runs)
         longest = max(run["total_s"] for run in runs)
-        cells.append(f"{statistics.mean(psnr):.2f} dB ± {(max(psnr) - min(psnr)) / 2:.2f}, {ssim:.3f}, {longest:.0f} s")
+        range_ = f" ± {(max(psnr) - min(psnr)) / 2:.2f}" if len(seeds) > 1 else ""
+        time = f"{longest:.0f} s" if longest >= 20 else f"{longest:.1f} s"
+        cells.append(f"{statistics.mean(psnr):.2f} dB{range_}, {ssim:.3f}, {time}")
     print(f"| {row} | " + " | ".join(cells) + " |")

@@ -1,5 +1,5 @@
 #!/usr/bin/env bash
-# An encoder from a plugin beside the built-in one in every neural spec, at equal time:
+# An encoder from a plugin beside the built-in one in neural specs, at equal time:
 #   bash benches/triplane.sh DATA_FOLDER OUT_FOLDER [BUDGET [SEEDS [VOLUME]]]
 # Each of SEEDS ("0 1 2") is another noise of 50 views of VOLUME (abdomen_128) and another start; each run has BUDGET (30s) for the whole
 # command. Prints mean and half the range of PSNR. Nothing else may run on the machine.
@@ -11,7 +11,7 @@ out=$2
 budget=${3:-30s}
 seeds=${4:-0 1 2}
 volume=${5:-abdomen_128}
-specs="balanced accurate ni-naf fast field-tv accurate-tv"
+specs="balanced accurate fast field-tv"
 cargo build --release --quiet -p conefield
 (cd plugins/examples && cargo build --release --quiet --locked -p triplane)
 bin=${CARGO_TARGET_DIR:-target}/release/conefield

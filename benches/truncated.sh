@@ -2,8 +2,8 @@
 # A body that is wider than the detector, with and without a look beyond the volume:
 #   bash benches/truncated.sh DATA_FOLDER OUT_FOLDER [SECONDS [SPECS]]
 # DATA_FOLDER holds volumes/abdomen_128.nii.gz. The detector is half as wide as the published one, the volume to reconstruct the
-# 64 x 64 x 128 voxels that all views see. Fields train for SECONDS (60); methods on voxels end by themselves. A line each:
-# PSNR and ssim_2d over that volume, and all seconds; "whole" has all 128 x 128 x 128 voxels as its volume, the same scored.
+# 64 x 64 x 128 voxels that all views see. Fields train for SECONDS (60); methods on voxels end by themselves. A row each: PSNR and
+# ssim_2d over that volume and the seconds of the command, without and with scene.surround, and with all 128 x 128 x 128 voxels.
 set -euo pipefail
 cd "$(dirname "$0")/.."
 data=$1
@@ -57,11 +57,12 @@ for spec in $specs; do
         volume=$run/volume.nii.gz
         [[ $way != whole ]] || { cut "$volume" "$run/middle.nii" && volume=$run/middle.nii; }
         "$bin" evaluate "$volume" "$out/truth.nii" --json >"$run/scores.json"
-        python3 - "$spec" "$way" "$run" <<'PY'
+        python3 - "$run" <<'PY'
 import json, sys
-spec, way, run = sys.argv[1:]
+run, = sys.argv[1:]
 scores, record = json.load(open(f"{run}/scores.json")), json.load(open(f"{run}/record.json"))
-print(f"{spec:10} {way:8} {scores['psnr']:6.2f} dB  {scores['ssim_2d']:.3f}  {record['total_s']:6.1f} s")
+json.dump({"scores": scores, "total_s": record["total_s"]}, open(f"{run}/scored.json", "w"))
 PY
     done
-done | tee "$out/truncated.txt"
+done
+python3 benches/spread.py "$out/{row}-{column}/scored.json" "$specs" "without with whole" 0 | tee "$out/truncated.md"
