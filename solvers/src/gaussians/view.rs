@@ -314,10 +314,12 @@ impl<R: Real> Footprint<R> {
     /// `1/√a` and [`HALVINGS`]`·N/a` in row `i` of `rows`, at the distances `du` from the footprint's middle.
     #[inline(always)]
     fn at<S: Simd>(&self, s: S, rows: &Rows<R>, i: usize, du: V<S, R>) -> [V<S, R>; 2] {
-        let splat = |x: R| V::<S, R>::splat(s, x);
-        let n2 = splat(self.spread[0] * R::of(HALVINGS));
-        let n = n2.mul_add(du, splat(rows.n[1][i])).mul_add(du, splat(rows.n[0][i]));
-        let a = splat(self.square[3]).mul_add(du, splat(rows.a[1][i])).mul_add(du, splat(rows.a[0][i]));
+        let [n0, n1] = [rows.n[0][i], rows.n[1][i]];
+        let [a0, a1] = [rows.a[0][i], rows.a[1][i]];
+        let n2 = V::<S, R>::splat(s, self.spread[0] * R::of(HALVINGS));
+        let n = n2.mul_add(du, V::<S, R>::splat(s, n1)).mul_add(du, V::<S, R>::splat(s, n0));
+        let a2 = V::<S, R>::splat(s, self.square[3]);
+        let a = a2.mul_add(du, V::<S, R>::splat(s, a1)).mul_add(du, V::<S, R>::splat(s, a0));
         let root = R::inverse_root_lanes(s, a);
         [root, n * (root * root)]
     }
