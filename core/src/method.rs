@@ -313,7 +313,8 @@ pub trait Plan: Send {
         true
     }
 
-    /// Upper bound of the passes over the views, for iterative methods.
+    /// Passes (for an iterative method) or steps after which it ends even if there is time for more, because more of them
+    /// may fit the noise. `None` if it trains until the time is over.
     fn passes(&self) -> Option<u64> {
         None
     }

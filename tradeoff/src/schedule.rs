@@ -68,7 +68,7 @@ pub struct Schedule {
     pub expected: Costs,
     /// Planned seconds of training.
     pub train_s: f64,
-    /// Passes at which a voxel method ends by itself, however much time is left: more of them do not always come closer.
+    /// Passes or steps after which the method ends even if there is time for more ([`Plan::passes`]).
     #[serde(skip)]
     pub passes: Option<u64>,
     #[serde(skip)]
@@ -200,11 +200,9 @@ impl Budget {
             );
             return Err(Error::invalid(TOO_SHORT.trim_end_matches(": "), "time", time(self.seconds), expected));
         }
-        let plan = method.plan();
-        let passes = match (kind, plan.links()) {
-            (Unknowns::Field, _) => None,
-            (Unknowns::Voxels, [first, ..]) => first.passes(),
-            (Unknowns::Voxels, []) => method.plan().passes(),
+        let passes = match method.plan().links() {
+            [first, ..] => first.passes(),
+            [] => method.plan().passes(),
         };
         let steps = (train_s / costs.step_s.max(1e-12)) as u64;
         Ok(Schedule {

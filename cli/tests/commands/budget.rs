@@ -54,6 +54,17 @@ fn a_plan_names_every_part_and_the_record_holds_them_against_it() {
     }
 }
 
+/// More steps than a spec of Gaussians has would fit the noise.
+#[test]
+fn gaussians_end_after_their_own_steps_with_time_left() {
+    let (dir, scan) = scan();
+    let small = ["start.count=200", "most=400", "training.steps=30"].into_iter().flat_map(|s| ["--set", s]);
+    let all = ["reconstruct", &text(&scan), "--spec", "gaussians", "-o", &text(&dir.path().join("run")), "--json"];
+    let record = json(&[&all[..], &small.collect::<Vec<_>>(), &["--budget", "20s"]].concat());
+    assert_eq!((&record["steps"], &record["plan"]["steps"]), (&Value::from(30), &Value::from(30)), "{record}");
+    assert!(record["total_s"].as_f64().unwrap() < 15.0, "{record}");
+}
+
 #[test]
 fn without_a_spec_the_best_of_the_shipped_front_is_taken() {
     let (dir, scan) = scan();

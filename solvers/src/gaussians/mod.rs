@@ -286,6 +286,10 @@ impl Plan for GaussianPlan {
         }
     }
 
+    fn passes(&self) -> Option<u64> {
+        self.training.steps
+    }
+
     fn inspect(&self, scan: &Scan) -> Result<Findings> {
         let fitted = fit(scan, &self.scene, &mut self.pipeline.clone())?;
         let mut lines = surround::found(scan, self.scene.surround)?;
