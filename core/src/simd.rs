@@ -532,8 +532,8 @@ mod tests {
             assert!((a[4] / b[4] - 1.0).abs() < 2e-7, "2^{} = {} not {}", x[i].min(0.0), a[4], b[4]);
         }
         let ends = run(Normal(&[-125.75f32, -126.0, -1e30]));
-        assert!((ends[0][4] / f64::from(-125.75).exp2() - 1.0).abs() < 2e-7);
-        assert!(ends[1][4] >= f64::from(-126).exp2() * (1.0 - 2e-7) && ends[2][4] == ends[1][4]);
+        assert!((ends[0][4] / (-125.75f64).exp2() - 1.0).abs() < 2e-7);
+        assert!(ends[1][4] >= (-126f64).exp2() * (1.0 - 2e-7) && ends[2][4] == ends[1][4]);
     }
 
     /// Products of several of them must not end among the denormals, which halved the speed of training.
