@@ -83,16 +83,16 @@ impl Costs {
 pub fn calibrate(bench: &Bench<'_>, plan: &mut dyn Plan, seconds: f64) -> Result<Costs> {
     // Passes get all of it: a single coarse scan cannot separate proportional from constant costs, and passes would
     // seem three times as expensive.
-    let begins = |plan: &mut dyn Plan, share: f64| match plan.pipeline() {
-        Some(_) => field(bench, plan, share * seconds),
+    let measured = |plan: &mut dyn Plan, share: f64, later: bool| match plan.pipeline() {
+        Some(_) => field(bench, plan, share * seconds, later),
         None => voxels(bench, plan, seconds),
     };
     let solved = match plan.links() {
-        [] => begins(plan, 0.5)?,
+        [] => measured(plan, 0.5, false)?,
         [first, later @ ..] => {
-            let mut costs = begins(first.as_mut(), 0.25)?;
+            let mut costs = measured(first.as_mut(), 0.25, false)?;
             for link in later {
-                let next = voxels(bench, link.as_mut(), seconds)?;
+                let next = measured(link.as_mut(), 0.25, true)?;
                 // Its start volume must be evaluated first.
                 let before = costs.export_s + next.prepare_s;
                 let passes = link.passes().unwrap_or(1) as f64;
@@ -107,16 +107,18 @@ pub fn calibrate(bench: &Bench<'_>, plan: &mut dyn Plan, seconds: f64) -> Result
     Ok(Costs { picture_s: picture(bench)?, score_s: score(bench)?, ..solved })
 }
 
-/// Measures steps on some of the views, then evaluation of some layers of the field.
-fn field(bench: &Bench<'_>, plan: &mut dyn Plan, seconds: f64) -> Result<Costs> {
+/// Measures steps on some of the views, then evaluation of some layers of the field. A `later` method of a chain gets a
+/// start volume.
+fn field(bench: &Bench<'_>, plan: &mut dyn Plan, seconds: f64, later: bool) -> Result<Costs> {
     let n = bench.scan.geometry.views.len();
     let every = n.div_ceil(VIEWS);
     let others: Vec<usize> = (0..n).filter(|v| v % every != 0).collect();
     let scan = bench.scan.split(&others)?.0;
     let mut laps = Laps::new(bench.cancelled);
     let limits = Limits { at_most: Some(seconds), ..Limits::default() };
+    let start = later.then(|| uniform(&scan));
     let begin = Instant::now();
-    let solution = plan.run(&job(bench, &scan, limits), &mut laps)?;
+    let solution = plan.run(&Job { start: start.as_ref(), ..job(bench, &scan, limits) }, &mut laps)?;
     // The work before the first step visits all pixels of all views.
     let fewer = n as f64 / scan.geometry.views.len() as f64;
     let prepare_s = fewer * (begin.elapsed().as_secs_f64() - solution.train_s).max(0.0);
@@ -141,11 +143,9 @@ fn voxels(bench: &Bench<'_>, plan: &mut dyn Plan, seconds: f64) -> Result<Costs>
         let share = plan.work(&scan.header()) / plan.work(&bench.scan.header());
         let mut laps = Laps::new(bench.cancelled);
         let limits = Limits { steps: Some(2), ..Limits::default() };
+        let start = uniform(&scan);
         let begin = Instant::now();
-        // A start volume costs as much as an empty one.
-        let grid = scan.geometry.volume;
-        let empty = Volume { data: Array3::zeros(grid.shape), grid, affine: None };
-        let solution = plan.run(&Job { start: Some(&empty), ..job(bench, &scan, limits) }, &mut laps)?;
+        let solution = plan.run(&Job { start: Some(&start), ..job(bench, &scan, limits) }, &mut laps)?;
         let took = begin.elapsed().as_secs_f64();
         let step_s = match (solution.steps, laps.typical()) {
             (2.., Some(lap)) => lap,
@@ -188,6 +188,14 @@ impl Passes {
 
 fn job<'a>(bench: &'a Bench<'_>, scan: &'a Scan, limits: Limits) -> Job<'a> {
     Job { seed: bench.seed, limits, volumes: bench.volumes, ..Job::new(scan, bench.backend) }
+}
+
+/// A start volume: what it contains does not change the durations. It is positive, because Gaussians need that.
+fn uniform(scan: &Scan) -> Volume {
+    let grid = scan.geometry.volume;
+    let longest = grid.size().into_iter().fold(0.0, f64::max);
+    let mean = scan.projections.mean().unwrap_or(0.0) as f64 / longest;
+    Volume { data: Array3::from_elem(grid.shape, (mean as f32).max(f32::MIN_POSITIVE)), grid, affine: None }
 }
 
 /// The scan with pixels and voxels `factor` times as large, as far as some remain.

@@ -65,6 +65,21 @@ fn gaussians_end_after_their_own_steps_with_time_left() {
     assert!(record["total_s"].as_f64().unwrap() < 15.0, "{record}");
 }
 
+/// Gaussians that start from the volume of the method before cannot be measured from an empty one.
+#[test]
+fn a_chain_that_ends_with_gaussians_has_a_plan() {
+    let (dir, scan) = scan();
+    let (scan, out) = (text(&scan), text(&dir.path().join("run")));
+    let small = ["methods.3.start.count=200", "methods.3.most=400", "methods.3.training.steps=30"];
+    let all = ["reconstruct", &scan, "--spec", "smooth-gaussians", "-o", &out, "--reference", "truth", "--json"];
+    let small: Vec<&str> = small.into_iter().flat_map(|s| ["--set", s]).collect();
+    let record = json(&[&all[..], &small, &["--budget", "20s"]].concat());
+    assert!(record["plan"]["expected"]["then_s"].as_f64().unwrap() > 0.0, "{record}");
+    // The three methods before make some passes more.
+    assert!((30..60).contains(&record["steps"].as_u64().unwrap()), "{record}");
+    assert!(record["total_s"].as_f64().unwrap() < 20.0, "{record}");
+}
+
 #[test]
 fn without_a_spec_the_best_of_the_shipped_front_is_taken() {
     let (dir, scan) = scan();
