@@ -1,8 +1,8 @@
 //! Bad input of every kind, as a user would meet it: the real command ends in time, in bounded memory, with the
 //! documented status and one message that says where, what and what instead; it leaves nothing behind.
 //!
-//! The outcome is kept in `docs/reference/bad-inputs.md`: `CONEFIELD_BLESS=1 cargo test -p conefield --test bad_input` writes it
-//! there, and without that variable the page must be what the command does now.
+//! The outcome is kept in `cases.md`: `CONEFIELD_BLESS=1 cargo test -p conefield --test bad_input` writes it there, and
+//! without that variable the table must be what the command does now.
 
 #![cfg(target_os = "linux")]
 
@@ -29,7 +29,7 @@ use case::{Case, Outcome};
 use rayon::prelude::*;
 
 #[test]
-fn every_bad_input_ends_as_the_page_says() {
+fn every_bad_input_ends_as_the_table_says() {
     let sections: Vec<(&str, Vec<Case>)> = vec![
         ("NIfTI", nifti::cases()),
         ("MetaImage", metaimage::cases()),

@@ -1,5 +1,5 @@
 //! Plugins that do one thing wrong each, and what becomes of them: refused when loaded, refused when tried out, found by
-//! the check, or an error of the run. `docs/reference/faulty-plugins.md` is made from this; `CONEFIELD_BLESS=1` writes it anew.
+//! the check, or an error of the run. `faulty.md` is made from this; `CONEFIELD_BLESS=1` writes it anew.
 
 use crate::build::{cargo, cc, library, sources};
 use crate::common::{conefield, done, text};
@@ -438,7 +438,7 @@ fn shortened(message: &str, want: &str) -> String {
 /// The page of all faults.
 fn page(rows: &[Row]) {
     let mut text = String::from(
-        "# Faulty plugins\n\nWhat happens to plugins with one fault each. `cli/tests/plugins/faulty.rs` makes this page from \
+        "# Faulty plugins\n\nWhat happens to plugins with one fault each. `cli/tests/plugins/faulty.rs` makes this table from \
          `plugins/tests`; `CONEFIELD_BLESS=1 cargo test -p conefield --test plugins` writes it.\n\n- *load*: refused by \
          `plugins list` (which shows the others), `plugins check` and a reconstruction when the library is loaded.\n- *trial*: \
          refused when the stage is made. Each stage is tried on a few rows, between guard zones and with a time limit.\n- \
@@ -457,7 +457,7 @@ fn page(rows: &[Row]) {
             let _ = writeln!(text, "| {what} | {by} | {said} |");
         }
     }
-    let path = sources().join("docs/reference/faulty-plugins.md");
+    let path = sources().join("cli/tests/plugins/faulty.md");
     if std::env::var_os("CONEFIELD_BLESS").is_some() {
         std::fs::write(&path, &text).unwrap();
     }
