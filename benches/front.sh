@@ -38,6 +38,7 @@ run coarse-112 fista-tv "$(cubic 112)" "$prior" bin=2 stop.passes=8
 run cubic-128 fista-tv "$(cubic 128)" "$prior" stop.passes=8
 run smooth-200 smooth-tv methods.1.stop.passes=5 methods.2.stop.passes=3
 run smooth-tv smooth-tv
+run smooth-long smooth-tv methods.2.stop.passes=30
 run cubic-200-long fista-tv "$(cubic 200)" "$prior" 'stop={ passes = 40, change = 2e-4 }'
 python3 - "$out" "$front" "$volumes" "${names[@]}" <<'PY'
 import json, math, statistics, sys

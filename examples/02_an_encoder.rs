@@ -13,9 +13,9 @@ stage_type!(Encoder, "waves", Waves, "waves of learned directions");
 #[derive(Debug, Clone, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields, default)]
 struct Waves {
-    /// Channels, a wave each.
+    /// Number of channels, one per wave.
     waves: usize,
-    /// Radians along the cube's side that a wave starts with, at most.
+    /// Largest initial frequency of a wave, in radians per cube side.
     frequency: f32,
 }
 

@@ -144,8 +144,8 @@ pub struct EndOptions {
     /// Stop training after this many steps.
     #[arg(long, value_name = "N", value_parser = clap::value_parser!(u64).range(1..))]
     pub steps: Option<u64>,
-    /// Stop training after this time at the latest. Unlike --seconds it neither replaces the spec's end nor stretches a learning-rate
-    /// schedule.
+    /// Stop training after this time at the latest. Unlike --seconds, it neither replaces the spec's own limits nor
+    /// stretches a learning-rate schedule.
     #[arg(long, value_name = "TIME", value_parser = crate::parse::seconds)]
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub at_most: Option<f64>,

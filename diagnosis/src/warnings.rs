@@ -106,15 +106,15 @@ fn truncated(s: &Survey, warn: Warn) {
         WarningKind::Truncated,
         format!(
             "the object extends beyond the detector's side in {} of the views, on {} of the rows ({:.1} mm at the \
-             axis): line integrals of {:.3} there, above {:.3} which counts as air",
+             axis): line integrals of {:.3} there; up to {:.3} counts as air",
             percent(t.views),
             percent(t.rows),
             t.height_mm,
             t.level,
             t.threshold
         ),
-        "make the volume as large as the whole object, not only as the field of view, and do not trust values near \
-         the rim of the field of view"
+        "make the volume as large as the whole object, not just the field of view, and do not trust values near the \
+         rim of the field of view"
             .into(),
     );
 }
@@ -140,7 +140,7 @@ fn covered(scan: &Scan, s: &Survey, warn: Warn) {
             size[2],
             fov.height_mm
         ),
-        "make the volume smaller, or trust the parts outside less; --png of info shows them".into(),
+        "make the volume smaller, or trust the parts outside less; conefield info --png shows them".into(),
     );
 }
 
@@ -153,7 +153,8 @@ fn offset(s: &Survey, warn: Warn) {
         if overlap < 0.0 { "more than" } else { "nearly" },
     );
     if overlap < 0.0 {
-        let advice = "no ray crosses the axis: check the offset's sign and unit, and that it is that of the centre";
+        let advice =
+            "no ray crosses the axis: check the offset's sign and unit, and that it refers to the detector's centre";
         warn(WarningKind::Offset, found, advice.into());
     } else if overlap < OVERLAP * 2.0 * half {
         warn(
@@ -200,14 +201,14 @@ fn angles(scan: &Scan, s: &Survey, warn: Warn) {
         warn(
             WarningKind::Gap,
             format!(
-                "no view between {:.1}° and {:.1}°: {:.1}°, {:.1} times the mean distance of {:.2}°",
+                "no view between {:.1}° and {:.1}°: a gap of {:.1}°, {:.1} times the mean step of {:.2}°",
                 a.largest_gap_at_deg,
                 a.largest_gap_at_deg + a.largest_gap_deg,
                 a.largest_gap_deg,
                 a.largest_gap_deg / a.mean_gap_deg,
                 a.mean_gap_deg
             ),
-            "check that no views are missing and that angles belong to their projections".into(),
+            "check that no views are missing and that the angles match their projections".into(),
         );
     }
 }
@@ -227,8 +228,8 @@ fn repeats(scan: &Scan, s: &Survey, warn: Warn) {
             percent(least)
         ),
         format!(
-            "if the scan takes both ends of a full turn, its steps are {step:.4}°: import it with step_deg = {} in place \
-             of range_deg, and leave the last view out with --views 0-{}",
+            "if the scan includes both ends of a full turn, its steps are {step:.4}°: import it with step_deg = {} \
+             instead of range_deg, and leave the last view out with --views 0-{}",
             (step * 1e6).round() / 1e6,
             n - 2
         ),
@@ -248,7 +249,10 @@ fn scale(scan: &Scan, s: &Survey, warn: Warn) {
         };
         warn(
             WarningKind::Scale,
-            format!("the source is {dso:.4} mm from the axis; most have {} to {} mm", DISTANCES[0], DISTANCES[1]),
+            format!(
+                "the source is {dso:.4} mm from the axis; most scanners have {} to {} mm",
+                DISTANCES[0], DISTANCES[1]
+            ),
             advice.into(),
         );
     }
@@ -284,17 +288,17 @@ fn voxels(scan: &Scan, s: &Survey, warn: Warn) {
     let size = grid.size();
     let fitting: [f64; 3] = std::array::from_fn(|k| (size[k] / supported[k]).round().max(1.0));
     let found = format!(
-        "voxels of {} where a pixel over the magnification of {:.3} is {}",
+        "voxels of {}, but a pixel divided by the magnification of {:.3} is {}",
         list(grid.spacing),
         s.setup.magnification,
         list(supported)
     );
     let shape = match fitting.iter().all(|n| *n >= FEW) {
-        true => format!("a shape of {:?} has voxels of that size", fitting.map(|n| n as usize)),
+        true => format!("a shape of {:?} gives voxels of that size", fitting.map(|n| n as usize)),
         false => "check that the pixel size is in mm, and that dso and dsd are not swapped".into(),
     };
     match fine {
-        true => warn(WarningKind::VoxelSize, found, format!("finer than the detector sees; {shape}")),
-        false => warn(WarningKind::VoxelSize, found, format!("details that the detector sees are lost; {shape}")),
+        true => warn(WarningKind::VoxelSize, found, format!("finer than the detector resolves; {shape}")),
+        false => warn(WarningKind::VoxelSize, found, format!("details that the detector resolves are lost; {shape}")),
     }
 }

@@ -21,9 +21,9 @@ use std::ops::Range;
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
 #[serde(rename_all = "kebab-case")]
 pub enum Convention {
-    /// Of torch-ngp, also in NAF, SAX-NeRF and NI-NeRF: primes 1, 19349663, 83492791.
+    /// From torch-ngp, also used by NAF, SAX-NeRF and NI-NeRF: primes 1, 19349663, 83492791.
     Naf,
-    /// Of the paper (its equation 4): primes 1, 2654435761, 805459861.
+    /// From the paper (equation 4): primes 1, 2654435761, 805459861.
     InstantNgp,
 }
 

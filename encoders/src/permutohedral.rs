@@ -38,7 +38,7 @@ pub struct Permutohedral {
     pub levels: usize,
     /// Features per level: 1, 2, 4 or 8.
     pub features: usize,
-    /// Cells along the cube's side on the coarsest level, for a cubic grid with as many vertices.
+    /// Cells along the cube's side on the coarsest level, for a cubic grid with the same number of vertices.
     pub base_resolution: u32,
     /// Ratio of consecutive levels' resolutions.
     pub growth: f64,
@@ -76,7 +76,7 @@ const PRIMES: [u32; 3] = [1, 2_654_435_761, 805_459_861];
 #[derive(Debug, Clone, PartialEq)]
 struct Level {
     table: Table,
-    /// Cells along the cube's side, for a cubic grid with as many vertices.
+    /// Cells along the cube's side, for a cubic grid with the same number of vertices.
     resolution: f64,
     /// `s` in the formula.
     scale: f64,

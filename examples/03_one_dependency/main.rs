@@ -1,4 +1,4 @@
-//! From a scan on disk to a volume on disk, in a program of its own: `conefield` is its one dependency.
+//! A standalone program that reads a scan from disk and writes a volume: `conefield` is its only dependency.
 
 use conefield::simulate::{Protocol, phantom};
 use conefield::{Reconstruct, Result, io};

@@ -46,7 +46,7 @@ pub(crate) fn of(voxels: &dyn Voxels, place: &str) -> (Affine, bool) {
     match voxels.affine() {
         Some(a) if fits(&a, grid.spacing) => return (a, true),
         Some(_) => tracing::warn!(
-            "{place}: the affine's voxel sizes are not the grid's {:?} mm: it is replaced by one from the grid",
+            "{place}: the affine's voxel sizes differ from the grid's {:?} mm; it is replaced by one from the grid",
             grid.spacing
         ),
         None => {}

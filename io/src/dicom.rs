@@ -99,7 +99,7 @@ fn assemble(place: &str, mut slices: Vec<Slice>) -> Result<Volume> {
     slices.sort_by(|a, b| dot(a.position, normal).total_cmp(&dot(b.position, normal)));
     let (first, last) = (&slices[0], &slices[slices.len() - 1]);
     if first.modality != "CT" {
-        tracing::warn!("{place}: the modality is {:?}, not CT: its values are no attenuation", first.modality);
+        tracing::warn!("{place}: the modality is {:?}, not CT: its values are not attenuation", first.modality);
     }
     let step = match slices.len() {
         1 => first.thickness()?,
@@ -162,7 +162,7 @@ fn even(place: &str, slices: &[Slice], normal: [f64; 3]) -> Result<()> {
     }
     if sorted[sorted.len() - 1] - sorted[0] > 0.01 * usual {
         tracing::warn!(
-            "{place}: slices lie {:.4} to {:.4} mm apart: they are taken as even",
+            "{place}: slices lie {:.4} to {:.4} mm apart: even spacing is assumed",
             sorted[0],
             sorted[sorted.len() - 1]
         );

@@ -221,7 +221,7 @@ impl Drop for Lease {
         match settled {
             Err(e) => tracing::error!("{e}"),
             Ok(()) if aside.is_dir() => tracing::info!(
-                "{}: what stood here before waits in {} until the work is complete",
+                "{}: the earlier content is kept in {} until the work is complete",
                 self.path.display(),
                 aside.display()
             ),
@@ -312,7 +312,7 @@ fn await_parts(path: &Path, contents: Contents) -> Result<()> {
         let mut reported = false;
         while matches!(lock::hold(&part), Held::Theirs) {
             if !reported {
-                tracing::info!("{}: waiting until another conefield, which is writing it, ends", part.display());
+                tracing::info!("{}: waiting for another conefield process that is writing to it", part.display());
                 reported = true;
             }
             if begin.elapsed() > ENDING {

@@ -111,7 +111,7 @@ fn read(path: &Path, with_test: bool) -> Result<DataSet> {
         let mut turned = train.clone();
         other.turn(&mut turned.geometry, &file);
         if let Some(better) = rays::agreement(&turned, data).filter(|o| o.residual < 0.5 * given.residual) {
-            tracing::warn!("{place}: offDetector fits the image as [u, v], not as [v, u]: taken so");
+            tracing::warn!("{place}: offDetector fits the image as [u, v], not as [v, u], and is read so");
             (train, agreement, swapped) = (turned, Some(better), true);
             test.iter_mut().for_each(|t| other.turn(&mut t.geometry, &file));
         }
@@ -189,7 +189,7 @@ impl Description {
         let item = required(views, "angles")?;
         let angles = item.numbers()?;
         if let Some(a) = angles.iter().find(|a| a.abs() > MOST_RADIANS) {
-            tracing::warn!("{place}: {}: {a} looks like degrees and is taken for radians", item.key());
+            tracing::warn!("{place}: {}: {a} looks like degrees but is read as radians", item.key());
         }
         let count = angles.len();
         let geometry = Geometry { detector: self.detector, views: self.orbit(angles).views(), volume: self.grid };

@@ -142,7 +142,7 @@ fn offset(input: &Input, header: &NiftiHeader) -> Result<u64> {
 fn scaling(input: &Input, header: &NiftiHeader) -> Result<(f64, f64)> {
     let (slope, inter) = (header.scl_slope, header.scl_inter);
     if !slope.is_finite() {
-        tracing::warn!("{}: scl_slope is {slope}: the values are taken as they are stored", input.place());
+        tracing::warn!("{}: scl_slope is {slope}: the stored values are used without scaling", input.place());
         return Ok((1.0, 0.0));
     }
     if slope == 0.0 {

@@ -391,7 +391,7 @@ fn i0(place: &str, d: &Description, options: &ImportOptions) -> Result<Option<I0
         return Err(Error::invalid(place, "values.i0", "i0 beside files.flat", "one of them"));
     }
     if flat && options.i0.is_some() {
-        tracing::info!("{place}: --i0 stands in for files.flat, which is not read");
+        tracing::info!("{place}: --i0 replaces files.flat, which is not read");
     }
     Ok(options.i0.or(said))
 }

@@ -39,7 +39,7 @@
     const last = run.curves[run.curves.length - 1] ?? {};
     const status = [["step", last.step, String], ["after", last.seconds, seconds], ["loss", last.loss], ["PSNR", last.psnr, (x) => `${x.toFixed(2)} dB`], ["held-out error", last.held_out]];
     const known = status.filter(([, x]) => Number.isFinite(x)).map(([name, x, show = (x) => short(x, 4)]) => `${name} ${show(x)}`);
-    byId("live").append(element("p", {}, known.join(" · ") || "Nothing is recorded yet."));
+    byId("live").append(element("p", {}, known.join(" · ") || "Nothing recorded yet."));
     if (run.live) byId("live").append(element("img", { class: "picture", src: run.live, alt: "The middle slices" }));
   }
   byId("live-section").hidden = byId("live").childElementCount === 0;
@@ -91,7 +91,7 @@
   scans.forEach((scan) => {
     const pieces = [element("h3", {}, scan.line)];
     if (scan.geometry) pieces.push(element("img", { class: "picture", src: scan.geometry, alt: "Source path, detector and volume from above and from the side" }));
-    if (scan.facts) pieces.push(element("details", {}, element("summary", {}, "What the scan's files say"), element("pre", {}, scan.facts)));
+    if (scan.facts) pieces.push(element("details", {}, element("summary", {}, "Metadata of the scan"), element("pre", {}, scan.facts)));
     byId("geometry").append(...pieces);
   });
   byId("geometry-section").hidden = scans.every((s) => !s.geometry);
@@ -175,7 +175,7 @@
     if (kept.against) byId("against").value = kept.against;
     curves();
     const status = (text) => { byId("live-note").textContent = text; };
-    status(`State of ${new Date().toLocaleTimeString()}, renewed every ${page.renewed} s.`);
+    status(`State at ${new Date().toLocaleTimeString()}, updated every ${page.renewed} s.`);
     const renew = async () => {
       try {
         if (!(await fetch(location.href, { cache: "no-store" })).ok) throw new Error("refused");
@@ -472,7 +472,7 @@
 
   if (!document.createElement("canvas").getContext("webgl2")) {
     byId("no-webgl").hidden = false;
-    byId("no-webgl").textContent = "This browser has no WebGL 2, which draws the volumes. The rest of the page needs none.";
+    byId("no-webgl").textContent = "This browser does not support WebGL 2, which is needed to draw the volumes. The rest of the page works without it.";
     byId("canvases").hidden = true;
     return;
   }

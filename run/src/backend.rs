@@ -91,8 +91,8 @@ impl Auto {
             Some(format!("there is a GPU, {best}: --backend wgpu:{} uses it", best.index))
         };
         match self.gpu.get_or_init(look) {
-            None => "chosen by --backend auto, which takes the CPU; no GPU is available".to_owned(),
-            Some(gpu) => format!("chosen by --backend auto, which takes the CPU; {gpu}"),
+            None => "chosen by --backend auto, which uses the CPU; no GPU is available".to_owned(),
+            Some(gpu) => format!("chosen by --backend auto, which uses the CPU; {gpu}"),
         }
     }
 }

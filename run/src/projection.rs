@@ -47,7 +47,7 @@ pub fn oddity(own: &VoxelGrid, grid: &VoxelGrid) -> Option<String> {
     let differs = (0..3).any(|k| (size[k] / want[k] - 1.0).abs() > SAME_BOX);
     differs.then(|| {
         let mm = |s: [f64; 3]| format!("{:.1} x {:.1} x {:.1} mm", s[0], s[1], s[2]);
-        format!("its box of {} is not the {} of the scan's volume: its own box is used", mm(size), mm(want))
+        format!("its box of {} differs from the {} of the scan's volume: its own box is used", mm(size), mm(want))
     })
 }
 

@@ -40,8 +40,8 @@ pub fn score(place: &str, volume: &Volume, reference: &Volume, peak: f64) -> Res
     same_shape(place, volume.data.shape(), reference.data.shape())?;
     if let Some(factor) = conefield_metrics::other_unit(volume.data.view(), reference.data.view()) {
         tracing::warn!(
-            "{place}: it is like the reference if it is multiplied by {factor:.4}: are both in one unit? The scores take \
-             them as they are"
+            "{place}: multiplied by {factor:.4} it matches the reference: are both in the same unit? The scores use \
+             both without scaling"
         );
     }
     conefield_metrics::evaluate(volume.data.view(), reference.data.view(), peak)

@@ -32,10 +32,10 @@ pub struct Chain {
     #[serde(deserialize_with = "stage::list")]
     #[schemars(schema_with = "stage::schema_of_list::<dyn Method>")]
     pub methods: Vec<Box<dyn Method>>,
-    /// Average the volumes of this many last methods; 1 returns the last volume.
+    /// Number of final methods whose volumes are averaged; 1 returns the last volume.
     #[serde(default = "one")]
     pub mean: usize,
-    /// Skip a method that has the same unknowns and pixels as the next one, which then makes its passes too. Two levels
+    /// Skip a method that has the same unknowns and pixels as the next one, which then does its passes too. Two levels
     /// of a small volume can have the same grid, and restarting an iteration in between loses its momentum. The mean
     /// then includes fewer volumes.
     #[serde(default)]
@@ -50,7 +50,7 @@ conefield_core::stage_type!(
     Method,
     "chain",
     Chain,
-    "methods one after the other, each from the volume of the one before"
+    "methods in sequence, each starting from the volume of the previous one"
 );
 
 #[typetag::serde(name = "chain")]
@@ -158,7 +158,7 @@ impl Plan for ChainPlan {
             all.lines.extend(new);
             if let Some(passes) = self.merged(i, &scan.header()) {
                 let next = at(i + 1);
-                all.lines.push(format!("{} is the grid of {next}, which makes its {passes} passes too", at(i)));
+                all.lines.push(format!("{} has the same grid as {next}, which does its {passes} passes too", at(i)));
             }
             all.attenuation = all.attenuation.or(found.attenuation);
             all.samples = all.samples.or(found.samples);

@@ -116,21 +116,21 @@ impl Trained<'_> {
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields, default)]
 pub struct Training {
-    /// Ends after this many passes over the views.
+    /// Ends training after this many passes over the views.
     pub epochs: Option<f64>,
-    /// Ends after this many steps.
+    /// Ends training after this many steps.
     pub steps: Option<u64>,
-    /// Ends after this many seconds of training. Which limit comes first ends the run.
+    /// Ends training after this many seconds. The first limit reached ends the run.
     pub seconds: Option<f64>,
-    /// Rays a step.
+    /// Rays per step.
     pub rays: usize,
-    /// Where a step takes its rays from.
+    /// Views that a step takes its rays from.
     pub views: Views,
-    /// Which pixels count.
+    /// Pixels that are used for training.
     pub pixels: Pixels,
     /// Pixels by which the support is widened.
     pub margin: usize,
-    /// Takes some of the rays of a step in windows of neighbouring pixels.
+    /// Takes some rays of each step from windows of neighbouring pixels.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub windows: Option<Windows>,
     /// Steps between two records of the metrics.
@@ -277,10 +277,10 @@ impl Plan for FieldPlan {
         let job = &Within::job(within.as_ref(), job);
         let Training { views, pixels, margin, windows, .. } = self.training;
         let source = RaySource::new(job.scan, &scene, &pipeline, RayChoice { views, pixels, margin, windows })?;
-        observer.note(&format!("{:.0}% of the pixels are trained on", 100.0 * source.share()));
+        observer.note(&format!("training uses {:.0}% of the pixels", 100.0 * source.share()));
         if let Some(whole) = source.whole_windows() {
             let none = if whole == 0 { ": all rays are single pixels" } else { "" };
-            observer.note(&format!("windows that can be trained on as a whole: {whole} in all views{none}"));
+            observer.note(&format!("windows whose pixels are all used for training: {whole} in all views{none}"));
         }
         let fitted = self.fitted_loss(job, &scene, &source);
         if let Some(loss) = &fitted {

@@ -54,17 +54,13 @@ fn levels(pipeline: &Pipeline, needed: Option<&[usize]>, cells: f64) -> Result<S
     let data = format!("the data resolve {cells:.0} cells along each side");
     Ok(match needed {
         None if pipeline.encoder.resolutions().is_none() => {
-            "all channels, as the encoder does not say how fine they are".into()
+            "all channels, as the encoder does not state their resolutions".into()
         }
         None => format!("all channels, as {data}"),
         Some(keep) => {
             let params = pipeline.encoder.keep_outputs(keep)?.stage.info().params;
             let saved = if info.params == 0 { 0.0 } else { 100.0 * (1.0 - params as f64 / info.params as f64) };
-            format!(
-                "{} of {} channels, {saved:.0}% fewer parameters of the encoder, as {data}",
-                keep.len(),
-                info.output
-            )
+            format!("{} of {} channels, {saved:.0}% fewer encoder parameters, as {data}", keep.len(), info.output)
         }
     })
 }

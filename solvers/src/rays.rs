@@ -15,36 +15,37 @@ use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 use std::borrow::Cow;
 
-/// Where a step takes its rays from.
+/// Views that a step takes its rays from.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
 #[serde(rename_all = "kebab-case")]
 pub enum Views {
-    /// One view a step, every view once an epoch in random order, and no pixel twice in a step where there are enough (published).
+    /// One view per step: every view once per epoch, in random order. No pixel occurs twice in a step if there are
+    /// enough (published).
     One,
     /// All views at once.
     All,
 }
 
-/// Which pixels count.
+/// Pixels that are used for training.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
 #[serde(rename_all = "kebab-case")]
 pub enum Pixels {
-    /// Those whose own measured value is positive (published). Under noise it keeps the positive half of the empty
+    /// Pixels with a positive measured value (published). With noise, this keeps the positive half of the empty
     /// background and so biases it.
     Positive,
-    /// Those that the object's shadow covers, with a margin: decided from smoothed neighbourhoods, so that the
-    /// noise of a pixel does not decide about itself.
+    /// Pixels in the object's shadow, and a margin around it. The shadow is found in smoothed views, so that a pixel's
+    /// own noise does not select it.
     Support,
     /// Every pixel whose ray meets the scene.
     All,
 }
 
-/// Some rays of a step come in square windows of neighbouring pixels (Cai et al., CVPR 2024: masked local-global ray sampling).
-/// Windows lie side by side from the detector's first pixel; only those whose pixels can all be trained on count.
+/// Some rays of a step form square windows of neighbouring pixels (Cai et al., CVPR 2024: masked local-global ray
+/// sampling). Windows tile the detector from its first pixel; a window is used only if all its pixels are.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields)]
 pub struct Windows {
-    /// Windows a step. The other rays of the step are single pixels outside them.
+    /// Windows per step. The other rays of the step are single pixels outside them.
     pub count: usize,
     /// Rows and columns of a window.
     pub side: usize,

@@ -123,7 +123,7 @@ pub fn carve(scan: &Scan) -> CarvedSupport {
             let box_: f64 = (0..3).map(|k| support.bounds()[1][k] - support.bounds()[0][k]).product();
             let all: f64 = g.volume.size().iter().product();
             let said = format!(
-                "{:.0}% of the volume, in a box of {:.0}%, by the air in {share} of {} views",
+                "{:.0}% of the volume, in a box of {:.0}%, from the air in {share} of {} views",
                 100.0 * support.share(),
                 100.0 * box_ / all,
                 g.views.len()

@@ -50,7 +50,7 @@ impl Within {
         let scan = less(job.scan)?;
         let sum = |scan: &Scan| scan.projections.iter().map(|p| f64::from(*p)).sum::<f64>();
         let share = 1.0 - sum(&scan) / sum(job.scan);
-        observer.note(&format!("surround: {:.0}% of what is measured lies beyond the volume", 100.0 * share));
+        observer.note(&format!("surround: {:.0}% of the measured attenuation lies beyond the volume", 100.0 * share));
         let held_out = job.held_out.map(less).transpose()?;
         Ok(Some(Self { scan, held_out }))
     }

@@ -274,7 +274,7 @@ impl StudyReport {
         words.push(format!("conefield {}{commit}", self.version));
         let mut line = format!("Mean ± standard deviation over the seeds; {}.", words.join("; "));
         if machines.len() > 1 {
-            line += " Not all ran on one machine: seconds do not compare.";
+            line += " The runs used several machines: their times are not comparable.";
         }
         line
     }

@@ -42,14 +42,14 @@ impl Jobs<'_> {
         let count = self.count;
         Ok(format!(
             "#!/bin/bash
-# Submit with: sbatch FILE, and with options of your cluster's before FILE, such as --partition, --gres or --cpus-per-task.
-# Submitted again, it goes on where it stopped.
+# Submit with: sbatch FILE, with your cluster's options before FILE, such as --partition, --gres or --cpus-per-task.
+# If submitted again, it continues where it stopped.
 #SBATCH --job-name={job}
 #SBATCH --array=1-{count}
 #SBATCH --output=%x-%A_%a.log
 #SBATCH --open-mode=append
 #SBATCH --requeue
-# A minute before its time is up a job ends after its step and keeps a checkpoint.
+# A minute before its time limit, a job ends after its current step and keeps a checkpoint.
 #SBATCH --signal=B:TERM@60
 exec {program}{general} study {study} -o {output} --shard \"$SLURM_ARRAY_TASK_ID/{count}\"
 "

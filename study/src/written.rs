@@ -111,7 +111,7 @@ pub struct WrittenSimulation {
     #[serde(deserialize_with = "detector")]
     #[schemars(with = "Option<String>")]
     pub detector: Option<[usize; 2]>,
-    /// Shift of the detector along its rows' and its columns' direction, V,U in mm.
+    /// Shift of the detector along v (from row to row) and u (from column to column), V,U in mm.
     #[serde(deserialize_with = "offset")]
     #[schemars(with = "Option<String>")]
     pub offset: Option<[f64; 2]>,

@@ -205,7 +205,7 @@ impl TradeoffReport {
         let made = format!("conefield {version}, {threads} threads, {simd}");
         let front = Front { made, pass_s: None, scans: tuned.collect(), points };
         let text = toml::to_string(&front).map_err(|e| Error::unsupported("front.toml", e.to_string()))?;
-        Ok(format!("# Made by \"conefield tradeoff\", picked from by \"conefield reconstruct --budget\".\n{text}"))
+        Ok(format!("# Written by \"conefield tradeoff\", read by \"conefield reconstruct --budget --front\".\n{text}"))
     }
 
     fn by_reference(&self) -> bool {

@@ -345,7 +345,7 @@ fn pick(
                 if needed <= now {
                     return Ok(Choice { point: i, costs: *c, fits: true, passed_over });
                 }
-                passed_over.push((i, format!("would take {} more, {} are left", time(needed), time(now))));
+                passed_over.push((i, format!("needs {}, but only {} are left", time(needed), time(now))));
                 // A field makes something of few steps; of few passes little comes.
                 let least = match kind {
                     Unknowns::Field => c.prepare_s + STEPS * c.step_s + c.after_s(),

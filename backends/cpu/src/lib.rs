@@ -71,7 +71,7 @@ impl Backend for Cpu {
             notes.push(match (info.identity, info.grads) {
                 (true, _) => format!("{name}: identity, left out"),
                 (_, GradKind::None) => format!("{name}: fused"),
-                (_, GradKind::Dense) => format!("{name}: fused, gradients in one copy a slot"),
+                (_, GradKind::Dense) => format!("{name}: fused, gradients in one copy per slot"),
                 (_, GradKind::Scatter) => {
                     format!(
                         "{name}: fused; gradients in a second pass over {} disjoint ranges",

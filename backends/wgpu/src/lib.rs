@@ -118,25 +118,24 @@ impl Backend for Wgpu {
                 (_, GradKind::None) => format!("{name}: fused"),
                 (_, GradKind::Dense) => format!("{name}: fused, gradients summed in each group of 64 rows"),
                 (_, GradKind::Scatter) => {
-                    let first = if chain.together() { ", added up in subgroups first" } else { "" };
+                    let first = if chain.together() { ", summed in subgroups first" } else { "" };
                     format!("{name}: fused, gradients by {}{first}", adapter.atomics)
                 }
             });
         }
-        notes.push("split: samples and line integrals are kernels of their own, since a ray's rows meet there".into());
+        notes.push("split: samples and line integrals have their own kernels, because they work on whole rays".into());
         let after = if chain.scatters() { ", and the encoder's gradients after it" } else { "" };
         notes.push(match chain.kept() {
-            0 => {
-                "split: forward and backward; the encoder is computed again, which costs less than its features".into()
-            }
-            n => format!("split: forward and backward{after}; {n} features a sample are kept in between"),
+            0 => "split: forward and backward; the encoder is recomputed, which costs less than storing its features"
+                .into(),
+            n => format!("split: forward and backward{after}; {n} features per sample are kept in between"),
         });
         if let Some(tables) = chain.halves() {
             notes.push(format!("tables are read from a copy in {tables}"));
         }
         if chain.segments() > 1 {
             notes.push(format!(
-                "parameters in {} buffers, as one may have {} bytes",
+                "parameters in {} buffers of at most {} bytes",
                 chain.segments(),
                 adapter.bound_bytes()
             ));

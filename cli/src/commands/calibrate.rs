@@ -26,7 +26,7 @@ use std::time::Instant;
 /// A quick reconstruction of some views predicts the others; the geometry with the smallest error is the estimate. For offset-v,
 /// tilt, distance and step, pairs of views are compared without a reconstruction. No phantom is needed. SCAN is not changed; OUT is
 /// the same scan with the corrected geometry. Parameters that the views do not determine, or that are right within three standard
-/// deviations, stay unchanged. A warning says if the views fit the other direction of rotation clearly better.
+/// deviations, stay unchanged. A warning reports if the views fit the opposite direction of rotation clearly better.
 #[derive(Args)]
 pub struct CalibrateArgs {
     /// The scan.
@@ -255,11 +255,11 @@ pub fn suspicion(scan: &Scan, backend: &dyn Backend) -> Result<Option<Suspicion>
         Suspicion {
             kind: "geometry",
             found: format!(
-                "the geometry is off: with the detector corrected ({}) held-out views are predicted with an error of \
-                 {after:.4}, and without with {before:.4}",
+                "the geometry is off: correcting the detector ({}) reduces the error of predicted held-out views from \
+                 {before:.4} to {after:.4}",
                 words.collect::<Vec<_>>().join(", ")
             ),
-            advice: "conefield calibrate SCAN -o CORRECTED finds the geometry and writes the scan with it",
+            advice: "conefield calibrate SCAN -o CORRECTED estimates the geometry and writes the corrected scan",
         }
     }))
 }

@@ -14,10 +14,10 @@ use std::path::PathBuf;
 
 /// Rewrite a volume or a scan in another format.
 ///
-/// Volumes: NIfTI (.nii, .nii.gz), MetaImage (.mha, .mhd with a .raw), NRRD, NumPy (.npy), a TIFF stack (.tif) or a folder of
-/// OME-Zarr (.zarr), by the name of OUT; IN may also be a .nhdr, or the folder of a DICOM series or of TIFF slices. Scans: the
-/// format is --to; r2 and naf keep test views. A scan may be corrected (--correct), and part of it taken; --bin averages line
-/// integrals.
+/// Volumes: the extension of OUT selects NIfTI (.nii, .nii.gz), MetaImage (.mha, .mhd with a .raw), NRRD, NumPy (.npy),
+/// a TIFF stack (.tif) or an OME-Zarr folder (.zarr). IN may also be a .nhdr file, or a folder with a DICOM series or
+/// TIFF slices. Scans: --to sets the format; r2 and naf keep test views. --correct corrects faults of a scan; other
+/// options select part of it; --bin averages line integrals.
 #[derive(Args)]
 pub struct ConvertArgs {
     /// A volume or a scan.

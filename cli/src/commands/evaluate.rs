@@ -35,9 +35,9 @@ pub struct EvaluateArgs {
     /// Both are label maps (whole numbers): compute Dice only.
     #[arg(long, conflicts_with_all = ["peak", "png", "segmenter"])]
     labels: bool,
-    /// Also segment both with this command and compute Dice, such as 'TotalSegmentator -i {in} -o {out} --ml'. {in} and {out} stand for
-    /// .nii.gz files; words are split as in a shell, but no shell runs. Both volumes have the voxel size and position of the
-    /// reference.
+    /// Also segment both with this command and compute Dice, such as 'TotalSegmentator -i {in} -o {out} --ml'. {in} and
+    /// {out} stand for .nii.gz files. The command is split into words as in a shell, but no shell runs. Both volumes
+    /// get the voxel size and position of the reference.
     #[arg(long, value_name = "CMD")]
     segmenter: Option<Segmenter>,
     /// Hounsfield units of the values 0 and 1, for the segmenter's input.

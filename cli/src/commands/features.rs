@@ -18,8 +18,9 @@ use std::path::PathBuf;
 
 /// Draw the principal components of the features of a finished run as colours.
 ///
-/// Red, green and blue are the first three principal components of the encoder's features in the three middle slices, where the object
-/// can be. Each is scaled from its 1st to its 99th percentile; signs have no meaning. The reconstruction is shown beside them.
+/// Red, green and blue are the first three principal components of the encoder's features in the three middle slices,
+/// within the support of the object. Each is scaled from its 1st to its 99th percentile; signs have no meaning. The
+/// reconstruction is shown beside them.
 #[derive(Args)]
 pub struct FeaturesArgs {
     #[command(flatten)]

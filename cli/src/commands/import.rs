@@ -18,10 +18,11 @@ use std::path::PathBuf;
 
 /// Convert the files of a scanner to a scan.
 ///
-/// SCANNER.toml names the files with the projections (TIFF, HDF5, .npy, .npz, .mha) and describes geometry (in mm) and array layout;
-/// docs/guide/formats.md has all keys. A .xtekct file of Nikon replaces it. Raw counts become line integrals; dead and hot pixels are
-/// interpolated. Then --correct corrects faults and a part may be taken; --bin averages counts. The command prints a summary of
-/// the scan; with -v all that conefield info prints of it, and the first and the last view.
+/// SCANNER.toml names the files with the projections (TIFF, HDF5, .npy, .npz, .mha) and describes the geometry (in mm)
+/// and the array layout; docs/guide/formats.md has all keys. A Nikon .xtekct file can take its place. Raw counts become
+/// line integrals; dead and hot pixels are interpolated. --correct then corrects faults; other options select part of
+/// the scan; --bin averages counts. The command prints a summary of the scan; with -v it also prints what conefield
+/// info prints, and the first and the last view.
 #[derive(Args)]
 pub struct ImportArgs {
     /// The description of the scanner.
@@ -34,8 +35,8 @@ pub struct ImportArgs {
     /// SCANNER.toml].
     #[arg(long, value_name = "N|air", value_parser = parse::i0)]
     i0: Option<I0>,
-    /// Lowest counts above dark; lower ones are raised to it [default: SCANNER.toml's, else 1 or a ten-thousandth of the open
-    /// beam].
+    /// Lowest count above dark; lower counts are raised to it [default: SCANNER.toml's, else 1 or a ten-thousandth of
+    /// the open beam].
     #[arg(long, value_name = "N", value_parser = parse::above_zero)]
     floor: Option<f64>,
     #[command(flatten)]

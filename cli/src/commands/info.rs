@@ -19,9 +19,9 @@ use std::path::{Path, PathBuf};
 
 /// Describe a scan, volume, run or weights file.
 ///
-/// For a scan: lengths in mm, magnification, supported voxel size, field of view, coverage of the volume, missing information, and
-/// warnings about problems for a reconstruction. SCANNER.toml and RTK's XML geometry work, too. For the folder of a run: method,
-/// progress and scores.
+/// For a scan: lengths in mm, magnification, supported voxel size, field of view, coverage of the volume, missing
+/// information, and warnings about problems for a reconstruction. SCANNER.toml and RTK's XML geometry work too. For the
+/// folder of a run: method, progress and scores.
 #[derive(Args)]
 pub struct InfoArgs {
     /// A scan, a volume, the folder of a run or a weights file.
@@ -117,7 +117,7 @@ fn volume(path: &Path, png: Option<&Path>) -> Result<Value> {
     }
     let mut missing = Vec::new();
     if v.affine.is_none() {
-        missing.push("voxel sizes and place: 1 mm and the centre are assumed");
+        missing.push("voxel size and position: 1 mm and the centre are assumed");
     }
     Ok(json!({
         "kind": "volume",

@@ -16,9 +16,9 @@ use std::time::Instant;
 
 /// Compute the views of a volume in the geometry of a scan.
 ///
-/// The result is a scan with the line integrals of the volume. The volume is placed at the centre of the volume of that scan; a NumPy
-/// array, which has no voxel size, fills the same box. --residual also writes measured minus predicted line integrals; structure there
-/// shows what the volume does not explain.
+/// The result is a scan with the line integrals of the volume. The volume is centred on the volume of the scan; a NumPy
+/// array, which has no voxel size, fills the same box. --residual also writes measured minus predicted line integrals;
+/// structure there shows what the volume does not explain.
 #[derive(Args)]
 pub struct ProjectArgs {
     /// The volume, in 1/unit of the scan, as "reconstruct" writes it.

@@ -40,7 +40,7 @@ use std::time::{Duration, Instant};
 ///
 /// RUN receives volume.nii.gz, metrics.jsonl, spec.toml (every setting), weights.safetensors, slices.png and, at the end,
 /// record.json. Ctrl-C stops the run after its step; the same command with --resume continues. With --budget the command first measures
-/// this machine for one to three seconds (less for a short budget) and then plans its work to take that time.
+/// this machine for one to three seconds (less for a short budget) and then plans its work to fit the budget.
 #[derive(Args)]
 pub struct ReconstructArgs {
     /// The scan.

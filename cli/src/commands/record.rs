@@ -88,13 +88,14 @@ pub fn summary(r: &RunRecord, output: &Path) -> String {
         out::duration(r.written.export_s),
     )];
     if let Some(budget) = r.budget_s {
-        let why = if r.total_s < USED * budget { ": the method ended by itself" } else { "" };
+        let why = if r.total_s < USED * budget { ": the method stopped by itself" } else { "" };
         lines.push(format!("{} in all, of a budget of {}{why}", out::duration(r.total_s), out::duration(budget)));
     }
     if r.rollbacks > 0 {
         let times = if r.rollbacks == 1 { "once".into() } else { format!("{} times", r.rollbacks) };
         lines.push(format!(
-            "training diverged and went back {times}, with half the learning rate; metrics.jsonl has the steps"
+            "training diverged and was rolled back {times}; each rollback halved the learning rate; metrics.jsonl has \
+             the steps"
         ));
     }
     if let Some(h) = r.held_out {

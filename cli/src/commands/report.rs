@@ -45,8 +45,8 @@ pub struct ReportArgs {
     /// Voxel projector: joseph, siddon or trilinear.
     #[arg(long, value_name = "TYPE", default_value = projection::PROJECTOR)]
     projector: String,
-    /// Size of the voxels of all volumes in the page before packing, two bytes each. Larger volumes are reduced to means of
-    /// blocks.
+    /// Total size of the volumes in the page before compression, at two bytes per voxel. Larger volumes are reduced by
+    /// averaging blocks of voxels.
     #[arg(long, value_name = "SIZE", default_value = "64MiB", value_parser = parse::bytes)]
     embed: u64,
     /// Print one JSON object.
@@ -151,14 +151,16 @@ fn notes(page: &Page, coarser: usize) -> Vec<String> {
     let mut notes =
         vec![format!("Made by conefield {}. The page is complete: it fetches nothing.", env!("CARGO_PKG_VERSION"))];
     if !page.volumes.is_empty() {
-        let coarse = if coarser > 1 { " of means of blocks of voxels" } else { "" };
+        let coarse = if coarser > 1 { ", averaged over blocks," } else { "" };
         notes.push(format!(
-            "Voxels are 16-bit steps{coarse}, spread evenly from each volume's lowest to its highest value; the step stands below the \
-             volume. Scores are those of the run's record, over all voxels as they are in its files."
+            "Voxel values{coarse} are stored in 16 bits, in even steps from each volume's lowest to its highest value; \
+             the step size is shown below the volume. Scores come from the run's record and use all voxels of its \
+             files."
         ));
         notes.push(
-            "Lung, soft tissue and bone are windows in Hounsfield units: level −600, 40 and 400, width 1500, 400 and 1800. They hold \
-             where the value of air is 0 and that of water is the one beside them, which is a guess: set it to what your data has."
+            "Lung, soft tissue and bone are windows in Hounsfield units: level −600, 40 and 400, width 1500, 400 and \
+             1800. They are correct if air has the value 0 and water the value shown next to them, which is a guess: \
+             set it to match your data."
                 .into(),
         );
     }

@@ -10,8 +10,8 @@ pub struct SelectionOptions {
     /// Only these views: 3,7,9 or 0-719:10 (0 to 719 in steps of 10) or every:10.
     #[arg(long, value_name = "VIEWS")]
     views: Option<ViewChoice>,
-    /// Turn the images by N quarter turns (NumPy's rot90). Like the flips this corrects how images were stored; source and detector
-    /// stay.
+    /// Turn the images by N quarter turns (NumPy's rot90). Like the flips, this corrects how images were stored; it
+    /// does not move source or detector.
     #[arg(long, value_name = "N", default_value_t = 0, value_parser = clap::value_parser!(u8).range(0..=3))]
     turns: u8,
     /// The file has the last row first.

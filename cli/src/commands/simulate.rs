@@ -33,7 +33,7 @@ pub struct SimulateArgs {
     /// Rows and columns of the detector, at the same size in mm [default: the protocol's; r2: 512x512].
     #[arg(long, value_name = "ROWSxCOLS", value_parser = parse::detector)]
     detector: Option<[usize; 2]>,
-    /// Shift of the detector along its rows' and its columns' direction, in mm.
+    /// Shift of the detector along v (from row to row) and u (from column to column), in mm.
     #[arg(long, value_name = "V,U", value_parser = parse::offset, allow_hyphen_values = true)]
     offset: Option<[f64; 2]>,
     /// Angles in degrees: evenly from START over RANGE, or a file with one per line.

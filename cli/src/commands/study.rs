@@ -43,11 +43,11 @@ pub struct StudyArgs {
     /// Continue the study in FOLDER. Methods, seeds, scans and volumes may be added; the rest must be the same.
     #[arg(long, conflicts_with = "force")]
     resume: bool,
-    /// Do the K-th of N shares of the runs. Other processes may do the other shares in the same FOLDER, also on other machines.
-    /// Existing runs are continued. The last process writes the table.
+    /// Run the K-th of N shares of the runs. Other processes may run the other shares in the same FOLDER, also on other
+    /// machines. Existing runs are continued. The last process to finish writes the table.
     #[arg(long, value_name = "K/N", value_parser = parse::part, conflicts_with = "force")]
     shard: Option<[usize; 2]>,
-    /// Run nothing; write a script that does the study as an array of Slurm jobs.
+    /// Run nothing; write a script that runs the study as an array of Slurm jobs.
     #[arg(long, value_name = "FILE", conflicts_with_all = ["force", "resume", "shard", "json"])]
     slurm: Option<PathBuf>,
     /// Jobs of that array [default: one per run, 1000 at most].
@@ -148,7 +148,7 @@ impl StudyArgs {
             out::json(&json!({ "done": done, "failed": failed, "table": null }))?;
         } else {
             out::say(&format!(
-                "{done} of {} runs of this share done; the last share to end writes the table",
+                "{done} of {} runs of this share done; the last share to finish writes the table",
                 cells.len()
             ))?;
         }

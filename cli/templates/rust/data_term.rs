@@ -9,7 +9,7 @@ stage_type!(DataTerm, "@name@", Settings, "squares of small residuals, the size 
 #[derive(Debug, Clone, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields, default)]
 pub struct Settings {
-    /// Residuals of at least this many standard deviations of the noise count by their size.
+    /// Residuals well above this many standard deviations of the noise have a linear cost.
     pub from: f64,
 }
 

@@ -9,9 +9,9 @@ stage_type!(Encoder, "@name@", Waves, "waves of learned directions");
 #[derive(Debug, Clone, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields, default)]
 pub struct Waves {
-    /// Channels, a wave each.
+    /// Number of channels, one per wave.
     pub waves: usize,
-    /// Radians along the cube's side that a wave starts with, at most.
+    /// Largest initial frequency of a wave, in radians per cube side.
     pub frequency: f32,
 }
 

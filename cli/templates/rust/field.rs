@@ -9,7 +9,7 @@ stage_type!(Field, "@name@", Settings, "a weighted sum through a softplus");
 #[derive(Debug, Clone, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields, default)]
 pub struct Settings {
-    /// The shift that training starts from; the lower, the nearer to 0 the first volume.
+    /// Initial shift; the lower it is, the closer the first volume is to 0.
     pub bias: f32,
 }
 

@@ -19,7 +19,7 @@ conefield_plugin::stage_type!(Initializer, "@name@", Settings, "uniform numbers 
 pub struct Settings {
     /// Fill blocks whose name begins with this, such as `encoder` or `field.0.weight`.
     pub prefix: String,
-    /// Numbers lie between plus and minus this.
+    /// Numbers are uniform between minus and plus this.
     pub bound: f32,
 }
 

@@ -9,7 +9,7 @@ stage_type!(Loss, "@name@", Settings, "the absolute difference, rounded near 0")
 #[derive(Debug, Clone, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields, default)]
 pub struct Settings {
-    /// Differences well below this count by their square.
+    /// Differences well below this have a quadratic loss.
     pub scale: f64,
 }
 

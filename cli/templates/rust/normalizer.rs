@@ -19,7 +19,7 @@ conefield_plugin::stage_type!(Normalizer, "@name@", Settings, "a learned scale a
 #[derive(Debug, Clone, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields, default)]
 pub struct Settings {
-    /// The scale that training starts from.
+    /// Initial scale.
     pub scale: f32,
 }
 

@@ -9,13 +9,13 @@ stage_type!(Prior, "@name@", Settings, "squared differences of neighbouring poin
 #[derive(Debug, Clone, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields, default)]
 pub struct Settings {
-    /// Weight against the mean loss of a ray.
+    /// Weight relative to the mean loss of a ray.
     pub weight: f64,
-    /// Blocks a step.
+    /// Blocks per step.
     pub blocks: usize,
     /// Points along a block's edge.
     pub edge: usize,
-    /// Distance of the points in voxels.
+    /// Spacing of the points in voxels.
     pub spacing: f64,
 }
 

@@ -17,9 +17,9 @@ conefield_plugin::stage_type!(Projector, "@name@", Settings, "equal intervals wi
 #[derive(Debug, Clone, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields, default)]
 pub struct Settings {
-    /// Samples of every ray that meets the box.
+    /// Samples per ray that meets the box.
     pub samples: usize,
-    /// Take a random place in every interval instead of its middle.
+    /// Use a random position in every interval instead of its middle.
     pub random: bool,
 }
 

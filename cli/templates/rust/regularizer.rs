@@ -9,9 +9,9 @@ stage_type!(Regularizer, "@name@", Settings, "squared differences of neighbours"
 #[derive(Debug, Clone, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields, default)]
 pub struct Settings {
-    /// How strong it is: times the root mean square of back-projected noise, for differences of 1/mm.
+    /// Strength, as a multiple of the root mean square of back-projected noise, for differences of 1/mm.
     pub weight: f64,
-    /// Steps towards the proximal map for each update.
+    /// Gradient steps of the proximal map per update.
     pub inner: usize,
 }
 

@@ -53,7 +53,7 @@ fn explain_says_what_a_gpu_makes_of_a_spec() {
         assert!(said.contains(words), "{said} lacks {words:?}");
     }
     if listed()["backends"][1]["adapters"][0]["subgroups"].is_array() {
-        assert!(said.contains("added up in subgroups first"), "{said}");
+        assert!(said.contains("summed in subgroups first"), "{said}");
     }
     let e = refused(2, &["explain", "ni-naf", "--backend", "cpu:1"]);
     assert!(e.contains("wgpu:N with the number of an adapter"), "{e}");

@@ -105,7 +105,7 @@ fn carving_serves_methods_on_voxels() {
     done(&["simulate", "phantom:head:16", "-o", &scan, "--views", "12", "--detector", "64x64"]);
     let set = "scene.support=\"carve\"";
     let all = done(&["explain", "sirt", "--scan", &scan, "--set", set]);
-    assert!(all.contains("support: ") && all.contains("by the air in 12 of 12 views"), "{all}");
+    assert!(all.contains("support: ") && all.contains("from the air in 12 of 12 views"), "{all}");
 }
 
 #[test]

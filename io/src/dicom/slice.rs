@@ -147,7 +147,7 @@ impl Slice {
         let place = path.display().to_string();
         let (pixels, end) = lengths::check(path)?;
         if pixels == PixelStorage::None {
-            tracing::warn!("{place}: left out, there is no picture in it");
+            tracing::warn!("{place}: skipped, it has no image");
             return Ok(None);
         }
         let object = open(path, end, OpenFileOptions::new().read_until(PIXEL_DATA.0))?;

@@ -171,7 +171,7 @@ impl FdkOrbit {
             Coverage::Short { .. } => format!("short scan: Parker's weights ({arc})"),
             Coverage::Limited => {
                 let needed = degrees(PI + self.fan);
-                format!("no weights can complete it ({arc}; {needed:.1} needed, or 360 with a detector aside)")
+                format!("no weights can complete it ({arc}; {needed:.1} needed, or 360 with an offset detector)")
             }
         }
     }

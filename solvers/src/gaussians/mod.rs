@@ -69,10 +69,10 @@ pub struct Gaussians {
     /// Average blocks of this many pixels per side before training.
     #[serde(default = "one")]
     pub bin: usize,
-    /// Slots for Gaussians, their largest number.
+    /// Number of slots: the largest possible number of Gaussians.
     #[serde(default = "places")]
     pub most: usize,
-    /// Initial Gaussians: at voxels of an FDK, or of the method's start volume.
+    /// Initial Gaussians: at voxels of an FDK reconstruction, or of the method's start volume.
     #[serde(default)]
     pub start: Start,
     /// Loss between predicted and measured line integrals.

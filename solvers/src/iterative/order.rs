@@ -65,7 +65,7 @@ pub enum Order {
     Sequential,
     /// Shuffled in every pass, by the run's seed.
     Random,
-    /// By golden section steps around the orbit: each subset is far from all earlier ones.
+    /// In golden-section steps around the orbit: each subset is far from all earlier ones.
     Golden,
 }
 

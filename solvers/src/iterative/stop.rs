@@ -14,7 +14,7 @@ pub struct Stop {
     /// Stop after this many seconds.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub seconds: Option<f64>,
-    /// Stop when a pass changes the volume by less than this share of it, both in root mean square.
+    /// Stop when the change in a pass is less than this share of the volume, both as root mean squares.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub change: Option<f64>,
     /// Stop when the error of the held-out views has not fallen for this many passes; keep the best volume.

@@ -11,8 +11,8 @@ use serde::{Deserialize, Serialize};
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields, default)]
 pub struct Huber {
-    /// The difference from which the loss is linear, in the scale that stages see. The most absorbing rays measure about 0.25
-    /// there with `scene.attenuation = "scan"`, and about 1 with `{ relative = 0.25 }`.
+    /// Difference above which the loss is linear, in the scale that stages see. There the most absorbing rays measure
+    /// about 0.25 with `scene.attenuation = "scan"`, and about 1 with `{ relative = 0.25 }`.
     pub delta: f64,
 }
 

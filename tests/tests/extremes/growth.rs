@@ -280,7 +280,7 @@ pub fn check() {
         let options = CurveOptions { log_x: true, log_y: true, ..CurveOptions::default() };
         let title = "Single against double precision";
         let labels = ["samples of a step, cells or turns a side", "error over the largest value"];
-        curves_png_with(page::file("../../../docs/images/error-growth.png"), title, labels[0], labels[1], &curves, &options).unwrap();
+        curves_png_with(page::picture(), title, labels[0], labels[1], &curves, &options).unwrap();
     }
     page::keep("growth", &text);
 }

@@ -7,9 +7,9 @@ use std::sync::Mutex;
 /// One part is written at a time.
 static PAGE: Mutex<()> = Mutex::new(());
 
-/// A file, from the folder of these tests.
-pub fn file(name: &str) -> PathBuf {
-    Path::new(env!("CARGO_MANIFEST_DIR")).join("tests/extremes").join(name)
+/// The picture of how errors grow, in the documentation.
+pub fn picture() -> PathBuf {
+    Path::new(env!("CARGO_MANIFEST_DIR")).join("../docs/images/error-growth.png")
 }
 
 /// Whether pages are written instead of compared.
@@ -25,7 +25,7 @@ pub fn head(title: &str) -> String {
 /// Writes `text` between the marks of `part`, or compares what stands there but for its figures.
 pub fn keep(part: &str, text: &str) {
     let _alone = PAGE.lock().unwrap_or_else(|e| e.into_inner());
-    let path = file("cases.md");
+    let path = Path::new(env!("CARGO_MANIFEST_DIR")).join("tests/extremes/cases.md");
     let page = fs::read_to_string(&path).unwrap();
     let (begin, end) =
         (format!("<!-- {part}: written by tests/tests/extremes -->\n"), format!("\n<!-- end of {part} -->"));

@@ -31,8 +31,8 @@ pub fn rates() -> Vec<Case> {
         case(1e-2, Ends::Right),
         case(1.0, Ends::Recovered),
         case(10.0, Ends::Warned),
-        case(1e2, Ends::Refused(&["training diverged", "gone back 8 times", "optimizer.lr"])),
-        case(1e30, Ends::Refused(&["training diverged", "gone back 8 times", "optimizer.lr"])),
+        case(1e2, Ends::Refused(&["training diverged", "after 8 rollbacks", "optimizer.lr"])),
+        case(1e30, Ends::Refused(&["training diverged", "after 8 rollbacks", "optimizer.lr"])),
     ]
 }
 

@@ -102,7 +102,7 @@ fn a_mask_that_is_never_decided_is_reported() {
     let (last, before) = records.split_last().unwrap();
     assert!(before.iter().all(|r| r.events.is_empty()));
     assert_eq!(last.events.len(), 1);
-    let words = ["fft-mask: no channel was looked at", "ends after 3.75 epochs", "waits for 1000"];
+    let words = ["fft-mask: no channel was evaluated", "ends after 3.75 epochs", "before epoch 1000"];
     assert!(words.iter().all(|w| last.events[0].contains(w)), "{:?}", last.events);
 }
 

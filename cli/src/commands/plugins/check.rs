@@ -40,7 +40,7 @@ pub struct Check {
     /// Input channels of a normalizer or a field; repeatable [default: 1, 3, 8 and 20].
     #[arg(long, value_name = "N", value_parser = clap::value_parser!(u16).range(1..))]
     width: Vec<u16>,
-    /// Largest allowed error of single against double precision, as a share of the largest output.
+    /// Largest allowed difference between single and double precision, as a share of the largest output.
     #[arg(long, value_name = "SHARE", default_value_t = 2e-5)]
     single: f64,
     /// Stop the check after this time.

@@ -80,8 +80,9 @@ pub fn page_runs(found: &[RunOnDisk], warnings: &mut Vec<Notice>) -> Vec<PageRun
             let notice = |found: String| Notice { found: format!("{name}: {found}"), advice: String::new() };
             warnings.extend((!run.is_complete()).then(|| notice(format!("the run is {}", run.status()))));
             if let Some(n) = run.record().and_then(|r| r["rollbacks"].as_u64()).filter(|n| *n > 0) {
-                warnings
-                    .push(notice(format!("training diverged {n} times and went back, with half the learning rate")));
+                warnings.push(notice(format!(
+                    "training diverged and was rolled back {n} times; each rollback halved the learning rate"
+                )));
             }
             PageRun {
                 folder: run.folder().display().to_string(),

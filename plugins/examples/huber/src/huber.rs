@@ -11,11 +11,11 @@ use conefield_plugin::prelude::*;
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields, default)]
 pub struct Huber {
-    /// How strong it is: times the root mean square of back-projected noise.
+    /// Strength, as a multiple of the root mean square of back-projected noise.
     pub weight: f64,
     /// Differences of neighbours, in 1/mm, below which slopes stay smooth.
     pub threshold: f64,
-    /// Dual steps for each update.
+    /// Dual steps per update.
     pub inner: usize,
 }
 

@@ -22,7 +22,7 @@ pub struct Siren {
     pub width: usize,
     /// Hidden layers.
     pub depth: usize,
-    /// Angular frequency of the sines. The paper has 30 for coordinates; features of order one want less.
+    /// Angular frequency of the sines. The paper has 30 for coordinates; features of order one need less.
     pub omega: f64,
 }
 

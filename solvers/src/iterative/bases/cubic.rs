@@ -20,8 +20,8 @@ use serde::{Deserialize, Serialize};
 pub struct Cubic {
     /// Spacing of the samples in voxels, 0.5 to 64. It is adjusted so that a whole number of samples fills the volume.
     pub spacing: f64,
-    /// Most samples along the longest side, 2 or more: larger volumes get a larger spacing. The resolution that few
-    /// views support depends more on this number than on the voxel size.
+    /// Maximum number of samples along the longest side, 2 or more; larger volumes get a larger spacing. The resolution
+    /// that few views support depends more on this number than on the voxel size.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub samples: Option<u32>,
 }

@@ -156,7 +156,7 @@ impl Callback for Masker {
         let (keep, report) = match &self.settings.keep {
             Some(keep) => {
                 let keep = still_there(keep, run.model.masks());
-                let report = format!("fft-mask: {} of {width} channels kept as the spec says", keep.len());
+                let report = format!("fft-mask: {} of {width} channels kept, as set in the spec", keep.len());
                 (keep, report)
             }
             None => {
@@ -180,7 +180,7 @@ impl Callback for Masker {
         if !self.done {
             let (ended, epoch) = (run.epoch(), self.settings.epoch);
             let report = format!(
-                "fft-mask: no channel was looked at: the run ends after {ended:.2} epochs, it waits for {epoch}"
+                "fft-mask: no channel was evaluated: the run ends after {ended:.2} epochs, before epoch {epoch}"
             );
             run.tally.window.events.push(report);
         }
@@ -267,7 +267,7 @@ impl FftMask {
         let mut notes = vec![];
         if keep.is_empty() {
             keep.push(0);
-            notes.push("every channel is noise: the first is kept all the same".to_string());
+            notes.push("every channel is noise: the first is kept anyway".to_string());
         }
         let list = |which: &dyn Fn(usize) -> bool| {
             all.iter().filter(|&&c| which(c)).map(usize::to_string).collect::<Vec<_>>().join(", ")

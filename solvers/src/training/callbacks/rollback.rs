@@ -204,7 +204,7 @@ impl Guard {
         let level = level?;
         let away = sum / WINDOW as f64 > self.beyond(10.0, level);
         let mean = sum / steps.max(1) as f64;
-        away.then(|| format!("the loss ran away, from {level:.3e} to {mean:.3e}"))
+        away.then(|| format!("the loss grew from {level:.3e} to {mean:.3e}"))
     }
 
     /// The loss of a prediction.
@@ -240,7 +240,7 @@ impl Guard {
             return Err(Error::Diverged { step, what: format!("{what}; {HINT}") });
         };
         if run.tally.rollbacks >= self.times {
-            let what = format!("{what}, after it had gone back {} times with half the rate each time", self.times);
+            let what = format!("{what}, after {} rollbacks with half the rate each time", self.times);
             return Err(Error::Diverged { step, what: format!("{what}; {HINT}") });
         }
         let Arena { params, grads, first, second } = &mut run.model.arena;
@@ -252,7 +252,7 @@ impl Guard {
         run.tally.rate *= 0.5;
         self.watched = Watched { sum: 0.0, empty: 0.0, steps: 0, dead: 0, ..self.watched.clone() };
         let rate = run.tally.rate;
-        run.report(format!("step {step}: {what}; back to where step {at} was, learning rate times {rate}"));
+        run.report(format!("step {step}: {what}; rolled back to step {at}, learning rate times {rate}"));
         Ok(Update::Leave)
     }
 }
