@@ -192,7 +192,9 @@ def test_runs_in_several_threads_do_not_mix(scan):
 def test_ctrl_c_ends_a_run_cleanly():
     program = textwrap.dedent(
         """
-        import conefield, time
+        import conefield, signal, time
+        # A shell may have started the tests in the background, with this signal ignored.
+        signal.signal(signal.SIGINT, signal.default_int_handler)
         scan = conefield.simulate("phantom:head:24", views=16, detector=(24, 24))
         try:
             conefield.reconstruct(scan, "fast", seconds="5m", callback=lambda p: print("step", p.step, flush=True), every=0.1)
