@@ -190,7 +190,7 @@ fn job<'a>(bench: &'a Bench<'_>, scan: &'a Scan, limits: Limits) -> Job<'a> {
     Job { seed: bench.seed, limits, volumes: bench.volumes, ..Job::new(scan, bench.backend) }
 }
 
-/// A start volume: what it contains does not change the durations. It is positive, because Gaussians need that.
+/// A start volume: what it contains hardly changes the durations. It is positive, because Gaussians need that.
 fn uniform(scan: &Scan) -> Volume {
     let grid = scan.geometry.volume;
     let longest = grid.size().into_iter().fold(0.0, f64::max);
