@@ -64,14 +64,14 @@ mod tests {
         board.picture(15, "live", &png).unwrap();
         board.record(&serde_json::from_str(&line(20)).unwrap()).unwrap();
         board.picture(25, "live", &png).unwrap();
-        // The run goes on after step 20: the later picture is made again.
+        // The run continues after step 20: the later picture is written again.
         fs::write(&metrics, line(10) + &line(20)).unwrap();
         drop(Board::new(&events, &metrics).unwrap());
         assert_eq!([count("IHDR"), count("loss")], [1, 2]);
         fs::write(&metrics, line(10) + &line(20) + &line(30)).unwrap();
         drop(Board::new(&events, &metrics).unwrap());
         assert_eq!([count("IHDR"), count("loss")], [1, 3]);
-        // A new run begins a new file.
+        // A new run starts a new file.
         fs::write(&metrics, "").unwrap();
         drop(Board::new(&events, &metrics).unwrap());
         assert_eq!([count("IHDR"), count("loss")], [0, 0]);

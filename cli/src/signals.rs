@@ -58,7 +58,7 @@ pub fn follow_input() {
     });
 }
 
-/// Acts as if this signal had been received, unless there was one already.
+/// Acts as if this signal had been received, unless one was received already.
 pub fn note(signal: u8) {
     let _ = CAUGHT.compare_exchange(0, signal, Ordering::Relaxed, Ordering::Relaxed);
 }

@@ -99,7 +99,7 @@ pub struct Explain {
     pub backend: String,
     /// One line per decision.
     pub notes: Vec<String>,
-    /// Bytes beyond model and scan.
+    /// Bytes of working memory, besides model and scan.
     pub scratch_bytes: usize,
 }
 

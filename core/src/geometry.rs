@@ -141,7 +141,7 @@ impl VoxelGrid {
 
     /// Refuses empty grids, sizes beyond memory, and spacings that are not positive and finite.
     pub fn validate(&self, place: &str) -> Result<()> {
-        ensure(!self.is_empty(), place, "volume.shape", format!("{:?}", self.shape), "at least one voxel an axis")?;
+        ensure(!self.is_empty(), place, "volume.shape", format!("{:?}", self.shape), "at least one voxel per axis")?;
         ensure(
             self.len().is_some_and(|n| n.checked_mul(8).is_some_and(|b| b <= isize::MAX as usize)),
             place,
@@ -166,7 +166,7 @@ impl VoxelGrid {
     }
 }
 
-/// All that maps a detector pixel to a ray through the volume.
+/// Views, detector and volume: maps every detector pixel to a ray through the volume.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct Geometry {
     /// Detector rows (v) × columns (u).

@@ -313,8 +313,8 @@ pub trait Plan: Send {
         true
     }
 
-    /// Passes (for an iterative method) or steps after which it ends even if there is time for more, because more of them
-    /// may fit the noise. `None` if it trains until the time is over.
+    /// Maximum number of passes (for an iterative method) or steps, even if time is left: more of them may fit the
+    /// noise. `None` if only time limits it.
     fn passes(&self) -> Option<u64> {
         None
     }

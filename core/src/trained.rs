@@ -27,7 +27,7 @@ pub struct TrainedField {
     pub unit_mm: f64,
 }
 
-/// What is stored beside spec and weights to restore the field.
+/// The data stored with spec and weights to restore the field.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct Placement {

@@ -102,7 +102,7 @@ impl BSplineGridStage {
         ensure((1..=32).contains(&s.levels), "spec", "levels", s.levels, "1 to 32")?;
         ensure([1, 2, 4, 8].contains(&s.features), "spec", "features", s.features, "1, 2, 4 or 8")?;
         let base = s.base_resolution;
-        ensure((1..=1 << 20).contains(&base), "spec", "base_resolution", base, "1 to 2^20 cells a side")?;
+        ensure((1..=1 << 20).contains(&base), "spec", "base_resolution", base, "1 to 2^20 cells per side")?;
         ensure((1.0..=16.0).contains(&s.growth), "spec", "growth", s.growth, "1 to 16")?;
         let mut levels = vec![];
         let mut params = 0u64;
@@ -435,7 +435,7 @@ impl Stage for BSplineGridStage {
     fn describe(&self) -> String {
         let cells = |l: Option<&Level>| l.map_or(0, |l| l.cells);
         format!(
-            "b-spline-grid: {} levels x {}, {} to {} cells a side, {} parameters",
+            "b-spline-grid: {} levels x {}, {} to {} cells per side, {} parameters",
             self.levels.len(),
             self.features,
             cells(self.levels.first()),

@@ -87,7 +87,7 @@ impl DenseGridStage {
         ensure((1..=32).contains(&s.levels), "spec", "levels", s.levels, "1 to 32")?;
         ensure([1, 2, 4, 8].contains(&s.features), "spec", "features", s.features, "1, 2, 4 or 8")?;
         let base = s.base_resolution;
-        ensure((1..=1 << 20).contains(&base), "spec", "base_resolution", base, "1 to 2^20 cells a side")?;
+        ensure((1..=1 << 20).contains(&base), "spec", "base_resolution", base, "1 to 2^20 cells per side")?;
         ensure((1.0..=16.0).contains(&s.growth), "spec", "growth", s.growth, "1 to 16")?;
         let mut levels = vec![];
         let mut total = 0u64;
@@ -289,7 +289,7 @@ impl Stage for DenseGridStage {
     fn describe(&self) -> String {
         let cells = |l: Option<&Level>| l.map_or(0, |l| l.grid.side()[0] - 1);
         format!(
-            "dense-grid: {} levels x {}, {} to {} cells a side, {} parameters",
+            "dense-grid: {} levels x {}, {} to {} cells per side, {} parameters",
             self.levels.len(),
             self.features,
             cells(self.levels.first()),

@@ -84,7 +84,7 @@ impl FrequencyStage {
         let s = settings;
         ensure((1..=64).contains(&s.bands), "spec", "bands", s.bands, "1 to 64")?;
         let max = s.max_frequency;
-        ensure((1.0..=1e6).contains(&max), "spec", "max_frequency", max, "1 to 1e6 periods a cube side")?;
+        ensure((1.0..=1e6).contains(&max), "spec", "max_frequency", max, "1 to 1e6 periods per cube side")?;
         let mut waves = vec![];
         for k in 0..s.bands {
             let t = if s.bands == 1 { 1.0 } else { k as f64 / (s.bands - 1) as f64 };
@@ -278,7 +278,7 @@ impl Stage for FrequencyStage {
     fn describe(&self) -> String {
         let s = &self.settings;
         format!(
-            "frequency: {} bands up to {} periods a cube side ({}), {} channels",
+            "frequency: {} bands up to {} periods per cube side ({}), {} channels",
             s.bands,
             s.max_frequency,
             if s.spacing == Spacing::Log { "log" } else { "linear" },

@@ -141,8 +141,8 @@ impl HashGridStage {
             if resolution > FINEST {
                 bad(
                     "levels",
-                    format!("level {l} with {resolution:.0} cells a side"),
-                    "at most 2^23 cells a side (positions are single precision): fewer levels or less growth",
+                    format!("level {l} with {resolution:.0} cells per side"),
+                    "at most 2^23 cells per side (positions are single precision): fewer levels or less growth",
                 )?;
             }
             let scale = resolution - 1.0;
@@ -664,7 +664,7 @@ impl Stage for HashGridStage {
     fn describe(&self) -> String {
         let side = |l: Option<&Level>| l.map_or(0.0, |l| l.scale + 1.0);
         format!(
-            "hash-grid: {} levels x {}, {:.0} to {:.0} cells a side, tables up to 2^{}, {} of them direct",
+            "hash-grid: {} levels x {}, {:.0} to {:.0} cells per side, tables up to 2^{}, {} of them direct",
             self.levels.len(),
             self.settings.features,
             side(self.levels.first()),

@@ -136,8 +136,8 @@ impl PermutohedralStage {
         let mut params = 0;
         for l in 0..s.levels {
             let resolution = f64::from(base) * s.growth.powi(l as i32);
-            let found = format!("level {l} with {resolution:.0} cells a side");
-            let expected = "at most 2^22 cells a side (positions are single precision): fewer levels or less growth";
+            let found = format!("level {l} with {resolution:.0} cells per side");
+            let expected = "at most 2^22 cells per side (positions are single precision): fewer levels or less growth";
             ensure(resolution <= FINEST, "spec", "levels", found, expected)?;
             levels.push(Level::new(s, l, resolution, params));
             params += levels[l].table.len;
@@ -508,7 +508,7 @@ impl Stage for PermutohedralStage {
     fn describe(&self) -> String {
         let cells = |l: Option<&Level>| l.map_or(0.0, |l| l.resolution);
         format!(
-            "permutohedral: {} levels x {}, {:.0} to {:.0} cells a side, tables up to 2^{}, {} of them direct",
+            "permutohedral: {} levels x {}, {:.0} to {:.0} cells per side, tables up to 2^{}, {} of them direct",
             self.levels.len(),
             self.features,
             cells(self.levels.first()),

@@ -115,13 +115,13 @@ impl PlanesStage {
         ensure((1..=32).contains(&s.levels), "spec", "levels", s.levels, "1 to 32")?;
         ensure([1, 2, 4, 8].contains(&s.features), "spec", "features", s.features, "1, 2, 4 or 8")?;
         let base = s.base_resolution;
-        ensure((1..=8192).contains(&base), "spec", "base_resolution", base, "1 to 8192 cells a side")?;
+        ensure((1..=8192).contains(&base), "spec", "base_resolution", base, "1 to 8192 cells per side")?;
         ensure((1.0..=16.0).contains(&s.growth), "spec", "growth", s.growth, "1 to 16")?;
         let mut stage = Self { form: s.form, features: s.features, levels: vec![], params: 0, outputs: 0 };
         for number in 0..s.levels {
             let cells = (f64::from(base) * s.growth.powi(number as i32)).round();
-            let found = format!("level {number} with {cells:.0} cells a side");
-            ensure(cells <= FINEST, "spec", "levels", found, "at most 8192 cells a side: fewer levels or less growth")?;
+            let found = format!("level {number} with {cells:.0} cells per side");
+            ensure(cells <= FINEST, "spec", "levels", found, "at most 8192 cells per side: fewer levels, less growth")?;
             let mut level = Level { cells: cells as u32, factors: vec![] };
             for orientation in 0..3 {
                 let first = stage.outputs + if s.form == Form::VectorMatrix { orientation * s.features } else { 0 };
@@ -413,7 +413,7 @@ impl Stage for PlanesStage {
     fn describe(&self) -> String {
         let cells = |l: Option<&Level>| l.map_or(0, |l| l.cells);
         format!(
-            "planes: {} levels x {} of {}, {} to {} cells a side, {} parameters",
+            "planes: {} levels x {} of {}, {} to {} cells per side, {} parameters",
             self.levels.len(),
             self.features,
             if self.form == Form::VectorMatrix { "planes and lines" } else { "three planes" },

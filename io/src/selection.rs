@@ -22,7 +22,7 @@ pub enum ViewChoice {
 impl FromStr for ViewChoice {
     type Err = String;
     fn from_str(text: &str) -> Result<Self, String> {
-        let form = "expected view numbers from 0, such as 3,7,9 or 0-719:10 (to the last and with it, in steps of 10), or every:10";
+        let form = "expected view numbers from 0, such as 3,7,9 or 0-719:10 (0 to 719 in steps of 10), or every:10";
         if let Some(k) = text.strip_prefix("every:") {
             return k.parse().ok().filter(|k| *k > 0).map(Self::Every).ok_or_else(|| form.to_owned());
         }
@@ -69,14 +69,14 @@ impl ViewChoice {
         };
         if let Some(last) = pieces.iter().map(|p| p[1]).find(|last| *last >= n) {
             return refused(
-                format!("{self}, in which {last} is no view"),
+                format!("{self}, which includes view {last}"),
                 format!("numbers below {n}, the views of the scan"),
             );
         }
         let all: Vec<usize> = pieces.iter().flat_map(|&[first, last, step]| (first..=last).step_by(step)).collect();
         let mut seen = HashSet::new();
         match all.iter().find(|v| !seen.insert(**v)) {
-            Some(twice) => refused(format!("{self}, in which {twice} stands twice"), "each view once".into()),
+            Some(twice) => refused(format!("{self}, which repeats view {twice}"), "each view once".into()),
             None => Ok(all),
         }
     }
@@ -286,7 +286,7 @@ mod tests {
         let e = choice("0-8").of(8).unwrap_err().to_string();
         assert!(e.contains("--views") && e.contains("0-8") && e.contains("below 8"), "{e}");
         let e = choice("1,0-2").of(8).unwrap_err().to_string();
-        assert!(e.contains("1 stands twice"), "{e}");
+        assert!(e.contains("repeats view 1"), "{e}");
     }
 
     #[test]

@@ -15,7 +15,7 @@ pub(crate) fn pair(result: ArrayView3<f32>, reference: ArrayView3<f32>, peak: f6
         format!("{:?}", result.shape()),
         format!("{:?}, the shape of the reference", reference.shape()),
     )?;
-    ensure(!result.is_empty(), PLACE, "shape", format!("{:?}", result.shape()), "at least one voxel an axis")?;
+    ensure(!result.is_empty(), PLACE, "shape", format!("{:?}", result.shape()), "at least one voxel per axis")?;
     ensure(peak.is_finite() && peak > 0.0, PLACE, "peak", peak, "a positive finite data range")?;
     finite(result, "result")?;
     finite(reference, "reference")
@@ -40,7 +40,7 @@ pub(crate) fn window(metric: &str, shape: &[usize], window: usize) -> Result<()>
         metric,
         "shape",
         format!("{shape:?}"),
-        format!("at least {window} voxels an axis, the size of the window"),
+        format!("at least {window} voxels along each axis, the size of the window"),
     )
 }
 

@@ -173,7 +173,7 @@ impl Projector for RayMarch {
             (_, Some(step), _) => format!("a sample every {step} voxels"),
             (.., Some(1.0)) => "a sample every finest cell of the encoder".into(),
             (.., Some(step)) => format!("a sample every {step} of the encoder's finest cells"),
-            _ => format!("{} samples a ray", self.count()),
+            _ => format!("{} samples per ray", self.count()),
         };
         format!("ray-march: {count}, {:?}, {:?}", self.sampling, self.extent).to_lowercase()
     }

@@ -57,7 +57,7 @@ def test_errors_name_the_wrong_setting(scan):
         ({"hold_out": [99]}, "index below 16"),
         ({"backend": "abacus"}, "cpu"),
         ({"peak": -1}, "above 0"),
-        ({"reference": np.ones((3, 3, 3))}, "the voxels that this scan asks for"),
+        ({"reference": np.ones((3, 3, 3))}, "the shape of the scan's volume"),
         ({"init": np.ones((24, 24, 24))}, "a method that starts from a volume"),
         ({"seed": -1}, "u64"),
     ]:

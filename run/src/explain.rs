@@ -105,7 +105,7 @@ fn text(r: &Explanation) -> String {
     lines.join("\n")
 }
 
-/// The parts of a method; for a chain, those of its methods in turn.
+/// The parts of a method; for a chain, the parts of each of its methods.
 fn outlined(o: &Outline, lines: &mut Vec<String>) {
     if !o.stages.is_empty() {
         lines.push(stages(o));

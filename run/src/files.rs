@@ -86,13 +86,13 @@ pub fn read_field(path: &Path) -> Result<TrainedField> {
     let place = path.display().to_string();
     let weights = read_weights(path)?;
     let note = |key: &str| {
-        let expected = "weights that a run of \"conefield reconstruct\" left";
+        let expected = "weights written by \"conefield reconstruct\"";
         weights.notes.get(key).ok_or_else(|| Error::invalid(&place, key, "no such note", expected))
     };
     let loaded = crate::specs::reread(note("spec")?, &format!("{place}: spec.toml"))?;
     let plan = crate::method::plan_without_files(&loaded, &Cpu::new())?;
     let placement: Placement = serde_json::from_str(note(PLACEMENT)?)
-        .map_err(|e| Error::invalid(&place, PLACEMENT, e, "what conefield writes there"))?;
+        .map_err(|e| Error::invalid(&place, PLACEMENT, e, "a value written by conefield"))?;
     placement.validate(&place)?;
     // The notes imply the size of the network: the tensors must match before memory is allocated for it. A mask reduces
     // the size.
@@ -104,7 +104,7 @@ pub fn read_field(path: &Path) -> Result<TrainedField> {
     })
 }
 
-/// More steps than any run takes: counting on from here is exact in every number type in use.
+/// More steps than any run takes. Up to here, counting is exact in every number type in use.
 const MOST_STEPS: u64 = 1 << 48;
 
 /// The checkpoint text with the run's progress; the other texts identify the run.
@@ -123,14 +123,14 @@ pub fn write_checkpoint(path: &Path, checkpoint: &Checkpoint<'_>, run: &BTreeMap
 pub fn read_checkpoint(path: &Path, run: &BTreeMap<String, String>) -> Result<Resume> {
     let place = path.display().to_string();
     if !path.exists() {
-        let expected = "an interrupted run with a checkpoint; others start over";
+        let expected = "an interrupted run with a checkpoint; other runs must start over";
         return Err(Error::invalid(place, "--resume", "no checkpoint", expected));
     }
     let mut file = conefield_io::read_checkpoint(path)?;
     let standing = file.notes.remove(STANDING).unwrap_or_default();
     same_run(&place, &file.notes, run)?;
     let standing: Standing = serde_json::from_str(&standing)
-        .map_err(|e| Error::invalid(&place, STANDING, e, "what conefield writes there"))?;
+        .map_err(|e| Error::invalid(&place, STANDING, e, "a value written by conefield"))?;
     let Standing { step, recorded, seconds, .. } = standing;
     ensure(step <= MOST_STEPS, &place, "step", step, format!("at most {MOST_STEPS}"))?;
     ensure(recorded <= step, &place, "recorded", recorded, format!("at most {step}, the steps that are done"))?;

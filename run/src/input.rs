@@ -84,7 +84,7 @@ pub fn reference(path: &Path, scan_path: &Path, scan: &Scan) -> Result<Volume> {
 /// Refuses a reference whose shape differs from the scan's volume; errors name `place`.
 pub fn check_reference(place: &str, volume: &Volume, scan: &Scan) -> Result<()> {
     let want = scan.geometry.volume.shape;
-    let expected = format!("{want:?}, the voxels that this scan asks for");
+    let expected = format!("{want:?}, the shape of the scan's volume");
     ensure(volume.data.shape() == want, place, "shape", format!("{:?}", volume.data.shape()), expected)
 }
 
@@ -92,7 +92,7 @@ pub fn check_reference(place: &str, volume: &Volume, scan: &Scan) -> Result<()> 
 pub fn held_out(choice: Option<&HoldOut>, n: usize, place: &str, field: &str) -> Result<Vec<usize>> {
     let Some(choice) = choice else { return Ok(vec![]) };
     let held = choice.views(n);
-    let found = format!("{choice}, which is none of {n} views");
+    let found = format!("{choice}, which selects none of {n} views");
     ensure(!held.is_empty(), place, field, found, "at least one view")?;
     Ok(held)
 }

@@ -18,7 +18,7 @@ const PROGRAM: u64 = 24 << 20;
 /// The limit of `--memory`.
 static BUDGET: OnceLock<u64> = OnceLock::new();
 
-/// Returns the bytes allocated by the process, if its allocator counts them.
+/// Returns the bytes allocated by the process, if the allocator counts them.
 static HELD: OnceLock<fn() -> u64> = OnceLock::new();
 
 /// Makes readers reserve memory in the allowance.

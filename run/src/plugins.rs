@@ -19,7 +19,7 @@ pub fn with<T>(f: impl FnOnce(&mut Plugins) -> T) -> T {
     f(&mut PLUGINS.lock().unwrap_or_else(PoisonError::into_inner))
 }
 
-/// Loads the plugins in `named`, in the environment and in the user's folder; `leave`: specs may load plugins too.
+/// Loads the plugins in `named`, in the environment and in the user's folder. With `leave`, specs may load plugins too.
 pub fn search(named: &[PathBuf], leave: bool) {
     LEAVE.store(leave, Ordering::Relaxed);
     with(|plugins| *plugins = Plugins::search(named));

@@ -67,7 +67,7 @@ pub fn changed(mut p: Protocol, changes: &Changes, place: &str) -> Result<Protoc
     match &changes.angles {
         Some(AnglesOption::File(path)) => {
             if changes.views.is_some() {
-                let expected = "--views or --angles FILE, which says how many there are";
+                let expected = "--views or --angles FILE, which determines the number";
                 return Err(Error::invalid(place, "--views", "both", expected));
             }
             p.angles = Angles::ListDeg(read_angles(path)?);

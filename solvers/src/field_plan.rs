@@ -34,7 +34,7 @@ use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 use std::sync::Arc;
 
-/// What is trained, and how: the settings that such methods share.
+/// Settings shared by methods that train a field.
 pub(crate) struct Trained<'a> {
     /// The name of the method.
     pub(crate) kind: &'static str,
@@ -49,7 +49,7 @@ pub(crate) struct Trained<'a> {
 }
 
 impl Trained<'_> {
-    /// Builds the remaining parts and compiles `pipeline`. `stages` are the lines of its stages, `beside` those of others.
+    /// Builds the remaining parts and compiles `pipeline`. `stages` describes its stages, `beside` everything else.
     pub(crate) fn plan(
         &self,
         pipeline: Pipeline,
@@ -91,7 +91,7 @@ impl Trained<'_> {
         let parameters = pipeline.layout().len() as u64;
         let kept = callbacks.iter().map(|c| c.bytes(parameters)).sum();
         let held_out = callbacks.iter().position(|c| c.needs_held_out()).map(|i| format!("callbacks.{i}"));
-        let what = format!("{} rays a step, Adam {}", self.training.rays, self.optimizer.lr);
+        let what = format!("{} rays per step, Adam {}", self.training.rays, self.optimizer.lr);
         let method = Line::new("method", self.kind, &what);
         Ok(Box::new(FieldPlan {
             scene: self.scene.clone(),
@@ -112,7 +112,7 @@ impl Trained<'_> {
     }
 }
 
-/// What a step learns from, and when training ends.
+/// The data of a step, and when training ends.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields, default)]
 pub struct Training {
@@ -164,7 +164,7 @@ impl Training {
         }
         let ends = self.epochs.is_some() || self.steps.is_some() || self.seconds.is_some();
         ensure(ends, "spec", "", "no end", "one of epochs, steps or seconds")?;
-        ensure(self.steps != Some(0), "spec", "steps", 0, "at least 1: no step leaves the field as it was drawn")?;
+        ensure(self.steps != Some(0), "spec", "steps", 0, "at least 1: without a step the field stays untrained")?;
         for (name, end) in [("epochs", self.epochs), ("seconds", self.seconds)] {
             if let Some(x) = end {
                 ensure(x.is_finite() && x > 0.0, "spec", name, x, "a positive finite number")?;
@@ -189,7 +189,7 @@ pub(crate) fn rollback() -> Vec<Box<dyn CallbackSpec>> {
     vec![Box::new(Rollback::default())]
 }
 
-/// The callbacks that settings name, each once.
+/// Builds the callbacks of the settings. Refuses duplicates.
 pub(crate) fn build_callbacks(settings: &[Box<dyn CallbackSpec>]) -> Result<Vec<Box<dyn Callback>>> {
     let mut all: Vec<Box<dyn Callback>> = vec![];
     for (i, spec) in settings.iter().enumerate() {
@@ -202,10 +202,10 @@ pub(crate) fn build_callbacks(settings: &[Box<dyn CallbackSpec>]) -> Result<Vec<
     Ok(all)
 }
 
-/// Rays that a loss learns from at most, unless one step has more.
+/// Maximum number of rays that a loss is fitted to, unless one step has more.
 const DRAWN: u64 = 1 << 16;
 
-/// The plan of a field that is trained.
+/// The plan of a trained field.
 struct FieldPlan {
     scene: SceneSettings,
     optimizer: Optimizer,
@@ -216,13 +216,13 @@ struct FieldPlan {
     initializer: Box<dyn Initializer>,
     loss: Arc<dyn Loss>,
     priors: Vec<Box<dyn Prior>>,
-    /// Of the first run. Another one makes its own, as callbacks keep a state.
+    /// Callbacks of the first run. Later runs build their own, because callbacks keep state.
     callbacks: Option<Vec<Box<dyn Callback>>>,
-    /// Bytes that callbacks keep.
+    /// Bytes held by callbacks.
     kept: u64,
     /// The key of the callback that needs held-out views.
     held_out: Option<String>,
-    /// Of the first run, unless the scan changes the stages.
+    /// Compiled stages for the first run, unless the scan changes the stages.
     compiled: Option<Box<dyn Executable>>,
     outline: Outline,
 }
@@ -246,8 +246,8 @@ impl Plan for FieldPlan {
             optimizer: 8 * n + kept,
             backend,
             working: RaySource::bytes(scan, self.training.windows) + learning + known,
-            // Parameters and moments from the file, those that callbacks keep too, and one of them again on its way into the
-            // model.
+            // Parameters and moments from the file, those that callbacks keep, and a copy of one of them while it is
+            // loaded into the model.
             resume: 16 * n + kept,
             volume: false,
             evaluating: backend + FieldVoxels::BYTES,
@@ -356,7 +356,7 @@ impl Plan for FieldPlan {
 }
 
 impl FieldPlan {
-    /// The loss that learns from the scan, if it does.
+    /// The loss fitted to the scan, if it depends on the scan.
     fn fitted_loss(&self, job: &Job<'_>, scene: &Scene, source: &RaySource<'_>) -> Option<Arc<dyn Loss>> {
         if !self.loss.needs_scan() {
             return None;
@@ -381,8 +381,8 @@ impl FieldPlan {
         Clock::new(Ends { steps, seconds }, job.limits, spent)
     }
 
-    /// The model as it begins, or as a checkpoint has it, and what computes it. `needed` are the encoder's channels that the
-    /// scan needs, if it does not need all; `compiled` is what was compiled, if it still fits.
+    /// The initial model, or the model from a checkpoint, and its executable. `needed`: the encoder's channels that the
+    /// scan needs, if not all. `compiled`: the compiled stages, if they still fit.
     fn begin(
         &self,
         job: &Job<'_>,
@@ -419,7 +419,7 @@ impl FieldPlan {
     }
 }
 
-/// Learns from the rays of a scan.
+/// Training on the rays of a scan.
 struct Rays<'a> {
     optimizer: &'a Optimizer,
     count: usize,

@@ -1,4 +1,4 @@
-//! Which rays a step trains on.
+//! Selection of the rays of a training step.
 
 use crate::shadow::{air_level, shadow};
 use conefield_core::backend::TrainRay;
@@ -15,18 +15,18 @@ use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 use std::borrow::Cow;
 
-/// Views that a step takes its rays from.
+/// Views from which a step takes its rays.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
 #[serde(rename_all = "kebab-case")]
 pub enum Views {
     /// One view per step: every view once per epoch, in random order. No pixel occurs twice in a step if there are
     /// enough (published).
     One,
-    /// All views at once.
+    /// All views.
     All,
 }
 
-/// Pixels that are used for training.
+/// Pixels used for training.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
 #[serde(rename_all = "kebab-case")]
 pub enum Pixels {
@@ -52,19 +52,19 @@ pub struct Windows {
 }
 
 impl Windows {
-    /// Refuses windows that a step of `rays` rays has no room for.
+    /// Refuses more windows than a step of `rays` rays can hold.
     pub fn validate(&self, rays: usize) -> Result<()> {
         ensure((2..=256).contains(&self.side), "spec", "side", self.side, "2 to 256 pixels")?;
         let most = rays / (self.side * self.side);
         ensure((1..=most).contains(&self.count), "spec", "count", self.count, format!("1 to {most} for {rays} rays"))
     }
 
-    /// Windows of a step of `rays` rays.
+    /// Number of windows in a step of `rays` rays.
     fn fitting(&self, rays: usize) -> usize {
         self.count.min(rays / (self.side * self.side))
     }
 
-    /// Windows side by side along a detector of `columns` columns; the remaining columns at the end are in none.
+    /// Number of windows along a detector of `columns` columns; the remaining columns at the end are in no window.
     fn across(&self, columns: usize) -> usize {
         columns / self.side
     }
@@ -75,7 +75,7 @@ impl Windows {
         (column < self.across(columns)).then(|| (row * self.across(columns) + column) as u32)
     }
 
-    /// The windows all of whose pixels are among `pixels`.
+    /// The windows whose pixels are all in `pixels`.
     fn whole(&self, pixels: &[u32], columns: usize) -> Vec<u32> {
         let mut inside: Vec<u32> = pixels.iter().filter_map(|&p| self.of(p, columns)).collect();
         inside.sort_unstable();
@@ -91,34 +91,34 @@ impl Windows {
     }
 }
 
-/// Which rays of a scan are trained on.
+/// Selection of the training rays of a scan.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct RayChoice {
-    /// The views that they come from.
+    /// Views from which rays are taken.
     pub views: Views,
-    /// The pixels that count.
+    /// Pixels that may be used.
     pub pixels: Pixels,
     /// Pixels by which the support is wider than the shadow.
     pub margin: usize,
-    /// Windows, if some rays come in windows.
+    /// Windows, if some rays are drawn in windows.
     pub windows: Option<Windows>,
 }
 
-/// The rays of a scan that may be trained on.
+/// The training rays of a scan.
 pub struct RaySource<'a> {
     scan: &'a Scan,
     scene: &'a Scene,
-    /// Of each view, its usable pixels (row-major index).
+    /// Usable pixels of each view (row-major index).
     pixels: Vec<Vec<u32>>,
-    /// Of each view, the windows whose pixels are all usable.
+    /// Windows of each view whose pixels are all usable.
     windows: Option<(Windows, Vec<Vec<u32>>)>,
     views: Views,
-    /// Views that have a usable pixel.
+    /// Views with at least one usable pixel.
     usable: Vec<usize>,
 }
 
 impl<'a> RaySource<'a> {
-    /// Bytes of the lists of pixels and windows: at most all of them.
+    /// Upper bound in bytes of the lists of pixels and windows.
     pub fn bytes(scan: &ScanHeader, windows: Option<Windows>) -> u64 {
         let listed = windows.map_or(0, |w| scan.pixels() / (w.side * w.side) as u64);
         size_of::<u32>() as u64 * (scan.pixels() + listed)
@@ -144,7 +144,7 @@ impl<'a> RaySource<'a> {
                     counts && pipeline.sees(&scene.pixel_ray(&scan.geometry, v, row, column))
                 };
                 let mut pixels: Vec<u32> = (0..view.len() as u32).filter(usable).collect();
-                // The list has grown by doubling, and the estimate of memory counts what it holds.
+                // The list has grown by doubling, but the memory estimate assumes its exact length.
                 pixels.shrink_to_fit();
                 pixels
             })
@@ -164,23 +164,23 @@ impl<'a> RaySource<'a> {
         Ok(Self { scan, scene, pixels, windows, views, usable })
     }
 
-    /// Share of all pixels that may be trained on.
+    /// Share of all pixels that are used for training.
     pub fn share(&self) -> f64 {
         let all = self.scan.projections.len().max(1);
         self.pixels.iter().map(Vec::len).sum::<usize>() as f64 / all as f64
     }
 
-    /// Steps that make an epoch.
+    /// Steps per epoch.
     pub fn steps_an_epoch(&self) -> u64 {
         self.usable.len() as u64
     }
 
-    /// How many windows there are to draw, if rays come in windows.
+    /// Number of windows to draw from; `None` without windows.
     pub fn whole_windows(&self) -> Option<usize> {
         self.windows.as_ref().map(|(_, whole)| whole.iter().map(Vec::len).sum())
     }
 
-    /// The rays of step `step` (from 0): the same for the same seed.
+    /// Draws the rays of step `step` (from 0), reproducible by `seed`.
     pub fn draw(&self, seed: u64, step: u64, count: usize, out: &mut Vec<TrainRay>) {
         out.clear();
         let mut rng = stream(seed, 2 * step);
@@ -190,7 +190,7 @@ impl<'a> RaySource<'a> {
         }
     }
 
-    /// The view of step `step`: every view once an epoch.
+    /// The view of step `step`: every view once per epoch.
     fn view_of(&self, seed: u64, step: u64) -> usize {
         let steps = self.steps_an_epoch();
         let mut order = self.usable.clone();
@@ -209,7 +209,7 @@ impl<'a> RaySource<'a> {
         self.scan.geometry.detector[1]
     }
 
-    /// Rays of one view: no pixel twice, as far as there are enough.
+    /// Draws rays of one view. No pixel is drawn twice if there are enough.
     fn draw_from(&self, view: usize, count: usize, rng: &mut impl Rng, out: &mut Vec<TrainRay>) {
         let columns = self.columns();
         let mut pixels = Cow::from(&self.pixels[view]);
@@ -222,7 +222,7 @@ impl<'a> RaySource<'a> {
             chosen.sort_unstable();
             let is_inside = |p: &u32| windows.of(*p, columns).is_some_and(|w| chosen.binary_search(&w).is_ok());
             let outside: Vec<u32> = pixels.iter().copied().filter(|p| !is_inside(p)).collect();
-            // If the windows have all pixels, the other rays come from all of them again.
+            // If the windows cover all pixels, the other rays are drawn from all pixels again.
             if !outside.is_empty() {
                 pixels = Cow::from(outside);
             }
@@ -231,7 +231,7 @@ impl<'a> RaySource<'a> {
         out.extend(single.map(|at| self.ray(view, pixels[at])));
     }
 
-    /// Rays of any views.
+    /// Draws rays of all views.
     fn draw_from_all(&self, count: usize, rng: &mut impl Rng, out: &mut Vec<TrainRay>) {
         let columns = self.columns();
         if let Some((windows, whole)) = &self.windows {
@@ -250,7 +250,7 @@ impl<'a> RaySource<'a> {
     }
 }
 
-/// `count` of the numbers below `n`, none of them twice before all were drawn.
+/// Draws `count` numbers below `n`; none is repeated before all have been drawn.
 fn apart(rng: &mut impl Rng, n: usize, count: usize) -> impl Iterator<Item = usize> {
     let rounds = (0..count).step_by(n).map(move |begin| sample(rng, n, n.min(count - begin)));
     rounds.flatten()
@@ -279,7 +279,7 @@ mod tests {
     #[test]
     fn windows_are_whole_and_stand_side_by_side() {
         let (columns, rows, windows) = (7, 5, Windows { count: 1, side: 2 });
-        // All pixels but one: its window is not whole. The last column and row are in none.
+        // All pixels but one, so its window is incomplete. The last column and row belong to no window.
         let pixels: Vec<u32> = (0..(columns * rows) as u32).filter(|&p| p != 9).collect();
         let whole = windows.whole(&pixels, columns);
         assert_eq!(whole, [0, 2, 3, 4, 5]);
@@ -298,7 +298,7 @@ mod tests {
     #[test]
     fn windows_that_do_not_fit_are_refused() {
         assert!(Windows { count: 16, side: 8 }.validate(2048).is_ok());
-        // A draw of fewer rays has as many as fit.
+        // If there are fewer rays, as many windows as fit.
         assert_eq!(Windows { count: 16, side: 8 }.fitting(1000), 15);
         for (windows, named) in [((33, 8), "count"), ((0, 8), "count"), ((1, 1), "side"), ((1, 257), "side")] {
             let error = Windows { count: windows.0, side: windows.1 }.validate(2048).unwrap_err().to_string();

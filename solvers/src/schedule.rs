@@ -65,7 +65,7 @@ pub struct Clock {
     limits: Limits,
     spent: Duration,
     running: Option<Instant>,
-    /// Creation time, and the time spent before: a deadline counts from there.
+    /// Creation time, and the training time before; a deadline counts from there.
     made: (Instant, Duration),
 }
 

@@ -65,7 +65,7 @@ impl Columns {
         heads.extend(SCORES.iter().filter(|_| self.scores));
         heads.extend(self.held_out.then_some("held-out error"));
         heads.extend(self.loss.then_some("loss"));
-        heads.extend(["steps or passes", "solving s", "all s", "peak memory"]);
+        heads.extend(["steps or passes", "solve time, s", "total time, s", "peak memory"]);
         heads
     }
 

@@ -160,8 +160,8 @@ const COLUMNS: [Column; 10] = [
     Column { key: "held_out", head: "held-out error", shown: |x| format!("{x:.3e}") },
     Column { key: "loss", head: "loss", shown: |x| format!("{x:.3e}") },
     Column { key: "steps", head: "steps or passes", shown: |x| number(x.round() as u64) },
-    Column { key: "train_s", head: "solving s", shown: two },
-    Column { key: "total_s", head: "all s", shown: two },
+    Column { key: "train_s", head: "solve time, s", shown: two },
+    Column { key: "total_s", head: "total time, s", shown: two },
     Column { key: "peak_bytes", head: "peak memory", shown: |x| bytes(x as u64) },
 ];
 
@@ -436,7 +436,7 @@ mod tests {
         let study = study(
             "volumes = ['phantom:head:16', 'phantom:abdomen:16']\nspecs = ['fdk', 'sirt']\nseeds = [1, 2, 3]\nbaseline = 'fdk'\n",
         );
-        // For every seed sirt is better by 1, 2 and 3 dB on the head, by 5 on the abdomen, where one run fails.
+        // For every seed sirt is better by 1, 2 and 3 dB on the head and by 5 dB on the abdomen, where one run fails.
         let psnr = |c: &Cell| match (c.case, c.method) {
             (0, 0) => 20.0 + 10.0 * c.seed as f64,
             (0, _) => 20.0 + 11.0 * c.seed as f64,
@@ -461,7 +461,7 @@ mod tests {
         let abdomen = line("abdomen-16", "sirt");
         assert_eq!((abdomen.done, abdomen.failed), (2, 1));
         assert_eq!(abdomen.difference.as_ref().unwrap()["psnr"], of(5.0, 0.0, 2));
-        // Over all cases: the mean of both for the seeds that both have.
+        // Over all cases: the mean of both, for the seeds that both have.
         let all = line("all", "sirt");
         assert_eq!(all.difference.as_ref().unwrap()["psnr"], of(3.25, 0.125f64.sqrt(), 2));
         assert_eq!((all.done, all.failed), (5, 1));

@@ -71,7 +71,7 @@ impl Simulation {
         let same = then.as_ref() == Some(&now)
             && scan.provenance["source"] == self.written
             && scan.provenance["prepared"] == self.preparation();
-        let expected = "the one of this study, as its file says now; --force starts over";
+        let expected = "a scan simulated as this study's file says; --force starts over";
         ensure(
             same,
             &place.display().to_string(),
@@ -93,7 +93,7 @@ impl Simulation {
         simulation::changed(protocol, &changes, "study").map_err(|e| match e {
             // Errors name the options of the command line.
             Error::Invalid { place, field, found, .. } if field == "--views" => {
-                Error::invalid(place, "views", found, "views, or angles from a file, which says how many there are")
+                Error::invalid(place, "views", found, "views, or angles from a file, which determines the number")
             }
             other => other,
         })

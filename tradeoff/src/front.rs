@@ -45,7 +45,8 @@ impl Unknowns {
 pub struct Front {
     /// Program and number of threads with which it was made.
     pub made: String,
-    /// Time of a pass of the [standard reconstruction](crate::speed) there, in seconds: how fast the machine was.
+    /// Time of a pass of the [standard reconstruction](crate::speed) on that machine, in seconds: a measure of its
+    /// speed.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub pass_s: Option<f64>,
     /// The scans on which it was measured.
@@ -97,13 +98,13 @@ pub struct Point {
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct Reached {
-    /// Its cost in steps or passes: times the duration of one, as measured on any machine, it gives the time there.
+    /// Its cost in steps or passes. Multiplied by the duration of one step on any machine, it gives the time there.
     pub steps: u64,
     /// Time for all steps in seconds.
     pub train_s: f64,
     /// Time of the whole run in seconds.
     pub total_s: f64,
-    /// Of that, the time for all but the steps, reading and scoring.
+    /// Part of `total_s` that is not spent on steps, reading or scoring.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub beside_s: Option<f64>,
     /// Peak memory.
@@ -167,7 +168,7 @@ impl Front {
     fn parse(text: &str, place: &str) -> Result<Self> {
         let front: Self = toml::from_str(text).map_err(|e| {
             let line = toml_line(text, &e).unwrap_or(1);
-            Error::invalid(format!("{place}:{line}"), "front", e.message(), "what conefield tradeoff writes")
+            Error::invalid(format!("{place}:{line}"), "front", e.message(), "a front written by conefield tradeoff")
         })?;
         ensure(!front.scans.is_empty(), place, "scans", "none", "the scans that it was measured on")?;
         ensure(!front.points.is_empty(), place, "points", "none", "at least one method")?;
@@ -182,7 +183,7 @@ impl Front {
         for (i, point) in front.points.iter().enumerate() {
             let field = |what: &str| format!("points[{i}].{what}");
             let (found, want) = (point.runs.len(), front.scans.len());
-            ensure(found == want, place, &field("runs"), format!("{found}"), format!("{want}, one a scan"))?;
+            ensure(found == want, place, &field("runs"), format!("{found}"), format!("{want}, one per scan"))?;
             for run in &point.runs {
                 let times = [point.budget_s, run.train_s, run.total_s, run.beside_s.unwrap_or(0.0)];
                 let good = times.iter().all(|t| t.is_finite() && *t >= 0.0) && run.steps > 0;
@@ -208,13 +209,14 @@ impl Front {
         near
     }
 
-    /// Whether one of its scans is about as large: the front then says what methods cost, as far as the speeds of both machines do.
+    /// Whether one of its scans is about as large. The front then predicts the cost of methods, given the speeds of
+    /// both machines.
     pub fn close(&self, size: Size) -> bool {
         let within = |a: f64, b: f64| (a / b).ln().abs() < NEAR.ln();
         self.sizes().any(|then| within(then.pixels, size.pixels) && within(then.voxels, size.voxels))
     }
 
-    /// Whether all of its scans are larger: a method takes less time than there.
+    /// Whether all of its scans are larger: a method then takes less time than there.
     pub fn larger(&self, size: Size) -> bool {
         self.sizes().all(|then| then.pixels > size.pixels && then.voxels > size.voxels)
     }
@@ -324,7 +326,7 @@ mod tests {
             (
                 "[[points.runs]]",
                 "[[points.runs]]\nsteps = 4\ntrain_s = 2.0\ntotal_s = 3.0\npsnr = 1\n[[points.runs]]",
-                "one a scan",
+                "one per scan",
             ),
         ] {
             let text = text("field").replace(from, to);

@@ -193,7 +193,7 @@ impl Base {
             for value in &lever.values {
                 base.built(&[set(lever, value)], specs).map_err(|e| {
                     let field = format!("{field}.levers.{}", lever.key);
-                    Error::invalid(place, field, value.to_string(), format!("a value that {} takes: {e}", base.name))
+                    Error::invalid(place, field, value.to_string(), format!("a value that {} accepts: {e}", base.name))
                 })?;
             }
         }

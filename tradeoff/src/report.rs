@@ -223,7 +223,7 @@ impl TradeoffReport {
     fn table(&self) -> Table {
         let mut heads = vec!["front", "budget"];
         heads.extend(self.by_reference().then_some(["PSNR dB", "ssim_2d"]).into_iter().flatten());
-        heads.extend(["held-out error", "steps or passes", "solving s", "all s", "peak memory"]);
+        heads.extend(["held-out error", "steps or passes", "solve time, s", "total time, s", "peak memory"]);
         let mut rows = vec![heads.iter().map(|h| h.to_string()).collect::<Vec<_>>()];
         for name in &self.front {
             let Some(p) = self.points.iter().find(|p| p.name == *name) else { continue };

@@ -14,17 +14,17 @@ use std::time::{Duration, Instant};
 pub const TOO_SHORT: &str = "the budget: ";
 /// Planned share of the budget; the rest is a reserve.
 const AIM: f64 = 0.98;
-/// Share of a point's steps for which there must be time.
+/// Minimum share of a point's steps that must fit into the time.
 const ENOUGH: f64 = 0.9;
-/// Most methods that are measured before one is taken.
+/// Maximum number of methods that are measured before one is chosen.
 const MEASURED: usize = 3;
 /// Longest measurement of a method, in seconds and as a share of the budget: for short budgets, and for those in which
 /// three seconds matter little. Passes on a less coarse scan predict full passes better.
 const CALIBRATION: [(f64, f64); 2] = [(1.0, 0.1), (3.0, 0.04)];
-/// Share of a chain's time that is reserved for its methods after the first. In `smooth-tv` they take nine tenths; the difference
-/// lets the first one end a little late.
+/// Share of a chain's time that is reserved for its methods after the first. In `smooth-tv` they take nine tenths; the
+/// difference lets the first one end a little late.
 const LATER: f64 = 0.7;
-/// Share of that without which they make nothing useful.
+/// Minimum share of that reserve for a useful result.
 const LEAST_LATER: f64 = 0.1;
 /// Minimum number of steps of a useful field.
 const STEPS: f64 = 10.0;
@@ -68,7 +68,7 @@ pub struct Schedule {
     pub expected: Costs,
     /// Planned seconds of training.
     pub train_s: f64,
-    /// Passes or steps after which the method ends even if there is time for more ([`Plan::passes`]).
+    /// Maximum number of passes or steps, even if time is left ([`Plan::passes`]).
     #[serde(skip)]
     pub passes: Option<u64>,
     #[serde(skip)]
@@ -108,8 +108,8 @@ impl Budget {
         let mut points: Vec<_> = front.points.iter().collect();
         points.sort_by(|a, b| b.accuracy().total_cmp(&a.accuracy()));
         let expected: Vec<(Unknowns, Expected)> = points.iter().map(|p| (p.kind, front.expected(p, size))).collect();
-        // A scan as large as one of the front costs what it cost there, on a machine of another speed. That is more
-        // accurate than an extrapolation from a coarser scan. A smaller scan costs less.
+        // On a scan as large as one of the front, the cost is the front's, scaled by the relative speed of the
+        // machines. This is more accurate than an extrapolation from a coarser scan. A smaller scan costs less.
         let iterates = points.iter().any(|p| p.kind == Unknowns::Voxels);
         let slower = match front.pass_s {
             // If it fails, the methods themselves are timed.
@@ -177,7 +177,7 @@ impl Budget {
     ) -> Result<Schedule> {
         let kind = Unknowns::of(method.plan());
         let left = self.left();
-        // If time is short, training gets half of it, as far as later methods can do with less.
+        // If time is short, training gets half of it, provided that later methods can do with less.
         let room = 0.5 * (left - costs.prepare_s - (costs.after_s() - costs.then_s));
         let costs = Costs { then_s: costs.then_s.min(room.max(costs.then_least_s)), ..costs };
         let load_s = self.begin.elapsed().as_secs_f64();
@@ -222,8 +222,8 @@ impl Budget {
     }
 }
 
-/// The costs of a voxel method that are `expected` on the front's machine, on one that takes `slower` times as long. Drawing and
-/// scoring are not included.
+/// The cost of a voxel method that costs `expected` on the front's machine, on a machine that takes `slower` times as
+/// long. Excludes drawing and scoring.
 fn as_there(expected: Expected, slower: f64, plan: &mut dyn Plan) -> Costs {
     let step_s = slower * expected.step_s;
     let costs = Costs { step_s, export_s: slower * expected.beside_s, ..Costs::default() };
@@ -300,7 +300,7 @@ fn pick(
     mut measure: impl FnMut(usize) -> Result<Costs>,
 ) -> Result<Choice> {
     let mut known: Vec<Option<Result<Costs, String>>> = points.iter().map(|_| None).collect();
-    // For fields and for voxels; what is known of one kind is the best guess for the other.
+    // For fields and for voxels. If only one kind has been measured, its ratio is the best guess for the other.
     let mut slower: [Option<f64>; 2] = [None; 2];
     slower[Unknowns::Voxels as usize] = voxels_slower;
     let index = |kind: Unknowns| kind as usize;
@@ -346,7 +346,7 @@ fn pick(
                     return Ok(Choice { point: i, costs: *c, fits: true, passed_over });
                 }
                 passed_over.push((i, format!("needs {}, but only {} are left", time(needed), time(now))));
-                // A field makes something of few steps; of few passes little comes.
+                // A few steps give a useful field; a few passes do not give a useful volume.
                 let least = match kind {
                     Unknowns::Field => c.prepare_s + STEPS * c.step_s + c.after_s(),
                     Unknowns::Voxels => needed,
@@ -408,7 +408,7 @@ mod tests {
 
     #[test]
     fn one_measurement_predicts_others_of_its_kind() {
-        // The field of 90 s takes 270, and the voxel method more by the same factor: 108 s.
+        // The field of 90 s takes 270 s, and the voxel method takes longer by the same factor: 108 s.
         assert_eq!(chosen(100.0, 3.0), (2, true, vec![0, 2]));
         // On a faster machine a better point fits.
         assert_eq!(chosen(50.0, 0.5), (0, true, vec![1, 0]));
@@ -431,7 +431,7 @@ mod tests {
         assert_eq!((choice.point, choice.fits, measured), (2, true, vec![0, 2]));
     }
 
-    /// Drawing and scoring are costs of every run, no sign of a slow machine.
+    /// Drawing and scoring cost the same in every run and do not indicate a slow machine.
     #[test]
     fn a_known_speed_is_not_overruled_by_what_is_measured() {
         let points = [(20.0, 1.0), (15.0, 1.0), (1.0, 1.0)]

@@ -1,4 +1,4 @@
-//! How fast this machine is: the time of a pass of a small reconstruction, which is the same on every machine.
+//! The speed of this machine: the time per pass of a small reconstruction that is the same on every machine.
 
 use crate::calibrate::Laps;
 use conefield_core::Result;
@@ -20,8 +20,8 @@ const VOXELS: usize = 80;
 /// Passes. The first one touches memory for the first time.
 const PASSES: u64 = 4;
 
-/// Seconds of a pass of total variation on 80³ samples of a cubic spline, from 16 views of 112 × 112 pixels: projector and prior, the work
-/// of all voxel methods of the shipped front.
+/// Seconds per pass of total variation on 80³ samples of a cubic spline, from 16 views of 112 × 112 pixels. Projector
+/// and prior do the same work as in all voxel methods of the shipped front.
 pub fn pass_s(backend: &dyn Backend, cancelled: &dyn Fn() -> bool) -> Result<f64> {
     let sets = [
         "basis={ type = \"cubic\", spacing = 1 }",

@@ -120,11 +120,17 @@ impl TradeoffArgs {
     /// All settings of the search, after checking.
     fn search(&self, candidates: Vec<Candidate>, general: &General) -> Result<Search> {
         let rising = self.budgets.windows(2).all(|w| w[0] < w[1]);
-        ensure(rising, "tradeoff", "--budgets", format!("{:?} seconds", self.budgets), "times that rise")?;
+        ensure(rising, "tradeoff", "--budgets", format!("{:?} seconds", self.budgets), "ascending times")?;
         let all = self.reference.len();
         let truth = all == 1 && self.reference[0] == Path::new("truth");
         let fits = all == 0 || truth || all == self.scans.len();
-        ensure(fits, "tradeoff", "--reference", format!("{all} volumes"), format!("{}, one a scan", self.scans.len()))?;
+        ensure(
+            fits,
+            "tradeoff",
+            "--reference",
+            format!("{all} volumes"),
+            format!("{}, one per scan", self.scans.len()),
+        )?;
         let ranked = all > 0 || self.hold_out.0.is_some();
         ensure(ranked, "tradeoff", "--hold-out", "none", "views to rank by, as there is no --reference")?;
         let references: Vec<PathBuf> =

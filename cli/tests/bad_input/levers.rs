@@ -41,7 +41,7 @@ pub fn cases() -> Vec<Case> {
             SEARCH,
             &["base[0].levers.cutoff", "7.0"],
         ),
-        refused("budgets that fall", |_| {}, "tradeoff scan -o out --budgets 9s,3s", &["--budgets", "rise"]),
+        refused("budgets that fall", |_| {}, "tradeoff scan -o out --budgets 9s,3s", &["--budgets", "ascending"]),
         refused(
             "fewer candidates than bases",
             |_| {},

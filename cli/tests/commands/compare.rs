@@ -78,8 +78,8 @@ fn table_picture_and_records_agree_and_resume_skips_what_is_done() {
         "ssim_skimage",
         "held-out error",
         "steps or passes",
-        "solving s",
-        "all s",
+        "solve time, s",
+        "total time, s",
         "peak memory",
     ];
     assert_eq!(rows[0], heads);
@@ -199,7 +199,7 @@ fn bad_input_makes_no_folder() {
         (&twice, &[], "a unique name"),
         (&text(&slash), &[], "a name for a folder"),
         ("fdk", &["--reference", "nothing.nii"], "nothing.nii"),
-        ("fdk", &["--reference", &text(&small)], "[24, 24, 24], the voxels that this scan asks for"),
+        ("fdk", &["--reference", &text(&small)], "[24, 24, 24], the shape of the scan's volume"),
         ("fdk", &["--hold-out", "12"], "expected an index below 12"),
         ("fdk,sirt", &["--set", "encoder.levels=3"], "encoder"),
     ] {

@@ -147,7 +147,7 @@ fn views_that_are_not_there_are_refused() {
     let said = refused(1, &["reconstruct", &scan, "--spec", "naf", "-o", &run, "--hold-out", "4"]);
     assert!(said.contains("found 4, expected an index below 4"), "{said}");
     let said = refused(1, &["reconstruct", &scan, "--spec", "naf", "-o", &run, "--hold-out", "every:100"]);
-    assert!(said.contains("--hold-out: found every:100, which is none of 4 views"), "{said}");
+    assert!(said.contains("--hold-out: found every:100, which selects none of 4 views"), "{said}");
     let said = refused(1, &["reconstruct", &scan, "--spec", "naf", "-o", &run, "--init", "no.safetensors"]);
     assert!(said.contains("no.safetensors"), "{said}");
     assert!(!dir.path().join("run").exists(), "nothing is made before the input is known to be good");

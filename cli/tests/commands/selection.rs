@@ -65,7 +65,7 @@ fn import_and_convert_take_the_same_part() {
 
     for (options, words) in [
         (["--views", "0-12"], ["--views", "numbers below 12"]),
-        (["--views", "1,1"], ["--views", "1 stands twice"]),
+        (["--views", "1,1"], ["--views", "repeats view 1"]),
         (["--rows", "4:20"], ["--rows", "the 10"]),
         (["--columns", "5:5"], ["--columns", "at least one"]),
         (["--bin", "11"], ["--bin", "at most 10"]),

@@ -196,7 +196,7 @@ fn bad_input_makes_no_folder() {
     let out = dir.path().join("out");
     for (more, want) in [
         (&["--reference", "nothing.nii"][..], "nothing.nii"),
-        (&["--reference", "a.nii", "--reference", "b.nii"], "1, one a scan"),
+        (&["--reference", "a.nii", "--reference", "b.nii"], "1, one per scan"),
         (&["--hold-out", "99"], "below 12"),
         (&["--hold-out", "none"], "views to rank by"),
     ] {

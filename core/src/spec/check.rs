@@ -246,7 +246,7 @@ fn plain(value: &Value) -> String {
     value.as_str().map_or_else(|| value.to_string(), str::to_owned)
 }
 
-/// Error for a text that is none of the allowed ones.
+/// Error for a text that is not one of the allowed ones.
 fn misnamed(node: &Node, path: &str, allowed: &[Value]) -> Option<Error> {
     let names: Vec<&str> = allowed.iter().filter_map(Value::as_str).collect();
     let text = node.text().filter(|_| !names.is_empty())?;

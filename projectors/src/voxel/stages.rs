@@ -110,7 +110,7 @@ impl VoxelProjector for Trilinear {
         Some(Fragment::new(&[&samples, include_str!("walk.wgsl"), include_str!("trilinear.wgsl")]))
     }
     fn describe(&self) -> String {
-        format!("trilinear: {} samples a voxel", self.samples_per_voxel)
+        format!("trilinear: {} samples per voxel", self.samples_per_voxel)
     }
 }
 

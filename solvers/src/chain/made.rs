@@ -104,7 +104,7 @@ impl Made {
             (Some(volume), None) => Reconstruction::Volume(volume),
             (Some(volume), Some((_, field))) => Reconstruction::Refined { field: Box::new(field), volume },
             (None, Some((_, field))) => Reconstruction::Field(field),
-            (None, None) => return Err(Error::unsupported("chain", "no method has made anything")),
+            (None, None) => return Err(Error::unsupported("chain", "no method has produced a result")),
         };
         let Counts { steps, train_s, samples, sampling_s, rollbacks, best } = self.counts;
         Ok(Solution { result, steps, train_s, samples, sampling_s, rollbacks, best })
@@ -142,7 +142,7 @@ impl Made {
     pub(super) fn resumed(resume: &Resume, links: &[Box<dyn Plan>], job: &Job<'_>) -> Result<(Self, Option<Resume>)> {
         let place = &resume.place;
         let kept = Kept::deserialize(&resume.standing.method);
-        let kept = kept.map_err(|e| Error::invalid(place, "method", e, "what a chain keeps"))?;
+        let kept = kept.map_err(|e| Error::invalid(place, "method", e, "the state of a chain"))?;
         let expected = format!("fewer than {}", links.len());
         ensure(kept.links < links.len(), place, "method.links", kept.links, expected)?;
         let grid = job.scan.geometry.volume;

@@ -255,7 +255,7 @@ fn check(orbit: &FdkOrbit, geometry: &Geometry) -> Result<()> {
     let span = |values: &mut dyn Iterator<Item = f64>| {
         values.fold((f64::INFINITY, f64::NEG_INFINITY), |(l, h), r| (l.min(r), h.max(r)))
     };
-    let circle = "a circular orbit around z for fdk; iterative methods take any";
+    let circle = "a circular orbit around z for fdk; iterative methods accept any orbit";
     let (low, high) = span(&mut orbit.radius.iter().copied());
     let found = format!("sources {low:.1} to {high:.1} mm from the axis z");
     ensure(low > 0.0 && high < 1.2 * low, "scan", "views", found, circle)?;
@@ -264,5 +264,5 @@ fn check(orbit: &FdkOrbit, geometry: &Geometry) -> Result<()> {
     ensure(top - bottom <= TILT * low, "scan", "views", found, circle)?;
     let steep = geometry.views.iter().position(|v| v.u[2].abs() > TILT * norm(v.u));
     let found = steep.map_or(String::new(), |v| format!("a detector whose rows rise along z in view {v}"));
-    ensure(steep.is_none(), "scan", "views", found, "rows across z for fdk; iterative methods take any")
+    ensure(steep.is_none(), "scan", "views", found, "rows across z for fdk; iterative methods accept any orbit")
 }

@@ -186,8 +186,8 @@ impl Method for Gaussians {
             callback.check(&pipeline).map_err(|e| e.within(&format!("callbacks.{i}")))?;
         }
         let loss = self.loss.build().map_err(|e| e.within("loss"))?;
-        let learns = if loss.needs_scan() { "one that learns from the scan" } else { "" };
-        ensure(learns.is_empty(), "spec", "loss", learns, "a loss that knows itself, such as l1")?;
+        let learns = if loss.needs_scan() { "one that is fitted to the scan" } else { "" };
+        ensure(learns.is_empty(), "spec", "loss", learns, "a loss that does not depend on the scan, such as l1")?;
         let mut priors = vec![];
         for (i, spec) in self.priors.iter().enumerate() {
             let prior = spec.build().and_then(|p| p.blocks().validate().map(|()| p));
@@ -206,7 +206,7 @@ impl Method for Gaussians {
             beside.push(Line::new(&format!("callbacks.{i}"), spec.typetag_name(), &said));
         }
         let Self { start, training, optimizer, .. } = self;
-        let what = format!("{} from the start, {} views a step, Adam {}", start.count, training.views, optimizer.lr);
+        let what = format!("{} from the start, {} views per step, Adam {}", start.count, training.views, optimizer.lr);
         let method = Line::new("method", "gaussians", &what);
         let control = self.density_control.map_or(0, |_| DensityControl::bytes(self.most));
         let kept = callbacks.iter().map(|c| c.bytes(pipeline.layout().len() as u64)).sum::<u64>() + control;

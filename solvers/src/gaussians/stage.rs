@@ -284,7 +284,7 @@ impl Stage for Mixture {
     }
 
     fn describe(&self) -> String {
-        format!("gaussians: places for {}", self.most)
+        format!("gaussians: {} slots", self.most)
     }
 }
 

@@ -75,7 +75,7 @@ impl Start {
             "spec",
             "count",
             self.count,
-            format!("8 to {most}, the places there are"),
+            format!("8 to {most}, the number of slots"),
         )?;
         let share = (0.0..1.0).contains(&self.threshold);
         ensure(share, "spec", "threshold", self.threshold, "a share from 0 to below 1")

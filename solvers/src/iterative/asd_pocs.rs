@@ -127,7 +127,7 @@ impl Iterative for Built {
     }
 
     fn describe(&self) -> String {
-        format!("asd-pocs: {}, {} descents a pass", self.updates.subsets, self.descents)
+        format!("asd-pocs: {}, {} descents per pass", self.updates.subsets, self.descents)
     }
 }
 

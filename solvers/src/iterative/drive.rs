@@ -275,7 +275,7 @@ pub(crate) fn finite(volume: &Array3<f32>, step: u64) -> Result<()> {
 /// Restores method, best volume and driver from a checkpoint.
 fn restore(resume: &Resume, method: &mut dyn Iteration, best: Option<&mut Array3<f32>>) -> Result<Kept> {
     let kept: std::result::Result<Kept, _> = serde_json::from_value(resume.standing.method.clone());
-    let kept = kept.map_err(|e| Error::invalid(&resume.place, "method", e, "what this method keeps"))?;
+    let kept = kept.map_err(|e| Error::invalid(&resume.place, "method", e, "the state of this method"))?;
     let best = best.filter(|_| kept.best.is_some()).map(|best| (BEST.to_owned(), flat_mut(best)));
     for (name, values) in method.state().into_iter().chain(best) {
         let found = resume.tensor(&name).map(|t| &t.1);

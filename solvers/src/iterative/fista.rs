@@ -184,7 +184,7 @@ impl Iterative for Built {
     fn solve(&self, job: &Job<'_>, observer: &mut dyn Observer) -> Result<Solution> {
         let begun = Instant::now();
         if self.pull > 0.0 && !self.shared.has_start(job) {
-            let expected = "0, or a volume to start from and to be held to";
+            let expected = "0, or a volume to start from and pull towards";
             return Err(Error::invalid("spec", "pull", self.pull, expected));
         }
         let stages = [self.data.describe(), self.prior.describe(), self.basis.describe()].join("; ");
@@ -258,7 +258,7 @@ impl Iterative for Built {
     }
 
     fn describe(&self) -> String {
-        let held = if self.pull > 0.0 { format!(", held to a volume by {}", self.pull) } else { String::new() };
+        let held = if self.pull > 0.0 { format!(", pull {} to a volume", self.pull) } else { String::new() };
         format!("fista: {}{held}", self.subsets)
     }
 }

@@ -52,7 +52,7 @@ impl std::fmt::Display for Subsets {
         match self {
             Self::Count(1) => f.write_str("all views at once"),
             Self::Count(n) => write!(f, "{n} subsets"),
-            Self::Each(Each::Views) => f.write_str("a view at a time"),
+            Self::Each(Each::Views) => f.write_str("one view at a time"),
         }
     }
 }

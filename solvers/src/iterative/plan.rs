@@ -42,7 +42,7 @@ pub(super) trait Iterative: Send + Sync {
     fn solve(&self, job: &Job<'_>, observer: &mut dyn Observer) -> Result<Solution>;
 }
 
-/// The rest of a pass, per unknown, in ray samples (forward and back-projection) of the same cost. On 50 views of 512²
+/// Cost per unknown of the rest of a pass, in ray samples of forward and back-projection. On 50 views of 512² pixels
 /// and 256³ voxels, ten subsets with total variation spend equal time on both.
 const SAMPLES: f64 = 200.0;
 

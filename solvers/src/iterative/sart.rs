@@ -152,7 +152,7 @@ impl Iterative for Built {
 
     fn describe(&self) -> String {
         let Updates { subsets, relaxation, decay, .. } = self.updates;
-        format!("sart: {subsets}, relaxation {relaxation} times {decay} a pass")
+        format!("sart: {subsets}, relaxation {relaxation} times {decay} per pass")
     }
 }
 

@@ -147,7 +147,7 @@ pub fn known_volume(job: &Job<'_>, named: Option<KnownVolume>) -> Result<Option<
     match (job.start, named) {
         (Some(given), named) => {
             let steps = named.map_or(KnownVolume::STEPS, |n| n.steps);
-            Ok(Some((in_mm(job, "start", given.clone())?, steps, "the volume of the method before".into())))
+            Ok(Some((in_mm(job, "start", given.clone())?, steps, "the volume of the previous method".into())))
         }
         (None, Some(KnownVolume { path, steps })) => Ok(Some((start_volume(job, &path)?, steps, path))),
         (None, None) => Ok(None),

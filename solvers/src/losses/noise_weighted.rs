@@ -74,7 +74,7 @@ impl Loss for Weighted {
         if self.growth > 0.0 {
             return format!("noise-weighted, {:.3} times exp(-{:.3} p)", self.factor, self.growth);
         }
-        "noise-weighted by what the scan shows".into()
+        "noise-weighted, fitted to the noise of the scan".into()
     }
 }
 

@@ -161,7 +161,7 @@ pub struct Kept<'a> {
 impl Kept<'_> {
     /// The deserialized values.
     pub fn value<T: DeserializeOwned>(&self) -> Result<T> {
-        let expected = "what this callback keeps";
+        let expected = "the state of this callback";
         T::deserialize(self.value).map_err(|e| Error::invalid(&self.resume.place, self.name, e, expected))
     }
 

@@ -171,7 +171,7 @@ fn a_checkpoint_that_does_not_fit_the_chain_is_refused() {
     refused(&kept, FIRST, "method: ");
     let mut alone = Heard::interrupting_after(1);
     Case::of(&scan).run(FIRST, &mut alone).err().unwrap();
-    refused(&alone.kept.unwrap(), &text, "what a chain keeps");
+    refused(&alone.kept.unwrap(), &text, "the state of a chain");
 }
 
 #[test]

@@ -25,7 +25,7 @@ pub fn sizes() -> Vec<Case> {
     for (n, growth) in [(21, 2.0), (29, 2.0), (32, 2.0), (32, 16.0)] {
         let finest = (16.0 * f64::powi(growth, n as i32 - 1)).log2();
         let what = format!("levels: {n}, 2^{finest:.0} cells a side on the finest");
-        all.push(Case::refused(what, &["encoder.levels", "2^23 cells a side"], move || with(levels(n, growth, 16))));
+        all.push(Case::refused(what, &["encoder.levels", "2^23 cells per side"], move || with(levels(n, growth, 16))));
     }
     for (n, words) in [(0, &["encoder.levels: found 0"][..]), (33, &["encoder.levels: found 33"])] {
         all.push(Case::refused(format!("levels: {n}"), words, move || with(levels(n, 1.1, 16))));

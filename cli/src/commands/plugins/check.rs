@@ -242,7 +242,7 @@ impl Check {
                 let mut refused = None;
                 let mut built = false;
                 for width in self.widths() {
-                    // A field may accept only points of the cube.
+                    // A field may accept only points of the unit cube.
                     let stage = match make(settings.clone())?.build(width) {
                         Ok(stage) => stage,
                         Err(e) => {

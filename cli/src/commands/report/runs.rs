@@ -111,7 +111,7 @@ fn names(found: &[RunOnDisk]) -> Vec<String> {
     struct Named {
         name: String,
     }
-    // A run that goes on has no record yet.
+    // An unfinished run has no record yet.
     let own = |run: &RunOnDisk| {
         let named = run.spec_name().map(str::to_owned);
         let named = named.or_else(|| toml::from_str(run.spec()).ok().map(|n: Named| n.name));

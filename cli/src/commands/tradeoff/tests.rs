@@ -47,7 +47,7 @@ fn bases_that_are_not_named_are_left_out() {
 
 #[test]
 fn a_product_is_used_up_without_repeating() {
-    // The base itself has 10 subsets: 3 x 2 combinations, one of which is the base.
+    // The base itself has 10 subsets. Of the 3 × 2 combinations one is the base.
     let levers = parse("[[base]]\nspec = 'os-sart'\n[base.levers]\nsubsets = [5, 10, 25]\nrelaxation = [0.4, 0.5]\n");
     let all = levers.unwrap().candidates(100, 3).unwrap();
     let default = specs::read("os-sart", &[]).unwrap().tree.clone();

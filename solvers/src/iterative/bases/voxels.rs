@@ -28,7 +28,7 @@ impl Basis for Voxels {
     }
 
     fn describe(&self) -> String {
-        "voxels: a coefficient each".into()
+        "voxels: one coefficient per voxel".into()
     }
 }
 

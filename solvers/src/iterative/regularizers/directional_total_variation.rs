@@ -67,7 +67,7 @@ impl Regularizer for DirectionalTotalVariation {
     fn describe(&self) -> String {
         let Self { weight, inner, strength, edge } = self;
         format!(
-            "directional-total-variation: weight {weight}, {inner} dual steps an update, strength {strength}, edge {edge}"
+            "directional-total-variation: weight {weight}, {inner} dual steps per update, strength {strength}, edge {edge}"
         )
     }
 }

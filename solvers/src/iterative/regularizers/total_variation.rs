@@ -56,7 +56,7 @@ impl Regularizer for TotalVariation {
     }
 
     fn describe(&self) -> String {
-        format!("total-variation: weight {}, {} dual steps an update", self.weight, self.inner)
+        format!("total-variation: weight {}, {} dual steps per update", self.weight, self.inner)
     }
 }
 

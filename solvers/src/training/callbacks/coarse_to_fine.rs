@@ -84,7 +84,7 @@ impl Callback for Opener {
         if ends.is_empty() || !encoder.coarse_to_fine() {
             return Err(Error::unsupported(
                 encoder.describe(),
-                "coarse-to-fine: its channels do not stand from coarse to fine",
+                "coarse-to-fine: its channels are not ordered from coarse to fine",
             ));
         }
         let most = ends.len();

@@ -141,7 +141,7 @@ impl Callback for Masker {
         if self.settings.scope == Scope::Finer && !pipeline.encoder.coarse_to_fine() {
             return Err(Error::unsupported(
                 "fft-mask with scope \"finer\"",
-                "this encoder's channels do not stand from coarse to fine; use scope = \"channel\"",
+                "this encoder's channels are not ordered from coarse to fine; use scope = \"channel\"",
             ));
         }
         Ok(())
